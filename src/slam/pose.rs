@@ -1,0 +1,114 @@
+//! What the tracker says of one frame: pose, covariance, state and quality.
+
+use crate::slam::geometry::se3::SE3;
+
+/// The id of no keyframe: before the mapper has made the first.
+pub const NO_KEYFRAME: u64 = u64::MAX;
+
+/// What a pose is worth.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum TrackingState {
+    /// No map that can be trusted yet; the pose is a working value.
+    Initializing,
+    /// The pose is good to its covariance.
+    Tracking,
+    /// The pose is usable, but worse than it should be.
+    Degraded(DegradedReason),
+    /// The pose is not claimed.
+    Lost(LostReason),
+}
+
+impl TrackingState {
+    /// Whether the pose is claimed: Tracking or Degraded.
+    pub fn is_tracked(self) -> bool {
+        matches!(self, Self::Tracking | Self::Degraded(_))
+    }
+}
+
+/// Why a pose is worse than it should be.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum DegradedReason {
+    /// The deadline came before the finest level was solved.
+    Budget,
+    /// Few of the keyframe's points are in view.
+    LowOverlap,
+    /// The residuals are larger than noise and depth variance explain.
+    HighResidual,
+    /// Frames are missing between this one and the one before.
+    Gap,
+}
+
+/// Why a pose is not claimed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LostReason {
+    /// The iteration left the image or became non-finite.
+    Diverged,
+    /// Too few of the points match.
+    TooFewInliers,
+    /// The keyframe has no usable points.
+    NoPoints,
+    /// The frame has another size than the keyframe, or no contrast at all.
+    UnusableFrame,
+    /// The mapper found the map inconsistent.
+    MapRejected,
+}
+
+/// Affine brightness between two images: `I_current ≈ eᵃ I_keyframe + b`.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Brightness {
+    /// Logarithm of the gain.
+    pub a: f64,
+    /// Offset, grey levels.
+    pub b: f64,
+}
+
+/// Figures that say how well a frame was aligned.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Quality {
+    /// Share of the keyframe's points that fall inside the frame, 0 to 1.
+    pub in_view_ratio: f64,
+    /// Share of the points in view whose residual is explained by noise and depth variance, 0 to 1.
+    pub inlier_ratio: f64,
+    /// Root mean square of residual over its standard deviation, Huber-weighted; 1 when all is as modelled.
+    pub whitened_rmse: f64,
+    /// Root mean square residual of the points in view, grey levels.
+    pub residual_rmse: f64,
+    /// Iterations, all levels.
+    pub iterations: u32,
+    /// Finest pyramid level that was solved.
+    pub finest_level: u32,
+    /// Points in view at that level.
+    pub points: u32,
+    /// Mean squared optical flow from the keyframe to here, pixels² at level 0.
+    pub mean_squared_flow: f64,
+}
+
+/// The tracker's word on one frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PoseEstimate {
+    /// Sequence of the frame.
+    pub sequence: u64,
+    /// Stamp of the frame, nanoseconds.
+    pub capture_nanos: i64,
+    /// Life of the map the pose belongs to.
+    pub epoch: u32,
+    /// Revision of the keyframe it was tracked on.
+    pub revision: u64,
+    /// Keyframe it was tracked on, [`NO_KEYFRAME`] before the first.
+    pub keyframe_id: u64,
+    /// What it is worth.
+    pub state: TrackingState,
+    /// Odometry pose; never jumps within an epoch.
+    pub world_from_camera: SE3,
+    /// Pose relative to the keyframe, translation in keyframe units.
+    pub keyframe_from_camera: SE3,
+    /// Upper triangle, row-major, of the covariance of the left increment (translation, rotation)
+    /// of `current_from_keyframe`, keyframe units and radians.
+    pub covariance: [f64; 21],
+    /// Brightness against the keyframe.
+    pub brightness: Brightness,
+    /// Figures of the alignment.
+    pub quality: Quality,
+    /// Whether the tracker asks for a new keyframe at this frame.
+    pub proposes_keyframe: bool,
+}

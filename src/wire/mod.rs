@@ -1,0 +1,1 @@
+//! Shared memory: the only place that names iceoryx2.
