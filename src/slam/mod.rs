@@ -8,6 +8,7 @@ pub mod depth;
 pub mod frame;
 pub mod geometry;
 pub mod image;
+pub mod initializer;
 pub mod keyframe;
 pub mod mapper;
 pub mod parameter;

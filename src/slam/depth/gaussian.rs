@@ -1,0 +1,294 @@
+//! The semi-dense Gaussian filter: every pixel with gradient keeps an inverse depth and a variance,
+//! narrowed by each observation (Engel, Sturm, Cremers 2013 §2.4).
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use crate::slam::depth::epipolar::TwoView;
+use crate::slam::depth::map::{BORDER_PX, DepthMap, GradientImage, Hypothesis};
+use crate::slam::depth::matching::{
+    Match, MatchingParams, Miss, Patch, condition, is_inside, search,
+};
+use crate::slam::image::buffer::Image;
+use crate::slam::parameter::{ParameterError, check_range};
+use crate::slam::pose::Brightness;
+
+/// Tuning of the filter.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct GaussianParams {
+    /// Half width of the search around a hypothesis, in its standard deviations. 2 holds 95 %.
+    pub search_sigmas: f32,
+    /// An observation further off than this many joint standard deviations contradicts. A gate of 1,
+    /// the literature's, rejects a third of the right ones.
+    pub gate_sigmas: f32,
+    /// A pixel is observed only when one match promises a variance below this many times its own:
+    /// waiting for baseline costs nothing and gains more than averaging equal views.
+    pub max_variance_ratio: f32,
+    /// Share of the match variance that is common to all observations of a pixel, because the
+    /// keyframe's own noise is in each: the variance never falls below this share of the best
+    /// single observation.
+    pub common_noise_ratio: f32,
+    /// Factor on the variance before each fusion: the world and the poses are never quite still.
+    pub process_inflation: f32,
+    /// Factor on the variance after a contradiction.
+    pub contradiction_inflation: f32,
+    /// Standard deviation beyond which a hypothesis is dropped, in units of the mean inverse depth.
+    pub max_std_dev: f32,
+    /// Largest inverse depth that is searched for a new pixel, in units of the mean inverse depth:
+    /// nothing nearer than a quarter of the usual distance is expected.
+    pub max_inverse_depth: f32,
+    /// Shortest segment worth a search for a new pixel, pixels.
+    pub min_new_segment_px: f32,
+}
+
+impl Default for GaussianParams {
+    fn default() -> Self {
+        Self {
+            search_sigmas: 2.0,
+            gate_sigmas: 2.5,
+            max_variance_ratio: 3.0,
+            common_noise_ratio: 0.5,
+            process_inflation: 1.01,
+            contradiction_inflation: 1.2,
+            max_std_dev: 0.5,
+            max_inverse_depth: 4.0,
+            min_new_segment_px: 3.0,
+        }
+    }
+}
+
+impl GaussianParams {
+    /// Checks every value.
+    pub fn validate(&self) -> Result<(), ParameterError> {
+        check_range("search_sigmas", self.search_sigmas, 0.5..=10.0)?;
+        check_range("gate_sigmas", self.gate_sigmas, 0.5..=10.0)?;
+        check_range("max_variance_ratio", self.max_variance_ratio, 0.1..=100.0)?;
+        check_range("common_noise_ratio", self.common_noise_ratio, 0.0..=1.0)?;
+        check_range("process_inflation", self.process_inflation, 1.0..=2.0)?;
+        check_range("contradiction_inflation", self.contradiction_inflation, 1.0..=10.0)?;
+        check_range("max_std_dev", self.max_std_dev, 0.01..=10.0)?;
+        check_range("max_inverse_depth", self.max_inverse_depth, 1.0..=100.0)?;
+        check_range("min_new_segment_px", self.min_new_segment_px, 1.0..=30.0)
+    }
+}
+
+/// Validity of a new hypothesis: so many failures in a row drop it.
+pub const NEW_VALIDITY: u8 = 4;
+/// Validity is counted up to here: a long-proven hypothesis survives a short occlusion.
+pub const MAX_VALIDITY: u8 = 20;
+
+/// What one frame did to the map.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct ObservationCounts {
+    /// Searches for pixels that had a hypothesis.
+    pub attempted: usize,
+    /// Of them, fused.
+    pub fused: usize,
+    /// Of them, contradicting or without a match.
+    pub failed: usize,
+    /// New hypotheses.
+    pub created: usize,
+}
+
+impl ObservationCounts {
+    /// The counts of two parts of the map together.
+    pub fn plus(self, other: Self) -> Self {
+        Self {
+            attempted: self.attempted + other.attempted,
+            fused: self.fused + other.fused,
+            failed: self.failed + other.failed,
+            created: self.created + other.created,
+        }
+    }
+}
+
+/// A frame to observe with.
+#[derive(Debug, Clone, Copy)]
+pub struct Observer<'a> {
+    /// Its brightness, level 0.
+    pub image: &'a Image<f32>,
+    /// Its geometry against the keyframe.
+    pub view: TwoView,
+    /// Its brightness against the keyframe.
+    pub brightness: Brightness,
+    /// Whether hypotheses that came from the keyframe before are left alone: they already hold
+    /// what frames from before this keyframe have to say.
+    pub only_new: bool,
+}
+
+/// Observes every pixel of `map` in a frame. Rows are independent: the result does not depend on
+/// the number of threads.
+pub fn observe(
+    map: &mut DepthMap,
+    observer: &Observer<'_>,
+    matching: &MatchingParams,
+    params: &GaussianParams,
+) -> ObservationCounts {
+    let (width, height) = (map.image.width(), map.image.height());
+    let (image, candidates) = (&map.image, &map.candidates);
+    let pixel = PixelObserver {
+        image,
+        observer,
+        gain: observer.brightness.a.exp() as f32,
+        offset: observer.brightness.b as f32,
+        matching,
+        params,
+    };
+    map.hypotheses
+        .pixels_mut()
+        .par_chunks_exact_mut(width)
+        .enumerate()
+        .filter(|(v, _)| (BORDER_PX..height - BORDER_PX).contains(v))
+        .map(|(v, row)| {
+            let mut counts = ObservationCounts::default();
+            for u in BORDER_PX..width - BORDER_PX {
+                if row[u].is_some() {
+                    if !(observer.only_new && row[u].propagated) {
+                        pixel.update(&mut row[u], u, v, &mut counts);
+                    }
+                } else if candidates.at(u, v) {
+                    pixel.create(&mut row[u], u, v, &mut counts);
+                }
+            }
+            counts
+        })
+        .reduce(ObservationCounts::default, ObservationCounts::plus)
+}
+
+struct PixelObserver<'a> {
+    image: &'a GradientImage,
+    observer: &'a Observer<'a>,
+    gain: f32,
+    offset: f32,
+    matching: &'a MatchingParams,
+    params: &'a GaussianParams,
+}
+
+impl PixelObserver<'_> {
+    /// Observes a pixel that has a hypothesis.
+    fn update(
+        &self,
+        hypothesis: &mut Hypothesis,
+        u: usize,
+        v: usize,
+        counts: &mut ObservationCounts,
+    ) {
+        let centre = hypothesis.smoothed;
+        let Observer { image: frame, view, .. } = self.observer;
+        let line = view.line(u as f32, v as f32);
+        let Some(at) = line.project(centre).filter(|p| is_inside(frame, p.u, p.v)) else { return };
+        let (vu, vv) = line.velocity(&at);
+        // Cheap refusal before the patch is read: even a match without photometric error is too coarse.
+        let least = (self.matching.line_noise_px.powi(2) + self.matching.sampling_noise_px.powi(2))
+            / (vu * vu + vv * vv);
+        if !(least < self.params.max_variance_ratio * hypothesis.variance) {
+            return;
+        }
+        let patch = Patch::new(self.image, u, v, self.gain, self.offset);
+        let Some(conditioning) = condition(view, &line, &at, &patch, self.matching) else { return };
+        let expected = conditioning.inverse_depth_per_px.powi(2) * conditioning.match_variance;
+        if expected > self.params.max_variance_ratio * hypothesis.variance {
+            return;
+        }
+        let reach = self.params.search_sigmas * hypothesis.variance.sqrt();
+        let (Some(from), Some(to)) =
+            (line.project((centre - reach).max(0.0)), line.project(centre + reach))
+        else {
+            return;
+        };
+        match search(frame, &line, &patch, &conditioning, &from, &to, self.matching) {
+            Ok(found) => {
+                counts.attempted += 1;
+                if self.fuse(hypothesis, &found) {
+                    counts.fused += 1;
+                } else {
+                    counts.failed += 1;
+                }
+            }
+            Err(Miss::Mismatch) => {
+                counts.attempted += 1;
+                counts.failed += 1;
+                hypothesis.validity = hypothesis.validity.saturating_sub(1);
+                if hypothesis.validity == 0 {
+                    hypothesis.reject();
+                }
+            }
+            Err(Miss::Ambiguous | Miss::OutOfView | Miss::TooLong) => {}
+        }
+    }
+
+    /// Product of Gaussians; false when the observation contradicts.
+    fn fuse(&self, hypothesis: &mut Hypothesis, found: &Match) -> bool {
+        let prior = hypothesis.variance * self.params.process_inflation;
+        let difference = found.inverse_depth - hypothesis.inverse_depth;
+        let gate = self.params.gate_sigmas;
+        if difference * difference > gate * gate * (prior + found.variance) {
+            hypothesis.variance = prior * self.params.contradiction_inflation;
+            hypothesis.validity = hypothesis.validity.saturating_sub(1);
+            let too_uncertain = hypothesis.variance > self.params.max_std_dev.powi(2);
+            if hypothesis.validity == 0 || too_uncertain {
+                hypothesis.reject();
+            }
+            return false;
+        }
+        let weight = prior / (prior + found.variance);
+        let fused = prior * found.variance / (prior + found.variance);
+        hypothesis.inverse_depth += weight * difference;
+        hypothesis.smoothed += weight * (found.inverse_depth - hypothesis.smoothed);
+        hypothesis.variance = fused.max(self.params.common_noise_ratio * found.variance).min(prior);
+        hypothesis.validity = (hypothesis.validity + 1).min(MAX_VALIDITY);
+        if !(hypothesis.inverse_depth > 0.0) {
+            hypothesis.reject();
+            return false;
+        }
+        true
+    }
+
+    /// Tries to give a pixel its first hypothesis, searching all depths.
+    fn create(
+        &self,
+        hypothesis: &mut Hypothesis,
+        u: usize,
+        v: usize,
+        counts: &mut ObservationCounts,
+    ) {
+        /// Failures after which a pixel is left alone on this keyframe.
+        const MAX_FAILURES: u8 = 6;
+        if hypothesis.failures >= MAX_FAILURES {
+            return;
+        }
+        let Observer { image: frame, view, .. } = self.observer;
+        let line = view.line(u as f32, v as f32);
+        let (Some(from), Some(at)) = (line.project(0.0), line.project(1.0)) else { return };
+        let Some(to) = line.project(self.params.max_inverse_depth) else { return };
+        let length = (to.u - from.u).hypot(to.v - from.v);
+        if !(self.params.min_new_segment_px..=self.matching.max_search_px).contains(&length)
+            || !is_inside(frame, at.u, at.v)
+        {
+            return;
+        }
+        let patch = Patch::new(self.image, u, v, self.gain, self.offset);
+        let Some(conditioning) = condition(view, &line, &at, &patch, self.matching) else { return };
+        match search(frame, &line, &patch, &conditioning, &from, &to, self.matching) {
+            Ok(found)
+                if found.inverse_depth > 0.0
+                    && found.variance < self.params.max_std_dev.powi(2) =>
+            {
+                counts.created += 1;
+                *hypothesis = Hypothesis {
+                    inverse_depth: found.inverse_depth,
+                    variance: found.variance,
+                    smoothed: found.inverse_depth,
+                    validity: NEW_VALIDITY,
+                    propagated: false,
+                    failures: hypothesis.failures,
+                };
+            }
+            Ok(_) | Err(Miss::OutOfView | Miss::TooLong) => {}
+            Err(Miss::Mismatch | Miss::Ambiguous) => {
+                hypothesis.failures = hypothesis.failures.saturating_add(1);
+            }
+        }
+    }
+}

@@ -1,0 +1,216 @@
+//! The semi-dense inverse-depth map of one keyframe: the image with its gradients, and a hypothesis
+//! at every pixel that has one.
+
+use crate::slam::image::buffer::Image;
+
+/// Pixels nearer to the border than this carry no depth: the matching pattern reaches 2 pixels, its
+/// gradients 1, and a bilinear sample 1 more.
+pub const BORDER_PX: usize = 4;
+
+/// A keyframe's image with its gradients, level 0.
+#[derive(Debug, Clone)]
+pub struct GradientImage {
+    /// Brightness, 0 to 255.
+    pub intensity: Image<f32>,
+    /// ∂I/∂u by central difference, grey levels a pixel; 0 on the border.
+    pub gradient_u: Image<f32>,
+    /// ∂I/∂v by central difference, grey levels a pixel; 0 on the border.
+    pub gradient_v: Image<f32>,
+}
+
+impl GradientImage {
+    /// A black image.
+    pub fn with_size(width: usize, height: usize) -> Self {
+        let black = Image::filled(width, height, 0.0);
+        Self { intensity: black.clone(), gradient_u: black.clone(), gradient_v: black }
+    }
+
+    /// Takes the grey values of a frame of the same size and differentiates them.
+    pub fn fill(&mut self, pixels: &[u8]) {
+        let (width, height) = (self.intensity.width(), self.intensity.height());
+        for (out, &grey) in self.intensity.pixels_mut().iter_mut().zip(pixels) {
+            *out = f32::from(grey);
+        }
+        let image = self.intensity.pixels();
+        for v in 1..height - 1 {
+            let inner = v * width + 1..v * width + width - 1;
+            for (out, i) in
+                self.gradient_u.pixels_mut()[inner.clone()].iter_mut().zip(inner.clone())
+            {
+                *out = 0.5 * (image[i + 1] - image[i - 1]);
+            }
+            for (out, i) in self.gradient_v.pixels_mut()[inner.clone()].iter_mut().zip(inner) {
+                *out = 0.5 * (image[i + width] - image[i - width]);
+            }
+        }
+    }
+
+    /// Width in pixels.
+    pub fn width(&self) -> usize {
+        self.intensity.width()
+    }
+
+    /// Height in pixels.
+    pub fn height(&self) -> usize {
+        self.intensity.height()
+    }
+}
+
+/// A Gaussian hypothesis on the inverse depth of a pixel.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Hypothesis {
+    /// Inverse depth as filtered from observations, 1/keyframe units.
+    pub inverse_depth: f32,
+    /// Its variance; negative where the pixel has no hypothesis.
+    pub variance: f32,
+    /// Inverse depth smoothed over consistent neighbours: what is published and searched around.
+    pub smoothed: f32,
+    /// How often it was confirmed less how often it failed; at 0 it is dropped.
+    pub validity: u8,
+    /// Whether it came from the keyframe before and carries that keyframe's observations.
+    pub propagated: bool,
+    /// Failures of a pixel without hypothesis: it is tried less often the more it failed.
+    pub failures: u8,
+}
+
+impl Hypothesis {
+    /// No hypothesis.
+    pub const NONE: Self = Self {
+        inverse_depth: 0.0,
+        variance: -1.0,
+        smoothed: 0.0,
+        validity: 0,
+        propagated: false,
+        failures: 0,
+    };
+
+    /// Whether there is a hypothesis.
+    #[inline]
+    pub fn is_some(&self) -> bool {
+        self.variance >= 0.0
+    }
+
+    /// Removes the hypothesis and remembers that this pixel failed.
+    #[inline]
+    pub fn reject(&mut self) {
+        *self = Self { failures: self.failures.saturating_add(1), ..Self::NONE };
+    }
+}
+
+/// The map of one keyframe.
+#[derive(Debug, Clone)]
+pub struct DepthMap {
+    /// The keyframe's image.
+    pub image: GradientImage,
+    /// A hypothesis a pixel.
+    pub hypotheses: Image<Hypothesis>,
+    /// Whether a pixel has enough gradient to carry depth.
+    pub candidates: Image<bool>,
+}
+
+impl DepthMap {
+    /// An empty map for images of this size.
+    pub fn with_size(width: usize, height: usize) -> Self {
+        Self {
+            image: GradientImage::with_size(width, height),
+            hypotheses: Image::filled(width, height, Hypothesis::NONE),
+            candidates: Image::filled(width, height, false),
+        }
+    }
+
+    /// Starts over on a new image: no hypotheses, candidates where ‖g‖ ≥ `min_gradient`, raised
+    /// evenly until at most `max_candidates` remain.
+    pub fn restart(&mut self, pixels: &[u8], min_gradient: f32, max_candidates: usize) {
+        self.image.fill(pixels);
+        self.hypotheses.pixels_mut().fill(Hypothesis::NONE);
+        self.choose_candidates(min_gradient, max_candidates);
+    }
+
+    fn choose_candidates(&mut self, min_gradient: f32, max_candidates: usize) {
+        /// Largest ‖g‖ of an 8-bit image: ½·255 in both directions.
+        const MAX_GRADIENT: f32 = 181.0;
+        const BINS: usize = 1024;
+        let bin = |strength: f32| ((strength / MAX_GRADIENT * BINS as f32) as usize).min(BINS - 1);
+        let (width, height) = (self.image.width(), self.image.height());
+        let gradient_u = self.image.gradient_u.pixels();
+        let gradient_v = self.image.gradient_v.pixels();
+        let strength =
+            |i: usize| (gradient_u[i] * gradient_u[i] + gradient_v[i] * gradient_v[i]).sqrt();
+        let inner = |v: usize| v * width + BORDER_PX..(v + 1) * width - BORDER_PX;
+        let rows = BORDER_PX..height - BORDER_PX;
+        let mut histogram = [0usize; BINS];
+        for i in rows.clone().flat_map(inner) {
+            let strength = strength(i);
+            if strength >= min_gradient {
+                histogram[bin(strength)] += 1;
+            }
+        }
+        let mut kept = 0;
+        let mut lowest = BINS;
+        while lowest > 0 && kept + histogram[lowest - 1] <= max_candidates {
+            lowest -= 1;
+            kept += histogram[lowest];
+        }
+        let candidates = self.candidates.pixels_mut();
+        candidates.fill(false);
+        for i in rows.flat_map(inner) {
+            let strength = strength(i);
+            candidates[i] = strength >= min_gradient && bin(strength) >= lowest;
+        }
+    }
+
+    /// Number of hypotheses.
+    pub fn num_hypotheses(&self) -> usize {
+        self.hypotheses.pixels().iter().filter(|h| h.is_some()).count()
+    }
+
+    /// Mean smoothed inverse depth of the hypotheses; `None` without any.
+    pub fn mean_inverse_depth(&self) -> Option<f64> {
+        let (mut sum, mut count) = (0.0, 0usize);
+        for h in self.hypotheses.pixels().iter().filter(|h| h.is_some()) {
+            sum += f64::from(h.smoothed);
+            count += 1;
+        }
+        (count > 0).then(|| sum / count as f64)
+    }
+
+    /// Multiplies every inverse depth by `factor` and every variance by its square.
+    pub fn rescale(&mut self, factor: f32) {
+        for h in self.hypotheses.pixels_mut().iter_mut().filter(|h| h.is_some()) {
+            h.inverse_depth *= factor;
+            h.smoothed *= factor;
+            h.variance *= factor * factor;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn gradients_are_central_differences() {
+        let (width, height) = (20, 16);
+        let pixels: Vec<u8> =
+            (0..width * height).map(|i| ((i % width) * 5 + (i / width) * 3) as u8).collect();
+        let mut image = GradientImage::with_size(width, height);
+        image.fill(&pixels);
+        assert_eq!(image.gradient_u.at(7, 8), 5.0);
+        assert_eq!(image.gradient_v.at(7, 8), 3.0);
+        assert_eq!(image.gradient_u.at(0, 8), 0.0);
+    }
+
+    #[test]
+    fn candidates_are_bounded_and_have_gradient() {
+        let (width, height) = (64, 64);
+        let pixels: Vec<u8> =
+            (0..width * height).map(|i| ((i * i * 31 + i * 7) % 251) as u8).collect();
+        let mut map = DepthMap::with_size(width, height);
+        map.restart(&pixels, 5.0, 100_000);
+        let all = map.candidates.pixels().iter().filter(|&&c| c).count();
+        map.restart(&pixels, 5.0, 500);
+        let some = map.candidates.pixels().iter().filter(|&&c| c).count();
+        assert!(all > 1000 && some <= 500 && some > 100, "{all} {some}");
+        assert!(!map.candidates.at(1, 30) && !map.candidates.at(30, 2));
+    }
+}

@@ -1,0 +1,498 @@
+//! The search for a keyframe pixel along its epipolar segment in another frame.
+//!
+//! A patch of [`PATTERN`] samples around the pixel, turned and scaled as the geometry says, is
+//! compared at 1-px steps along the segment, then refined by Gauss–Newton in one dimension. The
+//! uncertainty of the match follows Engel, Sturm, Cremers 2013 §2.2–2.3, summed over the patch.
+
+use serde::{Deserialize, Serialize};
+
+use crate::slam::depth::epipolar::{EpipolarLine, Projection, TwoView};
+use crate::slam::depth::map::{BORDER_PX, GradientImage};
+use crate::slam::image::buffer::Image;
+use crate::slam::parameter::{ParameterError, check_range};
+
+/// The 8-sample residual pattern of Engel, Koltun, Cremers 2018 (fig. 4): even offsets only, so that no
+/// sample takes part in the central difference of another and noise does not bias the refinement.
+pub const PATTERN: [(i32, i32); 8] =
+    [(0, -2), (-1, -1), (1, -1), (-2, 0), (0, 0), (2, 0), (-1, 1), (0, 2)];
+
+/// Most steps of one search: bounds the time a pixel can take.
+pub const MAX_STEPS: usize = 100;
+
+/// Tuning of the search.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct MatchingParams {
+    /// Standard deviation of the image noise, grey levels. Cameras in rooms have 2 to 4.
+    pub image_noise: f32,
+    /// Standard deviation by which pose and calibration errors misplace the epipolar line, pixels.
+    pub line_noise_px: f32,
+    /// Standard deviation that interpolation and sampling leave in a match, pixels.
+    pub sampling_noise_px: f32,
+    /// Longest segment that is searched, pixels: beyond it repeated structure wins.
+    pub max_search_px: f32,
+    /// Smallest root mean square gradient along the line over the patch, grey levels a pixel:
+    /// below it noise moves the match.
+    pub min_line_gradient: f32,
+    /// Largest root mean square residual of a match, grey levels, where the patch has no gradient.
+    pub max_residual: f32,
+    /// By how much that grows with each grey level a pixel of patch gradient: sub-pixel and
+    /// perspective errors show in proportion to it.
+    pub residual_per_gradient: f32,
+    /// The second minimum must be this many times worse than the best one.
+    pub min_ambiguity_ratio: f32,
+}
+
+impl Default for MatchingParams {
+    fn default() -> Self {
+        Self {
+            image_noise: 3.0,
+            line_noise_px: 0.1,
+            sampling_noise_px: 0.05,
+            max_search_px: 40.0,
+            min_line_gradient: 2.0,
+            max_residual: 10.0,
+            residual_per_gradient: 0.4,
+            min_ambiguity_ratio: 1.5,
+        }
+    }
+}
+
+impl MatchingParams {
+    /// Checks every value.
+    pub fn validate(&self) -> Result<(), ParameterError> {
+        check_range("image_noise", self.image_noise, 0.1..=50.0)?;
+        check_range("line_noise_px", self.line_noise_px, 0.0..=5.0)?;
+        check_range("sampling_noise_px", self.sampling_noise_px, 0.0..=2.0)?;
+        check_range("max_search_px", self.max_search_px, 5.0..=90.0)?;
+        check_range("min_line_gradient", self.min_line_gradient, 0.1..=50.0)?;
+        check_range("max_residual", self.max_residual, 1.0..=255.0)?;
+        check_range("residual_per_gradient", self.residual_per_gradient, 0.0..=10.0)?;
+        check_range("min_ambiguity_ratio", self.min_ambiguity_ratio, 1.0..=100.0)
+    }
+}
+
+/// The patch of a keyframe pixel: brightness as the other frame would show it, and gradients.
+#[derive(Debug, Clone, Copy)]
+pub struct Patch {
+    intensity: [f32; 8],
+    gradient_u: [f32; 8],
+    gradient_v: [f32; 8],
+}
+
+impl Patch {
+    /// The patch around `(u, v)`, at least [`BORDER_PX`] from the border, with the brightness
+    /// `gain * I + offset`.
+    #[inline]
+    pub fn new(image: &GradientImage, u: usize, v: usize, gain: f32, offset: f32) -> Self {
+        let width = image.width() as i32;
+        let centre = v as i32 * width + u as i32;
+        let at = |k: usize| (centre + PATTERN[k].1 * width + PATTERN[k].0) as usize;
+        let mut patch = Self { intensity: [0.0; 8], gradient_u: [0.0; 8], gradient_v: [0.0; 8] };
+        for k in 0..PATTERN.len() {
+            let i = at(k);
+            patch.intensity[k] = gain * image.intensity.pixels()[i] + offset;
+            patch.gradient_u[k] = gain * image.gradient_u.pixels()[i];
+            patch.gradient_v[k] = gain * image.gradient_v.pixels()[i];
+        }
+        patch
+    }
+}
+
+/// How well a match can be placed along the line, known before any search.
+#[derive(Debug, Clone, Copy)]
+pub struct Conditioning {
+    /// Unit direction of the line in the frame, towards larger inverse depth.
+    direction: (f32, f32),
+    /// Patch offsets in the frame.
+    offsets: [(f32, f32); 8],
+    /// Gradient along the line by sample, grey levels a pixel of the frame.
+    line_gradients: [f32; 8],
+    /// Mean squared gradient of the patch.
+    squared_gradient: f32,
+    /// Variance of the match along the line, pixels².
+    pub match_variance: f32,
+    /// ∂d/∂λ: inverse depth a pixel along the line.
+    pub inverse_depth_per_px: f32,
+}
+
+/// A match.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Match {
+    /// Observed inverse depth.
+    pub inverse_depth: f32,
+    /// Its variance.
+    pub variance: f32,
+    /// Mean squared residual of the patch, grey levels².
+    pub mean_squared_residual: f32,
+}
+
+/// Why there is no match.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Miss {
+    /// The segment or the patch leaves the image, or the point is behind the camera.
+    OutOfView,
+    /// The segment is longer than the search allows.
+    TooLong,
+    /// The best residual is larger than noise explains: occluded, moved or not the point.
+    Mismatch,
+    /// Another place on the segment matches about as well.
+    Ambiguous,
+}
+
+/// Judges the line of a pixel at inverse depth `d`; `None` where a match would tell nothing: no
+/// parallax, behind the camera, or no gradient along the line.
+#[inline]
+pub fn condition(
+    view: &TwoView,
+    line: &EpipolarLine,
+    at: &Projection,
+    patch: &Patch,
+    params: &MatchingParams,
+) -> Option<Conditioning> {
+    let (vu, vv) = line.velocity(at);
+    let speed = (vu * vu + vv * vv).sqrt();
+    if !(speed > f32::MIN_POSITIVE) {
+        return None;
+    }
+    let direction = (vu / speed, vv / speed);
+    let warp = view.patch_warp(at);
+    let determinant = warp[0] * warp[3] - warp[1] * warp[2];
+    // A patch that shrinks or grows this much compares different texture.
+    const DETERMINANT: std::ops::Range<f32> = 0.3..3.0;
+    if !DETERMINANT.contains(&determinant) {
+        return None;
+    }
+    let inverse = [warp[3], -warp[1], -warp[2], warp[0]].map(|x| x / determinant);
+    let along = (
+        inverse[0] * direction.0 + inverse[1] * direction.1,
+        inverse[2] * direction.0 + inverse[3] * direction.1,
+    );
+    let across = (
+        -inverse[0] * direction.1 + inverse[1] * direction.0,
+        -inverse[2] * direction.1 + inverse[3] * direction.0,
+    );
+    let mut line_gradients = [0.0; 8];
+    let (mut information, mut mixed, mut perpendicular) = (0.0, 0.0, 0.0);
+    for k in 0..PATTERN.len() {
+        let g = patch.gradient_u[k] * along.0 + patch.gradient_v[k] * along.1;
+        let h = patch.gradient_u[k] * across.0 + patch.gradient_v[k] * across.1;
+        line_gradients[k] = g;
+        information += g * g;
+        mixed += g * h;
+        perpendicular += h * h;
+    }
+    let samples = PATTERN.len() as f32;
+    if information < samples * params.min_line_gradient * params.min_line_gradient {
+        return None;
+    }
+    let tangent = mixed / information;
+    let geometric = params.line_noise_px * params.line_noise_px * (1.0 + tangent * tangent);
+    let photometric = 2.0 * params.image_noise * params.image_noise / information;
+    let sampling = params.sampling_noise_px * params.sampling_noise_px;
+    let offsets = PATTERN.map(|(x, y)| {
+        let (x, y) = (x as f32, y as f32);
+        (warp[0] * x + warp[1] * y, warp[2] * x + warp[3] * y)
+    });
+    Some(Conditioning {
+        direction,
+        offsets,
+        line_gradients,
+        squared_gradient: (information + perpendicular) / samples,
+        match_variance: geometric + photometric + sampling,
+        inverse_depth_per_px: 1.0 / speed,
+    })
+}
+
+/// Searches between the projections `from` and `to`, extended to at least `MIN_HALF_PX` either side.
+#[inline]
+pub fn search(
+    frame: &Image<f32>,
+    line: &EpipolarLine,
+    patch: &Patch,
+    conditioning: &Conditioning,
+    from: &Projection,
+    to: &Projection,
+    params: &MatchingParams,
+) -> Result<Match, Miss> {
+    // A prediction is never better than the steps of the search: look one step to both sides.
+    const MIN_HALF_PX: f32 = 1.5;
+    let (du, dv) = conditioning.direction;
+    let length = (to.u - from.u) * du + (to.v - from.v) * dv;
+    if !(length <= params.max_search_px) || length < 0.0 {
+        return Err(Miss::TooLong);
+    }
+    let middle = (0.5 * (from.u + to.u), 0.5 * (from.v + to.v));
+    let half = (0.5 * length).max(MIN_HALF_PX);
+    let steps = ((2.0 * half).ceil() as usize).min(MAX_STEPS - 1);
+    let start = -0.5 * steps as f32;
+    let reach = half + 1.0;
+    if !is_inside(frame, middle.0 - reach * du, middle.1 - reach * dv)
+        || !is_inside(frame, middle.0 + reach * du, middle.1 + reach * dv)
+    {
+        return Err(Miss::OutOfView);
+    }
+    let position = |lambda: f32| (middle.0 + lambda * du, middle.1 + lambda * dv);
+    let mut costs = [f32::INFINITY; MAX_STEPS];
+    let mut best = 0;
+    for step in 0..=steps {
+        let (u, v) = position(start + step as f32);
+        costs[step] = cost(frame, patch, conditioning, u, v);
+        if costs[step] < costs[best] {
+            best = step;
+        }
+    }
+    let limit = params.max_residual * params.max_residual
+        + params.residual_per_gradient
+            * params.residual_per_gradient
+            * conditioning.squared_gradient;
+    let refined = refine(frame, patch, conditioning, middle, start + best as f32, costs[best]);
+    let mean_squared_residual = refined.cost / PATTERN.len() as f32;
+    if !(mean_squared_residual <= limit) {
+        return Err(Miss::Mismatch);
+    }
+    // Steps next to the minimum belong to it.
+    const SAME_MINIMUM_STEPS: usize = 2;
+    let noise_floor = 2.0 * params.image_noise * params.image_noise * PATTERN.len() as f32;
+    let second = costs[..=steps]
+        .iter()
+        .enumerate()
+        .filter(|(step, _)| step.abs_diff(best) > SAME_MINIMUM_STEPS)
+        .fold(f32::INFINITY, |least, (_, &c)| least.min(c));
+    if second < params.min_ambiguity_ratio * refined.cost.max(noise_floor) {
+        return Err(Miss::Ambiguous);
+    }
+    let (u, v) = position(refined.lambda);
+    let inverse_depth = line.inverse_depth_at(u, v).ok_or(Miss::OutOfView)?;
+    let alpha = conditioning.inverse_depth_per_px;
+    Ok(Match {
+        inverse_depth,
+        variance: alpha * alpha * conditioning.match_variance,
+        mean_squared_residual,
+    })
+}
+
+struct Refined {
+    lambda: f32,
+    cost: f32,
+}
+
+/// Gauss–Newton along the line from the best step, each step clamped, undone when the cost rises.
+#[inline]
+fn refine(
+    frame: &Image<f32>,
+    patch: &Patch,
+    conditioning: &Conditioning,
+    middle: (f32, f32),
+    start: f32,
+    start_cost: f32,
+) -> Refined {
+    const MAX_ITERATIONS: usize = 4;
+    const MAX_STEP_PX: f32 = 0.75;
+    /// Further steps change the depth less than the sampling noise does.
+    const CONVERGED_PX: f32 = 0.02;
+    let (du, dv) = conditioning.direction;
+    let mut best = Refined { lambda: start, cost: start_cost };
+    let mut lambda = start;
+    for _ in 0..MAX_ITERATIONS {
+        let (mut gradient, mut information) = (0.0, 1e-6);
+        for k in 0..PATTERN.len() {
+            let (ou, ov) = conditioning.offsets[k];
+            let (u, v) = (middle.0 + lambda * du + ou, middle.1 + lambda * dv + ov);
+            let residual = bilinear(frame, u, v) - patch.intensity[k];
+            let weight = huber_weight(residual);
+            let g = conditioning.line_gradients[k];
+            gradient += weight * g * residual;
+            information += weight * g * g;
+        }
+        let step = (-gradient / information).clamp(-MAX_STEP_PX, MAX_STEP_PX);
+        let candidate = (lambda + step).clamp(start - 1.0, start + 1.0);
+        let cost =
+            cost(frame, patch, conditioning, middle.0 + candidate * du, middle.1 + candidate * dv);
+        if cost >= best.cost {
+            break;
+        }
+        best = Refined { lambda: candidate, cost };
+        lambda = candidate;
+        if step.abs() < CONVERGED_PX {
+            break;
+        }
+    }
+    best
+}
+
+/// Residuals beyond this many grey levels grow linearly (Engel, Koltun, Cremers 2018).
+const HUBER_GREY: f32 = 9.0;
+
+#[inline]
+fn huber_weight(residual: f32) -> f32 {
+    let magnitude = residual.abs();
+    if magnitude <= HUBER_GREY { 1.0 } else { HUBER_GREY / magnitude }
+}
+
+/// Σ ρ(residual) of the patch at a position, ρ(r) = r² up to [`HUBER_GREY`], linear beyond.
+#[inline]
+fn cost(frame: &Image<f32>, patch: &Patch, conditioning: &Conditioning, u: f32, v: f32) -> f32 {
+    let mut sum = 0.0;
+    for k in 0..PATTERN.len() {
+        let (ou, ov) = conditioning.offsets[k];
+        let residual = bilinear(frame, u + ou, v + ov) - patch.intensity[k];
+        let magnitude = residual.abs();
+        sum += if magnitude <= HUBER_GREY {
+            magnitude * magnitude
+        } else {
+            HUBER_GREY * (2.0 * magnitude - HUBER_GREY)
+        };
+    }
+    sum
+}
+
+/// Whether a patch at this position lies inside the image; false for NaN.
+#[inline]
+pub fn is_inside(frame: &Image<f32>, u: f32, v: f32) -> bool {
+    // The patch reaches 2 px, stretched by at most √3 (see `condition`), and one for the bilinear sample.
+    const MARGIN: f32 = BORDER_PX as f32 + 1.0;
+    u >= MARGIN
+        && v >= MARGIN
+        && u < frame.width() as f32 - 1.0 - MARGIN
+        && v < frame.height() as f32 - 1.0 - MARGIN
+}
+
+/// Bilinear sample; positions outside take the nearest pixel inside.
+#[inline]
+pub fn bilinear(image: &Image<f32>, u: f32, v: f32) -> f32 {
+    let (width, height) = (image.width(), image.height());
+    let u = u.max(0.0).min((width - 2) as f32);
+    let v = v.max(0.0).min((height - 2) as f32);
+    let (column, row) = (u as usize, v as usize);
+    let (fu, fv) = (u - column as f32, v - row as f32);
+    let i = row * width + column;
+    let pixels = image.pixels();
+    let upper = pixels[i] + fu * (pixels[i + 1] - pixels[i]);
+    let lower = pixels[i + width] + fu * (pixels[i + width + 1] - pixels[i + width]);
+    upper + fv * (lower - upper)
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector6;
+
+    use super::*;
+    use crate::slam::geometry::intrinsics::Intrinsics;
+    use crate::slam::geometry::se3::SE3;
+
+    const CAMERA: Intrinsics =
+        Intrinsics { fx: 200.0, fy: 200.0, cx: 99.5, cy: 74.5, width: 200, height: 150 };
+    const PLANE_INVERSE_DEPTH: f64 = 0.8;
+
+    /// A smooth texture on a fronto-parallel plane, seen by a camera at `current_from_keyframe`.
+    fn render(current_from_keyframe: &SE3) -> Vec<u8> {
+        let keyframe_from_current = current_from_keyframe.inverse();
+        let mut pixels = Vec::new();
+        for v in 0..CAMERA.height {
+            for u in 0..CAMERA.width {
+                let ray = nalgebra::Vector3::new(
+                    (u as f64 - CAMERA.cx) / CAMERA.fx,
+                    (v as f64 - CAMERA.cy) / CAMERA.fy,
+                    1.0,
+                );
+                let (o, r) =
+                    (keyframe_from_current.translation, keyframe_from_current.rotation * ray);
+                let s = (1.0 / PLANE_INVERSE_DEPTH - o.z) / r.z;
+                let (x, y) = ((o + r * s).x, (o + r * s).y);
+                let value = 128.0
+                    + 50.0 * (40.0 * x).sin() * (33.0 * y + 1.0).cos()
+                    + 30.0 * (17.0 * x + 23.0 * y).sin();
+                pixels.push(value.round() as u8);
+            }
+        }
+        pixels
+    }
+
+    fn image(pixels: &[u8]) -> GradientImage {
+        let mut image = GradientImage::with_size(CAMERA.width, CAMERA.height);
+        image.fill(pixels);
+        image
+    }
+
+    #[test]
+    fn matches_hold_the_true_inverse_depth_within_their_variance() {
+        let params =
+            MatchingParams { image_noise: 0.5, line_noise_px: 0.02, ..MatchingParams::default() };
+        let motion = SE3::exp(&Vector6::new(0.06, 0.02, 0.03, 0.02, -0.03, 0.05));
+        let (keyframe, frame) = (image(&render(&SE3::identity())), image(&render(&motion)));
+        let view = TwoView::new(&CAMERA, &motion);
+        let (mut found, mut within, mut errors) = (0, 0, Vec::new());
+        for v in (20..130).step_by(7) {
+            for u in (20..180).step_by(7) {
+                let line = view.line(u as f32, v as f32);
+                let patch = Patch::new(&keyframe, u, v, 1.0, 0.0);
+                let (Some(from), Some(to)) = (line.project(0.5), line.project(1.2)) else {
+                    continue;
+                };
+                let at = line.project(0.85).unwrap();
+                let Some(conditioning) = condition(&view, &line, &at, &patch, &params) else {
+                    continue;
+                };
+                let Ok(found_match) =
+                    search(&frame.intensity, &line, &patch, &conditioning, &from, &to, &params)
+                else {
+                    continue;
+                };
+                let error = f64::from(found_match.inverse_depth) - PLANE_INVERSE_DEPTH;
+                found += 1;
+                within += usize::from(error.abs() <= 3.0 * f64::from(found_match.variance).sqrt());
+                errors.push(error.abs());
+            }
+        }
+        errors.sort_by(f64::total_cmp);
+        assert!(found > 200, "{found}");
+        assert!(within * 100 >= found * 95, "{within} of {found}");
+        assert!(errors[errors.len() / 2] < 0.01, "{}", errors[errors.len() / 2]);
+    }
+
+    #[test]
+    fn gain_and_offset_are_taken_out() {
+        let params = MatchingParams::default();
+        let motion = SE3::exp(&Vector6::new(0.05, 0.0, 0.0, 0.0, 0.0, 0.0));
+        let bright: Vec<u8> =
+            render(&motion).iter().map(|&g| (f32::from(g) * 0.8 + 20.0) as u8).collect();
+        let (keyframe, frame) = (image(&render(&SE3::identity())), image(&bright));
+        let view = TwoView::new(&CAMERA, &motion);
+        let line = view.line(100.0, 75.0);
+        let (from, to, at) =
+            (line.project(0.4).unwrap(), line.project(1.2).unwrap(), line.project(0.8).unwrap());
+        let attempt = |gain, offset| {
+            let patch = Patch::new(&keyframe, 100, 75, gain, offset);
+            let conditioning = condition(&view, &line, &at, &patch, &params).unwrap();
+            search(&frame.intensity, &line, &patch, &conditioning, &from, &to, &params)
+        };
+        assert!((attempt(0.8, 20.0).unwrap().inverse_depth - 0.8).abs() < 0.03);
+        assert!(attempt(1.0, 0.0).map_or(true, |m| m.mean_squared_residual > 10.0));
+    }
+
+    #[test]
+    fn a_segment_outside_the_image_or_too_long_is_a_miss() {
+        let params = MatchingParams::default();
+        let motion = SE3::exp(&Vector6::new(0.5, 0.0, 0.0, 0.0, 0.0, 0.0));
+        let (keyframe, frame) = (image(&render(&SE3::identity())), image(&render(&motion)));
+        let view = TwoView::new(&CAMERA, &motion);
+        let attempt = |u: usize, d: (f32, f32)| {
+            let line = view.line(u as f32, 75.0);
+            let patch = Patch::new(&keyframe, u, 75, 1.0, 0.0);
+            let at = line.project(0.8).unwrap();
+            let conditioning = condition(&view, &line, &at, &patch, &params).unwrap();
+            search(
+                &frame.intensity,
+                &line,
+                &patch,
+                &conditioning,
+                &line.project(d.0).unwrap(),
+                &line.project(d.1).unwrap(),
+                &params,
+            )
+        };
+        assert_eq!(attempt(150, (0.75, 0.85)), Err(Miss::OutOfView));
+        assert_eq!(attempt(60, (0.1, 1.5)), Err(Miss::TooLong));
+    }
+}
