@@ -1,6 +1,14 @@
 //! The trait of everything that frames come from.
 
+use std::fmt;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+use crate::capture::image_file::ImageFileError;
+use crate::capture::rig::RigError;
+use crate::capture::tum;
 use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::rectification::RectificationError;
 use crate::slam::image::buffer::Image;
 use crate::slam::trajectory::StampedPose;
 
@@ -17,12 +25,171 @@ pub struct FrameStamp {
     pub gain: f32,
 }
 
-/// Why a source gave no frame.
+/// Why a source cannot be opened or gave no frame; says what, where and what to do.
 #[derive(Debug, thiserror::Error)]
 pub enum SourceError {
-    /// Reading failed; says what, where and what to do.
-    #[error("{0}")]
-    Read(String),
+    /// The name of a source is not understood.
+    #[error("source `{name}`: {problem}; sources are {SOURCE_FORMS}")]
+    Name {
+        /// The name as it was given.
+        name: String,
+        /// What is wrong with it.
+        problem: &'static str,
+    },
+    /// The source exists but not in this binary or not by this way of opening.
+    #[error("source `{name}`: {reason}")]
+    Unavailable {
+        /// The source.
+        name: String,
+        /// Why, and what to do.
+        reason: &'static str,
+    },
+    /// A list, rig or calibration file cannot be read.
+    #[error("{}: cannot be read: {source}; check the path and its permissions", path.display())]
+    Read {
+        /// The file or folder.
+        path: PathBuf,
+        /// What the system says.
+        source: std::io::Error,
+    },
+    /// A line of a list or calibration file is wrong.
+    #[error("{}, line {line}: {problem}", path.display())]
+    Line {
+        /// The file.
+        path: PathBuf,
+        /// Line, from 1.
+        line: usize,
+        /// What is wrong and what to do.
+        problem: String,
+    },
+    /// There is not a single frame.
+    #[error("{}: has no frames; check that it is the recording that was meant", path.display())]
+    Empty {
+        /// The list or folder.
+        path: PathBuf,
+    },
+    /// Nothing says what the camera is.
+    #[error(
+        "{}: has no camera.txt; name the camera with --rig FILE (examples: config/rigs)",
+        folder.display()
+    )]
+    NoRig {
+        /// The recording's folder.
+        folder: PathBuf,
+    },
+    /// The rig is not usable.
+    #[error(transparent)]
+    Rig(#[from] RigError),
+    /// The rig's lens cannot be rectified.
+    #[error("{}: {source}; check the calibration", path.display())]
+    Rectification {
+        /// The rig file.
+        path: PathBuf,
+        /// Why not.
+        source: RectificationError,
+    },
+    /// An image of the sequence is not usable.
+    #[error(transparent)]
+    Image(#[from] ImageFileError),
+    /// The caller's buffer does not fit the frames.
+    #[error("a buffer of {found} bytes for frames of {width}x{height}; give width * height bytes")]
+    Buffer {
+        /// Bytes of the buffer.
+        found: usize,
+        /// Frame width, pixels.
+        width: usize,
+        /// Frame height, pixels.
+        height: usize,
+    },
+}
+
+/// The forms of a source name, for errors and help.
+pub const SOURCE_FORMS: &str = "sim[:SCENE], tum:DIR, euroc:DIR, images:DIR and v4l:DEVICE";
+
+/// The name of a source, as the command line takes it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum SourceName {
+    /// `sim[:SCENE]`: the simulator.
+    Simulator {
+        /// The scene, where one is named.
+        scene: Option<String>,
+    },
+    /// `tum:DIR`: a recording in the layout of TUM RGB-D.
+    Tum(PathBuf),
+    /// `euroc:DIR`: a recording in the layout of EuRoC (ASL).
+    Euroc(PathBuf),
+    /// `images:DIR`: a folder of images.
+    Images(PathBuf),
+    /// `v4l:DEVICE`: a camera.
+    Camera(PathBuf),
+}
+
+impl SourceName {
+    /// Whether frames come at their own pace, whether or not somebody takes them.
+    pub fn is_camera(&self) -> bool {
+        matches!(self, Self::Camera(_))
+    }
+}
+
+impl FromStr for SourceName {
+    type Err = SourceError;
+
+    fn from_str(name: &str) -> Result<Self, SourceError> {
+        let error = |problem| SourceError::Name { name: name.to_owned(), problem };
+        let (kind, rest) = match name.split_once(':') {
+            Some((kind, rest)) => (kind, Some(rest)),
+            None => (name, None),
+        };
+        if kind == "sim" {
+            return match rest {
+                Some("") => Err(error("the scene's name is missing")),
+                scene => Ok(Self::Simulator { scene: scene.map(str::to_owned) }),
+            };
+        }
+        let form = match kind {
+            "tum" => Self::Tum,
+            "euroc" => Self::Euroc,
+            "images" => Self::Images,
+            "v4l" => Self::Camera,
+            _ if Path::new(name).exists() => {
+                return Err(error("say what kind of recording it is, as in tum:DIR"));
+            }
+            _ => return Err(error("this kind is not known")),
+        };
+        match rest {
+            None | Some("") if kind == "v4l" => Err(error("the device is missing, as /dev/video0")),
+            None | Some("") => Err(error("the folder is missing")),
+            Some(place) => Ok(form(PathBuf::from(place))),
+        }
+    }
+}
+
+impl fmt::Display for SourceName {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Simulator { scene: None } => write!(out, "sim"),
+            Self::Simulator { scene: Some(scene) } => write!(out, "sim:{scene}"),
+            Self::Tum(folder) => write!(out, "tum:{}", folder.display()),
+            Self::Euroc(folder) => write!(out, "euroc:{}", folder.display()),
+            Self::Images(folder) => write!(out, "images:{}", folder.display()),
+            Self::Camera(device) => write!(out, "v4l:{}", device.display()),
+        }
+    }
+}
+
+/// Opens a source. `rig` is a rig file, which wins over the calibration that a recording brings.
+pub fn open(name: &SourceName, rig: Option<&Path>) -> Result<Box<dyn FrameSource>, SourceError> {
+    let unavailable = |reason| SourceError::Unavailable { name: name.to_string(), reason };
+    match name {
+        SourceName::Tum(folder) => Ok(Box::new(tum::open(folder, rig)?)),
+        SourceName::Euroc(_) | SourceName::Images(_) => Err(unavailable("not yet")),
+        SourceName::Simulator { .. } => {
+            Err(unavailable("the simulator is opened with its own configuration"))
+        }
+        SourceName::Camera(_) => Err(unavailable(
+            "this binary was built without camera support; build it with --features v4l",
+        )),
+    }
 }
 
 /// Rectified, photometrically corrected grey frames in the order of their stamps.
@@ -44,7 +211,8 @@ pub trait FrameSource: Send {
     }
 
     /// Writes the next frame into `pixels` (`width * height` of [`FrameSource::intrinsics`]);
-    /// `None` after the last.
+    /// `None` after the last. After an error the next call goes on with the frame after it; what
+    /// `pixels` holds then is not a frame.
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError>;
 
     /// Ground-truth camera poses in order of their stamps, empty where there are none.

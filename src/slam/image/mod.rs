@@ -1,4 +1,5 @@
 //! Images, pyramids and gradients.
 
 pub mod buffer;
+pub mod gray;
 pub mod pyramid;

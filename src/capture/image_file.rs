@@ -1,0 +1,211 @@
+//! Image files: PNG and JPEG into grey values or depth, recognised by content, never by name.
+
+use std::fs::File;
+use std::io::{Read, Write};
+use std::path::{Path, PathBuf};
+
+use crate::capture::{jpeg_image, png_image};
+use crate::slam::image::buffer::Image;
+
+/// Largest width and height of an image, pixels; more is a broken header, not a camera.
+pub const MAX_SIDE: usize = 8192;
+
+/// Largest image file: 16-bit RGBA of the largest size, uncompressed.
+const MAX_FILE_BYTES: u64 = (MAX_SIDE * MAX_SIDE * 8) as u64;
+
+/// Steps of a 16-bit depth PNG in a metre, as TUM RGB-D defines them; 0 is "no depth".
+pub const DEPTH_STEPS_PER_METRE: f32 = 5000.0;
+
+/// What is wrong with the bytes of an image.
+#[derive(Debug, thiserror::Error)]
+pub enum DecodeError {
+    /// Neither PNG nor JPEG.
+    #[error("is neither PNG nor JPEG (it begins with {found:02x?}); convert it to one of them")]
+    NotAnImage {
+        /// The first bytes.
+        found: Vec<u8>,
+    },
+    /// Truncated or corrupt.
+    #[error("is a damaged {format} ({reason}); copy the file again or remove it from the sequence")]
+    Damaged {
+        /// The format that its first bytes name.
+        format: &'static str,
+        /// What the decoder met.
+        reason: String,
+    },
+    /// Another size than the camera's.
+    #[error(
+        "is {}x{} pixels where the rig says {}x{}; use the rig this sequence was recorded with",
+        found.0, found.1, expected.0, expected.1
+    )]
+    Size {
+        /// Width and height in the file.
+        found: (usize, usize),
+        /// Width and height of the rig.
+        expected: (usize, usize),
+    },
+    /// Another kind of samples than needed.
+    #[error("holds {found} where {expected} is needed; export it again in that format")]
+    Samples {
+        /// Colour type and bit depth in the file.
+        found: String,
+        /// What is needed.
+        expected: &'static str,
+    },
+}
+
+/// Why an image file cannot be read or written; names the file.
+#[derive(Debug, thiserror::Error)]
+pub enum ImageFileError {
+    /// The file cannot be opened or read.
+    #[error("{}: cannot be read: {source}", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// What the system says.
+        source: std::io::Error,
+    },
+    /// The content is not the image that is needed.
+    #[error("{}: {source}", path.display())]
+    Decode {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        source: DecodeError,
+    },
+    /// The file cannot be written.
+    #[error("{}: cannot be written: {source}", path.display())]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// What the system says.
+        source: std::io::Error,
+    },
+}
+
+/// Reads image files one after another in reused memory.
+#[derive(Debug, Default)]
+pub struct ImageFileReader {
+    bytes: Vec<u8>,
+    samples: Vec<u8>,
+}
+
+impl ImageFileReader {
+    /// Reads the PNG or JPEG at `path`, which must have `width * height` pixels, as grey values
+    /// (ITU-R BT.601 luma of colours).
+    pub fn read_gray_into(
+        &mut self,
+        path: &Path,
+        width: usize,
+        height: usize,
+        gray: &mut [u8],
+    ) -> Result<(), ImageFileError> {
+        self.load(path)?;
+        let Self { bytes, samples } = self;
+        decode_gray_into(bytes, width, height, samples, gray)
+            .map_err(|source| ImageFileError::Decode { path: path.to_owned(), source })
+    }
+
+    /// Reads the 16-bit grey PNG at `path` as depth in metres, 0 where there is none.
+    pub fn read_depth(
+        &mut self,
+        path: &Path,
+        width: usize,
+        height: usize,
+    ) -> Result<Image<f32>, ImageFileError> {
+        self.load(path)?;
+        let decode = |bytes: &[u8]| -> Result<Image<f32>, DecodeError> {
+            if !bytes.starts_with(&png_image::SIGNATURE) {
+                let found = "no PNG".to_owned();
+                return Err(DecodeError::Samples { found, expected: "a 16-bit grey PNG" });
+            }
+            let steps = png_image::decode_u16(bytes, width, height)?;
+            let metres = steps.iter().map(|&s| f32::from(s) / DEPTH_STEPS_PER_METRE).collect();
+            let found = (steps.len(), 1);
+            Image::try_from_pixels(width, height, metres)
+                .ok_or(DecodeError::Size { found, expected: (width, height) })
+        };
+        decode(&self.bytes)
+            .map_err(|source| ImageFileError::Decode { path: path.to_owned(), source })
+    }
+
+    /// Loads a regular file of bounded size; a pipe or device would block or never end.
+    fn load(&mut self, path: &Path) -> Result<(), ImageFileError> {
+        let refuse = |why: &str| std::io::Error::other(why.to_owned());
+        let mut load = || -> std::io::Result<()> {
+            let metadata = std::fs::metadata(path)?;
+            if !metadata.is_file() {
+                return Err(refuse("it is not a regular file"));
+            }
+            if metadata.len() > MAX_FILE_BYTES {
+                return Err(refuse("it is larger than any image that fits 8192x8192 pixels"));
+            }
+            self.bytes.clear();
+            File::open(path)?.take(MAX_FILE_BYTES).read_to_end(&mut self.bytes)?;
+            Ok(())
+        };
+        load().map_err(|source| ImageFileError::Read { path: path.to_owned(), source })
+    }
+}
+
+/// Decodes PNG or JPEG bytes of `width * height` pixels into grey values; `samples` is reused
+/// memory.
+pub fn decode_gray_into(
+    bytes: &[u8],
+    width: usize,
+    height: usize,
+    samples: &mut Vec<u8>,
+    gray: &mut [u8],
+) -> Result<(), DecodeError> {
+    if bytes.starts_with(&png_image::SIGNATURE) {
+        png_image::decode_gray_into(bytes, width, height, samples, gray)
+    } else if bytes.starts_with(&jpeg_image::SIGNATURE) {
+        jpeg_image::decode_gray_into(bytes, width, height, samples, gray)
+    } else {
+        const SHOWN: usize = 8;
+        let found = bytes.iter().take(SHOWN).copied().collect();
+        Err(DecodeError::NotAnImage { found })
+    }
+}
+
+/// Writes an 8-bit grey PNG, under a temporary name first.
+pub fn write_gray_png(
+    path: &Path,
+    width: usize,
+    height: usize,
+    pixels: &[u8],
+) -> Result<(), ImageFileError> {
+    write_png(path, png_image::encode_gray(width, height, png::BitDepth::Eight, pixels))
+}
+
+/// Writes a 16-bit grey PNG, for depth [`DEPTH_STEPS_PER_METRE`] to a metre and 0 where there is
+/// none, under a temporary name first.
+pub fn write_depth_png(
+    path: &Path,
+    width: usize,
+    height: usize,
+    steps: &[u16],
+) -> Result<(), ImageFileError> {
+    let samples: Vec<u8> = steps.iter().flat_map(|s| s.to_be_bytes()).collect();
+    write_png(path, png_image::encode_gray(width, height, png::BitDepth::Sixteen, &samples))
+}
+
+fn write_png(
+    path: &Path,
+    encoded: Result<Vec<u8>, png::EncodingError>,
+) -> Result<(), ImageFileError> {
+    let write = || -> std::io::Result<()> {
+        let bytes = encoded.map_err(std::io::Error::other)?;
+        let mut temporary = path.as_os_str().to_owned();
+        temporary.push(".partial");
+        let written = File::create(&temporary)
+            .and_then(|mut file| file.write_all(&bytes))
+            .and_then(|()| std::fs::rename(&temporary, path));
+        if written.is_err() {
+            // What is left of a full disc helps nobody; the first error is the one to report.
+            let _ = std::fs::remove_file(&temporary);
+        }
+        written
+    };
+    write().map_err(|source| ImageFileError::Write { path: path.to_owned(), source })
+}

@@ -1,0 +1,117 @@
+//! Grey and depth images of a PNG in memory, and the PNG files that datasets are written with.
+
+use std::io::Cursor;
+
+use png::{BitDepth, ColorType, Decoder, Limits, Reader, Transformations};
+
+use crate::capture::image_file::{DecodeError, MAX_SIDE};
+use crate::slam::image::gray::gray_from_interleaved;
+
+/// The first bytes of every PNG.
+pub const SIGNATURE: [u8; 8] = [0x89, b'P', b'N', b'G', b'\r', b'\n', 0x1a, b'\n'];
+
+const FORMAT: &str = "PNG";
+
+/// Memory that a decoder may take: the largest image with four 16-bit channels.
+const MAX_DECODER_BYTES: usize = MAX_SIDE * MAX_SIDE * 8;
+
+fn damaged(error: png::DecodingError) -> DecodeError {
+    DecodeError::Damaged { format: FORMAT, reason: error.to_string() }
+}
+
+/// Decodes a PNG of `width * height` pixels, of any colour type and bit depth, into grey values;
+/// 16-bit samples keep their high byte, alpha is ignored. `samples` is reused memory.
+pub fn decode_gray_into(
+    bytes: &[u8],
+    width: usize,
+    height: usize,
+    samples: &mut Vec<u8>,
+    gray: &mut [u8],
+) -> Result<(), DecodeError> {
+    // Palettes and low bit depths become 8-bit samples, 16-bit ones too.
+    let wanted = Transformations::EXPAND | Transformations::STRIP_16;
+    let mut reader = open(bytes, width, height, wanted)?;
+    if gray.len() != width * height {
+        return Err(DecodeError::Size { found: (width, height), expected: (width, height) });
+    }
+    let (color, _) = reader.output_color_type();
+    if color == ColorType::Grayscale {
+        return finish(&mut reader, gray);
+    }
+    samples.resize(width * height * color.samples(), 0);
+    finish(&mut reader, samples)?;
+    match color {
+        ColorType::GrayscaleAlpha => {
+            for (gray, pixel) in gray.iter_mut().zip(samples.chunks_exact(2)) {
+                *gray = pixel[0];
+            }
+        }
+        ColorType::Rgb => gray_from_interleaved::<3>(samples, gray),
+        ColorType::Rgba => gray_from_interleaved::<4>(samples, gray),
+        ColorType::Grayscale | ColorType::Indexed => {
+            let reason = "its palette could not be applied".to_owned();
+            return Err(DecodeError::Damaged { format: FORMAT, reason });
+        }
+    }
+    Ok(())
+}
+
+/// Decodes a 16-bit grey PNG of `width * height` pixels into its raw samples.
+pub fn decode_u16(bytes: &[u8], width: usize, height: usize) -> Result<Vec<u16>, DecodeError> {
+    let mut reader = open(bytes, width, height, Transformations::IDENTITY)?;
+    let kind = reader.output_color_type();
+    if kind != (ColorType::Grayscale, BitDepth::Sixteen) {
+        return Err(DecodeError::Samples {
+            found: format!("{:?} samples of {} bits", kind.0, kind.1 as u8),
+            expected: "16-bit grey",
+        });
+    }
+    let mut samples = vec![0; width * height * 2];
+    finish(&mut reader, &mut samples)?;
+    let pair = |pair: &[u8]| u16::from_be_bytes([pair[0], pair[1]]);
+    Ok(samples.chunks_exact(2).map(pair).collect())
+}
+
+/// A reader past the header, whose size has been checked.
+fn open(
+    bytes: &[u8],
+    width: usize,
+    height: usize,
+    transformations: Transformations,
+) -> Result<Reader<Cursor<&[u8]>>, DecodeError> {
+    let limits = Limits { bytes: MAX_DECODER_BYTES };
+    let mut decoder = Decoder::new_with_limits(Cursor::new(bytes), limits);
+    decoder.set_transformations(transformations);
+    let header = decoder.read_header_info().map_err(damaged)?;
+    let found = (header.width as usize, header.height as usize);
+    if found != (width, height) {
+        return Err(DecodeError::Size { found, expected: (width, height) });
+    }
+    decoder.read_info().map_err(damaged)
+}
+
+/// Reads the pixels and goes on to the end of the file, so that one that is cut short is noticed.
+fn finish(reader: &mut Reader<Cursor<&[u8]>>, samples: &mut [u8]) -> Result<(), DecodeError> {
+    reader.next_frame(samples).map_err(damaged)?;
+    reader.finish().map_err(damaged)
+}
+
+/// The bytes of a grey PNG; `samples` are rows of `width` samples, big-endian where 16 bits.
+pub fn encode_gray(
+    width: usize,
+    height: usize,
+    depth: BitDepth,
+    samples: &[u8],
+) -> Result<Vec<u8>, png::EncodingError> {
+    let side = |n: usize| u32::try_from(n).unwrap_or(u32::MAX);
+    let mut bytes = Vec::new();
+    let mut encoder = png::Encoder::new(&mut bytes, side(width), side(height));
+    encoder.set_color(ColorType::Grayscale);
+    encoder.set_depth(depth);
+    // Sequences are written at many frames a second and read once or twice.
+    encoder.set_compression(png::Compression::Fast);
+    let mut writer = encoder.write_header()?;
+    writer.write_image_data(samples)?;
+    writer.finish()?;
+    Ok(bytes)
+}

@@ -1,0 +1,122 @@
+//! Frames of a recording, whatever its layout: listed images of one camera, played in order.
+//!
+//! What is wrong with a recording's lists is found when it is opened: a bad line, a stamp out of
+//! order, a file that is not there. What is wrong inside an image is found when it is reached.
+
+use std::path::PathBuf;
+
+use crate::capture::image_file::ImageFileReader;
+use crate::capture::rig::Rig;
+use crate::capture::source::{FrameSource, FrameStamp, SourceError};
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::rectification::Rectification;
+use crate::slam::image::buffer::Image;
+use crate::slam::trajectory::StampedPose;
+
+/// A depth image belongs to a frame when their stamps differ by no more than this: two thirds of a
+/// period at 30 Hz, the customary bound of the TUM RGB-D tools.
+const DEPTH_ASSOCIATION_NANOS: u64 = 20_000_000;
+
+/// An image file with its stamp.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ListedImage {
+    /// Stamp, nanoseconds of the recording's clock.
+    pub nanos: i64,
+    /// The image file.
+    pub path: PathBuf,
+}
+
+/// What the lists of a recording say; every list is in order of its stamps.
+#[derive(Debug, Clone, Default)]
+pub struct Contents {
+    /// The frames.
+    pub frames: Vec<ListedImage>,
+    /// Depth images (16-bit PNG), empty where there are none.
+    pub depths: Vec<ListedImage>,
+    /// Ground-truth camera poses, empty where there are none.
+    pub ground_truth: Vec<StampedPose>,
+}
+
+/// A recording as a source of rectified frames.
+#[derive(Debug)]
+pub struct Recording {
+    contents: Contents,
+    rectification: Rectification,
+    reader: ImageFileReader,
+    /// The raw image, where it is not the rectified one.
+    raw: Vec<u8>,
+    next: usize,
+}
+
+impl Recording {
+    /// A recording with these contents, taken with the camera of `rig`; `rig_path` is where that
+    /// was read and `listed_in` what listed the frames, both for errors.
+    pub fn new(
+        contents: Contents,
+        rig: &Rig,
+        rig_path: PathBuf,
+        listed_in: PathBuf,
+    ) -> Result<Self, SourceError> {
+        if contents.frames.is_empty() {
+            return Err(SourceError::Empty { path: listed_in });
+        }
+        let rectification = Rectification::new(&rig.camera)
+            .map_err(|source| SourceError::Rectification { path: rig_path, source })?;
+        let Intrinsics { width, height, .. } = *rectification.intrinsics();
+        let raw = if rectification.is_identity() { Vec::new() } else { vec![0; width * height] };
+        Ok(Self { contents, rectification, reader: ImageFileReader::default(), raw, next: 0 })
+    }
+
+    /// The depth image nearest to a stamp, where one is near enough.
+    fn nearest_depth(&self, nanos: i64) -> Option<&ListedImage> {
+        let depths = &self.contents.depths;
+        let after = depths.partition_point(|depth| depth.nanos < nanos);
+        let neighbours = &depths[after.saturating_sub(1)..depths.len().min(after + 1)];
+        neighbours
+            .iter()
+            .min_by_key(|depth| depth.nanos.abs_diff(nanos))
+            .filter(|depth| depth.nanos.abs_diff(nanos) <= DEPTH_ASSOCIATION_NANOS)
+    }
+}
+
+impl FrameSource for Recording {
+    fn intrinsics(&self) -> Intrinsics {
+        *self.rectification.intrinsics()
+    }
+
+    fn num_frames(&self) -> Option<usize> {
+        Some(self.contents.frames.len())
+    }
+
+    fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
+        let Intrinsics { width, height, .. } = *self.rectification.intrinsics();
+        if pixels.len() != width * height {
+            return Err(SourceError::Buffer { found: pixels.len(), width, height });
+        }
+        let Some(frame) = self.contents.frames.get(self.next) else { return Ok(None) };
+        let sequence = self.next as u64;
+        // Counted before it is read: whoever goes on after a bad image gets the one after it.
+        self.next += 1;
+        if self.rectification.is_identity() {
+            self.reader.read_gray_into(&frame.path, width, height, pixels)?;
+        } else {
+            self.reader.read_gray_into(&frame.path, width, height, &mut self.raw)?;
+            self.rectification.rectify_into(&self.raw, pixels);
+        }
+        let capture_nanos = frame.nanos;
+        Ok(Some(FrameStamp { sequence, capture_nanos, exposure_nanos: 0, gain: 0.0 }))
+    }
+
+    fn ground_truth(&self) -> &[StampedPose] {
+        &self.contents.ground_truth
+    }
+
+    fn depth_at(&mut self, capture_nanos: i64) -> Result<Option<Image<f32>>, SourceError> {
+        let Some(path) = self.nearest_depth(capture_nanos).map(|depth| depth.path.clone()) else {
+            return Ok(None);
+        };
+        let Intrinsics { width, height, .. } = *self.rectification.intrinsics();
+        let raw = self.reader.read_depth(&path, width, height)?;
+        Ok(self.rectification.rectify_depth(&raw))
+    }
+}

@@ -1,0 +1,177 @@
+//! Rigs: what is known about a camera before it is opened, from TOML or a TUM `camera.txt`.
+
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+
+use crate::capture::listing;
+use crate::capture::source::SourceError;
+use crate::slam::geometry::camera_model::{CameraModel, Distortion};
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::parameter::{ParameterError, check_range};
+
+/// Sides of an image, pixels.
+const SIDE_RANGE: std::ops::RangeInclusive<usize> = 16..=8192;
+/// Focal lengths, pixels: from a fisheye on the smallest image to a telescope on the largest.
+const FOCAL_RANGE: std::ops::RangeInclusive<f64> = 1.0..=100_000.0;
+/// Lens coefficients; those of rational lenses reach tens.
+const COEFFICIENT_RANGE: std::ops::RangeInclusive<f64> = -1000.0..=1000.0;
+/// Frames a second.
+const RATE_RANGE: std::ops::RangeInclusive<f64> = 0.1..=1000.0;
+
+/// One camera: lens, intrinsics of the raw image and, where known, its frame rate.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Rig {
+    /// The calibrated camera.
+    pub camera: CameraModel,
+    /// Frames a second, where the rig names it.
+    pub rate_hz: Option<f64>,
+}
+
+/// Why a rig cannot be used; names the file.
+#[derive(Debug, thiserror::Error)]
+pub enum RigError {
+    /// The file is not a rig: bad syntax, an unknown or a missing key.
+    #[error("{}, line {line}: {problem}", path.display())]
+    Syntax {
+        /// The rig file.
+        path: PathBuf,
+        /// Line, from 1.
+        line: usize,
+        /// What is wrong, in one line.
+        problem: String,
+    },
+    /// A value that no camera can have.
+    #[error("{}: {source}", path.display())]
+    Value {
+        /// The rig file.
+        path: PathBuf,
+        /// Key, value and allowed range.
+        source: ParameterError,
+    },
+}
+
+/// The lens models of a rig file.
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+enum LensModel {
+    Pinhole,
+    Radtan,
+    Equidistant,
+}
+
+/// A rig file as it stands.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RigFile {
+    model: LensModel,
+    width: usize,
+    height: usize,
+    fx: f64,
+    fy: f64,
+    cx: f64,
+    cy: f64,
+    #[serde(default)]
+    coefficients: Vec<f64>,
+    rate_hz: Option<f64>,
+}
+
+impl Rig {
+    /// Reads a rig from a TOML file (`config/rigs/` has examples with every key).
+    pub fn read(path: &Path) -> Result<Self, SourceError> {
+        let text = listing::read_text(path)?;
+        Ok(Self::from_toml(path, &text)?)
+    }
+
+    /// Reads a rig from TOML text that came from `path`.
+    pub fn from_toml(path: &Path, text: &str) -> Result<Self, RigError> {
+        let file: RigFile = toml::from_str(text).map_err(|error| {
+            let before = error.span().and_then(|span| text.get(..span.start)).unwrap_or_default();
+            RigError::Syntax {
+                path: path.to_owned(),
+                line: before.matches('\n').count() + 1,
+                problem: error.message().replace('\n', " "),
+            }
+        })?;
+        file.rig().map_err(|source| RigError::Value { path: path.to_owned(), source })
+    }
+
+    /// Reads a rig from a `camera.txt`: `fx fy cx cy width height` and 0, 4, 5 or 8 radtan
+    /// coefficients (`k1 k2 p1 p2 [k3 [k4 k5 k6]]`), OpenCV's model and order.
+    pub fn read_camera_txt(path: &Path) -> Result<Self, SourceError> {
+        const SHAPE: &str =
+            "needs one line `fx fy cx cy width height [k1 k2 p1 p2 [k3 [k4 k5 k6]]]`";
+        let text = listing::read_text(path)?;
+        let syntax = |problem: &str| RigError::Syntax {
+            path: path.to_owned(),
+            line: 1,
+            problem: problem.to_owned(),
+        };
+        let mut rows = listing::rows(path, &text);
+        let row = rows.next().ok_or_else(|| syntax(SHAPE))?;
+        if let Some(second) = rows.next() {
+            return Err(second.error(format!("a second camera; {SHAPE}")));
+        }
+        let numbers = row
+            .text()
+            .split_whitespace()
+            .map(|field| row.number(field))
+            .collect::<Result<Vec<f64>, SourceError>>()?;
+        let [fx, fy, cx, cy, width, height, ref coefficients @ ..] = numbers[..] else {
+            return Err(row.error(format!("{SHAPE}, has {} numbers", numbers.len())));
+        };
+        let model = if coefficients.is_empty() { LensModel::Pinhole } else { LensModel::Radtan };
+        // A fraction or a negative number becomes a size that the range refuses.
+        let side = |x: f64| if x.fract() == 0.0 { x as usize } else { 0 };
+        let file = RigFile {
+            model,
+            width: side(width),
+            height: side(height),
+            fx,
+            fy,
+            cx,
+            cy,
+            coefficients: coefficients.to_vec(),
+            rate_hz: None,
+        };
+        let rig = file.rig();
+        Ok(rig.map_err(|source| RigError::Value { path: path.to_owned(), source })?)
+    }
+}
+
+impl RigFile {
+    fn rig(&self) -> Result<Rig, ParameterError> {
+        check_range("width", self.width, SIDE_RANGE)?;
+        check_range("height", self.height, SIDE_RANGE)?;
+        check_range("fx", self.fx, FOCAL_RANGE)?;
+        check_range("fy", self.fy, FOCAL_RANGE)?;
+        // The view around the optical axis is what is used, so the axis must meet the image.
+        check_range("cx", self.cx, 0.0..=(self.width - 1) as f64)?;
+        check_range("cy", self.cy, 0.0..=(self.height - 1) as f64)?;
+        for (i, &k) in self.coefficients.iter().enumerate() {
+            check_range(&format!("coefficients[{i}]"), k, COEFFICIENT_RANGE)?;
+        }
+        if let Some(rate_hz) = self.rate_hz {
+            check_range("rate_hz", rate_hz, RATE_RANGE)?;
+        }
+        let Self { width, height, fx, fy, cx, cy, .. } = *self;
+        let count_error = |allowed: &str| ParameterError {
+            key: "coefficients".to_owned(),
+            value: format!("{:?}", self.coefficients),
+            allowed: allowed.to_owned(),
+        };
+        let lens = match self.model {
+            LensModel::Pinhole if self.coefficients.is_empty() => Distortion::None,
+            LensModel::Pinhole => return Err(count_error("none with model = \"pinhole\"")),
+            LensModel::Radtan => Distortion::try_radtan(&self.coefficients)
+                .filter(|lens| *lens != Distortion::None)
+                .ok_or_else(|| count_error("4, 5 or 8 numbers: k1 k2 p1 p2 [k3 [k4 k5 k6]]"))?,
+            LensModel::Equidistant => Distortion::try_equidistant(&self.coefficients)
+                .ok_or_else(|| count_error("4 numbers: k1 k2 k3 k4"))?,
+        };
+        let intrinsics = Intrinsics { fx, fy, cx, cy, width, height };
+        let camera = CameraModel::new(intrinsics, lens)
+            .ok_or_else(|| count_error("finite numbers that belong to a camera"))?;
+        Ok(Rig { camera, rate_hz: self.rate_hz })
+    }
+}
