@@ -8,5 +8,6 @@ pub mod png_image;
 mod real_recordings;
 pub mod recording;
 pub mod rig;
+pub mod simulator;
 pub mod source;
 pub mod tum;

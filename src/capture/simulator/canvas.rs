@@ -1,0 +1,166 @@
+//! A tileable drawing surface: smooth noise and shapes with soft edges, wrapped at the borders.
+
+use crate::capture::simulator::random::{Stream, mix2, unit};
+use crate::capture::simulator::texture::Texture;
+
+/// Half the width of a drawn edge, texels: two pixels from dark to light keep the texture free of
+/// steps that a sampled image would turn into stairs.
+const EDGE_TEXELS: f32 = 1.0;
+
+/// A square of reflectances under construction.
+#[derive(Debug, Clone)]
+pub struct Canvas {
+    size: usize,
+    texels: Vec<f32>,
+}
+
+/// The outline of a drawn shape, in texels from its centre.
+#[derive(Debug, Clone, Copy)]
+pub enum Shape {
+    /// Rectangle of half sides.
+    Rectangle(f32, f32),
+    /// Ellipse of half axes.
+    Ellipse(f32, f32),
+    /// Circle line of a radius and half a width.
+    Ring(f32, f32),
+    /// Isosceles triangle of half a base and half a height.
+    Triangle(f32, f32),
+}
+
+impl Shape {
+    /// Radius of a disc around the centre that holds the shape.
+    fn reach(self) -> f32 {
+        match self {
+            Self::Rectangle(a, b) | Self::Triangle(a, b) => a.hypot(b),
+            Self::Ellipse(a, b) => a.max(b),
+            Self::Ring(radius, half_width) => radius + half_width,
+        }
+    }
+
+    /// Approximate distance to the outline, negative inside.
+    fn distance(self, x: f32, y: f32) -> f32 {
+        match self {
+            Self::Rectangle(a, b) => (x.abs() - a).max(y.abs() - b),
+            Self::Ellipse(a, b) => ((x / a).hypot(y / b) - 1.0) * a.min(b),
+            Self::Ring(radius, half_width) => (x.hypot(y) - radius).abs() - half_width,
+            Self::Triangle(a, b) => {
+                let side = (x.abs() * 2.0 * b + (y - b) * a) / (2.0 * b).hypot(a);
+                side.max(-b - y)
+            }
+        }
+    }
+}
+
+impl Canvas {
+    /// A surface of one reflectance; `size` is a power of two.
+    pub fn new(size: usize, value: f32) -> Self {
+        Self { size, texels: vec![value; size * size] }
+    }
+
+    /// Side in texels.
+    pub fn size(&self) -> f32 {
+        self.size as f32
+    }
+
+    /// Ends the drawing.
+    pub fn into_texture(self) -> Texture {
+        Texture::new(self.size, self.texels)
+    }
+
+    /// Adds noise of several octaves with zero mean: lattices from `cells` a side, each octave twice
+    /// as fine and `persistence` times as strong, down to two texels. `stretch` is how many times
+    /// longer the grain is along x than along y (a power of two).
+    pub fn add_noise(&mut self, seed: u64, cells: usize, octaves: u32, amplitude: f32, persistence: f32, stretch: usize) {
+        let mut strength = amplitude;
+        for octave in 0..octaves {
+            let along_y = cells << octave;
+            let along_x = (along_y / stretch).max(1);
+            if along_y * 2 > self.size {
+                break;
+            }
+            self.add_octave(mix2(seed, u64::from(octave)), along_x, along_y, strength);
+            strength *= persistence;
+        }
+    }
+
+    /// One lattice of random values with quintic blending in between.
+    fn add_octave(&mut self, seed: u64, cells_x: usize, cells_y: usize, strength: f32) {
+        let lattice: Vec<f32> =
+            (0..cells_x * cells_y).map(|i| unit(mix2(seed, i as u64)) * 2.0 - 1.0).collect();
+        let columns: Vec<(usize, usize, f32)> =
+            (0..self.size).map(|u| Self::cell(u, self.size, cells_x)).collect();
+        let size = self.size;
+        for (v, row) in self.texels.chunks_exact_mut(size).enumerate() {
+            let (top, bottom, b) = Self::cell(v, size, cells_y);
+            for (out, &(left, right, a)) in row.iter_mut().zip(&columns) {
+                let at = |x: usize, y: usize| lattice[y * cells_x + x];
+                let above = at(left, top) + a * (at(right, top) - at(left, top));
+                let below = at(left, bottom) + a * (at(right, bottom) - at(left, bottom));
+                *out += strength * (above + b * (below - above));
+            }
+        }
+    }
+
+    /// The lattice points before and after a texel, and the blend between them.
+    fn cell(texel: usize, size: usize, cells: usize) -> (usize, usize, f32) {
+        let place = (texel as f32 + 0.5) * cells as f32 / size as f32;
+        let first = place as usize;
+        let t = place - first as f32;
+        (first % cells, (first + 1) % cells, t * t * t * (t * (t * 6.0 - 15.0) + 10.0))
+    }
+
+    /// Paints a shape of one reflectance over what is there; `opacity` 1 hides it.
+    pub fn draw(&mut self, shape: Shape, centre: [f32; 2], angle_rad: f32, value: f32, opacity: f32) {
+        let reach = shape.reach() + 2.0 * EDGE_TEXELS;
+        let (sin, cos) = angle_rad.sin_cos();
+        let mask = self.size as i32 - 1;
+        let [cu, cv] = centre;
+        let rows = (cv - reach).floor() as i32..=(cv + reach).ceil() as i32;
+        for v in rows {
+            for u in (cu - reach).floor() as i32..=(cu + reach).ceil() as i32 {
+                let (dx, dy) = (u as f32 + 0.5 - cu, v as f32 + 0.5 - cv);
+                let distance = shape.distance(cos * dx + sin * dy, cos * dy - sin * dx);
+                let cover = (0.5 - 0.5 * distance / EDGE_TEXELS).clamp(0.0, 1.0) * opacity;
+                if cover > 0.0 {
+                    let at = (v & mask) as usize * self.size + (u & mask) as usize;
+                    self.texels[at] += cover * (value - self.texels[at]);
+                }
+            }
+        }
+    }
+
+    /// Multiplies every reflectance and adds to it, then keeps it within what surfaces have.
+    pub fn remap(&mut self, gain: f32, offset: f32) {
+        for texel in &mut self.texels {
+            *texel = (*texel * gain + offset).clamp(0.02, 0.98);
+        }
+    }
+
+    /// Covers the surface with `count` opaque shapes of all directions, radii from `smallest` to
+    /// `largest` texels with a density ∝ r⁻³: the dead-leaves model, whose edges, occlusions and
+    /// spectrum are those of natural images (Lee, Mumford, Huang, IJCV 2001).
+    pub fn scatter_leaves(&mut self, stream: &mut Stream, count: usize, smallest: f32, largest: f32, values: (f32, f32)) {
+        // Large first, so that the small ones stay visible.
+        let mut radii: Vec<f32> = (0..count)
+            .map(|_| {
+                let p = stream.uniform(0.0, 1.0);
+                let (a, b) = (smallest.powi(-2), largest.powi(-2));
+                (a + p * (b - a)).powf(-0.5)
+            })
+            .collect();
+        radii.sort_by(|a, b| b.total_cmp(a));
+        for radius in radii {
+            let slim = stream.uniform(0.35, 1.0);
+            let shape = match stream.index(5) {
+                0 | 1 => Shape::Rectangle(radius, radius * slim),
+                2 => Shape::Ellipse(radius, radius * slim),
+                3 => Shape::Triangle(radius, radius * slim),
+                _ => Shape::Ring(radius, (radius * 0.2).max(1.5)),
+            };
+            let centre = [stream.uniform(0.0, self.size()), stream.uniform(0.0, self.size())];
+            let angle = stream.uniform(0.0, std::f32::consts::TAU);
+            let value = stream.uniform(values.0, values.1);
+            self.draw(shape, centre, angle, value, 1.0);
+        }
+    }
+}

@@ -1,0 +1,237 @@
+//! The simulator: a camera in a textured scene, with exact poses and exact depth.
+//!
+//! [`trajectory`] says where the camera is, [`render`] what it sees there, [`sensor`] what becomes
+//! of the light; [`furnish`] builds the scenes. The same [`params`] give the same bytes.
+
+use rayon::prelude::*;
+
+use crate::capture::simulator::lens::Lens;
+use crate::capture::simulator::params::SimulatorParams;
+use crate::capture::simulator::render::{RenderScratch, Renderer};
+use crate::capture::simulator::scene::Scene;
+use crate::capture::simulator::sensor::Sensor;
+use crate::capture::simulator::trajectory::Trajectory;
+use crate::capture::source::{FrameSource, FrameStamp, SourceError};
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::image::buffer::Image;
+use crate::slam::parameter::ParameterError;
+use crate::slam::trajectory::StampedPose;
+
+mod canvas;
+mod cull;
+pub mod furnish;
+pub mod lens;
+pub mod params;
+pub mod pattern;
+pub mod random;
+pub mod render;
+pub mod scene;
+pub mod sensor;
+pub mod texture;
+pub mod trajectory;
+
+/// Stamp of the first frame: one second, so that no reader takes it for a missing one.
+const FIRST_NANOS: i64 = 1_000_000_000;
+/// Frames rendered between two reports of progress.
+const FRAMES_PER_REPORT: usize = 8;
+/// Motion blur is averaged over instants that lie at most this far apart in the image.
+const BLUR_STEP_PX: f64 = 1.0;
+/// Most instants of one exposure.
+const MAX_BLUR_STEPS: usize = 24;
+
+/// A simulated camera as a source of frames.
+///
+/// [`FrameSource::prepare`] renders all frames on the current rayon pool and keeps them:
+/// `frames × width × height` bytes, 184 MB for the default 600 frames. Depth is cast when asked for.
+#[derive(Debug)]
+pub struct Simulator {
+    params: SimulatorParams,
+    scene: Scene,
+    lens: Lens,
+    sensor: Sensor,
+    trajectory: Trajectory,
+    ground_truth: Vec<StampedPose>,
+    frames: Vec<Vec<u8>>,
+    next: usize,
+    scratch: RenderScratch,
+}
+
+impl Simulator {
+    /// Builds the scene and the path; nothing is rendered yet.
+    pub fn new(params: SimulatorParams) -> Result<Self, ParameterError> {
+        params.validate()?;
+        let scene = furnish::build(params.scene, params.seed);
+        let trajectory = Trajectory::new(scene.stage, &params.motion, params.seed);
+        let lens = Lens::pinhole(&params.intrinsics());
+        let sensor = Sensor::new(&params.sensor, params.seed, params.width, params.height);
+        let mut simulator = Self {
+            params,
+            scene,
+            lens,
+            sensor,
+            trajectory,
+            ground_truth: Vec::new(),
+            frames: Vec::new(),
+            next: 0,
+            scratch: RenderScratch::default(),
+        };
+        simulator.ground_truth = (0..simulator.params.frames)
+            .map(|i| {
+                let mut world_from_camera = simulator.pose(simulator.time_s(i));
+                world_from_camera.translation *= simulator.params.world_scale;
+                StampedPose { nanos: simulator.nanos(i), world_from_camera }
+            })
+            .collect();
+        Ok(simulator)
+    }
+
+    /// The parameters it was built with.
+    pub fn params(&self) -> &SimulatorParams {
+        &self.params
+    }
+
+    /// Stamp of a frame: the middle of the exposure (of the middle row), nanoseconds.
+    pub fn nanos(&self, frame: usize) -> i64 {
+        FIRST_NANOS + (frame as f64 * 1e9 / self.params.rate_hz).round() as i64
+    }
+
+    /// Time of a frame from the start, seconds.
+    fn time_s(&self, frame: usize) -> f64 {
+        (self.nanos(frame) - FIRST_NANOS) as f64 * 1e-9
+    }
+
+    /// The pose at a time from the start, in metres before the world's scale.
+    fn pose(&self, time_s: f64) -> SE3 {
+        self.trajectory.world_from_camera(time_s)
+    }
+
+    /// Brightness of a frame before the sensor, grey levels.
+    fn light(&self, frame: usize, scratch: &mut RenderScratch) -> Vec<f32> {
+        let sensor = &self.params.sensor;
+        let mut light = vec![0.0; self.params.width * self.params.height];
+        let renderer = Renderer { scene: &self.scene, lens: &self.lens };
+        let middle_s = self.time_s(frame);
+        let exposure_s = sensor.exposure_ms * 1e-3;
+        let row_s = sensor.row_time_us * 1e-6;
+        let middle_row = 0.5 * (self.params.height as f64 - 1.0);
+        let steps = self.blur_steps(middle_s, exposure_s);
+        for step in 0..steps {
+            let instant_s = middle_s + ((step as f64 + 0.5) / steps as f64 - 0.5) * exposure_s;
+            let pose_of_row = |row: usize| self.pose(instant_s + (row as f64 - middle_row) * row_s);
+            let weight = 1.0 / steps as f32;
+            renderer.add_grey(&pose_of_row, row_s == 0.0, weight, scratch, &mut light);
+        }
+        light
+    }
+
+    /// How many instants an exposure is averaged over: one a pixel of motion.
+    fn blur_steps(&self, middle_s: f64, exposure_s: f64) -> usize {
+        /// Distance at which the motion is judged: most of the scene lies farther.
+        const TYPICAL_DEPTH_M: f64 = 1.5;
+        if exposure_s == 0.0 {
+            return 1;
+        }
+        let (before, after) = (self.pose(middle_s - 0.5 * exposure_s), self.pose(middle_s + 0.5 * exposure_s));
+        let turn = before.rotation.angle_to(&after.rotation);
+        let step = (after.translation - before.translation).norm();
+        let motion_px = self.params.focal_px * (turn + step / TYPICAL_DEPTH_M);
+        ((motion_px / BLUR_STEP_PX).ceil() as usize + 1).clamp(2, MAX_BLUR_STEPS)
+    }
+
+    /// Renders one frame as the sensor gives it.
+    fn render(&self, frame: usize, scratch: &mut RenderScratch) -> Vec<u8> {
+        let mut light = self.light(frame, scratch);
+        let mut pixels = vec![0; light.len()];
+        self.sensor.read_out(frame as u64, self.time_s(frame), &mut light, &mut pixels);
+        pixels
+    }
+
+    /// Depth along the optical axis at a frame's ground-truth pose, in world units (0 where nothing is).
+    pub fn depth_of(&mut self, frame: usize) -> Image<f32> {
+        let pose = self.pose(self.time_s(frame));
+        let mut depth = Image::filled(self.params.width, self.params.height, 0.0);
+        let renderer = Renderer { scene: &self.scene, lens: &self.lens };
+        renderer.depth_into(&pose, &mut self.scratch, depth.pixels_mut());
+        let scale = self.params.world_scale as f32;
+        for value in depth.pixels_mut() {
+            *value *= scale;
+        }
+        depth
+    }
+}
+
+impl FrameSource for Simulator {
+    fn intrinsics(&self) -> Intrinsics {
+        self.params.intrinsics()
+    }
+
+    fn num_frames(&self) -> Option<usize> {
+        Some(self.params.frames)
+    }
+
+    fn prepare(
+        &mut self,
+        progress: &mut dyn FnMut(usize, usize) -> bool,
+    ) -> Result<(), SourceError> {
+        let total = self.params.frames;
+        while self.frames.len() < total {
+            if !progress(self.frames.len(), total) {
+                return Ok(());
+            }
+            let first = self.frames.len();
+            let batch = first..(first + FRAMES_PER_REPORT).min(total);
+            let shared = &*self;
+            let rendered: Vec<Vec<u8>> = batch
+                .into_par_iter()
+                .map_init(RenderScratch::default, |scratch, frame| shared.render(frame, scratch))
+                .collect();
+            self.frames.extend(rendered);
+        }
+        progress(total, total);
+        Ok(())
+    }
+
+    fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
+        let frame = self.next;
+        if frame >= self.params.frames {
+            return Ok(None);
+        }
+        let size = self.params.width * self.params.height;
+        if pixels.len() != size {
+            return Err(SourceError::Read(format!(
+                "simulator: the buffer for a frame has {} bytes, the image needs {size}: pass width × height of its intrinsics",
+                pixels.len()
+            )));
+        }
+        match self.frames.get(frame) {
+            Some(rendered) => pixels.copy_from_slice(rendered),
+            None => {
+                let mut scratch = std::mem::take(&mut self.scratch);
+                pixels.copy_from_slice(&self.render(frame, &mut scratch));
+                self.scratch = scratch;
+            }
+        }
+        self.next += 1;
+        let exposure_nanos = (self.params.sensor.exposure_ms * 1e6).round() as u64;
+        let gain = self.sensor.exposure(self.time_s(frame)).0 as f32;
+        Ok(Some(FrameStamp {
+            sequence: frame as u64,
+            capture_nanos: self.nanos(frame),
+            exposure_nanos,
+            gain,
+        }))
+    }
+
+    fn ground_truth(&self) -> &[StampedPose] {
+        &self.ground_truth
+    }
+
+    fn depth_at(&mut self, capture_nanos: i64) -> Result<Option<Image<f32>>, SourceError> {
+        let frame = self.ground_truth.binary_search_by_key(&capture_nanos, |pose| pose.nanos);
+        Ok(frame.ok().map(|frame| self.depth_of(frame)))
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,206 @@
+//! Camera paths: sums of sinusoids with incommensurate periods, smooth in every derivative.
+
+use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
+
+use crate::capture::simulator::params::{MotionKind, MotionParams};
+use crate::capture::simulator::random::Stream;
+use crate::capture::simulator::scene::Stage;
+use crate::slam::geometry::se3::SE3;
+
+/// Time over which mean speed and mean rate of turning hold, seconds. It is fixed, so that a
+/// shorter sequence is the beginning of a longer one.
+const MEAN_OVER_S: f64 = 20.0;
+/// Step of the sums that measure path and turning, seconds.
+const MEASURE_STEP_S: f64 = 1.0 / 30.0;
+
+/// A sinusoid of a phase.
+#[derive(Debug, Clone, Copy)]
+struct Wave {
+    amplitude: f64,
+    rate: f64,
+    phase: f64,
+}
+
+impl Wave {
+    fn at(self, phase: f64) -> f64 {
+        self.amplitude * (self.rate * phase + self.phase).sin()
+    }
+}
+
+fn sum(waves: &[Wave], phase: f64) -> f64 {
+    waves.iter().map(|w| w.at(phase)).sum()
+}
+
+/// A camera pose for every instant.
+#[derive(Debug, Clone)]
+pub struct Trajectory {
+    stage: Stage,
+    /// Offsets from the stage's centre along x, y, z; functions of the walking phase.
+    walk: [Vec<Wave>; 3],
+    /// Heading, elevation and roll about their means; functions of the turning phase.
+    turn: [Vec<Wave>; 3],
+    /// Tremor of x, y, z (metres) and heading, elevation, roll (radians); functions of time.
+    tremor: [Vec<Wave>; 6],
+    /// Walking phase a second.
+    walk_rate: f64,
+    /// Turning phase a second.
+    turn_rate: f64,
+}
+
+impl Trajectory {
+    /// A path through the stage, paced so that mean speed and turning are as asked.
+    pub fn new(stage: Stage, motion: &MotionParams, seed: u64) -> Self {
+        let mut stream = Stream::new(seed, 0x7247);
+        let mut path = Self {
+            stage,
+            walk: walk_waves(&stage, motion.kind, &mut stream),
+            turn: turn_waves(&stage, motion.kind, &mut stream),
+            tremor: tremor_waves(motion, &mut stream),
+            walk_rate: 0.0,
+            turn_rate: 0.0,
+        };
+        path.walk_rate = pace(motion.mean_speed_m_s, |rate| Self { walk_rate: rate, ..path.clone() }.mean_rates().0);
+        let turn = motion.mean_turn_deg_s.to_radians();
+        path.turn_rate = pace(turn, |rate| Self { turn_rate: rate, ..path.clone() }.mean_rates().1);
+        path
+    }
+
+    /// The camera pose at `time_s` from the start of the sequence, metres.
+    pub fn world_from_camera(&self, time_s: f64) -> SE3 {
+        let (walk, turn) = (self.walk_rate * time_s, self.turn_rate * time_s);
+        let centre = self.stage.centre;
+        let place = |k: usize| centre[k] + sum(&self.walk[k], walk) + sum(&self.tremor[k], time_s);
+        let angle = |k: usize| sum(&self.turn[k], turn) + sum(&self.tremor[3 + k], time_s);
+        let heading = self.stage.heading_rad + angle(0);
+        let elevation = self.stage.elevation_rad + angle(1);
+        SE3 {
+            rotation: looking(heading, elevation, angle(2)),
+            translation: Vector3::new(place(0), place(1), place(2)),
+        }
+    }
+
+    /// Mean speed (m/s) and mean rate of turning (rad/s) of the first [`MEAN_OVER_S`].
+    fn mean_rates(&self) -> (f64, f64) {
+        let steps = (MEAN_OVER_S / MEASURE_STEP_S) as usize;
+        let mut before = self.world_from_camera(0.0);
+        let (mut path, mut angle) = (0.0, 0.0);
+        for step in 1..=steps {
+            let now = self.world_from_camera(step as f64 * MEASURE_STEP_S);
+            path += (now.translation - before.translation).norm();
+            angle += now.rotation.angle_to(&before.rotation);
+            before = now;
+        }
+        let duration = steps as f64 * MEASURE_STEP_S;
+        (path / duration, angle / duration)
+    }
+}
+
+/// The phase rate at which `measure` gives `target`; 0 where nothing moves or tremor alone exceeds it.
+fn pace(target: f64, measure: impl Fn(f64) -> f64) -> f64 {
+    /// Fastest phase, rad/s; a stage is at least 0.2 m wide, so this is beyond any allowed speed.
+    const FASTEST: f64 = 64.0;
+    if target == 0.0 || measure(1.0) <= 0.0 || measure(0.0) >= target {
+        return 0.0;
+    }
+    // The first rate of a doubling row that is too fast, then bisection below it: the measure
+    // grows with the rate wherever a period is sampled often enough.
+    let mut high = 1.0 / 64.0;
+    while measure(high) < target && high < FASTEST {
+        high *= 2.0;
+    }
+    let mut low = 0.0;
+    for _ in 0..40 {
+        let middle = 0.5 * (low + high);
+        if measure(middle) < target { low = middle } else { high = middle }
+    }
+    0.5 * (low + high)
+}
+
+/// Rotation of a camera (x right, y down, z forward) in a z-up world that looks along `heading`
+/// (about the vertical, from +x towards +y) and `elevation` (upwards), rolled clockwise.
+fn looking(heading: f64, elevation: f64, roll: f64) -> UnitQuaternion<f64> {
+    let forward = Vector3::new(
+        heading.cos() * elevation.cos(),
+        heading.sin() * elevation.cos(),
+        elevation.sin(),
+    );
+    let right = Vector3::new(heading.sin(), -heading.cos(), 0.0);
+    let down = forward.cross(&right);
+    let upright = Matrix3::from_columns(&[right, down, forward]);
+    let rolled = upright * Rotation3::from_axis_angle(&Vector3::z_axis(), roll).into_inner();
+    UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rolled))
+}
+
+fn walk_waves(stage: &Stage, kind: MotionKind, stream: &mut Stream) -> [Vec<Wave>; 3] {
+    let mut phase = || stream.uniform_f64(0.0, std::f64::consts::TAU);
+    let start = {
+        let (low, high) = stage.start_rad;
+        low + (high - low) * phase() / std::f64::consts::TAU
+    };
+    let [x, y, z] = stage.reach;
+    match kind {
+        // An ellipse that the slower and faster waves keep from closing.
+        MotionKind::Handheld => [
+            vec![
+                Wave { amplitude: 0.86 * x, rate: 1.0, phase: start },
+                Wave { amplitude: 0.10 * x, rate: 2.236, phase: phase() },
+            ],
+            vec![
+                Wave { amplitude: 0.82 * y, rate: 1.0, phase: start + 1.4 },
+                Wave { amplitude: 0.14 * y, rate: 1.618, phase: phase() },
+            ],
+            vec![
+                Wave { amplitude: 0.60 * z, rate: 1.272, phase: phase() },
+                Wave { amplitude: 0.35 * z, rate: 2.899, phase: phase() },
+            ],
+        ],
+        MotionKind::Straight => {
+            // Across the mean viewing direction.
+            let (sin, cos) = stage.heading_rad.sin_cos();
+            let reach = x.min(y);
+            let along = |share: f64| vec![Wave { amplitude: share * reach, rate: 1.0, phase: 0.0 }];
+            [along(sin), along(-cos), vec![]]
+        }
+        MotionKind::Rotation | MotionKind::Standing => [vec![], vec![], vec![]],
+    }
+}
+
+fn turn_waves(stage: &Stage, kind: MotionKind, stream: &mut Stream) -> [Vec<Wave>; 3] {
+    if !matches!(kind, MotionKind::Handheld | MotionKind::Rotation) {
+        return [vec![], vec![], vec![]];
+    }
+    /// How far a hand lets the camera lean, radians.
+    const ROLL_RAD: f64 = 0.05;
+    let mut phase = || stream.uniform_f64(0.0, std::f64::consts::TAU);
+    let (heading, elevation) = (stage.heading_swing_rad, stage.elevation_swing_rad);
+    [
+        vec![
+            Wave { amplitude: 0.82 * heading, rate: 1.0, phase: phase() },
+            Wave { amplitude: 0.16 * heading, rate: 2.147, phase: phase() },
+        ],
+        vec![
+            Wave { amplitude: 0.62 * elevation, rate: 1.539, phase: phase() },
+            Wave { amplitude: 0.36 * elevation, rate: 0.7, phase: phase() },
+        ],
+        vec![Wave { amplitude: ROLL_RAD, rate: 1.1, phase: phase() }],
+    ]
+}
+
+fn tremor_waves(motion: &MotionParams, stream: &mut Stream) -> [Vec<Wave>; 6] {
+    /// Amplitude of each wave of a trembling hand: metres, then radians.
+    const PLACE_M: f64 = 0.0009;
+    const ANGLE_RAD: f64 = 0.0009;
+    const BANDS_HZ: [(f64, f64); 3] = [(1.4, 2.0), (2.6, 3.7), (4.4, 6.1)];
+    std::array::from_fn(|axis| {
+        if motion.kind != MotionKind::Handheld || motion.tremor == 0.0 {
+            return vec![];
+        }
+        let size = motion.tremor * if axis < 3 { PLACE_M } else { ANGLE_RAD };
+        let wave = |(low, high): (f64, f64)| Wave {
+            amplitude: size * stream.uniform_f64(0.6, 1.4) / low,
+            rate: std::f64::consts::TAU * stream.uniform_f64(low, high),
+            phase: stream.uniform_f64(0.0, std::f64::consts::TAU),
+        };
+        BANDS_HZ.map(wave).to_vec()
+    })
+}
