@@ -5,6 +5,7 @@
 
 pub mod alignment;
 pub mod depth;
+pub mod evaluation;
 pub mod frame;
 pub mod geometry;
 pub mod image;

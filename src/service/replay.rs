@@ -1,0 +1,269 @@
+//! The whole recipe in one process and one thread of control: every frame, in order.
+//!
+//! Frame N: track, map, and if the keyframe changed prepare it and give it to the tracker, where it
+//! is in force from frame N+1 on. Lockstep runs do the same over shared memory and give the same
+//! bits; times are measured here, around the calls.
+
+use std::time::Instant;
+
+use crate::capture::source::{FrameSource, FrameStamp, SourceError};
+use crate::service::given_pose::given_pose;
+use crate::service::results::{RecordedPose, RunMode, RunRecord};
+use crate::slam::alignment::reference::Reference;
+use crate::slam::evaluation::depth_error::DepthScale;
+use crate::slam::frame::FrameView;
+use crate::slam::mapper::{Mapper, MapperParams, StepOutcome};
+use crate::slam::parameter::ParameterError;
+use crate::slam::pose::{PoseEstimate, TrackingState};
+use crate::slam::tracker::{Tracker, TrackerParams};
+use crate::slam::trajectory::StampedPose;
+
+/// Where poses come from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum PoseOrigin {
+    /// The tracker estimates them.
+    #[default]
+    Tracker,
+    /// The source's ground truth; only the mapper is at work.
+    GroundTruth,
+}
+
+/// Where the first depth of a keyframe comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum DepthOrigin {
+    /// Images alone.
+    #[default]
+    Images,
+    /// The source's depth camera.
+    Sensor,
+}
+
+/// What to replay and how.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct ReplayConfig {
+    /// Tuning of the tracker.
+    pub tracker: TrackerParams,
+    /// Tuning of the mapper.
+    pub mapper: MapperParams,
+    /// Where poses come from.
+    pub poses: PoseOrigin,
+    /// Where the first depth comes from.
+    pub initial_depth: DepthOrigin,
+    /// Stop after as many frames; `None` for all.
+    pub max_frames: Option<usize>,
+}
+
+/// A frame that is done, for whoever watches.
+#[derive(Debug, Clone, Copy)]
+pub struct ReplayProgress {
+    /// Frames done.
+    pub done: usize,
+    /// Frames there will be, where that is known.
+    pub total: Option<usize>,
+    /// State of the frame just done.
+    pub state: TrackingState,
+    /// What the mapper made of it.
+    pub outcome: StepOutcome,
+}
+
+/// Why a sequence cannot be replayed.
+#[derive(Debug, thiserror::Error)]
+pub enum ReplayError {
+    /// The source gave no frame, or a broken one.
+    #[error(transparent)]
+    Source(#[from] SourceError),
+    /// A parameter out of its range.
+    #[error("configuration: {0}")]
+    Parameter(#[from] ParameterError),
+    /// The source ended before its first frame.
+    #[error("{0} has no frames: check the path and the list of images")]
+    Empty(String),
+    /// The source's size and intrinsics are no camera's.
+    #[error("{0} has unusable intrinsics: check its camera file or rig")]
+    Intrinsics(String),
+    /// Poses were to be given, but there are none.
+    #[error(
+        "{0} has no ground-truth poses: leave out '--poses groundtruth' or add groundtruth.txt"
+    )]
+    NoGroundTruth(String),
+    /// Depth was to come from a sensor, but there is none.
+    #[error(
+        "{0} has no depth images at its first frame: leave out '--initial-depth sensor' or add depth.txt"
+    )]
+    NoSensorDepth(String),
+}
+
+/// Replays `source` (named `source_name` in messages and results). `observe` is called after each
+/// frame and returns false to end early; what was done until then is recorded.
+pub fn replay(
+    source: &mut dyn FrameSource,
+    source_name: &str,
+    config: &ReplayConfig,
+    observe: &mut dyn FnMut(&ReplayProgress) -> bool,
+) -> Result<RunRecord, ReplayError> {
+    let mut replay = Replay::new(source, source_name, config)?;
+    let total = source.num_frames().map(|n| n.min(config.max_frames.unwrap_or(n)));
+    let mut pixels = vec![0; replay.num_pixels];
+    let begin = Instant::now();
+    while replay.record.frames_in < config.max_frames.map_or(u64::MAX, |n| n as u64) {
+        let Some(stamp) = source.next_into(&mut pixels)? else { break };
+        let (state, outcome) = replay.step(source, &stamp, &pixels)?;
+        let done = replay.record.frames_in as usize;
+        if !observe(&ReplayProgress { done, total, state, outcome }) {
+            break;
+        }
+    }
+    replay.finish(begin)
+}
+
+/// A replay under way.
+struct Replay<'a> {
+    config: &'a ReplayConfig,
+    width: usize,
+    height: usize,
+    num_pixels: usize,
+    tracker: Tracker,
+    mapper: Mapper,
+    record: RunRecord,
+    stamps: Option<(FrameStamp, FrameStamp)>,
+}
+
+impl<'a> Replay<'a> {
+    fn new(
+        source: &mut dyn FrameSource,
+        source_name: &str,
+        config: &'a ReplayConfig,
+    ) -> Result<Self, ReplayError> {
+        let intrinsics = source.intrinsics();
+        if !intrinsics.is_valid() {
+            return Err(ReplayError::Intrinsics(source_name.to_owned()));
+        }
+        let ground_truth = source.ground_truth().to_vec();
+        let given = config.poses == PoseOrigin::GroundTruth;
+        if given && ground_truth.is_empty() {
+            return Err(ReplayError::NoGroundTruth(source_name.to_owned()));
+        }
+        Ok(Self {
+            config,
+            width: intrinsics.width,
+            height: intrinsics.height,
+            num_pixels: intrinsics.width * intrinsics.height,
+            tracker: Tracker::new(intrinsics, config.tracker.clone())?,
+            mapper: Mapper::new(intrinsics, config.mapper.clone())?,
+            record: empty_record(source_name, ground_truth, given),
+            stamps: None,
+        })
+    }
+
+    /// One frame: track, map, hand the keyframe on.
+    fn step(
+        &mut self,
+        source: &mut dyn FrameSource,
+        stamp: &FrameStamp,
+        pixels: &[u8],
+    ) -> Result<(TrackingState, StepOutcome), ReplayError> {
+        self.count(stamp);
+        let frame = FrameView {
+            sequence: stamp.sequence,
+            capture_nanos: stamp.capture_nanos,
+            exposure_nanos: stamp.exposure_nanos,
+            width: self.width,
+            height: self.height,
+            pixels,
+        };
+        let Some(pose) = self.pose(&frame) else {
+            return Ok((TrackingState::Initializing, StepOutcome::default()));
+        };
+        let sensor_depth = match self.config.initial_depth {
+            DepthOrigin::Images => None,
+            DepthOrigin::Sensor => source.depth_at(stamp.capture_nanos)?,
+        };
+        let sensor_expected = self.config.initial_depth == DepthOrigin::Sensor;
+        if sensor_expected && sensor_depth.is_none() && self.record.frames_in == 1 {
+            return Err(ReplayError::NoSensorDepth(self.record.source.clone()));
+        }
+        let begin = Instant::now();
+        let outcome = self.mapper.step(&frame, &pose, sensor_depth.as_ref());
+        self.record.map_nanos.push(elapsed_nanos(begin));
+        if (outcome.keyframe_created || outcome.keyframe_changed)
+            && self.config.poses == PoseOrigin::Tracker
+            && let Some(keyframe) = self.mapper.keyframe()
+        {
+            self.tracker.adopt(Box::new(Reference::prepare(keyframe)));
+        }
+        Ok((pose.state, outcome))
+    }
+
+    /// The frame's pose, estimated or given; `None` where ground truth has none for it.
+    fn pose(&mut self, frame: &FrameView<'_>) -> Option<PoseEstimate> {
+        let (estimate, track_nanos) = match self.config.poses {
+            PoseOrigin::Tracker => {
+                let begin = Instant::now();
+                let estimate = self.tracker.track(frame, &mut |_| true);
+                (estimate, Some(elapsed_nanos(begin)))
+            }
+            PoseOrigin::GroundTruth => {
+                let estimate = given_pose(frame, self.mapper.keyframe(), &self.record.ground_truth);
+                (estimate?, None)
+            }
+        };
+        self.record.poses.push(RecordedPose { estimate, latency_nanos: None, track_nanos });
+        Some(estimate)
+    }
+
+    fn count(&mut self, stamp: &FrameStamp) {
+        self.record.frames_in += 1;
+        let (first, last) = self.stamps.unwrap_or((*stamp, *stamp));
+        let expected = last.sequence.saturating_add(1);
+        self.record.gaps += u64::from(self.stamps.is_some() && stamp.sequence > expected);
+        self.stamps = Some((first, *stamp));
+    }
+
+    fn finish(self, begin: Instant) -> Result<RunRecord, ReplayError> {
+        let mut record = self.record;
+        let Some((first, last)) = self.stamps else {
+            return Err(ReplayError::Empty(record.source));
+        };
+        record.recorded_nanos =
+            last.capture_nanos.saturating_sub(first.capture_nanos).max(0) as u64;
+        record.wall_nanos = elapsed_nanos(begin);
+        record.map = self.mapper.map().clone();
+        record.peak_rss_bytes = peak_rss_bytes();
+        Ok(record)
+    }
+}
+
+fn empty_record(source_name: &str, ground_truth: Vec<StampedPose>, poses_given: bool) -> RunRecord {
+    let depth_scale = if poses_given { DepthScale::Given } else { DepthScale::MedianRatio };
+    RunRecord {
+        mode: RunMode::Replay,
+        source: source_name.to_owned(),
+        poses: Vec::new(),
+        map: Default::default(),
+        ground_truth,
+        depth_scale,
+        frames_in: 0,
+        frames_dropped: 0,
+        gaps: 0,
+        restarts: 0,
+        deadline_nanos: None,
+        deadline_misses: None,
+        map_nanos: Vec::new(),
+        recorded_nanos: 0,
+        wall_nanos: 0,
+        peak_rss_bytes: None,
+    }
+}
+
+fn elapsed_nanos(begin: Instant) -> u64 {
+    u64::try_from(begin.elapsed().as_nanos()).unwrap_or(u64::MAX)
+}
+
+/// Largest resident memory of this process so far; `None` where the kernel does not say.
+pub fn peak_rss_bytes() -> Option<u64> {
+    const BYTES_PER_KB: u64 = 1024;
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
+    let kilobytes: u64 = line.split_whitespace().next()?.parse().ok()?;
+    Some(kilobytes * BYTES_PER_KB)
+}

@@ -1,0 +1,31 @@
+//! The keyframes' depth against the source's true depth.
+
+use crate::capture::source::{FrameSource, SourceError};
+use crate::service::results::RunRecord;
+use crate::slam::evaluation::depth_error::{DepthErrors, DepthStatistics};
+use crate::slam::keyframe::MapState;
+
+/// What the depth maps are worth.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct DepthEvaluation {
+    /// Statistics over all keyframes with true depth; `None` where there is none.
+    pub statistics: Option<DepthStatistics>,
+    /// Keyframes that have true depth.
+    pub keyframes: usize,
+}
+
+/// Compares every established keyframe that has true depth.
+pub fn evaluate_depth(
+    record: &RunRecord,
+    source: &mut dyn FrameSource,
+) -> Result<DepthEvaluation, SourceError> {
+    let mut errors = DepthErrors::default();
+    let mut keyframes = 0;
+    for keyframe in record.map.keyframes.iter().filter(|k| k.map_state == MapState::Established) {
+        if let Some(true_depth) = source.depth_at(keyframe.capture_nanos)? {
+            errors.add(keyframe, &true_depth, record.depth_scale);
+            keyframes += 1;
+        }
+    }
+    Ok(DepthEvaluation { statistics: errors.statistics(), keyframes })
+}

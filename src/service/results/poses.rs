@@ -1,0 +1,80 @@
+//! The trajectories and keyframe poses of a run.
+
+use std::collections::HashMap;
+use std::io::{self, Write};
+use std::path::Path;
+
+use crate::service::atomic_file::write_atomically;
+use crate::service::results::RunRecord;
+use crate::service::trajectory_file::tum_line;
+use crate::slam::mapper::Map;
+use crate::slam::trajectory::StampedPose;
+
+/// First line of `trajectory.txt`.
+pub const FINAL_COMMENT: &str =
+    "world_from_camera of every tracked frame: final pose of its keyframe x relative pose";
+
+/// First line of `trajectory_online.txt`.
+pub const ONLINE_COMMENT: &str = "world_from_camera of every tracked frame as it was published";
+
+/// Every tracked frame on the final pose of its keyframe. A frame whose keyframe the final map
+/// does not hold (it belongs to an earlier epoch) keeps its published pose.
+pub fn final_trajectory(record: &RunRecord) -> Vec<StampedPose> {
+    let places: HashMap<(u32, u64), _> = record
+        .map
+        .keyframes
+        .iter()
+        .map(|k| ((k.epoch, k.keyframe_id), k.world_from_keyframe))
+        .collect();
+    tracked(record, |estimate| match places.get(&(estimate.epoch, estimate.keyframe_id)) {
+        Some(world_from_keyframe) => world_from_keyframe.place(&estimate.keyframe_from_camera),
+        None => estimate.world_from_camera,
+    })
+}
+
+/// Every tracked frame as it was published.
+pub fn online_trajectory(record: &RunRecord) -> Vec<StampedPose> {
+    tracked(record, |estimate| estimate.world_from_camera)
+}
+
+fn tracked(
+    record: &RunRecord,
+    world_from_camera: impl Fn(&crate::slam::pose::PoseEstimate) -> crate::slam::geometry::se3::SE3,
+) -> Vec<StampedPose> {
+    let estimates = record.poses.iter().map(|pose| &pose.estimate);
+    estimates
+        .filter(|estimate| estimate.state.is_tracked())
+        .map(|estimate| StampedPose {
+            nanos: estimate.capture_nanos,
+            world_from_camera: world_from_camera(estimate),
+        })
+        .collect()
+}
+
+/// Writes one line for each keyframe: its pose as in a TUM file, then what a map needs besides.
+pub fn write_keyframes(path: &Path, map: &Map) -> io::Result<()> {
+    write_atomically(path, |file| {
+        writeln!(file, "# world_from_keyframe; lengths in the keyframe x scale = map units")?;
+        writeln!(
+            file,
+            "# timestamp tx ty tz qx qy qz qw scale keyframe_id sequence epoch points state"
+        )?;
+        map.keyframes.iter().try_for_each(|k| {
+            let pose = StampedPose {
+                nanos: k.capture_nanos,
+                world_from_camera: k.world_from_keyframe.rigid,
+            };
+            writeln!(
+                file,
+                "{} {} {} {} {} {} {:?}",
+                tum_line(&pose),
+                k.world_from_keyframe.scale,
+                k.keyframe_id,
+                k.sequence,
+                k.epoch,
+                k.points.len(),
+                k.map_state,
+            )
+        })
+    })
+}

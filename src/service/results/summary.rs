@@ -1,0 +1,227 @@
+//! `summary.json`: the figures of a run. A key without meaning in a mode is null.
+
+use serde::{Deserialize, Serialize};
+
+use crate::service::results::{RecordedPose, RunMode, RunRecord};
+use crate::slam::evaluation::TrajectoryEvaluation;
+use crate::slam::evaluation::depth_error::DepthStatistics;
+use crate::slam::evaluation::statistics::percentile;
+use crate::slam::pose::TrackingState;
+
+/// Percentiles of a time in milliseconds.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Percentiles {
+    /// Median.
+    pub p50: f64,
+    /// 95 of 100 are not longer.
+    pub p95: f64,
+    /// 99 of 100 are not longer.
+    pub p99: f64,
+    /// Longest.
+    pub max: f64,
+}
+
+impl Percentiles {
+    /// Percentiles (nearest rank) of times in nanoseconds; `None` of none.
+    pub fn of(nanos: impl Iterator<Item = u64>) -> Option<Self> {
+        let mut millis: Vec<f64> = nanos.map(|n| n as f64 * 1e-6).collect();
+        millis.sort_by(f64::total_cmp);
+        let at = |share| percentile(&millis, share);
+        Some(Self { p50: at(0.5)?, p95: at(0.95)?, p99: at(0.99)?, max: at(1.0)? })
+    }
+}
+
+/// A trajectory against ground truth; all null where there is none. Lengths in the ground truth's
+/// unit (metres), errors after the alignment.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct TrajectorySummary {
+    /// Poses that have ground truth.
+    pub matched_poses: Option<u64>,
+    /// Root mean square position error.
+    pub ate_rmse_m: Option<f64>,
+    /// Mean position error.
+    pub ate_mean_m: Option<f64>,
+    /// Median position error.
+    pub ate_median_m: Option<f64>,
+    /// Largest position error.
+    pub ate_max_m: Option<f64>,
+    /// Factor that multiplies our lengths to give the truth's.
+    pub ate_scale: Option<f64>,
+    /// Root mean square translation error from frame to frame, metres.
+    pub rpe_translation: Option<f64>,
+    /// Root mean square rotation error from frame to frame, degrees.
+    pub rpe_rotation_deg: Option<f64>,
+    /// Root mean square translation error over 1 s, metres.
+    pub rpe_translation_1s: Option<f64>,
+    /// Root mean square rotation error over 1 s, degrees.
+    pub rpe_rotation_deg_1s: Option<f64>,
+    /// Length of the true way between matched poses.
+    pub path_length_m: Option<f64>,
+    /// Largest over smallest scale of consecutive windows of 100 frames.
+    pub window_scale_ratio: Option<f64>,
+    /// Median position error of windows of 30 frames, each aligned by itself.
+    pub window_error_m: Option<f64>,
+}
+
+impl From<&TrajectoryEvaluation> for TrajectorySummary {
+    fn from(evaluation: &TrajectoryEvaluation) -> Self {
+        Self {
+            matched_poses: Some(evaluation.association.pairs.len() as u64),
+            ate_rmse_m: Some(evaluation.ate.rmse),
+            ate_mean_m: Some(evaluation.ate.mean),
+            ate_median_m: Some(evaluation.ate.median),
+            ate_max_m: Some(evaluation.ate.max),
+            ate_scale: Some(evaluation.alignment.scale),
+            rpe_translation: Some(evaluation.rpe_translation.rmse),
+            rpe_rotation_deg: Some(evaluation.rpe_rotation_deg.rmse),
+            rpe_translation_1s: evaluation.rpe_translation_1s.map(|s| s.rmse),
+            rpe_rotation_deg_1s: evaluation.rpe_rotation_deg_1s.map(|s| s.rmse),
+            path_length_m: Some(evaluation.path_length),
+            window_scale_ratio: evaluation.window_scale_ratio,
+            window_error_m: evaluation.window_error,
+        }
+    }
+}
+
+/// The figures of a run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Summary {
+    /// How it was driven.
+    pub mode: RunMode,
+    /// Where the frames came from.
+    pub source: String,
+    /// Frames that the source gave.
+    pub frames_in: u64,
+    /// Frames whose pose is claimed.
+    pub frames_tracked: u64,
+    /// Of them those whose pose is worse than it should be.
+    pub frames_degraded: u64,
+    /// Frames before the map could be trusted.
+    pub frames_initializing: u64,
+    /// Frames whose pose is not claimed.
+    pub frames_lost: u64,
+    /// Frames that the tracker never saw.
+    pub frames_dropped: u64,
+    /// Holes in the source's sequence.
+    pub gaps: u64,
+    /// How often tracking was lost.
+    pub lost_count: u64,
+    /// From the first frame to the first whose pose is claimed; null where none is.
+    pub initialization_secs: Option<f64>,
+    /// Keyframes of the final map.
+    pub keyframes: u64,
+    /// Points of `map.ply`.
+    pub points: u64,
+    /// Life of the map at the end, from 0.
+    pub epoch: u32,
+    /// From a frame's stamp to its pose's publication.
+    pub latency_ms: Option<Percentiles>,
+    /// Time that the tracker was allowed for a frame.
+    pub deadline_ms: Option<f64>,
+    /// Frames published later than that.
+    pub deadline_misses: Option<u64>,
+    /// Processes that were started again.
+    pub restarts: u64,
+    /// Time in the tracker for a frame.
+    pub track_ms: Option<Percentiles>,
+    /// Time in the mapper for a frame.
+    pub map_ms: Option<Percentiles>,
+    /// First to last stamp.
+    pub recorded_secs: f64,
+    /// Time that the run took.
+    pub wall_secs: f64,
+    /// Recorded duration over wall time.
+    pub realtime_factor: Option<f64>,
+    /// Largest resident memory of all processes together, 2²⁰ bytes.
+    pub peak_rss_mb: Option<f64>,
+    /// `trajectory.txt` against ground truth.
+    #[serde(flatten)]
+    pub trajectory: TrajectorySummary,
+    /// `trajectory_online.txt` against ground truth.
+    pub online: TrajectorySummary,
+    /// Pixels of keyframes whose true depth is known.
+    pub depth_pixels: Option<u64>,
+    /// Median relative depth error over them.
+    pub depth_relative_error_median: Option<f64>,
+    /// The same over the half with the smallest σ/d.
+    pub depth_relative_error_median_best_half: Option<f64>,
+    /// Share of them whose true inverse depth is within 1, 2 and 3 reported σ.
+    pub depth_coverage: Option<[f64; 3]>,
+    /// Share of the keyframes' pixels that have depth.
+    pub depth_density: Option<f64>,
+}
+
+impl Summary {
+    /// The figures of `record`, with `points` in the cloud and what the evaluations gave.
+    pub fn new(
+        record: &RunRecord,
+        points: usize,
+        trajectory: Option<&TrajectoryEvaluation>,
+        online: Option<&TrajectoryEvaluation>,
+        depth: Option<DepthStatistics>,
+    ) -> Self {
+        let count = |is: fn(TrackingState) -> bool| count_states(&record.poses, is);
+        let (recorded_secs, wall_secs) =
+            (record.recorded_nanos as f64 * 1e-9, record.wall_nanos as f64 * 1e-9);
+        const BYTES_PER_MB: f64 = 1_048_576.0;
+        Self {
+            mode: record.mode,
+            source: record.source.clone(),
+            frames_in: record.frames_in,
+            frames_tracked: count(TrackingState::is_tracked),
+            frames_degraded: count(|s| matches!(s, TrackingState::Degraded(_))),
+            frames_initializing: count(|s| s == TrackingState::Initializing),
+            frames_lost: count(is_lost),
+            frames_dropped: record.frames_dropped,
+            gaps: record.gaps,
+            lost_count: count_losses(&record.poses),
+            initialization_secs: initialization_secs(&record.poses),
+            keyframes: record.map.keyframes.len() as u64,
+            points: points as u64,
+            epoch: record.poses.last().map_or(0, |pose| pose.estimate.epoch),
+            latency_ms: Percentiles::of(record.poses.iter().filter_map(|p| p.latency_nanos)),
+            deadline_ms: record.deadline_nanos.map(|n| n as f64 * 1e-6),
+            deadline_misses: record.deadline_misses,
+            restarts: record.restarts,
+            track_ms: Percentiles::of(record.poses.iter().filter_map(|p| p.track_nanos)),
+            map_ms: Percentiles::of(record.map_nanos.iter().copied()),
+            recorded_secs,
+            wall_secs,
+            realtime_factor: (wall_secs > 0.0).then(|| recorded_secs / wall_secs),
+            peak_rss_mb: record.peak_rss_bytes.map(|bytes| bytes as f64 / BYTES_PER_MB),
+            trajectory: trajectory.map(TrajectorySummary::from).unwrap_or_default(),
+            online: online.map(TrajectorySummary::from).unwrap_or_default(),
+            depth_pixels: depth.map(|d| d.compared as u64),
+            depth_relative_error_median: depth.map(|d| d.relative_error_median),
+            depth_relative_error_median_best_half: depth.map(|d| d.relative_error_median_best_half),
+            depth_coverage: depth.map(|d| d.coverage),
+            depth_density: depth.map(|d| d.density),
+        }
+    }
+}
+
+fn is_lost(state: TrackingState) -> bool {
+    matches!(state, TrackingState::Lost(_))
+}
+
+fn count_states(poses: &[RecordedPose], is: fn(TrackingState) -> bool) -> u64 {
+    poses.iter().filter(|pose| is(pose.estimate.state)).count() as u64
+}
+
+/// Entries into Lost.
+fn count_losses(poses: &[RecordedPose]) -> u64 {
+    let mut was_lost = false;
+    let mut losses = 0;
+    for pose in poses {
+        let lost = is_lost(pose.estimate.state);
+        losses += u64::from(lost && !was_lost);
+        was_lost = lost;
+    }
+    losses
+}
+
+fn initialization_secs(poses: &[RecordedPose]) -> Option<f64> {
+    let first = poses.first()?.estimate.capture_nanos;
+    let tracked = poses.iter().find(|pose| pose.estimate.state.is_tracked())?;
+    Some((tracked.estimate.capture_nanos - first) as f64 * 1e-9)
+}

@@ -1,0 +1,300 @@
+//! Trajectory files: TUM (`timestamp tx ty tz qx qy qz qw`) in and out, EuRoC ground truth in.
+//!
+//! Stamps are nanoseconds as integers and numbers have as many digits as bring the same bits back,
+//! so that two runs can be compared byte by byte.
+
+use std::fs::File;
+use std::io::{self, Read, Write};
+use std::path::{Path, PathBuf};
+
+use crate::service::atomic_file::write_atomically;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::trajectory::StampedPose;
+
+/// Largest file that is read: 18 hours of poses at 30 Hz. A larger one is no trajectory.
+const MAX_FILE_BYTES: u64 = 256 << 20;
+
+const NANOS_PER_SEC: i64 = 1_000_000_000;
+
+/// Why a trajectory file cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum TrajectoryFileError {
+    /// The file cannot be opened or read.
+    #[error("cannot read {path}: {source}")]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// More bytes than any trajectory has.
+    #[error("{path} is larger than {} MiB: is it a trajectory?", MAX_FILE_BYTES >> 20)]
+    TooLarge {
+        /// The file.
+        path: PathBuf,
+    },
+    /// A line that is no pose.
+    #[error("{path}:{line}: {fault}")]
+    Line {
+        /// The file.
+        path: PathBuf,
+        /// Its line, from 1.
+        line: usize,
+        /// What is wrong.
+        fault: LineFault,
+    },
+    /// A file without a pose.
+    #[error("{path} has no poses: expected lines 'timestamp tx ty tz qx qy qz qw'")]
+    Empty {
+        /// The file.
+        path: PathBuf,
+    },
+}
+
+/// What is wrong with a line.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum LineFault {
+    /// Bytes that are no text.
+    #[error("not text: expected 'timestamp tx ty tz qx qy qz qw'")]
+    NotText,
+    /// Another number of columns.
+    #[error("{found} columns, expected {expected}")]
+    Columns {
+        /// Columns found.
+        found: usize,
+        /// Columns expected, in words.
+        expected: &'static str,
+    },
+    /// A column that is no finite number.
+    #[error("'{0}' is not a finite number")]
+    Number(String),
+    /// A stamp that does not fit into 64 bits of nanoseconds.
+    #[error("'{0}' is not a timestamp in {1}")]
+    Stamp(String, &'static str),
+    /// Earlier than the line before.
+    #[error("timestamp {0} is earlier than the one before: sort the file by time")]
+    Order(String),
+    /// A quaternion without a direction.
+    #[error("the quaternion has no length: expected qx qy qz qw of length 1")]
+    Quaternion,
+}
+
+/// Reads a trajectory in TUM layout, or in EuRoC's (`nanoseconds, p x y z, q w x y z, …`) where
+/// the columns are separated by commas. Poses are returned in order of their stamps.
+pub fn read_trajectory(path: &Path) -> Result<Vec<StampedPose>, TrajectoryFileError> {
+    let owned = || path.to_path_buf();
+    let mut bytes = Vec::new();
+    File::open(path)
+        .and_then(|file| file.take(MAX_FILE_BYTES + 1).read_to_end(&mut bytes))
+        .map_err(|source| TrajectoryFileError::Read { path: owned(), source })?;
+    if bytes.len() as u64 > MAX_FILE_BYTES {
+        return Err(TrajectoryFileError::TooLarge { path: owned() });
+    }
+    let poses = parse_trajectory(&bytes).map_err(|(line, fault)| TrajectoryFileError::Line {
+        path: owned(),
+        line,
+        fault,
+    })?;
+    if poses.is_empty() {
+        return Err(TrajectoryFileError::Empty { path: owned() });
+    }
+    Ok(poses)
+}
+
+/// The poses of a file's bytes, or the line (from 1) that is at fault.
+pub fn parse_trajectory(bytes: &[u8]) -> Result<Vec<StampedPose>, (usize, LineFault)> {
+    let mut poses: Vec<StampedPose> = Vec::new();
+    for (i, line) in bytes.split(|&b| b == b'\n').enumerate() {
+        let at = |fault| (i + 1, fault);
+        let line = std::str::from_utf8(line).map_err(|_| at(LineFault::NotText))?.trim();
+        if line.is_empty() || line.starts_with('#') {
+            continue;
+        }
+        let pose = parse_pose(line).map_err(at)?;
+        if poses.last().is_some_and(|last| pose.nanos < last.nanos) {
+            let stamp = line.split([' ', '\t', ',']).next().unwrap_or_default();
+            return Err(at(LineFault::Order(shortened(stamp))));
+        }
+        poses.push(pose);
+    }
+    Ok(poses)
+}
+
+fn parse_pose(line: &str) -> Result<StampedPose, LineFault> {
+    let is_euroc = line.contains(',');
+    let columns: Vec<&str> = if is_euroc {
+        line.split(',').map(str::trim).collect()
+    } else {
+        line.split_whitespace().collect()
+    };
+    let (fits, expected) = if is_euroc {
+        (columns.len() >= 8, "at least 8: nanoseconds, px, py, pz, qw, qx, qy, qz")
+    } else {
+        (columns.len() == 8, "8: timestamp tx ty tz qx qy qz qw")
+    };
+    if !fits {
+        return Err(LineFault::Columns { found: columns.len(), expected });
+    }
+    let nanos = if is_euroc {
+        let unit = "whole nanoseconds";
+        columns[0].parse().map_err(|_| LineFault::Stamp(shortened(columns[0]), unit))?
+    } else {
+        let fault = || LineFault::Stamp(shortened(columns[0]), "seconds");
+        nanos_from_secs(columns[0]).ok_or_else(fault)?
+    };
+    let mut numbers = [0.0; 7];
+    for (number, column) in numbers.iter_mut().zip(&columns[1..]) {
+        *number = parse_finite(column)?;
+    }
+    let [tx, ty, tz, a, b, c, d] = numbers;
+    let quaternion_xyzw = if is_euroc { [b, c, d, a] } else { [a, b, c, d] };
+    let world_from_camera =
+        SE3::try_from_parts(quaternion_xyzw, [tx, ty, tz]).ok_or(LineFault::Quaternion)?;
+    Ok(StampedPose { nanos, world_from_camera })
+}
+
+fn parse_finite(column: &str) -> Result<f64, LineFault> {
+    let number: Option<f64> = column.parse().ok();
+    number.filter(|n| n.is_finite()).ok_or_else(|| LineFault::Number(shortened(column)))
+}
+
+/// At most the first characters of a column: a message stays one readable line.
+fn shortened(column: &str) -> String {
+    const LONGEST: usize = 40;
+    if column.chars().count() <= LONGEST {
+        return column.to_owned();
+    }
+    column.chars().take(LONGEST).chain("…".chars()).collect()
+}
+
+/// Nanoseconds of a stamp in seconds: exact for plain decimals of up to nine digits after the
+/// point, through f64 for an exponent (`1.3e+09`), rounded to the nearest otherwise.
+pub fn nanos_from_secs(text: &str) -> Option<i64> {
+    exact_nanos(text).or_else(|| {
+        let nanos = text.parse::<f64>().ok()? * NANOS_PER_SEC as f64;
+        // i64::MAX as f64 is 2⁶³, the first value that does not fit.
+        let fits = nanos.abs() < i64::MAX as f64;
+        fits.then(|| nanos.round() as i64)
+    })
+}
+
+fn exact_nanos(text: &str) -> Option<i64> {
+    let (negative, digits) = match text.strip_prefix('-') {
+        Some(rest) => (true, rest),
+        None => (false, text),
+    };
+    let (secs, fraction) = digits.split_once('.').unwrap_or((digits, ""));
+    let plain = |part: &str| part.bytes().all(|b| b.is_ascii_digit());
+    if secs.is_empty() || !plain(secs) || !plain(fraction) {
+        return None;
+    }
+    const DIGITS: usize = 9;
+    let kept = &fraction[..fraction.len().min(DIGITS)];
+    let rounds_up = fraction.as_bytes().get(DIGITS).is_some_and(|&digit| digit >= b'5');
+    let nanos = format!("{kept:0<DIGITS$}").parse::<i64>().ok()? + i64::from(rounds_up);
+    let total = secs.parse::<i64>().ok()?.checked_mul(NANOS_PER_SEC)?.checked_add(nanos)?;
+    Some(if negative { -total } else { total })
+}
+
+/// A stamp as seconds with nine digits after the point.
+pub fn secs_from_nanos(nanos: i64) -> String {
+    let (sign, magnitude) = (if nanos < 0 { "-" } else { "" }, nanos.unsigned_abs());
+    let per_sec = NANOS_PER_SEC.unsigned_abs();
+    format!("{sign}{}.{:09}", magnitude / per_sec, magnitude % per_sec)
+}
+
+/// One pose as a TUM line without its end: the shortest digits that bring the same bits back.
+pub fn tum_line(pose: &StampedPose) -> String {
+    let t = &pose.world_from_camera.translation;
+    let [qx, qy, qz, qw] = pose.world_from_camera.quaternion_xyzw();
+    format!("{} {} {} {} {qx} {qy} {qz} {qw}", secs_from_nanos(pose.nanos), t.x, t.y, t.z)
+}
+
+/// Writes a trajectory in TUM layout. `comment` is one line without the `#`.
+pub fn write_trajectory(path: &Path, comment: &str, poses: &[StampedPose]) -> io::Result<()> {
+    write_atomically(path, |file| {
+        writeln!(file, "# {comment}")?;
+        writeln!(file, "# timestamp tx ty tz qx qy qz qw")?;
+        poses.iter().try_for_each(|pose| writeln!(file, "{}", tum_line(pose)))
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector6;
+    use proptest::prelude::*;
+
+    use super::*;
+
+    #[test]
+    fn stamps_keep_every_nanosecond() {
+        for (text, nanos) in [
+            ("1305033527.670034123", 1_305_033_527_670_034_123),
+            ("1305033527.67", 1_305_033_527_670_000_000),
+            ("0.0333333335", 33_333_334),
+            ("12", 12_000_000_000),
+            ("-0.5", -500_000_000),
+            ("1e-3", 1_000_000),
+            ("1.305031102175304e+09", 1_305_031_102_175_304_000),
+        ] {
+            let read = nanos_from_secs(text).unwrap();
+            // Only what went through f64 may round: to 2⁻²² s at today's stamps.
+            assert!((read - nanos).abs() <= if text.contains('e') { 256 } else { 0 }, "{text}");
+        }
+        for text in ["", ".", "-", "1.2.3", "nan", "inf", "9e99", "99999999999999999999", "1,5"] {
+            assert_eq!(nanos_from_secs(text), None, "{text}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn a_stamp_comes_back(nanos in i64::MIN + 1..i64::MAX) {
+            prop_assert_eq!(nanos_from_secs(&secs_from_nanos(nanos)), Some(nanos));
+        }
+
+        #[test]
+        fn a_line_is_a_fixed_point(xi in proptest::array::uniform6(-3.0f64..3.0), nanos in 0i64..i64::MAX) {
+            // The reader may change the last bit of a quaternion when it normalises it; the
+            // translation and the stamp come back as they are.
+            let pose = StampedPose { nanos, world_from_camera: SE3::exp(&Vector6::from(xi)) };
+            let read = parse_pose(&tum_line(&pose)).unwrap();
+            prop_assert_eq!(read.nanos, pose.nanos);
+            prop_assert_eq!(read.world_from_camera.translation, pose.world_from_camera.translation);
+            let turned = read.world_from_camera.rotation.angle_to(&pose.world_from_camera.rotation);
+            prop_assert!(turned < 1e-7);
+        }
+
+        #[test]
+        fn any_bytes_are_read_or_refused(bytes in proptest::collection::vec(any::<u8>(), 0..200)) {
+            let _ = parse_trajectory(&bytes);
+        }
+    }
+
+    #[test]
+    fn both_layouts_are_read() {
+        let tum =
+            parse_trajectory(b"# c\n\n1.5 1 2 3 0 0 0 1\r\n2.5\t1 2 3 0.5 0.5 0.5 0.5\n").unwrap();
+        let euroc = parse_trajectory(
+            b"#t\n1500000000,1,2,3,1,0,0,0,9,9\n2500000000, 1, 2, 3, .5, .5, .5, .5\n",
+        );
+        assert_eq!(euroc.unwrap(), tum);
+        assert_eq!(tum[0].nanos, 1_500_000_000);
+    }
+
+    #[test]
+    fn faults_name_their_line() {
+        let fault = |text: &str| parse_trajectory(text.as_bytes()).unwrap_err();
+        assert_eq!(fault("# c\n1 2 3\n").0, 2);
+        assert!(matches!(fault("1 2 3").1, LineFault::Columns { found: 3, .. }));
+        assert!(matches!(fault("1 0 0 0 0 0 0 1 9").1, LineFault::Columns { found: 9, .. }));
+        assert!(matches!(fault("1,2,3").1, LineFault::Columns { found: 3, .. }));
+        assert_eq!(fault("1 0 x 0 0 0 0 1").1, LineFault::Number("x".into()));
+        assert_eq!(fault("1 0 NaN 0 0 0 0 1").1, LineFault::Number("NaN".into()));
+        assert!(matches!(fault("t 0 0 0 0 0 0 1").1, LineFault::Stamp(..)));
+        assert!(matches!(fault("1.5,0,0,0,1,0,0,0").1, LineFault::Stamp(..)));
+        assert_eq!(fault("1 0 0 0 0 0 0 0").1, LineFault::Quaternion);
+        let order = fault("2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n");
+        assert_eq!(order, (2, LineFault::Order("1".into())));
+        assert_eq!(parse_trajectory(b"\xff\xfe").unwrap_err(), (1, LineFault::NotText));
+    }
+}

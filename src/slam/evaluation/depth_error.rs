@@ -1,0 +1,193 @@
+//! Semi-dense depth against true depth, and the reported variances against the errors made.
+
+use crate::slam::evaluation::statistics::median;
+use crate::slam::image::buffer::Image;
+use crate::slam::keyframe::Keyframe;
+
+/// Where a keyframe's scale comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum DepthScale {
+    /// The median ratio of true to estimated depth: the map has no metres of its own.
+    MedianRatio,
+    /// The keyframe's pose: the poses were given in metres.
+    Given,
+}
+
+/// Pixels of one or more keyframes whose true depth is known.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct DepthErrors {
+    /// `|z·s − z_true| / z_true`.
+    relative_error: Vec<f64>,
+    /// σ/d as reported.
+    relative_std_dev: Vec<f64>,
+    /// |error of d| / σ.
+    whitened_error: Vec<f64>,
+    /// Points, with or without true depth.
+    points: usize,
+    /// Pixels of the keyframes.
+    pixels: usize,
+}
+
+/// Statistics of depth errors.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct DepthStatistics {
+    /// Pixels compared.
+    pub compared: usize,
+    /// Median of `|z·s − z_true| / z_true` over all pixels with depth.
+    pub relative_error_median: f64,
+    /// The same over the half with the smallest σ/d.
+    pub relative_error_median_best_half: f64,
+    /// Share of the pixels whose inverse depth is within 1, 2 and 3 reported σ of the truth.
+    pub coverage: [f64; 3],
+    /// Share of the keyframes' pixels that have depth.
+    pub density: f64,
+}
+
+impl DepthErrors {
+    /// Adds the points of one keyframe. `true_depth` is in metres, 0 or not finite where unknown,
+    /// rectified like the keyframe; one of another size is not compared and adds nothing.
+    pub fn add(&mut self, keyframe: &Keyframe, true_depth: &Image<f32>, scale: DepthScale) {
+        let (width, height) = (true_depth.width(), true_depth.height());
+        if (width, height) != (keyframe.intrinsics.width, keyframe.intrinsics.height) {
+            return;
+        }
+        self.points += keyframe.points.len();
+        self.pixels += width * height;
+        let compared: Vec<Compared> = keyframe
+            .points
+            .iter()
+            .filter(|p| usize::from(p.u) < width && usize::from(p.v) < height)
+            .filter_map(|p| {
+                let z_true = f64::from(true_depth.at(usize::from(p.u), usize::from(p.v)));
+                let d = f64::from(p.inverse_depth);
+                let sigma = f64::from(p.variance).sqrt();
+                let usable = z_true > 0.0 && z_true.is_finite() && d > 0.0 && sigma.is_finite();
+                usable.then_some(Compared { z_true, d, sigma })
+            })
+            .collect();
+        let Some(s) = metres_per_unit(keyframe, &compared, scale) else { return };
+        for Compared { z_true, d, sigma } in compared {
+            self.relative_error.push((s / d - z_true).abs() / z_true);
+            self.relative_std_dev.push(sigma / d);
+            // In keyframe units the true inverse depth is s / z_true.
+            self.whitened_error.push((d - s / z_true).abs() / sigma.max(f64::MIN_POSITIVE));
+        }
+    }
+
+    /// The statistics; `None` where nothing could be compared.
+    pub fn statistics(&self) -> Option<DepthStatistics> {
+        let compared = self.relative_error.len();
+        let mut by_std_dev: Vec<usize> = (0..compared).collect();
+        by_std_dev.sort_by(|&i, &j| self.relative_std_dev[i].total_cmp(&self.relative_std_dev[j]));
+        let best: Vec<f64> =
+            by_std_dev[..compared.div_ceil(2)].iter().map(|&i| self.relative_error[i]).collect();
+        let within = |sigmas: f64| {
+            let inside = self.whitened_error.iter().filter(|&&e| e <= sigmas).count();
+            inside as f64 / compared as f64
+        };
+        Some(DepthStatistics {
+            compared,
+            relative_error_median: median(&self.relative_error)?,
+            relative_error_median_best_half: median(&best)?,
+            coverage: [within(1.0), within(2.0), within(3.0)],
+            density: self.points as f64 / self.pixels as f64,
+        })
+    }
+}
+
+/// One pixel: true depth (metres), estimated inverse depth and its σ (keyframe units).
+struct Compared {
+    z_true: f64,
+    d: f64,
+    sigma: f64,
+}
+
+/// Metres in a keyframe unit.
+fn metres_per_unit(keyframe: &Keyframe, compared: &[Compared], scale: DepthScale) -> Option<f64> {
+    match scale {
+        DepthScale::Given => Some(keyframe.world_from_keyframe.scale),
+        DepthScale::MedianRatio => {
+            median(&compared.iter().map(|c| c.z_true * c.d).collect::<Vec<_>>())
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::geometry::intrinsics::Intrinsics;
+    use crate::slam::geometry::se3::SE3;
+    use crate::slam::geometry::sim3::Sim3;
+    use crate::slam::keyframe::{DepthPoint, MapState};
+
+    fn keyframe(points: Vec<DepthPoint>, scale: f64) -> Keyframe {
+        Keyframe {
+            keyframe_id: 0,
+            epoch: 0,
+            revision: 0,
+            sequence: 0,
+            capture_nanos: 0,
+            map_state: MapState::Established,
+            world_from_keyframe: Sim3::new(SE3::identity(), scale),
+            intrinsics: Intrinsics {
+                fx: 20.0,
+                fy: 20.0,
+                cx: 10.0,
+                cy: 10.0,
+                width: 20,
+                height: 20,
+            },
+            image: vec![0; 400],
+            points,
+        }
+    }
+
+    fn point(u: u16, inverse_depth: f32, variance: f32) -> DepthPoint {
+        DepthPoint { u, v: 3, inverse_depth, variance, intensity: 0.0 }
+    }
+
+    #[test]
+    fn errors_by_hand() {
+        // True depth 4 m everywhere, unit 2 m: the right inverse depth is 0.5.
+        let truth = Image::filled(20, 20, 4.0f32);
+        let points = vec![
+            point(0, 0.5, 0.01),
+            point(1, 0.5, 0.01),
+            point(2, 0.5, 0.01),
+            point(3, 0.625, 0.01), // z = 3.2 m: 20 % off, 1.25 σ
+            point(4, 1.0, 0.04),   // z = 2 m: 50 % off, 2.5 σ
+            point(500, 1.0, 0.04), // outside
+        ];
+        for scale in [DepthScale::MedianRatio, DepthScale::Given] {
+            let mut errors = DepthErrors::default();
+            errors.add(&keyframe(points.clone(), 2.0), &truth, scale);
+            let s = errors.statistics().unwrap();
+            assert_eq!(s.compared, 5);
+            assert!(s.relative_error_median < 1e-9);
+            // The smallest σ/d are 0.16 (20 % off) and two of the three of 0.2.
+            assert!(s.relative_error_median_best_half < 1e-9);
+            assert_eq!(s.coverage, [0.6, 0.8, 1.0]);
+            assert!((s.density - 6.0 / 400.0).abs() < 1e-12);
+        }
+        let mut errors = DepthErrors::default();
+        errors.add(&keyframe(points, 1.0), &truth, DepthScale::Given);
+        assert!((errors.statistics().unwrap().relative_error_median - 0.5).abs() < 1e-6);
+    }
+
+    #[test]
+    fn pixels_without_truth_and_hostile_values_are_left_out() {
+        let mut truth = Image::filled(20, 20, 0.0f32);
+        truth.pixels_mut()[3 * 20] = f32::NAN;
+        truth.pixels_mut()[3 * 20 + 1] = 2.0;
+        let points = vec![point(0, 1.0, 0.1), point(1, f32::NAN, 0.1), point(2, 0.5, 0.1)];
+        let mut errors = DepthErrors::default();
+        errors.add(&keyframe(points, 1.0), &truth, DepthScale::MedianRatio);
+        assert_eq!(errors.statistics(), None);
+        errors.add(
+            &keyframe(vec![point(1, 0.5, 0.1)], 1.0),
+            &Image::filled(4, 4, 2.0),
+            DepthScale::Given,
+        );
+        assert_eq!(errors.statistics(), None);
+    }
+}

@@ -1,0 +1,232 @@
+//! How good an estimate is: trajectories against ground truth, depth against true depth.
+//!
+//! The trajectory figures are those of the Python package `evo` on the same files: nearest stamps
+//! without interpolation ([`association`]), Umeyama alignment ([`umeyama`]), absolute and relative
+//! errors ([`trajectory_error`]). [`windows`] adds how the scale wanders, [`depth_error`] what the
+//! depth maps and their variances are worth.
+
+pub mod association;
+pub mod depth_error;
+pub mod statistics;
+pub mod trajectory_error;
+pub mod umeyama;
+pub mod windows;
+
+use crate::slam::evaluation::association::{Association, associate};
+use crate::slam::evaluation::statistics::ErrorStatistics;
+use crate::slam::evaluation::trajectory_error::{
+    absolute_errors, path_length, relative_errors, successive_pairs, timed_pairs,
+};
+use crate::slam::evaluation::umeyama::{Alignment, AlignmentError, umeyama};
+use crate::slam::evaluation::windows::{scale_windows, window_error};
+use crate::slam::geometry::sim3::Sim3;
+use crate::slam::trajectory::StampedPose;
+
+/// Largest difference of two stamps that are taken for the same instant: 0.02 s, less than half a
+/// frame at 20 Hz and the habit of the field's tools.
+pub const MAX_DIFFERENCE_NANOS: i64 = 20_000_000;
+
+/// Interval of the second relative error: long enough that drift shows above noise.
+const INTERVAL_NANOS: i64 = 1_000_000_000;
+
+/// Why two trajectories cannot be compared.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum EvaluationError {
+    /// A stamp or pose that is no number; a broken file or a diverged estimate.
+    #[error("pose {index} of the {which} is not finite: remove it or mend its source")]
+    NotFinite {
+        /// `estimate` or `ground truth`.
+        which: &'static str,
+        /// Its place in the trajectory, from 0.
+        index: usize,
+    },
+    /// The trajectories share no time.
+    #[error(
+        "only {found} of {estimated} poses have ground truth within {max_difference_secs} s (at least {needed} are needed): check that both use the same clock, or allow a larger difference"
+    )]
+    TooFewMatches {
+        /// Matches found.
+        found: usize,
+        /// Poses of the estimate.
+        estimated: usize,
+        /// Matches needed.
+        needed: usize,
+        /// Largest difference of stamps that was allowed, seconds.
+        max_difference_secs: f64,
+    },
+    /// The positions do not fix the alignment.
+    #[error(transparent)]
+    Alignment(#[from] AlignmentError),
+}
+
+/// What a trajectory is worth against the ground truth. Lengths are in the ground truth's unit.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TrajectoryEvaluation {
+    /// Which poses were compared.
+    pub association: Association,
+    /// `truth_from_estimate`, by the alignment that was asked for.
+    pub alignment: Sim3,
+    /// Position errors after alignment, one for each match.
+    pub absolute: Vec<f64>,
+    /// Statistics of [`Self::absolute`]: the ATE.
+    pub ate: ErrorStatistics,
+    /// Relative translation error from match to match (evo's delta of 1 frame, all pairs).
+    pub rpe_translation: ErrorStatistics,
+    /// Relative rotation error from match to match, degrees.
+    pub rpe_rotation_deg: ErrorStatistics,
+    /// Relative translation error over 1 s; `None` where no two matches are 1 s apart.
+    pub rpe_translation_1s: Option<ErrorStatistics>,
+    /// Relative rotation error over 1 s, degrees.
+    pub rpe_rotation_deg_1s: Option<ErrorStatistics>,
+    /// Length of the way between the matched ground-truth positions.
+    pub path_length: f64,
+    /// Scale of each window of 100 matches, by the index of its first match.
+    pub window_scales: Vec<(usize, f64)>,
+    /// Largest over smallest of [`Self::window_scales`]; `None` below two windows.
+    pub window_scale_ratio: Option<f64>,
+    /// Median position error of windows of 30 matches, each aligned by itself.
+    pub window_error: Option<f64>,
+}
+
+/// Compares `estimate` with `truth`, both in order of their stamps.
+pub fn evaluate_trajectory(
+    estimate: &[StampedPose],
+    truth: &[StampedPose],
+    alignment: Alignment,
+    max_difference_nanos: i64,
+) -> Result<TrajectoryEvaluation, EvaluationError> {
+    check_finite(estimate, "estimate")?;
+    check_finite(truth, "ground truth")?;
+    let association = associate(estimate, truth, max_difference_nanos);
+    let needed = alignment.poses_needed().max(2);
+    if association.pairs.len() < needed {
+        return Err(EvaluationError::TooFewMatches {
+            found: association.pairs.len(),
+            estimated: estimate.len(),
+            needed,
+            max_difference_secs: max_difference_nanos as f64 * 1e-9,
+        });
+    }
+    let (estimated, true_poses) = association.select(estimate, truth);
+    let truth_from_estimate = umeyama(&estimated, &true_poses, alignment)?;
+    let absolute = absolute_errors(&estimated, &true_poses, &truth_from_estimate);
+    let scale = truth_from_estimate.scale;
+    let frames = relative_errors(&estimated, &true_poses, &successive_pairs(&estimated), scale);
+    let second_pairs = timed_pairs(&estimated, INTERVAL_NANOS, max_difference_nanos);
+    let seconds = relative_errors(&estimated, &true_poses, &second_pairs, scale);
+    let window_scales = scale_windows(&estimated, &true_poses);
+    let unusable = AlignmentError::NotFinite;
+    Ok(TrajectoryEvaluation {
+        ate: ErrorStatistics::of(&absolute).ok_or(unusable.clone())?,
+        rpe_translation: ErrorStatistics::of(&frames.translation).ok_or(unusable.clone())?,
+        rpe_rotation_deg: ErrorStatistics::of(&frames.rotation_deg).ok_or(unusable)?,
+        rpe_translation_1s: ErrorStatistics::of(&seconds.translation),
+        rpe_rotation_deg_1s: ErrorStatistics::of(&seconds.rotation_deg),
+        path_length: path_length(&true_poses),
+        window_scale_ratio: windows::scale_ratio(&window_scales),
+        window_scales,
+        window_error: window_error(&estimated, &true_poses, alignment),
+        alignment: truth_from_estimate,
+        association,
+        absolute,
+    })
+}
+
+fn check_finite(poses: &[StampedPose], which: &'static str) -> Result<(), EvaluationError> {
+    match poses.iter().position(|pose| !pose.world_from_camera.is_finite()) {
+        Some(index) => Err(EvaluationError::NotFinite { which, index }),
+        None => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{Vector3, Vector6};
+
+    use super::*;
+    use crate::slam::geometry::se3::SE3;
+
+    /// A winding path at 30 Hz.
+    fn path(frames: usize) -> Vec<StampedPose> {
+        let pose = |i: usize| {
+            let t = i as f64 / 30.0;
+            let position = [t.sin(), 0.4 * (1.7 * t).cos(), 0.3 * t];
+            let rotation = [0.2 * t.cos(), 0.1 * t, 0.3 * (0.5 * t).sin()];
+            let mut world_from_camera =
+                SE3::exp(&Vector6::new(0.0, 0.0, 0.0, rotation[0], rotation[1], rotation[2]));
+            world_from_camera.translation = Vector3::from(position);
+            StampedPose { nanos: i as i64 * 33_333_333, world_from_camera }
+        };
+        (0..frames).map(pose).collect()
+    }
+
+    fn transformed(poses: &[StampedPose], by: &Sim3) -> Vec<StampedPose> {
+        let place = |pose: &StampedPose| StampedPose {
+            nanos: pose.nanos,
+            world_from_camera: by.place(&pose.world_from_camera),
+        };
+        poses.iter().map(place).collect()
+    }
+
+    #[test]
+    fn a_similar_copy_has_no_error_and_the_inverse_scale() {
+        let truth = path(300);
+        let similarity = Sim3::new(SE3::exp(&Vector6::new(1.0, -2.0, 0.5, 0.3, 0.9, -1.2)), 0.25);
+        let estimate = transformed(&truth, &similarity);
+        let result =
+            evaluate_trajectory(&estimate, &truth, Alignment::Sim3, MAX_DIFFERENCE_NANOS).unwrap();
+        assert!(result.ate.max < 1e-9);
+        assert!((result.alignment.scale - 4.0).abs() < 1e-9);
+        assert!(result.rpe_translation.max < 1e-9 && result.rpe_rotation_deg.max < 1e-5);
+        assert!(result.rpe_translation_1s.unwrap().max < 1e-9);
+        assert!((result.window_scale_ratio.unwrap() - 1.0).abs() < 1e-9);
+        assert!(result.window_error.unwrap() < 1e-9);
+        let rigid =
+            evaluate_trajectory(&estimate, &truth, Alignment::SE3, MAX_DIFFERENCE_NANOS).unwrap();
+        assert_eq!(rigid.alignment.scale, 1.0);
+        assert!(rigid.ate.rmse > 0.1);
+    }
+
+    #[test]
+    fn drifting_scale_shows_in_the_windows_and_not_in_their_errors() {
+        let truth = path(300);
+        let mut estimate = truth.clone();
+        for (i, pose) in estimate.iter_mut().enumerate() {
+            pose.world_from_camera.translation *= if i < 100 { 1.0 } else { 2.0 };
+        }
+        let result =
+            evaluate_trajectory(&estimate, &truth, Alignment::Sim3, MAX_DIFFERENCE_NANOS).unwrap();
+        assert!((result.window_scale_ratio.unwrap() - 2.0).abs() < 1e-9);
+        assert!(result.window_error.unwrap() < 1e-9);
+        assert!(result.ate.rmse > 0.05);
+    }
+
+    #[test]
+    fn hostile_input_is_an_error_and_never_a_panic() {
+        let truth = path(40);
+        let evaluate = |estimate: &[StampedPose], truth: &[StampedPose]| {
+            evaluate_trajectory(estimate, truth, Alignment::Sim3, MAX_DIFFERENCE_NANOS)
+        };
+        assert!(matches!(evaluate(&[], &truth), Err(EvaluationError::TooFewMatches { .. })));
+        assert!(matches!(evaluate(&truth, &[]), Err(EvaluationError::TooFewMatches { .. })));
+        assert!(matches!(
+            evaluate(&truth[..2], &truth),
+            Err(EvaluationError::TooFewMatches { found: 2, needed: 3, .. })
+        ));
+        let mut broken = truth.clone();
+        broken[7].world_from_camera.translation.x = f64::NAN;
+        let error = evaluate(&broken, &truth).unwrap_err();
+        assert_eq!(error, EvaluationError::NotFinite { which: "estimate", index: 7 });
+        let mut still = truth.clone();
+        still.iter_mut().for_each(|p| p.world_from_camera = SE3::identity());
+        assert!(matches!(evaluate(&still, &truth), Err(EvaluationError::Alignment(_))));
+        assert!(matches!(evaluate(&truth, &still), Err(EvaluationError::Alignment(_))));
+        let mut huge = truth.clone();
+        huge.iter_mut().for_each(|p| p.world_from_camera.translation *= 1e300);
+        assert!(evaluate(&huge, &truth).is_err());
+        let far = i64::MAX - 5;
+        let ends =
+            [StampedPose { nanos: i64::MIN, ..truth[0] }, StampedPose { nanos: far, ..truth[1] }];
+        assert!(evaluate(&ends, &truth).is_err());
+    }
+}
