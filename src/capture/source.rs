@@ -6,10 +6,13 @@ use std::str::FromStr;
 
 use crate::capture::image_file::ImageFileError;
 use crate::capture::rig::RigError;
+use crate::capture::simulator::Simulator;
+use crate::capture::simulator::params::SimulatorParams;
 use crate::capture::tum;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::rectification::RectificationError;
 use crate::slam::image::buffer::Image;
+use crate::slam::parameter::ParameterError;
 use crate::slam::trajectory::StampedPose;
 
 /// Stamp of a frame just read.
@@ -88,6 +91,9 @@ pub enum SourceError {
         /// Why not.
         source: RectificationError,
     },
+    /// A parameter of the simulator is out of its range.
+    #[error("simulator.{0}")]
+    Simulator(#[from] ParameterError),
     /// An image of the sequence is not usable.
     #[error(transparent)]
     Image(#[from] ImageFileError),
@@ -178,13 +184,23 @@ impl fmt::Display for SourceName {
 }
 
 /// Opens a source. `rig` is a rig file, which wins over the calibration that a recording brings.
-pub fn open(name: &SourceName, rig: Option<&Path>) -> Result<Box<dyn FrameSource>, SourceError> {
+pub fn open(
+    name: &SourceName,
+    rig: Option<&Path>,
+    simulator: &SimulatorParams,
+) -> Result<Box<dyn FrameSource>, SourceError> {
     let unavailable = |reason| SourceError::Unavailable { name: name.to_string(), reason };
     match name {
         SourceName::Tum(folder) => Ok(Box::new(tum::open(folder, rig)?)),
         SourceName::Euroc(_) | SourceName::Images(_) => Err(unavailable("not yet")),
-        SourceName::Simulator { .. } => {
-            Err(unavailable("the simulator is opened with its own configuration"))
+        SourceName::Simulator { scene } => {
+            let mut params = simulator.clone();
+            if let Some(scene) = scene {
+                params.scene = scene
+                    .parse()
+                    .map_err(|problem| SourceError::Name { name: name.to_string(), problem })?;
+            }
+            Ok(Box::new(Simulator::new(params)?))
         }
         SourceName::Camera(_) => Err(unavailable(
             "this binary was built without camera support; build it with --features v4l",

@@ -35,7 +35,7 @@ pub struct MapperParams {
     pub num_seed_frames: usize,
     /// Frames kept for that, newest first: bounds the memory (one byte a pixel each).
     pub max_past_frames: usize,
-    /// Frames without a proposal are mapped only; at least so many lie between two keyframes.
+    /// At least so many frames lie between two keyframes.
     pub min_keyframe_interval: u64,
     /// Search along the epipolar line.
     pub matching: MatchingParams,
@@ -166,7 +166,7 @@ impl Mapper {
             return StepOutcome::default();
         }
         if self.map.keyframes.is_empty() {
-            return self.start(frame, sensor_depth);
+            return self.start(frame, pose, sensor_depth);
         }
         if matches!(pose.state, TrackingState::Lost(_)) || !pose.world_from_camera.is_finite() {
             return StepOutcome::default();
@@ -206,23 +206,32 @@ impl Mapper {
         self.keyframe().map_or(MapState::Initializing, |k| k.map_state)
     }
 
-    /// Begins a map on this frame with random depth, or with the sensor's.
-    fn start(&mut self, frame: &FrameView<'_>, sensor_depth: Option<&Image<f32>>) -> StepOutcome {
+    /// Begins a map on this frame: with the sensor's depth, with random depth, or, where the pose is
+    /// claimed without a map (it is given, so the baselines will be true), without any.
+    fn start(
+        &mut self,
+        frame: &FrameView<'_>,
+        pose: &PoseEstimate,
+        sensor_depth: Option<&Image<f32>>,
+    ) -> StepOutcome {
         self.map.keyframes.clear();
         self.past.clear();
         self.depth.restart(frame.pixels, self.params.min_gradient, self.params.max_candidates);
+        let is_given = pose.state.is_tracked();
         let map_state = match sensor_depth {
             Some(sensor) => {
                 take_sensor_depth(&mut self.depth, sensor, 1.0);
                 MapState::Established
             }
+            None if is_given => MapState::Established,
             None => {
                 randomise(&mut self.depth, self.params.initializer.seed ^ frame.sequence);
                 MapState::Initializing
             }
         };
         let scale = self.rescale_to_unit_mean();
-        self.add_keyframe(frame, Sim3::new(SE3::identity(), scale), map_state);
+        let world_from_camera = if is_given { pose.world_from_camera } else { SE3::identity() };
+        self.add_keyframe(frame, Sim3::new(world_from_camera, scale), map_state);
         StepOutcome {
             keyframe_created: true,
             keyframe_changed: true,
@@ -247,7 +256,7 @@ impl Mapper {
         };
         let proven = evidence.proves(params, self.intrinsics.width);
         if !proven && self.frames_on_keyframe > u64::from(params.max_frames) {
-            return self.start(frame, sensor_depth);
+            return self.start(frame, pose, sensor_depth);
         }
         if proven && let Some(keyframe) = self.map.keyframes.last_mut() {
             keyframe.map_state = MapState::Established;
@@ -436,15 +445,13 @@ impl Mapper {
 
     /// Median image motion that the translation of `pose` causes, pixels.
     fn median_parallax(&self, pose: &PoseEstimate) -> f64 {
-        /// Every so many points are enough for a median.
-        const STRIDE: usize = 16;
         let Some(keyframe) = self.keyframe() else { return 0.0 };
         let relative = keyframe.world_from_keyframe.locate(&pose.world_from_camera).inverse();
         let view = TwoView::new(&self.intrinsics, &relative);
         let mut parallax: Vec<f32> = keyframe
             .points
             .iter()
-            .step_by(STRIDE)
+            .step_by(SAMPLE_STRIDE)
             .filter_map(|p| {
                 let line = view.line(f32::from(p.u), f32::from(p.v));
                 let (far, at) = (line.project(0.0)?, line.project(p.inverse_depth)?);
@@ -458,6 +465,9 @@ impl Mapper {
         f64::from(*parallax.select_nth_unstable_by(middle, f32::total_cmp).1)
     }
 }
+
+/// Every so many points are enough for a median or a share.
+const SAMPLE_STRIDE: usize = 16;
 
 /// Grey values as f32.
 fn float_from_grey(out: &mut Image<f32>, pixels: &[u8]) {

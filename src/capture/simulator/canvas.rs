@@ -70,7 +70,15 @@ impl Canvas {
     /// Adds noise of several octaves with zero mean: lattices from `cells` a side, each octave twice
     /// as fine and `persistence` times as strong, down to two texels. `stretch` is how many times
     /// longer the grain is along x than along y (a power of two).
-    pub fn add_noise(&mut self, seed: u64, cells: usize, octaves: u32, amplitude: f32, persistence: f32, stretch: usize) {
+    pub fn add_noise(
+        &mut self,
+        seed: u64,
+        cells: usize,
+        octaves: u32,
+        amplitude: f32,
+        persistence: f32,
+        stretch: usize,
+    ) {
         let mut strength = amplitude;
         for octave in 0..octaves {
             let along_y = cells << octave;
@@ -110,7 +118,14 @@ impl Canvas {
     }
 
     /// Paints a shape of one reflectance over what is there; `opacity` 1 hides it.
-    pub fn draw(&mut self, shape: Shape, centre: [f32; 2], angle_rad: f32, value: f32, opacity: f32) {
+    pub fn draw(
+        &mut self,
+        shape: Shape,
+        centre: [f32; 2],
+        angle_rad: f32,
+        value: f32,
+        opacity: f32,
+    ) {
         let reach = shape.reach() + 2.0 * EDGE_TEXELS;
         let (sin, cos) = angle_rad.sin_cos();
         let mask = self.size as i32 - 1;
@@ -139,7 +154,14 @@ impl Canvas {
     /// Covers the surface with `count` opaque shapes of all directions, radii from `smallest` to
     /// `largest` texels with a density ∝ r⁻³: the dead-leaves model, whose edges, occlusions and
     /// spectrum are those of natural images (Lee, Mumford, Huang, IJCV 2001).
-    pub fn scatter_leaves(&mut self, stream: &mut Stream, count: usize, smallest: f32, largest: f32, values: (f32, f32)) {
+    pub fn scatter_leaves(
+        &mut self,
+        stream: &mut Stream,
+        count: usize,
+        smallest: f32,
+        largest: f32,
+        values: (f32, f32),
+    ) {
         // Large first, so that the small ones stay visible.
         let mut radii: Vec<f32> = (0..count)
             .map(|_| {

@@ -51,7 +51,13 @@ impl TileLists {
     }
 
     /// Fills the lists for the camera poses of all image rows.
-    pub fn fill(&mut self, scene: &Scene, lens: &Lens, pose_of_row: &dyn Fn(usize) -> SE3, is_global: bool) {
+    pub fn fill(
+        &mut self,
+        scene: &Scene,
+        lens: &Lens,
+        pose_of_row: &dyn Fn(usize) -> SE3,
+        is_global: bool,
+    ) {
         self.columns = lens.width.div_ceil(TILE_PX);
         self.starts.clear();
         self.blocks.clear();
@@ -90,7 +96,11 @@ impl TileLists {
 
 /// Bounds of the rays of a tile with a pixel to spare on every side: the lens bends lines, and
 /// between two rows' poses a block moves.
-fn tile_bounds(lens: &Lens, columns: std::ops::Range<usize>, rows: std::ops::Range<usize>) -> Bounds {
+fn tile_bounds(
+    lens: &Lens,
+    columns: std::ops::Range<usize>,
+    rows: std::ops::Range<usize>,
+) -> Bounds {
     let mut bounds = Bounds::EMPTY;
     for v in rows.clone() {
         for u in [columns.start, columns.end - 1] {

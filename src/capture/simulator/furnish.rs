@@ -54,7 +54,12 @@ fn room_floor(b: &mut Builder) {
     b.stack([3.0, 2.55], 0.42, &[[0.3, 0.22, 0.05], [0.24, 0.18, 0.04]], Cover::of(Pattern::Cover));
     b.stack([3.5, 2.7], 0.42, &[[0.14, 0.12, 0.16]], Cover::of(Pattern::Poster));
     b.table([4.95, 1.35], [0.9, 1.4, 0.75], 0.08, wood.with_middle(0.66));
-    b.stack([4.85, 1.0], 0.75, &[[0.3, 0.24, 0.2], [0.2, 0.2, 0.14]], Cover::of(Pattern::Cardboard));
+    b.stack(
+        [4.85, 1.0],
+        0.75,
+        &[[0.3, 0.24, 0.2], [0.2, 0.2, 0.14]],
+        Cover::of(Pattern::Cardboard),
+    );
     b.stack([5.05, 1.55], 0.75, &[[0.22, 0.3, 0.05], [0.2, 0.28, 0.04]], Cover::of(Pattern::Text));
     b.stack([4.75, 1.75], 0.75, &[[0.1, 0.1, 0.24]], Cover::of(Pattern::Poster).enlarged(0.5));
     b.chair([4.3, 1.6], 0.1, wood.with_middle(0.5));
@@ -63,7 +68,13 @@ fn room_floor(b: &mut Builder) {
     // A floor lamp: a thin pole in front of everything.
     b.place([4.75, 3.2], 0.0, [0.3, 0.3, 0.03], 0.4, wood);
     b.place([4.75, 3.2], 0.03, [0.04, 0.04, 1.4], 0.4, wood.with_middle(0.3));
-    b.place([4.75, 3.2], 1.43, [0.34, 0.34, 0.3], 0.4, Cover::of(Pattern::Fabric).with_middle(0.62));
+    b.place(
+        [4.75, 3.2],
+        1.43,
+        [0.34, 0.34, 0.3],
+        0.4,
+        Cover::of(Pattern::Fabric).with_middle(0.62),
+    );
     for x in [1.5, 3.5, 5.2] {
         b.place([x, 2.5], 2.86, [0.16, 5.0, 0.14], 0.0, wood.with_middle(0.42));
     }
@@ -79,14 +90,24 @@ fn room_east(b: &mut Builder) {
     picture(b, [5.985, 2.4], 2.3, 0.4, 0.4, FRAC_PI_2, Pattern::Poster);
     b.place([5.75, 1.4], 0.0, [0.4, 1.5, 0.7], 0.0, wood.with_middle(0.48));
     b.stack([5.75, 0.9], 0.7, &[[0.2, 0.26, 0.3]], Cover::of(Pattern::Picture).enlarged(0.4));
-    b.stack([5.45, 4.55], 0.0, &[[0.6, 0.5, 0.45], [0.5, 0.42, 0.4], [0.36, 0.32, 0.3]], Cover::of(Pattern::Cardboard));
+    b.stack(
+        [5.45, 4.55],
+        0.0,
+        &[[0.6, 0.5, 0.45], [0.5, 0.42, 0.4], [0.36, 0.32, 0.3]],
+        Cover::of(Pattern::Cardboard),
+    );
 }
 
 /// The wall at y = 5: a low cabinet with things on it under pictures.
 fn room_north(b: &mut Builder) {
     let wood = Cover::of(Pattern::Veneer);
     b.bookshelf([3.4, 4.8], [1.8, 0.36, 0.85], 2, 0.0, wood.with_middle(0.6));
-    b.stack([2.9, 4.78], 0.85, &[[0.3, 0.2, 0.22], [0.2, 0.14, 0.12]], Cover::of(Pattern::Cardboard));
+    b.stack(
+        [2.9, 4.78],
+        0.85,
+        &[[0.3, 0.2, 0.22], [0.2, 0.14, 0.12]],
+        Cover::of(Pattern::Cardboard),
+    );
     b.stack([3.8, 4.78], 0.85, &[[0.2, 0.2, 0.34]], Cover::of(Pattern::Poster).enlarged(0.5));
     picture(b, [3.3, 4.985], 1.75, 0.9, 0.7, 0.0, Pattern::Picture);
     picture(b, [4.5, 4.985], 1.6, 0.7, 1.0, 0.0, Pattern::Poster);
@@ -120,7 +141,15 @@ fn room_west(b: &mut Builder) {
 }
 
 /// A framed picture on a wall that runs along `turn_rad`, centred on height `z`.
-fn picture(b: &mut Builder, at: [f32; 2], z: f32, width: f32, height: f32, turn_rad: f32, pattern: Pattern) {
+fn picture(
+    b: &mut Builder,
+    at: [f32; 2],
+    z: f32,
+    width: f32,
+    height: f32,
+    turn_rad: f32,
+    pattern: Pattern,
+) {
     let (frame, depth) = (0.04, 0.025);
     let wood = Cover::of(Pattern::Veneer).with_middle(0.3);
     let size = [width + 2.0 * frame, depth, height + 2.0 * frame];
@@ -132,7 +161,13 @@ fn picture(b: &mut Builder, at: [f32; 2], z: f32, width: f32, height: f32, turn_
 /// A large printed table top seen from above.
 fn plane(seed: u64) -> Scene {
     let mut b = Builder::new(seed);
-    b.place([0.0, 0.0], -0.1, [40.0, 40.0, 0.1], 0.0, Cover::of(Pattern::Poster).with_contrast(0.8));
+    b.place(
+        [0.0, 0.0],
+        -0.1,
+        [40.0, 40.0, 0.1],
+        0.0,
+        Cover::of(Pattern::Poster).with_contrast(0.8),
+    );
     let stage = Stage {
         centre: [0.0, 0.0, 1.5],
         reach: [1.3, 1.1, 0.2],
@@ -168,7 +203,12 @@ fn corridor(seed: u64) -> Scene {
         let cover = Cover::of(Pattern::Veneer).with_middle(0.6);
         b.place([x, door], 0.0, [0.9, 0.06, 2.05], 0.0, cover);
         let side = if b.stream.index(2) == 0 { 0.25 } else { width - 0.25 };
-        b.stack([x + 1.0, side], 0.0, &[[0.4, 0.32, 0.4], [0.3, 0.26, 0.3]], Cover::of(Pattern::Cardboard));
+        b.stack(
+            [x + 1.0, side],
+            0.0,
+            &[[0.4, 0.32, 0.4], [0.3, 0.26, 0.3]],
+            Cover::of(Pattern::Cardboard),
+        );
         b.place([x + 0.5, 0.5 * width], 2.5, [0.14, width, 0.1], 0.0, cover.with_middle(0.45));
     }
     let stage = Stage {

@@ -35,7 +35,10 @@ impl Lens {
                 let (u, v) = (u as f64, v as f64);
                 let at = unproject(u, v);
                 let slope = |a: [f64; 2], b: [f64; 2]| {
-                    [((b[0] - a[0]) / (2.0 * STEP_PX)) as f32, ((b[1] - a[1]) / (2.0 * STEP_PX)) as f32]
+                    [
+                        ((b[0] - a[0]) / (2.0 * STEP_PX)) as f32,
+                        ((b[1] - a[1]) / (2.0 * STEP_PX)) as f32,
+                    ]
                 };
                 rays.push(Ray {
                     at: [at[0] as f32, at[1] as f32],

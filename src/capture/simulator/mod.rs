@@ -132,7 +132,8 @@ impl Simulator {
         if exposure_s == 0.0 {
             return 1;
         }
-        let (before, after) = (self.pose(middle_s - 0.5 * exposure_s), self.pose(middle_s + 0.5 * exposure_s));
+        let (before, after) =
+            (self.pose(middle_s - 0.5 * exposure_s), self.pose(middle_s + 0.5 * exposure_s));
         let turn = before.rotation.angle_to(&after.rotation);
         let step = (after.translation - before.translation).norm();
         let motion_px = self.params.focal_px * (turn + step / TYPICAL_DEPTH_M);
@@ -199,10 +200,11 @@ impl FrameSource for Simulator {
         }
         let size = self.params.width * self.params.height;
         if pixels.len() != size {
-            return Err(SourceError::Read(format!(
-                "simulator: the buffer for a frame has {} bytes, the image needs {size}: pass width × height of its intrinsics",
-                pixels.len()
-            )));
+            return Err(SourceError::Buffer {
+                found: pixels.len(),
+                width: self.params.width,
+                height: self.params.height,
+            });
         }
         match self.frames.get(frame) {
             Some(rendered) => pixels.copy_from_slice(rendered),

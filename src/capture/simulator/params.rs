@@ -1,5 +1,7 @@
 //! Everything that can be set about a simulated sequence.
 
+use std::str::FromStr;
+
 use serde::{Deserialize, Serialize};
 
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -15,6 +17,19 @@ pub enum SceneKind {
     Plane,
     /// A corridor of 24 × 2.4 × 2.6 m.
     Corridor,
+}
+
+impl FromStr for SceneKind {
+    type Err = &'static str;
+
+    fn from_str(name: &str) -> Result<Self, Self::Err> {
+        match name {
+            "room" => Ok(Self::Room),
+            "plane" => Ok(Self::Plane),
+            "corridor" => Ok(Self::Corridor),
+            _ => Err("there is no such scene; scenes are room, plane and corridor"),
+        }
+    }
 }
 
 /// How the camera moves.

@@ -102,7 +102,13 @@ fn planks(stream: &mut Stream) -> Canvas {
             }
             x += length;
         }
-        canvas.draw(Shape::Rectangle(0.5 * size, 1.4), [0.5 * size, row as f32 * width], 0.0, 0.12, 0.9);
+        canvas.draw(
+            Shape::Rectangle(0.5 * size, 1.4),
+            [0.5 * size, row as f32 * width],
+            0.0,
+            0.12,
+            0.9,
+        );
     }
     canvas.add_noise(stream.bits(), 64, 4, 0.10, 0.8, 16);
     canvas.add_noise(stream.bits(), 8, 6, 0.05, 0.7, 1);
@@ -131,8 +137,10 @@ fn wallpaper(stream: &mut Stream) -> Canvas {
     // Motifs at jittered places, each a little different, as in a hand-blocked paper.
     for cell in 0..36 {
         let place = |k: usize, jitter: f32| (k as f32 + 0.5 + jitter) * size / 6.0;
-        let centre =
-            [place(cell % 6, stream.uniform(-0.3, 0.3)), place(cell / 6, stream.uniform(-0.3, 0.3))];
+        let centre = [
+            place(cell % 6, stream.uniform(-0.3, 0.3)),
+            place(cell / 6, stream.uniform(-0.3, 0.3)),
+        ];
         let turn = stream.uniform(0.0, 3.14);
         let value = stream.uniform(0.25, 0.5);
         let petals = 3 + stream.index(4);
@@ -244,10 +252,8 @@ fn brick(stream: &mut Stream) -> Canvas {
     let (width, height) = (128.0, 42.666_668);
     for row in 0..24 {
         for column in 0..8 {
-            let centre = [
-                (column as f32 + 0.5 * (row % 2) as f32) * width,
-                (row as f32 + 0.5) * height,
-            ];
+            let centre =
+                [(column as f32 + 0.5 * (row % 2) as f32) * width, (row as f32 + 0.5) * height];
             let turn = stream.uniform(-0.01, 0.01);
             let value = stream.uniform(0.24, 0.52);
             let shape = Shape::Rectangle(0.5 * width - 4.0, 0.5 * height - 4.0);
@@ -263,8 +269,7 @@ fn carpet(stream: &mut Stream) -> Canvas {
     let mut canvas = Canvas::new(TEXTURE_SIZE, 0.35);
     let size = canvas.size();
     for cell in 0..64 {
-        let centre =
-            [(cell % 8) as f32 * size / 8.0 + 64.0, (cell / 8) as f32 * size / 8.0 + 64.0];
+        let centre = [(cell % 8) as f32 * size / 8.0 + 64.0, (cell / 8) as f32 * size / 8.0 + 64.0];
         let value = stream.uniform(0.2, 0.8);
         let turn = 0.7854 + stream.uniform(-0.15, 0.15);
         let half = stream.uniform(34.0, 56.0);
@@ -294,7 +299,13 @@ fn cover(stream: &mut Stream) -> Canvas {
             let ink = if value > 0.45 { 0.1 } else { 0.85 };
             let height = stream.uniform(0.15, 0.35) * band;
             let at = [u, v + stream.uniform(0.3, 0.7) * band];
-            canvas.draw(Shape::Rectangle(0.5 * width, height), at, stream.uniform(-0.3, 0.3), ink, 0.8);
+            canvas.draw(
+                Shape::Rectangle(0.5 * width, height),
+                at,
+                stream.uniform(-0.3, 0.3),
+                ink,
+                0.8,
+            );
             u += width + stream.uniform(10.0, 60.0);
         }
         v += band;

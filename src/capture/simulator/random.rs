@@ -71,7 +71,8 @@ impl Normal {
     /// Fills the table.
     pub fn new() -> Self {
         let size = 1usize << Self::BITS;
-        let raw: Vec<f64> = (0..size).map(|i| normal_quantile((i as f64 + 0.5) / size as f64)).collect();
+        let raw: Vec<f64> =
+            (0..size).map(|i| normal_quantile((i as f64 + 0.5) / size as f64)).collect();
         // The table cuts the tails; scaling restores unit variance, and ½ makes the sum of two one.
         let variance = raw.iter().map(|q| q * q).sum::<f64>() / size as f64;
         let scale = (0.5 / variance).sqrt();
@@ -107,9 +108,8 @@ fn normal_distribution(x: f64) -> f64 {
     const STEPS: usize = 48;
     let density = |z: f64| (-0.5 * z * z).exp() / (2.0 * std::f64::consts::PI).sqrt();
     let h = x / STEPS as f64;
-    let inner: f64 = (1..STEPS)
-        .map(|i| density(i as f64 * h) * if i % 2 == 1 { 4.0 } else { 2.0 })
-        .sum();
+    let inner: f64 =
+        (1..STEPS).map(|i| density(i as f64 * h) * if i % 2 == 1 { 4.0 } else { 2.0 }).sum();
     0.5 + (density(0.0) + inner + density(x)) * h / 3.0
 }
 

@@ -111,7 +111,12 @@ pub struct Renderer<'a> {
 impl Renderer<'_> {
     /// Casts one ray a pixel. `pose_of_row` gives the camera pose of every image row (all the same
     /// under a global shutter).
-    fn cast(&self, pose_of_row: &dyn Fn(usize) -> SE3, is_global: bool, scratch: &mut RenderScratch) {
+    fn cast(
+        &self,
+        pose_of_row: &dyn Fn(usize) -> SE3,
+        is_global: bool,
+        scratch: &mut RenderScratch,
+    ) {
         let (width, height) = (self.lens.width, self.lens.height);
         scratch.hits.clear();
         scratch.hits.reserve(width * height);
@@ -212,11 +217,15 @@ impl Renderer<'_> {
             _ => (0, 1, 1.0),
         };
         let step = |change: [f32; 2]| {
-            let turned: [f32; 3] =
-                std::array::from_fn(|k| local.rows[k][0] * change[0] + local.rows[k][1] * change[1]);
+            let turned: [f32; 3] = std::array::from_fn(|k| {
+                local.rows[k][0] * change[0] + local.rows[k][1] * change[1]
+            });
             // Along the face: the depth changes so that the point stays on the plane.
             let slide = turned[axis] / d[axis];
-            [hit.depth * (turned[right] - slide * d[right]), hit.depth * (turned[down] - slide * d[down])]
+            [
+                hit.depth * (turned[right] - slide * d[right]),
+                hit.depth * (turned[down] - slide * d[down]),
+            ]
         };
         let face = &block.faces[side];
         let density = [face.texels_per_metre[0], flip * face.texels_per_metre[1]];

@@ -89,7 +89,8 @@ impl Scene {
         let squared = to[0] * to[0] + to[1] * to[1] + to[2] * to[2];
         let facing = to[0] * normal[0] + to[1] * normal[1] + to[2] * normal[2];
         let cosine = (facing / squared.sqrt().max(1e-3)).max(0.0);
-        AMBIENT + LAMP * cosine / (1.0 + squared / (HALF_DISTANCE_M * HALF_DISTANCE_M))
+        AMBIENT
+            + LAMP * cosine / (1.0 + squared / (HALF_DISTANCE_M * HALF_DISTANCE_M))
             + 0.06 * normal[0]
     }
 }
@@ -212,7 +213,8 @@ impl Builder {
             let tall = height * self.stream.uniform(0.62, 0.95);
             let deep = self.stream.uniform(0.16, 0.22);
             let middle = self.stream.uniform(0.3, 0.62);
-            let pattern = [Pattern::Cover, Pattern::Cover, Pattern::Fabric, Pattern::Text][self.stream.index(4)];
+            let pattern = [Pattern::Cover, Pattern::Cover, Pattern::Fabric, Pattern::Text]
+                [self.stream.index(4)];
             let place = along + 0.5 * thick;
             let at = [from[0] + cos * place, from[1] + sin * place];
             let cover = Cover::of(pattern).with_middle(middle);
@@ -225,7 +227,14 @@ impl Builder {
     }
 
     /// An open shelf of `boards` storeys with books, its length along `turn_rad`.
-    pub fn bookshelf(&mut self, at: [f32; 2], size: [f32; 3], boards: usize, turn_rad: f32, cover: Cover) {
+    pub fn bookshelf(
+        &mut self,
+        at: [f32; 2],
+        size: [f32; 3],
+        boards: usize,
+        turn_rad: f32,
+        cover: Cover,
+    ) {
         const BOARD_M: f32 = 0.03;
         let (sin, cos) = turn_rad.sin_cos();
         let storey = (size[2] - BOARD_M) / boards as f32;

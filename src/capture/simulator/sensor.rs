@@ -18,7 +18,8 @@ pub struct Sensor {
 impl Sensor {
     /// A sensor for images of this size; `seed` chooses its noise.
     pub fn new(params: &SensorParams, seed: u64, width: usize, height: usize) -> Self {
-        let vignette = if params.vignette > 0.0 { vignette(params.vignette, width, height) } else { vec![] };
+        let vignette =
+            if params.vignette > 0.0 { vignette(params.vignette, width, height) } else { vec![] };
         Self { params: params.clone(), seed: mix2(seed, 0x5E50), normal: Normal::new(), vignette }
     }
 

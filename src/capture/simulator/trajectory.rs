@@ -59,7 +59,9 @@ impl Trajectory {
             walk_rate: 0.0,
             turn_rate: 0.0,
         };
-        path.walk_rate = pace(motion.mean_speed_m_s, |rate| Self { walk_rate: rate, ..path.clone() }.mean_rates().0);
+        path.walk_rate = pace(motion.mean_speed_m_s, |rate| {
+            Self { walk_rate: rate, ..path.clone() }.mean_rates().0
+        });
         let turn = motion.mean_turn_deg_s.to_radians();
         path.turn_rate = pace(turn, |rate| Self { turn_rate: rate, ..path.clone() }.mean_rates().1);
         path
