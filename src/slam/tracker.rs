@@ -1,42 +1,147 @@
 //! The recipe of a frame: predict, align to the keyframe coarse to fine, judge, report.
 
+pub mod motion;
+pub mod verdict;
+
 use serde::{Deserialize, Serialize};
 
-use crate::slam::alignment::reference::Reference;
+use crate::slam::alignment::align::{Aligner, Alignment, AlignmentParams};
+use crate::slam::alignment::reference::{Reference, ReferenceParams, num_levels};
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
-use crate::slam::parameter::ParameterError;
-use crate::slam::pose::{Brightness, NO_KEYFRAME, PoseEstimate, Quality, TrackingState};
+use crate::slam::image::sums::{SumPyramid, grey_per_sum};
+use crate::slam::keyframe::MapState;
+use crate::slam::parameter::{ParameterError, check_range};
+use crate::slam::pose::{
+    Brightness, LostReason, NO_KEYFRAME, PoseEstimate, Quality, TrackingState,
+};
+use crate::slam::tracker::motion::{Motion, hypotheses};
+use crate::slam::tracker::verdict::{VerdictParams, quality_of};
 
 /// Tuning of the tracker.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub struct TrackerParams {}
+pub struct TrackerParams {
+    /// Which points of a keyframe are aligned.
+    pub reference: ReferenceParams,
+    /// How they are aligned.
+    pub alignment: AlignmentParams,
+    /// What the result is worth.
+    pub verdict: VerdictParams,
+    /// The coarsest level fits badly, and other motions are tried, when its whitened RMSE is
+    /// above this many times the last good one. DSO gives a level up at 1.5.
+    pub poor_fit_ratio: f64,
+    /// Rotation about each axis of the other motions, degrees: half of what the coarsest level
+    /// converges from.
+    pub hypothesis_rotation_deg: f64,
+    /// Standard deviation of the coarsest level, grey levels, below which a frame has no
+    /// contrast: covered lens, overexposure, a white wall.
+    pub min_contrast: f64,
+    /// w_d of the keyframe distance: a keyframe is asked for at 1/w_d of the mean depth.
+    pub keyframe_distance_weight: f64,
+    /// w_u of the keyframe distance: … or when 1/w_u of the points are out of view.
+    pub keyframe_usage_weight: f64,
+}
+
+impl Default for TrackerParams {
+    fn default() -> Self {
+        Self {
+            reference: ReferenceParams::default(),
+            alignment: AlignmentParams::default(),
+            verdict: VerdictParams::default(),
+            poor_fit_ratio: 1.5,
+            hypothesis_rotation_deg: 3.0,
+            min_contrast: 2.0,
+            keyframe_distance_weight: 3.0,
+            keyframe_usage_weight: 4.0,
+        }
+    }
+}
 
 impl TrackerParams {
     /// Checks every value.
     pub fn validate(&self) -> Result<(), ParameterError> {
-        Ok(())
+        self.reference.validate().map_err(|error| error.within("reference"))?;
+        self.alignment.validate().map_err(|error| error.within("alignment"))?;
+        self.verdict.validate().map_err(|error| error.within("verdict"))?;
+        check_range("poor_fit_ratio", self.poor_fit_ratio, 1.0..=100.0)?;
+        check_range("hypothesis_rotation_deg", self.hypothesis_rotation_deg, 0.0..=45.0)?;
+        check_range("min_contrast", self.min_contrast, 0.0..=255.0)?;
+        check_range("keyframe_distance_weight", self.keyframe_distance_weight, 0.0..=1e3)?;
+        check_range("keyframe_usage_weight", self.keyframe_usage_weight, 0.0..=1e3)
     }
 }
+
+/// Variance of what is not known, keyframe units² and radians²: large and finite.
+pub const UNKNOWN_VARIANCE: f64 = 1.0e6;
 
 /// Tracks frames against the reference in force.
 #[derive(Debug)]
 pub struct Tracker {
+    params: TrackerParams,
+    intrinsics: Intrinsics,
+    aligner: Aligner,
     reference: Option<Box<Reference>>,
+    pyramid: SumPyramid,
+    motion: Motion,
+    brightness: Brightness,
+    last_sequence: Option<u64>,
+    was_lost: bool,
+    coarse_fit: Option<f64>,
 }
 
 impl Tracker {
     /// A tracker for images of `intrinsics`, without a keyframe yet.
-    pub fn new(_intrinsics: Intrinsics, params: TrackerParams) -> Result<Self, ParameterError> {
+    pub fn new(intrinsics: Intrinsics, params: TrackerParams) -> Result<Self, ParameterError> {
         params.validate()?;
-        Ok(Self { reference: None })
+        let Intrinsics { width, height, .. } = intrinsics;
+        let levels = num_levels(width, height);
+        let finest = params.reference.finest_level;
+        Ok(Self {
+            intrinsics,
+            aligner: Aligner::new(params.alignment.clone()),
+            reference: None,
+            pyramid: SumPyramid::with_size(width, height, levels, finest),
+            motion: Motion::default(),
+            brightness: Brightness::default(),
+            last_sequence: None,
+            was_lost: false,
+            coarse_fit: None,
+            params,
+        })
     }
 
-    /// Puts a prepared reference in force and gives back the one before, for its memory.
+    /// Puts a prepared reference in force and gives back the one before, for its memory. The
+    /// first of another epoch forgets where the camera was.
     pub fn adopt(&mut self, reference: Box<Reference>) -> Option<Box<Reference>> {
-        self.reference.replace(reference)
+        let before = self.reference.replace(reference);
+        let (old, new) = (before.as_deref(), self.reference.as_deref());
+        if let (Some(old), Some(new)) = (old, new) {
+            if old.epoch() != new.epoch() {
+                self.motion = Motion::default();
+            }
+            if old.epoch() != new.epoch() || old.keyframe_id() != new.keyframe_id() {
+                self.brightness = Brightness::default();
+                self.coarse_fit = None;
+            }
+        }
+        before
+    }
+
+    /// The reference in force.
+    pub fn reference(&self) -> Option<&Reference> {
+        self.reference.as_deref()
+    }
+
+    /// Forgets keyframe and motion.
+    pub fn reset(&mut self) {
+        self.reference = None;
+        self.motion = Motion::default();
+        self.brightness = Brightness::default();
+        self.last_sequence = None;
+        self.was_lost = false;
+        self.coarse_fit = None;
     }
 
     /// Tracks one frame. `budget` is asked before each iteration with the pyramid level it would
@@ -44,21 +149,226 @@ impl Tracker {
     pub fn track(
         &mut self,
         frame: &FrameView<'_>,
-        _budget: &mut dyn FnMut(usize) -> bool,
+        budget: &mut dyn FnMut(usize) -> bool,
     ) -> PoseEstimate {
+        let missing = self.count_missing(frame.sequence);
+        let Some(reference) = self.reference.take() else {
+            return self.unclaimed(frame, None, TrackingState::Initializing);
+        };
+        let estimate = match self.refusal(&reference, frame) {
+            Some(reason) => self.unclaimed(frame, Some(&reference), TrackingState::Lost(reason)),
+            None => {
+                let alignment = self.align(&reference, frame, budget);
+                self.report(&reference, frame, &alignment, missing)
+            }
+        };
+        self.was_lost = matches!(estimate.state, TrackingState::Lost(_));
+        self.reference = Some(reference);
+        estimate
+    }
+
+    /// Frames between this one and the one before.
+    fn count_missing(&mut self, sequence: u64) -> u64 {
+        let before = self.last_sequence.replace(sequence);
+        before.map_or(0, |before| sequence.saturating_sub(before).saturating_sub(1))
+    }
+
+    /// Why the frame cannot be aligned at all; fills the pyramid otherwise.
+    fn refusal(&mut self, reference: &Reference, frame: &FrameView<'_>) -> Option<LostReason> {
+        let Intrinsics { width, height, .. } = self.intrinsics;
+        let fits = frame.is_consistent() && (frame.width, frame.height) == (width, height);
+        if !fits {
+            return Some(LostReason::UnusableFrame);
+        }
+        if *reference.intrinsics() != self.intrinsics {
+            return Some(LostReason::NoPoints);
+        }
+        self.pyramid.fill(frame.pixels);
+        let flat = contrast(&self.pyramid) < self.params.min_contrast;
+        flat.then_some(LostReason::UnusableFrame)
+    }
+
+    /// Aligns from the predicted pose, and from others where that fits badly.
+    fn align(
+        &mut self,
+        reference: &Reference,
+        frame: &FrameView<'_>,
+        budget: &mut dyn FnMut(usize) -> bool,
+    ) -> Alignment {
+        let nanos = frame.capture_nanos;
+        // Before the first pose the camera stands where the keyframe was taken.
+        let first = reference.world_from_keyframe().place(&SE3::identity());
+        let predicted = self.motion.predict(nanos, 1.0).unwrap_or(first);
+        let mut best = self.align_coarsest(reference, &predicted, budget);
+        if self.fits_poorly(&best) {
+            let rotation = self.params.hypothesis_rotation_deg.to_radians();
+            for hypothesis in hypotheses(&self.motion, nanos, rotation) {
+                let other = self.align_coarsest(reference, &hypothesis, budget);
+                if is_better(&other, &best) {
+                    best = other;
+                }
+            }
+        }
+        self.coarse_fit = Some(quality_of(&best).whitened_rmse);
+        self.aligner.descend(reference, &self.pyramid, &mut best, budget);
+        best
+    }
+
+    /// Solves the coarsest level with points from one pose in the world.
+    fn align_coarsest(
+        &self,
+        reference: &Reference,
+        world_from_camera: &SE3,
+        budget: &mut dyn FnMut(usize) -> bool,
+    ) -> Alignment {
+        let start = reference.world_from_keyframe().locate(world_from_camera).inverse();
+        let (aligner, pyramid) = (&self.aligner, &self.pyramid);
+        let mut alignment = aligner.start(reference, pyramid, &start, self.brightness);
+        let level = alignment.level;
+        aligner.solve_level(reference, pyramid, level, &mut alignment, budget);
+        alignment
+    }
+
+    /// Whether the coarsest level says that the prediction led astray.
+    fn fits_poorly(&self, alignment: &Alignment) -> bool {
+        let quality = quality_of(alignment);
+        let bound = self.coarse_fit.map_or(f64::INFINITY, |fit| fit * self.params.poor_fit_ratio);
+        self.was_lost
+            || quality.whitened_rmse > bound
+            || quality.inlier_ratio < self.params.verdict.lost_inliers
+            || quality.in_view_ratio < self.params.verdict.degraded_in_view
+    }
+
+    /// Judges the alignment and puts the estimate together.
+    fn report(
+        &mut self,
+        reference: &Reference,
+        frame: &FrameView<'_>,
+        alignment: &Alignment,
+        missing: u64,
+    ) -> PoseEstimate {
+        let quality = quality_of(alignment);
+        let verdict = self.params.verdict.judge(alignment, &quality, self.was_lost, missing);
+        let covariance = alignment.covariance(&self.params.alignment);
+        let keyframe_from_camera = alignment.state.current_from_keyframe.inverse();
+        let world_from_camera = reference.world_from_keyframe().place(&keyframe_from_camera);
+        let covariance = match (verdict, covariance) {
+            (TrackingState::Lost(reason), _) => {
+                return self.lost(frame, reference, reason, quality);
+            }
+            (_, Some(covariance)) if world_from_camera.is_finite() => covariance,
+            _ => return self.lost(frame, reference, LostReason::TooFewInliers, quality),
+        };
+        self.motion.observe(frame.capture_nanos, &world_from_camera);
+        self.brightness = alignment.state.brightness;
+        let state = match reference.map_state() {
+            MapState::Established => verdict,
+            MapState::Initializing => TrackingState::Initializing,
+            MapState::Rejected => TrackingState::Lost(LostReason::MapRejected),
+        };
+        PoseEstimate {
+            state,
+            world_from_camera,
+            keyframe_from_camera,
+            covariance: upper_triangle(|row, column| covariance[(row, column)]),
+            brightness: alignment.state.brightness,
+            proposes_keyframe: self.proposes_keyframe(reference, alignment, &quality),
+            quality,
+            ..self.unclaimed(frame, Some(reference), state)
+        }
+    }
+
+    /// The estimate of a frame that could not be aligned: the last pose again, not claimed.
+    fn lost(
+        &mut self,
+        frame: &FrameView<'_>,
+        reference: &Reference,
+        reason: LostReason,
+        quality: Quality,
+    ) -> PoseEstimate {
+        self.motion.stop();
+        self.brightness = Brightness::default();
+        let quality = if is_finite(&quality) { quality } else { Quality::default() };
+        PoseEstimate {
+            quality,
+            ..self.unclaimed(frame, Some(reference), TrackingState::Lost(reason))
+        }
+    }
+
+    /// An estimate that claims nothing and repeats the last pose.
+    fn unclaimed(
+        &self,
+        frame: &FrameView<'_>,
+        reference: Option<&Reference>,
+        state: TrackingState,
+    ) -> PoseEstimate {
+        let world_from_camera = self.motion.last().unwrap_or_else(SE3::identity);
+        let keyframe_from_camera = reference.map_or_else(SE3::identity, |reference| {
+            reference.world_from_keyframe().locate(&world_from_camera)
+        });
         PoseEstimate {
             sequence: frame.sequence,
             capture_nanos: frame.capture_nanos,
-            epoch: 0,
-            revision: 0,
-            keyframe_id: self.reference.as_ref().map_or(NO_KEYFRAME, |r| r.keyframe_id()),
-            state: TrackingState::Initializing,
-            world_from_camera: SE3::identity(),
-            keyframe_from_camera: SE3::identity(),
-            covariance: [0.0; 21],
+            epoch: reference.map_or(0, Reference::epoch),
+            revision: reference.map_or(0, Reference::revision),
+            keyframe_id: reference.map_or(NO_KEYFRAME, Reference::keyframe_id),
+            state,
+            world_from_camera,
+            keyframe_from_camera,
+            covariance: upper_triangle(|row, column| match row == column {
+                true => UNKNOWN_VARIANCE,
+                false => 0.0,
+            }),
             brightness: Brightness::default(),
             quality: Quality::default(),
             proposes_keyframe: false,
         }
     }
+
+    /// The weighted distance of a keyframe (LSD14 §3.4): (w_d ‖t‖ d̄)² + (w_u (1 − usage))² > 1.
+    fn proposes_keyframe(
+        &self,
+        reference: &Reference,
+        alignment: &Alignment,
+        quality: &Quality,
+    ) -> bool {
+        let translation = alignment.state.current_from_keyframe.translation.norm();
+        let distance = translation * reference.mean_inverse_depth();
+        let from_distance = self.params.keyframe_distance_weight * distance;
+        let from_usage = self.params.keyframe_usage_weight * (1.0 - quality.in_view_ratio);
+        from_distance * from_distance + from_usage * from_usage > 1.0
+    }
 }
+
+/// Whether one coarse alignment explains the frame better than another: more inliers, counted
+/// over all points so that looking away does not pay.
+fn is_better(one: &Alignment, other: &Alignment) -> bool {
+    let inliers = |alignment: &Alignment| alignment.state.sums.inliers;
+    let energy = |alignment: &Alignment| alignment.state.sums.mean_energy();
+    inliers(one) > inliers(other) || (inliers(one) == inliers(other) && energy(one) < energy(other))
+}
+
+/// The upper triangle of a 6×6 matrix, row by row.
+fn upper_triangle(entry: impl Fn(usize, usize) -> f64) -> [f64; 21] {
+    let mut entries = (0..6).flat_map(|row| (row..6).map(move |column| (row, column)));
+    std::array::from_fn(|_| entries.next().map_or(0.0, |(row, column)| entry(row, column)))
+}
+
+fn is_finite(quality: &Quality) -> bool {
+    [quality.whitened_rmse, quality.residual_rmse, quality.mean_squared_flow]
+        .iter()
+        .all(|figure| figure.is_finite())
+}
+
+/// Standard deviation of the coarsest level, grey levels.
+fn contrast(pyramid: &SumPyramid) -> f64 {
+    let level = pyramid.num_levels().saturating_sub(1);
+    let pixels = pyramid.level(level).pixels();
+    let count = pixels.len().max(1) as f64;
+    let mean = pixels.iter().map(|&sum| f64::from(sum)).sum::<f64>() / count;
+    let squared = pixels.iter().map(|&sum| (f64::from(sum) - mean).powi(2)).sum::<f64>();
+    (squared / count).sqrt() * f64::from(grey_per_sum(level))
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,3 +1,14 @@
 //! Variance-normalised direct image alignment on SE(3) (Engel, Schöps, Cremers 2014, §3.3).
+//!
+//! [`mod@reference`] prepares a keyframe, [`residual`] evaluates the cost of one pose on one pyramid
+//! level, [`normal_equations`] solves for a step, [`align`] iterates coarse to fine.
 
+pub mod align;
+pub mod fusion;
+pub mod normal_equations;
+pub mod points;
 pub mod reference;
+pub mod residual;
+#[cfg(test)]
+pub mod scene;
+pub mod selection;

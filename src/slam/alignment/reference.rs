@@ -1,21 +1,218 @@
 //! The keyframe prepared for alignment: everything that is paid per keyframe and not per frame.
 
-use crate::slam::keyframe::Keyframe;
+use serde::{Deserialize, Serialize};
+
+use crate::slam::alignment::fusion::{Candidates, DepthFusion};
+use crate::slam::alignment::points::{LevelPoints, Point};
+use crate::slam::alignment::selection::{Selection, SelectionParams};
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::sim3::Sim3;
+use crate::slam::image::sums::{MAX_LEVELS, SumPyramid, grey_per_sum};
+use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::parameter::{ParameterError, check_range};
+use crate::slam::pose::NO_KEYFRAME;
+
+/// Which points of a keyframe are aligned.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ReferenceParams {
+    /// Finest pyramid level that is aligned, 0 or 1. Level 1 has half the noise at a quarter of
+    /// the pixels; level 0 costs another pyramid level and more iterations.
+    pub finest_level: usize,
+    /// Most points of each level, finest first. A level with more keeps the most informative
+    /// ones, evenly spread; these are what the time of a frame is made of.
+    pub point_budget: [usize; MAX_LEVELS],
+    /// How the points of a level are chosen.
+    pub selection: SelectionParams,
+}
+
+impl Default for ReferenceParams {
+    fn default() -> Self {
+        Self {
+            finest_level: 1,
+            point_budget: [12_000, 8_000, 5_000, 2_500, 1_200],
+            selection: SelectionParams::default(),
+        }
+    }
+}
+
+impl ReferenceParams {
+    /// Checks every value.
+    pub fn validate(&self) -> Result<(), ParameterError> {
+        check_range("finest_level", self.finest_level, 0..=1)?;
+        for (level, &budget) in self.point_budget.iter().enumerate() {
+            check_range(&format!("point_budget[{level}]"), budget, 100..=100_000)?;
+        }
+        self.selection.validate().map_err(|error| error.within("selection"))
+    }
+}
+
+/// A side shorter than this many pixels holds too little to align.
+const SHORTEST_SIDE_PX: usize = 24;
+
+/// Number of pyramid levels for images of this size, [`MAX_LEVELS`] at most.
+pub fn num_levels(width: usize, height: usize) -> usize {
+    let fits = |&level: &usize| width.min(height) >> level >= SHORTEST_SIDE_PX;
+    (0..MAX_LEVELS).take_while(fits).count().max(1)
+}
 
 /// A keyframe prepared for alignment, point clouds by pyramid level.
 #[derive(Debug, Clone)]
 pub struct Reference {
+    params: ReferenceParams,
     keyframe_id: u64,
+    epoch: u32,
+    revision: u64,
+    sequence: u64,
+    map_state: MapState,
+    world_from_keyframe: Sim3,
+    intrinsics: Intrinsics,
+    mean_inverse_depth: f64,
+    levels: Vec<LevelPoints>,
+    pyramid: SumPyramid,
+    fusion: DepthFusion,
+    selection: Selection,
 }
 
 impl Reference {
-    /// Prepares `keyframe`.
-    pub fn prepare(keyframe: &Keyframe) -> Self {
-        Self { keyframe_id: keyframe.keyframe_id }
+    /// An empty reference: memory for [`Reference::prepare_into`].
+    pub fn new(params: ReferenceParams) -> Self {
+        Self {
+            params,
+            keyframe_id: NO_KEYFRAME,
+            epoch: 0,
+            revision: 0,
+            sequence: 0,
+            map_state: MapState::Initializing,
+            world_from_keyframe: Sim3::identity(),
+            intrinsics: Intrinsics { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, width: 0, height: 0 },
+            mean_inverse_depth: 1.0,
+            levels: vec![LevelPoints::default(); MAX_LEVELS],
+            pyramid: SumPyramid::default(),
+            fusion: DepthFusion::default(),
+            selection: Selection::default(),
+        }
     }
 
-    /// The keyframe it was prepared from.
+    /// Prepares `keyframe` with the default parameters.
+    pub fn prepare(keyframe: &Keyframe) -> Self {
+        let mut reference = Self::new(ReferenceParams::default());
+        reference.prepare_into(keyframe);
+        reference
+    }
+
+    /// Prepares `keyframe` in the memory of this reference. A keyframe that cannot be used (image
+    /// of another size than its intrinsics, no valid point) leaves a reference without points.
+    pub fn prepare_into(&mut self, keyframe: &Keyframe) {
+        self.keyframe_id = keyframe.keyframe_id;
+        self.epoch = keyframe.epoch;
+        self.revision = keyframe.revision;
+        self.sequence = keyframe.sequence;
+        self.map_state = keyframe.map_state;
+        let placed = keyframe.world_from_keyframe.is_valid();
+        self.world_from_keyframe =
+            if placed { keyframe.world_from_keyframe } else { Sim3::identity() };
+        self.intrinsics = keyframe.intrinsics;
+        self.mean_inverse_depth = 1.0;
+        self.levels.iter_mut().for_each(LevelPoints::clear);
+        let Intrinsics { width, height, .. } = keyframe.intrinsics;
+        let usable =
+            placed && keyframe.intrinsics.is_valid() && width * height == keyframe.image.len();
+        if !usable {
+            return;
+        }
+        let (levels, finest) = (num_levels(width, height), self.params.finest_level);
+        if !self.pyramid.has_size(width, height, levels, finest) {
+            self.pyramid = SumPyramid::with_size(width, height, levels, finest);
+        }
+        self.pyramid.fill(&keyframe.image);
+        self.fusion.fuse(&keyframe.points, width, height, levels);
+        self.mean_inverse_depth = self.fusion.level(0).mean_inverse_depth().unwrap_or(1.0);
+        for level in finest..levels {
+            self.pack_level(level);
+        }
+    }
+
+    /// Chooses the points of one level and packs them for the loop over points.
+    fn pack_level(&mut self, level: usize) {
+        let intrinsics = self.intrinsics.at_level(level);
+        let image = self.pyramid.level(level);
+        let candidates = self.fusion.level(level);
+        let budget = self.params.point_budget[level];
+        let chosen = self.selection.choose(
+            &self.params.selection,
+            candidates,
+            image,
+            level,
+            intrinsics.fx / self.mean_inverse_depth,
+            budget,
+        );
+        let (inverse_fx, inverse_fy) = (1.0 / intrinsics.fx, 1.0 / intrinsics.fy);
+        for &index in chosen {
+            let candidate = candidates.get(index as usize);
+            let (u, v) = (usize::from(candidate.u), usize::from(candidate.v));
+            self.levels[level].push(Point {
+                ray_x: ((u as f64 - intrinsics.cx) * inverse_fx) as f32,
+                ray_y: ((v as f64 - intrinsics.cy) * inverse_fy) as f32,
+                inverse_depth: candidate.inverse_depth,
+                variance: candidate.variance,
+                intensity: f32::from(image.at(u, v)) * grey_per_sum(level),
+            });
+        }
+    }
+
+    /// The keyframe it was prepared from; [`NO_KEYFRAME`] before any.
     pub fn keyframe_id(&self) -> u64 {
         self.keyframe_id
+    }
+
+    /// Life of the map that the keyframe belongs to.
+    pub fn epoch(&self) -> u32 {
+        self.epoch
+    }
+
+    /// Revision of the keyframe.
+    pub fn revision(&self) -> u64 {
+        self.revision
+    }
+
+    /// Sequence of the frame that the keyframe was made from.
+    pub fn sequence(&self) -> u64 {
+        self.sequence
+    }
+
+    /// Whether the depth can be trusted.
+    pub fn map_state(&self) -> MapState {
+        self.map_state
+    }
+
+    /// The keyframe's pose with the scale of its depth.
+    pub fn world_from_keyframe(&self) -> &Sim3 {
+        &self.world_from_keyframe
+    }
+
+    /// Intrinsics of level 0.
+    pub fn intrinsics(&self) -> &Intrinsics {
+        &self.intrinsics
+    }
+
+    /// Mean inverse depth of all points of the keyframe, 1/keyframe units.
+    pub fn mean_inverse_depth(&self) -> f64 {
+        self.mean_inverse_depth
+    }
+
+    /// Finest level with points prepared.
+    pub fn finest_level(&self) -> usize {
+        self.params.finest_level
+    }
+
+    /// The points of one level; empty where the level is not aligned.
+    pub fn level(&self, level: usize) -> &LevelPoints {
+        &self.levels[level]
+    }
+
+    /// The candidates of one level before selection.
+    pub fn candidates(&self, level: usize) -> &Candidates {
+        self.fusion.level(level)
     }
 }

@@ -3,3 +3,4 @@
 pub mod buffer;
 pub mod gray;
 pub mod pyramid;
+pub mod sums;

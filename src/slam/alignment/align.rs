@@ -1,0 +1,373 @@
+//! Coarse to fine: iteratively re-weighted Gauss–Newton with Levenberg–Marquardt damping.
+
+use nalgebra::{Matrix6, SVector};
+use serde::{Deserialize, Serialize};
+
+use crate::slam::alignment::normal_equations::{NormalEquations, UNKNOWNS, pose_step};
+use crate::slam::alignment::reference::Reference;
+use crate::slam::alignment::residual::{
+    Evaluation, Weighting, accumulate_reference, mean_squared_flow,
+};
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::image::sums::{MAX_LEVELS, SumPyramid};
+use crate::slam::parameter::{ParameterError, check_range};
+use crate::slam::pose::Brightness;
+
+/// Tuning of the alignment.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct AlignmentParams {
+    /// Noise of one pixel of level 0, grey levels. Averages down by two with each level.
+    pub pixel_noise: f32,
+    /// What does not average down with the levels (interpolation, reflections, occlusion),
+    /// grey levels: floor of σ_I.
+    pub model_noise: f32,
+    /// Whether the variance of the inverse depth weighs the residuals (LSD14 §3.3); off only to
+    /// see what it buys.
+    pub use_depth_variance: bool,
+    /// Whether the pull of noisy depth on the translation is taken out of the gradient.
+    pub correct_depth_noise: bool,
+    /// Huber's k on |r|/σ_r; LSD-SLAM's 1.5 keeps 95 % efficiency on Gaussian noise.
+    pub huber: f32,
+    /// |r|/σ_r below which a point counts as inlier.
+    pub inlier_gate: f32,
+    /// Whether the brightness (a, b) is estimated with the pose.
+    pub estimate_brightness: bool,
+    /// Standard deviation of a around 0: a gain of 1.6 is one σ.
+    pub gain_prior_std_dev: f64,
+    /// Standard deviation of b around 0, grey levels.
+    pub offset_prior_std_dev: f64,
+    /// Most iterations of each level, finest first.
+    pub max_iterations: [u32; MAX_LEVELS],
+    /// A level is done when a step would move the image by less than this, pixels of the level.
+    pub step_tolerance_px: f64,
+    /// … and change its brightness by less than this, grey levels.
+    pub step_tolerance_grey: f64,
+    /// A level is done when a step keeps more than this share of the mean energy.
+    pub energy_tolerance: f64,
+    /// Smallest share of the level's points that must be in view.
+    pub min_in_view: f64,
+    /// Inflation s² of the covariance: neighbouring residuals are correlated and the model is
+    /// not perfect. Fitted by the example `calibrate_covariance` on simulated scenes.
+    pub covariance_inflation: f64,
+}
+
+impl Default for AlignmentParams {
+    fn default() -> Self {
+        Self {
+            pixel_noise: 2.5,
+            model_noise: 2.0,
+            use_depth_variance: true,
+            correct_depth_noise: true,
+            huber: 1.5,
+            inlier_gate: 2.5,
+            estimate_brightness: true,
+            gain_prior_std_dev: 0.5,
+            offset_prior_std_dev: 30.0,
+            max_iterations: [8, 12, 20, 30, 40],
+            step_tolerance_px: 0.01,
+            step_tolerance_grey: 0.1,
+            energy_tolerance: 0.999,
+            min_in_view: 0.05,
+            covariance_inflation: 1.0,
+        }
+    }
+}
+
+impl AlignmentParams {
+    /// Checks every value.
+    pub fn validate(&self) -> Result<(), ParameterError> {
+        check_range("pixel_noise", self.pixel_noise, 0.0..=100.0)?;
+        // Without a floor a noise-free image would weigh its residuals infinitely.
+        check_range("model_noise", self.model_noise, 0.01..=100.0)?;
+        check_range("huber", self.huber, 0.1..=100.0)?;
+        check_range("inlier_gate", self.inlier_gate, 0.1..=100.0)?;
+        check_range("gain_prior_std_dev", self.gain_prior_std_dev, 1e-3..=1e3)?;
+        check_range("offset_prior_std_dev", self.offset_prior_std_dev, 1e-3..=1e6)?;
+        for (level, &iterations) in self.max_iterations.iter().enumerate() {
+            check_range(&format!("max_iterations[{level}]"), iterations, 1..=1000)?;
+        }
+        check_range("step_tolerance_px", self.step_tolerance_px, 1e-6..=1.0)?;
+        check_range("step_tolerance_grey", self.step_tolerance_grey, 1e-6..=255.0)?;
+        check_range("energy_tolerance", self.energy_tolerance, 0.5..=1.0)?;
+        check_range("min_in_view", self.min_in_view, 0.0..=1.0)?;
+        check_range("covariance_inflation", self.covariance_inflation, 1e-3..=1e6)
+    }
+
+    /// The weighting of residuals on `level`.
+    pub fn weighting(&self, level: usize) -> Weighting {
+        let averaged = self.pixel_noise / (1u32 << level) as f32;
+        Weighting {
+            intensity_variance: averaged * averaged + self.model_noise * self.model_noise,
+            use_depth_variance: self.use_depth_variance,
+            correct_depth_noise: self.correct_depth_noise,
+            huber: self.huber,
+            inlier_gate: self.inlier_gate,
+        }
+    }
+}
+
+/// Where an alignment stands: the unknowns and how well they explain the image.
+#[derive(Debug, Clone, PartialEq)]
+pub struct AlignedState {
+    /// Pose, translation in keyframe units.
+    pub current_from_keyframe: SE3,
+    /// Brightness against the keyframe.
+    pub brightness: Brightness,
+    /// The sums at this state, priors included.
+    pub sums: NormalEquations,
+}
+
+/// Why an alignment came to its end.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Ending {
+    /// Solved down to the finest level.
+    Finished,
+    /// The budget ran out before that.
+    OutOfBudget,
+    /// No level has points in view.
+    NothingInView,
+}
+
+/// What came of an alignment.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Alignment {
+    /// The best state found.
+    pub state: AlignedState,
+    /// Finest level on which the state was solved.
+    pub level: usize,
+    /// Points of that level, in view or not.
+    pub points: usize,
+    /// Iterations of each level, finest first.
+    pub iterations: [u32; MAX_LEVELS],
+    /// Why it ended.
+    pub ending: Ending,
+    /// Mean squared flow from the keyframe, pixels² of level 0.
+    pub mean_squared_flow: f64,
+}
+
+impl Alignment {
+    /// Covariance of the left increment of `current_from_keyframe`, calibrated by the inflation
+    /// of `params`; `None` where the images do not determine the pose.
+    pub fn covariance(&self, params: &AlignmentParams) -> Option<Matrix6<f64>> {
+        self.state.sums.pose_covariance().map(|raw| raw * params.covariance_inflation)
+    }
+}
+
+/// Aligns frames to references.
+#[derive(Debug, Clone)]
+pub struct Aligner {
+    params: AlignmentParams,
+}
+
+impl Aligner {
+    /// An aligner with these parameters.
+    pub fn new(params: AlignmentParams) -> Self {
+        Self { params }
+    }
+
+    /// Its parameters.
+    pub fn params(&self) -> &AlignmentParams {
+        &self.params
+    }
+
+    /// The sums at one state on one level, priors included.
+    pub fn evaluate(
+        &self,
+        reference: &Reference,
+        frame: &SumPyramid,
+        level: usize,
+        current_from_keyframe: &SE3,
+        brightness: Brightness,
+    ) -> AlignedState {
+        let intrinsics = reference.intrinsics().at_level(level);
+        let weighting = self.params.weighting(level);
+        let at = Evaluation::new(&intrinsics, level, current_from_keyframe, brightness, &weighting);
+        let mut sums = accumulate_reference(reference.level(level), frame.level(level), &at);
+        if self.params.estimate_brightness {
+            let information = |std_dev: f64| 1.0 / (std_dev * std_dev);
+            sums.add_prior(6, brightness.a, 0.0, information(self.params.gain_prior_std_dev));
+            sums.add_prior(7, brightness.b, 0.0, information(self.params.offset_prior_std_dev));
+        } else {
+            sums.fix(6);
+            sums.fix(7);
+        }
+        AlignedState { current_from_keyframe: *current_from_keyframe, brightness, sums }
+    }
+
+    /// Aligns `frame` to `reference` from a first guess, from the coarsest level both have down
+    /// to the finest. `budget` is asked with the level before each iteration.
+    pub fn align(
+        &self,
+        reference: &Reference,
+        frame: &SumPyramid,
+        current_from_keyframe: &SE3,
+        brightness: Brightness,
+        budget: &mut dyn FnMut(usize) -> bool,
+    ) -> Alignment {
+        let mut alignment = self.start(reference, frame, current_from_keyframe, brightness);
+        self.descend(reference, frame, &mut alignment, budget);
+        alignment
+    }
+
+    /// The first guess, evaluated on the coarsest level with points.
+    pub fn start(
+        &self,
+        reference: &Reference,
+        frame: &SumPyramid,
+        current_from_keyframe: &SE3,
+        brightness: Brightness,
+    ) -> Alignment {
+        let has_points = |&level: &usize| !reference.level(level).is_empty();
+        let level = (0..frame.num_levels()).rev().find(has_points).unwrap_or(0);
+        Alignment {
+            state: self.evaluate(reference, frame, level, current_from_keyframe, brightness),
+            level,
+            points: reference.level(level).len(),
+            iterations: [0; MAX_LEVELS],
+            ending: Ending::NothingInView,
+            mean_squared_flow: 0.0,
+        }
+    }
+
+    /// Solves the levels below the one that `alignment` stands on, down to the finest.
+    pub fn descend(
+        &self,
+        reference: &Reference,
+        frame: &SumPyramid,
+        alignment: &mut Alignment,
+        budget: &mut dyn FnMut(usize) -> bool,
+    ) {
+        let finest = reference.finest_level().max(frame.finest_level());
+        let solved = alignment.iterations[alignment.level] > 0;
+        let first = if solved { alignment.level } else { alignment.level + 1 };
+        for level in (finest..first).rev() {
+            if !reference.level(level).is_empty()
+                && !self.solve_level(reference, frame, level, alignment, budget)
+            {
+                break;
+            }
+        }
+        alignment.mean_squared_flow = self.flow_of(reference, alignment);
+    }
+
+    /// Iterates on one level; whether there is budget for the next.
+    pub fn solve_level(
+        &self,
+        reference: &Reference,
+        frame: &SumPyramid,
+        level: usize,
+        alignment: &mut Alignment,
+        budget: &mut dyn FnMut(usize) -> bool,
+    ) -> bool {
+        if !budget(level) {
+            alignment.ending = Ending::OutOfBudget;
+            return false;
+        }
+        let AlignedState { current_from_keyframe, brightness, .. } = alignment.state;
+        let mut state = self.evaluate(reference, frame, level, &current_from_keyframe, brightness);
+        let points = reference.level(level).len();
+        let min_in_view = self.params.min_in_view * points as f64;
+        if f64::from(state.sums.in_view) < min_in_view.max(UNKNOWNS as f64) {
+            return true;
+        }
+        let intrinsics = reference.intrinsics().at_level(level);
+        let (mut lambda, mut failures, mut within_budget) = (0.0, 0, true);
+        for iteration in 0..self.params.max_iterations[level] {
+            // The first iteration was paid with the evaluation above.
+            if iteration > 0 && !budget(level) {
+                within_budget = false;
+                break;
+            }
+            let step = state.sums.damped_step(lambda);
+            let Some(step) = step.filter(is_sane) else {
+                (lambda, failures) = worse(lambda, failures);
+                if failures > MAX_FAILURES {
+                    break;
+                }
+                continue;
+            };
+            alignment.iterations[level] += 1;
+            let moved_px = step_in_pixels(&step, &intrinsics, reference.mean_inverse_depth());
+            let candidate = self.evaluate(
+                reference,
+                frame,
+                level,
+                &(SE3::exp(&pose_step(&step)) * state.current_from_keyframe),
+                Brightness { a: state.brightness.a + step[6], b: state.brightness.b + step[7] },
+            );
+            let in_view = f64::from(candidate.sums.in_view);
+            let keeps_view = in_view >= MIN_KEPT_IN_VIEW * f64::from(state.sums.in_view);
+            let ratio = candidate.sums.mean_energy() / state.sums.mean_energy();
+            if keeps_view && in_view >= min_in_view && ratio < 1.0 {
+                state = candidate;
+                lambda = if lambda <= FIRST_DAMPING { 0.0 } else { 0.5 * lambda };
+                failures = 0;
+                if ratio > self.params.energy_tolerance {
+                    break;
+                }
+            } else {
+                (lambda, failures) = worse(lambda, failures);
+                if failures > MAX_FAILURES {
+                    break;
+                }
+            }
+            let relit = TYPICAL_GREY * step[6].abs() + step[7].abs();
+            if moved_px < self.params.step_tolerance_px && relit < self.params.step_tolerance_grey {
+                break;
+            }
+        }
+        alignment.state = state;
+        alignment.level = level;
+        alignment.points = points;
+        alignment.ending = if within_budget { Ending::Finished } else { Ending::OutOfBudget };
+        within_budget
+    }
+
+    fn flow_of(&self, reference: &Reference, alignment: &Alignment) -> f64 {
+        let level = alignment.level;
+        let AlignedState { current_from_keyframe, brightness, .. } = &alignment.state;
+        let intrinsics = reference.intrinsics().at_level(level);
+        let weighting = self.params.weighting(level);
+        let at =
+            Evaluation::new(&intrinsics, level, current_from_keyframe, *brightness, &weighting);
+        let squared_pixel = f64::from(1u32 << (2 * level));
+        mean_squared_flow(reference.level(level), &at) * squared_pixel
+    }
+}
+
+/// Brightness at which a step in the gain is weighed against one in the offset.
+const TYPICAL_GREY: f64 = 128.0;
+
+/// λ after the first failure, and the bound below which a success sets it to zero.
+const FIRST_DAMPING: f64 = 0.2;
+
+/// Failures in a row after which a level is given up as converged: λ has grown by 2¹⁵ then.
+const MAX_FAILURES: u32 = 5;
+
+/// A step that pushes more than half of the points out of the image is a step into the dark, also
+/// when the rest fits better.
+const MIN_KEPT_IN_VIEW: f64 = 0.5;
+
+/// λ and the number of failures in a row after one more.
+fn worse(lambda: f64, failures: u32) -> (f64, u32) {
+    let failures = failures + 1;
+    let lambda =
+        if lambda == 0.0 { FIRST_DAMPING } else { lambda * f64::from(1u32 << failures.min(20)) };
+    (lambda, failures)
+}
+
+/// Whether a step is worth an evaluation: a rotation beyond a quarter turn or a gain beyond e² is
+/// an artefact of a nearly singular system.
+fn is_sane(step: &SVector<f64, UNKNOWNS>) -> bool {
+    let rotation = step.fixed_rows::<3>(3).norm();
+    rotation < std::f64::consts::FRAC_PI_2 && step[6].abs() < 2.0
+}
+
+/// How far a step moves the image, pixels of the level: f (‖t‖ d̄ + ‖ω‖).
+fn step_in_pixels(step: &SVector<f64, UNKNOWNS>, at: &Intrinsics, mean_inverse_depth: f64) -> f64 {
+    let translation = step.fixed_rows::<3>(0).norm() * mean_inverse_depth;
+    let rotation = step.fixed_rows::<3>(3).norm();
+    at.fx.max(at.fy) * (translation + rotation)
+}

@@ -1,0 +1,85 @@
+//! The normal equations of one evaluation, and the damped step that solves them.
+//!
+//! State: the left increment (translation, rotation) of `current_from_keyframe`, then the
+//! increments of the brightness a and b.
+
+use nalgebra::{Matrix6, SMatrix, SVector, Vector6};
+
+/// Unknowns: six of the pose, two of the brightness.
+pub const UNKNOWNS: usize = 8;
+
+/// Information, gradient and statistics of the residuals at one state.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NormalEquations {
+    /// Σ w J Jᵀ.
+    pub information: SMatrix<f64, UNKNOWNS, UNKNOWNS>,
+    /// Σ w J r.
+    pub gradient: SVector<f64, UNKNOWNS>,
+    /// Σ ρ(r/σ_r), Huber's ρ (q² inside, 2k|q| − k² outside).
+    pub energy: f64,
+    /// Σ r², grey levels².
+    pub squared_residual: f64,
+    /// Points that fall inside the image.
+    pub in_view: u32,
+    /// Points in view with |r| below the inlier gate.
+    pub inliers: u32,
+}
+
+impl Default for NormalEquations {
+    fn default() -> Self {
+        Self {
+            information: SMatrix::zeros(),
+            gradient: SVector::zeros(),
+            energy: 0.0,
+            squared_residual: 0.0,
+            in_view: 0,
+            inliers: 0,
+        }
+    }
+}
+
+impl NormalEquations {
+    /// Mean energy of the points in view; infinite without any.
+    pub fn mean_energy(&self) -> f64 {
+        if self.in_view == 0 { f64::INFINITY } else { self.energy / f64::from(self.in_view) }
+    }
+
+    /// Adds a prior N(mean, 1/information) on unknown `index`, whose value is now `value`.
+    pub fn add_prior(&mut self, index: usize, value: f64, mean: f64, information: f64) {
+        let deviation = value - mean;
+        self.information[(index, index)] += information;
+        self.gradient[index] += information * deviation;
+        self.energy += information * deviation * deviation;
+    }
+
+    /// Takes an unknown out of the problem: its step will be zero.
+    pub fn fix(&mut self, index: usize) {
+        self.information.row_mut(index).fill(0.0);
+        self.information.column_mut(index).fill(0.0);
+        self.information[(index, index)] = 1.0;
+        self.gradient[index] = 0.0;
+    }
+
+    /// The step −(A + λ diag A)⁻¹ g; `None` where A is not positive definite or not finite.
+    pub fn damped_step(&self, lambda: f64) -> Option<SVector<f64, UNKNOWNS>> {
+        let mut damped = self.information;
+        for i in 0..UNKNOWNS {
+            damped[(i, i)] *= 1.0 + lambda;
+        }
+        let step = -damped.cholesky()?.solve(&self.gradient);
+        step.iter().all(|x| x.is_finite()).then_some(step)
+    }
+
+    /// Covariance of the pose with the brightness marginalised, before calibration; `None` where
+    /// the information does not determine all unknowns.
+    pub fn pose_covariance(&self) -> Option<Matrix6<f64>> {
+        let inverse = self.information.cholesky()?.inverse();
+        let pose: Matrix6<f64> = inverse.fixed_view::<6, 6>(0, 0).into_owned();
+        pose.iter().all(|x| x.is_finite()).then_some(pose)
+    }
+}
+
+/// The pose part of a step.
+pub fn pose_step(step: &SVector<f64, UNKNOWNS>) -> Vector6<f64> {
+    step.fixed_rows::<6>(0).into_owned()
+}

@@ -1,0 +1,108 @@
+//! Points of one pyramid level in blocks of lanes.
+
+/// Points of one block: one register of AVX-512, two of AVX2, four of NEON.
+pub const LANES: usize = 16;
+
+/// Sixteen points, each quantity side by side and aligned to a cache line.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[repr(C, align(64))]
+pub struct PointBlock {
+    /// x of the ray (x, y, 1) through the pixel.
+    pub ray_x: [f32; LANES],
+    /// y of the ray.
+    pub ray_y: [f32; LANES],
+    /// Inverse depth, 1/keyframe units.
+    pub inverse_depth: [f32; LANES],
+    /// Variance of the inverse depth.
+    pub variance: [f32; LANES],
+    /// Brightness of the keyframe there, grey levels.
+    pub intensity: [f32; LANES],
+}
+
+/// A ray so flat that no camera of ours sees it: what pads the last block is never in view.
+const PADDING_RAY: f32 = 1.0e6;
+
+impl PointBlock {
+    const PADDING: Self = Self {
+        ray_x: [PADDING_RAY; LANES],
+        ray_y: [PADDING_RAY; LANES],
+        inverse_depth: [1.0; LANES],
+        variance: [1.0; LANES],
+        intensity: [0.0; LANES],
+    };
+}
+
+/// One point before it is packed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Point {
+    /// x of the ray (x, y, 1) through the pixel.
+    pub ray_x: f32,
+    /// y of the ray.
+    pub ray_y: f32,
+    /// Inverse depth, 1/keyframe units.
+    pub inverse_depth: f32,
+    /// Variance of the inverse depth.
+    pub variance: f32,
+    /// Brightness of the keyframe there, grey levels.
+    pub intensity: f32,
+}
+
+/// The points of one level.
+#[derive(Debug, Clone, Default)]
+pub struct LevelPoints {
+    blocks: Vec<PointBlock>,
+    len: usize,
+}
+
+impl LevelPoints {
+    /// Forgets the points and keeps the memory.
+    pub fn clear(&mut self) {
+        self.blocks.clear();
+        self.len = 0;
+    }
+
+    /// Adds a point.
+    pub fn push(&mut self, point: Point) {
+        let lane = self.len % LANES;
+        if lane == 0 {
+            self.blocks.push(PointBlock::PADDING);
+        }
+        if let Some(block) = self.blocks.last_mut() {
+            block.ray_x[lane] = point.ray_x;
+            block.ray_y[lane] = point.ray_y;
+            block.inverse_depth[lane] = point.inverse_depth;
+            block.variance[lane] = point.variance;
+            block.intensity[lane] = point.intensity;
+            self.len += 1;
+        }
+    }
+
+    /// The blocks; lanes beyond [`LevelPoints::len`] are never in view.
+    pub fn blocks(&self) -> &[PointBlock] {
+        &self.blocks
+    }
+
+    /// Number of points.
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Whether there is none.
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// The points one by one.
+    pub fn iter(&self) -> impl Iterator<Item = Point> + '_ {
+        let lanes = self.blocks.iter().flat_map(|block| {
+            (0..LANES).map(|lane| Point {
+                ray_x: block.ray_x[lane],
+                ray_y: block.ray_y[lane],
+                inverse_depth: block.inverse_depth[lane],
+                variance: block.variance[lane],
+                intensity: block.intensity[lane],
+            })
+        });
+        lanes.take(self.len)
+    }
+}

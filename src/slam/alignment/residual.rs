@@ -1,0 +1,228 @@
+//! The residual of a point, its variance and its Jacobian, and their sums over a level.
+//!
+//! With the keyframe's ray x = (x, y, 1), inverse depth d and variance V, and everything scaled
+//! by d so that points far away stay finite (`spec` letters):
+//! ```text
+//! X̃  = R x + t d = (x̃, ỹ, z̃)          p' = π(X̃)        n = (x̃, ỹ)/z̃
+//! r   = I(p') − (eᵃ I_k + b)            a_x = g_x f_x     a_y = g_y f_y     m = a_x n_x + a_y n_y
+//! J_t = d/z̃ (a_x, a_y, −m)             J_r = (−a_y − n_y m, a_x + n_x m, n_x a_y − n_y a_x)
+//! ∂r/∂d = (a_x t_x + a_y t_y − m t_z)/z̃
+//! σ_r² = (1 + e²ᵃ) σ_I² + (∂r/∂d)² V
+//! ```
+//! g is the derivative of the bilinear interpolant itself, so that the step descends on the cost
+//! that is evaluated.
+
+use std::cmp::Ordering;
+
+use crate::slam::alignment::normal_equations::{NormalEquations, UNKNOWNS};
+use crate::slam::alignment::points::{LANES, LevelPoints, Point};
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::image::buffer::Image;
+use crate::slam::image::sums::grey_per_sum;
+use crate::slam::pose::Brightness;
+
+/// Pixels at the rim that are not used: rectification and lenses are worst there.
+const BORDER_PX: f32 = 1.0;
+
+/// A point nearer to the camera than this share of its depth in the keyframe is not used: it is
+/// magnified beyond recognition, and division by its depth loses digits.
+const NEAREST_DEPTH_RATIO: f32 = 0.1;
+
+/// How residuals are weighted.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Weighting {
+    /// σ_I² of one image at this level, grey levels².
+    pub intensity_variance: f32,
+    /// Whether (∂r/∂d)² V enters σ_r².
+    pub use_depth_variance: bool,
+    /// Whether the bias that noise in d leaves in the translation is taken out of the gradient.
+    pub correct_depth_noise: bool,
+    /// Huber's k on |r|/σ_r.
+    pub huber: f32,
+    /// |r|/σ_r below which a point counts as inlier.
+    pub inlier_gate: f32,
+}
+
+/// One state on one level, in the numbers that the loop over points needs.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Evaluation {
+    pub(crate) rotation: [f32; 9],
+    pub(crate) translation: [f32; 3],
+    pub(crate) focal: [f32; 2],
+    pub(crate) centre: [f32; 2],
+    pub(crate) upper_bound: [f32; 2],
+    pub(crate) grey_per_sum: f32,
+    pub(crate) gain: f32,
+    pub(crate) offset: f32,
+    pub(crate) intensity_variance: f32,
+    pub(crate) depth_variance_factor: f32,
+    pub(crate) noise_correction: f32,
+    pub(crate) huber: f32,
+    pub(crate) inlier_gate_squared: f32,
+}
+
+impl Evaluation {
+    /// For `current_from_keyframe` (translation in keyframe units) and `brightness` on `level`;
+    /// `intrinsics` are those of the level.
+    pub fn new(
+        intrinsics: &Intrinsics,
+        level: usize,
+        current_from_keyframe: &SE3,
+        brightness: Brightness,
+        weighting: &Weighting,
+    ) -> Self {
+        let rotation = current_from_keyframe.rotation_matrix();
+        let gain = brightness.a.exp() as f32;
+        // The last pixel whose right and lower neighbours exist, less the border.
+        let upper = |side: usize| side as f32 - 1.0 - BORDER_PX;
+        Self {
+            rotation: std::array::from_fn(|i| rotation[(i / 3, i % 3)] as f32),
+            translation: std::array::from_fn(|i| current_from_keyframe.translation[i] as f32),
+            focal: [intrinsics.fx as f32, intrinsics.fy as f32],
+            centre: [intrinsics.cx as f32, intrinsics.cy as f32],
+            upper_bound: [upper(intrinsics.width), upper(intrinsics.height)],
+            grey_per_sum: grey_per_sum(level),
+            gain,
+            offset: brightness.b as f32,
+            intensity_variance: (1.0 + gain * gain) * weighting.intensity_variance,
+            depth_variance_factor: if weighting.use_depth_variance { 1.0 } else { 0.0 },
+            noise_correction: if weighting.correct_depth_noise { 1.0 } else { 0.0 },
+            huber: weighting.huber,
+            inlier_gate_squared: weighting.inlier_gate * weighting.inlier_gate,
+        }
+    }
+}
+
+/// What one point contributes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PointTerms {
+    /// Where it falls, pixels of the level.
+    pub projection: [f32; 2],
+    /// r, grey levels.
+    pub residual: f32,
+    /// σ_r², grey levels².
+    pub variance: f32,
+    /// ∂r/∂d, grey levels · keyframe units.
+    pub inverse_depth_derivative: f32,
+    /// ∂r/∂(translation, rotation, a, b).
+    pub jacobian: [f32; UNKNOWNS],
+}
+
+/// The terms of one point; `None` out of view.
+#[inline(always)]
+pub fn point_terms(image: &Image<u16>, at: &Evaluation, point: &Point) -> Option<PointTerms> {
+    let [r0, r1, r2, r3, r4, r5, r6, r7, r8] = at.rotation;
+    let [tx, ty, tz] = at.translation;
+    let (x, y, d) = (point.ray_x, point.ray_y, point.inverse_depth);
+    let warped_x = r0 * x + r1 * y + r2 + tx * d;
+    let warped_y = r3 * x + r4 * y + r5 + ty * d;
+    let depth_ratio = r6 * x + r7 * y + r8 + tz * d;
+    if depth_ratio.partial_cmp(&NEAREST_DEPTH_RATIO) != Some(Ordering::Greater) {
+        return None;
+    }
+    let inverse_ratio = 1.0 / depth_ratio;
+    let (nx, ny) = (warped_x * inverse_ratio, warped_y * inverse_ratio);
+    let u = at.focal[0] * nx + at.centre[0];
+    let v = at.focal[1] * ny + at.centre[1];
+    let inside = u >= BORDER_PX && v >= BORDER_PX && u < at.upper_bound[0] && v < at.upper_bound[1];
+    if !inside {
+        return None;
+    }
+    let (column, row) = (u as usize, v as usize);
+    let (du, dv) = (u - column as f32, v - row as f32);
+    let upper = column + row * image.width();
+    let pixel = |index: usize| f32::from(image.pixels()[index]);
+    let (p00, p10) = (pixel(upper), pixel(upper + 1));
+    let (p01, p11) = (pixel(upper + image.width()), pixel(upper + image.width() + 1));
+    let (dx_upper, dx_lower) = (p10 - p00, p11 - p01);
+    let (left, right) = (p00 + dx_upper * du, p01 + dx_lower * du);
+    let value = (left + (right - left) * dv) * at.grey_per_sum;
+    let gradient_x = (dx_upper + (dx_lower - dx_upper) * dv) * at.grey_per_sum;
+    let gradient_y = (right - left) * at.grey_per_sum;
+
+    let (ax, ay) = (gradient_x * at.focal[0], gradient_y * at.focal[1]);
+    let m = ax * nx + ay * ny;
+    let predicted = at.gain * point.intensity;
+    let inverse_depth_derivative = (ax * tx + ay * ty - m * tz) * inverse_ratio;
+    let from_depth = inverse_depth_derivative * inverse_depth_derivative * point.variance;
+    let scale = d * inverse_ratio;
+    Some(PointTerms {
+        projection: [u, v],
+        residual: value - (predicted + at.offset),
+        variance: at.intensity_variance + at.depth_variance_factor * from_depth,
+        inverse_depth_derivative,
+        jacobian: [
+            scale * ax,
+            scale * ay,
+            -scale * m,
+            -(ay + ny * m),
+            ax + nx * m,
+            nx * ay - ny * ax,
+            -predicted,
+            -1.0,
+        ],
+    })
+}
+
+/// Sums the normal equations of `points` over `image`; the explanation of every fast kernel.
+pub fn accumulate_reference(
+    points: &LevelPoints,
+    image: &Image<u16>,
+    at: &Evaluation,
+) -> NormalEquations {
+    let mut sums = NormalEquations::default();
+    for point in points.iter() {
+        let Some(terms) = point_terms(image, at, &point) else { continue };
+        let squared = terms.residual * terms.residual;
+        let normalized = squared / terms.variance;
+        let huber_weight = (at.huber / normalized.sqrt()).min(1.0);
+        let weight = f64::from(huber_weight / terms.variance);
+        sums.energy += f64::from(huber_weight * (2.0 - huber_weight) * normalized);
+        sums.squared_residual += f64::from(squared);
+        sums.in_view += 1;
+        sums.inliers += u32::from(normalized < at.inlier_gate_squared);
+        let residual = f64::from(terms.residual);
+        // Noise ε in d sits in r as (∂r/∂d) ε and in J_t as J_t ε/d: their product does not
+        // average out, and would pull the translation towards zero.
+        let product = at.noise_correction * terms.inverse_depth_derivative * point.variance;
+        let correlated = f64::from(product / point.inverse_depth);
+        let jacobian = terms.jacobian.map(f64::from);
+        for i in 0..UNKNOWNS {
+            let residual = if i < 3 { residual - correlated } else { residual };
+            sums.gradient[i] += weight * jacobian[i] * residual;
+            for j in i..UNKNOWNS {
+                sums.information[(i, j)] += weight * jacobian[i] * jacobian[j];
+            }
+        }
+    }
+    sums.information.fill_lower_triangle_with_upper_triangle();
+    sums
+}
+
+/// Mean squared optical flow, pixels² of the level, of every `LANES`-th point from the keyframe
+/// to where it falls; 0 where none is in view.
+pub fn mean_squared_flow(points: &LevelPoints, at: &Evaluation) -> f64 {
+    let [r0, r1, r2, r3, r4, r5, r6, r7, r8] = at.rotation;
+    let [tx, ty, tz] = at.translation;
+    let (mut sum, mut count) = (0.0f64, 0u32);
+    for (block, first) in points.blocks().iter().zip((0..points.len()).step_by(LANES)) {
+        let lane = (points.len() - first - 1).min(LANES / 2);
+        let (x, y, d) = (block.ray_x[lane], block.ray_y[lane], block.inverse_depth[lane]);
+        let depth_ratio = r6 * x + r7 * y + r8 + tz * d;
+        if depth_ratio.partial_cmp(&NEAREST_DEPTH_RATIO) != Some(Ordering::Greater) {
+            continue;
+        }
+        let nx = (r0 * x + r1 * y + r2 + tx * d) / depth_ratio;
+        let ny = (r3 * x + r4 * y + r5 + ty * d) / depth_ratio;
+        let (u, v) = (at.focal[0] * nx + at.centre[0], at.focal[1] * ny + at.centre[1]);
+        if !(u >= 0.0 && v >= 0.0 && u < at.upper_bound[0] && v < at.upper_bound[1]) {
+            continue;
+        }
+        let flow_u = f64::from(at.focal[0] * (nx - x));
+        let flow_v = f64::from(at.focal[1] * (ny - y));
+        sum += flow_u * flow_u + flow_v * flow_v;
+        count += 1;
+    }
+    if count == 0 { 0.0 } else { sum / f64::from(count) }
+}

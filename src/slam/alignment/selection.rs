@@ -1,0 +1,178 @@
+//! Which points of a level are aligned when there are more than the budget.
+//!
+//! The image is cut into tiles; each tile gets a share of the budget that grows with the square
+//! root of its points (between even spread and fair share), and keeps its most informative ones.
+
+use serde::{Deserialize, Serialize};
+
+use crate::slam::alignment::fusion::Candidates;
+use crate::slam::image::buffer::Image;
+use crate::slam::image::sums::grey_per_sum;
+use crate::slam::parameter::{ParameterError, check_range};
+
+/// How the points of a level are chosen.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SelectionParams {
+    /// Noise of a brightness difference, grey levels: how strong a gradient must be to count.
+    pub intensity_std_dev: f32,
+    /// Translation, in shares of the mean depth, at which noise in the image and in the depth are
+    /// weighed against each other. A keyframe is replaced at about a third.
+    pub typical_translation: f32,
+}
+
+impl Default for SelectionParams {
+    fn default() -> Self {
+        Self { intensity_std_dev: 4.0, typical_translation: 0.1 }
+    }
+}
+
+impl SelectionParams {
+    /// Checks every value.
+    pub fn validate(&self) -> Result<(), ParameterError> {
+        check_range("intensity_std_dev", self.intensity_std_dev, 0.1..=100.0)?;
+        check_range("typical_translation", self.typical_translation, 0.0..=10.0)
+    }
+}
+
+/// Side of a tile, pixels of the level: fine enough to spread, coarse enough that a tile with
+/// points gets at least a few.
+const TILE_PX: usize = 16;
+
+/// Chooses points, in memory that is used again.
+#[derive(Debug, Clone, Default)]
+pub struct Selection {
+    scores: Vec<f32>,
+    tile_of: Vec<u32>,
+    tile_starts: Vec<u32>,
+    by_tile: Vec<u32>,
+    chosen: Vec<u32>,
+}
+
+impl Selection {
+    /// Indices, ascending, of at most `budget` of the `candidates` on `image`, the sums of
+    /// `level`. `focal_times_depth`: focal length of the level times mean depth, what turns a
+    /// variance of inverse depth into pixels² for a translation of one mean depth.
+    pub fn choose(
+        &mut self,
+        params: &SelectionParams,
+        candidates: &Candidates,
+        image: &Image<u16>,
+        level: usize,
+        focal_times_depth: f64,
+        budget: usize,
+    ) -> &[u32] {
+        self.chosen.clear();
+        if candidates.len() <= budget {
+            self.chosen.extend(0..candidates.len() as u32);
+            return &self.chosen;
+        }
+        let pixels_per_inverse_depth = focal_times_depth as f32 * params.typical_translation;
+        self.score(params, candidates, image, level, pixels_per_inverse_depth);
+        let num_tiles = self.sort_into_tiles(candidates, image.width(), image.height());
+        self.fill_quotas(num_tiles, budget);
+        self.chosen.sort_unstable();
+        &self.chosen
+    }
+
+    /// Information of a point on a shift along its gradient, 1/pixels²:
+    /// 1/(σ²/|g|² + (∂u/∂d)² V).
+    fn score(
+        &mut self,
+        params: &SelectionParams,
+        candidates: &Candidates,
+        image: &Image<u16>,
+        level: usize,
+        pixels_per_inverse_depth: f32,
+    ) {
+        let grey = 0.5 * grey_per_sum(level);
+        let noise = params.intensity_std_dev * params.intensity_std_dev;
+        let from_depth = pixels_per_inverse_depth * pixels_per_inverse_depth;
+        let (right, bottom) = (image.width() - 1, image.height() - 1);
+        self.scores.clear();
+        self.scores.extend(candidates.as_slice().iter().map(|candidate| {
+            let (u, v) = (usize::from(candidate.u), usize::from(candidate.v));
+            let at = |u: usize, v: usize| f32::from(image.at(u, v));
+            let gx = (at((u + 1).min(right), v) - at(u.saturating_sub(1), v)) * grey;
+            let gy = (at(u, (v + 1).min(bottom)) - at(u, v.saturating_sub(1))) * grey;
+            let squared_gradient = gx * gx + gy * gy;
+            squared_gradient / (noise + squared_gradient * from_depth * candidate.variance)
+        }));
+    }
+
+    /// Counting sort of the candidates by tile; gives the number of tiles.
+    fn sort_into_tiles(&mut self, candidates: &Candidates, width: usize, height: usize) -> usize {
+        let columns = width.div_ceil(TILE_PX);
+        let num_tiles = columns * height.div_ceil(TILE_PX);
+        self.tile_of.clear();
+        self.tile_starts.clear();
+        self.tile_starts.resize(num_tiles + 1, 0);
+        for candidate in candidates.as_slice() {
+            let (u, v) = (usize::from(candidate.u), usize::from(candidate.v));
+            let tile = (v / TILE_PX) * columns + u / TILE_PX;
+            self.tile_of.push(tile as u32);
+            self.tile_starts[tile + 1] += 1;
+        }
+        for tile in 0..num_tiles {
+            self.tile_starts[tile + 1] += self.tile_starts[tile];
+        }
+        self.by_tile.clear();
+        self.by_tile.resize(candidates.len(), 0);
+        // Filled from the back so that each start ends where its tile begins.
+        let mut ends = std::mem::take(&mut self.tile_starts);
+        for (index, &tile) in self.tile_of.iter().enumerate().rev() {
+            let end = &mut ends[tile as usize + 1];
+            *end -= 1;
+            self.by_tile[*end as usize] = index as u32;
+        }
+        // Each end is now the start of its tile; shift them back into place.
+        ends.remove(0);
+        ends.push(candidates.len() as u32);
+        self.tile_starts = ends;
+        num_tiles
+    }
+
+    /// Takes from each tile its best points, as many as its share of the budget.
+    fn fill_quotas(&mut self, num_tiles: usize, budget: usize) {
+        let tile = |starts: &[u32], tile: usize| starts[tile] as usize..starts[tile + 1] as usize;
+        let share = |count: usize| (count as f64).sqrt();
+        let mut factor = 0.0;
+        // What full tiles cannot take goes to the others: three rounds leave a few per mille.
+        for _ in 0..3 {
+            let (mut open, mut taken) = (0.0, 0.0);
+            for index in 0..num_tiles {
+                let count = tile(&self.tile_starts, index).len();
+                if factor * share(count) >= count as f64 && factor > 0.0 {
+                    taken += count as f64;
+                } else {
+                    open += share(count);
+                }
+            }
+            factor = (budget as f64 - taken).max(0.0) / f64::max(open, 1.0);
+        }
+        let mut carried = 0.0;
+        for index in 0..num_tiles {
+            let range = tile(&self.tile_starts, index);
+            if range.is_empty() {
+                continue;
+            }
+            carried += (factor * share(range.len())).min(range.len() as f64);
+            let room = budget - self.chosen.len();
+            let quota = (carried as usize).min(range.len()).min(room);
+            carried -= quota as f64;
+            if quota == 0 {
+                continue;
+            }
+            let points = &mut self.by_tile[range];
+            if quota < points.len() {
+                let scores = &self.scores;
+                let best_first = |&a: &u32, &b: &u32| {
+                    let order = scores[b as usize].total_cmp(&scores[a as usize]);
+                    order.then(a.cmp(&b))
+                };
+                points.select_nth_unstable_by(quota - 1, best_first);
+            }
+            self.chosen.extend_from_slice(&points[..quota]);
+        }
+    }
+}

@@ -1,0 +1,159 @@
+//! The pyramid that alignment reads: each pixel of level l is the **sum** of the 4ˡ pixels below it.
+//!
+//! Sums of bytes are exact in 16 bits up to level 4, so that no level is rounded, two neighbours
+//! come with one 32-bit load, and half the memory of f32 moves. A sum times [`grey_per_sum`] is
+//! the 2×2 mean of means of the notation.
+
+use crate::slam::image::buffer::Image;
+
+/// Most levels: 255 · 4⁴ = 65 280 is the largest sum that 16 bits hold.
+pub const MAX_LEVELS: usize = 5;
+
+/// What turns a pixel of `level` into grey levels.
+pub fn grey_per_sum(level: usize) -> f32 {
+    1.0 / (1u32 << (2 * level)) as f32
+}
+
+/// Sums of one frame, by level.
+#[derive(Debug, Clone, Default)]
+pub struct SumPyramid {
+    width: usize,
+    height: usize,
+    finest_level: usize,
+    levels: Vec<Image<u16>>,
+}
+
+impl SumPyramid {
+    /// Memory for `num_levels` (at most [`MAX_LEVELS`]) levels over a `width * height` image.
+    /// Levels below `finest_level` (at most 1) are never filled and take no memory.
+    pub fn with_size(width: usize, height: usize, num_levels: usize, finest_level: usize) -> Self {
+        let finest_level = finest_level.min(1);
+        let levels = (0..num_levels.min(MAX_LEVELS))
+            .map(|l| match l < finest_level {
+                true => Image::filled(0, 0, 0),
+                false => Image::filled(width >> l, height >> l, 0),
+            })
+            .collect();
+        Self { width, height, finest_level, levels }
+    }
+
+    /// Whether the memory fits an image of this size and these levels.
+    pub fn has_size(&self, width: usize, height: usize, levels: usize, finest: usize) -> bool {
+        (self.width, self.height) == (width, height)
+            && self.levels.len() == levels.min(MAX_LEVELS)
+            && self.finest_level == finest.min(1)
+    }
+
+    /// Fills every level from the grey values of level 0. Does nothing when their number differs
+    /// (callers check it where the frame enters).
+    pub fn fill(&mut self, pixels: &[u8]) {
+        if pixels.len() != self.width * self.height {
+            return;
+        }
+        if self.finest_level == 0
+            && let Some(base) = self.levels.first_mut()
+        {
+            for (out, &grey) in base.pixels_mut().iter_mut().zip(pixels) {
+                *out = u16::from(grey);
+            }
+        }
+        if let Some(first) = self.levels.get_mut(1) {
+            halve_bytes(pixels, self.width, first);
+        }
+        for level in 2..self.levels.len() {
+            let (fine, coarse) = self.levels.split_at_mut(level);
+            halve_sums(&fine[level - 1], &mut coarse[0]);
+        }
+    }
+
+    /// The sums of one level; empty below the finest.
+    pub fn level(&self, level: usize) -> &Image<u16> {
+        &self.levels[level]
+    }
+
+    /// Number of levels, those below the finest included.
+    pub fn num_levels(&self) -> usize {
+        self.levels.len()
+    }
+
+    /// Finest level that is filled: 0 or 1.
+    pub fn finest_level(&self) -> usize {
+        self.finest_level
+    }
+}
+
+fn halve_bytes(pixels: &[u8], width: usize, coarse: &mut Image<u16>) {
+    let coarse_width = coarse.width();
+    if coarse_width == 0 {
+        return;
+    }
+    let rows = pixels.chunks_exact(2 * width);
+    for (out, rows) in coarse.pixels_mut().chunks_exact_mut(coarse_width).zip(rows) {
+        let (upper, lower) = rows.split_at(width);
+        let pairs = upper.as_chunks::<2>().0.iter().zip(lower.as_chunks::<2>().0);
+        for (out, (up, low)) in out.iter_mut().zip(pairs) {
+            *out = (u16::from(up[0]) + u16::from(up[1])) + (u16::from(low[0]) + u16::from(low[1]));
+        }
+    }
+}
+
+fn halve_sums(fine: &Image<u16>, coarse: &mut Image<u16>) {
+    let (fine_width, coarse_width) = (fine.width(), coarse.width());
+    if coarse_width == 0 {
+        return;
+    }
+    let rows = fine.pixels().chunks_exact(2 * fine_width);
+    for (out, rows) in coarse.pixels_mut().chunks_exact_mut(coarse_width).zip(rows) {
+        let (upper, lower) = rows.split_at(fine_width);
+        let pairs = upper.as_chunks::<2>().0.iter().zip(lower.as_chunks::<2>().0);
+        for (out, (up, low)) in out.iter_mut().zip(pairs) {
+            // Sums of a fresh pyramid cannot overflow (MAX_LEVELS); wrapping spares the check.
+            *out = up[0].wrapping_add(up[1]).wrapping_add(low[0].wrapping_add(low[1]));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_level_is_the_exact_sum_also_for_odd_sizes() {
+        let (width, height) = (77, 53);
+        let pixels: Vec<u8> = (0..width * height).map(|i| ((i * 7919) % 256) as u8).collect();
+        for finest in 0..2 {
+            let mut pyramid = SumPyramid::with_size(width, height, 4, finest);
+            pyramid.fill(&pixels);
+            for level in finest..4 {
+                let image = pyramid.level(level);
+                assert_eq!((image.width(), image.height()), (width >> level, height >> level));
+                for v in 0..image.height() {
+                    for u in 0..image.width() {
+                        let side = 1 << level;
+                        let sum: u32 = (0..side * side)
+                            .map(|i| (u * side + i % side, v * side + i / side))
+                            .map(|(x, y)| u32::from(pixels[y * width + x]))
+                            .sum();
+                        assert_eq!(u32::from(image.at(u, v)), sum, "level {level} at {u}, {v}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn white_does_not_overflow_at_the_coarsest_level() {
+        let mut pyramid = SumPyramid::with_size(64, 64, 9, 1);
+        pyramid.fill(&[255; 64 * 64]);
+        assert_eq!(pyramid.num_levels(), MAX_LEVELS);
+        let top = f32::from(pyramid.level(MAX_LEVELS - 1).at(3, 3));
+        assert_eq!(top * grey_per_sum(MAX_LEVELS - 1), 255.0);
+    }
+
+    #[test]
+    fn pixels_of_another_size_change_nothing() {
+        let mut pyramid = SumPyramid::with_size(32, 32, 3, 0);
+        pyramid.fill(&[9; 31 * 32]);
+        assert_eq!(pyramid.level(2).at(1, 1), 0);
+    }
+}

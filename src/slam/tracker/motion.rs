@@ -1,0 +1,118 @@
+//! Where the camera will be: constant velocity in the world, and what else it may have done.
+//!
+//! Poses are kept in the world, so that a new keyframe or refined depth disturbs nothing.
+
+use nalgebra::Vector6;
+
+use crate::slam::geometry::se3::SE3;
+
+/// A pose with its stamp.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Seen {
+    nanos: i64,
+    world_from_camera: SE3,
+}
+
+/// The last good pose and the velocity before it.
+#[derive(Debug, Clone, Default)]
+pub struct Motion {
+    last: Option<Seen>,
+    /// Twist of `last_from_next` per interval, and the interval in nanoseconds.
+    velocity: Option<(Vector6<f64>, f64)>,
+}
+
+/// A velocity is not carried on for longer than this many of the intervals it was measured over.
+const LONGEST_EXTRAPOLATION: f64 = 3.0;
+
+impl Motion {
+    /// Takes in a good pose.
+    pub fn observe(&mut self, nanos: i64, world_from_camera: &SE3) {
+        let now = Seen { nanos, world_from_camera: *world_from_camera };
+        self.velocity = self.last.and_then(|last| {
+            let interval = nanos.checked_sub(last.nanos).filter(|&interval| interval > 0)?;
+            let twist = (last.world_from_camera.inverse() * *world_from_camera).log();
+            Some((twist, interval as f64))
+        });
+        self.last = Some(now);
+    }
+
+    /// Forgets the velocity: after a loss only the place is worth something.
+    pub fn stop(&mut self) {
+        self.velocity = None;
+    }
+
+    /// The last good pose, `None` before the first.
+    pub fn last(&self) -> Option<SE3> {
+        self.last.map(|last| last.world_from_camera)
+    }
+
+    /// The pose at `nanos` if the camera moved on with `factor` of its velocity; `None` before
+    /// the first pose.
+    pub fn predict(&self, nanos: i64, factor: f64) -> Option<SE3> {
+        let last = self.last?;
+        let Some((twist, interval)) = self.velocity else { return Some(last.world_from_camera) };
+        let elapsed = nanos.saturating_sub(last.nanos) as f64;
+        let share = (elapsed / interval).clamp(0.0, LONGEST_EXTRAPOLATION);
+        Some(last.world_from_camera * SE3::exp(&(twist * (factor * share))))
+    }
+}
+
+/// Shares of the velocity that are tried when constant motion fits badly.
+const VELOCITY_FACTORS: [f64; 3] = [0.0, 0.5, 2.0];
+
+/// Other poses the camera may have at `nanos`: other shares of its velocity, and `rotation_rad`
+/// about each axis either way, from where it stood.
+pub fn hypotheses(motion: &Motion, nanos: i64, rotation_rad: f64) -> impl Iterator<Item = SE3> {
+    let speeds = VELOCITY_FACTORS.map(|factor| motion.predict(nanos, factor));
+    let last = motion.last();
+    let turns = (0..6).map(move |index| {
+        let mut twist = Vector6::zeros();
+        twist[3 + index / 2] = if index % 2 == 0 { rotation_rad } else { -rotation_rad };
+        last.map(|last| last * SE3::exp(&twist))
+    });
+    speeds.into_iter().chain(turns).flatten()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn pose(twist: [f64; 6]) -> SE3 {
+        SE3::exp(&Vector6::from(twist))
+    }
+
+    #[test]
+    fn constant_velocity_is_carried_on_over_a_missing_frame() {
+        let step = pose([0.1, 0.0, 0.02, 0.01, -0.03, 0.02]);
+        let mut motion = Motion::default();
+        assert_eq!(motion.predict(0, 1.0), None);
+        motion.observe(0, &pose([1.0; 6]));
+        motion.observe(33, &(pose([1.0; 6]) * step));
+        let expected = pose([1.0; 6]) * step * step * step;
+        let predicted = motion.predict(99, 1.0).unwrap();
+        assert!((predicted.inverse() * expected).log().norm() < 1e-12);
+    }
+
+    #[test]
+    fn broken_stamps_and_long_gaps_do_not_fling_the_camera_away() {
+        let mut motion = Motion::default();
+        motion.observe(100, &SE3::identity());
+        motion.observe(100, &pose([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]));
+        assert_eq!(motion.predict(200, 1.0), motion.last());
+        motion.observe(133, &pose([0.2, 0.0, 0.0, 0.0, 0.0, 0.0]));
+        let far = motion.predict(i64::MAX, 1.0).unwrap();
+        assert!((far.translation.x - 0.5).abs() < 1e-9);
+        let back = motion.predict(i64::MIN, 1.0).unwrap();
+        assert!((back.translation.x - 0.2).abs() < 1e-9);
+    }
+
+    #[test]
+    fn hypotheses_are_finite_and_cover_every_axis() {
+        let mut motion = Motion::default();
+        assert_eq!(hypotheses(&motion, 0, 0.1).count(), 0);
+        motion.observe(0, &SE3::identity());
+        let all: Vec<_> = hypotheses(&motion, 33, 0.1).collect();
+        assert_eq!(all.len(), 9);
+        assert!(all.iter().all(SE3::is_finite));
+    }
+}

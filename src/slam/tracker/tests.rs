@@ -1,0 +1,155 @@
+//! The tracker on a plane with exact poses, and on frames that no camera should send.
+
+use nalgebra::Vector6;
+
+use crate::slam::alignment::reference::Reference;
+use crate::slam::alignment::scene::{Plane, small_camera, small_plane};
+use crate::slam::frame::FrameView;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::pose::{LostReason, PoseEstimate, TrackingState};
+use crate::slam::tracker::{Tracker, TrackerParams};
+
+fn always(_level: usize) -> bool {
+    true
+}
+
+fn frame(sequence: u64, pixels: &[u8]) -> FrameView<'_> {
+    let camera = small_camera();
+    FrameView {
+        sequence,
+        capture_nanos: sequence as i64 * 33_333_333,
+        exposure_nanos: 0,
+        width: camera.width,
+        height: camera.height,
+        pixels,
+    }
+}
+
+fn tracker_on(keyframe: &Keyframe) -> Tracker {
+    let mut tracker = Tracker::new(small_camera(), TrackerParams::default()).unwrap();
+    tracker.adopt(Box::new(Reference::prepare(keyframe)));
+    tracker
+}
+
+/// Camera poses of a smooth path: out to 0.15 of the depth, 4° of turn.
+fn path(index: u64) -> SE3 {
+    let s = index as f64 / 12.0;
+    SE3::exp(&Vector6::new(0.12 * s, -0.05 * s, 0.08 * s, 0.03 * s, 0.05 * s, -0.06 * s))
+}
+
+fn is_clean(estimate: &PoseEstimate) -> bool {
+    let quality = &estimate.quality;
+    estimate.world_from_camera.is_finite()
+        && estimate.keyframe_from_camera.is_finite()
+        && estimate.covariance.iter().all(|x| x.is_finite())
+        && [estimate.brightness.a, estimate.brightness.b].iter().all(|x| x.is_finite())
+        && [quality.in_view_ratio, quality.inlier_ratio, quality.whitened_rmse]
+            .iter()
+            .chain(&[quality.residual_rmse, quality.mean_squared_flow])
+            .all(|x| x.is_finite())
+}
+
+#[test]
+fn a_path_over_a_plane_is_followed() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let mut tracker = tracker_on(&plane.keyframe(&camera, 2, 0.02));
+    for sequence in 0..=12 {
+        let truth = path(sequence);
+        let image = plane.render(&camera, &truth, 2.0, (1.1, 5.0), 100 + sequence);
+        let estimate = tracker.track(&frame(sequence, &image), &mut always);
+        assert_eq!(estimate.state, TrackingState::Tracking, "frame {sequence}");
+        let error = (estimate.keyframe_from_camera.inverse() * truth).log();
+        assert!(error.norm() < 2e-3, "frame {sequence}: {error}");
+        let gain = estimate.brightness.a.exp();
+        assert!((gain - 1.1).abs() < 0.02, "frame {sequence}: gain {gain}");
+        assert_eq!(estimate.world_from_camera, estimate.keyframe_from_camera);
+        assert!(is_clean(&estimate) && estimate.quality.whitened_rmse < 1.2);
+    }
+}
+
+#[test]
+fn hostile_frames_neither_panic_nor_claim_a_pose() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let keyframe = plane.keyframe(&camera, 2, 0.02);
+    let size = camera.width * camera.height;
+    let mut noise = crate::slam::alignment::scene::Noise(5);
+    let mut random: Vec<u8> = (0..size).map(|_| noise.bits() as u8).collect();
+    let saturated: Vec<u8> = keyframe.image.iter().map(|&p| p.saturating_mul(40)).collect();
+    let unrelated = Plane::new([-0.3, 0.1, 0.8], [7.0, 90.0], &camera);
+    let unrelated = unrelated.render(&camera, &path(40), 2.0, (1.0, 0.0), 3);
+    for image in [vec![0; size], vec![255; size], vec![128; size], random.clone(), unrelated] {
+        let mut tracker = tracker_on(&keyframe);
+        for sequence in 0..3 {
+            let estimate = tracker.track(&frame(sequence, &image), &mut always);
+            assert!(matches!(estimate.state, TrackingState::Lost(_)), "{:?}", estimate.state);
+            assert!(is_clean(&estimate));
+        }
+        // And the camera comes back.
+        let estimate = tracker.track(&frame(9, &keyframe.image), &mut always);
+        assert!(estimate.state.is_tracked(), "{estimate:?}");
+    }
+    let estimate = tracker_on(&keyframe).track(&frame(0, &saturated), &mut always);
+    assert!(is_clean(&estimate));
+    random.truncate(size - 1);
+    for (width, height) in [(camera.width, camera.height), (size - 1, 1), (0, 0), (usize::MAX, 2)] {
+        let wrong = FrameView { width, height, ..frame(0, &random) };
+        let estimate = tracker_on(&keyframe).track(&wrong, &mut always);
+        assert_eq!(estimate.state, TrackingState::Lost(LostReason::UnusableFrame));
+        assert!(is_clean(&estimate));
+    }
+}
+
+#[test]
+fn hostile_keyframes_neither_panic_nor_claim_a_pose() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let good = plane.keyframe(&camera, 2, 0.02);
+    let image = good.image.clone();
+    let mut empty = good.clone();
+    empty.points.clear();
+    let mut one = good.clone();
+    one.points.truncate(1);
+    let mut wrong_size = good.clone();
+    wrong_size.image.pop();
+    let mut hostile = good.clone();
+    hostile.points.iter_mut().for_each(|point| point.inverse_depth = f32::NAN);
+    let mut outside = good.clone();
+    outside.points.iter_mut().for_each(|point| point.u = u16::MAX);
+    let mut nowhere = good.clone();
+    nowhere.world_from_keyframe.scale = f64::NAN;
+    for keyframe in [empty, one, wrong_size, hostile, outside, nowhere] {
+        let estimate = tracker_on(&keyframe).track(&frame(0, &image), &mut always);
+        assert!(matches!(estimate.state, TrackingState::Lost(_)), "{:?}", estimate.state);
+        assert!(is_clean(&estimate), "{estimate:?}");
+    }
+}
+
+#[test]
+fn points_behind_the_camera_are_a_loss() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let keyframe = plane.keyframe(&camera, 2, 0.02);
+    let mut tracker = tracker_on(&keyframe);
+    let turned = SE3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, std::f64::consts::PI, 0.0));
+    tracker.motion.observe(0, &turned);
+    let estimate = tracker.track(&frame(1, &keyframe.image), &mut always);
+    assert!(matches!(estimate.state, TrackingState::Lost(_)), "{:?}", estimate.state);
+    assert!(is_clean(&estimate));
+}
+
+#[test]
+fn without_keyframe_or_trust_nothing_is_claimed() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let mut keyframe = plane.keyframe(&camera, 2, 0.02);
+    let image = keyframe.image.clone();
+    let mut tracker = Tracker::new(camera, TrackerParams::default()).unwrap();
+    let estimate = tracker.track(&frame(0, &image), &mut always);
+    assert_eq!(estimate.state, TrackingState::Initializing);
+    keyframe.map_state = MapState::Initializing;
+    tracker.adopt(Box::new(Reference::prepare(&keyframe)));
+    let estimate = tracker.track(&frame(1, &image), &mut always);
+    assert_eq!(estimate.state, TrackingState::Initializing);
+    keyframe.map_state = MapState::Rejected;
+    tracker.adopt(Box::new(Reference::prepare(&keyframe)));
+    let estimate = tracker.track(&frame(2, &image), &mut always);
+    assert_eq!(estimate.state, TrackingState::Lost(LostReason::MapRejected));
+}

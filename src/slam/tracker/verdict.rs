@@ -1,0 +1,104 @@
+//! What an aligned frame is worth: the thresholds between tracked, degraded and lost.
+
+use serde::{Deserialize, Serialize};
+
+use crate::slam::alignment::align::{Alignment, Ending};
+use crate::slam::parameter::{ParameterError, check_range};
+use crate::slam::pose::{DegradedReason, LostReason, Quality, TrackingState};
+
+/// Thresholds on the quality of an alignment.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct VerdictParams {
+    /// Fewest points in view, at the level solved: eight unknowns need many times as many.
+    pub min_points: u32,
+    /// Share of points in view below which a frame is lost.
+    pub lost_in_view: f64,
+    /// Share of inliers among the points in view below which a frame is lost.
+    pub lost_inliers: f64,
+    /// What `lost_inliers` rises by until a lost tracker may claim a pose again: a wrong pose
+    /// must not pass by chance.
+    pub recovery_margin: f64,
+    /// Share of points in view below which a pose is degraded.
+    pub degraded_in_view: f64,
+    /// Whitened RMSE above which a pose is degraded.
+    pub degraded_whitened_rmse: f64,
+    /// Missing frames in a row above which a pose is degraded.
+    pub gap_frames: u64,
+}
+
+impl Default for VerdictParams {
+    fn default() -> Self {
+        Self {
+            min_points: 60,
+            lost_in_view: 0.1,
+            lost_inliers: 0.5,
+            recovery_margin: 0.15,
+            degraded_in_view: 0.35,
+            degraded_whitened_rmse: 2.0,
+            gap_frames: 2,
+        }
+    }
+}
+
+impl VerdictParams {
+    /// Checks every value.
+    pub fn validate(&self) -> Result<(), ParameterError> {
+        check_range("min_points", self.min_points, 10..=10_000)?;
+        check_range("lost_in_view", self.lost_in_view, 0.0..=1.0)?;
+        check_range("lost_inliers", self.lost_inliers, 0.0..=1.0)?;
+        check_range("recovery_margin", self.recovery_margin, 0.0..=1.0)?;
+        check_range("degraded_in_view", self.degraded_in_view, 0.0..=1.0)?;
+        check_range("degraded_whitened_rmse", self.degraded_whitened_rmse, 0.0..=1e3)?;
+        check_range("gap_frames", self.gap_frames, 0..=1_000_000)
+    }
+
+    /// Judges an alignment. `was_lost`: whether the frame before was; `missing`: frames between.
+    pub fn judge(
+        &self,
+        alignment: &Alignment,
+        quality: &Quality,
+        was_lost: bool,
+        missing: u64,
+    ) -> TrackingState {
+        let inliers = self.lost_inliers + if was_lost { self.recovery_margin } else { 0.0 };
+        if !alignment.state.current_from_keyframe.is_finite() {
+            TrackingState::Lost(LostReason::Diverged)
+        } else if alignment.points < self.min_points as usize {
+            TrackingState::Lost(LostReason::NoPoints)
+        } else if alignment.ending == Ending::NothingInView
+            || quality.points < self.min_points
+            || quality.in_view_ratio < self.lost_in_view
+        {
+            TrackingState::Lost(LostReason::Diverged)
+        } else if quality.inlier_ratio < inliers {
+            TrackingState::Lost(LostReason::TooFewInliers)
+        } else if alignment.ending == Ending::OutOfBudget {
+            TrackingState::Degraded(DegradedReason::Budget)
+        } else if quality.in_view_ratio < self.degraded_in_view {
+            TrackingState::Degraded(DegradedReason::LowOverlap)
+        } else if quality.whitened_rmse > self.degraded_whitened_rmse {
+            TrackingState::Degraded(DegradedReason::HighResidual)
+        } else if missing > self.gap_frames {
+            TrackingState::Degraded(DegradedReason::Gap)
+        } else {
+            TrackingState::Tracking
+        }
+    }
+}
+
+/// The figures of an alignment.
+pub fn quality_of(alignment: &Alignment) -> Quality {
+    let sums = &alignment.state.sums;
+    let in_view = f64::from(sums.in_view).max(1.0);
+    Quality {
+        in_view_ratio: f64::from(sums.in_view) / alignment.points.max(1) as f64,
+        inlier_ratio: f64::from(sums.inliers) / in_view,
+        whitened_rmse: (sums.energy / in_view).sqrt(),
+        residual_rmse: (sums.squared_residual / in_view).sqrt(),
+        iterations: alignment.iterations.iter().sum(),
+        finest_level: alignment.level as u32,
+        points: sums.in_view,
+        mean_squared_flow: alignment.mean_squared_flow,
+    }
+}
