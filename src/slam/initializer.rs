@@ -22,6 +22,8 @@ pub struct InitializerParams {
     pub proven_std_dev_ratio: f32,
     /// Share of the searches that must find a consistent match.
     pub min_match_ratio: f64,
+    /// `matching.line_noise_px` until the start is proven: poses on unproven depth are that far off.
+    pub line_noise_px: f32,
     /// Frames after which an unproven start is thrown away and begun again on a new frame.
     pub max_frames: u32,
 }
@@ -34,6 +36,7 @@ impl Default for InitializerParams {
             min_proven_ratio: 0.5,
             proven_std_dev_ratio: 0.15,
             min_match_ratio: 0.6,
+            line_noise_px: 0.7,
             max_frames: 60,
         }
     }

@@ -226,6 +226,7 @@ impl Mapper {
             None if is_given => MapState::Established,
             None => {
                 randomise(&mut self.depth, self.params.initializer.seed ^ frame.sequence);
+                regularise(&mut self.depth, &mut self.regularised, &self.params.regularisation);
                 MapState::Initializing
             }
         };
@@ -277,7 +278,11 @@ impl Mapper {
             brightness: self.brightness_against_keyframe(pose),
             only_new: false,
         };
-        observe(&mut self.depth, &observer, &self.params.matching, &self.params.gaussian)
+        let mut matching = self.params.matching.clone();
+        if self.map_state() == MapState::Initializing {
+            matching.line_noise_px = self.params.initializer.line_noise_px;
+        }
+        observe(&mut self.depth, &observer, &matching, &self.params.gaussian)
     }
 
     /// Brightness of a frame against the keyframe in force; none is known for a pose that was

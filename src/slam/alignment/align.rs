@@ -1,6 +1,6 @@
 //! Coarse to fine: iteratively re-weighted Gauss–Newton with Levenberg–Marquardt damping.
 
-use nalgebra::{Matrix6, SVector};
+use nalgebra::{Matrix6, SVector, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::slam::alignment::normal_equations::{NormalEquations, UNKNOWNS, pose_step};
@@ -172,7 +172,9 @@ impl Aligner {
         &self.params
     }
 
-    /// The sums at one state on one level, priors included.
+    /// The sums at one state on one level, priors included. The depth variance weighs the residuals
+    /// as if the translation were `variance_translation`: held while a level is solved, because an
+    /// energy of r/σ_r alone falls when σ_r grows with the translation, however bad the fit.
     pub fn evaluate(
         &self,
         reference: &Reference,
@@ -180,10 +182,18 @@ impl Aligner {
         level: usize,
         current_from_keyframe: &SE3,
         brightness: Brightness,
+        variance_translation: &Vector3<f64>,
     ) -> AlignedState {
         let intrinsics = reference.intrinsics().at_level(level);
         let weighting = self.params.weighting(level);
-        let at = Evaluation::new(&intrinsics, level, current_from_keyframe, brightness, &weighting);
+        let at = Evaluation::new(
+            &intrinsics,
+            level,
+            current_from_keyframe,
+            brightness,
+            &weighting,
+            variance_translation,
+        );
         let mut sums = accumulate_reference(reference.level(level), frame.level(level), &at);
         if self.params.estimate_brightness {
             let information = |std_dev: f64| 1.0 / (std_dev * std_dev);
@@ -222,7 +232,14 @@ impl Aligner {
         let has_points = |&level: &usize| !reference.level(level).is_empty();
         let level = (0..frame.num_levels()).rev().find(has_points).unwrap_or(0);
         Alignment {
-            state: self.evaluate(reference, frame, level, current_from_keyframe, brightness),
+            state: self.evaluate(
+                reference,
+                frame,
+                level,
+                current_from_keyframe,
+                brightness,
+                &current_from_keyframe.translation,
+            ),
             level,
             points: reference.level(level).len(),
             iterations: [0; MAX_LEVELS],
@@ -266,7 +283,9 @@ impl Aligner {
             return false;
         }
         let AlignedState { current_from_keyframe, brightness, .. } = alignment.state;
-        let mut state = self.evaluate(reference, frame, level, &current_from_keyframe, brightness);
+        let held = current_from_keyframe.translation;
+        let mut state =
+            self.evaluate(reference, frame, level, &current_from_keyframe, brightness, &held);
         let points = reference.level(level).len();
         let min_in_view = self.params.min_in_view * points as f64;
         if f64::from(state.sums.in_view) < min_in_view.max(UNKNOWNS as f64) {
@@ -296,6 +315,7 @@ impl Aligner {
                 level,
                 &(SE3::exp(&pose_step(&step)) * state.current_from_keyframe),
                 Brightness { a: state.brightness.a + step[6], b: state.brightness.b + step[7] },
+                &held,
             );
             let in_view = f64::from(candidate.sums.in_view);
             let keeps_view = in_view >= MIN_KEPT_IN_VIEW * f64::from(state.sums.in_view);
@@ -330,8 +350,15 @@ impl Aligner {
         let AlignedState { current_from_keyframe, brightness, .. } = &alignment.state;
         let intrinsics = reference.intrinsics().at_level(level);
         let weighting = self.params.weighting(level);
-        let at =
-            Evaluation::new(&intrinsics, level, current_from_keyframe, *brightness, &weighting);
+        let translation = &current_from_keyframe.translation;
+        let at = Evaluation::new(
+            &intrinsics,
+            level,
+            current_from_keyframe,
+            *brightness,
+            &weighting,
+            translation,
+        );
         let squared_pixel = f64::from(1u32 << (2 * level));
         mean_squared_flow(reference.level(level), &at) * squared_pixel
     }

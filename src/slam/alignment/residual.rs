@@ -14,6 +14,8 @@
 
 use std::cmp::Ordering;
 
+use nalgebra::Vector3;
+
 use crate::slam::alignment::normal_equations::{NormalEquations, UNKNOWNS};
 use crate::slam::alignment::points::{LANES, LevelPoints, Point};
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -49,6 +51,7 @@ pub struct Weighting {
 pub struct Evaluation {
     pub(crate) rotation: [f32; 9],
     pub(crate) translation: [f32; 3],
+    pub(crate) variance_translation: [f32; 3],
     pub(crate) focal: [f32; 2],
     pub(crate) centre: [f32; 2],
     pub(crate) upper_bound: [f32; 2],
@@ -64,13 +67,15 @@ pub struct Evaluation {
 
 impl Evaluation {
     /// For `current_from_keyframe` (translation in keyframe units) and `brightness` on `level`;
-    /// `intrinsics` are those of the level.
+    /// `intrinsics` are those of the level. `variance_translation` is the translation at which
+    /// (∂r/∂d)² V is taken.
     pub fn new(
         intrinsics: &Intrinsics,
         level: usize,
         current_from_keyframe: &SE3,
         brightness: Brightness,
         weighting: &Weighting,
+        variance_translation: &Vector3<f64>,
     ) -> Self {
         let rotation = current_from_keyframe.rotation_matrix();
         let gain = brightness.a.exp() as f32;
@@ -79,6 +84,7 @@ impl Evaluation {
         Self {
             rotation: std::array::from_fn(|i| rotation[(i / 3, i % 3)] as f32),
             translation: std::array::from_fn(|i| current_from_keyframe.translation[i] as f32),
+            variance_translation: std::array::from_fn(|i| variance_translation[i] as f32),
             focal: [intrinsics.fx as f32, intrinsics.fy as f32],
             centre: [intrinsics.cx as f32, intrinsics.cy as f32],
             upper_bound: [upper(intrinsics.width), upper(intrinsics.height)],
@@ -145,7 +151,9 @@ pub fn point_terms(image: &Image<u16>, at: &Evaluation, point: &Point) -> Option
     let m = ax * nx + ay * ny;
     let predicted = at.gain * point.intensity;
     let inverse_depth_derivative = (ax * tx + ay * ty - m * tz) * inverse_ratio;
-    let from_depth = inverse_depth_derivative * inverse_depth_derivative * point.variance;
+    let [vx, vy, vz] = at.variance_translation;
+    let weighing_derivative = (ax * vx + ay * vy - m * vz) * inverse_ratio;
+    let from_depth = weighing_derivative * weighing_derivative * point.variance;
     let scale = d * inverse_ratio;
     Some(PointTerms {
         projection: [u, v],
@@ -186,7 +194,10 @@ pub fn accumulate_reference(
         // Noise ε in d sits in r as (∂r/∂d) ε and in J_t as J_t ε/d: their product does not
         // average out, and would pull the translation towards zero.
         let product = at.noise_correction * terms.inverse_depth_derivative * point.variance;
-        let correlated = f64::from(product / point.inverse_depth);
+        // Scaled by what the residual shows of it, so that a variance larger than the noise does
+        // not push the translation away instead.
+        let shown = (huber_weight * normalized).min(1.0);
+        let correlated = f64::from(product / point.inverse_depth * shown);
         let jacobian = terms.jacobian.map(f64::from);
         for i in 0..UNKNOWNS {
             let residual = if i < 3 { residual - correlated } else { residual };
