@@ -1,6 +1,8 @@
 //! Frames in: dataset readers, simulator, cameras. The only place that names image files and v4l.
 
+pub mod euroc;
 pub mod image_file;
+pub mod image_folder;
 pub mod jpeg_image;
 pub mod listing;
 pub mod png_image;
@@ -8,6 +10,7 @@ pub mod png_image;
 mod real_recordings;
 pub mod recording;
 pub mod rig;
+pub mod sensor_yaml;
 pub mod simulator;
 pub mod source;
 pub mod tum;

@@ -54,26 +54,38 @@ pub enum RigError {
 /// The lens models of a rig file.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(rename_all = "lowercase")]
-enum LensModel {
+pub enum LensModel {
+    /// No distortion.
     Pinhole,
+    /// OpenCV's radial-tangential model.
     Radtan,
+    /// Kannala–Brandt, OpenCV's `fisheye`.
     Equidistant,
 }
 
-/// A rig file as it stands.
+/// A rig as a file states it, unchecked.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct RigFile {
-    model: LensModel,
-    width: usize,
-    height: usize,
-    fx: f64,
-    fy: f64,
-    cx: f64,
-    cy: f64,
+pub struct RigFile {
+    /// The lens model.
+    pub model: LensModel,
+    /// Width of the raw image, pixels.
+    pub width: usize,
+    /// Height of the raw image, pixels.
+    pub height: usize,
+    /// Focal length along u, pixels.
+    pub fx: f64,
+    /// Focal length along v, pixels.
+    pub fy: f64,
+    /// Principal point, u; an integer is the centre of a pixel.
+    pub cx: f64,
+    /// Principal point, v.
+    pub cy: f64,
+    /// Lens coefficients in OpenCV's order, as many as the model needs.
     #[serde(default)]
-    coefficients: Vec<f64>,
-    rate_hz: Option<f64>,
+    pub coefficients: Vec<f64>,
+    /// Frames a second.
+    pub rate_hz: Option<f64>,
 }
 
 impl Rig {
@@ -93,7 +105,7 @@ impl Rig {
                 problem: error.message().replace('\n', " "),
             }
         })?;
-        file.rig().map_err(|source| RigError::Value { path: path.to_owned(), source })
+        file.rig_of(path)
     }
 
     /// Reads a rig from a `camera.txt`: `fx fy cx cy width height` and 0, 4, 5 or 8 radtan
@@ -134,12 +146,16 @@ impl Rig {
             coefficients: coefficients.to_vec(),
             rate_hz: None,
         };
-        let rig = file.rig();
-        Ok(rig.map_err(|source| RigError::Value { path: path.to_owned(), source })?)
+        Ok(file.rig_of(path)?)
     }
 }
 
 impl RigFile {
+    /// The checked rig; errors name `path`.
+    pub fn rig_of(&self, path: &Path) -> Result<Rig, RigError> {
+        self.rig().map_err(|source| RigError::Value { path: path.to_owned(), source })
+    }
+
     fn rig(&self) -> Result<Rig, ParameterError> {
         check_range("width", self.width, SIDE_RANGE)?;
         check_range("height", self.height, SIDE_RANGE)?;
