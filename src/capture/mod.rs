@@ -1,7 +1,11 @@
 //! Frames in: dataset readers, simulator, cameras. The only place that names image files and v4l.
 
+#[cfg(test)]
+mod conformance;
 pub mod euroc;
 pub mod image_file;
+#[cfg(test)]
+mod image_file_tests;
 pub mod image_folder;
 pub mod jpeg_image;
 pub mod listing;
@@ -13,4 +17,6 @@ pub mod rig;
 pub mod sensor_yaml;
 pub mod simulator;
 pub mod source;
+#[cfg(test)]
+mod test_images;
 pub mod tum;
