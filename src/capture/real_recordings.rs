@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use crate::capture::simulator::params::SimulatorParams;
 use crate::capture::source::{SourceName, open};
 
 /// The folder of a development recording; `None`, and a word about it, where it is not there.
@@ -20,6 +21,7 @@ fn recording(name: &str) -> Option<PathBuf> {
 
 #[test]
 fn every_recording_is_read_whole() {
+    let simulator = SimulatorParams::default();
     for (name, frames, poses, depths) in [
         ("redkitchen", 500, 503, 125),
         ("fr1-floor", 90, 316, 90),
@@ -27,7 +29,7 @@ fn every_recording_is_read_whole() {
         ("tsukuba", 150, 150, 0),
     ] {
         let Some(folder) = recording(name) else { continue };
-        let mut source = open(&SourceName::Tum(folder), None).expect(name);
+        let mut source = open(&SourceName::Tum(folder), None, &simulator).expect(name);
         assert_eq!(source.num_frames(), Some(frames), "{name}");
         assert_eq!(source.ground_truth().len(), poses, "{name}");
         let k = source.intrinsics();

@@ -215,6 +215,9 @@ pub fn open(
         SourceName::Tum(folder) => Ok(Box::new(tum::open(folder, rig)?)),
         SourceName::Euroc(folder) => Ok(Box::new(euroc::open(folder, rig)?)),
         SourceName::Images(folder) => Ok(Box::new(image_folder::open(folder, rig)?)),
+        SourceName::Simulator { .. } if rig.is_some() => Err(unavailable(
+            "the simulator takes no rig; its camera is in the table [simulator] of the configuration",
+        )),
         SourceName::Simulator { scene } => {
             let mut params = simulator.clone();
             if let Some(scene) = scene {
