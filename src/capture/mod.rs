@@ -10,8 +10,6 @@ pub mod image_folder;
 pub mod jpeg_image;
 pub mod listing;
 pub mod png_image;
-#[cfg(test)]
-mod real_recordings;
 pub mod recording;
 pub mod rig;
 pub mod sensor_yaml;

@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use crate::capture::simulator::params::SimulatorParams;
-use crate::capture::source::{SourceName, open};
+use semidense::capture::simulator::params::SimulatorParams;
+use semidense::capture::source::{SourceName, open};
 
 /// The folder of a development recording; `None`, and a word about it, where it is not there.
 fn recording(name: &str) -> Option<PathBuf> {
