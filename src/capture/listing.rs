@@ -16,12 +16,18 @@ pub struct Row<'a> {
     path: &'a Path,
     line: usize,
     text: &'a str,
+    is_indented: bool,
 }
 
 impl<'a> Row<'a> {
     /// The line without surrounding blanks.
     pub fn text(&self) -> &'a str {
         self.text
+    }
+
+    /// Whether the line begins with blanks.
+    pub fn is_indented(&self) -> bool {
+        self.is_indented
     }
 
     /// An error about this line: what is wrong and what to do.
@@ -103,9 +109,11 @@ pub fn read_text(path: &Path) -> Result<String, SourceError> {
 /// The rows of a list that was read from `path`.
 pub fn rows<'a>(path: &'a Path, text: &'a str) -> impl Iterator<Item = Row<'a>> {
     text.lines().enumerate().filter_map(move |(i, text)| {
-        let text = text.trim().trim_start_matches('\u{feff}');
+        let text = text.trim_start_matches('\u{feff}');
+        let is_indented = text.starts_with(char::is_whitespace);
+        let text = text.trim();
         let holds_entry = !text.is_empty() && !text.starts_with('#');
-        holds_entry.then_some(Row { path, line: i + 1, text })
+        holds_entry.then_some(Row { path, line: i + 1, text, is_indented })
     })
 }
 

@@ -1,13 +1,20 @@
 //! Frames in: dataset readers, simulator, cameras. The only place that names image files and v4l.
 
+#[cfg(test)]
+mod conformance;
+pub mod euroc;
 pub mod image_file;
+#[cfg(test)]
+mod image_file_tests;
+pub mod image_folder;
 pub mod jpeg_image;
 pub mod listing;
 pub mod png_image;
-#[cfg(test)]
-mod real_recordings;
 pub mod recording;
 pub mod rig;
+pub mod sensor_yaml;
 pub mod simulator;
 pub mod source;
+#[cfg(test)]
+mod test_images;
 pub mod tum;

@@ -24,6 +24,8 @@ pub struct ListedImage {
     pub nanos: i64,
     /// The image file.
     pub path: PathBuf,
+    /// Exposure time in nanoseconds, 0 where unknown.
+    pub exposure_nanos: u64,
 }
 
 /// What the lists of a recording say; every list is in order of its stamps.
@@ -103,8 +105,8 @@ impl FrameSource for Recording {
             self.reader.read_gray_into(&frame.path, width, height, &mut self.raw)?;
             self.rectification.rectify_into(&self.raw, pixels);
         }
-        let capture_nanos = frame.nanos;
-        Ok(Some(FrameStamp { sequence, capture_nanos, exposure_nanos: 0, gain: 0.0 }))
+        let (capture_nanos, exposure_nanos) = (frame.nanos, frame.exposure_nanos);
+        Ok(Some(FrameStamp { sequence, capture_nanos, exposure_nanos, gain: 0.0 }))
     }
 
     fn ground_truth(&self) -> &[StampedPose] {

@@ -54,26 +54,38 @@ pub enum RigError {
 /// The lens models of a rig file.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(rename_all = "lowercase")]
-enum LensModel {
+pub enum LensModel {
+    /// No distortion.
     Pinhole,
+    /// OpenCV's radial-tangential model.
     Radtan,
+    /// Kannala–Brandt, OpenCV's `fisheye`.
     Equidistant,
 }
 
-/// A rig file as it stands.
+/// A rig as a file states it, unchecked.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct RigFile {
-    model: LensModel,
-    width: usize,
-    height: usize,
-    fx: f64,
-    fy: f64,
-    cx: f64,
-    cy: f64,
+pub struct RigFile {
+    /// The lens model.
+    pub model: LensModel,
+    /// Width of the raw image, pixels.
+    pub width: usize,
+    /// Height of the raw image, pixels.
+    pub height: usize,
+    /// Focal length along u, pixels.
+    pub fx: f64,
+    /// Focal length along v, pixels.
+    pub fy: f64,
+    /// Principal point, u; an integer is the centre of a pixel.
+    pub cx: f64,
+    /// Principal point, v.
+    pub cy: f64,
+    /// Lens coefficients in OpenCV's order, as many as the model needs.
     #[serde(default)]
-    coefficients: Vec<f64>,
-    rate_hz: Option<f64>,
+    pub coefficients: Vec<f64>,
+    /// Frames a second.
+    pub rate_hz: Option<f64>,
 }
 
 impl Rig {
@@ -93,7 +105,7 @@ impl Rig {
                 problem: error.message().replace('\n', " "),
             }
         })?;
-        file.rig().map_err(|source| RigError::Value { path: path.to_owned(), source })
+        file.rig_of(path)
     }
 
     /// Reads a rig from a `camera.txt`: `fx fy cx cy width height` and 0, 4, 5 or 8 radtan
@@ -134,12 +146,16 @@ impl Rig {
             coefficients: coefficients.to_vec(),
             rate_hz: None,
         };
-        let rig = file.rig();
-        Ok(rig.map_err(|source| RigError::Value { path: path.to_owned(), source })?)
+        Ok(file.rig_of(path)?)
     }
 }
 
 impl RigFile {
+    /// The checked rig; errors name `path`.
+    pub fn rig_of(&self, path: &Path) -> Result<Rig, RigError> {
+        self.rig().map_err(|source| RigError::Value { path: path.to_owned(), source })
+    }
+
     fn rig(&self) -> Result<Rig, ParameterError> {
         check_range("width", self.width, SIDE_RANGE)?;
         check_range("height", self.height, SIDE_RANGE)?;
@@ -173,5 +189,59 @@ impl RigFile {
         let camera = CameraModel::new(intrinsics, lens)
             .ok_or_else(|| count_error("finite numbers that belong to a camera"))?;
         Ok(Rig { camera, rate_hz: self.rate_hz })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::geometry::rectification::Rectification;
+
+    #[test]
+    fn every_shipped_rig_is_valid() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/rigs");
+        let mut names = Vec::new();
+        for entry in std::fs::read_dir(&folder).expect("config/rigs") {
+            let path = entry.expect("entry").path();
+            let rig = Rig::read(&path).unwrap_or_else(|error| panic!("{error}"));
+            assert!(rig.rate_hz.is_some(), "{} names its rate", path.display());
+            Rectification::new(&rig.camera).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
+            names.push(path.file_name().expect("name").to_string_lossy().into_owned());
+        }
+        for name in ["tum-fr1.toml", "euroc-cam0.toml", "7scenes-kinect.toml", "simulator.toml"] {
+            assert!(names.iter().any(|n| n == name), "{name} is missing");
+        }
+    }
+
+    #[test]
+    fn a_bad_rig_names_file_key_value_and_range() {
+        const GOOD: &str = "model = \"radtan\"\nwidth = 640\nheight = 480\nfx = 500\nfy = 500.0\n\
+                            cx = 320\ncy = 240\ncoefficients = [0.1, 0.0, 0.0, 0.0]\n";
+        let path = Path::new("rigs/mine.toml");
+        assert!(Rig::from_toml(path, GOOD).is_ok());
+        for (from, to, expected) in [
+            ("width = 640", "width = 8", "rigs/mine.toml: width = 8: allowed is 16 to 8192"),
+            ("height = 480", "height = 9000", "height = 9000: allowed is 16 to 8192"),
+            ("height = 480", "height = -1", "rigs/mine.toml, line 3: "),
+            ("fx = 500", "fx = 0", "fx = 0: allowed is 1 to 100000"),
+            ("fy = 500.0", "fy = inf", "fy = inf: allowed is 1 to 100000"),
+            ("cx = 320", "cx = 640", "cx = 640: allowed is 0 to 639"),
+            ("cy = 240", "cy = -3", "cy = -3: allowed is 0 to 479"),
+            ("[0.1, ", "[nan, ", "coefficients[0] = NaN: allowed is -1000 to 1000"),
+            ("[0.1, ", "[", "coefficients = [0.0, 0.0, 0.0]: allowed is 4, 5 or 8 numbers"),
+            ("radtan", "pinhole", "allowed is none with model = \"pinhole\""),
+            ("radtan", "fov", "line 1: unknown variant `fov`, expected one of"),
+            ("cy = 240", "", "missing field `cy`"),
+            ("cy = 240", "cy = 240\nvignette = 1", "line 8: unknown field `vignette`"),
+            ("cy = 240", "cy 240", "line 7: "),
+        ] {
+            let text = GOOD.replace(from, to);
+            let message = Rig::from_toml(path, &text).expect_err(expected).to_string();
+            assert!(message.contains(expected), "{message}");
+            assert!(message.starts_with("rigs/mine.toml") && !message.contains('\n'), "{message}");
+        }
+        let equidistant = GOOD.replace("radtan", "equidistant").replace("0.0]", "0.0, 0.0]");
+        let message = Rig::from_toml(path, &equidistant).expect_err("five").to_string();
+        assert!(message.contains("4 numbers: k1 k2 k3 k4"), "{message}");
     }
 }

@@ -8,7 +8,7 @@ use crate::capture::image_file::ImageFileError;
 use crate::capture::rig::RigError;
 use crate::capture::simulator::Simulator;
 use crate::capture::simulator::params::SimulatorParams;
-use crate::capture::tum;
+use crate::capture::{euroc, image_folder, tum};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::rectification::RectificationError;
 use crate::slam::image::buffer::Image;
@@ -79,6 +79,27 @@ pub enum SourceError {
     NoRig {
         /// The recording's folder.
         folder: PathBuf,
+    },
+    /// Nothing says when the images were taken.
+    #[error(
+        "{}: has no times.txt and {} names no rate_hz; add one of them (name a rig with --rig)",
+        folder.display(), rig.display()
+    )]
+    NoStamps {
+        /// The folder of images.
+        folder: PathBuf,
+        /// The rig or camera.txt.
+        rig: PathBuf,
+    },
+    /// A list of stamps ends before the images do.
+    #[error("{}: has {stamps} stamps for {images} images; give one to each", path.display())]
+    FewStamps {
+        /// The list.
+        path: PathBuf,
+        /// Stamps in it.
+        stamps: usize,
+        /// Images in the folder.
+        images: usize,
     },
     /// The rig is not usable.
     #[error(transparent)]
@@ -192,7 +213,11 @@ pub fn open(
     let unavailable = |reason| SourceError::Unavailable { name: name.to_string(), reason };
     match name {
         SourceName::Tum(folder) => Ok(Box::new(tum::open(folder, rig)?)),
-        SourceName::Euroc(_) | SourceName::Images(_) => Err(unavailable("not yet")),
+        SourceName::Euroc(folder) => Ok(Box::new(euroc::open(folder, rig)?)),
+        SourceName::Images(folder) => Ok(Box::new(image_folder::open(folder, rig)?)),
+        SourceName::Simulator { .. } if rig.is_some() => Err(unavailable(
+            "the simulator takes no rig; its camera is in the table [simulator] of the configuration",
+        )),
         SourceName::Simulator { scene } => {
             let mut params = simulator.clone();
             if let Some(scene) = scene {

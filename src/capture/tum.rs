@@ -52,7 +52,7 @@ fn read_images(folder: &Path, list: &Path) -> Result<Vec<ListedImage>, SourceErr
         row.check_after(images.last().map(|image| image.nanos), nanos)?;
         let path = folder.join(name.trim_start());
         row.check_file(&path)?;
-        images.push(ListedImage { nanos, path });
+        images.push(ListedImage { nanos, path, exposure_nanos: 0 });
     }
     Ok(images)
 }

@@ -281,19 +281,24 @@ impl RemapTable {
     /// Bilinear interpolation of `raw` (rows of `width`) at every entry.
     ///
     /// The left and the right neighbour travel in the two halves of one u32: down first, which
-    /// fits 16 bits a half (255·256), then right.
+    /// fits 16 bits a half (255·256), then right. `a·(256 − w) + b·w` is written as
+    /// `256·a + (b − a)·w`: a negative difference wraps, the sum is exact again.
     fn interpolate(&self, raw: &[u8], width: usize, out: &mut [u8]) {
         const HALF: u32 = 1 << 15;
+        const SPREAD: u32 = 0x00ff_00ff;
+        let pair = |bytes: &[u8]| {
+            let both = u32::from(u16::from_le_bytes([bytes[0], bytes[1]]));
+            (both | both << 8) & SPREAD
+        };
+        let blend =
+            |a: u32, b: u32, w: u32| (a << 8).wrapping_add(b.wrapping_sub(a).wrapping_mul(w));
         let entries = self.offsets.iter().zip(&self.fractions);
         for (out, (&offset, &fraction)) in out.iter_mut().zip(entries) {
             // One bounds check for all four neighbours.
             let near = &raw[offset as usize..][..width + 2];
-            let above = u32::from(near[0]) | u32::from(near[1]) << 16;
-            let below = u32::from(near[width]) | u32::from(near[width + 1]) << 16;
             let [right, down] = fraction.to_le_bytes().map(u32::from);
-            let columns = above * (256 - down) + below * down;
-            let value = (columns & 0xffff) * (256 - right) + (columns >> 16) * right;
-            *out = ((value + HALF) >> 16) as u8;
+            let columns = blend(pair(near), pair(&near[width..]), down);
+            *out = (blend(columns & 0xffff, columns >> 16, right).wrapping_add(HALF) >> 16) as u8;
         }
     }
 }

@@ -1,0 +1,74 @@
+//! Recordings in the layout of EuRoC (ASL): `mav0/cam0` and `mav0/state_groundtruth_estimate0`.
+
+use std::path::Path;
+
+use crate::capture::listing::{read_text, rows};
+use crate::capture::recording::{Contents, ListedImage, Recording};
+use crate::capture::rig::Rig;
+use crate::capture::sensor_yaml;
+use crate::capture::source::SourceError;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::trajectory::StampedPose;
+
+/// Opens the recording in `folder`, which is `mav0` or holds it. The lens is that of
+/// `cam0/sensor.yaml` unless `rig` names another. The ground truth may be missing; it is the
+/// body's and is moved to the camera by the `T_BS` of `sensor.yaml`.
+pub fn open(folder: &Path, rig: Option<&Path>) -> Result<Recording, SourceError> {
+    let inner = folder.join("mav0");
+    let root = if inner.is_dir() { inner } else { folder.to_owned() };
+    let frame_list = root.join("cam0/data.csv");
+    let frames = read_frames(&root.join("cam0/data"), &frame_list)?;
+    let sensor_path = root.join("cam0/sensor.yaml");
+    let pose_list = root.join("state_groundtruth_estimate0/data.csv");
+    let has_truth = pose_list.exists();
+    // With a rig of its own and no ground truth, nothing of the sensor's file is needed.
+    let sensor = match rig {
+        Some(_) if !has_truth => None,
+        _ => Some(sensor_yaml::read(&sensor_path)?),
+    };
+    let body_from_camera = sensor.as_ref().map_or_else(SE3::identity, |s| s.body_from_camera);
+    let ground_truth =
+        if has_truth { read_truth(&pose_list, &body_from_camera)? } else { Vec::new() };
+    let (rig, rig_path) = match (rig, sensor) {
+        (None, Some(sensor)) => (sensor.rig, sensor_path),
+        (Some(path), _) => (Rig::read(path)?, path.to_owned()),
+        (None, None) => return Err(SourceError::NoRig { folder: root }),
+    };
+    let contents = Contents { frames, depths: Vec::new(), ground_truth };
+    Recording::new(contents, &rig, rig_path, frame_list)
+}
+
+/// Reads the `timestamp [ns],filename` lines of a camera.
+fn read_frames(images: &Path, list: &Path) -> Result<Vec<ListedImage>, SourceError> {
+    let text = read_text(list)?;
+    let mut frames: Vec<ListedImage> = Vec::new();
+    for row in rows(list, &text) {
+        let (stamp, name) =
+            row.text().split_once(',').ok_or_else(|| row.error("needs `timestamp,filename`"))?;
+        let nanos = row.nanos(stamp.trim())?;
+        row.check_after(frames.last().map(|frame| frame.nanos), nanos)?;
+        let path = images.join(name.trim());
+        row.check_file(&path)?;
+        frames.push(ListedImage { nanos, path, exposure_nanos: 0 });
+    }
+    Ok(frames)
+}
+
+/// Reads the body's poses, `timestamp, p x y z, q w x y z` and more, as the camera's.
+fn read_truth(list: &Path, body_from_camera: &SE3) -> Result<Vec<StampedPose>, SourceError> {
+    let text = read_text(list)?;
+    let mut poses: Vec<StampedPose> = Vec::new();
+    for row in rows(list, &text) {
+        let fields: Vec<&str> = row.text().split(',').map(str::trim).collect();
+        let [stamp, px, py, pz, qw, qx, qy, qz, ..] = fields[..] else {
+            return Err(row.error("needs `timestamp,px,py,pz,qw,qx,qy,qz` and maybe more"));
+        };
+        let nanos = row.nanos(stamp)?;
+        row.check_after(poses.last().map(|pose| pose.nanos), nanos)?;
+        let translation = [row.number(px)?, row.number(py)?, row.number(pz)?];
+        let quaternion_xyzw = [row.number(qx)?, row.number(qy)?, row.number(qz)?, row.number(qw)?];
+        let world_from_body = row.pose(quaternion_xyzw, translation)?;
+        poses.push(StampedPose { nanos, world_from_camera: world_from_body * *body_from_camera });
+    }
+    Ok(poses)
+}
