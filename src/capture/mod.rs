@@ -1,5 +1,6 @@
 //! Frames in: dataset readers, simulator, cameras. The only place that names image files and v4l.
 
+pub mod dataset_writer;
 pub mod image_file;
 pub mod jpeg_image;
 pub mod listing;
