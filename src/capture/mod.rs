@@ -3,6 +3,7 @@
 #[cfg(test)]
 mod conformance;
 pub mod euroc;
+pub mod dataset_writer;
 pub mod image_file;
 #[cfg(test)]
 mod image_file_tests;

@@ -28,12 +28,11 @@ pub enum Shape {
 }
 
 impl Shape {
-    /// Radius of a disc around the centre that holds the shape.
-    fn reach(self) -> f32 {
+    /// Half sides of a rectangle that holds the shape.
+    fn half_sides(self) -> (f32, f32) {
         match self {
-            Self::Rectangle(a, b) | Self::Triangle(a, b) => a.hypot(b),
-            Self::Ellipse(a, b) => a.max(b),
-            Self::Ring(radius, half_width) => radius + half_width,
+            Self::Rectangle(a, b) | Self::Triangle(a, b) | Self::Ellipse(a, b) => (a, b),
+            Self::Ring(radius, half_width) => (radius + half_width, radius + half_width),
         }
     }
 
@@ -41,14 +40,18 @@ impl Shape {
     fn distance(self, x: f32, y: f32) -> f32 {
         match self {
             Self::Rectangle(a, b) => (x.abs() - a).max(y.abs() - b),
-            Self::Ellipse(a, b) => ((x / a).hypot(y / b) - 1.0) * a.min(b),
-            Self::Ring(radius, half_width) => (x.hypot(y) - radius).abs() - half_width,
+            Self::Ellipse(a, b) => (length(x / a, y / b) - 1.0) * a.min(b),
+            Self::Ring(radius, half_width) => (length(x, y) - radius).abs() - half_width,
             Self::Triangle(a, b) => {
-                let side = (x.abs() * 2.0 * b + (y - b) * a) / (2.0 * b).hypot(a);
+                let side = (x.abs() * 2.0 * b + (y - b) * a) / length(2.0 * b, a);
                 side.max(-b - y)
             }
         }
     }
+}
+
+fn length(x: f32, y: f32) -> f32 {
+    (x * x + y * y).sqrt()
 }
 
 impl Canvas {
@@ -126,13 +129,14 @@ impl Canvas {
         value: f32,
         opacity: f32,
     ) {
-        let reach = shape.reach() + 2.0 * EDGE_TEXELS;
         let (sin, cos) = angle_rad.sin_cos();
+        let (a, b) = shape.half_sides();
+        let half_u = (a * cos).abs() + (b * sin).abs() + 2.0 * EDGE_TEXELS;
+        let half_v = (a * sin).abs() + (b * cos).abs() + 2.0 * EDGE_TEXELS;
         let mask = self.size as i32 - 1;
         let [cu, cv] = centre;
-        let rows = (cv - reach).floor() as i32..=(cv + reach).ceil() as i32;
-        for v in rows {
-            for u in (cu - reach).floor() as i32..=(cu + reach).ceil() as i32 {
+        for v in (cv - half_v) as i32 - 1..=(cv + half_v) as i32 + 1 {
+            for u in (cu - half_u) as i32 - 1..=(cu + half_u) as i32 + 1 {
                 let (dx, dy) = (u as f32 + 0.5 - cu, v as f32 + 0.5 - cv);
                 let distance = shape.distance(cos * dx + sin * dy, cos * dy - sin * dx);
                 let cover = (0.5 - 0.5 * distance / EDGE_TEXELS).clamp(0.0, 1.0) * opacity;

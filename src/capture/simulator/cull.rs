@@ -10,14 +10,23 @@ use crate::slam::geometry::se3::SE3;
 /// Side of a tile, pixels: a few blocks each, and few enough tiles to sort.
 const TILE_PX: usize = 16;
 
+/// A block that may be seen, and the least depth at which it may be, metres.
+#[derive(Debug, Clone, Copy)]
+pub struct Candidate {
+    /// Index into [`Scene::blocks`].
+    pub block: u32,
+    /// No ray meets it nearer than this.
+    pub nearest: f32,
+}
+
 /// For every tile the blocks that may be seen in it, nearest first.
 #[derive(Debug, Default)]
 pub struct TileLists {
     columns: usize,
     /// Start of each tile's part of `blocks`, and the end of the last.
     starts: Vec<usize>,
-    blocks: Vec<u32>,
-    boxes: Vec<(f32, u32, Bounds)>,
+    blocks: Vec<Candidate>,
+    boxes: Vec<(Candidate, Bounds)>,
 }
 
 /// Bounds in x and y at z = 1.
@@ -45,7 +54,7 @@ impl Bounds {
 impl TileLists {
     /// Blocks that the ray of a pixel can meet.
     #[inline]
-    pub fn of_pixel(&self, u: usize, v: usize) -> &[u32] {
+    pub fn of_pixel(&self, u: usize, v: usize) -> &[Candidate] {
         let tile = v / TILE_PX * self.columns + u / TILE_PX;
         &self.blocks[self.starts[tile]..self.starts[tile + 1]]
     }
@@ -71,8 +80,8 @@ impl TileLists {
                 self.starts.push(self.blocks.len());
                 let columns = column * TILE_PX..((column + 1) * TILE_PX).min(lens.width);
                 let tile = tile_bounds(lens, columns, rows.clone());
-                let seen = self.boxes.iter().filter(|(_, _, bounds)| bounds.overlaps(&tile));
-                self.blocks.extend(seen.map(|&(_, index, _)| index));
+                let seen = self.boxes.iter().filter(|(_, bounds)| bounds.overlaps(&tile));
+                self.blocks.extend(seen.map(|&(candidate, _)| candidate));
             }
         }
         self.starts.push(self.blocks.len());
@@ -87,10 +96,11 @@ impl TileLists {
                 nearest = nearest.min(include_block(block, &pose.inverse(), &mut bounds));
             }
             if nearest < f32::INFINITY {
-                self.boxes.push((nearest, index as u32, bounds));
+                self.boxes.push((Candidate { block: index as u32, nearest }, bounds));
             }
         }
-        self.boxes.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        self.boxes
+            .sort_by(|(a, _), (b, _)| a.nearest.total_cmp(&b.nearest).then(a.block.cmp(&b.block)));
     }
 }
 
@@ -135,6 +145,8 @@ fn include_block(block: &Block, camera_from_world: &SE3, bounds: &mut Bounds) ->
         ];
         *camera_from_world * Vector3::from(in_world.map(f64::from))
     });
+    /// Keeps the bound below the depths that rays find, which are rounded to f32.
+    const SPARE: f64 = 1.0 - 1e-5;
     let near = f64::from(NEAREST_M);
     let mut nearest = f64::INFINITY;
     let mut include = |p: &Vector3<f64>| {
@@ -153,5 +165,6 @@ fn include_block(block: &Block, camera_from_world: &SE3, bounds: &mut Bounds) ->
             }
         }
     }
-    nearest as f32
+    // A hollow block is met from inside, anywhere in front of the camera.
+    if block.is_hollow && nearest.is_finite() { 0.0 } else { (nearest * SPARE) as f32 }
 }

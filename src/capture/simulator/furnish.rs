@@ -4,10 +4,27 @@ use std::f32::consts::FRAC_PI_2;
 
 use crate::capture::simulator::params::SceneKind;
 use crate::capture::simulator::pattern::Pattern;
-use crate::capture::simulator::scene::{Builder, Cover, Scene, Stage};
+use crate::capture::simulator::scene::{Block, Builder, Cover, Scene, Stage};
 
-/// Builds a scene; the seed chooses the textures and small things, not where furniture stands.
+/// Builds a scene and paints its textures, in parallel on the current rayon pool.
 pub fn build(kind: SceneKind, seed: u64) -> Scene {
+    let Furnished { blocks, lamp, stage } = furnish(kind, seed);
+    Scene::new(blocks, lamp, stage, seed)
+}
+
+/// A scene without its textures.
+#[derive(Debug, Clone)]
+pub struct Furnished {
+    /// Everything that can be seen.
+    pub blocks: Vec<Block>,
+    /// The lamp, metres.
+    pub lamp: [f32; 3],
+    /// Where a camera may walk.
+    pub stage: Stage,
+}
+
+/// Puts up a scene; the seed chooses textures and small things, not where furniture stands.
+pub fn furnish(kind: SceneKind, seed: u64) -> Furnished {
     match kind {
         SceneKind::Room => room(seed),
         SceneKind::Plane => plane(seed),
@@ -16,16 +33,16 @@ pub fn build(kind: SceneKind, seed: u64) -> Scene {
 }
 
 /// 6 × 5 × 3 m. The camera walks in the west half and looks east.
-fn room(seed: u64) -> Scene {
+fn room(seed: u64) -> Furnished {
     let mut b = Builder::new(seed);
     let wall = Cover::of(Pattern::Plaster);
     let paper = Cover::of(Pattern::Wallpaper).enlarged(1.5);
     let covers = [
         wall,
         paper,
-        wall.with_middle(0.46),
-        Cover::of(Pattern::Brick).with_contrast(0.8),
-        Cover::of(Pattern::Planks),
+        wall.with_middle(0.52),
+        Cover::of(Pattern::Brick).with_contrast(0.6),
+        Cover::of(Pattern::Planks).with_contrast(0.8),
         wall.with_middle(0.56),
     ];
     b.shell([6.0, 5.0, 3.0], covers);
@@ -43,7 +60,7 @@ fn room(seed: u64) -> Scene {
         elevation_rad: -0.16,
         elevation_swing_rad: 0.12,
     };
-    Scene::new(b.blocks, [2.8, 2.4, 2.75], stage, seed)
+    Furnished { blocks: b.blocks, lamp: [2.8, 2.4, 2.75], stage }
 }
 
 /// Rug, low table and what lies on it, dining table with chairs.
@@ -159,7 +176,7 @@ fn picture(
 }
 
 /// A large printed table top seen from above.
-fn plane(seed: u64) -> Scene {
+fn plane(seed: u64) -> Furnished {
     let mut b = Builder::new(seed);
     b.place(
         [0.0, 0.0],
@@ -177,11 +194,11 @@ fn plane(seed: u64) -> Scene {
         elevation_rad: -1.25,
         elevation_swing_rad: 0.1,
     };
-    Scene::new(b.blocks, [0.0, 0.0, 3.0], stage, seed)
+    Furnished { blocks: b.blocks, lamp: [0.0, 0.0, 3.0], stage }
 }
 
 /// 24 × 2.4 × 2.6 m with doors, pictures and boxes along the walls.
-fn corridor(seed: u64) -> Scene {
+fn corridor(seed: u64) -> Furnished {
     let mut b = Builder::new(seed);
     let (length, width) = (24.0, 2.4);
     let wall = Cover::of(Pattern::Wallpaper).with_middle(0.54);
@@ -189,7 +206,7 @@ fn corridor(seed: u64) -> Scene {
         wall,
         wall,
         wall,
-        Cover::of(Pattern::Brick).with_contrast(0.8),
+        Cover::of(Pattern::Brick).with_contrast(0.6),
         Cover::of(Pattern::Carpet).with_contrast(0.7),
         Cover::of(Pattern::Plaster),
     ];
@@ -221,5 +238,5 @@ fn corridor(seed: u64) -> Scene {
         elevation_rad: -0.08,
         elevation_swing_rad: 0.08,
     };
-    Scene::new(b.blocks, [12.0, 1.2, 2.4], stage, seed)
+    Furnished { blocks: b.blocks, lamp: [12.0, 1.2, 2.4], stage }
 }

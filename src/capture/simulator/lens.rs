@@ -1,5 +1,9 @@
 //! The rays of a raw image: where every pixel looks.
 
+use nalgebra::Vector2;
+use rayon::prelude::*;
+
+use crate::slam::geometry::camera_model::CameraModel;
 use crate::slam::geometry::intrinsics::Intrinsics;
 
 /// The direction of a pixel as `(x, y, 1)`, and how it changes to the right and down.
@@ -11,6 +15,15 @@ pub struct Ray {
     pub du: [f32; 2],
     /// Change for one pixel down.
     pub dv: [f32; 2],
+}
+
+impl Ray {
+    /// x and y at z = 1, `a` pixels to the right and `b` down.
+    #[inline]
+    pub fn shifted(&self, a: f32, b: f32) -> [f32; 2] {
+        let Self { at, du, dv } = self;
+        [at[0] + a * du[0] + b * dv[0], at[1] + a * du[1] + b * dv[1]]
+    }
 }
 
 /// One ray a pixel, row by row.
@@ -25,33 +38,52 @@ pub struct Lens {
 }
 
 impl Lens {
-    /// The rays of a camera whose `unproject` gives x and y at z = 1 of a pixel.
-    pub fn new(width: usize, height: usize, unproject: impl Fn(f64, f64) -> [f64; 2]) -> Self {
-        /// Half a pixel to both sides: the derivative over the pixel itself.
-        const STEP_PX: f64 = 0.5;
-        let mut rays = Vec::with_capacity(width * height);
-        for v in 0..height {
-            for u in 0..width {
-                let (u, v) = (u as f64, v as f64);
-                let at = unproject(u, v);
-                let slope = |a: [f64; 2], b: [f64; 2]| {
-                    [
-                        ((b[0] - a[0]) / (2.0 * STEP_PX)) as f32,
-                        ((b[1] - a[1]) / (2.0 * STEP_PX)) as f32,
-                    ]
-                };
-                rays.push(Ray {
-                    at: [at[0] as f32, at[1] as f32],
-                    du: slope(unproject(u - STEP_PX, v), unproject(u + STEP_PX, v)),
-                    dv: slope(unproject(u, v - STEP_PX), unproject(u, v + STEP_PX)),
-                });
-            }
-        }
-        Self { width, height, rays }
+    /// The rays of a camera whose `unproject` gives x and y at z = 1 of a pixel, or `None` outside
+    /// its valid region: such a pixel sees nothing.
+    pub fn new(
+        width: usize,
+        height: usize,
+        unproject: impl Fn(f64, f64) -> Option<[f64; 2]> + Sync,
+    ) -> Self {
+        // One pixel more on every side, so that every pixel has neighbours to both sides.
+        let wide = width + 2;
+        let grid: Vec<[f64; 2]> = (0..wide * (height + 2))
+            .into_par_iter()
+            .map(|i| {
+                let (u, v) = ((i % wide) as f64 - 1.0, (i / wide) as f64 - 1.0);
+                unproject(u, v).unwrap_or([f64::NAN; 2])
+            })
+            .collect();
+        let ray = |i: usize| {
+            let at = (i / width + 1) * wide + i % width + 1;
+            let slope = |step: usize| {
+                let (before, after) = (grid[at - step], grid[at + step]);
+                std::array::from_fn(|k| {
+                    let central = 0.5 * (after[k] - before[k]);
+                    // At the rim of the valid region one side is missing.
+                    let sided = [central, after[k] - grid[at][k], grid[at][k] - before[k]];
+                    sided.into_iter().find(|s| s.is_finite()).unwrap_or(0.0) as f32
+                })
+            };
+            Ray { at: grid[at].map(|x| x as f32), du: slope(1), dv: slope(wide) }
+        };
+        Self { width, height, rays: (0..width * height).map(ray).collect() }
     }
 
     /// The rays of an ideal pinhole.
     pub fn pinhole(k: &Intrinsics) -> Self {
-        Self::new(k.width, k.height, |u, v| [(u - k.cx) / k.fx, (v - k.cy) / k.fy])
+        Self::new(k.width, k.height, |u, v| Some([(u - k.cx) / k.fx, (v - k.cy) / k.fy]))
+    }
+
+    /// The rays of a camera's raw image.
+    pub fn of_camera(camera: &CameraModel) -> Self {
+        let k = camera.intrinsics();
+        if camera.distortion().is_pinhole() {
+            return Self::pinhole(k);
+        }
+        Self::new(k.width, k.height, |u, v| {
+            let ray = camera.unproject(&Vector2::new(u, v))?;
+            (ray.z > 0.0).then(|| [ray.x / ray.z, ray.y / ray.z])
+        })
     }
 }

@@ -3,6 +3,8 @@
 //! [`trajectory`] says where the camera is, [`render`] what it sees there, [`sensor`] what becomes
 //! of the light; [`furnish`] builds the scenes. The same [`params`] give the same bytes.
 
+use std::borrow::Cow;
+
 use rayon::prelude::*;
 
 use crate::capture::simulator::lens::Lens;
@@ -12,7 +14,9 @@ use crate::capture::simulator::scene::Scene;
 use crate::capture::simulator::sensor::Sensor;
 use crate::capture::simulator::trajectory::Trajectory;
 use crate::capture::source::{FrameSource, FrameStamp, SourceError};
+use crate::slam::geometry::camera_model::CameraModel;
 use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::rectification::Rectification;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;
 use crate::slam::parameter::ParameterError;
@@ -28,6 +32,7 @@ pub mod random;
 pub mod render;
 pub mod scene;
 pub mod sensor;
+pub mod summary;
 pub mod texture;
 pub mod trajectory;
 
@@ -43,18 +48,25 @@ const MAX_BLUR_STEPS: usize = 24;
 /// A simulated camera as a source of frames.
 ///
 /// [`FrameSource::prepare`] renders all frames on the current rayon pool and keeps them:
-/// `frames × width × height` bytes, 184 MB for the default 600 frames. Depth is cast when asked for.
+/// `frames × width × height` bytes, 184 MB for the default 600 frames; frames that were not prepared
+/// are rendered when they are asked for. Depth is always cast when asked for. Frames of a distorted
+/// lens are rectified as they are handed out.
 #[derive(Debug)]
 pub struct Simulator {
     params: SimulatorParams,
     scene: Scene,
+    camera: CameraModel,
+    /// Rays of the raw images.
     lens: Lens,
+    rectification: Rectification,
+    /// Rays of the rectified images, where they are not the raw ones.
+    rectified_lens: Option<Lens>,
     sensor: Sensor,
     trajectory: Trajectory,
     ground_truth: Vec<StampedPose>,
+    /// Raw frames rendered so far.
     frames: Vec<Vec<u8>>,
     next: usize,
-    scratch: RenderScratch,
 }
 
 impl Simulator {
@@ -63,18 +75,27 @@ impl Simulator {
         params.validate()?;
         let scene = furnish::build(params.scene, params.seed);
         let trajectory = Trajectory::new(scene.stage, &params.motion, params.seed);
-        let lens = Lens::pinhole(&params.intrinsics());
+        let camera = params.camera()?;
+        let rectification = Rectification::new(&camera).map_err(|error| ParameterError {
+            key: "sensor.distortion".to_owned(),
+            value: format!("{:?}", params.sensor.distortion),
+            allowed: format!("a lens that can be rectified ({error})"),
+        })?;
+        let rectified_lens =
+            (!rectification.is_identity()).then(|| Lens::pinhole(rectification.intrinsics()));
         let sensor = Sensor::new(&params.sensor, params.seed, params.width, params.height);
         let mut simulator = Self {
             params,
             scene,
-            lens,
+            lens: Lens::of_camera(&camera),
+            camera,
+            rectification,
+            rectified_lens,
             sensor,
             trajectory,
             ground_truth: Vec::new(),
             frames: Vec::new(),
             next: 0,
-            scratch: RenderScratch::default(),
         };
         simulator.ground_truth = (0..simulator.params.frames)
             .map(|i| {
@@ -148,12 +169,34 @@ impl Simulator {
         pixels
     }
 
-    /// Depth along the optical axis at a frame's ground-truth pose, in world units (0 where nothing is).
-    pub fn depth_of(&mut self, frame: usize) -> Image<f32> {
+    /// The camera that takes the raw images.
+    pub fn camera(&self) -> &CameraModel {
+        &self.camera
+    }
+
+    /// The raw image of a frame, as the sensor gives it: from memory where it has been prepared,
+    /// rendered otherwise. `None` beyond the last frame.
+    pub fn raw_frame(&self, frame: usize) -> Option<Cow<'_, [u8]>> {
+        if frame >= self.params.frames {
+            return None;
+        }
+        Some(match self.frames.get(frame) {
+            Some(rendered) => Cow::Borrowed(rendered),
+            None => Cow::Owned(self.render(frame, &mut RenderScratch::default())),
+        })
+    }
+
+    /// Exact depth along the optical axis of the raw image at a frame's ground-truth pose, in world
+    /// units (0 where nothing is). `None` beyond the last frame.
+    pub fn raw_depth(&self, frame: usize) -> Option<Image<f32>> {
+        (frame < self.params.frames).then(|| self.depth_through(&self.lens, frame))
+    }
+
+    fn depth_through(&self, lens: &Lens, frame: usize) -> Image<f32> {
         let pose = self.pose(self.time_s(frame));
-        let mut depth = Image::filled(self.params.width, self.params.height, 0.0);
-        let renderer = Renderer { scene: &self.scene, lens: &self.lens };
-        renderer.depth_into(&pose, &mut self.scratch, depth.pixels_mut());
+        let mut depth = Image::filled(lens.width, lens.height, 0.0);
+        let renderer = Renderer { scene: &self.scene, lens };
+        renderer.depth_into(&pose, &mut RenderScratch::default(), depth.pixels_mut());
         let scale = self.params.world_scale as f32;
         for value in depth.pixels_mut() {
             *value *= scale;
@@ -164,7 +207,7 @@ impl Simulator {
 
 impl FrameSource for Simulator {
     fn intrinsics(&self) -> Intrinsics {
-        self.params.intrinsics()
+        *self.rectification.intrinsics()
     }
 
     fn num_frames(&self) -> Option<usize> {
@@ -195,25 +238,12 @@ impl FrameSource for Simulator {
 
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
         let frame = self.next;
-        if frame >= self.params.frames {
-            return Ok(None);
+        let (width, height) = (self.params.width, self.params.height);
+        if pixels.len() != width * height {
+            return Err(SourceError::Buffer { found: pixels.len(), width, height });
         }
-        let size = self.params.width * self.params.height;
-        if pixels.len() != size {
-            return Err(SourceError::Buffer {
-                found: pixels.len(),
-                width: self.params.width,
-                height: self.params.height,
-            });
-        }
-        match self.frames.get(frame) {
-            Some(rendered) => pixels.copy_from_slice(rendered),
-            None => {
-                let mut scratch = std::mem::take(&mut self.scratch);
-                pixels.copy_from_slice(&self.render(frame, &mut scratch));
-                self.scratch = scratch;
-            }
-        }
+        let Some(raw) = self.raw_frame(frame) else { return Ok(None) };
+        self.rectification.rectify_into(&raw, pixels);
         self.next += 1;
         let exposure_nanos = (self.params.sensor.exposure_ms * 1e6).round() as u64;
         let gain = self.sensor.exposure(self.time_s(frame)).0 as f32;
@@ -231,7 +261,9 @@ impl FrameSource for Simulator {
 
     fn depth_at(&mut self, capture_nanos: i64) -> Result<Option<Image<f32>>, SourceError> {
         let frame = self.ground_truth.binary_search_by_key(&capture_nanos, |pose| pose.nanos);
-        Ok(frame.ok().map(|frame| self.depth_of(frame)))
+        // Cast through the rectified rays: exact, where resampling would blur or shift it.
+        let lens = self.rectified_lens.as_ref().unwrap_or(&self.lens);
+        Ok(frame.ok().map(|frame| self.depth_through(lens, frame)))
     }
 }
 

@@ -4,6 +4,7 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
+use crate::slam::geometry::camera_model::{CameraModel, Distortion};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::parameter::{ParameterError, check_range};
 
@@ -84,6 +85,9 @@ pub struct SensorParams {
     pub exposure_ms: f64,
     /// Time from the start of one row to the next, microseconds; 0 is a global shutter.
     pub row_time_us: f64,
+    /// Radial-tangential lens of the raw image, OpenCV's order `k1 k2 p1 p2 [k3 [k4 k5 k6]]`;
+    /// empty is a pinhole. Frames are rectified like those of a real camera.
+    pub distortion: Vec<f64>,
 }
 
 impl Default for SensorParams {
@@ -96,6 +100,7 @@ impl Default for SensorParams {
             exposure_period_s: 5.0,
             exposure_ms: 0.0,
             row_time_us: 0.0,
+            distortion: Vec::new(),
         }
     }
 }
@@ -155,10 +160,24 @@ impl SimulatorParams {
         check_range("focal_px", self.focal_px, 0.25 * side..=20.0 * side)?;
         check_range("world_scale", self.world_scale, 1e-3..=1e3)?;
         self.motion.validate().map_err(|e| e.within("motion"))?;
-        self.sensor.validate().map_err(|e| e.within("sensor"))
+        self.sensor.validate().map_err(|e| e.within("sensor"))?;
+        let period_ms = 1e3 / self.rate_hz;
+        check_range("sensor.exposure_ms", self.sensor.exposure_ms, 0.0..=period_ms)?;
+        let readout_ms = self.sensor.row_time_us * 1e-3 * self.height as f64;
+        check_range("sensor.row_time_us × height, ms", readout_ms, 0.0..=period_ms)
     }
 
-    /// The ideal pinhole intrinsics; the principal point is the middle of the image.
+    /// The camera that takes the raw images.
+    pub fn camera(&self) -> Result<CameraModel, ParameterError> {
+        let lens = self.sensor.lens().map_err(|e| e.within("sensor"))?;
+        CameraModel::new(self.intrinsics(), lens).ok_or_else(|| ParameterError {
+            key: "focal_px".to_owned(),
+            value: self.focal_px.to_string(),
+            allowed: "numbers that belong to a camera".to_owned(),
+        })
+    }
+
+    /// Intrinsics of the raw image; the principal point is the middle of the image.
     pub fn intrinsics(&self) -> Intrinsics {
         Intrinsics {
             fx: self.focal_px,
@@ -189,6 +208,54 @@ impl SensorParams {
         check_range("offset_amplitude", self.offset_amplitude, 0.0..=100.0)?;
         check_range("exposure_period_s", self.exposure_period_s, 0.1..=1000.0)?;
         check_range("exposure_ms", self.exposure_ms, 0.0..=100.0)?;
-        check_range("row_time_us", self.row_time_us, 0.0..=500.0)
+        check_range("row_time_us", self.row_time_us, 0.0..=500.0)?;
+        for (i, &k) in self.distortion.iter().enumerate() {
+            check_range(&format!("distortion[{i}]"), k, -100.0..=100.0)?;
+        }
+        self.lens().map(|_| ())
+    }
+
+    /// The lens; an error unless there are 0, 4, 5 or 8 coefficients.
+    pub fn lens(&self) -> Result<Distortion, ParameterError> {
+        Distortion::try_radtan(&self.distortion).ok_or_else(|| ParameterError {
+            key: "distortion".to_owned(),
+            value: format!("{:?}", self.distortion),
+            allowed: "0, 4, 5 or 8 numbers: k1 k2 p1 p2 [k3 [k4 k5 k6]]".to_owned(),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_out_of_range_name_their_key() {
+        let refused = |change: &dyn Fn(&mut SimulatorParams)| {
+            let mut params = SimulatorParams::default();
+            change(&mut params);
+            params.validate().unwrap_err().to_string()
+        };
+        assert!(SimulatorParams::default().validate().is_ok());
+        assert!(refused(&|p| p.frames = 0).starts_with("frames = 0: allowed is"));
+        assert!(refused(&|p| p.width = 1 << 40).starts_with("width ="));
+        assert!(refused(&|p| p.focal_px = f64::NAN).starts_with("focal_px = NaN"));
+        assert!(refused(&|p| p.motion.mean_speed_m_s = -1.0).starts_with("motion.mean_speed_m_s"));
+        assert!(refused(&|p| p.sensor.vignette = 1.5).starts_with("sensor.vignette"));
+        assert!(refused(&|p| p.sensor.exposure_ms = 40.0).starts_with("sensor.exposure_ms"));
+        assert!(refused(&|p| p.sensor.row_time_us = 90.0).starts_with("sensor.row_time_us"));
+        assert!(refused(&|p| p.sensor.distortion = vec![0.1; 3]).starts_with("sensor.distortion"));
+        let infinite = vec![f64::INFINITY; 4];
+        assert!(refused(&|p| p.sensor.distortion = infinite.clone()).contains("distortion[0]"));
+    }
+
+    #[test]
+    fn parameters_survive_toml_and_unknown_keys_do_not() {
+        let mut params = SimulatorParams { scene: SceneKind::Corridor, ..Default::default() };
+        params.sensor.distortion = vec![0.1, 0.0, 0.0, 0.0];
+        let text = toml::to_string(&params).unwrap();
+        assert_eq!(toml::from_str::<SimulatorParams>(&text).unwrap(), params);
+        assert!(toml::from_str::<SimulatorParams>("[sensor]\nnoise = 2.0").is_err());
+        assert!(toml::from_str::<SimulatorParams>("scene = \"moon\"").is_err());
     }
 }

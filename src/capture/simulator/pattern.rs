@@ -1,5 +1,7 @@
 //! The printed and grown surfaces of the scenes: wood, plaster, paper, fabric, pictures, brick.
 
+use std::f32::consts::{FRAC_PI_2, FRAC_PI_4, PI, TAU};
+
 use rayon::prelude::*;
 
 use crate::capture::simulator::canvas::{Canvas, Shape};
@@ -110,7 +112,7 @@ fn planks(stream: &mut Stream) -> Canvas {
             0.9,
         );
     }
-    canvas.add_noise(stream.bits(), 64, 4, 0.10, 0.8, 16);
+    canvas.add_noise(stream.bits(), 64, 4, 0.065, 0.75, 16);
     canvas.add_noise(stream.bits(), 8, 6, 0.05, 0.7, 1);
     canvas.remap(1.0, 0.0);
     canvas
@@ -124,7 +126,7 @@ fn plaster(stream: &mut Stream) -> Canvas {
         let centre = [stream.uniform(0.0, canvas.size()), stream.uniform(0.0, canvas.size())];
         let shape = Shape::Ellipse(stream.uniform(2.0, 14.0), stream.uniform(1.5, 4.0));
         let value = stream.uniform(0.35, 0.85);
-        canvas.draw(shape, centre, stream.uniform(0.0, 3.14), value, 0.5);
+        canvas.draw(shape, centre, stream.uniform(0.0, PI), value, 0.5);
     }
     canvas.remap(1.0, 0.0);
     canvas
@@ -141,12 +143,12 @@ fn wallpaper(stream: &mut Stream) -> Canvas {
             place(cell % 6, stream.uniform(-0.3, 0.3)),
             place(cell / 6, stream.uniform(-0.3, 0.3)),
         ];
-        let turn = stream.uniform(0.0, 3.14);
+        let turn = stream.uniform(0.0, PI);
         let value = stream.uniform(0.25, 0.5);
         let petals = 3 + stream.index(4);
         let radius = stream.uniform(18.0, 42.0);
         for petal in 0..petals {
-            let angle = turn + petal as f32 * std::f32::consts::TAU / petals as f32;
+            let angle = turn + petal as f32 * TAU / petals as f32;
             let at = [centre[0] + radius * angle.cos(), centre[1] + radius * angle.sin()];
             canvas.draw(Shape::Ellipse(0.6 * radius, 0.25 * radius), at, angle, value, 0.9);
         }
@@ -199,7 +201,7 @@ fn cardboard(stream: &mut Stream) -> Canvas {
     let size = canvas.size();
     for _ in 0..26 {
         let centre = [stream.uniform(0.0, size), stream.uniform(0.0, size)];
-        let turn = stream.uniform(-0.2, 0.2) + 1.5708 * stream.index(2) as f32;
+        let turn = stream.uniform(-0.2, 0.2) + FRAC_PI_2 * stream.index(2) as f32;
         let (a, b) = (stream.uniform(26.0, 70.0), stream.uniform(18.0, 46.0));
         canvas.draw(Shape::Rectangle(a, b), centre, turn, stream.uniform(0.7, 0.9), 1.0);
         for line in 0..4 {
@@ -211,7 +213,7 @@ fn cardboard(stream: &mut Stream) -> Canvas {
     }
     for _ in 0..5 {
         let centre = [stream.uniform(0.0, size), stream.uniform(0.0, size)];
-        let turn = stream.uniform(0.0, 3.14);
+        let turn = stream.uniform(0.0, PI);
         canvas.draw(Shape::Rectangle(240.0, 12.0), centre, turn, 0.66, 0.6);
     }
     canvas.remap(1.0, 0.0);
@@ -229,14 +231,14 @@ fn fabric(stream: &mut Stream) -> Canvas {
         let value = stream.uniform(0.2, 0.75);
         canvas.draw(Shape::Rectangle(0.5 * size, half), [0.5 * size, across], 0.0, value, 0.5);
     }
-    canvas.add_noise(stream.bits(), 32, 5, 0.10, 0.8, 1);
+    canvas.add_noise(stream.bits(), 32, 5, 0.08, 0.7, 1);
     canvas.remap(1.0, 0.0);
     canvas
 }
 
 fn veneer(stream: &mut Stream) -> Canvas {
     let mut canvas = Canvas::new(TEXTURE_SIZE, 0.42);
-    canvas.add_noise(stream.bits(), 16, 6, 0.09, 0.75, 8);
+    canvas.add_noise(stream.bits(), 16, 6, 0.08, 0.7, 8);
     for _ in 0..40 {
         let centre = [stream.uniform(0.0, canvas.size()), stream.uniform(0.0, canvas.size())];
         let shape = Shape::Ellipse(stream.uniform(10.0, 50.0), stream.uniform(2.0, 6.0));
@@ -260,7 +262,7 @@ fn brick(stream: &mut Stream) -> Canvas {
             canvas.draw(shape, centre, turn, value, 1.0);
         }
     }
-    canvas.add_noise(stream.bits(), 16, 6, 0.07, 0.75, 1);
+    canvas.add_noise(stream.bits(), 16, 6, 0.05, 0.65, 1);
     canvas.remap(1.0, 0.0);
     canvas
 }
@@ -271,13 +273,13 @@ fn carpet(stream: &mut Stream) -> Canvas {
     for cell in 0..64 {
         let centre = [(cell % 8) as f32 * size / 8.0 + 64.0, (cell / 8) as f32 * size / 8.0 + 64.0];
         let value = stream.uniform(0.2, 0.8);
-        let turn = 0.7854 + stream.uniform(-0.15, 0.15);
+        let turn = FRAC_PI_4 + stream.uniform(-0.15, 0.15);
         let half = stream.uniform(34.0, 56.0);
         canvas.draw(Shape::Rectangle(half, half), centre, turn, value, 1.0);
         let inner = stream.uniform(0.15, 0.85);
         canvas.draw(Shape::Ring(0.5 * half, 0.12 * half), centre, 0.0, inner, 1.0);
         let shape = Shape::Triangle(0.3 * half, 0.3 * half);
-        canvas.draw(shape, centre, stream.uniform(0.0, 6.28), stream.uniform(0.1, 0.9), 1.0);
+        canvas.draw(shape, centre, stream.uniform(0.0, TAU), stream.uniform(0.1, 0.9), 1.0);
     }
     canvas.add_noise(stream.bits(), 64, 4, 0.08, 0.8, 1);
     canvas.remap(1.0, 0.0);

@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use crate::capture::simulator::cull::TileLists;
+use crate::capture::simulator::cull::{Candidate, TileLists};
 use crate::capture::simulator::lens::{Lens, Ray};
 use crate::capture::simulator::scene::{Block, Scene};
 use crate::capture::simulator::texture::Footprint;
@@ -12,6 +12,9 @@ use crate::slam::geometry::se3::SE3;
 pub const NEAREST_M: f32 = 0.05;
 /// Side of the grid of rays cast through a pixel that an edge crosses.
 const EDGE_GRID: usize = 4;
+/// Side of the square that a pixel averages over, pixels: its own area and the blur of a good lens,
+/// which keeps what is finer than the pixels out of the image.
+const PIXEL_WIDTH: f32 = 1.4;
 /// Brightness where no surface is.
 const SKY_GREY: f32 = 128.0;
 /// A pixel that sees nothing.
@@ -167,49 +170,58 @@ impl Renderer<'_> {
             for u in 0..width {
                 let at = v * width + u;
                 let ray = &self.lens.rays[at];
-                let value = if is_edge(&scratch.hits, width, height, u, v) {
-                    self.edge_grey(ray, scratch.lists.of_pixel(u, v), &scratch.locals)
+                let around = neighbourhood(&scratch.hits, width, height, u, v);
+                let value = if around.iter().any(|hit| hit.surface != around[0].surface) {
+                    self.edge_grey(ray, around, &scratch.locals)
                 } else {
-                    self.grey(ray, scratch.hits[at], &scratch.locals)
+                    self.grey(ray, around[0].surface, &scratch.locals)
                 };
                 grey[at] += weight * value;
             }
         }
     }
 
-    /// Mean over a grid of rays through a pixel that more than one surface fills.
-    fn edge_grey(&self, ray: &Ray, near: &[u32], locals: &[LocalView]) -> f32 {
+    /// Mean over a pixel that more than one surface fills: a grid of rays counts each surface's
+    /// share among those of the pixel and its neighbours, and each is sampled once, in its middle.
+    fn edge_grey(&self, ray: &Ray, around: [Hit; 5], locals: &[LocalView]) -> f32 {
         const STEP: f32 = 1.0 / EDGE_GRID as f32;
-        let mut sum = 0.0;
-        for i in 0..EDGE_GRID * EDGE_GRID {
-            let a = ((i % EDGE_GRID) as f32 + 0.5) * STEP - 0.5;
-            let b = ((i / EDGE_GRID) as f32 + 0.5) * STEP - 0.5;
-            let part = Ray {
-                at: [
-                    ray.at[0] + a * ray.du[0] + b * ray.dv[0],
-                    ray.at[1] + a * ray.du[1] + b * ray.dv[1],
-                ],
-                // Half a pixel rather than a quarter: the texture is then as soft as beside the edge.
-                du: ray.du.map(|d| 2.0 * STEP * d),
-                dv: ray.dv.map(|d| 2.0 * STEP * d),
-            };
-            let hit = first_hit(locals, near, part.at[0], part.at[1]);
-            sum += self.grey(&part, hit, locals);
+        const RAYS: usize = EDGE_GRID * EDGE_GRID;
+        let mut shares = [Share::default(); RAYS];
+        let mut num_shares = 0;
+        for i in 0..RAYS {
+            let a = PIXEL_WIDTH * (((i % EDGE_GRID) as f32 + 0.5) * STEP - 0.5);
+            let b = PIXEL_WIDTH * (((i / EDGE_GRID) as f32 + 0.5) * STEP - 0.5);
+            let [x, y] = ray.shifted(a, b);
+            let surface = first_of(locals, &around, x, y);
+            let known = shares[..num_shares].iter().position(|s| s.surface == surface);
+            let share = &mut shares[known.unwrap_or(num_shares)];
+            num_shares += usize::from(known.is_none());
+            *share = Share { surface, count: share.count + 1.0, a: share.a + a, b: share.b + b };
         }
-        sum * STEP * STEP
+        let mut sum = 0.0;
+        for share in &shares[..num_shares] {
+            let at = ray.shifted(share.a / share.count, share.b / share.count);
+            let side = (share.count / RAYS as f32).sqrt();
+            let part = Ray { at, du: ray.du.map(|d| side * d), dv: ray.dv.map(|d| side * d) };
+            sum += share.count * self.grey(&part, share.surface, locals);
+        }
+        sum / RAYS as f32
     }
 
     /// Brightness of a surface over the footprint of a ray, grey levels.
     #[inline]
-    fn grey(&self, ray: &Ray, hit: Hit, locals: &[LocalView]) -> f32 {
-        if hit.surface == NO_SURFACE {
+    fn grey(&self, ray: &Ray, surface: u32, locals: &[LocalView]) -> f32 {
+        if surface == NO_SURFACE {
             return SKY_GREY;
         }
-        let (index, side) = ((hit.surface >> 3) as usize, (hit.surface & 7) as usize);
+        let (index, side) = ((surface >> 3) as usize, (surface & 7) as usize);
         let (local, block) = (&locals[index], &self.scene.blocks[index]);
         let axis = side / 2;
         let d = local.direction(ray.at[0], ray.at[1]);
-        let point: [f32; 3] = std::array::from_fn(|k| local.origin[k] + hit.depth * d[k]);
+        let sign = if side & 1 == 1 { 1.0 } else { -1.0 };
+        // The plane of the face, which the ray meets even where another surface hides it.
+        let depth = (sign * local.half[axis] - local.origin[axis]) / d[axis];
+        let point: [f32; 3] = std::array::from_fn(|k| local.origin[k] + depth * d[k]);
         // Image axes of the face: upright on walls, x and y on floors.
         let (right, down, flip) = match axis {
             0 => (1, 2, -1.0),
@@ -222,10 +234,7 @@ impl Renderer<'_> {
             });
             // Along the face: the depth changes so that the point stays on the plane.
             let slide = turned[axis] / d[axis];
-            [
-                hit.depth * (turned[right] - slide * d[right]),
-                hit.depth * (turned[down] - slide * d[down]),
-            ]
+            [depth * (turned[right] - slide * d[right]), depth * (turned[down] - slide * d[down])]
         };
         let face = &block.faces[side];
         let density = [face.texels_per_metre[0], flip * face.texels_per_metre[1]];
@@ -235,8 +244,8 @@ impl Renderer<'_> {
                 face.offset[0] + density[0] * point[right],
                 face.offset[1] + density[1] * point[down],
             ],
-            du: [density[0] * du[0], density[1] * du[1]],
-            dv: [density[0] * dv[0], density[1] * dv[1]],
+            du: std::array::from_fn(|k| PIXEL_WIDTH * density[k] * du[k]),
+            dv: std::array::from_fn(|k| PIXEL_WIDTH * density[k] * dv[k]),
         };
         let texel = self.scene.textures[face.texture].sample(&footprint);
         let reflectance = (face.middle + face.contrast * (texel - 0.5)).clamp(0.02, 0.98);
@@ -246,7 +255,7 @@ impl Renderer<'_> {
             block.centre[1] + sin * point[0] + cos * point[1],
             block.centre[2] + point[2],
         ];
-        let outward = if (side & 1 == 1) != block.is_hollow { 1.0 } else { -1.0 };
+        let outward = if block.is_hollow { -sign } else { sign };
         let normal = match axis {
             0 => [cos * outward, sin * outward, 0.0],
             1 => [-sin * outward, cos * outward, 0.0],
@@ -256,14 +265,28 @@ impl Renderer<'_> {
     }
 }
 
+/// What a surface fills of a pixel.
+#[derive(Debug, Clone, Copy, Default)]
+struct Share {
+    surface: u32,
+    /// Rays that meet it.
+    count: f32,
+    /// Sums of their places in the pixel.
+    a: f32,
+    b: f32,
+}
+
 /// The nearest surface along a ray among the blocks `near`, which are sorted by nearest depth.
 #[inline]
-fn first_hit(locals: &[LocalView], near: &[u32], x: f32, y: f32) -> Hit {
+fn first_hit(locals: &[LocalView], near: &[Candidate], x: f32, y: f32) -> Hit {
     let (mut depth, mut block) = (f32::INFINITY, 0);
-    for &index in near {
-        let candidate = locals[index as usize].depth(x, y);
-        if candidate < depth {
-            (depth, block) = (candidate, index);
+    for candidate in near {
+        if candidate.nearest > depth {
+            break;
+        }
+        let met = locals[candidate.block as usize].depth(x, y);
+        if met < depth {
+            (depth, block) = (met, candidate.block);
         }
     }
     if depth == f32::INFINITY {
@@ -272,13 +295,37 @@ fn first_hit(locals: &[LocalView], near: &[u32], x: f32, y: f32) -> Hit {
     Hit { depth, surface: block * 8 + locals[block as usize].face(x, y, depth) }
 }
 
-/// Whether a neighbour of the pixel sees another surface.
+/// The surface that a ray meets first among the blocks of `around`.
+fn first_of(locals: &[LocalView], around: &[Hit; 5], x: f32, y: f32) -> u32 {
+    let (mut depth, mut block) = (f32::INFINITY, NO_SURFACE);
+    let mut tested = NO_SURFACE;
+    for hit in around.iter().filter(|hit| hit.surface != NO_SURFACE) {
+        let index = hit.surface >> 3;
+        if index == tested || index == block {
+            continue;
+        }
+        tested = index;
+        let met = locals[index as usize].depth(x, y);
+        if met < depth {
+            (depth, block) = (met, index);
+        }
+    }
+    if block == NO_SURFACE {
+        return NO_SURFACE;
+    }
+    block * 8 + locals[block as usize].face(x, y, depth)
+}
+
+/// What a pixel sees, then what its neighbours see (itself again outside the image).
 #[inline]
-fn is_edge(hits: &[Hit], width: usize, height: usize, u: usize, v: usize) -> bool {
+fn neighbourhood(hits: &[Hit], width: usize, height: usize, u: usize, v: usize) -> [Hit; 5] {
     let at = v * width + u;
-    let own = hits[at].surface;
-    (u > 0 && hits[at - 1].surface != own)
-        || (u + 1 < width && hits[at + 1].surface != own)
-        || (v > 0 && hits[at - width].surface != own)
-        || (v + 1 < height && hits[at + width].surface != own)
+    let or_self = |inside: bool, other: usize| hits[if inside { other } else { at }];
+    [
+        hits[at],
+        or_self(u > 0, at.wrapping_sub(1)),
+        or_self(u + 1 < width, at + 1),
+        or_self(v > 0, at.wrapping_sub(width)),
+        or_self(v + 1 < height, at + width),
+    ]
 }

@@ -80,7 +80,7 @@ impl Scene {
     #[inline]
     pub fn light(&self, point: [f32; 3], normal: [f32; 3]) -> f32 {
         /// Share of the light that comes from everywhere.
-        const AMBIENT: f32 = 0.58;
+        const AMBIENT: f32 = 0.62;
         /// Light of the lamp at no distance, facing it.
         const LAMP: f32 = 0.75;
         /// Distance at which the lamp's light is halved, metres.
@@ -217,7 +217,7 @@ impl Builder {
                 [self.stream.index(4)];
             let place = along + 0.5 * thick;
             let at = [from[0] + cos * place, from[1] + sin * place];
-            let cover = Cover::of(pattern).with_middle(middle);
+            let cover = Cover::of(pattern).with_middle(middle).with_contrast(0.6);
             self.place(at, base, [thick * 0.94, deep, tall], turn_rad, cover);
             along += thick;
             if self.stream.index(7) == 0 {

@@ -3,8 +3,8 @@
 /// Reflectance of a tileable square surface, 0 (black) to 1 (white), with every halving of it.
 #[derive(Debug, Clone)]
 pub struct Texture {
-    /// Finest first; level l is `size >> l` a side.
-    levels: Vec<Vec<f32>>,
+    /// Finest first, in [`STEPS`]; level l is `size >> l` a side.
+    levels: Vec<Vec<u16>>,
     size: usize,
 }
 
@@ -19,6 +19,8 @@ pub struct Footprint {
     pub dv: [f32; 2],
 }
 
+/// Steps of a stored reflectance: far finer than a grey level, half the memory traffic of f32.
+const STEPS: f32 = 65535.0;
 /// Longest chain of samples along a stretched footprint; beyond it the footprint is blurred.
 const MAX_TAPS: f32 = 12.0;
 /// Samples for each texel of the footprint's length, measured in its width.
@@ -28,18 +30,22 @@ impl Texture {
     /// Builds the mip levels by 2×2 means. `size` is a power of two and `texels` has `size²` entries.
     pub fn new(size: usize, texels: Vec<f32>) -> Self {
         assert!(size.is_power_of_two() && texels.len() == size * size, "texture size");
-        let mut levels = vec![texels];
+        let quantize = |texels: &[f32]| -> Vec<u16> {
+            texels.iter().map(|&t| (t.clamp(0.0, 1.0) * STEPS + 0.5) as u16).collect()
+        };
+        let mut fine = texels;
+        let mut levels = vec![quantize(&fine)];
         let mut side = size;
         while side > 1 {
-            let fine = &levels[levels.len() - 1];
             let half = side / 2;
-            let coarse = (0..half * half)
+            let coarse: Vec<f32> = (0..half * half)
                 .map(|i| {
                     let at = (i / half) * 2 * side + (i % half) * 2;
                     0.25 * (fine[at] + fine[at + 1] + fine[at + side] + fine[at + side + 1])
                 })
                 .collect();
-            levels.push(coarse);
+            levels.push(quantize(&coarse));
+            fine = coarse;
             side = half;
         }
         Self { levels, size }
@@ -62,12 +68,13 @@ impl Texture {
         let spread = (0.25 * (xx - yy) * (xx - yy) + xy * xy).sqrt();
         let major = (mean + spread).sqrt();
         let minor = (mean - spread).max(0.0).sqrt().max(major / MAX_TAPS);
-        let taps = (TAPS_PER_RATIO * major / minor.max(1e-12)).ceil().clamp(1.0, MAX_TAPS);
+        let taps =
+            ((TAPS_PER_RATIO * major / minor.max(1e-12)).min(MAX_TAPS - 1.0) as i32 + 1) as f32;
         if taps <= 2.0 {
             return self.trilinear(footprint.centre, (major * minor).sqrt());
         }
         let axis = if xx >= yy { [mean + spread - yy, xy] } else { [xy, mean + spread - xx] };
-        let step = major / (axis[0].hypot(axis[1]).max(1e-12) * taps);
+        let step = major / ((axis[0] * axis[0] + axis[1] * axis[1]).sqrt().max(1e-12) * taps);
         let mut sum = 0.0;
         let mut place = -0.5 * (taps - 1.0);
         for _ in 0..taps as usize {
@@ -81,10 +88,11 @@ impl Texture {
     /// Mean over a disc of `width` texels around `centre`.
     #[inline]
     pub fn trilinear(&self, centre: [f32; 2], width: f32) -> f32 {
-        let last = (self.levels.len() - 1) as f32;
-        let level = width.max(1.0).log2().min(last);
-        let fine = level as usize;
-        let between = level - fine as f32;
+        // The exponent of the width is the level, its mantissa the way to the next: log2 made of
+        // straight pieces, exact at whole levels and without a call.
+        let bits = width.clamp(1.0, self.size as f32).to_bits();
+        let fine = (bits >> 23) as usize - 127;
+        let between = (bits & 0x7F_FFFF) as f32 / 8_388_608.0;
         let first = self.bilinear(fine, centre);
         if between < 1e-3 {
             return first;
@@ -99,14 +107,22 @@ impl Texture {
         let scale = 1.0 / (1u32 << level) as f32;
         // Texel centres are at half-integer coordinates of the finest level.
         let (x, y) = (centre[0] * scale - 0.5, centre[1] * scale - 0.5);
-        let (x0, y0) = (x.floor(), y.floor());
-        let (a, b) = (x - x0, y - y0);
-        let (left, right) = ((x0 as i32 & mask) as usize, ((x0 as i32 + 1) & mask) as usize);
-        let (top, bottom) = ((y0 as i32 & mask) as usize, ((y0 as i32 + 1) & mask) as usize);
+        let (column, row) = (floor(x), floor(y));
+        let (a, b) = (x - column as f32, y - row as f32);
+        let (left, right) = ((column & mask) as usize, ((column + 1) & mask) as usize);
+        let (top, bottom) = ((row & mask) as usize, ((row + 1) & mask) as usize);
         let texels = &self.levels[level];
         let (upper, lower) = (&texels[top * side..][..side], &texels[bottom * side..][..side]);
-        let above = upper[left] + a * (upper[right] - upper[left]);
-        let below = lower[left] + a * (lower[right] - lower[left]);
-        above + b * (below - above)
+        let at = |row: &[u16], column: usize| f32::from(row[column]);
+        let above = at(upper, left) + a * (at(upper, right) - at(upper, left));
+        let below = at(lower, left) + a * (at(lower, right) - at(lower, left));
+        (above + b * (below - above)) * (1.0 / STEPS)
     }
+}
+
+/// The whole number below, without the call that the baseline instruction set needs for it.
+#[inline]
+fn floor(x: f32) -> i32 {
+    let towards_zero = x as i32;
+    towards_zero - i32::from((towards_zero as f32) > x)
 }

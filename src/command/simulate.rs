@@ -1,0 +1,288 @@
+//! `semidense simulate`: a simulated sequence as a dataset with exact depth and poses.
+
+use std::error::Error;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use clap::{Args, ValueEnum};
+use rayon::prelude::*;
+use serde::Serialize;
+
+use crate::capture::dataset_writer::{DatasetError, DatasetLayout, DatasetWriter};
+use crate::capture::simulator::Simulator;
+use crate::capture::simulator::params::{
+    MotionKind, MotionParams, SceneKind, SensorParams, SimulatorParams,
+};
+use crate::capture::simulator::summary::{PathSummary, gradient_share, summarize};
+use crate::capture::source::FrameSource;
+use crate::command::progress::Progress;
+
+/// Exit code of work that Ctrl-C ended, as shells have it (128 + SIGINT).
+const INTERRUPTED: u8 = 130;
+/// Frames written between two looks at progress and Ctrl-C.
+const FRAMES_PER_BATCH: usize = 8;
+/// Gradient from which a pixel counts as textured, grey levels a pixel.
+const TEXTURED_GRADIENT: f64 = 5.0;
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Layout {
+    /// TUM RGB-D: rgb/, depth/, groundtruth.txt, camera.txt
+    Tum,
+    /// EuRoC: mav0/cam0, mav0/depth0, mav0/state_groundtruth_estimate0
+    Euroc,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Scene {
+    /// A furnished room of 6 x 5 x 3 m
+    Room,
+    /// A printed plane seen from 1.5 m above
+    Plane,
+    /// A corridor of 24 x 2.4 x 2.6 m
+    Corridor,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Motion {
+    /// A walk with the camera in the hand
+    Handheld,
+    /// To and fro on a straight line across the view
+    Straight,
+    /// Turning about the optical centre
+    Rotation,
+    /// Nothing moves
+    Standing,
+}
+
+/// Write a simulated sequence as a dataset: images, exact depth, exact poses
+///
+/// The same options and seed give the same bytes, on any number of threads.
+#[derive(Debug, Args)]
+pub struct SimulateArgs {
+    /// Folder of the dataset; refused when it is not empty
+    #[arg(long, value_name = "DIR")]
+    output: PathBuf,
+    /// Replace the dataset that is in the folder
+    #[arg(long)]
+    force: bool,
+    /// Layout of the files
+    #[arg(long, value_enum, default_value = "tum")]
+    layout: Layout,
+    /// Print the summary as JSON
+    #[arg(long)]
+    json: bool,
+    /// What is seen
+    #[arg(long, value_enum, default_value = "room")]
+    scene: Scene,
+    /// Number of frames
+    #[arg(long, value_name = "N", default_value_t = SimulatorParams::default().frames)]
+    frames: usize,
+    /// Chooses textures, path and noise
+    #[arg(long, value_name = "N", default_value_t = SimulatorParams::default().seed)]
+    seed: u64,
+    /// Frames a second
+    #[arg(long, value_name = "HZ", default_value_t = SimulatorParams::default().rate_hz)]
+    rate: f64,
+    /// Image width in pixels
+    #[arg(long, value_name = "PX", default_value_t = SimulatorParams::default().width)]
+    width: usize,
+    /// Image height in pixels
+    #[arg(long, value_name = "PX", default_value_t = SimulatorParams::default().height)]
+    height: usize,
+    /// Focal length in pixels
+    #[arg(long, value_name = "PX", default_value_t = SimulatorParams::default().focal_px)]
+    focal: f64,
+    /// Factor on every length of world and path
+    #[arg(long, value_name = "FACTOR", default_value_t = SimulatorParams::default().world_scale)]
+    world_scale: f64,
+    #[command(flatten, next_help_heading = "Motion")]
+    motion: MotionArgs,
+    #[command(flatten, next_help_heading = "Lens and sensor")]
+    sensor: SensorArgs,
+}
+
+#[derive(Debug, Args)]
+struct MotionArgs {
+    /// How the camera moves
+    #[arg(long, value_enum, default_value = "handheld")]
+    motion: Motion,
+    /// Mean speed in m/s
+    #[arg(long, value_name = "M/S", default_value_t = MotionParams::default().mean_speed_m_s)]
+    speed: f64,
+    /// Mean rate of turning in degrees a second
+    #[arg(long, value_name = "DEG/S", default_value_t = MotionParams::default().mean_turn_deg_s)]
+    turn: f64,
+    /// Factor on the tremor of the hand
+    #[arg(long, value_name = "FACTOR", default_value_t = MotionParams::default().tremor)]
+    tremor: f64,
+}
+
+#[derive(Debug, Args)]
+struct SensorArgs {
+    /// Standard deviation of the pixel noise in grey levels
+    #[arg(long, value_name = "GREY", default_value_t = SensorParams::default().noise_std_dev)]
+    noise: f64,
+    /// Share of light lost in the image corners, 0 to 0.95
+    #[arg(long, value_name = "SHARE", default_value_t = SensorParams::default().vignette)]
+    vignette: f64,
+    /// Amplitude of the slow change of gain, as natural logarithm
+    #[arg(long, value_name = "LOG", default_value_t = SensorParams::default().gain_amplitude)]
+    gain_change: f64,
+    /// Amplitude of the slow change of offset in grey levels
+    #[arg(long, value_name = "GREY", default_value_t = SensorParams::default().offset_amplitude)]
+    offset_change: f64,
+    /// Period of both changes in seconds
+    #[arg(long, value_name = "S", default_value_t = SensorParams::default().exposure_period_s)]
+    exposure_period: f64,
+    /// Exposure time in ms: motion blurs over it
+    #[arg(long, value_name = "MS", default_value_t = SensorParams::default().exposure_ms)]
+    exposure: f64,
+    /// Time between the starts of two rows in microseconds: rolling shutter
+    #[arg(long, value_name = "US", default_value_t = SensorParams::default().row_time_us)]
+    row_time: f64,
+    /// Lens distortion k1,k2,p1,p2[,k3[,k4,k5,k6]] (radtan, as OpenCV)
+    #[arg(long, value_name = "K", value_delimiter = ',', allow_hyphen_values = true)]
+    distortion: Vec<f64>,
+}
+
+/// What was written.
+#[derive(Debug, Serialize)]
+struct Summary {
+    output: PathBuf,
+    frames: usize,
+    seed: u64,
+    #[serde(flatten)]
+    path: PathSummary,
+    /// Mean share of pixels with a gradient of at least 5 grey levels a pixel.
+    gradient_share: f64,
+}
+
+/// Renders, writes the dataset and prints its summary.
+pub fn run(args: &SimulateArgs) -> Result<ExitCode, Box<dyn Error>> {
+    let mut simulator = Simulator::new(params(args))?;
+    let layout = match args.layout {
+        Layout::Tum => DatasetLayout::Tum,
+        Layout::Euroc => DatasetLayout::Euroc,
+    };
+    let params = simulator.params();
+    let (camera, rate_hz) = (*simulator.camera(), params.rate_hz);
+    let writer = DatasetWriter::create(&args.output, layout, camera, rate_hz, args.force)?;
+    let interrupted = Arc::new(AtomicBool::new(false));
+    signal_hook::flag::register(signal_hook::consts::SIGINT, Arc::clone(&interrupted))?;
+    let Some(gradient_share) = write_frames(&mut simulator, &writer, &interrupted)? else {
+        eprintln!("semidense: interrupted; nothing was written to {}", args.output.display());
+        return Ok(ExitCode::from(INTERRUPTED));
+    };
+    writer.finish(simulator.ground_truth())?;
+    let summary = Summary {
+        output: args.output.clone(),
+        frames: args.frames,
+        seed: args.seed,
+        path: summarize(simulator.ground_truth()),
+        gradient_share,
+    };
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&summary)?);
+    } else {
+        print_summary(&summary);
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Renders and writes all frames; the mean share of textured pixels, `None` after Ctrl-C.
+fn write_frames(
+    simulator: &mut Simulator,
+    writer: &DatasetWriter,
+    interrupted: &AtomicBool,
+) -> Result<Option<f64>, DatasetError> {
+    let frames = simulator.params().frames;
+    let progress = Progress::new("simulate", Some(frames));
+    let mut shares = 0.0;
+    // Rendered and written batch by batch: memory stays small however long the sequence is.
+    for first in (0..frames).step_by(FRAMES_PER_BATCH) {
+        if interrupted.load(Ordering::Relaxed) {
+            progress.finish();
+            return Ok(None);
+        }
+        let batch = first..(first + FRAMES_PER_BATCH).min(frames);
+        let written: Result<Vec<f64>, DatasetError> = batch
+            .clone()
+            .into_par_iter()
+            .map(|frame| write_frame(simulator, writer, frame))
+            .collect();
+        shares += written?.iter().sum::<f64>();
+        batch.for_each(|frame| progress.update(frame + 1, ""));
+    }
+    progress.finish();
+    Ok(Some(shares / frames as f64))
+}
+
+/// Renders and writes one frame; its share of textured pixels.
+fn write_frame(
+    simulator: &Simulator,
+    writer: &DatasetWriter,
+    frame: usize,
+) -> Result<f64, DatasetError> {
+    let (Some(pixels), Some(depth)) = (simulator.raw_frame(frame), simulator.raw_depth(frame))
+    else {
+        return Ok(0.0);
+    };
+    writer.write_frame(simulator.nanos(frame), &pixels, &depth)?;
+    Ok(gradient_share(&pixels, depth.width(), TEXTURED_GRADIENT))
+}
+
+fn print_summary(summary: &Summary) {
+    let path = &summary.path;
+    println!(
+        "{} frames, {:.2} s, in {}",
+        summary.frames,
+        path.duration_s,
+        summary.output.display()
+    );
+    println!(
+        "path {:.2} m at {:.2} m/s, extent {:.2} m, rotation {:.0}°",
+        path.path_length_m, path.mean_speed_m_s, path.extent_m, path.rotation_deg
+    );
+    println!("textured pixels {:.1} %", 100.0 * summary.gradient_share);
+}
+
+fn params(args: &SimulateArgs) -> SimulatorParams {
+    let (motion, sensor) = (&args.motion, &args.sensor);
+    SimulatorParams {
+        scene: match args.scene {
+            Scene::Room => SceneKind::Room,
+            Scene::Plane => SceneKind::Plane,
+            Scene::Corridor => SceneKind::Corridor,
+        },
+        seed: args.seed,
+        frames: args.frames,
+        rate_hz: args.rate,
+        width: args.width,
+        height: args.height,
+        focal_px: args.focal,
+        world_scale: args.world_scale,
+        motion: MotionParams {
+            kind: match motion.motion {
+                Motion::Handheld => MotionKind::Handheld,
+                Motion::Straight => MotionKind::Straight,
+                Motion::Rotation => MotionKind::Rotation,
+                Motion::Standing => MotionKind::Standing,
+            },
+            mean_speed_m_s: motion.speed,
+            mean_turn_deg_s: motion.turn,
+            tremor: motion.tremor,
+        },
+        sensor: SensorParams {
+            noise_std_dev: sensor.noise,
+            vignette: sensor.vignette,
+            gain_amplitude: sensor.gain_change,
+            offset_amplitude: sensor.offset_change,
+            exposure_period_s: sensor.exposure_period,
+            exposure_ms: sensor.exposure,
+            row_time_us: sensor.row_time,
+            distortion: sensor.distortion.clone(),
+        },
+    }
+}
