@@ -3,10 +3,14 @@
 //! `run` and `replay` end in [`write_results`] with a [`RunRecord`], so that their files mean the
 //! same and can be compared byte by byte.
 
+pub mod colour;
+pub mod debug_pictures;
 pub mod depth_maps;
+pub mod pictures;
 pub mod ply;
 pub mod poses;
 pub mod summary;
+pub mod summary_text;
 
 use std::fs;
 use std::io::{self, Write};

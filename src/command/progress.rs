@@ -1,0 +1,63 @@
+//! How long work shows that it goes on: a bar on a terminal, plain lines otherwise; on stderr, so
+//! that stdout stays the result.
+
+use std::io::IsTerminal;
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+/// Plain lines over the whole work where its length is known.
+const PLAIN_LINES: usize = 10;
+
+/// Steps between plain lines where it is not.
+const PLAIN_INTERVAL: usize = 100;
+
+/// Progress of one piece of work.
+#[derive(Debug)]
+pub struct Progress {
+    what: &'static str,
+    total: Option<usize>,
+    bar: Option<ProgressBar>,
+}
+
+impl Progress {
+    /// Progress of `what` (one word or two), `total` steps where that is known.
+    pub fn new(what: &'static str, total: Option<usize>) -> Self {
+        let bar = std::io::stderr().is_terminal().then(|| {
+            let (bar, template) = match total {
+                Some(total) => (
+                    ProgressBar::new(total as u64),
+                    "{prefix} [{bar:32}] {pos}/{len} {elapsed} (left {eta}) {msg}",
+                ),
+                None => (ProgressBar::no_length(), "{prefix} {spinner} {pos} {elapsed} {msg}"),
+            };
+            let style = ProgressStyle::with_template(template);
+            bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
+                .with_prefix(what)
+        });
+        Self { what, total, bar }
+    }
+
+    /// `done` steps are over; `detail` says how it stands.
+    pub fn update(&self, done: usize, detail: &str) {
+        if let Some(bar) = &self.bar {
+            bar.set_position(done as u64);
+            if bar.message() != detail {
+                bar.set_message(detail.to_owned());
+            }
+            return;
+        }
+        let interval =
+            self.total.map_or(PLAIN_INTERVAL, |total| total.div_ceil(PLAIN_LINES)).max(1);
+        if done.is_multiple_of(interval) || self.total == Some(done) {
+            let of = self.total.map(|total| format!("/{total}")).unwrap_or_default();
+            eprintln!("{} {done}{of} {detail}", self.what);
+        }
+    }
+
+    /// Takes the bar away.
+    pub fn finish(&self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}
