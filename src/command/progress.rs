@@ -31,8 +31,7 @@ impl Progress {
                 None => (ProgressBar::no_length(), "{prefix} {spinner} {pos} {elapsed} {msg}"),
             };
             let style = ProgressStyle::with_template(template);
-            bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
-                .with_prefix(what)
+            bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar())).with_prefix(what)
         });
         Self { what, total, bar }
     }

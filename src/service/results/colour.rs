@@ -85,8 +85,11 @@ mod tests {
 
     #[test]
     fn a_picture_comes_back_from_its_png() {
-        let picture =
-            Picture { width: 3, height: 2, pixels: (0..6u8).map(|i| [i, 2 * i, 255 - i]).collect() };
+        let picture = Picture {
+            width: 3,
+            height: 2,
+            pixels: (0..6u8).map(|i| [i, 2 * i, 255 - i]).collect(),
+        };
         let bytes = picture.png().unwrap();
         let mut reader = png::Decoder::new(std::io::Cursor::new(bytes)).read_info().unwrap();
         let mut pixels = vec![0; 18];

@@ -5,9 +5,9 @@ use std::io::{self, Write};
 use std::path::Path;
 
 use crate::service::atomic_file::write_atomically;
+use crate::service::results::ResultsError;
 use crate::service::results::colour::Picture;
 use crate::service::results::pictures::{density_picture, inverse_depth_picture, variance_picture};
-use crate::service::results::ResultsError;
 use crate::slam::mapper::Map;
 
 /// Writes `keyframe-NNNN-{inverse-depth,variance,density}.png` for every keyframe into `dir`.

@@ -37,7 +37,8 @@ pub fn summary_text(summary: &Summary) -> String {
             ),
         );
     }
-    let times = [("track", summary.track_ms), ("map", summary.map_ms), ("latency", summary.latency_ms)];
+    let times =
+        [("track", summary.track_ms), ("map", summary.map_ms), ("latency", summary.latency_ms)];
     for (name, percentiles) in times {
         if let Some(percentiles) = percentiles {
             line(&format!("{name} time"), times_text(&percentiles));
@@ -80,7 +81,8 @@ fn times_text(p: &Percentiles) -> String {
 }
 
 fn run(summary: &Summary) -> String {
-    let mut text = format!("{:.2} s for {:.2} s recorded", summary.wall_secs, summary.recorded_secs);
+    let mut text =
+        format!("{:.2} s for {:.2} s recorded", summary.wall_secs, summary.recorded_secs);
     if let Some(factor) = summary.realtime_factor {
         let _ = write!(text, " (x{factor:.2} real time)");
     }
