@@ -8,8 +8,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::{Args, ValueEnum};
 
-use crate::capture::source::{FrameSource, SourceName, open};
+use crate::capture::simulator::params::SimulatorParams;
+use crate::capture::source::{FrameSource, SourceName};
 use crate::command::progress::Progress;
+use crate::service::open_source::open_source;
 use crate::service::replay::{DepthOrigin, PoseOrigin, ReplayConfig, ReplayProgress, replay};
 use crate::service::results::debug_pictures::write_debug_pictures;
 use crate::service::results::summary_text::summary_text;
@@ -62,6 +64,9 @@ pub struct ReplayArgs {
     /// Stop after as many frames
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     frames: Option<u32>,
+    /// Seed of the simulator
+    #[arg(long, value_name = "N", default_value_t = SimulatorParams::default().seed)]
+    seed: u64,
     /// Threads of the mapper; the result does not depend on it [default: one for each CPU]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: Option<u16>,
@@ -73,7 +78,8 @@ pub struct ReplayArgs {
 /// Replays, writes the results and prints the summary.
 pub fn run(args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error>> {
     prepare_output(&args.output)?;
-    let mut source = open(&args.source, args.rig.as_deref())?;
+    let simulator = SimulatorParams { seed: args.seed, ..SimulatorParams::default() };
+    let mut source = open_source(&args.source, args.rig.as_deref(), simulator)?;
     let interrupted = Arc::new(AtomicBool::new(false));
     signal_hook::flag::register(signal_hook::consts::SIGINT, Arc::clone(&interrupted))?;
     let threads = args.threads.map_or(0, usize::from);

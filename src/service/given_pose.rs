@@ -18,6 +18,21 @@ const DISTANCE_WEIGHT: f64 = 3.0;
 /// Weight of the share of points out of view: a quarter makes one.
 const USAGE_WEIGHT: f64 = 4.0;
 
+/// The true poses with the camera of the first frame that has one as the world, as a map has it
+/// whose first keyframe is the identity; empty where no pose is near `first_nanos` or later.
+pub fn truth_in_first_camera(ground_truth: &[StampedPose], first_nanos: i64) -> Vec<StampedPose> {
+    let earliest = first_nanos.saturating_sub(MAX_DIFFERENCE_NANOS);
+    let later = ground_truth.partition_point(|pose| pose.nanos < earliest);
+    let first = nearest(ground_truth, first_nanos, MAX_DIFFERENCE_NANOS).unwrap_or(later);
+    let Some(world) = ground_truth.get(first) else { return Vec::new() };
+    let camera_from_world = world.world_from_camera.inverse();
+    let place = |pose: &StampedPose| StampedPose {
+        nanos: pose.nanos,
+        world_from_camera: camera_from_world * pose.world_from_camera,
+    };
+    ground_truth.iter().map(place).collect()
+}
+
 /// The true pose of `frame`, exact (covariance zero), relative to `keyframe`; `None` where no true
 /// pose is near enough in time. Whether a keyframe is due is judged from the geometry.
 pub fn given_pose(
