@@ -78,7 +78,8 @@ pub struct ReplayArgs {
 /// Replays, writes the results and prints the summary.
 pub fn run(args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error>> {
     prepare_output(&args.output)?;
-    let simulator = SimulatorParams { seed: args.seed, ..SimulatorParams::default() };
+    let mut simulator = SimulatorParams { seed: args.seed, ..SimulatorParams::default() };
+    simulator.frames = args.frames.map_or(simulator.frames, |n| simulator.frames.min(n as usize));
     let mut source = open_source(&args.source, args.rig.as_deref(), simulator)?;
     let interrupted = Arc::new(AtomicBool::new(false));
     signal_hook::flag::register(signal_hook::consts::SIGINT, Arc::clone(&interrupted))?;

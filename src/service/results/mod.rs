@@ -9,6 +9,7 @@ pub mod depth_maps;
 pub mod pictures;
 pub mod ply;
 pub mod poses;
+pub mod report;
 pub mod summary;
 pub mod summary_text;
 
@@ -20,6 +21,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::capture::source::{FrameSource, SourceError};
 use crate::service::atomic_file::write_atomically;
+use crate::service::results::report::{ReportInput, report};
 use crate::service::results::summary::Summary;
 use crate::service::trajectory_file::write_trajectory;
 use crate::slam::evaluation::depth_error::DepthScale;
@@ -182,5 +184,15 @@ pub fn write_results(
             writeln!(file)
         })
     })?;
+    let page = report(&ReportInput {
+        record,
+        summary: &summary,
+        trajectory: &trajectory,
+        online: &online,
+        evaluation: evaluation.as_ref(),
+        online_evaluation: online_evaluation.as_ref(),
+        max_relative_std_dev: params.max_relative_std_dev,
+    });
+    write("report.html", &|path| write_atomically(path, |file| file.write_all(page.as_bytes())))?;
     Ok(summary)
 }
