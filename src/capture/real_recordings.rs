@@ -27,7 +27,7 @@ fn every_recording_is_read_whole() {
         ("tsukuba", 150, 150, 0),
     ] {
         let Some(folder) = recording(name) else { continue };
-        let mut source = open(&SourceName::Tum(folder), None).expect(name);
+        let mut source = open(&SourceName::Tum(folder), None, &Default::default()).expect(name);
         assert_eq!(source.num_frames(), Some(frames), "{name}");
         assert_eq!(source.ground_truth().len(), poses, "{name}");
         let k = source.intrinsics();

@@ -9,9 +9,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use clap::{Args, ValueEnum};
 
 use crate::capture::simulator::params::SimulatorParams;
-use crate::capture::source::{FrameSource, SourceName};
+use crate::capture::source::{FrameSource, SourceName, open};
 use crate::command::progress::Progress;
-use crate::service::open_source::open_source;
 use crate::service::replay::{DepthOrigin, PoseOrigin, ReplayConfig, ReplayProgress, replay};
 use crate::service::results::debug_pictures::write_debug_pictures;
 use crate::service::results::summary_text::summary_text;
@@ -80,7 +79,7 @@ pub fn run(args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error>> {
     prepare_output(&args.output)?;
     let mut simulator = SimulatorParams { seed: args.seed, ..SimulatorParams::default() };
     simulator.frames = args.frames.map_or(simulator.frames, |n| simulator.frames.min(n as usize));
-    let mut source = open_source(&args.source, args.rig.as_deref(), simulator)?;
+    let mut source = open(&args.source, args.rig.as_deref(), &simulator)?;
     let interrupted = Arc::new(AtomicBool::new(false));
     signal_hook::flag::register(signal_hook::consts::SIGINT, Arc::clone(&interrupted))?;
     let threads = args.threads.map_or(0, usize::from);

@@ -2,7 +2,6 @@
 
 pub mod atomic_file;
 pub mod given_pose;
-pub mod open_source;
 pub mod replay;
 pub mod results;
 pub mod trajectory_file;

@@ -126,6 +126,8 @@ struct Replay<'a> {
     mapper: Mapper,
     /// Poses to be given, the first camera's frame as the world; made at the first frame.
     given_poses: Vec<StampedPose>,
+    /// Memory of the reference that the tracker gave back.
+    spare: Option<Box<Reference>>,
     record: RunRecord,
     stamps: Option<(FrameStamp, FrameStamp)>,
 }
@@ -153,6 +155,7 @@ impl<'a> Replay<'a> {
             tracker: Tracker::new(intrinsics, config.tracker.clone())?,
             mapper: Mapper::new(intrinsics, config.mapper.clone())?,
             given_poses: Vec::new(),
+            spare: None,
             record: empty_record(source_name, ground_truth, given),
             stamps: None,
         })
@@ -192,7 +195,12 @@ impl<'a> Replay<'a> {
             && self.config.poses == PoseOrigin::Tracker
             && let Some(keyframe) = self.mapper.keyframe()
         {
-            self.tracker.adopt(Box::new(Reference::prepare(keyframe)));
+            let mut reference = self
+                .spare
+                .take()
+                .unwrap_or_else(|| Box::new(Reference::new(self.config.tracker.reference.clone())));
+            reference.prepare_into(keyframe);
+            self.spare = self.tracker.adopt(reference);
         }
         Ok((pose.state, outcome))
     }
@@ -206,7 +214,12 @@ impl<'a> Replay<'a> {
                 (estimate, Some(elapsed_nanos(begin)))
             }
             PoseOrigin::GroundTruth => {
-                let estimate = given_pose(frame, self.mapper.keyframe(), &self.given_poses);
+                let estimate = given_pose(
+                    frame,
+                    self.mapper.keyframe(),
+                    &self.given_poses,
+                    &self.config.tracker,
+                );
                 (estimate?, None)
             }
         };
