@@ -1,5 +1,6 @@
 //! The command line: arguments → configuration → shell → exit code.
 
+pub mod evaluate;
 pub mod progress;
 pub mod replay;
 
@@ -17,12 +18,14 @@ struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    Evaluate(evaluate::EvaluateArgs),
     Replay(replay::ReplayArgs),
 }
 
 /// Parses the command line and runs the chosen subcommand.
 pub fn main() -> ExitCode {
     let result = match Arguments::parse().command {
+        Command::Evaluate(arguments) => evaluate::run(&arguments),
         Command::Replay(arguments) => replay::run(&arguments),
     };
     result.unwrap_or_else(|error| {

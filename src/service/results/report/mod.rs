@@ -3,6 +3,7 @@
 pub mod axis;
 pub mod chart;
 pub mod charts;
+pub mod evaluation_plot;
 pub mod html;
 pub mod views;
 
