@@ -17,9 +17,16 @@ const RAINBOW: [Rgb; 9] = [
     [122, 4, 3],
 ];
 
-/// Stops of the scale for uncertainty and density, little to much: even steps of lightness.
-const HEAT: [Rgb; 6] =
-    [[13, 8, 60], [86, 15, 110], [160, 40, 100], [220, 80, 55], [250, 160, 30], [250, 245, 150]];
+/// Stops of the scale for uncertainty and density, little to much: growing lightness, and none so
+/// dark that it is lost on a darkened image.
+const HEAT: [Rgb; 6] = [
+    [60, 90, 220],
+    [120, 90, 225],
+    [195, 85, 195],
+    [240, 100, 110],
+    [255, 170, 60],
+    [255, 245, 150],
+];
 
 /// Colour of `share` (0 to 1, clamped; NaN counts as 0) on the scale for inverse depth.
 pub fn rainbow(share: f64) -> Rgb {

@@ -156,7 +156,9 @@ pub fn write_results(
     let trajectory = poses::final_trajectory(record);
     let online = poses::online_trajectory(record);
     let evaluate = |estimate: &[StampedPose]| {
-        let truth = &record.ground_truth;
+        // Poses that were given have no error.
+        let given = record.depth_scale == DepthScale::Given;
+        let truth = if given { &[][..] } else { &record.ground_truth };
         evaluate_trajectory(estimate, truth, params.alignment, MAX_DIFFERENCE_NANOS).ok()
     };
     let (evaluation, online_evaluation) = (evaluate(&trajectory), evaluate(&online));
@@ -191,6 +193,7 @@ pub fn write_results(
         online: &online,
         evaluation: evaluation.as_ref(),
         online_evaluation: online_evaluation.as_ref(),
+        cloud: &cloud,
         max_relative_std_dev: params.max_relative_std_dev,
     });
     write("report.html", &|path| write_atomically(path, |file| file.write_all(page.as_bytes())))?;

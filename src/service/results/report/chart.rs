@@ -149,11 +149,15 @@ impl Chart {
         for series in self.series.iter().rev().filter(|series| !series.name.is_empty()) {
             draw_text(svg, right, 18.0, "end", "opacity=\"0.8\"", series.name);
             right -= LETTER * series.name.chars().count() as f64 + 8.0;
-            let dash = if series.mark == Mark::DashedPath { DASH } else { "" };
+            let (path, width, style) = match series.mark {
+                Mark::Dots(_) => ("h0", 7, " stroke-linecap=\"round\""),
+                Mark::DashedPath | Mark::Rule => ("h16", 3, DASH),
+                _ => ("h16", 3, ""),
+            };
+            let start = if path == "h0" { right - 5.0 } else { right - 16.0 };
             let _ = write!(
                 svg,
-                "<path d=\"M{:.1} 14h16\" stroke=\"{}\" stroke-width=\"3\"{dash}/>",
-                right - 16.0,
+                "<path d=\"M{start:.1} 14{path}\" stroke=\"{}\" stroke-width=\"{width}\"{style}/>",
                 series.colour
             );
             right -= 32.0;

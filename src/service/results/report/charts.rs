@@ -8,6 +8,7 @@ use crate::service::results::report::axis::Range;
 use crate::service::results::report::chart::{Chart, Mark, Scaling, Series};
 use crate::service::results::report::views::Views;
 use crate::slam::evaluation::TrajectoryEvaluation;
+use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::evaluation::statistics::percentile;
 use crate::slam::evaluation::windows::SCALE_WINDOW;
 use crate::slam::geometry::sim3::Sim3;
@@ -34,6 +35,7 @@ pub fn trajectory_views(input: &ReportInput<'_>) -> [Chart; 2] {
     let truth: Vec<StampedPose> = truth_in_time(input);
     let (alignment, unit) = match input.evaluation {
         Some(evaluation) => (evaluation.alignment, "m"),
+        None if input.record.depth_scale == DepthScale::Given => (Sim3::identity(), "m"),
         None => (Sim3::identity(), "map units"),
     };
     trajectory_charts(input.trajectory, &truth, &alignment, unit, &keyframe_poses(input.record))

@@ -5,19 +5,22 @@ pub mod chart;
 pub mod charts;
 pub mod evaluation_plot;
 pub mod html;
+pub mod map_picture;
 pub mod views;
 
 use std::fmt::Write;
 
 use crate::service::results::colour::Picture;
 use crate::service::results::pictures::{
-    RELATIVE_STD_DEV_RANGE, inverse_depth_picture, variance_picture,
+    RELATIVE_STD_DEV_RANGE, density_picture, inverse_depth_picture, variance_picture,
 };
+use crate::service::results::ply::CloudPoint;
 use crate::service::results::report::chart::Chart;
 use crate::service::results::report::charts::{
     error_over_time, scale_over_time, time_charts, trajectory_views,
 };
 use crate::service::results::report::html::{escaped, png_address};
+use crate::service::results::report::map_picture::map_picture;
 use crate::service::results::summary::Summary;
 use crate::service::results::{RunMode, RunRecord};
 use crate::slam::evaluation::TrajectoryEvaluation;
@@ -43,6 +46,8 @@ pub struct ReportInput<'a> {
     pub evaluation: Option<&'a TrajectoryEvaluation>,
     /// The published one against ground truth.
     pub online_evaluation: Option<&'a TrajectoryEvaluation>,
+    /// The map's points.
+    pub cloud: &'a [CloudPoint],
     /// Largest σ/d of points that are shown.
     pub max_relative_std_dev: f64,
 }
@@ -69,6 +74,7 @@ pub fn report(input: &ReportInput<'_>) -> String {
     );
     page.push_str(&cards(summary));
     page.push_str(&states(input.record));
+    page.push_str(&map(input));
     section(&mut page, "Trajectory", &trajectory_views(input));
     let errors: Vec<Chart> =
         error_over_time(input).into_iter().chain(scale_over_time(input)).collect();
@@ -78,6 +84,19 @@ pub fn report(input: &ReportInput<'_>) -> String {
     page.push_str(&figures(summary));
     page.push_str("</main></body></html>\n");
     page
+}
+
+/// The map from above; nothing without points.
+fn map(input: &ReportInput<'_>) -> String {
+    let picture = map_picture(input.cloud, input.trajectory);
+    let Some(png) = picture.and_then(|picture| picture.png()) else { return String::new() };
+    format!(
+        "<section><h2>Map</h2><figure><img alt=\"map from above\" src=\"{}\"><figcaption>{} points \
+         from above, <span class=\"scale near-far\"></span> low to high; the camera's way in \
+         white.</figcaption></figure></section>",
+        png_address(&png),
+        grouped(input.cloud.len() as u64)
+    )
 }
 
 /// Charts side by side under a heading; nothing where there are none.
@@ -104,6 +123,7 @@ fn cards(summary: &Summary) -> String {
     };
     let share = 100.0 * summary.frames_tracked as f64 / summary.frames_in.max(1) as f64;
     let losses = match summary.lost_count {
+        _ if summary.frames_tracked == 0 => "never initialised".to_owned(),
         0 => "never lost".to_owned(),
         1 => "lost once".to_owned(),
         n => format!("lost {n} times"),
@@ -243,17 +263,19 @@ fn depth_maps(input: &ReportInput<'_>) -> String {
         picture_figure(&mut html, &picture, keyframe, &depths);
     }
     let middle = spread(shown / 2);
-    html.push_str("</div>");
     let [low, high] = RELATIVE_STD_DEV_RANGE;
     let _ = write!(
         html,
-        "<p>Uncertainty of every point of one of them: standard deviation over inverse depth, \
-         <span class=\"scale sure-unsure\"></span> {:.1} % to {:.0} %, logarithmic.</p>\
-         <div class=\"pictures\">",
+        "</div><p>All points of one of them; their standard deviation over inverse depth, \
+         <span class=\"scale sure-unsure\"></span> {:.1} % to {:.0} % (logarithmic); the share of \
+         pixels that have depth, 0 to 100 % on the same scale.</p><div class=\"pictures wide\">",
         100.0 * low,
         100.0 * high
     );
+    let (all, _) = inverse_depth_picture(middle, f64::INFINITY);
+    picture_figure(&mut html, &all, middle, "inverse depth");
     picture_figure(&mut html, &variance_picture(middle), middle, "uncertainty");
+    picture_figure(&mut html, &density_picture(middle), middle, "density");
     html.push_str("</div></section>");
     html
 }
@@ -273,7 +295,7 @@ fn picture_figure(html: &mut String, picture: &Picture, keyframe: &Keyframe, not
 
 /// Every figure of the summary as a table.
 fn figures(summary: &Summary) -> String {
-    let mut html = String::from("<section><h2>Figures</h2><table><tbody>");
+    let mut html = String::from("<section><h2>Figures</h2><dl>");
     let value = serde_json::to_value(summary).unwrap_or_default();
     for (key, value) in value.as_object().into_iter().flatten() {
         let text = match value {
@@ -289,9 +311,9 @@ fn figures(summary: &Summary) -> String {
             }
             other => figure(other),
         };
-        let _ = write!(html, "<tr><th>{key}</th><td>{}</td></tr>", escaped(&text));
+        let _ = write!(html, "<div><dt>{key}</dt><dd>{}</dd></div>", escaped(&text));
     }
-    html.push_str("</tbody></table></section>");
+    html.push_str("</dl></section>");
     html
 }
 
