@@ -49,7 +49,8 @@ impl Progress {
             self.total.map_or(PLAIN_INTERVAL, |total| total.div_ceil(PLAIN_LINES)).max(1);
         if done.is_multiple_of(interval) || self.total == Some(done) {
             let of = self.total.map(|total| format!("/{total}")).unwrap_or_default();
-            eprintln!("{} {done}{of} {detail}", self.what);
+            let separator = if detail.is_empty() { "" } else { ", " };
+            eprintln!("{} {done}{of}{separator}{detail}", self.what);
         }
     }
 

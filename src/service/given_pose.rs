@@ -9,21 +9,32 @@ use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::pose::{Brightness, NO_KEYFRAME, PoseEstimate, Quality, TrackingState};
+use crate::slam::tracker::TrackerParams;
 use crate::slam::trajectory::StampedPose;
 
-/// Weight of the distance in the choice of a keyframe: a third of the mean depth makes one
-/// (Engel, Schöps, Cremers 2014, §3.2).
-const DISTANCE_WEIGHT: f64 = 3.0;
-
-/// Weight of the share of points out of view: a quarter makes one.
-const USAGE_WEIGHT: f64 = 4.0;
+/// The true poses with the camera of the first frame that has one as the world, as a map has it
+/// whose first keyframe is the identity; empty where no pose is near `first_nanos` or later.
+pub fn truth_in_first_camera(ground_truth: &[StampedPose], first_nanos: i64) -> Vec<StampedPose> {
+    let earliest = first_nanos.saturating_sub(MAX_DIFFERENCE_NANOS);
+    let later = ground_truth.partition_point(|pose| pose.nanos < earliest);
+    let first = nearest(ground_truth, first_nanos, MAX_DIFFERENCE_NANOS).unwrap_or(later);
+    let Some(world) = ground_truth.get(first) else { return Vec::new() };
+    let camera_from_world = world.world_from_camera.inverse();
+    let place = |pose: &StampedPose| StampedPose {
+        nanos: pose.nanos,
+        world_from_camera: camera_from_world * pose.world_from_camera,
+    };
+    ground_truth.iter().map(place).collect()
+}
 
 /// The true pose of `frame`, exact (covariance zero), relative to `keyframe`; `None` where no true
-/// pose is near enough in time. Whether a keyframe is due is judged from the geometry.
+/// pose is near enough in time. Whether a keyframe is due is judged from the geometry, with the
+/// tracker's weights.
 pub fn given_pose(
     frame: &FrameView<'_>,
     keyframe: Option<&Keyframe>,
     ground_truth: &[StampedPose],
+    tracker: &TrackerParams,
 ) -> Option<PoseEstimate> {
     let index = nearest(ground_truth, frame.capture_nanos, MAX_DIFFERENCE_NANOS)?;
     let world_from_camera = ground_truth[index].world_from_camera;
@@ -46,7 +57,7 @@ pub fn given_pose(
         estimate.revision = keyframe.revision;
         estimate.keyframe_id = keyframe.keyframe_id;
         estimate.keyframe_from_camera = keyframe.world_from_keyframe.locate(&world_from_camera);
-        let view = view_of(keyframe, &estimate.keyframe_from_camera);
+        let view = view_of(keyframe, &estimate.keyframe_from_camera, tracker);
         estimate.quality = view.quality;
         estimate.proposes_keyframe = view.proposes_keyframe;
     }
@@ -59,7 +70,9 @@ struct View {
     proposes_keyframe: bool,
 }
 
-fn view_of(keyframe: &Keyframe, keyframe_from_camera: &SE3) -> View {
+/// The choice of a keyframe: `(w_d ‖t‖ d̄)² + (w_u (1 − usage))² > 1` (Engel, Schöps, Cremers 2014,
+/// §3.2, with the share of points out of view).
+fn view_of(keyframe: &Keyframe, keyframe_from_camera: &SE3, tracker: &TrackerParams) -> View {
     let k = keyframe.intrinsics;
     let camera_from_keyframe = keyframe_from_camera.inverse();
     let rotation = camera_from_keyframe.rotation_matrix();
@@ -83,8 +96,9 @@ fn view_of(keyframe: &Keyframe, keyframe_from_camera: &SE3) -> View {
     let points = keyframe.points.len().max(1) as f64;
     let in_view_ratio = f64::from(in_view) / points;
     let distance =
-        DISTANCE_WEIGHT * keyframe_from_camera.translation.norm() * inverse_depths / points;
-    let unused = USAGE_WEIGHT * (1.0 - in_view_ratio);
+        tracker.keyframe_distance_weight * keyframe_from_camera.translation.norm() * inverse_depths
+            / points;
+    let unused = tracker.keyframe_usage_weight * (1.0 - in_view_ratio);
     View {
         quality: Quality {
             in_view_ratio,
@@ -95,5 +109,85 @@ fn view_of(keyframe: &Keyframe, keyframe_from_camera: &SE3) -> View {
             ..Quality::default()
         },
         proposes_keyframe: distance.powi(2) + unused.powi(2) > 1.0,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::geometry::intrinsics::Intrinsics;
+    use crate::slam::geometry::sim3::Sim3;
+    use crate::slam::keyframe::{DepthPoint, MapState};
+
+    fn at(nanos: i64, x: f64) -> StampedPose {
+        let mut world_from_camera = SE3::identity();
+        world_from_camera.translation.x = x;
+        StampedPose { nanos, world_from_camera }
+    }
+
+    /// A wall of points at 2 keyframe units; a keyframe unit is 2 m.
+    fn keyframe() -> Keyframe {
+        let points = (0..100).map(|i| DepthPoint {
+            u: i % 10 * 10,
+            v: i / 10 * 10,
+            inverse_depth: 0.5,
+            variance: 0.01,
+            intensity: 0.0,
+        });
+        Keyframe {
+            keyframe_id: 4,
+            epoch: 0,
+            revision: 9,
+            sequence: 0,
+            capture_nanos: 0,
+            map_state: MapState::Established,
+            world_from_keyframe: Sim3::new(SE3::identity(), 2.0),
+            intrinsics: Intrinsics {
+                fx: 100.0,
+                fy: 100.0,
+                cx: 49.5,
+                cy: 49.5,
+                width: 100,
+                height: 100,
+            },
+            image: vec![0; 10_000],
+            points: points.collect(),
+        }
+    }
+
+    #[test]
+    fn a_given_pose_is_relative_to_the_keyframe_and_proposes_the_next() {
+        let truth = [at(0, 0.0), at(1_000_000_000, 0.04), at(2_000_000_000, 2.0)];
+        let frame = |nanos| FrameView {
+            sequence: 1,
+            capture_nanos: nanos,
+            exposure_nanos: 0,
+            width: 100,
+            height: 100,
+            pixels: &[],
+        };
+        let give =
+            |nanos| given_pose(&frame(nanos), Some(&keyframe()), &truth, &TrackerParams::default());
+        let near = give(1_010_000_000).unwrap();
+        assert!((near.keyframe_from_camera.translation.x - 0.02).abs() < 1e-12);
+        assert_eq!((near.keyframe_id, near.revision), (4, 9));
+        // 0.02 units at 100 px / 2 units: one pixel to the left; the first column goes out of view.
+        assert!((near.quality.mean_squared_flow - 1.0).abs() < 1e-9);
+        assert!((near.quality.in_view_ratio - 0.9).abs() < 1e-9);
+        assert!(!near.proposes_keyframe);
+        assert!(give(2_000_000_000).unwrap().proposes_keyframe);
+        assert!(give(500_000_000).is_none(), "no true pose is near");
+    }
+
+    #[test]
+    fn the_first_camera_that_has_a_pose_is_the_world() {
+        let truth = [at(0, 1.0), at(50_000_000, 4.0), at(90_000_000, 6.0)];
+        let moved = truth_in_first_camera(&truth, 60_000_000);
+        assert_eq!(moved[1].world_from_camera.translation.x, 0.0);
+        assert_eq!(moved[2].world_from_camera.translation.x, 2.0);
+        assert!(truth_in_first_camera(&truth, 500_000_000).is_empty());
+        assert!(truth_in_first_camera(&[], 0).is_empty());
+        let earlier = truth_in_first_camera(&truth, -500_000_000);
+        assert_eq!(earlier[0].world_from_camera.translation.x, 0.0);
     }
 }

@@ -7,7 +7,7 @@
 use std::time::Instant;
 
 use crate::capture::source::{FrameSource, FrameStamp, SourceError};
-use crate::service::given_pose::given_pose;
+use crate::service::given_pose::{given_pose, truth_in_first_camera};
 use crate::service::results::{RecordedPose, RunMode, RunRecord};
 use crate::slam::alignment::reference::Reference;
 use crate::slam::evaluation::depth_error::DepthScale;
@@ -124,6 +124,10 @@ struct Replay<'a> {
     num_pixels: usize,
     tracker: Tracker,
     mapper: Mapper,
+    /// Poses to be given, the first camera's frame as the world; made at the first frame.
+    given_poses: Vec<StampedPose>,
+    /// Memory of the reference that the tracker gave back.
+    spare: Option<Box<Reference>>,
     record: RunRecord,
     stamps: Option<(FrameStamp, FrameStamp)>,
 }
@@ -150,6 +154,8 @@ impl<'a> Replay<'a> {
             num_pixels: intrinsics.width * intrinsics.height,
             tracker: Tracker::new(intrinsics, config.tracker.clone())?,
             mapper: Mapper::new(intrinsics, config.mapper.clone())?,
+            given_poses: Vec::new(),
+            spare: None,
             record: empty_record(source_name, ground_truth, given),
             stamps: None,
         })
@@ -189,7 +195,12 @@ impl<'a> Replay<'a> {
             && self.config.poses == PoseOrigin::Tracker
             && let Some(keyframe) = self.mapper.keyframe()
         {
-            self.tracker.adopt(Box::new(Reference::prepare(keyframe)));
+            let mut reference = self
+                .spare
+                .take()
+                .unwrap_or_else(|| Box::new(Reference::new(self.config.tracker.reference.clone())));
+            reference.prepare_into(keyframe);
+            self.spare = self.tracker.adopt(reference);
         }
         Ok((pose.state, outcome))
     }
@@ -203,7 +214,12 @@ impl<'a> Replay<'a> {
                 (estimate, Some(elapsed_nanos(begin)))
             }
             PoseOrigin::GroundTruth => {
-                let estimate = given_pose(frame, self.mapper.keyframe(), &self.record.ground_truth);
+                let estimate = given_pose(
+                    frame,
+                    self.mapper.keyframe(),
+                    &self.given_poses,
+                    &self.config.tracker,
+                );
                 (estimate?, None)
             }
         };
@@ -213,6 +229,10 @@ impl<'a> Replay<'a> {
 
     fn count(&mut self, stamp: &FrameStamp) {
         self.record.frames_in += 1;
+        if self.stamps.is_none() && self.config.poses == PoseOrigin::GroundTruth {
+            let truth = &self.record.ground_truth;
+            self.given_poses = truth_in_first_camera(truth, stamp.capture_nanos);
+        }
         let (first, last) = self.stamps.unwrap_or((*stamp, *stamp));
         let expected = last.sequence.saturating_add(1);
         self.record.gaps += u64::from(self.stamps.is_some() && stamp.sequence > expected);

@@ -3,10 +3,15 @@
 //! `run` and `replay` end in [`write_results`] with a [`RunRecord`], so that their files mean the
 //! same and can be compared byte by byte.
 
+pub mod colour;
+pub mod debug_pictures;
 pub mod depth_maps;
+pub mod pictures;
 pub mod ply;
 pub mod poses;
+pub mod report;
 pub mod summary;
+pub mod summary_text;
 
 use std::fs;
 use std::io::{self, Write};
@@ -16,6 +21,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::capture::source::{FrameSource, SourceError};
 use crate::service::atomic_file::write_atomically;
+use crate::service::results::report::{ReportInput, report};
 use crate::service::results::summary::Summary;
 use crate::service::trajectory_file::write_trajectory;
 use crate::slam::evaluation::depth_error::DepthScale;
@@ -150,7 +156,9 @@ pub fn write_results(
     let trajectory = poses::final_trajectory(record);
     let online = poses::online_trajectory(record);
     let evaluate = |estimate: &[StampedPose]| {
-        let truth = &record.ground_truth;
+        // Poses that were given have no error.
+        let given = record.depth_scale == DepthScale::Given;
+        let truth = if given { &[][..] } else { &record.ground_truth };
         evaluate_trajectory(estimate, truth, params.alignment, MAX_DIFFERENCE_NANOS).ok()
     };
     let (evaluation, online_evaluation) = (evaluate(&trajectory), evaluate(&online));
@@ -178,5 +186,16 @@ pub fn write_results(
             writeln!(file)
         })
     })?;
+    let page = report(&ReportInput {
+        record,
+        summary: &summary,
+        trajectory: &trajectory,
+        online: &online,
+        evaluation: evaluation.as_ref(),
+        online_evaluation: online_evaluation.as_ref(),
+        cloud: &cloud,
+        max_relative_std_dev: params.max_relative_std_dev,
+    });
+    write("report.html", &|path| write_atomically(path, |file| file.write_all(page.as_bytes())))?;
     Ok(summary)
 }

@@ -1,0 +1,128 @@
+//! `semidense evaluate`: a trajectory against ground truth.
+
+use std::error::Error;
+use std::io::Write as _;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use clap::{Args, ValueEnum};
+
+use crate::service::atomic_file::write_atomically;
+use crate::service::results::report::evaluation_plot::evaluation_plot;
+use crate::service::results::summary::TrajectorySummary;
+use crate::service::trajectory_file::read_trajectory;
+use crate::slam::evaluation::statistics::ErrorStatistics;
+use crate::slam::evaluation::umeyama::Alignment;
+use crate::slam::evaluation::{TrajectoryEvaluation, evaluate_trajectory};
+
+/// What is fitted before positions are compared.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Align {
+    /// Rotation, translation and scale
+    Sim3,
+    /// Rotation and translation
+    Se3,
+    /// Nothing
+    None,
+}
+
+/// Compare a trajectory with ground truth: absolute and relative errors, scale
+///
+/// Files are in TUM layout (timestamp tx ty tz qx qy qz qw) or EuRoC ground truth (CSV, whose poses
+/// are the body's). Each pose of the shorter trajectory is compared with the one nearest in time of
+/// the longer; figures are those of the Python package evo.
+#[derive(Debug, Args)]
+pub struct EvaluateArgs {
+    /// Estimated trajectory
+    #[arg(value_name = "EST")]
+    estimate: PathBuf,
+    /// True trajectory
+    #[arg(value_name = "GT")]
+    truth: PathBuf,
+    /// What is fitted before positions are compared
+    #[arg(long, value_enum, default_value = "sim3")]
+    align: Align,
+    /// Largest difference of stamps taken for the same instant, seconds
+    #[arg(long, value_name = "SECS", default_value_t = 0.02, value_parser = parse_difference)]
+    max_difference: f64,
+    /// Print the figures as JSON, with the keys of summary.json
+    #[arg(long)]
+    json: bool,
+    /// Write a plot of both trajectories and of the error
+    #[arg(long, value_name = "FILE.svg")]
+    plot: Option<PathBuf>,
+}
+
+/// A difference of stamps: an hour is longer than any clock error worth bridging.
+fn parse_difference(text: &str) -> Result<f64, String> {
+    const LONGEST_SECS: f64 = 3600.0;
+    let secs: f64 = text.parse().map_err(|_| "expected seconds, such as 0.02".to_owned())?;
+    let allowed = (0.0..=LONGEST_SECS).contains(&secs);
+    allowed.then_some(secs).ok_or_else(|| format!("allowed is 0 to {LONGEST_SECS} s"))
+}
+
+/// Reads both files, compares them and prints the figures.
+pub fn run(args: &EvaluateArgs) -> Result<ExitCode, Box<dyn Error>> {
+    let estimate = read_trajectory(&args.estimate)?;
+    let truth = read_trajectory(&args.truth)?;
+    let alignment = match args.align {
+        Align::Sim3 => Alignment::Sim3,
+        Align::Se3 => Alignment::SE3,
+        Align::None => Alignment::None,
+    };
+    let max_difference_nanos = (args.max_difference * 1e9).round() as i64;
+    let evaluation = evaluate_trajectory(&estimate, &truth, alignment, max_difference_nanos)
+        .map_err(|error| {
+            format!("{} against {}: {error}", args.estimate.display(), args.truth.display())
+        })?;
+    if let Some(path) = &args.plot {
+        let svg = evaluation_plot(&estimate, &truth, &evaluation);
+        write_atomically(path, |file| file.write_all(svg.as_bytes()))
+            .map_err(|error| format!("cannot write {}: {error}", path.display()))?;
+    }
+    let text = if args.json {
+        serde_json::to_string_pretty(&TrajectorySummary::from(&evaluation))?
+    } else {
+        evaluation_text(&evaluation, estimate.len(), alignment)
+    };
+    writeln!(std::io::stdout(), "{text}")?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// The figures as a table.
+fn evaluation_text(
+    evaluation: &TrajectoryEvaluation,
+    estimated: usize,
+    alignment: Alignment,
+) -> String {
+    let fitted = match alignment {
+        Alignment::Sim3 => format!("sim3, scale {:.6}", evaluation.alignment.scale),
+        Alignment::SE3 => "se3".to_owned(),
+        Alignment::None => "none".to_owned(),
+    };
+    let mut lines = vec![
+        format!("{} of {estimated} poses matched", evaluation.association.pairs.len()),
+        format!("alignment {fitted}; path {:.3} m", evaluation.path_length),
+        format!("{:<26} {:>12} {:>12} {:>12} {:>12}", "", "rmse", "mean", "median", "max"),
+    ];
+    let mut row = |name: &str, statistics: Option<ErrorStatistics>| {
+        if let Some(s) = statistics {
+            lines.push(format!(
+                "{name:<26} {:>12.6} {:>12.6} {:>12.6} {:>12.6}",
+                s.rmse, s.mean, s.median, s.max
+            ));
+        }
+    };
+    row("ATE [m]", Some(evaluation.ate));
+    row("RPE, one frame [m]", Some(evaluation.rpe_translation));
+    row("RPE, one frame [deg]", Some(evaluation.rpe_rotation_deg));
+    row("RPE, 1 s [m]", evaluation.rpe_translation_1s);
+    row("RPE, 1 s [deg]", evaluation.rpe_rotation_deg_1s);
+    if let Some(error) = evaluation.window_error {
+        lines.push(format!("windows of 30 frames: median error {error:.6} m"));
+    }
+    if let Some(ratio) = evaluation.window_scale_ratio {
+        lines.push(format!("windows of 100 frames: largest / smallest scale {ratio:.4}"));
+    }
+    lines.join("\n")
+}

@@ -1,0 +1,150 @@
+//! `semidense replay`: a sequence through tracker and mapper in one process, deterministic.
+
+use std::error::Error;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use clap::{Args, ValueEnum};
+
+use crate::capture::simulator::params::SimulatorParams;
+use crate::capture::source::{FrameSource, SourceName, open};
+use crate::command::progress::Progress;
+use crate::service::replay::{DepthOrigin, PoseOrigin, ReplayConfig, ReplayProgress, replay};
+use crate::service::results::debug_pictures::write_debug_pictures;
+use crate::service::results::summary_text::summary_text;
+use crate::service::results::{ResultsParams, RunRecord, prepare_output, write_results};
+use crate::slam::pose::TrackingState;
+
+/// Exit code of a run that Ctrl-C ended, as shells have it (128 + SIGINT).
+const INTERRUPTED: u8 = 130;
+
+/// Where poses come from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
+enum Poses {
+    /// The tracker estimates them
+    #[default]
+    Tracker,
+    /// The source's ground truth; only the mapper is at work
+    Groundtruth,
+}
+
+/// Where the first depth of a keyframe comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
+enum InitialDepth {
+    /// Images alone
+    #[default]
+    Images,
+    /// The source's depth camera
+    Sensor,
+}
+
+/// Run a recorded or simulated sequence in one process: every frame, the same bits on every run
+#[derive(Debug, Args)]
+pub struct ReplayArgs {
+    /// sim[:SCENE], tum:DIR, euroc:DIR or images:DIR
+    source: SourceName,
+    /// Camera file; needed where the folder has no camera.txt
+    #[arg(long, value_name = "FILE")]
+    rig: Option<PathBuf>,
+    /// Folder for trajectory.txt, keyframes.txt, map.ply, summary.json and report.html
+    #[arg(long, value_name = "DIR", default_value = "output")]
+    output: PathBuf,
+    /// Where the first depth of a keyframe comes from
+    #[arg(long, value_enum, default_value_t)]
+    initial_depth: InitialDepth,
+    /// Where poses come from
+    #[arg(long, value_enum, default_value_t)]
+    poses: Poses,
+    /// Write pictures of every keyframe's inverse depth, variance and density into DIR/debug
+    #[arg(long)]
+    debug_images: bool,
+    /// Stop after as many frames
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    frames: Option<u32>,
+    /// Seed of the simulator
+    #[arg(long, value_name = "N", default_value_t = SimulatorParams::default().seed)]
+    seed: u64,
+    /// Threads of the mapper; the result does not depend on it [default: one for each CPU]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
+    threads: Option<u16>,
+    /// Print the summary as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Replays, writes the results and prints the summary.
+pub fn run(args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error>> {
+    prepare_output(&args.output)?;
+    let mut simulator = SimulatorParams { seed: args.seed, ..SimulatorParams::default() };
+    simulator.frames = args.frames.map_or(simulator.frames, |n| simulator.frames.min(n as usize));
+    let mut source = open(&args.source, args.rig.as_deref(), &simulator)?;
+    let interrupted = Arc::new(AtomicBool::new(false));
+    signal_hook::flag::register(signal_hook::consts::SIGINT, Arc::clone(&interrupted))?;
+    let threads = args.threads.map_or(0, usize::from);
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(threads)
+        .thread_name(|i| format!("mapper-{i}"))
+        .build()?;
+    let record = pool.install(|| {
+        record(args, source.as_mut(), &interrupted).map_err(|error| error.to_string())
+    })?;
+    let summary = write_results(&args.output, &record, source.as_mut(), &ResultsParams::default())?;
+    if args.debug_images {
+        write_debug_pictures(&args.output.join("debug"), &record.map)?;
+    }
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&summary)?);
+    } else {
+        print!("{}", summary_text(&summary));
+        println!("results in {}", args.output.display());
+    }
+    let code = if interrupted.load(Ordering::Relaxed) { INTERRUPTED } else { 0 };
+    Ok(ExitCode::from(code))
+}
+
+/// Prepares the source and replays it under a progress bar.
+fn record(
+    args: &ReplayArgs,
+    source: &mut dyn FrameSource,
+    interrupted: &AtomicBool,
+) -> Result<RunRecord, Box<dyn Error>> {
+    let goes_on = || !interrupted.load(Ordering::Relaxed);
+    let mut preparing: Option<Progress> = None;
+    source.prepare(&mut |done, total| {
+        let progress = preparing.get_or_insert_with(|| Progress::new("preparing", Some(total)));
+        progress.update(done, "");
+        goes_on()
+    })?;
+    preparing.iter().for_each(Progress::finish);
+    let config = ReplayConfig {
+        poses: match args.poses {
+            Poses::Tracker => PoseOrigin::Tracker,
+            Poses::Groundtruth => PoseOrigin::GroundTruth,
+        },
+        initial_depth: match args.initial_depth {
+            InitialDepth::Images => DepthOrigin::Images,
+            InitialDepth::Sensor => DepthOrigin::Sensor,
+        },
+        max_frames: args.frames.map(|frames| frames as usize),
+        ..ReplayConfig::default()
+    };
+    let total = source.num_frames().map(|n| n.min(config.max_frames.unwrap_or(n)));
+    let progress = Progress::new("replay", total);
+    let record = replay(source, &args.source.to_string(), &config, &mut |frame| {
+        progress.update(frame.done, state_word(frame));
+        goes_on()
+    });
+    progress.finish();
+    Ok(record?)
+}
+
+fn state_word(frame: &ReplayProgress) -> &'static str {
+    match frame.state {
+        TrackingState::Initializing => "initializing",
+        TrackingState::Tracking => "tracking",
+        TrackingState::Degraded(_) => "degraded",
+        TrackingState::Lost(_) => "lost",
+    }
+}

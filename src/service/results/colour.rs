@@ -1,0 +1,107 @@
+//! Colour scales and PNG: how numbers become pictures.
+
+/// Red, green, blue.
+pub type Rgb = [u8; 3];
+
+/// Stops of the scale for inverse depth, far to near: from dark blue over green to dark red, as
+/// distances are shown in robotics.
+const RAINBOW: [Rgb; 9] = [
+    [48, 18, 59],
+    [70, 107, 227],
+    [40, 188, 235],
+    [50, 242, 152],
+    [164, 252, 60],
+    [238, 207, 58],
+    [251, 126, 33],
+    [210, 49, 5],
+    [122, 4, 3],
+];
+
+/// Stops of the scale for uncertainty and density, little to much: growing lightness, and none so
+/// dark that it is lost on a darkened image.
+const HEAT: [Rgb; 6] = [
+    [60, 90, 220],
+    [120, 90, 225],
+    [195, 85, 195],
+    [240, 100, 110],
+    [255, 170, 60],
+    [255, 245, 150],
+];
+
+/// Colour of `share` (0 to 1, clamped; NaN counts as 0) on the scale for inverse depth.
+pub fn rainbow(share: f64) -> Rgb {
+    between(&RAINBOW, share)
+}
+
+/// Colour of `share` on the scale for uncertainty and density.
+pub fn heat(share: f64) -> Rgb {
+    between(&HEAT, share)
+}
+
+fn between(stops: &[Rgb], share: f64) -> Rgb {
+    let last = stops.len() - 1;
+    let place = share.clamp(0.0, 1.0) * last as f64;
+    // The cast takes NaN to 0.
+    let lower = (place as usize).min(last - 1);
+    let fraction = place - lower as f64;
+    std::array::from_fn(|channel| {
+        let (from, to) = (f64::from(stops[lower][channel]), f64::from(stops[lower + 1][channel]));
+        (from + (to - from) * fraction).round() as u8
+    })
+}
+
+/// An RGB picture.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Picture {
+    /// Width in pixels.
+    pub width: usize,
+    /// Height in pixels.
+    pub height: usize,
+    /// Row by row.
+    pub pixels: Vec<Rgb>,
+}
+
+impl Picture {
+    /// The picture as the bytes of a PNG file; `None` where its size and pixels disagree.
+    pub fn png(&self) -> Option<Vec<u8>> {
+        let mut bytes = Vec::new();
+        let (width, height) = (u32::try_from(self.width).ok()?, u32::try_from(self.height).ok()?);
+        let mut encoder = png::Encoder::new(&mut bytes, width, height);
+        encoder.set_color(png::ColorType::Rgb);
+        encoder.set_depth(png::BitDepth::Eight);
+        let mut writer = encoder.write_header().ok()?;
+        writer.write_image_data(self.pixels.as_flattened()).ok()?;
+        writer.finish().ok()?;
+        Some(bytes)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn scales_meet_their_ends_and_survive_any_number() {
+        assert_eq!(rainbow(0.0), RAINBOW[0]);
+        assert_eq!(rainbow(1.0), RAINBOW[8]);
+        assert_eq!(rainbow(0.125), RAINBOW[1]);
+        assert_eq!(heat(f64::INFINITY), HEAT[5]);
+        assert_eq!(heat(-3.0), HEAT[0]);
+        let _ = heat(f64::NAN);
+    }
+
+    #[test]
+    fn a_picture_comes_back_from_its_png() {
+        let picture = Picture {
+            width: 3,
+            height: 2,
+            pixels: (0..6u8).map(|i| [i, 2 * i, 255 - i]).collect(),
+        };
+        let bytes = picture.png().unwrap();
+        let mut reader = png::Decoder::new(std::io::Cursor::new(bytes)).read_info().unwrap();
+        let mut pixels = vec![0; 18];
+        reader.next_frame(&mut pixels).unwrap();
+        assert_eq!(pixels, picture.pixels.as_flattened());
+        assert_eq!(Picture { width: 4, ..picture }.png(), None);
+    }
+}

@@ -1,0 +1,91 @@
+//! Pictures of a keyframe's depth map: inverse depth, variance, density.
+
+use crate::service::results::colour::{Picture, Rgb, heat, rainbow};
+use crate::slam::evaluation::statistics::percentile;
+use crate::slam::keyframe::{DepthPoint, Keyframe};
+
+/// Brightness of the image under a depth map: dark enough that colours stand out.
+const BACKGROUND_GAIN: f64 = 0.45;
+
+/// Share of the points at either end of the scale that it does not stretch to: outliers.
+const CLIPPED_SHARE: f64 = 0.02;
+
+/// σ/d at the lower and upper end of the variance scale, which is logarithmic.
+pub const RELATIVE_STD_DEV_RANGE: [f64; 2] = [0.003, 0.3];
+
+/// Side of the blocks whose density is shown, pixels.
+const DENSITY_BLOCK: usize = 16;
+
+/// Inverse depth in colour (red near, blue far) over the darkened image, with what the ends of the
+/// scale mean. Points with σ/d above `max_relative_std_dev` are left out.
+pub fn inverse_depth_picture(
+    keyframe: &Keyframe,
+    max_relative_std_dev: f64,
+) -> (Picture, Option<[f64; 2]>) {
+    let shown = |p: &&DepthPoint| {
+        let ratio = relative_std_dev(p);
+        p.inverse_depth > 0.0 && ratio <= max_relative_std_dev
+    };
+    let points: Vec<&DepthPoint> = keyframe.points.iter().filter(shown).collect();
+    let mut sorted: Vec<f64> = points.iter().map(|p| f64::from(p.inverse_depth)).collect();
+    sorted.sort_by(f64::total_cmp);
+    let mut picture = background(keyframe);
+    let range = percentile(&sorted, CLIPPED_SHARE).zip(percentile(&sorted, 1.0 - CLIPPED_SHARE));
+    let Some((far, near)) = range else { return (picture, None) };
+    let width = (near - far).max(f64::MIN_POSITIVE);
+    for point in points {
+        let share = (f64::from(point.inverse_depth) - far) / width;
+        paint(&mut picture, point, rainbow(share));
+    }
+    (picture, Some([far, near]))
+}
+
+/// σ/d of every point in colour (bright: uncertain), logarithmic over [`RELATIVE_STD_DEV_RANGE`].
+pub fn variance_picture(keyframe: &Keyframe) -> Picture {
+    let mut picture = background(keyframe);
+    let [low, high] = RELATIVE_STD_DEV_RANGE;
+    for point in keyframe.points.iter().filter(|p| p.inverse_depth > 0.0) {
+        let share = (relative_std_dev(point) / low).ln() / (high / low).ln();
+        paint(&mut picture, point, heat(share));
+    }
+    picture
+}
+
+/// Share of pixels with depth by block.
+pub fn density_picture(keyframe: &Keyframe) -> Picture {
+    let (width, height) = (keyframe.intrinsics.width, keyframe.intrinsics.height);
+    let columns = width.div_ceil(DENSITY_BLOCK);
+    let mut counts = vec![0u32; columns * height.div_ceil(DENSITY_BLOCK)];
+    for point in &keyframe.points {
+        let (u, v) = (usize::from(point.u), usize::from(point.v));
+        if u < width && v < height {
+            counts[v / DENSITY_BLOCK * columns + u / DENSITY_BLOCK] += 1;
+        }
+    }
+    let full = (DENSITY_BLOCK * DENSITY_BLOCK) as f64;
+    let colour = |i: usize| {
+        let (u, v) = (i % width, i / width);
+        heat(f64::from(counts[v / DENSITY_BLOCK * columns + u / DENSITY_BLOCK]) / full)
+    };
+    Picture { width, height, pixels: (0..width * height).map(colour).collect() }
+}
+
+fn relative_std_dev(point: &DepthPoint) -> f64 {
+    f64::from(point.variance).sqrt() / f64::from(point.inverse_depth)
+}
+
+/// The keyframe's image, darkened; black where it has none.
+fn background(keyframe: &Keyframe) -> Picture {
+    let (width, height) = (keyframe.intrinsics.width, keyframe.intrinsics.height);
+    let dark = |grey: &u8| [(f64::from(*grey) * BACKGROUND_GAIN) as u8; 3];
+    let mut pixels: Vec<Rgb> = keyframe.image.iter().map(dark).collect();
+    pixels.resize(width * height, [0; 3]);
+    Picture { width, height, pixels }
+}
+
+fn paint(picture: &mut Picture, point: &DepthPoint, colour: Rgb) {
+    let (u, v) = (usize::from(point.u), usize::from(point.v));
+    if u < picture.width && v < picture.height {
+        picture.pixels[v * picture.width + u] = colour;
+    }
+}

@@ -1,0 +1,352 @@
+//! Charts as inline SVG: lines, paths, dots, bars and bands over two axes.
+
+use std::fmt::Write;
+
+use crate::service::results::report::axis::Range;
+use crate::service::results::report::html::escaped;
+
+/// Width of every chart's coordinate system; the page scales it.
+pub const CHART_WIDTH: f64 = 640.0;
+
+/// Space left of, above, right of and below the plot.
+const MARGIN: [f64; 4] = [58.0, 34.0, 14.0, 42.0];
+
+/// Most points that a path keeps.
+const MAX_PATH_POINTS: usize = 3000;
+
+/// How the points of a series are drawn.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Mark {
+    /// A line over x in ascending order; its extremes survive when it is thinned. NaN breaks it.
+    Line,
+    /// A line in any direction.
+    Path,
+    /// A broken line in any direction.
+    DashedPath,
+    /// Dots of this radius.
+    Dots(f64),
+    /// Bars from zero, of this width in x.
+    Bars(f64),
+    /// A vertical line through all of the plot at each x.
+    Rule,
+}
+
+/// Points drawn in one way.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Series {
+    /// Name in the legend; an empty one has no entry.
+    pub name: &'static str,
+    /// CSS colour.
+    pub colour: &'static str,
+    /// How the points are drawn.
+    pub mark: Mark,
+    /// x and y.
+    pub points: Vec<[f64; 2]>,
+}
+
+/// How the axes are scaled.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Scaling {
+    /// Each by itself.
+    Free,
+    /// Each by itself, y from zero.
+    FromZero,
+    /// A length is as long along x as along y.
+    Equal,
+}
+
+/// A chart.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Chart {
+    /// What it shows.
+    pub title: &'static str,
+    /// Label of the x axis.
+    pub x_label: String,
+    /// Label of the y axis.
+    pub y_label: String,
+    /// Height of the coordinate system.
+    pub height: f64,
+    /// How the axes are scaled.
+    pub scaling: Scaling,
+    /// What is drawn, the first at the bottom.
+    pub series: Vec<Series>,
+}
+
+/// Where the axes' values lie in the picture.
+struct Frame {
+    x: Range,
+    y: Range,
+    width: f64,
+    height: f64,
+}
+
+impl Frame {
+    fn place(&self, [x, y]: [f64; 2]) -> [f64; 2] {
+        [
+            MARGIN[0] + (x - self.x.low) / self.x.width() * self.width,
+            MARGIN[1] + (self.y.high - y) / self.y.width() * self.height,
+        ]
+    }
+}
+
+impl Chart {
+    /// The chart as an `<svg>` element. Its text takes the page's colour.
+    pub fn svg(&self) -> String {
+        let frame = self.frame();
+        let mut svg = format!(
+            "<svg class=\"chart\" xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {CHART_WIDTH} {}\" \
+             font-family=\"system-ui, sans-serif\" font-size=\"12\" fill=\"currentColor\" role=\"img\">\
+             <title>{}</title>",
+            self.height, self.title
+        );
+        draw_text(
+            &mut svg,
+            MARGIN[0],
+            18.0,
+            "start",
+            "font-weight=\"600\" font-size=\"13\"",
+            self.title,
+        );
+        self.draw_legend(&mut svg);
+        self.draw_axes(&mut svg, &frame);
+        for series in &self.series {
+            draw_series(&mut svg, &frame, series);
+        }
+        if self.series.iter().all(|series| series.points.is_empty()) {
+            let (x, y) = (MARGIN[0] + 0.5 * frame.width, MARGIN[1] + 0.5 * frame.height);
+            draw_text(&mut svg, x, y, "middle", "opacity=\"0.6\"", "nothing to show");
+        }
+        svg.push_str("</svg>");
+        svg
+    }
+
+    fn frame(&self) -> Frame {
+        let width = CHART_WIDTH - MARGIN[0] - MARGIN[2];
+        let height = self.height - MARGIN[1] - MARGIN[3];
+        let points = || self.series.iter().flat_map(|series| &series.points);
+        let rules_excluded = || {
+            let drawn = self.series.iter().filter(|series| series.mark != Mark::Rule);
+            drawn.flat_map(|series| &series.points)
+        };
+        let mut x = Range::around(points().map(|p| p[0]));
+        let mut y = Range::around(rules_excluded().map(|p| p[1]));
+        match self.scaling {
+            Scaling::Free => {}
+            Scaling::FromZero => y = y.from_zero(),
+            Scaling::Equal => {
+                let unit = (x.width() / width).max(y.width() / height);
+                x = x.widened_to(unit * width);
+                y = y.widened_to(unit * height);
+            }
+        }
+        Frame { x, y, width, height }
+    }
+
+    /// Names with a stroke of their colour, from the right end of the title's line.
+    fn draw_legend(&self, svg: &mut String) {
+        const LETTER: f64 = 6.6;
+        let mut right = CHART_WIDTH - MARGIN[2];
+        for series in self.series.iter().rev().filter(|series| !series.name.is_empty()) {
+            draw_text(svg, right, 18.0, "end", "opacity=\"0.8\"", series.name);
+            right -= LETTER * series.name.chars().count() as f64 + 8.0;
+            let (path, width, style) = match series.mark {
+                Mark::Dots(_) => ("h0", 7, " stroke-linecap=\"round\""),
+                Mark::DashedPath | Mark::Rule => ("h16", 3, DASH),
+                _ => ("h16", 3, ""),
+            };
+            let start = if path == "h0" { right - 5.0 } else { right - 16.0 };
+            let _ = write!(
+                svg,
+                "<path d=\"M{start:.1} 14{path}\" stroke=\"{}\" stroke-width=\"{width}\"{style}/>",
+                series.colour
+            );
+            right -= 32.0;
+        }
+    }
+
+    fn draw_axes(&self, svg: &mut String, frame: &Frame) {
+        let (left, top) = (MARGIN[0], MARGIN[1]);
+        let (right, bottom) = (left + frame.width, top + frame.height);
+        let mut grid = String::new();
+        for (value, text) in frame.x.ticks() {
+            let [x, _] = frame.place([value, frame.y.low]);
+            let _ = write!(grid, "M{x:.1} {top:.1}V{bottom:.1}");
+            draw_text(svg, x, bottom + 16.0, "middle", "opacity=\"0.75\"", &text);
+        }
+        for (value, text) in frame.y.ticks() {
+            let [_, y] = frame.place([frame.x.low, value]);
+            let _ = write!(grid, "M{left:.1} {y:.1}H{right:.1}");
+            draw_text(svg, left - 7.0, y + 4.0, "end", "opacity=\"0.75\"", &text);
+        }
+        let _ = write!(svg, "<path d=\"{grid}\" stroke=\"currentColor\" opacity=\"0.12\"/>");
+        let _ = write!(
+            svg,
+            "<path d=\"M{left:.1} {top:.1}V{bottom:.1}H{right:.1}\" fill=\"none\" \
+             stroke=\"currentColor\" opacity=\"0.45\"/>"
+        );
+        let middle = left + 0.5 * frame.width;
+        draw_text(svg, middle, self.height - 6.0, "middle", "opacity=\"0.75\"", &self.x_label);
+        let y = top + 0.5 * frame.height;
+        let turned = format!("opacity=\"0.75\" transform=\"rotate(-90 13 {y:.1})\"");
+        draw_text(svg, 13.0, y, "middle", &turned, &self.y_label);
+    }
+}
+
+const DASH: &str = " stroke-dasharray=\"6 4\"";
+
+fn draw_text(svg: &mut String, x: f64, y: f64, anchor: &str, attributes: &str, text: &str) {
+    let _ = write!(
+        svg,
+        "<text x=\"{x:.1}\" y=\"{y:.1}\" text-anchor=\"{anchor}\" {attributes}>{}</text>",
+        escaped(text)
+    );
+}
+
+fn draw_series(svg: &mut String, frame: &Frame, series: &Series) {
+    let colour = series.colour;
+    let finite = |p: &&[f64; 2]| p.iter().all(|c| c.is_finite());
+    match series.mark {
+        Mark::Line => draw_line(svg, &line_path(frame, &series.points), colour, "", 1.6),
+        Mark::Path => draw_line(svg, &stride_path(frame, &series.points), colour, "", 1.8),
+        Mark::DashedPath => draw_line(svg, &stride_path(frame, &series.points), colour, DASH, 1.6),
+        Mark::Dots(radius) => {
+            let mut path = String::new();
+            for &point in thinned(&series.points).filter(finite) {
+                let [x, y] = frame.place(point);
+                // A stroke of no length with round ends is a dot.
+                let _ = write!(path, "M{x:.1} {y:.1}h0");
+            }
+            let round = " stroke-linecap=\"round\"";
+            draw_line(svg, &path, colour, round, 2.0 * radius);
+        }
+        Mark::Bars(width) => {
+            let mut path = String::new();
+            for &[x, y] in series.points.iter().filter(finite) {
+                let [left, top] = frame.place([x, y]);
+                let [right, bottom] = frame.place([x + width, 0.0]);
+                let _ = write!(path, "M{left:.1} {bottom:.1}V{top:.1}H{right:.1}V{bottom:.1}z");
+            }
+            let _ = write!(svg, "<path d=\"{path}\" fill=\"{colour}\" fill-opacity=\"0.75\"/>");
+        }
+        Mark::Rule => {
+            let (top, bottom) = (MARGIN[1], MARGIN[1] + frame.height);
+            let mut path = String::new();
+            for &point in series.points.iter().filter(finite) {
+                let [x, _] = frame.place(point);
+                let _ = write!(path, "M{x:.1} {top:.1}V{bottom:.1}");
+            }
+            draw_line(svg, &path, colour, DASH, 1.4);
+        }
+    }
+}
+
+fn draw_line(svg: &mut String, path: &str, colour: &str, attributes: &str, width: f64) {
+    let _ = write!(
+        svg,
+        "<path d=\"{path}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"{width:.1}\" \
+         stroke-linejoin=\"round\"{attributes}/>"
+    );
+}
+
+/// Every n-th point, such that few enough are left; the last always.
+fn thinned(points: &[[f64; 2]]) -> impl Iterator<Item = &[f64; 2]> {
+    let stride = points.len().div_ceil(MAX_PATH_POINTS).max(1);
+    let last = points.len().saturating_sub(1);
+    points.iter().enumerate().filter(move |(i, _)| i % stride == 0 || *i == last).map(|(_, p)| p)
+}
+
+fn stride_path(frame: &Frame, points: &[[f64; 2]]) -> String {
+    joined(thinned(points).map(|&point| frame.place(point)))
+}
+
+/// A line over x: of the points that fall on one column of the picture, the first, the lowest,
+/// the highest and the last.
+fn line_path(frame: &Frame, points: &[[f64; 2]]) -> String {
+    let mut kept: Vec<[f64; 2]> = Vec::new();
+    let mut column: Vec<[f64; 2]> = Vec::new();
+    let mut flush = |column: &mut Vec<[f64; 2]>| {
+        let order = |a: &&[f64; 2], b: &&[f64; 2]| a[1].total_cmp(&b[1]);
+        let ends = [column.first(), column.iter().min_by(order), column.iter().max_by(order)];
+        let mut chosen: Vec<[f64; 2]> =
+            ends.into_iter().chain([column.last()]).flatten().copied().collect();
+        chosen.sort_by(|a, b| a[0].total_cmp(&b[0]));
+        chosen.dedup();
+        kept.extend(chosen);
+        column.clear();
+    };
+    for &point in points {
+        let placed = frame.place(point);
+        let breaks = !placed.iter().all(|c| c.is_finite());
+        let other_column = column.last().is_some_and(|last| last[0].floor() != placed[0].floor());
+        if breaks || other_column {
+            flush(&mut column);
+        }
+        column.push(placed);
+        if breaks {
+            flush(&mut column);
+        }
+    }
+    flush(&mut column);
+    joined(kept.into_iter())
+}
+
+/// An SVG path through the points; one that is not finite breaks it.
+fn joined(points: impl Iterator<Item = [f64; 2]>) -> String {
+    let mut path = String::new();
+    let mut draws = false;
+    for [x, y] in points {
+        let finite = x.is_finite() && y.is_finite();
+        if finite {
+            let _ = write!(path, "{}{x:.1} {y:.1}", if draws { 'L' } else { 'M' });
+        }
+        draws = finite;
+    }
+    path
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn chart(mark: Mark, points: Vec<[f64; 2]>) -> Chart {
+        Chart {
+            title: "t",
+            x_label: "x".into(),
+            y_label: "<y>".into(),
+            height: 240.0,
+            scaling: Scaling::Free,
+            series: vec![Series { name: "a", colour: "#000", mark, points }],
+        }
+    }
+
+    #[test]
+    fn long_series_are_thinned_and_keep_their_peak() {
+        let mut points: Vec<[f64; 2]> = (0..50_000).map(|i| [f64::from(i), 1.0]).collect();
+        points[31_234][1] = 100.0;
+        points[0][1] = 0.0;
+        let line = chart(Mark::Line, points.clone()).svg();
+        assert!(line.len() < 100_000);
+        let top = MARGIN[1] + (240.0 - MARGIN[1] - MARGIN[3]) * 0.04 / 1.08;
+        assert!(line.contains(&format!(" {top:.1}L")), "the peak at y = {top:.1} is drawn");
+        assert!(chart(Mark::Path, points).svg().len() < 100_000);
+    }
+
+    #[test]
+    fn any_points_make_a_well_formed_picture() {
+        let hostile = vec![
+            [f64::NAN, 1.0],
+            [0.0, f64::INFINITY],
+            [1.0, 2.0],
+            [f64::NAN, f64::NAN],
+            [2.0, 1.0],
+        ];
+        for mark in [Mark::Line, Mark::Path, Mark::Dots(2.0), Mark::Bars(1.0), Mark::Rule] {
+            for points in [hostile.clone(), Vec::new(), vec![[1.0, 1.0]]] {
+                let svg = chart(mark, points).svg();
+                assert!(!svg.contains("NaN") && !svg.contains("inf"), "{mark:?}: {svg}");
+                assert!(svg.contains("&lt;y&gt;") && svg.ends_with("</svg>"));
+            }
+        }
+        assert!(chart(Mark::Line, Vec::new()).svg().contains("nothing to show"));
+    }
+}

@@ -1,0 +1,276 @@
+//! The charts of a report, from what a run recorded.
+
+use nalgebra::Vector3;
+
+use crate::service::results::RunRecord;
+use crate::service::results::report::ReportInput;
+use crate::service::results::report::axis::Range;
+use crate::service::results::report::chart::{Chart, Mark, Scaling, Series};
+use crate::service::results::report::views::Views;
+use crate::slam::evaluation::TrajectoryEvaluation;
+use crate::slam::evaluation::depth_error::DepthScale;
+use crate::slam::evaluation::statistics::percentile;
+use crate::slam::evaluation::windows::SCALE_WINDOW;
+use crate::slam::geometry::sim3::Sim3;
+use crate::slam::trajectory::StampedPose;
+
+/// Colours that can be told apart with any sight, on white and on black.
+const TRUTH: &str = "#8b929c";
+const ESTIMATE: &str = "#2f6fed";
+const ONLINE: &str = "#e59a1a";
+const ERROR: &str = "#d6455d";
+const MAPPING: &str = "#1f9d78";
+
+/// Bars of a histogram.
+const BARS: usize = 40;
+
+/// Seconds from the first frame.
+fn secs(record: &RunRecord, nanos: i64) -> f64 {
+    let first = record.poses.first().map_or(0, |pose| pose.estimate.capture_nanos);
+    nanos.saturating_sub(first) as f64 * 1e-9
+}
+
+/// The trajectory from above and from the side, in the ground truth's frame where there is one.
+pub fn trajectory_views(input: &ReportInput<'_>) -> [Chart; 2] {
+    let truth: Vec<StampedPose> = truth_in_time(input);
+    let (alignment, unit) = match input.evaluation {
+        Some(evaluation) => (evaluation.alignment, "m"),
+        None if input.record.depth_scale == DepthScale::Given => (Sim3::identity(), "m"),
+        None => (Sim3::identity(), "map units"),
+    };
+    trajectory_charts(input.trajectory, &truth, &alignment, unit, &keyframe_poses(input.record))
+}
+
+/// From above and from the side: `truth`, and `estimate` and `keyframes` brought to its frame.
+pub fn trajectory_charts(
+    estimate: &[StampedPose],
+    truth: &[StampedPose],
+    alignment: &Sim3,
+    unit: &str,
+    keyframes: &[StampedPose],
+) -> [Chart; 2] {
+    let place = |pose: &StampedPose| StampedPose {
+        nanos: pose.nanos,
+        world_from_camera: alignment.place(&pose.world_from_camera),
+    };
+    let estimate: Vec<StampedPose> = estimate.iter().map(place).collect();
+    let keyframes: Vec<StampedPose> = keyframes.iter().map(place).collect();
+    let views = Views::of(if truth.is_empty() { &estimate } else { truth });
+    let chart = |title, y_label: &str, project: &dyn Fn(&Vector3<f64>) -> [f64; 2]| {
+        let points = |poses: &[StampedPose]| -> Vec<[f64; 2]> {
+            poses.iter().map(|pose| project(&pose.world_from_camera.translation)).collect()
+        };
+        let series = [
+            Series {
+                name: "ground truth",
+                colour: TRUTH,
+                mark: Mark::DashedPath,
+                points: points(truth),
+            },
+            Series {
+                name: "estimate",
+                colour: ESTIMATE,
+                mark: Mark::Path,
+                points: points(&estimate),
+            },
+            Series {
+                name: "keyframes",
+                colour: ESTIMATE,
+                mark: Mark::Dots(2.6),
+                points: points(&keyframes),
+            },
+        ];
+        Chart {
+            title,
+            x_label: format!("along the path's longest extent [{unit}]"),
+            y_label: format!("{y_label} [{unit}]"),
+            height: 420.0,
+            scaling: Scaling::Equal,
+            series: series.into_iter().filter(|series| !series.points.is_empty()).collect(),
+        }
+    };
+    [
+        chart("Trajectory from above", "across", &|p| views.from_above(p)),
+        chart("Trajectory from the side", "up", &|p| views.from_side(p)),
+    ]
+}
+
+/// True poses during the run.
+fn truth_in_time(input: &ReportInput<'_>) -> Vec<StampedPose> {
+    if input.evaluation.is_none() {
+        return Vec::new();
+    }
+    let poses = &input.record.poses;
+    let (Some(first), Some(last)) = (poses.first(), poses.last()) else { return Vec::new() };
+    let time = first.estimate.capture_nanos..=last.estimate.capture_nanos;
+    input.record.ground_truth.iter().filter(|pose| time.contains(&pose.nanos)).copied().collect()
+}
+
+fn keyframe_poses(record: &RunRecord) -> Vec<StampedPose> {
+    let pose = |k: &crate::slam::keyframe::Keyframe| StampedPose {
+        nanos: k.capture_nanos,
+        world_from_camera: k.world_from_keyframe.rigid,
+    };
+    record.map.keyframes.iter().map(pose).collect()
+}
+
+/// Position error over time, final and as published; `None` without ground truth.
+pub fn error_over_time(input: &ReportInput<'_>) -> Option<Chart> {
+    let evaluation = input.evaluation?;
+    let series = |name, colour, poses: &[StampedPose], evaluation: &TrajectoryEvaluation| Series {
+        name,
+        colour,
+        mark: Mark::Line,
+        points: error_points(poses, evaluation, |nanos| secs(input.record, nanos)),
+    };
+    let mut all = Vec::new();
+    if let Some(online) = input.online_evaluation {
+        all.push(series("as published", ONLINE, input.online, online));
+    }
+    all.push(series("final", ERROR, input.trajectory, evaluation));
+    Some(error_chart(all))
+}
+
+/// Time and position error of each match.
+pub fn error_points(
+    poses: &[StampedPose],
+    evaluation: &TrajectoryEvaluation,
+    secs: impl Fn(i64) -> f64,
+) -> Vec<[f64; 2]> {
+    let pairs = evaluation.association.pairs.iter().zip(&evaluation.absolute);
+    pairs.map(|(&(e, _), &error)| [secs(poses[e].nanos), error]).collect()
+}
+
+/// Position errors over time.
+pub fn error_chart(series: Vec<Series>) -> Chart {
+    Chart {
+        title: "Position error",
+        x_label: "time [s]".into(),
+        y_label: "error after alignment [m]".into(),
+        height: 280.0,
+        scaling: Scaling::FromZero,
+        series,
+    }
+}
+
+/// One line of errors.
+pub fn error_series(points: Vec<[f64; 2]>) -> Series {
+    Series { name: "error", colour: ERROR, mark: Mark::Line, points }
+}
+
+/// Scale of windows of 100 frames over that of the whole; `None` below two windows.
+pub fn scale_over_time(input: &ReportInput<'_>) -> Option<Chart> {
+    let evaluation = input.evaluation?;
+    if evaluation.window_scales.len() < 2 {
+        return None;
+    }
+    let pairs = &evaluation.association.pairs;
+    let time = |i: usize| pairs.get(i).map(|p| secs(input.record, input.trajectory[p.0].nanos));
+    let points: Vec<[f64; 2]> = evaluation
+        .window_scales
+        .iter()
+        .flat_map(|&(i, scale)| {
+            let ratio = scale / evaluation.alignment.scale;
+            [(i, ratio), (i + SCALE_WINDOW - 1, ratio)]
+        })
+        .filter_map(|(i, ratio)| time(i).map(|t| [t, ratio]))
+        .collect();
+    Some(Chart {
+        title: "Scale of 100-frame windows",
+        x_label: "time [s]".into(),
+        y_label: "scale / overall scale".into(),
+        height: 280.0,
+        scaling: Scaling::Free,
+        series: vec![Series { name: "", colour: MAPPING, mark: Mark::Path, points }],
+    })
+}
+
+/// Times of tracker and mapper over the run, and how often each occurs.
+pub fn time_charts(record: &RunRecord) -> Vec<Chart> {
+    let of_poses = |nanos: fn(&crate::service::results::RecordedPose) -> Option<u64>| {
+        let samples = record.poses.iter().filter_map(|pose| {
+            nanos(pose).map(|n| [secs(record, pose.estimate.capture_nanos), n as f64 * 1e-6])
+        });
+        samples.collect::<Vec<[f64; 2]>>()
+    };
+    let track = of_poses(|pose| pose.track_nanos);
+    let latency = of_poses(|pose| pose.latency_nanos);
+    // One map step for each frame it handled; spread over the frames in order.
+    let spread = record.poses.len() as f64 / record.map_nanos.len().max(1) as f64;
+    let map: Vec<[f64; 2]> = record
+        .map_nanos
+        .iter()
+        .enumerate()
+        .filter_map(|(i, &nanos)| {
+            let pose = record.poses.get((i as f64 * spread) as usize)?;
+            Some([secs(record, pose.estimate.capture_nanos), nanos as f64 * 1e-6])
+        })
+        .collect();
+    let deadline = record.deadline_nanos.map(|n| n as f64 * 1e-6);
+    let mut charts = Vec::new();
+    for (over_time, occurrence, colour, samples, limit) in [
+        ("Tracking time", "Tracking time, how often", ESTIMATE, track, None),
+        ("Mapping time", "Mapping time, how often", MAPPING, map, None),
+        ("Latency from stamp to pose", "Latency, how often", ONLINE, latency, deadline),
+    ] {
+        if !samples.is_empty() {
+            charts.push(time_chart(over_time, colour, samples.clone()));
+            charts.push(histogram(occurrence, colour, &samples, limit));
+        }
+    }
+    charts
+}
+
+fn time_chart(title: &'static str, colour: &'static str, points: Vec<[f64; 2]>) -> Chart {
+    Chart {
+        title,
+        x_label: "time [s]".into(),
+        y_label: "[ms]".into(),
+        height: 230.0,
+        scaling: Scaling::FromZero,
+        series: vec![Series { name: "", colour, mark: Mark::Line, points }],
+    }
+}
+
+/// How many frames took how long. The range ends at the 99th percentile and a half more; what is
+/// beyond is counted in the last bar.
+fn histogram(
+    title: &'static str,
+    colour: &'static str,
+    samples: &[[f64; 2]],
+    limit: Option<f64>,
+) -> Chart {
+    let mut sorted: Vec<f64> = samples.iter().map(|sample| sample[1]).collect();
+    sorted.sort_by(f64::total_cmp);
+    let p99 = percentile(&sorted, 0.99).unwrap_or(0.0);
+    let end = Range::around([1.5 * p99.max(limit.unwrap_or(0.0))].into_iter()).from_zero().high;
+    let end = end.min(1.5 * p99.max(limit.unwrap_or(0.0)).max(1e-3));
+    let width = end / BARS as f64;
+    let mut counts = [0u32; BARS];
+    for &time in &sorted {
+        counts[((time / width) as usize).min(BARS - 1)] += 1;
+    }
+    let bars = counts.iter().enumerate().map(|(i, &n)| [i as f64 * width, f64::from(n)]);
+    let mut series =
+        vec![Series { name: "", colour, mark: Mark::Bars(width * 0.9), points: bars.collect() }];
+    if let Some(p) = percentile(&sorted, 0.95) {
+        series.push(Series {
+            name: "p95",
+            colour: ERROR,
+            mark: Mark::Rule,
+            points: vec![[p, 0.0]],
+        });
+    }
+    if let Some(limit) = limit {
+        let points = vec![[limit, 0.0]];
+        series.push(Series { name: "deadline", colour: TRUTH, mark: Mark::Rule, points });
+    }
+    Chart {
+        title,
+        x_label: "[ms]".into(),
+        y_label: "frames".into(),
+        height: 230.0,
+        scaling: Scaling::FromZero,
+        series,
+    }
+}

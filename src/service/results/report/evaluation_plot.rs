@@ -1,0 +1,45 @@
+//! One picture of a trajectory against ground truth, as a file of its own.
+
+use std::fmt::Write;
+
+use crate::service::results::report::chart::{CHART_WIDTH, Chart};
+use crate::service::results::report::charts::{
+    error_chart, error_points, error_series, trajectory_charts,
+};
+use crate::slam::evaluation::TrajectoryEvaluation;
+use crate::slam::trajectory::StampedPose;
+
+/// Both trajectories from above and from the side and the position error over time, one below the
+/// other, as an SVG file with a white ground.
+pub fn evaluation_plot(
+    estimate: &[StampedPose],
+    truth: &[StampedPose],
+    evaluation: &TrajectoryEvaluation,
+) -> String {
+    let (first, last) = (estimate.first(), estimate.last());
+    let times = first.map_or(0, |pose| pose.nanos)..=last.map_or(0, |pose| pose.nanos);
+    let truth: Vec<StampedPose> =
+        truth.iter().filter(|pose| times.contains(&pose.nanos)).copied().collect();
+    let secs = |nanos: i64| nanos.saturating_sub(*times.start()) as f64 * 1e-9;
+    let errors = error_series(error_points(estimate, evaluation, secs));
+    let views = trajectory_charts(estimate, &truth, &evaluation.alignment, "m", &[]);
+    let charts: Vec<Chart> = views.into_iter().chain([error_chart(vec![errors])]).collect();
+    let height: f64 = charts.iter().map(|chart| chart.height).sum();
+    let mut svg = format!(
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {CHART_WIDTH} {height}\" \
+         color=\"#1c2230\"><rect width=\"100%\" height=\"100%\" fill=\"#fff\"/>"
+    );
+    let mut top = 0.0;
+    for chart in &charts {
+        // Each chart brings its own viewBox; its place is given by its size.
+        let _ = write!(
+            svg,
+            "<svg y=\"{top}\" width=\"{CHART_WIDTH}\" height=\"{}\">{}</svg>",
+            chart.height,
+            chart.svg()
+        );
+        top += chart.height;
+    }
+    svg.push_str("</svg>\n");
+    svg
+}

@@ -1,0 +1,53 @@
+//! Pieces of HTML: escaped text, pictures as data addresses.
+
+/// Text with the characters that mean something in HTML and SVG replaced.
+pub fn escaped(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for character in text.chars() {
+        match character {
+            '&' => out.push_str("&amp;"),
+            '<' => out.push_str("&lt;"),
+            '>' => out.push_str("&gt;"),
+            '"' => out.push_str("&quot;"),
+            '\'' => out.push_str("&#39;"),
+            _ => out.push(character),
+        }
+    }
+    out
+}
+
+/// The bytes of a PNG file as a `data:` address (base64, RFC 4648 §4).
+pub fn png_address(bytes: &[u8]) -> String {
+    const LETTERS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    let mut out = String::from("data:image/png;base64,");
+    out.reserve(bytes.len().div_ceil(3) * 4);
+    for chunk in bytes.chunks(3) {
+        let byte = |i: usize| u32::from(chunk.get(i).copied().unwrap_or(0));
+        let bits = byte(0) << 16 | byte(1) << 8 | byte(2);
+        for i in 0..4 {
+            let letter = LETTERS[(bits >> (18 - 6 * i) & 63) as usize];
+            out.push(if i <= chunk.len() { char::from(letter) } else { '=' });
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn base64_of_the_standard() {
+        let vectors =
+            [("", ""), ("f", "Zg=="), ("fo", "Zm8="), ("foo", "Zm9v"), ("foob", "Zm9vYg==")];
+        for (bytes, letters) in vectors {
+            assert_eq!(png_address(bytes.as_bytes()), format!("data:image/png;base64,{letters}"));
+        }
+        assert!(png_address(&[0xff, 0xef, 0xbe]).ends_with("/+++"));
+    }
+
+    #[test]
+    fn markup_is_escaped() {
+        assert_eq!(escaped("a<b & \"c'>"), "a&lt;b &amp; &quot;c&#39;&gt;");
+    }
+}

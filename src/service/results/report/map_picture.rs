@@ -1,0 +1,147 @@
+//! The map from above: every point of the cloud and the camera's way through it.
+
+use nalgebra::Vector3;
+
+use crate::service::results::colour::{Picture, Rgb, rainbow};
+use crate::service::results::ply::CloudPoint;
+use crate::service::results::report::views::Views;
+use crate::slam::evaluation::statistics::percentile;
+use crate::slam::trajectory::StampedPose;
+
+/// Width of the picture, pixels: sharp on a page twice as dense as its layout.
+const WIDTH: usize = 1600;
+
+/// Largest height, as a share of the width.
+const MAX_HEIGHT_RATIO: f64 = 0.7;
+
+/// Share of the points at either end that the picture leaves out: outliers would shrink the rest.
+const CUT_SHARE: f64 = 0.01;
+
+/// Points on a pixel that make it nearly as bright as it gets.
+const POINTS_FOR_BRIGHT: f64 = 6.0;
+
+const GROUND: Rgb = [16, 20, 27];
+const WAY: Rgb = [255, 255, 255];
+
+/// Points and way from above, coloured by height (blue low, red high); `None` without points.
+pub fn map_picture(cloud: &[CloudPoint], way: &[StampedPose]) -> Option<Picture> {
+    let views = Views::of(way);
+    let position = |point: &CloudPoint| Vector3::from(point.position.map(f64::from));
+    let flat: Vec<[f64; 3]> = cloud
+        .iter()
+        .map(position)
+        .filter(|p| p.iter().all(|c| c.is_finite()))
+        .map(|p| {
+            let ([x, y], [_, height]) = (views.from_above(&p), views.from_side(&p));
+            [x, y, height]
+        })
+        .collect();
+    let way: Vec<[f64; 2]> =
+        way.iter().map(|pose| views.from_above(&pose.world_from_camera.translation)).collect();
+    let mut ranges = [[0.0; 2]; 3];
+    for (axis, range) in ranges.iter_mut().enumerate() {
+        *range = middle_range(flat.iter().map(|p| p[axis]))?;
+    }
+    for (axis, range) in ranges.iter_mut().take(2).enumerate() {
+        for point in &way {
+            *range = [range[0].min(point[axis]), range[1].max(point[axis])];
+        }
+    }
+    Some(draw(&flat, &way, &ranges))
+}
+
+/// Lower and upper end of the values without [`CUT_SHARE`] at either end.
+fn middle_range(values: impl Iterator<Item = f64>) -> Option<[f64; 2]> {
+    let mut sorted: Vec<f64> = values.collect();
+    sorted.sort_by(f64::total_cmp);
+    let (low, high) = (percentile(&sorted, CUT_SHARE)?, percentile(&sorted, 1.0 - CUT_SHARE)?);
+    (high > low).then_some([low, high])
+}
+
+fn draw(points: &[[f64; 3]], way: &[[f64; 2]], ranges: &[[f64; 2]; 3]) -> Picture {
+    let [x, y, z] = ranges;
+    let (x_width, y_width) = (x[1] - x[0], y[1] - y[0]);
+    let tallest = MAX_HEIGHT_RATIO * WIDTH as f64;
+    let pixels_per_unit = (WIDTH as f64 / x_width).min(tallest / y_width);
+    let height = ((y_width * pixels_per_unit).ceil() as usize).clamp(1, tallest as usize);
+    let x_offset = 0.5 * (WIDTH as f64 - x_width * pixels_per_unit);
+    let pixel = |px: f64, py: f64| {
+        let (u, v) = (x_offset + (px - x[0]) * pixels_per_unit, (y[1] - py) * pixels_per_unit);
+        let inside = u >= 0.0 && v >= 0.0 && u < WIDTH as f64 && v < height as f64;
+        inside.then(|| v as usize * WIDTH + u as usize)
+    };
+    let mut counts = vec![(0u32, 0.0f64); WIDTH * height];
+    for &[px, py, pz] in points {
+        if let Some(i) = pixel(px, py) {
+            counts[i].0 += 1;
+            counts[i].1 += pz;
+        }
+    }
+    let colour = |&(count, sum): &(u32, f64)| {
+        if count == 0 {
+            return GROUND;
+        }
+        let share = (sum / f64::from(count) - z[0]) / (z[1] - z[0]);
+        // A single point is already seen; more make it brighter.
+        let bright = 1.0 - 0.65 * (-f64::from(count) / POINTS_FOR_BRIGHT).exp();
+        let full = rainbow(0.08 + 0.84 * share.clamp(0.0, 1.0));
+        std::array::from_fn(|c| {
+            (f64::from(GROUND[c]) * (1.0 - bright) + f64::from(full[c]) * bright) as u8
+        })
+    };
+    let mut picture = Picture { width: WIDTH, height, pixels: counts.iter().map(colour).collect() };
+    for step in way.windows(2) {
+        draw_step(&mut picture, step, pixels_per_unit, &pixel);
+    }
+    picture
+}
+
+/// A white stroke three pixels wide from one position to the next.
+fn draw_step(
+    picture: &mut Picture,
+    step: &[[f64; 2]],
+    pixels_per_unit: f64,
+    pixel: &dyn Fn(f64, f64) -> Option<usize>,
+) {
+    let [from, to] = [step[0], step[1]];
+    let length = (to[0] - from[0]).hypot(to[1] - from[1]) * pixels_per_unit;
+    let strokes = (length.ceil() as usize).clamp(1, WIDTH * 2);
+    for i in 0..=strokes {
+        let share = i as f64 / strokes as f64;
+        let at = [0, 1].map(|c| from[c] + share * (to[c] - from[c]));
+        let one = 1.0 / pixels_per_unit;
+        for (dx, dy) in [(0.0, 0.0), (one, 0.0), (-one, 0.0), (0.0, one), (0.0, -one)] {
+            if let Some(i) = pixel(at[0] + dx, at[1] + dy) {
+                picture.pixels[i] = WAY;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::geometry::se3::SE3;
+
+    fn point(x: f32, y: f32, z: f32) -> CloudPoint {
+        CloudPoint { position: [x, y, z], intensity: 0.0, variance: 0.0, keyframe_id: 0 }
+    }
+
+    #[test]
+    fn points_and_way_are_seen_and_outliers_do_not_shrink_them() {
+        let mut cloud: Vec<CloudPoint> = (0..5000)
+            .map(|i| point((i % 100) as f32, (i / 500) as f32, (i / 100) as f32))
+            .collect();
+        cloud.extend([point(1e9, 0.0, 0.0), point(f32::NAN, 0.0, 0.0)]);
+        let way = [0.0, 50.0].map(|x| StampedPose {
+            nanos: 0,
+            world_from_camera: SE3 { translation: [x, 0.0, 10.0].into(), ..SE3::identity() },
+        });
+        let picture = map_picture(&cloud, &way).unwrap();
+        let seen = picture.pixels.iter().filter(|&&p| p != GROUND && p != WAY).count();
+        assert!(seen > 3000, "{seen} of 5000 points are seen");
+        assert!(picture.pixels.iter().filter(|&&p| p == WAY).count() > 700);
+        assert_eq!(map_picture(&[], &way), None);
+        assert_eq!(map_picture(&cloud[..1], &[]), None);
+    }
+}

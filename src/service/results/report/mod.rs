@@ -1,0 +1,334 @@
+//! `report.html`: a run on one page that needs no other file and no network.
+
+pub mod axis;
+pub mod chart;
+pub mod charts;
+pub mod evaluation_plot;
+pub mod html;
+pub mod map_picture;
+pub mod views;
+
+use std::fmt::Write;
+
+use crate::service::results::colour::Picture;
+use crate::service::results::pictures::{
+    RELATIVE_STD_DEV_RANGE, density_picture, inverse_depth_picture, variance_picture,
+};
+use crate::service::results::ply::CloudPoint;
+use crate::service::results::report::chart::Chart;
+use crate::service::results::report::charts::{
+    error_over_time, scale_over_time, time_charts, trajectory_views,
+};
+use crate::service::results::report::html::{escaped, png_address};
+use crate::service::results::report::map_picture::map_picture;
+use crate::service::results::summary::Summary;
+use crate::service::results::{RunMode, RunRecord};
+use crate::slam::evaluation::TrajectoryEvaluation;
+use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::pose::TrackingState;
+use crate::slam::trajectory::StampedPose;
+
+/// Keyframes whose depth is shown: enough to see the run, few enough for one page.
+const PICTURED_KEYFRAMES: usize = 8;
+
+/// What a report is made from.
+#[derive(Debug, Clone, Copy)]
+pub struct ReportInput<'a> {
+    /// The run.
+    pub record: &'a RunRecord,
+    /// Its figures.
+    pub summary: &'a Summary,
+    /// Final trajectory.
+    pub trajectory: &'a [StampedPose],
+    /// Trajectory as published.
+    pub online: &'a [StampedPose],
+    /// The final trajectory against ground truth.
+    pub evaluation: Option<&'a TrajectoryEvaluation>,
+    /// The published one against ground truth.
+    pub online_evaluation: Option<&'a TrajectoryEvaluation>,
+    /// The map's points.
+    pub cloud: &'a [CloudPoint],
+    /// Largest σ/d of points that are shown.
+    pub max_relative_std_dev: f64,
+}
+
+/// The page.
+pub fn report(input: &ReportInput<'_>) -> String {
+    let summary = input.summary;
+    let mode = match summary.mode {
+        RunMode::Replay => "replay, one process, every frame",
+        RunMode::Lockstep => "lockstep run, every frame",
+        RunMode::Live => "live run, newest frame wins",
+    };
+    let source = escaped(&summary.source);
+    let mut page = format!(
+        "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
+         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\
+         <title>semidense: {source}</title><style>{}</style></head><body><main>\
+         <header><p class=\"product\">semidense {}</p><h1>{source}</h1>\
+         <p class=\"mode\">{mode} &middot; {} frames &middot; {:.1} s</p></header>",
+        include_str!("report.css"),
+        env!("CARGO_PKG_VERSION"),
+        summary.frames_in,
+        summary.recorded_secs
+    );
+    page.push_str(&cards(summary));
+    page.push_str(&states(input.record));
+    page.push_str(&map(input));
+    section(&mut page, "Trajectory", &trajectory_views(input));
+    let errors: Vec<Chart> =
+        error_over_time(input).into_iter().chain(scale_over_time(input)).collect();
+    section(&mut page, "Error", &errors);
+    page.push_str(&depth_maps(input));
+    section(&mut page, "Time", &time_charts(input.record));
+    page.push_str(&figures(summary));
+    page.push_str("</main></body></html>\n");
+    page
+}
+
+/// The map from above; nothing without points.
+fn map(input: &ReportInput<'_>) -> String {
+    let picture = map_picture(input.cloud, input.trajectory);
+    let Some(png) = picture.and_then(|picture| picture.png()) else { return String::new() };
+    format!(
+        "<section><h2>Map</h2><figure><img alt=\"map from above\" src=\"{}\"><figcaption>{} points \
+         from above, <span class=\"scale near-far\"></span> low to high; the camera's way in \
+         white.</figcaption></figure></section>",
+        png_address(&png),
+        grouped(input.cloud.len() as u64)
+    )
+}
+
+/// Charts side by side under a heading; nothing where there are none.
+fn section(page: &mut String, heading: &str, charts: &[Chart]) {
+    if charts.is_empty() {
+        return;
+    }
+    let _ = write!(page, "<section><h2>{heading}</h2><div class=\"charts\">");
+    for chart in charts {
+        let _ = write!(page, "<figure>{}</figure>", chart.svg());
+    }
+    page.push_str("</div></section>");
+}
+
+/// The figures that matter most, large.
+fn cards(summary: &Summary) -> String {
+    let mut cards = String::from("<section class=\"cards\">");
+    let mut card = |name: &str, value: String, note: String| {
+        let _ = write!(
+            cards,
+            "<div class=\"card\"><p class=\"name\">{name}</p><p class=\"value\">{value}</p>\
+             <p class=\"note\">{note}</p></div>"
+        );
+    };
+    let share = 100.0 * summary.frames_tracked as f64 / summary.frames_in.max(1) as f64;
+    let losses = match summary.lost_count {
+        _ if summary.frames_tracked == 0 => "never initialised".to_owned(),
+        0 => "never lost".to_owned(),
+        1 => "lost once".to_owned(),
+        n => format!("lost {n} times"),
+    };
+    card("Frames tracked", format!("{share:.1} %"), losses);
+    let trajectory = &summary.trajectory;
+    if let (Some(ate), Some(path)) = (trajectory.ate_rmse_m, trajectory.path_length_m) {
+        let note = format!("{:.2} % of {path:.2} m, {}", 100.0 * ate / path, "RMSE");
+        card("Position error (ATE)", length(ate), note);
+    }
+    if let Some(ratio) = trajectory.window_scale_ratio {
+        let note = "largest / smallest scale of 100 frames".to_owned();
+        card("Scale drift", format!("&times; {ratio:.2}"), note);
+    }
+    if let Some(error) = summary.depth_relative_error_median {
+        let best = summary.depth_relative_error_median_best_half.unwrap_or(error);
+        let note = format!("median; {:.1} % in the surer half", 100.0 * best);
+        card("Depth error", format!("{:.1} %", 100.0 * error), note);
+    }
+    let points = format!("{} points", grouped(summary.points));
+    card("Keyframes", summary.keyframes.to_string(), points);
+    if let Some(times) = summary.track_ms {
+        let note = format!("median; p99 {:.1} ms", times.p99);
+        card("Tracking a frame", format!("{:.1} ms", times.p50), note);
+    }
+    if let Some(times) = summary.latency_ms {
+        let misses = summary.deadline_misses.unwrap_or(0);
+        let note = format!("median; p99 {:.1} ms; {misses} after the deadline", times.p99);
+        card("Latency", format!("{:.1} ms", times.p50), note);
+    }
+    if let Some(factor) = summary.realtime_factor {
+        card("Speed", format!("&times; {factor:.1}"), "of real time".to_owned());
+    }
+    cards.push_str("</section>");
+    cards
+}
+
+/// A length in metres, in the unit that keeps it readable.
+fn length(metres: f64) -> String {
+    if metres < 0.01 {
+        format!("{:.2} mm", 1e3 * metres)
+    } else if metres < 1.0 {
+        format!("{:.2} cm", 1e2 * metres)
+    } else {
+        format!("{metres:.2} m")
+    }
+}
+
+/// A number with spaces between groups of three digits.
+fn grouped(number: u64) -> String {
+    let digits = number.to_string();
+    let mut out = String::new();
+    for (i, digit) in digits.chars().enumerate() {
+        if i > 0 && (digits.len() - i).is_multiple_of(3) {
+            out.push('\u{202f}');
+        }
+        out.push(digit);
+    }
+    out
+}
+
+/// Name, class and share of each state, and a strip that shows when it was.
+fn states(record: &RunRecord) -> String {
+    let count = record.poses.len();
+    if count == 0 {
+        return String::new();
+    }
+    let kinds: Vec<usize> =
+        record.poses.iter().map(|pose| state_kind(pose.estimate.state)).collect();
+    let mut html = String::from(
+        "<section><h2>States</h2><svg class=\"states\" viewBox=\"0 0 1000 22\" \
+         preserveAspectRatio=\"none\">",
+    );
+    let mut start = 0;
+    for run in kinds.chunk_by(|a, b| a == b) {
+        let scale = 1000.0 / count as f64;
+        let _ = write!(
+            html,
+            "<rect x=\"{:.2}\" width=\"{:.2}\" height=\"22\" class=\"{}\"/>",
+            start as f64 * scale,
+            run.len() as f64 * scale,
+            STATES[run[0]].1
+        );
+        start += run.len();
+    }
+    html.push_str("</svg><p class=\"legend\">");
+    for (kind, (name, class)) in STATES.iter().enumerate() {
+        let frames = kinds.iter().filter(|&&k| k == kind).count();
+        let _ = write!(html, "<span><i class=\"{class}\"></i>{name} {frames}</span>");
+    }
+    html.push_str("</p></section>");
+    html
+}
+
+/// Name and CSS class of each kind of state.
+const STATES: [(&str, &str); 4] = [
+    ("initializing", "initializing"),
+    ("tracking", "tracking"),
+    ("degraded", "degraded"),
+    ("lost", "lost"),
+];
+
+fn state_kind(state: TrackingState) -> usize {
+    match state {
+        TrackingState::Initializing => 0,
+        TrackingState::Tracking => 1,
+        TrackingState::Degraded(_) => 2,
+        TrackingState::Lost(_) => 3,
+    }
+}
+
+/// Depth of keyframes spread over the run, and one with its uncertainty.
+fn depth_maps(input: &ReportInput<'_>) -> String {
+    let usable = |k: &&Keyframe| k.map_state == MapState::Established && !k.points.is_empty();
+    let keyframes: Vec<&Keyframe> = input.record.map.keyframes.iter().filter(usable).collect();
+    if keyframes.is_empty() {
+        return String::new();
+    }
+    let shown = keyframes.len().min(PICTURED_KEYFRAMES);
+    let spread = |i: usize| keyframes[i * (keyframes.len() - 1) / (shown - 1).max(1)];
+    let mut html = format!(
+        "<section><h2>Depth</h2><p>Inverse depth of {shown} of {} keyframes: \
+         <span class=\"scale near-far\"></span> far to near. Points whose standard deviation is \
+         at most {:.0} % of their inverse depth.</p><div class=\"pictures\">",
+        keyframes.len(),
+        100.0 * input.max_relative_std_dev
+    );
+    for keyframe in (0..shown).map(spread) {
+        let (picture, range) = inverse_depth_picture(keyframe, input.max_relative_std_dev);
+        let depths = match range {
+            Some([far, near]) => {
+                let scale = keyframe.world_from_keyframe.scale;
+                format!("{:.2} to {:.2} map units", scale / near, scale / far)
+            }
+            None => "no points".to_owned(),
+        };
+        picture_figure(&mut html, &picture, keyframe, &depths);
+    }
+    let middle = spread(shown / 2);
+    let [low, high] = RELATIVE_STD_DEV_RANGE;
+    let _ = write!(
+        html,
+        "</div><p>All points of one of them; their standard deviation over inverse depth, \
+         <span class=\"scale sure-unsure\"></span> {:.1} % to {:.0} % (logarithmic); the share of \
+         pixels that have depth, 0 to 100 % on the same scale.</p><div class=\"pictures wide\">",
+        100.0 * low,
+        100.0 * high
+    );
+    let (all, _) = inverse_depth_picture(middle, f64::INFINITY);
+    picture_figure(&mut html, &all, middle, "inverse depth");
+    picture_figure(&mut html, &variance_picture(middle), middle, "uncertainty");
+    picture_figure(&mut html, &density_picture(middle), middle, "density");
+    html.push_str("</div></section>");
+    html
+}
+
+fn picture_figure(html: &mut String, picture: &Picture, keyframe: &Keyframe, note: &str) {
+    let Some(png) = picture.png() else { return };
+    let _ = write!(
+        html,
+        "<figure><img alt=\"depth of keyframe {0}\" src=\"{1}\">\
+         <figcaption>keyframe {0}, frame {2}: {3} points, {note}</figcaption></figure>",
+        keyframe.keyframe_id,
+        png_address(&png),
+        keyframe.sequence,
+        grouped(keyframe.points.len() as u64)
+    );
+}
+
+/// Every figure of the summary as a table.
+fn figures(summary: &Summary) -> String {
+    let mut html = String::from("<section><h2>Figures</h2><dl>");
+    let value = serde_json::to_value(summary).unwrap_or_default();
+    for (key, value) in value.as_object().into_iter().flatten() {
+        let text = match value {
+            serde_json::Value::Null => continue,
+            serde_json::Value::Object(entries) if entries.values().all(|v| v.is_null()) => continue,
+            serde_json::Value::Object(entries) => {
+                let entries = entries.iter().filter(|(_, v)| !v.is_null());
+                let named = entries.map(|(k, v)| format!("{k} {}", figure(v)));
+                named.collect::<Vec<_>>().join(", ")
+            }
+            serde_json::Value::Array(values) => {
+                values.iter().map(figure).collect::<Vec<_>>().join(", ")
+            }
+            other => figure(other),
+        };
+        let _ = write!(html, "<div><dt>{key}</dt><dd>{}</dd></div>", escaped(&text));
+    }
+    html.push_str("</dl></section>");
+    html
+}
+
+/// A number with at most five significant digits after the point; text as it is.
+fn figure(value: &serde_json::Value) -> String {
+    match value {
+        serde_json::Value::String(text) => text.clone(),
+        serde_json::Value::Number(number) if number.is_f64() => {
+            let number = number.as_f64().unwrap_or(f64::NAN);
+            if number != 0.0 && number.abs() < 1e-3 {
+                format!("{number:.3e}")
+            } else {
+                format!("{number:.4}")
+            }
+        }
+        other => other.to_string(),
+    }
+}

@@ -1,0 +1,91 @@
+//! Directions in which a trajectory is looked at: from above and from the side.
+
+use nalgebra::{Matrix3, Vector3};
+
+use crate::slam::trajectory::StampedPose;
+
+/// Length of the mean of the cameras' up vectors below which they agree on no direction.
+const SHORTEST_UP: f64 = 0.3;
+
+/// Orthonormal directions of a drawing.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Views {
+    /// Along which the trajectory extends most, level.
+    right: Vector3<f64>,
+    /// Level, into the side view.
+    forward: Vector3<f64>,
+    /// Where the cameras' upper edges point on average.
+    up: Vector3<f64>,
+}
+
+impl Views {
+    /// Directions for these poses. Cameras that do not agree on an up direction (one that looks
+    /// straight down may turn freely) are shown by the extent of their path alone.
+    pub fn of(poses: &[StampedPose]) -> Self {
+        let ups = poses.iter().map(|pose| pose.world_from_camera.rotation * -Vector3::y());
+        let mean_up = ups.sum::<Vector3<f64>>() / poses.len().max(1) as f64;
+        let extent = extent_axes(poses);
+        let up = if mean_up.norm() > SHORTEST_UP { mean_up.normalize() } else { extent[2] };
+        let level = |axis: &Vector3<f64>| axis - up * up.dot(axis);
+        // Of the extent's axes at most one is along `up`; the largest that is not gives the width.
+        let right = extent.iter().map(level).find(|axis| axis.norm() > 0.5);
+        let right = right.map_or_else(Vector3::x, |axis| axis.normalize());
+        Self { right, forward: up.cross(&right), up }
+    }
+
+    /// Right and forward: seen from above.
+    pub fn from_above(&self, position: &Vector3<f64>) -> [f64; 2] {
+        [self.right.dot(position), self.forward.dot(position)]
+    }
+
+    /// Right and up: seen from the side.
+    pub fn from_side(&self, position: &Vector3<f64>) -> [f64; 2] {
+        [self.right.dot(position), self.up.dot(position)]
+    }
+}
+
+/// Principal axes of the positions, the longest first; each points to its larger coordinate.
+fn extent_axes(poses: &[StampedPose]) -> [Vector3<f64>; 3] {
+    let positions = || poses.iter().map(|pose| pose.world_from_camera.translation);
+    let count = poses.len().max(1) as f64;
+    let mean = positions().sum::<Vector3<f64>>() / count;
+    let covariance: Matrix3<f64> =
+        positions().map(|position| (position - mean) * (position - mean).transpose() / count).sum();
+    if !covariance.iter().all(|c| c.is_finite()) {
+        return [Vector3::x(), Vector3::z(), -Vector3::y()];
+    }
+    let eigen = covariance.symmetric_eigen();
+    let mut order = [0, 1, 2];
+    order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]));
+    order.map(|i| {
+        let axis: Vector3<f64> = eigen.eigenvectors.column(i).into();
+        if axis[axis.iamax()] < 0.0 { -axis } else { axis }
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::geometry::se3::SE3;
+
+    #[test]
+    fn an_upright_camera_on_the_floor_is_seen_flat_from_the_side() {
+        // Optical axes: y is down, so the floor is the x–z plane.
+        let poses: Vec<StampedPose> = (0..50)
+            .map(|i| {
+                let t = f64::from(i) * 0.1;
+                let mut world_from_camera = SE3::identity();
+                world_from_camera.translation = Vector3::new(t.sin(), 0.0, 3.0 * t);
+                StampedPose { nanos: i64::from(i), world_from_camera }
+            })
+            .collect();
+        let views = Views::of(&poses);
+        for pose in &poses {
+            assert!(views.from_side(&pose.world_from_camera.translation)[1].abs() < 1e-12);
+        }
+        let [x, y] = views.from_above(&Vector3::new(0.0, 0.0, 1.0));
+        assert!(x > 0.9 && y.abs() < 0.5, "the long way lies along x");
+        let _ = Views::of(&[]);
+        let _ = Views::of(&poses[..1]);
+    }
+}

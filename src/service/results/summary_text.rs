@@ -1,0 +1,93 @@
+//! The summary as the few lines that a run prints when it ends.
+
+use std::fmt::Write;
+
+use crate::service::results::summary::{Percentiles, Summary, TrajectorySummary};
+
+/// The lines, each ended.
+pub fn summary_text(summary: &Summary) -> String {
+    let mut text = String::new();
+    let mut line = |name: &str, value: String| {
+        // Writing to a string cannot fail.
+        let _ = writeln!(text, "{name:<11} {value}");
+    };
+    line("frames", frames(summary));
+    line(
+        "map",
+        format!(
+            "{} keyframes, {} points, epoch {}",
+            summary.keyframes, summary.points, summary.epoch
+        ),
+    );
+    if let Some(error) = trajectory_errors(&summary.trajectory) {
+        line("trajectory", error);
+    }
+    if let Some(error) = trajectory_errors(&summary.online) {
+        line("online", error);
+    }
+    if let (Some(all), Some(best)) =
+        (summary.depth_relative_error_median, summary.depth_relative_error_median_best_half)
+    {
+        line(
+            "depth",
+            format!(
+                "median relative error {:.1} %, {:.1} % over the surer half",
+                100.0 * all,
+                100.0 * best
+            ),
+        );
+    }
+    let times =
+        [("track", summary.track_ms), ("map", summary.map_ms), ("latency", summary.latency_ms)];
+    for (name, percentiles) in times {
+        if let Some(percentiles) = percentiles {
+            line(&format!("{name} time"), times_text(&percentiles));
+        }
+    }
+    line("run", run(summary));
+    text
+}
+
+fn frames(summary: &Summary) -> String {
+    let initialised = match summary.initialization_secs {
+        Some(secs) => format!("initialised after {secs:.2} s"),
+        None => "never initialised".to_owned(),
+    };
+    format!(
+        "{} in, {} tracked, {} lost in {} losses, {} dropped, {} gaps; {initialised}",
+        summary.frames_in,
+        summary.frames_tracked,
+        summary.frames_lost,
+        summary.lost_count,
+        summary.frames_dropped,
+        summary.gaps
+    )
+}
+
+fn trajectory_errors(trajectory: &TrajectorySummary) -> Option<String> {
+    let (ate, path) = (trajectory.ate_rmse_m?, trajectory.path_length_m?);
+    let mut text = format!(
+        "ATE {ate:.4} m over {} poses and {path:.2} m, scale {:.4}",
+        trajectory.matched_poses?, trajectory.ate_scale?
+    );
+    if let Some(ratio) = trajectory.window_scale_ratio {
+        let _ = write!(text, ", scale drift x{ratio:.2}");
+    }
+    Some(text)
+}
+
+fn times_text(p: &Percentiles) -> String {
+    format!("{:.2} ms median, {:.2} p95, {:.2} p99, {:.2} max", p.p50, p.p95, p.p99, p.max)
+}
+
+fn run(summary: &Summary) -> String {
+    let mut text =
+        format!("{:.2} s for {:.2} s recorded", summary.wall_secs, summary.recorded_secs);
+    if let Some(factor) = summary.realtime_factor {
+        let _ = write!(text, " (x{factor:.2} real time)");
+    }
+    if let Some(memory) = summary.peak_rss_mb {
+        let _ = write!(text, ", {memory:.0} MB");
+    }
+    text
+}

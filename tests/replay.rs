@@ -1,0 +1,66 @@
+//! `semidense replay`: deterministic, whatever the number of threads, and its results are whole.
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use semidense::service::trajectory_file::read_trajectory;
+use serde_json::Value;
+
+fn replay(arguments: &[&str], output: &Path) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_semidense"))
+        .args(["replay", "--output"])
+        .arg(output)
+        .args(arguments)
+        .output()
+        .expect("the binary starts")
+}
+
+#[test]
+fn the_same_bits_for_one_two_and_four_threads() {
+    let folder = tempfile::tempdir().unwrap();
+    for poses in ["tracker", "groundtruth"] {
+        let files = ["1", "2", "4"].map(|threads| {
+            let dir = folder.path().join(poses).join(threads);
+            let arguments = ["sim", "--frames", "20", "--poses", poses, "--threads", threads];
+            let output = replay(&arguments, &dir);
+            assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+            let names = ["trajectory.txt", "trajectory_online.txt", "keyframes.txt", "map.ply"];
+            names.map(|name| std::fs::read(dir.join(name)).unwrap())
+        });
+        assert!(files[0] == files[1] && files[0] == files[2], "--poses {poses}");
+    }
+}
+
+#[test]
+fn given_poses_come_back_and_their_depth_is_judged() {
+    let folder = tempfile::tempdir().unwrap();
+    let arguments = ["sim", "--frames", "60", "--poses", "groundtruth", "--json"];
+    let output = replay(&arguments, folder.path());
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let summary: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(summary["frames_in"], 60);
+    assert_eq!(summary["frames_tracked"], 60);
+    assert!(summary["ate_rmse_m"].is_null() && summary["track_ms"].is_null());
+    let depth = summary["depth_relative_error_median"].as_f64().expect("the simulator has depth");
+    assert!(depth < 0.2, "median relative depth error {depth}");
+    let trajectory = read_trajectory(&folder.path().join("trajectory.txt")).unwrap();
+    assert_eq!(trajectory.len(), 60);
+    assert!(trajectory[0].world_from_camera.translation.norm() < 1e-9, "the first is the world");
+}
+
+#[test]
+fn what_cannot_be_replayed_is_one_clear_line() {
+    let folder = tempfile::tempdir().unwrap();
+    let empty = format!("tum:{}", folder.path().display());
+    for (arguments, part) in [
+        (vec!["sim:moon"], "sim:moon"),
+        (vec!["tum:/nowhere"], "/nowhere"),
+        (vec![empty.as_str()], "rgb.txt"),
+    ] {
+        let output = replay(&arguments, &folder.path().join("output"));
+        let message = String::from_utf8(output.stderr).unwrap();
+        assert!(!output.status.success());
+        assert!(message.contains(part), "{message}");
+        assert_eq!(message.trim_end().lines().count(), 1, "{message}");
+    }
+}

@@ -1,0 +1,233 @@
+//! The files that a run leaves behind, from records made by hand.
+
+use std::path::Path;
+
+use semidense::capture::source::{FrameSource, FrameStamp, SourceError};
+use semidense::service::results::{
+    RecordedPose, ResultsParams, RunMode, RunRecord, prepare_output, write_results,
+};
+use semidense::service::trajectory_file::read_trajectory;
+use semidense::slam::evaluation::depth_error::DepthScale;
+use semidense::slam::geometry::intrinsics::Intrinsics;
+use semidense::slam::geometry::se3::SE3;
+use semidense::slam::geometry::sim3::Sim3;
+use semidense::slam::image::buffer::Image;
+use semidense::slam::keyframe::{DepthPoint, Keyframe, MapState};
+use semidense::slam::mapper::Map;
+use semidense::slam::pose::{
+    Brightness, DegradedReason, LostReason, PoseEstimate, Quality, TrackingState,
+};
+use semidense::slam::trajectory::StampedPose;
+use serde_json::Value;
+
+const INTRINSICS: Intrinsics =
+    Intrinsics { fx: 30.0, fy: 30.0, cx: 15.5, cy: 11.5, width: 32, height: 24 };
+
+/// A source whose only use is its depth: 4 m at every pixel of every frame.
+struct Wall;
+
+impl FrameSource for Wall {
+    fn intrinsics(&self) -> Intrinsics {
+        INTRINSICS
+    }
+
+    fn num_frames(&self) -> Option<usize> {
+        None
+    }
+
+    fn next_into(&mut self, _pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
+        Ok(None)
+    }
+
+    fn depth_at(&mut self, _capture_nanos: i64) -> Result<Option<Image<f32>>, SourceError> {
+        Ok(Some(Image::filled(INTRINSICS.width, INTRINSICS.height, 4.0)))
+    }
+}
+
+fn nanos(i: usize) -> i64 {
+    1_305_033_527_000_000_001 + i as i64 * 33_333_333
+}
+
+/// Where the camera of frame i truly is, metres.
+fn truth(i: usize) -> SE3 {
+    let t = i as f64 / 30.0;
+    SE3 { translation: [t.sin(), 0.1 * (3.0 * t).cos(), 0.5 * t].into(), ..SE3::identity() }
+}
+
+/// A map unit is 2 m; keyframe 1 moved by (1, 0, 0) units after its frames were published.
+const UNIT_M: f64 = 2.0;
+
+fn world_from_keyframe(id: u64) -> Sim3 {
+    let shift = if id == 1 { 1.0 } else { 0.0 };
+    let rigid = SE3 { translation: [shift, 0.0, 0.0].into(), ..SE3::identity() };
+    Sim3::new(rigid, 0.5)
+}
+
+fn pose(i: usize, state: TrackingState, keyframe_id: u64) -> RecordedPose {
+    let mut world_from_camera = truth(i);
+    world_from_camera.translation /= UNIT_M;
+    let estimate = PoseEstimate {
+        sequence: i as u64,
+        capture_nanos: nanos(i),
+        epoch: 0,
+        revision: 0,
+        keyframe_id,
+        state,
+        world_from_camera,
+        keyframe_from_camera: world_from_keyframe(0).locate(&world_from_camera),
+        covariance: [0.0; 21],
+        brightness: Brightness::default(),
+        quality: Quality::default(),
+        proposes_keyframe: false,
+    };
+    RecordedPose {
+        estimate,
+        latency_nanos: None,
+        track_nanos: Some(1_000_000 * (i as u64 % 7 + 1)),
+    }
+}
+
+fn keyframe(keyframe_id: u64) -> Keyframe {
+    // A keyframe unit is half a map unit: 4 m are 4 keyframe units. One point is too uncertain.
+    let points = (0..20u16).map(|i| DepthPoint {
+        u: i,
+        v: 3,
+        inverse_depth: 0.25,
+        variance: if i == 0 { 0.01 } else { 1e-5 },
+        intensity: 100.0,
+    });
+    Keyframe {
+        keyframe_id,
+        epoch: 0,
+        revision: 1,
+        sequence: keyframe_id * 10,
+        capture_nanos: nanos(keyframe_id as usize * 10),
+        map_state: MapState::Established,
+        world_from_keyframe: world_from_keyframe(keyframe_id),
+        intrinsics: INTRINSICS,
+        image: vec![90; 32 * 24],
+        points: points.collect(),
+    }
+}
+
+fn record(poses: Vec<RecordedPose>, keyframes: Vec<Keyframe>, with_truth: bool) -> RunRecord {
+    let frames = poses.len();
+    let pose = |i| StampedPose { nanos: nanos(i), world_from_camera: truth(i) };
+    RunRecord {
+        mode: RunMode::Lockstep,
+        source: "tum:a<script>\"b\"".to_owned(),
+        poses,
+        map: Map { keyframes },
+        ground_truth: if with_truth { (0..frames).map(pose).collect() } else { Vec::new() },
+        depth_scale: DepthScale::MedianRatio,
+        frames_in: frames as u64,
+        frames_dropped: 0,
+        gaps: 0,
+        restarts: 0,
+        deadline_nanos: None,
+        deadline_misses: None,
+        map_nanos: vec![2_000_000; frames],
+        recorded_nanos: 2_000_000_000,
+        wall_nanos: 1_000_000_000,
+        peak_rss_bytes: None,
+    }
+}
+
+fn written(dir: &Path, record: &RunRecord) -> (Value, String) {
+    prepare_output(dir).unwrap();
+    write_results(dir, record, &mut Wall, &ResultsParams::default()).unwrap();
+    let read = |name: &str| std::fs::read_to_string(dir.join(name)).unwrap();
+    let report = read("report.html");
+    assert!(report.ends_with("</html>\n"));
+    assert_eq!(report.matches("<svg").count(), report.matches("</svg>").count());
+    assert!(!report.contains("<script>"), "the source's name is escaped");
+    assert!(!report.contains("http://") || !report.contains("src=\"http"), "no network is needed");
+    assert!(!report.contains("NaN"));
+    (serde_json::from_str(&read("summary.json")).unwrap(), report)
+}
+
+#[test]
+fn figures_and_files_of_a_run_with_truth_and_a_loss() {
+    let state = |i| match i {
+        0..3 => TrackingState::Initializing,
+        20 | 21 | 30 => TrackingState::Lost(LostReason::TooFewInliers),
+        25 => TrackingState::Degraded(DegradedReason::LowOverlap),
+        _ => TrackingState::Tracking,
+    };
+    let poses = (0..60).map(|i| pose(i, state(i), u64::from(i >= 40))).collect();
+    let record = record(poses, vec![keyframe(0), keyframe(1)], true);
+    let folder = tempfile::tempdir().unwrap();
+    let dir = folder.path().join("deep/output");
+    let (summary, report) = written(&dir, &record);
+
+    for (key, value) in [
+        ("frames_in", 60.0),
+        ("frames_tracked", 54.0),
+        ("frames_degraded", 1.0),
+        ("frames_initializing", 3.0),
+        ("frames_lost", 3.0),
+        ("lost_count", 2.0),
+        ("keyframes", 2.0),
+        ("points", 38.0),
+        ("matched_poses", 54.0),
+        ("realtime_factor", 2.0),
+    ] {
+        assert_eq!(summary[key].as_f64(), Some(value), "{key}");
+    }
+    assert!((summary["initialization_secs"].as_f64().unwrap() - 0.1).abs() < 1e-6);
+    assert_eq!(summary["track_ms"]["max"], 7.0);
+    assert!(summary["latency_ms"].is_null() && summary["deadline_ms"].is_null());
+    // The published poses are right to their scale; the final ones have the keyframe moved.
+    assert!(summary["online"]["ate_rmse_m"].as_f64().unwrap() < 1e-9);
+    assert!((summary["online"]["ate_scale"].as_f64().unwrap() - UNIT_M).abs() < 1e-9);
+    assert!(summary["ate_rmse_m"].as_f64().unwrap() > 0.01);
+    assert!(summary["depth_relative_error_median"].as_f64().unwrap() < 1e-6);
+    assert_eq!(summary["depth_pixels"], 40);
+    assert!(report.contains("Position error") && report.contains("data:image/png"));
+
+    let last = read_trajectory(&dir.join("trajectory.txt")).unwrap()[53];
+    assert_eq!(last.nanos, nanos(59));
+    let online = read_trajectory(&dir.join("trajectory_online.txt")).unwrap()[53];
+    let moved = last.world_from_camera.translation - online.world_from_camera.translation;
+    assert!((moved.x - 1.0).abs() < 1e-12 && moved.y.abs() < 1e-12);
+
+    let ply = std::fs::read(dir.join("map.ply")).unwrap();
+    let header_end = ply.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
+    assert_eq!(ply.len() - header_end, 38 * 24, "38 points of six numbers");
+    let z = f32::from_le_bytes(ply[header_end + 8..header_end + 12].try_into().unwrap());
+    assert!((z - 2.0).abs() < 1e-6, "4 m are 2 map units");
+    let names: Vec<_> = std::fs::read_dir(&dir).unwrap().map(|e| e.unwrap().file_name()).collect();
+    assert_eq!(names.len(), 6, "nothing temporary is left: {names:?}");
+}
+
+#[test]
+fn a_run_without_truth_keyframes_or_a_tracked_frame_is_reported_too() {
+    let folder = tempfile::tempdir().unwrap();
+    for frames in [0, 1, 5] {
+        let poses = (0..frames).map(|i| pose(i, TrackingState::Initializing, u64::MAX)).collect();
+        let (summary, _) = written(folder.path(), &record(poses, Vec::new(), false));
+        for key in ["ate_rmse_m", "initialization_secs", "depth_relative_error_median"] {
+            assert!(summary[key].is_null(), "{key}");
+        }
+        assert_eq!(summary["frames_tracked"], 0);
+    }
+}
+
+#[test]
+fn a_long_run_makes_a_small_report() {
+    let folder = tempfile::tempdir().unwrap();
+    let poses = (0..15_000).map(|i| pose(i, TrackingState::Tracking, 0)).collect();
+    let (summary, report) = written(folder.path(), &record(poses, vec![keyframe(0)], true));
+    assert_eq!(summary["matched_poses"], 15_000);
+    assert!((summary["window_scale_ratio"].as_f64().unwrap() - 1.0).abs() < 1e-9);
+    assert!(report.len() < 600_000, "{} bytes", report.len());
+}
+
+#[test]
+fn a_place_that_cannot_be_written_is_an_error_that_names_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("file");
+    std::fs::write(&file, "").unwrap();
+    let error = prepare_output(&file.join("output")).unwrap_err().to_string();
+    assert!(error.contains("file/output") && error.contains("--output"), "{error}");
+}
