@@ -21,6 +21,7 @@ struct Arguments {
 enum Command {
     Evaluate(evaluate::EvaluateArgs),
     Replay(replay::ReplayArgs),
+    Simulate(simulate::SimulateArgs),
 }
 
 /// Parses the command line and runs the chosen subcommand.
@@ -28,6 +29,7 @@ pub fn main() -> ExitCode {
     let result = match Arguments::parse().command {
         Command::Evaluate(arguments) => evaluate::run(&arguments),
         Command::Replay(arguments) => replay::run(&arguments),
+        Command::Simulate(arguments) => simulate::run(&arguments),
     };
     result.unwrap_or_else(|error| {
         eprintln!("semidense: {error}");
