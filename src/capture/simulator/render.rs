@@ -25,7 +25,7 @@ const NO_SURFACE: u32 = u32::MAX;
 pub struct Hit {
     /// Depth along the optical axis, metres; infinite where nothing is.
     pub depth: f32,
-    /// Block × 8 + face, [`NO_SURFACE`] where nothing is.
+    /// Block × 8 + face, all ones where nothing is.
     pub surface: u32,
 }
 
