@@ -310,6 +310,11 @@ impl ImmaturePoint {
         // K R K⁻¹: the turn alone.
         let warp = frame.view.patch_warp(&Projection { u: 0.0, v: 0.0, depth_ratio: 1.0 });
         let determinant = warp[0] * warp[3] - warp[1] * warp[2];
+        /// Area of a turned pixel: outside, the view is so oblique that the patch is not comparable.
+        const AREA: std::ops::RangeInclusive<f32> = 0.3..=3.0;
+        if !AREA.contains(&determinant) {
+            return Err(TraceStatus::BadCondition);
+        }
         let inverse_warp = [warp[3], -warp[1], -warp[2], warp[0]].map(|x| x / determinant);
         let offsets = PATTERN.map(|(x, y)| {
             let (x, y) = (x as f32, y as f32);
