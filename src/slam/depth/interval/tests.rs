@@ -110,16 +110,6 @@ fn coverage(noise: f64, seeds: u64) -> Coverage {
     }
     coverage.mature_errors.sort_by(f32::total_cmp);
     let share = |part: usize, all: usize| 100.0 * part as f64 / all.max(1) as f64;
-    println!(
-        "noise {noise}: sure {:.1} % of {}, all good {:.1} % of {}, mature {:.1} % of {}, median error {:.4}",
-        share(coverage.sure_holds, coverage.sure),
-        coverage.sure,
-        share(coverage.good_holds, coverage.good),
-        coverage.good,
-        share(coverage.mature, coverage.points),
-        coverage.points,
-        coverage.mature_errors.get(coverage.mature / 2).unwrap_or(&f32::NAN),
-    );
     coverage
 }
 
