@@ -18,3 +18,4 @@ pub mod pose;
 pub mod test_scene;
 pub mod tracker;
 pub mod trajectory;
+pub mod two_frame;

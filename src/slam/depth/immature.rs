@@ -279,6 +279,7 @@ impl ImmaturePoint {
         if !DEPTH_RATIO.contains(&far.depth_ratio) {
             return Err(TraceStatus::OutOfBounds);
         }
+        let centre = self.inverse_depth().and_then(|d| line.project(d)).unwrap_or(far);
         let (direction, length) = match self.max_inverse_depth {
             Some(max) => {
                 let near = line.project(max).filter(visible).ok_or(TraceStatus::OutOfBounds)?;
@@ -308,7 +309,7 @@ impl ImmaturePoint {
         };
         // At the origin, at depth ratio 1, what is left of the patch's Jacobian is the upper left of
         // K R K⁻¹: the turn alone.
-        let warp = frame.view.patch_warp(&Projection { u: 0.0, v: 0.0, depth_ratio: 1.0 });
+        let warp = frame.view.patch_warp(&centre);
         let determinant = warp[0] * warp[3] - warp[1] * warp[2];
         /// Area of a turned pixel: outside, the view is so oblique that the patch is not comparable.
         const AREA: std::ops::RangeInclusive<f32> = 0.3..=3.0;

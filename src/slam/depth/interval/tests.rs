@@ -109,7 +109,6 @@ fn coverage(noise: f64, seeds: u64) -> Coverage {
         }
     }
     coverage.mature_errors.sort_by(f32::total_cmp);
-    let share = |part: usize, all: usize| 100.0 * part as f64 / all.max(1) as f64;
     coverage
 }
 
