@@ -10,6 +10,7 @@ pub mod points;
 pub mod spread;
 pub mod system;
 
+use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::candidate::CandidateParams;
@@ -41,7 +42,7 @@ pub struct TwoFrameParams {
     pub evidence: EvidenceParams,
     /// Fewer points than this cannot carry a start.
     pub min_points: usize,
-    /// Frames in a row that must prove the parallax: one alone may be a blink.
+    /// Frames in a row that must prove the parallax and agree on the direction: one alone may be a blink.
     pub confirming_frames: u32,
     /// Frames after which an unproven start begins again on a new first frame: 2 s at 30 Hz.
     pub max_frames: u32,
@@ -144,8 +145,8 @@ pub struct TwoFrameInitializer {
     rotation_scratch: FitScratch,
     variances: Vec<f32>,
     sorted: Vec<f32>,
-    /// Whether the latest joint fit told parallax from rotation: then the next one starts from it alone.
-    is_settled: bool,
+    /// Direction from the first camera to the one before, in the first frame.
+    heading: Vector3<f64>,
     frames: u32,
     confirmed: u32,
     mismatches: u32,
@@ -179,7 +180,7 @@ impl TwoFrameInitializer {
             rotation_scratch: FitScratch::default(),
             variances: Vec::new(),
             sorted: Vec::new(),
-            is_settled: false,
+            heading: Vector3::zeros(),
             frames: 0,
             confirmed: 0,
             mismatches: 0,
@@ -204,7 +205,6 @@ impl TwoFrameInitializer {
             state.inverse_depths.clear();
             state.inverse_depths.resize(found, 1.0);
         }
-        self.is_settled = false;
         (self.frames, self.confirmed, self.mismatches) = (0, 0, 0);
         true
     }
@@ -224,11 +224,7 @@ impl TwoFrameInitializer {
         self.fit_jointly();
         let evidence = self.judge();
         let missing = evidence.missing(&self.params.evidence);
-        self.is_settled = !matches!(
-            missing,
-            Some(Waiting::Match | Waiting::Significance | Waiting::NegativeDepth)
-        );
-        self.confirmed = if missing.is_none() { self.confirmed + 1 } else { 0 };
+        self.count_confirmation(missing.is_none());
         self.mismatches = if missing == Some(Waiting::Match) { self.mismatches + 1 } else { 0 };
         let state = match missing {
             None if self.confirmed >= self.params.confirming_frames => InitState::Proven,
@@ -289,21 +285,20 @@ impl TwoFrameInitializer {
         }
     }
 
-    /// Everything, coarse to fine, from the frame before; while nothing is settled also from rest and
-    /// from the mirrored solution, and the best of them goes on to the finest level.
+    /// Everything, coarse to fine: from the frame before, from rest and from the mirrored solution,
+    /// because with little parallax a fit can settle in the wrong one of several minima and stay there.
+    /// The best goes on to the finest level.
     fn fit_jointly(&mut self) {
+        let mirror = mirrored(&self.joint, &self.rotation);
         let mut best = self.fit_coarsely();
-        if !self.is_settled {
-            let before = self.joint.clone();
-            for start in [at_rest(&self.rotation), mirrored(&before, &self.rotation)] {
+        for start in [at_rest(&self.rotation), mirror] {
+            std::mem::swap(&mut self.joint, &mut self.alternative);
+            self.joint.clone_from(&start);
+            let energy = self.fit_coarsely();
+            if energy < best {
+                best = energy;
+            } else {
                 std::mem::swap(&mut self.joint, &mut self.alternative);
-                self.joint.clone_from(&start);
-                let energy = self.fit_coarsely();
-                if energy < best {
-                    best = energy;
-                } else {
-                    std::mem::swap(&mut self.joint, &mut self.alternative);
-                }
             }
         }
         self.fit_joint_level(0);
@@ -343,6 +338,21 @@ impl TwoFrameInitializer {
             self.variances.iter_mut().for_each(|v| *v *= factor * factor);
         }
         evidence
+    }
+
+    /// Counts the frames in a row that prove the parallax and agree on where the camera went.
+    fn count_confirmation(&mut self, proves: bool) {
+        /// Cosine of 20°: a hand does not turn its path by more within a frame, a wrong minimum does.
+        const MIN_AGREEMENT: f64 = 0.94;
+        let travelled = self.joint.current_from_first.inverse().translation;
+        let heading = travelled / travelled.norm().max(f64::MIN_POSITIVE);
+        let agrees = heading.dot(&self.heading) >= MIN_AGREEMENT;
+        self.confirmed = match (proves, agrees) {
+            (true, true) => self.confirmed + 1,
+            (true, false) => 1,
+            (false, _) => 0,
+        };
+        self.heading = heading;
     }
 
     fn outcome(&self, state: InitState, evidence: Evidence) -> InitOutcome {

@@ -67,8 +67,8 @@ impl FitParams {
     }
 }
 
-/// Smallest and largest inverse depth, the mean being 1. Negative ones have no meaning; that noise
-/// may reach them is what tells noise from parallax.
+/// Smallest and largest inverse depth, the mean being 1. Negative ones have no meaning; that a point
+/// reaches them tells a wrong minimum.
 const INVERSE_DEPTHS: std::ops::RangeInclusive<f32> = -2.0..=10.0;
 
 /// The current frame at all levels, with the points of the first.
