@@ -92,7 +92,8 @@ fn figures(
     let scale = scaled[scaled.len() / 2].0;
     let within = scaled.iter().filter(|(product, sigma)| (product - scale).abs() < 2.0 * sigma);
     start.within_two_sigmas = within.count() as f64 / scaled.len() as f64;
-    let mut errors: Vec<f64> = scaled.iter().map(|(product, _)| (scale / product - 1.0).abs()).collect();
+    let mut errors: Vec<f64> =
+        scaled.iter().map(|(product, _)| (scale / product - 1.0).abs()).collect();
     errors.sort_by(f64::total_cmp);
     start.median_depth_error = errors[errors.len() / 2];
     start
