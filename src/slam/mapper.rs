@@ -3,7 +3,6 @@
 mod past;
 mod start;
 
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::epipolar::TwoView;
@@ -16,6 +15,7 @@ use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::buffer::Image;
+use crate::slam::image::quads::QuadImage;
 use crate::slam::initializer::InitializerParams;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS, MapState};
 use crate::slam::mapper::past::PastFrames;
@@ -113,7 +113,7 @@ pub struct Mapper {
     depth: DepthMap,
     next_depth: DepthMap,
     regularised: Image<Hypothesis>,
-    frame: Image<f32>,
+    frame: QuadImage,
     past: PastFrames,
     two_frame: TwoFrameInitializer,
     /// Sequence and stamp of the two-frame start's first frame.
@@ -135,7 +135,7 @@ impl Mapper {
             depth: DepthMap::with_size(width, height),
             next_depth: DepthMap::with_size(width, height),
             regularised: Image::filled(width, height, Hypothesis::NONE),
-            frame: Image::filled(width, height, 0.0),
+            frame: QuadImage::with_size(width, height),
             past: PastFrames::with_capacity(params.max_past_frames),
             two_frame: TwoFrameInitializer::new(intrinsics, params.initializer.two_frame.clone())
                 .map_err(|e| e.within("initializer.two_frame"))?,
@@ -206,7 +206,7 @@ impl Mapper {
     fn observe_frame(&mut self, frame: &FrameView<'_>, pose: &PoseEstimate) -> ObservationCounts {
         let Some(keyframe) = self.map.keyframes.last() else { return ObservationCounts::default() };
         let keyframe_from_camera = keyframe.world_from_keyframe.locate(&pose.world_from_camera);
-        float_from_grey(&mut self.frame, frame.pixels);
+        self.frame.fill(frame.pixels);
         let observer = Observer {
             image: &self.frame,
             view: TwoView::new(&self.intrinsics, &keyframe_from_camera.inverse()),
@@ -280,7 +280,7 @@ impl Mapper {
             if baseline < least {
                 continue;
             }
-            float_from_grey(&mut self.frame, &past.pixels);
+            self.frame.fill(&past.pixels);
             let observer = Observer {
                 image: &self.frame,
                 view: TwoView::new(&self.intrinsics, &keyframe_from_camera.inverse()),
@@ -352,13 +352,4 @@ impl Mapper {
         let brightness = self.brightness_against_keyframe(pose);
         self.past.push(frame.pixels, pose.world_from_camera, brightness);
     }
-}
-
-/// Grey values as f32.
-fn float_from_grey(out: &mut Image<f32>, pixels: &[u8]) {
-    out.pixels_mut()
-        .par_iter_mut()
-        .with_min_len(1 << 16)
-        .zip(pixels)
-        .for_each(|(o, &p)| *o = f32::from(p));
 }

@@ -9,7 +9,7 @@ use crate::slam::depth::map::{BORDER_PX, DepthMap, GradientImage, Hypothesis};
 use crate::slam::depth::matching::{
     Match, MatchingParams, Miss, Patch, condition, is_inside, search,
 };
-use crate::slam::image::buffer::Image;
+use crate::slam::image::quads::QuadImage;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::Brightness;
 
@@ -47,7 +47,7 @@ impl Default for GaussianParams {
         Self {
             search_sigmas: 2.0,
             gate_sigmas: 2.5,
-            max_variance_ratio: 3.0,
+            max_variance_ratio: 1.2,
             common_noise_ratio: 0.5,
             process_inflation: 1.01,
             contradiction_inflation: 1.2,
@@ -107,7 +107,7 @@ impl ObservationCounts {
 #[derive(Debug, Clone, Copy)]
 pub struct Observer<'a> {
     /// Its brightness, level 0.
-    pub image: &'a Image<f32>,
+    pub image: &'a QuadImage,
     /// Its geometry against the keyframe.
     pub view: TwoView,
     /// Its brightness against the keyframe.
@@ -177,7 +177,11 @@ impl PixelObserver<'_> {
         let centre = hypothesis.smoothed;
         let Observer { image: frame, view, .. } = self.observer;
         let line = view.line(u as f32, v as f32);
-        let Some(at) = line.project(centre).filter(|p| is_inside(frame, p.u, p.v)) else { return };
+        let Some(at) =
+            line.project(centre).filter(|p| is_inside(frame.width(), frame.height(), p.u, p.v))
+        else {
+            return;
+        };
         let (vu, vv) = line.velocity(&at);
         // Cheap refusal before the patch is read: even a match without photometric error is too coarse.
         let least = (self.matching.line_noise_px.powi(2) + self.matching.sampling_noise_px.powi(2))
@@ -264,7 +268,7 @@ impl PixelObserver<'_> {
         let Some(to) = line.project(self.params.max_inverse_depth) else { return };
         let length = (to.u - from.u).hypot(to.v - from.v);
         if !(self.params.min_new_segment_px..=self.matching.max_search_px).contains(&length)
-            || !is_inside(frame, at.u, at.v)
+            || !is_inside(frame.width(), frame.height(), at.u, at.v)
         {
             return;
         }

@@ -273,7 +273,7 @@ impl ImmaturePoint {
         const NO_MOTION_PX: f32 = 1e-4;
         let image = frame.image;
         let line = frame.view.line(f32::from(self.u), f32::from(self.v));
-        let visible = |p: &Projection| is_inside(image, p.u, p.v);
+        let visible = |p: &Projection| is_inside(image.width(), image.height(), p.u, p.v);
         let far = line.project(self.min_inverse_depth).filter(visible);
         let far = far.ok_or(TraceStatus::OutOfBounds)?;
         if !DEPTH_RATIO.contains(&far.depth_ratio) {
@@ -301,7 +301,7 @@ impl ImmaturePoint {
                 let most = params.max_first_search_ratio * (image.width() + image.height()) as f32;
                 let length = most.min(distance_to_epipole(&line, &far));
                 let end = (far.u + length * direction.0, far.v + length * direction.1);
-                if !is_inside(image, end.0, end.1) {
+                if !is_inside(image.width(), image.height(), end.0, end.1) {
                     return Err(TraceStatus::OutOfBounds);
                 }
                 (direction, length)

@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 use crate::slam::depth::epipolar::{EpipolarLine, Projection, TwoView};
 use crate::slam::depth::map::{BORDER_PX, GradientImage};
 use crate::slam::image::buffer::Image;
+use crate::slam::image::quads::QuadImage;
 use crate::slam::parameter::{ParameterError, check_range};
 
 /// The 8-sample residual pattern of Engel, Koltun, Cremers 2018 (fig. 4): even offsets only, so that no
@@ -83,7 +84,7 @@ pub struct Patch {
 impl Patch {
     /// The patch around `(u, v)`, at least [`BORDER_PX`] from the border, with the brightness
     /// `gain * I + offset`.
-    #[inline]
+    #[inline(always)]
     pub fn new(image: &GradientImage, u: usize, v: usize, gain: f32, offset: f32) -> Self {
         let width = image.width() as i32;
         let centre = v as i32 * width + u as i32;
@@ -105,7 +106,8 @@ pub struct Conditioning {
     /// Unit direction of the line in the frame, towards larger inverse depth.
     direction: (f32, f32),
     /// Patch offsets in the frame.
-    offsets: [(f32, f32); 8],
+    offsets_u: [f32; 8],
+    offsets_v: [f32; 8],
     /// Gradient along the line by sample, grey levels a pixel of the frame.
     line_gradients: [f32; 8],
     /// Mean squared gradient of the patch.
@@ -142,7 +144,7 @@ pub enum Miss {
 
 /// Judges the line of a pixel at inverse depth `d`; `None` where a match would tell nothing: no
 /// parallax, behind the camera, or no gradient along the line.
-#[inline]
+#[inline(always)]
 pub fn condition(
     view: &TwoView,
     line: &EpipolarLine,
@@ -190,13 +192,12 @@ pub fn condition(
     let geometric = params.line_noise_px * params.line_noise_px * (1.0 + tangent * tangent);
     let photometric = 2.0 * params.image_noise * params.image_noise / information;
     let sampling = params.sampling_noise_px * params.sampling_noise_px;
-    let offsets = PATTERN.map(|(x, y)| {
-        let (x, y) = (x as f32, y as f32);
-        (warp[0] * x + warp[1] * y, warp[2] * x + warp[3] * y)
-    });
+    let offsets_u = PATTERN.map(|(x, y)| warp[0] * x as f32 + warp[1] * y as f32);
+    let offsets_v = PATTERN.map(|(x, y)| warp[2] * x as f32 + warp[3] * y as f32);
     Some(Conditioning {
         direction,
-        offsets,
+        offsets_u,
+        offsets_v,
         line_gradients,
         squared_gradient: (information + perpendicular) / samples,
         match_variance: geometric + photometric + sampling,
@@ -204,10 +205,10 @@ pub fn condition(
     })
 }
 
-/// Searches between the projections `from` and `to`, extended to at least `MIN_HALF_PX` either side.
-#[inline]
+/// Searches between the projections `from` and `to`; a segment below a pixel is only refined.
+#[inline(always)]
 pub fn search(
-    frame: &Image<f32>,
+    frame: &QuadImage,
     line: &EpipolarLine,
     patch: &Patch,
     conditioning: &Conditioning,
@@ -215,54 +216,60 @@ pub fn search(
     to: &Projection,
     params: &MatchingParams,
 ) -> Result<Match, Miss> {
-    // A prediction is never better than the steps of the search: look one step to both sides.
-    const MIN_HALF_PX: f32 = 1.5;
+    /// Segments below this are within the reach of the refinement.
+    const MIN_SEARCH_PX: f32 = 1.0;
+    /// How far the refinement may go from where it starts, pixels.
+    const REFINE_REACH_PX: f32 = 1.5;
     let (du, dv) = conditioning.direction;
     let length = (to.u - from.u) * du + (to.v - from.v) * dv;
     if !(length <= params.max_search_px) || length < 0.0 {
         return Err(Miss::TooLong);
     }
     let middle = (0.5 * (from.u + to.u), 0.5 * (from.v + to.v));
-    let half = (0.5 * length).max(MIN_HALF_PX);
-    let steps = ((2.0 * half).ceil() as usize).min(MAX_STEPS - 1);
-    let start = -0.5 * steps as f32;
-    let reach = half + 1.0;
-    if !is_inside(frame, middle.0 - reach * du, middle.1 - reach * dv)
-        || !is_inside(frame, middle.0 + reach * du, middle.1 + reach * dv)
+    let reach = 0.5 * length + REFINE_REACH_PX;
+    if !is_inside(frame.width(), frame.height(), middle.0 - reach * du, middle.1 - reach * dv)
+        || !is_inside(frame.width(), frame.height(), middle.0 + reach * du, middle.1 + reach * dv)
     {
         return Err(Miss::OutOfView);
     }
-    let position = |lambda: f32| (middle.0 + lambda * du, middle.1 + lambda * dv);
-    let mut costs = [f32::INFINITY; MAX_STEPS];
-    let mut best = 0;
-    for step in 0..=steps {
-        let (u, v) = position(start + step as f32);
-        costs[step] = cost(frame, patch, conditioning, u, v);
-        if costs[step] < costs[best] {
-            best = step;
+    let along = Along { frame, patch, conditioning, middle };
+    let steps =
+        if length < MIN_SEARCH_PX { 0 } else { (length.ceil() as usize).min(MAX_STEPS - 1) };
+    let mut start = 0.0;
+    let mut second = f32::INFINITY;
+    if steps > 0 {
+        let first = -0.5 * steps as f32;
+        let mut costs = [f32::INFINITY; MAX_STEPS];
+        let mut best = 0;
+        for step in 0..=steps {
+            costs[step] = along.evaluate(first + step as f32).cost;
+            if costs[step] < costs[best] {
+                best = step;
+            }
         }
+        // Steps next to the minimum belong to it.
+        const SAME_MINIMUM_STEPS: usize = 2;
+        for (step, &cost) in costs[..=steps].iter().enumerate() {
+            if step.abs_diff(best) > SAME_MINIMUM_STEPS {
+                second = second.min(cost);
+            }
+        }
+        start = first + best as f32;
     }
+    let (lambda, cost) = along.refine(start, REFINE_REACH_PX);
     let limit = params.max_residual * params.max_residual
         + params.residual_per_gradient
             * params.residual_per_gradient
             * conditioning.squared_gradient;
-    let refined = refine(frame, patch, conditioning, middle, start + best as f32, costs[best]);
-    let mean_squared_residual = refined.cost / PATTERN.len() as f32;
+    let mean_squared_residual = cost / PATTERN.len() as f32;
     if !(mean_squared_residual <= limit) {
         return Err(Miss::Mismatch);
     }
-    // Steps next to the minimum belong to it.
-    const SAME_MINIMUM_STEPS: usize = 2;
     let noise_floor = 2.0 * params.image_noise * params.image_noise * PATTERN.len() as f32;
-    let second = costs[..=steps]
-        .iter()
-        .enumerate()
-        .filter(|(step, _)| step.abs_diff(best) > SAME_MINIMUM_STEPS)
-        .fold(f32::INFINITY, |least, (_, &c)| least.min(c));
-    if second < params.min_ambiguity_ratio * refined.cost.max(noise_floor) {
+    if second < params.min_ambiguity_ratio * cost.max(noise_floor) {
         return Err(Miss::Ambiguous);
     }
-    let (u, v) = position(refined.lambda);
+    let (u, v) = (middle.0 + lambda * du, middle.1 + lambda * dv);
     let inverse_depth = line.inverse_depth_at(u, v).ok_or(Miss::OutOfView)?;
     let alpha = conditioning.inverse_depth_per_px;
     Ok(Match {
@@ -272,90 +279,92 @@ pub fn search(
     })
 }
 
-struct Refined {
-    lambda: f32,
-    cost: f32,
+/// The patch as a function of its place λ along the line, pixels from `middle`.
+struct Along<'a> {
+    frame: &'a QuadImage,
+    patch: &'a Patch,
+    conditioning: &'a Conditioning,
+    middle: (f32, f32),
 }
 
-/// Gauss–Newton along the line from the best step, each step clamped, undone when the cost rises.
-#[inline]
-fn refine(
-    frame: &Image<f32>,
-    patch: &Patch,
-    conditioning: &Conditioning,
-    middle: (f32, f32),
-    start: f32,
-    start_cost: f32,
-) -> Refined {
-    const MAX_ITERATIONS: usize = 4;
-    const MAX_STEP_PX: f32 = 0.75;
-    /// Further steps change the depth less than the sampling noise does.
-    const CONVERGED_PX: f32 = 0.02;
-    let (du, dv) = conditioning.direction;
-    let mut best = Refined { lambda: start, cost: start_cost };
-    let mut lambda = start;
-    for _ in 0..MAX_ITERATIONS {
-        let (mut gradient, mut information) = (0.0, 1e-6);
-        for k in 0..PATTERN.len() {
-            let (ou, ov) = conditioning.offsets[k];
-            let (u, v) = (middle.0 + lambda * du + ou, middle.1 + lambda * dv + ov);
-            let residual = bilinear(frame, u, v) - patch.intensity[k];
-            let weight = huber_weight(residual);
-            let g = conditioning.line_gradients[k];
-            gradient += weight * g * residual;
-            information += weight * g * g;
-        }
-        let step = (-gradient / information).clamp(-MAX_STEP_PX, MAX_STEP_PX);
-        let candidate = (lambda + step).clamp(start - 1.0, start + 1.0);
-        let cost =
-            cost(frame, patch, conditioning, middle.0 + candidate * du, middle.1 + candidate * dv);
-        if cost >= best.cost {
-            break;
-        }
-        best = Refined { lambda: candidate, cost };
-        lambda = candidate;
-        if step.abs() < CONVERGED_PX {
-            break;
-        }
-    }
-    best
+/// The patch at one place.
+#[derive(Debug, Clone, Copy)]
+struct Evaluation {
+    /// Σ ρ(residual), ρ(r) = r² up to [`HUBER_GREY`], linear beyond.
+    cost: f32,
+    /// Half its derivative by λ.
+    gradient: f32,
+    /// Gauss–Newton's half second derivative.
+    information: f32,
 }
 
 /// Residuals beyond this many grey levels grow linearly (Engel, Koltun, Cremers 2018).
 const HUBER_GREY: f32 = 9.0;
 
-#[inline]
-fn huber_weight(residual: f32) -> f32 {
-    let magnitude = residual.abs();
-    if magnitude <= HUBER_GREY { 1.0 } else { HUBER_GREY / magnitude }
+impl Along<'_> {
+    #[inline(always)]
+    fn evaluate(&self, lambda: f32) -> Evaluation {
+        let Conditioning { direction, offsets_u, offsets_v, line_gradients, .. } =
+            self.conditioning;
+        let u = self.middle.0 + lambda * direction.0;
+        let v = self.middle.1 + lambda * direction.1;
+        let samples = self.frame.sample(&offsets_u.map(|o| u + o), &offsets_v.map(|o| v + o));
+        let (mut costs, mut gradients, mut informations) = ([0.0; 8], [0.0; 8], [0.0; 8]);
+        for k in 0..PATTERN.len() {
+            let residual = samples[k] - self.patch.intensity[k];
+            let magnitude = residual.abs();
+            let weight = if magnitude <= HUBER_GREY { 1.0 } else { HUBER_GREY / magnitude };
+            costs[k] = weight * (2.0 - weight) * residual * residual;
+            gradients[k] = weight * line_gradients[k] * residual;
+            informations[k] = weight * line_gradients[k] * line_gradients[k];
+        }
+        Evaluation { cost: sum(&costs), gradient: sum(&gradients), information: sum(&informations) }
+    }
+
+    /// Gauss–Newton along the line, each step clamped, undone when the cost rises: where it ends and
+    /// the cost there.
+    #[inline(always)]
+    fn refine(&self, start: f32, reach: f32) -> (f32, f32) {
+        const MAX_ITERATIONS: usize = 4;
+        const MAX_STEP_PX: f32 = 0.75;
+        /// Keeps a patch without gradient from dividing by zero, grey levels².
+        const LEAST_INFORMATION: f32 = 1e-6;
+        /// Further steps change the depth less than the sampling noise does.
+        const CONVERGED_PX: f32 = 0.03;
+        let (mut lambda, mut at) = (start, self.evaluate(start));
+        for _ in 0..MAX_ITERATIONS {
+            let step = -at.gradient / (at.information + LEAST_INFORMATION);
+            let next = (lambda + step.clamp(-MAX_STEP_PX, MAX_STEP_PX))
+                .clamp(start - reach, start + reach);
+            let moved = (next - lambda).abs();
+            let there = self.evaluate(next);
+            if !(there.cost < at.cost) {
+                break;
+            }
+            (lambda, at) = (next, there);
+            if moved < CONVERGED_PX {
+                break;
+            }
+        }
+        (lambda, at.cost)
+    }
 }
 
-/// Σ ρ(residual) of the patch at a position, ρ(r) = r² up to [`HUBER_GREY`], linear beyond.
-#[inline]
-fn cost(frame: &Image<f32>, patch: &Patch, conditioning: &Conditioning, u: f32, v: f32) -> f32 {
-    let mut sum = 0.0;
-    for k in 0..PATTERN.len() {
-        let (ou, ov) = conditioning.offsets[k];
-        let residual = bilinear(frame, u + ou, v + ov) - patch.intensity[k];
-        let magnitude = residual.abs();
-        sum += if magnitude <= HUBER_GREY {
-            magnitude * magnitude
-        } else {
-            HUBER_GREY * (2.0 * magnitude - HUBER_GREY)
-        };
-    }
-    sum
+/// Sum in a fixed order that eight lanes can do.
+#[inline(always)]
+fn sum(x: &[f32; 8]) -> f32 {
+    ((x[0] + x[4]) + (x[2] + x[6])) + ((x[1] + x[5]) + (x[3] + x[7]))
 }
 
 /// Whether a patch at this position lies inside the image; false for NaN.
 #[inline]
-pub fn is_inside(frame: &Image<f32>, u: f32, v: f32) -> bool {
+pub fn is_inside(width: usize, height: usize, u: f32, v: f32) -> bool {
     // The patch reaches 2 px, stretched by at most √3 (see `condition`), and one for the bilinear sample.
     const MARGIN: f32 = BORDER_PX as f32 + 1.0;
     u >= MARGIN
         && v >= MARGIN
-        && u < frame.width() as f32 - 1.0 - MARGIN
-        && v < frame.height() as f32 - 1.0 - MARGIN
+        && u < width as f32 - 1.0 - MARGIN
+        && v < height as f32 - 1.0 - MARGIN
 }
 
 /// Bilinear sample; positions outside take the nearest pixel inside.
@@ -409,6 +418,12 @@ mod tests {
         pixels
     }
 
+    fn quads(pixels: &[u8]) -> QuadImage {
+        let mut image = QuadImage::with_size(CAMERA.width, CAMERA.height);
+        image.fill(pixels);
+        image
+    }
+
     fn image(pixels: &[u8]) -> GradientImage {
         let mut image = GradientImage::with_size(CAMERA.width, CAMERA.height);
         image.fill(pixels);
@@ -420,7 +435,7 @@ mod tests {
         let params =
             MatchingParams { image_noise: 0.5, line_noise_px: 0.02, ..MatchingParams::default() };
         let motion = SE3::exp(&Vector6::new(0.06, 0.02, 0.03, 0.02, -0.03, 0.05));
-        let (keyframe, frame) = (image(&render(&SE3::identity())), image(&render(&motion)));
+        let (keyframe, frame) = (image(&render(&SE3::identity())), quads(&render(&motion)));
         let view = TwoView::new(&CAMERA, &motion);
         let (mut found, mut within, mut errors) = (0, 0, Vec::new());
         for v in (20..130).step_by(7) {
@@ -435,7 +450,7 @@ mod tests {
                     continue;
                 };
                 let Ok(found_match) =
-                    search(&frame.intensity, &line, &patch, &conditioning, &from, &to, &params)
+                    search(&frame, &line, &patch, &conditioning, &from, &to, &params)
                 else {
                     continue;
                 };
@@ -457,7 +472,7 @@ mod tests {
         let motion = SE3::exp(&Vector6::new(0.05, 0.0, 0.0, 0.0, 0.0, 0.0));
         let bright: Vec<u8> =
             render(&motion).iter().map(|&g| (f32::from(g) * 0.8 + 20.0) as u8).collect();
-        let (keyframe, frame) = (image(&render(&SE3::identity())), image(&bright));
+        let (keyframe, frame) = (image(&render(&SE3::identity())), quads(&bright));
         let view = TwoView::new(&CAMERA, &motion);
         let line = view.line(100.0, 75.0);
         let (from, to, at) =
@@ -465,7 +480,7 @@ mod tests {
         let attempt = |gain, offset| {
             let patch = Patch::new(&keyframe, 100, 75, gain, offset);
             let conditioning = condition(&view, &line, &at, &patch, &params).unwrap();
-            search(&frame.intensity, &line, &patch, &conditioning, &from, &to, &params)
+            search(&frame, &line, &patch, &conditioning, &from, &to, &params)
         };
         assert!((attempt(0.8, 20.0).unwrap().inverse_depth - 0.8).abs() < 0.03);
         assert!(attempt(1.0, 0.0).map_or(true, |m| m.mean_squared_residual > 10.0));
@@ -475,7 +490,7 @@ mod tests {
     fn a_segment_outside_the_image_or_too_long_is_a_miss() {
         let params = MatchingParams::default();
         let motion = SE3::exp(&Vector6::new(0.5, 0.0, 0.0, 0.0, 0.0, 0.0));
-        let (keyframe, frame) = (image(&render(&SE3::identity())), image(&render(&motion)));
+        let (keyframe, frame) = (image(&render(&SE3::identity())), quads(&render(&motion)));
         let view = TwoView::new(&CAMERA, &motion);
         let attempt = |u: usize, d: (f32, f32)| {
             let line = view.line(u as f32, 75.0);
@@ -483,7 +498,7 @@ mod tests {
             let at = line.project(0.8).unwrap();
             let conditioning = condition(&view, &line, &at, &patch, &params).unwrap();
             search(
-                &frame.intensity,
+                &frame,
                 &line,
                 &patch,
                 &conditioning,

@@ -3,4 +3,5 @@
 pub mod buffer;
 pub mod gray;
 pub mod pyramid;
+pub mod quads;
 pub mod sums;

@@ -10,7 +10,7 @@ use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::buffer::Image;
 use crate::slam::initializer::{StartEvidence, StartMethod, proven_ratio, randomise};
 use crate::slam::keyframe::MapState;
-use crate::slam::mapper::{Mapper, StepOutcome, float_from_grey};
+use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::pose::{PoseEstimate, TrackingState};
 use crate::slam::two_frame::evidence::Waiting;
 use crate::slam::two_frame::{InitOutcome, InitState};
@@ -112,7 +112,7 @@ impl Mapper {
         let first_pixels = self.two_frame.first_pixels().to_vec();
         self.depth.restart(&first_pixels, self.params.min_gradient, self.params.max_candidates);
         self.two_frame.fill(&mut self.depth);
-        float_from_grey(&mut self.frame, frame.pixels);
+        self.frame.fill(frame.pixels);
         let observer = Observer {
             image: &self.frame,
             view: TwoView::new(&self.intrinsics, &start.first_from_current.inverse()),
