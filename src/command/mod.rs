@@ -1,9 +1,9 @@
 //! The command line: arguments → configuration → shell → exit code.
 
-pub mod progress;
-pub mod simulate;
 pub mod evaluate;
+pub mod progress;
 pub mod replay;
+pub mod simulate;
 
 use std::process::ExitCode;
 

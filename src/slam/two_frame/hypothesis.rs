@@ -123,14 +123,10 @@ fn bring_forward_distinct(sorted: &mut [Hypothesis]) -> usize {
         t / t.norm().max(f64::MIN_POSITIVE)
     };
     let best = heading(&sorted[0]);
-    let other = sorted.iter().position(|h| heading(h).dot(&best) < SAME_COSINE);
-    match other {
-        Some(other) => {
-            sorted.swap(1, other);
-            NUM_SURVIVORS
-        }
-        None => 1,
-    }
+    let other = (1..sorted.len()).find(|&i| heading(&sorted[i]).dot(&best) < SAME_COSINE);
+    let Some(other) = other else { return 1 };
+    sorted.swap(1, other);
+    NUM_SURVIVORS
 }
 
 /// The mirrored pose: the translation reversed, the rotation on the other side of the one that explains
@@ -148,7 +144,7 @@ fn stepped(rotation_alone: &SE3, axis: usize) -> SE3 {
     /// In mean depths: about where a start is proven.
     const STEP: f64 = 0.02;
     let mut step = Vector3::zeros();
-    step[axis / 2] = if axis % 2 == 0 { STEP } else { -STEP };
+    step[axis % 3] = if axis < 3 { STEP } else { -STEP };
     // At depth 1 the centre moves by (t_x + ω_y, t_y − ω_x).
     let turn = SE3::exp(&Vector6::new(0.0, 0.0, 0.0, step.y, -step.x, 0.0));
     SE3 { rotation: turn.rotation * rotation_alone.rotation, translation: step }
