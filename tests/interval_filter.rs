@@ -39,7 +39,9 @@ fn sequence(seed: u64, noise_std_dev: f64) -> Sequence {
         (image.intensity.clone(), TwoView::new(&intrinsics, &(pose.inverse() * poses[0])))
     });
     let frames = frames.collect();
-    Sequence { keyframe: images[0].clone(), depth: simulator.depth_of(0), frames }
+    let nanos = simulator.ground_truth()[0].nanos;
+    let depth = simulator.depth_at(nanos).unwrap().unwrap();
+    Sequence { keyframe: images[0].clone(), depth, frames }
 }
 
 /// Shares of `Good` traces whose interval holds the truth.

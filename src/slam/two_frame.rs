@@ -6,6 +6,7 @@
 
 pub mod evidence;
 pub mod fit;
+pub mod hypothesis;
 pub mod points;
 pub mod spread;
 pub mod system;
@@ -26,6 +27,7 @@ use crate::slam::two_frame::evidence::{
 use crate::slam::two_frame::fit::{
     FitInput, FitParams, FitScratch, Freedom, depth_variances, fit_level,
 };
+use crate::slam::two_frame::hypothesis::Hypotheses;
 use crate::slam::two_frame::points::Points;
 use crate::slam::two_frame::spread::spread;
 use crate::slam::two_frame::system::State;
@@ -138,13 +140,17 @@ pub struct TwoFrameInitializer {
     images: Vec<GradientImage>,
     first_pixels: Vec<u8>,
     points: Points,
-    joint: State,
-    alternative: State,
+    joint: Hypotheses,
     rotation: State,
-    fit_scratch: FitScratch,
     rotation_scratch: FitScratch,
+    /// The latest result: pose, brightness, inverse depth of each point and its variance.
+    current_from_first: SE3,
+    brightness: Brightness,
+    inverse_depths: Vec<f32>,
     variances: Vec<f32>,
     sorted: Vec<f32>,
+    /// Significance of the parallax in the latest frame.
+    significance: f64,
     /// Direction from the first camera to the one before, in the first frame.
     heading: Vector3<f64>,
     frames: u32,
@@ -173,12 +179,14 @@ impl TwoFrameInitializer {
             intrinsics,
             first_pixels: Vec::new(),
             points: Points::default(),
-            joint: state.clone(),
-            alternative: state.clone(),
+            joint: Hypotheses::new(&state),
             rotation: state,
-            fit_scratch: FitScratch::default(),
             rotation_scratch: FitScratch::default(),
+            current_from_first: SE3::identity(),
+            brightness: Brightness::default(),
+            inverse_depths: Vec::new(),
             variances: Vec::new(),
+            significance: 0.0,
             sorted: Vec::new(),
             heading: Vector3::zeros(),
             frames: 0,
@@ -199,12 +207,16 @@ impl TwoFrameInitializer {
             return false;
         }
         self.first_pixels.extend_from_slice(pixels);
-        for state in [&mut self.joint, &mut self.alternative, &mut self.rotation] {
-            state.current_from_first = SE3::identity();
-            state.brightness = Brightness::default();
-            state.inverse_depths.clear();
-            state.inverse_depths.resize(found, 1.0);
-        }
+        self.rotation.current_from_first = SE3::identity();
+        self.rotation.brightness = Brightness::default();
+        self.rotation.inverse_depths.clear();
+        self.rotation.inverse_depths.resize(found, 1.0);
+        self.joint.restart();
+        self.current_from_first = SE3::identity();
+        self.brightness = Brightness::default();
+        self.inverse_depths.clear();
+        self.variances.clear();
+        self.significance = 0.0;
         (self.frames, self.confirmed, self.mismatches) = (0, 0, 0);
         true
     }
@@ -250,7 +262,7 @@ impl TwoFrameInitializer {
     pub fn depths(&self) -> impl Iterator<Item = InitialDepth> {
         /// A depth is usable when it is known to within half of itself.
         const USABLE_STD_DEV_RATIO: f32 = 0.5;
-        let depths = self.joint.inverse_depths.iter().zip(&self.variances);
+        let depths = self.inverse_depths.iter().zip(&self.variances);
         self.points.pixels.iter().zip(depths).filter_map(
             |(&(u, v), (&inverse_depth, &variance))| {
                 let usable =
@@ -284,57 +296,40 @@ impl TwoFrameInitializer {
         }
     }
 
-    /// Everything, coarse to fine: from the frame before, from rest and from the mirrored solution,
-    /// because with little parallax a fit can settle in the wrong one of several minima and stay there.
-    /// The best goes on to the finest level.
+    /// Pose, brightness and depths together, coarse to fine, from several starts.
     fn fit_jointly(&mut self) {
-        let mirror = mirrored(&self.joint, &self.rotation);
-        let mut best = self.fit_coarsely();
-        for start in [at_rest(&self.rotation), mirror] {
-            std::mem::swap(&mut self.joint, &mut self.alternative);
-            self.joint.clone_from(&start);
-            let energy = self.fit_coarsely();
-            if energy < best {
-                best = energy;
-            } else {
-                std::mem::swap(&mut self.joint, &mut self.alternative);
-            }
-        }
-        self.fit_joint_level(0);
-    }
-
-    /// Fits all levels but the finest; the energy on the last of them.
-    fn fit_coarsely(&mut self) -> f64 {
-        (1..self.images.len()).rev().fold(0.0, |_, level| self.fit_joint_level(level))
-    }
-
-    fn fit_joint_level(&mut self, level: usize) -> f64 {
+        /// Significance of the frame before from which on parallax may show.
+        const PARALLAX_SIGNIFICANCE: f64 = 3.0;
         let input =
             FitInput { images: &self.images, intrinsics: &self.intrinsics, points: &self.points };
-        let (state, scratch) = (&mut self.joint, &mut self.fit_scratch);
-        fit_level(&input, level, Freedom::Everything, state, scratch, &self.params.fit)
+        let with_directions = self.significance > PARALLAX_SIGNIFICANCE;
+        self.joint.fit(&input, &self.rotation, with_directions, &self.params.fit);
     }
 
     /// Variances and figures of the latest fit; then the scale goes to mean inverse depth 1.
     fn judge(&mut self) -> Evidence {
-        let (joint, rotation) = (&self.fit_scratch.system, &self.rotation_scratch.system);
+        let (state, scratch) = self.joint.best();
+        let (joint, rotation) = (&scratch.system, &self.rotation_scratch.system);
         let floor = self.params.fit.image_noise.powi(2);
         let noise = residual_variance(joint, &mut self.sorted).max(floor);
         let match_variance = self.params.match_noise_px.powi(2);
-        depth_variances(&self.joint, joint, noise, match_variance, &mut self.variances);
-        let evidence = judge(&self.joint, joint, &self.variances, rotation, &mut self.sorted);
-        let visible =
-            joint.points.iter().zip(&self.joint.inverse_depths).filter(|(p, _)| p.visible);
+        depth_variances(state, joint, noise, match_variance, &mut self.variances);
+        let evidence = judge(state, joint, &self.variances, rotation, &mut self.sorted);
+        let visible = joint.points.iter().zip(&state.inverse_depths).filter(|(p, _)| p.visible);
         let mean =
             visible.map(|(_, d)| f64::from(*d)).sum::<f64>() / joint.num_visible.max(1) as f64;
         /// A mean below this is not a scale but a failed fit.
         const MIN_MEAN: f64 = 0.05;
         if mean > MIN_MEAN {
             let factor = (1.0 / mean) as f32;
-            self.joint.current_from_first.translation *= mean;
-            self.joint.inverse_depths.iter_mut().for_each(|d| *d *= factor);
+            state.current_from_first.translation *= mean;
+            state.inverse_depths.iter_mut().for_each(|d| *d *= factor);
             self.variances.iter_mut().for_each(|v| *v *= factor * factor);
         }
+        self.significance = evidence.significance;
+        self.inverse_depths.clone_from(&state.inverse_depths);
+        self.current_from_first = state.current_from_first;
+        self.brightness = state.brightness;
         evidence
     }
 
@@ -342,7 +337,7 @@ impl TwoFrameInitializer {
     fn count_confirmation(&mut self, proves: bool) {
         /// Cosine of 20°: a hand does not turn its path by more within a frame, a wrong minimum does.
         const MIN_AGREEMENT: f64 = 0.94;
-        let travelled = self.joint.current_from_first.inverse().translation;
+        let travelled = self.current_from_first.inverse().translation;
         let heading = travelled / travelled.norm().max(f64::MIN_POSITIVE);
         let agrees = heading.dot(&self.heading) >= MIN_AGREEMENT;
         self.confirmed = match (proves, agrees) {
@@ -357,8 +352,8 @@ impl TwoFrameInitializer {
         InitOutcome {
             state,
             evidence,
-            first_from_current: self.joint.current_from_first.inverse(),
-            brightness: self.joint.brightness,
+            first_from_current: self.current_from_first.inverse(),
+            brightness: self.brightness,
         }
     }
 }
@@ -371,26 +366,6 @@ fn num_levels(intrinsics: &Intrinsics) -> usize {
     let fits =
         |l: &usize| intrinsics.width >> l >= MIN_WIDTH && intrinsics.height >> l >= MIN_HEIGHT;
     (0..MAX_LEVELS).take_while(fits).count().max(1)
-}
-
-/// The solution of a pure rotation, all depths 1.
-fn at_rest(rotation: &State) -> State {
-    State { inverse_depths: vec![1.0; rotation.inverse_depths.len()], ..rotation.clone() }
-}
-
-/// The other solution that a narrow view allows: near and far exchanged, the translation reversed, the
-/// rotation on the other side of the one that explains the frame best without translation.
-fn mirrored(state: &State, rotation: &State) -> State {
-    let best = rotation.current_from_first.rotation;
-    let turned = best * state.current_from_first.rotation.inverse() * best;
-    State {
-        current_from_first: SE3 {
-            rotation: turned,
-            translation: -state.current_from_first.translation,
-        },
-        brightness: state.brightness,
-        inverse_depths: state.inverse_depths.iter().map(|d| (2.0 - d).clamp(0.1, 2.0)).collect(),
-    }
 }
 
 #[cfg(test)]

@@ -125,3 +125,126 @@ fn with_the_noise_of_a_camera_most_sure_traces_hold_the_truth() {
     assert!(coverage.sure > 1000);
     assert!(coverage.sure_holds * 100 >= coverage.sure * 85);
 }
+
+/// Statuses and intervals on a path of which every step is longer than the one before.
+#[test]
+fn the_interval_shrinks_as_the_baseline_grows() {
+    let sequence = Sequence::new(4, 16, 1.0);
+    let mut filter = IntervalFilter::default();
+    let params = IntervalParams::default();
+    filter.restart(&sequence.keyframe, &CandidateParams { wanted: 500, ..Default::default() });
+    let starts: Vec<(u16, u16)> = filter.points().iter().map(|p| (p.u, p.v)).collect();
+    let mut histories = Vec::new();
+    for start in starts {
+        let frames = (0..16).map(|i| sequence.frame(i));
+        histories.push(interval_history(&sequence.keyframe, start, frames, &params));
+    }
+    let width = |s: &IntervalSample| Some(s.max_inverse_depth? - s.min_inverse_depth);
+    let median_after = |frame: usize| {
+        let mut widths: Vec<f32> = histories
+            .iter()
+            .filter(|h| h[15].status == TraceStatus::Good || h[15].status == TraceStatus::Skipped)
+            .filter_map(|h| width(&h[frame]))
+            .collect();
+        widths.sort_by(f32::total_cmp);
+        assert!(widths.len() > 100, "{}", widths.len());
+        widths[widths.len() / 2]
+    };
+    let medians = [0, 3, 7, 15].map(median_after);
+    // The baseline doubles from one to the next, twice from the first: so does the certainty.
+    assert!(medians.windows(2).all(|w| w[1] < 0.7 * w[0]), "{medians:?}");
+    assert!(medians[3] < 0.12 * medians[0], "{medians:?}");
+    let (near, all) = histories.iter().fold((0, 0), |(n, a), h| match h[15].status {
+        TraceStatus::Good => (n + usize::from(h[15].segment_px < 8.0), a + 1),
+        _ => (n, a),
+    });
+    assert!(near * 2 > all);
+}
+
+#[test]
+fn a_scaled_world_gives_the_same_verdicts() {
+    let sequence = Sequence::new(2, 6, 2.0);
+    let params = IntervalParams::default();
+    let wanted = CandidateParams { wanted: 300, ..Default::default() };
+    let poses = path(2, 7);
+    // A power of two leaves the digits as they are, so that even ties fall the same way.
+    let factor = 8.0;
+    let (mut filter, mut scaled) = (IntervalFilter::default(), IntervalFilter::default());
+    filter.restart(&sequence.keyframe, &wanted);
+    scaled.restart(&sequence.keyframe, &wanted);
+    for i in 0..6 {
+        let mut current_from_keyframe = poses[i + 1].inverse() * poses[0];
+        current_from_keyframe.translation *= factor;
+        let view = TwoView::new(&CAMERA, &current_from_keyframe);
+        let counts = filter.trace(&sequence.frame(i), &params);
+        assert_eq!(scaled.trace(&TraceFrame { view, ..sequence.frame(i) }, &params), counts);
+    }
+    scaled.rescale(factor as f32);
+    for (a, b) in filter.points().iter().zip(scaled.points()) {
+        assert_eq!((a.status, a.quality), (b.status, b.quality));
+        assert_eq!(
+            (a.min_inverse_depth, a.max_inverse_depth),
+            (b.min_inverse_depth, b.max_inverse_depth)
+        );
+    }
+}
+
+#[test]
+fn the_brightness_of_a_frame_is_taken_out() {
+    let sequence = Sequence::new(3, 4, 1.0);
+    let params = IntervalParams::default();
+    let mut outliers = [0, 0];
+    for (known, outliers) in [true, false].into_iter().zip(&mut outliers) {
+        let mut filter = IntervalFilter::default();
+        filter.restart(&sequence.keyframe, &CandidateParams { wanted: 500, ..Default::default() });
+        for i in 0..4 {
+            let frame = sequence.frame(i);
+            let mut image = frame.image.clone();
+            image.pixels_mut().iter_mut().for_each(|p| *p = 0.7 * *p + 50.0);
+            let brightness = Brightness { a: 0.7f64.ln(), b: 50.0 };
+            let brightness = if known { brightness } else { Brightness::default() };
+            let frame = TraceFrame { image: &image, brightness, ..frame };
+            *outliers += filter.trace(&frame, &params).outlier;
+        }
+    }
+    assert!(outliers[0] * 4 < outliers[1], "{outliers:?}");
+}
+
+#[test]
+fn every_status_is_reached_and_endings_are_final() {
+    let sequence = Sequence::new(1, 2, 0.0);
+    let params = IntervalParams::default();
+    let point = |u, v| ImmaturePoint::new(&sequence.keyframe, u, v).unwrap();
+    assert!(ImmaturePoint::new(&sequence.keyframe, 1, 100).is_none());
+    assert!(ImmaturePoint::new(&sequence.keyframe, u16::MAX, 100).is_none());
+    let frame_at = |x: f64, z: f64| TraceFrame {
+        view: TwoView::new(&CAMERA, &SE3::exp(&Vector6::new(x, 0.0, z, 0.0, 0.0, 0.0))),
+        ..sequence.frame(0)
+    };
+    // Nothing moves: nothing to gain.
+    assert_eq!(point(160, 120).trace(&frame_at(0.0, 0.0), &params), TraceStatus::BadCondition);
+    // At the border, the search would leave the image; then nothing more is tried.
+    let mut leaving = point(315, 120);
+    assert_eq!(leaving.trace(&frame_at(0.1, 0.0), &params), TraceStatus::OutOfBounds);
+    assert_eq!(leaving.trace(&sequence.frame(0), &params), TraceStatus::OutOfBounds);
+    assert!(leaving.is_ended());
+    // A black frame matches nothing, the second one ends it.
+    let black = Image::filled(CAMERA.width, CAMERA.height, 0.0);
+    let dark = TraceFrame { image: &black, ..frame_at(-0.05, 0.0) };
+    let mut outlier = point(160, 120);
+    assert_eq!(outlier.trace(&dark, &params), TraceStatus::Outlier);
+    assert!(!outlier.is_ended());
+    assert_eq!(outlier.trace(&dark, &params), TraceStatus::Outlier);
+    assert!(outlier.is_ended());
+    // A narrow interval is skipped, a wide one across the gradient is not worth a search.
+    let mut certain = point(160, 120);
+    (certain.min_inverse_depth, certain.max_inverse_depth) = (0.30, Some(0.301));
+    assert_eq!(certain.trace(&frame_at(-0.05, 0.0), &params), TraceStatus::Skipped);
+    let ramp: Vec<u8> =
+        (0..CAMERA.width * CAMERA.height).map(|i| (i / CAMERA.width) as u8).collect();
+    let across = gradient_image(&ramp);
+    let mut blind = ImmaturePoint::new(&across, 160, 120).unwrap();
+    (blind.min_inverse_depth, blind.max_inverse_depth) = (0.1, Some(0.5));
+    let sideways = TraceFrame { image: &across.intensity, ..frame_at(-0.05, 0.0) };
+    assert_eq!(blind.trace(&sideways, &params), TraceStatus::BadCondition);
+}

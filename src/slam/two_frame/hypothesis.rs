@@ -1,0 +1,151 @@
+//! Several starts of the joint fit, of which the best is kept.
+//!
+//! With little parallax the energy has several minima (near and far exchanged, a translation taken for
+//! a rotation), and a fit that began in the wrong one stays there while the baseline grows. So each
+//! frame is fitted from where the two best fits of the frame before ended, from rest, from the mirrored
+//! solution and, once there is something to see, from a small step in each direction.
+
+use nalgebra::{Vector3, Vector6};
+use rayon::prelude::*;
+
+use crate::slam::geometry::se3::SE3;
+use crate::slam::two_frame::fit::{FitInput, FitParams, FitScratch, Freedom, fit_level};
+use crate::slam::two_frame::system::State;
+
+/// Survivors, rest, mirror and six directions.
+const MAX_HYPOTHESES: usize = NUM_SURVIVORS + 2 + 6;
+/// Fits that go on to the finest level and to the next frame.
+const NUM_SURVIVORS: usize = 2;
+
+/// One start and where it came to.
+#[derive(Debug)]
+struct Hypothesis {
+    state: State,
+    energy: f64,
+    scratch: FitScratch,
+}
+
+/// The hypotheses of one frame, best first after a fit.
+#[derive(Debug)]
+pub struct Hypotheses {
+    all: Vec<Hypothesis>,
+    used: usize,
+    /// How many of the first ones are results of the frame before.
+    survivors: usize,
+}
+
+impl Hypotheses {
+    /// Memory for all of them; every state the same.
+    pub fn new(state: &State) -> Self {
+        let empty = |_| Hypothesis {
+            state: state.clone(),
+            energy: f64::INFINITY,
+            scratch: FitScratch::default(),
+        };
+        Self { all: (0..MAX_HYPOTHESES).map(empty).collect(), used: 0, survivors: 0 }
+    }
+
+    /// Forgets what earlier frames have shown.
+    pub fn restart(&mut self) {
+        (self.used, self.survivors) = (0, 0);
+    }
+
+    /// Fits all hypotheses to a frame. `rotation` is its fit without translation; `with_directions` adds
+    /// the starts that are worth their time only where there is parallax. The result does not depend on
+    /// the number of threads.
+    pub fn fit(
+        &mut self,
+        input: &FitInput<'_>,
+        rotation: &State,
+        with_directions: bool,
+        params: &FitParams,
+    ) {
+        self.propose(rotation, with_directions);
+        let fit_down_to = |finest: usize, from: usize, hypothesis: &mut Hypothesis| {
+            for level in (finest..from).rev() {
+                let (state, scratch) = (&mut hypothesis.state, &mut hypothesis.scratch);
+                hypothesis.energy =
+                    fit_level(input, level, Freedom::Everything, state, scratch, params);
+            }
+        };
+        let levels = input.images.len();
+        let all = &mut self.all[..self.used];
+        all.par_iter_mut().for_each(|h| fit_down_to(1.min(levels - 1), levels, h));
+        all.sort_by(|a, b| a.energy.total_cmp(&b.energy));
+        self.survivors = bring_forward_distinct(all);
+        if levels > 1 {
+            all[..self.survivors].par_iter_mut().for_each(|h| fit_down_to(0, 1, h));
+            all[..self.survivors].sort_by(|a, b| a.energy.total_cmp(&b.energy));
+        }
+    }
+
+    /// The best fit with its normal equations at the finest level; before any fit the state given first.
+    pub fn best(&mut self) -> (&mut State, &FitScratch) {
+        let best = &mut self.all[0];
+        (&mut best.state, &best.scratch)
+    }
+
+    /// Sets the starts behind the survivors.
+    fn propose(&mut self, rotation: &State, with_directions: bool) {
+        self.used = self.survivors;
+        self.add(rotation, rotation.current_from_first, |_| 1.0);
+        if self.survivors > 0 {
+            let best = self.all[0].state.clone();
+            let pose = mirrored(&best.current_from_first, &rotation.current_from_first);
+            // Near and far exchanged about the mean; a point nearer than twice that goes far away.
+            self.add(&best, pose, |d| (2.0 - d).clamp(0.1, 2.0));
+        }
+        if with_directions {
+            for axis in 0..6 {
+                let pose = stepped(&rotation.current_from_first, axis);
+                self.add(rotation, pose, |_| 1.0);
+            }
+        }
+    }
+
+    fn add(&mut self, like: &State, current_from_first: SE3, depth: impl Fn(f32) -> f32) {
+        let state = &mut self.all[self.used].state;
+        state.current_from_first = current_from_first;
+        state.brightness = like.brightness;
+        state.inverse_depths.clear();
+        state.inverse_depths.extend(like.inverse_depths.iter().map(|&d| depth(d)));
+        self.used += 1;
+    }
+}
+
+/// Moves the best hypothesis that went another way than the best of all to the second place; how many
+/// survive.
+fn bring_forward_distinct(sorted: &mut [Hypothesis]) -> usize {
+    /// Cosine of 15° between directions that count as the same.
+    const SAME_COSINE: f64 = 0.966;
+    let heading = |h: &Hypothesis| {
+        let t = h.state.current_from_first.translation;
+        t / t.norm().max(f64::MIN_POSITIVE)
+    };
+    let best = heading(&sorted[0]);
+    let other = (1..sorted.len()).find(|&i| heading(&sorted[i]).dot(&best) < SAME_COSINE);
+    let Some(other) = other else { return 1 };
+    sorted.swap(1, other);
+    NUM_SURVIVORS
+}
+
+/// The mirrored pose: the translation reversed, the rotation on the other side of the one that explains
+/// the frame best without translation.
+fn mirrored(current_from_first: &SE3, rotation_alone: &SE3) -> SE3 {
+    let best = rotation_alone.rotation;
+    SE3 {
+        rotation: best * current_from_first.rotation.inverse() * best,
+        translation: -current_from_first.translation,
+    }
+}
+
+/// A step along one of ±x, ±y, ±z with the turn that keeps the centre of the image where it is.
+fn stepped(rotation_alone: &SE3, axis: usize) -> SE3 {
+    /// In mean depths: about where a start is proven.
+    const STEP: f64 = 0.02;
+    let mut step = Vector3::zeros();
+    step[axis % 3] = if axis < 3 { STEP } else { -STEP };
+    // At depth 1 the centre moves by (t_x + ω_y, t_y − ω_x).
+    let turn = SE3::exp(&Vector6::new(0.0, 0.0, 0.0, step.y, -step.x, 0.0));
+    SE3 { rotation: turn.rotation * rotation_alone.rotation, translation: step }
+}
