@@ -3,11 +3,10 @@
 use nalgebra::{Matrix6, SVector, Vector3};
 use serde::{Deserialize, Serialize};
 
+use crate::slam::alignment::kernel::{Kernel, SimdMode};
 use crate::slam::alignment::normal_equations::{NormalEquations, UNKNOWNS, pose_step};
 use crate::slam::alignment::reference::Reference;
-use crate::slam::alignment::residual::{
-    Evaluation, Weighting, accumulate_reference, mean_squared_flow,
-};
+use crate::slam::alignment::residual::{Evaluation, Weighting, mean_squared_flow};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::sums::{MAX_LEVELS, SumPyramid};
@@ -48,6 +47,8 @@ pub struct AlignmentParams {
     pub energy_tolerance: f64,
     /// Smallest share of the level's points that must be in view.
     pub min_in_view: f64,
+    /// Which instructions are used.
+    pub simd: SimdMode,
     /// Inflation s² of the covariance: neighbouring residuals are correlated and the model is
     /// not perfect. Fitted by the example `calibrate_covariance` on simulated scenes.
     pub covariance_inflation: f64,
@@ -70,6 +71,7 @@ impl Default for AlignmentParams {
             step_tolerance_grey: 0.1,
             energy_tolerance: 0.999,
             min_in_view: 0.05,
+            simd: SimdMode::Auto,
             covariance_inflation: 1.0,
         }
     }
@@ -159,12 +161,14 @@ impl Alignment {
 #[derive(Debug, Clone)]
 pub struct Aligner {
     params: AlignmentParams,
+    kernel: Kernel,
 }
 
 impl Aligner {
     /// An aligner with these parameters.
     pub fn new(params: AlignmentParams) -> Self {
-        Self { params }
+        let kernel = Kernel::choose(params.simd);
+        Self { params, kernel }
     }
 
     /// Its parameters.
@@ -194,7 +198,7 @@ impl Aligner {
             &weighting,
             variance_translation,
         );
-        let mut sums = accumulate_reference(reference.level(level), frame.level(level), &at);
+        let mut sums = self.kernel.accumulate(reference.level(level), frame.level(level), &at);
         if self.params.estimate_brightness {
             let information = |std_dev: f64| 1.0 / (std_dev * std_dev);
             sums.add_prior(6, brightness.a, 0.0, information(self.params.gain_prior_std_dev));
@@ -320,22 +324,22 @@ impl Aligner {
             let in_view = f64::from(candidate.sums.in_view);
             let keeps_view = in_view >= MIN_KEPT_IN_VIEW * f64::from(state.sums.in_view);
             let ratio = candidate.sums.mean_energy() / state.sums.mean_energy();
-            if keeps_view && in_view >= min_in_view && ratio < 1.0 {
+            let relit = TYPICAL_GREY * step[6].abs() + step[7].abs();
+            let is_small =
+                moved_px < self.params.step_tolerance_px && relit < self.params.step_tolerance_grey;
+            if keeps_view && in_view >= min_in_view && ratio < TOLERATED_RISE {
                 state = candidate;
                 lambda = if lambda <= FIRST_DAMPING { 0.0 } else { 0.5 * lambda };
                 failures = 0;
-                if ratio > self.params.energy_tolerance {
+                let is_flat = ratio > self.params.energy_tolerance;
+                if is_small || (is_flat && moved_px < FLAT_STEP_PX) {
                     break;
                 }
             } else {
                 (lambda, failures) = worse(lambda, failures);
-                if failures > MAX_FAILURES {
+                if is_small || failures > MAX_FAILURES {
                     break;
                 }
-            }
-            let relit = TYPICAL_GREY * step[6].abs() + step[7].abs();
-            if moved_px < self.params.step_tolerance_px && relit < self.params.step_tolerance_grey {
-                break;
             }
         }
         alignment.state = state;
@@ -369,6 +373,14 @@ const TYPICAL_GREY: f64 = 128.0;
 
 /// λ after the first failure, and the bound below which a success sets it to zero.
 const FIRST_DAMPING: f64 = 0.2;
+
+/// A step is taken although it raises the mean energy by less than this: interpolation smooths
+/// noise, so that the energy is lowest between pixels, while the gradient is not misled.
+const TOLERATED_RISE: f64 = 1.02;
+
+/// An energy that no longer falls ends a level only when the step is below this, pixels of the
+/// level: the energy says little about where its minimum is.
+const FLAT_STEP_PX: f64 = 0.1;
 
 /// Failures in a row after which a level is given up as converged: λ has grown by 2¹⁵ then.
 const MAX_FAILURES: u32 = 5;

@@ -1,6 +1,13 @@
 //! The depth pyramid: a parent's inverse depth is the inverse-variance weighted mean of its valid
 //! children, its variance their harmonic mean n/Σ(1/V), because neighbours are correlated and
 //! down-sampling must not gain information.
+//!
+//! Where depth jumps, an edge in the image moves with what is in front: children behind the
+//! nearest one are left out, and so are pixels beside a nearer one.
+//!
+//! How much noise the mean really keeps is known only from the data: the scatter of children about
+//! their parent says which share κ of their variance is independent. It averages down, the rest
+//! stays: N_parent = N (κ/n + 1 − κ).
 
 use crate::slam::image::sums::MAX_LEVELS;
 use crate::slam::keyframe::{DepthPoint, MAX_KEYFRAME_POINTS};
@@ -16,6 +23,8 @@ pub struct Candidate {
     pub inverse_depth: f32,
     /// Variance of the inverse depth.
     pub variance: f32,
+    /// Variance of the noise that is left in the inverse depth, at most `variance`.
+    pub noise: f32,
 }
 
 /// All pixels with depth of one level, row by row on the levels above 0.
@@ -46,7 +55,7 @@ impl Candidates {
     }
 
     /// Mean inverse depth, `None` without points.
-    pub fn mean_inverse_depth(&self) -> Option<f64> {
+    fn mean_inverse_depth(&self) -> Option<f64> {
         let sum: f64 = self.points.iter().map(|point| f64::from(point.inverse_depth)).sum();
         (!self.points.is_empty()).then(|| sum / self.points.len() as f64)
     }
@@ -55,16 +64,44 @@ impl Candidates {
 /// Sums of the children of one parent.
 #[derive(Debug, Clone, Copy, Default)]
 struct Cell {
+    nearest: f32,
+    nearest_variance: f32,
     information: f32,
-    weighted_inverse_depth: f32,
+    weighted: f32,
+    weighted_square: f32,
+    noise: f32,
     children: f32,
 }
+
+impl Cell {
+    /// Whether depth jumps from `self` back to a pixel of this inverse depth and variance.
+    fn is_in_front_of(&self, inverse_depth: f32, variance: f32) -> bool {
+        let step = self.nearest - inverse_depth - JUMP_RATIO * self.nearest;
+        step > 0.0 && step * step > JUMP_SIGMAS * JUMP_SIGMAS * (variance + self.nearest_variance)
+    }
+
+    fn inverse_depth(&self) -> f32 {
+        self.weighted / self.information
+    }
+
+    fn variance(&self) -> f32 {
+        self.children / self.information
+    }
+}
+
+/// Depth jumps where neighbours differ by this share of the nearer one's inverse depth (a wall seen
+/// at 80° changes by about a hundredth a pixel at level 0) …
+const JUMP_RATIO: f32 = 0.04;
+
+/// … and by this many standard deviations more.
+const JUMP_SIGMAS: f32 = 3.0;
 
 /// Builds the depth pyramid, in memory that is used again.
 #[derive(Debug, Clone, Default)]
 pub struct DepthFusion {
     levels: [Candidates; MAX_LEVELS],
     cells: Vec<Cell>,
+    mean_inverse_depth: Option<f64>,
 }
 
 impl DepthFusion {
@@ -85,12 +122,19 @@ impl DepthFusion {
             v: point.v,
             inverse_depth: point.inverse_depth,
             variance: point.variance,
+            noise: point.variance,
         }));
+        self.mean_inverse_depth = self.levels[0].mean_inverse_depth();
         for level in 1..num_levels.min(MAX_LEVELS) {
             let (fine, coarse) = self.levels.split_at_mut(level);
             let (width, height) = (width >> level, height >> level);
-            halve(&fine[level - 1], &mut coarse[0], &mut self.cells, width, height);
+            halve(&mut fine[level - 1], &mut coarse[0], &mut self.cells, width, height);
         }
+    }
+
+    /// Mean inverse depth of all points of level 0, `None` without points.
+    pub fn mean_inverse_depth(&self) -> Option<f64> {
+        self.mean_inverse_depth
     }
 
     /// The pixels with depth of one level.
@@ -105,8 +149,9 @@ fn is_positive(value: f32) -> bool {
     SANE.contains(&value)
 }
 
+/// Fuses `fine` into `coarse`, and drops from `fine` what lies behind a jump in depth.
 fn halve(
-    fine: &Candidates,
+    fine: &mut Candidates,
     coarse: &mut Candidates,
     cells: &mut Vec<Cell>,
     width: usize,
@@ -114,29 +159,70 @@ fn halve(
 ) {
     cells.clear();
     cells.resize(width * height, Cell::default());
-    for child in &fine.points {
+    let cell_of = |child: &Candidate| {
         let (u, v) = (usize::from(child.u / 2), usize::from(child.v / 2));
-        if u >= width || v >= height {
-            continue;
+        (u < width && v < height).then_some(v * width + u)
+    };
+    for child in &fine.points {
+        if let Some(index) = cell_of(child)
+            && child.inverse_depth > cells[index].nearest
+        {
+            cells[index].nearest = child.inverse_depth;
+            cells[index].nearest_variance = child.variance;
         }
-        let cell = &mut cells[v * width + u];
+    }
+    fine.points.retain(|child| {
+        let Some(index) = cell_of(child) else { return true };
+        !is_behind_a_jump(cells, width, index, child)
+    });
+    for child in &fine.points {
+        let Some(index) = cell_of(child) else { continue };
+        let cell = &mut cells[index];
         let information = 1.0 / child.variance;
         cell.information += information;
-        cell.weighted_inverse_depth += information * child.inverse_depth;
+        cell.weighted += information * child.inverse_depth;
+        cell.weighted_square += information * child.inverse_depth * child.inverse_depth;
+        cell.noise += child.noise;
         cell.children += 1.0;
     }
-    for (v, row) in cells.chunks_exact(width).enumerate() {
-        for (u, cell) in row.iter().enumerate() {
-            if cell.children > 0.0 {
-                coarse.points.push(Candidate {
-                    u: u as u16,
-                    v: v as u16,
-                    inverse_depth: cell.weighted_inverse_depth / cell.information,
-                    variance: cell.children / cell.information,
-                });
-            }
+    let independent = independent_share(cells);
+    let filled = cells.iter().enumerate().filter(|(_, cell)| cell.children > 0.0);
+    coarse.points.extend(filled.map(|(index, cell)| {
+        let kept = independent / cell.children + 1.0 - independent;
+        Candidate {
+            u: (index % width) as u16,
+            v: (index / width) as u16,
+            inverse_depth: cell.inverse_depth(),
+            variance: cell.variance(),
+            noise: (cell.noise / cell.children * kept).min(cell.variance()),
         }
+    }));
+}
+
+/// Whether `child`, in cell `index`, or the cell beside it shows something nearer.
+fn is_behind_a_jump(cells: &[Cell], width: usize, index: usize, child: &Candidate) -> bool {
+    let jumps = |cell: Option<&Cell>| {
+        cell.is_some_and(|cell| cell.is_in_front_of(child.inverse_depth, child.variance))
+    };
+    // Only the neighbours that touch the child, not those across its parent.
+    let beside = if child.u.is_multiple_of(2) { index.checked_sub(1) } else { Some(index + 1) };
+    let above =
+        if child.v.is_multiple_of(2) { index.checked_sub(width) } else { Some(index + width) };
+    jumps(cells.get(index))
+        || beside.is_some_and(|index| jumps(cells.get(index)))
+        || above.is_some_and(|index| jumps(cells.get(index)))
+}
+
+/// κ: the scatter of children about their parent over what their variance predicts, 0 to 1.
+fn independent_share(cells: &[Cell]) -> f32 {
+    let (mut scatter, mut predicted) = (0.0f64, 0.0f64);
+    for cell in cells.iter().filter(|cell| cell.children > 1.5) {
+        let mean = cell.inverse_depth();
+        let spread = cell.weighted_square - cell.information * mean * mean;
+        scatter += f64::from(spread.max(0.0));
+        predicted += f64::from(cell.children - 1.0);
     }
+    if predicted == 0.0 { 0.0 } else { (scatter / predicted).min(1.0) as f32 }
 }
 
 #[cfg(test)]
@@ -160,6 +246,44 @@ mod tests {
         assert!((parent.variance - 0.15).abs() < 1e-6);
         fusion.fuse(&[point(0, 0, 1.0, 0.2), point(1, 1, 1.0, 0.2)], 64, 64, 2);
         assert!((fusion.level(1).get(0).variance - 0.2).abs() < 1e-6);
+    }
+
+    #[test]
+    fn an_edge_belongs_to_what_is_in_front() {
+        let mut fusion = DepthFusion::default();
+        // One cell with a child far behind, and a pixel right beside it that is as far.
+        let jump = [point(4, 4, 1.0, 1e-4), point(5, 4, 0.4, 1e-4), point(6, 4, 0.4, 1e-4)];
+        fusion.fuse(&jump, 64, 64, 2);
+        assert_eq!((fusion.level(0).len(), fusion.level(1).len()), (1, 1));
+        assert_eq!(fusion.level(1).get(0).inverse_depth, 1.0);
+        // Two pixels on, it is not beside the jump any more; and a slope is no jump.
+        fusion.fuse(&[point(4, 4, 1.0, 1e-4), point(7, 4, 0.4, 1e-4)], 64, 64, 2);
+        assert_eq!(fusion.level(1).len(), 2);
+        fusion.fuse(&[point(4, 4, 1.0, 1e-4), point(5, 4, 0.97, 1e-4)], 64, 64, 2);
+        assert_eq!((fusion.level(0).len(), fusion.level(1).len()), (2, 1));
+        // What noise explains is no jump either.
+        fusion.fuse(&[point(4, 4, 1.0, 0.04), point(5, 4, 0.4, 0.04)], 64, 64, 2);
+        assert_eq!(fusion.level(0).len(), 2);
+    }
+
+    #[test]
+    fn independent_noise_averages_down_and_common_noise_stays() {
+        let mut noise = crate::slam::alignment::scene::Noise(3);
+        let mut fusion = DepthFusion::default();
+        let std_dev = 0.05f32;
+        for (independent, expected) in [(1.0, 0.25), (0.0, 1.0)] {
+            let points: Vec<_> = (0..64u16 * 64)
+                .map(|i| {
+                    let error = independent * std_dev * noise.normal() as f32;
+                    point(i % 64, i / 64, 1.0 + error, std_dev * std_dev)
+                })
+                .collect();
+            fusion.fuse(&points, 64, 64, 2);
+            let parent = fusion.level(1).get(77);
+            let kept = parent.noise / (std_dev * std_dev);
+            assert!((kept - expected).abs() < 0.05, "{kept} is not {expected}");
+            assert!((parent.variance / (std_dev * std_dev) - 1.0).abs() < 1e-3);
+        }
     }
 
     #[test]

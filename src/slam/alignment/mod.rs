@@ -5,6 +5,7 @@
 
 pub mod align;
 pub mod fusion;
+pub mod kernel;
 pub mod normal_equations;
 pub mod points;
 pub mod reference;
@@ -12,3 +13,5 @@ pub mod residual;
 #[cfg(test)]
 pub mod scene;
 pub mod selection;
+#[cfg(test)]
+mod tests;

@@ -15,8 +15,14 @@ pub struct PointBlock {
     pub inverse_depth: [f32; LANES],
     /// Variance of the inverse depth.
     pub variance: [f32; LANES],
+    /// Noise left in the inverse depth: its variance over the inverse depth squared.
+    pub relative_noise: [f32; LANES],
     /// Brightness of the keyframe there, grey levels.
     pub intensity: [f32; LANES],
+    /// Gradient of the keyframe along u there, grey levels per pixel of the level.
+    pub gradient_x: [f32; LANES],
+    /// Gradient along v.
+    pub gradient_y: [f32; LANES],
 }
 
 /// A ray so flat that no camera of ours sees it: what pads the last block is never in view.
@@ -28,7 +34,10 @@ impl PointBlock {
         ray_y: [PADDING_RAY; LANES],
         inverse_depth: [1.0; LANES],
         variance: [1.0; LANES],
+        relative_noise: [0.0; LANES],
         intensity: [0.0; LANES],
+        gradient_x: [0.0; LANES],
+        gradient_y: [0.0; LANES],
     };
 }
 
@@ -43,8 +52,14 @@ pub struct Point {
     pub inverse_depth: f32,
     /// Variance of the inverse depth.
     pub variance: f32,
+    /// Noise left in the inverse depth: its variance over the inverse depth squared.
+    pub relative_noise: f32,
     /// Brightness of the keyframe there, grey levels.
     pub intensity: f32,
+    /// Gradient of the keyframe along u there, grey levels per pixel of the level.
+    pub gradient_x: f32,
+    /// Gradient along v.
+    pub gradient_y: f32,
 }
 
 /// The points of one level.
@@ -72,7 +87,10 @@ impl LevelPoints {
             block.ray_y[lane] = point.ray_y;
             block.inverse_depth[lane] = point.inverse_depth;
             block.variance[lane] = point.variance;
+            block.relative_noise[lane] = point.relative_noise;
             block.intensity[lane] = point.intensity;
+            block.gradient_x[lane] = point.gradient_x;
+            block.gradient_y[lane] = point.gradient_y;
             self.len += 1;
         }
     }
@@ -100,7 +118,10 @@ impl LevelPoints {
                 ray_y: block.ray_y[lane],
                 inverse_depth: block.inverse_depth[lane],
                 variance: block.variance[lane],
+                relative_noise: block.relative_noise[lane],
                 intensity: block.intensity[lane],
+                gradient_x: block.gradient_x[lane],
+                gradient_y: block.gradient_y[lane],
             })
         });
         lanes.take(self.len)

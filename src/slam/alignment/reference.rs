@@ -56,6 +56,10 @@ pub fn num_levels(width: usize, height: usize) -> usize {
     (0..MAX_LEVELS).take_while(fits).count().max(1)
 }
 
+/// Noise beyond a tenth of the inverse depth is corrected for as if it were a tenth: rotation and
+/// translation look so alike that the correction is amplified tenfold, and must stay one.
+const LARGEST_RELATIVE_NOISE: f32 = 0.01;
+
 /// A keyframe prepared for alignment, point clouds by pyramid level.
 #[derive(Debug, Clone)]
 pub struct Reference {
@@ -127,7 +131,7 @@ impl Reference {
         }
         self.pyramid.fill(&keyframe.image);
         self.fusion.fuse(&keyframe.points, width, height, levels);
-        self.mean_inverse_depth = self.fusion.level(0).mean_inverse_depth().unwrap_or(1.0);
+        self.mean_inverse_depth = self.fusion.mean_inverse_depth().unwrap_or(1.0);
         for level in finest..levels {
             self.pack_level(level);
         }
@@ -151,12 +155,21 @@ impl Reference {
         for &index in chosen {
             let candidate = candidates.get(index as usize);
             let (u, v) = (usize::from(candidate.u), usize::from(candidate.v));
+            if u == 0 || v == 0 || u + 1 >= image.width() || v + 1 >= image.height() {
+                continue;
+            }
+            let at = |u: usize, v: usize| f32::from(image.at(u, v)) * grey_per_sum(level);
             self.levels[level].push(Point {
                 ray_x: ((u as f64 - intrinsics.cx) * inverse_fx) as f32,
                 ray_y: ((v as f64 - intrinsics.cy) * inverse_fy) as f32,
                 inverse_depth: candidate.inverse_depth,
                 variance: candidate.variance,
-                intensity: f32::from(image.at(u, v)) * grey_per_sum(level),
+                relative_noise: (candidate.noise
+                    / (candidate.inverse_depth * candidate.inverse_depth))
+                    .min(LARGEST_RELATIVE_NOISE),
+                intensity: at(u, v),
+                gradient_x: 0.5 * (at(u + 1, v) - at(u - 1, v)),
+                gradient_y: 0.5 * (at(u, v + 1) - at(u, v - 1)),
             });
         }
     }

@@ -1,0 +1,284 @@
+//! The alignment against closed forms: derivatives, the claims of LSD14 fig. 4, invariances.
+
+use nalgebra::Vector6;
+
+use crate::slam::alignment::align::{Aligner, AlignmentParams, Ending};
+use crate::slam::alignment::kernel::{Kernel, SimdMode};
+use crate::slam::alignment::normal_equations::UNKNOWNS;
+use crate::slam::alignment::points::Point;
+use crate::slam::alignment::reference::{Reference, ReferenceParams};
+use crate::slam::alignment::residual::{Evaluation, PointTerms, accumulate_reference, point_terms};
+use crate::slam::alignment::scene::{Noise, Plane, small_camera, small_plane};
+use crate::slam::geometry::se3::SE3;
+use crate::slam::image::sums::SumPyramid;
+use crate::slam::keyframe::Keyframe;
+use crate::slam::pose::Brightness;
+
+const LEVELS: usize = 4;
+const LEVEL: usize = 1;
+
+fn pyramid(pixels: &[u8]) -> SumPyramid {
+    let camera = small_camera();
+    let mut pyramid = SumPyramid::with_size(camera.width, camera.height, LEVELS, LEVEL);
+    pyramid.fill(pixels);
+    pyramid
+}
+
+fn evaluation(pose: &SE3, brightness: Brightness) -> Evaluation {
+    let weighting = AlignmentParams::default().weighting(LEVEL);
+    let (camera, translation) = (small_camera().at_level(LEVEL), &pose.translation);
+    Evaluation::new(&camera, LEVEL, pose, brightness, &weighting, translation)
+}
+
+fn move_of(seed: u64, size: f64) -> SE3 {
+    let mut noise = Noise(seed);
+    SE3::exp(&Vector6::from_fn(|_, _| size * noise.uniform()))
+}
+
+/// Asserts that `analytic` is the derivative that `numeric` measured, over many points: the
+/// regression of one on the other is 1 and little is left.
+fn assert_derivative(name: &str, analytic: &[f64], numeric: &[f64]) {
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    let slope = dot(analytic, numeric) / dot(numeric, numeric);
+    let correlation =
+        dot(analytic, numeric) / (dot(analytic, analytic) * dot(numeric, numeric)).sqrt();
+    assert!(analytic.len() > 1000, "{name}: only {} points", analytic.len());
+    assert!((slope - 1.0).abs() < 0.02, "{name}: analytic = {slope} × numeric");
+    assert!(correlation > 0.995, "{name}: correlation {correlation}");
+}
+
+#[test]
+fn jacobians_are_the_central_differences_of_the_residual() {
+    // Long waves: the keyframe's and the frame's gradient agree to the curvature of the texture.
+    // No slant: W⁻ᵀ takes the inverse depth as constant around a point.
+    let camera = small_camera();
+    let plane = Plane::new([0.0, 0.0, 0.95], [60.0, 180.0], &camera);
+    let mut keyframe = plane.keyframe(&camera, 1, 0.0);
+    // No noise: strong gradients are preferred, also where noise made them.
+    keyframe.image = plane.render(&camera, &SE3::identity(), 0.0, (1.0, 0.0), 1);
+    let reference = Reference::prepare(&keyframe);
+    let current_from_keyframe = move_of(4, 0.06);
+    let image = plane.render(&camera, &current_from_keyframe.inverse(), 0.0, (0.9, 6.0), 5);
+    let pyramid = pyramid(&image);
+    let brightness = Brightness { a: 0.9f64.ln(), b: 6.0 };
+    let terms = |pose: &SE3, brightness: Brightness, point: &Point| {
+        point_terms(pyramid.level(LEVEL), &evaluation(pose, brightness), point)
+    };
+    let compare = |name: &str,
+                   analytic: &dyn Fn(&PointTerms) -> f32,
+                   shifted: &dyn Fn(&Point, f64) -> Option<PointTerms>,
+                   step: f64| {
+        let mut pairs = (Vec::new(), Vec::new());
+        for point in reference.level(LEVEL).iter() {
+            let here = terms(&current_from_keyframe, brightness, &point);
+            let around = (shifted(&point, step), shifted(&point, -step));
+            let (Some(here), (Some(plus), Some(minus))) = (here, around) else { continue };
+            pairs.0.push(f64::from(analytic(&here)));
+            pairs.1.push(f64::from(plus.residual - minus.residual) / (2.0 * step));
+        }
+        assert_derivative(name, &pairs.0, &pairs.1);
+    };
+    // Steps of about one pixel: the grey values are rounded, and the texture is smooth.
+    for unknown in 0..6 {
+        let shifted = |point: &Point, step: f64| {
+            let mut twist = Vector6::zeros();
+            twist[unknown] = step;
+            terms(&(SE3::exp(&twist) * current_from_keyframe), brightness, point)
+        };
+        compare(&format!("pose {unknown}"), &|t| t.jacobian[unknown], &shifted, 0.006);
+    }
+    let gain = |point: &Point, step: f64| {
+        let brightness = Brightness { a: brightness.a + step, ..brightness };
+        terms(&current_from_keyframe, brightness, point)
+    };
+    compare("a", &|t| t.jacobian[6], &gain, 0.01);
+    let offset = |point: &Point, step: f64| {
+        let brightness = Brightness { b: brightness.b + step, ..brightness };
+        terms(&current_from_keyframe, brightness, point)
+    };
+    compare("b", &|t| t.jacobian[7], &offset, 1.0);
+    let depth = |point: &Point, step: f64| {
+        let inverse_depth = point.inverse_depth + step as f32;
+        terms(&current_from_keyframe, brightness, &Point { inverse_depth, ..*point })
+    };
+    compare("inverse depth", &|t| t.inverse_depth_derivative, &depth, 0.08);
+}
+
+/// (point, σ_r², what the image noise alone gives) of every point in view.
+fn variances(pose: &SE3) -> Vec<(Point, f32, f32)> {
+    let (plane, camera) = (small_plane(), small_camera());
+    let reference = Reference::prepare(&plane.keyframe(&camera, 1, 0.1));
+    let image = pyramid(&plane.render(&camera, &pose.inverse(), 0.0, (1.0, 0.0), 1));
+    let at = evaluation(pose, Brightness::default());
+    let points = reference.level(LEVEL).iter();
+    let terms = points.filter_map(|point| {
+        let terms = point_terms(image.level(LEVEL), &at, &point)?;
+        Some((point, terms.variance, at.intensity_variance))
+    });
+    terms.collect()
+}
+
+#[test]
+fn under_pure_rotation_every_residual_has_the_same_variance() {
+    let variances = variances(&SE3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.02, -0.05, 0.03)));
+    assert!(variances.len() > 1000);
+    assert!(variances.iter().all(|&(_, variance, image)| variance == image));
+}
+
+#[test]
+fn under_translation_along_z_the_epipole_does_not_feel_the_depth() {
+    let variances = variances(&SE3::exp(&Vector6::new(0.0, 0.0, 0.1, 0.0, 0.0, 0.0)));
+    let mean_excess = |within: &dyn Fn(f32) -> bool| {
+        let near = variances.iter().filter(|(point, ..)| within(point.ray_x.hypot(point.ray_y)));
+        let excess: Vec<_> = near.map(|(_, variance, image)| variance / image - 1.0).collect();
+        assert!(excess.len() > 20);
+        excess.iter().sum::<f32>() / excess.len() as f32
+    };
+    let (centre, rim) = (mean_excess(&|radius| radius < 0.05), mean_excess(&|radius| radius > 0.5));
+    assert!(centre < 0.05 && rim > 20.0 * centre, "centre {centre}, rim {rim}");
+}
+
+#[test]
+fn under_translation_along_x_only_gradients_along_x_feel_the_depth() {
+    let variances = variances(&SE3::exp(&Vector6::new(0.1, 0.0, 0.0, 0.0, 0.0, 0.0)));
+    let mut seen = (0, 0);
+    for (point, variance, image) in variances {
+        let excess = variance - image;
+        // (g_x f_x t_x)² V to first order, whatever g_y is.
+        let focal = small_camera().at_level(LEVEL).fx as f32;
+        let expected = (point.gradient_x * focal * 0.1).powi(2) * point.variance;
+        assert!((excess - expected).abs() <= 0.01 * expected + 1e-3, "{excess}, {expected}");
+        seen.0 += usize::from(expected < 0.01 * image && point.gradient_y.abs() > 5.0);
+        seen.1 += usize::from(expected > image);
+    }
+    assert!(seen.0 > 10 && seen.1 > 100, "{seen:?}");
+}
+
+#[test]
+fn every_kernel_equals_the_reference() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let reference = Reference::prepare(&plane.keyframe(&camera, 1, 0.1));
+    let image = pyramid(&plane.render(&camera, &move_of(9, 0.02), 2.0, (0.9, 4.0), 8));
+    // Near the solution, far from it, and so that most points leave the image.
+    for (pose, gain) in
+        [(move_of(9, 0.02).inverse(), 0.9f64), (move_of(3, 0.1), 1.0), (move_of(5, 0.3), 1.1)]
+    {
+        let at = evaluation(&pose, Brightness { a: gain.ln(), b: 3.0 });
+        let (points, image) = (reference.level(LEVEL), image.level(LEVEL));
+        let expected = accumulate_reference(points, image, &at);
+        assert!(expected.in_view > 200);
+        for kernel in Kernel::available() {
+            let sums = kernel.accumulate(points, image, &at);
+            let close = |a: f64, b: f64, scale: f64| (a - b).abs() <= 2e-3 * scale;
+            let diagonal = expected.information.diagonal().map(f64::sqrt);
+            for i in 0..UNKNOWNS {
+                for j in 0..UNKNOWNS {
+                    let (a, b) = (sums.information[(i, j)], expected.information[(i, j)]);
+                    assert!(close(a, b, diagonal[i] * diagonal[j]), "{kernel:?} {i} {j}: {a} {b}");
+                }
+                let (a, b) = (sums.gradient[i], expected.gradient[i]);
+                let scale = diagonal[i] * expected.energy.sqrt();
+                assert!(close(a, b, scale), "{kernel:?} gradient {i}: {a} {b}");
+            }
+            assert!(close(sums.energy, expected.energy, expected.energy));
+            assert!(close(
+                sums.squared_residual,
+                expected.squared_residual,
+                expected.squared_residual
+            ));
+            // A point on the very border, or on the gate, may fall to either side by rounding.
+            assert!(sums.in_view.abs_diff(expected.in_view) <= 2);
+            assert!(sums.inliers.abs_diff(expected.inliers) <= 4);
+        }
+    }
+}
+
+fn aligned(keyframe: &Keyframe, image: &[u8], start: &SE3, simd: SimdMode) -> (SE3, Ending) {
+    let aligner = Aligner::new(AlignmentParams { simd, ..AlignmentParams::default() });
+    let reference = Reference::prepare(keyframe);
+    let alignment =
+        aligner.align(&reference, &pyramid(image), start, Brightness::default(), &mut |_| true);
+    (alignment.state.current_from_keyframe, alignment.ending)
+}
+
+#[test]
+fn the_unit_of_depth_and_translation_changes_nothing() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let keyframe = plane.keyframe(&camera, 2, 0.05);
+    let truth = move_of(2, 0.05);
+    let image = plane.render(&camera, &truth.inverse(), 2.0, (1.0, 0.0), 4);
+    let (pose, _) = aligned(&keyframe, &image, &SE3::identity(), SimdMode::Auto);
+    assert!((pose * truth.inverse()).log().norm() < 5e-3);
+    for scale in [1e-3, 0.25, 64.0, 1e4] {
+        let mut scaled = keyframe.clone();
+        for point in &mut scaled.points {
+            point.inverse_depth /= scale;
+            point.variance /= scale * scale;
+        }
+        let (mut other, _) = aligned(&scaled, &image, &SE3::identity(), SimdMode::Auto);
+        other.translation /= f64::from(scale);
+        let difference = (other * pose.inverse()).log().norm();
+        assert!(difference < 1e-5, "scale {scale}: {difference}");
+    }
+}
+
+#[test]
+fn starts_far_away_converge() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let keyframe = plane.keyframe(&camera, 2, 0.05);
+    let image = plane.render(&camera, &SE3::identity(), 2.0, (1.0, 0.0), 4);
+    for seed in 0..20 {
+        // Up to 12 px of level 0 from each unknown alone.
+        let (pose, _) = aligned(&keyframe, &image, &move_of(seed, 0.045), SimdMode::Auto);
+        assert!(pose.log().norm() < 5e-3, "seed {seed}: {}", pose.log().norm());
+    }
+}
+
+#[test]
+fn the_same_input_gives_the_same_bits() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let keyframe = plane.keyframe(&camera, 2, 0.05);
+    let image = plane.render(&camera, &move_of(2, 0.05), 2.0, (1.0, 0.0), 4);
+    for simd in [SimdMode::Auto, SimdMode::Portable] {
+        let once = aligned(&keyframe, &image, &SE3::identity(), simd);
+        assert_eq!(once, aligned(&keyframe, &image, &SE3::identity(), simd));
+    }
+}
+
+#[test]
+fn without_budget_the_best_so_far_is_given() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let reference = Reference::prepare(&plane.keyframe(&camera, 2, 0.05));
+    let truth = move_of(2, 0.05);
+    let image = pyramid(&plane.render(&camera, &truth.inverse(), 2.0, (1.0, 0.0), 4));
+    let aligner = Aligner::new(AlignmentParams::default());
+    let mut errors = Vec::new();
+    for iterations in [0, 4, 100] {
+        let mut left = iterations;
+        let mut budget = |_: usize| {
+            left -= 1;
+            left >= 0
+        };
+        let (start, brightness) = (SE3::identity(), Brightness::default());
+        let alignment = aligner.align(&reference, &image, &start, brightness, &mut budget);
+        let ending = if iterations < 100 { Ending::OutOfBudget } else { Ending::Finished };
+        assert_eq!(alignment.ending, ending);
+        errors.push((alignment.state.current_from_keyframe * truth.inverse()).log().norm());
+    }
+    assert!(errors[0] > errors[1] && errors[1] > errors[2], "{errors:?}");
+}
+
+#[test]
+fn a_budget_of_points_is_kept_and_spread() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let params = ReferenceParams { point_budget: [1000; 5], ..ReferenceParams::default() };
+    let mut reference = Reference::new(params);
+    reference.prepare_into(&plane.keyframe(&camera, 1, 0.1));
+    for level in 1..LEVELS {
+        let points = reference.level(level);
+        let available = reference.candidates(level).len();
+        assert!(points.len() <= 1000 && points.len() > 900.min(available * 7 / 10), "{level}");
+        let centre = points.iter().map(|point| f64::from(point.ray_x)).sum::<f64>();
+        assert!((centre / points.len() as f64).abs() < 0.05);
+    }
+}
