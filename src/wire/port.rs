@@ -281,7 +281,10 @@ pub(in crate::wire) fn retry<S, E: std::fmt::Display>(
         match open() {
             Ok(service) => return Ok(service),
             Err(error) if attempt == OPEN_ATTEMPTS => return Err(topic_error(name, &error)),
-            Err(_) => std::thread::sleep(OPEN_PAUSE),
+            Err(_) => {
+                // A pause; where it cannot be waited the attempts are over sooner.
+                let _ = wait(&[], None, OPEN_PAUSE);
+            }
         }
         attempt += 1;
     }
