@@ -6,8 +6,8 @@ use std::process::ExitCode;
 use clap::Args;
 
 use crate::capture::source::SourceName;
-use crate::command::CommandResult;
-use crate::service::capture::{CaptureOptions, run as run_shell};
+use crate::command::{CommandResult, INTERRUPTED};
+use crate::service::capture::{CaptureError, CaptureOptions, run as run_shell};
 use crate::service::config::Config;
 use crate::service::mode::Mode;
 use crate::service::shutdown::Shutdown;
@@ -21,6 +21,7 @@ pub struct CaptureArguments {
     /// Rig file with the camera's calibration
     #[arg(long, value_name = "FILE")]
     pub rig: Option<PathBuf>,
+    /// Lockstep or live.
     #[command(flatten)]
     pub mode: ModeArguments,
 }
@@ -57,6 +58,10 @@ pub fn run(config: &Config, arguments: CaptureArguments) -> CommandResult {
     let source: SourceName = arguments.source.parse()?;
     let mode = arguments.mode.mode(usual_mode(&source));
     let shutdown = Shutdown::install()?;
-    run_shell(config, &CaptureOptions { source, rig: arguments.rig, mode }, &shutdown)?;
-    Ok(ExitCode::SUCCESS)
+    let options = CaptureOptions { source, rig: arguments.rig, mode };
+    match run_shell(config, &options, &shutdown) {
+        Ok(()) => Ok(ExitCode::SUCCESS),
+        Err(CaptureError::Interrupted) => Ok(ExitCode::from(INTERRUPTED)),
+        Err(error) => Err(error.into()),
+    }
 }

@@ -11,6 +11,7 @@ pub mod status;
 pub mod tracker;
 
 use std::error::Error;
+use std::io::IsTerminal;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -18,6 +19,7 @@ use clap::{Args, Parser, Subcommand};
 
 use crate::service::child::{ERROR_PREFIX, follow_supervisor};
 use crate::service::config::{Config, ConfigError};
+use crate::wire::place::Place;
 
 /// Exit code of a run that was interrupted: 128 + SIGINT, as shells have it.
 const INTERRUPTED: u8 = 130;
@@ -90,12 +92,16 @@ enum Subcommands {
 /// Parses the command line and runs the chosen subcommand.
 pub fn main() -> ExitCode {
     let line = CommandLine::parse();
-    let outcome = prepare(&line.common).and_then(|config| match line.command {
-        Subcommands::Run(arguments) => run::run(&config, &line.common, arguments),
-        Subcommands::Capture(arguments) => capture::run(&config, arguments),
-        Subcommands::Tracker(arguments) => tracker::run(&config, arguments),
-        Subcommands::Mapper(arguments) => mapper::run(&config, arguments),
-        Subcommands::Status(arguments) => status::run(&config, arguments),
+    let outcome = prepare(&line.common).and_then(|config| {
+        let outcome = match line.command {
+            Subcommands::Run(arguments) => run::run(&config, &line.common, arguments),
+            Subcommands::Capture(arguments) => capture::run(&config, arguments),
+            Subcommands::Tracker(arguments) => tracker::run(&config, arguments),
+            Subcommands::Mapper(arguments) => mapper::run(&config, arguments),
+            Subcommands::Status(arguments) => status::run(&config, arguments),
+        };
+        Place::new(&config.instance, &config.root)?.tidy();
+        outcome
     });
     outcome.unwrap_or_else(|error| {
         let line = error.to_string().split_whitespace().collect::<Vec<_>>().join(" ");
@@ -111,6 +117,7 @@ fn prepare(common: &CommonArguments) -> Result<Config, Box<dyn Error>> {
     tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(std::io::stderr)
+        .with_ansi(std::io::stderr().is_terminal())
         .with_target(false)
         .init();
     let config = common.load()?;

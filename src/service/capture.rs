@@ -3,14 +3,13 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use crate::capture::source::{FrameSource, FrameStamp, SourceError, SourceName};
+use crate::capture::source::{FrameSource, FrameStamp, SourceError, SourceName, open};
 use crate::service::clock::{Pace, duration_from_nanos, now_nanos};
 use crate::service::config::Config;
 use crate::service::health::{Health, ProcessState};
 use crate::service::mode::Mode;
 use crate::service::peers::Peer;
 use crate::service::shutdown::Shutdown;
-use crate::service::source::{OpenSourceError, open_source};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::wire::message::{FrameHeader, StepMessage};
 use crate::wire::place::{Claim, Place, PlaceError};
@@ -44,10 +43,7 @@ pub enum CaptureError {
     /// A topic cannot be opened.
     #[error(transparent)]
     Open(#[from] OpenError),
-    /// The source cannot be opened.
-    #[error(transparent)]
-    OpenSource(#[from] OpenSourceError),
-    /// The source gave no frame.
+    /// The source cannot be opened, or gave no frame.
     #[error(transparent)]
     Source(#[from] SourceError),
     /// A frame cannot be sent.
@@ -123,7 +119,7 @@ impl<'a> Shell<'a> {
         options: &CaptureOptions,
         shutdown: &'a Shutdown,
     ) -> Result<Self, CaptureError> {
-        let source = open_source(&options.source, options.rig.as_deref(), &config.simulator)?;
+        let source = open(&options.source, options.rig.as_deref(), &config.simulator)?;
         let intrinsics = source.intrinsics();
         if !intrinsics.is_valid() {
             return Err(CaptureError::Intrinsics(options.source.clone()));

@@ -290,9 +290,10 @@ mod tests {
             assert_eq!(listed, Some(value), "{key} in config/semidense.toml");
         }
         assert_eq!(shipped.len(), built_in.len());
-        let is_entry = |line: &&str| line.contains('=') && !line.starts_with('#');
-        for line in text.lines().filter(is_entry) {
-            assert!(line.contains(" # "), "no unit and reason: {line}");
+        let lines: Vec<&str> = text.lines().collect();
+        for pair in lines.windows(2) {
+            let is_entry = pair[1].contains('=') && !pair[1].starts_with('#');
+            assert!(!is_entry || pair[0].starts_with("# "), "no unit and reason: {}", pair[1]);
         }
     }
 

@@ -18,7 +18,6 @@ pub mod reference_feed;
 pub mod replay;
 pub mod results;
 pub mod shutdown;
-pub mod source;
 pub mod supervisor;
 pub mod tracker;
 pub mod trajectory_file;

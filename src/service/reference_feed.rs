@@ -9,42 +9,46 @@ use std::time::Duration;
 
 use crossbeam::queue::ArrayQueue;
 
-use crate::slam::alignment::reference::Reference;
+use crate::slam::alignment::reference::{Reference, ReferenceParams};
+use crate::slam::keyframe::Keyframe;
 use crate::wire::keyframe_inbox::{InboxError, KeyframeInbox};
 use crate::wire::place::Place;
 use crate::wire::port::{Access, Hub, OpenError, wait};
 
 /// Longest sleep of the second thread without a look at its end.
 const WAKE_PERIOD: Duration = Duration::from_millis(100);
-/// Used references that wait to be freed; more are freed by the tracker itself.
-const MAX_USED: usize = 4;
+/// Used references whose memory waits for the next: one in use, one prepared, one being made.
+const MAX_USED: usize = 3;
 
 /// Gives the newest keyframe, prepared.
 #[derive(Debug)]
 pub enum ReferenceFeed {
     /// Prepares when asked.
-    Synchronous(Box<KeyframeInbox>),
+    Synchronous(Box<Synchronous>),
     /// Prepares beside the frame loop.
     Threaded(Preparer),
 }
 
 impl ReferenceFeed {
     /// Prepares when asked.
-    pub fn synchronous(hub: &Hub) -> Result<Self, OpenError> {
-        Ok(Self::Synchronous(Box::new(KeyframeInbox::open(hub)?)))
+    pub fn synchronous(hub: &Hub, params: &ReferenceParams) -> Result<Self, OpenError> {
+        let (inbox, params) = (KeyframeInbox::open(hub)?, params.clone());
+        Ok(Self::Synchronous(Box::new(Synchronous { inbox, params, used: None })))
     }
 
     /// Prepares on a thread of its own, which joins the instance by itself.
-    pub fn threaded(place: &Place) -> io::Result<Self> {
-        Ok(Self::Threaded(Preparer::start(place)?))
+    pub fn threaded(place: &Place, params: &ReferenceParams) -> io::Result<Self> {
+        Ok(Self::Threaded(Preparer::start(place, params)?))
     }
 
     /// The newest reference that has not been taken.
     pub fn newest(&mut self) -> Result<Option<Box<Reference>>, InboxError> {
         match self {
             Self::Threaded(preparer) => Ok(preparer.shared.prepared.pop()),
-            Self::Synchronous(inbox) => match inbox.newest() {
-                Ok(keyframe) => Ok(keyframe.map(|k| Box::new(Reference::prepare(&k)))),
+            Self::Synchronous(synchronous) => match synchronous.inbox.newest() {
+                Ok(keyframe) => Ok(keyframe.map(|keyframe| {
+                    prepare(&keyframe, synchronous.used.take(), &synchronous.params)
+                })),
                 Err(InboxError::Message(error)) => {
                     tracing::warn!("mapper/keyframe: {error}");
                     Ok(None)
@@ -54,13 +58,35 @@ impl ReferenceFeed {
         }
     }
 
-    /// Takes back a used reference, to be freed where it does not cost the frame loop.
-    pub fn give_back(&self, used: Box<Reference>) {
-        if let Self::Threaded(preparer) = self {
-            // A full queue gives it back to us, and it is freed here.
-            let _ = preparer.shared.used.push(used);
+    /// Takes back a used reference: its memory serves the next one.
+    pub fn give_back(&mut self, used: Box<Reference>) {
+        match self {
+            Self::Synchronous(synchronous) => synchronous.used = Some(used),
+            Self::Threaded(preparer) => {
+                // A full queue gives it back to us, and it is freed here.
+                let _ = preparer.shared.used.push(used);
+            }
         }
     }
+}
+
+/// A reference of `keyframe`, in the memory of a used one where there is one.
+fn prepare(
+    keyframe: &Keyframe,
+    used: Option<Box<Reference>>,
+    params: &ReferenceParams,
+) -> Box<Reference> {
+    let mut reference = used.unwrap_or_else(|| Box::new(Reference::new(params.clone())));
+    reference.prepare_into(keyframe);
+    reference
+}
+
+/// Prepares on the tracker's own thread.
+#[derive(Debug)]
+pub struct Synchronous {
+    inbox: KeyframeInbox,
+    params: ReferenceParams,
+    used: Option<Box<Reference>>,
 }
 
 /// The second thread; ends when dropped.
@@ -78,16 +104,16 @@ struct Shared {
 }
 
 impl Preparer {
-    fn start(place: &Place) -> io::Result<Self> {
+    fn start(place: &Place, params: &ReferenceParams) -> io::Result<Self> {
         let shared = Arc::new(Shared {
             prepared: ArrayQueue::new(1),
             used: ArrayQueue::new(MAX_USED),
             stop: AtomicBool::new(false),
         });
-        let (theirs, place) = (Arc::clone(&shared), place.clone());
+        let (theirs, place, params) = (Arc::clone(&shared), place.clone(), params.clone());
         let thread = std::thread::Builder::new()
             .name("semidense-reference".to_owned())
-            .spawn(move || prepare_until_stopped(&place, &theirs))?;
+            .spawn(move || prepare_until_stopped(&place, &params, &theirs))?;
         Ok(Self { shared, thread: Some(thread) })
     }
 }
@@ -102,7 +128,7 @@ impl Drop for Preparer {
     }
 }
 
-fn prepare_until_stopped(place: &Place, shared: &Shared) {
+fn prepare_until_stopped(place: &Place, params: &ReferenceParams, shared: &Shared) {
     let opened = Hub::join(place, "tracker-reference", Access::Member)
         .and_then(|hub| Ok((KeyframeInbox::open(&hub)?, hub)));
     let (mut inbox, _hub) = match opened {
@@ -117,12 +143,14 @@ fn prepare_until_stopped(place: &Place, shared: &Shared) {
             tracing::error!("no keyframes any more: {error}");
             return;
         }
-        while shared.used.pop().is_some() {}
         match inbox.newest() {
             Ok(None) => {}
             Ok(Some(keyframe)) => {
                 // What the tracker has not taken yet is older: it goes.
-                shared.prepared.force_push(Box::new(Reference::prepare(&keyframe)));
+                let reference = prepare(&keyframe, shared.used.pop(), params);
+                if let Some(older) = shared.prepared.force_push(reference) {
+                    drop(shared.used.push(older));
+                }
             }
             Err(error) => tracing::warn!("{error}"),
         }

@@ -5,7 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use crate::capture::source::{FrameSource, SourceName};
+use crate::capture::source::{FrameSource, SourceError, SourceName, open};
 use crate::service::child::Child;
 use crate::service::config::Config;
 use crate::service::health::ProcessState;
@@ -16,7 +16,6 @@ use crate::service::recorder::{Recorder, RunCounters};
 use crate::service::replay::peak_rss_bytes;
 use crate::service::results::RunRecord;
 use crate::service::shutdown::Shutdown;
-use crate::service::source::{OpenSourceError, open_source};
 use crate::slam::mapper::Map;
 use crate::slam::pose::TrackingState;
 use crate::wire::command::{Command, CommandClient, CommandError};
@@ -98,7 +97,7 @@ pub enum RunError {
     Open(#[from] OpenError),
     /// The source cannot be opened.
     #[error(transparent)]
-    Source(#[from] OpenSourceError),
+    Source(#[from] SourceError),
     /// Poses cannot be received.
     #[error(transparent)]
     Receive(#[from] ReceiveError),
@@ -122,7 +121,7 @@ pub fn run(
     shutdown: &Shutdown,
     observe: &mut dyn FnMut(&RunProgress),
 ) -> Result<RunOutcome, RunError> {
-    let source = open_source(&options.source, options.rig.as_deref(), &config.simulator)?;
+    let source = open(&options.source, options.rig.as_deref(), &config.simulator)?;
     let place = Place::new(&config.instance, &config.root)?;
     let _claim = claim_all(&place)?;
     place.check_shared_memory(shared_memory_bytes(&source.intrinsics(), None))?;

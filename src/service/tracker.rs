@@ -92,9 +92,10 @@ impl<'a> Shell<'a> {
         let place = Place::new(&config.instance, &config.root)?;
         let claim = place.claim("tracker")?;
         let hub = Hub::join(&place, "tracker", Access::Member)?;
+        let params = &config.tracking.reference;
         let references = match mode {
-            Mode::Lockstep => ReferenceFeed::synchronous(&hub)?,
-            Mode::Live => ReferenceFeed::threaded(&place).map_err(TrackerError::Thread)?,
+            Mode::Lockstep => ReferenceFeed::synchronous(&hub, params)?,
+            Mode::Live => ReferenceFeed::threaded(&place, params).map_err(TrackerError::Thread)?,
         };
         Ok(Self {
             config,

@@ -395,3 +395,6 @@ pub fn keyframe_pose_from_message(
         similarity_from_message(&message.world_from_keyframe, "world_from_keyframe")?;
     Ok(KeyframePose { keyframe_id: message.keyframe_id, world_from_keyframe })
 }
+
+#[cfg(test)]
+mod tests;

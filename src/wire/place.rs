@@ -1,8 +1,8 @@
 //! Where an instance lives: its name, the folder of its files, the prefix of its shared memory, and
 //! the claim of a process to be the only one of its kind.
 
-use std::fs::{DirBuilder, File, OpenOptions};
-use std::io::{Read, Seek, Write};
+use std::fs::{self, DirBuilder, File, OpenOptions};
+use std::io::{self, Read, Seek, Write};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 
@@ -14,6 +14,9 @@ pub const SYSTEM_ROOT: &str = "/run/semidense";
 pub const ROOT_VARIABLE: &str = "SEMIDENSE_ROOT";
 /// Where the kernel keeps shared memory.
 pub const SHARED_MEMORY: &str = "/dev/shm";
+
+/// Held while a process joins, and by the last one while it clears up.
+const JOIN_LOCK: &str = ".join.lock";
 
 /// Longest folder: the socket of a listener lies in it, and a socket's path has at most 107 bytes.
 const MAX_ROOT_BYTES: usize = 48;
@@ -40,7 +43,7 @@ pub enum PlaceError {
         /// What.
         path: PathBuf,
         /// Why.
-        source: std::io::Error,
+        source: io::Error,
     },
     /// There is one already.
     #[error(
@@ -99,7 +102,7 @@ impl Place {
     pub fn create(&self) -> Result<(), PlaceError> {
         let io = |source| PlaceError::Io { path: self.root.clone(), source };
         DirBuilder::new().recursive(true).mode(0o700).create(&self.root).map_err(io)?;
-        let owner = std::fs::metadata(&self.root).map_err(io)?.uid();
+        let owner = fs::metadata(&self.root).map_err(io)?.uid();
         if owner != rustix::process::geteuid().as_raw() {
             return Err(PlaceError::Foreign(self.root.clone()));
         }
@@ -112,13 +115,7 @@ impl Place {
         let path = self.root.join(format!("{}.{process}.lock", self.instance));
         let io = |source| PlaceError::Io { path: path.clone(), source };
         loop {
-            let mut file = OpenOptions::new()
-                .read(true)
-                .write(true)
-                .create(true)
-                .truncate(false)
-                .open(&path)
-                .map_err(io)?;
+            let mut file = open_lock(&path).map_err(io)?;
             if rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive).is_err() {
                 let mut holder = String::new();
                 file.read_to_string(&mut holder).map_err(io)?;
@@ -132,6 +129,44 @@ impl Place {
                 writeln!(file, "{}", std::process::id()).map_err(io)?;
                 return Ok(Claim { _file: file, path });
             }
+        }
+    }
+
+    /// Keeps [`Place::tidy`] away while a process joins.
+    pub(in crate::wire) fn hold(&self) -> Result<File, PlaceError> {
+        let path = self.root.join(JOIN_LOCK);
+        let io = |source| PlaceError::Io { path: path.clone(), source };
+        loop {
+            let file = open_lock(&path).map_err(io)?;
+            rustix::fs::flock(&file, FlockOperation::LockShared).map_err(|e| io(e.into()))?;
+            if is_same_file(&file, &path) {
+                return Ok(file);
+            }
+        }
+    }
+
+    /// Removes what iceoryx2 leaves behind on purpose when its last node is gone: its counter of
+    /// nodes and its empty folders. Does nothing while anybody is here or joins.
+    pub fn tidy(&self) {
+        let path = self.root.join(JOIN_LOCK);
+        let Ok(lock) = open_lock(&path) else { return };
+        let is_alone = rustix::fs::flock(&lock, FlockOperation::NonBlockingLockExclusive).is_ok()
+            && is_same_file(&lock, &path);
+        if !is_alone {
+            return;
+        }
+        // What cannot be removed is removed by the next one.
+        let is_empty = |folder: &Path| fs::read_dir(folder).map_or(true, |mut f| f.next().is_none());
+        if is_empty(&self.root.join("nodes")) {
+            for entry in fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten() {
+                let name = entry.file_name().to_string_lossy().into_owned();
+                if name.starts_with(&self.prefix) && name.ends_with(".global_mgmt") {
+                    let _ = fs::remove_file(entry.path());
+                }
+            }
+            let _ = fs::remove_dir(self.root.join("nodes"));
+            let _ = fs::remove_dir(self.root.join("services"));
+            let _ = fs::remove_file(&path);
         }
     }
 
@@ -159,12 +194,16 @@ pub struct Claim {
 impl Drop for Claim {
     fn drop(&mut self) {
         // Removed while still locked, so that no other process can hold the same name.
-        let _ = std::fs::remove_file(&self.path);
+        let _ = fs::remove_file(&self.path);
     }
 }
 
+fn open_lock(path: &Path) -> io::Result<File> {
+    OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path)
+}
+
 fn is_same_file(file: &File, path: &Path) -> bool {
-    match (file.metadata(), std::fs::metadata(path)) {
+    match (file.metadata(), fs::metadata(path)) {
         (Ok(open), Ok(named)) => (open.dev(), open.ino()) == (named.dev(), named.ino()),
         _ => false,
     }
@@ -232,7 +271,7 @@ mod tests {
         assert!(place.claim("tracker").is_ok());
         drop(first);
         drop(place.claim("capture").unwrap());
-        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
     }
 
     #[test]

@@ -111,6 +111,7 @@ impl Hub {
             return Err(not_running(place));
         }
         set_log_level(LogLevel::Fatal);
+        let _joining = place.hold()?;
         let failed = |reason: String| OpenError::Node {
             root: place.root.display().to_string(),
             reason,
@@ -462,3 +463,6 @@ pub fn wait(
     events.iter().for_each(|e| e.take());
     Ok(())
 }
+
+#[cfg(test)]
+mod tests;
