@@ -88,7 +88,9 @@ pub fn print_summary(summary: &Summary, output: &Path, json: bool) -> serde_json
     println!("map         {} keyframes, {} points", summary.keyframes, summary.points);
     let times = |name: &str, times: Option<Percentiles>| {
         if let Some(Percentiles { p50, p95, p99, max }) = times {
-            println!("{name:11} median {p50:.2} ms, 95 % {p95:.2}, 99 % {p99:.2}, longest {max:.2}");
+            println!(
+                "{name:11} median {p50:.2} ms, 95 % {p95:.2}, 99 % {p99:.2}, longest {max:.2}"
+            );
         }
     };
     times("tracking", summary.track_ms);

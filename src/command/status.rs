@@ -8,10 +8,10 @@ use clap::Args;
 use serde_json::{Value, json};
 
 use crate::command::CommandResult;
+use crate::service::clock::now_nanos;
 use crate::service::config::Config;
 use crate::service::health::{cause, percentile_ms};
 use crate::service::peers::{HEALTH_TOPICS, Peer};
-use crate::service::clock::now_nanos;
 use crate::service::shutdown::Shutdown;
 use crate::wire::message::HealthMessage;
 use crate::wire::place::Place;

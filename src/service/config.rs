@@ -188,7 +188,9 @@ impl Config {
             let line = before.map_or(1, |before| before.matches('\n').count() + 1);
             ConfigError::Syntax { place: format!("{file}:{line}"), reason: one_line(&error, text) }
         })?;
-        config.validate().map_err(|source| ConfigError::Value { place: file.to_owned(), source })?;
+        config
+            .validate()
+            .map_err(|source| ConfigError::Value { place: file.to_owned(), source })?;
         Ok(config)
     }
 
@@ -319,7 +321,10 @@ mod tests {
         let error = load("[mapper]\n\nthread = 3\n");
         assert!(error.contains("x.toml:3: `thread = 3`: unknown field `thread`"), "{error}");
         let error = load("[tracker]\nbudget_ms = -1.0\n");
-        assert!(error.ends_with("x.toml: tracker.budget_ms = -1: allowed is 0 to 10000"), "{error}");
+        assert!(
+            error.ends_with("x.toml: tracker.budget_ms = -1: allowed is 0 to 10000"),
+            "{error}"
+        );
         let error = load("[tracker]\nbudget_ms = nan\n");
         assert!(error.contains("tracker.budget_ms = NaN"), "{error}");
         assert!(load("[mapper]\nthreads = \"x\"\n").contains("x.toml:2: `threads = \"x\"`"));

@@ -160,8 +160,7 @@ impl<'a> Reader<'a> {
 
     fn keyframe(&mut self, index: u64) -> Result<Keyframe, MapFileError> {
         let path = self.path.to_owned();
-        let wrong =
-            move |source| MapFileError::Keyframe { path: path.clone(), index, source };
+        let wrong = move |source| MapFileError::Keyframe { path: path.clone(), index, source };
         let (keyframe_id, revision, sequence) = (self.u64()?, self.u64()?, self.u64()?);
         let capture_nanos = i64::from_le_bytes(self.bytes()?);
         let (epoch, state, width, height) = (self.u32()?, self.u32()?, self.u32()?, self.u32()?);

@@ -172,11 +172,7 @@ struct Supervisor<'a> {
 
 impl<'a> Supervisor<'a> {
     /// Opens its own ports first, so that nothing is missed, then starts the children.
-    fn start(
-        config: &'a Config,
-        options: &'a RunOptions,
-        place: &Place,
-    ) -> Result<Self, RunError> {
+    fn start(config: &'a Config, options: &'a RunOptions, place: &Place) -> Result<Self, RunError> {
         let hub = Hub::join(place, "supervisor", Access::Member)?;
         let [capture, tracker, mapper] = &HEALTH_TOPICS;
         let peers =
@@ -257,8 +253,7 @@ impl<'a> Supervisor<'a> {
         for index in 0..self.children.len() {
             let child = &mut self.children[index];
             let process = child.name;
-            let status =
-                child.poll().map_err(|source| RunError::Child { process, source })?;
+            let status = child.poll().map_err(|source| RunError::Child { process, source })?;
             let Some(status) = status else { continue };
             if process == "capture" && status.success() {
                 return Ok(Some(Ended::Finished));

@@ -8,7 +8,9 @@ use iceoryx2::port::server::Server;
 use iceoryx2::prelude::*;
 
 use crate::wire::message::{CommandRequest, CommandResponse, PATH_BYTES, TEXT_BYTES};
-use crate::wire::port::{Access, Events, Hub, OpenError, Wake, not_running, retry, topic_error, wait};
+use crate::wire::port::{
+    Access, Events, Hub, OpenError, Wake, not_running, retry, topic_error, wait,
+};
 use crate::wire::topic::{MAPPER_COMMAND, service_name};
 
 /// Clients at a time: the supervisor, an operator, a network link.
@@ -122,10 +124,8 @@ impl CommandServer {
     /// Opens it.
     pub fn open(hub: &Hub) -> Result<Self, OpenError> {
         let name = service_name(&hub.place().instance, MAPPER_COMMAND);
-        let server = service(hub, &name)?
-            .server_builder()
-            .create()
-            .map_err(|e| topic_error(&name, &e))?;
+        let server =
+            service(hub, &name)?.server_builder().create().map_err(|e| topic_error(&name, &e))?;
         Ok(Self { server, events: hub.events(&name)? })
     }
 
@@ -165,10 +165,8 @@ impl CommandClient {
     /// Opens it.
     pub fn open(hub: &Hub) -> Result<Self, OpenError> {
         let name = service_name(&hub.place().instance, MAPPER_COMMAND);
-        let client = service(hub, &name)?
-            .client_builder()
-            .create()
-            .map_err(|e| topic_error(&name, &e))?;
+        let client =
+            service(hub, &name)?.client_builder().create().map_err(|e| topic_error(&name, &e))?;
         Ok(Self { client, wake: hub.notifier(&name)? })
     }
 

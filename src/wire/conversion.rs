@@ -112,8 +112,7 @@ pub fn similarity_from_message(
 /// The intrinsics of a header, checked.
 fn intrinsics_from(values: &[f64; 4], width: u32, height: u32) -> Result<Intrinsics, MessageError> {
     let [fx, fy, cx, cy] = *values;
-    let intrinsics =
-        Intrinsics { fx, fy, cx, cy, width: width as usize, height: height as usize };
+    let intrinsics = Intrinsics { fx, fy, cx, cy, width: width as usize, height: height as usize };
     if intrinsics.is_valid() {
         Ok(intrinsics)
     } else {

@@ -56,9 +56,10 @@ impl KeyframeInbox {
         if header.keyframe_id != image_header.keyframe_id {
             return Ok(None);
         }
-        let keyframe = self.depth.as_ref().map(|(header, points)| {
-            keyframe_from_messages(header, points, image_header, pixels)
-        });
+        let keyframe = self
+            .depth
+            .as_ref()
+            .map(|(header, points)| keyframe_from_messages(header, points, image_header, pixels));
         self.depth = None;
         Ok(keyframe.transpose()?)
     }

@@ -27,9 +27,7 @@ const MAX_INSTANCE_BYTES: usize = 32;
 #[derive(Debug, thiserror::Error)]
 pub enum PlaceError {
     /// The name of the instance.
-    #[error(
-        "instance `{0}` is not a name: use 1 to 32 of the characters a-z, A-Z, 0-9, _ and -"
-    )]
+    #[error("instance `{0}` is not a name: use 1 to 32 of the characters a-z, A-Z, 0-9, _ and -")]
     Instance(String),
     /// The folder's path is too long.
     #[error("{0}: the runtime folder may have at most {MAX_ROOT_BYTES} bytes; set {ROOT_VARIABLE}")]
@@ -156,7 +154,8 @@ impl Place {
             return;
         }
         // What cannot be removed is removed by the next one.
-        let is_empty = |folder: &Path| fs::read_dir(folder).map_or(true, |mut f| f.next().is_none());
+        let is_empty =
+            |folder: &Path| fs::read_dir(folder).map_or(true, |mut f| f.next().is_none());
         if is_empty(&self.root.join("nodes")) {
             for entry in fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten() {
                 let name = entry.file_name().to_string_lossy().into_owned();

@@ -112,10 +112,8 @@ impl Hub {
         }
         set_log_level(LogLevel::Fatal);
         let _joining = place.hold()?;
-        let failed = |reason: String| OpenError::Node {
-            root: place.root.display().to_string(),
-            reason,
-        };
+        let failed =
+            |reason: String| OpenError::Node { root: place.root.display().to_string(), reason };
         let name = NodeName::new(process).map_err(|e| failed(e.to_string()))?;
         let node = NodeBuilder::new()
             .name(&name)
@@ -455,7 +453,8 @@ pub fn wait(
     let descriptors = events.iter().map(|e| e.descriptor()).chain(interrupt);
     let mut polled: Vec<_> =
         descriptors.map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN)).collect();
-    let timeout = Timespec { tv_sec: timeout.as_secs() as i64, tv_nsec: timeout.subsec_nanos().into() };
+    let timeout =
+        Timespec { tv_sec: timeout.as_secs() as i64, tv_nsec: timeout.subsec_nanos().into() };
     match rustix::event::poll(&mut polled, Some(&timeout)) {
         Ok(_) | Err(rustix::io::Errno::INTR) => {}
         Err(e) => return Err(WaitError(e.to_string())),
