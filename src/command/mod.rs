@@ -4,9 +4,13 @@
 //! not understood, 130 interrupted (results so far are written).
 
 pub mod capture;
+pub mod evaluate;
 pub mod mapper;
+pub mod progress;
+pub mod replay;
 pub mod run;
 pub mod run_progress;
+pub mod simulate;
 pub mod status;
 pub mod tracker;
 
@@ -86,6 +90,9 @@ enum Subcommands {
     Capture(capture::CaptureArguments),
     Tracker(tracker::TrackerArguments),
     Mapper(mapper::MapperArguments),
+    Replay(replay::ReplayArgs),
+    Simulate(simulate::SimulateArgs),
+    Evaluate(evaluate::EvaluateArgs),
     Status(status::StatusArguments),
 }
 
@@ -98,6 +105,9 @@ pub fn main() -> ExitCode {
             Subcommands::Capture(arguments) => capture::run(&config, arguments),
             Subcommands::Tracker(arguments) => tracker::run(&config, arguments),
             Subcommands::Mapper(arguments) => mapper::run(&config, arguments),
+            Subcommands::Replay(arguments) => replay::run(&config, &arguments),
+            Subcommands::Simulate(arguments) => simulate::run(&arguments),
+            Subcommands::Evaluate(arguments) => evaluate::run(&arguments),
             Subcommands::Status(arguments) => status::run(&config, arguments),
         };
         Place::new(&config.instance, &config.root)?.tidy();

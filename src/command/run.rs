@@ -7,9 +7,10 @@ use clap::Args;
 
 use crate::capture::source::SourceName;
 use crate::command::capture::{ModeArguments, usual_mode};
-use crate::command::run_progress::{RunDisplay, print_summary};
+use crate::command::run_progress::RunDisplay;
 use crate::command::{CommandResult, CommonArguments, INTERRUPTED};
 use crate::service::config::Config;
+use crate::service::results::summary_text::summary_text;
 use crate::service::results::{prepare_output, write_results};
 use crate::service::shutdown::Shutdown;
 use crate::service::supervisor::{Ended, RunOptions, run as supervise};
@@ -58,7 +59,12 @@ pub fn run(config: &Config, common: &CommonArguments, arguments: RunArguments) -
     }
     let source = outcome.source.as_mut();
     let summary = write_results(&arguments.output, &outcome.record, source, &config.results)?;
-    print_summary(&summary, &arguments.output, arguments.json)?;
+    if arguments.json {
+        println!("{}", serde_json::to_string_pretty(&summary)?);
+    } else {
+        print!("{}", summary_text(&summary));
+        println!("results in {}", arguments.output.display());
+    }
     match outcome.ended {
         Ended::Finished => Ok(ExitCode::SUCCESS),
         Ended::Interrupted => {

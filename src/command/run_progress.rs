@@ -1,12 +1,10 @@
-//! How a run is shown: a bar on a terminal, plain lines otherwise; a short summary at its end.
+//! How a run is shown: a bar on a terminal, plain lines otherwise.
 
 use std::io::IsTerminal;
-use std::path::Path;
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
-use crate::service::results::summary::{Percentiles, Summary};
 use crate::service::supervisor::RunProgress;
 use crate::slam::pose::TrackingState;
 
@@ -73,37 +71,4 @@ pub fn state_name(state: TrackingState) -> &'static str {
         TrackingState::Degraded(_) => "degraded",
         TrackingState::Lost(_) => "lost",
     }
-}
-
-/// Prints the summary: as JSON, or the few figures that a person wants first.
-pub fn print_summary(summary: &Summary, output: &Path, json: bool) -> serde_json::Result<()> {
-    if json {
-        println!("{}", serde_json::to_string_pretty(summary)?);
-        return Ok(());
-    }
-    let Summary { frames_in, frames_tracked, frames_dropped, lost_count, .. } = summary;
-    println!(
-        "frames      {frames_in}, tracked {frames_tracked}, dropped {frames_dropped}, lost {lost_count} times"
-    );
-    println!("map         {} keyframes, {} points", summary.keyframes, summary.points);
-    let times = |name: &str, times: Option<Percentiles>| {
-        if let Some(Percentiles { p50, p95, p99, max }) = times {
-            println!(
-                "{name:11} median {p50:.2} ms, 95 % {p95:.2}, 99 % {p99:.2}, longest {max:.2}"
-            );
-        }
-    };
-    times("tracking", summary.track_ms);
-    times("mapping", summary.map_ms);
-    times("latency", summary.latency_ms);
-    let figures = &summary.trajectory;
-    match (figures.ate_rmse_m, figures.path_length_m) {
-        (Some(ate), Some(path)) => println!(
-            "ATE         {ate:.4} m on {path:.2} m, {} frames compared",
-            figures.matched_poses.unwrap_or(0)
-        ),
-        _ => println!("ATE         no tracked frames with ground truth"),
-    }
-    println!("results     {}", output.display());
-    Ok(())
 }

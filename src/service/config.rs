@@ -61,7 +61,7 @@ impl Default for CaptureConfig {
 }
 
 /// The tracker process.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrackerConfig {
     /// Live: time from a frame's instant to its pose, milliseconds; 0 is half the time between two
@@ -69,24 +69,12 @@ pub struct TrackerConfig {
     pub budget_ms: f64,
 }
 
-impl Default for TrackerConfig {
-    fn default() -> Self {
-        Self { budget_ms: 0.0 }
-    }
-}
-
 /// The mapper process.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MapperConfig {
     /// Threads of its pool; 0 is one for each CPU. The map does not depend on it.
     pub threads: usize,
-}
-
-impl Default for MapperConfig {
-    fn default() -> Self {
-        Self { threads: 0 }
-    }
 }
 
 /// Who starts and watches the three.

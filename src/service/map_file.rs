@@ -228,9 +228,7 @@ mod tests {
             image: (0..17 * 16).map(|i| (i % 251) as u8).collect(),
             points: vec![point; 5],
         };
-        let mut map = Map::default();
-        map.keyframes = vec![keyframe.clone(), Keyframe { keyframe_id: 8, ..keyframe }];
-        map
+        Map { keyframes: vec![keyframe.clone(), Keyframe { keyframe_id: 8, ..keyframe }] }
     }
 
     #[test]

@@ -50,7 +50,7 @@ impl<F> Pairing<F> {
     /// The oldest pair. Frames before it will get no pose any more and are let go.
     pub fn take(&mut self) -> Option<(F, PoseEstimate)> {
         while let Some(pose) = self.poses.front() {
-            let Some((oldest, _)) = self.frames.front() else { return None };
+            let (oldest, _) = self.frames.front()?;
             let newest = self.frames.back().map_or(*oldest, |(sequence, _)| *sequence);
             if let Some(index) = self.frames.iter().position(|(s, _)| *s == pose.sequence) {
                 self.frames.drain(..index);

@@ -60,7 +60,9 @@ impl Recorder {
     pub fn collect(&mut self) -> Result<bool, ReceiveError> {
         let before = self.recorded.len() + self.map_nanos.len();
         while let Some(message) = self.poses.receive()? {
-            message.payload().first().map(|pose| self.take_pose(pose));
+            if let Some(pose) = message.payload().first() {
+                self.take_pose(pose);
+            }
         }
         while let Some(message) = self.steps.receive()? {
             let Some(step) = message.payload().first() else { continue };
