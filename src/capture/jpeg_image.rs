@@ -16,6 +16,7 @@ const FORMAT: &str = "JPEG";
 /// Decodes a JPEG of `width * height` pixels into grey values; `samples` is reused memory for the
 /// rare files whose luma is not stored as such (RGB, CMYK). A file that ends early is an error:
 /// the decoder alone would fill the missing part with grey.
+/// Not noticed is a file with its end marker whose scan lacks blocks: the decoder fills them.
 pub fn decode_gray_into(
     bytes: &[u8],
     width: usize,

@@ -14,5 +14,8 @@ pub mod keyframe;
 pub mod mapper;
 pub mod parameter;
 pub mod pose;
+#[cfg(test)]
+pub mod test_scene;
 pub mod tracker;
 pub mod trajectory;
+pub mod two_frame;

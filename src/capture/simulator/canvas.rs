@@ -101,13 +101,15 @@ impl Canvas {
         let columns: Vec<(usize, usize, f32)> =
             (0..self.size).map(|u| Self::cell(u, self.size, cells_x)).collect();
         let size = self.size;
+        let mut blended = vec![0.0; cells_x];
         for (v, row) in self.texels.chunks_exact_mut(size).enumerate() {
             let (top, bottom, b) = Self::cell(v, size, cells_y);
+            let (above, below) = (&lattice[top * cells_x..], &lattice[bottom * cells_x..]);
+            for (out, (above, below)) in blended.iter_mut().zip(above.iter().zip(below)) {
+                *out = strength * (above + b * (below - above));
+            }
             for (out, &(left, right, a)) in row.iter_mut().zip(&columns) {
-                let at = |x: usize, y: usize| lattice[y * cells_x + x];
-                let above = at(left, top) + a * (at(right, top) - at(left, top));
-                let below = at(left, bottom) + a * (at(right, bottom) - at(left, bottom));
-                *out += strength * (above + b * (below - above));
+                *out += blended[left] + a * (blended[right] - blended[left]);
             }
         }
     }

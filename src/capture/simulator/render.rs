@@ -25,7 +25,7 @@ const NO_SURFACE: u32 = u32::MAX;
 pub struct Hit {
     /// Depth along the optical axis, metres; infinite where nothing is.
     pub depth: f32,
-    /// Block × 8 + face, [`NO_SURFACE`] where nothing is.
+    /// Block × 8 + face, all ones where nothing is.
     pub surface: u32,
 }
 
@@ -186,13 +186,14 @@ impl Renderer<'_> {
     fn edge_grey(&self, ray: &Ray, around: [Hit; 5], locals: &[LocalView]) -> f32 {
         const STEP: f32 = 1.0 / EDGE_GRID as f32;
         const RAYS: usize = EDGE_GRID * EDGE_GRID;
+        let (blocks, num_blocks) = blocks_of(&around);
         let mut shares = [Share::default(); RAYS];
         let mut num_shares = 0;
         for i in 0..RAYS {
             let a = PIXEL_WIDTH * (((i % EDGE_GRID) as f32 + 0.5) * STEP - 0.5);
             let b = PIXEL_WIDTH * (((i / EDGE_GRID) as f32 + 0.5) * STEP - 0.5);
             let [x, y] = ray.shifted(a, b);
-            let surface = first_of(locals, &around, x, y);
+            let surface = first_of(locals, &blocks[..num_blocks], x, y);
             let known = shares[..num_shares].iter().position(|s| s.surface == surface);
             let share = &mut shares[known.unwrap_or(num_shares)];
             num_shares += usize::from(known.is_none());
@@ -295,16 +296,11 @@ fn first_hit(locals: &[LocalView], near: &[Candidate], x: f32, y: f32) -> Hit {
     Hit { depth, surface: block * 8 + locals[block as usize].face(x, y, depth) }
 }
 
-/// The surface that a ray meets first among the blocks of `around`.
-fn first_of(locals: &[LocalView], around: &[Hit; 5], x: f32, y: f32) -> u32 {
+/// The surface that a ray meets first among a few blocks.
+#[inline]
+fn first_of(locals: &[LocalView], blocks: &[u32], x: f32, y: f32) -> u32 {
     let (mut depth, mut block) = (f32::INFINITY, NO_SURFACE);
-    let mut tested = NO_SURFACE;
-    for hit in around.iter().filter(|hit| hit.surface != NO_SURFACE) {
-        let index = hit.surface >> 3;
-        if index == tested || index == block {
-            continue;
-        }
-        tested = index;
+    for &index in blocks {
         let met = locals[index as usize].depth(x, y);
         if met < depth {
             (depth, block) = (met, index);
@@ -314,6 +310,20 @@ fn first_of(locals: &[LocalView], around: &[Hit; 5], x: f32, y: f32) -> u32 {
         return NO_SURFACE;
     }
     block * 8 + locals[block as usize].face(x, y, depth)
+}
+
+/// The different blocks among some hits, and how many those are.
+#[inline]
+fn blocks_of(around: &[Hit; 5]) -> ([u32; 5], usize) {
+    let (mut blocks, mut count) = ([0; 5], 0);
+    for hit in around.iter().filter(|hit| hit.surface != NO_SURFACE) {
+        let block = hit.surface >> 3;
+        if !blocks[..count].contains(&block) {
+            blocks[count] = block;
+            count += 1;
+        }
+    }
+    (blocks, count)
 }
 
 /// What a pixel sees, then what its neighbours see (itself again outside the image).

@@ -24,7 +24,7 @@ const STEPS: f32 = 65535.0;
 /// Longest chain of samples along a stretched footprint; beyond it the footprint is blurred.
 const MAX_TAPS: f32 = 12.0;
 /// Samples for each texel of the footprint's length, measured in its width.
-const TAPS_PER_RATIO: f32 = 1.5;
+const TAPS_PER_RATIO: f32 = 1.0;
 
 impl Texture {
     /// Builds the mip levels by 2×2 means. `size` is a power of two and `texels` has `size²` entries.

@@ -27,10 +27,22 @@ impl GradientImage {
 
     /// Takes the grey values of a frame of the same size and differentiates them.
     pub fn fill(&mut self, pixels: &[u8]) {
-        let (width, height) = (self.intensity.width(), self.intensity.height());
         for (out, &grey) in self.intensity.pixels_mut().iter_mut().zip(pixels) {
             *out = f32::from(grey);
         }
+        self.differentiate();
+    }
+
+    /// Takes the brightness of an image of the same size and differentiates it.
+    pub fn fill_from(&mut self, image: &Image<f32>) {
+        for (out, &intensity) in self.intensity.pixels_mut().iter_mut().zip(image.pixels()) {
+            *out = intensity;
+        }
+        self.differentiate();
+    }
+
+    fn differentiate(&mut self) {
+        let (width, height) = (self.intensity.width(), self.intensity.height());
         let image = self.intensity.pixels();
         for v in 1..height - 1 {
             let inner = v * width + 1..v * width + width - 1;

@@ -2,10 +2,14 @@
 //!
 //! [`epipolar`] is the geometry between a keyframe and a frame, [`matching`] the search along an
 //! epipolar segment, [`gaussian`] the semi-dense filter, [`propagation`] the step to a new keyframe,
-//! [`regularisation`] the smoothing of the map.
+//! [`regularisation`] the smoothing of the map. [`interval`] is the sparse filter on [`immature`] points
+//! at the pixels that [`candidate`] chooses (Engel, Koltun, Cremers 2018).
 
+pub mod candidate;
 pub mod epipolar;
 pub mod gaussian;
+pub mod immature;
+pub mod interval;
 pub mod map;
 pub mod matching;
 pub mod propagation;

@@ -1,0 +1,455 @@
+//! One immature point: an interval of inverse depth, narrowed by a search along the epipolar segment in
+//! each new frame (Engel, Koltun, Cremers 2018 §2.2).
+
+use serde::{Deserialize, Serialize};
+
+use crate::slam::depth::epipolar::{EpipolarLine, Projection, TwoView};
+use crate::slam::depth::map::{BORDER_PX, GradientImage};
+use crate::slam::depth::matching::{MAX_STEPS, PATTERN, bilinear, is_inside};
+use crate::slam::image::buffer::Image;
+use crate::slam::parameter::{ParameterError, check_range};
+use crate::slam::pose::Brightness;
+
+/// Tuning of a trace.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct IntervalParams {
+    /// Longest first search, as a share of width + height: 30 px at 640×480.
+    pub max_first_search_ratio: f32,
+    /// Shorter segments are certain already, pixels.
+    pub min_segment_px: f32,
+    /// Error of a match where the gradient lies along the line: this once for the search and once for
+    /// the gradient's direction, pixels.
+    pub match_error_px: f32,
+    /// Largest error of a match, pixels: beyond it the direction is as good as unknown.
+    pub max_match_error_px: f32,
+    /// A match with a larger root mean square residual over the pattern (Huber) is an outlier, grey
+    /// levels: 12, raised by a tenth (1.2 on the energy).
+    pub max_residual: f32,
+    /// A mature point's last segment is shorter, pixels.
+    pub mature_segment_px: f32,
+    /// A mature point's second minimum is this many times worse than its best.
+    pub mature_quality: f32,
+}
+
+impl Default for IntervalParams {
+    fn default() -> Self {
+        Self {
+            max_first_search_ratio: 0.027,
+            min_segment_px: 1.5,
+            match_error_px: 0.2,
+            max_match_error_px: 10.0,
+            max_residual: 13.15,
+            mature_segment_px: 8.0,
+            mature_quality: 3.0,
+        }
+    }
+}
+
+impl IntervalParams {
+    /// Checks every value.
+    pub fn validate(&self) -> Result<(), ParameterError> {
+        check_range("max_first_search_ratio", self.max_first_search_ratio, 0.001..=0.2)?;
+        check_range("min_segment_px", self.min_segment_px, 0.1..=20.0)?;
+        check_range("match_error_px", self.match_error_px, 0.01..=5.0)?;
+        check_range("max_match_error_px", self.max_match_error_px, 0.5..=50.0)?;
+        check_range("max_residual", self.max_residual, 1.0..=255.0)?;
+        check_range("mature_segment_px", self.mature_segment_px, 1.0..=100.0)?;
+        check_range("mature_quality", self.mature_quality, 1.0..=100.0)
+    }
+}
+
+/// What the last trace of a point came to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum TraceStatus {
+    /// Never traced.
+    Uninitialized,
+    /// Matched: the interval is new.
+    Good,
+    /// The segment leaves the image, or the patch is seen much larger or smaller. Final.
+    OutOfBounds,
+    /// No acceptable match. A second one in a row is final.
+    Outlier,
+    /// The segment is so short that the point is certain already.
+    Skipped,
+    /// The match would be less certain than the interval is: no parallax, or the gradient lies across.
+    BadCondition,
+}
+
+/// A frame to trace in.
+#[derive(Debug, Clone, Copy)]
+pub struct TraceFrame<'a> {
+    /// Its brightness, level 0.
+    pub image: &'a Image<f32>,
+    /// Its geometry against the frame of the points.
+    pub view: TwoView,
+    /// Its brightness against that frame.
+    pub brightness: Brightness,
+}
+
+/// A point whose depth is not known yet.
+#[derive(Debug, Clone)]
+pub struct ImmaturePoint {
+    /// Column of its pixel.
+    pub u: u16,
+    /// Row of its pixel.
+    pub v: u16,
+    /// Brightness at the samples of the [`PATTERN`].
+    pub intensities: [f32; 8],
+    /// Weight of each sample, `c²/(c²+‖g‖²)`: strong gradients misjudge sub-pixel errors as residual.
+    pub weights: [f32; 8],
+    /// Gradient structure tensor Σ g gᵀ over the pattern: uu, uv, vv.
+    structure: [f32; 3],
+    /// Lower end of the interval, 1/keyframe units; slightly below zero where infinity is within it.
+    pub min_inverse_depth: f32,
+    /// Upper end; unknown before the first match.
+    pub max_inverse_depth: Option<f32>,
+    /// Energy of the second minimum over that of the best; 0 before the first match.
+    pub quality: f32,
+    /// Where the last match lies in its frame.
+    pub last_match: Option<(f32, f32)>,
+    /// Length of the interval's segment in the last frame, pixels; infinite before the first match.
+    pub last_segment_px: f32,
+    /// What the last trace came to.
+    pub status: TraceStatus,
+    /// No further trace is tried.
+    ended: bool,
+}
+
+/// Gradient, grey levels a pixel, at which the weight of a sample is one half.
+const HALF_WEIGHT_GRADIENT: f32 = 50.0;
+
+/// The part of an epipolar line to be searched.
+struct Segment {
+    line: EpipolarLine,
+    start: (f32, f32),
+    direction: (f32, f32),
+    length: f32,
+    /// Pattern offsets in the frame.
+    offsets: [(f32, f32); 8],
+    /// Inverse of the 2×2 that turned them.
+    inverse_warp: [f32; 4],
+}
+
+impl Segment {
+    fn at(&self, lambda: f32) -> (f32, f32) {
+        (self.start.0 + lambda * self.direction.0, self.start.1 + lambda * self.direction.1)
+    }
+}
+
+/// The best match on a segment.
+struct Found {
+    lambda: f32,
+    energy: f32,
+    quality: f32,
+    steps: usize,
+}
+
+impl ImmaturePoint {
+    /// The point of pixel `(u, v)` with all depths possible; `None` within [`BORDER_PX`] of the border.
+    pub fn new(image: &GradientImage, u: u16, v: u16) -> Option<Self> {
+        let (width, height) = (image.width(), image.height());
+        let (column, row) = (usize::from(u), usize::from(v));
+        let columns = BORDER_PX..width.saturating_sub(BORDER_PX);
+        let rows = BORDER_PX..height.saturating_sub(BORDER_PX);
+        if !columns.contains(&column) || !rows.contains(&row) {
+            return None;
+        }
+        let (mut intensities, mut weights, mut structure) = ([0.0; 8], [0.0; 8], [0.0; 3]);
+        for (k, (x, y)) in PATTERN.iter().enumerate() {
+            let i = ((row as i32 + y) * width as i32 + column as i32 + x) as usize;
+            let (gu, gv) = (image.gradient_u.pixels()[i], image.gradient_v.pixels()[i]);
+            intensities[k] = image.intensity.pixels()[i];
+            let half = HALF_WEIGHT_GRADIENT * HALF_WEIGHT_GRADIENT;
+            weights[k] = half / (half + gu * gu + gv * gv);
+            structure[0] += gu * gu;
+            structure[1] += gu * gv;
+            structure[2] += gv * gv;
+        }
+        Some(Self {
+            u,
+            v,
+            intensities,
+            weights,
+            structure,
+            min_inverse_depth: 0.0,
+            max_inverse_depth: None,
+            quality: 0.0,
+            last_match: None,
+            last_segment_px: f32::INFINITY,
+            status: TraceStatus::Uninitialized,
+            ended: false,
+        })
+    }
+
+    /// Middle of the interval; `None` before the first match.
+    pub fn inverse_depth(&self) -> Option<f32> {
+        self.max_inverse_depth.map(|max| 0.5 * (self.min_inverse_depth + max))
+    }
+
+    /// Whether no further trace is tried.
+    pub fn is_ended(&self) -> bool {
+        self.ended
+    }
+
+    /// Whether the depth is known well enough to be used.
+    pub fn is_mature(&self, params: &IntervalParams) -> bool {
+        let usable = matches!(
+            self.status,
+            TraceStatus::Good | TraceStatus::Skipped | TraceStatus::BadCondition
+        );
+        usable
+            && self.last_segment_px < params.mature_segment_px
+            && self.quality > params.mature_quality
+            && self.inverse_depth().is_some_and(|d| d > 0.0)
+    }
+
+    /// Multiplies the interval by `factor`.
+    pub fn rescale(&mut self, factor: f32) {
+        self.min_inverse_depth *= factor;
+        self.max_inverse_depth = self.max_inverse_depth.map(|max| factor * max);
+    }
+
+    /// Searches the point in a frame and narrows its interval.
+    pub fn trace(&mut self, frame: &TraceFrame<'_>, params: &IntervalParams) -> TraceStatus {
+        if self.ended {
+            return self.status;
+        }
+        let status = self.try_trace(frame, params);
+        self.ended = match status {
+            TraceStatus::OutOfBounds => true,
+            TraceStatus::Outlier => self.status == TraceStatus::Outlier,
+            _ => false,
+        };
+        self.status = status;
+        status
+    }
+
+    fn try_trace(&mut self, frame: &TraceFrame<'_>, params: &IntervalParams) -> TraceStatus {
+        let segment = match self.segment(frame, params) {
+            Ok(segment) => segment,
+            Err(status) => return status,
+        };
+        let first = self.max_inverse_depth.is_none();
+        let error = self.match_error(&segment, params);
+        if !first && 2.0 * error > segment.length {
+            return TraceStatus::BadCondition;
+        }
+        let error = error.min(params.max_match_error_px);
+        let patch = self.brightened(&frame.brightness);
+        let found = search(frame.image, &segment, &patch, self.dither());
+        let samples = PATTERN.len() as f32;
+        if !(found.energy <= samples * params.max_residual * params.max_residual) {
+            return TraceStatus::Outlier;
+        }
+        let ends = [found.lambda - error, found.lambda + error].map(|lambda| {
+            let (u, v) = segment.at(lambda);
+            segment.line.inverse_depth_at(u, v)
+        });
+        let [Some(a), Some(b)] = ends else { return TraceStatus::Outlier };
+        if a.max(b) < 0.0 {
+            return TraceStatus::Outlier;
+        }
+        /// A longer search sees enough of the line to judge its ambiguity anew.
+        const REJUDGE_STEPS: usize = 10;
+        if first || found.quality < self.quality || found.steps > REJUDGE_STEPS {
+            self.quality = found.quality;
+        }
+        (self.min_inverse_depth, self.max_inverse_depth) = (a.min(b), Some(a.max(b)));
+        self.last_match = Some(segment.at(found.lambda));
+        self.last_segment_px = 2.0 * error;
+        TraceStatus::Good
+    }
+
+    /// The part of the epipolar line that the interval allows.
+    fn segment(
+        &mut self,
+        frame: &TraceFrame<'_>,
+        params: &IntervalParams,
+    ) -> Result<Segment, TraceStatus> {
+        /// A patch seen larger or smaller than this is not compared: it is turned, but not scaled.
+        const DEPTH_RATIO: std::ops::RangeInclusive<f32> = 0.75..=1.5;
+        /// Motion over all depths, pixels, below which the line has no direction.
+        const NO_MOTION_PX: f32 = 1e-4;
+        let image = frame.image;
+        let line = frame.view.line(f32::from(self.u), f32::from(self.v));
+        let visible = |p: &Projection| is_inside(image, p.u, p.v);
+        let far = line.project(self.min_inverse_depth).filter(visible);
+        let far = far.ok_or(TraceStatus::OutOfBounds)?;
+        if !DEPTH_RATIO.contains(&far.depth_ratio) {
+            return Err(TraceStatus::OutOfBounds);
+        }
+        let centre = self.inverse_depth().and_then(|d| line.project(d)).unwrap_or(far);
+        let (direction, length) = match self.max_inverse_depth {
+            Some(max) => {
+                let near = line.project(max).filter(visible).ok_or(TraceStatus::OutOfBounds)?;
+                let (du, dv) = (near.u - far.u, near.v - far.v);
+                let length = du.hypot(dv);
+                self.last_segment_px = length;
+                if length < params.min_segment_px {
+                    return Err(TraceStatus::Skipped);
+                }
+                ((du / length, dv / length), length)
+            }
+            None => {
+                let (du, dv) = line.velocity(&far);
+                let speed = du.hypot(dv);
+                if !(speed > NO_MOTION_PX) {
+                    return Err(TraceStatus::BadCondition);
+                }
+                let direction = (du / speed, dv / speed);
+                let most = params.max_first_search_ratio * (image.width() + image.height()) as f32;
+                let length = most.min(distance_to_epipole(&line, &far));
+                let end = (far.u + length * direction.0, far.v + length * direction.1);
+                if !is_inside(image, end.0, end.1) {
+                    return Err(TraceStatus::OutOfBounds);
+                }
+                (direction, length)
+            }
+        };
+        // At the origin, at depth ratio 1, what is left of the patch's Jacobian is the upper left of
+        // K R K⁻¹: the turn alone.
+        let warp = frame.view.patch_warp(&centre);
+        let determinant = warp[0] * warp[3] - warp[1] * warp[2];
+        /// Area of a turned pixel: outside, the view is so oblique that the patch is not comparable.
+        const AREA: std::ops::RangeInclusive<f32> = 0.3..=3.0;
+        if !AREA.contains(&determinant) {
+            return Err(TraceStatus::BadCondition);
+        }
+        let inverse_warp = [warp[3], -warp[1], -warp[2], warp[0]].map(|x| x / determinant);
+        let offsets = PATTERN.map(|(x, y)| {
+            let (x, y) = (x as f32, y as f32);
+            (warp[0] * x + warp[1] * y, warp[2] * x + warp[3] * y)
+        });
+        Ok(Segment { line, start: (far.u, far.v), direction, length, offsets, inverse_warp })
+    }
+
+    /// Expected error of a match, pixels: `e = c + c (h_∥ + h_⊥)/h_∥` with the structure tensor along
+    /// and across the line, turned back to where the gradients are.
+    fn match_error(&self, segment: &Segment, params: &IntervalParams) -> f32 {
+        let (m, (du, dv)) = (segment.inverse_warp, segment.direction);
+        let information = |x: f32, y: f32| {
+            let (u, v) = (m[0] * x + m[1] * y, m[2] * x + m[3] * y);
+            let h = self.structure;
+            u * u * h[0] + 2.0 * u * v * h[1] + v * v * h[2]
+        };
+        let (along, across) = (information(du, dv), information(-dv, du));
+        if !(along > 0.0) {
+            return f32::INFINITY;
+        }
+        params.match_error_px * (1.0 + (along + across) / along)
+    }
+
+    /// The pattern's brightness as the frame shows it.
+    fn brightened(&self, brightness: &Brightness) -> [f32; 8] {
+        let (gain, offset) = (brightness.a.exp() as f32, brightness.b as f32);
+        self.intensities.map(|i| gain * i + offset)
+    }
+
+    /// A number in [0, 1) that differs from pixel to pixel: no two neighbours search the same grid.
+    fn dither(&self) -> f32 {
+        let mixed = (u32::from(self.u) << 16 | u32::from(self.v)).wrapping_mul(0x9E37_79B9);
+        ((mixed ^ (mixed >> 15)).wrapping_mul(0x85EB_CA6B) >> 8) as f32 / (1 << 24) as f32
+    }
+}
+
+/// How far ahead of `far` the image of infinitely near points lies, if the line runs towards it.
+fn distance_to_epipole(line: &EpipolarLine, far: &Projection) -> f32 {
+    // With kt_z > 0 the projection runs towards kt/kt_z; else it leaves the image at a finite depth.
+    if line.kt[2] > 0.0 {
+        (line.kt[0] / line.kt[2] - far.u).hypot(line.kt[1] / line.kt[2] - far.v)
+    } else {
+        f32::INFINITY
+    }
+}
+
+/// Searches at 1-px steps and refines by Gauss–Newton.
+fn search(image: &Image<f32>, segment: &Segment, patch: &[f32; 8], dither: f32) -> Found {
+    /// Steps this near to the best belong to the same minimum.
+    const SAME_MINIMUM_STEPS: usize = 2;
+    let steps = ((segment.length + dither).ceil() as usize + 1).min(MAX_STEPS - 1);
+    let mut energies = [f32::INFINITY; MAX_STEPS];
+    let mut best = 0;
+    for step in 0..steps {
+        energies[step] = energy(image, segment, patch, step as f32 - dither);
+        if energies[step] < energies[best] {
+            best = step;
+        }
+    }
+    let second = energies[..steps]
+        .iter()
+        .enumerate()
+        .filter(|(step, _)| step.abs_diff(best) > SAME_MINIMUM_STEPS)
+        .fold(f32::INFINITY, |least, (_, &e)| least.min(e));
+    /// Energies below one squared grey level are rounding.
+    const LEAST_ENERGY: f32 = 1.0;
+    let quality = second / energies[best].max(LEAST_ENERGY);
+    let (lambda, energy) = refine(image, segment, patch, best as f32 - dither, energies[best]);
+    Found { lambda, energy, quality, steps }
+}
+
+/// At most three Gauss–Newton steps along the line; a step that raises the energy is halved and taken
+/// from where it started.
+fn refine(
+    image: &Image<f32>,
+    segment: &Segment,
+    patch: &[f32; 8],
+    lambda: f32,
+    start_energy: f32,
+) -> (f32, f32) {
+    const MAX_ITERATIONS: usize = 3;
+    const MAX_STEP_PX: f32 = 0.5;
+    /// Smaller steps are far below the error that is claimed.
+    const CONVERGED_PX: f32 = 0.1;
+    let mut best = (lambda, start_energy);
+    let mut share = 1.0;
+    for _ in 0..MAX_ITERATIONS {
+        let step = gauss_newton_step(image, segment, patch, best.0);
+        let step = share * step.clamp(-MAX_STEP_PX, MAX_STEP_PX);
+        let candidate = best.0 + step;
+        let energy = energy(image, segment, patch, candidate);
+        if energy < best.1 {
+            best = (candidate, energy);
+        } else {
+            share *= 0.5;
+        }
+        if !(step.abs() >= CONVERGED_PX) {
+            break;
+        }
+    }
+    best
+}
+
+/// The Gauss–Newton step of the Huber energy along the line.
+fn gauss_newton_step(image: &Image<f32>, segment: &Segment, patch: &[f32; 8], lambda: f32) -> f32 {
+    let (u, v) = segment.at(lambda);
+    let (du, dv) = segment.direction;
+    let (mut gradient, mut information) = (0.0, f32::MIN_POSITIVE);
+    for (k, (ou, ov)) in segment.offsets.iter().enumerate() {
+        let (x, y) = (u + ou, v + ov);
+        let slope = 0.5 * (bilinear(image, x + du, y + dv) - bilinear(image, x - du, y - dv));
+        let residual = bilinear(image, x, y) - patch[k];
+        let weight = if residual.abs() <= HUBER_GREY { 1.0 } else { HUBER_GREY / residual.abs() };
+        gradient += weight * slope * residual;
+        information += weight * slope * slope;
+    }
+    -gradient / information
+}
+
+/// Residuals beyond this many grey levels grow linearly.
+const HUBER_GREY: f32 = 9.0;
+
+/// Σ ρ(residual) of the pattern, ρ(r) = r² up to [`HUBER_GREY`], linear beyond.
+fn energy(image: &Image<f32>, segment: &Segment, patch: &[f32; 8], lambda: f32) -> f32 {
+    let (u, v) = segment.at(lambda);
+    let mut sum = 0.0;
+    for (k, (ou, ov)) in segment.offsets.iter().enumerate() {
+        let residual = (bilinear(image, u + ou, v + ov) - patch[k]).abs();
+        sum += if residual <= HUBER_GREY {
+            residual * residual
+        } else {
+            HUBER_GREY * (2.0 * residual - HUBER_GREY)
+        };
+    }
+    sum
+}

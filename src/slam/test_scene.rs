@@ -1,0 +1,176 @@
+//! An analytic scene for tests: a textured room with boxes in it, rendered by ray casting with exact
+//! depth.
+
+use nalgebra::Vector3;
+
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::image::buffer::Image;
+
+/// A camera of about 63° × 49°.
+pub const CAMERA: Intrinsics =
+    Intrinsics { fx: 260.0, fy: 260.0, cx: 159.5, cy: 119.5, width: 320, height: 240 };
+
+/// One rendered frame.
+pub struct Rendering {
+    /// Brightness without noise, 0 to 255.
+    pub intensity: Image<f32>,
+    /// Exact inverse depth at the pixel centres, 1/m.
+    pub inverse_depth: Image<f32>,
+}
+
+impl Rendering {
+    /// Eight-bit pixels with Gaussian noise.
+    pub fn noisy(&self, std_dev: f64, seed: u64) -> Vec<u8> {
+        let mut random = Random::new(seed);
+        let grey = |i: &f32| (f64::from(*i) + std_dev * random.normal()).round();
+        self.intensity.pixels().iter().map(grey).map(|i| i.clamp(0.0, 255.0) as u8).collect()
+    }
+}
+
+/// SplitMix64.
+pub struct Random(u64);
+
+impl Random {
+    pub fn new(seed: u64) -> Self {
+        Self(seed.wrapping_mul(0xD134_2543_DE82_EF95).wrapping_add(1))
+    }
+
+    /// Uniform in [0, 1).
+    pub fn uniform(&mut self) -> f64 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
+    }
+
+    /// Standard normal, by Box and Muller.
+    pub fn normal(&mut self) -> f64 {
+        let radius = (-2.0 * (1.0 - self.uniform()).ln()).sqrt();
+        radius * (std::f64::consts::TAU * self.uniform()).cos()
+    }
+}
+
+/// An axis-aligned box.
+#[derive(Clone, Copy)]
+struct Cuboid {
+    low: Vector3<f64>,
+    high: Vector3<f64>,
+}
+
+impl Cuboid {
+    /// Where a ray enters and leaves, as multiples of its direction, with the axes of the faces.
+    fn cross(&self, origin: &Vector3<f64>, ray: &Vector3<f64>) -> Option<[(f64, usize); 2]> {
+        let (mut enter, mut leave) = ((f64::NEG_INFINITY, 0), (f64::INFINITY, 0));
+        for axis in 0..3 {
+            let a = (self.low[axis] - origin[axis]) / ray[axis];
+            let b = (self.high[axis] - origin[axis]) / ray[axis];
+            if a.min(b) > enter.0 {
+                enter = (a.min(b), axis);
+            }
+            if a.max(b) < leave.0 {
+                leave = (a.max(b), axis);
+            }
+        }
+        (enter.0 < leave.0).then_some([enter, leave])
+    }
+}
+
+/// A room around the origin, the camera looking along +z into it.
+pub struct Scene {
+    seed: u64,
+    room: Cuboid,
+    boxes: [Cuboid; 4],
+}
+
+impl Scene {
+    /// The room of a seed: same plan, other places and other texture.
+    pub fn new(seed: u64) -> Self {
+        let mut random = Random::new(seed);
+        let mut cuboid = |low: [f64; 3], size: [f64; 3]| {
+            let low = Vector3::from(low).map(|x| x + 0.15 * (random.uniform() - 0.5));
+            Cuboid { low, high: low + Vector3::from(size) }
+        };
+        let boxes = [
+            cuboid([-1.1, -0.2, 2.0], [0.6, 1.9, 0.5]),
+            cuboid([0.4, 0.3, 1.5], [0.6, 1.4, 0.6]),
+            cuboid([-0.3, -1.6, 2.6], [0.7, 1.0, 0.6]),
+            cuboid([1.0, -0.9, 3.2], [0.5, 0.8, 0.5]),
+        ];
+        let room =
+            Cuboid { low: Vector3::new(-2.5, -1.6, -2.0), high: Vector3::new(2.5, 1.6, 4.2) };
+        Self { seed, room, boxes }
+    }
+
+    /// Renders the view of a camera; every pixel is the mean of 2×2 rays.
+    pub fn render(&self, camera: &Intrinsics, world_from_camera: &SE3) -> Rendering {
+        let rotation = world_from_camera.rotation_matrix();
+        let origin = world_from_camera.translation;
+        let ray = |u: f64, v: f64| {
+            rotation * Vector3::new((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0)
+        };
+        let mut intensity = Image::filled(camera.width, camera.height, 0.0);
+        let mut inverse_depth = intensity.clone();
+        for i in 0..camera.width * camera.height {
+            let (u, v) = ((i % camera.width) as f64, (i / camera.width) as f64);
+            inverse_depth.pixels_mut()[i] = (1.0 / self.hit(&origin, &ray(u, v)).0) as f32;
+            let samples = [(-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)];
+            let sum: f64 =
+                samples.iter().map(|s| self.shade(&origin, &ray(u + s.0, v + s.1))).sum();
+            intensity.pixels_mut()[i] = (0.25 * sum) as f32;
+        }
+        Rendering { intensity, inverse_depth }
+    }
+
+    fn shade(&self, origin: &Vector3<f64>, ray: &Vector3<f64>) -> f64 {
+        let (distance, axis, surface) = self.hit(origin, ray);
+        let at = origin + ray * distance;
+        let (x, y) = match axis {
+            0 => (at.y, at.z),
+            1 => (at.x, at.z),
+            _ => (at.x, at.y),
+        };
+        self.texture(surface * 3 + axis as u64, x, y)
+    }
+
+    /// Distance along the ray (depth, for rays of unit depth), axis of the face and surface.
+    fn hit(&self, origin: &Vector3<f64>, ray: &Vector3<f64>) -> (f64, usize, u64) {
+        let [_, wall] = self.room.cross(origin, ray).unwrap_or([(0.0, 0), (1.0, 0)]);
+        let mut nearest = (wall.0, wall.1, 0);
+        for (index, cuboid) in self.boxes.iter().enumerate() {
+            if let Some([(enter, axis), _]) = cuboid.cross(origin, ray)
+                && enter > 0.0
+                && enter < nearest.0
+            {
+                nearest = (enter, axis, index as u64 + 1);
+            }
+        }
+        nearest
+    }
+
+    /// Smooth noise of three sizes and soft-edged stripes, so that there are corners and edges.
+    fn texture(&self, surface: u64, x: f64, y: f64) -> f64 {
+        let surface = surface ^ (self.seed << 8);
+        let noise = 45.0 * lattice_noise(surface, x / 0.06, y / 0.06)
+            + 50.0 * lattice_noise(surface ^ 0x55, x / 0.2, y / 0.2)
+            + 60.0 * lattice_noise(surface ^ 0xAA, x / 0.7, y / 0.7);
+        let stripes = 25.0 * ((4.0 * x + 1.5 * y).sin() * 12.0).tanh();
+        128.0 + noise + stripes
+    }
+}
+
+/// Value noise in [-1, 1], smooth between the points of a unit lattice.
+fn lattice_noise(seed: u64, x: f64, y: f64) -> f64 {
+    let (column, row) = (x.floor(), y.floor());
+    let corner = |dx: f64, dy: f64| {
+        let cell = ((column + dx) as i64 as u64).wrapping_mul(0x9E37_79B9)
+            ^ ((row + dy) as i64 as u64).wrapping_mul(0x85EB_CA6B_1234_5677);
+        2.0 * Random::new(cell ^ seed.wrapping_mul(0x2545_F491_4F6C_DD1D)).uniform() - 1.0
+    };
+    let smooth = |t: f64| t * t * (3.0 - 2.0 * t);
+    let (fx, fy) = (smooth(x - column), smooth(y - row));
+    let upper = corner(0.0, 0.0) * (1.0 - fx) + corner(1.0, 0.0) * fx;
+    let lower = corner(0.0, 1.0) * (1.0 - fx) + corner(1.0, 1.0) * fx;
+    upper * (1.0 - fy) + lower * fy
+}

@@ -1,0 +1,397 @@
+//! The first depth of a map from two frames: pose, brightness and the depths of the first frame's
+//! points together, frame after frame, until parallax is proven (after the idea of Engel, Koltun,
+//! Cremers 2018 §3.1).
+//!
+//! A camera that stands or only turns never gets there, however noisy its images: see [`evidence`].
+
+pub mod evidence;
+pub mod fit;
+pub mod points;
+pub mod spread;
+pub mod system;
+
+use nalgebra::Vector3;
+use serde::{Deserialize, Serialize};
+
+use crate::slam::depth::candidate::CandidateParams;
+use crate::slam::depth::map::{DepthMap, GradientImage};
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::image::pyramid::Pyramid;
+use crate::slam::parameter::{ParameterError, check_range};
+use crate::slam::pose::Brightness;
+use crate::slam::two_frame::evidence::{
+    Evidence, EvidenceParams, Waiting, judge, residual_variance,
+};
+use crate::slam::two_frame::fit::{
+    FitInput, FitParams, FitScratch, Freedom, depth_variances, fit_level,
+};
+use crate::slam::two_frame::points::Points;
+use crate::slam::two_frame::spread::spread;
+use crate::slam::two_frame::system::State;
+
+/// Tuning of the two-frame start.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TwoFrameParams {
+    /// The points of the first frame.
+    pub candidates: CandidateParams,
+    /// The fit.
+    pub fit: FitParams,
+    /// What counts as proof.
+    pub evidence: EvidenceParams,
+    /// Fewer points than this cannot carry a start.
+    pub min_points: usize,
+    /// Frames in a row that must prove the parallax and agree on the direction: one alone may be a blink.
+    pub confirming_frames: u32,
+    /// Frames after which an unproven start begins again on a new first frame: 2 s at 30 Hz.
+    pub max_frames: u32,
+    /// Frames in a row that may fail to match before it begins again.
+    pub max_mismatches: u32,
+    /// Standard deviation that interpolation and sampling leave in a match, pixels.
+    pub match_noise_px: f32,
+}
+
+impl Default for TwoFrameParams {
+    fn default() -> Self {
+        Self {
+            candidates: CandidateParams { wanted: 1500, ..CandidateParams::default() },
+            fit: FitParams::default(),
+            evidence: EvidenceParams::default(),
+            min_points: 200,
+            confirming_frames: 2,
+            max_frames: 60,
+            max_mismatches: 3,
+            match_noise_px: 0.15,
+        }
+    }
+}
+
+impl TwoFrameParams {
+    /// Checks every value.
+    pub fn validate(&self) -> Result<(), ParameterError> {
+        self.candidates.validate().map_err(|e| e.within("candidates"))?;
+        self.fit.validate().map_err(|e| e.within("fit"))?;
+        self.evidence.validate().map_err(|e| e.within("evidence"))?;
+        check_range("min_points", self.min_points, 20..=100_000)?;
+        check_range("confirming_frames", self.confirming_frames, 1..=100)?;
+        check_range("max_frames", self.max_frames, 2..=100_000)?;
+        check_range("max_mismatches", self.max_mismatches, 1..=1000)?;
+        check_range("match_noise_px", self.match_noise_px, 0.0..=5.0)
+    }
+}
+
+/// Why a start is given up; the frame that showed it is the new first frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Failure {
+    /// Too many frames without proof.
+    TooLong,
+    /// The frames no longer show what the first one does.
+    Mismatch,
+    /// The frame has another size than the intrinsics say. Nothing is begun on it.
+    WrongSize,
+}
+
+/// Where a start stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum InitState {
+    /// Not proven yet, and by what.
+    Waiting(Waiting),
+    /// Parallax is proven: pose and depths can be used.
+    Proven,
+    /// Given up and begun again.
+    Failed(Failure),
+}
+
+/// What one frame came to.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct InitOutcome {
+    /// Where the start stands.
+    pub state: InitState,
+    /// The figures behind it.
+    pub evidence: Evidence,
+    /// Pose of the frame, in units in which the points' mean inverse depth is 1.
+    pub first_from_current: SE3,
+    /// Brightness of the frame against the first.
+    pub brightness: Brightness,
+}
+
+/// The depth of a pixel of the first frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct InitialDepth {
+    /// Column.
+    pub u: u16,
+    /// Row.
+    pub v: u16,
+    /// Inverse depth; the mean over the points is 1.
+    pub inverse_depth: f32,
+    /// Its variance.
+    pub variance: f32,
+}
+
+/// Finds the first depth. Keeps its memory; the same frames give the same result.
+#[derive(Debug)]
+pub struct TwoFrameInitializer {
+    params: TwoFrameParams,
+    intrinsics: Vec<Intrinsics>,
+    pyramid: Pyramid,
+    images: Vec<GradientImage>,
+    first_pixels: Vec<u8>,
+    points: Points,
+    joint: State,
+    alternative: State,
+    rotation: State,
+    fit_scratch: FitScratch,
+    rotation_scratch: FitScratch,
+    variances: Vec<f32>,
+    sorted: Vec<f32>,
+    /// Direction from the first camera to the one before, in the first frame.
+    heading: Vector3<f64>,
+    frames: u32,
+    confirmed: u32,
+    mismatches: u32,
+}
+
+impl TwoFrameInitializer {
+    /// An initialiser for images of `intrinsics`; nothing is begun.
+    pub fn new(intrinsics: Intrinsics, params: TwoFrameParams) -> Result<Self, ParameterError> {
+        params.validate()?;
+        check_range("width", intrinsics.width, 32..=8192)?;
+        check_range("height", intrinsics.height, 32..=8192)?;
+        let num_levels = num_levels(&intrinsics);
+        let intrinsics: Vec<_> = (0..num_levels).map(|l| intrinsics.at_level(l)).collect();
+        let images = intrinsics.iter().map(|k| GradientImage::with_size(k.width, k.height));
+        let state = State {
+            current_from_first: SE3::identity(),
+            brightness: Brightness::default(),
+            inverse_depths: Vec::new(),
+        };
+        Ok(Self {
+            pyramid: Pyramid::with_size(intrinsics[0].width, intrinsics[0].height, num_levels),
+            images: images.collect(),
+            params,
+            intrinsics,
+            first_pixels: Vec::new(),
+            points: Points::default(),
+            joint: state.clone(),
+            alternative: state.clone(),
+            rotation: state,
+            fit_scratch: FitScratch::default(),
+            rotation_scratch: FitScratch::default(),
+            variances: Vec::new(),
+            sorted: Vec::new(),
+            heading: Vector3::zeros(),
+            frames: 0,
+            confirmed: 0,
+            mismatches: 0,
+        })
+    }
+
+    /// Begins on a first frame; `false` where it has the wrong size or too little texture.
+    pub fn begin(&mut self, pixels: &[u8]) -> bool {
+        self.first_pixels.clear();
+        if pixels.len() != self.intrinsics[0].width * self.intrinsics[0].height {
+            return false;
+        }
+        self.load(pixels);
+        let found = self.points.choose(&self.images[0], &self.pyramid, &self.params.candidates);
+        if found < self.params.min_points {
+            return false;
+        }
+        self.first_pixels.extend_from_slice(pixels);
+        for state in [&mut self.joint, &mut self.alternative, &mut self.rotation] {
+            state.current_from_first = SE3::identity();
+            state.brightness = Brightness::default();
+            state.inverse_depths.clear();
+            state.inverse_depths.resize(found, 1.0);
+        }
+        (self.frames, self.confirmed, self.mismatches) = (0, 0, 0);
+        true
+    }
+
+    /// Takes the next frame: fits, judges, and begins again by itself where it must.
+    pub fn step(&mut self, pixels: &[u8]) -> InitOutcome {
+        if pixels.len() != self.intrinsics[0].width * self.intrinsics[0].height {
+            return self.outcome(InitState::Failed(Failure::WrongSize), Evidence::default());
+        }
+        if self.first_pixels.is_empty() {
+            let missing = if self.begin(pixels) { Waiting::Translation } else { Waiting::Texture };
+            return self.outcome(InitState::Waiting(missing), Evidence::default());
+        }
+        self.load(pixels);
+        self.frames += 1;
+        self.fit_rotation();
+        self.fit_jointly();
+        let evidence = self.judge();
+        let missing = evidence.missing(&self.params.evidence);
+        self.count_confirmation(missing.is_none());
+        self.mismatches = if missing == Some(Waiting::Match) { self.mismatches + 1 } else { 0 };
+        let state = match missing {
+            None if self.confirmed >= self.params.confirming_frames => InitState::Proven,
+            _ if self.mismatches >= self.params.max_mismatches => {
+                InitState::Failed(Failure::Mismatch)
+            }
+            _ if self.frames >= self.params.max_frames => InitState::Failed(Failure::TooLong),
+            missing => InitState::Waiting(missing.unwrap_or(Waiting::Confirmation)),
+        };
+        let outcome = self.outcome(state, evidence);
+        if matches!(state, InitState::Failed(_)) {
+            self.begin(pixels);
+        }
+        outcome
+    }
+
+    /// The frame that the depths belong to; empty before one is begun.
+    pub fn first_pixels(&self) -> &[u8] {
+        &self.first_pixels
+    }
+
+    /// The depths of the first frame's points as the latest frame left them; usable once proven.
+    pub fn depths(&self) -> impl Iterator<Item = InitialDepth> {
+        /// A depth is usable when it is known to within half of itself.
+        const USABLE_STD_DEV_RATIO: f32 = 0.5;
+        let depths = self.joint.inverse_depths.iter().zip(&self.variances);
+        self.points.pixels.iter().zip(depths).filter_map(
+            |(&(u, v), (&inverse_depth, &variance))| {
+                let usable =
+                    inverse_depth > 0.0 && variance.sqrt() < USABLE_STD_DEV_RATIO * inverse_depth;
+                usable.then_some(InitialDepth { u, v, inverse_depth, variance })
+            },
+        )
+    }
+
+    /// Fills a depth map that was restarted on [`TwoFrameInitializer::first_pixels`]: the points, and
+    /// around them every candidate pixel with a wider variance.
+    pub fn fill(&self, map: &mut DepthMap) {
+        let depths: Vec<InitialDepth> = self.depths().collect();
+        spread(&depths, map);
+    }
+
+    fn load(&mut self, pixels: &[u8]) {
+        self.pyramid.fill(pixels);
+        for (level, image) in self.images.iter_mut().enumerate() {
+            image.fill_from(self.pyramid.level(level));
+        }
+    }
+
+    /// Rotation and brightness alone, coarse to fine, from the frame before.
+    fn fit_rotation(&mut self) {
+        let input =
+            FitInput { images: &self.images, intrinsics: &self.intrinsics, points: &self.points };
+        for level in (0..self.images.len()).rev() {
+            let (state, scratch) = (&mut self.rotation, &mut self.rotation_scratch);
+            fit_level(&input, level, Freedom::Rotation, state, scratch, &self.params.fit);
+        }
+    }
+
+    /// Everything, coarse to fine: from the frame before, from rest and from the mirrored solution,
+    /// because with little parallax a fit can settle in the wrong one of several minima and stay there.
+    /// The best goes on to the finest level.
+    fn fit_jointly(&mut self) {
+        let mirror = mirrored(&self.joint, &self.rotation);
+        let mut best = self.fit_coarsely();
+        for start in [at_rest(&self.rotation), mirror] {
+            std::mem::swap(&mut self.joint, &mut self.alternative);
+            self.joint.clone_from(&start);
+            let energy = self.fit_coarsely();
+            if energy < best {
+                best = energy;
+            } else {
+                std::mem::swap(&mut self.joint, &mut self.alternative);
+            }
+        }
+        self.fit_joint_level(0);
+    }
+
+    /// Fits all levels but the finest; the energy on the last of them.
+    fn fit_coarsely(&mut self) -> f64 {
+        (1..self.images.len()).rev().fold(0.0, |_, level| self.fit_joint_level(level))
+    }
+
+    fn fit_joint_level(&mut self, level: usize) -> f64 {
+        let input =
+            FitInput { images: &self.images, intrinsics: &self.intrinsics, points: &self.points };
+        let (state, scratch) = (&mut self.joint, &mut self.fit_scratch);
+        fit_level(&input, level, Freedom::Everything, state, scratch, &self.params.fit)
+    }
+
+    /// Variances and figures of the latest fit; then the scale goes to mean inverse depth 1.
+    fn judge(&mut self) -> Evidence {
+        let (joint, rotation) = (&self.fit_scratch.system, &self.rotation_scratch.system);
+        let floor = self.params.fit.image_noise.powi(2);
+        let noise = residual_variance(joint, &mut self.sorted).max(floor);
+        let match_variance = self.params.match_noise_px.powi(2);
+        depth_variances(&self.joint, joint, noise, match_variance, &mut self.variances);
+        let evidence = judge(&self.joint, joint, &self.variances, rotation, &mut self.sorted);
+        let visible =
+            joint.points.iter().zip(&self.joint.inverse_depths).filter(|(p, _)| p.visible);
+        let mean =
+            visible.map(|(_, d)| f64::from(*d)).sum::<f64>() / joint.num_visible.max(1) as f64;
+        /// A mean below this is not a scale but a failed fit.
+        const MIN_MEAN: f64 = 0.05;
+        if mean > MIN_MEAN {
+            let factor = (1.0 / mean) as f32;
+            self.joint.current_from_first.translation *= mean;
+            self.joint.inverse_depths.iter_mut().for_each(|d| *d *= factor);
+            self.variances.iter_mut().for_each(|v| *v *= factor * factor);
+        }
+        evidence
+    }
+
+    /// Counts the frames in a row that prove the parallax and agree on where the camera went.
+    fn count_confirmation(&mut self, proves: bool) {
+        /// Cosine of 20°: a hand does not turn its path by more within a frame, a wrong minimum does.
+        const MIN_AGREEMENT: f64 = 0.94;
+        let travelled = self.joint.current_from_first.inverse().translation;
+        let heading = travelled / travelled.norm().max(f64::MIN_POSITIVE);
+        let agrees = heading.dot(&self.heading) >= MIN_AGREEMENT;
+        self.confirmed = match (proves, agrees) {
+            (true, true) => self.confirmed + 1,
+            (true, false) => 1,
+            (false, _) => 0,
+        };
+        self.heading = heading;
+    }
+
+    fn outcome(&self, state: InitState, evidence: Evidence) -> InitOutcome {
+        InitOutcome {
+            state,
+            evidence,
+            first_from_current: self.joint.current_from_first.inverse(),
+            brightness: self.joint.brightness,
+        }
+    }
+}
+
+/// Levels down to about 80 pixels across: a tenth of the image then moves by a few pixels.
+fn num_levels(intrinsics: &Intrinsics) -> usize {
+    const MIN_WIDTH: usize = 64;
+    const MIN_HEIGHT: usize = 48;
+    const MAX_LEVELS: usize = 6;
+    let fits =
+        |l: &usize| intrinsics.width >> l >= MIN_WIDTH && intrinsics.height >> l >= MIN_HEIGHT;
+    (0..MAX_LEVELS).take_while(fits).count().max(1)
+}
+
+/// The solution of a pure rotation, all depths 1.
+fn at_rest(rotation: &State) -> State {
+    State { inverse_depths: vec![1.0; rotation.inverse_depths.len()], ..rotation.clone() }
+}
+
+/// The other solution that a narrow view allows: near and far exchanged, the translation reversed, the
+/// rotation on the other side of the one that explains the frame best without translation.
+fn mirrored(state: &State, rotation: &State) -> State {
+    let best = rotation.current_from_first.rotation;
+    let turned = best * state.current_from_first.rotation.inverse() * best;
+    State {
+        current_from_first: SE3 {
+            rotation: turned,
+            translation: -state.current_from_first.translation,
+        },
+        brightness: state.brightness,
+        inverse_depths: state.inverse_depths.iter().map(|d| (2.0 - d).clamp(0.1, 2.0)).collect(),
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,311 @@
+//! Levenberg–Marquardt on pose, brightness and inverse depths together, coarse to fine; and on rotation
+//! and brightness alone.
+//!
+//! Each depth meets only the pose, so it is eliminated (Schur complement): with D_i the damped
+//! information of depth i and m_i its row of mixed terms,
+//!
+//! ```text
+//! (H − Σ m_i m_iᵀ/D_i) δ = −(g − Σ m_i g_i/D_i)        δd_i = −(g_i + m_iᵀδ)/D_i
+//! ```
+//!
+//! Two priors make D_i positive without parallax: a depth lies near the median of its neighbours and,
+//! loosely, near 1; the second also holds the scale, which the images leave free.
+
+use nalgebra::{SMatrix, SVector, Vector6};
+use serde::{Deserialize, Serialize};
+
+use crate::slam::depth::map::GradientImage;
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::parameter::{ParameterError, check_range};
+use crate::slam::two_frame::points::{NUM_NEIGHBOURS, Points};
+use crate::slam::two_frame::system::{LevelView, NUM_UNKNOWNS, State, System};
+
+/// Tuning of the fit.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct FitParams {
+    /// Standard deviation of the image noise, grey levels: weighs images against priors.
+    pub image_noise: f32,
+    /// Standard deviation of an inverse depth about its neighbours' median; the mean is 1.
+    pub neighbour_std_dev: f32,
+    /// Standard deviation of an inverse depth about 1: loose, rooms vary by more than a factor of 2.
+    pub depth_std_dev: f32,
+    /// Most iterations a level.
+    pub max_iterations: u32,
+    /// A level is done when a step lowers the energy by less than this share.
+    pub min_energy_drop: f64,
+}
+
+impl Default for FitParams {
+    fn default() -> Self {
+        Self {
+            image_noise: 3.0,
+            neighbour_std_dev: 0.5,
+            depth_std_dev: 1.0,
+            max_iterations: 20,
+            min_energy_drop: 3e-4,
+        }
+    }
+}
+
+impl FitParams {
+    /// Checks every value.
+    pub fn validate(&self) -> Result<(), ParameterError> {
+        check_range("image_noise", self.image_noise, 0.1..=50.0)?;
+        check_range("neighbour_std_dev", self.neighbour_std_dev, 0.01..=100.0)?;
+        check_range("depth_std_dev", self.depth_std_dev, 0.01..=100.0)?;
+        check_range("max_iterations", self.max_iterations, 1..=1000)?;
+        check_range("min_energy_drop", self.min_energy_drop, 0.0..=0.5)
+    }
+
+    /// Weights of the two priors, in the squared grey levels of the energy.
+    fn prior_weights(&self) -> (f32, f32) {
+        // A residual is the difference of two noisy values.
+        let noise = 2.0 * self.image_noise * self.image_noise;
+        (noise / self.neighbour_std_dev.powi(2), noise / self.depth_std_dev.powi(2))
+    }
+}
+
+/// Smallest and largest inverse depth, the mean being 1. Negative ones have no meaning; that a point
+/// reaches them tells a wrong minimum.
+const INVERSE_DEPTHS: std::ops::RangeInclusive<f32> = -2.0..=10.0;
+
+/// The current frame at all levels, with the points of the first.
+#[derive(Debug, Clone, Copy)]
+pub struct FitInput<'a> {
+    /// The current frame, finest level first.
+    pub images: &'a [GradientImage],
+    /// Intrinsics of the levels.
+    pub intrinsics: &'a [Intrinsics],
+    /// Points of the first frame.
+    pub points: &'a Points,
+}
+
+impl<'a> FitInput<'a> {
+    /// One level.
+    pub fn level(&self, level: usize) -> LevelView<'a> {
+        LevelView {
+            image: &self.images[level],
+            intrinsics: &self.intrinsics[level],
+            patches: &self.points.patches[level],
+        }
+    }
+}
+
+/// What may move.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Freedom {
+    /// Rotation and brightness.
+    Rotation,
+    /// Pose, brightness and depths.
+    Everything,
+}
+
+/// Memory of the fit.
+#[derive(Debug, Default)]
+pub struct FitScratch {
+    /// Normal equations at the best state so far; after a fit, at its result on the last level.
+    pub system: System,
+    trial: System,
+    medians: Vec<f32>,
+    trial_depths: Vec<f32>,
+}
+
+/// Fits `state` on one level; the energy with priors that it ends at.
+pub fn fit_level(
+    input: &FitInput<'_>,
+    level: usize,
+    freedom: Freedom,
+    state: &mut State,
+    scratch: &mut FitScratch,
+    params: &FitParams,
+) -> f64 {
+    const FIRST_DAMPING: f64 = 0.01;
+    const LEAST_DAMPING: f64 = 1e-6;
+    const SUCCESS_FACTOR: f64 = 0.3;
+    const FAILURE_FACTOR: f64 = 5.0;
+    /// So many failures in a row make a step of nothing.
+    const MAX_FAILURES: u32 = 5;
+    let view = input.level(level);
+    let weights = params.prior_weights();
+    scratch.system.evaluate(&view, state);
+    neighbour_medians(input.points, &state.inverse_depths, &mut scratch.medians);
+    let (mut damping, mut failures) = (FIRST_DAMPING, 0);
+    for _ in 0..params.max_iterations {
+        let step = match freedom {
+            Freedom::Rotation => rotation_step(&scratch.system, damping),
+            Freedom::Everything => {
+                let trial = &mut scratch.trial_depths;
+                joint_step(&scratch.system, state, &scratch.medians, weights, damping, trial)
+            }
+        };
+        let Some(step) = step else { break };
+        let mut next = State {
+            inverse_depths: std::mem::take(&mut scratch.trial_depths),
+            ..moved(state, &step)
+        };
+        if freedom == Freedom::Rotation {
+            next.inverse_depths.clone_from(&state.inverse_depths);
+        }
+        scratch.trial.evaluate(&view, &next);
+        let before =
+            scratch.system.energy + prior(&state.inverse_depths, &scratch.medians, weights);
+        let after = scratch.trial.energy + prior(&next.inverse_depths, &scratch.medians, weights);
+        if after < before {
+            std::mem::swap(state, &mut next);
+            std::mem::swap(&mut scratch.system, &mut scratch.trial);
+            neighbour_medians(input.points, &state.inverse_depths, &mut scratch.medians);
+            damping = (damping * SUCCESS_FACTOR).max(LEAST_DAMPING);
+            failures = 0;
+        } else {
+            damping *= FAILURE_FACTOR;
+            failures += 1;
+        }
+        scratch.trial_depths = next.inverse_depths;
+        let stalled = after < before && before - after < params.min_energy_drop * before;
+        if stalled || failures >= MAX_FAILURES {
+            break;
+        }
+    }
+    scratch.system.energy + prior(&state.inverse_depths, &scratch.medians, weights)
+}
+
+/// The state after a step of pose and brightness, without depths.
+fn moved(state: &State, step: &SVector<f64, NUM_UNKNOWNS>) -> State {
+    let twist = Vector6::from_iterator(step.iter().take(6).copied());
+    let mut brightness = state.brightness;
+    brightness.a += step[6];
+    brightness.b += step[7];
+    State {
+        current_from_first: SE3::exp(&twist) * state.current_from_first,
+        brightness,
+        inverse_depths: Vec::new(),
+    }
+}
+
+/// The step of rotation and brightness; the translation stays.
+fn rotation_step(system: &System, damping: f64) -> Option<SVector<f64, NUM_UNKNOWNS>> {
+    let mut hessian = system.hessian.fixed_view::<5, 5>(3, 3).into_owned();
+    for i in 0..5 {
+        hessian[(i, i)] = hessian[(i, i)] * (1.0 + damping) + f64::MIN_POSITIVE;
+    }
+    let gradient = system.gradient.fixed_rows::<5>(3).into_owned();
+    let solved = hessian.cholesky()?.solve(&-gradient);
+    let mut step = SVector::<f64, NUM_UNKNOWNS>::zeros();
+    step.fixed_rows_mut::<5>(3).copy_from(&solved);
+    is_sane(&step).then_some(step)
+}
+
+/// The step of pose and brightness, and the depths after it.
+fn joint_step(
+    system: &System,
+    state: &State,
+    medians: &[f32],
+    (neighbour_weight, depth_weight): (f32, f32),
+    damping: f64,
+    depths_after: &mut Vec<f32>,
+) -> Option<SVector<f64, NUM_UNKNOWNS>> {
+    /// Largest change of a depth in one step: the projection is far from linear beyond.
+    const MAX_DEPTH_STEP: f32 = 0.5;
+    let mut hessian = system.hessian;
+    for i in 0..NUM_UNKNOWNS {
+        hessian[(i, i)] *= 1.0 + damping;
+    }
+    let mut gradient = system.gradient;
+    let own = |i: usize| {
+        let (point, d) = (&system.points[i], state.inverse_depths[i]);
+        let information =
+            point.information * (1.0 + damping as f32) + neighbour_weight + depth_weight;
+        let slope = point.gradient + neighbour_weight * (d - medians[i]) + depth_weight * (d - 1.0);
+        (f64::from(information), f64::from(slope))
+    };
+    for (i, point) in system.points.iter().enumerate().filter(|(_, p)| p.visible) {
+        let (information, slope) = own(i);
+        let mixed = SVector::from(point.mixed.map(f64::from));
+        gradient -= mixed * (slope / information);
+        hessian.ger(-1.0 / information, &mixed, &mixed, 1.0);
+    }
+    let step = hessian.cholesky()?.solve(&-gradient);
+    if !is_sane(&step) {
+        return None;
+    }
+    depths_after.clear();
+    depths_after.extend(system.points.iter().zip(&state.inverse_depths).enumerate().map(
+        |(i, (point, &d))| {
+            let (information, slope) = own(i);
+            let by_pose: f64 = (0..NUM_UNKNOWNS).map(|k| f64::from(point.mixed[k]) * step[k]).sum();
+            let change = -((slope + by_pose) / information) as f32;
+            (d + change.clamp(-MAX_DEPTH_STEP, MAX_DEPTH_STEP))
+                .clamp(*INVERSE_DEPTHS.start(), *INVERSE_DEPTHS.end())
+        },
+    ));
+    Some(step)
+}
+
+/// Whether a step can be taken: finite and within what two frames in a row show.
+fn is_sane(step: &SVector<f64, NUM_UNKNOWNS>) -> bool {
+    /// In mean depths, radians and log gain; the offset is bounded by the grey scale.
+    const LARGEST: f64 = 1.0;
+    step.iter().all(|x| x.is_finite()) && step.iter().take(7).all(|x| x.abs() < LARGEST)
+}
+
+/// Median inverse depth of each point's neighbours.
+fn neighbour_medians(points: &Points, inverse_depths: &[f32], medians: &mut Vec<f32>) {
+    medians.clear();
+    medians.extend(points.neighbours.iter().map(|neighbours| {
+        let mut depths = neighbours.map(|j| inverse_depths[j as usize]);
+        depths.sort_unstable_by(f32::total_cmp);
+        0.5 * (depths[NUM_NEIGHBOURS / 2 - 1] + depths[NUM_NEIGHBOURS / 2])
+    }));
+}
+
+/// Energy of the priors.
+fn prior(inverse_depths: &[f32], medians: &[f32], weights: (f32, f32)) -> f64 {
+    let energy = |(d, median): (&f32, &f32)| {
+        weights.0 * (d - median).powi(2) + weights.1 * (d - 1.0).powi(2)
+    };
+    inverse_depths.iter().zip(medians).map(|pair| f64::from(energy(pair))).sum()
+}
+
+/// Variance of each point's inverse depth with the length of the translation held: its own residuals',
+/// and what the uncertainty of the pose adds. `noise` is the variance of a residual, `match_variance_px`
+/// that of what interpolation and sampling misplace, pixels²; infinite where a point is not visible.
+pub fn depth_variances(
+    state: &State,
+    system: &System,
+    noise: f32,
+    match_variance_px: f32,
+    variances: &mut Vec<f32>,
+) {
+    let pose_covariance = pose_covariance(state, system);
+    variances.clear();
+    variances.extend(system.points.iter().map(|point| {
+        if !point.visible || !(point.information > 0.0) || !(point.squared_speed > 0.0) {
+            return f32::INFINITY;
+        }
+        let mixed = SVector::from(point.mixed.map(f64::from)) / f64::from(point.information);
+        let from_pose = (mixed.transpose() * pose_covariance * mixed)[0] as f32;
+        noise * (1.0 / point.information + from_pose) + match_variance_px / point.squared_speed
+    }));
+}
+
+/// Inverse of the pose's normal equations after elimination of the depths, scale held; zero where they
+/// are singular.
+fn pose_covariance(state: &State, system: &System) -> SMatrix<f64, NUM_UNKNOWNS, NUM_UNKNOWNS> {
+    let mut hessian = system.hessian;
+    for point in system.points.iter().filter(|p| p.visible && p.information > 0.0) {
+        let mixed = SVector::from(point.mixed.map(f64::from));
+        hessian.ger(-1.0 / f64::from(point.information), &mixed, &mixed, 1.0);
+    }
+    let length = state.current_from_first.translation.norm();
+    if length > 0.0 {
+        // A weight far above any other holds the translation's length.
+        let weight = 1e3 * system.hessian.diagonal().rows(0, 3).sum();
+        let direction = state.current_from_first.translation / length;
+        let mut along = SVector::<f64, NUM_UNKNOWNS>::zeros();
+        along.fixed_rows_mut::<3>(0).copy_from(&direction);
+        hessian.ger(weight, &along, &along, 1.0);
+    }
+    hessian.try_inverse().unwrap_or_else(SMatrix::zeros)
+}

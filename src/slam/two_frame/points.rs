@@ -1,0 +1,103 @@
+//! The points of the first frame: where they are, what they look like at each level, which are
+//! neighbours.
+
+use crate::slam::depth::candidate::{CandidateParams, CandidateSelector};
+use crate::slam::depth::map::GradientImage;
+use crate::slam::depth::matching::{PATTERN, bilinear};
+use crate::slam::image::buffer::Image;
+use crate::slam::image::pyramid::Pyramid;
+
+/// Neighbours that a point's depth is smoothed with.
+pub const NUM_NEIGHBOURS: usize = 8;
+
+/// Gradient, grey levels a pixel, at which the weight of a sample is one half.
+const HALF_WEIGHT_GRADIENT: f32 = 50.0;
+
+/// A point as one pyramid level shows it.
+#[derive(Debug, Clone, Copy)]
+pub struct LevelPatch {
+    /// Column at the level.
+    pub u: f32,
+    /// Row at the level.
+    pub v: f32,
+    /// Brightness at the samples of the pattern.
+    pub intensities: [f32; 8],
+    /// Weight of the samples; all 0 where the patch does not fit into the level.
+    pub weights: [f32; 8],
+}
+
+/// The points of the first frame.
+#[derive(Debug, Default)]
+pub struct Points {
+    /// Column and row, level 0.
+    pub pixels: Vec<(u16, u16)>,
+    /// The points' patches, finest level first.
+    pub patches: Vec<Vec<LevelPatch>>,
+    /// The nearest other points of each.
+    pub neighbours: Vec<[u32; NUM_NEIGHBOURS]>,
+    selector: CandidateSelector,
+}
+
+impl Points {
+    /// Chooses the points of a frame and takes their patches; how many there are.
+    pub fn choose(
+        &mut self,
+        image: &GradientImage,
+        pyramid: &Pyramid,
+        params: &CandidateParams,
+    ) -> usize {
+        let mut chosen = Vec::new();
+        self.selector.choose(image, params, &mut chosen);
+        self.pixels.clear();
+        self.pixels.extend(chosen.iter().map(|c| (c.u, c.v)));
+        self.patches.resize(pyramid.num_levels(), Vec::new());
+        for (level, patches) in self.patches.iter_mut().enumerate() {
+            patches.clear();
+            patches.extend(self.pixels.iter().map(|&p| patch_at(pyramid.level(level), level, p)));
+        }
+        self.neighbours.clear();
+        if self.pixels.len() > NUM_NEIGHBOURS {
+            self.neighbours.extend((0..self.pixels.len()).map(|i| nearest(&self.pixels, i)));
+        }
+        self.neighbours.len()
+    }
+}
+
+fn patch_at(image: &Image<f32>, level: usize, (u, v): (u16, u16)) -> LevelPatch {
+    /// The pattern reaches 2 pixels, its gradient 1.
+    const REACH_PX: f32 = 3.0;
+    let shrink = f32::powi(0.5, level as i32);
+    let (u, v) = ((f32::from(u) + 0.5) * shrink - 0.5, (f32::from(v) + 0.5) * shrink - 0.5);
+    let mut patch = LevelPatch { u, v, intensities: [0.0; 8], weights: [0.0; 8] };
+    let columns = REACH_PX..image.width() as f32 - 1.0 - REACH_PX;
+    let rows = REACH_PX..image.height() as f32 - 1.0 - REACH_PX;
+    if !columns.contains(&u) || !rows.contains(&v) {
+        return patch;
+    }
+    for (k, (x, y)) in PATTERN.iter().enumerate() {
+        let (x, y) = (u + *x as f32, v + *y as f32);
+        let gu = 0.5 * (bilinear(image, x + 1.0, y) - bilinear(image, x - 1.0, y));
+        let gv = 0.5 * (bilinear(image, x, y + 1.0) - bilinear(image, x, y - 1.0));
+        let half = HALF_WEIGHT_GRADIENT * HALF_WEIGHT_GRADIENT;
+        patch.intensities[k] = bilinear(image, x, y);
+        patch.weights[k] = half / (half + gu * gu + gv * gv);
+    }
+    patch
+}
+
+/// The nearest other points, by distance, ties by index. There are more than [`NUM_NEIGHBOURS`] points.
+fn nearest(pixels: &[(u16, u16)], i: usize) -> [u32; NUM_NEIGHBOURS] {
+    let mut found = [(u32::MAX, 0); NUM_NEIGHBOURS];
+    let (u, v) = (i32::from(pixels[i].0), i32::from(pixels[i].1));
+    for (j, pixel) in pixels.iter().enumerate() {
+        let (du, dv) = (i32::from(pixel.0) - u, i32::from(pixel.1) - v);
+        let distance = (du * du + dv * dv) as u32;
+        if j == i || distance >= found[NUM_NEIGHBOURS - 1].0 {
+            continue;
+        }
+        let place = found.partition_point(|f| f.0 <= distance);
+        found[place..].rotate_right(1);
+        found[place] = (distance, j as u32);
+    }
+    found.map(|f| f.1)
+}

@@ -1,0 +1,78 @@
+//! Spreads the depths of a few points over the candidate pixels around them.
+
+use crate::slam::depth::gaussian::NEW_VALIDITY;
+use crate::slam::depth::map::{DepthMap, Hypothesis};
+use crate::slam::two_frame::InitialDepth;
+
+/// Side of the cells in which points are looked up, pixels; neighbours are found one cell away at most.
+const CELL_PX: usize = 16;
+/// Points that a pixel takes its depth from.
+const NUM_NEAREST: usize = 4;
+/// Standard deviation by which inverse depths of a surface differ, a pixel of distance, relative.
+const SLOPE_STD_DEV_RATIO: f32 = 0.005;
+
+/// Gives every candidate of `map` near a point a hypothesis: the nearest point's inverse depth, its
+/// variance widened by the distance and by how much the nearest points differ.
+pub fn spread(depths: &[InitialDepth], map: &mut DepthMap) {
+    let (width, height) = (map.image.width(), map.image.height());
+    let (columns, rows) = (width.div_ceil(CELL_PX), height.div_ceil(CELL_PX));
+    let mut cells: Vec<Vec<usize>> = vec![Vec::new(); columns * rows];
+    for (i, depth) in depths.iter().enumerate() {
+        let (u, v) = (usize::from(depth.u), usize::from(depth.v));
+        if u < width && v < height {
+            cells[v / CELL_PX * columns + u / CELL_PX].push(i);
+        }
+    }
+    let candidates = map.candidates.pixels();
+    let pixels = map.hypotheses.pixels_mut().iter_mut().enumerate();
+    for (i, hypothesis) in pixels.filter(|(i, _)| candidates[*i]) {
+        let (u, v) = (i % width, i / width);
+        let (column, row) = (u / CELL_PX, v / CELL_PX);
+        let mut nearest = [(f32::INFINITY, 0); NUM_NEAREST];
+        for y in row.saturating_sub(1)..(row + 2).min(rows) {
+            for x in column.saturating_sub(1)..(column + 2).min(columns) {
+                for &point in &cells[y * columns + x] {
+                    insert(&mut nearest, squared_distance(&depths[point], u, v), point);
+                }
+            }
+        }
+        if nearest[0].0.is_finite() {
+            *hypothesis = hypothesis_from(depths, &nearest);
+        }
+    }
+}
+
+fn squared_distance(depth: &InitialDepth, u: usize, v: usize) -> f32 {
+    let (du, dv) = (f32::from(depth.u) - u as f32, f32::from(depth.v) - v as f32);
+    du * du + dv * dv
+}
+
+fn insert(nearest: &mut [(f32, usize); NUM_NEAREST], distance: f32, point: usize) {
+    let place = nearest.partition_point(|n| n.0 <= distance);
+    if place < NUM_NEAREST {
+        nearest[place..].rotate_right(1);
+        nearest[place] = (distance, point);
+    }
+}
+
+fn hypothesis_from(depths: &[InitialDepth], nearest: &[(f32, usize); NUM_NEAREST]) -> Hypothesis {
+    let (squared_distance, index) = nearest[0];
+    let point = &depths[index];
+    let on_point = squared_distance == 0.0;
+    let mut spread = 0.0;
+    if !on_point {
+        let others = nearest.iter().skip(1).filter(|n| n.0.is_finite());
+        let differences = others.map(|n| (depths[n.1].inverse_depth - point.inverse_depth).powi(2));
+        spread = differences.sum::<f32>() / (NUM_NEAREST - 1) as f32;
+    }
+    let slope = SLOPE_STD_DEV_RATIO * point.inverse_depth;
+    let variance = point.variance + spread + slope * slope * squared_distance;
+    Hypothesis {
+        inverse_depth: point.inverse_depth,
+        variance,
+        smoothed: point.inverse_depth,
+        validity: NEW_VALIDITY,
+        propagated: false,
+        failures: 0,
+    }
+}
