@@ -6,13 +6,18 @@ use std::collections::BTreeMap;
 use std::fs;
 
 use rustix::process::{Pid, Signal};
+use semidense::capture::source::{SourceName, open};
+use semidense::service::config::Config;
 use semidense::service::peers::{HEALTH_TOPICS, Peer};
+use semidense::service::replay::{ReplayConfig, replay};
+use semidense::service::results::RecordedPose;
+use semidense::wire::conversion::pose_from_message;
 use semidense::wire::keyframe_inbox::KeyframeInbox;
 use semidense::wire::message::PoseMessage;
 use semidense::wire::port::{Hub, Subscriber};
 use semidense::wire::topic::{POSE, TRACKER_HEALTH};
 use serde_json::Value;
-use support::{Rig, end, finish, signal, until};
+use support::{Rig, end, finish, signal, small_camera, until};
 
 /// A live run that lasts a minute if nobody ends it.
 const SLOW: &[&str] = &["--live", "--set", "simulator.rate_hz=8"];
@@ -23,20 +28,22 @@ fn summary(rig: &Rig) -> Value {
     serde_json::from_str(&text).unwrap()
 }
 
+/// Frames of the runs that are compared bit for bit.
+const FRAMES: usize = 25;
+
 /// Runs in lockstep and gives every pose as an observer sees it, without the times.
 fn observed_poses(rig: &Rig, arguments: &[&str]) -> BTreeMap<u64, String> {
-    let child = rig.run(25, arguments).spawn().unwrap();
+    let child = rig.run(FRAMES, arguments).spawn().unwrap();
     let hub = rig.observe();
     let poses: Subscriber<PoseMessage, ()> = until("poses", || hub.subscriber(&POSE).ok());
     let mut seen = BTreeMap::new();
     until("the last frame", || {
         while let Some(message) = poses.receive().unwrap() {
-            let pose = message.payload()[0];
+            let pose = pose_from_message(&message.payload()[0]).unwrap();
             // Floating point prints its shortest exact form: equal texts are equal bits.
-            let pose = PoseMessage { published_nanos: 0, latency_nanos: 0, track_nanos: 0, ..pose };
             seen.insert(pose.sequence, format!("{pose:?}"));
         }
-        seen.contains_key(&24).then_some(())
+        seen.contains_key(&(FRAMES as u64 - 1)).then_some(())
     });
     drop((poses, hub));
     let ended = end(child);
@@ -63,12 +70,30 @@ fn a_run_ends_by_itself_writes_its_results_and_leaves_nothing() {
     assert_eq!(rig.leftovers(), Vec::<String>::new());
 }
 
+/// The same frames through `replay`, in this process.
+fn replayed_poses() -> BTreeMap<u64, String> {
+    let settings: Vec<String> =
+        small_camera(FRAMES).iter().map(|s| format!("simulator.{s}")).collect();
+    let config = Config::load(None, &settings).unwrap();
+    let name: SourceName = "sim".parse().unwrap();
+    let mut source = open(&name, None, &config.simulator).unwrap();
+    let replayed = ReplayConfig {
+        tracker: config.tracking,
+        mapper: config.mapping,
+        ..ReplayConfig::default()
+    };
+    let record = replay(source.as_mut(), "sim", &replayed, &mut |_| true).unwrap();
+    let pose = |pose: &RecordedPose| (pose.estimate.sequence, format!("{:?}", pose.estimate));
+    record.poses.iter().map(pose).collect()
+}
+
 #[test]
-fn lockstep_gives_the_same_bits_with_any_number_of_threads() {
+fn lockstep_gives_the_bits_of_replay_with_any_number_of_threads() {
     let (one, other) = (Rig::new(), Rig::new());
     let first = observed_poses(&one, &["--set", "mapper.threads=1"]);
     let second = observed_poses(&other, &["--set", "mapper.threads=3"]);
     assert_eq!(first, second);
+    assert_eq!(first, replayed_poses());
     for file in ["trajectory.txt", "trajectory_online.txt", "keyframes.txt", "map.ply"] {
         let read = |rig: &Rig| fs::read(rig.output().join(file)).unwrap();
         assert!(read(&one) == read(&other), "{file} differs");

@@ -15,6 +15,12 @@ pub struct Rig {
     folder: tempfile::TempDir,
 }
 
+/// The simulated camera of the tests, as keys below `simulator`.
+pub fn small_camera(frames: usize) -> [String; 4] {
+    let fixed = |setting: &str| setting.to_owned();
+    [format!("frames={frames}"), fixed("width=160"), fixed("height=120"), fixed("focal_px=131.0")]
+}
+
 /// How a command ended.
 pub struct Ended {
     pub status: ExitStatus,
@@ -58,8 +64,7 @@ impl Rig {
     /// `run` on a small simulated camera, with more arguments.
     pub fn run(&self, frames: usize, arguments: &[&str]) -> Command {
         let mut command = self.command(&["run", "--output", self.output().to_str().unwrap()]);
-        command.args(["--set", &format!("simulator.frames={frames}")]);
-        for setting in ["width=160", "height=120", "focal_px=131.0"] {
+        for setting in small_camera(frames) {
             command.args(["--set", &format!("simulator.{setting}")]);
         }
         command.args(arguments);
