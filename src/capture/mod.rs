@@ -2,8 +2,8 @@
 
 #[cfg(test)]
 mod conformance;
-pub mod euroc;
 pub mod dataset_writer;
+pub mod euroc;
 pub mod image_file;
 #[cfg(test)]
 mod image_file_tests;

@@ -103,13 +103,32 @@ pub fn encode_gray(
     depth: BitDepth,
     samples: &[u8],
 ) -> Result<Vec<u8>, png::EncodingError> {
+    // Sequences are written at many frames a second and read once or twice.
+    encode((width, height), (ColorType::Grayscale, depth), png::Compression::Fast, samples)
+}
+
+/// The bytes of a colour PNG; `samples` are rows of `width` times red, green, blue.
+pub fn encode_rgb(
+    width: usize,
+    height: usize,
+    samples: &[u8],
+) -> Result<Vec<u8>, png::EncodingError> {
+    let format = (ColorType::Rgb, BitDepth::Eight);
+    encode((width, height), format, png::Compression::Balanced, samples)
+}
+
+fn encode(
+    (width, height): (usize, usize),
+    (color, depth): (ColorType, BitDepth),
+    compression: png::Compression,
+    samples: &[u8],
+) -> Result<Vec<u8>, png::EncodingError> {
     let side = |n: usize| u32::try_from(n).unwrap_or(u32::MAX);
     let mut bytes = Vec::new();
     let mut encoder = png::Encoder::new(&mut bytes, side(width), side(height));
-    encoder.set_color(ColorType::Grayscale);
+    encoder.set_color(color);
     encoder.set_depth(depth);
-    // Sequences are written at many frames a second and read once or twice.
-    encoder.set_compression(png::Compression::Fast);
+    encoder.set_compression(compression);
     let mut writer = encoder.write_header()?;
     writer.write_image_data(samples)?;
     writer.finish()?;

@@ -6,11 +6,28 @@ use serde::{Deserialize, Serialize};
 use crate::slam::depth::gaussian::NEW_VALIDITY;
 use crate::slam::depth::map::{DepthMap, Hypothesis};
 use crate::slam::parameter::{ParameterError, check_range};
+use crate::slam::two_frame::TwoFrameParams;
+
+/// How a map begins where no sensor gives its depth.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum StartMethod {
+    /// Pose and depths of two frames together, once their parallax is proven (DSO18 §3.1).
+    #[default]
+    TwoFrame,
+    /// Random depth, proven or thrown away by the frames that follow (LSD14 §3.1).
+    Random,
+}
 
 /// Tuning of the start.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct InitializerParams {
+    /// How a map begins. The two-frame start is the default: it does not begin on a standing or
+    /// turning camera, and its first depth is right to a few per cent.
+    pub method: StartMethod,
+    /// The two-frame start.
+    pub two_frame: TwoFrameParams,
     /// Seed of the random depth; the same seed gives the same map.
     pub seed: u64,
     /// Median parallax that proves motion, as a share of the image width: 8 px at 640. Less cannot be
@@ -31,6 +48,8 @@ pub struct InitializerParams {
 impl Default for InitializerParams {
     fn default() -> Self {
         Self {
+            method: StartMethod::TwoFrame,
+            two_frame: TwoFrameParams::default(),
             seed: 1,
             min_parallax_ratio: 0.0125,
             min_proven_ratio: 0.5,
@@ -45,6 +64,7 @@ impl Default for InitializerParams {
 impl InitializerParams {
     /// Checks every value.
     pub fn validate(&self) -> Result<(), ParameterError> {
+        self.two_frame.validate().map_err(|e| e.within("two_frame"))?;
         check_range("min_parallax_ratio", self.min_parallax_ratio, 0.001..=0.5)?;
         check_range("min_proven_ratio", self.min_proven_ratio, 0.01..=1.0)?;
         check_range("proven_std_dev_ratio", self.proven_std_dev_ratio, 0.001..=1.0)?;

@@ -1,27 +1,28 @@
 //! The recipe of a map step: observe depth, regularise, choose keyframes, propagate.
 
-use std::collections::VecDeque;
+mod past;
+mod start;
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::epipolar::TwoView;
-use crate::slam::depth::gaussian::{
-    GaussianParams, NEW_VALIDITY, ObservationCounts, Observer, observe,
-};
+use crate::slam::depth::gaussian::{GaussianParams, ObservationCounts, Observer, observe};
 use crate::slam::depth::map::{DepthMap, Hypothesis};
 use crate::slam::depth::matching::MatchingParams;
 use crate::slam::depth::propagation::{PropagationParams, propagate};
 use crate::slam::depth::regularisation::{RegularisationParams, regularise};
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
-use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::buffer::Image;
-use crate::slam::initializer::{InitializerParams, StartEvidence, proven_ratio, randomise};
+use crate::slam::initializer::InitializerParams;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS, MapState};
+use crate::slam::mapper::past::PastFrames;
+use crate::slam::mapper::start::take_sensor_depth;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::{Brightness, PoseEstimate, TrackingState};
+use crate::slam::two_frame::TwoFrameInitializer;
 
 /// Tuning of the mapper.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -102,15 +103,6 @@ pub struct Map {
     pub keyframes: Vec<Keyframe>,
 }
 
-/// A frame kept to observe the new pixels of the next keyframe.
-#[derive(Debug)]
-struct PastFrame {
-    pixels: Vec<u8>,
-    world_from_camera: SE3,
-    /// Against the keyframe in force.
-    brightness: Brightness,
-}
-
 /// Keeps the map.
 #[derive(Debug)]
 pub struct Mapper {
@@ -122,8 +114,10 @@ pub struct Mapper {
     next_depth: DepthMap,
     regularised: Image<Hypothesis>,
     frame: Image<f32>,
-    past: VecDeque<PastFrame>,
-    spare_pixels: Vec<Vec<u8>>,
+    past: PastFrames,
+    two_frame: TwoFrameInitializer,
+    /// Sequence and stamp of the two-frame start's first frame.
+    first_stamp: Option<(u64, i64)>,
     revision: u64,
     next_keyframe_id: u64,
     epoch: u32,
@@ -136,19 +130,21 @@ impl Mapper {
         params.validate()?;
         let (width, height) = (intrinsics.width, intrinsics.height);
         Ok(Self {
-            params,
             intrinsics,
             map: Map::default(),
             depth: DepthMap::with_size(width, height),
             next_depth: DepthMap::with_size(width, height),
             regularised: Image::filled(width, height, Hypothesis::NONE),
             frame: Image::filled(width, height, 0.0),
-            past: VecDeque::new(),
-            spare_pixels: Vec::new(),
+            past: PastFrames::with_capacity(params.max_past_frames),
+            two_frame: TwoFrameInitializer::new(intrinsics, params.initializer.two_frame.clone())
+                .map_err(|e| e.within("initializer.two_frame"))?,
+            first_stamp: None,
             revision: 0,
             next_keyframe_id: 0,
             epoch: 0,
             frames_on_keyframe: 0,
+            params,
         })
     }
 
@@ -206,67 +202,6 @@ impl Mapper {
         self.keyframe().map_or(MapState::Initializing, |k| k.map_state)
     }
 
-    /// Begins a map on this frame: with the sensor's depth, with random depth, or, where the pose is
-    /// claimed without a map (it is given, so the baselines will be true), without any.
-    fn start(
-        &mut self,
-        frame: &FrameView<'_>,
-        pose: &PoseEstimate,
-        sensor_depth: Option<&Image<f32>>,
-    ) -> StepOutcome {
-        self.map.keyframes.clear();
-        self.past.clear();
-        self.depth.restart(frame.pixels, self.params.min_gradient, self.params.max_candidates);
-        let is_given = pose.state.is_tracked();
-        let map_state = match sensor_depth {
-            Some(sensor) => {
-                take_sensor_depth(&mut self.depth, sensor, 1.0);
-                MapState::Established
-            }
-            None if is_given => MapState::Established,
-            None => {
-                randomise(&mut self.depth, self.params.initializer.seed ^ frame.sequence);
-                regularise(&mut self.depth, &mut self.regularised, &self.params.regularisation);
-                MapState::Initializing
-            }
-        };
-        let scale = self.rescale_to_unit_mean();
-        let world_from_camera = if is_given { pose.world_from_camera } else { SE3::identity() };
-        self.add_keyframe(frame, Sim3::new(world_from_camera, scale), map_state);
-        StepOutcome {
-            keyframe_created: true,
-            keyframe_changed: true,
-            graph_changed: true,
-            ..Default::default()
-        }
-    }
-
-    /// Judges a start that is not proven yet: proves it, goes on, or begins again.
-    fn continue_start(
-        &mut self,
-        frame: &FrameView<'_>,
-        pose: &PoseEstimate,
-        observations: ObservationCounts,
-        sensor_depth: Option<&Image<f32>>,
-    ) -> StepOutcome {
-        let params = &self.params.initializer;
-        let evidence = StartEvidence {
-            median_parallax_px: self.median_parallax(pose),
-            proven_ratio: proven_ratio(&self.depth, params.proven_std_dev_ratio),
-            match_ratio: observations.fused as f64 / observations.attempted.max(1) as f64,
-        };
-        let proven = evidence.proves(params, self.intrinsics.width);
-        if !proven && self.frames_on_keyframe > u64::from(params.max_frames) {
-            return self.start(frame, pose, sensor_depth);
-        }
-        if proven && let Some(keyframe) = self.map.keyframes.last_mut() {
-            keyframe.map_state = MapState::Established;
-        }
-        self.remember(frame, pose);
-        self.publish_depth();
-        StepOutcome { keyframe_changed: true, observations, ..Default::default() }
-    }
-
     /// Observes the depth map of the keyframe in force in `frame`.
     fn observe_frame(&mut self, frame: &FrameView<'_>, pose: &PoseEstimate) -> ObservationCounts {
         let Some(keyframe) = self.map.keyframes.last() else { return ObservationCounts::default() };
@@ -318,7 +253,7 @@ impl Mapper {
             &self.params.propagation,
         );
         std::mem::swap(&mut self.depth, &mut self.next_depth);
-        self.rebase_past(brightness, before_image, world_from_before.rigid);
+        self.past.rebase(brightness, &before_image, world_from_before.rigid);
         let mut world_from_keyframe = Sim3::new(pose.world_from_camera, world_from_before.scale);
         if let Some(sensor) = sensor_depth {
             take_sensor_depth(&mut self.depth, sensor, world_from_keyframe.scale);
@@ -330,20 +265,6 @@ impl Mapper {
         self.add_keyframe(frame, world_from_keyframe, MapState::Established);
     }
 
-    /// Expresses the brightness of past frames against the new keyframe, and files the old one.
-    fn rebase_past(&mut self, new: Brightness, before_image: Vec<u8>, world_from_before: SE3) {
-        self.past.push_back(PastFrame {
-            pixels: before_image,
-            world_from_camera: world_from_before,
-            brightness: Brightness::default(),
-        });
-        for past in &mut self.past {
-            let a = past.brightness.a - new.a;
-            past.brightness = Brightness { a, b: past.brightness.b - a.exp() * new.b };
-        }
-        self.forget_oldest();
-    }
-
     /// Gives new pixels of the keyframe their depth from frames before it, shortest baseline first:
     /// each narrows the search of the next.
     fn seed_from_past(&mut self, world_from_keyframe: &Sim3) {
@@ -353,7 +274,7 @@ impl Mapper {
         const MIN_BASELINE: f64 = 0.01;
         let mut least = MIN_BASELINE;
         let mut used = 0;
-        for past in self.past.iter().rev() {
+        for past in self.past.newest_first() {
             let keyframe_from_camera = world_from_keyframe.locate(&past.world_from_camera);
             let baseline = keyframe_from_camera.translation.norm();
             if baseline < least {
@@ -428,51 +349,10 @@ impl Mapper {
     }
 
     fn remember(&mut self, frame: &FrameView<'_>, pose: &PoseEstimate) {
-        let mut pixels = self.spare_pixels.pop().unwrap_or_default();
-        pixels.clear();
-        pixels.extend_from_slice(frame.pixels);
         let brightness = self.brightness_against_keyframe(pose);
-        self.past.push_back(PastFrame {
-            pixels,
-            world_from_camera: pose.world_from_camera,
-            brightness,
-        });
-        self.forget_oldest();
-    }
-
-    fn forget_oldest(&mut self) {
-        while self.past.len() > self.params.max_past_frames {
-            if let Some(oldest) = self.past.pop_front() {
-                self.spare_pixels.push(oldest.pixels);
-            }
-        }
-    }
-
-    /// Median image motion that the translation of `pose` causes, pixels.
-    fn median_parallax(&self, pose: &PoseEstimate) -> f64 {
-        let Some(keyframe) = self.keyframe() else { return 0.0 };
-        let relative = keyframe.world_from_keyframe.locate(&pose.world_from_camera).inverse();
-        let view = TwoView::new(&self.intrinsics, &relative);
-        let mut parallax: Vec<f32> = keyframe
-            .points
-            .iter()
-            .step_by(SAMPLE_STRIDE)
-            .filter_map(|p| {
-                let line = view.line(f32::from(p.u), f32::from(p.v));
-                let (far, at) = (line.project(0.0)?, line.project(p.inverse_depth)?);
-                Some((at.u - far.u).hypot(at.v - far.v))
-            })
-            .collect();
-        if parallax.is_empty() {
-            return 0.0;
-        }
-        let middle = parallax.len() / 2;
-        f64::from(*parallax.select_nth_unstable_by(middle, f32::total_cmp).1)
+        self.past.push(frame.pixels, pose.world_from_camera, brightness);
     }
 }
-
-/// Every so many points are enough for a median or a share.
-const SAMPLE_STRIDE: usize = 16;
 
 /// Grey values as f32.
 fn float_from_grey(out: &mut Image<f32>, pixels: &[u8]) {
@@ -481,28 +361,4 @@ fn float_from_grey(out: &mut Image<f32>, pixels: &[u8]) {
         .with_min_len(1 << 16)
         .zip(pixels)
         .for_each(|(o, &p)| *o = f32::from(p));
-}
-
-/// Gives every candidate the depth of a sensor, in units of `scale` metres.
-fn take_sensor_depth(map: &mut DepthMap, sensor: &Image<f32>, scale: f64) {
-    /// Relative standard deviation of a depth camera at room distances.
-    const SENSOR_STD_DEV_RATIO: f32 = 0.01;
-    if (sensor.width(), sensor.height()) != (map.image.width(), map.image.height()) {
-        return;
-    }
-    let pixels = map.hypotheses.pixels_mut().iter_mut().zip(map.candidates.pixels());
-    for ((hypothesis, candidate), &depth) in pixels.zip(sensor.pixels()) {
-        if !candidate || !(depth > 0.0) || !depth.is_finite() {
-            continue;
-        }
-        let inverse_depth = scale as f32 / depth;
-        *hypothesis = Hypothesis {
-            inverse_depth,
-            variance: (SENSOR_STD_DEV_RATIO * inverse_depth).powi(2),
-            smoothed: inverse_depth,
-            validity: NEW_VALIDITY,
-            propagated: true,
-            failures: 0,
-        };
-    }
 }

@@ -1,5 +1,6 @@
 //! What the tracker says of one frame: pose, covariance, state and quality.
 
+use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
 
 /// The id of no keyframe: before the mapper has made the first.
@@ -111,4 +112,24 @@ pub struct PoseEstimate {
     pub quality: Quality,
     /// Whether the tracker asks for a new keyframe at this frame.
     pub proposes_keyframe: bool,
+}
+
+impl PoseEstimate {
+    /// Nothing known of `frame` yet: at the world's origin, not claimed.
+    pub fn unknown(frame: &FrameView<'_>) -> Self {
+        Self {
+            sequence: frame.sequence,
+            capture_nanos: frame.capture_nanos,
+            epoch: 0,
+            revision: 0,
+            keyframe_id: NO_KEYFRAME,
+            state: TrackingState::Initializing,
+            world_from_camera: SE3::identity(),
+            keyframe_from_camera: SE3::identity(),
+            covariance: [0.0; 21],
+            brightness: Brightness::default(),
+            quality: Quality::default(),
+            proposes_keyframe: false,
+        }
+    }
 }

@@ -98,7 +98,8 @@ impl Scene {
             cuboid([-0.3, -1.6, 2.6], [0.7, 1.0, 0.6]),
             cuboid([1.0, -0.9, 3.2], [0.5, 0.8, 0.5]),
         ];
-        let room = Cuboid { low: Vector3::new(-2.5, -1.6, -2.0), high: Vector3::new(2.5, 1.6, 4.2) };
+        let room =
+            Cuboid { low: Vector3::new(-2.5, -1.6, -2.0), high: Vector3::new(2.5, 1.6, 4.2) };
         Self { seed, room, boxes }
     }
 
@@ -115,7 +116,8 @@ impl Scene {
             let (u, v) = ((i % camera.width) as f64, (i / camera.width) as f64);
             inverse_depth.pixels_mut()[i] = (1.0 / self.hit(&origin, &ray(u, v)).0) as f32;
             let samples = [(-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)];
-            let sum: f64 = samples.iter().map(|s| self.shade(&origin, &ray(u + s.0, v + s.1))).sum();
+            let sum: f64 =
+                samples.iter().map(|s| self.shade(&origin, &ray(u + s.0, v + s.1))).sum();
             intensity.pixels_mut()[i] = (0.25 * sum) as f32;
         }
         Rendering { intensity, inverse_depth }

@@ -251,11 +251,13 @@ impl TwoFrameInitializer {
         /// A depth is usable when it is known to within half of itself.
         const USABLE_STD_DEV_RATIO: f32 = 0.5;
         let depths = self.joint.inverse_depths.iter().zip(&self.variances);
-        self.points.pixels.iter().zip(depths).filter_map(|(&(u, v), (&inverse_depth, &variance))| {
-            let usable =
-                inverse_depth > 0.0 && variance.sqrt() < USABLE_STD_DEV_RATIO * inverse_depth;
-            usable.then_some(InitialDepth { u, v, inverse_depth, variance })
-        })
+        self.points.pixels.iter().zip(depths).filter_map(
+            |(&(u, v), (&inverse_depth, &variance))| {
+                let usable =
+                    inverse_depth > 0.0 && variance.sqrt() < USABLE_STD_DEV_RATIO * inverse_depth;
+                usable.then_some(InitialDepth { u, v, inverse_depth, variance })
+            },
+        )
     }
 
     /// Fills a depth map that was restarted on [`TwoFrameInitializer::first_pixels`]: the points, and
@@ -274,11 +276,8 @@ impl TwoFrameInitializer {
 
     /// Rotation and brightness alone, coarse to fine, from the frame before.
     fn fit_rotation(&mut self) {
-        let input = FitInput {
-            images: &self.images,
-            intrinsics: &self.intrinsics,
-            points: &self.points,
-        };
+        let input =
+            FitInput { images: &self.images, intrinsics: &self.intrinsics, points: &self.points };
         for level in (0..self.images.len()).rev() {
             let (state, scratch) = (&mut self.rotation, &mut self.rotation_scratch);
             fit_level(&input, level, Freedom::Rotation, state, scratch, &self.params.fit);
@@ -310,11 +309,8 @@ impl TwoFrameInitializer {
     }
 
     fn fit_joint_level(&mut self, level: usize) -> f64 {
-        let input = FitInput {
-            images: &self.images,
-            intrinsics: &self.intrinsics,
-            points: &self.points,
-        };
+        let input =
+            FitInput { images: &self.images, intrinsics: &self.intrinsics, points: &self.points };
         let (state, scratch) = (&mut self.joint, &mut self.fit_scratch);
         fit_level(&input, level, Freedom::Everything, state, scratch, &self.params.fit)
     }
@@ -327,8 +323,10 @@ impl TwoFrameInitializer {
         let match_variance = self.params.match_noise_px.powi(2);
         depth_variances(&self.joint, joint, noise, match_variance, &mut self.variances);
         let evidence = judge(&self.joint, joint, &self.variances, rotation, &mut self.sorted);
-        let visible = joint.points.iter().zip(&self.joint.inverse_depths).filter(|(p, _)| p.visible);
-        let mean = visible.map(|(_, d)| f64::from(*d)).sum::<f64>() / joint.num_visible.max(1) as f64;
+        let visible =
+            joint.points.iter().zip(&self.joint.inverse_depths).filter(|(p, _)| p.visible);
+        let mean =
+            visible.map(|(_, d)| f64::from(*d)).sum::<f64>() / joint.num_visible.max(1) as f64;
         /// A mean below this is not a scale but a failed fit.
         const MIN_MEAN: f64 = 0.05;
         if mean > MIN_MEAN {
@@ -370,7 +368,8 @@ fn num_levels(intrinsics: &Intrinsics) -> usize {
     const MIN_WIDTH: usize = 64;
     const MIN_HEIGHT: usize = 48;
     const MAX_LEVELS: usize = 6;
-    let fits = |l: &usize| intrinsics.width >> l >= MIN_WIDTH && intrinsics.height >> l >= MIN_HEIGHT;
+    let fits =
+        |l: &usize| intrinsics.width >> l >= MIN_WIDTH && intrinsics.height >> l >= MIN_HEIGHT;
     (0..MAX_LEVELS).take_while(fits).count().max(1)
 }
 

@@ -232,7 +232,8 @@ mod tests {
             assert!(chosen.len() * 10 >= wanted * 8 && chosen.len() * 10 <= wanted * 11);
             let mut cells = [0usize; 16];
             for c in &chosen {
-                cells[usize::from(c.v) * 4 / CAMERA.height * 4 + usize::from(c.u) * 4 / CAMERA.width] += 1;
+                cells[usize::from(c.v) * 4 / CAMERA.height * 4
+                    + usize::from(c.u) * 4 / CAMERA.width] += 1;
             }
             let least = cells.iter().min().unwrap();
             assert!(least * 16 * 3 >= chosen.len(), "{cells:?}");

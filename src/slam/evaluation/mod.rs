@@ -1,7 +1,7 @@
 //! How good an estimate is: trajectories against ground truth, depth against true depth.
 //!
 //! The trajectory figures are those of the Python package `evo` on the same files: nearest stamps
-//! without interpolation ([`association`]), Umeyama alignment ([`umeyama`]), absolute and relative
+//! without interpolation ([`association`]), Umeyama alignment ([`mod@umeyama`]), absolute and relative
 //! errors ([`trajectory_error`]). [`windows`] adds how the scale wanders, [`depth_error`] what the
 //! depth maps and their variances are worth.
 

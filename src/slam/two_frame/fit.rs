@@ -215,9 +215,9 @@ fn joint_step(
     let mut gradient = system.gradient;
     let own = |i: usize| {
         let (point, d) = (&system.points[i], state.inverse_depths[i]);
-        let information = point.information * (1.0 + damping as f32) + neighbour_weight + depth_weight;
-        let slope =
-            point.gradient + neighbour_weight * (d - medians[i]) + depth_weight * (d - 1.0);
+        let information =
+            point.information * (1.0 + damping as f32) + neighbour_weight + depth_weight;
+        let slope = point.gradient + neighbour_weight * (d - medians[i]) + depth_weight * (d - 1.0);
         (f64::from(information), f64::from(slope))
     };
     for (i, point) in system.points.iter().enumerate().filter(|(_, p)| p.visible) {

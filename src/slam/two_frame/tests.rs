@@ -42,7 +42,12 @@ struct Started {
 }
 
 /// Runs up to `frames` frames; the figures of the first proof, and all outcomes.
-fn run(motion: Motion, seed: u64, noise: f64, frames: usize) -> (Option<Started>, Vec<InitOutcome>) {
+fn run(
+    motion: Motion,
+    seed: u64,
+    noise: f64,
+    frames: usize,
+) -> (Option<Started>, Vec<InitOutcome>) {
     let scene = Scene::new(seed);
     let mut initializer = TwoFrameInitializer::new(CAMERA, TwoFrameParams::default()).unwrap();
     let mut first = (0, scene.render(&CAMERA, &SE3::identity()));
@@ -67,7 +72,8 @@ fn run(motion: Motion, seed: u64, noise: f64, frames: usize) -> (Option<Started>
             InitState::Proven => {
                 let from_first = pose(motion, seed, first.0).inverse();
                 let true_pose = from_first * pose(motion, seed, frame);
-                let started = figures(&initializer, &outcome, &true_pose, &first.1.inverse_depth, frame);
+                let started =
+                    figures(&initializer, &outcome, &true_pose, &first.1.inverse_depth, frame);
                 return (Some(started), outcomes);
             }
             InitState::Failed(_) if !matches!(motion, Motion::Standing) => {
@@ -122,8 +128,16 @@ fn assert_starts(motion: Motion) {
                 started.within_two_sigmas
             );
         }
-        assert!(started.median_depth_error <= 0.1, "{motion:?} {seed}: {}", started.median_depth_error);
-        assert!(started.direction_error_deg <= 5.0, "{motion:?} {seed}: {}", started.direction_error_deg);
+        assert!(
+            started.median_depth_error <= 0.1,
+            "{motion:?} {seed}: {}",
+            started.median_depth_error
+        );
+        assert!(
+            started.direction_error_deg <= 5.0,
+            "{motion:?} {seed}: {}",
+            started.direction_error_deg
+        );
     }
 }
 

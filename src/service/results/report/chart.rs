@@ -9,7 +9,7 @@ use crate::service::results::report::html::escaped;
 pub const CHART_WIDTH: f64 = 640.0;
 
 /// Space left of, above, right of and below the plot.
-const MARGIN: [f64; 4] = [58.0, 34.0, 14.0, 42.0];
+const MARGIN: [f64; 4] = [66.0, 34.0, 14.0, 42.0];
 
 /// Most points that a path keeps.
 const MAX_PATH_POINTS: usize = 3000;
@@ -187,8 +187,8 @@ impl Chart {
         let middle = left + 0.5 * frame.width;
         draw_text(svg, middle, self.height - 6.0, "middle", "opacity=\"0.75\"", &self.x_label);
         let y = top + 0.5 * frame.height;
-        let turned = format!("opacity=\"0.75\" transform=\"rotate(-90 13 {y:.1})\"");
-        draw_text(svg, 13.0, y, "middle", &turned, &self.y_label);
+        let turned = format!("opacity=\"0.75\" transform=\"rotate(-90 12 {y:.1})\"");
+        draw_text(svg, 12.0, y, "middle", &turned, &self.y_label);
     }
 }
 

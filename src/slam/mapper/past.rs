@@ -1,0 +1,93 @@
+//! Frames from before the keyframe, kept to give depth to the new pixels of the next one.
+
+use std::collections::VecDeque;
+
+use crate::slam::geometry::se3::SE3;
+use crate::slam::pose::Brightness;
+
+/// One of them.
+#[derive(Debug)]
+pub(super) struct PastFrame {
+    /// Grey values, level 0.
+    pub(super) pixels: Vec<u8>,
+    /// Where it was taken.
+    pub(super) world_from_camera: SE3,
+    /// Its brightness against the keyframe in force.
+    pub(super) brightness: Brightness,
+}
+
+/// At most a fixed number of past frames; the oldest give way and leave their memory.
+#[derive(Debug)]
+pub(super) struct PastFrames {
+    frames: VecDeque<PastFrame>,
+    capacity: usize,
+}
+
+impl PastFrames {
+    /// None yet, at most `capacity`.
+    pub(super) fn with_capacity(capacity: usize) -> Self {
+        Self { frames: VecDeque::with_capacity(capacity + 1), capacity }
+    }
+
+    /// Forgets all.
+    pub(super) fn clear(&mut self) {
+        self.frames.clear();
+    }
+
+    /// Files a copy of a frame.
+    pub(super) fn push(&mut self, pixels: &[u8], world_from_camera: SE3, brightness: Brightness) {
+        let full = self.frames.len() >= self.capacity;
+        let oldest = if full { self.frames.pop_front() } else { None };
+        let mut memory = oldest.map(|frame| frame.pixels).unwrap_or_default();
+        memory.clear();
+        memory.extend_from_slice(pixels);
+        self.frames.push_back(PastFrame { pixels: memory, world_from_camera, brightness });
+    }
+
+    /// Expresses every brightness against a new keyframe, whose brightness against the one before is
+    /// `new`, and files the one before: with `I_new = eᵃ I + b` a frame's `(a', b')` becomes
+    /// `(a' − a, b' − e^(a' − a) b)`.
+    pub(super) fn rebase(&mut self, new: Brightness, before: &[u8], world_from_before: SE3) {
+        self.push(before, world_from_before, Brightness::default());
+        for past in &mut self.frames {
+            let a = past.brightness.a - new.a;
+            past.brightness = Brightness { a, b: past.brightness.b - a.exp() * new.b };
+        }
+    }
+
+    /// All, the newest first.
+    pub(super) fn newest_first(&self) -> impl Iterator<Item = &PastFrame> {
+        self.frames.iter().rev()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn brightness_follows_the_keyframe() {
+        let mut past = PastFrames::with_capacity(4);
+        // I_f = e^0.3 I_k + 5 and I_n = e^0.1 I_k − 2: a grey of 100 in the new keyframe.
+        past.push(&[1], SE3::identity(), Brightness { a: 0.3, b: 5.0 });
+        past.rebase(Brightness { a: 0.1, b: -2.0 }, &[2], SE3::identity());
+        let in_keyframe = (100.0 + 2.0) / 0.1f64.exp();
+        let expected = 0.3f64.exp() * in_keyframe + 5.0;
+        let frame = past.newest_first().last().unwrap();
+        assert!((frame.brightness.a.exp() * 100.0 + frame.brightness.b - expected).abs() < 1e-9);
+        let before = past.newest_first().next().unwrap();
+        assert!(
+            (before.brightness.a.exp() * 100.0 + before.brightness.b - in_keyframe).abs() < 1e-9
+        );
+    }
+
+    #[test]
+    fn the_oldest_gives_way() {
+        let mut past = PastFrames::with_capacity(2);
+        for i in 0..5u8 {
+            past.push(&[i], SE3::identity(), Brightness::default());
+        }
+        let kept: Vec<u8> = past.newest_first().map(|f| f.pixels[0]).collect();
+        assert_eq!(kept, [4, 3]);
+    }
+}

@@ -1,0 +1,198 @@
+//! How a map begins: from two frames, from random depth, from a sensor, or from given poses.
+
+use crate::slam::depth::epipolar::TwoView;
+use crate::slam::depth::gaussian::{NEW_VALIDITY, ObservationCounts, Observer, observe};
+use crate::slam::depth::map::{DepthMap, Hypothesis};
+use crate::slam::depth::regularisation::regularise;
+use crate::slam::frame::FrameView;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::geometry::sim3::Sim3;
+use crate::slam::image::buffer::Image;
+use crate::slam::initializer::{StartEvidence, StartMethod, proven_ratio, randomise};
+use crate::slam::keyframe::MapState;
+use crate::slam::mapper::{Mapper, StepOutcome, float_from_grey};
+use crate::slam::pose::{PoseEstimate, TrackingState};
+use crate::slam::two_frame::evidence::Waiting;
+use crate::slam::two_frame::{InitOutcome, InitState};
+
+impl Mapper {
+    /// Begins a map on this frame: with the sensor's depth, with random depth, or, where the pose is
+    /// claimed without a map (it is given, so the baselines will be true), without any.
+    pub(super) fn start(
+        &mut self,
+        frame: &FrameView<'_>,
+        pose: &PoseEstimate,
+        sensor_depth: Option<&Image<f32>>,
+    ) -> StepOutcome {
+        self.map.keyframes.clear();
+        self.past.clear();
+        self.depth.restart(frame.pixels, self.params.min_gradient, self.params.max_candidates);
+        let is_given = pose.state.is_tracked();
+        let map_state = match sensor_depth {
+            Some(sensor) => {
+                take_sensor_depth(&mut self.depth, sensor, 1.0);
+                MapState::Established
+            }
+            None if is_given => MapState::Established,
+            None => match self.params.initializer.method {
+                StartMethod::TwoFrame => return self.start_from_two_frames(frame),
+                StartMethod::Random => {
+                    self.start_at_random(frame);
+                    MapState::Initializing
+                }
+            },
+        };
+        let scale = self.rescale_to_unit_mean();
+        let world_from_camera = if is_given { pose.world_from_camera } else { SE3::identity() };
+        self.add_keyframe(frame, Sim3::new(world_from_camera, scale), map_state);
+        StepOutcome {
+            keyframe_created: true,
+            keyframe_changed: true,
+            graph_changed: true,
+            ..Default::default()
+        }
+    }
+
+    /// Judges a start that is not proven yet: proves it, goes on, or begins again.
+    pub(super) fn continue_start(
+        &mut self,
+        frame: &FrameView<'_>,
+        pose: &PoseEstimate,
+        observations: ObservationCounts,
+        sensor_depth: Option<&Image<f32>>,
+    ) -> StepOutcome {
+        let params = &self.params.initializer;
+        let evidence = StartEvidence {
+            median_parallax_px: self.median_parallax(pose),
+            proven_ratio: proven_ratio(&self.depth, params.proven_std_dev_ratio),
+            match_ratio: observations.fused as f64 / observations.attempted.max(1) as f64,
+        };
+        let proven = evidence.proves(params, self.intrinsics.width);
+        if !proven && self.frames_on_keyframe > u64::from(params.max_frames) {
+            return self.start(frame, pose, sensor_depth);
+        }
+        if proven && let Some(keyframe) = self.map.keyframes.last_mut() {
+            keyframe.map_state = MapState::Established;
+        }
+        self.remember(frame, pose);
+        self.publish_depth();
+        StepOutcome { keyframe_changed: true, observations, ..Default::default() }
+    }
+
+    /// Random depth on this frame.
+    fn start_at_random(&mut self, frame: &FrameView<'_>) {
+        randomise(&mut self.depth, self.params.initializer.seed ^ frame.sequence);
+        regularise(&mut self.depth, &mut self.regularised, &self.params.regularisation);
+    }
+
+    /// Gives the two-frame start another frame. Once it is proven its first frame becomes a keyframe
+    /// and this frame the next one, so that the tracker begins where the camera is.
+    fn start_from_two_frames(&mut self, frame: &FrameView<'_>) -> StepOutcome {
+        let start = self.two_frame.step(frame.pixels);
+        let stamp = (frame.sequence, frame.capture_nanos);
+        let first = *self.first_stamp.get_or_insert(stamp);
+        match start.state {
+            InitState::Waiting(Waiting::Texture) => self.first_stamp = None,
+            InitState::Waiting(_) => {}
+            InitState::Failed(_) => self.first_stamp = Some(stamp),
+            InitState::Proven => {
+                self.first_stamp = None;
+                return self.begin_proven(frame, first, &start);
+            }
+        }
+        StepOutcome::default()
+    }
+
+    fn begin_proven(
+        &mut self,
+        frame: &FrameView<'_>,
+        first: (u64, i64),
+        start: &InitOutcome,
+    ) -> StepOutcome {
+        let first_pixels = self.two_frame.first_pixels().to_vec();
+        self.depth.restart(&first_pixels, self.params.min_gradient, self.params.max_candidates);
+        self.two_frame.fill(&mut self.depth);
+        float_from_grey(&mut self.frame, frame.pixels);
+        let observer = Observer {
+            image: &self.frame,
+            view: TwoView::new(&self.intrinsics, &start.first_from_current.inverse()),
+            brightness: start.brightness,
+            only_new: false,
+        };
+        let observations =
+            observe(&mut self.depth, &observer, &self.params.matching, &self.params.gaussian);
+        regularise(&mut self.depth, &mut self.regularised, &self.params.regularisation);
+        let scale = self.rescale_to_unit_mean();
+        let first_frame = FrameView {
+            sequence: first.0,
+            capture_nanos: first.1,
+            pixels: &first_pixels,
+            ..*frame
+        };
+        let world_from_first = Sim3::new(SE3::identity(), scale);
+        self.add_keyframe(&first_frame, world_from_first, MapState::Established);
+        let pose = PoseEstimate {
+            state: TrackingState::Initializing,
+            world_from_camera: start.first_from_current,
+            brightness: start.brightness,
+            keyframe_id: self.next_keyframe_id - 1,
+            ..PoseEstimate::unknown(frame)
+        };
+        self.change_keyframe(frame, &pose, None);
+        StepOutcome {
+            keyframe_created: true,
+            keyframe_changed: true,
+            graph_changed: true,
+            observations,
+        }
+    }
+
+    /// Median image motion that the translation of `pose` causes, pixels.
+    fn median_parallax(&self, pose: &PoseEstimate) -> f64 {
+        let Some(keyframe) = self.keyframe() else { return 0.0 };
+        let relative = keyframe.world_from_keyframe.locate(&pose.world_from_camera).inverse();
+        let view = TwoView::new(&self.intrinsics, &relative);
+        let mut parallax: Vec<f32> = keyframe
+            .points
+            .iter()
+            .step_by(SAMPLE_STRIDE)
+            .filter_map(|p| {
+                let line = view.line(f32::from(p.u), f32::from(p.v));
+                let (far, at) = (line.project(0.0)?, line.project(p.inverse_depth)?);
+                Some((at.u - far.u).hypot(at.v - far.v))
+            })
+            .collect();
+        if parallax.is_empty() {
+            return 0.0;
+        }
+        let middle = parallax.len() / 2;
+        f64::from(*parallax.select_nth_unstable_by(middle, f32::total_cmp).1)
+    }
+}
+
+/// Every so many points are enough for a median or a share.
+const SAMPLE_STRIDE: usize = 16;
+
+/// Gives every candidate the depth of a sensor, in units of `scale` metres.
+pub(super) fn take_sensor_depth(map: &mut DepthMap, sensor: &Image<f32>, scale: f64) {
+    /// Relative standard deviation of a depth camera at room distances.
+    const SENSOR_STD_DEV_RATIO: f32 = 0.01;
+    if (sensor.width(), sensor.height()) != (map.image.width(), map.image.height()) {
+        return;
+    }
+    let pixels = map.hypotheses.pixels_mut().iter_mut().zip(map.candidates.pixels());
+    for ((hypothesis, candidate), &depth) in pixels.zip(sensor.pixels()) {
+        if !candidate || !(depth > 0.0) || !depth.is_finite() {
+            continue;
+        }
+        let inverse_depth = scale as f32 / depth;
+        *hypothesis = Hypothesis {
+            inverse_depth,
+            variance: (SENSOR_STD_DEV_RATIO * inverse_depth).powi(2),
+            smoothed: inverse_depth,
+            validity: NEW_VALIDITY,
+            propagated: true,
+            failures: 0,
+        };
+    }
+}
