@@ -1,38 +1,136 @@
 //! The command line: arguments → configuration → shell → exit code.
+//!
+//! Exit codes: 0 done, 1 failed (one line says what, where and what to do), 2 the command line is
+//! not understood, 130 interrupted (results so far are written).
 
+pub mod capture;
 pub mod evaluate;
+pub mod mapper;
 pub mod progress;
 pub mod replay;
+pub mod run;
+pub mod run_progress;
 pub mod simulate;
+pub mod status;
+pub mod tracker;
 
+use std::error::Error;
+use std::io::IsTerminal;
+use std::path::PathBuf;
 use std::process::ExitCode;
 
-use clap::{Parser, Subcommand};
+use clap::{Args, Parser, Subcommand};
 
-/// Real-time semi-dense direct visual SLAM for robot computers
+use crate::service::child::{ERROR_PREFIX, follow_supervisor};
+use crate::service::config::{Config, ConfigError};
+use crate::wire::place::Place;
+
+/// Exit code of a run that was interrupted: 128 + SIGINT, as shells have it.
+const INTERRUPTED: u8 = 130;
+
+/// What a command may fail with: one line for the user.
+pub type CommandResult = Result<ExitCode, Box<dyn Error>>;
+
 #[derive(Debug, Parser)]
-#[command(name = "semidense", version)]
-struct Arguments {
+#[command(
+    name = "semidense",
+    version,
+    about = "Real-time semi-dense direct visual SLAM for robot computers",
+    after_help = "Start with `semidense run`: it simulates a camera in a furnished room, tracks it, maps the room,\n\
+                  and writes trajectory, map and figures into ./output.\n\
+                  Then `semidense run --source tum:DIR` for a recording.\n\n\
+                  Exit codes: 0 done, 1 failed, 2 wrong usage, 130 interrupted (results so far are written)."
+)]
+struct CommandLine {
+    #[command(flatten)]
+    common: CommonArguments,
     #[command(subcommand)]
-    command: Command,
+    command: Subcommands,
+}
+
+/// Options that every command has.
+#[derive(Debug, Clone, Args)]
+pub struct CommonArguments {
+    /// Configuration file [default: /etc/semidense/semidense.toml where it exists]
+    #[arg(long, global = true, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// Set one key of the configuration, as in mapper.threads=2; may be repeated
+    #[arg(long, global = true, value_name = "KEY=VALUE")]
+    pub set: Vec<String>,
+    /// Name of the instance: two of different names run side by side [default: semidense]
+    #[arg(long, global = true, value_name = "NAME")]
+    pub instance: Option<String>,
+    /// What to log: error, warn, info, debug or trace, also by module
+    #[arg(long, global = true, value_name = "LEVEL", default_value = "warn")]
+    pub log: String,
+}
+
+impl CommonArguments {
+    /// Configuration with everything that was said on the command line.
+    fn load(&self) -> Result<Config, ConfigError> {
+        let named = self.instance.iter().map(|name| format!("instance={name:?}"));
+        let settings: Vec<String> = self.set.iter().cloned().chain(named).collect();
+        Config::load(self.config.as_deref(), &settings)
+    }
+
+    /// The same options for a child process.
+    fn to_arguments(&self) -> Vec<String> {
+        let mut arguments = vec!["--log".to_owned(), self.log.clone()];
+        let mut push = |option: &str, value: String| arguments.extend([option.to_owned(), value]);
+        self.config.iter().for_each(|file| push("--config", file.to_string_lossy().into_owned()));
+        self.set.iter().for_each(|setting| push("--set", setting.clone()));
+        self.instance.iter().for_each(|name| push("--instance", name.clone()));
+        arguments
+    }
 }
 
 #[derive(Debug, Subcommand)]
-enum Command {
-    Evaluate(evaluate::EvaluateArgs),
+enum Subcommands {
+    Run(run::RunArguments),
+    Capture(capture::CaptureArguments),
+    Tracker(tracker::TrackerArguments),
+    Mapper(mapper::MapperArguments),
     Replay(replay::ReplayArgs),
     Simulate(simulate::SimulateArgs),
+    Evaluate(evaluate::EvaluateArgs),
+    Status(status::StatusArguments),
 }
 
 /// Parses the command line and runs the chosen subcommand.
 pub fn main() -> ExitCode {
-    let result = match Arguments::parse().command {
-        Command::Evaluate(arguments) => evaluate::run(&arguments),
-        Command::Replay(arguments) => replay::run(&arguments),
-        Command::Simulate(arguments) => simulate::run(&arguments),
-    };
-    result.unwrap_or_else(|error| {
-        eprintln!("semidense: {error}");
+    let line = CommandLine::parse();
+    let outcome = prepare(&line.common).and_then(|config| {
+        let outcome = match line.command {
+            Subcommands::Run(arguments) => run::run(&config, &line.common, arguments),
+            Subcommands::Capture(arguments) => capture::run(&config, arguments),
+            Subcommands::Tracker(arguments) => tracker::run(&config, arguments),
+            Subcommands::Mapper(arguments) => mapper::run(&config, arguments),
+            Subcommands::Replay(arguments) => replay::run(&config, &arguments),
+            Subcommands::Simulate(arguments) => simulate::run(&arguments),
+            Subcommands::Evaluate(arguments) => evaluate::run(&arguments),
+            Subcommands::Status(arguments) => status::run(&config, arguments),
+        };
+        Place::new(&config.instance, &config.root)?.tidy();
+        outcome
+    });
+    outcome.unwrap_or_else(|error| {
+        let line = error.to_string().split_whitespace().collect::<Vec<_>>().join(" ");
+        eprintln!("{ERROR_PREFIX}{line}");
         ExitCode::FAILURE
     })
+}
+
+fn prepare(common: &CommonArguments) -> Result<Config, Box<dyn Error>> {
+    follow_supervisor()?;
+    let filter = tracing_subscriber::EnvFilter::try_new(&common.log)
+        .map_err(|error| format!("--log {}: {error}", common.log))?;
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr)
+        .with_ansi(std::io::stderr().is_terminal())
+        .with_target(false)
+        .init();
+    let config = common.load()?;
+    tracing::info!("configuration:\n{}", config.to_text());
+    Ok(config)
 }

@@ -8,13 +8,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::{Args, ValueEnum};
 
-use crate::capture::simulator::params::SimulatorParams;
 use crate::capture::source::{FrameSource, SourceName, open};
 use crate::command::progress::Progress;
+use crate::service::config::Config;
 use crate::service::replay::{DepthOrigin, PoseOrigin, ReplayConfig, ReplayProgress, replay};
 use crate::service::results::debug_pictures::write_debug_pictures;
 use crate::service::results::summary_text::summary_text;
-use crate::service::results::{ResultsParams, RunRecord, prepare_output, write_results};
+use crate::service::results::{RunRecord, prepare_output, write_results};
 use crate::slam::pose::TrackingState;
 
 /// Exit code of a run that Ctrl-C ended, as shells have it (128 + SIGINT).
@@ -63,10 +63,10 @@ pub struct ReplayArgs {
     /// Stop after as many frames
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     frames: Option<u32>,
-    /// Seed of the simulator
-    #[arg(long, value_name = "N", default_value_t = SimulatorParams::default().seed)]
-    seed: u64,
-    /// Threads of the mapper; the result does not depend on it [default: one for each CPU]
+    /// Seed of the simulator [default: simulator.seed]
+    #[arg(long, value_name = "N")]
+    seed: Option<u64>,
+    /// Threads of the mapper; the result does not depend on it [default: mapper.threads]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: Option<u16>,
     /// Print the summary as JSON
@@ -75,22 +75,23 @@ pub struct ReplayArgs {
 }
 
 /// Replays, writes the results and prints the summary.
-pub fn run(args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error>> {
+pub fn run(config: &Config, args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error>> {
     prepare_output(&args.output)?;
-    let mut simulator = SimulatorParams { seed: args.seed, ..SimulatorParams::default() };
+    let mut simulator = config.simulator.clone();
+    simulator.seed = args.seed.unwrap_or(simulator.seed);
     simulator.frames = args.frames.map_or(simulator.frames, |n| simulator.frames.min(n as usize));
     let mut source = open(&args.source, args.rig.as_deref(), &simulator)?;
     let interrupted = Arc::new(AtomicBool::new(false));
     signal_hook::flag::register(signal_hook::consts::SIGINT, Arc::clone(&interrupted))?;
-    let threads = args.threads.map_or(0, usize::from);
+    let threads = args.threads.map_or(config.mapper.threads, usize::from);
     let pool = rayon::ThreadPoolBuilder::new()
         .num_threads(threads)
         .thread_name(|i| format!("mapper-{i}"))
         .build()?;
     let record = pool.install(|| {
-        record(args, source.as_mut(), &interrupted).map_err(|error| error.to_string())
+        record(config, args, source.as_mut(), &interrupted).map_err(|error| error.to_string())
     })?;
-    let summary = write_results(&args.output, &record, source.as_mut(), &ResultsParams::default())?;
+    let summary = write_results(&args.output, &record, source.as_mut(), &config.results)?;
     if args.debug_images {
         write_debug_pictures(&args.output.join("debug"), &record.map)?;
     }
@@ -106,6 +107,7 @@ pub fn run(args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error>> {
 
 /// Prepares the source and replays it under a progress bar.
 fn record(
+    config: &Config,
     args: &ReplayArgs,
     source: &mut dyn FrameSource,
     interrupted: &AtomicBool,
@@ -118,7 +120,9 @@ fn record(
         goes_on()
     })?;
     preparing.iter().for_each(Progress::finish);
-    let config = ReplayConfig {
+    let replayed = ReplayConfig {
+        tracker: config.tracking.clone(),
+        mapper: config.mapping.clone(),
         poses: match args.poses {
             Poses::Tracker => PoseOrigin::Tracker,
             Poses::Groundtruth => PoseOrigin::GroundTruth,
@@ -128,11 +132,10 @@ fn record(
             InitialDepth::Sensor => DepthOrigin::Sensor,
         },
         max_frames: args.frames.map(|frames| frames as usize),
-        ..ReplayConfig::default()
     };
-    let total = source.num_frames().map(|n| n.min(config.max_frames.unwrap_or(n)));
+    let total = source.num_frames().map(|n| n.min(replayed.max_frames.unwrap_or(n)));
     let progress = Progress::new("replay", total);
-    let record = replay(source, &args.source.to_string(), &config, &mut |frame| {
+    let record = replay(source, &args.source.to_string(), &replayed, &mut |frame| {
         progress.update(frame.done, state_word(frame));
         goes_on()
     });

@@ -1,1 +1,12 @@
 //! Shared memory: the only place that names iceoryx2.
+//!
+//! [`message`] are the bytes, [`conversion`] checks them, [`topic`] is the table of who sends what,
+//! [`place`] says where an instance lives, [`port`] sends, receives and waits, [`command`] asks.
+
+pub mod command;
+pub mod conversion;
+pub mod keyframe_inbox;
+pub mod message;
+pub mod place;
+pub mod port;
+pub mod topic;

@@ -1,0 +1,45 @@
+//! Another process on the same machine, started at any time: prints every pose and keyframe.
+//!
+//! ```sh
+//! semidense run --live &
+//! cargo run --release --example subscribe
+//! ```
+
+use std::error::Error;
+use std::time::Duration;
+
+use semidense::service::shutdown::Shutdown;
+use semidense::wire::conversion::pose_from_message;
+use semidense::wire::keyframe_inbox::KeyframeInbox;
+use semidense::wire::message::PoseMessage;
+use semidense::wire::place::Place;
+use semidense::wire::port::{Access, Hub, Subscriber, wait};
+use semidense::wire::topic::POSE;
+
+fn main() -> Result<(), Box<dyn Error>> {
+    // The instance's name is the first argument; its folder is where `semidense run` puts it too.
+    let instance = std::env::args().nth(1).unwrap_or_else(|| "semidense".to_owned());
+    let place = Place::new(&instance, "")?;
+    let hub = Hub::join(&place, "subscribe", Access::Observer)?;
+    let poses: Subscriber<PoseMessage, ()> = hub.subscriber(&POSE)?;
+    // The keyframe in force comes at once, however late we are: it is the topic's history.
+    let mut keyframes = KeyframeInbox::open(&hub)?;
+    let shutdown = Shutdown::install()?;
+    while !shutdown.is_requested() {
+        let events = [poses.events(), keyframes.events()];
+        wait(&events, Some(shutdown.descriptor()), Duration::from_secs(1))?;
+        if let Some(keyframe) = keyframes.newest()? {
+            let (id, points) = (keyframe.keyframe_id, keyframe.points.len());
+            println!("keyframe {id} revision {}: {points} points", keyframe.revision);
+        }
+        while let Some(message) = poses.receive()? {
+            // A slice of one message that lies in shared memory; checked before it is believed.
+            for pose in message.payload().iter().map(pose_from_message) {
+                let pose = pose?;
+                let [x, y, z] = pose.world_from_camera.translation.into();
+                println!("frame {} {:?}: {x:.3} {y:.3} {z:.3}", pose.sequence, pose.state);
+            }
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,26 @@
+//! `semidense mapper`: the semi-dense map.
+
+use std::process::ExitCode;
+
+use clap::Args;
+
+use crate::command::CommandResult;
+use crate::command::capture::ModeArguments;
+use crate::service::config::Config;
+use crate::service::mapper::run as run_shell;
+use crate::service::shutdown::Shutdown;
+
+/// Estimate the depth of keyframes and publish the map
+#[derive(Debug, Args)]
+pub struct MapperArguments {
+    /// The mapper takes what comes in either way.
+    #[command(flatten)]
+    _mode: ModeArguments,
+}
+
+/// Runs it.
+pub fn run(config: &Config, _arguments: MapperArguments) -> CommandResult {
+    let shutdown = Shutdown::install()?;
+    run_shell(config, &shutdown)?;
+    Ok(ExitCode::SUCCESS)
+}

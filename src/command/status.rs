@@ -1,0 +1,127 @@
+//! `semidense status`: what is running, and how well.
+
+use std::io::IsTerminal;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use clap::Args;
+use serde_json::{Value, json};
+
+use crate::command::CommandResult;
+use crate::service::clock::now_nanos;
+use crate::service::config::Config;
+use crate::service::health::{cause, percentile_ms};
+use crate::service::peers::{HEALTH_TOPICS, Peer};
+use crate::service::shutdown::Shutdown;
+use crate::wire::message::HealthMessage;
+use crate::wire::place::Place;
+use crate::wire::port::{Access, Hub, wait};
+
+/// Time between two looks: rates are taken over it.
+const PERIOD: Duration = Duration::from_secs(1);
+/// A process that has said nothing for so long is not there any more.
+const STALE_NANOS: i64 = 3_000_000_000;
+
+/// Show states, rates and latencies of the running processes
+#[derive(Debug, Args)]
+pub struct StatusArguments {
+    /// Show it once and end
+    #[arg(long)]
+    once: bool,
+    /// One JSON object for each look
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs it.
+pub fn run(config: &Config, arguments: StatusArguments) -> CommandResult {
+    let place = Place::new(&config.instance, &config.root)?;
+    let hub = Hub::join(&place, "status", Access::Observer)?;
+    let mut peers = Vec::new();
+    for topic in &HEALTH_TOPICS {
+        peers.push(Peer::open(&hub, topic)?);
+    }
+    let shutdown = Shutdown::install()?;
+    let is_live = std::io::stdout().is_terminal() && !arguments.once && !arguments.json;
+    let mut before: Vec<Option<HealthMessage>> = vec![None; peers.len()];
+    loop {
+        wait(&[], Some(shutdown.descriptor()), PERIOD)?;
+        if shutdown.is_requested() {
+            return Ok(ExitCode::SUCCESS);
+        }
+        let mut rows = Vec::new();
+        for (peer, before) in peers.iter_mut().zip(&mut before) {
+            peer.update()?;
+            rows.push((peer.name(), row(peer, before.as_ref())));
+            *before = peer.last().copied();
+        }
+        show(&rows, arguments.json, is_live);
+        if arguments.once {
+            return Ok(ExitCode::SUCCESS);
+        }
+    }
+}
+
+/// One process as JSON; null where it has never spoken.
+fn row(peer: &Peer, before: Option<&HealthMessage>) -> Value {
+    let Some(health) = peer.last() else { return Value::Null };
+    let is_stale = now_nanos() - health.published_nanos > STALE_NANOS;
+    let state = peer.state().map_or("unknown", |state| state.name());
+    let rate_hz = before.and_then(|before| {
+        let nanos = health.published_nanos - before.published_nanos;
+        let frames = health.frames.checked_sub(before.frames)?;
+        (nanos > 0).then(|| frames as f64 * 1e9 / nanos as f64)
+    });
+    json!({
+        "state": if is_stale { "silent" } else { state },
+        "cause": cause(health),
+        "process_id": health.process_id,
+        "frames": health.frames,
+        "rate_hz": rate_hz,
+        "dropped": health.dropped,
+        "gaps": health.gaps,
+        "refused": health.refused,
+        "deadline_misses": health.deadline_misses,
+        "peak_rss_mb": health.peak_rss_bytes as f64 / f64::from(1 << 20),
+        "latency_ms": {
+            "p50": percentile_ms(&health.latency_counts, 0.5),
+            "p99": percentile_ms(&health.latency_counts, 0.99),
+            "max": percentile_ms(&health.latency_counts, 1.0),
+        },
+    })
+}
+
+fn show(rows: &[(&str, Value)], json: bool, is_live: bool) {
+    if json {
+        let object: serde_json::Map<_, _> =
+            rows.iter().map(|(name, row)| ((*name).to_owned(), row.clone())).collect();
+        println!("{}", Value::Object(object));
+        return;
+    }
+    if is_live {
+        // Clear the screen and go to its first place.
+        print!("\x1b[2J\x1b[H");
+    }
+    println!("process  state      frames   rate/s  dropped  late  p50 ms  p99 ms  MB");
+    for (name, row) in rows {
+        let number = |value: &Value, digits: usize| {
+            value.as_f64().map_or("-".to_owned(), |x| format!("{x:.digits$}"))
+        };
+        if row.is_null() {
+            println!("{name:8} not running");
+            continue;
+        }
+        println!(
+            "{name:8} {:9} {:>7} {:>8} {:>8} {:>5} {:>7} {:>7} {:>3} {}",
+            row["state"].as_str().unwrap_or(""),
+            number(&row["frames"], 0),
+            number(&row["rate_hz"], 1),
+            number(&row["dropped"], 0),
+            number(&row["deadline_misses"], 0),
+            number(&row["latency_ms"]["p50"], 2),
+            number(&row["latency_ms"]["p99"], 2),
+            number(&row["peak_rss_mb"], 0),
+            row["cause"].as_str().unwrap_or(""),
+        );
+    }
+}

@@ -1,0 +1,65 @@
+//! The time a frame has: says before each iteration whether it still fits.
+
+use crate::service::clock::now_nanos;
+
+/// Levels whose cost is kept; deeper pyramids do not exist.
+const MAX_LEVELS: usize = 16;
+/// Share of a new measurement in the running mean: a few frames follow a change of load.
+const NEW_SHARE: f64 = 0.2;
+
+/// What an iteration costs at each pyramid level, learned from the time between two questions.
+#[derive(Debug, Clone, Default)]
+pub struct IterationCosts {
+    nanos: [f64; MAX_LEVELS],
+}
+
+impl IterationCosts {
+    /// The answer to "is there time for an iteration at this level?" until `deadline_nanos`.
+    pub fn until(&mut self, deadline_nanos: i64) -> impl FnMut(usize) -> bool {
+        let mut running: Option<(usize, i64)> = None;
+        move |level| {
+            let now = now_nanos();
+            if let Some((level, since)) = running.take() {
+                self.learn(level, now - since);
+            }
+            let fits = self.fits(level, now, deadline_nanos);
+            running = fits.then_some((level, now));
+            fits
+        }
+    }
+
+    fn learn(&mut self, level: usize, nanos: i64) {
+        let Some(cost) = self.nanos.get_mut(level) else { return };
+        let share = if *cost == 0.0 { 1.0 } else { NEW_SHARE };
+        *cost += share * (nanos as f64 - *cost);
+    }
+
+    fn fits(&self, level: usize, now: i64, deadline_nanos: i64) -> bool {
+        let cost = self.nanos.get(level).copied().unwrap_or(0.0);
+        now as f64 + cost <= deadline_nanos as f64
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_iteration_that_does_not_fit_is_refused() {
+        let mut costs = IterationCosts::default();
+        assert!(costs.fits(3, 100, 100), "nothing is known yet");
+        costs.learn(0, 1000);
+        assert!(costs.fits(0, 0, 1000));
+        assert!(!costs.fits(0, 1, 1000));
+        assert!(costs.fits(1, 1, 1000), "another level has its own cost");
+        costs.learn(0, 2000);
+        assert_eq!(costs.nanos[0], 1200.0);
+    }
+
+    #[test]
+    fn a_deadline_in_the_past_refuses_everything() {
+        let mut costs = IterationCosts::default();
+        let mut budget = costs.until(now_nanos() - 1);
+        assert!(!budget(0) && !budget(99));
+    }
+}

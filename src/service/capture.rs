@@ -1,0 +1,282 @@
+//! The capture process: frames from the source straight into shared memory, at their pace.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use crate::capture::source::{FrameSource, FrameStamp, SourceError, SourceName, open};
+use crate::service::clock::{Pace, duration_from_nanos, now_nanos};
+use crate::service::config::Config;
+use crate::service::health::{Health, ProcessState};
+use crate::service::mode::Mode;
+use crate::service::peers::Peer;
+use crate::service::shutdown::Shutdown;
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::wire::message::{FrameHeader, StepMessage};
+use crate::wire::place::{Claim, Place, PlaceError};
+use crate::wire::port::{
+    Access, Hub, OpenError, Publisher, ReceiveError, SendError, Subscriber, WaitError, wait,
+};
+use crate::wire::topic::{
+    CAPTURE_HEALTH, FRAME, MAPPER_HEALTH, STEP, TRACKER_HEALTH, shared_memory_bytes,
+};
+
+/// Longest sleep without a look at signals and health.
+const WAKE_PERIOD: Duration = Duration::from_millis(100);
+
+/// What to capture and how.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CaptureOptions {
+    /// Where frames come from.
+    pub source: SourceName,
+    /// The camera's rig file.
+    pub rig: Option<PathBuf>,
+    /// Lockstep or live.
+    pub mode: Mode,
+}
+
+/// Why capture ends early.
+#[derive(Debug, thiserror::Error)]
+pub enum CaptureError {
+    /// The place is not right, or taken.
+    #[error(transparent)]
+    Place(#[from] PlaceError),
+    /// A topic cannot be opened.
+    #[error(transparent)]
+    Open(#[from] OpenError),
+    /// The source cannot be opened, or gave no frame.
+    #[error(transparent)]
+    Source(#[from] SourceError),
+    /// A frame cannot be sent.
+    #[error(transparent)]
+    Send(#[from] SendError),
+    /// The others cannot be heard.
+    #[error(transparent)]
+    Receive(#[from] ReceiveError),
+    /// Waiting failed.
+    #[error(transparent)]
+    Wait(#[from] WaitError),
+    /// Size and intrinsics of no camera.
+    #[error("{0}: its size and intrinsics belong to no camera; check its camera file or rig")]
+    Intrinsics(SourceName),
+    /// A process that must be there is not.
+    #[error(
+        "{process} did not get ready within {seconds} s; start it, or raise capture.connect_timeout_s"
+    )]
+    NotReady {
+        /// Which.
+        process: &'static str,
+        /// How long was waited.
+        seconds: f64,
+    },
+    /// The map does not take in a frame.
+    #[error(
+        "the mapper did not take in frame {sequence} within {seconds} s; raise capture.step_timeout_s if it is only slow"
+    )]
+    NoStep {
+        /// Which frame.
+        sequence: u64,
+        /// How long was waited.
+        seconds: f64,
+    },
+    /// A signal, before the end.
+    #[error("interrupted")]
+    Interrupted,
+}
+
+/// Runs the process to the end of the source or to the signal.
+pub fn run(
+    config: &Config,
+    options: &CaptureOptions,
+    shutdown: &Shutdown,
+) -> Result<(), CaptureError> {
+    let mut shell = Shell::prepare(config, options, shutdown)?;
+    let outcome = shell.prepare_source().and_then(|()| shell.stream());
+    match &outcome {
+        Ok(()) => shell.health.enter(ProcessState::Finished, "the source has ended"),
+        Err(error) => shell.health.enter(ProcessState::Failed, &error.to_string()),
+    }
+    outcome
+}
+
+struct Shell<'a> {
+    config: &'a Config,
+    mode: Mode,
+    shutdown: &'a Shutdown,
+    source: Box<dyn FrameSource>,
+    intrinsics: Intrinsics,
+    frames: Publisher<u8, FrameHeader>,
+    steps: Subscriber<StepMessage, ()>,
+    peers: [Peer; 2],
+    health: Health,
+    pace: Option<Pace>,
+    next_sequence: Option<u64>,
+    _claim: Claim,
+}
+
+impl<'a> Shell<'a> {
+    fn prepare(
+        config: &'a Config,
+        options: &CaptureOptions,
+        shutdown: &'a Shutdown,
+    ) -> Result<Self, CaptureError> {
+        let source = open(&options.source, options.rig.as_deref(), &config.simulator)?;
+        let intrinsics = source.intrinsics();
+        if !intrinsics.is_valid() {
+            return Err(CaptureError::Intrinsics(options.source.clone()));
+        }
+        let place = Place::new(&config.instance, &config.root)?;
+        let claim = place.claim("capture")?;
+        place.check_shared_memory(shared_memory_bytes(&intrinsics, Some("capture")))?;
+        let hub = Hub::join(&place, "capture", Access::Member)?;
+        let mut health = Health::open(&hub, &CAPTURE_HEALTH)?;
+        health.counters().total = source.num_frames().unwrap_or(0) as u64;
+        Ok(Self {
+            config,
+            mode: options.mode,
+            shutdown,
+            frames: hub.publisher(&FRAME, intrinsics.width * intrinsics.height)?,
+            steps: hub.subscriber(&STEP)?,
+            peers: [Peer::open(&hub, &TRACKER_HEALTH)?, Peer::open(&hub, &MAPPER_HEALTH)?],
+            source,
+            intrinsics,
+            health,
+            pace: None,
+            next_sequence: None,
+            _claim: claim,
+        })
+    }
+
+    /// Whether frames come from a recording, which can wait for its readers.
+    fn is_recorded(&self) -> bool {
+        self.source.num_frames().is_some()
+    }
+
+    /// Everything that must be over before the first frame: rendering, and tracker and mapper.
+    fn prepare_source(&mut self) -> Result<(), CaptureError> {
+        self.health.enter(ProcessState::Preparing, "");
+        let (health, shutdown) = (&mut self.health, self.shutdown);
+        self.source.prepare(&mut |done, total| {
+            health.progress(done, total);
+            !shutdown.is_requested()
+        })?;
+        self.health.enter(ProcessState::Ready, "");
+        if !self.is_recorded() {
+            return Ok(());
+        }
+        let seconds = self.config.capture.connect_timeout_s;
+        let deadline = now_nanos().saturating_add((seconds * 1e9) as i64);
+        loop {
+            for peer in &mut self.peers {
+                peer.update()?;
+            }
+            let Some(missing) = self.peers.iter().find(|peer| !peer.is_ready()) else {
+                return Ok(());
+            };
+            if now_nanos() > deadline {
+                return Err(CaptureError::NotReady { process: missing.name(), seconds });
+            }
+            self.pause(Duration::from_millis(10))?;
+        }
+    }
+
+    /// Frame after frame.
+    fn stream(&mut self) -> Result<(), CaptureError> {
+        self.health.enter(ProcessState::Running, "");
+        while let Some(sequence) = self.send_next()? {
+            if self.mode == Mode::Lockstep {
+                self.await_step(sequence)?;
+            }
+            self.health.report();
+        }
+        Ok(())
+    }
+
+    /// Reads the next frame into shared memory and sends it when it is due; its sequence, `None`
+    /// after the last.
+    fn send_next(&mut self) -> Result<Option<u64>, CaptureError> {
+        let mut loan = self.frames.loan(self.intrinsics.width * self.intrinsics.height)?;
+        let Some(stamp) = self.source.next_into(loan.bytes_mut())? else { return Ok(None) };
+        if self.shutdown.is_requested() {
+            return Err(CaptureError::Interrupted);
+        }
+        let clock_nanos = match self.mode {
+            Mode::Live if self.source.num_frames().is_none() => stamp.capture_nanos,
+            Mode::Live => {
+                let start = Pace::start(stamp.capture_nanos, now_nanos());
+                let due = self.pace.get_or_insert(start).due_nanos(stamp.capture_nanos);
+                wait_until(due, self.shutdown, &mut self.health)?;
+                due
+            }
+            Mode::Lockstep => now_nanos(),
+        };
+        loan.send(self.header(&stamp, clock_nanos))?;
+        self.count(&stamp);
+        Ok(Some(stamp.sequence))
+    }
+
+    fn header(&self, stamp: &FrameStamp, clock_nanos: i64) -> FrameHeader {
+        let k = &self.intrinsics;
+        FrameHeader {
+            sequence: stamp.sequence,
+            capture_nanos: stamp.capture_nanos,
+            clock_nanos,
+            exposure_nanos: stamp.exposure_nanos,
+            intrinsics: [k.fx, k.fy, k.cx, k.cy],
+            width: k.width as u32,
+            height: k.height as u32,
+            stride: k.width as u32,
+            gain: stamp.gain,
+        }
+    }
+
+    fn count(&mut self, stamp: &FrameStamp) {
+        let counters = self.health.counters();
+        counters.frames += 1;
+        counters.gaps += u64::from(self.next_sequence.is_some_and(|next| next != stamp.sequence));
+        self.next_sequence = Some(stamp.sequence.saturating_add(1));
+    }
+
+    /// Lockstep: waits until the frame is in the map.
+    fn await_step(&mut self, sequence: u64) -> Result<(), CaptureError> {
+        let seconds = self.config.capture.step_timeout_s;
+        let deadline = now_nanos().saturating_add((seconds * 1e9) as i64);
+        loop {
+            while let Some(step) = self.steps.receive()? {
+                if step.payload().first().is_some_and(|step| step.sequence == sequence) {
+                    return Ok(());
+                }
+            }
+            if now_nanos() > deadline {
+                return Err(CaptureError::NoStep { sequence, seconds });
+            }
+            self.pause(WAKE_PERIOD)?;
+        }
+    }
+
+    /// Sleeps until a step, a signal or the end of `period`.
+    fn pause(&mut self, period: Duration) -> Result<(), CaptureError> {
+        wait(&[self.steps.events()], Some(self.shutdown.descriptor()), period)?;
+        self.frames.serve_late_joiners();
+        self.health.report();
+        if self.shutdown.is_requested() { Err(CaptureError::Interrupted) } else { Ok(()) }
+    }
+}
+
+/// Sleeps until `due_nanos`.
+fn wait_until(
+    due_nanos: i64,
+    shutdown: &Shutdown,
+    health: &mut Health,
+) -> Result<(), CaptureError> {
+    loop {
+        let left = duration_from_nanos(due_nanos - now_nanos());
+        if shutdown.is_requested() {
+            return Err(CaptureError::Interrupted);
+        }
+        if left.is_zero() {
+            return Ok(());
+        }
+        wait(&[], Some(shutdown.descriptor()), left.min(WAKE_PERIOD))?;
+        health.report();
+    }
+}

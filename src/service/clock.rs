@@ -1,0 +1,56 @@
+//! The process's clock, and the pace of a recording that is played live.
+
+use std::time::Duration;
+
+use rustix::time::{ClockId, clock_gettime};
+
+/// Nanoseconds of CLOCK_MONOTONIC, the one clock of all our messages.
+pub fn now_nanos() -> i64 {
+    let now = clock_gettime(ClockId::Monotonic);
+    now.tv_sec * 1_000_000_000 + now.tv_nsec
+}
+
+/// `nanos` as a duration, nothing where it is negative.
+pub fn duration_from_nanos(nanos: i64) -> Duration {
+    Duration::from_nanos(u64::try_from(nanos).unwrap_or(0))
+}
+
+/// Says when a recorded frame is due: as long after the first as its stamp says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Pace {
+    first_stamp_nanos: i64,
+    first_clock_nanos: i64,
+}
+
+impl Pace {
+    /// The first frame, with this stamp, is due at `clock_nanos`.
+    pub fn start(stamp_nanos: i64, clock_nanos: i64) -> Self {
+        Self { first_stamp_nanos: stamp_nanos, first_clock_nanos: clock_nanos }
+    }
+
+    /// When the frame with this stamp is due.
+    pub fn due_nanos(&self, stamp_nanos: i64) -> i64 {
+        let since_first = stamp_nanos.saturating_sub(self.first_stamp_nanos);
+        self.first_clock_nanos.saturating_add(since_first)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn frames_are_due_as_their_stamps_say() {
+        let pace = Pace::start(5_000, 1_000_000);
+        assert_eq!(pace.due_nanos(5_000), 1_000_000);
+        assert_eq!(pace.due_nanos(38_000), 1_033_000);
+        assert_eq!(pace.due_nanos(i64::MAX), i64::MAX, "a hostile stamp does not overflow");
+    }
+
+    #[test]
+    fn the_clock_does_not_go_back() {
+        let first = now_nanos();
+        assert!(now_nanos() >= first);
+        assert_eq!(duration_from_nanos(-1), Duration::ZERO);
+    }
+}

@@ -1,0 +1,334 @@
+//! The configuration: every parameter struct under one roof, read once, checked once.
+//!
+//! Precedence: built-in < `semidense.toml` < `--set key=value`; a rig file is the camera's alone.
+//! Unknown keys are refused; an error names the place, the key, the value and what is allowed.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use toml::{Table, Value};
+
+use crate::capture::simulator::params::SimulatorParams;
+use crate::service::results::ResultsParams;
+use crate::slam::mapper::MapperParams;
+use crate::slam::parameter::{ParameterError, check_range};
+use crate::slam::tracker::TrackerParams;
+
+/// Read when it exists and no other file is named.
+pub const SYSTEM_FILE: &str = "/etc/semidense/semidense.toml";
+
+/// Everything that can be set.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Config {
+    /// First part of every topic's name: two instances run side by side.
+    pub instance: String,
+    /// Folder of sockets and locks; empty for the usual one (`SEMIDENSE_ROOT`, systemd's
+    /// `RUNTIME_DIRECTORY`, `$XDG_RUNTIME_DIR/semidense`, or one in the temporary folder).
+    pub root: String,
+    /// The capture process.
+    pub capture: CaptureConfig,
+    /// The tracker process.
+    pub tracker: TrackerConfig,
+    /// The mapper process.
+    pub mapper: MapperConfig,
+    /// Who starts and watches the three.
+    pub supervisor: SupervisorConfig,
+    /// How tracking computes.
+    pub tracking: TrackerParams,
+    /// How mapping computes.
+    pub mapping: MapperParams,
+    /// What the files of a run contain.
+    pub results: ResultsParams,
+    /// The simulated camera and its world.
+    pub simulator: SimulatorParams,
+}
+
+/// The capture process.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CaptureConfig {
+    /// Longest wait for tracker and mapper to get ready before a recording starts, seconds.
+    pub connect_timeout_s: f64,
+    /// Lockstep: longest wait for the map to take in a frame, seconds.
+    pub step_timeout_s: f64,
+}
+
+impl Default for CaptureConfig {
+    fn default() -> Self {
+        Self { connect_timeout_s: 30.0, step_timeout_s: 60.0 }
+    }
+}
+
+/// The tracker process.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TrackerConfig {
+    /// Live: time from a frame's instant to its pose, milliseconds; 0 is half the time between two
+    /// frames.
+    pub budget_ms: f64,
+}
+
+/// The mapper process.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct MapperConfig {
+    /// Threads of its pool; 0 is one for each CPU. The map does not depend on it.
+    pub threads: usize,
+}
+
+/// Who starts and watches the three.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SupervisorConfig {
+    /// Live: how often a process that died is started again before the run is given up.
+    pub max_restarts: u32,
+    /// Longest wait for a process to end before it is killed, seconds.
+    pub stop_timeout_s: f64,
+    /// Longest wait for the mapper to write its map, seconds.
+    pub save_timeout_s: f64,
+}
+
+impl Default for SupervisorConfig {
+    fn default() -> Self {
+        Self { max_restarts: 5, stop_timeout_s: 5.0, save_timeout_s: 120.0 }
+    }
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self {
+            instance: "semidense".to_owned(),
+            root: String::new(),
+            capture: CaptureConfig::default(),
+            tracker: TrackerConfig::default(),
+            mapper: MapperConfig::default(),
+            supervisor: SupervisorConfig::default(),
+            tracking: TrackerParams::default(),
+            mapping: MapperParams::default(),
+            results: ResultsParams::default(),
+            simulator: SimulatorParams::default(),
+        }
+    }
+}
+
+/// Why a configuration is refused; one line that names the place.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// The file cannot be read.
+    #[error("{path}: {source}; check --config")]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// A key or a value is not understood.
+    #[error("{place}: {reason}")]
+    Syntax {
+        /// File and line, or the option.
+        place: String,
+        /// What is wrong.
+        reason: String,
+    },
+    /// A value is out of range.
+    #[error("{place}: {source}")]
+    Value {
+        /// File, or the option.
+        place: String,
+        /// Key, value, what is allowed.
+        source: ParameterError,
+    },
+}
+
+impl Config {
+    /// Reads the file (the system's where none is named and it exists) and applies `settings`,
+    /// each `key=value`, in their order.
+    pub fn load(file: Option<&Path>, settings: &[String]) -> Result<Self, ConfigError> {
+        let system = Path::new(SYSTEM_FILE);
+        let file = file.or_else(|| system.exists().then_some(system));
+        let mut table = Table::new();
+        if let Some(path) = file {
+            let text = std::fs::read_to_string(path)
+                .map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
+            Self::from_text(&text, &path.display().to_string())?;
+            table = text.parse().unwrap_or_default();
+        }
+        let mut config = Self::from_table(&table, "the built-in configuration")?;
+        for setting in settings {
+            let place = format!("--set {setting}");
+            apply(&mut table, setting)
+                .map_err(|reason| ConfigError::Syntax { place: place.clone(), reason })?;
+            config = Self::from_table(&table, &place)?;
+        }
+        Ok(config)
+    }
+
+    /// The configuration as TOML, every key.
+    pub fn to_text(&self) -> String {
+        // Every field is a plain value: nothing that TOML cannot say.
+        toml::to_string(self).unwrap_or_default()
+    }
+
+    fn from_text(text: &str, file: &str) -> Result<Self, ConfigError> {
+        let config: Self = toml::from_str(text).map_err(|error| {
+            let before = error.span().and_then(|span| text.get(..span.start));
+            let line = before.map_or(1, |before| before.matches('\n').count() + 1);
+            ConfigError::Syntax { place: format!("{file}:{line}"), reason: one_line(&error, text) }
+        })?;
+        config
+            .validate()
+            .map_err(|source| ConfigError::Value { place: file.to_owned(), source })?;
+        Ok(config)
+    }
+
+    fn from_table(table: &Table, place: &str) -> Result<Self, ConfigError> {
+        let config: Self = table.clone().try_into().map_err(|error: toml::de::Error| {
+            ConfigError::Syntax { place: place.to_owned(), reason: one_line(&error, "") }
+        })?;
+        config
+            .validate()
+            .map_err(|source| ConfigError::Value { place: place.to_owned(), source })?;
+        Ok(config)
+    }
+
+    /// Checks every value.
+    fn validate(&self) -> Result<(), ParameterError> {
+        // Longer than an hour is a mistake of unit.
+        let seconds = 0.1..=3600.0;
+        let capture = &self.capture;
+        check_range("capture.connect_timeout_s", capture.connect_timeout_s, seconds.clone())?;
+        check_range("capture.step_timeout_s", capture.step_timeout_s, seconds.clone())?;
+        check_range("tracker.budget_ms", self.tracker.budget_ms, 0.0..=10_000.0)?;
+        check_range("mapper.threads", self.mapper.threads, 0..=256)?;
+        let supervisor = &self.supervisor;
+        check_range("supervisor.max_restarts", supervisor.max_restarts, 0..=1000)?;
+        check_range("supervisor.stop_timeout_s", supervisor.stop_timeout_s, seconds.clone())?;
+        check_range("supervisor.save_timeout_s", supervisor.save_timeout_s, seconds)?;
+        self.tracking.validate().map_err(|e| e.within("tracking"))?;
+        self.mapping.validate().map_err(|e| e.within("mapping"))?;
+        self.results.validate().map_err(|e| e.within("results"))?;
+        self.simulator.validate().map_err(|e| e.within("simulator"))
+    }
+}
+
+/// The parser's message with the line it points at, on one line.
+fn one_line(error: &toml::de::Error, text: &str) -> String {
+    let message = error.message().split_whitespace().collect::<Vec<_>>().join(" ");
+    let start = error.span().map(|span| span.start);
+    let line = start.and_then(|start| {
+        let begin = text.get(..start)?.rfind('\n').map_or(0, |newline| newline + 1);
+        text.get(begin..)?.lines().next()
+    });
+    match line.map(str::trim) {
+        Some(line) if !line.is_empty() => format!("`{line}`: {message}"),
+        _ => message,
+    }
+}
+
+/// Puts `key.of.tables=value` into `table`. A value that is no TOML is a text.
+fn apply(table: &mut Table, setting: &str) -> Result<(), String> {
+    let form = "write it as key=value, as in mapper.threads=2";
+    let (path, value) = setting.split_once('=').ok_or_else(|| form.to_owned())?;
+    let value = value.trim();
+    let value = format!("value = {value}")
+        .parse::<Table>()
+        .ok()
+        .and_then(|mut parsed| (parsed.len() == 1).then(|| parsed.remove("value"))?)
+        .unwrap_or_else(|| Value::String(value.to_owned()));
+    let mut keys: Vec<&str> = path.split('.').map(str::trim).collect();
+    let last = keys.pop().filter(|key| !key.is_empty()).ok_or_else(|| form.to_owned())?;
+    let mut table = table;
+    for key in keys {
+        let entry = table.entry(key).or_insert_with(|| Value::Table(Table::new()));
+        table = entry.as_table_mut().ok_or_else(|| format!("`{key}` has no keys below it"))?;
+    }
+    table.insert(last.to_owned(), value);
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn set(settings: &[&str]) -> Result<Config, String> {
+        let settings: Vec<String> = settings.iter().map(|s| (*s).to_owned()).collect();
+        Config::load(None, &settings).map_err(|e| e.to_string())
+    }
+
+    /// Every key with its value, dotted.
+    fn keys(table: &Table, prefix: &str, found: &mut Vec<(String, Value)>) {
+        for (key, value) in table {
+            let name = format!("{prefix}{key}");
+            match value {
+                Value::Table(inner) => keys(inner, &format!("{name}."), found),
+                value => found.push((name, value.clone())),
+            }
+        }
+        found.sort_by(|a, b| a.0.cmp(&b.0));
+    }
+
+    #[test]
+    fn the_shipped_file_lists_every_key_with_its_default() {
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/config/semidense.toml");
+        let text = std::fs::read_to_string(path).unwrap();
+        let (mut shipped, mut built_in) = (Vec::new(), Vec::new());
+        keys(&text.parse().unwrap(), "", &mut shipped);
+        keys(&Config::default().to_text().parse().unwrap(), "", &mut built_in);
+        for (key, value) in &built_in {
+            let listed = shipped.iter().find(|(k, _)| k == key).map(|(_, v)| v);
+            assert_eq!(listed, Some(value), "{key} in config/semidense.toml");
+        }
+        assert_eq!(shipped.len(), built_in.len());
+        let lines: Vec<&str> = text.lines().collect();
+        for pair in lines.windows(2) {
+            let is_entry = pair[1].contains('=') && !pair[1].starts_with('#');
+            assert!(!is_entry || pair[0].starts_with("# "), "no unit and reason: {}", pair[1]);
+        }
+    }
+
+    #[test]
+    fn later_words_win() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("semidense.toml");
+        std::fs::write(&path, "instance = \"rig2\"\n[mapper]\nthreads = 3\n").unwrap();
+        let config = Config::load(Some(&path), &["mapper.threads=1".to_owned()]).unwrap();
+        assert_eq!((config.instance.as_str(), config.mapper.threads), ("rig2", 1));
+        assert_eq!(set(&["instance=rig3"]).unwrap().instance, "rig3");
+        assert_eq!(Config::load(None, &[]).unwrap(), Config::default());
+    }
+
+    #[test]
+    fn errors_name_place_key_value_and_range() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("x.toml");
+        let load = |text: &str| {
+            std::fs::write(&path, text).unwrap();
+            Config::load(Some(&path), &[]).unwrap_err().to_string()
+        };
+        let error = load("[mapper]\n\nthread = 3\n");
+        assert!(error.contains("x.toml:3: `thread = 3`: unknown field `thread`"), "{error}");
+        let error = load("[tracker]\nbudget_ms = -1.0\n");
+        assert!(
+            error.ends_with("x.toml: tracker.budget_ms = -1: allowed is 0 to 10000"),
+            "{error}"
+        );
+        let error = load("[tracker]\nbudget_ms = nan\n");
+        assert!(error.contains("tracker.budget_ms = NaN"), "{error}");
+        assert!(load("[mapper]\nthreads = \"x\"\n").contains("x.toml:2: `threads = \"x\"`"));
+        assert!(load("[[[").contains("x.toml:1"));
+        assert_eq!(load("a = [\n\n\n").lines().count(), 1);
+        let error = Config::load(Some(Path::new("/nowhere.toml")), &[]).unwrap_err().to_string();
+        assert!(error.starts_with("/nowhere.toml: "), "{error}");
+    }
+
+    #[test]
+    fn bad_settings_are_refused() {
+        assert!(set(&["mapper.threads"]).unwrap_err().contains("key=value"));
+        assert!(set(&["mapper.thread=1"]).unwrap_err().contains("--set mapper.thread=1: unknown"));
+        assert!(set(&["mapper.threads=999"]).unwrap_err().contains("0 to 256"));
+        assert!(set(&["instance.x=1"]).is_err());
+        assert!(set(&["=1"]).is_err());
+        assert!(set(&["mapper.threads=1\nx=2"]).is_err());
+    }
+}

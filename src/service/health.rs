@@ -1,0 +1,207 @@
+//! The health of a process: state, counters and latencies, published once a second and on change.
+
+use crate::service::clock::now_nanos;
+use crate::service::replay::peak_rss_bytes;
+use crate::wire::command::{text_bytes, text_from_bytes};
+use crate::wire::message::{HISTOGRAM_BUCKETS, HealthMessage, TEXT_BYTES};
+use crate::wire::port::{Hub, OpenError, Publisher};
+use crate::wire::topic::Topic;
+
+/// Time between two reports when nothing changes.
+const REPORT_PERIOD_NANOS: i64 = 1_000_000_000;
+/// Time between two reports of progress: smooth to the eye, nothing for the machine.
+const PROGRESS_PERIOD_NANOS: i64 = 100_000_000;
+
+/// What a process is doing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ProcessState {
+    /// It opens its ports and its input.
+    Starting,
+    /// It does what must be over before the first frame.
+    Preparing,
+    /// It waits for the first frame.
+    Ready,
+    /// It works.
+    Running,
+    /// Its input has ended.
+    Finished,
+    /// It cannot go on.
+    Failed,
+}
+
+impl ProcessState {
+    const ALL: [(Self, u32, &'static str); 6] = [
+        (Self::Starting, 0, "starting"),
+        (Self::Preparing, 1, "preparing"),
+        (Self::Ready, 2, "ready"),
+        (Self::Running, 3, "running"),
+        (Self::Finished, 4, "finished"),
+        (Self::Failed, 5, "failed"),
+    ];
+
+    /// The state of a code; `None` for one that stands for nothing.
+    pub fn from_code(code: u32) -> Option<Self> {
+        Self::ALL.iter().find(|(_, c, _)| *c == code).map(|(state, ..)| *state)
+    }
+
+    /// Its code in [`HealthMessage`].
+    pub fn code(self) -> u32 {
+        self as u32
+    }
+
+    /// Its name.
+    pub fn name(self) -> &'static str {
+        Self::ALL[self as usize].2
+    }
+}
+
+/// The bucket of a latency: half octaves from 1 µs, the last holds all from 12 s.
+pub fn bucket(nanos: u64) -> usize {
+    let micros = nanos / 1000;
+    if micros == 0 {
+        return 0;
+    }
+    let octave = micros.ilog2() as usize;
+    // The upper half octave starts at 2^(octave + ½).
+    let upper = u128::from(micros) * u128::from(micros) >= 1_u128 << (2 * octave + 1);
+    (2 * octave + usize::from(upper)).min(HISTOGRAM_BUCKETS - 1)
+}
+
+/// The latency in milliseconds that `share` (0 to 1) of the counted ones do not exceed, rounded up
+/// to the end of its bucket; `None` where nothing was counted.
+pub fn percentile_ms(counts: &[u64; HISTOGRAM_BUCKETS], share: f64) -> Option<f64> {
+    let total: u64 = counts.iter().fold(0, |sum, &count| sum.saturating_add(count));
+    let wanted = (share * total as f64).ceil().max(1.0) as u64;
+    let mut sum = 0_u64;
+    let index = counts.iter().position(|&count| {
+        sum = sum.saturating_add(count);
+        sum >= wanted
+    })?;
+    Some(f64::powf(2.0, (index as f64 + 1.0) / 2.0) / 1000.0)
+}
+
+/// Why a process is in its state, as text.
+pub fn cause(message: &HealthMessage) -> String {
+    text_from_bytes(&message.cause, message.cause_bytes)
+}
+
+/// Counts, and publishes when it is time.
+#[derive(Debug)]
+pub struct Health {
+    publisher: Publisher<HealthMessage, ()>,
+    message: HealthMessage,
+    changed: bool,
+}
+
+impl Health {
+    /// Opens the topic and reports [`ProcessState::Starting`].
+    pub fn open(hub: &Hub, topic: &Topic) -> Result<Self, OpenError> {
+        let message = HealthMessage {
+            published_nanos: 0,
+            started_nanos: now_nanos(),
+            process_id: std::process::id(),
+            state: ProcessState::Starting.code(),
+            progress_done: 0,
+            progress_total: 0,
+            frames: 0,
+            dropped: 0,
+            gaps: 0,
+            refused: 0,
+            deadline_misses: 0,
+            total: 0,
+            detail: 0,
+            cause_bytes: 0,
+            peak_rss_bytes: 0,
+            latency_counts: [0; HISTOGRAM_BUCKETS],
+            cause: [0; TEXT_BYTES],
+        };
+        let publisher = hub.publisher(topic, 1)?;
+        let mut health = Self { publisher, message, changed: true };
+        health.report();
+        Ok(health)
+    }
+
+    /// The counters, to be counted up.
+    pub fn counters(&mut self) -> &mut HealthMessage {
+        &mut self.message
+    }
+
+    /// Takes down one latency.
+    pub fn count_latency(&mut self, nanos: u64) {
+        self.message.latency_counts[bucket(nanos)] += 1;
+    }
+
+    /// Enters a state; the next report goes out at once.
+    pub fn enter(&mut self, state: ProcessState, cause: &str) {
+        let (text, length) = text_bytes(cause);
+        let known = (self.message.state, self.message.cause) == (state.code(), text);
+        if known {
+            return;
+        }
+        (self.message.state, self.message.cause, self.message.cause_bytes) =
+            (state.code(), text, length);
+        self.changed = true;
+        self.report();
+    }
+
+    /// Reports how much of the preparation is done.
+    pub fn progress(&mut self, done: usize, total: usize) {
+        (self.message.progress_done, self.message.progress_total) = (done as u64, total as u64);
+        let due = now_nanos() - self.message.published_nanos >= PROGRESS_PERIOD_NANOS;
+        self.changed |= due || done == total;
+        self.report();
+    }
+
+    /// Publishes when something changed or a second is over, and serves those who came late.
+    pub fn report(&mut self) {
+        self.publisher.serve_late_joiners();
+        let now = now_nanos();
+        if !self.changed && now - self.message.published_nanos < REPORT_PERIOD_NANOS {
+            return;
+        }
+        self.message.published_nanos = now;
+        self.message.peak_rss_bytes = peak_rss_bytes().unwrap_or(0);
+        self.changed = false;
+        if let Err(error) = self.publisher.send((), &[self.message]) {
+            tracing::warn!("{error}");
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn buckets_are_half_octaves() {
+        assert_eq!(bucket(0), 0);
+        assert_eq!(bucket(1_000), 0);
+        assert_eq!(bucket(2_000), 2);
+        assert_eq!(bucket(3_000), 3, "3 µs is above 2^1.5");
+        assert_eq!(bucket(1_024_000), 20);
+        assert_eq!(bucket(u64::MAX), HISTOGRAM_BUCKETS - 1);
+    }
+
+    #[test]
+    fn percentiles_are_never_below_the_truth() {
+        let mut counts = [0; HISTOGRAM_BUCKETS];
+        assert_eq!(percentile_ms(&counts, 0.5), None);
+        for micros in 1..=1000_u64 {
+            counts[bucket(micros * 1000)] += 1;
+        }
+        for (share, truth) in [(0.5, 0.5), (0.99, 0.99), (1.0, 1.0)] {
+            let estimate = percentile_ms(&counts, share).unwrap();
+            assert!(estimate >= truth && estimate <= truth * 1.5, "{share}: {estimate}");
+        }
+        assert!(percentile_ms(&[u64::MAX; HISTOGRAM_BUCKETS], 0.5).is_some());
+    }
+
+    #[test]
+    fn states_have_their_codes() {
+        for (state, code, name) in ProcessState::ALL {
+            assert_eq!((state.code(), state.name()), (code, name));
+            assert_eq!(ProcessState::from_code(code), Some(state));
+        }
+        assert_eq!(ProcessState::from_code(6), None);
+    }
+}

@@ -1,0 +1,262 @@
+//! The whole map as a binary file, little-endian: the mapper writes it, supervisor and mapper read
+//! it. Everything read is checked: a broken file gives an error that names what is wrong.
+//!
+//! Layout: magic, then the number of keyframes (u64), then each keyframe: id, revision, sequence
+//! (u64), stamp (i64), epoch, map state, width, height (u32), pose (8 × f64), intrinsics
+//! (4 × f64), number of points (u64), points (u16, u16, 3 × f32), image bytes.
+
+use std::fs::File;
+use std::io::{self, BufReader, Read, Write};
+use std::path::{Path, PathBuf};
+
+use crate::service::atomic_file::write_atomically;
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS};
+use crate::slam::mapper::Map;
+use crate::wire::conversion::{
+    MessageError, check_points, code_from_map_state, map_state_from_code, similarity_from_message,
+    similarity_message,
+};
+
+/// First bytes of the file, with the version of the layout.
+const MAGIC: [u8; 16] = *b"semidense map 1\n";
+/// More keyframes than an hour at one each 30 ms: a broken number, not a map.
+const MAX_KEYFRAMES: u64 = 120_000;
+
+/// Why a map cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub enum MapFileError {
+    /// The file cannot be read, or ends too early.
+    #[error("{path}: {source}; the map is not usable")]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+    /// The file is something else.
+    #[error("{0}: this is no map of this version")]
+    Magic(PathBuf),
+    /// More than any map has.
+    #[error("{path}: {what} = {count} is more than any map has")]
+    TooMany {
+        /// The file.
+        path: PathBuf,
+        /// Of what.
+        what: &'static str,
+        /// How many.
+        count: u64,
+    },
+    /// A keyframe is broken.
+    #[error("{path}: keyframe {index}: {source}")]
+    Keyframe {
+        /// The file.
+        path: PathBuf,
+        /// Its place in the file.
+        index: u64,
+        /// What is wrong.
+        source: MessageError,
+    },
+    /// There is more than the map.
+    #[error("{0}: there are bytes after the map's end")]
+    Trailing(PathBuf),
+}
+
+/// Writes `map` under a temporary name and renames it to `path`.
+pub fn write_map(path: &Path, map: &Map) -> io::Result<()> {
+    write_atomically(path, |file| {
+        file.write_all(&MAGIC)?;
+        file.write_all(&(map.keyframes.len() as u64).to_le_bytes())?;
+        map.keyframes.iter().try_for_each(|keyframe| write_keyframe(file, keyframe))
+    })
+}
+
+fn write_keyframe(file: &mut impl Write, keyframe: &Keyframe) -> io::Result<()> {
+    let k = &keyframe.intrinsics;
+    for number in [keyframe.keyframe_id, keyframe.revision, keyframe.sequence] {
+        file.write_all(&number.to_le_bytes())?;
+    }
+    file.write_all(&keyframe.capture_nanos.to_le_bytes())?;
+    let state = code_from_map_state(keyframe.map_state);
+    for number in [keyframe.epoch, state, k.width as u32, k.height as u32] {
+        file.write_all(&number.to_le_bytes())?;
+    }
+    let pose = similarity_message(&keyframe.world_from_keyframe);
+    for number in pose.into_iter().chain([k.fx, k.fy, k.cx, k.cy]) {
+        file.write_all(&number.to_le_bytes())?;
+    }
+    file.write_all(&(keyframe.points.len() as u64).to_le_bytes())?;
+    for point in &keyframe.points {
+        file.write_all(&point.u.to_le_bytes())?;
+        file.write_all(&point.v.to_le_bytes())?;
+        for number in [point.inverse_depth, point.variance, point.intensity] {
+            file.write_all(&number.to_le_bytes())?;
+        }
+    }
+    file.write_all(&keyframe.image)
+}
+
+/// Reads the map that [`write_map`] wrote.
+pub fn read_map(path: &Path) -> Result<Map, MapFileError> {
+    let mut reader = Reader::open(path)?;
+    if reader.bytes::<16>()? != MAGIC {
+        return Err(MapFileError::Magic(path.to_owned()));
+    }
+    let count = reader.count("keyframes", MAX_KEYFRAMES)?;
+    let mut map = Map::default();
+    for index in 0..count {
+        map.keyframes.push(reader.keyframe(index)?);
+    }
+    match reader.file.read(&mut [0]) {
+        Ok(0) => Ok(map),
+        _ => Err(MapFileError::Trailing(path.to_owned())),
+    }
+}
+
+/// Reads numbers and says where it failed.
+struct Reader<'a> {
+    file: BufReader<File>,
+    path: &'a Path,
+}
+
+impl<'a> Reader<'a> {
+    fn open(path: &'a Path) -> Result<Self, MapFileError> {
+        let file = File::open(path)
+            .map_err(|source| MapFileError::Read { path: path.to_owned(), source })?;
+        Ok(Self { file: BufReader::new(file), path })
+    }
+
+    fn bytes<const N: usize>(&mut self) -> Result<[u8; N], MapFileError> {
+        let mut bytes = [0; N];
+        self.file
+            .read_exact(&mut bytes)
+            .map_err(|source| MapFileError::Read { path: self.path.to_owned(), source })?;
+        Ok(bytes)
+    }
+
+    fn u64(&mut self) -> Result<u64, MapFileError> {
+        Ok(u64::from_le_bytes(self.bytes()?))
+    }
+
+    fn u32(&mut self) -> Result<u32, MapFileError> {
+        Ok(u32::from_le_bytes(self.bytes()?))
+    }
+
+    fn f64(&mut self) -> Result<f64, MapFileError> {
+        Ok(f64::from_le_bytes(self.bytes()?))
+    }
+
+    fn f32(&mut self) -> Result<f32, MapFileError> {
+        Ok(f32::from_le_bytes(self.bytes()?))
+    }
+
+    fn count(&mut self, what: &'static str, most: u64) -> Result<u64, MapFileError> {
+        let count = self.u64()?;
+        if count <= most {
+            return Ok(count);
+        }
+        Err(MapFileError::TooMany { path: self.path.to_owned(), what, count })
+    }
+
+    fn keyframe(&mut self, index: u64) -> Result<Keyframe, MapFileError> {
+        let path = self.path.to_owned();
+        let wrong = move |source| MapFileError::Keyframe { path: path.clone(), index, source };
+        let (keyframe_id, revision, sequence) = (self.u64()?, self.u64()?, self.u64()?);
+        let capture_nanos = i64::from_le_bytes(self.bytes()?);
+        let (epoch, state, width, height) = (self.u32()?, self.u32()?, self.u32()?, self.u32()?);
+        let mut numbers = [0.0; 12];
+        for number in &mut numbers {
+            *number = self.f64()?;
+        }
+        let [pose @ .., fx, fy, cx, cy] = numbers;
+        let intrinsics =
+            Intrinsics { fx, fy, cx, cy, width: width as usize, height: height as usize };
+        if !intrinsics.is_valid() {
+            return Err(wrong(MessageError::InvalidIntrinsics { width, height }));
+        }
+        let num_points = self.count("points", MAX_KEYFRAME_POINTS as u64)?;
+        let points = (0..num_points).map(|_| self.point()).collect::<Result<Vec<_>, _>>()?;
+        check_points(&points, &intrinsics).map_err(&wrong)?;
+        let mut image = vec![0; intrinsics.width * intrinsics.height];
+        self.file
+            .read_exact(&mut image)
+            .map_err(|source| MapFileError::Read { path: self.path.to_owned(), source })?;
+        Ok(Keyframe {
+            keyframe_id,
+            epoch,
+            revision,
+            sequence,
+            capture_nanos,
+            map_state: map_state_from_code(state).map_err(&wrong)?,
+            world_from_keyframe: similarity_from_message(&pose, "world_from_keyframe")
+                .map_err(&wrong)?,
+            intrinsics,
+            image,
+            points,
+        })
+    }
+
+    fn point(&mut self) -> Result<DepthPoint, MapFileError> {
+        let u = u16::from_le_bytes(self.bytes()?);
+        let v = u16::from_le_bytes(self.bytes()?);
+        let (inverse_depth, variance, intensity) = (self.f32()?, self.f32()?, self.f32()?);
+        Ok(DepthPoint { u, v, inverse_depth, variance, intensity })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::geometry::se3::SE3;
+    use crate::slam::geometry::sim3::Sim3;
+    use crate::slam::keyframe::MapState;
+    use nalgebra::Vector6;
+
+    fn map() -> Map {
+        let rigid = SE3::exp(&Vector6::new(0.3, -0.2, 0.1, 0.4, 0.5, -0.6));
+        let point =
+            DepthPoint { u: 3, v: 15, inverse_depth: 0.7, variance: 0.01, intensity: 128.5 };
+        let keyframe = Keyframe {
+            keyframe_id: 7,
+            epoch: 1,
+            revision: 42,
+            sequence: 99,
+            capture_nanos: -5,
+            map_state: MapState::Established,
+            world_from_keyframe: Sim3::new(rigid, 1.7),
+            intrinsics: Intrinsics { fx: 20.0, fy: 21.0, cx: 8.0, cy: 7.5, width: 17, height: 16 },
+            image: (0..17 * 16).map(|i| (i % 251) as u8).collect(),
+            points: vec![point; 5],
+        };
+        Map { keyframes: vec![keyframe.clone(), Keyframe { keyframe_id: 8, ..keyframe }] }
+    }
+
+    #[test]
+    fn a_map_survives_the_file_bit_for_bit() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("map.bin");
+        write_map(&path, &map()).unwrap();
+        assert_eq!(read_map(&path).unwrap().keyframes, map().keyframes);
+    }
+
+    #[test]
+    fn every_cut_and_every_wrong_byte_is_survived() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("map.bin");
+        write_map(&path, &map()).unwrap();
+        let whole = std::fs::read(&path).unwrap();
+        for length in 0..whole.len() {
+            std::fs::write(&path, &whole[..length]).unwrap();
+            let error = read_map(&path).unwrap_err().to_string();
+            assert!(error.contains("map.bin") && error.lines().count() == 1, "{error}");
+        }
+        for index in 0..300 {
+            let mut broken = whole.clone();
+            broken[index] ^= 0xff;
+            std::fs::write(&path, &broken).unwrap();
+            let _ = read_map(&path); // an error or another value, never a panic
+        }
+        std::fs::write(&path, [whole, vec![0]].concat()).unwrap();
+        assert!(matches!(read_map(&path), Err(MapFileError::Trailing(_))));
+    }
+}

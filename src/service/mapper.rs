@@ -1,0 +1,294 @@
+//! The mapper process: pairs frames with their poses, lets the map take them in, publishes it.
+
+use std::path::Path;
+use std::time::Duration;
+
+use crate::service::clock::now_nanos;
+use crate::service::config::Config;
+use crate::service::health::{Health, ProcessState};
+use crate::service::map_file::write_map;
+use crate::service::pairing::Pairing;
+use crate::service::shutdown::Shutdown;
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::keyframe::{DepthPoint, Keyframe, KeyframePose, MAX_KEYFRAME_POINTS};
+use crate::slam::mapper::{Map, Mapper, StepOutcome};
+use crate::slam::parameter::ParameterError;
+use crate::slam::pose::{NO_KEYFRAME, PoseEstimate};
+use crate::wire::command::{Command, CommandError, CommandServer};
+use crate::wire::conversion::{
+    code_from_map_state, frame_from_message, keyframe_header, keyframe_image_header,
+    keyframe_pose_message, pose_from_message,
+};
+use crate::wire::message::{
+    FrameHeader, GraphHeader, KeyframeHeader, KeyframeImageHeader, KeyframePoseMessage,
+    PoseMessage, StepMessage,
+};
+use crate::wire::place::{Claim, Place, PlaceError};
+use crate::wire::port::{
+    Access, Hub, OpenError, Publisher, ReceiveError, Received, SendError, Subscriber, WaitError,
+    wait,
+};
+use crate::wire::topic::{
+    FRAME, GRAPH, KEYFRAME, KEYFRAME_IMAGE, MAPPER_HEALTH, MAX_GRAPH_KEYFRAMES, POSE, STEP,
+};
+
+/// Longest sleep without a look at signals and health.
+const WAKE_PERIOD: Duration = Duration::from_millis(100);
+
+/// Why the mapper ends early.
+#[derive(Debug, thiserror::Error)]
+pub enum MapperError {
+    /// The place is not right, or taken.
+    #[error(transparent)]
+    Place(#[from] PlaceError),
+    /// A topic cannot be opened.
+    #[error(transparent)]
+    Open(#[from] OpenError),
+    /// Frames or poses cannot be received.
+    #[error(transparent)]
+    Receive(#[from] ReceiveError),
+    /// The map cannot be sent.
+    #[error(transparent)]
+    Send(#[from] SendError),
+    /// A command cannot be answered.
+    #[error(transparent)]
+    Command(#[from] CommandError),
+    /// Waiting failed.
+    #[error(transparent)]
+    Wait(#[from] WaitError),
+    /// The configuration does not fit the frames.
+    #[error("mapping: {0}")]
+    Parameter(#[from] ParameterError),
+    /// No threads.
+    #[error("the pool of {threads} threads cannot be made ({reason}); set mapper.threads")]
+    Pool {
+        /// How many were wanted.
+        threads: usize,
+        /// What the system says.
+        reason: String,
+    },
+}
+
+/// Runs the process until the signal.
+pub fn run(config: &Config, shutdown: &Shutdown) -> Result<(), MapperError> {
+    let mut shell = Shell::prepare(config)?;
+    shell.health.enter(ProcessState::Ready, "");
+    let outcome = shell.map_until(shutdown);
+    match &outcome {
+        Ok(()) => shell.health.enter(ProcessState::Finished, "stopped"),
+        Err(error) => shell.health.enter(ProcessState::Failed, &error.to_string()),
+    }
+    outcome
+}
+
+type Frame = Received<u8, FrameHeader>;
+
+struct Shell<'a> {
+    config: &'a Config,
+    frames: Subscriber<u8, FrameHeader>,
+    poses: Subscriber<PoseMessage, ()>,
+    pairing: Pairing<Frame>,
+    commands: CommandServer,
+    output: Output,
+    health: Health,
+    mapper: Option<(Intrinsics, Mapper)>,
+    pool: rayon::ThreadPool,
+    hub: Hub,
+    _claim: Claim,
+}
+
+impl<'a> Shell<'a> {
+    fn prepare(config: &'a Config) -> Result<Self, MapperError> {
+        let place = Place::new(&config.instance, &config.root)?;
+        let claim = place.claim("mapper")?;
+        let hub = Hub::join(&place, "mapper", Access::Member)?;
+        let threads = config.mapper.threads;
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .thread_name(|index| format!("semidense-map-{index}"))
+            .build()
+            .map_err(|e| MapperError::Pool { threads, reason: e.to_string() })?;
+        Ok(Self {
+            config,
+            frames: hub.subscriber(&FRAME)?,
+            poses: hub.subscriber(&POSE)?,
+            // One place less than may be borrowed: the next is received before the oldest goes.
+            pairing: Pairing::new(FRAME.borrowed - 1),
+            commands: CommandServer::open(&hub)?,
+            output: Output::open(&hub)?,
+            health: Health::open(&hub, &MAPPER_HEALTH)?,
+            mapper: None,
+            pool,
+            hub,
+            _claim: claim,
+        })
+    }
+
+    fn map_until(&mut self, shutdown: &Shutdown) -> Result<(), MapperError> {
+        while !shutdown.is_requested() {
+            let events = [self.frames.events(), self.poses.events(), self.commands.events()];
+            wait(&events, Some(shutdown.descriptor()), WAKE_PERIOD)?;
+            self.output.serve_late_joiners();
+            while let Some((frame, pose)) = self.next_pair()? {
+                self.step(&frame, &pose)?;
+                if shutdown.is_requested() {
+                    return Ok(());
+                }
+            }
+            self.answer_commands()?;
+            self.health.report();
+        }
+        Ok(())
+    }
+
+    /// The oldest frame with its pose, of those that are still here.
+    fn next_pair(&mut self) -> Result<Option<(Frame, PoseEstimate)>, MapperError> {
+        while let Some(frame) = self.frames.receive()? {
+            self.pairing.push_frame(frame.header().sequence, frame);
+        }
+        while let Some(message) = self.poses.receive()? {
+            match message.payload().first().map(pose_from_message) {
+                Some(Ok(pose)) => self.pairing.push_pose(pose),
+                Some(Err(error)) => {
+                    self.health.counters().refused += 1;
+                    tracing::warn!("tracker/pose: {error}");
+                }
+                None => self.health.counters().refused += 1,
+            }
+        }
+        Ok(self.pairing.take())
+    }
+
+    /// One frame into the map, and what changed out to the others.
+    fn step(&mut self, received: &Frame, pose: &PoseEstimate) -> Result<(), MapperError> {
+        let (frame, intrinsics) = match frame_from_message(received.header(), received.payload()) {
+            Ok(frame) => frame,
+            Err(error) => {
+                self.health.counters().refused += 1;
+                tracing::warn!("capture/frame: {error}");
+                return Ok(());
+            }
+        };
+        let known = self.mapper.take().filter(|(of, _)| *of == intrinsics);
+        let (_, mapper) = match known {
+            Some(mapper) => self.mapper.insert(mapper),
+            None => {
+                self.output.open_images(&self.hub, &intrinsics)?;
+                let mapper = Mapper::new(intrinsics, self.config.mapping.clone())?;
+                self.mapper.insert((intrinsics, mapper))
+            }
+        };
+        let begin = now_nanos();
+        let outcome = self.pool.install(|| mapper.step(&frame, pose, None));
+        let step_nanos = u64::try_from(now_nanos() - begin).unwrap_or(0);
+        self.output.publish(mapper, &outcome, frame.sequence, step_nanos)?;
+        self.health.enter(ProcessState::Running, "");
+        let counters = self.health.counters();
+        counters.frames += 1;
+        counters.dropped = self.pairing.dropped();
+        counters.total = mapper.map().keyframes.len() as u64;
+        counters.detail = mapper.keyframe().map_or(0, |k| code_from_map_state(k.map_state));
+        self.health.count_latency(step_nanos);
+        self.health.report();
+        Ok(())
+    }
+
+    fn answer_commands(&mut self) -> Result<(), MapperError> {
+        let mapper = self.mapper.as_ref().map(|(_, mapper)| mapper);
+        Ok(self.commands.answer(|command| match command {
+            Command::SaveMap(path) => save_map(mapper, &path),
+        })?)
+    }
+}
+
+fn save_map(mapper: Option<&Mapper>, path: &Path) -> Result<(), String> {
+    let empty = Map::default();
+    let map = mapper.map_or(&empty, Mapper::map);
+    write_map(path, map).map_err(|e| format!("{}: {e}", path.display()))
+}
+
+/// Everything that the mapper publishes.
+struct Output {
+    steps: Publisher<StepMessage, ()>,
+    depths: Publisher<DepthPoint, KeyframeHeader>,
+    graphs: Publisher<KeyframePoseMessage, GraphHeader>,
+    /// Open from the first frame on: it must know the size of the images.
+    images: Option<Publisher<u8, KeyframeImageHeader>>,
+}
+
+impl Output {
+    fn open(hub: &Hub) -> Result<Self, OpenError> {
+        Ok(Self {
+            steps: hub.publisher(&STEP, 1)?,
+            depths: hub.publisher(&KEYFRAME, MAX_KEYFRAME_POINTS)?,
+            graphs: hub.publisher(&GRAPH, MAX_GRAPH_KEYFRAMES)?,
+            images: None,
+        })
+    }
+
+    fn open_images(&mut self, hub: &Hub, intrinsics: &Intrinsics) -> Result<(), OpenError> {
+        let pixels = intrinsics.width * intrinsics.height;
+        self.images = Some(hub.publisher(&KEYFRAME_IMAGE, pixels)?);
+        Ok(())
+    }
+
+    fn serve_late_joiners(&self) {
+        self.steps.serve_late_joiners();
+        self.depths.serve_late_joiners();
+        self.graphs.serve_late_joiners();
+        self.images.iter().for_each(Publisher::serve_late_joiners);
+    }
+
+    /// Image before depth: who sees the depth has the image. The step last: who sees it has all.
+    fn publish(
+        &self,
+        mapper: &Mapper,
+        outcome: &StepOutcome,
+        sequence: u64,
+        step_nanos: u64,
+    ) -> Result<(), SendError> {
+        let keyframe = mapper.keyframe();
+        if let Some(keyframe) = keyframe {
+            if outcome.keyframe_created {
+                self.publish_image(keyframe)?;
+            }
+            if outcome.keyframe_created || outcome.keyframe_changed {
+                self.depths.send(keyframe_header(keyframe), &keyframe.points)?;
+            }
+            if outcome.graph_changed {
+                self.publish_graph(mapper.map(), keyframe)?;
+            }
+        }
+        let step = StepMessage {
+            sequence,
+            keyframe_id: keyframe.map_or(NO_KEYFRAME, |k| k.keyframe_id),
+            revision: keyframe.map_or(0, |k| k.revision),
+            step_nanos,
+            keyframes: mapper.map().keyframes.len() as u64,
+            points: keyframe.map_or(0, |k| k.points.len() as u64),
+        };
+        self.steps.send((), &[step])
+    }
+
+    fn publish_image(&self, keyframe: &Keyframe) -> Result<(), SendError> {
+        match &self.images {
+            Some(images) => images.send(keyframe_image_header(keyframe), &keyframe.image),
+            None => Ok(()),
+        }
+    }
+
+    /// The newest keyframes where there are more than a message holds.
+    fn publish_graph(&self, map: &Map, newest: &Keyframe) -> Result<(), SendError> {
+        let first = map.keyframes.len().saturating_sub(MAX_GRAPH_KEYFRAMES);
+        let poses: Vec<KeyframePoseMessage> = map.keyframes[first..]
+            .iter()
+            .map(|keyframe| {
+                let (keyframe_id, world_from_keyframe) =
+                    (keyframe.keyframe_id, keyframe.world_from_keyframe);
+                keyframe_pose_message(&KeyframePose { keyframe_id, world_from_keyframe })
+            })
+            .collect();
+        let header = GraphHeader { revision: newest.revision, epoch: newest.epoch, reserved: 0 };
+        self.graphs.send(header, &poses)
+    }
+}

@@ -1,0 +1,153 @@
+//! Brings frames and their poses together by sequence.
+
+use std::collections::VecDeque;
+
+use crate::slam::pose::PoseEstimate;
+
+/// Poses kept while their frame is missing: half a second at 60 Hz, far more than a frame is late.
+const MAX_POSES: usize = 32;
+
+/// Frames and poses that wait for each other. `F` is a frame as it lies in shared memory.
+#[derive(Debug)]
+pub struct Pairing<F> {
+    frames: VecDeque<(u64, F)>,
+    poses: VecDeque<PoseEstimate>,
+    max_frames: usize,
+    dropped: u64,
+}
+
+impl<F> Pairing<F> {
+    /// Keeps at most `max_frames` frames: they are borrowed from shared memory.
+    pub fn new(max_frames: usize) -> Self {
+        let (frames, poses) = (VecDeque::new(), VecDeque::new());
+        Self { frames, poses, max_frames, dropped: 0 }
+    }
+
+    /// A frame came; the oldest goes where there are too many, all where the source starts again.
+    pub fn push_frame(&mut self, sequence: u64, frame: F) {
+        if self.frames.back().is_some_and(|(last, _)| *last >= sequence) {
+            self.dropped += self.frames.len() as u64;
+            self.frames.clear();
+        }
+        if self.frames.len() == self.max_frames {
+            self.frames.pop_front();
+            self.dropped += 1;
+        }
+        self.frames.push_back((sequence, frame));
+    }
+
+    /// A pose came; older ones go where the source starts again.
+    pub fn push_pose(&mut self, pose: PoseEstimate) {
+        if self.poses.back().is_some_and(|last| last.sequence >= pose.sequence) {
+            self.poses.clear();
+        }
+        if self.poses.len() == MAX_POSES {
+            self.poses.pop_front();
+        }
+        self.poses.push_back(pose);
+    }
+
+    /// The oldest pair. Frames before it will get no pose any more and are let go.
+    pub fn take(&mut self) -> Option<(F, PoseEstimate)> {
+        while let Some(pose) = self.poses.front() {
+            let (oldest, _) = self.frames.front()?;
+            let newest = self.frames.back().map_or(*oldest, |(sequence, _)| *sequence);
+            if let Some(index) = self.frames.iter().position(|(s, _)| *s == pose.sequence) {
+                self.frames.drain(..index);
+                self.dropped += index as u64;
+                let (_, frame) = self.frames.pop_front()?;
+                return Some((frame, self.poses.pop_front()?));
+            }
+            if pose.sequence > newest {
+                return None; // its frame is on the way
+            }
+            self.poses.pop_front();
+        }
+        None
+    }
+
+    /// Frames that were let go without a pose since the start.
+    pub fn dropped(&self) -> u64 {
+        self.dropped
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::geometry::se3::SE3;
+    use crate::slam::pose::{Brightness, NO_KEYFRAME, Quality, TrackingState};
+
+    fn pose(sequence: u64) -> PoseEstimate {
+        PoseEstimate {
+            sequence,
+            capture_nanos: 0,
+            epoch: 0,
+            revision: 0,
+            keyframe_id: NO_KEYFRAME,
+            state: TrackingState::Initializing,
+            world_from_camera: SE3::identity(),
+            keyframe_from_camera: SE3::identity(),
+            covariance: [0.0; 21],
+            brightness: Brightness::default(),
+            quality: Quality::default(),
+            proposes_keyframe: false,
+        }
+    }
+
+    fn take(pairing: &mut Pairing<char>) -> Option<(char, u64)> {
+        pairing.take().map(|(frame, pose)| (frame, pose.sequence))
+    }
+
+    #[test]
+    fn either_may_come_first() {
+        let mut pairing = Pairing::new(3);
+        pairing.push_pose(pose(0));
+        assert_eq!(take(&mut pairing), None);
+        pairing.push_frame(0, 'a');
+        assert_eq!(take(&mut pairing), Some(('a', 0)));
+        pairing.push_frame(1, 'b');
+        assert_eq!(take(&mut pairing), None);
+        pairing.push_pose(pose(1));
+        assert_eq!(take(&mut pairing), Some(('b', 1)));
+        assert_eq!(pairing.dropped(), 0);
+    }
+
+    #[test]
+    fn what_the_tracker_skipped_is_let_go() {
+        let mut pairing = Pairing::new(3);
+        for (sequence, frame) in [(0, 'a'), (1, 'b'), (2, 'c')] {
+            pairing.push_frame(sequence, frame);
+        }
+        pairing.push_pose(pose(2));
+        assert_eq!(take(&mut pairing), Some(('c', 2)));
+        assert_eq!(pairing.dropped(), 2);
+    }
+
+    #[test]
+    fn a_pose_without_its_frame_does_not_block() {
+        let mut pairing = Pairing::new(2);
+        for (sequence, frame) in [(0, 'a'), (1, 'b'), (2, 'c')] {
+            pairing.push_frame(sequence, frame);
+        }
+        for sequence in 0..=3 {
+            pairing.push_pose(pose(sequence));
+        }
+        assert_eq!(take(&mut pairing), Some(('b', 1)));
+        assert_eq!(take(&mut pairing), Some(('c', 2)));
+        assert_eq!(take(&mut pairing), None, "frame 3 is on the way");
+        pairing.push_frame(3, 'd');
+        assert_eq!(take(&mut pairing), Some(('d', 3)));
+    }
+
+    #[test]
+    fn a_source_that_starts_again_does_not_block() {
+        let mut pairing = Pairing::new(3);
+        pairing.push_pose(pose(500));
+        pairing.push_frame(501, 'x');
+        pairing.push_frame(0, 'a');
+        pairing.push_pose(pose(0));
+        assert_eq!(take(&mut pairing), Some(('a', 0)));
+        assert_eq!(pairing.dropped(), 1);
+    }
+}

@@ -1,0 +1,57 @@
+//! What a process knows of the others: their last health.
+
+use crate::service::health::ProcessState;
+use crate::wire::message::HealthMessage;
+use crate::wire::port::{Hub, OpenError, ReceiveError, Subscriber};
+use crate::wire::topic::{CAPTURE_HEALTH, MAPPER_HEALTH, TRACKER_HEALTH, Topic};
+
+/// The health topics of all processes, in the order of the pipeline.
+pub const HEALTH_TOPICS: [Topic; 3] = [CAPTURE_HEALTH, TRACKER_HEALTH, MAPPER_HEALTH];
+
+/// Another process as seen through its health topic.
+#[derive(Debug)]
+pub struct Peer {
+    topic: Topic,
+    subscriber: Subscriber<HealthMessage, ()>,
+    last: Option<HealthMessage>,
+}
+
+impl Peer {
+    /// Listens to `topic`; what was said last comes too.
+    pub fn open(hub: &Hub, topic: &Topic) -> Result<Self, OpenError> {
+        Ok(Self { topic: *topic, subscriber: hub.subscriber(topic)?, last: None })
+    }
+
+    /// Name of the process.
+    pub fn name(&self) -> &'static str {
+        self.topic.owner
+    }
+
+    /// Takes in what came, and gives the last word.
+    pub fn update(&mut self) -> Result<Option<&HealthMessage>, ReceiveError> {
+        while let Some(message) = self.subscriber.receive()? {
+            self.last = message.payload().first().copied().or(self.last);
+        }
+        Ok(self.last.as_ref())
+    }
+
+    /// The last word.
+    pub fn last(&self) -> Option<&HealthMessage> {
+        self.last.as_ref()
+    }
+
+    /// Forgets it: the process was started again.
+    pub fn forget(&mut self) {
+        self.last = None;
+    }
+
+    /// Its state by the last word.
+    pub fn state(&self) -> Option<ProcessState> {
+        ProcessState::from_code(self.last.as_ref()?.state)
+    }
+
+    /// Whether frames can be sent to it.
+    pub fn is_ready(&self) -> bool {
+        matches!(self.state(), Some(ProcessState::Ready | ProcessState::Running))
+    }
+}

@@ -1,0 +1,255 @@
+//! The tracker process: waits for frames, adopts keyframes, publishes one pose for each frame.
+
+use std::time::Duration;
+
+use crate::service::budget::IterationCosts;
+use crate::service::clock::now_nanos;
+use crate::service::config::Config;
+use crate::service::health::{Health, ProcessState};
+use crate::service::mode::Mode;
+use crate::service::reference_feed::ReferenceFeed;
+use crate::service::shutdown::Shutdown;
+use crate::slam::frame::FrameView;
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::parameter::ParameterError;
+use crate::slam::pose::{LostReason, PoseEstimate, TrackingState};
+use crate::slam::tracker::Tracker;
+use crate::wire::conversion::{
+    PoseTiming, codes_from_state, frame_from_message, pose_from_message, pose_message,
+};
+use crate::wire::keyframe_inbox::InboxError;
+use crate::wire::message::{FrameHeader, PoseMessage};
+use crate::wire::place::{Claim, Place, PlaceError};
+use crate::wire::port::{
+    Access, Hub, OpenError, Publisher, ReceiveError, Received, SendError, Subscriber, WaitError,
+    wait,
+};
+use crate::wire::topic::{FRAME, POSE, TRACKER_HEALTH};
+
+/// Longest sleep without a look at signals and health.
+const WAKE_PERIOD: Duration = Duration::from_millis(100);
+/// Budget until two frames have told their distance: half of 30 Hz.
+const FIRST_BUDGET_NANOS: i64 = 16_000_000;
+
+/// Why the tracker ends early.
+#[derive(Debug, thiserror::Error)]
+pub enum TrackerError {
+    /// The place is not right, or taken.
+    #[error(transparent)]
+    Place(#[from] PlaceError),
+    /// A topic cannot be opened.
+    #[error(transparent)]
+    Open(#[from] OpenError),
+    /// Frames cannot be received.
+    #[error(transparent)]
+    Receive(#[from] ReceiveError),
+    /// A pose cannot be sent.
+    #[error(transparent)]
+    Send(#[from] SendError),
+    /// Keyframes cannot be received.
+    #[error(transparent)]
+    Inbox(#[from] InboxError),
+    /// Waiting failed.
+    #[error(transparent)]
+    Wait(#[from] WaitError),
+    /// The configuration does not fit the frames.
+    #[error("tracking: {0}")]
+    Parameter(#[from] ParameterError),
+    /// The thread that prepares keyframes cannot be started.
+    #[error("the thread that prepares keyframes cannot be started ({0})")]
+    Thread(std::io::Error),
+}
+
+/// Runs the process until the signal.
+pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), TrackerError> {
+    let mut shell = Shell::prepare(config, mode)?;
+    shell.health.enter(ProcessState::Ready, "");
+    let outcome = shell.track_until(shutdown);
+    match &outcome {
+        Ok(()) => shell.health.enter(ProcessState::Finished, "stopped"),
+        Err(error) => shell.health.enter(ProcessState::Failed, &error.to_string()),
+    }
+    outcome
+}
+
+struct Shell<'a> {
+    config: &'a Config,
+    mode: Mode,
+    frames: Subscriber<u8, FrameHeader>,
+    poses: Publisher<PoseMessage, ()>,
+    references: ReferenceFeed,
+    health: Health,
+    tracker: Option<(Intrinsics, Tracker)>,
+    costs: IterationCosts,
+    last_frame: Option<FrameHeader>,
+    period_nanos: i64,
+    _hub: Hub,
+    _claim: Claim,
+}
+
+impl<'a> Shell<'a> {
+    fn prepare(config: &'a Config, mode: Mode) -> Result<Self, TrackerError> {
+        let place = Place::new(&config.instance, &config.root)?;
+        let claim = place.claim("tracker")?;
+        let hub = Hub::join(&place, "tracker", Access::Member)?;
+        let params = &config.tracking.reference;
+        let references = match mode {
+            Mode::Lockstep => ReferenceFeed::synchronous(&hub, params)?,
+            Mode::Live => ReferenceFeed::threaded(&place, params).map_err(TrackerError::Thread)?,
+        };
+        Ok(Self {
+            config,
+            mode,
+            frames: hub.subscriber(&FRAME)?,
+            poses: hub.publisher(&POSE, 1)?,
+            references,
+            health: Health::open(&hub, &TRACKER_HEALTH)?,
+            tracker: None,
+            costs: IterationCosts::default(),
+            last_frame: None,
+            period_nanos: 2 * FIRST_BUDGET_NANOS,
+            _hub: hub,
+            _claim: claim,
+        })
+    }
+
+    fn track_until(&mut self, shutdown: &Shutdown) -> Result<(), TrackerError> {
+        while !shutdown.is_requested() {
+            wait(&[self.frames.events()], Some(shutdown.descriptor()), WAKE_PERIOD)?;
+            self.poses.serve_late_joiners();
+            while let Some(frame) = self.next_frame()? {
+                self.step(&frame)?;
+            }
+            self.health.report();
+        }
+        Ok(())
+    }
+
+    /// The oldest frame in lockstep, the newest live.
+    fn next_frame(&self) -> Result<Option<Received<u8, FrameHeader>>, ReceiveError> {
+        match self.mode {
+            Mode::Lockstep => self.frames.receive(),
+            Mode::Live => self.frames.newest(),
+        }
+    }
+
+    /// One frame: adopt, track, publish.
+    fn step(&mut self, received: &Received<u8, FrameHeader>) -> Result<(), TrackerError> {
+        let arrival_nanos = now_nanos();
+        let header = *received.header();
+        let (frame, intrinsics) = match frame_from_message(&header, received.payload()) {
+            Ok(frame) => frame,
+            Err(error) => {
+                self.health.counters().refused += 1;
+                tracing::warn!("capture/frame: {error}");
+                return Ok(());
+            }
+        };
+        self.count_gap(&header);
+        let deadline_nanos = self.deadline_nanos(arrival_nanos);
+        let estimate = self.track(&frame, intrinsics, deadline_nanos)?;
+        let track_nanos = now_nanos().saturating_sub(arrival_nanos);
+        self.publish(&estimate, &header, track_nanos, deadline_nanos)
+    }
+
+    fn track(
+        &mut self,
+        frame: &FrameView<'_>,
+        intrinsics: Intrinsics,
+        deadline_nanos: Option<i64>,
+    ) -> Result<PoseEstimate, TrackerError> {
+        let known = self.tracker.take().filter(|(of, _)| *of == intrinsics);
+        let (_, tracker) = match known {
+            Some(tracker) => self.tracker.insert(tracker),
+            None => {
+                let tracker = Tracker::new(intrinsics, self.config.tracking.clone())?;
+                self.tracker.insert((intrinsics, tracker))
+            }
+        };
+        if let Some(reference) = self.references.newest()?
+            && let Some(used) = tracker.adopt(reference)
+        {
+            self.references.give_back(used);
+        }
+        Ok(match deadline_nanos {
+            None => tracker.track(frame, &mut |_| true),
+            Some(deadline) => tracker.track(frame, &mut self.costs.until(deadline)),
+        })
+    }
+
+    /// Until when the pose of a frame that has just arrived is due; `None` in lockstep.
+    fn deadline_nanos(&self, arrival_nanos: i64) -> Option<i64> {
+        let budget_nanos = match self.config.tracker.budget_ms {
+            0.0 => self.period_nanos / 2,
+            budget_ms => (budget_ms * 1e6) as i64,
+        };
+        (self.mode == Mode::Live).then(|| arrival_nanos.saturating_add(budget_nanos))
+    }
+
+    /// Learns the frame period, and counts what was missed.
+    fn count_gap(&mut self, header: &FrameHeader) {
+        let last = self.last_frame.replace(*header);
+        let Some(last) = last.filter(|last| last.sequence < header.sequence) else { return };
+        let frames = header.sequence - last.sequence;
+        let elapsed = header.capture_nanos.saturating_sub(last.capture_nanos);
+        if elapsed > 0 {
+            self.period_nanos = elapsed / i64::try_from(frames).unwrap_or(i64::MAX);
+        }
+        self.health.counters().dropped += frames - 1;
+    }
+
+    fn publish(
+        &mut self,
+        estimate: &PoseEstimate,
+        header: &FrameHeader,
+        track_nanos: i64,
+        deadline_nanos: Option<i64>,
+    ) -> Result<(), TrackerError> {
+        let published_nanos = now_nanos();
+        let positive = |nanos: i64| u64::try_from(nanos).unwrap_or(0);
+        let timing = PoseTiming {
+            published_nanos,
+            latency_nanos: positive(published_nanos.saturating_sub(header.clock_nanos)),
+            track_nanos: positive(track_nanos),
+        };
+        let mut message = pose_message(estimate, &timing);
+        if let Err(error) = pose_from_message(&message) {
+            // Nothing non-finite leaves this process.
+            tracing::error!("frame {}: the tracker's pose is refused: {error}", header.sequence);
+            message = pose_message(&unclaimed(estimate), &timing);
+        }
+        self.poses.send((), &[message])?;
+        self.health.enter(ProcessState::Running, "");
+        self.health.count_latency(timing.latency_nanos);
+        let counters = self.health.counters();
+        counters.frames += 1;
+        counters.detail = codes_from_state(estimate.state).0;
+        let late = deadline_nanos.is_some_and(|deadline| published_nanos > deadline);
+        counters.deadline_misses += u64::from(late);
+        self.health.report();
+        Ok(())
+    }
+}
+
+/// The same frame, lost, without a number that could be broken.
+fn unclaimed(estimate: &PoseEstimate) -> PoseEstimate {
+    /// A variance that says "unknown": large and finite.
+    const UNKNOWN_VARIANCE: f64 = 1e6;
+    let identity = crate::slam::geometry::se3::SE3::identity();
+    let mut covariance = [0.0; 21];
+    let mut diagonal = 0;
+    for row in 0..6 {
+        covariance[diagonal] = UNKNOWN_VARIANCE;
+        diagonal += 6 - row;
+    }
+    PoseEstimate {
+        state: TrackingState::Lost(LostReason::Diverged),
+        world_from_camera: identity,
+        keyframe_from_camera: identity,
+        covariance,
+        brightness: Default::default(),
+        quality: Default::default(),
+        proposes_keyframe: false,
+        ..*estimate
+    }
+}

@@ -1,0 +1,229 @@
+//! Questions to the mapper and its answers: never on the frame path.
+
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use iceoryx2::port::client::Client;
+use iceoryx2::port::server::Server;
+use iceoryx2::prelude::*;
+
+use crate::wire::message::{CommandRequest, CommandResponse, PATH_BYTES, TEXT_BYTES};
+use crate::wire::port::{
+    Access, Events, Hub, OpenError, Wake, not_running, retry, topic_error, wait,
+};
+use crate::wire::topic::{MAPPER_COMMAND, service_name};
+
+/// Clients at a time: the supervisor, an operator, a network link.
+const MAX_CLIENTS: usize = 4;
+/// Pause between two looks for the answer.
+const ANSWER_PAUSE: Duration = Duration::from_millis(10);
+
+/// What can be asked of the mapper.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Command {
+    /// Write the whole map to this file.
+    SaveMap(PathBuf),
+}
+
+/// Why a question was not asked, not understood or not answered.
+#[derive(Debug, thiserror::Error)]
+pub enum CommandError {
+    /// The path does not fit.
+    #[error("{0}: a path may have at most {PATH_BYTES} bytes")]
+    PathTooLong(PathBuf),
+    /// A request that stands for nothing.
+    #[error("the mapper got a request that it does not know (kind {0})")]
+    Unknown(u32),
+    /// The transport failed.
+    #[error("mapper/command: {0}")]
+    Transport(String),
+    /// The mapper says no.
+    #[error("mapper: {0}")]
+    Refused(String),
+    /// No answer came.
+    #[error("the mapper gave no answer within {0:?}")]
+    NoAnswer(Duration),
+}
+
+/// Text as the bytes of a message, cut at a character where it is too long.
+pub fn text_bytes(text: &str) -> ([u8; TEXT_BYTES], u32) {
+    let mut length = text.len().min(TEXT_BYTES);
+    while !text.is_char_boundary(length) {
+        length -= 1;
+    }
+    let mut bytes = [0; TEXT_BYTES];
+    bytes[..length].copy_from_slice(&text.as_bytes()[..length]);
+    (bytes, length as u32)
+}
+
+/// The text of a message; what is not UTF-8 or a control character is replaced.
+pub fn text_from_bytes(bytes: &[u8; TEXT_BYTES], length: u32) -> String {
+    let length = (length as usize).min(TEXT_BYTES);
+    let text = String::from_utf8_lossy(&bytes[..length]);
+    text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect()
+}
+
+fn request_of(command: &Command) -> Result<CommandRequest, CommandError> {
+    let Command::SaveMap(path) = command;
+    let bytes = path.as_os_str().as_encoded_bytes();
+    if bytes.len() > PATH_BYTES {
+        return Err(CommandError::PathTooLong(path.clone()));
+    }
+    let mut request =
+        CommandRequest { kind: 0, path_bytes: bytes.len() as u32, path: [0; PATH_BYTES] };
+    request.path[..bytes.len()].copy_from_slice(bytes);
+    Ok(request)
+}
+
+fn command_of(request: &CommandRequest) -> Result<Command, CommandError> {
+    use std::os::unix::ffi::OsStrExt;
+    let length = (request.path_bytes as usize).min(PATH_BYTES);
+    let path = Path::new(std::ffi::OsStr::from_bytes(&request.path[..length]));
+    match request.kind {
+        0 => Ok(Command::SaveMap(path.to_owned())),
+        kind => Err(CommandError::Unknown(kind)),
+    }
+}
+
+type Factory = iceoryx2::service::port_factory::request_response::PortFactory<
+    ipc::Service,
+    CommandRequest,
+    (),
+    CommandResponse,
+    (),
+>;
+
+fn service(hub: &Hub, name: &str) -> Result<Factory, OpenError> {
+    let service_name = ServiceName::new(name).map_err(|e| topic_error(name, &e))?;
+    let builder = || {
+        hub.node()
+            .service_builder(&service_name)
+            .request_response::<CommandRequest, CommandResponse>()
+    };
+    match hub.access() {
+        Access::Observer => builder().open().map_err(|_| not_running(hub.place())),
+        Access::Member => retry(name, || {
+            builder()
+                .max_clients(MAX_CLIENTS)
+                .max_servers(2)
+                .enable_safe_overflow_for_requests(true)
+                .enable_safe_overflow_for_responses(true)
+                .open_or_create()
+        }),
+    }
+}
+
+/// The mapper's side.
+#[derive(Debug)]
+pub struct CommandServer {
+    server: Server<ipc::Service, CommandRequest, (), CommandResponse, ()>,
+    events: Events,
+}
+
+impl CommandServer {
+    /// Opens it.
+    pub fn open(hub: &Hub) -> Result<Self, OpenError> {
+        let name = service_name(&hub.place().instance, MAPPER_COMMAND);
+        let server =
+            service(hub, &name)?.server_builder().create().map_err(|e| topic_error(&name, &e))?;
+        Ok(Self { server, events: hub.events(&name)? })
+    }
+
+    /// Its wake-ups, for [`wait`].
+    pub fn events(&self) -> &Events {
+        &self.events
+    }
+
+    /// Answers every waiting question with what `act` makes of it.
+    pub fn answer(
+        &self,
+        mut act: impl FnMut(Command) -> Result<(), String>,
+    ) -> Result<(), CommandError> {
+        let failed = |e: &dyn std::fmt::Display| CommandError::Transport(e.to_string());
+        while let Some(request) = self.server.receive().map_err(|e| failed(&e))? {
+            let result = match command_of(request.payload()) {
+                Ok(command) => act(command),
+                Err(error) => Err(error.to_string()),
+            };
+            let (text, text_bytes) = text_bytes(result.as_ref().err().map_or("", String::as_str));
+            let status = u32::from(result.is_err());
+            let response = CommandResponse { status, text_bytes, text };
+            request.send_copy(response).map_err(|e| failed(&e))?;
+        }
+        Ok(())
+    }
+}
+
+/// The side of those who ask.
+#[derive(Debug)]
+pub struct CommandClient {
+    client: Client<ipc::Service, CommandRequest, (), CommandResponse, ()>,
+    wake: Wake,
+}
+
+impl CommandClient {
+    /// Opens it.
+    pub fn open(hub: &Hub) -> Result<Self, OpenError> {
+        let name = service_name(&hub.place().instance, MAPPER_COMMAND);
+        let client =
+            service(hub, &name)?.client_builder().create().map_err(|e| topic_error(&name, &e))?;
+        Ok(Self { client, wake: hub.notifier(&name)? })
+    }
+
+    /// Asks and waits for the answer; `is_alive` says whether there is still someone to answer.
+    pub fn ask(
+        &self,
+        command: &Command,
+        timeout: Duration,
+        mut is_alive: impl FnMut() -> bool,
+    ) -> Result<(), CommandError> {
+        let failed = |e: &dyn std::fmt::Display| CommandError::Transport(e.to_string());
+        let pending = self.client.send_copy(request_of(command)?).map_err(|e| failed(&e))?;
+        self.wake.notify();
+        let deadline = Instant::now() + timeout;
+        while Instant::now() < deadline && is_alive() {
+            if let Some(response) = pending.receive().map_err(|e| failed(&e))? {
+                let response = response.payload();
+                return match response.status {
+                    0 => Ok(()),
+                    _ => Err(CommandError::Refused(text_from_bytes(
+                        &response.text,
+                        response.text_bytes,
+                    ))),
+                };
+            }
+            wait(&[], None, ANSWER_PAUSE).map_err(|e| failed(&e))?;
+        }
+        Err(CommandError::NoAnswer(timeout))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_command_survives_the_way() {
+        let command = Command::SaveMap(PathBuf::from("/tmp/map.bin"));
+        assert_eq!(command_of(&request_of(&command).unwrap()).unwrap(), command);
+        let long = Command::SaveMap(PathBuf::from("x".repeat(PATH_BYTES + 1)));
+        assert!(matches!(request_of(&long), Err(CommandError::PathTooLong(_))));
+    }
+
+    #[test]
+    fn hostile_requests_are_refused() {
+        let mut request = request_of(&Command::SaveMap(PathBuf::from("/tmp/x"))).unwrap();
+        request.path_bytes = u32::MAX;
+        assert!(command_of(&request).is_ok(), "a length is cut, never believed");
+        request.kind = 77;
+        assert!(matches!(command_of(&request), Err(CommandError::Unknown(77))));
+    }
+
+    #[test]
+    fn texts_are_cut_at_a_character() {
+        let (bytes, length) = text_bytes(&"ä".repeat(TEXT_BYTES));
+        assert_eq!(length as usize, TEXT_BYTES);
+        assert_eq!(text_from_bytes(&bytes, length), "ä".repeat(TEXT_BYTES / 2));
+        assert_eq!(text_from_bytes(&[0xff; TEXT_BYTES], u32::MAX).chars().next(), Some('\u{fffd}'));
+    }
+}

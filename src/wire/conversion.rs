@@ -1,0 +1,399 @@
+//! The checked way between messages and the types of `slam`. A hostile message gives an error.
+//!
+//! Going out and back in keeps every bit: lockstep and replay must agree to the last digit.
+
+use nalgebra::{Quaternion, UnitQuaternion, Vector3};
+
+use crate::slam::frame::FrameView;
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::geometry::sim3::Sim3;
+use crate::slam::keyframe::{DepthPoint, Keyframe, KeyframePose, MAX_KEYFRAME_POINTS, MapState};
+use crate::slam::pose::{
+    Brightness, DegradedReason, LostReason, PoseEstimate, Quality, TrackingState,
+};
+use crate::wire::message::{
+    FrameHeader, KeyframeHeader, KeyframeImageHeader, KeyframePoseMessage, PoseMessage,
+    RigidMessage, SimilarityMessage,
+};
+
+/// Farthest a sent quaternion may be from unit length: rounding, not another transform.
+const QUATERNION_TOLERANCE: f64 = 1e-6;
+
+/// A message that cannot be what it says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum MessageError {
+    /// A code that stands for nothing.
+    #[error("{field} has the unknown code {code}")]
+    UnknownCode {
+        /// Where.
+        field: &'static str,
+        /// The code.
+        code: u32,
+    },
+    /// NaN, infinity, a quaternion that is none, a scale that is not positive.
+    #[error("{field} is not a valid number")]
+    InvalidNumber {
+        /// Where.
+        field: &'static str,
+    },
+    /// Size and intrinsics that no camera has.
+    #[error("size {width} × {height} and its intrinsics belong to no camera")]
+    InvalidIntrinsics {
+        /// Width in pixels.
+        width: u32,
+        /// Height in pixels.
+        height: u32,
+    },
+    /// The payload has another length than the header says.
+    #[error("payload has {length} elements where {expected} are announced")]
+    WrongLength {
+        /// Elements that came.
+        length: usize,
+        /// Elements that should have come.
+        expected: usize,
+    },
+    /// A point outside the image.
+    #[error("point {index} lies outside the image or is not finite")]
+    InvalidPoint {
+        /// Its place in the payload.
+        index: usize,
+    },
+    /// Depth and image of different keyframes.
+    #[error("depth of keyframe {keyframe_id} with the image of {image_id}")]
+    OtherKeyframe {
+        /// Keyframe of the depth.
+        keyframe_id: u64,
+        /// Keyframe of the image.
+        image_id: u64,
+    },
+}
+
+/// The message of a rigid transform.
+pub fn rigid_message(transform: &SE3) -> RigidMessage {
+    let [x, y, z, w] = transform.quaternion_xyzw();
+    let t = &transform.translation;
+    [x, y, z, w, t.x, t.y, t.z]
+}
+
+/// The rigid transform of a message, bit for bit.
+pub fn rigid_from_message(
+    message: &RigidMessage,
+    field: &'static str,
+) -> Result<SE3, MessageError> {
+    let [x, y, z, w, tx, ty, tz] = *message;
+    let quaternion = Quaternion::new(w, x, y, z);
+    let is_unit = (quaternion.norm() - 1.0).abs() <= QUATERNION_TOLERANCE;
+    if !is_unit || ![tx, ty, tz].iter().all(|t| t.is_finite()) {
+        return Err(MessageError::InvalidNumber { field });
+    }
+    // Normalising again would change the last bits.
+    let rotation = UnitQuaternion::new_unchecked(quaternion);
+    Ok(SE3 { rotation, translation: Vector3::new(tx, ty, tz) })
+}
+
+/// The message of a similarity.
+pub fn similarity_message(similarity: &Sim3) -> SimilarityMessage {
+    let [x, y, z, w, tx, ty, tz] = rigid_message(&similarity.rigid);
+    [x, y, z, w, tx, ty, tz, similarity.scale]
+}
+
+/// The similarity of a message, bit for bit.
+pub fn similarity_from_message(
+    message: &SimilarityMessage,
+    field: &'static str,
+) -> Result<Sim3, MessageError> {
+    let [x, y, z, w, tx, ty, tz, scale] = *message;
+    let rigid = rigid_from_message(&[x, y, z, w, tx, ty, tz], field)?;
+    let similarity = Sim3::new(rigid, scale);
+    if similarity.is_valid() { Ok(similarity) } else { Err(MessageError::InvalidNumber { field }) }
+}
+
+/// The intrinsics of a header, checked.
+fn intrinsics_from(values: &[f64; 4], width: u32, height: u32) -> Result<Intrinsics, MessageError> {
+    let [fx, fy, cx, cy] = *values;
+    let intrinsics = Intrinsics { fx, fy, cx, cy, width: width as usize, height: height as usize };
+    if intrinsics.is_valid() {
+        Ok(intrinsics)
+    } else {
+        Err(MessageError::InvalidIntrinsics { width, height })
+    }
+}
+
+/// The frame of a message with its intrinsics.
+pub fn frame_from_message<'a>(
+    header: &FrameHeader,
+    pixels: &'a [u8],
+) -> Result<(FrameView<'a>, Intrinsics), MessageError> {
+    let intrinsics = intrinsics_from(&header.intrinsics, header.width, header.height)?;
+    let expected = intrinsics.width * intrinsics.height;
+    if header.stride != header.width || pixels.len() != expected {
+        return Err(MessageError::WrongLength { length: pixels.len(), expected });
+    }
+    let frame = FrameView {
+        sequence: header.sequence,
+        capture_nanos: header.capture_nanos,
+        exposure_nanos: header.exposure_nanos,
+        width: intrinsics.width,
+        height: intrinsics.height,
+        pixels,
+    };
+    Ok((frame, intrinsics))
+}
+
+/// State and reason as codes.
+pub fn codes_from_state(state: TrackingState) -> (u32, u32) {
+    match state {
+        TrackingState::Initializing => (0, 0),
+        TrackingState::Tracking => (1, 0),
+        TrackingState::Degraded(reason) => (
+            2,
+            match reason {
+                DegradedReason::Budget => 0,
+                DegradedReason::LowOverlap => 1,
+                DegradedReason::HighResidual => 2,
+                DegradedReason::Gap => 3,
+            },
+        ),
+        TrackingState::Lost(reason) => (
+            3,
+            match reason {
+                LostReason::Diverged => 0,
+                LostReason::TooFewInliers => 1,
+                LostReason::NoPoints => 2,
+                LostReason::UnusableFrame => 3,
+                LostReason::MapRejected => 4,
+            },
+        ),
+    }
+}
+
+/// The state of two codes.
+pub fn state_from_codes(state: u32, reason: u32) -> Result<TrackingState, MessageError> {
+    Ok(match (state, reason) {
+        (0, 0) => TrackingState::Initializing,
+        (1, 0) => TrackingState::Tracking,
+        (2, 0) => TrackingState::Degraded(DegradedReason::Budget),
+        (2, 1) => TrackingState::Degraded(DegradedReason::LowOverlap),
+        (2, 2) => TrackingState::Degraded(DegradedReason::HighResidual),
+        (2, 3) => TrackingState::Degraded(DegradedReason::Gap),
+        (3, 0) => TrackingState::Lost(LostReason::Diverged),
+        (3, 1) => TrackingState::Lost(LostReason::TooFewInliers),
+        (3, 2) => TrackingState::Lost(LostReason::NoPoints),
+        (3, 3) => TrackingState::Lost(LostReason::UnusableFrame),
+        (3, 4) => TrackingState::Lost(LostReason::MapRejected),
+        (0..=3, code) => return Err(MessageError::UnknownCode { field: "reason", code }),
+        (code, _) => return Err(MessageError::UnknownCode { field: "state", code }),
+    })
+}
+
+/// The state of a map as a code.
+pub fn code_from_map_state(state: MapState) -> u32 {
+    match state {
+        MapState::Initializing => 0,
+        MapState::Established => 1,
+        MapState::Rejected => 2,
+    }
+}
+
+/// The state of a map from its code.
+pub fn map_state_from_code(code: u32) -> Result<MapState, MessageError> {
+    match code {
+        0 => Ok(MapState::Initializing),
+        1 => Ok(MapState::Established),
+        2 => Ok(MapState::Rejected),
+        code => Err(MessageError::UnknownCode { field: "map_state", code }),
+    }
+}
+
+/// When a pose was published and what it took.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct PoseTiming {
+    /// CLOCK_MONOTONIC at publication.
+    pub published_nanos: i64,
+    /// From the frame's instant to publication.
+    pub latency_nanos: u64,
+    /// Time that tracking took.
+    pub track_nanos: u64,
+}
+
+/// The message of a pose.
+pub fn pose_message(pose: &PoseEstimate, timing: &PoseTiming) -> PoseMessage {
+    let (state, reason) = codes_from_state(pose.state);
+    let quality = &pose.quality;
+    PoseMessage {
+        sequence: pose.sequence,
+        capture_nanos: pose.capture_nanos,
+        published_nanos: timing.published_nanos,
+        latency_nanos: timing.latency_nanos,
+        track_nanos: timing.track_nanos,
+        revision: pose.revision,
+        keyframe_id: pose.keyframe_id,
+        epoch: pose.epoch,
+        state,
+        reason,
+        proposes_keyframe: u32::from(pose.proposes_keyframe),
+        world_from_camera: rigid_message(&pose.world_from_camera),
+        keyframe_from_camera: rigid_message(&pose.keyframe_from_camera),
+        covariance: pose.covariance,
+        brightness: [pose.brightness.a, pose.brightness.b],
+        in_view_ratio: quality.in_view_ratio,
+        inlier_ratio: quality.inlier_ratio,
+        whitened_rmse: quality.whitened_rmse,
+        residual_rmse: quality.residual_rmse,
+        mean_squared_flow: quality.mean_squared_flow,
+        iterations: quality.iterations,
+        finest_level: quality.finest_level,
+        points: quality.points,
+        reserved: 0,
+    }
+}
+
+/// The pose of a message, checked.
+pub fn pose_from_message(message: &PoseMessage) -> Result<PoseEstimate, MessageError> {
+    let finite = |field, values: &[f64]| {
+        let all = values.iter().all(|x| x.is_finite());
+        if all { Ok(()) } else { Err(MessageError::InvalidNumber { field }) }
+    };
+    finite("covariance", &message.covariance)?;
+    finite("brightness", &message.brightness)?;
+    let quality = Quality {
+        in_view_ratio: message.in_view_ratio,
+        inlier_ratio: message.inlier_ratio,
+        whitened_rmse: message.whitened_rmse,
+        residual_rmse: message.residual_rmse,
+        iterations: message.iterations,
+        finest_level: message.finest_level,
+        points: message.points,
+        mean_squared_flow: message.mean_squared_flow,
+    };
+    let ratios = [quality.in_view_ratio, quality.inlier_ratio, quality.mean_squared_flow];
+    finite("quality", &ratios)?;
+    finite("quality", &[quality.whitened_rmse, quality.residual_rmse])?;
+    let proposes_keyframe = match message.proposes_keyframe {
+        0 => false,
+        1 => true,
+        code => return Err(MessageError::UnknownCode { field: "proposes_keyframe", code }),
+    };
+    Ok(PoseEstimate {
+        sequence: message.sequence,
+        capture_nanos: message.capture_nanos,
+        epoch: message.epoch,
+        revision: message.revision,
+        keyframe_id: message.keyframe_id,
+        state: state_from_codes(message.state, message.reason)?,
+        world_from_camera: rigid_from_message(&message.world_from_camera, "world_from_camera")?,
+        keyframe_from_camera: rigid_from_message(
+            &message.keyframe_from_camera,
+            "keyframe_from_camera",
+        )?,
+        covariance: message.covariance,
+        brightness: Brightness { a: message.brightness[0], b: message.brightness[1] },
+        quality,
+        proposes_keyframe,
+    })
+}
+
+/// The header of a keyframe's depth.
+pub fn keyframe_header(keyframe: &Keyframe) -> KeyframeHeader {
+    let k = &keyframe.intrinsics;
+    KeyframeHeader {
+        keyframe_id: keyframe.keyframe_id,
+        revision: keyframe.revision,
+        sequence: keyframe.sequence,
+        capture_nanos: keyframe.capture_nanos,
+        world_from_keyframe: similarity_message(&keyframe.world_from_keyframe),
+        intrinsics: [k.fx, k.fy, k.cx, k.cy],
+        epoch: keyframe.epoch,
+        map_state: code_from_map_state(keyframe.map_state),
+        width: k.width as u32,
+        height: k.height as u32,
+    }
+}
+
+/// The header of a keyframe's image.
+pub fn keyframe_image_header(keyframe: &Keyframe) -> KeyframeImageHeader {
+    KeyframeImageHeader {
+        keyframe_id: keyframe.keyframe_id,
+        epoch: keyframe.epoch,
+        width: keyframe.intrinsics.width as u32,
+        height: keyframe.intrinsics.height as u32,
+        stride: keyframe.intrinsics.width as u32,
+    }
+}
+
+/// The keyframe of its two messages, checked to the last point.
+pub fn keyframe_from_messages(
+    header: &KeyframeHeader,
+    points: &[DepthPoint],
+    image_header: &KeyframeImageHeader,
+    image: &[u8],
+) -> Result<Keyframe, MessageError> {
+    let same = (header.keyframe_id, header.epoch) == (image_header.keyframe_id, image_header.epoch);
+    if !same {
+        let (keyframe_id, image_id) = (header.keyframe_id, image_header.keyframe_id);
+        return Err(MessageError::OtherKeyframe { keyframe_id, image_id });
+    }
+    let intrinsics = intrinsics_from(&header.intrinsics, header.width, header.height)?;
+    let expected = intrinsics.width * intrinsics.height;
+    let sized = (image_header.width, image_header.height) == (header.width, header.height)
+        && image_header.stride == header.width;
+    if !sized || image.len() != expected {
+        return Err(MessageError::WrongLength { length: image.len(), expected });
+    }
+    check_points(points, &intrinsics)?;
+    Ok(Keyframe {
+        keyframe_id: header.keyframe_id,
+        epoch: header.epoch,
+        revision: header.revision,
+        sequence: header.sequence,
+        capture_nanos: header.capture_nanos,
+        map_state: map_state_from_code(header.map_state)?,
+        world_from_keyframe: similarity_from_message(
+            &header.world_from_keyframe,
+            "world_from_keyframe",
+        )?,
+        intrinsics,
+        image: image.to_vec(),
+        points: points.to_vec(),
+    })
+}
+
+/// Checks that every point lies in the image and is finite, and that there are not too many.
+pub fn check_points(points: &[DepthPoint], intrinsics: &Intrinsics) -> Result<(), MessageError> {
+    if points.len() > MAX_KEYFRAME_POINTS {
+        let expected = MAX_KEYFRAME_POINTS;
+        return Err(MessageError::WrongLength { length: points.len(), expected });
+    }
+    let is_valid = |p: &DepthPoint| {
+        usize::from(p.u) < intrinsics.width
+            && usize::from(p.v) < intrinsics.height
+            && p.inverse_depth.is_finite()
+            && p.variance.is_finite()
+            && p.intensity.is_finite()
+    };
+    match points.iter().position(|p| !is_valid(p)) {
+        Some(index) => Err(MessageError::InvalidPoint { index }),
+        None => Ok(()),
+    }
+}
+
+/// The message of a keyframe's pose.
+pub fn keyframe_pose_message(pose: &KeyframePose) -> KeyframePoseMessage {
+    KeyframePoseMessage {
+        keyframe_id: pose.keyframe_id,
+        world_from_keyframe: similarity_message(&pose.world_from_keyframe),
+    }
+}
+
+/// The pose of a keyframe from its message, checked.
+pub fn keyframe_pose_from_message(
+    message: &KeyframePoseMessage,
+) -> Result<KeyframePose, MessageError> {
+    let world_from_keyframe =
+        similarity_from_message(&message.world_from_keyframe, "world_from_keyframe")?;
+    Ok(KeyframePose { keyframe_id: message.keyframe_id, world_from_keyframe })
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,66 @@
+//! Puts the two halves of a keyframe together: its depth and its image come as two messages.
+
+use crate::slam::keyframe::{DepthPoint, Keyframe};
+use crate::wire::conversion::{MessageError, keyframe_from_messages};
+use crate::wire::message::{KeyframeHeader, KeyframeImageHeader};
+use crate::wire::port::{Events, Hub, OpenError, ReceiveError, Subscriber};
+use crate::wire::topic::{KEYFRAME, KEYFRAME_IMAGE};
+
+/// Why no keyframe came out.
+#[derive(Debug, thiserror::Error)]
+pub enum InboxError {
+    /// The transport failed.
+    #[error(transparent)]
+    Receive(#[from] ReceiveError),
+    /// A message is broken; the next one may be right.
+    #[error("mapper/keyframe: {0}")]
+    Message(#[from] MessageError),
+}
+
+/// Receives whole keyframes, newest only.
+#[derive(Debug)]
+pub struct KeyframeInbox {
+    depths: Subscriber<DepthPoint, KeyframeHeader>,
+    images: Subscriber<u8, KeyframeImageHeader>,
+    /// Depth whose image has not come yet.
+    depth: Option<(KeyframeHeader, Vec<DepthPoint>)>,
+    /// Newest image: it serves every revision of its keyframe's depth.
+    image: Option<(KeyframeImageHeader, Vec<u8>)>,
+}
+
+impl KeyframeInbox {
+    /// Opens it; a keyframe that is already in force comes too.
+    pub fn open(hub: &Hub) -> Result<Self, OpenError> {
+        let depths = hub.subscriber(&KEYFRAME)?;
+        let images = hub.subscriber(&KEYFRAME_IMAGE)?;
+        Ok(Self { depths, images, depth: None, image: None })
+    }
+
+    /// Its wake-ups.
+    pub fn events(&self) -> &Events {
+        self.depths.events()
+    }
+
+    /// The newest keyframe that has not been taken.
+    pub fn newest(&mut self) -> Result<Option<Keyframe>, InboxError> {
+        // Depth first: the mapper sends the image before it, so the image of what comes is here.
+        if let Some(depth) = self.depths.newest()? {
+            self.depth = Some((*depth.header(), depth.payload().to_vec()));
+        }
+        if let Some(image) = self.images.newest()? {
+            self.image = Some((*image.header(), image.payload().to_vec()));
+        }
+        let (Some((header, _)), Some((image_header, pixels))) = (&self.depth, &self.image) else {
+            return Ok(None);
+        };
+        if header.keyframe_id != image_header.keyframe_id {
+            return Ok(None);
+        }
+        let keyframe = self
+            .depth
+            .as_ref()
+            .map(|(header, points)| keyframe_from_messages(header, points, image_header, pixels));
+        self.depth = None;
+        Ok(keyframe.transpose()?)
+    }
+}

@@ -1,0 +1,292 @@
+//! The messages as they lie in shared memory: `#[repr(C)]`, scalars only, every bit pattern valid.
+//!
+//! A `type_name` carries the version of its message; size and alignment are pinned by a test. The
+//! checked way to the types of `slam` is in [`crate::wire::conversion`].
+
+use iceoryx2::prelude::ZeroCopySend;
+
+use crate::slam::keyframe::DepthPoint;
+
+/// Bytes of a text in a message; longer ones are cut.
+pub const TEXT_BYTES: usize = 192;
+/// Bytes of the path in a request: the longest path of Linux.
+pub const PATH_BYTES: usize = 4096;
+/// Buckets of a latency histogram.
+pub const HISTOGRAM_BUCKETS: usize = 48;
+
+/// A rigid transform: quaternion x, y, z, w, then translation x, y, z.
+pub type RigidMessage = [f64; 7];
+/// A similarity: a rigid transform, then the scale.
+pub type SimilarityMessage = [f64; 8];
+
+/// Header of `capture/frame`; the payload is the grey image.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
+#[type_name("semidense.FrameHeader.v1")]
+pub struct FrameHeader {
+    /// Number of the frame at its source; a gap is a frame that is missing.
+    pub sequence: u64,
+    /// Middle of the exposure, nanoseconds: CLOCK_MONOTONIC of a camera, else the recording's clock.
+    pub capture_nanos: i64,
+    /// CLOCK_MONOTONIC instant that latency counts from: the stamp of a camera, the paced instant
+    /// of a recording played live, the sending in lockstep.
+    pub clock_nanos: i64,
+    /// Exposure time in nanoseconds, 0 where unknown.
+    pub exposure_nanos: u64,
+    /// fx, fy, cx, cy in pixels.
+    pub intrinsics: [f64; 4],
+    /// Width in pixels.
+    pub width: u32,
+    /// Height in pixels.
+    pub height: u32,
+    /// Bytes from row to row; equal to the width.
+    pub stride: u32,
+    /// Sensor gain, 0 where unknown.
+    pub gain: f32,
+}
+
+/// Message of `tracker/pose`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
+#[type_name("semidense.Pose.v1")]
+pub struct PoseMessage {
+    /// Sequence of the frame.
+    pub sequence: u64,
+    /// Stamp of the frame, nanoseconds.
+    pub capture_nanos: i64,
+    /// CLOCK_MONOTONIC when the pose was published.
+    pub published_nanos: i64,
+    /// From the frame's `clock_nanos` to `published_nanos`.
+    pub latency_nanos: u64,
+    /// Time that tracking took.
+    pub track_nanos: u64,
+    /// Revision of the keyframe it was tracked on.
+    pub revision: u64,
+    /// Keyframe it was tracked on, all ones before the first.
+    pub keyframe_id: u64,
+    /// Life of the map.
+    pub epoch: u32,
+    /// 0 initializing, 1 tracking, 2 degraded, 3 lost.
+    pub state: u32,
+    /// Why: degraded 0 budget, 1 low overlap, 2 high residual, 3 gap; lost 0 diverged, 1 too few
+    /// inliers, 2 no points, 3 unusable frame, 4 map rejected; otherwise 0.
+    pub reason: u32,
+    /// 1 when the tracker asks for a new keyframe here.
+    pub proposes_keyframe: u32,
+    /// Odometry pose.
+    pub world_from_camera: RigidMessage,
+    /// Pose relative to the keyframe, keyframe units.
+    pub keyframe_from_camera: RigidMessage,
+    /// Upper triangle, row-major, of the left increment (translation, rotation) of
+    /// `current_from_keyframe`.
+    pub covariance: [f64; 21],
+    /// Brightness against the keyframe: a, b.
+    pub brightness: [f64; 2],
+    /// Share of the keyframe's points in view.
+    pub in_view_ratio: f64,
+    /// Share of these that are explained.
+    pub inlier_ratio: f64,
+    /// Residual over its standard deviation.
+    pub whitened_rmse: f64,
+    /// Residual in grey levels.
+    pub residual_rmse: f64,
+    /// Mean squared optical flow, pixels².
+    pub mean_squared_flow: f64,
+    /// Iterations, all levels.
+    pub iterations: u32,
+    /// Finest level that was solved.
+    pub finest_level: u32,
+    /// Points in view at that level.
+    pub points: u32,
+    /// Zero.
+    pub reserved: u32,
+}
+
+/// Header of `mapper/keyframe`; the payload is its [`DepthPoint`]s.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
+#[type_name("semidense.KeyframeHeader.v1")]
+pub struct KeyframeHeader {
+    /// Its id.
+    pub keyframe_id: u64,
+    /// Counts up with every change of the map.
+    pub revision: u64,
+    /// Sequence of its frame.
+    pub sequence: u64,
+    /// Stamp of its frame, nanoseconds.
+    pub capture_nanos: i64,
+    /// Its pose and the scale of its depth.
+    pub world_from_keyframe: SimilarityMessage,
+    /// fx, fy, cx, cy in pixels.
+    pub intrinsics: [f64; 4],
+    /// Life of the map.
+    pub epoch: u32,
+    /// 0 initializing, 1 established, 2 rejected.
+    pub map_state: u32,
+    /// Width of its image, pixels.
+    pub width: u32,
+    /// Height of its image, pixels.
+    pub height: u32,
+}
+
+// SAFETY: `#[repr(C)]` with two u16 and three f32: self-contained, no padding, every bit pattern valid.
+unsafe impl ZeroCopySend for DepthPoint {
+    unsafe fn type_name() -> &'static str {
+        "semidense.DepthPoint.v1"
+    }
+}
+
+/// Header of `mapper/keyframe_image`; the payload is the grey image.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ZeroCopySend)]
+#[type_name("semidense.KeyframeImageHeader.v1")]
+pub struct KeyframeImageHeader {
+    /// The keyframe.
+    pub keyframe_id: u64,
+    /// Life of the map.
+    pub epoch: u32,
+    /// Width in pixels.
+    pub width: u32,
+    /// Height in pixels.
+    pub height: u32,
+    /// Bytes from row to row; equal to the width.
+    pub stride: u32,
+}
+
+/// Message of `mapper/step`: this frame is in the map.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ZeroCopySend)]
+#[type_name("semidense.Step.v1")]
+pub struct StepMessage {
+    /// Sequence of the frame.
+    pub sequence: u64,
+    /// The keyframe in force from the next frame on, all ones before the first.
+    pub keyframe_id: u64,
+    /// Its revision.
+    pub revision: u64,
+    /// Time that the step took.
+    pub step_nanos: u64,
+    /// Keyframes in the map.
+    pub keyframes: u64,
+    /// Points with depth of the keyframe in force.
+    pub points: u64,
+}
+
+/// Header of `mapper/graph`; the payload is one [`KeyframePoseMessage`] per keyframe.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ZeroCopySend)]
+#[type_name("semidense.GraphHeader.v1")]
+pub struct GraphHeader {
+    /// Revision of the map.
+    pub revision: u64,
+    /// Life of the map.
+    pub epoch: u32,
+    /// Zero.
+    pub reserved: u32,
+}
+
+/// The pose of one keyframe in `mapper/graph`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
+#[type_name("semidense.KeyframePose.v1")]
+pub struct KeyframePoseMessage {
+    /// The keyframe.
+    pub keyframe_id: u64,
+    /// Its pose.
+    pub world_from_keyframe: SimilarityMessage,
+}
+
+/// Message of `<process>/health`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
+#[type_name("semidense.Health.v1")]
+pub struct HealthMessage {
+    /// CLOCK_MONOTONIC when it was published.
+    pub published_nanos: i64,
+    /// CLOCK_MONOTONIC when the process started.
+    pub started_nanos: i64,
+    /// Its process id.
+    pub process_id: u32,
+    /// 0 starting, 1 preparing, 2 ready, 3 running, 4 finished, 5 failed.
+    pub state: u32,
+    /// Preparing: how much of the work is done.
+    pub progress_done: u64,
+    /// Preparing: how much work there is, 0 where unknown.
+    pub progress_total: u64,
+    /// Frames sent, tracked or mapped.
+    pub frames: u64,
+    /// Frames that came too late to be handled.
+    pub dropped: u64,
+    /// Frames that the source lost.
+    pub gaps: u64,
+    /// Messages that were refused because they are broken.
+    pub refused: u64,
+    /// Frames that took longer than the budget.
+    pub deadline_misses: u64,
+    /// Capture: frames there will be, 0 where unknown. Mapper: keyframes of the map.
+    pub total: u64,
+    /// State of the last frame: as in [`PoseMessage`], or of the map: as in [`KeyframeHeader`].
+    pub detail: u32,
+    /// Bytes of `cause` that are used.
+    pub cause_bytes: u32,
+    /// Largest resident memory so far.
+    pub peak_rss_bytes: u64,
+    /// How often each latency came, see [`crate::service::health`].
+    pub latency_counts: [u64; HISTOGRAM_BUCKETS],
+    /// Why the state is what it is, UTF-8.
+    pub cause: [u8; TEXT_BYTES],
+}
+
+/// Request of `mapper/command`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, ZeroCopySend)]
+#[type_name("semidense.CommandRequest.v1")]
+pub struct CommandRequest {
+    /// 0 save the map to `path`.
+    pub kind: u32,
+    /// Bytes of `path` that are used.
+    pub path_bytes: u32,
+    /// Absolute path of the file.
+    pub path: [u8; PATH_BYTES],
+}
+
+/// Response of `mapper/command`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, ZeroCopySend)]
+#[type_name("semidense.CommandResponse.v1")]
+pub struct CommandResponse {
+    /// 0 done, 1 failed.
+    pub status: u32,
+    /// Bytes of `text` that are used.
+    pub text_bytes: u32,
+    /// What failed, UTF-8.
+    pub text: [u8; TEXT_BYTES],
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A change of layout breaks every program that reads our topics: it needs a new version in
+    /// the `type_name` and in [`crate::wire::topic::WIRE_VERSION`].
+    fn assert_layout<T: ZeroCopySend>(size: usize, alignment: usize, name: &str) {
+        assert_eq!((size_of::<T>(), align_of::<T>()), (size, alignment), "{name}");
+        // SAFETY: it only returns a name.
+        assert_eq!(unsafe { <T as ZeroCopySend>::type_name() }, name);
+    }
+
+    #[test]
+    fn layouts_are_pinned() {
+        assert_layout::<FrameHeader>(80, 8, "semidense.FrameHeader.v1");
+        assert_layout::<PoseMessage>(424, 8, "semidense.Pose.v1");
+        assert_layout::<KeyframeHeader>(144, 8, "semidense.KeyframeHeader.v1");
+        assert_layout::<DepthPoint>(16, 4, "semidense.DepthPoint.v1");
+        assert_layout::<KeyframeImageHeader>(24, 8, "semidense.KeyframeImageHeader.v1");
+        assert_layout::<StepMessage>(48, 8, "semidense.Step.v1");
+        assert_layout::<GraphHeader>(16, 8, "semidense.GraphHeader.v1");
+        assert_layout::<KeyframePoseMessage>(72, 8, "semidense.KeyframePose.v1");
+        assert_layout::<HealthMessage>(680, 8, "semidense.Health.v1");
+        assert_layout::<CommandRequest>(4104, 4, "semidense.CommandRequest.v1");
+        assert_layout::<CommandResponse>(200, 4, "semidense.CommandResponse.v1");
+    }
+}

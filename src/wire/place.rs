@@ -1,0 +1,283 @@
+//! Where an instance lives: its name, the folder of its files, the prefix of its shared memory, and
+//! the claim of a process to be the only one of its kind.
+
+use std::fs::{self, DirBuilder, File, OpenOptions};
+use std::io::{self, Read, Seek, Write};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+use std::path::{Path, PathBuf};
+
+use rustix::fs::FlockOperation;
+
+/// The folder under systemd, where every unit has the same one.
+pub const SYSTEM_ROOT: &str = "/run/semidense";
+/// Environment variable that names the folder.
+pub const ROOT_VARIABLE: &str = "SEMIDENSE_ROOT";
+/// Where the kernel keeps shared memory.
+pub const SHARED_MEMORY: &str = "/dev/shm";
+
+/// Held while a process joins, and by the last one while it clears up.
+const JOIN_LOCK: &str = ".join.lock";
+
+/// Longest folder: the socket of a listener lies in it, and a socket's path has at most 107 bytes.
+const MAX_ROOT_BYTES: usize = 48;
+/// Longest name of an instance: it is part of every topic's name.
+const MAX_INSTANCE_BYTES: usize = 32;
+
+/// Why an instance cannot live there.
+#[derive(Debug, thiserror::Error)]
+pub enum PlaceError {
+    /// The name of the instance.
+    #[error("instance `{0}` is not a name: use 1 to 32 of the characters a-z, A-Z, 0-9, _ and -")]
+    Instance(String),
+    /// The folder's path is too long.
+    #[error("{0}: the runtime folder may have at most {MAX_ROOT_BYTES} bytes; set {ROOT_VARIABLE}")]
+    TooLong(PathBuf),
+    /// The folder belongs to someone else.
+    #[error("{0}: the runtime folder belongs to another user; set {ROOT_VARIABLE} to one of yours")]
+    Foreign(PathBuf),
+    /// The folder or a file in it cannot be made.
+    #[error("{path}: {source}; set {ROOT_VARIABLE} to a folder that can be written")]
+    Io {
+        /// What.
+        path: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+    /// There is one already.
+    #[error(
+        "{process} of instance `{instance}` already runs as process {holder}: stop it, or choose another --instance"
+    )]
+    Taken {
+        /// Kind of process.
+        process: String,
+        /// Instance.
+        instance: String,
+        /// Process id of the one that runs.
+        holder: String,
+    },
+    /// Too little shared memory.
+    #[error(
+        "{SHARED_MEMORY} has {free_mb} MB free where {needed_mb} MB are needed: enlarge it (mount -o remount,size=…, or docker run --shm-size=…)"
+    )]
+    SharedMemory {
+        /// Free.
+        free_mb: u64,
+        /// Needed.
+        needed_mb: u64,
+    },
+}
+
+/// Where an instance lives.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Place {
+    /// Name of the instance, first part of every topic's name.
+    pub instance: String,
+    /// Folder of sockets, locks and lists; of one user.
+    pub root: PathBuf,
+    /// First part of the names in [`SHARED_MEMORY`].
+    pub prefix: String,
+}
+
+impl Place {
+    /// The place of `instance` below `root`, the usual folder where that is empty. Touches nothing.
+    pub fn new(instance: &str, root: &str) -> Result<Self, PlaceError> {
+        let allowed = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
+        let named = (1..=MAX_INSTANCE_BYTES).contains(&instance.len());
+        if !named || !instance.chars().all(allowed) {
+            return Err(PlaceError::Instance(instance.to_owned()));
+        }
+        let root = if root.is_empty() { usual_root() } else { PathBuf::from(root) };
+        let root = std::path::absolute(&root)
+            .map_err(|source| PlaceError::Io { path: root.clone(), source })?;
+        if root.as_os_str().len() > MAX_ROOT_BYTES {
+            return Err(PlaceError::TooLong(root));
+        }
+        let prefix = prefix_of(&root);
+        Ok(Self { instance: instance.to_owned(), root, prefix })
+    }
+
+    /// Makes the folder, for this user alone.
+    pub fn create(&self) -> Result<(), PlaceError> {
+        let io = |source| PlaceError::Io { path: self.root.clone(), source };
+        DirBuilder::new().recursive(true).mode(0o700).create(&self.root).map_err(io)?;
+        let owner = fs::metadata(&self.root).map_err(io)?.uid();
+        if owner != rustix::process::geteuid().as_raw() {
+            return Err(PlaceError::Foreign(self.root.clone()));
+        }
+        Ok(())
+    }
+
+    /// Claims to be the only `process` of this instance; the kernel ends the claim with the process.
+    pub fn claim(&self, process: &str) -> Result<Claim, PlaceError> {
+        self.create()?;
+        let path = self.root.join(format!("{}.{process}.lock", self.instance));
+        let io = |source| PlaceError::Io { path: path.clone(), source };
+        loop {
+            let mut file = open_lock(&path).map_err(io)?;
+            if rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive).is_err() {
+                let mut holder = String::new();
+                file.read_to_string(&mut holder).map_err(io)?;
+                let (process, instance) = (process.to_owned(), self.instance.clone());
+                return Err(PlaceError::Taken { process, instance, holder: holder.trim().into() });
+            }
+            // The one before may have removed the file between our opening and our lock.
+            if is_same_file(&file, &path) {
+                file.set_len(0).map_err(io)?;
+                file.rewind().map_err(io)?;
+                writeln!(file, "{}", std::process::id()).map_err(io)?;
+                return Ok(Claim { _file: file, path });
+            }
+        }
+    }
+
+    /// Keeps [`Place::tidy`] away while a process joins.
+    pub(in crate::wire) fn hold(&self) -> Result<File, PlaceError> {
+        let path = self.root.join(JOIN_LOCK);
+        let io = |source| PlaceError::Io { path: path.clone(), source };
+        loop {
+            let file = open_lock(&path).map_err(io)?;
+            rustix::fs::flock(&file, FlockOperation::LockShared).map_err(|e| io(e.into()))?;
+            if is_same_file(&file, &path) {
+                return Ok(file);
+            }
+        }
+    }
+
+    /// Removes what iceoryx2 leaves behind on purpose when its last node is gone: its counter of
+    /// nodes and its empty folders. Does nothing while anybody is here or joins.
+    pub fn tidy(&self) {
+        let path = self.root.join(JOIN_LOCK);
+        let Ok(lock) = open_lock(&path) else { return };
+        let is_alone = rustix::fs::flock(&lock, FlockOperation::NonBlockingLockExclusive).is_ok()
+            && is_same_file(&lock, &path);
+        if !is_alone {
+            return;
+        }
+        // What cannot be removed is removed by the next one.
+        let is_empty =
+            |folder: &Path| fs::read_dir(folder).map_or(true, |mut f| f.next().is_none());
+        if is_empty(&self.root.join("nodes")) {
+            for entry in fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten() {
+                let name = entry.file_name().to_string_lossy().into_owned();
+                if name.starts_with(&self.prefix) && name.ends_with(".global_mgmt") {
+                    let _ = fs::remove_file(entry.path());
+                }
+            }
+            let _ = fs::remove_dir(self.root.join("nodes"));
+            let _ = fs::remove_dir(self.root.join("services"));
+            let _ = fs::remove_file(&path);
+        }
+    }
+
+    /// Checks that shared memory has `needed` bytes left: what is missing is not an error later but
+    /// the death of the process.
+    pub fn check_shared_memory(&self, needed: u64) -> Result<(), PlaceError> {
+        let path = PathBuf::from(SHARED_MEMORY);
+        let stat = rustix::fs::statvfs(SHARED_MEMORY)
+            .map_err(|e| PlaceError::Io { path, source: e.into() })?;
+        let free = stat.f_bavail.saturating_mul(stat.f_frsize);
+        if free >= needed {
+            return Ok(());
+        }
+        Err(PlaceError::SharedMemory { free_mb: free >> 20, needed_mb: (needed >> 20) + 1 })
+    }
+}
+
+/// The claim of a process to be the only one; ends when dropped.
+#[derive(Debug)]
+pub struct Claim {
+    _file: File,
+    path: PathBuf,
+}
+
+impl Drop for Claim {
+    fn drop(&mut self) {
+        // Removed while still locked, so that no other process can hold the same name.
+        let _ = fs::remove_file(&self.path);
+    }
+}
+
+fn open_lock(path: &Path) -> io::Result<File> {
+    OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path)
+}
+
+fn is_same_file(file: &File, path: &Path) -> bool {
+    match (file.metadata(), fs::metadata(path)) {
+        (Ok(open), Ok(named)) => (open.dev(), open.ino()) == (named.dev(), named.ino()),
+        _ => false,
+    }
+}
+
+/// The environment's word, else systemd's runtime folder, else the user's, else one in the
+/// temporary folder.
+fn usual_root() -> PathBuf {
+    let variable = |name: &str| std::env::var_os(name).filter(|value| !value.is_empty());
+    if let Some(root) = variable(ROOT_VARIABLE) {
+        return PathBuf::from(root);
+    }
+    if let Some(folder) = variable("RUNTIME_DIRECTORY") {
+        return PathBuf::from(folder);
+    }
+    if let Some(folder) = variable("XDG_RUNTIME_DIR") {
+        return PathBuf::from(folder).join("semidense");
+    }
+    let user = rustix::process::geteuid().as_raw();
+    std::env::temp_dir().join(format!("semidense-{user}"))
+}
+
+/// Names in shared memory are global, so folders that differ need prefixes that differ.
+fn prefix_of(root: &Path) -> String {
+    if root == Path::new(SYSTEM_ROOT) {
+        return "semidense_".to_owned();
+    }
+    // FNV-1a, 32 bits.
+    const OFFSET: u32 = 0x811c_9dc5;
+    const PRIME: u32 = 0x0100_0193;
+    let bytes = root.as_os_str().as_encoded_bytes();
+    let hash = bytes.iter().fold(OFFSET, |hash, &b| (hash ^ u32::from(b)).wrapping_mul(PRIME));
+    format!("semidense_{hash:08x}_")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_and_folders_are_checked() {
+        assert!(Place::new("rig-1", "/tmp/x").is_ok());
+        for bad in ["", "a/b", "ä", &"x".repeat(33)] {
+            assert!(matches!(Place::new(bad, "/tmp/x"), Err(PlaceError::Instance(_))), "{bad}");
+        }
+        let long = format!("/tmp/{}", "x".repeat(60));
+        assert!(matches!(Place::new("rig", &long), Err(PlaceError::TooLong(_))));
+    }
+
+    #[test]
+    fn every_folder_has_its_prefix() {
+        let prefix = |root| Place::new("rig", root).unwrap().prefix;
+        assert_eq!(prefix(SYSTEM_ROOT), "semidense_");
+        assert_ne!(prefix("/tmp/a"), prefix("/tmp/b"));
+        assert!(prefix("/tmp/a").starts_with("semidense_"));
+    }
+
+    #[test]
+    fn only_one_claim_at_a_time() {
+        let folder = tempfile::tempdir().unwrap();
+        let place = Place::new("rig", folder.path().to_str().unwrap()).unwrap();
+        let first = place.claim("capture").unwrap();
+        let error = place.claim("capture").unwrap_err().to_string();
+        assert!(error.contains(&format!("process {}", std::process::id())), "{error}");
+        assert!(place.claim("tracker").is_ok());
+        drop(first);
+        drop(place.claim("capture").unwrap());
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn too_little_shared_memory_is_said() {
+        let place = Place::new("rig", "/tmp/x").unwrap();
+        assert!(place.check_shared_memory(0).is_ok());
+        let error = place.check_shared_memory(u64::MAX).unwrap_err().to_string();
+        assert!(error.starts_with("/dev/shm has"), "{error}");
+    }
+}

@@ -1,0 +1,467 @@
+//! Typed ports: send, receive, wait. Quality of service comes from the table in
+//! [`crate::wire::topic`]; every data topic has a wake-up event of the same name.
+
+use std::fmt::Debug;
+use std::os::fd::BorrowedFd;
+use std::time::Duration;
+
+use iceoryx2::port::listener::Listener;
+use iceoryx2::port::notifier::Notifier;
+use iceoryx2::port::publisher::Publisher as RawPublisher;
+use iceoryx2::port::subscriber::Subscriber as RawSubscriber;
+use iceoryx2::port::update_connections::UpdateConnections;
+use iceoryx2::prelude::*;
+use iceoryx2::sample::Sample;
+use iceoryx2::sample_mut::SampleMut;
+use iceoryx2::service::port_factory::event::PortFactory as EventFactory;
+use iceoryx2::service::port_factory::publish_subscribe::PortFactory as DataFactory;
+use rustix::event::{PollFd, PollFlags, Timespec};
+
+use crate::wire::place::{Place, PlaceError};
+use crate::wire::topic::Topic;
+
+/// Nodes that may open one service: our processes, observers, and the dead until they are cleaned.
+const MAX_NODES: usize = 40;
+/// Listeners and notifiers of one event: enough for every subscriber of the topic.
+const MAX_EVENT_PORTS: usize = 16;
+/// Publishers of one topic: the owner, its successor while the dead one is cleaned, a network link.
+const MAX_PUBLISHERS: usize = 3;
+/// How often opening is tried while another process removes the same service.
+const OPEN_ATTEMPTS: usize = 50;
+/// Pause between two attempts.
+const OPEN_PAUSE: Duration = Duration::from_millis(10);
+
+/// Why a process cannot take part.
+#[derive(Debug, thiserror::Error)]
+pub enum OpenError {
+    /// The place is not right.
+    #[error(transparent)]
+    Place(#[from] PlaceError),
+    /// iceoryx2 cannot make a node there.
+    #[error("{root}: no node can be made there ({reason}); is it another user's folder?")]
+    Node {
+        /// Folder.
+        root: String,
+        /// What iceoryx2 says.
+        reason: String,
+    },
+    /// Nobody offers this topic.
+    #[error("nothing runs under the name `{instance}` in {root}")]
+    NotRunning {
+        /// Instance.
+        instance: String,
+        /// Folder.
+        root: String,
+    },
+    /// A topic cannot be opened.
+    #[error("topic {topic}: {reason}")]
+    Topic {
+        /// Its name.
+        topic: String,
+        /// What iceoryx2 says.
+        reason: String,
+    },
+}
+
+/// Why a message was not sent.
+#[derive(Debug, thiserror::Error)]
+#[error("topic {topic}: sending failed ({reason})")]
+pub struct SendError {
+    topic: String,
+    reason: String,
+}
+
+/// Why no message was received.
+#[derive(Debug, thiserror::Error)]
+#[error("topic {topic}: receiving failed ({reason})")]
+pub struct ReceiveError {
+    topic: String,
+    reason: String,
+}
+
+/// Why waiting failed.
+#[derive(Debug, thiserror::Error)]
+#[error("waiting for messages failed ({0})")]
+pub struct WaitError(String);
+
+/// Whether a topic that does not exist is made.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Access {
+    /// Make it: a process of the pipeline.
+    Member,
+    /// Only open what is there: an observer.
+    Observer,
+}
+
+/// A process's membership in an instance; every port is made from it.
+#[derive(Debug)]
+pub struct Hub {
+    node: Node<ipc::Service>,
+    place: Place,
+    access: Access,
+}
+
+impl Hub {
+    /// Joins the instance at `place` under the name `process`. iceoryx2 stays quiet and leaves the
+    /// signals alone; what dead processes left behind is removed.
+    pub fn join(place: &Place, process: &str, access: Access) -> Result<Self, OpenError> {
+        if access == Access::Member {
+            place.create()?;
+        } else if !place.root.join("services").exists() {
+            return Err(not_running(place));
+        }
+        set_log_level(LogLevel::Fatal);
+        let _joining = place.hold()?;
+        let failed =
+            |reason: String| OpenError::Node { root: place.root.display().to_string(), reason };
+        let name = NodeName::new(process).map_err(|e| failed(e.to_string()))?;
+        let node = NodeBuilder::new()
+            .name(&name)
+            .config(&transport_config(place)?)
+            .signal_handling_mode(SignalHandlingMode::Disabled)
+            .create::<ipc::Service>()
+            .map_err(|e| failed(e.to_string()))?;
+        Ok(Self { node, place: place.clone(), access })
+    }
+
+    /// Removes what dead processes left behind; milliseconds, so not for a frame loop.
+    pub fn clean_up(&self) {
+        self.node.try_cleanup_dead_nodes();
+    }
+
+    /// A sender of slices of `T` with a header of `H`, at most `max_length` elements.
+    pub fn publisher<T, H>(
+        &self,
+        topic: &Topic,
+        max_length: usize,
+    ) -> Result<Publisher<T, H>, OpenError>
+    where
+        T: Debug + ZeroCopySend + 'static,
+        H: Debug + ZeroCopySend + 'static,
+    {
+        let name = topic.service_name(&self.place.instance);
+        let service = self.data_service::<T, H>(topic, &name)?;
+        let port = service
+            .publisher_builder()
+            .initial_max_slice_len(max_length)
+            .max_loaned_samples(topic.loans)
+            .create()
+            .map_err(|e| topic_error(&name, &e))?;
+        let notifier = self
+            .event_service(&name)?
+            .notifier_builder()
+            .create()
+            .map_err(|e| topic_error(&name, &e))?;
+        Ok(Publisher { port, notifier, topic: name })
+    }
+
+    /// A receiver of slices of `T` with a header of `H`.
+    pub fn subscriber<T, H>(&self, topic: &Topic) -> Result<Subscriber<T, H>, OpenError>
+    where
+        T: Debug + ZeroCopySend + 'static,
+        H: Debug + ZeroCopySend + 'static,
+    {
+        let name = topic.service_name(&self.place.instance);
+        let service = self.data_service::<T, H>(topic, &name)?;
+        let port = service
+            .subscriber_builder()
+            .buffer_size(topic.buffer)
+            .history_request(topic.history)
+            .create()
+            .map_err(|e| topic_error(&name, &e))?;
+        let events = self.events(&name)?;
+        let subscriber = Subscriber { port, events, topic: name };
+        // Connects now, so that nothing sent from here on is missed.
+        subscriber.connect();
+        Ok(subscriber)
+    }
+
+    /// The wake-ups of the service `name`.
+    pub(in crate::wire) fn events(&self, name: &str) -> Result<Events, OpenError> {
+        let listener = self.event_service(name)?.listener_builder().create();
+        Ok(Events { listener: listener.map_err(|e| topic_error(name, &e))? })
+    }
+
+    /// What wakes those who listen to the service `name`.
+    pub(in crate::wire) fn notifier(&self, name: &str) -> Result<Wake, OpenError> {
+        let notifier = self.event_service(name)?.notifier_builder().create();
+        Ok(Wake { notifier: notifier.map_err(|e| topic_error(name, &e))? })
+    }
+
+    pub(in crate::wire) fn node(&self) -> &Node<ipc::Service> {
+        &self.node
+    }
+
+    pub(in crate::wire) fn place(&self) -> &Place {
+        &self.place
+    }
+
+    pub(in crate::wire) fn access(&self) -> Access {
+        self.access
+    }
+
+    fn data_service<T, H>(
+        &self,
+        topic: &Topic,
+        name: &str,
+    ) -> Result<DataFactory<ipc::Service, [T], H>, OpenError>
+    where
+        T: Debug + ZeroCopySend + 'static,
+        H: Debug + ZeroCopySend + 'static,
+    {
+        let service_name = ServiceName::new(name).map_err(|e| topic_error(name, &e))?;
+        let builder = || {
+            self.node
+                .service_builder(&service_name)
+                .publish_subscribe::<[T]>()
+                .user_header::<H>()
+                .enable_safe_overflow(true)
+        };
+        match self.access {
+            // An observer demands nothing: the mirror of a network link has other sizes.
+            Access::Observer => builder().open().map_err(|_| not_running(&self.place)),
+            Access::Member => retry(name, || {
+                builder()
+                    .max_publishers(MAX_PUBLISHERS)
+                    .max_subscribers(topic.subscribers)
+                    .max_nodes(MAX_NODES)
+                    .subscriber_max_buffer_size(topic.buffer)
+                    .subscriber_max_borrowed_samples(topic.borrowed)
+                    .history_size(topic.history)
+                    .open_or_create()
+            }),
+        }
+    }
+
+    fn event_service(&self, name: &str) -> Result<EventFactory<ipc::Service>, OpenError> {
+        let service_name = ServiceName::new(name).map_err(|e| topic_error(name, &e))?;
+        let builder = || self.node.service_builder(&service_name).event();
+        match self.access {
+            Access::Observer => builder().open().map_err(|_| not_running(&self.place)),
+            // No deadline on the service: a network link could not mirror it.
+            Access::Member => retry(name, || {
+                builder()
+                    .max_listeners(MAX_EVENT_PORTS)
+                    .max_notifiers(MAX_EVENT_PORTS)
+                    .max_nodes(MAX_NODES)
+                    .disable_deadline()
+                    .open_or_create()
+            }),
+        }
+    }
+}
+
+/// iceoryx2's configuration for `place`, independent of any file that lies around.
+fn transport_config(place: &Place) -> Result<Config, OpenError> {
+    let wrong = |_| OpenError::Place(PlaceError::TooLong(place.root.clone()));
+    let mut config = Config::default();
+    let root = Path::new(place.root.as_os_str().as_encoded_bytes()).map_err(wrong)?;
+    config.global.set_root_path(&root);
+    config.global.prefix = FileName::new(place.prefix.as_bytes()).map_err(wrong)?;
+    Ok(config)
+}
+
+pub(in crate::wire) fn not_running(place: &Place) -> OpenError {
+    let root = place.root.display().to_string();
+    OpenError::NotRunning { instance: place.instance.clone(), root }
+}
+
+pub(in crate::wire) fn topic_error(name: &str, error: &dyn std::fmt::Display) -> OpenError {
+    OpenError::Topic { topic: name.to_owned(), reason: error.to_string() }
+}
+
+/// Opens a service that another process may be removing at this moment.
+pub(in crate::wire) fn retry<S, E: std::fmt::Display>(
+    name: &str,
+    mut open: impl FnMut() -> Result<S, E>,
+) -> Result<S, OpenError> {
+    let mut attempt = 1;
+    loop {
+        match open() {
+            Ok(service) => return Ok(service),
+            Err(error) if attempt == OPEN_ATTEMPTS => return Err(topic_error(name, &error)),
+            Err(_) => {
+                // A pause; where it cannot be waited the attempts are over sooner.
+                let _ = wait(&[], None, OPEN_PAUSE);
+            }
+        }
+        attempt += 1;
+    }
+}
+
+/// Sends slices of `T` with a header of `H`, and wakes those who wait.
+#[derive(Debug)]
+pub struct Publisher<T: Debug + ZeroCopySend + 'static, H: Debug + ZeroCopySend + 'static> {
+    port: RawPublisher<ipc::Service, [T], H>,
+    notifier: Notifier<ipc::Service>,
+    topic: String,
+}
+
+impl<T: Debug + ZeroCopySend + Copy, H: Debug + Default + ZeroCopySend> Publisher<T, H> {
+    /// Copies `payload` into shared memory and sends it.
+    pub fn send(&self, header: H, payload: &[T]) -> Result<(), SendError> {
+        let failed = |e: &dyn std::fmt::Display| self.error(e);
+        let sample = self.port.loan_slice_uninit(payload.len()).map_err(|e| failed(&e))?;
+        let mut sample = sample.write_from_slice(payload);
+        *sample.user_header_mut() = header;
+        sample.send().map_err(|e| failed(&e))?;
+        self.wake();
+        Ok(())
+    }
+
+    /// Gives the history to those who came late.
+    pub fn serve_late_joiners(&self) {
+        // What fails here fails again, and is reported, at the next send.
+        let _ = self.port.update_connections();
+    }
+
+    fn wake(&self) {
+        // A listener that died is no reason to stop sending.
+        let _ = self.notifier.notify();
+    }
+
+    fn error(&self, reason: &dyn std::fmt::Display) -> SendError {
+        SendError { topic: self.topic.clone(), reason: reason.to_string() }
+    }
+}
+
+impl<H: Debug + Default + ZeroCopySend> Publisher<u8, H> {
+    /// Room for `length` bytes in shared memory, to be written in place.
+    pub fn loan(&self, length: usize) -> Result<Loan<'_, H>, SendError> {
+        let sample = self.port.loan_slice_uninit(length).map_err(|e| self.error(&e))?;
+        // SAFETY: every bit pattern is a u8, and the kernel or an earlier message has initialised
+        // the mapped memory.
+        let sample = unsafe { sample.assume_init() };
+        Ok(Loan { sample, publisher: self })
+    }
+}
+
+/// Bytes in shared memory that are not sent yet; dropped without sending they go back.
+#[derive(Debug)]
+pub struct Loan<'a, H: Debug + Default + ZeroCopySend + 'static> {
+    sample: SampleMut<ipc::Service, [u8], H>,
+    publisher: &'a Publisher<u8, H>,
+}
+
+impl<H: Debug + Default + ZeroCopySend> Loan<'_, H> {
+    /// The bytes.
+    pub fn bytes_mut(&mut self) -> &mut [u8] {
+        self.sample.payload_mut()
+    }
+
+    /// Sends them.
+    pub fn send(mut self, header: H) -> Result<(), SendError> {
+        *self.sample.user_header_mut() = header;
+        self.sample.send().map_err(|e| self.publisher.error(&e))?;
+        self.publisher.wake();
+        Ok(())
+    }
+}
+
+/// Receives slices of `T` with a header of `H`.
+#[derive(Debug)]
+pub struct Subscriber<T: Debug + ZeroCopySend + 'static, H: Debug + ZeroCopySend + 'static> {
+    port: RawSubscriber<ipc::Service, [T], H>,
+    events: Events,
+    topic: String,
+}
+
+impl<T: Debug + ZeroCopySend, H: Debug + ZeroCopySend> Subscriber<T, H> {
+    /// The oldest unread message.
+    pub fn receive(&self) -> Result<Option<Received<T, H>>, ReceiveError> {
+        match self.port.receive() {
+            Ok(sample) => Ok(sample.map(|sample| Received { sample })),
+            Err(e) => Err(ReceiveError { topic: self.topic.clone(), reason: e.to_string() }),
+        }
+    }
+
+    /// The newest unread message; older ones are skipped.
+    pub fn newest(&self) -> Result<Option<Received<T, H>>, ReceiveError> {
+        let mut newest = None;
+        while let Some(received) = self.receive()? {
+            newest = Some(received);
+        }
+        Ok(newest)
+    }
+
+    /// Its wake-ups, for [`wait`].
+    pub fn events(&self) -> &Events {
+        &self.events
+    }
+
+    fn connect(&self) {
+        // What fails here fails again, and is reported, at the first receive.
+        let _ = self.port.update_connections();
+    }
+}
+
+/// A message in shared memory; its place is free again when this is dropped.
+#[derive(Debug)]
+pub struct Received<T: Debug + ZeroCopySend + 'static, H: Debug + ZeroCopySend + 'static> {
+    sample: Sample<ipc::Service, [T], H>,
+}
+
+impl<T: Debug + ZeroCopySend, H: Debug + ZeroCopySend> Received<T, H> {
+    /// Its header.
+    pub fn header(&self) -> &H {
+        self.sample.user_header()
+    }
+
+    /// Its payload.
+    pub fn payload(&self) -> &[T] {
+        self.sample.payload()
+    }
+}
+
+/// The wake-ups of one topic.
+#[derive(Debug)]
+pub struct Events {
+    listener: Listener<ipc::Service>,
+}
+
+impl Events {
+    /// Takes all wake-ups; their number does not matter, messages are counted by themselves.
+    fn take(&self) {
+        let _ = self.listener.try_wait(|_| {});
+    }
+
+    fn descriptor(&self) -> BorrowedFd<'_> {
+        // SAFETY: the descriptor is the listener's and lives as long as it.
+        unsafe { BorrowedFd::borrow_raw(self.listener.file_descriptor().native_handle()) }
+    }
+}
+
+/// Wakes those who listen.
+#[derive(Debug)]
+pub(in crate::wire) struct Wake {
+    notifier: Notifier<ipc::Service>,
+}
+
+impl Wake {
+    pub(in crate::wire) fn notify(&self) {
+        let _ = self.notifier.notify();
+    }
+}
+
+/// Waits until one of `events` wakes, `interrupt` is readable, or `timeout` is over. It may also
+/// return early: the caller looks at its ports and its clock.
+pub fn wait(
+    events: &[&Events],
+    interrupt: Option<BorrowedFd<'_>>,
+    timeout: Duration,
+) -> Result<(), WaitError> {
+    let descriptors = events.iter().map(|e| e.descriptor()).chain(interrupt);
+    let mut polled: Vec<_> =
+        descriptors.map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN)).collect();
+    let timeout =
+        Timespec { tv_sec: timeout.as_secs() as i64, tv_nsec: timeout.subsec_nanos().into() };
+    match rustix::event::poll(&mut polled, Some(&timeout)) {
+        Ok(_) | Err(rustix::io::Errno::INTR) => {}
+        Err(e) => return Err(WaitError(e.to_string())),
+    }
+    events.iter().for_each(|e| e.take());
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests;

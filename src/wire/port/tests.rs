@@ -1,0 +1,130 @@
+//! Two members of one instance in one process, and those who come late.
+
+use std::os::fd::AsFd;
+use std::os::unix::net::UnixStream;
+use std::path::Path as StdPath;
+use std::time::Instant;
+
+use super::*;
+use crate::wire::message::{FrameHeader, PoseMessage};
+use crate::wire::topic::{FRAME, POSE};
+
+const LONG: Duration = Duration::from_secs(600);
+
+struct Rig {
+    _folder: tempfile::TempDir,
+    place: Place,
+}
+
+impl Rig {
+    fn new() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let place = Place::new("rig", folder.path().to_str().unwrap()).unwrap();
+        Self { _folder: folder, place }
+    }
+
+    fn join(&self, name: &str) -> Hub {
+        Hub::join(&self.place, name, Access::Member).unwrap()
+    }
+}
+
+impl Drop for Rig {
+    fn drop(&mut self) {
+        self.place.tidy();
+    }
+}
+
+fn header(sequence: u64) -> FrameHeader {
+    FrameHeader { sequence, ..FrameHeader::default() }
+}
+
+#[test]
+fn a_frame_is_written_in_place_and_wakes_its_reader() {
+    let rig = Rig::new();
+    let (sender, receiver) = (rig.join("capture"), rig.join("tracker"));
+    let frames = sender.publisher::<u8, FrameHeader>(&FRAME, 12).unwrap();
+    let reader = receiver.subscriber::<u8, FrameHeader>(&FRAME).unwrap();
+    let mut loan = frames.loan(12).unwrap();
+    loan.bytes_mut().copy_from_slice(b"twelve bytes");
+    loan.send(header(7)).unwrap();
+    wait(&[reader.events()], None, LONG).unwrap();
+    let received = reader.receive().unwrap().unwrap();
+    assert_eq!((received.header().sequence, received.payload()), (7, &b"twelve bytes"[..]));
+    assert!(reader.receive().unwrap().is_none());
+}
+
+#[test]
+fn a_slow_reader_loses_the_oldest_and_blocks_nobody() {
+    let rig = Rig::new();
+    let hub = rig.join("capture");
+    let frames = hub.publisher::<u8, FrameHeader>(&FRAME, 1).unwrap();
+    let reader = hub.subscriber::<u8, FrameHeader>(&FRAME).unwrap();
+    for sequence in 0..100 {
+        frames.send(header(sequence), &[0]).unwrap();
+    }
+    let oldest = reader.receive().unwrap().unwrap().header().sequence;
+    assert_eq!(oldest, 100 - FRAME.buffer as u64);
+    assert_eq!(reader.newest().unwrap().unwrap().header().sequence, 99);
+}
+
+#[test]
+fn who_comes_late_gets_the_history() {
+    let rig = Rig::new();
+    let hub = rig.join("tracker");
+    let poses = hub.publisher::<u64, ()>(&POSE, 1).unwrap();
+    poses.send((), &[1]).unwrap();
+    poses.send((), &[2]).unwrap();
+    let observer = Hub::join(&rig.place, "observer", Access::Observer).unwrap();
+    let late = observer.subscriber::<u64, ()>(&POSE).unwrap();
+    poses.serve_late_joiners();
+    assert_eq!(late.receive().unwrap().unwrap().payload(), [2]);
+}
+
+#[test]
+fn other_types_and_absent_services_are_refused() {
+    let rig = Rig::new();
+    let observer = Hub::join(&rig.place, "observer", Access::Observer);
+    assert!(matches!(observer, Err(OpenError::NotRunning { .. })));
+    let hub = rig.join("tracker");
+    let _poses = hub.publisher::<PoseMessage, ()>(&POSE, 1).unwrap();
+    let other = hub.subscriber::<u64, ()>(&POSE).unwrap_err().to_string();
+    assert!(other.starts_with("topic rig/v1/tracker/pose"), "{other}");
+}
+
+#[test]
+fn an_interrupt_ends_the_wait() {
+    let (readable, writable) = UnixStream::pair().unwrap();
+    drop(writable);
+    let start = Instant::now();
+    wait(&[], Some(readable.as_fd()), LONG).unwrap();
+    assert!(start.elapsed() < LONG / 2, "it waited for the timeout");
+}
+
+#[test]
+fn nothing_is_left_behind() {
+    let rig = Rig::new();
+    let hub = rig.join("capture");
+    let frames = hub.publisher::<u8, FrameHeader>(&FRAME, 1).unwrap();
+    frames.send(header(0), &[0]).unwrap();
+    rig.place.tidy();
+    assert!(shared_memory(&rig.place) > 0, "it is still in use");
+    drop((hub, frames));
+    rig.place.tidy();
+    assert_eq!(shared_memory(&rig.place), 0);
+    assert_eq!(std::fs::read_dir(&rig.place.root).unwrap().count(), 0);
+}
+
+/// Files of this place in shared memory.
+fn shared_memory(place: &Place) -> usize {
+    let names = std::fs::read_dir(StdPath::new(crate::wire::place::SHARED_MEMORY)).unwrap();
+    let ours = |name: &str| name.starts_with(&place.prefix);
+    names.filter(|name| ours(&name.as_ref().unwrap().file_name().to_string_lossy())).count()
+}
+
+#[test]
+fn the_file_for_foreign_tools_says_the_same() {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/config/iceoryx2.toml");
+    let file = Config::from_file(&FilePath::new(path.as_bytes()).unwrap()).unwrap();
+    let place = Place::new("semidense", crate::wire::place::SYSTEM_ROOT).unwrap();
+    assert_eq!(file, transport_config(&place).unwrap());
+}

@@ -1,0 +1,171 @@
+//! The table of topics: who sends what to how many, and the shared memory that takes.
+
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::keyframe::{DepthPoint, MAX_KEYFRAME_POINTS};
+use crate::wire::message::{
+    FrameHeader, GraphHeader, HealthMessage, KeyframeHeader, KeyframeImageHeader,
+    KeyframePoseMessage, PoseMessage, StepMessage,
+};
+
+/// Version in every topic's name; counts up when a message changes.
+pub const WIRE_VERSION: u32 = 1;
+
+/// Most keyframes in one message of `mapper/graph`; the newest are sent when there are more.
+pub const MAX_GRAPH_KEYFRAMES: usize = 4096;
+
+/// One data topic with its quality of service. Its wake-up event has the same name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Topic {
+    /// The process that sends it.
+    pub owner: &'static str,
+    /// What it carries.
+    pub noun: &'static str,
+    /// How many may listen: our processes, two observers and one place for a network link.
+    pub subscribers: usize,
+    /// Unread messages a subscriber keeps; the oldest go first.
+    pub buffer: usize,
+    /// Messages a subscriber may hold at a time.
+    pub borrowed: usize,
+    /// Messages that one who comes late still gets.
+    pub history: usize,
+    /// Messages that the sender may write at a time.
+    pub loans: usize,
+}
+
+/// Frames: the mapper keeps some while their poses are computed.
+pub const FRAME: Topic = Topic {
+    owner: "capture",
+    noun: "frame",
+    subscribers: 5,
+    buffer: 4,
+    borrowed: 4,
+    history: 0,
+    loans: 2,
+};
+/// Poses: small, so the buffer is deep enough that a recorder that stalls loses none.
+pub const POSE: Topic = Topic {
+    owner: "tracker",
+    noun: "pose",
+    subscribers: 8,
+    buffer: 1024,
+    borrowed: 2,
+    history: 1,
+    loans: 2,
+};
+/// Depth of the keyframe in force: only the newest counts.
+pub const KEYFRAME: Topic = Topic {
+    owner: "mapper",
+    noun: "keyframe",
+    subscribers: 4,
+    buffer: 1,
+    borrowed: 2,
+    history: 1,
+    loans: 1,
+};
+/// Image of the keyframe in force.
+pub const KEYFRAME_IMAGE: Topic = Topic { noun: "keyframe_image", ..KEYFRAME };
+/// Frames that are in the map.
+pub const STEP: Topic = Topic { owner: "mapper", noun: "step", ..POSE };
+/// Poses of all keyframes.
+pub const GRAPH: Topic = Topic { noun: "graph", ..KEYFRAME };
+/// Health of capture.
+pub const CAPTURE_HEALTH: Topic = Topic {
+    owner: "capture",
+    noun: "health",
+    subscribers: 8,
+    buffer: 4,
+    borrowed: 2,
+    history: 1,
+    loans: 1,
+};
+/// Health of the tracker.
+pub const TRACKER_HEALTH: Topic = Topic { owner: "tracker", ..CAPTURE_HEALTH };
+/// Health of the mapper.
+pub const MAPPER_HEALTH: Topic = Topic { owner: "mapper", ..CAPTURE_HEALTH };
+
+/// The request/response service of the mapper.
+pub const MAPPER_COMMAND: &str = "mapper/command";
+
+/// Bytes that iceoryx2 adds to each message: its own header and alignment.
+const CHUNK_OVERHEAD_BYTES: usize = 128;
+
+impl Topic {
+    /// Messages that the sender reserves room for.
+    pub fn chunks(&self) -> usize {
+        self.subscribers * (self.buffer + self.borrowed) + self.history + self.loans
+    }
+
+    /// Shared memory of the topic, bytes, when one message has `message_bytes`.
+    pub fn bytes(&self, message_bytes: usize) -> u64 {
+        (self.chunks() * (message_bytes + CHUNK_OVERHEAD_BYTES)) as u64
+    }
+
+    /// Name of the service: `<instance>/v<wire version>/<owner>/<noun>`.
+    pub fn service_name(&self, instance: &str) -> String {
+        service_name(instance, &format!("{}/{}", self.owner, self.noun))
+    }
+}
+
+/// Name of a service: `<instance>/v<wire version>/<path>`.
+pub fn service_name(instance: &str, path: &str) -> String {
+    format!("{instance}/v{WIRE_VERSION}/{path}")
+}
+
+/// Every data topic with the bytes of its largest message, for images of this size.
+pub fn table(intrinsics: &Intrinsics) -> Vec<(Topic, usize)> {
+    let image = intrinsics.width * intrinsics.height;
+    let points = MAX_KEYFRAME_POINTS * size_of::<DepthPoint>();
+    let graph = MAX_GRAPH_KEYFRAMES * size_of::<KeyframePoseMessage>();
+    vec![
+        (FRAME, size_of::<FrameHeader>() + image),
+        (POSE, size_of::<PoseMessage>()),
+        (KEYFRAME, size_of::<KeyframeHeader>() + points),
+        (KEYFRAME_IMAGE, size_of::<KeyframeImageHeader>() + image),
+        (STEP, size_of::<StepMessage>()),
+        (GRAPH, size_of::<GraphHeader>() + graph),
+        (CAPTURE_HEALTH, size_of::<HealthMessage>()),
+        (TRACKER_HEALTH, size_of::<HealthMessage>()),
+        (MAPPER_HEALTH, size_of::<HealthMessage>()),
+    ]
+}
+
+/// Shared memory that the topics of `owner` take for images of this size; of all for `None`.
+pub fn shared_memory_bytes(intrinsics: &Intrinsics, owner: Option<&str>) -> u64 {
+    let wanted = |topic: &Topic| owner.is_none_or(|owner| topic.owner == owner);
+    table(intrinsics).iter().filter(|(t, _)| wanted(t)).map(|(t, bytes)| t.bytes(*bytes)).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn intrinsics(width: usize, height: usize) -> Intrinsics {
+        Intrinsics { fx: 500.0, fy: 500.0, cx: 300.0, cy: 200.0, width, height }
+    }
+
+    #[test]
+    fn the_usual_camera_fits_into_the_smallest_usual_shared_memory() {
+        // 64 MiB is what a container gets.
+        let sum = shared_memory_bytes(&intrinsics(640, 480), None);
+        assert!(sum < 64 << 20, "{sum} bytes");
+        let large = shared_memory_bytes(&intrinsics(1280, 720), None);
+        assert!(large < 128 << 20, "{large} bytes");
+    }
+
+    #[test]
+    fn names_are_unique_and_carry_the_version() {
+        let mut names: Vec<_> =
+            table(&intrinsics(640, 480)).iter().map(|(t, _)| t.service_name("rig1")).collect();
+        assert!(names.contains(&"rig1/v1/capture/frame".to_owned()));
+        names.sort();
+        names.dedup();
+        assert_eq!(names.len(), 9);
+    }
+
+    #[test]
+    fn a_buffer_holds_the_history() {
+        for (topic, _) in table(&intrinsics(640, 480)) {
+            assert!(topic.buffer >= topic.history, "{topic:?}");
+        }
+    }
+}

@@ -1,0 +1,258 @@
+//! The real binary: three processes over shared memory, from the first frame to the results.
+
+mod support;
+
+use std::collections::BTreeMap;
+use std::fs;
+
+use rustix::process::{Pid, Signal};
+use semidense::capture::source::{SourceName, open};
+use semidense::service::config::Config;
+use semidense::service::peers::{HEALTH_TOPICS, Peer};
+use semidense::service::replay::{ReplayConfig, replay};
+use semidense::service::results::RecordedPose;
+use semidense::wire::conversion::pose_from_message;
+use semidense::wire::keyframe_inbox::KeyframeInbox;
+use semidense::wire::message::PoseMessage;
+use semidense::wire::port::{Hub, Subscriber};
+use semidense::wire::topic::{POSE, TRACKER_HEALTH};
+use serde_json::Value;
+use support::{Rig, end, finish, signal, small_camera, until};
+
+/// A live run that lasts a minute if nobody ends it.
+const SLOW: &[&str] = &["--live", "--set", "simulator.rate_hz=8"];
+const SLOW_FRAMES: usize = 480;
+
+fn summary(rig: &Rig) -> Value {
+    let text = fs::read_to_string(rig.output().join("summary.json")).unwrap();
+    serde_json::from_str(&text).unwrap()
+}
+
+/// Frames of the runs that are compared bit for bit.
+const FRAMES: usize = 25;
+
+/// Runs in lockstep and gives every pose as an observer sees it, without the times.
+fn observed_poses(rig: &Rig, arguments: &[&str]) -> BTreeMap<u64, String> {
+    let child = rig.run(FRAMES, arguments).spawn().unwrap();
+    let hub = rig.observe();
+    let poses: Subscriber<PoseMessage, ()> = until("poses", || hub.subscriber(&POSE).ok());
+    let mut seen = BTreeMap::new();
+    until("the last frame", || {
+        while let Some(message) = poses.receive().unwrap() {
+            let pose = pose_from_message(&message.payload()[0]).unwrap();
+            // Floating point prints its shortest exact form: equal texts are equal bits.
+            seen.insert(pose.sequence, format!("{pose:?}"));
+        }
+        seen.contains_key(&(FRAMES as u64 - 1)).then_some(())
+    });
+    drop((poses, hub));
+    let ended = end(child);
+    assert!(ended.status.success(), "{}", ended.stderr);
+    seen
+}
+
+#[test]
+fn a_run_ends_by_itself_writes_its_results_and_leaves_nothing() {
+    let rig = Rig::new();
+    let ended = finish(rig.run(20, &[]));
+    assert!(ended.status.success(), "{}", ended.stderr);
+    for file in ["trajectory.txt", "keyframes.txt", "map.ply", "report.html"] {
+        assert!(rig.output().join(file).exists(), "{file}");
+    }
+    let hidden = fs::read_dir(rig.output()).unwrap().flatten();
+    assert!(hidden.into_iter().all(|f| !f.file_name().to_string_lossy().starts_with('.')));
+    let summary = summary(&rig);
+    assert_eq!(summary["mode"], "lockstep");
+    assert_eq!(summary["frames_in"], 20);
+    assert_eq!(summary["frames_dropped"], 0);
+    assert!(summary["track_ms"]["p50"].is_number() && summary["map_ms"]["p50"].is_number());
+    assert!(ended.stdout.starts_with("frames"), "{}", ended.stdout);
+    assert_eq!(rig.leftovers(), Vec::<String>::new());
+}
+
+/// The same frames through `replay`, in this process.
+fn replayed_poses() -> BTreeMap<u64, String> {
+    let settings: Vec<String> =
+        small_camera(FRAMES).iter().map(|s| format!("simulator.{s}")).collect();
+    let config = Config::load(None, &settings).unwrap();
+    let name: SourceName = "sim".parse().unwrap();
+    let mut source = open(&name, None, &config.simulator).unwrap();
+    let replayed = ReplayConfig {
+        tracker: config.tracking,
+        mapper: config.mapping,
+        ..ReplayConfig::default()
+    };
+    let record = replay(source.as_mut(), "sim", &replayed, &mut |_| true).unwrap();
+    let pose = |pose: &RecordedPose| (pose.estimate.sequence, format!("{:?}", pose.estimate));
+    record.poses.iter().map(pose).collect()
+}
+
+#[test]
+fn lockstep_gives_the_bits_of_replay_with_any_number_of_threads() {
+    let (one, other) = (Rig::new(), Rig::new());
+    let first = observed_poses(&one, &["--set", "mapper.threads=1"]);
+    let second = observed_poses(&other, &["--set", "mapper.threads=3"]);
+    assert_eq!(first, second);
+    assert_eq!(first, replayed_poses());
+    for file in ["trajectory.txt", "trajectory_online.txt", "keyframes.txt", "map.ply"] {
+        let read = |rig: &Rig| fs::read(rig.output().join(file)).unwrap();
+        assert!(read(&one) == read(&other), "{file} differs");
+    }
+}
+
+#[test]
+fn who_comes_late_gets_the_keyframe_and_status_sees_all_three() {
+    let rig = Rig::new();
+    let child = rig.run(SLOW_FRAMES, SLOW).spawn().unwrap();
+    let hub = rig.observe();
+    let mut tracker = until("the tracker", || Peer::open(&hub, &TRACKER_HEALTH).ok());
+    until("ten frames", || {
+        let health = tracker.update().unwrap();
+        health.is_some_and(|health| health.frames >= 10).then_some(())
+    });
+    let late = rig.observe();
+    let mut inbox = KeyframeInbox::open(&late).unwrap();
+    let keyframe = until("the keyframe", || inbox.newest().unwrap());
+    assert_eq!(keyframe.image.len(), 160 * 120);
+
+    let status = finish(rig.command(&["status", "--once", "--json"]));
+    assert!(status.status.success(), "{}", status.stderr);
+    let status: Value = serde_json::from_str(&status.stdout).unwrap();
+    for process in ["capture", "tracker", "mapper"] {
+        assert_eq!(status[process]["state"], "running", "{status}");
+    }
+
+    let second = finish(rig.run(20, &[]));
+    assert_eq!(second.status.code(), Some(1));
+    assert_one_error(&second.stderr, "already runs as process");
+
+    drop((tracker, inbox, hub, late));
+    signal(&child, Signal::INT);
+    let ended = end(child);
+    assert_eq!(ended.status.code(), Some(130), "{}", ended.stderr);
+    let frames = summary(&rig)["frames_in"].as_u64().unwrap();
+    assert!((10..SLOW_FRAMES as u64).contains(&frames), "{frames} frames");
+    assert_eq!(rig.leftovers(), Vec::<String>::new());
+}
+
+#[test]
+fn a_killed_tracker_comes_back() {
+    let rig = Rig::new();
+    let child = rig.run(100, SLOW).spawn().unwrap();
+    let hub = rig.observe();
+    let mut tracker = until("the tracker", || Peer::open(&hub, &TRACKER_HEALTH).ok());
+    let victim = until("ten frames", || {
+        let health = tracker.update().unwrap();
+        health.filter(|health| health.frames >= 10).map(|health| health.process_id)
+    });
+    let victim = Pid::from_raw(i32::try_from(victim).unwrap()).unwrap();
+    rustix::process::kill_process(victim, Signal::KILL).unwrap();
+    until("another tracker", || {
+        let health = tracker.update().unwrap()?;
+        let is_new = health.process_id != victim.as_raw_nonzero().get().cast_unsigned();
+        (is_new && health.frames > 0).then_some(())
+    });
+    drop((tracker, hub));
+    let ended = end(child);
+    assert!(ended.status.success(), "{}", ended.stderr);
+    assert_eq!(summary(&rig)["restarts"], 1);
+    assert_eq!(rig.leftovers(), Vec::<String>::new());
+}
+
+#[test]
+fn nothing_outlives_a_killed_supervisor() {
+    let rig = Rig::new();
+    let child = rig.run(SLOW_FRAMES, SLOW).spawn().unwrap();
+    let hub = rig.observe();
+    let pids = process_ids(&hub);
+    drop(hub);
+    signal(&child, Signal::KILL);
+    assert!(!end(child).status.success());
+    for pid in pids {
+        let pid = Pid::from_raw(i32::try_from(pid).unwrap()).unwrap();
+        until("the end of a child", || rustix::process::test_kill_process(pid).err());
+    }
+    // The kernel ended its claim; the name of the lock stays until the next run.
+    let left = rig.leftovers();
+    assert!(left.iter().all(|name| name == "semidense.supervisor.lock"), "{left:?}");
+    let again = finish(rig.run(5, &[]));
+    assert!(again.status.success(), "{}", again.stderr);
+    assert_eq!(rig.leftovers(), Vec::<String>::new());
+}
+
+fn process_ids(hub: &Hub) -> Vec<u32> {
+    let open = |topic| until("a process", || Peer::open(hub, topic).ok());
+    let mut peers: Vec<Peer> = HEALTH_TOPICS.iter().map(open).collect();
+    let mut ids = Vec::new();
+    for peer in &mut peers {
+        ids.push(until("its health", || peer.update().unwrap().map(|health| health.process_id)));
+    }
+    ids
+}
+
+/// Exactly one line says what is wrong, and nobody panicked.
+fn assert_one_error(stderr: &str, expected: &str) {
+    let errors: Vec<_> = stderr.lines().filter(|line| line.starts_with("error: ")).collect();
+    assert_eq!(errors.len(), 1, "{stderr}");
+    assert!(errors[0].contains(expected), "{expected} is not in {stderr}");
+    assert!(!stderr.contains("panicked"), "{stderr}");
+}
+
+#[test]
+fn bad_input_gives_one_line_and_leaves_nothing() {
+    let rig = Rig::new();
+    let file = rig.folder().join("file");
+    fs::write(&file, "x").unwrap();
+    let broken = broken_recording(&rig);
+    let (file, broken) = (file.to_str().unwrap(), broken.as_str());
+    let cases: &[(&[&str], &str)] = &[
+        (&["--source", "nonsense"], "nonsense"),
+        (&["--source", "tum:/nowhere"], "/nowhere"),
+        (&["--source", "sim:moon"], "moon"),
+        (&["--source", broken], "2.png"),
+        (&["--output", file], file),
+        (&["--output", "/proc/nowhere"], "/proc/nowhere"),
+        (&["--config", "/nowhere.toml"], "/nowhere.toml"),
+        (&["--config", file], "file:1"),
+        (&["--set", "mapper.thread=1"], "mapper.thread=1"),
+        (&["--set", "mapper.threads=1000"], "0 to 256"),
+        (&["--set", "simulator.frames=0"], "simulator.frames"),
+        (&["--instance", "a/b"], "a/b"),
+        (&["--log", "=="], "--log"),
+    ];
+    for (arguments, expected) in cases {
+        let output = ["--output", rig.folder().to_str().unwrap()];
+        let own_output = arguments.contains(&"--output");
+        let mut command = rig.command(&["run"]);
+        command.args(*arguments).args(if own_output { &[][..] } else { &output[..] });
+        let ended = finish(command);
+        assert_eq!(ended.status.code(), Some(1), "{arguments:?}: {}", ended.stderr);
+        assert_one_error(&ended.stderr, expected);
+        assert_eq!(rig.leftovers(), Vec::<String>::new(), "{arguments:?}");
+    }
+    let usage = finish(rig.command(&["run", "--nonsense"]));
+    assert_eq!(usage.status.code(), Some(2));
+    let status = finish(rig.command(&["status", "--once"]));
+    assert_one_error(&status.stderr, "nothing runs under the name `semidense`");
+}
+
+/// A recording whose second image is cut in half.
+fn broken_recording(rig: &Rig) -> String {
+    const SIZE: u32 = 64;
+    let folder = rig.folder().join("recording");
+    fs::create_dir_all(folder.join("rgb")).unwrap();
+    fs::write(folder.join("camera.txt"), "60 60 31.5 31.5 64 64\n").unwrap();
+    let mut list = String::new();
+    for index in 1..=3 {
+        let pixels: Vec<u8> = (0..SIZE * SIZE).map(|i| (i * 37 % 251) as u8).collect();
+        let mut bytes = Vec::new();
+        let mut encoder = png::Encoder::new(&mut bytes, SIZE, SIZE);
+        encoder.set_color(png::ColorType::Grayscale);
+        encoder.write_header().unwrap().write_image_data(&pixels).unwrap();
+        let length = if index == 2 { bytes.len() / 2 } else { bytes.len() };
+        fs::write(folder.join(format!("rgb/{index}.png")), &bytes[..length]).unwrap();
+        list += &format!("{index}.0 rgb/{index}.png\n");
+    }
+    fs::write(folder.join("rgb.txt"), list).unwrap();
+    format!("tum:{}", folder.display())
+}
