@@ -18,7 +18,7 @@ use crate::service::supervisor::{Ended, RunOptions, run as supervise};
 /// Start capture, tracker and mapper on a source, watch them, and write the results
 #[derive(Debug, Args)]
 pub struct RunArguments {
-    /// Where frames come from: sim[:SCENE], tum:DIR, euroc:DIR, images:DIR or v4l:DEVICE
+    /// Where frames come from: sim, sim:SCENE, tum:DIR, euroc:DIR, images:DIR or v4l:DEVICE
     #[arg(long, value_name = "SOURCE", default_value = "sim")]
     source: String,
     /// Rig file with the camera's calibration
