@@ -36,6 +36,9 @@ pub struct MapperParams {
     pub num_seed_frames: usize,
     /// Frames kept for that, newest first: bounds the memory (one byte a pixel each).
     pub max_past_frames: usize,
+    /// The depth is smoothed and published again when this share of it has changed: a map that
+    /// hardly changed costs the tracker as much to prepare as a new one.
+    pub publish_change_ratio: f64,
     /// At least so many frames lie between two keyframes.
     pub min_keyframe_interval: u64,
     /// Search along the epipolar line.
@@ -57,6 +60,7 @@ impl Default for MapperParams {
             max_candidates: MAX_KEYFRAME_POINTS,
             num_seed_frames: 4,
             max_past_frames: 40,
+            publish_change_ratio: 0.2,
             min_keyframe_interval: 2,
             matching: MatchingParams::default(),
             gaussian: GaussianParams::default(),
@@ -74,6 +78,7 @@ impl MapperParams {
         check_range("max_candidates", self.max_candidates, 100..=MAX_KEYFRAME_POINTS)?;
         check_range("num_seed_frames", self.num_seed_frames, 0..=20)?;
         check_range("max_past_frames", self.max_past_frames, 1..=200)?;
+        check_range("publish_change_ratio", self.publish_change_ratio, 0.0..=10.0)?;
         check_range("min_keyframe_interval", self.min_keyframe_interval, 1..=1000)?;
         self.matching.validate().map_err(|e| e.within("matching"))?;
         self.gaussian.validate().map_err(|e| e.within("gaussian"))?;
@@ -122,6 +127,8 @@ pub struct Mapper {
     next_keyframe_id: u64,
     epoch: u32,
     frames_on_keyframe: u64,
+    /// Hypotheses changed since the depth was smoothed and published.
+    unpublished: usize,
 }
 
 impl Mapper {
@@ -144,6 +151,7 @@ impl Mapper {
             next_keyframe_id: 0,
             epoch: 0,
             frames_on_keyframe: 0,
+            unpublished: 0,
             params,
         })
     }
@@ -170,22 +178,30 @@ impl Mapper {
         self.frames_on_keyframe += 1;
         let initializing = self.map_state() == MapState::Initializing;
         let observations = self.observe_frame(frame, pose);
-        regularise(&mut self.depth, &mut self.regularised, &self.params.regularisation);
+        self.unpublished += observations.fused + observations.created;
         if initializing {
+            self.refine();
             return self.continue_start(frame, pose, observations, sensor_depth);
         }
         let due = self.frames_on_keyframe >= self.params.min_keyframe_interval;
-        let mut outcome =
-            StepOutcome { observations, keyframe_changed: true, ..Default::default() };
         if pose.proposes_keyframe && due {
             self.change_keyframe(frame, pose, sensor_depth);
-            outcome.keyframe_created = true;
-            outcome.graph_changed = true;
-        } else {
-            self.remember(frame, pose);
+            return StepOutcome {
+                keyframe_created: true,
+                keyframe_changed: true,
+                graph_changed: true,
+                observations,
+            };
+        }
+        self.remember(frame, pose);
+        let known = self.keyframe().map_or(0, |keyframe| keyframe.points.len());
+        let keyframe_changed =
+            self.unpublished as f64 > self.params.publish_change_ratio * known as f64;
+        if keyframe_changed {
+            self.refine();
             self.publish_depth();
         }
-        outcome
+        StepOutcome { keyframe_changed, observations, ..Default::default() }
     }
 
     /// The keyframe in force, once there is one.
@@ -260,7 +276,7 @@ impl Mapper {
         } else {
             self.seed_from_past(&world_from_keyframe);
         }
-        regularise(&mut self.depth, &mut self.regularised, &self.params.regularisation);
+        self.refine();
         world_from_keyframe.scale *= self.rescale_to_unit_mean();
         self.add_keyframe(frame, world_from_keyframe, MapState::Established);
     }
@@ -294,6 +310,12 @@ impl Mapper {
                 break;
             }
         }
+    }
+
+    /// Smooths what was observed.
+    fn refine(&mut self) {
+        regularise(&mut self.depth, &mut self.regularised, &self.params.regularisation);
+        self.unpublished = 0;
     }
 
     /// Rescales the depth map to mean inverse depth 1; the factor belongs to the keyframe's scale.

@@ -9,6 +9,8 @@ use crate::slam::depth::map::{BORDER_PX, DepthMap, GradientImage, Hypothesis};
 use crate::slam::depth::matching::{
     Match, MatchingParams, Miss, Patch, condition, is_inside, search,
 };
+use crate::slam::depth::observation_kernel::row_kernel;
+use crate::slam::image::buffer::Image;
 use crate::slam::image::quads::QuadImage;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::Brightness;
@@ -126,38 +128,29 @@ pub fn observe(
     params: &GaussianParams,
 ) -> ObservationCounts {
     let (width, height) = (map.image.width(), map.image.height());
-    let (image, candidates) = (&map.image, &map.candidates);
     let pixel = PixelObserver {
-        image,
+        image: &map.image,
+        candidates: &map.candidates,
         observer,
         gain: observer.brightness.a.exp() as f32,
         offset: observer.brightness.b as f32,
         matching,
         params,
     };
+    let observe_row = row_kernel();
     map.hypotheses
         .pixels_mut()
         .par_chunks_exact_mut(width)
         .enumerate()
         .filter(|(v, _)| (BORDER_PX..height - BORDER_PX).contains(v))
-        .map(|(v, row)| {
-            let mut counts = ObservationCounts::default();
-            for u in BORDER_PX..width - BORDER_PX {
-                if row[u].is_some() {
-                    if !(observer.only_new && row[u].propagated) {
-                        pixel.update(&mut row[u], u, v, &mut counts);
-                    }
-                } else if candidates.at(u, v) {
-                    pixel.create(&mut row[u], u, v, &mut counts);
-                }
-            }
-            counts
-        })
+        .map(|(v, row)| observe_row(&pixel, row, v))
         .reduce(ObservationCounts::default, ObservationCounts::plus)
 }
 
-struct PixelObserver<'a> {
+/// Everything that the observation of a pixel needs.
+pub(super) struct PixelObserver<'a> {
     image: &'a GradientImage,
+    candidates: &'a Image<bool>,
     observer: &'a Observer<'a>,
     gain: f32,
     offset: f32,
@@ -166,7 +159,25 @@ struct PixelObserver<'a> {
 }
 
 impl PixelObserver<'_> {
+    /// Observes the pixels of row `v`.
+    #[inline(always)]
+    pub(super) fn observe_row(&self, row: &mut [Hypothesis], v: usize) -> ObservationCounts {
+        let mut counts = ObservationCounts::default();
+        let candidates = self.candidates.row(v);
+        for u in BORDER_PX..row.len() - BORDER_PX {
+            if row[u].is_some() {
+                if !(self.observer.only_new && row[u].propagated) {
+                    self.update(&mut row[u], u, v, &mut counts);
+                }
+            } else if candidates[u] {
+                self.create(&mut row[u], u, v, &mut counts);
+            }
+        }
+        counts
+    }
+
     /// Observes a pixel that has a hypothesis.
+    #[inline(always)]
     fn update(
         &self,
         hypothesis: &mut Hypothesis,
@@ -250,6 +261,7 @@ impl PixelObserver<'_> {
     }
 
     /// Tries to give a pixel its first hypothesis, searching all depths.
+    #[inline(always)]
     fn create(
         &self,
         hypothesis: &mut Hypothesis,

@@ -12,5 +12,6 @@ pub mod immature;
 pub mod interval;
 pub mod map;
 pub mod matching;
+mod observation_kernel;
 pub mod propagation;
 pub mod regularisation;

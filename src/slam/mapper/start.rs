@@ -3,7 +3,6 @@
 use crate::slam::depth::epipolar::TwoView;
 use crate::slam::depth::gaussian::{NEW_VALIDITY, ObservationCounts, Observer, observe};
 use crate::slam::depth::map::{DepthMap, Hypothesis};
-use crate::slam::depth::regularisation::regularise;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
@@ -82,7 +81,7 @@ impl Mapper {
     /// Random depth on this frame.
     fn start_at_random(&mut self, frame: &FrameView<'_>) {
         randomise(&mut self.depth, self.params.initializer.seed ^ frame.sequence);
-        regularise(&mut self.depth, &mut self.regularised, &self.params.regularisation);
+        self.refine();
     }
 
     /// Gives the two-frame start another frame. Once it is proven its first frame becomes a keyframe
@@ -121,7 +120,7 @@ impl Mapper {
         };
         let observations =
             observe(&mut self.depth, &observer, &self.params.matching, &self.params.gaussian);
-        regularise(&mut self.depth, &mut self.regularised, &self.params.regularisation);
+        self.refine();
         let scale = self.rescale_to_unit_mean();
         let first_frame = FrameView {
             sequence: first.0,
