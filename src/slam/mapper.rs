@@ -7,10 +7,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::epipolar::TwoView;
 use crate::slam::depth::gaussian::{GaussianParams, ObservationCounts, Observer, observe};
-use crate::slam::depth::map::{DepthMap, Hypothesis};
+use crate::slam::depth::map::DepthMap;
 use crate::slam::depth::matching::MatchingParams;
 use crate::slam::depth::propagation::{PropagationParams, propagate};
-use crate::slam::depth::regularisation::{RegularisationParams, regularise};
+use crate::slam::depth::regularisation::{RegularisationParams, RegularisationScratch, regularise};
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::sim3::Sim3;
@@ -117,7 +117,7 @@ pub struct Mapper {
     /// The depth map of the keyframe in force, and memory for the next.
     depth: DepthMap,
     next_depth: DepthMap,
-    regularised: Image<Hypothesis>,
+    regularisation: RegularisationScratch,
     frame: QuadImage,
     past: PastFrames,
     two_frame: TwoFrameInitializer,
@@ -141,7 +141,7 @@ impl Mapper {
             map: Map::default(),
             depth: DepthMap::with_size(width, height),
             next_depth: DepthMap::with_size(width, height),
-            regularised: Image::filled(width, height, Hypothesis::NONE),
+            regularisation: RegularisationScratch::with_size(width, height),
             frame: QuadImage::with_size(width, height),
             past: PastFrames::with_capacity(params.max_past_frames),
             two_frame: TwoFrameInitializer::new(intrinsics, params.initializer.two_frame.clone())
@@ -314,7 +314,7 @@ impl Mapper {
 
     /// Smooths what was observed.
     fn refine(&mut self) {
-        regularise(&mut self.depth, &mut self.regularised, &self.params.regularisation);
+        regularise(&mut self.depth, &mut self.regularisation, &self.params.regularisation);
         self.unpublished = 0;
     }
 

@@ -131,6 +131,7 @@ pub fn observe(
     let pixel = PixelObserver {
         image: &map.image,
         candidates: &map.candidates,
+        structure: &map.structure,
         observer,
         gain: observer.brightness.a.exp() as f32,
         offset: observer.brightness.b as f32,
@@ -151,6 +152,7 @@ pub fn observe(
 pub(super) struct PixelObserver<'a> {
     image: &'a GradientImage,
     candidates: &'a Image<bool>,
+    structure: &'a Image<[f32; 3]>,
     observer: &'a Observer<'a>,
     gain: f32,
     offset: f32,
@@ -193,15 +195,9 @@ impl PixelObserver<'_> {
         else {
             return;
         };
-        let (vu, vv) = line.velocity(&at);
-        // Cheap refusal before the patch is read: even a match without photometric error is too coarse.
-        let least = (self.matching.line_noise_px.powi(2) + self.matching.sampling_noise_px.powi(2))
-            / (vu * vu + vv * vv);
-        if !(least < self.params.max_variance_ratio * hypothesis.variance) {
-            return;
-        }
-        let patch = Patch::new(self.image, u, v, self.gain, self.offset);
-        let Some(conditioning) = condition(view, &line, &at, &patch, self.matching) else { return };
+        let structure = &self.structure.row(v)[u];
+        let conditioning = condition(view, &line, &at, structure, self.gain, self.matching);
+        let Some(conditioning) = conditioning else { return };
         let expected = conditioning.inverse_depth_per_px.powi(2) * conditioning.match_variance;
         if expected > self.params.max_variance_ratio * hypothesis.variance {
             return;
@@ -212,6 +208,7 @@ impl PixelObserver<'_> {
         else {
             return;
         };
+        let patch = Patch::new(self.image, u, v, self.gain, self.offset);
         match search(frame, &line, &patch, &conditioning, &from, &to, self.matching) {
             Ok(found) => {
                 counts.attempted += 1;
@@ -284,8 +281,10 @@ impl PixelObserver<'_> {
         {
             return;
         }
+        let structure = &self.structure.row(v)[u];
+        let conditioning = condition(view, &line, &at, structure, self.gain, self.matching);
+        let Some(conditioning) = conditioning else { return };
         let patch = Patch::new(self.image, u, v, self.gain, self.offset);
-        let Some(conditioning) = condition(view, &line, &at, &patch, self.matching) else { return };
         match search(frame, &line, &patch, &conditioning, &from, &to, self.matching) {
             Ok(found)
                 if found.inverse_depth > 0.0

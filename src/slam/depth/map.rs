@@ -1,6 +1,9 @@
 //! The semi-dense inverse-depth map of one keyframe: the image with its gradients, and a hypothesis
 //! at every pixel that has one.
 
+use rayon::prelude::*;
+
+use crate::slam::depth::matching::PATTERN;
 use crate::slam::image::buffer::Image;
 
 /// Pixels nearer to the border than this carry no depth: the matching pattern reaches 2 pixels, its
@@ -118,6 +121,8 @@ pub struct DepthMap {
     pub hypotheses: Image<Hypothesis>,
     /// Whether a pixel has enough gradient to carry depth.
     pub candidates: Image<bool>,
+    /// Σ (g_u², g_u g_v, g_v²) over the matching pattern around each candidate.
+    pub structure: Image<[f32; 3]>,
 }
 
 impl DepthMap {
@@ -127,6 +132,7 @@ impl DepthMap {
             image: GradientImage::with_size(width, height),
             hypotheses: Image::filled(width, height, Hypothesis::NONE),
             candidates: Image::filled(width, height, false),
+            structure: Image::filled(width, height, [0.0; 3]),
         }
     }
 
@@ -136,6 +142,25 @@ impl DepthMap {
         self.image.fill(pixels);
         self.hypotheses.pixels_mut().fill(Hypothesis::NONE);
         self.choose_candidates(min_gradient, max_candidates);
+        self.sum_structure();
+    }
+
+    fn sum_structure(&mut self) {
+        let width = self.image.width();
+        let candidates = &self.candidates;
+        let gradient_u = self.image.gradient_u.pixels();
+        let gradient_v = self.image.gradient_v.pixels();
+        let offsets = PATTERN.map(|(x, y)| y as isize * width as isize + x as isize);
+        self.structure.pixels_mut().par_chunks_exact_mut(width).enumerate().for_each(|(v, row)| {
+            for (u, structure) in row.iter_mut().enumerate().filter(|(u, _)| candidates.at(*u, v)) {
+                let centre = v * width + u;
+                *structure = offsets.iter().fold([0.0; 3], |[uu, uv, vv], &offset| {
+                    let i = centre.wrapping_add_signed(offset);
+                    let (gu, gv) = (gradient_u[i], gradient_v[i]);
+                    [uu + gu * gu, uv + gu * gv, vv + gv * gv]
+                });
+            }
+        });
     }
 
     fn choose_candidates(&mut self, min_gradient: f32, max_candidates: usize) {

@@ -105,11 +105,10 @@ impl Patch {
 pub struct Conditioning {
     /// Unit direction of the line in the frame, towards larger inverse depth.
     direction: (f32, f32),
-    /// Patch offsets in the frame.
-    offsets_u: [f32; 8],
-    offsets_v: [f32; 8],
-    /// Gradient along the line by sample, grey levels a pixel of the frame.
-    line_gradients: [f32; 8],
+    /// The same direction in the keyframe: the step there of one pixel here.
+    along: (f32, f32),
+    /// Jacobian of the frame's position by the keyframe's, row-major.
+    warp: [f32; 4],
     /// Mean squared gradient of the patch.
     squared_gradient: f32,
     /// Variance of the match along the line, pixels².
@@ -142,14 +141,16 @@ pub enum Miss {
     Ambiguous,
 }
 
-/// Judges the line of a pixel at inverse depth `d`; `None` where a match would tell nothing: no
-/// parallax, behind the camera, or no gradient along the line.
+/// Judges the line of a pixel at the projection `at`, from the structure of its patch (Σ g_u², g_u g_v,
+/// g_v²) times `gain`²; `None` where a match would tell nothing: no parallax, or no gradient along
+/// the line.
 #[inline(always)]
 pub fn condition(
     view: &TwoView,
     line: &EpipolarLine,
     at: &Projection,
-    patch: &Patch,
+    structure: &[f32; 3],
+    gain: f32,
     params: &MatchingParams,
 ) -> Option<Conditioning> {
     let (vu, vv) = line.velocity(at);
@@ -174,32 +175,24 @@ pub fn condition(
         -inverse[0] * direction.1 + inverse[1] * direction.0,
         -inverse[2] * direction.1 + inverse[3] * direction.0,
     );
-    let mut line_gradients = [0.0; 8];
-    let (mut information, mut mixed, mut perpendicular) = (0.0, 0.0, 0.0);
-    for k in 0..PATTERN.len() {
-        let g = patch.gradient_u[k] * along.0 + patch.gradient_v[k] * along.1;
-        let h = patch.gradient_u[k] * across.0 + patch.gradient_v[k] * across.1;
-        line_gradients[k] = g;
-        information += g * g;
-        mixed += g * h;
-        perpendicular += h * h;
-    }
+    let [uu, uv, vv] = structure.map(|sum| gain * gain * sum);
+    let product = |a: (f32, f32), b: (f32, f32)| {
+        uu * a.0 * b.0 + uv * (a.0 * b.1 + a.1 * b.0) + vv * a.1 * b.1
+    };
+    let information = product(along, along);
     let samples = PATTERN.len() as f32;
-    if information < samples * params.min_line_gradient * params.min_line_gradient {
+    if !(information >= samples * params.min_line_gradient * params.min_line_gradient) {
         return None;
     }
-    let tangent = mixed / information;
+    let tangent = product(along, across) / information;
     let geometric = params.line_noise_px * params.line_noise_px * (1.0 + tangent * tangent);
     let photometric = 2.0 * params.image_noise * params.image_noise / information;
     let sampling = params.sampling_noise_px * params.sampling_noise_px;
-    let offsets_u = PATTERN.map(|(x, y)| warp[0] * x as f32 + warp[1] * y as f32);
-    let offsets_v = PATTERN.map(|(x, y)| warp[2] * x as f32 + warp[3] * y as f32);
     Some(Conditioning {
         direction,
-        offsets_u,
-        offsets_v,
-        line_gradients,
-        squared_gradient: (information + perpendicular) / samples,
+        along,
+        warp,
+        squared_gradient: (information + product(across, across)) / samples,
         match_variance: geometric + photometric + sampling,
         inverse_depth_per_px: 1.0 / speed,
     })
@@ -232,7 +225,7 @@ pub fn search(
     {
         return Err(Miss::OutOfView);
     }
-    let along = Along { frame, patch, conditioning, middle };
+    let along = Along::new(frame, patch, conditioning, middle);
     let steps =
         if length < MIN_SEARCH_PX { 0 } else { (length.ceil() as usize).min(MAX_STEPS - 1) };
     let mut start = 0.0;
@@ -282,9 +275,13 @@ pub fn search(
 /// The patch as a function of its place λ along the line, pixels from `middle`.
 struct Along<'a> {
     frame: &'a QuadImage,
-    patch: &'a Patch,
-    conditioning: &'a Conditioning,
-    middle: (f32, f32),
+    intensity: &'a [f32; 8],
+    direction: (f32, f32),
+    /// Position of each sample at λ = 0.
+    u: [f32; 8],
+    v: [f32; 8],
+    /// Gradient along the line by sample, grey levels a pixel of the frame.
+    line_gradients: [f32; 8],
 }
 
 /// The patch at one place.
@@ -301,17 +298,33 @@ struct Evaluation {
 /// Residuals beyond this many grey levels grow linearly (Engel, Koltun, Cremers 2018).
 const HUBER_GREY: f32 = 9.0;
 
-impl Along<'_> {
+impl<'a> Along<'a> {
+    #[inline(always)]
+    fn new(
+        frame: &'a QuadImage,
+        patch: &'a Patch,
+        conditioning: &Conditioning,
+        middle: (f32, f32),
+    ) -> Self {
+        let Conditioning { direction, along, warp, .. } = *conditioning;
+        let (mut u, mut v, mut line_gradients) = ([0.0; 8], [0.0; 8], [0.0; 8]);
+        for k in 0..PATTERN.len() {
+            let (x, y) = (PATTERN[k].0 as f32, PATTERN[k].1 as f32);
+            u[k] = middle.0 + (warp[0] * x + warp[1] * y);
+            v[k] = middle.1 + (warp[2] * x + warp[3] * y);
+            line_gradients[k] = patch.gradient_u[k] * along.0 + patch.gradient_v[k] * along.1;
+        }
+        Self { frame, intensity: &patch.intensity, direction, u, v, line_gradients }
+    }
+
     #[inline(always)]
     fn evaluate(&self, lambda: f32) -> Evaluation {
-        let Conditioning { direction, offsets_u, offsets_v, line_gradients, .. } =
-            self.conditioning;
-        let u = self.middle.0 + lambda * direction.0;
-        let v = self.middle.1 + lambda * direction.1;
-        let samples = self.frame.sample(&offsets_u.map(|o| u + o), &offsets_v.map(|o| v + o));
+        let line_gradients = &self.line_gradients;
+        let (du, dv) = (lambda * self.direction.0, lambda * self.direction.1);
+        let samples = self.frame.sample(&self.u.map(|u| u + du), &self.v.map(|v| v + dv));
         let (mut costs, mut gradients, mut informations) = ([0.0; 8], [0.0; 8], [0.0; 8]);
         for k in 0..PATTERN.len() {
-            let residual = samples[k] - self.patch.intensity[k];
+            let residual = samples[k] - self.intensity[k];
             let magnitude = residual.abs();
             let weight = if magnitude <= HUBER_GREY { 1.0 } else { HUBER_GREY / magnitude };
             costs[k] = weight * (2.0 - weight) * residual * residual;
@@ -424,6 +437,12 @@ mod tests {
         image
     }
 
+    fn structure(patch: &Patch) -> [f32; 3] {
+        let sum = |a: &[f32; 8], b: &[f32; 8]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f32>();
+        let (gu, gv) = (&patch.gradient_u, &patch.gradient_v);
+        [sum(gu, gu), sum(gu, gv), sum(gv, gv)]
+    }
+
     fn image(pixels: &[u8]) -> GradientImage {
         let mut image = GradientImage::with_size(CAMERA.width, CAMERA.height);
         image.fill(pixels);
@@ -446,7 +465,9 @@ mod tests {
                     continue;
                 };
                 let at = line.project(0.85).unwrap();
-                let Some(conditioning) = condition(&view, &line, &at, &patch, &params) else {
+                let Some(conditioning) =
+                    condition(&view, &line, &at, &structure(&patch), 1.0, &params)
+                else {
                     continue;
                 };
                 let Ok(found_match) =
@@ -479,7 +500,8 @@ mod tests {
             (line.project(0.4).unwrap(), line.project(1.2).unwrap(), line.project(0.8).unwrap());
         let attempt = |gain, offset| {
             let patch = Patch::new(&keyframe, 100, 75, gain, offset);
-            let conditioning = condition(&view, &line, &at, &patch, &params).unwrap();
+            let conditioning =
+                condition(&view, &line, &at, &structure(&patch), 1.0, &params).unwrap();
             search(&frame, &line, &patch, &conditioning, &from, &to, &params)
         };
         assert!((attempt(0.8, 20.0).unwrap().inverse_depth - 0.8).abs() < 0.03);
@@ -496,7 +518,8 @@ mod tests {
             let line = view.line(u as f32, 75.0);
             let patch = Patch::new(&keyframe, u, 75, 1.0, 0.0);
             let at = line.project(0.8).unwrap();
-            let conditioning = condition(&view, &line, &at, &patch, &params).unwrap();
+            let conditioning =
+                condition(&view, &line, &at, &structure(&patch), 1.0, &params).unwrap();
             search(
                 &frame,
                 &line,

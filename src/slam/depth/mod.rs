@@ -15,3 +15,4 @@ pub mod matching;
 mod observation_kernel;
 pub mod propagation;
 pub mod regularisation;
+mod smoothing_kernel;

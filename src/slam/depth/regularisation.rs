@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::gaussian::NEW_VALIDITY;
 use crate::slam::depth::map::{BORDER_PX, DepthMap, Hypothesis};
+use crate::slam::depth::smoothing_kernel::sums_kernel;
 use crate::slam::image::buffer::Image;
 use crate::slam::parameter::{ParameterError, check_range};
 
@@ -52,68 +53,142 @@ impl RegularisationParams {
     }
 }
 
-/// Regularises `map`; `scratch` is memory of the same size. Rows are independent of each other.
+/// Memory of the regularisation.
+#[derive(Debug, Clone)]
+pub struct RegularisationScratch {
+    /// Filtered inverse depth and variance as planes, variance negative where there is none.
+    inverse_depth: Image<f32>,
+    variance: Image<f32>,
+    hypotheses: Image<Hypothesis>,
+}
+
+impl RegularisationScratch {
+    /// For maps of this size.
+    pub fn with_size(width: usize, height: usize) -> Self {
+        Self {
+            inverse_depth: Image::filled(width, height, 0.0),
+            variance: Image::filled(width, height, -1.0),
+            hypotheses: Image::filled(width, height, Hypothesis::NONE),
+        }
+    }
+}
+
+/// Regularises `map`. Rows are independent of each other: the result does not depend on the number
+/// of threads.
 pub fn regularise(
     map: &mut DepthMap,
-    scratch: &mut Image<Hypothesis>,
+    scratch: &mut RegularisationScratch,
     params: &RegularisationParams,
 ) {
     let (width, height) = (map.image.width(), map.image.height());
+    let RegularisationScratch { inverse_depth, variance, hypotheses } = scratch;
     let (before, candidates) = (&map.hypotheses, &map.candidates);
-    scratch.pixels_mut().par_chunks_exact_mut(width).enumerate().for_each(|(v, row)| {
+    let planes = inverse_depth.pixels_mut().par_chunks_exact_mut(width);
+    let planes = planes.zip(variance.pixels_mut().par_chunks_exact_mut(width));
+    planes.enumerate().for_each(|(v, (d, variance))| {
+        for ((d, variance), hypothesis) in d.iter_mut().zip(variance).zip(before.row(v)) {
+            (*d, *variance) = (hypothesis.inverse_depth, hypothesis.variance);
+        }
+    });
+    let neighbourhood = Neighbourhood { inverse_depth, variance, params };
+    let sum_neighbours = sums_kernel();
+    hypotheses.pixels_mut().par_chunks_exact_mut(width).enumerate().for_each(|(v, row)| {
         row.copy_from_slice(before.row(v));
         if !(BORDER_PX..height - BORDER_PX).contains(&v) {
             return;
         }
-        for (u, out) in row.iter_mut().enumerate().take(width - BORDER_PX).skip(BORDER_PX) {
-            if out.is_some() {
-                smooth(out, before, u, v, params);
-            } else if candidates.at(u, v) {
-                fill(out, before, u, v, params);
+        for first in (BORDER_PX..width - BORDER_PX).step_by(LANES) {
+            let block = first..(first + LANES).min(width - BORDER_PX);
+            if row[block.clone()].iter().any(Hypothesis::is_some) {
+                // The last block overlaps the one before it, so that every block is whole.
+                let first = first.min(width - BORDER_PX - LANES);
+                smooth(
+                    &mut row[first..first + LANES],
+                    &sum_neighbours(&neighbourhood, first, v),
+                    params,
+                );
+            }
+            for u in block {
+                if !before.at(u, v).is_some() && candidates.at(u, v) {
+                    fill(&mut row[u], before, u, v, params);
+                }
             }
         }
     });
-    std::mem::swap(&mut map.hypotheses, scratch);
+    std::mem::swap(&mut map.hypotheses, hypotheses);
 }
 
-/// Whether two inverse depths can lie on one surface.
-#[inline]
-fn is_consistent(a: &Hypothesis, b: &Hypothesis, slack: f32) -> bool {
-    let difference = a.inverse_depth - b.inverse_depth;
-    let tolerance = slack * a.inverse_depth;
-    difference * difference <= a.variance + b.variance + tolerance * tolerance
+/// Pixels that are summed at a time.
+pub(super) const LANES: usize = 8;
+
+/// The map before smoothing.
+pub(super) struct Neighbourhood<'a> {
+    inverse_depth: &'a Image<f32>,
+    variance: &'a Image<f32>,
+    params: &'a RegularisationParams,
 }
 
-fn smooth(
-    out: &mut Hypothesis,
-    before: &Image<Hypothesis>,
-    u: usize,
-    v: usize,
-    params: &RegularisationParams,
-) {
-    let centre = *out;
-    let spread = params.distance_std_dev * params.distance_std_dev;
-    let (mut sum, mut weights, mut neighbours) = (0.0, 0.0, 0u8);
-    for y in v - RADIUS..=v + RADIUS {
-        for (x, other) in before.row(y)[u - RADIUS..=u + RADIUS].iter().enumerate() {
-            if !other.is_some() || !is_consistent(&centre, other, params.surface_slack_ratio) {
-                continue;
+/// Sums over the consistent neighbours of [`LANES`] pixels, each pixel its own neighbour.
+pub(super) struct NeighbourSums {
+    weighted: [f32; LANES],
+    weights: [f32; LANES],
+    count: [f32; LANES],
+}
+
+impl Neighbourhood<'_> {
+    /// The sums of the pixels from `first` on in row `v`.
+    #[inline(always)]
+    pub(super) fn sums(&self, first: usize, v: usize) -> NeighbourSums {
+        let spread = self.params.distance_std_dev * self.params.distance_std_dev;
+        let slack = self.params.surface_slack_ratio;
+        let load = |image: &Image<f32>, u: usize, v: usize| {
+            let mut lanes = [0.0; LANES];
+            lanes.copy_from_slice(&image.row(v)[u..u + LANES]);
+            lanes
+        };
+        let centre = load(self.inverse_depth, first, v);
+        let centre_variance = load(self.variance, first, v);
+        let mut allowed = [0.0; LANES];
+        for k in 0..LANES {
+            let tolerance = slack * centre[k];
+            allowed[k] = centre_variance[k] + tolerance * tolerance;
+        }
+        let mut sums =
+            NeighbourSums { weighted: [0.0; LANES], weights: [0.0; LANES], count: [0.0; LANES] };
+        for y in v - RADIUS..=v + RADIUS {
+            for x in 0..=2 * RADIUS {
+                let d = load(self.inverse_depth, first + x - RADIUS, y);
+                let variance = load(self.variance, first + x - RADIUS, y);
+                let (dx, dy) = (x as f32 - RADIUS as f32, y as f32 - v as f32);
+                let distance = spread * (dx * dx + dy * dy);
+                for k in 0..LANES {
+                    let difference = d[k] - centre[k];
+                    let consistent =
+                        variance[k] >= 0.0 && difference * difference <= allowed[k] + variance[k];
+                    let weight = if consistent { 1.0 / (variance[k] + distance) } else { 0.0 };
+                    sums.weighted[k] += weight * d[k];
+                    sums.weights[k] += weight;
+                    sums.count[k] += if consistent { 1.0 } else { 0.0 };
+                }
             }
-            let (dx, dy) = (x as f32 - RADIUS as f32, y as f32 - v as f32);
-            let weight = 1.0 / (other.variance + spread * (dx * dx + dy * dy));
-            sum += weight * other.inverse_depth;
-            weights += weight;
-            neighbours += 1;
+        }
+        sums
+    }
+}
+
+/// Smooths the hypotheses of a block, and drops those with too few neighbours.
+fn smooth(block: &mut [Hypothesis], sums: &NeighbourSums, params: &RegularisationParams) {
+    for (k, hypothesis) in block.iter_mut().enumerate().filter(|(_, h)| h.is_some()) {
+        // The pixel itself is among the consistent ones.
+        if sums.count[k] <= f32::from(params.min_neighbours) || !(sums.weights[k] > 0.0) {
+            hypothesis.reject();
+        } else {
+            hypothesis.smoothed = sums.weighted[k] / sums.weights[k];
         }
     }
-    // The pixel itself is among the consistent ones.
-    if neighbours <= params.min_neighbours || !(weights > 0.0) {
-        out.reject();
-    } else {
-        out.smoothed = sum / weights;
-    }
 }
 
+/// Gives a pixel the mean of its neighbours, where they are many and agree.
 fn fill(
     out: &mut Hypothesis,
     before: &Image<Hypothesis>,
@@ -179,7 +254,7 @@ mod tests {
     }
 
     fn run(map: &mut DepthMap) {
-        let mut scratch = map.hypotheses.clone();
+        let mut scratch = RegularisationScratch::with_size(32, 32);
         regularise(map, &mut scratch, &RegularisationParams::default());
     }
 
