@@ -265,7 +265,7 @@ fn without_budget_the_best_so_far_is_given() {
         assert_eq!(alignment.ending, ending);
         errors.push((alignment.state.current_from_keyframe * truth.inverse()).log().norm());
     }
-    assert!(errors[0] > errors[1] && errors[1] > errors[2], "{errors:?}");
+    assert!(errors[1] < 0.25 * errors[0] && errors[2] < 0.1 * errors[0], "{errors:?}");
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! Four lanes of plain arithmetic: the same bits on every CPU, and what NEON is compiled from.
 
-use crate::slam::alignment::kernel::lanes::{Lanes, Sample};
+use crate::slam::alignment::kernel::lanes_kernel::{Lanes, Sample};
 
 /// Four floats.
 #[derive(Clone, Copy)]

@@ -1,14 +1,14 @@
 //! The loop over points, for the instructions that the CPU has.
 //!
-//! [`accumulate`] is the algorithm, once, over any [`lanes::Lanes`]; the instruction sets are
+//! `accumulate_kernel` is the algorithm, once, over any `lanes_kernel::Lanes`; the instruction sets are
 //! chosen at run time. The portable one is plain arithmetic without fused multiply-add and gives
 //! the same bits on every CPU. `residual::accumulate_reference` is the explanation of all.
 
-mod accumulate;
-mod lanes;
-mod portable;
+mod accumulate_kernel;
+mod lanes_kernel;
+mod portable_kernel;
 #[cfg(target_arch = "x86_64")]
-mod x86;
+mod x86_kernel;
 
 use crate::slam::alignment::normal_equations::NormalEquations;
 use crate::slam::alignment::points::LevelPoints;
@@ -80,15 +80,15 @@ impl Kernel {
         match self {
             // SAFETY: plain arithmetic needs no instructions; the bounds were checked above.
             Self::Portable => unsafe {
-                accumulate::accumulate::<portable::FourLanes>(points, image, at)
+                accumulate_kernel::accumulate::<portable_kernel::FourLanes>(points, image, at)
             },
             // SAFETY: only `available` makes this value, after it has found AVX2 and FMA; the
             // bounds were checked above.
             #[cfg(target_arch = "x86_64")]
-            Self::Avx2 => unsafe { x86::accumulate_avx2(points, image, at) },
+            Self::Avx2 => unsafe { x86_kernel::accumulate_avx2(points, image, at) },
             // SAFETY: as above with AVX-512F.
             #[cfg(target_arch = "x86_64")]
-            Self::Avx512 => unsafe { x86::accumulate_avx512(points, image, at) },
+            Self::Avx512 => unsafe { x86_kernel::accumulate_avx512(points, image, at) },
         }
     }
 }

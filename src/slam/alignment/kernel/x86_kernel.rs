@@ -2,8 +2,8 @@
 
 use std::arch::x86_64::*;
 
-use crate::slam::alignment::kernel::accumulate::accumulate;
-use crate::slam::alignment::kernel::lanes::{Lanes, Sample};
+use crate::slam::alignment::kernel::accumulate_kernel::accumulate;
+use crate::slam::alignment::kernel::lanes_kernel::{Lanes, Sample};
 use crate::slam::alignment::normal_equations::NormalEquations;
 use crate::slam::alignment::points::LevelPoints;
 use crate::slam::alignment::residual::Evaluation;

@@ -4,7 +4,7 @@
 //! point, the columns of the whitened Jacobian √w J and residual √w r; then five passes sum their
 //! products with at most eleven sums each, what sixteen registers hold without spilling.
 
-use crate::slam::alignment::kernel::lanes::Lanes;
+use crate::slam::alignment::kernel::lanes_kernel::Lanes;
 use crate::slam::alignment::normal_equations::{NormalEquations, UNKNOWNS};
 use crate::slam::alignment::points::{LANES, LevelPoints, PointBlock};
 use crate::slam::alignment::residual::{
