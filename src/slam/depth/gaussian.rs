@@ -27,9 +27,10 @@ pub struct GaussianParams {
     /// A pixel is observed only when one match promises a variance below this many times its own:
     /// waiting for baseline costs nothing and gains more than averaging equal views.
     pub max_variance_ratio: f32,
-    /// Share of the match variance that is common to all observations of a pixel, because the
-    /// keyframe's own noise is in each: the variance never falls below this share of the best
-    /// single observation.
+    /// Share of the match variance that is common to all observations of a pixel: the keyframe's own
+    /// noise, the pose's error and the interpolation of the same patch are in each. The variance never
+    /// falls below this share of the best single observation; at 1 repeated views are averaged but
+    /// not believed more, which is what the coverage of the simulated room asks for.
     pub common_noise_ratio: f32,
     /// Factor on the variance before each fusion: the world and the poses are never quite still.
     pub process_inflation: f32,
@@ -50,7 +51,7 @@ impl Default for GaussianParams {
             search_sigmas: 2.0,
             gate_sigmas: 2.5,
             max_variance_ratio: 1.2,
-            common_noise_ratio: 0.5,
+            common_noise_ratio: 1.0,
             process_inflation: 1.01,
             contradiction_inflation: 1.2,
             max_std_dev: 0.5,

@@ -48,7 +48,7 @@ impl Default for MatchingParams {
     fn default() -> Self {
         Self {
             image_noise: 3.0,
-            line_noise_px: 0.1,
+            line_noise_px: 0.2,
             sampling_noise_px: 0.05,
             max_search_px: 40.0,
             min_line_gradient: 2.0,
