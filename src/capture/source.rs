@@ -228,7 +228,7 @@ pub fn open(
             Ok(Box::new(Simulator::new(params)?))
         }
         SourceName::Camera(_) => Err(unavailable(
-            "this binary was built without camera support; build it with --features v4l",
+            "this version opens no cameras; record images and use images:DIR, or the simulator with sim",
         )),
     }
 }

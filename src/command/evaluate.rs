@@ -7,6 +7,7 @@ use std::process::ExitCode;
 
 use clap::{Args, ValueEnum};
 
+use crate::command::print::print;
 use crate::service::atomic_file::write_atomically;
 use crate::service::results::report::evaluation_plot::evaluation_plot;
 use crate::service::results::summary::TrajectorySummary;
@@ -85,7 +86,7 @@ pub fn run(args: &EvaluateArgs) -> Result<ExitCode, Box<dyn Error>> {
     } else {
         evaluation_text(&evaluation, estimate.len(), alignment)
     };
-    writeln!(std::io::stdout(), "{text}")?;
+    print(&format!("{text}\n"))?;
     Ok(ExitCode::SUCCESS)
 }
 

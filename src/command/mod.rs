@@ -6,6 +6,7 @@
 pub mod capture;
 pub mod evaluate;
 pub mod mapper;
+pub mod print;
 pub mod progress;
 pub mod replay;
 pub mod run;
@@ -21,12 +22,16 @@ use std::process::ExitCode;
 
 use clap::{Args, Parser, Subcommand};
 
+use crate::command::print::{PrintError, note};
 use crate::service::child::{ERROR_PREFIX, follow_supervisor};
 use crate::service::config::{Config, ConfigError};
 use crate::wire::place::Place;
 
 /// Exit code of a run that was interrupted: 128 + SIGINT, as shells have it.
 const INTERRUPTED: u8 = 130;
+
+/// Heading of the options that every command has.
+const COMMON: &str = "Common options";
 
 /// What a command may fail with: one line for the user.
 pub type CommandResult = Result<ExitCode, Box<dyn Error>>;
@@ -52,16 +57,16 @@ struct CommandLine {
 #[derive(Debug, Clone, Args)]
 pub struct CommonArguments {
     /// Configuration file [default: /etc/semidense/semidense.toml where it exists]
-    #[arg(long, global = true, value_name = "FILE")]
+    #[arg(long, global = true, help_heading = COMMON, value_name = "FILE")]
     pub config: Option<PathBuf>,
     /// Set one key of the configuration, as in mapper.threads=2; may be repeated
-    #[arg(long, global = true, value_name = "KEY=VALUE")]
+    #[arg(long, global = true, help_heading = COMMON, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
     /// Name of the instance: two of different names run side by side [default: semidense]
-    #[arg(long, global = true, value_name = "NAME")]
+    #[arg(long, global = true, help_heading = COMMON, value_name = "NAME")]
     pub instance: Option<String>,
     /// What to log: error, warn, info, debug or trace, also by module
-    #[arg(long, global = true, value_name = "LEVEL", default_value = "warn")]
+    #[arg(long, global = true, help_heading = COMMON, value_name = "LEVEL", default_value = "warn")]
     pub log: String,
 }
 
@@ -91,7 +96,7 @@ enum Subcommands {
     Tracker(tracker::TrackerArguments),
     Mapper(mapper::MapperArguments),
     Replay(replay::ReplayArgs),
-    Simulate(simulate::SimulateArgs),
+    Simulate(Box<simulate::SimulateArgs>),
     Evaluate(evaluate::EvaluateArgs),
     Status(status::StatusArguments),
 }
@@ -106,7 +111,7 @@ pub fn main() -> ExitCode {
             Subcommands::Tracker(arguments) => tracker::run(&config, arguments),
             Subcommands::Mapper(arguments) => mapper::run(&config, arguments),
             Subcommands::Replay(arguments) => replay::run(&config, &arguments),
-            Subcommands::Simulate(arguments) => simulate::run(&arguments),
+            Subcommands::Simulate(arguments) => simulate::run(&config, &arguments),
             Subcommands::Evaluate(arguments) => evaluate::run(&arguments),
             Subcommands::Status(arguments) => status::run(&config, arguments),
         };
@@ -114,8 +119,11 @@ pub fn main() -> ExitCode {
         outcome
     });
     outcome.unwrap_or_else(|error| {
+        if error.downcast_ref::<PrintError>().is_some_and(PrintError::is_reader_gone) {
+            return ExitCode::SUCCESS;
+        }
         let line = error.to_string().split_whitespace().collect::<Vec<_>>().join(" ");
-        eprintln!("{ERROR_PREFIX}{line}");
+        note(&format!("{ERROR_PREFIX}{line}"));
         ExitCode::FAILURE
     })
 }

@@ -5,6 +5,8 @@ use std::io::IsTerminal;
 
 use indicatif::{ProgressBar, ProgressStyle};
 
+use crate::command::print::note;
+
 /// Plain lines over the whole work where its length is known.
 const PLAIN_LINES: usize = 10;
 
@@ -50,7 +52,7 @@ impl Progress {
         if done.is_multiple_of(interval) || self.total == Some(done) {
             let of = self.total.map(|total| format!("/{total}")).unwrap_or_default();
             let separator = if detail.is_empty() { "" } else { ", " };
-            eprintln!("{} {done}{of}{separator}{detail}", self.what);
+            note(&format!("{} {done}{of}{separator}{detail}", self.what));
         }
     }
 

@@ -9,6 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use clap::{Args, ValueEnum};
 
 use crate::capture::source::{FrameSource, SourceName, open};
+use crate::command::print::print;
 use crate::command::progress::Progress;
 use crate::service::config::Config;
 use crate::service::replay::{DepthOrigin, PoseOrigin, ReplayConfig, ReplayProgress, replay};
@@ -43,7 +44,7 @@ enum InitialDepth {
 /// Run a recorded or simulated sequence in one process: every frame, the same bits on every run
 #[derive(Debug, Args)]
 pub struct ReplayArgs {
-    /// sim[:SCENE], tum:DIR, euroc:DIR or images:DIR
+    /// sim, sim:SCENE, tum:DIR, euroc:DIR or images:DIR
     source: SourceName,
     /// Camera file; needed where the folder has no camera.txt
     #[arg(long, value_name = "FILE")]
@@ -96,10 +97,10 @@ pub fn run(config: &Config, args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error
         write_debug_pictures(&args.output.join("debug"), &record.map)?;
     }
     if args.json {
-        println!("{}", serde_json::to_string_pretty(&summary)?);
+        print(&format!("{}\n", serde_json::to_string_pretty(&summary)?))?;
     } else {
-        print!("{}", summary_text(&summary));
-        println!("results in {}", args.output.display());
+        let place = args.output.display();
+        print(&format!("{}results in {place}\n", summary_text(&summary)))?;
     }
     let code = if interrupted.load(Ordering::Relaxed) { INTERRUPTED } else { 0 };
     Ok(ExitCode::from(code))

@@ -7,6 +7,7 @@ use clap::Args;
 
 use crate::capture::source::SourceName;
 use crate::command::capture::{ModeArguments, usual_mode};
+use crate::command::print::{note, print};
 use crate::command::run_progress::RunDisplay;
 use crate::command::{CommandResult, CommonArguments, INTERRUPTED};
 use crate::service::config::Config;
@@ -18,7 +19,7 @@ use crate::service::supervisor::{Ended, RunOptions, run as supervise};
 /// Start capture, tracker and mapper on a source, watch them, and write the results
 #[derive(Debug, Args)]
 pub struct RunArguments {
-    /// Where frames come from: sim, sim:SCENE, tum:DIR, euroc:DIR, images:DIR or v4l:DEVICE
+    /// Where frames come from: sim, sim:SCENE, tum:DIR, euroc:DIR or images:DIR
     #[arg(long, value_name = "SOURCE", default_value = "sim")]
     source: String,
     /// Rig file with the camera's calibration
@@ -51,7 +52,7 @@ pub fn run(config: &Config, common: &CommonArguments, arguments: RunArguments) -
     let mut outcome = supervise(config, &options, &shutdown, &mut |p| display.show(p))?;
     display.finish();
     if outcome.record.poses.is_empty() && outcome.ended == Ended::Interrupted {
-        eprintln!("interrupted before the first pose: there are no results");
+        note("interrupted before the first pose: there are no results");
         return Ok(ExitCode::from(INTERRUPTED));
     }
     if let (true, Ended::Failed(cause)) = (outcome.record.poses.is_empty(), &outcome.ended) {
@@ -60,15 +61,15 @@ pub fn run(config: &Config, common: &CommonArguments, arguments: RunArguments) -
     let source = outcome.source.as_mut();
     let summary = write_results(&arguments.output, &outcome.record, source, &config.results)?;
     if arguments.json {
-        println!("{}", serde_json::to_string_pretty(&summary)?);
+        print(&format!("{}\n", serde_json::to_string_pretty(&summary)?))?;
     } else {
-        print!("{}", summary_text(&summary));
-        println!("results in {}", arguments.output.display());
+        let place = arguments.output.display();
+        print(&format!("{}results in {place}\n", summary_text(&summary)))?;
     }
     match outcome.ended {
         Ended::Finished => Ok(ExitCode::SUCCESS),
         Ended::Interrupted => {
-            eprintln!("interrupted: the results so far are in {}", arguments.output.display());
+            note(&format!("interrupted: the results so far are in {}", arguments.output.display()));
             Ok(ExitCode::from(INTERRUPTED))
         }
         Ended::Failed(cause) => Err(cause.into()),

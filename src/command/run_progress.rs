@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
+use crate::command::print::note;
 use crate::service::supervisor::RunProgress;
 use crate::slam::pose::TrackingState;
 
@@ -52,7 +53,7 @@ impl RunDisplay {
         }
         let due = self.last_line.is_none_or(|last| last.elapsed() >= LINE_PERIOD);
         if !self.is_quiet && total > 0 && (due || has_changed) {
-            eprintln!("{prefix} {done}/{total} {message}");
+            note(&format!("{prefix} {done}/{total} {message}"));
             self.last_line = Some(Instant::now());
         }
     }

@@ -12,12 +12,12 @@ use serde::Serialize;
 
 use crate::capture::dataset_writer::{DatasetError, DatasetLayout, DatasetWriter};
 use crate::capture::simulator::Simulator;
-use crate::capture::simulator::params::{
-    MotionKind, MotionParams, SceneKind, SensorParams, SimulatorParams,
-};
+use crate::capture::simulator::params::{MotionKind, SceneKind, SimulatorParams};
 use crate::capture::simulator::summary::{PathSummary, gradient_share, summarize};
 use crate::capture::source::FrameSource;
+use crate::command::print::{note, print};
 use crate::command::progress::Progress;
+use crate::service::config::Config;
 
 /// Exit code of work that Ctrl-C ended, as shells have it (128 + SIGINT).
 const INTERRUPTED: u8 = 130;
@@ -58,7 +58,8 @@ enum Motion {
 
 /// Write a simulated sequence as a dataset: images, exact depth, exact poses
 ///
-/// The same options and seed give the same bytes, on any number of threads.
+/// What is not said is taken from the configuration, section `simulator`. The same values and seed
+/// give the same bytes, on any number of threads.
 #[derive(Debug, Args)]
 pub struct SimulateArgs {
     /// Folder of the dataset; refused when it is not empty
@@ -74,29 +75,29 @@ pub struct SimulateArgs {
     #[arg(long)]
     json: bool,
     /// What is seen
-    #[arg(long, value_enum, default_value = "room")]
-    scene: Scene,
+    #[arg(long, value_enum)]
+    scene: Option<Scene>,
     /// Number of frames
-    #[arg(long, value_name = "N", default_value_t = SimulatorParams::default().frames)]
-    frames: usize,
+    #[arg(long, value_name = "N")]
+    frames: Option<usize>,
     /// Chooses textures, path and noise
-    #[arg(long, value_name = "N", default_value_t = SimulatorParams::default().seed)]
-    seed: u64,
+    #[arg(long, value_name = "N")]
+    seed: Option<u64>,
     /// Frames a second
-    #[arg(long, value_name = "HZ", default_value_t = SimulatorParams::default().rate_hz)]
-    rate: f64,
+    #[arg(long, value_name = "HZ")]
+    rate: Option<f64>,
     /// Image width in pixels
-    #[arg(long, value_name = "PX", default_value_t = SimulatorParams::default().width)]
-    width: usize,
+    #[arg(long, value_name = "PX")]
+    width: Option<usize>,
     /// Image height in pixels
-    #[arg(long, value_name = "PX", default_value_t = SimulatorParams::default().height)]
-    height: usize,
+    #[arg(long, value_name = "PX")]
+    height: Option<usize>,
     /// Focal length in pixels
-    #[arg(long, value_name = "PX", default_value_t = SimulatorParams::default().focal_px)]
-    focal: f64,
+    #[arg(long, value_name = "PX")]
+    focal: Option<f64>,
     /// Factor on every length of world and path
-    #[arg(long, value_name = "FACTOR", default_value_t = SimulatorParams::default().world_scale)]
-    world_scale: f64,
+    #[arg(long, value_name = "FACTOR")]
+    world_scale: Option<f64>,
     #[command(flatten, next_help_heading = "Motion")]
     motion: MotionArgs,
     #[command(flatten, next_help_heading = "Lens and sensor")]
@@ -106,45 +107,45 @@ pub struct SimulateArgs {
 #[derive(Debug, Args)]
 struct MotionArgs {
     /// How the camera moves
-    #[arg(long, value_enum, default_value = "handheld")]
-    motion: Motion,
+    #[arg(long, value_enum)]
+    motion: Option<Motion>,
     /// Mean speed in m/s
-    #[arg(long, value_name = "M/S", default_value_t = MotionParams::default().mean_speed_m_s)]
-    speed: f64,
+    #[arg(long, value_name = "M/S")]
+    speed: Option<f64>,
     /// Mean rate of turning in degrees a second
-    #[arg(long, value_name = "DEG/S", default_value_t = MotionParams::default().mean_turn_deg_s)]
-    turn: f64,
+    #[arg(long, value_name = "DEG/S")]
+    turn: Option<f64>,
     /// Factor on the tremor of the hand
-    #[arg(long, value_name = "FACTOR", default_value_t = MotionParams::default().tremor)]
-    tremor: f64,
+    #[arg(long, value_name = "FACTOR")]
+    tremor: Option<f64>,
 }
 
 #[derive(Debug, Args)]
 struct SensorArgs {
     /// Standard deviation of the pixel noise in grey levels
-    #[arg(long, value_name = "GREY", default_value_t = SensorParams::default().noise_std_dev)]
-    noise: f64,
+    #[arg(long, value_name = "GREY")]
+    noise: Option<f64>,
     /// Share of light lost in the image corners, 0 to 0.95
-    #[arg(long, value_name = "SHARE", default_value_t = SensorParams::default().vignette)]
-    vignette: f64,
+    #[arg(long, value_name = "SHARE")]
+    vignette: Option<f64>,
     /// Amplitude of the slow change of gain, as natural logarithm
-    #[arg(long, value_name = "LOG", default_value_t = SensorParams::default().gain_amplitude)]
-    gain_change: f64,
+    #[arg(long, value_name = "LOG")]
+    gain_change: Option<f64>,
     /// Amplitude of the slow change of offset in grey levels
-    #[arg(long, value_name = "GREY", default_value_t = SensorParams::default().offset_amplitude)]
-    offset_change: f64,
+    #[arg(long, value_name = "GREY")]
+    offset_change: Option<f64>,
     /// Period of both changes in seconds
-    #[arg(long, value_name = "S", default_value_t = SensorParams::default().exposure_period_s)]
-    exposure_period: f64,
+    #[arg(long, value_name = "S")]
+    exposure_period: Option<f64>,
     /// Exposure time in ms: motion blurs over it
-    #[arg(long, value_name = "MS", default_value_t = SensorParams::default().exposure_ms)]
-    exposure: f64,
+    #[arg(long, value_name = "MS")]
+    exposure: Option<f64>,
     /// Time between the starts of two rows in microseconds: rolling shutter
-    #[arg(long, value_name = "US", default_value_t = SensorParams::default().row_time_us)]
-    row_time: f64,
-    /// Lens distortion k1,k2,p1,p2[,k3[,k4,k5,k6]] (radtan, as OpenCV)
+    #[arg(long, value_name = "US")]
+    row_time: Option<f64>,
+    /// Lens distortion: 4, 5 or 8 of k1,k2,p1,p2,k3,k4,k5,k6 (radtan, as OpenCV)
     #[arg(long, value_name = "K", value_delimiter = ',', allow_hyphen_values = true)]
-    distortion: Vec<f64>,
+    distortion: Option<Vec<f64>>,
 }
 
 /// What was written.
@@ -160,8 +161,8 @@ struct Summary {
 }
 
 /// Renders, writes the dataset and prints its summary.
-pub fn run(args: &SimulateArgs) -> Result<ExitCode, Box<dyn Error>> {
-    let mut simulator = Simulator::new(params(args))?;
+pub fn run(config: &Config, args: &SimulateArgs) -> Result<ExitCode, Box<dyn Error>> {
+    let mut simulator = Simulator::new(params(&config.simulator, args))?;
     let layout = match args.layout {
         Layout::Tum => DatasetLayout::Tum,
         Layout::Euroc => DatasetLayout::Euroc,
@@ -172,21 +173,21 @@ pub fn run(args: &SimulateArgs) -> Result<ExitCode, Box<dyn Error>> {
     let interrupted = Arc::new(AtomicBool::new(false));
     signal_hook::flag::register(signal_hook::consts::SIGINT, Arc::clone(&interrupted))?;
     let Some(gradient_share) = write_frames(&mut simulator, &writer, &interrupted)? else {
-        eprintln!("semidense: interrupted; nothing was written to {}", args.output.display());
+        note(&format!("interrupted: nothing was written to {}", args.output.display()));
         return Ok(ExitCode::from(INTERRUPTED));
     };
     writer.finish(simulator.ground_truth())?;
     let summary = Summary {
         output: args.output.clone(),
-        frames: args.frames,
-        seed: args.seed,
+        frames: simulator.params().frames,
+        seed: simulator.params().seed,
         path: summarize(simulator.ground_truth()),
         gradient_share,
     };
     if args.json {
-        println!("{}", serde_json::to_string_pretty(&summary)?);
+        print(&format!("{}\n", serde_json::to_string_pretty(&summary)?))?;
     } else {
-        print_summary(&summary);
+        print(&summary_text(&summary))?;
     }
     Ok(ExitCode::SUCCESS)
 }
@@ -233,56 +234,62 @@ fn write_frame(
     Ok(gradient_share(&pixels, depth.width(), TEXTURED_GRADIENT))
 }
 
-fn print_summary(summary: &Summary) {
+fn summary_text(summary: &Summary) -> String {
     let path = &summary.path;
-    println!(
-        "{} frames, {:.2} s, in {}",
+    format!(
+        "{} frames, {:.2} s, in {}\npath {:.2} m at {:.2} m/s, extent {:.2} m, rotation {:.0}°\n\
+         textured pixels {:.1} %\n",
         summary.frames,
         path.duration_s,
-        summary.output.display()
-    );
-    println!(
-        "path {:.2} m at {:.2} m/s, extent {:.2} m, rotation {:.0}°",
-        path.path_length_m, path.mean_speed_m_s, path.extent_m, path.rotation_deg
-    );
-    println!("textured pixels {:.1} %", 100.0 * summary.gradient_share);
+        summary.output.display(),
+        path.path_length_m,
+        path.mean_speed_m_s,
+        path.extent_m,
+        path.rotation_deg,
+        100.0 * summary.gradient_share
+    )
 }
 
-fn params(args: &SimulateArgs) -> SimulatorParams {
-    let (motion, sensor) = (&args.motion, &args.sensor);
-    SimulatorParams {
-        scene: match args.scene {
-            Scene::Room => SceneKind::Room,
-            Scene::Plane => SceneKind::Plane,
-            Scene::Corridor => SceneKind::Corridor,
-        },
-        seed: args.seed,
-        frames: args.frames,
-        rate_hz: args.rate,
-        width: args.width,
-        height: args.height,
-        focal_px: args.focal,
-        world_scale: args.world_scale,
-        motion: MotionParams {
-            kind: match motion.motion {
-                Motion::Handheld => MotionKind::Handheld,
-                Motion::Straight => MotionKind::Straight,
-                Motion::Rotation => MotionKind::Rotation,
-                Motion::Standing => MotionKind::Standing,
-            },
-            mean_speed_m_s: motion.speed,
-            mean_turn_deg_s: motion.turn,
-            tremor: motion.tremor,
-        },
-        sensor: SensorParams {
-            noise_std_dev: sensor.noise,
-            vignette: sensor.vignette,
-            gain_amplitude: sensor.gain_change,
-            offset_amplitude: sensor.offset_change,
-            exposure_period_s: sensor.exposure_period,
-            exposure_ms: sensor.exposure,
-            row_time_us: sensor.row_time,
-            distortion: sensor.distortion.clone(),
-        },
+/// The configuration with what the command line says otherwise.
+fn params(configured: &SimulatorParams, args: &SimulateArgs) -> SimulatorParams {
+    fn set<T: Clone>(value: &mut T, said: &Option<T>) {
+        if let Some(said) = said {
+            value.clone_from(said);
+        }
     }
+    let mut params = configured.clone();
+    let scene = args.scene.map(|scene| match scene {
+        Scene::Room => SceneKind::Room,
+        Scene::Plane => SceneKind::Plane,
+        Scene::Corridor => SceneKind::Corridor,
+    });
+    set(&mut params.scene, &scene);
+    set(&mut params.seed, &args.seed);
+    set(&mut params.frames, &args.frames);
+    set(&mut params.rate_hz, &args.rate);
+    set(&mut params.width, &args.width);
+    set(&mut params.height, &args.height);
+    set(&mut params.focal_px, &args.focal);
+    set(&mut params.world_scale, &args.world_scale);
+    let motion = &args.motion;
+    let kind = motion.motion.map(|kind| match kind {
+        Motion::Handheld => MotionKind::Handheld,
+        Motion::Straight => MotionKind::Straight,
+        Motion::Rotation => MotionKind::Rotation,
+        Motion::Standing => MotionKind::Standing,
+    });
+    set(&mut params.motion.kind, &kind);
+    set(&mut params.motion.mean_speed_m_s, &motion.speed);
+    set(&mut params.motion.mean_turn_deg_s, &motion.turn);
+    set(&mut params.motion.tremor, &motion.tremor);
+    let sensor = &args.sensor;
+    set(&mut params.sensor.noise_std_dev, &sensor.noise);
+    set(&mut params.sensor.vignette, &sensor.vignette);
+    set(&mut params.sensor.gain_amplitude, &sensor.gain_change);
+    set(&mut params.sensor.offset_amplitude, &sensor.offset_change);
+    set(&mut params.sensor.exposure_period_s, &sensor.exposure_period);
+    set(&mut params.sensor.exposure_ms, &sensor.exposure);
+    set(&mut params.sensor.row_time_us, &sensor.row_time);
+    set(&mut params.sensor.distortion, &sensor.distortion);
+    params
 }

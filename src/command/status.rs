@@ -8,6 +8,7 @@ use clap::Args;
 use serde_json::{Value, json};
 
 use crate::command::CommandResult;
+use crate::command::print::print;
 use crate::service::clock::now_nanos;
 use crate::service::config::Config;
 use crate::service::health::{cause, percentile_ms};
@@ -21,6 +22,9 @@ use crate::wire::port::{Access, Hub, wait};
 const PERIOD: Duration = Duration::from_secs(1);
 /// A process that has said nothing for so long is not there any more.
 const STALE_NANOS: i64 = 3_000_000_000;
+
+/// Terminals clear the screen and go to its first place.
+const CLEAR_SCREEN: &str = "\x1b[2J\x1b[H";
 
 /// Show states, rates and latencies of the running processes
 #[derive(Debug, Args)]
@@ -55,7 +59,8 @@ pub fn run(config: &Config, arguments: StatusArguments) -> CommandResult {
             rows.push((peer.name(), row(peer, before.as_ref())));
             *before = peer.last().copied();
         }
-        show(&rows, arguments.json, is_live);
+        let clear = if is_live { CLEAR_SCREEN } else { "" };
+        print(&format!("{clear}{}", text_of(&rows, arguments.json)))?;
         if arguments.once {
             return Ok(ExitCode::SUCCESS);
         }
@@ -91,27 +96,24 @@ fn row(peer: &Peer, before: Option<&HealthMessage>) -> Value {
     })
 }
 
-fn show(rows: &[(&str, Value)], json: bool, is_live: bool) {
+/// The rows as JSON or as a table.
+fn text_of(rows: &[(&str, Value)], json: bool) -> String {
     if json {
         let object: serde_json::Map<_, _> =
             rows.iter().map(|(name, row)| ((*name).to_owned(), row.clone())).collect();
-        println!("{}", Value::Object(object));
-        return;
+        return format!("{}\n", Value::Object(object));
     }
-    if is_live {
-        // Clear the screen and go to its first place.
-        print!("\x1b[2J\x1b[H");
-    }
-    println!("process  state      frames   rate/s  dropped  late  p50 ms  p99 ms  MB");
+    let mut lines =
+        vec!["process  state      frames   rate/s  dropped  late  p50 ms  p99 ms  MB".to_owned()];
     for (name, row) in rows {
         let number = |value: &Value, digits: usize| {
             value.as_f64().map_or("-".to_owned(), |x| format!("{x:.digits$}"))
         };
         if row.is_null() {
-            println!("{name:8} not running");
+            lines.push(format!("{name:8} not running"));
             continue;
         }
-        println!(
+        lines.push(format!(
             "{name:8} {:9} {:>7} {:>8} {:>8} {:>5} {:>7} {:>7} {:>3} {}",
             row["state"].as_str().unwrap_or(""),
             number(&row["frames"], 0),
@@ -122,6 +124,7 @@ fn show(rows: &[(&str, Value)], json: bool, is_live: bool) {
             number(&row["latency_ms"]["p99"], 2),
             number(&row["peak_rss_mb"], 0),
             row["cause"].as_str().unwrap_or(""),
-        );
+        ));
     }
+    lines.join("\n") + "\n"
 }

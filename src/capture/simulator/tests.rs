@@ -107,7 +107,6 @@ fn the_default_rig_sees_what_it_promises() {
     }
     let (noisy_share, clean_share) =
         (noisy_sum / frames.len() as f64, clean_sum / frames.len() as f64);
-    println!("gradient share {noisy_share:.3}, without noise {clean_share:.3}");
     assert!((0.20..=0.40).contains(&noisy_share), "{noisy_share}");
     assert!((0.20..=0.40).contains(&clean_share), "{clean_share}");
 }
@@ -190,7 +189,6 @@ fn exact_depth_and_poses_carry_one_frame_into_another() {
         let frames = rectified_frames(&mut source, &[100, 101, 105, 120]);
         for (to, tolerance) in [(101, 1.0), (105, 1.0), (120, 1.1)] {
             let (difference, count) = warp_difference(&mut source, &frames, 100, to);
-            println!("{scene:?} 100 to {to}: {difference:.2} grey levels over {count} pixels");
             assert!(difference < tolerance, "{scene:?} 100 to {to}: {difference}");
             assert!(count > 60_000, "{scene:?} 100 to {to}: {count} pixels");
         }
@@ -205,7 +203,6 @@ fn a_rectified_lens_reprojects_as_well() {
     assert_ne!(source.intrinsics().fx, 525.0);
     let frames = rectified_frames(&mut source, &[100, 105]);
     let (difference, count) = warp_difference(&mut source, &frames, 100, 105);
-    println!("distorted: {difference:.2} over {count}");
     assert!(difference < 1.1, "{difference}");
     assert!(count > 60_000, "{count}");
 }

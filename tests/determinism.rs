@@ -1,0 +1,64 @@
+//! The same bits for any number of threads, and for three processes as for one, on a sequence that
+//! initialises, tracks and changes keyframes.
+
+#[allow(dead_code, reason = "every test uses its part of what they share")]
+mod support;
+
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+
+use serde_json::Value;
+use support::{Rig, finish};
+
+/// Half-size images of the default room: 3 s, enough for a map and its first new keyframes.
+const SETTINGS: [&str; 4] = [
+    "simulator.frames=90",
+    "simulator.width=320",
+    "simulator.height=240",
+    "simulator.focal_px=262.5",
+];
+/// What must be equal.
+const FILES: [&str; 4] = ["trajectory.txt", "trajectory_online.txt", "keyframes.txt", "map.ply"];
+
+/// Runs a command of the binary on the sequence and gives its summary.
+fn summary(mut command: Command, output: &Path) -> Value {
+    for setting in SETTINGS {
+        command.args(["--set", setting]);
+    }
+    command.arg("--json").arg("--output").arg(output);
+    let ended = finish(command);
+    assert!(ended.status.success(), "{}", ended.stderr);
+    serde_json::from_str(&ended.stdout).unwrap()
+}
+
+fn contents(output: &Path) -> [Vec<u8>; FILES.len()] {
+    FILES.map(|name| fs::read(output.join(name)).unwrap())
+}
+
+/// Compares file by file, so that a failure names the file and not a megabyte of bytes.
+fn assert_same(one: &[Vec<u8>], other: &[Vec<u8>], what: &str) {
+    for (name, (one, other)) in FILES.iter().zip(one.iter().zip(other)) {
+        assert!(one == other, "{name} differs: {what}");
+    }
+}
+
+#[test]
+fn threads_and_processes_do_not_change_a_bit() {
+    let rig = Rig::new();
+    let replayed = ["1", "2", "4"].map(|threads| {
+        let output = rig.folder().join(threads);
+        let figures = summary(rig.command(&["replay", "sim", "--threads", threads]), &output);
+        // Equal files of a run that never tracked would prove nothing.
+        assert!(figures["frames_tracked"].as_u64().unwrap() >= 45, "{figures}");
+        assert!(figures["keyframes"].as_u64().unwrap() >= 2, "{figures}");
+        contents(&output)
+    });
+    assert_same(&replayed[0], &replayed[1], "1 and 2 threads");
+    assert_same(&replayed[0], &replayed[2], "1 and 4 threads");
+
+    let output = rig.folder().join("processes");
+    summary(rig.command(&["run", "--set", "mapper.threads=2"]), &output);
+    assert_same(&replayed[0], &contents(&output), "one process and three in lockstep");
+    assert_eq!(rig.leftovers(), Vec::<String>::new());
+}
