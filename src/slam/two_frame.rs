@@ -10,6 +10,7 @@ pub mod hypothesis;
 pub mod points;
 pub mod spread;
 pub mod system;
+mod system_kernel;
 
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};

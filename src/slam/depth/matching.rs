@@ -325,8 +325,8 @@ impl<'a> Along<'a> {
         let (mut costs, mut gradients, mut informations) = ([0.0; 8], [0.0; 8], [0.0; 8]);
         for k in 0..PATTERN.len() {
             let residual = samples[k] - self.intensity[k];
-            let magnitude = residual.abs();
-            let weight = if magnitude <= HUBER_GREY { 1.0 } else { HUBER_GREY / magnitude };
+            // 1 up to the bound, without a branch, so that the lanes go together.
+            let weight = HUBER_GREY / residual.abs().max(HUBER_GREY);
             costs[k] = weight * (2.0 - weight) * residual * residual;
             gradients[k] = weight * line_gradients[k] * residual;
             informations[k] = weight * line_gradients[k] * line_gradients[k];

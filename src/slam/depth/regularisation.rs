@@ -118,6 +118,9 @@ pub fn regularise(
     std::mem::swap(&mut map.hypotheses, hypotheses);
 }
 
+/// Keeps the weight of a certain pixel finite: far below any variance a match can have.
+const LEAST_VARIANCE: f32 = 1e-12;
+
 /// Pixels that are summed at a time.
 pub(super) const LANES: usize = 8;
 
@@ -163,12 +166,14 @@ impl Neighbourhood<'_> {
                 let distance = spread * (dx * dx + dy * dy);
                 for k in 0..LANES {
                     let difference = d[k] - centre[k];
-                    let consistent =
-                        variance[k] >= 0.0 && difference * difference <= allowed[k] + variance[k];
-                    let weight = if consistent { 1.0 / (variance[k] + distance) } else { 0.0 };
+                    // Without branches, so that the lanes go together.
+                    let consistent = (variance[k] >= 0.0)
+                        & (difference * difference <= allowed[k] + variance[k]);
+                    let taken = f32::from(u8::from(consistent));
+                    let weight = taken / (variance[k].max(LEAST_VARIANCE) + distance);
                     sums.weighted[k] += weight * d[k];
                     sums.weights[k] += weight;
-                    sums.count[k] += if consistent { 1.0 } else { 0.0 };
+                    sums.count[k] += taken;
                 }
             }
         }

@@ -20,6 +20,7 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::pose::Brightness;
 use crate::slam::two_frame::points::LevelPatch;
+use crate::slam::two_frame::system_kernel::evaluation_kernel;
 
 /// Translation, rotation, a, b.
 pub const NUM_UNKNOWNS: usize = 8;
@@ -131,6 +132,11 @@ impl Geometry {
 impl System {
     /// Evaluates every point at `state`. Sums go in the order of the points.
     pub fn evaluate(&mut self, level: &LevelView<'_>, state: &State) {
+        evaluation_kernel()(self, level, state);
+    }
+
+    #[inline(always)]
+    pub(super) fn evaluate_points(&mut self, level: &LevelView<'_>, state: &State) {
         let geometry = Geometry::new(level.intrinsics, state);
         self.points.clear();
         self.hessian.fill(0.0);
@@ -159,7 +165,7 @@ struct PoseSums {
 }
 
 impl PoseSums {
-    #[inline]
+    #[inline(always)]
     fn add(&mut self, jacobian: &[f32; NUM_UNKNOWNS], weight: f32, residual: f32) {
         for r in 0..NUM_UNKNOWNS {
             let weighted = weight * jacobian[r];
@@ -185,6 +191,7 @@ impl PoseSums {
 }
 
 /// The residuals of one point with their derivatives.
+#[inline(always)]
 fn evaluate_point(
     image: &GradientImage,
     geometry: &Geometry,
@@ -221,12 +228,8 @@ fn evaluate_point(
         let v = geometry.fy * q[1] * inverse_z + geometry.cy;
         let Some([brightness, gradient_u, gradient_v]) = sample(image, u, v) else { return hidden };
         let residual = brightness - (geometry.gain * patch.intensities[k] + geometry.offset);
-        let magnitude = residual.abs();
-        let (huber, cost) = if magnitude <= HUBER_GREY {
-            (1.0, residual * residual)
-        } else {
-            (HUBER_GREY / magnitude, HUBER_GREY * (2.0 * magnitude - HUBER_GREY))
-        };
+        let huber = HUBER_GREY / residual.abs().max(HUBER_GREY);
+        let cost = huber * (2.0 - huber) * residual * residual;
         let alpha = gradient_u * geometry.fx * inverse_z;
         let beta = gradient_v * geometry.fy * inverse_z;
         let gamma = -(alpha * q[0] + beta * q[1]) * inverse_z;
@@ -259,7 +262,7 @@ fn evaluate_point(
 }
 
 /// Brightness and gradient between pixels; `None` outside or for NaN.
-#[inline]
+#[inline(always)]
 fn sample(image: &GradientImage, u: f32, v: f32) -> Option<[f32; 3]> {
     let (width, height) = (image.width(), image.height());
     // One pixel inside the border, where the central difference is defined.
