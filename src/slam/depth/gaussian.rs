@@ -50,7 +50,7 @@ impl Default for GaussianParams {
         Self {
             search_sigmas: 2.0,
             gate_sigmas: 2.5,
-            max_variance_ratio: 0.9,
+            max_variance_ratio: 0.7,
             common_noise_ratio: 1.0,
             process_inflation: 1.01,
             contradiction_inflation: 1.2,
