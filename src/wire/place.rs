@@ -18,6 +18,9 @@ pub const SHARED_MEMORY: &str = "/dev/shm";
 /// Held while a process joins, and by the last one while it clears up.
 const JOIN_LOCK: &str = ".join.lock";
 
+/// End of the name of a claim's file, behind the instance and the process.
+const CLAIM_SUFFIX: &str = ".lock";
+
 /// Longest folder: the socket of a listener lies in it, and a socket's path has at most 107 bytes.
 const MAX_ROOT_BYTES: usize = 48;
 /// Longest name of an instance: it is part of every topic's name.
@@ -110,7 +113,9 @@ impl Place {
     /// Claims to be the only `process` of this instance; the kernel ends the claim with the process.
     pub fn claim(&self, process: &str) -> Result<Claim, PlaceError> {
         self.create()?;
-        let path = self.root.join(format!("{}.{process}.lock", self.instance));
+        // Keeps away who tidies up and would hold the lock for a moment.
+        let _joining = self.hold()?;
+        let path = self.root.join(format!("{}.{process}{CLAIM_SUFFIX}", self.instance));
         let io = |source| PlaceError::Io { path: path.clone(), source };
         loop {
             let mut file = open_lock(&path).map_err(io)?;
@@ -144,11 +149,13 @@ impl Place {
     }
 
     /// Removes what iceoryx2 leaves behind on purpose when its last node is gone: its counter of
-    /// nodes and its empty folders. Does nothing while anybody is here or joins.
+    /// nodes and its empty folders; and the claims of processes that were killed. Does nothing while
+    /// anybody is here or joins.
     pub fn tidy(&self) {
         let path = self.root.join(JOIN_LOCK);
         let Ok(lock) = open_lock(&path) else { return };
-        let is_alone = rustix::fs::flock(&lock, FlockOperation::NonBlockingLockExclusive).is_ok()
+        // Waits for whoever joins or tidies up: of two that leave together, the second must look.
+        let is_alone = rustix::fs::flock(&lock, FlockOperation::LockExclusive).is_ok()
             && is_same_file(&lock, &path);
         if !is_alone {
             return;
@@ -163,9 +170,25 @@ impl Place {
                     let _ = fs::remove_file(entry.path());
                 }
             }
+            self.remove_dead_claims();
             let _ = fs::remove_dir(self.root.join("nodes"));
             let _ = fs::remove_dir(self.root.join("services"));
             let _ = fs::remove_file(&path);
+        }
+    }
+
+    /// Removes the files of claims that nobody holds any more. While nobody may join.
+    fn remove_dead_claims(&self) {
+        for entry in fs::read_dir(&self.root).into_iter().flatten().flatten() {
+            let path = entry.path();
+            let name = entry.file_name().to_string_lossy().into_owned();
+            if name == JOIN_LOCK || !name.ends_with(CLAIM_SUFFIX) {
+                continue;
+            }
+            let Ok(file) = File::open(&path) else { continue };
+            if rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive).is_ok() {
+                let _ = fs::remove_file(&path);
+            }
         }
     }
 
@@ -270,7 +293,23 @@ mod tests {
         assert!(place.claim("tracker").is_ok());
         drop(first);
         drop(place.claim("capture").unwrap());
+        place.tidy();
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn claims_of_the_dead_are_cleared_and_others_kept() {
+        let folder = tempfile::tempdir().unwrap();
+        let place = Place::new("rig", folder.path().to_str().unwrap()).unwrap();
+        let dead = folder.path().join("rig.supervisor.lock");
+        fs::write(&dead, "4194304\n").unwrap();
+        let foreign = folder.path().join("notes.txt");
+        fs::write(&foreign, "").unwrap();
+        let living = place.claim("capture").unwrap();
+        place.tidy();
+        assert!(!dead.exists() && foreign.exists());
+        assert!(place.claim("capture").is_err(), "the living one still holds its claim");
+        drop(living);
     }
 
     #[test]
