@@ -97,7 +97,7 @@ struct Recording {
 }
 
 /// Frames by the list of each. The way through redkitchen turns fast, blurs and changes its
-/// exposure: the camera is lost half way, and the bound says no more than that it begins well.
+/// exposure; its scale drifts, so its bound is wide.
 const RECORDINGS: [Recording; 4] = [
     Recording { name: "fr1-floor", frames: 90, min_tracked: 70, max_losses: 0, max_ate_m: 0.03 },
     Recording { name: "tsukuba", frames: 150, min_tracked: 110, max_losses: 1, max_ate_m: 0.15 },
