@@ -3,7 +3,8 @@
 //!
 //! Layout: magic, then the number of keyframes (u64), then each keyframe: id, revision, sequence
 //! (u64), stamp (i64), epoch, map state, width, height (u32), pose (8 × f64), intrinsics
-//! (4 × f64), number of points (u64), points (u16, u16, 3 × f32), image bytes.
+//! (4 × f64), number of points (u64), points (u16, u16, 3 × f32), number of image bytes (u64, 0 where the
+//! image was given up), image bytes.
 
 use std::fs::File;
 use std::io::{self, BufReader, Read, Write};
@@ -19,7 +20,7 @@ use crate::wire::conversion::{
 };
 
 /// First bytes of the file, with the version of the layout.
-const MAGIC: [u8; 16] = *b"semidense map 1\n";
+const MAGIC: [u8; 16] = *b"semidense map 2\n";
 /// More keyframes than an hour at one each 30 ms: a broken number, not a map.
 const MAX_KEYFRAMES: u64 = 120_000;
 
@@ -93,6 +94,7 @@ fn write_keyframe(file: &mut impl Write, keyframe: &Keyframe) -> io::Result<()> 
             file.write_all(&number.to_le_bytes())?;
         }
     }
+    file.write_all(&(keyframe.image.len() as u64).to_le_bytes())?;
     file.write_all(&keyframe.image)
 }
 
@@ -177,7 +179,13 @@ impl<'a> Reader<'a> {
         let num_points = self.count("points", MAX_KEYFRAME_POINTS as u64)?;
         let points = (0..num_points).map(|_| self.point()).collect::<Result<Vec<_>, _>>()?;
         check_points(&points, &intrinsics).map_err(&wrong)?;
-        let mut image = vec![0; intrinsics.width * intrinsics.height];
+        let size = intrinsics.width * intrinsics.height;
+        let bytes = self.count("image bytes", size as u64)? as usize;
+        if bytes != 0 && bytes != size {
+            let (path, what) = (self.path.to_owned(), "image bytes");
+            return Err(MapFileError::TooMany { path, what, count: bytes as u64 });
+        }
+        let mut image = vec![0; bytes];
         self.file
             .read_exact(&mut image)
             .map_err(|source| MapFileError::Read { path: self.path.to_owned(), source })?;

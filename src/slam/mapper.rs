@@ -1,5 +1,6 @@
 //! The recipe of a map step: observe depth, regularise, choose keyframes, propagate.
 
+mod memory;
 mod past;
 mod start;
 
@@ -18,6 +19,7 @@ use crate::slam::image::buffer::Image;
 use crate::slam::image::quads::QuadImage;
 use crate::slam::initializer::InitializerParams;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS, MapState};
+use crate::slam::mapper::memory::BYTES_PER_MEGABYTE;
 use crate::slam::mapper::past::PastFrames;
 use crate::slam::mapper::start::take_sensor_depth;
 use crate::slam::parameter::{ParameterError, check_range};
@@ -39,6 +41,9 @@ pub struct MapperParams {
     /// The depth is smoothed and published again when this share of it has changed: a map that
     /// hardly changed costs the tracker as much to prepare as a new one.
     pub publish_change_ratio: f64,
+    /// Most memory for images and depth of the keyframes of the map, megabytes: about 1.7 a keyframe at
+    /// 640×480. Beyond it the oldest keep only their poses.
+    pub max_map_megabytes: usize,
     /// At least so many frames lie between two keyframes.
     pub min_keyframe_interval: u64,
     /// Search along the epipolar line.
@@ -61,6 +66,7 @@ impl Default for MapperParams {
             num_seed_frames: 4,
             max_past_frames: 40,
             publish_change_ratio: 0.2,
+            max_map_megabytes: 512,
             min_keyframe_interval: 2,
             matching: MatchingParams::default(),
             gaussian: GaussianParams::default(),
@@ -79,6 +85,7 @@ impl MapperParams {
         check_range("num_seed_frames", self.num_seed_frames, 0..=20)?;
         check_range("max_past_frames", self.max_past_frames, 1..=200)?;
         check_range("publish_change_ratio", self.publish_change_ratio, 0.0..=10.0)?;
+        check_range("max_map_megabytes", self.max_map_megabytes, 16..=1_000_000)?;
         check_range("min_keyframe_interval", self.min_keyframe_interval, 1..=1000)?;
         self.matching.validate().map_err(|e| e.within("matching"))?;
         self.gaussian.validate().map_err(|e| e.within("gaussian"))?;
@@ -344,6 +351,7 @@ impl Mapper {
             image: frame.pixels.to_vec(),
             points: Vec::new(),
         });
+        self.map.forget_depth_beyond(self.params.max_map_megabytes * BYTES_PER_MEGABYTE);
         self.next_keyframe_id += 1;
         self.frames_on_keyframe = 0;
         self.publish_depth();

@@ -3,7 +3,7 @@
 use crate::capture::source::{FrameSource, SourceError};
 use crate::service::results::RunRecord;
 use crate::slam::evaluation::depth_error::{DepthErrors, DepthStatistics};
-use crate::slam::keyframe::MapState;
+use crate::slam::keyframe::{Keyframe, MapState};
 
 /// What the depth maps are worth.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -21,11 +21,16 @@ pub fn evaluate_depth(
 ) -> Result<DepthEvaluation, SourceError> {
     let mut errors = DepthErrors::default();
     let mut keyframes = 0;
-    for keyframe in record.map.keyframes.iter().filter(|k| k.map_state == MapState::Established) {
+    for keyframe in record.map.keyframes.iter().filter(|k| is_evaluated(k)) {
         if let Some(true_depth) = source.depth_at(keyframe.capture_nanos)? {
             errors.add(keyframe, &true_depth, record.depth_scale);
             keyframes += 1;
         }
     }
     Ok(DepthEvaluation { statistics: errors.statistics(), keyframes })
+}
+
+/// Whether a keyframe's depth is proven and still held.
+fn is_evaluated(keyframe: &Keyframe) -> bool {
+    keyframe.map_state == MapState::Established && !keyframe.points.is_empty()
 }
