@@ -196,8 +196,33 @@ fn figures_and_files_of_a_run_with_truth_and_a_loss() {
     assert_eq!(ply.len() - header_end, 38 * 24, "38 points of six numbers");
     let z = f32::from_le_bytes(ply[header_end + 8..header_end + 12].try_into().unwrap());
     assert!((z - 2.0).abs() < 1e-6, "4 m are 2 map units");
+    let pcd = std::fs::read(dir.join("map.pcd")).unwrap();
+    let data = pcd.windows(12).position(|w| w == b"DATA binary\n").unwrap() + 12;
+    assert_eq!(pcd[data..], ply[header_end..], "the same points in both files");
+    let header = std::str::from_utf8(&pcd[..data]).unwrap();
+    assert!(header.contains("\nWIDTH 38\nHEIGHT 1\n") && header.contains("\nPOINTS 38\n"));
     let names: Vec<_> = std::fs::read_dir(&dir).unwrap().map(|e| e.unwrap().file_name()).collect();
-    assert_eq!(names.len(), 6, "nothing temporary is left: {names:?}");
+    assert_eq!(names.len(), 7, "nothing temporary is left: {names:?}");
+}
+
+#[test]
+fn of_several_epochs_the_longest_is_judged_and_all_are_written() {
+    let mut poses: Vec<_> = (0..60).map(|i| pose(i, TrackingState::Tracking, 0)).collect();
+    for pose in &mut poses[20..] {
+        // The second epoch has another origin and another unit.
+        pose.estimate.epoch = 1;
+        pose.estimate.keyframe_id = 1;
+        pose.estimate.world_from_camera.translation *= 3.0;
+        pose.estimate.world_from_camera.translation.x += 100.0;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let (summary, report) = written(folder.path(), &record(poses, Vec::new(), true));
+    assert_eq!((&summary["epochs"], &summary["evaluated_epoch"]), (&2.into(), &1.into()));
+    assert_eq!(summary["matched_poses"], 40);
+    assert!(summary["ate_rmse_m"].as_f64().unwrap() < 1e-9);
+    assert!((summary["ate_scale"].as_f64().unwrap() - UNIT_M / 3.0).abs() < 1e-9);
+    assert!(report.contains("Position error"));
+    assert_eq!(read_trajectory(&folder.path().join("trajectory.txt")).unwrap().len(), 60);
 }
 
 #[test]

@@ -182,7 +182,7 @@ impl<'a> Shell<'a> {
         let outcome = self.pool.install(|| mapper.step(&frame, pose, None));
         let step_nanos = u64::try_from(now_nanos() - begin).unwrap_or(0);
         self.output.publish(mapper, &outcome, frame.sequence, step_nanos)?;
-        self.health.enter(ProcessState::Running, "");
+        self.health.enter(ProcessState::Running, &mapper.situation().to_string());
         let counters = self.health.counters();
         counters.frames += 1;
         counters.dropped = self.pairing.dropped();
@@ -249,10 +249,10 @@ impl Output {
     ) -> Result<(), SendError> {
         let keyframe = mapper.keyframe();
         if let Some(keyframe) = keyframe {
-            if outcome.keyframe_created {
+            if outcome.needs_image() {
                 self.publish_image(keyframe)?;
             }
-            if outcome.keyframe_created || outcome.keyframe_changed {
+            if outcome.needs_publishing() {
                 self.depths.send(keyframe_header(keyframe), &keyframe.points)?;
             }
             if outcome.graph_changed {
@@ -277,11 +277,15 @@ impl Output {
         }
     }
 
-    /// The newest keyframes where there are more than a message holds.
+    /// The keyframes of the epoch; the newest where there are more than a message holds.
     fn publish_graph(&self, map: &Map, newest: &Keyframe) -> Result<(), SendError> {
-        let first = map.keyframes.len().saturating_sub(MAX_GRAPH_KEYFRAMES);
-        let poses: Vec<KeyframePoseMessage> = map.keyframes[first..]
+        let is_of_epoch = |keyframe: &&Keyframe| keyframe.epoch == newest.epoch;
+        let count = map.keyframes.iter().filter(is_of_epoch).count();
+        let poses: Vec<KeyframePoseMessage> = map
+            .keyframes
             .iter()
+            .filter(is_of_epoch)
+            .skip(count.saturating_sub(MAX_GRAPH_KEYFRAMES))
             .map(|keyframe| {
                 let (keyframe_id, world_from_keyframe) =
                     (keyframe.keyframe_id, keyframe.world_from_keyframe);

@@ -191,7 +191,7 @@ impl<'a> Replay<'a> {
         let begin = Instant::now();
         let outcome = self.mapper.step(&frame, &pose, sensor_depth.as_ref());
         self.record.map_nanos.push(elapsed_nanos(begin));
-        if (outcome.keyframe_created || outcome.keyframe_changed)
+        if outcome.needs_publishing()
             && self.config.poses == PoseOrigin::Tracker
             && let Some(keyframe) = self.mapper.keyframe()
         {

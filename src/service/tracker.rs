@@ -12,7 +12,7 @@ use crate::service::shutdown::Shutdown;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::parameter::ParameterError;
-use crate::slam::pose::{LostReason, PoseEstimate, TrackingState};
+use crate::slam::pose::{DegradedReason, LostReason, PoseEstimate, TrackingState};
 use crate::slam::tracker::Tracker;
 use crate::wire::conversion::{
     PoseTiming, codes_from_state, frame_from_message, pose_from_message, pose_message,
@@ -219,7 +219,7 @@ impl<'a> Shell<'a> {
             message = pose_message(&unclaimed(estimate), &timing);
         }
         self.poses.send((), &[message])?;
-        self.health.enter(ProcessState::Running, "");
+        self.health.enter(ProcessState::Running, state_text(estimate.state));
         self.health.count_latency(timing.latency_nanos);
         let counters = self.health.counters();
         counters.frames += 1;
@@ -228,6 +228,25 @@ impl<'a> Shell<'a> {
         counters.deadline_misses += u64::from(late);
         self.health.report();
         Ok(())
+    }
+}
+
+/// A state and its reason, for whoever looks on.
+fn state_text(state: TrackingState) -> &'static str {
+    match state {
+        TrackingState::Initializing => "initializing: the mapper has no map to trust yet",
+        TrackingState::Tracking => "tracking",
+        TrackingState::Degraded(DegradedReason::Budget) => "degraded: the time ran out",
+        TrackingState::Degraded(DegradedReason::LowOverlap) => {
+            "degraded: little of the keyframe is in view"
+        }
+        TrackingState::Degraded(DegradedReason::HighResidual) => "degraded: the images fit badly",
+        TrackingState::Degraded(DegradedReason::Gap) => "degraded: frames are missing",
+        TrackingState::Lost(LostReason::Diverged) => "lost: the keyframe is out of view",
+        TrackingState::Lost(LostReason::TooFewInliers) => "lost: too few points match",
+        TrackingState::Lost(LostReason::NoPoints) => "lost: the keyframe has no usable points",
+        TrackingState::Lost(LostReason::UnusableFrame) => "lost: the frame has no contrast",
+        TrackingState::Lost(LostReason::MapRejected) => "lost: the map contradicts itself",
     }
 }
 

@@ -1,7 +1,10 @@
 //! The recipe of a map step: observe depth, regularise, choose keyframes, propagate.
 
+pub mod consistency;
 mod memory;
 mod past;
+pub mod recovery;
+pub mod situation;
 mod start;
 
 use serde::{Deserialize, Serialize};
@@ -19,11 +22,16 @@ use crate::slam::image::buffer::Image;
 use crate::slam::image::quads::QuadImage;
 use crate::slam::initializer::InitializerParams;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS, MapState};
+use crate::slam::mapper::consistency::{
+    Consistency, ConsistencyParams, Contradiction, judge_change,
+};
 use crate::slam::mapper::memory::BYTES_PER_MEGABYTE;
 use crate::slam::mapper::past::PastFrames;
+use crate::slam::mapper::recovery::{Recovery, RecoveryParams};
+use crate::slam::mapper::situation::{Situation, StartProgress};
 use crate::slam::mapper::start::take_sensor_depth;
 use crate::slam::parameter::{ParameterError, check_range};
-use crate::slam::pose::{Brightness, PoseEstimate, TrackingState};
+use crate::slam::pose::{Brightness, NO_KEYFRAME, PoseEstimate, TrackingState};
 use crate::slam::two_frame::TwoFrameInitializer;
 
 /// Tuning of the mapper.
@@ -56,6 +64,10 @@ pub struct MapperParams {
     pub regularisation: RegularisationParams,
     /// The start.
     pub initializer: InitializerParams,
+    /// When the map is rejected.
+    pub consistency: ConsistencyParams,
+    /// What is done when the camera is lost.
+    pub recovery: RecoveryParams,
 }
 
 impl Default for MapperParams {
@@ -73,6 +85,8 @@ impl Default for MapperParams {
             propagation: PropagationParams::default(),
             regularisation: RegularisationParams::default(),
             initializer: InitializerParams::default(),
+            consistency: ConsistencyParams::default(),
+            recovery: RecoveryParams::default(),
         }
     }
 }
@@ -91,7 +105,9 @@ impl MapperParams {
         self.gaussian.validate().map_err(|e| e.within("gaussian"))?;
         self.propagation.validate().map_err(|e| e.within("propagation"))?;
         self.regularisation.validate().map_err(|e| e.within("regularisation"))?;
-        self.initializer.validate().map_err(|e| e.within("initializer"))
+        self.initializer.validate().map_err(|e| e.within("initializer"))?;
+        self.consistency.validate().map_err(|e| e.within("consistency"))?;
+        self.recovery.validate().map_err(|e| e.within("recovery"))
     }
 }
 
@@ -100,7 +116,9 @@ impl MapperParams {
 pub struct StepOutcome {
     /// The keyframe in force was made in this step: publish its image too.
     pub keyframe_created: bool,
-    /// The keyframe in force has other depth than before: publish it.
+    /// An earlier keyframe is in force again: publish its image too.
+    pub keyframe_restored: bool,
+    /// The keyframe in force has other depth or another state than before: publish it.
     pub keyframe_changed: bool,
     /// A keyframe's pose changed, or one was added: publish the graph.
     pub graph_changed: bool,
@@ -108,10 +126,22 @@ pub struct StepOutcome {
     pub observations: ObservationCounts,
 }
 
-/// All keyframes of one epoch, with their final depth.
+impl StepOutcome {
+    /// Whether the keyframe in force is another one or another revision than before.
+    pub fn needs_publishing(&self) -> bool {
+        self.keyframe_created || self.keyframe_restored || self.keyframe_changed
+    }
+
+    /// Whether another keyframe than before is in force.
+    pub fn needs_image(&self) -> bool {
+        self.keyframe_created || self.keyframe_restored
+    }
+}
+
+/// All keyframes of all epochs, with their final depth. Each epoch has a scale and a drift of its own.
 #[derive(Debug, Clone, Default)]
 pub struct Map {
-    /// Keyframes in order of creation; the last is the one in force.
+    /// Keyframes in order of creation.
     pub keyframes: Vec<Keyframe>,
 }
 
@@ -121,6 +151,8 @@ pub struct Mapper {
     params: MapperParams,
     intrinsics: Intrinsics,
     map: Map,
+    /// Place in the map of the keyframe in force; `None` before the first.
+    in_force: Option<usize>,
     /// The depth map of the keyframe in force, and memory for the next.
     depth: DepthMap,
     next_depth: DepthMap,
@@ -130,9 +162,12 @@ pub struct Mapper {
     two_frame: TwoFrameInitializer,
     /// Sequence and stamp of the two-frame start's first frame.
     first_stamp: Option<(u64, i64)>,
+    start_progress: StartProgress,
+    recovery: Recovery,
+    consistency: Consistency,
+    contradiction: Option<Contradiction>,
     revision: u64,
     next_keyframe_id: u64,
-    epoch: u32,
     frames_on_keyframe: u64,
     /// Hypotheses changed since the depth was smoothed and published.
     unpublished: usize,
@@ -146,6 +181,7 @@ impl Mapper {
         Ok(Self {
             intrinsics,
             map: Map::default(),
+            in_force: None,
             depth: DepthMap::with_size(width, height),
             next_depth: DepthMap::with_size(width, height),
             regularisation: RegularisationScratch::with_size(width, height),
@@ -154,9 +190,12 @@ impl Mapper {
             two_frame: TwoFrameInitializer::new(intrinsics, params.initializer.two_frame.clone())
                 .map_err(|e| e.within("initializer.two_frame"))?,
             first_stamp: None,
+            start_progress: StartProgress::default(),
+            recovery: Recovery::new(&intrinsics),
+            consistency: Consistency::default(),
+            contradiction: None,
             revision: 0,
             next_keyframe_id: 0,
-            epoch: 0,
             frames_on_keyframe: 0,
             unpublished: 0,
             params,
@@ -176,16 +215,25 @@ impl Mapper {
         {
             return StepOutcome::default();
         }
-        if self.map.keyframes.is_empty() {
-            return self.start(frame, pose, sensor_depth);
-        }
-        if matches!(pose.state, TrackingState::Lost(_)) || !pose.world_from_camera.is_finite() {
+        let Some(keyframe) = self.keyframe() else { return self.start(frame, pose, sensor_depth) };
+        if pose.keyframe_id == NO_KEYFRAME || pose.epoch != keyframe.epoch {
+            // The tracker has not seen this epoch yet.
             return StepOutcome::default();
         }
+        let is_lost = matches!(pose.state, TrackingState::Lost(_));
+        if is_lost || !pose.world_from_camera.is_finite() || self.is_rejected() {
+            return self.recover(frame, pose, sensor_depth);
+        }
+        self.recovery.end();
         self.frames_on_keyframe += 1;
         let initializing = self.map_state() == MapState::Initializing;
         let observations = self.observe_frame(frame, pose);
         self.unpublished += observations.fused + observations.created;
+        let contradiction = self.consistency.observe(&observations, &self.params.consistency);
+        if let Some(contradiction) = contradiction.filter(|_| !initializing) {
+            self.reject(contradiction);
+            return StepOutcome { keyframe_changed: true, observations, ..Default::default() };
+        }
         if initializing {
             self.refine();
             return self.continue_start(frame, pose, observations, sensor_depth);
@@ -198,6 +246,7 @@ impl Mapper {
                 keyframe_changed: true,
                 graph_changed: true,
                 observations,
+                ..Default::default()
             };
         }
         self.remember(frame, pose);
@@ -207,13 +256,31 @@ impl Mapper {
         if keyframe_changed {
             self.refine();
             self.publish_depth();
+            let points = self.keyframe().map_or(0, |keyframe| keyframe.points.len());
+            let lost_depth = self.consistency.count_points(points, &self.params.consistency);
+            if let Some(contradiction) = lost_depth {
+                self.reject(contradiction);
+            }
         }
         StepOutcome { keyframe_changed, observations, ..Default::default() }
     }
 
     /// The keyframe in force, once there is one.
     pub fn keyframe(&self) -> Option<&Keyframe> {
-        self.map.keyframes.last()
+        self.map.keyframes.get(self.in_force?)
+    }
+
+    /// What the mapper is doing, and why.
+    pub fn situation(&self) -> Situation {
+        let state = self.keyframe().map(|keyframe| keyframe.map_state);
+        match (state, self.contradiction) {
+            (None, _) => Situation::Starting(self.start_progress),
+            _ if self.recovery.is_restarting => Situation::Restarting(self.start_progress),
+            (Some(MapState::Rejected), Some(why)) => Situation::Rejected(why),
+            _ if self.recovery.is_under_way() => Situation::Lost,
+            (Some(MapState::Initializing), _) => Situation::Unproven,
+            _ => Situation::Mapping,
+        }
     }
 
     /// Every keyframe.
@@ -225,9 +292,42 @@ impl Mapper {
         self.keyframe().map_or(MapState::Initializing, |k| k.map_state)
     }
 
+    fn is_rejected(&self) -> bool {
+        self.map_state() == MapState::Rejected
+    }
+
+    /// Declares the keyframe in force contradictory: nothing is claimed on it any more.
+    fn reject(&mut self, contradiction: Contradiction) {
+        self.contradiction = Some(contradiction);
+        self.revision += 1;
+        let revision = self.revision;
+        if let Some(keyframe) = self.keyframe_mut() {
+            keyframe.map_state = MapState::Rejected;
+            keyframe.revision = revision;
+        }
+    }
+
+    fn keyframe_mut(&mut self) -> Option<&mut Keyframe> {
+        self.map.keyframes.get_mut(self.in_force?)
+    }
+
+    /// Leaves the depth that was reached with the keyframe in force.
+    fn leave_keyframe(&mut self) {
+        if self.unpublished > 0 && !self.is_rejected() {
+            self.publish_depth();
+        }
+    }
+
+    /// Puts a keyframe of the map in force.
+    fn enter_keyframe(&mut self, index: usize) {
+        self.in_force = Some(index);
+        self.consistency = Consistency::default();
+        (self.frames_on_keyframe, self.unpublished) = (0, 0);
+    }
+
     /// Observes the depth map of the keyframe in force in `frame`.
     fn observe_frame(&mut self, frame: &FrameView<'_>, pose: &PoseEstimate) -> ObservationCounts {
-        let Some(keyframe) = self.map.keyframes.last() else { return ObservationCounts::default() };
+        let Some(keyframe) = self.keyframe() else { return ObservationCounts::default() };
         let keyframe_from_camera = keyframe.world_from_keyframe.locate(&pose.world_from_camera);
         self.frame.fill(frame.pixels);
         let observer = Observer {
@@ -257,7 +357,8 @@ impl Mapper {
         pose: &PoseEstimate,
         sensor_depth: Option<&Image<f32>>,
     ) {
-        let Some(before) = self.map.keyframes.last() else { return };
+        let Some(before) = self.keyframe() else { return };
+        let epoch = before.epoch;
         let world_from_before = before.world_from_keyframe;
         let before_image = before.image.clone();
         let brightness = self.brightness_against_keyframe(pose);
@@ -284,8 +385,14 @@ impl Mapper {
             self.seed_from_past(&world_from_keyframe);
         }
         self.refine();
-        world_from_keyframe.scale *= self.rescale_to_unit_mean();
-        self.add_keyframe(frame, world_from_keyframe, MapState::Established);
+        let factor = self.rescale_to_unit_mean();
+        world_from_keyframe.scale *= factor;
+        let (before, after) = (self.next_depth.num_hypotheses(), self.depth.num_hypotheses());
+        let contradiction = judge_change(before, after, factor, &self.params.consistency);
+        self.add_keyframe(frame, world_from_keyframe, MapState::Established, epoch);
+        if let Some(contradiction) = contradiction {
+            self.reject(contradiction);
+        }
     }
 
     /// Gives new pixels of the keyframe their depth from frames before it, shortest baseline first:
@@ -338,10 +445,11 @@ impl Mapper {
         frame: &FrameView<'_>,
         world_from_keyframe: Sim3,
         map_state: MapState,
+        epoch: u32,
     ) {
         self.map.keyframes.push(Keyframe {
             keyframe_id: self.next_keyframe_id,
-            epoch: self.epoch,
+            epoch,
             revision: self.revision,
             sequence: frame.sequence,
             capture_nanos: frame.capture_nanos,
@@ -353,14 +461,17 @@ impl Mapper {
         });
         self.map.forget_depth_beyond(self.params.max_map_megabytes * BYTES_PER_MEGABYTE);
         self.next_keyframe_id += 1;
-        self.frames_on_keyframe = 0;
+        self.enter_keyframe(self.map.keyframes.len() - 1);
         self.publish_depth();
     }
 
     /// Writes the depth map into the keyframe in force.
     fn publish_depth(&mut self) {
         self.revision += 1;
-        let Some(keyframe) = self.map.keyframes.last_mut() else { return };
+        let in_force = self.in_force;
+        let Some(keyframe) = in_force.and_then(|index| self.map.keyframes.get_mut(index)) else {
+            return;
+        };
         keyframe.revision = self.revision;
         keyframe.points.clear();
         let width = self.depth.image.width();

@@ -16,8 +16,8 @@ use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::{
     Brightness, LostReason, NO_KEYFRAME, PoseEstimate, Quality, TrackingState,
 };
-use crate::slam::tracker::motion::{Motion, hypotheses};
-use crate::slam::tracker::verdict::{VerdictParams, quality_of};
+use crate::slam::tracker::motion::{Motion, hypotheses, turned};
+use crate::slam::tracker::verdict::{VerdictParams, is_better, quality_of};
 
 /// Tuning of the tracker.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -35,6 +35,9 @@ pub struct TrackerParams {
     /// Rotation about each axis of the other motions, degrees: half of what the coarsest level
     /// converges from.
     pub hypothesis_rotation_deg: f64,
+    /// Rotation about each axis of the views near the keyframe's own that a lost tracker tries,
+    /// degrees: as far as a coarse alignment reaches, so that the views join.
+    pub recovery_rotation_deg: f64,
     /// Standard deviation of the coarsest level, grey levels, below which a frame has no
     /// contrast: covered lens, overexposure, a white wall.
     pub min_contrast: f64,
@@ -52,6 +55,7 @@ impl Default for TrackerParams {
             verdict: VerdictParams::default(),
             poor_fit_ratio: 1.5,
             hypothesis_rotation_deg: 3.0,
+            recovery_rotation_deg: 6.0,
             min_contrast: 2.0,
             keyframe_distance_weight: 3.0,
             keyframe_usage_weight: 4.0,
@@ -67,6 +71,7 @@ impl TrackerParams {
         self.verdict.validate().map_err(|error| error.within("verdict"))?;
         check_range("poor_fit_ratio", self.poor_fit_ratio, 1.0..=100.0)?;
         check_range("hypothesis_rotation_deg", self.hypothesis_rotation_deg, 0.0..=45.0)?;
+        check_range("recovery_rotation_deg", self.recovery_rotation_deg, 0.0..=45.0)?;
         check_range("min_contrast", self.min_contrast, 0.0..=255.0)?;
         check_range("keyframe_distance_weight", self.keyframe_distance_weight, 0.0..=1e3)?;
         check_range("keyframe_usage_weight", self.keyframe_usage_weight, 0.0..=1e3)
@@ -120,6 +125,7 @@ impl Tracker {
         if let (Some(old), Some(new)) = (old, new) {
             if old.epoch() != new.epoch() {
                 self.motion = Motion::default();
+                self.was_lost = false;
             }
             if old.epoch() != new.epoch() || old.keyframe_id() != new.keyframe_id() {
                 self.brightness = Brightness::default();
@@ -202,7 +208,10 @@ impl Tracker {
         let mut best = self.align_coarsest(reference, &predicted, budget);
         if self.fits_poorly(&best) {
             let rotation = self.params.hypothesis_rotation_deg.to_radians();
-            for hypothesis in hypotheses(&self.motion, nanos, rotation) {
+            // A lost camera may be where the keyframe was taken: the mapper may have found it there.
+            let views = self.params.recovery_rotation_deg.to_radians();
+            let at_keyframe = self.was_lost.then(|| turned(&first, views)).into_iter().flatten();
+            for hypothesis in hypotheses(&self.motion, nanos, rotation).chain(at_keyframe) {
                 let other = self.align_coarsest(reference, &hypothesis, budget);
                 if is_better(&other, &best) {
                     best = other;
@@ -338,14 +347,6 @@ impl Tracker {
         let from_usage = self.params.keyframe_usage_weight * (1.0 - quality.in_view_ratio);
         from_distance * from_distance + from_usage * from_usage > 1.0
     }
-}
-
-/// Whether one coarse alignment explains the frame better than another: more inliers, counted
-/// over all points so that looking away does not pay.
-fn is_better(one: &Alignment, other: &Alignment) -> bool {
-    let inliers = |alignment: &Alignment| alignment.state.sums.inliers;
-    let energy = |alignment: &Alignment| alignment.state.sums.mean_energy();
-    inliers(one) > inliers(other) || (inliers(one) == inliers(other) && energy(one) < energy(other))
 }
 
 /// The upper triangle of a 6×6 matrix, row by row.

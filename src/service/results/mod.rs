@@ -6,6 +6,7 @@
 pub mod colour;
 pub mod debug_pictures;
 pub mod depth_maps;
+pub mod pcd;
 pub mod pictures;
 pub mod ply;
 pub mod poses;
@@ -96,7 +97,7 @@ pub struct RunRecord {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ResultsParams {
-    /// Largest σ/d of a point of `map.ply` and of the report's pictures. 0.1: a point that is known
+    /// Largest σ/d of a point of `map.ply`, `map.pcd` and of the report's pictures. 0.1: a point that is known
     /// to a tenth of its distance; larger values keep more points and more outliers.
     pub max_relative_std_dev: f64,
     /// What is fitted before positions are compared with the ground truth: `sim3`, `se3` or `none`.
@@ -144,8 +145,8 @@ pub fn prepare_output(dir: &Path) -> Result<(), ResultsError> {
     attempt().map_err(|source| ResultsError::Write { path: dir.to_path_buf(), source })
 }
 
-/// Writes `trajectory.txt`, `trajectory_online.txt`, `keyframes.txt`, `map.ply`, `summary.json`
-/// and `report.html` into `dir`, which [`prepare_output`] has made. True depth comes from
+/// Writes `trajectory.txt`, `trajectory_online.txt`, `keyframes.txt`, `map.ply`, `map.pcd`,
+/// `summary.json` and `report.html` into `dir`, which [`prepare_output`] has made. True depth comes from
 /// `depth_source` where it has any.
 pub fn write_results(
     dir: &Path,
@@ -153,8 +154,10 @@ pub fn write_results(
     depth_source: &mut dyn FrameSource,
     params: &ResultsParams,
 ) -> Result<Summary, ResultsError> {
-    let trajectory = poses::final_trajectory(record);
-    let online = poses::online_trajectory(record);
+    // Files hold every epoch; figures and pictures are of the longest.
+    let epoch = poses::longest_epoch(record);
+    let trajectory = poses::final_trajectory(record, epoch);
+    let online = poses::online_trajectory(record, epoch);
     let evaluate = |estimate: &[StampedPose]| {
         // Poses that were given have no error.
         let given = record.depth_scale == DepthScale::Given;
@@ -176,10 +179,15 @@ pub fn write_results(
         let path = dir.join(name);
         write(&path).map_err(|source| ResultsError::Write { path, source })
     };
-    write("trajectory.txt", &|path| write_trajectory(path, poses::FINAL_COMMENT, &trajectory))?;
-    write("trajectory_online.txt", &|path| write_trajectory(path, poses::ONLINE_COMMENT, &online))?;
+    write("trajectory.txt", &|path| {
+        write_trajectory(path, poses::FINAL_COMMENT, &poses::final_trajectory(record, None))
+    })?;
+    write("trajectory_online.txt", &|path| {
+        write_trajectory(path, poses::ONLINE_COMMENT, &poses::online_trajectory(record, None))
+    })?;
     write("keyframes.txt", &|path| poses::write_keyframes(path, &record.map))?;
     write("map.ply", &|path| ply::write_ply(path, &cloud))?;
+    write("map.pcd", &|path| pcd::write_pcd(path, &cloud))?;
     write("summary.json", &|path| {
         write_atomically(path, |file| {
             serde_json::to_writer_pretty(&mut *file, &summary)?;

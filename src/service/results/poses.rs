@@ -1,6 +1,6 @@
 //! The trajectories and keyframe poses of a run.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::io::{self, Write};
 use std::path::Path;
 
@@ -17,33 +17,45 @@ pub const FINAL_COMMENT: &str =
 /// First line of `trajectory_online.txt`.
 pub const ONLINE_COMMENT: &str = "world_from_camera of every tracked frame as it was published";
 
-/// Every tracked frame on the final pose of its keyframe. A frame whose keyframe the final map
-/// does not hold (it belongs to an earlier epoch) keeps its published pose.
-pub fn final_trajectory(record: &RunRecord) -> Vec<StampedPose> {
+/// The epoch with the most tracked frames, the earliest of equals; `None` where none is tracked. Each
+/// epoch has a frame and a scale of its own, so that only one can be compared with ground truth.
+pub fn longest_epoch(record: &RunRecord) -> Option<u32> {
+    let mut frames = BTreeMap::new();
+    for pose in record.poses.iter().filter(|pose| pose.estimate.state.is_tracked()) {
+        *frames.entry(pose.estimate.epoch).or_insert(0_usize) += 1;
+    }
+    frames.into_iter().rev().max_by_key(|&(_, count)| count).map(|(epoch, _)| epoch)
+}
+
+/// Every tracked frame, of one epoch or of all, on the final pose of its keyframe. A frame whose
+/// keyframe the final map does not hold keeps its published pose.
+pub fn final_trajectory(record: &RunRecord, epoch: Option<u32>) -> Vec<StampedPose> {
     let places: HashMap<(u32, u64), _> = record
         .map
         .keyframes
         .iter()
         .map(|k| ((k.epoch, k.keyframe_id), k.world_from_keyframe))
         .collect();
-    tracked(record, |estimate| match places.get(&(estimate.epoch, estimate.keyframe_id)) {
+    tracked(record, epoch, |estimate| match places.get(&(estimate.epoch, estimate.keyframe_id)) {
         Some(world_from_keyframe) => world_from_keyframe.place(&estimate.keyframe_from_camera),
         None => estimate.world_from_camera,
     })
 }
 
-/// Every tracked frame as it was published.
-pub fn online_trajectory(record: &RunRecord) -> Vec<StampedPose> {
-    tracked(record, |estimate| estimate.world_from_camera)
+/// Every tracked frame, of one epoch or of all, as it was published.
+pub fn online_trajectory(record: &RunRecord, epoch: Option<u32>) -> Vec<StampedPose> {
+    tracked(record, epoch, |estimate| estimate.world_from_camera)
 }
 
 fn tracked(
     record: &RunRecord,
+    epoch: Option<u32>,
     world_from_camera: impl Fn(&crate::slam::pose::PoseEstimate) -> crate::slam::geometry::se3::SE3,
 ) -> Vec<StampedPose> {
     let estimates = record.poses.iter().map(|pose| &pose.estimate);
     estimates
         .filter(|estimate| estimate.state.is_tracked())
+        .filter(|estimate| epoch.is_none_or(|epoch| estimate.epoch == epoch))
         .map(|estimate| StampedPose {
             nanos: estimate.capture_nanos,
             world_from_camera: world_from_camera(estimate),

@@ -1,7 +1,10 @@
 //! `summary.json`: the figures of a run. A key without meaning in a mode is null.
 
+use std::collections::BTreeSet;
+
 use serde::{Deserialize, Serialize};
 
+use crate::service::results::poses::longest_epoch;
 use crate::service::results::{RecordedPose, RunMode, RunRecord};
 use crate::slam::evaluation::TrajectoryEvaluation;
 use crate::slam::evaluation::depth_error::DepthStatistics;
@@ -114,6 +117,11 @@ pub struct Summary {
     pub points: u64,
     /// Life of the map at the end, from 0.
     pub epoch: u32,
+    /// Epochs with tracked frames.
+    pub epochs: u64,
+    /// The epoch that is compared with ground truth: the one with the most tracked frames. Each epoch
+    /// has a frame and a scale of its own; `matched_poses` says how many frames its figures cover.
+    pub evaluated_epoch: Option<u32>,
     /// From a frame's stamp to its pose's publication.
     pub latency_ms: Option<Percentiles>,
     /// Time that the tracker was allowed for a frame.
@@ -179,6 +187,8 @@ impl Summary {
             keyframes: record.map.keyframes.len() as u64,
             points: points as u64,
             epoch: record.poses.last().map_or(0, |pose| pose.estimate.epoch),
+            epochs: count_epochs(&record.poses),
+            evaluated_epoch: trajectory.and_then(|_| longest_epoch(record)),
             latency_ms: Percentiles::of(record.poses.iter().filter_map(|p| p.latency_nanos)),
             deadline_ms: record.deadline_nanos.map(|n| n as f64 * 1e-6),
             deadline_misses: record.deadline_misses,
@@ -206,6 +216,11 @@ fn is_lost(state: TrackingState) -> bool {
 
 fn count_states(poses: &[RecordedPose], is: fn(TrackingState) -> bool) -> u64 {
     poses.iter().filter(|pose| is(pose.estimate.state)).count() as u64
+}
+
+fn count_epochs(poses: &[RecordedPose]) -> u64 {
+    let tracked = poses.iter().filter(|pose| pose.estimate.state.is_tracked());
+    tracked.map(|pose| pose.estimate.epoch).collect::<BTreeSet<_>>().len() as u64
 }
 
 /// Entries into Lost.

@@ -19,6 +19,10 @@ pub fn summary_text(summary: &Summary) -> String {
             summary.keyframes, summary.points, summary.epoch
         ),
     );
+    if let Some(epoch) = summary.evaluated_epoch.filter(|_| summary.epochs > 1) {
+        let figures = format!("of epoch {epoch}, the longest of {}", summary.epochs);
+        line("errors", figures);
+    }
     if let Some(error) = trajectory_errors(&summary.trajectory) {
         line("trajectory", error);
     }

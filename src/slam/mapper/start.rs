@@ -8,48 +8,84 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::buffer::Image;
 use crate::slam::initializer::{StartEvidence, StartMethod, proven_ratio, randomise};
-use crate::slam::keyframe::MapState;
+use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::mapper::situation::StartProgress;
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::pose::{PoseEstimate, TrackingState};
 use crate::slam::two_frame::evidence::Waiting;
 use crate::slam::two_frame::{InitOutcome, InitState};
 
 impl Mapper {
-    /// Begins a map on this frame: with the sensor's depth, with random depth, or, where the pose is
-    /// claimed without a map (it is given, so the baselines will be true), without any.
+    /// Begins an epoch on this frame: with the sensor's depth, with random depth, or, where the pose is
+    /// claimed without a map (it is given, so the baselines will be true), without any. An epoch after
+    /// the first begins where the camera was last known to be and in the unit of the last keyframe:
+    /// nothing ties it to the one before, and who does not look at the epoch sees the smallest jump.
     pub(super) fn start(
         &mut self,
         frame: &FrameView<'_>,
         pose: &PoseEstimate,
         sensor_depth: Option<&Image<f32>>,
     ) -> StepOutcome {
-        self.map.keyframes.clear();
-        self.past.clear();
-        self.depth.restart(frame.pixels, self.params.min_gradient, self.params.max_candidates);
         let is_given = pose.state.is_tracked();
+        let from_images = sensor_depth.is_none() && !is_given;
+        if from_images && self.params.initializer.method == StartMethod::TwoFrame {
+            return self.start_from_two_frames(frame, pose);
+        }
+        let (origin, unit) = self.origin(pose);
+        self.begin_epoch(frame.pixels);
         let map_state = match sensor_depth {
             Some(sensor) => {
                 take_sensor_depth(&mut self.depth, sensor, 1.0);
                 MapState::Established
             }
             None if is_given => MapState::Established,
-            None => match self.params.initializer.method {
-                StartMethod::TwoFrame => return self.start_from_two_frames(frame),
-                StartMethod::Random => {
-                    self.start_at_random(frame);
-                    MapState::Initializing
-                }
-            },
+            None => {
+                self.start_at_random(frame);
+                MapState::Initializing
+            }
         };
-        let scale = self.rescale_to_unit_mean();
-        let world_from_camera = if is_given { pose.world_from_camera } else { SE3::identity() };
-        self.add_keyframe(frame, Sim3::new(world_from_camera, scale), map_state);
+        let unit = if from_images { unit } else { 1.0 };
+        let scale = unit * self.rescale_to_unit_mean();
+        let world_from_camera = if is_given { pose.world_from_camera } else { origin };
+        let epoch = self.next_epoch();
+        self.add_keyframe(frame, Sim3::new(world_from_camera, scale), map_state, epoch);
         StepOutcome {
             keyframe_created: true,
             keyframe_changed: true,
             graph_changed: true,
             ..Default::default()
         }
+    }
+
+    /// Where the next epoch begins and what its unit is in the one before, as far as can be known.
+    fn origin(&self, pose: &PoseEstimate) -> (SE3, f64) {
+        let trusted = |keyframe: &&Keyframe| keyframe.map_state == MapState::Established;
+        match self.map.keyframes.iter().rev().find(trusted) {
+            Some(last) => (pose.world_from_camera, last.world_from_keyframe.scale),
+            None => (SE3::identity(), 1.0),
+        }
+    }
+
+    fn next_epoch(&self) -> u32 {
+        self.map.keyframes.last().map_or(0, |last| last.epoch + 1)
+    }
+
+    /// Leaves the keyframe in force, discards a start that was never proven, and begins depth on `pixels`.
+    fn begin_epoch(&mut self, pixels: &[u8]) {
+        self.leave_keyframe();
+        self.map.keyframes.retain(|keyframe| keyframe.map_state != MapState::Initializing);
+        self.in_force = None;
+        self.contradiction = None;
+        self.recovery.end();
+        self.past.clear();
+        self.depth.restart(pixels, self.params.min_gradient, self.params.max_candidates);
+    }
+
+    /// Forgets what a two-frame start has seen.
+    pub(super) fn forget_start(&mut self) {
+        self.first_stamp = None;
+        self.start_progress = StartProgress::default();
+        self.two_frame.begin(&[]);
     }
 
     /// Judges a start that is not proven yet: proves it, goes on, or begins again.
@@ -70,7 +106,7 @@ impl Mapper {
         if !proven && self.frames_on_keyframe > u64::from(params.max_frames) {
             return self.start(frame, pose, sensor_depth);
         }
-        if proven && let Some(keyframe) = self.map.keyframes.last_mut() {
+        if proven && let Some(keyframe) = self.keyframe_mut() {
             keyframe.map_state = MapState::Established;
         }
         self.remember(frame, pose);
@@ -86,8 +122,9 @@ impl Mapper {
 
     /// Gives the two-frame start another frame. Once it is proven its first frame becomes a keyframe
     /// and this frame the next one, so that the tracker begins where the camera is.
-    fn start_from_two_frames(&mut self, frame: &FrameView<'_>) -> StepOutcome {
+    fn start_from_two_frames(&mut self, frame: &FrameView<'_>, pose: &PoseEstimate) -> StepOutcome {
         let start = self.two_frame.step(frame.pixels);
+        self.start_progress.observe(start.state);
         let stamp = (frame.sequence, frame.capture_nanos);
         let first = *self.first_stamp.get_or_insert(stamp);
         match start.state {
@@ -96,7 +133,7 @@ impl Mapper {
             InitState::Failed(_) => self.first_stamp = Some(stamp),
             InitState::Proven => {
                 self.first_stamp = None;
-                return self.begin_proven(frame, first, &start);
+                return self.begin_proven(frame, first, &start, self.origin(pose));
             }
         }
         StepOutcome::default()
@@ -107,9 +144,11 @@ impl Mapper {
         frame: &FrameView<'_>,
         first: (u64, i64),
         start: &InitOutcome,
+        (origin, unit): (SE3, f64),
     ) -> StepOutcome {
         let first_pixels = self.two_frame.first_pixels().to_vec();
-        self.depth.restart(&first_pixels, self.params.min_gradient, self.params.max_candidates);
+        self.begin_epoch(&first_pixels);
+        let epoch = self.next_epoch();
         self.two_frame.fill(&mut self.depth);
         self.frame.fill(frame.pixels);
         let observer = Observer {
@@ -128,11 +167,13 @@ impl Mapper {
             pixels: &first_pixels,
             ..*frame
         };
-        let world_from_first = Sim3::new(SE3::identity(), scale);
-        self.add_keyframe(&first_frame, world_from_first, MapState::Established);
+        let world_from_start = Sim3::new(origin, unit);
+        let world_from_first = Sim3::new(origin, unit * scale);
+        self.add_keyframe(&first_frame, world_from_first, MapState::Established, epoch);
         let pose = PoseEstimate {
             state: TrackingState::Initializing,
-            world_from_camera: start.first_from_current,
+            epoch,
+            world_from_camera: world_from_start.place(&start.first_from_current),
             brightness: start.brightness,
             keyframe_id: self.next_keyframe_id - 1,
             ..PoseEstimate::unknown(frame)
@@ -143,6 +184,7 @@ impl Mapper {
             keyframe_changed: true,
             graph_changed: true,
             observations,
+            ..Default::default()
         }
     }
 

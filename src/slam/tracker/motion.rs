@@ -73,6 +73,30 @@ pub fn hypotheses(motion: &Motion, nanos: i64, rotation_rad: f64) -> impl Iterat
     speeds.into_iter().chain(turns).flatten()
 }
 
+/// A camera as it stands, panned and tilted by `rotation_rad` either way and both, and rolled: the views
+/// from which a coarse alignment finds it, wherever it looks near there.
+pub fn turned(world_from_camera: &SE3, rotation_rad: f64) -> impl Iterator<Item = SE3> {
+    /// (tilt, pan, roll) in units of the rotation.
+    const TURNS: [[f64; 3]; 11] = [
+        [0.0, 0.0, 0.0],
+        [1.0, 0.0, 0.0],
+        [-1.0, 0.0, 0.0],
+        [0.0, 1.0, 0.0],
+        [0.0, -1.0, 0.0],
+        [1.0, 1.0, 0.0],
+        [1.0, -1.0, 0.0],
+        [-1.0, 1.0, 0.0],
+        [-1.0, -1.0, 0.0],
+        [0.0, 0.0, 1.0],
+        [0.0, 0.0, -1.0],
+    ];
+    let world_from_camera = *world_from_camera;
+    TURNS.into_iter().map(move |turn| {
+        let [tilt, pan, roll] = turn.map(|share| share * rotation_rad);
+        world_from_camera * SE3::exp(&Vector6::new(0.0, 0.0, 0.0, tilt, pan, roll))
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -19,6 +19,12 @@ pub struct VerdictParams {
     /// What `lost_inliers` rises by until a lost tracker may claim a pose again: a wrong pose
     /// must not pass by chance.
     pub recovery_margin: f64,
+    /// Farthest from the keyframe that a lost tracker may claim a pose, keyframe units (mean depths):
+    /// from afar the depth variance explains any image.
+    pub recovery_distance: f64,
+    /// Largest logarithm of the gain, either way, with which a lost tracker may claim a pose: a
+    /// small gain flattens any image. Automatic exposure stays below a factor of e.
+    pub recovery_gain: f64,
     /// Share of points in view below which a pose is degraded.
     pub degraded_in_view: f64,
     /// Whitened RMSE above which a pose is degraded.
@@ -34,6 +40,8 @@ impl Default for VerdictParams {
             lost_in_view: 0.1,
             lost_inliers: 0.5,
             recovery_margin: 0.15,
+            recovery_distance: 1.0,
+            recovery_gain: 1.0,
             degraded_in_view: 0.35,
             degraded_whitened_rmse: 2.0,
             gap_frames: 2,
@@ -48,6 +56,8 @@ impl VerdictParams {
         check_range("lost_in_view", self.lost_in_view, 0.0..=1.0)?;
         check_range("lost_inliers", self.lost_inliers, 0.0..=1.0)?;
         check_range("recovery_margin", self.recovery_margin, 0.0..=1.0)?;
+        check_range("recovery_distance", self.recovery_distance, 0.0..=1e3)?;
+        check_range("recovery_gain", self.recovery_gain, 0.0..=100.0)?;
         check_range("degraded_in_view", self.degraded_in_view, 0.0..=1.0)?;
         check_range("degraded_whitened_rmse", self.degraded_whitened_rmse, 0.0..=1e3)?;
         check_range("gap_frames", self.gap_frames, 0..=1_000_000)
@@ -71,6 +81,8 @@ impl VerdictParams {
             || quality.in_view_ratio < self.lost_in_view
         {
             TrackingState::Lost(LostReason::Diverged)
+        } else if was_lost && !self.is_near(alignment) {
+            TrackingState::Lost(LostReason::Diverged)
         } else if quality.inlier_ratio < inliers {
             TrackingState::Lost(LostReason::TooFewInliers)
         } else if alignment.ending == Ending::OutOfBudget {
@@ -84,6 +96,13 @@ impl VerdictParams {
         } else {
             TrackingState::Tracking
         }
+    }
+
+    /// Whether place and brightness are such as a camera that is found again has.
+    fn is_near(&self, alignment: &Alignment) -> bool {
+        let state = &alignment.state;
+        state.current_from_keyframe.translation.norm() <= self.recovery_distance
+            && state.brightness.a.abs() <= self.recovery_gain
     }
 }
 
@@ -101,4 +120,12 @@ pub fn quality_of(alignment: &Alignment) -> Quality {
         points: sums.in_view,
         mean_squared_flow: alignment.mean_squared_flow,
     }
+}
+
+/// Whether one coarse alignment explains the frame better than another: more inliers, counted
+/// over all points so that looking away does not pay.
+pub fn is_better(one: &Alignment, other: &Alignment) -> bool {
+    let inliers = |alignment: &Alignment| alignment.state.sums.inliers;
+    let energy = |alignment: &Alignment| alignment.state.sums.mean_energy();
+    inliers(one) > inliers(other) || (inliers(one) == inliers(other) && energy(one) < energy(other))
 }

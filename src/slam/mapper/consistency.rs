@@ -1,0 +1,161 @@
+//! Whether the map still agrees with itself: what must not pass for a pose is caught here.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+use crate::slam::depth::gaussian::ObservationCounts;
+use crate::slam::parameter::{ParameterError, check_range};
+
+/// What a map that can be trusted does not do.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ConsistencyParams {
+    /// Share of a frame's searches that may fail. Recordings stay below 0.57, nearly all of their
+    /// frames below 0.4.
+    pub max_failed_ratio: f64,
+    /// Frames in a row with more failures that reject the map: one alone may be a blink.
+    pub max_failed_frames: u32,
+    /// Share of the hypotheses that a keyframe must keep, and that must reach the next one.
+    /// Recordings keep 0.4 at worst.
+    pub min_kept_ratio: f64,
+    /// Largest ratio, either way, of mean inverse depths of a keyframe and the next one. A keyframe
+    /// comes after a third of the mean depth: walking up to a wall gives 1.5, recordings 0.74 to 1.32.
+    pub max_depth_ratio: f64,
+}
+
+impl Default for ConsistencyParams {
+    fn default() -> Self {
+        Self {
+            max_failed_ratio: 0.7,
+            max_failed_frames: 5,
+            min_kept_ratio: 0.1,
+            max_depth_ratio: 2.5,
+        }
+    }
+}
+
+impl ConsistencyParams {
+    /// Checks every value.
+    pub fn validate(&self) -> Result<(), ParameterError> {
+        check_range("max_failed_ratio", self.max_failed_ratio, 0.0..=1.0)?;
+        check_range("max_failed_frames", self.max_failed_frames, 1..=1000)?;
+        check_range("min_kept_ratio", self.min_kept_ratio, 0.0..=1.0)?;
+        check_range("max_depth_ratio", self.max_depth_ratio, 1.0..=1e6)
+    }
+}
+
+/// Why a map is rejected.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Contradiction {
+    /// Frame after frame most searches fail: the poses or the depths are wrong.
+    FailedSearches,
+    /// Almost no depth is left.
+    LostDepth,
+    /// The mean depth jumped from one keyframe to the next.
+    ScaleJump,
+}
+
+impl fmt::Display for Contradiction {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::FailedSearches => "frame after frame most searches for depth fail",
+            Self::LostDepth => "almost no depth is left",
+            Self::ScaleJump => "the mean depth jumped from one keyframe to the next",
+        })
+    }
+}
+
+/// What is watched from frame to frame on one keyframe.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Consistency {
+    failed_frames: u32,
+    most_points: usize,
+}
+
+impl Consistency {
+    /// Takes in what a frame did to the map.
+    pub(super) fn observe(
+        &mut self,
+        counts: &ObservationCounts,
+        params: &ConsistencyParams,
+    ) -> Option<Contradiction> {
+        /// Fewer searches than this say nothing about the map.
+        const MIN_SEARCHES: usize = 200;
+        if counts.attempted >= MIN_SEARCHES {
+            let failed_ratio = counts.failed as f64 / counts.attempted as f64;
+            let has_failed = failed_ratio > params.max_failed_ratio;
+            self.failed_frames = if has_failed { self.failed_frames + 1 } else { 0 };
+        }
+        (self.failed_frames >= params.max_failed_frames).then_some(Contradiction::FailedSearches)
+    }
+
+    /// Takes in how many points the keyframe has now.
+    pub(super) fn count_points(
+        &mut self,
+        points: usize,
+        params: &ConsistencyParams,
+    ) -> Option<Contradiction> {
+        self.most_points = self.most_points.max(points);
+        let kept = params.min_kept_ratio * self.most_points as f64;
+        ((points as f64) < kept).then_some(Contradiction::LostDepth)
+    }
+}
+
+/// Judges the step to a new keyframe: hypotheses before and after, and the new mean inverse depth in
+/// units of the one before.
+pub(super) fn judge_change(
+    before: usize,
+    after: usize,
+    depth_ratio: f64,
+    params: &ConsistencyParams,
+) -> Option<Contradiction> {
+    if (after as f64) < params.min_kept_ratio * before as f64 {
+        return Some(Contradiction::LostDepth);
+    }
+    let bound = params.max_depth_ratio;
+    let is_plausible = depth_ratio <= bound && depth_ratio * bound >= 1.0;
+    (!is_plausible).then_some(Contradiction::ScaleJump)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn counts(attempted: usize, failed: usize) -> ObservationCounts {
+        ObservationCounts { attempted, failed, fused: attempted - failed, created: 0 }
+    }
+
+    #[test]
+    fn failures_reject_only_in_a_row_and_in_number() {
+        let params = ConsistencyParams::default();
+        let mut watched = Consistency::default();
+        for _ in 0..50 {
+            for _ in 1..params.max_failed_frames {
+                assert_eq!(watched.observe(&counts(1000, 900), &params), None);
+            }
+            assert_eq!(watched.observe(&counts(1000, 300), &params), None);
+        }
+        let few = (0..50).filter_map(|_| watched.observe(&counts(100, 100), &params)).count();
+        assert_eq!(few, 0);
+        let last = (0..params.max_failed_frames)
+            .map(|_| watched.observe(&counts(1000, 900), &params))
+            .last();
+        assert_eq!(last, Some(Some(Contradiction::FailedSearches)));
+    }
+
+    #[test]
+    fn a_jump_of_the_scale_and_a_collapse_are_rejected() {
+        let params = ConsistencyParams::default();
+        assert_eq!(judge_change(1000, 500, 1.4, &params), None);
+        assert_eq!(judge_change(0, 0, 1.0, &params), None);
+        assert_eq!(judge_change(1000, 50, 1.0, &params), Some(Contradiction::LostDepth));
+        for ratio in [3.0, 0.3, f64::NAN, f64::INFINITY, 0.0] {
+            assert_eq!(judge_change(1000, 900, ratio, &params), Some(Contradiction::ScaleJump));
+        }
+        let mut watched = Consistency::default();
+        assert_eq!(watched.count_points(1000, &params), None);
+        assert_eq!(watched.count_points(400, &params), None);
+        assert_eq!(watched.count_points(40, &params), Some(Contradiction::LostDepth));
+    }
+}

@@ -1,0 +1,318 @@
+//! What the mapper does while the camera is lost: it looks for it on recent keyframes, and when that
+//! fails for long begins a new epoch beside the search. Whichever is first wins: until the new
+//! epoch's start is proven the old one can be found again.
+
+use serde::{Deserialize, Serialize};
+
+use crate::slam::alignment::align::{Aligner, Alignment, AlignmentParams};
+use crate::slam::alignment::kernel::SimdMode;
+use crate::slam::alignment::reference::{Reference, ReferenceParams, num_levels};
+use crate::slam::depth::gaussian::MAX_VALIDITY;
+use crate::slam::depth::map::{DepthMap, Hypothesis};
+use crate::slam::frame::FrameView;
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::image::buffer::Image;
+use crate::slam::image::sums::SumPyramid;
+use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
+use crate::slam::mapper::{Mapper, StepOutcome};
+use crate::slam::parameter::{ParameterError, check_range};
+use crate::slam::pose::{Brightness, PoseEstimate};
+use crate::slam::tracker::motion::turned;
+use crate::slam::tracker::verdict::{VerdictParams, is_better, quality_of};
+
+/// Tuning of the recovery from a loss.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RecoveryParams {
+    /// Recent keyframes of the epoch that are searched for the camera, in turn.
+    pub num_keyframes: usize,
+    /// Keyframes that are searched in one frame: each costs about as much as a keyframe's
+    /// preparation in the tracker, and a frame must stay bounded.
+    pub keyframes_per_frame: usize,
+    /// The camera is looked for where the keyframe was taken and turned so far about its axes,
+    /// degrees; a coarse alignment reaches about as far on each side.
+    pub rotation_deg: f64,
+    /// Time of the frames' stamps without success after which a new epoch is begun, seconds: two
+    /// or three rounds of the search.
+    pub lost_timeout_secs: f64,
+}
+
+impl Default for RecoveryParams {
+    fn default() -> Self {
+        Self {
+            num_keyframes: 20,
+            keyframes_per_frame: 1,
+            rotation_deg: 6.0,
+            lost_timeout_secs: 2.0,
+        }
+    }
+}
+
+impl RecoveryParams {
+    /// Checks every value.
+    pub fn validate(&self) -> Result<(), ParameterError> {
+        check_range("num_keyframes", self.num_keyframes, 0..=10_000)?;
+        check_range("keyframes_per_frame", self.keyframes_per_frame, 1..=100)?;
+        check_range("rotation_deg", self.rotation_deg, 0.0..=45.0)?;
+        check_range("lost_timeout_secs", self.lost_timeout_secs, 0.0..=1e6)
+    }
+}
+
+/// The search, its memory, and how long it has been going on.
+#[derive(Debug)]
+pub(super) struct Recovery {
+    aligner: Aligner,
+    verdict: VerdictParams,
+    reference: Reference,
+    pyramid: SumPyramid,
+    /// Stamp of the first lost frame; `None` while the camera is where it is thought to be.
+    since_nanos: Option<i64>,
+    /// Keyframes searched since then.
+    searched: usize,
+    /// Whether a new epoch is being begun.
+    pub(super) is_restarting: bool,
+}
+
+impl Recovery {
+    /// A search in images of `intrinsics`. What it finds is only proposed, and the tracker judges by
+    /// its own parameters, so that the defaults do here; portable, so that every CPU finds the same.
+    pub(super) fn new(intrinsics: &Intrinsics) -> Self {
+        let Intrinsics { width, height, .. } = *intrinsics;
+        let reference = ReferenceParams::default();
+        let levels = num_levels(width, height);
+        let alignment = AlignmentParams { simd: SimdMode::Portable, ..Default::default() };
+        Self {
+            aligner: Aligner::new(alignment),
+            verdict: VerdictParams::default(),
+            pyramid: SumPyramid::with_size(width, height, levels, reference.finest_level),
+            reference: Reference::new(reference),
+            since_nanos: None,
+            searched: 0,
+            is_restarting: false,
+        }
+    }
+
+    /// The camera is found.
+    pub(super) fn end(&mut self) {
+        (self.since_nanos, self.searched, self.is_restarting) = (None, 0, false);
+    }
+
+    /// Whether the camera is lost.
+    pub(super) fn is_under_way(&self) -> bool {
+        self.since_nanos.is_some()
+    }
+
+    /// How long it has been lost, seconds.
+    fn lost_secs(&mut self, nanos: i64) -> f64 {
+        let since = *self.since_nanos.get_or_insert(nanos);
+        nanos.saturating_sub(since) as f64 * 1e-9
+    }
+
+    /// The next of `keyframes`, newest first and in turn, that shows what `pixels` do.
+    fn find(
+        &mut self,
+        keyframes: &[Keyframe],
+        in_force: usize,
+        pixels: &[u8],
+        params: &RecoveryParams,
+    ) -> Option<usize> {
+        let epoch = keyframes.get(in_force)?.epoch;
+        // The tracker itself looks around the keyframe in force.
+        let is_eligible = |index: &usize| {
+            let keyframe = &keyframes[*index];
+            *index != in_force
+                && keyframe.epoch == epoch
+                && keyframe.map_state == MapState::Established
+                // The oldest of a large map keep only their poses.
+                && !keyframe.points.is_empty()
+        };
+        let newest_first = (0..keyframes.len()).rev().filter(is_eligible);
+        let candidates: Vec<usize> = newest_first.take(params.num_keyframes).collect();
+        if candidates.is_empty() {
+            return None;
+        }
+        self.pyramid.fill(pixels);
+        for _ in 0..params.keyframes_per_frame.min(candidates.len()) {
+            let index = candidates[self.searched % candidates.len()];
+            self.searched += 1;
+            if self.shows(&keyframes[index], params.rotation_deg.to_radians()) {
+                return Some(index);
+            }
+        }
+        None
+    }
+
+    /// Whether the frame in the pyramid can be aligned to `keyframe` from some view near it.
+    fn shows(&mut self, keyframe: &Keyframe, rotation_rad: f64) -> bool {
+        self.reference.prepare_into(keyframe);
+        let (aligner, reference, pyramid) = (&self.aligner, &self.reference, &self.pyramid);
+        let mut best: Option<Alignment> = None;
+        for keyframe_from_camera in turned(&SE3::identity(), rotation_rad) {
+            let start = keyframe_from_camera.inverse();
+            let mut other = aligner.start(reference, pyramid, &start, Brightness::default());
+            let level = other.level;
+            aligner.solve_level(reference, pyramid, level, &mut other, &mut |_| true);
+            if best.as_ref().is_none_or(|best| is_better(&other, best)) {
+                best = Some(other);
+            }
+        }
+        let Some(mut best) = best else { return false };
+        aligner.descend(reference, pyramid, &mut best, &mut |_| true);
+        self.verdict.judge(&best, &quality_of(&best), true, 0).is_tracked()
+    }
+}
+
+impl Mapper {
+    /// One frame of a loss: searches some keyframes; after the timeout gives the frame to a new
+    /// start as well.
+    pub(super) fn recover(
+        &mut self,
+        frame: &FrameView<'_>,
+        pose: &PoseEstimate,
+        sensor_depth: Option<&Image<f32>>,
+    ) -> StepOutcome {
+        let lost_secs = self.recovery.lost_secs(frame.capture_nanos);
+        if let Some(in_force) = self.in_force {
+            let (keyframes, params) = (&self.map.keyframes, &self.params.recovery);
+            let found = self.recovery.find(keyframes, in_force, frame.pixels, params);
+            if let Some(index) = found {
+                return self.restore_keyframe(index);
+            }
+        }
+        if lost_secs < self.params.recovery.lost_timeout_secs {
+            return StepOutcome::default();
+        }
+        if !std::mem::replace(&mut self.recovery.is_restarting, true) {
+            self.forget_start();
+        }
+        self.start(frame, pose, sensor_depth)
+    }
+
+    /// Puts an earlier keyframe in force again, with the depth it was left with.
+    fn restore_keyframe(&mut self, index: usize) -> StepOutcome {
+        self.leave_keyframe();
+        let Some(keyframe) = self.map.keyframes.get_mut(index) else {
+            return StepOutcome::default();
+        };
+        let (min_gradient, max_candidates) = (self.params.min_gradient, self.params.max_candidates);
+        self.depth.restart(&keyframe.image, min_gradient, max_candidates);
+        restore_points(&mut self.depth, &keyframe.points);
+        self.revision += 1;
+        keyframe.revision = self.revision;
+        self.enter_keyframe(index);
+        self.past.clear();
+        StepOutcome { keyframe_restored: true, keyframe_changed: true, ..Default::default() }
+    }
+}
+
+/// Puts the points of a keyframe back into its depth map: each as its filter left it, half proven.
+fn restore_points(map: &mut DepthMap, points: &[DepthPoint]) {
+    for point in points {
+        let index = usize::from(point.v) * map.image.width() + usize::from(point.u);
+        if let Some(hypothesis) = map.hypotheses.pixels_mut().get_mut(index) {
+            *hypothesis = Hypothesis {
+                inverse_depth: point.inverse_depth,
+                variance: point.variance,
+                smoothed: point.inverse_depth,
+                validity: MAX_VALIDITY / 2,
+                propagated: true,
+                failures: 0,
+            };
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::geometry::sim3::Sim3;
+    use crate::slam::test_scene::{CAMERA, Scene};
+    use nalgebra::Vector6;
+
+    /// A keyframe with exact depth at every fourth pixel.
+    fn keyframe(scene: &Scene, keyframe_id: u64, world_from_camera: SE3) -> Keyframe {
+        let view = scene.render(&CAMERA, &world_from_camera);
+        let pixels = (4..CAMERA.height - 4)
+            .step_by(2)
+            .flat_map(|v| (4..CAMERA.width - 4).step_by(2).map(move |u| (u, v)));
+        let points = pixels.map(|(u, v)| DepthPoint {
+            u: u as u16,
+            v: v as u16,
+            inverse_depth: view.inverse_depth.at(u, v),
+            variance: 1e-4,
+            intensity: view.intensity.at(u, v),
+        });
+        Keyframe {
+            keyframe_id,
+            epoch: 0,
+            revision: 1,
+            sequence: keyframe_id,
+            capture_nanos: 0,
+            map_state: MapState::Established,
+            world_from_keyframe: Sim3::new(world_from_camera, 1.0),
+            intrinsics: CAMERA,
+            points: points.collect(),
+            image: view.noisy(1.0, keyframe_id),
+        }
+    }
+
+    fn at(twist: [f64; 6]) -> SE3 {
+        SE3::exp(&Vector6::from(twist))
+    }
+
+    #[test]
+    fn a_known_view_is_found_on_its_keyframe_and_an_unknown_one_on_none() {
+        let scene = Scene::new(3);
+        let home = at([0.0; 6]);
+        let away = at([0.0, 0.0, 0.0, 0.0, 1.2, 0.0]);
+        let elsewhere = at([0.0, 0.0, 0.0, 0.0, 2.8, 0.0]);
+        let keyframes =
+            [keyframe(&scene, 0, home), keyframe(&scene, 1, away), keyframe(&scene, 2, elsewhere)];
+        let params = RecoveryParams { keyframes_per_frame: 3, ..Default::default() };
+        let find = |recovery: &mut Recovery, view: SE3| {
+            let pixels = scene.render(&CAMERA, &view).noisy(2.0, 9);
+            recovery.find(&keyframes, 2, &pixels, &params)
+        };
+        let mut recovery = Recovery::new(&CAMERA);
+        let near_home = at([0.1, -0.05, 0.1, 0.05, 0.1, -0.05]);
+        assert_eq!(find(&mut recovery, near_home), Some(0));
+        assert_eq!(find(&mut recovery, away * near_home), Some(1));
+        assert_eq!(find(&mut recovery, at([0.0, 0.0, 0.0, 0.0, -1.5, 0.0])), None);
+        assert_eq!(find(&mut recovery, elsewhere), None, "the one in force is the tracker's");
+    }
+
+    #[test]
+    fn keyframes_take_turns_and_rejected_ones_and_other_epochs_are_left_out() {
+        let scene = Scene::new(3);
+        let known = keyframe(&scene, 0, SE3::identity());
+        let mut rejected = known.clone();
+        rejected.map_state = MapState::Rejected;
+        let other_epoch = Keyframe { epoch: 1, ..known.clone() };
+        let in_force = keyframe(&scene, 3, at([0.0, 0.0, 0.0, 0.0, 2.0, 0.0]));
+        let pixels = known.image.clone();
+        let params = RecoveryParams::default();
+        let mut recovery = Recovery::new(&CAMERA);
+        let without = [rejected, other_epoch, in_force.clone()];
+        assert_eq!(recovery.find(&without, 2, &pixels, &params), None);
+        assert_eq!(recovery.searched, 0);
+        let far = keyframe(&scene, 1, at([0.0, 0.0, 0.0, 0.0, -2.0, 0.0]));
+        let with = [known, far, in_force];
+        assert_eq!(recovery.find(&with, 2, &pixels, &params), None, "the newest is first");
+        assert_eq!(recovery.find(&with, 2, &pixels, &params), Some(0));
+    }
+
+    #[test]
+    fn a_depth_map_is_restored_from_its_points() {
+        let scene = Scene::new(4);
+        let keyframe = keyframe(&scene, 0, SE3::identity());
+        let mut map = DepthMap::with_size(CAMERA.width, CAMERA.height);
+        map.restart(&keyframe.image, 5.0, 100_000);
+        restore_points(&mut map, &keyframe.points);
+        assert_eq!(map.num_hypotheses(), keyframe.points.len());
+        let point = keyframe.points[77];
+        let hypothesis = map.hypotheses.at(usize::from(point.u), usize::from(point.v));
+        assert_eq!(hypothesis.smoothed, point.inverse_depth);
+        assert_eq!(hypothesis.variance, point.variance);
+    }
+}

@@ -1,0 +1,104 @@
+//! What the mapper is doing and why, for whoever looks on.
+
+use std::fmt;
+
+use crate::slam::mapper::consistency::Contradiction;
+use crate::slam::two_frame::evidence::Waiting;
+use crate::slam::two_frame::{Failure, InitState};
+
+/// Where the mapper stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Situation {
+    /// No map yet.
+    Starting(StartProgress),
+    /// The first depth is random and not proven.
+    Unproven,
+    /// The map can be trusted and grows.
+    Mapping,
+    /// The camera is lost; recent keyframes are searched for it.
+    Lost,
+    /// The map contradicted itself; earlier keyframes are searched for the camera.
+    Rejected(Contradiction),
+    /// The camera has been lost for long: a new epoch is being begun, and the search goes on.
+    Restarting(StartProgress),
+}
+
+impl fmt::Display for Situation {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Starting(progress) => write!(f, "starting: {progress}"),
+            Self::Unproven => f.write_str("starting: random depth is not proven yet"),
+            Self::Mapping => f.write_str("mapping"),
+            Self::Lost => f.write_str("lost: looking for the camera on recent keyframes"),
+            Self::Rejected(why) => write!(f, "map rejected: {why}"),
+            Self::Restarting(progress) => write!(f, "lost: beginning a new epoch, {progress}"),
+        }
+    }
+}
+
+/// How far a two-frame start is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct StartProgress {
+    /// What it waits for; `None` before its first frame.
+    pub waiting: Option<Waiting>,
+    /// How often it has begun again.
+    pub failures: u32,
+    /// Why the last time.
+    pub last_failure: Option<Failure>,
+}
+
+impl StartProgress {
+    /// Takes in what a frame came to.
+    pub(super) fn observe(&mut self, state: InitState) {
+        match state {
+            InitState::Waiting(waiting) => self.waiting = Some(waiting),
+            InitState::Failed(failure) => {
+                self.waiting = None;
+                self.failures += 1;
+                self.last_failure = Some(failure);
+            }
+            InitState::Proven => *self = Self::default(),
+        }
+    }
+}
+
+impl fmt::Display for StartProgress {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self.waiting {
+            None => "waiting for a frame",
+            Some(Waiting::Texture) => "waiting for texture",
+            Some(Waiting::Match) => "waiting for a frame that shows what the first one does",
+            Some(Waiting::Significance) => "waiting for parallax: a rotation explains the images",
+            Some(Waiting::NegativeDepth) => "waiting for parallax: depths are contradictory",
+            Some(Waiting::Translation) => "waiting for translation",
+            Some(Waiting::Accuracy) => "waiting for parallax: depths are uncertain",
+            Some(Waiting::Confirmation) => "waiting for confirmation",
+        })?;
+        let why = match self.last_failure {
+            None => return Ok(()),
+            Some(Failure::TooLong) => "too many frames without proof",
+            Some(Failure::Mismatch) => "the view changed too much",
+            Some(Failure::WrongSize) => "a frame of another size",
+        };
+        write!(f, "; begun again {} times, the last for {why}", self.failures)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_start_tells_what_it_waits_for_and_why_it_began_again() {
+        let mut progress = StartProgress::default();
+        progress.observe(InitState::Waiting(Waiting::Translation));
+        assert_eq!(Situation::Starting(progress).to_string(), "starting: waiting for translation");
+        progress.observe(InitState::Failed(Failure::TooLong));
+        progress.observe(InitState::Waiting(Waiting::Texture));
+        let text = Situation::Restarting(progress).to_string();
+        assert!(text.starts_with("lost: beginning a new epoch, waiting for texture"), "{text}");
+        assert!(text.ends_with("begun again 1 times, the last for too many frames without proof"));
+        progress.observe(InitState::Proven);
+        assert_eq!(progress, StartProgress::default());
+    }
+}

@@ -1,0 +1,273 @@
+//! Loss and recovery over the whole recipe: a blackout before a known view and before a new one, a
+//! standing camera, and a map that contradicts itself.
+
+use nalgebra::Vector6;
+use semidense::capture::simulator::Simulator;
+use semidense::capture::simulator::params::{
+    MotionKind, MotionParams, SensorParams, SimulatorParams,
+};
+use semidense::capture::source::{FrameSource, FrameStamp, SourceError};
+use semidense::service::replay::{ReplayConfig, replay};
+use semidense::service::results::RunRecord;
+use semidense::slam::evaluation::umeyama::Alignment;
+use semidense::slam::evaluation::{MAX_DIFFERENCE_NANOS, evaluate_trajectory};
+use semidense::slam::frame::FrameView;
+use semidense::slam::geometry::intrinsics::Intrinsics;
+use semidense::slam::geometry::se3::SE3;
+use semidense::slam::keyframe::MapState;
+use semidense::slam::mapper::consistency::Contradiction;
+use semidense::slam::mapper::recovery::RecoveryParams;
+use semidense::slam::mapper::situation::Situation;
+use semidense::slam::mapper::{Mapper, MapperParams};
+use semidense::slam::pose::{NO_KEYFRAME, PoseEstimate, TrackingState};
+use semidense::slam::trajectory::StampedPose;
+
+/// Time from frame to frame.
+const PERIOD_NANOS: i64 = 33_333_333;
+
+/// Frames in an order of our own, at a steady rate.
+struct Script {
+    intrinsics: Intrinsics,
+    frames: Vec<Vec<u8>>,
+    truth: Vec<StampedPose>,
+    next: usize,
+}
+
+/// The frames of a simulated sequence with their poses.
+struct Footage {
+    intrinsics: Intrinsics,
+    frames: Vec<Vec<u8>>,
+    poses: Vec<SE3>,
+}
+
+/// A sequence at 320 × 240 with noise of `noise_std_dev` grey levels.
+fn footage(seed: u64, kind: MotionKind, frames: usize, noise_std_dev: f64) -> Footage {
+    let params = SimulatorParams {
+        seed,
+        frames,
+        motion: MotionParams { kind, ..MotionParams::default() },
+        sensor: SensorParams { noise_std_dev, ..SensorParams::default() },
+        width: 320,
+        height: 240,
+        focal_px: 262.5,
+        ..SimulatorParams::default()
+    };
+    let mut source = Simulator::new(params).unwrap();
+    let intrinsics = source.intrinsics();
+    let mut pixels = vec![0; intrinsics.width * intrinsics.height];
+    let (mut taken, mut poses) = (Vec::new(), Vec::new());
+    while let Some(stamp) = source.next_into(&mut pixels).unwrap() {
+        let truth = source.ground_truth();
+        let nearest = truth.iter().min_by_key(|p| p.nanos.abs_diff(stamp.capture_nanos)).unwrap();
+        poses.push(nearest.world_from_camera);
+        taken.push(pixels.clone());
+    }
+    Footage { intrinsics, frames: taken, poses }
+}
+
+impl Script {
+    fn new(intrinsics: Intrinsics) -> Self {
+        Self { intrinsics, frames: Vec::new(), truth: Vec::new(), next: 0 }
+    }
+
+    fn show(&mut self, footage: &Footage, order: impl Iterator<Item = usize>) {
+        for index in order {
+            let nanos = self.frames.len() as i64 * PERIOD_NANOS;
+            self.truth.push(StampedPose { nanos, world_from_camera: footage.poses[index] });
+            self.frames.push(footage.frames[index].clone());
+        }
+    }
+
+    fn black_out(&mut self, frames: usize) {
+        let black = vec![0; self.intrinsics.width * self.intrinsics.height];
+        self.frames.extend(std::iter::repeat_n(black, frames));
+    }
+
+    fn replay(mut self, config: &ReplayConfig) -> RunRecord {
+        replay(&mut self, "script", config, &mut |_| true).unwrap()
+    }
+}
+
+impl FrameSource for Script {
+    fn intrinsics(&self) -> Intrinsics {
+        self.intrinsics
+    }
+
+    fn num_frames(&self) -> Option<usize> {
+        Some(self.frames.len())
+    }
+
+    fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
+        let Some(frame) = self.frames.get(self.next) else { return Ok(None) };
+        pixels.copy_from_slice(frame);
+        let sequence = self.next as u64;
+        let capture_nanos = self.next as i64 * PERIOD_NANOS;
+        self.next += 1;
+        Ok(Some(FrameStamp { sequence, capture_nanos, exposure_nanos: 0, gain: 0.0 }))
+    }
+
+    fn ground_truth(&self) -> &[StampedPose] {
+        &self.truth
+    }
+}
+
+fn estimates(record: &RunRecord) -> impl DoubleEndedIterator<Item = &PoseEstimate> {
+    record.poses.iter().map(|pose| &pose.estimate)
+}
+
+fn count_tracked(record: &RunRecord, frames: std::ops::Range<usize>) -> usize {
+    estimates(record).skip(frames.start).take(frames.len()).filter(|e| e.state.is_tracked()).count()
+}
+
+/// ATE over the tracked frames of an epoch, as a share of the path.
+fn error_ratio(record: &RunRecord, epoch: u32) -> f64 {
+    let tracked: Vec<StampedPose> = estimates(record)
+        .filter(|e| e.state.is_tracked() && e.epoch == epoch)
+        .map(|e| StampedPose { nanos: e.capture_nanos, world_from_camera: e.world_from_camera })
+        .collect();
+    let truth = &record.ground_truth;
+    let evaluation =
+        evaluate_trajectory(&tracked, truth, Alignment::Sim3, MAX_DIFFERENCE_NANOS).unwrap();
+    println!(
+        "epoch {epoch}: ATE {} over {} of {}",
+        evaluation.ate.rmse,
+        tracked.len(),
+        evaluation.path_length
+    );
+    evaluation.ate.rmse / evaluation.path_length
+}
+
+#[test]
+fn after_a_blackout_a_known_view_is_found_again() {
+    let room = footage(1, MotionKind::Handheld, 140, 2.0);
+    let replay = |recovery: RecoveryParams| {
+        let mut script = Script::new(room.intrinsics);
+        script.show(&room, 0..140);
+        script.black_out(20);
+        // The camera is back where it was four seconds ago.
+        script.show(&room, 20..80);
+        let mapper = MapperParams { recovery, ..MapperParams::default() };
+        script.replay(&ReplayConfig { mapper, ..ReplayConfig::default() })
+    };
+    let record = replay(RecoveryParams::default());
+    let mut lost = estimates(&record).skip(140).take(20);
+    assert!(lost.all(|e| matches!(e.state, TrackingState::Lost(_))), "black is no pose");
+    let after = count_tracked(&record, 160..220);
+    println!("{after} of 60 tracked after the blackout");
+    assert!(after >= 50, "{after}");
+    assert!(estimates(&record).all(|e| e.epoch == 0), "it is the same map");
+    let ratio = error_ratio(&record, 0);
+    assert!(ratio < 0.02, "{ratio}");
+
+    let without_search =
+        RecoveryParams { num_keyframes: 0, lost_timeout_secs: 1e3, ..RecoveryParams::default() };
+    let after = count_tracked(&replay(without_search), 160..220);
+    assert!(after < 10, "the tracker alone does not get there: {after}");
+}
+
+#[test]
+fn after_a_blackout_a_new_view_begins_a_new_epoch() {
+    let room = footage(1, MotionKind::Handheld, 80, 2.0);
+    let elsewhere = footage(7, MotionKind::Handheld, 170, 2.0);
+    let mut script = Script::new(room.intrinsics);
+    script.show(&room, 0..80);
+    script.black_out(20);
+    script.show(&elsewhere, 0..170);
+    let record = script.replay(&ReplayConfig::default());
+    for (index, estimate) in estimates(&record).enumerate() {
+        let claims_the_old = index >= 80 && estimate.epoch == 0 && estimate.state.is_tracked();
+        assert!(!claims_the_old, "frame {index} is claimed on a map of another place");
+    }
+    let after = count_tracked(&record, 100..270);
+    println!("{after} of 170 tracked after the blackout");
+    assert!(after >= 100, "{after}");
+    assert_eq!(estimates(&record).last().unwrap().epoch, 1);
+    assert!(error_ratio(&record, 1) < 0.03);
+    let epochs: Vec<u32> = record.map.keyframes.iter().map(|k| k.epoch).collect();
+    assert!(epochs.is_sorted() && epochs[0] == 0, "earlier epochs stay: {epochs:?}");
+    // The new epoch begins near where the camera was last known to be.
+    let last = estimates(&record).rfind(|e| e.epoch == 0 && e.state.is_tracked()).unwrap();
+    let first = record.map.keyframes.iter().find(|k| k.epoch == 1).unwrap();
+    assert_eq!(first.world_from_keyframe.rigid, last.world_from_camera);
+}
+
+#[test]
+fn a_standing_camera_never_initialises() {
+    for (seed, noise_std_dev) in [(1, 2.0), (2, 4.0)] {
+        let still = footage(seed, MotionKind::Standing, 75, noise_std_dev);
+        let mut script = Script::new(still.intrinsics);
+        script.show(&still, 0..75);
+        let record = script.replay(&ReplayConfig::default());
+        assert!(record.map.keyframes.is_empty(), "{seed}");
+        assert!(estimates(&record).all(|e| e.state == TrackingState::Initializing), "{seed}");
+    }
+}
+
+#[test]
+fn a_camera_that_comes_to_rest_stays_where_it_is() {
+    const REST: usize = 70;
+    let room = footage(3, MotionKind::Handheld, REST, 0.0);
+    let mut script = Script::new(room.intrinsics);
+    script.show(&room, 0..REST);
+    script.show(&room, std::iter::repeat_n(REST - 1, 150));
+    let mut random = 1u64;
+    for pixel in script.frames.iter_mut().flatten() {
+        // A sum of four uniform bytes is near enough to a Gaussian: σ = 148 / 49 = 3 grey levels.
+        random =
+            random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        let sum: i32 = (random >> 32).to_le_bytes()[..4].iter().map(|&b| i32::from(b)).sum();
+        *pixel = (i32::from(*pixel) + (sum - 510) / 49).clamp(0, 255) as u8;
+    }
+    let record = script.replay(&ReplayConfig::default());
+    // The first frames of rest are the end of the motion: refined depth moves the pose a little.
+    let resting: Vec<_> = estimates(&record).skip(REST + 20).collect();
+    assert!(resting.iter().all(|e| e.state == TrackingState::Tracking));
+    let last = record.map.keyframes.last().unwrap();
+    assert!(last.sequence < REST as u64 + 5, "no keyframe is made at rest: {}", last.sequence);
+    // In shares of the mean depth: a few millimetres in a room of a few metres.
+    let unit = last.world_from_keyframe.scale;
+    let first = resting[0].world_from_camera.translation;
+    let furthest = resting
+        .iter()
+        .map(|e| (e.world_from_camera.translation - first).norm() / unit)
+        .fold(0.0, f64::max);
+    println!("furthest from rest: {furthest} of the mean depth");
+    assert!(furthest < 0.004, "{furthest}");
+}
+
+#[test]
+fn a_map_whose_poses_are_wrong_is_rejected() {
+    const WRONG: usize = 50;
+    let room = footage(1, MotionKind::Handheld, WRONG + 10, 2.0);
+    let mut mapper = Mapper::new(room.intrinsics, MapperParams::default()).unwrap();
+    for (index, pixels) in room.frames.iter().enumerate() {
+        let frame = FrameView {
+            sequence: index as u64,
+            capture_nanos: index as i64 * PERIOD_NANOS,
+            exposure_nanos: 0,
+            width: room.intrinsics.width,
+            height: room.intrinsics.height,
+            pixels,
+        };
+        // Three degrees are thirteen pixels.
+        let rotation = if index < WRONG { 0.0 } else { 3_f64.to_radians() };
+        let wrong = SE3::exp(&Vector6::new(0.0, 0.0, 0.0, rotation, 0.0, rotation));
+        let (keyframe_id, epoch) =
+            mapper.keyframe().map_or((NO_KEYFRAME, 0), |k| (k.keyframe_id, k.epoch));
+        let pose = PoseEstimate {
+            state: TrackingState::Tracking,
+            world_from_camera: room.poses[0].inverse() * room.poses[index] * wrong,
+            keyframe_id,
+            epoch,
+            proposes_keyframe: index % 15 == 0,
+            ..PoseEstimate::unknown(&frame)
+        };
+        mapper.step(&frame, &pose, None);
+        if index + 1 == WRONG {
+            assert_eq!(mapper.situation(), Situation::Mapping);
+        }
+    }
+    let expected = Situation::Rejected(Contradiction::FailedSearches);
+    assert_eq!(mapper.situation(), expected);
+    assert_eq!(mapper.keyframe().unwrap().map_state, MapState::Rejected);
+}
