@@ -69,6 +69,7 @@ impl InitializerParams {
         check_range("min_proven_ratio", self.min_proven_ratio, 0.01..=1.0)?;
         check_range("proven_std_dev_ratio", self.proven_std_dev_ratio, 0.001..=1.0)?;
         check_range("min_match_ratio", self.min_match_ratio, 0.0..=1.0)?;
+        check_range("line_noise_px", self.line_noise_px, 0.0..=5.0)?;
         check_range("max_frames", self.max_frames, 5..=10_000)
     }
 }

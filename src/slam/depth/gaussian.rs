@@ -203,7 +203,9 @@ impl PixelObserver<'_> {
         if expected > self.params.max_variance_ratio * hypothesis.variance {
             return;
         }
-        let reach = self.params.search_sigmas * hypothesis.variance.sqrt();
+        // No further than the search goes: half its length to either side.
+        let longest = 0.45 * self.matching.max_search_px * conditioning.inverse_depth_per_px;
+        let reach = (self.params.search_sigmas * hypothesis.variance.sqrt()).min(longest);
         let (Some(from), Some(to)) =
             (line.project((centre - reach).max(0.0)), line.project(centre + reach))
         else {
@@ -251,7 +253,7 @@ impl PixelObserver<'_> {
         hypothesis.smoothed += weight * (found.inverse_depth - hypothesis.smoothed);
         hypothesis.variance = fused.max(self.params.common_noise_ratio * found.variance).min(prior);
         hypothesis.validity = (hypothesis.validity + 1).min(MAX_VALIDITY);
-        if !(hypothesis.inverse_depth > 0.0) {
+        if !(hypothesis.inverse_depth > 0.0 && hypothesis.smoothed > 0.0) {
             hypothesis.reject();
             return false;
         }

@@ -186,7 +186,9 @@ pub fn condition(
     }
     let tangent = product(along, across) / information;
     let geometric = params.line_noise_px * params.line_noise_px * (1.0 + tangent * tangent);
-    let photometric = 2.0 * params.image_noise * params.image_noise / information;
+    // Noise of the frame, and of the keyframe as brightened.
+    let noise = (1.0 + gain * gain) * params.image_noise * params.image_noise;
+    let photometric = noise / information;
     let sampling = params.sampling_noise_px * params.sampling_noise_px;
     Some(Conditioning {
         direction,
@@ -264,7 +266,10 @@ pub fn search(
     }
     let (u, v) = (middle.0 + lambda * du, middle.1 + lambda * dv);
     let inverse_depth = line.inverse_depth_at(u, v).ok_or(Miss::OutOfView)?;
-    let alpha = conditioning.inverse_depth_per_px;
+    // ∂d/∂λ where the match is: it changes along the line when the camera moves towards the scene.
+    let at = line.project(inverse_depth).ok_or(Miss::OutOfView)?;
+    let (vu, vv) = line.velocity(&at);
+    let alpha = 1.0 / (vu * vu + vv * vv).sqrt().max(f32::MIN_POSITIVE);
     Ok(Match {
         inverse_depth,
         variance: alpha * alpha * conditioning.match_variance,

@@ -104,6 +104,7 @@ pub fn regularise(
                 let first = first.min(width - BORDER_PX - LANES);
                 smooth(
                     &mut row[first..first + LANES],
+                    &before.row(v)[first..first + LANES],
                     &sum_neighbours(&neighbourhood, first, v),
                     params,
                 );
@@ -182,8 +183,14 @@ impl Neighbourhood<'_> {
 }
 
 /// Smooths the hypotheses of a block, and drops those with too few neighbours.
-fn smooth(block: &mut [Hypothesis], sums: &NeighbourSums, params: &RegularisationParams) {
-    for (k, hypothesis) in block.iter_mut().enumerate().filter(|(_, h)| h.is_some()) {
+fn smooth(
+    block: &mut [Hypothesis],
+    before: &[Hypothesis],
+    sums: &NeighbourSums,
+    params: &RegularisationParams,
+) {
+    // What was filled just now has no sums.
+    for (k, hypothesis) in block.iter_mut().enumerate().filter(|(k, _)| before[*k].is_some()) {
         // The pixel itself is among the consistent ones.
         if sums.count[k] <= f32::from(params.min_neighbours) || !(sums.weights[k] > 0.0) {
             hypothesis.reject();
@@ -210,7 +217,8 @@ fn fill(
     let (mut sum, mut squares, mut weights, mut neighbours) = (0.0f32, 0.0f32, 0.0f32, 0u8);
     for y in v - RADIUS..=v + RADIUS {
         for other in before.row(y)[u - RADIUS..=u + RADIUS].iter().filter(|h| h.is_some()) {
-            let weight = 1.0 / (other.variance + spread);
+            let weight =
+                1.0 / (other.variance + spread * other.inverse_depth * other.inverse_depth);
             sum += weight * other.inverse_depth;
             squares += weight * other.inverse_depth * other.inverse_depth;
             weights += weight;

@@ -45,10 +45,8 @@ impl PastFrames {
     }
 
     /// Expresses every brightness against a new keyframe, whose brightness against the one before is
-    /// `new`, and files the one before: with `I_new = eᵃ I + b` a frame's `(a', b')` becomes
-    /// `(a' − a, b' − e^(a' − a) b)`.
-    pub(super) fn rebase(&mut self, new: Brightness, before: &[u8], world_from_before: SE3) {
-        self.push(before, world_from_before, Brightness::default());
+    /// `new`: with `I_new = eᵃ I + b` a frame's `(a', b')` becomes `(a' − a, b' − e^(a' − a) b)`.
+    pub(super) fn rebase(&mut self, new: Brightness) {
         for past in &mut self.frames {
             let a = past.brightness.a - new.a;
             past.brightness = Brightness { a, b: past.brightness.b - a.exp() * new.b };
@@ -69,16 +67,16 @@ mod tests {
     fn brightness_follows_the_keyframe() {
         let mut past = PastFrames::with_capacity(4);
         // I_f = e^0.3 I_k + 5 and I_n = e^0.1 I_k − 2: a grey of 100 in the new keyframe.
+        past.push(&[2], SE3::identity(), Brightness::default());
         past.push(&[1], SE3::identity(), Brightness { a: 0.3, b: 5.0 });
-        past.rebase(Brightness { a: 0.1, b: -2.0 }, &[2], SE3::identity());
+        past.rebase(Brightness { a: 0.1, b: -2.0 });
+        let shown = |b: Brightness| b.a.exp() * 100.0 + b.b;
         let in_keyframe = (100.0 + 2.0) / 0.1f64.exp();
-        let expected = 0.3f64.exp() * in_keyframe + 5.0;
-        let frame = past.newest_first().last().unwrap();
-        assert!((frame.brightness.a.exp() * 100.0 + frame.brightness.b - expected).abs() < 1e-9);
-        let before = past.newest_first().next().unwrap();
-        assert!(
-            (before.brightness.a.exp() * 100.0 + before.brightness.b - in_keyframe).abs() < 1e-9
-        );
+        let mut newest_first = past.newest_first();
+        let frame = newest_first.next().unwrap();
+        assert!((shown(frame.brightness) - (0.3f64.exp() * in_keyframe + 5.0)).abs() < 1e-9);
+        let before = newest_first.next().unwrap();
+        assert!((shown(before.brightness) - in_keyframe).abs() < 1e-9);
     }
 
     #[test]

@@ -130,6 +130,9 @@ impl Mapper {
         match start.state {
             InitState::Waiting(Waiting::Texture) => self.first_stamp = None,
             InitState::Waiting(_) => {}
+            InitState::Failed(_) if self.two_frame.first_pixels().is_empty() => {
+                self.first_stamp = None
+            }
             InitState::Failed(_) => self.first_stamp = Some(stamp),
             InitState::Proven => {
                 self.first_stamp = None;

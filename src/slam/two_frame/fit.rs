@@ -281,6 +281,7 @@ pub fn depth_variances(
     let pose_covariance = pose_covariance(state, system);
     variances.clear();
     variances.extend(system.points.iter().map(|point| {
+        let Some(pose_covariance) = &pose_covariance else { return f32::INFINITY };
         if !point.visible || !(point.information > 0.0) || !(point.squared_speed > 0.0) {
             return f32::INFINITY;
         }
@@ -290,9 +291,12 @@ pub fn depth_variances(
     }));
 }
 
-/// Inverse of the pose's normal equations after elimination of the depths, scale held; zero where they
-/// are singular.
-fn pose_covariance(state: &State, system: &System) -> SMatrix<f64, NUM_UNKNOWNS, NUM_UNKNOWNS> {
+/// Inverse of the pose's normal equations after elimination of the depths, scale held; `None` where
+/// they are not positive definite.
+fn pose_covariance(
+    state: &State,
+    system: &System,
+) -> Option<SMatrix<f64, NUM_UNKNOWNS, NUM_UNKNOWNS>> {
     let mut hessian = system.hessian;
     for point in system.points.iter().filter(|p| p.visible && p.information > 0.0) {
         let mixed = SVector::from(point.mixed.map(f64::from));
@@ -307,5 +311,5 @@ fn pose_covariance(state: &State, system: &System) -> SMatrix<f64, NUM_UNKNOWNS,
         along.fixed_rows_mut::<3>(0).copy_from(&direction);
         hessian.ger(weight, &along, &along, 1.0);
     }
-    hessian.try_inverse().unwrap_or_else(SMatrix::zeros)
+    hessian.cholesky().map(|factor| factor.inverse())
 }

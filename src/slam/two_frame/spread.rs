@@ -11,6 +11,9 @@ const NUM_NEAREST: usize = 4;
 /// Standard deviation by which inverse depths of a surface differ, a pixel of distance, relative.
 const SLOPE_STD_DEV_RATIO: f32 = 0.005;
 
+/// Standard deviation of a pixel with a single point near it, relative.
+const LONELY_STD_DEV_RATIO: f32 = 0.2;
+
 /// Gives every candidate of `map` near a point a hypothesis: the nearest point's inverse depth, its
 /// variance widened by the distance and by how much the nearest points differ.
 pub fn spread(depths: &[InitialDepth], map: &mut DepthMap) {
@@ -62,8 +65,10 @@ fn hypothesis_from(depths: &[InitialDepth], nearest: &[(f32, usize); NUM_NEAREST
     let mut spread = 0.0;
     if !on_point {
         let others = nearest.iter().skip(1).filter(|n| n.0.is_finite());
-        let differences = others.map(|n| (depths[n.1].inverse_depth - point.inverse_depth).powi(2));
-        spread = differences.sum::<f32>() / (NUM_NEAREST - 1) as f32;
+        let squared = |n: &(f32, usize)| (depths[n.1].inverse_depth - point.inverse_depth).powi(2);
+        let (sum, count) = others.fold((0.0, 0u8), |(s, c), n| (s + squared(n), c + 1));
+        let alone = (LONELY_STD_DEV_RATIO * point.inverse_depth).powi(2);
+        spread = if count == 0 { alone } else { sum / f32::from(count) };
     }
     let slope = SLOPE_STD_DEV_RATIO * point.inverse_depth;
     let variance = point.variance + spread + slope * slope * squared_distance;
