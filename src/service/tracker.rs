@@ -147,17 +147,18 @@ impl<'a> Shell<'a> {
         };
         self.count_gap(&header);
         let deadline_nanos = self.deadline_nanos(arrival_nanos);
-        let estimate = self.track(&frame, intrinsics, deadline_nanos)?;
-        let track_nanos = now_nanos().saturating_sub(arrival_nanos);
+        let (estimate, track_nanos) = self.track(&frame, intrinsics, deadline_nanos)?;
         self.publish(&estimate, &header, track_nanos, deadline_nanos)
     }
 
+    /// The pose of a frame, and the time that tracking it took: in lockstep the reference is prepared
+    /// in this thread too, but it is paid per keyframe and not part of it.
     fn track(
         &mut self,
         frame: &FrameView<'_>,
         intrinsics: Intrinsics,
         deadline_nanos: Option<i64>,
-    ) -> Result<PoseEstimate, TrackerError> {
+    ) -> Result<(PoseEstimate, i64), TrackerError> {
         let known = self.tracker.take().filter(|(of, _)| *of == intrinsics);
         let (_, tracker) = match known {
             Some(tracker) => self.tracker.insert(tracker),
@@ -171,10 +172,12 @@ impl<'a> Shell<'a> {
         {
             self.references.give_back(used);
         }
-        Ok(match deadline_nanos {
+        let begin_nanos = now_nanos();
+        let estimate = match deadline_nanos {
             None => tracker.track(frame, &mut |_| true),
             Some(deadline) => tracker.track(frame, &mut self.costs.until(deadline)),
-        })
+        };
+        Ok((estimate, now_nanos().saturating_sub(begin_nanos)))
     }
 
     /// Until when the pose of a frame that has just arrived is due; `None` in lockstep.

@@ -393,7 +393,10 @@ impl Mapper {
         let factor = self.rescale_to_unit_mean();
         world_from_keyframe.scale *= factor;
         let (before, after) = (self.next_depth.num_hypotheses(), self.depth.num_hypotheses());
-        let contradiction = judge_change(before, after, carried * factor, &self.params.consistency);
+        // A first keyframe without depth had nothing to be rescaled by: its mean is not 1.
+        let depth_ratio =
+            self.next_depth.mean_inverse_depth().map_or(1.0, |mean| mean * carried * factor);
+        let contradiction = judge_change(before, after, depth_ratio, &self.params.consistency);
         self.add_keyframe(frame, world_from_keyframe, MapState::Established, epoch);
         if let Some(contradiction) = contradiction {
             self.reject(contradiction);

@@ -193,7 +193,14 @@ impl Summary {
             deadline_ms: record.deadline_nanos.map(|n| n as f64 * 1e-6),
             deadline_misses: record.deadline_misses,
             restarts: record.restarts,
-            track_ms: Percentiles::of(record.poses.iter().filter_map(|p| p.track_nanos)),
+            // A frame without a keyframe costs nothing and tells nothing.
+            track_ms: Percentiles::of(
+                record
+                    .poses
+                    .iter()
+                    .filter(|p| p.estimate.quality.points > 0)
+                    .filter_map(|p| p.track_nanos),
+            ),
             map_ms: Percentiles::of(record.map_nanos.iter().copied()),
             recorded_secs,
             wall_secs,
