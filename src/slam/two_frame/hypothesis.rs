@@ -68,13 +68,17 @@ impl Hypotheses {
                     fit_level(input, level, Freedom::Everything, state, scratch, params);
             }
         };
+        /// Level down to which every start is fitted: 160 pixels across tell one minimum from another,
+        /// and each level costs the same.
+        const COARSE_LEVEL: usize = 2;
         let levels = input.images.len();
+        let coarse = COARSE_LEVEL.min(levels - 1);
         let all = &mut self.all[..self.used];
-        all.par_iter_mut().for_each(|h| fit_down_to(1.min(levels - 1), levels, h));
+        all.par_iter_mut().for_each(|h| fit_down_to(coarse, levels, h));
         all.sort_by(|a, b| a.energy.total_cmp(&b.energy));
         self.survivors = bring_forward_distinct(all);
-        if levels > 1 {
-            all[..self.survivors].par_iter_mut().for_each(|h| fit_down_to(0, 1, h));
+        if coarse > 0 {
+            all[..self.survivors].par_iter_mut().for_each(|h| fit_down_to(0, coarse, h));
             all[..self.survivors].sort_by(|a, b| a.energy.total_cmp(&b.energy));
         }
     }
