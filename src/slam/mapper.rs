@@ -303,17 +303,6 @@ impl Mapper {
         self.map_state() == MapState::Rejected
     }
 
-    /// Declares the keyframe in force contradictory: nothing is claimed on it any more.
-    fn reject(&mut self, contradiction: Contradiction) {
-        self.contradiction = Some(contradiction);
-        self.revision += 1;
-        let revision = self.revision;
-        if let Some(keyframe) = self.keyframe_mut() {
-            keyframe.map_state = MapState::Rejected;
-            keyframe.revision = revision;
-        }
-    }
-
     fn keyframe_mut(&mut self) -> Option<&mut Keyframe> {
         self.map.keyframes.get_mut(self.in_force?)
     }

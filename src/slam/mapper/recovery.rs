@@ -15,6 +15,7 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;
 use crate::slam::image::sums::SumPyramid;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
+use crate::slam::mapper::consistency::Contradiction;
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::{Brightness, PoseEstimate};
@@ -187,6 +188,17 @@ impl Mapper {
             self.forget_start();
         }
         self.start(frame, pose, sensor_depth)
+    }
+
+    /// Declares the keyframe in force contradictory: nothing is claimed on it any more.
+    pub(super) fn reject(&mut self, contradiction: Contradiction) {
+        self.contradiction = Some(contradiction);
+        self.revision += 1;
+        let revision = self.revision;
+        if let Some(keyframe) = self.keyframe_mut() {
+            keyframe.map_state = MapState::Rejected;
+            keyframe.revision = revision;
+        }
     }
 
     /// Puts an earlier keyframe in force again, with the depth it was left with.

@@ -79,9 +79,8 @@ impl VerdictParams {
         } else if alignment.ending == Ending::NothingInView
             || quality.points < self.min_points
             || quality.in_view_ratio < self.lost_in_view
+            || (was_lost && !self.is_near(alignment))
         {
-            TrackingState::Lost(LostReason::Diverged)
-        } else if was_lost && !self.is_near(alignment) {
             TrackingState::Lost(LostReason::Diverged)
         } else if quality.inlier_ratio < inliers {
             TrackingState::Lost(LostReason::TooFewInliers)
