@@ -65,19 +65,35 @@ impl Candidates {
 #[derive(Debug, Clone, Copy, Default)]
 struct Cell {
     nearest: f32,
-    nearest_variance: f32,
+    nearest_noise: f32,
     information: f32,
     weighted: f32,
     weighted_square: f32,
     noise: f32,
     children: f32,
+    is_behind: bool,
 }
 
 impl Cell {
-    /// Whether depth jumps from `self` back to a pixel of this inverse depth and variance.
-    fn is_in_front_of(&self, inverse_depth: f32, variance: f32) -> bool {
+    /// Whether depth jumps from the nearest child back to a pixel of this inverse depth and noise.
+    fn is_in_front_of(&self, inverse_depth: f32, noise: f32) -> bool {
         let step = self.nearest - inverse_depth - JUMP_RATIO * self.nearest;
-        step > 0.0 && step * step > JUMP_SIGMAS * JUMP_SIGMAS * (variance + self.nearest_variance)
+        step > 0.0 && step * step > JUMP_SIGMAS * JUMP_SIGMAS * (noise + self.nearest_noise)
+    }
+
+    /// Whether depth jumps from the mean of this cell back to that of `other`, in whose means
+    /// `kept_…` of the children's noise is left.
+    fn is_cell_in_front_of(&self, kept_here: f32, other: &Cell, kept_there: f32) -> bool {
+        let (nearer, farther) = (self.inverse_depth(), other.inverse_depth());
+        let step = nearer - farther - CELL_JUMP_RATIO * nearer;
+        let noise =
+            self.noise / self.children * kept_here + other.noise / other.children * kept_there;
+        step > 0.0 && step * step > JUMP_SIGMAS * JUMP_SIGMAS * noise
+    }
+
+    /// Share of the children's noise that their mean keeps.
+    fn kept_noise(&self, independent: f32) -> f32 {
+        independent / self.children + 1.0 - independent
     }
 
     fn inverse_depth(&self) -> f32 {
@@ -93,7 +109,11 @@ impl Cell {
 /// at 80° changes by about a hundredth a pixel at level 0) …
 const JUMP_RATIO: f32 = 0.04;
 
-/// … and by this many standard deviations more.
+/// The same between means of neighbouring cells, two pixels apart: more, because it costs all
+/// pixels of a cell, and slanted surfaces are worth keeping.
+const CELL_JUMP_RATIO: f32 = 0.15;
+
+/// … and by this many standard deviations of the noise more.
 const JUMP_SIGMAS: f32 = 3.0;
 
 /// Builds the depth pyramid, in memory that is used again.
@@ -168,7 +188,7 @@ fn halve(
             && child.inverse_depth > cells[index].nearest
         {
             cells[index].nearest = child.inverse_depth;
-            cells[index].nearest_variance = child.variance;
+            cells[index].nearest_noise = child.noise;
         }
     }
     fine.points.retain(|child| {
@@ -186,9 +206,12 @@ fn halve(
         cell.children += 1.0;
     }
     let independent = independent_share(cells);
-    let filled = cells.iter().enumerate().filter(|(_, cell)| cell.children > 0.0);
+    mark_cells_behind(cells, width, independent);
+    fine.points.retain(|child| cell_of(child).is_none_or(|index| !cells[index].is_behind));
+    let is_used = |cell: &Cell| cell.children > 0.0 && !cell.is_behind;
+    let filled = cells.iter().enumerate().filter(|(_, cell)| is_used(cell));
     coarse.points.extend(filled.map(|(index, cell)| {
-        let kept = independent / cell.children + 1.0 - independent;
+        let kept = cell.kept_noise(independent);
         Candidate {
             u: (index % width) as u16,
             v: (index / width) as u16,
@@ -199,10 +222,28 @@ fn halve(
     }));
 }
 
+/// Marks the cells beside which depth jumps to something nearer: single children are too noisy
+/// to tell where their means can.
+fn mark_cells_behind(cells: &mut [Cell], width: usize, independent: f32) {
+    for index in 0..cells.len() {
+        let cell = cells[index];
+        if cell.children == 0.0 {
+            continue;
+        }
+        let around = [index.wrapping_sub(1), index + 1, index.wrapping_sub(width), index + width];
+        cells[index].is_behind = around.into_iter().any(|beside| {
+            cells.get(beside).is_some_and(|beside| {
+                let (there, here) = (beside.kept_noise(independent), cell.kept_noise(independent));
+                beside.children > 0.0 && beside.is_cell_in_front_of(there, &cell, here)
+            })
+        });
+    }
+}
+
 /// Whether `child`, in cell `index`, or the cell beside it shows something nearer.
 fn is_behind_a_jump(cells: &[Cell], width: usize, index: usize, child: &Candidate) -> bool {
     let jumps = |cell: Option<&Cell>| {
-        cell.is_some_and(|cell| cell.is_in_front_of(child.inverse_depth, child.variance))
+        cell.is_some_and(|cell| cell.is_in_front_of(child.inverse_depth, child.noise))
     };
     // Only the neighbours that touch the child, not those across its parent.
     let beside = if child.u.is_multiple_of(2) { index.checked_sub(1) } else { Some(index + 1) };
@@ -256,8 +297,8 @@ mod tests {
         fusion.fuse(&jump, 64, 64, 2);
         assert_eq!((fusion.level(0).len(), fusion.level(1).len()), (1, 1));
         assert_eq!(fusion.level(1).get(0).inverse_depth, 1.0);
-        // Two pixels on, it is not beside the jump any more; and a slope is no jump.
-        fusion.fuse(&[point(4, 4, 1.0, 1e-4), point(7, 4, 0.4, 1e-4)], 64, 64, 2);
+        // Beyond the next cell it is not beside the jump any more; and a slope is no jump.
+        fusion.fuse(&[point(4, 4, 1.0, 1e-4), point(9, 4, 0.4, 1e-4)], 64, 64, 2);
         assert_eq!(fusion.level(1).len(), 2);
         fusion.fuse(&[point(4, 4, 1.0, 1e-4), point(5, 4, 0.97, 1e-4)], 64, 64, 2);
         assert_eq!((fusion.level(0).len(), fusion.level(1).len()), (2, 1));

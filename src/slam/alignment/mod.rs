@@ -10,8 +10,10 @@ pub mod normal_equations;
 pub mod points;
 pub mod reference;
 pub mod residual;
+pub mod scatter;
 #[cfg(test)]
 pub mod scene;
 pub mod selection;
+pub mod surroundings;
 #[cfg(test)]
 mod tests;

@@ -15,8 +15,8 @@ pub struct PointBlock {
     pub inverse_depth: [f32; LANES],
     /// Variance of the inverse depth.
     pub variance: [f32; LANES],
-    /// Noise left in the inverse depth: its variance over the inverse depth squared.
-    pub relative_noise: [f32; LANES],
+    /// Inverse depth of the surroundings without the point itself: where the Jacobian is taken.
+    pub surrounding_inverse_depth: [f32; LANES],
     /// Brightness of the keyframe there, grey levels.
     pub intensity: [f32; LANES],
     /// Gradient of the keyframe along u there, grey levels per pixel of the level.
@@ -34,7 +34,7 @@ impl PointBlock {
         ray_y: [PADDING_RAY; LANES],
         inverse_depth: [1.0; LANES],
         variance: [1.0; LANES],
-        relative_noise: [0.0; LANES],
+        surrounding_inverse_depth: [1.0; LANES],
         intensity: [0.0; LANES],
         gradient_x: [0.0; LANES],
         gradient_y: [0.0; LANES],
@@ -52,8 +52,8 @@ pub struct Point {
     pub inverse_depth: f32,
     /// Variance of the inverse depth.
     pub variance: f32,
-    /// Noise left in the inverse depth: its variance over the inverse depth squared.
-    pub relative_noise: f32,
+    /// Inverse depth of the surroundings without the point itself: where the Jacobian is taken.
+    pub surrounding_inverse_depth: f32,
     /// Brightness of the keyframe there, grey levels.
     pub intensity: f32,
     /// Gradient of the keyframe along u there, grey levels per pixel of the level.
@@ -87,7 +87,7 @@ impl LevelPoints {
             block.ray_y[lane] = point.ray_y;
             block.inverse_depth[lane] = point.inverse_depth;
             block.variance[lane] = point.variance;
-            block.relative_noise[lane] = point.relative_noise;
+            block.surrounding_inverse_depth[lane] = point.surrounding_inverse_depth;
             block.intensity[lane] = point.intensity;
             block.gradient_x[lane] = point.gradient_x;
             block.gradient_y[lane] = point.gradient_y;
@@ -118,7 +118,7 @@ impl LevelPoints {
                 ray_y: block.ray_y[lane],
                 inverse_depth: block.inverse_depth[lane],
                 variance: block.variance[lane],
-                relative_noise: block.relative_noise[lane],
+                surrounding_inverse_depth: block.surrounding_inverse_depth[lane],
                 intensity: block.intensity[lane],
                 gradient_x: block.gradient_x[lane],
                 gradient_y: block.gradient_y[lane],

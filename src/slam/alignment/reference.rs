@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::slam::alignment::fusion::{Candidates, DepthFusion};
 use crate::slam::alignment::points::{LevelPoints, Point};
 use crate::slam::alignment::selection::{Selection, SelectionParams};
+use crate::slam::alignment::surroundings::Surroundings;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::sums::{MAX_LEVELS, SumPyramid, grey_per_sum};
@@ -56,10 +57,6 @@ pub fn num_levels(width: usize, height: usize) -> usize {
     (0..MAX_LEVELS).take_while(fits).count().max(1)
 }
 
-/// Noise beyond a tenth of the inverse depth is corrected for as if it were a tenth: rotation and
-/// translation look so alike that the correction is amplified tenfold, and must stay one.
-const LARGEST_RELATIVE_NOISE: f32 = 0.01;
-
 /// A keyframe prepared for alignment, point clouds by pyramid level.
 #[derive(Debug, Clone)]
 pub struct Reference {
@@ -76,6 +73,7 @@ pub struct Reference {
     pyramid: SumPyramid,
     fusion: DepthFusion,
     selection: Selection,
+    surroundings: Surroundings,
 }
 
 impl Reference {
@@ -95,6 +93,7 @@ impl Reference {
             pyramid: SumPyramid::default(),
             fusion: DepthFusion::default(),
             selection: Selection::default(),
+            surroundings: Surroundings::default(),
         }
     }
 
@@ -151,6 +150,8 @@ impl Reference {
             intrinsics.fx / self.mean_inverse_depth,
             budget,
         );
+        // Coarser levels only start the finer ones, and their depth has less noise to be pulled by.
+        self.surroundings.measure(candidates, image.width(), image.height());
         let (inverse_fx, inverse_fy) = (1.0 / intrinsics.fx, 1.0 / intrinsics.fy);
         for &index in chosen {
             let candidate = candidates.get(index as usize);
@@ -164,9 +165,11 @@ impl Reference {
                 ray_y: ((v as f64 - intrinsics.cy) * inverse_fy) as f32,
                 inverse_depth: candidate.inverse_depth,
                 variance: candidate.variance,
-                relative_noise: (candidate.noise
-                    / (candidate.inverse_depth * candidate.inverse_depth))
-                    .min(LARGEST_RELATIVE_NOISE),
+                surrounding_inverse_depth: if level == self.params.finest_level {
+                    self.surroundings.without(&candidate)
+                } else {
+                    candidate.inverse_depth
+                },
                 intensity: at(u, v),
                 gradient_x: 0.5 * (at(u + 1, v) - at(u - 1, v)),
                 gradient_y: 0.5 * (at(u, v + 1) - at(u, v - 1)),

@@ -46,8 +46,6 @@ pub struct Weighting {
     pub intensity_variance: f32,
     /// Whether (∂r/∂d)² V enters σ_r².
     pub use_depth_variance: bool,
-    /// Whether the bias that noise in d leaves in the translation is taken out of the gradient.
-    pub correct_depth_noise: bool,
     /// Huber's k on |r|/σ_r.
     pub huber: f32,
     /// |r|/σ_r below which a point counts as inlier.
@@ -68,7 +66,6 @@ pub struct Evaluation {
     pub(crate) offset: f32,
     pub(crate) intensity_variance: f32,
     pub(crate) depth_variance_factor: f32,
-    pub(crate) noise_correction: f32,
     pub(crate) huber: f32,
     pub(crate) inlier_gate_squared: f32,
 }
@@ -101,7 +98,6 @@ impl Evaluation {
             offset: brightness.b as f32,
             intensity_variance: (1.0 + gain * gain) * weighting.intensity_variance,
             depth_variance_factor: if weighting.use_depth_variance { 1.0 } else { 0.0 },
-            noise_correction: if weighting.correct_depth_noise { 1.0 } else { 0.0 },
             huber: weighting.huber,
             inlier_gate_squared: weighting.inlier_gate * weighting.inlier_gate,
         }
@@ -152,6 +148,11 @@ pub fn point_terms(image: &Image<u16>, at: &Evaluation, point: &Point) -> Option
     let (above, below) = (p00 + (p10 - p00) * du, p01 + (p11 - p01) * du);
     let value = (above + (below - above) * dv) * at.grey_per_sum;
 
+    let d = point.surrounding_inverse_depth;
+    let depth_ratio = (r6 * x + r7 * y + r8 + tz * d).max(NEAREST_DEPTH_RATIO);
+    let inverse_ratio = 1.0 / depth_ratio;
+    let nx = (r0 * x + r1 * y + r2 + tx * d) * inverse_ratio;
+    let ny = (r3 * x + r4 * y + r5 + ty * d) * inverse_ratio;
     // How the warp turns and scales a neighbourhood: ∂n/∂(x, y) = M/z̃.
     let (m11, m12) = (r0 - nx * r6, r1 - nx * r7);
     let (m21, m22) = (r3 - ny * r6, r4 - ny * r7);
@@ -204,15 +205,8 @@ pub fn accumulate_reference(
         sums.in_view += 1;
         sums.inliers += u32::from(normalized < at.inlier_gate_squared);
         let residual = f64::from(terms.residual);
-        // Noise in d sits in r and in J_t: their product does not average out, and would pull
-        // the translation towards zero by N/d² of J_t·t. Scaled by what the residual shows of it,
-        // so that a variance larger than the noise does not push the translation away instead.
-        let shown = (huber_weight * normalized).min(at.huber * at.huber);
-        let noise = at.noise_correction * point.relative_noise * point.inverse_depth;
-        let correlated = f64::from(noise * terms.inverse_depth_derivative * shown);
         let jacobian = terms.jacobian.map(f64::from);
         for i in 0..UNKNOWNS {
-            let residual = if i < 3 { residual - correlated } else { residual };
             sums.gradient[i] += weight * jacobian[i] * residual;
             for j in i..UNKNOWNS {
                 sums.information[(i, j)] += weight * jacobian[i] * jacobian[j];

@@ -5,9 +5,10 @@ use nalgebra::Vector6;
 use crate::slam::alignment::align::{Aligner, AlignmentParams, Ending};
 use crate::slam::alignment::kernel::{Kernel, SimdMode};
 use crate::slam::alignment::normal_equations::UNKNOWNS;
-use crate::slam::alignment::points::Point;
+use crate::slam::alignment::points::{LevelPoints, Point};
 use crate::slam::alignment::reference::{Reference, ReferenceParams};
 use crate::slam::alignment::residual::{Evaluation, PointTerms, accumulate_reference, point_terms};
+use crate::slam::alignment::scatter::GradientScatter;
 use crate::slam::alignment::scene::{Noise, Plane, small_camera, small_plane};
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::sums::SumPyramid;
@@ -281,4 +282,52 @@ fn a_budget_of_points_is_kept_and_spread() {
         let centre = points.iter().map(|point| f64::from(point.ray_x)).sum::<f64>();
         assert!((centre / points.len() as f64).abs() < 0.05);
     }
+}
+
+#[test]
+fn noise_in_the_depth_does_not_pull_the_translation() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let truth = SE3::exp(&Vector6::new(0.1, 0.04, -0.05, 0.01, 0.02, 0.0));
+    let image = pyramid(&plane.render(&camera, &truth.inverse(), 2.0, (1.0, 0.0), 4));
+    let reference = Reference::prepare(&plane.keyframe(&camera, 1, 0.1));
+    let at = evaluation(&truth, Brightness::default());
+    // Where the normal equations at the true pose would go, as a share of the translation.
+    let pull = |points: &LevelPoints| {
+        let sums = accumulate_reference(points, image.level(LEVEL), &at);
+        let step = sums.damped_step(0.0).unwrap();
+        step.fixed_rows::<3>(0).dot(&truth.translation) / truth.translation.norm_squared()
+    };
+    let mut own_depth = LevelPoints::default();
+    for point in reference.level(LEVEL).iter() {
+        own_depth.push(Point { surrounding_inverse_depth: point.inverse_depth, ..point });
+    }
+    let (without, with) = (pull(reference.level(LEVEL)), pull(&own_depth));
+    assert!(without.abs() < 0.01 && with < -0.02, "{without} without, {with} with shared noise");
+}
+
+#[test]
+fn tiles_hold_the_gradient_and_correlated_residuals_cost_certainty() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let reference = Reference::prepare(&plane.keyframe(&camera, 1, 0.0));
+    let points = reference.level(LEVEL);
+    let at = evaluation(&SE3::identity(), Brightness::default());
+    let std_dev = |image: &SumPyramid| {
+        let scatter = GradientScatter::measure(points, image.level(LEVEL), &at);
+        assert!(scatter.tiles > 100 && scatter.curvature_ratio <= 1.0);
+        let sums = accumulate_reference(points, image.level(LEVEL), &at);
+        let covariance = scatter.covariance(&sums).unwrap();
+        assert!(covariance.cholesky().is_some());
+        covariance.fixed_view::<3, 3>(0, 0).trace().sqrt()
+    };
+    let clean = plane.render(&camera, &SE3::identity(), 2.0, (1.0, 0.0), 4);
+    // The same deviation in every pixel of a patch of 16: noise that does not average out in it.
+    let mut noise = Noise(6);
+    let patches: Vec<_> = (0..20 * 15).map(|_| 4.0 * noise.normal()).collect();
+    let deviating = clean.iter().enumerate().map(|(i, &grey)| {
+        let (u, v) = (i % camera.width, i / camera.width);
+        (f64::from(grey) + patches[v / 16 * 20 + u / 16]).round().clamp(0.0, 255.0) as u8
+    });
+    let (clean, deviating) =
+        (std_dev(&pyramid(&clean)), std_dev(&pyramid(&deviating.collect::<Vec<_>>())));
+    assert!(deviating > 2.0 * clean, "{deviating} with, {clean} without patches");
 }

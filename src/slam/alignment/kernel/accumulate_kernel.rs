@@ -15,10 +15,9 @@ use crate::slam::image::buffer::Image;
 /// Blocks of a chunk: its columns take 10 kB, a third of a small first-level cache.
 const CHUNK_BLOCKS: usize = 16;
 
-/// Columns: eight of the Jacobian, the residual, the residual less what depth noise adds to it.
-const COLUMNS: usize = UNKNOWNS + 2;
+/// Columns: eight of the Jacobian, the residual.
+const COLUMNS: usize = UNKNOWNS + 1;
 const RESIDUAL: usize = UNKNOWNS;
-const CORRECTED: usize = UNKNOWNS + 1;
 
 /// The columns of one block of points.
 #[derive(Clone, Copy)]
@@ -120,6 +119,12 @@ unsafe fn whiten<L: Lanes>(
         let predicted = load(&block.intensity).mul(constant(at.gain));
         let residual = value.sub(predicted.add(constant(at.offset)));
 
+        let d = load(&block.surrounding_inverse_depth);
+        let depth_ratio = r6.mul_add(x, r7.mul_add(y, tz.mul_add(d, r8)));
+        let depth_ratio = depth_ratio.max(constant(NEAREST_DEPTH_RATIO));
+        let inverse_ratio = one.div(depth_ratio);
+        let nx = r0.mul_add(x, r1.mul_add(y, tx.mul_add(d, r2))).mul(inverse_ratio);
+        let ny = r3.mul_add(x, r4.mul_add(y, ty.mul_add(d, r5))).mul(inverse_ratio);
         let (m11, m12) = (r0.sub(nx.mul(r6)), r1.sub(nx.mul(r7)));
         let (m21, m22) = (r3.sub(ny.mul(r6)), r4.sub(ny.mul(r7)));
         let determinant = m11.mul(m22).sub(m12.mul(m21)).max(constant(SMALLEST_DETERMINANT));
@@ -130,7 +135,6 @@ unsafe fn whiten<L: Lanes>(
         let ay = m11.mul(keyframe_y).sub(m12.mul(keyframe_x));
         let m = ax.mul_add(nx, ay.mul(ny));
 
-        let derivative = ax.mul_add(tx, ay.mul_add(ty, zero.sub(m).mul(tz))).mul(inverse_ratio);
         let [wx, wy, wz] = at.variance_translation.map(constant);
         let weighing = ax.mul_add(wx, ay.mul_add(wy, zero.sub(m).mul(wz))).mul(inverse_ratio);
         let from_depth = weighing.mul(weighing).mul(load(&block.variance));
@@ -164,9 +168,6 @@ unsafe fn whiten<L: Lanes>(
         store(whitened, 6, zero.sub(predicted));
         store(whitened, 7, constant(-1.0));
         store(whitened, RESIDUAL, residual);
-        let shown = huber.mul(normalized).min(constant(at.huber * at.huber));
-        let noise = load(&block.relative_noise).mul(d).mul(constant(at.noise_correction));
-        store(whitened, CORRECTED, residual.sub(noise.mul(derivative).mul(shown)));
     }
 }
 
@@ -238,8 +239,8 @@ unsafe fn sum_gradient<L: Lanes>(columns: &[Whitened], sums: &mut Sums) {
     unsafe {
         sum_products!(L, columns, sums;
             loads a = 0, b = 1, c = 2, d = 3, e = 4, f = 5, g = 6, h = 7,
-                r = RESIDUAL, s = CORRECTED;
-            ar = a[0] * s[CORRECTED], br = b[1] * s[CORRECTED], cr = c[2] * s[CORRECTED],
+                r = RESIDUAL;
+            ar = a[0] * r[RESIDUAL], br = b[1] * r[RESIDUAL], cr = c[2] * r[RESIDUAL],
             dr = d[3] * r[RESIDUAL], er = e[4] * r[RESIDUAL], fr = f[5] * r[RESIDUAL],
             gr = g[6] * r[RESIDUAL], hr = h[7] * r[RESIDUAL]);
     }
@@ -257,7 +258,7 @@ unsafe fn finish<L: Lanes>(sums: &Sums, statistics: &Statistics<L>) -> NormalEqu
         for j in i..UNKNOWNS {
             equations.information[(i, j)] = total(&sums.0[i][j]);
         }
-        equations.gradient[i] = total(&sums.0[i][if i < 3 { CORRECTED } else { RESIDUAL }]);
+        equations.gradient[i] = total(&sums.0[i][RESIDUAL]);
     }
     equations.information.fill_lower_triangle_with_upper_triangle();
     let (mut energy, mut squared_residual) = ([0.0; LANES], [0.0; LANES]);
