@@ -9,7 +9,7 @@ use crate::service::results::{RecordedPose, RunMode, RunRecord};
 use crate::slam::evaluation::TrajectoryEvaluation;
 use crate::slam::evaluation::depth_error::DepthStatistics;
 use crate::slam::evaluation::statistics::percentile;
-use crate::slam::pose::TrackingState;
+use crate::slam::pose::{NO_KEYFRAME, TrackingState};
 
 /// Percentiles of a time in milliseconds.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -198,7 +198,7 @@ impl Summary {
                 record
                     .poses
                     .iter()
-                    .filter(|p| p.estimate.quality.points > 0)
+                    .filter(|p| p.estimate.keyframe_id != NO_KEYFRAME)
                     .filter_map(|p| p.track_nanos),
             ),
             map_ms: Percentiles::of(record.map_nanos.iter().copied()),
