@@ -6,6 +6,7 @@
 //! ```
 
 use std::error::Error;
+use std::process::ExitCode;
 use std::time::Duration;
 
 use semidense::service::shutdown::Shutdown;
@@ -16,7 +17,17 @@ use semidense::wire::place::Place;
 use semidense::wire::port::{Access, Hub, Subscriber, wait};
 use semidense::wire::topic::POSE;
 
-fn main() -> Result<(), Box<dyn Error>> {
+fn main() -> ExitCode {
+    match subscribe() {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("subscribe: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn subscribe() -> Result<(), Box<dyn Error>> {
     // The instance's name is the first argument; its folder is where `semidense run` puts it too.
     let instance = std::env::args().nth(1).unwrap_or_else(|| "semidense".to_owned());
     let place = Place::new(&instance, "")?;
