@@ -68,9 +68,9 @@ impl Hypotheses {
                     fit_level(input, level, Freedom::Everything, state, scratch, params);
             }
         };
-        /// Level down to which every start is fitted: 160 pixels across tell one minimum from another,
-        /// and each level costs the same.
-        const COARSE_LEVEL: usize = 2;
+        /// Level down to which every start is fitted: on 160 pixels across, one level coarser, a wrong
+        /// minimum of a recording looks better than the right one.
+        const COARSE_LEVEL: usize = 1;
         let levels = input.images.len();
         let coarse = COARSE_LEVEL.min(levels - 1);
         let all = &mut self.all[..self.used];
