@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::slam::alignment::fusion::{Candidates, DepthFusion};
 use crate::slam::alignment::points::{LevelPoints, Point};
+use crate::slam::alignment::scatter::tile_of;
 use crate::slam::alignment::selection::{Selection, SelectionParams};
 use crate::slam::alignment::surroundings::Surroundings;
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -160,7 +161,8 @@ impl Reference {
                 continue;
             }
             let at = |u: usize, v: usize| f32::from(image.at(u, v)) * grey_per_sum(level);
-            self.levels[level].push(Point {
+            let tile = tile_of(u, v, image.width(), image.height());
+            let point = Point {
                 ray_x: ((u as f64 - intrinsics.cx) * inverse_fx) as f32,
                 ray_y: ((v as f64 - intrinsics.cy) * inverse_fy) as f32,
                 inverse_depth: candidate.inverse_depth,
@@ -173,7 +175,8 @@ impl Reference {
                 intensity: at(u, v),
                 gradient_x: 0.5 * (at(u + 1, v) - at(u - 1, v)),
                 gradient_y: 0.5 * (at(u, v + 1) - at(u, v - 1)),
-            });
+            };
+            self.levels[level].push(point, tile);
         }
     }
 
