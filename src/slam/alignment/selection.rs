@@ -45,7 +45,8 @@ pub struct Selection {
     scores: Vec<f32>,
     tile_of: Vec<u32>,
     tile_starts: Vec<u32>,
-    by_tile: Vec<u32>,
+    by_tile: Vec<u64>,
+    is_chosen: Vec<bool>,
     chosen: Vec<u32>,
 }
 
@@ -71,7 +72,6 @@ impl Selection {
         self.score(params, candidates, image, level, pixels_per_inverse_depth);
         let num_tiles = self.sort_into_tiles(candidates, image.width(), image.height());
         self.fill_quotas(num_tiles, budget);
-        self.chosen.sort_unstable();
         &self.chosen
     }
 
@@ -123,7 +123,7 @@ impl Selection {
         for (index, &tile) in self.tile_of.iter().enumerate().rev() {
             let end = &mut ends[tile as usize + 1];
             *end -= 1;
-            self.by_tile[*end as usize] = index as u32;
+            self.by_tile[*end as usize] = rank(self.scores[index], index as u32);
         }
         // Each end is now the start of its tile; shift them back into place.
         ends.remove(0);
@@ -132,7 +132,8 @@ impl Selection {
         num_tiles
     }
 
-    /// Takes from each tile its best points, as many as its share of the budget.
+    /// Takes from each tile its best points, as many as its share of the budget, and lists them
+    /// in ascending order.
     fn fill_quotas(&mut self, num_tiles: usize, budget: usize) {
         let tile = |starts: &[u32], tile: usize| starts[tile] as usize..starts[tile + 1] as usize;
         let share = |count: usize| (count as f64).sqrt();
@@ -150,29 +151,47 @@ impl Selection {
             }
             factor = (budget as f64 - taken).max(0.0) / f64::max(open, 1.0);
         }
-        let mut carried = 0.0;
+        let (mut carried, mut taken) = (0.0, 0);
+        self.is_chosen.clear();
+        self.is_chosen.resize(self.scores.len(), false);
         for index in 0..num_tiles {
             let range = tile(&self.tile_starts, index);
             if range.is_empty() {
                 continue;
             }
             carried += (factor * share(range.len())).min(range.len() as f64);
-            let room = budget - self.chosen.len();
-            let quota = (carried as usize).min(range.len()).min(room);
+            let quota = (carried as usize).min(range.len()).min(budget - taken);
             carried -= quota as f64;
             if quota == 0 {
                 continue;
             }
-            let points = &mut self.by_tile[range];
-            if quota < points.len() {
-                let scores = &self.scores;
-                let best_first = |&a: &u32, &b: &u32| {
-                    let order = scores[b as usize].total_cmp(&scores[a as usize]);
-                    order.then(a.cmp(&b))
-                };
-                points.select_nth_unstable_by(quota - 1, best_first);
+            let ranks = &mut self.by_tile[range];
+            if quota < ranks.len() {
+                ranks.select_nth_unstable(quota - 1);
             }
-            self.chosen.extend_from_slice(&points[..quota]);
+            for &rank in &ranks[..quota] {
+                self.is_chosen[index_of(rank)] = true;
+            }
+            taken += quota;
         }
+        // One more than there are: every index is written, and over those that are not chosen.
+        self.chosen.resize(taken + 1, 0);
+        let mut count = 0;
+        for (index, &is_chosen) in self.is_chosen.iter().enumerate() {
+            self.chosen[count] = index as u32;
+            count += usize::from(is_chosen);
+        }
+        self.chosen.truncate(taken);
     }
+}
+
+/// Orders candidates, the best first, the earlier of two alike: a score is never negative, so that
+/// its bits are in its order.
+fn rank(score: f32, index: u32) -> u64 {
+    u64::from(!score.to_bits()) << 32 | u64::from(index)
+}
+
+/// The candidate of a [`rank`].
+fn index_of(rank: u64) -> usize {
+    rank as u32 as usize
 }
