@@ -115,8 +115,7 @@ impl Front {
     fn hides(self, child: &Candidate) -> bool {
         let nearest = self.inverse_depth();
         let step = nearest - child.inverse_depth - JUMP_RATIO * nearest;
-        let noise = child.noise + self.noise();
-        (step > 0.0) & (step * step > JUMP_SIGMAS * JUMP_SIGMAS * noise)
+        step > 0.0 && step * step > JUMP_SIGMAS * JUMP_SIGMAS * (child.noise + self.noise())
     }
 }
 
@@ -149,7 +148,7 @@ impl Cell {
         let nearer = self.inverse_depth;
         let step = nearer - other.inverse_depth - CELL_JUMP_RATIO * nearer;
         let noise = self.mean_noise + other.mean_noise;
-        (step > 0.0) & (step * step > JUMP_SIGMAS * JUMP_SIGMAS * noise)
+        step > 0.0 && step * step > JUMP_SIGMAS * JUMP_SIGMAS * noise
     }
 }
 
@@ -286,11 +285,12 @@ impl Cells {
     fn add(&mut self, child: &Candidate) -> bool {
         let Some(index) = self.cell_of(child) else { return true };
         let stride = self.stride();
-        // Only the neighbours that touch the child, not those across its parent.
-        let beside = if child.u.is_multiple_of(2) { index - 1 } else { index + 1 };
-        let above = if child.v.is_multiple_of(2) { index - stride } else { index + stride };
+        // Only the neighbours that touch the child, not those across its parent; by arithmetic,
+        // because a branch on the side would be foretold wrong half of the time.
+        let beside = index + 2 * usize::from(child.u % 2) - 1;
+        let across = index + 2 * usize::from(child.v % 2) * stride - stride;
         let hides = |index: usize| self.fronts[index].hides(child);
-        let is_behind = hides(index) | hides(beside) | hides(above);
+        let is_behind = hides(index) || hides(beside) || hides(across);
         if !is_behind {
             self.cells[index].add(child);
         }
@@ -339,8 +339,8 @@ impl Cells {
                 continue;
             }
             let hides = |beside: usize| self.cells[beside].hides(&cell);
-            let beside = hides(index - 1) | hides(index + 1);
-            if beside | hides(index - stride) | hides(index + stride) {
+            let beside = hides(index - 1) || hides(index + 1);
+            if beside || hides(index - stride) || hides(index + stride) {
                 self.cells[index].is_behind = true;
                 continue;
             }

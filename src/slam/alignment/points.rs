@@ -92,6 +92,7 @@ impl LevelPoints {
     }
 
     /// Adds a point that lies in `tile` of the image.
+    #[inline]
     pub fn push(&mut self, point: Point, tile: u16) {
         let lane = self.len % LANES;
         if lane == 0 {

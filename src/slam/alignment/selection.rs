@@ -42,8 +42,7 @@ const TILE_PX: usize = 16;
 /// Chooses points, in memory that is used again.
 #[derive(Debug, Clone, Default)]
 pub struct Selection {
-    scores: Vec<f32>,
-    tile_of: Vec<u32>,
+    ranked: Vec<(u64, u32)>,
     tile_starts: Vec<u32>,
     by_tile: Vec<u64>,
     is_chosen: Vec<bool>,
@@ -69,15 +68,15 @@ impl Selection {
             return &self.chosen;
         }
         let pixels_per_inverse_depth = focal_times_depth as f32 * params.typical_translation;
-        self.score(params, candidates, image, level, pixels_per_inverse_depth);
-        let num_tiles = self.sort_into_tiles(candidates, image.width(), image.height());
+        self.rank_all(params, candidates, image, level, pixels_per_inverse_depth);
+        let num_tiles = self.sort_into_tiles();
         self.fill_quotas(num_tiles, budget);
         &self.chosen
     }
 
-    /// Information of a point on a shift along its gradient, 1/pixels²:
-    /// 1/(σ²/|g|² + (∂u/∂d)² V).
-    fn score(
+    /// Ranks the candidates by their information on a shift along the gradient, 1/pixels²:
+    /// 1/(σ²/|g|² + (∂u/∂d)² V), and counts those of each tile.
+    fn rank_all(
         &mut self,
         params: &SelectionParams,
         candidates: &Candidates,
@@ -88,47 +87,46 @@ impl Selection {
         let grey = 0.5 * grey_per_sum(level);
         let noise = params.intensity_std_dev * params.intensity_std_dev;
         let from_depth = pixels_per_inverse_depth * pixels_per_inverse_depth;
-        let (right, bottom) = (image.width() - 1, image.height() - 1);
-        self.scores.clear();
-        self.scores.extend(candidates.as_slice().iter().map(|candidate| {
+        let (width, pixels) = (image.width(), image.pixels());
+        let (right, bottom) = (width - 1, image.height() - 1);
+        let columns = width.div_ceil(TILE_PX);
+        self.tile_starts.clear();
+        self.tile_starts.resize(columns * image.height().div_ceil(TILE_PX) + 1, 0);
+        self.ranked.clear();
+        let points = candidates.as_slice().iter().zip(0..);
+        self.ranked.extend(points.map(|(candidate, index)| {
             let (u, v) = (usize::from(candidate.u), usize::from(candidate.v));
-            let at = |u: usize, v: usize| f32::from(image.at(u, v));
-            let gx = (at((u + 1).min(right), v) - at(u.saturating_sub(1), v)) * grey;
-            let gy = (at(u, (v + 1).min(bottom)) - at(u, v.saturating_sub(1))) * grey;
+            let row = v * width;
+            let at = |index: usize| f32::from(pixels[index]);
+            let gx = (at(row + (u + 1).min(right)) - at(row + u.saturating_sub(1))) * grey;
+            let below = if v < bottom { row + width } else { row };
+            let gy = (at(below + u) - at(row.saturating_sub(width) + u)) * grey;
             let squared_gradient = gx * gx + gy * gy;
-            squared_gradient / (noise + squared_gradient * from_depth * candidate.variance)
+            let score =
+                squared_gradient / (noise + squared_gradient * from_depth * candidate.variance);
+            let tile = (v / TILE_PX) * columns + u / TILE_PX;
+            self.tile_starts[tile + 1] += 1;
+            (rank(score, index), tile as u32)
         }));
     }
 
-    /// Counting sort of the candidates by tile; gives the number of tiles.
-    fn sort_into_tiles(&mut self, candidates: &Candidates, width: usize, height: usize) -> usize {
-        let columns = width.div_ceil(TILE_PX);
-        let num_tiles = columns * height.div_ceil(TILE_PX);
-        self.tile_of.clear();
-        self.tile_starts.clear();
-        self.tile_starts.resize(num_tiles + 1, 0);
-        for candidate in candidates.as_slice() {
-            let (u, v) = (usize::from(candidate.u), usize::from(candidate.v));
-            let tile = (v / TILE_PX) * columns + u / TILE_PX;
-            self.tile_of.push(tile as u32);
-            self.tile_starts[tile + 1] += 1;
-        }
+    /// Counting sort of the ranks by tile; gives the number of tiles.
+    fn sort_into_tiles(&mut self) -> usize {
+        let num_tiles = self.tile_starts.len() - 1;
         for tile in 0..num_tiles {
             self.tile_starts[tile + 1] += self.tile_starts[tile];
         }
         self.by_tile.clear();
-        self.by_tile.resize(candidates.len(), 0);
-        // Filled from the back so that each start ends where its tile begins.
-        let mut ends = std::mem::take(&mut self.tile_starts);
-        for (index, &tile) in self.tile_of.iter().enumerate().rev() {
-            let end = &mut ends[tile as usize + 1];
-            *end -= 1;
-            self.by_tile[*end as usize] = rank(self.scores[index], index as u32);
+        self.by_tile.resize(self.ranked.len(), 0);
+        // Each start moves to the end of its tile, which is the start of the next …
+        for &(rank, tile) in &self.ranked {
+            let at = &mut self.tile_starts[tile as usize];
+            self.by_tile[*at as usize] = rank;
+            *at += 1;
         }
-        // Each end is now the start of its tile; shift them back into place.
-        ends.remove(0);
-        ends.push(candidates.len() as u32);
-        self.tile_starts = ends;
+        // … and all move back into place.
+        self.tile_starts.copy_within(0..num_tiles, 1);
+        self.tile_starts[0] = 0;
         num_tiles
     }
 
@@ -153,7 +151,7 @@ impl Selection {
         }
         let (mut carried, mut taken) = (0.0, 0);
         self.is_chosen.clear();
-        self.is_chosen.resize(self.scores.len(), false);
+        self.is_chosen.resize(self.ranked.len(), false);
         for index in 0..num_tiles {
             let range = tile(&self.tile_starts, index);
             if range.is_empty() {
