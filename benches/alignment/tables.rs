@@ -120,8 +120,11 @@ fn print_roofline() {
 
 /// Times of the parts of a frame and of a whole one.
 fn print_times() {
-    println!("Times, milliseconds, the fastest kernel and default parameters:\n");
-    println!("size      what                                   median    p95    p99    max");
+    println!(
+        "Times in milliseconds, fastest kernel, default parameters; the least is the one that"
+    );
+    println!("nothing else disturbed:\n");
+    println!("size      what                                    least median    p95    p99    max");
     for size in SIZES {
         let mut stage = Stage::new(size, 1);
         let name = format!("{}x{}", size.0, size.1);
@@ -167,7 +170,8 @@ fn times(count: usize, mut run: impl FnMut(usize)) -> Vec<f64> {
 fn row(size: &str, what: &str, times: Vec<f64>) {
     let at = |share: f64| times[((times.len() - 1) as f64 * share) as usize];
     println!(
-        "{size:<9} {what:<38} {:>6.3} {:>6.3} {:>6.3} {:>6.3}",
+        "{size:<9} {what:<38} {:>6.3} {:>6.3} {:>6.3} {:>6.3} {:>6.3}",
+        at(0.0),
         at(0.5),
         at(0.95),
         at(0.99),
