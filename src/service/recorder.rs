@@ -84,6 +84,7 @@ impl Recorder {
                     estimate,
                     latency_nanos: Some(message.latency_nanos),
                     track_nanos: Some(message.track_nanos),
+                    trace: None,
                 });
             }
         }

@@ -7,6 +7,7 @@
 use std::time::Instant;
 
 use crate::capture::source::{FrameSource, FrameStamp, SourceError};
+use crate::service::alignment_stamps::AlignmentStamps;
 use crate::service::given_pose::{given_pose, truth_in_first_camera};
 use crate::service::results::{RecordedPose, RunMode, RunRecord};
 use crate::slam::alignment::reference::Reference;
@@ -207,10 +208,15 @@ impl<'a> Replay<'a> {
 
     /// The frame's pose, estimated or given; `None` where ground truth has none for it.
     fn pose(&mut self, frame: &FrameView<'_>) -> Option<PoseEstimate> {
+        let mut stamps = AlignmentStamps::begin();
         let (estimate, track_nanos) = match self.config.poses {
             PoseOrigin::Tracker => {
                 let begin = Instant::now();
-                let estimate = self.tracker.track(frame, &mut |_| true);
+                let mut budget = |level| {
+                    stamps.ask(level);
+                    true
+                };
+                let estimate = self.tracker.track(frame, &mut budget);
                 (estimate, Some(elapsed_nanos(begin)))
             }
             PoseOrigin::GroundTruth => {
@@ -223,7 +229,8 @@ impl<'a> Replay<'a> {
                 (estimate?, None)
             }
         };
-        self.record.poses.push(RecordedPose { estimate, latency_nanos: None, track_nanos });
+        let trace = self.tracker.reference().and_then(|reference| stamps.trace(reference));
+        self.record.poses.push(RecordedPose { estimate, latency_nanos: None, track_nanos, trace });
         Some(estimate)
     }
 

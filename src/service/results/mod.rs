@@ -3,6 +3,7 @@
 //! `run` and `replay` end in [`write_results`] with a [`RunRecord`], so that their files mean the
 //! same and can be compared byte by byte.
 
+pub mod alignment_levels;
 pub mod colour;
 pub mod debug_pictures;
 pub mod depth_maps;
@@ -21,6 +22,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use crate::capture::source::{FrameSource, SourceError};
+use crate::service::alignment_stamps::AlignmentTrace;
 use crate::service::atomic_file::write_atomically;
 use crate::service::results::report::{ReportInput, report};
 use crate::service::results::summary::Summary;
@@ -54,6 +56,8 @@ pub struct RecordedPose {
     pub latency_nanos: Option<u64>,
     /// Time in the tracker; `None` where the pose was given.
     pub track_nanos: Option<u64>,
+    /// What its parts took; `None` where the frame was not aligned in this process.
+    pub trace: Option<AlignmentTrace>,
 }
 
 /// Everything that is known of a run when it ends.

@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
 
+use crate::service::results::alignment_levels::{LevelSummary, alignment_levels};
 use crate::service::results::poses::longest_epoch;
 use crate::service::results::{RecordedPose, RunMode, RunRecord};
 use crate::slam::evaluation::TrajectoryEvaluation;
@@ -132,6 +133,11 @@ pub struct Summary {
     pub restarts: u64,
     /// Time in the tracker for a frame.
     pub track_ms: Option<Percentiles>,
+    /// Of it, from the frame to the first iteration: the image pyramid, but for some thousandths.
+    /// Known in a replay.
+    pub pyramid_ms: Option<Percentiles>,
+    /// What aligning costs on each pyramid level, finest first. Known in a replay.
+    pub alignment_levels: Option<Vec<LevelSummary>>,
     /// Time in the mapper for a frame.
     pub map_ms: Option<Percentiles>,
     /// First to last stamp.
@@ -171,6 +177,7 @@ impl Summary {
         let count = |is: fn(TrackingState) -> bool| count_states(&record.poses, is);
         let (recorded_secs, wall_secs) =
             (record.recorded_nanos as f64 * 1e-9, record.wall_nanos as f64 * 1e-9);
+        let traces: Vec<_> = record.poses.iter().filter_map(|pose| pose.trace).collect();
         const BYTES_PER_MB: f64 = 1_048_576.0;
         Self {
             mode: record.mode,
@@ -201,6 +208,8 @@ impl Summary {
                     .filter(|p| p.estimate.keyframe_id != NO_KEYFRAME)
                     .filter_map(|p| p.track_nanos),
             ),
+            pyramid_ms: Percentiles::of(traces.iter().map(|trace| trace.pyramid_nanos)),
+            alignment_levels: alignment_levels(&traces),
             map_ms: Percentiles::of(record.map_nanos.iter().copied()),
             recorded_secs,
             wall_secs,

@@ -372,7 +372,7 @@ impl Aligner {
             &weighting,
             translation,
         );
-        GradientScatter::measure(reference.level(level), frame.level(level), &at)
+        self.kernel.scatter(reference.level(level), frame.level(level), &at)
     }
 
     fn flow_of(&self, reference: &Reference, alignment: &Alignment) -> f64 {

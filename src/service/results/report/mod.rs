@@ -301,14 +301,6 @@ fn figures(summary: &Summary) -> String {
         let text = match value {
             serde_json::Value::Null => continue,
             serde_json::Value::Object(entries) if entries.values().all(|v| v.is_null()) => continue,
-            serde_json::Value::Object(entries) => {
-                let entries = entries.iter().filter(|(_, v)| !v.is_null());
-                let named = entries.map(|(k, v)| format!("{k} {}", figure(v)));
-                named.collect::<Vec<_>>().join(", ")
-            }
-            serde_json::Value::Array(values) => {
-                values.iter().map(figure).collect::<Vec<_>>().join(", ")
-            }
             other => figure(other),
         };
         let _ = write!(html, "<div><dt>{key}</dt><dd>{}</dd></div>", escaped(&text));
@@ -317,10 +309,20 @@ fn figures(summary: &Summary) -> String {
     html
 }
 
-/// A number with at most five significant digits after the point; text as it is.
+/// A number with at most five significant digits after the point; text as it is; several with
+/// their names.
 fn figure(value: &serde_json::Value) -> String {
     match value {
         serde_json::Value::String(text) => text.clone(),
+        serde_json::Value::Object(entries) => {
+            let entries = entries.iter().filter(|(_, value)| !value.is_null());
+            let named = entries.map(|(key, value)| format!("{key} {}", figure(value)));
+            named.collect::<Vec<_>>().join(", ")
+        }
+        serde_json::Value::Array(values) => {
+            let separator = if values.iter().any(|value| value.is_object()) { "; " } else { ", " };
+            values.iter().map(figure).collect::<Vec<_>>().join(separator)
+        }
         serde_json::Value::Number(number) if number.is_f64() => {
             let number = number.as_f64().unwrap_or(f64::NAN);
             if number != 0.0 && number.abs() < 1e-3 {
