@@ -101,8 +101,10 @@ fn painted(
 /// Every 2ˡ-th pixel of every 2ˡ-th row.
 fn halved(picture: Picture, level: usize) -> Picture {
     let (width, height) = (picture.width >> level, picture.height >> level);
-    let pixel =
-        |i: usize| picture.pixels[((i / width << level) * picture.width) + (i % width << level)];
+    let pixel = |i: usize| {
+        let (column, row) = ((i % width) << level, (i / width) << level);
+        picture.pixels[row * picture.width + column]
+    };
     Picture { width, height, pixels: (0..width * height).map(pixel).collect() }
 }
 
