@@ -76,7 +76,10 @@ fn a_replay_says_what_a_budget_buys_and_what_the_covariance_is_worth() {
     let weights = folder.path().join("debug/keyframe-0000-weights.png");
     assert!(std::fs::read(weights).unwrap().starts_with(b"\x89PNG"));
     let report = std::fs::read_to_string(folder.path().join("report.html")).unwrap();
-    assert!(report.contains("Quality and budget") && !report.contains("NaN"));
+    let (_, charts) = report.split_once("Quality and budget").expect("the section is there");
+    let (charts, _) = charts.split_once("</section>").unwrap();
+    assert_eq!(charts.matches("</svg>").count(), 2);
+    assert!(!charts.contains("NaN") && !charts.contains("nothing to show"));
 }
 
 #[test]
