@@ -142,6 +142,7 @@ fn record(poses: Vec<RecordedPose>, keyframes: Vec<Keyframe>, with_truth: bool) 
         deadline_nanos: None,
         deadline_misses: None,
         map_nanos: vec![2_000_000; frames],
+        budget_samples: Vec::new(),
         recorded_nanos: 2_000_000_000,
         wall_nanos: 1_000_000_000,
         peak_rss_bytes: None,

@@ -16,6 +16,7 @@ pub mod pairing;
 pub mod peers;
 pub mod recorder;
 pub mod reference_feed;
+pub mod rehearsal;
 pub mod replay;
 pub mod results;
 pub mod shutdown;

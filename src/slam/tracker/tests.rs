@@ -131,7 +131,7 @@ fn points_behind_the_camera_are_a_loss() {
     let keyframe = plane.keyframe(&camera, 2, 0.02);
     let mut tracker = tracker_on(&keyframe);
     let turned = SE3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, std::f64::consts::PI, 0.0));
-    tracker.motion.observe(0, &turned);
+    tracker.memory.motion.observe(0, &turned);
     let estimate = tracker.track(&frame(1, &keyframe.image), &mut always);
     assert!(matches!(estimate.state, TrackingState::Lost(_)), "{:?}", estimate.state);
     assert!(is_clean(&estimate));
@@ -171,5 +171,30 @@ fn sub_pixel_motion_is_found_without_pull_from_or_to_whole_pixels() {
         let mean = errors.sum::<Vector6<f64>>() / 6.0;
         // Pixels of level 0. A gradient that shares noise with the residual leaves 0.12 here.
         assert!(mean.norm() < 0.06, "{shift_px} px: {mean}");
+    }
+}
+
+#[test]
+fn rehearsals_with_any_budget_leave_the_tracker_as_it_is() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let keyframe = plane.keyframe(&camera, 2, 0.02);
+    let (mut rehearsing, mut other) = (tracker_on(&keyframe), tracker_on(&keyframe));
+    for sequence in 0..=8 {
+        let image = plane.render(&camera, &path(sequence), 2.0, (1.0, 0.0), 100 + sequence);
+        let frame = frame(sequence, &image);
+        let memory = rehearsing.memory().clone();
+        let estimate = rehearsing.track(&frame, &mut always);
+        assert_eq!(estimate, other.track(&frame, &mut always), "frame {sequence}");
+        assert_eq!(estimate, rehearsing.rehearse(&memory, &frame, &mut always));
+        for iterations in [0, 1, 3] {
+            let mut left = iterations;
+            let mut budget = |_: usize| {
+                left -= 1;
+                left >= 0
+            };
+            let short = rehearsing.rehearse(&memory, &frame, &mut budget);
+            assert_ne!(short.state, TrackingState::Tracking, "{iterations} iterations");
+            assert!(is_clean(&short));
+        }
     }
 }
