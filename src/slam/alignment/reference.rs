@@ -57,6 +57,12 @@ pub fn num_levels(width: usize, height: usize) -> usize {
     (0..MAX_LEVELS).take_while(fits).count().max(1)
 }
 
+/// The finest of `num_levels` levels that is aligned: an image so small that it has only level 0 is
+/// aligned there, whatever the parameters prefer.
+pub fn finest_level(num_levels: usize, params: &ReferenceParams) -> usize {
+    params.finest_level.min(num_levels.saturating_sub(1))
+}
+
 /// A keyframe prepared for alignment, point clouds by pyramid level.
 #[derive(Debug, Clone)]
 pub struct Reference {
@@ -69,6 +75,7 @@ pub struct Reference {
     world_from_keyframe: Sim3,
     intrinsics: Intrinsics,
     mean_inverse_depth: f64,
+    finest_level: usize,
     levels: Vec<LevelPoints>,
     pyramid: SumPyramid,
     fusion: DepthFusion,
@@ -80,6 +87,7 @@ impl Reference {
     /// An empty reference: memory for [`Reference::prepare_into`].
     pub fn new(params: ReferenceParams) -> Self {
         Self {
+            finest_level: params.finest_level,
             params,
             keyframe_id: NO_KEYFRAME,
             epoch: 0,
@@ -124,7 +132,9 @@ impl Reference {
         if !usable {
             return;
         }
-        let (levels, finest) = (num_levels(width, height), self.params.finest_level);
+        let levels = num_levels(width, height);
+        let finest = finest_level(levels, &self.params);
+        self.finest_level = finest;
         if !self.pyramid.has_size(width, height, levels, finest) {
             self.pyramid = SumPyramid::with_size(width, height, levels, finest);
         }
@@ -165,7 +175,7 @@ impl Reference {
                 ray_y: ((v as f64 - intrinsics.cy) * inverse_fy) as f32,
                 inverse_depth: candidate.inverse_depth,
                 variance: candidate.variance,
-                surrounding_inverse_depth: if level == self.params.finest_level {
+                surrounding_inverse_depth: if level == self.finest_level {
                     self.surroundings.without(&candidate)
                 } else {
                     candidate.inverse_depth
@@ -219,7 +229,7 @@ impl Reference {
 
     /// Finest level with points prepared.
     pub fn finest_level(&self) -> usize {
-        self.params.finest_level
+        self.finest_level
     }
 
     /// The points of one level; empty where the level is not aligned.

@@ -5,6 +5,7 @@ use nalgebra::Vector6;
 use crate::slam::alignment::reference::Reference;
 use crate::slam::alignment::scene::{Plane, small_camera, small_plane};
 use crate::slam::frame::FrameView;
+use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::pose::{LostReason, PoseEstimate, TrackingState};
@@ -135,6 +136,73 @@ fn points_behind_the_camera_are_a_loss() {
     let estimate = tracker.track(&frame(1, &keyframe.image), &mut always);
     assert!(matches!(estimate.state, TrackingState::Lost(_)), "{:?}", estimate.state);
     assert!(is_clean(&estimate));
+}
+
+#[test]
+fn only_frames_that_are_found_say_what_a_good_fit_is() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let keyframe = plane.keyframe(&camera, 2, 0.02);
+    let mut tracker = tracker_on(&keyframe);
+    assert!(tracker.track(&frame(0, &keyframe.image), &mut always).state.is_tracked());
+    let good = tracker.coarse_fit;
+    assert!(good.is_some());
+    let unrelated = Plane::new([-0.3, 0.1, 0.8], [7.0, 90.0], &camera);
+    let unrelated = unrelated.render(&camera, &path(40), 2.0, (1.0, 0.0), 3);
+    let estimate = tracker.track(&frame(1, &unrelated), &mut always);
+    assert!(matches!(estimate.state, TrackingState::Lost(_)), "{:?}", estimate.state);
+    assert_eq!(tracker.coarse_fit, good, "a lost frame");
+    // Time ends within the first level of a frame that is hard to follow.
+    let image = plane.render(&camera, &path(6), 2.0, (1.0, 0.0), 7);
+    let mut left = 2;
+    let mut short = |_: usize| {
+        left -= 1;
+        left >= 0
+    };
+    tracker.was_lost = false;
+    tracker.track(&frame(2, &image), &mut short);
+    assert_eq!(tracker.coarse_fit, good, "a frame cut short");
+}
+
+#[test]
+fn a_far_hypothesis_does_not_win_by_its_tolerance() {
+    let (plane, camera) = (small_plane(), small_camera());
+    // From afar, depth as uncertain as this explains any image.
+    let keyframe = plane.keyframe(&camera, 2, 0.4);
+    let mut tracker = tracker_on(&keyframe);
+    let far = SE3::exp(&Vector6::new(0.3, 0.2, -2.0, 0.0, 0.0, 0.0));
+    tracker.motion.observe(0, &far);
+    tracker.was_lost = true;
+    let truth = SE3::exp(&Vector6::new(0.01, 0.0, 0.0, 0.04, -0.03, 0.0));
+    let image = plane.render(&camera, &truth, 2.0, (1.0, 0.0), 4);
+    let estimate = tracker.track(&frame(1, &image), &mut always);
+    assert!(estimate.state.is_tracked(), "{:?}", estimate.state);
+    let error = (estimate.keyframe_from_camera.inverse() * truth).log();
+    assert!(error.norm() < 0.02, "{error}");
+}
+
+#[test]
+fn images_of_one_level_are_tracked_on_it() {
+    // Thermal cameras give 32×24.
+    for (width, height) in [(32, 24), (64, 47), (47, 64)] {
+        let (fx, fy) = (0.8 * width as f64, 0.8 * width as f64);
+        let (cx, cy) = (0.5 * width as f64 - 0.3, 0.5 * height as f64 - 0.7);
+        let camera = Intrinsics { fx, fy, cx, cy, width, height };
+        let plane = Plane::new([0.12, -0.2, 0.95], [8.0, 60.0], &camera);
+        let keyframe = plane.keyframe(&camera, 1, 0.01);
+        let mut tracker = Tracker::new(camera, TrackerParams::default()).unwrap();
+        tracker.adopt(Box::new(Reference::prepare(&keyframe)));
+        for sequence in 0..=4 {
+            let truth = path(sequence);
+            let image = plane.render(&camera, &truth, 2.0, (1.0, 0.0), 100 + sequence);
+            let view = FrameView { width, height, ..frame(sequence, &image) };
+            let estimate = tracker.track(&view, &mut always);
+            assert_eq!(estimate.state, TrackingState::Tracking, "{width}×{height}, {sequence}");
+            assert_eq!(estimate.quality.finest_level, 0);
+            let error = (estimate.keyframe_from_camera.inverse() * truth).log();
+            // Half a pixel.
+            assert!(error.norm() * camera.fx < 0.5, "{width}×{height}, {sequence}: {error}");
+        }
+    }
 }
 
 #[test]
