@@ -216,8 +216,7 @@ impl Tracker {
             // A lost camera may be where the keyframe was taken: the mapper may have found it there.
             let views = self.params.recovery_rotation_deg.to_radians();
             let at_keyframe = self.was_lost.then(|| turned(&first, views)).into_iter().flatten();
-            let explain =
-                |of: &Alignment| self.aligner.explanation(reference, &self.pyramid, of);
+            let explain = |of: &Alignment| self.aligner.explanation(reference, &self.pyramid, of);
             let mut explained = explain(&best);
             for hypothesis in hypotheses(&self.motion, nanos, rotation).chain(at_keyframe) {
                 let other = self.align_coarsest(reference, &hypothesis, budget);
@@ -322,9 +321,11 @@ impl Tracker {
         state: TrackingState,
     ) -> PoseEstimate {
         let world_from_camera = self.motion.last().unwrap_or_else(SE3::identity);
-        let keyframe_from_camera = reference.map_or_else(SE3::identity, |reference| {
-            reference.world_from_keyframe().locate(&world_from_camera)
-        });
+        let located = reference
+            .map(|reference| reference.world_from_keyframe().locate(&world_from_camera))
+            // Beyond all numbers where the keyframe's unit is absurdly small.
+            .filter(SE3::is_finite);
+        let keyframe_from_camera = located.unwrap_or_else(SE3::identity);
         PoseEstimate {
             sequence: frame.sequence,
             capture_nanos: frame.capture_nanos,
@@ -381,5 +382,7 @@ fn contrast(pyramid: &SumPyramid) -> f64 {
     (squared / count).sqrt() * f64::from(grey_per_sum(level))
 }
 
+#[cfg(test)]
+mod hostile_tests;
 #[cfg(test)]
 mod tests;

@@ -87,12 +87,7 @@ impl Recovery {
         Self {
             aligner: Aligner::new(alignment),
             verdict: VerdictParams::default(),
-            pyramid: SumPyramid::with_size(
-                width,
-                height,
-                levels,
-                finest_level(levels, &reference),
-            ),
+            pyramid: SumPyramid::with_size(width, height, levels, finest_level(levels, &reference)),
             reference: Reference::new(reference),
             since_nanos: None,
             searched: 0,
