@@ -12,10 +12,10 @@ const TOLERANCE: f64 = 1e-3;
 fn record(world_scale: f64, poses: PoseOrigin, initial_depth: DepthOrigin) -> RunRecord {
     let params = SimulatorParams {
         seed: 2,
-        frames: 60,
-        width: 320,
-        height: 240,
-        focal_px: 262.5,
+        frames: 45,
+        width: 240,
+        height: 180,
+        focal_px: 197.0,
         world_scale,
         ..SimulatorParams::default()
     };
