@@ -15,7 +15,7 @@ const CAMERA: Intrinsics =
 const SPACING: usize = 12;
 /// σ of the inverse depth over the inverse depth.
 const RELATIVE_STD_DEV: f64 = 0.03;
-const TRIALS: usize = 400;
+const TRIALS: usize = 1000;
 
 /// SplitMix64, summed to a normal.
 struct Noise(u64);
@@ -85,13 +85,12 @@ fn arrived(map: &DepthMap, (u, v): (usize, usize)) -> Option<Hypothesis> {
     nearest.map(|(x, y)| map.hypotheses.at(x, y))
 }
 
-/// Root mean square over pixels and trials of error over predicted standard deviation.
-fn normalized_spread(target_from_source: &SE3) -> f64 {
+/// Root mean square over trials of error over predicted standard deviation, for each pixel.
+fn normalized_spreads(target_from_source: &SE3) -> Vec<f64> {
     let params = PropagationParams { process_noise_ratio: 0.0, ..PropagationParams::default() };
     let carried = carried(target_from_source);
-    assert!(carried.len() > 40, "{}", carried.len());
     let (mut source, mut target, mut noise) = (blank(), blank(), Noise(5));
-    let (mut sum, mut count) = (0.0, 0);
+    let mut sums = vec![(0.0, 0.0); carried.len()];
     for _ in 0..TRIALS {
         for point in &carried {
             let std_dev = RELATIVE_STD_DEV * point.inverse_depth;
@@ -108,15 +107,15 @@ fn normalized_spread(target_from_source: &SE3) -> f64 {
         target.hypotheses.pixels_mut().fill(Hypothesis::NONE);
         let same = Brightness::default();
         propagate(&source, &mut target, &CAMERA, target_from_source, same, &params);
-        for point in &carried {
+        for (point, (sum, count)) in carried.iter().zip(&mut sums) {
             let Some(found) = arrived(&target, point.target) else { continue };
             let error = f64::from(found.inverse_depth) - point.target_inverse_depth;
-            sum += error * error / f64::from(found.variance);
-            count += 1;
+            *sum += error * error / f64::from(found.variance);
+            *count += 1.0;
         }
     }
-    assert!(count > carried.len() * TRIALS * 9 / 10, "{count} of {}", carried.len() * TRIALS);
-    (sum / f64::from(count as u32)).sqrt()
+    assert!(sums.iter().all(|(_, count)| *count > 0.9 * TRIALS as f64), "pixels went missing");
+    sums.iter().map(|(sum, count)| f64::sqrt(sum / count)).collect()
 }
 
 #[test]
@@ -130,9 +129,12 @@ fn propagated_variance_is_the_scatter_of_what_arrives() {
         ("rolled", [0.0, 0.0, 0.0, 0.0, 0.0, 0.4]),
         ("all of it", [0.1, -0.15, -0.2, 0.1, -0.25, 0.2]),
     ] {
-        let spread = normalized_spread(&SE3::exp(&Vector6::from(twist)));
-        println!("{name}: {spread:.4}");
-        // Linear in the noise up to its share of the depth; 400 trials of some hundred pixels.
-        assert!((spread - 1.0).abs() < 0.04, "{name}: {spread}");
+        let spreads = normalized_spreads(&SE3::exp(&Vector6::from(twist)));
+        assert!(spreads.len() > 40, "{name}: {} pixels", spreads.len());
+        let mean = spreads.iter().sum::<f64>() / spreads.len() as f64;
+        let worst = spreads.iter().map(|spread| (spread - 1.0).abs()).fold(0.0, f64::max);
+        println!("{name}: mean {mean:.4}, farthest from 1 by {worst:.4}, {} pixels", spreads.len());
+        // To first order in noise of 3 %. A pixel's spread over so many trials scatters by 0.022.
+        assert!((mean - 1.0).abs() < 0.01 && worst < 0.1, "{name}: mean {mean}, worst {worst}");
     }
 }
