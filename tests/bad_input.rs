@@ -144,6 +144,44 @@ fn an_output_folder_that_cannot_be_made_is_refused_before_any_work() {
     assert_eq!(rig.leftovers(), Vec::<String>::new());
 }
 
+#[test]
+fn a_folder_that_is_not_there_is_named() {
+    let rig = Rig::new();
+    let output = rig.output();
+    for kind in ["tum", "euroc", "images"] {
+        let source = format!("{kind}:/nowhere/at-all");
+        for arguments in [vec!["run", "--source", &source], vec!["replay", &source]] {
+            let output = output.to_str().unwrap();
+            let ended = finish(rig.command(&[&arguments[..], &["--output", output]].concat()));
+            assert_refused(&ended, &[&source, "no folder /nowhere/at-all"], kind);
+        }
+    }
+}
+
+#[test]
+fn a_rig_of_another_camera_is_warned_of_in_one_line() {
+    let rig = Rig::new();
+    let folder = recording(&rig);
+    let (camera, output) = (rig.folder().join("other.toml"), rig.output());
+    let source = format!("tum:{}", folder.display());
+    for (focal, is_warned) in [(52.0, false), (60.0, true)] {
+        let text = format!(
+            "model = \"pinhole\"\nwidth = 64\nheight = 48\nfx = {focal}\nfy = {focal}\ncx = 31.5\ncy = 23.5\n"
+        );
+        fs::write(&camera, text).unwrap();
+        for arguments in [vec!["run", "--source", &source], vec!["replay", &source]] {
+            let mut command = rig.command(&arguments);
+            command.arg("--rig").arg(&camera).arg("--output").arg(&output);
+            let ended = finish(command);
+            assert!(ended.status.success(), "{}", ended.stderr);
+            let warnings: Vec<_> =
+                ended.stderr.lines().filter(|line| line.contains("camera.txt")).collect();
+            assert_eq!(warnings.len(), usize::from(is_warned), "{}", ended.stderr);
+            assert!(warnings.iter().all(|line| line.contains("other.toml")), "{warnings:?}");
+        }
+    }
+}
+
 /// The binary in a shell whose children may write files of a few kilobytes at most: to a program a
 /// full disk looks much the same.
 fn with_small_files(rig: &Rig, arguments: &str) -> Command {

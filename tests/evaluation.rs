@@ -4,6 +4,8 @@
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
+use nalgebra::Vector6;
+use semidense::slam::geometry::se3::SE3;
 use serde_json::Value;
 
 /// Largest difference of two figures of the same meaning.
@@ -59,6 +61,80 @@ fn figures_are_those_of_evo() {
             let difference = (ours - expected).abs();
             assert!(difference < TOLERANCE, "{name}: {key} is {ours}, evo has {expected}");
         }
+    }
+}
+
+/// Ground truth in EuRoC's layout of a body that carries the camera of `world_from_cameras`.
+fn write_euroc(folder: &Path, body_from_camera: &SE3, world_from_cameras: &[(i64, SE3)]) {
+    let poses = folder.join("mav0/state_groundtruth_estimate0");
+    std::fs::create_dir_all(&poses).unwrap();
+    std::fs::create_dir_all(folder.join("mav0/cam0")).unwrap();
+    let mut lines = String::from("#timestamp, p, q\n");
+    for (nanos, world_from_camera) in world_from_cameras {
+        let body = *world_from_camera * body_from_camera.inverse();
+        let (t, [x, y, z, w]) = (body.translation, body.quaternion_xyzw());
+        lines += &format!("{nanos},{},{},{},{w},{x},{y},{z}\n", t.x, t.y, t.z);
+    }
+    std::fs::write(poses.join("data.csv"), lines).unwrap();
+    let (r, t) = (body_from_camera.rotation_matrix(), body_from_camera.translation);
+    let row = |i: usize| format!("{}, {}, {}, {},", r[(i, 0)], r[(i, 1)], r[(i, 2)], t[i]);
+    let sensor = format!(
+        "T_BS:\n  data: [{} {} {} 0.0, 0.0, 0.0, 1.0]\nresolution: [752, 480]\ncamera_model: pinhole\n\
+         intrinsics: [458.654, 457.296, 367.215, 248.375]\ndistortion_model: none\n\
+         distortion_coefficients: []\n",
+        row(0),
+        row(1),
+        row(2)
+    );
+    std::fs::write(folder.join("mav0/cam0/sensor.yaml"), sensor).unwrap();
+}
+
+#[test]
+fn ground_truth_of_a_body_is_moved_to_its_camera() {
+    let path = |i: i64| {
+        let s = i as f64 / 20.0;
+        let pose = SE3::exp(&Vector6::new(s, (2.0 * s).sin(), 0.0, 0.2 * s, 0.7 * s.cos(), s));
+        (1_000_000_000 + i * 50_000_000, pose)
+    };
+    let cameras: Vec<_> = (0..60).map(path).collect();
+    // The camera as mounted on EuRoC's helicopter: turned by a right angle and some.
+    let turned = SE3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.02, -0.01, 1.556));
+    let aside = SE3::exp(&Vector6::new(-0.1, 0.3, 0.05, 0.02, -0.01, 1.556));
+    for body_from_camera in [turned, aside] {
+        let folder = tempfile::tempdir().unwrap();
+        write_euroc(folder.path(), &body_from_camera, &cameras);
+        let estimate = folder.path().join("estimate.txt");
+        let line = |(nanos, pose): &(i64, SE3)| {
+            let (t, [x, y, z, w]) = (pose.translation, pose.quaternion_xyzw());
+            format!("{} {} {} {} {x} {y} {z} {w}\n", *nanos as f64 * 1e-9, t.x, t.y, t.z)
+        };
+        std::fs::write(&estimate, cameras.iter().map(line).collect::<String>()).unwrap();
+        let estimate = estimate.display().to_string();
+        let figures = |truth: &Path, more: &[&str]| -> (Value, String) {
+            let truth = truth.display().to_string();
+            let output = evaluate(&[&[&estimate, &truth, "--json"], more].concat());
+            let said = String::from_utf8(output.stderr).unwrap();
+            (serde_json::from_slice(&output.stdout).expect(&said), said)
+        };
+        let beside = folder.path().join("mav0/state_groundtruth_estimate0/data.csv");
+        let alone = folder.path().join("alone.csv");
+        std::fs::copy(&beside, &alone).unwrap();
+        let sensor = folder.path().join("mav0/cam0/sensor.yaml").display().to_string();
+        let (by_body, warning) = figures(&alone, &[]);
+        assert!(warning.contains("--sensor") && warning.lines().count() == 1, "{warning}");
+        for (figures, said) in [figures(&beside, &[]), figures(&alone, &["--sensor", &sensor])] {
+            assert!(said.contains("moved to the camera"), "{said}");
+            for key in ["ate_rmse_m", "rpe_translation", "rpe_rotation_deg"] {
+                assert!(
+                    number(&figures[key]) < TOLERANCE,
+                    "{key} of a perfect estimate: {figures}"
+                );
+            }
+        }
+        // Positions are the same where camera and body are in one place; relative motions never.
+        let is_aside = body_from_camera.translation.norm() > 0.0;
+        assert_eq!(number(&by_body["ate_rmse_m"]) > 1e-3, is_aside, "{by_body}");
+        assert!(number(&by_body["rpe_translation"]) > 1e-3, "{by_body}");
     }
 }
 

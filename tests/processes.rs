@@ -120,6 +120,8 @@ fn who_comes_late_gets_the_keyframe_and_status_sees_all_three() {
     let status: Value = serde_json::from_str(&status.stdout).unwrap();
     for process in ["capture", "tracker", "mapper"] {
         assert_eq!(status[process]["state"], "running", "{status}");
+        let rate_hz = status[process]["rate_hz"].as_f64();
+        assert!(rate_hz.is_some_and(|rate_hz| rate_hz > 0.5), "{process}: {status}");
     }
 
     let second = finish(rig.run(20, &[]));

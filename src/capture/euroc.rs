@@ -1,6 +1,6 @@
 //! Recordings in the layout of EuRoC (ASL): `mav0/cam0` and `mav0/state_groundtruth_estimate0`.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use crate::capture::listing::{read_text, rows};
 use crate::capture::recording::{Contents, ListedImage, Recording};
@@ -10,15 +10,17 @@ use crate::capture::source::SourceError;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::trajectory::StampedPose;
 
+/// Lens and mounting of the camera, below the recording's folder.
+const SENSOR_FILE: &str = "cam0/sensor.yaml";
+
 /// Opens the recording in `folder`, which is `mav0` or holds it. The lens is that of
 /// `cam0/sensor.yaml` unless `rig` names another. The ground truth may be missing; it is the
 /// body's and is moved to the camera by the `T_BS` of `sensor.yaml`.
 pub fn open(folder: &Path, rig: Option<&Path>) -> Result<Recording, SourceError> {
-    let inner = folder.join("mav0");
-    let root = if inner.is_dir() { inner } else { folder.to_owned() };
+    let root = root_of(folder);
     let frame_list = root.join("cam0/data.csv");
     let frames = read_frames(&root.join("cam0/data"), &frame_list)?;
-    let sensor_path = root.join("cam0/sensor.yaml");
+    let sensor_path = root.join(SENSOR_FILE);
     let pose_list = root.join("state_groundtruth_estimate0/data.csv");
     let has_truth = pose_list.exists();
     // With a rig of its own and no ground truth, nothing of the sensor's file is needed.
@@ -36,6 +38,24 @@ pub fn open(folder: &Path, rig: Option<&Path>) -> Result<Recording, SourceError>
     };
     let contents = Contents { frames, depths: Vec::new(), ground_truth };
     Recording::new(contents, &rig, rig_path, frame_list)
+}
+
+fn root_of(folder: &Path) -> PathBuf {
+    let inner = folder.join("mav0");
+    if inner.is_dir() { inner } else { folder.to_owned() }
+}
+
+/// The camera of the recording's own `sensor.yaml`, and where that is; `None` where there is none.
+pub fn own_rig(folder: &Path) -> Option<(Rig, PathBuf)> {
+    let path = root_of(folder).join(SENSOR_FILE);
+    Some((sensor_yaml::read(&path).ok()?.rig, path))
+}
+
+/// The camera's `sensor.yaml` that a recording has beside the folder of `pose_list`, where there is one.
+pub fn sensor_beside(pose_list: &Path) -> Option<PathBuf> {
+    // A bare file name lies in a folder too.
+    let pose_list = pose_list.canonicalize().ok()?;
+    Some(pose_list.parent()?.parent()?.join(SENSOR_FILE)).filter(|path| path.is_file())
 }
 
 /// Reads the `timestamp [ns],filename` lines of a camera.

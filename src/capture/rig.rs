@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use nalgebra::Vector2;
 use serde::Deserialize;
 
 use crate::capture::listing;
@@ -147,6 +148,27 @@ impl Rig {
             rate_hz: None,
         };
         Ok(file.rig_of(path)?)
+    }
+}
+
+impl Rig {
+    /// By how much the images of two cameras of the same place differ, pixels: the largest shift over
+    /// a grid of rays; infinite where the sizes differ or a ray meets only one of the images.
+    pub fn largest_shift_px(&self, other: &Self) -> f64 {
+        /// Rays along each side, rims included.
+        const GRID: usize = 9;
+        let (own, others) = (self.camera.intrinsics(), other.camera.intrinsics());
+        if (own.width, own.height) != (others.width, others.height) {
+            return f64::INFINITY;
+        }
+        let place = |i: usize, side: usize| i as f64 / (GRID - 1) as f64 * (side - 1) as f64;
+        let shift = |index: usize| {
+            let (column, row) = (index % GRID, index / GRID);
+            let pixel = Vector2::new(place(column, own.width), place(row, own.height));
+            let ray = self.camera.unproject(&pixel)?;
+            Some((other.camera.project(&ray)? - pixel).norm())
+        };
+        (0..GRID * GRID).map(|index| shift(index).unwrap_or(f64::INFINITY)).fold(0.0, f64::max)
     }
 }
 

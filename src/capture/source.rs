@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use crate::capture::image_file::ImageFileError;
-use crate::capture::rig::RigError;
+use crate::capture::rig::{Rig, RigError};
 use crate::capture::simulator::Simulator;
 use crate::capture::simulator::params::SimulatorParams;
 use crate::capture::{euroc, image_folder, tum};
@@ -46,6 +46,14 @@ pub enum SourceError {
         name: String,
         /// Why, and what to do.
         reason: &'static str,
+    },
+    /// The folder of a recording is not there.
+    #[error("source `{name}`: there is no folder {}; check the path", folder.display())]
+    NoFolder {
+        /// The source.
+        name: String,
+        /// The folder.
+        folder: PathBuf,
     },
     /// A list, rig or calibration file cannot be read.
     #[error("{}: cannot be read: {source}; check the path and its permissions", path.display())]
@@ -156,6 +164,14 @@ impl SourceName {
     pub fn is_camera(&self) -> bool {
         matches!(self, Self::Camera(_))
     }
+
+    /// The folder of a recording; `None` for what is none.
+    pub fn folder(&self) -> Option<&Path> {
+        match self {
+            Self::Tum(folder) | Self::Euroc(folder) | Self::Images(folder) => Some(folder),
+            Self::Simulator { .. } | Self::Camera(_) => None,
+        }
+    }
 }
 
 impl FromStr for SourceName {
@@ -211,6 +227,9 @@ pub fn open(
     simulator: &SimulatorParams,
 ) -> Result<Box<dyn FrameSource>, SourceError> {
     let unavailable = |reason| SourceError::Unavailable { name: name.to_string(), reason };
+    if let Some(folder) = name.folder().filter(|folder| !folder.is_dir()) {
+        return Err(SourceError::NoFolder { name: name.to_string(), folder: folder.to_owned() });
+    }
     match name {
         SourceName::Tum(folder) => Ok(Box::new(tum::open(folder, rig)?)),
         SourceName::Euroc(folder) => Ok(Box::new(euroc::open(folder, rig)?)),
@@ -231,6 +250,28 @@ pub fn open(
             "this version opens no cameras; record images and use images:DIR, or the simulator with sim",
         )),
     }
+}
+
+/// Where the recording's own camera is another than that of the `rig` which wins over it: what differs,
+/// in one line. `None` where they agree, or the recording brings no camera that can be read.
+pub fn rig_conflict(name: &SourceName, rig: Option<&Path>) -> Option<String> {
+    /// Displacement that no calibration of the same camera brings about, pixels: files are written
+    /// with few digits, and calibrations of one camera differ by tenths.
+    const MAX_SHIFT_PX: f64 = 2.0;
+    let (folder, rig) = (name.folder()?, rig?);
+    let (own, own_path) = match name {
+        SourceName::Euroc(_) => euroc::own_rig(folder),
+        _ => tum::own_rig(folder),
+    }?;
+    let shift_px = own.largest_shift_px(&Rig::read(rig).ok()?);
+    (shift_px > MAX_SHIFT_PX).then(|| {
+        format!(
+            "the camera of {} and that of {} differ by up to {shift_px:.0} px; the first is used, leave out --rig \
+             for the second",
+            rig.display(),
+            own_path.display()
+        )
+    })
 }
 
 /// Rectified, photometrically corrected grey frames in the order of their stamps.

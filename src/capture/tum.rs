@@ -1,6 +1,6 @@
 //! Recordings in the layout of TUM RGB-D: `rgb.txt`, `depth.txt`, `groundtruth.txt`, `camera.txt`.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use crate::capture::listing::{read_text, rows};
 use crate::capture::recording::{Contents, ListedImage, Recording};
@@ -25,11 +25,14 @@ pub fn open(folder: &Path, rig: Option<&Path>) -> Result<Recording, SourceError>
     Recording::new(contents, &rig, rig_path, frame_list)
 }
 
+/// The camera that the folder itself brings, and where it says so; `None` where it does not.
+pub fn own_rig(folder: &Path) -> Option<(Rig, PathBuf)> {
+    let path = folder.join(CAMERA_FILE);
+    Some((Rig::read_camera_txt(&path).ok()?, path))
+}
+
 /// The rig that is named, otherwise the folder's `camera.txt`; with where it was read.
-pub fn read_rig(
-    folder: &Path,
-    rig: Option<&Path>,
-) -> Result<(Rig, std::path::PathBuf), SourceError> {
+pub fn read_rig(folder: &Path, rig: Option<&Path>) -> Result<(Rig, PathBuf), SourceError> {
     if let Some(path) = rig {
         return Ok((Rig::read(path)?, path.to_owned()));
     }

@@ -7,14 +7,17 @@ use std::process::ExitCode;
 
 use clap::{Args, ValueEnum};
 
-use crate::command::print::print;
+use crate::capture::euroc::sensor_beside;
+use crate::capture::sensor_yaml;
+use crate::command::print::{note, print};
 use crate::service::atomic_file::write_atomically;
 use crate::service::results::report::evaluation_plot::evaluation_plot;
 use crate::service::results::summary::TrajectorySummary;
-use crate::service::trajectory_file::read_trajectory;
+use crate::service::trajectory_file::read_trajectory_file;
 use crate::slam::evaluation::statistics::ErrorStatistics;
 use crate::slam::evaluation::umeyama::Alignment;
 use crate::slam::evaluation::{TrajectoryEvaluation, evaluate_trajectory};
+use crate::slam::trajectory::StampedPose;
 
 /// What is fitted before positions are compared.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -29,8 +32,8 @@ enum Align {
 
 /// Compare a trajectory with ground truth: absolute and relative errors, scale
 ///
-/// Files are in TUM layout (timestamp tx ty tz qx qy qz qw) or EuRoC ground truth (CSV, whose poses
-/// are the body's). Each pose of the shorter trajectory is compared with the one nearest in time of
+/// Files are in TUM layout (timestamp tx ty tz qx qy qz qw) or EuRoC ground truth (CSV). EuRoC's poses
+/// are the body's: against a camera's trajectory they are moved by the T_BS of cam0/sensor.yaml. Each pose of the shorter trajectory is compared with the one nearest in time of
 /// the longer; figures are those of the Python package evo.
 #[derive(Debug, Args)]
 pub struct EvaluateArgs {
@@ -46,6 +49,9 @@ pub struct EvaluateArgs {
     /// Largest difference of stamps taken for the same instant, seconds
     #[arg(long, value_name = "SECS", default_value_t = 0.02, value_parser = parse_difference)]
     max_difference: f64,
+    /// sensor.yaml of the camera, where it does not lie beside EuRoC ground truth
+    #[arg(long, value_name = "FILE")]
+    sensor: Option<PathBuf>,
     /// Print the figures as JSON, with the keys of summary.json
     #[arg(long)]
     json: bool,
@@ -64,8 +70,12 @@ fn parse_difference(text: &str) -> Result<f64, String> {
 
 /// Reads both files, compares them and prints the figures.
 pub fn run(args: &EvaluateArgs) -> Result<ExitCode, Box<dyn Error>> {
-    let estimate = read_trajectory(&args.estimate)?;
-    let truth = read_trajectory(&args.truth)?;
+    let estimate = read_trajectory_file(&args.estimate)?;
+    let mut truth = read_trajectory_file(&args.truth)?;
+    if truth.is_euroc && !estimate.is_euroc {
+        move_to_camera(&mut truth.poses, args)?;
+    }
+    let (estimate, truth) = (estimate.poses, truth.poses);
     let alignment = match args.align {
         Align::Sim3 => Alignment::Sim3,
         Align::Se3 => Alignment::SE3,
@@ -88,6 +98,26 @@ pub fn run(args: &EvaluateArgs) -> Result<ExitCode, Box<dyn Error>> {
     };
     print(&format!("{text}\n"))?;
     Ok(ExitCode::SUCCESS)
+}
+
+/// Moves poses of the body to the camera on it: an estimate is the camera's, and seen from another
+/// place, or along other axes, the same motion has another relative error.
+fn move_to_camera(truth: &mut [StampedPose], args: &EvaluateArgs) -> Result<(), Box<dyn Error>> {
+    let beside = sensor_beside(&args.truth);
+    let Some(path) = args.sensor.as_ref().or(beside.as_ref()) else {
+        note(&format!(
+            "warning: the poses of {} are the body's and no cam0/sensor.yaml lies beside its folder: \
+             relative errors are about other axes than the camera's; name the file with --sensor",
+            args.truth.display()
+        ));
+        return Ok(());
+    };
+    let body_from_camera = sensor_yaml::read(path)?.body_from_camera;
+    for pose in truth {
+        pose.world_from_camera = pose.world_from_camera * body_from_camera;
+    }
+    note(&format!("ground truth of the body, moved to the camera by {}", path.display()));
+    Ok(())
 }
 
 /// The figures as a table.

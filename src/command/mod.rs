@@ -21,6 +21,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::{Args, Parser, Subcommand};
+use tracing_subscriber::EnvFilter;
 
 use crate::command::print::{PrintError, note};
 use crate::service::child::{ERROR_PREFIX, follow_supervisor};
@@ -128,10 +129,25 @@ pub fn main() -> ExitCode {
     })
 }
 
+/// The filter of `--log`. A word alone must be a level: the filter's own reader takes every other word
+/// for the name of a module, and then nothing of the program is logged.
+fn log_filter(text: &str) -> Result<EnvFilter, String> {
+    const LEVELS: [&str; 6] = ["off", "error", "warn", "info", "debug", "trace"];
+    let form =
+        "write error, warn, info, debug or trace, or module=level as in semidense::service=debug";
+    let is_level = |word: &str| LEVELS.iter().any(|level| level.eq_ignore_ascii_case(word.trim()));
+    for directive in text.split(',') {
+        let level = directive.rsplit_once('=').map_or(directive, |(_, level)| level);
+        if !is_level(level) {
+            return Err(format!("--log {text}: `{}` is no level; {form}", level.trim()));
+        }
+    }
+    EnvFilter::try_new(text).map_err(|error| format!("--log {text}: {error}; {form}"))
+}
+
 fn prepare(common: &CommonArguments) -> Result<Config, Box<dyn Error>> {
     follow_supervisor()?;
-    let filter = tracing_subscriber::EnvFilter::try_new(&common.log)
-        .map_err(|error| format!("--log {}: {error}", common.log))?;
+    let filter = log_filter(&common.log)?;
     tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(std::io::stderr)
@@ -141,4 +157,21 @@ fn prepare(common: &CommonArguments) -> Result<Config, Box<dyn Error>> {
     let config = common.load()?;
     tracing::info!("configuration:\n{}", config.to_text());
     Ok(config)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::log_filter;
+
+    #[test]
+    fn a_log_level_is_a_level() {
+        for good in ["warn", "INFO", "off", "warn,semidense::service=debug", "semidense=trace"] {
+            assert!(log_filter(good).is_ok(), "{good}");
+        }
+        for bad in ["nonsense", "warn,nonsense", "semidense=loud", "", "3", "warn,"] {
+            let error = log_filter(bad).unwrap_err();
+            assert!(error.starts_with(&format!("--log {bad}: ")), "{error}");
+            assert!(error.contains("warn, info") && !error.contains('\n'), "{error}");
+        }
+    }
 }

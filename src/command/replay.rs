@@ -8,8 +8,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::{Args, ValueEnum};
 
-use crate::capture::source::{FrameSource, SourceName, open};
-use crate::command::print::print;
+use crate::capture::source::{FrameSource, SourceName, open, rig_conflict};
+use crate::command::print::{note, print};
 use crate::command::progress::Progress;
 use crate::service::config::Config;
 use crate::service::replay::{DepthOrigin, PoseOrigin, ReplayConfig, ReplayProgress, replay};
@@ -83,6 +83,9 @@ pub fn run(config: &Config, args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error
     simulator.seed = args.seed.unwrap_or(simulator.seed);
     simulator.frames = args.frames.map_or(simulator.frames, |n| simulator.frames.min(n as usize));
     let mut source = open(&args.source, args.rig.as_deref(), &simulator)?;
+    if let Some(conflict) = rig_conflict(&args.source, args.rig.as_deref()) {
+        note(&format!("warning: {conflict}"));
+    }
     let interrupted = Arc::new(AtomicBool::new(false));
     signal_hook::flag::register(signal_hook::consts::SIGINT, Arc::clone(&interrupted))?;
     let threads = args.threads.map_or(config.mapper.threads, usize::from);

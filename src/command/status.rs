@@ -20,6 +20,9 @@ use crate::wire::port::{Access, Hub, wait};
 
 /// Time between two looks: rates are taken over it.
 const PERIOD: Duration = Duration::from_secs(1);
+/// Looks after which `--once` shows what it has: two reports are a second apart, a process that
+/// starts or ends may give only one.
+const MAX_LOOKS: usize = 4;
 /// A process that has said nothing for so long is not there any more.
 const STALE_NANOS: i64 = 3_000_000_000;
 
@@ -48,7 +51,9 @@ pub fn run(config: &Config, arguments: StatusArguments) -> CommandResult {
     let shutdown = Shutdown::install()?;
     let is_live = std::io::stdout().is_terminal() && !arguments.once && !arguments.json;
     let mut before: Vec<Option<HealthMessage>> = vec![None; peers.len()];
+    let mut looks = 0;
     loop {
+        looks += 1;
         wait(&[], Some(shutdown.descriptor()), PERIOD)?;
         if shutdown.is_requested() {
             return Ok(ExitCode::SUCCESS);
@@ -57,7 +62,15 @@ pub fn run(config: &Config, arguments: StatusArguments) -> CommandResult {
         for (peer, before) in peers.iter_mut().zip(&mut before) {
             peer.update()?;
             rows.push((peer.name(), row(peer, before.as_ref())));
-            *before = peer.last().copied();
+            // One look takes its rates since the first report, to be done soonest.
+            if !(arguments.once && before.is_some()) {
+                *before = peer.last().copied();
+            }
+        }
+        // A rate takes two reports of a process; one that is alone or silent has none.
+        let is_measured = |(_, row): &(_, Value)| row.is_null() || !row["rate_hz"].is_null();
+        if arguments.once && looks < MAX_LOOKS && !rows.iter().all(is_measured) {
+            continue;
         }
         let clear = if is_live { CLEAR_SCREEN } else { "" };
         print(&format!("{clear}{}", text_of(&rows, arguments.json)))?;

@@ -3,7 +3,9 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use crate::capture::source::{FrameSource, FrameStamp, SourceError, SourceName, open};
+use crate::capture::source::{
+    FrameSource, FrameStamp, SourceError, SourceName, open, rig_conflict,
+};
 use crate::service::clock::{Pace, duration_from_nanos, now_nanos};
 use crate::service::config::Config;
 use crate::service::health::{Health, ProcessState};
@@ -119,7 +121,11 @@ impl<'a> Shell<'a> {
         options: &CaptureOptions,
         shutdown: &'a Shutdown,
     ) -> Result<Self, CaptureError> {
-        let source = open(&options.source, options.rig.as_deref(), &config.simulator)?;
+        let rig = options.rig.as_deref();
+        let source = open(&options.source, rig, &config.simulator)?;
+        if let Some(conflict) = rig_conflict(&options.source, rig) {
+            tracing::warn!("{conflict}");
+        }
         let intrinsics = source.intrinsics();
         if !intrinsics.is_valid() {
             return Err(CaptureError::Intrinsics(options.source.clone()));

@@ -184,7 +184,10 @@ impl Config {
 
     fn from_table(table: &Table, place: &str) -> Result<Self, ConfigError> {
         let config: Self = table.clone().try_into().map_err(|error: toml::de::Error| {
-            ConfigError::Syntax { place: place.to_owned(), reason: one_line(&error, "") }
+            let known = Table::try_from(Self::default()).unwrap_or_default();
+            let unknown = unknown_key(table, &known, "");
+            let reason = unknown.unwrap_or_else(|| one_line(&error, ""));
+            ConfigError::Syntax { place: place.to_owned(), reason }
         })?;
         config
             .validate()
@@ -224,6 +227,24 @@ fn one_line(error: &toml::de::Error, text: &str) -> String {
         Some(line) if !line.is_empty() => format!("`{line}`: {message}"),
         _ => message,
     }
+}
+
+/// The first key of `table`, in full, that is not in `known`, and which there are in its place.
+fn unknown_key(table: &Table, known: &Table, prefix: &str) -> Option<String> {
+    table.iter().find_map(|(key, value)| match (value, known.get(key)) {
+        (_, None) => {
+            let there_are = known.keys().map(String::as_str).collect::<Vec<_>>().join(", ");
+            let place = match prefix.strip_suffix('.') {
+                Some(outer) => format!("keys of `{outer}` are"),
+                None => "keys are".to_owned(),
+            };
+            Some(format!("unknown key `{prefix}{key}`; {place} {there_are}"))
+        }
+        (Value::Table(inner), Some(Value::Table(known))) => {
+            unknown_key(inner, known, &format!("{prefix}{key}."))
+        }
+        _ => None,
+    })
 }
 
 /// Puts `key.of.tables=value` into `table`. A value that is no TOML is a text.
@@ -325,7 +346,13 @@ mod tests {
     #[test]
     fn bad_settings_are_refused() {
         assert!(set(&["mapper.threads"]).unwrap_err().contains("key=value"));
-        assert!(set(&["mapper.thread=1"]).unwrap_err().contains("--set mapper.thread=1: unknown"));
+        let error = set(&["mapper.thread=1"]).unwrap_err();
+        assert!(error.ends_with("unknown key `mapper.thread`; keys of `mapper` are threads"));
+        let error = set(&["tracking.alignment.hubr=1"]).unwrap_err();
+        assert!(error.contains("unknown key `tracking.alignment.hubr`; keys of "), "{error}");
+        let error = set(&["mappr.threads=1"]).unwrap_err();
+        assert!(error.contains("unknown key `mappr`; keys are "), "{error}");
+        assert!(set(&["mapper.threads=x"]).unwrap_err().contains("mapper.threads=x: invalid type"));
         assert!(set(&["mapper.threads=999"]).unwrap_err().contains("0 to 256"));
         assert!(set(&["instance.x=1"]).is_err());
         assert!(set(&["=1"]).is_err());

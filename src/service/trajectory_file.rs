@@ -79,9 +79,23 @@ pub enum LineFault {
     Quaternion,
 }
 
-/// Reads a trajectory in TUM layout, or in EuRoC's (`nanoseconds, p x y z, q w x y z, …`) where
-/// the columns are separated by commas. Poses are returned in order of their stamps.
+/// A trajectory as a file holds it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TrajectoryFile {
+    /// Its poses, in order of their stamps.
+    pub poses: Vec<StampedPose>,
+    /// Whether it is in EuRoC's layout, whose poses are those of the body that carries the camera.
+    pub is_euroc: bool,
+}
+
+/// The poses of a file, in order of their stamps; see [`read_trajectory_file`].
 pub fn read_trajectory(path: &Path) -> Result<Vec<StampedPose>, TrajectoryFileError> {
+    Ok(read_trajectory_file(path)?.poses)
+}
+
+/// Reads a trajectory in TUM layout, or in EuRoC's (`nanoseconds, p x y z, q w x y z, …`) where
+/// the columns are separated by commas.
+pub fn read_trajectory_file(path: &Path) -> Result<TrajectoryFile, TrajectoryFileError> {
     let owned = || path.to_path_buf();
     let mut bytes = Vec::new();
     File::open(path)
@@ -98,7 +112,10 @@ pub fn read_trajectory(path: &Path) -> Result<Vec<StampedPose>, TrajectoryFileEr
     if poses.is_empty() {
         return Err(TrajectoryFileError::Empty { path: owned() });
     }
-    Ok(poses)
+    let is_entry =
+        |line: &&[u8]| !line.trim_ascii().is_empty() && !line.trim_ascii().starts_with(b"#");
+    let first = bytes.split(|&b| b == b'\n').find(is_entry);
+    Ok(TrajectoryFile { poses, is_euroc: first.is_some_and(|line| line.contains(&b',')) })
 }
 
 /// The poses of a file's bytes, or the line (from 1) that is at fault.

@@ -168,6 +168,8 @@ pub struct Mapper {
     recovery: Recovery,
     consistency: Consistency,
     contradiction: Option<Contradiction>,
+    /// Whether the unit of the first keyframe is still to be found.
+    is_unit_open: bool,
     revision: u64,
     next_keyframe_id: u64,
     frames_on_keyframe: u64,
@@ -196,6 +198,7 @@ impl Mapper {
             recovery: Recovery::new(&intrinsics),
             consistency: Consistency::default(),
             contradiction: None,
+            is_unit_open: false,
             revision: 0,
             next_keyframe_id: 0,
             frames_on_keyframe: 0,
@@ -234,6 +237,7 @@ impl Mapper {
         self.recovery.end();
         self.frames_on_keyframe += 1;
         let initializing = self.map_state() == MapState::Initializing;
+        self.guess_unit(pose);
         let observations = self.observe_frame(frame, pose);
         self.unpublished += observations.fused + observations.created;
         let contradiction = self.consistency.observe(&observations, &self.params.consistency);
@@ -262,6 +266,7 @@ impl Mapper {
             self.unpublished as f64 > self.params.publish_change_ratio * known as f64;
         if keyframe_changed {
             self.refine();
+            self.keep_unit_mean();
             self.publish_depth();
             let points = self.keyframe().map_or(0, |keyframe| keyframe.points.len());
             let lost_depth = self.consistency.count_points(points, &self.params.consistency);
@@ -332,10 +337,7 @@ impl Mapper {
             brightness: pose.brightness,
             only_new: false,
         };
-        let mut matching = self.params.matching.clone();
-        if self.map_state() == MapState::Initializing {
-            matching.line_noise_px = self.params.initializer.line_noise_px;
-        }
+        let matching = self.matching_at(pose);
         observe(&mut self.depth, &observer, &matching, &self.params.gaussian)
     }
 
@@ -346,6 +348,7 @@ impl Mapper {
         pose: &PoseEstimate,
         sensor_depth: Option<&Image<f32>>,
     ) {
+        self.is_unit_open = false;
         let Some(before) = self.keyframe() else { return };
         let epoch = before.epoch;
         let world_from_before = before.world_from_keyframe;

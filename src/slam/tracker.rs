@@ -5,8 +5,8 @@ pub mod verdict;
 
 use serde::{Deserialize, Serialize};
 
-use crate::slam::alignment::align::{Aligner, Alignment, AlignmentParams};
-use crate::slam::alignment::reference::{Reference, ReferenceParams, num_levels};
+use crate::slam::alignment::align::{Aligner, Alignment, AlignmentParams, Ending};
+use crate::slam::alignment::reference::{Reference, ReferenceParams, finest_level, num_levels};
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
@@ -108,7 +108,7 @@ impl Tracker {
         params.validate()?;
         let Intrinsics { width, height, .. } = intrinsics;
         let levels = num_levels(width, height);
-        let finest = params.reference.finest_level;
+        let finest = finest_level(levels, &params.reference);
         Ok(Self {
             intrinsics,
             aligner: Aligner::new(params.alignment.clone()),
@@ -162,8 +162,12 @@ impl Tracker {
         let estimate = match self.refusal(&reference, frame) {
             Some(reason) => self.unclaimed(frame, Some(&reference), TrackingState::Lost(reason)),
             None => {
-                let alignment = self.align(&reference, frame, budget);
-                self.report(&reference, frame, &alignment, missing)
+                let (alignment, coarse_fit) = self.align(&reference, frame, budget);
+                let estimate = self.report(&reference, frame, &alignment, missing);
+                // A bar set by a frame that was lost, or cut short, would let the next one pass.
+                let is_lost = matches!(estimate.state, TrackingState::Lost(_));
+                self.memory.coarse_fit = coarse_fit.filter(|_| !is_lost).or(self.memory.coarse_fit);
+                estimate
             }
         };
         self.memory.was_lost = matches!(estimate.state, TrackingState::Lost(_));
@@ -211,13 +215,14 @@ impl Tracker {
         flat.then_some(LostReason::UnusableFrame)
     }
 
-    /// Aligns from the predicted pose, and from others where that fits badly.
+    /// Aligns from the predicted pose, and from others where that fits badly. Also gives the whitened
+    /// RMSE of the coarsest level, where there was time and a view to solve it.
     fn align(
         &mut self,
         reference: &Reference,
         frame: &FrameView<'_>,
         budget: &mut dyn FnMut(usize) -> bool,
-    ) -> Alignment {
+    ) -> (Alignment, Option<f64>) {
         let nanos = frame.capture_nanos;
         // Before the first pose the camera stands where the keyframe was taken.
         let first = reference.world_from_keyframe().place(&SE3::identity());
@@ -229,16 +234,20 @@ impl Tracker {
             let views = self.params.recovery_rotation_deg.to_radians();
             let at_keyframe =
                 self.memory.was_lost.then(|| turned(&first, views)).into_iter().flatten();
+            let explain = |of: &Alignment| self.aligner.explanation(reference, &self.pyramid, of);
+            let mut explained = explain(&best);
             for hypothesis in hypotheses(&self.memory.motion, nanos, rotation).chain(at_keyframe) {
                 let other = self.align_coarsest(reference, &hypothesis, budget);
-                if is_better(&other, &best) {
-                    best = other;
+                let by_other = explain(&other);
+                if is_better(&by_other, &explained) {
+                    (best, explained) = (other, by_other);
                 }
             }
         }
-        self.memory.coarse_fit = Some(quality_of(&best).whitened_rmse);
+        let is_solved = best.ending == Ending::Finished;
+        let coarse_fit = is_solved.then(|| quality_of(&best).whitened_rmse);
         self.aligner.descend(reference, &self.pyramid, &mut best, budget);
-        best
+        (best, coarse_fit)
     }
 
     /// Solves the coarsest level with points from one pose in the world.
@@ -331,9 +340,11 @@ impl Tracker {
         state: TrackingState,
     ) -> PoseEstimate {
         let world_from_camera = self.memory.motion.last().unwrap_or_else(SE3::identity);
-        let keyframe_from_camera = reference.map_or_else(SE3::identity, |reference| {
-            reference.world_from_keyframe().locate(&world_from_camera)
-        });
+        let located = reference
+            .map(|reference| reference.world_from_keyframe().locate(&world_from_camera))
+            // Beyond all numbers where the keyframe's unit is absurdly small.
+            .filter(SE3::is_finite);
+        let keyframe_from_camera = located.unwrap_or_else(SE3::identity);
         PoseEstimate {
             sequence: frame.sequence,
             capture_nanos: frame.capture_nanos,
@@ -390,5 +401,7 @@ fn contrast(pyramid: &SumPyramid) -> f64 {
     (squared / count).sqrt() * f64::from(grey_per_sum(level))
 }
 
+#[cfg(test)]
+mod hostile_tests;
 #[cfg(test)]
 mod tests;

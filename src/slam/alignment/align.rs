@@ -273,8 +273,7 @@ impl Aligner {
                 break;
             }
         }
-        alignment.mean_squared_flow = self.flow_of(reference, alignment);
-        alignment.scatter = self.scatter_of(reference, frame, alignment);
+        self.measure(reference, frame, alignment);
     }
 
     /// Iterates on one level; whether there is budget for the next.
@@ -353,44 +352,39 @@ impl Aligner {
         within_budget
     }
 
-    fn scatter_of(
+    /// The sums of an alignment on its level as if every depth were exact: terms on which several of
+    /// them can be compared. (∂r/∂d)² V grows with the translation, so that by its own σ_r the
+    /// alignment farthest from the keyframe explains any image best; and no translation is fair to
+    /// all, since it would be that of one of them.
+    pub fn explanation(
         &self,
         reference: &Reference,
         frame: &SumPyramid,
         alignment: &Alignment,
-    ) -> GradientScatter {
-        let level = alignment.level;
+    ) -> NormalEquations {
         let AlignedState { current_from_keyframe, brightness, .. } = &alignment.state;
-        let intrinsics = reference.intrinsics().at_level(level);
-        let weighting = self.params.weighting(level);
-        let translation = &current_from_keyframe.translation;
-        let at = Evaluation::new(
-            &intrinsics,
-            level,
-            current_from_keyframe,
-            *brightness,
-            &weighting,
-            translation,
-        );
-        self.kernel.scatter(reference.level(level), frame.level(level), &at)
+        let (level, nowhere) = (alignment.level, Vector3::zeros());
+        let state =
+            self.evaluate(reference, frame, level, current_from_keyframe, *brightness, &nowhere);
+        state.sums
     }
 
-    fn flow_of(&self, reference: &Reference, alignment: &Alignment) -> f64 {
+    /// Takes the figures of the state that an alignment ended in.
+    fn measure(&self, reference: &Reference, frame: &SumPyramid, alignment: &mut Alignment) {
         let level = alignment.level;
         let AlignedState { current_from_keyframe, brightness, .. } = &alignment.state;
-        let intrinsics = reference.intrinsics().at_level(level);
-        let weighting = self.params.weighting(level);
-        let translation = &current_from_keyframe.translation;
         let at = Evaluation::new(
-            &intrinsics,
+            &reference.intrinsics().at_level(level),
             level,
             current_from_keyframe,
             *brightness,
-            &weighting,
-            translation,
+            &self.params.weighting(level),
+            &current_from_keyframe.translation,
         );
+        let points = reference.level(level);
         let squared_pixel = f64::from(1u32 << (2 * level));
-        mean_squared_flow(reference.level(level), &at) * squared_pixel
+        alignment.mean_squared_flow = mean_squared_flow(points, &at) * squared_pixel;
+        alignment.scatter = self.kernel.scatter(points, frame.level(level), &at);
     }
 }
 

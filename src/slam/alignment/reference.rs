@@ -58,6 +58,12 @@ pub fn num_levels(width: usize, height: usize) -> usize {
     (0..MAX_LEVELS).take_while(fits).count().max(1)
 }
 
+/// The finest of `num_levels` levels that is aligned: an image so small that it has only level 0 is
+/// aligned there, whatever the parameters prefer.
+pub fn finest_level(num_levels: usize, params: &ReferenceParams) -> usize {
+    params.finest_level.min(num_levels.saturating_sub(1))
+}
+
 /// A keyframe prepared for alignment, point clouds by pyramid level.
 #[derive(Debug, Clone)]
 pub struct Reference {
@@ -70,6 +76,7 @@ pub struct Reference {
     world_from_keyframe: Sim3,
     intrinsics: Intrinsics,
     mean_inverse_depth: f64,
+    finest_level: usize,
     levels: Vec<LevelPoints>,
     pyramid: SumPyramid,
     fusion: DepthFusion,
@@ -81,6 +88,7 @@ impl Reference {
     /// An empty reference: memory for [`Reference::prepare_into`].
     pub fn new(params: ReferenceParams) -> Self {
         Self {
+            finest_level: params.finest_level,
             params,
             keyframe_id: NO_KEYFRAME,
             epoch: 0,
@@ -125,7 +133,9 @@ impl Reference {
         if !usable {
             return;
         }
-        let (levels, finest) = (num_levels(width, height), self.params.finest_level);
+        let levels = num_levels(width, height);
+        let finest = finest_level(levels, &self.params);
+        self.finest_level = finest;
         if !self.pyramid.has_size(width, height, levels, finest) {
             self.pyramid = SumPyramid::with_size(width, height, levels, finest);
         }
@@ -152,7 +162,7 @@ impl Reference {
             budget,
         );
         // Coarser levels only start the finer ones, and their depth has less noise to be pulled by.
-        let is_finest = level == self.params.finest_level;
+        let is_finest = level == self.finest_level;
         if is_finest {
             self.surroundings.measure(candidates, image.width(), image.height());
         }
@@ -225,7 +235,7 @@ impl Reference {
 
     /// Finest level with points prepared.
     pub fn finest_level(&self) -> usize {
-        self.params.finest_level
+        self.finest_level
     }
 
     /// The points of one level; empty where the level is not aligned.

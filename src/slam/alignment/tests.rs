@@ -301,6 +301,39 @@ fn without_budget_the_best_so_far_is_given() {
     assert!(errors[1] < 0.25 * errors[0] && errors[2] < 0.1 * errors[0], "{errors:?}");
 }
 
+fn median(values: &[f64]) -> f64 {
+    let mut values = values.to_vec();
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}
+
+#[test]
+fn each_level_that_there_is_time_for_makes_the_pose_better() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let reference = Reference::prepare(&plane.keyframe(&camera, 2, 0.02));
+    let aligner = Aligner::new(AlignmentParams::default());
+    // By the finest level that is solved, none first.
+    let mut errors = [const { Vec::new() }; LEVELS - LEVEL + 1];
+    for seed in 0..9 {
+        let truth = move_of(seed, 0.04);
+        let image = pyramid(&plane.render(&camera, &truth.inverse(), 2.0, (1.0, 0.0), 10 + seed));
+        for (errors, finest) in errors.iter_mut().zip((LEVEL..=LEVELS).rev()) {
+            let mut budget = |level: usize| level >= finest;
+            let (start, brightness) = (SE3::identity(), Brightness::default());
+            let alignment = aligner.align(&reference, &image, &start, brightness, &mut budget);
+            assert_eq!(alignment.ending == Ending::Finished, finest == LEVEL);
+            let error = alignment.state.current_from_keyframe * truth.inverse();
+            errors.push(error.log().norm());
+        }
+    }
+    for pair in errors.windows(2) {
+        let [coarse, fine] = [&pair[0], &pair[1]];
+        assert!(fine.iter().zip(coarse).all(|(fine, coarse)| fine < coarse), "{errors:?}");
+        // Four times the points, each placed twice as finely: with independent noise a quarter is left.
+        assert!(median(fine) < 0.5 * median(coarse), "{errors:?}");
+    }
+}
+
 #[test]
 fn a_budget_of_points_is_kept_and_spread() {
     let (plane, camera) = (small_plane(), small_camera());

@@ -18,6 +18,8 @@ pub struct TwoView {
     rotation: [[f32; 3]; 3],
     /// `K t`.
     translation: [f32; 3],
+    /// Pixels are so many focal lengths.
+    per_focal_length: f32,
 }
 
 /// One keyframe pixel seen through a [`TwoView`]: its epipolar line, parametrised by inverse depth.
@@ -70,7 +72,16 @@ impl TwoView {
         Self {
             rotation: [0, 1, 2].map(|r| [0, 1, 2].map(|c| rotation[(r, c)] as f32)),
             translation: [0, 1, 2].map(|r| translation[r] as f32),
+            per_focal_length: (1.0 / intrinsics.fx.max(intrinsics.fy)) as f32,
         }
+    }
+
+    /// How far the translation moves the projection `at` of a pixel of `line`, focal lengths.
+    #[inline]
+    pub fn disparity(&self, line: &EpipolarLine, at: &Projection) -> f32 {
+        let [far_u, far_v, z] = line.pr;
+        let (du, dv) = (at.u - far_u / z, at.v - far_v / z);
+        (du * du + dv * dv).sqrt() * self.per_focal_length
     }
 
     /// The epipolar line of keyframe pixel `(u, v)`.

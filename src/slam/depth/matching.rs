@@ -26,10 +26,16 @@ pub const MAX_STEPS: usize = 100;
 pub struct MatchingParams {
     /// Standard deviation of the image noise, grey levels. Cameras in rooms have 2 to 4.
     pub image_noise: f32,
-    /// Standard deviation by which pose and calibration errors misplace the epipolar line, pixels.
+    /// Standard deviation by which errors of the calibration, and of the pose beyond its covariance,
+    /// misplace the epipolar line, pixels.
     pub line_noise_px: f32,
-    /// Standard deviation that interpolation and sampling leave in a match, pixels.
+    /// Standard deviation that interpolation and sampling leave in a match, pixels: measured without
+    /// noise and with hardly any parallax in the simulated room.
     pub sampling_noise_px: f32,
+    /// Standard deviation that the slant of surfaces leaves in a match, pixels for a disparity of one
+    /// focal length. The patch is taken for one at a single depth: on a surface slanted by θ a sample
+    /// r pixels off the centre is misplaced by r tan θ times the disparity in focal lengths. r is 1 to 2.
+    pub slant_noise_px: f32,
     /// Longest segment that is searched, pixels: beyond it repeated structure wins.
     pub max_search_px: f32,
     /// Smallest root mean square gradient along the line over the patch, grey levels a pixel:
@@ -49,7 +55,8 @@ impl Default for MatchingParams {
         Self {
             image_noise: 3.0,
             line_noise_px: 0.2,
-            sampling_noise_px: 0.05,
+            sampling_noise_px: 0.08,
+            slant_noise_px: 1.5,
             max_search_px: 40.0,
             min_line_gradient: 2.0,
             max_residual: 10.0,
@@ -60,11 +67,18 @@ impl Default for MatchingParams {
 }
 
 impl MatchingParams {
+    /// `line_noise_px` together with an uncertainty of the pose of `pose_noise_px`, no larger than any
+    /// search reaches.
+    pub fn line_noise_with(&self, pose_noise_px: f64) -> f32 {
+        self.line_noise_px.hypot(pose_noise_px as f32).min(self.max_search_px)
+    }
+
     /// Checks every value.
     pub fn validate(&self) -> Result<(), ParameterError> {
         check_range("image_noise", self.image_noise, 0.1..=50.0)?;
         check_range("line_noise_px", self.line_noise_px, 0.0..=5.0)?;
         check_range("sampling_noise_px", self.sampling_noise_px, 0.0..=2.0)?;
+        check_range("slant_noise_px", self.slant_noise_px, 0.0..=20.0)?;
         check_range("max_search_px", self.max_search_px, 5.0..=90.0)?;
         check_range("min_line_gradient", self.min_line_gradient, 0.1..=50.0)?;
         check_range("max_residual", self.max_residual, 1.0..=255.0)?;
@@ -179,8 +193,12 @@ pub fn condition(
     let product = |a: (f32, f32), b: (f32, f32)| {
         uu * a.0 * b.0 + uv * (a.0 * b.1 + a.1 * b.0) + vv * a.1 * b.1
     };
-    let information = product(along, along);
+    let measured = product(along, along);
     let samples = PATTERN.len() as f32;
+    // Noise of the keyframe gives gradient where there is none: of a central difference half its variance.
+    let squared_along = along.0 * along.0 + along.1 * along.1;
+    let by_noise = 0.5 * samples * (gain * params.image_noise).powi(2) * squared_along;
+    let information = measured - by_noise;
     if !(information >= samples * params.min_line_gradient * params.min_line_gradient) {
         return None;
     }
@@ -188,13 +206,15 @@ pub fn condition(
     let geometric = params.line_noise_px * params.line_noise_px * (1.0 + tangent * tangent);
     // Noise of the frame, and of the keyframe as brightened.
     let noise = (1.0 + gain * gain) * params.image_noise * params.image_noise;
-    let photometric = noise / information;
-    let sampling = params.sampling_noise_px * params.sampling_noise_px;
+    // The match is where Σ ĝ r = 0, ĝ with noise: its variance is σ² Σ ĝ²/(Σ ĝ g)².
+    let photometric = noise * measured / (information * information);
+    let slant = params.slant_noise_px * view.disparity(line, at);
+    let sampling = params.sampling_noise_px * params.sampling_noise_px + slant * slant;
     Some(Conditioning {
         direction,
         along,
         warp,
-        squared_gradient: (information + product(across, across)) / samples,
+        squared_gradient: (measured + product(across, across)) / samples,
         match_variance: geometric + photometric + sampling,
         inverse_depth_per_px: 1.0 / speed,
     })

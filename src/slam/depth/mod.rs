@@ -1,7 +1,7 @@
 //! Inverse depth by small-baseline stereo, and the filters that keep it (Engel, Sturm, Cremers 2013).
 //!
 //! [`epipolar`] is the geometry between a keyframe and a frame, [`matching`] the search along an
-//! epipolar segment, [`gaussian`] the semi-dense filter, [`propagation`] the step to a new keyframe,
+//! epipolar segment, [`pose_noise`] what a pose's covariance is in pixels there, [`gaussian`] the semi-dense filter, [`propagation`] the step to a new keyframe,
 //! [`regularisation`] the smoothing of the map. [`interval`] is the sparse filter on [`immature`] points
 //! at the pixels that [`candidate`] chooses (Engel, Koltun, Cremers 2018).
 
@@ -13,6 +13,7 @@ pub mod interval;
 pub mod map;
 pub mod matching;
 mod observation_kernel;
+pub mod pose_noise;
 pub mod propagation;
 pub mod regularisation;
 mod smoothing_kernel;

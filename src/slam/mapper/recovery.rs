@@ -6,7 +6,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::slam::alignment::align::{Aligner, Alignment, AlignmentParams};
 use crate::slam::alignment::kernel::SimdMode;
-use crate::slam::alignment::reference::{Reference, ReferenceParams, num_levels};
+use crate::slam::alignment::normal_equations::NormalEquations;
+use crate::slam::alignment::reference::{Reference, ReferenceParams, finest_level, num_levels};
 use crate::slam::depth::gaussian::MAX_VALIDITY;
 use crate::slam::depth::map::{DepthMap, Hypothesis};
 use crate::slam::frame::FrameView;
@@ -86,7 +87,7 @@ impl Recovery {
         Self {
             aligner: Aligner::new(alignment),
             verdict: VerdictParams::default(),
-            pyramid: SumPyramid::with_size(width, height, levels, reference.finest_level),
+            pyramid: SumPyramid::with_size(width, height, levels, finest_level(levels, &reference)),
             reference: Reference::new(reference),
             since_nanos: None,
             searched: 0,
@@ -148,17 +149,18 @@ impl Recovery {
     fn shows(&mut self, keyframe: &Keyframe, rotation_rad: f64) -> bool {
         self.reference.prepare_into(keyframe);
         let (aligner, reference, pyramid) = (&self.aligner, &self.reference, &self.pyramid);
-        let mut best: Option<Alignment> = None;
+        let mut best: Option<(Alignment, NormalEquations)> = None;
         for keyframe_from_camera in turned(&SE3::identity(), rotation_rad) {
             let start = keyframe_from_camera.inverse();
             let mut other = aligner.start(reference, pyramid, &start, Brightness::default());
             let level = other.level;
             aligner.solve_level(reference, pyramid, level, &mut other, &mut |_| true);
-            if best.as_ref().is_none_or(|best| is_better(&other, best)) {
-                best = Some(other);
+            let explained = aligner.explanation(reference, pyramid, &other);
+            if best.as_ref().is_none_or(|(_, by_best)| is_better(&explained, by_best)) {
+                best = Some((other, explained));
             }
         }
-        let Some(mut best) = best else { return false };
+        let Some((mut best, _)) = best else { return false };
         aligner.descend(reference, pyramid, &mut best, &mut |_| true);
         self.verdict.judge(&best, &quality_of(&best), true, 0).is_tracked()
     }

@@ -3,6 +3,8 @@
 use crate::slam::depth::epipolar::TwoView;
 use crate::slam::depth::gaussian::{NEW_VALIDITY, ObservationCounts, Observer, observe};
 use crate::slam::depth::map::{DepthMap, Hypothesis};
+use crate::slam::depth::matching::MatchingParams;
+use crate::slam::depth::pose_noise::pose_noise_px;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
@@ -33,6 +35,7 @@ impl Mapper {
         }
         let (origin, unit) = self.origin(pose);
         self.begin_epoch(frame.pixels);
+        self.is_unit_open = is_given && sensor_depth.is_none();
         let map_state = match sensor_depth {
             Some(sensor) => {
                 take_sensor_depth(&mut self.depth, sensor, 1.0);
@@ -57,6 +60,50 @@ impl Mapper {
         }
     }
 
+    /// How to search in a frame at `pose`: the less is known of the pose, the less is believed of a match.
+    pub(super) fn matching_at(&self, pose: &PoseEstimate) -> MatchingParams {
+        let matching = &self.params.matching;
+        let line_noise_px = match self.map_state() {
+            MapState::Initializing => self.params.initializer.line_noise_px,
+            _ => matching.line_noise_with(pose_noise_px(&self.intrinsics, &pose.covariance)),
+        };
+        MatchingParams { line_noise_px, ..matching.clone() }
+    }
+
+    /// Gives a keyframe without depth, at given poses, the unit in which the longest search in a frame
+    /// at `pose` reaches the nearest depth that is looked for: what the poses are measured in says
+    /// nothing about how far away things are.
+    pub(super) fn guess_unit(&mut self, pose: &PoseEstimate) {
+        /// Share of the longest search that is used, so that rounding does not make it too long.
+        const USED_SEARCH: f64 = 0.95;
+        if !self.is_unit_open {
+            return;
+        }
+        let focal_px = self.intrinsics.fx.max(self.intrinsics.fy);
+        let nearest = f64::from(self.params.gaussian.max_inverse_depth);
+        let search_px = USED_SEARCH * f64::from(self.params.matching.max_search_px);
+        let Some(keyframe) = self.keyframe_mut().filter(|keyframe| keyframe.points.is_empty())
+        else {
+            return;
+        };
+        let placed = &mut keyframe.world_from_keyframe;
+        let baseline = (pose.world_from_camera.translation - placed.rigid.translation).norm();
+        if baseline > 0.0 {
+            placed.scale = baseline * focal_px * nearest / search_px;
+        }
+    }
+
+    /// Once such a keyframe has depth, its mean inverse depth is kept at 1.
+    pub(super) fn keep_unit_mean(&mut self) {
+        if !self.is_unit_open {
+            return;
+        }
+        let factor = self.rescale_to_unit_mean();
+        if let Some(keyframe) = self.keyframe_mut() {
+            keyframe.world_from_keyframe.scale *= factor;
+        }
+    }
+
     /// Where the next epoch begins and what its unit is in the one before, as far as can be known.
     fn origin(&self, pose: &PoseEstimate) -> (SE3, f64) {
         let trusted = |keyframe: &&Keyframe| keyframe.map_state == MapState::Established;
@@ -76,6 +123,7 @@ impl Mapper {
         self.map.keyframes.retain(|keyframe| keyframe.map_state != MapState::Initializing);
         self.in_force = None;
         self.contradiction = None;
+        self.is_unit_open = false;
         self.recovery.end();
         self.past.clear();
         self.depth.restart(pixels, self.params.min_gradient, self.params.max_candidates);

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::slam::alignment::align::{Alignment, Ending};
+use crate::slam::alignment::normal_equations::NormalEquations;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::{DegradedReason, LostReason, Quality, TrackingState};
 
@@ -121,10 +122,11 @@ pub fn quality_of(alignment: &Alignment) -> Quality {
     }
 }
 
-/// Whether one coarse alignment explains the frame better than another: more inliers, counted
-/// over all points so that looking away does not pay.
-pub fn is_better(one: &Alignment, other: &Alignment) -> bool {
-    let inliers = |alignment: &Alignment| alignment.state.sums.inliers;
-    let energy = |alignment: &Alignment| alignment.state.sums.mean_energy();
-    inliers(one) > inliers(other) || (inliers(one) == inliers(other) && energy(one) < energy(other))
+/// Whether one coarse alignment explains the frame better than another, both as of
+/// [`Aligner::explanation`]: more inliers, counted over all points so that looking away does not pay.
+///
+/// [`Aligner::explanation`]: crate::slam::alignment::align::Aligner::explanation
+pub fn is_better(one: &NormalEquations, other: &NormalEquations) -> bool {
+    one.inliers > other.inliers
+        || (one.inliers == other.inliers && one.mean_energy() < other.mean_energy())
 }

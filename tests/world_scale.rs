@@ -1,0 +1,106 @@
+//! The unit of the world is nobody's business: the simulated room a tenth and ten times as large gives
+//! the same trajectory and the same depth up to that factor, in every way to start and to be given poses.
+
+use semidense::capture::simulator::Simulator;
+use semidense::capture::simulator::params::SimulatorParams;
+use semidense::service::replay::{DepthOrigin, PoseOrigin, ReplayConfig, replay};
+use semidense::service::results::RunRecord;
+
+/// Share of the path by which trajectories may differ where a sensor's metres enter as f32.
+const TOLERANCE: f64 = 1e-3;
+
+fn record(world_scale: f64, poses: PoseOrigin, initial_depth: DepthOrigin) -> RunRecord {
+    let params = SimulatorParams {
+        seed: 2,
+        frames: 45,
+        width: 240,
+        height: 180,
+        focal_px: 197.0,
+        world_scale,
+        ..SimulatorParams::default()
+    };
+    let mut source = Simulator::new(params).unwrap();
+    let config = ReplayConfig { poses, initial_depth, ..ReplayConfig::default() };
+    replay(&mut source, "sim", &config, &mut |_| true).unwrap()
+}
+
+/// Positions of the claimed poses, with the frame's number.
+fn positions(record: &RunRecord) -> Vec<(u64, nalgebra::Vector3<f64>)> {
+    let poses = record.poses.iter().map(|pose| pose.estimate);
+    let tracked = poses.filter(|pose| pose.state.is_tracked());
+    tracked.map(|pose| (pose.sequence, pose.world_from_camera.translation)).collect()
+}
+
+/// Median over the points of all keyframes of depth in world units.
+fn median_depth(record: &RunRecord) -> f64 {
+    let of_keyframe = record.map.keyframes.iter().flat_map(|keyframe| {
+        let scale = keyframe.world_from_keyframe.scale;
+        keyframe.points.iter().map(move |point| scale / f64::from(point.inverse_depth))
+    });
+    let mut depths: Vec<f64> = of_keyframe.collect();
+    depths.sort_by(f64::total_cmp);
+    depths[depths.len() / 2]
+}
+
+/// Compares the room of `scale` with the room as it is; `unit`: what its lengths are multiplied by.
+fn assert_same(name: &str, one: &RunRecord, other: &RunRecord, unit: f64) {
+    let (expected, found) = (positions(one), positions(other));
+    assert!(expected.len() > 20, "{name}: {} poses", expected.len());
+    let points = |record: &RunRecord| -> usize {
+        record.map.keyframes.iter().map(|keyframe| keyframe.points.len()).sum()
+    };
+    println!(
+        "{name}: {} and {} poses, {} and {} keyframes, {} and {} points, median depth {:.4} and {:.4}",
+        expected.len(),
+        found.len(),
+        one.map.keyframes.len(),
+        other.map.keyframes.len(),
+        points(one),
+        points(other),
+        median_depth(one),
+        median_depth(other) / unit
+    );
+    assert_eq!(expected.len(), found.len(), "{name}");
+    let path: f64 = expected.windows(2).map(|pair| (pair[1].1 - pair[0].1).norm()).sum();
+    for ((sequence, expected), (other_sequence, found)) in expected.iter().zip(&found) {
+        assert_eq!(sequence, other_sequence, "{name}");
+        let off = (found / unit - expected).norm();
+        assert!(off <= TOLERANCE * path, "{name}, frame {sequence}: {off} of {path}");
+    }
+    let ratio = median_depth(other) / unit / median_depth(one);
+    assert!((ratio - 1.0).abs() < 0.01, "{name}: depth {ratio}");
+    let (few, many) = (points(one).min(points(other)), points(one).max(points(other)));
+    assert!(few as f64 > 0.99 * many as f64, "{name}: {few} and {many} points");
+}
+
+#[test]
+fn from_images_alone_not_a_bit_changes() {
+    let (poses, depth) = (PoseOrigin::Tracker, DepthOrigin::Images);
+    let one = record(1.0, poses, depth);
+    for scale in [0.1, 10.0] {
+        let other = record(scale, poses, depth);
+        // The unit of a map from images is its own.
+        assert_same(&format!("images, {scale}"), &one, &other, 1.0);
+        assert_eq!(positions(&one), positions(&other), "{scale}");
+    }
+}
+
+#[test]
+fn with_depth_of_a_sensor_everything_is_in_its_unit() {
+    let (poses, depth) = (PoseOrigin::Tracker, DepthOrigin::Sensor);
+    let one = record(1.0, poses, depth);
+    for scale in [0.1, 10.0] {
+        assert_same(&format!("sensor, {scale}"), &one, &record(scale, poses, depth), scale);
+    }
+}
+
+#[test]
+fn with_given_poses_depth_is_in_their_unit() {
+    for depth in [DepthOrigin::Sensor, DepthOrigin::Images] {
+        let one = record(1.0, PoseOrigin::GroundTruth, depth);
+        for scale in [0.1, 10.0] {
+            let other = record(scale, PoseOrigin::GroundTruth, depth);
+            assert_same(&format!("given poses, {depth:?}, {scale}"), &one, &other, scale);
+        }
+    }
+}
