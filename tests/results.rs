@@ -84,6 +84,7 @@ fn pose(i: usize, state: TrackingState, keyframe_id: u64) -> RecordedPose {
         estimate,
         latency_nanos: None,
         track_nanos: Some(1_000_000 * (i as u64 % 7 + 1)),
+        wake_nanos: Some(40_000),
     }
 }
 
@@ -126,6 +127,7 @@ fn record(poses: Vec<RecordedPose>, keyframes: Vec<Keyframe>, with_truth: bool) 
         restarts: 0,
         deadline_nanos: None,
         deadline_misses: None,
+        page_faults: None,
         map_nanos: vec![2_000_000; frames],
         recorded_nanos: 2_000_000_000,
         wall_nanos: 1_000_000_000,

@@ -3,6 +3,7 @@
 //! Exit codes: 0 done, 1 failed (one line says what, where and what to do), 2 the command line is
 //! not understood, 130 interrupted (results so far are written).
 
+pub mod bench;
 pub mod capture;
 pub mod evaluate;
 pub mod mapper;
@@ -99,6 +100,7 @@ enum Subcommands {
     Simulate(Box<simulate::SimulateArgs>),
     Evaluate(evaluate::EvaluateArgs),
     Status(status::StatusArguments),
+    Bench(bench::BenchArguments),
 }
 
 /// Parses the command line and runs the chosen subcommand.
@@ -114,6 +116,7 @@ pub fn main() -> ExitCode {
             Subcommands::Simulate(arguments) => simulate::run(&config, &arguments),
             Subcommands::Evaluate(arguments) => evaluate::run(&arguments),
             Subcommands::Status(arguments) => status::run(&config, arguments),
+            Subcommands::Bench(arguments) => bench::run(&config, &line.common, arguments),
         };
         Place::new(&config.instance, &config.root)?.tidy();
         outcome

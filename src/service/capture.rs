@@ -9,6 +9,7 @@ use crate::service::config::Config;
 use crate::service::health::{Health, ProcessState};
 use crate::service::mode::Mode;
 use crate::service::peers::Peer;
+use crate::service::schedule::{apply, in_force};
 use crate::service::shutdown::Shutdown;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::wire::message::{FrameHeader, StepMessage};
@@ -24,7 +25,7 @@ use crate::wire::topic::{
 const WAKE_PERIOD: Duration = Duration::from_millis(100);
 
 /// What to capture and how.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct CaptureOptions {
     /// Where frames come from.
     pub source: SourceName,
@@ -90,7 +91,13 @@ pub fn run(
     shutdown: &Shutdown,
 ) -> Result<(), CaptureError> {
     let mut shell = Shell::prepare(config, options, shutdown)?;
-    let outcome = shell.prepare_source().and_then(|()| shell.stream());
+    let outcome = shell.prepare_source().and_then(|()| {
+        // After the preparation: rendering a simulated world has no deadline.
+        let refusals = apply(&config.capture.scheduling);
+        refusals.iter().for_each(|refusal| tracing::warn!("capture: {refusal}"));
+        shell.health.tell_scheduling(&in_force(), &refusals);
+        shell.stream()
+    });
     match &outcome {
         Ok(()) => shell.health.enter(ProcessState::Finished, "the source has ended"),
         Err(error) => shell.health.enter(ProcessState::Failed, &error.to_string()),
@@ -220,6 +227,7 @@ impl<'a> Shell<'a> {
             sequence: stamp.sequence,
             capture_nanos: stamp.capture_nanos,
             clock_nanos,
+            sent_nanos: now_nanos(),
             exposure_nanos: stamp.exposure_nanos,
             intrinsics: [k.fx, k.fy, k.cx, k.cy],
             width: k.width as u32,

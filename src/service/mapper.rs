@@ -8,6 +8,7 @@ use crate::service::config::Config;
 use crate::service::health::{Health, ProcessState};
 use crate::service::map_file::write_map;
 use crate::service::pairing::Pairing;
+use crate::service::schedule::{apply, in_force};
 use crate::service::shutdown::Shutdown;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{DepthPoint, Keyframe, KeyframePose, MAX_KEYFRAME_POINTS};
@@ -71,7 +72,11 @@ pub enum MapperError {
 
 /// Runs the process until the signal.
 pub fn run(config: &Config, shutdown: &Shutdown) -> Result<(), MapperError> {
+    // Before the pool is made: its threads run where this one does.
+    let refusals = apply(&config.mapper.scheduling);
+    refusals.iter().for_each(|refusal| tracing::warn!("mapper: {refusal}"));
     let mut shell = Shell::prepare(config)?;
+    shell.health.tell_scheduling(&in_force(), &refusals);
     shell.health.enter(ProcessState::Ready, "");
     let outcome = shell.map_until(shutdown);
     match &outcome {
@@ -188,6 +193,7 @@ impl<'a> Shell<'a> {
         counters.dropped = self.pairing.dropped();
         counters.total = mapper.map().keyframes.len() as u64;
         counters.detail = mapper.keyframe().map_or(0, |k| code_from_map_state(k.map_state));
+        self.health.count_work(step_nanos);
         self.health.count_latency(step_nanos);
         self.health.report();
         Ok(())

@@ -13,8 +13,8 @@ use crate::service::map_file::{MapFileError, read_map};
 use crate::service::mode::Mode;
 use crate::service::peers::{HEALTH_TOPICS, Peer};
 use crate::service::recorder::{Recorder, RunCounters};
-use crate::service::replay::peak_rss_bytes;
 use crate::service::results::RunRecord;
+use crate::service::schedule::peak_rss_bytes;
 use crate::service::shutdown::Shutdown;
 use crate::slam::mapper::Map;
 use crate::slam::pose::TrackingState;
@@ -43,6 +43,8 @@ pub struct RunOptions {
     pub mode: Mode,
     /// Folder for results; it exists.
     pub output: PathBuf,
+    /// Whether the map is fetched at the end.
+    pub keeps_map: bool,
     /// Options that every child gets: where the configuration comes from.
     pub arguments: Vec<String>,
 }
@@ -129,8 +131,8 @@ pub fn run(
     let mut ended = supervisor.watch(shutdown, observe)?;
     supervisor.stop("capture");
     supervisor.settle(&ended)?;
-    let map = match supervisor.save_map() {
-        Ok(map) => map,
+    let map = match options.keeps_map.then(|| supervisor.save_map()).transpose() {
+        Ok(map) => map.unwrap_or_default(),
         Err(error) => {
             if ended == Ended::Finished {
                 ended = Ended::Failed(error.to_string());
@@ -144,8 +146,8 @@ pub fn run(
         ended = Ended::Failed(format!("{lost} of {} poses did not arrive", counters.frames_in));
     }
     let (name, truth) = (options.source.to_string(), source.ground_truth().to_vec());
-    let budget_ms = config.tracker.budget_ms;
-    let record = recorder.into_record(options.mode, name, map, truth, budget_ms, &counters);
+    let deadline_ms = config.tracker.deadline_ms;
+    let record = recorder.into_record(options.mode, name, map, truth, deadline_ms, &counters);
     Ok(RunOutcome { record, source, ended })
 }
 
@@ -354,6 +356,7 @@ impl<'a> Supervisor<'a> {
             gaps: capture.last().map_or(0, |health| health.gaps),
             restarts: self.restarts,
             deadline_misses: tracker.last().map_or(0, |health| health.deadline_misses),
+            page_faults: tracker.last().map_or(0, |health| health.page_faults),
             peak_rss_bytes: peaks.sum::<u64>() + peak_rss_bytes().unwrap_or(0),
         };
         if capture.state() == Some(ProcessState::Failed) {

@@ -26,6 +26,8 @@ const MAX_NODES: usize = 40;
 const MAX_EVENT_PORTS: usize = 16;
 /// Publishers of one topic: the owner, its successor while the dead one is cleaned, a network link.
 const MAX_PUBLISHERS: usize = 3;
+/// Most events, and the interrupt, that are waited for at a time.
+const MAX_WAITED: usize = 8;
 /// How often opening is tried while another process removes the same service.
 const OPEN_ATTEMPTS: usize = 50;
 /// Pause between two attempts.
@@ -450,12 +452,27 @@ pub fn wait(
     interrupt: Option<BorrowedFd<'_>>,
     timeout: Duration,
 ) -> Result<(), WaitError> {
-    let descriptors = events.iter().map(|e| e.descriptor()).chain(interrupt);
-    let mut polled: Vec<_> =
-        descriptors.map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN)).collect();
     let timeout =
         Timespec { tv_sec: timeout.as_secs() as i64, tv_nsec: timeout.subsec_nanos().into() };
-    match rustix::event::poll(&mut polled, Some(&timeout)) {
+    let mut descriptors = events.iter().map(|e| e.descriptor()).chain(interrupt);
+    let polled = match descriptors.next() {
+        None => rustix::event::poll(&mut [], Some(&timeout)),
+        // An array: a frame loop that waits must not allocate.
+        Some(first) => {
+            let entry = |descriptor| PollFd::from_borrowed_fd(descriptor, PollFlags::IN);
+            let mut polled: [_; MAX_WAITED] = std::array::from_fn(|_| entry(first));
+            let mut count = 1;
+            for descriptor in descriptors {
+                let place = polled
+                    .get_mut(count)
+                    .ok_or_else(|| WaitError(format!("more than {MAX_WAITED} at a time")))?;
+                *place = entry(descriptor);
+                count += 1;
+            }
+            rustix::event::poll(&mut polled[..count], Some(&timeout))
+        }
+    };
+    match polled {
         Ok(_) | Err(rustix::io::Errno::INTR) => {}
         Err(e) => return Err(WaitError(e.to_string())),
     }
