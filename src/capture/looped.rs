@@ -63,6 +63,11 @@ impl FrameSource for Looped {
         Ok(())
     }
 
+    fn skip_to(&mut self, sequence: u64) -> Result<(), SourceError> {
+        self.next = sequence.saturating_add(1);
+        Ok(())
+    }
+
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
         if self.kept.is_empty() {
             let (name, reason) = (self.name.to_string(), "it has no frames to repeat");

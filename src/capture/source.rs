@@ -290,6 +290,14 @@ pub trait FrameSource: Send {
     /// `pixels` holds then is not a frame.
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError>;
 
+    /// Leaves out frames until the next one comes after `sequence`.
+    fn skip_to(&mut self, sequence: u64) -> Result<(), SourceError> {
+        let k = self.intrinsics();
+        let mut pixels = vec![0; k.width * k.height];
+        while self.next_into(&mut pixels)?.is_some_and(|stamp| stamp.sequence < sequence) {}
+        Ok(())
+    }
+
     /// Ground-truth camera poses in order of their stamps, empty where there are none.
     fn ground_truth(&self) -> &[StampedPose] {
         &[]

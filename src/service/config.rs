@@ -99,7 +99,8 @@ pub struct MapperConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SupervisorConfig {
-    /// Live: how often a process that died is started again before the run is given up.
+    /// Live: how often in a row processes that die within two seconds of their start are started again
+    /// before the run is given up. Who has lived longer is always started again.
     pub max_restarts: u32,
     /// Longest wait for a process to end before it is killed, seconds.
     pub stop_timeout_s: f64,

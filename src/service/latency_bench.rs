@@ -27,11 +27,8 @@ const SLOW_READER_PAUSE: Duration = Duration::from_millis(500);
 const READER_PAUSE: Duration = Duration::from_millis(20);
 /// Settings that make a map step longer than a frame period: all pixels carry depth, and it is smoothed
 /// and published with every frame, by one thread.
-const SATURATED_MAPPER: [&str; 3] = [
-    "mapping.min_gradient=0.5",
-    "mapping.publish_change_ratio=0.0",
-    "mapper.threads=1",
-];
+const SATURATED_MAPPER: [&str; 3] =
+    ["mapping.min_gradient=0.5", "mapping.publish_change_ratio=0.0", "mapper.threads=1"];
 /// Settings of real-time scheduling.
 const REAL_TIME: [&str; 5] = [
     "capture.scheduling.policy=fifo",

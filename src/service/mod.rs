@@ -3,6 +3,7 @@
 pub mod atomic_file;
 pub mod budget;
 pub mod capture;
+pub mod checkpoint;
 pub mod child;
 pub mod clock;
 pub mod config;

@@ -28,9 +28,11 @@ const WAKE_PERIOD: Duration = Duration::from_millis(50);
 /// After the last frame of a live run: silence that means all of it has been handled.
 const SILENCE: Duration = Duration::from_millis(500);
 /// Pause before the first restart of a process; it doubles up to the longest.
-const FIRST_BACK_OFF: Duration = Duration::from_millis(200);
+const FIRST_BACK_OFF: Duration = Duration::from_millis(50);
 /// Longest pause before a restart.
 const LONGEST_BACK_OFF: Duration = Duration::from_secs(5);
+/// Who has lived so long did not die of its start: the pauses begin anew.
+const HEALTHY_LIFE: Duration = Duration::from_secs(2);
 
 /// What to run.
 #[derive(Debug, Clone)]
@@ -170,6 +172,8 @@ struct Supervisor<'a> {
     commands: CommandClient,
     hub: Hub,
     restarts: u64,
+    /// Restarts in a row of processes that died young.
+    hasty_restarts: u32,
 }
 
 impl<'a> Supervisor<'a> {
@@ -189,6 +193,7 @@ impl<'a> Supervisor<'a> {
             commands: CommandClient::open(&hub)?,
             hub,
             restarts: 0,
+            hasty_restarts: 0,
         };
         for name in ["mapper", "tracker", "capture"] {
             let child = supervisor.spawn(name)?;
@@ -263,10 +268,13 @@ impl<'a> Supervisor<'a> {
             let fault = child.fault();
             let is_fault = fault.is_some();
             let cause = fault.unwrap_or_else(|| format!("{process} ended with {status}"));
+            if child.age() > HEALTHY_LIFE {
+                self.hasty_restarts = 0;
+            }
             // Who says why will say the same again; who dies without a word may have had bad luck.
             let may_restart = self.options.mode == Mode::Live
                 && !is_fault
-                && self.restarts < u64::from(self.config.supervisor.max_restarts);
+                && self.hasty_restarts < self.config.supervisor.max_restarts;
             if !may_restart {
                 return Ok(Some(Ended::Failed(cause)));
             }
@@ -275,13 +283,14 @@ impl<'a> Supervisor<'a> {
             self.children[index] = self.spawn(process)?;
             self.peers.iter_mut().filter(|p| p.name() == process).for_each(Peer::forget);
             self.restarts += 1;
+            self.hasty_restarts += 1;
         }
         Ok(None)
     }
 
     /// Waits longer with every restart, and goes on collecting.
     fn back_off(&mut self, shutdown: &Shutdown) -> Result<(), RunError> {
-        let doubled = FIRST_BACK_OFF * 2_u32.saturating_pow(self.restarts.min(8) as u32);
+        let doubled = FIRST_BACK_OFF * 2_u32.saturating_pow(self.hasty_restarts.min(8));
         let end = Instant::now() + doubled.min(LONGEST_BACK_OFF);
         self.hub.clean_up();
         while Instant::now() < end && !shutdown.is_requested() {

@@ -18,15 +18,16 @@ use crate::slam::pose::{DegradedReason, LostReason, PoseEstimate, TrackingState}
 use crate::slam::tracker::Tracker;
 use crate::wire::conversion::{
     PoseTiming, codes_from_state, frame_from_message, pose_from_message, pose_message,
+    rigid_from_message,
 };
 use crate::wire::keyframe_inbox::InboxError;
-use crate::wire::message::{FrameHeader, PoseMessage};
+use crate::wire::message::{FrameHeader, PoseMessage, StepMessage};
 use crate::wire::place::{Claim, Place, PlaceError};
 use crate::wire::port::{
     Access, Hub, OpenError, Publisher, ReceiveError, Received, SendError, Subscriber, WaitError,
     wait,
 };
-use crate::wire::topic::{FRAME, POSE, TRACKER_HEALTH};
+use crate::wire::topic::{FRAME, POSE, STEP, TRACKER_HEALTH};
 
 /// Longest sleep without a look at signals and health.
 const WAKE_PERIOD: Duration = Duration::from_millis(100);
@@ -84,6 +85,8 @@ struct Shell<'a> {
     frames: Subscriber<u8, FrameHeader>,
     poses: Publisher<PoseMessage, ()>,
     references: ReferenceFeed,
+    /// Live, until the first keyframe: what the mapper says of the last pose, for a restart.
+    steps: Option<Subscriber<StepMessage, ()>>,
     health: Health,
     tracker: Option<(Intrinsics, Tracker)>,
     last_intrinsics: Option<Intrinsics>,
@@ -113,6 +116,7 @@ impl<'a> Shell<'a> {
             frames: hub.subscriber(&FRAME)?,
             poses: hub.publisher(&POSE, 1)?,
             references,
+            steps: (mode == Mode::Live).then(|| hub.subscriber(&STEP)).transpose()?,
             health: Health::open(&hub, &TRACKER_HEALTH)?,
             tracker: None,
             last_intrinsics: None,
@@ -190,10 +194,14 @@ impl<'a> Shell<'a> {
                 self.tracker.insert((intrinsics, tracker))
             }
         };
-        if let Some(reference) = self.references.newest()?
-            && let Some(used) = tracker.adopt(reference)
-        {
-            self.references.give_back(used);
+        if let Some(reference) = self.references.newest()? {
+            let epoch = reference.epoch();
+            if let Some(used) = tracker.adopt(reference) {
+                self.references.give_back(used);
+            }
+            if let Some(steps) = self.steps.take() {
+                resume(tracker, epoch, &steps)?;
+            }
         }
         let begin_nanos = now_nanos();
         let estimate = match deadline_nanos {
@@ -279,6 +287,23 @@ impl<'a> Shell<'a> {
         counters.deadline_misses += u64::from(late);
         Ok(())
     }
+}
+
+/// Goes on from the last pose of this epoch that the mapper has heard of: another tracker's, which died.
+fn resume(
+    tracker: &mut Tracker,
+    epoch: u32,
+    steps: &Subscriber<StepMessage, ()>,
+) -> Result<(), ReceiveError> {
+    let newest = steps.newest()?;
+    let step = newest.as_ref().and_then(|message| message.payload().first());
+    if let Some(step) = step.filter(|step| step.has_pose == 1 && step.epoch == epoch)
+        && let Ok(world_from_camera) =
+            rigid_from_message(&step.world_from_camera, "world_from_camera")
+    {
+        tracker.resume_at(step.pose_nanos, &world_from_camera);
+    }
+    Ok(())
 }
 
 /// A state and its reason, for whoever looks on.

@@ -159,8 +159,8 @@ pub struct KeyframeImageHeader {
 
 /// Message of `mapper/step`: this frame is in the map.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ZeroCopySend)]
-#[type_name("semidense.Step.v1")]
+#[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
+#[type_name("semidense.Step.v2")]
 pub struct StepMessage {
     /// Sequence of the frame.
     pub sequence: u64,
@@ -174,6 +174,14 @@ pub struct StepMessage {
     pub keyframes: u64,
     /// Points with depth of the keyframe in force.
     pub points: u64,
+    /// Stamp of the last frame whose pose was claimed, nanoseconds.
+    pub pose_nanos: i64,
+    /// That pose: where a tracker that is started again begins.
+    pub world_from_camera: RigidMessage,
+    /// 1 when there was such a frame in the epoch.
+    pub has_pose: u32,
+    /// Life of the map.
+    pub epoch: u32,
 }
 
 /// Header of `mapper/graph`; the payload is one [`KeyframePoseMessage`] per keyframe.
@@ -307,7 +315,7 @@ mod tests {
         assert_layout::<KeyframeHeader>(144, 8, "semidense.KeyframeHeader.v1");
         assert_layout::<DepthPoint>(16, 4, "semidense.DepthPoint.v1");
         assert_layout::<KeyframeImageHeader>(24, 8, "semidense.KeyframeImageHeader.v1");
-        assert_layout::<StepMessage>(48, 8, "semidense.Step.v1");
+        assert_layout::<StepMessage>(120, 8, "semidense.Step.v2");
         assert_layout::<GraphHeader>(16, 8, "semidense.GraphHeader.v1");
         assert_layout::<KeyframePoseMessage>(72, 8, "semidense.KeyframePose.v1");
         assert_layout::<HealthMessage>(1680, 8, "semidense.Health.v2");
