@@ -5,9 +5,10 @@
 #[allow(dead_code, reason = "every test uses its part of what they share")]
 mod support;
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::io::Write;
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal};
@@ -98,11 +99,21 @@ fn distance(one: &SE3, other: &SE3) -> f64 {
     (one.translation - other.translation).norm()
 }
 
-/// The names of this instance in shared memory, without what differs with every process.
-fn shared_files(rig: &Rig) -> usize {
+/// How many files of each kind this instance has in shared memory and in its folder: the names themselves
+/// differ with every process.
+fn files(rig: &Rig) -> BTreeMap<String, usize> {
     let prefix = rig.place().prefix;
-    let entries = fs::read_dir(SHARED_MEMORY).unwrap().flatten();
-    entries.filter(|e| e.file_name().to_string_lossy().starts_with(&prefix)).count()
+    let names = |folder: &Path| {
+        let entries = fs::read_dir(folder).unwrap().flatten();
+        entries.map(|e| e.file_name().to_string_lossy().into_owned()).collect::<Vec<_>>()
+    };
+    let shared = names(Path::new(SHARED_MEMORY)).into_iter().filter(|n| n.starts_with(&prefix));
+    let mut counts = BTreeMap::new();
+    for name in shared.chain(names(&rig.root())) {
+        let kind = name.rsplit('.').next().unwrap_or_default().to_owned();
+        *counts.entry(kind).or_default() += 1;
+    }
+    counts
 }
 
 /// Resident memory of a process, bytes.
@@ -114,6 +125,19 @@ fn resident(pid: u32) -> Option<f64> {
 
 fn pid_of(peer: &mut Peer) -> u32 {
     until("a process id", || peer.update().unwrap().map(|health| health.process_id))
+}
+
+/// Kills a process and looks that poses resume; how long they were missing.
+fn kill(watch: &mut Watch, peer: &mut Peer) -> Duration {
+    let pid = pid_of(peer);
+    rustix::process::kill_process(Pid::from_raw(pid as i32).unwrap(), Signal::KILL).unwrap();
+    let begin = Instant::now();
+    until("the process that takes its place", || {
+        watch.look();
+        (peer.update().unwrap()?.process_id != pid).then_some(())
+    });
+    watch.until_resumed(&format!("poses after a kill of {}", peer.name()));
+    begin.elapsed()
 }
 
 /// Kills as often at random instants, and looks after each that all goes on.
@@ -129,10 +153,14 @@ fn soak(kills: usize, seed: u64) {
     let memory = |peers: &mut Vec<Peer>| -> Option<f64> {
         peers.iter_mut().map(|peer| resident(pid_of(peer))).sum()
     };
-    let (files_before, memory_before) = (shared_files(&rig), memory(&mut peers).unwrap());
+    // Who is connected to whom depends on who started last: each once in a known order, then and at the end.
+    for peer in &mut peers {
+        kill(&mut watch, peer);
+    }
+    let (files_before, memory_before) = (files(&rig), memory(&mut peers).unwrap());
     let mut dice = Dice(seed);
     let mut pauses = Vec::new();
-    for kill in 0..kills {
+    for _ in 0..kills {
         let instant = Duration::from_millis(dice.below(400));
         let begin = Instant::now();
         while begin.elapsed() < instant {
@@ -140,22 +168,21 @@ fn soak(kills: usize, seed: u64) {
             std::thread::sleep(Duration::from_millis(2));
         }
         let index = dice.below(3) as usize;
-        let (name, pid) = (peers[index].name(), pid_of(&mut peers[index]));
-        rustix::process::kill_process(Pid::from_raw(pid as i32).unwrap(), Signal::KILL).unwrap();
-        until("the process that takes its place", || {
-            watch.look();
-            let health = peers[index].update().unwrap()?;
-            (health.process_id != pid).then_some(())
-        });
-        let pause = watch.until_resumed(&format!("poses after kill {kill}, of {name}"));
-        pauses.push((name, pause));
+        pauses.push((peers[index].name(), kill(&mut watch, &mut peers[index])));
     }
-    watch.until_resumed("poses at the end");
+    for peer in &mut peers {
+        kill(&mut watch, peer);
+    }
     report(&pauses);
     assert_eq!(watch.epochs.len(), 1, "the map began anew: {:?}", watch.epochs);
     until("the leftovers of the dead to be gone", || {
         watch.look();
-        (shared_files(&rig) <= files_before).then_some(())
+        let files = files(&rig);
+        let is_same = files == files_before;
+        if !is_same {
+            std::thread::sleep(Duration::from_millis(200));
+        }
+        is_same.then_some(())
     });
     let memory_after = memory(&mut peers).unwrap();
     assert!(memory_after < MEMORY_SLACK * memory_before, "{memory_before} → {memory_after}");

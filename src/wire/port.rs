@@ -18,7 +18,8 @@ use iceoryx2::service::port_factory::publish_subscribe::PortFactory as DataFacto
 use rustix::event::{PollFd, PollFlags, Timespec};
 
 use crate::wire::place::{Place, PlaceError};
-use crate::wire::topic::Topic;
+use crate::wire::topic::{Topic, WIRE_VERSION};
+use crate::wire::version::foreign_version;
 
 /// Nodes that may open one service: our processes, observers, and the dead until they are cleaned.
 const MAX_NODES: usize = 40;
@@ -54,6 +55,16 @@ pub enum OpenError {
         instance: String,
         /// Folder.
         root: String,
+    },
+    /// The instance is another version's.
+    #[error(
+        "instance `{instance}` speaks wire version {found}, this program {WIRE_VERSION}: stop the old one, or use programs of one version"
+    )]
+    Version {
+        /// Instance.
+        instance: String,
+        /// Its version.
+        found: u32,
     },
     /// A topic cannot be opened.
     #[error("topic {topic}: {reason}")]
@@ -117,12 +128,17 @@ impl Hub {
         let failed =
             |reason: String| OpenError::Node { root: place.root.display().to_string(), reason };
         let name = NodeName::new(process).map_err(|e| failed(e.to_string()))?;
+        let config = transport_config(place)?;
         let node = NodeBuilder::new()
             .name(&name)
-            .config(&transport_config(place)?)
+            .config(&config)
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create::<ipc::Service>()
             .map_err(|e| failed(e.to_string()))?;
+        // After the node: what the dead have left was removed as it was made.
+        if let Some(found) = foreign_version(&config, &place.instance) {
+            return Err(OpenError::Version { instance: place.instance.clone(), found });
+        }
         Ok(Self { node, place: place.clone(), access })
     }
 
