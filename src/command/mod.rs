@@ -5,6 +5,7 @@
 
 pub mod bench;
 pub mod capture;
+pub mod doctor;
 pub mod evaluate;
 pub mod mapper;
 pub mod print;
@@ -101,6 +102,7 @@ enum Subcommands {
     Evaluate(evaluate::EvaluateArgs),
     Status(status::StatusArguments),
     Bench(bench::BenchArguments),
+    Doctor(doctor::DoctorArguments),
 }
 
 /// Parses the command line and runs the chosen subcommand.
@@ -116,6 +118,7 @@ pub fn main() -> ExitCode {
             Subcommands::Simulate(arguments) => simulate::run(&config, &arguments),
             Subcommands::Evaluate(arguments) => evaluate::run(&arguments),
             Subcommands::Status(arguments) => status::run(&config, arguments),
+            Subcommands::Doctor(arguments) => doctor::run(&config, arguments),
             Subcommands::Bench(arguments) => bench::run(&config, &line.common, arguments),
         };
         Place::new(&config.instance, &config.root)?.tidy();

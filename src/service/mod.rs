@@ -7,6 +7,7 @@ pub mod checkpoint;
 pub mod child;
 pub mod clock;
 pub mod config;
+pub mod doctor;
 pub mod frame_order;
 pub mod given_pose;
 pub mod health;
