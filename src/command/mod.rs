@@ -22,7 +22,10 @@ use std::io::IsTerminal;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use tracing_subscriber::EnvFilter;
+use tracing_subscriber::fmt::format::FmtSpan;
+use tracing_subscriber::prelude::*;
 
 use crate::command::print::{PrintError, note};
 use crate::service::child::{ERROR_PREFIX, follow_supervisor};
@@ -70,6 +73,31 @@ pub struct CommonArguments {
     /// What to log: error, warn, info, debug or trace, also by module
     #[arg(long, global = true, help_heading = COMMON, value_name = "LEVEL", default_value = "warn")]
     pub log: String,
+    /// How to log: lines of text or JSON on standard error, or the systemd journal
+    #[arg(long, global = true, help_heading = COMMON, value_name = "FORMAT", value_enum, default_value_t)]
+    pub log_format: LogFormat,
+}
+
+/// How to log.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
+pub enum LogFormat {
+    /// Lines of text on standard error
+    #[default]
+    Text,
+    /// One JSON object a line on standard error
+    Json,
+    /// The systemd journal, with its fields
+    Journald,
+}
+
+impl LogFormat {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Text => "text",
+            Self::Json => "json",
+            Self::Journald => "journald",
+        }
+    }
 }
 
 impl CommonArguments {
@@ -83,6 +111,7 @@ impl CommonArguments {
     /// The same options for a child process.
     fn to_arguments(&self) -> Vec<String> {
         let mut arguments = vec!["--log".to_owned(), self.log.clone()];
+        arguments.extend(["--log-format".to_owned(), self.log_format.name().to_owned()]);
         let mut push = |option: &str, value: String| arguments.extend([option.to_owned(), value]);
         self.config.iter().for_each(|file| push("--config", file.to_string_lossy().into_owned()));
         self.set.iter().for_each(|setting| push("--set", setting.clone()));
@@ -134,16 +163,31 @@ pub fn main() -> ExitCode {
     })
 }
 
-fn prepare(common: &CommonArguments) -> Result<Config, Box<dyn Error>> {
-    follow_supervisor()?;
-    let filter = tracing_subscriber::EnvFilter::try_new(&common.log)
-        .map_err(|error| format!("--log {}: {error}", common.log))?;
-    tracing_subscriber::fmt()
-        .with_env_filter(filter)
+/// Spans are logged as they end, with the time that they took, where the level shows them.
+fn start_log(filter: EnvFilter, format: LogFormat) -> Result<(), Box<dyn Error>> {
+    let lines = tracing_subscriber::fmt::layer()
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal())
         .with_target(false)
-        .init();
+        .with_span_events(FmtSpan::CLOSE);
+    let registry = tracing_subscriber::registry().with(filter);
+    match format {
+        LogFormat::Text => registry.with(lines).init(),
+        LogFormat::Json => registry.with(lines.json()).init(),
+        LogFormat::Journald => {
+            let journal = tracing_journald::layer()
+                .map_err(|error| format!("--log-format journald: no journal here ({error})"))?;
+            registry.with(journal).init();
+        }
+    }
+    Ok(())
+}
+
+fn prepare(common: &CommonArguments) -> Result<Config, Box<dyn Error>> {
+    follow_supervisor()?;
+    let filter = EnvFilter::try_new(&common.log)
+        .map_err(|error| format!("--log {}: {error}", common.log))?;
+    start_log(filter, common.log_format)?;
     let config = common.load()?;
     tracing::info!("configuration:\n{}", config.to_text());
     Ok(config)

@@ -233,6 +233,7 @@ impl<'a> Shell<'a> {
     /// Reads the next frame into shared memory and sends it when it is due; its sequence, `None`
     /// after the last.
     fn send_next(&mut self) -> Result<Option<u64>, CaptureError> {
+        let _span = tracing::trace_span!("frame").entered();
         let mut loan = self.frames.loan(self.intrinsics.width * self.intrinsics.height)?;
         let Some(mut stamp) = self.source.next_into(loan.bytes_mut())? else { return Ok(None) };
         stamp.sequence = stamp.sequence.saturating_add(self.first_sequence);
@@ -249,6 +250,7 @@ impl<'a> Shell<'a> {
             }
             Mode::Lockstep => now_nanos(),
         };
+        let _span = tracing::trace_span!("publish", sequence = stamp.sequence).entered();
         loan.send(self.header(&stamp, clock_nanos))?;
         self.count(&stamp);
         Ok(Some(stamp.sequence))

@@ -198,12 +198,15 @@ impl<'a> Shell<'a> {
             self.change_camera(intrinsics)?;
         }
         let Some((_, mapper)) = &mut self.mapper else { return Ok(()) };
+        let _span = tracing::trace_span!("frame", sequence = frame.sequence).entered();
         let begin = now_nanos();
-        let outcome = self.pool.install(|| mapper.step(&frame, pose, None));
+        let outcome = tracing::trace_span!("map")
+            .in_scope(|| self.pool.install(|| mapper.step(&frame, pose, None)));
         let step_nanos = u64::try_from(now_nanos() - begin).unwrap_or(0);
         if pose.state.is_tracked() {
             self.last_pose = Some(*pose);
         }
+        let _span = tracing::trace_span!("publish").entered();
         self.output.publish(mapper, &outcome)?;
         self.output.publish_step(mapper, frame.sequence, step_nanos, self.last_pose.as_ref())?;
         let is_new = outcome.needs_image();

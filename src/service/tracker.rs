@@ -153,6 +153,7 @@ impl<'a> Shell<'a> {
     /// One frame: adopt, track, publish.
     fn step(&mut self, received: &Received<u8, FrameHeader>) -> Result<(), TrackerError> {
         let arrival_nanos = now_nanos();
+        let _span = tracing::trace_span!("frame", sequence = received.header().sequence).entered();
         let header = *received.header();
         let (frame, intrinsics) = match frame_from_message(&header, received.payload()) {
             Ok(frame) => frame,
@@ -203,6 +204,7 @@ impl<'a> Shell<'a> {
                 resume(tracker, epoch, &steps)?;
             }
         }
+        let _span = tracing::trace_span!("track").entered();
         let begin_nanos = now_nanos();
         let estimate = match deadline_nanos {
             None => tracker.track(frame, &mut |_| true),
@@ -260,6 +262,7 @@ impl<'a> Shell<'a> {
         [wake_nanos, track_nanos]: [i64; 2],
         deadline_nanos: Option<i64>,
     ) -> Result<(), TrackerError> {
+        let _span = tracing::trace_span!("publish").entered();
         let published_nanos = now_nanos();
         // A camera's stamp may lie in the future of our clock.
         let positive = |nanos: i64| u64::try_from(nanos).unwrap_or(0);
