@@ -86,6 +86,7 @@ fn pose(i: usize, state: TrackingState, keyframe_id: u64) -> RecordedPose {
         latency_nanos: None,
         track_nanos: Some(1_000_000 * (i as u64 % 7 + 1)),
         trace: (state != TrackingState::Initializing).then(|| trace(i)),
+        wake_nanos: Some(40_000),
     }
 }
 
@@ -141,6 +142,7 @@ fn record(poses: Vec<RecordedPose>, keyframes: Vec<Keyframe>, with_truth: bool) 
         restarts: 0,
         deadline_nanos: None,
         deadline_misses: None,
+        page_faults: None,
         map_nanos: vec![2_000_000; frames],
         budget_samples: Vec::new(),
         recorded_nanos: 2_000_000_000,

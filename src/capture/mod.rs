@@ -10,6 +10,7 @@ mod image_file_tests;
 pub mod image_folder;
 pub mod jpeg_image;
 pub mod listing;
+pub mod looped;
 pub mod png_image;
 pub mod recording;
 pub mod rig;

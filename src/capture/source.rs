@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use crate::capture::image_file::ImageFileError;
+use crate::capture::looped::Looped;
 use crate::capture::rig::{Rig, RigError};
 use crate::capture::simulator::Simulator;
 use crate::capture::simulator::params::SimulatorParams;
@@ -139,10 +140,11 @@ pub enum SourceError {
 }
 
 /// The forms of a source name, for errors and help.
-pub const SOURCE_FORMS: &str = "sim[:SCENE], tum:DIR, euroc:DIR, images:DIR and v4l:DEVICE";
+pub const SOURCE_FORMS: &str =
+    "sim[:SCENE], tum:DIR, euroc:DIR, images:DIR and loop:FRAMES:HZ:SOURCE";
 
 /// The name of a source, as the command line takes it.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum SourceName {
     /// `sim[:SCENE]`: the simulator.
     Simulator {
@@ -157,6 +159,15 @@ pub enum SourceName {
     Images(PathBuf),
     /// `v4l:DEVICE`: a camera.
     Camera(PathBuf),
+    /// `loop:FRAMES:HZ:SOURCE`: a recording to and fro, for benches and soak tests.
+    Looped {
+        /// Frames in all.
+        num_frames: u64,
+        /// Frames in a second.
+        rate_hz: f64,
+        /// What is repeated.
+        inner: Box<SourceName>,
+    },
 }
 
 impl SourceName {
@@ -169,6 +180,7 @@ impl SourceName {
     pub fn folder(&self) -> Option<&Path> {
         match self {
             Self::Tum(folder) | Self::Euroc(folder) | Self::Images(folder) => Some(folder),
+            Self::Looped { inner, .. } => inner.folder(),
             Self::Simulator { .. } | Self::Camera(_) => None,
         }
     }
@@ -183,6 +195,10 @@ impl FromStr for SourceName {
             Some((kind, rest)) => (kind, Some(rest)),
             None => (name, None),
         };
+        if kind == "loop" {
+            return parse_loop(rest.unwrap_or(""))
+                .ok_or_else(|| error("write loop:FRAMES:HZ:SOURCE, as loop:9000:30:sim"));
+        }
         if kind == "sim" {
             return match rest {
                 Some("") => Err(error("the scene's name is missing")),
@@ -207,6 +223,15 @@ impl FromStr for SourceName {
     }
 }
 
+/// `FRAMES:HZ:SOURCE`.
+fn parse_loop(text: &str) -> Option<SourceName> {
+    let mut parts = text.splitn(3, ':');
+    let num_frames = parts.next()?.parse().ok().filter(|&frames| frames > 0)?;
+    let rate_hz = parts.next()?.parse().ok().filter(|rate| (0.01..=10_000.0).contains(rate))?;
+    let inner = parts.next().filter(|inner| !inner.starts_with("loop"))?.parse().ok()?;
+    Some(SourceName::Looped { num_frames, rate_hz, inner: Box::new(inner) })
+}
+
 impl fmt::Display for SourceName {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
@@ -216,6 +241,9 @@ impl fmt::Display for SourceName {
             Self::Euroc(folder) => write!(out, "euroc:{}", folder.display()),
             Self::Images(folder) => write!(out, "images:{}", folder.display()),
             Self::Camera(device) => write!(out, "v4l:{}", device.display()),
+            Self::Looped { num_frames, rate_hz, inner } => {
+                write!(out, "loop:{num_frames}:{rate_hz}:{inner}")
+            }
         }
     }
 }
@@ -245,6 +273,13 @@ pub fn open(
                     .map_err(|problem| SourceError::Name { name: name.to_string(), problem })?;
             }
             Ok(Box::new(Simulator::new(params)?))
+        }
+        SourceName::Looped { inner, .. } if inner.is_camera() => {
+            Err(unavailable("a camera cannot be repeated; name a recording or the simulator"))
+        }
+        SourceName::Looped { num_frames, rate_hz, inner } => {
+            let source = open(inner, rig, simulator)?;
+            Ok(Box::new(Looped::new(name.clone(), source, *num_frames, *rate_hz)))
         }
         SourceName::Camera(_) => Err(unavailable(
             "this version opens no cameras; record images and use images:DIR, or the simulator with sim",
@@ -296,6 +331,14 @@ pub trait FrameSource: Send {
     /// `None` after the last. After an error the next call goes on with the frame after it; what
     /// `pixels` holds then is not a frame.
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError>;
+
+    /// Leaves out frames until the next one comes after `sequence`.
+    fn skip_to(&mut self, sequence: u64) -> Result<(), SourceError> {
+        let k = self.intrinsics();
+        let mut pixels = vec![0; k.width * k.height];
+        while self.next_into(&mut pixels)?.is_some_and(|stamp| stamp.sequence < sequence) {}
+        Ok(())
+    }
 
     /// Ground-truth camera poses in order of their stamps, empty where there are none.
     fn ground_truth(&self) -> &[StampedPose] {

@@ -8,19 +8,19 @@ use crate::command::CommandResult;
 use crate::command::capture::ModeArguments;
 use crate::service::config::Config;
 use crate::service::mapper::run as run_shell;
+use crate::service::mode::Mode;
 use crate::service::shutdown::Shutdown;
 
 /// Estimate the depth of keyframes and publish the map
 #[derive(Debug, Args)]
 pub struct MapperArguments {
-    /// The mapper takes what comes in either way.
     #[command(flatten)]
-    _mode: ModeArguments,
+    mode: ModeArguments,
 }
 
 /// Runs it.
-pub fn run(config: &Config, _arguments: MapperArguments) -> CommandResult {
+pub fn run(config: &Config, arguments: MapperArguments) -> CommandResult {
     let shutdown = Shutdown::install()?;
-    run_shell(config, &shutdown)?;
+    run_shell(config, arguments.mode.mode(Mode::Live), &shutdown)?;
     Ok(ExitCode::SUCCESS)
 }

@@ -3,7 +3,9 @@
 //! Exit codes: 0 done, 1 failed (one line says what, where and what to do), 2 the command line is
 //! not understood, 130 interrupted (results so far are written).
 
+pub mod bench;
 pub mod capture;
+pub mod doctor;
 pub mod evaluate;
 pub mod mapper;
 pub mod print;
@@ -20,8 +22,10 @@ use std::io::IsTerminal;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, Parser, Subcommand, ValueEnum};
 use tracing_subscriber::EnvFilter;
+use tracing_subscriber::fmt::format::FmtSpan;
+use tracing_subscriber::prelude::*;
 
 use crate::command::print::{PrintError, note};
 use crate::service::child::{ERROR_PREFIX, follow_supervisor};
@@ -69,6 +73,31 @@ pub struct CommonArguments {
     /// What to log: error, warn, info, debug or trace, also by module
     #[arg(long, global = true, help_heading = COMMON, value_name = "LEVEL", default_value = "warn")]
     pub log: String,
+    /// How to log: lines of text or JSON on standard error, or the systemd journal
+    #[arg(long, global = true, help_heading = COMMON, value_name = "FORMAT", value_enum, default_value_t)]
+    pub log_format: LogFormat,
+}
+
+/// How to log.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
+pub enum LogFormat {
+    /// Lines of text on standard error
+    #[default]
+    Text,
+    /// One JSON object a line on standard error
+    Json,
+    /// The systemd journal, with its fields
+    Journald,
+}
+
+impl LogFormat {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Text => "text",
+            Self::Json => "json",
+            Self::Journald => "journald",
+        }
+    }
 }
 
 impl CommonArguments {
@@ -82,6 +111,7 @@ impl CommonArguments {
     /// The same options for a child process.
     fn to_arguments(&self) -> Vec<String> {
         let mut arguments = vec!["--log".to_owned(), self.log.clone()];
+        arguments.extend(["--log-format".to_owned(), self.log_format.name().to_owned()]);
         let mut push = |option: &str, value: String| arguments.extend([option.to_owned(), value]);
         self.config.iter().for_each(|file| push("--config", file.to_string_lossy().into_owned()));
         self.set.iter().for_each(|setting| push("--set", setting.clone()));
@@ -100,6 +130,8 @@ enum Subcommands {
     Simulate(Box<simulate::SimulateArgs>),
     Evaluate(evaluate::EvaluateArgs),
     Status(status::StatusArguments),
+    Bench(bench::BenchArguments),
+    Doctor(doctor::DoctorArguments),
 }
 
 /// Parses the command line and runs the chosen subcommand.
@@ -115,6 +147,8 @@ pub fn main() -> ExitCode {
             Subcommands::Simulate(arguments) => simulate::run(&config, &arguments),
             Subcommands::Evaluate(arguments) => evaluate::run(&arguments),
             Subcommands::Status(arguments) => status::run(&config, arguments),
+            Subcommands::Doctor(arguments) => doctor::run(&config, arguments),
+            Subcommands::Bench(arguments) => bench::run(&config, &line.common, arguments),
         };
         Place::new(&config.instance, &config.root)?.tidy();
         outcome
@@ -145,15 +179,29 @@ fn log_filter(text: &str) -> Result<EnvFilter, String> {
     EnvFilter::try_new(text).map_err(|error| format!("--log {text}: {error}; {form}"))
 }
 
-fn prepare(common: &CommonArguments) -> Result<Config, Box<dyn Error>> {
-    follow_supervisor()?;
-    let filter = log_filter(&common.log)?;
-    tracing_subscriber::fmt()
-        .with_env_filter(filter)
+/// Spans are logged as they end, with the time that they took, where the level shows them.
+fn start_log(filter: EnvFilter, format: LogFormat) -> Result<(), Box<dyn Error>> {
+    let lines = tracing_subscriber::fmt::layer()
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal())
         .with_target(false)
-        .init();
+        .with_span_events(FmtSpan::CLOSE);
+    let registry = tracing_subscriber::registry().with(filter);
+    match format {
+        LogFormat::Text => registry.with(lines).init(),
+        LogFormat::Json => registry.with(lines.json()).init(),
+        LogFormat::Journald => {
+            let journal = tracing_journald::layer()
+                .map_err(|error| format!("--log-format journald: no journal here ({error})"))?;
+            registry.with(journal).init();
+        }
+    }
+    Ok(())
+}
+
+fn prepare(common: &CommonArguments) -> Result<Config, Box<dyn Error>> {
+    follow_supervisor()?;
+    start_log(log_filter(&common.log)?, common.log_format)?;
     let config = common.load()?;
     tracing::info!("configuration:\n{}", config.to_text());
     Ok(config)

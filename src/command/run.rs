@@ -46,6 +46,7 @@ pub fn run(config: &Config, common: &CommonArguments, arguments: RunArguments) -
         rig: arguments.rig,
         mode,
         output: arguments.output.clone(),
+        keeps_map: true,
         arguments: common.to_arguments(),
     };
     let mut display = RunDisplay::new(arguments.json);

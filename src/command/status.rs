@@ -11,7 +11,7 @@ use crate::command::CommandResult;
 use crate::command::print::print;
 use crate::service::clock::now_nanos;
 use crate::service::config::Config;
-use crate::service::health::{cause, percentile_ms};
+use crate::service::health::{cause, percentile_ms, scheduling_name, warning};
 use crate::service::peers::{HEALTH_TOPICS, Peer};
 use crate::service::shutdown::Shutdown;
 use crate::wire::message::HealthMessage;
@@ -99,12 +99,24 @@ fn row(peer: &Peer, before: Option<&HealthMessage>) -> Value {
         "dropped": health.dropped,
         "gaps": health.gaps,
         "refused": health.refused,
+        "disordered": health.disordered,
+        "resized": health.resized,
         "deadline_misses": health.deadline_misses,
+        "page_faults": health.page_faults,
+        "scheduling": scheduling_name(health.scheduling),
+        "priority": health.priority,
+        "memory_locked": health.memory_locked != 0,
+        "warning": warning(health),
         "peak_rss_mb": health.peak_rss_bytes as f64 / f64::from(1 << 20),
         "latency_ms": {
             "p50": percentile_ms(&health.latency_counts, 0.5),
             "p99": percentile_ms(&health.latency_counts, 0.99),
             "max": percentile_ms(&health.latency_counts, 1.0),
+        },
+        "wake_ms": {
+            "p50": percentile_ms(&health.wake_counts, 0.5),
+            "p99": percentile_ms(&health.wake_counts, 0.99),
+            "max": percentile_ms(&health.wake_counts, 1.0),
         },
     })
 }
@@ -138,6 +150,9 @@ fn text_of(rows: &[(&str, Value)], json: bool) -> String {
             number(&row["peak_rss_mb"], 0),
             row["cause"].as_str().unwrap_or(""),
         ));
+        if let Some(warning) = row["warning"].as_str().filter(|warning| !warning.is_empty()) {
+            lines.push(format!("         warning: {warning}"));
+        }
     }
     lines.join("\n") + "\n"
 }

@@ -11,22 +11,28 @@ use crate::service::config::Config;
 use crate::service::health::{Health, ProcessState};
 use crate::service::mode::Mode;
 use crate::service::peers::Peer;
+use crate::service::schedule::{apply, in_force};
 use crate::service::shutdown::Shutdown;
 use crate::slam::geometry::intrinsics::Intrinsics;
-use crate::wire::message::{FrameHeader, StepMessage};
+use crate::wire::message::{FrameHeader, PoseMessage, StepMessage};
 use crate::wire::place::{Claim, Place, PlaceError};
 use crate::wire::port::{
     Access, Hub, OpenError, Publisher, ReceiveError, SendError, Subscriber, WaitError, wait,
 };
 use crate::wire::topic::{
-    CAPTURE_HEALTH, FRAME, MAPPER_HEALTH, STEP, TRACKER_HEALTH, shared_memory_bytes,
+    CAPTURE_HEALTH, FRAME, MAPPER_HEALTH, POSE, STEP, TRACKER_HEALTH, shared_memory_bytes,
 };
 
 /// Longest sleep without a look at signals and health.
 const WAKE_PERIOD: Duration = Duration::from_millis(100);
+/// Longest wait for the last pose of a tracker that runs already: it serves who comes late ten times in a
+/// second.
+const LAST_POSE_NANOS: i64 = 250_000_000;
+/// Pause between two looks for it.
+const LAST_POSE_PAUSE: Duration = Duration::from_millis(10);
 
 /// What to capture and how.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct CaptureOptions {
     /// Where frames come from.
     pub source: SourceName,
@@ -92,7 +98,13 @@ pub fn run(
     shutdown: &Shutdown,
 ) -> Result<(), CaptureError> {
     let mut shell = Shell::prepare(config, options, shutdown)?;
-    let outcome = shell.prepare_source().and_then(|()| shell.stream());
+    let outcome = shell.prepare_source().and_then(|()| {
+        // After the preparation: rendering a simulated world has no deadline.
+        let refusals = apply(&config.capture.scheduling);
+        refusals.iter().for_each(|refusal| tracing::warn!("capture: {refusal}"));
+        shell.health.tell_scheduling(&in_force(), &refusals);
+        shell.stream()
+    });
     match &outcome {
         Ok(()) => shell.health.enter(ProcessState::Finished, "the source has ended"),
         Err(error) => shell.health.enter(ProcessState::Failed, &error.to_string()),
@@ -108,9 +120,13 @@ struct Shell<'a> {
     intrinsics: Intrinsics,
     frames: Publisher<u8, FrameHeader>,
     steps: Subscriber<StepMessage, ()>,
+    /// Until the first frame: what a tracker says that runs already.
+    poses: Option<Subscriber<PoseMessage, ()>>,
     peers: [Peer; 2],
     health: Health,
     pace: Option<Pace>,
+    /// What a camera's numbers begin with.
+    first_sequence: u64,
     next_sequence: Option<u64>,
     _claim: Claim,
 }
@@ -142,11 +158,13 @@ impl<'a> Shell<'a> {
             shutdown,
             frames: hub.publisher(&FRAME, intrinsics.width * intrinsics.height)?,
             steps: hub.subscriber(&STEP)?,
+            poses: (options.mode == Mode::Live).then(|| hub.subscriber(&POSE)).transpose()?,
             peers: [Peer::open(&hub, &TRACKER_HEALTH)?, Peer::open(&hub, &MAPPER_HEALTH)?],
             source,
             intrinsics,
             health,
             pace: None,
+            first_sequence: 0,
             next_sequence: None,
             _claim: claim,
         })
@@ -165,6 +183,7 @@ impl<'a> Shell<'a> {
             health.progress(done, total);
             !shutdown.is_requested()
         })?;
+        self.go_on_after_another()?;
         self.health.enter(ProcessState::Ready, "");
         if !self.is_recorded() {
             return Ok(());
@@ -185,6 +204,26 @@ impl<'a> Shell<'a> {
         }
     }
 
+    /// Where another capture has died: a recording goes on behind its last frame, and a camera's
+    /// numbers behind its last number. Sequences never go back.
+    fn go_on_after_another(&mut self) -> Result<(), CaptureError> {
+        let Some(poses) = self.poses.take() else { return Ok(()) };
+        let deadline = now_nanos().saturating_add(LAST_POSE_NANOS);
+        while now_nanos() < deadline {
+            let newest = poses.newest()?;
+            if let Some(pose) = newest.as_ref().and_then(|message| message.payload().first()) {
+                if self.is_recorded() {
+                    self.source.skip_to(pose.sequence)?;
+                } else {
+                    self.first_sequence = pose.sequence.saturating_add(1);
+                }
+                return Ok(());
+            }
+            self.pause(LAST_POSE_PAUSE)?;
+        }
+        Ok(())
+    }
+
     /// Frame after frame.
     fn stream(&mut self) -> Result<(), CaptureError> {
         self.health.enter(ProcessState::Running, "");
@@ -200,8 +239,10 @@ impl<'a> Shell<'a> {
     /// Reads the next frame into shared memory and sends it when it is due; its sequence, `None`
     /// after the last.
     fn send_next(&mut self) -> Result<Option<u64>, CaptureError> {
+        let _span = tracing::trace_span!("frame").entered();
         let mut loan = self.frames.loan(self.intrinsics.width * self.intrinsics.height)?;
-        let Some(stamp) = self.source.next_into(loan.bytes_mut())? else { return Ok(None) };
+        let Some(mut stamp) = self.source.next_into(loan.bytes_mut())? else { return Ok(None) };
+        stamp.sequence = stamp.sequence.saturating_add(self.first_sequence);
         if self.shutdown.is_requested() {
             return Err(CaptureError::Interrupted);
         }
@@ -215,6 +256,7 @@ impl<'a> Shell<'a> {
             }
             Mode::Lockstep => now_nanos(),
         };
+        let _span = tracing::trace_span!("publish", sequence = stamp.sequence).entered();
         loan.send(self.header(&stamp, clock_nanos))?;
         self.count(&stamp);
         Ok(Some(stamp.sequence))
@@ -226,6 +268,7 @@ impl<'a> Shell<'a> {
             sequence: stamp.sequence,
             capture_nanos: stamp.capture_nanos,
             clock_nanos,
+            sent_nanos: now_nanos(),
             exposure_nanos: stamp.exposure_nanos,
             intrinsics: [k.fx, k.fy, k.cx, k.cy],
             width: k.width as u32,

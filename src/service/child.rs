@@ -6,6 +6,7 @@ use std::path::Path;
 use std::process::{ChildStderr, Command, ExitStatus, Stdio};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal};
 
@@ -44,6 +45,7 @@ pub struct Child {
     /// Its name: the subcommand.
     pub name: &'static str,
     process: std::process::Child,
+    started: Instant,
     fault: Arc<Mutex<Option<String>>>,
     reader: Option<JoinHandle<()>>,
 }
@@ -71,7 +73,12 @@ impl Child {
                 Some(thread.spawn(move || forward(stderr, &fault))?)
             }
         };
-        Ok(Self { name, process, fault, reader })
+        Ok(Self { name, process, started: Instant::now(), fault, reader })
+    }
+
+    /// How long ago it was started.
+    pub fn age(&self) -> Duration {
+        self.started.elapsed()
     }
 
     /// How it ended; `None` while it runs.

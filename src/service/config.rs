@@ -10,6 +10,7 @@ use toml::{Table, Value};
 
 use crate::capture::simulator::params::SimulatorParams;
 use crate::service::results::ResultsParams;
+use crate::service::schedule::SchedulingParams;
 use crate::slam::mapper::MapperParams;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::tracker::TrackerParams;
@@ -52,21 +53,35 @@ pub struct CaptureConfig {
     pub connect_timeout_s: f64,
     /// Lockstep: longest wait for the map to take in a frame, seconds.
     pub step_timeout_s: f64,
+    /// What it asks of the kernel. On a robot: fifo, above the tracker's priority.
+    pub scheduling: SchedulingParams,
 }
 
 impl Default for CaptureConfig {
     fn default() -> Self {
-        Self { connect_timeout_s: 30.0, step_timeout_s: 60.0 }
+        let scheduling = SchedulingParams { priority: 80, ..SchedulingParams::default() };
+        Self { connect_timeout_s: 30.0, step_timeout_s: 60.0, scheduling }
     }
 }
 
 /// The tracker process.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrackerConfig {
-    /// Live: time from a frame's instant to its pose, milliseconds; 0 is half the time between two
-    /// frames.
-    pub budget_ms: f64,
+    /// Live: time from a frame's arrival to its pose, milliseconds; 0 is half the time between two
+    /// frames. At the deadline the best pose so far is published as degraded (budget).
+    pub deadline_ms: f64,
+    /// Live: after so many frame periods without a frame the tracker is stale.
+    pub stale_periods: f64,
+    /// What its frame loop asks of the kernel. On a robot: fifo, and locked memory.
+    pub scheduling: SchedulingParams,
+}
+
+impl Default for TrackerConfig {
+    fn default() -> Self {
+        let scheduling = SchedulingParams::default();
+        Self { deadline_ms: 0.0, stale_periods: 10.0, scheduling }
+    }
 }
 
 /// The mapper process.
@@ -75,13 +90,17 @@ pub struct TrackerConfig {
 pub struct MapperConfig {
     /// Threads of its pool; 0 is one for each CPU. The map does not depend on it.
     pub threads: usize,
+    /// What it asks of the kernel, for all its threads. It has no deadline: leave it on other CPUs than
+    /// the tracker where there are enough.
+    pub scheduling: SchedulingParams,
 }
 
 /// Who starts and watches the three.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SupervisorConfig {
-    /// Live: how often a process that died is started again before the run is given up.
+    /// Live: how often in a row processes that die within two seconds of their start are started again
+    /// before the run is given up. Who has lived longer is always started again.
     pub max_restarts: u32,
     /// Longest wait for a process to end before it is killed, seconds.
     pub stop_timeout_s: f64,
@@ -202,7 +221,15 @@ impl Config {
         let capture = &self.capture;
         check_range("capture.connect_timeout_s", capture.connect_timeout_s, seconds.clone())?;
         check_range("capture.step_timeout_s", capture.step_timeout_s, seconds.clone())?;
-        check_range("tracker.budget_ms", self.tracker.budget_ms, 0.0..=10_000.0)?;
+        check_range("tracker.deadline_ms", self.tracker.deadline_ms, 0.0..=10_000.0)?;
+        check_range("tracker.stale_periods", self.tracker.stale_periods, 2.0..=1e6)?;
+        for (process, scheduling) in [
+            ("capture", &self.capture.scheduling),
+            ("tracker", &self.tracker.scheduling),
+            ("mapper", &self.mapper.scheduling),
+        ] {
+            scheduling.validate().map_err(|e| e.within(&format!("{process}.scheduling")))?;
+        }
         check_range("mapper.threads", self.mapper.threads, 0..=256)?;
         let supervisor = &self.supervisor;
         check_range("supervisor.max_restarts", supervisor.max_restarts, 0..=1000)?;
@@ -329,13 +356,13 @@ mod tests {
         };
         let error = load("[mapper]\n\nthread = 3\n");
         assert!(error.contains("x.toml:3: `thread = 3`: unknown field `thread`"), "{error}");
-        let error = load("[tracker]\nbudget_ms = -1.0\n");
+        let error = load("[tracker]\ndeadline_ms = -1.0\n");
         assert!(
-            error.ends_with("x.toml: tracker.budget_ms = -1: allowed is 0 to 10000"),
+            error.ends_with("x.toml: tracker.deadline_ms = -1: allowed is 0 to 10000"),
             "{error}"
         );
-        let error = load("[tracker]\nbudget_ms = nan\n");
-        assert!(error.contains("tracker.budget_ms = NaN"), "{error}");
+        let error = load("[tracker]\ndeadline_ms = nan\n");
+        assert!(error.contains("tracker.deadline_ms = NaN"), "{error}");
         assert!(load("[mapper]\nthreads = \"x\"\n").contains("x.toml:2: `threads = \"x\"`"));
         assert!(load("[[[").contains("x.toml:1"));
         assert_eq!(load("a = [\n\n\n").lines().count(), 1);

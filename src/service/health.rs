@@ -1,7 +1,7 @@
 //! The health of a process: state, counters and latencies, published once a second and on change.
 
 use crate::service::clock::now_nanos;
-use crate::service::replay::peak_rss_bytes;
+use crate::service::schedule::{InForce, Policy, Refusal, peak_rss_bytes};
 use crate::wire::command::{text_bytes, text_from_bytes};
 use crate::wire::message::{HISTOGRAM_BUCKETS, HealthMessage, TEXT_BYTES};
 use crate::wire::port::{Hub, OpenError, Publisher};
@@ -27,16 +27,19 @@ pub enum ProcessState {
     Finished,
     /// It cannot go on.
     Failed,
+    /// It works, but its input has stopped coming.
+    Stale,
 }
 
 impl ProcessState {
-    const ALL: [(Self, u32, &'static str); 6] = [
+    const ALL: [(Self, u32, &'static str); 7] = [
         (Self::Starting, 0, "starting"),
         (Self::Preparing, 1, "preparing"),
         (Self::Ready, 2, "ready"),
         (Self::Running, 3, "running"),
         (Self::Finished, 4, "finished"),
         (Self::Failed, 5, "failed"),
+        (Self::Stale, 6, "stale"),
     ];
 
     /// The state of a code; `None` for one that stands for nothing.
@@ -77,12 +80,42 @@ pub fn percentile_ms(counts: &[u64; HISTOGRAM_BUCKETS], share: f64) -> Option<f6
         sum = sum.saturating_add(count);
         sum >= wanted
     })?;
-    Some(f64::powf(2.0, (index as f64 + 1.0) / 2.0) / 1000.0)
+    Some(bucket_end_ms(index))
+}
+
+/// Where a bucket ends, milliseconds.
+pub fn bucket_end_ms(index: usize) -> f64 {
+    f64::powf(2.0, (index as f64 + 1.0) / 2.0) / 1000.0
 }
 
 /// Why a process is in its state, as text.
 pub fn cause(message: &HealthMessage) -> String {
     text_from_bytes(&message.cause, message.cause_bytes)
+}
+
+/// What the system refused, as text; empty where nothing was.
+pub fn warning(message: &HealthMessage) -> String {
+    text_from_bytes(&message.warning, message.warning_bytes)
+}
+
+/// The code of a policy in [`HealthMessage`].
+fn scheduling_code(policy: Option<Policy>) -> u32 {
+    match policy {
+        Some(Policy::Other) => 0,
+        Some(Policy::Fifo) => 1,
+        Some(Policy::Deadline) => 2,
+        Some(Policy::Inherit) | None => 3,
+    }
+}
+
+/// The policy of a code, in words.
+pub fn scheduling_name(code: u32) -> &'static str {
+    match code {
+        0 => "other",
+        1 => "fifo",
+        2 => "deadline",
+        _ => "unknown",
+    }
 }
 
 /// Counts, and publishes when it is time.
@@ -107,12 +140,22 @@ impl Health {
             dropped: 0,
             gaps: 0,
             refused: 0,
+            disordered: 0,
+            resized: 0,
             deadline_misses: 0,
+            page_faults: 0,
             total: 0,
             detail: 0,
             cause_bytes: 0,
             peak_rss_bytes: 0,
             latency_counts: [0; HISTOGRAM_BUCKETS],
+            work_counts: [0; HISTOGRAM_BUCKETS],
+            wake_counts: [0; HISTOGRAM_BUCKETS],
+            scheduling: scheduling_code(None),
+            priority: 0,
+            memory_locked: 0,
+            warning_bytes: 0,
+            warning: [0; TEXT_BYTES],
             cause: [0; TEXT_BYTES],
         };
         let publisher = hub.publisher(topic, 1)?;
@@ -129,6 +172,27 @@ impl Health {
     /// Takes down one latency.
     pub fn count_latency(&mut self, nanos: u64) {
         self.message.latency_counts[bucket(nanos)] += 1;
+    }
+
+    /// Takes down the time that the work on a frame took.
+    pub fn count_work(&mut self, nanos: u64) {
+        self.message.work_counts[bucket(nanos)] += 1;
+    }
+
+    /// Takes down the time from the sending of a frame to the look at it.
+    pub fn count_wake(&mut self, nanos: u64) {
+        self.message.wake_counts[bucket(nanos)] += 1;
+    }
+
+    /// Says what the kernel does for this process and what it refused; the first refusal as a text.
+    pub fn tell_scheduling(&mut self, in_force: &InForce, refusals: &[Refusal]) {
+        let warning = refusals.first().map_or(String::new(), Refusal::to_string);
+        self.message.scheduling = scheduling_code(in_force.policy);
+        self.message.priority = in_force.priority;
+        self.message.memory_locked = u32::from(in_force.memory_locked);
+        (self.message.warning, self.message.warning_bytes) = text_bytes(&warning);
+        self.changed = true;
+        self.report();
     }
 
     /// Enters a state; the next report goes out at once.
@@ -202,6 +266,6 @@ mod tests {
             assert_eq!((state.code(), state.name()), (code, name));
             assert_eq!(ProcessState::from_code(code), Some(state));
         }
-        assert_eq!(ProcessState::from_code(6), None);
+        assert_eq!(ProcessState::from_code(7), None);
     }
 }

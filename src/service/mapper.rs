@@ -3,11 +3,14 @@
 use std::path::Path;
 use std::time::Duration;
 
+use crate::service::checkpoint::{Checkpoint, read_checkpoint};
 use crate::service::clock::now_nanos;
 use crate::service::config::Config;
 use crate::service::health::{Health, ProcessState};
 use crate::service::map_file::write_map;
+use crate::service::mode::Mode;
 use crate::service::pairing::Pairing;
+use crate::service::schedule::{apply, in_force};
 use crate::service::shutdown::Shutdown;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{DepthPoint, Keyframe, KeyframePose, MAX_KEYFRAME_POINTS};
@@ -17,7 +20,7 @@ use crate::slam::pose::{NO_KEYFRAME, PoseEstimate};
 use crate::wire::command::{Command, CommandError, CommandServer};
 use crate::wire::conversion::{
     code_from_map_state, frame_from_message, keyframe_header, keyframe_image_header,
-    keyframe_pose_message, pose_from_message,
+    keyframe_pose_message, pose_from_message, rigid_message,
 };
 use crate::wire::message::{
     FrameHeader, GraphHeader, KeyframeHeader, KeyframeImageHeader, KeyframePoseMessage,
@@ -34,6 +37,8 @@ use crate::wire::topic::{
 
 /// Longest sleep without a look at signals and health.
 const WAKE_PERIOD: Duration = Duration::from_millis(100);
+/// Time between two checkpoints of a keyframe whose depth improves; a new keyframe has one at once.
+const CHECKPOINT_PERIOD_NANOS: i64 = 1_000_000_000;
 
 /// Why the mapper ends early.
 #[derive(Debug, thiserror::Error)]
@@ -70,8 +75,12 @@ pub enum MapperError {
 }
 
 /// Runs the process until the signal.
-pub fn run(config: &Config, shutdown: &Shutdown) -> Result<(), MapperError> {
-    let mut shell = Shell::prepare(config)?;
+pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), MapperError> {
+    // Before the pool is made: its threads run where this one does.
+    let refusals = apply(&config.mapper.scheduling);
+    refusals.iter().for_each(|refusal| tracing::warn!("mapper: {refusal}"));
+    let mut shell = Shell::prepare(config, mode)?;
+    shell.health.tell_scheduling(&in_force(), &refusals);
     shell.health.enter(ProcessState::Ready, "");
     let outcome = shell.map_until(shutdown);
     match &outcome {
@@ -92,16 +101,28 @@ struct Shell<'a> {
     output: Output,
     health: Health,
     mapper: Option<(Intrinsics, Mapper)>,
+    /// Live: what a successor goes on from, and when it was written last.
+    checkpoint: Option<Checkpoint>,
+    checkpoint_nanos: i64,
+    /// What a mapper that died has left for this one, until the first frame.
+    left: Option<Map>,
+    /// The last pose that was claimed.
+    last_pose: Option<PoseEstimate>,
     pool: rayon::ThreadPool,
     hub: Hub,
     _claim: Claim,
 }
 
 impl<'a> Shell<'a> {
-    fn prepare(config: &'a Config) -> Result<Self, MapperError> {
+    fn prepare(config: &'a Config, mode: Mode) -> Result<Self, MapperError> {
         let place = Place::new(&config.instance, &config.root)?;
         let claim = place.claim("mapper")?;
         let hub = Hub::join(&place, "mapper", Access::Member)?;
+        let (checkpoint, left) = match mode {
+            // A run in lockstep ends with any of its processes.
+            Mode::Lockstep => (None, None),
+            Mode::Live => open_checkpoint(&place.checkpoint_path()),
+        };
         let threads = config.mapper.threads;
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(threads)
@@ -118,6 +139,10 @@ impl<'a> Shell<'a> {
             output: Output::open(&hub)?,
             health: Health::open(&hub, &MAPPER_HEALTH)?,
             mapper: None,
+            checkpoint,
+            checkpoint_nanos: 0,
+            left,
+            last_pose: None,
             pool,
             hub,
             _claim: claim,
@@ -169,27 +194,56 @@ impl<'a> Shell<'a> {
                 return Ok(());
             }
         };
-        let known = self.mapper.take().filter(|(of, _)| *of == intrinsics);
-        let (_, mapper) = match known {
-            Some(mapper) => self.mapper.insert(mapper),
-            None => {
-                self.output.open_images(&self.hub, &intrinsics)?;
-                let mapper = Mapper::new(intrinsics, self.config.mapping.clone())?;
-                self.mapper.insert((intrinsics, mapper))
-            }
-        };
+        if self.mapper.as_ref().is_none_or(|(of, _)| *of != intrinsics) {
+            self.change_camera(intrinsics)?;
+        }
+        let Some((_, mapper)) = &mut self.mapper else { return Ok(()) };
+        let _span = tracing::trace_span!("frame", sequence = frame.sequence).entered();
         let begin = now_nanos();
-        let outcome = self.pool.install(|| mapper.step(&frame, pose, None));
+        let outcome = tracing::trace_span!("map")
+            .in_scope(|| self.pool.install(|| mapper.step(&frame, pose, None)));
         let step_nanos = u64::try_from(now_nanos() - begin).unwrap_or(0);
-        self.output.publish(mapper, &outcome, frame.sequence, step_nanos)?;
+        if pose.state.is_tracked() {
+            self.last_pose = Some(*pose);
+        }
+        let _span = tracing::trace_span!("publish").entered();
+        self.output.publish(mapper, &outcome)?;
+        self.output.publish_step(mapper, frame.sequence, step_nanos, self.last_pose.as_ref())?;
+        let is_new = outcome.needs_image();
+        let is_due = outcome.keyframe_changed
+            && now_nanos().saturating_sub(self.checkpoint_nanos) > CHECKPOINT_PERIOD_NANOS;
+        if let Some(checkpoint) = self.checkpoint.as_ref().filter(|_| is_new || is_due)
+            && let Some(map) = mapper.checkpoint()
+        {
+            checkpoint.put(map);
+            self.checkpoint_nanos = now_nanos();
+        }
         self.health.enter(ProcessState::Running, &mapper.situation().to_string());
         let counters = self.health.counters();
         counters.frames += 1;
         counters.dropped = self.pairing.dropped();
         counters.total = mapper.map().keyframes.len() as u64;
         counters.detail = mapper.keyframe().map_or(0, |k| code_from_map_state(k.map_state));
+        self.health.count_work(step_nanos);
         self.health.count_latency(step_nanos);
         self.health.report();
+        Ok(())
+    }
+
+    /// A mapper for another camera: the first, which goes on from what a dead one has left, or one in
+    /// mid-stream, which begins an epoch.
+    fn change_camera(&mut self, intrinsics: Intrinsics) -> Result<(), MapperError> {
+        self.output.open_images(&self.hub, &intrinsics)?;
+        let mut mapper = Mapper::new(intrinsics, self.config.mapping.clone())?;
+        if let Some((_, before)) = self.mapper.take() {
+            self.health.counters().resized += 1;
+            mapper.succeed(before);
+        }
+        if let Some(map) = self.left.take() {
+            let outcome = mapper.resume(map);
+            self.output.publish(&mapper, &outcome)?;
+        }
+        self.mapper = Some((intrinsics, mapper));
         Ok(())
     }
 
@@ -199,6 +253,17 @@ impl<'a> Shell<'a> {
             Command::SaveMap(path) => save_map(mapper, &path),
         })?)
     }
+}
+
+/// What a dead mapper has left, and the keeper of our own. Without either the mapper works too.
+fn open_checkpoint(path: &Path) -> (Option<Checkpoint>, Option<Map>) {
+    let left = read_checkpoint(path).unwrap_or_else(|error| {
+        tracing::warn!("the map begins anew: {error}");
+        None
+    });
+    let kept = Checkpoint::keep(path);
+    let kept = kept.inspect_err(|error| tracing::warn!("there will be no checkpoints ({error})"));
+    (kept.ok(), left)
 }
 
 fn save_map(mapper: Option<&Mapper>, path: &Path) -> Result<(), String> {
@@ -239,26 +304,32 @@ impl Output {
         self.images.iter().for_each(Publisher::serve_late_joiners);
     }
 
-    /// Image before depth: who sees the depth has the image. The step last: who sees it has all.
-    fn publish(
+    /// Image before depth: who sees the depth has the image.
+    fn publish(&self, mapper: &Mapper, outcome: &StepOutcome) -> Result<(), SendError> {
+        let Some(keyframe) = mapper.keyframe() else { return Ok(()) };
+        if outcome.needs_image() {
+            self.publish_image(keyframe)?;
+        }
+        if outcome.needs_publishing() {
+            self.depths.send(keyframe_header(keyframe), &keyframe.points)?;
+        }
+        if outcome.graph_changed {
+            self.publish_graph(mapper.map(), keyframe)?;
+        }
+        Ok(())
+    }
+
+    /// After everything else of the frame: who sees the step has all.
+    fn publish_step(
         &self,
         mapper: &Mapper,
-        outcome: &StepOutcome,
         sequence: u64,
         step_nanos: u64,
+        pose: Option<&PoseEstimate>,
     ) -> Result<(), SendError> {
         let keyframe = mapper.keyframe();
-        if let Some(keyframe) = keyframe {
-            if outcome.needs_image() {
-                self.publish_image(keyframe)?;
-            }
-            if outcome.needs_publishing() {
-                self.depths.send(keyframe_header(keyframe), &keyframe.points)?;
-            }
-            if outcome.graph_changed {
-                self.publish_graph(mapper.map(), keyframe)?;
-            }
-        }
+        let epoch = keyframe.map_or(0, |k| k.epoch);
+        let pose = pose.filter(|pose| pose.epoch == epoch);
         let step = StepMessage {
             sequence,
             keyframe_id: keyframe.map_or(NO_KEYFRAME, |k| k.keyframe_id),
@@ -266,6 +337,11 @@ impl Output {
             step_nanos,
             keyframes: mapper.map().keyframes.len() as u64,
             points: keyframe.map_or(0, |k| k.points.len() as u64),
+            pose_nanos: pose.map_or(0, |pose| pose.capture_nanos),
+            world_from_camera: pose
+                .map_or_else(Default::default, |pose| rigid_message(&pose.world_from_camera)),
+            has_pose: u32::from(pose.is_some()),
+            epoch,
         };
         self.steps.send((), &[step])
     }

@@ -52,6 +52,9 @@ impl Peer {
 
     /// Whether frames can be sent to it.
     pub fn is_ready(&self) -> bool {
-        matches!(self.state(), Some(ProcessState::Ready | ProcessState::Running))
+        matches!(
+            self.state(),
+            Some(ProcessState::Ready | ProcessState::Running | ProcessState::Stale)
+        )
     }
 }

@@ -34,6 +34,8 @@ pub struct RunCounters {
     pub restarts: u64,
     /// Frames published after the deadline.
     pub deadline_misses: u64,
+    /// Page faults of the tracker's frame loop since it was warm.
+    pub page_faults: u64,
     /// Largest resident memory of all processes together, bytes.
     pub peak_rss_bytes: u64,
 }
@@ -85,6 +87,7 @@ impl Recorder {
                     latency_nanos: Some(message.latency_nanos),
                     track_nanos: Some(message.track_nanos),
                     trace: None,
+                    wake_nanos: Some(message.wake_nanos),
                 });
             }
         }
@@ -112,7 +115,7 @@ impl Recorder {
         source: String,
         map: Map,
         ground_truth: Vec<StampedPose>,
-        budget_ms: f64,
+        deadline_ms: f64,
         counters: &RunCounters,
     ) -> RunRecord {
         let stamps = |pose: Option<&RecordedPose>| pose.map_or(0, |p| p.estimate.capture_nanos);
@@ -121,7 +124,7 @@ impl Recorder {
         let recorded_nanos = positive(last.saturating_sub(first));
         let period_nanos = recorded_nanos / counters.frames_in.saturating_sub(1).max(1);
         let deadline_nanos =
-            if budget_ms > 0.0 { (budget_ms * 1e6) as u64 } else { period_nanos / 2 };
+            if deadline_ms > 0.0 { (deadline_ms * 1e6) as u64 } else { period_nanos / 2 };
         let is_live = mode == Mode::Live;
         let wall_nanos = self.span_nanos.map_or(0, |(first, last)| last.saturating_sub(first));
         RunRecord {
@@ -137,6 +140,7 @@ impl Recorder {
             restarts: counters.restarts,
             deadline_nanos: is_live.then_some(deadline_nanos),
             deadline_misses: is_live.then_some(counters.deadline_misses),
+            page_faults: Some(counters.page_faults),
             map_nanos: self.map_nanos,
             budget_samples: Vec::new(),
             recorded_nanos,

@@ -11,6 +11,7 @@ use crate::service::alignment_stamps::AlignmentStamps;
 use crate::service::given_pose::{given_pose, truth_in_first_camera};
 use crate::service::rehearsal::Rehearsal;
 use crate::service::results::{RecordedPose, RunMode, RunRecord};
+use crate::service::schedule::peak_rss_bytes;
 use crate::slam::alignment::reference::Reference;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::frame::FrameView;
@@ -241,7 +242,13 @@ impl<'a> Replay<'a> {
             }
         };
         let trace = self.tracker.reference().and_then(|reference| stamps.trace(reference));
-        self.record.poses.push(RecordedPose { estimate, latency_nanos: None, track_nanos, trace });
+        self.record.poses.push(RecordedPose {
+            estimate,
+            latency_nanos: None,
+            track_nanos,
+            wake_nanos: None,
+            trace,
+        });
         Some(estimate)
     }
 
@@ -288,6 +295,7 @@ fn empty_record(source_name: &str, ground_truth: Vec<StampedPose>, poses_given: 
         restarts: 0,
         deadline_nanos: None,
         deadline_misses: None,
+        page_faults: None,
         map_nanos: Vec::new(),
         budget_samples: Vec::new(),
         recorded_nanos: 0,
@@ -298,13 +306,4 @@ fn empty_record(source_name: &str, ground_truth: Vec<StampedPose>, poses_given: 
 
 fn elapsed_nanos(begin: Instant) -> u64 {
     u64::try_from(begin.elapsed().as_nanos()).unwrap_or(u64::MAX)
-}
-
-/// Largest resident memory of this process so far; `None` where the kernel does not say.
-pub fn peak_rss_bytes() -> Option<u64> {
-    const BYTES_PER_KB: u64 = 1024;
-    let status = std::fs::read_to_string("/proc/self/status").ok()?;
-    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
-    let kilobytes: u64 = line.split_whitespace().next()?.parse().ok()?;
-    Some(kilobytes * BYTES_PER_KB)
 }

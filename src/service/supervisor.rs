@@ -13,8 +13,8 @@ use crate::service::map_file::{MapFileError, read_map};
 use crate::service::mode::Mode;
 use crate::service::peers::{HEALTH_TOPICS, Peer};
 use crate::service::recorder::{Recorder, RunCounters};
-use crate::service::replay::peak_rss_bytes;
 use crate::service::results::RunRecord;
+use crate::service::schedule::peak_rss_bytes;
 use crate::service::shutdown::Shutdown;
 use crate::slam::mapper::Map;
 use crate::slam::pose::TrackingState;
@@ -28,9 +28,11 @@ const WAKE_PERIOD: Duration = Duration::from_millis(50);
 /// After the last frame of a live run: silence that means all of it has been handled.
 const SILENCE: Duration = Duration::from_millis(500);
 /// Pause before the first restart of a process; it doubles up to the longest.
-const FIRST_BACK_OFF: Duration = Duration::from_millis(200);
+const FIRST_BACK_OFF: Duration = Duration::from_millis(50);
 /// Longest pause before a restart.
 const LONGEST_BACK_OFF: Duration = Duration::from_secs(5);
+/// Who has lived so long did not die of its start: the pauses begin anew.
+const HEALTHY_LIFE: Duration = Duration::from_secs(2);
 
 /// What to run.
 #[derive(Debug, Clone)]
@@ -43,6 +45,8 @@ pub struct RunOptions {
     pub mode: Mode,
     /// Folder for results; it exists.
     pub output: PathBuf,
+    /// Whether the map is fetched at the end.
+    pub keeps_map: bool,
     /// Options that every child gets: where the configuration comes from.
     pub arguments: Vec<String>,
 }
@@ -129,8 +133,8 @@ pub fn run(
     let mut ended = supervisor.watch(shutdown, observe)?;
     supervisor.stop("capture");
     supervisor.settle(&ended)?;
-    let map = match supervisor.save_map() {
-        Ok(map) => map,
+    let map = match options.keeps_map.then(|| supervisor.save_map()).transpose() {
+        Ok(map) => map.unwrap_or_default(),
         Err(error) => {
             if ended == Ended::Finished {
                 ended = Ended::Failed(error.to_string());
@@ -144,8 +148,8 @@ pub fn run(
         ended = Ended::Failed(format!("{lost} of {} poses did not arrive", counters.frames_in));
     }
     let (name, truth) = (options.source.to_string(), source.ground_truth().to_vec());
-    let budget_ms = config.tracker.budget_ms;
-    let record = recorder.into_record(options.mode, name, map, truth, budget_ms, &counters);
+    let deadline_ms = config.tracker.deadline_ms;
+    let record = recorder.into_record(options.mode, name, map, truth, deadline_ms, &counters);
     Ok(RunOutcome { record, source, ended })
 }
 
@@ -168,6 +172,8 @@ struct Supervisor<'a> {
     commands: CommandClient,
     hub: Hub,
     restarts: u64,
+    /// Restarts in a row of processes that died young.
+    hasty_restarts: u32,
 }
 
 impl<'a> Supervisor<'a> {
@@ -187,6 +193,7 @@ impl<'a> Supervisor<'a> {
             commands: CommandClient::open(&hub)?,
             hub,
             restarts: 0,
+            hasty_restarts: 0,
         };
         for name in ["mapper", "tracker", "capture"] {
             let child = supervisor.spawn(name)?;
@@ -261,10 +268,13 @@ impl<'a> Supervisor<'a> {
             let fault = child.fault();
             let is_fault = fault.is_some();
             let cause = fault.unwrap_or_else(|| format!("{process} ended with {status}"));
+            if child.age() > HEALTHY_LIFE {
+                self.hasty_restarts = 0;
+            }
             // Who says why will say the same again; who dies without a word may have had bad luck.
             let may_restart = self.options.mode == Mode::Live
                 && !is_fault
-                && self.restarts < u64::from(self.config.supervisor.max_restarts);
+                && self.hasty_restarts < self.config.supervisor.max_restarts;
             if !may_restart {
                 return Ok(Some(Ended::Failed(cause)));
             }
@@ -273,13 +283,14 @@ impl<'a> Supervisor<'a> {
             self.children[index] = self.spawn(process)?;
             self.peers.iter_mut().filter(|p| p.name() == process).for_each(Peer::forget);
             self.restarts += 1;
+            self.hasty_restarts += 1;
         }
         Ok(None)
     }
 
     /// Waits longer with every restart, and goes on collecting.
     fn back_off(&mut self, shutdown: &Shutdown) -> Result<(), RunError> {
-        let doubled = FIRST_BACK_OFF * 2_u32.saturating_pow(self.restarts.min(8) as u32);
+        let doubled = FIRST_BACK_OFF * 2_u32.saturating_pow(self.hasty_restarts.min(8));
         let end = Instant::now() + doubled.min(LONGEST_BACK_OFF);
         self.hub.clean_up();
         while Instant::now() < end && !shutdown.is_requested() {
@@ -354,6 +365,7 @@ impl<'a> Supervisor<'a> {
             gaps: capture.last().map_or(0, |health| health.gaps),
             restarts: self.restarts,
             deadline_misses: tracker.last().map_or(0, |health| health.deadline_misses),
+            page_faults: tracker.last().map_or(0, |health| health.page_faults),
             peak_rss_bytes: peaks.sum::<u64>() + peak_rss_bytes().unwrap_or(0),
         };
         if capture.state() == Some(ProcessState::Failed) {

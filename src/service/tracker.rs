@@ -5,9 +5,11 @@ use std::time::Duration;
 use crate::service::budget::IterationCosts;
 use crate::service::clock::now_nanos;
 use crate::service::config::Config;
+use crate::service::frame_order::{Arrival, FrameOrder};
 use crate::service::health::{Health, ProcessState};
 use crate::service::mode::Mode;
 use crate::service::reference_feed::ReferenceFeed;
+use crate::service::schedule::{apply, in_force, thread_usage};
 use crate::service::shutdown::Shutdown;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -16,20 +18,21 @@ use crate::slam::pose::{DegradedReason, LostReason, PoseEstimate, TrackingState}
 use crate::slam::tracker::Tracker;
 use crate::wire::conversion::{
     PoseTiming, codes_from_state, frame_from_message, pose_from_message, pose_message,
+    rigid_from_message,
 };
 use crate::wire::keyframe_inbox::InboxError;
-use crate::wire::message::{FrameHeader, PoseMessage};
+use crate::wire::message::{FrameHeader, PoseMessage, StepMessage};
 use crate::wire::place::{Claim, Place, PlaceError};
 use crate::wire::port::{
     Access, Hub, OpenError, Publisher, ReceiveError, Received, SendError, Subscriber, WaitError,
     wait,
 };
-use crate::wire::topic::{FRAME, POSE, TRACKER_HEALTH};
+use crate::wire::topic::{FRAME, POSE, STEP, TRACKER_HEALTH};
 
 /// Longest sleep without a look at signals and health.
 const WAKE_PERIOD: Duration = Duration::from_millis(100);
-/// Budget until two frames have told their distance: half of 30 Hz.
-const FIRST_BUDGET_NANOS: i64 = 16_000_000;
+/// Frames until everything that the loop uses has been touched: page faults count from here.
+const WARM_UP_FRAMES: u64 = 100;
 
 /// Why the tracker ends early.
 #[derive(Debug, thiserror::Error)]
@@ -63,6 +66,10 @@ pub enum TrackerError {
 /// Runs the process until the signal.
 pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), TrackerError> {
     let mut shell = Shell::prepare(config, mode)?;
+    // After the thread that prepares keyframes was made: that one stays ordinary.
+    let refusals = apply(&config.tracker.scheduling);
+    refusals.iter().for_each(|refusal| tracing::warn!("tracker: {refusal}"));
+    shell.health.tell_scheduling(&in_force(), &refusals);
     shell.health.enter(ProcessState::Ready, "");
     let outcome = shell.track_until(shutdown);
     match &outcome {
@@ -78,11 +85,17 @@ struct Shell<'a> {
     frames: Subscriber<u8, FrameHeader>,
     poses: Publisher<PoseMessage, ()>,
     references: ReferenceFeed,
+    /// Live, until the first keyframe: what the mapper says of the last pose, for a restart.
+    steps: Option<Subscriber<StepMessage, ()>>,
     health: Health,
     tracker: Option<(Intrinsics, Tracker)>,
+    last_intrinsics: Option<Intrinsics>,
     costs: IterationCosts,
-    last_frame: Option<FrameHeader>,
-    period_nanos: i64,
+    order: FrameOrder,
+    /// CLOCK_MONOTONIC when the last frame arrived.
+    last_arrival_nanos: Option<i64>,
+    /// Page faults of this thread until the loop was warm.
+    warm_page_faults: Option<u64>,
     _hub: Hub,
     _claim: Claim,
 }
@@ -103,11 +116,14 @@ impl<'a> Shell<'a> {
             frames: hub.subscriber(&FRAME)?,
             poses: hub.publisher(&POSE, 1)?,
             references,
+            steps: (mode == Mode::Live).then(|| hub.subscriber(&STEP)).transpose()?,
             health: Health::open(&hub, &TRACKER_HEALTH)?,
             tracker: None,
+            last_intrinsics: None,
             costs: IterationCosts::default(),
-            last_frame: None,
-            period_nanos: 2 * FIRST_BUDGET_NANOS,
+            order: FrameOrder::default(),
+            last_arrival_nanos: None,
+            warm_page_faults: None,
             _hub: hub,
             _claim: claim,
         })
@@ -120,6 +136,7 @@ impl<'a> Shell<'a> {
             while let Some(frame) = self.next_frame()? {
                 self.step(&frame)?;
             }
+            self.look_for_silence();
             self.health.report();
         }
         Ok(())
@@ -136,19 +153,27 @@ impl<'a> Shell<'a> {
     /// One frame: adopt, track, publish.
     fn step(&mut self, received: &Received<u8, FrameHeader>) -> Result<(), TrackerError> {
         let arrival_nanos = now_nanos();
+        let _span = tracing::trace_span!("frame", sequence = received.header().sequence).entered();
         let header = *received.header();
         let (frame, intrinsics) = match frame_from_message(&header, received.payload()) {
             Ok(frame) => frame,
-            Err(error) => {
+            Err(_) => {
+                // Not logged: whoever sends many of them must not make this loop do I/O.
                 self.health.counters().refused += 1;
-                tracing::warn!("capture/frame: {error}");
+                self.health.enter(ProcessState::Running, "a broken frame was refused");
                 return Ok(());
             }
         };
-        self.count_gap(&header);
+        if !self.is_in_order(&header) {
+            return Ok(());
+        }
+        self.last_arrival_nanos = Some(arrival_nanos);
         let deadline_nanos = self.deadline_nanos(arrival_nanos);
         let (estimate, track_nanos) = self.track(&frame, intrinsics, deadline_nanos)?;
-        self.publish(&estimate, &header, track_nanos, deadline_nanos)
+        let wake_nanos = arrival_nanos.saturating_sub(header.sent_nanos);
+        self.publish(&estimate, &header, [wake_nanos, track_nanos], deadline_nanos)?;
+        self.count_page_faults();
+        Ok(())
     }
 
     /// The pose of a frame, and the time that tracking it took: in lockstep the reference is prepared
@@ -163,15 +188,23 @@ impl<'a> Shell<'a> {
         let (_, tracker) = match known {
             Some(tracker) => self.tracker.insert(tracker),
             None => {
+                // The first, or another camera in mid-stream.
+                let is_first = self.last_intrinsics.replace(intrinsics).is_none();
+                self.health.counters().resized += u64::from(!is_first);
                 let tracker = Tracker::new(intrinsics, self.config.tracking.clone())?;
                 self.tracker.insert((intrinsics, tracker))
             }
         };
-        if let Some(reference) = self.references.newest()?
-            && let Some(used) = tracker.adopt(reference)
-        {
-            self.references.give_back(used);
+        if let Some(reference) = self.references.newest()? {
+            let epoch = reference.epoch();
+            if let Some(used) = tracker.adopt(reference) {
+                self.references.give_back(used);
+            }
+            if let Some(steps) = self.steps.take() {
+                resume(tracker, epoch, &steps)?;
+            }
         }
+        let _span = tracing::trace_span!("track").entered();
         let begin_nanos = now_nanos();
         let estimate = match deadline_nanos {
             None => tracker.track(frame, &mut |_| true),
@@ -182,56 +215,98 @@ impl<'a> Shell<'a> {
 
     /// Until when the pose of a frame that has just arrived is due; `None` in lockstep.
     fn deadline_nanos(&self, arrival_nanos: i64) -> Option<i64> {
-        let budget_nanos = match self.config.tracker.budget_ms {
-            0.0 => self.period_nanos / 2,
-            budget_ms => (budget_ms * 1e6) as i64,
+        let allowed_nanos = match self.config.tracker.deadline_ms {
+            0.0 => self.order.period_nanos() / 2,
+            deadline_ms => (deadline_ms * 1e6) as i64,
         };
-        (self.mode == Mode::Live).then(|| arrival_nanos.saturating_add(budget_nanos))
+        (self.mode == Mode::Live).then(|| arrival_nanos.saturating_add(allowed_nanos))
     }
 
-    /// Learns the frame period, and counts what was missed.
-    fn count_gap(&mut self, header: &FrameHeader) {
-        let last = self.last_frame.replace(*header);
-        let Some(last) = last.filter(|last| last.sequence < header.sequence) else { return };
-        let frames = header.sequence - last.sequence;
-        let elapsed = header.capture_nanos.saturating_sub(last.capture_nanos);
-        if elapsed > 0 {
-            self.period_nanos = elapsed / i64::try_from(frames).unwrap_or(i64::MAX);
+    /// Counts what is missing or out of order; whether the frame is to be used.
+    fn is_in_order(&mut self, header: &FrameHeader) -> bool {
+        let arrival = self.order.arrive(header);
+        let counters = self.health.counters();
+        match arrival {
+            Arrival::Next { missing } => counters.dropped += missing,
+            Arrival::ClockJump | Arrival::Renumbered | Arrival::Repeated => {
+                counters.disordered += 1;
+            }
         }
-        self.health.counters().dropped += frames - 1;
+        arrival != Arrival::Repeated
+    }
+
+    /// Live: says it when frames have stopped coming. The next frame ends the state.
+    fn look_for_silence(&mut self) {
+        let Some(last) = self.last_arrival_nanos.filter(|_| self.mode == Mode::Live) else {
+            return;
+        };
+        let allowed = self.config.tracker.stale_periods * self.order.period_nanos() as f64;
+        if now_nanos().saturating_sub(last) as f64 > allowed {
+            self.health.enter(ProcessState::Stale, "no frames come: look at capture");
+        }
+    }
+
+    fn count_page_faults(&mut self) {
+        if self.health.counters().frames < WARM_UP_FRAMES {
+            return;
+        }
+        let faults = thread_usage().page_faults;
+        let warm = *self.warm_page_faults.get_or_insert(faults);
+        self.health.counters().page_faults = faults.saturating_sub(warm);
     }
 
     fn publish(
         &mut self,
         estimate: &PoseEstimate,
         header: &FrameHeader,
-        track_nanos: i64,
+        [wake_nanos, track_nanos]: [i64; 2],
         deadline_nanos: Option<i64>,
     ) -> Result<(), TrackerError> {
+        let _span = tracing::trace_span!("publish").entered();
         let published_nanos = now_nanos();
+        // A camera's stamp may lie in the future of our clock.
         let positive = |nanos: i64| u64::try_from(nanos).unwrap_or(0);
         let timing = PoseTiming {
             published_nanos,
             latency_nanos: positive(published_nanos.saturating_sub(header.clock_nanos)),
             track_nanos: positive(track_nanos),
+            wake_nanos: positive(wake_nanos),
         };
         let mut message = pose_message(estimate, &timing);
-        if let Err(error) = pose_from_message(&message) {
+        if pose_from_message(&message).is_err() {
             // Nothing non-finite leaves this process.
-            tracing::error!("frame {}: the tracker's pose is refused: {error}", header.sequence);
+            self.health.counters().refused += 1;
             message = pose_message(&unclaimed(estimate), &timing);
         }
         self.poses.send((), &[message])?;
         self.health.enter(ProcessState::Running, state_text(estimate.state));
         self.health.count_latency(timing.latency_nanos);
+        self.health.count_work(timing.track_nanos);
+        self.health.count_wake(timing.wake_nanos);
         let counters = self.health.counters();
         counters.frames += 1;
         counters.detail = codes_from_state(estimate.state).0;
         let late = deadline_nanos.is_some_and(|deadline| published_nanos > deadline);
         counters.deadline_misses += u64::from(late);
-        self.health.report();
         Ok(())
     }
+}
+
+/// Goes on from the last pose of this epoch that the mapper has heard of: another tracker's, which died.
+fn resume(
+    tracker: &mut Tracker,
+    epoch: u32,
+    steps: &Subscriber<StepMessage, ()>,
+) -> Result<(), ReceiveError> {
+    let newest = steps.newest()?;
+    let step = newest.as_ref().and_then(|message| message.payload().first());
+    if let Some(step) = step.filter(|step| step.has_pose == 1 && step.epoch == epoch)
+        && let Ok(world_from_camera) =
+            rigid_from_message(&step.world_from_camera, "world_from_camera")
+    {
+        tracker.resume_at(step.pose_nanos, &world_from_camera);
+    }
+    Ok(())
 }
 
 /// A state and its reason, for whoever looks on.

@@ -4,6 +4,7 @@ pub mod consistency;
 mod memory;
 mod past;
 pub mod recovery;
+mod resume;
 pub mod situation;
 mod start;
 

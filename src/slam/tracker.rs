@@ -137,6 +137,13 @@ impl Tracker {
         before
     }
 
+    /// Goes on where another tracker of this camera ended: at `nanos` it claimed this pose. The next frame
+    /// is searched for around it, and must fit as well as after a loss.
+    pub fn resume_at(&mut self, nanos: i64, world_from_camera: &SE3) {
+        self.memory.motion.observe(nanos, world_from_camera);
+        self.memory.was_lost = true;
+    }
+
     /// The reference in force.
     pub fn reference(&self) -> Option<&Reference> {
         self.reference.as_deref()

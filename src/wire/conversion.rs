@@ -215,6 +215,8 @@ pub struct PoseTiming {
     pub latency_nanos: u64,
     /// Time that tracking took.
     pub track_nanos: u64,
+    /// From the sending of the frame to the tracker's look at it.
+    pub wake_nanos: u64,
 }
 
 /// The message of a pose.
@@ -227,6 +229,7 @@ pub fn pose_message(pose: &PoseEstimate, timing: &PoseTiming) -> PoseMessage {
         published_nanos: timing.published_nanos,
         latency_nanos: timing.latency_nanos,
         track_nanos: timing.track_nanos,
+        wake_nanos: timing.wake_nanos,
         revision: pose.revision,
         keyframe_id: pose.keyframe_id,
         epoch: pose.epoch,

@@ -22,7 +22,7 @@ pub type SimilarityMessage = [f64; 8];
 /// Header of `capture/frame`; the payload is the grey image.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
-#[type_name("semidense.FrameHeader.v1")]
+#[type_name("semidense.FrameHeader.v2")]
 pub struct FrameHeader {
     /// Number of the frame at its source; a gap is a frame that is missing.
     pub sequence: u64,
@@ -31,6 +31,8 @@ pub struct FrameHeader {
     /// CLOCK_MONOTONIC instant that latency counts from: the stamp of a camera, the paced instant
     /// of a recording played live, the sending in lockstep.
     pub clock_nanos: i64,
+    /// CLOCK_MONOTONIC when it was sent: wake-ups are measured from here.
+    pub sent_nanos: i64,
     /// Exposure time in nanoseconds, 0 where unknown.
     pub exposure_nanos: u64,
     /// fx, fy, cx, cy in pixels.
@@ -48,7 +50,7 @@ pub struct FrameHeader {
 /// Message of `tracker/pose`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
-#[type_name("semidense.Pose.v1")]
+#[type_name("semidense.Pose.v2")]
 pub struct PoseMessage {
     /// Sequence of the frame.
     pub sequence: u64,
@@ -60,6 +62,8 @@ pub struct PoseMessage {
     pub latency_nanos: u64,
     /// Time that tracking took.
     pub track_nanos: u64,
+    /// From the sending of the frame to the tracker's look at it.
+    pub wake_nanos: u64,
     /// Revision of the keyframe it was tracked on.
     pub revision: u64,
     /// Keyframe it was tracked on, all ones before the first.
@@ -155,8 +159,8 @@ pub struct KeyframeImageHeader {
 
 /// Message of `mapper/step`: this frame is in the map.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ZeroCopySend)]
-#[type_name("semidense.Step.v1")]
+#[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
+#[type_name("semidense.Step.v2")]
 pub struct StepMessage {
     /// Sequence of the frame.
     pub sequence: u64,
@@ -170,6 +174,14 @@ pub struct StepMessage {
     pub keyframes: u64,
     /// Points with depth of the keyframe in force.
     pub points: u64,
+    /// Stamp of the last frame whose pose was claimed, nanoseconds.
+    pub pose_nanos: i64,
+    /// That pose: where a tracker that is started again begins.
+    pub world_from_camera: RigidMessage,
+    /// 1 when there was such a frame in the epoch.
+    pub has_pose: u32,
+    /// Life of the map.
+    pub epoch: u32,
 }
 
 /// Header of `mapper/graph`; the payload is one [`KeyframePoseMessage`] per keyframe.
@@ -199,7 +211,7 @@ pub struct KeyframePoseMessage {
 /// Message of `<process>/health`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
-#[type_name("semidense.Health.v1")]
+#[type_name("semidense.Health.v2")]
 pub struct HealthMessage {
     /// CLOCK_MONOTONIC when it was published.
     pub published_nanos: i64,
@@ -207,7 +219,7 @@ pub struct HealthMessage {
     pub started_nanos: i64,
     /// Its process id.
     pub process_id: u32,
-    /// 0 starting, 1 preparing, 2 ready, 3 running, 4 finished, 5 failed.
+    /// 0 starting, 1 preparing, 2 ready, 3 running, 4 finished, 5 failed, 6 stale.
     pub state: u32,
     /// Preparing: how much of the work is done.
     pub progress_done: u64,
@@ -221,8 +233,15 @@ pub struct HealthMessage {
     pub gaps: u64,
     /// Messages that were refused because they are broken.
     pub refused: u64,
-    /// Frames that took longer than the budget.
+    /// Frames whose sequence or stamp does not come after the one before: repeated, out of order, or
+    /// after a jump of the source's clock.
+    pub disordered: u64,
+    /// Changes of the image size or the intrinsics.
+    pub resized: u64,
+    /// Frames that took longer than the deadline.
     pub deadline_misses: u64,
+    /// Page faults of the frame loop since its first hundred frames.
+    pub page_faults: u64,
     /// Capture: frames there will be, 0 where unknown. Mapper: keyframes of the map.
     pub total: u64,
     /// State of the last frame: as in [`PoseMessage`], or of the map: as in [`KeyframeHeader`].
@@ -233,6 +252,20 @@ pub struct HealthMessage {
     pub peak_rss_bytes: u64,
     /// How often each latency came, see [`crate::service::health`].
     pub latency_counts: [u64; HISTOGRAM_BUCKETS],
+    /// The same of the time that the work on a frame took.
+    pub work_counts: [u64; HISTOGRAM_BUCKETS],
+    /// The same of the time from the sending of a frame to the look at it.
+    pub wake_counts: [u64; HISTOGRAM_BUCKETS],
+    /// Scheduling in force: 0 other, 1 FIFO, 2 deadline, 3 unknown.
+    pub scheduling: u32,
+    /// Priority of FIFO scheduling, else 0.
+    pub priority: u32,
+    /// 1 when the memory is locked.
+    pub memory_locked: u32,
+    /// Bytes of `warning` that are used.
+    pub warning_bytes: u32,
+    /// What the system refused and which limit to raise, UTF-8.
+    pub warning: [u8; TEXT_BYTES],
     /// Why the state is what it is, UTF-8.
     pub cause: [u8; TEXT_BYTES],
 }
@@ -277,15 +310,15 @@ mod tests {
 
     #[test]
     fn layouts_are_pinned() {
-        assert_layout::<FrameHeader>(80, 8, "semidense.FrameHeader.v1");
-        assert_layout::<PoseMessage>(424, 8, "semidense.Pose.v1");
+        assert_layout::<FrameHeader>(88, 8, "semidense.FrameHeader.v2");
+        assert_layout::<PoseMessage>(432, 8, "semidense.Pose.v2");
         assert_layout::<KeyframeHeader>(144, 8, "semidense.KeyframeHeader.v1");
         assert_layout::<DepthPoint>(16, 4, "semidense.DepthPoint.v1");
         assert_layout::<KeyframeImageHeader>(24, 8, "semidense.KeyframeImageHeader.v1");
-        assert_layout::<StepMessage>(48, 8, "semidense.Step.v1");
+        assert_layout::<StepMessage>(120, 8, "semidense.Step.v2");
         assert_layout::<GraphHeader>(16, 8, "semidense.GraphHeader.v1");
         assert_layout::<KeyframePoseMessage>(72, 8, "semidense.KeyframePose.v1");
-        assert_layout::<HealthMessage>(680, 8, "semidense.Health.v1");
+        assert_layout::<HealthMessage>(1680, 8, "semidense.Health.v2");
         assert_layout::<CommandRequest>(4104, 4, "semidense.CommandRequest.v1");
         assert_layout::<CommandResponse>(200, 4, "semidense.CommandResponse.v1");
     }

@@ -10,3 +10,4 @@ pub mod message;
 pub mod place;
 pub mod port;
 pub mod topic;
+mod version;

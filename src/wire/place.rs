@@ -18,6 +18,9 @@ pub const SHARED_MEMORY: &str = "/dev/shm";
 /// Held while a process joins, and by the last one while it clears up.
 const JOIN_LOCK: &str = ".join.lock";
 
+/// End of the name of the mapper's checkpoint, behind the instance.
+const CHECKPOINT_SUFFIX: &str = ".checkpoint";
+
 /// End of the name of a claim's file, behind the instance and the process.
 const CLAIM_SUFFIX: &str = ".lock";
 
@@ -135,6 +138,11 @@ impl Place {
         }
     }
 
+    /// Where the mapper keeps what it needs to go on after its death.
+    pub fn checkpoint_path(&self) -> PathBuf {
+        self.root.join(format!("{}{CHECKPOINT_SUFFIX}", self.instance))
+    }
+
     /// Keeps [`Place::tidy`] away while a process joins.
     pub(in crate::wire) fn hold(&self) -> Result<File, PlaceError> {
         let path = self.root.join(JOIN_LOCK);
@@ -182,6 +190,12 @@ impl Place {
         for entry in fs::read_dir(&self.root).into_iter().flatten().flatten() {
             let path = entry.path();
             let name = entry.file_name().to_string_lossy().into_owned();
+            if name.ends_with(CHECKPOINT_SUFFIX)
+                || name.contains(CHECKPOINT_SUFFIX) && name.ends_with(".tmp")
+            {
+                // Nobody is left who would go on from it.
+                let _ = fs::remove_file(&path);
+            }
             if name == JOIN_LOCK || !name.ends_with(CLAIM_SUFFIX) {
                 continue;
             }

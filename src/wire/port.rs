@@ -18,7 +18,8 @@ use iceoryx2::service::port_factory::publish_subscribe::PortFactory as DataFacto
 use rustix::event::{PollFd, PollFlags, Timespec};
 
 use crate::wire::place::{Place, PlaceError};
-use crate::wire::topic::Topic;
+use crate::wire::topic::{Topic, WIRE_VERSION};
+use crate::wire::version::foreign_version;
 
 /// Nodes that may open one service: our processes, observers, and the dead until they are cleaned.
 const MAX_NODES: usize = 40;
@@ -26,6 +27,8 @@ const MAX_NODES: usize = 40;
 const MAX_EVENT_PORTS: usize = 16;
 /// Publishers of one topic: the owner, its successor while the dead one is cleaned, a network link.
 const MAX_PUBLISHERS: usize = 3;
+/// Most events, and the interrupt, that are waited for at a time.
+const MAX_WAITED: usize = 8;
 /// How often opening is tried while another process removes the same service.
 const OPEN_ATTEMPTS: usize = 50;
 /// Pause between two attempts.
@@ -52,6 +55,16 @@ pub enum OpenError {
         instance: String,
         /// Folder.
         root: String,
+    },
+    /// The instance is another version's.
+    #[error(
+        "instance `{instance}` speaks wire version {found}, this program {WIRE_VERSION}: stop the old one, or use programs of one version"
+    )]
+    Version {
+        /// Instance.
+        instance: String,
+        /// Its version.
+        found: u32,
     },
     /// A topic cannot be opened.
     #[error("topic {topic}: {reason}")]
@@ -115,12 +128,17 @@ impl Hub {
         let failed =
             |reason: String| OpenError::Node { root: place.root.display().to_string(), reason };
         let name = NodeName::new(process).map_err(|e| failed(e.to_string()))?;
+        let config = transport_config(place)?;
         let node = NodeBuilder::new()
             .name(&name)
-            .config(&transport_config(place)?)
+            .config(&config)
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create::<ipc::Service>()
             .map_err(|e| failed(e.to_string()))?;
+        // After the node: what the dead have left was removed as it was made.
+        if let Some(found) = foreign_version(&config, &place.instance) {
+            return Err(OpenError::Version { instance: place.instance.clone(), found });
+        }
         Ok(Self { node, place: place.clone(), access })
     }
 
@@ -450,12 +468,27 @@ pub fn wait(
     interrupt: Option<BorrowedFd<'_>>,
     timeout: Duration,
 ) -> Result<(), WaitError> {
-    let descriptors = events.iter().map(|e| e.descriptor()).chain(interrupt);
-    let mut polled: Vec<_> =
-        descriptors.map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN)).collect();
     let timeout =
         Timespec { tv_sec: timeout.as_secs() as i64, tv_nsec: timeout.subsec_nanos().into() };
-    match rustix::event::poll(&mut polled, Some(&timeout)) {
+    let mut descriptors = events.iter().map(|e| e.descriptor()).chain(interrupt);
+    let polled = match descriptors.next() {
+        None => rustix::event::poll(&mut [], Some(&timeout)),
+        // An array: a frame loop that waits must not allocate.
+        Some(first) => {
+            let entry = |descriptor| PollFd::from_borrowed_fd(descriptor, PollFlags::IN);
+            let mut polled: [_; MAX_WAITED] = std::array::from_fn(|_| entry(first));
+            let mut count = 1;
+            for descriptor in descriptors {
+                let place = polled
+                    .get_mut(count)
+                    .ok_or_else(|| WaitError(format!("more than {MAX_WAITED} at a time")))?;
+                *place = entry(descriptor);
+                count += 1;
+            }
+            rustix::event::poll(&mut polled[..count], Some(&timeout))
+        }
+    };
+    match polled {
         Ok(_) | Err(rustix::io::Errno::INTR) => {}
         Err(e) => return Err(WaitError(e.to_string())),
     }

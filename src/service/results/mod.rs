@@ -62,6 +62,8 @@ pub struct RecordedPose {
     pub track_nanos: Option<u64>,
     /// What its parts took; `None` where the frame was not aligned in this process.
     pub trace: Option<AlignmentTrace>,
+    /// From the frame's sending to the tracker's look at it; `None` in one process.
+    pub wake_nanos: Option<u64>,
 }
 
 /// Everything that is known of a run when it ends.
@@ -91,6 +93,8 @@ pub struct RunRecord {
     pub deadline_nanos: Option<u64>,
     /// Frames published after the deadline; `None` without one.
     pub deadline_misses: Option<u64>,
+    /// Page faults of the tracker's frame loop since it was warm; `None` in one process.
+    pub page_faults: Option<u64>,
     /// Time in the mapper, one for each frame it handled.
     pub map_nanos: Vec<u64>,
     /// Frames that were aligned again with fewer iterations; empty where none were.

@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
 
+use crate::service::health::{bucket, bucket_end_ms};
 use crate::service::results::alignment_levels::{LevelSummary, alignment_levels};
 use crate::service::results::budget_curve::BudgetCurve;
 use crate::service::results::poses::longest_epoch;
@@ -13,6 +14,7 @@ use crate::slam::evaluation::depth_error::DepthStatistics;
 use crate::slam::evaluation::normalized_error::NormalizedErrors;
 use crate::slam::evaluation::statistics::percentile;
 use crate::slam::pose::{NO_KEYFRAME, TrackingState};
+use crate::wire::message::HISTOGRAM_BUCKETS;
 
 /// Percentiles of a time in milliseconds.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -34,6 +36,28 @@ impl Percentiles {
         millis.sort_by(f64::total_cmp);
         let at = |share| percentile(&millis, share);
         Some(Self { p50: at(0.5)?, p95: at(0.95)?, p99: at(0.99)?, max: at(1.0)? })
+    }
+}
+
+/// How often each time came.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Histogram {
+    /// Upper ends of the buckets that are not empty, milliseconds: half octaves.
+    pub below_ms: Vec<f64>,
+    /// How often a time fell into each.
+    pub counts: Vec<u64>,
+}
+
+impl Histogram {
+    /// Histogram of times in nanoseconds; `None` of none.
+    pub fn of(nanos: impl Iterator<Item = u64>) -> Option<Self> {
+        let mut counts = [0; HISTOGRAM_BUCKETS];
+        nanos.for_each(|nanos| counts[bucket(nanos)] += 1);
+        let filled: Vec<usize> = (0..HISTOGRAM_BUCKETS).filter(|&i| counts[i] > 0).collect();
+        (!filled.is_empty()).then(|| Self {
+            below_ms: filled.iter().map(|&i| bucket_end_ms(i)).collect(),
+            counts: filled.iter().map(|&i| counts[i]).collect(),
+        })
     }
 }
 
@@ -157,10 +181,20 @@ pub struct Summary {
     pub evaluated_epoch: Option<u32>,
     /// From a frame's stamp to its pose's publication.
     pub latency_ms: Option<Percentiles>,
+    /// From a frame's sending to the tracker's look at it.
+    pub wake_ms: Option<Percentiles>,
+    /// How often each latency came.
+    pub latency_histogram: Option<Histogram>,
+    /// How often each time in the tracker came.
+    pub track_histogram: Option<Histogram>,
+    /// How often each wake-up time came.
+    pub wake_histogram: Option<Histogram>,
     /// Time that the tracker was allowed for a frame.
     pub deadline_ms: Option<f64>,
     /// Frames published later than that.
     pub deadline_misses: Option<u64>,
+    /// Page faults of the tracker's frame loop after its first hundred frames.
+    pub page_faults: Option<u64>,
     /// Processes that were started again.
     pub restarts: u64,
     /// Time in the tracker for a frame.
@@ -235,17 +269,15 @@ impl Summary {
             epochs: count_epochs(&record.poses),
             evaluated_epoch: trajectory.and_then(|_| longest_epoch(record)),
             latency_ms: Percentiles::of(record.poses.iter().filter_map(|p| p.latency_nanos)),
+            wake_ms: Percentiles::of(record.poses.iter().filter_map(|p| p.wake_nanos)),
+            latency_histogram: Histogram::of(record.poses.iter().filter_map(|p| p.latency_nanos)),
+            track_histogram: Histogram::of(track_nanos(record)),
+            wake_histogram: Histogram::of(record.poses.iter().filter_map(|p| p.wake_nanos)),
             deadline_ms: record.deadline_nanos.map(|n| n as f64 * 1e-6),
             deadline_misses: record.deadline_misses,
+            page_faults: record.page_faults,
             restarts: record.restarts,
-            // A frame without a keyframe costs nothing and tells nothing.
-            track_ms: Percentiles::of(
-                record
-                    .poses
-                    .iter()
-                    .filter(|p| p.estimate.keyframe_id != NO_KEYFRAME)
-                    .filter_map(|p| p.track_nanos),
-            ),
+            track_ms: Percentiles::of(track_nanos(record)),
             pyramid_ms: Percentiles::of(traces.iter().map(|trace| trace.pyramid_nanos)),
             alignment_levels: alignment_levels(&traces),
             map_ms: Percentiles::of(record.map_nanos.iter().copied()),
@@ -264,6 +296,12 @@ impl Summary {
             depth_density: depth.map(|d| d.density),
         }
     }
+}
+
+/// Times in the tracker. A frame without a keyframe costs nothing and tells nothing.
+fn track_nanos(record: &RunRecord) -> impl Iterator<Item = u64> {
+    let has_keyframe = |pose: &&RecordedPose| pose.estimate.keyframe_id != NO_KEYFRAME;
+    record.poses.iter().filter(has_keyframe).filter_map(|pose| pose.track_nanos)
 }
 
 fn is_lost(state: TrackingState) -> bool {

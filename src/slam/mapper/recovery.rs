@@ -221,7 +221,7 @@ impl Mapper {
 }
 
 /// Puts the points of a keyframe back into its depth map: each as its filter left it, half proven.
-fn restore_points(map: &mut DepthMap, points: &[DepthPoint]) {
+pub(super) fn restore_points(map: &mut DepthMap, points: &[DepthPoint]) {
     for point in points {
         let index = usize::from(point.v) * map.image.width() + usize::from(point.u);
         if let Some(hypothesis) = map.hypotheses.pixels_mut().get_mut(index) {

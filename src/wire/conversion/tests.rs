@@ -51,7 +51,7 @@ fn read(keyframe: &Keyframe) -> Result<Keyframe, MessageError> {
 
 #[test]
 fn poses_survive_bit_for_bit() {
-    let timing = PoseTiming { published_nanos: 5, latency_nanos: 4, track_nanos: 3 };
+    let timing = PoseTiming { published_nanos: 5, latency_nanos: 4, track_nanos: 3, wake_nanos: 2 };
     let read = pose_from_message(&pose_message(&pose(), &timing)).unwrap();
     assert_eq!(read, pose());
     let bits = |t: &SE3| rigid_message(t).map(f64::to_bits);

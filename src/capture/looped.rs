@@ -1,0 +1,150 @@
+//! A recording played to and fro at a steady rate: frames without end for benches and soak tests.
+
+use crate::capture::source::{FrameSource, FrameStamp, SourceError, SourceName};
+use crate::slam::geometry::intrinsics::Intrinsics;
+
+/// Most memory for the frames that are kept, bytes: two thousand VGA images.
+const MAX_KEPT_BYTES: usize = 640 << 20;
+
+/// The frames of another source, from memory, forwards and backwards in turn: the camera never jumps.
+pub struct Looped {
+    name: SourceName,
+    inner: Box<dyn FrameSource>,
+    intrinsics: Intrinsics,
+    kept: Vec<Vec<u8>>,
+    num_frames: u64,
+    period_nanos: f64,
+    next: u64,
+}
+
+impl Looped {
+    /// Plays `inner` until `num_frames` have come, `rate_hz` in a second.
+    pub fn new(
+        name: SourceName,
+        inner: Box<dyn FrameSource>,
+        num_frames: u64,
+        rate_hz: f64,
+    ) -> Self {
+        let intrinsics = inner.intrinsics();
+        let period_nanos = 1e9 / rate_hz;
+        Self { name, inner, intrinsics, kept: Vec::new(), num_frames, period_nanos, next: 0 }
+    }
+
+    /// The kept frame that is shown as frame `sequence`.
+    fn place(&self, sequence: u64) -> usize {
+        let last = self.kept.len() as u64 - 1;
+        // There and back without showing either end twice.
+        let phase = sequence % (2 * last).max(1);
+        (if phase <= last { phase } else { 2 * last - phase }) as usize
+    }
+}
+
+impl FrameSource for Looped {
+    fn intrinsics(&self) -> Intrinsics {
+        self.intrinsics
+    }
+
+    fn num_frames(&self) -> Option<usize> {
+        usize::try_from(self.num_frames).ok()
+    }
+
+    fn prepare(
+        &mut self,
+        progress: &mut dyn FnMut(usize, usize) -> bool,
+    ) -> Result<(), SourceError> {
+        self.inner.prepare(progress)?;
+        let bytes = self.intrinsics.width * self.intrinsics.height;
+        let mut pixels = vec![0; bytes];
+        while (self.kept.len() + 1) * bytes <= MAX_KEPT_BYTES
+            && self.inner.next_into(&mut pixels)?.is_some()
+        {
+            self.kept.push(pixels.clone());
+        }
+        Ok(())
+    }
+
+    fn skip_to(&mut self, sequence: u64) -> Result<(), SourceError> {
+        self.next = sequence.saturating_add(1);
+        Ok(())
+    }
+
+    fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
+        if self.kept.is_empty() {
+            let (name, reason) = (self.name.to_string(), "it has no frames to repeat");
+            return Err(SourceError::Unavailable { name, reason });
+        }
+        let kept = &self.kept[self.place(self.next)];
+        if pixels.len() != kept.len() {
+            let Intrinsics { width, height, .. } = self.intrinsics;
+            return Err(SourceError::Buffer { found: pixels.len(), width, height });
+        }
+        if self.next >= self.num_frames {
+            return Ok(None);
+        }
+        pixels.copy_from_slice(kept);
+        let sequence = self.next;
+        self.next += 1;
+        Ok(Some(FrameStamp {
+            sequence,
+            // From one period on: a stamp of zero is what a camera without a clock gives.
+            capture_nanos: ((sequence + 1) as f64 * self.period_nanos) as i64,
+            exposure_nanos: 0,
+            gain: 0.0,
+        }))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::capture::simulator::params::SimulatorParams;
+    use crate::capture::source::open;
+
+    #[test]
+    fn frames_go_to_and_fro_at_the_rate() {
+        let simulator = SimulatorParams {
+            frames: 4,
+            width: 64,
+            height: 48,
+            focal_px: 50.0,
+            ..SimulatorParams::default()
+        };
+        let mut once = open(&"sim".parse().unwrap(), None, &simulator).unwrap();
+        once.prepare(&mut |_, _| true).unwrap();
+        let mut frames = Vec::new();
+        let mut pixels = vec![0; 64 * 48];
+        while once.next_into(&mut pixels).unwrap().is_some() {
+            frames.push(pixels.clone());
+        }
+        assert_eq!(frames.len(), 4);
+        let mut looped = open(&"loop:9:50:sim".parse().unwrap(), None, &simulator).unwrap();
+        looped.prepare(&mut |_, _| true).unwrap();
+        for (sequence, place) in [0, 1, 2, 3, 2, 1, 0, 1, 2].into_iter().enumerate() {
+            let stamp = looped.next_into(&mut pixels).unwrap().unwrap();
+            assert_eq!(stamp.sequence, sequence as u64);
+            assert_eq!(stamp.capture_nanos, 20_000_000 * (sequence as i64 + 1));
+            assert!(pixels == frames[place], "frame {sequence}");
+        }
+        assert!(looped.next_into(&mut pixels).unwrap().is_none());
+    }
+
+    #[test]
+    fn a_loop_of_one_frame_repeats_it() {
+        let simulator =
+            SimulatorParams { frames: 1, width: 64, height: 48, ..SimulatorParams::default() };
+        let mut looped = open(&"loop:3:10:sim".parse().unwrap(), None, &simulator).unwrap();
+        looped.prepare(&mut |_, _| true).unwrap();
+        let mut pixels = vec![0; 64 * 48];
+        let count = std::iter::from_fn(|| looped.next_into(&mut pixels).unwrap()).count();
+        assert_eq!(count, 3);
+    }
+
+    #[test]
+    fn loops_have_a_length_and_a_rate() {
+        for wrong in ["loop:", "loop:0:30:sim", "loop:5:0:sim", "loop:5:inf:sim", "loop:5:30"] {
+            assert!(wrong.parse::<SourceName>().is_err(), "{wrong}");
+        }
+        let name: SourceName = "loop:5:30:tum:/x:y".parse().unwrap();
+        assert_eq!(name.to_string(), "loop:5:30:tum:/x:y");
+    }
+}

@@ -1,0 +1,180 @@
+//! `semidense bench latency`: how late poses are, at rest and under load.
+
+use std::process::ExitCode;
+
+use clap::{Args, Subcommand, ValueEnum};
+
+use crate::capture::source::SourceName;
+use crate::command::print::{note, print};
+use crate::command::run_progress::RunDisplay;
+use crate::command::{CommandResult, CommonArguments, INTERRUPTED};
+use crate::service::config::Config;
+use crate::service::latency_bench::{Disturbance, Measurement, Tail, Trial, TrialError, try_out};
+use crate::service::shutdown::Shutdown;
+
+/// Measure on this machine
+#[derive(Debug, Args)]
+pub struct BenchArguments {
+    #[command(subcommand)]
+    what: Bench,
+}
+
+#[derive(Debug, Subcommand)]
+enum Bench {
+    Latency(LatencyArguments),
+}
+
+/// What goes on beside the pipeline.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Beside {
+    /// Each of the following in turn
+    All,
+    /// Nothing
+    Idle,
+    /// A busy thread for each CPU
+    BusyCpus,
+    /// A mapper with more to do than it can
+    SaturatedMapper,
+    /// A subscriber that reads slowly
+    SlowReader,
+    /// A subscriber that never reads
+    DeafReader,
+}
+
+/// Scheduling of capture and tracker.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum RealTime {
+    /// As the configuration says
+    Off,
+    /// FIFO priorities, locked memory
+    On,
+    /// First off, then on
+    Both,
+}
+
+/// Run capture, tracker and mapper live and print how late poses are: at rest and under load, with and
+/// without real-time scheduling
+#[derive(Debug, Args)]
+pub struct LatencyArguments {
+    /// What is captured, to and fro; the default room is rendered first
+    #[arg(long, value_name = "SOURCE", default_value = "sim")]
+    source: String,
+    /// Frames in a second
+    #[arg(long, value_name = "HZ", default_value_t = 30.0)]
+    fps: f64,
+    /// Seconds of each trial
+    #[arg(long, value_name = "SECONDS", default_value_t = 30.0)]
+    seconds: f64,
+    /// What goes on beside
+    #[arg(long, value_enum, default_value_t = Beside::All)]
+    load: Beside,
+    /// Scheduling of capture and tracker
+    #[arg(long, value_enum, default_value_t = RealTime::Both)]
+    realtime: RealTime,
+    /// Print JSON: one object for each trial
+    #[arg(long)]
+    json: bool,
+}
+
+/// Most frames of a trial: a day at 60 Hz; poses are kept until its end.
+const MAX_FRAMES: f64 = 5_184_000.0;
+
+/// Runs it.
+pub fn run(config: &Config, common: &CommonArguments, arguments: BenchArguments) -> CommandResult {
+    let Bench::Latency(arguments) = arguments.what;
+    let frames = (arguments.fps * arguments.seconds).round();
+    if !(1.0..=MAX_FRAMES).contains(&frames) {
+        return Err(format!(
+            "--fps {} for --seconds {}: that are {frames} frames; allowed are 1 to {MAX_FRAMES}",
+            arguments.fps, arguments.seconds
+        )
+        .into());
+    }
+    let source: SourceName = arguments.source.parse()?;
+    let shutdown = Shutdown::install()?;
+    let mut measurements = Vec::new();
+    for disturbance in disturbances(arguments.load) {
+        for real_time in real_times(arguments.realtime) {
+            let rate_hz = arguments.fps;
+            let trial = Trial { disturbance, real_time, frames: frames as u64, rate_hz };
+            if !arguments.json {
+                let scheduling = if real_time { "real time" } else { "ordinary" };
+                note(&format!("{}, {scheduling}:", disturbance.name()));
+            }
+            let mut display = RunDisplay::new(arguments.json);
+            let options = common.to_arguments();
+            let tried =
+                try_out(config, &trial, &source, &options, &shutdown, &mut |p| display.show(p));
+            display.finish();
+            match tried {
+                Err(TrialError::Interrupted) => return Ok(ExitCode::from(INTERRUPTED)),
+                tried => measurements.push(tried?),
+            }
+        }
+    }
+    print(&match arguments.json {
+        true => format!("{}\n", serde_json::to_string_pretty(&measurements)?),
+        false => table(&measurements),
+    })?;
+    Ok(ExitCode::SUCCESS)
+}
+
+fn disturbances(beside: Beside) -> Vec<Disturbance> {
+    match beside {
+        Beside::All => Disturbance::ALL.to_vec(),
+        Beside::Idle => vec![Disturbance::Idle],
+        Beside::BusyCpus => vec![Disturbance::BusyCpus],
+        Beside::SaturatedMapper => vec![Disturbance::SaturatedMapper],
+        Beside::SlowReader => vec![Disturbance::SlowReader],
+        Beside::DeafReader => vec![Disturbance::DeafReader],
+    }
+}
+
+fn real_times(real_time: RealTime) -> Vec<bool> {
+    match real_time {
+        RealTime::Off => vec![false],
+        RealTime::On => vec![true],
+        RealTime::Both => vec![false, true],
+    }
+}
+
+/// The measurements as lines; times in milliseconds.
+fn table(measurements: &[Measurement]) -> String {
+    let mut lines = vec![format!(
+        "{:16} {:9} {:>6} {:>28} {:>28} {:>5} {:>5} {:>6} {:>9}",
+        "beside",
+        "schedule",
+        "frames",
+        "latency p50/p99/p99.9/max",
+        "wake p50/p99/p99.9/max",
+        "late",
+        "drop",
+        "faults",
+        "stolen ms"
+    )];
+    let tail = |tail: Option<Tail>| {
+        tail.map_or("-".to_owned(), |t| {
+            format!("{:.2}/{:.2}/{:.2}/{:.2}", t.p50, t.p99, t.p999, t.max)
+        })
+    };
+    for m in measurements {
+        lines.push(format!(
+            "{:16} {:9} {:>6} {:>28} {:>28} {:>5} {:>5} {:>6} {:>9}",
+            m.disturbance.name(),
+            if m.real_time { "real time" } else { "ordinary" },
+            m.frames,
+            tail(m.latency_ms),
+            tail(m.wake_ms),
+            m.deadline_misses,
+            m.dropped,
+            m.page_faults,
+            m.stolen_ms.map_or("-".to_owned(), |stolen| format!("{stolen:.0}")),
+        ));
+    }
+    if let Some(deadline_ms) = measurements.first().and_then(|m| m.deadline_ms) {
+        lines.push(format!(
+            "times in ms; late: published more than {deadline_ms:.1} ms after the frame arrived; faults: page faults of the frame loop when warm"
+        ));
+    }
+    lines.join("\n") + "\n"
+}

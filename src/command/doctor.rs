@@ -1,0 +1,45 @@
+//! `semidense doctor`: what on this machine will cost latency or break.
+
+use std::process::ExitCode;
+
+use clap::Args;
+
+use crate::command::CommandResult;
+use crate::command::print::print;
+use crate::service::config::Config;
+use crate::service::doctor::{Finding, Machine, Severity, examine};
+
+/// Look for what on this machine will cost latency or break, and say how to mend it
+///
+/// Looks at limits, CPU governor, real-time throttling, clock source, shared memory, permissions and
+/// cameras. Exits with 1 when something will not work.
+#[derive(Debug, Args)]
+pub struct DoctorArguments {
+    /// Print the findings as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs it.
+pub fn run(config: &Config, arguments: DoctorArguments) -> CommandResult {
+    let findings = examine(&Machine::default(), config);
+    print(&match arguments.json {
+        true => format!("{}\n", serde_json::to_string_pretty(&findings)?),
+        false => findings.iter().map(line).collect(),
+    })?;
+    let is_broken = findings.iter().any(|finding| finding.severity == Severity::Error);
+    Ok(if is_broken { ExitCode::FAILURE } else { ExitCode::SUCCESS })
+}
+
+fn line(finding: &Finding) -> String {
+    let severity = match finding.severity {
+        Severity::Ok => "ok",
+        Severity::Warning => "warning",
+        Severity::Error => "ERROR",
+    };
+    let remedy = match finding.remedy.is_empty() {
+        true => String::new(),
+        false => format!("{:31} mend it: {}\n", "", finding.remedy),
+    };
+    format!("{severity:8} {:21} {}\n{remedy}", finding.subject, finding.found)
+}

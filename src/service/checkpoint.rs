@@ -1,0 +1,139 @@
+//! The mapper's checkpoint: what it needs to go on after its death, in the runtime folder. Written by a
+//! thread of its own, so that no frame waits for a file.
+
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+
+use crossbeam::queue::ArrayQueue;
+
+use crate::service::map_file::{MapFileError, read_map, write_map};
+use crate::slam::mapper::Map;
+
+/// Writes the newest checkpoint; removes the file when dropped, which a killed process cannot.
+#[derive(Debug)]
+pub struct Checkpoint {
+    path: PathBuf,
+    shared: Arc<Shared>,
+    thread: Option<JoinHandle<()>>,
+}
+
+#[derive(Debug)]
+struct Shared {
+    newest: ArrayQueue<Map>,
+    stop: AtomicBool,
+}
+
+impl Checkpoint {
+    /// Keeps the checkpoint in the file `path`.
+    pub fn keep(path: &Path) -> io::Result<Self> {
+        remove_unfinished(path);
+        let shared = Arc::new(Shared { newest: ArrayQueue::new(1), stop: AtomicBool::new(false) });
+        let (theirs, file) = (Arc::clone(&shared), path.to_owned());
+        let thread = std::thread::Builder::new()
+            .name("semidense-checkpoint".to_owned())
+            .spawn(move || write_until_stopped(&file, &theirs))?;
+        Ok(Self { path: path.to_owned(), shared, thread: Some(thread) })
+    }
+
+    /// Hands over the newest state; one that was not written yet is older and goes.
+    pub fn put(&self, map: Map) {
+        drop(self.shared.newest.force_push(map));
+        self.wake();
+    }
+
+    fn wake(&self) {
+        self.thread.iter().for_each(|thread| thread.thread().unpark());
+    }
+}
+
+impl Drop for Checkpoint {
+    fn drop(&mut self) {
+        self.shared.stop.store(true, Ordering::Release);
+        self.wake();
+        if let Some(thread) = self.thread.take() {
+            // A panic of the thread has been reported where it happened.
+            drop(thread.join());
+        }
+        // Who ends in order leaves nothing to go on from.
+        drop(fs::remove_file(&self.path));
+    }
+}
+
+fn write_until_stopped(path: &Path, shared: &Shared) {
+    while !shared.stop.load(Ordering::Acquire) {
+        match shared.newest.pop() {
+            None => std::thread::park(),
+            Some(map) => {
+                if let Err(error) = write_map(path, &map) {
+                    tracing::warn!(
+                        "{}: no checkpoint ({error}); a mapper that dies will begin anew",
+                        path.display()
+                    );
+                }
+            }
+        }
+    }
+}
+
+/// Removes what mappers that were killed while they wrote have left.
+fn remove_unfinished(path: &Path) {
+    let (Some(folder), Some(name)) = (path.parent(), path.file_name()) else { return };
+    let beginning = format!(".{}.", name.to_string_lossy());
+    for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+        let name = entry.file_name().to_string_lossy().into_owned();
+        if name.starts_with(&beginning) && name.ends_with(".tmp") {
+            // What cannot be removed is removed by the next.
+            drop(fs::remove_file(entry.path()));
+        }
+    }
+}
+
+/// The checkpoint that a killed mapper left at `path`; `None` where there is none.
+pub fn read_checkpoint(path: &Path) -> Result<Option<Map>, MapFileError> {
+    match path.exists() {
+        true => read_map(path).map(Some),
+        false => Ok(None),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::time::{Duration, Instant};
+
+    fn until(mut holds: impl FnMut() -> bool) {
+        let start = Instant::now();
+        while !holds() {
+            assert!(start.elapsed() < Duration::from_secs(60), "waited in vain");
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+
+    #[test]
+    fn a_checkpoint_is_there_until_its_keeper_ends_in_order() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("rig.checkpoint");
+        assert!(read_checkpoint(&path).unwrap().is_none());
+        let unfinished = folder.path().join(".rig.checkpoint.17.tmp");
+        fs::write(&unfinished, "half").unwrap();
+        let kept = Checkpoint::keep(&path).unwrap();
+        assert!(!unfinished.exists());
+        kept.put(Map::default());
+        until(|| path.exists());
+        assert_eq!(read_checkpoint(&path).unwrap().unwrap().keyframes.len(), 0);
+        drop(kept);
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn a_broken_checkpoint_is_an_error() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("rig.checkpoint");
+        fs::write(&path, "semidense").unwrap();
+        assert!(read_checkpoint(&path).is_err());
+    }
+}

@@ -1,0 +1,369 @@
+//! What on this machine will cost latency or break: each finding with the line that mends it.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use rustix::process::{Resource, getrlimit};
+use serde::Serialize;
+
+use crate::service::config::Config;
+use crate::service::schedule::Policy;
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::wire::place::{Place, SHARED_MEMORY};
+use crate::wire::topic::shared_memory_bytes;
+
+/// How bad a finding is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Severity {
+    /// As it should be.
+    Ok,
+    /// It works, but later or less surely than it could.
+    Warning,
+    /// It will not work.
+    Error,
+}
+
+/// One thing that was looked at.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Finding {
+    /// What was looked at.
+    pub subject: &'static str,
+    /// How bad it is.
+    pub severity: Severity,
+    /// What was found.
+    pub found: String,
+    /// The line that mends it; empty where nothing needs mending.
+    pub remedy: String,
+}
+
+impl Finding {
+    fn ok(subject: &'static str, found: impl Into<String>) -> Self {
+        let (severity, found) = (Severity::Ok, found.into());
+        Self { subject, severity, found, remedy: String::new() }
+    }
+
+    fn warning(subject: &'static str, found: impl Into<String>, remedy: impl Into<String>) -> Self {
+        let (severity, found, remedy) = (Severity::Warning, found.into(), remedy.into());
+        Self { subject, severity, found, remedy }
+    }
+
+    fn error(subject: &'static str, found: impl Into<String>, remedy: impl Into<String>) -> Self {
+        Self { severity: Severity::Error, ..Self::warning(subject, found, remedy) }
+    }
+}
+
+/// The largest camera that is usual: what shared memory must hold.
+const LARGE_CAMERA: Intrinsics =
+    Intrinsics { fx: 1000.0, fy: 1000.0, cx: 639.5, cy: 359.5, width: 1280, height: 720 };
+/// The smallest limit of locked memory that a tracker needs, bytes.
+const MIN_LOCKED_BYTES: u64 = 512 << 20;
+
+/// The files that the kernel shows, below `root` (`/`).
+#[derive(Debug, Clone)]
+pub struct Machine {
+    /// Folder that holds `proc`, `sys` and `dev`.
+    pub root: PathBuf,
+}
+
+impl Default for Machine {
+    fn default() -> Self {
+        Self { root: PathBuf::from("/") }
+    }
+}
+
+/// Looks at everything.
+pub fn examine(machine: &Machine, config: &Config) -> Vec<Finding> {
+    vec![
+        real_time_limit(config),
+        memory_limit(config),
+        machine.real_time_throttling(),
+        machine.governor(),
+        machine.clock_source(),
+        machine.cpus(),
+        shared_memory(),
+        runtime_folder(config),
+        machine.cameras(),
+    ]
+}
+
+fn wants_real_time(config: &Config) -> bool {
+    let processes = [&config.capture.scheduling, &config.tracker.scheduling];
+    processes.iter().any(|s| matches!(s.policy, Policy::Fifo | Policy::Deadline))
+}
+
+fn real_time_limit(config: &Config) -> Finding {
+    const SUBJECT: &str = "real-time limit";
+    let wanted =
+        u64::from(config.capture.scheduling.priority.max(config.tracker.scheduling.priority));
+    let limit = getrlimit(Resource::Rtprio).current;
+    let is_root = rustix::process::geteuid().is_root();
+    let found = limit.map_or("none".to_owned(), |limit| limit.to_string());
+    if is_root || limit.is_none_or(|limit| limit >= wanted) {
+        return Finding::ok(SUBJECT, if is_root { "root: any priority".to_owned() } else { found });
+    }
+    let remedy = format!(
+        "LimitRTPRIO={wanted} in the unit, or `{} - rtprio {wanted}` in /etc/security/limits.conf and a new login",
+        user()
+    );
+    let found = format!("priorities up to {found}, {wanted} wanted");
+    match wants_real_time(config) {
+        true => Finding::error(SUBJECT, found, remedy),
+        false => Finding::warning(SUBJECT, found, remedy),
+    }
+}
+
+fn memory_limit(config: &Config) -> Finding {
+    const SUBJECT: &str = "locked memory";
+    let limit = getrlimit(Resource::Memlock).current;
+    let is_root = rustix::process::geteuid().is_root();
+    if is_root || limit.is_none_or(|limit| limit >= MIN_LOCKED_BYTES) {
+        let found = if is_root { "root: no limit" } else { "enough" };
+        return Finding::ok(SUBJECT, found);
+    }
+    let remedy = format!(
+        "LimitMEMLOCK=infinity in the unit, or `{} - memlock unlimited` in /etc/security/limits.conf and a new login",
+        user()
+    );
+    let found = format!("{} MB may be locked", limit.unwrap_or(0) >> 20);
+    match config.tracker.scheduling.lock_memory {
+        true => Finding::error(SUBJECT, found, remedy),
+        false => Finding::warning(SUBJECT, found, remedy),
+    }
+}
+
+fn user() -> String {
+    std::env::var("USER").unwrap_or_else(|_| rustix::process::geteuid().as_raw().to_string())
+}
+
+fn shared_memory() -> Finding {
+    const SUBJECT: &str = "shared memory";
+    let needed = shared_memory_bytes(&LARGE_CAMERA, None);
+    match rustix::fs::statvfs(SHARED_MEMORY) {
+        Err(error) => Finding::error(
+            SUBJECT,
+            format!("{SHARED_MEMORY}: {error}"),
+            format!("mount -t tmpfs tmpfs {SHARED_MEMORY}"),
+        ),
+        Ok(stat) => {
+            let free = stat.f_bavail.saturating_mul(stat.f_frsize);
+            let found =
+                format!("{} MB free, {} MB needed for 1280x720", free >> 20, (needed >> 20) + 1);
+            if free >= needed {
+                return Finding::ok(SUBJECT, found);
+            }
+            Finding::warning(
+                SUBJECT,
+                found,
+                format!("mount -o remount,size={}M {SHARED_MEMORY}", (2 * needed) >> 20),
+            )
+        }
+    }
+}
+
+fn runtime_folder(config: &Config) -> Finding {
+    const SUBJECT: &str = "runtime folder";
+    let place = match Place::new(&config.instance, &config.root) {
+        Ok(place) => place,
+        Err(error) => {
+            return Finding::error(SUBJECT, error.to_string(), "set root in the configuration");
+        }
+    };
+    let existed = place.root.exists();
+    let made = place.create();
+    if !existed {
+        // Only a trial: what was not there is not there afterwards.
+        drop(fs::remove_dir(&place.root));
+    }
+    match made {
+        Ok(()) => Finding::ok(SUBJECT, place.root.display().to_string()),
+        Err(error) => Finding::error(
+            SUBJECT,
+            error.to_string(),
+            "run as the user who owns it, or set SEMIDENSE_ROOT to a folder of yours",
+        ),
+    }
+}
+
+impl Machine {
+    fn read(&self, path: &str) -> Option<String> {
+        Some(fs::read_to_string(self.root.join(path)).ok()?.trim().to_owned())
+    }
+
+    fn real_time_throttling(&self) -> Finding {
+        const SUBJECT: &str = "real-time throttling";
+        let number =
+            |name: &str| self.read(&format!("proc/sys/kernel/{name}"))?.parse::<i64>().ok();
+        match (number("sched_rt_runtime_us"), number("sched_rt_period_us")) {
+            (Some(runtime), Some(period)) if runtime >= 0 && runtime < period / 2 => {
+                Finding::warning(
+                    SUBJECT,
+                    format!("{runtime} of {period} µs for real-time processes"),
+                    "sysctl kernel.sched_rt_runtime_us=950000",
+                )
+            }
+            (Some(runtime), Some(period)) if runtime >= 0 => Finding::ok(
+                SUBJECT,
+                format!("{runtime} of {period} µs: enough, nothing here spins"),
+            ),
+            (Some(_), _) => Finding::ok(SUBJECT, "off"),
+            _ => Finding::ok(SUBJECT, "the kernel does not say"),
+        }
+    }
+
+    fn governor(&self) -> Finding {
+        const SUBJECT: &str = "CPU governor";
+        let path = "sys/devices/system/cpu/cpu0/cpufreq/scaling_governor";
+        match self.read(path).as_deref() {
+            None => Finding::ok(SUBJECT, "none: the clock does not change here"),
+            Some("performance") => Finding::ok(SUBJECT, "performance"),
+            Some(other) => Finding::warning(
+                SUBJECT,
+                format!("{other}: the first milliseconds after a pause are slow"),
+                "cpupower frequency-set -g performance",
+            ),
+        }
+    }
+
+    fn clock_source(&self) -> Finding {
+        const SUBJECT: &str = "clock source";
+        let folder = "sys/devices/system/clocksource/clocksource0";
+        let Some(current) = self.read(&format!("{folder}/current_clocksource")) else {
+            return Finding::ok(SUBJECT, "the kernel does not say");
+        };
+        let slow = ["hpet", "acpi_pm", "jiffies", "refined-jiffies"];
+        if !slow.contains(&current.as_str()) {
+            return Finding::ok(SUBJECT, current);
+        }
+        Finding::warning(
+            SUBJECT,
+            format!("{current}: every look at the clock costs a microsecond"),
+            format!(
+                "echo tsc > /{folder}/current_clocksource, or tsc=reliable on the kernel's command line"
+            ),
+        )
+    }
+
+    fn cpus(&self) -> Finding {
+        const SUBJECT: &str = "CPUs";
+        let count = std::thread::available_parallelism().map_or(1, usize::from);
+        let kernel = match self.read("sys/kernel/realtime").as_deref() {
+            Some("1") => "a real-time kernel",
+            _ => "no real-time kernel",
+        };
+        let found = format!("{count}, {kernel}");
+        if count >= 2 {
+            return Finding::ok(SUBJECT, found);
+        }
+        Finding::warning(SUBJECT, found, "give it two: the mapper takes one for itself")
+    }
+
+    fn cameras(&self) -> Finding {
+        const SUBJECT: &str = "cameras";
+        let folder = self.root.join("dev");
+        let is_camera =
+            |name: &str| name.strip_prefix("video").is_some_and(|n| n.parse::<u32>().is_ok());
+        let mut nodes: Vec<PathBuf> = fs::read_dir(folder)
+            .into_iter()
+            .flatten()
+            .flatten()
+            .filter(|entry| is_camera(&entry.file_name().to_string_lossy()))
+            .map(|entry| entry.path())
+            .collect();
+        nodes.sort();
+        let names = |nodes: &[&PathBuf]| {
+            let names: Vec<String> = nodes.iter().map(|n| n.display().to_string()).collect();
+            names.join(", ")
+        };
+        let closed: Vec<&PathBuf> = nodes.iter().filter(|node| !can_open(node)).collect();
+        if nodes.is_empty() {
+            return Finding::ok(SUBJECT, "none: recordings and the simulator work without");
+        }
+        if closed.is_empty() {
+            return Finding::ok(SUBJECT, names(&nodes.iter().collect::<Vec<_>>()));
+        }
+        Finding::warning(
+            SUBJECT,
+            format!("{} may not be opened", names(&closed)),
+            format!("usermod -aG video {}, and a new login", user()),
+        )
+    }
+}
+
+/// Whether this user may read and write it, without opening it: opening may wake a camera.
+fn can_open(path: &Path) -> bool {
+    use rustix::fs::{Access, access};
+    access(path, Access::READ_OK | Access::WRITE_OK).is_ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A machine whose kernel shows these files.
+    fn machine(files: &[(&str, &str)]) -> (tempfile::TempDir, Machine) {
+        let folder = tempfile::tempdir().unwrap();
+        for (path, text) in files {
+            let path = folder.path().join(path);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, text).unwrap();
+        }
+        let machine = Machine { root: folder.path().to_owned() };
+        (folder, machine)
+    }
+
+    #[test]
+    fn what_is_slow_is_found_with_its_remedy() {
+        let (_folder, machine) = machine(&[
+            ("sys/devices/system/cpu/cpu0/cpufreq/scaling_governor", "powersave\n"),
+            ("sys/devices/system/clocksource/clocksource0/current_clocksource", "hpet\n"),
+            ("proc/sys/kernel/sched_rt_runtime_us", "100000\n"),
+            ("proc/sys/kernel/sched_rt_period_us", "1000000\n"),
+        ]);
+        for finding in [machine.governor(), machine.clock_source(), machine.real_time_throttling()]
+        {
+            assert_eq!(finding.severity, Severity::Warning, "{finding:?}");
+            assert!(!finding.remedy.is_empty());
+        }
+        assert!(machine.governor().found.contains("powersave"));
+    }
+
+    #[test]
+    fn a_machine_as_it_should_be_has_no_remedies() {
+        let (_folder, machine) = machine(&[
+            ("sys/devices/system/cpu/cpu0/cpufreq/scaling_governor", "performance"),
+            ("sys/devices/system/clocksource/clocksource0/current_clocksource", "tsc"),
+            ("proc/sys/kernel/sched_rt_runtime_us", "950000"),
+            ("proc/sys/kernel/sched_rt_period_us", "1000000"),
+            ("dev/video0", ""),
+            ("dev/video-camera", ""),
+        ]);
+        for finding in [
+            machine.governor(),
+            machine.clock_source(),
+            machine.real_time_throttling(),
+            machine.cameras(),
+        ] {
+            assert_eq!(finding.severity, Severity::Ok, "{finding:?}");
+        }
+        assert!(machine.cameras().found.ends_with("dev/video0"));
+    }
+
+    #[test]
+    fn a_kernel_that_shows_nothing_is_no_fault() {
+        let (_folder, machine) = machine(&[]);
+        let findings = [machine.governor(), machine.clock_source(), machine.cameras()];
+        assert!(findings.iter().all(|finding| finding.severity == Severity::Ok));
+    }
+
+    #[test]
+    fn the_examination_leaves_nothing_behind() {
+        let folder = tempfile::tempdir().unwrap();
+        let root = folder.path().join("root");
+        let config = Config { root: root.display().to_string(), ..Config::default() };
+        let findings = examine(&Machine::default(), &config);
+        assert!(findings.len() >= 9 && !root.exists());
+        let foreign = Config { root: "/proc/nowhere".to_owned(), ..Config::default() };
+        assert_eq!(runtime_folder(&foreign).severity, Severity::Error);
+    }
+}

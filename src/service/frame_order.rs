@@ -1,0 +1,117 @@
+//! The order of frames as they arrive: what is missing, repeated or out of order, and how far apart they are.
+
+use crate::wire::message::FrameHeader;
+
+/// Distance of two frames before any is known: 30 Hz.
+const FIRST_PERIOD_NANOS: i64 = 33_000_000;
+/// Distances that cameras have: from 1000 Hz to one in five seconds. What lies outside is a jump of the
+/// source's clock.
+const PERIODS_NANOS: std::ops::RangeInclusive<i64> = 1_000_000..=5_000_000_000;
+/// So many frames in a row that seem repeated are a source that counts anew.
+const RENUMBERED_FRAMES: u32 = 10;
+
+/// What a frame is to the one before.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Arrival {
+    /// It comes after it; so many are missing between.
+    Next {
+        /// Frames that did not arrive.
+        missing: u64,
+    },
+    /// It comes after it, but the source's clock has jumped.
+    ClockJump,
+    /// It is the same again, or an older one: not to be used.
+    Repeated,
+    /// The source counts anew.
+    Renumbered,
+}
+
+/// Follows the frames of one source.
+#[derive(Debug, Clone, Default)]
+pub struct FrameOrder {
+    last: Option<(u64, i64)>,
+    period_nanos: Option<i64>,
+    repeated: u32,
+}
+
+impl FrameOrder {
+    /// Time between two frames, by the stamps of the last two.
+    pub fn period_nanos(&self) -> i64 {
+        self.period_nanos.unwrap_or(FIRST_PERIOD_NANOS)
+    }
+
+    /// Says what the next frame is. Hostile numbers are as good as any.
+    pub fn arrive(&mut self, header: &FrameHeader) -> Arrival {
+        let (sequence, stamp) = (header.sequence, header.capture_nanos);
+        let Some((last_sequence, last_stamp)) = self.last else {
+            self.last = Some((sequence, stamp));
+            return Arrival::Next { missing: 0 };
+        };
+        if sequence <= last_sequence {
+            self.repeated += 1;
+            if self.repeated < RENUMBERED_FRAMES {
+                return Arrival::Repeated;
+            }
+            (self.last, self.repeated) = (Some((sequence, stamp)), 0);
+            return Arrival::Renumbered;
+        }
+        (self.last, self.repeated) = (Some((sequence, stamp)), 0);
+        let frames = sequence - last_sequence;
+        let period = i64::try_from(frames)
+            .ok()
+            .and_then(|frames| stamp.checked_sub(last_stamp)?.checked_div(frames));
+        match period.filter(|period| PERIODS_NANOS.contains(period)) {
+            Some(period) => {
+                self.period_nanos = Some(period);
+                Arrival::Next { missing: frames - 1 }
+            }
+            None => Arrival::ClockJump,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn frame(sequence: u64, millis: i64) -> FrameHeader {
+        FrameHeader { sequence, capture_nanos: millis * 1_000_000, ..FrameHeader::default() }
+    }
+
+    #[test]
+    fn holes_and_distances_are_found() {
+        let mut order = FrameOrder::default();
+        assert_eq!(order.arrive(&frame(7, 0)), Arrival::Next { missing: 0 });
+        assert_eq!(order.arrive(&frame(8, 20)), Arrival::Next { missing: 0 });
+        assert_eq!(order.period_nanos(), 20_000_000);
+        assert_eq!(order.arrive(&frame(11, 80)), Arrival::Next { missing: 2 });
+        assert_eq!(order.period_nanos(), 20_000_000);
+    }
+
+    #[test]
+    fn repeated_frames_are_refused_until_the_source_counts_anew() {
+        let mut order = FrameOrder::default();
+        order.arrive(&frame(100, 0));
+        assert_eq!(order.arrive(&frame(100, 0)), Arrival::Repeated);
+        assert_eq!(order.arrive(&frame(99, 50)), Arrival::Repeated);
+        assert_eq!(order.arrive(&frame(101, 33)), Arrival::Next { missing: 0 });
+        let mut arrivals = (0..10).map(|i| order.arrive(&frame(i, 1000 + 33 * i as i64)));
+        assert!(arrivals.by_ref().take(9).all(|arrival| arrival == Arrival::Repeated));
+        assert_eq!(arrivals.next(), Some(Arrival::Renumbered));
+        assert_eq!(order.arrive(&frame(10, 1330)), Arrival::Next { missing: 0 });
+    }
+
+    #[test]
+    fn jumps_of_the_clock_do_not_become_a_period() {
+        let mut order = FrameOrder::default();
+        order.arrive(&frame(0, 0));
+        order.arrive(&frame(1, 40));
+        assert_eq!(order.arrive(&frame(2, 3_600_000)), Arrival::ClockJump);
+        assert_eq!(order.arrive(&frame(3, -5)), Arrival::ClockJump);
+        assert_eq!(order.period_nanos(), 40_000_000);
+        let hostile = FrameHeader { sequence: u64::MAX, capture_nanos: i64::MAX, ..frame(0, 0) };
+        assert_eq!(order.arrive(&hostile), Arrival::ClockJump);
+        let back = FrameHeader { sequence: u64::MAX, capture_nanos: i64::MIN, ..frame(0, 0) };
+        assert_eq!(order.arrive(&back), Arrival::Repeated);
+    }
+}

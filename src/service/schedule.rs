@@ -1,0 +1,389 @@
+//! What a process asks of the kernel: policy and priority, CPUs, locked and touched memory, timer
+//! slack. What is refused is a warning that names the limit to raise; the process goes on without.
+
+use std::mem::MaybeUninit;
+use std::num::NonZeroU64;
+
+use rustix::mm::MlockAllFlags;
+use rustix::thread::CpuSet;
+use serde::{Deserialize, Serialize};
+
+use crate::slam::parameter::{ParameterError, check_range};
+
+/// How the kernel chooses when the frame loop runs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Policy {
+    /// As whoever started the process set it: a unit, chrt, or nobody.
+    #[default]
+    Inherit,
+    /// Shared with everybody (SCHED_OTHER).
+    Other,
+    /// Before everything of lower priority (SCHED_FIFO).
+    Fifo,
+    /// A guaranteed share of every period (SCHED_DEADLINE).
+    Deadline,
+}
+
+/// What a process asks of the kernel for its frame loop.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SchedulingParams {
+    /// inherit, other, fifo or deadline. Inherit leaves what the systemd unit or chrt has set.
+    pub policy: Policy,
+    /// Priority of fifo, 1 to 99. Above the kernel's threaded interrupts (50) nothing else waits; capture
+    /// comes before the tracker, or its frames would be late.
+    pub priority: u32,
+    /// Computing time within each period, milliseconds, of deadline.
+    pub runtime_ms: f64,
+    /// Period of deadline, milliseconds: at most the time between two frames.
+    pub period_ms: f64,
+    /// CPUs that the frame loop may use, from 0; empty leaves them all. Deadline takes no CPUs.
+    pub cpus: Vec<usize>,
+    /// Whether all memory, also what comes later, stays in RAM (mlockall): no page fault in the loop.
+    pub lock_memory: bool,
+    /// How late the kernel may wake from a timed sleep, microseconds; 0 leaves the usual 50.
+    pub timer_slack_us: u64,
+}
+
+impl Default for SchedulingParams {
+    fn default() -> Self {
+        Self {
+            policy: Policy::Inherit,
+            priority: 70,
+            runtime_ms: 10.0,
+            period_ms: 33.0,
+            cpus: Vec::new(),
+            lock_memory: false,
+            timer_slack_us: 0,
+        }
+    }
+}
+
+/// CPUs that the kernel's set of CPUs holds.
+const MAX_CPU: usize = CpuSet::MAX_CPU;
+
+impl SchedulingParams {
+    /// Checks every value.
+    pub fn validate(&self) -> Result<(), ParameterError> {
+        check_range("priority", self.priority, 1..=99)?;
+        check_range("runtime_ms", self.runtime_ms, 0.1..=1000.0)?;
+        check_range("period_ms", self.period_ms, self.runtime_ms..=1000.0)?;
+        for &cpu in &self.cpus {
+            check_range("cpus", cpu, 0..=MAX_CPU - 1)?;
+        }
+        check_range("timer_slack_us", self.timer_slack_us, 0..=1_000_000)
+    }
+}
+
+/// What the kernel refused; says which limit to raise.
+#[derive(Debug, thiserror::Error, Clone, PartialEq, Eq)]
+pub enum Refusal {
+    /// No real-time policy.
+    #[error(
+        "{policy} scheduling refused ({reason}): raise RLIMIT_RTPRIO to {priority} (LimitRTPRIO= in the unit, rtprio in /etc/security/limits.conf)"
+    )]
+    RealTime {
+        /// Which policy.
+        policy: &'static str,
+        /// Which priority.
+        priority: u32,
+        /// What the kernel says.
+        reason: String,
+    },
+    /// No deadline policy.
+    #[error(
+        "deadline scheduling refused ({reason}): it needs CAP_SYS_NICE (AmbientCapabilities= in the unit), no CPU list, and a free share of the CPUs"
+    )]
+    Deadline {
+        /// What the kernel says.
+        reason: String,
+    },
+    /// Not these CPUs.
+    #[error(
+        "CPUs {cpus:?} refused ({reason}): name CPUs that exist and that the unit's CPUAffinity= allows"
+    )]
+    Cpus {
+        /// Which.
+        cpus: Vec<usize>,
+        /// What the kernel says.
+        reason: String,
+    },
+    /// Memory cannot be locked.
+    #[error(
+        "locking memory refused ({reason}): raise RLIMIT_MEMLOCK (LimitMEMLOCK=infinity in the unit, memlock in /etc/security/limits.conf)"
+    )]
+    Memory {
+        /// What the kernel says.
+        reason: String,
+    },
+    /// No other timer slack.
+    #[error("timer slack refused ({reason}): leave timer_slack_us at 0")]
+    TimerSlack {
+        /// What the kernel says.
+        reason: String,
+    },
+}
+
+/// The scheduling that is in force, as the kernel tells it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct InForce {
+    /// Policy of the calling thread; `None` where it is none that we know.
+    pub policy: Option<Policy>,
+    /// Priority of FIFO, else 0.
+    pub priority: u32,
+    /// Whether some memory of the process is locked.
+    pub memory_locked: bool,
+}
+
+/// Policy numbers of the kernel (linux/sched.h).
+const SCHED_OTHER: u32 = 0;
+const SCHED_FIFO: u32 = 1;
+const SCHED_DEADLINE: u32 = 6;
+/// Threads that are made later do not inherit the policy (linux/sched.h).
+const SCHED_FLAG_RESET_ON_FORK: u64 = 1;
+
+/// `struct sched_attr` of sched_setattr(2), its first version.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default)]
+struct SchedAttr {
+    size: u32,
+    policy: u32,
+    flags: u64,
+    nice: i32,
+    priority: u32,
+    runtime: u64,
+    deadline: u64,
+    period: u64,
+}
+
+/// Applies `params` to the calling thread (memory: to the process), and gives what was refused. Threads
+/// that are made later run as SCHED_OTHER on the same CPUs.
+pub fn apply(params: &SchedulingParams) -> Vec<Refusal> {
+    let mut refusals = Vec::new();
+    // Memory first: under FIFO the touching of new pages would hold up everybody else.
+    if params.lock_memory {
+        let flags = MlockAllFlags::CURRENT | MlockAllFlags::FUTURE;
+        match rustix::mm::mlockall(flags) {
+            Ok(()) => touch_stack(),
+            Err(error) => refusals.push(Refusal::Memory { reason: error.to_string() }),
+        }
+    }
+    if let Some(slack) = NonZeroU64::new(params.timer_slack_us.saturating_mul(1000))
+        && let Err(error) = rustix::thread::set_current_timer_slack(Some(slack))
+    {
+        refusals.push(Refusal::TimerSlack { reason: error.to_string() });
+    }
+    if !params.cpus.is_empty() {
+        let mut set = CpuSet::new();
+        params.cpus.iter().filter(|&&cpu| cpu < MAX_CPU).for_each(|&cpu| set.set(cpu));
+        if let Err(error) = rustix::thread::sched_setaffinity(None, &set) {
+            refusals.push(Refusal::Cpus { cpus: params.cpus.clone(), reason: error.to_string() });
+        }
+    }
+    refusals.extend(apply_policy(params).err());
+    refusals
+}
+
+fn apply_policy(params: &SchedulingParams) -> Result<(), Refusal> {
+    let nanos = |millis: f64| (millis * 1e6) as u64;
+    let size = size_of::<SchedAttr>() as u32;
+    let attributes = match params.policy {
+        Policy::Inherit => return Ok(()),
+        Policy::Other => SchedAttr { size, policy: SCHED_OTHER, ..SchedAttr::default() },
+        Policy::Fifo => SchedAttr {
+            size,
+            policy: SCHED_FIFO,
+            flags: SCHED_FLAG_RESET_ON_FORK,
+            priority: params.priority,
+            ..SchedAttr::default()
+        },
+        Policy::Deadline => SchedAttr {
+            size,
+            policy: SCHED_DEADLINE,
+            flags: SCHED_FLAG_RESET_ON_FORK,
+            runtime: nanos(params.runtime_ms),
+            deadline: nanos(params.period_ms),
+            period: nanos(params.period_ms),
+            ..SchedAttr::default()
+        },
+    };
+    set_attributes(&attributes).map_err(|error| {
+        let reason = error.to_string();
+        match params.policy {
+            Policy::Deadline => Refusal::Deadline { reason },
+            Policy::Other => Refusal::RealTime { policy: "other", priority: 0, reason },
+            _ => Refusal::RealTime { policy: "FIFO", priority: params.priority, reason },
+        }
+    })
+}
+
+fn set_attributes(attributes: &SchedAttr) -> std::io::Result<()> {
+    const NO_FLAGS: libc::c_uint = 0;
+    const THIS_THREAD: libc::pid_t = 0;
+    // SAFETY: the kernel reads `size` bytes from a struct that is `#[repr(C)]` and of that size.
+    let result = unsafe {
+        libc::syscall(
+            libc::SYS_sched_setattr,
+            THIS_THREAD,
+            std::ptr::from_ref(attributes),
+            NO_FLAGS,
+        )
+    };
+    if result == 0 { Ok(()) } else { Err(std::io::Error::last_os_error()) }
+}
+
+/// The scheduling of the calling thread, as the kernel tells it.
+pub fn in_force() -> InForce {
+    let mut attributes = SchedAttr::default();
+    const NO_FLAGS: libc::c_uint = 0;
+    const THIS_THREAD: libc::pid_t = 0;
+    let size = size_of::<SchedAttr>() as libc::c_uint;
+    // SAFETY: the kernel writes at most `size` bytes to a struct of that size whose every bit pattern is
+    // valid.
+    let result = unsafe {
+        libc::syscall(
+            libc::SYS_sched_getattr,
+            THIS_THREAD,
+            std::ptr::from_mut(&mut attributes),
+            size,
+            NO_FLAGS,
+        )
+    };
+    let policy = match attributes.policy {
+        _ if result != 0 => None,
+        SCHED_OTHER => Some(Policy::Other),
+        SCHED_FIFO => Some(Policy::Fifo),
+        SCHED_DEADLINE => Some(Policy::Deadline),
+        _ => None,
+    };
+    let priority = if policy == Some(Policy::Fifo) { attributes.priority } else { 0 };
+    InForce { policy, priority, memory_locked: locked_kilobytes().is_some_and(|kb| kb > 0) }
+}
+
+/// Memory of this process that is locked, from the kernel's own account.
+fn locked_kilobytes() -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find_map(|line| line.strip_prefix("VmLck:"))?;
+    line.split_whitespace().next()?.parse().ok()
+}
+
+/// Touches the stack that the frame loop will use, so that its pages are there.
+fn touch_stack() {
+    /// More than the deepest call of a frame takes, far less than the 8 MB that a main thread has.
+    const STACK_BYTES: usize = 256 << 10;
+    let stack = [MaybeUninit::<u8>::zeroed(); STACK_BYTES];
+    std::hint::black_box(&stack);
+}
+
+/// What the calling thread has used so far.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct ThreadUsage {
+    /// Page faults, with and without input.
+    pub page_faults: u64,
+    /// Times that it gave up the CPU by itself: sleeps and waits.
+    pub waits: u64,
+    /// Times that the kernel took the CPU away.
+    pub preemptions: u64,
+}
+
+/// The usage of the calling thread. One call to the kernel, no allocation.
+pub fn thread_usage() -> ThreadUsage {
+    usage(libc::RUSAGE_THREAD).map_or(ThreadUsage::default(), |usage| {
+        let count = |value: libc::c_long| u64::try_from(value).unwrap_or(0);
+        ThreadUsage {
+            page_faults: count(usage.ru_minflt) + count(usage.ru_majflt),
+            waits: count(usage.ru_nvcsw),
+            preemptions: count(usage.ru_nivcsw),
+        }
+    })
+}
+
+/// Largest resident memory of this process so far; `None` where the kernel does not say. One call to the
+/// kernel, no allocation.
+pub fn peak_rss_bytes() -> Option<u64> {
+    const BYTES_PER_KB: u64 = 1024;
+    u64::try_from(usage(libc::RUSAGE_SELF)?.ru_maxrss).ok()?.checked_mul(BYTES_PER_KB)
+}
+
+fn usage(who: libc::c_int) -> Option<libc::rusage> {
+    let mut usage = MaybeUninit::<libc::rusage>::zeroed();
+    // SAFETY: the kernel fills the struct it is given; all its fields are integers, so that zeros are
+    // valid already.
+    unsafe { (libc::getrusage(who, usage.as_mut_ptr()) == 0).then(|| usage.assume_init()) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Runs it in a thread of its own: the test runner's others keep their scheduling.
+    fn in_thread<T: Send + 'static>(run: impl FnOnce() -> T + Send + 'static) -> T {
+        std::thread::spawn(run).join().unwrap()
+    }
+
+    #[test]
+    fn what_is_asked_for_is_in_force_or_refused_with_its_limit() {
+        let asked = SchedulingParams { policy: Policy::Fifo, priority: 42, ..Default::default() };
+        let (refusals, found) = in_thread(move || (apply(&asked), in_force()));
+        match refusals.first() {
+            None => assert_eq!((found.policy, found.priority), (Some(Policy::Fifo), 42)),
+            Some(refusal) => {
+                assert!(refusal.to_string().contains("LimitRTPRIO"), "{refusal}");
+                assert_eq!(found.policy, Some(Policy::Other));
+            }
+        }
+    }
+
+    #[test]
+    fn threads_of_a_real_time_thread_are_ordinary() {
+        let asked = SchedulingParams { policy: Policy::Fifo, ..Default::default() };
+        let found = in_thread(move || {
+            apply(&asked);
+            in_thread(in_force)
+        });
+        assert_eq!(found.policy, Some(Policy::Other));
+    }
+
+    #[test]
+    fn cpus_are_chosen_or_refused() {
+        let asked = SchedulingParams { cpus: vec![0], ..Default::default() };
+        let (refusals, cpu) = in_thread(move || (apply(&asked), rustix::thread::sched_getcpu()));
+        assert!(!refusals.is_empty() || cpu == 0, "runs on {cpu}");
+        let absent = SchedulingParams { cpus: vec![MAX_CPU - 1], ..Default::default() };
+        let refusals = in_thread(move || apply(&absent));
+        assert!(refusals[0].to_string().contains("CPUAffinity"), "{refusals:?}");
+    }
+
+    #[test]
+    fn nothing_is_changed_unless_asked() {
+        let (before, refusals, after) =
+            in_thread(|| (in_force(), apply(&SchedulingParams::default()), in_force()));
+        assert_eq!((refusals, before), (Vec::new(), after));
+    }
+
+    #[test]
+    fn page_faults_are_counted() {
+        let (before, after) = in_thread(|| {
+            let before = thread_usage();
+            std::hint::black_box(vec![1_u8; 16 << 20]);
+            (before, thread_usage())
+        });
+        assert!(after.page_faults > before.page_faults, "{before:?} {after:?}");
+        assert!(peak_rss_bytes().unwrap() > 1 << 20);
+    }
+
+    #[test]
+    fn parameters_are_checked() {
+        assert!(SchedulingParams::default().validate().is_ok());
+        let wrong = |params: SchedulingParams| params.validate().unwrap_err().to_string();
+        assert!(
+            wrong(SchedulingParams { priority: 100, ..Default::default() }).contains("1 to 99")
+        );
+        assert!(
+            wrong(SchedulingParams { period_ms: 5.0, ..Default::default() }).contains("period")
+        );
+        let far = SchedulingParams { cpus: vec![9999], ..Default::default() };
+        assert!(wrong(far).contains("cpus"));
+    }
+}

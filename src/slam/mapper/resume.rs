@@ -1,0 +1,62 @@
+//! What of the map a mapper needs to go on after its death, and how it goes on.
+
+use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::mapper::recovery::restore_points;
+use crate::slam::mapper::{Map, Mapper, StepOutcome};
+
+impl Mapper {
+    /// The keyframe in force with its image and depth, and the poses of the others of its epoch; `None`
+    /// where there is no established keyframe to go on from.
+    pub fn checkpoint(&self) -> Option<Map> {
+        let in_force = self.keyframe()?;
+        if in_force.map_state != MapState::Established {
+            return None;
+        }
+        let of_epoch = self.map.keyframes.iter().filter(|k| k.epoch == in_force.epoch);
+        let keyframes = of_epoch.map(|keyframe| match std::ptr::eq(keyframe, in_force) {
+            true => keyframe.clone(),
+            false => Keyframe { image: Vec::new(), points: Vec::new(), ..*keyframe },
+        });
+        Some(Map { keyframes: keyframes.collect() })
+    }
+
+    /// Takes over from the mapper of another camera: its keyframes stay in the map, and epochs, ids and
+    /// revisions go on.
+    pub fn succeed(&mut self, before: Self) {
+        self.map = before.map;
+        self.revision = before.revision;
+        self.next_keyframe_id = before.next_keyframe_id;
+    }
+
+    /// Goes on from a checkpoint: its keyframe is in force again, the epoch and all ids go on. Does nothing
+    /// with a map that this camera cannot have made.
+    pub fn resume(&mut self, map: Map) -> StepOutcome {
+        let fits = |keyframe: &Keyframe| {
+            keyframe.intrinsics == self.intrinsics
+                && keyframe.image.len() == self.intrinsics.width * self.intrinsics.height
+                && !keyframe.points.is_empty()
+                && keyframe.map_state == MapState::Established
+        };
+        let Some(index) = map.keyframes.iter().rposition(fits) else {
+            return StepOutcome::default();
+        };
+        let newest = |number: fn(&Keyframe) -> u64| map.keyframes.iter().map(number).max();
+        self.revision = newest(|keyframe| keyframe.revision).unwrap_or(0).saturating_add(1);
+        self.next_keyframe_id =
+            newest(|keyframe| keyframe.keyframe_id).map_or(0, |id| id.saturating_add(1));
+        self.map = map;
+        let (min_gradient, max_candidates) = (self.params.min_gradient, self.params.max_candidates);
+        let keyframe = &mut self.map.keyframes[index];
+        keyframe.revision = self.revision;
+        self.depth.restart(&keyframe.image, min_gradient, max_candidates);
+        restore_points(&mut self.depth, &keyframe.points);
+        self.past.clear();
+        self.enter_keyframe(index);
+        StepOutcome {
+            keyframe_restored: true,
+            keyframe_changed: true,
+            graph_changed: true,
+            ..Default::default()
+        }
+    }
+}

@@ -1,0 +1,306 @@
+//! The tracker's frame loop as it runs in its process: once warm, it allocates nothing, touches no new page,
+//! and gives up its CPU only to wait for the next frame. What iceoryx2 itself allocates is counted apart:
+//! the same calls to shared memory without a tracker.
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+use std::fs;
+use std::io::Write;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use semidense::service::clock::now_nanos;
+use semidense::service::config::Config;
+use semidense::service::mode::Mode;
+use semidense::service::schedule::in_force;
+use semidense::service::shutdown::Shutdown;
+use semidense::service::tracker;
+use semidense::slam::frame::FrameView;
+use semidense::slam::geometry::intrinsics::Intrinsics;
+use semidense::slam::geometry::sim3::Sim3;
+use semidense::slam::keyframe::{DepthPoint, Keyframe, MapState};
+use semidense::slam::pose::PoseEstimate;
+use semidense::wire::conversion::{
+    keyframe_header, keyframe_image_header, pose_from_message, pose_message,
+};
+use semidense::wire::message::{
+    FrameHeader, HealthMessage, KeyframeHeader, KeyframeImageHeader, PoseMessage,
+};
+use semidense::wire::place::Place;
+use semidense::wire::port::{Access, Hub, Publisher, Subscriber, wait};
+use semidense::wire::topic::{FRAME, KEYFRAME, KEYFRAME_IMAGE, POSE, TRACKER_HEALTH};
+
+/// The system's allocator, counting in the threads that ask for it.
+struct Counting;
+
+static ALLOCATIONS: AtomicU64 = AtomicU64::new(0);
+
+thread_local! {
+    static IS_COUNTED: Cell<bool> = const { Cell::new(false) };
+}
+
+fn count() {
+    // A thread that ends has no locals any more.
+    if IS_COUNTED.try_with(Cell::get).unwrap_or(false) {
+        ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
+    }
+}
+
+// SAFETY: every call goes to the system's allocator unchanged.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        count();
+        // SAFETY: the caller's contract.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: the caller's contract.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+
+    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        count();
+        // SAFETY: the caller's contract.
+        unsafe { System.realloc(pointer, layout, size) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+const CAMERA: Intrinsics =
+    Intrinsics { fx: 260.0, fy: 260.0, cx: 159.5, cy: 119.5, width: 320, height: 240 };
+/// Frames until everything has been touched.
+const WARM_UP: u64 = 150;
+/// Frames that are counted.
+const COUNTED: u64 = 300;
+/// Pause between two frames: the loop must wait for each.
+const PAUSE: Duration = Duration::from_millis(2);
+/// Page faults that are allowed where the system refuses to lock memory.
+const UNLOCKED_PAGE_FAULTS: u64 = 20;
+/// Far above anything that is expected: it ends a test that hangs.
+const WATCH_DOG: Duration = Duration::from_secs(120);
+
+/// Smooth waves, shifted by `shift` pixels.
+fn image(shift: f64) -> Vec<u8> {
+    let grey = |u: usize, v: usize| {
+        let (u, v) = (u as f64 - shift, v as f64);
+        128.0 + 40.0 * (u * 0.19).sin() * (v * 0.13).cos() + 30.0 * (0.07 * u + 0.11 * v).sin()
+    };
+    (0..CAMERA.width * CAMERA.height)
+        .map(|i| grey(i % CAMERA.width, i / CAMERA.width) as u8)
+        .collect()
+}
+
+fn keyframe() -> Keyframe {
+    let image = image(0.0);
+    let pixels = (2..CAMERA.height - 2).flat_map(|v| (2..CAMERA.width - 2).map(move |u| (u, v)));
+    let points = pixels.map(|(u, v)| DepthPoint {
+        u: u as u16,
+        v: v as u16,
+        inverse_depth: 1.0,
+        variance: 1e-3,
+        intensity: f32::from(image[v * CAMERA.width + u]),
+    });
+    Keyframe {
+        keyframe_id: 0,
+        epoch: 0,
+        revision: 0,
+        sequence: 0,
+        capture_nanos: 0,
+        map_state: MapState::Established,
+        world_from_keyframe: Sim3::identity(),
+        intrinsics: CAMERA,
+        points: points.collect(),
+        image,
+    }
+}
+
+fn header(sequence: u64) -> FrameHeader {
+    let now = now_nanos();
+    FrameHeader {
+        sequence,
+        capture_nanos: now,
+        clock_nanos: now,
+        sent_nanos: now,
+        exposure_nanos: 0,
+        intrinsics: [CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy],
+        width: CAMERA.width as u32,
+        height: CAMERA.height as u32,
+        stride: CAMERA.width as u32,
+        gain: 0.0,
+    }
+}
+
+/// What stands for capture and mapper.
+struct Others {
+    frames: Publisher<u8, FrameHeader>,
+    poses: Subscriber<PoseMessage, ()>,
+    health: Subscriber<HealthMessage, ()>,
+    reports: u64,
+    images: [Vec<u8>; 4],
+    sequence: u64,
+    tracked: u64,
+    _hub: Hub,
+    _keyframe: (Publisher<DepthPoint, KeyframeHeader>, Publisher<u8, KeyframeImageHeader>),
+}
+
+impl Others {
+    fn new(place: &Place) -> Self {
+        let hub = Hub::join(place, "others", Access::Member).unwrap();
+        let keyframe = keyframe();
+        let depths = hub.publisher(&KEYFRAME, keyframe.points.len()).unwrap();
+        let images = hub.publisher(&KEYFRAME_IMAGE, keyframe.image.len()).unwrap();
+        images.send(keyframe_image_header(&keyframe), &keyframe.image).unwrap();
+        depths.send(keyframe_header(&keyframe), &keyframe.points).unwrap();
+        Self {
+            frames: hub.publisher(&FRAME, CAMERA.width * CAMERA.height).unwrap(),
+            poses: hub.subscriber(&POSE).unwrap(),
+            health: hub.subscriber(&TRACKER_HEALTH).unwrap(),
+            reports: 0,
+            images: std::array::from_fn(|i| image(0.3 * i as f64)),
+            sequence: 0,
+            tracked: 0,
+            _hub: hub,
+            _keyframe: (depths, images),
+        }
+    }
+
+    /// Sends frame after frame until `count` have had their pose.
+    fn send(&mut self, count: u64) {
+        let (mut answered, start) = (0, Instant::now());
+        while answered < count {
+            assert!(start.elapsed() < WATCH_DOG, "no poses come");
+            self._keyframe.0.serve_late_joiners();
+            self._keyframe.1.serve_late_joiners();
+            self.sequence += 1;
+            let image = &self.images[self.sequence as usize % self.images.len()];
+            self.frames.send(header(self.sequence), image).unwrap();
+            wait(&[self.poses.events()], None, Duration::from_millis(50)).unwrap();
+            while let Some(message) = self.poses.receive().unwrap() {
+                let pose = pose_from_message(&message.payload()[0]).unwrap();
+                self.tracked += u64::from(pose.state.is_tracked());
+                answered += 1;
+            }
+            while self.health.receive().unwrap().is_some() {
+                self.reports += 1;
+            }
+            std::thread::sleep(PAUSE);
+        }
+    }
+}
+
+/// The calls to shared memory of a frame loop that tracks nothing.
+fn echo(place: &Place, shutdown: &Shutdown) {
+    let hub = Hub::join(place, "tracker", Access::Member).unwrap();
+    let frames: Subscriber<u8, FrameHeader> = hub.subscriber(&FRAME).unwrap();
+    let poses: Publisher<PoseMessage, ()> = hub.publisher(&POSE, 1).unwrap();
+    let view = FrameView {
+        sequence: 0,
+        capture_nanos: 0,
+        exposure_nanos: 0,
+        width: 1,
+        height: 1,
+        pixels: &[0],
+    };
+    let lost = PoseEstimate::unknown(&view);
+    let message = pose_message(&lost, &Default::default());
+    while !shutdown.is_requested() {
+        wait(&[frames.events()], Some(shutdown.descriptor()), Duration::from_millis(100)).unwrap();
+        poses.serve_late_joiners();
+        while let Some(_frame) = frames.newest().unwrap() {
+            poses.send((), &[message]).unwrap();
+        }
+    }
+}
+
+/// What a thread has done.
+#[derive(Debug, Clone, Copy)]
+struct Cost {
+    allocations: u64,
+    page_faults: u64,
+    waits: u64,
+}
+
+impl Cost {
+    /// So far, of the thread `tid`, by the kernel's account.
+    fn of(tid: i32) -> Self {
+        let read = |file| fs::read_to_string(format!("/proc/self/task/{tid}/{file}")).unwrap();
+        let stat = read("stat");
+        // Behind the name, which may hold anything: state is field 3, minor and major faults are 10 and 12.
+        let fields: Vec<&str> = stat.rsplit_once(')').unwrap().1.split_whitespace().collect();
+        let field = |number: usize| fields[number - 3].parse::<u64>().unwrap();
+        let status = read("status");
+        let waits =
+            status.lines().find_map(|l| l.strip_prefix("voluntary_ctxt_switches:")).unwrap();
+        Self {
+            allocations: ALLOCATIONS.load(Ordering::SeqCst),
+            page_faults: field(10) + field(12),
+            waits: waits.trim().parse().unwrap(),
+        }
+    }
+
+    fn since(self, before: Self) -> Self {
+        Self {
+            allocations: self.allocations - before.allocations,
+            page_faults: self.page_faults - before.page_faults,
+            waits: self.waits - before.waits,
+        }
+    }
+}
+
+/// What `COUNTED` warm frames cost a loop that runs in a thread of its own, and how many of them were
+/// tracked.
+fn cost_of(run: impl FnOnce(&Place, &Shutdown) + Send + 'static) -> (Cost, u64) {
+    let folder = tempfile::tempdir().unwrap();
+    let place = Place::new("loop", folder.path().to_str().unwrap()).unwrap();
+    let theirs = place.clone();
+    let shutdown = Shutdown::install().unwrap();
+    let mut others = Others::new(&place);
+    let (tell, told) = std::sync::mpsc::channel();
+    let thread = std::thread::spawn(move || {
+        tell.send(rustix::thread::gettid().as_raw_nonzero().get()).unwrap();
+        IS_COUNTED.set(true);
+        run(&theirs, &shutdown);
+        IS_COUNTED.set(false);
+    });
+    others.send(WARM_UP);
+    let tid = told.recv().unwrap();
+    let (before, tracked, reports) = (Cost::of(tid), others.tracked, others.reports);
+    others.send(COUNTED);
+    let mut cost = Cost::of(tid).since(before);
+    // A report of its health costs the transport as much as a pose.
+    cost.allocations = cost.allocations.saturating_sub(others.reports - reports);
+    let tracked = others.tracked - tracked;
+    signal_hook::low_level::raise(signal_hook::consts::SIGTERM).unwrap();
+    thread.join().unwrap();
+    (cost, tracked)
+}
+
+#[test]
+fn the_loop_allocates_only_what_its_transport_does() {
+    let (of_transport, _) = cost_of(echo);
+    let (of_loop, tracked) = cost_of(|place, shutdown| {
+        let mut config = Config {
+            instance: place.instance.clone(),
+            root: place.root.display().to_string(),
+            ..Config::default()
+        };
+        // Frames come as fast as they are answered: half a period is no deadline.
+        config.tracker.deadline_ms = 1000.0;
+        config.tracker.scheduling.lock_memory = true;
+        tracker::run(&config, Mode::Live, shutdown).unwrap();
+    });
+    let line = format!(
+        "{COUNTED} frames: {of_loop:?} in the loop, {of_transport:?} in its transport alone"
+    );
+    // A closed standard error must not fail a test.
+    let _ = writeln!(std::io::stderr(), "{line}");
+    assert!(tracked > COUNTED / 2, "only {tracked} frames were tracked: this measures nothing");
+    assert!(of_loop.allocations <= of_transport.allocations, "{line}");
+    let allowed = if in_force().memory_locked { 0 } else { UNLOCKED_PAGE_FAULTS };
+    assert!(of_loop.page_faults <= allowed, "{line}");
+    // One wait a frame, and some that a stale wake-up has ended early.
+    assert!(of_loop.waits <= COUNTED + COUNTED / 5 + 20, "{line}");
+}
