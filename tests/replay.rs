@@ -56,6 +56,33 @@ fn given_poses_come_back_and_their_depth_is_judged() {
 }
 
 #[test]
+fn a_replay_says_what_a_budget_buys_and_what_the_covariance_is_worth() {
+    let folder = tempfile::tempdir().unwrap();
+    let arguments = ["sim", "--frames", "80", "--debug-images", "--json"];
+    let output = replay(&[&arguments[..], &HALF_SIZE].concat(), folder.path());
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let summary: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let column = |name: &str| -> Vec<f64> {
+        let values = summary["budget_curve"][name].as_array().unwrap();
+        values.iter().map(|value| value.as_f64().unwrap()).collect()
+    };
+    let (iterations, median) = (column("iterations"), column("displacement_px_p50"));
+    let most = column("displacement_px_p90");
+    assert_eq!(iterations[..5], [0.0, 1.0, 2.0, 3.0, 4.0]);
+    assert!(median[0] > 0.0 && median.last() < median.first(), "{median:?}");
+    assert!(median.iter().zip(&most).all(|(median, most)| median <= most), "{median:?} {most:?}");
+    assert!(summary["nees_frames"].as_u64().unwrap() > 40);
+    assert!(summary["nees_mean"].as_f64().unwrap() > 0.0);
+    let weights = folder.path().join("debug/keyframe-0000-weights.png");
+    assert!(std::fs::read(weights).unwrap().starts_with(b"\x89PNG"));
+    let report = std::fs::read_to_string(folder.path().join("report.html")).unwrap();
+    let (_, charts) = report.split_once("Quality and budget").expect("the section is there");
+    let (charts, _) = charts.split_once("</section>").unwrap();
+    assert_eq!(charts.matches("</svg>").count(), 2);
+    assert!(!charts.contains("NaN") && !charts.contains("nothing to show"));
+}
+
+#[test]
 fn what_cannot_be_replayed_is_one_clear_line() {
     let folder = tempfile::tempdir().unwrap();
     let empty = format!("tum:{}", folder.path().display());

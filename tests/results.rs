@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use semidense::capture::source::{FrameSource, FrameStamp, SourceError};
+use semidense::service::alignment_stamps::{AlignmentTrace, LevelTrace};
 use semidense::service::results::{
     RecordedPose, ResultsParams, RunMode, RunRecord, prepare_output, write_results,
 };
@@ -84,7 +85,21 @@ fn pose(i: usize, state: TrackingState, keyframe_id: u64) -> RecordedPose {
         estimate,
         latency_nanos: None,
         track_nanos: Some(1_000_000 * (i as u64 % 7 + 1)),
+        trace: (state != TrackingState::Initializing).then(|| trace(i)),
     }
+}
+
+/// Level 1 with 1000 points, 2 or 5 iterations of 3 µs.
+fn trace(i: usize) -> AlignmentTrace {
+    let iterations = if i.is_multiple_of(3) { 5 } else { 2 };
+    let mut trace = AlignmentTrace { pyramid_nanos: 50_000, ..AlignmentTrace::default() };
+    trace.levels[1] = LevelTrace {
+        points: 1000,
+        iterations,
+        timed_evaluations: iterations,
+        timed_nanos: 3_000 * u64::from(iterations),
+    };
+    trace
 }
 
 fn keyframe(keyframe_id: u64) -> Keyframe {
@@ -127,6 +142,7 @@ fn record(poses: Vec<RecordedPose>, keyframes: Vec<Keyframe>, with_truth: bool) 
         deadline_nanos: None,
         deadline_misses: None,
         map_nanos: vec![2_000_000; frames],
+        budget_samples: Vec::new(),
         recorded_nanos: 2_000_000_000,
         wall_nanos: 1_000_000_000,
         peak_rss_bytes: None,
@@ -176,6 +192,10 @@ fn figures_and_files_of_a_run_with_truth_and_a_loss() {
     }
     assert!((summary["initialization_secs"].as_f64().unwrap() - 0.1).abs() < 1e-6);
     assert_eq!(summary["track_ms"]["max"], 7.0);
+    assert_eq!(summary["pyramid_ms"]["p50"], 0.05);
+    let levels = serde_json::json!([{ "level": 1, "frames": 57, "points": 1000.0,
+        "iterations_median": 2.0, "iterations_mean": 3.0, "nanos_per_point": 3.0 }]);
+    assert_eq!(summary["alignment_levels"], levels);
     assert!(summary["latency_ms"].is_null() && summary["deadline_ms"].is_null());
     // The published poses are right to their scale; the final ones have the keyframe moved.
     assert!(summary["online"]["ate_rmse_m"].as_f64().unwrap() < 1e-9);

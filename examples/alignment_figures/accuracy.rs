@@ -20,6 +20,9 @@ pub struct Arguments {
     /// Standard deviation of the noise put on the inverse depth, share of it
     #[arg(long, default_value_t = 0.05)]
     depth_noise: f64,
+    /// Each point's noise is this to a power of -1 to 1 times that; 1 for all the same
+    #[arg(long, default_value_t = 1.0)]
+    noise_spread: f64,
     /// Smallest gradient of a keyframe's points, grey levels a pixel
     #[arg(long, default_value_t = 5.0)]
     min_gradient: f64,
@@ -45,6 +48,7 @@ pub fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
     };
     let choice = KeyframeChoice {
         depth_noise: arguments.depth_noise,
+        noise_spread: arguments.noise_spread,
         min_gradient: arguments.min_gradient,
         every: arguments.keyframe_every,
     };

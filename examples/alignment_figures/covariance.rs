@@ -92,7 +92,8 @@ fn run_cases(
         })?;
         let mut recorded = Recorded::new(Box::new(simulator), arguments.frames)?;
         for &depth_noise in case.depth_noises {
-            let choice = KeyframeChoice { depth_noise, min_gradient: 5.0, every: 0 };
+            let choice =
+                KeyframeChoice { depth_noise, noise_spread: 1.0, min_gradient: 5.0, every: 0 };
             for (params, all) in params.iter().zip(&mut all) {
                 let frames = track(&mut recorded, params, &choice)?;
                 let claimed = frames.iter().filter(|frame| frame.estimate.state.is_tracked());

@@ -4,9 +4,11 @@
 //! ```text
 //! cargo run --release --example alignment_figures -- accuracy tum:DIR
 //! cargo run --release --example alignment_figures -- covariance
+//! cargo run --release --example alignment_figures -- basin
 //! ```
 
 mod accuracy;
+mod basin;
 mod covariance;
 mod sequence;
 
@@ -27,12 +29,15 @@ enum Figure {
     Accuracy(accuracy::Arguments),
     /// Fits the inflation of the covariance on some simulated scenes and validates it on others.
     Covariance(covariance::Arguments),
+    /// Share of random starts that converge, by their distance, with and without depth variance.
+    Basin(basin::Arguments),
 }
 
 fn main() -> ExitCode {
     let outcome = match Arguments::parse().figure {
         Figure::Accuracy(arguments) => accuracy::run(&arguments),
         Figure::Covariance(arguments) => covariance::run(&arguments),
+        Figure::Basin(arguments) => basin::run(&arguments),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,

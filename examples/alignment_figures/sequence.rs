@@ -4,9 +4,10 @@ use std::collections::HashMap;
 use std::error::Error;
 use std::time::Instant;
 
-use nalgebra::{Matrix6, Vector6};
+use nalgebra::Vector6;
 use semidense::capture::source::{FrameSource, FrameStamp, SourceError};
 use semidense::slam::alignment::reference::Reference;
+use semidense::slam::evaluation::normalized_error::normalized;
 use semidense::slam::frame::FrameView;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
@@ -22,6 +23,8 @@ use semidense::slam::trajectory::StampedPose;
 pub struct KeyframeChoice {
     /// Standard deviation of the noise put on the inverse depth, share of it.
     pub depth_noise: f64,
+    /// The noise of each point is this to a uniform power of -1 to 1 times that; 1 for all the same.
+    pub noise_spread: f64,
     /// Smallest gradient of a point, grey levels a pixel.
     pub min_gradient: f64,
     /// A new keyframe after as many frames; 0 where the tracker proposes one.
@@ -46,40 +49,22 @@ pub struct TrackedFrame {
 impl TrackedFrame {
     /// Normalised squared errors of (all six, translation, rotation).
     pub fn normalized(&self) -> Option<[f64; 3]> {
-        let covariance = full(&self.estimate.covariance);
-        let all = self.error.dot(&(covariance.try_inverse()? * self.error));
-        let part = |start: usize| {
-            let block = covariance.fixed_view::<3, 3>(start, start).into_owned();
-            let error = self.error.fixed_rows::<3>(start).into_owned();
-            Some(error.dot(&(block.try_inverse()? * error)))
-        };
-        Some([all, part(0)?, part(3)?])
+        normalized(&self.error, &self.estimate.covariance)
     }
-}
-
-fn full(triangle: &[f64; 21]) -> Matrix6<f64> {
-    let mut matrix = Matrix6::zeros();
-    let mut entries = triangle.iter();
-    for row in 0..6 {
-        for column in row..6 {
-            let value = entries.next().copied().unwrap_or(0.0);
-            matrix[(row, column)] = value;
-            matrix[(column, row)] = value;
-        }
-    }
-    matrix
 }
 
 /// A small fixed generator (SplitMix64) of normal numbers.
-struct Noise(u64);
+pub struct Noise(pub u64);
 
 impl Noise {
-    fn normal(&mut self) -> f64 {
+    /// Standard normal.
+    pub fn normal(&mut self) -> f64 {
         let sum: f64 = (0..12).map(|_| self.uniform()).sum();
         sum - 6.0
     }
 
-    fn uniform(&mut self) -> f64 {
+    /// Uniform in [0, 1).
+    pub fn uniform(&mut self) -> f64 {
         self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
         let mut z = self.0;
         z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
@@ -113,6 +98,32 @@ impl Recorded {
         }
         let truth = source.ground_truth().to_vec();
         Ok(Self { source, frames, truth, depths: HashMap::new() })
+    }
+
+    /// The keyframe of frame `index`, at its true pose with depth as `choice` says; `None` without true depth
+    /// or pose.
+    pub fn keyframe(
+        &mut self,
+        index: usize,
+        choice: &KeyframeChoice,
+        noise: &mut Noise,
+    ) -> Result<Option<Keyframe>, Box<dyn Error>> {
+        let Some((stamp, pixels)) = self.frames.get(index).cloned() else { return Ok(None) };
+        let (depth, pose) = (self.depth_at(stamp.capture_nanos)?, self.true_pose(&stamp));
+        let (Some(depth), Some(pose)) = (depth, pose) else { return Ok(None) };
+        let intrinsics = self.source.intrinsics();
+        Ok(Some(make_keyframe(0, &stamp, &intrinsics, &pixels, &depth, pose, choice, noise)))
+    }
+
+    /// Pixels and true pose of a frame.
+    pub fn frame(&self, index: usize) -> Option<(&[u8], SE3)> {
+        let (stamp, pixels) = self.frames.get(index)?;
+        Some((pixels, self.true_pose(stamp)?))
+    }
+
+    fn true_pose(&self, stamp: &FrameStamp) -> Option<SE3> {
+        let nearest = self.truth.iter().min_by_key(|pose| (pose.nanos - stamp.capture_nanos).abs());
+        nearest.map(|pose| pose.world_from_camera)
     }
 
     fn depth_at(&mut self, nanos: i64) -> Result<Option<Image<f32>>, SourceError> {
@@ -235,7 +246,11 @@ fn make_keyframe(
     let mean = points.iter().map(|point| point.2).sum::<f64>() / points.len().max(1) as f64;
     let points = points.iter().map(|&(u, v, metric)| {
         let exact = metric / mean;
-        let std_dev = exact * choice.depth_noise;
+        let spread = match choice.noise_spread {
+            1.0 => 1.0,
+            spread => spread.powf(2.0 * noise.uniform() - 1.0),
+        };
+        let std_dev = exact * choice.depth_noise * spread;
         DepthPoint {
             u: u as u16,
             v: v as u16,

@@ -58,7 +58,8 @@ pub struct ReplayArgs {
     /// Where poses come from
     #[arg(long, value_enum, default_value_t)]
     poses: Poses,
-    /// Write pictures of every keyframe's inverse depth, variance and density into DIR/debug
+    /// Write pictures of every keyframe's inverse depth, variance, density and weights for three
+    /// motions into DIR/debug
     #[arg(long)]
     debug_images: bool,
     /// Stop after as many frames
@@ -97,7 +98,7 @@ pub fn run(config: &Config, args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error
     })?;
     let summary = write_results(&args.output, &record, source.as_mut(), &config.results)?;
     if args.debug_images {
-        write_debug_pictures(&args.output.join("debug"), &record.map)?;
+        write_debug_pictures(&args.output.join("debug"), &record.map, &config.tracking)?;
     }
     if args.json {
         print(&format!("{}\n", serde_json::to_string_pretty(&summary)?))?;

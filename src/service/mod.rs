@@ -1,5 +1,6 @@
 //! Process shells: clock, threads, scheduling, configuration, health, results; one loop a process.
 
+pub mod alignment_stamps;
 pub mod atomic_file;
 pub mod budget;
 pub mod capture;
@@ -15,6 +16,7 @@ pub mod pairing;
 pub mod peers;
 pub mod recorder;
 pub mod reference_feed;
+pub mod rehearsal;
 pub mod replay;
 pub mod results;
 pub mod shutdown;

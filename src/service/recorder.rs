@@ -84,6 +84,7 @@ impl Recorder {
                     estimate,
                     latency_nanos: Some(message.latency_nanos),
                     track_nanos: Some(message.track_nanos),
+                    trace: None,
                 });
             }
         }
@@ -137,6 +138,7 @@ impl Recorder {
             deadline_nanos: is_live.then_some(deadline_nanos),
             deadline_misses: is_live.then_some(counters.deadline_misses),
             map_nanos: self.map_nanos,
+            budget_samples: Vec::new(),
             recorded_nanos,
             wall_nanos: positive(wall_nanos),
             peak_rss_bytes: Some(counters.peak_rss_bytes),

@@ -7,7 +7,9 @@
 use std::time::Instant;
 
 use crate::capture::source::{FrameSource, FrameStamp, SourceError};
+use crate::service::alignment_stamps::AlignmentStamps;
 use crate::service::given_pose::{given_pose, truth_in_first_camera};
+use crate::service::rehearsal::Rehearsal;
 use crate::service::results::{RecordedPose, RunMode, RunRecord};
 use crate::slam::alignment::reference::Reference;
 use crate::slam::evaluation::depth_error::DepthScale;
@@ -102,7 +104,7 @@ pub fn replay(
     observe: &mut dyn FnMut(&ReplayProgress) -> bool,
 ) -> Result<RunRecord, ReplayError> {
     let mut replay = Replay::new(source, source_name, config)?;
-    let total = source.num_frames().map(|n| n.min(config.max_frames.unwrap_or(n)));
+    let total = frames_to_come(source, config);
     let mut pixels = vec![0; replay.num_pixels];
     let begin = Instant::now();
     while replay.record.frames_in < config.max_frames.map_or(u64::MAX, |n| n as u64) {
@@ -116,6 +118,11 @@ pub fn replay(
     replay.finish(begin)
 }
 
+/// Frames there will be, where that is known.
+fn frames_to_come(source: &dyn FrameSource, config: &ReplayConfig) -> Option<usize> {
+    source.num_frames().map(|n| n.min(config.max_frames.unwrap_or(n)))
+}
+
 /// A replay under way.
 struct Replay<'a> {
     config: &'a ReplayConfig,
@@ -126,6 +133,7 @@ struct Replay<'a> {
     mapper: Mapper,
     /// Poses to be given, the first camera's frame as the world; made at the first frame.
     given_poses: Vec<StampedPose>,
+    rehearsal: Rehearsal,
     /// Memory of the reference that the tracker gave back.
     spare: Option<Box<Reference>>,
     record: RunRecord,
@@ -155,6 +163,7 @@ impl<'a> Replay<'a> {
             tracker: Tracker::new(intrinsics, config.tracker.clone())?,
             mapper: Mapper::new(intrinsics, config.mapper.clone())?,
             given_poses: Vec::new(),
+            rehearsal: Rehearsal::new(frames_to_come(source, config)),
             spare: None,
             record: empty_record(source_name, ground_truth, given),
             stamps: None,
@@ -207,11 +216,19 @@ impl<'a> Replay<'a> {
 
     /// The frame's pose, estimated or given; `None` where ground truth has none for it.
     fn pose(&mut self, frame: &FrameView<'_>) -> Option<PoseEstimate> {
+        let mut stamps = AlignmentStamps::begin();
         let (estimate, track_nanos) = match self.config.poses {
             PoseOrigin::Tracker => {
+                let memory = self.tracker.memory().clone();
                 let begin = Instant::now();
-                let estimate = self.tracker.track(frame, &mut |_| true);
-                (estimate, Some(elapsed_nanos(begin)))
+                let mut budget = |level| {
+                    stamps.ask(level);
+                    true
+                };
+                let estimate = self.tracker.track(frame, &mut budget);
+                let track_nanos = elapsed_nanos(begin);
+                self.rehearsal.observe(&mut self.tracker, &memory, frame);
+                (estimate, Some(track_nanos))
             }
             PoseOrigin::GroundTruth => {
                 let estimate = given_pose(
@@ -223,7 +240,8 @@ impl<'a> Replay<'a> {
                 (estimate?, None)
             }
         };
-        self.record.poses.push(RecordedPose { estimate, latency_nanos: None, track_nanos });
+        let trace = self.tracker.reference().and_then(|reference| stamps.trace(reference));
+        self.record.poses.push(RecordedPose { estimate, latency_nanos: None, track_nanos, trace });
         Some(estimate)
     }
 
@@ -246,7 +264,9 @@ impl<'a> Replay<'a> {
         };
         record.recorded_nanos =
             last.capture_nanos.saturating_sub(first.capture_nanos).max(0) as u64;
-        record.wall_nanos = elapsed_nanos(begin);
+        let (samples, rehearsal_nanos) = self.rehearsal.into_samples();
+        record.budget_samples = samples;
+        record.wall_nanos = elapsed_nanos(begin).saturating_sub(rehearsal_nanos);
         record.map = self.mapper.map().clone();
         record.peak_rss_bytes = peak_rss_bytes();
         Ok(record)
@@ -269,6 +289,7 @@ fn empty_record(source_name: &str, ground_truth: Vec<StampedPose>, poses_given: 
         deadline_nanos: None,
         deadline_misses: None,
         map_nanos: Vec::new(),
+        budget_samples: Vec::new(),
         recorded_nanos: 0,
         wall_nanos: 0,
         peak_rss_bytes: None,

@@ -89,6 +89,12 @@ pub struct Tracker {
     aligner: Aligner,
     reference: Option<Box<Reference>>,
     pyramid: SumPyramid,
+    memory: Memory,
+}
+
+/// What a tracker remembers from frame to frame.
+#[derive(Debug, Clone, Default)]
+pub struct Memory {
     motion: Motion,
     brightness: Brightness,
     last_sequence: Option<u64>,
@@ -108,11 +114,7 @@ impl Tracker {
             aligner: Aligner::new(params.alignment.clone()),
             reference: None,
             pyramid: SumPyramid::with_size(width, height, levels, finest),
-            motion: Motion::default(),
-            brightness: Brightness::default(),
-            last_sequence: None,
-            was_lost: false,
-            coarse_fit: None,
+            memory: Memory::default(),
             params,
         })
     }
@@ -124,12 +126,12 @@ impl Tracker {
         let (old, new) = (before.as_deref(), self.reference.as_deref());
         if let (Some(old), Some(new)) = (old, new) {
             if old.epoch() != new.epoch() {
-                self.motion = Motion::default();
-                self.was_lost = false;
+                self.memory.motion = Motion::default();
+                self.memory.was_lost = false;
             }
             if old.epoch() != new.epoch() || old.keyframe_id() != new.keyframe_id() {
-                self.brightness = Brightness::default();
-                self.coarse_fit = None;
+                self.memory.brightness = Brightness::default();
+                self.memory.coarse_fit = None;
             }
         }
         before
@@ -143,11 +145,7 @@ impl Tracker {
     /// Forgets keyframe and motion.
     pub fn reset(&mut self) {
         self.reference = None;
-        self.motion = Motion::default();
-        self.brightness = Brightness::default();
-        self.last_sequence = None;
-        self.was_lost = false;
-        self.coarse_fit = None;
+        self.memory = Memory::default();
     }
 
     /// Tracks one frame. `budget` is asked before each iteration with the pyramid level it would
@@ -168,18 +166,37 @@ impl Tracker {
                 let estimate = self.report(&reference, frame, &alignment, missing);
                 // A bar set by a frame that was lost, or cut short, would let the next one pass.
                 let is_lost = matches!(estimate.state, TrackingState::Lost(_));
-                self.coarse_fit = coarse_fit.filter(|_| !is_lost).or(self.coarse_fit);
+                self.memory.coarse_fit = coarse_fit.filter(|_| !is_lost).or(self.memory.coarse_fit);
                 estimate
             }
         };
-        self.was_lost = matches!(estimate.state, TrackingState::Lost(_));
+        self.memory.was_lost = matches!(estimate.state, TrackingState::Lost(_));
         self.reference = Some(reference);
+        estimate
+    }
+
+    /// What it remembers of the frames so far, for [`Self::rehearse`].
+    pub fn memory(&self) -> &Memory {
+        &self.memory
+    }
+
+    /// What [`Self::track`] would say of `frame` with `memory` and another budget. This tracker's own
+    /// memory stays as it is.
+    pub fn rehearse(
+        &mut self,
+        memory: &Memory,
+        frame: &FrameView<'_>,
+        budget: &mut dyn FnMut(usize) -> bool,
+    ) -> PoseEstimate {
+        let own = std::mem::replace(&mut self.memory, memory.clone());
+        let estimate = self.track(frame, budget);
+        self.memory = own;
         estimate
     }
 
     /// Frames between this one and the one before.
     fn count_missing(&mut self, sequence: u64) -> u64 {
-        let before = self.last_sequence.replace(sequence);
+        let before = self.memory.last_sequence.replace(sequence);
         before.map_or(0, |before| sequence.saturating_sub(before).saturating_sub(1))
     }
 
@@ -209,16 +226,17 @@ impl Tracker {
         let nanos = frame.capture_nanos;
         // Before the first pose the camera stands where the keyframe was taken.
         let first = reference.world_from_keyframe().place(&SE3::identity());
-        let predicted = self.motion.predict(nanos, 1.0).unwrap_or(first);
+        let predicted = self.memory.motion.predict(nanos, 1.0).unwrap_or(first);
         let mut best = self.align_coarsest(reference, &predicted, budget);
         if self.fits_poorly(&best) {
             let rotation = self.params.hypothesis_rotation_deg.to_radians();
             // A lost camera may be where the keyframe was taken: the mapper may have found it there.
             let views = self.params.recovery_rotation_deg.to_radians();
-            let at_keyframe = self.was_lost.then(|| turned(&first, views)).into_iter().flatten();
+            let at_keyframe =
+                self.memory.was_lost.then(|| turned(&first, views)).into_iter().flatten();
             let explain = |of: &Alignment| self.aligner.explanation(reference, &self.pyramid, of);
             let mut explained = explain(&best);
-            for hypothesis in hypotheses(&self.motion, nanos, rotation).chain(at_keyframe) {
+            for hypothesis in hypotheses(&self.memory.motion, nanos, rotation).chain(at_keyframe) {
                 let other = self.align_coarsest(reference, &hypothesis, budget);
                 let by_other = explain(&other);
                 if is_better(&by_other, &explained) {
@@ -241,7 +259,7 @@ impl Tracker {
     ) -> Alignment {
         let start = reference.world_from_keyframe().locate(world_from_camera).inverse();
         let (aligner, pyramid) = (&self.aligner, &self.pyramid);
-        let mut alignment = aligner.start(reference, pyramid, &start, self.brightness);
+        let mut alignment = aligner.start(reference, pyramid, &start, self.memory.brightness);
         let level = alignment.level;
         aligner.solve_level(reference, pyramid, level, &mut alignment, budget);
         alignment
@@ -250,8 +268,9 @@ impl Tracker {
     /// Whether the coarsest level says that the prediction led astray.
     fn fits_poorly(&self, alignment: &Alignment) -> bool {
         let quality = quality_of(alignment);
-        let bound = self.coarse_fit.map_or(f64::INFINITY, |fit| fit * self.params.poor_fit_ratio);
-        self.was_lost
+        let bound =
+            self.memory.coarse_fit.map_or(f64::INFINITY, |fit| fit * self.params.poor_fit_ratio);
+        self.memory.was_lost
             || quality.whitened_rmse > bound
             || quality.inlier_ratio < self.params.verdict.lost_inliers
             || quality.in_view_ratio < self.params.verdict.degraded_in_view
@@ -266,7 +285,7 @@ impl Tracker {
         missing: u64,
     ) -> PoseEstimate {
         let quality = quality_of(alignment);
-        let verdict = self.params.verdict.judge(alignment, &quality, self.was_lost, missing);
+        let verdict = self.params.verdict.judge(alignment, &quality, self.memory.was_lost, missing);
         let covariance = alignment.covariance(&self.params.alignment);
         let keyframe_from_camera = alignment.state.current_from_keyframe.inverse();
         let world_from_camera = reference.world_from_keyframe().place(&keyframe_from_camera);
@@ -277,8 +296,8 @@ impl Tracker {
             (_, Some(covariance)) if world_from_camera.is_finite() => covariance,
             _ => return self.lost(frame, reference, LostReason::TooFewInliers, quality),
         };
-        self.motion.observe(frame.capture_nanos, &world_from_camera);
-        self.brightness = alignment.state.brightness;
+        self.memory.motion.observe(frame.capture_nanos, &world_from_camera);
+        self.memory.brightness = alignment.state.brightness;
         let state = match reference.map_state() {
             MapState::Established => verdict,
             MapState::Initializing => TrackingState::Initializing,
@@ -304,8 +323,8 @@ impl Tracker {
         reason: LostReason,
         quality: Quality,
     ) -> PoseEstimate {
-        self.motion.stop();
-        self.brightness = Brightness::default();
+        self.memory.motion.stop();
+        self.memory.brightness = Brightness::default();
         let quality = if is_finite(&quality) { quality } else { Quality::default() };
         PoseEstimate {
             quality,
@@ -320,7 +339,7 @@ impl Tracker {
         reference: Option<&Reference>,
         state: TrackingState,
     ) -> PoseEstimate {
-        let world_from_camera = self.motion.last().unwrap_or_else(SE3::identity);
+        let world_from_camera = self.memory.motion.last().unwrap_or_else(SE3::identity);
         let located = reference
             .map(|reference| reference.world_from_keyframe().locate(&world_from_camera))
             // Beyond all numbers where the keyframe's unit is absurdly small.

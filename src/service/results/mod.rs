@@ -3,9 +3,12 @@
 //! `run` and `replay` end in [`write_results`] with a [`RunRecord`], so that their files mean the
 //! same and can be compared byte by byte.
 
+pub mod alignment_levels;
+pub mod budget_curve;
 pub mod colour;
 pub mod debug_pictures;
 pub mod depth_maps;
+pub mod lettering;
 pub mod pcd;
 pub mod pictures;
 pub mod ply;
@@ -13,6 +16,7 @@ pub mod poses;
 pub mod report;
 pub mod summary;
 pub mod summary_text;
+pub mod weight_picture;
 
 use std::fs;
 use std::io::{self, Write};
@@ -21,7 +25,9 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use crate::capture::source::{FrameSource, SourceError};
+use crate::service::alignment_stamps::AlignmentTrace;
 use crate::service::atomic_file::write_atomically;
+use crate::service::results::budget_curve::BudgetSample;
 use crate::service::results::report::{ReportInput, report};
 use crate::service::results::summary::Summary;
 use crate::service::trajectory_file::write_trajectory;
@@ -54,6 +60,8 @@ pub struct RecordedPose {
     pub latency_nanos: Option<u64>,
     /// Time in the tracker; `None` where the pose was given.
     pub track_nanos: Option<u64>,
+    /// What its parts took; `None` where the frame was not aligned in this process.
+    pub trace: Option<AlignmentTrace>,
 }
 
 /// Everything that is known of a run when it ends.
@@ -85,9 +93,11 @@ pub struct RunRecord {
     pub deadline_misses: Option<u64>,
     /// Time in the mapper, one for each frame it handled.
     pub map_nanos: Vec<u64>,
+    /// Frames that were aligned again with fewer iterations; empty where none were.
+    pub budget_samples: Vec<BudgetSample>,
     /// First to last stamp.
     pub recorded_nanos: u64,
-    /// Time that the run took, without the preparation of the source.
+    /// Time that the run took, without the preparation of the source and frames aligned again.
     pub wall_nanos: u64,
     /// Largest resident memory of all processes together.
     pub peak_rss_bytes: Option<u64>,
@@ -172,6 +182,7 @@ pub fn write_results(
         cloud.len(),
         evaluation.as_ref(),
         online_evaluation.as_ref(),
+        poses::normalized_errors_of(record, epoch).as_ref(),
         depth.statistics,
     );
 

@@ -27,17 +27,22 @@ pub fn inverse_depth_picture(
         p.inverse_depth > 0.0 && ratio <= max_relative_std_dev
     };
     let points: Vec<&DepthPoint> = keyframe.points.iter().filter(shown).collect();
-    let mut sorted: Vec<f64> = points.iter().map(|p| f64::from(p.inverse_depth)).collect();
-    sorted.sort_by(f64::total_cmp);
     let mut picture = background(keyframe);
-    let range = percentile(&sorted, CLIPPED_SHARE).zip(percentile(&sorted, 1.0 - CLIPPED_SHARE));
-    let Some((far, near)) = range else { return (picture, None) };
+    let range = middle_range(points.iter().map(|p| f64::from(p.inverse_depth)));
+    let Some([far, near]) = range else { return (picture, None) };
     let width = (near - far).max(f64::MIN_POSITIVE);
     for point in points {
         let share = (f64::from(point.inverse_depth) - far) / width;
         paint(&mut picture, point, rainbow(share));
     }
     (picture, Some([far, near]))
+}
+
+/// Lower and upper end of the values without the outliers at either end; `None` of none.
+pub fn middle_range(values: impl Iterator<Item = f64>) -> Option<[f64; 2]> {
+    let mut sorted: Vec<f64> = values.collect();
+    sorted.sort_by(f64::total_cmp);
+    Some([percentile(&sorted, CLIPPED_SHARE)?, percentile(&sorted, 1.0 - CLIPPED_SHARE)?])
 }
 
 /// σ/d of every point in colour (bright: uncertain), logarithmic over [`RELATIVE_STD_DEV_RANGE`].
@@ -75,7 +80,7 @@ fn relative_std_dev(point: &DepthPoint) -> f64 {
 }
 
 /// The keyframe's image, darkened; black where it has none.
-fn background(keyframe: &Keyframe) -> Picture {
+pub fn background(keyframe: &Keyframe) -> Picture {
     let (width, height) = (keyframe.intrinsics.width, keyframe.intrinsics.height);
     let dark = |grey: &u8| [(f64::from(*grey) * BACKGROUND_GAIN) as u8; 3];
     let mut pixels: Vec<Rgb> = keyframe.image.iter().map(dark).collect();

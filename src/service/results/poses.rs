@@ -7,7 +7,11 @@ use std::path::Path;
 use crate::service::atomic_file::write_atomically;
 use crate::service::results::RunRecord;
 use crate::service::trajectory_file::tum_line;
+use crate::slam::evaluation::MAX_DIFFERENCE_NANOS;
+use crate::slam::evaluation::depth_error::DepthScale;
+use crate::slam::evaluation::normalized_error::{NormalizedErrors, normalized_errors};
 use crate::slam::mapper::Map;
+use crate::slam::pose::PoseEstimate;
 use crate::slam::trajectory::StampedPose;
 
 /// First line of `trajectory.txt`.
@@ -45,6 +49,21 @@ pub fn final_trajectory(record: &RunRecord, epoch: Option<u32>) -> Vec<StampedPo
 /// Every tracked frame, of one epoch or of all, as it was published.
 pub fn online_trajectory(record: &RunRecord, epoch: Option<u32>) -> Vec<StampedPose> {
     tracked(record, epoch, |estimate| estimate.world_from_camera)
+}
+
+/// Errors of the tracked frames of one epoch against their covariance; `None` without ground truth or where
+/// it was given.
+pub fn normalized_errors_of(record: &RunRecord, epoch: Option<u32>) -> Option<NormalizedErrors> {
+    if record.depth_scale == DepthScale::Given {
+        return None;
+    }
+    let in_epoch = |of: u32| epoch.is_none_or(|epoch| of == epoch);
+    let estimates = record.poses.iter().map(|pose| &pose.estimate);
+    let tracked: Vec<&PoseEstimate> =
+        estimates.filter(|e| e.state.is_tracked() && in_epoch(e.epoch)).collect();
+    let keyframes = record.map.keyframes.iter().filter(|keyframe| in_epoch(keyframe.epoch));
+    let stamps: Vec<(u64, i64)> = keyframes.map(|k| (k.keyframe_id, k.capture_nanos)).collect();
+    normalized_errors(&tracked, &stamps, &record.ground_truth, MAX_DIFFERENCE_NANOS)
 }
 
 fn tracked(

@@ -4,10 +4,13 @@ use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
 
+use crate::service::results::alignment_levels::{LevelSummary, alignment_levels};
+use crate::service::results::budget_curve::BudgetCurve;
 use crate::service::results::poses::longest_epoch;
 use crate::service::results::{RecordedPose, RunMode, RunRecord};
 use crate::slam::evaluation::TrajectoryEvaluation;
 use crate::slam::evaluation::depth_error::DepthStatistics;
+use crate::slam::evaluation::normalized_error::NormalizedErrors;
 use crate::slam::evaluation::statistics::percentile;
 use crate::slam::pose::{NO_KEYFRAME, TrackingState};
 
@@ -86,6 +89,36 @@ impl From<&TrajectoryEvaluation> for TrajectorySummary {
     }
 }
 
+/// Normalised estimation errors squared of `current_from_keyframe`; all null without ground truth.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct NeesSummary {
+    /// Frames compared.
+    pub nees_frames: Option<u64>,
+    /// Mean of all six unknowns; 6 where the covariance is right.
+    pub nees_mean: Option<f64>,
+    /// Median of all six unknowns; 5.3 where the covariance is right.
+    pub nees_median: Option<f64>,
+    /// Mean of the translation alone; 3 where the covariance is right.
+    pub nees_translation: Option<f64>,
+    /// Mean of the rotation alone; 3 where the covariance is right.
+    pub nees_rotation: Option<f64>,
+    /// Share of the frames below 12.6; 0.95 where the covariance is right.
+    pub nees_below_bound: Option<f64>,
+}
+
+impl From<&NormalizedErrors> for NeesSummary {
+    fn from(errors: &NormalizedErrors) -> Self {
+        Self {
+            nees_frames: Some(errors.frames as u64),
+            nees_mean: Some(errors.mean),
+            nees_median: Some(errors.median),
+            nees_translation: Some(errors.translation),
+            nees_rotation: Some(errors.rotation),
+            nees_below_bound: Some(errors.below_bound),
+        }
+    }
+}
+
 /// The figures of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
@@ -132,8 +165,15 @@ pub struct Summary {
     pub restarts: u64,
     /// Time in the tracker for a frame.
     pub track_ms: Option<Percentiles>,
+    /// Of it, from the frame to the first iteration: the image pyramid, but for some thousandths.
+    /// Known in a replay.
+    pub pyramid_ms: Option<Percentiles>,
+    /// What aligning costs on each pyramid level, finest first. Known in a replay.
+    pub alignment_levels: Option<Vec<LevelSummary>>,
     /// Time in the mapper for a frame.
     pub map_ms: Option<Percentiles>,
+    /// Quality of a pose as a function of the iterations it is given; of replays.
+    pub budget_curve: Option<BudgetCurve>,
     /// First to last stamp.
     pub recorded_secs: f64,
     /// Time that the run took.
@@ -147,6 +187,9 @@ pub struct Summary {
     pub trajectory: TrajectorySummary,
     /// `trajectory_online.txt` against ground truth.
     pub online: TrajectorySummary,
+    /// Errors of the tracked poses against their covariance, with the map's own depth.
+    #[serde(flatten)]
+    pub nees: NeesSummary,
     /// Pixels of keyframes whose true depth is known.
     pub depth_pixels: Option<u64>,
     /// Median relative depth error over them.
@@ -166,11 +209,13 @@ impl Summary {
         points: usize,
         trajectory: Option<&TrajectoryEvaluation>,
         online: Option<&TrajectoryEvaluation>,
+        nees: Option<&NormalizedErrors>,
         depth: Option<DepthStatistics>,
     ) -> Self {
         let count = |is: fn(TrackingState) -> bool| count_states(&record.poses, is);
         let (recorded_secs, wall_secs) =
             (record.recorded_nanos as f64 * 1e-9, record.wall_nanos as f64 * 1e-9);
+        let traces: Vec<_> = record.poses.iter().filter_map(|pose| pose.trace).collect();
         const BYTES_PER_MB: f64 = 1_048_576.0;
         Self {
             mode: record.mode,
@@ -201,13 +246,17 @@ impl Summary {
                     .filter(|p| p.estimate.keyframe_id != NO_KEYFRAME)
                     .filter_map(|p| p.track_nanos),
             ),
+            pyramid_ms: Percentiles::of(traces.iter().map(|trace| trace.pyramid_nanos)),
+            alignment_levels: alignment_levels(&traces),
             map_ms: Percentiles::of(record.map_nanos.iter().copied()),
+            budget_curve: BudgetCurve::of(&record.budget_samples),
             recorded_secs,
             wall_secs,
             realtime_factor: (wall_secs > 0.0).then(|| recorded_secs / wall_secs),
             peak_rss_mb: record.peak_rss_bytes.map(|bytes| bytes as f64 / BYTES_PER_MB),
             trajectory: trajectory.map(TrajectorySummary::from).unwrap_or_default(),
             online: online.map(TrajectorySummary::from).unwrap_or_default(),
+            nees: nees.map(NeesSummary::from).unwrap_or_default(),
             depth_pixels: depth.map(|d| d.compared as u64),
             depth_relative_error_median: depth.map(|d| d.relative_error_median),
             depth_relative_error_median_best_half: depth.map(|d| d.relative_error_median_best_half),

@@ -384,7 +384,7 @@ impl Aligner {
         let points = reference.level(level);
         let squared_pixel = f64::from(1u32 << (2 * level));
         alignment.mean_squared_flow = mean_squared_flow(points, &at) * squared_pixel;
-        alignment.scatter = GradientScatter::measure(points, frame.level(level), &at);
+        alignment.scatter = self.kernel.scatter(points, frame.level(level), &at);
     }
 }
 

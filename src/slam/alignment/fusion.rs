@@ -54,54 +54,24 @@ impl Candidates {
         &self.points
     }
 
-    /// Mean inverse depth, `None` without points.
-    fn mean_inverse_depth(&self) -> Option<f64> {
-        let sum: f64 = self.points.iter().map(|point| f64::from(point.inverse_depth)).sum();
+    /// Takes the usable points of a keyframe; gives their mean inverse depth, `None` without any.
+    fn fill(&mut self, points: &[DepthPoint], width: usize, height: usize) -> Option<f64> {
+        let mut sum = 0.0;
+        self.points.extend(points.iter().take(MAX_KEYFRAME_POINTS).filter_map(|point| {
+            let inside = usize::from(point.u) < width && usize::from(point.v) < height;
+            if !inside || !is_positive(point.inverse_depth) || !is_positive(point.variance) {
+                return None;
+            }
+            sum += f64::from(point.inverse_depth);
+            Some(Candidate {
+                u: point.u,
+                v: point.v,
+                inverse_depth: point.inverse_depth,
+                variance: point.variance,
+                noise: point.variance,
+            })
+        }));
         (!self.points.is_empty()).then(|| sum / self.points.len() as f64)
-    }
-}
-
-/// Sums of the children of one parent.
-#[derive(Debug, Clone, Copy, Default)]
-struct Cell {
-    nearest: f32,
-    nearest_noise: f32,
-    information: f32,
-    weighted: f32,
-    weighted_square: f32,
-    noise: f32,
-    children: f32,
-    is_behind: bool,
-}
-
-impl Cell {
-    /// Whether depth jumps from the nearest child back to a pixel of this inverse depth and noise.
-    fn is_in_front_of(&self, inverse_depth: f32, noise: f32) -> bool {
-        let step = self.nearest - inverse_depth - JUMP_RATIO * self.nearest;
-        step > 0.0 && step * step > JUMP_SIGMAS * JUMP_SIGMAS * (noise + self.nearest_noise)
-    }
-
-    /// Whether depth jumps from the mean of this cell back to that of `other`, in whose means
-    /// `kept_…` of the children's noise is left.
-    fn is_cell_in_front_of(&self, kept_here: f32, other: &Cell, kept_there: f32) -> bool {
-        let (nearer, farther) = (self.inverse_depth(), other.inverse_depth());
-        let step = nearer - farther - CELL_JUMP_RATIO * nearer;
-        let noise =
-            self.noise / self.children * kept_here + other.noise / other.children * kept_there;
-        step > 0.0 && step * step > JUMP_SIGMAS * JUMP_SIGMAS * noise
-    }
-
-    /// Share of the children's noise that their mean keeps.
-    fn kept_noise(&self, independent: f32) -> f32 {
-        independent / self.children + 1.0 - independent
-    }
-
-    fn inverse_depth(&self) -> f32 {
-        self.weighted / self.information
-    }
-
-    fn variance(&self) -> f32 {
-        self.children / self.information
     }
 }
 
@@ -116,39 +86,118 @@ const CELL_JUMP_RATIO: f32 = 0.15;
 /// … and by this many standard deviations of the noise more.
 const JUMP_SIGMAS: f32 = 3.0;
 
+/// The nearest child of one parent: the bits of its inverse depth, which are in the order of what
+/// they stand for because it is positive, above those of its noise. In one word, because two
+/// children follow each other closely, and a store of halves delays the load of the whole.
+#[derive(Debug, Clone, Copy, Default)]
+struct Front(u64);
+
+impl Front {
+    fn of(child: &Candidate) -> Self {
+        let bits = |value: f32| u64::from(value.to_bits());
+        Self(bits(child.inverse_depth) << 32 | bits(child.noise))
+    }
+
+    fn inverse_depth(self) -> f32 {
+        f32::from_bits((self.0 >> 32) as u32)
+    }
+
+    fn noise(self) -> f32 {
+        f32::from_bits(self.0 as u32)
+    }
+
+    /// The nearer one, the first of two alike.
+    fn nearer(self, other: Self) -> Self {
+        if other.0 >> 32 > self.0 >> 32 { other } else { self }
+    }
+
+    /// Whether depth jumps from here back to `child`.
+    fn hides(self, child: &Candidate) -> bool {
+        let nearest = self.inverse_depth();
+        let step = nearest - child.inverse_depth - JUMP_RATIO * nearest;
+        step > 0.0 && step * step > JUMP_SIGMAS * JUMP_SIGMAS * (child.noise + self.noise())
+    }
+}
+
+/// The children of one parent: sums, then their mean.
+#[derive(Debug, Clone, Copy, Default)]
+struct Cell {
+    information: f32,
+    weighted: f32,
+    weighted_square: f32,
+    noise: f32,
+    children: f32,
+    inverse_depth: f32,
+    mean_noise: f32,
+    is_behind: bool,
+}
+
+impl Cell {
+    fn add(&mut self, child: &Candidate) {
+        let information = 1.0 / child.variance;
+        self.information += information;
+        self.weighted += information * child.inverse_depth;
+        self.weighted_square += information * child.inverse_depth * child.inverse_depth;
+        self.noise += child.noise;
+        self.children += 1.0;
+    }
+
+    /// Whether depth jumps from the mean of this cell back to that of `other`; never from a cell
+    /// without children.
+    fn hides(&self, other: &Cell) -> bool {
+        let nearer = self.inverse_depth;
+        let step = nearer - other.inverse_depth - CELL_JUMP_RATIO * nearer;
+        let noise = self.mean_noise + other.mean_noise;
+        step > 0.0 && step * step > JUMP_SIGMAS * JUMP_SIGMAS * noise
+    }
+}
+
+/// A cell with children, and where it lies.
+#[derive(Debug, Clone, Copy)]
+struct Filled {
+    index: u32,
+    u: u16,
+    v: u16,
+}
+
+/// The cells of one level with a rim of empty ones, so that each has four neighbours. All are zero
+/// between two levels.
+#[derive(Debug, Clone, Default)]
+struct Cells {
+    width: usize,
+    height: usize,
+    fronts: Vec<Front>,
+    cells: Vec<Cell>,
+    filled: Vec<Filled>,
+}
+
 /// Builds the depth pyramid, in memory that is used again.
 #[derive(Debug, Clone, Default)]
 pub struct DepthFusion {
     levels: [Candidates; MAX_LEVELS],
-    cells: Vec<Cell>,
+    cells: Cells,
     mean_inverse_depth: Option<f64>,
 }
 
 impl DepthFusion {
     /// Fuses `points` of a `width * height` image into `num_levels` levels. Points outside the
     /// image, or without a positive finite inverse depth and variance, are left out, as are those
-    /// beyond [`MAX_KEYFRAME_POINTS`].
-    pub fn fuse(&mut self, points: &[DepthPoint], width: usize, height: usize, num_levels: usize) {
+    /// beyond [`MAX_KEYFRAME_POINTS`]. Levels below `finest` only feed the coarser ones, and keep
+    /// what lies behind jumps.
+    pub fn fuse(
+        &mut self,
+        points: &[DepthPoint],
+        width: usize,
+        height: usize,
+        num_levels: usize,
+        finest: usize,
+    ) {
         self.levels.iter_mut().for_each(|level| level.points.clear());
-        let inside = |point: &&DepthPoint| {
-            usize::from(point.u) < width
-                && usize::from(point.v) < height
-                && is_positive(point.inverse_depth)
-                && is_positive(point.variance)
-        };
-        let base = points.iter().take(MAX_KEYFRAME_POINTS).filter(inside);
-        self.levels[0].points.extend(base.map(|point| Candidate {
-            u: point.u,
-            v: point.v,
-            inverse_depth: point.inverse_depth,
-            variance: point.variance,
-            noise: point.variance,
-        }));
-        self.mean_inverse_depth = self.levels[0].mean_inverse_depth();
+        self.mean_inverse_depth = self.levels[0].fill(points, width, height);
         for level in 1..num_levels.min(MAX_LEVELS) {
             let (fine, coarse) = self.levels.split_at_mut(level);
-            let (width, height) = (width >> level, height >> level);
-            halve(&mut fine[level - 1], &mut coarse[0], &mut self.cells, width, height);
+            self.cells.lay_out(width >> level, height >> level);
+            self.cells.halve(&mut fine[level - 1], &mut coarse[0], level > finest);
         }
     }
 
@@ -169,101 +218,142 @@ fn is_positive(value: f32) -> bool {
     SANE.contains(&value)
 }
 
-/// Fuses `fine` into `coarse`, and drops from `fine` what lies behind a jump in depth.
-fn halve(
-    fine: &mut Candidates,
-    coarse: &mut Candidates,
-    cells: &mut Vec<Cell>,
-    width: usize,
-    height: usize,
-) {
-    cells.clear();
-    cells.resize(width * height, Cell::default());
-    let cell_of = |child: &Candidate| {
+impl Cells {
+    /// Makes room for a level of `width * height` pixels.
+    fn lay_out(&mut self, width: usize, height: usize) {
+        (self.width, self.height) = (width, height);
+        let count = self.stride() * (height + 2);
+        if self.cells.len() < count {
+            self.cells.resize(count, Cell::default());
+            self.fronts.resize(count, Front::default());
+        }
+    }
+
+    fn stride(&self) -> usize {
+        self.width + 2
+    }
+
+    /// The cell of a child; an odd row or column at the end has none.
+    fn cell_of(&self, child: &Candidate) -> Option<usize> {
         let (u, v) = (usize::from(child.u / 2), usize::from(child.v / 2));
-        (u < width && v < height).then_some(v * width + u)
-    };
-    for child in &fine.points {
-        if let Some(index) = cell_of(child)
-            && child.inverse_depth > cells[index].nearest
-        {
-            cells[index].nearest = child.inverse_depth;
-            cells[index].nearest_noise = child.noise;
+        (u < self.width && v < self.height).then(|| (v + 1) * self.stride() + u + 1)
+    }
+
+    /// Fuses `fine` into `coarse`; drops from `fine` what lies behind a jump in depth, if wanted.
+    fn halve(&mut self, fine: &mut Candidates, coarse: &mut Candidates, drops_behind: bool) {
+        for child in &fine.points {
+            let Some(index) = self.cell_of(child) else { continue };
+            self.fronts[index] = self.fronts[index].nearer(Front::of(child));
+        }
+        self.find_filled();
+        if drops_behind {
+            fine.points.retain(|child| self.add(child));
+        } else {
+            fine.points.iter().for_each(|child| _ = self.add(child));
+        }
+        let independent = self.average();
+        self.keep_noise(independent);
+        self.emit(coarse);
+        if drops_behind {
+            let is_behind = |index: usize| self.cells[index].is_behind;
+            fine.points.retain(|child| self.cell_of(child).is_none_or(|index| !is_behind(index)));
+        }
+        for filled in self.filled.drain(..) {
+            self.cells[filled.index as usize] = Cell::default();
+            self.fronts[filled.index as usize] = Front::default();
         }
     }
-    fine.points.retain(|child| {
-        let Some(index) = cell_of(child) else { return true };
-        !is_behind_a_jump(cells, width, index, child)
-    });
-    for child in &fine.points {
-        let Some(index) = cell_of(child) else { continue };
-        let cell = &mut cells[index];
-        let information = 1.0 / child.variance;
-        cell.information += information;
-        cell.weighted += information * child.inverse_depth;
-        cell.weighted_square += information * child.inverse_depth * child.inverse_depth;
-        cell.noise += child.noise;
-        cell.children += 1.0;
-    }
-    let independent = independent_share(cells);
-    mark_cells_behind(cells, width, independent);
-    fine.points.retain(|child| cell_of(child).is_none_or(|index| !cells[index].is_behind));
-    let is_used = |cell: &Cell| cell.children > 0.0 && !cell.is_behind;
-    let filled = cells.iter().enumerate().filter(|(_, cell)| is_used(cell));
-    coarse.points.extend(filled.map(|(index, cell)| {
-        let kept = cell.kept_noise(independent);
-        Candidate {
-            u: (index % width) as u16,
-            v: (index / width) as u16,
-            inverse_depth: cell.inverse_depth(),
-            variance: cell.variance(),
-            noise: (cell.noise / cell.children * kept).min(cell.variance()),
+
+    /// Lists the cells with children, row by row.
+    fn find_filled(&mut self) {
+        let (width, stride) = (self.width, self.stride());
+        // One more than there are cells: every one is written, and those without children again.
+        self.filled.resize(width * self.height + 1, Filled { index: 0, u: 0, v: 0 });
+        let mut count = 0;
+        for v in 0..self.height {
+            let first = (v + 1) * stride + 1;
+            for (u, front) in self.fronts[first..first + width].iter().enumerate() {
+                self.filled[count] = Filled { index: (first + u) as u32, u: u as u16, v: v as u16 };
+                count += usize::from(front.0 > 0);
+            }
         }
-    }));
-}
+        self.filled.truncate(count);
+    }
 
-/// Marks the cells beside which depth jumps to something nearer: single children are too noisy
-/// to tell where their means can.
-fn mark_cells_behind(cells: &mut [Cell], width: usize, independent: f32) {
-    for index in 0..cells.len() {
-        let cell = cells[index];
-        if cell.children == 0.0 {
-            continue;
+    /// Adds a child to its cell; false where it lies behind a jump and is not added.
+    #[inline(always)]
+    fn add(&mut self, child: &Candidate) -> bool {
+        let Some(index) = self.cell_of(child) else { return true };
+        let stride = self.stride();
+        // Only the neighbours that touch the child, not those across its parent; by arithmetic,
+        // because a branch on the side would be foretold wrong half of the time.
+        let beside = index + 2 * usize::from(child.u % 2) - 1;
+        let across = index + 2 * usize::from(child.v % 2) * stride - stride;
+        let hides = |index: usize| self.fronts[index].hides(child);
+        let is_behind = hides(index) || hides(beside) || hides(across);
+        if !is_behind {
+            self.cells[index].add(child);
         }
-        let around = [index.wrapping_sub(1), index + 1, index.wrapping_sub(width), index + width];
-        cells[index].is_behind = around.into_iter().any(|beside| {
-            cells.get(beside).is_some_and(|beside| {
-                let (there, here) = (beside.kept_noise(independent), cell.kept_noise(independent));
-                beside.children > 0.0 && beside.is_cell_in_front_of(there, &cell, here)
-            })
-        });
+        !is_behind
     }
-}
 
-/// Whether `child`, in cell `index`, or the cell beside it shows something nearer.
-fn is_behind_a_jump(cells: &[Cell], width: usize, index: usize, child: &Candidate) -> bool {
-    let jumps = |cell: Option<&Cell>| {
-        cell.is_some_and(|cell| cell.is_in_front_of(child.inverse_depth, child.noise))
-    };
-    // Only the neighbours that touch the child, not those across its parent.
-    let beside = if child.u.is_multiple_of(2) { index.checked_sub(1) } else { Some(index + 1) };
-    let above =
-        if child.v.is_multiple_of(2) { index.checked_sub(width) } else { Some(index + width) };
-    jumps(cells.get(index))
-        || beside.is_some_and(|index| jumps(cells.get(index)))
-        || above.is_some_and(|index| jumps(cells.get(index)))
-}
-
-/// κ: the scatter of children about their parent over what their variance predicts, 0 to 1.
-fn independent_share(cells: &[Cell]) -> f32 {
-    let (mut scatter, mut predicted) = (0.0f64, 0.0f64);
-    for cell in cells.iter().filter(|cell| cell.children > 1.5) {
-        let mean = cell.inverse_depth();
-        let spread = cell.weighted_square - cell.information * mean * mean;
-        scatter += f64::from(spread.max(0.0));
-        predicted += f64::from(cell.children - 1.0);
+    /// Takes the means; gives κ, the scatter of children about their parent over what their
+    /// variance predicts, 0 to 1.
+    fn average(&mut self) -> f32 {
+        let (mut scatter, mut predicted) = (0.0f64, 0.0f64);
+        for filled in &self.filled {
+            let cell = &mut self.cells[filled.index as usize];
+            if cell.children == 0.0 {
+                continue;
+            }
+            let mean = cell.weighted / cell.information;
+            cell.inverse_depth = mean;
+            // An only child does not scatter, but for rounding.
+            let spread = cell.weighted_square - cell.information * mean * mean;
+            scatter += if cell.children > 1.5 { f64::from(spread.max(0.0)) } else { 0.0 };
+            predicted += f64::from(cell.children - 1.0);
+        }
+        if predicted == 0.0 { 0.0 } else { (scatter / predicted).min(1.0) as f32 }
     }
-    if predicted == 0.0 { 0.0 } else { (scatter / predicted).min(1.0) as f32 }
+
+    /// The noise that is left in each mean, when `independent` is the share that averages down.
+    fn keep_noise(&mut self, independent: f32) {
+        for filled in &self.filled {
+            let cell = &mut self.cells[filled.index as usize];
+            if cell.children > 0.0 {
+                let kept = independent / cell.children + 1.0 - independent;
+                cell.mean_noise = cell.noise / cell.children * kept;
+            }
+        }
+    }
+
+    /// Writes the means, but for those beside which depth jumps to something nearer: single
+    /// children are too noisy to tell where their means can.
+    fn emit(&mut self, coarse: &mut Candidates) {
+        let stride = self.stride();
+        coarse.points.reserve(self.filled.len());
+        for filled in &self.filled {
+            let index = filled.index as usize;
+            let cell = self.cells[index];
+            if cell.children == 0.0 {
+                continue;
+            }
+            let hides = |beside: usize| self.cells[beside].hides(&cell);
+            let beside = hides(index - 1) || hides(index + 1);
+            if beside || hides(index - stride) || hides(index + stride) {
+                self.cells[index].is_behind = true;
+                continue;
+            }
+            let variance = cell.children / cell.information;
+            coarse.points.push(Candidate {
+                u: filled.u,
+                v: filled.v,
+                inverse_depth: cell.inverse_depth,
+                variance,
+                noise: cell.mean_noise.min(variance),
+            });
+        }
+    }
 }
 
 #[cfg(test)]
@@ -277,7 +367,7 @@ mod tests {
     #[test]
     fn a_parent_is_the_weighted_mean_and_gains_no_information() {
         let mut fusion = DepthFusion::default();
-        fusion.fuse(&[point(4, 6, 1.0, 0.1), point(5, 7, 2.0, 0.3)], 64, 64, 2);
+        fusion.fuse(&[point(4, 6, 1.0, 0.1), point(5, 7, 2.0, 0.3)], 64, 64, 2, 0);
         let level = fusion.level(1);
         assert_eq!(level.len(), 1);
         let parent = level.get(0);
@@ -285,7 +375,7 @@ mod tests {
         // Weights 10 and 10/3: (10 + 20/3)/(40/3) = 1.25; 2/(40/3) = 0.15.
         assert!((parent.inverse_depth - 1.25).abs() < 1e-6);
         assert!((parent.variance - 0.15).abs() < 1e-6);
-        fusion.fuse(&[point(0, 0, 1.0, 0.2), point(1, 1, 1.0, 0.2)], 64, 64, 2);
+        fusion.fuse(&[point(0, 0, 1.0, 0.2), point(1, 1, 1.0, 0.2)], 64, 64, 2, 0);
         assert!((fusion.level(1).get(0).variance - 0.2).abs() < 1e-6);
     }
 
@@ -294,17 +384,43 @@ mod tests {
         let mut fusion = DepthFusion::default();
         // One cell with a child far behind, and a pixel right beside it that is as far.
         let jump = [point(4, 4, 1.0, 1e-4), point(5, 4, 0.4, 1e-4), point(6, 4, 0.4, 1e-4)];
-        fusion.fuse(&jump, 64, 64, 2);
+        fusion.fuse(&jump, 64, 64, 2, 0);
         assert_eq!((fusion.level(0).len(), fusion.level(1).len()), (1, 1));
         assert_eq!(fusion.level(1).get(0).inverse_depth, 1.0);
         // Beyond the next cell it is not beside the jump any more; and a slope is no jump.
-        fusion.fuse(&[point(4, 4, 1.0, 1e-4), point(9, 4, 0.4, 1e-4)], 64, 64, 2);
+        fusion.fuse(&[point(4, 4, 1.0, 1e-4), point(9, 4, 0.4, 1e-4)], 64, 64, 2, 0);
         assert_eq!(fusion.level(1).len(), 2);
-        fusion.fuse(&[point(4, 4, 1.0, 1e-4), point(5, 4, 0.97, 1e-4)], 64, 64, 2);
+        fusion.fuse(&[point(4, 4, 1.0, 1e-4), point(5, 4, 0.97, 1e-4)], 64, 64, 2, 0);
         assert_eq!((fusion.level(0).len(), fusion.level(1).len()), (2, 1));
         // What noise explains is no jump either.
-        fusion.fuse(&[point(4, 4, 1.0, 0.04), point(5, 4, 0.4, 0.04)], 64, 64, 2);
+        fusion.fuse(&[point(4, 4, 1.0, 0.04), point(5, 4, 0.4, 0.04)], 64, 64, 2, 0);
         assert_eq!(fusion.level(0).len(), 2);
+    }
+
+    #[test]
+    fn the_other_side_of_the_image_is_not_beside_a_pixel() {
+        let mut fusion = DepthFusion::default();
+        // Near at the left end of a row, far at the right end of the rows above and below: with
+        // single pixels, and with cells whose means jump but whose pixels do not.
+        let near = [point(0, 4, 1.0, 1e-4), point(0, 8, 1.0, 1e-4)];
+        let far = [point(63, 2, 0.4, 1e-4), point(63, 9, 0.4, 1e-4)];
+        fusion.fuse(&[near, far].concat(), 64, 64, 2, 0);
+        assert_eq!((fusion.level(0).len(), fusion.level(1).len()), (4, 4));
+        let near = [point(63, 4, 1.0, 1e-4), point(63, 8, 1.0, 1e-4)];
+        let far = [point(0, 6, 0.4, 1e-4), point(1, 7, 0.4, 1e-4), point(0, 10, 0.4, 1e-4)];
+        fusion.fuse(&[near.as_slice(), &far].concat(), 64, 64, 2, 0);
+        assert_eq!((fusion.level(0).len(), fusion.level(1).len()), (5, 4));
+    }
+
+    #[test]
+    fn memory_that_is_used_again_is_empty() {
+        let mut fusion = DepthFusion::default();
+        let wall: Vec<_> = (0..64 * 64).map(|i| point(i % 64, i / 64, 1.0, 1e-4)).collect();
+        fusion.fuse(&wall, 64, 64, 4, 0);
+        assert_eq!(fusion.level(3).len(), 64);
+        fusion.fuse(&[point(9, 9, 0.4, 1e-4)], 50, 40, 4, 0);
+        assert!((0..4).all(|level| fusion.level(level).len() == 1));
+        assert_eq!(fusion.level(3).get(0).inverse_depth, 0.4);
     }
 
     #[test]
@@ -319,7 +435,7 @@ mod tests {
                     point(i % 64, i / 64, 1.0 + error, std_dev * std_dev)
                 })
                 .collect();
-            fusion.fuse(&points, 64, 64, 2);
+            fusion.fuse(&points, 64, 64, 2, 0);
             let parent = fusion.level(1).get(77);
             let kept = parent.noise / (std_dev * std_dev);
             assert!((kept - expected).abs() < 0.05, "{kept} is not {expected}");
@@ -339,10 +455,10 @@ mod tests {
             point(1, 1, 1.0, f32::INFINITY),
             point(1, 1, 1.0e-40, 1.0),
         ];
-        fusion.fuse(&points, 64, 64, 3);
+        fusion.fuse(&points, 64, 64, 3, 0);
         assert!((0..3).all(|level| fusion.level(level).is_empty()));
         // A pixel that only exists on the finer level of an odd size has no parent.
-        fusion.fuse(&[point(64, 64, 1.0, 0.1)], 65, 65, 2);
+        fusion.fuse(&[point(64, 64, 1.0, 0.1)], 65, 65, 2, 0);
         assert_eq!((fusion.level(0).len(), fusion.level(1).len()), (1, 0));
     }
 }

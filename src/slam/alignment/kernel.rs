@@ -6,13 +6,17 @@
 
 mod accumulate_kernel;
 mod lanes_kernel;
+#[cfg(target_arch = "aarch64")]
+mod neon_kernel;
 mod portable_kernel;
+mod scatter_kernel;
 #[cfg(target_arch = "x86_64")]
 mod x86_kernel;
 
 use crate::slam::alignment::normal_equations::NormalEquations;
 use crate::slam::alignment::points::LevelPoints;
 use crate::slam::alignment::residual::Evaluation;
+use crate::slam::alignment::scatter::GradientScatter;
 use crate::slam::image::buffer::Image;
 use serde::{Deserialize, Serialize};
 
@@ -38,6 +42,9 @@ pub enum Kernel {
     /// AVX-512, sixteen lanes.
     #[cfg(target_arch = "x86_64")]
     Avx512,
+    /// NEON, four lanes.
+    #[cfg(target_arch = "aarch64")]
+    Neon,
 }
 
 impl Kernel {
@@ -52,6 +59,10 @@ impl Kernel {
             if is_x86_feature_detected!("avx512f") {
                 kernels.push(Self::Avx512);
             }
+        }
+        #[cfg(target_arch = "aarch64")]
+        if std::arch::is_aarch64_feature_detected!("neon") {
+            kernels.push(Self::Neon);
         }
         kernels
     }
@@ -72,16 +83,12 @@ impl Kernel {
         image: &Image<u16>,
         at: &Evaluation,
     ) -> NormalEquations {
-        let (right, bottom) = (at.upper_bound[0] as usize, at.upper_bound[1] as usize);
-        // What the kernels rely on: a projection below the bound has a right and a lower neighbour.
-        if right >= image.width() || bottom >= image.height() {
+        if !fits(image, at) {
             return NormalEquations::default();
         }
         match self {
             // SAFETY: plain arithmetic needs no instructions; the bounds were checked above.
-            Self::Portable => unsafe {
-                accumulate_kernel::accumulate::<portable_kernel::FourLanes>(points, image, at)
-            },
+            Self::Portable => unsafe { portable_kernel::accumulate_portable(points, image, at) },
             // SAFETY: only `available` makes this value, after it has found AVX2 and FMA; the
             // bounds were checked above.
             #[cfg(target_arch = "x86_64")]
@@ -89,6 +96,42 @@ impl Kernel {
             // SAFETY: as above with AVX-512F.
             #[cfg(target_arch = "x86_64")]
             Self::Avx512 => unsafe { x86_kernel::accumulate_avx512(points, image, at) },
+            // SAFETY: as above with NEON.
+            #[cfg(target_arch = "aarch64")]
+            Self::Neon => unsafe { neon_kernel::accumulate_neon(points, image, at) },
         }
     }
+
+    /// Measures how the gradient of the cost scatters over `image`; nothing where `at` was made
+    /// for another size. `GradientScatter::reference` is the explanation.
+    pub fn scatter(
+        self,
+        points: &LevelPoints,
+        image: &Image<u16>,
+        at: &Evaluation,
+    ) -> GradientScatter {
+        if !fits(image, at) {
+            return GradientScatter::default();
+        }
+        match self {
+            // SAFETY: plain arithmetic needs no instructions; the bounds were checked above.
+            Self::Portable => unsafe { portable_kernel::scatter_portable(points, image, at) },
+            // SAFETY: only `available` makes this value, after it has found AVX2 and FMA; the
+            // bounds were checked above.
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2 => unsafe { x86_kernel::scatter_avx2(points, image, at) },
+            // SAFETY: as above with AVX-512F.
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512 => unsafe { x86_kernel::scatter_avx512(points, image, at) },
+            // SAFETY: as above with NEON.
+            #[cfg(target_arch = "aarch64")]
+            Self::Neon => unsafe { neon_kernel::scatter_neon(points, image, at) },
+        }
+    }
+}
+
+/// What the kernels rely on: a projection below the bound of `at` has a right and a lower neighbour.
+fn fits(image: &Image<u16>, at: &Evaluation) -> bool {
+    let (right, bottom) = (at.upper_bound[0] as usize, at.upper_bound[1] as usize);
+    right < image.width() && bottom < image.height()
 }

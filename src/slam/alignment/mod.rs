@@ -4,6 +4,7 @@
 //! level, [`normal_equations`] solves for a step, [`align`] iterates coarse to fine.
 
 pub mod align;
+pub mod displacement;
 pub mod fusion;
 pub mod kernel;
 pub mod normal_equations;
@@ -17,3 +18,4 @@ pub mod selection;
 pub mod surroundings;
 #[cfg(test)]
 mod tests;
+pub mod weights;

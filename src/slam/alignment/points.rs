@@ -62,10 +62,24 @@ pub struct Point {
     pub gradient_y: f32,
 }
 
+/// Consecutive points of one block that lie in one tile of the image.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct TileRun {
+    /// The block.
+    pub block: u32,
+    /// The tile.
+    pub tile: u16,
+    /// Lane of the first point.
+    pub first: u8,
+    /// Lane after the last.
+    pub end: u8,
+}
+
 /// The points of one level.
 #[derive(Debug, Clone, Default)]
 pub struct LevelPoints {
     blocks: Vec<PointBlock>,
+    runs: Vec<TileRun>,
     len: usize,
 }
 
@@ -73,11 +87,13 @@ impl LevelPoints {
     /// Forgets the points and keeps the memory.
     pub fn clear(&mut self) {
         self.blocks.clear();
+        self.runs.clear();
         self.len = 0;
     }
 
-    /// Adds a point.
-    pub fn push(&mut self, point: Point) {
+    /// Adds a point that lies in `tile` of the image.
+    #[inline]
+    pub fn push(&mut self, point: Point, tile: u16) {
         let lane = self.len % LANES;
         if lane == 0 {
             self.blocks.push(PointBlock::PADDING);
@@ -93,6 +109,16 @@ impl LevelPoints {
             block.gradient_y[lane] = point.gradient_y;
             self.len += 1;
         }
+        let (block, first) = ((self.blocks.len() - 1) as u32, lane as u8);
+        match self.runs.last_mut() {
+            Some(run) if run.block == block && run.tile == tile => run.end = first + 1,
+            _ => self.runs.push(TileRun { block, tile, first, end: first + 1 }),
+        }
+    }
+
+    /// Where the points lie: runs in their order, each within one block and one tile.
+    pub fn runs(&self) -> &[TileRun] {
+        &self.runs
     }
 
     /// The blocks; lanes beyond [`LevelPoints::len`] are never in view.

@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::slam::alignment::fusion::{Candidates, DepthFusion};
 use crate::slam::alignment::points::{LevelPoints, Point};
+use crate::slam::alignment::scatter::tile_of;
 use crate::slam::alignment::selection::{Selection, SelectionParams};
 use crate::slam::alignment::surroundings::Surroundings;
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -139,7 +140,7 @@ impl Reference {
             self.pyramid = SumPyramid::with_size(width, height, levels, finest);
         }
         self.pyramid.fill(&keyframe.image);
-        self.fusion.fuse(&keyframe.points, width, height, levels);
+        self.fusion.fuse(&keyframe.points, width, height, levels, finest);
         self.mean_inverse_depth = self.fusion.mean_inverse_depth().unwrap_or(1.0);
         for level in finest..levels {
             self.pack_level(level);
@@ -161,7 +162,10 @@ impl Reference {
             budget,
         );
         // Coarser levels only start the finer ones, and their depth has less noise to be pulled by.
-        self.surroundings.measure(candidates, image.width(), image.height());
+        let is_finest = level == self.finest_level;
+        if is_finest {
+            self.surroundings.measure(candidates, image.width(), image.height());
+        }
         let (inverse_fx, inverse_fy) = (1.0 / intrinsics.fx, 1.0 / intrinsics.fy);
         for &index in chosen {
             let candidate = candidates.get(index as usize);
@@ -170,12 +174,13 @@ impl Reference {
                 continue;
             }
             let at = |u: usize, v: usize| f32::from(image.at(u, v)) * grey_per_sum(level);
-            self.levels[level].push(Point {
+            let tile = tile_of(u, v, image.width(), image.height());
+            let point = Point {
                 ray_x: ((u as f64 - intrinsics.cx) * inverse_fx) as f32,
                 ray_y: ((v as f64 - intrinsics.cy) * inverse_fy) as f32,
                 inverse_depth: candidate.inverse_depth,
                 variance: candidate.variance,
-                surrounding_inverse_depth: if level == self.finest_level {
+                surrounding_inverse_depth: if is_finest {
                     self.surroundings.without(&candidate)
                 } else {
                     candidate.inverse_depth
@@ -183,7 +188,8 @@ impl Reference {
                 intensity: at(u, v),
                 gradient_x: 0.5 * (at(u + 1, v) - at(u - 1, v)),
                 gradient_y: 0.5 * (at(u, v + 1) - at(u, v - 1)),
-            });
+            };
+            self.levels[level].push(point, tile);
         }
     }
 
@@ -237,7 +243,8 @@ impl Reference {
         &self.levels[level]
     }
 
-    /// The candidates of one level before selection.
+    /// The candidates of one level before selection; on levels that are not aligned, also those
+    /// behind a jump in depth.
     pub fn candidates(&self, level: usize) -> &Candidates {
         self.fusion.level(level)
     }

@@ -18,6 +18,19 @@ use crate::slam::image::buffer::Image;
 /// Between 8×6 and 40×30 the calibration depends little on it.
 const TILES: (usize, usize) = (16, 12);
 
+/// Number of tiles.
+pub const NUM_TILES: usize = TILES.0 * TILES.1;
+
+/// The tile of a pixel of an image of this size.
+pub fn tile_of(u: usize, v: usize, width: usize, height: usize) -> u16 {
+    let (columns, rows) = TILES;
+    // Sides are at most 65 536 pixels, and 32-bit division is the faster one.
+    let share = |at: usize, parts: usize, side: usize| {
+        ((at as u32 * parts as u32 / (side as u32).max(1)) as usize).min(parts - 1)
+    };
+    (share(v, rows, height) * columns + share(u, columns, width)) as u16
+}
+
 /// Where fewer tiles than this have points, their scatter is too few numbers to trust, and
 /// the information stands in for it.
 const TRUSTED_TILES: f64 = UNKNOWNS as f64;
@@ -39,39 +52,69 @@ impl Default for GradientScatter {
     }
 }
 
+/// Sums over the points of one tile.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct TileSum {
+    /// Σ w J r.
+    pub gradient: [f32; UNKNOWNS],
+    /// Σ w; positive where a point is in view.
+    pub weight: f32,
+}
+
+/// Sums over the points of all tiles.
+#[derive(Debug, Clone)]
+pub struct ScatterSums {
+    /// By tile.
+    pub tiles: [TileSum; NUM_TILES],
+    /// Σ w of the points whose Huber weight is 1.
+    pub quadratic: f32,
+}
+
+impl Default for ScatterSums {
+    fn default() -> Self {
+        Self { tiles: [TileSum::default(); NUM_TILES], quadratic: 0.0 }
+    }
+}
+
 impl GradientScatter {
-    /// Measures it at one state.
-    pub fn measure(points: &LevelPoints, image: &Image<u16>, at: &Evaluation) -> Self {
-        let (columns, rows) = TILES;
-        let mut gradients = [[0.0f32; UNKNOWNS]; TILES.0 * TILES.1];
-        let mut is_seen = [false; TILES.0 * TILES.1];
-        let (mut weights, mut quadratic) = (0.0f32, 0.0f32);
-        let per_pixel =
-            (columns as f32 / image.width() as f32, rows as f32 / image.height() as f32);
+    /// Measures it at one state, point by point; the explanation of `Kernel::scatter`.
+    pub fn reference(points: &LevelPoints, image: &Image<u16>, at: &Evaluation) -> Self {
+        let mut sums = ScatterSums::default();
         for point in points.iter() {
             let Some(terms) = point_terms(image, at, &point) else { continue };
             let normalized = terms.residual * terms.residual / terms.variance;
             let huber = (at.huber / normalized.sqrt()).min(1.0);
-            let information = 1.0 / terms.variance;
-            weights += huber * information;
-            quadratic += if huber < 1.0 { 0.0 } else { information };
-            let column = (at.focal[0] * point.ray_x + at.centre[0]) * per_pixel.0;
-            let row = (at.focal[1] * point.ray_y + at.centre[1]) * per_pixel.1;
-            let tile = (row as usize).min(rows - 1) * columns + (column as usize).min(columns - 1);
-            let pull = huber * information * terms.residual;
-            for (sum, derivative) in gradients[tile].iter_mut().zip(terms.jacobian) {
-                *sum += pull * derivative;
+            let weight = huber / terms.variance;
+            sums.quadratic += if huber < 1.0 { 0.0 } else { weight };
+            let u = (at.focal[0] * point.ray_x + at.centre[0]).round() as usize;
+            let v = (at.focal[1] * point.ray_y + at.centre[1]).round() as usize;
+            let tile = &mut sums.tiles[usize::from(tile_of(u, v, image.width(), image.height()))];
+            tile.weight += weight;
+            for (sum, derivative) in tile.gradient.iter_mut().zip(terms.jacobian) {
+                *sum += weight * derivative * terms.residual;
             }
-            is_seen[tile] = true;
         }
+        Self::from_sums(&sums)
+    }
+
+    /// S and the curvature from the sums of the tiles.
+    pub fn from_sums(sums: &ScatterSums) -> Self {
         let mut scatter = Self::default();
-        for (gradient, _) in gradients.iter().zip(is_seen).filter(|(_, is_seen)| *is_seen) {
-            let gradient = SMatrix::<f64, UNKNOWNS, 1>::from(gradient.map(f64::from));
-            scatter.outer += gradient * gradient.transpose();
+        let mut weights = 0.0;
+        for tile in sums.tiles.iter().filter(|tile| tile.weight > 0.0) {
+            weights += f64::from(tile.weight);
             scatter.tiles += 1;
+            let gradient = tile.gradient.map(f64::from);
+            for i in 0..UNKNOWNS {
+                for j in i..UNKNOWNS {
+                    scatter.outer[(i, j)] += gradient[i] * gradient[j];
+                }
+            }
         }
-        if quadratic > 0.0 {
-            scatter.curvature_ratio = f64::from(quadratic / weights);
+        scatter.outer.fill_lower_triangle_with_upper_triangle();
+        if sums.quadratic > 0.0 {
+            // Two sums of the same weights may differ by rounding.
+            scatter.curvature_ratio = (f64::from(sums.quadratic) / weights).min(1.0);
         }
         scatter
     }

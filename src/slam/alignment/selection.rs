@@ -42,10 +42,10 @@ const TILE_PX: usize = 16;
 /// Chooses points, in memory that is used again.
 #[derive(Debug, Clone, Default)]
 pub struct Selection {
-    scores: Vec<f32>,
-    tile_of: Vec<u32>,
+    ranked: Vec<(u64, u32)>,
     tile_starts: Vec<u32>,
-    by_tile: Vec<u32>,
+    by_tile: Vec<u64>,
+    is_chosen: Vec<bool>,
     chosen: Vec<u32>,
 }
 
@@ -68,16 +68,15 @@ impl Selection {
             return &self.chosen;
         }
         let pixels_per_inverse_depth = focal_times_depth as f32 * params.typical_translation;
-        self.score(params, candidates, image, level, pixels_per_inverse_depth);
-        let num_tiles = self.sort_into_tiles(candidates, image.width(), image.height());
+        self.rank_all(params, candidates, image, level, pixels_per_inverse_depth);
+        let num_tiles = self.sort_into_tiles();
         self.fill_quotas(num_tiles, budget);
-        self.chosen.sort_unstable();
         &self.chosen
     }
 
-    /// Information of a point on a shift along its gradient, 1/pixels²:
-    /// 1/(σ²/|g|² + (∂u/∂d)² V).
-    fn score(
+    /// Ranks the candidates by their information on a shift along the gradient, 1/pixels²:
+    /// 1/(σ²/|g|² + (∂u/∂d)² V), and counts those of each tile.
+    fn rank_all(
         &mut self,
         params: &SelectionParams,
         candidates: &Candidates,
@@ -88,51 +87,51 @@ impl Selection {
         let grey = 0.5 * grey_per_sum(level);
         let noise = params.intensity_std_dev * params.intensity_std_dev;
         let from_depth = pixels_per_inverse_depth * pixels_per_inverse_depth;
-        let (right, bottom) = (image.width() - 1, image.height() - 1);
-        self.scores.clear();
-        self.scores.extend(candidates.as_slice().iter().map(|candidate| {
+        let (width, pixels) = (image.width(), image.pixels());
+        let (right, bottom) = (width - 1, image.height() - 1);
+        let columns = width.div_ceil(TILE_PX);
+        self.tile_starts.clear();
+        self.tile_starts.resize(columns * image.height().div_ceil(TILE_PX) + 1, 0);
+        self.ranked.clear();
+        let points = candidates.as_slice().iter().zip(0..);
+        self.ranked.extend(points.map(|(candidate, index)| {
             let (u, v) = (usize::from(candidate.u), usize::from(candidate.v));
-            let at = |u: usize, v: usize| f32::from(image.at(u, v));
-            let gx = (at((u + 1).min(right), v) - at(u.saturating_sub(1), v)) * grey;
-            let gy = (at(u, (v + 1).min(bottom)) - at(u, v.saturating_sub(1))) * grey;
+            let row = v * width;
+            let at = |index: usize| f32::from(pixels[index]);
+            let gx = (at(row + (u + 1).min(right)) - at(row + u.saturating_sub(1))) * grey;
+            let below = if v < bottom { row + width } else { row };
+            let gy = (at(below + u) - at(row.saturating_sub(width) + u)) * grey;
             let squared_gradient = gx * gx + gy * gy;
-            squared_gradient / (noise + squared_gradient * from_depth * candidate.variance)
+            let score =
+                squared_gradient / (noise + squared_gradient * from_depth * candidate.variance);
+            let tile = (v / TILE_PX) * columns + u / TILE_PX;
+            self.tile_starts[tile + 1] += 1;
+            (rank(score, index), tile as u32)
         }));
     }
 
-    /// Counting sort of the candidates by tile; gives the number of tiles.
-    fn sort_into_tiles(&mut self, candidates: &Candidates, width: usize, height: usize) -> usize {
-        let columns = width.div_ceil(TILE_PX);
-        let num_tiles = columns * height.div_ceil(TILE_PX);
-        self.tile_of.clear();
-        self.tile_starts.clear();
-        self.tile_starts.resize(num_tiles + 1, 0);
-        for candidate in candidates.as_slice() {
-            let (u, v) = (usize::from(candidate.u), usize::from(candidate.v));
-            let tile = (v / TILE_PX) * columns + u / TILE_PX;
-            self.tile_of.push(tile as u32);
-            self.tile_starts[tile + 1] += 1;
-        }
+    /// Counting sort of the ranks by tile; gives the number of tiles.
+    fn sort_into_tiles(&mut self) -> usize {
+        let num_tiles = self.tile_starts.len() - 1;
         for tile in 0..num_tiles {
             self.tile_starts[tile + 1] += self.tile_starts[tile];
         }
         self.by_tile.clear();
-        self.by_tile.resize(candidates.len(), 0);
-        // Filled from the back so that each start ends where its tile begins.
-        let mut ends = std::mem::take(&mut self.tile_starts);
-        for (index, &tile) in self.tile_of.iter().enumerate().rev() {
-            let end = &mut ends[tile as usize + 1];
-            *end -= 1;
-            self.by_tile[*end as usize] = index as u32;
+        self.by_tile.resize(self.ranked.len(), 0);
+        // Each start moves to the end of its tile, which is the start of the next …
+        for &(rank, tile) in &self.ranked {
+            let at = &mut self.tile_starts[tile as usize];
+            self.by_tile[*at as usize] = rank;
+            *at += 1;
         }
-        // Each end is now the start of its tile; shift them back into place.
-        ends.remove(0);
-        ends.push(candidates.len() as u32);
-        self.tile_starts = ends;
+        // … and all move back into place.
+        self.tile_starts.copy_within(0..num_tiles, 1);
+        self.tile_starts[0] = 0;
         num_tiles
     }
 
-    /// Takes from each tile its best points, as many as its share of the budget.
+    /// Takes from each tile its best points, as many as its share of the budget, and lists them
+    /// in ascending order.
     fn fill_quotas(&mut self, num_tiles: usize, budget: usize) {
         let tile = |starts: &[u32], tile: usize| starts[tile] as usize..starts[tile + 1] as usize;
         let share = |count: usize| (count as f64).sqrt();
@@ -150,29 +149,47 @@ impl Selection {
             }
             factor = (budget as f64 - taken).max(0.0) / f64::max(open, 1.0);
         }
-        let mut carried = 0.0;
+        let (mut carried, mut taken) = (0.0, 0);
+        self.is_chosen.clear();
+        self.is_chosen.resize(self.ranked.len(), false);
         for index in 0..num_tiles {
             let range = tile(&self.tile_starts, index);
             if range.is_empty() {
                 continue;
             }
             carried += (factor * share(range.len())).min(range.len() as f64);
-            let room = budget - self.chosen.len();
-            let quota = (carried as usize).min(range.len()).min(room);
+            let quota = (carried as usize).min(range.len()).min(budget - taken);
             carried -= quota as f64;
             if quota == 0 {
                 continue;
             }
-            let points = &mut self.by_tile[range];
-            if quota < points.len() {
-                let scores = &self.scores;
-                let best_first = |&a: &u32, &b: &u32| {
-                    let order = scores[b as usize].total_cmp(&scores[a as usize]);
-                    order.then(a.cmp(&b))
-                };
-                points.select_nth_unstable_by(quota - 1, best_first);
+            let ranks = &mut self.by_tile[range];
+            if quota < ranks.len() {
+                ranks.select_nth_unstable(quota - 1);
             }
-            self.chosen.extend_from_slice(&points[..quota]);
+            for &rank in &ranks[..quota] {
+                self.is_chosen[index_of(rank)] = true;
+            }
+            taken += quota;
         }
+        // One more than there are: every index is written, and over those that are not chosen.
+        self.chosen.resize(taken + 1, 0);
+        let mut count = 0;
+        for (index, &is_chosen) in self.is_chosen.iter().enumerate() {
+            self.chosen[count] = index as u32;
+            count += usize::from(is_chosen);
+        }
+        self.chosen.truncate(taken);
     }
+}
+
+/// Orders candidates, the best first, the earlier of two alike: a score is never negative, so that
+/// its bits are in its order.
+fn rank(score: f32, index: u32) -> u64 {
+    u64::from(!score.to_bits()) << 32 | u64::from(index)
+}
+
+/// The candidate of a [`rank`].
+fn index_of(rank: u64) -> usize {
+    rank as u32 as usize
 }

@@ -94,7 +94,7 @@ mod tests {
         };
         let mut fusion = DepthFusion::default();
         // Two in one tile, one alone in another.
-        fusion.fuse(&[depth(1, 1, 1.0), depth(6, 3, 2.0), depth(40, 9, 6.0)], 64, 32, 1);
+        fusion.fuse(&[depth(1, 1, 1.0), depth(6, 3, 2.0), depth(40, 9, 6.0)], 64, 32, 1, 0);
         let level = fusion.level(0);
         let mut surroundings = Surroundings::default();
         surroundings.measure(level, 64, 32);

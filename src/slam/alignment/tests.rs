@@ -194,6 +194,38 @@ fn every_kernel_equals_the_reference() {
     }
 }
 
+#[test]
+fn every_kernel_scatters_as_the_reference() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let reference = Reference::prepare(&plane.keyframe(&camera, 1, 0.1));
+    let image = pyramid(&plane.render(&camera, &move_of(9, 0.02), 2.0, (0.9, 4.0), 8));
+    let (points, image) = (reference.level(LEVEL), image.level(LEVEL));
+    assert!(points.runs().len() > points.blocks().len());
+    // Near the solution, where the gradients of tiles are all that is left, far from it, and so
+    // that most points leave the image.
+    for (pose, gain) in
+        [(move_of(9, 0.02).inverse(), 0.9f64), (move_of(3, 0.1), 1.0), (move_of(5, 0.3), 1.1)]
+    {
+        let at = evaluation(&pose, Brightness { a: gain.ln(), b: 3.0 });
+        let expected = GradientScatter::reference(points, image, &at);
+        assert!(expected.tiles > 12 && expected.curvature_ratio < 1.0);
+        for kernel in Kernel::available() {
+            let scatter = kernel.scatter(points, image, &at);
+            assert!(scatter.tiles.abs_diff(expected.tiles) <= 1, "{kernel:?}");
+            let off = (scatter.curvature_ratio / expected.curvature_ratio - 1.0).abs();
+            assert!(off < 2e-3, "{kernel:?} curvature off by {off}");
+            for i in 0..UNKNOWNS {
+                for j in 0..UNKNOWNS {
+                    let scale = (expected.outer[(i, i)] * expected.outer[(j, j)]).sqrt();
+                    let (a, b) = (scatter.outer[(i, j)], expected.outer[(i, j)]);
+                    assert!((a - b).abs() <= 2e-3 * scale, "{kernel:?} {i} {j}: {a} {b}");
+                    assert_eq!(a, scatter.outer[(j, i)]);
+                }
+            }
+        }
+    }
+}
+
 fn aligned(keyframe: &Keyframe, image: &[u8], start: &SE3, simd: SimdMode) -> (SE3, Ending) {
     let aligner = Aligner::new(AlignmentParams { simd, ..AlignmentParams::default() });
     let reference = Reference::prepare(keyframe);
@@ -332,7 +364,7 @@ fn noise_in_the_depth_does_not_pull_the_translation() {
     };
     let mut own_depth = LevelPoints::default();
     for point in reference.level(LEVEL).iter() {
-        own_depth.push(Point { surrounding_inverse_depth: point.inverse_depth, ..point });
+        own_depth.push(Point { surrounding_inverse_depth: point.inverse_depth, ..point }, 0);
     }
     let (without, with) = (pull(reference.level(LEVEL)), pull(&own_depth));
     assert!(without.abs() < 0.01 && with < -0.02, "{without} without, {with} with shared noise");
@@ -345,7 +377,7 @@ fn tiles_hold_the_gradient_and_correlated_residuals_cost_certainty() {
     let points = reference.level(LEVEL);
     let at = evaluation(&SE3::identity(), Brightness::default());
     let std_dev = |image: &SumPyramid| {
-        let scatter = GradientScatter::measure(points, image.level(LEVEL), &at);
+        let scatter = GradientScatter::reference(points, image.level(LEVEL), &at);
         assert!(scatter.tiles > 100 && scatter.curvature_ratio <= 1.0);
         let sums = accumulate_reference(points, image.level(LEVEL), &at);
         let covariance = scatter.covariance(&sums).unwrap();

@@ -2,11 +2,12 @@
 //!
 //! The trajectory figures are those of the Python package `evo` on the same files: nearest stamps
 //! without interpolation ([`association`]), Umeyama alignment ([`mod@umeyama`]), absolute and relative
-//! errors ([`trajectory_error`]). [`windows`] adds how the scale wanders, [`depth_error`] what the
+//! errors ([`trajectory_error`]); [`normalized_error`] holds pose errors against their covariance. [`windows`] adds how the scale wanders, [`depth_error`] what the
 //! depth maps and their variances are worth.
 
 pub mod association;
 pub mod depth_error;
+pub mod normalized_error;
 pub mod statistics;
 pub mod trajectory_error;
 pub mod umeyama;

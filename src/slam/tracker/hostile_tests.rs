@@ -169,9 +169,9 @@ proptest! {
         let mut tracker = Tracker::new(CAMERA, TrackerParams::default()).unwrap();
         tracker.adopt(Box::new(Reference::prepare(&harm.done_to(good.clone()))));
         if let Some(before) = before {
-            tracker.motion.observe(0, &before);
+            tracker.memory.motion.observe(0, &before);
         }
-        tracker.was_lost = was_lost;
+        tracker.memory.was_lost = was_lost;
         for (picture, capture_nanos, sequence) in pictures {
             let pixels = picture.pixels(&good.image);
             let mut left = iterations;

@@ -133,7 +133,7 @@ fn points_behind_the_camera_are_a_loss() {
     let keyframe = plane.keyframe(&camera, 2, 0.02);
     let mut tracker = tracker_on(&keyframe);
     let turned = SE3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, std::f64::consts::PI, 0.0));
-    tracker.motion.observe(0, &turned);
+    tracker.memory.motion.observe(0, &turned);
     let estimate = tracker.track(&frame(1, &keyframe.image), &mut always);
     assert!(matches!(estimate.state, TrackingState::Lost(_)), "{:?}", estimate.state);
     assert!(is_clean(&estimate));
@@ -145,13 +145,13 @@ fn only_frames_that_are_found_say_what_a_good_fit_is() {
     let keyframe = plane.keyframe(&camera, 2, 0.02);
     let mut tracker = tracker_on(&keyframe);
     assert!(tracker.track(&frame(0, &keyframe.image), &mut always).state.is_tracked());
-    let good = tracker.coarse_fit;
+    let good = tracker.memory.coarse_fit;
     assert!(good.is_some());
     let unrelated = Plane::new([-0.3, 0.1, 0.8], [7.0, 90.0], &camera);
     let unrelated = unrelated.render(&camera, &path(40), 2.0, (1.0, 0.0), 3);
     let estimate = tracker.track(&frame(1, &unrelated), &mut always);
     assert!(matches!(estimate.state, TrackingState::Lost(_)), "{:?}", estimate.state);
-    assert_eq!(tracker.coarse_fit, good, "a lost frame");
+    assert_eq!(tracker.memory.coarse_fit, good, "a lost frame");
     // Time ends within the first level of a frame that is hard to follow.
     let image = plane.render(&camera, &path(6), 2.0, (1.0, 0.0), 7);
     let mut left = 2;
@@ -159,9 +159,9 @@ fn only_frames_that_are_found_say_what_a_good_fit_is() {
         left -= 1;
         left >= 0
     };
-    tracker.was_lost = false;
+    tracker.memory.was_lost = false;
     tracker.track(&frame(2, &image), &mut short);
-    assert_eq!(tracker.coarse_fit, good, "a frame cut short");
+    assert_eq!(tracker.memory.coarse_fit, good, "a frame cut short");
 }
 
 #[test]
@@ -171,8 +171,8 @@ fn a_far_hypothesis_does_not_win_by_its_tolerance() {
     let keyframe = plane.keyframe(&camera, 2, 0.4);
     let mut tracker = tracker_on(&keyframe);
     let far = SE3::exp(&Vector6::new(0.3, 0.2, -2.0, 0.0, 0.0, 0.0));
-    tracker.motion.observe(0, &far);
-    tracker.was_lost = true;
+    tracker.memory.motion.observe(0, &far);
+    tracker.memory.was_lost = true;
     let truth = SE3::exp(&Vector6::new(0.01, 0.0, 0.0, 0.04, -0.03, 0.0));
     let mut image = plane.render(&camera, &truth, 2.0, (1.0, 0.0), 4);
     // Something stands in the way of a quarter of the view: the right pose does not explain that.
@@ -272,5 +272,30 @@ fn sub_pixel_motion_is_found_without_pull_from_or_to_whole_pixels() {
         // Pixels of level 0. The mean of so many scatters by 0.006. A gradient that shares noise
         // with the residual leaves 0.12 here.
         assert!(mean.norm() < 0.02, "{shift_px} px: {mean}");
+    }
+}
+
+#[test]
+fn rehearsals_with_any_budget_leave_the_tracker_as_it_is() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let keyframe = plane.keyframe(&camera, 2, 0.02);
+    let (mut rehearsing, mut other) = (tracker_on(&keyframe), tracker_on(&keyframe));
+    for sequence in 0..=8 {
+        let image = plane.render(&camera, &path(sequence), 2.0, (1.0, 0.0), 100 + sequence);
+        let frame = frame(sequence, &image);
+        let memory = rehearsing.memory().clone();
+        let estimate = rehearsing.track(&frame, &mut always);
+        assert_eq!(estimate, other.track(&frame, &mut always), "frame {sequence}");
+        assert_eq!(estimate, rehearsing.rehearse(&memory, &frame, &mut always));
+        for iterations in [0, 1, 3] {
+            let mut left = iterations;
+            let mut budget = |_: usize| {
+                left -= 1;
+                left >= 0
+            };
+            let short = rehearsing.rehearse(&memory, &frame, &mut budget);
+            assert_ne!(short.state, TrackingState::Tracking, "{iterations} iterations");
+            assert!(is_clean(&short));
+        }
     }
 }

@@ -51,6 +51,19 @@ impl Range {
         Self { low: middle - 0.5 * width, high: middle + 0.5 * width }
     }
 
+    /// Of a range of decimal logarithms: the powers of ten within, with the text for each.
+    pub fn decade_ticks(self) -> Vec<(f64, String)> {
+        let exponents = self.low.ceil() as i32..=self.high.floor() as i32;
+        // A range of f64 spans some six hundred decades.
+        let stride = (exponents.clone().count() as f64 / TICKS).ceil().max(1.0) as usize;
+        let tick = |exponent: i32| {
+            let decimals = usize::try_from(-exponent).unwrap_or(0);
+            let value = 10f64.powi(exponent);
+            (value, format!("{value:.decimals$}"))
+        };
+        exponents.step_by(stride).map(tick).collect()
+    }
+
     /// Round values within the range, with the text for each.
     pub fn ticks(self) -> Vec<(f64, String)> {
         let step = round_step(self.width() / TICKS);

@@ -53,6 +53,8 @@ pub enum Scaling {
     FromZero,
     /// A length is as long along x as along y.
     Equal,
+    /// Each by itself, y in decades; only values above zero are shown.
+    Decades,
 }
 
 /// A chart.
@@ -75,13 +77,16 @@ pub struct Chart {
 /// Where the axes' values lie in the picture.
 struct Frame {
     x: Range,
+    /// Of the values, or of their decimal logarithms.
     y: Range,
+    in_decades: bool,
     width: f64,
     height: f64,
 }
 
 impl Frame {
     fn place(&self, [x, y]: [f64; 2]) -> [f64; 2] {
+        let y = if self.in_decades { y.log10() } else { y };
         [
             MARGIN[0] + (x - self.x.low) / self.x.width() * self.width,
             MARGIN[1] + (self.y.high - y) / self.y.width() * self.height,
@@ -128,10 +133,12 @@ impl Chart {
             let drawn = self.series.iter().filter(|series| series.mark != Mark::Rule);
             drawn.flat_map(|series| &series.points)
         };
+        let in_decades = self.scaling == Scaling::Decades;
+        let height_of = |y: f64| if in_decades { y.log10() } else { y };
         let mut x = Range::around(points().map(|p| p[0]));
-        let mut y = Range::around(rules_excluded().map(|p| p[1]));
+        let mut y = Range::around(rules_excluded().map(|p| height_of(p[1])));
         match self.scaling {
-            Scaling::Free => {}
+            Scaling::Free | Scaling::Decades => {}
             Scaling::FromZero => y = y.from_zero(),
             Scaling::Equal => {
                 let unit = (x.width() / width).max(y.width() / height);
@@ -139,7 +146,7 @@ impl Chart {
                 y = y.widened_to(unit * height);
             }
         }
-        Frame { x, y, width, height }
+        Frame { x, y, in_decades, width, height }
     }
 
     /// Names with a stroke of their colour, from the right end of the title's line.
@@ -173,7 +180,8 @@ impl Chart {
             let _ = write!(grid, "M{x:.1} {top:.1}V{bottom:.1}");
             draw_text(svg, x, bottom + 16.0, "middle", "opacity=\"0.75\"", &text);
         }
-        for (value, text) in frame.y.ticks() {
+        let ticks = if frame.in_decades { frame.y.decade_ticks() } else { frame.y.ticks() };
+        for (value, text) in ticks {
             let [_, y] = frame.place([frame.x.low, value]);
             let _ = write!(grid, "M{left:.1} {y:.1}H{right:.1}");
             draw_text(svg, left - 7.0, y + 4.0, "end", "opacity=\"0.75\"", &text);
@@ -190,6 +198,34 @@ impl Chart {
         let turned = format!("opacity=\"0.75\" transform=\"rotate(-90 12 {y:.1})\"");
         draw_text(svg, 12.0, y, "middle", &turned, &self.y_label);
     }
+}
+
+/// Charts in rows of `columns` as an SVG file with a white ground.
+pub fn svg_file(charts: &[Chart], columns: usize) -> String {
+    let rows: Vec<&[Chart]> = charts.chunks(columns.max(1)).collect();
+    let highest = |row: &[Chart]| row.iter().map(|chart| chart.height).fold(0.0, f64::max);
+    let height: f64 = rows.iter().map(|row| highest(row)).sum();
+    let width = CHART_WIDTH * columns.max(1) as f64;
+    let mut svg = format!(
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {width} {height}\" \
+         color=\"#1c2230\"><rect width=\"100%\" height=\"100%\" fill=\"#fff\"/>"
+    );
+    let mut top = 0.0;
+    for row in rows {
+        for (column, chart) in row.iter().enumerate() {
+            // Each chart brings its own viewBox; its place is given by its size.
+            let _ = write!(
+                svg,
+                "<svg x=\"{}\" y=\"{top}\" width=\"{CHART_WIDTH}\" height=\"{}\">{}</svg>",
+                column as f64 * CHART_WIDTH,
+                chart.height,
+                chart.svg()
+            );
+        }
+        top += highest(row);
+    }
+    svg.push_str("</svg>\n");
+    svg
 }
 
 const DASH: &str = " stroke-dasharray=\"6 4\"";
@@ -348,5 +384,18 @@ mod tests {
             }
         }
         assert!(chart(Mark::Line, Vec::new()).svg().contains("nothing to show"));
+    }
+
+    #[test]
+    fn decades_are_equally_far_apart() {
+        let points = vec![[0.0, 0.01], [1.0, 0.1], [2.0, 0.0], [3.0, 1.0]];
+        let chart = Chart { scaling: Scaling::Decades, ..chart(Mark::Path, points) };
+        let frame = chart.frame();
+        let heights = [0.01, 0.1, 1.0].map(|y| frame.place([0.0, y])[1]);
+        assert!((heights[0] - heights[1] - (heights[1] - heights[2])).abs() < 1e-9);
+        assert!(heights[2] > MARGIN[1] && heights[0] < 240.0 - MARGIN[3]);
+        let svg = chart.svg();
+        assert!(svg.contains(">0.01<") && svg.contains(">0.1<") && svg.contains(">1<"));
+        assert!(!svg.contains("NaN") && !svg.contains("inf"), "zero has no place: {svg}");
     }
 }

@@ -14,11 +14,15 @@ use crate::slam::evaluation::windows::SCALE_WINDOW;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::trajectory::StampedPose;
 
-/// Colours that can be told apart with any sight, on white and on black.
+/// Colours that can be told apart with any sight, on white and on black: of the truth,
 const TRUTH: &str = "#8b929c";
-const ESTIMATE: &str = "#2f6fed";
+/// … of estimates,
+pub const ESTIMATE: &str = "#2f6fed";
+/// … of what was published,
 const ONLINE: &str = "#e59a1a";
-const ERROR: &str = "#d6455d";
+/// … of errors,
+pub const ERROR: &str = "#d6455d";
+/// … of the mapper.
 const MAPPING: &str = "#1f9d78";
 
 /// Bars of a histogram.

@@ -1,8 +1,6 @@
 //! One picture of a trajectory against ground truth, as a file of its own.
 
-use std::fmt::Write;
-
-use crate::service::results::report::chart::{CHART_WIDTH, Chart};
+use crate::service::results::report::chart::{Chart, svg_file};
 use crate::service::results::report::charts::{
     error_chart, error_points, error_series, trajectory_charts,
 };
@@ -24,22 +22,5 @@ pub fn evaluation_plot(
     let errors = error_series(error_points(estimate, evaluation, secs));
     let views = trajectory_charts(estimate, &truth, &evaluation.alignment, "m", &[]);
     let charts: Vec<Chart> = views.into_iter().chain([error_chart(vec![errors])]).collect();
-    let height: f64 = charts.iter().map(|chart| chart.height).sum();
-    let mut svg = format!(
-        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {CHART_WIDTH} {height}\" \
-         color=\"#1c2230\"><rect width=\"100%\" height=\"100%\" fill=\"#fff\"/>"
-    );
-    let mut top = 0.0;
-    for chart in &charts {
-        // Each chart brings its own viewBox; its place is given by its size.
-        let _ = write!(
-            svg,
-            "<svg y=\"{top}\" width=\"{CHART_WIDTH}\" height=\"{}\">{}</svg>",
-            chart.height,
-            chart.svg()
-        );
-        top += chart.height;
-    }
-    svg.push_str("</svg>\n");
-    svg
+    svg_file(&charts, 1)
 }

@@ -1,6 +1,7 @@
 //! `report.html`: a run on one page that needs no other file and no network.
 
 pub mod axis;
+pub mod budget_charts;
 pub mod chart;
 pub mod charts;
 pub mod evaluation_plot;
@@ -15,6 +16,7 @@ use crate::service::results::pictures::{
     RELATIVE_STD_DEV_RANGE, density_picture, inverse_depth_picture, variance_picture,
 };
 use crate::service::results::ply::CloudPoint;
+use crate::service::results::report::budget_charts::budget_charts;
 use crate::service::results::report::chart::Chart;
 use crate::service::results::report::charts::{
     error_over_time, scale_over_time, time_charts, trajectory_views,
@@ -81,6 +83,7 @@ pub fn report(input: &ReportInput<'_>) -> String {
     section(&mut page, "Error", &errors);
     page.push_str(&depth_maps(input));
     section(&mut page, "Time", &time_charts(input.record));
+    page.push_str(&budget(input));
     page.push_str(&figures(summary));
     page.push_str("</main></body></html>\n");
     page
@@ -97,6 +100,28 @@ fn map(input: &ReportInput<'_>) -> String {
         png_address(&png),
         grouped(input.cloud.len() as u64)
     )
+}
+
+/// What a deadline costs; nothing where no frame was aligned again.
+fn budget(input: &ReportInput<'_>) -> String {
+    let samples = &input.record.budget_samples;
+    let charts = budget_charts(samples, input.summary.budget_curve.as_ref());
+    if charts.is_empty() {
+        return String::new();
+    }
+    let mut html = format!(
+        "<section><h2>Quality and budget</h2><p>{} frames aligned again and stopped early: how far the \
+         keyframe's points then lie, on average over the image, from where the pose without a \
+         deadline puts them. Each curve begins with the prediction alone, which a coarse level may \
+         be less exact than; 0.001 px is no difference.</p>\
+         <div class=\"charts\">",
+        samples.len()
+    );
+    for chart in &charts {
+        let _ = write!(html, "<figure>{}</figure>", chart.svg());
+    }
+    html.push_str("</div></section>");
+    html
 }
 
 /// Charts side by side under a heading; nothing where there are none.
@@ -300,15 +325,9 @@ fn figures(summary: &Summary) -> String {
     for (key, value) in value.as_object().into_iter().flatten() {
         let text = match value {
             serde_json::Value::Null => continue,
+            // A table of its own, and drawn.
+            _ if key == "budget_curve" => continue,
             serde_json::Value::Object(entries) if entries.values().all(|v| v.is_null()) => continue,
-            serde_json::Value::Object(entries) => {
-                let entries = entries.iter().filter(|(_, v)| !v.is_null());
-                let named = entries.map(|(k, v)| format!("{k} {}", figure(v)));
-                named.collect::<Vec<_>>().join(", ")
-            }
-            serde_json::Value::Array(values) => {
-                values.iter().map(figure).collect::<Vec<_>>().join(", ")
-            }
             other => figure(other),
         };
         let _ = write!(html, "<div><dt>{key}</dt><dd>{}</dd></div>", escaped(&text));
@@ -317,10 +336,20 @@ fn figures(summary: &Summary) -> String {
     html
 }
 
-/// A number with at most five significant digits after the point; text as it is.
+/// A number with at most five significant digits after the point; text as it is; several with
+/// their names.
 fn figure(value: &serde_json::Value) -> String {
     match value {
         serde_json::Value::String(text) => text.clone(),
+        serde_json::Value::Object(entries) => {
+            let entries = entries.iter().filter(|(_, value)| !value.is_null());
+            let named = entries.map(|(key, value)| format!("{key} {}", figure(value)));
+            named.collect::<Vec<_>>().join(", ")
+        }
+        serde_json::Value::Array(values) => {
+            let separator = if values.iter().any(|value| value.is_object()) { "; " } else { ", " };
+            values.iter().map(figure).collect::<Vec<_>>().join(separator)
+        }
         serde_json::Value::Number(number) if number.is_f64() => {
             let number = number.as_f64().unwrap_or(f64::NAN);
             if number != 0.0 && number.abs() < 1e-3 {

@@ -13,16 +13,20 @@ use crate::slam::alignment::residual::{
 use crate::slam::image::buffer::Image;
 
 /// Blocks of a chunk: its columns take 10 kB, a third of a small first-level cache.
-const CHUNK_BLOCKS: usize = 16;
+pub const CHUNK_BLOCKS: usize = 16;
 
 /// Columns: eight of the Jacobian, the residual.
 const COLUMNS: usize = UNKNOWNS + 1;
-const RESIDUAL: usize = UNKNOWNS;
+pub const RESIDUAL: usize = UNKNOWNS;
 
 /// The columns of one block of points.
 #[derive(Clone, Copy)]
 #[repr(C, align(64))]
-struct Whitened([[f32; LANES]; COLUMNS]);
+pub struct Whitened(pub [[f32; LANES]; COLUMNS]);
+
+impl Whitened {
+    pub const ZERO: Self = Self([[0.0; LANES]; COLUMNS]);
+}
 
 /// Sums of products of columns, the upper triangle of JᵀWJ and JᵀWr, lane by lane; `[i][j]`, j > 7
 /// the residual.
@@ -31,11 +35,22 @@ struct Whitened([[f32; LANES]; COLUMNS]);
 struct Sums([[[f32; LANES]; COLUMNS]; UNKNOWNS]);
 
 /// Sums that are not products of columns.
-struct Statistics<L> {
+pub struct Statistics<L> {
     energy: L,
     squared_residual: L,
     in_view: u32,
     inliers: u32,
+}
+
+impl<L: Lanes> Statistics<L> {
+    /// # Safety
+    /// The CPU has the instructions of `L`.
+    #[inline(always)]
+    pub unsafe fn zero() -> Self {
+        // SAFETY: this function's own contract.
+        let zero = unsafe { L::splat(0.0) };
+        Self { energy: zero, squared_residual: zero, in_view: 0, inliers: 0 }
+    }
 }
 
 /// # Safety
@@ -47,13 +62,11 @@ pub unsafe fn accumulate<L: Lanes>(
     image: &Image<u16>,
     at: &Evaluation,
 ) -> NormalEquations {
-    let mut columns = [Whitened([[0.0; LANES]; COLUMNS]); CHUNK_BLOCKS];
+    let mut columns = [Whitened::ZERO; CHUNK_BLOCKS];
     let mut sums = Sums([[[0.0; LANES]; COLUMNS]; UNKNOWNS]);
     // SAFETY: this function's own contract; all pointers go to blocks of sixteen floats.
     unsafe {
-        let zero = L::splat(0.0);
-        let mut statistics =
-            Statistics { energy: zero, squared_residual: zero, in_view: 0, inliers: 0 };
+        let mut statistics = Statistics::<L>::zero();
         for blocks in points.blocks().chunks(CHUNK_BLOCKS) {
             for (block, whitened) in blocks.iter().zip(&mut columns) {
                 for lane in (0..LANES).step_by(L::N) {
@@ -76,7 +89,7 @@ pub unsafe fn accumulate<L: Lanes>(
 /// # Safety
 /// As [`accumulate`].
 #[inline(always)]
-unsafe fn whiten<L: Lanes>(
+pub unsafe fn whiten<L: Lanes>(
     block: &PointBlock,
     lane: usize,
     image: &Image<u16>,

@@ -1,0 +1,60 @@
+//! How good a pose is after some iterations or some time: two charts of the report.
+
+use crate::service::results::budget_curve::{BudgetCurve, BudgetSample, displacement_by_time};
+use crate::service::results::report::chart::{Chart, Mark, Scaling, Series};
+use crate::service::results::report::charts::{ERROR, ESTIMATE};
+use crate::slam::evaluation::statistics::median;
+
+/// A displacement below this is none: a hundredth of what the alignment itself is right to, pixels.
+const LEAST_PX: f64 = 1e-3;
+
+/// The axis of time ends at so many times the median time of a whole frame: one that another
+/// process held up would squeeze all others.
+const SHOWN_MEDIANS: f64 = 2.0;
+
+/// Points along the axis of time.
+const TIME_STEPS: usize = 160;
+
+/// Displacement against iterations and against time; nothing where no frame was aligned again.
+pub fn budget_charts(samples: &[BudgetSample], curve: Option<&BudgetCurve>) -> Vec<Chart> {
+    let Some(curve) = curve else { return Vec::new() };
+    let iterations = || curve.iterations.iter().map(|&n| f64::from(n));
+    let by_iterations = |displacements: &[f64]| -> Vec<[f64; 2]> {
+        iterations().zip(displacements).map(|(n, &px)| [n, px.max(LEAST_PX)]).collect()
+    };
+    let whole: Vec<f64> =
+        samples.iter().filter_map(|s| s.last()).map(|step| step.nanos as f64 * 1e-6).collect();
+    let longest = SHOWN_MEDIANS * median(&whole).unwrap_or(0.0);
+    let times: Vec<f64> =
+        (0..=TIME_STEPS).map(|i| i as f64 / TIME_STEPS as f64 * longest).collect();
+    let by_time = displacement_by_time(samples, &times);
+    let share = |index: usize| -> Vec<[f64; 2]> {
+        by_time.iter().map(|(time, px)| [*time, px[index].max(LEAST_PX)]).collect()
+    };
+    let mut by_iterations = chart(
+        "Pose after so many iterations",
+        "iterations, all levels together",
+        by_iterations(&curve.displacement_px_p50),
+        by_iterations(&curve.displacement_px_p90),
+    );
+    // The budgets that were tried.
+    let dots = by_iterations.series.clone().into_iter();
+    by_iterations.series.extend(dots.map(|line| Series {
+        name: "",
+        mark: Mark::Dots(2.4),
+        ..line
+    }));
+    vec![by_iterations, chart("Pose after so long", "time in the tracker [ms]", share(0), share(1))]
+}
+
+fn chart(title: &'static str, x_label: &str, half: Vec<[f64; 2]>, most: Vec<[f64; 2]>) -> Chart {
+    let line = |name, colour, points| Series { name, colour, mark: Mark::Path, points };
+    Chart {
+        title,
+        x_label: x_label.into(),
+        y_label: "from the final pose [px]".into(),
+        height: 260.0,
+        scaling: Scaling::Decades,
+        series: vec![line("90 % of frames", ERROR, most), line("median", ESTIMATE, half)],
+    }
+}

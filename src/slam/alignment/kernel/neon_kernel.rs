@@ -1,0 +1,154 @@
+//! NEON lanes, four of them.
+
+use std::arch::aarch64::*;
+
+use crate::slam::alignment::kernel::accumulate_kernel::accumulate;
+use crate::slam::alignment::kernel::lanes_kernel::{Lanes, Sample};
+use crate::slam::alignment::kernel::scatter_kernel::scatter;
+use crate::slam::alignment::normal_equations::NormalEquations;
+use crate::slam::alignment::points::LevelPoints;
+use crate::slam::alignment::residual::Evaluation;
+use crate::slam::alignment::scatter::GradientScatter;
+use crate::slam::image::buffer::Image;
+
+/// # Safety
+/// The CPU has NEON; `at` was made for the size of `image`.
+#[target_feature(enable = "neon")]
+pub unsafe fn accumulate_neon(
+    points: &LevelPoints,
+    image: &Image<u16>,
+    at: &Evaluation,
+) -> NormalEquations {
+    // SAFETY: this function's own contract.
+    unsafe { accumulate::<float32x4_t>(points, image, at) }
+}
+
+/// # Safety
+/// The CPU has NEON; `at` was made for the size of `image`.
+#[target_feature(enable = "neon")]
+pub unsafe fn scatter_neon(
+    points: &LevelPoints,
+    image: &Image<u16>,
+    at: &Evaluation,
+) -> GradientScatter {
+    // SAFETY: this function's own contract.
+    unsafe { scatter::<float32x4_t>(points, image, at) }
+}
+
+impl Lanes for float32x4_t {
+    const N: usize = 4;
+    type Mask = uint32x4_t;
+
+    #[inline(always)]
+    unsafe fn splat(value: f32) -> Self {
+        // SAFETY: the trait's contract.
+        unsafe { vdupq_n_f32(value) }
+    }
+    #[inline(always)]
+    unsafe fn load(from: *const f32) -> Self {
+        // SAFETY: the trait's contract.
+        unsafe { vld1q_f32(from) }
+    }
+    #[inline(always)]
+    unsafe fn store(self, to: *mut f32) {
+        // SAFETY: the trait's contract.
+        unsafe { vst1q_f32(to, self) }
+    }
+    #[inline(always)]
+    unsafe fn add(self, other: Self) -> Self {
+        // SAFETY: the trait's contract.
+        unsafe { vaddq_f32(self, other) }
+    }
+    #[inline(always)]
+    unsafe fn sub(self, other: Self) -> Self {
+        // SAFETY: the trait's contract.
+        unsafe { vsubq_f32(self, other) }
+    }
+    #[inline(always)]
+    unsafe fn mul(self, other: Self) -> Self {
+        // SAFETY: the trait's contract.
+        unsafe { vmulq_f32(self, other) }
+    }
+    #[inline(always)]
+    unsafe fn div(self, other: Self) -> Self {
+        // SAFETY: the trait's contract.
+        unsafe { vdivq_f32(self, other) }
+    }
+    #[inline(always)]
+    unsafe fn sqrt(self) -> Self {
+        // SAFETY: the trait's contract.
+        unsafe { vsqrtq_f32(self) }
+    }
+    #[inline(always)]
+    unsafe fn min(self, other: Self) -> Self {
+        // The number where the other is not one (0/0 in Huber's weight), as on the other CPUs.
+        // SAFETY: the trait's contract.
+        unsafe { vminnmq_f32(self, other) }
+    }
+    #[inline(always)]
+    unsafe fn max(self, other: Self) -> Self {
+        // SAFETY: the trait's contract.
+        unsafe { vmaxnmq_f32(self, other) }
+    }
+    #[inline(always)]
+    unsafe fn mul_add(self, factor: Self, summand: Self) -> Self {
+        // SAFETY: the trait's contract.
+        unsafe { vfmaq_f32(summand, self, factor) }
+    }
+    #[inline(always)]
+    unsafe fn greater(self, other: Self) -> uint32x4_t {
+        // SAFETY: the trait's contract.
+        unsafe { vcgtq_f32(self, other) }
+    }
+    #[inline(always)]
+    unsafe fn at_least(self, other: Self) -> uint32x4_t {
+        // SAFETY: the trait's contract.
+        unsafe { vcgeq_f32(self, other) }
+    }
+    #[inline(always)]
+    unsafe fn both(one: uint32x4_t, other: uint32x4_t) -> uint32x4_t {
+        // SAFETY: the trait's contract.
+        unsafe { vandq_u32(one, other) }
+    }
+    #[inline(always)]
+    unsafe fn select(mask: uint32x4_t, yes: Self, no: Self) -> Self {
+        // SAFETY: the trait's contract.
+        unsafe { vbslq_f32(mask, yes, no) }
+    }
+    #[inline(always)]
+    unsafe fn count(mask: uint32x4_t) -> u32 {
+        // SAFETY: the trait's contract.
+        unsafe { vaddvq_u32(vshrq_n_u32::<31>(mask)) }
+    }
+    #[inline(always)]
+    unsafe fn sample(image: &[u16], stride: usize, u: Self, v: Self) -> Sample<Self> {
+        // SAFETY: the trait's contract; every index and its right and lower neighbour lie within
+        // the image, so that each load reads two of its pixels.
+        unsafe {
+            let (column, row) = (vcvtq_u32_f32(u), vcvtq_u32_f32(v));
+            let upper = vmlaq_u32(column, row, vdupq_n_u32(stride as u32));
+            let lower = vaddq_u32(upper, vdupq_n_u32(stride as u32));
+            let pixels = image.as_ptr();
+            let pair = |index: u32| pixels.add(index as usize).cast::<u32>().read_unaligned();
+            // There is no gather; little-endian: the left pixel is the lower half of a pair.
+            let pairs = |index: uint32x4_t| {
+                let pairs = vdupq_n_u32(pair(vgetq_lane_u32::<0>(index)));
+                let pairs = vsetq_lane_u32::<1>(pair(vgetq_lane_u32::<1>(index)), pairs);
+                let pairs = vsetq_lane_u32::<2>(pair(vgetq_lane_u32::<2>(index)), pairs);
+                vsetq_lane_u32::<3>(pair(vgetq_lane_u32::<3>(index)), pairs)
+            };
+            let (upper, lower) = (pairs(upper), pairs(lower));
+            let low = vdupq_n_u32(0xFFFF);
+            let left = |pair: uint32x4_t| vcvtq_f32_u32(vandq_u32(pair, low));
+            let right = |pair: uint32x4_t| vcvtq_f32_u32(vshrq_n_u32::<16>(pair));
+            Sample {
+                upper_left: left(upper),
+                upper_right: right(upper),
+                lower_left: left(lower),
+                lower_right: right(lower),
+                du: vsubq_f32(u, vcvtq_f32_u32(column)),
+                dv: vsubq_f32(v, vcvtq_f32_u32(row)),
+            }
+        }
+    }
+}

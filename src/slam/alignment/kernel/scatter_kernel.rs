@@ -1,0 +1,138 @@
+//! The gradient of the cost by tile of the image, for any instruction set:
+//! `GradientScatter::reference` in lanes.
+//!
+//! The whitened columns hold all of it: √w J · √w r is a point's gradient, √w · √w its weight, and
+//! its Huber weight is 1 where (√w r)² ≤ k². Points lie row by row, so that a block meets a few
+//! tiles in runs of lanes: each run adds its products, lane by lane, to the sums of its tile.
+
+use crate::slam::alignment::kernel::accumulate_kernel::{
+    CHUNK_BLOCKS, RESIDUAL, Statistics, Whitened, whiten,
+};
+use crate::slam::alignment::kernel::lanes_kernel::Lanes;
+use crate::slam::alignment::normal_equations::UNKNOWNS;
+use crate::slam::alignment::points::{LANES, LevelPoints, TileRun};
+use crate::slam::alignment::residual::Evaluation;
+use crate::slam::alignment::scatter::{GradientScatter, NUM_TILES, ScatterSums};
+use crate::slam::image::buffer::Image;
+
+/// The column of −√w: the derivative by the offset is −1.
+const WEIGHT: usize = 7;
+
+/// Sums of one tile, lane by lane; where an instruction set has fewer lanes, the rest stays zero.
+#[derive(Clone, Copy)]
+#[repr(C, align(64))]
+struct TileSums {
+    gradient: [[f32; LANES]; UNKNOWNS],
+    weight: [f32; LANES],
+}
+
+impl TileSums {
+    const ZERO: Self = Self { gradient: [[0.0; LANES]; UNKNOWNS], weight: [0.0; LANES] };
+}
+
+/// Ones where a run is, read at an offset: sixteen zeros, sixteen ones, sixteen zeros.
+static ONES: [f32; 3 * LANES] = {
+    let mut ones = [0.0; 3 * LANES];
+    let mut lane = LANES;
+    while lane < 2 * LANES {
+        ones[lane] = 1.0;
+        lane += 1;
+    }
+    ones
+};
+
+/// # Safety
+/// The CPU has the instructions of `L`; a projection below `at.upper_bound` has a right and a
+/// lower neighbour in `image`.
+#[inline(always)]
+pub unsafe fn scatter<L: Lanes>(
+    points: &LevelPoints,
+    image: &Image<u16>,
+    at: &Evaluation,
+) -> GradientScatter {
+    let mut columns = [Whitened::ZERO; CHUNK_BLOCKS];
+    let mut tiles = [TileSums::ZERO; NUM_TILES];
+    let mut sums = ScatterSums::default();
+    let mut runs = points.runs();
+    // SAFETY: this function's own contract; all pointers go to blocks of sixteen floats.
+    unsafe {
+        let mut statistics = Statistics::<L>::zero();
+        let mut quadratic = L::splat(0.0);
+        for (chunk, blocks) in points.blocks().chunks(CHUNK_BLOCKS).enumerate() {
+            for (block, whitened) in blocks.iter().zip(&mut columns) {
+                for lane in (0..LANES).step_by(L::N) {
+                    whiten::<L>(block, lane, image, at, whitened, &mut statistics);
+                    quadratic = quadratic.add(quadratic_weight::<L>(whitened, lane, at.huber));
+                }
+            }
+            let first_block = chunk * CHUNK_BLOCKS;
+            let is_here = |run: &TileRun| (run.block as usize) < first_block + blocks.len();
+            let (here, rest) = runs.split_at(runs.partition_point(is_here));
+            runs = rest;
+            for run in here {
+                let Some(tile) = tiles.get_mut(usize::from(run.tile)) else { continue };
+                add_run::<L>(&columns[run.block as usize - first_block], run, tile);
+            }
+        }
+        let mut lanes = [0.0; LANES];
+        quadratic.store(lanes.as_mut_ptr());
+        sums.quadratic = total(&lanes);
+    }
+    for (tile, sums) in tiles.iter().zip(&mut sums.tiles) {
+        sums.weight = total(&tile.weight);
+        if sums.weight > 0.0 {
+            sums.gradient = std::array::from_fn(|i| total(&tile.gradient[i]));
+        }
+    }
+    GradientScatter::from_sums(&sums)
+}
+
+/// The weights of the points whose Huber weight is 1.
+///
+/// # Safety
+/// The CPU has the instructions of `L`; `lane` + N is at most sixteen.
+#[inline(always)]
+unsafe fn quadratic_weight<L: Lanes>(whitened: &Whitened, lane: usize, huber: f32) -> L {
+    // SAFETY: this function's own contract.
+    unsafe {
+        let root = L::load(whitened.0[WEIGHT].as_ptr().add(lane));
+        let residual = L::load(whitened.0[RESIDUAL].as_ptr().add(lane));
+        let is_within = L::splat(huber * huber).at_least(residual.mul(residual));
+        L::select(is_within, root.mul(root), L::splat(0.0))
+    }
+}
+
+/// Adds the products of the lanes of `run`, whose block is `whitened`.
+///
+/// # Safety
+/// The CPU has the instructions of `L`.
+#[inline(always)]
+unsafe fn add_run<L: Lanes>(whitened: &Whitened, run: &TileRun, tile: &mut TileSums) {
+    let (first, end) = (usize::from(run.first).min(LANES), usize::from(run.end).min(LANES));
+    // SAFETY: this function's own contract; a register begins at a multiple of N below sixteen,
+    // and the ones at most sixteen before or after those of the mask.
+    unsafe {
+        for lane in (first - first % L::N..end).step_by(L::N) {
+            let column = |index: usize| L::load(whitened.0[index].as_ptr().add(lane));
+            // One from the first lane on, and one before the end.
+            let from_first = L::load(ONES.as_ptr().add(LANES + lane - first));
+            let before_end = L::load(ONES.as_ptr().add(2 * LANES + lane - end));
+            let mask = from_first.mul(before_end);
+            let residual = column(RESIDUAL).mul(mask);
+            let root = column(WEIGHT);
+            for (index, sum) in tile.gradient.iter_mut().enumerate() {
+                column(index).mul_add(residual, L::load(sum.as_ptr())).store(sum.as_mut_ptr());
+            }
+            let sum = &mut tile.weight;
+            root.mul(mask).mul_add(root, L::load(sum.as_ptr())).store(sum.as_mut_ptr());
+        }
+    }
+}
+
+/// The sum of all lanes, halving by halving: the same order everywhere.
+#[inline(always)]
+fn total(lanes: &[f32; LANES]) -> f32 {
+    let eight: [f32; 8] = std::array::from_fn(|lane| lanes[lane] + lanes[lane + 8]);
+    let four: [f32; 4] = std::array::from_fn(|lane| eight[lane] + eight[lane + 4]);
+    (four[0] + four[2]) + (four[1] + four[3])
+}
