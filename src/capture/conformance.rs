@@ -369,7 +369,8 @@ fn what_is_missing_is_named() {
     let message = open(&SourceName::Images(empty.path().to_owned()), None).err().expect("empty");
     assert!(message.to_string().contains("has no frames"), "{message}");
     let nowhere = open(&SourceName::Images(empty.path().join("none")), None).err().expect("none");
-    assert!(nowhere.to_string().contains("none: cannot be read"), "{nowhere}");
+    assert!(nowhere.to_string().contains("there is no folder "), "{nowhere}");
+    assert!(nowhere.to_string().contains("none; check the path"), "{nowhere}");
 }
 
 #[test]

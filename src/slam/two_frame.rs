@@ -163,8 +163,8 @@ impl TwoFrameInitializer {
     /// An initialiser for images of `intrinsics`; nothing is begun.
     pub fn new(intrinsics: Intrinsics, params: TwoFrameParams) -> Result<Self, ParameterError> {
         params.validate()?;
-        check_range("width", intrinsics.width, 32..=8192)?;
-        check_range("height", intrinsics.height, 32..=8192)?;
+        check_range("image width", intrinsics.width, 32..=8192)?;
+        check_range("image height", intrinsics.height, 32..=8192)?;
         let num_levels = num_levels(&intrinsics);
         let intrinsics: Vec<_> = (0..num_levels).map(|l| intrinsics.at_level(l)).collect();
         let images = intrinsics.iter().map(|k| GradientImage::with_size(k.width, k.height));
