@@ -4,6 +4,9 @@ use crate::service::clock::now_nanos;
 
 /// Levels whose cost is kept; deeper pyramids do not exist.
 const MAX_LEVELS: usize = 16;
+/// What the end of a frame that is cut short takes, in iterations of the finest level: it is looked at there
+/// up to three times to choose among what there is, each time compared, and once for its covariance.
+const RESERVED_LOOKS: f64 = 8.0;
 /// Share of a new measurement in the running mean: a few frames follow a change of load.
 const NEW_SHARE: f64 = 0.2;
 
@@ -36,7 +39,8 @@ impl IterationCosts {
 
     fn fits(&self, level: usize, now: i64, deadline_nanos: i64) -> bool {
         let cost = self.nanos.get(level).copied().unwrap_or(0.0);
-        now as f64 + cost <= deadline_nanos as f64
+        let of_finest = self.nanos.iter().copied().find(|&cost| cost > 0.0).unwrap_or(0.0);
+        now as f64 + cost + RESERVED_LOOKS * of_finest <= deadline_nanos as f64
     }
 }
 
@@ -49,9 +53,10 @@ mod tests {
         let mut costs = IterationCosts::default();
         assert!(costs.fits(3, 100, 100), "nothing is known yet");
         costs.learn(0, 1000);
-        assert!(costs.fits(0, 0, 1000));
-        assert!(!costs.fits(0, 1, 1000));
-        assert!(costs.fits(1, 1, 1000), "another level has its own cost");
+        let reserve = (RESERVED_LOOKS * 1000.0) as i64;
+        assert!(costs.fits(0, 0, 1000 + reserve));
+        assert!(!costs.fits(0, 1, 1000 + reserve));
+        assert!(costs.fits(1, 1, 1000 + reserve), "another level has its own cost");
         costs.learn(0, 2000);
         assert_eq!(costs.nanos[0], 1200.0);
     }

@@ -17,7 +17,7 @@ use crate::slam::pose::{
     Brightness, LostReason, NO_KEYFRAME, PoseEstimate, Quality, TrackingState,
 };
 use crate::slam::tracker::motion::{Motion, hypotheses, turned};
-use crate::slam::tracker::verdict::{VerdictParams, is_better, quality_of};
+use crate::slam::tracker::verdict::{VerdictParams, fits_better, is_better, quality_of};
 
 /// Tuning of the tracker.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -254,7 +254,38 @@ impl Tracker {
         let is_solved = best.ending == Ending::Finished;
         let coarse_fit = is_solved.then(|| quality_of(&best).whitened_rmse);
         self.aligner.descend(reference, &self.pyramid, &mut best, budget);
+        if best.ending == Ending::OutOfBudget {
+            best = self.better_when_cut_short(reference, &best, &predicted);
+        }
         (best, coarse_fit)
+    }
+
+    /// Of an alignment that was cut short and the prediction it began with, the one that
+    /// explains the finest level better, and one step from there: a coarse level alone is often worse than
+    /// constant motion.
+    fn better_when_cut_short(
+        &self,
+        reference: &Reference,
+        cut_short: &Alignment,
+        predicted: &SE3,
+    ) -> Alignment {
+        let guess = reference.world_from_keyframe().locate(predicted).inverse();
+        let reached = &cut_short.state.current_from_keyframe;
+        let brightnesses = [cut_short.state.brightness, self.memory.brightness];
+        let [reached, guessed] =
+            [(reached, brightnesses[0]), (&guess, brightnesses[1])].map(|(pose, brightness)| {
+                let (aligner, frame) = (&self.aligner, &self.pyramid);
+                aligner.stand_on_finest(reference, frame, cut_short, pose, brightness)
+            });
+        let explain = |of: &Alignment| self.aligner.explanation(reference, &self.pyramid, of);
+        let better = |one: Alignment, other: Alignment| {
+            if fits_better(&explain(&one), &explain(&other)) { one } else { other }
+        };
+        let best = better(guessed, reached);
+        // The sums are there: the step costs one look.
+        let Some((pose, brightness)) = best.state.after_step() else { return best };
+        let (aligner, frame) = (&self.aligner, &self.pyramid);
+        better(aligner.stand_on_finest(reference, frame, cut_short, &pose, brightness), best)
     }
 
     /// Solves the coarsest level with points from one pose in the world.

@@ -120,6 +120,16 @@ pub struct AlignedState {
     pub sums: NormalEquations,
 }
 
+impl AlignedState {
+    /// Where an undamped step leads; `None` where it leads nowhere that a camera can be.
+    pub fn after_step(&self) -> Option<(SE3, Brightness)> {
+        let step = self.sums.damped_step(0.0).filter(is_sane)?;
+        let pose = SE3::exp(&pose_step(&step)) * self.current_from_keyframe;
+        let Brightness { a, b } = self.brightness;
+        Some((pose, Brightness { a: a + step[6], b: b + step[7] }))
+    }
+}
+
 /// Why an alignment came to its end.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Ending {
@@ -152,10 +162,17 @@ pub struct Alignment {
 
 impl Alignment {
     /// Covariance of the left increment of `current_from_keyframe`, calibrated by the inflation
-    /// of `params`; `None` where the images do not determine the pose.
+    /// of `params`; `None` where the images do not determine the pose. One that was cut short by its budget
+    /// is as uncertain as the step that it could not take.
     pub fn covariance(&self, params: &AlignmentParams) -> Option<Matrix6<f64>> {
         let all = self.scatter.covariance(&self.state.sums)?;
-        Some(all.fixed_view::<6, 6>(0, 0) * params.covariance_inflation)
+        let covariance = all.fixed_view::<6, 6>(0, 0) * params.covariance_inflation;
+        if self.ending != Ending::OutOfBudget {
+            return Some(covariance);
+        }
+        // As far as the next step would lead it may be from where it would have ended.
+        let step = pose_step(&self.state.sums.damped_step(0.0)?);
+        Some(covariance + step * step.transpose())
     }
 }
 
@@ -253,6 +270,28 @@ impl Aligner {
             mean_squared_flow: 0.0,
             scatter: GradientScatter::default(),
         }
+    }
+
+    /// Takes an alignment that was cut short to the finest level as it stands, without a step: there its
+    /// figures say what it is worth, and it can be compared with others.
+    pub fn stand_on_finest(
+        &self,
+        reference: &Reference,
+        frame: &SumPyramid,
+        cut_short: &Alignment,
+        current_from_keyframe: &SE3,
+        brightness: Brightness,
+    ) -> Alignment {
+        let finest = reference.finest_level().max(frame.finest_level());
+        let held = &current_from_keyframe.translation;
+        let mut alignment = Alignment {
+            state: self.evaluate(reference, frame, finest, current_from_keyframe, brightness, held),
+            level: finest,
+            points: reference.level(finest).len(),
+            ..cut_short.clone()
+        };
+        self.measure(reference, frame, &mut alignment);
+        alignment
     }
 
     /// Solves the levels below the one that `alignment` stands on, down to the finest.

@@ -8,7 +8,7 @@ use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::keyframe::{Keyframe, MapState};
-use crate::slam::pose::{LostReason, PoseEstimate, TrackingState};
+use crate::slam::pose::{DegradedReason, LostReason, PoseEstimate, TrackingState};
 use crate::slam::tracker::{Tracker, TrackerParams};
 
 fn always(_level: usize) -> bool {
@@ -298,4 +298,49 @@ fn rehearsals_with_any_budget_leave_the_tracker_as_it_is() {
             assert!(is_clean(&short));
         }
     }
+}
+
+#[test]
+fn a_short_budget_is_never_worse_than_the_prediction() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let mut tracker = tracker_on(&plane.keyframe(&camera, 2, 0.02));
+    // By the iterations that there is time for.
+    let mut errors = [const { Vec::new() }; 7];
+    let mut whole_errors = Vec::new();
+    for sequence in 0..=12 {
+        let image = plane.render(&camera, &path(sequence), 2.0, (1.0, 0.0), 100 + sequence);
+        let (frame, truth) = (frame(sequence, &image), path(sequence).inverse());
+        let memory = tracker.memory().clone();
+        let error_of = |estimate: &PoseEstimate| {
+            (estimate.keyframe_from_camera.inverse() * truth.inverse()).log() * camera.fx
+        };
+        let whole = error_of(&tracker.track(&frame, &mut always)).norm();
+        if sequence > 2 {
+            whole_errors.push(whole);
+        }
+        // The third frame is the first whose velocity is known.
+        for (iterations, errors) in errors.iter_mut().enumerate().filter(|_| sequence > 2) {
+            let mut left = iterations;
+            let mut budget = |_: usize| {
+                let is_left = left > 0;
+                left = left.saturating_sub(1);
+                is_left
+            };
+            let short = tracker.rehearse(&memory, &frame, &mut budget);
+            assert_eq!(short.state, TrackingState::Degraded(DegradedReason::Budget));
+            let error = error_of(&short);
+            errors.push(error.norm());
+            // The covariance says so: within three of its standard deviations in every direction.
+            let std_dev = [0, 6, 11, 15, 18, 20].map(|i| short.covariance[i].sqrt() * camera.fx);
+            assert!((0..6).all(|i| error[i].abs() < 3.0 * std_dev[i] + 0.1), "{error} {std_dev:?}");
+        }
+    }
+    let median = |errors: &mut Vec<f64>| {
+        errors.sort_by(f64::total_cmp);
+        errors[errors.len() / 2]
+    };
+    let medians = errors.each_mut().map(median);
+    // A good prediction may lie nearer to the truth than noise lets any alignment come.
+    let allowed = 1.05 * medians[0].max(median(&mut whole_errors));
+    assert!(medians.iter().all(|&error| error <= allowed), "{allowed} px: {medians:?}");
 }

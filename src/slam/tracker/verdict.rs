@@ -130,3 +130,15 @@ pub fn is_better(one: &NormalEquations, other: &NormalEquations) -> bool {
     one.inliers > other.inliers
         || (one.inliers == other.inliers && one.mean_energy() < other.mean_energy())
 }
+
+/// Whether of two states near each other one fits better: by the energy, which tells more finely than a count
+/// of inliers, unless one of them gains by looking away.
+pub fn fits_better(one: &NormalEquations, other: &NormalEquations) -> bool {
+    /// Shares of points in view that differ by more are not compared by the energy of those.
+    const SIMILAR_VIEW: f64 = 0.8;
+    let (one_in_view, other_in_view) = (f64::from(one.in_view), f64::from(other.in_view));
+    if one_in_view.min(other_in_view) < SIMILAR_VIEW * one_in_view.max(other_in_view) {
+        return is_better(one, other);
+    }
+    one.mean_energy() < other.mean_energy()
+}
