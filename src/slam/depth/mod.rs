@@ -17,3 +17,4 @@ pub mod pose_noise;
 pub mod propagation;
 pub mod regularisation;
 mod smoothing_kernel;
+mod trace_kernel;

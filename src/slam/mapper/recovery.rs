@@ -215,6 +215,7 @@ impl Mapper {
         self.revision += 1;
         keyframe.revision = self.revision;
         self.enter_keyframe(index);
+        self.plant_points();
         self.past.clear();
         StepOutcome { keyframe_restored: true, keyframe_changed: true, ..Default::default() }
     }
