@@ -7,6 +7,7 @@ pub mod observation;
 mod past;
 pub mod recovery;
 mod resume;
+pub mod reuse;
 pub mod situation;
 mod start;
 
@@ -30,6 +31,7 @@ use crate::slam::mapper::consistency::{Consistency, ConsistencyParams, Contradic
 use crate::slam::mapper::observation::DepthFilter;
 use crate::slam::mapper::past::PastFrames;
 use crate::slam::mapper::recovery::{Recovery, RecoveryParams};
+use crate::slam::mapper::reuse::ReuseParams;
 use crate::slam::mapper::situation::{Situation, StartProgress};
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::{NO_KEYFRAME, PoseEstimate, TrackingState};
@@ -43,7 +45,7 @@ pub struct MapperParams {
     pub min_gradient: f32,
     /// Most pixels that may carry depth; the strongest gradients are kept. Bounds time and memory.
     pub max_candidates: usize,
-    /// Frames from before a new keyframe that give depth to its new pixels; 0 waits for the frames that
+    /// Frames from before a new keyframe that give depth to its new pixels in the Gaussian filter; 0 waits for the frames that
     /// follow. In the simulated room 4 changed neither error nor density, and a search over all depths
     /// for every new pixel made a new keyframe cost ten times as much.
     pub num_seed_frames: usize,
@@ -57,7 +59,9 @@ pub struct MapperParams {
     pub max_map_megabytes: usize,
     /// At least so many frames lie between two keyframes.
     pub min_keyframe_interval: u64,
-    /// Which filter estimates depth.
+    /// Which filter estimates depth: `gaussian`, `interval` (sparse) or `both`. The Gaussian filter is
+    /// the most accurate semi-dense one in the simulated room and the cheapest; see
+    /// `docs/depth-filters.md`.
     pub depth_filter: DepthFilter,
     /// Search along the epipolar line.
     pub matching: MatchingParams,
@@ -65,7 +69,8 @@ pub struct MapperParams {
     pub gaussian: GaussianParams,
     /// The interval filter.
     pub interval: IntervalParams,
-    /// The points of the interval filter, where it is alone.
+    /// The points of the interval filter where it is alone; with the Gaussian filter it traces every
+    /// pixel with gradient that has no depth yet.
     pub candidates: CandidateParams,
     /// The step to a new keyframe.
     pub propagation: PropagationParams,
@@ -75,6 +80,8 @@ pub struct MapperParams {
     pub initializer: InitializerParams,
     /// When the map is rejected.
     pub consistency: ConsistencyParams,
+    /// When an earlier keyframe is taken up again.
+    pub reuse: ReuseParams,
     /// What is done when the camera is lost.
     pub recovery: RecoveryParams,
 }
@@ -98,6 +105,7 @@ impl Default for MapperParams {
             regularisation: RegularisationParams::default(),
             initializer: InitializerParams::default(),
             consistency: ConsistencyParams::default(),
+            reuse: ReuseParams::default(),
             recovery: RecoveryParams::default(),
         }
     }
@@ -121,6 +129,7 @@ impl MapperParams {
         self.regularisation.validate().map_err(|e| e.within("regularisation"))?;
         self.initializer.validate().map_err(|e| e.within("initializer"))?;
         self.consistency.validate().map_err(|e| e.within("consistency"))?;
+        self.reuse.validate().map_err(|e| e.within("reuse"))?;
         self.recovery.validate().map_err(|e| e.within("recovery"))
     }
 }
@@ -255,7 +264,9 @@ impl Mapper {
         self.guess_unit(pose);
         let observations = self.observe_frame(frame, pose);
         self.unpublished += observations.fused + observations.created;
-        let contradiction = self.consistency.observe(&observations, &self.params.consistency);
+        let points = self.keyframe().map_or(0, |keyframe| keyframe.points.len());
+        let contradiction =
+            self.consistency.observe(&observations, points, &self.params.consistency);
         if let Some(contradiction) = contradiction.filter(|_| !initializing) {
             self.reject(contradiction);
             return StepOutcome { keyframe_changed: true, observations, ..Default::default() };
@@ -266,19 +277,21 @@ impl Mapper {
         }
         let due = self.frames_on_keyframe >= self.params.min_keyframe_interval;
         if pose.proposes_keyframe && due {
-            self.change_keyframe(frame, pose, sensor_depth);
+            let is_reused = self.reuse_keyframe(frame, pose);
+            if !is_reused {
+                self.change_keyframe(frame, pose, sensor_depth);
+            }
             return StepOutcome {
-                keyframe_created: true,
+                keyframe_created: !is_reused,
+                keyframe_restored: is_reused,
                 keyframe_changed: true,
-                graph_changed: true,
+                graph_changed: !is_reused,
                 observations,
-                ..Default::default()
             };
         }
         self.remember(frame, pose);
-        let known = self.keyframe().map_or(0, |keyframe| keyframe.points.len());
         let keyframe_changed =
-            self.unpublished as f64 > self.params.publish_change_ratio * known as f64;
+            self.unpublished as f64 > self.params.publish_change_ratio * points as f64;
         if keyframe_changed {
             self.refine();
             self.keep_unit_mean();

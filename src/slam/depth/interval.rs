@@ -191,12 +191,15 @@ impl IntervalFilter {
                 }
                 TraceStatus::Good if point.is_mature(params) => {
                     let Some(mature) = MatureDepth::of(point) else { continue };
+                    if !was_known {
+                        counts.created += 1;
+                        *hypothesis = mature.hypothesis(NEW_VALIDITY);
+                        continue;
+                    }
                     let confirmed = hypothesis.validity.saturating_add(1).min(MAX_VALIDITY);
-                    let validity = if was_known { confirmed } else { NEW_VALIDITY };
-                    *hypothesis = mature.hypothesis(validity);
-                    counts.attempted += usize::from(was_known);
-                    counts.fused += usize::from(was_known);
-                    counts.created += usize::from(!was_known);
+                    *hypothesis = mature.hypothesis(confirmed);
+                    counts.attempted += 1;
+                    counts.fused += 1;
                 }
                 _ => {}
             }

@@ -50,7 +50,6 @@ fn trace_points_avx2(
 mod tests {
     use super::*;
     use crate::slam::depth::epipolar::TwoView;
-    use crate::slam::depth::immature::TraceStatus;
     use crate::slam::depth::map::GradientImage;
     use crate::slam::geometry::se3::SE3;
     use crate::slam::image::quads::QuadImage;
@@ -81,7 +80,7 @@ mod tests {
             let max = p.max_inverse_depth.map(f32::to_bits);
             (p.status, p.min_inverse_depth.to_bits(), max, p.quality.to_bits())
         };
-        assert!(portable.iter().filter(|p| p.status == TraceStatus::Good).count() > 300);
+        assert!(portable.iter().filter(|p| p.max_inverse_depth.is_some()).count() > 300);
         assert!(portable.iter().map(bits).eq(fast.iter().map(bits)));
     }
 }

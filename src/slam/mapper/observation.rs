@@ -10,7 +10,7 @@ use crate::slam::frame::FrameView;
 use crate::slam::mapper::Mapper;
 use crate::slam::pose::PoseEstimate;
 
-/// Which filter estimates depth.
+/// Which filter estimates depth; `docs/depth-filters.md` compares them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum DepthFilter {
