@@ -196,11 +196,10 @@ fn chart(svg: &mut String, story: &Story, params: &IntervalParams) {
     let (plot_width, plot_height) = (CHART.0 - LEFT - RIGHT, CHART.1 - TOP - BOTTOM);
     let y = |d: f64| TOP + (high - d.clamp(low, high)) / (high - low) * plot_height;
     let step = plot_width / story.samples.len() as f64;
-    let matches = matches(story);
     let _ = write!(
         svg,
-        "<text x=\"{LEFT}\" y=\"22\" font-weight=\"600\">pixel ({}, {}), {:.2} m away, {matches} \
-         matches</text><rect x=\"{LEFT}\" y=\"{TOP}\" width=\"{plot_width}\" \
+        "<text x=\"{LEFT}\" y=\"22\" font-weight=\"600\">pixel ({}, {}), {:.2} m away</text>\
+         <rect x=\"{LEFT}\" y=\"{TOP}\" width=\"{plot_width}\" \
          height=\"{plot_height}\" fill=\"#f6f7f9\"/>",
         story.pixel.0,
         story.pixel.1,

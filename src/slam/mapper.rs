@@ -45,9 +45,10 @@ pub struct MapperParams {
     pub min_gradient: f32,
     /// Most pixels that may carry depth; the strongest gradients are kept. Bounds time and memory.
     pub max_candidates: usize,
-    /// Frames from before a new keyframe that give depth to its new pixels in the Gaussian filter; 0 waits for the frames that
-    /// follow. In the simulated room 4 changed neither error nor density, and a search over all depths
-    /// for every new pixel made a new keyframe cost ten times as much.
+    /// Frames from before a new keyframe that give depth to its new pixels in the Gaussian filter; 0
+    /// waits for the frames that follow. In the simulated room one lowers the median error by a
+    /// quarter (0.7 instead of 1.0 %), 4 no further, and each is a search over all depths for every
+    /// new pixel.
     pub num_seed_frames: usize,
     /// Frames kept for that, newest first: bounds the memory (one byte a pixel each).
     pub max_past_frames: usize,
@@ -91,7 +92,7 @@ impl Default for MapperParams {
         Self {
             min_gradient: 5.0,
             max_candidates: MAX_KEYFRAME_POINTS,
-            num_seed_frames: 0,
+            num_seed_frames: 1,
             max_past_frames: 40,
             publish_change_ratio: 0.2,
             max_map_megabytes: 512,

@@ -82,6 +82,9 @@ impl Mapper {
         let mut least = MIN_BASELINE;
         let mut used = 0;
         for past in self.past.newest_first() {
+            if used >= self.params.num_seed_frames {
+                break;
+            }
             let keyframe_from_camera = world_from_keyframe.locate(&past.world_from_camera);
             let baseline = keyframe_from_camera.translation.norm();
             if baseline < least {
@@ -97,9 +100,6 @@ impl Mapper {
             observe(&mut self.depth, &observer, &self.params.matching, &self.params.gaussian);
             least = baseline * BASELINE_STEP;
             used += 1;
-            if used >= self.params.num_seed_frames {
-                break;
-            }
         }
     }
 
