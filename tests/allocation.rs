@@ -1,13 +1,21 @@
-//! After warm-up neither tracking a frame nor preparing a keyframe allocates.
+//! After warm-up neither tracking a frame nor preparing a keyframe nor tracing points allocates.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use semidense::slam::alignment::reference::{Reference, ReferenceParams};
+use semidense::slam::depth::candidate::CandidateParams;
+use semidense::slam::depth::epipolar::TwoView;
+use semidense::slam::depth::immature::{IntervalParams, TraceFrame};
+use semidense::slam::depth::interval::IntervalFilter;
+use semidense::slam::depth::map::DepthMap;
 use semidense::slam::frame::FrameView;
 use semidense::slam::geometry::intrinsics::Intrinsics;
+use semidense::slam::geometry::se3::SE3;
 use semidense::slam::geometry::sim3::Sim3;
+use semidense::slam::image::quads::QuadImage;
 use semidense::slam::keyframe::{DepthPoint, Keyframe, MapState};
+use semidense::slam::pose::Brightness;
 use semidense::slam::tracker::{Tracker, TrackerParams};
 
 /// The system's allocator, counting.
@@ -108,4 +116,41 @@ fn a_frame_and_a_keyframe_allocate_nothing_after_warm_up() {
     let allocations = ALLOCATIONS.load(Ordering::Relaxed) - before;
     assert_eq!(allocations, 0, "in two keyframes of 13 frames each");
     assert!(tracked > 20, "only {tracked} frames were tracked: this measures nothing");
+    tracing_points_allocates_nothing();
+}
+
+/// Two keyframes of points, each traced through some frames; the second one is in warm memory. Part of
+/// the only test of this file: what another one allocated meanwhile would be counted.
+fn tracing_points_allocates_nothing() {
+    let (mut map, mut filter) =
+        (DepthMap::with_size(CAMERA.width, CAMERA.height), IntervalFilter::default());
+    let params = IntervalParams::default();
+    let frames = [1.0, 2.0, 3.0, 4.0].map(|shift| {
+        let mut frame = QuadImage::with_size(CAMERA.width, CAMERA.height);
+        frame.fill(&image(shift));
+        frame
+    });
+    let pixels = image(0.0);
+    let (mut before, mut matched) = (0, 0);
+    for keyframe in 0..3 {
+        if keyframe == 2 {
+            before = ALLOCATIONS.load(Ordering::Relaxed);
+        }
+        map.restart(&pixels, 1.0, 100_000);
+        filter.restart_where_empty(&map);
+        filter.restart_with_known(&mut map, &CandidateParams::default());
+        for (frame, shift) in frames.iter().zip(1..) {
+            let mut moved = SE3::identity();
+            // A wall at depth 1 moves by `shift` pixels.
+            moved.translation.x = f64::from(shift) / CAMERA.fx;
+            let view = TwoView::new(&CAMERA, &moved);
+            let traced = TraceFrame { image: frame, view, brightness: Brightness::default() };
+            matched += filter.trace(&traced, &params).good;
+            filter.write_into(&mut map, &params);
+        }
+        filter.hand_over(&mut map, &params);
+    }
+    let allocations = ALLOCATIONS.load(Ordering::Relaxed) - before;
+    assert_eq!(allocations, 0, "in one keyframe of 4 frames");
+    assert!(matched > 1000, "only {matched} matches: this measures nothing");
 }

@@ -62,3 +62,20 @@ fn threads_and_processes_do_not_change_a_bit() {
     assert_same(&replayed[0], &contents(&output), "one process and three in lockstep");
     assert_eq!(rig.leftovers(), Vec::<String>::new());
 }
+
+#[test]
+fn no_depth_filter_depends_on_the_number_of_threads() {
+    let rig = Rig::new();
+    for filter in ["interval", "both", "gaussian"] {
+        let chosen = format!("mapping.depth_filter=\"{filter}\"");
+        let replayed = ["1", "3"].map(|threads| {
+            let output = rig.folder().join(format!("{filter}-{threads}"));
+            let arguments = ["replay", "sim", "--threads", threads, "--set", &chosen];
+            let figures = summary(rig.command(&arguments), &output);
+            assert!(figures["frames_tracked"].as_u64().unwrap() >= 45, "{filter}: {figures}");
+            assert!(figures["keyframes"].as_u64().unwrap() >= 2, "{filter}: {figures}");
+            contents(&output)
+        });
+        assert_same(&replayed[0], &replayed[1], &format!("{filter}, 1 and 3 threads"));
+    }
+}

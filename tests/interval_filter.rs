@@ -10,6 +10,7 @@ use semidense::slam::depth::immature::{ImmaturePoint, IntervalParams, TraceFrame
 use semidense::slam::depth::interval::IntervalFilter;
 use semidense::slam::depth::map::GradientImage;
 use semidense::slam::image::buffer::Image;
+use semidense::slam::image::quads::QuadImage;
 use semidense::slam::pose::Brightness;
 
 /// Frames that one keyframe is traced through: 0.8 s, 0.4 m of a slow walk.
@@ -18,7 +19,7 @@ const FRAMES: usize = 24;
 struct Sequence {
     keyframe: GradientImage,
     depth: Image<f32>,
-    frames: Vec<(Image<f32>, TwoView)>,
+    frames: Vec<(QuadImage, TwoView)>,
 }
 
 fn sequence(seed: u64, noise_std_dev: f64) -> Sequence {
@@ -29,19 +30,19 @@ fn sequence(seed: u64, noise_std_dev: f64) -> Sequence {
     let intrinsics = simulator.intrinsics();
     let poses: Vec<_> = simulator.ground_truth().iter().map(|p| p.world_from_camera).collect();
     let mut pixels = vec![0; intrinsics.width * intrinsics.height];
-    let mut images = Vec::new();
+    let mut keyframe = GradientImage::with_size(intrinsics.width, intrinsics.height);
+    simulator.next_into(&mut pixels).unwrap().unwrap();
+    keyframe.fill(&pixels);
+    let mut frames = Vec::new();
     while simulator.next_into(&mut pixels).unwrap().is_some() {
-        let mut image = GradientImage::with_size(intrinsics.width, intrinsics.height);
+        let mut image = QuadImage::with_size(intrinsics.width, intrinsics.height);
         image.fill(&pixels);
-        images.push(image);
+        let pose = &poses[frames.len() + 1];
+        frames.push((image, TwoView::new(&intrinsics, &(pose.inverse() * poses[0]))));
     }
-    let frames = images.iter().zip(&poses).skip(1).map(|(image, pose)| {
-        (image.intensity.clone(), TwoView::new(&intrinsics, &(pose.inverse() * poses[0])))
-    });
-    let frames = frames.collect();
     let nanos = simulator.ground_truth()[0].nanos;
     let depth = simulator.depth_at(nanos).unwrap().unwrap();
-    Sequence { keyframe: images[0].clone(), depth, frames }
+    Sequence { keyframe, depth, frames }
 }
 
 /// Shares of `Good` traces whose interval holds the truth.
@@ -53,6 +54,8 @@ struct Coverage {
     sure_holds: usize,
     points: usize,
     mature_errors: Vec<f32>,
+    /// |error|/σ of mature points.
+    whitened_errors: Vec<f32>,
 }
 
 impl Coverage {
@@ -79,6 +82,13 @@ impl Coverage {
             self.points,
             self.mature_errors.get(self.mature_errors.len() / 2).unwrap_or(&f32::NAN),
         );
+        println!("mature within 1, 2, 3 σ: {:.3?}", [1.0, 2.0, 3.0].map(|s| self.within(s)));
+    }
+
+    /// Share of mature points whose error is within so many σ.
+    fn within(&self, sigmas: f32) -> f64 {
+        let inside = self.whitened_errors.iter().filter(|e| **e <= sigmas).count();
+        inside as f64 / self.whitened_errors.len() as f64
     }
 }
 
@@ -102,7 +112,10 @@ fn coverage(noise_std_dev: f64) -> Coverage {
         coverage.points += filter.points().len();
         let mature = filter.points().iter().filter(|p| p.is_mature(&params));
         let error = |p: &ImmaturePoint| Some((p.inverse_depth()? / truth(p) - 1.0).abs());
-        coverage.mature_errors.extend(mature.filter_map(error));
+        coverage.mature_errors.extend(mature.clone().filter_map(error));
+        let whitened =
+            |p: &ImmaturePoint| Some((p.inverse_depth()? - truth(p)).abs() / p.std_dev()?);
+        coverage.whitened_errors.extend(mature.filter_map(whitened));
     }
     coverage.report(noise_std_dev);
     coverage

@@ -115,9 +115,20 @@ pub struct Observer<'a> {
     pub view: TwoView,
     /// Its brightness against the keyframe.
     pub brightness: Brightness,
-    /// Whether hypotheses that came from the keyframe before are left alone: they already hold
-    /// what frames from before this keyframe have to say.
-    pub only_new: bool,
+    /// Which pixels are observed.
+    pub pixels: ObservedPixels,
+}
+
+/// Which pixels of a map are observed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ObservedPixels {
+    /// Hypotheses, and pixels that may get one.
+    All,
+    /// Without the hypotheses that came from the keyframe before: they already hold what frames from
+    /// before this keyframe have to say.
+    New,
+    /// Hypotheses alone: others bring new ones.
+    Known,
 }
 
 /// Observes every pixel of `map` in a frame. Rows are independent: the result does not depend on
@@ -169,10 +180,10 @@ impl PixelObserver<'_> {
         let candidates = self.candidates.row(v);
         for u in BORDER_PX..row.len() - BORDER_PX {
             if row[u].is_some() {
-                if !(self.observer.only_new && row[u].propagated) {
+                if !(self.observer.pixels == ObservedPixels::New && row[u].propagated) {
                     self.update(&mut row[u], u, v, &mut counts);
                 }
-            } else if candidates[u] {
+            } else if candidates[u] && self.observer.pixels != ObservedPixels::Known {
                 self.create(&mut row[u], u, v, &mut counts);
             }
         }

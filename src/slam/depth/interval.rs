@@ -4,8 +4,12 @@
 use rayon::prelude::*;
 
 use crate::slam::depth::candidate::{Candidate, CandidateParams, CandidateSelector};
-use crate::slam::depth::immature::{ImmaturePoint, IntervalParams, TraceFrame, TraceStatus};
-use crate::slam::depth::map::GradientImage;
+use crate::slam::depth::gaussian::{MAX_VALIDITY, NEW_VALIDITY, ObservationCounts};
+use crate::slam::depth::immature::{
+    HALF_INTERVAL_SIGMAS, ImmaturePoint, IntervalParams, TraceFrame, TraceStatus,
+};
+use crate::slam::depth::map::{DepthMap, GradientImage, Hypothesis};
+use crate::slam::depth::trace_kernel::trace_kernel;
 
 /// What one frame did to the points.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -25,7 +29,8 @@ pub struct TraceCounts {
 }
 
 impl TraceCounts {
-    fn of(status: TraceStatus) -> Self {
+    /// One point that came to `status`.
+    pub(super) fn of(status: TraceStatus) -> Self {
         let mut counts = Self::default();
         match status {
             TraceStatus::Good => counts.good = 1,
@@ -64,8 +69,24 @@ pub struct MatureDepth {
     pub variance: f32,
 }
 
-/// Standard deviations in half an interval: it holds the truth in about 95 of 100 points.
-const HALF_INTERVAL_SIGMAS: f32 = 2.0;
+impl MatureDepth {
+    /// What the interval of `point` says; `None` before its first match.
+    fn of(point: &ImmaturePoint) -> Option<Self> {
+        let (inverse_depth, std_dev) = (point.inverse_depth()?, point.std_dev()?);
+        Some(Self { u: point.u, v: point.v, inverse_depth, variance: std_dev * std_dev })
+    }
+
+    fn hypothesis(&self, validity: u8) -> Hypothesis {
+        Hypothesis {
+            inverse_depth: self.inverse_depth,
+            variance: self.variance,
+            smoothed: self.inverse_depth,
+            validity,
+            propagated: false,
+            failures: 0,
+        }
+    }
+}
 
 /// The immature points of one keyframe.
 #[derive(Debug, Default)]
@@ -73,6 +94,8 @@ pub struct IntervalFilter {
     points: Vec<ImmaturePoint>,
     selector: CandidateSelector,
     candidates: Vec<Candidate>,
+    /// Indices of the chosen pixels, ascending.
+    chosen: Vec<usize>,
 }
 
 impl IntervalFilter {
@@ -84,22 +107,104 @@ impl IntervalFilter {
         self.points.extend(points);
     }
 
+    /// Starts over at every pixel of `map` that may carry depth and has none.
+    pub fn restart_where_empty(&mut self, map: &DepthMap) {
+        let width = map.image.width();
+        self.points.clear();
+        let pixels = map.candidates.pixels().iter().zip(map.hypotheses.pixels()).enumerate();
+        let empty = pixels.filter(|(_, (candidate, h))| **candidate && !h.is_some());
+        self.points.extend(empty.filter_map(|(i, _)| {
+            ImmaturePoint::new(&map.image, (i % width) as u16, (i / width) as u16)
+        }));
+    }
+
+    /// Starts over with the hypotheses of `map` and, between them, evenly chosen points whose depth is
+    /// not known. Where a start or a sensor gave depth to every pixel only the chosen ones keep it.
+    pub fn restart_with_known(&mut self, map: &mut DepthMap, params: &CandidateParams) {
+        /// More hypotheses than this many times what is wanted are a map of every pixel.
+        const MOST_PER_WANTED: usize = 3;
+        self.selector.choose(&map.image, params, &mut self.candidates);
+        if map.num_hypotheses() > MOST_PER_WANTED * params.wanted {
+            self.chosen.clear();
+            self.chosen.extend(self.candidates.iter().map(|c| map.index(c.u, c.v)));
+            self.chosen.sort_unstable();
+            for (i, hypothesis) in map.hypotheses.pixels_mut().iter_mut().enumerate() {
+                if self.chosen.binary_search(&i).is_err() {
+                    *hypothesis = Hypothesis::NONE;
+                }
+            }
+        }
+        let width = map.image.width();
+        self.points.clear();
+        let hypotheses = map.hypotheses.pixels().iter().enumerate();
+        self.points.extend(hypotheses.filter(|(_, h)| h.is_some()).filter_map(|(i, h)| {
+            let half = HALF_INTERVAL_SIGMAS * h.variance.sqrt();
+            let point = ImmaturePoint::new(&map.image, (i % width) as u16, (i / width) as u16)?;
+            Some(point.with_interval(h.smoothed - half, h.smoothed + half))
+        }));
+        let unknown = self.candidates.iter().filter(|c| !is_near_known(map, c));
+        self.points.extend(unknown.filter_map(|c| ImmaturePoint::new(&map.image, c.u, c.v)));
+    }
+
     /// Traces every point in a frame. Points are independent: the result does not depend on the number
     /// of threads.
     pub fn trace(&mut self, frame: &TraceFrame<'_>, params: &IntervalParams) -> TraceCounts {
         /// Points a thread takes at once: some tens of microseconds.
         const CHUNK: usize = 128;
+        let trace = trace_kernel();
         self.points
             .par_chunks_mut(CHUNK)
-            .map(|points| {
-                points.iter_mut().fold(TraceCounts::default(), |counts, point| {
-                    if point.is_ended() {
-                        return counts.plus(TraceCounts { ended: 1, ..Default::default() });
-                    }
-                    counts.plus(TraceCounts::of(point.trace(frame, params)))
-                })
-            })
+            .map(|points| trace(points, frame, params))
             .reduce(TraceCounts::default, TraceCounts::plus)
+    }
+
+    /// Gives the pixels of mature points their first hypothesis in `map` and ends these points: from
+    /// there on the map's own filter goes on. The number of new hypotheses.
+    pub fn hand_over(&mut self, map: &mut DepthMap, params: &IntervalParams) -> usize {
+        let mut created = 0;
+        for point in self.points.iter_mut().filter(|p| !p.is_ended() && p.is_mature(params)) {
+            let Some(mature) = MatureDepth::of(point) else { continue };
+            let index = map.index(point.u, point.v);
+            let hypothesis = &mut map.hypotheses.pixels_mut()[index];
+            if !hypothesis.is_some() {
+                *hypothesis = mature.hypothesis(NEW_VALIDITY);
+                created += 1;
+            }
+            point.end();
+        }
+        created
+    }
+
+    /// Writes the depth of mature points into `map` after a trace, and takes out that of points without
+    /// a match; what it came to.
+    pub fn write_into(&self, map: &mut DepthMap, params: &IntervalParams) -> ObservationCounts {
+        let mut counts = ObservationCounts::default();
+        for point in &self.points {
+            let index = map.index(point.u, point.v);
+            let hypothesis = &mut map.hypotheses.pixels_mut()[index];
+            let was_known = hypothesis.is_some();
+            match point.status {
+                TraceStatus::Outlier if point.is_ended() && was_known => {
+                    counts.attempted += 1;
+                    counts.failed += 1;
+                    hypothesis.reject();
+                }
+                TraceStatus::Good if point.is_mature(params) => {
+                    let Some(mature) = MatureDepth::of(point) else { continue };
+                    if !was_known {
+                        counts.created += 1;
+                        *hypothesis = mature.hypothesis(NEW_VALIDITY);
+                        continue;
+                    }
+                    let confirmed = hypothesis.validity.saturating_add(1).min(MAX_VALIDITY);
+                    *hypothesis = mature.hypothesis(confirmed);
+                    counts.attempted += 1;
+                    counts.fused += 1;
+                }
+                _ => {}
+            }
+        }
+        counts
     }
 
     /// All points, in the order of their choice.
@@ -109,17 +214,21 @@ impl IntervalFilter {
 
     /// The depths that are certain, in the order of the points.
     pub fn mature(&self, params: &IntervalParams) -> impl Iterator<Item = MatureDepth> {
-        self.points.iter().filter(|p| p.is_mature(params)).filter_map(|p| {
-            let (inverse_depth, max) = (p.inverse_depth()?, p.max_inverse_depth?);
-            let std_dev = (max - inverse_depth) / HALF_INTERVAL_SIGMAS;
-            Some(MatureDepth { u: p.u, v: p.v, inverse_depth, variance: std_dev * std_dev })
-        })
+        self.points.iter().filter(|p| p.is_mature(params)).filter_map(MatureDepth::of)
     }
 
     /// Multiplies every interval by `factor`.
     pub fn rescale(&mut self, factor: f32) {
         self.points.iter_mut().for_each(|p| p.rescale(factor));
     }
+}
+
+/// Whether a hypothesis of `map` is within a pattern's reach of the candidate.
+fn is_near_known(map: &DepthMap, candidate: &Candidate) -> bool {
+    const REACH_PX: usize = 2;
+    let (u, v) = (usize::from(candidate.u), usize::from(candidate.v));
+    (v - REACH_PX..=v + REACH_PX)
+        .any(|y| map.hypotheses.row(y)[u - REACH_PX..=u + REACH_PX].iter().any(Hypothesis::is_some))
 }
 
 /// The interval of a point after one frame.

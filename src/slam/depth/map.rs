@@ -196,6 +196,11 @@ impl DepthMap {
         }
     }
 
+    /// Place of pixel `(u, v)` in the planes.
+    pub(super) fn index(&self, u: u16, v: u16) -> usize {
+        usize::from(v) * self.image.width() + usize::from(u)
+    }
+
     /// Number of hypotheses.
     pub fn num_hypotheses(&self) -> usize {
         self.hypotheses.pixels().iter().filter(|h| h.is_some()).count()

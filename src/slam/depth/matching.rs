@@ -390,7 +390,7 @@ impl<'a> Along<'a> {
 
 /// Sum in a fixed order that eight lanes can do.
 #[inline(always)]
-fn sum(x: &[f32; 8]) -> f32 {
+pub(super) fn sum(x: &[f32; 8]) -> f32 {
     ((x[0] + x[4]) + (x[2] + x[6])) + ((x[1] + x[5]) + (x[3] + x[7]))
 }
 

@@ -16,4 +16,6 @@ mod observation_kernel;
 pub mod pose_noise;
 pub mod propagation;
 pub mod regularisation;
+mod segment;
 mod smoothing_kernel;
+mod trace_kernel;

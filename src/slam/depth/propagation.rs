@@ -117,20 +117,31 @@ fn settle(present: &mut Hypothesis, arriving: Hypothesis) {
         *present = arriving;
         return;
     }
+    match joined(*present, &arriving) {
+        Some(joined) => *present = joined,
+        None if arriving.inverse_depth > present.inverse_depth => *present = arriving,
+        None => {}
+    }
+}
+
+/// Two hypotheses of one pixel as one; `None` where they are of different surfaces.
+pub fn joined(one: Hypothesis, other: &Hypothesis) -> Option<Hypothesis> {
     /// Joint standard deviations within which two hypotheses are one surface.
     const SAME_SURFACE_SIGMAS: f32 = 2.0;
-    let difference = arriving.inverse_depth - present.inverse_depth;
-    let joint = present.variance + arriving.variance;
-    if difference * difference <= SAME_SURFACE_SIGMAS * SAME_SURFACE_SIGMAS * joint {
-        let weight = present.variance / joint;
-        present.inverse_depth += weight * difference;
-        present.smoothed = present.inverse_depth;
-        // They share observations: the mean of two is no more certain than the better one.
-        present.variance = present.variance.min(arriving.variance);
-        present.validity = present.validity.max(arriving.validity);
-    } else if difference > 0.0 {
-        *present = arriving;
+    let difference = other.inverse_depth - one.inverse_depth;
+    let joint = one.variance + other.variance;
+    if !(difference * difference <= SAME_SURFACE_SIGMAS * SAME_SURFACE_SIGMAS * joint) {
+        return None;
     }
+    let inverse_depth = one.inverse_depth + one.variance / joint * difference;
+    Some(Hypothesis {
+        inverse_depth,
+        smoothed: inverse_depth,
+        // They share observations: the mean of two is no more certain than the better one.
+        variance: one.variance.min(other.variance),
+        validity: one.validity.max(other.validity),
+        ..one
+    })
 }
 
 #[cfg(test)]

@@ -74,15 +74,20 @@ pub(super) struct Consistency {
 }
 
 impl Consistency {
-    /// Takes in what a frame did to the map.
+    /// Takes in what a frame did to a map of `points`.
     pub(super) fn observe(
         &mut self,
         counts: &ObservationCounts,
+        points: usize,
         params: &ConsistencyParams,
     ) -> Option<Contradiction> {
         /// Fewer searches than this say nothing about the map.
         const MIN_SEARCHES: usize = 200;
-        if counts.attempted >= MIN_SEARCHES {
+        /// Nor do those of so small a share of it: where nearly all is certain already only what
+        /// failed before is searched for.
+        const MIN_SEARCHED_RATIO: f64 = 0.1;
+        let enough = MIN_SEARCHED_RATIO * points as f64;
+        if counts.attempted >= MIN_SEARCHES && counts.attempted as f64 >= enough {
             let failed_ratio = counts.failed as f64 / counts.attempted as f64;
             let has_failed = failed_ratio > params.max_failed_ratio;
             self.failed_frames = if has_failed { self.failed_frames + 1 } else { 0 };
@@ -132,14 +137,17 @@ mod tests {
         let mut watched = Consistency::default();
         for _ in 0..50 {
             for _ in 1..params.max_failed_frames {
-                assert_eq!(watched.observe(&counts(1000, 900), &params), None);
+                assert_eq!(watched.observe(&counts(1000, 900), 5000, &params), None);
             }
-            assert_eq!(watched.observe(&counts(1000, 300), &params), None);
+            assert_eq!(watched.observe(&counts(1000, 300), 5000, &params), None);
         }
-        let few = (0..50).filter_map(|_| watched.observe(&counts(100, 100), &params)).count();
+        let few = (0..50).filter_map(|_| watched.observe(&counts(100, 100), 500, &params)).count();
         assert_eq!(few, 0);
+        // A map of which only a twentieth is not certain yet.
+        let rest = (0..50).filter_map(|_| watched.observe(&counts(1000, 900), 20_000, &params));
+        assert_eq!(rest.count(), 0);
         let last = (0..params.max_failed_frames)
-            .map(|_| watched.observe(&counts(1000, 900), &params))
+            .map(|_| watched.observe(&counts(1000, 900), 5000, &params))
             .last();
         assert_eq!(last, Some(Some(Contradiction::FailedSearches)));
     }

@@ -10,6 +10,7 @@ use crate::slam::alignment::normal_equations::NormalEquations;
 use crate::slam::alignment::reference::{Reference, ReferenceParams, finest_level, num_levels};
 use crate::slam::depth::gaussian::MAX_VALIDITY;
 use crate::slam::depth::map::{DepthMap, Hypothesis};
+use crate::slam::depth::propagation::joined;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
@@ -145,6 +146,21 @@ impl Recovery {
         None
     }
 
+    /// Aligns a frame to `keyframe` from where the camera is expected; `None` where it does not fit.
+    pub(super) fn locate(
+        &mut self,
+        keyframe: &Keyframe,
+        pixels: &[u8],
+        keyframe_from_camera: &SE3,
+    ) -> Option<Alignment> {
+        self.pyramid.fill(pixels);
+        self.reference.prepare_into(keyframe);
+        let (start, brightness) = (keyframe_from_camera.inverse(), Brightness::default());
+        let (reference, pyramid) = (&self.reference, &self.pyramid);
+        let found = self.aligner.align(reference, pyramid, &start, brightness, &mut |_| true);
+        self.verdict.judge(&found, &quality_of(&found), true, 0).is_tracked().then_some(found)
+    }
+
     /// Whether the frame in the pyramid can be aligned to `keyframe` from some view near it.
     fn shows(&mut self, keyframe: &Keyframe, rotation_rad: f64) -> bool {
         self.reference.prepare_into(keyframe);
@@ -211,27 +227,40 @@ impl Mapper {
         };
         let (min_gradient, max_candidates) = (self.params.min_gradient, self.params.max_candidates);
         self.depth.restart(&keyframe.image, min_gradient, max_candidates);
-        restore_points(&mut self.depth, &keyframe.points);
         self.revision += 1;
         keyframe.revision = self.revision;
+        self.restore_points(index);
         self.enter_keyframe(index);
+        self.plant_points();
         self.past.clear();
         StepOutcome { keyframe_restored: true, keyframe_changed: true, ..Default::default() }
     }
+
+    /// Puts the points of the keyframe at `index` into the depth map.
+    pub(super) fn restore_points(&mut self, index: usize) {
+        if let Some(keyframe) = self.map.keyframes.get(index) {
+            restore_points(&mut self.depth, &keyframe.points);
+        }
+    }
 }
 
-/// Puts the points of a keyframe back into its depth map: each as its filter left it, half proven.
+/// Puts the points of a keyframe back into its depth map: each as its filter left it, half proven, and
+/// joined with what is there already if that is the same surface.
 pub(super) fn restore_points(map: &mut DepthMap, points: &[DepthPoint]) {
     for point in points {
         let index = usize::from(point.v) * map.image.width() + usize::from(point.u);
         if let Some(hypothesis) = map.hypotheses.pixels_mut().get_mut(index) {
-            *hypothesis = Hypothesis {
+            let restored = Hypothesis {
                 inverse_depth: point.inverse_depth,
                 variance: point.variance,
                 smoothed: point.inverse_depth,
                 validity: MAX_VALIDITY / 2,
                 propagated: true,
                 failures: 0,
+            };
+            *hypothesis = match hypothesis.is_some() {
+                true => joined(restored, hypothesis).unwrap_or(restored),
+                false => restored,
             };
         }
     }

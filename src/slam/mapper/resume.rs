@@ -52,6 +52,7 @@ impl Mapper {
         restore_points(&mut self.depth, &keyframe.points);
         self.past.clear();
         self.enter_keyframe(index);
+        self.plant_points();
         StepOutcome {
             keyframe_restored: true,
             keyframe_changed: true,

@@ -1,7 +1,9 @@
 //! How a map begins: from two frames, from random depth, from a sensor, or from given poses.
 
 use crate::slam::depth::epipolar::TwoView;
-use crate::slam::depth::gaussian::{NEW_VALIDITY, ObservationCounts, Observer, observe};
+use crate::slam::depth::gaussian::{
+    NEW_VALIDITY, ObservationCounts, ObservedPixels, Observer, observe,
+};
 use crate::slam::depth::map::{DepthMap, Hypothesis};
 use crate::slam::depth::matching::MatchingParams;
 use crate::slam::depth::pose_noise::pose_noise_px;
@@ -89,7 +91,9 @@ impl Mapper {
         let placed = &mut keyframe.world_from_keyframe;
         let baseline = (pose.world_from_camera.translation - placed.rigid.translation).norm();
         if baseline > 0.0 {
-            placed.scale = baseline * focal_px * nearest / search_px;
+            let factor = baseline * focal_px * nearest / search_px / placed.scale;
+            placed.scale *= factor;
+            self.points.rescale(factor as f32);
         }
     }
 
@@ -206,7 +210,7 @@ impl Mapper {
             image: &self.frame,
             view: TwoView::new(&self.intrinsics, &start.first_from_current.inverse()),
             brightness: start.brightness,
-            only_new: false,
+            pixels: ObservedPixels::All,
         };
         let observations =
             observe(&mut self.depth, &observer, &self.params.matching, &self.params.gaussian);

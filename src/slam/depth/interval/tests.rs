@@ -5,7 +5,7 @@ use nalgebra::Vector6;
 use super::*;
 use crate::slam::depth::epipolar::TwoView;
 use crate::slam::geometry::se3::SE3;
-use crate::slam::image::buffer::Image;
+use crate::slam::image::quads::QuadImage;
 use crate::slam::pose::Brightness;
 use crate::slam::test_scene::{CAMERA, Random, Rendering, Scene};
 
@@ -31,10 +31,17 @@ fn gradient_image(pixels: &[u8]) -> GradientImage {
     image
 }
 
+fn quad_image(pixels: &[u8]) -> QuadImage {
+    let mut image = QuadImage::with_size(CAMERA.width, CAMERA.height);
+    image.fill(pixels);
+    image
+}
+
 struct Sequence {
     keyframe: GradientImage,
     truth: Rendering,
-    frames: Vec<(Image<f32>, TwoView)>,
+    pixels: Vec<Vec<u8>>,
+    frames: Vec<(QuadImage, TwoView)>,
 }
 
 impl Sequence {
@@ -43,13 +50,12 @@ impl Sequence {
         let poses = path(seed, num_frames + 1);
         let truth = scene.render(&CAMERA, &poses[0]);
         let keyframe = gradient_image(&truth.noisy(noise, 1000 * seed));
-        let frames = (1..=num_frames).map(|i| {
-            let pixels = scene.render(&CAMERA, &poses[i]).noisy(noise, 1000 * seed + i as u64);
-            let view = TwoView::new(&CAMERA, &(poses[i].inverse() * poses[0]));
-            (gradient_image(&pixels).intensity, view)
-        });
+        let noisy = |i| scene.render(&CAMERA, &poses[i]).noisy(noise, 1000 * seed + i as u64);
+        let pixels: Vec<_> = (1..=num_frames).map(noisy).collect();
+        let view = |i: usize| TwoView::new(&CAMERA, &(poses[i].inverse() * poses[0]));
+        let frames = pixels.iter().zip(1..).map(|(pixels, i)| (quad_image(pixels), view(i)));
         let frames = frames.collect();
-        Self { keyframe, truth, frames }
+        Self { keyframe, truth, pixels, frames }
     }
 
     fn frame(&self, i: usize) -> TraceFrame<'_> {
@@ -198,12 +204,11 @@ fn the_brightness_of_a_frame_is_taken_out() {
         let mut filter = IntervalFilter::default();
         filter.restart(&sequence.keyframe, &CandidateParams { wanted: 500, ..Default::default() });
         for i in 0..4 {
-            let frame = sequence.frame(i);
-            let mut image = frame.image.clone();
-            image.pixels_mut().iter_mut().for_each(|p| *p = 0.7 * *p + 50.0);
             let brightness = Brightness { a: 0.7f64.ln(), b: 50.0 };
+            let shown = |grey: &u8| (0.7 * f32::from(*grey) + 50.0).round() as u8;
+            let image = quad_image(&sequence.pixels[i].iter().map(shown).collect::<Vec<_>>());
             let brightness = if known { brightness } else { Brightness::default() };
-            let frame = TraceFrame { image: &image, brightness, ..frame };
+            let frame = TraceFrame { image: &image, brightness, ..sequence.frame(i) };
             *outliers += filter.trace(&frame, &params).outlier;
         }
     }
@@ -229,7 +234,7 @@ fn every_status_is_reached_and_endings_are_final() {
     assert_eq!(leaving.trace(&sequence.frame(0), &params), TraceStatus::OutOfBounds);
     assert!(leaving.is_ended());
     // A black frame matches nothing, the second one ends it.
-    let black = Image::filled(CAMERA.width, CAMERA.height, 0.0);
+    let black = QuadImage::with_size(CAMERA.width, CAMERA.height);
     let dark = TraceFrame { image: &black, ..frame_at(-0.05, 0.0) };
     let mut outlier = point(160, 120);
     assert_eq!(outlier.trace(&dark, &params), TraceStatus::Outlier);
@@ -245,6 +250,7 @@ fn every_status_is_reached_and_endings_are_final() {
     let across = gradient_image(&ramp);
     let mut blind = ImmaturePoint::new(&across, 160, 120).unwrap();
     (blind.min_inverse_depth, blind.max_inverse_depth) = (0.1, Some(0.5));
-    let sideways = TraceFrame { image: &across.intensity, ..frame_at(-0.05, 0.0) };
+    let ramp = quad_image(&ramp);
+    let sideways = TraceFrame { image: &ramp, ..frame_at(-0.05, 0.0) };
     assert_eq!(blind.trace(&sideways, &params), TraceStatus::BadCondition);
 }

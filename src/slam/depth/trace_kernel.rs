@@ -1,0 +1,86 @@
+//! The tracing of immature points, compiled for the vector units that the processor has.
+//!
+//! One source for all: no operation is fused or reordered, so every version gives the same bits.
+
+use crate::slam::depth::immature::{ImmaturePoint, IntervalParams, TraceFrame};
+use crate::slam::depth::interval::TraceCounts;
+
+/// A version of [`trace_points`].
+pub(super) type TraceKernel =
+    fn(&mut [ImmaturePoint], &TraceFrame<'_>, &IntervalParams) -> TraceCounts;
+
+/// The best version for this processor.
+pub(super) fn trace_kernel() -> TraceKernel {
+    #[cfg(target_arch = "x86_64")]
+    if std::arch::is_x86_feature_detected!("avx2") {
+        return |points, frame, params| {
+            // SAFETY: the processor has AVX2, as was just asked.
+            unsafe { trace_points_avx2(points, frame, params) }
+        };
+    }
+    trace_points
+}
+
+/// Traces points one after the other; the explanation of the others.
+#[inline(always)]
+fn trace_points(
+    points: &mut [ImmaturePoint],
+    frame: &TraceFrame<'_>,
+    params: &IntervalParams,
+) -> TraceCounts {
+    points.iter_mut().fold(TraceCounts::default(), |counts, point| {
+        if point.is_ended() {
+            return counts.plus(TraceCounts { ended: 1, ..Default::default() });
+        }
+        counts.plus(TraceCounts::of(point.trace(frame, params)))
+    })
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+fn trace_points_avx2(
+    points: &mut [ImmaturePoint],
+    frame: &TraceFrame<'_>,
+    params: &IntervalParams,
+) -> TraceCounts {
+    trace_points(points, frame, params)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::depth::epipolar::TwoView;
+    use crate::slam::depth::map::GradientImage;
+    use crate::slam::geometry::se3::SE3;
+    use crate::slam::image::quads::QuadImage;
+    use crate::slam::pose::Brightness;
+    use crate::slam::test_scene::{CAMERA, Scene};
+    use nalgebra::Vector6;
+
+    #[test]
+    fn every_version_gives_the_same_bits() {
+        let scene = Scene::new(5);
+        let moved = SE3::exp(&Vector6::new(0.05, 0.01, 0.02, 0.0, 0.01, 0.0));
+        let mut image = GradientImage::with_size(CAMERA.width, CAMERA.height);
+        image.fill(&scene.render(&CAMERA, &SE3::identity()).noisy(2.0, 1));
+        let mut frame = QuadImage::with_size(CAMERA.width, CAMERA.height);
+        frame.fill(&scene.render(&CAMERA, &moved).noisy(2.0, 2));
+        let view = TwoView::new(&CAMERA, &moved.inverse());
+        let frame = TraceFrame { image: &frame, view, brightness: Brightness { a: 0.02, b: -1.0 } };
+        let pixels = (20..220).step_by(3).flat_map(|v| (20..300).step_by(5).map(move |u| (u, v)));
+        let mut portable: Vec<_> =
+            pixels.filter_map(|(u, v)| ImmaturePoint::new(&image, u, v)).collect();
+        let mut fast = portable.clone();
+        let params = IntervalParams::default();
+        for _ in 0..2 {
+            let counts = trace_points(&mut portable, &frame, &params);
+            assert_eq!(trace_kernel()(&mut fast, &frame, &params), counts);
+        }
+        let bits = |p: &ImmaturePoint| {
+            let max = p.max_inverse_depth.map(f32::to_bits);
+            (p.status, p.min_inverse_depth.to_bits(), max, p.quality.to_bits())
+        };
+        assert!(portable.iter().filter(|p| p.max_inverse_depth.is_some()).count() > 300);
+        assert!(portable.iter().map(bits).eq(fast.iter().map(bits)));
+    }
+}
