@@ -11,6 +11,7 @@ pub mod points;
 pub mod spread;
 pub mod system;
 mod system_kernel;
+pub mod witness;
 
 use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
@@ -32,6 +33,7 @@ use crate::slam::two_frame::hypothesis::Hypotheses;
 use crate::slam::two_frame::points::Points;
 use crate::slam::two_frame::spread::spread;
 use crate::slam::two_frame::system::State;
+use crate::slam::two_frame::witness::Witnesses;
 
 /// Tuning of the two-frame start.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -51,6 +53,8 @@ pub struct TwoFrameParams {
     pub max_frames: u32,
     /// Frames in a row that may fail to match before it begins again.
     pub max_mismatches: u32,
+    /// Earlier frames that are kept to choose between motions: about 1 MB each at 640×480.
+    pub max_witnesses: usize,
     /// Standard deviation that interpolation and sampling leave in a match, pixels.
     pub match_noise_px: f32,
 }
@@ -65,6 +69,7 @@ impl Default for TwoFrameParams {
             confirming_frames: 2,
             max_frames: 60,
             max_mismatches: 3,
+            max_witnesses: 8,
             match_noise_px: 0.15,
         }
     }
@@ -80,6 +85,7 @@ impl TwoFrameParams {
         check_range("confirming_frames", self.confirming_frames, 1..=100)?;
         check_range("max_frames", self.max_frames, 2..=100_000)?;
         check_range("max_mismatches", self.max_mismatches, 1..=1000)?;
+        check_range("max_witnesses", self.max_witnesses, 1..=100)?;
         check_range("match_noise_px", self.match_noise_px, 0.0..=5.0)
     }
 }
@@ -142,6 +148,7 @@ pub struct TwoFrameInitializer {
     first_pixels: Vec<u8>,
     points: Points,
     joint: Hypotheses,
+    witnesses: Witnesses,
     rotation: State,
     rotation_scratch: FitScratch,
     /// The latest result: pose, brightness, inverse depth of each point and its variance.
@@ -181,6 +188,7 @@ impl TwoFrameInitializer {
             first_pixels: Vec::new(),
             points: Points::default(),
             joint: Hypotheses::new(&state),
+            witnesses: Witnesses::default(),
             rotation: state,
             rotation_scratch: FitScratch::default(),
             current_from_first: SE3::identity(),
@@ -213,6 +221,7 @@ impl TwoFrameInitializer {
         self.rotation.inverse_depths.clear();
         self.rotation.inverse_depths.resize(found, 1.0);
         self.joint.restart();
+        self.witnesses.clear();
         self.current_from_first = SE3::identity();
         self.brightness = Brightness::default();
         self.inverse_depths.clear();
@@ -236,6 +245,7 @@ impl TwoFrameInitializer {
         self.fit_rotation();
         self.fit_jointly();
         let evidence = self.judge();
+        self.witnesses.push(&self.images, &self.rotation, self.params.max_witnesses);
         let missing = evidence.missing(&self.params.evidence);
         self.count_confirmation(missing.is_none());
         self.mismatches = if missing == Some(Waiting::Match) { self.mismatches + 1 } else { 0 };
@@ -289,8 +299,7 @@ impl TwoFrameInitializer {
 
     /// Rotation and brightness alone, coarse to fine, from the frame before.
     fn fit_rotation(&mut self) {
-        let input =
-            FitInput { images: &self.images, intrinsics: &self.intrinsics, points: &self.points };
+        let input = input(&self.images, &self.intrinsics, &self.points);
         for level in (0..self.images.len()).rev() {
             let (state, scratch) = (&mut self.rotation, &mut self.rotation_scratch);
             fit_level(&input, level, Freedom::Rotation, state, scratch, &self.params.fit);
@@ -301,14 +310,14 @@ impl TwoFrameInitializer {
     fn fit_jointly(&mut self) {
         /// Significance of the frame before from which on parallax may show.
         const PARALLAX_SIGNIFICANCE: f64 = 3.0;
-        let input =
-            FitInput { images: &self.images, intrinsics: &self.intrinsics, points: &self.points };
+        let input = input(&self.images, &self.intrinsics, &self.points);
         let with_directions = self.significance > PARALLAX_SIGNIFICANCE;
-        self.joint.fit(&input, &self.rotation, with_directions, &self.params.fit);
+        self.joint.fit(&input, &self.rotation, with_directions, &self.witnesses, &self.params.fit);
     }
 
     /// Variances and figures of the latest fit; then the scale goes to mean inverse depth 1.
     fn judge(&mut self) -> Evidence {
+        let rival = self.joint.rival();
         let (state, scratch) = self.joint.best();
         let (joint, rotation) = (&scratch.system, &self.rotation_scratch.system);
         let floor = self.params.fit.image_noise.powi(2);
@@ -316,6 +325,7 @@ impl TwoFrameInitializer {
         let match_variance = self.params.match_noise_px.powi(2);
         depth_variances(state, joint, noise, match_variance, &mut self.variances);
         let evidence = judge(state, joint, &self.variances, rotation, &mut self.sorted);
+        let evidence = Evidence { rival, witnesses: self.witnesses.len(), ..evidence };
         let visible = joint.points.iter().zip(&state.inverse_depths).filter(|(p, _)| p.visible);
         let mean =
             visible.map(|(_, d)| f64::from(*d)).sum::<f64>() / joint.num_visible.max(1) as f64;
@@ -357,6 +367,15 @@ impl TwoFrameInitializer {
             brightness: self.brightness,
         }
     }
+}
+
+/// The whole of a frame.
+fn input<'a>(
+    images: &'a [GradientImage],
+    intrinsics: &'a [Intrinsics],
+    points: &'a Points,
+) -> FitInput<'a> {
+    FitInput { images, finest: 0, intrinsics, points }
 }
 
 /// Levels down to about 80 pixels across: a tenth of the image then moves by a few pixels.

@@ -70,6 +70,7 @@ impl fmt::Display for StartProgress {
             Some(Waiting::Match) => "waiting for a frame that shows what the first one does",
             Some(Waiting::Significance) => "waiting for parallax: a rotation explains the images",
             Some(Waiting::NegativeDepth) => "waiting for parallax: depths are contradictory",
+            Some(Waiting::Rival) => "waiting for parallax: two motions explain the images",
             Some(Waiting::Translation) => "waiting for translation",
             Some(Waiting::Accuracy) => "waiting for parallax: depths are uncertain",
             Some(Waiting::Confirmation) => "waiting for confirmation",

@@ -2,12 +2,13 @@
 //!
 //! A rotation leaves no trace of depth: then each depth that is fitted explains no more than one
 //! degree of freedom's share of the noise. Parallax explains many times more, and leaves no point
-//! behind the camera.
+//! behind the camera. What another motion explains about as well is not proven either.
 
 use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::matching::PATTERN;
 use crate::slam::parameter::{ParameterError, check_range};
+use crate::slam::two_frame::hypothesis::Rival;
 use crate::slam::two_frame::system::{State, System};
 
 /// What counts as proof.
@@ -17,6 +18,17 @@ pub struct EvidenceParams {
     /// Shortest translation, in mean depths: 1/60 moves a point at the mean depth by 9 px of a 640 px
     /// image (Engel, Koltun, Cremers 2018 latch there).
     pub min_translation: f64,
+    /// Shortest translation with which a start can be proven early, in mean depths: 2 px at 640. The
+    /// earlier frames must confirm it; its depths are good to a tenth, and later frames mend them.
+    pub min_early_translation: f64,
+    /// Earlier frames that an early start needs.
+    pub min_early_witnesses: usize,
+    /// Largest rotation of an early start, as a multiple of its rival's. On a plane the wrong motion
+    /// adds a turn to the true one.
+    pub max_early_turn_ratio: f64,
+    /// Energy by which another motion must be worse, in this frame and the earlier ones together, as a
+    /// share: what a rolling shutter and the lens leave is of that size.
+    pub min_rival_excess: f64,
     /// Energy that a fitted depth explains over the energy of one degree of freedom of what remains.
     /// Without parallax 1 to 3, with 9 px of it 30 to 100.
     pub min_significance: f64,
@@ -35,9 +47,13 @@ impl Default for EvidenceParams {
     fn default() -> Self {
         Self {
             min_translation: 1.0 / 60.0,
+            min_early_translation: 0.004,
+            min_early_witnesses: 4,
+            max_early_turn_ratio: 1.1,
+            min_rival_excess: 0.03,
             min_significance: 8.0,
             max_negative_ratio: 0.05,
-            max_std_dev_ratio: 0.1,
+            max_std_dev_ratio: 0.12,
             min_visible_ratio: 0.6,
             max_median_residual: 15.0,
         }
@@ -48,6 +64,10 @@ impl EvidenceParams {
     /// Checks every value.
     pub fn validate(&self) -> Result<(), ParameterError> {
         check_range("min_translation", self.min_translation, 1e-4..=1.0)?;
+        check_range("min_early_translation", self.min_early_translation, 1e-4..=1.0)?;
+        check_range("min_early_witnesses", self.min_early_witnesses, 1..=1000)?;
+        check_range("max_early_turn_ratio", self.max_early_turn_ratio, 0.0..=1e6)?;
+        check_range("min_rival_excess", self.min_rival_excess, 0.0..=10.0)?;
         check_range("min_significance", self.min_significance, 1.0..=1e4)?;
         check_range("max_negative_ratio", self.max_negative_ratio, 0.0..=0.5)?;
         check_range("max_std_dev_ratio", self.max_std_dev_ratio, 1e-3..=1.0)?;
@@ -67,6 +87,8 @@ pub enum Waiting {
     Significance,
     /// Too many points come out behind the camera.
     NegativeDepth,
+    /// Another motion explains the frames about as well.
+    Rival,
     /// The camera has hardly moved.
     Translation,
     /// The depths are too uncertain.
@@ -90,6 +112,10 @@ pub struct Evidence {
     pub visible_ratio: f64,
     /// Root mean square residual (Huber) of the middle point, grey levels.
     pub median_residual: f64,
+    /// The second best motion; `None` where there is no other.
+    pub rival: Option<Rival>,
+    /// Earlier frames that were asked.
+    pub witnesses: usize,
 }
 
 impl Evidence {
@@ -97,14 +123,25 @@ impl Evidence {
     pub fn missing(&self, params: &EvidenceParams) -> Option<Waiting> {
         let matches = self.visible_ratio >= params.min_visible_ratio
             && self.median_residual <= params.max_median_residual;
+        let is_unrivalled = self.rival.is_none_or(|rival| rival.excess >= params.min_rival_excess);
         let checks = [
             (matches, Waiting::Match),
             (self.significance >= params.min_significance, Waiting::Significance),
             (self.negative_ratio <= params.max_negative_ratio, Waiting::NegativeDepth),
-            (self.translation >= params.min_translation, Waiting::Translation),
+            (is_unrivalled, Waiting::Rival),
+            (self.has_moved(params), Waiting::Translation),
             (self.median_std_dev_ratio <= params.max_std_dev_ratio, Waiting::Accuracy),
         ];
         checks.iter().find(|(met, _)| !met).map(|(_, waiting)| *waiting)
+    }
+
+    /// Whether the translation is long enough, or confirmed well enough.
+    fn has_moved(&self, params: &EvidenceParams) -> bool {
+        let turns_less = |rival: Rival| rival.turn_ratio <= params.max_early_turn_ratio;
+        let is_confirmed =
+            self.witnesses >= params.min_early_witnesses && self.rival.is_none_or(turns_less);
+        self.translation >= params.min_translation
+            || is_confirmed && self.translation >= params.min_early_translation
     }
 }
 
@@ -120,7 +157,8 @@ pub fn residual_variance(system: &System, sorted: &mut Vec<f32>) -> f32 {
     median(sorted).unwrap_or(f32::INFINITY)
 }
 
-/// Judges the joint fit (`state`, `joint` and its variances) against the pure `rotation`.
+/// Judges the joint fit (`state`, `joint` and its variances) against the pure `rotation`; what other
+/// motions and earlier frames say is not in it yet.
 pub fn judge(
     state: &State,
     joint: &System,
@@ -166,6 +204,8 @@ pub fn judge(
         median_std_dev_ratio: f64::from(median(sorted).unwrap_or(f32::INFINITY)),
         visible_ratio: joint.num_visible as f64 / joint.points.len().max(1) as f64,
         median_residual,
+        rival: None,
+        witnesses: 0,
     }
 }
 
@@ -173,4 +213,49 @@ pub fn judge(
 pub fn median(values: &mut [f32]) -> Option<f32> {
     let middle = values.len() / 2;
     (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f32::total_cmp).1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// All that a start asks for.
+    fn proven() -> Evidence {
+        Evidence {
+            translation: 0.03,
+            significance: 30.0,
+            negative_ratio: 0.0,
+            median_std_dev_ratio: 0.05,
+            visible_ratio: 0.9,
+            median_residual: 3.0,
+            rival: None,
+            witnesses: 8,
+        }
+    }
+
+    #[test]
+    fn two_motions_that_explain_the_frames_alike_prove_nothing() {
+        let params = EvidenceParams::default();
+        assert_eq!(proven().missing(&params), None);
+        let against = |excess| {
+            let rival = Some(Rival { excess, turn_ratio: 0.5 });
+            Evidence { rival, ..proven() }.missing(&params)
+        };
+        assert_eq!(against(0.2), None);
+        assert_eq!(against(0.01), Some(Waiting::Rival));
+        assert_eq!(against(f64::NAN), Some(Waiting::Rival));
+    }
+
+    #[test]
+    fn a_short_translation_must_be_confirmed_by_earlier_frames() {
+        let params = EvidenceParams::default();
+        let early = Evidence { translation: 0.006, ..proven() };
+        assert_eq!(early.missing(&params), None);
+        let waits = |evidence: Evidence| evidence.missing(&params) == Some(Waiting::Translation);
+        assert!(waits(Evidence { witnesses: 2, ..early }));
+        assert!(waits(Evidence { translation: 0.001, ..early }));
+        let rival = Some(Rival { excess: 0.2, turn_ratio: 2.0 });
+        assert!(waits(Evidence { rival, ..early }), "it turns more than it need");
+        assert_eq!(Evidence { rival, ..proven() }.missing(&params), None);
+    }
 }

@@ -74,19 +74,21 @@ const INVERSE_DEPTHS: std::ops::RangeInclusive<f32> = -2.0..=10.0;
 /// The current frame at all levels, with the points of the first.
 #[derive(Debug, Clone, Copy)]
 pub struct FitInput<'a> {
-    /// The current frame, finest level first.
+    /// The frame, finest level first.
     pub images: &'a [GradientImage],
-    /// Intrinsics of the levels.
+    /// Level of the first of the images.
+    pub finest: usize,
+    /// Intrinsics of all levels.
     pub intrinsics: &'a [Intrinsics],
     /// Points of the first frame.
     pub points: &'a Points,
 }
 
 impl<'a> FitInput<'a> {
-    /// One level.
+    /// One level, from the finest on.
     pub fn level(&self, level: usize) -> LevelView<'a> {
         LevelView {
-            image: &self.images[level],
+            image: &self.images[level - self.finest],
             intrinsics: &self.intrinsics[level],
             patches: &self.points.patches[level],
         }
@@ -98,6 +100,8 @@ impl<'a> FitInput<'a> {
 pub enum Freedom {
     /// Rotation and brightness.
     Rotation,
+    /// Pose and brightness; the depths stay.
+    Pose,
     /// Pose, brightness and depths.
     Everything,
 }
@@ -135,6 +139,7 @@ pub fn fit_level(
     for _ in 0..params.max_iterations {
         let step = match freedom {
             Freedom::Rotation => rotation_step(&scratch.system, damping),
+            Freedom::Pose => pose_step(&scratch.system, damping),
             Freedom::Everything => {
                 let trial = &mut scratch.trial_depths;
                 joint_step(&scratch.system, state, &scratch.medians, weights, damping, trial)
@@ -145,7 +150,7 @@ pub fn fit_level(
             inverse_depths: std::mem::take(&mut scratch.trial_depths),
             ..moved(state, &step)
         };
-        if freedom == Freedom::Rotation {
+        if freedom != Freedom::Everything {
             next.inverse_depths.clone_from(&state.inverse_depths);
         }
         scratch.trial.evaluate(&view, &next);
@@ -194,6 +199,16 @@ fn rotation_step(system: &System, damping: f64) -> Option<SVector<f64, NUM_UNKNO
     let solved = hessian.cholesky()?.solve(&-gradient);
     let mut step = SVector::<f64, NUM_UNKNOWNS>::zeros();
     step.fixed_rows_mut::<5>(3).copy_from(&solved);
+    is_sane(&step).then_some(step)
+}
+
+/// The step of pose and brightness with the depths held.
+fn pose_step(system: &System, damping: f64) -> Option<SVector<f64, NUM_UNKNOWNS>> {
+    let mut hessian = system.hessian;
+    for i in 0..NUM_UNKNOWNS {
+        hessian[(i, i)] = hessian[(i, i)] * (1.0 + damping) + f64::MIN_POSITIVE;
+    }
+    let step = hessian.cholesky()?.solve(&-system.gradient);
     is_sane(&step).then_some(step)
 }
 

@@ -3,7 +3,8 @@
 //! With little parallax the energy has several minima (near and far exchanged, a translation taken for
 //! a rotation), and a fit that began in the wrong one stays there while the baseline grows. So each
 //! frame is fitted from where the two best fits of the frame before ended, from rest, from the mirrored
-//! solution and, once there is something to see, from a small step in each direction.
+//! solution and, once there is something to see, from a small step in each direction. Of the two best
+//! the earlier frames choose.
 
 use nalgebra::{Vector3, Vector6};
 use rayon::prelude::*;
@@ -11,6 +12,7 @@ use rayon::prelude::*;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::two_frame::fit::{FitInput, FitParams, FitScratch, Freedom, fit_level};
 use crate::slam::two_frame::system::State;
+use crate::slam::two_frame::witness::Witnesses;
 
 /// Survivors, rest, mirror and six directions.
 const MAX_HYPOTHESES: usize = NUM_SURVIVORS + 2 + 6;
@@ -25,6 +27,15 @@ struct Hypothesis {
     scratch: FitScratch,
 }
 
+/// The second best motion of a frame, where it goes clearly another way than the best.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Rival {
+    /// Energy of this frame and the earlier ones beyond that of the best, as a share of it.
+    pub excess: f64,
+    /// Rotation that the best needs over the one that this needs.
+    pub turn_ratio: f64,
+}
+
 /// The hypotheses of one frame, best first after a fit.
 #[derive(Debug)]
 pub struct Hypotheses {
@@ -32,6 +43,7 @@ pub struct Hypotheses {
     used: usize,
     /// How many of the first ones are results of the frame before.
     survivors: usize,
+    rival: Option<Rival>,
 }
 
 impl Hypotheses {
@@ -42,22 +54,23 @@ impl Hypotheses {
             energy: f64::INFINITY,
             scratch: FitScratch::default(),
         };
-        Self { all: (0..MAX_HYPOTHESES).map(empty).collect(), used: 0, survivors: 0 }
+        Self { all: (0..MAX_HYPOTHESES).map(empty).collect(), used: 0, survivors: 0, rival: None }
     }
 
     /// Forgets what earlier frames have shown.
     pub fn restart(&mut self) {
-        (self.used, self.survivors) = (0, 0);
+        (self.used, self.survivors, self.rival) = (0, 0, None);
     }
 
     /// Fits all hypotheses to a frame. `rotation` is its fit without translation; `with_directions` adds
-    /// the starts that are worth their time only where there is parallax. The result does not depend on
-    /// the number of threads.
+    /// the starts, and asks the `witnesses`, which is worth its time only where there is parallax. The
+    /// result does not depend on the number of threads.
     pub fn fit(
         &mut self,
         input: &FitInput<'_>,
         rotation: &State,
         with_directions: bool,
+        witnesses: &Witnesses,
         params: &FitParams,
     ) {
         self.propose(rotation, with_directions);
@@ -81,6 +94,34 @@ impl Hypotheses {
             all[..self.survivors].par_iter_mut().for_each(|h| fit_down_to(0, coarse, h));
             all[..self.survivors].sort_by(|a, b| a.energy.total_cmp(&b.energy));
         }
+        self.rival = None;
+        if with_directions && self.survivors > 1 {
+            self.hear(input, witnesses, params);
+        }
+    }
+
+    /// Puts that survivor first whose depths explain this frame and the earlier ones best.
+    fn hear(&mut self, input: &FitInput<'_>, witnesses: &Witnesses, params: &FitParams) {
+        /// Cosine of 30°: nearer directions are the same motion, seen inaccurately.
+        const RIVAL_COSINE: f64 = 0.87;
+        let together =
+            |h: &Hypothesis| h.energy + witnesses.energy(input, &h.state.inverse_depths, params);
+        let (mut best, mut other) = (together(&self.all[0]), together(&self.all[1]));
+        if other < best {
+            self.all.swap(0, 1);
+            std::mem::swap(&mut best, &mut other);
+        }
+        let poses = [0, 1].map(|i| self.all[i].state.current_from_first.inverse());
+        if heading(&poses[0]).dot(&heading(&poses[1])) < RIVAL_COSINE {
+            let turns = poses.map(|pose| pose.rotation.angle().max(f64::MIN_POSITIVE));
+            let excess = (other - best) / best.max(f64::MIN_POSITIVE);
+            self.rival = Some(Rival { excess, turn_ratio: turns[0] / turns[1] });
+        }
+    }
+
+    /// The second best motion of the latest frame, if the two can be told apart by their direction.
+    pub fn rival(&self) -> Option<Rival> {
+        self.rival
     }
 
     /// The best fit with its normal equations at the finest level; before any fit the state given first.
@@ -122,15 +163,17 @@ impl Hypotheses {
 fn bring_forward_distinct(sorted: &mut [Hypothesis]) -> usize {
     /// Cosine of 15° between directions that count as the same.
     const SAME_COSINE: f64 = 0.966;
-    let heading = |h: &Hypothesis| {
-        let t = h.state.current_from_first.translation;
-        t / t.norm().max(f64::MIN_POSITIVE)
-    };
-    let best = heading(&sorted[0]);
-    let other = (1..sorted.len()).find(|&i| heading(&sorted[i]).dot(&best) < SAME_COSINE);
+    let direction = |i: usize| heading(&sorted[i].state.current_from_first);
+    let best = direction(0);
+    let other = (1..sorted.len()).find(|&i| direction(i).dot(&best) < SAME_COSINE);
     let Some(other) = other else { return 1 };
     sorted.swap(1, other);
     NUM_SURVIVORS
+}
+
+/// Direction of a pose's translation; zero without one.
+fn heading(pose: &SE3) -> Vector3<f64> {
+    pose.translation / pose.translation.norm().max(f64::MIN_POSITIVE)
 }
 
 /// The mirrored pose: the translation reversed, the rotation on the other side of the one that explains

@@ -36,6 +36,8 @@ fn pose(motion: Motion, seed: u64, frame: usize) -> SE3 {
 }
 
 struct Started {
+    /// Whether the translation was shorter than an unconfirmed start needs.
+    is_early: bool,
     direction_error_deg: f64,
     median_depth_error: f64,
     within_two_sigmas: f64,
@@ -103,6 +105,7 @@ fn figures(
     let mut errors: Vec<f64> = ratios.iter().map(|r| (r / scale - 1.0).abs()).collect();
     errors.sort_by(f64::total_cmp);
     Started {
+        is_early: outcome.evidence.translation < EvidenceParams::default().min_translation,
         direction_error_deg: cosine.clamp(-1.0, 1.0).acos().to_degrees(),
         median_depth_error: errors[errors.len() / 2],
         within_two_sigmas,
@@ -118,8 +121,10 @@ fn assert_starts(motion: Motion) {
             "{motion:?} {seed}: {}",
             started.median_depth_error
         );
+        // With 2 px of parallax and 0.2 px of noise the direction is good to a tenth of a radian.
+        let direction_deg = if started.is_early { 12.0 } else { 5.0 };
         assert!(
-            started.direction_error_deg <= 5.0,
+            started.direction_error_deg <= direction_deg,
             "{motion:?} {seed}: {}",
             started.direction_error_deg
         );
@@ -179,7 +184,7 @@ fn derivatives_are_those_of_the_residuals() {
     assert!(initializer.begin(&first));
     initializer.load(&second);
     let (images, intrinsics) = (&initializer.images, &initializer.intrinsics);
-    let input = FitInput { images, intrinsics, points: &initializer.points };
+    let input = input(images, intrinsics, &initializer.points);
     // The finest level: central differences are the slope where the image is smooth.
     let view = input.level(0);
     let energy = |state: &State| {
@@ -226,6 +231,34 @@ fn derivatives_are_those_of_the_residuals() {
         agree += usize::from((slope - 2.0 * point.gradient).abs() < 0.3 * scale);
     }
     assert!(agree * 10 >= all * 9 && all > 500, "{agree} of {all}");
+}
+
+#[test]
+fn earlier_frames_tell_true_depths_from_those_of_another_motion() {
+    let scene = Scene::new(5);
+    let first = scene.render(&CAMERA, &SE3::identity());
+    let mut initializer = TwoFrameInitializer::new(CAMERA, TwoFrameParams::default()).unwrap();
+    assert!(initializer.begin(&first.noisy(2.0, 1)));
+    // A path that bends: depths that only fit one of its steps do not fit the others.
+    for (frame, twist) in
+        [[0.03, 0.0, 0.0], [0.02, 0.03, 0.0], [0.0, 0.02, 0.03]].iter().enumerate()
+    {
+        let [x, y, z] = *twist;
+        let moved = SE3::exp(&Vector6::new(x, y, z, 0.002, -0.003, 0.001));
+        initializer.step(&scene.render(&CAMERA, &moved).noisy(2.0, 2 + frame as u64));
+    }
+    assert_eq!(initializer.witnesses.len(), 3);
+    let input = input(&initializer.images, &initializer.intrinsics, &initializer.points);
+    let at = |&(u, v): &(u16, u16)| first.inverse_depth.at(usize::from(u), usize::from(v));
+    let truth: Vec<f32> = initializer.points.pixels.iter().map(at).collect();
+    let tilted = initializer.points.pixels.iter().map(|p| {
+        let across = f32::from(p.0) / CAMERA.width as f32 - 0.5;
+        at(p) * (1.0 + 0.8 * across)
+    });
+    let energy =
+        |depths: &[f32]| initializer.witnesses.energy(&input, depths, &initializer.params.fit);
+    let (right, wrong) = (energy(&truth), energy(&tilted.collect::<Vec<_>>()));
+    assert!(right * (1.0 + EvidenceParams::default().min_rival_excess) < wrong, "{right} {wrong}");
 }
 
 #[test]

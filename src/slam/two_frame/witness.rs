@@ -1,0 +1,88 @@
+//! Earlier frames of a start, which the depths of every motion must explain as well.
+//!
+//! Two views of a plane are explained by two motions, with the translation and the normal of the plane
+//! exchanged (Longuet-Higgins 1986), and two near views of a shallow scene nearly so. The plane of the
+//! wrong motion turns with the camera's path, the true one stays: the depths found in one frame fit the
+//! others only where they are right.
+
+use std::collections::VecDeque;
+
+use rayon::prelude::*;
+
+use crate::slam::depth::map::GradientImage;
+use crate::slam::two_frame::fit::{FitInput, FitParams, FitScratch, Freedom, fit_level};
+use crate::slam::two_frame::system::State;
+
+/// Levels on which a witness is heard, coarse to fine: motions differ by pixels, and half of the
+/// resolution is a quarter of the time and memory.
+const LEVELS: std::ops::RangeInclusive<usize> = 1..=2;
+
+/// One earlier frame.
+#[derive(Debug)]
+struct Witness {
+    /// Its images, finest kept level first.
+    images: Vec<GradientImage>,
+    /// Its fit without translation: where the search for its pose begins.
+    rotation: State,
+}
+
+/// The latest frames before the current one.
+#[derive(Debug, Default)]
+pub struct Witnesses {
+    kept: VecDeque<Witness>,
+}
+
+impl Witnesses {
+    /// Forgets all.
+    pub fn clear(&mut self) {
+        self.kept.clear();
+    }
+
+    /// How many there are.
+    pub fn len(&self) -> usize {
+        self.kept.len()
+    }
+
+    /// Whether there is none.
+    pub fn is_empty(&self) -> bool {
+        self.kept.is_empty()
+    }
+
+    /// Adds a frame (all its levels, and its fit without translation); at most `most` are kept.
+    pub fn push(&mut self, images: &[GradientImage], rotation: &State, most: usize) {
+        while self.kept.len() >= most.max(1) {
+            self.kept.pop_front();
+        }
+        let (finest, coarsest) = heard_levels(images.len());
+        let images = images[finest..=coarsest].to_vec();
+        self.kept.push_back(Witness { images, rotation: rotation.clone() });
+    }
+
+    /// Energy of the witnesses with these depths, each frame from the pose that fits it best. `input`
+    /// gives points and intrinsics. The sum goes in the order of the frames.
+    pub fn energy(&self, input: &FitInput<'_>, inverse_depths: &[f32], params: &FitParams) -> f64 {
+        let (finest, coarsest) = heard_levels(input.intrinsics.len());
+        let energies: Vec<f64> = self
+            .kept
+            .par_iter()
+            .map(|witness| {
+                let input = FitInput { images: &witness.images, finest, ..*input };
+                let mut state = witness.rotation.clone();
+                state.inverse_depths.clear();
+                state.inverse_depths.extend_from_slice(inverse_depths);
+                let mut scratch = FitScratch::default();
+                for level in (finest..=coarsest).rev() {
+                    fit_level(&input, level, Freedom::Pose, &mut state, &mut scratch, params);
+                }
+                scratch.system.energy
+            })
+            .collect();
+        energies.iter().sum()
+    }
+}
+
+/// Finest and coarsest level heard of so many.
+fn heard_levels(levels: usize) -> (usize, usize) {
+    let last = levels.saturating_sub(1);
+    ((*LEVELS.start()).min(last), (*LEVELS.end()).min(last))
+}
