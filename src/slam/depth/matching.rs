@@ -26,9 +26,11 @@ pub const MAX_STEPS: usize = 100;
 pub struct MatchingParams {
     /// Standard deviation of the image noise, grey levels. Cameras in rooms have 2 to 4.
     pub image_noise: f32,
-    /// Standard deviation by which errors of the calibration, and of the pose beyond its covariance,
-    /// misplace the epipolar line, pixels.
+    /// Standard deviation by which errors of an estimated pose beyond its covariance misplace the epipolar
+    /// line, pixels. A pose that is given without covariance has none.
     pub line_noise_px: f32,
+    /// The same of errors of the calibration, which are in every match, pixels.
+    pub calibration_noise_px: f32,
     /// Standard deviation that interpolation and sampling leave in a match, pixels: measured without
     /// noise and with hardly any parallax in the simulated room.
     pub sampling_noise_px: f32,
@@ -55,6 +57,7 @@ impl Default for MatchingParams {
         Self {
             image_noise: 3.0,
             line_noise_px: 0.2,
+            calibration_noise_px: 0.03,
             sampling_noise_px: 0.08,
             slant_noise_px: 1.5,
             max_search_px: 40.0,
@@ -67,16 +70,20 @@ impl Default for MatchingParams {
 }
 
 impl MatchingParams {
-    /// `line_noise_px` together with an uncertainty of the pose of `pose_noise_px`, no larger than any
-    /// search reaches.
+    /// By how much the epipolar line is misplaced when the pose is uncertain by `pose_noise_px`, no more than
+    /// any search reaches. A pose that is certain is given: then only the calibration errs.
     pub fn line_noise_with(&self, pose_noise_px: f64) -> f32 {
-        self.line_noise_px.hypot(pose_noise_px as f32).min(self.max_search_px)
+        let is_estimated = pose_noise_px > 0.0;
+        let of_pose =
+            if is_estimated { self.line_noise_px.hypot(pose_noise_px as f32) } else { 0.0 };
+        of_pose.hypot(self.calibration_noise_px).min(self.max_search_px)
     }
 
     /// Checks every value.
     pub fn validate(&self) -> Result<(), ParameterError> {
         check_range("image_noise", self.image_noise, 0.1..=50.0)?;
         check_range("line_noise_px", self.line_noise_px, 0.0..=5.0)?;
+        check_range("calibration_noise_px", self.calibration_noise_px, 0.0..=5.0)?;
         check_range("sampling_noise_px", self.sampling_noise_px, 0.0..=2.0)?;
         check_range("slant_noise_px", self.slant_noise_px, 0.0..=20.0)?;
         check_range("max_search_px", self.max_search_px, 5.0..=90.0)?;
