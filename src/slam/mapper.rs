@@ -61,8 +61,7 @@ pub struct MapperParams {
     /// At least so many frames lie between two keyframes.
     pub min_keyframe_interval: u64,
     /// Which filter estimates depth: `gaussian`, `interval` (sparse) or `both`. The Gaussian filter is
-    /// the most accurate semi-dense one in the simulated room and the cheapest; see
-    /// `docs/depth-filters.md`.
+    /// the cheaper of the two that make a semi-dense map; `docs/depth-filters.md` compares them.
     pub depth_filter: DepthFilter,
     /// Search along the epipolar line.
     pub matching: MatchingParams,
