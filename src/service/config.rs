@@ -374,7 +374,10 @@ mod tests {
     fn bad_settings_are_refused() {
         assert!(set(&["mapper.threads"]).unwrap_err().contains("key=value"));
         let error = set(&["mapper.thread=1"]).unwrap_err();
-        assert!(error.ends_with("unknown key `mapper.thread`; keys of `mapper` are threads, scheduling"));
+        assert!(
+            error
+                .ends_with("unknown key `mapper.thread`; keys of `mapper` are threads, scheduling")
+        );
         let error = set(&["tracking.alignment.hubr=1"]).unwrap_err();
         assert!(error.contains("unknown key `tracking.alignment.hubr`; keys of "), "{error}");
         let error = set(&["mappr.threads=1"]).unwrap_err();
