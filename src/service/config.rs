@@ -376,7 +376,7 @@ mod tests {
         let error = set(&["mapper.thread=1"]).unwrap_err();
         assert!(
             error
-                .ends_with("unknown key `mapper.thread`; keys of `mapper` are threads, scheduling")
+                .ends_with("unknown key `mapper.thread`; keys of `mapper` are scheduling, threads")
         );
         let error = set(&["tracking.alignment.hubr=1"]).unwrap_err();
         assert!(error.contains("unknown key `tracking.alignment.hubr`; keys of "), "{error}");
