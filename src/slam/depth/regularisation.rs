@@ -139,40 +139,40 @@ impl Neighbourhood<'_> {
     pub(super) fn sums(&self, first: usize, v: usize) -> NeighbourSums {
         let spread = self.params.distance_std_dev * self.params.distance_std_dev;
         let slack = self.params.surface_slack_ratio;
-        let load = |image: &Image<f32>, u: usize, v: usize| {
-            let mut lanes = [0.0; LANES];
-            lanes.copy_from_slice(&image.row(v)[u..u + LANES]);
-            lanes
+        let window = first - RADIUS..first + LANES + RADIUS;
+        let row = |image: &'_ Image<f32>, y: usize| -> [f32; LANES + 2 * RADIUS] {
+            let mut values = [0.0; LANES + 2 * RADIUS];
+            values.copy_from_slice(&image.row(y)[window.clone()]);
+            values
         };
-        let centre = load(self.inverse_depth, first, v);
-        let centre_variance = load(self.variance, first, v);
-        let mut allowed = [0.0; LANES];
+        let (depths, variances) = (row(self.inverse_depth, v), row(self.variance, v));
+        let (mut centre, mut allowed) = ([0.0; LANES], [0.0; LANES]);
         for k in 0..LANES {
+            centre[k] = depths[k + RADIUS];
             let tolerance = slack * centre[k];
-            allowed[k] = centre_variance[k] + tolerance * tolerance;
+            allowed[k] = variances[k + RADIUS] + tolerance * tolerance;
         }
-        let mut sums =
-            NeighbourSums { weighted: [0.0; LANES], weights: [0.0; LANES], count: [0.0; LANES] };
+        let (mut weighted, mut weights, mut count) = ([0.0; LANES], [0.0; LANES], [0.0; LANES]);
         for y in v - RADIUS..=v + RADIUS {
+            let (depths, variances) = (row(self.inverse_depth, y), row(self.variance, y));
             for x in 0..=2 * RADIUS {
-                let d = load(self.inverse_depth, first + x - RADIUS, y);
-                let variance = load(self.variance, first + x - RADIUS, y);
                 let (dx, dy) = (x as f32 - RADIUS as f32, y as f32 - v as f32);
                 let distance = spread * (dx * dx + dy * dy);
                 for k in 0..LANES {
-                    let difference = d[k] - centre[k];
+                    let (d, variance) = (depths[k + x], variances[k + x]);
+                    let difference = d - centre[k];
+                    let squared = difference * difference;
                     // Without branches, so that the lanes go together.
-                    let consistent = (variance[k] >= 0.0)
-                        & (difference * difference <= allowed[k] + variance[k]);
-                    let taken = f32::from(u8::from(consistent));
-                    let weight = taken / (variance[k].max(LEAST_VARIANCE) + distance);
-                    sums.weighted[k] += weight * d[k];
-                    sums.weights[k] += weight;
-                    sums.count[k] += taken;
+                    let consistent = (variance >= 0.0) & (squared <= allowed[k] + variance);
+                    let taken = if consistent { 1.0 } else { 0.0 };
+                    let weight = taken / (variance.max(LEAST_VARIANCE) + distance);
+                    weighted[k] += weight * d;
+                    weights[k] += weight;
+                    count[k] += taken;
                 }
             }
         }
-        sums
+        NeighbourSums { weighted, weights, count }
     }
 }
 
