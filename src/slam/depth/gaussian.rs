@@ -13,7 +13,7 @@ use crate::slam::depth::observation_kernel::row_kernel;
 use crate::slam::depth::promise::{LANES, PixelLanes, promises};
 use crate::slam::image::buffer::Image;
 use crate::slam::image::quads::QuadImage;
-use crate::slam::image::quads_kernel::Sampler;
+use crate::slam::image::quads_kernel::{Sampled, Sampler};
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::Brightness;
 
@@ -277,7 +277,8 @@ impl PixelObserver<'_> {
             return;
         };
         let patch = Patch::new(self.image, u, v, self.gain, self.offset);
-        match search(sampler, frame, &line, &patch, &conditioning, &from, &to, self.matching) {
+        let frame = Sampled { image: frame, sampler };
+        match search(frame, &line, &patch, &conditioning, &from, &to, self.matching) {
             Ok(found) => {
                 counts.attempted += 1;
                 if self.fuse(hypothesis, &found) {
@@ -354,7 +355,8 @@ impl PixelObserver<'_> {
         let conditioning = condition(view, &line, &at, structure, self.gain, self.matching);
         let Some(conditioning) = conditioning else { return };
         let patch = Patch::new(self.image, u, v, self.gain, self.offset);
-        match search(sampler, frame, &line, &patch, &conditioning, &from, &to, self.matching) {
+        let frame = Sampled { image: frame, sampler };
+        match search(frame, &line, &patch, &conditioning, &from, &to, self.matching) {
             Ok(found)
                 if found.inverse_depth > 0.0
                     && found.variance < self.params.max_std_dev.powi(2) =>

@@ -211,9 +211,8 @@ impl DepthMap {
             }
             histogram
         };
-        let add = |one: [u32; BINS], other: [u32; BINS]| {
-            std::array::from_fn(|bin| one[bin] + other[bin])
-        };
+        let add =
+            |one: [u32; BINS], other: [u32; BINS]| std::array::from_fn(|bin| one[bin] + other[bin]);
         let rows = rows.into_par_iter().with_min_len(BAND_ROWS);
         let histogram = rows.fold(|| [0; BINS], count_row).reduce(|| [0; BINS], add);
         let mut kept = 0;

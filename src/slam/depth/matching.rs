@@ -9,8 +9,7 @@ use serde::{Deserialize, Serialize};
 use crate::slam::depth::epipolar::{EpipolarLine, Projection, TwoView};
 use crate::slam::depth::map::{BORDER_PX, GradientImage};
 use crate::slam::image::buffer::Image;
-use crate::slam::image::quads::QuadImage;
-use crate::slam::image::quads_kernel::Sampler;
+use crate::slam::image::quads_kernel::{Sampled, Sampler};
 use crate::slam::parameter::{ParameterError, check_range};
 
 /// The 8-sample residual pattern of Engel, Koltun, Cremers 2018 (fig. 4): even offsets only, so that no
@@ -240,8 +239,7 @@ impl Conditioning {
 /// Searches between the projections `from` and `to`; a segment below a pixel is only refined.
 #[inline(always)]
 pub fn search<S: Sampler>(
-    sampler: S,
-    frame: &QuadImage,
+    frame: Sampled<'_, S>,
     line: &EpipolarLine,
     patch: &Patch,
     conditioning: &Conditioning,
@@ -260,12 +258,20 @@ pub fn search<S: Sampler>(
     }
     let middle = (0.5 * (from.u + to.u), 0.5 * (from.v + to.v));
     let reach = 0.5 * length + REFINE_REACH_PX;
-    if !is_inside(frame.width(), frame.height(), middle.0 - reach * du, middle.1 - reach * dv)
-        || !is_inside(frame.width(), frame.height(), middle.0 + reach * du, middle.1 + reach * dv)
-    {
+    if !is_inside(
+        frame.image.width(),
+        frame.image.height(),
+        middle.0 - reach * du,
+        middle.1 - reach * dv,
+    ) || !is_inside(
+        frame.image.width(),
+        frame.image.height(),
+        middle.0 + reach * du,
+        middle.1 + reach * dv,
+    ) {
         return Err(Miss::OutOfView);
     }
-    let along = Along::new(sampler, frame, patch, conditioning, middle);
+    let along = Along::new(frame, patch, conditioning, middle);
     let steps =
         if length < MIN_SEARCH_PX { 0 } else { (length.ceil() as usize).min(MAX_STEPS - 1) };
     let mut start = 0.0;
@@ -323,8 +329,7 @@ pub fn search<S: Sampler>(
 
 /// The patch as a function of its place λ along the line, pixels from `middle`.
 struct Along<'a, S> {
-    sampler: S,
-    frame: &'a QuadImage,
+    frame: Sampled<'a, S>,
     intensity: &'a [f32; 8],
     direction: (f32, f32),
     /// Position of each sample at λ = 0.
@@ -351,8 +356,7 @@ const HUBER_GREY: f32 = 9.0;
 impl<'a, S: Sampler> Along<'a, S> {
     #[inline(always)]
     fn new(
-        sampler: S,
-        frame: &'a QuadImage,
+        frame: Sampled<'a, S>,
         patch: &'a Patch,
         conditioning: &Conditioning,
         middle: (f32, f32),
@@ -365,14 +369,15 @@ impl<'a, S: Sampler> Along<'a, S> {
             v[k] = middle.1 + (warp[2] * x + warp[3] * y);
             line_gradients[k] = patch.gradient_u[k] * along.0 + patch.gradient_v[k] * along.1;
         }
-        Self { sampler, frame, intensity: &patch.intensity, direction, u, v, line_gradients }
+        Self { frame, intensity: &patch.intensity, direction, u, v, line_gradients }
     }
 
     /// The frame under the patch at `lambda`.
     #[inline(always)]
     fn look(&self, lambda: f32) -> [f32; 8] {
         let (du, dv) = (lambda * self.direction.0, lambda * self.direction.1);
-        self.sampler.sample(self.frame, &self.u.map(|u| u + du), &self.v.map(|v| v + dv))
+        let Sampled { image, sampler } = self.frame;
+        sampler.sample(image, &self.u.map(|u| u + du), &self.v.map(|v| v + dv))
     }
 
     /// Compares what was seen there with the patch.

@@ -77,9 +77,7 @@ pub fn promises(
         (along_u[k], along_v[k]) = (a * du + b * dv, c * du + d * dv);
         (across_u[k], across_v[k]) = (-a * dv + b * du, -c * dv + d * du);
         inverse_depth_per_px[k] = 1.0 / speed;
-        promises[k] &= (speed > f32::MIN_POSITIVE)
-            & (determinant >= DETERMINANT.start)
-            & (determinant < DETERMINANT.end);
+        promises[k] &= (speed > f32::MIN_POSITIVE) & DETERMINANT.contains(&determinant);
     }
     // What a match there would be worth.
     let samples = PATTERN.len() as f32;
@@ -93,8 +91,7 @@ pub fn promises(
         let (a, b) = (along_u[k], along_v[k]);
         let (c, d) = (across_u[k], across_v[k]);
         let measured = uu * a * a + uv * (a * b + b * a) + vv * b * b;
-        let by_noise =
-            0.5 * samples * (gain * params.image_noise).powi(2) * (a * a + b * b);
+        let by_noise = 0.5 * samples * (gain * params.image_noise).powi(2) * (a * a + b * b);
         let information = measured - by_noise;
         let tangent = (uu * a * c + uv * (a * d + b * c) + vv * b * d) / information;
         let geometric = params.line_noise_px * params.line_noise_px * (1.0 + tangent * tangent);
@@ -135,8 +132,7 @@ mod tests {
             ));
             let view = TwoView::new(&camera, &motion);
             let (v, gain) = (5.0 + (i % 140) as f32, 0.7 + (i % 7) as f32 * 0.1);
-            let random =
-                |k: usize, step: usize| ((i * 31 + k * step) % 101) as f32 / 100.0;
+            let random = |k: usize, step: usize| ((i * 31 + k * step) % 101) as f32 / 100.0;
             let mut pixels = PixelLanes::default();
             for k in 0..LANES {
                 pixels.u[k] = 4.0 + (i * 3 + k * 11) as f32 % 190.0;
@@ -148,7 +144,8 @@ mod tests {
                     plane[k] = sum;
                 }
             }
-            let together = promises(&pixels, v, &view, (camera.width, camera.height), gain, &params);
+            let together =
+                promises(&pixels, v, &view, (camera.width, camera.height), gain, &params);
             for k in 0..LANES {
                 let line = view.line(pixels.u[k], v);
                 let alone = line

@@ -8,6 +8,15 @@ pub trait Sampler: Copy {
     fn sample(self, image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> [f32; 8];
 }
 
+/// An image and the way to sample it.
+#[derive(Debug, Clone, Copy)]
+pub struct Sampled<'a, S> {
+    /// The image.
+    pub image: &'a QuadImage,
+    /// The way.
+    pub sampler: S,
+}
+
 /// The explanation of the others: for every processor.
 #[derive(Debug, Clone, Copy)]
 pub struct PortableSampler;
