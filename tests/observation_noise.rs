@@ -14,6 +14,7 @@ use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::image::buffer::Image;
 use semidense::slam::image::quads::QuadImage;
+use semidense::slam::image::quads_kernel::{PortableSampler, Sampled};
 
 /// Frames of a sequence; every third observes the first one, over baselines up to 0.3 m.
 const FRAMES: usize = 19;
@@ -108,6 +109,7 @@ fn observe(
         return None;
     }
     let patch = Patch::new(&map.image, u, v, 1.0, 0.0);
+    let frame = Sampled { image: frame, sampler: PortableSampler };
     let found = search(frame, &line, &patch, &conditioning, &from, &to, params).ok()?;
     Some(f64::from((found.inverse_depth - truth) / found.variance.sqrt()))
 }

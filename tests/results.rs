@@ -144,6 +144,7 @@ fn record(poses: Vec<RecordedPose>, keyframes: Vec<Keyframe>, with_truth: bool) 
         deadline_misses: None,
         page_faults: None,
         map_nanos: vec![2_000_000; frames],
+        keyframe_nanos: vec![5_000_000; 3],
         budget_samples: Vec::new(),
         recorded_nanos: 2_000_000_000,
         wall_nanos: 1_000_000_000,

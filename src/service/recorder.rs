@@ -18,6 +18,7 @@ pub struct Recorder {
     steps: Subscriber<StepMessage, ()>,
     recorded: Vec<RecordedPose>,
     map_nanos: Vec<u64>,
+    keyframe_nanos: Vec<u64>,
     last_step: Option<StepMessage>,
     /// CLOCK_MONOTONIC of the first frame and of the last pose.
     span_nanos: Option<(i64, i64)>,
@@ -48,6 +49,7 @@ impl Recorder {
             steps: hub.subscriber(&STEP)?,
             recorded: Vec::new(),
             map_nanos: Vec::new(),
+            keyframe_nanos: Vec::new(),
             last_step: None,
             span_nanos: None,
         })
@@ -69,6 +71,9 @@ impl Recorder {
         while let Some(message) = self.steps.receive()? {
             let Some(step) = message.payload().first() else { continue };
             self.map_nanos.push(step.step_nanos);
+            if step.keyframes > self.last_step.map_or(0, |last| last.keyframes) {
+                self.keyframe_nanos.push(step.step_nanos);
+            }
             self.last_step = Some(*step);
         }
         Ok(self.recorded.len() + self.map_nanos.len() > before)
@@ -142,6 +147,7 @@ impl Recorder {
             deadline_misses: is_live.then_some(counters.deadline_misses),
             page_faults: Some(counters.page_faults),
             map_nanos: self.map_nanos,
+            keyframe_nanos: self.keyframe_nanos,
             budget_samples: Vec::new(),
             recorded_nanos,
             wall_nanos: positive(wall_nanos),

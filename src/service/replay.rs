@@ -200,7 +200,11 @@ impl<'a> Replay<'a> {
         }
         let begin = Instant::now();
         let outcome = self.mapper.step(&frame, &pose, sensor_depth.as_ref());
-        self.record.map_nanos.push(elapsed_nanos(begin));
+        let step_nanos = elapsed_nanos(begin);
+        self.record.map_nanos.push(step_nanos);
+        if outcome.keyframe_created {
+            self.record.keyframe_nanos.push(step_nanos);
+        }
         if outcome.needs_publishing()
             && self.config.poses == PoseOrigin::Tracker
             && let Some(keyframe) = self.mapper.keyframe()
@@ -297,6 +301,7 @@ fn empty_record(source_name: &str, ground_truth: Vec<StampedPose>, poses_given: 
         deadline_misses: None,
         page_faults: None,
         map_nanos: Vec::new(),
+        keyframe_nanos: Vec::new(),
         budget_samples: Vec::new(),
         recorded_nanos: 0,
         wall_nanos: 0,

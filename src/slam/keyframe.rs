@@ -22,6 +22,11 @@ pub struct DepthPoint {
 /// Most points of one keyframe: bounds the message and the tracker's memory.
 pub const MAX_KEYFRAME_POINTS: usize = 100_000;
 
+/// Most bytes of image and depth that a keyframe of `num_pixels` holds: one a pixel, 16 a point.
+pub const fn most_keyframe_bytes(num_pixels: usize) -> usize {
+    num_pixels + MAX_KEYFRAME_POINTS * size_of::<DepthPoint>()
+}
+
 /// Whether the map behind a keyframe can be trusted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MapState {

@@ -97,6 +97,8 @@ pub struct RunRecord {
     pub page_faults: Option<u64>,
     /// Time in the mapper, one for each frame it handled.
     pub map_nanos: Vec<u64>,
+    /// Of them, those of the steps that made a keyframe, the one of the start too.
+    pub keyframe_nanos: Vec<u64>,
     /// Frames that were aligned again with fewer iterations; empty where none were.
     pub budget_samples: Vec<BudgetSample>,
     /// First to last stamp.

@@ -206,6 +206,8 @@ pub struct Summary {
     pub alignment_levels: Option<Vec<LevelSummary>>,
     /// Time in the mapper for a frame.
     pub map_ms: Option<Percentiles>,
+    /// Of it, the steps that made a keyframe.
+    pub keyframe_ms: Option<Percentiles>,
     /// Quality of a pose as a function of the iterations it is given; of replays.
     pub budget_curve: Option<BudgetCurve>,
     /// First to last stamp.
@@ -281,6 +283,7 @@ impl Summary {
             pyramid_ms: Percentiles::of(traces.iter().map(|trace| trace.pyramid_nanos)),
             alignment_levels: alignment_levels(&traces),
             map_ms: Percentiles::of(record.map_nanos.iter().copied()),
+            keyframe_ms: Percentiles::of(record.keyframe_nanos.iter().copied()),
             budget_curve: BudgetCurve::of(&record.budget_samples),
             recorded_secs,
             wall_secs,

@@ -41,8 +41,12 @@ pub fn summary_text(summary: &Summary) -> String {
             ),
         );
     }
-    let times =
-        [("track", summary.track_ms), ("map", summary.map_ms), ("latency", summary.latency_ms)];
+    let times = [
+        ("track", summary.track_ms),
+        ("map", summary.map_ms),
+        ("keyframe", summary.keyframe_ms),
+        ("latency", summary.latency_ms),
+    ];
     for (name, percentiles) in times {
         if let Some(percentiles) = percentiles {
             line(&format!("{name} time"), times_text(&percentiles));

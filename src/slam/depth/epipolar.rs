@@ -9,17 +9,17 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 
 /// Smallest `pr_z + kt_z d` that counts as in front of the camera (ratio of the depths).
-const MIN_DEPTH_RATIO: f32 = 1e-3;
+pub(super) const MIN_DEPTH_RATIO: f32 = 1e-3;
 
 /// Two-view geometry, prepared once per frame and used for every pixel.
 #[derive(Debug, Clone, Copy)]
 pub struct TwoView {
     /// `K R K⁻¹`, row-major.
-    rotation: [[f32; 3]; 3],
+    pub(super) rotation: [[f32; 3]; 3],
     /// `K t`.
-    translation: [f32; 3],
+    pub(super) translation: [f32; 3],
     /// Pixels are so many focal lengths.
-    per_focal_length: f32,
+    pub(super) per_focal_length: f32,
 }
 
 /// One keyframe pixel seen through a [`TwoView`]: its epipolar line, parametrised by inverse depth.

@@ -10,8 +10,10 @@ use crate::slam::depth::matching::{
     Match, MatchingParams, Miss, Patch, condition, is_inside, search,
 };
 use crate::slam::depth::observation_kernel::row_kernel;
+use crate::slam::depth::promise::{LANES, PixelLanes, promises};
 use crate::slam::image::buffer::Image;
 use crate::slam::image::quads::QuadImage;
+use crate::slam::image::quads_kernel::{Sampled, Sampler};
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::Brightness;
 
@@ -160,6 +162,9 @@ pub fn observe(
         .reduce(ObservationCounts::default, ObservationCounts::plus)
 }
 
+/// Columns that are listed at a time, on the stack.
+const BLOCK: usize = 512;
+
 /// Everything that the observation of a pixel needs.
 pub(super) struct PixelObserver<'a> {
     image: &'a GradientImage,
@@ -175,25 +180,74 @@ pub(super) struct PixelObserver<'a> {
 impl PixelObserver<'_> {
     /// Observes the pixels of row `v`.
     #[inline(always)]
-    pub(super) fn observe_row(&self, row: &mut [Hypothesis], v: usize) -> ObservationCounts {
+    pub(super) fn observe_row<S: Sampler>(
+        &self,
+        sampler: S,
+        row: &mut [Hypothesis],
+        v: usize,
+    ) -> ObservationCounts {
         let mut counts = ObservationCounts::default();
         let candidates = self.candidates.row(v);
-        for u in BORDER_PX..row.len() - BORDER_PX {
-            if row[u].is_some() {
-                if !(self.observer.pixels == ObservedPixels::New && row[u].propagated) {
-                    self.update(&mut row[u], u, v, &mut counts);
-                }
-            } else if candidates[u] && self.observer.pixels != ObservedPixels::Known {
-                self.create(&mut row[u], u, v, &mut counts);
+        let skips_propagated = self.observer.pixels == ObservedPixels::New;
+        let creates = self.observer.pixels != ObservedPixels::Known;
+        let (mut known, mut unknown) = ([0u16; BLOCK], [0u16; BLOCK]);
+        for first in (BORDER_PX..row.len() - BORDER_PX).step_by(BLOCK) {
+            let (mut num_known, mut num_unknown) = (0, 0);
+            // Lists without branches: what comes next can hardly be guessed.
+            for u in first..(first + BLOCK).min(row.len() - BORDER_PX) {
+                let (hypothesis, is_some) = (&row[u], row[u].is_some());
+                (known[num_known], unknown[num_unknown]) = (u as u16, u as u16);
+                num_known += usize::from(is_some & !(skips_propagated & hypothesis.propagated));
+                num_unknown += usize::from(!is_some & candidates[u] & creates);
+            }
+            for columns in known[..num_known].chunks(LANES) {
+                self.update_promising(sampler, row, columns, v, &mut counts);
+            }
+            for &u in &unknown[..num_unknown] {
+                let u = usize::from(u);
+                self.create(sampler, &mut row[u], u, v, &mut counts);
             }
         }
         counts
     }
 
+    /// Updates those of the `columns` of row `v`, at most [`LANES`], whose match promises something.
+    #[inline(always)]
+    fn update_promising<S: Sampler>(
+        &self,
+        sampler: S,
+        row: &mut [Hypothesis],
+        columns: &[u16],
+        v: usize,
+        counts: &mut ObservationCounts,
+    ) {
+        let mut pixels = PixelLanes::default();
+        for (k, u) in columns.iter().map(|&u| usize::from(u)).enumerate() {
+            let hypothesis = &row[u];
+            pixels.u[k] = u as f32;
+            pixels.inverse_depth[k] = hypothesis.smoothed;
+            pixels.enough[k] = self.params.max_variance_ratio * hypothesis.variance;
+            let structure = &self.structure.row(v)[u];
+            for (plane, &sum) in pixels.structure.iter_mut().zip(structure) {
+                plane[k] = sum;
+            }
+        }
+        let Observer { image: frame, view, .. } = self.observer;
+        let size = (frame.width(), frame.height());
+        let promises = promises(&pixels, v as f32, view, size, self.gain, self.matching);
+        for (&u, &promises) in columns.iter().zip(&promises) {
+            if promises {
+                let u = usize::from(u);
+                self.update(sampler, &mut row[u], u, v, counts);
+            }
+        }
+    }
+
     /// Observes a pixel that has a hypothesis.
     #[inline(always)]
-    fn update(
+    fn update<S: Sampler>(
         &self,
+        sampler: S,
         hypothesis: &mut Hypothesis,
         u: usize,
         v: usize,
@@ -210,8 +264,8 @@ impl PixelObserver<'_> {
         let structure = &self.structure.row(v)[u];
         let conditioning = condition(view, &line, &at, structure, self.gain, self.matching);
         let Some(conditioning) = conditioning else { return };
-        let expected = conditioning.inverse_depth_per_px.powi(2) * conditioning.match_variance;
-        if expected > self.params.max_variance_ratio * hypothesis.variance {
+        let enough = self.params.max_variance_ratio * hypothesis.variance;
+        if conditioning.expected_variance() > enough {
             return;
         }
         // No further than the search goes: half its length to either side.
@@ -223,6 +277,7 @@ impl PixelObserver<'_> {
             return;
         };
         let patch = Patch::new(self.image, u, v, self.gain, self.offset);
+        let frame = Sampled { image: frame, sampler };
         match search(frame, &line, &patch, &conditioning, &from, &to, self.matching) {
             Ok(found) => {
                 counts.attempted += 1;
@@ -273,8 +328,9 @@ impl PixelObserver<'_> {
 
     /// Tries to give a pixel its first hypothesis, searching all depths.
     #[inline(always)]
-    fn create(
+    fn create<S: Sampler>(
         &self,
+        sampler: S,
         hypothesis: &mut Hypothesis,
         u: usize,
         v: usize,
@@ -299,6 +355,7 @@ impl PixelObserver<'_> {
         let conditioning = condition(view, &line, &at, structure, self.gain, self.matching);
         let Some(conditioning) = conditioning else { return };
         let patch = Patch::new(self.image, u, v, self.gain, self.offset);
+        let frame = Sampled { image: frame, sampler };
         match search(frame, &line, &patch, &conditioning, &from, &to, self.matching) {
             Ok(found)
                 if found.inverse_depth > 0.0

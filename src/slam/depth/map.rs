@@ -10,6 +10,10 @@ use crate::slam::image::buffer::Image;
 /// gradients 1, and a bilinear sample 1 more.
 pub const BORDER_PX: usize = 4;
 
+/// Rows that a thread takes at least, where a row is cheap: waking another thread costs as much as
+/// thousands of pixels.
+pub(super) const BAND_ROWS: usize = 60;
+
 /// A keyframe's image with its gradients, level 0.
 #[derive(Debug, Clone)]
 pub struct GradientImage {
@@ -30,10 +34,29 @@ impl GradientImage {
 
     /// Takes the grey values of a frame of the same size and differentiates them.
     pub fn fill(&mut self, pixels: &[u8]) {
-        for (out, &grey) in self.intensity.pixels_mut().iter_mut().zip(pixels) {
-            *out = f32::from(grey);
-        }
-        self.differentiate();
+        let (width, height) = (self.intensity.width(), self.intensity.height());
+        let row = |v: usize| &pixels[v * width..(v + 1) * width];
+        let intensity = self.intensity.pixels_mut().par_chunks_exact_mut(width);
+        let gradient_u = self.gradient_u.pixels_mut().par_chunks_exact_mut(width);
+        let gradient_v = self.gradient_v.pixels_mut().par_chunks_exact_mut(width);
+        let rows = intensity.zip(gradient_u).zip(gradient_v).enumerate();
+        rows.with_min_len(BAND_ROWS).for_each(|(v, ((intensity, gradient_u), gradient_v))| {
+            let here = row(v);
+            for (out, &grey) in intensity.iter_mut().zip(here) {
+                *out = f32::from(grey);
+            }
+            if v == 0 || v + 1 == height {
+                return;
+            }
+            let sides = here.iter().zip(&here[2..]);
+            for (out, (&left, &right)) in gradient_u[1..].iter_mut().zip(sides) {
+                *out = 0.5 * (f32::from(right) - f32::from(left));
+            }
+            let ends = row(v - 1).iter().zip(row(v + 1)).skip(1).take(width - 2);
+            for (out, (&above, &below)) in gradient_v[1..].iter_mut().zip(ends) {
+                *out = 0.5 * (f32::from(below) - f32::from(above));
+            }
+        });
     }
 
     /// Takes the brightness of an image of the same size and differentiates it.
@@ -123,7 +146,12 @@ pub struct DepthMap {
     pub candidates: Image<bool>,
     /// Σ (g_u², g_u g_v, g_v²) over the matching pattern around each candidate.
     pub structure: Image<[f32; 3]>,
+    /// Memory for what arrives from the keyframe before, by band of its rows.
+    pub(super) arrivals: Vec<Vec<Arrival>>,
 }
+
+/// A hypothesis on its way to a pixel of this place in the image.
+pub(super) type Arrival = (u32, Hypothesis);
 
 impl DepthMap {
     /// An empty map for images of this size.
@@ -133,6 +161,7 @@ impl DepthMap {
             hypotheses: Image::filled(width, height, Hypothesis::NONE),
             candidates: Image::filled(width, height, false),
             structure: Image::filled(width, height, [0.0; 3]),
+            arrivals: Vec::new(),
         }
     }
 
@@ -140,7 +169,8 @@ impl DepthMap {
     /// evenly until at most `max_candidates` remain.
     pub fn restart(&mut self, pixels: &[u8], min_gradient: f32, max_candidates: usize) {
         self.image.fill(pixels);
-        self.hypotheses.pixels_mut().fill(Hypothesis::NONE);
+        let rows = self.hypotheses.pixels_mut().par_chunks_exact_mut(self.image.width());
+        rows.with_min_len(BAND_ROWS).for_each(|row| row.fill(Hypothesis::NONE));
         self.choose_candidates(min_gradient, max_candidates);
         self.sum_structure();
     }
@@ -175,25 +205,32 @@ impl DepthMap {
             |i: usize| (gradient_u[i] * gradient_u[i] + gradient_v[i] * gradient_v[i]).sqrt();
         let inner = |v: usize| v * width + BORDER_PX..(v + 1) * width - BORDER_PX;
         let rows = BORDER_PX..height - BORDER_PX;
-        let mut histogram = [0usize; BINS];
-        for i in rows.clone().flat_map(inner) {
-            let strength = strength(i);
-            if strength >= min_gradient {
+        let count_row = |mut histogram: [u32; BINS], v: usize| {
+            for strength in inner(v).map(strength).filter(|s| *s >= min_gradient) {
                 histogram[bin(strength)] += 1;
             }
-        }
+            histogram
+        };
+        let add =
+            |one: [u32; BINS], other: [u32; BINS]| std::array::from_fn(|bin| one[bin] + other[bin]);
+        let rows = rows.into_par_iter().with_min_len(BAND_ROWS);
+        let histogram = rows.fold(|| [0; BINS], count_row).reduce(|| [0; BINS], add);
         let mut kept = 0;
         let mut lowest = BINS;
-        while lowest > 0 && kept + histogram[lowest - 1] <= max_candidates {
+        while lowest > 0 && kept + histogram[lowest - 1] as usize <= max_candidates {
             lowest -= 1;
-            kept += histogram[lowest];
+            kept += histogram[lowest] as usize;
         }
-        let candidates = self.candidates.pixels_mut();
-        candidates.fill(false);
-        for i in rows.flat_map(inner) {
-            let strength = strength(i);
-            candidates[i] = strength >= min_gradient && bin(strength) >= lowest;
-        }
+        let rows = self.candidates.pixels_mut().par_chunks_exact_mut(width).enumerate();
+        rows.with_min_len(BAND_ROWS).for_each(|(v, row)| {
+            row.fill(false);
+            if (BORDER_PX..height - BORDER_PX).contains(&v) {
+                for (is_candidate, i) in row[BORDER_PX..].iter_mut().zip(inner(v)) {
+                    let strength = strength(i);
+                    *is_candidate = strength >= min_gradient && bin(strength) >= lowest;
+                }
+            }
+        });
     }
 
     /// Place of pixel `(u, v)` in the planes.
@@ -218,11 +255,14 @@ impl DepthMap {
 
     /// Multiplies every inverse depth by `factor` and every variance by its square.
     pub fn rescale(&mut self, factor: f32) {
-        for h in self.hypotheses.pixels_mut().iter_mut().filter(|h| h.is_some()) {
-            h.inverse_depth *= factor;
-            h.smoothed *= factor;
-            h.variance *= factor * factor;
-        }
+        let rows = self.hypotheses.pixels_mut().par_chunks_exact_mut(self.image.width());
+        rows.with_min_len(BAND_ROWS).for_each(|row| {
+            for h in row.iter_mut().filter(|h| h.is_some()) {
+                h.inverse_depth *= factor;
+                h.smoothed *= factor;
+                h.variance *= factor * factor;
+            }
+        });
     }
 }
 

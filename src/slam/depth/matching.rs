@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use crate::slam::depth::epipolar::{EpipolarLine, Projection, TwoView};
 use crate::slam::depth::map::{BORDER_PX, GradientImage};
 use crate::slam::image::buffer::Image;
-use crate::slam::image::quads::QuadImage;
+use crate::slam::image::quads_kernel::{Sampled, Sampler};
 use crate::slam::parameter::{ParameterError, check_range};
 
 /// The 8-sample residual pattern of Engel, Koltun, Cremers 2018 (fig. 4): even offsets only, so that no
@@ -162,6 +162,9 @@ pub enum Miss {
     Ambiguous,
 }
 
+/// A patch that shrinks or grows by more than this compares different texture.
+pub(super) const DETERMINANT: std::ops::Range<f32> = 0.3..3.0;
+
 /// Judges the line of a pixel at the projection `at`, from the structure of its patch (Σ g_u², g_u g_v,
 /// g_v²) times `gain`²; `None` where a match would tell nothing: no parallax, or no gradient along
 /// the line.
@@ -182,8 +185,6 @@ pub fn condition(
     let direction = (vu / speed, vv / speed);
     let warp = view.patch_warp(at);
     let determinant = warp[0] * warp[3] - warp[1] * warp[2];
-    // A patch that shrinks or grows this much compares different texture.
-    const DETERMINANT: std::ops::Range<f32> = 0.3..3.0;
     if !DETERMINANT.contains(&determinant) {
         return None;
     }
@@ -227,10 +228,18 @@ pub fn condition(
     })
 }
 
+impl Conditioning {
+    /// Variance that a match would give the inverse depth.
+    #[inline(always)]
+    pub fn expected_variance(&self) -> f32 {
+        self.inverse_depth_per_px.powi(2) * self.match_variance
+    }
+}
+
 /// Searches between the projections `from` and `to`; a segment below a pixel is only refined.
 #[inline(always)]
-pub fn search(
-    frame: &QuadImage,
+pub fn search<S: Sampler>(
+    frame: Sampled<'_, S>,
     line: &EpipolarLine,
     patch: &Patch,
     conditioning: &Conditioning,
@@ -249,9 +258,17 @@ pub fn search(
     }
     let middle = (0.5 * (from.u + to.u), 0.5 * (from.v + to.v));
     let reach = 0.5 * length + REFINE_REACH_PX;
-    if !is_inside(frame.width(), frame.height(), middle.0 - reach * du, middle.1 - reach * dv)
-        || !is_inside(frame.width(), frame.height(), middle.0 + reach * du, middle.1 + reach * dv)
-    {
+    if !is_inside(
+        frame.image.width(),
+        frame.image.height(),
+        middle.0 - reach * du,
+        middle.1 - reach * dv,
+    ) || !is_inside(
+        frame.image.width(),
+        frame.image.height(),
+        middle.0 + reach * du,
+        middle.1 + reach * dv,
+    ) {
         return Err(Miss::OutOfView);
     }
     let along = Along::new(frame, patch, conditioning, middle);
@@ -259,14 +276,20 @@ pub fn search(
         if length < MIN_SEARCH_PX { 0 } else { (length.ceil() as usize).min(MAX_STEPS - 1) };
     let mut start = 0.0;
     let mut second = f32::INFINITY;
-    if steps > 0 {
+    // What the best place looks like is kept for the refinement.
+    let mut seen;
+    if steps == 0 {
+        seen = along.look(start);
+    } else {
         let first = -0.5 * steps as f32;
+        seen = [0.0; 8];
         let mut costs = [f32::INFINITY; MAX_STEPS];
         let mut best = 0;
         for step in 0..=steps {
-            costs[step] = along.evaluate(first + step as f32).cost;
-            if costs[step] < costs[best] {
-                best = step;
+            let samples = along.look(first + step as f32);
+            costs[step] = along.compare(&samples).cost;
+            if costs[step] < costs[best] || step == 0 {
+                (best, seen) = (step, samples);
             }
         }
         // Steps next to the minimum belong to it.
@@ -278,7 +301,7 @@ pub fn search(
         }
         start = first + best as f32;
     }
-    let (lambda, cost) = along.refine(start, REFINE_REACH_PX);
+    let (lambda, cost) = along.refine(start, &seen, REFINE_REACH_PX);
     let limit = params.max_residual * params.max_residual
         + params.residual_per_gradient
             * params.residual_per_gradient
@@ -305,8 +328,8 @@ pub fn search(
 }
 
 /// The patch as a function of its place λ along the line, pixels from `middle`.
-struct Along<'a> {
-    frame: &'a QuadImage,
+struct Along<'a, S> {
+    frame: Sampled<'a, S>,
     intensity: &'a [f32; 8],
     direction: (f32, f32),
     /// Position of each sample at λ = 0.
@@ -330,10 +353,10 @@ struct Evaluation {
 /// Residuals beyond this many grey levels grow linearly (Engel, Koltun, Cremers 2018).
 const HUBER_GREY: f32 = 9.0;
 
-impl<'a> Along<'a> {
+impl<'a, S: Sampler> Along<'a, S> {
     #[inline(always)]
     fn new(
-        frame: &'a QuadImage,
+        frame: Sampled<'a, S>,
         patch: &'a Patch,
         conditioning: &Conditioning,
         middle: (f32, f32),
@@ -349,11 +372,18 @@ impl<'a> Along<'a> {
         Self { frame, intensity: &patch.intensity, direction, u, v, line_gradients }
     }
 
+    /// The frame under the patch at `lambda`.
     #[inline(always)]
-    fn evaluate(&self, lambda: f32) -> Evaluation {
-        let line_gradients = &self.line_gradients;
+    fn look(&self, lambda: f32) -> [f32; 8] {
         let (du, dv) = (lambda * self.direction.0, lambda * self.direction.1);
-        let samples = self.frame.sample(&self.u.map(|u| u + du), &self.v.map(|v| v + dv));
+        let Sampled { image, sampler } = self.frame;
+        sampler.sample(image, &self.u.map(|u| u + du), &self.v.map(|v| v + dv))
+    }
+
+    /// Compares what was seen there with the patch.
+    #[inline(always)]
+    fn compare(&self, samples: &[f32; 8]) -> Evaluation {
+        let line_gradients = &self.line_gradients;
         let (mut costs, mut gradients, mut informations) = ([0.0; 8], [0.0; 8], [0.0; 8]);
         for k in 0..PATTERN.len() {
             let residual = samples[k] - self.intensity[k];
@@ -366,23 +396,23 @@ impl<'a> Along<'a> {
         Evaluation { cost: sum(&costs), gradient: sum(&gradients), information: sum(&informations) }
     }
 
-    /// Gauss–Newton along the line, each step clamped, undone when the cost rises: where it ends and
+    /// Gauss–Newton along the line from `start`, where the frame was `seen`, each step clamped, undone when the cost rises: where it ends and
     /// the cost there.
     #[inline(always)]
-    fn refine(&self, start: f32, reach: f32) -> (f32, f32) {
+    fn refine(&self, start: f32, seen: &[f32; 8], reach: f32) -> (f32, f32) {
         const MAX_ITERATIONS: usize = 4;
         const MAX_STEP_PX: f32 = 0.75;
         /// Keeps a patch without gradient from dividing by zero, grey levels².
         const LEAST_INFORMATION: f32 = 1e-6;
         /// Further steps change the depth less than the sampling noise does.
         const CONVERGED_PX: f32 = 0.03;
-        let (mut lambda, mut at) = (start, self.evaluate(start));
+        let (mut lambda, mut at) = (start, self.compare(seen));
         for _ in 0..MAX_ITERATIONS {
             let step = -at.gradient / (at.information + LEAST_INFORMATION);
             let next = (lambda + step.clamp(-MAX_STEP_PX, MAX_STEP_PX))
                 .clamp(start - reach, start + reach);
             let moved = (next - lambda).abs();
-            let there = self.evaluate(next);
+            let there = self.compare(&self.look(next));
             if !(there.cost < at.cost) {
                 break;
             }
@@ -401,15 +431,17 @@ pub(super) fn sum(x: &[f32; 8]) -> f32 {
     ((x[0] + x[4]) + (x[2] + x[6])) + ((x[1] + x[5]) + (x[3] + x[7]))
 }
 
+/// How far inside the frame a patch must be: it reaches 2 px, stretched by at most √3 (see
+/// [`condition`]), and one more for the bilinear sample.
+pub(super) const MARGIN_PX: f32 = BORDER_PX as f32 + 1.0;
+
 /// Whether a patch at this position lies inside the image; false for NaN.
 #[inline]
 pub fn is_inside(width: usize, height: usize, u: f32, v: f32) -> bool {
-    // The patch reaches 2 px, stretched by at most √3 (see `condition`), and one for the bilinear sample.
-    const MARGIN: f32 = BORDER_PX as f32 + 1.0;
-    u >= MARGIN
-        && v >= MARGIN
-        && u < width as f32 - 1.0 - MARGIN
-        && v < height as f32 - 1.0 - MARGIN
+    u >= MARGIN_PX
+        && v >= MARGIN_PX
+        && u < width as f32 - 1.0 - MARGIN_PX
+        && v < height as f32 - 1.0 - MARGIN_PX
 }
 
 /// Bilinear sample; positions outside take the nearest pixel inside.

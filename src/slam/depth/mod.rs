@@ -14,6 +14,7 @@ pub mod map;
 pub mod matching;
 mod observation_kernel;
 pub mod pose_noise;
+pub mod promise;
 pub mod propagation;
 pub mod regularisation;
 mod segment;

@@ -4,6 +4,9 @@
 
 use crate::slam::depth::gaussian::{ObservationCounts, PixelObserver};
 use crate::slam::depth::map::Hypothesis;
+#[cfg(target_arch = "x86_64")]
+use crate::slam::image::quads_kernel::Avx2Sampler;
+use crate::slam::image::quads_kernel::PortableSampler;
 
 /// A version of [`PixelObserver::observe_row`].
 pub(super) type RowKernel = fn(&PixelObserver<'_>, &mut [Hypothesis], usize) -> ObservationCounts;
@@ -12,6 +15,16 @@ pub(super) type RowKernel = fn(&PixelObserver<'_>, &mut [Hypothesis], usize) -> 
 pub(super) fn row_kernel() -> RowKernel {
     #[cfg(target_arch = "x86_64")]
     if std::arch::is_x86_feature_detected!("avx2") {
+        let has_avx512 = std::arch::is_x86_feature_detected!("avx512f")
+            && std::arch::is_x86_feature_detected!("avx512vl")
+            && std::arch::is_x86_feature_detected!("avx512bw")
+            && std::arch::is_x86_feature_detected!("avx512dq");
+        if has_avx512 {
+            return |pixel, row, v| {
+                // SAFETY: the processor has these, as was just asked.
+                unsafe { observe_row_avx512(pixel, row, v) }
+            };
+        }
         return |pixel, row, v| {
             // SAFETY: the processor has AVX2, as was just asked.
             unsafe { observe_row_avx2(pixel, row, v) }
@@ -26,7 +39,7 @@ fn observe_row_portable(
     row: &mut [Hypothesis],
     v: usize,
 ) -> ObservationCounts {
-    pixel.observe_row(row, v)
+    pixel.observe_row(PortableSampler, row, v)
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -36,5 +49,19 @@ fn observe_row_avx2(
     row: &mut [Hypothesis],
     v: usize,
 ) -> ObservationCounts {
-    pixel.observe_row(row, v)
+    // SAFETY: this function asks for AVX2.
+    let sampler = unsafe { Avx2Sampler::new() };
+    pixel.observe_row(sampler, row, v)
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2,avx512f,avx512vl,avx512bw,avx512dq")]
+fn observe_row_avx512(
+    pixel: &PixelObserver<'_>,
+    row: &mut [Hypothesis],
+    v: usize,
+) -> ObservationCounts {
+    // SAFETY: this function asks for AVX2.
+    let sampler = unsafe { Avx2Sampler::new() };
+    pixel.observe_row(sampler, row, v)
 }

@@ -3,10 +3,11 @@
 //! `d' = 1/z' = d/(r_z + t_z d)` with r_z the third component of R (x, y, 1)ᵀ, and
 //! `σ'² = r_z² (d'/d)⁴ σ² + σ_p²`.
 
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::epipolar::TwoView;
-use crate::slam::depth::map::{BORDER_PX, DepthMap, Hypothesis};
+use crate::slam::depth::map::{Arrival, BAND_ROWS, BORDER_PX, DepthMap, Hypothesis};
 use crate::slam::depth::matching::bilinear;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
@@ -60,39 +61,74 @@ pub fn propagate(
     params: &PropagationParams,
 ) {
     let (width, height) = (source.image.width(), source.image.height());
-    let view = TwoView::new(intrinsics, target_from_source);
-    let (gain, offset) = (brightness.a.exp() as f32, brightness.b as f32);
-    for v in BORDER_PX..height - BORDER_PX {
-        for u in BORDER_PX..width - BORDER_PX {
-            let from = source.hypotheses.at(u, v);
-            if !from.is_some() {
-                continue;
-            }
-            let line = view.line(u as f32, v as f32);
-            let Some(at) = line.project(from.smoothed) else { continue };
-            let margin = BORDER_PX as f32;
-            let inside = at.u >= margin
-                && at.v >= margin
-                && at.u < (width - BORDER_PX) as f32 - 0.5
-                && at.v < (height - BORDER_PX) as f32 - 0.5;
-            if !inside {
-                continue;
-            }
-            let (tu, tv) = ((at.u + 0.5) as usize, (at.v + 0.5) as usize);
-            if !target.candidates.at(tu, tv) {
-                continue;
-            }
-            let expected = gain * source.image.intensity.at(u, v) + offset;
-            let residual = (bilinear(&target.image.intensity, at.u, at.v) - expected).abs();
-            let gradient =
-                target.image.gradient_u.at(tu, tv).hypot(target.image.gradient_v.at(tu, tv));
-            if residual > params.max_residual + params.residual_per_gradient * gradient {
-                continue;
-            }
-            let arriving = carry(&from, at.depth_ratio, line.pr[2], params);
-            let index = tv * width + tu;
-            settle(&mut target.hypotheses.pixels_mut()[index], arriving);
+    let mut arrivals = std::mem::take(&mut target.arrivals);
+    arrivals.resize_with(height.div_ceil(BAND_ROWS), Vec::new);
+    let way = Way {
+        source,
+        target,
+        view: TwoView::new(intrinsics, target_from_source),
+        gain: brightness.a.exp() as f32,
+        offset: brightness.b as f32,
+        params,
+    };
+    arrivals.par_iter_mut().enumerate().for_each(|(band, arrivals)| {
+        arrivals.clear();
+        let rows = band * BAND_ROWS..((band + 1) * BAND_ROWS).min(height);
+        for v in rows.filter(|v| (BORDER_PX..height - BORDER_PX).contains(v)) {
+            let columns = BORDER_PX..width - BORDER_PX;
+            arrivals.extend(columns.filter_map(|u| way.carry_pixel(u, v)));
         }
+    });
+    // In the order of the source's rows: who comes first to a pixel matters there.
+    let present = target.hypotheses.pixels_mut();
+    for &(index, arriving) in arrivals.iter().flatten() {
+        settle(&mut present[index as usize], arriving);
+    }
+    target.arrivals = arrivals;
+}
+
+/// What a hypothesis needs on its way from one keyframe to the next.
+struct Way<'a> {
+    source: &'a DepthMap,
+    target: &'a DepthMap,
+    view: TwoView,
+    gain: f32,
+    offset: f32,
+    params: &'a PropagationParams,
+}
+
+impl Way<'_> {
+    /// The hypothesis of a source pixel where it arrives, if there is one and it does.
+    fn carry_pixel(&self, u: usize, v: usize) -> Option<Arrival> {
+        let (source, target, params) = (self.source, self.target, self.params);
+        let from = source.hypotheses.at(u, v);
+        if !from.is_some() {
+            return None;
+        }
+        let (width, height) = (target.image.width(), target.image.height());
+        let line = self.view.line(u as f32, v as f32);
+        let at = line.project(from.smoothed)?;
+        let margin = BORDER_PX as f32;
+        let inside = at.u >= margin
+            && at.v >= margin
+            && at.u < (width - BORDER_PX) as f32 - 0.5
+            && at.v < (height - BORDER_PX) as f32 - 0.5;
+        if !inside {
+            return None;
+        }
+        let (tu, tv) = ((at.u + 0.5) as usize, (at.v + 0.5) as usize);
+        if !target.candidates.at(tu, tv) {
+            return None;
+        }
+        let expected = self.gain * source.image.intensity.at(u, v) + self.offset;
+        let residual = (bilinear(&target.image.intensity, at.u, at.v) - expected).abs();
+        let gradient_u = f64::from(target.image.gradient_u.at(tu, tv));
+        let gradient_v = f64::from(target.image.gradient_v.at(tu, tv));
+        let gradient = (gradient_u * gradient_u + gradient_v * gradient_v).sqrt() as f32;
+        if residual > params.max_residual + params.residual_per_gradient * gradient {
+            return None;
+        }
+        Some(((tv * width + tu) as u32, carry(&from, at.depth_ratio, line.pr[2], params)))
     }
 }
 

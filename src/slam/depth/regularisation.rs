@@ -53,13 +53,12 @@ impl RegularisationParams {
     }
 }
 
-/// Memory of the regularisation.
+/// Memory of the regularisation: the map as it was before, as planes.
 #[derive(Debug, Clone)]
 pub struct RegularisationScratch {
-    /// Filtered inverse depth and variance as planes, variance negative where there is none.
     inverse_depth: Image<f32>,
+    /// Negative where there is no hypothesis.
     variance: Image<f32>,
-    hypotheses: Image<Hypothesis>,
 }
 
 impl RegularisationScratch {
@@ -68,7 +67,6 @@ impl RegularisationScratch {
         Self {
             inverse_depth: Image::filled(width, height, 0.0),
             variance: Image::filled(width, height, -1.0),
-            hypotheses: Image::filled(width, height, Hypothesis::NONE),
         }
     }
 }
@@ -81,42 +79,38 @@ pub fn regularise(
     params: &RegularisationParams,
 ) {
     let (width, height) = (map.image.width(), map.image.height());
-    let RegularisationScratch { inverse_depth, variance, hypotheses } = scratch;
-    let (before, candidates) = (&map.hypotheses, &map.candidates);
+    let RegularisationScratch { inverse_depth, variance } = scratch;
+    let (hypotheses, candidates) = (&mut map.hypotheses, &map.candidates);
     let planes = inverse_depth.pixels_mut().par_chunks_exact_mut(width);
     let planes = planes.zip(variance.pixels_mut().par_chunks_exact_mut(width));
-    planes.enumerate().for_each(|(v, (d, variance))| {
-        for ((d, variance), hypothesis) in d.iter_mut().zip(variance).zip(before.row(v)) {
+    planes.zip(hypotheses.pixels().par_chunks_exact(width)).for_each(|((d, variance), row)| {
+        for ((d, variance), hypothesis) in d.iter_mut().zip(variance).zip(row) {
             (*d, *variance) = (hypothesis.inverse_depth, hypothesis.variance);
         }
     });
-    let neighbourhood = Neighbourhood { inverse_depth, variance, params };
+    let before = Neighbourhood { inverse_depth, variance, params };
     let sum_neighbours = sums_kernel();
     hypotheses.pixels_mut().par_chunks_exact_mut(width).enumerate().for_each(|(v, row)| {
-        row.copy_from_slice(before.row(v));
         if !(BORDER_PX..height - BORDER_PX).contains(&v) {
             return;
         }
+        let present = before.variance.row(v);
+        let candidates = candidates.row(v);
         for first in (BORDER_PX..width - BORDER_PX).step_by(LANES) {
             let block = first..(first + LANES).min(width - BORDER_PX);
-            if row[block.clone()].iter().any(Hypothesis::is_some) {
-                // The last block overlaps the one before it, so that every block is whole.
-                let first = first.min(width - BORDER_PX - LANES);
-                smooth(
-                    &mut row[first..first + LANES],
-                    &before.row(v)[first..first + LANES],
-                    &sum_neighbours(&neighbourhood, first, v),
-                    params,
-                );
-            }
-            for u in block {
-                if !before.at(u, v).is_some() && candidates.at(u, v) {
-                    fill(&mut row[u], before, u, v, params);
+            if present[block.clone()].iter().any(|&variance| variance >= 0.0) {
+                // The last block is summed with some of the one before it, so that it is whole.
+                let whole = first.min(width - BORDER_PX - LANES);
+                let sums = sum_neighbours(&before, whole, v);
+                for u in block.clone().filter(|&u| present[u] >= 0.0) {
+                    smooth(&mut row[u], &sums, u - whole, params);
                 }
+            }
+            for u in block.filter(|&u| candidates[u] && !(present[u] >= 0.0)) {
+                before.fill(&mut row[u], u, v);
             }
         }
     });
-    std::mem::swap(&mut map.hypotheses, hypotheses);
 }
 
 /// Keeps the weight of a certain pixel finite: far below any variance a match can have.
@@ -145,104 +139,104 @@ impl Neighbourhood<'_> {
     pub(super) fn sums(&self, first: usize, v: usize) -> NeighbourSums {
         let spread = self.params.distance_std_dev * self.params.distance_std_dev;
         let slack = self.params.surface_slack_ratio;
-        let load = |image: &Image<f32>, u: usize, v: usize| {
-            let mut lanes = [0.0; LANES];
-            lanes.copy_from_slice(&image.row(v)[u..u + LANES]);
-            lanes
+        let window = first - RADIUS..first + LANES + RADIUS;
+        let row = |image: &'_ Image<f32>, y: usize| -> [f32; LANES + 2 * RADIUS] {
+            let mut values = [0.0; LANES + 2 * RADIUS];
+            values.copy_from_slice(&image.row(y)[window.clone()]);
+            values
         };
-        let centre = load(self.inverse_depth, first, v);
-        let centre_variance = load(self.variance, first, v);
-        let mut allowed = [0.0; LANES];
+        let (depths, variances) = (row(self.inverse_depth, v), row(self.variance, v));
+        let (mut centre, mut allowed) = ([0.0; LANES], [0.0; LANES]);
         for k in 0..LANES {
+            centre[k] = depths[k + RADIUS];
             let tolerance = slack * centre[k];
-            allowed[k] = centre_variance[k] + tolerance * tolerance;
+            allowed[k] = variances[k + RADIUS] + tolerance * tolerance;
         }
-        let mut sums =
-            NeighbourSums { weighted: [0.0; LANES], weights: [0.0; LANES], count: [0.0; LANES] };
+        let (mut weighted, mut weights, mut count) = ([0.0; LANES], [0.0; LANES], [0.0; LANES]);
         for y in v - RADIUS..=v + RADIUS {
+            let (depths, variances) = (row(self.inverse_depth, y), row(self.variance, y));
             for x in 0..=2 * RADIUS {
-                let d = load(self.inverse_depth, first + x - RADIUS, y);
-                let variance = load(self.variance, first + x - RADIUS, y);
                 let (dx, dy) = (x as f32 - RADIUS as f32, y as f32 - v as f32);
                 let distance = spread * (dx * dx + dy * dy);
                 for k in 0..LANES {
-                    let difference = d[k] - centre[k];
+                    let (d, variance) = (depths[k + x], variances[k + x]);
+                    let difference = d - centre[k];
+                    let squared = difference * difference;
                     // Without branches, so that the lanes go together.
-                    let consistent = (variance[k] >= 0.0)
-                        & (difference * difference <= allowed[k] + variance[k]);
-                    let taken = f32::from(u8::from(consistent));
-                    let weight = taken / (variance[k].max(LEAST_VARIANCE) + distance);
-                    sums.weighted[k] += weight * d[k];
-                    sums.weights[k] += weight;
-                    sums.count[k] += taken;
+                    let consistent = (variance >= 0.0) & (squared <= allowed[k] + variance);
+                    let taken = if consistent { 1.0 } else { 0.0 };
+                    let weight = taken / (variance.max(LEAST_VARIANCE) + distance);
+                    weighted[k] += weight * d;
+                    weights[k] += weight;
+                    count[k] += taken;
                 }
             }
         }
-        sums
+        NeighbourSums { weighted, weights, count }
     }
 }
 
-/// Smooths the hypotheses of a block, and drops those with too few neighbours.
+/// Smooths the hypothesis whose sums stand at `lane`, or drops it for want of neighbours.
 fn smooth(
-    block: &mut [Hypothesis],
-    before: &[Hypothesis],
+    hypothesis: &mut Hypothesis,
     sums: &NeighbourSums,
+    lane: usize,
     params: &RegularisationParams,
 ) {
-    // What was filled just now has no sums.
-    for (k, hypothesis) in block.iter_mut().enumerate().filter(|(k, _)| before[*k].is_some()) {
-        // The pixel itself is among the consistent ones.
-        if sums.count[k] <= f32::from(params.min_neighbours) || !(sums.weights[k] > 0.0) {
-            hypothesis.reject();
-        } else {
-            hypothesis.smoothed = sums.weighted[k] / sums.weights[k];
-        }
+    // The pixel itself is among the consistent ones.
+    let few = sums.count[lane] <= f32::from(params.min_neighbours);
+    if few || !(sums.weights[lane] > 0.0) {
+        hypothesis.reject();
+    } else {
+        hypothesis.smoothed = sums.weighted[lane] / sums.weights[lane];
     }
 }
 
-/// Gives a pixel the mean of its neighbours, where they are many and agree.
-fn fill(
-    out: &mut Hypothesis,
-    before: &Image<Hypothesis>,
-    u: usize,
-    v: usize,
-    params: &RegularisationParams,
-) {
-    /// Failures after which neighbours' depth is not tried again: the pixel is something else.
-    const MAX_FAILURES: u8 = 2;
-    if out.failures > MAX_FAILURES {
-        return;
-    }
-    let spread = params.distance_std_dev * params.distance_std_dev;
-    let (mut sum, mut squares, mut weights, mut neighbours) = (0.0f32, 0.0f32, 0.0f32, 0u8);
-    for y in v - RADIUS..=v + RADIUS {
-        for other in before.row(y)[u - RADIUS..=u + RADIUS].iter().filter(|h| h.is_some()) {
-            let weight =
-                1.0 / (other.variance + spread * other.inverse_depth * other.inverse_depth);
-            sum += weight * other.inverse_depth;
-            squares += weight * other.inverse_depth * other.inverse_depth;
-            weights += weight;
-            neighbours += 1;
+impl Neighbourhood<'_> {
+    /// Gives a pixel without hypothesis the mean of its neighbours, where they are many and agree.
+    fn fill(&self, out: &mut Hypothesis, u: usize, v: usize) {
+        /// Failures after which neighbours' depth is not tried again: the pixel is something else.
+        const MAX_FAILURES: u8 = 2;
+        if out.failures > MAX_FAILURES {
+            return;
         }
+        let (rows, columns) = (v - RADIUS..=v + RADIUS, u - RADIUS..=u + RADIUS);
+        let neighbours: u8 = rows
+            .clone()
+            .flat_map(|y| &self.variance.row(y)[columns.clone()])
+            .map(|&variance| u8::from(variance >= 0.0))
+            .sum();
+        if neighbours < self.params.min_fill_neighbours {
+            return;
+        }
+        let spread = self.params.distance_std_dev * self.params.distance_std_dev;
+        let (mut sum, mut squares, mut weights) = (0.0f32, 0.0f32, 0.0f32);
+        for y in rows {
+            let variances = &self.variance.row(y)[columns.clone()];
+            let depths = &self.inverse_depth.row(y)[columns.clone()];
+            for (&d, &variance) in depths.iter().zip(variances).filter(|(_, v)| **v >= 0.0) {
+                let weight = 1.0 / (variance + spread * d * d);
+                sum += weight * d;
+                squares += weight * d * d;
+                weights += weight;
+            }
+        }
+        let mean = sum / weights;
+        let variance = (squares / weights - mean * mean).max(0.0) + f32::from(neighbours) / weights;
+        // Neighbours on two surfaces say nothing of which one the hole is on.
+        const MAX_STD_DEV_RATIO: f32 = 0.15;
+        if variance > (MAX_STD_DEV_RATIO * mean).powi(2) {
+            return;
+        }
+        *out = Hypothesis {
+            inverse_depth: mean,
+            variance,
+            smoothed: mean,
+            validity: NEW_VALIDITY / 2,
+            propagated: false,
+            failures: out.failures,
+        };
     }
-    if neighbours < params.min_fill_neighbours {
-        return;
-    }
-    let mean = sum / weights;
-    let variance = (squares / weights - mean * mean).max(0.0) + f32::from(neighbours) / weights;
-    // Neighbours on two surfaces say nothing of which one the hole is on.
-    const MAX_STD_DEV_RATIO: f32 = 0.15;
-    if variance > (MAX_STD_DEV_RATIO * mean).powi(2) {
-        return;
-    }
-    *out = Hypothesis {
-        inverse_depth: mean,
-        variance,
-        smoothed: mean,
-        validity: NEW_VALIDITY / 2,
-        propagated: false,
-        failures: out.failures,
-    };
 }
 
 #[cfg(test)]

@@ -46,6 +46,7 @@ impl<T: Copy> Image<T> {
     }
 
     /// Row `v`.
+    #[inline]
     pub fn row(&self, v: usize) -> &[T] {
         &self.pixels[v * self.width..(v + 1) * self.width]
     }

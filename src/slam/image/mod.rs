@@ -4,4 +4,5 @@ pub mod buffer;
 pub mod gray;
 pub mod pyramid;
 pub mod quads;
+pub mod quads_kernel;
 pub mod sums;

@@ -40,6 +40,11 @@ impl QuadImage {
         self.height
     }
 
+    /// All pixels with their neighbours, lowest byte first: the pixel, right, lower, lower right.
+    pub fn quads(&self) -> &[u32] {
+        &self.quads
+    }
+
     /// Bilinear samples at eight positions, each at least a pixel from the border; elsewhere the
     /// value is some pixel's.
     #[inline(always)]

@@ -143,24 +143,26 @@ impl Mapper {
     pub(super) fn publish_depth(&mut self) {
         self.revision += 1;
         let in_force = self.in_force;
+        let known = self.depth.num_hypotheses();
         let Some(keyframe) = in_force.and_then(|index| self.map.keyframes.get_mut(index)) else {
             return;
         };
         keyframe.revision = self.revision;
         keyframe.points.clear();
-        let width = self.depth.image.width();
-        let intensity = self.depth.image.intensity.pixels();
-        for (i, h) in self.depth.hypotheses.pixels().iter().enumerate() {
-            if h.is_some() && h.smoothed > 0.0 && keyframe.points.len() < MAX_KEYFRAME_POINTS {
-                keyframe.points.push(DepthPoint {
-                    u: (i % width) as u16,
-                    v: (i / width) as u16,
-                    inverse_depth: h.smoothed,
-                    variance: h.variance,
-                    intensity: intensity[i],
-                });
-            }
+        keyframe.points.reserve_exact(known.min(MAX_KEYFRAME_POINTS));
+        let image = &self.depth.image.intensity;
+        for v in 0..image.height() {
+            let row = self.depth.hypotheses.row(v).iter().zip(image.row(v)).enumerate();
+            let known = row.filter(|(_, (h, _))| h.is_some() && h.smoothed > 0.0);
+            keyframe.points.extend(known.map(|(u, (h, &intensity))| DepthPoint {
+                u: u as u16,
+                v: v as u16,
+                inverse_depth: h.smoothed,
+                variance: h.variance,
+                intensity,
+            }));
         }
+        keyframe.points.truncate(MAX_KEYFRAME_POINTS);
     }
 
     pub(super) fn remember(&mut self, frame: &FrameView<'_>, pose: &PoseEstimate) {

@@ -32,8 +32,11 @@ fn depth_bytes(keyframe: &Keyframe) -> usize {
 mod tests {
     use super::*;
     use crate::slam::geometry::intrinsics::Intrinsics;
+    use crate::slam::geometry::se3::SE3;
     use crate::slam::geometry::sim3::Sim3;
-    use crate::slam::keyframe::MapState;
+    use crate::slam::keyframe::{MAX_KEYFRAME_POINTS, MapState, most_keyframe_bytes};
+    use crate::slam::mapper::past::PastFrames;
+    use crate::slam::pose::Brightness;
 
     fn keyframe(keyframe_id: u64) -> Keyframe {
         Keyframe {
@@ -48,6 +51,22 @@ mod tests {
             image: vec![7; 400],
             points: vec![DepthPoint::default(); 25],
         }
+    }
+
+    #[test]
+    fn a_keyframe_and_a_frame_hold_what_is_stated() {
+        const NUM_PIXELS: usize = 640 * 480;
+        let mut full = keyframe(0);
+        full.image = vec![0; NUM_PIXELS];
+        full.points = vec![DepthPoint::default(); MAX_KEYFRAME_POINTS];
+        assert_eq!(depth_bytes(&full), most_keyframe_bytes(NUM_PIXELS));
+        assert_eq!(most_keyframe_bytes(NUM_PIXELS), 1_907_200);
+        let mut past = PastFrames::with_capacity(4);
+        for _ in 0..9 {
+            past.push(&full.image, SE3::identity(), Brightness::default());
+        }
+        let held: usize = past.newest_first().map(|frame| frame.pixels.capacity()).sum();
+        assert_eq!(held, 4 * NUM_PIXELS);
     }
 
     #[test]

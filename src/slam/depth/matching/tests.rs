@@ -5,6 +5,8 @@ use nalgebra::Vector6;
 use super::*;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
+use crate::slam::image::quads::QuadImage;
+use crate::slam::image::quads_kernel::PortableSampler;
 
 const CAMERA: Intrinsics =
     Intrinsics { fx: 200.0, fy: 200.0, cx: 99.5, cy: 74.5, width: 200, height: 150 };
@@ -39,6 +41,10 @@ fn quads(pixels: &[u8]) -> QuadImage {
     image
 }
 
+fn sampled(image: &QuadImage) -> Sampled<'_, PortableSampler> {
+    Sampled { image, sampler: PortableSampler }
+}
+
 fn structure(patch: &Patch) -> [f32; 3] {
     let sum = |a: &[f32; 8], b: &[f32; 8]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f32>();
     let (gu, gv) = (&patch.gradient_u, &patch.gradient_v);
@@ -71,7 +77,8 @@ fn matches_hold_the_true_inverse_depth_within_their_variance() {
             else {
                 continue;
             };
-            let Ok(found_match) = search(&frame, &line, &patch, &conditioning, &from, &to, &params)
+            let Ok(found_match) =
+                search(sampled(&frame), &line, &patch, &conditioning, &from, &to, &params)
             else {
                 continue;
             };
@@ -101,7 +108,7 @@ fn gain_and_offset_are_taken_out() {
     let attempt = |gain, offset| {
         let patch = Patch::new(&keyframe, 100, 75, gain, offset);
         let conditioning = condition(&view, &line, &at, &structure(&patch), 1.0, &params).unwrap();
-        search(&frame, &line, &patch, &conditioning, &from, &to, &params)
+        search(sampled(&frame), &line, &patch, &conditioning, &from, &to, &params)
     };
     assert!((attempt(0.8, 20.0).unwrap().inverse_depth - 0.8).abs() < 0.03);
     assert!(attempt(1.0, 0.0).map_or(true, |m| m.mean_squared_residual > 10.0));
@@ -119,7 +126,7 @@ fn a_segment_outside_the_image_or_too_long_is_a_miss() {
         let at = line.project(0.8).unwrap();
         let conditioning = condition(&view, &line, &at, &structure(&patch), 1.0, &params).unwrap();
         search(
-            &frame,
+            sampled(&frame),
             &line,
             &patch,
             &conditioning,

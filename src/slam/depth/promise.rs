@@ -1,0 +1,166 @@
+//! Which of many pixels a frame promises to observe well: the judgement of
+//! [`condition`](crate::slam::depth::matching::condition) for a register of pixels at a time.
+//!
+//! Short loops over arrays, which every compiler turns into vector instructions; each operation is the
+//! one that the judgement of a single pixel does, so both decide alike to the last bit.
+
+use crate::slam::depth::epipolar::{MIN_DEPTH_RATIO, TwoView};
+use crate::slam::depth::matching::{DETERMINANT, MARGIN_PX, MatchingParams, PATTERN};
+
+/// Pixels that are judged at a time: a register of the widest vector unit.
+pub const LANES: usize = 16;
+
+type Lanes = [f32; LANES];
+
+/// What is known of [`LANES`] pixels of a row, by quantity.
+#[derive(Debug, Clone, Default)]
+pub struct PixelLanes {
+    /// Column.
+    pub u: Lanes,
+    /// Inverse depth that is searched around.
+    pub inverse_depth: Lanes,
+    /// Variance below which a match must promise to be, or the pixel is not worth a search.
+    pub enough: Lanes,
+    /// Σ (g_u², g_u g_v, g_v²) over the patch.
+    pub structure: [Lanes; 3],
+}
+
+/// Whether each pixel of row `v` is seen within a frame of `size` (width, height), and one match there
+/// promises a variance of no more than `enough`.
+#[inline(always)]
+pub fn promises(
+    pixels: &PixelLanes,
+    v: f32,
+    view: &TwoView,
+    size: (usize, usize),
+    gain: f32,
+    params: &MatchingParams,
+) -> [bool; LANES] {
+    let (m, kt) = (&view.rotation, &view.translation);
+    let mut promises = [false; LANES];
+    // Projection.
+    let (mut at_u, mut at_v, mut depth_ratio) = ([0.0; LANES], [0.0; LANES], [0.0; LANES]);
+    let mut parallax = [0.0; LANES];
+    let right = size.0 as f32 - 1.0 - MARGIN_PX;
+    let bottom = size.1 as f32 - 1.0 - MARGIN_PX;
+    for k in 0..LANES {
+        let (u, d) = (pixels.u[k], pixels.inverse_depth[k]);
+        let pr_u = m[0][0] * u + m[0][1] * v + m[0][2];
+        let pr_v = m[1][0] * u + m[1][1] * v + m[1][2];
+        let pr_z = m[2][0] * u + m[2][1] * v + m[2][2];
+        let z = pr_z + kt[2] * d;
+        depth_ratio[k] = 1.0 / z;
+        at_u[k] = (pr_u + kt[0] * d) * depth_ratio[k];
+        at_v[k] = (pr_v + kt[1] * d) * depth_ratio[k];
+        let (du, dv) = (at_u[k] - pr_u / pr_z, at_v[k] - pr_v / pr_z);
+        parallax[k] = (du * du + dv * dv).sqrt() * view.per_focal_length;
+        promises[k] = (z > MIN_DEPTH_RATIO)
+            & (at_u[k] >= MARGIN_PX)
+            & (at_v[k] >= MARGIN_PX)
+            & (at_u[k] < right)
+            & (at_v[k] < bottom);
+    }
+    // The line's direction in the keyframe.
+    let (mut along_u, mut along_v) = ([0.0; LANES], [0.0; LANES]);
+    let (mut across_u, mut across_v) = ([0.0; LANES], [0.0; LANES]);
+    let mut inverse_depth_per_px = [0.0; LANES];
+    for k in 0..LANES {
+        let (u, v, s) = (at_u[k], at_v[k], depth_ratio[k]);
+        let (speed_u, speed_v) = ((kt[0] - kt[2] * u) * s, (kt[1] - kt[2] * v) * s);
+        let speed = (speed_u * speed_u + speed_v * speed_v).sqrt();
+        let (du, dv) = (speed_u / speed, speed_v / speed);
+        let (uu, uv) = ((m[0][0] - u * m[2][0]) * s, (m[0][1] - u * m[2][1]) * s);
+        let (vu, vv) = ((m[1][0] - v * m[2][0]) * s, (m[1][1] - v * m[2][1]) * s);
+        let determinant = uu * vv - uv * vu;
+        let (a, b) = (vv / determinant, -uv / determinant);
+        let (c, d) = (-vu / determinant, uu / determinant);
+        (along_u[k], along_v[k]) = (a * du + b * dv, c * du + d * dv);
+        (across_u[k], across_v[k]) = (-a * dv + b * du, -c * dv + d * du);
+        inverse_depth_per_px[k] = 1.0 / speed;
+        promises[k] &= (speed > f32::MIN_POSITIVE) & DETERMINANT.contains(&determinant);
+    }
+    // What a match there would be worth.
+    let samples = PATTERN.len() as f32;
+    let noise = (1.0 + gain * gain) * params.image_noise * params.image_noise;
+    let least = samples * params.min_line_gradient * params.min_line_gradient;
+    let [structure_uu, structure_uv, structure_vv] = &pixels.structure;
+    for k in 0..LANES {
+        let uu = gain * gain * structure_uu[k];
+        let uv = gain * gain * structure_uv[k];
+        let vv = gain * gain * structure_vv[k];
+        let (a, b) = (along_u[k], along_v[k]);
+        let (c, d) = (across_u[k], across_v[k]);
+        let measured = uu * a * a + uv * (a * b + b * a) + vv * b * b;
+        let by_noise = 0.5 * samples * (gain * params.image_noise).powi(2) * (a * a + b * b);
+        let information = measured - by_noise;
+        let tangent = (uu * a * c + uv * (a * d + b * c) + vv * b * d) / information;
+        let geometric = params.line_noise_px * params.line_noise_px * (1.0 + tangent * tangent);
+        let photometric = noise * measured / (information * information);
+        let slant = params.slant_noise_px * parallax[k];
+        let sampling = params.sampling_noise_px * params.sampling_noise_px + slant * slant;
+        let match_variance = geometric + photometric + sampling;
+        let expected = inverse_depth_per_px[k].powi(2) * match_variance;
+        promises[k] &= (information >= least) & !(expected > pixels.enough[k]);
+    }
+    promises
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector6;
+
+    use super::*;
+    use crate::slam::depth::matching::{condition, is_inside};
+    use crate::slam::geometry::intrinsics::Intrinsics;
+    use crate::slam::geometry::se3::SE3;
+
+    #[test]
+    fn a_register_of_pixels_is_judged_as_each_of_them() {
+        let camera =
+            Intrinsics { fx: 200.0, fy: 190.0, cx: 99.5, cy: 74.5, width: 200, height: 150 };
+        let params = MatchingParams::default();
+        let (mut kept, mut judged) = (0, 0);
+        for i in 0..400usize {
+            let vary = |step: usize, scale: f64| ((i * step % 97) as f64 / 48.0 - 1.0) * scale;
+            let motion = SE3::exp(&Vector6::new(
+                vary(5, 0.2),
+                vary(7, 0.2),
+                vary(11, 0.4),
+                vary(13, 0.2),
+                vary(17, 0.2),
+                vary(19, 0.8),
+            ));
+            let view = TwoView::new(&camera, &motion);
+            let (v, gain) = (5.0 + (i % 140) as f32, 0.7 + (i % 7) as f32 * 0.1);
+            let random = |k: usize, step: usize| ((i * 31 + k * step) % 101) as f32 / 100.0;
+            let mut pixels = PixelLanes::default();
+            for k in 0..LANES {
+                pixels.u[k] = 4.0 + (i * 3 + k * 11) as f32 % 190.0;
+                pixels.inverse_depth[k] = 3.0 * random(k, 17);
+                pixels.enough[k] = 1e-5 * 1e4f32.powf(random(k, 29));
+                let (gu, gv) = (30.0 * random(k, 7), 30.0 * random(k, 3));
+                let (uu, uv, vv) = (8.0 * gu * gu, 6.0 * gu * gv, 8.0 * gv * gv);
+                for (plane, sum) in pixels.structure.iter_mut().zip([uu, uv, vv]) {
+                    plane[k] = sum;
+                }
+            }
+            let together =
+                promises(&pixels, v, &view, (camera.width, camera.height), gain, &params);
+            for k in 0..LANES {
+                let line = view.line(pixels.u[k], v);
+                let alone = line
+                    .project(pixels.inverse_depth[k])
+                    .filter(|p| is_inside(camera.width, camera.height, p.u, p.v))
+                    .and_then(|at| {
+                        let structure = pixels.structure.map(|plane| plane[k]);
+                        condition(&view, &line, &at, &structure, gain, &params)
+                    })
+                    .is_some_and(|c| !(c.expected_variance() > pixels.enough[k]));
+                assert_eq!(together[k], alone, "motion {i}, pixel {k}");
+                kept += usize::from(alone);
+                judged += 1;
+            }
+        }
+        assert!(kept > judged / 20 && kept < judged * 19 / 20, "{kept} of {judged}");
+    }
+}
