@@ -12,6 +12,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal};
+use semidense::service::health::ProcessState;
 use semidense::service::peers::{HEALTH_TOPICS, Peer};
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::pose::PoseEstimate;
@@ -208,6 +209,33 @@ fn report(pauses: &[(&str, Duration)]) {
             let _ = writeln!(std::io::stderr(), "{line}");
         }
     }
+}
+
+#[test]
+fn a_source_that_stalls_is_said_and_recovers_alone() {
+    let rig = Rig::new();
+    let child = rig.run(60, &["--live", "--source", "loop:1000000:20:sim"]).spawn().unwrap();
+    let hub = rig.observe();
+    let mut watch = Watch::new(&hub);
+    watch.until_resumed("the first pose");
+    let open = |topic| until("a process", || Peer::open(&hub, topic).ok());
+    let [mut capture, mut tracker, _] = HEALTH_TOPICS.each_ref().map(open);
+    let pid = Pid::from_raw(pid_of(&mut capture) as i32).unwrap();
+    let mut until_state = |wanted: ProcessState| {
+        until(wanted.name(), || {
+            tracker.update().unwrap();
+            (tracker.state() == Some(wanted)).then_some(())
+        });
+    };
+    rustix::process::kill_process(pid, Signal::STOP).unwrap();
+    until_state(ProcessState::Stale);
+    rustix::process::kill_process(pid, Signal::CONT).unwrap();
+    until_state(ProcessState::Running);
+    watch.until_resumed("poses after the stall");
+    drop((capture, tracker, watch, hub));
+    signal(&child, Signal::INT);
+    assert_eq!(end(child).status.code(), Some(130));
+    assert_eq!(rig.leftovers(), Vec::<String>::new());
 }
 
 #[test]

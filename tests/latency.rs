@@ -1,0 +1,66 @@
+//! `semidense bench latency`: that its report is complete; what it measures is for people, not for a test.
+
+#[allow(dead_code, reason = "every test uses its part of what they share")]
+mod support;
+
+use serde_json::Value;
+use support::{Rig, finish, small_camera};
+
+/// 1 000 frames.
+const TRIAL: [&str; 6] = ["--fps", "60", "--seconds", "16.667", "--realtime", "on"];
+const FRAMES: u64 = 1000;
+
+/// The measurements of trials on a small camera.
+fn bench(arguments: &[&str]) -> Vec<Value> {
+    let rig = Rig::new();
+    let mut command = rig.command(&["bench", "latency", "--json"]);
+    command.args(arguments);
+    for setting in small_camera(40) {
+        command.args(["--set", &format!("simulator.{setting}")]);
+    }
+    let ended = finish(command);
+    assert!(ended.status.success(), "{}", ended.stderr);
+    assert_eq!(rig.leftovers(), Vec::<String>::new());
+    serde_json::from_str(&ended.stdout).unwrap()
+}
+
+fn assert_complete(measurement: &Value, frames: u64) {
+    assert_eq!(measurement["frames"], frames, "{measurement}");
+    let count =
+        |key: &str| measurement[key].as_u64().unwrap_or_else(|| panic!("{key}: {measurement}"));
+    assert_eq!(count("poses") + count("dropped"), frames, "every frame is accounted for");
+    assert!(count("tracked") <= count("poses") && count("deadline_misses") <= count("poses"));
+    let _ = count("page_faults");
+    for times in ["latency_ms", "wake_ms", "track_ms"] {
+        let at = |share: &str| measurement[times][share].as_f64().unwrap();
+        assert!(0.0 <= at("p50") && at("p50") <= at("p99"), "{times}: {measurement}");
+        assert!(at("p99") <= at("p999") && at("p999") <= at("max"), "{times}: {measurement}");
+    }
+    assert!(measurement["deadline_ms"].as_f64().unwrap() > 0.0);
+    assert!(measurement["stolen_ms"].is_number(), "{measurement}");
+}
+
+#[test]
+fn a_thousand_frames_with_every_cpu_busy_give_a_whole_report() {
+    let measurements = bench(&[&TRIAL[..], &["--load", "busy-cpus"]].concat());
+    assert_eq!(measurements.len(), 1);
+    assert_eq!(measurements[0]["disturbance"], "busy_cpus");
+    assert_eq!(measurements[0]["real_time"], true);
+    assert_complete(&measurements[0], FRAMES);
+}
+
+#[test]
+fn every_disturbance_is_tried_with_and_without_real_time() {
+    let measurements =
+        bench(&["--fps", "30", "--seconds", "1", "--load", "all", "--realtime", "both"]);
+    assert_eq!(measurements.len(), 10);
+    measurements.iter().for_each(|measurement| assert_complete(measurement, 30));
+}
+
+#[test]
+fn a_trial_without_frames_is_refused() {
+    let rig = Rig::new();
+    let ended = finish(rig.command(&["bench", "latency", "--seconds", "0"]));
+    assert_eq!(ended.status.code(), Some(1));
+    assert!(ended.stderr.contains("allowed are 1 to"), "{}", ended.stderr);
+}
