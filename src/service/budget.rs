@@ -4,9 +4,13 @@ use crate::service::clock::now_nanos;
 
 /// Levels whose cost is kept; deeper pyramids do not exist.
 const MAX_LEVELS: usize = 16;
+/// Most that one measurement counts, in running means.
+const LARGEST_RISE: f64 = 4.0;
+/// Share of all costs that is kept when they forbid an iteration: a wrong one is forgotten within a second.
+const KEPT_AT_REFUSAL: f64 = 0.9;
 /// What the end of a frame that is cut short takes, in iterations of the finest level: it is looked at there
 /// up to three times to choose among what there is, each time compared, and once for its covariance.
-const RESERVED_LOOKS: f64 = 8.0;
+const RESERVED_LOOKS: f64 = 11.0;
 /// Share of a new measurement in the running mean: a few frames follow a change of load.
 const NEW_SHARE: f64 = 0.2;
 
@@ -26,6 +30,9 @@ impl IterationCosts {
                 self.learn(level, now - since);
             }
             let fits = self.fits(level, now, deadline_nanos);
+            if !fits {
+                self.forget();
+            }
             running = fits.then_some((level, now));
             fits
         }
@@ -34,7 +41,14 @@ impl IterationCosts {
     fn learn(&mut self, level: usize, nanos: i64) {
         let Some(cost) = self.nanos.get_mut(level) else { return };
         let share = if *cost == 0.0 { 1.0 } else { NEW_SHARE };
-        *cost += share * (nanos as f64 - *cost);
+        // One iteration during which the CPU was taken away says nothing about the next.
+        let sane = if *cost == 0.0 { f64::INFINITY } else { LARGEST_RISE * *cost };
+        *cost += share * ((nanos as f64).min(sane) - *cost);
+    }
+
+    /// Believes less in costs that forbid an iteration: what is never tried is never measured again.
+    fn forget(&mut self) {
+        self.nanos.iter_mut().for_each(|cost| *cost *= KEPT_AT_REFUSAL);
     }
 
     fn fits(&self, level: usize, now: i64, deadline_nanos: i64) -> bool {
@@ -59,6 +73,19 @@ mod tests {
         assert!(costs.fits(1, 1, 1000 + reserve), "another level has its own cost");
         costs.learn(0, 2000);
         assert_eq!(costs.nanos[0], 1200.0);
+    }
+
+    #[test]
+    fn one_iteration_that_took_long_does_not_forbid_all_that_follow() {
+        let mut costs = IterationCosts::default();
+        costs.learn(1, 50_000_000);
+        let allowed = |costs: &mut IterationCosts| costs.until(now_nanos() + 16_000_000)(1);
+        assert!(!allowed(&mut costs));
+        assert!((0..60).any(|_| allowed(&mut costs)), "two seconds of frames at 30 Hz");
+        let mut costs = IterationCosts::default();
+        costs.learn(1, 150_000);
+        costs.learn(1, 50_000_000);
+        assert!(allowed(&mut costs));
     }
 
     #[test]

@@ -13,12 +13,13 @@ use crossbeam::queue::ArrayQueue;
 use crate::service::map_file::{MapFileError, read_map, write_map};
 use crate::slam::mapper::Map;
 
-/// Writes the newest checkpoint; removes the file when dropped, which a killed process cannot.
+/// Writes the newest checkpoint. The file stays unless the process ends in order.
 #[derive(Debug)]
 pub struct Checkpoint {
     path: PathBuf,
     shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
+    is_over: bool,
 }
 
 #[derive(Debug)]
@@ -36,7 +37,12 @@ impl Checkpoint {
         let thread = std::thread::Builder::new()
             .name("semidense-checkpoint".to_owned())
             .spawn(move || write_until_stopped(&file, &theirs))?;
-        Ok(Self { path: path.to_owned(), shared, thread: Some(thread) })
+        Ok(Self { path: path.to_owned(), shared, thread: Some(thread), is_over: false })
+    }
+
+    /// Nobody needs to go on from here: the file is removed with this.
+    pub fn end_in_order(&mut self) {
+        self.is_over = true;
     }
 
     /// Hands over the newest state; one that was not written yet is older and goes.
@@ -58,8 +64,9 @@ impl Drop for Checkpoint {
             // A panic of the thread has been reported where it happened.
             drop(thread.join());
         }
-        // Who ends in order leaves nothing to go on from.
-        drop(fs::remove_file(&self.path));
+        if self.is_over {
+            drop(fs::remove_file(&self.path));
+        }
     }
 }
 
@@ -120,11 +127,15 @@ mod tests {
         assert!(read_checkpoint(&path).unwrap().is_none());
         let unfinished = folder.path().join(".rig.checkpoint.17.tmp");
         fs::write(&unfinished, "half").unwrap();
-        let kept = Checkpoint::keep(&path).unwrap();
+        let mut kept = Checkpoint::keep(&path).unwrap();
         assert!(!unfinished.exists());
         kept.put(Map::default());
         until(|| path.exists());
         assert_eq!(read_checkpoint(&path).unwrap().unwrap().keyframes.len(), 0);
+        drop(kept);
+        assert!(path.exists(), "a panic or an error is no end in order");
+        kept = Checkpoint::keep(&path).unwrap();
+        kept.end_in_order();
         drop(kept);
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
     }

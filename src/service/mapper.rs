@@ -84,7 +84,10 @@ pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), Mappe
     shell.health.enter(ProcessState::Ready, "");
     let outcome = shell.map_until(shutdown);
     match &outcome {
-        Ok(()) => shell.health.enter(ProcessState::Finished, "stopped"),
+        Ok(()) => {
+            shell.checkpoint.iter_mut().for_each(Checkpoint::end_in_order);
+            shell.health.enter(ProcessState::Finished, "stopped");
+        }
         Err(error) => shell.health.enter(ProcessState::Failed, &error.to_string()),
     }
     outcome

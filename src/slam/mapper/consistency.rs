@@ -91,6 +91,9 @@ impl Consistency {
             let failed_ratio = counts.failed as f64 / counts.attempted as f64;
             let has_failed = failed_ratio > params.max_failed_ratio;
             self.failed_frames = if has_failed { self.failed_frames + 1 } else { 0 };
+        } else {
+            // A frame that says nothing is not one of a row of bad ones.
+            self.failed_frames = self.failed_frames.saturating_sub(1);
         }
         (self.failed_frames >= params.max_failed_frames).then_some(Contradiction::FailedSearches)
     }

@@ -4,6 +4,10 @@ use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::mapper::recovery::restore_points;
 use crate::slam::mapper::{Map, Mapper, StepOutcome};
 
+/// More keyframes than are made between two checkpoints, and more revisions.
+const UNKNOWN_KEYFRAMES: u64 = 1000;
+const UNKNOWN_REVISIONS: u64 = 1_000_000;
+
 impl Mapper {
     /// The keyframe in force with its image and depth, and the poses of the others of its epoch; `None`
     /// where there is no established keyframe to go on from.
@@ -37,13 +41,15 @@ impl Mapper {
                 && !keyframe.points.is_empty()
                 && keyframe.map_state == MapState::Established
         };
+        // What the dead mapper published after its last checkpoint has numbers of its own: they are left out.
+        let newest = |number: fn(&Keyframe) -> u64| map.keyframes.iter().map(number).max();
+        let newest_revision = newest(|keyframe| keyframe.revision).unwrap_or(0);
+        let newest_id = newest(|keyframe| keyframe.keyframe_id).unwrap_or(0);
+        self.revision = newest_revision.saturating_add(UNKNOWN_REVISIONS);
+        self.next_keyframe_id = newest_id.saturating_add(UNKNOWN_KEYFRAMES);
         let Some(index) = map.keyframes.iter().rposition(fits) else {
             return StepOutcome::default();
         };
-        let newest = |number: fn(&Keyframe) -> u64| map.keyframes.iter().map(number).max();
-        self.revision = newest(|keyframe| keyframe.revision).unwrap_or(0).saturating_add(1);
-        self.next_keyframe_id =
-            newest(|keyframe| keyframe.keyframe_id).map_or(0, |id| id.saturating_add(1));
         self.map = map;
         let (min_gradient, max_candidates) = (self.params.min_gradient, self.params.max_candidates);
         let keyframe = &mut self.map.keyframes[index];
