@@ -76,9 +76,10 @@ pub struct Quality {
     pub residual_rmse: f64,
     /// Iterations, all levels.
     pub iterations: u32,
-    /// Finest pyramid level that was solved.
+    /// Finest pyramid level that was solved: a coarser one than usual where the frame was cut short
+    /// by its deadline, the number of all levels where none was.
     pub finest_level: u32,
-    /// Points in view at that level.
+    /// Points in view.
     pub points: u32,
     /// Mean squared optical flow from the keyframe to here, pixels² at level 0.
     pub mean_squared_flow: f64,

@@ -98,9 +98,9 @@ pub struct PoseMessage {
     pub mean_squared_flow: f64,
     /// Iterations, all levels.
     pub iterations: u32,
-    /// Finest level that was solved.
+    /// Finest level that was solved; the number of all levels where none was.
     pub finest_level: u32,
-    /// Points in view at that level.
+    /// Points in view.
     pub points: u32,
     /// Zero.
     pub reserved: u32,

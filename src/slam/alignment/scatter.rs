@@ -112,8 +112,9 @@ impl GradientScatter {
             }
         }
         scatter.outer.fill_lower_triangle_with_upper_triangle();
-        if sums.quadratic > 0.0 {
-            // Two sums of the same weights may differ by rounding.
+        if weights > 0.0 {
+            // None where every residual is an outlier: the energy has no curvature there, and the
+            // covariance no bound. Two sums of the same weights may differ by rounding.
             scatter.curvature_ratio = (f64::from(sums.quadratic) / weights).min(1.0);
         }
         scatter

@@ -396,3 +396,19 @@ fn tiles_hold_the_gradient_and_correlated_residuals_cost_certainty() {
         (std_dev(&pyramid(&clean)), std_dev(&pyramid(&deviating.collect::<Vec<_>>())));
     assert!(deviating > 2.0 * clean, "{deviating} with, {clean} without patches");
 }
+
+#[test]
+fn where_every_residual_is_an_outlier_the_covariance_has_no_bound() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let reference = Reference::prepare(&plane.keyframe(&camera, 1, 0.0));
+    let points = reference.level(LEVEL);
+    let image = pyramid(&plane.render(&camera, &SE3::identity(), 2.0, (1.0, 0.0), 4));
+    // An offset of 200 grey levels is far beyond what noise explains, everywhere.
+    let at = evaluation(&SE3::identity(), Brightness { a: 0.0, b: 200.0 });
+    let sums = accumulate_reference(points, image.level(LEVEL), &at);
+    for kernel in Kernel::available() {
+        let scatter = kernel.scatter(points, image.level(LEVEL), &at);
+        assert!(scatter.tiles > 100);
+        assert!(scatter.covariance(&sums).is_none(), "{kernel:?}");
+    }
+}

@@ -110,13 +110,16 @@ impl VerdictParams {
 pub fn quality_of(alignment: &Alignment) -> Quality {
     let sums = &alignment.state.sums;
     let in_view = f64::from(sums.in_view).max(1.0);
+    // One that was cut short stands on the finest level, but was solved on coarser ones at most.
+    let iterations = &alignment.iterations;
+    let solved = iterations.iter().position(|&taken| taken > 0).unwrap_or(iterations.len());
     Quality {
         in_view_ratio: f64::from(sums.in_view) / alignment.points.max(1) as f64,
         inlier_ratio: f64::from(sums.inliers) / in_view,
         whitened_rmse: (sums.energy / in_view).sqrt(),
         residual_rmse: (sums.squared_residual / in_view).sqrt(),
         iterations: alignment.iterations.iter().sum(),
-        finest_level: alignment.level as u32,
+        finest_level: solved as u32,
         points: sums.in_view,
         mean_squared_flow: alignment.mean_squared_flow,
     }

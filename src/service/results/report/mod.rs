@@ -5,6 +5,7 @@ pub mod budget_charts;
 pub mod chart;
 pub mod charts;
 pub mod evaluation_plot;
+pub mod figures;
 pub mod html;
 pub mod map_picture;
 pub mod views;
@@ -21,6 +22,7 @@ use crate::service::results::report::chart::Chart;
 use crate::service::results::report::charts::{
     error_over_time, scale_over_time, time_charts, trajectory_views,
 };
+use crate::service::results::report::figures::figures;
 use crate::service::results::report::html::{escaped, png_address};
 use crate::service::results::report::map_picture::map_picture;
 use crate::service::results::summary::Summary;
@@ -112,8 +114,8 @@ fn budget(input: &ReportInput<'_>) -> String {
     let mut html = format!(
         "<section><h2>Quality and budget</h2><p>{} frames aligned again and stopped early: how far the \
          keyframe's points then lie, on average over the image, from where the pose without a \
-         deadline puts them. Each curve begins with the prediction alone, which a coarse level may \
-         be less exact than; 0.001 px is no difference.</p>\
+         deadline puts them. Each curve begins with the prediction and one step from it; 0.001 px is \
+         no difference.</p>\
          <div class=\"charts\">",
         samples.len()
     );
@@ -316,48 +318,4 @@ fn picture_figure(html: &mut String, picture: &Picture, keyframe: &Keyframe, not
         keyframe.sequence,
         grouped(keyframe.points.len() as u64)
     );
-}
-
-/// Every figure of the summary as a table.
-fn figures(summary: &Summary) -> String {
-    let mut html = String::from("<section><h2>Figures</h2><dl>");
-    let value = serde_json::to_value(summary).unwrap_or_default();
-    for (key, value) in value.as_object().into_iter().flatten() {
-        let text = match value {
-            serde_json::Value::Null => continue,
-            // A table of its own, and drawn.
-            _ if key == "budget_curve" => continue,
-            serde_json::Value::Object(entries) if entries.values().all(|v| v.is_null()) => continue,
-            other => figure(other),
-        };
-        let _ = write!(html, "<div><dt>{key}</dt><dd>{}</dd></div>", escaped(&text));
-    }
-    html.push_str("</dl></section>");
-    html
-}
-
-/// A number with at most five significant digits after the point; text as it is; several with
-/// their names.
-fn figure(value: &serde_json::Value) -> String {
-    match value {
-        serde_json::Value::String(text) => text.clone(),
-        serde_json::Value::Object(entries) => {
-            let entries = entries.iter().filter(|(_, value)| !value.is_null());
-            let named = entries.map(|(key, value)| format!("{key} {}", figure(value)));
-            named.collect::<Vec<_>>().join(", ")
-        }
-        serde_json::Value::Array(values) => {
-            let separator = if values.iter().any(|value| value.is_object()) { "; " } else { ", " };
-            values.iter().map(figure).collect::<Vec<_>>().join(separator)
-        }
-        serde_json::Value::Number(number) if number.is_f64() => {
-            let number = number.as_f64().unwrap_or(f64::NAN);
-            if number != 0.0 && number.abs() < 1e-3 {
-                format!("{number:.3e}")
-            } else {
-                format!("{number:.4}")
-            }
-        }
-        other => other.to_string(),
-    }
 }
