@@ -189,7 +189,8 @@ impl Config {
         toml::to_string(self).unwrap_or_default()
     }
 
-    fn from_text(text: &str, file: &str) -> Result<Self, ConfigError> {
+    /// Reads the text of a configuration that came from `file`; what it does not name has its default.
+    pub fn from_text(text: &str, file: &str) -> Result<Self, ConfigError> {
         let config: Self = toml::from_str(text).map_err(|error| {
             let before = error.span().and_then(|span| text.get(..span.start));
             let line = before.map_or(1, |before| before.matches('\n').count() + 1);

@@ -100,7 +100,14 @@ fn write_keyframe(file: &mut impl Write, keyframe: &Keyframe) -> io::Result<()> 
 
 /// Reads the map that [`write_map`] wrote.
 pub fn read_map(path: &Path) -> Result<Map, MapFileError> {
-    let mut reader = Reader::open(path)?;
+    let file =
+        File::open(path).map_err(|source| MapFileError::Read { path: path.to_owned(), source })?;
+    parse_map(path, BufReader::new(file))
+}
+
+/// Reads the map from the bytes of a file that came from `path`.
+pub fn parse_map(path: &Path, bytes: impl Read) -> Result<Map, MapFileError> {
+    let mut reader = Reader { file: bytes, path };
     if reader.bytes::<16>()? != MAGIC {
         return Err(MapFileError::Magic(path.to_owned()));
     }
@@ -116,18 +123,12 @@ pub fn read_map(path: &Path) -> Result<Map, MapFileError> {
 }
 
 /// Reads numbers and says where it failed.
-struct Reader<'a> {
-    file: BufReader<File>,
+struct Reader<'a, R> {
+    file: R,
     path: &'a Path,
 }
 
-impl<'a> Reader<'a> {
-    fn open(path: &'a Path) -> Result<Self, MapFileError> {
-        let file = File::open(path)
-            .map_err(|source| MapFileError::Read { path: path.to_owned(), source })?;
-        Ok(Self { file: BufReader::new(file), path })
-    }
-
+impl<R: Read> Reader<'_, R> {
     fn bytes<const N: usize>(&mut self) -> Result<[u8; N], MapFileError> {
         let mut bytes = [0; N];
         self.file

@@ -82,6 +82,7 @@ pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), Mappe
     let mut shell = Shell::prepare(config, mode)?;
     shell.health.tell_scheduling(&in_force(), &refusals);
     shell.health.enter(ProcessState::Ready, "");
+    shell.health.tell_ready();
     let outcome = shell.map_until(shutdown);
     match &outcome {
         Ok(()) => {

@@ -71,6 +71,7 @@ pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), Track
     refusals.iter().for_each(|refusal| tracing::warn!("tracker: {refusal}"));
     shell.health.tell_scheduling(&in_force(), &refusals);
     shell.health.enter(ProcessState::Ready, "");
+    shell.health.tell_ready();
     let outcome = shell.track_until(shutdown);
     match &outcome {
         Ok(()) => shell.health.enter(ProcessState::Finished, "stopped"),
