@@ -7,6 +7,16 @@ use crate::slam::mapper::{Map, Mapper, StepOutcome};
 /// More keyframes than are made between two checkpoints, and more revisions.
 const UNKNOWN_KEYFRAMES: u64 = 1000;
 const UNKNOWN_REVISIONS: u64 = 1_000_000;
+/// More epochs than a mapper begins between two checkpoints: an epoch that is proven has one at once.
+const UNKNOWN_EPOCHS: u32 = 16;
+
+impl Map {
+    /// What a mapper writes before it begins, where a dead one may have left `self`: who comes after it
+    /// gives other numbers to its epochs, even if it dies without another checkpoint.
+    pub fn reserve_epochs(&mut self) {
+        self.free_epoch = self.free_epoch.saturating_add(UNKNOWN_EPOCHS);
+    }
+}
 
 impl Mapper {
     /// The keyframe in force with its image and depth, and the poses of the others of its epoch; `None`
@@ -21,7 +31,8 @@ impl Mapper {
             true => keyframe.clone(),
             false => Keyframe { image: Vec::new(), points: Vec::new(), ..*keyframe },
         });
-        Some(Map { keyframes: keyframes.collect() })
+        let free_epoch = self.next_epoch().saturating_add(UNKNOWN_EPOCHS);
+        Some(Map { keyframes: keyframes.collect(), free_epoch })
     }
 
     /// Takes over from the mapper of another camera: its keyframes stay in the map, and epochs, ids and
@@ -30,6 +41,7 @@ impl Mapper {
         self.map = before.map;
         self.revision = before.revision;
         self.next_keyframe_id = before.next_keyframe_id;
+        self.first_free_epoch = before.first_free_epoch;
     }
 
     /// Goes on from a checkpoint: its keyframe is in force again, the epoch and all ids go on. Does nothing
@@ -47,6 +59,7 @@ impl Mapper {
         let newest_id = newest(|keyframe| keyframe.keyframe_id).unwrap_or(0);
         self.revision = newest_revision.saturating_add(UNKNOWN_REVISIONS);
         self.next_keyframe_id = newest_id.saturating_add(UNKNOWN_KEYFRAMES);
+        self.first_free_epoch = map.free_epoch;
         let Some(index) = map.keyframes.iter().rposition(fits) else {
             return StepOutcome::default();
         };
