@@ -61,7 +61,8 @@ fn what_was_found_stays_mended() {
 
 #[test]
 fn every_target_is_built_and_fed() {
-    let manifest = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz/Cargo.toml")).unwrap();
+    let manifest =
+        fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz/Cargo.toml")).unwrap();
     for (name, _) in TARGETS {
         assert!(manifest.contains(&format!("fuzz_targets/{name}.rs")), "{name}");
     }
