@@ -9,7 +9,7 @@ for process in capture tracker mapper; do
     soon "$process is ready" 60 is_active "$process"
     expect "$process says what it does" "$(property "$process" StatusText)" test -n "$(property "$process" StatusText)"
 done
-soon "poses flow" 90 tracks
+soon "poses flow" 120 tracks
 seen=$(status '[.capture, .tracker, .mapper] | map("\(.frames) frames, \(.rate_hz // 0 | floor)/s, \(.state) (\(.cause))") | join("; ")')
 pass "status" "$seen"
 
