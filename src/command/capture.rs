@@ -5,25 +5,49 @@ use std::process::ExitCode;
 
 use clap::Args;
 
-use crate::capture::source::SourceName;
+use crate::capture::source::{SourceError, SourceName};
 use crate::command::{CommandResult, INTERRUPTED};
 use crate::service::capture::{CaptureError, CaptureOptions, run as run_shell};
-use crate::service::config::Config;
+use crate::service::config::{CaptureConfig, Config};
 use crate::service::mode::Mode;
 use crate::service::shutdown::Shutdown;
 
 /// Send frames from a source into shared memory
 #[derive(Debug, Args)]
 pub struct CaptureArguments {
-    /// Where frames come from: sim, sim:SCENE, tum:DIR, euroc:DIR or images:DIR
-    #[arg(long, value_name = "SOURCE", default_value = "sim")]
-    pub source: String,
-    /// Rig file with the camera's calibration
-    #[arg(long, value_name = "FILE")]
-    pub rig: Option<PathBuf>,
+    /// Where frames come from and how the camera is.
+    #[command(flatten)]
+    pub source: SourceArguments,
     /// Lockstep or live.
     #[command(flatten)]
     pub mode: ModeArguments,
+}
+
+/// Where frames come from.
+#[derive(Debug, Args)]
+pub struct SourceArguments {
+    /// Where frames come from: sim, sim:SCENE, tum:DIR, euroc:DIR, images:DIR or v4l:DEVICE [default: capture.source
+    /// of the configuration]
+    #[arg(long, value_name = "SOURCE")]
+    source: Option<String>,
+    /// Rig file with the camera's calibration [default: capture.rig of the configuration]
+    #[arg(long, value_name = "FILE")]
+    rig: Option<PathBuf>,
+}
+
+impl SourceArguments {
+    /// Source and rig: the command line's word, else the configuration's. A source that the command line names
+    /// does not take the configuration's rig, which is another camera's.
+    pub fn source_and_rig(
+        self,
+        config: &CaptureConfig,
+    ) -> Result<(SourceName, Option<PathBuf>), SourceError> {
+        let configured = (!config.rig.is_empty()).then(|| PathBuf::from(&config.rig));
+        match self.source {
+            Some(source) => Ok((source.parse()?, self.rig)),
+            None => Ok((config.source.parse()?, self.rig.or(configured))),
+        }
+    }
 }
 
 /// How frames are paced.
@@ -55,10 +79,10 @@ pub fn usual_mode(source: &SourceName) -> Mode {
 
 /// Runs it.
 pub fn run(config: &Config, arguments: CaptureArguments) -> CommandResult {
-    let source: SourceName = arguments.source.parse()?;
+    let (source, rig) = arguments.source.source_and_rig(&config.capture)?;
     let mode = arguments.mode.mode(usual_mode(&source));
     let shutdown = Shutdown::install()?;
-    let options = CaptureOptions { source, rig: arguments.rig, mode };
+    let options = CaptureOptions { source, rig, mode };
     match run_shell(config, &options, &shutdown) {
         Ok(()) => Ok(ExitCode::SUCCESS),
         Err(CaptureError::Interrupted) => Ok(ExitCode::from(INTERRUPTED)),

@@ -19,17 +19,17 @@ pub mod tracker;
 
 use std::error::Error;
 use std::io::IsTerminal;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use clap::{Args, Parser, Subcommand, ValueEnum};
+use clap::{Args, CommandFactory, Parser, Subcommand, ValueEnum};
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::fmt::format::FmtSpan;
 use tracing_subscriber::prelude::*;
 
 use crate::command::print::{PrintError, note};
 use crate::service::child::{ERROR_PREFIX, follow_supervisor};
-use crate::service::config::{Config, ConfigError};
+use crate::service::config::{Config, ConfigError, SYSTEM_FOLDER, file_for};
 use crate::wire::place::Place;
 
 /// Exit code of a run that was interrupted: 128 + SIGINT, as shells have it.
@@ -61,7 +61,8 @@ struct CommandLine {
 /// Options that every command has.
 #[derive(Debug, Clone, Args)]
 pub struct CommonArguments {
-    /// Configuration file [default: /etc/semidense/semidense.toml where it exists]
+    /// Configuration file [default: /etc/semidense/NAME.toml of the instance, else
+    /// /etc/semidense/semidense.toml, where they exist]
     #[arg(long, global = true, help_heading = COMMON, value_name = "FILE")]
     pub config: Option<PathBuf>,
     /// Set one key of the configuration, as in mapper.threads=2; may be repeated
@@ -105,7 +106,8 @@ impl CommonArguments {
     fn load(&self) -> Result<Config, ConfigError> {
         let named = self.instance.iter().map(|name| format!("instance={name:?}"));
         let settings: Vec<String> = self.set.iter().cloned().chain(named).collect();
-        Config::load(self.config.as_deref(), &settings)
+        let usual = || file_for(Path::new(SYSTEM_FOLDER), self.instance.as_deref());
+        Config::load(self.config.clone().or_else(usual).as_deref(), &settings)
     }
 
     /// The same options for a child process.
@@ -132,6 +134,11 @@ enum Subcommands {
     Status(status::StatusArguments),
     Bench(bench::BenchArguments),
     Doctor(doctor::DoctorArguments),
+}
+
+/// The command line as `clap` knows it: what man page and shell completions are made of.
+pub fn command_line() -> clap::Command {
+    CommandLine::command()
 }
 
 /// Parses the command line and runs the chosen subcommand.

@@ -5,8 +5,7 @@ use std::process::ExitCode;
 
 use clap::Args;
 
-use crate::capture::source::SourceName;
-use crate::command::capture::{ModeArguments, usual_mode};
+use crate::command::capture::{ModeArguments, SourceArguments, usual_mode};
 use crate::command::print::{note, print};
 use crate::command::run_progress::RunDisplay;
 use crate::command::{CommandResult, CommonArguments, INTERRUPTED};
@@ -19,12 +18,9 @@ use crate::service::supervisor::{Ended, RunOptions, run as supervise};
 /// Start capture, tracker and mapper on a source, watch them, and write the results
 #[derive(Debug, Args)]
 pub struct RunArguments {
-    /// Where frames come from: sim, sim:SCENE, tum:DIR, euroc:DIR or images:DIR
-    #[arg(long, value_name = "SOURCE", default_value = "sim")]
-    source: String,
-    /// Rig file with the camera's calibration
-    #[arg(long, value_name = "FILE")]
-    rig: Option<PathBuf>,
+    /// Where frames come from and how the camera is.
+    #[command(flatten)]
+    source: SourceArguments,
     #[command(flatten)]
     mode: ModeArguments,
     /// Folder for trajectory, keyframes, map, summary and report
@@ -37,13 +33,13 @@ pub struct RunArguments {
 
 /// Runs it.
 pub fn run(config: &Config, common: &CommonArguments, arguments: RunArguments) -> CommandResult {
-    let source: SourceName = arguments.source.parse()?;
+    let (source, rig) = arguments.source.source_and_rig(&config.capture)?;
     let mode = arguments.mode.mode(usual_mode(&source));
     prepare_output(&arguments.output)?;
     let shutdown = Shutdown::install()?;
     let options = RunOptions {
         source,
-        rig: arguments.rig,
+        rig,
         mode,
         output: arguments.output.clone(),
         keeps_map: true,

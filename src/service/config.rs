@@ -15,8 +15,10 @@ use crate::slam::mapper::MapperParams;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::tracker::TrackerParams;
 
-/// Read when it exists and no other file is named.
-pub const SYSTEM_FILE: &str = "/etc/semidense/semidense.toml";
+/// Folder of the files that are read when no other is named: `<instance>.toml`, else `semidense.toml`.
+pub const SYSTEM_FOLDER: &str = "/etc/semidense";
+/// Read for every instance that has no file of its own.
+const COMMON_FILE: &str = "semidense.toml";
 
 /// Everything that can be set.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -25,7 +27,8 @@ pub struct Config {
     /// First part of every topic's name: two instances run side by side.
     pub instance: String,
     /// Folder of sockets and locks; empty for the usual one (`SEMIDENSE_ROOT`, systemd's
-    /// `RUNTIME_DIRECTORY`, `$XDG_RUNTIME_DIR/semidense`, or one in the temporary folder).
+    /// `RUNTIME_DIRECTORY`, `/run/semidense` for the user of the services, `$XDG_RUNTIME_DIR/semidense`, or one
+    /// in the temporary folder).
     pub root: String,
     /// The capture process.
     pub capture: CaptureConfig,
@@ -49,6 +52,11 @@ pub struct Config {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CaptureConfig {
+    /// Where frames come from when `--source` does not say: sim, sim:SCENE, tum:DIR, euroc:DIR, images:DIR or
+    /// v4l:DEVICE.
+    pub source: String,
+    /// The camera's rig file when `--rig` does not say; empty for none.
+    pub rig: String,
     /// Longest wait for tracker and mapper to get ready before a recording starts, seconds.
     pub connect_timeout_s: f64,
     /// Lockstep: longest wait for the map to take in a frame, seconds.
@@ -60,7 +68,14 @@ pub struct CaptureConfig {
 impl Default for CaptureConfig {
     fn default() -> Self {
         let scheduling = SchedulingParams { priority: 80, ..SchedulingParams::default() };
-        Self { connect_timeout_s: 30.0, step_timeout_s: 60.0, scheduling }
+        let source = "sim".to_owned();
+        Self {
+            source,
+            rig: String::new(),
+            connect_timeout_s: 30.0,
+            step_timeout_s: 60.0,
+            scheduling,
+        }
     }
 }
 
@@ -161,11 +176,8 @@ pub enum ConfigError {
 }
 
 impl Config {
-    /// Reads the file (the system's where none is named and it exists) and applies `settings`,
-    /// each `key=value`, in their order.
+    /// Reads the file, where one is named, and applies `settings`, each `key=value`, in their order.
     pub fn load(file: Option<&Path>, settings: &[String]) -> Result<Self, ConfigError> {
-        let system = Path::new(SYSTEM_FILE);
-        let file = file.or_else(|| system.exists().then_some(system));
         let mut table = Table::new();
         if let Some(path) = file {
             let text = std::fs::read_to_string(path)
@@ -241,6 +253,14 @@ impl Config {
         self.results.validate().map_err(|e| e.within("results"))?;
         self.simulator.validate().map_err(|e| e.within("simulator"))
     }
+}
+
+/// The file in `folder` for `instance`: its own, else the one for all; `None` where there is neither.
+pub fn file_for(folder: &Path, instance: Option<&str>) -> Option<PathBuf> {
+    // A name that is none must not lead out of the folder; it is refused later.
+    let instance = instance.filter(|name| !name.contains('/'));
+    let own = instance.map(|name| folder.join(format!("{name}.toml")));
+    own.into_iter().chain([folder.join(COMMON_FILE)]).find(|file| file.exists())
 }
 
 /// The parser's message with the line it points at, on one line.
@@ -345,6 +365,22 @@ mod tests {
         assert_eq!((config.instance.as_str(), config.mapper.threads), ("rig2", 1));
         assert_eq!(set(&["instance=rig3"]).unwrap().instance, "rig3");
         assert_eq!(Config::load(None, &[]).unwrap(), Config::default());
+    }
+
+    #[test]
+    fn an_instance_has_its_own_file_or_the_common_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let found = |instance| {
+            let file = file_for(folder.path(), instance)?;
+            Some(file.file_name()?.to_str()?.to_owned())
+        };
+        assert_eq!(found(Some("front")), None);
+        std::fs::write(folder.path().join("semidense.toml"), "").unwrap();
+        std::fs::write(folder.path().join("front.toml"), "").unwrap();
+        assert_eq!(found(Some("front")).as_deref(), Some("front.toml"));
+        assert_eq!(found(Some("rear")).as_deref(), Some("semidense.toml"));
+        assert_eq!(found(None).as_deref(), Some("semidense.toml"));
+        assert_eq!(found(Some("../front")).as_deref(), Some("semidense.toml"));
     }
 
     #[test]

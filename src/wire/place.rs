@@ -261,8 +261,8 @@ fn is_same_file(file: &File, path: &Path) -> bool {
     }
 }
 
-/// The environment's word, else systemd's runtime folder, else the user's, else one in the
-/// temporary folder.
+/// The environment's word, else systemd's runtime folder, else for the user of the services theirs, else the
+/// user's own, else one in the temporary folder.
 fn usual_root() -> PathBuf {
     let variable = |name: &str| std::env::var_os(name).filter(|value| !value.is_empty());
     if let Some(root) = variable(ROOT_VARIABLE) {
@@ -270,6 +270,10 @@ fn usual_root() -> PathBuf {
     }
     if let Some(folder) = variable("RUNTIME_DIRECTORY") {
         return PathBuf::from(folder);
+    }
+    let is_mine = |found: fs::Metadata| found.uid() == rustix::process::geteuid().as_raw();
+    if fs::metadata(SYSTEM_ROOT).is_ok_and(is_mine) {
+        return PathBuf::from(SYSTEM_ROOT);
     }
     if let Some(folder) = variable("XDG_RUNTIME_DIR") {
         return PathBuf::from(folder).join("semidense");

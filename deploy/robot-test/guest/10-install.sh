@@ -1,0 +1,36 @@
+# The package installs on a plain Debian, with everything that it promises.
+. /host/guest/lib
+rig=robot
+
+cp /host/semidense.deb /tmp/
+apt-get install -y -qq --no-install-recommends /tmp/semidense.deb 2>&1
+expect "apt install" "version $(dpkg-query -W -f '${Version}' semidense)" test "$(dpkg-query -W -f '${Status}' semidense)" = "install ok installed"
+expect "the binary runs" "$(semidense --version)" semidense --version
+expect "user semidense, in group video" "$(id semidense)" sh -c 'id -nG semidense | grep -qw video'
+expect "runtime folder" "$(stat -c '%a %U' /run/semidense)" test "$(stat -c '%a %U' /run/semidense)" = "700 semidense"
+expect "nothing runs before a rig is enabled" "$(systemctl list-units --plain --no-legend 'semidense-*' | wc -l) units" \
+    test -z "$(systemctl list-units --plain --no-legend 'semidense-*')"
+problems=$(systemd-analyze verify --man=no semidense@robot.target semidense-capture@robot.service \
+    semidense-tracker@robot.service semidense-mapper@robot.service 2>&1 | grep semidense)
+expect "units are well formed" "${problems:-no complaint}" test -z "$problems"
+expect "shell completion" "bash" test -s /usr/share/bash-completion/completions/semidense
+
+# The rig of the next checks: a simulated recording, to and fro, at a rate that an emulated CPU keeps up with.
+cp -r /host/sim /var/lib/robot-sim
+chmod -R a+rX /var/lib/robot-sim
+cat > /etc/semidense/robot.toml <<'CONFIG'
+[capture]
+source = "loop:100000:5:tum:/var/lib/robot-sim"
+# Fewer points and frames to choose between than usual: the start is what takes longest on an emulated CPU.
+[mapping.initializer.two_frame]
+max_witnesses = 2
+[mapping.initializer.two_frame.candidates]
+wanted = 400
+CONFIG
+# An emulated CPU on a busy machine may hold a process up for longer than a robot's watchdog allows.
+for process in capture tracker mapper; do
+    mkdir -p "/etc/systemd/system/semidense-$process@.service.d"
+    printf '[Service]\nWatchdogSec=%s\n' "$([ $process = mapper ] && echo 30 || echo 12)" \
+        > "/etc/systemd/system/semidense-$process@.service.d/emulated.conf"
+done
+systemctl daemon-reload

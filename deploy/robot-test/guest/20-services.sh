@@ -1,0 +1,54 @@
+# A rig that is enabled gets ready by itself, under the scheduling that its units declare, and gives poses.
+. /host/guest/lib
+rig=robot
+
+systemctl enable semidense@robot.target 2>&1
+systemctl start semidense@robot.target
+for process in capture tracker mapper; do
+    # Type=notify: active means that the process itself has said so.
+    soon "$process is ready" 60 is_active "$process"
+    expect "$process says what it does" "$(property "$process" StatusText)" test -n "$(property "$process" StatusText)"
+done
+soon "poses flow" 120 tracks
+seen=$(status '[.capture, .tracker, .mapper] | map("\(.frames) frames, \(.rate_hz // 0 | floor)/s, \(.state) (\(.cause))") | join("; ")')
+pass "status" "$seen"
+
+tracker=$(main_pid tracker)
+expect "tracker runs as FIFO" "$(chrt -p "$tracker" | tr '\n' ' ')" sh -c "chrt -p $tracker | grep -q 'priority: 70'"
+others=$(for task in /proc/"$tracker"/task/*; do chrt -p "${task##*/}"; done | grep -c SCHED_FIFO)
+expect "only its frame loop" "$others of its $(ls /proc/"$tracker"/task | wc -l) threads are FIFO" test "$others" = 1
+expect "tracker's memory is locked" "$(grep VmLck /proc/"$tracker"/status | tr -s '\t ' ' ')" \
+    sh -c "grep VmLck /proc/$tracker/status | grep -qv ' 0 kB'"
+seen=$(status '.tracker | "\(.scheduling) \(.priority), memory locked: \(.memory_locked)"')
+expect "tracker says so itself" "$seen" test "$seen" = "fifo 70, memory locked: true"
+seen=$(status '[.capture, .tracker, .mapper] | map(.warning // "") | join("")')
+expect "nothing was refused" "${seen:-no warning}" test -z "$seen"
+
+for process in capture tracker mapper; do
+    exposure=$(systemd-analyze security --no-pager "$(unit "$process")" 2> /dev/null | sed -n 's/.*: \([0-9.]*\) .*/\1/p' | tail -n 1)
+    expect "exposure of $process" "$exposure of 10" awk "BEGIN {exit !($exposure > 0 && $exposure < 2)}"
+done
+
+# The watchdog of the package, before this test made it longer for emulation.
+for process in capture tracker mapper; do
+    file=/usr/lib/systemd/system/semidense-$process@.service
+    expect "watchdog of $process" "$(grep WatchdogSec "$file"), here $(property "$process" WatchdogUSec)" \
+        test "$(property "$process" WatchdogUSec)" != 0
+done
+
+# The example of a CPU for the tracker alone.
+mkdir -p /etc/systemd/system/semidense-tracker@robot.service.d
+cp /usr/share/doc/semidense/examples/cpus.conf /etc/systemd/system/semidense-tracker@robot.service.d/
+systemctl daemon-reload
+systemctl restart "$(unit tracker)"
+expect "CPUAffinity" "$(taskset -cp "$(main_pid tracker)")" sh -c "taskset -cp $(main_pid tracker) | grep -q ': 1$'"
+soon "poses after a restart by hand" 60 tracks
+
+# A second rig beside the first.
+sed 's/:5:/:3:/' /etc/semidense/robot.toml > /etc/semidense/other.toml
+rig=other
+systemctl start semidense@other.target
+soon "a second rig gives poses" 120 tracks
+systemctl stop semidense@other.target
+rig=robot
+soon "the first goes on" 30 tracks

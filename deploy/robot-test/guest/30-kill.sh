@@ -1,0 +1,30 @@
+# kill -9 of each service: it is started again, the others go on, poses resume.
+. /host/guest/lib
+rig=robot
+
+for process in capture tracker mapper; do
+    before=$(property "$process" NRestarts)
+    others=
+    for other in capture tracker mapper; do
+        [ "$other" = "$process" ] || others="$others $(main_pid "$other")"
+    done
+    victim=$(main_pid "$process")
+    kill -9 "$victim"
+    soon "$process is started again" 30 has_restarted "$process" $((before + 1))
+    soon "$process is ready again" 30 is_active "$process"
+    soon "poses after the death of $process" 60 tracks
+    soon "$process works again" 60 frames_flow "$process"
+    # shellcheck disable=SC2086
+    expect "the others have not noticed" "processes$others" kill -0 $others
+done
+
+# Who dies at once, again and again, is started later and later.
+before=$(property mapper NRestarts)
+for _ in 1 2 3 4 5 6; do
+    victim=$(main_pid mapper)
+    [ "$victim" -gt 0 ] && kill -9 "$victim"
+    within 15 is_active mapper
+    begin=$TOOK
+done
+expect "back-off" "the sixth restart in a row took $begin ms" test "$begin" -gt 900
+soon "and then it works" 60 frames_flow mapper

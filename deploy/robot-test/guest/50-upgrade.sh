@@ -1,0 +1,16 @@
+# An upgrade keeps what the user has configured and restarts the rigs that run.
+. /host/guest/lib
+rig=robot
+
+echo '# mine' >> /etc/semidense/webcam.toml
+old=$(main_pid tracker)
+DEBIAN_FRONTEND=noninteractive apt-get install -y -o Dpkg::Options::=--force-confdef -o Dpkg::Options::=--force-confold \
+    /host/semidense-next.deb 2>&1
+expect "upgraded" "version $(dpkg-query -W -f '${Version}' semidense)" \
+    test "$(dpkg-query -W -f '${Version}' semidense)" = "$(dpkg-deb -f /host/semidense-next.deb Version)"
+# Changed by both sides; changed by the package alone.
+expect "the user's configuration stays" "$(tail -n 1 /etc/semidense/webcam.toml)" grep -q '^# mine' /etc/semidense/webcam.toml
+expect "the package's own is renewed" "$(tail -n 1 /etc/semidense/semidense.toml)" grep -q '^# next' /etc/semidense/semidense.toml
+expect "a rig of the user's stays" "robot.toml" test -s /etc/semidense/robot.toml
+expect "the rig was restarted" "tracker was process $old, is $(main_pid tracker)" test "$old" != "$(main_pid tracker)"
+soon "poses after the upgrade" 120 tracks

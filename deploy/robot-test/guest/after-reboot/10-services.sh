@@ -1,0 +1,7 @@
+# The enabled rig has come back by itself.
+. /host/guest/lib
+rig=robot
+
+soon "rig is active after the boot" 60 systemctl is-active --quiet semidense@robot.target
+soon "poses after the boot" 120 tracks
+pass "since the boot" "$(cut -d. -f1 /proc/uptime) s"

@@ -1,0 +1,119 @@
+//! What is installed fits the binary: units call commands that exist, shipped configurations are accepted, the package
+//! has every file, and the pause before a restart grows.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use semidense::capture::rig::Rig;
+use semidense::command::command_line;
+use semidense::service::config::Config;
+
+const PROCESSES: [&str; 3] = ["capture", "tracker", "mapper"];
+
+fn root() -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR"))
+}
+
+fn unit(process: &str) -> String {
+    let path = root().join(format!("deploy/systemd/semidense-{process}@.service"));
+    fs::read_to_string(path).unwrap()
+}
+
+#[test]
+fn units_call_commands_that_exist() {
+    for process in PROCESSES {
+        let text = unit(process).replace("\\\n", " ");
+        let line = text.lines().find_map(|line| line.strip_prefix("ExecStart=/usr/bin/")).unwrap();
+        let line = line.replace("%i", "front").replace("${SEMIDENSE_LOG}", "warn");
+        let words: Vec<&str> = line.split_whitespace().collect();
+        let matches = command_line().try_get_matches_from(&words).unwrap();
+        assert_eq!(matches.subcommand_name(), Some(process));
+        let of_unit = matches.subcommand().unwrap().1;
+        let settings = of_unit.get_many::<String>("set").unwrap_or_default().cloned();
+        Config::load(None, &settings.collect::<Vec<_>>()).unwrap();
+    }
+}
+
+#[test]
+fn units_are_closed_alike() {
+    let closed = |process: &str| -> BTreeSet<String> {
+        let text = unit(process);
+        let (_, section) = text.split_once("# Everything else is closed.").unwrap();
+        let is_setting = |line: &&str| line.contains('=') && !line.starts_with('#');
+        let is_own = |line: &str| line.starts_with("DeviceAllow") || line.starts_with("PrivateDev");
+        let settings = section.lines().filter(is_setting).filter(|line| !is_own(line));
+        settings.map(str::to_owned).collect()
+    };
+    assert!(closed("tracker").len() > 20);
+    for process in PROCESSES {
+        assert_eq!(closed(process), closed("tracker"), "{process}");
+    }
+}
+
+#[test]
+fn the_rig_of_the_package_is_accepted() {
+    let file = root().join("deploy/debian/webcam.toml");
+    let config = Config::load(Some(&file), &[]).unwrap();
+    assert!(config.capture.source.starts_with("v4l:"));
+    let installed = Path::new("/usr/share/semidense/rigs");
+    let name = Path::new(&config.capture.rig).strip_prefix(installed).unwrap();
+    Rig::read(&root().join("config/rigs").join(name)).unwrap();
+}
+
+#[test]
+fn the_package_has_every_file() {
+    let text = fs::read_to_string(root().join("Cargo.toml")).unwrap();
+    let manifest: toml::Table = text.parse().unwrap();
+    let deb = &manifest["package"]["metadata"]["deb"];
+    let assets: Vec<(String, String)> = deb["assets"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|asset| {
+            let word = |index: usize| asset[index].as_str().unwrap().to_owned();
+            (word(0), word(1))
+        })
+        .collect();
+    for (source, _) in assets.iter().filter(|(source, _)| !source.starts_with("target/")) {
+        let folder = root().join(Path::new(source).parent().unwrap());
+        let is_there =
+            if source.contains('*') { folder.is_dir() } else { root().join(source).is_file() };
+        assert!(is_there, "{source} is not there");
+    }
+    let rigs: Vec<_> =
+        assets.iter().filter(|(_, place)| place == "usr/share/semidense/rigs/").collect();
+    assert_eq!(rigs.len(), 1, "the folder that webcam.toml names");
+    for file in deb["conf-files"].as_array().unwrap() {
+        let (folder, name) = file.as_str().unwrap()[1..].rsplit_once('/').unwrap();
+        let is_installed = |(source, place): &(String, String)| {
+            place.trim_end_matches('/') == folder && source.ends_with(&format!("/{name}"))
+        };
+        assert!(assets.iter().any(is_installed), "{file} is not installed");
+    }
+}
+
+#[test]
+fn the_pause_before_a_restart_grows_and_is_forgotten() {
+    let folder = tempfile::tempdir().unwrap();
+    let after = |result: &str| {
+        let status = Command::new("sh")
+            .arg(root().join("deploy/systemd/back-off"))
+            .arg("unit")
+            .env("RUNTIME_DIRECTORY", folder.path())
+            .env("SERVICE_RESULT", result)
+            .status();
+        assert!(status.unwrap().success());
+        fs::read_to_string(folder.path().join(".back-off.unit")).ok().map(|t| t.trim().to_owned())
+    };
+    // Tenths of a second: the first death waits for nothing.
+    let pauses: Vec<_> = (0..4).map(|_| after("signal").unwrap()).collect();
+    assert_eq!(pauses, ["0", "2", "4", "8"]);
+    assert_eq!(after("success"), None);
+    assert_eq!(after("watchdog").as_deref(), Some("0"));
+    // A life that was long enough.
+    let file = fs::File::options().write(true).open(folder.path().join(".back-off.unit")).unwrap();
+    file.set_modified(std::time::UNIX_EPOCH).unwrap();
+    assert_eq!(after("signal").as_deref(), Some("0"));
+}
