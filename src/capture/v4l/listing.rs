@@ -116,11 +116,11 @@ pub fn cameras(dev: &Path) -> Vec<CameraReport> {
     nodes(dev).iter().filter_map(|path| report(dev, path)).collect()
 }
 
-/// Whether a camera can be used, and the kernel's word where not; `None` for what is no camera.
-pub fn access(path: &Path) -> Option<(Access, Option<Errno>)> {
+/// Whether a node can be used; `None` for what is no camera.
+pub fn access(path: &Path) -> Option<Access> {
     match KernelDevice::open(path) {
-        Ok(mut device) => is_camera(&device).then(|| device_access(&mut device)),
-        Err(error) => Some((refused_access(error), Some(error))),
+        Ok(mut device) => is_camera(&device).then(|| device_access(&mut device).0),
+        Err(error) => Some(refused_access(error)),
     }
 }
 
