@@ -1,8 +1,8 @@
 //! Ground truth for a camera that is fed a recording: vivid's output, looped to its capture node.
 //!
 //! ```sh
-//! camera_loop feed tum:DIR HZ /dev/video1    # GREY pictures of 640x480 to the output node, to and fro, without end
-//! camera_loop watch tum:DIR TRUTH            # while `semidense run --source v4l:…` reads the capture node
+//! camera_loop feed tum:DIR HZ | v4l2-ctl -d /dev/video1 --stream-out-mmap --stream-from=-    # GREY, 640x480
+//! camera_loop watch tum:DIR TRUTH       # while `semidense run --source v4l:…` reads the capture node
 //! ```
 //!
 //! The recording has a quarter of the size; vivid's scaler copies pairs of pixels, so each is repeated
@@ -11,7 +11,6 @@
 
 use std::collections::HashMap;
 use std::error::Error;
-use std::fs::OpenOptions;
 use std::io::Write;
 use std::path::Path;
 use std::process::ExitCode;
@@ -35,9 +34,9 @@ fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let words: Vec<&str> = arguments.iter().map(String::as_str).collect();
     let outcome = match words.as_slice() {
-        ["feed", source, rate, device] => feed(source, rate, device),
+        ["feed", source, rate] => feed(source, rate),
         ["watch", source, truth] => watch(source, truth),
-        _ => Err("usage: camera_loop feed SOURCE HZ DEVICE | watch SOURCE TRUTH".into()),
+        _ => Err("usage: camera_loop feed SOURCE HZ | watch SOURCE TRUTH".into()),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
@@ -69,18 +68,18 @@ fn enlarged(pixels: &[u8], width: usize) -> Vec<u8> {
     large
 }
 
-fn feed(source: &str, rate_hz: &str, device: &str) -> Result<(), Box<dyn Error>> {
+/// To and fro, without end: the camera never jumps.
+fn feed(source: &str, rate_hz: &str) -> Result<(), Box<dyn Error>> {
     let mut source = open(&source.parse()?, None, &SourceParams::default())?;
     let width = source.intrinsics().width;
     let period = Duration::from_secs_f64(1.0 / rate_hz.parse::<f64>()?);
     let pictures = pictures(source.as_mut())?;
-    let mut device = OpenOptions::new().write(true).open(device)?;
+    let mut output = std::io::stdout().lock();
     let back = (1..pictures.len().saturating_sub(1)).rev();
     let order: Vec<usize> = (0..pictures.len()).chain(back).collect();
     loop {
         for &index in &order {
-            // One picture a write, as the driver wants it.
-            device.write_all(&enlarged(&pictures[index].1, width))?;
+            output.write_all(&enlarged(&pictures[index].1, width))?;
             std::thread::sleep(period);
         }
     }

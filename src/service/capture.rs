@@ -149,6 +149,10 @@ impl<'a> Shell<'a> {
         options: &CaptureOptions,
         shutdown: &'a Shutdown,
     ) -> Result<Self, CaptureError> {
+        if let (SourceName::Camera(name), Mode::Lockstep) = (&options.source, options.mode) {
+            let reason = "a camera does not wait for the map; leave out --lockstep".to_owned();
+            return Err(SourceError::Camera { name: name.clone(), reason }.into());
+        }
         let rig = options.rig.as_deref();
         let source = open(&options.source, rig, &config.source_params())?;
         if let Some(conflict) = rig_conflict(&options.source, rig) {

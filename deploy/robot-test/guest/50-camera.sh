@@ -149,8 +149,10 @@ finish
 
 echo "-- trajectory"
 prepare_loop
-/host/camera_loop feed tum:/host/sim 4 "$out" &
+/host/camera_loop feed tum:/host/sim 4 2> /dev/null | v4l2-ctl -d "$out" --stream-out-mmap --stream-from=- > /dev/null 2>&1 &
 feeder=$!
+# One frame of five: emulation does not keep up with sixty a second.
+control percentage_of_dropped_buffers=80
 sleep 1
 $user semidense --instance "$rig" run --source "v4l:platform-vivid.0" --rig "$work/rig.toml" --output "$work/run" --json \
     --set tracker.deadline_ms=2000 > "$work/summary.json" 2> "$work/log" &
@@ -158,8 +160,8 @@ job=$!
 soon "run: frames flow" 60 flows
 SEMIDENSE_INSTANCE="$rig" $user /host/camera_loop watch tum:/host/sim "$work/truth.txt" > "$work/watch.json" 2>&1 &
 watcher=$!
-soon "run: it tracks" 120 tracks
-sleep 90
+soon "run: it tracks" 240 tracks
+sleep 60
 kill -INT "$watcher"
 wait "$watcher"
 finish
