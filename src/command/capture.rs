@@ -15,10 +15,10 @@ use crate::service::shutdown::Shutdown;
 /// Send frames from a source into shared memory
 #[derive(Debug, Args)]
 pub struct CaptureArguments {
-    /// Where frames come from: sim, sim:SCENE, tum:DIR, euroc:DIR, images:DIR or v4l:DEVICE
+    /// Where frames come from: sim, sim:SCENE, tum:DIR, euroc:DIR or images:DIR
     #[arg(long, value_name = "SOURCE", default_value = "sim")]
     pub source: String,
-    /// Rig file with the camera's calibration; a camera (v4l) needs one
+    /// Rig file with the camera's calibration
     #[arg(long, value_name = "FILE")]
     pub rig: Option<PathBuf>,
     /// Lockstep or live.

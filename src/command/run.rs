@@ -19,10 +19,10 @@ use crate::service::supervisor::{Ended, RunOptions, run as supervise};
 /// Start capture, tracker and mapper on a source, watch them, and write the results
 #[derive(Debug, Args)]
 pub struct RunArguments {
-    /// Where frames come from: sim, sim:SCENE, tum:DIR, euroc:DIR, images:DIR or v4l:DEVICE
+    /// Where frames come from: sim, sim:SCENE, tum:DIR, euroc:DIR or images:DIR
     #[arg(long, value_name = "SOURCE", default_value = "sim")]
     source: String,
-    /// Rig file with the camera's calibration; a camera (v4l) needs one
+    /// Rig file with the camera's calibration
     #[arg(long, value_name = "FILE")]
     rig: Option<PathBuf>,
     #[command(flatten)]
