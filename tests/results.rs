@@ -5,7 +5,7 @@ use std::path::Path;
 use semidense::capture::source::{FrameSource, FrameStamp, SourceError};
 use semidense::service::alignment_stamps::{AlignmentTrace, LevelTrace};
 use semidense::service::results::{
-    RecordedPose, ResultsParams, RunMode, RunRecord, prepare_output, write_results,
+    RecordedPose, Rejection, ResultsParams, RunMode, RunRecord, prepare_output, write_results,
 };
 use semidense::service::trajectory_file::read_trajectory;
 use semidense::slam::evaluation::depth_error::DepthScale;
@@ -15,6 +15,7 @@ use semidense::slam::geometry::sim3::Sim3;
 use semidense::slam::image::buffer::Image;
 use semidense::slam::keyframe::{DepthPoint, Keyframe, MapState};
 use semidense::slam::mapper::Map;
+use semidense::slam::mapper::consistency::Contradiction;
 use semidense::slam::pose::{
     Brightness, DegradedReason, LostReason, PoseEstimate, Quality, TrackingState,
 };
@@ -145,6 +146,7 @@ fn record(poses: Vec<RecordedPose>, keyframes: Vec<Keyframe>, with_truth: bool) 
         page_faults: None,
         map_nanos: vec![2_000_000; frames],
         keyframe_nanos: vec![5_000_000; 3],
+        rejections: None,
         budget_samples: Vec::new(),
         recorded_nanos: 2_000_000_000,
         wall_nanos: 1_000_000_000,
@@ -174,7 +176,10 @@ fn figures_and_files_of_a_run_with_truth_and_a_loss() {
         _ => TrackingState::Tracking,
     };
     let poses = (0..60).map(|i| pose(i, state(i), u64::from(i >= 40))).collect();
+    let contradiction = Contradiction::ScaleJump;
+    let rejections = Some(vec![Rejection { sequence: 20, contradiction }]);
     let record = record(poses, vec![keyframe(0), keyframe(1)], true);
+    let record = RunRecord { rejections, ..record };
     let folder = tempfile::tempdir().unwrap();
     let dir = folder.path().join("deep/output");
     let (summary, report) = written(&dir, &record);
@@ -194,6 +199,8 @@ fn figures_and_files_of_a_run_with_truth_and_a_loss() {
         assert_eq!(summary[key].as_f64(), Some(value), "{key}");
     }
     assert!((summary["initialization_secs"].as_f64().unwrap() - 0.1).abs() < 1e-6);
+    let rejected = serde_json::json!([{ "sequence": 20, "reason": contradiction.to_string() }]);
+    assert_eq!(summary["map_rejections"], rejected);
     assert_eq!(summary["track_ms"]["max"], 7.0);
     assert_eq!(summary["pyramid_ms"]["p50"], 0.05);
     let levels = serde_json::json!([{ "level": 1, "frames": 57, "points": 1000.0,

@@ -148,6 +148,7 @@ impl Recorder {
             page_faults: Some(counters.page_faults),
             map_nanos: self.map_nanos,
             keyframe_nanos: self.keyframe_nanos,
+            rejections: None,
             budget_samples: Vec::new(),
             recorded_nanos,
             wall_nanos: positive(wall_nanos),

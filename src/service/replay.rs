@@ -10,11 +10,12 @@ use crate::capture::source::{FrameSource, FrameStamp, SourceError};
 use crate::service::alignment_stamps::AlignmentStamps;
 use crate::service::given_pose::{given_pose, truth_in_first_camera};
 use crate::service::rehearsal::Rehearsal;
-use crate::service::results::{RecordedPose, RunMode, RunRecord};
+use crate::service::results::{RecordedPose, Rejection, RunMode, RunRecord};
 use crate::service::schedule::peak_rss_bytes;
 use crate::slam::alignment::reference::Reference;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::frame::FrameView;
+use crate::slam::mapper::situation::Situation;
 use crate::slam::mapper::{Mapper, MapperParams, StepOutcome};
 use crate::slam::parameter::ParameterError;
 use crate::slam::pose::{PoseEstimate, TrackingState};
@@ -198,9 +199,16 @@ impl<'a> Replay<'a> {
         if sensor_expected && sensor_depth.is_none() && self.record.frames_in == 1 {
             return Err(ReplayError::NoSensorDepth(self.record.source.clone()));
         }
+        let was_rejected = matches!(self.mapper.situation(), Situation::Rejected(_));
         let begin = Instant::now();
         let outcome = self.mapper.step(&frame, &pose, sensor_depth.as_ref());
         let step_nanos = elapsed_nanos(begin);
+        if let Situation::Rejected(contradiction) = self.mapper.situation()
+            && !was_rejected
+        {
+            let rejection = Rejection { sequence: frame.sequence, contradiction };
+            self.record.rejections.get_or_insert_default().push(rejection);
+        }
         self.record.map_nanos.push(step_nanos);
         if outcome.keyframe_created {
             self.record.keyframe_nanos.push(step_nanos);
@@ -302,6 +310,7 @@ fn empty_record(source_name: &str, ground_truth: Vec<StampedPose>, poses_given: 
         page_faults: None,
         map_nanos: Vec::new(),
         keyframe_nanos: Vec::new(),
+        rejections: Some(Vec::new()),
         budget_samples: Vec::new(),
         recorded_nanos: 0,
         wall_nanos: 0,

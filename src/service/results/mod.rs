@@ -35,6 +35,7 @@ use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::evaluation::umeyama::Alignment;
 use crate::slam::evaluation::{MAX_DIFFERENCE_NANOS, evaluate_trajectory};
 use crate::slam::mapper::Map;
+use crate::slam::mapper::consistency::Contradiction;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::PoseEstimate;
 use crate::slam::trajectory::StampedPose;
@@ -64,6 +65,15 @@ pub struct RecordedPose {
     pub trace: Option<AlignmentTrace>,
     /// From the frame's sending to the tracker's look at it; `None` in one process.
     pub wake_nanos: Option<u64>,
+}
+
+/// The map was found to contradict itself.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Rejection {
+    /// Sequence of the frame that showed it.
+    pub sequence: u64,
+    /// How.
+    pub contradiction: Contradiction,
 }
 
 /// Everything that is known of a run when it ends.
@@ -99,6 +109,8 @@ pub struct RunRecord {
     pub map_nanos: Vec<u64>,
     /// Of them, those of the steps that made a keyframe, the one of the start too.
     pub keyframe_nanos: Vec<u64>,
+    /// Frames at which the map was found to contradict itself, and how; known in a replay.
+    pub rejections: Option<Vec<Rejection>>,
     /// Frames that were aligned again with fewer iterations; empty where none were.
     pub budget_samples: Vec<BudgetSample>,
     /// First to last stamp.

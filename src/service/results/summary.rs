@@ -8,7 +8,7 @@ use crate::service::health::{bucket, bucket_end_ms};
 use crate::service::results::alignment_levels::{LevelSummary, alignment_levels};
 use crate::service::results::budget_curve::BudgetCurve;
 use crate::service::results::poses::longest_epoch;
-use crate::service::results::{RecordedPose, RunMode, RunRecord};
+use crate::service::results::{RecordedPose, Rejection, RunMode, RunRecord};
 use crate::slam::evaluation::TrajectoryEvaluation;
 use crate::slam::evaluation::depth_error::DepthStatistics;
 use crate::slam::evaluation::normalized_error::NormalizedErrors;
@@ -169,6 +169,8 @@ pub struct Summary {
     pub gaps: u64,
     /// How often tracking was lost.
     pub lost_count: u64,
+    /// Each time the map was found to contradict itself: the frame, and why. Known in a replay.
+    pub map_rejections: Option<Vec<RejectionSummary>>,
     /// From the first frame to the first whose pose is claimed; null where none is.
     pub initialization_secs: Option<f64>,
     /// Keyframes of the final map.
@@ -241,6 +243,21 @@ pub struct Summary {
     pub depth_density: Option<f64>,
 }
 
+/// One time that the map was found to contradict itself.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RejectionSummary {
+    /// Sequence of the frame that showed it.
+    pub sequence: u64,
+    /// How, in words.
+    pub reason: String,
+}
+
+impl From<&Rejection> for RejectionSummary {
+    fn from(rejection: &Rejection) -> Self {
+        Self { sequence: rejection.sequence, reason: rejection.contradiction.to_string() }
+    }
+}
+
 impl Summary {
     /// The figures of `record`, with `points` in the cloud and what the evaluations gave.
     pub fn new(
@@ -267,6 +284,10 @@ impl Summary {
             frames_dropped: record.frames_dropped,
             gaps: record.gaps,
             lost_count: count_losses(&record.poses),
+            map_rejections: record
+                .rejections
+                .as_ref()
+                .map(|all| all.iter().map(RejectionSummary::from).collect()),
             initialization_secs: initialization_secs(&record.poses),
             keyframes: record.map.keyframes.len() as u64,
             points: points as u64,

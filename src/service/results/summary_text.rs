@@ -19,6 +19,9 @@ pub fn summary_text(summary: &Summary) -> String {
             summary.keyframes, summary.points, summary.epoch
         ),
     );
+    for rejection in summary.map_rejections.iter().flatten() {
+        line("rejected", format!("map at frame {}: {}", rejection.sequence, rejection.reason));
+    }
     if let Some(epoch) = summary.evaluated_epoch.filter(|_| summary.epochs > 1) {
         let figures = format!("of epoch {epoch}, the longest of {}", summary.epochs);
         line("errors", figures);
