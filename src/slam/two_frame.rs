@@ -4,9 +4,11 @@
 //!
 //! A camera that stands or only turns never gets there, however noisy its images: see [`evidence`].
 
+pub mod elimination;
 pub mod evidence;
 pub mod fit;
 pub mod hypothesis;
+pub mod lanes;
 pub mod points;
 pub mod spread;
 pub mod system;
@@ -20,6 +22,7 @@ use crate::slam::depth::candidate::CandidateParams;
 use crate::slam::depth::map::{DepthMap, GradientImage};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
+use crate::slam::image::buffer::Image;
 use crate::slam::image::pyramid::Pyramid;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::Brightness;
@@ -144,7 +147,7 @@ pub struct TwoFrameInitializer {
     params: TwoFrameParams,
     intrinsics: Vec<Intrinsics>,
     pyramid: Pyramid,
-    images: Vec<GradientImage>,
+    gradients: GradientImage,
     first_pixels: Vec<u8>,
     points: Points,
     joint: Hypotheses,
@@ -174,7 +177,6 @@ impl TwoFrameInitializer {
         check_range("image height", intrinsics.height, 32..=8192)?;
         let num_levels = num_levels(&intrinsics);
         let intrinsics: Vec<_> = (0..num_levels).map(|l| intrinsics.at_level(l)).collect();
-        let images = intrinsics.iter().map(|k| GradientImage::with_size(k.width, k.height));
         let state = State {
             current_from_first: SE3::identity(),
             brightness: Brightness::default(),
@@ -182,7 +184,7 @@ impl TwoFrameInitializer {
         };
         Ok(Self {
             pyramid: Pyramid::with_size(intrinsics[0].width, intrinsics[0].height, num_levels),
-            images: images.collect(),
+            gradients: GradientImage::with_size(intrinsics[0].width, intrinsics[0].height),
             params,
             intrinsics,
             first_pixels: Vec::new(),
@@ -210,8 +212,9 @@ impl TwoFrameInitializer {
         if pixels.len() != self.intrinsics[0].width * self.intrinsics[0].height {
             return false;
         }
-        self.load(pixels);
-        let found = self.points.choose(&self.images[0], &self.pyramid, &self.params.candidates);
+        self.pyramid.fill(pixels);
+        self.gradients.fill_from(self.pyramid.level(0));
+        let found = self.points.choose(&self.gradients, &self.pyramid, &self.params.candidates);
         if found < self.params.min_points {
             return false;
         }
@@ -240,12 +243,12 @@ impl TwoFrameInitializer {
             let missing = if self.begin(pixels) { Waiting::Translation } else { Waiting::Texture };
             return self.outcome(InitState::Waiting(missing), Evidence::default());
         }
-        self.load(pixels);
+        self.pyramid.fill(pixels);
         self.frames += 1;
         self.fit_rotation();
         self.fit_jointly();
         let evidence = self.judge();
-        self.witnesses.push(&self.images, &self.rotation, self.params.max_witnesses);
+        self.witnesses.push(self.pyramid.levels(), &self.rotation, self.params.max_witnesses);
         let missing = evidence.missing(&self.params.evidence);
         self.count_confirmation(missing.is_none());
         self.mismatches = if missing == Some(Waiting::Match) { self.mismatches + 1 } else { 0 };
@@ -290,17 +293,10 @@ impl TwoFrameInitializer {
         spread(&depths, map);
     }
 
-    fn load(&mut self, pixels: &[u8]) {
-        self.pyramid.fill(pixels);
-        for (level, image) in self.images.iter_mut().enumerate() {
-            image.fill_from(self.pyramid.level(level));
-        }
-    }
-
     /// Rotation and brightness alone, coarse to fine, from the frame before.
     fn fit_rotation(&mut self) {
-        let input = input(&self.images, &self.intrinsics, &self.points);
-        for level in (0..self.images.len()).rev() {
+        let input = input(self.pyramid.levels(), &self.intrinsics, &self.points);
+        for level in (0..self.pyramid.num_levels()).rev() {
             let (state, scratch) = (&mut self.rotation, &mut self.rotation_scratch);
             fit_level(&input, level, Freedom::Rotation, state, scratch, &self.params.fit);
         }
@@ -310,7 +306,7 @@ impl TwoFrameInitializer {
     fn fit_jointly(&mut self) {
         /// Significance of the frame before from which on parallax may show.
         const PARALLAX_SIGNIFICANCE: f64 = 3.0;
-        let input = input(&self.images, &self.intrinsics, &self.points);
+        let input = input(self.pyramid.levels(), &self.intrinsics, &self.points);
         let with_directions = self.significance > PARALLAX_SIGNIFICANCE;
         self.joint.fit(&input, &self.rotation, with_directions, &self.witnesses, &self.params.fit);
     }
@@ -326,7 +322,7 @@ impl TwoFrameInitializer {
         depth_variances(state, joint, noise, match_variance, &mut self.variances);
         let evidence = judge(state, joint, &self.variances, rotation, &mut self.sorted);
         let evidence = Evidence { rival, witnesses: self.witnesses.len(), ..evidence };
-        let visible = joint.points.iter().zip(&state.inverse_depths).filter(|(p, _)| p.visible);
+        let visible = joint.points().zip(&state.inverse_depths).filter(|(p, _)| p.visible);
         let mean =
             visible.map(|(_, d)| f64::from(*d)).sum::<f64>() / joint.num_visible.max(1) as f64;
         /// A mean below this is not a scale but a failed fit.
@@ -371,7 +367,7 @@ impl TwoFrameInitializer {
 
 /// The whole of a frame.
 fn input<'a>(
-    images: &'a [GradientImage],
+    images: &'a [Image<f32>],
     intrinsics: &'a [Intrinsics],
     points: &'a Points,
 ) -> FitInput<'a> {

@@ -36,6 +36,11 @@ impl Pyramid {
         &self.levels[level]
     }
 
+    /// All levels, finest first.
+    pub fn levels(&self) -> &[Image<f32>] {
+        &self.levels
+    }
+
     /// Number of levels.
     pub fn num_levels(&self) -> usize {
         self.levels.len()

@@ -152,7 +152,7 @@ pub fn residual_variance(system: &System, sorted: &mut Vec<f32>) -> f32 {
     const FREEDOM_RATIO: f32 = (PATTERN.len() as f32 - 1.0) / PATTERN.len() as f32;
     sorted.clear();
     sorted.extend(
-        system.points.iter().filter(|p| p.visible).map(|p| p.energy / (p.weight * FREEDOM_RATIO)),
+        system.points().filter(|p| p.visible).map(|p| p.energy / (p.weight * FREEDOM_RATIO)),
     );
     median(sorted).unwrap_or(f32::INFINITY)
 }
@@ -170,7 +170,7 @@ pub fn judge(
     const PLACED_STD_DEV: f32 = 0.3;
     let (mut explained, mut remaining, mut both, mut depths) = (0.0f64, 0.0f64, 0usize, 0.0f64);
     let (mut placed, mut negative) = (0usize, 0usize);
-    for (i, (point, alone)) in joint.points.iter().zip(&rotation.points).enumerate() {
+    for (i, (point, alone)) in joint.points().zip(rotation.points()).enumerate() {
         if !point.visible {
             continue;
         }
@@ -202,7 +202,7 @@ pub fn judge(
             1.0
         },
         median_std_dev_ratio: f64::from(median(sorted).unwrap_or(f32::INFINITY)),
-        visible_ratio: joint.num_visible as f64 / joint.points.len().max(1) as f64,
+        visible_ratio: joint.num_visible as f64 / joint.num_points.max(1) as f64,
         median_residual,
         rival: None,
         witnesses: 0,

@@ -1,25 +1,17 @@
 //! Levenberg–Marquardt on pose, brightness and inverse depths together, coarse to fine; and on rotation
 //! and brightness alone.
-//!
-//! Each depth meets only the pose, so it is eliminated (Schur complement): with D_i the damped
-//! information of depth i and m_i its row of mixed terms,
-//!
-//! ```text
-//! (H − Σ m_i m_iᵀ/D_i) δ = −(g − Σ m_i g_i/D_i)        δd_i = −(g_i + m_iᵀδ)/D_i
-//! ```
-//!
-//! Two priors make D_i positive without parallax: a depth lies near the median of its neighbours and,
-//! loosely, near 1; the second also holds the scale, which the images leave free.
 
 use nalgebra::{SMatrix, SVector, Vector6};
 use serde::{Deserialize, Serialize};
 
-use crate::slam::depth::map::GradientImage;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
+use crate::slam::image::buffer::Image;
 use crate::slam::parameter::{ParameterError, check_range};
-use crate::slam::two_frame::points::{NUM_NEIGHBOURS, Points};
+use crate::slam::two_frame::elimination::{Elimination, PriorWeights, prior_energy};
+use crate::slam::two_frame::points::Points;
 use crate::slam::two_frame::system::{LevelView, NUM_UNKNOWNS, State, System};
+use crate::slam::two_frame::system_kernel::system_kernels;
 
 /// Tuning of the fit.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -59,23 +51,21 @@ impl FitParams {
         check_range("min_energy_drop", self.min_energy_drop, 0.0..=0.5)
     }
 
-    /// Weights of the two priors, in the squared grey levels of the energy.
-    fn prior_weights(&self) -> (f32, f32) {
+    fn prior_weights(&self) -> PriorWeights {
         // A residual is the difference of two noisy values.
         let noise = 2.0 * self.image_noise * self.image_noise;
-        (noise / self.neighbour_std_dev.powi(2), noise / self.depth_std_dev.powi(2))
+        PriorWeights {
+            neighbour: noise / self.neighbour_std_dev.powi(2),
+            depth: noise / self.depth_std_dev.powi(2),
+        }
     }
 }
-
-/// Smallest and largest inverse depth, the mean being 1. Negative ones have no meaning; that a point
-/// reaches them tells a wrong minimum.
-const INVERSE_DEPTHS: std::ops::RangeInclusive<f32> = -2.0..=10.0;
 
 /// The current frame at all levels, with the points of the first.
 #[derive(Debug, Clone, Copy)]
 pub struct FitInput<'a> {
     /// The frame, finest level first.
-    pub images: &'a [GradientImage],
+    pub images: &'a [Image<f32>],
     /// Level of the first of the images.
     pub finest: usize,
     /// Intrinsics of all levels.
@@ -112,6 +102,7 @@ pub struct FitScratch {
     /// Normal equations at the best state so far; after a fit, at its result on the last level.
     pub system: System,
     trial: System,
+    elimination: Elimination,
     medians: Vec<f32>,
     trial_depths: Vec<f32>,
 }
@@ -132,17 +123,18 @@ pub fn fit_level(
     /// So many failures in a row make a step of nothing.
     const MAX_FAILURES: u32 = 5;
     let view = input.level(level);
+    let find_medians = system_kernels().medians;
     let weights = params.prior_weights();
     scratch.system.evaluate(&view, state);
-    neighbour_medians(input.points, &state.inverse_depths, &mut scratch.medians);
+    find_medians(&input.points.neighbours, &state.inverse_depths, &mut scratch.medians);
     let (mut damping, mut failures) = (FIRST_DAMPING, 0);
     for _ in 0..params.max_iterations {
         let step = match freedom {
             Freedom::Rotation => rotation_step(&scratch.system, damping),
             Freedom::Pose => pose_step(&scratch.system, damping),
             Freedom::Everything => {
-                let trial = &mut scratch.trial_depths;
-                joint_step(&scratch.system, state, &scratch.medians, weights, damping, trial)
+                scratch.elimination.weights = weights;
+                joint_step(scratch, state, damping)
             }
         };
         let Some(step) = step else { break };
@@ -155,12 +147,13 @@ pub fn fit_level(
         }
         scratch.trial.evaluate(&view, &next);
         let before =
-            scratch.system.energy + prior(&state.inverse_depths, &scratch.medians, weights);
-        let after = scratch.trial.energy + prior(&next.inverse_depths, &scratch.medians, weights);
+            scratch.system.energy + prior_energy(&state.inverse_depths, &scratch.medians, weights);
+        let after =
+            scratch.trial.energy + prior_energy(&next.inverse_depths, &scratch.medians, weights);
         if after < before {
             std::mem::swap(state, &mut next);
             std::mem::swap(&mut scratch.system, &mut scratch.trial);
-            neighbour_medians(input.points, &state.inverse_depths, &mut scratch.medians);
+            find_medians(&input.points.neighbours, &state.inverse_depths, &mut scratch.medians);
             damping = (damping * SUCCESS_FACTOR).max(LEAST_DAMPING);
             failures = 0;
         } else {
@@ -173,7 +166,7 @@ pub fn fit_level(
             break;
         }
     }
-    scratch.system.energy + prior(&state.inverse_depths, &scratch.medians, weights)
+    scratch.system.energy + prior_energy(&state.inverse_depths, &scratch.medians, weights)
 }
 
 /// The state after a step of pose and brightness, without depths.
@@ -212,49 +205,30 @@ fn pose_step(system: &System, damping: f64) -> Option<SVector<f64, NUM_UNKNOWNS>
     is_sane(&step).then_some(step)
 }
 
-/// The step of pose and brightness, and the depths after it.
+/// The step of pose and brightness; the depths after it go to `trial_depths`.
 fn joint_step(
-    system: &System,
+    scratch: &mut FitScratch,
     state: &State,
-    medians: &[f32],
-    (neighbour_weight, depth_weight): (f32, f32),
     damping: f64,
-    depths_after: &mut Vec<f32>,
 ) -> Option<SVector<f64, NUM_UNKNOWNS>> {
-    /// Largest change of a depth in one step: the projection is far from linear beyond.
-    const MAX_DEPTH_STEP: f32 = 0.5;
-    let mut hessian = system.hessian;
-    for i in 0..NUM_UNKNOWNS {
-        hessian[(i, i)] *= 1.0 + damping;
-    }
-    let mut gradient = system.gradient;
-    let own = |i: usize| {
-        let (point, d) = (&system.points[i], state.inverse_depths[i]);
-        let information =
-            point.information * (1.0 + damping as f32) + neighbour_weight + depth_weight;
-        let slope = point.gradient + neighbour_weight * (d - medians[i]) + depth_weight * (d - 1.0);
-        (f64::from(information), f64::from(slope))
-    };
-    for (i, point) in system.points.iter().enumerate().filter(|(_, p)| p.visible) {
-        let (information, slope) = own(i);
-        let mixed = SVector::from(point.mixed.map(f64::from));
-        gradient -= mixed * (slope / information);
-        hessian.ger(-1.0 / information, &mixed, &mixed, 1.0);
+    let (system, elimination) = (&scratch.system, &mut scratch.elimination);
+    elimination.damping_factor = 1.0 + damping as f32;
+    (system_kernels().reduce)(elimination, system, &state.inverse_depths, &scratch.medians);
+    let (mut hessian, mut gradient) = (system.hessian, system.gradient);
+    for r in 0..NUM_UNKNOWNS {
+        hessian[(r, r)] *= 1.0 + damping;
+        gradient[r] -= elimination.sums.row(r);
+        // The lower triangle is all that the factorisation reads.
+        for c in 0..=r {
+            hessian[(r, c)] -= elimination.sums.entry(r, c);
+        }
     }
     let step = hessian.cholesky()?.solve(&-gradient);
     if !is_sane(&step) {
         return None;
     }
-    depths_after.clear();
-    depths_after.extend(system.points.iter().zip(&state.inverse_depths).enumerate().map(
-        |(i, (point, &d))| {
-            let (information, slope) = own(i);
-            let by_pose: f64 = (0..NUM_UNKNOWNS).map(|k| f64::from(point.mixed[k]) * step[k]).sum();
-            let change = -((slope + by_pose) / information) as f32;
-            (d + change.clamp(-MAX_DEPTH_STEP, MAX_DEPTH_STEP))
-                .clamp(*INVERSE_DEPTHS.start(), *INVERSE_DEPTHS.end())
-        },
-    ));
+    let after = &mut scratch.trial_depths;
+    elimination.depths_after(system, &state.inverse_depths, &step, after);
     Some(step)
 }
 
@@ -263,24 +237,6 @@ fn is_sane(step: &SVector<f64, NUM_UNKNOWNS>) -> bool {
     /// In mean depths, radians and log gain; the offset is bounded by the grey scale.
     const LARGEST: f64 = 1.0;
     step.iter().all(|x| x.is_finite()) && step.iter().take(7).all(|x| x.abs() < LARGEST)
-}
-
-/// Median inverse depth of each point's neighbours.
-fn neighbour_medians(points: &Points, inverse_depths: &[f32], medians: &mut Vec<f32>) {
-    medians.clear();
-    medians.extend(points.neighbours.iter().map(|neighbours| {
-        let mut depths = neighbours.map(|j| inverse_depths[j as usize]);
-        depths.sort_unstable_by(f32::total_cmp);
-        0.5 * (depths[NUM_NEIGHBOURS / 2 - 1] + depths[NUM_NEIGHBOURS / 2])
-    }));
-}
-
-/// Energy of the priors.
-fn prior(inverse_depths: &[f32], medians: &[f32], weights: (f32, f32)) -> f64 {
-    let energy = |(d, median): (&f32, &f32)| {
-        weights.0 * (d - median).powi(2) + weights.1 * (d - 1.0).powi(2)
-    };
-    inverse_depths.iter().zip(medians).map(|pair| f64::from(energy(pair))).sum()
 }
 
 /// Variance of each point's inverse depth with the length of the translation held: its own residuals',
@@ -295,7 +251,7 @@ pub fn depth_variances(
 ) {
     let pose_covariance = pose_covariance(state, system);
     variances.clear();
-    variances.extend(system.points.iter().map(|point| {
+    variances.extend(system.points().map(|point| {
         let Some(pose_covariance) = &pose_covariance else { return f32::INFINITY };
         if !point.visible || !(point.information > 0.0) || !(point.squared_speed > 0.0) {
             return f32::INFINITY;
@@ -313,7 +269,7 @@ fn pose_covariance(
     system: &System,
 ) -> Option<SMatrix<f64, NUM_UNKNOWNS, NUM_UNKNOWNS>> {
     let mut hessian = system.hessian;
-    for point in system.points.iter().filter(|p| p.visible && p.information > 0.0) {
+    for point in system.points().filter(|p| p.visible && p.information > 0.0) {
         let mixed = SVector::from(point.mixed.map(f64::from));
         hessian.ger(-1.0 / f64::from(point.information), &mixed, &mixed, 1.0);
     }

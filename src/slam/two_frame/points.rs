@@ -6,6 +6,7 @@ use crate::slam::depth::map::GradientImage;
 use crate::slam::depth::matching::{PATTERN, bilinear};
 use crate::slam::image::buffer::Image;
 use crate::slam::image::pyramid::Pyramid;
+use crate::slam::two_frame::lanes::{LANES, Lanes};
 
 /// Neighbours that a point's depth is smoothed with.
 pub const NUM_NEIGHBOURS: usize = 8;
@@ -13,18 +14,23 @@ pub const NUM_NEIGHBOURS: usize = 8;
 /// Gradient, grey levels a pixel, at which the weight of a sample is one half.
 const HALF_WEIGHT_GRADIENT: f32 = 50.0;
 
-/// A point as one pyramid level shows it.
+/// A block of points as one pyramid level shows them.
 #[derive(Debug, Clone, Copy)]
-pub struct LevelPatch {
-    /// Column at the level.
-    pub u: f32,
-    /// Row at the level.
-    pub v: f32,
+pub struct PatchBlock {
+    /// Columns at the level.
+    pub u: Lanes,
+    /// Rows at the level.
+    pub v: Lanes,
     /// Brightness at the samples of the pattern.
-    pub intensities: [f32; 8],
-    /// Weight of the samples; all 0 where the patch does not fit into the level.
-    pub weights: [f32; 8],
+    pub intensities: [Lanes; 8],
+    /// Weights of the samples; all 0 where the patch does not fit into the level.
+    pub weights: [Lanes; 8],
+    /// Sum of a point's weights.
+    pub weight: Lanes,
 }
+
+/// The nearest other points of a block of points: of each neighbour the lanes' indices.
+pub type NeighbourBlock = [[u32; LANES]; NUM_NEIGHBOURS];
 
 /// The points of the first frame.
 #[derive(Debug, Default)]
@@ -32,9 +38,9 @@ pub struct Points {
     /// Column and row, level 0.
     pub pixels: Vec<(u16, u16)>,
     /// The points' patches, finest level first.
-    pub patches: Vec<Vec<LevelPatch>>,
+    pub patches: Vec<Vec<PatchBlock>>,
     /// The nearest other points of each.
-    pub neighbours: Vec<[u32; NUM_NEIGHBOURS]>,
+    pub neighbours: Vec<NeighbourBlock>,
     selector: CandidateSelector,
 }
 
@@ -53,36 +59,68 @@ impl Points {
         self.patches.resize(pyramid.num_levels(), Vec::new());
         for (level, patches) in self.patches.iter_mut().enumerate() {
             patches.clear();
-            patches.extend(self.pixels.iter().map(|&p| patch_at(pyramid.level(level), level, p)));
+            let block = |pixels: &[_]| patches_at(pyramid.level(level), level, pixels);
+            patches.extend(self.pixels.chunks(LANES).map(block));
         }
         self.neighbours.clear();
-        if self.pixels.len() > NUM_NEIGHBOURS {
-            self.neighbours.extend((0..self.pixels.len()).map(|i| nearest(&self.pixels, i)));
+        if self.pixels.len() <= NUM_NEIGHBOURS {
+            return 0;
         }
-        self.neighbours.len()
+        for first in (0..self.pixels.len()).step_by(LANES) {
+            let mut block = [[0; LANES]; NUM_NEIGHBOURS];
+            for l in 0..LANES.min(self.pixels.len() - first) {
+                for (lanes, neighbour) in block.iter_mut().zip(nearest(&self.pixels, first + l)) {
+                    lanes[l] = neighbour;
+                }
+            }
+            self.neighbours.push(block);
+        }
+        self.pixels.len()
     }
 }
 
-fn patch_at(image: &Image<f32>, level: usize, (u, v): (u16, u16)) -> LevelPatch {
+/// The patches of a block; a lane to spare weighs nothing.
+fn patches_at(image: &Image<f32>, level: usize, pixels: &[(u16, u16)]) -> PatchBlock {
+    let empty = [0.0; LANES];
+    let mut block = PatchBlock {
+        u: empty,
+        v: empty,
+        intensities: [empty; 8],
+        weights: [empty; 8],
+        weight: empty,
+    };
+    for (l, &pixel) in pixels.iter().enumerate() {
+        fill_lane(&mut block, l, image, level, pixel);
+    }
+    block
+}
+
+fn fill_lane(
+    block: &mut PatchBlock,
+    l: usize,
+    image: &Image<f32>,
+    level: usize,
+    (u, v): (u16, u16),
+) {
     /// The pattern reaches 2 pixels, its gradient 1.
     const REACH_PX: f32 = 3.0;
     let shrink = f32::powi(0.5, level as i32);
     let (u, v) = ((f32::from(u) + 0.5) * shrink - 0.5, (f32::from(v) + 0.5) * shrink - 0.5);
-    let mut patch = LevelPatch { u, v, intensities: [0.0; 8], weights: [0.0; 8] };
+    (block.u[l], block.v[l]) = (u, v);
     let columns = REACH_PX..image.width() as f32 - 1.0 - REACH_PX;
     let rows = REACH_PX..image.height() as f32 - 1.0 - REACH_PX;
     if !columns.contains(&u) || !rows.contains(&v) {
-        return patch;
+        return;
     }
     for (k, (x, y)) in PATTERN.iter().enumerate() {
         let (x, y) = (u + *x as f32, v + *y as f32);
         let gu = 0.5 * (bilinear(image, x + 1.0, y) - bilinear(image, x - 1.0, y));
         let gv = 0.5 * (bilinear(image, x, y + 1.0) - bilinear(image, x, y - 1.0));
         let half = HALF_WEIGHT_GRADIENT * HALF_WEIGHT_GRADIENT;
-        patch.intensities[k] = bilinear(image, x, y);
-        patch.weights[k] = half / (half + gu * gu + gv * gv);
+        block.intensities[k][l] = bilinear(image, x, y);
+        block.weights[k][l] = half / (half + gu * gu + gv * gv);
+        block.weight[l] += block.weights[k][l];
     }
-    patch
 }
 
 /// The nearest other points, by distance, ties by index. There are more than [`NUM_NEIGHBOURS`] points.

@@ -10,17 +10,20 @@
 //! ```
 //!
 //! δ = (translation, rotation), `current_from_first ← exp(δ) current_from_first`. All of it stays finite
-//! at d = 0, a point at infinity.
+//! at d = 0, a point at infinity. Residuals and gradients are those of each sample; what moves the
+//! projection is taken at the point itself for its whole pattern (Engel, Koltun, Cremers 2018 §2.3), so
+//! that a sample adds to 14 sums and not to 80.
 
 use nalgebra::{SMatrix, SVector};
 
-use crate::slam::depth::map::GradientImage;
 use crate::slam::depth::matching::PATTERN;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
+use crate::slam::image::buffer::Image;
 use crate::slam::pose::Brightness;
-use crate::slam::two_frame::points::LevelPatch;
-use crate::slam::two_frame::system_kernel::evaluation_kernel;
+use crate::slam::two_frame::lanes::{LANES, LaneSum, Lanes, NormalSums, lanes, lanes_of};
+use crate::slam::two_frame::points::PatchBlock;
+use crate::slam::two_frame::system_kernel::{WindowSampler, system_kernels};
 
 /// Translation, rotation, a, b.
 pub const NUM_UNKNOWNS: usize = 8;
@@ -43,14 +46,34 @@ pub struct State {
 #[derive(Debug, Clone, Copy)]
 pub struct LevelView<'a> {
     /// The current frame.
-    pub image: &'a GradientImage,
+    pub image: &'a Image<f32>,
     /// Its intrinsics.
     pub intrinsics: &'a Intrinsics,
     /// The points.
-    pub patches: &'a [LevelPatch],
+    pub patches: &'a [PatchBlock],
 }
 
-/// The part of the normal equations that belongs to one point.
+/// The part of the normal equations that belongs to the points of a block; all 0 where a point is not
+/// visible, but its energy.
+#[derive(Debug, Clone, Copy)]
+pub struct SystemBlock {
+    /// Σ w ∂r/∂(pose, brightness) ∂r/∂d.
+    pub mixed: [Lanes; NUM_UNKNOWNS],
+    /// Σ w (∂r/∂d)².
+    pub information: Lanes,
+    /// Σ w r ∂r/∂d.
+    pub gradient: Lanes,
+    /// Σ ρ(r), weighted.
+    pub energy: Lanes,
+    /// Σ of the weights of the samples, Huber's not included.
+    pub weight: Lanes,
+    /// Speed of the projection, pixels of the level a unit of inverse depth, squared.
+    pub squared_speed: Lanes,
+    /// Whether the whole pattern falls into the current frame.
+    pub visible: [bool; LANES],
+}
+
+/// One point of a [`SystemBlock`].
 #[derive(Debug, Clone, Copy)]
 pub struct PointSystem {
     /// Σ w ∂r/∂(pose, brightness) ∂r/∂d.
@@ -61,9 +84,9 @@ pub struct PointSystem {
     pub gradient: f32,
     /// Σ ρ(r), weighted.
     pub energy: f32,
-    /// Σ of the weights of the samples, Huber's not included.
+    /// Σ of the weights of the samples.
     pub weight: f32,
-    /// Speed of the projection, pixels of the level a unit of inverse depth, squared.
+    /// Speed of the projection, squared.
     pub squared_speed: f32,
     /// Whether the whole pattern falls into the current frame.
     pub visible: bool,
@@ -72,8 +95,10 @@ pub struct PointSystem {
 /// Normal equations at one state.
 #[derive(Debug, Clone)]
 pub struct System {
-    /// Each point's part.
-    pub points: Vec<PointSystem>,
+    /// The points' parts.
+    pub blocks: Vec<SystemBlock>,
+    /// How many points there are.
+    pub num_points: usize,
     /// JᵀWJ of pose and brightness.
     pub hessian: SMatrix<f64, NUM_UNKNOWNS, NUM_UNKNOWNS>,
     /// JᵀWr of pose and brightness.
@@ -88,11 +113,65 @@ pub struct System {
 impl Default for System {
     fn default() -> Self {
         Self {
-            points: Vec::new(),
+            blocks: Vec::new(),
+            num_points: 0,
             hessian: SMatrix::zeros(),
             gradient: SVector::zeros(),
             energy: 0.0,
             num_visible: 0,
+        }
+    }
+}
+
+impl System {
+    /// Evaluates every point at `state`. Sums go in the order of the points.
+    pub fn evaluate(&mut self, level: &LevelView<'_>, state: &State) {
+        (system_kernels().evaluate)(self, level, state);
+    }
+
+    /// Each point's part.
+    pub fn points(&self) -> impl Iterator<Item = PointSystem> {
+        (0..self.num_points).map(|i| {
+            let (block, l) = (&self.blocks[i / LANES], i % LANES);
+            PointSystem {
+                mixed: block.mixed.map(|lanes| lanes[l]),
+                information: block.information[l],
+                gradient: block.gradient[l],
+                energy: block.energy[l],
+                weight: block.weight[l],
+                squared_speed: block.squared_speed[l],
+                visible: block.visible[l],
+            }
+        })
+    }
+
+    #[inline(always)]
+    pub(super) fn evaluate_blocks<S: WindowSampler>(
+        &mut self,
+        sampler: S,
+        level: &LevelView<'_>,
+        state: &State,
+    ) {
+        let geometry = Geometry::new(level.intrinsics, state);
+        self.blocks.clear();
+        self.num_points = state.inverse_depths.len();
+        self.num_visible = 0;
+        let (mut energy, mut sums) = (LaneSum::default(), NormalSums::default());
+        for (i, patch) in level.patches.iter().enumerate() {
+            let d = lanes_of(&state.inverse_depths, i, 1.0);
+            let samples = PatternSums::of(sampler, level.image, &geometry, patch, &d);
+            let block = samples.expand(&geometry, patch, &d, &mut sums);
+            energy.add(&block.energy);
+            self.num_visible += block.visible.iter().filter(|v| **v).count();
+            self.blocks.push(block);
+        }
+        self.energy = energy.total();
+        for r in 0..NUM_UNKNOWNS {
+            self.gradient[r] = sums.row(r);
+            for c in 0..=r {
+                self.hessian[(r, c)] = sums.entry(r, c);
+                self.hessian[(c, r)] = self.hessian[(r, c)];
+            }
         }
     }
 }
@@ -104,6 +183,8 @@ const HIDDEN_ENERGY: f32 = PATTERN.len() as f32 * HUBER_GREY * HUBER_GREY;
 struct Geometry {
     rotation: [[f32; 3]; 3],
     translation: [f32; 3],
+    /// What the samples of the pattern add to q.
+    offsets: [[f32; 3]; 8],
     fx: f32,
     fy: f32,
     cx: f32,
@@ -119,6 +200,10 @@ impl Geometry {
         Self {
             rotation: [0, 1, 2].map(|r| [0, 1, 2].map(|c| rotation[(r, c)] as f32)),
             translation: [0, 1, 2].map(|r| translation[r] as f32),
+            offsets: PATTERN.map(|(du, dv)| {
+                let (x, y) = (f64::from(du) / intrinsics.fx, f64::from(dv) / intrinsics.fy);
+                [0, 1, 2].map(|r| (rotation[(r, 0)] * x + rotation[(r, 1)] * y) as f32)
+            }),
             fx: intrinsics.fx as f32,
             fy: intrinsics.fy as f32,
             cx: intrinsics.cx as f32,
@@ -129,153 +214,196 @@ impl Geometry {
     }
 }
 
-impl System {
-    /// Evaluates every point at `state`. Sums go in the order of the points.
-    pub fn evaluate(&mut self, level: &LevelView<'_>, state: &State) {
-        evaluation_kernel()(self, level, state);
-    }
+/// Sums over the samples of each point's pattern. c is eᵃ I₀, w the weight with Huber's.
+struct PatternSums {
+    /// q of the point itself.
+    q: [Lanes; 3],
+    /// Σ w (g_u², g_u g_v, g_v²).
+    squares: [Lanes; 3],
+    /// Σ w g_u (c, 1).
+    by_u: [Lanes; 2],
+    /// Σ w g_v (c, 1).
+    by_v: [Lanes; 2],
+    /// Σ w (c², c, 1).
+    by_brightness: [Lanes; 3],
+    /// Σ w r (g_u, g_v, c, 1).
+    residuals: [Lanes; 4],
+    energy: Lanes,
+    visible: [bool; LANES],
+}
 
+impl PatternSums {
     #[inline(always)]
-    pub(super) fn evaluate_points(&mut self, level: &LevelView<'_>, state: &State) {
-        let geometry = Geometry::new(level.intrinsics, state);
-        self.points.clear();
-        self.hessian.fill(0.0);
-        self.gradient.fill(0.0);
-        self.energy = 0.0;
-        self.num_visible = 0;
-        for (patch, &d) in level.patches.iter().zip(&state.inverse_depths) {
-            let mut pose = PoseSums::default();
-            let point = evaluate_point(level.image, &geometry, patch, d, &mut pose);
-            self.energy += f64::from(point.energy);
-            self.num_visible += usize::from(point.visible);
-            if point.visible {
-                pose.add_to(&mut self.hessian, &mut self.gradient);
+    fn of<S: WindowSampler>(
+        sampler: S,
+        image: &Image<f32>,
+        geometry: &Geometry,
+        patch: &PatchBlock,
+        d: &Lanes,
+    ) -> Self {
+        /// Depth ratio below which a point counts as behind the camera.
+        const MIN_DEPTH_RATIO: f32 = 0.05;
+        let (m, t) = (&geometry.rotation, &geometry.translation);
+        let (x, y) = (
+            lanes(|l| (patch.u[l] - geometry.cx) / geometry.fx),
+            lanes(|l| (patch.v[l] - geometry.cy) / geometry.fy),
+        );
+        let q =
+            [0, 1, 2].map(|r| lanes(|l| m[r][0] * x[l] + m[r][1] * y[l] + m[r][2] + t[r] * d[l]));
+        // One pixel inside the border, where the central difference is defined.
+        let (last_u, last_v) = ((image.width() - 2) as f32, (image.height() - 2) as f32);
+        let mut sums = Self {
+            q,
+            squares: [[0.0; LANES]; 3],
+            by_u: [[0.0; LANES]; 2],
+            by_v: [[0.0; LANES]; 2],
+            by_brightness: [[0.0; LANES]; 3],
+            residuals: [[0.0; LANES]; 4],
+            energy: [0.0; LANES],
+            visible: patch.weight.map(|weight| weight > 0.0),
+        };
+        for k in 0..PATTERN.len() {
+            let offset = &geometry.offsets[k];
+            let z = lanes(|l| q[2][l] + offset[2]);
+            let inverse_z = lanes(|l| 1.0 / z[l]);
+            let u = lanes(|l| geometry.fx * (q[0][l] + offset[0]) * inverse_z[l] + geometry.cx);
+            let v = lanes(|l| geometry.fy * (q[1][l] + offset[1]) * inverse_z[l] + geometry.cy);
+            for l in 0..LANES {
+                let is_inside = (u[l] >= 1.0) & (v[l] >= 1.0) & (u[l] < last_u) & (v[l] < last_v);
+                sums.visible[l] &= is_inside & (z[l] > MIN_DEPTH_RATIO);
             }
-            self.points.push(point);
+            let [brightness, gu, gv] = sampler.sample(image, &u, &v);
+            let c = lanes(|l| geometry.gain * patch.intensities[k][l]);
+            let r = lanes(|l| brightness[l] - (c[l] + geometry.offset));
+            let huber = lanes(|l| {
+                let size = r[l].abs();
+                HUBER_GREY / if size > HUBER_GREY { size } else { HUBER_GREY }
+            });
+            let w = lanes(|l| huber[l] * patch.weights[k][l]);
+            let (wu, wv) = (lanes(|l| w[l] * gu[l]), lanes(|l| w[l] * gv[l]));
+            let (wc, wr) = (lanes(|l| w[l] * c[l]), lanes(|l| w[l] * r[l]));
+            add_product(&mut sums.squares[0], &wu, &gu);
+            add_product(&mut sums.squares[1], &wu, &gv);
+            add_product(&mut sums.squares[2], &wv, &gv);
+            add_product(&mut sums.by_u[0], &wu, &c);
+            add(&mut sums.by_u[1], &wu);
+            add_product(&mut sums.by_v[0], &wv, &c);
+            add(&mut sums.by_v[1], &wv);
+            add_product(&mut sums.by_brightness[0], &wc, &c);
+            add(&mut sums.by_brightness[1], &wc);
+            add(&mut sums.by_brightness[2], &w);
+            add_product(&mut sums.residuals[0], &wr, &gu);
+            add_product(&mut sums.residuals[1], &wr, &gv);
+            add_product(&mut sums.residuals[2], &wr, &c);
+            add(&mut sums.residuals[3], &wr);
+            for l in 0..LANES {
+                sums.energy[l] += (2.0 - huber[l]) * wr[l] * r[l];
+            }
         }
-        self.hessian.fill_upper_triangle_with_lower_triangle();
+        sums
     }
-}
 
-/// Sums of one point for pose and brightness; the lower triangle of the matrix.
-#[derive(Default)]
-struct PoseSums {
-    hessian: [[f32; NUM_UNKNOWNS]; NUM_UNKNOWNS],
-    gradient: [f32; NUM_UNKNOWNS],
-}
-
-impl PoseSums {
+    /// The normal equations of the block; the pose's go to `normal`.
     #[inline(always)]
-    fn add(&mut self, jacobian: &[f32; NUM_UNKNOWNS], weight: f32, residual: f32) {
-        for r in 0..NUM_UNKNOWNS {
-            let weighted = weight * jacobian[r];
-            self.gradient[r] += weighted * residual;
-            for c in 0..NUM_UNKNOWNS {
-                self.hessian[r][c] += weighted * jacobian[c];
-            }
+    fn expand(
+        mut self,
+        geometry: &Geometry,
+        patch: &PatchBlock,
+        d: &Lanes,
+        normal: &mut NormalSums,
+    ) -> SystemBlock {
+        let visible = self.visible;
+        let groups = [&mut self.squares[..], &mut self.by_u, &mut self.by_v];
+        let groups = groups.into_iter().chain([&mut self.by_brightness[..], &mut self.residuals]);
+        for sum in groups.flatten() {
+            *sum = lanes(|l| if visible[l] { sum[l] } else { 0.0 });
         }
-    }
-
-    fn add_to(
-        &self,
-        hessian: &mut SMatrix<f64, NUM_UNKNOWNS, NUM_UNKNOWNS>,
-        gradient: &mut SVector<f64, NUM_UNKNOWNS>,
-    ) {
-        for r in 0..NUM_UNKNOWNS {
-            gradient[r] += f64::from(self.gradient[r]);
-            for c in 0..=r {
-                hessian[(r, c)] += f64::from(self.hessian[r][c]);
-            }
-        }
-    }
-}
-
-/// The residuals of one point with their derivatives.
-#[inline(always)]
-fn evaluate_point(
-    image: &GradientImage,
-    geometry: &Geometry,
-    patch: &LevelPatch,
-    d: f32,
-    pose: &mut PoseSums,
-) -> PointSystem {
-    /// Depth ratio below which a point counts as behind the camera.
-    const MIN_DEPTH_RATIO: f32 = 0.05;
-    let weight_sum: f32 = patch.weights.iter().sum();
-    let hidden = PointSystem {
-        mixed: [0.0; NUM_UNKNOWNS],
-        information: 0.0,
-        gradient: 0.0,
-        energy: if weight_sum > 0.0 { HIDDEN_ENERGY } else { 0.0 },
-        weight: 0.0,
-        squared_speed: 0.0,
-        visible: false,
-    };
-    if !(weight_sum > 0.0) {
-        return hidden;
-    }
-    let mut point = PointSystem { energy: 0.0, weight: weight_sum, visible: true, ..hidden };
-    let (m, t) = (&geometry.rotation, &geometry.translation);
-    for (k, (du, dv)) in PATTERN.iter().enumerate() {
-        let x = (patch.u + *du as f32 - geometry.cx) / geometry.fx;
-        let y = (patch.v + *dv as f32 - geometry.cy) / geometry.fy;
-        let q = [0, 1, 2].map(|r| m[r][0] * x + m[r][1] * y + m[r][2] + t[r] * d);
-        if !(q[2] > MIN_DEPTH_RATIO) {
-            return hidden;
-        }
-        let inverse_z = 1.0 / q[2];
-        let u = geometry.fx * q[0] * inverse_z + geometry.cx;
-        let v = geometry.fy * q[1] * inverse_z + geometry.cy;
-        let Some([brightness, gradient_u, gradient_v]) = sample(image, u, v) else { return hidden };
-        let residual = brightness - (geometry.gain * patch.intensities[k] + geometry.offset);
-        let huber = HUBER_GREY / residual.abs().max(HUBER_GREY);
-        let cost = huber * (2.0 - huber) * residual * residual;
-        let alpha = gradient_u * geometry.fx * inverse_z;
-        let beta = gradient_v * geometry.fy * inverse_z;
-        let gamma = -(alpha * q[0] + beta * q[1]) * inverse_z;
-        let jacobian = [
-            d * alpha,
-            d * beta,
-            d * gamma,
-            q[1] * gamma - q[2] * beta,
-            q[2] * alpha - q[0] * gamma,
-            q[0] * beta - q[1] * alpha,
-            -geometry.gain * patch.intensities[k],
-            -1.0,
+        let hidden = lanes(|l| if patch.weight[l] > 0.0 { HIDDEN_ENERGY } else { 0.0 });
+        let energy = lanes(|l| if visible[l] { self.energy[l] } else { hidden[l] });
+        let weight = lanes(|l| if visible[l] { patch.weight[l] } else { 0.0 });
+        // What a lane out of view holds may not be finite, and 0 times that is not 0.
+        let q = [
+            lanes(|l| if visible[l] { self.q[0][l] } else { 0.0 }),
+            lanes(|l| if visible[l] { self.q[1][l] } else { 0.0 }),
+            lanes(|l| if visible[l] { self.q[2][l] } else { 1.0 }),
         ];
-        let by_depth = alpha * t[0] + beta * t[1] + gamma * t[2];
-        let weight = huber * patch.weights[k];
-        pose.add(&jacobian, weight, residual);
-        for (sum, by_pose) in point.mixed.iter_mut().zip(&jacobian) {
-            *sum += weight * by_depth * by_pose;
+        let t = &geometry.translation;
+        let inverse_z = lanes(|l| 1.0 / q[2][l]);
+        let alpha = lanes(|l| geometry.fx * inverse_z[l]);
+        let beta = lanes(|l| geometry.fy * inverse_z[l]);
+        let gamma_u = lanes(|l| -alpha[l] * q[0][l] * inverse_z[l]);
+        let gamma_v = lanes(|l| -beta[l] * q[1][l] * inverse_z[l]);
+        let zero = [0.0; LANES];
+        let by_u = [
+            lanes(|l| d[l] * alpha[l]),
+            zero,
+            lanes(|l| d[l] * gamma_u[l]),
+            lanes(|l| q[1][l] * gamma_u[l]),
+            lanes(|l| q[2][l] * alpha[l] - q[0][l] * gamma_u[l]),
+            lanes(|l| -q[1][l] * alpha[l]),
+        ];
+        let by_v = [
+            zero,
+            lanes(|l| d[l] * beta[l]),
+            lanes(|l| d[l] * gamma_v[l]),
+            lanes(|l| q[1][l] * gamma_v[l] - q[2][l] * beta[l]),
+            lanes(|l| -q[0][l] * gamma_v[l]),
+            lanes(|l| q[0][l] * beta[l]),
+        ];
+        let speed_u = lanes(|l| alpha[l] * t[0] + gamma_u[l] * t[2]);
+        let speed_v = lanes(|l| beta[l] * t[1] + gamma_v[l] * t[2]);
+        let [uu, uv, vv] = &self.squares;
+        let [ru, rv, rc, r1] = &self.residuals;
+        let mut mixed = [zero; NUM_UNKNOWNS];
+        for i in 0..6 {
+            let along_u = lanes(|l| uu[l] * by_u[i][l] + uv[l] * by_v[i][l]);
+            let along_v = lanes(|l| uv[l] * by_u[i][l] + vv[l] * by_v[i][l]);
+            mixed[i] = lanes(|l| along_u[l] * speed_u[l] + along_v[l] * speed_v[l]);
+            normal.add_row(i, &lanes(|l| ru[l] * by_u[i][l] + rv[l] * by_v[i][l]));
+            for c in 0..=i {
+                let entry = lanes(|l| along_u[l] * by_u[c][l] + along_v[l] * by_v[c][l]);
+                normal.add_entry(i, c, &entry);
+            }
+            for b in 0..2 {
+                let (u, v) = (&self.by_u[b], &self.by_v[b]);
+                let entry = lanes(|l| -(u[l] * by_u[i][l] + v[l] * by_v[i][l]));
+                normal.add_entry(6 + b, i, &entry);
+            }
         }
-        point.information += weight * by_depth * by_depth;
-        point.gradient += weight * by_depth * residual;
-        point.energy += patch.weights[k] * cost;
-        if (*du, *dv) == (0, 0) {
-            let speed_u = geometry.fx * (t[0] - q[0] * inverse_z * t[2]) * inverse_z;
-            let speed_v = geometry.fy * (t[1] - q[1] * inverse_z * t[2]) * inverse_z;
-            point.squared_speed = speed_u * speed_u + speed_v * speed_v;
+        for b in 0..2 {
+            let (u, v) = (&self.by_u[b], &self.by_v[b]);
+            mixed[6 + b] = lanes(|l| -(u[l] * speed_u[l] + v[l] * speed_v[l]));
+        }
+        normal.add_row(6, &lanes(|l| -rc[l]));
+        normal.add_row(7, &lanes(|l| -r1[l]));
+        normal.add_entry(6, 6, &self.by_brightness[0]);
+        normal.add_entry(7, 6, &self.by_brightness[1]);
+        normal.add_entry(7, 7, &self.by_brightness[2]);
+        SystemBlock {
+            mixed,
+            information: lanes(|l| {
+                (uu[l] * speed_u[l] + 2.0 * uv[l] * speed_v[l]) * speed_u[l]
+                    + vv[l] * speed_v[l] * speed_v[l]
+            }),
+            gradient: lanes(|l| ru[l] * speed_u[l] + rv[l] * speed_v[l]),
+            energy,
+            weight,
+            squared_speed: lanes(|l| speed_u[l] * speed_u[l] + speed_v[l] * speed_v[l]),
+            visible,
         }
     }
-    point
 }
 
-/// Brightness and gradient between pixels; `None` outside or for NaN.
 #[inline(always)]
-fn sample(image: &GradientImage, u: f32, v: f32) -> Option<[f32; 3]> {
-    let (width, height) = (image.width(), image.height());
-    // One pixel inside the border, where the central difference is defined.
-    if !(u >= 1.0 && v >= 1.0 && u < (width - 2) as f32 && v < (height - 2) as f32) {
-        return None;
+fn add(sum: &mut Lanes, value: &Lanes) {
+    for l in 0..LANES {
+        sum[l] += value[l];
     }
-    let (column, row) = (u as usize, v as usize);
-    let (fu, fv) = (u - column as f32, v - row as f32);
-    let i = row * width + column;
-    Some([&image.intensity, &image.gradient_u, &image.gradient_v].map(|plane| {
-        let (upper, lower) = (&plane.pixels()[i..i + 2], &plane.pixels()[i + width..i + width + 2]);
-        let above = upper[0] + fu * (upper[1] - upper[0]);
-        let below = lower[0] + fu * (lower[1] - lower[0]);
-        above + fv * (below - above)
-    }))
+}
+
+#[inline(always)]
+fn add_product(sum: &mut Lanes, a: &Lanes, b: &Lanes) {
+    for l in 0..LANES {
+        sum[l] += a[l] * b[l];
+    }
 }

@@ -182,8 +182,8 @@ fn derivatives_are_those_of_the_residuals() {
     let (first, second, moved) = two_views(0.0);
     let mut initializer = TwoFrameInitializer::new(CAMERA, TwoFrameParams::default()).unwrap();
     assert!(initializer.begin(&first));
-    initializer.load(&second);
-    let (images, intrinsics) = (&initializer.images, &initializer.intrinsics);
+    initializer.pyramid.fill(&second);
+    let (images, intrinsics) = (initializer.pyramid.levels(), &initializer.intrinsics);
     let input = input(images, intrinsics, &initializer.points);
     // The finest level: central differences are the slope where the image is smooth.
     let view = input.level(0);
@@ -224,8 +224,8 @@ fn derivatives_are_those_of_the_residuals() {
     };
     let (less, more) = (shifted(-0.02), shifted(0.02));
     let (mut agree, mut all) = (0, 0);
-    for (i, point) in at.points.iter().enumerate().filter(|(_, p)| p.visible) {
-        let slope = (more.points[i].energy - less.points[i].energy) / 0.04;
+    for (i, point) in at.points().enumerate().filter(|(_, p)| p.visible) {
+        let slope = (more[i].energy - less[i].energy) / 0.04;
         let scale = (point.information * point.energy.max(1.0)).sqrt();
         all += 1;
         agree += usize::from((slope - 2.0 * point.gradient).abs() < 0.3 * scale);
@@ -248,7 +248,7 @@ fn earlier_frames_tell_true_depths_from_those_of_another_motion() {
         initializer.step(&scene.render(&CAMERA, &moved).noisy(2.0, 2 + frame as u64));
     }
     assert_eq!(initializer.witnesses.len(), 3);
-    let input = input(&initializer.images, &initializer.intrinsics, &initializer.points);
+    let input = input(initializer.pyramid.levels(), &initializer.intrinsics, &initializer.points);
     let at = |&(u, v): &(u16, u16)| first.inverse_depth.at(usize::from(u), usize::from(v));
     let truth: Vec<f32> = initializer.points.pixels.iter().map(at).collect();
     let tilted = initializer.points.pixels.iter().map(|p| {

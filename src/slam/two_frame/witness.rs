@@ -9,7 +9,7 @@ use std::collections::VecDeque;
 
 use rayon::prelude::*;
 
-use crate::slam::depth::map::GradientImage;
+use crate::slam::image::buffer::Image;
 use crate::slam::two_frame::fit::{FitInput, FitParams, FitScratch, Freedom, fit_level};
 use crate::slam::two_frame::system::State;
 
@@ -21,7 +21,7 @@ const LEVELS: std::ops::RangeInclusive<usize> = 1..=2;
 #[derive(Debug)]
 struct Witness {
     /// Its images, finest kept level first.
-    images: Vec<GradientImage>,
+    images: Vec<Image<f32>>,
     /// Its fit without translation: where the search for its pose begins.
     rotation: State,
 }
@@ -49,7 +49,7 @@ impl Witnesses {
     }
 
     /// Adds a frame (all its levels, and its fit without translation); at most `most` are kept.
-    pub fn push(&mut self, images: &[GradientImage], rotation: &State, most: usize) {
+    pub fn push(&mut self, images: &[Image<f32>], rotation: &State, most: usize) {
         while self.kept.len() >= most.max(1) {
             self.kept.pop_front();
         }
