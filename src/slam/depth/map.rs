@@ -83,6 +83,14 @@ impl GradientImage {
         }
     }
 
+    /// ‖g‖ of the pixels of row `v` that are not on the border, grey levels a pixel.
+    #[inline(always)]
+    fn strengths(&self, v: usize) -> impl Iterator<Item = f32> {
+        let inner = BORDER_PX..self.width() - BORDER_PX;
+        let (u, v) = (&self.gradient_u.row(v)[inner.clone()], &self.gradient_v.row(v)[inner]);
+        u.iter().zip(v).map(|(gu, gv)| (gu * gu + gv * gv).sqrt())
+    }
+
     /// Width in pixels.
     pub fn width(&self) -> usize {
         self.intensity.width()
@@ -135,6 +143,71 @@ impl Hypothesis {
     }
 }
 
+/// Columns that are listed at a time, on the stack.
+const LISTED_COLUMNS: usize = 512;
+
+/// Room for a list of columns.
+pub(in crate::slam) struct KnownColumns([u16; LISTED_COLUMNS]);
+
+impl Default for KnownColumns {
+    fn default() -> Self {
+        Self([0; LISTED_COLUMNS])
+    }
+}
+
+/// Gives the columns of `row` that have a hypothesis, ascending, some hundred at a time. Listed without
+/// branches: what comes next can hardly be guessed.
+#[inline(always)]
+pub(in crate::slam) fn for_each_known(
+    row: &[Hypothesis],
+    KnownColumns(columns): &mut KnownColumns,
+    mut take: impl FnMut(&[u16]),
+) {
+    for (block, hypotheses) in row.chunks(LISTED_COLUMNS).enumerate() {
+        let mut known = 0;
+        for (k, hypothesis) in hypotheses.iter().enumerate() {
+            columns[known] = (block * LISTED_COLUMNS + k) as u16;
+            known += usize::from(hypothesis.is_some());
+        }
+        take(&columns[..known]);
+    }
+}
+
+/// Largest ‖g‖ of an 8-bit image: ½·255 in both directions.
+const MAX_GRADIENT: f32 = 181.0;
+/// Steps of the strength of gradients, by which candidates are thinned out.
+const BINS: usize = 1024;
+
+/// Where a gradient of `strength` lies among the [`BINS`]: the whole part is its bin.
+#[inline(always)]
+fn bin(strength: f32) -> f32 {
+    strength / MAX_GRADIENT * BINS as f32
+}
+
+/// Pixels whose structure is summed at a time.
+const LANES: usize = 8;
+
+/// Σ (g_u², g_u g_v, g_v²) over the pattern around [`LANES`] pixels from `first` on, by quantity.
+#[inline(always)]
+fn structure_of_block(
+    gradient_u: &[f32],
+    gradient_v: &[f32],
+    width: usize,
+    first: usize,
+) -> [[f32; LANES]; 3] {
+    let [mut uu, mut uv, mut vv] = [[0.0f32; LANES]; 3];
+    for (x, y) in PATTERN {
+        let from = first.wrapping_add_signed(y as isize * width as isize + x as isize);
+        let (gu, gv) = (&gradient_u[from..from + LANES], &gradient_v[from..from + LANES]);
+        for k in 0..LANES {
+            uu[k] += gu[k] * gu[k];
+            uv[k] += gu[k] * gv[k];
+            vv[k] += gv[k] * gv[k];
+        }
+    }
+    [uu, uv, vv]
+}
+
 /// The map of one keyframe.
 #[derive(Debug, Clone)]
 pub struct DepthMap {
@@ -176,61 +249,84 @@ impl DepthMap {
     }
 
     fn sum_structure(&mut self) {
-        let width = self.image.width();
+        let (width, height) = (self.image.width(), self.image.height());
         let candidates = &self.candidates;
         let gradient_u = self.image.gradient_u.pixels();
         let gradient_v = self.image.gradient_v.pixels();
-        let offsets = PATTERN.map(|(x, y)| y as isize * width as isize + x as isize);
-        self.structure.pixels_mut().par_chunks_exact_mut(width).enumerate().for_each(|(v, row)| {
-            for (u, structure) in row.iter_mut().enumerate().filter(|(u, _)| candidates.at(*u, v)) {
-                let centre = v * width + u;
-                *structure = offsets.iter().fold([0.0; 3], |[uu, uv, vv], &offset| {
-                    let i = centre.wrapping_add_signed(offset);
-                    let (gu, gv) = (gradient_u[i], gradient_v[i]);
-                    [uu + gu * gu, uv + gu * gv, vv + gv * gv]
-                });
+        let rows = self.structure.pixels_mut().par_chunks_exact_mut(width).enumerate();
+        rows.with_min_len(BAND_ROWS).for_each(|(v, row)| {
+            if !(BORDER_PX..height - BORDER_PX).contains(&v) {
+                return;
+            }
+            let candidates = candidates.row(v);
+            for first in (BORDER_PX..width - BORDER_PX).step_by(LANES) {
+                // The last block is summed with some of the one before it, so that it is whole.
+                let first = first.min(width - BORDER_PX - LANES);
+                if !candidates[first..first + LANES].iter().any(|&candidate| candidate) {
+                    continue;
+                }
+                let sums = structure_of_block(gradient_u, gradient_v, width, v * width + first);
+                for (k, structure) in row[first..first + LANES].iter_mut().enumerate() {
+                    *structure = sums.map(|plane| plane[k]);
+                }
             }
         });
     }
 
     fn choose_candidates(&mut self, min_gradient: f32, max_candidates: usize) {
-        /// Largest ‖g‖ of an 8-bit image: ½·255 in both directions.
-        const MAX_GRADIENT: f32 = 181.0;
-        const BINS: usize = 1024;
-        let bin = |strength: f32| ((strength / MAX_GRADIENT * BINS as f32) as usize).min(BINS - 1);
         let (width, height) = (self.image.width(), self.image.height());
-        let gradient_u = self.image.gradient_u.pixels();
-        let gradient_v = self.image.gradient_v.pixels();
-        let strength =
-            |i: usize| (gradient_u[i] * gradient_u[i] + gradient_v[i] * gradient_v[i]).sqrt();
-        let inner = |v: usize| v * width + BORDER_PX..(v + 1) * width - BORDER_PX;
-        let rows = BORDER_PX..height - BORDER_PX;
-        let count_row = |mut histogram: [u32; BINS], v: usize| {
-            for strength in inner(v).map(strength).filter(|s| *s >= min_gradient) {
-                histogram[bin(strength)] += 1;
+        let image = &self.image;
+        let rows = self.candidates.pixels_mut().par_chunks_exact_mut(width).enumerate();
+        let enough = |strength: f32| strength >= min_gradient;
+        let count = rows.with_min_len(BAND_ROWS).map(|(v, row)| {
+            row.fill(false);
+            if (BORDER_PX..height - BORDER_PX).contains(&v) {
+                let strengths = image.strengths(v);
+                row[BORDER_PX..].iter_mut().zip(strengths).for_each(|(c, s)| *c = enough(s));
             }
-            histogram
-        };
-        let add =
-            |one: [u32; BINS], other: [u32; BINS]| std::array::from_fn(|bin| one[bin] + other[bin]);
-        let rows = rows.into_par_iter().with_min_len(BAND_ROWS);
-        let histogram = rows.fold(|| [0; BINS], count_row).reduce(|| [0; BINS], add);
-        let mut kept = 0;
-        let mut lowest = BINS;
+            row.iter().map(|&candidate| usize::from(candidate)).sum::<usize>()
+        });
+        let count: usize = count.sum();
+        if count <= max_candidates {
+            return;
+        }
+        let histogram = self.histogram();
+        let (mut kept, mut lowest) = (0, BINS);
         while lowest > 0 && kept + histogram[lowest - 1] as usize <= max_candidates {
             lowest -= 1;
             kept += histogram[lowest] as usize;
         }
+        let image = &self.image;
+        let lowest = lowest as f32;
         let rows = self.candidates.pixels_mut().par_chunks_exact_mut(width).enumerate();
         rows.with_min_len(BAND_ROWS).for_each(|(v, row)| {
-            row.fill(false);
             if (BORDER_PX..height - BORDER_PX).contains(&v) {
-                for (is_candidate, i) in row[BORDER_PX..].iter_mut().zip(inner(v)) {
-                    let strength = strength(i);
-                    *is_candidate = strength >= min_gradient && bin(strength) >= lowest;
-                }
+                let strengths = image.strengths(v);
+                row[BORDER_PX..]
+                    .iter_mut()
+                    .zip(strengths)
+                    .for_each(|(c, s)| *c &= bin(s) >= lowest);
             }
         });
+    }
+
+    /// How many candidates there are of each strength of gradient.
+    fn histogram(&self) -> [u32; BINS] {
+        let (width, height) = (self.image.width(), self.image.height());
+        let count_row = |mut histogram: [u32; BINS + 1], v: usize| {
+            let candidates = &self.candidates.row(v)[BORDER_PX..width - BORDER_PX];
+            for (&is_candidate, strength) in candidates.iter().zip(self.image.strengths(v)) {
+                // The others are counted too, in a bin of their own: no branch can be guessed wrong.
+                let bin = (bin(strength) as usize).min(BINS - 1);
+                histogram[if is_candidate { bin } else { BINS }] += 1;
+            }
+            histogram
+        };
+        type Bins = [u32; BINS + 1];
+        let add = |one: Bins, other: Bins| std::array::from_fn(|bin| one[bin] + other[bin]);
+        let rows = (BORDER_PX..height - BORDER_PX).into_par_iter().with_min_len(BAND_ROWS);
+        let counts = rows.fold(|| [0; BINS + 1], count_row).reduce(|| [0; BINS + 1], add);
+        std::array::from_fn(|bin| counts[bin])
     }
 
     /// Place of pixel `(u, v)` in the planes.
@@ -240,15 +336,18 @@ impl DepthMap {
 
     /// Number of hypotheses.
     pub fn num_hypotheses(&self) -> usize {
-        self.hypotheses.pixels().iter().filter(|h| h.is_some()).count()
+        self.hypotheses.pixels().iter().map(|h| usize::from(h.is_some())).sum()
     }
 
     /// Mean smoothed inverse depth of the hypotheses; `None` without any.
     pub fn mean_inverse_depth(&self) -> Option<f64> {
         let (mut sum, mut count) = (0.0, 0usize);
-        for h in self.hypotheses.pixels().iter().filter(|h| h.is_some()) {
-            sum += f64::from(h.smoothed);
-            count += 1;
+        let mut columns = KnownColumns::default();
+        for row in self.hypotheses.pixels().chunks_exact(self.image.width().max(1)) {
+            for_each_known(row, &mut columns, |known| {
+                count += known.len();
+                known.iter().for_each(|&u| sum += f64::from(row[usize::from(u)].smoothed));
+            });
         }
         (count > 0).then(|| sum / count as f64)
     }
@@ -294,5 +393,37 @@ mod tests {
         let some = map.candidates.pixels().iter().filter(|&&c| c).count();
         assert!(all > 1000 && some <= 500 && some > 100, "{all} {some}");
         assert!(!map.candidates.at(1, 30) && !map.candidates.at(30, 2));
+    }
+
+    #[test]
+    fn candidates_and_their_structure_are_those_of_each_pixel() {
+        let (width, height) = (61, 45);
+        let pixels: Vec<u8> =
+            (0..width * height).map(|i| ((i * i * 31 + i * 7) % 251) as u8).collect();
+        let mut map = DepthMap::with_size(width, height);
+        map.restart(&pixels, 40.0, 700);
+        let (gu, gv) = (map.image.gradient_u.pixels(), map.image.gradient_v.pixels());
+        let strength = |i: usize| (gu[i] * gu[i] + gv[i] * gv[i]).sqrt();
+        let weakest = |wanted: bool, worst: fn(f32, f32) -> f32, start: f32| {
+            let inner = (BORDER_PX..height - BORDER_PX)
+                .flat_map(|v| (BORDER_PX..width - BORDER_PX).map(move |u| v * width + u));
+            let chosen = inner.filter(|&i| map.candidates.pixels()[i] == wanted);
+            chosen.map(strength).fold(start, worst)
+        };
+        let kept = weakest(true, f32::min, f32::INFINITY);
+        let left = weakest(false, f32::max, 0.0);
+        assert!(kept >= 40.0 && kept > left, "{kept} {left}");
+        for v in 0..height {
+            for u in (0..width).filter(|&u| map.candidates.at(u, v)) {
+                let mut sums = [0.0f32; 3];
+                for (x, y) in PATTERN {
+                    let i = (v as i32 + y) as usize * width + (u as i32 + x) as usize;
+                    sums[0] += gu[i] * gu[i];
+                    sums[1] += gu[i] * gv[i];
+                    sums[2] += gv[i] * gv[i];
+                }
+                assert_eq!(map.structure.at(u, v).map(f32::to_bits), sums.map(f32::to_bits));
+            }
+        }
     }
 }

@@ -6,12 +6,14 @@
 //! at the pixels that [`candidate`] chooses (Engel, Koltun, Cremers 2018).
 
 pub mod candidate;
+mod carrying_kernel;
 pub mod epipolar;
 pub mod gaussian;
 pub mod immature;
 pub mod interval;
 pub mod map;
 pub mod matching;
+mod neighbour_sums;
 mod observation_kernel;
 pub mod pose_noise;
 pub mod promise;

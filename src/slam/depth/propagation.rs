@@ -3,11 +3,16 @@
 //! `d' = 1/z' = d/(r_z + t_z d)` with r_z the third component of R (x, y, 1)ᵀ, and
 //! `σ'² = r_z² (d'/d)⁴ σ² + σ_p²`.
 
+use std::ops::Range;
+
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::slam::depth::epipolar::TwoView;
-use crate::slam::depth::map::{Arrival, BAND_ROWS, BORDER_PX, DepthMap, Hypothesis};
+use crate::slam::depth::carrying_kernel::carrying_kernel;
+use crate::slam::depth::epipolar::{MIN_DEPTH_RATIO, TwoView};
+use crate::slam::depth::map::{
+    Arrival, BAND_ROWS, BORDER_PX, DepthMap, Hypothesis, KnownColumns, for_each_known,
+};
 use crate::slam::depth::matching::bilinear;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
@@ -60,24 +65,17 @@ pub fn propagate(
     brightness: Brightness,
     params: &PropagationParams,
 ) {
-    let (width, height) = (source.image.width(), source.image.height());
+    let height = source.image.height();
     let mut arrivals = std::mem::take(&mut target.arrivals);
     arrivals.resize_with(height.div_ceil(BAND_ROWS), Vec::new);
-    let way = Way {
-        source,
-        target,
-        view: TwoView::new(intrinsics, target_from_source),
-        gain: brightness.a.exp() as f32,
-        offset: brightness.b as f32,
-        params,
-    };
+    let view = TwoView::new(intrinsics, target_from_source);
+    let brighter = (brightness.a.exp() as f32, brightness.b as f32);
+    let way = Way::new(source, target, view, brighter, params);
+    let carry_rows = carrying_kernel();
     arrivals.par_iter_mut().enumerate().for_each(|(band, arrivals)| {
         arrivals.clear();
-        let rows = band * BAND_ROWS..((band + 1) * BAND_ROWS).min(height);
-        for v in rows.filter(|v| (BORDER_PX..height - BORDER_PX).contains(v)) {
-            let columns = BORDER_PX..width - BORDER_PX;
-            arrivals.extend(columns.filter_map(|u| way.carry_pixel(u, v)));
-        }
+        let (first, end) = (band * BAND_ROWS, (band + 1) * BAND_ROWS);
+        carry_rows(&way, first.max(BORDER_PX)..end.min(height - BORDER_PX), arrivals);
     });
     // In the order of the source's rows: who comes first to a pixel matters there.
     let present = target.hypotheses.pixels_mut();
@@ -88,7 +86,7 @@ pub fn propagate(
 }
 
 /// What a hypothesis needs on its way from one keyframe to the next.
-struct Way<'a> {
+pub(super) struct Way<'a> {
     source: &'a DepthMap,
     target: &'a DepthMap,
     view: TwoView,
@@ -97,42 +95,125 @@ struct Way<'a> {
     params: &'a PropagationParams,
 }
 
-impl Way<'_> {
-    /// The hypothesis of a source pixel where it arrives, if there is one and it does.
-    fn carry_pixel(&self, u: usize, v: usize) -> Option<Arrival> {
-        let (source, target, params) = (self.source, self.target, self.params);
-        let from = source.hypotheses.at(u, v);
-        if !from.is_some() {
-            return None;
+/// Hypotheses that are projected at a time.
+const LANES: usize = 16;
+
+/// Where [`LANES`] source pixels arrive.
+struct Places {
+    u: [f32; LANES],
+    v: [f32; LANES],
+    depth_ratio: [f32; LANES],
+    /// r_z of the formula above.
+    r_z: [f32; LANES],
+    /// Whether they do, away from the target's border.
+    inside: [bool; LANES],
+}
+
+impl<'a> Way<'a> {
+    /// The way between two maps, seen like this; brightness grows by a gain and an offset.
+    pub(super) fn new(
+        source: &'a DepthMap,
+        target: &'a DepthMap,
+        view: TwoView,
+        (gain, offset): (f32, f32),
+        params: &'a PropagationParams,
+    ) -> Self {
+        Self { source, target, view, gain, offset, params }
+    }
+
+    /// Carries the hypotheses of some source rows, in their order.
+    #[inline(always)]
+    pub(super) fn carry_rows(&self, rows: Range<usize>, arrivals: &mut Vec<Arrival>) {
+        let mut columns = KnownColumns::default();
+        for v in rows {
+            let hypotheses = self.source.hypotheses.row(v);
+            for_each_known(hypotheses, &mut columns, |known| {
+                for columns in known.chunks(LANES) {
+                    let places = self.project(hypotheses, columns, v);
+                    let inside = columns.iter().enumerate().filter(|(k, _)| places.inside[*k]);
+                    arrivals.extend(inside.filter_map(|(k, &u)| {
+                        let u = usize::from(u);
+                        self.arrive(
+                            &hypotheses[u],
+                            self.source.image.intensity.at(u, v),
+                            &places,
+                            k,
+                        )
+                    }));
+                }
+            });
         }
-        let (width, height) = (target.image.width(), target.image.height());
-        let line = self.view.line(u as f32, v as f32);
-        let at = line.project(from.smoothed)?;
+    }
+
+    /// The projections of some hypotheses of row `v`; each operation is that of
+    /// [`EpipolarLine::project`](crate::slam::depth::epipolar::EpipolarLine::project).
+    #[inline(always)]
+    fn project(&self, hypotheses: &[Hypothesis], columns: &[u16], v: usize) -> Places {
+        let (m, kt) = (&self.view.rotation, &self.view.translation);
+        let (width, height) = (self.target.image.width(), self.target.image.height());
         let margin = BORDER_PX as f32;
-        let inside = at.u >= margin
-            && at.v >= margin
-            && at.u < (width - BORDER_PX) as f32 - 0.5
-            && at.v < (height - BORDER_PX) as f32 - 0.5;
-        if !inside {
+        let right = (width - BORDER_PX) as f32 - 0.5;
+        let bottom = (height - BORDER_PX) as f32 - 0.5;
+        let (mut columns_u, mut d) = ([0.0; LANES], [0.0; LANES]);
+        for (k, &u) in columns.iter().enumerate() {
+            (columns_u[k], d[k]) = (f32::from(u), hypotheses[usize::from(u)].smoothed);
+        }
+        let v = v as f32;
+        let zero = [0.0; LANES];
+        let inside = [false; LANES];
+        let mut places = Places { u: zero, v: zero, depth_ratio: zero, r_z: zero, inside };
+        for k in 0..LANES {
+            let u = columns_u[k];
+            let pr_u = m[0][0] * u + m[0][1] * v + m[0][2];
+            let pr_v = m[1][0] * u + m[1][1] * v + m[1][2];
+            let pr_z = m[2][0] * u + m[2][1] * v + m[2][2];
+            let z = pr_z + kt[2] * d[k];
+            let depth_ratio = 1.0 / z;
+            let at_u = (pr_u + kt[0] * d[k]) * depth_ratio;
+            let at_v = (pr_v + kt[1] * d[k]) * depth_ratio;
+            (places.u[k], places.v[k]) = (at_u, at_v);
+            (places.depth_ratio[k], places.r_z[k]) = (depth_ratio, pr_z);
+            places.inside[k] = (z > MIN_DEPTH_RATIO)
+                & (at_u >= margin)
+                & (at_v >= margin)
+                & (at_u < right)
+                & (at_v < bottom);
+        }
+        places
+    }
+
+    /// The hypothesis `from`, of a pixel of this `intensity`, where it arrives, if what is seen there
+    /// looks like it.
+    #[inline(always)]
+    fn arrive(
+        &self,
+        from: &Hypothesis,
+        intensity: f32,
+        places: &Places,
+        k: usize,
+    ) -> Option<Arrival> {
+        let (image, params) = (&self.target.image, self.params);
+        let (u, v) = (places.u[k], places.v[k]);
+        // Through i32: what is inside fits, and the conversion is a single instruction.
+        let (column, row) = ((u + 0.5) as i32 as usize, (v + 0.5) as i32 as usize);
+        let index = row * image.width() + column;
+        if !self.target.candidates.pixels()[index] {
             return None;
         }
-        let (tu, tv) = ((at.u + 0.5) as usize, (at.v + 0.5) as usize);
-        if !target.candidates.at(tu, tv) {
-            return None;
-        }
-        let expected = self.gain * source.image.intensity.at(u, v) + self.offset;
-        let residual = (bilinear(&target.image.intensity, at.u, at.v) - expected).abs();
-        let gradient_u = f64::from(target.image.gradient_u.at(tu, tv));
-        let gradient_v = f64::from(target.image.gradient_v.at(tu, tv));
+        let expected = self.gain * intensity + self.offset;
+        let residual = (bilinear(&image.intensity, u, v) - expected).abs();
+        let gradient_u = f64::from(image.gradient_u.pixels()[index]);
+        let gradient_v = f64::from(image.gradient_v.pixels()[index]);
         let gradient = (gradient_u * gradient_u + gradient_v * gradient_v).sqrt() as f32;
         if residual > params.max_residual + params.residual_per_gradient * gradient {
             return None;
         }
-        Some(((tv * width + tu) as u32, carry(&from, at.depth_ratio, line.pr[2], params)))
+        Some((index as u32, carry(from, places.depth_ratio[k], places.r_z[k], params)))
     }
 }
 
 /// One hypothesis in the target's coordinates: `depth_ratio = d'/d`, `r_z` as in the formula above.
+#[inline(always)]
 fn carry(from: &Hypothesis, depth_ratio: f32, r_z: f32, params: &PropagationParams) -> Hypothesis {
     let stretch = r_z * depth_ratio * depth_ratio;
     let inverse_depth = from.smoothed * depth_ratio;
@@ -148,6 +229,7 @@ fn carry(from: &Hypothesis, depth_ratio: f32, r_z: f32, params: &PropagationPara
 }
 
 /// Two hypotheses on one pixel: fused if consistent, else the nearer one hides the other.
+#[inline]
 fn settle(present: &mut Hypothesis, arriving: Hypothesis) {
     if !present.is_some() {
         *present = arriving;
@@ -161,6 +243,7 @@ fn settle(present: &mut Hypothesis, arriving: Hypothesis) {
 }
 
 /// Two hypotheses of one pixel as one; `None` where they are of different surfaces.
+#[inline]
 pub fn joined(one: Hypothesis, other: &Hypothesis) -> Option<Hypothesis> {
     /// Joint standard deviations within which two hypotheses are one surface.
     const SAME_SURFACE_SIGMAS: f32 = 2.0;

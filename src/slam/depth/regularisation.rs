@@ -4,17 +4,19 @@
 //! Only the published value is smoothed: the filtered one and its variance stay, so that smoothing
 //! never pretends to an observation.
 
+use std::ops::Range;
+
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::gaussian::NEW_VALIDITY;
-use crate::slam::depth::map::{BORDER_PX, DepthMap, Hypothesis};
-use crate::slam::depth::smoothing_kernel::sums_kernel;
+use crate::slam::depth::map::{BAND_ROWS, BORDER_PX, DepthMap, Hypothesis};
+use crate::slam::depth::neighbour_sums::{
+    FillingSums, LANES, RADIUS, RowPlanes, SmoothingSums, WINDOW_ROWS, filling_sums, smoothing_sums,
+};
+use crate::slam::depth::smoothing_kernel::{SmoothingKernel, smoothing_kernel};
 use crate::slam::image::buffer::Image;
 use crate::slam::parameter::{ParameterError, check_range};
-
-/// Half width of the 5×5 neighbourhood.
-const RADIUS: usize = 2;
 
 /// Tuning of the regularisation.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -53,21 +55,28 @@ impl RegularisationParams {
     }
 }
 
-/// Memory of the regularisation: the map as it was before, as planes.
+/// Memory of the regularisation.
 #[derive(Debug, Clone)]
 pub struct RegularisationScratch {
-    inverse_depth: Image<f32>,
-    /// Negative where there is no hypothesis.
-    variance: Image<f32>,
+    bands: Vec<BandScratch>,
+}
+
+/// Memory for some rows.
+#[derive(Debug, Clone)]
+struct BandScratch {
+    /// The rows around the one at hand, at their number modulo their count.
+    window: [RowPlanes; WINDOW_ROWS],
+    /// The rows above and below the band, as they were before: other threads smooth them.
+    above: Vec<Hypothesis>,
+    below: Vec<Hypothesis>,
 }
 
 impl RegularisationScratch {
     /// For maps of this size.
     pub fn with_size(width: usize, height: usize) -> Self {
-        Self {
-            inverse_depth: Image::filled(width, height, 0.0),
-            variance: Image::filled(width, height, -1.0),
-        }
+        let window = std::array::from_fn(|_| RowPlanes::with_width(width));
+        let band = BandScratch { window, above: Vec::new(), below: Vec::new() };
+        Self { bands: vec![band; height.div_ceil(BAND_ROWS)] }
     }
 }
 
@@ -78,108 +87,122 @@ pub fn regularise(
     scratch: &mut RegularisationScratch,
     params: &RegularisationParams,
 ) {
+    regularise_with(smoothing_kernel(), map, scratch, params);
+}
+
+fn regularise_with(
+    smooth_band: SmoothingKernel,
+    map: &mut DepthMap,
+    scratch: &mut RegularisationScratch,
+    params: &RegularisationParams,
+) {
     let (width, height) = (map.image.width(), map.image.height());
-    let RegularisationScratch { inverse_depth, variance } = scratch;
     let (hypotheses, candidates) = (&mut map.hypotheses, &map.candidates);
-    let planes = inverse_depth.pixels_mut().par_chunks_exact_mut(width);
-    let planes = planes.zip(variance.pixels_mut().par_chunks_exact_mut(width));
-    planes.zip(hypotheses.pixels().par_chunks_exact(width)).for_each(|((d, variance), row)| {
-        for ((d, variance), hypothesis) in d.iter_mut().zip(variance).zip(row) {
-            (*d, *variance) = (hypothesis.inverse_depth, hypothesis.variance);
-        }
-    });
-    let before = Neighbourhood { inverse_depth, variance, params };
-    let sum_neighbours = sums_kernel();
-    hypotheses.pixels_mut().par_chunks_exact_mut(width).enumerate().for_each(|(v, row)| {
-        if !(BORDER_PX..height - BORDER_PX).contains(&v) {
-            return;
-        }
-        let present = before.variance.row(v);
-        let candidates = candidates.row(v);
-        for first in (BORDER_PX..width - BORDER_PX).step_by(LANES) {
-            let block = first..(first + LANES).min(width - BORDER_PX);
-            if present[block.clone()].iter().any(|&variance| variance >= 0.0) {
-                // The last block is summed with some of the one before it, so that it is whole.
-                let whole = first.min(width - BORDER_PX - LANES);
-                let sums = sum_neighbours(&before, whole, v);
-                for u in block.clone().filter(|&u| present[u] >= 0.0) {
-                    smooth(&mut row[u], &sums, u - whole, params);
-                }
-            }
-            for u in block.filter(|&u| candidates[u] && !(present[u] >= 0.0)) {
-                before.fill(&mut row[u], u, v);
-            }
-        }
+    for (band, scratch) in scratch.bands.iter_mut().enumerate() {
+        let (first, end) = (band * BAND_ROWS, ((band + 1) * BAND_ROWS).min(height));
+        let rows = |rows: Range<usize>| &hypotheses.pixels()[rows.start * width..rows.end * width];
+        scratch.above.clear();
+        scratch.above.extend_from_slice(rows(first.saturating_sub(RADIUS)..first));
+        scratch.below.clear();
+        scratch.below.extend_from_slice(rows(end..(end + RADIUS).min(height)));
+    }
+    let bands = hypotheses.pixels_mut().par_chunks_mut(BAND_ROWS * width).enumerate();
+    bands.zip(&mut scratch.bands).for_each(|((band, rows), scratch)| {
+        let BandScratch { window, above, below } = scratch;
+        let first = band * BAND_ROWS;
+        smooth_band(&mut Band {
+            candidates,
+            width,
+            height,
+            first,
+            rows,
+            above,
+            below,
+            window,
+            params,
+        });
     });
 }
 
-/// Keeps the weight of a certain pixel finite: far below any variance a match can have.
-const LEAST_VARIANCE: f32 = 1e-12;
-
-/// Pixels that are summed at a time.
-pub(super) const LANES: usize = 8;
-
-/// The map before smoothing.
-pub(super) struct Neighbourhood<'a> {
-    inverse_depth: &'a Image<f32>,
-    variance: &'a Image<f32>,
+/// Some rows of the map, on their way from before to after.
+pub(super) struct Band<'a> {
+    candidates: &'a Image<bool>,
+    width: usize,
+    height: usize,
+    /// Number of its first row.
+    first: usize,
+    rows: &'a mut [Hypothesis],
+    above: &'a [Hypothesis],
+    below: &'a [Hypothesis],
+    window: &'a mut [RowPlanes; WINDOW_ROWS],
     params: &'a RegularisationParams,
 }
 
-/// Sums over the consistent neighbours of [`LANES`] pixels, each pixel its own neighbour.
-pub(super) struct NeighbourSums {
-    weighted: [f32; LANES],
-    weights: [f32; LANES],
-    count: [f32; LANES],
-}
-
-impl Neighbourhood<'_> {
-    /// The sums of the pixels from `first` on in row `v`.
+impl Band<'_> {
+    /// Smooths, drops and fills row by row; the window keeps what the rows were before.
     #[inline(always)]
-    pub(super) fn sums(&self, first: usize, v: usize) -> NeighbourSums {
-        let spread = self.params.distance_std_dev * self.params.distance_std_dev;
-        let slack = self.params.surface_slack_ratio;
-        let window = first - RADIUS..first + LANES + RADIUS;
-        let row = |image: &'_ Image<f32>, y: usize| -> [f32; LANES + 2 * RADIUS] {
-            let mut values = [0.0; LANES + 2 * RADIUS];
-            values.copy_from_slice(&image.row(y)[window.clone()]);
-            values
-        };
-        let (depths, variances) = (row(self.inverse_depth, v), row(self.variance, v));
-        let (mut centre, mut allowed) = ([0.0; LANES], [0.0; LANES]);
-        for k in 0..LANES {
-            centre[k] = depths[k + RADIUS];
-            let tolerance = slack * centre[k];
-            allowed[k] = variances[k + RADIUS] + tolerance * tolerance;
+    pub(super) fn regularise(&mut self) {
+        let (first, end) = (self.first, self.first + self.rows.len() / self.width);
+        let inner = first.max(BORDER_PX)..end.min(self.height - BORDER_PX);
+        let mut next = inner.start - RADIUS;
+        for v in inner {
+            while next <= v + RADIUS {
+                self.load(next);
+                next += 1;
+            }
+            self.regularise_row(v);
         }
-        let (mut weighted, mut weights, mut count) = ([0.0; LANES], [0.0; LANES], [0.0; LANES]);
-        for y in v - RADIUS..=v + RADIUS {
-            let (depths, variances) = (row(self.inverse_depth, y), row(self.variance, y));
-            for x in 0..=2 * RADIUS {
-                let (dx, dy) = (x as f32 - RADIUS as f32, y as f32 - v as f32);
-                let distance = spread * (dx * dx + dy * dy);
-                for k in 0..LANES {
-                    let (d, variance) = (depths[k + x], variances[k + x]);
-                    let difference = d - centre[k];
-                    let squared = difference * difference;
-                    // Without branches, so that the lanes go together.
-                    let consistent = (variance >= 0.0) & (squared <= allowed[k] + variance);
-                    let taken = if consistent { 1.0 } else { 0.0 };
-                    let weight = taken / (variance.max(LEAST_VARIANCE) + distance);
-                    weighted[k] += weight * d;
-                    weights[k] += weight;
-                    count[k] += taken;
+    }
+
+    /// Takes row `v` as it is now into the window.
+    #[inline(always)]
+    fn load(&mut self, v: usize) {
+        let (first, end) = (self.first, self.first + self.rows.len() / self.width);
+        let at = |from: usize| (v - from) * self.width..(v - from + 1) * self.width;
+        let row = if v < first {
+            // As many rows as there are end where the band begins.
+            &self.above[at(first - self.above.len() / self.width)]
+        } else if v >= end {
+            &self.below[at(end)]
+        } else {
+            &self.rows[at(first)]
+        };
+        self.window[v % WINDOW_ROWS].fill(row, self.params.distance_std_dev);
+    }
+
+    #[inline(always)]
+    fn regularise_row(&mut self, v: usize) {
+        let (width, params) = (self.width, self.params);
+        let window = &*self.window;
+        let around: [&RowPlanes; WINDOW_ROWS] =
+            std::array::from_fn(|y| &window[(v + y - RADIUS) % WINDOW_ROWS]);
+        let row = &mut self.rows[(v - self.first) * width..(v - self.first + 1) * width];
+        let candidates = self.candidates.row(v);
+        let present = &around[RADIUS].variance;
+        for first in (BORDER_PX..width - BORDER_PX).step_by(LANES) {
+            let block = first..(first + LANES).min(width - BORDER_PX);
+            if present[block.clone()].iter().any(|&variance| variance >= 0.0) {
+                let sums = smoothing_sums(&around, first, params.surface_slack_ratio);
+                for u in block.clone().filter(|&u| present[u] >= 0.0) {
+                    smooth(&mut row[u], &sums, u - first, params);
+                }
+            }
+            let is_hole = |u: usize| candidates[u] & !(present[u] >= 0.0);
+            if block.clone().any(is_hole) {
+                let sums = filling_sums(&around, first);
+                for u in block.filter(|&u| is_hole(u)) {
+                    fill(&mut row[u], &sums, u - first, params);
                 }
             }
         }
-        NeighbourSums { weighted, weights, count }
     }
 }
 
 /// Smooths the hypothesis whose sums stand at `lane`, or drops it for want of neighbours.
+#[inline(always)]
 fn smooth(
     hypothesis: &mut Hypothesis,
-    sums: &NeighbourSums,
+    sums: &SmoothingSums,
     lane: usize,
     params: &RegularisationParams,
 ) {
@@ -192,51 +215,32 @@ fn smooth(
     }
 }
 
-impl Neighbourhood<'_> {
-    /// Gives a pixel without hypothesis the mean of its neighbours, where they are many and agree.
-    fn fill(&self, out: &mut Hypothesis, u: usize, v: usize) {
-        /// Failures after which neighbours' depth is not tried again: the pixel is something else.
-        const MAX_FAILURES: u8 = 2;
-        if out.failures > MAX_FAILURES {
-            return;
-        }
-        let (rows, columns) = (v - RADIUS..=v + RADIUS, u - RADIUS..=u + RADIUS);
-        let neighbours: u8 = rows
-            .clone()
-            .flat_map(|y| &self.variance.row(y)[columns.clone()])
-            .map(|&variance| u8::from(variance >= 0.0))
-            .sum();
-        if neighbours < self.params.min_fill_neighbours {
-            return;
-        }
-        let spread = self.params.distance_std_dev * self.params.distance_std_dev;
-        let (mut sum, mut squares, mut weights) = (0.0f32, 0.0f32, 0.0f32);
-        for y in rows {
-            let variances = &self.variance.row(y)[columns.clone()];
-            let depths = &self.inverse_depth.row(y)[columns.clone()];
-            for (&d, &variance) in depths.iter().zip(variances).filter(|(_, v)| **v >= 0.0) {
-                let weight = 1.0 / (variance + spread * d * d);
-                sum += weight * d;
-                squares += weight * d * d;
-                weights += weight;
-            }
-        }
-        let mean = sum / weights;
-        let variance = (squares / weights - mean * mean).max(0.0) + f32::from(neighbours) / weights;
-        // Neighbours on two surfaces say nothing of which one the hole is on.
-        const MAX_STD_DEV_RATIO: f32 = 0.15;
-        if variance > (MAX_STD_DEV_RATIO * mean).powi(2) {
-            return;
-        }
-        *out = Hypothesis {
-            inverse_depth: mean,
-            variance,
-            smoothed: mean,
-            validity: NEW_VALIDITY / 2,
-            propagated: false,
-            failures: out.failures,
-        };
+/// Gives a pixel without hypothesis the mean of its neighbours, where they are many and agree.
+#[inline(always)]
+fn fill(out: &mut Hypothesis, sums: &FillingSums, lane: usize, params: &RegularisationParams) {
+    /// Failures after which neighbours' depth is not tried again: the pixel is something else.
+    const MAX_FAILURES: u8 = 2;
+    let neighbours = sums.count[lane];
+    if out.failures > MAX_FAILURES || neighbours < f32::from(params.min_fill_neighbours) {
+        return;
     }
+    let weights = sums.weights[lane];
+    let mean = sums.weighted[lane] / weights;
+    let scatter = (sums.squares[lane] / weights - mean * mean).max(0.0);
+    let variance = scatter + neighbours / weights;
+    // Neighbours on two surfaces say nothing of which one the hole is on.
+    const MAX_STD_DEV_RATIO: f32 = 0.15;
+    if variance > (MAX_STD_DEV_RATIO * mean).powi(2) {
+        return;
+    }
+    *out = Hypothesis {
+        inverse_depth: mean,
+        variance,
+        smoothed: mean,
+        validity: NEW_VALIDITY / 2,
+        propagated: false,
+        failures: out.failures,
+    };
 }
 
 #[cfg(test)]
@@ -308,5 +312,106 @@ mod tests {
         let h = map.hypotheses.at(16, 16);
         assert!(h.is_some() && (h.inverse_depth - 1.0).abs() < 1e-4 && h.variance >= 1e-4);
         assert!(!map.hypotheses.at(28, 28).is_some());
+    }
+
+    /// The explanation: pixel by pixel, neighbour by neighbour.
+    fn regularised(map: &DepthMap, params: &RegularisationParams) -> Vec<Hypothesis> {
+        let (width, height) = (map.image.width(), map.image.height());
+        let before = &map.hypotheses;
+        let mut after = before.pixels().to_vec();
+        let inner = |v: usize| (BORDER_PX..width - BORDER_PX).map(move |u| (u, v));
+        for (u, v) in (BORDER_PX..height - BORDER_PX).flat_map(inner) {
+            let spread = params.distance_std_dev * params.distance_std_dev;
+            let centre = before.at(u, v);
+            let (mut sum, mut squares, mut weights, mut count) = (0.0, 0.0, 0.0, 0.0);
+            let window = (v - 2..=v + 2).flat_map(|y| (u - 2..=u + 2).map(move |x| (x, y)));
+            for (x, y) in window {
+                let h = before.at(x, y);
+                let d = h.inverse_depth;
+                let squared = (x.abs_diff(u).pow(2) + y.abs_diff(v).pow(2)) as f32;
+                let tolerance = params.surface_slack_ratio * centre.inverse_depth;
+                let allowed = centre.variance + tolerance * tolerance + h.variance;
+                let difference = d - centre.inverse_depth;
+                let weight = match centre.is_some() {
+                    true if difference * difference <= allowed => h.variance + spread * squared,
+                    true => continue,
+                    false => h.variance + spread * d * d,
+                };
+                if h.is_some() {
+                    let weight = 1.0 / weight.max(1e-12);
+                    sum += weight * d;
+                    squares += weight * d * d;
+                    weights += weight;
+                    count += 1.0;
+                }
+            }
+            let out = &mut after[v * width + u];
+            if centre.is_some() {
+                match count <= f32::from(params.min_neighbours) {
+                    true => out.reject(),
+                    false => out.smoothed = sum / weights,
+                }
+            } else if map.candidates.at(u, v) {
+                let sums = FillingSums {
+                    weights: [weights; LANES],
+                    weighted: [sum; LANES],
+                    squares: [squares; LANES],
+                    count: [count; LANES],
+                };
+                fill(out, &sums, 0, params);
+            }
+        }
+        after
+    }
+
+    #[test]
+    fn every_version_gives_the_bits_of_the_explanation() {
+        // No multiple of the lanes wide, more than a band high.
+        let (width, height) = (83, 2 * BAND_ROWS + 7);
+        let mut map = DepthMap::with_size(width, height);
+        let mut state = 1u32;
+        let mut random = |below: u32| {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (state >> 8) % below
+        };
+        for i in 0..width * height {
+            map.candidates.pixels_mut()[i] = random(10) < 8;
+            let failures = random(5) as u8;
+            // Dense and sparse parts, two surfaces, every degree of certainty.
+            let is_some = random(10) < if i % width < 40 { 7 } else { 2 };
+            let surface = if (i / 7) % 13 < 10 { 1.0 } else { 1.6 };
+            let inverse_depth = surface + random(100) as f32 * 1e-3;
+            let variance = [0.0, 1e-6, 1e-4, 1e-2][random(4) as usize];
+            let known = Hypothesis {
+                inverse_depth,
+                variance,
+                smoothed: 0.5,
+                validity: 9,
+                ..Hypothesis::NONE
+            };
+            map.hypotheses.pixels_mut()[i] =
+                Hypothesis { failures, ..if is_some { known } else { Hypothesis::NONE } };
+        }
+        let params = RegularisationParams::default();
+        let expected = regularised(&map, &params);
+        let bits = |h: &Hypothesis| {
+            let floats = [h.inverse_depth, h.variance, h.smoothed].map(f32::to_bits);
+            (floats, h.validity, h.failures)
+        };
+        let filled = |(h, before): (&Hypothesis, &Hypothesis)| h.is_some() && !before.is_some();
+        let dropped = |(h, before): (&Hypothesis, &Hypothesis)| !h.is_some() && before.is_some();
+        let pairs = || expected.iter().zip(map.hypotheses.pixels());
+        assert!(pairs().filter(|p| filled(*p)).count() > 100);
+        assert!(pairs().filter(|p| dropped(*p)).count() > 100);
+        for kernel in [smoothing_kernel(), |band: &mut Band<'_>| band.regularise()] {
+            let mut found = map.clone();
+            let mut scratch = RegularisationScratch::with_size(width, height);
+            // Twice with the same memory: nothing of the first may be left in it.
+            for _ in 0..2 {
+                found.hypotheses = map.hypotheses.clone();
+                regularise_with(kernel, &mut found, &mut scratch, &params);
+            }
+            assert!(found.hypotheses.pixels().iter().map(bits).eq(expected.iter().map(bits)));
+        }
     }
 }

@@ -1,32 +1,31 @@
-//! The sums over the neighbours of a block of pixels, compiled for the vector units that the
-//! processor has.
+//! The smoothing of some rows of the map, compiled for the vector units that the processor has.
 //!
 //! One source for all: no operation is fused or reordered, so every version gives the same bits.
 
-use crate::slam::depth::regularisation::{NeighbourSums, Neighbourhood};
+use crate::slam::depth::regularisation::Band;
 
-/// A version of [`Neighbourhood::sums`].
-pub(super) type SumsKernel = fn(&Neighbourhood<'_>, usize, usize) -> NeighbourSums;
+/// A version of [`Band::regularise`].
+pub(super) type SmoothingKernel = fn(&mut Band<'_>);
 
 /// The best version for this processor.
-pub(super) fn sums_kernel() -> SumsKernel {
+pub(super) fn smoothing_kernel() -> SmoothingKernel {
     #[cfg(target_arch = "x86_64")]
     if std::arch::is_x86_feature_detected!("avx2") {
-        return |neighbourhood, first, v| {
+        return |band| {
             // SAFETY: the processor has AVX2, as was just asked.
-            unsafe { sums_avx2(neighbourhood, first, v) }
+            unsafe { regularise_avx2(band) }
         };
     }
-    sums_portable
+    regularise_portable
 }
 
 /// The explanation of the others.
-fn sums_portable(neighbourhood: &Neighbourhood<'_>, first: usize, v: usize) -> NeighbourSums {
-    neighbourhood.sums(first, v)
+fn regularise_portable(band: &mut Band<'_>) {
+    band.regularise()
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn sums_avx2(neighbourhood: &Neighbourhood<'_>, first: usize, v: usize) -> NeighbourSums {
-    neighbourhood.sums(first, v)
+fn regularise_avx2(band: &mut Band<'_>) {
+    band.regularise()
 }

@@ -2,6 +2,7 @@
 
 use crate::slam::depth::epipolar::TwoView;
 use crate::slam::depth::gaussian::{ObservedPixels, Observer, observe};
+use crate::slam::depth::map::{KnownColumns, for_each_known};
 use crate::slam::depth::propagation::propagate;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::sim3::Sim3;
@@ -151,17 +152,18 @@ impl Mapper {
         keyframe.points.clear();
         keyframe.points.reserve_exact(known.min(MAX_KEYFRAME_POINTS));
         let image = &self.depth.image.intensity;
+        let mut columns = KnownColumns::default();
         for v in 0..image.height() {
-            let row = self.depth.hypotheses.row(v).iter().zip(image.row(v)).enumerate();
-            let known = row.filter(|(_, (h, _))| h.is_some() && h.smoothed > 0.0);
-            keyframe.points.extend(known.map(|(u, (h, &intensity))| DepthPoint {
-                u: u as u16,
-                v: v as u16,
-                inverse_depth: h.smoothed,
-                variance: h.variance,
-                intensity,
-            }));
+            let (row, intensities) = (self.depth.hypotheses.row(v), image.row(v));
+            for_each_known(row, &mut columns, |known| {
+                keyframe.points.extend(known.iter().map(|&u| {
+                    let (h, intensity) = (&row[usize::from(u)], intensities[usize::from(u)]);
+                    let (inverse_depth, variance) = (h.smoothed, h.variance);
+                    DepthPoint { u, v: v as u16, inverse_depth, variance, intensity }
+                }));
+            });
         }
+        keyframe.points.retain(|point| point.inverse_depth > 0.0);
         keyframe.points.truncate(MAX_KEYFRAME_POINTS);
     }
 
