@@ -133,6 +133,18 @@ pub(super) struct SmoothingSums {
     pub(super) count: [f32; LANES],
 }
 
+impl SmoothingSums {
+    /// The weighted means; not a number where no neighbour is consistent.
+    #[inline(always)]
+    pub(super) fn smoothed(&self) -> [f32; LANES] {
+        let mut means = [0.0; LANES];
+        for k in 0..LANES {
+            means[k] = self.weighted[k] / self.weights[k];
+        }
+        means
+    }
+}
+
 /// The sums of the pixels from `first` on in the middle one of the rows. Neighbours are consistent that
 /// differ by no more than a joint standard deviation and `slack` times the inverse depth.
 #[inline(always)]
@@ -182,6 +194,14 @@ pub(super) struct FillingSums {
     pub(super) weighted: [f32; LANES],
     pub(super) squares: [f32; LANES],
     pub(super) count: [f32; LANES],
+}
+
+impl FillingSums {
+    /// A bit for each pixel that has at least so many neighbours.
+    #[inline(always)]
+    pub(super) fn at_least(&self, neighbours: f32) -> u32 {
+        (0..LANES).fold(0, |bits, k| bits | u32::from(self.count[k] >= neighbours) << k)
+    }
 }
 
 /// The sums of the pixels from `first` on in the middle one of the rows.

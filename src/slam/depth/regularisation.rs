@@ -181,28 +181,44 @@ impl Band<'_> {
         let present = &around[RADIUS].variance;
         for first in (BORDER_PX..width - BORDER_PX).step_by(LANES) {
             let block = first..(first + LANES).min(width - BORDER_PX);
-            if present[block.clone()].iter().any(|&variance| variance >= 0.0) {
-                let sums = smoothing_sums(&around, first, params.surface_slack_ratio);
-                for u in block.clone().filter(|&u| present[u] >= 0.0) {
-                    smooth(&mut row[u], &sums, u - first, params);
-                }
+            let (mut known, mut holes) = (0u32, 0u32);
+            for (k, (&variance, &is_candidate)) in
+                present[block.clone()].iter().zip(&candidates[block.clone()]).enumerate()
+            {
+                known |= u32::from(variance >= 0.0) << k;
+                holes |= u32::from(!(variance >= 0.0) & is_candidate) << k;
             }
-            let is_hole = |u: usize| candidates[u] & !(present[u] >= 0.0);
-            if block.clone().any(is_hole) {
+            let row = &mut row[block];
+            if known != 0 {
+                let sums = smoothing_sums(&around, first, params.surface_slack_ratio);
+                let smoothed = sums.smoothed();
+                for_each_bit(known, |k| smooth(&mut row[k], &sums, smoothed[k], k, params));
+            }
+            if holes != 0 {
                 let sums = filling_sums(&around, first);
-                for u in block.filter(|&u| is_hole(u)) {
-                    fill(&mut row[u], &sums, u - first, params);
-                }
+                let enough = sums.at_least(f32::from(params.min_fill_neighbours));
+                for_each_bit(holes & enough, |k| fill(&mut row[k], &sums, k));
             }
         }
     }
 }
 
-/// Smooths the hypothesis whose sums stand at `lane`, or drops it for want of neighbours.
+/// Calls `take` with the places of the bits that are set, ascending: one guess wrong where they end, and
+/// not one at each.
+#[inline(always)]
+fn for_each_bit(mut bits: u32, mut take: impl FnMut(usize)) {
+    while bits != 0 {
+        take(bits.trailing_zeros() as usize);
+        bits &= bits - 1;
+    }
+}
+
+/// Gives the hypothesis whose sums stand at `lane` their mean, or drops it for want of neighbours.
 #[inline(always)]
 fn smooth(
     hypothesis: &mut Hypothesis,
     sums: &SmoothingSums,
+    smoothed: f32,
     lane: usize,
     params: &RegularisationParams,
 ) {
@@ -211,17 +227,17 @@ fn smooth(
     if few || !(sums.weights[lane] > 0.0) {
         hypothesis.reject();
     } else {
-        hypothesis.smoothed = sums.weighted[lane] / sums.weights[lane];
+        hypothesis.smoothed = smoothed;
     }
 }
 
-/// Gives a pixel without hypothesis the mean of its neighbours, where they are many and agree.
+/// Gives a pixel without hypothesis the mean of its neighbours, where they agree; that they are many is known.
 #[inline(always)]
-fn fill(out: &mut Hypothesis, sums: &FillingSums, lane: usize, params: &RegularisationParams) {
+fn fill(out: &mut Hypothesis, sums: &FillingSums, lane: usize) {
     /// Failures after which neighbours' depth is not tried again: the pixel is something else.
     const MAX_FAILURES: u8 = 2;
     let neighbours = sums.count[lane];
-    if out.failures > MAX_FAILURES || neighbours < f32::from(params.min_fill_neighbours) {
+    if out.failures > MAX_FAILURES {
         return;
     }
     let weights = sums.weights[lane];
@@ -351,14 +367,14 @@ mod tests {
                     true => out.reject(),
                     false => out.smoothed = sum / weights,
                 }
-            } else if map.candidates.at(u, v) {
+            } else if map.candidates.at(u, v) && count >= f32::from(params.min_fill_neighbours) {
                 let sums = FillingSums {
                     weights: [weights; LANES],
                     weighted: [sum; LANES],
                     squares: [squares; LANES],
                     count: [count; LANES],
                 };
-                fill(out, &sums, 0, params);
+                fill(out, &sums, 0);
             }
         }
         after
