@@ -10,8 +10,7 @@ use std::process::ExitCode;
 use std::time::Instant;
 
 use clap::Parser;
-use semidense::capture::simulator::params::SimulatorParams;
-use semidense::capture::source::{FrameSource, SourceName, open};
+use semidense::capture::source::{FrameSource, SourceName, SourceParams, open};
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::image::buffer::Image;
@@ -89,7 +88,7 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
     let mut all_millis = Vec::new();
     let (mut tried, mut started, mut wrong) = (0, 0, 0);
     for name in &arguments.sources {
-        let mut source = open(name, None, &SimulatorParams::default())?;
+        let mut source = open(name, None, &SourceParams::default())?;
         let frames = read(source.as_mut(), arguments.frames)?;
         let mut millis = Vec::new();
         let (mut here, mut none, mut wrongs, mut lates) = (0, 0, 0, Vec::new());
