@@ -246,7 +246,8 @@ pub fn message(bytes: &[u8]) {
                     None => break,
                 }
             }
-            let image = vec![9; (header.width as usize).wrapping_mul(header.height as usize) % 9999];
+            let image =
+                vec![9; (header.width as usize).wrapping_mul(header.height as usize) % 9999];
             let _ = keyframe_from_messages(&header, &points, &image_header, &image);
             let _ = keyframe_from_messages(&header, &points, &image_header, rest);
         }
@@ -294,7 +295,8 @@ pub fn pipeline(bytes: &[u8]) {
             // A frame, tracked; and with the pose that came of it, mapped.
             0 => {
                 let Some(view) = take_view(&mut rest, *kind) else { continue };
-                let (of, tracker) = tracker.get_or_insert_with(|| (view.intrinsics, tracker_for(view.intrinsics)));
+                let (of, tracker) =
+                    tracker.get_or_insert_with(|| (view.intrinsics, tracker_for(view.intrinsics)));
                 if *of != view.intrinsics {
                     (*of, *tracker) = (view.intrinsics, tracker_for(view.intrinsics));
                 }
@@ -317,10 +319,13 @@ pub fn pipeline(bytes: &[u8]) {
                 let Some(header) = take::<KeyframeHeader>(&mut rest) else { continue };
                 let Some(point) = take::<DepthPoint>(&mut rest) else { continue };
                 let size = (header.width as usize).saturating_mul(header.height as usize);
-                let Some((_, tracker)) = tracker.as_mut().filter(|_| size <= MAX_PIXELS) else { continue };
+                let Some((_, tracker)) = tracker.as_mut().filter(|_| size <= MAX_PIXELS) else {
+                    continue;
+                };
                 let (keyframe_id, epoch) = (header.keyframe_id, header.epoch);
                 let (width, height) = (header.width, header.height);
-                let image_header = KeyframeImageHeader { keyframe_id, epoch, width, height, stride: width };
+                let image_header =
+                    KeyframeImageHeader { keyframe_id, epoch, width, height, stride: width };
                 let mut points = vec![point];
                 points.extend((0..size).step_by(3).map(|i| DepthPoint {
                     u: (i % width as usize) as u16,
@@ -328,7 +333,9 @@ pub fn pipeline(bytes: &[u8]) {
                     ..point
                 }));
                 let image = picture(width as usize, height as usize, *kind);
-                if let Ok(keyframe) = keyframe_from_messages(&header, &points, &image_header, &image) {
+                if let Ok(keyframe) =
+                    keyframe_from_messages(&header, &points, &image_header, &image)
+                {
                     let mut reference = Reference::new(ReferenceParams::default());
                     reference.prepare_into(&keyframe);
                     tracker.adopt(Box::new(reference));

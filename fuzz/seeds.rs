@@ -17,8 +17,8 @@ use semidense::wire::message::{
     KeyframePoseMessage, PATH_BYTES, StepMessage, TEXT_BYTES,
 };
 
-use crate::parsers::{IMAGE_SIDE, SENSOR_YAML, plain};
 use super::test_images::{flat_block_jpeg, png_of};
+use crate::parsers::{IMAGE_SIDE, SENSOR_YAML, plain};
 
 /// A good input of a target.
 #[derive(Debug, Clone)]
@@ -38,7 +38,10 @@ pub fn seeds() -> Vec<Seed> {
     let mut add = |target, bytes: Vec<u8>| seeds.push(Seed { target, bytes });
     let kind = |kind: u8, rest: &[u8]| [&[kind], rest].concat();
     add("trajectory", b"# c\n1.5 1 2 3 0 0 0 1\n2.5\t-1e-3 2 3 0.5 0.5 0.5 0.5\n".to_vec());
-    add("trajectory", b"#t\n1500000000,1,2,3,1,0,0,0,9,9\n2500000000, 1, 2, 3, .5, .5, .5, .5\n".to_vec());
+    add(
+        "trajectory",
+        b"#t\n1500000000,1,2,3,1,0,0,0,9,9\n2500000000, 1, 2, 3, .5, .5, .5, .5\n".to_vec(),
+    );
     let toml = "model = \"radtan\"\nwidth = 64\nheight = 48\nfx = 50\nfy = 50.0\ncx = 32\ncy = 24\n\
                 coefficients = [0.1, 0.0, 0.0, 0.0]\nrate_hz = 30\n";
     let fisheye = toml.replace("radtan", "equidistant");
@@ -60,12 +63,22 @@ pub fn seeds() -> Vec<Seed> {
     add("lists", kind(3, b"1.25\n2.5\n"));
     images().into_iter().for_each(|bytes| add("image", bytes));
     let file = include_str!("../config/semidense.toml");
-    let plain: String = file.lines().filter(|l| !l.starts_with('#')).map(|l| format!("{l}\n")).collect();
+    let plain: String =
+        file.lines().filter(|l| !l.starts_with('#')).map(|l| format!("{l}\n")).collect();
     add("configuration", kind(0, plain.as_bytes()));
-    add("configuration", kind(0, b"[tracker]\ndeadline_ms = 5.0\n[mapper.scheduling]\ncpus = [0]\n"));
-    add("configuration", kind(1, b"mapper.threads=2\nsimulator.motion.mean_speed_m_s=1.0\ninstance=rig2\n"));
+    add(
+        "configuration",
+        kind(0, b"[tracker]\ndeadline_ms = 5.0\n[mapper.scheduling]\ncpus = [0]\n"),
+    );
+    add(
+        "configuration",
+        kind(1, b"mapper.threads=2\nsimulator.motion.mean_speed_m_s=1.0\ninstance=rig2\n"),
+    );
     add("map", map_bytes());
-    messages().into_iter().zip(0..).for_each(|(message, index)| add("message", kind(index, &message)));
+    messages()
+        .into_iter()
+        .zip(0..)
+        .for_each(|(message, index)| add("message", kind(index, &message)));
     add("pipeline", pipeline());
     seeds
 }
@@ -80,7 +93,14 @@ fn images() -> Vec<Vec<u8>> {
         png_of(side, side, ColorType::Grayscale, BitDepth::Eight, None, &samples(pixels)),
         png_of(side, side, ColorType::Grayscale, BitDepth::Sixteen, None, &samples(2 * pixels)),
         png_of(side, side, ColorType::Rgba, BitDepth::Eight, None, &samples(4 * pixels)),
-        png_of(side, side, ColorType::Indexed, BitDepth::Four, Some(&palette), &samples(pixels / 2)),
+        png_of(
+            side,
+            side,
+            ColorType::Indexed,
+            BitDepth::Four,
+            Some(&palette),
+            &samples(pixels / 2),
+        ),
         flat_block_jpeg(IMAGE_SIDE, IMAGE_SIDE, 1, false, |u, v, _| (40 * u + 80 * v) as u8),
         flat_block_jpeg(IMAGE_SIDE, IMAGE_SIDE, 3, false, |u, v, c| (40 * u + 80 * v) as u8 + c),
         flat_block_jpeg(IMAGE_SIDE, IMAGE_SIDE, 3, true, |u, v, c| (40 * u + 80 * v) as u8 + c),
@@ -107,7 +127,8 @@ fn map_bytes() -> Vec<u8> {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("map");
     let second = Keyframe { keyframe_id: 1, epoch: 1, ..keyframe() };
-    write_map(&path, &Map { keyframes: vec![keyframe(), second] }).expect("written");
+    write_map(&path, &Map { keyframes: vec![keyframe(), second], free_epoch: 17 })
+        .expect("written");
     std::fs::read(path).expect("read")
 }
 
@@ -181,7 +202,8 @@ fn messages() -> [Vec<u8>; 7] {
     let response = CommandResponse { status: 1, text_bytes: 2, text: [b't'; TEXT_BYTES] };
     [
         [bytes_of(&frame_header(1)), pixels.clone()].concat(),
-        [bytes_of(&pose_message(&pose(1), &timing)), bytes_of(&pose_message(&pose(2), &timing))].concat(),
+        [bytes_of(&pose_message(&pose(1), &timing)), bytes_of(&pose_message(&pose(2), &timing))]
+            .concat(),
         [
             bytes_of(&keyframe_header(&keyframe)),
             bytes_of(&keyframe_image_header(&keyframe)),
@@ -198,7 +220,8 @@ fn messages() -> [Vec<u8>; 7] {
 
 /// Frames, a keyframe from the wire, frames on it, and a pose from the wire.
 fn pipeline() -> Vec<u8> {
-    let frame = |sequence: u64| [vec![4 * sequence as u8], bytes_of(&frame_header(sequence))].concat();
+    let frame =
+        |sequence: u64| [vec![4 * sequence as u8], bytes_of(&frame_header(sequence))].concat();
     let keyframe = keyframe();
     let mut bytes = [frame(1), frame(2)].concat();
     bytes.push(2);

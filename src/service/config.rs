@@ -71,7 +71,7 @@ pub struct TrackerConfig {
     /// Live: time from a frame's arrival to its pose, milliseconds; 0 is half the time between two
     /// frames. At the deadline the best pose so far is published as degraded (budget).
     pub deadline_ms: f64,
-    /// Live: after so many frame periods without a frame the tracker is stale.
+    /// Live: after so many frame periods without a frame tracker and mapper are stale.
     pub stale_periods: f64,
     /// What its frame loop asks of the kernel. On a robot: fifo, and locked memory.
     pub scheduling: SchedulingParams,

@@ -5,7 +5,7 @@ use std::time::Duration;
 use crate::service::budget::IterationCosts;
 use crate::service::clock::now_nanos;
 use crate::service::config::Config;
-use crate::service::frame_order::{Arrival, FrameOrder};
+use crate::service::frame_order::{Arrival, FrameOrder, SILENCE};
 use crate::service::health::{Health, ProcessState};
 use crate::service::mode::Mode;
 use crate::service::reference_feed::ReferenceFeed;
@@ -238,12 +238,9 @@ impl<'a> Shell<'a> {
 
     /// Live: says it when frames have stopped coming. The next frame ends the state.
     fn look_for_silence(&mut self) {
-        let Some(last) = self.last_arrival_nanos.filter(|_| self.mode == Mode::Live) else {
-            return;
-        };
-        let allowed = self.config.tracker.stale_periods * self.order.period_nanos() as f64;
-        if now_nanos().saturating_sub(last) as f64 > allowed {
-            self.health.enter(ProcessState::Stale, "no frames come: look at capture");
+        let periods = self.config.tracker.stale_periods;
+        if self.mode == Mode::Live && self.order.is_silent(self.last_arrival_nanos, periods) {
+            self.health.enter(ProcessState::Stale, SILENCE);
         }
     }
 
