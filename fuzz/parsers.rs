@@ -199,7 +199,8 @@ pub fn map(bytes: &[u8]) {
     }
     let Some(intrinsics) = map.keyframes.last().map(|keyframe| keyframe.intrinsics) else { return };
     if intrinsics.width * intrinsics.height <= MAX_PIXELS {
-        let mut mapper = Mapper::new(intrinsics, small_mapper()).expect("valid parameters");
+        let mut mapper =
+            Mapper::new(intrinsics, MapperParams::default()).expect("valid parameters");
         mapper.resume(map);
         let view = View::new(1, 0, intrinsics, 3);
         let unknown = semidense::slam::pose::PoseEstimate::unknown(&view.frame());
@@ -358,16 +359,12 @@ fn tracker_for(intrinsics: Intrinsics) -> Tracker {
     Tracker::new(intrinsics, TrackerParams::default()).expect("valid parameters")
 }
 
-fn small_mapper() -> MapperParams {
-    MapperParams { max_map_megabytes: 1, ..MapperParams::default() }
-}
-
 fn map_step(
     mapper: &mut Option<(Intrinsics, Mapper)>,
     view: &View,
     pose: &semidense::slam::pose::PoseEstimate,
 ) {
-    let fresh = || Mapper::new(view.intrinsics, small_mapper()).expect("valid parameters");
+    let fresh = || Mapper::new(view.intrinsics, MapperParams::default()).expect("valid parameters");
     let (of, mapper) = mapper.get_or_insert_with(|| (view.intrinsics, fresh()));
     if *of != view.intrinsics {
         let before = std::mem::replace(mapper, fresh());

@@ -18,16 +18,15 @@ use crate::slam::pose::{DegradedReason, LostReason, PoseEstimate, TrackingState}
 use crate::slam::tracker::Tracker;
 use crate::wire::conversion::{
     PoseTiming, codes_from_state, frame_from_message, pose_from_message, pose_message,
-    rigid_from_message,
 };
 use crate::wire::keyframe_inbox::InboxError;
-use crate::wire::message::{FrameHeader, PoseMessage, StepMessage};
+use crate::wire::message::{FrameHeader, PoseMessage};
 use crate::wire::place::{Claim, Place, PlaceError};
 use crate::wire::port::{
     Access, Hub, OpenError, Publisher, ReceiveError, Received, SendError, Subscriber, WaitError,
     wait,
 };
-use crate::wire::topic::{FRAME, POSE, STEP, TRACKER_HEALTH};
+use crate::wire::topic::{FRAME, POSE, TRACKER_HEALTH};
 
 /// Longest sleep without a look at signals and health.
 const WAKE_PERIOD: Duration = Duration::from_millis(100);
@@ -86,8 +85,6 @@ struct Shell<'a> {
     frames: Subscriber<u8, FrameHeader>,
     poses: Publisher<PoseMessage, ()>,
     references: ReferenceFeed,
-    /// Live, until the first keyframe: what the mapper says of the last pose, for a restart.
-    steps: Option<Subscriber<StepMessage, ()>>,
     health: Health,
     tracker: Option<(Intrinsics, Tracker)>,
     last_intrinsics: Option<Intrinsics>,
@@ -117,7 +114,6 @@ impl<'a> Shell<'a> {
             frames: hub.subscriber(&FRAME)?,
             poses: hub.publisher(&POSE, 1)?,
             references,
-            steps: (mode == Mode::Live).then(|| hub.subscriber(&STEP)).transpose()?,
             health: Health::open(&hub, &TRACKER_HEALTH)?,
             tracker: None,
             last_intrinsics: None,
@@ -201,8 +197,9 @@ impl<'a> Shell<'a> {
             if let Some(used) = tracker.adopt(reference) {
                 self.references.give_back(used);
             }
-            if let Some(steps) = self.steps.take() {
-                resume(tracker, epoch, &steps)?;
+            // Another tracker's, which died.
+            if let Some(last) = self.references.last_pose().filter(|last| last.epoch == epoch) {
+                tracker.resume_at(last.nanos, &last.world_from_camera);
             }
         }
         let _span = tracing::trace_span!("track").entered();
@@ -288,23 +285,6 @@ impl<'a> Shell<'a> {
         counters.deadline_misses += u64::from(late);
         Ok(())
     }
-}
-
-/// Goes on from the last pose of this epoch that the mapper has heard of: another tracker's, which died.
-fn resume(
-    tracker: &mut Tracker,
-    epoch: u32,
-    steps: &Subscriber<StepMessage, ()>,
-) -> Result<(), ReceiveError> {
-    let newest = steps.newest()?;
-    let step = newest.as_ref().and_then(|message| message.payload().first());
-    if let Some(step) = step.filter(|step| step.has_pose == 1 && step.epoch == epoch)
-        && let Ok(world_from_camera) =
-            rigid_from_message(&step.world_from_camera, "world_from_camera")
-    {
-        tracker.resume_at(step.pose_nanos, &world_from_camera);
-    }
-    Ok(())
 }
 
 /// A state and its reason, for whoever looks on.
