@@ -199,8 +199,7 @@ pub fn map(bytes: &[u8]) {
     }
     let Some(intrinsics) = map.keyframes.last().map(|keyframe| keyframe.intrinsics) else { return };
     if intrinsics.width * intrinsics.height <= MAX_PIXELS {
-        let mut mapper =
-            Mapper::new(intrinsics, MapperParams::default()).expect("valid parameters");
+        let Ok(mut mapper) = Mapper::new(intrinsics, MapperParams::default()) else { return };
         mapper.resume(map);
         let view = View::new(1, 0, intrinsics, 3);
         let unknown = semidense::slam::pose::PoseEstimate::unknown(&view.frame());
@@ -364,14 +363,17 @@ fn map_step(
     view: &View,
     pose: &semidense::slam::pose::PoseEstimate,
 ) {
-    let fresh = || Mapper::new(view.intrinsics, MapperParams::default()).expect("valid parameters");
-    let (of, mapper) = mapper.get_or_insert_with(|| (view.intrinsics, fresh()));
-    if *of != view.intrinsics {
-        let before = std::mem::replace(mapper, fresh());
-        mapper.succeed(before);
-        *of = view.intrinsics;
+    if mapper.as_ref().is_none_or(|(of, _)| *of != view.intrinsics) {
+        // Too small an image is refused, as in the mapper's shell.
+        let Ok(mut fresh) = Mapper::new(view.intrinsics, MapperParams::default()) else { return };
+        if let Some((_, before)) = mapper.take() {
+            fresh.succeed(before);
+        }
+        *mapper = Some((view.intrinsics, fresh));
     }
-    mapper.step(&view.frame(), pose, None);
+    if let Some((_, mapper)) = mapper {
+        mapper.step(&view.frame(), pose, None);
+    }
 }
 
 /// A frame with a picture of its own.

@@ -30,7 +30,7 @@ pub struct Seed {
 }
 
 const CAMERA: Intrinsics =
-    Intrinsics { fx: 20.0, fy: 20.0, cx: 15.5, cy: 11.5, width: 32, height: 24 };
+    Intrinsics { fx: 25.0, fy: 25.0, cx: 19.5, cy: 15.5, width: 40, height: 32 };
 
 /// At least one seed of each target, and one for each kind that its first byte can name.
 pub fn seeds() -> Vec<Seed> {

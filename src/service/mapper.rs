@@ -241,7 +241,15 @@ impl<'a> Shell<'a> {
             return Ok(());
         };
         if self.mapper.as_ref().is_none_or(|(of, _)| *of != intrinsics) {
-            self.change_camera(intrinsics)?;
+            match self.change_camera(intrinsics) {
+                Err(MapperError::Parameter(error)) => {
+                    // The configuration was checked at the start: it is the image that is too small.
+                    self.health.counters().refused += 1;
+                    self.health.enter(ProcessState::Running, &error.to_string());
+                    return Ok(());
+                }
+                changed => changed?,
+            }
         }
         let Some((_, mapper)) = &mut self.mapper else { return Ok(()) };
         let _span = tracing::trace_span!("frame", sequence = frame.sequence).entered();
@@ -279,8 +287,8 @@ impl<'a> Shell<'a> {
     /// A mapper for another camera: the first, which goes on from what a dead one has left, or one in
     /// mid-stream, which begins an epoch.
     fn change_camera(&mut self, intrinsics: Intrinsics) -> Result<(), MapperError> {
-        self.output.open_images(&self.hub, &intrinsics)?;
         let mut mapper = Mapper::new(intrinsics, self.config.mapping.clone())?;
+        self.output.open_images(&self.hub, &intrinsics)?;
         if let Some((_, before)) = self.mapper.take() {
             self.health.counters().resized += 1;
             mapper.succeed(before);
