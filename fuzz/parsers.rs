@@ -433,15 +433,25 @@ pub mod plain {
     /// Implement it for nothing else.
     pub unsafe trait Message {}
 
-    // SAFETY: src/wire/message.rs promises it of every message.
-    unsafe impl Message for FrameHeader {}
-    unsafe impl Message for PoseMessage {}
-    unsafe impl Message for KeyframeHeader {}
-    unsafe impl Message for KeyframeImageHeader {}
-    unsafe impl Message for DepthPoint {}
-    unsafe impl Message for KeyframePoseMessage {}
-    unsafe impl Message for StepMessage {}
-    unsafe impl Message for HealthMessage {}
-    unsafe impl Message for CommandRequest {}
-    unsafe impl Message for CommandResponse {}
+    macro_rules! messages {
+        ($($message:ty),*) => {
+            $(
+                // SAFETY: src/wire/message.rs promises it of every message.
+                unsafe impl Message for $message {}
+            )*
+        };
+    }
+
+    messages!(
+        FrameHeader,
+        PoseMessage,
+        KeyframeHeader,
+        KeyframeImageHeader,
+        DepthPoint,
+        KeyframePoseMessage,
+        StepMessage,
+        HealthMessage,
+        CommandRequest,
+        CommandResponse
+    );
 }

@@ -145,7 +145,11 @@ fn kill(watch: &mut Watch, peer: &mut Peer) -> Duration {
 fn soak(kills: usize, seed: u64) {
     let rig = Rig::new();
     let source = "loop:1000000:20:sim";
-    let child = rig.run(60, &["--live", "--source", source]).spawn().unwrap();
+    // The dice kill the same process again within two seconds of its start, six times in a row if they are
+    // thrown often enough: no reason to give up here.
+    let patient = ["--set", "supervisor.max_restarts=1000"];
+    let mut command = rig.run(60, &["--live", "--source", source]);
+    let child = command.args(patient).spawn().unwrap();
     let hub = rig.observe();
     let mut watch = Watch::new(&hub);
     watch.until_resumed("the first pose");
