@@ -9,7 +9,7 @@ use std::os::unix::net::UnixDatagram;
 use std::process::Child;
 
 use rustix::process::Signal;
-use support::{Rig, end, signal, small_camera, until};
+use support::{Rig, signal, small_camera, until};
 
 /// Time between two heartbeats that the manager allows: loops wake ten times in a second.
 const WATCHDOG_US: &str = "800000";
@@ -72,13 +72,15 @@ impl Manager {
         self.heard.iter().any(|heard| heard == message)
     }
 
+    /// Ends it, and listens until it has ended: a socket holds few messages.
     fn stop(mut self) -> Vec<String> {
+        self.listen();
         signal(&self.child, Signal::TERM);
-        end(self.child);
-        let mut bytes = [0; 4096];
-        while let Ok(length) = self.socket.recv(&mut bytes) {
-            self.heard.push(String::from_utf8(bytes[..length].to_vec()).unwrap());
-        }
+        until("its end", || {
+            self.listen();
+            self.child.try_wait().unwrap()
+        });
+        self.listen();
         self.heard
     }
 }
