@@ -13,7 +13,7 @@ const RESERVED: &[(&str, &[&str], &str)] = &[
     ("iceoryx2::", &["src/wire/"], "its API changes with every release: one room to change"),
     ("png::", &["src/capture/"], "image files are read and written in one room"),
     ("zune_jpeg", &["src/capture/"], "image files are read and written in one room"),
-    ("v4l::", &["src/capture/v4l"], "cameras are opened in one file"),
+    ("ioctl", &["src/capture/v4l"], "the kernel's video interface is spoken in one room"),
     (
         "std::time",
         &["src/service/", "src/command/", "src/wire/", "src/capture/v4l"],

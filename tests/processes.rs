@@ -78,7 +78,7 @@ fn replayed_poses() -> BTreeMap<u64, String> {
         small_camera(FRAMES).iter().map(|s| format!("simulator.{s}")).collect();
     let config = Config::load(None, &settings).unwrap();
     let name: SourceName = "sim".parse().unwrap();
-    let mut source = open(&name, None, &config.simulator).unwrap();
+    let mut source = open(&name, None, &config.source_params()).unwrap();
     let replayed = ReplayConfig {
         tracker: config.tracking,
         mapper: config.mapping,

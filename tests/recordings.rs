@@ -3,8 +3,7 @@
 use std::io::Write;
 use std::path::PathBuf;
 
-use semidense::capture::simulator::params::SimulatorParams;
-use semidense::capture::source::{SourceName, open};
+use semidense::capture::source::{SourceName, SourceParams, open};
 
 /// The folder of a development recording; `None`, and a word about it, where it is not there.
 fn recording(name: &str) -> Option<PathBuf> {
@@ -27,7 +26,7 @@ fn recording(name: &str) -> Option<PathBuf> {
 
 #[test]
 fn every_recording_is_read_whole() {
-    let simulator = SimulatorParams::default();
+    let params = SourceParams::default();
     for (name, frames, poses, depths) in [
         ("redkitchen", 500, 503, 125),
         ("fr1-floor", 90, 316, 90),
@@ -35,7 +34,7 @@ fn every_recording_is_read_whole() {
         ("tsukuba", 150, 150, 0),
     ] {
         let Some(folder) = recording(name) else { continue };
-        let mut source = open(&SourceName::Tum(folder), None, &simulator).expect(name);
+        let mut source = open(&SourceName::Tum(folder), None, &params).expect(name);
         assert_eq!(source.num_frames(), Some(frames), "{name}");
         assert_eq!(source.ground_truth().len(), poses, "{name}");
         let k = source.intrinsics();

@@ -7,7 +7,7 @@ use semidense::capture::simulator::Simulator;
 use semidense::capture::simulator::params::{
     MotionKind, MotionParams, SceneKind, SensorParams, SimulatorParams,
 };
-use semidense::capture::source::{FrameSource, SourceName, open};
+use semidense::capture::source::{FrameSource, SourceName, SourceParams, open};
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::image::buffer::Image;
 use semidense::slam::two_frame::evidence::EvidenceParams;
@@ -183,7 +183,7 @@ fn assert_recording_starts(name: &str, skips: &[usize], direction_deg: f64, dept
     let Some(folder) = recording(name) else { return };
     for &skip in skips {
         let mut source =
-            open(&SourceName::Tum(folder.clone()), None, &SimulatorParams::default()).unwrap();
+            open(&SourceName::Tum(folder.clone()), None, &SourceParams::default()).unwrap();
         let start = start(source.as_mut(), skip).unwrap();
         println!("{name} from {skip}: {start:.3?}");
         assert!(

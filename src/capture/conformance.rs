@@ -5,7 +5,9 @@ use std::path::Path;
 
 use crate::capture::image_file::{write_depth_png, write_gray_png};
 use crate::capture::simulator::params::SimulatorParams;
-use crate::capture::source::{self, FrameSource, FrameStamp, SourceError, SourceName};
+use crate::capture::source::{
+    self, FrameSource, FrameStamp, SourceError, SourceName, SourceParams,
+};
 use crate::capture::test_images::flat_block_jpeg;
 
 const WIDTH: usize = 32;
@@ -102,7 +104,7 @@ fn open(name: &SourceName, rig: Option<&Path>) -> Result<Box<dyn FrameSource>, S
         focal_px: 30.0,
         ..SimulatorParams::default()
     };
-    source::open(name, rig, &simulator)
+    source::open(name, rig, &SourceParams { simulator, ..SourceParams::default() })
 }
 
 /// Makes a dataset, lets `spoil` change it and opens it.
@@ -385,7 +387,7 @@ fn source_names_are_parsed_and_explained() {
         ("ros:topic", "this kind is not known; sources are sim[:SCENE], tum:DIR"),
         ("tum", "the folder is missing"),
         ("images:", "the folder is missing"),
-        ("v4l:", "the device is missing, as /dev/video0"),
+        ("v4l:", "the device is missing, as in v4l:/dev/video0"),
         ("sim:", "the scene's name is missing"),
         ("/", "say what kind of recording it is, as in tum:DIR"),
     ] {
@@ -395,6 +397,6 @@ fn source_names_are_parsed_and_explained() {
     let rig = Path::new("rig.toml");
     let simulated = open(&SourceName::Simulator { scene: None }, Some(rig)).err().expect("a rig");
     assert!(simulated.to_string().contains("the simulator takes no rig"), "{simulated}");
-    let camera = open(&SourceName::Camera("/dev/video0".into()), None).err().expect("no v4l");
-    assert!(camera.to_string().contains("opens no cameras"), "{camera}");
+    let camera = open(&SourceName::Camera("/dev/video0".into()), None).err().expect("no rig");
+    assert!(camera.to_string().contains("a camera needs a rig file"), "{camera}");
 }

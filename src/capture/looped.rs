@@ -98,7 +98,7 @@ impl FrameSource for Looped {
 mod tests {
     use super::*;
     use crate::capture::simulator::params::SimulatorParams;
-    use crate::capture::source::open;
+    use crate::capture::source::{SourceParams, open};
 
     #[test]
     fn frames_go_to_and_fro_at_the_rate() {
@@ -109,7 +109,8 @@ mod tests {
             focal_px: 50.0,
             ..SimulatorParams::default()
         };
-        let mut once = open(&"sim".parse().unwrap(), None, &simulator).unwrap();
+        let params = SourceParams { simulator, ..SourceParams::default() };
+        let mut once = open(&"sim".parse().unwrap(), None, &params).unwrap();
         once.prepare(&mut |_, _| true).unwrap();
         let mut frames = Vec::new();
         let mut pixels = vec![0; 64 * 48];
@@ -117,7 +118,7 @@ mod tests {
             frames.push(pixels.clone());
         }
         assert_eq!(frames.len(), 4);
-        let mut looped = open(&"loop:9:50:sim".parse().unwrap(), None, &simulator).unwrap();
+        let mut looped = open(&"loop:9:50:sim".parse().unwrap(), None, &params).unwrap();
         looped.prepare(&mut |_, _| true).unwrap();
         for (sequence, place) in [0, 1, 2, 3, 2, 1, 0, 1, 2].into_iter().enumerate() {
             let stamp = looped.next_into(&mut pixels).unwrap().unwrap();
@@ -132,7 +133,8 @@ mod tests {
     fn a_loop_of_one_frame_repeats_it() {
         let simulator =
             SimulatorParams { frames: 1, width: 64, height: 48, ..SimulatorParams::default() };
-        let mut looped = open(&"loop:3:10:sim".parse().unwrap(), None, &simulator).unwrap();
+        let params = SourceParams { simulator, ..SourceParams::default() };
+        let mut looped = open(&"loop:3:10:sim".parse().unwrap(), None, &params).unwrap();
         looped.prepare(&mut |_, _| true).unwrap();
         let mut pixels = vec![0; 64 * 48];
         let count = std::iter::from_fn(|| looped.next_into(&mut pixels).unwrap()).count();

@@ -1,4 +1,4 @@
-//! Frames in: dataset readers, simulator, cameras. The only place that names image files and v4l.
+//! Frames in: dataset readers, simulator, cameras. The only place that names image files and video devices.
 
 #[cfg(test)]
 mod conformance;
@@ -20,3 +20,4 @@ pub mod source;
 #[cfg(test)]
 mod test_images;
 pub mod tum;
+pub mod v4l;

@@ -1,6 +1,7 @@
 //! The trait of everything that frames come from.
 
 use std::fmt;
+use std::os::fd::BorrowedFd;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
@@ -9,7 +10,8 @@ use crate::capture::looped::Looped;
 use crate::capture::rig::{Rig, RigError};
 use crate::capture::simulator::Simulator;
 use crate::capture::simulator::params::SimulatorParams;
-use crate::capture::{euroc, image_folder, tum};
+use crate::capture::v4l::params::CameraParams;
+use crate::capture::{euroc, image_folder, tum, v4l};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::rectification::RectificationError;
 use crate::slam::image::buffer::Image;
@@ -27,6 +29,37 @@ pub struct FrameStamp {
     pub exposure_nanos: u64,
     /// Sensor gain, 0 where unknown.
     pub gain: f32,
+}
+
+/// What waiting for a frame came to.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Arrival {
+    /// The next frame can be read at once.
+    Frame,
+    /// None yet: the time is over, or the caller was woken.
+    Nothing,
+    /// There is no camera to read from, for this reason; it is opened as soon as it can be.
+    Absent(String),
+}
+
+/// Frames of a camera that did not become frames here.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct FrameLosses {
+    /// Never came, by the driver's numbers.
+    pub missing: u64,
+    /// Came, and were passed over for a newer one.
+    pub late: u64,
+    /// Came damaged.
+    pub broken: u64,
+}
+
+/// A remark of a source for the log.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Notice {
+    /// What is remarked.
+    pub text: String,
+    /// Whether something is not as it was asked for.
+    pub is_warning: bool,
 }
 
 /// Why a source cannot be opened or gave no frame; says what, where and what to do.
@@ -127,6 +160,30 @@ pub enum SourceError {
     /// An image of the sequence is not usable.
     #[error(transparent)]
     Image(#[from] ImageFileError),
+    /// A camera without a calibration.
+    #[error(
+        "v4l:{name}: a camera needs a rig file, which says what its lens is: name it with --rig FILE (config/rigs/webcam.toml is a start, for a first try at 640x480)"
+    )]
+    CameraRig {
+        /// The camera.
+        name: String,
+    },
+    /// A camera that cannot serve.
+    #[error("v4l:{name}: {reason}")]
+    Camera {
+        /// The camera.
+        name: String,
+        /// Why, and what to do.
+        reason: String,
+    },
+    /// A frame came damaged; the next may be good.
+    #[error("v4l:{name}: a damaged frame: {reason}")]
+    BrokenFrame {
+        /// The camera.
+        name: String,
+        /// What is wrong with it.
+        reason: String,
+    },
     /// The caller's buffer does not fit the frames.
     #[error("a buffer of {found} bytes for frames of {width}x{height}; give width * height bytes")]
     Buffer {
@@ -139,9 +196,16 @@ pub enum SourceError {
     },
 }
 
+impl SourceError {
+    /// Whether only this frame is lost, as is usual with cameras.
+    pub fn is_passing(&self) -> bool {
+        matches!(self, Self::BrokenFrame { .. })
+    }
+}
+
 /// The forms of a source name, for errors and help.
 pub const SOURCE_FORMS: &str =
-    "sim[:SCENE], tum:DIR, euroc:DIR, images:DIR and loop:FRAMES:HZ:SOURCE";
+    "sim[:SCENE], tum:DIR, euroc:DIR, images:DIR, v4l:DEVICE and loop:FRAMES:HZ:SOURCE";
 
 /// The name of a source, as the command line takes it.
 #[derive(Debug, Clone, PartialEq)]
@@ -157,8 +221,8 @@ pub enum SourceName {
     Euroc(PathBuf),
     /// `images:DIR`: a folder of images.
     Images(PathBuf),
-    /// `v4l:DEVICE`: a camera.
-    Camera(PathBuf),
+    /// `v4l:DEVICE`: a camera, by its path, its number or the name that udev gives it.
+    Camera(String),
     /// `loop:FRAMES:HZ:SOURCE`: a recording to and fro, for benches and soak tests.
     Looped {
         /// Frames in all.
@@ -209,14 +273,18 @@ impl FromStr for SourceName {
             "tum" => Self::Tum,
             "euroc" => Self::Euroc,
             "images" => Self::Images,
-            "v4l" => Self::Camera,
+            "v4l" => {
+                return match rest {
+                    None | Some("") => Err(error("the device is missing, as in v4l:/dev/video0")),
+                    Some(device) => Ok(Self::Camera(device.to_owned())),
+                };
+            }
             _ if Path::new(name).exists() => {
                 return Err(error("say what kind of recording it is, as in tum:DIR"));
             }
             _ => return Err(error("this kind is not known")),
         };
         match rest {
-            None | Some("") if kind == "v4l" => Err(error("the device is missing, as /dev/video0")),
             None | Some("") => Err(error("the folder is missing")),
             Some(place) => Ok(form(PathBuf::from(place))),
         }
@@ -240,7 +308,7 @@ impl fmt::Display for SourceName {
             Self::Tum(folder) => write!(out, "tum:{}", folder.display()),
             Self::Euroc(folder) => write!(out, "euroc:{}", folder.display()),
             Self::Images(folder) => write!(out, "images:{}", folder.display()),
-            Self::Camera(device) => write!(out, "v4l:{}", device.display()),
+            Self::Camera(device) => write!(out, "v4l:{device}"),
             Self::Looped { num_frames, rate_hz, inner } => {
                 write!(out, "loop:{num_frames}:{rate_hz}:{inner}")
             }
@@ -248,11 +316,21 @@ impl fmt::Display for SourceName {
     }
 }
 
-/// Opens a source. `rig` is a rig file, which wins over the calibration that a recording brings.
+/// What can be set about sources.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct SourceParams {
+    /// The simulated camera and its world.
+    pub simulator: SimulatorParams,
+    /// What is asked of a camera.
+    pub camera: CameraParams,
+}
+
+/// Opens a source. `rig` is a rig file, which wins over the calibration that a recording brings. A camera
+/// is opened when its first frame is awaited.
 pub fn open(
     name: &SourceName,
     rig: Option<&Path>,
-    simulator: &SimulatorParams,
+    params: &SourceParams,
 ) -> Result<Box<dyn FrameSource>, SourceError> {
     let unavailable = |reason| SourceError::Unavailable { name: name.to_string(), reason };
     if let Some(folder) = name.folder().filter(|folder| !folder.is_dir()) {
@@ -266,7 +344,7 @@ pub fn open(
             "the simulator takes no rig; its camera is in the table [simulator] of the configuration",
         )),
         SourceName::Simulator { scene } => {
-            let mut params = simulator.clone();
+            let mut params = params.simulator.clone();
             if let Some(scene) = scene {
                 params.scene = scene
                     .parse()
@@ -278,12 +356,10 @@ pub fn open(
             Err(unavailable("a camera cannot be repeated; name a recording or the simulator"))
         }
         SourceName::Looped { num_frames, rate_hz, inner } => {
-            let source = open(inner, rig, simulator)?;
+            let source = open(inner, rig, params)?;
             Ok(Box::new(Looped::new(name.clone(), source, *num_frames, *rate_hz)))
         }
-        SourceName::Camera(_) => Err(unavailable(
-            "this version opens no cameras; record images and use images:DIR, or the simulator with sim",
-        )),
+        SourceName::Camera(device) => Ok(Box::new(v4l::open(device, rig, &params.camera)?)),
     }
 }
 
@@ -327,6 +403,13 @@ pub trait FrameSource: Send {
         Ok(())
     }
 
+    /// Waits until the next frame can be read, at most `millis`, or until `wake` can be read. Recordings
+    /// always have one, or their end.
+    fn await_frame(&mut self, wake: BorrowedFd<'_>, millis: u32) -> Result<Arrival, SourceError> {
+        let _ = (wake, millis);
+        Ok(Arrival::Frame)
+    }
+
     /// Writes the next frame into `pixels` (`width * height` of [`FrameSource::intrinsics`]);
     /// `None` after the last. After an error the next call goes on with the frame after it; what
     /// `pixels` holds then is not a frame.
@@ -338,6 +421,16 @@ pub trait FrameSource: Send {
         let mut pixels = vec![0; k.width * k.height];
         while self.next_into(&mut pixels)?.is_some_and(|stamp| stamp.sequence < sequence) {}
         Ok(())
+    }
+
+    /// What a camera has lost so far; `None` for recordings, which lose nothing.
+    fn losses(&self) -> Option<FrameLosses> {
+        None
+    }
+
+    /// A remark for the log that nobody has taken yet: what was granted, what was refused.
+    fn take_notice(&mut self) -> Option<Notice> {
+        None
     }
 
     /// Ground-truth camera poses in order of their stamps, empty where there are none.

@@ -4,6 +4,7 @@
 //! not understood, 130 interrupted (results so far are written).
 
 pub mod bench;
+pub mod cameras;
 pub mod capture;
 pub mod doctor;
 pub mod evaluate;
@@ -134,6 +135,7 @@ enum Subcommands {
     Status(status::StatusArguments),
     Bench(bench::BenchArguments),
     Doctor(doctor::DoctorArguments),
+    Cameras(cameras::CamerasArguments),
 }
 
 /// The command line as `clap` knows it: what man page and shell completions are made of.
@@ -154,6 +156,7 @@ pub fn main() -> ExitCode {
             Subcommands::Simulate(arguments) => simulate::run(&config, &arguments),
             Subcommands::Evaluate(arguments) => evaluate::run(&arguments),
             Subcommands::Status(arguments) => status::run(&config, arguments),
+            Subcommands::Cameras(arguments) => cameras::run(arguments),
             Subcommands::Doctor(arguments) => doctor::run(&config, arguments),
             Subcommands::Bench(arguments) => bench::run(&config, &line.common, arguments),
         };

@@ -79,10 +79,17 @@ pub struct ReplayArgs {
 /// Replays, writes the results and prints the summary.
 pub fn run(config: &Config, args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error>> {
     prepare_output(&args.output)?;
-    let mut simulator = config.simulator.clone();
+    if args.source.is_camera() {
+        let name = &args.source;
+        return Err(
+            format!("{name}: a camera cannot be replayed; semidense run --source {name}").into()
+        );
+    }
+    let mut params = config.source_params();
+    let simulator = &mut params.simulator;
     simulator.seed = args.seed.unwrap_or(simulator.seed);
     simulator.frames = args.frames.map_or(simulator.frames, |n| simulator.frames.min(n as usize));
-    let mut source = open(&args.source, args.rig.as_deref(), &simulator)?;
+    let mut source = open(&args.source, args.rig.as_deref(), &params)?;
     if let Some(conflict) = rig_conflict(&args.source, args.rig.as_deref()) {
         note(&format!("warning: {conflict}"));
     }

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use crate::capture::source::{
-    FrameSource, FrameStamp, SourceError, SourceName, open, rig_conflict,
+    Arrival, FrameSource, FrameStamp, SourceError, SourceName, open, rig_conflict,
 };
 use crate::service::clock::{Pace, duration_from_nanos, now_nanos};
 use crate::service::config::Config;
@@ -112,6 +112,16 @@ pub fn run(
     outcome
 }
 
+/// What became of the next frame.
+enum Sent {
+    /// It was sent, with this sequence.
+    Frame(u64),
+    /// It was damaged.
+    Nothing,
+    /// There is none.
+    End,
+}
+
 struct Shell<'a> {
     config: &'a Config,
     mode: Mode,
@@ -125,6 +135,8 @@ struct Shell<'a> {
     peers: [Peer; 2],
     health: Health,
     pace: Option<Pace>,
+    /// Why there is no camera, while there is none.
+    absence: Option<String>,
     /// What a camera's numbers begin with.
     first_sequence: u64,
     next_sequence: Option<u64>,
@@ -137,8 +149,12 @@ impl<'a> Shell<'a> {
         options: &CaptureOptions,
         shutdown: &'a Shutdown,
     ) -> Result<Self, CaptureError> {
+        if let (SourceName::Camera(name), Mode::Lockstep) = (&options.source, options.mode) {
+            let reason = "a camera does not wait for the map; leave out --lockstep".to_owned();
+            return Err(SourceError::Camera { name: name.clone(), reason }.into());
+        }
         let rig = options.rig.as_deref();
-        let source = open(&options.source, rig, &config.simulator)?;
+        let source = open(&options.source, rig, &config.source_params())?;
         if let Some(conflict) = rig_conflict(&options.source, rig) {
             tracing::warn!("{conflict}");
         }
@@ -164,6 +180,7 @@ impl<'a> Shell<'a> {
             intrinsics,
             health,
             pace: None,
+            absence: None,
             first_sequence: 0,
             next_sequence: None,
             _claim: claim,
@@ -226,28 +243,87 @@ impl<'a> Shell<'a> {
 
     /// Frame after frame.
     fn stream(&mut self) -> Result<(), CaptureError> {
-        self.health.enter(ProcessState::Running, "");
-        while let Some(sequence) = self.send_next()? {
-            if self.mode == Mode::Lockstep {
-                self.await_step(sequence)?;
+        if self.is_recorded() {
+            self.health.enter(ProcessState::Running, "");
+        }
+        loop {
+            if self.await_frame()? {
+                match self.send_next()? {
+                    Sent::Frame(sequence) if self.mode == Mode::Lockstep => {
+                        self.await_step(sequence)?;
+                    }
+                    Sent::Frame(_) | Sent::Nothing => {}
+                    Sent::End => return Ok(()),
+                }
             }
+            self.count_losses();
             self.health.report();
         }
-        Ok(())
     }
 
-    /// Reads the next frame into shared memory and sends it when it is due; its sequence, `None`
-    /// after the last.
-    fn send_next(&mut self) -> Result<Option<u64>, CaptureError> {
+    /// Waits for the next frame, for a moment; whether there is one. An absent camera is a state.
+    fn await_frame(&mut self) -> Result<bool, CaptureError> {
+        let millis = WAKE_PERIOD.as_millis() as u32;
+        let arrival = self.source.await_frame(self.shutdown.descriptor(), millis)?;
+        while let Some(notice) = self.source.take_notice() {
+            match notice.is_warning {
+                true => tracing::warn!("capture: {}", notice.text),
+                false => tracing::info!("capture: {}", notice.text),
+            }
+        }
+        if self.shutdown.is_requested() {
+            return Err(CaptureError::Interrupted);
+        }
+        match arrival {
+            Arrival::Frame => {
+                if self.absence.take().is_some() {
+                    tracing::warn!("capture: frames come again");
+                }
+                self.health.enter(ProcessState::Running, "");
+                return Ok(true);
+            }
+            Arrival::Nothing => {}
+            Arrival::Absent(reason) => {
+                self.health.enter(ProcessState::Stale, &reason);
+                if self.absence.as_ref() != Some(&reason) {
+                    tracing::warn!("capture: {reason}");
+                    self.absence = Some(reason);
+                }
+            }
+        }
+        Ok(false)
+    }
+
+    /// What a camera has lost, into the health.
+    fn count_losses(&mut self) {
+        if let Some(losses) = self.source.losses() {
+            let counters = self.health.counters();
+            counters.gaps = losses.missing;
+            counters.dropped = losses.late;
+            counters.refused = losses.broken;
+        }
+    }
+
+    /// Reads the next frame into shared memory and sends it when it is due.
+    fn send_next(&mut self) -> Result<Sent, CaptureError> {
         let _span = tracing::trace_span!("frame").entered();
         let mut loan = self.frames.loan(self.intrinsics.width * self.intrinsics.height)?;
-        let Some(mut stamp) = self.source.next_into(loan.bytes_mut())? else { return Ok(None) };
+        let mut stamp = match self.source.next_into(loan.bytes_mut()) {
+            Ok(Some(stamp)) => stamp,
+            Ok(None) => return Ok(Sent::End),
+            Err(error) if error.is_passing() => {
+                tracing::debug!("{error}");
+                return Ok(Sent::Nothing);
+            }
+            Err(error) => return Err(error.into()),
+        };
         stamp.sequence = stamp.sequence.saturating_add(self.first_sequence);
         if self.shutdown.is_requested() {
             return Err(CaptureError::Interrupted);
         }
         let clock_nanos = match self.mode {
-            Mode::Live if self.source.num_frames().is_none() => stamp.capture_nanos,
+            // A driver's stamp may lie in the future; no latency is negative.
+            Mode::Live if !self.is_recorded() => stamp.capture_nanos.min(now_nanos()),
             Mode::Live => {
                 let start = Pace::start(stamp.capture_nanos, now_nanos());
                 let due = self.pace.get_or_insert(start).due_nanos(stamp.capture_nanos);
@@ -259,7 +335,7 @@ impl<'a> Shell<'a> {
         let _span = tracing::trace_span!("publish", sequence = stamp.sequence).entered();
         loan.send(self.header(&stamp, clock_nanos))?;
         self.count(&stamp);
-        Ok(Some(stamp.sequence))
+        Ok(Sent::Frame(stamp.sequence))
     }
 
     fn header(&self, stamp: &FrameStamp, clock_nanos: i64) -> FrameHeader {

@@ -9,6 +9,8 @@ use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
 use crate::capture::simulator::params::SimulatorParams;
+use crate::capture::source::SourceParams;
+use crate::capture::v4l::params::CameraParams;
 use crate::service::results::ResultsParams;
 use crate::service::schedule::SchedulingParams;
 use crate::slam::mapper::MapperParams;
@@ -63,18 +65,22 @@ pub struct CaptureConfig {
     pub step_timeout_s: f64,
     /// What it asks of the kernel. On a robot: fifo, above the tracker's priority.
     pub scheduling: SchedulingParams,
+    /// What it asks of a camera (source `v4l:DEVICE`).
+    pub camera: CameraParams,
 }
 
 impl Default for CaptureConfig {
     fn default() -> Self {
         let scheduling = SchedulingParams { priority: 80, ..SchedulingParams::default() };
         let source = "sim".to_owned();
+        let camera = CameraParams::default();
         Self {
             source,
             rig: String::new(),
             connect_timeout_s: 30.0,
             step_timeout_s: 60.0,
             scheduling,
+            camera,
         }
     }
 }
@@ -195,6 +201,11 @@ impl Config {
         Ok(config)
     }
 
+    /// What can be set about sources.
+    pub fn source_params(&self) -> SourceParams {
+        SourceParams { simulator: self.simulator.clone(), camera: self.capture.camera.clone() }
+    }
+
     /// The configuration as TOML, every key.
     pub fn to_text(&self) -> String {
         // Every field is a plain value: nothing that TOML cannot say.
@@ -233,6 +244,7 @@ impl Config {
         let capture = &self.capture;
         check_range("capture.connect_timeout_s", capture.connect_timeout_s, seconds.clone())?;
         check_range("capture.step_timeout_s", capture.step_timeout_s, seconds.clone())?;
+        capture.camera.validate().map_err(|e| e.within("capture.camera"))?;
         check_range("tracker.deadline_ms", self.tracker.deadline_ms, 0.0..=10_000.0)?;
         check_range("tracker.stale_periods", self.tracker.stale_periods, 2.0..=1e6)?;
         for (process, scheduling) in [

@@ -1,11 +1,15 @@
 //! What on this machine will cost latency or break: each finding with the line that mends it.
 
+mod cameras;
+mod processes;
+
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use rustix::process::{Resource, getrlimit};
 use serde::Serialize;
 
+use self::cameras::{CameraAccess, camera_access};
 use crate::service::config::Config;
 use crate::service::schedule::Policy;
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -64,17 +68,19 @@ const MIN_LOCKED_BYTES: u64 = 512 << 20;
 pub struct Machine {
     /// Folder that holds `proc`, `sys` and `dev`.
     pub root: PathBuf,
+    /// How a camera is asked whether it can be used.
+    camera_access: CameraAccess,
 }
 
 impl Default for Machine {
     fn default() -> Self {
-        Self { root: PathBuf::from("/") }
+        Self { root: PathBuf::from("/"), camera_access }
     }
 }
 
 /// Looks at everything.
 pub fn examine(machine: &Machine, config: &Config) -> Vec<Finding> {
-    vec![
+    let mut findings = vec![
         real_time_limit(config),
         memory_limit(config),
         machine.real_time_throttling(),
@@ -83,8 +89,10 @@ pub fn examine(machine: &Machine, config: &Config) -> Vec<Finding> {
         machine.cpus(),
         shared_memory(),
         runtime_folder(config),
-        machine.cameras(),
-    ]
+    ];
+    findings.extend(machine.processes(config));
+    findings.extend(machine.cameras());
+    findings
 }
 
 fn wants_real_time(config: &Config) -> bool {
@@ -257,43 +265,6 @@ impl Machine {
         }
         Finding::warning(SUBJECT, found, "give it two: the mapper takes one for itself")
     }
-
-    fn cameras(&self) -> Finding {
-        const SUBJECT: &str = "cameras";
-        let folder = self.root.join("dev");
-        let is_camera =
-            |name: &str| name.strip_prefix("video").is_some_and(|n| n.parse::<u32>().is_ok());
-        let mut nodes: Vec<PathBuf> = fs::read_dir(folder)
-            .into_iter()
-            .flatten()
-            .flatten()
-            .filter(|entry| is_camera(&entry.file_name().to_string_lossy()))
-            .map(|entry| entry.path())
-            .collect();
-        nodes.sort();
-        let names = |nodes: &[&PathBuf]| {
-            let names: Vec<String> = nodes.iter().map(|n| n.display().to_string()).collect();
-            names.join(", ")
-        };
-        let closed: Vec<&PathBuf> = nodes.iter().filter(|node| !can_open(node)).collect();
-        if nodes.is_empty() {
-            return Finding::ok(SUBJECT, "none: recordings and the simulator work without");
-        }
-        if closed.is_empty() {
-            return Finding::ok(SUBJECT, names(&nodes.iter().collect::<Vec<_>>()));
-        }
-        Finding::warning(
-            SUBJECT,
-            format!("{} may not be opened", names(&closed)),
-            format!("usermod -aG video {}, and a new login", user()),
-        )
-    }
-}
-
-/// Whether this user may read and write it, without opening it: opening may wake a camera.
-fn can_open(path: &Path) -> bool {
-    use rustix::fs::{Access, access};
-    access(path, Access::READ_OK | Access::WRITE_OK).is_ok()
 }
 
 #[cfg(test)]
@@ -301,14 +272,14 @@ mod tests {
     use super::*;
 
     /// A machine whose kernel shows these files.
-    fn machine(files: &[(&str, &str)]) -> (tempfile::TempDir, Machine) {
+    pub(super) fn machine(files: &[(&str, &str)]) -> (tempfile::TempDir, Machine) {
         let folder = tempfile::tempdir().unwrap();
         for (path, text) in files {
             let path = folder.path().join(path);
             fs::create_dir_all(path.parent().unwrap()).unwrap();
             fs::write(path, text).unwrap();
         }
-        let machine = Machine { root: folder.path().to_owned() };
+        let machine = Machine { root: folder.path().to_owned(), ..Machine::default() };
         (folder, machine)
     }
 
@@ -335,24 +306,17 @@ mod tests {
             ("sys/devices/system/clocksource/clocksource0/current_clocksource", "tsc"),
             ("proc/sys/kernel/sched_rt_runtime_us", "950000"),
             ("proc/sys/kernel/sched_rt_period_us", "1000000"),
-            ("dev/video0", ""),
-            ("dev/video-camera", ""),
         ]);
-        for finding in [
-            machine.governor(),
-            machine.clock_source(),
-            machine.real_time_throttling(),
-            machine.cameras(),
-        ] {
+        for finding in [machine.governor(), machine.clock_source(), machine.real_time_throttling()]
+        {
             assert_eq!(finding.severity, Severity::Ok, "{finding:?}");
         }
-        assert!(machine.cameras().found.ends_with("dev/video0"));
     }
 
     #[test]
     fn a_kernel_that_shows_nothing_is_no_fault() {
         let (_folder, machine) = machine(&[]);
-        let findings = [machine.governor(), machine.clock_source(), machine.cameras()];
+        let findings = [machine.governor(), machine.clock_source(), machine.real_time_throttling()];
         assert!(findings.iter().all(|finding| finding.severity == Severity::Ok));
     }
 
@@ -362,7 +326,7 @@ mod tests {
         let root = folder.path().join("root");
         let config = Config { root: root.display().to_string(), ..Config::default() };
         let findings = examine(&Machine::default(), &config);
-        assert!(findings.len() >= 9 && !root.exists());
+        assert!(findings.len() >= 10 && !root.exists());
         let foreign = Config { root: "/proc/nowhere".to_owned(), ..Config::default() };
         assert_eq!(runtime_folder(&foreign).severity, Severity::Error);
     }

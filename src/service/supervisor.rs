@@ -125,7 +125,7 @@ pub fn run(
     shutdown: &Shutdown,
     observe: &mut dyn FnMut(&RunProgress),
 ) -> Result<RunOutcome, RunError> {
-    let source = open(&options.source, options.rig.as_deref(), &config.simulator)?;
+    let source = open(&options.source, options.rig.as_deref(), &config.source_params())?;
     let place = Place::new(&config.instance, &config.root)?;
     let _claim = claim_all(&place)?;
     place.check_shared_memory(shared_memory_bytes(&source.intrinsics(), None))?;

@@ -1,0 +1,121 @@
+//! Ground truth for a camera that is fed a recording: vivid's output, looped to its capture node.
+//!
+//! ```sh
+//! camera_loop feed tum:DIR HZ | v4l2-ctl -d /dev/video1 --stream-out-mmap --stream-from=-    # GREY, 640x480
+//! camera_loop watch tum:DIR TRUTH       # while `semidense run --source v4l:…` reads the capture node
+//! ```
+//!
+//! The recording has a quarter of the size; vivid's scaler copies pairs of pixels, so each is repeated
+//! four times. The node keeps the last picture that it was given, so that any pace will do. `watch` looks at every frame that capture sends, finds the picture of the recording that
+//! it is, pixel for pixel, and writes its true pose with the stamp of the camera.
+
+use std::collections::HashMap;
+use std::error::Error;
+use std::io::Write;
+use std::path::Path;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use semidense::capture::source::{FrameSource, SourceParams, open};
+use semidense::service::shutdown::Shutdown;
+use semidense::service::trajectory_file::write_trajectory;
+use semidense::slam::trajectory::StampedPose;
+use semidense::wire::message::FrameHeader;
+use semidense::wire::place::Place;
+use semidense::wire::port::{Access, Hub, Subscriber, wait};
+use semidense::wire::topic::FRAME;
+
+/// How much larger the output's pictures are, along each side.
+const SCALE: usize = 4;
+/// What the scaler copies at a time.
+const PAIR: usize = 2;
+
+fn main() -> ExitCode {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let words: Vec<&str> = arguments.iter().map(String::as_str).collect();
+    let outcome = match words.as_slice() {
+        ["feed", source, rate] => feed(source, rate),
+        ["watch", source, truth] => watch(source, truth),
+        _ => Err("usage: camera_loop feed SOURCE HZ | watch SOURCE TRUTH".into()),
+    };
+    match outcome {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("camera_loop: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// The pictures of a recording, with their stamps.
+fn pictures(source: &mut dyn FrameSource) -> Result<Vec<(i64, Vec<u8>)>, Box<dyn Error>> {
+    let k = source.intrinsics();
+    let mut found = Vec::new();
+    let mut pixels = vec![0; k.width * k.height];
+    while let Some(stamp) = source.next_into(&mut pixels)? {
+        found.push((stamp.capture_nanos, pixels.clone()));
+    }
+    Ok(found)
+}
+
+/// A picture as the output node takes it.
+fn enlarged(pixels: &[u8], width: usize) -> Vec<u8> {
+    let mut large = Vec::with_capacity(SCALE * SCALE * pixels.len());
+    for row in pixels.chunks(width) {
+        let row: Vec<u8> = row.chunks(PAIR).flat_map(|pair| pair.repeat(SCALE)).collect();
+        (0..SCALE).for_each(|_| large.extend_from_slice(&row));
+    }
+    large
+}
+
+/// To and fro, without end: the camera never jumps.
+fn feed(source: &str, rate_hz: &str) -> Result<(), Box<dyn Error>> {
+    let mut source = open(&source.parse()?, None, &SourceParams::default())?;
+    let width = source.intrinsics().width;
+    let period = Duration::from_secs_f64(1.0 / rate_hz.parse::<f64>()?);
+    let pictures = pictures(source.as_mut())?;
+    let mut output = std::io::stdout().lock();
+    let back = (1..pictures.len().saturating_sub(1)).rev();
+    let order: Vec<usize> = (0..pictures.len()).chain(back).collect();
+    loop {
+        for &index in &order {
+            output.write_all(&enlarged(&pictures[index].1, width))?;
+            std::thread::sleep(period);
+        }
+    }
+}
+
+fn watch(source: &str, truth: &str) -> Result<(), Box<dyn Error>> {
+    let mut source = open(&source.parse()?, None, &SourceParams::default())?;
+    let pictures = pictures(source.as_mut())?;
+    let poses: HashMap<i64, StampedPose> =
+        source.ground_truth().iter().map(|pose| (pose.nanos, *pose)).collect();
+    let index_of: HashMap<&[u8], usize> =
+        pictures.iter().enumerate().map(|(index, (_, pixels))| (&pixels[..], index)).collect();
+    let instance = std::env::var("SEMIDENSE_INSTANCE").unwrap_or_else(|_| "semidense".to_owned());
+    let hub = Hub::join(&Place::new(&instance, "")?, "camera_loop", Access::Observer)?;
+    let subscriber: Subscriber<u8, FrameHeader> = hub.subscriber(&FRAME)?;
+    let shutdown = Shutdown::install()?;
+    let (mut exact, mut unknown, mut repeated, mut last) = (0, 0, 0, None);
+    let mut trajectory = Vec::new();
+    while !shutdown.is_requested() {
+        wait(&[subscriber.events()], Some(shutdown.descriptor()), Duration::from_secs(1))?;
+        while let Some(frame) = subscriber.receive()? {
+            let Some(&index) = index_of.get(frame.payload()) else {
+                unknown += 1;
+                continue;
+            };
+            exact += 1;
+            repeated += usize::from(last.replace(index) == Some(index));
+            if let Some(pose) = poses.get(&pictures[index].0) {
+                trajectory.push(StampedPose { nanos: frame.header().capture_nanos, ..*pose });
+            }
+        }
+    }
+    write_trajectory(Path::new(truth), "true poses at the stamps of the camera", &trajectory)?;
+    println!(
+        "{{\"exact\": {exact}, \"unknown\": {unknown}, \"repeated\": {repeated}, \"poses\": {}}}",
+        trajectory.len()
+    );
+    Ok(())
+}

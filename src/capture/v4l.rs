@@ -1,0 +1,157 @@
+//! Cameras of the kernel (V4L2): named, opened, read, lost and found again.
+//!
+//! The kernel is spoken to directly, through the few structures of `linux/videodev2.h` in [`kernel`].
+//! The crate `v4l` (0.14, last released in 2023) would need libclang at build time, and its stream
+//! cannot go on after one timeout: it gives the kernel a buffer that the kernel still has. The interface
+//! is the kernel's ABI, so nothing here ages.
+//!
+//! From the inside out: [`video_device`] is what a device does, [`device`] the kernel's; [`negotiation`],
+//! [`controls`], [`stamps`] and [`pixel_format`] decide about one thing each; [`connection`] is the
+//! camera that comes and goes, and this file makes a [`FrameSource`] of it.
+
+pub mod connection;
+mod controls;
+mod device;
+mod device_name;
+#[cfg(test)]
+mod fake;
+mod kernel;
+pub mod listing;
+pub mod negotiation;
+pub mod params;
+pub mod pixel_format;
+mod stamps;
+pub mod video_device;
+
+use std::os::fd::BorrowedFd;
+use std::path::Path;
+
+use self::connection::Camera;
+use self::device::Kernel;
+use self::negotiation::Wish;
+use self::params::CameraParams;
+use self::pixel_format::{PixelFormat, unpack_gray};
+use self::video_device::VideoSystem;
+use crate::capture::rig::Rig;
+use crate::capture::source::{Arrival, FrameLosses, FrameSource, FrameStamp, Notice, SourceError};
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::rectification::Rectification;
+
+/// How long a reader that has not waited before is made to wait at a time, milliseconds.
+const READ_MILLIS: u32 = 1000;
+
+/// A camera as a source of rectified frames: the newest that there is, without end.
+pub struct CameraSource<S: VideoSystem> {
+    name: String,
+    camera: Camera<S>,
+    rectification: Rectification,
+    /// The raw image, where it is not the rectified one.
+    raw: Vec<u8>,
+    /// Memory of the JPEG decoder.
+    samples: Vec<u8>,
+}
+
+/// The camera of this name (a path, a number or udev's name), with the lens of a rig file. The camera
+/// itself is opened when a frame is awaited: it may come later.
+pub fn open(
+    name: &str,
+    rig: Option<&Path>,
+    params: &CameraParams,
+) -> Result<CameraSource<impl VideoSystem + use<>>, SourceError> {
+    let path = rig.ok_or_else(|| SourceError::CameraRig { name: name.to_owned() })?;
+    CameraSource::new(Kernel, name, &Rig::read(path)?, path, params)
+}
+
+impl<S: VideoSystem> CameraSource<S> {
+    fn new(
+        system: S,
+        name: &str,
+        rig: &Rig,
+        rig_path: &Path,
+        params: &CameraParams,
+    ) -> Result<Self, SourceError> {
+        let rectification = Rectification::new(&rig.camera)
+            .map_err(|source| SourceError::Rectification { path: rig_path.to_owned(), source })?;
+        let Intrinsics { width, height, .. } = *rectification.intrinsics();
+        let own_rate = (params.rate_hz > 0.0).then_some(params.rate_hz);
+        let wish = Wish {
+            width: width as u32,
+            height: height as u32,
+            format: params.format.format(),
+            rate_hz: own_rate.or(rig.rate_hz),
+        };
+        let raw = if rectification.is_identity() { Vec::new() } else { vec![0; width * height] };
+        let camera = Camera::new(system, name.to_owned(), params.clone(), wish);
+        Ok(Self { name: name.to_owned(), camera, rectification, raw, samples: Vec::new() })
+    }
+
+    fn failed(&self, reason: String) -> SourceError {
+        SourceError::Camera { name: self.name.clone(), reason }
+    }
+
+    /// Converts the frame that waits; why it is none.
+    fn convert(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, String> {
+        let Intrinsics { width, height, .. } = *self.rectification.intrinsics();
+        let Some((held, grant, bytes)) = self.camera.held() else { return Ok(None) };
+        let is_packed = grant.format == PixelFormat::Grey && grant.stride == width;
+        if let (true, Some(packed)) = (is_packed, bytes.get(..width * height)) {
+            // Straight from the driver's memory, rectified or not.
+            self.rectification.rectify_into(packed, pixels);
+            return Ok(Some(held.stamp));
+        }
+        let is_identity = self.rectification.is_identity();
+        let gray = if is_identity { &mut *pixels } else { &mut self.raw[..] };
+        unpack_gray(grant.format, bytes, grant.stride, (width, height), &mut self.samples, gray)
+            .map_err(|broken| broken.to_string())?;
+        if !is_identity {
+            self.rectification.rectify_into(&self.raw, pixels);
+        }
+        Ok(Some(held.stamp))
+    }
+}
+
+impl<S: VideoSystem> FrameSource for CameraSource<S> {
+    fn intrinsics(&self) -> Intrinsics {
+        *self.rectification.intrinsics()
+    }
+
+    fn num_frames(&self) -> Option<usize> {
+        None
+    }
+
+    fn await_frame(&mut self, wake: BorrowedFd<'_>, millis: u32) -> Result<Arrival, SourceError> {
+        self.camera.await_frame(Some(wake), millis).map_err(|reason| self.failed(reason))
+    }
+
+    fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
+        let Intrinsics { width, height, .. } = *self.rectification.intrinsics();
+        if pixels.len() != width * height {
+            return Err(SourceError::Buffer { found: pixels.len(), width, height });
+        }
+        while self.camera.held().is_none() {
+            let arrival = self.camera.await_frame(None, READ_MILLIS);
+            if let Arrival::Absent(reason) = arrival.map_err(|reason| self.failed(reason))? {
+                return Err(self.failed(reason));
+            }
+        }
+        let converted = self.convert(pixels);
+        self.camera.release(converted.is_err());
+        converted.map_err(|reason| SourceError::BrokenFrame { name: self.name.clone(), reason })
+    }
+
+    fn skip_to(&mut self, _sequence: u64) -> Result<(), SourceError> {
+        // A camera's numbers begin with whoever opens it.
+        Ok(())
+    }
+
+    fn losses(&self) -> Option<FrameLosses> {
+        Some(self.camera.losses())
+    }
+
+    fn take_notice(&mut self) -> Option<Notice> {
+        self.camera.take_notice()
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,394 @@
+//! A camera as it comes and goes: opened, streaming, lost, opened again.
+//!
+//! Nothing here waits longer than it is told to, and nothing that happens to the camera is an error,
+//! but one: a camera that has never given a frame and cannot, whatever it does, is a matter for the user.
+
+use std::collections::VecDeque;
+use std::os::fd::BorrowedFd;
+use std::path::PathBuf;
+
+use rustix::io::Errno;
+
+use super::controls::{self, Exposure};
+use super::kernel::FLAG_ERROR;
+use super::negotiation::{Grant, NegotiationError, Wish, negotiate, rate_differs};
+use super::params::CameraParams;
+use super::stamps::{FrameNumbers, taken};
+use super::video_device::{Filled, OpenFailure, Readiness, VideoDevice, VideoSystem};
+use crate::capture::source::{Arrival, FrameLosses, FrameStamp, Notice};
+
+/// Pause before the first attempt to open a camera again.
+const FIRST_PAUSE_NANOS: i64 = 100_000_000;
+/// A camera that has streamed so long did not fail of its start: the pauses begin anew.
+const HEALTHY_NANOS: i64 = 2_000_000_000;
+/// How often a value that the camera changes is read: a request to a USB camera takes a millisecond.
+const EXPOSURE_PERIOD_NANOS: i64 = 200_000_000;
+/// Most notices that are kept for who asks: a camera that complains for ever is heard often enough.
+const MAX_NOTICES: usize = 16;
+
+/// Why a camera cannot be used, for good or for now.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Fault {
+    reason: String,
+    /// Whether it may pass by itself.
+    passes: bool,
+}
+
+impl Fault {
+    fn passing(reason: String) -> Self {
+        Self { reason, passes: true }
+    }
+}
+
+/// A frame that waits for its reader.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Held {
+    /// Its buffer.
+    pub filled: Filled,
+    /// Its stamp.
+    pub stamp: FrameStamp,
+}
+
+struct Stream<D> {
+    path: PathBuf,
+    device: D,
+    grant: Grant,
+    num_buffers: usize,
+    /// Buffers that are to be given to the driver.
+    idle: Vec<usize>,
+    since_nanos: i64,
+    newest_nanos: i64,
+    exposure: Exposure,
+    exposure_nanos: i64,
+    lock_is_due: bool,
+    held: Option<Held>,
+}
+
+enum State<D> {
+    Absent { retry_nanos: i64, reason: String },
+    Streaming(Box<Stream<D>>),
+}
+
+/// A camera by its name.
+pub struct Camera<S: VideoSystem> {
+    system: S,
+    name: String,
+    params: CameraParams,
+    wish: Wish,
+    state: State<S::Device>,
+    pause_nanos: i64,
+    numbers: FrameNumbers,
+    losses: FrameLosses,
+    notices: VecDeque<Notice>,
+    has_streamed: bool,
+    is_stamped: bool,
+    last_nanos: Option<i64>,
+}
+
+impl<S: VideoSystem> Camera<S> {
+    /// A camera that is not open yet.
+    pub fn new(system: S, name: String, params: CameraParams, wish: Wish) -> Self {
+        Self {
+            system,
+            name,
+            params,
+            wish,
+            state: State::Absent { retry_nanos: i64::MIN, reason: "not opened yet".to_owned() },
+            pause_nanos: FIRST_PAUSE_NANOS,
+            numbers: FrameNumbers::default(),
+            losses: FrameLosses::default(),
+            notices: VecDeque::new(),
+            has_streamed: false,
+            is_stamped: true,
+            last_nanos: None,
+        }
+    }
+
+    /// What was lost so far.
+    pub fn losses(&self) -> FrameLosses {
+        self.losses
+    }
+
+    /// The oldest remark that nobody has taken.
+    pub fn take_notice(&mut self) -> Option<Notice> {
+        self.notices.pop_front()
+    }
+
+    /// Waits for a frame, at most `millis`, or until `wake` can be read. Err where the camera can never
+    /// serve, with the reason.
+    pub fn await_frame(
+        &mut self,
+        wake: Option<BorrowedFd<'_>>,
+        millis: u32,
+    ) -> Result<Arrival, String> {
+        let outcome = match &mut self.state {
+            State::Absent { retry_nanos, reason } => {
+                let left = retry_nanos.saturating_sub(self.system.now_nanos());
+                if left > 0 {
+                    let left_millis = u32::try_from(left / 1_000_000 + 1).unwrap_or(u32::MAX);
+                    let reason = reason.clone();
+                    self.system.pause(wake, millis.min(left_millis));
+                    return Ok(Arrival::Absent(reason));
+                }
+                self.open().map(|()| Arrival::Nothing)
+            }
+            State::Streaming(_) => self.look(wake, millis),
+        };
+        match outcome {
+            Ok(arrival) => Ok(arrival),
+            Err(fault) if fault.passes || self.has_streamed => Ok(self.retire(fault.reason)),
+            Err(fault) => Err(fault.reason),
+        }
+    }
+
+    /// Closes the camera, to be opened again after a pause.
+    fn retire(&mut self, reason: String) -> Arrival {
+        let now = self.system.now_nanos();
+        if let State::Streaming(stream) = &self.state {
+            self.numbers.restart();
+            if now.saturating_sub(stream.since_nanos) >= HEALTHY_NANOS {
+                self.pause_nanos = FIRST_PAUSE_NANOS;
+            }
+        }
+        let retry_nanos = now.saturating_add(self.pause_nanos);
+        let longest = (self.params.retry_s * 1e9) as i64;
+        self.pause_nanos = self.pause_nanos.saturating_mul(2).min(longest);
+        self.state = State::Absent { retry_nanos, reason: reason.clone() };
+        Arrival::Absent(reason)
+    }
+
+    fn warn(&mut self, text: String) {
+        note(&mut self.notices, text, true);
+    }
+
+    /// Opens the camera and lets it stream.
+    fn open(&mut self) -> Result<(), Fault> {
+        let (path, mut device) =
+            self.system.open(&self.name).map_err(|failure| open_fault(&self.name, failure))?;
+        let at = |reason: String| format!("{}: {reason}", path.display());
+        let refused = |error: Errno| Fault::passing(at(refusal(error, &path.display())));
+        let grant = negotiate(&mut device, &self.wish).map_err(|error| match error {
+            NegotiationError::Device(error) => refused(error),
+            error @ NegotiationError::Size { .. } => Fault {
+                reason: at(format!("{error}; name the rig of one of these sizes with --rig")),
+                passes: false,
+            },
+            error => Fault { reason: at(error.to_string()), passes: false },
+        })?;
+        if rate_differs(self.wish.rate_hz, grant.rate_hz) {
+            let (wanted, granted) =
+                (self.wish.rate_hz.unwrap_or(0.0), grant.rate_hz.unwrap_or(0.0));
+            let text = format!("{wanted:.1} frames a second were asked for, {granted:.1} come");
+            self.warn(at(text));
+        }
+        for refusal in controls::apply(&mut device, &self.params) {
+            self.warn(at(refusal));
+        }
+        let num_buffers = device.make_buffers(self.params.buffers).map_err(refused)?;
+        if num_buffers < 2 {
+            return Err(Fault::passing(at(format!(
+                "its driver makes {num_buffers} buffers, two are needed"
+            ))));
+        }
+        for index in 0..num_buffers {
+            device.enqueue(index).map_err(refused)?;
+        }
+        device.start().map_err(refused)?;
+        let now = self.system.now_nanos();
+        let rate = grant.rate_hz.map_or("unknown rate".to_owned(), |rate| format!("{rate:.1} Hz"));
+        let text = format!(
+            "{}x{} {}, {rate}, {num_buffers} buffers",
+            self.wish.width,
+            self.wish.height,
+            grant.format.code()
+        );
+        note(&mut self.notices, at(text), false);
+        let exposure = controls::exposure(&device);
+        self.state = State::Streaming(Box::new(Stream {
+            path,
+            device,
+            grant,
+            num_buffers,
+            idle: Vec::with_capacity(num_buffers),
+            since_nanos: now,
+            newest_nanos: now,
+            exposure,
+            exposure_nanos: now,
+            lock_is_due: controls::has_locks(&self.params),
+            held: None,
+        }));
+        Ok(())
+    }
+
+    /// One look at a camera that streams.
+    fn look(&mut self, wake: Option<BorrowedFd<'_>>, millis: u32) -> Result<Arrival, Fault> {
+        let State::Streaming(stream) = &mut self.state else { return Ok(Arrival::Nothing) };
+        if stream.held.is_some() {
+            return Ok(Arrival::Frame);
+        }
+        stream.return_idle()?;
+        let readiness = stream.device.wait(wake, millis).map_err(|error| stream.fault(error))?;
+        if readiness == Readiness::Ready {
+            self.drain()?;
+        }
+        let now = self.system.now_nanos();
+        let State::Streaming(stream) = &mut self.state else { return Ok(Arrival::Nothing) };
+        if let Some(held) = stream.held {
+            self.has_streamed = true;
+            self.last_nanos = Some(held.stamp.capture_nanos);
+            return Ok(Arrival::Frame);
+        }
+        let silent_nanos = now.saturating_sub(stream.newest_nanos);
+        if silent_nanos as f64 > self.params.stall_s * 1e9 {
+            let path = stream.path.display();
+            let seconds = self.params.stall_s;
+            return Err(Fault::passing(format!("{path}: gives no frame for {seconds} s")));
+        }
+        // Between two frames there is time for slow requests.
+        let mut notices = Vec::new();
+        if stream.lock_is_due
+            && now.saturating_sub(stream.since_nanos) as f64 >= self.params.settle_s * 1e9
+        {
+            stream.lock_is_due = false;
+            notices = controls::lock(&mut stream.device, &self.params);
+            stream.exposure = controls::exposure(&stream.device);
+        }
+        if stream.exposure.changes
+            && now.saturating_sub(stream.exposure_nanos) >= EXPOSURE_PERIOD_NANOS
+        {
+            stream.exposure_nanos = now;
+            stream.exposure = controls::exposure(&stream.device);
+        }
+        notices.into_iter().for_each(|text| self.warn(text));
+        Ok(Arrival::Nothing)
+    }
+
+    /// Takes every buffer that is filled and holds the newest good one.
+    fn drain(&mut self) -> Result<(), Fault> {
+        let State::Streaming(stream) = &mut self.state else { return Ok(()) };
+        let arrival_nanos = self.system.now_nanos();
+        let offset_nanos = self.params.stamp_offset_us.saturating_mul(1000);
+        // A camera may fill as fast as we look: no more than all buffers twice.
+        for _ in 0..2 * stream.num_buffers {
+            let filled = match stream.device.dequeue() {
+                Ok(filled) => filled,
+                Err(Errno::AGAIN) => break,
+                Err(error) => return Err(stream.fault(error)),
+            };
+            stream.newest_nanos = arrival_nanos;
+            let (sequence, missing) = self.numbers.number(filled.sequence);
+            self.losses.missing += missing;
+            let taken = taken(&filled, arrival_nanos, stream.exposure.nanos, offset_nanos);
+            let before = stream.held.map(|held| held.stamp.capture_nanos).or(self.last_nanos);
+            let is_broken = filled.flags & FLAG_ERROR != 0
+                || before.is_some_and(|before| taken.nanos <= before);
+            if is_broken {
+                self.losses.broken += 1;
+                stream.idle.push(filled.index);
+                stream.return_idle()?;
+                continue;
+            }
+            let stamp = FrameStamp {
+                sequence,
+                capture_nanos: taken.nanos,
+                exposure_nanos: stream.exposure.nanos,
+                gain: stream.exposure.gain,
+            };
+            if let Some(older) = stream.held.replace(Held { filled, stamp }) {
+                self.losses.late += 1;
+                stream.idle.push(older.filled.index);
+                stream.return_idle()?;
+            }
+            if self.is_stamped && !taken.is_stamped {
+                let text = "its driver's stamps are not of CLOCK_MONOTONIC; frames are stamped as they arrive";
+                note(&mut self.notices, format!("{}: {text}", stream.path.display()), true);
+            }
+            self.is_stamped = taken.is_stamped;
+        }
+        Ok(())
+    }
+
+    /// The frame that waits, its layout and its bytes: those that the driver says it has filled, none
+    /// where it says more than there are.
+    pub fn held(&self) -> Option<(Held, Grant, &[u8])> {
+        let State::Streaming(stream) = &self.state else { return None };
+        let held = stream.held?;
+        let memory = stream.device.memory(held.filled.index);
+        Some((held, stream.grant, memory.get(..held.filled.used).unwrap_or(&[])))
+    }
+
+    /// Gives the buffer of the frame that waits back to the driver; `is_broken` where it was no picture.
+    pub fn release(&mut self, is_broken: bool) {
+        self.losses.broken += u64::from(is_broken);
+        let State::Streaming(stream) = &mut self.state else { return };
+        if let Some(held) = stream.held.take() {
+            stream.idle.push(held.filled.index);
+            // What is refused is tried again at the next look, which also says what is wrong.
+            let _ = stream.return_idle();
+        }
+    }
+}
+
+fn note(notices: &mut VecDeque<Notice>, text: String, is_warning: bool) {
+    if notices.len() < MAX_NOTICES {
+        notices.push_back(Notice { text, is_warning });
+    }
+}
+
+impl<D: VideoDevice> Stream<D> {
+    /// Gives idle buffers to the driver. One that it refuses stays for the next look; a driver that has
+    /// none left, or is gone, is a fault.
+    fn return_idle(&mut self) -> Result<(), Fault> {
+        let mut refused = None;
+        let device = &mut self.device;
+        self.idle.retain(|&index| {
+            let answer = device.enqueue(index);
+            refused = answer.err().or(refused);
+            answer.is_err()
+        });
+        match refused {
+            Some(error @ (Errno::NODEV | Errno::NXIO)) => Err(self.fault(error)),
+            Some(error) if self.idle.len() >= self.num_buffers => Err(self.fault(error)),
+            _ => Ok(()),
+        }
+    }
+
+    fn fault(&self, error: Errno) -> Fault {
+        let path = self.path.display();
+        Fault::passing(format!("{path}: {}", refusal(error, &path)))
+    }
+}
+
+/// What an error of the kernel means for a camera, and what to do.
+fn refusal(error: Errno, path: &dyn std::fmt::Display) -> String {
+    match error {
+        Errno::BUSY => format!("in use by another program, which `fuser {path}` names; end it"),
+        Errno::NODEV | Errno::NXIO | Errno::NOENT => "unplugged; plug it in again".to_owned(),
+        Errno::ACCESS | Errno::PERM => {
+            "may not be opened; `usermod -aG video USER` and a new login, or SupplementaryGroups=video in the unit"
+                .to_owned()
+        }
+        Errno::NOSPC => "the USB bus has no bandwidth left; use another port, a lower rate, or mjpeg".to_owned(),
+        Errno::IO => "its driver reports a fault of the device or the cable".to_owned(),
+        error => format!("its driver refuses ({error})"),
+    }
+}
+
+fn open_fault(name: &str, failure: OpenFailure) -> Fault {
+    match failure {
+        OpenFailure::Missing => Fault::passing(format!(
+            "there is no camera {name}; plug it in (semidense cameras lists those that there are)"
+        )),
+        OpenFailure::Refused(path, error) => {
+            Fault::passing(format!("{}: {}", path.display(), refusal(error, &path.display())))
+        }
+        OpenFailure::Ambiguous(paths) => {
+            let names: Vec<String> = paths.iter().map(|path| path.display().to_string()).collect();
+            let reason = format!("{name} may be {}; name one of them", names.join(" or "));
+            Fault { reason, passes: false }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

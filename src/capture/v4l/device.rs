@@ -1,0 +1,472 @@
+//! A capture device of the kernel: requests, mapped buffers, waiting.
+
+use std::fs::File;
+use std::os::fd::{AsFd, AsRawFd, BorrowedFd};
+use std::path::{Path, PathBuf};
+use std::ptr::NonNull;
+
+use rustix::event::{PollFd, PollFlags, Timespec};
+use rustix::io::Errno;
+use rustix::time::{ClockId, clock_gettime};
+
+use super::device_name::find;
+use super::kernel::{self, KernelStruct, Request};
+use super::video_device::{
+    Capability, ControlRange, Filled, FourCc, Fraction, Layout, OfferedFormat, OpenFailure,
+    PeriodRange, Readiness, SizeRange, VideoDevice, VideoSystem,
+};
+
+/// Most entries of an enumeration that are believed: a driver without an end is broken.
+const MAX_ENTRIES: u32 = 1024;
+/// Most buffers that are made.
+const MAX_BUFFERS: u32 = 32;
+
+/// Memory of the driver, mapped for reading.
+struct Mapping {
+    start: NonNull<libc::c_void>,
+    length: usize,
+    /// Whether the driver has it, and may write.
+    is_queued: bool,
+}
+
+// SAFETY: the mapping is memory of this process, bound to no thread.
+unsafe impl Send for Mapping {}
+
+impl Drop for Mapping {
+    fn drop(&mut self) {
+        // SAFETY: `start` and `length` are those of a mapping that nobody else unmaps; slices of it
+        // borrow the device that owns it.
+        unsafe { libc::munmap(self.start.as_ptr(), self.length) };
+    }
+}
+
+/// An open device node.
+pub struct KernelDevice {
+    // Before the file, so that buffers are unmapped before they are given back.
+    buffers: Vec<Mapping>,
+    file: File,
+}
+
+impl KernelDevice {
+    /// Opens a node, without waiting for anything.
+    pub fn open(path: &Path) -> Result<Self, Errno> {
+        use rustix::fs::{Mode, OFlags};
+        let flags = OFlags::RDWR | OFlags::NONBLOCK | OFlags::CLOEXEC;
+        let descriptor = retry(|| rustix::fs::open(path, flags, Mode::empty()))?;
+        Ok(Self { buffers: Vec::new(), file: File::from(descriptor) })
+    }
+
+    /// One request; the driver reads and writes `structure`.
+    fn request<T: KernelStruct>(
+        &self,
+        request: &Request<T>,
+        structure: &mut T,
+    ) -> Result<(), Errno> {
+        retry(|| {
+            // SAFETY: the number encodes the size of `T`, which is the structure of this request, and
+            // the kernel keeps no pointer to it.
+            let answer = unsafe {
+                libc::ioctl(
+                    self.file.as_raw_fd(),
+                    request.number as _,
+                    std::ptr::from_mut(structure),
+                )
+            };
+            if answer < 0 { Err(last_error()) } else { Ok(()) }
+        })
+    }
+
+    /// Entry after entry, until the driver has no more.
+    fn enumerate<T: KernelStruct, R>(
+        &self,
+        request: &Request<T>,
+        first: impl Fn(u32) -> T,
+        read: impl Fn(&T) -> R,
+    ) -> Vec<R> {
+        let mut found = Vec::new();
+        for index in 0..MAX_ENTRIES {
+            let mut entry = first(index);
+            if self.request(request, &mut entry).is_err() {
+                break;
+            }
+            found.push(read(&entry));
+        }
+        found
+    }
+
+    fn map(&self, index: u32) -> Result<Mapping, Errno> {
+        let mut buffer = blank_buffer(index);
+        self.request(&kernel::QUERY_BUFFER, &mut buffer)?;
+        let length = buffer.length as usize;
+        // SAFETY: for MMAP buffers the union holds the offset.
+        let offset = unsafe { buffer.place.offset };
+        // SAFETY: a new mapping of `length` bytes, which the kernel places; nothing else is touched.
+        let start = unsafe {
+            libc::mmap(
+                std::ptr::null_mut(),
+                length,
+                libc::PROT_READ,
+                libc::MAP_SHARED,
+                self.file.as_raw_fd(),
+                offset.into(),
+            )
+        };
+        if start == libc::MAP_FAILED {
+            return Err(last_error());
+        }
+        let start = NonNull::new(start).ok_or(Errno::NOMEM)?;
+        Ok(Mapping { start, length, is_queued: false })
+    }
+}
+
+fn last_error() -> Errno {
+    Errno::from_io_error(&std::io::Error::last_os_error()).unwrap_or(Errno::IO)
+}
+
+/// Again while a signal interrupts.
+fn retry<T>(mut call: impl FnMut() -> Result<T, Errno>) -> Result<T, Errno> {
+    loop {
+        match call() {
+            Err(Errno::INTR) => {}
+            answer => return answer,
+        }
+    }
+}
+
+fn blank_buffer(index: u32) -> kernel::Buffer {
+    let mut buffer = kernel::Buffer::zeroed();
+    buffer.index = index;
+    buffer.buffer_type = kernel::BUFFER_TYPE_CAPTURE;
+    buffer.memory = kernel::MEMORY_MMAP;
+    buffer
+}
+
+/// A text of the kernel: up to its zero.
+fn text(bytes: &[u8]) -> String {
+    let end = bytes.iter().position(|&b| b == 0).unwrap_or(bytes.len());
+    String::from_utf8_lossy(&bytes[..end]).trim().to_owned()
+}
+
+fn control_range(query: &kernel::QueryControl) -> ControlRange {
+    ControlRange {
+        id: query.id,
+        name: text(&query.name),
+        kind: query.kind,
+        minimum: query.minimum,
+        maximum: query.maximum,
+        step: query.step,
+        default: query.default,
+        flags: query.flags,
+    }
+}
+
+/// The driver's stamp in nanoseconds.
+fn stamp_nanos(stamp: libc::timeval) -> i64 {
+    let (seconds, micros) = (i64::from(stamp.tv_sec), i64::from(stamp.tv_usec));
+    seconds.saturating_mul(1_000_000_000).saturating_add(micros.saturating_mul(1000))
+}
+
+impl VideoDevice for KernelDevice {
+    fn capability(&self) -> Result<Capability, Errno> {
+        let mut found = kernel::Capability::zeroed();
+        self.request(&kernel::QUERY_CAPABILITY, &mut found)?;
+        let has_own = found.capabilities & kernel::CAP_DEVICE_CAPS != 0;
+        Ok(Capability {
+            driver: text(&found.driver),
+            card: text(&found.card),
+            bus: text(&found.bus_info),
+            flags: if has_own { found.device_caps } else { found.capabilities },
+        })
+    }
+
+    fn formats(&self) -> Vec<OfferedFormat> {
+        let first = |index| {
+            let mut entry = kernel::FormatDescription::zeroed();
+            (entry.index, entry.buffer_type) = (index, kernel::BUFFER_TYPE_CAPTURE);
+            entry
+        };
+        self.enumerate(&kernel::ENUMERATE_FORMATS, first, |entry| OfferedFormat {
+            code: FourCc(entry.pixel_format),
+            description: text(&entry.description),
+        })
+    }
+
+    fn sizes(&self, code: FourCc) -> Vec<SizeRange> {
+        let first = |index| {
+            let mut entry = kernel::FrameSizeEnumeration::zeroed();
+            (entry.index, entry.pixel_format) = (index, code.0);
+            entry
+        };
+        let mut sizes = self.enumerate(&kernel::ENUMERATE_SIZES, first, |entry| {
+            let [a, b, c, d, e, f] = entry.range;
+            match entry.kind {
+                kernel::ENUMERATION_DISCRETE => {
+                    SizeRange { smallest: (a, b), largest: (a, b), step: (1, 1) }
+                }
+                _ => SizeRange { smallest: (a, d), largest: (b, e), step: (c, f) },
+            }
+        });
+        // A range has one entry; some drivers give it again for every index.
+        sizes.dedup();
+        sizes
+    }
+
+    fn periods(&self, code: FourCc, width: u32, height: u32) -> Vec<PeriodRange> {
+        let first = |index| {
+            let mut entry = kernel::FramePeriodEnumeration::zeroed();
+            (entry.index, entry.pixel_format) = (index, code.0);
+            (entry.width, entry.height) = (width, height);
+            entry
+        };
+        let mut periods = self.enumerate(&kernel::ENUMERATE_PERIODS, first, |entry| {
+            let [shortest, longest, _] = entry.range;
+            match entry.kind {
+                kernel::ENUMERATION_DISCRETE => PeriodRange { shortest, longest: shortest },
+                _ => PeriodRange { shortest, longest },
+            }
+        });
+        periods.dedup();
+        periods
+    }
+
+    fn set_layout(&mut self, code: FourCc, width: u32, height: u32) -> Result<Layout, Errno> {
+        let mut format = kernel::Format::zeroed();
+        format.buffer_type = kernel::BUFFER_TYPE_CAPTURE;
+        // All the rest zero: a stride or size that was left there would be taken for a wish.
+        // SAFETY: every bit pattern is a value of every member.
+        let mut pix = unsafe { format.pix.pix };
+        (pix.width, pix.height, pix.pixel_format) = (width, height, code.0);
+        pix.field = kernel::FIELD_NONE;
+        format.pix.pix = pix;
+        self.request(&kernel::SET_FORMAT, &mut format)?;
+        // SAFETY: as above.
+        let pix = unsafe { format.pix.pix };
+        Ok(Layout {
+            code: FourCc(pix.pixel_format),
+            width: pix.width,
+            height: pix.height,
+            stride: pix.bytes_per_line,
+            field: pix.field,
+        })
+    }
+
+    fn period(&self) -> Result<(Fraction, bool), Errno> {
+        let mut parm = kernel::StreamParm::zeroed();
+        parm.buffer_type = kernel::BUFFER_TYPE_CAPTURE;
+        self.request(&kernel::GET_PARM, &mut parm)?;
+        Ok((parm.time_per_frame, parm.capability & kernel::CAP_TIME_PER_FRAME != 0))
+    }
+
+    fn set_period(&mut self, period: Fraction) -> Result<Fraction, Errno> {
+        let mut parm = kernel::StreamParm::zeroed();
+        parm.buffer_type = kernel::BUFFER_TYPE_CAPTURE;
+        parm.time_per_frame = period;
+        self.request(&kernel::SET_PARM, &mut parm)?;
+        Ok(parm.time_per_frame)
+    }
+
+    fn controls(&self) -> Vec<ControlRange> {
+        let mut found: Vec<ControlRange> = Vec::new();
+        let mut id = 0;
+        for _ in 0..MAX_ENTRIES {
+            let mut query = kernel::QueryControl::zeroed();
+            query.id = id | kernel::CONTROL_NEXT;
+            if self.request(&kernel::QUERY_CONTROL, &mut query).is_err() || query.id <= id {
+                break;
+            }
+            id = query.id;
+            if query.flags & kernel::CONTROL_DISABLED == 0 {
+                found.push(control_range(&query));
+            }
+        }
+        found
+    }
+
+    fn menu(&self, control: &ControlRange) -> Vec<(u32, String)> {
+        let (Ok(first), Ok(last)) =
+            (u32::try_from(control.minimum), u32::try_from(control.maximum))
+        else {
+            return Vec::new();
+        };
+        let item = |index| {
+            let mut menu = kernel::QueryMenu::zeroed();
+            (menu.id, menu.index) = (control.id, index);
+            self.request(&kernel::QUERY_MENU, &mut menu).ok()?;
+            let bytes = menu.name;
+            let [a, b, c, d, e, f, g, h, ..] = bytes;
+            Some(match control.kind {
+                kernel::CONTROL_TYPE_INTEGER_MENU => {
+                    (index, i64::from_ne_bytes([a, b, c, d, e, f, g, h]).to_string())
+                }
+                _ => (index, text(&bytes)),
+            })
+        };
+        (first..=last).take(MAX_ENTRIES as usize).filter_map(item).collect()
+    }
+
+    fn control(&self, id: u32) -> Option<ControlRange> {
+        let mut query = kernel::QueryControl::zeroed();
+        query.id = id;
+        self.request(&kernel::QUERY_CONTROL, &mut query).ok()?;
+        (query.flags & kernel::CONTROL_DISABLED == 0).then(|| control_range(&query))
+    }
+
+    fn value(&self, id: u32) -> Result<i32, Errno> {
+        let mut control = kernel::Control { id, value: 0 };
+        self.request(&kernel::GET_CONTROL, &mut control)?;
+        Ok(control.value)
+    }
+
+    fn set_value(&mut self, id: u32, value: i32) -> Result<(), Errno> {
+        self.request(&kernel::SET_CONTROL, &mut kernel::Control { id, value })
+    }
+
+    fn make_buffers(&mut self, count: u32) -> Result<usize, Errno> {
+        let mut wish = kernel::RequestBuffers::zeroed();
+        wish.count = count;
+        wish.buffer_type = kernel::BUFFER_TYPE_CAPTURE;
+        wish.memory = kernel::MEMORY_MMAP;
+        self.buffers.clear();
+        self.request(&kernel::REQUEST_BUFFERS, &mut wish)?;
+        if count > 0 {
+            for index in 0..wish.count.min(MAX_BUFFERS) {
+                let mapping = self.map(index)?;
+                self.buffers.push(mapping);
+            }
+        }
+        Ok(self.buffers.len())
+    }
+
+    fn enqueue(&mut self, index: usize) -> Result<(), Errno> {
+        let number = u32::try_from(index).map_err(|_| Errno::INVAL)?;
+        if self.buffers.get(index).is_none_or(|buffer| buffer.is_queued) {
+            return Err(Errno::INVAL);
+        }
+        self.request(&kernel::ENQUEUE_BUFFER, &mut blank_buffer(number))?;
+        self.buffers[index].is_queued = true;
+        Ok(())
+    }
+
+    fn dequeue(&mut self) -> Result<Filled, Errno> {
+        let mut buffer = blank_buffer(0);
+        self.request(&kernel::DEQUEUE_BUFFER, &mut buffer)?;
+        let index = buffer.index as usize;
+        // A driver that names a buffer which it does not have is not to be believed.
+        let mapping = self.buffers.get_mut(index).ok_or(Errno::IO)?;
+        mapping.is_queued = false;
+        Ok(Filled {
+            index,
+            used: buffer.bytes_used as usize,
+            sequence: buffer.sequence,
+            stamp_nanos: stamp_nanos(buffer.timestamp),
+            flags: buffer.flags,
+        })
+    }
+
+    fn start(&mut self) -> Result<(), Errno> {
+        let mut buffer_type = kernel::BUFFER_TYPE_CAPTURE as i32;
+        self.request(&kernel::STREAM_ON, &mut buffer_type)
+    }
+
+    fn memory(&self, index: usize) -> &[u8] {
+        let Some(mapping) = self.buffers.get(index).filter(|mapping| !mapping.is_queued) else {
+            return &[];
+        };
+        // SAFETY: the mapping lives as long as the device, has `length` bytes, and is not the driver's:
+        // it was dequeued, and `enqueue` needs `&mut self`, which ends this borrow.
+        unsafe { std::slice::from_raw_parts(mapping.start.as_ptr().cast(), mapping.length) }
+    }
+
+    fn wait(&self, wake: Option<BorrowedFd<'_>>, millis: u32) -> Result<Readiness, Errno> {
+        let own = PollFd::new(&self.file, PollFlags::IN);
+        let events = match wake {
+            None => poll(&mut [own], millis)?,
+            Some(wake) => poll(&mut [own, PollFd::from_borrowed_fd(wake, PollFlags::IN)], millis)?,
+        };
+        // An error is ready too: the next dequeue names it.
+        Ok(if events.is_empty() { Readiness::Nothing } else { Readiness::Ready })
+    }
+}
+
+impl Drop for KernelDevice {
+    fn drop(&mut self) {
+        let mut buffer_type = kernel::BUFFER_TYPE_CAPTURE as i32;
+        // Closing ends the stream too; a device that is gone refuses, which changes nothing.
+        let _ = self.request(&kernel::STREAM_OFF, &mut buffer_type);
+    }
+}
+
+/// What happened on the first descriptor within `millis`; nothing where a signal came.
+fn poll(descriptors: &mut [PollFd<'_>], millis: u32) -> Result<PollFlags, Errno> {
+    let timeout = Timespec {
+        tv_sec: i64::from(millis / 1000),
+        tv_nsec: i64::from(millis % 1000) * 1_000_000,
+    };
+    match rustix::event::poll(descriptors, Some(&timeout)) {
+        Ok(_) => Ok(descriptors.first().map_or(PollFlags::empty(), PollFd::revents)),
+        Err(Errno::INTR) => Ok(PollFlags::empty()),
+        Err(error) => Err(error),
+    }
+}
+
+/// The devices and the clock of this machine.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Kernel;
+
+impl VideoSystem for Kernel {
+    type Device = KernelDevice;
+
+    fn open(&mut self, name: &str) -> Result<(PathBuf, KernelDevice), OpenFailure> {
+        let path = find(Path::new("/dev"), name)?;
+        match KernelDevice::open(&path) {
+            Ok(device) => Ok((path, device)),
+            Err(Errno::NOENT) => Err(OpenFailure::Missing),
+            Err(error) => Err(OpenFailure::Refused(path, error)),
+        }
+    }
+
+    fn now_nanos(&self) -> i64 {
+        let now = clock_gettime(ClockId::Monotonic);
+        now.tv_sec * 1_000_000_000 + now.tv_nsec
+    }
+
+    fn pause(&self, wake: Option<BorrowedFd<'_>>, millis: u32) {
+        // Without a descriptor it is a sleep; what wakes is looked at by the caller.
+        let _ = match wake {
+            None => poll(&mut [], millis),
+            Some(wake) => {
+                poll(&mut [PollFd::from_borrowed_fd(wake.as_fd(), PollFlags::IN)], millis)
+            }
+        };
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_no_camera_says_so_and_does_not_break() {
+        let mut null = KernelDevice::open(Path::new("/dev/null")).unwrap();
+        assert_eq!(null.capability().unwrap_err(), Errno::NOTTY);
+        assert!(null.formats().is_empty() && null.controls().is_empty());
+        assert_eq!(null.make_buffers(4).unwrap_err(), Errno::NOTTY);
+        assert_eq!(null.enqueue(0).unwrap_err(), Errno::INVAL);
+        assert!(null.dequeue().is_err());
+        assert!(null.memory(0).is_empty());
+    }
+
+    #[test]
+    fn a_node_that_is_not_there_is_missing() {
+        let missing = Kernel.open("/dev/video-that-nobody-has").err();
+        assert_eq!(missing, Some(OpenFailure::Missing));
+    }
+
+    #[test]
+    fn stamps_and_texts_of_the_kernel() {
+        let stamp = libc::timeval { tv_sec: 3, tv_usec: 250_000 };
+        assert_eq!(stamp_nanos(stamp), 3_250_000_000);
+        assert_eq!(text(b"Vivid\0\0xx"), "Vivid");
+        assert_eq!(text(&[0xff, b'a']), "\u{fffd}a");
+    }
+}

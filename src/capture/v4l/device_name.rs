@@ -1,0 +1,93 @@
+//! How a camera is named: by path, by number, or by what udev calls it.
+
+use std::path::{Path, PathBuf};
+
+use super::video_device::OpenFailure;
+
+/// Folders of udev's names, in the order of trust: an id stays with the camera, a path with the plug.
+const NAME_FOLDERS: [&str; 3] = ["v4l/by-id", "v4l/by-path", "semidense"];
+/// What udev adds to the name of a camera's first image node.
+const FIRST_NODE: &str = "-video-index0";
+
+/// The node of a camera's name below `dev` (`/dev`): a path, a number (`0` is `video0`), `video0`, or a
+/// name in `v4l/by-id` or `v4l/by-path`, whole, without `-video-index0`, or the beginning of one only.
+///
+/// Looked up again before every opening: udev's names go and come with the camera.
+pub fn find(dev: &Path, name: &str) -> Result<PathBuf, OpenFailure> {
+    let number = name.strip_prefix("video").unwrap_or(name);
+    if let Ok(number) = number.parse::<u32>() {
+        return Ok(dev.join(format!("video{number}")));
+    }
+    if name.contains('/') {
+        return Ok(PathBuf::from(name));
+    }
+    for folder in NAME_FOLDERS {
+        let folder = dev.join(folder);
+        for exact in [name.to_owned(), format!("{name}{FIRST_NODE}")] {
+            if folder.join(&exact).exists() {
+                return Ok(folder.join(exact));
+            }
+        }
+        let mut found: Vec<PathBuf> = std::fs::read_dir(&folder)
+            .into_iter()
+            .flatten()
+            .flatten()
+            .map(|entry| entry.file_name().to_string_lossy().into_owned())
+            .filter(|entry| entry.starts_with(name))
+            // Further nodes of the same camera carry no images.
+            .filter(|entry| entry.ends_with(FIRST_NODE) || !entry.contains("-video-index"))
+            .map(|entry| folder.join(entry))
+            .collect();
+        found.sort();
+        match found.as_slice() {
+            [] => {}
+            [only] => return Ok(only.clone()),
+            _ => return Err(OpenFailure::Ambiguous(found)),
+        }
+    }
+    Err(OpenFailure::Missing)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn dev(names: &[&str]) -> tempfile::TempDir {
+        let folder = tempfile::tempdir().unwrap();
+        for name in names {
+            let path = folder.path().join(name);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(path, "").unwrap();
+        }
+        folder
+    }
+
+    #[test]
+    fn cameras_have_paths_numbers_and_ids() {
+        let left = "v4l/by-id/usb-Maker_Cam_AA11-video-index0";
+        let dev = dev(&[
+            left,
+            "v4l/by-id/usb-Maker_Cam_AA11-video-index1",
+            "v4l/by-id/usb-Maker_Cam_BB22-video-index0",
+            "v4l/by-path/pci-0000:00:14.0-usb-0:1:1.0-video-index0",
+        ]);
+        let find = |name: &str| find(dev.path(), name);
+        let at = |path: &str| Ok(dev.path().join(path));
+        assert_eq!(find("/dev/video7"), Ok(PathBuf::from("/dev/video7")));
+        assert_eq!(find("./here"), Ok(PathBuf::from("./here")));
+        assert_eq!(find("2"), at("video2"));
+        assert_eq!(find("video3"), at("video3"));
+        for name in ["usb-Maker_Cam_AA11-video-index0", "usb-Maker_Cam_AA11", "usb-Maker_Cam_A"] {
+            assert_eq!(find(name), at(left), "{name}");
+        }
+        assert_eq!(
+            find("usb-Maker_Cam_AA11-video-index1"),
+            at("v4l/by-id/usb-Maker_Cam_AA11-video-index1")
+        );
+        assert!(find("pci-0000:00:14.0").unwrap().to_string_lossy().contains("by-path"));
+        assert_eq!(find("usb-Other"), Err(OpenFailure::Missing));
+        assert_eq!(find("99999999999"), Err(OpenFailure::Missing));
+        let Err(OpenFailure::Ambiguous(found)) = find("usb-Maker") else { panic!("two fit") };
+        assert_eq!(found.len(), 2);
+    }
+}

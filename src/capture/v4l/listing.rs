@@ -1,0 +1,301 @@
+//! The cameras of this machine: who they are, what they offer, whether they can be opened.
+
+use std::path::{Path, PathBuf};
+
+use rustix::io::Errno;
+use serde::Serialize;
+
+use super::device::KernelDevice;
+use super::kernel::{
+    CAP_VIDEO_CAPTURE, CAP_VIDEO_CAPTURE_MPLANE, CONTROL_INACTIVE, CONTROL_READ_ONLY,
+    CONTROL_TYPE_BOOLEAN, CONTROL_TYPE_INTEGER, CONTROL_TYPE_INTEGER_MENU, CONTROL_TYPE_MENU,
+    CONTROL_WRITE_ONLY,
+};
+use super::pixel_format::PixelFormat;
+use super::video_device::{ControlRange, OfferedFormat, SizeRange, VideoDevice, rate_hz};
+
+/// Folders of udev's names for video nodes.
+const NAME_FOLDERS: [&str; 3] = ["v4l/by-id", "v4l/by-path", "semidense"];
+
+/// Whether a node can be used.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Access {
+    /// It can be opened, and nobody else streams from it.
+    Free,
+    /// Another program has its buffers.
+    Busy,
+    /// This user may not open it.
+    Forbidden,
+    /// It cannot be opened for another reason.
+    Unusable,
+}
+
+/// A size of a format.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct SizeReport {
+    /// The size, or the smallest and the largest.
+    pub size: String,
+    /// Frames a second that it can have, the most first; empty where the driver does not say.
+    pub rates_hz: Vec<f64>,
+}
+
+/// A format.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct FormatReport {
+    /// Its four letters.
+    pub code: String,
+    /// Its name.
+    pub description: String,
+    /// Whether it can be converted here.
+    pub usable: bool,
+    /// Its sizes.
+    pub sizes: Vec<SizeReport>,
+}
+
+/// A control.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ControlReport {
+    /// Its name.
+    pub name: String,
+    /// integer, boolean, menu or other.
+    pub kind: &'static str,
+    /// Smallest value.
+    pub minimum: i32,
+    /// Largest value.
+    pub maximum: i32,
+    /// Step.
+    pub step: i32,
+    /// Value after plugging in.
+    pub default: i32,
+    /// Value in force, where it can be read.
+    pub value: Option<i32>,
+    /// Whether it cannot be set now: it is read-only, or an automatic has it.
+    pub fixed: bool,
+    /// Names of a menu's values.
+    pub items: Vec<(u32, String)>,
+}
+
+/// A video node that gives pictures, or could not be asked.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct CameraReport {
+    /// The node.
+    pub path: PathBuf,
+    /// udev's names for it, as `v4l:NAME` takes them.
+    pub names: Vec<String>,
+    /// Whether it can be used.
+    pub access: Access,
+    /// Why not, in the kernel's words.
+    pub problem: Option<String>,
+    /// The camera's name.
+    pub card: String,
+    /// Its driver.
+    pub driver: String,
+    /// Where it is plugged in.
+    pub bus: String,
+    /// What it offers.
+    pub formats: Vec<FormatReport>,
+    /// What can be set.
+    pub controls: Vec<ControlReport>,
+}
+
+/// The video nodes below `dev` (`/dev`), in the order of their numbers.
+pub fn nodes(dev: &Path) -> Vec<PathBuf> {
+    let number = |path: &Path| -> Option<u32> {
+        path.file_name()?.to_str()?.strip_prefix("video")?.parse().ok()
+    };
+    let entries = std::fs::read_dir(dev).into_iter().flatten().flatten();
+    let mut found: Vec<(u32, PathBuf)> =
+        entries.filter_map(|entry| Some((number(&entry.path())?, entry.path()))).collect();
+    found.sort();
+    found.into_iter().map(|(_, path)| path).collect()
+}
+
+/// Every camera below `dev`, and every node that cannot be asked whether it is one.
+pub fn cameras(dev: &Path) -> Vec<CameraReport> {
+    nodes(dev).iter().filter_map(|path| report(dev, path)).collect()
+}
+
+/// Whether a node can be used; `None` for what is no camera.
+pub fn access(path: &Path) -> Option<Access> {
+    match KernelDevice::open(path) {
+        Ok(mut device) => is_camera(&device).then(|| device_access(&mut device).0),
+        Err(error) => Some(refused_access(error)),
+    }
+}
+
+fn refused_access(error: Errno) -> Access {
+    match error {
+        Errno::ACCESS | Errno::PERM => Access::Forbidden,
+        Errno::BUSY => Access::Busy,
+        _ => Access::Unusable,
+    }
+}
+
+fn is_camera(device: &dyn VideoDevice) -> bool {
+    let flags = device.capability().map_or(0, |capability| capability.flags);
+    flags & (CAP_VIDEO_CAPTURE | CAP_VIDEO_CAPTURE_MPLANE) != 0
+}
+
+/// A device without buffers of ours is busy where another program has some.
+fn device_access(device: &mut dyn VideoDevice) -> (Access, Option<Errno>) {
+    match device.make_buffers(0) {
+        Err(Errno::BUSY) => (Access::Busy, Some(Errno::BUSY)),
+        _ => (Access::Free, None),
+    }
+}
+
+fn report(dev: &Path, path: &Path) -> Option<CameraReport> {
+    let mut found = CameraReport {
+        path: path.to_owned(),
+        names: names(dev, path),
+        access: Access::Free,
+        problem: None,
+        card: String::new(),
+        driver: String::new(),
+        bus: String::new(),
+        formats: Vec::new(),
+        controls: Vec::new(),
+    };
+    let mut device = match KernelDevice::open(path) {
+        Ok(device) => device,
+        Err(error) => {
+            (found.access, found.problem) = (refused_access(error), Some(error.to_string()));
+            return Some(found);
+        }
+    };
+    if !is_camera(&device) {
+        return None;
+    }
+    let (access, error) = device_access(&mut device);
+    (found.access, found.problem) = (access, error.map(|error| error.to_string()));
+    describe(&device, &mut found);
+    Some(found)
+}
+
+/// What a device says of itself.
+fn describe(device: &dyn VideoDevice, found: &mut CameraReport) {
+    if let Ok(capability) = device.capability() {
+        (found.card, found.driver, found.bus) =
+            (capability.card, capability.driver, capability.bus);
+    }
+    found.formats = device.formats().iter().map(|format| format_report(device, format)).collect();
+    let controls = device.controls();
+    found.controls = controls.iter().filter_map(|c| control_report(device, c)).collect();
+}
+
+fn format_report(device: &dyn VideoDevice, format: &OfferedFormat) -> FormatReport {
+    let size = |size: &SizeRange| {
+        let (width, height) = size.largest;
+        let periods = device.periods(format.code, width, height);
+        let mut rates: Vec<f64> = periods
+            .iter()
+            .flat_map(|period| [rate_hz(period.shortest), rate_hz(period.longest)])
+            .collect();
+        rates.sort_by(|a, b| b.total_cmp(a));
+        rates.dedup();
+        SizeReport { size: size.to_string(), rates_hz: rates }
+    };
+    FormatReport {
+        code: format.code.to_string(),
+        description: format.description.clone(),
+        usable: PixelFormat::of(format.code).is_some(),
+        sizes: device.sizes(format.code).iter().map(size).collect(),
+    }
+}
+
+/// A control with its value; `None` for headings and buttons.
+fn control_report(device: &dyn VideoDevice, control: &ControlRange) -> Option<ControlReport> {
+    let kind = match control.kind {
+        CONTROL_TYPE_INTEGER => "integer",
+        CONTROL_TYPE_BOOLEAN => "boolean",
+        CONTROL_TYPE_MENU | CONTROL_TYPE_INTEGER_MENU => "menu",
+        _ => return None,
+    };
+    let is_readable = control.flags & CONTROL_WRITE_ONLY == 0;
+    let items = if kind == "menu" { device.menu(control) } else { Vec::new() };
+    Some(ControlReport {
+        name: control.name.clone(),
+        kind,
+        minimum: control.minimum,
+        maximum: control.maximum,
+        step: control.step,
+        default: control.default,
+        value: is_readable.then(|| device.value(control.id).ok()).flatten(),
+        fixed: control.flags & (CONTROL_READ_ONLY | CONTROL_INACTIVE) != 0,
+        items,
+    })
+}
+
+/// udev's names that lead to a node.
+fn names(dev: &Path, path: &Path) -> Vec<String> {
+    let leads_here = |link: &Path| link.canonicalize().is_ok_and(|target| target == path);
+    let mut found = Vec::new();
+    for folder in NAME_FOLDERS {
+        let entries = std::fs::read_dir(dev.join(folder)).into_iter().flatten().flatten();
+        let links = entries.map(|entry| entry.path()).filter(|link| leads_here(link));
+        let mut names: Vec<String> = links
+            .filter_map(|link| Some(link.file_name()?.to_string_lossy().into_owned()))
+            .collect();
+        names.sort();
+        found.append(&mut names);
+    }
+    found
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::capture::v4l::fake::Fake;
+
+    #[test]
+    fn nodes_are_counted_and_not_spelled() {
+        let dev = tempfile::tempdir().unwrap();
+        for name in ["video10", "video2", "video", "videox", "video-cam", "vbi0"] {
+            std::fs::write(dev.path().join(name), "").unwrap();
+        }
+        assert_eq!(nodes(dev.path()), [dev.path().join("video2"), dev.path().join("video10")]);
+        assert_eq!(nodes(Path::new("/nowhere")), [PathBuf::new(); 0]);
+        // A file that is no device is no camera.
+        assert_eq!(cameras(dev.path()), []);
+    }
+
+    #[test]
+    fn udev_names_lead_to_their_node() {
+        let dev = tempfile::tempdir().unwrap();
+        let dev = dev.path().canonicalize().unwrap();
+        std::fs::create_dir_all(dev.join("v4l/by-id")).unwrap();
+        std::fs::write(dev.join("video0"), "").unwrap();
+        std::os::unix::fs::symlink("../../video0", dev.join("v4l/by-id/usb-A-video-index0"))
+            .unwrap();
+        std::os::unix::fs::symlink("../../video1", dev.join("v4l/by-id/usb-B-video-index0"))
+            .unwrap();
+        assert_eq!(names(&dev, &dev.join("video0")), ["usb-A-video-index0"]);
+    }
+
+    #[test]
+    fn a_camera_says_what_it_offers() {
+        let fake = Fake::with_formats(&[(PixelFormat::Yuyv, &[(640, 480), (320, 240)], 30)])
+            .with_control(0x0098_0913, "Gain", (0, 100, 5), 40, 0);
+        let mut found = CameraReport {
+            path: "/dev/video0".into(),
+            names: Vec::new(),
+            access: Access::Free,
+            problem: None,
+            card: String::new(),
+            driver: String::new(),
+            bus: String::new(),
+            formats: Vec::new(),
+            controls: Vec::new(),
+        };
+        describe(&fake.device(), &mut found);
+        let format = &found.formats[0];
+        assert_eq!((format.code.as_str(), format.usable), ("YUYV", true));
+        assert_eq!(
+            format.sizes[0],
+            SizeReport { size: "640x480".to_owned(), rates_hz: vec![30.0] }
+        );
+        let gain = &found.controls[0];
+        assert_eq!((gain.name.as_str(), gain.value, gain.maximum), ("Gain", Some(40), 100));
+    }
+}

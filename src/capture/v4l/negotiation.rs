@@ -1,0 +1,255 @@
+//! What a camera is asked for, and what it grants: format, size, rate.
+
+use rustix::io::Errno;
+
+use super::kernel::{CAP_STREAMING, CAP_VIDEO_CAPTURE, CAP_VIDEO_CAPTURE_MPLANE};
+use super::pixel_format::{PixelFormat, is_usable};
+use super::video_device::{Fraction, Layout, SizeRange, VideoDevice, rate_hz};
+
+/// A rate within this share of the wish is the one that was asked for: 29.97 for 30.
+const RATE_TOLERANCE: f64 = 0.05;
+/// Rates are asked for in thousandths of a hertz.
+const MILLIHERTZ: f64 = 1000.0;
+
+/// What is wanted.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Wish {
+    /// Width, pixels.
+    pub width: u32,
+    /// Height, pixels.
+    pub height: u32,
+    /// Format; `None` for the best.
+    pub format: Option<PixelFormat>,
+    /// Frames a second; `None` for the camera's own.
+    pub rate_hz: Option<f64>,
+}
+
+/// What was granted.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Grant {
+    /// Format.
+    pub format: PixelFormat,
+    /// Bytes from row to row.
+    pub stride: usize,
+    /// Frames a second, where the driver says.
+    pub rate_hz: Option<f64>,
+}
+
+/// Why a camera does not serve.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum NegotiationError {
+    /// No capture device that streams.
+    #[error("is no camera that this program can read: {0}")]
+    NoCamera(&'static str),
+    /// None of our formats.
+    #[error(
+        "offers {offered}, none of the formats asked for; set capture.camera.format = \"auto\""
+    )]
+    NoFormat {
+        /// What it offers.
+        offered: String,
+    },
+    /// Not the rig's size.
+    #[error("gives {found} where {wanted} is asked for; it offers {offered}")]
+    Size {
+        /// What it gives.
+        found: String,
+        /// The rig's size.
+        wanted: String,
+        /// Sizes of its formats.
+        offered: String,
+    },
+    /// The driver refuses.
+    #[error("{0}")]
+    Device(Errno),
+}
+
+/// Asks for format, size and rate, and checks what is granted. A rate that is not granted is no error;
+/// the grant tells it.
+pub fn negotiate(device: &mut dyn VideoDevice, wish: &Wish) -> Result<Grant, NegotiationError> {
+    check_capability(device)?;
+    let (format, layout) = agree_on_layout(device, wish)?;
+    let rate_hz = agree_on_rate(device, wish.rate_hz);
+    Ok(Grant { format, stride: layout.stride as usize, rate_hz })
+}
+
+/// Whether a granted rate is not the one that was asked for.
+pub fn rate_differs(wanted: Option<f64>, granted: Option<f64>) -> bool {
+    let pair = wanted.zip(granted);
+    pair.is_some_and(|(wanted, granted)| (granted - wanted).abs() > RATE_TOLERANCE * wanted)
+}
+
+fn check_capability(device: &dyn VideoDevice) -> Result<(), NegotiationError> {
+    let no_camera = NegotiationError::NoCamera;
+    let capability = device.capability().map_err(|error| match error {
+        Errno::NOTTY | Errno::INVAL => no_camera("it is no video device"),
+        error => NegotiationError::Device(error),
+    })?;
+    let has = |flag: u32| capability.flags & flag != 0;
+    if !has(CAP_VIDEO_CAPTURE) && has(CAP_VIDEO_CAPTURE_MPLANE) {
+        return Err(no_camera("it gives pictures in several planes only"));
+    }
+    if !has(CAP_VIDEO_CAPTURE) {
+        return Err(no_camera(
+            "it gives no pictures; a camera may have several nodes, try the other",
+        ));
+    }
+    if !has(CAP_STREAMING) {
+        return Err(no_camera("it does not stream"));
+    }
+    Ok(())
+}
+
+/// Formats in the order of trial: those that reach the rate in their order, then the fastest of the
+/// others. A driver that does not say what it offers is asked for all.
+fn candidates(device: &dyn VideoDevice, wish: &Wish) -> Vec<PixelFormat> {
+    let offered = device.formats();
+    let is_wanted = |format: &PixelFormat| {
+        wish.format.is_none_or(|wanted| wanted == *format)
+            && (offered.is_empty() || offered.iter().any(|o| o.code == format.code()))
+    };
+    let fastest = |format: PixelFormat| {
+        let periods = device.periods(format.code(), wish.width, wish.height);
+        let rates = periods.iter().map(|period| rate_hz(period.shortest));
+        rates.fold(None, |best: Option<f64>, rate| Some(best.map_or(rate, |b| b.max(rate))))
+    };
+    let mut found: Vec<(PixelFormat, f64)> = PixelFormat::ALL
+        .into_iter()
+        .filter(is_wanted)
+        .map(|format| {
+            let shortfall = match (wish.rate_hz, fastest(format)) {
+                (Some(wanted), Some(fastest)) => wanted * (1.0 - RATE_TOLERANCE) - fastest,
+                _ => 0.0,
+            };
+            (format, shortfall.max(0.0))
+        })
+        .collect();
+    // Stable: who reaches the rate stays in order.
+    found.sort_by(|a, b| a.1.total_cmp(&b.1));
+    found.into_iter().map(|(format, _)| format).collect()
+}
+
+fn agree_on_layout(
+    device: &mut dyn VideoDevice,
+    wish: &Wish,
+) -> Result<(PixelFormat, Layout), NegotiationError> {
+    let mut found: Option<Layout> = None;
+    for format in candidates(device, wish) {
+        match device.set_layout(format.code(), wish.width, wish.height) {
+            // This format or size is not there; another may be.
+            Err(Errno::INVAL) => {}
+            Err(error) => return Err(NegotiationError::Device(error)),
+            Ok(layout) if layout.code != format.code() => {}
+            Ok(layout)
+                if (layout.width, layout.height) == (wish.width, wish.height)
+                    && is_usable(&layout) =>
+            {
+                return Ok((format, layout));
+            }
+            Ok(layout) => found = found.or(Some(layout)),
+        }
+    }
+    let Some(layout) = found else {
+        let codes: Vec<String> = device.formats().iter().map(|o| o.code.to_string()).collect();
+        let offered = if codes.is_empty() { "nothing".to_owned() } else { codes.join(", ") };
+        return Err(NegotiationError::NoFormat { offered });
+    };
+    let order = if layout.field > 1 { " in half pictures" } else { "" };
+    Err(NegotiationError::Size {
+        found: format!("{}x{} {}{order}", layout.width, layout.height, layout.code),
+        wanted: format!("{}x{}", wish.width, wish.height),
+        offered: offered_sizes(device),
+    })
+}
+
+fn offered_sizes(device: &dyn VideoDevice) -> String {
+    let known = device.formats().into_iter().filter(|o| PixelFormat::of(o.code).is_some());
+    let mut sizes: Vec<SizeRange> = known.flat_map(|o| device.sizes(o.code)).collect();
+    sizes.sort_by_key(|size| (size.smallest, size.largest));
+    sizes.dedup();
+    match sizes.as_slice() {
+        [] => "no others that it tells".to_owned(),
+        sizes => sizes.iter().map(SizeRange::to_string).collect::<Vec<_>>().join(", "),
+    }
+}
+
+fn agree_on_rate(device: &mut dyn VideoDevice, wanted: Option<f64>) -> Option<f64> {
+    let own = device.period().ok();
+    let granted = match (wanted, own) {
+        (Some(wanted), Some((_, true))) => {
+            let denominator = (wanted * MILLIHERTZ).round() as u32;
+            let period = Fraction { numerator: MILLIHERTZ as u32, denominator };
+            device.set_period(period).ok().or(own.map(|(period, _)| period))
+        }
+        _ => own.map(|(period, _)| period),
+    };
+    granted.map(rate_hz).filter(|rate| *rate > 0.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::capture::v4l::fake::Fake;
+
+    fn wish(format: Option<PixelFormat>, rate_hz: Option<f64>) -> Wish {
+        Wish { width: 640, height: 480, format, rate_hz }
+    }
+
+    #[test]
+    fn the_cheapest_format_that_reaches_the_rate_is_taken() {
+        // A webcam: raw pictures slowly, compressed ones fast.
+        let webcam = Fake::with_formats(&[
+            (PixelFormat::Mjpeg, &[(640, 480)], 30),
+            (PixelFormat::Yuyv, &[(640, 480)], 10),
+        ]);
+        let granted = |wish: Wish| negotiate(&mut webcam.device(), &wish).unwrap();
+        assert_eq!(granted(wish(None, Some(30.0))).format, PixelFormat::Mjpeg);
+        assert_eq!(granted(wish(None, Some(30.5))).format, PixelFormat::Mjpeg, "within 5 %");
+        assert_eq!(granted(wish(None, Some(60.0))).format, PixelFormat::Mjpeg, "the fastest");
+        let slow = granted(wish(None, Some(10.0)));
+        assert_eq!((slow.format, slow.stride), (PixelFormat::Yuyv, 1280));
+        assert_eq!(granted(wish(None, None)).format, PixelFormat::Yuyv);
+        assert_eq!(granted(wish(Some(PixelFormat::Mjpeg), None)).format, PixelFormat::Mjpeg);
+        assert!(rate_differs(Some(60.0), Some(30.0)) && !rate_differs(Some(30.0), Some(29.97)));
+    }
+
+    #[test]
+    fn rows_are_as_long_as_granted() {
+        let padded = Fake::with_formats(&[(PixelFormat::Grey, &[(640, 480)], 30)]);
+        padded.pad_rows(64);
+        let grant = negotiate(&mut padded.device(), &wish(None, Some(30.0))).unwrap();
+        assert_eq!((grant.stride, grant.rate_hz), (704, Some(30.0)));
+    }
+
+    #[test]
+    fn another_size_is_refused_with_those_that_there_are() {
+        let camera = Fake::with_formats(&[(PixelFormat::Yuyv, &[(320, 240), (1280, 720)], 30)]);
+        let error = negotiate(&mut camera.device(), &wish(None, None)).unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "gives 320x240 YUYV where 640x480 is asked for; it offers 320x240, 1280x720"
+        );
+        let grey = negotiate(&mut camera.device(), &wish(Some(PixelFormat::Grey), None));
+        assert_eq!(grey.unwrap_err(), NegotiationError::NoFormat { offered: "YUYV".to_owned() });
+    }
+
+    #[test]
+    fn what_is_no_camera_is_named_so() {
+        let fake = Fake::with_formats(&[(PixelFormat::Grey, &[(640, 480)], 30)]);
+        let refused = |flags| {
+            fake.set_capability_flags(flags);
+            negotiate(&mut fake.device(), &wish(None, None)).unwrap_err().to_string()
+        };
+        assert!(refused(CAP_STREAMING).contains("no pictures"), "an output or metadata node");
+        assert!(refused(CAP_VIDEO_CAPTURE).contains("does not stream"));
+        assert!(refused(CAP_VIDEO_CAPTURE_MPLANE | CAP_STREAMING).contains("several planes"));
+    }
+
+    #[test]
+    fn a_busy_camera_is_no_matter_of_formats() {
+        let fake = Fake::with_formats(&[(PixelFormat::Grey, &[(640, 480)], 30)]);
+        fake.refuse_layout(Errno::BUSY);
+        let error = negotiate(&mut fake.device(), &wish(None, None)).unwrap_err();
+        assert_eq!(error, NegotiationError::Device(Errno::BUSY));
+    }
+}
