@@ -2,11 +2,14 @@
 //! and gives up its CPU only to wait for the next frame. What iceoryx2 itself allocates is counted apart:
 //! the same calls to shared memory without a tracker.
 
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
+#[allow(dead_code, reason = "every test uses its part of what they share")]
+#[path = "support/counting_allocator.rs"]
+mod counting_allocator;
+#[path = "support/waves.rs"]
+mod waves;
+
 use std::fs;
 use std::io::Write;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use semidense::service::clock::now_nanos;
@@ -16,9 +19,7 @@ use semidense::service::schedule::in_force;
 use semidense::service::shutdown::Shutdown;
 use semidense::service::tracker;
 use semidense::slam::frame::FrameView;
-use semidense::slam::geometry::intrinsics::Intrinsics;
-use semidense::slam::geometry::sim3::Sim3;
-use semidense::slam::keyframe::{DepthPoint, Keyframe, MapState};
+use semidense::slam::keyframe::DepthPoint;
 use semidense::slam::pose::PoseEstimate;
 use semidense::wire::conversion::{
     keyframe_header, keyframe_image_header, pose_from_message, pose_message,
@@ -30,47 +31,9 @@ use semidense::wire::place::Place;
 use semidense::wire::port::{Access, Hub, Publisher, Subscriber, wait};
 use semidense::wire::topic::{FRAME, KEYFRAME, KEYFRAME_IMAGE, POSE, TRACKER_HEALTH};
 
-/// The system's allocator, counting in the threads that ask for it.
-struct Counting;
+use counting_allocator::{allocations, count_here};
+use waves::{CAMERA, image, keyframe};
 
-static ALLOCATIONS: AtomicU64 = AtomicU64::new(0);
-
-thread_local! {
-    static IS_COUNTED: Cell<bool> = const { Cell::new(false) };
-}
-
-fn count() {
-    // A thread that ends has no locals any more.
-    if IS_COUNTED.try_with(Cell::get).unwrap_or(false) {
-        ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
-    }
-}
-
-// SAFETY: every call goes to the system's allocator unchanged.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        count();
-        // SAFETY: the caller's contract.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller's contract.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-
-    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        count();
-        // SAFETY: the caller's contract.
-        unsafe { System.realloc(pointer, layout, size) }
-    }
-}
-
-#[global_allocator]
-static ALLOCATOR: Counting = Counting;
-
-const CAMERA: Intrinsics =
-    Intrinsics { fx: 260.0, fy: 260.0, cx: 159.5, cy: 119.5, width: 320, height: 240 };
 /// Frames until everything has been touched.
 const WARM_UP: u64 = 150;
 /// Frames that are counted.
@@ -81,41 +44,6 @@ const PAUSE: Duration = Duration::from_millis(2);
 const UNLOCKED_PAGE_FAULTS: u64 = 20;
 /// Far above anything that is expected: it ends a test that hangs.
 const WATCH_DOG: Duration = Duration::from_secs(120);
-
-/// Smooth waves, shifted by `shift` pixels.
-fn image(shift: f64) -> Vec<u8> {
-    let grey = |u: usize, v: usize| {
-        let (u, v) = (u as f64 - shift, v as f64);
-        128.0 + 40.0 * (u * 0.19).sin() * (v * 0.13).cos() + 30.0 * (0.07 * u + 0.11 * v).sin()
-    };
-    (0..CAMERA.width * CAMERA.height)
-        .map(|i| grey(i % CAMERA.width, i / CAMERA.width) as u8)
-        .collect()
-}
-
-fn keyframe() -> Keyframe {
-    let image = image(0.0);
-    let pixels = (2..CAMERA.height - 2).flat_map(|v| (2..CAMERA.width - 2).map(move |u| (u, v)));
-    let points = pixels.map(|(u, v)| DepthPoint {
-        u: u as u16,
-        v: v as u16,
-        inverse_depth: 1.0,
-        variance: 1e-3,
-        intensity: f32::from(image[v * CAMERA.width + u]),
-    });
-    Keyframe {
-        keyframe_id: 0,
-        epoch: 0,
-        revision: 0,
-        sequence: 0,
-        capture_nanos: 0,
-        map_state: MapState::Established,
-        world_from_keyframe: Sim3::identity(),
-        intrinsics: CAMERA,
-        points: points.collect(),
-        image,
-    }
-}
 
 fn header(sequence: u64) -> FrameHeader {
     let now = now_nanos();
@@ -149,7 +77,7 @@ struct Others {
 impl Others {
     fn new(place: &Place) -> Self {
         let hub = Hub::join(place, "others", Access::Member).unwrap();
-        let keyframe = keyframe();
+        let keyframe = keyframe(0);
         let depths = hub.publisher(&KEYFRAME, keyframe.points.len()).unwrap();
         let images = hub.publisher(&KEYFRAME_IMAGE, keyframe.image.len()).unwrap();
         images.send(keyframe_image_header(&keyframe), &keyframe.image).unwrap();
@@ -235,7 +163,7 @@ impl Cost {
         let waits =
             status.lines().find_map(|l| l.strip_prefix("voluntary_ctxt_switches:")).unwrap();
         Self {
-            allocations: ALLOCATIONS.load(Ordering::SeqCst),
+            allocations: allocations(),
             page_faults: field(10) + field(12),
             waits: waits.trim().parse().unwrap(),
         }
@@ -261,9 +189,9 @@ fn cost_of(run: impl FnOnce(&Place, &Shutdown) + Send + 'static) -> (Cost, u64) 
     let (tell, told) = std::sync::mpsc::channel();
     let thread = std::thread::spawn(move || {
         tell.send(rustix::thread::gettid().as_raw_nonzero().get()).unwrap();
-        IS_COUNTED.set(true);
+        count_here(true);
         run(&theirs, &shutdown);
-        IS_COUNTED.set(false);
+        count_here(false);
     });
     others.send(WARM_UP);
     let tid = told.recv().unwrap();

@@ -133,7 +133,7 @@ fn record(poses: Vec<RecordedPose>, keyframes: Vec<Keyframe>, with_truth: bool) 
         mode: RunMode::Lockstep,
         source: "tum:a<script>\"b\"".to_owned(),
         poses,
-        map: Map { keyframes },
+        map: Map { keyframes, ..Map::default() },
         ground_truth: if with_truth { (0..frames).map(pose).collect() } else { Vec::new() },
         depth_scale: DepthScale::MedianRatio,
         frames_in: frames as u64,

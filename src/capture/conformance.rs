@@ -171,6 +171,23 @@ fn every_source_keeps_the_contract() {
 }
 
 #[test]
+fn frames_can_be_left_out_up_to_a_sequence() {
+    for kind in ["tum", "euroc", "images", "sim"] {
+        for (sequence, expected) in
+            [(0, vec![1, 2, 3, 4]), (2, vec![3, 4]), (4, vec![]), (99, vec![])]
+        {
+            let (_folder, source) = opened(kind, |_| {});
+            let mut source = source.unwrap_or_else(|error| panic!("{kind}: {error}"));
+            source.prepare(&mut |_, _| true).expect("prepared");
+            source.skip_to(sequence).unwrap_or_else(|error| panic!("{kind}: {error}"));
+            let frames = play(&mut *source).unwrap_or_else(|error| panic!("{kind}: {error}"));
+            let left: Vec<u64> = frames.iter().map(|(stamp, _)| stamp.sequence).collect();
+            assert_eq!(left, expected, "{kind} behind {sequence}");
+        }
+    }
+}
+
+#[test]
 fn a_bad_image_is_one_error_and_the_next_frame_follows() {
     for (kind, image) in [
         ("tum", "rgb/2.png"),

@@ -112,15 +112,19 @@ impl Rig {
     /// Reads a rig from a `camera.txt`: `fx fy cx cy width height` and 0, 4, 5 or 8 radtan
     /// coefficients (`k1 k2 p1 p2 [k3 [k4 k5 k6]]`), OpenCV's model and order.
     pub fn read_camera_txt(path: &Path) -> Result<Self, SourceError> {
+        Self::from_camera_txt(path, &listing::read_text(path)?)
+    }
+
+    /// Reads a rig from the text of a `camera.txt` that came from `path`.
+    pub fn from_camera_txt(path: &Path, text: &str) -> Result<Self, SourceError> {
         const SHAPE: &str =
             "needs one line `fx fy cx cy width height [k1 k2 p1 p2 [k3 [k4 k5 k6]]]`";
-        let text = listing::read_text(path)?;
         let syntax = |problem: &str| RigError::Syntax {
             path: path.to_owned(),
             line: 1,
             problem: problem.to_owned(),
         };
-        let mut rows = listing::rows(path, &text);
+        let mut rows = listing::rows(path, text);
         let row = rows.next().ok_or_else(|| syntax(SHAPE))?;
         if let Some(second) = rows.next() {
             return Err(second.error(format!("a second camera; {SHAPE}")));

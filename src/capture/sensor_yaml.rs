@@ -33,8 +33,12 @@ struct Entry<'a> {
 
 /// Reads the `sensor.yaml` at `path`.
 pub fn read(path: &Path) -> Result<SensorYaml, SourceError> {
-    let text = read_text(path)?;
-    let entries = read_entries(path, &text)?;
+    parse(path, &read_text(path)?)
+}
+
+/// Reads the text of a `sensor.yaml` that came from `path`.
+pub fn parse(path: &Path, text: &str) -> Result<SensorYaml, SourceError> {
+    let entries = read_entries(path, text)?;
     let get = |key: &str| {
         entries.get(key).ok_or_else(|| SourceError::Line {
             path: path.to_owned(),

@@ -9,7 +9,8 @@ use crate::command::print::{note, print};
 use crate::command::run_progress::RunDisplay;
 use crate::command::{CommandResult, CommonArguments, INTERRUPTED};
 use crate::service::config::Config;
-use crate::service::latency_bench::{Disturbance, Measurement, Tail, Trial, TrialError, try_out};
+use crate::service::latency_bench::{Disturbance, Measurement, Trial, TrialError, try_out};
+use crate::service::results::summary::Percentiles;
 use crate::service::shutdown::Shutdown;
 
 /// Measure on this machine
@@ -152,7 +153,7 @@ fn table(measurements: &[Measurement]) -> String {
         "faults",
         "stolen ms"
     )];
-    let tail = |tail: Option<Tail>| {
+    let tail = |tail: Option<Percentiles>| {
         tail.map_or("-".to_owned(), |t| {
             format!("{:.2}/{:.2}/{:.2}/{:.2}", t.p50, t.p99, t.p999, t.max)
         })

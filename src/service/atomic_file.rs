@@ -1,7 +1,8 @@
 //! Files that are whole or not there: written under a temporary name, then renamed.
 
-use std::fs::{self, File};
+use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufWriter, Write};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 
 /// Lets `write` fill a new file beside `path` and renames it to `path` when all of it is written.
@@ -10,9 +11,30 @@ pub fn write_atomically(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>,
 ) -> io::Result<()> {
+    /// As far as the process's mask allows.
+    const EVERYBODY: u32 = 0o666;
+    write_with_mode(path, EVERYBODY, write)
+}
+
+/// The same, and nobody but the user of the process may read the file.
+pub fn write_privately(
+    path: &Path,
+    write: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>,
+) -> io::Result<()> {
+    const USER_ALONE: u32 = 0o600;
+    write_with_mode(path, USER_ALONE, write)
+}
+
+fn write_with_mode(
+    path: &Path,
+    mode: u32,
+    write: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>,
+) -> io::Result<()> {
     let name = path.file_name().ok_or(io::ErrorKind::InvalidInput)?.to_string_lossy();
     let temporary = path.with_file_name(format!(".{name}.{}.tmp", std::process::id()));
-    let result = File::create(&temporary).and_then(|file| {
+    let mut options = OpenOptions::new();
+    options.write(true).create(true).truncate(true).mode(mode);
+    let result = options.open(&temporary).and_then(|file| {
         let mut writer = BufWriter::new(file);
         write(&mut writer)?;
         writer.flush()

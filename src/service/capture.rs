@@ -103,6 +103,7 @@ pub fn run(
         let refusals = apply(&config.capture.scheduling);
         refusals.iter().for_each(|refusal| tracing::warn!("capture: {refusal}"));
         shell.health.tell_scheduling(&in_force(), &refusals);
+        shell.health.tell_ready();
         shell.stream()
     });
     match &outcome {

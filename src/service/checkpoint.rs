@@ -10,7 +10,8 @@ use std::thread::JoinHandle;
 
 use crossbeam::queue::ArrayQueue;
 
-use crate::service::map_file::{MapFileError, read_map, write_map};
+use crate::service::atomic_file::write_privately;
+use crate::service::map_file::{MapFileError, read_map, write_map_into};
 use crate::slam::mapper::Map;
 
 /// Writes the newest checkpoint. The file stays unless the process ends in order.
@@ -29,9 +30,10 @@ struct Shared {
 }
 
 impl Checkpoint {
-    /// Keeps the checkpoint in the file `path`.
-    pub fn keep(path: &Path) -> io::Result<Self> {
+    /// Keeps the checkpoint in the file `path`; `first` is written before this returns.
+    pub fn keep(path: &Path, first: &Map) -> io::Result<Self> {
         remove_unfinished(path);
+        write(path, first)?;
         let shared = Arc::new(Shared { newest: ArrayQueue::new(1), stop: AtomicBool::new(false) });
         let (theirs, file) = (Arc::clone(&shared), path.to_owned());
         let thread = std::thread::Builder::new()
@@ -70,12 +72,17 @@ impl Drop for Checkpoint {
     }
 }
 
+/// It holds images: for the user of the process alone.
+fn write(path: &Path, map: &Map) -> io::Result<()> {
+    write_privately(path, |file| write_map_into(file, map))
+}
+
 fn write_until_stopped(path: &Path, shared: &Shared) {
     while !shared.stop.load(Ordering::Acquire) {
         match shared.newest.pop() {
             None => std::thread::park(),
             Some(map) => {
-                if let Err(error) = write_map(path, &map) {
+                if let Err(error) = write(path, &map) {
                     tracing::warn!(
                         "{}: no checkpoint ({error}); a mapper that dies will begin anew",
                         path.display()
@@ -110,6 +117,7 @@ pub fn read_checkpoint(path: &Path) -> Result<Option<Map>, MapFileError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::os::unix::fs::PermissionsExt;
     use std::time::{Duration, Instant};
 
     fn until(mut holds: impl FnMut() -> bool) {
@@ -127,14 +135,14 @@ mod tests {
         assert!(read_checkpoint(&path).unwrap().is_none());
         let unfinished = folder.path().join(".rig.checkpoint.17.tmp");
         fs::write(&unfinished, "half").unwrap();
-        let mut kept = Checkpoint::keep(&path).unwrap();
-        assert!(!unfinished.exists());
-        kept.put(Map::default());
-        until(|| path.exists());
-        assert_eq!(read_checkpoint(&path).unwrap().unwrap().keyframes.len(), 0);
+        let mut kept = Checkpoint::keep(&path, &Map::default()).unwrap();
+        assert!(!unfinished.exists() && path.exists());
+        kept.put(Map { free_epoch: 7, ..Map::default() });
+        until(|| read_checkpoint(&path).unwrap().unwrap().free_epoch == 7);
+        assert_eq!(fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o600);
         drop(kept);
         assert!(path.exists(), "a panic or an error is no end in order");
-        kept = Checkpoint::keep(&path).unwrap();
+        kept = Checkpoint::keep(&path, &Map::default()).unwrap();
         kept.end_in_order();
         drop(kept);
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);

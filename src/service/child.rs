@@ -10,6 +10,8 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal};
 
+use crate::service::manager_notice::VARIABLES;
+
 /// Environment variable with the process id of the supervisor.
 pub const SUPERVISOR_VARIABLE: &str = "SEMIDENSE_SUPERVISOR";
 /// What the last line of a command that fails begins with.
@@ -54,7 +56,12 @@ impl Child {
     /// Starts the subcommand `name` of this binary, in a process group of its own, so that a Ctrl-C
     /// at the terminal reaches only the supervisor.
     pub fn start(name: &'static str, arguments: &[String], root: &Path) -> io::Result<Self> {
-        let mut process = Command::new(std::env::current_exe()?)
+        let mut command = Command::new(std::env::current_exe()?);
+        // The service manager knows the supervisor, not its children.
+        for variable in VARIABLES {
+            command.env_remove(variable);
+        }
+        let mut process = command
             .arg(name)
             .args(arguments)
             .env(SUPERVISOR_VARIABLE, std::process::id().to_string())

@@ -92,7 +92,7 @@ pub struct TrackerConfig {
     /// Live: time from a frame's arrival to its pose, milliseconds; 0 is half the time between two
     /// frames. At the deadline the best pose so far is published as degraded (budget).
     pub deadline_ms: f64,
-    /// Live: after so many frame periods without a frame the tracker is stale.
+    /// Live: after so many frame periods without a frame tracker and mapper are stale.
     pub stale_periods: f64,
     /// What its frame loop asks of the kernel. On a robot: fifo, and locked memory.
     pub scheduling: SchedulingParams,
@@ -212,7 +212,8 @@ impl Config {
         toml::to_string(self).unwrap_or_default()
     }
 
-    fn from_text(text: &str, file: &str) -> Result<Self, ConfigError> {
+    /// Reads the text of a configuration that came from `file`; what it does not name has its default.
+    pub fn from_text(text: &str, file: &str) -> Result<Self, ConfigError> {
         let config: Self = toml::from_str(text).map_err(|error| {
             let before = error.span().and_then(|span| text.get(..span.start));
             let line = before.map_or(1, |before| before.matches('\n').count() + 1);

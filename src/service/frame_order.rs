@@ -1,5 +1,6 @@
 //! The order of frames as they arrive: what is missing, repeated or out of order, and how far apart they are.
 
+use crate::service::clock::now_nanos;
 use crate::wire::message::FrameHeader;
 
 /// Distance of two frames before any is known: 30 Hz.
@@ -9,6 +10,9 @@ const FIRST_PERIOD_NANOS: i64 = 33_000_000;
 const PERIODS_NANOS: std::ops::RangeInclusive<i64> = 1_000_000..=5_000_000_000;
 /// So many frames in a row that seem repeated are a source that counts anew.
 const RENUMBERED_FRAMES: u32 = 10;
+
+/// What a process says whose frames have stopped coming.
+pub const SILENCE: &str = "no frames come: look at capture";
 
 /// What a frame is to the one before.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -38,6 +42,13 @@ impl FrameOrder {
     /// Time between two frames, by the stamps of the last two.
     pub fn period_nanos(&self) -> i64 {
         self.period_nanos.unwrap_or(FIRST_PERIOD_NANOS)
+    }
+
+    /// Whether frames have stopped coming: none for so many periods since the last one.
+    pub fn is_silent(&self, last_arrival_nanos: Option<i64>, periods: f64) -> bool {
+        let allowed_nanos = periods * self.period_nanos() as f64;
+        last_arrival_nanos
+            .is_some_and(|last| now_nanos().saturating_sub(last) as f64 > allowed_nanos)
     }
 
     /// Says what the next frame is. Hostile numbers are as good as any.

@@ -1,6 +1,7 @@
 //! The health of a process: state, counters and latencies, published once a second and on change.
 
 use crate::service::clock::now_nanos;
+use crate::service::manager_notice::ManagerNotice;
 use crate::service::schedule::{InForce, Policy, Refusal, peak_rss_bytes};
 use crate::wire::command::{text_bytes, text_from_bytes};
 use crate::wire::message::{HISTOGRAM_BUCKETS, HealthMessage, TEXT_BYTES};
@@ -118,12 +119,16 @@ pub fn scheduling_name(code: u32) -> &'static str {
     }
 }
 
-/// Counts, and publishes when it is time.
+/// Counts, and publishes when it is time: to everybody who subscribes, and to the service manager.
 #[derive(Debug)]
 pub struct Health {
     publisher: Publisher<HealthMessage, ()>,
     message: HealthMessage,
     changed: bool,
+    notice: ManagerNotice,
+    /// Frames that had been counted when the rate was told last, and when that was.
+    told: (u64, i64),
+    rate_hz: f64,
 }
 
 impl Health {
@@ -159,7 +164,9 @@ impl Health {
             cause: [0; TEXT_BYTES],
         };
         let publisher = hub.publisher(topic, 1)?;
-        let mut health = Self { publisher, message, changed: true };
+        let notice = ManagerNotice::from_environment();
+        let told = (0, message.started_nanos);
+        let mut health = Self { publisher, message, changed: true, notice, told, rate_hz: 0.0 };
         health.report();
         Ok(health)
     }
@@ -208,18 +215,28 @@ impl Health {
         self.report();
     }
 
+    /// Tells the service manager that everything is open and read: from now on the process does its work.
+    pub fn tell_ready(&mut self) {
+        self.notice.ready();
+    }
+
     /// Reports how much of the preparation is done.
     pub fn progress(&mut self, done: usize, total: usize) {
         (self.message.progress_done, self.message.progress_total) = (done as u64, total as u64);
         let due = now_nanos() - self.message.published_nanos >= PROGRESS_PERIOD_NANOS;
         self.changed |= due || done == total;
+        if due {
+            self.notice.prepares();
+        }
         self.report();
     }
 
-    /// Publishes when something changed or a second is over, and serves those who came late.
+    /// Publishes when something changed or a second is over, and serves those who came late. The frame loop
+    /// calls it on every turn, so that it is the loop's heartbeat too.
     pub fn report(&mut self) {
         self.publisher.serve_late_joiners();
         let now = now_nanos();
+        self.notice.beat(now);
         if !self.changed && now - self.message.published_nanos < REPORT_PERIOD_NANOS {
             return;
         }
@@ -229,6 +246,30 @@ impl Health {
         if let Err(error) = self.publisher.send((), &[self.message]) {
             tracing::warn!("{error}");
         }
+        self.tell_status(now);
+    }
+
+    /// The state, its cause and the figures as a line for the service manager.
+    fn tell_status(&mut self, now: i64) {
+        let (frames, since) = self.told;
+        if now - since >= REPORT_PERIOD_NANOS {
+            let secs = (now - since) as f64 * 1e-9;
+            self.rate_hz = self.message.frames.saturating_sub(frames) as f64 / secs;
+            self.told = (self.message.frames, now);
+        }
+        let state = ProcessState::from_code(self.message.state).unwrap_or(ProcessState::Failed);
+        if matches!(state, ProcessState::Finished | ProcessState::Failed) {
+            self.notice.stopping();
+        }
+        let length = (self.message.cause_bytes as usize).min(TEXT_BYTES);
+        // Our own text, cut at a character.
+        let cause = str::from_utf8(&self.message.cause[..length]).unwrap_or_default();
+        let separator = if cause.is_empty() { "" } else { ": " };
+        let (name, rate_hz) = (state.name(), self.rate_hz);
+        let HealthMessage { frames, deadline_misses, refused, .. } = self.message;
+        self.notice.status(format_args!(
+            "{name}{separator}{cause} ({rate_hz:.1} frames/s, {frames} frames, {deadline_misses} late, {refused} refused)"
+        ));
     }
 }
 

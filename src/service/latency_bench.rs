@@ -13,9 +13,9 @@ use crate::capture::source::SourceName;
 use crate::service::config::Config;
 use crate::service::mode::Mode;
 use crate::service::results::RecordedPose;
+use crate::service::results::summary::Percentiles;
 use crate::service::shutdown::Shutdown;
 use crate::service::supervisor::{Ended, RunError, RunOptions, RunOutcome, RunProgress, run};
-use crate::slam::evaluation::statistics::percentile;
 use crate::wire::message::{FrameHeader, PoseMessage};
 use crate::wire::place::{Place, PlaceError};
 use crate::wire::port::{Access, Hub, OpenError, Subscriber, wait};
@@ -84,28 +84,6 @@ pub struct Trial {
     pub rate_hz: f64,
 }
 
-/// Percentiles of a time, milliseconds.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Tail {
-    /// Median.
-    pub p50: f64,
-    /// 99 of 100 are not longer.
-    pub p99: f64,
-    /// 999 of 1000 are not longer.
-    pub p999: f64,
-    /// Longest.
-    pub max: f64,
-}
-
-impl Tail {
-    fn of(nanos: impl Iterator<Item = u64>) -> Option<Self> {
-        let mut millis: Vec<f64> = nanos.map(|nanos| nanos as f64 * 1e-6).collect();
-        millis.sort_by(f64::total_cmp);
-        let at = |share| percentile(&millis, share);
-        Some(Self { p50: at(0.5)?, p99: at(0.99)?, p999: at(0.999)?, max: at(1.0)? })
-    }
-}
-
 /// What came of a trial.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Measurement {
@@ -122,11 +100,11 @@ pub struct Measurement {
     /// Of them those that are claimed.
     pub tracked: u64,
     /// From the instant that a frame was due to its pose's publication.
-    pub latency_ms: Option<Tail>,
+    pub latency_ms: Option<Percentiles>,
     /// From the sending of a frame to the tracker's look at it.
-    pub wake_ms: Option<Tail>,
+    pub wake_ms: Option<Percentiles>,
     /// Time in the tracker.
-    pub track_ms: Option<Tail>,
+    pub track_ms: Option<Percentiles>,
     /// Time that the tracker was allowed from a frame's arrival.
     pub deadline_ms: Option<f64>,
     /// Poses published later than that.
@@ -211,7 +189,8 @@ pub fn try_out(
 
 fn measurement(trial: &Trial, outcome: &RunOutcome, stolen_ms: Option<f64>) -> Measurement {
     let record = &outcome.record;
-    let tail = |of: fn(&RecordedPose) -> Option<u64>| Tail::of(record.poses.iter().filter_map(of));
+    let tail =
+        |of: fn(&RecordedPose) -> Option<u64>| Percentiles::of(record.poses.iter().filter_map(of));
     Measurement {
         disturbance: trial.disturbance,
         real_time: trial.real_time,

@@ -1,7 +1,7 @@
 //! The whole map as a binary file, little-endian: the mapper writes it, supervisor and mapper read
 //! it. Everything read is checked: a broken file gives an error that names what is wrong.
 //!
-//! Layout: magic, then the number of keyframes (u64), then each keyframe: id, revision, sequence
+//! Layout: magic, then the first free epoch (u32), the number of keyframes (u64), then each keyframe: id, revision, sequence
 //! (u64), stamp (i64), epoch, map state, width, height (u32), pose (8 × f64), intrinsics
 //! (4 × f64), number of points (u64), points (u16, u16, 3 × f32), number of image bytes (u64, 0 where the
 //! image was given up), image bytes.
@@ -20,7 +20,11 @@ use crate::wire::conversion::{
 };
 
 /// First bytes of the file, with the version of the layout.
-const MAGIC: [u8; 16] = *b"semidense map 2\n";
+const MAGIC: [u8; 16] = *b"semidense map 3\n";
+/// Largest id or revision: what comes after it must not overflow.
+const MAX_NUMBER: u64 = u64::MAX / 2;
+/// Largest number of an epoch, for the same reason.
+const MAX_EPOCH: u64 = (u32::MAX / 2) as u64;
 /// More keyframes than an hour at one each 30 ms: a broken number, not a map.
 const MAX_KEYFRAMES: u64 = 120_000;
 
@@ -65,11 +69,15 @@ pub enum MapFileError {
 
 /// Writes `map` under a temporary name and renames it to `path`.
 pub fn write_map(path: &Path, map: &Map) -> io::Result<()> {
-    write_atomically(path, |file| {
-        file.write_all(&MAGIC)?;
-        file.write_all(&(map.keyframes.len() as u64).to_le_bytes())?;
-        map.keyframes.iter().try_for_each(|keyframe| write_keyframe(file, keyframe))
-    })
+    write_atomically(path, |file| write_map_into(file, map))
+}
+
+/// Writes the bytes of `map`.
+pub fn write_map_into(file: &mut impl Write, map: &Map) -> io::Result<()> {
+    file.write_all(&MAGIC)?;
+    file.write_all(&map.free_epoch.to_le_bytes())?;
+    file.write_all(&(map.keyframes.len() as u64).to_le_bytes())?;
+    map.keyframes.iter().try_for_each(|keyframe| write_keyframe(file, keyframe))
 }
 
 fn write_keyframe(file: &mut impl Write, keyframe: &Keyframe) -> io::Result<()> {
@@ -100,12 +108,19 @@ fn write_keyframe(file: &mut impl Write, keyframe: &Keyframe) -> io::Result<()> 
 
 /// Reads the map that [`write_map`] wrote.
 pub fn read_map(path: &Path) -> Result<Map, MapFileError> {
-    let mut reader = Reader::open(path)?;
+    let file =
+        File::open(path).map_err(|source| MapFileError::Read { path: path.to_owned(), source })?;
+    parse_map(path, BufReader::new(file))
+}
+
+/// Reads the map from the bytes of a file that came from `path`.
+pub fn parse_map(path: &Path, bytes: impl Read) -> Result<Map, MapFileError> {
+    let mut reader = Reader { file: bytes, path };
     if reader.bytes::<16>()? != MAGIC {
         return Err(MapFileError::Magic(path.to_owned()));
     }
+    let mut map = Map { free_epoch: reader.epoch()?, ..Map::default() };
     let count = reader.count("keyframes", MAX_KEYFRAMES)?;
-    let mut map = Map::default();
     for index in 0..count {
         map.keyframes.push(reader.keyframe(index)?);
     }
@@ -116,18 +131,12 @@ pub fn read_map(path: &Path) -> Result<Map, MapFileError> {
 }
 
 /// Reads numbers and says where it failed.
-struct Reader<'a> {
-    file: BufReader<File>,
+struct Reader<'a, R> {
+    file: R,
     path: &'a Path,
 }
 
-impl<'a> Reader<'a> {
-    fn open(path: &'a Path) -> Result<Self, MapFileError> {
-        let file = File::open(path)
-            .map_err(|source| MapFileError::Read { path: path.to_owned(), source })?;
-        Ok(Self { file: BufReader::new(file), path })
-    }
-
+impl<R: Read> Reader<'_, R> {
     fn bytes<const N: usize>(&mut self) -> Result<[u8; N], MapFileError> {
         let mut bytes = [0; N];
         self.file
@@ -154,6 +163,15 @@ impl<'a> Reader<'a> {
 
     fn count(&mut self, what: &'static str, most: u64) -> Result<u64, MapFileError> {
         let count = self.u64()?;
+        self.at_most(what, count, most)
+    }
+
+    fn epoch(&mut self) -> Result<u32, MapFileError> {
+        let epoch = self.u32()?;
+        self.at_most("epoch", u64::from(epoch), MAX_EPOCH).map(|_| epoch)
+    }
+
+    fn at_most(&self, what: &'static str, count: u64, most: u64) -> Result<u64, MapFileError> {
         if count <= most {
             return Ok(count);
         }
@@ -163,9 +181,10 @@ impl<'a> Reader<'a> {
     fn keyframe(&mut self, index: u64) -> Result<Keyframe, MapFileError> {
         let path = self.path.to_owned();
         let wrong = move |source| MapFileError::Keyframe { path: path.clone(), index, source };
-        let (keyframe_id, revision, sequence) = (self.u64()?, self.u64()?, self.u64()?);
+        let keyframe_id = self.count("keyframe id", MAX_NUMBER)?;
+        let (revision, sequence) = (self.count("revision", MAX_NUMBER)?, self.u64()?);
         let capture_nanos = i64::from_le_bytes(self.bytes()?);
-        let (epoch, state, width, height) = (self.u32()?, self.u32()?, self.u32()?, self.u32()?);
+        let (epoch, state, width, height) = (self.epoch()?, self.u32()?, self.u32()?, self.u32()?);
         let mut numbers = [0.0; 12];
         for number in &mut numbers {
             *number = self.f64()?;
@@ -236,7 +255,8 @@ mod tests {
             image: (0..17 * 16).map(|i| (i % 251) as u8).collect(),
             points: vec![point; 5],
         };
-        Map { keyframes: vec![keyframe.clone(), Keyframe { keyframe_id: 8, ..keyframe }] }
+        let keyframes = vec![keyframe.clone(), Keyframe { keyframe_id: 8, ..keyframe }];
+        Map { keyframes, free_epoch: 18 }
     }
 
     #[test]
@@ -244,7 +264,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("map.bin");
         write_map(&path, &map()).unwrap();
-        assert_eq!(read_map(&path).unwrap().keyframes, map().keyframes);
+        let read = read_map(&path).unwrap();
+        assert_eq!((read.keyframes, read.free_epoch), (map().keyframes, 18));
     }
 
     #[test]

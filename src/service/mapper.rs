@@ -6,6 +6,7 @@ use std::time::Duration;
 use crate::service::checkpoint::{Checkpoint, read_checkpoint};
 use crate::service::clock::now_nanos;
 use crate::service::config::Config;
+use crate::service::frame_order::{Arrival, FrameOrder, SILENCE};
 use crate::service::health::{Health, ProcessState};
 use crate::service::map_file::write_map;
 use crate::service::mode::Mode;
@@ -82,6 +83,7 @@ pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), Mappe
     let mut shell = Shell::prepare(config, mode)?;
     shell.health.tell_scheduling(&in_force(), &refusals);
     shell.health.enter(ProcessState::Ready, "");
+    shell.health.tell_ready();
     let outcome = shell.map_until(shutdown);
     match &outcome {
         Ok(()) => {
@@ -97,9 +99,15 @@ type Frame = Received<u8, FrameHeader>;
 
 struct Shell<'a> {
     config: &'a Config,
+    mode: Mode,
     frames: Subscriber<u8, FrameHeader>,
     poses: Subscriber<PoseMessage, ()>,
     pairing: Pairing<Frame>,
+    order: FrameOrder,
+    /// Frames that did not arrive.
+    missing: u64,
+    /// CLOCK_MONOTONIC when the last frame arrived.
+    last_arrival_nanos: Option<i64>,
     commands: CommandServer,
     output: Output,
     health: Health,
@@ -134,10 +142,14 @@ impl<'a> Shell<'a> {
             .map_err(|e| MapperError::Pool { threads, reason: e.to_string() })?;
         Ok(Self {
             config,
+            mode,
             frames: hub.subscriber(&FRAME)?,
             poses: hub.subscriber(&POSE)?,
             // One place less than may be borrowed: the next is received before the oldest goes.
             pairing: Pairing::new(FRAME.borrowed - 1),
+            order: FrameOrder::default(),
+            missing: 0,
+            last_arrival_nanos: None,
             commands: CommandServer::open(&hub)?,
             output: Output::open(&hub)?,
             health: Health::open(&hub, &MAPPER_HEALTH)?,
@@ -164,6 +176,7 @@ impl<'a> Shell<'a> {
                 }
             }
             self.answer_commands()?;
+            self.look_for_silence();
             self.health.report();
         }
         Ok(())
@@ -172,7 +185,7 @@ impl<'a> Shell<'a> {
     /// The oldest frame with its pose, of those that are still here.
     fn next_pair(&mut self) -> Result<Option<(Frame, PoseEstimate)>, MapperError> {
         while let Some(frame) = self.frames.receive()? {
-            self.pairing.push_frame(frame.header().sequence, frame);
+            self.take_in(frame);
         }
         while let Some(message) = self.poses.receive()? {
             match message.payload().first().map(pose_from_message) {
@@ -187,15 +200,45 @@ impl<'a> Shell<'a> {
         Ok(self.pairing.take())
     }
 
+    /// A frame that is whole and comes in its turn waits for its pose; counts what is not and what is
+    /// missing.
+    fn take_in(&mut self, frame: Frame) {
+        let header = *frame.header();
+        if let Err(error) = frame_from_message(&header, frame.payload()) {
+            self.health.counters().refused += 1;
+            tracing::warn!("capture/frame: {error}");
+            return;
+        }
+        self.last_arrival_nanos = Some(now_nanos());
+        let arrival = self.order.arrive(&header);
+        match arrival {
+            Arrival::Next { missing } => self.missing = self.missing.saturating_add(missing),
+            Arrival::ClockJump | Arrival::Renumbered | Arrival::Repeated => {
+                self.health.counters().disordered += 1;
+            }
+        }
+        if arrival == Arrival::Renumbered {
+            self.pairing.restart();
+        }
+        if arrival != Arrival::Repeated {
+            self.pairing.push_frame(header.sequence, frame);
+        }
+    }
+
+    /// Live: says it when frames have stopped coming. The next step ends the state.
+    fn look_for_silence(&mut self) {
+        let periods = self.config.tracker.stale_periods;
+        if self.mode == Mode::Live && self.order.is_silent(self.last_arrival_nanos, periods) {
+            self.health.enter(ProcessState::Stale, SILENCE);
+        }
+    }
+
     /// One frame into the map, and what changed out to the others.
     fn step(&mut self, received: &Frame, pose: &PoseEstimate) -> Result<(), MapperError> {
-        let (frame, intrinsics) = match frame_from_message(received.header(), received.payload()) {
-            Ok(frame) => frame,
-            Err(error) => {
-                self.health.counters().refused += 1;
-                tracing::warn!("capture/frame: {error}");
-                return Ok(());
-            }
+        // Checked when it was taken in.
+        let Ok((frame, intrinsics)) = frame_from_message(received.header(), received.payload())
+        else {
+            return Ok(());
         };
         if self.mapper.as_ref().is_none_or(|(of, _)| *of != intrinsics) {
             self.change_camera(intrinsics)?;
@@ -224,7 +267,7 @@ impl<'a> Shell<'a> {
         self.health.enter(ProcessState::Running, &mapper.situation().to_string());
         let counters = self.health.counters();
         counters.frames += 1;
-        counters.dropped = self.pairing.dropped();
+        counters.dropped = self.missing.saturating_add(self.pairing.dropped());
         counters.total = mapper.map().keyframes.len() as u64;
         counters.detail = mapper.keyframe().map_or(0, |k| code_from_map_state(k.map_state));
         self.health.count_work(step_nanos);
@@ -264,7 +307,9 @@ fn open_checkpoint(path: &Path) -> (Option<Checkpoint>, Option<Map>) {
         tracing::warn!("the map begins anew: {error}");
         None
     });
-    let kept = Checkpoint::keep(path);
+    let mut reserved = left.clone().unwrap_or_default();
+    reserved.reserve_epochs();
+    let kept = Checkpoint::keep(path, &reserved);
     let kept = kept.inspect_err(|error| tracing::warn!("there will be no checkpoints ({error})"));
     (kept.ok(), left)
 }

@@ -13,6 +13,7 @@ pub mod frame_order;
 pub mod given_pose;
 pub mod health;
 pub mod latency_bench;
+pub mod manager_notice;
 pub mod map_file;
 pub mod mapper;
 pub mod mode;

@@ -23,12 +23,15 @@ impl<F> Pairing<F> {
         Self { frames, poses, max_frames, dropped: 0 }
     }
 
-    /// A frame came; the oldest goes where there are too many, all where the source starts again.
+    /// The source counts anew: what waits belongs to the time before.
+    pub fn restart(&mut self) {
+        self.dropped += self.frames.len() as u64;
+        self.frames.clear();
+        self.poses.clear();
+    }
+
+    /// A frame came, later than all before; the oldest goes where there are too many.
     pub fn push_frame(&mut self, sequence: u64, frame: F) {
-        if self.frames.back().is_some_and(|(last, _)| *last >= sequence) {
-            self.dropped += self.frames.len() as u64;
-            self.frames.clear();
-        }
         if self.frames.len() == self.max_frames {
             self.frames.pop_front();
             self.dropped += 1;
@@ -36,15 +39,16 @@ impl<F> Pairing<F> {
         self.frames.push_back((sequence, frame));
     }
 
-    /// A pose came; older ones go where the source starts again.
+    /// A pose came: in its turn or, from a tracker that has died, late or once more.
     pub fn push_pose(&mut self, pose: PoseEstimate) {
-        if self.poses.back().is_some_and(|last| last.sequence >= pose.sequence) {
-            self.poses.clear();
+        let place = self.poses.partition_point(|known| known.sequence < pose.sequence);
+        if self.poses.get(place).is_some_and(|known| known.sequence == pose.sequence) {
+            return;
         }
-        if self.poses.len() == MAX_POSES {
+        self.poses.insert(place, pose);
+        if self.poses.len() > MAX_POSES {
             self.poses.pop_front();
         }
-        self.poses.push_back(pose);
     }
 
     /// The oldest pair. Frames before it will get no pose any more and are let go.
@@ -145,9 +149,37 @@ mod tests {
         let mut pairing = Pairing::new(3);
         pairing.push_pose(pose(500));
         pairing.push_frame(501, 'x');
+        pairing.restart();
         pairing.push_frame(0, 'a');
         pairing.push_pose(pose(0));
         assert_eq!(take(&mut pairing), Some(('a', 0)));
         assert_eq!(pairing.dropped(), 1);
+    }
+
+    #[test]
+    fn late_and_repeated_poses_cost_no_pair() {
+        let mut pairing = Pairing::new(3);
+        for (sequence, frame) in [(4, 'a'), (5, 'b'), (6, 'c')] {
+            pairing.push_frame(sequence, frame);
+        }
+        for sequence in [5, 6, 5, 2, 4, 6] {
+            pairing.push_pose(pose(sequence));
+        }
+        assert_eq!(take(&mut pairing), Some(('a', 4)));
+        assert_eq!(take(&mut pairing), Some(('b', 5)));
+        pairing.push_pose(pose(4));
+        assert_eq!(take(&mut pairing), Some(('c', 6)));
+        assert_eq!(pairing.dropped(), 0);
+    }
+
+    #[test]
+    fn a_pose_of_a_frame_that_never_comes_does_not_block_those_before_it() {
+        let mut pairing = Pairing::new(3);
+        pairing.push_pose(pose(u64::MAX));
+        for sequence in 0..100 {
+            pairing.push_frame(sequence, 'a');
+            pairing.push_pose(pose(sequence));
+            assert_eq!(take(&mut pairing), Some(('a', sequence)));
+        }
     }
 }

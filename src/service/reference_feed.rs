@@ -10,15 +10,40 @@ use std::time::Duration;
 use crossbeam::queue::ArrayQueue;
 
 use crate::slam::alignment::reference::{Reference, ReferenceParams};
+use crate::slam::geometry::se3::SE3;
 use crate::slam::keyframe::Keyframe;
+use crate::wire::conversion::rigid_from_message;
 use crate::wire::keyframe_inbox::{InboxError, KeyframeInbox};
+use crate::wire::message::StepMessage;
 use crate::wire::place::Place;
-use crate::wire::port::{Access, Hub, OpenError, wait};
+use crate::wire::port::{Access, Hub, OpenError, Subscriber, wait};
+use crate::wire::topic::STEP;
 
 /// Longest sleep of the second thread without a look at its end.
 const WAKE_PERIOD: Duration = Duration::from_millis(100);
 /// Used references whose memory waits for the next: one in use, one prepared, one being made.
 const MAX_USED: usize = 3;
+
+/// The last pose that was claimed, as the mapper knows it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LastPose {
+    /// Life of the map.
+    pub epoch: u32,
+    /// Stamp of its frame, nanoseconds.
+    pub nanos: i64,
+    /// The pose.
+    pub world_from_camera: SE3,
+}
+
+impl LastPose {
+    /// The pose of a step; `None` where it names none, or none that can be.
+    fn of(step: &StepMessage) -> Option<Self> {
+        let world_from_camera = rigid_from_message(&step.world_from_camera, "world_from_camera");
+        let (epoch, nanos) = (step.epoch, step.pose_nanos);
+        let world_from_camera = world_from_camera.ok().filter(|_| step.has_pose == 1)?;
+        Some(Self { epoch, nanos, world_from_camera })
+    }
+}
 
 /// Gives the newest keyframe, prepared.
 #[derive(Debug)]
@@ -39,6 +64,15 @@ impl ReferenceFeed {
     /// Prepares on a thread of its own, which joins the instance by itself.
     pub fn threaded(place: &Place, params: &ReferenceParams) -> io::Result<Self> {
         Ok(Self::Threaded(Preparer::start(place, params)?))
+    }
+
+    /// Live: where the map has heard of the camera last, with the first reference of a tracker that is
+    /// started again. Said once.
+    pub fn last_pose(&self) -> Option<LastPose> {
+        match self {
+            Self::Threaded(preparer) => preparer.shared.last_pose.pop(),
+            Self::Synchronous(_) => None,
+        }
     }
 
     /// The newest reference that has not been taken.
@@ -100,6 +134,7 @@ pub struct Preparer {
 struct Shared {
     prepared: ArrayQueue<Box<Reference>>,
     used: ArrayQueue<Box<Reference>>,
+    last_pose: ArrayQueue<LastPose>,
     stop: AtomicBool,
 }
 
@@ -108,6 +143,7 @@ impl Preparer {
         let shared = Arc::new(Shared {
             prepared: ArrayQueue::new(1),
             used: ArrayQueue::new(MAX_USED),
+            last_pose: ArrayQueue::new(1),
             stop: AtomicBool::new(false),
         });
         let (theirs, place, params) = (Arc::clone(&shared), place.clone(), params.clone());
@@ -130,14 +166,16 @@ impl Drop for Preparer {
 
 fn prepare_until_stopped(place: &Place, params: &ReferenceParams, shared: &Shared) {
     let opened = Hub::join(place, "tracker-reference", Access::Member)
-        .and_then(|hub| Ok((KeyframeInbox::open(&hub)?, hub)));
-    let (mut inbox, _hub) = match opened {
+        .and_then(|hub| Ok((KeyframeInbox::open(&hub)?, hub.subscriber(&STEP)?, hub)));
+    let (mut inbox, steps, _hub) = match opened {
         Ok(opened) => opened,
         Err(error) => {
             tracing::error!("no keyframes: {error}");
             return;
         }
     };
+    // Until the first keyframe. Here and not in the frame loop: it maps memory of the mapper's.
+    let mut steps: Option<Subscriber<StepMessage, ()>> = Some(steps);
     while !shared.stop.load(Ordering::Acquire) {
         if let Err(error) = wait(&[inbox.events()], None, WAKE_PERIOD) {
             tracing::error!("no keyframes any more: {error}");
@@ -148,6 +186,9 @@ fn prepare_until_stopped(place: &Place, params: &ReferenceParams, shared: &Share
             Ok(Some(keyframe)) => {
                 // What the tracker has not taken yet is older: it goes.
                 let reference = prepare(&keyframe, shared.used.pop(), params);
+                if let Some(last) = steps.take().and_then(|steps| last_pose(&steps)) {
+                    shared.last_pose.force_push(last);
+                }
                 if let Some(older) = shared.prepared.force_push(reference) {
                     drop(shared.used.push(older));
                 }
@@ -155,4 +196,10 @@ fn prepare_until_stopped(place: &Place, params: &ReferenceParams, shared: &Share
             Err(error) => tracing::warn!("{error}"),
         }
     }
+}
+
+fn last_pose(steps: &Subscriber<StepMessage, ()>) -> Option<LastPose> {
+    let newest = steps.newest();
+    let newest = newest.inspect_err(|error| tracing::warn!("{error}")).ok()??;
+    LastPose::of(newest.payload().first()?)
 }

@@ -5,7 +5,7 @@ use std::time::Duration;
 use crate::service::budget::IterationCosts;
 use crate::service::clock::now_nanos;
 use crate::service::config::Config;
-use crate::service::frame_order::{Arrival, FrameOrder};
+use crate::service::frame_order::{Arrival, FrameOrder, SILENCE};
 use crate::service::health::{Health, ProcessState};
 use crate::service::mode::Mode;
 use crate::service::reference_feed::ReferenceFeed;
@@ -18,16 +18,15 @@ use crate::slam::pose::{DegradedReason, LostReason, PoseEstimate, TrackingState}
 use crate::slam::tracker::Tracker;
 use crate::wire::conversion::{
     PoseTiming, codes_from_state, frame_from_message, pose_from_message, pose_message,
-    rigid_from_message,
 };
 use crate::wire::keyframe_inbox::InboxError;
-use crate::wire::message::{FrameHeader, PoseMessage, StepMessage};
+use crate::wire::message::{FrameHeader, PoseMessage};
 use crate::wire::place::{Claim, Place, PlaceError};
 use crate::wire::port::{
     Access, Hub, OpenError, Publisher, ReceiveError, Received, SendError, Subscriber, WaitError,
     wait,
 };
-use crate::wire::topic::{FRAME, POSE, STEP, TRACKER_HEALTH};
+use crate::wire::topic::{FRAME, POSE, TRACKER_HEALTH};
 
 /// Longest sleep without a look at signals and health.
 const WAKE_PERIOD: Duration = Duration::from_millis(100);
@@ -71,6 +70,7 @@ pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), Track
     refusals.iter().for_each(|refusal| tracing::warn!("tracker: {refusal}"));
     shell.health.tell_scheduling(&in_force(), &refusals);
     shell.health.enter(ProcessState::Ready, "");
+    shell.health.tell_ready();
     let outcome = shell.track_until(shutdown);
     match &outcome {
         Ok(()) => shell.health.enter(ProcessState::Finished, "stopped"),
@@ -85,8 +85,6 @@ struct Shell<'a> {
     frames: Subscriber<u8, FrameHeader>,
     poses: Publisher<PoseMessage, ()>,
     references: ReferenceFeed,
-    /// Live, until the first keyframe: what the mapper says of the last pose, for a restart.
-    steps: Option<Subscriber<StepMessage, ()>>,
     health: Health,
     tracker: Option<(Intrinsics, Tracker)>,
     last_intrinsics: Option<Intrinsics>,
@@ -116,7 +114,6 @@ impl<'a> Shell<'a> {
             frames: hub.subscriber(&FRAME)?,
             poses: hub.publisher(&POSE, 1)?,
             references,
-            steps: (mode == Mode::Live).then(|| hub.subscriber(&STEP)).transpose()?,
             health: Health::open(&hub, &TRACKER_HEALTH)?,
             tracker: None,
             last_intrinsics: None,
@@ -200,8 +197,9 @@ impl<'a> Shell<'a> {
             if let Some(used) = tracker.adopt(reference) {
                 self.references.give_back(used);
             }
-            if let Some(steps) = self.steps.take() {
-                resume(tracker, epoch, &steps)?;
+            // Another tracker's, which died.
+            if let Some(last) = self.references.last_pose().filter(|last| last.epoch == epoch) {
+                tracker.resume_at(last.nanos, &last.world_from_camera);
             }
         }
         let _span = tracing::trace_span!("track").entered();
@@ -237,12 +235,9 @@ impl<'a> Shell<'a> {
 
     /// Live: says it when frames have stopped coming. The next frame ends the state.
     fn look_for_silence(&mut self) {
-        let Some(last) = self.last_arrival_nanos.filter(|_| self.mode == Mode::Live) else {
-            return;
-        };
-        let allowed = self.config.tracker.stale_periods * self.order.period_nanos() as f64;
-        if now_nanos().saturating_sub(last) as f64 > allowed {
-            self.health.enter(ProcessState::Stale, "no frames come: look at capture");
+        let periods = self.config.tracker.stale_periods;
+        if self.mode == Mode::Live && self.order.is_silent(self.last_arrival_nanos, periods) {
+            self.health.enter(ProcessState::Stale, SILENCE);
         }
     }
 
@@ -290,23 +285,6 @@ impl<'a> Shell<'a> {
         counters.deadline_misses += u64::from(late);
         Ok(())
     }
-}
-
-/// Goes on from the last pose of this epoch that the mapper has heard of: another tracker's, which died.
-fn resume(
-    tracker: &mut Tracker,
-    epoch: u32,
-    steps: &Subscriber<StepMessage, ()>,
-) -> Result<(), ReceiveError> {
-    let newest = steps.newest()?;
-    let step = newest.as_ref().and_then(|message| message.payload().first());
-    if let Some(step) = step.filter(|step| step.has_pose == 1 && step.epoch == epoch)
-        && let Ok(world_from_camera) =
-            rigid_from_message(&step.world_from_camera, "world_from_camera")
-    {
-        tracker.resume_at(step.pose_nanos, &world_from_camera);
-    }
-    Ok(())
 }
 
 /// A state and its reason, for whoever looks on.

@@ -166,6 +166,8 @@ impl StepOutcome {
 pub struct Map {
     /// Keyframes in order of creation.
     pub keyframes: Vec<Keyframe>,
+    /// Numbers of epochs from here on are given by nobody yet; see [`Mapper::checkpoint`].
+    pub free_epoch: u32,
 }
 
 /// Keeps the map.
@@ -195,6 +197,8 @@ pub struct Mapper {
     is_unit_open: bool,
     revision: u64,
     next_keyframe_id: u64,
+    /// Numbers of epochs below may have been given by a mapper that died.
+    first_free_epoch: u32,
     frames_on_keyframe: u64,
     /// Hypotheses changed since the depth was smoothed and published.
     unpublished: usize,
@@ -225,6 +229,7 @@ impl Mapper {
             is_unit_open: false,
             revision: 0,
             next_keyframe_id: 0,
+            first_free_epoch: 0,
             frames_on_keyframe: 0,
             unpublished: 0,
             params,

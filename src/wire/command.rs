@@ -75,7 +75,8 @@ fn request_of(command: &Command) -> Result<CommandRequest, CommandError> {
     Ok(request)
 }
 
-fn command_of(request: &CommandRequest) -> Result<Command, CommandError> {
+/// What a request asks for; its numbers are checked, never believed.
+pub fn command_of(request: &CommandRequest) -> Result<Command, CommandError> {
     use std::os::unix::ffi::OsStrExt;
     let length = (request.path_bytes as usize).min(PATH_BYTES);
     let path = Path::new(std::ffi::OsStr::from_bytes(&request.path[..length]));

@@ -3,7 +3,7 @@
 
 use std::fs::{self, DirBuilder, File, OpenOptions};
 use std::io::{self, Read, Seek, Write};
-use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
 use rustix::fs::FlockOperation;
@@ -143,6 +143,25 @@ impl Place {
         self.root.join(format!("{}{CHECKPOINT_SUFFIX}", self.instance))
     }
 
+    /// Takes from the group and all others what iceoryx2 gives them: its counter of nodes is the one
+    /// segment that it makes for everybody.
+    pub(in crate::wire) fn keep_to_user(&self) {
+        const USER_ALONE: u32 = 0o600;
+        for path in self.node_counters() {
+            // Another user's cannot be changed, and is not ours.
+            let _ = fs::set_permissions(path, fs::Permissions::from_mode(USER_ALONE));
+        }
+    }
+
+    /// The segments of [`SHARED_MEMORY`] in which iceoryx2 counts the nodes below the root.
+    fn node_counters(&self) -> impl Iterator<Item = PathBuf> {
+        let entries = fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
+        entries.map(|entry| entry.path()).filter(|path| {
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            name.starts_with(&self.prefix) && name.ends_with(".global_mgmt")
+        })
+    }
+
     /// Keeps [`Place::tidy`] away while a process joins.
     pub(in crate::wire) fn hold(&self) -> Result<File, PlaceError> {
         let path = self.root.join(JOIN_LOCK);
@@ -172,12 +191,7 @@ impl Place {
         let is_empty =
             |folder: &Path| fs::read_dir(folder).map_or(true, |mut f| f.next().is_none());
         if is_empty(&self.root.join("nodes")) {
-            for entry in fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten() {
-                let name = entry.file_name().to_string_lossy().into_owned();
-                if name.starts_with(&self.prefix) && name.ends_with(".global_mgmt") {
-                    let _ = fs::remove_file(entry.path());
-                }
-            }
+            self.node_counters().for_each(|path| drop(fs::remove_file(path)));
             self.remove_dead_claims();
             let _ = fs::remove_dir(self.root.join("nodes"));
             let _ = fs::remove_dir(self.root.join("services"));
@@ -235,7 +249,9 @@ impl Drop for Claim {
 }
 
 fn open_lock(path: &Path) -> io::Result<File> {
-    OpenOptions::new().read(true).write(true).create(true).truncate(false).open(path)
+    const USER_ALONE: u32 = 0o600;
+    let mut options = OpenOptions::new();
+    options.read(true).write(true).create(true).truncate(false).mode(USER_ALONE).open(path)
 }
 
 fn is_same_file(file: &File, path: &Path) -> bool {

@@ -125,8 +125,7 @@ impl Hub {
         }
         set_log_level(LogLevel::Fatal);
         let _joining = place.hold()?;
-        let failed =
-            |reason: String| OpenError::Node { root: place.root.display().to_string(), reason };
+        let failed = |reason| OpenError::Node { root: place.root.display().to_string(), reason };
         let name = NodeName::new(process).map_err(|e| failed(e.to_string()))?;
         let config = transport_config(place)?;
         let node = NodeBuilder::new()
@@ -135,6 +134,7 @@ impl Hub {
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create::<ipc::Service>()
             .map_err(|e| failed(e.to_string()))?;
+        place.keep_to_user();
         // After the node: what the dead have left was removed as it was made.
         if let Some(found) = foreign_version(&config, &place.instance) {
             return Err(OpenError::Version { instance: place.instance.clone(), found });
@@ -280,8 +280,8 @@ fn transport_config(place: &Place) -> Result<Config, OpenError> {
 }
 
 pub(in crate::wire) fn not_running(place: &Place) -> OpenError {
-    let root = place.root.display().to_string();
-    OpenError::NotRunning { instance: place.instance.clone(), root }
+    let (instance, root) = (place.instance.clone(), place.root.display().to_string());
+    OpenError::NotRunning { instance, root }
 }
 
 pub(in crate::wire) fn topic_error(name: &str, error: &dyn std::fmt::Display) -> OpenError {

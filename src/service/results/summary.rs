@@ -25,6 +25,8 @@ pub struct Percentiles {
     pub p95: f64,
     /// 99 of 100 are not longer.
     pub p99: f64,
+    /// 999 of 1000 are not longer.
+    pub p999: f64,
     /// Longest.
     pub max: f64,
 }
@@ -35,7 +37,8 @@ impl Percentiles {
         let mut millis: Vec<f64> = nanos.map(|n| n as f64 * 1e-6).collect();
         millis.sort_by(f64::total_cmp);
         let at = |share| percentile(&millis, share);
-        Some(Self { p50: at(0.5)?, p95: at(0.95)?, p99: at(0.99)?, max: at(1.0)? })
+        let (p50, p95, p99) = (at(0.5)?, at(0.95)?, at(0.99)?);
+        Some(Self { p50, p95, p99, p999: at(0.999)?, max: at(1.0)? })
     }
 }
 

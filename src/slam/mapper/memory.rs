@@ -71,7 +71,7 @@ mod tests {
 
     #[test]
     fn the_oldest_lose_their_depth_and_keep_their_pose() {
-        let mut map = Map { keyframes: (0..5).map(keyframe).collect() };
+        let mut map = Map { keyframes: (0..5).map(keyframe).collect(), ..Map::default() };
         let one = depth_bytes(&map.keyframes[0]);
         map.forget_depth_beyond(2 * one);
         let kept: Vec<bool> = map.keyframes.iter().map(|k| !k.points.is_empty()).collect();

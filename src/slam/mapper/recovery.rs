@@ -41,6 +41,9 @@ pub struct RecoveryParams {
     pub lost_timeout_secs: f64,
 }
 
+/// Longest time that two lost frames are taken to be apart: the slowest camera's period.
+const LONGEST_STEP_NANOS: i64 = 5_000_000_000;
+
 impl Default for RecoveryParams {
     fn default() -> Self {
         Self {
@@ -69,8 +72,10 @@ pub(super) struct Recovery {
     verdict: VerdictParams,
     reference: Reference,
     pyramid: SumPyramid,
-    /// Stamp of the first lost frame; `None` while the camera is where it is thought to be.
-    since_nanos: Option<i64>,
+    /// Stamp of the last lost frame; `None` while the camera is where it is thought to be.
+    last_nanos: Option<i64>,
+    /// Time of the stamps since the first.
+    lost_nanos: i64,
     /// Keyframes searched since then.
     searched: usize,
     /// Whether a new epoch is being begun.
@@ -90,7 +95,8 @@ impl Recovery {
             verdict: VerdictParams::default(),
             pyramid: SumPyramid::with_size(width, height, levels, finest_level(levels, &reference)),
             reference: Reference::new(reference),
-            since_nanos: None,
+            last_nanos: None,
+            lost_nanos: 0,
             searched: 0,
             is_restarting: false,
         }
@@ -98,18 +104,21 @@ impl Recovery {
 
     /// The camera is found.
     pub(super) fn end(&mut self) {
-        (self.since_nanos, self.searched, self.is_restarting) = (None, 0, false);
+        (self.last_nanos, self.lost_nanos) = (None, 0);
+        (self.searched, self.is_restarting) = (0, false);
     }
 
     /// Whether the camera is lost.
     pub(super) fn is_under_way(&self) -> bool {
-        self.since_nanos.is_some()
+        self.last_nanos.is_some()
     }
 
-    /// How long it has been lost, seconds.
+    /// How long it has been lost, seconds, with another lost frame. A step of the clock, back or far
+    /// forwards, is no time in which anything was searched.
     fn lost_secs(&mut self, nanos: i64) -> f64 {
-        let since = *self.since_nanos.get_or_insert(nanos);
-        nanos.saturating_sub(since) as f64 * 1e-9
+        let step = nanos.saturating_sub(self.last_nanos.replace(nanos).unwrap_or(nanos));
+        self.lost_nanos = self.lost_nanos.saturating_add(step.clamp(0, LONGEST_STEP_NANOS));
+        self.lost_nanos as f64 * 1e-9
     }
 
     /// The next of `keyframes`, newest first and in turn, that shows what `pixels` do.
@@ -343,6 +352,22 @@ mod tests {
         let with = [known, far, in_force];
         assert_eq!(recovery.find(&with, 2, &pixels, &params), None, "the newest is first");
         assert_eq!(recovery.find(&with, 2, &pixels, &params), Some(0));
+    }
+
+    #[test]
+    fn steps_of_the_clock_neither_delay_nor_end_a_search() {
+        const SECOND: i64 = 1_000_000_000;
+        let mut recovery = Recovery::new(&CAMERA);
+        let mut secs = |stamp: i64| recovery.lost_secs(stamp);
+        assert_eq!(secs(100 * SECOND), 0.0);
+        assert_eq!(secs(101 * SECOND), 1.0);
+        // An hour back, and on from there.
+        assert_eq!(secs(-3500 * SECOND), 1.0);
+        assert_eq!(secs(-3499 * SECOND), 2.0);
+        assert_eq!(secs(i64::MIN), 2.0);
+        assert_eq!(secs(i64::MAX), 7.0, "a leap counts as the longest period");
+        recovery.end();
+        assert_eq!(recovery.lost_secs(0), 0.0);
     }
 
     #[test]

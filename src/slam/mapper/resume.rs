@@ -7,6 +7,16 @@ use crate::slam::mapper::{Map, Mapper, StepOutcome};
 /// More keyframes than are made between two checkpoints, and more revisions.
 const UNKNOWN_KEYFRAMES: u64 = 1000;
 const UNKNOWN_REVISIONS: u64 = 1_000_000;
+/// More epochs than a mapper begins between two checkpoints: an epoch that is proven has one at once.
+const UNKNOWN_EPOCHS: u32 = 16;
+
+impl Map {
+    /// What a mapper writes before it begins, where a dead one may have left `self`: who comes after it
+    /// gives other numbers to its epochs, even if it dies without another checkpoint.
+    pub fn reserve_epochs(&mut self) {
+        self.free_epoch = self.free_epoch.saturating_add(UNKNOWN_EPOCHS);
+    }
+}
 
 impl Mapper {
     /// The keyframe in force with its image and depth, and the poses of the others of its epoch; `None`
@@ -21,7 +31,8 @@ impl Mapper {
             true => keyframe.clone(),
             false => Keyframe { image: Vec::new(), points: Vec::new(), ..*keyframe },
         });
-        Some(Map { keyframes: keyframes.collect() })
+        let free_epoch = self.next_epoch().saturating_add(UNKNOWN_EPOCHS);
+        Some(Map { keyframes: keyframes.collect(), free_epoch })
     }
 
     /// Takes over from the mapper of another camera: its keyframes stay in the map, and epochs, ids and
@@ -30,6 +41,7 @@ impl Mapper {
         self.map = before.map;
         self.revision = before.revision;
         self.next_keyframe_id = before.next_keyframe_id;
+        self.first_free_epoch = before.first_free_epoch;
     }
 
     /// Goes on from a checkpoint: its keyframe is in force again, the epoch and all ids go on. Does nothing
@@ -47,6 +59,7 @@ impl Mapper {
         let newest_id = newest(|keyframe| keyframe.keyframe_id).unwrap_or(0);
         self.revision = newest_revision.saturating_add(UNKNOWN_REVISIONS);
         self.next_keyframe_id = newest_id.saturating_add(UNKNOWN_KEYFRAMES);
+        self.first_free_epoch = map.free_epoch;
         let Some(index) = map.keyframes.iter().rposition(fits) else {
             return StepOutcome::default();
         };
@@ -65,5 +78,70 @@ impl Mapper {
             graph_changed: true,
             ..Default::default()
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::geometry::sim3::Sim3;
+    use crate::slam::keyframe::DepthPoint;
+    use crate::slam::mapper::MapperParams;
+    use crate::slam::test_scene::CAMERA;
+
+    fn mapper() -> Mapper {
+        Mapper::new(CAMERA, MapperParams::default()).unwrap()
+    }
+
+    fn keyframe(epoch: u32) -> Keyframe {
+        let point = DepthPoint { u: 9, v: 9, inverse_depth: 1.0, variance: 0.1, intensity: 9.0 };
+        Keyframe {
+            keyframe_id: 3,
+            epoch,
+            revision: 5,
+            sequence: 1,
+            capture_nanos: 0,
+            map_state: MapState::Established,
+            world_from_keyframe: Sim3::identity(),
+            intrinsics: CAMERA,
+            image: (0..CAMERA.width * CAMERA.height).map(|i| (i * i % 251) as u8).collect(),
+            points: vec![point],
+        }
+    }
+
+    /// What a mapper leaves that dies after its start, and the number of its first epoch.
+    fn short_life(left: Option<Map>) -> (Map, u32) {
+        let mut reserved = left.clone().unwrap_or_default();
+        reserved.reserve_epochs();
+        let mut mapper = mapper();
+        if let Some(map) = left {
+            mapper.resume(map);
+        }
+        (reserved, mapper.next_epoch())
+    }
+
+    #[test]
+    fn no_epoch_has_the_number_of_one_that_died_unproven() {
+        let (left, first) = short_life(None);
+        let (left, second) = short_life(Some(left));
+        let (_, third) = short_life(Some(left));
+        assert!(first == 0 && 0 < second && second < third, "{first} {second} {third}");
+    }
+
+    #[test]
+    fn an_established_epoch_goes_on_and_the_one_after_it_is_new() {
+        let mut first = mapper();
+        first.resume(Map { keyframes: vec![keyframe(2)], free_epoch: 7 });
+        assert_eq!(first.keyframe().unwrap().epoch, 2);
+        // It is lost, begins an epoch with this number that is never proven, and dies.
+        let unproven = first.next_epoch();
+        let mut second = mapper();
+        second.resume(first.checkpoint().unwrap());
+        assert_eq!(second.keyframe().unwrap().epoch, 2);
+        assert!(second.next_epoch() > unproven);
+        let mut with_another_camera = mapper();
+        let unproven = second.next_epoch();
+        with_another_camera.succeed(second);
+        assert_eq!(with_another_camera.next_epoch(), unproven);
     }
 }

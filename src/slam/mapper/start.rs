@@ -117,8 +117,10 @@ impl Mapper {
         }
     }
 
-    fn next_epoch(&self) -> u32 {
-        self.map.keyframes.last().map_or(0, |last| last.epoch + 1)
+    /// The number of the next epoch: one that no epoch had before, here or in a mapper that died.
+    pub(super) fn next_epoch(&self) -> u32 {
+        let after_last = self.map.keyframes.last().map_or(0, |last| last.epoch.saturating_add(1));
+        after_last.max(self.first_free_epoch)
     }
 
     /// Leaves the keyframe in force, discards a start that was never proven, and begins depth on `pixels`.

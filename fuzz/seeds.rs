@@ -1,0 +1,244 @@
+//! Small good inputs, from which fuzzing starts: made here, so that none is a file of somebody's.
+
+use semidense::service::map_file::write_map;
+use semidense::slam::frame::FrameView;
+use semidense::slam::geometry::intrinsics::Intrinsics;
+use semidense::slam::geometry::se3::SE3;
+use semidense::slam::geometry::sim3::Sim3;
+use semidense::slam::keyframe::{DepthPoint, Keyframe, MapState};
+use semidense::slam::mapper::Map;
+use semidense::slam::pose::{PoseEstimate, TrackingState};
+use semidense::wire::conversion::{
+    PoseTiming, keyframe_header, keyframe_image_header, pose_message, rigid_message,
+    similarity_message,
+};
+use semidense::wire::message::{
+    CommandRequest, CommandResponse, FrameHeader, HISTOGRAM_BUCKETS, HealthMessage,
+    KeyframePoseMessage, PATH_BYTES, StepMessage, TEXT_BYTES,
+};
+
+use super::test_images::{flat_block_jpeg, png_of};
+use crate::parsers::{IMAGE_SIDE, SENSOR_YAML, plain};
+
+/// A good input of a target.
+#[derive(Debug, Clone)]
+pub struct Seed {
+    /// The target's name.
+    pub target: &'static str,
+    /// Its bytes.
+    pub bytes: Vec<u8>,
+}
+
+const CAMERA: Intrinsics =
+    Intrinsics { fx: 20.0, fy: 20.0, cx: 15.5, cy: 11.5, width: 32, height: 24 };
+
+/// At least one seed of each target, and one for each kind that its first byte can name.
+pub fn seeds() -> Vec<Seed> {
+    let mut seeds = Vec::new();
+    let mut add = |target, bytes: Vec<u8>| seeds.push(Seed { target, bytes });
+    let kind = |kind: u8, rest: &[u8]| [&[kind], rest].concat();
+    add("trajectory", b"# c\n1.5 1 2 3 0 0 0 1\n2.5\t-1e-3 2 3 0.5 0.5 0.5 0.5\n".to_vec());
+    add(
+        "trajectory",
+        b"#t\n1500000000,1,2,3,1,0,0,0,9,9\n2500000000, 1, 2, 3, .5, .5, .5, .5\n".to_vec(),
+    );
+    let toml = "model = \"radtan\"\nwidth = 64\nheight = 48\nfx = 50\nfy = 50.0\ncx = 32\ncy = 24\n\
+                coefficients = [0.1, 0.0, 0.0, 0.0]\nrate_hz = 30\n";
+    let fisheye = toml.replace("radtan", "equidistant");
+    let pinhole = toml.replace("radtan", "pinhole").replace("[0.1, 0.0, 0.0, 0.0]", "[]");
+    [toml, &fisheye, &pinhole].iter().for_each(|rig| add("rig", kind(0, rig.as_bytes())));
+    add("rig", kind(1, b"# c\n50 50 32 24 64 48\n"));
+    add("rig", kind(1, b"50 50.0 3.2e1 24 64 48 0.1 0.01 0 0 0.001 0.1 0.1 0.1\n"));
+    add("rig", kind(2, SENSOR_YAML.as_bytes()));
+    let lists: [&[u8]; 7] = [
+        b"# c\n1.25 1.png\n2.5 2.png\n",
+        b"1.26 1.png\n2.51 2.png\n",
+        b"1.25 0 0 0 0 0 0 1\n2.5 1 0 0 0.5 0.5 0.5 0.5\n",
+        b"1.png 1.25 3.5\n2 2.5\n",
+        b"#t,f\n1250000000,1.png\n2500000000,2.png\n",
+        b"1250000000,1,2,3,1,0,0,0,9\n2500000000,1,2,3,.5,.5,.5,.5,9\n",
+        SENSOR_YAML.as_bytes(),
+    ];
+    lists.iter().zip(0..).for_each(|(list, index)| add("lists", kind(index, list)));
+    add("lists", kind(3, b"1.25\n2.5\n"));
+    images().into_iter().for_each(|bytes| add("image", bytes));
+    let file = include_str!("../config/semidense.toml");
+    let plain: String =
+        file.lines().filter(|l| !l.starts_with('#')).map(|l| format!("{l}\n")).collect();
+    add("configuration", kind(0, plain.as_bytes()));
+    add(
+        "configuration",
+        kind(0, b"[tracker]\ndeadline_ms = 5.0\n[mapper.scheduling]\ncpus = [0]\n"),
+    );
+    add(
+        "configuration",
+        kind(1, b"mapper.threads=2\nsimulator.motion.mean_speed_m_s=1.0\ninstance=rig2\n"),
+    );
+    add("map", map_bytes());
+    messages()
+        .into_iter()
+        .zip(0..)
+        .for_each(|(message, index)| add("message", kind(index, &message)));
+    add("pipeline", pipeline());
+    seeds
+}
+
+fn images() -> Vec<Vec<u8>> {
+    use png::{BitDepth, ColorType};
+    let side = IMAGE_SIDE as u32;
+    let samples = |count: usize| -> Vec<u8> { (0..count).map(|i| (i * 37 % 251) as u8).collect() };
+    let pixels = IMAGE_SIDE * IMAGE_SIDE;
+    let palette = samples(3 * 16);
+    vec![
+        png_of(side, side, ColorType::Grayscale, BitDepth::Eight, None, &samples(pixels)),
+        png_of(side, side, ColorType::Grayscale, BitDepth::Sixteen, None, &samples(2 * pixels)),
+        png_of(side, side, ColorType::Rgba, BitDepth::Eight, None, &samples(4 * pixels)),
+        png_of(
+            side,
+            side,
+            ColorType::Indexed,
+            BitDepth::Four,
+            Some(&palette),
+            &samples(pixels / 2),
+        ),
+        flat_block_jpeg(IMAGE_SIDE, IMAGE_SIDE, 1, false, |u, v, _| (40 * u + 80 * v) as u8),
+        flat_block_jpeg(IMAGE_SIDE, IMAGE_SIDE, 3, false, |u, v, c| (40 * u + 80 * v) as u8 + c),
+        flat_block_jpeg(IMAGE_SIDE, IMAGE_SIDE, 3, true, |u, v, c| (40 * u + 80 * v) as u8 + c),
+    ]
+}
+
+fn keyframe() -> Keyframe {
+    let point = DepthPoint { u: 3, v: 15, inverse_depth: 0.7, variance: 0.01, intensity: 128.5 };
+    Keyframe {
+        keyframe_id: 0,
+        epoch: 0,
+        revision: 1,
+        sequence: 0,
+        capture_nanos: 5,
+        map_state: MapState::Established,
+        world_from_keyframe: Sim3::new(SE3::identity(), 1.5),
+        intrinsics: CAMERA,
+        image: (0..CAMERA.width * CAMERA.height).map(|i| (i * i % 251) as u8).collect(),
+        points: (0..24).map(|u| DepthPoint { u, ..point }).collect(),
+    }
+}
+
+fn map_bytes() -> Vec<u8> {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let path = folder.path().join("map");
+    let second = Keyframe { keyframe_id: 1, epoch: 1, ..keyframe() };
+    write_map(&path, &Map { keyframes: vec![keyframe(), second], free_epoch: 17 })
+        .expect("written");
+    std::fs::read(path).expect("read")
+}
+
+fn frame_header(sequence: u64) -> FrameHeader {
+    FrameHeader {
+        sequence,
+        capture_nanos: 33_000_000 * sequence as i64,
+        clock_nanos: 0,
+        sent_nanos: 0,
+        exposure_nanos: 5_000_000,
+        intrinsics: [CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy],
+        width: CAMERA.width as u32,
+        height: CAMERA.height as u32,
+        stride: CAMERA.width as u32,
+        gain: 1.0,
+    }
+}
+
+fn pose(sequence: u64) -> PoseEstimate {
+    let (width, height) = (CAMERA.width, CAMERA.height);
+    let (capture_nanos, exposure_nanos) = (33_000_000 * sequence as i64, 0);
+    let pixels = &[][..];
+    let frame = FrameView { sequence, capture_nanos, exposure_nanos, width, height, pixels };
+    PoseEstimate { state: TrackingState::Tracking, keyframe_id: 0, ..PoseEstimate::unknown(&frame) }
+}
+
+/// One message of each kind of `parsers::message`, in its order.
+fn messages() -> [Vec<u8>; 7] {
+    let (keyframe, timing) = (keyframe(), PoseTiming::default());
+    let pixels = vec![9; CAMERA.width * CAMERA.height];
+    let health = HealthMessage {
+        published_nanos: 1,
+        started_nanos: 0,
+        process_id: 1,
+        state: 3,
+        progress_done: 0,
+        progress_total: 0,
+        frames: 9,
+        dropped: 0,
+        gaps: 0,
+        refused: 0,
+        disordered: 0,
+        resized: 0,
+        deadline_misses: 0,
+        page_faults: 0,
+        total: 0,
+        detail: 0,
+        cause_bytes: 4,
+        peak_rss_bytes: 0,
+        latency_counts: [1; HISTOGRAM_BUCKETS],
+        work_counts: [0; HISTOGRAM_BUCKETS],
+        wake_counts: [2; HISTOGRAM_BUCKETS],
+        scheduling: 1,
+        priority: 70,
+        memory_locked: 1,
+        warning_bytes: 3,
+        warning: [b'w'; TEXT_BYTES],
+        cause: [b'c'; TEXT_BYTES],
+    };
+    let step = StepMessage {
+        world_from_camera: rigid_message(&SE3::identity()),
+        has_pose: 1,
+        ..StepMessage::default()
+    };
+    let graph = KeyframePoseMessage {
+        keyframe_id: 1,
+        world_from_keyframe: similarity_message(&keyframe.world_from_keyframe),
+    };
+    let mut request = CommandRequest { kind: 0, path_bytes: 6, path: [0; PATH_BYTES] };
+    request.path[..6].copy_from_slice(b"/tmp/x");
+    let response = CommandResponse { status: 1, text_bytes: 2, text: [b't'; TEXT_BYTES] };
+    [
+        [bytes_of(&frame_header(1)), pixels.clone()].concat(),
+        [bytes_of(&pose_message(&pose(1), &timing)), bytes_of(&pose_message(&pose(2), &timing))]
+            .concat(),
+        [
+            bytes_of(&keyframe_header(&keyframe)),
+            bytes_of(&keyframe_image_header(&keyframe)),
+            keyframe.points[..4].iter().flat_map(bytes_of).collect(),
+            pixels,
+        ]
+        .concat(),
+        [bytes_of(&graph), bytes_of(&graph)].concat(),
+        bytes_of(&step),
+        bytes_of(&health),
+        [bytes_of(&request), bytes_of(&response)].concat(),
+    ]
+}
+
+/// Frames, a keyframe from the wire, frames on it, and a pose from the wire.
+fn pipeline() -> Vec<u8> {
+    let frame =
+        |sequence: u64| [vec![4 * sequence as u8], bytes_of(&frame_header(sequence))].concat();
+    let keyframe = keyframe();
+    let mut bytes = [frame(1), frame(2)].concat();
+    bytes.push(2);
+    bytes.extend(bytes_of(&keyframe_header(&keyframe)));
+    bytes.extend(bytes_of(&keyframe.points[0]));
+    bytes.extend((3..6).flat_map(frame));
+    bytes.push(1);
+    bytes.extend(bytes_of(&frame_header(6)));
+    bytes.extend(bytes_of(&pose_message(&pose(6), &PoseTiming::default())));
+    bytes.push(3);
+    bytes.extend((7..9).flat_map(frame));
+    bytes
+}
+
+/// A message as it lies in shared memory.
+fn bytes_of<T: Copy + plain::Message>(message: &T) -> Vec<u8> {
+    // SAFETY: a message has no padding, so that all its bytes are initialised.
+    unsafe { std::slice::from_raw_parts(std::ptr::from_ref(message).cast::<u8>(), size_of::<T>()) }
+        .to_vec()
+}

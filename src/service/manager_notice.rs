@@ -1,0 +1,211 @@
+//! What the service manager hears of a process (sd_notify(3)): that it is ready, a line of status, and the
+//! heartbeat of its frame loop. One socket for the life of the process and no allocation: it is used from
+//! the frame loop itself, so that a loop that hangs is not taken for a live one.
+
+use std::fmt::Write as _;
+use std::io::{self, Cursor, Write as _};
+use std::os::linux::net::SocketAddrExt;
+use std::os::unix::net::{SocketAddr, UnixDatagram};
+
+/// Heartbeats in the time that the manager allows between two: two may be lost or late.
+const BEATS_IN_TIMEOUT: i64 = 4;
+/// Longest message: a state, a cause and a few numbers.
+const MESSAGE_BYTES: usize = 512;
+/// By how much a long preparation asks for more time to start, microseconds.
+const START_EXTENSION_US: u64 = 30_000_000;
+
+/// The variables that tell a process of its manager (systemd.exec(5)).
+pub const VARIABLES: [&str; 3] = ["NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"];
+
+/// The manager of this process, where it has one.
+#[derive(Debug, Default)]
+pub struct ManagerNotice {
+    socket: Option<UnixDatagram>,
+    heartbeat: Option<Heartbeat>,
+    said_ready: bool,
+}
+
+/// When the next heartbeat is due.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Heartbeat {
+    period_nanos: i64,
+    last_nanos: i64,
+}
+
+impl Heartbeat {
+    /// `timeout_us` and `process_id` as the manager's variables have them; `None` where it does not watch
+    /// this process.
+    fn of(timeout_us: Option<&str>, process_id: Option<&str>, own_id: u32) -> Option<Self> {
+        let timeout_us: i64 = timeout_us?.parse().ok().filter(|&us| us > 0)?;
+        let is_meant = process_id.is_none_or(|id| id.parse() == Ok(own_id));
+        let period_nanos = timeout_us.saturating_mul(1000) / BEATS_IN_TIMEOUT;
+        is_meant.then_some(Self { period_nanos, last_nanos: i64::MIN })
+    }
+
+    /// Whether it is due; counts from now if it is.
+    fn is_due(&mut self, now_nanos: i64) -> bool {
+        let is_due = now_nanos.saturating_sub(self.last_nanos) >= self.period_nanos;
+        if is_due {
+            self.last_nanos = now_nanos;
+        }
+        is_due
+    }
+}
+
+impl ManagerNotice {
+    /// The manager that the environment names. A name that is none is a warning: the process is wanted
+    /// more than its manager's knowledge of it.
+    pub fn from_environment() -> Self {
+        let variable = |name: &str| std::env::var(name).ok().filter(|value| !value.is_empty());
+        let [path, timeout_us, process_id] = VARIABLES.map(variable);
+        let Some(path) = path else { return Self::default() };
+        let socket = connect(&path)
+            .inspect_err(|error| tracing::warn!("NOTIFY_SOCKET={path}: {error}"))
+            .ok();
+        let own_id = std::process::id();
+        let heartbeat = Heartbeat::of(timeout_us.as_deref(), process_id.as_deref(), own_id);
+        Self { socket, heartbeat, said_ready: false }
+    }
+
+    /// The process does its work from now on. Said once.
+    pub fn ready(&mut self) {
+        if !std::mem::replace(&mut self.said_ready, true) {
+            self.send(format_args!("READY=1"));
+        }
+    }
+
+    /// The process is at its end.
+    pub fn stopping(&self) {
+        self.send(format_args!("STOPPING=1"));
+    }
+
+    /// The preparation goes on: until the process is ready the manager waits longer.
+    pub fn prepares(&self) {
+        if !self.said_ready {
+            self.send(format_args!("EXTEND_TIMEOUT_USEC={START_EXTENSION_US}"));
+        }
+    }
+
+    /// One line for `systemctl status`.
+    pub fn status(&self, status: std::fmt::Arguments<'_>) {
+        self.send(format_args!("STATUS={}", OneLine(status)));
+    }
+
+    /// The frame loop is alive. Call it from there, as often as you like.
+    pub fn beat(&mut self, now_nanos: i64) {
+        if self.heartbeat.as_mut().is_some_and(|heartbeat| heartbeat.is_due(now_nanos)) {
+            self.send(format_args!("WATCHDOG=1"));
+        }
+    }
+
+    fn send(&self, message: std::fmt::Arguments<'_>) {
+        let Some(socket) = &self.socket else { return };
+        let mut bytes = Cursor::new([0; MESSAGE_BYTES]);
+        // What does not fit is cut; a manager that is full or gone is none to wait for.
+        let _ = bytes.write_fmt(message);
+        let length = bytes.position() as usize;
+        let _ = socket.send(&bytes.get_ref()[..length]);
+    }
+}
+
+/// Connects to the socket at `path`, or in the abstract namespace where it begins with `@`.
+fn connect(path: &str) -> io::Result<UnixDatagram> {
+    let address = match path.strip_prefix('@') {
+        Some(name) => SocketAddr::from_abstract_name(name)?,
+        None => SocketAddr::from_pathname(path)?,
+    };
+    let socket = UnixDatagram::unbound()?;
+    socket.connect_addr(&address)?;
+    socket.set_nonblocking(true)?;
+    Ok(socket)
+}
+
+/// Text whose line ends are blanks: a second line would be another assignment.
+struct OneLine<'a>(std::fmt::Arguments<'a>);
+
+impl std::fmt::Display for OneLine<'_> {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        struct Blanked<'a, 'b>(&'a mut std::fmt::Formatter<'b>);
+        impl std::fmt::Write for Blanked<'_, '_> {
+            fn write_str(&mut self, text: &str) -> std::fmt::Result {
+                text.split(char::is_control).enumerate().try_for_each(|(index, part)| {
+                    if index > 0 {
+                        self.0.write_char(' ')?;
+                    }
+                    self.0.write_str(part)
+                })
+            }
+        }
+        write!(Blanked(out), "{}", self.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn beats_come_more_often_than_every_half_of_the_timeout() {
+        let mut heartbeat = Heartbeat::of(Some("2000000"), Some("17"), 17).unwrap();
+        let millis = |ms: i64| ms * 1_000_000;
+        assert!(heartbeat.is_due(millis(5)), "the first at once");
+        assert!(!heartbeat.is_due(millis(504)));
+        assert!(heartbeat.is_due(millis(505)));
+        assert!(heartbeat.is_due(millis(1400)));
+        assert!(!heartbeat.is_due(millis(1500)));
+    }
+
+    #[test]
+    fn only_who_is_watched_beats() {
+        assert_eq!(Heartbeat::of(None, None, 17), None);
+        assert_eq!(Heartbeat::of(Some("0"), None, 17), None);
+        assert_eq!(Heartbeat::of(Some("x"), None, 17), None);
+        assert_eq!(Heartbeat::of(Some("1000"), Some("18"), 17), None);
+        assert!(Heartbeat::of(Some("1000"), None, 17).is_some());
+        assert!(Heartbeat::of(Some("9223372036854775807"), None, 17).is_some());
+    }
+
+    fn heard(by: &UnixDatagram) -> String {
+        let mut bytes = [0; 2 * MESSAGE_BYTES];
+        let length = by.recv(&mut bytes).unwrap();
+        String::from_utf8(bytes[..length].to_vec()).unwrap()
+    }
+
+    #[test]
+    fn the_manager_hears_what_is_said() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("notify");
+        let manager = UnixDatagram::bind(&path).unwrap();
+        let socket = connect(path.to_str().unwrap()).ok();
+        let heartbeat = Heartbeat::of(Some("1000"), None, 1);
+        let mut notice = ManagerNotice { socket, heartbeat, said_ready: false };
+        notice.prepares();
+        assert_eq!(heard(&manager), "EXTEND_TIMEOUT_USEC=30000000");
+        notice.ready();
+        notice.ready();
+        notice.prepares();
+        notice.status(format_args!("a\nWATCHDOG=trigger{}", "\r"));
+        assert_eq!(heard(&manager), "READY=1");
+        assert_eq!(heard(&manager), "STATUS=a WATCHDOG=trigger ");
+        notice.beat(7);
+        notice.beat(8);
+        notice.stopping();
+        assert_eq!(heard(&manager), "WATCHDOG=1");
+        assert_eq!(heard(&manager), "STOPPING=1");
+        notice.status(format_args!("{}", "x".repeat(3 * MESSAGE_BYTES)));
+        assert!(heard(&manager).len() <= MESSAGE_BYTES, "a long text is cut");
+        drop(manager);
+        notice.status(format_args!("nobody listens, and nobody waits"));
+    }
+
+    #[test]
+    fn a_manager_may_have_an_abstract_name() {
+        let name = format!("semidense-test-{}", std::process::id());
+        let address = SocketAddr::from_abstract_name(&name).unwrap();
+        let manager = UnixDatagram::bind_addr(&address).unwrap();
+        let socket = connect(&format!("@{name}")).ok();
+        ManagerNotice { socket, ..Default::default() }.ready();
+        assert_eq!(heard(&manager), "READY=1");
+        assert!(connect("/nowhere/notify").is_err());
+    }
+}

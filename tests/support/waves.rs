@@ -1,0 +1,45 @@
+//! Smooth waves on a wall at depth 1: frames that can be tracked, and a keyframe of them.
+
+use semidense::slam::geometry::intrinsics::Intrinsics;
+use semidense::slam::geometry::sim3::Sim3;
+use semidense::slam::keyframe::{DepthPoint, Keyframe, MapState};
+
+/// What they are seen with.
+pub const CAMERA: Intrinsics =
+    Intrinsics { fx: 260.0, fy: 260.0, cx: 159.5, cy: 119.5, width: 320, height: 240 };
+
+/// The waves, shifted by `shift` pixels.
+pub fn image(shift: f64) -> Vec<u8> {
+    let grey = |u: usize, v: usize| {
+        let (u, v) = (u as f64 - shift, v as f64);
+        128.0 + 40.0 * (u * 0.19).sin() * (v * 0.13).cos() + 30.0 * (0.07 * u + 0.11 * v).sin()
+    };
+    (0..CAMERA.width * CAMERA.height)
+        .map(|i| grey(i % CAMERA.width, i / CAMERA.width) as u8)
+        .collect()
+}
+
+/// A keyframe with depth at every pixel.
+pub fn keyframe(keyframe_id: u64) -> Keyframe {
+    let image = image(0.0);
+    let pixels = (2..CAMERA.height - 2).flat_map(|v| (2..CAMERA.width - 2).map(move |u| (u, v)));
+    let points = pixels.map(|(u, v)| DepthPoint {
+        u: u as u16,
+        v: v as u16,
+        inverse_depth: 1.0,
+        variance: 1e-3,
+        intensity: f32::from(image[v * CAMERA.width + u]),
+    });
+    Keyframe {
+        keyframe_id,
+        epoch: 0,
+        revision: keyframe_id,
+        sequence: 0,
+        capture_nanos: 0,
+        map_state: MapState::Established,
+        world_from_keyframe: Sim3::identity(),
+        intrinsics: CAMERA,
+        points: points.collect(),
+        image,
+    }
+}
