@@ -20,4 +20,4 @@ done
 left=$(leftovers)
 expect "nothing is left when the last rig is stopped" "${left:-nothing}" test -z "$left"
 systemctl start semidense@robot.target
-soon "poses after stop and start" 120 tracks
+soon "poses after stop and start" 240 tracks
