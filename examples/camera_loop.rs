@@ -47,8 +47,11 @@ fn main() -> ExitCode {
     }
 }
 
-/// The pictures of a recording, with their stamps.
-fn pictures(source: &mut dyn FrameSource) -> Result<Vec<(i64, Vec<u8>)>, Box<dyn Error>> {
+/// A picture of the recording: its stamp in nanoseconds, and its pixels.
+type Picture = (i64, Vec<u8>);
+
+/// All pictures of a recording.
+fn pictures(source: &mut dyn FrameSource) -> Result<Vec<Picture>, Box<dyn Error>> {
     let k = source.intrinsics();
     let mut found = Vec::new();
     let mut pixels = vec![0; k.width * k.height];

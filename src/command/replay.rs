@@ -78,13 +78,13 @@ pub struct ReplayArgs {
 
 /// Replays, writes the results and prints the summary.
 pub fn run(config: &Config, args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error>> {
-    prepare_output(&args.output)?;
     if args.source.is_camera() {
         let name = &args.source;
         return Err(
             format!("{name}: a camera cannot be replayed; semidense run --source {name}").into()
         );
     }
+    prepare_output(&args.output)?;
     let mut params = config.source_params();
     let simulator = &mut params.simulator;
     simulator.seed = args.seed.unwrap_or(simulator.seed);

@@ -140,8 +140,12 @@ fn memory_limit(config: &Config) -> Finding {
     }
 }
 
+/// The name of this user: services have no USER, and `usermod` takes no numbers.
 fn user() -> String {
-    std::env::var("USER").unwrap_or_else(|_| rustix::process::geteuid().as_raw().to_string())
+    let number = rustix::process::geteuid().as_raw().to_string();
+    let users = fs::read_to_string("/etc/passwd").unwrap_or_default();
+    let line = users.lines().find(|line| line.split(':').nth(2) == Some(&number));
+    line.and_then(|line| line.split(':').next()).unwrap_or(&number).to_owned()
 }
 
 fn shared_memory() -> Finding {

@@ -23,6 +23,8 @@ const FIRST_PAUSE_NANOS: i64 = 100_000_000;
 const HEALTHY_NANOS: i64 = 2_000_000_000;
 /// How often a value that the camera changes is read: a request to a USB camera takes a millisecond.
 const EXPOSURE_PERIOD_NANOS: i64 = 200_000_000;
+/// Pause after a wake-up without a frame.
+const IDLE_PAUSE_MILLIS: u32 = 1;
 /// Most notices that are kept for who asks: a camera that complains for ever is heard often enough.
 const MAX_NOTICES: usize = 16;
 
@@ -228,8 +230,9 @@ impl<S: VideoSystem> Camera<S> {
         }
         stream.return_idle()?;
         let readiness = stream.device.wait(wake, millis).map_err(|error| stream.fault(error))?;
-        if readiness == Readiness::Ready {
-            self.drain()?;
+        if readiness == Readiness::Ready && self.drain()? == 0 {
+            // A driver that wakes for nothing must not turn this into a loop that never sleeps.
+            self.system.pause(wake, IDLE_PAUSE_MILLIS);
         }
         let now = self.system.now_nanos();
         let State::Streaming(stream) = &mut self.state else { return Ok(Arrival::Nothing) };
@@ -263,9 +266,10 @@ impl<S: VideoSystem> Camera<S> {
         Ok(Arrival::Nothing)
     }
 
-    /// Takes every buffer that is filled and holds the newest good one.
-    fn drain(&mut self) -> Result<(), Fault> {
-        let State::Streaming(stream) = &mut self.state else { return Ok(()) };
+    /// Takes every buffer that is filled and holds the newest good one; how many there were.
+    fn drain(&mut self) -> Result<usize, Fault> {
+        let State::Streaming(stream) = &mut self.state else { return Ok(0) };
+        let mut count = 0;
         let arrival_nanos = self.system.now_nanos();
         let offset_nanos = self.params.stamp_offset_us.saturating_mul(1000);
         // A camera may fill as fast as we look: no more than all buffers twice.
@@ -275,6 +279,7 @@ impl<S: VideoSystem> Camera<S> {
                 Err(Errno::AGAIN) => break,
                 Err(error) => return Err(stream.fault(error)),
             };
+            count += 1;
             stream.newest_nanos = arrival_nanos;
             let (sequence, missing) = self.numbers.number(filled.sequence);
             self.losses.missing += missing;
@@ -305,7 +310,7 @@ impl<S: VideoSystem> Camera<S> {
             }
             self.is_stamped = taken.is_stamped;
         }
-        Ok(())
+        Ok(count)
     }
 
     /// The frame that waits, its layout and its bytes: those that the driver says it has filled, none

@@ -162,8 +162,8 @@ fn control_range(query: &kernel::QueryControl) -> ControlRange {
 
 /// The driver's stamp in nanoseconds.
 fn stamp_nanos(stamp: libc::timeval) -> i64 {
-    let (seconds, micros) = (i64::from(stamp.tv_sec), i64::from(stamp.tv_usec));
-    seconds.saturating_mul(1_000_000_000).saturating_add(micros.saturating_mul(1000))
+    let micros = stamp.tv_usec.saturating_mul(1000);
+    stamp.tv_sec.saturating_mul(1_000_000_000).saturating_add(micros)
 }
 
 impl VideoDevice for KernelDevice {

@@ -17,6 +17,9 @@ use super::video_device::{
 /// Formats with sizes and the fastest rate.
 type Offer = (PixelFormat, Vec<(u32, u32)>, u32);
 
+/// The same as a test writes it.
+type OfferedHere<'a> = (PixelFormat, &'a [(u32, u32)], u32);
+
 /// What a driver does at a dequeue.
 #[derive(Debug, Clone)]
 pub enum Event {
@@ -61,7 +64,7 @@ impl Default for Fake {
 }
 
 impl Fake {
-    pub fn with_formats(offers: &[(PixelFormat, &[(u32, u32)], u32)]) -> Self {
+    pub fn with_formats(offers: &[OfferedHere<'_>]) -> Self {
         let offers = offers.iter().map(|(f, sizes, rate)| (*f, sizes.to_vec(), *rate)).collect();
         Self(Arc::new(Mutex::new(Inner {
             offers,

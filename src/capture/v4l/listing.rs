@@ -255,7 +255,7 @@ mod tests {
             std::fs::write(dev.path().join(name), "").unwrap();
         }
         assert_eq!(nodes(dev.path()), [dev.path().join("video2"), dev.path().join("video10")]);
-        assert_eq!(nodes(Path::new("/nowhere")), [PathBuf::new(); 0]);
+        assert!(nodes(Path::new("/nowhere")).is_empty());
         // A file that is no device is no camera.
         assert_eq!(cameras(dev.path()), []);
     }

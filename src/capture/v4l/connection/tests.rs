@@ -282,3 +282,17 @@ fn bytes_that_are_not_there_are_not_shown() {
     }
     assert_eq!(camera.losses().broken, 4);
 }
+
+#[test]
+fn a_driver_that_wakes_for_nothing_does_not_keep_the_processor() {
+    let fake = Fake::default();
+    let mut camera = camera(&fake);
+    take(&fake, &mut camera, 0);
+    for _ in 0..50 {
+        fake.give(Event::Fails(Errno::AGAIN));
+        let before = fake.now_nanos();
+        assert_eq!(camera.await_frame(None, 10), Ok(Arrival::Nothing));
+        assert!(fake.now_nanos() > before, "it slept");
+    }
+    assert_eq!((take(&fake, &mut camera, 1), fake.opened()), (1, 1));
+}
