@@ -172,7 +172,7 @@ impl<S: VideoSystem> Camera<S> {
         let grant = negotiate(&mut device, &self.wish).map_err(|error| match error {
             NegotiationError::Device(error) => refused(error),
             error @ NegotiationError::Size { .. } => Fault {
-                reason: at(format!("{error}; name the rig of one of these sizes with --rig")),
+                reason: at(format!("{error}; name the rig of a size that it gives with --rig")),
                 passes: false,
             },
             error => Fault { reason: at(error.to_string()), passes: false },

@@ -1,4 +1,4 @@
-//! What a capture device does, call by call. The kernel's devices are [`super::device::KernelDevice`];
+//! What a capture device does, call by call. The kernel's devices are those of `device.rs`;
 //! everything that decides works on this trait and is tested with a device that is none.
 
 use std::fmt;
