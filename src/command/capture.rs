@@ -30,7 +30,7 @@ pub struct SourceArguments {
     /// of the configuration]
     #[arg(long, value_name = "SOURCE")]
     source: Option<String>,
-    /// Rig file with the camera's calibration [default: capture.rig of the configuration]
+    /// Rig file with the camera's calibration; a camera (v4l) needs one [default: capture.rig of the configuration]
     #[arg(long, value_name = "FILE")]
     rig: Option<PathBuf>,
 }

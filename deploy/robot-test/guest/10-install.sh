@@ -30,7 +30,7 @@ CONFIG
 # An emulated CPU on a busy machine may hold a process up for longer than a robot's watchdog allows.
 for process in capture tracker mapper; do
     mkdir -p "/etc/systemd/system/semidense-$process@.service.d"
-    printf '[Service]\nWatchdogSec=%s\n' "$([ $process = mapper ] && echo 30 || echo 12)" \
+    printf '[Service]\nWatchdogSec=%s\n' "$([ $process = mapper ] && echo 60 || echo 12)" \
         > "/etc/systemd/system/semidense-$process@.service.d/emulated.conf"
 done
 systemctl daemon-reload

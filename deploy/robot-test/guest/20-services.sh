@@ -9,7 +9,7 @@ for process in capture tracker mapper; do
     soon "$process is ready" 60 is_active "$process"
     expect "$process says what it does" "$(property "$process" StatusText)" test -n "$(property "$process" StatusText)"
 done
-soon "poses flow" 120 tracks
+soon "poses flow" 240 tracks
 seen=$(status '[.capture, .tracker, .mapper] | map("\(.frames) frames, \(.rate_hz // 0 | floor)/s, \(.state) (\(.cause))") | join("; ")')
 pass "status" "$seen"
 
@@ -42,13 +42,13 @@ cp /usr/share/doc/semidense/examples/cpus.conf /etc/systemd/system/semidense-tra
 systemctl daemon-reload
 systemctl restart "$(unit tracker)"
 expect "CPUAffinity" "$(taskset -cp "$(main_pid tracker)")" sh -c "taskset -cp $(main_pid tracker) | grep -q ': 1$'"
-soon "poses after a restart by hand" 60 tracks
+soon "poses after a restart by hand" 120 tracks
 
 # A second rig beside the first.
 sed 's/:5:/:3:/' /etc/semidense/robot.toml > /etc/semidense/other.toml
 rig=other
 systemctl start semidense@other.target
-soon "a second rig gives poses" 120 tracks
+soon "a second rig gives poses" 300 tracks
 systemctl stop semidense@other.target
 rig=robot
 soon "the first goes on" 30 tracks

@@ -12,7 +12,7 @@ for process in capture tracker mapper; do
     kill -9 "$victim"
     soon "$process is started again" 30 has_restarted "$process" $((before + 1))
     soon "$process is ready again" 30 is_active "$process"
-    soon "poses after the death of $process" 60 tracks
+    soon "poses after the death of $process" 120 tracks
     soon "$process works again" 60 frames_flow "$process"
     # shellcheck disable=SC2086
     expect "the others have not noticed" "processes$others" kill -0 $others

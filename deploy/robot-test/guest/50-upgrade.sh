@@ -13,4 +13,4 @@ expect "the user's configuration stays" "$(tail -n 1 /etc/semidense/webcam.toml)
 expect "the package's own is renewed" "$(tail -n 1 /etc/semidense/semidense.toml)" grep -q '^# next' /etc/semidense/semidense.toml
 expect "a rig of the user's stays" "robot.toml" test -s /etc/semidense/robot.toml
 expect "the rig was restarted" "tracker was process $old, is $(main_pid tracker)" test "$old" != "$(main_pid tracker)"
-soon "poses after the upgrade" 120 tracks
+soon "poses after the upgrade" 240 tracks
