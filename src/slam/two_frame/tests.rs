@@ -222,7 +222,8 @@ fn derivatives_are_those_of_the_residuals() {
         let depths = state.inverse_depths.iter().map(|d| d + change).collect();
         energy(&State { inverse_depths: depths, ..state.clone() })
     };
-    let (less, more) = (shifted(-0.02), shifted(0.02));
+    let points = |change: f32| shifted(change).points().collect::<Vec<_>>();
+    let (less, more) = (points(-0.02), points(0.02));
     let (mut agree, mut all) = (0, 0);
     for (i, point) in at.points().enumerate().filter(|(_, p)| p.visible) {
         let slope = (more[i].energy - less[i].energy) / 0.04;
@@ -349,4 +350,68 @@ fn hostile_frames_are_refused_and_a_start_begins_again_by_itself() {
     assert_eq!(initializer.step(&second).state, InitState::Proven);
     let nonsense = TwoFrameParams { match_noise_px: f32::NAN, ..TwoFrameParams::default() };
     assert!(TwoFrameInitializer::new(CAMERA, nonsense).is_err());
+}
+
+#[test]
+fn every_version_of_the_sums_gives_the_same_bits() {
+    use crate::slam::two_frame::system::System;
+    use crate::slam::two_frame::system_kernel::{portable_kernels, system_kernels};
+    let (first, second, moved) = two_views(2.0);
+    let mut initializer = TwoFrameInitializer::new(CAMERA, TwoFrameParams::default()).unwrap();
+    assert!(initializer.begin(&first));
+    initializer.pyramid.fill(&second);
+    let input = input(initializer.pyramid.levels(), &initializer.intrinsics, &initializer.points);
+    let num_points = initializer.points.pixels.len();
+    for (level, depth) in [(0, 0.4f32), (1, -1.5), (2, 5.0), (0, f32::NAN)] {
+        let state = State {
+            current_from_first: moved.inverse(),
+            brightness: Brightness { a: 0.02, b: -1.0 },
+            inverse_depths: (0..num_points).map(|i| depth + 0.01 * (i % 7) as f32).collect(),
+        };
+        let systems = [system_kernels(), portable_kernels()].map(|kernels| {
+            let mut system = System::default();
+            (kernels.evaluate)(&mut system, &input.level(level), &state);
+            format!("{system:?}")
+        });
+        assert!(systems[0] == systems[1], "level {level}, depth {depth}");
+    }
+}
+
+#[test]
+fn a_point_counts_as_it_does_alone() {
+    use crate::slam::two_frame::system::System;
+    let (first, second, moved) = two_views(2.0);
+    let mut initializer = TwoFrameInitializer::new(CAMERA, TwoFrameParams::default()).unwrap();
+    assert!(initializer.begin(&first));
+    initializer.pyramid.fill(&second);
+    let input = input(initializer.pyramid.levels(), &initializer.intrinsics, &initializer.points);
+    let state = State {
+        current_from_first: moved.inverse(),
+        brightness: Brightness { a: 0.02, b: -1.0 },
+        inverse_depths: vec![0.4; initializer.points.pixels.len()],
+    };
+    let (view, mut system) = (input.level(0), System::default());
+    system.evaluate(&view, &state);
+    let (k, image) = (&initializer.intrinsics[0], view.image);
+    let mut checked = 0;
+    for (i, point) in system.points().enumerate().filter(|(_, p)| p.visible) {
+        let (patch, l) = (&view.patches[i / 8], i % 8);
+        let mut energy = 0.0;
+        for (s, (du, dv)) in crate::slam::depth::matching::PATTERN.iter().enumerate() {
+            let pixel =
+                [f64::from(patch.u[l]) + f64::from(*du), f64::from(patch.v[l]) + f64::from(*dv)];
+            let ray = Vector3::new((pixel[0] - k.cx) / k.fx, (pixel[1] - k.cy) / k.fy, 1.0);
+            let pose = &state.current_from_first;
+            let q = pose.rotation_matrix() * ray + pose.translation * 0.4f32 as f64;
+            let (u, v) = (k.fx * q.x / q.z + k.cx, k.fy * q.y / q.z + k.cy);
+            let seen = crate::slam::depth::matching::bilinear(image, u as f32, v as f32);
+            let expected = 0.02f64.exp() as f32 * patch.intensities[s][l] - 1.0;
+            let size = (seen - expected).abs();
+            let cost = if size <= 9.0 { size * size } else { 9.0 * (2.0 * size - 9.0) };
+            energy += patch.weights[s][l] * cost;
+        }
+        assert!((energy - point.energy).abs() <= 1.0 + 0.01 * energy, "{i}: {energy} {point:?}");
+        checked += 1;
+    }
+    assert!(checked > 500);
 }
