@@ -256,3 +256,19 @@ fn broken_recording(rig: &Rig) -> String {
     fs::write(folder.join("rgb.txt"), list).unwrap();
     format!("tum:{}", folder.display())
 }
+
+#[test]
+fn status_sees_who_runs_without_capture() {
+    let rig = Rig::new();
+    let tracker = rig.command(&["tracker", "--live"]).spawn().unwrap();
+    let status = until("status of a tracker alone", || {
+        let ended = finish(rig.command(&["status", "--once", "--json"]));
+        let status: Value = serde_json::from_str(&ended.stdout).ok()?;
+        status["tracker"].is_object().then_some(status)
+    });
+    assert!(status["capture"].is_null() && status["mapper"].is_null(), "{status}");
+    signal(&tracker, Signal::INT);
+    end(tracker);
+    let nobody = finish(rig.command(&["status", "--once"]));
+    assert_eq!(nobody.status.code(), Some(1), "{}", nobody.stdout);
+}

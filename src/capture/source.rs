@@ -115,7 +115,7 @@ pub enum SourceError {
     },
     /// Nothing says what the camera is.
     #[error(
-        "{}: has no camera.txt; name the camera with --rig FILE (examples: config/rigs)",
+        "{}: has no camera.txt; name the camera with --rig FILE (examples: config/rigs, /usr/share/semidense/rigs)",
         folder.display()
     )]
     NoRig {
@@ -162,7 +162,7 @@ pub enum SourceError {
     Image(#[from] ImageFileError),
     /// A camera without a calibration.
     #[error(
-        "v4l:{name}: a camera needs a rig file, which says what its lens is: name it with --rig FILE (config/rigs/webcam.toml is a start, for a first try at 640x480)"
+        "v4l:{name}: a camera needs a rig file, which says what its lens is: name it with --rig FILE (webcam.toml of config/rigs or /usr/share/semidense/rigs is a start, for a first try at 640x480)"
     )]
     CameraRig {
         /// The camera.

@@ -103,6 +103,10 @@ pub fn run(config: &Config, args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error
     let record = pool.install(|| {
         record(config, args, source.as_mut(), &interrupted).map_err(|error| error.to_string())
     })?;
+    if record.poses.is_empty() && interrupted.load(Ordering::Relaxed) {
+        note("interrupted before the first frame: there are no results");
+        return Ok(ExitCode::from(INTERRUPTED));
+    }
     let summary = write_results(&args.output, &record, source.as_mut(), &config.results)?;
     if args.debug_images {
         write_debug_pictures(&args.output.join("debug"), &record.map, &config.tracking)?;

@@ -44,9 +44,11 @@ pub struct StatusArguments {
 pub fn run(config: &Config, arguments: StatusArguments) -> CommandResult {
     let place = Place::new(&config.instance, &config.root)?;
     let hub = Hub::join(&place, "status", Access::Observer)?;
-    let mut peers = Vec::new();
-    for topic in &HEALTH_TOPICS {
-        peers.push(Peer::open(&hub, topic)?);
+    let mut peers = HEALTH_TOPICS.each_ref().map(|topic| Peer::open(&hub, topic));
+    if peers.iter().all(Result::is_err) {
+        let [first, ..] = peers;
+        first?;
+        return Ok(ExitCode::FAILURE);
     }
     let shutdown = Shutdown::install()?;
     let is_live = std::io::stdout().is_terminal() && !arguments.once && !arguments.json;
@@ -59,7 +61,15 @@ pub fn run(config: &Config, arguments: StatusArguments) -> CommandResult {
             return Ok(ExitCode::SUCCESS);
         }
         let mut rows = Vec::new();
-        for (peer, before) in peers.iter_mut().zip(&mut before) {
+        for ((topic, peer), before) in HEALTH_TOPICS.iter().zip(&mut peers).zip(&mut before) {
+            if peer.is_err() {
+                // It may have come up since the last look.
+                *peer = Peer::open(&hub, topic);
+            }
+            let Ok(peer) = peer else {
+                rows.push((topic.owner, Value::Null));
+                continue;
+            };
             peer.update()?;
             rows.push((peer.name(), row(peer, before.as_ref())));
             // One look takes its rates since the first report, to be done soonest.

@@ -30,10 +30,11 @@ struct Shared {
 }
 
 impl Checkpoint {
-    /// Keeps the checkpoint in the file `path`; `first` is written before this returns.
+    /// Keeps the checkpoint in the file `path`; `first` is written before this returns, unless the disk
+    /// refuses, which is said in the log; the next one may fit.
     pub fn keep(path: &Path, first: &Map) -> io::Result<Self> {
         remove_unfinished(path);
-        write(path, first)?;
+        write_or_warn(path, first);
         let shared = Arc::new(Shared { newest: ArrayQueue::new(1), stop: AtomicBool::new(false) });
         let (theirs, file) = (Arc::clone(&shared), path.to_owned());
         let thread = std::thread::Builder::new()
@@ -77,17 +78,21 @@ fn write(path: &Path, map: &Map) -> io::Result<()> {
     write_privately(path, |file| write_map_into(file, map))
 }
 
+fn write_or_warn(path: &Path, map: &Map) {
+    if let Err(error) = write(path, map) {
+        tracing::warn!(
+            "{}: no checkpoint ({error}); a mapper that dies will begin anew",
+            path.display()
+        );
+    }
+}
+
 fn write_until_stopped(path: &Path, shared: &Shared) {
     while !shared.stop.load(Ordering::Acquire) {
         match shared.newest.pop() {
             None => std::thread::park(),
             Some(map) => {
-                if let Err(error) = write(path, &map) {
-                    tracing::warn!(
-                        "{}: no checkpoint ({error}); a mapper that dies will begin anew",
-                        path.display()
-                    );
-                }
+                write_or_warn(path, &map);
             }
         }
     }

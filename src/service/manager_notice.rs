@@ -103,8 +103,10 @@ impl ManagerNotice {
         let mut bytes = Cursor::new([0; MESSAGE_BYTES]);
         // What does not fit is cut; a manager that is full or gone is none to wait for.
         let _ = bytes.write_fmt(message);
-        let length = bytes.position() as usize;
-        let _ = socket.send(&bytes.get_ref()[..length]);
+        let written = &bytes.get_ref()[..bytes.position() as usize];
+        // Not within a character: the manager takes UTF-8 only.
+        let whole = std::str::from_utf8(written).map_or_else(|e| e.valid_up_to(), str::len);
+        let _ = socket.send(&written[..whole]);
     }
 }
 

@@ -27,6 +27,9 @@ const EXPOSURE_PERIOD_NANOS: i64 = 200_000_000;
 const IDLE_PAUSE_MILLIS: u32 = 1;
 /// Most notices that are kept for who asks: a camera that complains for ever is heard often enough.
 const MAX_NOTICES: usize = 16;
+/// Frames whose stamps go back are refused; after so many in a row, a third of a second, it is the clock that has
+/// stepped.
+const MAX_REFUSED_IN_A_ROW: u32 = 10;
 
 /// Why a camera cannot be used, for good or for now.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -85,6 +88,8 @@ pub struct Camera<S: VideoSystem> {
     has_streamed: bool,
     is_stamped: bool,
     last_nanos: Option<i64>,
+    /// Frames refused since the last good one.
+    refused_in_a_row: u32,
 }
 
 impl<S: VideoSystem> Camera<S> {
@@ -103,6 +108,7 @@ impl<S: VideoSystem> Camera<S> {
             has_streamed: false,
             is_stamped: true,
             last_nanos: None,
+            refused_in_a_row: 0,
         }
     }
 
@@ -229,6 +235,8 @@ impl<S: VideoSystem> Camera<S> {
             return Ok(Arrival::Frame);
         }
         stream.return_idle()?;
+        self.see_to_exposure();
+        let State::Streaming(stream) = &mut self.state else { return Ok(Arrival::Nothing) };
         let readiness = stream.device.wait(wake, millis).map_err(|error| stream.fault(error))?;
         if readiness == Readiness::Ready && self.drain()? == 0 {
             // A driver that wakes for nothing must not turn this into a loop that never sleeps.
@@ -247,7 +255,14 @@ impl<S: VideoSystem> Camera<S> {
             let seconds = self.params.stall_s;
             return Err(Fault::passing(format!("{path}: gives no frame for {seconds} s")));
         }
-        // Between two frames there is time for slow requests.
+        Ok(Arrival::Nothing)
+    }
+
+    /// Locks what shall be locked, once the camera has settled, and reads the exposure again where it
+    /// changes by itself: when a frame has been handed on, and not only when none comes.
+    fn see_to_exposure(&mut self) {
+        let now = self.system.now_nanos();
+        let State::Streaming(stream) = &mut self.state else { return };
         let mut notices = Vec::new();
         if stream.lock_is_due
             && now.saturating_sub(stream.since_nanos) as f64 >= self.params.settle_s * 1e9
@@ -263,7 +278,6 @@ impl<S: VideoSystem> Camera<S> {
             stream.exposure = controls::exposure(&stream.device);
         }
         notices.into_iter().for_each(|text| self.warn(text));
-        Ok(Arrival::Nothing)
     }
 
     /// Takes every buffer that is filled and holds the newest good one; how many there were.
@@ -283,10 +297,17 @@ impl<S: VideoSystem> Camera<S> {
             stream.newest_nanos = arrival_nanos;
             let (sequence, missing) = self.numbers.number(filled.sequence);
             self.losses.missing += missing;
-            let taken = taken(&filled, arrival_nanos, stream.exposure.nanos, offset_nanos);
+            let mut taken = taken(&filled, arrival_nanos, stream.exposure.nanos, offset_nanos);
             let before = stream.held.map(|held| held.stamp.capture_nanos).or(self.last_nanos);
+            if !taken.is_stamped || self.refused_in_a_row >= MAX_REFUSED_IN_A_ROW {
+                // Frames that were fetched together have arrived together; and a driver whose stamps have
+                // gone back for good is not blind for ever.
+                taken.nanos =
+                    before.map_or(taken.nanos, |before| taken.nanos.max(before.saturating_add(1)));
+            }
             let is_broken = filled.flags & FLAG_ERROR != 0
                 || before.is_some_and(|before| taken.nanos <= before);
+            self.refused_in_a_row = if is_broken { self.refused_in_a_row + 1 } else { 0 };
             if is_broken {
                 self.losses.broken += 1;
                 stream.idle.push(filled.index);

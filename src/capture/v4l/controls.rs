@@ -232,12 +232,18 @@ pub struct Exposure {
     pub changes: bool,
 }
 
+/// No camera that makes frames for this exposes longer than a second: what says so means another unit.
+const LONGEST_EXPOSURE_NANOS: u64 = 1_000_000_000;
+
 /// Reads exposure time and gain.
 pub fn exposure(device: &dyn VideoDevice) -> Exposure {
     let time = EXPOSURE.reading(device);
     let gain = GAIN_KNOB.reading(device);
     Exposure {
-        nanos: time.map_or(0, |(micros, _)| u64::try_from(micros).unwrap_or(0) * 1000),
+        nanos: time
+            .and_then(|(micros, _)| u64::try_from(micros).ok()?.checked_mul(1000))
+            .filter(|nanos| *nanos <= LONGEST_EXPOSURE_NANOS)
+            .unwrap_or(0),
         gain: gain.map_or(0.0, |(value, _)| value as f32),
         changes: [time, gain].iter().flatten().any(|(_, changes)| *changes),
     }

@@ -177,7 +177,7 @@ fn agree_on_rate(device: &mut dyn VideoDevice, wanted: Option<f64>) -> Option<f6
     let own = device.period().ok();
     let granted = match (wanted, own) {
         (Some(wanted), Some((_, true))) => {
-            let denominator = (wanted * MILLIHERTZ).round() as u32;
+            let denominator = (wanted * MILLIHERTZ).round().max(1.0) as u32;
             let period = Fraction { numerator: MILLIHERTZ as u32, denominator };
             device.set_period(period).ok().or(own.map(|(period, _)| period))
         }

@@ -205,7 +205,7 @@ impl<'a> Way<'a> {
         let gradient_u = f64::from(image.gradient_u.pixels()[index]);
         let gradient_v = f64::from(image.gradient_v.pixels()[index]);
         let gradient = (gradient_u * gradient_u + gradient_v * gradient_v).sqrt() as f32;
-        if residual > params.max_residual + params.residual_per_gradient * gradient {
+        if !(residual <= params.max_residual + params.residual_per_gradient * gradient) {
             return None;
         }
         Some((index as u32, carry(from, places.depth_ratio[k], places.r_z[k], params)))

@@ -246,7 +246,7 @@ fn fill(out: &mut Hypothesis, sums: &FillingSums, lane: usize) {
     let variance = scatter + neighbours / weights;
     // Neighbours on two surfaces say nothing of which one the hole is on.
     const MAX_STD_DEV_RATIO: f32 = 0.15;
-    if variance > (MAX_STD_DEV_RATIO * mean).powi(2) {
+    if !(variance <= (MAX_STD_DEV_RATIO * mean).powi(2)) {
         return;
     }
     *out = Hypothesis {

@@ -322,6 +322,7 @@ impl PatternSums {
         let energy = lanes(|l| if visible[l] { self.energy[l] } else { hidden[l] });
         let weight = lanes(|l| if visible[l] { patch.weight[l] } else { 0.0 });
         // What a lane out of view holds may not be finite, and 0 times that is not 0.
+        let d = &lanes(|l| if visible[l] { d[l] } else { 0.0 });
         let q = [
             lanes(|l| if visible[l] { self.q[0][l] } else { 0.0 }),
             lanes(|l| if visible[l] { self.q[1][l] } else { 0.0 }),
@@ -382,8 +383,10 @@ impl PatternSums {
         SystemBlock {
             mixed,
             information: lanes(|l| {
-                (uu[l] * speed_u[l] + 2.0 * uv[l] * speed_v[l]) * speed_u[l]
-                    + vv[l] * speed_v[l] * speed_v[l]
+                let squared = (uu[l] * speed_u[l] + 2.0 * uv[l] * speed_v[l]) * speed_u[l]
+                    + vv[l] * speed_v[l] * speed_v[l];
+                // A sum of squares: what rounding leaves of terms that cancel is none.
+                squared.max(0.0)
             }),
             gradient: lanes(|l| ru[l] * speed_u[l] + rv[l] * speed_v[l]),
             energy,

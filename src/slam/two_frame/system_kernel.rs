@@ -94,7 +94,8 @@ impl WindowSampler for PortableSampler {
             let (column, row) = (u[l] as i32, v[l] as i32);
             fu[l] = u[l] - column as f32;
             let fv = v[l] - row as f32;
-            let index = row.wrapping_sub(1).wrapping_mul(width as i32).wrapping_add(column - 1);
+            let index =
+                row.wrapping_sub(1).wrapping_mul(width as i32).wrapping_add(column.wrapping_sub(1));
             let first = (index as u32).min(last) as usize;
             let window = &pixels[first..first + 3 * width + 4];
             let at = |row: usize, column: usize| window[row * width + column];
