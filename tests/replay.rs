@@ -1,7 +1,8 @@
 //! `semidense replay`: deterministic, whatever the number of threads, and its results are whole.
 
+use std::io::{BufRead, BufReader};
 use std::path::Path;
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
 
 use semidense::service::trajectory_file::read_trajectory;
 use serde_json::Value;
@@ -97,4 +98,26 @@ fn what_cannot_be_replayed_is_one_clear_line() {
         assert!(message.contains(part), "{message}");
         assert_eq!(message.trim_end().lines().count(), 1, "{message}");
     }
+}
+
+#[test]
+fn results_survive_a_replay_that_is_interrupted_before_its_first_frame() {
+    let folder = tempfile::tempdir().unwrap();
+    let earlier = folder.path().join("trajectory.txt");
+    std::fs::write(&earlier, "of an earlier run").unwrap();
+    let mut child = Command::new(env!("CARGO_BIN_EXE_semidense"))
+        .args(["replay", "sim", "--output"])
+        .arg(folder.path())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut said = BufReader::new(child.stderr.take().unwrap()).lines();
+    let first = said.next().unwrap().unwrap();
+    assert!(first.starts_with("preparing"), "{first}");
+    let pid = rustix::process::Pid::from_child(&child);
+    rustix::process::kill_process(pid, rustix::process::Signal::INT).unwrap();
+    let rest: Vec<String> = said.map_while(Result::ok).collect();
+    assert_eq!(child.wait().unwrap().code(), Some(130), "{rest:?}");
+    assert!(rest.iter().any(|line| line.contains("there are no results")), "{rest:?}");
+    assert_eq!(std::fs::read_to_string(&earlier).unwrap(), "of an earlier run");
 }

@@ -50,7 +50,7 @@ pub type CommandResult = Result<ExitCode, Box<dyn Error>>;
     after_help = "Start with `semidense run`: it simulates a camera in a furnished room, tracks it, maps the room,\n\
                   and writes trajectory, map and figures into ./output.\n\
                   Then `semidense run --source tum:DIR` for a recording.\n\n\
-                  Exit codes: 0 done, 1 failed, 2 wrong usage, 130 interrupted (results so far are written)."
+                  Exit codes: 0 done, 1 failed, 2 wrong usage, 130 interrupted before the end (results so far are written)."
 )]
 struct CommandLine {
     #[command(flatten)]

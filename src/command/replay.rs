@@ -9,6 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use clap::{Args, ValueEnum};
 
 use crate::capture::source::{FrameSource, SourceName, open, rig_conflict};
+use crate::command::INTERRUPTED;
 use crate::command::print::{note, print};
 use crate::command::progress::Progress;
 use crate::service::config::Config;
@@ -17,9 +18,6 @@ use crate::service::results::debug_pictures::write_debug_pictures;
 use crate::service::results::summary_text::summary_text;
 use crate::service::results::{RunRecord, prepare_output, write_results};
 use crate::slam::pose::TrackingState;
-
-/// Exit code of a run that Ctrl-C ended, as shells have it (128 + SIGINT).
-const INTERRUPTED: u8 = 130;
 
 /// Where poses come from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
@@ -84,6 +82,8 @@ pub fn run(config: &Config, args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error
             format!("{name}: a camera cannot be replayed; semidense run --source {name}").into()
         );
     }
+    let interrupted = Arc::new(AtomicBool::new(false));
+    signal_hook::flag::register(signal_hook::consts::SIGINT, Arc::clone(&interrupted))?;
     prepare_output(&args.output)?;
     let mut params = config.source_params();
     let simulator = &mut params.simulator;
@@ -93,8 +93,6 @@ pub fn run(config: &Config, args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error
     if let Some(conflict) = rig_conflict(&args.source, args.rig.as_deref()) {
         note(&format!("warning: {conflict}"));
     }
-    let interrupted = Arc::new(AtomicBool::new(false));
-    signal_hook::flag::register(signal_hook::consts::SIGINT, Arc::clone(&interrupted))?;
     let threads = args.threads.map_or(config.mapper.threads, usize::from);
     let pool = rayon::ThreadPoolBuilder::new()
         .num_threads(threads)
@@ -103,10 +101,10 @@ pub fn run(config: &Config, args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error
     let record = pool.install(|| {
         record(config, args, source.as_mut(), &interrupted).map_err(|error| error.to_string())
     })?;
-    if record.poses.is_empty() && interrupted.load(Ordering::Relaxed) {
+    let Some(record) = record else {
         note("interrupted before the first frame: there are no results");
         return Ok(ExitCode::from(INTERRUPTED));
-    }
+    };
     let summary = write_results(&args.output, &record, source.as_mut(), &config.results)?;
     if args.debug_images {
         write_debug_pictures(&args.output.join("debug"), &record.map, &config.tracking)?;
@@ -121,13 +119,13 @@ pub fn run(config: &Config, args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error
     Ok(ExitCode::from(code))
 }
 
-/// Prepares the source and replays it under a progress bar.
+/// Prepares the source and replays it under a progress bar; `None` where Ctrl-C came before a frame.
 fn record(
     config: &Config,
     args: &ReplayArgs,
     source: &mut dyn FrameSource,
     interrupted: &AtomicBool,
-) -> Result<RunRecord, Box<dyn Error>> {
+) -> Result<Option<RunRecord>, Box<dyn Error>> {
     let goes_on = || !interrupted.load(Ordering::Relaxed);
     let mut preparing: Option<Progress> = None;
     source.prepare(&mut |done, total| {
@@ -136,6 +134,9 @@ fn record(
         goes_on()
     })?;
     preparing.iter().for_each(Progress::finish);
+    if !goes_on() {
+        return Ok(None);
+    }
     let replayed = ReplayConfig {
         tracker: config.tracking.clone(),
         mapper: config.mapping.clone(),
@@ -156,7 +157,7 @@ fn record(
         goes_on()
     });
     progress.finish();
-    Ok(record?)
+    Ok(Some(record?))
 }
 
 fn state_word(frame: &ReplayProgress) -> &'static str {

@@ -15,12 +15,11 @@ use crate::capture::simulator::Simulator;
 use crate::capture::simulator::params::{MotionKind, SceneKind, SimulatorParams};
 use crate::capture::simulator::summary::{PathSummary, gradient_share, summarize};
 use crate::capture::source::FrameSource;
+use crate::command::INTERRUPTED;
 use crate::command::print::{note, print};
 use crate::command::progress::Progress;
 use crate::service::config::Config;
 
-/// Exit code of work that Ctrl-C ended, as shells have it (128 + SIGINT).
-const INTERRUPTED: u8 = 130;
 /// Frames written between two looks at progress and Ctrl-C.
 const FRAMES_PER_BATCH: usize = 8;
 /// Gradient from which a pixel counts as textured, grey levels a pixel.

@@ -99,6 +99,23 @@ pub struct CameraReport {
     pub controls: Vec<ControlReport>,
 }
 
+impl CameraReport {
+    /// A node that was not asked yet.
+    fn of(path: &Path, names: Vec<String>) -> Self {
+        Self {
+            path: path.to_owned(),
+            names,
+            access: Access::Free,
+            problem: None,
+            card: String::new(),
+            driver: String::new(),
+            bus: String::new(),
+            formats: Vec::new(),
+            controls: Vec::new(),
+        }
+    }
+}
+
 /// The video nodes below `dev` (`/dev`), in the order of their numbers.
 pub fn nodes(dev: &Path) -> Vec<PathBuf> {
     let number = |path: &Path| -> Option<u32> {
@@ -146,17 +163,7 @@ fn device_access(device: &mut dyn VideoDevice) -> (Access, Option<Errno>) {
 }
 
 fn report(dev: &Path, path: &Path) -> Option<CameraReport> {
-    let mut found = CameraReport {
-        path: path.to_owned(),
-        names: names(dev, path),
-        access: Access::Free,
-        problem: None,
-        card: String::new(),
-        driver: String::new(),
-        bus: String::new(),
-        formats: Vec::new(),
-        controls: Vec::new(),
-    };
+    let mut found = CameraReport::of(path, names(dev, path));
     let mut device = match KernelDevice::open(path) {
         Ok(device) => device,
         Err(error) => {
@@ -277,17 +284,7 @@ mod tests {
     fn a_camera_says_what_it_offers() {
         let fake = Fake::with_formats(&[(PixelFormat::Yuyv, &[(640, 480), (320, 240)], 30)])
             .with_control(0x0098_0913, "Gain", (0, 100, 5), 40, 0);
-        let mut found = CameraReport {
-            path: "/dev/video0".into(),
-            names: Vec::new(),
-            access: Access::Free,
-            problem: None,
-            card: String::new(),
-            driver: String::new(),
-            bus: String::new(),
-            formats: Vec::new(),
-            controls: Vec::new(),
-        };
+        let mut found = CameraReport::of(Path::new("/dev/video0"), Vec::new());
         describe(&fake.device(), &mut found);
         let format = &found.formats[0];
         assert_eq!((format.code.as_str(), format.usable), ("YUYV", true));
