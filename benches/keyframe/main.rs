@@ -19,7 +19,7 @@ use semidense::slam::frame::FrameView;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::image::quads::QuadImage;
 use semidense::slam::keyframe::MAX_KEYFRAME_POINTS;
-use semidense::slam::mapper::{Mapper, MapperParams};
+use semidense::slam::mapper::{Mapper, MapperParams, Stage};
 use semidense::slam::pose::{Brightness, PoseEstimate, TrackingState};
 
 /// The frame of the first keyframe, in the middle of the path through the room.
@@ -242,7 +242,8 @@ fn tracked_covariance() -> [f64; 21] {
 fn whole(sequence: &Sequence, pools: &[rayon::ThreadPool]) {
     let camera = sequence.simulator.intrinsics();
     let mut by_place: [Vec<Vec<f64>>; 2] = [0, 1].map(|_| vec![Vec::new(); INTERVAL]);
-    for (pool, by_place) in pools.iter().zip(&mut by_place) {
+    let mut changes: [Vec<f64>; 2] = [0, 1].map(|_| Vec::new());
+    for ((pool, by_place), changes) in pools.iter().zip(&mut by_place).zip(&mut changes) {
         for _ in 0..4 {
             let mut mapper =
                 Mapper::new(camera, MapperParams::default()).expect("default values are valid");
@@ -265,13 +266,23 @@ fn whole(sequence: &Sequence, pools: &[rayon::ThreadPool]) {
                 };
                 let depth = (k == 0).then(|| sequence.simulator.raw_depth(FIRST)).flatten();
                 let begin = Instant::now();
-                pool.install(|| mapper.step(&frame, &pose, depth.as_ref()));
+                let mut change = None;
+                let mut enter = |stage| {
+                    if stage == Stage::ChangeKeyframe {
+                        change = Some(Instant::now());
+                    }
+                };
+                pool.install(|| mapper.step(&frame, &pose, depth.as_ref(), &mut enter));
+                changes.extend(change.map(|begin| begin.elapsed().as_secs_f64() * 1e3));
+                pool.install(|| mapper.finish_keyframe());
                 if k > 0 {
                     by_place[k % INTERVAL].push(begin.elapsed().as_secs_f64() * 1e3);
                 }
             }
         }
     }
+    let [one, two] = [0, 1].map(|pool: usize| spread(changes[pool].clone()));
+    println!("{:44} {one:>15}          {two:>15}", "a new keyframe, until it can be published");
     for place in 0..INTERVAL {
         let name = match place {
             0 => "whole step: a new keyframe".to_owned(),

@@ -15,7 +15,7 @@ use crate::service::schedule::{apply, in_force};
 use crate::service::shutdown::Shutdown;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{DepthPoint, Keyframe, KeyframePose, MAX_KEYFRAME_POINTS};
-use crate::slam::mapper::{Map, Mapper, StepOutcome};
+use crate::slam::mapper::{Map, Mapper, Stage, StepOutcome};
 use crate::slam::parameter::ParameterError;
 use crate::slam::pose::{NO_KEYFRAME, PoseEstimate};
 use crate::wire::command::{Command, CommandError, CommandServer};
@@ -254,15 +254,27 @@ impl<'a> Shell<'a> {
         let Some((_, mapper)) = &mut self.mapper else { return Ok(()) };
         let _span = tracing::trace_span!("frame", sequence = frame.sequence).entered();
         let begin = now_nanos();
+        let mut change = None;
+        let mut enter = |stage| {
+            if stage == Stage::ChangeKeyframe {
+                change = Some(now_nanos());
+            }
+        };
         let outcome = tracing::trace_span!("map")
-            .in_scope(|| self.pool.install(|| mapper.step(&frame, pose, None)));
-        let step_nanos = u64::try_from(now_nanos() - begin).unwrap_or(0);
+            .in_scope(|| self.pool.install(|| mapper.step(&frame, pose, None, &mut enter)));
         if pose.state.is_tracked() {
             self.last_pose = Some(*pose);
         }
+        tracing::trace_span!("publish").in_scope(|| self.output.publish(mapper, &outcome))?;
+        let change_nanos = change.filter(|_| outcome.keyframe_created).map_or(0, nanos_since);
+        // The tracker has the keyframe; the rest it gets as another revision.
+        let finished = tracing::trace_span!("finish_keyframe")
+            .in_scope(|| self.pool.install(|| mapper.finish_keyframe()));
+        let step_nanos = nanos_since(begin);
         let _span = tracing::trace_span!("publish").entered();
-        self.output.publish(mapper, &outcome)?;
-        self.output.publish_step(mapper, frame.sequence, step_nanos, self.last_pose.as_ref())?;
+        self.output.publish(mapper, &finished)?;
+        let durations = [step_nanos, change_nanos];
+        self.output.publish_step(mapper, frame.sequence, durations, self.last_pose.as_ref())?;
         let is_new = outcome.needs_image();
         let is_due = outcome.keyframe_changed
             && now_nanos().saturating_sub(self.checkpoint_nanos) > CHECKPOINT_PERIOD_NANOS;
@@ -307,6 +319,11 @@ impl<'a> Shell<'a> {
             Command::SaveMap(path) => save_map(mapper, &path),
         })?)
     }
+}
+
+/// Time since an instant of CLOCK_MONOTONIC.
+fn nanos_since(begin: i64) -> u64 {
+    u64::try_from(now_nanos() - begin).unwrap_or(0)
 }
 
 /// What a dead mapper has left, and the keeper of our own. Without either the mapper works too.
@@ -380,7 +397,7 @@ impl Output {
         &self,
         mapper: &Mapper,
         sequence: u64,
-        step_nanos: u64,
+        [step_nanos, change_nanos]: [u64; 2],
         pose: Option<&PoseEstimate>,
     ) -> Result<(), SendError> {
         let keyframe = mapper.keyframe();
@@ -391,6 +408,7 @@ impl Output {
             keyframe_id: keyframe.map_or(NO_KEYFRAME, |k| k.keyframe_id),
             revision: keyframe.map_or(0, |k| k.revision),
             step_nanos,
+            change_nanos,
             keyframes: mapper.map().keyframes.len() as u64,
             points: keyframe.map_or(0, |k| k.points.len() as u64),
             pose_nanos: pose.map_or(0, |pose| pose.capture_nanos),

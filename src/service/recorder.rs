@@ -18,6 +18,7 @@ pub struct Recorder {
     steps: Subscriber<StepMessage, ()>,
     recorded: Vec<RecordedPose>,
     map_nanos: Vec<u64>,
+    keyframe_step_nanos: Vec<u64>,
     keyframe_nanos: Vec<u64>,
     last_step: Option<StepMessage>,
     /// CLOCK_MONOTONIC of the first frame and of the last pose.
@@ -49,6 +50,7 @@ impl Recorder {
             steps: hub.subscriber(&STEP)?,
             recorded: Vec::new(),
             map_nanos: Vec::new(),
+            keyframe_step_nanos: Vec::new(),
             keyframe_nanos: Vec::new(),
             last_step: None,
             span_nanos: None,
@@ -71,8 +73,9 @@ impl Recorder {
         while let Some(message) = self.steps.receive()? {
             let Some(step) = message.payload().first() else { continue };
             self.map_nanos.push(step.step_nanos);
-            if step.keyframes > self.last_step.map_or(0, |last| last.keyframes) {
-                self.keyframe_nanos.push(step.step_nanos);
+            if step.change_nanos > 0 {
+                self.keyframe_step_nanos.push(step.step_nanos);
+                self.keyframe_nanos.push(step.change_nanos);
             }
             self.last_step = Some(*step);
         }
@@ -147,6 +150,7 @@ impl Recorder {
             deadline_misses: is_live.then_some(counters.deadline_misses),
             page_faults: Some(counters.page_faults),
             map_nanos: self.map_nanos,
+            keyframe_step_nanos: self.keyframe_step_nanos,
             keyframe_nanos: self.keyframe_nanos,
             rejections: None,
             budget_samples: Vec::new(),

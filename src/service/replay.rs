@@ -16,7 +16,7 @@ use crate::slam::alignment::reference::Reference;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::frame::FrameView;
 use crate::slam::mapper::situation::Situation;
-use crate::slam::mapper::{Mapper, MapperParams, StepOutcome};
+use crate::slam::mapper::{Mapper, MapperParams, Stage, StepOutcome};
 use crate::slam::parameter::ParameterError;
 use crate::slam::pose::{PoseEstimate, TrackingState};
 use crate::slam::tracker::{Tracker, TrackerParams};
@@ -201,7 +201,15 @@ impl<'a> Replay<'a> {
         }
         let was_rejected = matches!(self.mapper.situation(), Situation::Rejected(_));
         let begin = Instant::now();
-        let outcome = self.mapper.step(&frame, &pose, sensor_depth.as_ref());
+        let mut change = None;
+        let mut enter = |stage| {
+            if stage == Stage::ChangeKeyframe {
+                change = Some(Instant::now());
+            }
+        };
+        let mut outcome = self.mapper.step(&frame, &pose, sensor_depth.as_ref(), &mut enter);
+        let change_nanos = change.map(elapsed_nanos);
+        outcome.keyframe_changed |= self.mapper.finish_keyframe().keyframe_changed;
         let step_nanos = elapsed_nanos(begin);
         if let Situation::Rejected(contradiction) = self.mapper.situation()
             && !was_rejected
@@ -210,8 +218,9 @@ impl<'a> Replay<'a> {
             self.record.rejections.get_or_insert_default().push(rejection);
         }
         self.record.map_nanos.push(step_nanos);
-        if outcome.keyframe_created {
-            self.record.keyframe_nanos.push(step_nanos);
+        if let Some(change_nanos) = change_nanos.filter(|_| outcome.keyframe_created) {
+            self.record.keyframe_step_nanos.push(step_nanos);
+            self.record.keyframe_nanos.push(change_nanos);
         }
         if outcome.needs_publishing()
             && self.config.poses == PoseOrigin::Tracker
@@ -309,6 +318,7 @@ fn empty_record(source_name: &str, ground_truth: Vec<StampedPose>, poses_given: 
         deadline_misses: None,
         page_faults: None,
         map_nanos: Vec::new(),
+        keyframe_step_nanos: Vec::new(),
         keyframe_nanos: Vec::new(),
         rejections: Some(Vec::new()),
         budget_samples: Vec::new(),

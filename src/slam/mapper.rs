@@ -27,6 +27,7 @@ use crate::slam::image::buffer::Image;
 use crate::slam::image::quads::QuadImage;
 use crate::slam::initializer::InitializerParams;
 use crate::slam::keyframe::{Keyframe, MAX_KEYFRAME_POINTS, MapState};
+use crate::slam::mapper::change::Unfinished;
 use crate::slam::mapper::consistency::{Consistency, ConsistencyParams, Contradiction};
 use crate::slam::mapper::observation::DepthFilter;
 use crate::slam::mapper::past::PastFrames;
@@ -134,6 +135,15 @@ impl MapperParams {
     }
 }
 
+/// Parts of a step, for who measures them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Stage {
+    /// Depth is looked for in the frame.
+    Observe,
+    /// Another keyframe is put in force.
+    ChangeKeyframe,
+}
+
 /// What changed in one step, and what has to be published.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct StepOutcome {
@@ -202,6 +212,8 @@ pub struct Mapper {
     frames_on_keyframe: u64,
     /// Hypotheses changed since the depth was smoothed and published.
     unpublished: usize,
+    /// What the keyframe in force wants when it is published.
+    unfinished: Option<Unfinished>,
 }
 
 impl Mapper {
@@ -232,17 +244,32 @@ impl Mapper {
             first_free_epoch: 0,
             frames_on_keyframe: 0,
             unpublished: 0,
+            unfinished: None,
             params,
         })
     }
 
     /// Takes in one tracked frame. `sensor_depth` (metres, 0 where none) initialises the depth of
-    /// new keyframes where a depth camera may be used.
+    /// new keyframes where a depth camera may be used. `enter` hears of each stage as it begins.
     pub fn step(
         &mut self,
         frame: &FrameView<'_>,
         pose: &PoseEstimate,
         sensor_depth: Option<&Image<f32>>,
+        enter: &mut dyn FnMut(Stage),
+    ) -> StepOutcome {
+        let finished = self.finish_keyframe();
+        let outcome = self.take_in(frame, pose, sensor_depth, enter);
+        let keyframe_changed = outcome.keyframe_changed || finished.keyframe_changed;
+        StepOutcome { keyframe_changed, ..outcome }
+    }
+
+    fn take_in(
+        &mut self,
+        frame: &FrameView<'_>,
+        pose: &PoseEstimate,
+        sensor_depth: Option<&Image<f32>>,
+        enter: &mut dyn FnMut(Stage),
     ) -> StepOutcome {
         if !frame.is_consistent()
             || (frame.width, frame.height) != (self.intrinsics.width, self.intrinsics.height)
@@ -267,6 +294,7 @@ impl Mapper {
         self.frames_on_keyframe += 1;
         let initializing = self.map_state() == MapState::Initializing;
         self.guess_unit(pose);
+        enter(Stage::Observe);
         let observations = self.observe_frame(frame, pose);
         self.unpublished += observations.fused + observations.created;
         let points = self.keyframe().map_or(0, |keyframe| keyframe.points.len());
@@ -282,6 +310,7 @@ impl Mapper {
         }
         let due = self.frames_on_keyframe >= self.params.min_keyframe_interval;
         if pose.proposes_keyframe && due {
+            enter(Stage::ChangeKeyframe);
             let is_reused = self.reuse_keyframe(frame, pose);
             if !is_reused {
                 self.change_keyframe(frame, pose, sensor_depth);

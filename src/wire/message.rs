@@ -160,7 +160,7 @@ pub struct KeyframeImageHeader {
 /// Message of `mapper/step`: this frame is in the map.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
-#[type_name("semidense.Step.v2")]
+#[type_name("semidense.Step.v3")]
 pub struct StepMessage {
     /// Sequence of the frame.
     pub sequence: u64,
@@ -170,6 +170,9 @@ pub struct StepMessage {
     pub revision: u64,
     /// Time that the step took.
     pub step_nanos: u64,
+    /// Time of it in which a new keyframe was made and published, once the frame was observed; 0 where
+    /// none was.
+    pub change_nanos: u64,
     /// Keyframes in the map.
     pub keyframes: u64,
     /// Points with depth of the keyframe in force.
@@ -315,7 +318,7 @@ mod tests {
         assert_layout::<KeyframeHeader>(144, 8, "semidense.KeyframeHeader.v1");
         assert_layout::<DepthPoint>(16, 4, "semidense.DepthPoint.v1");
         assert_layout::<KeyframeImageHeader>(24, 8, "semidense.KeyframeImageHeader.v1");
-        assert_layout::<StepMessage>(120, 8, "semidense.Step.v2");
+        assert_layout::<StepMessage>(128, 8, "semidense.Step.v3");
         assert_layout::<GraphHeader>(16, 8, "semidense.GraphHeader.v1");
         assert_layout::<KeyframePoseMessage>(72, 8, "semidense.KeyframePose.v1");
         assert_layout::<HealthMessage>(1680, 8, "semidense.Health.v2");

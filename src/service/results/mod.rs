@@ -107,7 +107,10 @@ pub struct RunRecord {
     pub page_faults: Option<u64>,
     /// Time in the mapper, one for each frame it handled.
     pub map_nanos: Vec<u64>,
-    /// Of them, those of the steps that made a keyframe, the one of the start too.
+    /// Of them, those of the steps that changed to a new keyframe.
+    pub keyframe_step_nanos: Vec<u64>,
+    /// Of each of those, the time from the observed frame to a keyframe that others can have: carrying,
+    /// smoothing, live also publishing.
     pub keyframe_nanos: Vec<u64>,
     /// Frames at which the map was found to contradict itself, and how; known in a replay.
     pub rejections: Option<Vec<Rejection>>,

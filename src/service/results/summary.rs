@@ -211,7 +211,10 @@ pub struct Summary {
     pub alignment_levels: Option<Vec<LevelSummary>>,
     /// Time in the mapper for a frame.
     pub map_ms: Option<Percentiles>,
-    /// Of it, the steps that made a keyframe.
+    /// Of it, the steps that changed to a new keyframe.
+    pub keyframe_step_ms: Option<Percentiles>,
+    /// Of those, from the observed frame to a keyframe that others can have: carrying, smoothing, live
+    /// also publishing. What follows, depth for new pixels, is published as its next revision.
     pub keyframe_ms: Option<Percentiles>,
     /// Quality of a pose as a function of the iterations it is given; of replays.
     pub budget_curve: Option<BudgetCurve>,
@@ -307,6 +310,7 @@ impl Summary {
             pyramid_ms: Percentiles::of(traces.iter().map(|trace| trace.pyramid_nanos)),
             alignment_levels: alignment_levels(&traces),
             map_ms: Percentiles::of(record.map_nanos.iter().copied()),
+            keyframe_step_ms: Percentiles::of(record.keyframe_step_nanos.iter().copied()),
             keyframe_ms: Percentiles::of(record.keyframe_nanos.iter().copied()),
             budget_curve: BudgetCurve::of(&record.budget_samples),
             recorded_secs,

@@ -1,22 +1,32 @@
-//! The step to a new keyframe: carry the depth over, look back for new pixels, rescale, publish.
+//! The step to a new keyframe: carry the depth over, smooth it, rescale, publish; then, what can wait
+//! until it is published: the last depth of the keyframe before, and a look back for new pixels.
 
 use crate::slam::depth::epipolar::TwoView;
 use crate::slam::depth::gaussian::{ObservedPixels, Observer, observe};
-use crate::slam::depth::map::{KnownColumns, for_each_known};
+use crate::slam::depth::map::{DepthMap, KnownColumns, for_each_known};
 use crate::slam::depth::propagation::propagate;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS, MapState};
-use crate::slam::mapper::Mapper;
 use crate::slam::mapper::consistency::judge_change;
 use crate::slam::mapper::memory::BYTES_PER_MEGABYTE;
 use crate::slam::mapper::observation::DepthFilter;
 use crate::slam::mapper::start::take_sensor_depth;
+use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::pose::{Brightness, PoseEstimate};
 
+/// What a new keyframe still wants when it is published.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Unfinished {
+    /// Place in the map of the keyframe before, whose depth map is the mapper's `next_depth`.
+    before: usize,
+    /// Whether its new pixels have no depth yet.
+    has_new_pixels: bool,
+}
+
 impl Mapper {
-    /// Makes `frame` the keyframe: carries the depth over, looks back for its new pixels, rescales.
+    /// Makes `frame` the keyframe: carries the depth over, smooths it, rescales.
     pub(super) fn change_keyframe(
         &mut self,
         frame: &FrameView<'_>,
@@ -24,7 +34,7 @@ impl Mapper {
         sensor_depth: Option<&Image<f32>>,
     ) {
         self.is_unit_open = false;
-        let Some(before) = self.keyframe() else { return };
+        let (Some(index), Some(before)) = (self.in_force, self.keyframe()) else { return };
         let epoch = before.epoch;
         let world_from_before = before.world_from_keyframe;
         let brightness = pose.brightness;
@@ -32,7 +42,6 @@ impl Mapper {
         if self.unpublished > 0 {
             self.refine();
         }
-        self.publish_depth();
 
         let (min_gradient, max_candidates) = (self.params.min_gradient, self.params.max_candidates);
         self.next_depth.restart(frame.pixels, min_gradient, max_candidates);
@@ -48,38 +57,56 @@ impl Mapper {
         std::mem::swap(&mut self.depth, &mut self.next_depth);
         self.past.rebase(brightness);
         let mut world_from_keyframe = Sim3::new(pose.world_from_camera, world_from_before.scale);
-        // What is asked of new pixels is asked in units of the mean inverse depth.
-        let carried = self.rescale_to_unit_mean();
-        world_from_keyframe.scale *= carried;
         if let Some(sensor) = sensor_depth {
             take_sensor_depth(&mut self.depth, sensor, world_from_keyframe.scale);
-        } else {
-            self.seed_from_past(&world_from_keyframe);
         }
         self.refine();
         let factor = self.rescale_to_unit_mean();
         world_from_keyframe.scale *= factor;
         let (before, after) = (self.next_depth.num_hypotheses(), self.depth.num_hypotheses());
         // A first keyframe without depth had nothing to be rescaled by: its mean is not 1.
-        let depth_ratio =
-            self.next_depth.mean_inverse_depth().map_or(1.0, |mean| mean * carried * factor);
+        let depth_ratio = self.next_depth.mean_inverse_depth().map_or(1.0, |mean| mean * factor);
         let contradiction = judge_change(before, after, depth_ratio, &self.params.consistency);
         self.add_keyframe(frame, world_from_keyframe, MapState::Established, epoch);
+        self.unfinished =
+            Some(Unfinished { before: index, has_new_pixels: sensor_depth.is_none() });
         if let Some(contradiction) = contradiction {
             self.reject(contradiction);
         }
     }
 
+    /// What a new keyframe can wait for until it is published: the last depth of the one before goes
+    /// into the map, and new pixels get their depth from past frames. To be called when the step's
+    /// outcome is out; otherwise the next step does it first.
+    pub fn finish_keyframe(&mut self) -> StepOutcome {
+        let Some(unfinished) = self.unfinished.take() else { return StepOutcome::default() };
+        self.revision += 1;
+        if let Some(before) = self.map.keyframes.get_mut(unfinished.before) {
+            before.revision = self.revision;
+            write_depth(&self.next_depth, before);
+        }
+        let is_searched = self.params.depth_filter == DepthFilter::Gaussian
+            && unfinished.has_new_pixels
+            && !self.is_rejected();
+        let Some(keyframe) = self.keyframe().filter(|_| is_searched) else {
+            return StepOutcome::default();
+        };
+        let world_from_keyframe = keyframe.world_from_keyframe;
+        if !self.seed_from_past(&world_from_keyframe) {
+            return StepOutcome::default();
+        }
+        self.refine();
+        self.publish_depth();
+        StepOutcome { keyframe_changed: true, ..Default::default() }
+    }
+
     /// Gives new pixels of the keyframe their depth from frames before it, shortest baseline first:
-    /// each narrows the search of the next.
-    fn seed_from_past(&mut self, world_from_keyframe: &Sim3) {
+    /// each narrows the search of the next. False where none was far enough away.
+    fn seed_from_past(&mut self, world_from_keyframe: &Sim3) -> bool {
         /// Each frame's baseline is at least this many times the one before.
         const BASELINE_STEP: f64 = 1.7;
         /// Baselines shorter than this share of the mean depth tell nothing.
         const MIN_BASELINE: f64 = 0.01;
-        if self.params.depth_filter != DepthFilter::Gaussian {
-            return;
-        }
         let mut least = MIN_BASELINE;
         let mut used = 0;
         for past in self.past.newest_first() {
@@ -102,6 +129,7 @@ impl Mapper {
             least = baseline * BASELINE_STEP;
             used += 1;
         }
+        used > 0
     }
 
     /// Rescales the depth map to mean inverse depth 1; the factor belongs to the keyframe's scale.
@@ -144,30 +172,100 @@ impl Mapper {
     pub(super) fn publish_depth(&mut self) {
         self.revision += 1;
         let in_force = self.in_force;
-        let known = self.depth.num_hypotheses();
-        let Some(keyframe) = in_force.and_then(|index| self.map.keyframes.get_mut(index)) else {
-            return;
-        };
-        keyframe.revision = self.revision;
-        keyframe.points.clear();
-        keyframe.points.reserve_exact(known.min(MAX_KEYFRAME_POINTS));
-        let image = &self.depth.image.intensity;
-        let mut columns = KnownColumns::default();
-        for v in 0..image.height() {
-            let (row, intensities) = (self.depth.hypotheses.row(v), image.row(v));
-            for_each_known(row, &mut columns, |known| {
-                keyframe.points.extend(known.iter().map(|&u| {
-                    let (h, intensity) = (&row[usize::from(u)], intensities[usize::from(u)]);
-                    let (inverse_depth, variance) = (h.smoothed, h.variance);
-                    DepthPoint { u, v: v as u16, inverse_depth, variance, intensity }
-                }));
-            });
+        if let Some(keyframe) = in_force.and_then(|index| self.map.keyframes.get_mut(index)) {
+            keyframe.revision = self.revision;
+            write_depth(&self.depth, keyframe);
         }
-        keyframe.points.retain(|point| point.inverse_depth > 0.0);
-        keyframe.points.truncate(MAX_KEYFRAME_POINTS);
     }
 
     pub(super) fn remember(&mut self, frame: &FrameView<'_>, pose: &PoseEstimate) {
         self.past.push(frame.pixels, pose.world_from_camera, pose.brightness);
+    }
+}
+
+/// Makes the hypotheses of `depth` the points of its keyframe.
+fn write_depth(depth: &DepthMap, keyframe: &mut Keyframe) {
+    keyframe.points.clear();
+    keyframe.points.reserve_exact(depth.num_hypotheses().min(MAX_KEYFRAME_POINTS));
+    let image = &depth.image.intensity;
+    let mut columns = KnownColumns::default();
+    for v in 0..image.height() {
+        let (row, intensities) = (depth.hypotheses.row(v), image.row(v));
+        for_each_known(row, &mut columns, |known| {
+            keyframe.points.extend(known.iter().map(|&u| {
+                let (h, intensity) = (&row[usize::from(u)], intensities[usize::from(u)]);
+                let (inverse_depth, variance) = (h.smoothed, h.variance);
+                DepthPoint { u, v: v as u16, inverse_depth, variance, intensity }
+            }));
+        });
+    }
+    keyframe.points.retain(|point| point.inverse_depth > 0.0);
+    keyframe.points.truncate(MAX_KEYFRAME_POINTS);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::geometry::se3::SE3;
+    use crate::slam::mapper::MapperParams;
+    use crate::slam::pose::TrackingState;
+    use crate::slam::test_scene::{CAMERA, Scene};
+
+    /// A camera that moves sideways with exact poses, exact depth for its first keyframe alone; a
+    /// keyframe is asked for at the last but one step. What the steps and their rests gave, with the
+    /// keyframes' points then, and the mapper.
+    fn walk(finishes: bool) -> (Vec<[(StepOutcome, Vec<Vec<DepthPoint>>); 2]>, Mapper) {
+        let scene = Scene::new(3);
+        let mut mapper = Mapper::new(CAMERA, MapperParams::default()).unwrap();
+        let outcomes = (0..6u64).map(|k| {
+            let x = 0.08 * k as f64;
+            let world_from_camera = SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() };
+            let view = scene.render(&CAMERA, &world_from_camera);
+            let mut depth = view.inverse_depth.clone();
+            depth.pixels_mut().iter_mut().for_each(|d| *d = 1.0 / *d);
+            let pixels = view.noisy(1.0, k);
+            let frame = FrameView {
+                sequence: k,
+                capture_nanos: k as i64 * 33_333_333,
+                exposure_nanos: 0,
+                width: CAMERA.width,
+                height: CAMERA.height,
+                pixels: &pixels,
+            };
+            let pose = PoseEstimate {
+                state: TrackingState::Tracking,
+                keyframe_id: mapper.keyframe().map_or(u64::MAX, |k| k.keyframe_id),
+                world_from_camera,
+                proposes_keyframe: k == 4,
+                ..PoseEstimate::unknown(&frame)
+            };
+            let step = mapper.step(&frame, &pose, (k == 0).then_some(&depth), &mut |_| {});
+            let points = |mapper: &Mapper| {
+                mapper.map.keyframes.iter().map(|keyframe| keyframe.points.clone()).collect()
+            };
+            let at_once = points(&mapper);
+            let rest = if finishes { mapper.finish_keyframe() } else { StepOutcome::default() };
+            [(step, at_once), (rest, points(&mapper))]
+        });
+        (outcomes.collect(), mapper)
+    }
+
+    #[test]
+    fn a_new_keyframe_is_published_first_and_finished_then() {
+        let (outcomes, mapper) = walk(true);
+        let [(step, at_once), (rest, finished)] = &outcomes[4];
+        assert!(step.keyframe_created && step.needs_image());
+        assert!(rest.needs_publishing() && !rest.needs_image() && !rest.graph_changed);
+        assert!(outcomes[..4].iter().all(|[_, (rest, _)]| *rest == StepOutcome::default()));
+        // The one before has the depth that was reached on it, the new one depth for new pixels.
+        assert!(at_once[0] != finished[0]);
+        assert!(finished[1].len() > at_once[1].len());
+        // Who does not ask for the rest has it with the next step, and nothing else changes.
+        let (others, late) = walk(false);
+        assert!(others[5][0].0.keyframe_changed);
+        for (one, other) in mapper.map().keyframes.iter().zip(&late.map().keyframes) {
+            assert!(one.points == other.points, "keyframe {}", one.keyframe_id);
+            assert_eq!(one.world_from_keyframe, other.world_from_keyframe);
+        }
     }
 }

@@ -199,7 +199,7 @@ mod tests {
                 proposes_keyframe: true,
                 ..PoseEstimate::unknown(&frame)
             };
-            self.mapper.step(&frame, &pose, Some(&depth))
+            self.mapper.step(&frame, &pose, Some(&depth), &mut |_| {})
         }
     }
 

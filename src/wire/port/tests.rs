@@ -88,7 +88,7 @@ fn other_types_and_absent_services_are_refused() {
     let hub = rig.join("tracker");
     let _poses = hub.publisher::<PoseMessage, ()>(&POSE, 1).unwrap();
     let other = hub.subscriber::<u64, ()>(&POSE).unwrap_err().to_string();
-    assert!(other.starts_with("topic rig/v2/tracker/pose"), "{other}");
+    assert!(other.starts_with("topic rig/v3/tracker/pose"), "{other}");
 }
 
 #[test]
@@ -99,7 +99,7 @@ fn another_wire_version_is_refused_with_both_versions() {
     let service = hub.node.service_builder(&name).publish_subscribe::<[u64]>().open_or_create();
     for access in [Access::Member, Access::Observer] {
         let error = Hub::join(&rig.place, "observer", access).unwrap_err().to_string();
-        assert!(error.contains("speaks wire version 1, this program 2"), "{error}");
+        assert!(error.contains("speaks wire version 1, this program 3"), "{error}");
     }
     drop(service);
     assert!(Hub::join(&rig.place, "observer", Access::Member).is_ok());
