@@ -30,6 +30,8 @@ const MANY_KILLS: usize = 200;
 /// The camera moves slowly to and fro: within the second that a restart may take it goes far less than this
 /// between two poses, in units of the map (about a room's depth).
 const LARGEST_STEP: f64 = 0.5;
+/// Who dies sooner after its start is started again later and later.
+const HASTY: Duration = Duration::from_secs(2);
 /// Memory that a process may take more than at the beginning: pages of other code, a fuller map.
 const MEMORY_SLACK: f64 = 1.5;
 
@@ -165,6 +167,7 @@ fn soak(kills: usize, seed: u64) {
     let (files_before, memory_before) = (files(&rig), memory(&mut peers).unwrap());
     let mut dice = Dice(seed);
     let mut pauses = Vec::new();
+    let mut began = [Instant::now(); 3];
     for _ in 0..kills {
         let instant = Duration::from_millis(dice.below(400));
         let begin = Instant::now();
@@ -173,7 +176,10 @@ fn soak(kills: usize, seed: u64) {
             std::thread::sleep(Duration::from_millis(2));
         }
         let index = dice.below(3) as usize;
-        pauses.push((peers[index].name(), kill(&mut watch, &mut peers[index])));
+        let has_lived = began[index].elapsed() > HASTY;
+        let (name, missing) = (peers[index].name(), kill(&mut watch, &mut peers[index]));
+        began[index] = Instant::now();
+        pauses.push(Pause { name, missing, has_lived });
     }
     for peer in &mut peers {
         kill(&mut watch, peer);
@@ -198,15 +204,31 @@ fn soak(kills: usize, seed: u64) {
     assert_eq!(rig.leftovers(), Vec::<String>::new());
 }
 
+/// How long poses were missing after a kill.
+struct Pause {
+    name: &'static str,
+    missing: Duration,
+    /// Whether who was killed had lived long enough to be started again at once.
+    has_lived: bool,
+}
+
 /// Says how long poses were missing; the runner swallows `println!`.
-fn report(pauses: &[(&str, Duration)]) {
-    for name in ["capture", "tracker", "mapper"] {
-        let mut times: Vec<f64> =
-            pauses.iter().filter(|(n, _)| *n == name).map(|(_, t)| t.as_secs_f64()).collect();
+fn report(pauses: &[Pause]) {
+    let times = |name, has_lived| {
+        let of_kind = pauses.iter().filter(|p| p.name == name && p.has_lived == has_lived);
+        let mut times: Vec<f64> = of_kind.map(|pause| pause.missing.as_secs_f64()).collect();
         times.sort_by(f64::total_cmp);
+        times
+    };
+    for (name, has_lived) in
+        ["capture", "tracker", "mapper"].into_iter().flat_map(|name| [(name, true), (name, false)])
+    {
+        let times = times(name, has_lived);
         if let (Some(median), Some(longest)) = (times.get(times.len() / 2), times.last()) {
+            let start = if has_lived { "at once" } else { "with back-off" };
             let line = format!(
-                "{name}: {} kills, poses back after {median:.2} s (median), {longest:.2} s (longest)",
+                "{name}, started again {start}: {} kills, poses back after {median:.2} s (median), \
+                 {longest:.2} s (longest)",
                 times.len()
             );
             // A closed standard error must not fail a test.

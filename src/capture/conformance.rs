@@ -387,6 +387,11 @@ fn what_is_missing_is_named() {
     let empty = tempfile::tempdir().expect("temporary folder");
     let message = open(&SourceName::Images(empty.path().to_owned()), None).err().expect("empty");
     assert!(message.to_string().contains("has no frames"), "{message}");
+    fs::write(empty.path().join("rgb.txt"), "").expect("written");
+    for named in [SourceName::Images, SourceName::Euroc] {
+        let error = open(&named(empty.path().to_owned()), None).err().expect("another layout");
+        assert!(error.to_string().contains("looks like tum:"), "{error}");
+    }
     let nowhere = open(&SourceName::Images(empty.path().join("none")), None).err().expect("none");
     assert!(nowhere.to_string().contains("there is no folder "), "{nowhere}");
     assert!(nowhere.to_string().contains("none; check the path"), "{nowhere}");

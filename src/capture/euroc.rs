@@ -18,7 +18,7 @@ const SENSOR_FILE: &str = "cam0/sensor.yaml";
 /// body's and is moved to the camera by the `T_BS` of `sensor.yaml`.
 pub fn open(folder: &Path, rig: Option<&Path>) -> Result<Recording, SourceError> {
     let root = root_of(folder);
-    let frame_list = root.join("cam0/data.csv");
+    let frame_list = frame_list(folder);
     let frames = read_frames(&root.join("cam0/data"), &frame_list)?;
     let sensor_path = root.join(SENSOR_FILE);
     let pose_list = root.join("state_groundtruth_estimate0/data.csv");
@@ -38,6 +38,11 @@ pub fn open(folder: &Path, rig: Option<&Path>) -> Result<Recording, SourceError>
     };
     let contents = Contents { frames, depths: Vec::new(), ground_truth };
     Recording::new(contents, &rig, rig_path, frame_list)
+}
+
+/// The list of the images of the recording in `folder`.
+pub(super) fn frame_list(folder: &Path) -> PathBuf {
+    root_of(folder).join("cam0/data.csv")
 }
 
 fn root_of(folder: &Path) -> PathBuf {

@@ -42,6 +42,11 @@ pub fn open(folder: &Path, rig: Option<&Path>) -> Result<Recording, SourceError>
     Recording::new(contents, &rig, rig_path, folder.to_owned())
 }
 
+/// Whether there is an image in `folder`.
+pub(super) fn has_images(folder: &Path) -> bool {
+    list_images(folder).is_ok_and(|images| !images.is_empty())
+}
+
 /// The images of a folder in natural order: what begins like a PNG or JPEG, and what is called one
 /// (so that an empty or foreign file of that name is found out when it is reached).
 fn list_images(folder: &Path) -> Result<Vec<PathBuf>, SourceError> {

@@ -89,6 +89,14 @@ pub enum SourceError {
         /// The folder.
         folder: PathBuf,
     },
+    /// The folder has the layout of another kind of source.
+    #[error("source `{name}`: the folder has not this layout; it looks like {likely}")]
+    Layout {
+        /// The source.
+        name: String,
+        /// What it could be named.
+        likely: String,
+    },
     /// A list, rig or calibration file cannot be read.
     #[error("{}: cannot be read: {source}; check the path and its permissions", path.display())]
     Read {
@@ -336,6 +344,9 @@ pub fn open(
     if let Some(folder) = name.folder().filter(|folder| !folder.is_dir()) {
         return Err(SourceError::NoFolder { name: name.to_string(), folder: folder.to_owned() });
     }
+    if let Some(likely) = misnamed(name) {
+        return Err(SourceError::Layout { name: name.to_string(), likely: likely.to_string() });
+    }
     match name {
         SourceName::Tum(folder) => Ok(Box::new(tum::open(folder, rig)?)),
         SourceName::Euroc(folder) => Ok(Box::new(euroc::open(folder, rig)?)),
@@ -363,6 +374,27 @@ pub fn open(
     }
 }
 
+/// What a folder without the layout that its source names is by the layout that it has.
+fn misnamed(name: &SourceName) -> Option<SourceName> {
+    let folder = name.folder()?;
+    let layouts = [
+        SourceName::Tum(folder.to_owned()),
+        SourceName::Euroc(folder.to_owned()),
+        SourceName::Images(folder.to_owned()),
+    ];
+    if has_layout(name) { None } else { layouts.into_iter().find(has_layout) }
+}
+
+/// Whether the list by which a layout is known, or an image, is where it belongs.
+fn has_layout(name: &SourceName) -> bool {
+    match name {
+        SourceName::Tum(folder) => folder.join("rgb.txt").is_file(),
+        SourceName::Euroc(folder) => euroc::frame_list(folder).is_file(),
+        SourceName::Images(folder) => image_folder::has_images(folder),
+        _ => false,
+    }
+}
+
 /// Where the recording's own camera is another than that of the `rig` which wins over it: what differs,
 /// in one line. `None` where they agree, or the recording brings no camera that can be read.
 pub fn rig_conflict(name: &SourceName, rig: Option<&Path>) -> Option<String> {
@@ -375,10 +407,13 @@ pub fn rig_conflict(name: &SourceName, rig: Option<&Path>) -> Option<String> {
         _ => tum::own_rig(folder),
     }?;
     let shift_px = own.largest_shift_px(&Rig::read(rig).ok()?);
+    let difference = match shift_px.is_finite() {
+        true => format!("differ by up to {shift_px:.0} px"),
+        false => "see different parts of the world or have images of different sizes".to_owned(),
+    };
     (shift_px > MAX_SHIFT_PX).then(|| {
         format!(
-            "the camera of {} and that of {} differ by up to {shift_px:.0} px; the first is used, leave out --rig \
-             for the second",
+            "the camera of {} and that of {} {difference}; the first is used, leave out --rig for the second",
             rig.display(),
             own_path.display()
         )

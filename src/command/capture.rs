@@ -26,8 +26,9 @@ pub struct CaptureArguments {
 /// Where frames come from.
 #[derive(Debug, Args)]
 pub struct SourceArguments {
-    /// Where frames come from: sim, sim:SCENE, tum:DIR, euroc:DIR, images:DIR or v4l:DEVICE [default: capture.source
-    /// of the configuration]
+    /// Where frames come from: sim, sim:SCENE, tum:DIR, euroc:DIR, images:DIR, v4l:DEVICE, or
+    /// loop:FRAMES:HZ:SOURCE, another source to and fro, FRAMES in all at HZ a second [default: capture.source of the
+    /// configuration]
     #[arg(long, value_name = "SOURCE")]
     source: Option<String>,
     /// Rig file with the camera's calibration; a camera (v4l) needs one [default: capture.rig of the configuration]

@@ -42,12 +42,13 @@ enum InitialDepth {
 /// Run a recorded or simulated sequence in one process: every frame, the same bits on every run
 #[derive(Debug, Args)]
 pub struct ReplayArgs {
-    /// sim, sim:SCENE, tum:DIR, euroc:DIR or images:DIR
+    /// sim, sim:SCENE, tum:DIR, euroc:DIR, images:DIR, or loop:FRAMES:HZ:SOURCE (another to and fro, FRAMES in all)
     source: SourceName,
-    /// Camera file; needed where the folder has no camera.txt
+    /// Rig file with the camera's calibration; needed where the recording brings none
     #[arg(long, value_name = "FILE")]
     rig: Option<PathBuf>,
-    /// Folder for trajectory.txt, keyframes.txt, map.ply, summary.json and report.html
+    /// Folder for trajectory.txt, trajectory_online.txt, keyframes.txt, map.ply, map.pcd, summary.json
+    /// and report.html
     #[arg(long, value_name = "DIR", default_value = "output")]
     output: PathBuf,
     /// Where the first depth of a keyframe comes from

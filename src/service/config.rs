@@ -54,10 +54,11 @@ pub struct Config {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CaptureConfig {
-    /// Where frames come from when `--source` does not say: sim, sim:SCENE, tum:DIR, euroc:DIR, images:DIR or
-    /// v4l:DEVICE.
+    /// Where frames come from when `--source` does not say: sim, sim:SCENE, tum:DIR, euroc:DIR, images:DIR,
+    /// v4l:DEVICE or loop:FRAMES:HZ:SOURCE.
     pub source: String,
-    /// The camera's rig file when `--rig` does not say; empty for none.
+    /// The camera's rig file when `--rig` does not say; empty for none. In a configuration file a path is
+    /// relative to that file.
     pub rig: String,
     /// Longest wait for tracker and mapper to get ready before a recording starts, seconds.
     pub connect_timeout_s: f64,
@@ -190,6 +191,7 @@ impl Config {
                 .map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
             Self::from_text(&text, &path.display().to_string())?;
             table = text.parse().unwrap_or_default();
+            place_rig(&mut table, path);
         }
         let mut config = Self::from_table(&table, "the built-in configuration")?;
         for setting in settings {
@@ -275,9 +277,40 @@ pub fn file_for(folder: &Path, instance: Option<&str>) -> Option<PathBuf> {
     own.into_iter().chain([folder.join(COMMON_FILE)]).find(|file| file.exists())
 }
 
+/// Makes a rig path of the configuration `file` relative to that file, wherever the program is started.
+fn place_rig(table: &mut Table, file: &Path) {
+    let capture = table.get_mut("capture").and_then(Value::as_table_mut);
+    let Some(Value::String(rig)) = capture.and_then(|capture| capture.get_mut("rig")) else {
+        return;
+    };
+    if let (false, Some(folder)) = (rig.is_empty(), file.parent()) {
+        *rig = folder.join(&*rig).to_string_lossy().into_owned();
+    }
+}
+
+/// A message of the parser in the words of who writes a configuration.
+fn without_types(message: &str) -> String {
+    const NAMES: [(&str, &str); 8] = [
+        ("usize", "a whole number, 0 or more"),
+        ("u64", "a whole number, 0 or more"),
+        ("u32", "a whole number, 0 or more"),
+        ("u16", "a whole number, 0 to 65535"),
+        ("u8", "a whole number, 0 to 255"),
+        ("i64", "a whole number"),
+        ("f64", "a number"),
+        ("f32", "a number"),
+    ];
+    let named = NAMES.iter().find_map(|(of_type, name)| {
+        let before = message.strip_suffix(&format!("expected {of_type}"))?;
+        Some(format!("{before}expected {name}"))
+    });
+    named.unwrap_or_else(|| message.to_owned())
+}
+
 /// The parser's message with the line it points at, on one line.
 fn one_line(error: &toml::de::Error, text: &str) -> String {
     let message = error.message().split_whitespace().collect::<Vec<_>>().join(" ");
+    let message = without_types(&message);
     let start = error.span().map(|span| span.start);
     let line = start.and_then(|start| {
         let begin = text.get(..start)?.rfind('\n').map_or(0, |newline| newline + 1);
@@ -372,9 +405,14 @@ mod tests {
     fn later_words_win() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("semidense.toml");
-        std::fs::write(&path, "instance = \"rig2\"\n[mapper]\nthreads = 3\n").unwrap();
+        let text = "instance = \"rig2\"\n[mapper]\nthreads = 3\n[capture]\nrig = \"cam.toml\"\n";
+        std::fs::write(&path, text).unwrap();
         let config = Config::load(Some(&path), &["mapper.threads=1".to_owned()]).unwrap();
         assert_eq!((config.instance.as_str(), config.mapper.threads), ("rig2", 1));
+        // A path in a file is the file's, one on the command line is not.
+        assert_eq!(Path::new(&config.capture.rig), folder.path().join("cam.toml"));
+        let config = Config::load(Some(&path), &["capture.rig=x.toml".to_owned()]).unwrap();
+        assert_eq!(config.capture.rig, "x.toml");
         assert_eq!(set(&["instance=rig3"]).unwrap().instance, "rig3");
         assert_eq!(Config::load(None, &[]).unwrap(), Config::default());
     }
@@ -432,6 +470,8 @@ mod tests {
         let error = set(&["mappr.threads=1"]).unwrap_err();
         assert!(error.contains("unknown key `mappr`; keys are "), "{error}");
         assert!(set(&["mapper.threads=x"]).unwrap_err().contains("mapper.threads=x: invalid type"));
+        assert!(set(&["mapper.threads=-3"]).unwrap_err().ends_with("a whole number, 0 or more"));
+        assert!(set(&["tracker.deadline_ms=x"]).unwrap_err().ends_with("expected a number"));
         assert!(set(&["mapper.threads=999"]).unwrap_err().contains("0 to 256"));
         assert!(set(&["instance.x=1"]).is_err());
         assert!(set(&["=1"]).is_err());

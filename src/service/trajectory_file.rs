@@ -20,7 +20,9 @@ const NANOS_PER_SEC: i64 = 1_000_000_000;
 #[derive(Debug, thiserror::Error)]
 pub enum TrajectoryFileError {
     /// The file cannot be opened or read.
-    #[error("cannot read {path}: {source}")]
+    #[error(
+        "cannot read {path}: {source}; name a trajectory file, lines of `seconds x y z qx qy qz qw`"
+    )]
     Read {
         /// The file.
         path: PathBuf,
