@@ -218,6 +218,7 @@ fn the_loop_allocates_only_what_its_transport_does() {
         // Frames come as fast as they are answered: half a period is no deadline.
         config.tracker.deadline_ms = 1000.0;
         config.tracker.scheduling.lock_memory = true;
+        config.tracker.early_wake_us = 300.0;
         tracker::run(&config, Mode::Live, shutdown).unwrap();
     });
     let line = format!(

@@ -121,3 +121,36 @@ fn results_survive_a_replay_that_is_interrupted_before_its_first_frame() {
     assert!(rest.iter().any(|line| line.contains("there are no results")), "{rest:?}");
     assert_eq!(std::fs::read_to_string(&earlier).unwrap(), "of an earlier run");
 }
+
+#[test]
+fn results_are_of_the_frames_before_one_that_cannot_be_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let (recording, output) = (folder.path().join("recording"), folder.path().join("output"));
+    let sizes = ["--set", "simulator.width=160", "--set", "simulator.height=120"];
+    let made = Command::new(env!("CARGO_BIN_EXE_semidense"))
+        .args(["simulate", "--layout", "tum", "--set", "simulator.frames=8"])
+        .args(sizes)
+        .arg("--output")
+        .arg(&recording)
+        .output()
+        .unwrap();
+    assert!(made.status.success(), "{made:?}");
+    let mut images: Vec<_> = std::fs::read_dir(recording.join("rgb"))
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .collect();
+    images.sort();
+    std::fs::write(&images[5], b"no image").unwrap();
+    let replayed = Command::new(env!("CARGO_BIN_EXE_semidense"))
+        .arg("replay")
+        .arg(format!("tum:{}", recording.display()))
+        .arg("--output")
+        .arg(&output)
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&replayed.stderr).into_owned();
+    assert_eq!(replayed.status.code(), Some(1), "{said}");
+    assert!(said.contains("the results are of the 5 frames before"), "{said}");
+    let summary = std::fs::read_to_string(output.join("summary.json")).unwrap();
+    assert_eq!(serde_json::from_str::<Value>(&summary).unwrap()["frames_in"], 5);
+}

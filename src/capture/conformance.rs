@@ -392,6 +392,9 @@ fn what_is_missing_is_named() {
         let error = open(&named(empty.path().to_owned()), None).err().expect("another layout");
         assert!(error.to_string().contains("looks like tum:"), "{error}");
     }
+    let looped = format!("loop:9:30:images:{}", empty.path().display());
+    let error = open(&looped.parse().expect("a name"), None).err().expect("another layout");
+    assert!(error.to_string().starts_with("source `images:"), "{error}");
     let nowhere = open(&SourceName::Images(empty.path().join("none")), None).err().expect("none");
     assert!(nowhere.to_string().contains("there is no folder "), "{nowhere}");
     assert!(nowhere.to_string().contains("none; check the path"), "{nowhere}");

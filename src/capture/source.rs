@@ -376,7 +376,11 @@ pub fn open(
 
 /// What a folder without the layout that its source names is by the layout that it has.
 fn misnamed(name: &SourceName) -> Option<SourceName> {
-    let folder = name.folder()?;
+    let (SourceName::Tum(folder) | SourceName::Euroc(folder) | SourceName::Images(folder)) = name
+    else {
+        // What a loop repeats is looked at when that is opened.
+        return None;
+    };
     let layouts = [
         SourceName::Tum(folder.to_owned()),
         SourceName::Euroc(folder.to_owned()),

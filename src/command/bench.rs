@@ -47,7 +47,7 @@ enum Beside {
 enum RealTime {
     /// As the configuration says
     Off,
-    /// FIFO priorities, locked memory
+    /// FIFO priorities, locked memory, a tracker that is awake when a frame is expected
     On,
     /// First off, then on
     Both,
@@ -103,7 +103,7 @@ pub fn run(config: &Config, common: &CommonArguments, arguments: BenchArguments)
                 note(&format!("{}, {scheduling}:", disturbance.name()));
             }
             let mut display = RunDisplay::new(arguments.json);
-            let options = common.to_arguments();
+            let options = common.without_instance().to_arguments();
             let tried =
                 try_out(config, &trial, &source, &options, &shutdown, &mut |p| display.show(p));
             display.finish();

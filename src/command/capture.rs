@@ -6,6 +6,7 @@ use std::process::ExitCode;
 use clap::Args;
 
 use crate::capture::source::{SourceError, SourceName};
+use crate::command::print::note;
 use crate::command::{CommandResult, INTERRUPTED};
 use crate::service::capture::{CaptureError, CaptureOptions, run as run_shell};
 use crate::service::config::{CaptureConfig, Config};
@@ -31,7 +32,7 @@ pub struct SourceArguments {
     /// configuration]
     #[arg(long, value_name = "SOURCE")]
     source: Option<String>,
-    /// Rig file with the camera's calibration; a camera (v4l) needs one [default: capture.rig of the configuration]
+    /// Rig file with the camera's calibration; a camera (v4l) needs one [default: capture.rig of the configuration, for the source that stands there]
     #[arg(long, value_name = "FILE")]
     rig: Option<PathBuf>,
 }
@@ -45,7 +46,16 @@ impl SourceArguments {
     ) -> Result<(SourceName, Option<PathBuf>), SourceError> {
         let configured = (!config.rig.is_empty()).then(|| PathBuf::from(&config.rig));
         match self.source {
-            Some(source) => Ok((source.parse()?, self.rig)),
+            Some(source) => {
+                if let (Some(rig), None) = (configured, &self.rig) {
+                    note(&format!(
+                        "warning: capture.rig ({}) is for the source of the configuration and not used for {source}; \
+                         --rig FILE names one",
+                        rig.display()
+                    ));
+                }
+                Ok((source.parse()?, self.rig))
+            }
             None => Ok((config.source.parse()?, self.rig.or(configured))),
         }
     }

@@ -107,8 +107,18 @@ impl CommonArguments {
     fn load(&self) -> Result<Config, ConfigError> {
         let named = self.instance.iter().map(|name| format!("instance={name:?}"));
         let settings: Vec<String> = self.set.iter().cloned().chain(named).collect();
+        Config::load(self.file().as_deref(), &settings)
+    }
+
+    /// The configuration file: the one that is named, else the usual one.
+    fn file(&self) -> Option<PathBuf> {
         let usual = || file_for(Path::new(SYSTEM_FOLDER), self.instance.as_deref());
-        Config::load(self.config.clone().or_else(usual).as_deref(), &settings)
+        self.config.clone().or_else(usual)
+    }
+
+    /// The same options but for the instance.
+    fn without_instance(&self) -> Self {
+        Self { config: self.file(), instance: None, ..self.clone() }
     }
 
     /// The same options for a child process.

@@ -13,7 +13,9 @@ use crate::command::INTERRUPTED;
 use crate::command::print::{note, print};
 use crate::command::progress::Progress;
 use crate::service::config::Config;
-use crate::service::replay::{DepthOrigin, PoseOrigin, ReplayConfig, ReplayProgress, replay};
+use crate::service::replay::{
+    DepthOrigin, PoseOrigin, ReplayConfig, ReplayError, ReplayProgress, replay,
+};
 use crate::service::results::debug_pictures::write_debug_pictures;
 use crate::service::results::summary_text::summary_text;
 use crate::service::results::{RunRecord, prepare_output, write_results};
@@ -102,7 +104,7 @@ pub fn run(config: &Config, args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error
     let record = pool.install(|| {
         record(config, args, source.as_mut(), &interrupted).map_err(|error| error.to_string())
     })?;
-    let Some(record) = record else {
+    let Some((record, fault)) = record else {
         note("interrupted before the first frame: there are no results");
         return Ok(ExitCode::from(INTERRUPTED));
     };
@@ -116,17 +118,21 @@ pub fn run(config: &Config, args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error
         let place = args.output.display();
         print(&format!("{}results in {place}\n", summary_text(&summary)))?;
     }
+    if let Some(fault) = fault {
+        return Err(fault.into());
+    }
     let code = if interrupted.load(Ordering::Relaxed) { INTERRUPTED } else { 0 };
     Ok(ExitCode::from(code))
 }
 
-/// Prepares the source and replays it under a progress bar; `None` where Ctrl-C came before a frame.
+/// Prepares the source and replays it under a progress bar; `None` where Ctrl-C came before a frame. The
+/// text is why a source failed on the way.
 fn record(
     config: &Config,
     args: &ReplayArgs,
     source: &mut dyn FrameSource,
     interrupted: &AtomicBool,
-) -> Result<Option<RunRecord>, Box<dyn Error>> {
+) -> Result<Option<(RunRecord, Option<String>)>, Box<dyn Error>> {
     let goes_on = || !interrupted.load(Ordering::Relaxed);
     let mut preparing: Option<Progress> = None;
     source.prepare(&mut |done, total| {
@@ -138,7 +144,7 @@ fn record(
     if !goes_on() {
         return Ok(None);
     }
-    let replayed = ReplayConfig {
+    let config = ReplayConfig {
         tracker: config.tracking.clone(),
         mapper: config.mapping.clone(),
         poses: match args.poses {
@@ -151,14 +157,21 @@ fn record(
         },
         max_frames: args.frames.map(|frames| frames as usize),
     };
-    let total = source.num_frames().map(|n| n.min(replayed.max_frames.unwrap_or(n)));
+    let total = source.num_frames().map(|n| n.min(config.max_frames.unwrap_or(n)));
     let progress = Progress::new("replay", total);
-    let record = replay(source, &args.source.to_string(), &replayed, &mut |frame| {
+    let replayed = replay(source, &args.source.to_string(), &config, &mut |frame| {
         progress.update(frame.done, state_word(frame));
         goes_on()
     });
     progress.finish();
-    Ok(Some(record?))
+    match replayed {
+        Err(ReplayError::Cut { record, cause }) => {
+            let fault =
+                format!("{cause}; the results are of the {} frames before", record.frames_in);
+            Ok(Some((*record, Some(fault))))
+        }
+        replayed => Ok(Some((replayed?, None))),
+    }
 }
 
 fn state_word(frame: &ReplayProgress) -> &'static str {

@@ -93,6 +93,10 @@ pub struct TrackerConfig {
     /// Live: time from a frame's arrival to its pose, milliseconds; 0 is half the time between two
     /// frames. At the deadline the best pose so far is published as degraded (budget).
     pub deadline_ms: f64,
+    /// Live: so long before a frame is expected the frame loop is awake, and looks for it until as long
+    /// after, microseconds; 0 sleeps until it comes. A CPU that sleeps takes about 100 to wake; 300
+    /// costs 2 % of a CPU at 30 Hz. For cameras with an even period.
+    pub early_wake_us: f64,
     /// Live: after so many frame periods without a frame tracker and mapper are stale.
     pub stale_periods: f64,
     /// What its frame loop asks of the kernel. On a robot: fifo, and locked memory.
@@ -102,7 +106,7 @@ pub struct TrackerConfig {
 impl Default for TrackerConfig {
     fn default() -> Self {
         let scheduling = SchedulingParams::default();
-        Self { deadline_ms: 0.0, stale_periods: 10.0, scheduling }
+        Self { deadline_ms: 0.0, early_wake_us: 0.0, stale_periods: 10.0, scheduling }
     }
 }
 
@@ -249,6 +253,7 @@ impl Config {
         check_range("capture.step_timeout_s", capture.step_timeout_s, seconds.clone())?;
         capture.camera.validate().map_err(|e| e.within("capture.camera"))?;
         check_range("tracker.deadline_ms", self.tracker.deadline_ms, 0.0..=10_000.0)?;
+        check_range("tracker.early_wake_us", self.tracker.early_wake_us, 0.0..=10_000.0)?;
         check_range("tracker.stale_periods", self.tracker.stale_periods, 2.0..=1e6)?;
         for (process, scheduling) in [
             ("capture", &self.capture.scheduling),

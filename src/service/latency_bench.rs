@@ -30,12 +30,13 @@ const READER_PAUSE: Duration = Duration::from_millis(20);
 const SATURATED_MAPPER: [&str; 3] =
     ["mapping.min_gradient=0.5", "mapping.publish_change_ratio=0.0", "mapper.threads=1"];
 /// Settings of real-time scheduling.
-const REAL_TIME: [&str; 5] = [
+const REAL_TIME: [&str; 6] = [
     "capture.scheduling.policy=fifo",
     "capture.scheduling.timer_slack_us=1",
     "tracker.scheduling.policy=fifo",
     "tracker.scheduling.lock_memory=true",
     "capture.scheduling.lock_memory=true",
+    "tracker.early_wake_us=300.0",
 ];
 
 /// What goes on beside the pipeline.

@@ -9,6 +9,7 @@ pub mod child;
 pub mod clock;
 pub mod config;
 pub mod doctor;
+pub mod early_wake;
 pub mod frame_order;
 pub mod given_pose;
 pub mod health;

@@ -81,12 +81,8 @@ fn rehearse(tracker: &mut Tracker, memory: &Memory, frame: &FrameView<'_>) -> Op
         displacement_px: mean_displacement_px(reference, &pose, &best, POINT_STRIDE),
     };
     let last = BudgetStep { iterations: needed, nanos, displacement_px: 0.0 };
-    let mut sample: BudgetSample = attempts.into_iter().map(step).chain([last]).collect();
-    // Less cannot take longer than more: what it took longer was another process.
-    for index in (1..sample.len()).rev() {
-        sample[index - 1].nanos = sample[index - 1].nanos.min(sample[index].nanos);
-    }
-    Some(sample)
+    // A frame that is cut short takes a last look at the finest level: less may take longer than more.
+    Some(attempts.into_iter().map(step).chain([last]).collect())
 }
 
 fn elapsed_nanos(begin: Instant) -> u64 {

@@ -76,6 +76,14 @@ pub enum ReplayError {
     /// The source gave no frame, or a broken one.
     #[error(transparent)]
     Source(#[from] SourceError),
+    /// The source failed later; what came before is whole.
+    #[error("{cause}; the results are of the {} frames before", record.frames_in)]
+    Cut {
+        /// Everything until then.
+        record: Box<RunRecord>,
+        /// Why it ended.
+        cause: SourceError,
+    },
     /// A parameter out of its range.
     #[error("configuration: {0}")]
     Parameter(#[from] ParameterError),
@@ -109,15 +117,28 @@ pub fn replay(
     let total = frames_to_come(source, config);
     let mut pixels = vec![0; replay.num_pixels];
     let begin = Instant::now();
+    let mut fault = None;
     while replay.record.frames_in < config.max_frames.map_or(u64::MAX, |n| n as u64) {
-        let Some(stamp) = source.next_into(&mut pixels)? else { break };
+        let stamp = match source.next_into(&mut pixels) {
+            Ok(Some(stamp)) => stamp,
+            Ok(None) => break,
+            Err(cause) if replay.record.frames_in > 0 => {
+                fault = Some(cause);
+                break;
+            }
+            Err(cause) => return Err(cause.into()),
+        };
         let (state, outcome) = replay.step(source, &stamp, &pixels)?;
         let done = replay.record.frames_in as usize;
         if !observe(&ReplayProgress { done, total, state, outcome }) {
             break;
         }
     }
-    replay.finish(begin)
+    let record = replay.finish(begin)?;
+    match fault {
+        None => Ok(record),
+        Some(cause) => Err(ReplayError::Cut { record: Box::new(record), cause }),
+    }
 }
 
 /// Frames there will be, where that is known.

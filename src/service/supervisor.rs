@@ -19,6 +19,7 @@ use crate::service::shutdown::Shutdown;
 use crate::slam::mapper::Map;
 use crate::slam::pose::TrackingState;
 use crate::wire::command::{Command, CommandClient, CommandError};
+use crate::wire::message::HealthMessage;
 use crate::wire::place::{Claim, Place, PlaceError};
 use crate::wire::port::{Access, Hub, OpenError, ReceiveError, WaitError, wait};
 use crate::wire::topic::shared_memory_bytes;
@@ -172,6 +173,8 @@ struct Supervisor<'a> {
     commands: CommandClient,
     hub: Hub,
     restarts: u64,
+    /// The last words of processes that died: what they have counted.
+    of_dead: Vec<(&'static str, HealthMessage)>,
     /// Restarts in a row of processes that died young.
     hasty_restarts: u32,
 }
@@ -193,6 +196,7 @@ impl<'a> Supervisor<'a> {
             commands: CommandClient::open(&hub)?,
             hub,
             restarts: 0,
+            of_dead: Vec::new(),
             hasty_restarts: 0,
         };
         for name in ["mapper", "tracker", "capture"] {
@@ -281,7 +285,10 @@ impl<'a> Supervisor<'a> {
             tracing::warn!("{cause}; it is started again");
             self.back_off(shutdown)?;
             self.children[index] = self.spawn(process)?;
-            self.peers.iter_mut().filter(|p| p.name() == process).for_each(Peer::forget);
+            for peer in self.peers.iter_mut().filter(|peer| peer.name() == process) {
+                self.of_dead.extend(peer.last().map(|last| (process, *last)));
+                peer.forget();
+            }
             self.restarts += 1;
             self.hasty_restarts += 1;
         }
@@ -360,12 +367,17 @@ impl<'a> Supervisor<'a> {
         self.hub.clean_up();
         let [capture, tracker, _] = &self.peers;
         let peaks = self.peers.iter().filter_map(|peer| Some(peer.last()?.peak_rss_bytes));
+        let sum = |peer: &Peer, counted: fn(&HealthMessage) -> u64| -> u64 {
+            let of_dead = self.of_dead.iter().filter(|(name, _)| *name == peer.name());
+            of_dead.map(|(_, last)| last).chain(peer.last()).map(counted).sum()
+        };
         let counters = RunCounters {
-            frames_in: capture.last().map_or(0, |health| health.frames),
-            gaps: capture.last().map_or(0, |health| health.gaps),
+            // Who is killed leaves the count of a moment before.
+            frames_in: sum(capture, |health| health.frames).max(self.recorder.num_poses() as u64),
+            gaps: sum(capture, |health| health.gaps),
             restarts: self.restarts,
-            deadline_misses: tracker.last().map_or(0, |health| health.deadline_misses),
-            page_faults: tracker.last().map_or(0, |health| health.page_faults),
+            deadline_misses: sum(tracker, |health| health.deadline_misses),
+            page_faults: sum(tracker, |health| health.page_faults),
             peak_rss_bytes: peaks.sum::<u64>() + peak_rss_bytes().unwrap_or(0),
         };
         if capture.state() == Some(ProcessState::Failed) {

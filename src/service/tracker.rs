@@ -5,6 +5,7 @@ use std::time::Duration;
 use crate::service::budget::IterationCosts;
 use crate::service::clock::now_nanos;
 use crate::service::config::Config;
+use crate::service::early_wake::Watch;
 use crate::service::frame_order::{Arrival, FrameOrder, SILENCE};
 use crate::service::health::{Health, ProcessState};
 use crate::service::mode::Mode;
@@ -128,7 +129,9 @@ impl<'a> Shell<'a> {
 
     fn track_until(&mut self, shutdown: &Shutdown) -> Result<(), TrackerError> {
         while !shutdown.is_requested() {
-            wait(&[self.frames.events()], Some(shutdown.descriptor()), WAKE_PERIOD)?;
+            if let Some(frame) = self.await_frame(shutdown)? {
+                self.step(&frame)?;
+            }
             self.poses.serve_late_joiners();
             while let Some(frame) = self.next_frame()? {
                 self.step(&frame)?;
@@ -137,6 +140,27 @@ impl<'a> Shell<'a> {
             self.health.report();
         }
         Ok(())
+    }
+
+    /// Sleeps until something happens. Live, where the configuration asks for it, it is awake when the
+    /// next frame is near and looks for it.
+    fn await_frame(
+        &mut self,
+        shutdown: &Shutdown,
+    ) -> Result<Option<Received<u8, FrameHeader>>, TrackerError> {
+        let early_us = self.config.tracker.early_wake_us;
+        let (last, period) = (self.last_arrival_nanos, self.order.period_nanos());
+        let watch = Watch::plan(early_us, last, period, now_nanos());
+        let watch = watch.filter(|_| self.mode == Mode::Live);
+        let sleep = watch.map_or(WAKE_PERIOD, |watch| watch.sleep(now_nanos()).min(WAKE_PERIOD));
+        wait(&[self.frames.events()], Some(shutdown.descriptor()), sleep)?;
+        while watch.is_some_and(|watch| watch.is_on(now_nanos())) {
+            if let Some(frame) = self.next_frame()? {
+                return Ok(Some(frame));
+            }
+            std::hint::spin_loop();
+        }
+        Ok(None)
     }
 
     /// The oldest frame in lockstep, the newest live.

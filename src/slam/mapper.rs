@@ -230,7 +230,8 @@ impl Mapper {
             regularisation: RegularisationScratch::with_size(width, height),
             points: IntervalFilter::default(),
             frame: QuadImage::with_size(width, height),
-            past: PastFrames::with_capacity(params.max_past_frames),
+            // The keyframe in force is one more.
+            past: PastFrames::with_capacity(params.max_past_frames + 1),
             two_frame: TwoFrameInitializer::new(intrinsics, params.initializer.two_frame.clone())
                 .map_err(|e| e.within("initializer.two_frame"))?,
             first_stamp: None,

@@ -249,7 +249,9 @@ pub fn joined(one: Hypothesis, other: &Hypothesis) -> Option<Hypothesis> {
     const SAME_SURFACE_SIGMAS: f32 = 2.0;
     let difference = other.inverse_depth - one.inverse_depth;
     let joint = one.variance + other.variance;
-    if !(difference * difference <= SAME_SURFACE_SIGMAS * SAME_SURFACE_SIGMAS * joint) {
+    if !(joint > 0.0
+        && difference * difference <= SAME_SURFACE_SIGMAS * SAME_SURFACE_SIGMAS * joint)
+    {
         return None;
     }
     let inverse_depth = one.inverse_depth + one.variance / joint * difference;

@@ -21,7 +21,11 @@ use crate::slam::pose::{Brightness, PoseEstimate};
 pub(super) struct Unfinished {
     /// Place in the map of the keyframe before, whose depth map is the mapper's `next_depth`.
     before: usize,
-    /// Whether its new pixels have no depth yet.
+    /// Hypotheses of that.
+    known: usize,
+    /// Its mean inverse depth over what the new keyframe had when it was carried over.
+    depth_ratio: f64,
+    /// Whether the new pixels have no depth yet.
     has_new_pixels: bool,
 }
 
@@ -33,7 +37,6 @@ impl Mapper {
         pose: &PoseEstimate,
         sensor_depth: Option<&Image<f32>>,
     ) {
-        self.is_unit_open = false;
         let (Some(index), Some(before)) = (self.in_force, self.keyframe()) else { return };
         let epoch = before.epoch;
         let world_from_before = before.world_from_keyframe;
@@ -63,50 +66,57 @@ impl Mapper {
         self.refine();
         let factor = self.rescale_to_unit_mean();
         world_from_keyframe.scale *= factor;
-        let (before, after) = (self.next_depth.num_hypotheses(), self.depth.num_hypotheses());
-        // A first keyframe without depth had nothing to be rescaled by: its mean is not 1.
-        let depth_ratio = self.next_depth.mean_inverse_depth().map_or(1.0, |mean| mean * factor);
-        let contradiction = judge_change(before, after, depth_ratio, &self.params.consistency);
+        // Without any depth there was nothing to be rescaled by.
+        self.is_unit_open &= self.depth.num_hypotheses() == 0;
+        self.unfinished = Some(Unfinished {
+            before: index,
+            known: self.next_depth.num_hypotheses(),
+            // The mean of a first keyframe without depth was not 1.
+            depth_ratio: self.next_depth.mean_inverse_depth().map_or(1.0, |mean| mean * factor),
+            has_new_pixels: sensor_depth.is_none(),
+        });
         self.add_keyframe(frame, world_from_keyframe, MapState::Established, epoch);
-        self.unfinished =
-            Some(Unfinished { before: index, has_new_pixels: sensor_depth.is_none() });
-        if let Some(contradiction) = contradiction {
-            self.reject(contradiction);
-        }
     }
 
     /// What a new keyframe can wait for until it is published: the last depth of the one before goes
-    /// into the map, and new pixels get their depth from past frames. To be called when the step's
-    /// outcome is out; otherwise the next step does it first.
+    /// into the map, new pixels get their depth from past frames, and the change is judged. To be
+    /// called when the step's outcome is out; otherwise the next step does it first.
     pub fn finish_keyframe(&mut self) -> StepOutcome {
         let Some(unfinished) = self.unfinished.take() else { return StepOutcome::default() };
         self.revision += 1;
-        if let Some(before) = self.map.keyframes.get_mut(unfinished.before) {
+        let before = self.map.keyframes.get_mut(unfinished.before);
+        // One whose depth was forgotten stays without.
+        if let Some(before) = before.filter(|before| !before.image.is_empty()) {
             before.revision = self.revision;
             write_depth(&self.next_depth, before);
         }
-        let is_searched = self.params.depth_filter == DepthFilter::Gaussian
-            && unfinished.has_new_pixels
-            && !self.is_rejected();
-        let Some(keyframe) = self.keyframe().filter(|_| is_searched) else {
-            return StepOutcome::default();
-        };
-        let world_from_keyframe = keyframe.world_from_keyframe;
-        if !self.seed_from_past(&world_from_keyframe) {
-            return StepOutcome::default();
+        let searches = self.params.depth_filter == DepthFilter::Gaussian;
+        let mut keyframe_changed = false;
+        if searches && unfinished.has_new_pixels && self.seed_from_past() {
+            self.refine();
+            self.keep_unit_mean();
+            self.publish_depth();
+            keyframe_changed = true;
         }
-        self.refine();
-        self.publish_depth();
-        StepOutcome { keyframe_changed: true, ..Default::default() }
+        let (known, mean) = (self.depth.num_hypotheses(), self.depth.mean_inverse_depth());
+        let depth_ratio = unfinished.depth_ratio / mean.unwrap_or(1.0);
+        let params = &self.params.consistency;
+        if let Some(contradiction) = judge_change(unfinished.known, known, depth_ratio, params) {
+            self.reject(contradiction);
+            keyframe_changed = true;
+        }
+        StepOutcome { keyframe_changed, ..Default::default() }
     }
 
     /// Gives new pixels of the keyframe their depth from frames before it, shortest baseline first:
     /// each narrows the search of the next. False where none was far enough away.
-    fn seed_from_past(&mut self, world_from_keyframe: &Sim3) -> bool {
+    fn seed_from_past(&mut self) -> bool {
         /// Each frame's baseline is at least this many times the one before.
         const BASELINE_STEP: f64 = 1.7;
         /// Baselines shorter than this share of the mean depth tell nothing.
         const MIN_BASELINE: f64 = 0.01;
+        let Some(keyframe) = self.keyframe() else { return false };
+        let world_from_keyframe = keyframe.world_from_keyframe;
         let mut least = MIN_BASELINE;
         let mut used = 0;
         for past in self.past.newest_first() {

@@ -9,7 +9,7 @@ use crate::slam::alignment::kernel::SimdMode;
 use crate::slam::alignment::normal_equations::NormalEquations;
 use crate::slam::alignment::reference::{Reference, ReferenceParams, finest_level, num_levels};
 use crate::slam::depth::gaussian::MAX_VALIDITY;
-use crate::slam::depth::map::{DepthMap, Hypothesis};
+use crate::slam::depth::map::{BORDER_PX, DepthMap, Hypothesis};
 use crate::slam::depth::propagation::joined;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -137,6 +137,7 @@ impl Recovery {
                 && keyframe.epoch == epoch
                 && keyframe.map_state == MapState::Established
                 // The oldest of a large map keep only their poses.
+                && !keyframe.image.is_empty()
                 && !keyframe.points.is_empty()
         };
         let newest_first = (0..keyframes.len()).rev().filter(is_eligible);
@@ -256,7 +257,18 @@ impl Mapper {
 /// Puts the points of a keyframe back into its depth map: each as its filter left it, half proven, and
 /// joined with what is there already if that is the same surface.
 pub(super) fn restore_points(map: &mut DepthMap, points: &[DepthPoint]) {
-    for point in points {
+    let inside = |at: u16, side: usize| {
+        (BORDER_PX..side.saturating_sub(BORDER_PX)).contains(&usize::from(at))
+    };
+    let (width, height) = (map.image.width(), map.image.height());
+    // A checkpoint of other parameters may hold others.
+    let usable = points.iter().filter(|point| {
+        inside(point.u, width)
+            && inside(point.v, height)
+            && point.inverse_depth > 0.0
+            && point.variance > 0.0
+    });
+    for point in usable {
         let index = usize::from(point.v) * map.image.width() + usize::from(point.u);
         if let Some(hypothesis) = map.hypotheses.pixels_mut().get_mut(index) {
             let restored = Hypothesis {

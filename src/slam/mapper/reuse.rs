@@ -80,6 +80,7 @@ impl Mapper {
                 && keyframe.epoch == present.epoch
                 && keyframe.map_state == MapState::Established
                 // The oldest of a large map keep only their poses.
+                && !keyframe.image.is_empty()
                 && !keyframe.points.is_empty();
             if !is_eligible {
                 continue;
