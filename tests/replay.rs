@@ -101,6 +101,19 @@ fn what_cannot_be_replayed_is_one_clear_line() {
 }
 
 #[test]
+fn a_name_that_is_none_is_refused_before_the_work() {
+    let folder = tempfile::tempdir().unwrap();
+    let replayed = Command::new(env!("CARGO_BIN_EXE_semidense"))
+        .args(["replay", "sim", "--instance", "a/b", "--output"])
+        .arg(folder.path().join("output"))
+        .output()
+        .unwrap();
+    assert_eq!(replayed.status.code(), Some(1));
+    assert!(String::from_utf8_lossy(&replayed.stderr).contains("`a/b` is not a name"));
+    assert!(!folder.path().join("output").exists());
+}
+
+#[test]
 fn results_survive_a_replay_that_is_interrupted_before_its_first_frame() {
     let folder = tempfile::tempdir().unwrap();
     let earlier = folder.path().join("trajectory.txt");

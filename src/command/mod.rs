@@ -157,6 +157,7 @@ pub fn command_line() -> clap::Command {
 pub fn main() -> ExitCode {
     let line = CommandLine::parse();
     let outcome = prepare(&line.common).and_then(|config| {
+        let place = Place::new(&config.instance, &config.root)?;
         let outcome = match line.command {
             Subcommands::Run(arguments) => run::run(&config, &line.common, arguments),
             Subcommands::Capture(arguments) => capture::run(&config, arguments),
@@ -170,7 +171,7 @@ pub fn main() -> ExitCode {
             Subcommands::Doctor(arguments) => doctor::run(&config, arguments),
             Subcommands::Bench(arguments) => bench::run(&config, &line.common, arguments),
         };
-        Place::new(&config.instance, &config.root)?.tidy();
+        place.tidy();
         outcome
     });
     outcome.unwrap_or_else(|error| {

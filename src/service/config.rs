@@ -309,7 +309,11 @@ fn without_types(message: &str) -> String {
         let before = message.strip_suffix(&format!("expected {of_type}"))?;
         Some(format!("{before}expected {name}"))
     });
-    named.unwrap_or_else(|| message.to_owned())
+    let of_table = || {
+        let (before, _) = message.split_once("expected struct ")?;
+        Some(format!("{before}expected keys below it, as in mapper.threads=2"))
+    };
+    named.or_else(of_table).unwrap_or_else(|| message.to_owned())
 }
 
 /// The parser's message with the line it points at, on one line.
@@ -476,6 +480,7 @@ mod tests {
         assert!(error.contains("unknown key `mappr`; keys are "), "{error}");
         assert!(set(&["mapper.threads=x"]).unwrap_err().contains("mapper.threads=x: invalid type"));
         assert!(set(&["mapper.threads=-3"]).unwrap_err().ends_with("a whole number, 0 or more"));
+        assert!(set(&["mapper=2"]).unwrap_err().contains("expected keys below it"));
         assert!(set(&["tracker.deadline_ms=x"]).unwrap_err().ends_with("expected a number"));
         assert!(set(&["mapper.threads=999"]).unwrap_err().contains("0 to 256"));
         assert!(set(&["instance.x=1"]).is_err());

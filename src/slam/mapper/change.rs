@@ -222,12 +222,12 @@ mod tests {
     use crate::slam::test_scene::{CAMERA, Scene};
 
     /// A camera that moves sideways with exact poses, exact depth for its first keyframe alone; a
-    /// keyframe is asked for at the last but one step. What the steps and their rests gave, with the
+    /// keyframe is asked for at the fifth step. What the steps and their rests gave, with the
     /// keyframes' points then, and the mapper.
-    fn walk(finishes: bool) -> (Vec<[(StepOutcome, Vec<Vec<DepthPoint>>); 2]>, Mapper) {
+    fn walk(steps: u64, finishes: bool) -> (Vec<[(StepOutcome, Vec<Vec<DepthPoint>>); 2]>, Mapper) {
         let scene = Scene::new(3);
         let mut mapper = Mapper::new(CAMERA, MapperParams::default()).unwrap();
-        let outcomes = (0..6u64).map(|k| {
+        let outcomes = (0..steps).map(|k| {
             let x = 0.08 * k as f64;
             let world_from_camera = SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() };
             let view = scene.render(&CAMERA, &world_from_camera);
@@ -262,7 +262,7 @@ mod tests {
 
     #[test]
     fn a_new_keyframe_is_published_first_and_finished_then() {
-        let (outcomes, mapper) = walk(true);
+        let (outcomes, mapper) = walk(6, true);
         let [(step, at_once), (rest, finished)] = &outcomes[4];
         assert!(step.keyframe_created && step.needs_image());
         assert!(rest.needs_publishing() && !rest.needs_image() && !rest.graph_changed);
@@ -271,11 +271,21 @@ mod tests {
         assert!(at_once[0] != finished[0]);
         assert!(finished[1].len() > at_once[1].len());
         // Who does not ask for the rest has it with the next step, and nothing else changes.
-        let (others, late) = walk(false);
+        let (others, late) = walk(6, false);
         assert!(others[5][0].0.keyframe_changed);
         for (one, other) in mapper.map().keyframes.iter().zip(&late.map().keyframes) {
             assert!(one.points == other.points, "keyframe {}", one.keyframe_id);
             assert_eq!(one.world_from_keyframe, other.world_from_keyframe);
         }
+    }
+
+    #[test]
+    fn depth_that_was_forgotten_does_not_come_back() {
+        let (_, mut mapper) = walk(5, false);
+        assert!(!mapper.map.keyframes[0].points.is_empty());
+        mapper.map.forget_depth_beyond(0);
+        mapper.finish_keyframe();
+        assert!(mapper.map.keyframes[0].points.is_empty());
+        assert!(!mapper.map.keyframes[1].points.is_empty());
     }
 }
