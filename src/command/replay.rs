@@ -101,10 +101,10 @@ pub fn run(config: &Config, args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error
         .num_threads(threads)
         .thread_name(|i| format!("mapper-{i}"))
         .build()?;
-    let record = pool.install(|| {
+    let replayed = pool.install(|| {
         record(config, args, source.as_mut(), &interrupted).map_err(|error| error.to_string())
     })?;
-    let Some((record, fault)) = record else {
+    let Some(Replayed { record, fault }) = replayed else {
         note("interrupted before the first frame: there are no results");
         return Ok(ExitCode::from(INTERRUPTED));
     };
@@ -125,14 +125,20 @@ pub fn run(config: &Config, args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error
     Ok(ExitCode::from(code))
 }
 
-/// Prepares the source and replays it under a progress bar; `None` where Ctrl-C came before a frame. The
-/// text is why a source failed on the way.
+/// What was replayed.
+struct Replayed {
+    record: RunRecord,
+    /// Why the source failed on the way.
+    fault: Option<String>,
+}
+
+/// Prepares the source and replays it under a progress bar; `None` where Ctrl-C came before a frame.
 fn record(
     config: &Config,
     args: &ReplayArgs,
     source: &mut dyn FrameSource,
     interrupted: &AtomicBool,
-) -> Result<Option<(RunRecord, Option<String>)>, Box<dyn Error>> {
+) -> Result<Option<Replayed>, Box<dyn Error>> {
     let goes_on = || !interrupted.load(Ordering::Relaxed);
     let mut preparing: Option<Progress> = None;
     source.prepare(&mut |done, total| {
@@ -168,9 +174,9 @@ fn record(
         Err(ReplayError::Cut { record, cause }) => {
             let fault =
                 format!("{cause}; the results are of the {} frames before", record.frames_in);
-            Ok(Some((*record, Some(fault))))
+            Ok(Some(Replayed { record: *record, fault: Some(fault) }))
         }
-        replayed => Ok(Some((replayed?, None))),
+        replayed => Ok(Some(Replayed { record: replayed?, fault: None })),
     }
 }
 

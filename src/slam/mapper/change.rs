@@ -221,10 +221,16 @@ mod tests {
     use crate::slam::pose::TrackingState;
     use crate::slam::test_scene::{CAMERA, Scene};
 
+    /// What a step, or the rest of it, gave, and the keyframes' points then.
+    #[derive(Debug, Clone, PartialEq)]
+    struct Taken {
+        outcome: StepOutcome,
+        points: Vec<Vec<DepthPoint>>,
+    }
+
     /// A camera that moves sideways with exact poses, exact depth for its first keyframe alone; a
-    /// keyframe is asked for at the fifth step. What the steps and their rests gave, with the
-    /// keyframes' points then, and the mapper.
-    fn walk(steps: u64, finishes: bool) -> (Vec<[(StepOutcome, Vec<Vec<DepthPoint>>); 2]>, Mapper) {
+    /// keyframe is asked for at the fifth step. What the steps and their rests gave, and the mapper.
+    fn walk(steps: u64, finishes: bool) -> (Vec<[Taken; 2]>, Mapper) {
         let scene = Scene::new(3);
         let mut mapper = Mapper::new(CAMERA, MapperParams::default()).unwrap();
         let outcomes = (0..steps).map(|k| {
@@ -250,12 +256,13 @@ mod tests {
                 ..PoseEstimate::unknown(&frame)
             };
             let step = mapper.step(&frame, &pose, (k == 0).then_some(&depth), &mut |_| {});
-            let points = |mapper: &Mapper| {
-                mapper.map.keyframes.iter().map(|keyframe| keyframe.points.clone()).collect()
+            let taken = |outcome, mapper: &Mapper| {
+                let keyframes = mapper.map.keyframes.iter();
+                Taken { outcome, points: keyframes.map(|k| k.points.clone()).collect() }
             };
-            let at_once = points(&mapper);
+            let at_once = taken(step, &mapper);
             let rest = if finishes { mapper.finish_keyframe() } else { StepOutcome::default() };
-            [(step, at_once), (rest, points(&mapper))]
+            [at_once, taken(rest, &mapper)]
         });
         (outcomes.collect(), mapper)
     }
@@ -263,16 +270,17 @@ mod tests {
     #[test]
     fn a_new_keyframe_is_published_first_and_finished_then() {
         let (outcomes, mapper) = walk(6, true);
-        let [(step, at_once), (rest, finished)] = &outcomes[4];
-        assert!(step.keyframe_created && step.needs_image());
-        assert!(rest.needs_publishing() && !rest.needs_image() && !rest.graph_changed);
-        assert!(outcomes[..4].iter().all(|[_, (rest, _)]| *rest == StepOutcome::default()));
+        let [step, rest] = &outcomes[4];
+        let (published, then) = (step.outcome, rest.outcome);
+        assert!(published.keyframe_created && published.needs_image());
+        assert!(then.needs_publishing() && !then.needs_image() && !then.graph_changed);
+        assert!(outcomes[..4].iter().all(|[_, rest]| rest.outcome == StepOutcome::default()));
         // The one before has the depth that was reached on it, the new one depth for new pixels.
-        assert!(at_once[0] != finished[0]);
-        assert!(finished[1].len() > at_once[1].len());
+        assert!(step.points[0] != rest.points[0]);
+        assert!(rest.points[1].len() > step.points[1].len());
         // Who does not ask for the rest has it with the next step, and nothing else changes.
         let (others, late) = walk(6, false);
-        assert!(others[5][0].0.keyframe_changed);
+        assert!(others[5][0].outcome.keyframe_changed);
         for (one, other) in mapper.map().keyframes.iter().zip(&late.map().keyframes) {
             assert!(one.points == other.points, "keyframe {}", one.keyframe_id);
             assert_eq!(one.world_from_keyframe, other.world_from_keyframe);
