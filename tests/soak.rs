@@ -203,11 +203,11 @@ fn soak(kills: usize, seed: u64) {
     let ended = end(child);
     assert_eq!(ended.status.code(), Some(130), "{}", ended.stderr);
     assert_eq!(rig.leftovers(), Vec::<String>::new());
-    // What dead processes have counted counts too: frames without a pose, while a tracker was dead.
+    // What dead processes have counted counts too.
     let summary = fs::read_to_string(rig.output().join("summary.json")).unwrap();
     let summary: Value = serde_json::from_str(&summary).unwrap();
     let of = |name: &str| summary[name].as_u64().unwrap();
-    assert!(of("frames_in") >= of("frames_tracked") && of("frames_dropped") > 0, "{summary}");
+    assert!(of("frames_in") >= of("frames_tracked") + of("frames_initializing"), "{summary}");
 }
 
 /// How long poses were missing after a kill.
