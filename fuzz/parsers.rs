@@ -203,7 +203,7 @@ pub fn map(bytes: &[u8]) {
         mapper.resume(map);
         let view = View::new(1, 0, intrinsics, 3);
         let unknown = semidense::slam::pose::PoseEstimate::unknown(&view.frame());
-        mapper.step(&view.frame(), &unknown, None, &mut |_| {});
+        mapper.step(&view.frame(), &unknown, None, &mut || {});
     }
 }
 
@@ -372,7 +372,7 @@ fn map_step(
         *mapper = Some((view.intrinsics, fresh));
     }
     if let Some((_, mapper)) = mapper {
-        mapper.step(&view.frame(), pose, None, &mut |_| {});
+        mapper.step(&view.frame(), pose, None, &mut || {});
     }
 }
 

@@ -8,6 +8,8 @@ use support::{Rig, finish, small_camera};
 
 /// 1 000 frames.
 const TRIAL: [&str; 6] = ["--fps", "60", "--seconds", "16.667", "--realtime", "on"];
+/// A name of the user's: the bench's processes have one of their own.
+const NAMED: [&str; 2] = ["--instance", "named"];
 const FRAMES: u64 = 1000;
 
 /// The measurements of trials on a small camera.
@@ -42,7 +44,7 @@ fn assert_complete(measurement: &Value, frames: u64) {
 
 #[test]
 fn a_thousand_frames_with_every_cpu_busy_give_a_whole_report() {
-    let measurements = bench(&[&TRIAL[..], &["--load", "busy-cpus"]].concat());
+    let measurements = bench(&[&TRIAL[..], &NAMED, &["--load", "busy-cpus"]].concat());
     assert_eq!(measurements.len(), 1);
     assert_eq!(measurements[0]["disturbance"], "busy_cpus");
     assert_eq!(measurements[0]["real_time"], true);

@@ -262,7 +262,7 @@ fn a_map_whose_poses_are_wrong_is_rejected() {
             proposes_keyframe: index % 15 == 0,
             ..PoseEstimate::unknown(&frame)
         };
-        mapper.step(&frame, &pose, None, &mut |_| {});
+        mapper.step(&frame, &pose, None, &mut || {});
         rejected_at = rejected_at.or_else(|| {
             let is_rejected = matches!(mapper.situation(), Situation::Rejected(_));
             is_rejected.then_some((index, mapper.keyframe()?.map_state))

@@ -19,7 +19,7 @@ use semidense::slam::frame::FrameView;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::image::quads::QuadImage;
 use semidense::slam::keyframe::MAX_KEYFRAME_POINTS;
-use semidense::slam::mapper::{Mapper, MapperParams, Stage};
+use semidense::slam::mapper::{Mapper, MapperParams};
 use semidense::slam::pose::{Brightness, PoseEstimate, TrackingState};
 
 /// The frame of the first keyframe, in the middle of the path through the room.
@@ -267,12 +267,8 @@ fn whole(sequence: &Sequence, pools: &[rayon::ThreadPool]) {
                 let depth = (k == 0).then(|| sequence.simulator.raw_depth(FIRST)).flatten();
                 let begin = Instant::now();
                 let mut change = None;
-                let mut enter = |stage| {
-                    if stage == Stage::ChangeKeyframe {
-                        change = Some(Instant::now());
-                    }
-                };
-                pool.install(|| mapper.step(&frame, &pose, depth.as_ref(), &mut enter));
+                let mut change_begins = || change = Some(Instant::now());
+                pool.install(|| mapper.step(&frame, &pose, depth.as_ref(), &mut change_begins));
                 changes.extend(change.map(|begin| begin.elapsed().as_secs_f64() * 1e3));
                 pool.install(|| mapper.finish_keyframe());
                 if k > 0 {

@@ -171,12 +171,14 @@ fn record(
     });
     progress.finish();
     match replayed {
-        Err(ReplayError::Cut { record, cause }) => {
-            let fault =
-                format!("{cause}; the results are of the {} frames before", record.frames_in);
-            Ok(Some(Replayed { record: *record, fault: Some(fault) }))
+        Ok(record) => Ok(Some(Replayed { record, fault: None })),
+        Err(error) => {
+            let fault = Some(error.to_string());
+            match error {
+                ReplayError::Cut { record, .. } => Ok(Some(Replayed { record: *record, fault })),
+                error => Err(error.into()),
+            }
         }
-        replayed => Ok(Some(Replayed { record: replayed?, fault: None })),
     }
 }
 

@@ -15,7 +15,7 @@ use crate::service::schedule::{apply, in_force};
 use crate::service::shutdown::Shutdown;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{DepthPoint, Keyframe, KeyframePose, MAX_KEYFRAME_POINTS};
-use crate::slam::mapper::{Map, Mapper, Stage, StepOutcome};
+use crate::slam::mapper::{Map, Mapper, StepOutcome};
 use crate::slam::parameter::ParameterError;
 use crate::slam::pose::{NO_KEYFRAME, PoseEstimate};
 use crate::wire::command::{Command, CommandError, CommandServer};
@@ -255,13 +255,9 @@ impl<'a> Shell<'a> {
         let _span = tracing::trace_span!("frame", sequence = frame.sequence).entered();
         let begin = now_nanos();
         let mut change = None;
-        let mut enter = |stage| {
-            if stage == Stage::ChangeKeyframe {
-                change = Some(now_nanos());
-            }
-        };
+        let mut change_begins = || change = Some(now_nanos());
         let outcome = tracing::trace_span!("map")
-            .in_scope(|| self.pool.install(|| mapper.step(&frame, pose, None, &mut enter)));
+            .in_scope(|| self.pool.install(|| mapper.step(&frame, pose, None, &mut change_begins)));
         if pose.state.is_tracked() {
             self.last_pose = Some(*pose);
         }

@@ -16,7 +16,7 @@ use crate::slam::alignment::reference::Reference;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::frame::FrameView;
 use crate::slam::mapper::situation::Situation;
-use crate::slam::mapper::{Mapper, MapperParams, Stage, StepOutcome};
+use crate::slam::mapper::{Mapper, MapperParams, StepOutcome};
 use crate::slam::parameter::ParameterError;
 use crate::slam::pose::{PoseEstimate, TrackingState};
 use crate::slam::tracker::{Tracker, TrackerParams};
@@ -223,12 +223,9 @@ impl<'a> Replay<'a> {
         let was_rejected = matches!(self.mapper.situation(), Situation::Rejected(_));
         let begin = Instant::now();
         let mut change = None;
-        let mut enter = |stage| {
-            if stage == Stage::ChangeKeyframe {
-                change = Some(Instant::now());
-            }
-        };
-        let mut outcome = self.mapper.step(&frame, &pose, sensor_depth.as_ref(), &mut enter);
+        let mut change_begins = || change = Some(Instant::now());
+        let mut outcome =
+            self.mapper.step(&frame, &pose, sensor_depth.as_ref(), &mut change_begins);
         let change_nanos = change.map(elapsed_nanos);
         outcome.keyframe_changed |= self.mapper.finish_keyframe().keyframe_changed;
         let step_nanos = elapsed_nanos(begin);

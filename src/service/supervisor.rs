@@ -19,7 +19,6 @@ use crate::service::shutdown::Shutdown;
 use crate::slam::mapper::Map;
 use crate::slam::pose::TrackingState;
 use crate::wire::command::{Command, CommandClient, CommandError};
-use crate::wire::message::HealthMessage;
 use crate::wire::place::{Claim, Place, PlaceError};
 use crate::wire::port::{Access, Hub, OpenError, ReceiveError, WaitError, wait};
 use crate::wire::topic::shared_memory_bytes;
@@ -173,8 +172,8 @@ struct Supervisor<'a> {
     commands: CommandClient,
     hub: Hub,
     restarts: u64,
-    /// The last words of processes that died: what they have counted.
-    of_dead: Vec<(&'static str, HealthMessage)>,
+    /// What processes that died had counted by their last words.
+    of_dead: RunCounters,
     /// Restarts in a row of processes that died young.
     hasty_restarts: u32,
 }
@@ -196,7 +195,7 @@ impl<'a> Supervisor<'a> {
             commands: CommandClient::open(&hub)?,
             hub,
             restarts: 0,
-            of_dead: Vec::new(),
+            of_dead: RunCounters::default(),
             hasty_restarts: 0,
         };
         for name in ["mapper", "tracker", "capture"] {
@@ -286,7 +285,7 @@ impl<'a> Supervisor<'a> {
             self.back_off(shutdown)?;
             self.children[index] = self.spawn(process)?;
             for peer in self.peers.iter_mut().filter(|peer| peer.name() == process) {
-                self.of_dead.extend(peer.last().map(|last| (process, *last)));
+                count(&mut self.of_dead, peer);
                 peer.forget();
             }
             self.restarts += 1;
@@ -367,23 +366,35 @@ impl<'a> Supervisor<'a> {
         self.hub.clean_up();
         let [capture, tracker, _] = &self.peers;
         let peaks = self.peers.iter().filter_map(|peer| Some(peer.last()?.peak_rss_bytes));
-        let sum = |peer: &Peer, counted: fn(&HealthMessage) -> u64| -> u64 {
-            let of_dead = self.of_dead.iter().filter(|(name, _)| *name == peer.name());
-            of_dead.map(|(_, last)| last).chain(peer.last()).map(counted).sum()
-        };
+        let mut sums = self.of_dead;
+        [capture, tracker].into_iter().for_each(|peer| count(&mut sums, peer));
         let counters = RunCounters {
             // Who is killed leaves the count of a moment before.
-            frames_in: sum(capture, |health| health.frames).max(self.recorder.num_poses() as u64),
-            gaps: sum(capture, |health| health.gaps),
+            frames_in: sums.frames_in.max(self.recorder.num_poses() as u64),
             restarts: self.restarts,
-            deadline_misses: sum(tracker, |health| health.deadline_misses),
-            page_faults: sum(tracker, |health| health.page_faults),
             peak_rss_bytes: peaks.sum::<u64>() + peak_rss_bytes().unwrap_or(0),
+            ..sums
         };
         if capture.state() == Some(ProcessState::Failed) {
             tracing::debug!("capture has failed after {} frames", counters.frames_in);
         }
         Ok((self.recorder, counters))
+    }
+}
+
+/// Adds what a process has counted by its last word.
+fn count(sums: &mut RunCounters, peer: &Peer) {
+    let Some(last) = peer.last() else { return };
+    match peer.name() {
+        "capture" => {
+            sums.frames_in += last.frames;
+            sums.gaps += last.gaps;
+        }
+        "tracker" => {
+            sums.deadline_misses += last.deadline_misses;
+            sums.page_faults += last.page_faults;
+        }
+        _ => {}
     }
 }
 

@@ -51,7 +51,7 @@ pub struct MapperParams {
     /// quarter (0.7 instead of 1.0 %), 4 no further, and each is a search over all depths for every
     /// new pixel.
     pub num_seed_frames: usize,
-    /// Frames kept for that, newest first: bounds the memory (one byte a pixel each).
+    /// Frames kept for that, newest first, beside the keyframe in force: bounds the memory (one byte a pixel each).
     pub max_past_frames: usize,
     /// The depth is smoothed and published again when this share of it has changed: a map that
     /// hardly changed costs the tracker as much to prepare as a new one.
@@ -133,15 +133,6 @@ impl MapperParams {
         self.reuse.validate().map_err(|e| e.within("reuse"))?;
         self.recovery.validate().map_err(|e| e.within("recovery"))
     }
-}
-
-/// Parts of a step, for who measures them.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Stage {
-    /// Depth is looked for in the frame.
-    Observe,
-    /// Another keyframe is put in force.
-    ChangeKeyframe,
 }
 
 /// What changed in one step, and what has to be published.
@@ -251,16 +242,17 @@ impl Mapper {
     }
 
     /// Takes in one tracked frame. `sensor_depth` (metres, 0 where none) initialises the depth of
-    /// new keyframes where a depth camera may be used. `enter` hears of each stage as it begins.
+    /// new keyframes where a depth camera may be used. `change_begins` is called when
+    /// the frame is observed and another keyframe is to be put in force, for who measures that.
     pub fn step(
         &mut self,
         frame: &FrameView<'_>,
         pose: &PoseEstimate,
         sensor_depth: Option<&Image<f32>>,
-        enter: &mut dyn FnMut(Stage),
+        change_begins: &mut dyn FnMut(),
     ) -> StepOutcome {
         let finished = self.finish_keyframe();
-        let outcome = self.take_in(frame, pose, sensor_depth, enter);
+        let outcome = self.take_in(frame, pose, sensor_depth, change_begins);
         let keyframe_changed = outcome.keyframe_changed || finished.keyframe_changed;
         StepOutcome { keyframe_changed, ..outcome }
     }
@@ -270,7 +262,7 @@ impl Mapper {
         frame: &FrameView<'_>,
         pose: &PoseEstimate,
         sensor_depth: Option<&Image<f32>>,
-        enter: &mut dyn FnMut(Stage),
+        change_begins: &mut dyn FnMut(),
     ) -> StepOutcome {
         if !frame.is_consistent()
             || (frame.width, frame.height) != (self.intrinsics.width, self.intrinsics.height)
@@ -295,7 +287,6 @@ impl Mapper {
         self.frames_on_keyframe += 1;
         let initializing = self.map_state() == MapState::Initializing;
         self.guess_unit(pose);
-        enter(Stage::Observe);
         let observations = self.observe_frame(frame, pose);
         self.unpublished += observations.fused + observations.created;
         let points = self.keyframe().map_or(0, |keyframe| keyframe.points.len());
@@ -311,7 +302,7 @@ impl Mapper {
         }
         let due = self.frames_on_keyframe >= self.params.min_keyframe_interval;
         if pose.proposes_keyframe && due {
-            enter(Stage::ChangeKeyframe);
+            change_begins();
             let is_reused = self.reuse_keyframe(frame, pose);
             if !is_reused {
                 self.change_keyframe(frame, pose, sensor_depth);

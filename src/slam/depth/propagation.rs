@@ -341,5 +341,7 @@ mod tests {
         settle(&mut pixel, at(2.01, 1e-4));
         assert!((pixel.inverse_depth - 2.005).abs() < 1e-5);
         assert_eq!(pixel.variance, 1e-4);
+        // Without any variance there is nothing to weigh with.
+        assert!(joined(at(1.0, 0.0), &at(1.0, 0.0)).is_none());
     }
 }

@@ -230,9 +230,9 @@ mod tests {
 
     /// A camera that moves sideways with exact poses, exact depth for its first keyframe alone; a
     /// keyframe is asked for at the fifth step. What the steps and their rests gave, and the mapper.
-    fn walk(steps: u64, finishes: bool) -> (Vec<[Taken; 2]>, Mapper) {
+    fn walk(params: MapperParams, steps: u64, finishes: bool) -> (Vec<[Taken; 2]>, Mapper) {
         let scene = Scene::new(3);
-        let mut mapper = Mapper::new(CAMERA, MapperParams::default()).unwrap();
+        let mut mapper = Mapper::new(CAMERA, params).unwrap();
         let outcomes = (0..steps).map(|k| {
             let x = 0.08 * k as f64;
             let world_from_camera = SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() };
@@ -255,7 +255,7 @@ mod tests {
                 proposes_keyframe: k == 4,
                 ..PoseEstimate::unknown(&frame)
             };
-            let step = mapper.step(&frame, &pose, (k == 0).then_some(&depth), &mut |_| {});
+            let step = mapper.step(&frame, &pose, (k == 0).then_some(&depth), &mut || {});
             let taken = |outcome, mapper: &Mapper| {
                 let keyframes = mapper.map.keyframes.iter();
                 Taken { outcome, points: keyframes.map(|k| k.points.clone()).collect() }
@@ -269,7 +269,7 @@ mod tests {
 
     #[test]
     fn a_new_keyframe_is_published_first_and_finished_then() {
-        let (outcomes, mapper) = walk(6, true);
+        let (outcomes, mapper) = walk(MapperParams::default(), 6, true);
         let [step, rest] = &outcomes[4];
         let (published, then) = (step.outcome, rest.outcome);
         assert!(published.keyframe_created && published.needs_image());
@@ -279,7 +279,7 @@ mod tests {
         assert!(step.points[0] != rest.points[0]);
         assert!(rest.points[1].len() > step.points[1].len());
         // Who does not ask for the rest has it with the next step, and nothing else changes.
-        let (others, late) = walk(6, false);
+        let (others, late) = walk(MapperParams::default(), 6, false);
         assert!(others[5][0].outcome.keyframe_changed);
         for (one, other) in mapper.map().keyframes.iter().zip(&late.map().keyframes) {
             assert!(one.points == other.points, "keyframe {}", one.keyframe_id);
@@ -288,8 +288,16 @@ mod tests {
     }
 
     #[test]
+    fn one_past_frame_is_one_beside_the_keyframe() {
+        let params = MapperParams { max_past_frames: 1, ..MapperParams::default() };
+        let (outcomes, _) = walk(params, 5, true);
+        let [step, rest] = &outcomes[4];
+        assert!(rest.points[1].len() > step.points[1].len());
+    }
+
+    #[test]
     fn depth_that_was_forgotten_does_not_come_back() {
-        let (_, mut mapper) = walk(5, false);
+        let (_, mut mapper) = walk(MapperParams::default(), 5, false);
         assert!(!mapper.map.keyframes[0].points.is_empty());
         mapper.map.forget_depth_beyond(0);
         mapper.finish_keyframe();

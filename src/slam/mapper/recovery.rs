@@ -326,6 +326,25 @@ mod tests {
     }
 
     #[test]
+    fn points_that_no_filter_could_have_left_are_not_restored() {
+        let mut map = DepthMap::with_size(CAMERA.width, CAMERA.height);
+        let point = DepthPoint { u: 50, v: 40, inverse_depth: 1.0, variance: 1e-4, intensity: 0.0 };
+        let right = CAMERA.width as u16 - 1;
+        let points = [
+            point,
+            DepthPoint { u: 51, variance: 0.0, ..point },
+            DepthPoint { u: 52, variance: f32::NAN, ..point },
+            DepthPoint { u: 53, inverse_depth: -1.0, ..point },
+            DepthPoint { u: right, ..point },
+            DepthPoint { v: 0, ..point },
+            DepthPoint { v: u16::MAX, ..point },
+        ];
+        restore_points(&mut map, &points);
+        assert_eq!(map.num_hypotheses(), 1);
+        assert!(map.hypotheses.row(40)[50].is_some());
+    }
+
+    #[test]
     fn a_known_view_is_found_on_its_keyframe_and_an_unknown_one_on_none() {
         let scene = Scene::new(3);
         let home = at([0.0; 6]);

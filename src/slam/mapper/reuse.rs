@@ -200,7 +200,7 @@ mod tests {
                 proposes_keyframe: true,
                 ..PoseEstimate::unknown(&frame)
             };
-            self.mapper.step(&frame, &pose, Some(&depth), &mut |_| {})
+            self.mapper.step(&frame, &pose, Some(&depth), &mut || {})
         }
     }
 
