@@ -13,10 +13,13 @@ use semidense::capture::{png_image, sensor_yaml};
 use semidense::service::config::Config;
 use semidense::service::frame_order::FrameOrder;
 use semidense::service::health::{ProcessState, cause, percentile_ms, warning};
+use semidense::service::journal::recovered::Recovered;
 use semidense::service::map_file::parse_map;
 use semidense::service::pairing::Pairing;
+use semidense::service::recording::RecordParts;
 use semidense::service::trajectory_file::{parse_trajectory, tum_line};
 use semidense::slam::alignment::reference::{Reference, ReferenceParams};
+use semidense::slam::evaluation::depth_error::DepthScale;
 use semidense::slam::frame::FrameView;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::rectification::Rectification;
@@ -205,6 +208,27 @@ pub fn map(bytes: &[u8]) {
         let unknown = semidense::slam::pose::PoseEstimate::unknown(&view.frame());
         mapper.step(&view.frame(), &unknown, None, &mut || {});
     }
+}
+
+/// The log of a journal: what is read is a run that results can be made of.
+pub fn journal(bytes: &[u8]) {
+    let Some(found) = Recovered::from_log(bytes) else { return };
+    let folder = Path::new("/nowhere");
+    let map = found.map(folder, 1 << 20);
+    assert!(map.keyframes.iter().all(|keyframe| keyframe.world_from_keyframe.is_valid()));
+    let poses = found.recording.num_poses();
+    assert!(found.counters.frames_in >= poses as u64);
+    let record = found.recording.into_record(RecordParts {
+        mode: found.start.mode,
+        source: found.start.source,
+        map,
+        ground_truth: Vec::new(),
+        depth_scale: DepthScale::MedianRatio,
+        deadline_ms: 0.0,
+        counters: found.counters,
+    });
+    assert_eq!(record.poses.len(), poses);
+    let _ = Config::from_text(&found.start.config, "journal");
 }
 
 /// One message of any topic: the first byte says which.

@@ -1,11 +1,14 @@
 //! Small good inputs, from which fuzzing starts: made here, so that none is a file of somebody's.
 
+use semidense::service::journal::log::{Record, RunStart, Step, log_header};
 use semidense::service::map_file::write_map;
+use semidense::service::recording::RunCounters;
+use semidense::service::results::RunMode;
 use semidense::slam::frame::FrameView;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::geometry::sim3::Sim3;
-use semidense::slam::keyframe::{DepthPoint, Keyframe, MapState};
+use semidense::slam::keyframe::{DepthPoint, Keyframe, KeyframePose, MapState};
 use semidense::slam::mapper::Map;
 use semidense::slam::pose::{PoseEstimate, TrackingState};
 use semidense::wire::conversion::{
@@ -75,6 +78,7 @@ pub fn seeds() -> Vec<Seed> {
         kind(1, b"mapper.threads=2\nsimulator.motion.mean_speed_m_s=1.0\ninstance=rig2\n"),
     );
     add("map", map_bytes());
+    add("journal", journal());
     messages()
         .into_iter()
         .zip(0..)
@@ -130,6 +134,31 @@ fn map_bytes() -> Vec<u8> {
     write_map(&path, &Map { keyframes: vec![keyframe(), second], free_epoch: 17 })
         .expect("written");
     std::fs::read(path).expect("read")
+}
+
+fn journal() -> Vec<u8> {
+    let start = RunStart {
+        mode: RunMode::Live,
+        source: "sim".to_owned(),
+        rig: None,
+        folder: "/".to_owned(),
+        config: "instance = \"rig\"\n".to_owned(),
+        poses_given: false,
+        began_secs: 1,
+    };
+    let world_from_keyframe = Sim3::new(SE3::identity(), 2.0);
+    let without_depth = Keyframe { image: Vec::new(), points: Vec::new(), ..keyframe() };
+    let records = [
+        Record::Start(Box::new(start)),
+        Record::Pose(Box::new(pose_message(&pose(1), &PoseTiming::default()))),
+        Record::Step(Step { step_nanos: 5, change_nanos: 3, start_frame: 1 }),
+        Record::Keyframe(Box::new(without_depth)),
+        Record::KeyframePose(0, KeyframePose { keyframe_id: 0, world_from_keyframe }),
+        Record::Counters(RunCounters { frames_in: 2, ..RunCounters::default() }),
+    ];
+    let mut bytes = log_header();
+    records.iter().for_each(|record| record.write(&mut bytes));
+    bytes
 }
 
 fn frame_header(sequence: u64) -> FrameHeader {

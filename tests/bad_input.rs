@@ -173,7 +173,8 @@ fn a_rig_of_another_camera_is_warned_of_in_one_line() {
             let mut command = rig.command(&arguments);
             command.arg("--rig").arg(&camera).arg("--output").arg(&output);
             let ended = finish(command);
-            assert!(ended.status.success(), "{}", ended.stderr);
+            // Nothing can be tracked on so few pictures.
+            assert_eq!(ended.status.code(), Some(3), "{}", ended.stderr);
             let warnings: Vec<_> =
                 ended.stderr.lines().filter(|line| line.contains("camera.txt")).collect();
             assert_eq!(warnings.len(), usize::from(is_warned), "{}", ended.stderr);
@@ -205,12 +206,13 @@ fn results_that_do_not_fit_are_one_line_and_no_half_file() {
     let output = rig.output();
     let arguments = format!("replay sim --frames 2 --output '{}'", output.display());
     let ended = finish(with_small_files(&rig, &arguments));
-    assert_refused(&ended, &["output/report.html", "--output"], "full folder");
+    assert_refused(&ended, &["output/report.html", "MB are free", "--output"], "full folder");
     let names: Vec<String> = fs::read_dir(&output)
         .unwrap()
         .map(|entry| entry.unwrap().file_name().to_string_lossy().into_owned())
         .collect();
-    assert!(!names.iter().any(|n| n.starts_with('.') || n == "report.html"), "{names:?}");
+    // The run is not lost: its journal is all that there is.
+    assert!(names.len() == 1 && names[0].starts_with(".semidense-journal"), "{names:?}");
 }
 
 #[test]

@@ -117,7 +117,8 @@ fn a_name_that_is_none_is_refused_before_the_work() {
 fn results_survive_a_replay_that_is_interrupted_before_its_first_frame() {
     let folder = tempfile::tempdir().unwrap();
     let earlier = folder.path().join("trajectory.txt");
-    std::fs::write(&earlier, "of an earlier run").unwrap();
+    let of_an_earlier_run = "# world_from_camera of every tracked frame: of an earlier run\n";
+    std::fs::write(&earlier, of_an_earlier_run).unwrap();
     let mut child = Command::new(env!("CARGO_BIN_EXE_semidense"))
         .args(["replay", "sim", "--output"])
         .arg(folder.path())
@@ -132,7 +133,7 @@ fn results_survive_a_replay_that_is_interrupted_before_its_first_frame() {
     let rest: Vec<String> = said.map_while(Result::ok).collect();
     assert_eq!(child.wait().unwrap().code(), Some(130), "{rest:?}");
     assert!(rest.iter().any(|line| line.contains("there are no results")), "{rest:?}");
-    assert_eq!(std::fs::read_to_string(&earlier).unwrap(), "of an earlier run");
+    assert_eq!(std::fs::read_to_string(&earlier).unwrap(), of_an_earlier_run);
 }
 
 #[test]

@@ -4,8 +4,10 @@ use std::path::Path;
 
 use semidense::capture::source::{FrameSource, FrameStamp, SourceError};
 use semidense::service::alignment_stamps::{AlignmentTrace, LevelTrace};
+use semidense::service::results::output_folder::prepare_output;
+use semidense::service::results::untracked::StartTally;
 use semidense::service::results::{
-    RecordedPose, Rejection, ResultsParams, RunMode, RunRecord, prepare_output, write_results,
+    EndOfRun, RecordedPose, Rejection, ResultsParams, RunMode, RunRecord, write_results,
 };
 use semidense::service::trajectory_file::read_trajectory;
 use semidense::slam::evaluation::depth_error::DepthScale;
@@ -133,6 +135,7 @@ fn record(poses: Vec<RecordedPose>, keyframes: Vec<Keyframe>, with_truth: bool) 
     RunRecord {
         mode: RunMode::Lockstep,
         source: "tum:a<script>\"b\"".to_owned(),
+        ended: EndOfRun::Interrupted,
         poses,
         map: Map { keyframes, ..Map::default() },
         ground_truth: if with_truth { (0..frames).map(pose).collect() } else { Vec::new() },
@@ -147,6 +150,7 @@ fn record(poses: Vec<RecordedPose>, keyframes: Vec<Keyframe>, with_truth: bool) 
         map_nanos: vec![2_000_000; frames],
         keyframe_step_nanos: vec![5_000_000; 3],
         keyframe_nanos: vec![3_000_000; 3],
+        start: StartTally::default(),
         rejections: None,
         budget_samples: Vec::new(),
         recorded_nanos: 2_000_000_000,

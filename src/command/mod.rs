@@ -1,16 +1,18 @@
 //! The command line: arguments → configuration → shell → exit code.
 //!
 //! Exit codes: 0 done, 1 failed (one line says what, where and what to do), 2 the command line is
-//! not understood, 130 interrupted (results so far are written).
+//! not understood, 3 nothing was tracked (one line says why), 130 interrupted (results so far are written).
 
 pub mod bench;
 pub mod cameras;
 pub mod capture;
 pub mod doctor;
+pub mod ending;
 pub mod evaluate;
 pub mod mapper;
 pub mod print;
 pub mod progress;
+pub mod recover;
 pub mod replay;
 pub mod run;
 pub mod run_progress;
@@ -36,6 +38,9 @@ use crate::wire::place::Place;
 /// Exit code of a run that was interrupted: 128 + SIGINT, as shells have it.
 const INTERRUPTED: u8 = 130;
 
+/// Exit code of a run that has tracked nothing.
+const NOTHING_TRACKED: u8 = 3;
+
 /// Heading of the options that every command has.
 const COMMON: &str = "Common options";
 
@@ -48,9 +53,9 @@ pub type CommandResult = Result<ExitCode, Box<dyn Error>>;
     version,
     about = "Real-time semi-dense direct visual SLAM for robot computers",
     after_help = "Start with `semidense run`: it simulates a camera in a furnished room, tracks it, maps the room,\n\
-                  and writes trajectory, map and figures into ./output.\n\
+                  and writes trajectory, map and figures into a new folder below ./output.\n\
                   Then `semidense run --source tum:DIR` for a recording.\n\n\
-                  Exit codes: 0 done, 1 failed, 2 wrong usage, 130 interrupted before the end (results so far are written)."
+                  Exit codes: 0 done, 1 failed, 2 wrong usage, 3 nothing was tracked, 130 interrupted before the end (results so far are written)."
 )]
 struct CommandLine {
     #[command(flatten)]
@@ -140,6 +145,7 @@ enum Subcommands {
     Tracker(tracker::TrackerArguments),
     Mapper(mapper::MapperArguments),
     Replay(replay::ReplayArgs),
+    Recover(recover::RecoverArguments),
     Simulate(Box<simulate::SimulateArgs>),
     Evaluate(evaluate::EvaluateArgs),
     Status(status::StatusArguments),
@@ -164,6 +170,7 @@ pub fn main() -> ExitCode {
             Subcommands::Tracker(arguments) => tracker::run(&config, arguments),
             Subcommands::Mapper(arguments) => mapper::run(&config, arguments),
             Subcommands::Replay(arguments) => replay::run(&config, &arguments),
+            Subcommands::Recover(arguments) => recover::run(&config, &arguments),
             Subcommands::Simulate(arguments) => simulate::run(&config, &arguments),
             Subcommands::Evaluate(arguments) => evaluate::run(&arguments),
             Subcommands::Status(arguments) => status::run(&config, arguments),

@@ -1,25 +1,32 @@
 //! `semidense replay`: a sequence through tracker and mapper in one process, deterministic.
 
 use std::error::Error;
-use std::path::PathBuf;
+use std::io;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::{Args, ValueEnum};
 
 use crate::capture::source::{FrameSource, SourceName, open, rig_conflict};
 use crate::command::INTERRUPTED;
-use crate::command::print::{note, print};
+use crate::command::ending::{Ending, note_unfinished, run_start};
+use crate::command::print::note;
 use crate::command::progress::Progress;
 use crate::service::config::Config;
+use crate::service::journal::folder::unfinished;
+use crate::service::journal::log::RunStart;
+use crate::service::journal::replayed::ReplayJournal;
+use crate::service::journal::{Journal, JournalOptions};
 use crate::service::replay::{
     DepthOrigin, PoseOrigin, ReplayConfig, ReplayError, ReplayProgress, replay,
 };
 use crate::service::results::debug_pictures::write_debug_pictures;
-use crate::service::results::summary_text::summary_text;
-use crate::service::results::{RunRecord, prepare_output, write_results};
+use crate::service::results::output_folder::OutputFolder;
+use crate::service::results::set::DEBUG_FOLDER;
+use crate::service::results::{EndOfRun, RunRecord};
+use crate::service::shutdown::Shutdown;
 use crate::slam::pose::TrackingState;
+use crate::wire::place::Place;
 
 /// Where poses come from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
@@ -50,9 +57,9 @@ pub struct ReplayArgs {
     #[arg(long, value_name = "FILE")]
     rig: Option<PathBuf>,
     /// Folder for trajectory.txt, trajectory_online.txt, keyframes.txt, map.ply, map.pcd, summary.json
-    /// and report.html
-    #[arg(long, value_name = "DIR", default_value = "output")]
-    output: PathBuf,
+    /// and report.html [default: a new one below ./output, named by the time (UTC); output/latest leads to the newest]
+    #[arg(long, value_name = "DIR")]
+    output: Option<PathBuf>,
     /// Where the first depth of a keyframe comes from
     #[arg(long, value_enum, default_value_t)]
     initial_depth: InitialDepth,
@@ -85,9 +92,10 @@ pub fn run(config: &Config, args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error
             format!("{name}: a camera cannot be replayed; semidense run --source {name}").into()
         );
     }
-    let interrupted = Arc::new(AtomicBool::new(false));
-    signal_hook::flag::register(signal_hook::consts::SIGINT, Arc::clone(&interrupted))?;
-    prepare_output(&args.output)?;
+    let shutdown = Shutdown::install()?;
+    let place = Place::new(&config.instance, &config.root)?;
+    let output = OutputFolder::prepare(args.output.as_deref())?;
+    note_unfinished(&unfinished(Some(&place), output.path()));
     let mut params = config.source_params();
     let simulator = &mut params.simulator;
     simulator.seed = args.seed.unwrap_or(simulator.seed);
@@ -101,35 +109,38 @@ pub fn run(config: &Config, args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error
         .num_threads(threads)
         .thread_name(|i| format!("mapper-{i}"))
         .build()?;
+    let journal = JournalOptions {
+        output: output.path().to_owned(),
+        start: RunStart {
+            poses_given: args.poses == Poses::Groundtruth,
+            ..run_start(
+                &Config { simulator: params.simulator, ..config.clone() },
+                &args.source,
+                args.rig.as_deref(),
+            )
+        },
+        max_depth_bytes: config.mapping.max_map_bytes() as u64,
+    };
+    let begin = || ReplayJournal::begin(&journal, &place);
     let replayed = pool.install(|| {
-        record(config, args, source.as_mut(), &interrupted).map_err(|error| error.to_string())
+        record(config, args, source.as_mut(), &shutdown, &begin).map_err(|error| error.to_string())
     })?;
-    let Some(Replayed { record, fault }) = replayed else {
+    let Some(Replayed { record, journal }) = replayed else {
         note("interrupted before the first frame: there are no results");
         return Ok(ExitCode::from(INTERRUPTED));
     };
-    let summary = write_results(&args.output, &record, source.as_mut(), &config.results)?;
-    if args.debug_images {
-        write_debug_pictures(&args.output.join("debug"), &record.map, &config.tracking)?;
-    }
-    if args.json {
-        print(&format!("{}\n", serde_json::to_string_pretty(&summary)?))?;
-    } else {
-        let place = args.output.display();
-        print(&format!("{}results in {place}\n", summary_text(&summary)))?;
-    }
-    if let Some(fault) = fault {
-        return Err(fault.into());
-    }
-    let code = if interrupted.load(Ordering::Relaxed) { INTERRUPTED } else { 0 };
-    Ok(ExitCode::from(code))
+    let write_more = |folder: &Path| match args.debug_images {
+        true => write_debug_pictures(&folder.join(DEBUG_FOLDER), &record.map, &config.tracking),
+        false => Ok(()),
+    };
+    let ending = Ending { output: &output, config, json: args.json, write_more: &write_more };
+    ending.finish(&record, source.as_mut(), journal)
 }
 
 /// What was replayed.
 struct Replayed {
     record: RunRecord,
-    /// Why the source failed on the way.
-    fault: Option<String>,
+    journal: Option<Journal>,
 }
 
 /// Prepares the source and replays it under a progress bar; `None` where Ctrl-C came before a frame.
@@ -137,9 +148,10 @@ fn record(
     config: &Config,
     args: &ReplayArgs,
     source: &mut dyn FrameSource,
-    interrupted: &AtomicBool,
+    shutdown: &Shutdown,
+    begin_journal: &dyn Fn() -> io::Result<ReplayJournal>,
 ) -> Result<Option<Replayed>, Box<dyn Error>> {
-    let goes_on = || !interrupted.load(Ordering::Relaxed);
+    let goes_on = || !shutdown.is_requested();
     let mut preparing: Option<Progress> = None;
     source.prepare(&mut |done, total| {
         let progress = preparing.get_or_insert_with(|| Progress::new("preparing", Some(total)));
@@ -165,24 +177,35 @@ fn record(
     };
     let total = source.num_frames().map(|n| n.min(config.max_frames.unwrap_or(n)));
     let progress = Progress::new("replay", total);
+    let mut journal = begin_journal()
+        .inspect_err(|error| {
+            tracing::warn!("no journal is kept ({error}); a kill would lose the replay")
+        })
+        .ok();
     let replayed = replay(source, &args.source.to_string(), &config, &mut |frame| {
         progress.update(frame.done, state_word(frame));
+        journal.iter_mut().for_each(|journal| journal.observe(frame));
         goes_on()
     });
     progress.finish();
-    match replayed {
-        Ok(record) => Ok(Some(Replayed { record, fault: None })),
+    let journal = journal.map(ReplayJournal::into_journal);
+    let (record, ended) = match replayed {
+        Ok(record) if goes_on() => (record, EndOfRun::Finished),
+        Ok(record) => (record, EndOfRun::Interrupted),
         Err(error) => {
-            let fault = Some(error.to_string());
-            match error {
-                ReplayError::Cut { record, .. } => Ok(Some(Replayed { record: *record, fault })),
-                error => Err(error.into()),
-            }
+            let fault = error.to_string();
+            let ReplayError::Cut { record, .. } = error else {
+                // There is nothing that could be lost.
+                drop(journal.map(Journal::finish));
+                return Err(error.into());
+            };
+            (*record, EndOfRun::Failed(fault))
         }
-    }
+    };
+    Ok(Some(Replayed { record: RunRecord { ended, ..record }, journal }))
 }
 
-fn state_word(frame: &ReplayProgress) -> &'static str {
+fn state_word(frame: &ReplayProgress<'_>) -> &'static str {
     match frame.state {
         TrackingState::Initializing => "initializing",
         TrackingState::Tracking => "tracking",

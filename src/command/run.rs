@@ -6,14 +6,20 @@ use std::process::ExitCode;
 use clap::Args;
 
 use crate::command::capture::{ModeArguments, SourceArguments, usual_mode};
-use crate::command::print::{note, print};
+use crate::command::ending::{Ending, note_unfinished, run_start};
+use crate::command::print::note;
 use crate::command::run_progress::RunDisplay;
 use crate::command::{CommandResult, CommonArguments, INTERRUPTED};
 use crate::service::config::Config;
-use crate::service::results::summary_text::summary_text;
-use crate::service::results::{prepare_output, write_results};
+use crate::service::journal::folder::unfinished;
+use crate::service::journal::log::RunStart;
+use crate::service::journal::{Journal, JournalOptions};
+use crate::service::mode::Mode;
+use crate::service::results::RunMode;
+use crate::service::results::output_folder::OutputFolder;
 use crate::service::shutdown::Shutdown;
 use crate::service::supervisor::{Ended, RunOptions, run as supervise};
+use crate::wire::place::Place;
 
 /// Start capture, tracker and mapper on a source, watch them, and write the results
 #[derive(Debug, Args)]
@@ -23,9 +29,10 @@ pub struct RunArguments {
     source: SourceArguments,
     #[command(flatten)]
     mode: ModeArguments,
-    /// Folder for trajectory, keyframes, map, summary and report
-    #[arg(long, value_name = "DIR", default_value = "output")]
-    output: PathBuf,
+    /// Folder for trajectory, keyframes, map, summary and report [default: a new one below ./output, named by the
+    /// time (UTC); output/latest leads to the newest]
+    #[arg(long, value_name = "DIR")]
+    output: Option<PathBuf>,
     /// Print the summary as JSON, and no progress
     #[arg(long)]
     json: bool,
@@ -35,40 +42,39 @@ pub struct RunArguments {
 pub fn run(config: &Config, common: &CommonArguments, arguments: RunArguments) -> CommandResult {
     let (source, rig) = arguments.source.source_and_rig(&config.capture)?;
     let mode = arguments.mode.mode(usual_mode(&source));
-    prepare_output(&arguments.output)?;
+    let place = Place::new(&config.instance, &config.root)?;
+    let output = OutputFolder::prepare(arguments.output.as_deref())?;
+    note_unfinished(&unfinished(Some(&place), output.path()));
     let shutdown = Shutdown::install()?;
+    let journal = JournalOptions {
+        output: output.path().to_owned(),
+        start: RunStart {
+            mode: if mode == Mode::Live { RunMode::Live } else { RunMode::Lockstep },
+            ..run_start(config, &source, rig.as_deref())
+        },
+        max_depth_bytes: config.mapping.max_map_bytes() as u64,
+    };
     let options = RunOptions {
         source,
         rig,
         mode,
-        output: arguments.output.clone(),
+        output: output.path().to_owned(),
         keeps_map: true,
+        journal: Some(journal),
         arguments: common.to_arguments(),
     };
     let mut display = RunDisplay::new(arguments.json);
     let mut outcome = supervise(config, &options, &shutdown, &mut |p| display.show(p))?;
     display.finish();
-    if outcome.record.poses.is_empty() && outcome.ended == Ended::Interrupted {
-        note("interrupted before the first pose: there are no results");
-        return Ok(ExitCode::from(INTERRUPTED));
+    if outcome.record.poses.is_empty() && outcome.ended != Ended::Finished {
+        // There is nothing that could be lost.
+        drop(outcome.journal.take().map(Journal::finish));
+        let Ended::Failed(cause) = outcome.ended else {
+            note("interrupted before the first pose: there are no results");
+            return Ok(ExitCode::from(INTERRUPTED));
+        };
+        return Err(cause.into());
     }
-    if let (true, Ended::Failed(cause)) = (outcome.record.poses.is_empty(), &outcome.ended) {
-        return Err(cause.as_str().into());
-    }
-    let source = outcome.source.as_mut();
-    let summary = write_results(&arguments.output, &outcome.record, source, &config.results)?;
-    if arguments.json {
-        print(&format!("{}\n", serde_json::to_string_pretty(&summary)?))?;
-    } else {
-        let place = arguments.output.display();
-        print(&format!("{}results in {place}\n", summary_text(&summary)))?;
-    }
-    match outcome.ended {
-        Ended::Finished => Ok(ExitCode::SUCCESS),
-        Ended::Interrupted => {
-            note(&format!("interrupted: the results so far are in {}", arguments.output.display()));
-            Ok(ExitCode::from(INTERRUPTED))
-        }
-        Ended::Failed(cause) => Err(cause.into()),
-    }
+    let ending = Ending { output: &output, config, json: arguments.json, write_more: &|_| Ok(()) };
+    ending.finish(&outcome.record, outcome.source.as_mut(), outcome.journal.take())
 }

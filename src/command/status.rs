@@ -1,6 +1,7 @@
 //! `semidense status`: what is running, and how well.
 
 use std::io::IsTerminal;
+use std::path::Path;
 use std::process::ExitCode;
 use std::time::Duration;
 
@@ -8,10 +9,12 @@ use clap::Args;
 use serde_json::{Value, json};
 
 use crate::command::CommandResult;
+use crate::command::ending::note_unfinished;
 use crate::command::print::print;
 use crate::service::clock::now_nanos;
 use crate::service::config::Config;
 use crate::service::health::{cause, percentile_ms, scheduling_name, warning};
+use crate::service::journal::folder::unfinished;
 use crate::service::peers::{HEALTH_TOPICS, Peer};
 use crate::service::shutdown::Shutdown;
 use crate::wire::message::HealthMessage;
@@ -44,6 +47,7 @@ pub struct StatusArguments {
 /// Runs it.
 pub fn run(config: &Config, arguments: StatusArguments) -> CommandResult {
     let place = Place::new(&config.instance, &config.root)?;
+    note_unfinished(&unfinished(Some(&place), Path::new(".")));
     let hub = Hub::join(&place, "status", Access::Observer)?;
     let mut peers = Vec::new();
     for topic in &HEALTH_TOPICS {

@@ -167,6 +167,7 @@ pub fn try_out(
         mode: Mode::Live,
         output: PathBuf::new(),
         keeps_map: false,
+        journal: None,
         arguments: arguments
             .iter()
             .cloned()

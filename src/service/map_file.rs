@@ -130,6 +130,22 @@ pub fn parse_map(path: &Path, bytes: impl Read) -> Result<Map, MapFileError> {
     }
 }
 
+/// The bytes of one keyframe, as in the file.
+pub fn keyframe_bytes(keyframe: &Keyframe) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    // Writing into memory cannot fail.
+    let _ = write_keyframe(&mut bytes, keyframe);
+    bytes
+}
+
+/// The keyframe of [`keyframe_bytes`], and nothing after it.
+pub fn parse_keyframe(bytes: &[u8]) -> Result<Keyframe, MapFileError> {
+    let path = Path::new("keyframe");
+    let mut reader = Reader { file: bytes, path };
+    let keyframe = reader.keyframe(0)?;
+    if reader.file.is_empty() { Ok(keyframe) } else { Err(MapFileError::Trailing(path.to_owned())) }
+}
+
 /// Reads numbers and says where it failed.
 struct Reader<'a, R> {
     file: R,

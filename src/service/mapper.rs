@@ -20,8 +20,8 @@ use crate::slam::parameter::ParameterError;
 use crate::slam::pose::{NO_KEYFRAME, PoseEstimate};
 use crate::wire::command::{Command, CommandError, CommandServer};
 use crate::wire::conversion::{
-    code_from_map_state, frame_from_message, keyframe_header, keyframe_image_header,
-    keyframe_pose_message, pose_from_message, rigid_message,
+    code_from_map_state, code_from_start_frame, frame_from_message, keyframe_header,
+    keyframe_image_header, keyframe_pose_message, pose_from_message, rigid_message,
 };
 use crate::wire::message::{
     FrameHeader, GraphHeader, KeyframeHeader, KeyframeImageHeader, KeyframePoseMessage,
@@ -412,6 +412,8 @@ impl Output {
                 .map_or_else(Default::default, |pose| rigid_message(&pose.world_from_camera)),
             has_pose: u32::from(pose.is_some()),
             epoch,
+            start_frame: code_from_start_frame(mapper.start_frame()),
+            reserved: 0,
         };
         self.steps.send((), &[step])
     }

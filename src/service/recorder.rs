@@ -1,12 +1,13 @@
-//! Collects what a run publishes until its results are written.
+//! Collects what a run publishes until its results are written, and keeps its journal.
 
-use crate::service::mode::Mode;
-use crate::service::results::{RecordedPose, RunMode, RunRecord};
-use crate::slam::evaluation::depth_error::DepthScale;
+use crate::service::journal::Journal;
+use crate::service::journal::feed::KeyframeFeed;
+use crate::service::journal::log::{Record, Step};
+use crate::service::journal::recovered::complete;
+use crate::service::recording::{RecordParts, Recording, RunCounters};
+use crate::service::results::RunRecord;
 use crate::slam::mapper::Map;
 use crate::slam::pose::TrackingState;
-use crate::slam::trajectory::StampedPose;
-use crate::wire::conversion::pose_from_message;
 use crate::wire::message::{PoseMessage, StepMessage};
 use crate::wire::port::{Events, Hub, OpenError, ReceiveError, Subscriber};
 use crate::wire::topic::{POSE, STEP};
@@ -16,44 +17,22 @@ use crate::wire::topic::{POSE, STEP};
 pub struct Recorder {
     poses: Subscriber<PoseMessage, ()>,
     steps: Subscriber<StepMessage, ()>,
-    recorded: Vec<RecordedPose>,
-    map_nanos: Vec<u64>,
-    keyframe_step_nanos: Vec<u64>,
-    keyframe_nanos: Vec<u64>,
+    recording: Recording,
     last_step: Option<StepMessage>,
-    /// CLOCK_MONOTONIC of the first frame and of the last pose.
-    span_nanos: Option<(i64, i64)>,
-}
-
-/// What only the supervisor knows of a run.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct RunCounters {
-    /// Frames that capture sent.
-    pub frames_in: u64,
-    /// Holes in the source's sequence.
-    pub gaps: u64,
-    /// Processes that were started again.
-    pub restarts: u64,
-    /// Frames published after the deadline.
-    pub deadline_misses: u64,
-    /// Page faults of the tracker's frame loop since it was warm.
-    pub page_faults: u64,
-    /// Largest resident memory of all processes together, bytes.
-    pub peak_rss_bytes: u64,
+    /// The journal and what only it needs.
+    journal: Option<(Journal, KeyframeFeed)>,
 }
 
 impl Recorder {
-    /// Listens from now on.
-    pub fn open(hub: &Hub) -> Result<Self, OpenError> {
+    /// Listens from now on; what comes goes into the journal too, where there is one.
+    pub fn open(hub: &Hub, journal: Option<Journal>) -> Result<Self, OpenError> {
+        let keyframes = journal.is_some().then(|| KeyframeFeed::open(hub)).transpose()?;
         Ok(Self {
             poses: hub.subscriber(&POSE)?,
             steps: hub.subscriber(&STEP)?,
-            recorded: Vec::new(),
-            map_nanos: Vec::new(),
-            keyframe_step_nanos: Vec::new(),
-            keyframe_nanos: Vec::new(),
+            recording: Recording::default(),
             last_step: None,
-            span_nanos: None,
+            journal: journal.zip(keyframes),
         })
     }
 
@@ -64,51 +43,53 @@ impl Recorder {
 
     /// Takes in everything that came; whether that was anything.
     pub fn collect(&mut self) -> Result<bool, ReceiveError> {
-        let before = self.recorded.len() + self.map_nanos.len();
+        let before = self.recording.num_poses() + self.recording.num_steps();
         while let Some(message) = self.poses.receive()? {
-            if let Some(pose) = message.payload().first() {
-                self.take_pose(pose);
+            let Some(pose) = message.payload().first() else { continue };
+            match self.recording.take_pose(pose) {
+                Err(error) => tracing::warn!("tracker/pose: {error}"),
+                Ok(()) => self.keep(|| Record::Pose(Box::new(*pose))),
             }
         }
         while let Some(message) = self.steps.receive()? {
             let Some(step) = message.payload().first() else { continue };
-            self.map_nanos.push(step.step_nanos);
-            if step.change_nanos > 0 {
-                self.keyframe_step_nanos.push(step.step_nanos);
-                self.keyframe_nanos.push(step.change_nanos);
-            }
+            let StepMessage { step_nanos, change_nanos, start_frame, .. } = *step;
+            self.recording.take_step(step_nanos, change_nanos, start_frame);
+            self.keep(|| Record::Step(Step { step_nanos, change_nanos, start_frame }));
             self.last_step = Some(*step);
         }
-        Ok(self.recorded.len() + self.map_nanos.len() > before)
+        if let Some((journal, keyframes)) = &mut self.journal {
+            keyframes.collect(journal, false)?;
+        }
+        Ok(self.recording.num_poses() + self.recording.num_steps() > before)
     }
 
-    fn take_pose(&mut self, message: &PoseMessage) {
-        match pose_from_message(message) {
-            Err(error) => tracing::warn!("tracker/pose: {error}"),
-            Ok(estimate) => {
-                let latency = i64::try_from(message.latency_nanos).unwrap_or(i64::MAX);
-                let sent_nanos = message.published_nanos.saturating_sub(latency);
-                let first = self.span_nanos.map_or(sent_nanos, |(first, _)| first);
-                self.span_nanos = Some((first, message.published_nanos));
-                self.recorded.push(RecordedPose {
-                    estimate,
-                    latency_nanos: Some(message.latency_nanos),
-                    track_nanos: Some(message.track_nanos),
-                    trace: None,
-                    wake_nanos: Some(message.wake_nanos),
-                });
-            }
+    fn keep(&mut self, record: impl FnOnce() -> Record) {
+        if let Some((journal, _)) = &mut self.journal {
+            journal.append(&record());
+        }
+    }
+
+    /// Whether what was counted is due in the journal.
+    pub fn wants_counters(&self) -> bool {
+        self.journal.as_ref().is_some_and(|(journal, _)| journal.wants_counters())
+    }
+
+    /// Keeps what was counted until now.
+    pub fn count(&mut self, counters: RunCounters) {
+        if let Some((journal, _)) = &mut self.journal {
+            journal.count(counters);
         }
     }
 
     /// Poses so far.
     pub fn num_poses(&self) -> usize {
-        self.recorded.len()
+        self.recording.num_poses()
     }
 
     /// State of the last frame.
     pub fn state(&self) -> Option<TrackingState> {
-        self.recorded.last().map(|pose| pose.estimate.state)
+        self.recording.state()
     }
 
     /// What the mapper said last.
@@ -116,47 +97,26 @@ impl Recorder {
         self.last_step.as_ref()
     }
 
-    /// The record of the whole run.
-    pub fn into_record(
-        self,
-        mode: Mode,
-        source: String,
-        map: Map,
-        ground_truth: Vec<StampedPose>,
-        deadline_ms: f64,
-        counters: &RunCounters,
-    ) -> RunRecord {
-        let stamps = |pose: Option<&RecordedPose>| pose.map_or(0, |p| p.estimate.capture_nanos);
-        let (first, last) = (stamps(self.recorded.first()), stamps(self.recorded.last()));
-        let positive = |nanos: i64| u64::try_from(nanos).unwrap_or(0);
-        let recorded_nanos = positive(last.saturating_sub(first));
-        let period_nanos = recorded_nanos / counters.frames_in.saturating_sub(1).max(1);
-        let deadline_nanos =
-            if deadline_ms > 0.0 { (deadline_ms * 1e6) as u64 } else { period_nanos / 2 };
-        let is_live = mode == Mode::Live;
-        let wall_nanos = self.span_nanos.map_or(0, |(first, last)| last.saturating_sub(first));
-        RunRecord {
-            mode: if is_live { RunMode::Live } else { RunMode::Lockstep },
-            source,
-            frames_in: counters.frames_in,
-            frames_dropped: counters.frames_in.saturating_sub(self.recorded.len() as u64),
-            poses: self.recorded,
-            map,
-            ground_truth,
-            depth_scale: DepthScale::MedianRatio,
-            gaps: counters.gaps,
-            restarts: counters.restarts,
-            deadline_nanos: is_live.then_some(deadline_nanos),
-            deadline_misses: is_live.then_some(counters.deadline_misses),
-            page_faults: Some(counters.page_faults),
-            map_nanos: self.map_nanos,
-            keyframe_step_nanos: self.keyframe_step_nanos,
-            keyframe_nanos: self.keyframe_nanos,
-            rejections: None,
-            budget_samples: Vec::new(),
-            recorded_nanos,
-            wall_nanos: positive(wall_nanos),
-            peak_rss_bytes: Some(counters.peak_rss_bytes),
+    /// Completes the map of a mapper that has died on the way, or that gave none, with what the journal
+    /// kept: at most `max_bytes` of depth.
+    pub fn complete_map(&mut self, map: &mut Map, max_bytes: u64) -> Result<(), ReceiveError> {
+        if let Some((journal, keyframes)) = &mut self.journal {
+            keyframes.collect(journal, true)?;
+            complete(map, journal.map(max_bytes));
+            map.forget_depth_beyond(usize::try_from(max_bytes).unwrap_or(usize::MAX));
         }
+        Ok(())
+    }
+
+    /// The record of the whole run, and its journal with all of it.
+    pub fn into_record(mut self, parts: RecordParts) -> (RunRecord, Option<Journal>) {
+        self.count(parts.counters);
+        let journal = self.journal.take().map(|(mut journal, mut keyframes)| {
+            if let Err(error) = keyframes.collect(&mut journal, true) {
+                tracing::warn!("mapper/keyframe: {error}");
+            }
+            journal
+        });
+        (self.recording.into_record(parts), journal)
     }
 }

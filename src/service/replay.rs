@@ -15,8 +15,9 @@ use crate::service::schedule::peak_rss_bytes;
 use crate::slam::alignment::reference::Reference;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::frame::FrameView;
-use crate::slam::mapper::situation::Situation;
-use crate::slam::mapper::{Mapper, MapperParams, StepOutcome};
+use crate::slam::keyframe::Keyframe;
+use crate::slam::mapper::situation::{Situation, StartFrame};
+use crate::slam::mapper::{Map, Mapper, MapperParams, StepOutcome};
 use crate::slam::parameter::ParameterError;
 use crate::slam::pose::{PoseEstimate, TrackingState};
 use crate::slam::tracker::{Tracker, TrackerParams};
@@ -59,7 +60,7 @@ pub struct ReplayConfig {
 
 /// A frame that is done, for whoever watches.
 #[derive(Debug, Clone, Copy)]
-pub struct ReplayProgress {
+pub struct ReplayProgress<'a> {
     /// Frames done.
     pub done: usize,
     /// Frames there will be, where that is known.
@@ -68,6 +69,14 @@ pub struct ReplayProgress {
     pub state: TrackingState,
     /// What the mapper made of it.
     pub outcome: StepOutcome,
+    /// Everything until now, but for the map.
+    pub record: &'a RunRecord,
+    /// The map until now.
+    pub map: &'a Map,
+    /// What the frame came to in a start.
+    pub start_frame: Option<StartFrame>,
+    /// The active keyframe.
+    pub keyframe: Option<&'a Keyframe>,
 }
 
 /// Why a sequence cannot be replayed.
@@ -111,7 +120,7 @@ pub fn replay(
     source: &mut dyn FrameSource,
     source_name: &str,
     config: &ReplayConfig,
-    observe: &mut dyn FnMut(&ReplayProgress) -> bool,
+    observe: &mut dyn FnMut(&ReplayProgress<'_>) -> bool,
 ) -> Result<RunRecord, ReplayError> {
     let mut replay = Replay::new(source, source_name, config)?;
     let total = frames_to_come(source, config);
@@ -130,7 +139,12 @@ pub fn replay(
         };
         let (state, outcome) = replay.step(source, &stamp, &pixels)?;
         let done = replay.record.frames_in as usize;
-        if !observe(&ReplayProgress { done, total, state, outcome }) {
+        let (record, map, keyframe) =
+            (&replay.record, replay.mapper.map(), replay.mapper.keyframe());
+        let start_frame = replay.mapper.start_frame();
+        let progress =
+            ReplayProgress { done, total, state, outcome, record, map, start_frame, keyframe };
+        if !observe(&progress) {
             break;
         }
     }
@@ -236,6 +250,7 @@ impl<'a> Replay<'a> {
             self.record.rejections.get_or_insert_default().push(rejection);
         }
         self.record.map_nanos.push(step_nanos);
+        self.record.start.count(self.mapper.start_frame());
         if let Some(change_nanos) = change_nanos.filter(|_| outcome.keyframe_created) {
             self.record.keyframe_step_nanos.push(step_nanos);
             self.record.keyframe_nanos.push(change_nanos);
@@ -324,6 +339,7 @@ fn empty_record(source_name: &str, ground_truth: Vec<StampedPose>, poses_given: 
     RunRecord {
         mode: RunMode::Replay,
         source: source_name.to_owned(),
+        ended: Default::default(),
         poses: Vec::new(),
         map: Default::default(),
         ground_truth,
@@ -338,6 +354,7 @@ fn empty_record(source_name: &str, ground_truth: Vec<StampedPose>, poses_given: 
         map_nanos: Vec::new(),
         keyframe_step_nanos: Vec::new(),
         keyframe_nanos: Vec::new(),
+        start: Default::default(),
         rejections: Some(Vec::new()),
         budget_samples: Vec::new(),
         recorded_nanos: 0,

@@ -9,13 +9,16 @@ use crate::capture::source::{FrameSource, SourceError, SourceName, open};
 use crate::service::child::Child;
 use crate::service::config::Config;
 use crate::service::health::ProcessState;
+use crate::service::journal::{Journal, JournalOptions};
 use crate::service::map_file::{MapFileError, read_map};
 use crate::service::mode::Mode;
 use crate::service::peers::{HEALTH_TOPICS, Peer};
-use crate::service::recorder::{Recorder, RunCounters};
-use crate::service::results::RunRecord;
+use crate::service::recorder::Recorder;
+use crate::service::recording::{RecordParts, RunCounters};
+use crate::service::results::{EndOfRun, RunMode, RunRecord};
 use crate::service::schedule::peak_rss_bytes;
 use crate::service::shutdown::Shutdown;
+use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::mapper::Map;
 use crate::slam::pose::TrackingState;
 use crate::wire::command::{Command, CommandClient, CommandError};
@@ -47,6 +50,8 @@ pub struct RunOptions {
     pub output: PathBuf,
     /// Whether the map is fetched at the end.
     pub keeps_map: bool,
+    /// The journal to keep; without one a kill of the supervisor loses the run.
+    pub journal: Option<JournalOptions>,
     /// Options that every child gets: where the configuration comes from.
     pub arguments: Vec<String>,
 }
@@ -84,6 +89,8 @@ pub enum Ended {
 pub struct RunOutcome {
     /// Everything for the results.
     pub record: RunRecord,
+    /// Its journal, to be finished once the results are written.
+    pub journal: Option<Journal>,
     /// The source once more, for its true depth.
     pub source: Box<dyn FrameSource>,
     /// How it ended.
@@ -133,7 +140,7 @@ pub fn run(
     let mut ended = supervisor.watch(shutdown, observe)?;
     supervisor.stop("capture");
     supervisor.settle(&ended)?;
-    let map = match options.keeps_map.then(|| supervisor.save_map()).transpose() {
+    let mut map = match options.keeps_map.then(|| supervisor.save_map()).transpose() {
         Ok(map) => map.unwrap_or_default(),
         Err(error) => {
             if ended == Ended::Finished {
@@ -142,6 +149,10 @@ pub fn run(
             Map::default()
         }
     };
+    if options.keeps_map && (supervisor.restarts > 0 || map.keyframes.is_empty()) {
+        let max_bytes = config.mapping.max_map_bytes() as u64;
+        supervisor.recorder.complete_map(&mut map, max_bytes)?;
+    }
     let (recorder, counters) = supervisor.finish()?;
     let lost = counters.frames_in.saturating_sub(recorder.num_poses() as u64);
     if options.mode == Mode::Lockstep && ended == Ended::Finished && lost > 0 {
@@ -149,8 +160,37 @@ pub fn run(
     }
     let (name, truth) = (options.source.to_string(), source.ground_truth().to_vec());
     let deadline_ms = config.tracker.deadline_ms;
-    let record = recorder.into_record(options.mode, name, map, truth, deadline_ms, &counters);
-    Ok(RunOutcome { record, source, ended })
+    let (record, journal) = recorder.into_record(RecordParts {
+        mode: if options.mode == Mode::Live { RunMode::Live } else { RunMode::Lockstep },
+        source: name,
+        map,
+        ground_truth: truth,
+        depth_scale: DepthScale::MedianRatio,
+        deadline_ms,
+        counters,
+    });
+    let record = RunRecord { ended: end_of_run(&ended), ..record };
+    Ok(RunOutcome { record, journal, source, ended })
+}
+
+fn end_of_run(ended: &Ended) -> EndOfRun {
+    match ended {
+        Ended::Finished => EndOfRun::Finished,
+        Ended::Interrupted => EndOfRun::Interrupted,
+        Ended::Failed(cause) => EndOfRun::Failed(cause.clone()),
+    }
+}
+
+/// The journal of the run. Without one it goes on.
+fn begin_journal(options: &RunOptions, place: &Place) -> Option<Journal> {
+    let begun = Journal::begin(options.journal.as_ref()?, place);
+    begun
+        .inspect_err(|error| {
+            tracing::warn!(
+                "no journal is kept ({error}); a kill of this process would lose the run"
+            )
+        })
+        .ok()
 }
 
 /// The claim of the supervisor, after a look that none of the three runs already.
@@ -191,7 +231,7 @@ impl<'a> Supervisor<'a> {
             root: place.root.clone(),
             children: Vec::new(),
             peers,
-            recorder: Recorder::open(&hub)?,
+            recorder: Recorder::open(&hub, begin_journal(options, place))?,
             commands: CommandClient::open(&hub)?,
             hub,
             restarts: 0,
@@ -233,6 +273,9 @@ impl<'a> Supervisor<'a> {
             self.recorder.collect()?;
             for peer in &mut self.peers {
                 peer.update()?;
+            }
+            if self.recorder.wants_counters() {
+                self.recorder.count(self.counters());
             }
             observe(&self.progress());
             if shutdown.is_requested() {
@@ -364,21 +407,26 @@ impl<'a> Supervisor<'a> {
             peer.update()?;
         }
         self.hub.clean_up();
+        let counters = self.counters();
+        if self.peers[0].state() == Some(ProcessState::Failed) {
+            tracing::debug!("capture has failed after {} frames", counters.frames_in);
+        }
+        Ok((self.recorder, counters))
+    }
+
+    /// What was counted until now.
+    fn counters(&self) -> RunCounters {
         let [capture, tracker, _] = &self.peers;
         let peaks = self.peers.iter().filter_map(|peer| Some(peer.last()?.peak_rss_bytes));
         let mut sums = self.of_dead;
         [capture, tracker].into_iter().for_each(|peer| count(&mut sums, peer));
-        let counters = RunCounters {
+        RunCounters {
             // Who is killed leaves the count of a moment before.
             frames_in: sums.frames_in.max(self.recorder.num_poses() as u64),
             restarts: self.restarts,
             peak_rss_bytes: peaks.sum::<u64>() + peak_rss_bytes().unwrap_or(0),
             ..sums
-        };
-        if capture.state() == Some(ProcessState::Failed) {
-            tracing::debug!("capture has failed after {} frames", counters.frames_in);
         }
-        Ok((self.recorder, counters))
     }
 }
 

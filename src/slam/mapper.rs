@@ -33,7 +33,7 @@ use crate::slam::mapper::observation::DepthFilter;
 use crate::slam::mapper::past::PastFrames;
 use crate::slam::mapper::recovery::{Recovery, RecoveryParams};
 use crate::slam::mapper::reuse::ReuseParams;
-use crate::slam::mapper::situation::{Situation, StartProgress};
+use crate::slam::mapper::situation::{Situation, StartFrame, StartProgress};
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::{NO_KEYFRAME, PoseEstimate, TrackingState};
 use crate::slam::two_frame::TwoFrameInitializer;
@@ -191,6 +191,8 @@ pub struct Mapper {
     /// Sequence and stamp of the two-frame start's first frame.
     first_stamp: Option<(u64, i64)>,
     start_progress: StartProgress,
+    /// What the last frame came to, where it was one of a two-frame start.
+    start_frame: Option<StartFrame>,
     recovery: Recovery,
     consistency: Consistency,
     contradiction: Option<Contradiction>,
@@ -227,6 +229,7 @@ impl Mapper {
                 .map_err(|e| e.within("initializer.two_frame"))?,
             first_stamp: None,
             start_progress: StartProgress::default(),
+            start_frame: None,
             recovery: Recovery::new(&intrinsics),
             consistency: Consistency::default(),
             contradiction: None,
@@ -252,6 +255,7 @@ impl Mapper {
         change_begins: &mut dyn FnMut(),
     ) -> StepOutcome {
         let finished = self.finish_keyframe();
+        self.start_frame = None;
         let outcome = self.take_in(frame, pose, sensor_depth, change_begins);
         let keyframe_changed = outcome.keyframe_changed || finished.keyframe_changed;
         StepOutcome { keyframe_changed, ..outcome }
@@ -347,6 +351,11 @@ impl Mapper {
             (Some(MapState::Initializing), _) => Situation::Unproven,
             _ => Situation::Mapping,
         }
+    }
+
+    /// What the last frame came to, where it was one of a two-frame start.
+    pub fn start_frame(&self) -> Option<StartFrame> {
+        self.start_frame
     }
 
     /// Every keyframe.

@@ -126,6 +126,8 @@ pub struct InitOutcome {
     pub first_from_current: SE3,
     /// Brightness of the frame against the first.
     pub brightness: Brightness,
+    /// How far the rotation that explains the frame best moves the middle of the image, pixels.
+    pub rotation_px: f64,
 }
 
 /// The depth of a pixel of the first frame.
@@ -356,7 +358,9 @@ impl TwoFrameInitializer {
     }
 
     fn outcome(&self, state: InitState, evidence: Evidence) -> InitOutcome {
+        let rotation_rad = self.rotation.current_from_first.rotation.angle();
         InitOutcome {
+            rotation_px: rotation_rad * self.intrinsics[0].fx,
             state,
             evidence,
             first_from_current: self.current_from_first.inverse(),

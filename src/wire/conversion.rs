@@ -9,6 +9,7 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{DepthPoint, Keyframe, KeyframePose, MAX_KEYFRAME_POINTS, MapState};
+use crate::slam::mapper::situation::StartFrame;
 use crate::slam::pose::{
     Brightness, DegradedReason, LostReason, PoseEstimate, Quality, TrackingState,
 };
@@ -185,6 +186,29 @@ pub fn state_from_codes(state: u32, reason: u32) -> Result<TrackingState, Messag
         (0..=3, code) => return Err(MessageError::UnknownCode { field: "reason", code }),
         (code, _) => return Err(MessageError::UnknownCode { field: "state", code }),
     })
+}
+
+/// Every [`StartFrame`], in the order of their codes from 1.
+const START_FRAMES: [StartFrame; 8] = [
+    StartFrame::Begun,
+    StartFrame::Dark,
+    StartFrame::Overexposed,
+    StartFrame::Textureless,
+    StartFrame::Unmatched,
+    StartFrame::Still,
+    StartFrame::Turned,
+    StartFrame::LittleParallax,
+];
+
+/// What a frame came to in a start, as a code.
+pub fn code_from_start_frame(frame: Option<StartFrame>) -> u32 {
+    let place = frame.and_then(|frame| START_FRAMES.iter().position(|known| *known == frame));
+    place.map_or(0, |place| place as u32 + 1)
+}
+
+/// What a frame came to in a start, from its code; `None` for 0 and for a code that stands for nothing.
+pub fn start_frame_from_code(code: u32) -> Option<StartFrame> {
+    START_FRAMES.get((code as usize).checked_sub(1)?).copied()
 }
 
 /// The state of a map as a code.

@@ -160,7 +160,7 @@ pub struct KeyframeImageHeader {
 /// Message of `mapper/step`: this frame is in the map.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
-#[type_name("semidense.Step.v3")]
+#[type_name("semidense.Step.v4")]
 pub struct StepMessage {
     /// Sequence of the frame.
     pub sequence: u64,
@@ -185,6 +185,11 @@ pub struct StepMessage {
     pub has_pose: u32,
     /// Life of the map.
     pub epoch: u32,
+    /// While there is no map, what the frame came to: 1 begun, 2 dark, 3 overexposed, 4 textureless,
+    /// 5 unmatched, 6 still, 7 turned, 8 little parallax; otherwise 0.
+    pub start_frame: u32,
+    /// Zero.
+    pub reserved: u32,
 }
 
 /// Header of `mapper/graph`; the payload is one [`KeyframePoseMessage`] per keyframe.
@@ -318,7 +323,7 @@ mod tests {
         assert_layout::<KeyframeHeader>(144, 8, "semidense.KeyframeHeader.v1");
         assert_layout::<DepthPoint>(16, 4, "semidense.DepthPoint.v1");
         assert_layout::<KeyframeImageHeader>(24, 8, "semidense.KeyframeImageHeader.v1");
-        assert_layout::<StepMessage>(128, 8, "semidense.Step.v3");
+        assert_layout::<StepMessage>(136, 8, "semidense.Step.v4");
         assert_layout::<GraphHeader>(16, 8, "semidense.GraphHeader.v1");
         assert_layout::<KeyframePoseMessage>(72, 8, "semidense.KeyframePose.v1");
         assert_layout::<HealthMessage>(1680, 8, "semidense.Health.v2");

@@ -8,7 +8,7 @@ use crate::wire::message::{
 };
 
 /// Version in every topic's name; counts up when a message changes.
-pub const WIRE_VERSION: u32 = 3;
+pub const WIRE_VERSION: u32 = 4;
 
 /// Most keyframes in one message of `mapper/graph`; the newest are sent when there are more.
 pub const MAX_GRAPH_KEYFRAMES: usize = 4096;
@@ -56,7 +56,7 @@ pub const POSE: Topic = Topic {
 pub const KEYFRAME: Topic = Topic {
     owner: "mapper",
     noun: "keyframe",
-    subscribers: 4,
+    subscribers: 5,
     buffer: 1,
     borrowed: 2,
     history: 1,
@@ -156,7 +156,7 @@ mod tests {
     fn names_are_unique_and_carry_the_version() {
         let mut names: Vec<_> =
             table(&intrinsics(640, 480)).iter().map(|(t, _)| t.service_name("rig1")).collect();
-        assert!(names.contains(&"rig1/v3/capture/frame".to_owned()));
+        assert!(names.contains(&"rig1/v4/capture/frame".to_owned()));
         names.sort();
         names.dedup();
         assert_eq!(names.len(), 9);

@@ -9,16 +9,18 @@ pub mod colour;
 pub mod debug_pictures;
 pub mod depth_maps;
 pub mod lettering;
+pub mod output_folder;
 pub mod pcd;
 pub mod pictures;
 pub mod ply;
 pub mod poses;
 pub mod report;
+pub mod set;
 pub mod summary;
 pub mod summary_text;
+pub mod untracked;
 pub mod weight_picture;
 
-use std::fs;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
@@ -28,12 +30,15 @@ use crate::capture::source::{FrameSource, SourceError};
 use crate::service::alignment_stamps::AlignmentTrace;
 use crate::service::atomic_file::write_atomically;
 use crate::service::results::budget_curve::BudgetSample;
+use crate::service::results::ply::CloudPoint;
 use crate::service::results::report::{ReportInput, report};
+use crate::service::results::set::ResultSet;
 use crate::service::results::summary::Summary;
+use crate::service::results::untracked::StartTally;
 use crate::service::trajectory_file::write_trajectory;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::evaluation::umeyama::Alignment;
-use crate::slam::evaluation::{MAX_DIFFERENCE_NANOS, evaluate_trajectory};
+use crate::slam::evaluation::{MAX_DIFFERENCE_NANOS, TrajectoryEvaluation, evaluate_trajectory};
 use crate::slam::mapper::Map;
 use crate::slam::mapper::consistency::Contradiction;
 use crate::slam::parameter::{ParameterError, check_range};
@@ -76,6 +81,20 @@ pub struct Rejection {
     pub contradiction: Contradiction,
 }
 
+/// How a run ended.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub enum EndOfRun {
+    /// With the end of the source.
+    #[default]
+    Finished,
+    /// By a signal.
+    Interrupted,
+    /// Because something failed; says what.
+    Failed(String),
+    /// It was killed: this is what its journal has of it.
+    Recovered,
+}
+
 /// Everything that is known of a run when it ends.
 #[derive(Debug, Clone)]
 pub struct RunRecord {
@@ -83,6 +102,8 @@ pub struct RunRecord {
     pub mode: RunMode,
     /// Where the frames came from, as the user named it.
     pub source: String,
+    /// How it ended.
+    pub ended: EndOfRun,
     /// One for each frame that reached the tracker, in order.
     pub poses: Vec<RecordedPose>,
     /// The map at the end.
@@ -112,6 +133,8 @@ pub struct RunRecord {
     /// Of each of those, the time from the observed frame to a keyframe that others can have: carrying,
     /// smoothing, live also publishing.
     pub keyframe_nanos: Vec<u64>,
+    /// What frames came to while there was no map.
+    pub start: StartTally,
     /// Frames at which the map was found to contradict itself, and how; known in a replay.
     pub rejections: Option<Vec<Rejection>>,
     /// Frames that were aligned again with fewer iterations; empty where none were.
@@ -159,83 +182,164 @@ pub enum ResultsError {
         /// What the system says.
         source: io::Error,
     },
+    /// There is no room.
+    #[error(
+        "cannot write {path}: {source}; about {needed_mb} MB are needed and {free_mb} MB are free: make room, or choose another folder with --output"
+    )]
+    Room {
+        /// The file.
+        path: PathBuf,
+        /// What the system says.
+        source: io::Error,
+        /// What all files of the run take.
+        needed_mb: u64,
+        /// What the file system has.
+        free_mb: u64,
+    },
+    /// A file of the user's would be replaced.
+    #[error(
+        "{0} was not written by semidense and would be replaced: move it away, or choose another folder with --output"
+    )]
+    Foreign(PathBuf),
     /// True depth that cannot be read.
     #[error("cannot read the depth of a keyframe for evaluation: {0}")]
     Depth(#[from] SourceError),
 }
 
-/// Makes the output folder and writes and removes a file in it, so that a folder without room or
-/// permission is noticed before the run and not after it.
-pub fn prepare_output(dir: &Path) -> Result<(), ResultsError> {
-    let probe = dir.join(".semidense-write-test");
-    let attempt = || {
-        fs::create_dir_all(dir)?;
-        fs::write(&probe, [0u8; 4096])?;
-        fs::remove_file(&probe)
-    };
-    attempt().map_err(|source| ResultsError::Write { path: dir.to_path_buf(), source })
+/// The figures of a run and what they are made of.
+pub struct Results<'a> {
+    /// The figures.
+    pub summary: Summary,
+    record: &'a RunRecord,
+    params: &'a ResultsParams,
+    trajectory: Vec<StampedPose>,
+    online: Vec<StampedPose>,
+    evaluation: Option<TrajectoryEvaluation>,
+    online_evaluation: Option<TrajectoryEvaluation>,
+    cloud: Vec<CloudPoint>,
 }
 
-/// Writes `trajectory.txt`, `trajectory_online.txt`, `keyframes.txt`, `map.ply`, `map.pcd`,
-/// `summary.json` and `report.html` into `dir`, which [`prepare_output`] has made. True depth comes from
-/// `depth_source` where it has any.
+impl<'a> Results<'a> {
+    /// Evaluates a run. True depth comes from `depth_source` where it has any.
+    pub fn new(
+        record: &'a RunRecord,
+        depth_source: &mut dyn FrameSource,
+        params: &'a ResultsParams,
+    ) -> Result<Self, ResultsError> {
+        // Files hold every epoch; figures and pictures are of the longest.
+        let epoch = poses::longest_epoch(record);
+        let trajectory = poses::final_trajectory(record, epoch);
+        let online = poses::online_trajectory(record, epoch);
+        let evaluate = |estimate: &[StampedPose]| {
+            // Poses that were given have no error.
+            let given = record.depth_scale == DepthScale::Given;
+            let truth = if given { &[][..] } else { &record.ground_truth };
+            evaluate_trajectory(estimate, truth, params.alignment, MAX_DIFFERENCE_NANOS).ok()
+        };
+        let (evaluation, online_evaluation) = (evaluate(&trajectory), evaluate(&online));
+        let depth = depth_maps::evaluate_depth(record, depth_source)?;
+        let cloud = ply::point_cloud(&record.map, params.max_relative_std_dev);
+        let summary = Summary::new(
+            record,
+            cloud.len(),
+            evaluation.as_ref(),
+            online_evaluation.as_ref(),
+            poses::normalized_errors_of(record, epoch).as_ref(),
+            depth.statistics,
+        );
+        Ok(Self {
+            summary,
+            record,
+            params,
+            trajectory,
+            online,
+            evaluation,
+            online_evaluation,
+            cloud,
+        })
+    }
+
+    /// Writes `trajectory.txt`, `trajectory_online.txt`, `keyframes.txt`, `map.ply`, `map.pcd`,
+    /// `summary.json` and `report.html` into `dir`, which [`output_folder::prepare_output`] has made: all of
+    /// them, in the place of an earlier run's, or none. `write_more` writes what belongs to the set
+    /// besides, into the folder that it is given.
+    pub fn write(
+        &self,
+        dir: &Path,
+        write_more: &dyn Fn(&Path) -> Result<(), ResultsError>,
+    ) -> Result<(), ResultsError> {
+        let record = self.record;
+        let page = report(&ReportInput {
+            record,
+            summary: &self.summary,
+            trajectory: &self.trajectory,
+            online: &self.online,
+            evaluation: self.evaluation.as_ref(),
+            online_evaluation: self.online_evaluation.as_ref(),
+            cloud: &self.cloud,
+            max_relative_std_dev: self.params.max_relative_std_dev,
+        });
+        let needed = needed_bytes(record, self.cloud.len(), page.len());
+        let failed = |path: PathBuf, source| write_failure(dir, needed, path, source);
+        let set = ResultSet::begin(dir).map_err(|source| failed(dir.to_owned(), source))?;
+        let write = |name: &str, write: &dyn Fn(&Path) -> io::Result<()>| {
+            // Named by the place where the user looks for it.
+            write(&set.folder().join(name)).map_err(|source| failed(dir.join(name), source))
+        };
+        write("trajectory.txt", &|path| {
+            write_trajectory(path, poses::FINAL_COMMENT, &poses::final_trajectory(record, None))
+        })?;
+        write("trajectory_online.txt", &|path| {
+            write_trajectory(path, poses::ONLINE_COMMENT, &poses::online_trajectory(record, None))
+        })?;
+        write("keyframes.txt", &|path| poses::write_keyframes(path, &record.map))?;
+        write("map.ply", &|path| ply::write_ply(path, &self.cloud))?;
+        write("map.pcd", &|path| pcd::write_pcd(path, &self.cloud))?;
+        write("summary.json", &|path| {
+            write_atomically(path, |file| {
+                serde_json::to_writer_pretty(&mut *file, &self.summary)?;
+                writeln!(file)
+            })
+        })?;
+        write("report.html", &|path| {
+            write_atomically(path, |file| file.write_all(page.as_bytes()))
+        })?;
+        write_more(set.folder())?;
+        set.commit().map_err(|source| failed(dir.to_owned(), source))
+    }
+}
+
+/// Evaluates a run and writes its files into `dir`; see [`Results`].
 pub fn write_results(
     dir: &Path,
     record: &RunRecord,
     depth_source: &mut dyn FrameSource,
     params: &ResultsParams,
 ) -> Result<Summary, ResultsError> {
-    // Files hold every epoch; figures and pictures are of the longest.
-    let epoch = poses::longest_epoch(record);
-    let trajectory = poses::final_trajectory(record, epoch);
-    let online = poses::online_trajectory(record, epoch);
-    let evaluate = |estimate: &[StampedPose]| {
-        // Poses that were given have no error.
-        let given = record.depth_scale == DepthScale::Given;
-        let truth = if given { &[][..] } else { &record.ground_truth };
-        evaluate_trajectory(estimate, truth, params.alignment, MAX_DIFFERENCE_NANOS).ok()
-    };
-    let (evaluation, online_evaluation) = (evaluate(&trajectory), evaluate(&online));
-    let depth = depth_maps::evaluate_depth(record, depth_source)?;
-    let cloud = ply::point_cloud(&record.map, params.max_relative_std_dev);
-    let summary = Summary::new(
-        record,
-        cloud.len(),
-        evaluation.as_ref(),
-        online_evaluation.as_ref(),
-        poses::normalized_errors_of(record, epoch).as_ref(),
-        depth.statistics,
-    );
+    let results = Results::new(record, depth_source, params)?;
+    results.write(dir, &|_| Ok(()))?;
+    Ok(results.summary)
+}
 
-    let write = |name: &str, write: &dyn Fn(&Path) -> io::Result<()>| {
-        let path = dir.join(name);
-        write(&path).map_err(|source| ResultsError::Write { path, source })
-    };
-    write("trajectory.txt", &|path| {
-        write_trajectory(path, poses::FINAL_COMMENT, &poses::final_trajectory(record, None))
-    })?;
-    write("trajectory_online.txt", &|path| {
-        write_trajectory(path, poses::ONLINE_COMMENT, &poses::online_trajectory(record, None))
-    })?;
-    write("keyframes.txt", &|path| poses::write_keyframes(path, &record.map))?;
-    write("map.ply", &|path| ply::write_ply(path, &cloud))?;
-    write("map.pcd", &|path| pcd::write_pcd(path, &cloud))?;
-    write("summary.json", &|path| {
-        write_atomically(path, |file| {
-            serde_json::to_writer_pretty(&mut *file, &summary)?;
-            writeln!(file)
-        })
-    })?;
-    let page = report(&ReportInput {
-        record,
-        summary: &summary,
-        trajectory: &trajectory,
-        online: &online,
-        evaluation: evaluation.as_ref(),
-        online_evaluation: online_evaluation.as_ref(),
-        cloud: &cloud,
-        max_relative_std_dev: params.max_relative_std_dev,
-    });
-    write("report.html", &|path| write_atomically(path, |file| file.write_all(page.as_bytes())))?;
-    Ok(summary)
+/// About what the files of a run take.
+fn needed_bytes(record: &RunRecord, points: usize, page: usize) -> u64 {
+    /// Of a point in either cloud, a line of either trajectory, a line of `keyframes.txt`.
+    const POINT_BYTES: usize = 24;
+    const POSE_BYTES: usize = 170;
+    const KEYFRAME_BYTES: usize = 220;
+    /// Largest `summary.json`.
+    const SUMMARY_BYTES: usize = 50_000;
+    let lines = 2 * POSE_BYTES * record.poses.len() + KEYFRAME_BYTES * record.map.keyframes.len();
+    (2 * POINT_BYTES * points + lines + page + SUMMARY_BYTES) as u64
+}
+
+/// What to say where a file cannot be written: how much is lacking, where it is room.
+fn write_failure(dir: &Path, needed: u64, path: PathBuf, source: io::Error) -> ResultsError {
+    use io::ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
+    if !matches!(source.kind(), StorageFull | QuotaExceeded | FileTooLarge) {
+        return ResultsError::Write { path, source };
+    }
+    let free =
+        rustix::fs::statvfs(dir).map_or(0, |stat| stat.f_bavail.saturating_mul(stat.f_frsize));
+    ResultsError::Room { path, source, needed_mb: needed.div_ceil(1 << 20), free_mb: free >> 20 }
 }

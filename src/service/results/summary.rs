@@ -8,7 +8,8 @@ use crate::service::health::{bucket, bucket_end_ms};
 use crate::service::results::alignment_levels::{LevelSummary, alignment_levels};
 use crate::service::results::budget_curve::BudgetCurve;
 use crate::service::results::poses::longest_epoch;
-use crate::service::results::{RecordedPose, Rejection, RunMode, RunRecord};
+use crate::service::results::untracked::Untracked;
+use crate::service::results::{EndOfRun, RecordedPose, Rejection, RunMode, RunRecord};
 use crate::slam::evaluation::TrajectoryEvaluation;
 use crate::slam::evaluation::depth_error::DepthStatistics;
 use crate::slam::evaluation::normalized_error::NormalizedErrors;
@@ -153,6 +154,11 @@ pub struct Summary {
     pub mode: RunMode,
     /// Where the frames came from.
     pub source: String,
+    /// How it ended: `finished`, `interrupted`, `failed`, or `recovered` where it was killed and this comes from
+    /// its journal.
+    pub ended: String,
+    /// What failed.
+    pub failure: Option<String>,
     /// Frames that the source gave.
     pub frames_in: u64,
     /// Frames whose pose is claimed.
@@ -173,6 +179,8 @@ pub struct Summary {
     pub map_rejections: Option<Vec<RejectionSummary>>,
     /// From the first frame to the first whose pose is claimed; null where none is.
     pub initialization_secs: Option<f64>,
+    /// Why nothing was tracked; null where something was.
+    pub untracked: Option<String>,
     /// Keyframes of the final map.
     pub keyframes: u64,
     /// Points of `map.ply`.
@@ -276,9 +284,17 @@ impl Summary {
             (record.recorded_nanos as f64 * 1e-9, record.wall_nanos as f64 * 1e-9);
         let traces: Vec<_> = record.poses.iter().filter_map(|pose| pose.trace).collect();
         const BYTES_PER_MB: f64 = 1_048_576.0;
+        let (ended, failure) = match &record.ended {
+            EndOfRun::Finished => ("finished", None),
+            EndOfRun::Interrupted => ("interrupted", None),
+            EndOfRun::Failed(cause) => ("failed", Some(cause)),
+            EndOfRun::Recovered => ("recovered", None),
+        };
         Self {
             mode: record.mode,
             source: record.source.clone(),
+            ended: ended.to_owned(),
+            failure: failure.cloned(),
             frames_in: record.frames_in,
             frames_tracked: count(TrackingState::is_tracked),
             frames_degraded: count(|s| matches!(s, TrackingState::Degraded(_))),
@@ -292,6 +308,7 @@ impl Summary {
                 .as_ref()
                 .map(|all| all.iter().map(RejectionSummary::from).collect()),
             initialization_secs: initialization_secs(&record.poses),
+            untracked: Untracked::of(record).map(|why| why.to_string()),
             keyframes: record.map.keyframes.len() as u64,
             points: points as u64,
             epoch: record.poses.last().map_or(0, |pose| pose.estimate.epoch),

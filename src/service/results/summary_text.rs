@@ -62,7 +62,7 @@ pub fn summary_text(summary: &Summary) -> String {
 fn frames(summary: &Summary) -> String {
     let initialised = match summary.initialization_secs {
         Some(secs) => format!("initialised after {secs:.2} s"),
-        None => "never initialised: it takes texture and sideways motion".to_owned(),
+        None => "never initialised".to_owned(),
     };
     format!(
         "{} in, {} tracked, {} lost in {} losses, {} dropped, {} gaps; {initialised}",

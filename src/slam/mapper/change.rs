@@ -10,7 +10,6 @@ use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS, MapState};
 use crate::slam::mapper::consistency::judge_change;
-use crate::slam::mapper::memory::BYTES_PER_MEGABYTE;
 use crate::slam::mapper::observation::DepthFilter;
 use crate::slam::mapper::start::take_sensor_depth;
 use crate::slam::mapper::{Mapper, StepOutcome};
@@ -170,7 +169,7 @@ impl Mapper {
             image: frame.pixels.to_vec(),
             points: Vec::new(),
         });
-        self.map.forget_depth_beyond(self.params.max_map_megabytes * BYTES_PER_MEGABYTE);
+        self.map.forget_depth_beyond(self.params.max_map_bytes());
         self.next_keyframe_id += 1;
         self.past.push(frame.pixels, world_from_keyframe.rigid, Brightness::default());
         self.enter_keyframe(self.map.keyframes.len() - 1);

@@ -1,10 +1,17 @@
 //! Bounds the memory of the map: a robot runs for days.
 
 use crate::slam::keyframe::{DepthPoint, Keyframe};
-use crate::slam::mapper::Map;
+use crate::slam::mapper::{Map, MapperParams};
 
 /// Bytes in the megabyte of the configuration.
-pub(super) const BYTES_PER_MEGABYTE: usize = 1_000_000;
+const BYTES_PER_MEGABYTE: usize = 1_000_000;
+
+impl MapperParams {
+    /// Bytes of image and depth that the map may hold.
+    pub fn max_map_bytes(&self) -> usize {
+        self.max_map_megabytes * BYTES_PER_MEGABYTE
+    }
+}
 
 impl Map {
     /// Takes image and depth from the oldest keyframes until the rest fit into `max_bytes`; their poses

@@ -4,7 +4,7 @@ use std::fmt;
 
 use crate::slam::mapper::consistency::Contradiction;
 use crate::slam::two_frame::evidence::Waiting;
-use crate::slam::two_frame::{Failure, InitState};
+use crate::slam::two_frame::{Failure, InitOutcome, InitState};
 
 /// Where the mapper stands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -32,6 +32,60 @@ impl fmt::Display for Situation {
             Self::Lost => f.write_str("lost: looking for the camera on recent keyframes"),
             Self::Rejected(why) => write!(f, "map rejected: {why}"),
             Self::Restarting(progress) => write!(f, "lost: beginning a new epoch, {progress}"),
+        }
+    }
+}
+
+/// What one frame came to while there is no map: why none began on it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum StartFrame {
+    /// It is the first frame of a start, or ended one.
+    Begun,
+    /// It has too little texture, and is dark.
+    Dark,
+    /// It has too little texture, and is overexposed.
+    Overexposed,
+    /// It has too little texture, in full light.
+    Textureless,
+    /// It does not show what the first frame does.
+    Unmatched,
+    /// It shows the same as the first frame: the camera has not moved.
+    Still,
+    /// A rotation of the camera explains it.
+    Turned,
+    /// There is parallax, but too little to prove depth.
+    LittleParallax,
+}
+
+impl StartFrame {
+    /// What the frame `pixels` came to in a start.
+    pub(super) fn of(outcome: &InitOutcome, is_first: bool, pixels: &[u8]) -> Self {
+        /// Motion of the image that noise does not make, pixels.
+        const MIN_MOTION_PX: f64 = 1.0;
+        match outcome.state {
+            InitState::Waiting(Waiting::Texture) => Self::without_texture(pixels),
+            InitState::Waiting(_) if is_first => Self::Begun,
+            InitState::Waiting(Waiting::Match) | InitState::Failed(Failure::Mismatch) => {
+                Self::Unmatched
+            }
+            InitState::Waiting(Waiting::Significance) if outcome.rotation_px < MIN_MOTION_PX => {
+                Self::Still
+            }
+            InitState::Waiting(Waiting::Significance) => Self::Turned,
+            InitState::Waiting(_) => Self::LittleParallax,
+            InitState::Proven | InitState::Failed(_) => Self::Begun,
+        }
+    }
+
+    fn without_texture(pixels: &[u8]) -> Self {
+        /// Mean grey levels below and above which a sensor shows nothing.
+        const DARK: usize = 20;
+        const OVEREXPOSED: usize = 235;
+        let sum: usize = pixels.iter().map(|&pixel| usize::from(pixel)).sum();
+        match sum / pixels.len().max(1) {
+            ..=DARK => Self::Dark,
+            OVEREXPOSED.. => Self::Overexposed,
+            _ => Self::Textureless,
         }
     }
 }

@@ -13,7 +13,7 @@ use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::buffer::Image;
 use crate::slam::initializer::{StartEvidence, StartMethod, proven_ratio, randomise};
 use crate::slam::keyframe::{Keyframe, MapState};
-use crate::slam::mapper::situation::StartProgress;
+use crate::slam::mapper::situation::{StartFrame, StartProgress};
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::pose::{PoseEstimate, TrackingState};
 use crate::slam::two_frame::evidence::Waiting;
@@ -177,7 +177,9 @@ impl Mapper {
     /// Gives the two-frame start another frame. Once it is proven its first frame becomes a keyframe
     /// and this frame the next one, so that the tracker begins where the camera is.
     fn start_from_two_frames(&mut self, frame: &FrameView<'_>, pose: &PoseEstimate) -> StepOutcome {
+        let is_first = self.two_frame.first_pixels().is_empty();
         let start = self.two_frame.step(frame.pixels);
+        self.start_frame = Some(StartFrame::of(&start, is_first, frame.pixels));
         self.start_progress.observe(start.state);
         let stamp = (frame.sequence, frame.capture_nanos);
         let first = *self.first_stamp.get_or_insert(stamp);

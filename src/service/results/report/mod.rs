@@ -26,7 +26,7 @@ use crate::service::results::report::figures::figures;
 use crate::service::results::report::html::{escaped, png_address};
 use crate::service::results::report::map_picture::map_picture;
 use crate::service::results::summary::Summary;
-use crate::service::results::{RunMode, RunRecord};
+use crate::service::results::{EndOfRun, RunMode, RunRecord};
 use crate::slam::evaluation::TrajectoryEvaluation;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::pose::TrackingState;
@@ -70,11 +70,12 @@ pub fn report(input: &ReportInput<'_>) -> String {
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\
          <title>semidense: {source}</title><style>{}</style></head><body><main>\
          <header><p class=\"product\">semidense {}</p><h1>{source}</h1>\
-         <p class=\"mode\">{mode} &middot; {} frames &middot; {:.1} s</p></header>",
+         <p class=\"mode\">{mode} &middot; {} frames &middot; {:.1} s</p>{}</header>",
         include_str!("report.css"),
         env!("CARGO_PKG_VERSION"),
         summary.frames_in,
-        summary.recorded_secs
+        summary.recorded_secs,
+        notices(summary, &input.record.ended)
     );
     page.push_str(&cards(summary));
     page.push_str(&states(input.record));
@@ -89,6 +90,31 @@ pub fn report(input: &ReportInput<'_>) -> String {
     page.push_str(&figures(summary));
     page.push_str("</main></body></html>\n");
     page
+}
+
+/// What a reader must know first.
+fn notices(summary: &Summary, ended: &EndOfRun) -> String {
+    let untracked = summary
+        .untracked
+        .as_ref()
+        .map(|why| format!("<p class=\"notice\">Nothing was tracked: {}.</p>", escaped(why)));
+    end_notice(ended) + &untracked.unwrap_or_default()
+}
+
+/// What a reader must know of a run that did not come to its end; nothing of one that did.
+fn end_notice(ended: &EndOfRun) -> String {
+    let text = match ended {
+        EndOfRun::Finished => return String::new(),
+        EndOfRun::Interrupted => "Interrupted: this is the run until then.".to_owned(),
+        EndOfRun::Failed(cause) => {
+            format!("Failed: {}. This is the run until then.", escaped(cause))
+        }
+        EndOfRun::Recovered => {
+            "The run was killed: recovered from its journal, which may lack the last two seconds."
+                .to_owned()
+        }
+    };
+    format!("<p class=\"notice\">{text}</p>")
 }
 
 /// The map from above; nothing without points.

@@ -1,0 +1,133 @@
+//! How a run, a replay or a recovery ends: results written, what is said, exit code.
+
+use std::path::Path;
+use std::process::ExitCode;
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use crate::capture::source::{FrameSource, SourceName};
+use crate::command::print::{note, print};
+use crate::command::{CommandResult, INTERRUPTED, NOTHING_TRACKED};
+use crate::service::config::Config;
+use crate::service::journal::Journal;
+use crate::service::journal::folder::Unfinished;
+use crate::service::journal::log::RunStart;
+use crate::service::results::output_folder::OutputFolder;
+use crate::service::results::set::has_tracked_set;
+use crate::service::results::summary_text::summary_text;
+use crate::service::results::{EndOfRun, Results, ResultsError, RunMode, RunRecord};
+
+/// Where and how results are given out.
+pub struct Ending<'a> {
+    /// Their folder.
+    pub output: &'a OutputFolder,
+    /// How they are evaluated.
+    pub config: &'a Config,
+    /// Whether the summary is printed as JSON.
+    pub json: bool,
+    /// Writes what belongs to the set besides, into the folder that it is given.
+    pub write_more: &'a dyn Fn(&Path) -> Result<(), ResultsError>,
+}
+
+impl Ending<'_> {
+    /// Writes the results of `record` and says what there is to say. A run that has tracked nothing does not
+    /// replace one that has. The journal goes when its run is written.
+    pub fn finish(
+        &self,
+        record: &RunRecord,
+        source: &mut dyn FrameSource,
+        journal: Option<Journal>,
+    ) -> CommandResult {
+        let output = self.output.path();
+        let place = output.display().to_string();
+        let results = Results::new(record, source, &self.config.results)?;
+        let is_tracked = results.summary.frames_tracked > 0;
+        let keeps_earlier = !is_tracked && has_tracked_set(output);
+        if !keeps_earlier {
+            results
+                .write(output, self.write_more)
+                .map_err(|error| not_written(&error, output, journal.as_ref()))?;
+        }
+        if is_tracked {
+            self.output.become_latest().unwrap_or_else(|error| {
+                note(&format!(
+                    "warning: {place} is written, but not linked as the latest ({error})"
+                ));
+            });
+        }
+        if let Some(Err(error)) = journal.map(Journal::finish) {
+            note(&format!("warning: the journal of this run cannot be removed ({error})"));
+        }
+        if self.json {
+            print(&format!("{}\n", serde_json::to_string_pretty(&results.summary)?))?;
+        } else {
+            print(&summary_text(&results.summary))?;
+        }
+        let where_to = match keeps_earlier {
+            true => format!("nothing is written: the earlier results in {place} are kept"),
+            false => format!("results in {place}"),
+        };
+        if !self.json {
+            print(&format!("{where_to}\n"))?;
+        }
+        match &record.ended {
+            EndOfRun::Failed(cause) => Err(cause.as_str().into()),
+            EndOfRun::Interrupted => {
+                note(&format!("interrupted: {where_to}"));
+                Ok(ExitCode::from(INTERRUPTED))
+            }
+            EndOfRun::Finished | EndOfRun::Recovered if !is_tracked => {
+                let why = results.summary.untracked.as_deref().unwrap_or_default();
+                note(&format!("nothing was tracked: {why}; {where_to}"));
+                Ok(ExitCode::from(NOTHING_TRACKED))
+            }
+            EndOfRun::Finished | EndOfRun::Recovered => Ok(ExitCode::SUCCESS),
+        }
+    }
+}
+
+/// What is said where results cannot be written: nothing is lost.
+fn not_written(error: &ResultsError, output: &Path, journal: Option<&Journal>) -> String {
+    let Some(journal) = journal else { return error.to_string() };
+    format!(
+        "{error}; what was in {} is as it was, and the journal of this run is in {}: `{}` writes its results",
+        output.display(),
+        journal.folder().display(),
+        recover_command(journal.folder().parent().unwrap_or(output))
+    )
+}
+
+/// What to type to recover the journal in a folder.
+fn recover_command(output: &Path) -> String {
+    let path = output.display().to_string();
+    let is_plain = |c: char| c.is_alphanumeric() || "/._-".contains(c);
+    match path.chars().all(is_plain) {
+        true => format!("semidense recover {path}"),
+        false => format!("semidense recover '{}'", path.replace('\'', r"'\''")),
+    }
+}
+
+/// Says where the journals of killed runs are and what to type.
+pub fn note_unfinished(found: &[Unfinished]) {
+    for unfinished in found {
+        note(&format!(
+            "a run was killed before its results were written; its journal is {}: `{}` writes them",
+            unfinished.folder.display(),
+            recover_command(unfinished.output())
+        ));
+    }
+}
+
+/// What a journal keeps of how a run is started.
+pub fn run_start(config: &Config, source: &SourceName, rig: Option<&Path>) -> RunStart {
+    let folder = std::env::current_dir().unwrap_or_default();
+    let since = SystemTime::now().duration_since(UNIX_EPOCH);
+    RunStart {
+        mode: RunMode::Replay,
+        source: source.to_string(),
+        rig: rig.map(|rig| rig.to_string_lossy().into_owned()),
+        folder: folder.to_string_lossy().into_owned(),
+        config: config.to_text(),
+        poses_given: false,
+        began_secs: since.map_or(0, |since| since.as_secs()),
+    }
+}

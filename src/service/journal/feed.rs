@@ -1,0 +1,105 @@
+//! What the mapper publishes of its keyframes, for the journal: the newest revision of each.
+
+use std::collections::HashMap;
+use std::time::{Duration, Instant};
+
+use crate::service::journal::Journal;
+use crate::service::journal::log::Record;
+use crate::slam::keyframe::{DepthPoint, KeyframePose};
+use crate::wire::conversion::{keyframe_from_messages, keyframe_pose_from_message};
+use crate::wire::message::{GraphHeader, KeyframeHeader, KeyframeImageHeader, KeyframePoseMessage};
+use crate::wire::port::{Hub, OpenError, ReceiveError, Received, Subscriber};
+use crate::wire::topic::{GRAPH, KEYFRAME, KEYFRAME_IMAGE};
+
+/// Time between two states of the same keyframe in the journal: up to 2 MB each.
+const PERIOD: Duration = Duration::from_millis(1500);
+
+/// Follows the mapper's keyframes. Depth stays in shared memory until it goes to the journal.
+#[derive(Debug)]
+pub struct KeyframeFeed {
+    depths: Subscriber<DepthPoint, KeyframeHeader>,
+    images: Subscriber<u8, KeyframeImageHeader>,
+    graphs: Subscriber<KeyframePoseMessage, GraphHeader>,
+    depth: Option<Received<DepthPoint, KeyframeHeader>>,
+    image: Option<Received<u8, KeyframeImageHeader>>,
+    /// Revision that the journal has, and since when.
+    kept: Option<(u64, Instant)>,
+    /// Poses that the journal has, by epoch and keyframe.
+    poses: HashMap<(u32, u64), KeyframePose>,
+}
+
+impl KeyframeFeed {
+    /// Listens from now on.
+    pub fn open(hub: &Hub) -> Result<Self, OpenError> {
+        Ok(Self {
+            depths: hub.subscriber(&KEYFRAME)?,
+            images: hub.subscriber(&KEYFRAME_IMAGE)?,
+            graphs: hub.subscriber(&GRAPH)?,
+            depth: None,
+            image: None,
+            kept: None,
+            poses: HashMap::new(),
+        })
+    }
+
+    /// Takes in what came and gives the journal what is due; at the end everything is.
+    pub fn collect(&mut self, journal: &mut Journal, is_end: bool) -> Result<(), ReceiveError> {
+        while let Some(depth) = self.depths.receive()? {
+            let of = |header: &KeyframeHeader| (header.epoch, header.keyframe_id);
+            let before = self.depth.as_ref().map(|before| of(before.header()));
+            if before.is_some_and(|before| before != of(depth.header())) {
+                // The last of a keyframe, while its image is still here.
+                self.keep(journal);
+                self.kept = None;
+            }
+            self.depth = Some(depth);
+        }
+        while let Some(image) = self.images.receive()? {
+            self.image = Some(image);
+        }
+        let is_due = self.kept.is_none_or(|(_, at)| at.elapsed() >= PERIOD);
+        if is_due || is_end {
+            self.keep(journal);
+        }
+        self.collect_graph(journal)
+    }
+
+    /// Gives the journal the newest state of the keyframe, where it has an older one.
+    fn keep(&mut self, journal: &mut Journal) {
+        let (Some(depth), Some(image)) = (&self.depth, &self.image) else { return };
+        let (header, image_header) = (depth.header(), image.header());
+        let is_known = self.kept.is_some_and(|(revision, _)| revision == header.revision);
+        let same =
+            (header.epoch, header.keyframe_id) == (image_header.epoch, image_header.keyframe_id);
+        if is_known || !same {
+            return;
+        }
+        match keyframe_from_messages(header, depth.payload(), image_header, image.payload()) {
+            Err(error) => tracing::warn!("mapper/keyframe: {error}"),
+            Ok(keyframe) => {
+                let (revision, key) = (keyframe.revision, (keyframe.epoch, keyframe.keyframe_id));
+                let (keyframe_id, world_from_keyframe) =
+                    (keyframe.keyframe_id, keyframe.world_from_keyframe);
+                if journal.put_keyframe(keyframe).is_none() {
+                    self.kept = Some((revision, Instant::now()));
+                    self.poses.insert(key, KeyframePose { keyframe_id, world_from_keyframe });
+                }
+            }
+        }
+    }
+
+    /// Gives the journal the poses that have changed.
+    fn collect_graph(&mut self, journal: &mut Journal) -> Result<(), ReceiveError> {
+        let Some(graph) = self.graphs.newest()? else { return Ok(()) };
+        let epoch = graph.header().epoch;
+        for message in graph.payload() {
+            let Ok(pose) = keyframe_pose_from_message(message) else { continue };
+            let known = self.poses.get_mut(&(epoch, pose.keyframe_id));
+            if let Some(known) = known.filter(|known| **known != pose) {
+                *known = pose;
+                journal.append(&Record::KeyframePose(epoch, pose));
+            }
+        }
+        Ok(())
+    }
+}

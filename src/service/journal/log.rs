@@ -1,0 +1,393 @@
+//! The log of a run: an append-only file of checked records, little-endian.
+//!
+//! Layout: magic, then records: bytes of kind and payload together (u32), their CRC-32 (u32), kind (u8),
+//! payload. A process that dies tears the last record at most: reading ends at the first record that is not
+//! whole, and what came before counts.
+
+use std::io::Read;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use serde::{Deserialize, Serialize};
+
+use crate::service::map_file::{keyframe_bytes, parse_keyframe};
+use crate::service::recording::RunCounters;
+use crate::service::results::RunMode;
+use crate::slam::keyframe::{Keyframe, KeyframePose};
+use crate::wire::conversion::{similarity_from_message, similarity_message};
+use crate::wire::message::PoseMessage;
+
+/// First bytes of the file, with the version of the layout.
+const MAGIC: [u8; 16] = *b"semidense log 1\n";
+/// Bytes before kind and payload.
+const PREFIX_BYTES: usize = 8;
+/// Largest record: the configuration is a tenth of it.
+const MAX_RECORD_BYTES: usize = 1 << 20;
+/// Largest log that is read: three weeks of poses at 30 Hz would be larger.
+const MAX_LOG_BYTES: u64 = 32 << 30;
+
+/// How a run was started: what it takes to open its source again.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RunStart {
+    /// How it is driven.
+    pub mode: RunMode,
+    /// Where the frames come from.
+    pub source: String,
+    /// The camera's rig file.
+    pub rig: Option<String>,
+    /// The folder that relative paths are relative to.
+    pub folder: String,
+    /// The whole configuration, as TOML.
+    pub config: String,
+    /// Whether poses were given and not estimated.
+    pub poses_given: bool,
+    /// When, seconds since 1970.
+    pub began_secs: u64,
+}
+
+impl RunStart {
+    /// When the run began.
+    pub fn began(&self) -> SystemTime {
+        UNIX_EPOCH.checked_add(Duration::from_secs(self.began_secs)).unwrap_or(UNIX_EPOCH)
+    }
+}
+
+/// A step of the mapper.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Step {
+    /// Time that it took.
+    pub step_nanos: u64,
+    /// The part of it in which a keyframe was made and published; 0 where none was.
+    pub change_nanos: u64,
+    /// What the frame came to in a start, as its code in `mapper/step`.
+    pub start_frame: u32,
+}
+
+/// One entry of the log.
+#[derive(Debug, Clone)]
+pub enum Record {
+    /// The first one.
+    Start(Box<RunStart>),
+    /// A pose as it was received.
+    Pose(Box<PoseMessage>),
+    /// A step of the mapper.
+    Step(Step),
+    /// What was counted until now.
+    Counters(RunCounters),
+    /// A keyframe without image and points.
+    Keyframe(Box<Keyframe>),
+    /// A keyframe's pose has changed.
+    KeyframePose(u32, KeyframePose),
+}
+
+impl Record {
+    const START: u8 = 1;
+    const POSE: u8 = 2;
+    const STEP: u8 = 3;
+    const COUNTERS: u8 = 4;
+    const KEYFRAME: u8 = 5;
+    const KEYFRAME_POSE: u8 = 6;
+
+    /// Appends the record's bytes to `log`.
+    pub fn write(&self, log: &mut Vec<u8>) {
+        let begin = log.len();
+        log.extend([0; PREFIX_BYTES]);
+        self.write_body(log);
+        let body = &log[begin + PREFIX_BYTES..];
+        let (length, checksum) = (body.len() as u32, crc32fast::hash(body));
+        log[begin..begin + 4].copy_from_slice(&length.to_le_bytes());
+        log[begin + 4..begin + PREFIX_BYTES].copy_from_slice(&checksum.to_le_bytes());
+    }
+
+    fn write_body(&self, log: &mut Vec<u8>) {
+        match self {
+            Self::Start(start) => {
+                log.push(Self::START);
+                // Strings and plain values: nothing that JSON cannot say.
+                log.extend(serde_json::to_vec(start).unwrap_or_default());
+            }
+            Self::Pose(pose) => {
+                log.push(Self::POSE);
+                write_pose(pose, log);
+            }
+            Self::Step(step) => {
+                log.push(Self::STEP);
+                write_u64s(log, &[step.step_nanos, step.change_nanos]);
+                write_u32s(log, &[step.start_frame]);
+            }
+            Self::Counters(counters) => {
+                log.push(Self::COUNTERS);
+                log.extend(serde_json::to_vec(counters).unwrap_or_default());
+            }
+            Self::Keyframe(keyframe) => {
+                log.push(Self::KEYFRAME);
+                log.extend(keyframe_bytes(keyframe));
+            }
+            Self::KeyframePose(epoch, pose) => {
+                log.push(Self::KEYFRAME_POSE);
+                write_u64s(log, &[u64::from(*epoch), pose.keyframe_id]);
+                write_f64s(log, &similarity_message(&pose.world_from_keyframe));
+            }
+        }
+    }
+
+    /// The record of a kind and a payload; `None` where they do not fit.
+    fn from_body(body: &[u8]) -> Option<Self> {
+        let (&kind, payload) = body.split_first()?;
+        let mut bytes = payload;
+        let record = match kind {
+            Self::START => return serde_json::from_slice(payload).ok().map(Self::Start),
+            Self::COUNTERS => return serde_json::from_slice(payload).ok().map(Self::Counters),
+            Self::KEYFRAME => {
+                let keyframe = parse_keyframe(payload).ok()?;
+                return Some(Self::Keyframe(Box::new(keyframe)));
+            }
+            Self::POSE => Self::Pose(Box::new(read_pose(&mut bytes)?)),
+            Self::STEP => {
+                let [step_nanos, change_nanos] = read_u64s(&mut bytes)?;
+                let [start_frame] = read_u32s(&mut bytes)?;
+                Self::Step(Step { step_nanos, change_nanos, start_frame })
+            }
+            Self::KEYFRAME_POSE => {
+                let [epoch, keyframe_id] = read_u64s(&mut bytes)?;
+                let pose = similarity_from_message(&read_f64s(&mut bytes)?, "pose").ok()?;
+                let pose = KeyframePose { keyframe_id, world_from_keyframe: pose };
+                Self::KeyframePose(u32::try_from(epoch).ok()?, pose)
+            }
+            _ => return None,
+        };
+        bytes.is_empty().then_some(record)
+    }
+}
+
+/// The first bytes of a log.
+pub fn log_header() -> Vec<u8> {
+    MAGIC.to_vec()
+}
+
+/// What a log holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LogEnd {
+    /// It ends with a whole record.
+    Whole,
+    /// What follows the last whole record cannot be read: the process died while it wrote.
+    Torn,
+    /// It is something else, or of another version.
+    Unknown,
+}
+
+/// Reads a log to its end, or to the first record that is not whole.
+pub fn read_log(log: impl Read, take: &mut dyn FnMut(Record)) -> LogEnd {
+    let mut log = log.take(MAX_LOG_BYTES);
+    let mut magic = [0; MAGIC.len()];
+    if log.read_exact(&mut magic).is_err() || magic != MAGIC {
+        return LogEnd::Unknown;
+    }
+    let mut body = Vec::new();
+    loop {
+        let mut prefix = Vec::with_capacity(PREFIX_BYTES);
+        match log.by_ref().take(PREFIX_BYTES as u64).read_to_end(&mut prefix) {
+            Ok(0) => return LogEnd::Whole,
+            Ok(PREFIX_BYTES) => {}
+            _ => return LogEnd::Torn,
+        }
+        let mut rest = &prefix[..];
+        let (Some([length]), Some([checksum])) = (read_u32s(&mut rest), read_u32s(&mut rest))
+        else {
+            return LogEnd::Torn;
+        };
+        if length as usize > MAX_RECORD_BYTES {
+            return LogEnd::Torn;
+        }
+        body.clear();
+        let read = log.by_ref().take(u64::from(length)).read_to_end(&mut body);
+        let is_whole = read.is_ok_and(|bytes| bytes == length as usize);
+        if !is_whole || crc32fast::hash(&body) != checksum {
+            return LogEnd::Torn;
+        }
+        match Record::from_body(&body) {
+            Some(record) => take(record),
+            None => return LogEnd::Torn,
+        }
+    }
+}
+
+fn write_u64s(bytes: &mut Vec<u8>, numbers: &[u64]) {
+    numbers.iter().for_each(|number| bytes.extend(number.to_le_bytes()));
+}
+
+fn write_u32s(bytes: &mut Vec<u8>, numbers: &[u32]) {
+    numbers.iter().for_each(|number| bytes.extend(number.to_le_bytes()));
+}
+
+fn write_f64s(bytes: &mut Vec<u8>, numbers: &[f64]) {
+    numbers.iter().for_each(|number| bytes.extend(number.to_le_bytes()));
+}
+
+fn read_u64s<const N: usize>(bytes: &mut &[u8]) -> Option<[u64; N]> {
+    read_numbers(bytes, u64::from_le_bytes)
+}
+
+fn read_u32s<const N: usize>(bytes: &mut &[u8]) -> Option<[u32; N]> {
+    read_numbers(bytes, u32::from_le_bytes)
+}
+
+fn read_f64s<const N: usize>(bytes: &mut &[u8]) -> Option<[f64; N]> {
+    read_numbers(bytes, f64::from_le_bytes)
+}
+
+fn read_numbers<T: Copy + Default, const N: usize, const SIZE: usize>(
+    bytes: &mut &[u8],
+    from: fn([u8; SIZE]) -> T,
+) -> Option<[T; N]> {
+    let mut numbers = [T::default(); N];
+    for number in &mut numbers {
+        let (first, rest) = bytes.split_first_chunk::<SIZE>()?;
+        (*number, *bytes) = (from(*first), rest);
+    }
+    Some(numbers)
+}
+
+fn write_pose(p: &PoseMessage, bytes: &mut Vec<u8>) {
+    write_u64s(bytes, &[p.sequence, p.capture_nanos.cast_unsigned()]);
+    write_u64s(bytes, &[p.published_nanos.cast_unsigned(), p.latency_nanos, p.track_nanos]);
+    write_u64s(bytes, &[p.wake_nanos, p.revision, p.keyframe_id]);
+    write_u32s(bytes, &[p.epoch, p.state, p.reason, p.proposes_keyframe]);
+    write_u32s(bytes, &[p.iterations, p.finest_level, p.points]);
+    write_f64s(bytes, &p.world_from_camera);
+    write_f64s(bytes, &p.keyframe_from_camera);
+    write_f64s(bytes, &p.covariance);
+    write_f64s(bytes, &p.brightness);
+    write_f64s(bytes, &[p.in_view_ratio, p.inlier_ratio, p.whitened_rmse]);
+    write_f64s(bytes, &[p.residual_rmse, p.mean_squared_flow]);
+}
+
+fn read_pose(bytes: &mut &[u8]) -> Option<PoseMessage> {
+    let [sequence, capture, published, latency_nanos, track_nanos] = read_u64s(bytes)?;
+    let [wake_nanos, revision, keyframe_id] = read_u64s(bytes)?;
+    let [epoch, state, reason, proposes_keyframe] = read_u32s(bytes)?;
+    let [iterations, finest_level, points] = read_u32s(bytes)?;
+    let (world_from_camera, keyframe_from_camera) = (read_f64s(bytes)?, read_f64s(bytes)?);
+    let (covariance, brightness) = (read_f64s(bytes)?, read_f64s(bytes)?);
+    let [in_view_ratio, inlier_ratio, whitened_rmse] = read_f64s(bytes)?;
+    let [residual_rmse, mean_squared_flow] = read_f64s(bytes)?;
+    Some(PoseMessage {
+        sequence,
+        capture_nanos: capture.cast_signed(),
+        published_nanos: published.cast_signed(),
+        latency_nanos,
+        track_nanos,
+        wake_nanos,
+        revision,
+        keyframe_id,
+        epoch,
+        state,
+        reason,
+        proposes_keyframe,
+        world_from_camera,
+        keyframe_from_camera,
+        covariance,
+        brightness,
+        in_view_ratio,
+        inlier_ratio,
+        whitened_rmse,
+        residual_rmse,
+        mean_squared_flow,
+        iterations,
+        finest_level,
+        points,
+        reserved: 0,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::frame::FrameView;
+    use crate::slam::geometry::intrinsics::Intrinsics;
+    use crate::slam::geometry::se3::SE3;
+    use crate::slam::geometry::sim3::Sim3;
+    use crate::slam::keyframe::MapState;
+    use crate::slam::pose::PoseEstimate;
+    use crate::wire::conversion::{PoseTiming, pose_message};
+
+    fn records() -> Vec<Record> {
+        let start = RunStart {
+            mode: RunMode::Live,
+            source: "tum:a \"b\"\n".into(),
+            rig: None,
+            folder: "/x".into(),
+            config: "instance = \"x\"\n".into(),
+            poses_given: false,
+            began_secs: 5,
+        };
+        let frame = FrameView {
+            sequence: 7,
+            capture_nanos: -5,
+            exposure_nanos: 0,
+            width: 0,
+            height: 0,
+            pixels: &[],
+        };
+        let timing = PoseTiming { published_nanos: 11, latency_nanos: 12, ..Default::default() };
+        let mut pose = pose_message(&PoseEstimate::unknown(&frame), &timing);
+        pose.covariance[20] = 0.125;
+        let world_from_keyframe = Sim3::new(SE3::identity(), 1.5);
+        let keyframe = Keyframe {
+            keyframe_id: 3,
+            epoch: 1,
+            revision: 9,
+            sequence: 7,
+            capture_nanos: -5,
+            map_state: MapState::Established,
+            world_from_keyframe,
+            intrinsics: Intrinsics { fx: 20.0, fy: 21.0, cx: 8.0, cy: 7.5, width: 17, height: 16 },
+            image: Vec::new(),
+            points: Vec::new(),
+        };
+        vec![
+            Record::Start(Box::new(start)),
+            Record::Pose(Box::new(pose)),
+            Record::Step(Step { step_nanos: 5, change_nanos: 6, start_frame: 2 }),
+            Record::Counters(RunCounters { frames_in: 8, gaps: 9, ..RunCounters::default() }),
+            Record::Keyframe(Box::new(keyframe)),
+            Record::KeyframePose(1, KeyframePose { keyframe_id: 3, world_from_keyframe }),
+        ]
+    }
+
+    fn read(bytes: &[u8]) -> (Vec<Record>, LogEnd) {
+        let mut found = Vec::new();
+        let end = read_log(bytes, &mut |record| found.push(record));
+        (found, end)
+    }
+
+    #[test]
+    fn every_record_comes_back_and_a_torn_end_costs_one() {
+        let mut log = log_header();
+        let mut ends = vec![log.len()];
+        for record in records() {
+            record.write(&mut log);
+            ends.push(log.len());
+        }
+        let (found, end) = read(&log);
+        assert_eq!(end, LogEnd::Whole);
+        assert_eq!(format!("{found:?}"), format!("{:?}", records()));
+        for length in 0..log.len() {
+            let (found, end) = read(&log[..length]);
+            assert_eq!(found.len(), ends.iter().filter(|&&e| e <= length).count().max(1) - 1);
+            let is_whole = ends.contains(&length);
+            let expected = match (length < MAGIC.len(), is_whole) {
+                (true, _) => LogEnd::Unknown,
+                (_, true) => LogEnd::Whole,
+                _ => LogEnd::Torn,
+            };
+            assert_eq!(end, expected, "{length} bytes");
+        }
+        for place in MAGIC.len()..log.len() {
+            let mut broken = log.clone();
+            broken[place] ^= 0x10;
+            let (found, end) = read(&broken);
+            let whole = ends.iter().filter(|&&e| e <= place).count() - 1;
+            assert_eq!((found.len(), end), (whole, LogEnd::Torn), "byte {place}");
+        }
+    }
+}

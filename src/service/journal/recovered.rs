@@ -1,0 +1,156 @@
+//! A run as its journal has it.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{BufReader, Read};
+use std::path::{Path, PathBuf};
+
+use crate::service::journal::folder::{LOG, keyframe_file};
+use crate::service::journal::log::{Record, RunStart, read_log};
+use crate::service::map_file::read_map;
+use crate::service::recording::{Recording, RunCounters};
+use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
+use crate::slam::mapper::Map;
+
+/// Why a journal cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum JournalError {
+    /// The log cannot be read.
+    #[error("{path}: {source}; the journal is not usable")]
+    Read {
+        /// The log.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// The log is something else.
+    #[error("{0}: this is no journal of this version of semidense")]
+    Unknown(PathBuf),
+}
+
+/// Everything that a journal holds but the depth of its keyframes.
+#[derive(Debug)]
+pub struct Recovered {
+    /// How the run was started.
+    pub start: RunStart,
+    /// Its poses and times.
+    pub recording: Recording,
+    /// What was counted last; frames at least as many as poses.
+    pub counters: RunCounters,
+    /// Keyframes by epoch and id, without image and points.
+    keyframes: BTreeMap<(u32, u64), Keyframe>,
+}
+
+impl Recovered {
+    /// Reads the journal in `folder`.
+    pub fn read(folder: &Path) -> Result<Self, JournalError> {
+        let path = folder.join(LOG);
+        let file = File::open(&path)
+            .map_err(|source| JournalError::Read { path: path.clone(), source })?;
+        Self::from_log(BufReader::new(file)).ok_or(JournalError::Unknown(path))
+    }
+
+    /// What a log holds; `None` where it does not begin with the start of a run.
+    pub fn from_log(log: impl Read) -> Option<Self> {
+        let mut found: Option<Self> = None;
+        read_log(log, &mut |record| match (&mut found, record) {
+            (None, Record::Start(start)) => found = Some(Self::of(*start)),
+            (None, _) => {}
+            (Some(found), record) => found.take(record),
+        });
+        found
+    }
+
+    fn of(start: RunStart) -> Self {
+        Self {
+            start,
+            recording: Recording::default(),
+            counters: RunCounters::default(),
+            keyframes: BTreeMap::new(),
+        }
+    }
+
+    fn take(&mut self, record: Record) {
+        match record {
+            // There is one, at the beginning.
+            Record::Start(_) => {}
+            // The reader of the log cannot know what a pose may hold; what cannot be is left out.
+            Record::Pose(pose) => drop(self.recording.take_pose(&pose)),
+            Record::Step(step) => {
+                self.recording.take_step(step.step_nanos, step.change_nanos, step.start_frame)
+            }
+            Record::Counters(counters) => self.counters = counters,
+            Record::Keyframe(keyframe) => {
+                self.keyframes.insert((keyframe.epoch, keyframe.keyframe_id), *keyframe);
+            }
+            Record::KeyframePose(epoch, pose) => {
+                if let Some(keyframe) = self.keyframes.get_mut(&(epoch, pose.keyframe_id)) {
+                    keyframe.world_from_keyframe = pose.world_from_keyframe;
+                }
+            }
+        }
+        let frames_in = self.counters.frames_in.max(self.recording.num_poses() as u64);
+        self.counters.frames_in = frames_in;
+    }
+
+    /// The map, with at most `max_bytes` of depth from the files in `folder`, the newest first. A start
+    /// that was never proven is no part of it.
+    pub fn map(&self, folder: &Path, max_bytes: u64) -> Map {
+        let proven = |keyframe: &&Keyframe| keyframe.map_state != MapState::Initializing;
+        let mut keyframes: Vec<Keyframe> =
+            self.keyframes.values().filter(proven).cloned().collect();
+        let mut bytes = 0;
+        for keyframe in keyframes.iter_mut().rev() {
+            if bytes > max_bytes {
+                break;
+            }
+            let path = folder.join(keyframe_file(keyframe.epoch, keyframe.keyframe_id));
+            let Ok(map) = read_map(&path) else { continue };
+            let Some(kept) = map.keyframes.into_iter().next() else { continue };
+            if kept.intrinsics == keyframe.intrinsics {
+                take_depth(keyframe, kept);
+                bytes += (keyframe.image.len() + size_of_val(&keyframe.points[..])) as u64;
+            }
+        }
+        Map { keyframes, free_epoch: 0 }
+    }
+}
+
+/// The map of the journal in `folder`; empty where it cannot be read.
+pub(super) fn read_map_of(folder: &Path, max_bytes: u64) -> Map {
+    Recovered::read(folder).map_or_else(|_| Map::default(), |found| found.map(folder, max_bytes))
+}
+
+/// Gives a keyframe image and depth of another state of it, in the unit that its pose has now.
+fn take_depth(keyframe: &mut Keyframe, from: Keyframe) {
+    let factor = (keyframe.world_from_keyframe.scale / from.world_from_keyframe.scale) as f32;
+    keyframe.image = from.image;
+    keyframe.points = from.points;
+    if factor != 1.0 {
+        keyframe.points.iter_mut().for_each(|point| {
+            *point = DepthPoint {
+                inverse_depth: point.inverse_depth * factor,
+                variance: point.variance * factor * factor,
+                ..*point
+            };
+        });
+    }
+}
+
+/// Completes the map of a mapper that has died on the way with what the journal kept: depth that the mapper no
+/// longer has, and keyframes that it never heard of.
+pub fn complete(map: &mut Map, journal: Map) {
+    for kept in journal.keyframes {
+        let is_same = |keyframe: &Keyframe| {
+            (keyframe.epoch, keyframe.keyframe_id) == (kept.epoch, kept.keyframe_id)
+        };
+        match map.keyframes.iter().position(is_same) {
+            Some(index) if map.keyframes[index].points.is_empty() && !kept.points.is_empty() => {
+                take_depth(&mut map.keyframes[index], kept);
+            }
+            Some(_) => {}
+            None => map.keyframes.push(kept),
+        }
+    }
+    map.keyframes.sort_by_key(|keyframe| (keyframe.epoch, keyframe.keyframe_id));
+}

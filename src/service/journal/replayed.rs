@@ -1,0 +1,98 @@
+//! The journal of a replay: the same records, taken from the record that grows in the same process.
+
+use std::collections::HashMap;
+use std::io;
+use std::time::{Duration, Instant};
+
+use crate::service::journal::log::{Record, Step};
+use crate::service::journal::{Journal, JournalOptions};
+use crate::service::recording::RunCounters;
+use crate::service::replay::ReplayProgress;
+use crate::service::results::RunRecord;
+use crate::slam::keyframe::Keyframe;
+use crate::wire::conversion::{PoseTiming, code_from_start_frame, pose_message};
+use crate::wire::place::Place;
+
+/// Time between two states of the same keyframe in the journal.
+const PERIOD: Duration = Duration::from_secs(2);
+
+/// Follows a replay.
+#[derive(Debug)]
+pub struct ReplayJournal {
+    journal: Journal,
+    begin: Instant,
+    /// Poses and steps that the journal has.
+    poses: usize,
+    steps: usize,
+    /// Revisions that the journal has, by epoch and keyframe.
+    revisions: HashMap<(u32, u64), u64>,
+    active: Option<(u32, u64)>,
+    looked: Instant,
+}
+
+impl ReplayJournal {
+    /// Begins it.
+    pub fn begin(options: &JournalOptions, place: &Place) -> io::Result<Self> {
+        Ok(Self {
+            journal: Journal::begin(options, place)?,
+            begin: Instant::now(),
+            poses: 0,
+            steps: 0,
+            revisions: HashMap::new(),
+            active: None,
+            looked: Instant::now(),
+        })
+    }
+
+    /// The journal alone, to be finished.
+    pub fn into_journal(self) -> Journal {
+        self.journal
+    }
+
+    /// Takes in what a frame has brought.
+    pub fn observe(&mut self, progress: &ReplayProgress<'_>) {
+        self.take_poses(progress.record, code_from_start_frame(progress.start_frame));
+        let key = |keyframe: &Keyframe| (keyframe.epoch, keyframe.keyframe_id);
+        let active = progress.keyframe.map(key);
+        let has_changed = active != self.active;
+        if has_changed || self.looked.elapsed() >= PERIOD {
+            self.looked = Instant::now();
+            // One that the disk was too slow for is tried again in the next round.
+            self.active = active;
+            self.take_keyframes(&progress.map.keyframes);
+        }
+        if self.journal.wants_counters() {
+            let RunRecord { frames_in, gaps, .. } = *progress.record;
+            self.journal.count(RunCounters { frames_in, gaps, ..RunCounters::default() });
+        }
+    }
+
+    fn take_poses(&mut self, record: &RunRecord, start_frame: u32) {
+        let published_nanos = i64::try_from(self.begin.elapsed().as_nanos()).unwrap_or(i64::MAX);
+        for pose in &record.poses[self.poses..] {
+            let track_nanos = pose.track_nanos.unwrap_or(0);
+            let timing = PoseTiming { published_nanos, track_nanos, ..PoseTiming::default() };
+            let message = pose_message(&pose.estimate, &timing);
+            self.journal.append(&Record::Pose(Box::new(message)));
+        }
+        for step in &record.map_nanos[self.steps..] {
+            let (step_nanos, change_nanos) = (*step, 0);
+            self.journal.append(&Record::Step(Step { step_nanos, change_nanos, start_frame }));
+        }
+        (self.poses, self.steps) = (record.poses.len(), record.map_nanos.len());
+    }
+
+    /// Gives the journal every keyframe of which it has an older state.
+    fn take_keyframes(&mut self, keyframes: &[Keyframe]) {
+        for keyframe in keyframes.iter().filter(|keyframe| !keyframe.points.is_empty()) {
+            let key = (keyframe.epoch, keyframe.keyframe_id);
+            if self.revisions.get(&key) == Some(&keyframe.revision) {
+                continue;
+            }
+            if self.journal.put_keyframe(keyframe.clone()).is_some() {
+                return;
+            }
+            self.revisions.insert(key, keyframe.revision);
+        }
+    }
+}

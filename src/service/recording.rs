@@ -1,0 +1,155 @@
+//! What is collected of a run while it goes on: poses, times and counts, until they are a record.
+
+use serde::{Deserialize, Serialize};
+
+use crate::service::results::untracked::StartTally;
+use crate::service::results::{RecordedPose, RunMode, RunRecord};
+use crate::slam::evaluation::depth_error::DepthScale;
+use crate::slam::mapper::Map;
+use crate::slam::pose::TrackingState;
+use crate::slam::trajectory::StampedPose;
+use crate::wire::conversion::{MessageError, pose_from_message, start_frame_from_code};
+use crate::wire::message::PoseMessage;
+
+/// What only the supervisor knows of a run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(default)]
+pub struct RunCounters {
+    /// Frames that capture sent.
+    pub frames_in: u64,
+    /// Holes in the source's sequence.
+    pub gaps: u64,
+    /// Processes that were started again.
+    pub restarts: u64,
+    /// Frames published after the deadline.
+    pub deadline_misses: u64,
+    /// Page faults of the tracker's frame loop since it was warm.
+    pub page_faults: u64,
+    /// Largest resident memory of all processes together, bytes.
+    pub peak_rss_bytes: u64,
+}
+
+/// Poses and steps of a run so far.
+#[derive(Debug, Default)]
+pub struct Recording {
+    poses: Vec<RecordedPose>,
+    map_nanos: Vec<u64>,
+    keyframe_step_nanos: Vec<u64>,
+    keyframe_nanos: Vec<u64>,
+    start: StartTally,
+    /// CLOCK_MONOTONIC of the first frame and of the last pose.
+    span_nanos: Option<(i64, i64)>,
+}
+
+/// What a record is made of besides what was collected.
+#[derive(Debug)]
+pub struct RecordParts {
+    /// How the run was driven.
+    pub mode: RunMode,
+    /// Where the frames came from.
+    pub source: String,
+    /// The map at the end.
+    pub map: Map,
+    /// True poses.
+    pub ground_truth: Vec<StampedPose>,
+    /// Where metres come from when depth is compared.
+    pub depth_scale: DepthScale,
+    /// The tracker's deadline as it is configured, milliseconds.
+    pub deadline_ms: f64,
+    /// What was counted.
+    pub counters: RunCounters,
+}
+
+impl Recording {
+    /// Takes in a pose as it was sent.
+    pub fn take_pose(&mut self, message: &PoseMessage) -> Result<(), MessageError> {
+        let estimate = pose_from_message(message)?;
+        let latency = i64::try_from(message.latency_nanos).unwrap_or(i64::MAX);
+        let sent_nanos = message.published_nanos.saturating_sub(latency);
+        let first = self.span_nanos.map_or(sent_nanos, |(first, _)| first);
+        self.span_nanos = Some((first, message.published_nanos));
+        self.poses.push(RecordedPose {
+            estimate,
+            latency_nanos: Some(message.latency_nanos),
+            track_nanos: Some(message.track_nanos),
+            trace: None,
+            wake_nanos: Some(message.wake_nanos),
+        });
+        Ok(())
+    }
+
+    /// Takes in a step of the mapper: what it took, `change_nanos` 0 where no keyframe was made, and the
+    /// code of what the frame came to in a start.
+    pub fn take_step(&mut self, step_nanos: u64, change_nanos: u64, start_frame: u32) {
+        self.start.count(start_frame_from_code(start_frame));
+        self.map_nanos.push(step_nanos);
+        if change_nanos > 0 {
+            self.keyframe_step_nanos.push(step_nanos);
+            self.keyframe_nanos.push(change_nanos);
+        }
+    }
+
+    /// Poses so far.
+    pub fn num_poses(&self) -> usize {
+        self.poses.len()
+    }
+
+    /// Steps of the mapper so far.
+    pub fn num_steps(&self) -> usize {
+        self.map_nanos.len()
+    }
+
+    /// State of the last frame.
+    pub fn state(&self) -> Option<TrackingState> {
+        self.poses.last().map(|pose| pose.estimate.state)
+    }
+
+    /// The record of the whole run.
+    pub fn into_record(mut self, parts: RecordParts) -> RunRecord {
+        let counters = &parts.counters;
+        let stamps = |pose: Option<&RecordedPose>| pose.map_or(0, |p| p.estimate.capture_nanos);
+        let (first, last) = (stamps(self.poses.first()), stamps(self.poses.last()));
+        let positive = |nanos: i64| u64::try_from(nanos).unwrap_or(0);
+        let recorded_nanos = positive(last.saturating_sub(first));
+        let period_nanos = recorded_nanos / counters.frames_in.saturating_sub(1).max(1);
+        let deadline_nanos = if parts.deadline_ms > 0.0 {
+            (parts.deadline_ms * 1e6) as u64
+        } else {
+            period_nanos / 2
+        };
+        let (is_live, is_replay) = (parts.mode == RunMode::Live, parts.mode == RunMode::Replay);
+        let wall_nanos = self.span_nanos.map_or(0, |(first, last)| last.saturating_sub(first));
+        if is_replay {
+            // One process: nothing was sent.
+            self.poses.iter_mut().for_each(|p| (p.latency_nanos, p.wake_nanos) = (None, None));
+        }
+        if parts.depth_scale == DepthScale::Given {
+            self.poses.iter_mut().for_each(|pose| pose.track_nanos = None);
+        }
+        RunRecord {
+            mode: parts.mode,
+            source: parts.source,
+            ended: Default::default(),
+            frames_in: counters.frames_in,
+            frames_dropped: counters.frames_in.saturating_sub(self.poses.len() as u64),
+            poses: self.poses,
+            map: parts.map,
+            ground_truth: parts.ground_truth,
+            depth_scale: parts.depth_scale,
+            gaps: counters.gaps,
+            restarts: counters.restarts,
+            deadline_nanos: is_live.then_some(deadline_nanos),
+            deadline_misses: is_live.then_some(counters.deadline_misses),
+            page_faults: (!is_replay).then_some(counters.page_faults),
+            map_nanos: self.map_nanos,
+            keyframe_step_nanos: self.keyframe_step_nanos,
+            keyframe_nanos: self.keyframe_nanos,
+            start: self.start,
+            rejections: None,
+            budget_samples: Vec::new(),
+            recorded_nanos,
+            wall_nanos: positive(wall_nanos),
+            peak_rss_bytes: (counters.peak_rss_bytes > 0).then_some(counters.peak_rss_bytes),
+        }
+    }
+}

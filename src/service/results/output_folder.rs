@@ -1,0 +1,218 @@
+//! Where the results of a run go: the folder that the user names, or a new one for each run.
+
+use std::fs::{self, File};
+use std::io;
+use std::os::unix::fs::symlink;
+use std::path::{Path, PathBuf};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use rustix::fs::{Mode, OFlags};
+
+use crate::service::results::ResultsError;
+use crate::service::results::set::{finish_commit, foreign_file};
+
+/// Folder of the folders, below the one that the program is started in.
+pub const PARENT: &str = "output";
+/// Name of the link to the newest folder.
+pub const LATEST: &str = "latest";
+
+/// Most runs that start in the same second in the same folder.
+const MAX_SAME_SECOND: u32 = 1000;
+
+/// The folder of a run's results; made by the program, it goes with the run where nothing was written.
+#[derive(Debug)]
+pub struct OutputFolder {
+    path: PathBuf,
+    is_new: bool,
+}
+
+impl OutputFolder {
+    /// The folder that is `named`, else a new one in [`PARENT`], named by the second (UTC) of its making.
+    /// Looks that it can be written, so that a folder without room or permission is noticed before the run.
+    pub fn prepare(named: Option<&Path>) -> Result<Self, ResultsError> {
+        let folder = match named {
+            Some(path) => Self { path: path.to_owned(), is_new: false },
+            None => {
+                let made = new_folder(Path::new(PARENT), &utc_stamp(SystemTime::now()));
+                let path = made.map_err(|source| write_error(Path::new(PARENT), source))?;
+                Self { path, is_new: true }
+            }
+        };
+        prepare_output(&folder.path)?;
+        Ok(folder)
+    }
+
+    /// Its path.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Of a folder that was made for the run: links [`LATEST`] to it. A `latest` of the user's own stays.
+    pub fn become_latest(&self) -> io::Result<()> {
+        let (Some(parent), Some(name)) = (self.path.parent(), self.path.file_name()) else {
+            return Ok(());
+        };
+        let latest = parent.join(LATEST);
+        let is_link = fs::symlink_metadata(&latest).map_or(true, |found| found.is_symlink());
+        if !self.is_new || !is_link {
+            return Ok(());
+        }
+        let temporary = parent.join(format!(".{LATEST}.{}", std::process::id()));
+        drop(fs::remove_file(&temporary));
+        symlink(name, &temporary)?;
+        fs::rename(&temporary, &latest).inspect_err(|_| drop(fs::remove_file(&temporary)))
+    }
+}
+
+impl Drop for OutputFolder {
+    fn drop(&mut self) {
+        if self.is_new {
+            // Only an empty folder can be removed so.
+            drop(fs::remove_dir(&self.path));
+            drop(self.path.parent().map(fs::remove_dir));
+        }
+    }
+}
+
+/// Makes the folder where it is missing, looks that it can be written and that it holds no file of the user's
+/// that results would replace, and finishes what a killed process has left half done.
+pub fn prepare_output(folder: &Path) -> Result<(), ResultsError> {
+    let attempt = || {
+        fs::create_dir_all(folder)?;
+        write_probe(folder)?;
+        finish_commit(folder)?;
+        foreign_file(folder)
+    };
+    match attempt().map_err(|source| write_error(folder, source))? {
+        Some(file) => Err(ResultsError::Foreign(file)),
+        None => Ok(()),
+    }
+}
+
+fn write_error(path: &Path, source: io::Error) -> ResultsError {
+    ResultsError::Write { path: path.to_path_buf(), source }
+}
+
+/// Writes a page into a file that has no name, so that nothing of it can remain.
+fn write_probe(folder: &Path) -> io::Result<()> {
+    let flags = OFlags::TMPFILE | OFlags::WRONLY | OFlags::CLOEXEC;
+    match rustix::fs::open(folder, flags, Mode::RUSR | Mode::WUSR) {
+        Ok(file) => io::Write::write_all(&mut File::from(file), &[0; 4096]),
+        // Some file systems (NFS, FUSE) cannot: there the file loses its name at once.
+        Err(rustix::io::Errno::OPNOTSUPP | rustix::io::Errno::ISDIR | rustix::io::Errno::INVAL) => {
+            let probe = folder.join(format!(".semidense-write-test.{}", std::process::id()));
+            let mut file = File::create(&probe)?;
+            fs::remove_file(&probe)?;
+            io::Write::write_all(&mut file, &[0; 4096])
+        }
+        Err(error) => Err(error.into()),
+    }
+}
+
+/// Makes `parent/stamp`, or `parent/stamp-2` and so on where that is taken.
+fn new_folder(parent: &Path, stamp: &str) -> io::Result<PathBuf> {
+    fs::create_dir_all(parent)?;
+    let numbered = (2..=MAX_SAME_SECOND).map(|n| format!("{stamp}-{n}"));
+    for name in std::iter::once(stamp.to_owned()).chain(numbered) {
+        let path = parent.join(name);
+        match fs::create_dir(&path) {
+            Ok(()) => return Ok(path),
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
+            Err(error) => return Err(error),
+        }
+    }
+    Err(io::ErrorKind::AlreadyExists.into())
+}
+
+/// `2026-11-22T03-15-00Z`: UTC, in order by name, and without a character that shells or Windows dislike.
+pub fn utc_stamp(time: SystemTime) -> String {
+    const SECS_PER_DAY: u64 = 86_400;
+    let secs = time.duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs());
+    let (days, of_day) = (secs / SECS_PER_DAY, secs % SECS_PER_DAY);
+    let (year, month, day) = date_of(days);
+    let (hour, minute, second) = (of_day / 3600, of_day / 60 % 60, of_day % 60);
+    format!("{year:04}-{month:02}-{day:02}T{hour:02}-{minute:02}-{second:02}Z")
+}
+
+/// Year, month and day of a number of days since 1970-01-01, in the Gregorian calendar: years are counted from
+/// March, so that the leap day is the last of its year.
+fn date_of(days: u64) -> (u64, u64, u64) {
+    const DAYS_PER_ERA: u64 = 146_097; // 400 years
+    const DAYS_BEFORE_EPOCH: u64 = 719_468; // from 0000-03-01
+    let since_march = days + DAYS_BEFORE_EPOCH;
+    let (era, of_era) = (since_march / DAYS_PER_ERA, since_march % DAYS_PER_ERA);
+    let year_of_era = (of_era - of_era / 1460 + of_era / 36_524 - of_era / 146_096) / 365;
+    let of_year = of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
+    let from_march = (5 * of_year + 2) / 153;
+    let day = of_year - (153 * from_march + 2) / 5 + 1;
+    let month = if from_march < 10 { from_march + 3 } else { from_march - 9 };
+    (400 * era + year_of_era + u64::from(month <= 2), month, day)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::time::Duration;
+
+    #[test]
+    fn stamps_are_dates() {
+        for (secs, stamp) in [
+            (0, "1970-01-01T00-00-00Z"),
+            (951_782_399, "2000-02-28T23-59-59Z"),
+            (951_782_400, "2000-02-29T00-00-00Z"),
+            (1_795_317_300, "2026-11-22T03-15-00Z"),
+            (4_107_542_400, "2100-03-01T00-00-00Z"),
+        ] {
+            assert_eq!(utc_stamp(UNIX_EPOCH + Duration::from_secs(secs)), stamp);
+        }
+    }
+
+    #[test]
+    fn runs_of_the_same_second_have_folders_of_their_own() {
+        let folder = tempfile::tempdir().unwrap();
+        let parent = folder.path().join("output");
+        let make = || new_folder(&parent, "2026-11-22T03-15-00Z").unwrap();
+        let threads: Vec<_> = std::thread::scope(|scope| {
+            let all: Vec<_> = (0..8).map(|_| scope.spawn(make)).collect();
+            all.into_iter().map(|thread| thread.join().unwrap()).collect()
+        });
+        let mut names = threads;
+        names.sort();
+        names.dedup();
+        assert_eq!(names.len(), 8);
+    }
+
+    #[test]
+    fn the_link_follows_and_a_folder_that_stayed_empty_goes() {
+        let folder = tempfile::tempdir().unwrap();
+        let make = |stamp| {
+            let path = new_folder(folder.path(), stamp).unwrap();
+            fs::write(path.join("x"), "x").unwrap();
+            OutputFolder { path, is_new: true }
+        };
+        let link = folder.path().join(LATEST);
+        for stamp in ["1", "2"] {
+            let output = make(stamp);
+            output.become_latest().unwrap();
+            assert_eq!(fs::read_link(&link).unwrap(), Path::new(stamp));
+        }
+        let empty = make("3");
+        fs::remove_file(empty.path().join("x")).unwrap();
+        drop(empty);
+        assert!(!folder.path().join("3").exists() && folder.path().join("2").exists());
+        fs::remove_file(&link).unwrap();
+        fs::create_dir(&link).unwrap();
+        make("4").become_latest().unwrap();
+        assert!(link.is_dir() && !link.is_symlink(), "it is the user's");
+    }
+
+    #[test]
+    fn nothing_of_the_probe_remains_and_a_file_of_the_user_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        prepare_output(folder.path()).unwrap();
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+        fs::write(folder.path().join("map.ply"), "mine").unwrap();
+        let error = prepare_output(folder.path()).unwrap_err().to_string();
+        assert!(error.contains("map.ply") && error.contains("--output"), "{error}");
+    }
+}

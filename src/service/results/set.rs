@@ -1,0 +1,350 @@
+//! The files of a run as one set: written aside, then put in the place of the set before, all or none.
+//!
+//! A set is written into a folder of its own inside the output folder, synchronised, and renamed to a name that
+//! says that it is complete. From then on its files only have to be moved up: whoever finds a complete set
+//! (see [`finish_commit`]) goes on with that, so that two sets are never mixed. Only files that a run writes are
+//! ever replaced or removed.
+
+use std::fs::{self, File};
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+
+use rustix::fs::FlockOperation;
+
+/// Files of every set, with what each begins with: a file of that name that begins otherwise is the user's.
+const FILES: [(&str, &str); 7] = [
+    ("summary.json", "{\n  \"mode\": \""),
+    ("trajectory.txt", "# world_from_camera of every tracked frame"),
+    ("trajectory_online.txt", "# world_from_camera of every tracked frame"),
+    ("keyframes.txt", "# world_from_keyframe; lengths in the keyframe"),
+    ("map.ply", "ply\nformat binary_little_endian 1.0\ncomment x y z in map units"),
+    ("map.pcd", "# .PCD v0.7 - x y z in map units"),
+    ("report.html", "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">"),
+];
+/// The file that is moved up first: as long as it is still aside, the files of the set before are in place.
+const FIRST: &str = FILES[0].0;
+/// Folder of pictures for whoever works on the algorithms, in sets that have them.
+pub const DEBUG_FOLDER: &str = "debug";
+
+/// Name of a set that is being written, before the process id.
+const PARTIAL: &str = ".semidense-results.partial-";
+/// Name of a set that is written and not yet moved up.
+const COMPLETE: &str = ".semidense-results.complete";
+
+/// A set that is being written. Dropped without a commit it is removed, and the set before stays.
+#[derive(Debug)]
+pub struct ResultSet {
+    output: PathBuf,
+    folder: PathBuf,
+    /// Held while the set is written: a folder that nobody holds was left by a process that died.
+    _lock: File,
+}
+
+impl ResultSet {
+    /// Begins a set inside the folder `output`; what killed processes left half written there goes.
+    pub fn begin(output: &Path) -> io::Result<Self> {
+        remove_abandoned(output)?;
+        let folder = output.join(format!("{PARTIAL}{}", std::process::id()));
+        fs::create_dir(&folder)?;
+        let lock = File::open(&folder)?;
+        rustix::fs::flock(&lock, FlockOperation::LockExclusive)?;
+        Ok(Self { output: output.to_owned(), folder, _lock: lock })
+    }
+
+    /// Where its files are written.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// Puts the set in the place of the one before.
+    pub fn commit(self) -> io::Result<()> {
+        synchronise(&self.folder)?;
+        let output = lock(&self.output)?;
+        move_up(&self.output)?;
+        fs::rename(&self.folder, self.output.join(COMPLETE))?;
+        output.sync_all()?;
+        move_up(&self.output)
+    }
+}
+
+impl Drop for ResultSet {
+    fn drop(&mut self) {
+        // What cannot be removed is removed by the next set. After a commit there is nothing.
+        drop(fs::remove_dir_all(&self.folder));
+    }
+}
+
+/// Moves up a complete set that a killed process has left in `output`; whether there was one.
+pub fn finish_commit(output: &Path) -> io::Result<bool> {
+    if !output.join(COMPLETE).exists() {
+        return Ok(false);
+    }
+    let _lock = lock(output)?;
+    move_up(output)?;
+    Ok(true)
+}
+
+/// The first file in `output` that a set would replace and that no run has written.
+pub fn foreign_file(output: &Path) -> io::Result<Option<PathBuf>> {
+    for (name, beginning) in FILES {
+        let path = output.join(name);
+        if fs::symlink_metadata(&path).is_ok() && !begins_with(&path, beginning)? {
+            return Ok(Some(path));
+        }
+    }
+    Ok(None)
+}
+
+/// Whether `output` holds a set.
+pub fn has_set(output: &Path) -> bool {
+    let (name, beginning) = FILES[0];
+    begins_with(&output.join(name), beginning).unwrap_or(false)
+}
+
+/// Whether `output` holds a set of a run that has tracked something.
+pub fn has_tracked_set(output: &Path) -> bool {
+    let tracked = || {
+        let text = fs::read_to_string(output.join(FILES[0].0)).ok()?;
+        let summary: serde_json::Value = serde_json::from_str(&text).ok()?;
+        summary["frames_tracked"].as_u64()
+    };
+    has_set(output) && tracked().is_some_and(|frames| frames > 0)
+}
+
+/// Whether `output` holds a set that was written after `time`.
+pub fn has_set_since(output: &Path, time: SystemTime) -> bool {
+    let written = fs::metadata(output.join(FILES[0].0)).and_then(|found| found.modified());
+    has_set(output) && written.is_ok_and(|written| written > time)
+}
+
+fn begins_with(path: &Path, beginning: &str) -> io::Result<bool> {
+    // A pipe would never end, a folder cannot be read.
+    if !fs::metadata(path)?.is_file() {
+        return Ok(false);
+    }
+    let mut bytes = Vec::new();
+    File::open(path)?.take(beginning.len() as u64).read_to_end(&mut bytes)?;
+    Ok(bytes == beginning.as_bytes())
+}
+
+/// Keeps other processes from moving a set up in the same folder. Ends when dropped.
+fn lock(output: &Path) -> io::Result<File> {
+    let folder = File::open(output)?;
+    rustix::fs::flock(&folder, FlockOperation::LockExclusive)?;
+    Ok(folder)
+}
+
+/// Moves the files of a complete set up, where there is one. Can be interrupted anywhere and repeated.
+fn move_up(output: &Path) -> io::Result<()> {
+    let complete = output.join(COMPLETE);
+    if !complete.exists() {
+        return Ok(());
+    }
+    if complete.join(FIRST).exists() {
+        remove_debug_pictures(output)?;
+        fs::rename(complete.join(FIRST), output.join(FIRST))?;
+    }
+    move_files(&complete, output)?;
+    let debug = complete.join(DEBUG_FOLDER);
+    if debug.exists() {
+        fs::create_dir_all(output.join(DEBUG_FOLDER))?;
+        move_files(&debug, &output.join(DEBUG_FOLDER))?;
+        fs::remove_dir(debug)?;
+    }
+    fs::remove_dir(complete)?;
+    File::open(output)?.sync_all()
+}
+
+fn move_files(from: &Path, to: &Path) -> io::Result<()> {
+    for entry in fs::read_dir(from)? {
+        let entry = entry?;
+        if entry.file_type()?.is_file() {
+            fs::rename(entry.path(), to.join(entry.file_name()))?;
+        }
+    }
+    Ok(())
+}
+
+/// Removes the pictures of the set before: the new one need not have as many.
+fn remove_debug_pictures(output: &Path) -> io::Result<()> {
+    let debug = output.join(DEBUG_FOLDER);
+    if !has_set(output) || !debug.is_dir() {
+        return Ok(());
+    }
+    for entry in fs::read_dir(&debug)? {
+        let entry = entry?;
+        if is_debug_picture(&entry.file_name().to_string_lossy()) && entry.file_type()?.is_file() {
+            fs::remove_file(entry.path())?;
+        }
+    }
+    // A folder that holds something of the user's stays.
+    drop(fs::remove_dir(debug));
+    Ok(())
+}
+
+/// Whether a file has the name of a picture of a keyframe: `keyframe-NNNN-kind.png`.
+fn is_debug_picture(name: &str) -> bool {
+    let kinds = ["inverse-depth", "variance", "density", "weights"];
+    let rest = name.strip_prefix("keyframe-").and_then(|rest| rest.strip_suffix(".png"));
+    rest.and_then(|rest| rest.split_once('-')).is_some_and(|(number, kind)| {
+        number.bytes().all(|b| b.is_ascii_digit()) && kinds.contains(&kind)
+    })
+}
+
+/// Removes sets that processes were writing when they died.
+fn remove_abandoned(output: &Path) -> io::Result<()> {
+    for entry in fs::read_dir(output)? {
+        let path = entry?.path();
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        if !name.starts_with(PARTIAL) || !path.is_dir() {
+            continue;
+        }
+        let Ok(folder) = File::open(&path) else { continue };
+        if rustix::fs::flock(&folder, FlockOperation::NonBlockingLockExclusive).is_ok() {
+            fs::remove_dir_all(&path)?;
+        }
+    }
+    Ok(())
+}
+
+/// Waits until every file of `folder` and the folder itself are on the disk.
+fn synchronise(folder: &Path) -> io::Result<()> {
+    for entry in fs::read_dir(folder)? {
+        let entry = entry?;
+        match entry.file_type()?.is_dir() {
+            true => synchronise(&entry.path())?,
+            false => File::open(entry.path())?.sync_all()?,
+        }
+    }
+    File::open(folder)?.sync_all()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Writes a set whose files all end in `text`, with so many pictures.
+    fn write(set: &ResultSet, text: &str, pictures: usize) {
+        for (name, beginning) in FILES {
+            fs::write(set.folder().join(name), format!("{beginning}{text}")).unwrap();
+        }
+        let debug = set.folder().join(DEBUG_FOLDER);
+        for i in 0..pictures {
+            fs::create_dir_all(&debug).unwrap();
+            fs::write(debug.join(format!("keyframe-{i:04}-variance.png")), text).unwrap();
+        }
+    }
+
+    fn commit(output: &Path, text: &str, pictures: usize) {
+        let set = ResultSet::begin(output).unwrap();
+        write(&set, text, pictures);
+        set.commit().unwrap();
+    }
+
+    /// Every file of `output` with its content.
+    fn content(output: &Path) -> Vec<(String, String)> {
+        let mut found = Vec::new();
+        for entry in fs::read_dir(output).unwrap().flatten() {
+            let name = entry.file_name().to_string_lossy().into_owned();
+            match entry.path().is_dir() {
+                true => {
+                    let inner = content(&entry.path()).into_iter();
+                    found.extend(inner.map(|(file, text)| (format!("{name}/{file}"), text)));
+                    found.push((name, String::new()));
+                }
+                false => found.push((name, fs::read_to_string(entry.path()).unwrap())),
+            }
+        }
+        found.sort();
+        found
+    }
+
+    fn all_of(content: &[(String, String)], text: &str) -> bool {
+        let files = content.iter().filter(|(name, _)| FILES.iter().any(|(file, _)| file == name));
+        files.filter(|(_, found)| found.ends_with(text)).count() == FILES.len()
+    }
+
+    #[test]
+    fn a_set_replaces_the_one_before_and_nothing_else() {
+        let folder = tempfile::tempdir().unwrap();
+        let output = folder.path();
+        for (name, text) in [("notes.txt", "mine"), ("debug.txt", "mine")] {
+            fs::write(output.join(name), text).unwrap();
+        }
+        commit(output, "first", 3);
+        fs::write(output.join("debug/mine.png"), "mine").unwrap();
+        commit(output, "second", 1);
+        let found = content(output);
+        assert!(all_of(&found, "second"), "{found:?}");
+        let names: Vec<&str> = found.iter().map(|(name, _)| name.as_str()).collect();
+        assert!(names.contains(&"debug/keyframe-0000-variance.png"));
+        assert!(!names.contains(&"debug/keyframe-0001-variance.png"), "of the first set");
+        assert!(names.contains(&"debug/mine.png") && names.contains(&"notes.txt"));
+        assert!(!names.iter().any(|name| name.starts_with('.')), "{names:?}");
+        fs::remove_file(output.join("debug/mine.png")).unwrap();
+        commit(output, "third", 0);
+        assert!(!output.join("debug").exists());
+    }
+
+    #[test]
+    fn a_set_that_is_given_up_leaves_the_one_before() {
+        let folder = tempfile::tempdir().unwrap();
+        commit(folder.path(), "first", 1);
+        let before = content(folder.path());
+        let set = ResultSet::begin(folder.path()).unwrap();
+        write(&set, "second", 2);
+        drop(set);
+        assert_eq!(content(folder.path()), before);
+    }
+
+    #[test]
+    fn a_commit_that_is_interrupted_anywhere_is_finished_by_the_next() {
+        for moved in 0..FILES.len() {
+            let folder = tempfile::tempdir().unwrap();
+            let output = folder.path();
+            commit(output, "first", 2);
+            let set = ResultSet::begin(output).unwrap();
+            write(&set, "second", 1);
+            fs::rename(set.folder(), output.join(COMPLETE)).unwrap();
+            drop(set);
+            // The process dies when it has moved so many files.
+            if moved > 0 {
+                remove_debug_pictures(output).unwrap();
+            }
+            for (name, _) in &FILES[..moved] {
+                fs::rename(output.join(COMPLETE).join(name), output.join(name)).unwrap();
+            }
+            assert!(finish_commit(output).unwrap());
+            let found = content(output);
+            assert!(all_of(&found, "second"), "after {moved} files: {found:?}");
+            assert_eq!(found.len(), FILES.len() + 2, "{found:?}");
+            assert!(!finish_commit(output).unwrap());
+        }
+    }
+
+    #[test]
+    fn what_a_killed_process_was_writing_goes_and_what_another_writes_stays() {
+        let folder = tempfile::tempdir().unwrap();
+        let abandoned = folder.path().join(format!("{PARTIAL}4194304"));
+        fs::create_dir(&abandoned).unwrap();
+        fs::write(abandoned.join("map.ply"), "half").unwrap();
+        let living = folder.path().join(format!("{PARTIAL}1"));
+        fs::create_dir(&living).unwrap();
+        let held = File::open(&living).unwrap();
+        rustix::fs::flock(&held, FlockOperation::LockExclusive).unwrap();
+        drop(ResultSet::begin(folder.path()).unwrap());
+        assert!(!abandoned.exists() && living.exists());
+    }
+
+    #[test]
+    fn a_file_of_the_user_is_found_and_one_of_ours_is_none() {
+        let folder = tempfile::tempdir().unwrap();
+        assert!(foreign_file(folder.path()).unwrap().is_none() && !has_set(folder.path()));
+        commit(folder.path(), "first", 0);
+        assert!(foreign_file(folder.path()).unwrap().is_none() && has_set(folder.path()));
+        let mine = folder.path().join("trajectory.txt");
+        fs::write(&mine, "1.0 0 0 0 0 0 0 1\n").unwrap();
+        assert_eq!(foreign_file(folder.path()).unwrap(), Some(mine));
+    }
+}
