@@ -10,6 +10,7 @@ use std::process::ExitCode;
 use std::time::Instant;
 
 use clap::Parser;
+use nalgebra::{Matrix4, Vector4};
 use semidense::capture::source::{FrameSource, SourceName, SourceParams, open};
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
@@ -66,6 +67,11 @@ struct Start {
     rotation_error_deg: f64,
     /// NaN where the source has no depth.
     median_depth_error: f64,
+    /// Slopes of ln(inverse depth / true) along columns, rows and the logarithm of the true inverse depth;
+    /// NaN where the source has no depth. A relief of −0.3 is a scene flattened by 30 %.
+    modes: [f64; 3],
+    /// What the evidence says of errors common to all depths.
+    common_error: f64,
 }
 
 impl Start {
@@ -109,12 +115,16 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
             if !arguments.brief {
                 println!(
                     "{name} from {first:2}: after {:2} frames, moved {:.4}, direction {:5.1}°, rotation \
-                     {:.2}°, depth {:.3}{}",
+                     {:.2}°, depth {:.3}, common {:.3}, modes {:+.2} {:+.2} {:+.2}{}",
                     start.late,
                     start.translation,
                     start.direction_error_deg,
                     start.rotation_error_deg,
                     start.median_depth_error,
+                    start.common_error,
+                    start.modes[0],
+                    start.modes[1],
+                    start.modes[2],
                     if start.is_wrong() { "  WRONG" } else { "" },
                 );
             }
@@ -174,13 +184,16 @@ fn start(
         match outcome.state {
             InitState::Failed(_) => first = frame,
             InitState::Waiting(_) => {}
-            InitState::Proven => return Ok(Some(figures(&initializer, &outcome, first, frame, i))),
+            InitState::Proven => {
+                return Ok(Some(figures(intrinsics, &initializer, &outcome, first, frame, i)));
+            }
         }
     }
     Ok(None)
 }
 
 fn figures(
+    intrinsics: Intrinsics,
     initializer: &TwoFrameInitializer,
     outcome: &InitOutcome,
     first: &Frame,
@@ -207,7 +220,47 @@ fn figures(
         direction_error_deg: cosine.clamp(-1.0, 1.0).acos().to_degrees(),
         rotation_error_deg: found.rotation.angle_to(&truth.rotation).to_degrees(),
         median_depth_error: quantile(&mut errors, 0.5),
+        modes: depth.map_or([f64::NAN; 3], |depth| modes(intrinsics, initializer, depth)),
+        common_error: outcome.evidence.common_error,
     }
+}
+
+/// Slopes of ln(d / d_true) over (X, Y, ln d_true), X and Y the ray's coordinates: least squares, reweighted
+/// against points on occluding edges.
+fn modes(k: Intrinsics, initializer: &TwoFrameInitializer, depth: &Image<f32>) -> [f64; 3] {
+    /// Deviations beyond this many median deviations lose weight.
+    const HUBER: f64 = 2.0;
+    const ROUNDS: usize = 10;
+    let rows: Vec<(Vector4<f64>, f64)> = initializer
+        .depths()
+        .filter_map(|d| {
+            let (u, v) = (usize::from(d.u), usize::from(d.v));
+            let inverse = 1.0 / f64::from(depth.at(u, v));
+            let ray = ((f64::from(d.u) - k.cx) / k.fx, (f64::from(d.v) - k.cy) / k.fy);
+            let log_ratio = (f64::from(d.inverse_depth) / inverse).ln();
+            (inverse.is_finite() && log_ratio.is_finite())
+                .then(|| (Vector4::new(ray.0, ray.1, inverse.ln(), 1.0), log_ratio))
+        })
+        .collect();
+    let mut weights = vec![1.0; rows.len()];
+    let mut slopes = Vector4::zeros();
+    for _ in 0..ROUNDS {
+        let (mut hessian, mut right) = (Matrix4::zeros(), Vector4::zeros());
+        for ((row, y), w) in rows.iter().zip(&weights) {
+            hessian += row * row.transpose() * *w;
+            right += row * (*y * *w);
+        }
+        let Some(solved) = hessian.cholesky().map(|factor| factor.solve(&right)) else {
+            return [f64::NAN; 3];
+        };
+        slopes = solved;
+        let residual = |(row, y): &(Vector4<f64>, f64)| (y - row.dot(&slopes)).abs();
+        let mut sizes: Vec<f64> = rows.iter().map(residual).collect();
+        let limit = HUBER * 1.4826 * quantile(&mut sizes.clone(), 0.5).max(1e-6);
+        sizes.iter_mut().for_each(|size| *size = (limit / *size).min(1.0));
+        weights = sizes;
+    }
+    [slopes[0], slopes[1], slopes[2]]
 }
 
 /// A quantile; NaN of nothing.

@@ -23,12 +23,18 @@ pub struct EvidenceParams {
     pub min_early_translation: f64,
     /// Earlier frames that an early start needs.
     pub min_early_witnesses: usize,
-    /// Largest rotation of an early start, as a multiple of its rival's. On a plane the wrong motion
-    /// adds a turn to the true one.
-    pub max_early_turn_ratio: f64,
     /// Energy by which another motion must be worse, in this frame and the earlier ones together, as a
     /// share: what a rolling shutter and the lens leave is of that size.
     pub min_rival_excess: f64,
+    /// The same for a motion that does not turn clearly less than its rival. On a plane the wrong motion
+    /// adds a turn to the true one, and the rolling shutter of a nodding camera favours it by up to
+    /// 0.18.
+    pub min_turning_rival_excess: f64,
+    /// Rotation over the rival's from which that holds.
+    pub max_turn_ratio: f64,
+    /// Largest median of the relative error that the uncertainty of the pose gives all depths together:
+    /// later frames cannot see it, and take it for the shape of the scene.
+    pub max_common_error: f64,
     /// Energy that a fitted depth explains over the energy of one degree of freedom of what remains.
     /// Without parallax 1 to 3, with 9 px of it 30 to 100.
     pub min_significance: f64,
@@ -41,6 +47,9 @@ pub struct EvidenceParams {
     /// Largest root mean square residual of the middle point, grey levels: above it the frames do not
     /// show the same.
     pub max_median_residual: f64,
+    /// The same as a multiple of the least that a frame of this start has left, which is the camera's noise:
+    /// a fit that leaves more has ended in a wrong minimum.
+    pub max_residual_growth: f64,
 }
 
 impl Default for EvidenceParams {
@@ -49,13 +58,16 @@ impl Default for EvidenceParams {
             min_translation: 1.0 / 60.0,
             min_early_translation: 0.004,
             min_early_witnesses: 4,
-            max_early_turn_ratio: 1.1,
             min_rival_excess: 0.03,
+            min_turning_rival_excess: 0.2,
+            max_turn_ratio: 0.8,
+            max_common_error: 0.02,
             min_significance: 8.0,
             max_negative_ratio: 0.05,
             max_std_dev_ratio: 0.12,
             min_visible_ratio: 0.6,
             max_median_residual: 15.0,
+            max_residual_growth: 2.0,
         }
     }
 }
@@ -66,13 +78,16 @@ impl EvidenceParams {
         check_range("min_translation", self.min_translation, 1e-4..=1.0)?;
         check_range("min_early_translation", self.min_early_translation, 1e-4..=1.0)?;
         check_range("min_early_witnesses", self.min_early_witnesses, 1..=1000)?;
-        check_range("max_early_turn_ratio", self.max_early_turn_ratio, 0.0..=1e6)?;
         check_range("min_rival_excess", self.min_rival_excess, 0.0..=10.0)?;
+        check_range("min_turning_rival_excess", self.min_turning_rival_excess, 0.0..=10.0)?;
+        check_range("max_turn_ratio", self.max_turn_ratio, 0.0..=1e6)?;
+        check_range("max_common_error", self.max_common_error, 1e-3..=1.0)?;
         check_range("min_significance", self.min_significance, 1.0..=1e4)?;
         check_range("max_negative_ratio", self.max_negative_ratio, 0.0..=0.5)?;
         check_range("max_std_dev_ratio", self.max_std_dev_ratio, 1e-3..=1.0)?;
         check_range("min_visible_ratio", self.min_visible_ratio, 0.1..=1.0)?;
-        check_range("max_median_residual", self.max_median_residual, 1.0..=255.0)
+        check_range("max_median_residual", self.max_median_residual, 1.0..=255.0)?;
+        check_range("max_residual_growth", self.max_residual_growth, 1.0..=100.0)
     }
 }
 
@@ -108,10 +123,14 @@ pub struct Evidence {
     pub negative_ratio: f64,
     /// Median relative standard deviation of the inverse depths.
     pub median_std_dev_ratio: f64,
+    /// Median relative error of the inverse depths that the uncertainty of the pose gives all together.
+    pub common_error: f64,
     /// Share of the points in view.
     pub visible_ratio: f64,
     /// Root mean square residual (Huber) of the middle point, grey levels.
     pub median_residual: f64,
+    /// The least of these among the frames of this start, at least the camera's noise.
+    pub least_residual: f64,
     /// The second best motion; `None` where there is no other.
     pub rival: Option<Rival>,
     /// Earlier frames that were asked.
@@ -122,24 +141,30 @@ impl Evidence {
     /// What is missing; `None` when the parallax is proven.
     pub fn missing(&self, params: &EvidenceParams) -> Option<Waiting> {
         let matches = self.visible_ratio >= params.min_visible_ratio
-            && self.median_residual <= params.max_median_residual;
-        let is_unrivalled = self.rival.is_none_or(|rival| rival.excess >= params.min_rival_excess);
+            && self.median_residual <= params.max_median_residual
+            && self.median_residual <= params.max_residual_growth * self.least_residual;
+        let is_unrivalled = self.rival.is_none_or(|rival| {
+            let turns_less = rival.turn_ratio <= params.max_turn_ratio;
+            let min_excess =
+                if turns_less { params.min_rival_excess } else { params.min_turning_rival_excess };
+            rival.excess >= min_excess
+        });
+        let is_accurate = self.median_std_dev_ratio <= params.max_std_dev_ratio
+            && self.common_error <= params.max_common_error;
         let checks = [
             (matches, Waiting::Match),
             (self.significance >= params.min_significance, Waiting::Significance),
             (self.negative_ratio <= params.max_negative_ratio, Waiting::NegativeDepth),
             (is_unrivalled, Waiting::Rival),
             (self.has_moved(params), Waiting::Translation),
-            (self.median_std_dev_ratio <= params.max_std_dev_ratio, Waiting::Accuracy),
+            (is_accurate, Waiting::Accuracy),
         ];
         checks.iter().find(|(met, _)| !met).map(|(_, waiting)| *waiting)
     }
 
     /// Whether the translation is long enough, or confirmed well enough.
     fn has_moved(&self, params: &EvidenceParams) -> bool {
-        let turns_less = |rival: Rival| rival.turn_ratio <= params.max_early_turn_ratio;
-        let is_confirmed =
-            self.witnesses >= params.min_early_witnesses && self.rival.is_none_or(turns_less);
+        let is_confirmed = self.witnesses >= params.min_early_witnesses;
         self.translation >= params.min_translation
             || is_confirmed && self.translation >= params.min_early_translation
     }
@@ -204,6 +229,8 @@ pub fn judge(
         median_std_dev_ratio: f64::from(median(sorted).unwrap_or(f32::INFINITY)),
         visible_ratio: joint.num_visible as f64 / joint.num_points.max(1) as f64,
         median_residual,
+        common_error: f64::INFINITY,
+        least_residual: median_residual,
         rival: None,
         witnesses: 0,
     }
@@ -228,6 +255,8 @@ mod tests {
             median_std_dev_ratio: 0.05,
             visible_ratio: 0.9,
             median_residual: 3.0,
+            common_error: 0.01,
+            least_residual: 3.0,
             rival: None,
             witnesses: 8,
         }
@@ -247,6 +276,30 @@ mod tests {
     }
 
     #[test]
+    fn a_motion_that_turns_more_than_its_rival_needs_more_evidence() {
+        let params = EvidenceParams::default();
+        let against = |excess, turn_ratio| {
+            let rival = Some(Rival { excess, turn_ratio });
+            Evidence { rival, ..proven() }.missing(&params)
+        };
+        assert_eq!(against(0.1, 0.5), None);
+        assert_eq!(against(0.1, 1.9), Some(Waiting::Rival));
+        assert_eq!(against(0.1, f64::NAN), Some(Waiting::Rival));
+        assert_eq!(against(0.4, 1.9), None);
+    }
+
+    #[test]
+    fn an_error_common_to_all_depths_and_a_bad_fit_are_waited_for() {
+        let params = EvidenceParams::default();
+        let uncertain = Evidence { common_error: 0.05, ..proven() };
+        assert_eq!(uncertain.missing(&params), Some(Waiting::Accuracy));
+        let ended_elsewhere = Evidence { median_residual: 8.0, ..proven() };
+        assert_eq!(ended_elsewhere.missing(&params), Some(Waiting::Match));
+        let noisy = Evidence { least_residual: 6.0, ..ended_elsewhere };
+        assert_eq!(noisy.missing(&params), None);
+    }
+
+    #[test]
     fn a_short_translation_must_be_confirmed_by_earlier_frames() {
         let params = EvidenceParams::default();
         let early = Evidence { translation: 0.006, ..proven() };
@@ -254,8 +307,5 @@ mod tests {
         let waits = |evidence: Evidence| evidence.missing(&params) == Some(Waiting::Translation);
         assert!(waits(Evidence { witnesses: 2, ..early }));
         assert!(waits(Evidence { translation: 0.001, ..early }));
-        let rival = Some(Rival { excess: 0.2, turn_ratio: 2.0 });
-        assert!(waits(Evidence { rival, ..early }), "it turns more than it need");
-        assert_eq!(Evidence { rival, ..proven() }.missing(&params), None);
     }
 }

@@ -9,8 +9,9 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::two_frame::elimination::{Elimination, PriorWeights, prior_energy};
+use crate::slam::two_frame::evidence::median;
 use crate::slam::two_frame::points::Points;
-use crate::slam::two_frame::system::{LevelView, NUM_UNKNOWNS, State, System};
+use crate::slam::two_frame::system::{LevelView, NUM_UNKNOWNS, PointSystem, State, System};
 use crate::slam::two_frame::system_kernel::system_kernels;
 
 /// Tuning of the fit.
@@ -49,6 +50,23 @@ impl FitParams {
         check_range("depth_std_dev", self.depth_std_dev, 0.01..=100.0)?;
         check_range("max_iterations", self.max_iterations, 1..=1000)?;
         check_range("min_energy_drop", self.min_energy_drop, 0.0..=0.5)
+    }
+
+    /// The same with priors that hold the unit and points without any information, and nothing else.
+    pub fn released(&self) -> Self {
+        /// Factor on the standard deviations of the priors: a hundredth of their weight. Thirty changes no
+        /// figure any more.
+        const RELEASE: f32 = 10.0;
+        /// Soft modes take more and smaller steps.
+        const MAX_ITERATIONS: u32 = 40;
+        const MIN_ENERGY_DROP: f64 = 1e-6;
+        Self {
+            neighbour_std_dev: RELEASE * self.neighbour_std_dev,
+            depth_std_dev: RELEASE * self.depth_std_dev,
+            max_iterations: MAX_ITERATIONS,
+            min_energy_drop: MIN_ENERGY_DROP,
+            ..self.clone()
+        }
     }
 
     fn prior_weights(&self) -> PriorWeights {
@@ -260,6 +278,23 @@ pub fn depth_variances(
         let from_pose = (mixed.transpose() * pose_covariance * mixed)[0] as f32;
         noise * (1.0 / point.information + from_pose) + match_variance_px / point.squared_speed
     }));
+}
+
+/// Median over the visible points of the relative error that the uncertainty of the pose gives all depths
+/// together, infinite where it cannot be told; `noise` is the variance of a residual.
+pub fn common_error(state: &State, system: &System, noise: f32) -> f64 {
+    let Some(pose_covariance) = pose_covariance(state, system) else { return f64::INFINITY };
+    let is_placed =
+        |(point, d): &(PointSystem, &f32)| point.visible && point.information > 0.0 && **d > 0.0;
+    let points = system.points().zip(&state.inverse_depths).filter(is_placed);
+    let mut errors: Vec<f32> = points
+        .map(|(point, d)| {
+            let mixed = SVector::from(point.mixed.map(f64::from)) / f64::from(point.information);
+            let variance = (mixed.transpose() * pose_covariance * mixed)[0] as f32 * noise;
+            variance.sqrt() / d
+        })
+        .collect();
+    median(&mut errors).map_or(f64::INFINITY, f64::from)
 }
 
 /// Inverse of the pose's normal equations after elimination of the depths, scale held; `None` where

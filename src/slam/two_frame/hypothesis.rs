@@ -119,6 +119,13 @@ impl Hypotheses {
         }
     }
 
+    /// Fits the best again on one level, from where it is.
+    pub fn refit(&mut self, input: &FitInput<'_>, level: usize, params: &FitParams) {
+        let best = &mut self.all[0];
+        let (state, scratch) = (&mut best.state, &mut best.scratch);
+        best.energy = fit_level(input, level, Freedom::Everything, state, scratch, params);
+    }
+
     /// The second best motion of the latest frame, if the two can be told apart by their direction.
     pub fn rival(&self) -> Option<Rival> {
         self.rival

@@ -41,6 +41,8 @@ struct Started {
     direction_error_deg: f64,
     median_depth_error: f64,
     within_two_sigmas: f64,
+    /// Slope of ln(d / d_true) over ln d_true: −0.3 is a scene flattened by 30 %.
+    relief: f64,
 }
 
 /// Runs up to `frames` frames; the figures of the first proof, and all outcomes.
@@ -102,6 +104,7 @@ fn figures(
         (f64::from(d.inverse_depth) - truth).abs() < 2.0 * f64::from(d.variance).sqrt()
     });
     let within_two_sigmas = within.count() as f64 / ratios.len() as f64;
+    let relief = relief(initializer, truth, scale);
     let mut errors: Vec<f64> = ratios.iter().map(|r| (r / scale - 1.0).abs()).collect();
     errors.sort_by(f64::total_cmp);
     Started {
@@ -109,7 +112,26 @@ fn figures(
         direction_error_deg: cosine.clamp(-1.0, 1.0).acos().to_degrees(),
         median_depth_error: errors[errors.len() / 2],
         within_two_sigmas,
+        relief,
     }
+}
+
+fn relief(initializer: &TwoFrameInitializer, truth: &Image<f32>, scale: f64) -> f64 {
+    let logs: Vec<(f64, f64)> = initializer
+        .depths()
+        .map(|d| {
+            let truth = f64::from(truth.at(usize::from(d.u), usize::from(d.v)));
+            (truth.ln(), (f64::from(d.inverse_depth) * scale / truth).ln())
+        })
+        // Points on an edge between two surfaces belong to either.
+        .filter(|(_, error)| error.abs() < 0.5)
+        .collect();
+    let mean = |of: fn(&(f64, f64)) -> f64| logs.iter().map(of).sum::<f64>() / logs.len() as f64;
+    let (mean_x, mean_y) = (mean(|log| log.0), mean(|log| log.1));
+    let sums = logs.iter().fold((0.0, 0.0), |(xy, xx), (x, y)| {
+        (xy + (x - mean_x) * (y - mean_y), xx + (x - mean_x).powi(2))
+    });
+    sums.0 / sums.1
 }
 
 fn assert_starts(motion: Motion) {
@@ -150,6 +172,16 @@ fn forward_motion_starts() {
 #[test]
 fn mixed_motion_starts() {
     assert_starts(Motion::Mixed);
+}
+
+#[test]
+fn a_start_does_not_flatten_the_scene() {
+    for motion in [Motion::Sideways, Motion::Forward, Motion::Mixed] {
+        let reliefs: Vec<f64> =
+            (1..=4).map(|seed| run(motion, seed, 2.0, 40).0.expect("a start").relief).collect();
+        let mean = reliefs.iter().sum::<f64>() / reliefs.len() as f64;
+        assert!(mean.abs() < 0.1, "{motion:?}: {mean} of {reliefs:?}");
+    }
 }
 
 #[test]
