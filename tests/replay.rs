@@ -84,6 +84,24 @@ fn a_replay_says_what_a_budget_buys_and_what_the_covariance_is_worth() {
 }
 
 #[test]
+fn the_floor_of_the_covariance_is_for_readers_only() {
+    let folder = tempfile::tempdir().unwrap();
+    let runs = ["0", "1", "50"].map(|image_px| {
+        let floor = format!("tracking.covariance_floor.image_px={image_px}");
+        let arguments = ["sim", "--frames", "80", "--json", "--set", &floor];
+        let dir = folder.path().join(image_px);
+        let output = replay(&[&arguments[..], &HALF_SIZE].concat(), &dir);
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let summary: Value = serde_json::from_slice(&output.stdout).unwrap();
+        let files = ["trajectory.txt", "trajectory_online.txt", "keyframes.txt", "map.ply"];
+        (files.map(|name| std::fs::read(dir.join(name)).unwrap()), summary)
+    });
+    assert!(runs[0].0 == runs[1].0 && runs[0].0 == runs[2].0, "the mapper sees the floor");
+    let [none, usual, wide] = runs.map(|(_, summary)| summary["nees_median"].as_f64().unwrap());
+    assert!(none > 3.0 * usual && usual > 3.0 * wide, "{none} {usual} {wide}");
+}
+
+#[test]
 fn what_cannot_be_replayed_is_one_clear_line() {
     let folder = tempfile::tempdir().unwrap();
     let empty = format!("tum:{}", folder.path().display());

@@ -262,6 +262,7 @@ fn whole(sequence: &Sequence, pools: &[rayon::ThreadPool]) {
                     world_from_camera: sequence.first_from(k),
                     proposes_keyframe: k > 0 && k % INTERVAL == 0,
                     covariance: tracked_covariance(),
+                    alignment_covariance: tracked_covariance(),
                     ..PoseEstimate::unknown(&frame)
                 };
                 let depth = (k == 0).then(|| sequence.simulator.raw_depth(FIRST)).flatten();

@@ -49,7 +49,7 @@ pub struct TrackedFrame {
 impl TrackedFrame {
     /// Normalised squared errors of (all six, translation, rotation).
     pub fn normalized(&self) -> Option<[f64; 3]> {
-        normalized(&self.error, &self.estimate.covariance)
+        normalized(&self.error, &self.estimate.alignment_covariance)
     }
 }
 

@@ -48,6 +48,7 @@ pub fn given_pose(
         world_from_camera,
         keyframe_from_camera: SE3::identity(),
         covariance: [0.0; 21],
+        alignment_covariance: [0.0; 21],
         brightness: Brightness::default(),
         quality: Quality::default(),
         proposes_keyframe: false,

@@ -93,6 +93,7 @@ mod tests {
             world_from_camera: SE3::identity(),
             keyframe_from_camera: SE3::identity(),
             covariance: [0.0; 21],
+            alignment_covariance: [0.0; 21],
             brightness: Brightness::default(),
             quality: Quality::default(),
             proposes_keyframe: false,

@@ -346,6 +346,7 @@ fn unclaimed(estimate: &PoseEstimate) -> PoseEstimate {
         world_from_camera: identity,
         keyframe_from_camera: identity,
         covariance,
+        alignment_covariance: covariance,
         brightness: Default::default(),
         quality: Default::default(),
         proposes_keyframe: false,

@@ -105,8 +105,15 @@ pub struct PoseEstimate {
     /// Pose relative to the keyframe, translation in keyframe units.
     pub keyframe_from_camera: SE3,
     /// Upper triangle, row-major, of the covariance of the left increment (translation, rotation)
-    /// of `current_from_keyframe`, keyframe units and radians.
+    /// of `current_from_keyframe`, keyframe units and radians: that of the alignment, raised by the
+    /// floor of [`CovarianceFloorParams`] for errors that all points share. This is what is published. It
+    /// says nothing about the drift of the keyframe itself.
+    ///
+    /// [`CovarianceFloorParams`]: crate::slam::tracker::covariance_floor::CovarianceFloorParams
     pub covariance: [f64; 21],
+    /// The same of the alignment alone, as if the errors of distant points were independent: too sure to
+    /// be fused. The mapper weighs matches with it.
+    pub alignment_covariance: [f64; 21],
     /// Brightness against the keyframe.
     pub brightness: Brightness,
     /// Figures of the alignment.
@@ -128,6 +135,7 @@ impl PoseEstimate {
             world_from_camera: SE3::identity(),
             keyframe_from_camera: SE3::identity(),
             covariance: [0.0; 21],
+            alignment_covariance: [0.0; 21],
             brightness: Brightness::default(),
             quality: Quality::default(),
             proposes_keyframe: false,

@@ -1,5 +1,6 @@
 //! The recipe of a frame: predict, align to the keyframe coarse to fine, judge, report.
 
+pub mod covariance_floor;
 pub mod motion;
 pub mod verdict;
 
@@ -16,6 +17,7 @@ use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::{
     Brightness, LostReason, NO_KEYFRAME, PoseEstimate, Quality, TrackingState,
 };
+use crate::slam::tracker::covariance_floor::CovarianceFloorParams;
 use crate::slam::tracker::motion::{Motion, hypotheses, turned};
 use crate::slam::tracker::verdict::{VerdictParams, fits_better, is_better, quality_of};
 
@@ -29,6 +31,8 @@ pub struct TrackerParams {
     pub alignment: AlignmentParams,
     /// What the result is worth.
     pub verdict: VerdictParams,
+    /// What the published covariance may not fall below.
+    pub covariance_floor: CovarianceFloorParams,
     /// The coarsest level fits badly, and other motions are tried, when its whitened RMSE is
     /// above this many times the last good one. DSO gives a level up at 1.5.
     pub poor_fit_ratio: f64,
@@ -53,6 +57,7 @@ impl Default for TrackerParams {
             reference: ReferenceParams::default(),
             alignment: AlignmentParams::default(),
             verdict: VerdictParams::default(),
+            covariance_floor: CovarianceFloorParams::default(),
             poor_fit_ratio: 1.5,
             hypothesis_rotation_deg: 3.0,
             recovery_rotation_deg: 6.0,
@@ -69,6 +74,7 @@ impl TrackerParams {
         self.reference.validate().map_err(|error| error.within("reference"))?;
         self.alignment.validate().map_err(|error| error.within("alignment"))?;
         self.verdict.validate().map_err(|error| error.within("verdict"))?;
+        self.covariance_floor.validate().map_err(|error| error.within("covariance_floor"))?;
         check_range("poor_fit_ratio", self.poor_fit_ratio, 1.0..=100.0)?;
         check_range("hypothesis_rotation_deg", self.hypothesis_rotation_deg, 0.0..=45.0)?;
         check_range("recovery_rotation_deg", self.recovery_rotation_deg, 0.0..=45.0)?;
@@ -334,6 +340,9 @@ impl Tracker {
             (_, Some(covariance)) if world_from_camera.is_finite() => covariance,
             _ => return self.lost(frame, reference, LostReason::TooFewInliers, quality),
         };
+        let translation = &alignment.state.current_from_keyframe.translation;
+        let published =
+            self.params.covariance_floor.raised(&covariance, &self.intrinsics, translation);
         self.memory.motion.observe(frame.capture_nanos, &world_from_camera);
         self.memory.brightness = alignment.state.brightness;
         let state = match reference.map_state() {
@@ -345,7 +354,8 @@ impl Tracker {
             state,
             world_from_camera,
             keyframe_from_camera,
-            covariance: upper_triangle(|row, column| covariance[(row, column)]),
+            covariance: upper_triangle(|row, column| published[(row, column)]),
+            alignment_covariance: upper_triangle(|row, column| covariance[(row, column)]),
             brightness: alignment.state.brightness,
             proposes_keyframe: self.proposes_keyframe(reference, alignment, &quality),
             quality,
@@ -383,6 +393,10 @@ impl Tracker {
             // Beyond all numbers where the keyframe's unit is absurdly small.
             .filter(SE3::is_finite);
         let keyframe_from_camera = located.unwrap_or_else(SE3::identity);
+        let unknown = upper_triangle(|row, column| match row == column {
+            true => UNKNOWN_VARIANCE,
+            false => 0.0,
+        });
         PoseEstimate {
             sequence: frame.sequence,
             capture_nanos: frame.capture_nanos,
@@ -392,10 +406,8 @@ impl Tracker {
             state,
             world_from_camera,
             keyframe_from_camera,
-            covariance: upper_triangle(|row, column| match row == column {
-                true => UNKNOWN_VARIANCE,
-                false => 0.0,
-            }),
+            covariance: unknown,
+            alignment_covariance: unknown,
             brightness: Brightness::default(),
             quality: Quality::default(),
             proposes_keyframe: false,

@@ -263,6 +263,7 @@ pub fn pose_message(pose: &PoseEstimate, timing: &PoseTiming) -> PoseMessage {
         world_from_camera: rigid_message(&pose.world_from_camera),
         keyframe_from_camera: rigid_message(&pose.keyframe_from_camera),
         covariance: pose.covariance,
+        alignment_covariance: pose.alignment_covariance,
         brightness: [pose.brightness.a, pose.brightness.b],
         in_view_ratio: quality.in_view_ratio,
         inlier_ratio: quality.inlier_ratio,
@@ -283,6 +284,7 @@ pub fn pose_from_message(message: &PoseMessage) -> Result<PoseEstimate, MessageE
         if all { Ok(()) } else { Err(MessageError::InvalidNumber { field }) }
     };
     finite("covariance", &message.covariance)?;
+    finite("alignment_covariance", &message.alignment_covariance)?;
     finite("brightness", &message.brightness)?;
     let quality = Quality {
         in_view_ratio: message.in_view_ratio,
@@ -315,6 +317,7 @@ pub fn pose_from_message(message: &PoseMessage) -> Result<PoseEstimate, MessageE
             "keyframe_from_camera",
         )?,
         covariance: message.covariance,
+        alignment_covariance: message.alignment_covariance,
         brightness: Brightness { a: message.brightness[0], b: message.brightness[1] },
         quality,
         proposes_keyframe,

@@ -50,7 +50,7 @@ pub struct FrameHeader {
 /// Message of `tracker/pose`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
-#[type_name("semidense.Pose.v2")]
+#[type_name("semidense.Pose.v3")]
 pub struct PoseMessage {
     /// Sequence of the frame.
     pub sequence: u64,
@@ -81,9 +81,15 @@ pub struct PoseMessage {
     pub world_from_camera: RigidMessage,
     /// Pose relative to the keyframe, keyframe units.
     pub keyframe_from_camera: RigidMessage,
-    /// Upper triangle, row-major, of the left increment (translation, rotation) of
-    /// `current_from_keyframe`.
+    /// Upper triangle, row-major, of the covariance of the left increment (translation, rotation) of
+    /// `current_from_keyframe`, keyframe units and radians. Raised by a floor for errors that all points
+    /// share (`tracking.covariance_floor`), which is measured on recordings and not calibrated to a
+    /// camera: check the `nees_…` figures of a recording of your own before you fuse it. It does not hold
+    /// the drift of the keyframe itself, nor that of the scale.
     pub covariance: [f64; 21],
+    /// The same of the alignment alone, for the mapper. Too sure by up to a hundred in standard
+    /// deviation: never fuse it.
+    pub alignment_covariance: [f64; 21],
     /// Brightness against the keyframe: a, b.
     pub brightness: [f64; 2],
     /// Share of the keyframe's points in view.
@@ -319,7 +325,7 @@ mod tests {
     #[test]
     fn layouts_are_pinned() {
         assert_layout::<FrameHeader>(88, 8, "semidense.FrameHeader.v2");
-        assert_layout::<PoseMessage>(432, 8, "semidense.Pose.v2");
+        assert_layout::<PoseMessage>(600, 8, "semidense.Pose.v3");
         assert_layout::<KeyframeHeader>(144, 8, "semidense.KeyframeHeader.v1");
         assert_layout::<DepthPoint>(16, 4, "semidense.DepthPoint.v1");
         assert_layout::<KeyframeImageHeader>(24, 8, "semidense.KeyframeImageHeader.v1");

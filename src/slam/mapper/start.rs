@@ -67,7 +67,8 @@ impl Mapper {
         let matching = &self.params.matching;
         let line_noise_px = match self.map_state() {
             MapState::Initializing => self.params.initializer.line_noise_px,
-            _ => matching.line_noise_with(pose_noise_px(&self.intrinsics, &pose.covariance)),
+            _ => matching
+                .line_noise_with(pose_noise_px(&self.intrinsics, &pose.alignment_covariance)),
         };
         MatchingParams { line_noise_px, ..matching.clone() }
     }

@@ -335,7 +335,8 @@ fn a_short_budget_is_never_worse_than_the_prediction() {
             let error = error_of(&short);
             errors.push(error.norm());
             // The covariance says so: within three of its standard deviations in every direction.
-            let std_dev = [0, 6, 11, 15, 18, 20].map(|i| short.covariance[i].sqrt() * camera.fx);
+            let std_dev =
+                [0, 6, 11, 15, 18, 20].map(|i| short.alignment_covariance[i].sqrt() * camera.fx);
             assert!((0..6).all(|i| error[i].abs() < 3.0 * std_dev[i] + 0.1), "{error} {std_dev:?}");
         }
     }

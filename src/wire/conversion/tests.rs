@@ -21,6 +21,7 @@ fn pose() -> PoseEstimate {
         world_from_camera: transform(),
         keyframe_from_camera: transform().inverse(),
         covariance: std::array::from_fn(|i| 0.1 / (i as f64 + 3.0)),
+        alignment_covariance: std::array::from_fn(|i| 0.01 / (i as f64 + 3.0)),
         brightness: Brightness { a: 0.1, b: -3.0 },
         quality: Quality { in_view_ratio: 0.9, points: 123, ..Quality::default() },
         proposes_keyframe: true,
@@ -131,6 +132,7 @@ proptest! {
         message.proposes_keyframe = codes[2];
         message.world_from_camera = std::array::from_fn(number);
         message.covariance = std::array::from_fn(|i| number(i + 7));
+        message.alignment_covariance = std::array::from_fn(|i| number(i + 8));
         message.residual_rmse = number(31);
         if let Ok(read) = pose_from_message(&message) {
             prop_assert!(read.world_from_camera.is_finite());
