@@ -12,6 +12,8 @@ use crate::service::results::untracked::Untracked;
 use crate::service::results::{EndOfRun, RecordedPose, Rejection, RunMode, RunRecord};
 use crate::slam::evaluation::TrajectoryEvaluation;
 use crate::slam::evaluation::depth_error::DepthStatistics;
+use crate::slam::evaluation::grade::{Grade, GradeInput};
+use crate::slam::evaluation::map_consistency::MapConsistency;
 use crate::slam::evaluation::normalized_error::NormalizedErrors;
 use crate::slam::evaluation::statistics::percentile;
 use crate::slam::pose::{NO_KEYFRAME, TrackingState};
@@ -159,6 +161,8 @@ pub struct Summary {
     pub ended: String,
     /// What failed.
     pub failure: Option<String>,
+    /// What the run is worth by what can be known without ground truth.
+    pub grade: Grade,
     /// Frames that the source gave.
     pub frames_in: u64,
     /// Frames whose pose is claimed.
@@ -295,6 +299,7 @@ impl Summary {
             source: record.source.clone(),
             ended: ended.to_owned(),
             failure: failure.cloned(),
+            grade: grade(record),
             frames_in: record.frames_in,
             frames_tracked: count(TrackingState::is_tracked),
             frames_degraded: count(|s| matches!(s, TrackingState::Degraded(_))),
@@ -344,6 +349,24 @@ impl Summary {
             depth_density: depth.map(|d| d.density),
         }
     }
+}
+
+/// The grade of a run.
+fn grade(record: &RunRecord) -> Grade {
+    let keyframes = &record.map.keyframes;
+    let sequences = record.poses.iter().map(|pose| pose.estimate.sequence);
+    let (first, last) = (sequences.clone().min(), sequences.max());
+    let frames = last.zip(first).map_or(0, |(last, first)| last - first + 1);
+    Grade::of(&GradeInput {
+        frames_tracked: count_states(&record.poses, TrackingState::is_tracked),
+        frames_lost: count_states(&record.poses, is_lost),
+        losses: count_losses(&record.poses),
+        epochs: count_epochs(&record.poses),
+        rejections: record.rejections.as_ref().map_or(0, |all| all.len() as u64),
+        frames,
+        width: keyframes.first().map_or(0, |keyframe| keyframe.intrinsics.width),
+        consistency: MapConsistency::measure(keyframes),
+    })
 }
 
 /// Times in the tracker. A frame without a keyframe costs nothing and tells nothing.

@@ -3,6 +3,7 @@
 use std::fmt::Write;
 
 use crate::service::results::summary::{Percentiles, Summary, TrajectorySummary};
+use crate::slam::evaluation::grade::Grade;
 
 /// The lines, each ended.
 pub fn summary_text(summary: &Summary) -> String {
@@ -56,7 +57,14 @@ pub fn summary_text(summary: &Summary) -> String {
         }
     }
     line("run", run(summary));
+    line("grade", grade_text(&summary.grade));
     text
+}
+
+/// The level and at most two reasons; what it cannot see is in the report.
+fn grade_text(grade: &Grade) -> String {
+    let reasons: Vec<&str> = grade.reasons.iter().take(2).map(String::as_str).collect();
+    format!("{}: {}", grade.level.name(), reasons.join("; "))
 }
 
 fn frames(summary: &Summary) -> String {

@@ -7,13 +7,15 @@ use serde_json::{Map, Value};
 use crate::service::results::report::html::escaped;
 use crate::service::results::summary::Summary;
 
+/// What has a place of its own on the page.
+const DRAWN: [&str; 2] = ["budget_curve", "grade"];
+
 /// The figures as a list, and those that are lists themselves as tables.
 pub fn figures(summary: &Summary) -> String {
     let mut html = String::from("<section><h2>Figures</h2><dl>");
     let value = serde_json::to_value(summary).unwrap_or_default();
     let entries = value.as_object().into_iter().flatten();
-    // The curve is a table of its own, and drawn.
-    let shown = entries.filter(|(key, value)| *key != "budget_curve" && has_figures(value));
+    let shown = entries.filter(|(key, value)| !DRAWN.contains(&key.as_str()) && has_figures(value));
     let mut tables = String::new();
     for (key, value) in shown {
         match value {

@@ -6,6 +6,7 @@ pub mod chart;
 pub mod charts;
 pub mod evaluation_plot;
 pub mod figures;
+pub mod grade_banner;
 pub mod html;
 pub mod map_picture;
 pub mod views;
@@ -23,6 +24,7 @@ use crate::service::results::report::charts::{
     error_over_time, scale_over_time, time_charts, trajectory_views,
 };
 use crate::service::results::report::figures::figures;
+use crate::service::results::report::grade_banner::grade_banner;
 use crate::service::results::report::html::{escaped, png_address};
 use crate::service::results::report::map_picture::map_picture;
 use crate::service::results::summary::Summary;
@@ -77,6 +79,7 @@ pub fn report(input: &ReportInput<'_>) -> String {
         summary.recorded_secs,
         notices(summary, &input.record.ended)
     );
+    page.push_str(&grade_banner(&summary.grade));
     page.push_str(&cards(summary));
     page.push_str(&states(input.record));
     page.push_str(&map(input));
