@@ -216,6 +216,9 @@ fn messages() -> [Vec<u8>; 7] {
         warning_bytes: 3,
         warning: [b'w'; TEXT_BYTES],
         cause: [b'c'; TEXT_BYTES],
+        source: [b's'; TEXT_BYTES],
+        source_bytes: 5,
+        reserved: 0,
     };
     let step = StepMessage {
         world_from_camera: rigid_message(&SE3::identity()),

@@ -4,6 +4,7 @@ mod support;
 
 use std::collections::BTreeMap;
 use std::fs;
+use std::io::{BufRead, BufReader};
 
 use rustix::process::{Pid, Signal};
 use semidense::capture::source::{SourceName, open};
@@ -128,6 +129,11 @@ fn who_comes_late_gets_the_keyframe_and_status_sees_all_three() {
         let rate_hz = status[process]["rate_hz"].as_f64();
         assert!(rate_hz.is_some_and(|rate_hz| rate_hz > 0.5), "{process}: {status}");
     }
+    assert_eq!((&status["instance"], &status["source"]), (&"semidense".into(), &"sim".into()));
+    assert_eq!(status["ended"], false, "{status}");
+    assert!(status["keyframes"].as_u64() > Some(0) && status["uptime_secs"].as_f64() > Some(0.5));
+    assert!(status["pose"]["state"].is_string() && status["pose"]["position"][2].is_f64());
+    assert!(status["pose"]["age_secs"].as_f64() < Some(60.0), "{status}");
 
     let second = finish(rig.run(20, &[]));
     assert_eq!(second.status.code(), Some(1));
@@ -271,8 +277,24 @@ fn status_sees_who_runs_without_capture() {
         status["tracker"].is_object().then_some(status)
     });
     assert!(status["capture"].is_null() && status["mapper"].is_null(), "{status}");
+
+    signal(&tracker, Signal::STOP);
+    let stopped = finish(rig.command(&["status", "--once"]));
+    assert!(stopped.stdout.contains("\ntracker  stopped"), "{}", stopped.stdout);
+    assert!(stopped.stdout.contains("\nmapper   not running"), "{}", stopped.stdout);
+    signal(&tracker, Signal::CONT);
+
+    let mut watching = rig.command(&["status"]).spawn().unwrap();
+    let mut lines = BufReader::new(watching.stdout.take().unwrap()).lines();
+    let heard =
+        lines.by_ref().map_while(Result::ok).find(|line| line.starts_with("semidense, up 0:"));
+    assert!(heard.is_some(), "the tracker is there");
     signal(&tracker, Signal::INT);
     end(tracker);
+    let rest: Vec<String> = lines.map_while(Result::ok).collect();
+    assert_eq!(rest.last().map(String::as_str), Some("the run has ended"), "{rest:?}");
+    let watched = end(watching);
+    assert_eq!(watched.status.code(), Some(0), "{}", watched.stderr);
     let nobody = finish(rig.command(&["status", "--once"]));
     assert_eq!(nobody.status.code(), Some(1), "{}", nobody.stdout);
 }

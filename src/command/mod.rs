@@ -18,6 +18,7 @@ pub mod run;
 pub mod run_progress;
 pub mod simulate;
 pub mod status;
+pub mod status_text;
 pub mod tracker;
 
 use std::error::Error;

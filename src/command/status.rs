@@ -1,5 +1,6 @@
 //! `semidense status`: what is running, and how well.
 
+use std::error::Error;
 use std::io::IsTerminal;
 use std::path::Path;
 use std::process::ExitCode;
@@ -11,16 +12,18 @@ use serde_json::{Value, json};
 use crate::command::CommandResult;
 use crate::command::ending::note_unfinished;
 use crate::command::print::print;
+use crate::command::status_text::{legend, status_text};
 use crate::service::clock::now_nanos;
 use crate::service::config::Config;
-use crate::service::health::{cause, percentile_ms, scheduling_name, warning};
+use crate::service::health::{cause, percentile_ms, scheduling_name, source, warning};
 use crate::service::journal::folder::unfinished;
+use crate::service::liveness::Liveness;
 use crate::service::peers::{HEALTH_TOPICS, Peer};
 use crate::service::shutdown::Shutdown;
-use crate::wire::message::HealthMessage;
+use crate::wire::message::{HealthMessage, PoseMessage};
 use crate::wire::place::Place;
-use crate::wire::port::{Access, Hub, OpenError, wait};
-use crate::wire::topic::Topic;
+use crate::wire::port::{Access, Hub, OpenError, Subscriber, wait};
+use crate::wire::topic::{POSE, Topic};
 
 /// Time between two looks: rates are taken over it.
 const PERIOD: Duration = Duration::from_secs(1);
@@ -30,11 +33,15 @@ const MAX_LOOKS: usize = 4;
 /// A process that has said nothing for so long is not there any more.
 const STALE_NANOS: i64 = 3_000_000_000;
 
+/// Width of a terminal that does not tell its own, columns.
+const USUAL_WIDTH: usize = 80;
+
 /// Terminals clear the screen and go to its first place.
 const CLEAR_SCREEN: &str = "\x1b[2J\x1b[H";
 
 /// Show states, rates and latencies of the running processes
 #[derive(Debug, Args)]
+#[command(after_help = legend())]
 pub struct StatusArguments {
     /// Show it once and end
     #[arg(long)]
@@ -49,52 +56,162 @@ pub fn run(config: &Config, arguments: StatusArguments) -> CommandResult {
     let place = Place::new(&config.instance, &config.root)?;
     note_unfinished(&unfinished(Some(&place), Path::new(".")));
     let hub = Hub::join(&place, "status", Access::Observer)?;
-    let mut peers = Vec::new();
-    for topic in &HEALTH_TOPICS {
-        peers.push(listen(&hub, topic)?);
-    }
-    if peers.iter().all(Option::is_none) {
-        // Its error says that nothing runs, unless this has changed just now.
-        Peer::open(&hub, &HEALTH_TOPICS[0])?;
-    }
+    let mut watch = Watch::open(&hub, &config.instance)?;
     let shutdown = Shutdown::install()?;
     let is_live = std::io::stdout().is_terminal() && !arguments.once && !arguments.json;
-    let mut before: Vec<Option<HealthMessage>> = vec![None; peers.len()];
-    let mut looks = 0;
-    loop {
-        looks += 1;
+    for looks in 1.. {
         wait(&[], Some(shutdown.descriptor()), PERIOD)?;
         if shutdown.is_requested() {
-            return Ok(ExitCode::SUCCESS);
+            break;
         }
-        let mut rows = Vec::new();
-        for ((topic, peer), before) in HEALTH_TOPICS.iter().zip(&mut peers).zip(&mut before) {
-            if peer.is_none() {
-                // It may have come up since the last look.
-                *peer = listen(&hub, topic)?;
-            }
-            let Some(peer) = peer else {
-                rows.push((topic.owner, Value::Null));
-                continue;
-            };
-            peer.update()?;
-            rows.push((peer.name(), row(peer, before.as_ref())));
-            // One look takes its rates since the first report, to be done soonest.
-            if !(arguments.once && before.is_some()) {
-                *before = peer.last().copied();
-            }
-        }
+        let look = watch.look(&hub, arguments.once)?;
         // A rate takes two reports of a process; one that is alone or silent has none.
-        let is_measured = |(_, row): &(_, Value)| row.is_null() || !row["rate_hz"].is_null();
-        if arguments.once && looks < MAX_LOOKS && !rows.iter().all(is_measured) {
+        let has_ended = look["ended"] == true;
+        if arguments.once && looks < MAX_LOOKS && !is_measured(&look) && !has_ended {
             continue;
         }
         let clear = if is_live { CLEAR_SCREEN } else { "" };
-        print(&format!("{clear}{}", text_of(&rows, arguments.json)))?;
-        if arguments.once {
-            return Ok(ExitCode::SUCCESS);
+        let text = match arguments.json {
+            true => format!("{look}\n"),
+            false => status_text(&look, terminal_width()),
+        };
+        print(&format!("{clear}{text}"))?;
+        if has_ended && !arguments.json {
+            print("the run has ended\n")?;
+        }
+        if arguments.once || has_ended {
+            break;
         }
     }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Columns of the terminal; the usual ones where standard output is none.
+fn terminal_width() -> usize {
+    let size = rustix::termios::tcgetwinsize(std::io::stdout());
+    size.map_or(USUAL_WIDTH, |size| usize::from(size.ws_col)).max(1)
+}
+
+/// Whether every process that speaks has given two reports.
+fn is_measured(look: &Value) -> bool {
+    let processes = HEALTH_TOPICS.iter().map(|topic| &look[topic.owner]);
+    processes.into_iter().all(|row| row.is_null() || !row["rate_hz"].is_null())
+}
+
+/// What is listened to.
+struct Watch {
+    instance: String,
+    peers: Vec<Option<Peer>>,
+    before: Vec<Option<HealthMessage>>,
+    poses: Option<Subscriber<PoseMessage, ()>>,
+    last_pose: Option<PoseMessage>,
+}
+
+impl Watch {
+    fn open(hub: &Hub, instance: &str) -> Result<Self, OpenError> {
+        let peers: Result<Vec<_>, _> =
+            HEALTH_TOPICS.iter().map(|topic| listen(hub, topic)).collect();
+        let peers = peers?;
+        if peers.iter().all(Option::is_none) {
+            // Its error says that nothing runs, unless this has changed just now.
+            Peer::open(hub, &HEALTH_TOPICS[0])?;
+        }
+        let before = vec![None; peers.len()];
+        Ok(Self { instance: instance.to_owned(), peers, before, poses: None, last_pose: None })
+    }
+
+    /// One look. `keeps_first`: rates are taken since the first report, to be done soonest.
+    fn look(&mut self, hub: &Hub, keeps_first: bool) -> CommandValue {
+        let mut look = json!({ "instance": self.instance, "source": null, "uptime_secs": null, "keyframes": null });
+        let now = now_nanos();
+        let (mut heard, mut ended) = (0, 0);
+        for ((topic, peer), before) in
+            HEALTH_TOPICS.iter().zip(&mut self.peers).zip(&mut self.before)
+        {
+            if peer.is_none() {
+                // It may have come up since the last look.
+                *peer = listen(hub, topic)?;
+            }
+            look[topic.owner] = Value::Null;
+            let Some(peer) = peer else { continue };
+            peer.update()?;
+            let Some(health) = peer.last() else { continue };
+            let state = state_of(health, peer.state().map(|state| state.name()), now);
+            heard += 1;
+            ended += usize::from(state == NOT_RUNNING);
+            look[topic.owner] = row(health, state, before.as_ref(), now);
+            match topic.owner {
+                "capture" => look["source"] = json!(source(health)),
+                "mapper" => look["keyframes"] = json!(health.total),
+                _ => {}
+            }
+            let known = look["uptime_secs"].as_f64().unwrap_or_default();
+            let own = look[topic.owner]["uptime_secs"].as_f64().unwrap_or_default();
+            // A process that was started again is younger than the run.
+            look["uptime_secs"] = json!(known.max(own));
+            if !(keeps_first && before.is_some()) {
+                *before = Some(*health);
+            }
+        }
+        self.hear_poses(hub)?;
+        look["pose"] = self.last_pose.as_ref().map_or(Value::Null, |pose| pose_row(pose, now));
+        look["ended"] = json!(heard > 0 && ended == heard);
+        Ok(look)
+    }
+
+    /// Keeps the newest pose.
+    fn hear_poses(&mut self, hub: &Hub) -> Result<(), Box<dyn Error>> {
+        if self.poses.is_none() {
+            self.poses = match hub.subscriber(&POSE) {
+                Ok(poses) => Some(poses),
+                Err(OpenError::NotRunning { .. }) => None,
+                Err(error) => return Err(error.into()),
+            };
+        }
+        let Some(poses) = &mut self.poses else { return Ok(()) };
+        while let Some(message) = poses.receive()? {
+            self.last_pose = message.payload().first().copied().or(self.last_pose);
+        }
+        Ok(())
+    }
+}
+
+/// A look, or why there is none.
+type CommandValue = Result<Value, Box<dyn Error>>;
+
+/// The state of a process that has ended.
+const NOT_RUNNING: &str = "not running";
+
+/// What a process is doing: by its own report, unless the kernel knows better. A process in another
+/// container has an id that means nothing here; as long as it reports it is believed.
+fn state_of(health: &HealthMessage, reported: Option<&'static str>, now: i64) -> &'static str {
+    let is_stale = now - health.published_nanos > STALE_NANOS;
+    let has_finished = matches!(reported, Some("finished" | "failed"));
+    match Liveness::of(health.process_id) {
+        Liveness::Gone if is_stale || has_finished => NOT_RUNNING,
+        Liveness::Stopped => "stopped",
+        _ if is_stale => "silent",
+        _ => reported.unwrap_or("unknown"),
+    }
+}
+
+/// A pose as JSON.
+fn pose_row(pose: &PoseMessage, now: i64) -> Value {
+    let state = match pose.state {
+        0 => "initializing",
+        1 => "tracking",
+        2 => "degraded",
+        3 => "lost",
+        _ => "unknown",
+    };
+    let [.., x, y, z] = pose.world_from_camera;
+    json!({
+        "state": state,
+        "sequence": pose.sequence,
+        "epoch": pose.epoch,
+        "position": [x, y, z],
+        "age_secs": (now - pose.published_nanos).max(0) as f64 * 1e-9,
+    })
 }
 
 /// The process that speaks on `topic`; `None` where it does not run.
@@ -106,20 +223,18 @@ fn listen(hub: &Hub, topic: &Topic) -> Result<Option<Peer>, OpenError> {
     }
 }
 
-/// One process as JSON; null where it has never spoken.
-fn row(peer: &Peer, before: Option<&HealthMessage>) -> Value {
-    let Some(health) = peer.last() else { return Value::Null };
-    let is_stale = now_nanos() - health.published_nanos > STALE_NANOS;
-    let state = peer.state().map_or("unknown", |state| state.name());
+/// One process as JSON.
+fn row(health: &HealthMessage, state: &str, before: Option<&HealthMessage>, now: i64) -> Value {
     let rate_hz = before.and_then(|before| {
         let nanos = health.published_nanos - before.published_nanos;
         let frames = health.frames.checked_sub(before.frames)?;
         (nanos > 0).then(|| frames as f64 * 1e9 / nanos as f64)
     });
     json!({
-        "state": if is_stale { "silent" } else { state },
+        "state": state,
         "cause": cause(health),
         "process_id": health.process_id,
+        "uptime_secs": (now - health.started_nanos).max(0) as f64 * 1e-9,
         "frames": health.frames,
         "rate_hz": rate_hz,
         "dropped": health.dropped,
@@ -145,40 +260,4 @@ fn row(peer: &Peer, before: Option<&HealthMessage>) -> Value {
             "max": percentile_ms(&health.wake_counts, 1.0),
         },
     })
-}
-
-/// The rows as JSON or as a table.
-fn text_of(rows: &[(&str, Value)], json: bool) -> String {
-    if json {
-        let object: serde_json::Map<_, _> =
-            rows.iter().map(|(name, row)| ((*name).to_owned(), row.clone())).collect();
-        return format!("{}\n", Value::Object(object));
-    }
-    let mut lines =
-        vec!["process  state      frames   rate/s  dropped  late  p50 ms  p99 ms  MB".to_owned()];
-    for (name, row) in rows {
-        let number = |value: &Value, digits: usize| {
-            value.as_f64().map_or("-".to_owned(), |x| format!("{x:.digits$}"))
-        };
-        if row.is_null() {
-            lines.push(format!("{name:8} not running"));
-            continue;
-        }
-        lines.push(format!(
-            "{name:8} {:9} {:>7} {:>8} {:>8} {:>5} {:>7} {:>7} {:>3} {}",
-            row["state"].as_str().unwrap_or(""),
-            number(&row["frames"], 0),
-            number(&row["rate_hz"], 1),
-            number(&row["dropped"], 0),
-            number(&row["deadline_misses"], 0),
-            number(&row["latency_ms"]["p50"], 2),
-            number(&row["latency_ms"]["p99"], 2),
-            number(&row["peak_rss_mb"], 0),
-            row["cause"].as_str().unwrap_or(""),
-        ));
-        if let Some(warning) = row["warning"].as_str().filter(|warning| !warning.is_empty()) {
-            lines.push(format!("         warning: {warning}"));
-        }
-    }
-    lines.join("\n") + "\n"
 }

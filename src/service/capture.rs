@@ -168,6 +168,7 @@ impl<'a> Shell<'a> {
         place.check_shared_memory(shared_memory_bytes(&intrinsics, Some("capture")))?;
         let hub = Hub::join(&place, "capture", Access::Member)?;
         let mut health = Health::open(&hub, &CAPTURE_HEALTH)?;
+        health.tell_source(&options.source.to_string());
         health.counters().total = source.num_frames().unwrap_or(0) as u64;
         Ok(Self {
             config,

@@ -15,6 +15,7 @@ pub mod given_pose;
 pub mod health;
 pub mod journal;
 pub mod latency_bench;
+pub mod liveness;
 pub mod manager_notice;
 pub mod map_file;
 pub mod mapper;

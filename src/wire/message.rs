@@ -225,7 +225,7 @@ pub struct KeyframePoseMessage {
 /// Message of `<process>/health`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
-#[type_name("semidense.Health.v2")]
+#[type_name("semidense.Health.v3")]
 pub struct HealthMessage {
     /// CLOCK_MONOTONIC when it was published.
     pub published_nanos: i64,
@@ -282,6 +282,12 @@ pub struct HealthMessage {
     pub warning: [u8; TEXT_BYTES],
     /// Why the state is what it is, UTF-8.
     pub cause: [u8; TEXT_BYTES],
+    /// Capture: where its frames come from, as the user named it, UTF-8; long names lose their end.
+    pub source: [u8; TEXT_BYTES],
+    /// Bytes of `source` that are used.
+    pub source_bytes: u32,
+    /// Zero.
+    pub reserved: u32,
 }
 
 /// Request of `mapper/command`.
@@ -332,7 +338,7 @@ mod tests {
         assert_layout::<StepMessage>(136, 8, "semidense.Step.v4");
         assert_layout::<GraphHeader>(16, 8, "semidense.GraphHeader.v1");
         assert_layout::<KeyframePoseMessage>(72, 8, "semidense.KeyframePose.v1");
-        assert_layout::<HealthMessage>(1680, 8, "semidense.Health.v2");
+        assert_layout::<HealthMessage>(1880, 8, "semidense.Health.v3");
         assert_layout::<CommandRequest>(4104, 4, "semidense.CommandRequest.v1");
         assert_layout::<CommandResponse>(200, 4, "semidense.CommandResponse.v1");
     }

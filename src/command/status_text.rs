@@ -1,0 +1,270 @@
+//! How `semidense status` looks: a table that fits the terminal, and a legend.
+
+use serde_json::Value;
+
+/// A column of the table.
+struct Column {
+    heading: &'static str,
+    /// Widest text that is expected.
+    width: usize,
+    /// Columns of a higher number go first where the terminal is narrow.
+    rank: u8,
+    /// Where the value is in a process's object, and its decimals.
+    value: (&'static [&'static str], usize),
+    legend: &'static str,
+}
+
+/// Everything that can be shown of a process, in the order of the columns.
+const COLUMNS: [Column; 8] = [
+    Column {
+        heading: "frames",
+        width: 8,
+        rank: 2,
+        value: (&["frames"], 0),
+        legend: "handled since the process started",
+    },
+    Column {
+        heading: "rate",
+        width: 6,
+        rank: 1,
+        value: (&["rate_hz"], 1),
+        legend: "frames a second",
+    },
+    Column {
+        heading: "drop",
+        width: 5,
+        rank: 4,
+        value: (&["dropped"], 0),
+        legend: "passed over for a newer frame",
+    },
+    Column {
+        heading: "late",
+        width: 5,
+        rank: 3,
+        value: (&["deadline_misses"], 0),
+        legend: "done after the deadline",
+    },
+    Column {
+        heading: "p50",
+        width: 7,
+        rank: 5,
+        value: (&["latency_ms", "p50"], 2),
+        legend: "half of the latencies are shorter, ms from the frame's stamp",
+    },
+    Column {
+        heading: "p99",
+        width: 7,
+        rank: 2,
+        value: (&["latency_ms", "p99"], 2),
+        legend: "99 of 100 latencies are shorter, ms",
+    },
+    Column {
+        heading: "MB",
+        width: 5,
+        rank: 6,
+        value: (&["peak_rss_mb"], 0),
+        legend: "most memory held so far",
+    },
+    Column {
+        heading: "up",
+        width: 7,
+        rank: 7,
+        value: (&["uptime_secs"], 0),
+        legend: "seconds since the process started",
+    },
+];
+
+/// Name and state, in front of the columns: `capture  not running`.
+const NAME_WIDTH: usize = 8;
+const STATE_WIDTH: usize = 12;
+
+/// The lines of one look, wrapped at words to `width` columns.
+pub fn status_text(look: &Value, width: usize) -> String {
+    let mut lines = wrapped(&headline(look), width, 0);
+    if let Some(pose) = pose_line(&look["pose"]) {
+        lines.extend(wrapped(&pose, width, 2));
+    }
+    let columns = fitting(width);
+    let mut heading = format!("{:NAME_WIDTH$} {:STATE_WIDTH$}", "process", "state");
+    for column in &columns {
+        heading += &format!(" {:>1$}", column.heading, column.width);
+    }
+    lines.push(heading.trim_end().to_owned());
+    for name in ["capture", "tracker", "mapper"] {
+        lines.extend(process_lines(name, &look[name], &columns, width));
+    }
+    let legend: Vec<String> =
+        columns.iter().map(|c| format!("{}: {}", c.heading, c.legend)).collect();
+    lines.extend(wrapped(&legend.join("; "), width, 0));
+    lines.join("\n") + "\n"
+}
+
+/// One line for each column: for `--help`.
+pub fn legend() -> String {
+    let mut text = "Columns (fewer where the terminal is narrow):\n  state   as published; `stopped` by a signal, `silent` for 3 s, `not running`\n".to_owned();
+    for column in &COLUMNS {
+        text += &format!("  {:7} {}\n", column.heading, column.legend);
+    }
+    text + "It ends when all processes of the run have ended."
+}
+
+/// The columns that fit, the most important first to be kept.
+fn fitting(width: usize) -> Vec<&'static Column> {
+    let mut columns: Vec<&Column> = COLUMNS.iter().collect();
+    let needed = |columns: &[&Column]| {
+        NAME_WIDTH + 1 + STATE_WIDTH + columns.iter().map(|c| c.width + 1).sum::<usize>()
+    };
+    while needed(&columns) > width {
+        let Some(least) = (0..columns.len()).max_by_key(|&i| columns[i].rank) else { break };
+        columns.remove(least);
+    }
+    columns
+}
+
+/// Instance, source, time and keyframes.
+fn headline(look: &Value) -> String {
+    let text = |key: &str| look[key].as_str().unwrap_or_default().to_owned();
+    let mut parts = vec![text("instance")];
+    parts.extend(Some(text("source")).filter(|source| !source.is_empty()));
+    parts.extend(look["uptime_secs"].as_f64().map(|secs| format!("up {}", clock(secs))));
+    parts.extend(look["keyframes"].as_u64().map(|count| match count {
+        1 => "1 keyframe".to_owned(),
+        count => format!("{count} keyframes"),
+    }));
+    parts.join(", ")
+}
+
+/// Minutes and seconds, with hours where there are any.
+fn clock(secs: f64) -> String {
+    let secs = secs.max(0.0) as u64;
+    let (hours, minutes, secs) = (secs / 3600, secs / 60 % 60, secs % 60);
+    if hours > 0 {
+        format!("{hours}:{minutes:02}:{secs:02}")
+    } else {
+        format!("{minutes}:{secs:02}")
+    }
+}
+
+/// Last pose: state, position, age.
+fn pose_line(pose: &Value) -> Option<String> {
+    let state = pose["state"].as_str()?;
+    let at = |i: usize| pose["position"][i].as_f64();
+    let age = pose["age_secs"].as_f64()?;
+    let age =
+        if age < 10.0 { format!("{:.0} ms ago", 1e3 * age) } else { format!("{age:.0} s ago") };
+    Some(format!(
+        "last pose {state}, x {:.2} y {:.2} z {:.2} map units, {age}",
+        at(0)?,
+        at(1)?,
+        at(2)?
+    ))
+}
+
+/// A process: its row, why it is in its state, what it was refused.
+fn process_lines(name: &str, row: &Value, columns: &[&Column], width: usize) -> Vec<String> {
+    let state = row["state"].as_str().unwrap_or("not running");
+    let mut line = format!("{name:NAME_WIDTH$} {state:STATE_WIDTH$}");
+    for column in columns.iter().filter(|_| !row.is_null()) {
+        let (path, digits) = column.value;
+        let value = path.iter().fold(row, |value, key| &value[*key]);
+        let shown = value.as_f64().map_or("-".to_owned(), |x| format!("{x:.digits$}"));
+        line += &format!(" {shown:>0$}", column.width);
+    }
+    let mut lines = vec![line.trim_end().to_owned()];
+    for (key, label) in [("cause", ""), ("warning", "warning: ")] {
+        let text = row[key].as_str().unwrap_or_default();
+        if !text.is_empty() && text != state {
+            lines.extend(wrapped(&format!("  {label}{text}"), width, 4));
+        }
+    }
+    lines
+}
+
+/// Lines of at most `width` characters, broken at spaces; all but the first indented. Only a word that is
+/// longer than a line is cut.
+fn wrapped(text: &str, width: usize, indent: usize) -> Vec<String> {
+    let width = width.max(indent + 8);
+    let lead: String = text.chars().take_while(|c| *c == ' ').collect();
+    let (mut lines, mut line) = (Vec::new(), lead);
+    let mut is_begun = false;
+    for word in text.split_whitespace() {
+        let mut word = word;
+        let length = |text: &str| text.chars().count();
+        if is_begun && length(&line) + 1 + length(word) > width {
+            lines.push(std::mem::replace(&mut line, " ".repeat(indent)));
+            is_begun = false;
+        }
+        while length(&line) + length(word) > width && !is_begun {
+            let room = width - length(&line);
+            let cut = word.char_indices().nth(room).map_or(word.len(), |(at, _)| at);
+            line.push_str(&word[..cut]);
+            lines.push(std::mem::replace(&mut line, " ".repeat(indent)));
+            word = &word[cut..];
+        }
+        if is_begun {
+            line.push(' ');
+        }
+        line.push_str(word);
+        is_begun = true;
+    }
+    if is_begun {
+        lines.push(line);
+    }
+    lines
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    fn look() -> Value {
+        let process = json!({
+            "state": "running", "cause": "degraded: little of the keyframe is in view",
+            "frames": 123_456, "rate_hz": 29.97, "dropped": 12, "deadline_misses": 3, "uptime_secs": 4120.0,
+            "latency_ms": {"p50": 3.25, "p99": 12.5}, "peak_rss_mb": 182.0,
+            "warning": "real-time scheduling was refused; raise RLIMIT_RTPRIO to 70 for this user",
+        });
+        json!({
+            "instance": "front", "source": "tum:/data/a-folder-with-a-rather-long-name/and/below",
+            "uptime_secs": 4125.0, "keyframes": 14, "capture": process, "tracker": process, "mapper": null,
+            "pose": {"state": "tracking", "position": [1.2, -0.05, 3.0], "age_secs": 0.021},
+        })
+    }
+
+    #[test]
+    fn no_line_is_wider_than_the_terminal_and_no_word_is_cut() {
+        let words = |text: &str| text.split_whitespace().map(str::to_owned).collect::<Vec<_>>();
+        for width in [120, 80, 60, 45] {
+            let text = status_text(&look(), width);
+            for line in text.lines() {
+                assert!(line.chars().count() <= width, "{width}: {line}");
+            }
+            let warning =
+                "real-time scheduling was refused; raise RLIMIT_RTPRIO to 70 for this user";
+            let shown = words(&text).join(" ");
+            assert!(shown.contains(warning), "{width}: {text}");
+            for part in [
+                "front,",
+                "up 1:08:45, 14 keyframes",
+                "x 1.20 y -0.05 z 3.00",
+                "21 ms ago",
+                "mapper not running",
+            ] {
+                assert!(shown.contains(part), "{width}, {part}: {text}");
+            }
+            assert!(shown.contains("rate: frames a second"), "{text}");
+        }
+        assert!(status_text(&look(), 80).contains("12.50"));
+        assert!(status_text(&look(), 45).contains("30.0"));
+    }
+
+    #[test]
+    fn a_word_longer_than_a_line_is_cut_and_nothing_is_lost() {
+        let lines = wrapped("a bcdefghijklmnopqrstuvwxyz z", 12, 2);
+        assert!(lines.iter().all(|line| line.chars().count() <= 12), "{lines:?}");
+        assert_eq!(lines.concat().replace(' ', ""), "abcdefghijklmnopqrstuvwxyzz");
+        assert_eq!(wrapped("", 10, 2), Vec::<String>::new());
+    }
+}
