@@ -56,7 +56,7 @@ pub fn run(config: &Config, arguments: StatusArguments) -> CommandResult {
     let place = Place::new(&config.instance, &config.root)?;
     note_unfinished(&unfinished(Some(&place), Path::new(".")));
     let hub = Hub::join(&place, "status", Access::Observer)?;
-    let mut watch = Watch::open(&hub, &config.instance)?;
+    let mut watch = Watch::open(&hub, &place, &config.instance)?;
     let shutdown = Shutdown::install()?;
     let is_live = std::io::stdout().is_terminal() && !arguments.once && !arguments.json;
     for looks in 1.. {
@@ -99,7 +99,8 @@ fn is_measured(look: &Value) -> bool {
 }
 
 /// What is listened to.
-struct Watch {
+struct Watch<'a> {
+    place: &'a Place,
     instance: String,
     peers: Vec<Option<Peer>>,
     before: Vec<Option<HealthMessage>>,
@@ -107,8 +108,8 @@ struct Watch {
     last_pose: Option<PoseMessage>,
 }
 
-impl Watch {
-    fn open(hub: &Hub, instance: &str) -> Result<Self, OpenError> {
+impl<'a> Watch<'a> {
+    fn open(hub: &Hub, place: &'a Place, instance: &str) -> Result<Self, OpenError> {
         let peers: Result<Vec<_>, _> =
             HEALTH_TOPICS.iter().map(|topic| listen(hub, topic)).collect();
         let peers = peers?;
@@ -117,7 +118,14 @@ impl Watch {
             Peer::open(hub, &HEALTH_TOPICS[0])?;
         }
         let before = vec![None; peers.len()];
-        Ok(Self { instance: instance.to_owned(), peers, before, poses: None, last_pose: None })
+        Ok(Self {
+            place,
+            instance: instance.to_owned(),
+            peers,
+            before,
+            poses: None,
+            last_pose: None,
+        })
     }
 
     /// One look. `keeps_first`: rates are taken since the first report, to be done soonest.
@@ -132,11 +140,20 @@ impl Watch {
                 // It may have come up since the last look.
                 *peer = listen(hub, topic)?;
             }
-            look[topic.owner] = Value::Null;
-            let Some(peer) = peer else { continue };
-            peer.update()?;
-            let Some(health) = peer.last() else { continue };
-            let state = state_of(health, peer.state().map(|state| state.name()), now);
+            if let Some(peer) = peer {
+                peer.update()?;
+            }
+            let said = peer.as_ref().and_then(|peer| Some((peer.state(), peer.last()?)));
+            let Some((reported, health)) = said else {
+                // One that is stopped cannot hand its last report to a subscriber that joins.
+                let id = self.place.claimant(topic.owner);
+                let stopped = id.filter(|&id| Liveness::of(id) == Liveness::Stopped);
+                look[topic.owner] = stopped
+                    .map_or(Value::Null, |id| json!({ "state": "stopped", "process_id": id }));
+                heard += usize::from(stopped.is_some());
+                continue;
+            };
+            let state = state_of(health, reported.map(|state| state.name()), now);
             heard += 1;
             ended += usize::from(state == NOT_RUNNING);
             look[topic.owner] = row(health, state, before.as_ref(), now);

@@ -113,6 +113,13 @@ impl Place {
         Ok(())
     }
 
+    /// Id of the process that claimed to be the only `process` of this instance last; it may have been killed
+    /// since.
+    pub fn claimant(&self, process: &str) -> Option<u32> {
+        let path = self.root.join(format!("{}.{process}{CLAIM_SUFFIX}", self.instance));
+        fs::read_to_string(path).ok()?.trim().parse().ok()
+    }
+
     /// Claims to be the only `process` of this instance; the kernel ends the claim with the process.
     pub fn claim(&self, process: &str) -> Result<Claim, PlaceError> {
         self.create()?;

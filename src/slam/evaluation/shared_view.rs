@@ -8,8 +8,8 @@ use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
 /// Smallest share of the points of each keyframe that falls into the other's image: below, what is left
 /// in common is a rim.
 const MIN_SHARED: f64 = 0.3;
-/// Most keyframes that are compared with earlier ones: bounds the time, spread evenly over the map.
-const MAX_JUDGED: usize = 100;
+/// Most keyframes that are compared with earlier ones, spread evenly over the map: 240 pairs, a second.
+const MAX_JUDGED: usize = 60;
 /// Most earlier keyframes that are looked at for each, spread evenly.
 const MAX_EARLIER: usize = 64;
 /// Points that tell how much two keyframes share: to a few percent.
@@ -101,7 +101,7 @@ pub struct Pair {
 }
 
 /// Pairs of keyframes that share a view: each later one with the oldest, the newest and two between of
-/// the earlier ones that see the same place. At most four for each of a hundred keyframes.
+/// the earlier ones that see the same place. At most four for each of sixty keyframes.
 pub fn pairs(keyframes: &[Keyframe]) -> Vec<Pair> {
     let judged = |k: &Keyframe| {
         let has_image = k.image.len() == k.intrinsics.width * k.intrinsics.height;
