@@ -17,7 +17,7 @@ use crate::wire::conversion::{similarity_from_message, similarity_message};
 use crate::wire::message::PoseMessage;
 
 /// First bytes of the file, with the version of the layout.
-const MAGIC: [u8; 16] = *b"semidense log 1\n";
+const MAGIC: [u8; 16] = *b"semidense log 2\n";
 /// Bytes before kind and payload.
 const PREFIX_BYTES: usize = 8;
 /// Largest record: the configuration is a tenth of it.
@@ -256,6 +256,7 @@ fn write_pose(p: &PoseMessage, bytes: &mut Vec<u8>) {
     write_f64s(bytes, &p.world_from_camera);
     write_f64s(bytes, &p.keyframe_from_camera);
     write_f64s(bytes, &p.covariance);
+    write_f64s(bytes, &p.alignment_covariance);
     write_f64s(bytes, &p.brightness);
     write_f64s(bytes, &[p.in_view_ratio, p.inlier_ratio, p.whitened_rmse]);
     write_f64s(bytes, &[p.residual_rmse, p.mean_squared_flow]);
@@ -267,7 +268,8 @@ fn read_pose(bytes: &mut &[u8]) -> Option<PoseMessage> {
     let [epoch, state, reason, proposes_keyframe] = read_u32s(bytes)?;
     let [iterations, finest_level, points] = read_u32s(bytes)?;
     let (world_from_camera, keyframe_from_camera) = (read_f64s(bytes)?, read_f64s(bytes)?);
-    let (covariance, brightness) = (read_f64s(bytes)?, read_f64s(bytes)?);
+    let (covariance, alignment_covariance) = (read_f64s(bytes)?, read_f64s(bytes)?);
+    let brightness = read_f64s(bytes)?;
     let [in_view_ratio, inlier_ratio, whitened_rmse] = read_f64s(bytes)?;
     let [residual_rmse, mean_squared_flow] = read_f64s(bytes)?;
     Some(PoseMessage {
@@ -286,6 +288,7 @@ fn read_pose(bytes: &mut &[u8]) -> Option<PoseMessage> {
         world_from_camera,
         keyframe_from_camera,
         covariance,
+        alignment_covariance,
         brightness,
         in_view_ratio,
         inlier_ratio,
