@@ -256,6 +256,9 @@ pub struct Summary {
     pub depth_coverage: Option<[f64; 3]>,
     /// Share of the keyframes' pixels that have depth.
     pub depth_density: Option<f64>,
+    /// Depth errors common to a keyframe, medians of their magnitude: relative error for each unit of the ray
+    /// along columns, along rows, and for each unit of ln d (relief).
+    pub depth_modes: Option<[f64; 3]>,
 }
 
 /// One time that the map was found to contradict itself.
@@ -347,6 +350,7 @@ impl Summary {
             depth_relative_error_median_best_half: depth.map(|d| d.relative_error_median_best_half),
             depth_coverage: depth.map(|d| d.coverage),
             depth_density: depth.map(|d| d.density),
+            depth_modes: depth.and_then(|d| d.modes),
         }
     }
 }

@@ -1,5 +1,6 @@
 //! Semi-dense depth against true depth, and the reported variances against the errors made.
 
+use crate::slam::evaluation::depth_modes::DepthModes;
 use crate::slam::evaluation::statistics::median;
 use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::Keyframe;
@@ -22,6 +23,8 @@ pub struct DepthErrors {
     relative_std_dev: Vec<f64>,
     /// |error of d| / σ.
     whitened_error: Vec<f64>,
+    /// Errors common to a keyframe, of each that has enough points.
+    modes: Vec<DepthModes>,
     /// Points, with or without true depth.
     points: usize,
     /// Pixels of the keyframes.
@@ -41,6 +44,9 @@ pub struct DepthStatistics {
     pub coverage: [f64; 3],
     /// Share of the keyframes' pixels that have depth.
     pub density: f64,
+    /// Medians over the keyframes of the tilt of depth along columns and rows and of the error of its relief,
+    /// as [`DepthModes`] defines them, without their sign; `None` where no keyframe has enough points.
+    pub modes: Option<[f64; 3]>,
 }
 
 impl DepthErrors {
@@ -66,6 +72,7 @@ impl DepthErrors {
             })
             .collect();
         let Some(s) = metres_per_unit(keyframe, &compared, scale) else { return };
+        self.modes.extend(DepthModes::of(keyframe, true_depth, s));
         for Compared { z_true, d, sigma } in compared {
             self.relative_error.push((s / d - z_true).abs() / z_true);
             self.relative_std_dev.push(sigma / d);
@@ -91,7 +98,18 @@ impl DepthErrors {
             relative_error_median_best_half: median(&best)?,
             coverage: [within(1.0), within(2.0), within(3.0)],
             density: self.points as f64 / self.pixels as f64,
+            modes: self.median_modes(),
         })
+    }
+}
+
+impl DepthErrors {
+    /// Medians of the modes' magnitudes.
+    fn median_modes(&self) -> Option<[f64; 3]> {
+        let of = |mode: usize| {
+            median(&self.modes.iter().map(|modes| modes.magnitudes()[mode]).collect::<Vec<_>>())
+        };
+        Some([of(0)?, of(1)?, of(2)?])
     }
 }
 

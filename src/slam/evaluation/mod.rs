@@ -3,13 +3,14 @@
 //! The trajectory figures are those of the Python package `evo` on the same files: nearest stamps
 //! without interpolation ([`association`]), Umeyama alignment ([`mod@umeyama`]), absolute and relative
 //! errors ([`trajectory_error`]); [`normalized_error`] holds pose errors against their covariance. [`windows`] adds how the scale wanders, [`depth_error`] what the
-//! depth maps and their variances are worth. Without any truth, [`map_consistency`] holds the keyframes
+//! depth maps and their variances are worth, [`depth_modes`] what is wrong with the whole of one. Without any truth, [`map_consistency`] holds the keyframes
 //! against each other ([`shared_view`], [`patch_misfit`], [`depth_agreement`]), and [`grade`] says what
 //! that is worth.
 
 pub mod association;
 pub mod depth_agreement;
 pub mod depth_error;
+pub mod depth_modes;
 pub mod grade;
 pub mod map_consistency;
 pub mod normalized_error;

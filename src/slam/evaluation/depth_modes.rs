@@ -1,0 +1,162 @@
+//! Errors of depth that are common to a whole keyframe: tilt along columns and rows, and relief.
+//!
+//! A relative error of depth that is a plane over the image, or grows with depth, looks like camera motion:
+//! poses absorb it and images hardly show it. The median error does not show it either, so it is measured by
+//! itself: the fit `ln(d_true/d) = γ + αX + βY + ρ ln d_true`, X and Y the ray's coordinates.
+
+use nalgebra::{Matrix4, Vector4};
+use serde::{Deserialize, Serialize};
+
+use crate::slam::image::buffer::Image;
+use crate::slam::keyframe::Keyframe;
+
+/// The common errors of one keyframe's depth.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct DepthModes {
+    /// Logarithm of the depth over the true depth, in the middle of the image, at the geometric mean depth.
+    pub scale: f64,
+    /// α: relative depth error for each unit of X, which is f pixels along a row.
+    pub column: f64,
+    /// β: the same along a column.
+    pub row: f64,
+    /// ρ: relative depth error for each unit of ln d; positive where relief is flattened.
+    pub relief: f64,
+}
+
+/// Fewer points than this fit anything.
+const MIN_POINTS: usize = 50;
+/// Fits, each with the weights of the one before: errors of wrong matches have no bound.
+const ITERATIONS: usize = 10;
+/// Residual with half the weight, in median absolute residuals.
+const HALF_WEIGHT_MEDIANS: f64 = 2.0;
+
+impl DepthModes {
+    /// The modes of `keyframe`, whose depth in metres is `metres_per_unit / d`; `None` where too few points have
+    /// true depth, or all at one depth or in one line.
+    pub fn of(keyframe: &Keyframe, true_depth: &Image<f32>, metres_per_unit: f64) -> Option<Self> {
+        let camera = &keyframe.intrinsics;
+        let mut samples: Vec<(Vector4<f64>, f64)> = Vec::new();
+        for point in &keyframe.points {
+            let (u, v) = (usize::from(point.u), usize::from(point.v));
+            if u >= true_depth.width() || v >= true_depth.height() {
+                continue;
+            }
+            let (z_true, d) = (f64::from(true_depth.at(u, v)), f64::from(point.inverse_depth));
+            if !(z_true > 0.0 && z_true.is_finite() && d > 0.0 && d.is_finite()) {
+                continue;
+            }
+            let (x, y) = ((u as f64 - camera.cx) / camera.fx, (v as f64 - camera.cy) / camera.fy);
+            let error = (metres_per_unit / (d * z_true)).ln();
+            samples.push((Vector4::new(1.0, x, y, -z_true.ln()), error));
+        }
+        if samples.len() < MIN_POINTS {
+            return None;
+        }
+        let mean = samples.iter().map(|(phi, _)| phi[3]).sum::<f64>() / samples.len() as f64;
+        samples.iter_mut().for_each(|(phi, _)| phi[3] -= mean);
+        let mut modes = Vector4::zeros();
+        let mut half_weight = f64::INFINITY;
+        for _ in 0..ITERATIONS {
+            let (mut normal, mut right) = (Matrix4::zeros(), Vector4::zeros());
+            for (phi, error) in &samples {
+                let weight = 1.0 / (1.0 + ((error - phi.dot(&modes)) / half_weight).powi(2));
+                normal += weight * phi * phi.transpose();
+                right += weight * *error * phi;
+            }
+            modes = normal.cholesky()?.solve(&right);
+            let mut residuals: Vec<f64> =
+                samples.iter().map(|(phi, error)| (error - phi.dot(&modes)).abs()).collect();
+            let middle = residuals.len() / 2;
+            let median = *residuals.select_nth_unstable_by(middle, f64::total_cmp).1;
+            half_weight = HALF_WEIGHT_MEDIANS * median.max(f64::MIN_POSITIVE);
+        }
+        let [scale, column, row, relief] = modes.into();
+        modes.iter().all(|mode: &f64| mode.is_finite()).then_some(Self {
+            scale,
+            column,
+            row,
+            relief,
+        })
+    }
+
+    /// Tilt along columns and rows and relief, without their sign.
+    pub fn magnitudes(&self) -> [f64; 3] {
+        [self.column.abs(), self.row.abs(), self.relief.abs()]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::geometry::intrinsics::Intrinsics;
+    use crate::slam::geometry::se3::SE3;
+    use crate::slam::geometry::sim3::Sim3;
+    use crate::slam::keyframe::{DepthPoint, MapState};
+
+    const CAMERA: Intrinsics =
+        Intrinsics { fx: 100.0, fy: 110.0, cx: 59.5, cy: 39.5, width: 120, height: 80 };
+
+    /// A keyframe of unit 2 m and its true depth, with the given modes in its depth.
+    fn keyframe(modes: &DepthModes, wrong_share: f64) -> (Keyframe, Image<f32>) {
+        let mut truth = Image::filled(CAMERA.width, CAMERA.height, 0.0f32);
+        let mut points = Vec::new();
+        for v in 0..CAMERA.height {
+            for u in 0..CAMERA.width {
+                let k = v * CAMERA.width + u;
+                let z = 1.0 + (k * 7919 % 1000) as f64 / 500.0;
+                truth.pixels_mut()[k] = z as f32;
+                let (x, y) =
+                    ((u as f64 - CAMERA.cx) / CAMERA.fx, (v as f64 - CAMERA.cy) / CAMERA.fy);
+                let exponent = modes.column * x + modes.row * y - modes.relief * (z / 1.89).ln();
+                let is_wrong = ((k * 31 % 100) as f64) < 100.0 * wrong_share;
+                let wrong = if is_wrong { 3.0 } else { 1.0 };
+                let inverse_depth = (2.0 / (z * wrong * (modes.scale + exponent).exp())) as f32;
+                points.push(DepthPoint {
+                    u: u as u16,
+                    v: v as u16,
+                    inverse_depth,
+                    variance: 0.01,
+                    intensity: 0.0,
+                });
+            }
+        }
+        let keyframe = Keyframe {
+            keyframe_id: 0,
+            epoch: 0,
+            revision: 0,
+            sequence: 0,
+            capture_nanos: 0,
+            map_state: MapState::Established,
+            world_from_keyframe: Sim3::new(SE3::identity(), 2.0),
+            intrinsics: CAMERA,
+            image: vec![0; CAMERA.width * CAMERA.height],
+            points,
+        };
+        (keyframe, truth)
+    }
+
+    #[test]
+    fn the_modes_that_were_put_in_come_out_beside_wrong_matches() {
+        let put = DepthModes { scale: 0.02, column: 0.1, row: -0.05, relief: 0.2 };
+        for wrong_share in [0.0, 0.1] {
+            let (keyframe, truth) = keyframe(&put, wrong_share);
+            let found = DepthModes::of(&keyframe, &truth, 2.0).unwrap();
+            assert!((found.column - put.column).abs() < 0.005, "{found:?}");
+            assert!((found.row - put.row).abs() < 0.005, "{found:?}");
+            assert!((found.relief - put.relief).abs() < 0.005, "{found:?}");
+            assert!((found.scale - put.scale).abs() < 0.01, "{found:?}");
+        }
+    }
+
+    #[test]
+    fn depth_that_cannot_be_compared_has_none() {
+        let exact = DepthModes { scale: 0.0, column: 0.0, row: 0.0, relief: 0.0 };
+        let (mut keyframe, mut truth) = keyframe(&exact, 0.0);
+        assert!(DepthModes::of(&keyframe, &Image::filled(1, 1, 2.0), 2.0).is_none());
+        // At one depth there is no relief.
+        truth.pixels_mut().fill(2.0);
+        assert!(DepthModes::of(&keyframe, &truth, 2.0).is_none());
+        keyframe.points.truncate(MIN_POINTS - 1);
+        assert!(DepthModes::of(&keyframe, &truth, 2.0).is_none());
+    }
+}
