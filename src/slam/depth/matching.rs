@@ -27,7 +27,9 @@ pub struct MatchingParams {
     /// Standard deviation of the image noise, grey levels. Cameras in rooms have 2 to 4.
     pub image_noise: f32,
     /// Standard deviation by which errors of an estimated pose beyond its covariance misplace the epipolar
-    /// line, pixels. A pose that is given without covariance has none.
+    /// line, pixels. A pose that is given without covariance has none. The covariance takes the errors of
+    /// points for independent; what is common to a keyframe's depth is in every pose on it and comes back with
+    /// every match. `docs/depth-noise.md` has the figures.
     pub line_noise_px: f32,
     /// The same of errors of the calibration, which are in every match, pixels.
     pub calibration_noise_px: f32,
@@ -56,7 +58,7 @@ impl Default for MatchingParams {
     fn default() -> Self {
         Self {
             image_noise: 3.0,
-            line_noise_px: 0.2,
+            line_noise_px: 1.0,
             calibration_noise_px: 0.03,
             sampling_noise_px: 0.08,
             slant_noise_px: 1.5,

@@ -4,6 +4,7 @@
 use crate::slam::depth::epipolar::TwoView;
 use crate::slam::depth::gaussian::{ObservedPixels, Observer, observe};
 use crate::slam::depth::map::{DepthMap, KnownColumns, for_each_known};
+use crate::slam::depth::matching::MatchingParams;
 use crate::slam::depth::propagation::propagate;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::sim3::Sim3;
@@ -26,6 +27,8 @@ pub(super) struct Unfinished {
     depth_ratio: f64,
     /// Whether the new pixels have no depth yet.
     has_new_pixels: bool,
+    /// By how much epipolar lines are misplaced, pixels: past frames' poses are as certain as its own.
+    line_noise_px: f32,
 }
 
 impl Mapper {
@@ -73,6 +76,7 @@ impl Mapper {
             // The mean of a first keyframe without depth was not 1.
             depth_ratio: self.next_depth.mean_inverse_depth().map_or(1.0, |mean| mean * factor),
             has_new_pixels: sensor_depth.is_none(),
+            line_noise_px: self.matching_at(pose).line_noise_px,
         });
         self.add_keyframe(frame, world_from_keyframe, MapState::Established, epoch);
     }
@@ -91,7 +95,7 @@ impl Mapper {
         }
         let searches = self.params.depth_filter == DepthFilter::Gaussian;
         let mut keyframe_changed = false;
-        if searches && unfinished.has_new_pixels && self.seed_from_past() {
+        if searches && unfinished.has_new_pixels && self.seed_from_past(unfinished.line_noise_px) {
             self.refine();
             self.keep_unit_mean();
             self.publish_depth();
@@ -109,13 +113,14 @@ impl Mapper {
 
     /// Gives new pixels of the keyframe their depth from frames before it, shortest baseline first:
     /// each narrows the search of the next. False where none was far enough away.
-    fn seed_from_past(&mut self) -> bool {
+    fn seed_from_past(&mut self, line_noise_px: f32) -> bool {
         /// Each frame's baseline is at least this many times the one before.
         const BASELINE_STEP: f64 = 1.7;
         /// Baselines shorter than this share of the mean depth tell nothing.
         const MIN_BASELINE: f64 = 0.01;
         let Some(keyframe) = self.keyframe() else { return false };
         let world_from_keyframe = keyframe.world_from_keyframe;
+        let matching = MatchingParams { line_noise_px, ..self.params.matching.clone() };
         let mut least = MIN_BASELINE;
         let mut used = 0;
         for past in self.past.newest_first() {
@@ -134,7 +139,7 @@ impl Mapper {
                 brightness: past.brightness,
                 pixels: ObservedPixels::New,
             };
-            observe(&mut self.depth, &observer, &self.params.matching, &self.params.gaussian);
+            observe(&mut self.depth, &observer, &matching, &self.params.gaussian);
             least = baseline * BASELINE_STEP;
             used += 1;
         }
@@ -284,6 +289,17 @@ mod tests {
             assert!(one.points == other.points, "keyframe {}", one.keyframe_id);
             assert_eq!(one.world_from_keyframe, other.world_from_keyframe);
         }
+    }
+
+    #[test]
+    fn errors_of_estimated_poses_are_none_of_given_ones_in_past_frames_either() {
+        let with_line_noise = |line_noise_px| {
+            let matching = MatchingParams { line_noise_px, ..MatchingParams::default() };
+            walk(MapperParams { matching, ..MapperParams::default() }, 6, true).0
+        };
+        let (small, large) = (with_line_noise(0.1), with_line_noise(3.0));
+        assert!(small[4][1].points[1].len() > small[4][0].points[1].len(), "no new pixels");
+        assert!(small == large);
     }
 
     #[test]
