@@ -131,6 +131,40 @@ fn ground_truth_of_a_body_is_moved_to_its_camera() {
                 );
             }
         }
+        // The same truth in TUM layout: `--sensor` says that it is the body's.
+        let tum = folder.path().join("truth.txt");
+        let text = std::fs::read_to_string(&alone).unwrap();
+        let as_tum = |line: &str| {
+            let columns: Vec<&str> = line.split(',').map(str::trim).collect();
+            let secs = columns[0].parse::<f64>().unwrap() * 1e-9;
+            let [x, y, z, qw, qx, qy, qz] = columns[1..8] else { panic!("{line}") };
+            format!("{secs} {x} {y} {z} {qx} {qy} {qz} {qw}\n")
+        };
+        let lines = text.lines().filter(|line| !line.starts_with('#'));
+        std::fs::write(&tum, lines.map(as_tum).collect::<String>()).unwrap();
+        let (moved, _) = figures(&tum, &["--sensor", &sensor]);
+        assert!(number(&moved["rpe_translation"]) < TOLERANCE, "{moved}");
+
+        // An estimate of the body's poses has the figures of the camera's.
+        let bend = |(i, (nanos, pose)): (usize, &(i64, SE3))| {
+            let off = (i as f64).sin() * 0.01;
+            (*nanos, *pose * SE3::exp(&Vector6::new(off, 0.0, -off, off, 0.0, 2.0 * off)))
+        };
+        let bent: Vec<(i64, SE3)> = cameras.iter().enumerate().map(bend).collect();
+        let other = tempfile::tempdir().unwrap();
+        write_euroc(other.path(), &body_from_camera, &bent);
+        let by_camera = other.path().join("camera.txt");
+        std::fs::write(&by_camera, bent.iter().map(line).collect::<String>()).unwrap();
+        let of = |estimate: &Path| -> Value {
+            let [estimate, truth] = [estimate, &beside].map(|path| path.display().to_string());
+            serde_json::from_slice(&evaluate(&[&estimate, &truth, "--json"]).stdout).unwrap()
+        };
+        let body = of(&other.path().join("mav0/state_groundtruth_estimate0/data.csv"));
+        for key in ["ate_rmse_m", "rpe_translation", "rpe_rotation_deg"] {
+            let off = number(&body[key]) - number(&of(&by_camera)[key]);
+            assert!(off.abs() < TOLERANCE, "{key} of the body's poses: {body}");
+            assert!(number(&body[key]) > 1e-3, "{key}: {body}");
+        }
         // Positions are the same where camera and body are in one place; relative motions never.
         let is_aside = body_from_camera.translation.norm() > 0.0;
         assert_eq!(number(&by_body["ate_rmse_m"]) > 1e-3, is_aside, "{by_body}");

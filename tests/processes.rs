@@ -219,7 +219,7 @@ fn bad_input_gives_one_line_and_leaves_nothing() {
         (&["--source", "nonsense"], "nonsense"),
         (&["--source", "tum:/nowhere"], "/nowhere"),
         (&["--source", "sim:moon"], "moon"),
-        (&["--source", broken], "2.png"),
+        (&["--strict", "--source", broken], "2.png"),
         (&["--output", file], file),
         (&["--output", "/proc/nowhere"], "/proc/nowhere"),
         (&["--config", "/nowhere.toml"], "/nowhere.toml"),

@@ -142,6 +142,8 @@ fn record(poses: Vec<RecordedPose>, keyframes: Vec<Keyframe>, with_truth: bool) 
         ground_truth: if with_truth { (0..frames).map(pose).collect() } else { Vec::new() },
         depth_scale: DepthScale::MedianRatio,
         frames_in: frames as u64,
+        frames_refused: 0,
+        refused: None,
         frames_dropped: 0,
         gaps: 0,
         restarts: 0,

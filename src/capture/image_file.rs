@@ -1,10 +1,10 @@
 //! Image files: PNG and JPEG into grey values or depth, recognised by content, never by name.
 
 use std::fs::File;
-use std::io::{Read, Write};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use crate::capture::{jpeg_image, png_image};
+use crate::capture::{input_file, jpeg_image, png_image};
 use crate::slam::image::buffer::Image;
 
 /// Largest width and height of an image, pixels; more is a broken header, not a camera.
@@ -19,6 +19,9 @@ pub const DEPTH_STEPS_PER_METRE: f32 = 5000.0;
 /// What is wrong with the bytes of an image.
 #[derive(Debug, thiserror::Error)]
 pub enum DecodeError {
+    /// Not a single byte.
+    #[error("is empty; copy the file again or remove it from the sequence")]
+    Empty,
     /// Neither PNG nor JPEG.
     #[error("is neither PNG nor JPEG (it begins with {found:02x?}); convert it to one of them")]
     NotAnImage {
@@ -58,7 +61,7 @@ pub enum DecodeError {
 #[derive(Debug, thiserror::Error)]
 pub enum ImageFileError {
     /// The file cannot be opened or read.
-    #[error("{}: cannot be read: {source}", path.display())]
+    #[error("{}: cannot be read: {source}; copy it there or remove it from the sequence", path.display())]
     Read {
         /// The file.
         path: PathBuf,
@@ -129,22 +132,9 @@ impl ImageFileReader {
             .map_err(|source| ImageFileError::Decode { path: path.to_owned(), source })
     }
 
-    /// Loads a regular file of bounded size; a pipe or device would block or never end.
     fn load(&mut self, path: &Path) -> Result<(), ImageFileError> {
-        let refuse = |why: &str| std::io::Error::other(why.to_owned());
-        let mut load = || -> std::io::Result<()> {
-            let metadata = std::fs::metadata(path)?;
-            if !metadata.is_file() {
-                return Err(refuse("it is not a regular file"));
-            }
-            if metadata.len() > MAX_FILE_BYTES {
-                return Err(refuse("it is larger than any image that fits 8192x8192 pixels"));
-            }
-            self.bytes.clear();
-            File::open(path)?.take(MAX_FILE_BYTES).read_to_end(&mut self.bytes)?;
-            Ok(())
-        };
-        load().map_err(|source| ImageFileError::Read { path: path.to_owned(), source })
+        input_file::read_into(path, MAX_FILE_BYTES, &mut self.bytes)
+            .map_err(|source| ImageFileError::Read { path: path.to_owned(), source })
     }
 }
 
@@ -161,6 +151,8 @@ pub fn decode_gray_into(
         png_image::decode_gray_into(bytes, width, height, samples, gray)
     } else if bytes.starts_with(&jpeg_image::SIGNATURE) {
         jpeg_image::decode_gray_into(bytes, width, height, samples, gray)
+    } else if bytes.is_empty() {
+        Err(DecodeError::Empty)
     } else {
         const SHOWN: usize = 8;
         let found = bytes.iter().take(SHOWN).copied().collect();

@@ -125,7 +125,7 @@ fn errors_name_the_file_and_what_to_do() {
     let small = png_of(8, 16, ColorType::Grayscale, BitDepth::Eight, None, &[0; 128]);
     for (bytes, expected) in [
         (None, "frame.png: cannot be read"),
-        (Some(&b""[..]), "is neither PNG nor JPEG"),
+        (Some(&b""[..]), "is empty; copy the file again"),
         (Some(&b"GIF89a.."[..]), "convert it to one of them"),
         (Some(&small[..small.len() - 9]), "is 8x16 pixels where the rig says 16x16"),
         (Some(&[0xff, 0xd8, 0xff, 0xe0][..]), "is a damaged JPEG (it ends before its last marker)"),

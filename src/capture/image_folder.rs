@@ -2,7 +2,6 @@
 
 use std::cmp::Ordering;
 use std::collections::HashMap;
-use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -10,7 +9,7 @@ use crate::capture::listing::{Row, read_text, rows};
 use crate::capture::recording::{Contents, ListedImage, Recording};
 use crate::capture::source::SourceError;
 use crate::capture::tum::read_rig;
-use crate::capture::{jpeg_image, png_image};
+use crate::capture::{input_file, jpeg_image, png_image};
 
 const NANOS_PER_SECOND: f64 = 1e9;
 const NANOS_PER_MILLISECOND: f64 = 1e6;
@@ -48,7 +47,7 @@ pub(super) fn has_images(folder: &Path) -> bool {
 }
 
 /// The images of a folder in natural order: what begins like a PNG or JPEG, and what is called one
-/// (so that an empty or foreign file of that name is found out when it is reached).
+/// (so that whatever is wrong with it is found when it is reached).
 fn list_images(folder: &Path) -> Result<Vec<PathBuf>, SourceError> {
     let list = || -> std::io::Result<Vec<PathBuf>> {
         let mut images = Vec::new();
@@ -56,8 +55,7 @@ fn list_images(folder: &Path) -> Result<Vec<PathBuf>, SourceError> {
             let path = entry?.path();
             let is_hidden =
                 path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."));
-            if !is_hidden && path.is_file() && (is_called_image(&path) || begins_like_image(&path)?)
-            {
+            if !is_hidden && (is_called_image(&path) || begins_like_image(&path)) {
                 images.push(path);
             }
         }
@@ -71,15 +69,22 @@ fn list_images(folder: &Path) -> Result<Vec<PathBuf>, SourceError> {
     Ok(images)
 }
 
-fn is_called_image(path: &Path) -> bool {
+/// Whether a file has the ending of an image.
+pub(super) fn is_called_image(path: &Path) -> bool {
     let Some(extension) = path.extension() else { return false };
     ["png", "jpg", "jpeg"].iter().any(|known| extension.eq_ignore_ascii_case(known))
 }
 
-fn begins_like_image(path: &Path) -> std::io::Result<bool> {
-    let mut start = Vec::new();
-    File::open(path)?.take(png_image::SIGNATURE.len() as u64).read_to_end(&mut start)?;
-    Ok(start == png_image::SIGNATURE || start.starts_with(&jpeg_image::SIGNATURE))
+fn begins_like_image(path: &Path) -> bool {
+    let read = || -> std::io::Result<Vec<u8>> {
+        let mut start = Vec::new();
+        input_file::open(path)?.take(png_image::SIGNATURE.len() as u64).read_to_end(&mut start)?;
+        Ok(start)
+    };
+    // What cannot be read and is not called an image is somebody else's file.
+    read().is_ok_and(|start| {
+        start == png_image::SIGNATURE || start.starts_with(&jpeg_image::SIGNATURE)
+    })
 }
 
 /// Order of names in which a run of digits counts as its number.

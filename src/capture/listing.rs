@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use crate::capture::input_file;
 use crate::capture::source::SourceError;
 use crate::slam::geometry::se3::SE3;
 
@@ -79,31 +80,12 @@ impl<'a> Row<'a> {
             "{problem} the entry before it; sort the list by time and keep one entry for each"
         )))
     }
-
-    /// Checks that the file that the row names is there.
-    pub fn check_file(&self, file: &Path) -> Result<(), SourceError> {
-        if file.is_file() {
-            return Ok(());
-        }
-        let file = file.display();
-        Err(self.error(format!("{file} is missing; copy it there or remove the line")))
-    }
 }
 
 /// Reads a text file of bounded size.
 pub fn read_text(path: &Path) -> Result<String, SourceError> {
-    let refuse = |why: &str| std::io::Error::other(why.to_owned());
-    let read = || -> std::io::Result<String> {
-        let metadata = std::fs::metadata(path)?;
-        if !metadata.is_file() {
-            return Err(refuse("it is not a regular file"));
-        }
-        if metadata.len() > MAX_LIST_BYTES {
-            return Err(refuse("it is larger than 1 GiB, too large for a list"));
-        }
-        std::fs::read_to_string(path)
-    };
-    read().map_err(|source| SourceError::Read { path: path.to_owned(), source })
+    input_file::read_text(path, MAX_LIST_BYTES)
+        .map_err(|source| SourceError::Read { path: path.to_owned(), source })
 }
 
 /// The rows of a list that was read from `path`.

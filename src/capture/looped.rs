@@ -1,6 +1,8 @@
 //! A recording played to and fro at a steady rate: frames without end for benches and soak tests.
 
-use crate::capture::source::{FrameSource, FrameStamp, SourceError, SourceName};
+use std::collections::VecDeque;
+
+use crate::capture::source::{FrameSource, FrameStamp, Notice, SourceError, SourceName};
 use crate::slam::geometry::intrinsics::Intrinsics;
 
 /// Most memory for the frames that are kept, bytes: two thousand VGA images.
@@ -15,6 +17,8 @@ pub struct Looped {
     num_frames: u64,
     period_nanos: f64,
     next: u64,
+    /// Images that are left out, for the log.
+    notices: VecDeque<String>,
 }
 
 impl Looped {
@@ -27,7 +31,8 @@ impl Looped {
     ) -> Self {
         let intrinsics = inner.intrinsics();
         let period_nanos = 1e9 / rate_hz;
-        Self { name, inner, intrinsics, kept: Vec::new(), num_frames, period_nanos, next: 0 }
+        let (kept, notices) = (Vec::new(), VecDeque::new());
+        Self { name, inner, intrinsics, kept, num_frames, period_nanos, next: 0, notices }
     }
 
     /// The kept frame that is shown as frame `sequence`.
@@ -55,12 +60,22 @@ impl FrameSource for Looped {
         self.inner.prepare(progress)?;
         let bytes = self.intrinsics.width * self.intrinsics.height;
         let mut pixels = vec![0; bytes];
-        while (self.kept.len() + 1) * bytes <= MAX_KEPT_BYTES
-            && self.inner.next_into(&mut pixels)?.is_some()
-        {
-            self.kept.push(pixels.clone());
+        while (self.kept.len() + 1) * bytes <= MAX_KEPT_BYTES {
+            match self.inner.next_into(&mut pixels) {
+                Ok(Some(_)) => self.kept.push(pixels.clone()),
+                Ok(None) => break,
+                // A hole in what is repeated would come back with every turn: the image is left out.
+                Err(error) if error.is_passing() => {
+                    self.notices.push_back(format!("left out: {error}"))
+                }
+                Err(error) => return Err(error),
+            }
         }
         Ok(())
+    }
+
+    fn take_notice(&mut self) -> Option<Notice> {
+        Some(Notice { text: self.notices.pop_front()?, is_warning: true })
     }
 
     fn skip_to(&mut self, sequence: u64) -> Result<(), SourceError> {

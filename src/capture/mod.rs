@@ -8,6 +8,7 @@ pub mod image_file;
 #[cfg(test)]
 mod image_file_tests;
 pub mod image_folder;
+pub mod input_file;
 pub mod jpeg_image;
 pub mod listing;
 pub mod looped;
@@ -17,6 +18,7 @@ pub mod rig;
 pub mod sensor_yaml;
 pub mod simulator;
 pub mod source;
+pub mod source_name;
 #[cfg(test)]
 mod test_images;
 pub mod tum;

@@ -1,7 +1,8 @@
 //! Frames of a recording, whatever its layout: listed images of one camera, played in order.
 //!
 //! What is wrong with a recording's lists is found when it is opened: a bad line, a stamp out of
-//! order, a file that is not there. What is wrong inside an image is found when it is reached.
+//! order. What is wrong with an image, also that it is not there, is found when it is reached, and
+//! whoever plays the recording decides whether to continue with the next.
 
 use std::path::PathBuf;
 
@@ -107,6 +108,13 @@ impl FrameSource for Recording {
         }
         let (capture_nanos, exposure_nanos) = (frame.nanos, frame.exposure_nanos);
         Ok(Some(FrameStamp { sequence, capture_nanos, exposure_nanos, gain: 0.0 }))
+    }
+
+    fn skip_to(&mut self, sequence: u64) -> Result<(), SourceError> {
+        // Sequences are places in the list: nothing need be read.
+        let next = usize::try_from(sequence).unwrap_or(usize::MAX).saturating_add(1);
+        self.next = self.next.max(next);
+        Ok(())
     }
 
     fn ground_truth(&self) -> &[StampedPose] {

@@ -17,6 +17,15 @@ const SIDE_RANGE: std::ops::RangeInclusive<usize> = 16..=8192;
 const FOCAL_RANGE: std::ops::RangeInclusive<f64> = 1.0..=100_000.0;
 /// Lens coefficients; those of rational lenses reach tens.
 const COEFFICIENT_RANGE: std::ops::RangeInclusive<f64> = -1000.0..=1000.0;
+/// Widest view of a lens without a model for it, degrees: at the edge of a pinhole image of 160° a pixel is
+/// 33 times as fine as in the middle.
+const WIDEST_PINHOLE_DEG: f64 = 160.0;
+/// Widest view that any lens has, degrees; fisheyes that look backwards reach 280.
+const WIDEST_DEG: f64 = 300.0;
+/// Narrowest view that is a camera's, degrees; telescopes have less.
+const NARROWEST_DEG: f64 = 0.5;
+/// Views that cameras of robots have, degrees; others are remarked.
+const USUAL_DEG: std::ops::RangeInclusive<f64> = 10.0..=160.0;
 /// Frames a second.
 const RATE_RANGE: std::ops::RangeInclusive<f64> = 0.1..=1000.0;
 
@@ -176,10 +185,66 @@ impl Rig {
     }
 }
 
+impl Rig {
+    /// What is unusual about the camera and may be a mistake, in one line.
+    pub fn remark(&self) -> Option<String> {
+        let k = self.camera.intrinsics();
+        let is_fisheye = matches!(self.camera.distortion(), Distortion::Equidistant(_));
+        let (across, down) =
+            (view_deg(k.fx, k.cx, k.width, is_fisheye), view_deg(k.fy, k.cy, k.height, is_fisheye));
+        if USUAL_DEG.contains(&across.max(down)) {
+            return None;
+        }
+        Some(format!(
+            "fx = {} and fy = {} with {}x{} pixels are a field of view of {across:.1}° x {down:.1}°, where cameras have {} to {}°: \
+             are they in pixels, and of this image size?",
+            k.fx,
+            k.fy,
+            k.width,
+            k.height,
+            USUAL_DEG.start(),
+            USUAL_DEG.end()
+        ))
+    }
+}
+
+/// Angle between the first and the last pixel of a row or column as the focal length alone has it, degrees.
+/// A fisheye's image grows with the angle, that of other lenses with its tangent.
+fn view_deg(focal_px: f64, centre_px: f64, side: usize, is_fisheye: bool) -> f64 {
+    let half = |distance_px: f64| match distance_px / focal_px {
+        angle if is_fisheye => angle,
+        tangent => tangent.atan(),
+    };
+    (half(centre_px) + half((side - 1) as f64 - centre_px)).to_degrees()
+}
+
 impl RigFile {
     /// The checked rig; errors name `path`.
     pub fn rig_of(&self, path: &Path) -> Result<Rig, RigError> {
         self.rig().map_err(|source| RigError::Value { path: path.to_owned(), source })
+    }
+
+    /// Checks that a focal length gives a view that a lens of this model can have.
+    fn check_view(
+        &self,
+        key: &str,
+        focal_px: f64,
+        centre_px: f64,
+        side: usize,
+    ) -> Result<(), ParameterError> {
+        let is_fisheye = self.model == LensModel::Equidistant;
+        let widest = if is_fisheye { WIDEST_DEG } else { WIDEST_PINHOLE_DEG };
+        let view_deg = view_deg(focal_px, centre_px, side, is_fisheye);
+        if (NARROWEST_DEG..=widest).contains(&view_deg) {
+            return Ok(());
+        }
+        Err(ParameterError {
+            key: key.to_owned(),
+            value: focal_px.to_string(),
+            allowed: format!(
+                "a focal length in pixels with a field of view of {NARROWEST_DEG} to {widest}°, this one has {view_deg:.1}° on {side} px"
+            ),
+        })
     }
 
     fn rig(&self) -> Result<Rig, ParameterError> {
@@ -190,6 +255,8 @@ impl RigFile {
         // The view around the optical axis is what is used, so the axis must meet the image.
         check_range("cx", self.cx, 0.0..=(self.width - 1) as f64)?;
         check_range("cy", self.cy, 0.0..=(self.height - 1) as f64)?;
+        self.check_view("fx", self.fx, self.cx, self.width)?;
+        self.check_view("fy", self.fy, self.cy, self.height)?;
         for (i, &k) in self.coefficients.iter().enumerate() {
             check_range(&format!("coefficients[{i}]"), k, COEFFICIENT_RANGE)?;
         }
@@ -236,6 +303,31 @@ mod tests {
         }
         for name in ["tum-fr1.toml", "euroc-cam0.toml", "7scenes-kinect.toml", "simulator.toml"] {
             assert!(names.iter().any(|n| n == name), "{name} is missing");
+        }
+    }
+
+    #[test]
+    fn an_unusual_field_of_view_is_remarked_and_an_impossible_one_refused() {
+        let rig = |model: &str, focal: f64| {
+            let lens = if model == "equidistant" { "coefficients = [0, 0, 0, 0]\n" } else { "" };
+            let text = format!(
+                "model = \"{model}\"\nwidth = 640\nheight = 480\nfx = {focal}\nfy = {focal}\ncx = 320\ncy = 240\n{lens}"
+            );
+            Rig::from_toml(Path::new("x.toml"), &text).map_err(|error| error.to_string())
+        };
+        for (model, focal, degrees) in [
+            ("pinhole", 500.0, None),
+            ("pinhole", 60.0, None),
+            ("pinhole", 5000.0, Some("7.3° x 5.5°")),
+            ("equidistant", 200.0, Some("183.1° x 137.2°")),
+        ] {
+            let remark = rig(model, focal).unwrap().remark();
+            assert_eq!(remark.is_some(), degrees.is_some(), "{model} {focal}: {remark:?}");
+            assert!(remark.unwrap_or_default().contains(degrees.unwrap_or_default()));
+        }
+        for (model, focal) in [("pinhole", 50.0), ("pinhole", 90000.0), ("equidistant", 100.0)] {
+            let error = rig(model, focal).unwrap_err();
+            assert!(error.starts_with(&format!("x.toml: fx = {focal}: allowed is")), "{error}");
         }
     }
 

@@ -1,15 +1,14 @@
 //! The trait of everything that frames come from.
 
-use std::fmt;
 use std::os::fd::BorrowedFd;
 use std::path::{Path, PathBuf};
-use std::str::FromStr;
 
 use crate::capture::image_file::ImageFileError;
 use crate::capture::looped::Looped;
 use crate::capture::rig::{Rig, RigError};
 use crate::capture::simulator::Simulator;
 use crate::capture::simulator::params::SimulatorParams;
+pub use crate::capture::source_name::SourceName;
 use crate::capture::v4l::params::CameraParams;
 use crate::capture::{euroc, image_folder, tum, v4l};
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -66,12 +65,12 @@ pub struct Notice {
 #[derive(Debug, thiserror::Error)]
 pub enum SourceError {
     /// The name of a source is not understood.
-    #[error("source `{name}`: {problem}; sources are {SOURCE_FORMS}")]
+    #[error("source `{name}`: {problem}")]
     Name {
         /// The name as it was given.
         name: String,
-        /// What is wrong with it.
-        problem: &'static str,
+        /// What is wrong with it, and what to do.
+        problem: String,
     },
     /// The source exists but not in this binary or not by this way of opening.
     #[error("source `{name}`: {reason}")]
@@ -192,6 +191,14 @@ pub enum SourceError {
         /// What is wrong with it.
         reason: String,
     },
+    /// A recording without one image that can be used.
+    #[error("none of its {count} images can be used; the first: {first}")]
+    AllDamaged {
+        /// Images.
+        count: u64,
+        /// Which the first is, and what is wrong with it.
+        first: String,
+    },
     /// The caller's buffer does not fit the frames.
     #[error("a buffer of {found} bytes for frames of {width}x{height}; give width * height bytes")]
     Buffer {
@@ -205,122 +212,10 @@ pub enum SourceError {
 }
 
 impl SourceError {
-    /// Whether only this frame is lost, as is usual with cameras.
+    /// Whether only this frame is lost and the next may be good: a damaged frame of a camera, a damaged or
+    /// missing image of a recording.
     pub fn is_passing(&self) -> bool {
-        matches!(self, Self::BrokenFrame { .. })
-    }
-}
-
-/// The forms of a source name, for errors and help.
-pub const SOURCE_FORMS: &str =
-    "sim[:SCENE], tum:DIR, euroc:DIR, images:DIR, v4l:DEVICE and loop:FRAMES:HZ:SOURCE";
-
-/// The name of a source, as the command line takes it.
-#[derive(Debug, Clone, PartialEq)]
-pub enum SourceName {
-    /// `sim[:SCENE]`: the simulator.
-    Simulator {
-        /// The scene, where one is named.
-        scene: Option<String>,
-    },
-    /// `tum:DIR`: a recording in the layout of TUM RGB-D.
-    Tum(PathBuf),
-    /// `euroc:DIR`: a recording in the layout of EuRoC (ASL).
-    Euroc(PathBuf),
-    /// `images:DIR`: a folder of images.
-    Images(PathBuf),
-    /// `v4l:DEVICE`: a camera, by its path, its number or the name that udev gives it.
-    Camera(String),
-    /// `loop:FRAMES:HZ:SOURCE`: a recording to and fro, for benches and soak tests.
-    Looped {
-        /// Frames in all.
-        num_frames: u64,
-        /// Frames in a second.
-        rate_hz: f64,
-        /// What is repeated.
-        inner: Box<SourceName>,
-    },
-}
-
-impl SourceName {
-    /// Whether frames come at their own pace, whether or not somebody takes them.
-    pub fn is_camera(&self) -> bool {
-        matches!(self, Self::Camera(_))
-    }
-
-    /// The folder of a recording; `None` for what is none.
-    pub fn folder(&self) -> Option<&Path> {
-        match self {
-            Self::Tum(folder) | Self::Euroc(folder) | Self::Images(folder) => Some(folder),
-            Self::Looped { inner, .. } => inner.folder(),
-            Self::Simulator { .. } | Self::Camera(_) => None,
-        }
-    }
-}
-
-impl FromStr for SourceName {
-    type Err = SourceError;
-
-    fn from_str(name: &str) -> Result<Self, SourceError> {
-        let error = |problem| SourceError::Name { name: name.to_owned(), problem };
-        let (kind, rest) = match name.split_once(':') {
-            Some((kind, rest)) => (kind, Some(rest)),
-            None => (name, None),
-        };
-        if kind == "loop" {
-            return parse_loop(rest.unwrap_or(""))
-                .ok_or_else(|| error("write loop:FRAMES:HZ:SOURCE, as loop:9000:30:sim"));
-        }
-        if kind == "sim" {
-            return match rest {
-                Some("") => Err(error("the scene's name is missing")),
-                scene => Ok(Self::Simulator { scene: scene.map(str::to_owned) }),
-            };
-        }
-        let form = match kind {
-            "tum" => Self::Tum,
-            "euroc" => Self::Euroc,
-            "images" => Self::Images,
-            "v4l" => {
-                return match rest {
-                    None | Some("") => Err(error("the device is missing, as in v4l:/dev/video0")),
-                    Some(device) => Ok(Self::Camera(device.to_owned())),
-                };
-            }
-            _ if Path::new(name).exists() => {
-                return Err(error("say what kind of recording it is, as in tum:DIR"));
-            }
-            _ => return Err(error("this kind is not known")),
-        };
-        match rest {
-            None | Some("") => Err(error("the folder is missing")),
-            Some(place) => Ok(form(PathBuf::from(place))),
-        }
-    }
-}
-
-/// `FRAMES:HZ:SOURCE`.
-fn parse_loop(text: &str) -> Option<SourceName> {
-    let mut parts = text.splitn(3, ':');
-    let num_frames = parts.next()?.parse().ok().filter(|&frames| frames > 0)?;
-    let rate_hz = parts.next()?.parse().ok().filter(|rate| (0.01..=10_000.0).contains(rate))?;
-    let inner = parts.next().filter(|inner| !inner.starts_with("loop"))?.parse().ok()?;
-    Some(SourceName::Looped { num_frames, rate_hz, inner: Box::new(inner) })
-}
-
-impl fmt::Display for SourceName {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Simulator { scene: None } => write!(out, "sim"),
-            Self::Simulator { scene: Some(scene) } => write!(out, "sim:{scene}"),
-            Self::Tum(folder) => write!(out, "tum:{}", folder.display()),
-            Self::Euroc(folder) => write!(out, "euroc:{}", folder.display()),
-            Self::Images(folder) => write!(out, "images:{}", folder.display()),
-            Self::Camera(device) => write!(out, "v4l:{device}"),
-            Self::Looped { num_frames, rate_hz, inner } => {
-                write!(out, "loop:{num_frames}:{rate_hz}:{inner}")
-            }
-        }
+        matches!(self, Self::BrokenFrame { .. } | Self::Image(_))
     }
 }
 
@@ -357,9 +252,10 @@ pub fn open(
         SourceName::Simulator { scene } => {
             let mut params = params.simulator.clone();
             if let Some(scene) = scene {
-                params.scene = scene
-                    .parse()
-                    .map_err(|problem| SourceError::Name { name: name.to_string(), problem })?;
+                params.scene = scene.parse().map_err(|problem: &str| SourceError::Name {
+                    name: name.to_string(),
+                    problem: problem.to_owned(),
+                })?;
             }
             Ok(Box::new(Simulator::new(params)?))
         }
@@ -381,35 +277,17 @@ fn misnamed(name: &SourceName) -> Option<SourceName> {
         // What a loop repeats is looked at when that is opened.
         return None;
     };
-    let layouts = [
-        SourceName::Tum(folder.to_owned()),
-        SourceName::Euroc(folder.to_owned()),
-        SourceName::Images(folder.to_owned()),
-    ];
-    if has_layout(name) { None } else { layouts.into_iter().find(has_layout) }
-}
-
-/// Whether the list by which a layout is known, or an image, is where it belongs.
-fn has_layout(name: &SourceName) -> bool {
-    match name {
-        SourceName::Tum(folder) => folder.join("rgb.txt").is_file(),
-        SourceName::Euroc(folder) => euroc::frame_list(folder).is_file(),
-        SourceName::Images(folder) => image_folder::has_images(folder),
-        _ => false,
-    }
+    if name.has_layout() { None } else { SourceName::of_folder(folder) }
 }
 
 /// Where the recording's own camera is another than that of the `rig` which wins over it: what differs,
 /// in one line. `None` where they agree, or the recording brings no camera that can be read.
-pub fn rig_conflict(name: &SourceName, rig: Option<&Path>) -> Option<String> {
+fn rig_conflict(name: &SourceName, rig: Option<&Path>) -> Option<String> {
     /// Displacement that no calibration of the same camera brings about, pixels: files are written
     /// with few digits, and calibrations of one camera differ by tenths.
     const MAX_SHIFT_PX: f64 = 2.0;
     let (folder, rig) = (name.folder()?, rig?);
-    let (own, own_path) = match name {
-        SourceName::Euroc(_) => euroc::own_rig(folder),
-        _ => tum::own_rig(folder),
-    }?;
+    let (own, own_path) = own_rig(name, folder)?;
     let shift_px = own.largest_shift_px(&Rig::read(rig).ok()?);
     let difference = match shift_px.is_finite() {
         true => format!("differ by up to {shift_px:.0} px"),
@@ -422,6 +300,27 @@ pub fn rig_conflict(name: &SourceName, rig: Option<&Path>) -> Option<String> {
             own_path.display()
         )
     })
+}
+
+/// What may be wrong with the camera of a source, one line each: it is another than the recording's own, or
+/// its field of view is unusual.
+pub fn rig_remarks(name: &SourceName, rig: Option<&Path>) -> Vec<String> {
+    let used = match (name.folder(), rig) {
+        (_, Some(path)) => Rig::read(path).ok().map(|rig| (rig, path.to_owned())),
+        (Some(folder), None) => own_rig(name, folder),
+        (None, None) => None,
+    };
+    let unusual =
+        used.and_then(|(rig, path)| Some(format!("{}: {}", path.display(), rig.remark()?)));
+    rig_conflict(name, rig).into_iter().chain(unusual).collect()
+}
+
+/// The camera that a recording brings, and where it says so.
+fn own_rig(name: &SourceName, folder: &Path) -> Option<(Rig, PathBuf)> {
+    match name {
+        SourceName::Euroc(_) => euroc::own_rig(folder),
+        _ => tum::own_rig(folder),
+    }
 }
 
 /// Rectified, photometrically corrected grey frames in the order of their stamps.
@@ -458,8 +357,14 @@ pub trait FrameSource: Send {
     fn skip_to(&mut self, sequence: u64) -> Result<(), SourceError> {
         let k = self.intrinsics();
         let mut pixels = vec![0; k.width * k.height];
-        while self.next_into(&mut pixels)?.is_some_and(|stamp| stamp.sequence < sequence) {}
-        Ok(())
+        loop {
+            match self.next_into(&mut pixels) {
+                Ok(Some(stamp)) if stamp.sequence < sequence => {}
+                Err(error) if error.is_passing() => {}
+                Err(error) => return Err(error),
+                Ok(_) => return Ok(()),
+            }
+        }
     }
 
     /// What a camera has lost so far; `None` for recordings, which lose nothing.

@@ -8,13 +8,16 @@ use crate::capture::rig::Rig;
 use crate::capture::source::SourceError;
 use crate::slam::trajectory::StampedPose;
 
+/// The list of the images, by which the layout is known.
+pub const FRAME_LIST: &str = "rgb.txt";
+
 /// The camera of a folder, where no rig is named: `camera.txt`, see [`Rig::read_camera_txt`].
 pub const CAMERA_FILE: &str = "camera.txt";
 
 /// Opens the recording in `folder`; without `rig` its `camera.txt` serves. `depth.txt` and
 /// `groundtruth.txt` may be missing.
 pub fn open(folder: &Path, rig: Option<&Path>) -> Result<Recording, SourceError> {
-    let frame_list = folder.join("rgb.txt");
+    let frame_list = folder.join(FRAME_LIST);
     let frames = read_images(folder, &frame_list)?;
     let (rig, rig_path) = read_rig(folder, rig)?;
     let depth_list = folder.join("depth.txt");
@@ -54,7 +57,6 @@ fn read_images(folder: &Path, list: &Path) -> Result<Vec<ListedImage>, SourceErr
         let nanos = row.seconds(stamp)?;
         row.check_after(images.last().map(|image| image.nanos), nanos)?;
         let path = folder.join(name.trim_start());
-        row.check_file(&path)?;
         images.push(ListedImage { nanos, path, exposure_nanos: 0 });
     }
     Ok(images)

@@ -1,5 +1,6 @@
 //! `semidense bench latency`: how late poses are, at rest and under load.
 
+use std::ffi::OsString;
 use std::process::ExitCode;
 
 use clap::{Args, Subcommand, ValueEnum};
@@ -57,9 +58,9 @@ enum RealTime {
 /// without real-time scheduling
 #[derive(Debug, Args)]
 pub struct LatencyArguments {
-    /// What is captured, to and fro; the default room is rendered first
+    /// What is captured, back and forth; the default room is rendered first
     #[arg(long, value_name = "SOURCE", default_value = "sim")]
-    source: String,
+    source: OsString,
     /// Frames in a second
     #[arg(long, value_name = "HZ", default_value_t = 30.0)]
     fps: f64,
@@ -91,7 +92,7 @@ pub fn run(config: &Config, common: &CommonArguments, arguments: BenchArguments)
         )
         .into());
     }
-    let source: SourceName = arguments.source.parse()?;
+    let source = SourceName::parse(&arguments.source)?;
     let shutdown = Shutdown::install()?;
     let mut measurements = Vec::new();
     for disturbance in disturbances(arguments.load) {

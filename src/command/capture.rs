@@ -1,5 +1,6 @@
 //! `semidense capture`: frames into shared memory.
 
+use std::ffi::OsString;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -25,28 +26,36 @@ pub struct CaptureArguments {
 }
 
 /// Where frames come from.
-#[derive(Debug, Args)]
+#[derive(Debug, Clone, Args)]
 pub struct SourceArguments {
-    /// Where frames come from: sim, sim:SCENE, tum:DIR, euroc:DIR, images:DIR, v4l:DEVICE, or
-    /// loop:FRAMES:HZ:SOURCE, another source to and fro, FRAMES in all at HZ a second [default: capture.source of the
-    /// configuration]
-    #[arg(long, value_name = "SOURCE")]
-    source: Option<String>,
+    /// Where frames come from: DIR (its layout is recognised), sim, sim:SCENE, tum:DIR, euroc:DIR,
+    /// images:DIR, v4l:DEVICE, or loop:FRAMES:HZ:SOURCE, another source back and forth, FRAMES in all at
+    /// HZ a second [default: capture.source of the configuration, which is sim]
+    #[arg(value_name = "SOURCE")]
+    source: Option<OsString>,
+    /// The same as SOURCE, as scripts of earlier versions have it
+    #[arg(long = "source", value_name = "SOURCE", hide = true, conflicts_with = "source")]
+    source_option: Option<OsString>,
     /// Rig file with the camera's calibration; a camera (v4l) needs one [default: capture.rig of the configuration, for the source that stands there]
     #[arg(long, value_name = "FILE")]
     rig: Option<PathBuf>,
+    /// End with an error at an image of a recording that is damaged or missing; otherwise it is left out,
+    /// counted and named [default: capture.strict of the configuration]
+    #[arg(long)]
+    pub strict: bool,
 }
 
 impl SourceArguments {
-    /// Source and rig: the command line's word, else the configuration's. A source that the command line names
+    /// Source and rig: those of the command line, else the configuration's. A source that the command line names
     /// does not take the configuration's rig, which is another camera's.
     pub fn source_and_rig(
         self,
         config: &CaptureConfig,
     ) -> Result<(SourceName, Option<PathBuf>), SourceError> {
         let configured = (!config.rig.is_empty()).then(|| PathBuf::from(&config.rig));
-        match self.source {
+        match self.source.or(self.source_option) {
             Some(source) => {
+                let source = SourceName::parse(&source)?;
                 if let (Some(rig), None) = (configured, &self.rig) {
                     note(&format!(
                         "warning: capture.rig ({}) is for the source of the configuration and not used for {source}; \
@@ -54,7 +63,7 @@ impl SourceArguments {
                         rig.display()
                     ));
                 }
-                Ok((source.parse()?, self.rig))
+                Ok((source, self.rig))
             }
             None => Ok((config.source.parse()?, self.rig.or(configured))),
         }
@@ -90,11 +99,13 @@ pub fn usual_mode(source: &SourceName) -> Mode {
 
 /// Runs it.
 pub fn run(config: &Config, arguments: CaptureArguments) -> CommandResult {
+    let mut config = config.clone();
+    config.capture.strict |= arguments.source.strict;
     let (source, rig) = arguments.source.source_and_rig(&config.capture)?;
     let mode = arguments.mode.mode(usual_mode(&source));
     let shutdown = Shutdown::install()?;
     let options = CaptureOptions { source, rig, mode };
-    match run_shell(config, &options, &shutdown) {
+    match run_shell(&config, &options, &shutdown) {
         Ok(()) => Ok(ExitCode::SUCCESS),
         Err(CaptureError::Interrupted) => Ok(ExitCode::from(INTERRUPTED)),
         Err(error) => Err(error.into()),

@@ -11,9 +11,10 @@ use crate::service::config::Config;
 use crate::service::journal::Journal;
 use crate::service::journal::folder::Unfinished;
 use crate::service::journal::log::RunStart;
+use crate::service::results::calibration::calibration_warning;
 use crate::service::results::output_folder::OutputFolder;
 use crate::service::results::set::has_tracked_set;
-use crate::service::results::summary_text::summary_text;
+use crate::service::results::summary_text::{refused_text, summary_text};
 use crate::service::results::{EndOfRun, Results, ResultsError, RunMode, RunRecord};
 
 /// Where and how results are given out.
@@ -61,13 +62,16 @@ impl Ending<'_> {
             print(&format!("{}\n", serde_json::to_string_pretty(&results.summary)?))?;
         } else {
             print(&summary_text(&results.summary))?;
+            if let Some(warning) = calibration_warning(results.summary.whitened_residual_median) {
+                note(&format!("warning: {warning}"));
+            }
         }
         let where_to = match keeps_earlier {
             true => format!("nothing is written: the earlier results in {place} are kept"),
             false => format!("results in {place}"),
         };
         if !self.json {
-            print(&format!("{where_to}\n"))?;
+            print(&format!("{where_to}{}\n", refused_text(&results.summary)))?;
         }
         match &record.ended {
             EndOfRun::Failed(cause) => Err(cause.as_str().into()),

@@ -13,11 +13,10 @@ use crate::command::print::{note, print};
 use crate::service::atomic_file::write_atomically;
 use crate::service::results::report::evaluation_plot::evaluation_plot;
 use crate::service::results::summary::TrajectorySummary;
-use crate::service::trajectory_file::read_trajectory_file;
+use crate::service::trajectory_file::{TrajectoryFile, read_trajectory_file};
 use crate::slam::evaluation::statistics::ErrorStatistics;
 use crate::slam::evaluation::umeyama::Alignment;
 use crate::slam::evaluation::{TrajectoryEvaluation, evaluate_trajectory};
-use crate::slam::trajectory::StampedPose;
 
 /// What is fitted before positions are compared.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -33,7 +32,8 @@ enum Align {
 /// Compare a trajectory with ground truth: absolute and relative errors, scale
 ///
 /// Files are in TUM layout (timestamp tx ty tz qx qy qz qw) or EuRoC ground truth (CSV). EuRoC's poses
-/// are the body's: against a camera's trajectory they are moved by the T_BS of cam0/sensor.yaml. Each pose of the shorter trajectory is compared with the one nearest in time of
+/// are the body's and are moved to the camera by the T_BS of cam0/sensor.yaml, also those of an estimate in
+/// that layout. Each pose of the shorter trajectory is compared with the one nearest in time of
 /// the longer; figures are those of the Python package evo.
 #[derive(Debug, Args)]
 pub struct EvaluateArgs {
@@ -49,7 +49,8 @@ pub struct EvaluateArgs {
     /// Largest difference of stamps taken for the same instant, seconds
     #[arg(long, value_name = "SECS", default_value_t = 0.02, value_parser = parse_difference)]
     max_difference: f64,
-    /// sensor.yaml of the camera, where it does not lie beside EuRoC ground truth
+    /// sensor.yaml of the camera, where it does not lie beside EuRoC ground truth; says of ground truth in any
+    /// layout that its poses are the body's
     #[arg(long, value_name = "FILE")]
     sensor: Option<PathBuf>,
     /// Print the figures as JSON, with the keys of summary.json
@@ -70,11 +71,9 @@ fn parse_difference(text: &str) -> Result<f64, String> {
 
 /// Reads both files, compares them and prints the figures.
 pub fn run(args: &EvaluateArgs) -> Result<ExitCode, Box<dyn Error>> {
-    let estimate = read_trajectory_file(&args.estimate)?;
+    let mut estimate = read_trajectory_file(&args.estimate)?;
     let mut truth = read_trajectory_file(&args.truth)?;
-    if truth.is_euroc && !estimate.is_euroc {
-        move_to_camera(&mut truth.poses, args)?;
-    }
+    move_to_camera(&mut estimate, &mut truth, args)?;
     let (estimate, truth) = (estimate.poses, truth.poses);
     let alignment = match args.align {
         Align::Sim3 => Alignment::Sim3,
@@ -101,22 +100,32 @@ pub fn run(args: &EvaluateArgs) -> Result<ExitCode, Box<dyn Error>> {
 }
 
 /// Moves poses of the body to the camera on it: an estimate is the camera's, and seen from another
-/// place, or along other axes, the same motion has another relative error.
-fn move_to_camera(truth: &mut [StampedPose], args: &EvaluateArgs) -> Result<(), Box<dyn Error>> {
-    let beside = sensor_beside(&args.truth);
-    let Some(path) = args.sensor.as_ref().or(beside.as_ref()) else {
-        note(&format!(
-            "warning: the poses of {} are the body's and no cam0/sensor.yaml lies beside its folder: \
-             relative errors are about other axes than the camera's; name the file with --sensor",
-            args.truth.display()
-        ));
+/// place, or along other axes, the same motion has another relative error. EuRoC's poses are the body's, and
+/// so is ground truth of any layout for which `--sensor` is given.
+fn move_to_camera(
+    estimate: &mut TrajectoryFile,
+    truth: &mut TrajectoryFile,
+    args: &EvaluateArgs,
+) -> Result<(), Box<dyn Error>> {
+    let beside = || sensor_beside(&args.truth).filter(|_| truth.is_euroc);
+    let Some(path) = args.sensor.clone().or_else(beside) else {
+        if truth.is_euroc {
+            note(&format!(
+                "warning: the poses of {} are the body's and no cam0/sensor.yaml lies beside its folder: \
+                 relative errors are about other axes than the camera's; name the file with --sensor",
+                args.truth.display()
+            ));
+        }
         return Ok(());
     };
-    let body_from_camera = sensor_yaml::read(path)?.body_from_camera;
-    for pose in truth {
+    let body_from_camera = sensor_yaml::read(&path)?.body_from_camera;
+    let with_estimate = estimate.is_euroc;
+    let moved = if with_estimate { &mut estimate.poses[..] } else { &mut [] };
+    for pose in truth.poses.iter_mut().chain(moved) {
         pose.world_from_camera = pose.world_from_camera * body_from_camera;
     }
-    note(&format!("ground truth of the body, moved to the camera by {}", path.display()));
+    let what = if with_estimate { "estimate and ground truth" } else { "ground truth" };
+    note(&format!("{what} of the body, moved to the camera by {}", path.display()));
     Ok(())
 }
 

@@ -22,6 +22,7 @@ pub mod status_text;
 pub mod tracker;
 
 use std::error::Error;
+use std::ffi::{OsStr, OsString};
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -34,6 +35,7 @@ use tracing_subscriber::prelude::*;
 use crate::command::print::{PrintError, note};
 use crate::service::child::{ERROR_PREFIX, follow_supervisor};
 use crate::service::config::{Config, ConfigError, SYSTEM_FOLDER, file_for};
+use crate::wire::limits::check_address_space;
 use crate::wire::place::Place;
 
 /// Exit code of a run that was interrupted: 128 + SIGINT, as shells have it.
@@ -55,7 +57,7 @@ pub type CommandResult = Result<ExitCode, Box<dyn Error>>;
     about = "Real-time semi-dense direct visual SLAM for robot computers",
     after_help = "Start with `semidense run`: it simulates a camera in a furnished room, tracks it, maps the room,\n\
                   and writes trajectory, map and figures into a new folder below ./output.\n\
-                  Then `semidense run --source tum:DIR` for a recording.\n\n\
+                  Then `semidense run DIR` for a recording, `semidense run v4l:0 --rig FILE` for a camera.\n\n\
                   Exit codes: 0 done, 1 failed, 2 wrong usage, 3 nothing was tracked, 130 interrupted before the end (results so far are written)."
 )]
 struct CommandLine {
@@ -128,13 +130,15 @@ impl CommonArguments {
     }
 
     /// The same options for a child process.
-    fn to_arguments(&self) -> Vec<String> {
-        let mut arguments = vec!["--log".to_owned(), self.log.clone()];
-        arguments.extend(["--log-format".to_owned(), self.log_format.name().to_owned()]);
-        let mut push = |option: &str, value: String| arguments.extend([option.to_owned(), value]);
-        self.config.iter().for_each(|file| push("--config", file.to_string_lossy().into_owned()));
-        self.set.iter().for_each(|setting| push("--set", setting.clone()));
-        self.instance.iter().for_each(|name| push("--instance", name.clone()));
+    fn to_arguments(&self) -> Vec<OsString> {
+        let mut arguments: Vec<OsString> = Vec::new();
+        let mut push =
+            |option: &str, value: &OsStr| arguments.extend([option.into(), value.into()]);
+        push("--log", self.log.as_ref());
+        push("--log-format", self.log_format.name().as_ref());
+        self.config.iter().for_each(|file| push("--config", file.as_ref()));
+        self.set.iter().for_each(|setting| push("--set", setting.as_ref()));
+        self.instance.iter().for_each(|name| push("--instance", name.as_ref()));
         arguments
     }
 }
@@ -165,12 +169,19 @@ pub fn main() -> ExitCode {
     let line = CommandLine::parse();
     let outcome = prepare(&line.common).and_then(|config| {
         let place = Place::new(&config.instance, &config.root)?;
+        if let Some(occupied) = &place.occupied {
+            note(&format!(
+                "warning: {} is not a folder of this user alone; {} is used in its place",
+                occupied.display(),
+                place.root.display()
+            ));
+        }
         let outcome = match line.command {
             Subcommands::Run(arguments) => run::run(&config, &line.common, arguments),
             Subcommands::Capture(arguments) => capture::run(&config, arguments),
             Subcommands::Tracker(arguments) => tracker::run(&config, arguments),
             Subcommands::Mapper(arguments) => mapper::run(&config, arguments),
-            Subcommands::Replay(arguments) => replay::run(&config, &arguments),
+            Subcommands::Replay(arguments) => replay::run(&config, arguments),
             Subcommands::Recover(arguments) => recover::run(&config, &arguments),
             Subcommands::Simulate(arguments) => simulate::run(&config, &arguments),
             Subcommands::Evaluate(arguments) => evaluate::run(&arguments),
@@ -230,6 +241,7 @@ fn start_log(filter: EnvFilter, format: LogFormat) -> Result<(), Box<dyn Error>>
 
 fn prepare(common: &CommonArguments) -> Result<Config, Box<dyn Error>> {
     follow_supervisor()?;
+    check_address_space(0)?;
     start_log(log_filter(&common.log)?, common.log_format)?;
     let config = common.load()?;
     tracing::info!("configuration:\n{}", config.to_text());

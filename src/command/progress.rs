@@ -1,17 +1,16 @@
 //! How long work shows that it goes on: a bar on a terminal, plain lines otherwise; on stderr, so
 //! that stdout stays the result.
 
+use std::cell::Cell;
 use std::io::IsTerminal;
+use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::command::print::note;
 
-/// Plain lines over the whole work where its length is known.
-const PLAIN_LINES: usize = 10;
-
-/// Steps between plain lines where it is not.
-const PLAIN_INTERVAL: usize = 100;
+/// Time between two plain lines: a log of a long run stays short, and it is seen to go on.
+pub const LINE_PERIOD: Duration = Duration::from_secs(5);
 
 /// Progress of one piece of work.
 #[derive(Debug)]
@@ -19,6 +18,8 @@ pub struct Progress {
     what: &'static str,
     total: Option<usize>,
     bar: Option<ProgressBar>,
+    /// When the last plain line came, or the work began.
+    last_line: Cell<Instant>,
 }
 
 impl Progress {
@@ -35,7 +36,7 @@ impl Progress {
             let style = ProgressStyle::with_template(template);
             bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar())).with_prefix(what)
         });
-        Self { what, total, bar }
+        Self { what, total, bar, last_line: Cell::new(Instant::now()) }
     }
 
     /// `done` steps are over; `detail` says how it stands.
@@ -47,9 +48,8 @@ impl Progress {
             }
             return;
         }
-        let interval =
-            self.total.map_or(PLAIN_INTERVAL, |total| total.div_ceil(PLAIN_LINES)).max(1);
-        if done.is_multiple_of(interval) || self.total == Some(done) {
+        if self.last_line.get().elapsed() >= LINE_PERIOD {
+            self.last_line.set(Instant::now());
             let of = self.total.map(|total| format!("/{total}")).unwrap_or_default();
             let separator = if detail.is_empty() { "" } else { ", " };
             note(&format!("{} {done}{of}{separator}{detail}", self.what));

@@ -7,12 +7,13 @@ use std::process::ExitCode;
 
 use clap::{Args, ValueEnum};
 
-use crate::capture::source::{FrameSource, SourceName, open, rig_conflict};
+use crate::capture::source::{FrameSource, open, rig_remarks};
 use crate::command::INTERRUPTED;
+use crate::command::capture::SourceArguments;
 use crate::command::ending::{Ending, note_unfinished, run_start};
 use crate::command::print::note;
 use crate::command::progress::Progress;
-use crate::service::config::Config;
+use crate::service::config::{CaptureConfig, Config};
 use crate::service::journal::folder::unfinished;
 use crate::service::journal::log::RunStart;
 use crate::service::journal::replayed::ReplayJournal;
@@ -51,11 +52,9 @@ enum InitialDepth {
 /// Run a recorded or simulated sequence in one process: every frame, the same bits on every run
 #[derive(Debug, Args)]
 pub struct ReplayArgs {
-    /// sim, sim:SCENE, tum:DIR, euroc:DIR, images:DIR, or loop:FRAMES:HZ:SOURCE (another to and fro, FRAMES in all)
-    source: SourceName,
-    /// Rig file with the camera's calibration; needed where the recording brings none
-    #[arg(long, value_name = "FILE")]
-    rig: Option<PathBuf>,
+    /// Where frames come from and how the camera is.
+    #[command(flatten)]
+    source: SourceArguments,
     /// Folder for trajectory.txt, trajectory_online.txt, keyframes.txt, map.ply, map.pcd, summary.json
     /// and report.html [default: a new one below ./output, named by the time (UTC); output/latest leads to the newest]
     #[arg(long, value_name = "DIR")]
@@ -85,13 +84,15 @@ pub struct ReplayArgs {
 }
 
 /// Replays, writes the results and prints the summary.
-pub fn run(config: &Config, args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error>> {
-    if args.source.is_camera() {
-        let name = &args.source;
-        return Err(
-            format!("{name}: a camera cannot be replayed; semidense run --source {name}").into()
-        );
+pub fn run(config: &Config, args: ReplayArgs) -> Result<ExitCode, Box<dyn Error>> {
+    let is_strict = config.capture.strict || args.source.strict;
+    let (name, rig) = args.source.clone().source_and_rig(&config.capture)?;
+    if name.is_camera() {
+        return Err(format!("{name}: a camera cannot be replayed; semidense run {name}").into());
     }
+    let args = &args;
+    let capture = CaptureConfig { strict: is_strict, ..config.capture.clone() };
+    let config = &Config { capture, ..config.clone() };
     let shutdown = Shutdown::install()?;
     let place = Place::new(&config.instance, &config.root)?;
     let output = OutputFolder::prepare(args.output.as_deref())?;
@@ -100,9 +101,9 @@ pub fn run(config: &Config, args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error
     let simulator = &mut params.simulator;
     simulator.seed = args.seed.unwrap_or(simulator.seed);
     simulator.frames = args.frames.map_or(simulator.frames, |n| simulator.frames.min(n as usize));
-    let mut source = open(&args.source, args.rig.as_deref(), &params)?;
-    if let Some(conflict) = rig_conflict(&args.source, args.rig.as_deref()) {
-        note(&format!("warning: {conflict}"));
+    let mut source = open(&name, rig.as_deref(), &params)?;
+    for remark in rig_remarks(&name, rig.as_deref()) {
+        note(&format!("warning: {remark}"));
     }
     let threads = args.threads.map_or(config.mapper.threads, usize::from);
     let pool = rayon::ThreadPoolBuilder::new()
@@ -115,15 +116,16 @@ pub fn run(config: &Config, args: &ReplayArgs) -> Result<ExitCode, Box<dyn Error
             poses_given: args.poses == Poses::Groundtruth,
             ..run_start(
                 &Config { simulator: params.simulator, ..config.clone() },
-                &args.source,
-                args.rig.as_deref(),
+                &name,
+                rig.as_deref(),
             )
         },
         max_depth_bytes: config.mapping.max_map_bytes() as u64,
     };
     let begin = || ReplayJournal::begin(&journal, &place);
     let replayed = pool.install(|| {
-        record(config, args, source.as_mut(), &shutdown, &begin).map_err(|error| error.to_string())
+        record(config, args, &name.to_string(), source.as_mut(), &shutdown, &begin)
+            .map_err(|error| error.to_string())
     })?;
     let Some(Replayed { record, journal }) = replayed else {
         note("interrupted before the first frame: there are no results");
@@ -147,6 +149,7 @@ struct Replayed {
 fn record(
     config: &Config,
     args: &ReplayArgs,
+    source_name: &str,
     source: &mut dyn FrameSource,
     shutdown: &Shutdown,
     begin_journal: &dyn Fn() -> io::Result<ReplayJournal>,
@@ -174,6 +177,7 @@ fn record(
             InitialDepth::Sensor => DepthOrigin::Sensor,
         },
         max_frames: args.frames.map(|frames| frames as usize),
+        strict: config.capture.strict,
     };
     let total = source.num_frames().map(|n| n.min(config.max_frames.unwrap_or(n)));
     let progress = Progress::new("replay", total);
@@ -182,7 +186,7 @@ fn record(
             tracing::warn!("no journal is kept ({error}); a kill would lose the replay")
         })
         .ok();
-    let replayed = replay(source, &args.source.to_string(), &config, &mut |frame| {
+    let replayed = replay(source, source_name, &config, &mut |frame| {
         progress.update(frame.done, state_word(frame));
         journal.iter_mut().for_each(|journal| journal.observe(frame));
         goes_on()

@@ -40,6 +40,10 @@ pub struct RunArguments {
 
 /// Runs it.
 pub fn run(config: &Config, common: &CommonArguments, arguments: RunArguments) -> CommandResult {
+    let mut child_arguments = common.to_arguments();
+    if arguments.source.strict {
+        child_arguments.extend(["--set".into(), "capture.strict=true".into()]);
+    }
     let (source, rig) = arguments.source.source_and_rig(&config.capture)?;
     let mode = arguments.mode.mode(usual_mode(&source));
     let place = Place::new(&config.instance, &config.root)?;
@@ -61,7 +65,7 @@ pub fn run(config: &Config, common: &CommonArguments, arguments: RunArguments) -
         output: output.path().to_owned(),
         keeps_map: true,
         journal: Some(journal),
-        arguments: common.to_arguments(),
+        arguments: child_arguments,
     };
     let mut display = RunDisplay::new(arguments.json);
     let mut outcome = supervise(config, &options, &shutdown, &mut |p| display.show(p))?;

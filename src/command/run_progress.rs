@@ -1,24 +1,24 @@
 //! How a run is shown: a bar on a terminal, plain lines otherwise.
 
 use std::io::IsTerminal;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::command::print::note;
+use crate::command::progress::LINE_PERIOD;
 use crate::service::supervisor::RunProgress;
 use crate::slam::pose::TrackingState;
-
-/// Time between two plain lines: readable, and a long run does not fill a log.
-const LINE_PERIOD: Duration = Duration::from_secs(2);
 
 /// Shows the progress of a run.
 #[derive(Debug)]
 pub struct RunDisplay {
     bar: Option<ProgressBar>,
     is_quiet: bool,
-    is_running: bool,
-    last_line: Option<Instant>,
+    /// When the last plain line came, or the run began.
+    last_line: Instant,
+    /// What is waited for, once it has been told.
+    waits_for: Option<String>,
 }
 
 impl RunDisplay {
@@ -30,20 +30,20 @@ impl RunDisplay {
             bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
             bar
         });
-        Self { bar, is_quiet, is_running: false, last_line: None }
+        Self { bar, is_quiet, last_line: Instant::now(), waits_for: None }
     }
 
     /// Shows how far it is.
     pub fn show(&mut self, progress: &RunProgress) {
-        let (prefix, done, total, message) = match *progress {
-            RunProgress::Preparing(done, total) => ("preparing", done, total, String::new()),
+        let (prefix, done, total, message) = match progress {
+            RunProgress::Waiting(reason) => return self.show_waiting(reason),
+            RunProgress::Preparing(done, total) => ("preparing", *done, *total, String::new()),
             RunProgress::Running { frames, total, state, keyframes } => {
                 let state = state.map_or("", state_name);
-                ("running", frames, total, format!("{state}, {keyframes} keyframes"))
+                ("running", *frames, *total, format!("{state}, {keyframes} keyframes"))
             }
         };
-        let is_running = matches!(progress, RunProgress::Running { .. });
-        let has_changed = std::mem::replace(&mut self.is_running, is_running) != is_running;
+        self.waits_for = None;
         if let Some(bar) = &self.bar {
             bar.set_prefix(prefix);
             bar.set_length(total);
@@ -51,10 +51,26 @@ impl RunDisplay {
             bar.set_message(message);
             return;
         }
-        let due = self.last_line.is_none_or(|last| last.elapsed() >= LINE_PERIOD);
-        if !self.is_quiet && total > 0 && (due || has_changed) {
-            note(&format!("{prefix} {done}/{total} {message}"));
-            self.last_line = Some(Instant::now());
+        let has_work = total > 0 || matches!(progress, RunProgress::Running { .. });
+        if !self.is_quiet && has_work && self.last_line.elapsed() >= LINE_PERIOD {
+            // How many frames a camera will give nobody knows.
+            let of = if total > 0 { format!("/{total}") } else { String::new() };
+            note(format!("{prefix} {done}{of} {message}").trim_end());
+            self.last_line = Instant::now();
+        }
+    }
+
+    /// Says once that a camera is waited for, and why.
+    fn show_waiting(&mut self, reason: &str) {
+        if self.waits_for.as_deref() == Some(reason) {
+            return;
+        }
+        self.waits_for = Some(reason.to_owned());
+        let line = format!("waiting: {reason}; Ctrl-C ends");
+        match &self.bar {
+            Some(bar) => bar.println(line),
+            None if self.is_quiet => {}
+            None => note(&line),
         }
     }
 

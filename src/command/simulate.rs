@@ -150,7 +150,8 @@ struct SensorArgs {
 /// What was written.
 #[derive(Debug, Serialize)]
 struct Summary {
-    output: PathBuf,
+    /// As text, whatever its bytes.
+    output: String,
     frames: usize,
     seed: u64,
     #[serde(flatten)]
@@ -177,7 +178,7 @@ pub fn run(config: &Config, args: &SimulateArgs) -> Result<ExitCode, Box<dyn Err
     };
     writer.finish(simulator.ground_truth())?;
     let summary = Summary {
-        output: args.output.clone(),
+        output: args.output.display().to_string(),
         frames: simulator.params().frames,
         seed: simulator.params().seed,
         path: summarize(simulator.ground_truth()),
@@ -240,7 +241,7 @@ fn summary_text(summary: &Summary) -> String {
          textured pixels {:.1} %\n",
         summary.frames,
         path.duration_s,
-        summary.output.display(),
+        summary.output,
         path.path_length_m,
         path.mean_speed_m_s,
         path.extent_m,

@@ -4,13 +4,14 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use crate::capture::source::{
-    Arrival, FrameSource, FrameStamp, SourceError, SourceName, open, rig_conflict,
+    Arrival, FrameSource, FrameStamp, SourceError, SourceName, open, rig_remarks,
 };
 use crate::service::clock::{Pace, duration_from_nanos, now_nanos};
 use crate::service::config::Config;
 use crate::service::health::{Health, ProcessState};
 use crate::service::mode::Mode;
 use crate::service::peers::Peer;
+use crate::service::refused_images::RefusedImages;
 use crate::service::schedule::{apply, in_force};
 use crate::service::shutdown::Shutdown;
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -107,7 +108,11 @@ pub fn run(
         shell.stream()
     });
     match &outcome {
-        Ok(()) => shell.health.enter(ProcessState::Finished, "the source has ended"),
+        Ok(()) => {
+            let left_out = shell.refused.text();
+            let cause = left_out.as_deref().unwrap_or("the source has ended");
+            shell.health.enter(ProcessState::Finished, cause);
+        }
         Err(error) => shell.health.enter(ProcessState::Failed, &error.to_string()),
     }
     outcome
@@ -138,6 +143,8 @@ struct Shell<'a> {
     pace: Option<Pace>,
     /// Why there is no camera, while there is none.
     absence: Option<String>,
+    /// Images of a recording that could not be used.
+    refused: RefusedImages,
     /// What a camera's numbers begin with.
     first_sequence: u64,
     next_sequence: Option<u64>,
@@ -156,8 +163,8 @@ impl<'a> Shell<'a> {
         }
         let rig = options.rig.as_deref();
         let source = open(&options.source, rig, &config.source_params())?;
-        if let Some(conflict) = rig_conflict(&options.source, rig) {
-            tracing::warn!("{conflict}");
+        for remark in rig_remarks(&options.source, rig) {
+            tracing::warn!("{remark}");
         }
         let intrinsics = source.intrinsics();
         if !intrinsics.is_valid() {
@@ -183,6 +190,7 @@ impl<'a> Shell<'a> {
             health,
             pace: None,
             absence: None,
+            refused: RefusedImages::default(),
             first_sequence: 0,
             next_sequence: None,
             _claim: claim,
@@ -245,9 +253,6 @@ impl<'a> Shell<'a> {
 
     /// Frame after frame.
     fn stream(&mut self) -> Result<(), CaptureError> {
-        if self.is_recorded() {
-            self.health.enter(ProcessState::Running, "");
-        }
         loop {
             if self.await_frame()? {
                 match self.send_next()? {
@@ -281,7 +286,8 @@ impl<'a> Shell<'a> {
                 if self.absence.take().is_some() {
                     tracing::warn!("capture: frames come again");
                 }
-                self.health.enter(ProcessState::Running, "");
+                let left_out = self.refused.text();
+                self.health.enter(ProcessState::Running, left_out.as_deref().unwrap_or_default());
                 return Ok(true);
             }
             Arrival::Nothing => {}
@@ -312,13 +318,16 @@ impl<'a> Shell<'a> {
         let mut loan = self.frames.loan(self.intrinsics.width * self.intrinsics.height)?;
         let mut stamp = match self.source.next_into(loan.bytes_mut()) {
             Ok(Some(stamp)) => stamp,
-            Ok(None) => return Ok(Sent::End),
-            Err(error) if error.is_passing() => {
-                tracing::debug!("{error}");
+            Ok(None) => {
+                return self.refused.error().map_or(Ok(Sent::End), |error| Err(error.into()));
+            }
+            Err(error) if error.is_passing() && !self.ends_at(&error) => {
+                self.refuse(&error);
                 return Ok(Sent::Nothing);
             }
             Err(error) => return Err(error.into()),
         };
+        self.refused.accept();
         stamp.sequence = stamp.sequence.saturating_add(self.first_sequence);
         if self.shutdown.is_requested() {
             return Err(CaptureError::Interrupted);
@@ -338,6 +347,23 @@ impl<'a> Shell<'a> {
         loan.send(self.header(&stamp, clock_nanos))?;
         self.count(&stamp);
         Ok(Sent::Frame(stamp.sequence))
+    }
+
+    /// Whether a frame that cannot be used ends the run; a camera's never does.
+    fn ends_at(&self, error: &SourceError) -> bool {
+        self.config.capture.strict && matches!(error, SourceError::Image(_))
+    }
+
+    /// A frame is left out: a camera counts its own, those of a recording are named too.
+    fn refuse(&mut self, error: &SourceError) {
+        if !self.is_recorded() {
+            tracing::debug!("{error}");
+            return;
+        }
+        self.refused.refuse(error);
+        self.health.counters().refused = self.refused.count();
+        // Its place in the sequence stays empty, which is no gap: it is counted here.
+        self.next_sequence = self.next_sequence.map(|next| next.saturating_add(1));
     }
 
     fn header(&self, stamp: &FrameStamp, clock_nanos: i64) -> FrameHeader {

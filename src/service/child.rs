@@ -1,5 +1,6 @@
 //! A process that the supervisor has started: it ends with the supervisor, whatever happens.
 
+use std::ffi::OsString;
 use std::io::{self, BufRead, BufReader, Write};
 use std::os::unix::process::CommandExt;
 use std::path::Path;
@@ -55,7 +56,7 @@ pub struct Child {
 impl Child {
     /// Starts the subcommand `name` of this binary, in a process group of its own, so that a Ctrl-C
     /// at the terminal reaches only the supervisor.
-    pub fn start(name: &'static str, arguments: &[String], root: &Path) -> io::Result<Self> {
+    pub fn start(name: &'static str, arguments: &[OsString], root: &Path) -> io::Result<Self> {
         let mut command = Command::new(std::env::current_exe()?);
         // The service manager knows the supervisor, not its children.
         for variable in VARIABLES {

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
+use crate::capture::input_file;
 use crate::capture::simulator::params::SimulatorParams;
 use crate::capture::source::SourceParams;
 use crate::capture::v4l::params::CameraParams;
@@ -19,6 +20,8 @@ use crate::slam::tracker::TrackerParams;
 
 /// Folder of the files that are read when no other is named: `<instance>.toml`, else `semidense.toml`.
 pub const SYSTEM_FOLDER: &str = "/etc/semidense";
+/// Largest configuration file; the one with every key has 30 kB.
+const MAX_FILE_BYTES: u64 = 1 << 20;
 /// Read for every instance that has no file of its own.
 const COMMON_FILE: &str = "semidense.toml";
 
@@ -54,12 +57,15 @@ pub struct Config {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CaptureConfig {
-    /// Where frames come from when `--source` does not say: sim, sim:SCENE, tum:DIR, euroc:DIR, images:DIR,
-    /// v4l:DEVICE or loop:FRAMES:HZ:SOURCE.
+    /// Where frames come from when the command line does not say: a folder whose layout is recognised, sim,
+    /// sim:SCENE, tum:DIR, euroc:DIR, images:DIR, v4l:DEVICE or loop:FRAMES:HZ:SOURCE.
     pub source: String,
     /// The camera's rig file when `--rig` does not say; empty for none. In a configuration file a path is
     /// relative to that file.
     pub rig: String,
+    /// Whether an image of a recording that is damaged or missing ends the run with an error, as `--strict`
+    /// does; otherwise it is left out and counted.
+    pub strict: bool,
     /// Longest wait for tracker and mapper to get ready before a recording starts, seconds.
     pub connect_timeout_s: f64,
     /// Lockstep: longest wait for the map to take in a frame, seconds.
@@ -78,6 +84,7 @@ impl Default for CaptureConfig {
         Self {
             source,
             rig: String::new(),
+            strict: false,
             connect_timeout_s: 30.0,
             step_timeout_s: 60.0,
             scheduling,
@@ -161,7 +168,7 @@ impl Default for Config {
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// The file cannot be read.
-    #[error("{path}: {source}; check --config")]
+    #[error("{path}: cannot be read: {source}; check --config")]
     Read {
         /// The file.
         path: PathBuf,
@@ -191,7 +198,7 @@ impl Config {
     pub fn load(file: Option<&Path>, settings: &[String]) -> Result<Self, ConfigError> {
         let mut table = Table::new();
         if let Some(path) = file {
-            let text = std::fs::read_to_string(path)
+            let text = input_file::read_text(path, MAX_FILE_BYTES)
                 .map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
             Self::from_text(&text, &path.display().to_string())?;
             table = text.parse().unwrap_or_default();

@@ -1,5 +1,6 @@
 //! Latency under trial: the three processes live on a repeated sequence, beside what may disturb them.
 
+use std::ffi::OsString;
 use std::hint::black_box;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -144,7 +145,7 @@ pub fn try_out(
     config: &Config,
     trial: &Trial,
     source: &SourceName,
-    arguments: &[String],
+    arguments: &[OsString],
     shutdown: &Shutdown,
     observe: &mut dyn FnMut(&RunProgress),
 ) -> Result<Measurement, TrialError> {
@@ -171,8 +172,8 @@ pub fn try_out(
         arguments: arguments
             .iter()
             .cloned()
-            .chain(["--instance".to_owned(), config.instance.clone()])
-            .chain(settings.iter().flat_map(|&set| ["--set".to_owned(), set.to_owned()]))
+            .chain(["--instance".into(), config.instance.clone().into()])
+            .chain(settings.iter().flat_map(|&set| ["--set".into(), set.into()]))
             .collect(),
     };
     let place = Place::new(&config.instance, &config.root)?;

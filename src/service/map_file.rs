@@ -6,10 +6,10 @@
 //! (4 × f64), number of points (u64), points (u16, u16, 3 × f32), number of image bytes (u64, 0 where the
 //! image was given up), image bytes.
 
-use std::fs::File;
 use std::io::{self, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
 
+use crate::capture::input_file;
 use crate::service::atomic_file::write_atomically;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS};
@@ -108,8 +108,8 @@ fn write_keyframe(file: &mut impl Write, keyframe: &Keyframe) -> io::Result<()> 
 
 /// Reads the map that [`write_map`] wrote.
 pub fn read_map(path: &Path) -> Result<Map, MapFileError> {
-    let file =
-        File::open(path).map_err(|source| MapFileError::Read { path: path.to_owned(), source })?;
+    let file = input_file::open(path)
+        .map_err(|source| MapFileError::Read { path: path.to_owned(), source })?;
     parse_map(path, BufReader::new(file))
 }
 

@@ -25,6 +25,7 @@ pub mod peers;
 pub mod recorder;
 pub mod recording;
 pub mod reference_feed;
+pub mod refused_images;
 pub mod rehearsal;
 pub mod replay;
 pub mod results;

@@ -17,6 +17,8 @@ use crate::wire::message::PoseMessage;
 pub struct RunCounters {
     /// Frames that capture sent.
     pub frames_in: u64,
+    /// Images that the source could not give.
+    pub frames_refused: u64,
     /// Holes in the source's sequence.
     pub gaps: u64,
     /// Processes that were started again.
@@ -131,6 +133,8 @@ impl Recording {
             source: parts.source,
             ended: Default::default(),
             frames_in: counters.frames_in,
+            frames_refused: counters.frames_refused,
+            refused: None,
             frames_dropped: counters.frames_in.saturating_sub(self.poses.len() as u64),
             poses: self.poses,
             map: parts.map,

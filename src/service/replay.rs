@@ -9,6 +9,7 @@ use std::time::Instant;
 use crate::capture::source::{FrameSource, FrameStamp, SourceError};
 use crate::service::alignment_stamps::AlignmentStamps;
 use crate::service::given_pose::{given_pose, truth_in_first_camera};
+use crate::service::refused_images::RefusedImages;
 use crate::service::rehearsal::Rehearsal;
 use crate::service::results::{RecordedPose, Rejection, RunMode, RunRecord};
 use crate::service::schedule::peak_rss_bytes;
@@ -56,6 +57,8 @@ pub struct ReplayConfig {
     pub initial_depth: DepthOrigin,
     /// Stop after as many frames; `None` for all.
     pub max_frames: Option<usize>,
+    /// An image that cannot be used ends the replay; otherwise it is left out and counted.
+    pub strict: bool,
 }
 
 /// A frame that is done, for whoever watches.
@@ -126,17 +129,24 @@ pub fn replay(
     let total = frames_to_come(source, config);
     let mut pixels = vec![0; replay.num_pixels];
     let begin = Instant::now();
+    let mut refused = RefusedImages::default();
     let mut fault = None;
     while replay.record.frames_in < config.max_frames.map_or(u64::MAX, |n| n as u64) {
         let stamp = match source.next_into(&mut pixels) {
             Ok(Some(stamp)) => stamp,
             Ok(None) => break,
+            Err(error) if error.is_passing() && !config.strict => {
+                refused.refuse(&error);
+                replay.leave_out();
+                continue;
+            }
             Err(cause) if replay.record.frames_in > 0 => {
                 fault = Some(cause);
                 break;
             }
             Err(cause) => return Err(cause.into()),
         };
+        refused.accept();
         let (state, outcome) = replay.step(source, &stamp, &pixels)?;
         let done = replay.record.frames_in as usize;
         let (record, map, keyframe) =
@@ -148,7 +158,11 @@ pub fn replay(
             break;
         }
     }
-    let record = replay.finish(begin)?;
+    if let Some(error) = refused.error() {
+        return Err(error.into());
+    }
+    let mut record = replay.finish(begin)?;
+    (record.frames_refused, record.refused) = (refused.count(), refused.text());
     match fault {
         None => Ok(record),
         Some(cause) => Err(ReplayError::Cut { record: Box::new(record), cause }),
@@ -228,7 +242,13 @@ impl<'a> Replay<'a> {
         };
         let sensor_depth = match self.config.initial_depth {
             DepthOrigin::Images => None,
-            DepthOrigin::Sensor => source.depth_at(stamp.capture_nanos)?,
+            DepthOrigin::Sensor => match source.depth_at(stamp.capture_nanos) {
+                Err(error) if error.is_passing() && !self.config.strict => {
+                    tracing::warn!("left out: {error}");
+                    None
+                }
+                depth => depth?,
+            },
         };
         let sensor_expected = self.config.initial_depth == DepthOrigin::Sensor;
         if sensor_expected && sensor_depth.is_none() && self.record.frames_in == 1 {
@@ -318,6 +338,13 @@ impl<'a> Replay<'a> {
         self.stamps = Some((first, *stamp));
     }
 
+    /// An image was left out: its place in the sequence stays empty, which is no gap.
+    fn leave_out(&mut self) {
+        if let Some((_, last)) = &mut self.stamps {
+            last.sequence = last.sequence.saturating_add(1);
+        }
+    }
+
     fn finish(self, begin: Instant) -> Result<RunRecord, ReplayError> {
         let mut record = self.record;
         let Some((first, last)) = self.stamps else {
@@ -345,6 +372,8 @@ fn empty_record(source_name: &str, ground_truth: Vec<StampedPose>, poses_given: 
         ground_truth,
         depth_scale,
         frames_in: 0,
+        frames_refused: 0,
+        refused: None,
         frames_dropped: 0,
         gaps: 0,
         restarts: 0,

@@ -1,6 +1,7 @@
 //! The supervisor: starts the three processes, watches them, collects what they publish, ends them
 //! in order, and leaves nothing behind.
 
+use std::ffi::OsString;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -8,7 +9,7 @@ use std::time::{Duration, Instant};
 use crate::capture::source::{FrameSource, SourceError, SourceName, open};
 use crate::service::child::Child;
 use crate::service::config::Config;
-use crate::service::health::ProcessState;
+use crate::service::health::{ProcessState, cause};
 use crate::service::journal::{Journal, JournalOptions};
 use crate::service::map_file::{MapFileError, read_map};
 use crate::service::mode::Mode;
@@ -53,12 +54,14 @@ pub struct RunOptions {
     /// The journal to keep; without one a kill of the supervisor loses the run.
     pub journal: Option<JournalOptions>,
     /// Options that every child gets: where the configuration comes from.
-    pub arguments: Vec<String>,
+    pub arguments: Vec<OsString>,
 }
 
 /// How far a run is, for whoever watches.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum RunProgress {
+    /// There is no camera, for this reason; it is used as soon as it is there.
+    Waiting(String),
     /// The processes start, and the source is prepared: (done, total) of that work.
     Preparing(u64, u64),
     /// Frames come.
@@ -153,6 +156,7 @@ pub fn run(
         let max_bytes = config.mapping.max_map_bytes() as u64;
         supervisor.recorder.complete_map(&mut map, max_bytes)?;
     }
+    let refused = supervisor.refused()?;
     let (recorder, counters) = supervisor.finish()?;
     let lost = counters.frames_in.saturating_sub(recorder.num_poses() as u64);
     if options.mode == Mode::Lockstep && ended == Ended::Finished && lost > 0 {
@@ -169,7 +173,7 @@ pub fn run(
         deadline_ms,
         counters,
     });
-    let record = RunRecord { ended: end_of_run(&ended), ..record };
+    let record = RunRecord { ended: end_of_run(&ended), refused, ..record };
     Ok(RunOutcome { record, journal, source, ended })
 }
 
@@ -247,15 +251,14 @@ impl<'a> Supervisor<'a> {
 
     fn spawn(&self, name: &'static str) -> Result<Child, RunError> {
         let mut arguments = self.options.arguments.clone();
-        let mut push = |words: &[&str]| arguments.extend(words.iter().map(|&w| w.to_owned()));
-        match self.options.mode {
-            Mode::Lockstep => push(&["--lockstep"]),
-            Mode::Live => push(&["--live"]),
-        }
+        arguments.push(match self.options.mode {
+            Mode::Lockstep => "--lockstep".into(),
+            Mode::Live => "--live".into(),
+        });
         if name == "capture" {
-            push(&["--source", &self.options.source.to_string()]);
+            arguments.extend(["--source".into(), self.options.source.to_os_string()]);
             if let Some(rig) = &self.options.rig {
-                push(&["--rig", &rig.to_string_lossy()]);
+                arguments.extend(["--rig".into(), rig.clone().into_os_string()]);
             }
         }
         Child::start(name, &arguments, &self.root)
@@ -289,6 +292,9 @@ impl<'a> Supervisor<'a> {
 
     fn progress(&self) -> RunProgress {
         let Some(capture) = self.peers[0].last() else { return RunProgress::Preparing(0, 0) };
+        if self.peers[0].state() == Some(ProcessState::Stale) {
+            return RunProgress::Waiting(cause(capture));
+        }
         if self.recorder.num_poses() == 0 {
             return RunProgress::Preparing(capture.progress_done, capture.progress_total);
         }
@@ -398,6 +404,16 @@ impl<'a> Supervisor<'a> {
         Ok(map?)
     }
 
+    /// What capture says of images that it has left out.
+    fn refused(&mut self) -> Result<Option<String>, RunError> {
+        let is_camera = self.options.source.is_camera();
+        let last = self.peers[0].update()?.filter(|last| last.refused > 0);
+        Ok(last.map(|last| match is_camera {
+            true => format!("{} left out: they came damaged", last.refused),
+            false => cause(last),
+        }))
+    }
+
     /// Ends the others, and gives what was collected.
     fn finish(mut self) -> Result<(Recorder, RunCounters), RunError> {
         self.stop("tracker");
@@ -437,6 +453,7 @@ fn count(sums: &mut RunCounters, peer: &Peer) {
         "capture" => {
             sums.frames_in += last.frames;
             sums.gaps += last.gaps;
+            sums.frames_refused += last.refused;
         }
         "tracker" => {
             sums.deadline_misses += last.deadline_misses;

@@ -3,10 +3,10 @@
 //! Stamps are nanoseconds as integers and numbers have as many digits as bring the same bits back,
 //! so that two runs can be compared byte by byte.
 
-use std::fs::File;
-use std::io::{self, Read, Write};
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
+use crate::capture::input_file;
 use crate::service::atomic_file::write_atomically;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::trajectory::StampedPose;
@@ -28,12 +28,6 @@ pub enum TrajectoryFileError {
         path: PathBuf,
         /// What the system says.
         source: io::Error,
-    },
-    /// More bytes than any trajectory has.
-    #[error("{path} is larger than {} MiB: is it a trajectory?", MAX_FILE_BYTES >> 20)]
-    TooLarge {
-        /// The file.
-        path: PathBuf,
     },
     /// A line that is no pose.
     #[error("{path}:{line}: {fault}")]
@@ -100,12 +94,8 @@ pub fn read_trajectory(path: &Path) -> Result<Vec<StampedPose>, TrajectoryFileEr
 pub fn read_trajectory_file(path: &Path) -> Result<TrajectoryFile, TrajectoryFileError> {
     let owned = || path.to_path_buf();
     let mut bytes = Vec::new();
-    File::open(path)
-        .and_then(|file| file.take(MAX_FILE_BYTES + 1).read_to_end(&mut bytes))
+    input_file::read_into(path, MAX_FILE_BYTES, &mut bytes)
         .map_err(|source| TrajectoryFileError::Read { path: owned(), source })?;
-    if bytes.len() as u64 > MAX_FILE_BYTES {
-        return Err(TrajectoryFileError::TooLarge { path: owned() });
-    }
     let poses = parse_trajectory(&bytes).map_err(|(line, fault)| TrajectoryFileError::Line {
         path: owned(),
         line,

@@ -8,9 +8,8 @@ use iceoryx2::port::server::Server;
 use iceoryx2::prelude::*;
 
 use crate::wire::message::{CommandRequest, CommandResponse, PATH_BYTES, TEXT_BYTES};
-use crate::wire::port::{
-    Access, Events, Hub, OpenError, Wake, not_running, retry, topic_error, wait,
-};
+use crate::wire::open_error::{not_running, topic_error};
+use crate::wire::port::{Access, Events, Hub, OpenError, Wake, retry, wait};
 use crate::wire::topic::{MAPPER_COMMAND, service_name};
 
 /// Clients at a time: the supervisor, an operator, a network link.

@@ -6,8 +6,11 @@
 pub mod command;
 pub mod conversion;
 pub mod keyframe_inbox;
+pub mod limits;
 pub mod message;
+pub mod open_error;
 pub mod place;
 pub mod port;
+mod root_folder;
 pub mod topic;
 mod version;

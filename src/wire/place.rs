@@ -6,7 +6,10 @@ use std::io::{self, Read, Seek, Write};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
-use rustix::fs::FlockOperation;
+use rustix::fs::{Access, FlockOperation};
+
+use crate::wire::limits::{check_address_space, raise_open_files};
+use crate::wire::root_folder::{is_mine, usual_root};
 
 /// The folder under systemd, where every unit has the same one.
 pub const SYSTEM_ROOT: &str = "/run/semidense";
@@ -38,6 +41,11 @@ pub enum PlaceError {
     /// The folder's path is too long.
     #[error("{0}: the runtime folder may have at most {MAX_ROOT_BYTES} bytes; set {ROOT_VARIABLE}")]
     TooLong(PathBuf),
+    /// The folder's path has bytes that a service cannot have.
+    #[error(
+        "{0}: the runtime folder's path may have letters, digits and the like, all of them UTF-8; set {ROOT_VARIABLE}"
+    )]
+    Characters(PathBuf),
     /// The folder belongs to someone else.
     #[error("{0}: the runtime folder belongs to another user; set {ROOT_VARIABLE} to one of yours")]
     Foreign(PathBuf),
@@ -61,6 +69,31 @@ pub enum PlaceError {
         /// Process id of the one that runs.
         holder: String,
     },
+    /// Too few files may be open at a time.
+    #[error(
+        "a process may have {limit} files open here where {needed} are needed: raise the limit (ulimit -n 1024, LimitNOFILE= of a systemd unit, docker run --ulimit nofile=1024)"
+    )]
+    OpenFiles {
+        /// The limit.
+        limit: u64,
+        /// What is needed.
+        needed: u64,
+    },
+    /// Too little address space.
+    #[error(
+        "a process may have {limit_mb} MB of address space here where {needed_mb} MB are needed: raise the limit (ulimit -v unlimited, LimitAS= of a systemd unit)"
+    )]
+    AddressSpace {
+        /// The limit.
+        limit_mb: u64,
+        /// What is needed.
+        needed_mb: u64,
+    },
+    /// There is no shared memory.
+    #[error(
+        "{SHARED_MEMORY}: {0}: there is no shared memory here; mount a tmpfs there (a container: docker run --shm-size=128m)"
+    )]
+    NoSharedMemory(io::Error),
     /// Too little shared memory.
     #[error(
         "{SHARED_MEMORY} has {free_mb} MB free where {needed_mb} MB are needed: enlarge it (mount -o remount,size=…, or docker run --shm-size=…)"
@@ -82,6 +115,8 @@ pub struct Place {
     pub root: PathBuf,
     /// First part of the names in [`SHARED_MEMORY`].
     pub prefix: String,
+    /// The usual folder in the temporary one, where somebody else's is in its place.
+    pub occupied: Option<PathBuf>,
 }
 
 impl Place {
@@ -92,23 +127,31 @@ impl Place {
         if !named || !instance.chars().all(allowed) {
             return Err(PlaceError::Instance(instance.to_owned()));
         }
-        let root = if root.is_empty() { usual_root() } else { PathBuf::from(root) };
+        let (root, occupied) = match root {
+            "" => usual_root(),
+            named => (PathBuf::from(named), None),
+        };
         let root = std::path::absolute(&root)
             .map_err(|source| PlaceError::Io { path: root.clone(), source })?;
         if root.as_os_str().len() > MAX_ROOT_BYTES {
             return Err(PlaceError::TooLong(root));
         }
+        if root.to_str().is_none() {
+            return Err(PlaceError::Characters(root));
+        }
         let prefix = prefix_of(&root);
-        Ok(Self { instance: instance.to_owned(), root, prefix })
+        Ok(Self { instance: instance.to_owned(), root, prefix, occupied })
     }
 
     /// Makes the folder, for this user alone.
     pub fn create(&self) -> Result<(), PlaceError> {
         let io = |source| PlaceError::Io { path: self.root.clone(), source };
         DirBuilder::new().recursive(true).mode(0o700).create(&self.root).map_err(io)?;
-        let owner = fs::metadata(&self.root).map_err(io)?.uid();
-        if owner != rustix::process::geteuid().as_raw() {
-            return Err(PlaceError::Foreign(self.root.clone()));
+        // Neither the folder nor a link to it may be somebody else's.
+        for found in [fs::symlink_metadata(&self.root), fs::metadata(&self.root)] {
+            if !is_mine(&found.map_err(io)?) {
+                return Err(PlaceError::Foreign(self.root.clone()));
+            }
         }
         Ok(())
     }
@@ -122,6 +165,7 @@ impl Place {
 
     /// Claims to be the only `process` of this instance; the kernel ends the claim with the process.
     pub fn claim(&self, process: &str) -> Result<Claim, PlaceError> {
+        raise_open_files()?;
         self.create()?;
         // Keeps away who tidies up and would hold the lock for a moment.
         let _joining = self.hold()?;
@@ -197,13 +241,56 @@ impl Place {
         // What cannot be removed is removed by the next one.
         let is_empty =
             |folder: &Path| fs::read_dir(folder).map_or(true, |mut f| f.next().is_none());
+        self.remove_failed_nodes();
         if is_empty(&self.root.join("nodes")) {
             self.node_counters().for_each(|path| drop(fs::remove_file(path)));
             self.remove_dead_claims();
             let _ = fs::remove_dir(self.root.join("nodes"));
-            let _ = fs::remove_dir(self.root.join("services"));
+            // Without a node nobody has a service open: what is left there is of the dead.
+            let _ = fs::remove_dir_all(self.root.join("services"));
+            self.events().for_each(|path| drop(fs::remove_file(path)));
             let _ = fs::remove_file(&path);
         }
+    }
+
+    /// Removes the folders of nodes that never came to life: a start that failed leaves one without its
+    /// `.node_monitor`, and nobody could ever tell that it is dead. While nobody may join.
+    fn remove_failed_nodes(&self) {
+        let nodes = self.root.join("nodes");
+        for entry in fs::read_dir(&nodes).into_iter().flatten().flatten() {
+            let id = entry.file_name().to_string_lossy().into_owned();
+            let has_monitor = || {
+                let mut others = fs::read_dir(&nodes).into_iter().flatten().flatten();
+                others.any(|other| {
+                    let name = other.file_name().to_string_lossy().into_owned();
+                    name.contains(&id) && name.contains(".node_monitor")
+                })
+            };
+            if entry.file_type().is_ok_and(|kind| kind.is_dir()) && !has_monitor() {
+                let _ = fs::remove_dir_all(entry.path());
+            }
+        }
+    }
+
+    /// The sockets of events in the folder.
+    fn events(&self) -> impl Iterator<Item = PathBuf> {
+        let entries = fs::read_dir(&self.root).into_iter().flatten().flatten();
+        entries.map(|entry| entry.path()).filter(|path| {
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            name.starts_with(&self.prefix) && name.ends_with(".event")
+        })
+    }
+
+    /// The process id of a member of the instance that runs, by its claim.
+    pub(in crate::wire) fn running(&self) -> Option<String> {
+        ["capture", "tracker", "mapper"].iter().find_map(|process| {
+            let path = self.root.join(format!("{}.{process}{CLAIM_SUFFIX}", self.instance));
+            let mut file = File::open(path).ok()?;
+            rustix::fs::flock(&file, FlockOperation::NonBlockingLockShared).err()?;
+            let mut holder = String::new();
+            file.read_to_string(&mut holder).ok()?;
+            Some(holder.trim().to_owned())
+        })
     }
 
     /// Removes the files of claims that nobody holds any more. While nobody may join.
@@ -227,12 +314,13 @@ impl Place {
         }
     }
 
-    /// Checks that shared memory has `needed` bytes left: what is missing is not an error later but
-    /// the death of the process.
+    /// Checks that shared memory has `needed` bytes left, and the address space room for them: what is
+    /// missing is not an error later but the death of the process.
     pub fn check_shared_memory(&self, needed: u64) -> Result<(), PlaceError> {
-        let path = PathBuf::from(SHARED_MEMORY);
-        let stat = rustix::fs::statvfs(SHARED_MEMORY)
-            .map_err(|e| PlaceError::Io { path, source: e.into() })?;
+        check_address_space(needed)?;
+        let none = |cause| PlaceError::NoSharedMemory(io::Error::from(cause));
+        rustix::fs::access(SHARED_MEMORY, Access::WRITE_OK | Access::EXEC_OK).map_err(none)?;
+        let stat = rustix::fs::statvfs(SHARED_MEMORY).map_err(none)?;
         let free = stat.f_bavail.saturating_mul(stat.f_frsize);
         if free >= needed {
             return Ok(());
@@ -266,27 +354,6 @@ fn is_same_file(file: &File, path: &Path) -> bool {
         (Ok(open), Ok(named)) => (open.dev(), open.ino()) == (named.dev(), named.ino()),
         _ => false,
     }
-}
-
-/// The environment's word, else systemd's runtime folder, else for the user of the services theirs, else the
-/// user's own, else one in the temporary folder.
-fn usual_root() -> PathBuf {
-    let variable = |name: &str| std::env::var_os(name).filter(|value| !value.is_empty());
-    if let Some(root) = variable(ROOT_VARIABLE) {
-        return PathBuf::from(root);
-    }
-    if let Some(folder) = variable("RUNTIME_DIRECTORY") {
-        return PathBuf::from(folder);
-    }
-    let is_mine = |found: fs::Metadata| found.uid() == rustix::process::geteuid().as_raw();
-    if fs::metadata(SYSTEM_ROOT).is_ok_and(is_mine) {
-        return PathBuf::from(SYSTEM_ROOT);
-    }
-    if let Some(folder) = variable("XDG_RUNTIME_DIR") {
-        return PathBuf::from(folder).join("semidense");
-    }
-    let user = rustix::process::geteuid().as_raw();
-    std::env::temp_dir().join(format!("semidense-{user}"))
 }
 
 /// Names in shared memory are global, so folders that differ need prefixes that differ.
@@ -351,6 +418,24 @@ mod tests {
         assert!(!dead.exists() && foreign.exists());
         assert!(place.claim("capture").is_err(), "the living one still holds its claim");
         drop(living);
+    }
+
+    #[test]
+    fn what_a_failed_start_left_is_cleared() {
+        let folder = tempfile::tempdir().unwrap();
+        let place = Place::new("rig", folder.path().to_str().unwrap()).unwrap();
+        let nodes = folder.path().join("nodes");
+        fs::create_dir_all(nodes.join("123")).unwrap();
+        fs::write(nodes.join("123/x.details"), "").unwrap();
+        fs::create_dir_all(nodes.join("456")).unwrap();
+        fs::write(nodes.join("p_456.node_monitor"), "").unwrap();
+        place.tidy();
+        assert!(!nodes.join("123").exists() && nodes.join("456").exists());
+        fs::remove_file(nodes.join("p_456.node_monitor")).unwrap();
+        fs::create_dir(folder.path().join("services")).unwrap();
+        fs::write(folder.path().join("services/x.service"), "").unwrap();
+        place.tidy();
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
     }
 
     #[test]

@@ -17,8 +17,11 @@ use iceoryx2::service::port_factory::event::PortFactory as EventFactory;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory as DataFactory;
 use rustix::event::{PollFd, PollFlags, Timespec};
 
+use crate::wire::limits::raise_open_files;
+pub use crate::wire::open_error::OpenError;
+use crate::wire::open_error::{in_words, not_running, topic_error};
 use crate::wire::place::{Place, PlaceError};
-use crate::wire::topic::{Topic, WIRE_VERSION};
+use crate::wire::topic::Topic;
 use crate::wire::version::foreign_version;
 
 /// Nodes that may open one service: our processes, observers, and the dead until they are cleaned.
@@ -33,48 +36,6 @@ const MAX_WAITED: usize = 8;
 const OPEN_ATTEMPTS: usize = 50;
 /// Pause between two attempts.
 const OPEN_PAUSE: Duration = Duration::from_millis(10);
-
-/// Why a process cannot take part.
-#[derive(Debug, thiserror::Error)]
-pub enum OpenError {
-    /// The place is not right.
-    #[error(transparent)]
-    Place(#[from] PlaceError),
-    /// iceoryx2 cannot make a node there.
-    #[error("{root}: no node can be made there ({reason}); is it another user's folder?")]
-    Node {
-        /// Folder.
-        root: String,
-        /// What iceoryx2 says.
-        reason: String,
-    },
-    /// Nobody offers this topic.
-    #[error("nothing runs under the name `{instance}` in {root}")]
-    NotRunning {
-        /// Instance.
-        instance: String,
-        /// Folder.
-        root: String,
-    },
-    /// The instance is another version's.
-    #[error(
-        "instance `{instance}` speaks wire version {found}, this program {WIRE_VERSION}: stop the old one, or use programs of one version"
-    )]
-    Version {
-        /// Instance.
-        instance: String,
-        /// Its version.
-        found: u32,
-    },
-    /// A topic cannot be opened.
-    #[error("topic {topic}: {reason}")]
-    Topic {
-        /// Its name.
-        topic: String,
-        /// What iceoryx2 says.
-        reason: String,
-    },
-}
 
 /// Why a message was not sent.
 #[derive(Debug, thiserror::Error)]
@@ -118,6 +79,7 @@ impl Hub {
     /// Joins the instance at `place` under the name `process`. iceoryx2 stays quiet and leaves the
     /// signals alone; what dead processes left behind is removed.
     pub fn join(place: &Place, process: &str, access: Access) -> Result<Self, OpenError> {
+        raise_open_files()?;
         if access == Access::Member {
             place.create()?;
         } else if !place.root.join("services").exists() {
@@ -125,7 +87,9 @@ impl Hub {
         }
         set_log_level(LogLevel::Fatal);
         let _joining = place.hold()?;
-        let failed = |reason| OpenError::Node { root: place.root.display().to_string(), reason };
+        let root = place.root.display().to_string();
+        let failed =
+            |reason: String| OpenError::Node { root: root.clone(), reason: in_words(&reason) };
         let name = NodeName::new(process).map_err(|e| failed(e.to_string()))?;
         let config = transport_config(place)?;
         let node = NodeBuilder::new()
@@ -271,21 +235,12 @@ impl Hub {
 
 /// iceoryx2's configuration for `place`, independent of any file that lies around.
 fn transport_config(place: &Place) -> Result<Config, OpenError> {
-    let wrong = |_| OpenError::Place(PlaceError::TooLong(place.root.clone()));
+    let wrong = |_| OpenError::Place(PlaceError::Characters(place.root.clone()));
     let mut config = Config::default();
     let root = Path::new(place.root.as_os_str().as_encoded_bytes()).map_err(wrong)?;
     config.global.set_root_path(&root);
     config.global.prefix = FileName::new(place.prefix.as_bytes()).map_err(wrong)?;
     Ok(config)
-}
-
-pub(in crate::wire) fn not_running(place: &Place) -> OpenError {
-    let (instance, root) = (place.instance.clone(), place.root.display().to_string());
-    OpenError::NotRunning { instance, root }
-}
-
-pub(in crate::wire) fn topic_error(name: &str, error: &dyn std::fmt::Display) -> OpenError {
-    OpenError::Topic { topic: name.to_owned(), reason: error.to_string() }
 }
 
 /// Opens a service that another process may be removing at this moment.

@@ -22,7 +22,15 @@ pub fn evaluate_depth(
     let mut errors = DepthErrors::default();
     let mut keyframes = 0;
     for keyframe in record.map.keyframes.iter().filter(|k| is_evaluated(k)) {
-        if let Some(true_depth) = source.depth_at(keyframe.capture_nanos)? {
+        let true_depth = match source.depth_at(keyframe.capture_nanos) {
+            // One damaged file is no reason to lose the results.
+            Err(error) if error.is_passing() => {
+                tracing::warn!("a keyframe is not compared with its true depth: {error}");
+                None
+            }
+            depth => depth?,
+        };
+        if let Some(true_depth) = true_depth {
             errors.add(keyframe, &true_depth, record.depth_scale);
             keyframes += 1;
         }

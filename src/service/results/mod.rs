@@ -5,6 +5,7 @@
 
 pub mod alignment_levels;
 pub mod budget_curve;
+pub mod calibration;
 pub mod colour;
 pub mod debug_pictures;
 pub mod depth_maps;
@@ -114,6 +115,10 @@ pub struct RunRecord {
     pub depth_scale: DepthScale,
     /// Frames that the source gave.
     pub frames_in: u64,
+    /// Images of the source that could not be used and were left out.
+    pub frames_refused: u64,
+    /// Which of them was the first, and why.
+    pub refused: Option<String>,
     /// Frames that the tracker never saw because a newer one had come.
     pub frames_dropped: u64,
     /// Places where the source's sequence has a hole.

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::service::health::{bucket, bucket_end_ms};
 use crate::service::results::alignment_levels::{LevelSummary, alignment_levels};
 use crate::service::results::budget_curve::BudgetCurve;
+use crate::service::results::calibration::whitened_residual_median;
 use crate::service::results::poses::longest_epoch;
 use crate::service::results::untracked::Untracked;
 use crate::service::results::{EndOfRun, RecordedPose, Rejection, RunMode, RunRecord};
@@ -165,6 +166,10 @@ pub struct Summary {
     pub grade: Grade,
     /// Frames that the source gave.
     pub frames_in: u64,
+    /// Images of the source that could not be used and were left out.
+    pub frames_refused: u64,
+    /// How many they are, which is the first, and what is wrong with it; null where there are none.
+    pub refused: Option<String>,
     /// Frames whose pose is claimed.
     pub frames_tracked: u64,
     /// Of them those whose pose is worse than it should be.
@@ -181,6 +186,9 @@ pub struct Summary {
     pub lost_count: u64,
     /// Each time the map was found to contradict itself: the frame, and why. Known in a replay.
     pub map_rejections: Option<Vec<RejectionSummary>>,
+    /// Median over the tracked frames of residuals over their standard deviation: 1 where all is as modelled, above
+    /// 1.3 the calibration is doubted; null of less than 30 frames.
+    pub whitened_residual_median: Option<f64>,
     /// From the first frame to the first whose pose is claimed; null where none is.
     pub initialization_secs: Option<f64>,
     /// Why nothing was tracked; null where something was.
@@ -304,6 +312,8 @@ impl Summary {
             failure: failure.cloned(),
             grade: grade(record),
             frames_in: record.frames_in,
+            frames_refused: record.frames_refused,
+            refused: record.refused.clone(),
             frames_tracked: count(TrackingState::is_tracked),
             frames_degraded: count(|s| matches!(s, TrackingState::Degraded(_))),
             frames_initializing: count(|s| s == TrackingState::Initializing),
@@ -315,6 +325,7 @@ impl Summary {
                 .rejections
                 .as_ref()
                 .map(|all| all.iter().map(RejectionSummary::from).collect()),
+            whitened_residual_median: whitened_residual_median(&record.poses),
             initialization_secs: initialization_secs(&record.poses),
             untracked: Untracked::of(record).map(|why| why.to_string()),
             keyframes: record.map.keyframes.len() as u64,

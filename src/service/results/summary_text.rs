@@ -13,6 +13,9 @@ pub fn summary_text(summary: &Summary) -> String {
         let _ = writeln!(text, "{name:<11} {value}");
     };
     line("frames", frames(summary));
+    if let Some(refused) = &summary.refused {
+        line("images", refused.clone());
+    }
     line(
         "map",
         format!(
@@ -65,6 +68,17 @@ pub fn summary_text(summary: &Summary) -> String {
 fn grade_text(grade: &Grade) -> String {
     let reasons: Vec<&str> = grade.reasons.iter().take(2).map(String::as_str).collect();
     format!("{}: {}", grade.level.name(), reasons.join("; "))
+}
+
+/// What the last line of a run says of images that could not be used; empty where all could.
+pub fn refused_text(summary: &Summary) -> String {
+    match summary.frames_refused {
+        0 => String::new(),
+        refused => {
+            let all = refused + summary.frames_in;
+            format!("; {refused} of {all} images could not be used and were left out")
+        }
+    }
 }
 
 fn frames(summary: &Summary) -> String {

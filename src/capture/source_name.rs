@@ -1,0 +1,326 @@
+//! Names of sources as the command line takes them, and what a folder without a name is.
+
+use std::ffi::{OsStr, OsString};
+use std::fmt;
+use std::os::unix::ffi::{OsStrExt, OsStringExt};
+use std::os::unix::fs::FileTypeExt;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+use crate::capture::source::SourceError;
+use crate::capture::{euroc, image_folder, tum};
+
+/// The forms of a source name, for errors and help.
+pub const SOURCE_FORMS: &str = "a folder (TUM, EuRoC or images), sim[:SCENE], tum:DIR, euroc:DIR, images:DIR, v4l:DEVICE and loop:FRAMES:HZ:SOURCE";
+
+/// Endings of video files.
+const VIDEO_ENDINGS: [&str; 12] =
+    ["mp4", "m4v", "mov", "mkv", "webm", "avi", "mpg", "mpeg", "ts", "wmv", "ogv", "h264"];
+/// Endings of files in which recordings are packed.
+const ARCHIVE_ENDINGS: [&str; 6] = ["zip", "tgz", "gz", "tar", "7z", "xz"];
+/// Endings of what ROS records.
+const BAG_ENDINGS: [&str; 3] = ["bag", "db3", "mcap"];
+/// Names of a folder's content that an error lists.
+const MAX_LISTED: usize = 6;
+
+/// The name of a source, as the command line takes it.
+#[derive(Debug, Clone, PartialEq)]
+pub enum SourceName {
+    /// `sim[:SCENE]`: the simulator.
+    Simulator {
+        /// The scene, where one is named.
+        scene: Option<String>,
+    },
+    /// `tum:DIR`: a recording in the layout of TUM RGB-D.
+    Tum(PathBuf),
+    /// `euroc:DIR`: a recording in the layout of EuRoC (ASL).
+    Euroc(PathBuf),
+    /// `images:DIR`: a folder of images.
+    Images(PathBuf),
+    /// `v4l:DEVICE`: a camera, by its path, its number or the name that udev gives it.
+    Camera(String),
+    /// `loop:FRAMES:HZ:SOURCE`: a recording back and forth, for benches and soak tests.
+    Looped {
+        /// Frames in all.
+        num_frames: u64,
+        /// Frames in a second.
+        rate_hz: f64,
+        /// What is repeated.
+        inner: Box<SourceName>,
+    },
+}
+
+impl SourceName {
+    /// Whether frames come at their own pace, whether or not somebody takes them.
+    pub fn is_camera(&self) -> bool {
+        matches!(self, Self::Camera(_))
+    }
+
+    /// The folder of a recording; `None` for anything else.
+    pub fn folder(&self) -> Option<&Path> {
+        match self {
+            Self::Tum(folder) | Self::Euroc(folder) | Self::Images(folder) => Some(folder),
+            Self::Looped { inner, .. } => inner.folder(),
+            Self::Simulator { .. } | Self::Camera(_) => None,
+        }
+    }
+
+    /// Reads a name: `kind:place`, or a path, whose layout is recognised. A path may have any bytes.
+    pub fn parse(name: &OsStr) -> Result<Self, SourceError> {
+        let error = |problem: &str| name_error(name, problem);
+        let bytes = name.as_bytes();
+        let (kind, rest) = match bytes.iter().position(|&byte| byte == b':') {
+            Some(colon) => (&bytes[..colon], Some(OsStr::from_bytes(&bytes[colon + 1..]))),
+            None => (bytes, None),
+        };
+        let rest = rest.filter(|rest| !rest.is_empty());
+        let text = |rest: Option<&OsStr>| match rest.map(OsStr::to_str) {
+            Some(None) => Err(error("its name is not text")),
+            Some(Some(text)) => Ok(Some(text.to_owned())),
+            None => Ok(None),
+        };
+        let folder = || rest.map(PathBuf::from).ok_or_else(|| error("the folder is missing"));
+        match kind {
+            b"loop" => text(rest)?
+                .and_then(|text| parse_loop(&text))
+                .unwrap_or_else(|| Err(error("write loop:FRAMES:HZ:SOURCE, as loop:9000:30:sim"))),
+            // A folder may be called like a kind.
+            b"tum" | b"euroc" | b"images" if bytes == kind && Path::new(name).is_dir() => {
+                recognise(Path::new(name))
+            }
+            b"sim" if bytes == b"sim:" => Err(error("the scene's name is missing")),
+            b"sim" => Ok(Self::Simulator { scene: text(rest)? }),
+            b"tum" => folder().map(Self::Tum),
+            b"euroc" => folder().map(Self::Euroc),
+            b"images" => folder().map(Self::Images),
+            b"v4l" => match text(rest)? {
+                None => Err(error("the device is missing, as in v4l:/dev/video0")),
+                Some(device) => Ok(Self::Camera(device)),
+            },
+            _ => recognise(Path::new(name)),
+        }
+    }
+
+    /// The name as an argument of another process, byte by byte.
+    pub fn to_os_string(&self) -> OsString {
+        let with = |kind: &str, place: &Path| {
+            let mut bytes = kind.as_bytes().to_vec();
+            bytes.extend_from_slice(place.as_os_str().as_bytes());
+            OsString::from_vec(bytes)
+        };
+        match self {
+            Self::Tum(folder) => with("tum:", folder),
+            Self::Euroc(folder) => with("euroc:", folder),
+            Self::Images(folder) => with("images:", folder),
+            Self::Looped { num_frames, rate_hz, inner } => {
+                with(&format!("loop:{num_frames}:{rate_hz}:"), Path::new(&inner.to_os_string()))
+            }
+            Self::Simulator { .. } | Self::Camera(_) => OsString::from(self.to_string()),
+        }
+    }
+
+    /// Whether the list by which a layout is known, or an image, is where it belongs.
+    pub(super) fn has_layout(&self) -> bool {
+        match self {
+            Self::Tum(folder) => folder.join(tum::FRAME_LIST).exists(),
+            Self::Euroc(folder) => euroc::frame_list(folder).exists(),
+            Self::Images(folder) => image_folder::has_images(folder),
+            _ => false,
+        }
+    }
+
+    /// The recording that a folder holds by its layout.
+    pub(super) fn of_folder(folder: &Path) -> Option<Self> {
+        [Self::Tum, Self::Euroc, Self::Images]
+            .into_iter()
+            .map(|form| form(folder.to_owned()))
+            .find(Self::has_layout)
+    }
+}
+
+impl FromStr for SourceName {
+    type Err = SourceError;
+
+    fn from_str(name: &str) -> Result<Self, SourceError> {
+        Self::parse(OsStr::new(name))
+    }
+}
+
+impl fmt::Display for SourceName {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Simulator { scene: None } => write!(out, "sim"),
+            Self::Simulator { scene: Some(scene) } => write!(out, "sim:{scene}"),
+            Self::Tum(folder) => write!(out, "tum:{}", folder.display()),
+            Self::Euroc(folder) => write!(out, "euroc:{}", folder.display()),
+            Self::Images(folder) => write!(out, "images:{}", folder.display()),
+            Self::Camera(device) => write!(out, "v4l:{device}"),
+            Self::Looped { num_frames, rate_hz, inner } => {
+                write!(out, "loop:{num_frames}:{rate_hz}:{inner}")
+            }
+        }
+    }
+}
+
+fn name_error(name: &OsStr, problem: &str) -> SourceError {
+    SourceError::Name { name: name.to_string_lossy().into_owned(), problem: problem.to_owned() }
+}
+
+/// `FRAMES:HZ:SOURCE`; `None` where it has another form.
+fn parse_loop(text: &str) -> Option<Result<SourceName, SourceError>> {
+    let mut parts = text.splitn(3, ':');
+    let num_frames = parts.next()?.parse().ok().filter(|&frames| frames > 0)?;
+    let rate_hz = parts.next()?.parse().ok().filter(|rate| (0.01..=10_000.0).contains(rate))?;
+    let inner = parts.next().filter(|inner| !inner.starts_with("loop"))?.parse();
+    let looped = |inner| SourceName::Looped { num_frames, rate_hz, inner: Box::new(inner) };
+    Some(inner.map(looped))
+}
+
+/// The source that a path is, or what is there instead and what to do.
+fn recognise(path: &Path) -> Result<SourceName, SourceError> {
+    let error = |problem: String| Err(name_error(path.as_os_str(), &problem));
+    let kind = match std::fs::metadata(path) {
+        Ok(metadata) => metadata.file_type(),
+        Err(_) if has_kind(path) => {
+            return error(format!("this kind is not known; sources are {SOURCE_FORMS}"));
+        }
+        Err(cause) => {
+            return error(format!("{cause}; sources are {SOURCE_FORMS}"));
+        }
+    };
+    if kind.is_dir() {
+        return SourceName::of_folder(path).map_or_else(|| error(nothing_known_in(path)), Ok);
+    }
+    let is_video_device = || path.to_string_lossy().contains("video") && kind.is_char_device();
+    match path.to_str() {
+        Some(device) if is_video_device() => Ok(SourceName::Camera(device.to_owned())),
+        _ => error(what_a_file_is(path)),
+    }
+}
+
+/// Whether a name reads like `kind:place`, whose kind is then wrong, and not like a path.
+fn has_kind(name: &Path) -> bool {
+    let name = name.to_string_lossy();
+    name.split_once(':').is_some_and(|(kind, _)| !kind.is_empty() && !kind.contains(['/', '.']))
+}
+
+fn has_ending(path: &Path, endings: &[&str]) -> bool {
+    let ending = path.extension().unwrap_or_default();
+    endings.iter().any(|known| ending.eq_ignore_ascii_case(known))
+}
+
+/// What to do with a file that is named instead of a folder.
+fn what_a_file_is(path: &Path) -> String {
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+    let folder = folder.unwrap_or(Path::new("."));
+    let is_list =
+        path.file_name().is_some_and(|name| name == tum::FRAME_LIST || name == "data.csv");
+    if has_ending(path, &VIDEO_ENDINGS) {
+        let (video, frames) = (quoted(path), quoted(&path.with_extension("frames")));
+        return format!(
+            "this is a video: make a folder of images with times of it, mkdir {frames} && ffmpeg -i {video} -fps_mode passthrough \
+             -pix_fmt gray {frames}/%06d.png && ffprobe -v error -select_streams v:0 -show_entries frame=pts_time \
+             -of default=nw=1:nk=1 {video} > {frames}/times.txt, and name that folder with --rig FILE for the camera"
+        );
+    }
+    if has_ending(path, &ARCHIVE_ENDINGS) {
+        return "this is an archive: unpack it and name the folder".to_owned();
+    }
+    if has_ending(path, &BAG_ENDINGS) {
+        return "this is a ROS bag: export its images into a folder with a times.txt and name that"
+            .to_owned();
+    }
+    if image_folder::is_called_image(path) || is_list {
+        return format!("this is one file of a recording: name its folder, {}", folder.display());
+    }
+    format!("this is a file; name a folder with a recording; sources are {SOURCE_FORMS}")
+}
+
+/// A path as an argument of a shell.
+fn quoted(path: &Path) -> String {
+    format!("'{}'", path.display().to_string().replace('\'', "'\\''"))
+}
+
+/// What was looked for in a folder that holds no recording, and what is there.
+fn nothing_known_in(folder: &Path) -> String {
+    let entries = std::fs::read_dir(folder);
+    let mut entries: Vec<PathBuf> =
+        entries.into_iter().flatten().flatten().map(|entry| entry.path()).collect();
+    entries.sort();
+    let inner = entries.iter().filter(|path| path.is_dir()).find_map(|p| SourceName::of_folder(p));
+    let name = |path: &PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let mut names: Vec<String> = entries.iter().take(MAX_LISTED).map(name).collect();
+    if entries.len() > MAX_LISTED {
+        names.push(format!("and {} more", entries.len() - MAX_LISTED));
+    }
+    let found = if names.is_empty() { "it is empty".to_owned() } else { names.join(", ") };
+    let hint =
+        inner.map_or(String::new(), |inner| format!("; there is a recording in it: {inner}"));
+    format!(
+        "no recording was recognised: looked for rgb.txt (TUM), mav0/cam0/data.csv or cam0/data.csv (EuRoC) and PNG or \
+         JPEG images, found {found}{hint}"
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_keep_every_byte_of_a_path() {
+        for name in [&b"tum:/a/\xff\xfe:b"[..], b"loop:5:30:images:/x", b"sim:room", b"v4l:0"] {
+            let name = OsStr::from_bytes(name);
+            assert_eq!(SourceName::parse(name).unwrap().to_os_string(), name);
+        }
+        assert!(SourceName::parse(OsStr::from_bytes(b"v4l:\xff")).is_err());
+    }
+
+    #[test]
+    fn a_folder_is_recognised_by_what_is_in_it() {
+        let root = tempfile::tempdir().unwrap();
+        let make = |file: &str| {
+            let path = root.path().join(file);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(&path, png_start()).unwrap();
+        };
+        make("t/rgb.txt");
+        make("t/rgb/1.png");
+        make("e/mav0/cam0/data.csv");
+        make("i/1.png");
+        make("odd: ä/1.png");
+        make("outer/inner/rgb.txt");
+        let of = |folder: &str| SourceName::parse(root.path().join(folder).as_os_str());
+        assert!(matches!(of("t"), Ok(SourceName::Tum(_))));
+        assert!(matches!(of("e"), Ok(SourceName::Euroc(_))));
+        assert!(matches!(of("e/mav0"), Ok(SourceName::Euroc(_))));
+        assert!(matches!(of("i"), Ok(SourceName::Images(_))));
+        assert!(matches!(of("odd: ä"), Ok(SourceName::Images(_))));
+        let error = of("outer").unwrap_err().to_string();
+        assert!(error.contains("found inner; there is a recording in it: tum:"), "{error}");
+        let error = of("none").unwrap_err().to_string();
+        assert!(error.contains("No such file"), "{error}");
+    }
+
+    fn png_start() -> [u8; 8] {
+        crate::capture::png_image::SIGNATURE
+    }
+
+    #[test]
+    fn files_say_what_to_do_with_them() {
+        let folder = tempfile::tempdir().unwrap();
+        for (name, words) in [
+            ("it's.MP4", "mkdir '"),
+            ("a.zip", "unpack"),
+            ("a.bag", "ROS bag"),
+            ("rgb.txt", "name its folder"),
+            ("1.png", "name its folder"),
+            ("notes", "this is a file"),
+        ] {
+            let path = folder.path().join(name);
+            std::fs::write(&path, "x").unwrap();
+            let error = SourceName::parse(path.as_os_str()).unwrap_err().to_string();
+            assert!(error.contains(words) && !error.contains('\n'), "{error}");
+        }
+        assert_eq!(quoted(Path::new("it's")), r"'it'\''s'");
+    }
+}

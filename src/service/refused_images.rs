@@ -1,0 +1,102 @@
+//! Images of a recording that could not be used: left out, counted and named.
+
+use crate::capture::source::SourceError;
+
+/// Images that are named one by one; of more only the number is told.
+const MAX_NAMED: usize = 10;
+
+/// The images that a run leaves out.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct RefusedImages {
+    count: u64,
+    /// The first of them: which, and why.
+    reasons: Vec<String>,
+    /// Reasons that have been logged.
+    logged: usize,
+    has_good_image: bool,
+}
+
+impl RefusedImages {
+    /// An image was left out for this reason. It is logged once a good one has shown that the
+    /// recording as a whole is usable; where none is, the reason becomes the error.
+    pub fn refuse(&mut self, error: &SourceError) {
+        self.count += 1;
+        if self.reasons.len() < MAX_NAMED {
+            self.reasons.push(error.to_string());
+        }
+        self.log();
+    }
+
+    /// A good image came.
+    pub fn accept(&mut self) {
+        if !self.has_good_image {
+            self.has_good_image = true;
+            self.log();
+        }
+    }
+
+    fn log(&mut self) {
+        if !self.has_good_image {
+            return;
+        }
+        for reason in &self.reasons[self.logged..] {
+            tracing::warn!("left out: {reason}");
+            self.logged += 1;
+            if self.logged == MAX_NAMED {
+                tracing::warn!("further images that are left out are only counted");
+            }
+        }
+    }
+
+    /// How many were left out.
+    pub fn count(&self) -> u64 {
+        self.count
+    }
+
+    /// The first of them, which and why.
+    pub fn reasons(&self) -> &[String] {
+        &self.reasons
+    }
+
+    /// The error of a source that has ended without one good image; `None` where there was one, or
+    /// nothing was left out.
+    pub fn error(&self) -> Option<SourceError> {
+        let first = self.reasons.first().filter(|_| !self.has_good_image)?;
+        Some(SourceError::AllDamaged { count: self.count, first: first.clone() })
+    }
+
+    /// What was left out in a few words; `None` where nothing was.
+    pub fn text(&self) -> Option<String> {
+        let first = self.reasons.first()?;
+        Some(format!("{} left out, the first: {first}", self.count))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::PathBuf;
+
+    use super::*;
+    use crate::capture::image_file::{DecodeError, ImageFileError};
+
+    fn empty(name: usize) -> SourceError {
+        let path = PathBuf::from(format!("{name}.png"));
+        ImageFileError::Decode { path, source: DecodeError::Empty }.into()
+    }
+
+    #[test]
+    fn all_are_counted_and_the_first_are_named() {
+        let mut refused = RefusedImages::default();
+        assert_eq!((refused.text(), refused.error().is_none()), (None, true));
+        for name in 0..25 {
+            refused.refuse(&empty(name));
+        }
+        assert_eq!((refused.count(), refused.reasons().len(), refused.logged), (25, 10, 0));
+        let error = refused.error().unwrap().to_string();
+        assert!(error.contains("25") && error.contains("0.png: is empty"), "{error}");
+        refused.accept();
+        assert_eq!(refused.logged, 10);
+        assert!(refused.error().is_none());
+        assert!(refused.text().unwrap().starts_with("25 left out, the first: 0.png: is empty"));
+    }
+}

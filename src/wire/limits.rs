@@ -1,0 +1,44 @@
+//! Limits of the process that are too low to take part in an instance, found before they are met.
+
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+
+use crate::wire::place::PlaceError;
+
+/// Files that a process of the pipeline may have to open at a time: the mapper has 134, each topic with
+/// its event and each further subscriber takes some more.
+const OPEN_FILES: u64 = 256;
+/// Address space of a process without images: the program, its threads' stacks and arenas. A run on
+/// small images works with 200 MB and ends in a fault of the mapper with 150 MB.
+const ADDRESS_SPACE_BYTES: u64 = 256 << 20;
+/// Times that an image's topics are mapped or copied in one process: the mapper keeps keyframes.
+const COPIES: u64 = 3;
+
+/// Raises the limit of open files to what is needed, where the hard limit lets it.
+pub fn raise_open_files() -> Result<(), PlaceError> {
+    let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
+    if current.is_none_or(|files| files >= OPEN_FILES) {
+        return Ok(());
+    }
+    let wanted = Rlimit { current: Some(OPEN_FILES), maximum };
+    match maximum {
+        Some(limit) if limit < OPEN_FILES => {
+            Err(PlaceError::OpenFiles { limit, needed: OPEN_FILES })
+        }
+        _ => setrlimit(Resource::Nofile, wanted).map_err(|_| PlaceError::OpenFiles {
+            limit: current.unwrap_or_default(),
+            needed: OPEN_FILES,
+        }),
+    }
+}
+
+/// Checks that the address space suffices for `shared_bytes` of shared memory and what is made of it:
+/// what is missing later is no error but the death of the process.
+pub fn check_address_space(shared_bytes: u64) -> Result<(), PlaceError> {
+    let needed = ADDRESS_SPACE_BYTES.saturating_add(shared_bytes.saturating_mul(COPIES));
+    match getrlimit(Resource::As).current {
+        Some(limit) if limit < needed => {
+            Err(PlaceError::AddressSpace { limit_mb: limit >> 20, needed_mb: needed >> 20 })
+        }
+        _ => Ok(()),
+    }
+}

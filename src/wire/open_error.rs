@@ -1,0 +1,104 @@
+//! Why a process cannot take part in an instance, in words that say what to do.
+
+use crate::wire::place::{Place, PlaceError, SHARED_MEMORY};
+use crate::wire::topic::WIRE_VERSION;
+
+/// Why a process cannot take part.
+#[derive(Debug, thiserror::Error)]
+pub enum OpenError {
+    /// The place is not right.
+    #[error(transparent)]
+    Place(#[from] PlaceError),
+    /// iceoryx2 cannot make a node there.
+    #[error("{root}: this process cannot join there: {reason}")]
+    Node {
+        /// Folder.
+        root: String,
+        /// What iceoryx2 says.
+        reason: String,
+    },
+    /// Nobody offers this topic.
+    #[error("nothing runs under the name `{instance}` in {root}")]
+    NotRunning {
+        /// Instance.
+        instance: String,
+        /// Folder.
+        root: String,
+    },
+    /// It runs, and its topics cannot be opened from here.
+    #[error(
+        "instance `{instance}` runs (process {holder}), but its shared memory is not in {SHARED_MEMORY}: it is just starting, or this container has a {SHARED_MEMORY} of its own (docker run --ipc=host shares the host's)"
+    )]
+    Elsewhere {
+        /// Instance.
+        instance: String,
+        /// One of its processes.
+        holder: String,
+    },
+    /// The instance is another version's.
+    #[error(
+        "instance `{instance}` speaks wire version {found}, this program {WIRE_VERSION}: stop the old one, or use programs of one version"
+    )]
+    Version {
+        /// Instance.
+        instance: String,
+        /// Its version.
+        found: u32,
+    },
+    /// A topic cannot be opened.
+    #[error("topic {topic}: {reason}")]
+    Topic {
+        /// Its name.
+        topic: String,
+        /// What iceoryx2 says.
+        reason: String,
+    },
+}
+
+pub(in crate::wire) fn not_running(place: &Place) -> OpenError {
+    if let Some(holder) = place.running() {
+        return OpenError::Elsewhere { instance: place.instance.clone(), holder };
+    }
+    let (instance, root) = (place.instance.clone(), place.root.display().to_string());
+    OpenError::NotRunning { instance, root }
+}
+
+pub(in crate::wire) fn topic_error(name: &str, error: &dyn std::fmt::Display) -> OpenError {
+    OpenError::Topic { topic: name.to_owned(), reason: in_words(&error.to_string()) }
+}
+
+/// What iceoryx2 calls by the names of its types, with what the user can do about it.
+pub(in crate::wire) fn in_words(reason: &str) -> String {
+    const CAUSES: [(&[&str], &str); 3] = [
+        (
+            &["HangsInCreation", "ServiceInCorruptedState"],
+            "another process has made it, but its shared memory is not in /dev/shm here; containers that share a runtime \
+             folder must share /dev/shm (docker run --ipc=host), else set SEMIDENSE_ROOT to a folder for each",
+        ),
+        (
+            &["InsufficientPermissions", "PermissionDenied"],
+            "another user has made it; run as that user, or set SEMIDENSE_ROOT to a folder of yours",
+        ),
+        (
+            &["InternalFailure", "InternalError", "UnableToCreate", "Unable"],
+            "the system refuses files or memory for it; look at ulimit -n, ulimit -v and the space in /dev/shm and the \
+             runtime folder (semidense doctor lists them)",
+        ),
+    ];
+    let cause = CAUSES.iter().find(|(names, _)| names.iter().any(|name| reason.contains(name)));
+    cause.map_or_else(|| reason.to_owned(), |(_, words)| format!("{words} ({reason})"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_of_types_become_words() {
+        let hangs = in_words("PublishSubscribeOpenError::HangsInCreation");
+        assert!(hangs.contains("--ipc=host") && hangs.ends_with("HangsInCreation)"), "{hangs}");
+        let files = in_words("EventCreateError(InternalFailure)");
+        assert!(files.contains("ulimit -n"), "{files}");
+        assert_eq!(in_words("IncompatibleTypes"), "IncompatibleTypes");
+    }
+}
