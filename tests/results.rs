@@ -147,6 +147,8 @@ fn record(poses: Vec<RecordedPose>, keyframes: Vec<Keyframe>, with_truth: bool) 
         frames_dropped: 0,
         gaps: 0,
         restarts: 0,
+        restart_causes: Vec::new(),
+        frames_skipped_by_mapper: None,
         deadline_nanos: None,
         deadline_misses: None,
         page_faults: None,

@@ -1,7 +1,11 @@
 //! A recording played to and fro at a steady rate: frames without end for benches and soak tests.
 
 use std::collections::VecDeque;
+use std::fs::File;
+use std::io;
+use std::path::PathBuf;
 
+use crate::capture::frame_store::FrameStore;
 use crate::capture::source::{FrameSource, FrameStamp, Notice, SourceError, SourceName};
 use crate::slam::geometry::intrinsics::Intrinsics;
 
@@ -13,7 +17,7 @@ pub struct Looped {
     name: SourceName,
     inner: Box<dyn FrameSource>,
     intrinsics: Intrinsics,
-    kept: Vec<Vec<u8>>,
+    kept: FrameStore,
     num_frames: u64,
     period_nanos: f64,
     next: u64,
@@ -31,7 +35,8 @@ impl Looped {
     ) -> Self {
         let intrinsics = inner.intrinsics();
         let period_nanos = 1e9 / rate_hz;
-        let (kept, notices) = (Vec::new(), VecDeque::new());
+        let kept = FrameStore::in_memory(intrinsics.width * intrinsics.height);
+        let notices = VecDeque::new();
         Self { name, inner, intrinsics, kept, num_frames, period_nanos, next: 0, notices }
     }
 
@@ -41,6 +46,11 @@ impl Looped {
         // There and back without showing either end twice.
         let phase = sequence % (2 * last).max(1);
         (if phase <= last { phase } else { 2 * last - phase }) as usize
+    }
+
+    /// The place of the kept frames fails.
+    fn unkept(&self, source: io::Error) -> SourceError {
+        SourceError::Read { path: PathBuf::from(self.name.to_string()), source }
     }
 }
 
@@ -57,12 +67,25 @@ impl FrameSource for Looped {
         &mut self,
         progress: &mut dyn FnMut(usize, usize) -> bool,
     ) -> Result<(), SourceError> {
+        if self.kept.is_complete() {
+            return Ok(());
+        }
         self.inner.prepare(progress)?;
         let bytes = self.intrinsics.width * self.intrinsics.height;
+        let most = (MAX_KEPT_BYTES / bytes).max(1);
+        let total = self.inner.num_frames().map_or(most, |frames| frames.min(most));
         let mut pixels = vec![0; bytes];
-        while (self.kept.len() + 1) * bytes <= MAX_KEPT_BYTES {
+        // What a process before has kept need not be kept again; images that it left out do not count.
+        let mut num_known = self.kept.len();
+        while self.kept.len() < most {
             match self.inner.next_into(&mut pixels) {
-                Ok(Some(_)) => self.kept.push(pixels.clone()),
+                Ok(Some(_)) if num_known > 0 => num_known -= 1,
+                Ok(Some(_)) => {
+                    self.kept.push(pixels.clone()).map_err(|source| self.unkept(source))?;
+                    if !progress(self.kept.len().min(total), total) {
+                        return Ok(());
+                    }
+                }
                 Ok(None) => break,
                 // A hole in what is repeated would come back with every turn: the image is left out.
                 Err(error) if error.is_passing() => {
@@ -71,6 +94,11 @@ impl FrameSource for Looped {
                 Err(error) => return Err(error),
             }
         }
+        self.kept.complete().map_err(|source| self.unkept(source))
+    }
+
+    fn keep_prepared_in(&mut self, file: File) -> io::Result<()> {
+        self.kept = FrameStore::in_file(file, self.intrinsics.width * self.intrinsics.height)?;
         Ok(())
     }
 
@@ -88,15 +116,16 @@ impl FrameSource for Looped {
             let (name, reason) = (self.name.to_string(), "it has no frames to repeat");
             return Err(SourceError::Unavailable { name, reason });
         }
-        let kept = &self.kept[self.place(self.next)];
-        if pixels.len() != kept.len() {
+        if pixels.len() != self.intrinsics.width * self.intrinsics.height {
             let Intrinsics { width, height, .. } = self.intrinsics;
             return Err(SourceError::Buffer { found: pixels.len(), width, height });
         }
         if self.next >= self.num_frames {
             return Ok(None);
         }
-        pixels.copy_from_slice(kept);
+        let kept = self.kept.get(self.place(self.next));
+        let kept = kept.ok_or_else(|| self.unkept(io::ErrorKind::UnexpectedEof.into()))?;
+        pixels.copy_from_slice(&kept);
         let sequence = self.next;
         self.next += 1;
         Ok(Some(FrameStamp {

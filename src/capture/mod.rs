@@ -4,6 +4,7 @@
 mod conformance;
 pub mod dataset_writer;
 pub mod euroc;
+pub mod frame_store;
 pub mod image_file;
 #[cfg(test)]
 mod image_file_tests;

@@ -1,5 +1,6 @@
 //! The trait of everything that frames come from.
 
+use std::fs::File;
 use std::os::fd::BorrowedFd;
 use std::path::{Path, PathBuf};
 
@@ -257,7 +258,7 @@ pub fn open(
                     problem: problem.to_owned(),
                 })?;
             }
-            Ok(Box::new(Simulator::new(params)?))
+            Ok(Box::new(Simulator::unpainted(params)?))
         }
         SourceName::Looped { inner, .. } if inner.is_camera() => {
             Err(unavailable("a camera cannot be repeated; name a recording or the simulator"))
@@ -330,6 +331,13 @@ pub trait FrameSource: Send {
 
     /// How many frames there will be, where that is known (recordings, simulator).
     fn num_frames(&self) -> Option<usize>;
+
+    /// Keeps frames that are prepared in `file` and takes those that are there: of a process of the same source
+    /// that was killed. Sources that prepare none have no use for it.
+    fn keep_prepared_in(&mut self, file: File) -> std::io::Result<()> {
+        drop(file);
+        Ok(())
+    }
 
     /// Work that must be over before the first frame is published (the simulator renders here).
     /// `progress` is called with (done, total) and returns false to stop early.

@@ -145,7 +145,7 @@ struct Replayed {
     journal: Option<Journal>,
 }
 
-/// Prepares the source and replays it under a progress bar; `None` where Ctrl-C came before a frame.
+/// Prepares the source and replays it under a progress bar; `None` where a signal came before a frame.
 fn record(
     config: &Config,
     args: &ReplayArgs,

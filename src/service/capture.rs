@@ -6,16 +6,20 @@ use std::time::Duration;
 use crate::capture::source::{
     Arrival, FrameSource, FrameStamp, SourceError, SourceName, open, rig_remarks,
 };
+use crate::service::child::{is_supervised, prepared_frames};
 use crate::service::clock::{Pace, duration_from_nanos, now_nanos};
 use crate::service::config::Config;
 use crate::service::health::{Health, ProcessState};
 use crate::service::mode::Mode;
 use crate::service::peers::Peer;
+use crate::service::position::{
+    Position, PositionKeeper, Predecessor, position_key, run_from_environment,
+};
 use crate::service::refused_images::RefusedImages;
 use crate::service::schedule::{apply, in_force};
 use crate::service::shutdown::Shutdown;
 use crate::slam::geometry::intrinsics::Intrinsics;
-use crate::wire::message::{FrameHeader, PoseMessage, StepMessage};
+use crate::wire::message::{FrameHeader, HealthMessage, PoseMessage, StepMessage};
 use crate::wire::place::{Claim, Place, PlaceError};
 use crate::wire::port::{
     Access, Hub, OpenError, Publisher, ReceiveError, SendError, Subscriber, WaitError, wait,
@@ -26,7 +30,7 @@ use crate::wire::topic::{
 
 /// Longest sleep without a look at signals and health.
 const WAKE_PERIOD: Duration = Duration::from_millis(100);
-/// Longest wait for the last pose of a tracker that runs already: it serves who comes late ten times in a
+/// Longest wait for the last pose of a tracker that runs already: it serves late subscribers ten times a
 /// second.
 const LAST_POSE_NANOS: i64 = 250_000_000;
 /// Pause between two looks for it.
@@ -107,6 +111,11 @@ pub fn run(
         shell.health.tell_ready();
         shell.stream()
     });
+    // A supervisor that did not ask for the end starts another, which continues from here.
+    let is_asked = matches!(outcome, Err(CaptureError::Interrupted)) && !is_supervised();
+    if outcome.is_ok() || is_asked {
+        shell.position.end_in_order();
+    }
     match &outcome {
         Ok(()) => {
             let left_out = shell.refused.text();
@@ -136,7 +145,11 @@ struct Shell<'a> {
     intrinsics: Intrinsics,
     frames: Publisher<u8, FrameHeader>,
     steps: Subscriber<StepMessage, ()>,
-    /// Until the first frame: what a tracker says that runs already.
+    /// Live: the place in the source, for a successor; without the file capture works too.
+    position: PositionKeeper,
+    /// Where a capture of the same run has died.
+    left: Option<Position>,
+    /// Until the first frame, where nothing is known of a capture before: what a tracker says that runs already.
     poses: Option<Subscriber<PoseMessage, ()>>,
     peers: [Peer; 2],
     health: Health,
@@ -147,7 +160,11 @@ struct Shell<'a> {
     refused: RefusedImages,
     /// What a camera's numbers begin with.
     first_sequence: u64,
+    /// What is no newer than the last frame of the capture before is not sent.
+    predecessor: Predecessor,
     next_sequence: Option<u64>,
+    /// Gaps between the last frame of the capture before and the first of this one.
+    gaps_before: u64,
     _claim: Claim,
 }
 
@@ -174,16 +191,29 @@ impl<'a> Shell<'a> {
         let claim = place.claim("capture")?;
         place.check_shared_memory(shared_memory_bytes(&intrinsics, Some("capture")))?;
         let hub = Hub::join(&place, "capture", Access::Member)?;
+        let (position, left) = match options.mode {
+            // A run in lockstep ends with any of its processes.
+            Mode::Lockstep => (PositionKeeper::default(), None),
+            Mode::Live => {
+                let source = options.source.to_string();
+                let key = position_key(&run_from_environment(), &source, options.rig.as_deref());
+                PositionKeeper::open_or_warn(&place.position_path(), key)
+            }
+        };
+        // A supervisor knows whether there was a capture before; without one the tracker is asked too.
+        let asks_tracker = options.mode == Mode::Live && left.is_none() && !is_supervised();
         let mut health = Health::open(&hub, &CAPTURE_HEALTH)?;
         health.tell_source(&options.source.to_string());
         health.counters().total = source.num_frames().unwrap_or(0) as u64;
-        Ok(Self {
+        let shell = Self {
             config,
             mode: options.mode,
             shutdown,
             frames: hub.publisher(&FRAME, intrinsics.width * intrinsics.height)?,
             steps: hub.subscriber(&STEP)?,
-            poses: (options.mode == Mode::Live).then(|| hub.subscriber(&POSE)).transpose()?,
+            position,
+            left,
+            poses: asks_tracker.then(|| hub.subscriber(&POSE)).transpose()?,
             peers: [Peer::open(&hub, &TRACKER_HEALTH)?, Peer::open(&hub, &MAPPER_HEALTH)?],
             source,
             intrinsics,
@@ -192,9 +222,13 @@ impl<'a> Shell<'a> {
             absence: None,
             refused: RefusedImages::default(),
             first_sequence: 0,
+            predecessor: Predecessor::default(),
             next_sequence: None,
+            gaps_before: 0,
             _claim: claim,
-        })
+        };
+        hub.reserve()?;
+        Ok(shell)
     }
 
     /// Whether frames come from a recording, which can wait for its readers.
@@ -205,6 +239,11 @@ impl<'a> Shell<'a> {
     /// Everything that must be over before the first frame: rendering, and tracker and mapper.
     fn prepare_source(&mut self) -> Result<(), CaptureError> {
         self.health.enter(ProcessState::Preparing, "");
+        if let Some(file) = prepared_frames()
+            && let Err(error) = self.source.keep_prepared_in(file)
+        {
+            tracing::warn!("capture: frames are prepared again after a restart ({error})");
+        }
         let (health, shutdown) = (&mut self.health, self.shutdown);
         self.source.prepare(&mut |done, total| {
             health.progress(done, total);
@@ -231,22 +270,32 @@ impl<'a> Shell<'a> {
         }
     }
 
-    /// Where another capture has died: a recording goes on behind its last frame, and a camera's
-    /// numbers behind its last number. Sequences never go back.
+    /// Where another capture has died: a recording continues behind its last frame, and a camera's
+    /// numbers behind its last number. Neither sequences nor stamps go back.
     fn go_on_after_another(&mut self) -> Result<(), CaptureError> {
+        if let Some(left) = self.left {
+            self.predecessor.last_nanos = Some(left.capture_nanos);
+            return self.go_on_behind(left.sequence);
+        }
         let Some(poses) = self.poses.take() else { return Ok(()) };
         let deadline = now_nanos().saturating_add(LAST_POSE_NANOS);
         while now_nanos() < deadline {
             let newest = poses.newest()?;
             if let Some(pose) = newest.as_ref().and_then(|message| message.payload().first()) {
-                if self.is_recorded() {
-                    self.source.skip_to(pose.sequence)?;
-                } else {
-                    self.first_sequence = pose.sequence.saturating_add(1);
-                }
-                return Ok(());
+                return self.go_on_behind(pose.sequence);
             }
             self.pause(LAST_POSE_PAUSE)?;
+        }
+        Ok(())
+    }
+
+    fn go_on_behind(&mut self, sequence: u64) -> Result<(), CaptureError> {
+        if self.is_recorded() {
+            self.source.skip_to(sequence)?;
+        } else {
+            self.first_sequence = sequence.saturating_add(1);
+            // What the camera saw while nobody looked is a hole, of a length that nobody knows.
+            self.gaps_before = 1;
         }
         Ok(())
     }
@@ -306,7 +355,7 @@ impl<'a> Shell<'a> {
     fn count_losses(&mut self) {
         if let Some(losses) = self.source.losses() {
             let counters = self.health.counters();
-            counters.gaps = losses.missing;
+            counters.gaps = losses.missing.saturating_add(self.gaps_before);
             counters.dropped = losses.late;
             counters.refused = losses.broken;
         }
@@ -329,6 +378,10 @@ impl<'a> Shell<'a> {
         };
         self.refused.accept();
         stamp.sequence = stamp.sequence.saturating_add(self.first_sequence);
+        if self.predecessor.is_ahead_of(&stamp) {
+            self.health.counters().disordered += 1;
+            return Ok(Sent::Nothing);
+        }
         if self.shutdown.is_requested() {
             return Err(CaptureError::Interrupted);
         }
@@ -344,8 +397,11 @@ impl<'a> Shell<'a> {
             Mode::Lockstep => now_nanos(),
         };
         let _span = tracing::trace_span!("publish", sequence = stamp.sequence).entered();
+        count(self.health.counters(), &mut self.next_sequence, &stamp);
+        // Before it is sent: a frame that is lost between the two is better than one that is sent twice.
+        let counters = self.health.counters();
+        self.position.note_or_warn(&Position::at(&stamp, counters.frames, counters.gaps));
         loan.send(self.header(&stamp, clock_nanos))?;
-        self.count(&stamp);
         Ok(Sent::Frame(stamp.sequence))
     }
 
@@ -382,13 +438,6 @@ impl<'a> Shell<'a> {
         }
     }
 
-    fn count(&mut self, stamp: &FrameStamp) {
-        let counters = self.health.counters();
-        counters.frames += 1;
-        counters.gaps += u64::from(self.next_sequence.is_some_and(|next| next != stamp.sequence));
-        self.next_sequence = Some(stamp.sequence.saturating_add(1));
-    }
-
     /// Lockstep: waits until the frame is in the map.
     fn await_step(&mut self, sequence: u64) -> Result<(), CaptureError> {
         let seconds = self.config.capture.step_timeout_s;
@@ -413,6 +462,12 @@ impl<'a> Shell<'a> {
         self.health.report();
         if self.shutdown.is_requested() { Err(CaptureError::Interrupted) } else { Ok(()) }
     }
+}
+
+fn count(counters: &mut HealthMessage, next_sequence: &mut Option<u64>, stamp: &FrameStamp) {
+    counters.frames += 1;
+    counters.gaps += u64::from(next_sequence.is_some_and(|next| next != stamp.sequence));
+    *next_sequence = Some(stamp.sequence.saturating_add(1));
 }
 
 /// Sleeps until `due_nanos`.

@@ -30,11 +30,9 @@ struct Shared {
 }
 
 impl Checkpoint {
-    /// Keeps the checkpoint in the file `path`; `first` is written before this returns, unless the disk
-    /// refuses, which is said in the log; the next one may fit.
-    pub fn keep(path: &Path, first: &Map) -> io::Result<Self> {
+    /// Keeps the checkpoint in the file `path`; what a mapper before has left there stays until the first.
+    pub fn keep(path: &Path) -> io::Result<Self> {
         remove_unfinished(path);
-        write_or_warn(path, first);
         let shared = Arc::new(Shared { newest: ArrayQueue::new(1), stop: AtomicBool::new(false) });
         let (theirs, file) = (Arc::clone(&shared), path.to_owned());
         let thread = std::thread::Builder::new()
@@ -46,6 +44,12 @@ impl Checkpoint {
     /// Nobody needs to go on from here: the file is removed with this.
     pub fn end_in_order(&mut self) {
         self.is_over = true;
+    }
+
+    /// Writes a state before it returns, unless the disk refuses, which is said in the log; the next one may
+    /// fit. Before the first [`Checkpoint::put`].
+    pub fn put_now(&self, map: &Map) {
+        write_or_warn(&self.path, map);
     }
 
     /// Hands over the newest state; one that was not written yet is older and goes.
@@ -140,14 +144,16 @@ mod tests {
         assert!(read_checkpoint(&path).unwrap().is_none());
         let unfinished = folder.path().join(".rig.checkpoint.17.tmp");
         fs::write(&unfinished, "half").unwrap();
-        let mut kept = Checkpoint::keep(&path, &Map::default()).unwrap();
-        assert!(!unfinished.exists() && path.exists());
+        let mut kept = Checkpoint::keep(&path).unwrap();
+        assert!(!unfinished.exists() && !path.exists());
+        kept.put_now(&Map { free_epoch: 3, ..Map::default() });
+        assert_eq!(read_checkpoint(&path).unwrap().unwrap().free_epoch, 3);
         kept.put(Map { free_epoch: 7, ..Map::default() });
         until(|| read_checkpoint(&path).unwrap().unwrap().free_epoch == 7);
         assert_eq!(fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o600);
         drop(kept);
         assert!(path.exists(), "a panic or an error is no end in order");
-        kept = Checkpoint::keep(&path, &Map::default()).unwrap();
+        kept = Checkpoint::keep(&path).unwrap();
         kept.end_in_order();
         drop(kept);
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);

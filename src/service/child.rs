@@ -1,7 +1,9 @@
 //! A process that the supervisor has started: it ends with the supervisor, whatever happens.
 
 use std::ffi::OsString;
+use std::fs::File;
 use std::io::{self, BufRead, BufReader, Write};
+use std::os::fd::AsFd;
 use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::{ChildStderr, Command, ExitStatus, Stdio};
@@ -9,12 +11,20 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use rustix::fs::MemfdFlags;
 use rustix::process::{Pid, Signal};
 
+use crate::capture::source::SourceName;
+use crate::service::liveness::Liveness;
 use crate::service::manager_notice::VARIABLES;
+use crate::service::mode::Mode;
+use crate::service::position::RUN_VARIABLE;
 
 /// Environment variable with the process id of the supervisor.
 pub const SUPERVISOR_VARIABLE: &str = "SEMIDENSE_SUPERVISOR";
+/// Environment variable that says where frames that are prepared outlive their process.
+const FRAMES_VARIABLE: &str = "SEMIDENSE_PREPARED_FRAMES";
+const FRAMES_ON_STDIN: &str = "stdin";
 /// What the last line of a command that fails begins with.
 pub const ERROR_PREFIX: &str = "error: ";
 
@@ -27,6 +37,31 @@ pub enum FollowError {
     /// The kernel refuses.
     #[error("the kernel does not tell when the supervisor dies ({0})")]
     Kernel(io::Error),
+}
+
+/// Whether a supervisor has started this process.
+pub fn is_supervised() -> bool {
+    std::env::var_os(SUPERVISOR_VARIABLE).is_some()
+}
+
+/// Where a supervisor has frames kept that are prepared before the first one is due: its own memory, so that a
+/// capture that is killed leaves them to the next.
+pub fn prepared_frames() -> Option<File> {
+    let place = std::env::var(FRAMES_VARIABLE).ok()?;
+    (place == FRAMES_ON_STDIN).then_some(())?;
+    io::stdin().as_fd().try_clone_to_owned().ok().map(File::from)
+}
+
+/// Memory for frames that are prepared before a live run and may be needed by more than one capture.
+pub fn memory_for_frames(source: &SourceName, mode: Mode) -> Option<File> {
+    let prepares = matches!(source, SourceName::Simulator { .. } | SourceName::Looped { .. });
+    if !prepares || mode != Mode::Live {
+        return None;
+    }
+    let memory = rustix::fs::memfd_create("semidense-frames", MemfdFlags::CLOEXEC);
+    let said =
+        memory.inspect_err(|error| tracing::warn!("a capture that dies prepares anew ({error})"));
+    said.ok().map(File::from)
 }
 
 /// In a process that a supervisor has started: be told to stop when it dies. Does nothing in one
@@ -55,8 +90,16 @@ pub struct Child {
 
 impl Child {
     /// Starts the subcommand `name` of this binary, in a process group of its own, so that a Ctrl-C
-    /// at the terminal reaches only the supervisor.
-    pub fn start(name: &'static str, arguments: &[OsString], root: &Path) -> io::Result<Self> {
+    /// at the terminal reaches only the supervisor. `run` names the run that it belongs to; `frames`
+    /// is where it keeps frames that it prepares.
+    pub fn start(
+        name: &'static str,
+        arguments: &[OsString],
+        root: &Path,
+        run: &str,
+        frames: Option<&File>,
+    ) -> io::Result<Self> {
+        let frames = frames.map(File::try_clone).transpose()?;
         let mut command = Command::new(std::env::current_exe()?);
         // The service manager knows the supervisor, not its children.
         for variable in VARIABLES {
@@ -67,7 +110,9 @@ impl Child {
             .args(arguments)
             .env(SUPERVISOR_VARIABLE, std::process::id().to_string())
             .env(crate::wire::place::ROOT_VARIABLE, root)
-            .stdin(Stdio::null())
+            .env(RUN_VARIABLE, run)
+            .env(FRAMES_VARIABLE, if frames.is_some() { FRAMES_ON_STDIN } else { "" })
+            .stdin(frames.map_or_else(Stdio::null, Stdio::from))
             .stdout(Stdio::null())
             .stderr(Stdio::piped())
             .process_group(0)
@@ -84,6 +129,11 @@ impl Child {
         Ok(Self { name, process, started: Instant::now(), fault, reader })
     }
 
+    /// Its process id.
+    pub fn id(&self) -> u32 {
+        self.process.id()
+    }
+
     /// How long ago it was started.
     pub fn age(&self) -> Duration {
         self.started.elapsed()
@@ -92,6 +142,11 @@ impl Child {
     /// How it ended; `None` while it runs.
     pub fn poll(&mut self) -> io::Result<Option<ExitStatus>> {
         self.process.try_wait()
+    }
+
+    /// Whether a signal or a debugger keeps it from running.
+    pub fn is_stopped(&self) -> bool {
+        Liveness::of(self.id()) == Liveness::Stopped
     }
 
     /// Asks it to stop (SIGTERM).

@@ -135,6 +135,9 @@ pub struct SupervisorConfig {
     /// Live: how often in a row processes that die within two seconds of their start are started again
     /// before the run is given up. Who has lived longer is always started again.
     pub max_restarts: u32,
+    /// Longest time without a sign of life of a process before it is killed, seconds; live it is started again,
+    /// in lockstep the run ends. 0 waits for ever.
+    pub watchdog_s: f64,
     /// Longest wait for a process to end before it is killed, seconds.
     pub stop_timeout_s: f64,
     /// Longest wait for the mapper to write its map, seconds.
@@ -143,7 +146,7 @@ pub struct SupervisorConfig {
 
 impl Default for SupervisorConfig {
     fn default() -> Self {
-        Self { max_restarts: 5, stop_timeout_s: 5.0, save_timeout_s: 120.0 }
+        Self { max_restarts: 5, watchdog_s: 10.0, stop_timeout_s: 5.0, save_timeout_s: 120.0 }
     }
 }
 
@@ -272,6 +275,10 @@ impl Config {
         check_range("mapper.threads", self.mapper.threads, 0..=256)?;
         let supervisor = &self.supervisor;
         check_range("supervisor.max_restarts", supervisor.max_restarts, 0..=1000)?;
+        // Signs of life come once a second: less than two would kill those that a busy machine holds up.
+        if supervisor.watchdog_s != 0.0 {
+            check_range("supervisor.watchdog_s", supervisor.watchdog_s, 2.0..=3600.0)?;
+        }
         check_range("supervisor.stop_timeout_s", supervisor.stop_timeout_s, seconds.clone())?;
         check_range("supervisor.save_timeout_s", supervisor.save_timeout_s, seconds)?;
         self.tracking.validate().map_err(|e| e.within("tracking"))?;

@@ -4,6 +4,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use crate::service::checkpoint::{Checkpoint, read_checkpoint};
+use crate::service::child::is_supervised;
 use crate::service::clock::now_nanos;
 use crate::service::config::Config;
 use crate::service::frame_order::{Arrival, FrameOrder, SILENCE};
@@ -40,6 +41,9 @@ use crate::wire::topic::{
 const WAKE_PERIOD: Duration = Duration::from_millis(100);
 /// Time between two checkpoints of a keyframe whose depth improves; a new keyframe has one at once.
 const CHECKPOINT_PERIOD_NANOS: i64 = 1_000_000_000;
+
+/// What a mapper says of itself before it writes its map, which may take long.
+pub const WRITES_MAP: &str = "the map is being written";
 
 /// Why the mapper ends early.
 #[derive(Debug, thiserror::Error)]
@@ -87,7 +91,10 @@ pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), Mappe
     let outcome = shell.map_until(shutdown);
     match &outcome {
         Ok(()) => {
-            shell.checkpoint.iter_mut().for_each(Checkpoint::end_in_order);
+            // A supervisor that did not ask for the end starts another, which continues from the checkpoint.
+            if !is_supervised() {
+                shell.kept.iter_mut().for_each(|kept| kept.checkpoint.end_in_order());
+            }
             shell.health.enter(ProcessState::Finished, "stopped");
         }
         Err(error) => shell.health.enter(ProcessState::Failed, &error.to_string()),
@@ -113,7 +120,7 @@ struct Shell<'a> {
     health: Health,
     mapper: Option<(Intrinsics, Mapper)>,
     /// Live: what a successor goes on from, and when it was written last.
-    checkpoint: Option<Checkpoint>,
+    kept: Option<Kept>,
     checkpoint_nanos: i64,
     /// What a mapper that died has left for this one, until the first frame.
     left: Option<Map>,
@@ -129,7 +136,7 @@ impl<'a> Shell<'a> {
         let place = Place::new(&config.instance, &config.root)?;
         let claim = place.claim("mapper")?;
         let hub = Hub::join(&place, "mapper", Access::Member)?;
-        let (checkpoint, left) = match mode {
+        let (kept, left) = match mode {
             // A run in lockstep ends with any of its processes.
             Mode::Lockstep => (None, None),
             Mode::Live => open_checkpoint(&place.checkpoint_path()),
@@ -140,7 +147,7 @@ impl<'a> Shell<'a> {
             .thread_name(|index| format!("semidense-map-{index}"))
             .build()
             .map_err(|e| MapperError::Pool { threads, reason: e.to_string() })?;
-        Ok(Self {
+        let shell = Self {
             config,
             mode,
             frames: hub.subscriber(&FRAME)?,
@@ -154,14 +161,16 @@ impl<'a> Shell<'a> {
             output: Output::open(&hub)?,
             health: Health::open(&hub, &MAPPER_HEALTH)?,
             mapper: None,
-            checkpoint,
+            kept,
             checkpoint_nanos: 0,
             left,
             last_pose: None,
             pool,
             hub,
             _claim: claim,
-        })
+        };
+        shell.hub.reserve()?;
+        Ok(shell)
     }
 
     fn map_until(&mut self, shutdown: &Shutdown) -> Result<(), MapperError> {
@@ -261,6 +270,9 @@ impl<'a> Shell<'a> {
         if pose.state.is_tracked() {
             self.last_pose = Some(*pose);
         }
+        if mapper.keyframe().is_some() {
+            self.kept.iter_mut().for_each(Kept::reserve);
+        }
         tracing::trace_span!("publish").in_scope(|| self.output.publish(mapper, &outcome))?;
         let change_nanos = change.filter(|_| outcome.keyframe_created).map_or(0, nanos_since);
         // The tracker has the keyframe; the rest it gets as another revision.
@@ -274,10 +286,10 @@ impl<'a> Shell<'a> {
         let is_new = outcome.needs_image();
         let is_due = outcome.keyframe_changed
             && now_nanos().saturating_sub(self.checkpoint_nanos) > CHECKPOINT_PERIOD_NANOS;
-        if let Some(checkpoint) = self.checkpoint.as_ref().filter(|_| is_new || is_due)
+        if let Some(kept) = self.kept.as_ref().filter(|_| is_new || is_due)
             && let Some(map) = mapper.checkpoint()
         {
-            checkpoint.put(map);
+            kept.checkpoint.put(map);
             self.checkpoint_nanos = now_nanos();
         }
         self.health.enter(ProcessState::Running, &mapper.situation().to_string());
@@ -302,6 +314,7 @@ impl<'a> Shell<'a> {
             mapper.succeed(before);
         }
         if let Some(map) = self.left.take() {
+            self.kept.iter_mut().for_each(Kept::reserve);
             let outcome = mapper.resume(map);
             self.output.publish(&mapper, &outcome)?;
         }
@@ -310,9 +323,13 @@ impl<'a> Shell<'a> {
     }
 
     fn answer_commands(&mut self) -> Result<(), MapperError> {
-        let mapper = self.mapper.as_ref().map(|(_, mapper)| mapper);
+        let (mapper, health) = (self.mapper.as_ref().map(|(_, mapper)| mapper), &mut self.health);
         Ok(self.commands.answer(|command| match command {
-            Command::SaveMap(path) => save_map(mapper, &path),
+            Command::SaveMap(path) => {
+                // It may take longer than the pause between two signs of life.
+                health.enter(ProcessState::Running, WRITES_MAP);
+                save_map(mapper, &path)
+            }
         })?)
     }
 }
@@ -323,16 +340,35 @@ fn nanos_since(begin: i64) -> u64 {
 }
 
 /// What a dead mapper has left, and the keeper of our own. Without either the mapper works too.
-fn open_checkpoint(path: &Path) -> (Option<Checkpoint>, Option<Map>) {
+fn open_checkpoint(path: &Path) -> (Option<Kept>, Option<Map>) {
     let left = read_checkpoint(path).unwrap_or_else(|error| {
         tracing::warn!("the map begins anew: {error}");
         None
     });
-    let mut reserved = left.clone().unwrap_or_default();
-    reserved.reserve_epochs();
-    let kept = Checkpoint::keep(path, &reserved);
-    let kept = kept.inspect_err(|error| tracing::warn!("there will be no checkpoints ({error})"));
-    (kept.ok(), left)
+    let mut reservation = left.clone().unwrap_or_default();
+    reservation.reserve_epochs();
+    match Checkpoint::keep(path) {
+        Ok(checkpoint) => (Some(Kept { checkpoint, reservation: Some(reservation) }), left),
+        Err(error) => {
+            tracing::warn!("there will be no checkpoints ({error})");
+            (None, left)
+        }
+    }
+}
+
+/// The checkpoint of this mapper, and what it writes before it gives its first number.
+struct Kept {
+    checkpoint: Checkpoint,
+    reservation: Option<Map>,
+}
+
+impl Kept {
+    /// From now on numbers are given: who comes after gives others.
+    fn reserve(&mut self) {
+        if let Some(map) = self.reservation.take() {
+            self.checkpoint.put_now(&map);
+        }
+    }
 }
 
 fn save_map(mapper: Option<&Mapper>, path: &Path) -> Result<(), String> {
@@ -363,7 +399,7 @@ impl Output {
     fn open_images(&mut self, hub: &Hub, intrinsics: &Intrinsics) -> Result<(), OpenError> {
         let pixels = intrinsics.width * intrinsics.height;
         self.images = Some(hub.publisher(&KEYFRAME_IMAGE, pixels)?);
-        Ok(())
+        hub.reserve()
     }
 
     fn serve_late_joiners(&self) {

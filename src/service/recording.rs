@@ -31,6 +31,17 @@ pub struct RunCounters {
     pub peak_rss_bytes: u64,
 }
 
+impl RunCounters {
+    /// Adds what one process has counted of frames.
+    pub fn add(&mut self, counted: &Self) {
+        self.frames_in += counted.frames_in;
+        self.frames_refused += counted.frames_refused;
+        self.gaps += counted.gaps;
+        self.deadline_misses += counted.deadline_misses;
+        self.page_faults += counted.page_faults;
+    }
+}
+
 /// Poses and steps of a run so far.
 #[derive(Debug, Default)]
 pub struct Recording {
@@ -128,6 +139,7 @@ impl Recording {
         if parts.depth_scale == DepthScale::Given {
             self.poses.iter_mut().for_each(|pose| pose.track_nanos = None);
         }
+        let skipped = self.poses.len().saturating_sub(self.map_nanos.len());
         RunRecord {
             mode: parts.mode,
             source: parts.source,
@@ -142,6 +154,8 @@ impl Recording {
             depth_scale: parts.depth_scale,
             gaps: counters.gaps,
             restarts: counters.restarts,
+            restart_causes: Vec::new(),
+            frames_skipped_by_mapper: (!is_replay).then_some(skipped as u64),
             deadline_nanos: is_live.then_some(deadline_nanos),
             deadline_misses: is_live.then_some(counters.deadline_misses),
             page_faults: (!is_replay).then_some(counters.page_faults),

@@ -164,16 +164,29 @@ impl Drop for Preparer {
     }
 }
 
-fn prepare_until_stopped(place: &Place, params: &ReferenceParams, shared: &Shared) {
-    let opened = Hub::join(place, "tracker-reference", Access::Member)
-        .and_then(|hub| Ok((KeyframeInbox::open(&hub)?, hub.subscriber(&STEP)?, hub)));
-    let (mut inbox, steps, _hub) = match opened {
-        Ok(opened) => opened,
-        Err(error) => {
-            tracing::error!("no keyframes: {error}");
-            return;
-        }
+type Opened = (KeyframeInbox, Subscriber<StepMessage, ()>, Hub);
+
+/// Opens the ports, again and again: a tracker without keyframes is of no use. `None` at the end.
+fn open_until_stopped(place: &Place, shared: &Shared) -> Option<Opened> {
+    let open = || -> Result<Opened, OpenError> {
+        let hub = Hub::join(place, "tracker-reference", Access::Member)?;
+        let ports = (KeyframeInbox::open(&hub)?, hub.subscriber(&STEP)?);
+        hub.reserve()?;
+        Ok((ports.0, ports.1, hub))
     };
+    while !shared.stop.load(Ordering::Acquire) {
+        match open() {
+            Ok(opened) => return Some(opened),
+            Err(error) => tracing::error!("no keyframes yet: {error}"),
+        }
+        // A pause; where it cannot be waited the next attempt comes sooner.
+        drop(wait(&[], None, WAKE_PERIOD));
+    }
+    None
+}
+
+fn prepare_until_stopped(place: &Place, params: &ReferenceParams, shared: &Shared) {
+    let Some((mut inbox, steps, _hub)) = open_until_stopped(place, shared) else { return };
     // Until the first keyframe. Here and not in the frame loop: it maps memory of the mapper's.
     let mut steps: Option<Subscriber<StepMessage, ()>> = Some(steps);
     while !shared.stop.load(Ordering::Acquire) {

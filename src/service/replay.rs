@@ -377,6 +377,8 @@ fn empty_record(source_name: &str, ground_truth: Vec<StampedPose>, poses_given: 
         frames_dropped: 0,
         gaps: 0,
         restarts: 0,
+        restart_causes: Vec::new(),
+        frames_skipped_by_mapper: None,
         deadline_nanos: None,
         deadline_misses: None,
         page_faults: None,

@@ -1,31 +1,39 @@
-//! Shutdown as a value: SIGINT and SIGTERM set it, every wait wakes by it, every loop looks at it.
+//! Shutdown as a value: SIGINT, SIGTERM and SIGHUP set it, every wait wakes by it, every loop looks at it.
 
-use std::io;
+use std::io::{self, Read};
 use std::os::fd::{AsFd, BorrowedFd};
 use std::os::unix::net::UnixStream;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
-use signal_hook::consts::{SIGINT, SIGTERM};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 /// Whether the process shall end, and a descriptor that is readable from then on.
 #[derive(Debug)]
 pub struct Shutdown {
     requested: Arc<AtomicBool>,
     readable: UnixStream,
+    /// One byte for each SIGINT.
+    interrupts: UnixStream,
+    num_interrupts: AtomicUsize,
 }
 
 impl Shutdown {
-    /// Takes over SIGINT and SIGTERM.
+    /// Takes over SIGINT (Ctrl-C), SIGTERM and SIGHUP (the terminal is closed), the last not where it is
+    /// ignored (`nohup`).
     pub fn install() -> io::Result<Self> {
         let requested = Arc::new(AtomicBool::new(false));
         let (readable, writable) = UnixStream::pair()?;
-        for signal in [SIGINT, SIGTERM] {
+        let (interrupts, interrupted) = UnixStream::pair()?;
+        interrupts.set_nonblocking(true)?;
+        signal_hook::low_level::pipe::register(SIGINT, interrupted)?;
+        let hang_up = (!is_ignored(SIGHUP)).then_some(SIGHUP);
+        for signal in [SIGINT, SIGTERM].into_iter().chain(hang_up) {
             // The flag first: whoever is woken by the descriptor must find it set.
             signal_hook::flag::register(signal, Arc::clone(&requested))?;
             signal_hook::low_level::pipe::register(signal, writable.try_clone()?)?;
         }
-        Ok(Self { requested, readable })
+        Ok(Self { requested, readable, interrupts, num_interrupts: AtomicUsize::new(0) })
     }
 
     /// Whether the process shall end.
@@ -33,10 +41,27 @@ impl Shutdown {
         self.requested.load(Ordering::Acquire)
     }
 
+    /// Whether Ctrl-C came twice: what is still waited for is to be given up.
+    pub fn is_urgent(&self) -> bool {
+        const ENOUGH: usize = 2;
+        let mut bytes = [0; ENOUGH];
+        let new = (&self.interrupts).read(&mut bytes).unwrap_or(0);
+        self.num_interrupts.fetch_add(new, Ordering::Relaxed) + new >= ENOUGH
+    }
+
     /// Readable once the process shall end.
     pub fn descriptor(&self) -> BorrowedFd<'_> {
         self.readable.as_fd()
     }
+}
+
+/// Whether this process was started with `signal` ignored.
+fn is_ignored(signal: i32) -> bool {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    let mask = mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).unwrap_or(0);
+    // Signals count from 1.
+    mask >> (signal - 1) & 1 == 1
 }
 
 #[cfg(test)]
@@ -47,12 +72,19 @@ mod tests {
 
     #[test]
     fn a_signal_ends_every_wait() {
+        for signal in [SIGTERM, SIGHUP, SIGINT] {
+            let shutdown = Shutdown::install().unwrap();
+            assert!(!shutdown.is_requested());
+            signal_hook::low_level::raise(signal).unwrap();
+            let start = Instant::now();
+            wait(&[], Some(shutdown.descriptor()), Duration::from_secs(600)).unwrap();
+            assert!(shutdown.is_requested() && !shutdown.is_urgent());
+            assert!(start.elapsed() < Duration::from_secs(300), "it waited for the timeout");
+        }
         let shutdown = Shutdown::install().unwrap();
-        assert!(!shutdown.is_requested());
-        signal_hook::low_level::raise(SIGTERM).unwrap();
-        let start = Instant::now();
-        wait(&[], Some(shutdown.descriptor()), Duration::from_secs(600)).unwrap();
-        assert!(shutdown.is_requested());
-        assert!(start.elapsed() < Duration::from_secs(300), "it waited for the timeout");
+        signal_hook::low_level::raise(SIGINT).unwrap();
+        assert!(!shutdown.is_urgent());
+        signal_hook::low_level::raise(SIGINT).unwrap();
+        assert!(shutdown.is_urgent() && shutdown.is_urgent());
     }
 }

@@ -2,27 +2,32 @@
 //! in order, and leaves nothing behind.
 
 use std::ffi::OsString;
+use std::fs::File;
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use crate::capture::source::{FrameSource, SourceError, SourceName, open};
-use crate::service::child::Child;
+use crate::service::checkpoint::read_checkpoint;
+use crate::service::child::{Child, memory_for_frames};
+use crate::service::clock::now_nanos;
 use crate::service::config::Config;
+use crate::service::final_map::{FinalMapError, final_map};
 use crate::service::health::{ProcessState, cause};
 use crate::service::journal::{Journal, JournalOptions};
-use crate::service::map_file::{MapFileError, read_map};
 use crate::service::mode::Mode;
 use crate::service::peers::{HEALTH_TOPICS, Peer};
+use crate::service::position::{position_key, read_position};
 use crate::service::recorder::Recorder;
 use crate::service::recording::{RecordParts, RunCounters};
-use crate::service::results::{EndOfRun, RunMode, RunRecord};
+use crate::service::results::{EndOfRun, RestartCause, RunMode, RunRecord};
 use crate::service::schedule::peak_rss_bytes;
 use crate::service::shutdown::Shutdown;
+use crate::service::supervised::{Death, Supervised};
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::mapper::Map;
 use crate::slam::pose::TrackingState;
-use crate::wire::command::{Command, CommandClient, CommandError};
+use crate::wire::command::CommandClient;
 use crate::wire::place::{Claim, Place, PlaceError};
 use crate::wire::port::{Access, Hub, OpenError, ReceiveError, WaitError, wait};
 use crate::wire::topic::shared_memory_bytes;
@@ -31,12 +36,10 @@ use crate::wire::topic::shared_memory_bytes;
 const WAKE_PERIOD: Duration = Duration::from_millis(50);
 /// After the last frame of a live run: silence that means all of it has been handled.
 const SILENCE: Duration = Duration::from_millis(500);
-/// Pause before the first restart of a process; it doubles up to the longest.
-const FIRST_BACK_OFF: Duration = Duration::from_millis(50);
-/// Longest pause before a restart.
-const LONGEST_BACK_OFF: Duration = Duration::from_secs(5);
-/// Who has lived so long did not die of its start: the pauses begin anew.
-const HEALTHY_LIFE: Duration = Duration::from_secs(2);
+/// Time between two looks for shared memory that is promised and not taken.
+const RESERVE_PERIOD: Duration = Duration::from_secs(1);
+/// Pause between two looks for the end or the answer of a process.
+const ANSWER_PAUSE: Duration = Duration::from_millis(5);
 
 /// What to run.
 #[derive(Debug, Clone)]
@@ -141,23 +144,26 @@ pub fn run(
     place.check_shared_memory(shared_memory_bytes(&source.intrinsics(), None))?;
     let mut supervisor = Supervisor::start(config, options, &place)?;
     let mut ended = supervisor.watch(shutdown, observe)?;
-    supervisor.stop("capture");
-    supervisor.settle(&ended)?;
-    let mut map = match options.keeps_map.then(|| supervisor.save_map()).transpose() {
+    supervisor.stop(CAPTURE, shutdown);
+    supervisor.settle(&ended, shutdown)?;
+    let mut map = match options.keeps_map.then(|| supervisor.final_map(shutdown)).transpose() {
         Ok(map) => map.unwrap_or_default(),
         Err(error) => {
             if ended == Ended::Finished {
                 ended = Ended::Failed(error.to_string());
             }
-            Map::default()
+            supervisor.map_of_checkpoint()
         }
     };
-    if options.keeps_map && (supervisor.restarts > 0 || map.keyframes.is_empty()) {
+    if options.keeps_map && (supervisor.restarts() > 0 || map.keyframes.is_empty()) {
         let max_bytes = config.mapping.max_map_bytes() as u64;
         supervisor.recorder.complete_map(&mut map, max_bytes)?;
     }
     let refused = supervisor.refused()?;
-    let (recorder, counters) = supervisor.finish()?;
+    if let (Ended::Finished, Some(cause)) = (&ended, &supervisor.bus_error) {
+        ended = Ended::Failed(cause.clone());
+    }
+    let (recorder, counters, restart_causes) = supervisor.finish(shutdown)?;
     let lost = counters.frames_in.saturating_sub(recorder.num_poses() as u64);
     if options.mode == Mode::Lockstep && ended == Ended::Finished && lost > 0 {
         ended = Ended::Failed(format!("{lost} of {} poses did not arrive", counters.frames_in));
@@ -173,7 +179,7 @@ pub fn run(
         deadline_ms,
         counters,
     });
-    let record = RunRecord { ended: end_of_run(&ended), refused, ..record };
+    let record = RunRecord { ended: end_of_run(&ended), refused, restart_causes, ..record };
     Ok(RunOutcome { record, journal, source, ended })
 }
 
@@ -206,47 +212,69 @@ fn claim_all(place: &Place) -> Result<Claim, PlaceError> {
     Ok(claim)
 }
 
+/// Indices of the processes, in the order of [`HEALTH_TOPICS`].
+const CAPTURE: usize = 0;
+const TRACKER: usize = 1;
+const MAPPER: usize = 2;
+
 struct Supervisor<'a> {
     config: &'a Config,
     options: &'a RunOptions,
-    root: PathBuf,
-    children: Vec<Child>,
-    peers: [Peer; 3],
+    place: Place,
+    /// Names the run to its processes.
+    run: String,
+    /// Frames that capture has prepared: rendering takes longer than a robot may be without poses.
+    frames: Option<File>,
+    processes: [Supervised; 3],
     recorder: Recorder,
     commands: CommandClient,
     hub: Hub,
-    restarts: u64,
-    /// What processes that died had counted by their last words.
-    of_dead: RunCounters,
-    /// Restarts in a row of processes that died young.
-    hasty_restarts: u32,
+    /// What processes that have ended had counted.
+    of_ended: RunCounters,
+    /// Why a process last died of memory that was not there: a run that meets it is no success.
+    bus_error: Option<String>,
+    /// When shared memory was last taken, and whether some of it was not to be had.
+    reserved: Instant,
+    is_short: bool,
 }
 
 impl<'a> Supervisor<'a> {
     /// Opens its own ports first, so that nothing is missed, then starts the children.
     fn start(config: &'a Config, options: &'a RunOptions, place: &Place) -> Result<Self, RunError> {
         let hub = Hub::join(place, "supervisor", Access::Member)?;
+        let open = |topic| Peer::open(&hub, topic).map(Supervised::new);
         let [capture, tracker, mapper] = &HEALTH_TOPICS;
-        let peers =
-            [Peer::open(&hub, capture)?, Peer::open(&hub, tracker)?, Peer::open(&hub, mapper)?];
+        let processes = [open(capture)?, open(tracker)?, open(mapper)?];
         let mut supervisor = Self {
             config,
             options,
-            root: place.root.clone(),
-            children: Vec::new(),
-            peers,
+            place: place.clone(),
+            run: format!("{}-{}", std::process::id(), now_nanos()),
+            frames: memory_for_frames(&options.source, options.mode),
+            processes,
             recorder: Recorder::open(&hub, begin_journal(options, place))?,
             commands: CommandClient::open(&hub)?,
             hub,
-            restarts: 0,
-            of_dead: RunCounters::default(),
-            hasty_restarts: 0,
+            of_ended: RunCounters::default(),
+            bus_error: None,
+            reserved: Instant::now(),
+            is_short: false,
         };
-        for name in ["mapper", "tracker", "capture"] {
-            let child = supervisor.spawn(name)?;
-            supervisor.children.push(child);
-        }
+        supervisor.hub.reserve()?;
+        supervisor.start_due()?;
         Ok(supervisor)
+    }
+
+    /// Starts every process that is due, those that died together at the same time.
+    fn start_due(&mut self) -> Result<(), RunError> {
+        // Who reads before who writes.
+        for index in [MAPPER, TRACKER, CAPTURE] {
+            if self.processes[index].is_due() {
+                let child = self.spawn(self.processes[index].name())?;
+                self.processes[index].run(child);
+            }
+        }
+        Ok(())
     }
 
     fn spawn(&self, name: &'static str) -> Result<Child, RunError> {
@@ -255,13 +283,15 @@ impl<'a> Supervisor<'a> {
             Mode::Lockstep => "--lockstep".into(),
             Mode::Live => "--live".into(),
         });
-        if name == "capture" {
+        if name == HEALTH_TOPICS[CAPTURE].owner {
             arguments.extend(["--source".into(), self.options.source.to_os_string()]);
             if let Some(rig) = &self.options.rig {
                 arguments.extend(["--rig".into(), rig.clone().into_os_string()]);
             }
         }
-        Child::start(name, &arguments, &self.root)
+        let is_capture = name == HEALTH_TOPICS[CAPTURE].owner;
+        let frames = self.frames.as_ref().filter(|_| is_capture);
+        Child::start(name, &arguments, &self.place.root, &self.run, frames)
             .map_err(|source| RunError::Child { process: name, source })
     }
 
@@ -274,8 +304,8 @@ impl<'a> Supervisor<'a> {
         loop {
             wait(&[self.recorder.events()], Some(shutdown.descriptor()), WAKE_PERIOD)?;
             self.recorder.collect()?;
-            for peer in &mut self.peers {
-                peer.update()?;
+            for process in &mut self.processes {
+                process.listen()?;
             }
             if self.recorder.wants_counters() {
                 self.recorder.count(self.counters());
@@ -284,15 +314,34 @@ impl<'a> Supervisor<'a> {
             if shutdown.is_requested() {
                 return Ok(Ended::Interrupted);
             }
-            if let Some(ended) = self.check_children(shutdown)? {
+            if let Some(ended) = self.check_processes()? {
                 return Ok(ended);
             }
+            self.start_due()?;
+            self.keep_reserved();
+        }
+    }
+
+    /// Takes what subscribers that have come meanwhile were promised of shared memory.
+    fn keep_reserved(&mut self) {
+        if self.reserved.elapsed() < RESERVE_PERIOD {
+            return;
+        }
+        self.reserved = Instant::now();
+        match (self.hub.reserve(), self.is_short) {
+            (Err(error), false) => {
+                tracing::warn!("{error}");
+                self.is_short = true;
+            }
+            (outcome, _) => self.is_short = outcome.is_err(),
         }
     }
 
     fn progress(&self) -> RunProgress {
-        let Some(capture) = self.peers[0].last() else { return RunProgress::Preparing(0, 0) };
-        if self.peers[0].state() == Some(ProcessState::Stale) {
+        let Some(capture) = self.processes[CAPTURE].peer.last() else {
+            return RunProgress::Preparing(0, 0);
+        };
+        if self.processes[CAPTURE].peer.state() == Some(ProcessState::Stale) {
             return RunProgress::Waiting(cause(capture));
         }
         if self.recorder.num_poses() == 0 {
@@ -306,67 +355,86 @@ impl<'a> Supervisor<'a> {
         }
     }
 
-    /// Looks who has ended: the source's end ends the run, a death restarts the process (live) or
+    /// Looks who has ended or hangs: the source's end ends the run, a death restarts the process (live) or
     /// ends the run (lockstep: a frame without an answer cannot be made good).
-    fn check_children(&mut self, shutdown: &Shutdown) -> Result<Option<Ended>, RunError> {
-        for index in 0..self.children.len() {
-            let child = &mut self.children[index];
-            let process = child.name;
-            let status = child.poll().map_err(|source| RunError::Child { process, source })?;
-            let Some(status) = status else { continue };
-            if process == "capture" && status.success() {
-                return Ok(Some(Ended::Finished));
+    fn check_processes(&mut self) -> Result<Option<Ended>, RunError> {
+        let watchdog = Duration::from_secs_f64(self.config.supervisor.watchdog_s);
+        let mut has_died = false;
+        for index in [CAPTURE, TRACKER, MAPPER] {
+            let process = &mut self.processes[index];
+            let name = process.name();
+            let ended = process
+                .poll(watchdog)
+                .map_err(|source| RunError::Child { process: name, source })?;
+            match ended {
+                None => {}
+                Some(None) => return Ok(Some(Ended::Finished)),
+                Some(Some(death)) => {
+                    has_died = true;
+                    let counted = self.counted(index);
+                    self.of_ended.add(&counted);
+                    self.processes[index].peer.forget();
+                    if let Some(failed) = self.mourn(index, death) {
+                        return Ok(Some(failed));
+                    }
+                }
             }
-            let fault = child.fault();
-            let is_fault = fault.is_some();
-            let cause = fault.unwrap_or_else(|| format!("{process} ended with {status}"));
-            if child.age() > HEALTHY_LIFE {
-                self.hasty_restarts = 0;
-            }
-            // Who says why will say the same again; who dies without a word may have had bad luck.
-            let may_restart = self.options.mode == Mode::Live
-                && !is_fault
-                && self.hasty_restarts < self.config.supervisor.max_restarts;
-            if !may_restart {
-                return Ok(Some(Ended::Failed(cause)));
-            }
-            tracing::warn!("{cause}; it is started again");
-            self.back_off(shutdown)?;
-            self.children[index] = self.spawn(process)?;
-            for peer in self.peers.iter_mut().filter(|peer| peer.name() == process) {
-                count(&mut self.of_dead, peer);
-                peer.forget();
-            }
-            self.restarts += 1;
-            self.hasty_restarts += 1;
+        }
+        if has_died {
+            self.hub.clean_up();
         }
         Ok(None)
     }
 
-    /// Waits longer with every restart, and goes on collecting.
-    fn back_off(&mut self, shutdown: &Shutdown) -> Result<(), RunError> {
-        let doubled = FIRST_BACK_OFF * 2_u32.saturating_pow(self.hasty_restarts.min(8));
-        let end = Instant::now() + doubled.min(LONGEST_BACK_OFF);
-        self.hub.clean_up();
-        while Instant::now() < end && !shutdown.is_requested() {
-            wait(&[self.recorder.events()], Some(shutdown.descriptor()), WAKE_PERIOD)?;
-            self.recorder.collect()?;
+    /// Plans a restart after a death, or says that there is none.
+    fn mourn(&mut self, index: usize, death: Death) -> Option<Ended> {
+        if death.is_bus_error {
+            self.bus_error = Some(death.cause.clone());
         }
-        Ok(())
+        let process = &mut self.processes[index];
+        let is_live = self.options.mode == Mode::Live;
+        if !is_live || !process.may_restart(&death, self.config.supervisor.max_restarts) {
+            return Some(Ended::Failed(death.cause));
+        }
+        tracing::warn!("{}; it is started again", death.cause);
+        process.plan_restart(death);
+        None
     }
 
-    fn child(&mut self, name: &str) -> Option<&mut Child> {
-        self.children.iter_mut().find(|child| child.name == name)
+    /// What a process has counted: by its last health, which may be a second old where it was killed, and for
+    /// capture by the place that it wrote down with every frame.
+    fn counted(&self, index: usize) -> RunCounters {
+        let mut counted = RunCounters::default();
+        let Some(health) = self.processes[index].peer.last() else { return counted };
+        match index {
+            CAPTURE => {
+                let source = self.options.source.to_string();
+                let key = position_key(&self.run, &source, self.options.rig.as_deref());
+                let place = read_position(&self.place.position_path(), key)
+                    .filter(|place| place.process_id == health.process_id)
+                    .unwrap_or_default();
+                counted.frames_in = health.frames.max(place.frames);
+                counted.gaps = health.gaps.max(place.gaps);
+                counted.frames_refused = health.refused;
+            }
+            TRACKER => {
+                counted.deadline_misses = health.deadline_misses;
+                counted.page_faults = health.page_faults;
+            }
+            _ => {}
+        }
+        counted
     }
 
-    /// Asks a process to stop, and kills it when it does not.
-    fn stop(&mut self, name: &str) {
+    /// Asks a process to stop, and kills it when it does not, or at a second Ctrl-C.
+    fn stop(&mut self, index: usize, shutdown: &Shutdown) {
         let end = Instant::now() + Duration::from_secs_f64(self.config.supervisor.stop_timeout_s);
-        let Some(child) = self.child(name) else { return };
+        let name = self.processes[index].name();
+        let Some(child) = self.processes[index].child() else { return };
         child.ask_to_stop();
-        while Instant::now() < end {
+        while Instant::now() < end && !shutdown.is_urgent() && !child.is_stopped() {
             match child.poll() {
-                Ok(None) => drop(wait(&[], None, Duration::from_millis(5))),
+                Ok(None) => drop(wait(&[], None, ANSWER_PAUSE)),
                 Ok(Some(_)) | Err(_) => return,
             }
         }
@@ -375,13 +443,13 @@ impl<'a> Supervisor<'a> {
     }
 
     /// Collects what is still under way after the last frame.
-    fn settle(&mut self, ended: &Ended) -> Result<(), RunError> {
+    fn settle(&mut self, ended: &Ended, shutdown: &Shutdown) -> Result<(), RunError> {
         self.recorder.collect()?;
         if self.options.mode == Mode::Lockstep || matches!(ended, Ended::Failed(_)) {
             return Ok(());
         }
         let mut last = Instant::now();
-        while last.elapsed() < SILENCE {
+        while last.elapsed() < SILENCE && !shutdown.is_urgent() {
             wait(&[self.recorder.events()], None, WAKE_PERIOD)?;
             if self.recorder.collect()? {
                 last = Instant::now();
@@ -390,24 +458,21 @@ impl<'a> Supervisor<'a> {
         Ok(())
     }
 
-    /// Has the mapper write its map, and reads it.
-    fn save_map(&mut self) -> Result<Map, SaveMapError> {
-        let file = format!(".semidense-map-{}.bin", std::process::id());
-        let path = std::path::absolute(self.options.output.join(file))?;
-        let timeout = Duration::from_secs_f64(self.config.supervisor.save_timeout_s);
-        let mapper = self.children.iter_mut().find(|child| child.name == "mapper");
-        let Some(mapper) = mapper else { return Ok(Map::default()) };
-        let command = Command::SaveMap(path.clone());
-        self.commands.ask(&command, timeout, || matches!(mapper.poll(), Ok(None)))?;
-        let map = read_map(&path);
-        remove(&path);
-        Ok(map?)
+    fn final_map(&mut self, shutdown: &Shutdown) -> Result<Map, FinalMapError> {
+        let (folder, config) = (&self.options.output, &self.config.supervisor);
+        final_map(&mut self.processes[MAPPER], &self.commands, folder, config, shutdown)
+    }
+
+    /// What a mapper that cannot be asked has written down last.
+    fn map_of_checkpoint(&self) -> Map {
+        let left = read_checkpoint(&self.place.checkpoint_path());
+        left.inspect_err(|error| tracing::warn!("{error}")).ok().flatten().unwrap_or_default()
     }
 
     /// What capture says of images that it has left out.
     fn refused(&mut self) -> Result<Option<String>, RunError> {
         let is_camera = self.options.source.is_camera();
-        let last = self.peers[0].update()?.filter(|last| last.refused > 0);
+        let last = self.processes[CAPTURE].peer.update()?.filter(|last| last.refused > 0);
         Ok(last.map(|last| match is_camera {
             true => format!("{} left out: they came damaged", last.refused),
             false => cause(last),
@@ -415,67 +480,37 @@ impl<'a> Supervisor<'a> {
     }
 
     /// Ends the others, and gives what was collected.
-    fn finish(mut self) -> Result<(Recorder, RunCounters), RunError> {
-        self.stop("tracker");
-        self.stop("mapper");
+    fn finish(
+        mut self,
+        shutdown: &Shutdown,
+    ) -> Result<(Recorder, RunCounters, Vec<RestartCause>), RunError> {
+        self.stop(TRACKER, shutdown);
+        self.stop(MAPPER, shutdown);
         self.recorder.collect()?;
-        for peer in &mut self.peers {
-            peer.update()?;
+        for process in &mut self.processes {
+            process.listen()?;
         }
         self.hub.clean_up();
-        let counters = self.counters();
-        if self.peers[0].state() == Some(ProcessState::Failed) {
-            tracing::debug!("capture has failed after {} frames", counters.frames_in);
-        }
-        Ok((self.recorder, counters))
+        let causes = self.processes.iter().flat_map(Supervised::restart_causes);
+        let (causes, counters) = (causes.collect(), self.counters());
+        Ok((self.recorder, counters, causes))
+    }
+
+    fn restarts(&self) -> u64 {
+        self.processes.iter().map(Supervised::restarts).sum()
     }
 
     /// What was counted until now.
     fn counters(&self) -> RunCounters {
-        let [capture, tracker, _] = &self.peers;
-        let peaks = self.peers.iter().filter_map(|peer| Some(peer.last()?.peak_rss_bytes));
-        let mut sums = self.of_dead;
-        [capture, tracker].into_iter().for_each(|peer| count(&mut sums, peer));
+        let peaks = self.processes.iter().filter_map(|p| Some(p.peer.last()?.peak_rss_bytes));
+        let mut sums = self.of_ended;
+        [CAPTURE, TRACKER].into_iter().for_each(|index| sums.add(&self.counted(index)));
         RunCounters {
             // Who is killed leaves the count of a moment before.
             frames_in: sums.frames_in.max(self.recorder.num_poses() as u64),
-            restarts: self.restarts,
+            restarts: self.restarts(),
             peak_rss_bytes: peaks.sum::<u64>() + peak_rss_bytes().unwrap_or(0),
             ..sums
         }
-    }
-}
-
-/// Adds what a process has counted by its last word.
-fn count(sums: &mut RunCounters, peer: &Peer) {
-    let Some(last) = peer.last() else { return };
-    match peer.name() {
-        "capture" => {
-            sums.frames_in += last.frames;
-            sums.gaps += last.gaps;
-            sums.frames_refused += last.refused;
-        }
-        "tracker" => {
-            sums.deadline_misses += last.deadline_misses;
-            sums.page_faults += last.page_faults;
-        }
-        _ => {}
-    }
-}
-
-/// Why there is no map.
-#[derive(Debug, thiserror::Error)]
-enum SaveMapError {
-    #[error(transparent)]
-    Command(#[from] CommandError),
-    #[error(transparent)]
-    File(#[from] MapFileError),
-    #[error("the output folder's path is not usable ({0})")]
-    Path(#[from] io::Error),
-}
-
-fn remove(path: &Path) {
-    if let Err(error) = std::fs::remove_file(path) {
-        tracing::warn!("{}: cannot be removed ({error})", path.display());
     }
 }

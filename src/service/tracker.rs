@@ -95,7 +95,7 @@ struct Shell<'a> {
     last_arrival_nanos: Option<i64>,
     /// Page faults of this thread until the loop was warm.
     warm_page_faults: Option<u64>,
-    _hub: Hub,
+    hub: Hub,
     _claim: Claim,
 }
 
@@ -109,7 +109,7 @@ impl<'a> Shell<'a> {
             Mode::Lockstep => ReferenceFeed::synchronous(&hub, params)?,
             Mode::Live => ReferenceFeed::threaded(&place, params).map_err(TrackerError::Thread)?,
         };
-        Ok(Self {
+        let shell = Self {
             config,
             mode,
             frames: hub.subscriber(&FRAME)?,
@@ -122,9 +122,11 @@ impl<'a> Shell<'a> {
             order: FrameOrder::default(),
             last_arrival_nanos: None,
             warm_page_faults: None,
-            _hub: hub,
+            hub,
             _claim: claim,
-        })
+        };
+        shell.hub.reserve()?;
+        Ok(shell)
     }
 
     fn track_until(&mut self, shutdown: &Shutdown) -> Result<(), TrackerError> {

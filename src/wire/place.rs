@@ -6,7 +6,8 @@ use std::io::{self, Read, Seek, Write};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
-use rustix::fs::{Access, FlockOperation};
+use iceoryx2::prelude::{Config, FileName, Path as IpcPath, SemanticString};
+use rustix::fs::{Access, FallocateFlags, FlockOperation};
 
 use crate::wire::limits::{check_address_space, raise_open_files};
 use crate::wire::root_folder::{is_mine, usual_root};
@@ -23,6 +24,9 @@ const JOIN_LOCK: &str = ".join.lock";
 
 /// End of the name of the mapper's checkpoint, behind the instance.
 const CHECKPOINT_SUFFIX: &str = ".checkpoint";
+
+/// End of the name of the file with capture's place in its source, behind the instance.
+const POSITION_SUFFIX: &str = ".position";
 
 /// End of the name of a claim's file, behind the instance and the process.
 const CLAIM_SUFFIX: &str = ".lock";
@@ -94,6 +98,16 @@ pub enum PlaceError {
         "{SHARED_MEMORY}: {0}: there is no shared memory here; mount a tmpfs there (a container: docker run --shm-size=128m)"
     )]
     NoSharedMemory(io::Error),
+    /// Shared memory ran out while what was promised was taken.
+    #[error(
+        "{SHARED_MEMORY} is full: {missing_kb} kB of {needed_kb} kB could not be reserved; enlarge it (mount -o remount,size=…, or docker run --shm-size=…) or remove what other programs left there"
+    )]
+    Reservation {
+        /// Could not be had.
+        missing_kb: u64,
+        /// Were wanted.
+        needed_kb: u64,
+    },
     /// Too little shared memory.
     #[error(
         "{SHARED_MEMORY} has {free_mb} MB free where {needed_mb} MB are needed: enlarge it (mount -o remount,size=…, or docker run --shm-size=…)"
@@ -194,6 +208,11 @@ impl Place {
         self.root.join(format!("{}{CHECKPOINT_SUFFIX}", self.instance))
     }
 
+    /// Where capture keeps its place in the source.
+    pub fn position_path(&self) -> PathBuf {
+        self.root.join(format!("{}{POSITION_SUFFIX}", self.instance))
+    }
+
     /// Takes from the group and all others what iceoryx2 gives them: its counter of nodes is the one
     /// segment that it makes for everybody.
     pub(in crate::wire) fn keep_to_user(&self) {
@@ -211,6 +230,16 @@ impl Place {
             let name = path.file_name().unwrap_or_default().to_string_lossy();
             name.starts_with(&self.prefix) && name.ends_with(".global_mgmt")
         })
+    }
+
+    /// iceoryx2's configuration for this place, independent of any file that lies around.
+    pub(in crate::wire) fn transport_config(&self) -> Result<Config, PlaceError> {
+        let wrong = |_| PlaceError::Characters(self.root.clone());
+        let mut config = Config::default();
+        let root = IpcPath::new(self.root.as_os_str().as_encoded_bytes()).map_err(wrong)?;
+        config.global.set_root_path(&root);
+        config.global.prefix = FileName::new(self.prefix.as_bytes()).map_err(wrong)?;
+        Ok(config)
     }
 
     /// Keeps [`Place::tidy`] away while a process joins.
@@ -299,6 +328,7 @@ impl Place {
             let path = entry.path();
             let name = entry.file_name().to_string_lossy().into_owned();
             if name.ends_with(CHECKPOINT_SUFFIX)
+                || name.ends_with(POSITION_SUFFIX)
                 || name.contains(CHECKPOINT_SUFFIX) && name.ends_with(".tmp")
             {
                 // Nobody is left who would go on from it.
@@ -314,6 +344,19 @@ impl Place {
         }
     }
 
+    /// Takes all memory that the segments of this place have promised, where some of it is still to be had on
+    /// first use only.
+    pub(in crate::wire) fn reserve_shared_memory(&self) -> Result<(), PlaceError> {
+        reserve(Path::new(SHARED_MEMORY), &self.prefix)
+    }
+
+    /// Checks that shared memory has room for a process and its connections to all topics.
+    pub(in crate::wire) fn check_room_to_join(&self) -> Result<(), PlaceError> {
+        /// Twice what the supervisor takes, which listens to most.
+        const JOIN_BYTES: u64 = 1 << 20;
+        self.check_shared_memory(JOIN_BYTES)
+    }
+
     /// Checks that shared memory has `needed` bytes left, and the address space room for them: what is
     /// missing is not an error later but the death of the process.
     pub fn check_shared_memory(&self, needed: u64) -> Result<(), PlaceError> {
@@ -326,6 +369,47 @@ impl Place {
             return Ok(());
         }
         Err(PlaceError::SharedMemory { free_mb: free >> 20, needed_mb: (needed >> 20) + 1 })
+    }
+}
+
+/// What is free of shared memory, bytes.
+pub fn free_shared_memory() -> Option<u64> {
+    let stat = rustix::fs::statvfs(SHARED_MEMORY).ok()?;
+    Some(stat.f_bavail.saturating_mul(stat.f_frsize))
+}
+
+/// Takes what the segments whose names begin with `prefix` in `folder` have promised and not got: they are made
+/// sparse, and a page that is not there when it is touched ends the process (SIGBUS). Milliseconds for what is new,
+/// a fraction of one where all is taken.
+fn reserve(folder: &Path, prefix: &str) -> Result<(), PlaceError> {
+    /// What `st_blocks` counts in.
+    const BLOCK_BYTES: u64 = 512;
+    let (mut needed, mut missing) = (0, 0);
+    for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+        if !entry.file_name().to_string_lossy().starts_with(prefix) {
+            continue;
+        }
+        // Segments come and go: one that is gone needs nothing.
+        let Ok(found) = entry.metadata() else { continue };
+        let lacks = found.len().saturating_sub(found.blocks().saturating_mul(BLOCK_BYTES));
+        // Written only: a segment that is being made may be open for nothing else.
+        let Ok(file) = OpenOptions::new().write(true).open(entry.path()) else { continue };
+        if lacks == 0 {
+            continue;
+        }
+        needed += lacks;
+        let taken = rustix::fs::fallocate(&file, FallocateFlags::KEEP_SIZE, 0, found.len());
+        // A file system that cannot reserve leaves it as it was.
+        if taken == Err(rustix::io::Errno::NOSPC) {
+            missing += lacks;
+        }
+    }
+    match missing {
+        0 => Ok(()),
+        _ => Err(PlaceError::Reservation {
+            missing_kb: missing.div_ceil(1 << 10),
+            needed_kb: needed.div_ceil(1 << 10),
+        }),
     }
 }
 
@@ -411,11 +495,12 @@ mod tests {
         let place = Place::new("rig", folder.path().to_str().unwrap()).unwrap();
         let dead = folder.path().join("rig.supervisor.lock");
         fs::write(&dead, "4194304\n").unwrap();
+        fs::write(place.position_path(), "").unwrap();
         let foreign = folder.path().join("notes.txt");
         fs::write(&foreign, "").unwrap();
         let living = place.claim("capture").unwrap();
         place.tidy();
-        assert!(!dead.exists() && foreign.exists());
+        assert!(!dead.exists() && foreign.exists() && !place.position_path().exists());
         assert!(place.claim("capture").is_err(), "the living one still holds its claim");
         drop(living);
     }
@@ -436,6 +521,23 @@ mod tests {
         fs::write(folder.path().join("services/x.service"), "").unwrap();
         place.tidy();
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn what_segments_promise_is_taken() {
+        // The kernel's own tmpfs, under names that no process of ours has.
+        let prefix = format!("semidense-reserve-test-{}-", std::process::id());
+        let segment = Path::new(SHARED_MEMORY).join(format!("{prefix}x"));
+        let foreign = Path::new(SHARED_MEMORY).join(format!("x{prefix}"));
+        for path in [&segment, &foreign] {
+            File::create(path).unwrap().set_len(1 << 20).unwrap();
+        }
+        reserve(Path::new(SHARED_MEMORY), &prefix).unwrap();
+        let bytes = |path: &Path| 512 * fs::metadata(path).unwrap().blocks();
+        let (taken, left) = (bytes(&segment), bytes(&foreign));
+        let length = fs::metadata(&segment).unwrap().len();
+        [segment, foreign].iter().for_each(|path| fs::remove_file(path).unwrap());
+        assert_eq!((taken, left, length), (1 << 20, 0, 1 << 20));
     }
 
     #[test]

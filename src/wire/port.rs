@@ -20,7 +20,7 @@ use rustix::event::{PollFd, PollFlags, Timespec};
 use crate::wire::limits::raise_open_files;
 pub use crate::wire::open_error::OpenError;
 use crate::wire::open_error::{in_words, not_running, topic_error};
-use crate::wire::place::{Place, PlaceError};
+use crate::wire::place::Place;
 use crate::wire::topic::Topic;
 use crate::wire::version::foreign_version;
 
@@ -86,12 +86,13 @@ impl Hub {
             return Err(not_running(place));
         }
         set_log_level(LogLevel::Fatal);
+        place.check_room_to_join()?;
         let _joining = place.hold()?;
         let root = place.root.display().to_string();
         let failed =
             |reason: String| OpenError::Node { root: root.clone(), reason: in_words(&reason) };
         let name = NodeName::new(process).map_err(|e| failed(e.to_string()))?;
-        let config = transport_config(place)?;
+        let config = place.transport_config()?;
         let node = NodeBuilder::new()
             .name(&name)
             .config(&config)
@@ -111,6 +112,11 @@ impl Hub {
         self.node.try_cleanup_dead_nodes();
     }
 
+    /// Takes all shared memory that the open ports have promised; an observer's subscriber does it by itself.
+    pub fn reserve(&self) -> Result<(), OpenError> {
+        Ok(self.place.reserve_shared_memory()?)
+    }
+
     /// A sender of slices of `T` with a header of `H`, at most `max_length` elements.
     pub fn publisher<T, H>(
         &self,
@@ -122,6 +128,8 @@ impl Hub {
         H: Debug + ZeroCopySend + 'static,
     {
         let name = topic.service_name(&self.place.instance);
+        let message_bytes = size_of::<H>() + max_length * size_of::<T>();
+        self.place.check_shared_memory(topic.bytes(message_bytes))?;
         let service = self.data_service::<T, H>(topic, &name)?;
         let port = service
             .publisher_builder()
@@ -155,6 +163,9 @@ impl Hub {
         let subscriber = Subscriber { port, events, topic: name };
         // Connects now, so that nothing sent from here on is missed.
         subscriber.connect();
+        if self.access == Access::Observer {
+            self.reserve()?;
+        }
         Ok(subscriber)
     }
 
@@ -233,16 +244,6 @@ impl Hub {
     }
 }
 
-/// iceoryx2's configuration for `place`, independent of any file that lies around.
-fn transport_config(place: &Place) -> Result<Config, OpenError> {
-    let wrong = |_| OpenError::Place(PlaceError::Characters(place.root.clone()));
-    let mut config = Config::default();
-    let root = Path::new(place.root.as_os_str().as_encoded_bytes()).map_err(wrong)?;
-    config.global.set_root_path(&root);
-    config.global.prefix = FileName::new(place.prefix.as_bytes()).map_err(wrong)?;
-    Ok(config)
-}
-
 /// Opens a service that another process may be removing at this moment.
 pub(in crate::wire) fn retry<S, E: std::fmt::Display>(
     name: &str,
@@ -302,8 +303,7 @@ impl<H: Debug + Default + ZeroCopySend> Publisher<u8, H> {
     /// Room for `length` bytes in shared memory, to be written in place.
     pub fn loan(&self, length: usize) -> Result<Loan<'_, H>, SendError> {
         let sample = self.port.loan_slice_uninit(length).map_err(|e| self.error(&e))?;
-        // SAFETY: every bit pattern is a u8, and the kernel or an earlier message has initialised
-        // the mapped memory.
+        // SAFETY: every bit pattern is a u8; the kernel or an earlier message has initialised it.
         let sample = unsafe { sample.assume_init() };
         Ok(Loan { sample, publisher: self })
     }

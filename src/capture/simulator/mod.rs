@@ -4,9 +4,14 @@
 //! of the light; [`furnish`] builds the scenes. The same [`params`] give the same bytes.
 
 use std::borrow::Cow;
+use std::fs::File;
+use std::io;
+use std::path::PathBuf;
+use std::sync::OnceLock;
 
 use rayon::prelude::*;
 
+use crate::capture::frame_store::FrameStore;
 use crate::capture::simulator::lens::Lens;
 use crate::capture::simulator::params::SimulatorParams;
 use crate::capture::simulator::render::{RenderScratch, Renderer};
@@ -54,7 +59,8 @@ const MAX_BLUR_STEPS: usize = 24;
 #[derive(Debug)]
 pub struct Simulator {
     params: SimulatorParams,
-    scene: Scene,
+    /// Painted when the first frame is rendered: a capture that takes the place of another has its frames.
+    scene: OnceLock<Scene>,
     camera: CameraModel,
     /// Rays of the raw images.
     lens: Lens,
@@ -65,16 +71,24 @@ pub struct Simulator {
     trajectory: Trajectory,
     ground_truth: Vec<StampedPose>,
     /// Raw frames rendered so far.
-    frames: Vec<Vec<u8>>,
+    frames: FrameStore,
     next: usize,
 }
 
 impl Simulator {
     /// Builds the scene and the path; nothing is rendered yet.
     pub fn new(params: SimulatorParams) -> Result<Self, ParameterError> {
+        let simulator = Self::unpainted(params)?;
+        simulator.scene();
+        Ok(simulator)
+    }
+
+    /// Builds the path alone. The first frame is to be asked for as a [`FrameSource`]: the scene is painted on the
+    /// rayon pool, which must not be busy with frames that wait for it.
+    pub fn unpainted(params: SimulatorParams) -> Result<Self, ParameterError> {
         params.validate()?;
-        let scene = furnish::build(params.scene, params.seed);
-        let trajectory = Trajectory::new(scene.stage, &params.motion, params.seed);
+        let stage = furnish::furnish(params.scene, params.seed).stage;
+        let trajectory = Trajectory::new(stage, &params.motion, params.seed);
         let camera = params.camera()?;
         let rectification = Rectification::new(&camera).map_err(|error| ParameterError {
             key: "sensor.distortion".to_owned(),
@@ -84,9 +98,10 @@ impl Simulator {
         let rectified_lens =
             (!rectification.is_identity()).then(|| Lens::pinhole(rectification.intrinsics()));
         let sensor = Sensor::new(&params.sensor, params.seed, params.width, params.height);
+        let frames = FrameStore::in_memory(params.width * params.height);
         let mut simulator = Self {
             params,
-            scene,
+            scene: OnceLock::new(),
             lens: Lens::of_camera(&camera),
             camera,
             rectification,
@@ -94,7 +109,7 @@ impl Simulator {
             sensor,
             trajectory,
             ground_truth: Vec::new(),
-            frames: Vec::new(),
+            frames,
             next: 0,
         };
         simulator.ground_truth = (0..simulator.params.frames)
@@ -110,6 +125,10 @@ impl Simulator {
     /// The parameters it was built with.
     pub fn params(&self) -> &SimulatorParams {
         &self.params
+    }
+
+    fn scene(&self) -> &Scene {
+        self.scene.get_or_init(|| furnish::build(self.params.scene, self.params.seed))
     }
 
     /// Stamp of a frame: the middle of the exposure (of the middle row), nanoseconds.
@@ -131,7 +150,7 @@ impl Simulator {
     fn light(&self, frame: usize, scratch: &mut RenderScratch) -> Vec<f32> {
         let sensor = &self.params.sensor;
         let mut light = vec![0.0; self.params.width * self.params.height];
-        let renderer = Renderer { scene: &self.scene, lens: &self.lens };
+        let renderer = Renderer { scene: self.scene(), lens: &self.lens };
         let middle_s = self.time_s(frame);
         let exposure_s = sensor.exposure_ms * 1e-3;
         let row_s = sensor.row_time_us * 1e-6;
@@ -181,7 +200,7 @@ impl Simulator {
             return None;
         }
         Some(match self.frames.get(frame) {
-            Some(rendered) => Cow::Borrowed(rendered),
+            Some(rendered) => rendered,
             None => Cow::Owned(self.render(frame, &mut RenderScratch::default())),
         })
     }
@@ -195,7 +214,7 @@ impl Simulator {
     fn depth_through(&self, lens: &Lens, frame: usize) -> Image<f32> {
         let pose = self.pose(self.time_s(frame));
         let mut depth = Image::filled(lens.width, lens.height, 0.0);
-        let renderer = Renderer { scene: &self.scene, lens };
+        let renderer = Renderer { scene: self.scene(), lens };
         renderer.depth_into(&pose, &mut RenderScratch::default(), depth.pixels_mut());
         let scale = self.params.world_scale as f32;
         for value in depth.pixels_mut() {
@@ -214,11 +233,20 @@ impl FrameSource for Simulator {
         Some(self.params.frames)
     }
 
+    fn keep_prepared_in(&mut self, file: File) -> io::Result<()> {
+        self.frames = FrameStore::in_file(file, self.params.width * self.params.height)?;
+        Ok(())
+    }
+
     fn prepare(
         &mut self,
         progress: &mut dyn FnMut(usize, usize) -> bool,
     ) -> Result<(), SourceError> {
         let total = self.params.frames;
+        if self.frames.len() < total {
+            // Before the frames that are rendered side by side.
+            self.scene();
+        }
         while self.frames.len() < total {
             if !progress(self.frames.len(), total) {
                 return Ok(());
@@ -230,9 +258,20 @@ impl FrameSource for Simulator {
                 .into_par_iter()
                 .map_init(RenderScratch::default, |scratch, frame| shared.render(frame, scratch))
                 .collect();
-            self.frames.extend(rendered);
+            for frame in rendered {
+                let path = || PathBuf::from("rendered frames");
+                self.frames
+                    .push(frame)
+                    .map_err(|source| SourceError::Read { path: path(), source })?;
+            }
         }
         progress(total, total);
+        Ok(())
+    }
+
+    fn skip_to(&mut self, sequence: u64) -> Result<(), SourceError> {
+        let next = usize::try_from(sequence.saturating_add(1)).unwrap_or(usize::MAX);
+        self.next = self.next.max(next);
         Ok(())
     }
 

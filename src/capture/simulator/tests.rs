@@ -284,7 +284,7 @@ fn a_rolling_shutter_takes_every_row_at_its_own_time() {
     params.sensor.row_time_us = 0.0;
     let global = Simulator::new(params).unwrap();
     let image = rolling.raw_frame(4).unwrap();
-    let renderer = Renderer { scene: &global.scene, lens: &global.lens };
+    let renderer = Renderer { scene: global.scene(), lens: &global.lens };
     for row in [3usize, 120, 236] {
         let time_s = global.time_s(4) + (row as f64 - 119.5) * 1e-4;
         let pose = global.pose(time_s);

@@ -96,6 +96,17 @@ pub enum EndOfRun {
     Recovered,
 }
 
+/// Why a process was started again, and how often for this.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RestartCause {
+    /// The process.
+    pub process: String,
+    /// What had ended it, in one line.
+    pub cause: String,
+    /// How often.
+    pub count: u64,
+}
+
 /// Everything that is known of a run when it ends.
 #[derive(Debug, Clone)]
 pub struct RunRecord {
@@ -125,6 +136,10 @@ pub struct RunRecord {
     pub gaps: u64,
     /// Processes that were started again.
     pub restarts: u64,
+    /// Which, and why; empty in one process.
+    pub restart_causes: Vec<RestartCause>,
+    /// Frames with a pose that the mapper did not take in because newer ones had come; `None` in one process.
+    pub frames_skipped_by_mapper: Option<u64>,
     /// Time that the tracker was allowed for a frame; `None` without a deadline.
     pub deadline_nanos: Option<u64>,
     /// Frames published after the deadline; `None` without one.

@@ -1,6 +1,6 @@
 //! `summary.json`: the figures of a run. A key without meaning in a mode is null.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use serde::{Deserialize, Serialize};
 
@@ -10,7 +10,9 @@ use crate::service::results::budget_curve::BudgetCurve;
 use crate::service::results::calibration::whitened_residual_median;
 use crate::service::results::poses::longest_epoch;
 use crate::service::results::untracked::Untracked;
-use crate::service::results::{EndOfRun, RecordedPose, Rejection, RunMode, RunRecord};
+use crate::service::results::{
+    EndOfRun, RecordedPose, Rejection, RestartCause, RunMode, RunRecord,
+};
 use crate::slam::evaluation::TrajectoryEvaluation;
 use crate::slam::evaluation::depth_error::DepthStatistics;
 use crate::slam::evaluation::grade::{Grade, GradeInput};
@@ -222,6 +224,12 @@ pub struct Summary {
     pub page_faults: Option<u64>,
     /// Processes that were started again.
     pub restarts: u64,
+    /// Of them each process by its name.
+    pub restarts_by_process: BTreeMap<String, u64>,
+    /// Why, each cause with how often.
+    pub restart_causes: Vec<RestartCause>,
+    /// Frames with a pose that the mapper did not take in because newer ones had come. Null in one process.
+    pub frames_skipped_by_mapper: Option<u64>,
     /// Time in the tracker for a frame.
     pub track_ms: Option<Percentiles>,
     /// Of it, from the frame to the first iteration: the image pyramid, but for some thousandths.
@@ -342,6 +350,9 @@ impl Summary {
             deadline_misses: record.deadline_misses,
             page_faults: record.page_faults,
             restarts: record.restarts,
+            restarts_by_process: restarts_by_process(&record.restart_causes),
+            restart_causes: record.restart_causes.clone(),
+            frames_skipped_by_mapper: record.frames_skipped_by_mapper,
             track_ms: Percentiles::of(track_nanos(record)),
             pyramid_ms: Percentiles::of(traces.iter().map(|trace| trace.pyramid_nanos)),
             alignment_levels: alignment_levels(&traces),
@@ -385,6 +396,12 @@ fn grade(record: &RunRecord) -> Grade {
 }
 
 /// Times in the tracker. A frame without a keyframe costs nothing and tells nothing.
+fn restarts_by_process(causes: &[RestartCause]) -> BTreeMap<String, u64> {
+    let mut sums = BTreeMap::new();
+    causes.iter().for_each(|cause| *sums.entry(cause.process.clone()).or_default() += cause.count);
+    sums
+}
+
 fn track_nanos(record: &RunRecord) -> impl Iterator<Item = u64> {
     let has_keyframe = |pose: &&RecordedPose| pose.estimate.keyframe_id != NO_KEYFRAME;
     record.poses.iter().filter(has_keyframe).filter_map(|pose| pose.track_nanos)

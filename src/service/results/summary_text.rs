@@ -23,6 +23,9 @@ pub fn summary_text(summary: &Summary) -> String {
             summary.keyframes, summary.points, summary.epoch
         ),
     );
+    for restart in &summary.restart_causes {
+        line("restarts", format!("{} {}: {}", restart.count, restart.process, restart.cause));
+    }
     for rejection in summary.map_rejections.iter().flatten() {
         line("rejected", format!("map at frame {}: {}", rejection.sequence, rejection.reason));
     }
@@ -86,8 +89,12 @@ fn frames(summary: &Summary) -> String {
         Some(secs) => format!("initialised after {secs:.2} s"),
         None => "never initialised".to_owned(),
     };
+    let skipped = match summary.frames_skipped_by_mapper {
+        None | Some(0) => String::new(),
+        Some(frames) => format!(", {frames} skipped by the mapper"),
+    };
     format!(
-        "{} in, {} tracked, {} lost in {} losses, {} dropped, {} gaps; {initialised}",
+        "{} in, {} tracked, {} lost in {} losses, {} dropped, {} gaps{skipped}; {initialised}",
         summary.frames_in,
         summary.frames_tracked,
         summary.frames_lost,

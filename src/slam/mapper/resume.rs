@@ -11,8 +11,8 @@ const UNKNOWN_REVISIONS: u64 = 1_000_000;
 const UNKNOWN_EPOCHS: u32 = 16;
 
 impl Map {
-    /// What a mapper writes before it begins, where a dead one may have left `self`: who comes after it
-    /// gives other numbers to its epochs, even if it dies without another checkpoint.
+    /// What a mapper writes before it numbers anything, where a dead one may have left `self`: who comes after
+    /// it gives other numbers to its epochs, even if it dies without another checkpoint.
     pub fn reserve_epochs(&mut self) {
         self.free_epoch = self.free_epoch.saturating_add(UNKNOWN_EPOCHS);
     }
@@ -53,6 +53,9 @@ impl Mapper {
                 && !keyframe.points.is_empty()
                 && keyframe.map_state == MapState::Established
         };
+        if map.free_epoch == 0 && map.keyframes.is_empty() {
+            return StepOutcome::default();
+        }
         // What the dead mapper published after its last checkpoint has numbers of its own: they are left out.
         let newest = |number: fn(&Keyframe) -> u64| map.keyframes.iter().map(number).max();
         let newest_revision = newest(|keyframe| keyframe.revision).unwrap_or(0);

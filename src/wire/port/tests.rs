@@ -140,5 +140,5 @@ fn the_file_for_foreign_tools_says_the_same() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/config/iceoryx2.toml");
     let file = Config::from_file(&FilePath::new(path.as_bytes()).unwrap()).unwrap();
     let place = Place::new("semidense", crate::wire::place::SYSTEM_ROOT).unwrap();
-    assert_eq!(file, transport_config(&place).unwrap());
+    assert_eq!(file, place.transport_config().unwrap());
 }

@@ -1,0 +1,270 @@
+//! Where capture stands in its source, in a small file of the runtime folder: whoever takes the place of a
+//! capture that was killed continues behind its last frame, whatever else died with it.
+
+use std::fs::{self, File, OpenOptions};
+use std::io;
+use std::os::unix::fs::{FileExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+
+use crate::capture::source::FrameStamp;
+
+/// Environment variable by which a supervisor names its run, so that the file of an earlier one is not taken.
+pub const RUN_VARIABLE: &str = "SEMIDENSE_RUN";
+
+/// Numbers of a slot: key, count of writes, process, sequence, stamp, frames, gaps, and their checksum.
+const SLOT_NUMBERS: usize = 8;
+const SLOT_BYTES: usize = 8 * SLOT_NUMBERS;
+/// Written in turn: a write that is cut short leaves the one before.
+const SLOTS: u64 = 2;
+
+/// The last frame of a capture and what it had counted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Position {
+    /// The capture process.
+    pub process_id: u32,
+    /// Sequence of the frame.
+    pub sequence: u64,
+    /// Its stamp, nanoseconds of the source's clock.
+    pub capture_nanos: i64,
+    /// Frames that this process has sent, with this one.
+    pub frames: u64,
+    /// Holes in the source's sequence that it has met.
+    pub gaps: u64,
+}
+
+/// Frames in a row that may be no newer than the last one of the capture before: a second at 30 Hz.
+const MAX_FRAMES_BEHIND: u32 = 30;
+
+/// What the frames of a file belong to: a run and its source. FNV-1a, 64 bits.
+pub fn position_key(run: &str, source: &str, rig: Option<&Path>) -> u64 {
+    let rig = rig.map_or(&b""[..], |rig| rig.as_os_str().as_encoded_bytes());
+    // A byte that none of them contains keeps "ab" + "c" from "a" + "bc".
+    let parts = [run.as_bytes(), &[0], source.as_bytes(), &[0], rig];
+    hash(parts.iter().flat_map(|part| part.iter().copied()))
+}
+
+fn hash(bytes: impl Iterator<Item = u8>) -> u64 {
+    const OFFSET: u64 = 0xcbf2_9ce4_8422_2325;
+    const PRIME: u64 = 0x0100_0000_01b3;
+    bytes.fold(OFFSET, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(PRIME))
+}
+
+impl Position {
+    /// Of this process at a frame.
+    pub fn at(stamp: &FrameStamp, frames: u64, gaps: u64) -> Self {
+        let (process_id, sequence) = (std::process::id(), stamp.sequence);
+        Self { process_id, sequence, capture_nanos: stamp.capture_nanos, frames, gaps }
+    }
+}
+
+/// The run that a supervisor has named to this process; empty where there is none.
+pub fn run_from_environment() -> String {
+    std::env::var(RUN_VARIABLE).unwrap_or_default()
+}
+
+/// Keeps the position of this process, where it can be kept: without a file capture works too.
+#[derive(Debug, Default)]
+pub struct PositionKeeper {
+    file: Option<PositionFile>,
+}
+
+impl PositionKeeper {
+    /// Opens the file at `path`; with it the position that a capture of the same key has left there.
+    pub fn open_or_warn(path: &Path, key: u64) -> (Self, Option<Position>) {
+        match PositionFile::open(path, key) {
+            Ok((file, left)) => (Self { file: Some(file) }, left),
+            Err(error) => {
+                let path = path.display();
+                tracing::warn!("{path}: the place in the source cannot be kept ({error})");
+                (Self::default(), None)
+            }
+        }
+    }
+
+    /// Writes the position of a frame that is about to be sent. A file that refuses is said once.
+    pub fn note_or_warn(&mut self, position: &Position) {
+        if let Some(Err(error)) = self.file.as_mut().map(|file| file.note(position)) {
+            tracing::warn!("the place in the source is not kept any more ({error})");
+            self.file = None;
+        }
+    }
+
+    /// Nobody continues from here: the file is removed when this is dropped.
+    pub fn end_in_order(&mut self) {
+        self.file.iter_mut().for_each(PositionFile::end_in_order);
+    }
+}
+
+/// How far the capture before had come, until the first frame behind it.
+#[derive(Debug, Default)]
+pub struct Predecessor {
+    /// Stamp of its last frame.
+    pub last_nanos: Option<i64>,
+    frames_behind: u32,
+}
+
+impl Predecessor {
+    /// Whether a frame is no newer than its last. A source that gives only such frames has another clock by
+    /// now.
+    pub fn is_ahead_of(&mut self, stamp: &FrameStamp) -> bool {
+        let is_ahead = self.last_nanos.is_some_and(|last| stamp.capture_nanos <= last);
+        self.frames_behind += u32::from(is_ahead);
+        if !is_ahead || self.frames_behind > MAX_FRAMES_BEHIND {
+            self.last_nanos = None;
+        }
+        self.last_nanos.is_some()
+    }
+}
+
+/// The file. It stays unless the process ends in order.
+#[derive(Debug)]
+struct PositionFile {
+    path: PathBuf,
+    file: File,
+    key: u64,
+    writes: u64,
+    is_over: bool,
+}
+
+impl PositionFile {
+    fn open(path: &Path, key: u64) -> io::Result<(Self, Option<Position>)> {
+        const USER_ALONE: u32 = 0o600;
+        let mut options = OpenOptions::new();
+        options.read(true).write(true).create(true).truncate(false).mode(USER_ALONE);
+        let file = options.open(path)?;
+        let left = newest_slot(&file, key);
+        if left.is_none() {
+            // Room for both slots is there from now on: writing a position cannot run out of it.
+            file.write_all_at(&[0; SLOT_BYTES * SLOTS as usize], 0)?;
+        }
+        let writes = left.map_or(0, |(writes, _)| writes);
+        let file = Self { path: path.to_owned(), file, key, writes, is_over: false };
+        Ok((file, left.map(|(_, position)| position)))
+    }
+
+    /// One write, without waiting for a disk.
+    fn note(&mut self, position: &Position) -> io::Result<()> {
+        self.writes += 1;
+        let slot = slot_bytes(self.key, self.writes, position);
+        self.file.write_all_at(&slot, (self.writes % SLOTS) * SLOT_BYTES as u64)
+    }
+
+    fn end_in_order(&mut self) {
+        self.is_over = true;
+    }
+}
+
+impl Drop for PositionFile {
+    fn drop(&mut self) {
+        if self.is_over {
+            drop(fs::remove_file(&self.path));
+        }
+    }
+}
+
+/// The position in the file at `path`; `None` where there is none of this key.
+pub fn read_position(path: &Path, key: u64) -> Option<Position> {
+    newest_slot(&File::open(path).ok()?, key).map(|(_, position)| position)
+}
+
+fn slot_bytes(key: u64, writes: u64, position: &Position) -> [u8; SLOT_BYTES] {
+    let Position { process_id, sequence, capture_nanos, frames, gaps } = *position;
+    let stamp = capture_nanos.cast_unsigned();
+    let numbers = [key, writes, u64::from(process_id), sequence, stamp, frames, gaps];
+    let mut bytes = [0; SLOT_BYTES];
+    for (place, number) in bytes.chunks_exact_mut(8).zip(numbers) {
+        place.copy_from_slice(&number.to_le_bytes());
+    }
+    let sum = hash(bytes[..SLOT_BYTES - 8].iter().copied());
+    bytes[SLOT_BYTES - 8..].copy_from_slice(&sum.to_le_bytes());
+    bytes
+}
+
+/// The slot that was written last of those that are whole and of this key.
+fn newest_slot(file: &File, key: u64) -> Option<(u64, Position)> {
+    let read = |slot: u64| {
+        let mut bytes = [0; SLOT_BYTES];
+        file.read_exact_at(&mut bytes, slot * SLOT_BYTES as u64).ok()?;
+        position_from_slot(&bytes, key)
+    };
+    (0..SLOTS).filter_map(read).max_by_key(|(writes, _)| *writes)
+}
+
+fn position_from_slot(bytes: &[u8; SLOT_BYTES], key: u64) -> Option<(u64, Position)> {
+    let mut numbers = [0; SLOT_NUMBERS];
+    for (number, place) in numbers.iter_mut().zip(bytes.chunks_exact(8)) {
+        *number = u64::from_le_bytes(place.try_into().ok()?);
+    }
+    let [of, writes, process_id, sequence, stamp, frames, gaps, sum] = numbers;
+    if of != key || sum != hash(bytes[..SLOT_BYTES - 8].iter().copied()) {
+        return None;
+    }
+    let process_id = u32::try_from(process_id).ok()?;
+    let capture_nanos = stamp.cast_signed();
+    Some((writes, Position { process_id, sequence, capture_nanos, frames, gaps }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn position(sequence: u64) -> Position {
+        let capture_nanos = -7 + sequence as i64;
+        Position { process_id: 17, sequence, capture_nanos, frames: sequence + 1, gaps: 2 }
+    }
+
+    #[test]
+    fn the_last_position_is_found_again_and_only_by_its_own_run() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("rig.position");
+        let key = position_key("run 1", "sim", None);
+        let (mut keeper, left) = PositionFile::open(&path, key).unwrap();
+        assert_eq!((left, read_position(&path, key)), (None, None));
+        for sequence in 0..5 {
+            keeper.note(&position(sequence)).unwrap();
+            assert_eq!(read_position(&path, key), Some(position(sequence)));
+        }
+        // A kill runs no destructor; without the word this is the same.
+        drop(keeper);
+        let (mut next, left) = PositionFile::open(&path, key).unwrap();
+        assert_eq!(left, Some(position(4)));
+        next.note(&position(5)).unwrap();
+        assert_eq!(read_position(&path, key), Some(position(5)));
+        next.end_in_order();
+        drop(next);
+        assert!(!path.exists());
+        let (mut keeper, _) = PositionFile::open(&path, key).unwrap();
+        keeper.note(&position(8)).unwrap();
+        for other in [
+            position_key("run 2", "sim", None),
+            position_key("run 1", "sim:plane", None),
+            position_key("run 1", "sim", Some(Path::new("x"))),
+        ] {
+            assert_eq!(read_position(&path, other), None);
+        }
+        let other = position_key("run 2", "sim", None);
+        assert_eq!(PositionFile::open(&path, other).unwrap().1, None);
+    }
+
+    #[test]
+    fn a_torn_write_leaves_the_position_before() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("rig.position");
+        let (mut keeper, _) = PositionFile::open(&path, 3).unwrap();
+        keeper.note(&position(10)).unwrap();
+        keeper.note(&position(11)).unwrap();
+        let whole = fs::read(&path).unwrap();
+        let newest = slot_bytes(3, 2, &position(11));
+        let at = whole.windows(SLOT_BYTES).position(|slot| slot == newest).unwrap();
+        for byte in at..at + SLOT_BYTES {
+            let mut torn = whole.clone();
+            torn[byte] ^= 0x40;
+            fs::write(&path, &torn).unwrap();
+            assert_eq!(read_position(&path, 3), Some(position(10)), "byte {byte}");
+        }
+        for length in 0..SLOT_BYTES {
+            fs::write(&path, &whole[..length]).unwrap();
+            assert_eq!(read_position(&path, 3), None, "{length} bytes");
+        }
+    }
+}

@@ -1,0 +1,283 @@
+//! One process as its supervisor sees it: whether it lives, when it gave the last sign of life, when it is
+//! started again and why it had to be.
+
+use std::io;
+use std::os::unix::process::ExitStatusExt;
+use std::process::ExitStatus;
+use std::time::{Duration, Instant};
+
+use rustix::process::Signal;
+
+use crate::service::child::Child;
+use crate::service::health::ProcessState;
+use crate::service::liveness::Liveness;
+use crate::service::peers::Peer;
+use crate::service::results::RestartCause;
+use crate::wire::place::{SHARED_MEMORY, free_shared_memory};
+use crate::wire::port::ReceiveError;
+use crate::wire::topic::CAPTURE_HEALTH;
+
+/// Pause before the second restart in a row; it doubles up to the longest. The first comes at once.
+const FIRST_BACK_OFF: Duration = Duration::from_millis(50);
+/// Longest pause before a restart.
+const LONGEST_BACK_OFF: Duration = Duration::from_secs(5);
+/// A process that has lived so long did not die of its start: the pauses begin anew.
+const HEALTHY_LIFE: Duration = Duration::from_secs(2);
+/// Shortest time that a process has for its first sign of life: it is loaded, reads its configuration and
+/// joins the others, on a machine that may be busy.
+const FIRST_SIGN: Duration = Duration::from_secs(30);
+/// A supervisor that did not look for so long was held up itself, and cannot tell who was silent meanwhile.
+const HELD_UP: Duration = Duration::from_secs(1);
+/// Free shared memory below which a SIGBUS is put down to its end, bytes: less than the smallest segment of
+/// images.
+const NEARLY_FULL_BYTES: u64 = 1 << 20;
+
+/// Why a process ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Death {
+    /// One line, which names the process.
+    pub cause: String,
+    /// Whether it ended by itself with an error of its own, which it would meet again.
+    pub is_fault: bool,
+    /// Whether memory that it had mapped was not there.
+    pub is_bus_error: bool,
+}
+
+/// One of the three processes.
+#[derive(Debug)]
+pub struct Supervised {
+    /// What it says of itself.
+    pub peer: Peer,
+    child: Option<Child>,
+    /// When the next one is due, while there is none.
+    due: Option<Instant>,
+    /// Restarts in a row of processes that died young.
+    hasty_restarts: u32,
+    /// Causes of the restarts so far, each with how often.
+    causes: Vec<(String, u64)>,
+    last_sign: Instant,
+    last_look: Instant,
+    was_ready: bool,
+}
+
+impl Supervised {
+    /// A process that is to be started.
+    pub fn new(peer: Peer) -> Self {
+        let now = Instant::now();
+        Self {
+            peer,
+            child: None,
+            due: Some(now),
+            hasty_restarts: 0,
+            causes: Vec::new(),
+            last_sign: now,
+            last_look: now,
+            was_ready: false,
+        }
+    }
+
+    /// Its name.
+    pub fn name(&self) -> &'static str {
+        self.peer.name()
+    }
+
+    /// The process itself, where it has been started and its end has not been met.
+    pub fn child(&mut self) -> Option<&mut Child> {
+        self.child.as_mut()
+    }
+
+    /// Whether it is to be started now.
+    pub fn is_due(&self) -> bool {
+        self.due.is_some_and(|due| due <= Instant::now())
+    }
+
+    /// It has been started.
+    pub fn run(&mut self, child: Child) {
+        (self.child, self.due, self.was_ready) = (Some(child), None, false);
+        (self.last_sign, self.last_look) = (Instant::now(), Instant::now());
+    }
+
+    /// Takes in what it says of itself.
+    pub fn listen(&mut self) -> Result<(), ReceiveError> {
+        // What one that has ended said last stays; what one that was killed said is counted already.
+        let Some(pid) = self.child.as_ref().map(Child::id) else { return Ok(()) };
+        let now = Instant::now();
+        let before = self.peer.last().map(|health| health.published_nanos);
+        let last = self.peer.update()?.map(|health| (health.process_id, health.published_nanos));
+        // Not the last word of the one before.
+        let is_own = last.is_some_and(|(id, _)| id == pid);
+        let was_held_up = now.duration_since(self.last_look) > HELD_UP;
+        if was_held_up || is_own && last.map(|(_, nanos)| nanos) != before {
+            self.last_sign = now;
+        }
+        self.was_ready |= is_own && self.peer.is_ready();
+        self.last_look = now;
+        if !is_own {
+            self.peer.forget();
+        }
+        Ok(())
+    }
+
+    /// For how long it has given no sign of life, where that is longer than `watchdog` allows.
+    pub fn silence(&self, watchdog: Duration) -> Option<Duration> {
+        if watchdog.is_zero() || self.child.is_none() {
+            return None;
+        }
+        let has_spoken = self.peer.last().is_some();
+        let allowed = if has_spoken { watchdog } else { watchdog.max(FIRST_SIGN) };
+        let is_at_its_end =
+            matches!(self.peer.state(), Some(ProcessState::Finished | ProcessState::Failed));
+        let silence = self.last_look.duration_since(self.last_sign);
+        // One that is at its end has said its last word, and has as long as any other to leave.
+        (silence > allowed + if is_at_its_end { FIRST_SIGN } else { Duration::ZERO })
+            .then_some(silence)
+    }
+
+    /// How it ended, if it did; one that gives no sign of life is killed. An end in order (`None` within)
+    /// is no death.
+    pub fn poll(&mut self, watchdog: Duration) -> io::Result<Option<Option<Death>>> {
+        let silence = self.silence(watchdog);
+        let name = self.peer.name();
+        let Some(child) = &mut self.child else { return Ok(None) };
+        if let Some(status) = child.poll()? {
+            let fault = child.fault();
+            // Its last words; without them its counts are a moment older.
+            drop(self.listen());
+            self.bury();
+            // Only capture ends by itself: with its source.
+            let is_end = status.success() && name == CAPTURE_HEALTH.owner;
+            return Ok(Some((!is_end).then(|| death(name, status, fault))));
+        }
+        let Some(silence) = silence else { return Ok(None) };
+        let liveness = Liveness::of(child.id());
+        child.kill();
+        self.bury();
+        let cause = hang(name, silence, liveness);
+        Ok(Some(Some(Death { cause, is_fault: false, is_bus_error: false })))
+    }
+
+    /// It has ended: its life counts for the pause before the next.
+    fn bury(&mut self) {
+        if self.child.as_ref().is_some_and(|child| child.age() > HEALTHY_LIFE) {
+            self.hasty_restarts = 0;
+        }
+        self.child = None;
+    }
+
+    /// Whether it is worth starting again after this death: a process that names a fault of its own would
+    /// meet it again, unless it is one that has just taken the place of another and found the place not yet
+    /// cleared.
+    pub fn may_restart(&self, death: &Death, max_restarts: u32) -> bool {
+        let is_lasting = death.is_fault && (self.was_ready || self.restarts() == 0);
+        !is_lasting && self.hasty_restarts < max_restarts
+    }
+
+    /// Plans the next start: at once for a process that had lived, later and later for one that dies of
+    /// its start.
+    pub fn plan_restart(&mut self, death: Death) {
+        self.due = Some(Instant::now() + back_off(self.hasty_restarts));
+        self.hasty_restarts += 1;
+        match self.causes.iter_mut().find(|(cause, _)| *cause == death.cause) {
+            Some((_, count)) => *count += 1,
+            None => self.causes.push((death.cause, 1)),
+        }
+    }
+
+    /// How often it was started again.
+    pub fn restarts(&self) -> u64 {
+        self.causes.iter().map(|(_, count)| count).sum()
+    }
+
+    /// Why, each cause with how often.
+    pub fn restart_causes(&self) -> impl Iterator<Item = RestartCause> {
+        let process = self.name();
+        self.causes.iter().map(move |(cause, count)| RestartCause {
+            process: process.to_owned(),
+            cause: cause.clone(),
+            count: *count,
+        })
+    }
+}
+
+fn back_off(hasty_restarts: u32) -> Duration {
+    match hasty_restarts {
+        0 => Duration::ZERO,
+        n => (FIRST_BACK_OFF * 2_u32.saturating_pow((n - 1).min(8))).min(LONGEST_BACK_OFF),
+    }
+}
+
+fn death(name: &str, status: ExitStatus, fault: Option<String>) -> Death {
+    let is_bus_error = status.signal() == Some(Signal::BUS.as_raw());
+    let is_fault = fault.is_some();
+    let cause = match (fault, status.signal()) {
+        (Some(fault), _) => fault,
+        (None, Some(_)) if is_bus_error => bus_error(name, free_shared_memory()),
+        (None, Some(signal)) => format!("{name} was killed by {}", signal_name(signal)),
+        (None, None) => format!("{name} ended with {status} in the middle of the run"),
+    };
+    Death { cause, is_fault, is_bus_error }
+}
+
+/// What a SIGBUS means: a page that was promised and is not there.
+fn bus_error(name: &str, free_bytes: Option<u64>) -> String {
+    match free_bytes {
+        Some(free) if free < NEARLY_FULL_BYTES => format!(
+            "{name} was killed by SIGBUS: {SHARED_MEMORY} is full ({} kB free); remove what other programs left there, or enlarge it (mount -o remount,size=…)",
+            free >> 10
+        ),
+        _ => format!(
+            "{name} was killed by SIGBUS: a page that it had mapped was not there; look at {SHARED_MEMORY} (full?) and at the disk of the recording"
+        ),
+    }
+}
+
+fn hang(name: &str, silence: Duration, liveness: Liveness) -> String {
+    let seconds = silence.as_secs();
+    match liveness {
+        Liveness::Stopped => format!(
+            "{name} was stopped (SIGSTOP or a debugger) and gave no sign of life for {seconds} s; it was killed (supervisor.watchdog_s)"
+        ),
+        _ => format!(
+            "{name} hung: no sign of life for {seconds} s; it was killed (supervisor.watchdog_s)"
+        ),
+    }
+}
+
+fn signal_name(signal: i32) -> String {
+    match Signal::from_named_raw(signal) {
+        Some(Signal::KILL) => "SIGKILL (by hand, or by the kernel for want of memory)".to_owned(),
+        Some(Signal::SEGV) => "SIGSEGV".to_owned(),
+        Some(Signal::ABORT) => "SIGABRT".to_owned(),
+        Some(Signal::TERM) => "SIGTERM".to_owned(),
+        Some(Signal::INT) => "SIGINT".to_owned(),
+        _ => format!("signal {signal}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_restart_is_at_once_and_the_pauses_grow_to_a_bound() {
+        assert_eq!(back_off(0), Duration::ZERO);
+        assert_eq!(back_off(1), FIRST_BACK_OFF);
+        assert_eq!(back_off(2), 2 * FIRST_BACK_OFF);
+        assert!((3..40).all(|n| back_off(n) > back_off(2) && back_off(n) <= LONGEST_BACK_OFF));
+        assert_eq!(back_off(u32::MAX), LONGEST_BACK_OFF);
+    }
+
+    #[test]
+    fn a_death_says_what_it_was() {
+        let of = |raw: i32| death("mapper", ExitStatus::from_raw(raw), None);
+        let killed = of(9);
+        assert!(killed.cause.starts_with("mapper was killed by SIGKILL"), "{killed:?}");
+        assert!(!killed.is_bus_error && !killed.is_fault);
+        assert!(of(7).is_bus_error && of(7).cause.contains("SIGBUS"), "{:?}", of(7));
+        assert_eq!(of(3 << 8).cause, "mapper ended with exit status: 3 in the middle of the run");
+        let fault = death("mapper", ExitStatus::from_raw(1 << 8), Some("no disk".to_owned()));
+        assert_eq!((fault.cause.as_str(), fault.is_fault), ("no disk", true));
+        assert!(bus_error("mapper", Some(4096)).contains("/dev/shm is full (4 kB free)"));
+        assert!(!bus_error("mapper", Some(1 << 30)).contains("is full"));
+    }
+}
