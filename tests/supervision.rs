@@ -1,0 +1,273 @@
+//! What a supervised run makes of processes that die together, hang, or lose their memory, and of signals to
+//! itself.
+
+#[allow(dead_code, reason = "every test uses its part of what they share")]
+mod support;
+
+use std::fs;
+use std::io::Write;
+use std::process::Child;
+use std::time::Duration;
+
+use rustix::process::{Pid, Signal, kill_process};
+use semidense::service::peers::{HEALTH_TOPICS, Peer};
+use semidense::wire::port::Hub;
+use serde_json::Value;
+use support::{Rig, end, finish, signal, until};
+
+const CAPTURE: usize = 0;
+const TRACKER: usize = 1;
+const MAPPER: usize = 2;
+
+/// A live run of ten seconds and its processes as an observer sees them.
+struct Live {
+    rig: Rig,
+    run: Child,
+    peers: Vec<Peer>,
+    _hub: Hub,
+}
+
+/// Frames of the source: ten seconds at 30 Hz.
+const FRAMES: u64 = 300;
+
+impl Live {
+    fn start(arguments: &[&str]) -> Self {
+        Self::start_in(Rig::new(), arguments)
+    }
+
+    fn start_in(rig: Rig, arguments: &[&str]) -> Self {
+        let source = format!("loop:{FRAMES}:30:sim");
+        let mut command = rig.run(40, &["--live", "--source", &source]);
+        let run = command.args(arguments).spawn().unwrap();
+        let hub = rig.observe();
+        let open = |topic| until("a process", || Peer::open(&hub, topic).ok());
+        let peers = HEALTH_TOPICS.iter().map(open).collect();
+        Self { rig, run, peers, _hub: hub }
+    }
+
+    fn until_frames(&mut self, process: usize, frames: u64) {
+        until("frames", || (self.peers[process].update().unwrap()?.frames >= frames).then_some(()));
+    }
+
+    fn pid(&mut self, process: usize) -> Pid {
+        let id = until("a process", || self.peers[process].update().unwrap().map(|h| h.process_id));
+        Pid::from_raw(id as i32).unwrap()
+    }
+
+    fn send(&mut self, processes: &[usize], signal: Signal) {
+        let pids: Vec<Pid> = processes.iter().map(|&process| self.pid(process)).collect();
+        pids.iter().for_each(|&pid| kill_process(pid, signal).unwrap());
+    }
+
+    fn until_replaced(&mut self, process: usize, before: Pid) {
+        until("the process that takes its place", || {
+            let id = self.peers[process].update().unwrap()?.process_id;
+            (Pid::from_raw(id as i32) != Some(before)).then_some(())
+        });
+    }
+
+    /// Waits for the end; exit code, standard error and the summary.
+    fn end(self) -> (Option<i32>, String, Value, Rig) {
+        drop((self.peers, self._hub));
+        let ended = end(self.run);
+        let text = fs::read_to_string(self.rig.output().join("summary.json")).unwrap_or_default();
+        let summary = serde_json::from_str(&text).unwrap_or(Value::Null);
+        assert!(!ended.stderr.contains("panicked"), "{}", ended.stderr);
+        assert_eq!(self.rig.leftovers(), Vec::<String>::new());
+        (ended.status.code(), ended.stderr, summary, self.rig)
+    }
+}
+
+/// Stamps of the poses as they were published, in the order of the file.
+fn stamps(rig: &Rig) -> Vec<f64> {
+    let text = fs::read_to_string(rig.output().join("trajectory_online.txt")).unwrap();
+    let poses = text.lines().filter(|line| !line.starts_with('#'));
+    poses.map(|line| line.split_whitespace().next().unwrap().parse().unwrap()).collect()
+}
+
+/// Whoever dies, the source goes on where it was: no frame comes twice and no stamp goes back.
+fn kills_do_not_rewind(processes: &[usize]) {
+    let mut live = Live::start(&[]);
+    live.until_frames(TRACKER, 90);
+    live.send(processes, Signal::KILL);
+    let (code, stderr, summary, rig) = live.end();
+    assert_eq!(code, Some(0), "{stderr}");
+    let stamps = stamps(&rig);
+    assert!(stamps.is_sorted_by(|one, next| one < next), "{stamps:?}");
+    // The first of the loop has the stamp of one period.
+    assert!(stamps.last().unwrap() <= &(FRAMES as f64 / 30.0 + 1e-3), "{stamps:?}");
+    assert_eq!(summary["restarts"], processes.len(), "{summary}");
+    for &process in processes {
+        assert_eq!(summary["restarts_by_process"][HEALTH_TOPICS[process].owner], 1, "{summary}");
+    }
+    assert!(summary["restart_causes"][0]["cause"].as_str().unwrap().contains("SIGKILL"));
+    // All were sent, but for those that a process that dies had in its hands.
+    let frames_in = summary["frames_in"].as_u64().unwrap();
+    assert!((FRAMES - 2..=FRAMES).contains(&frames_in), "{summary}");
+}
+
+#[test]
+fn capture_and_tracker_that_die_together_do_not_rewind_the_source() {
+    kills_do_not_rewind(&[CAPTURE, TRACKER]);
+}
+
+#[test]
+fn all_three_that_die_together_do_not_rewind_the_source() {
+    kills_do_not_rewind(&[CAPTURE, TRACKER, MAPPER]);
+}
+
+#[test]
+fn a_closed_terminal_ends_a_run_with_its_results() {
+    let mut live = Live::start(&[]);
+    live.until_frames(TRACKER, 60);
+    signal(&live.run, Signal::HUP);
+    let (code, stderr, summary, rig) = live.end();
+    assert_eq!(code, Some(130), "{stderr}");
+    assert!(summary["frames_in"].as_u64().unwrap() >= 60, "{summary}");
+    assert!(rig.output().join("map.ply").exists());
+}
+
+#[test]
+fn a_replay_that_is_ended_by_any_signal_keeps_its_results() {
+    for ending in [Signal::INT, Signal::TERM, Signal::HUP] {
+        let rig = Rig::new();
+        let output = rig.output();
+        let arguments = ["replay", "loop:1000000:30:sim", "--output", output.to_str().unwrap()];
+        let mut command = rig.command(&arguments);
+        for setting in support::small_camera(20) {
+            command.args(["--set", &format!("simulator.{setting}")]);
+        }
+        let replay = command.spawn().unwrap();
+        // Nothing says that frames are done; what comes too soon ends it without results and another code path.
+        std::thread::sleep(Duration::from_secs(3));
+        signal(&replay, ending);
+        let ended = end(replay);
+        assert_eq!(ended.status.code(), Some(130), "{ending:?}: {}", ended.stderr);
+    }
+}
+
+#[test]
+fn a_process_that_hangs_is_started_again_and_said() {
+    for process in [CAPTURE, TRACKER, MAPPER] {
+        let mut live = Live::start(&["--set", "supervisor.watchdog_s=2"]);
+        live.until_frames(TRACKER, 45);
+        let stopped = live.pid(process);
+        live.send(&[process], Signal::STOP);
+        live.until_replaced(process, stopped);
+        let (code, stderr, summary, rig) = live.end();
+        assert_eq!(code, Some(0), "{stderr}");
+        let cause = summary["restart_causes"][0]["cause"].as_str().unwrap_or_default();
+        assert!(cause.contains("was stopped"), "{summary}");
+        assert!(cause.starts_with(HEALTH_TOPICS[process].owner), "{summary}");
+        assert!(stamps(&rig).is_sorted_by(|one, next| one < next));
+    }
+}
+
+#[test]
+fn a_process_that_hangs_in_lockstep_ends_the_run_with_its_name() {
+    let rig = Rig::new();
+    let watchdog = ["--set", "supervisor.watchdog_s=2"];
+    let mut command = rig.run(40, &["--lockstep", "--source", "loop:1000000:30:sim"]);
+    let run = command.args(watchdog).spawn().unwrap();
+    let hub = rig.observe();
+    let mut tracker = until("the tracker", || Peer::open(&hub, &HEALTH_TOPICS[TRACKER]).ok());
+    let id = until("frames", || {
+        let health = tracker.update().unwrap();
+        health.filter(|health| health.frames > 5).map(|health| health.process_id)
+    });
+    kill_process(Pid::from_raw(id as i32).unwrap(), Signal::STOP).unwrap();
+    drop((tracker, hub));
+    let ended = end(run);
+    assert_eq!(ended.status.code(), Some(1), "{}", ended.stderr);
+    assert!(ended.stderr.contains("error: tracker was stopped"), "{}", ended.stderr);
+    assert_eq!(rig.leftovers(), Vec::<String>::new());
+}
+
+#[test]
+fn a_mapper_that_hangs_at_the_end_does_not_hold_up_the_results() {
+    let mut live = Live::start(&[]);
+    live.until_frames(MAPPER, 90);
+    // More than a second of mapping: there is a checkpoint.
+    live.send(&[MAPPER], Signal::STOP);
+    signal(&live.run, Signal::INT);
+    let (code, stderr, summary, _rig) = live.end();
+    assert_eq!(code, Some(130), "{stderr}");
+    assert!(summary["keyframes"].as_u64().unwrap() > 0, "the checkpoint serves: {summary}");
+}
+
+#[test]
+fn a_mapper_that_dies_before_it_numbers_anything_leaves_the_first_numbers() {
+    let mut live = Live::start(&[]);
+    let before = live.pid(MAPPER);
+    live.send(&[MAPPER], Signal::KILL);
+    live.until_replaced(MAPPER, before);
+    let (code, stderr, summary, rig) = live.end();
+    assert_eq!(code, Some(0), "{stderr}");
+    assert_eq!(summary["restarts"], 1, "{summary}");
+    assert_eq!(summary["epoch"], 0, "{summary}");
+    let keyframes = fs::read_to_string(rig.output().join("keyframes.txt")).unwrap();
+    let first = keyframes.lines().find(|line| !line.starts_with('#')).unwrap();
+    const KEYFRAME_ID: usize = 9;
+    assert_eq!(first.split_whitespace().nth(KEYFRAME_ID), Some("0"), "{first}");
+}
+
+/// Runs `script` in a shell with a /dev/shm of its own, of `megabytes`; `None` where that is not allowed here.
+fn with_shared_memory(rig: &Rig, megabytes: u32, script: &str) -> Option<support::Ended> {
+    let mount = format!("mount -t tmpfs -o size={megabytes}m tmpfs /dev/shm");
+    let shell = |script: &str| {
+        let mut command = rig.command(&[]);
+        let binary = command.get_program().to_owned();
+        command = std::process::Command::new("unshare");
+        command.args(["--mount", "sh", "-c", script]).env("SEMIDENSE", binary);
+        command.env("SEMIDENSE_ROOT", rig.root()).env("OUTPUT", rig.output());
+        command.stdin(std::process::Stdio::null());
+        command.stdout(std::process::Stdio::piped()).stderr(std::process::Stdio::piped());
+        command
+    };
+    let may = shell(&mount).status().is_ok_and(|status| status.success());
+    if !may {
+        let line = "skipped: this user may not mount a /dev/shm of its own (unshare --mount)";
+        let _ = writeln!(std::io::stderr(), "{line}");
+        return None;
+    }
+    Some(finish(shell(&format!("{mount} && {script}"))))
+}
+
+/// Options of a small live run, for a shell.
+const SMALL: &str = "--live --source loop:150:30:sim --output $OUTPUT --set simulator.frames=40 \
+     --set simulator.width=160 --set simulator.height=120 --set simulator.focal_px=131.0";
+
+#[test]
+fn shared_memory_that_others_fill_costs_a_run_nothing() {
+    let rig = Rig::new();
+    // Whatever is left once frames flow is taken by somebody else.
+    let script = format!(
+        "$SEMIDENSE run {SMALL} & run=$!; \
+         until $SEMIDENSE status --once 2>/dev/null | grep -q '^mapper .*mapping'; do sleep 0.2; done; \
+         dd if=/dev/zero of=/dev/shm/foreign bs=64k 2>/dev/null; \
+         $SEMIDENSE status --once >&2; echo status $? >&2; wait $run"
+    );
+    let Some(ended) = with_shared_memory(&rig, 64, &script) else { return };
+    assert_eq!(ended.status.code(), Some(0), "{}", ended.stderr);
+    assert!(!ended.stderr.contains("SIGBUS"), "{}", ended.stderr);
+    // Nobody new has room, and it is said.
+    assert!(ended.stderr.contains("status 1"), "{}", ended.stderr);
+    assert!(ended.stderr.contains("error: /dev/shm has 0 MB free"), "{}", ended.stderr);
+    let summary = fs::read_to_string(rig.output().join("summary.json")).unwrap();
+    let summary: Value = serde_json::from_str(&summary).unwrap();
+    assert_eq!(summary["restarts"], 0, "{summary}");
+    assert_eq!(summary["frames_in"], 150, "{summary}");
+}
+
+#[test]
+fn shared_memory_that_is_too_small_is_said_in_one_line_at_the_start() {
+    let rig = Rig::new();
+    for megabytes in [1, 10, 24] {
+        let script = format!("$SEMIDENSE run {SMALL}");
+        let Some(ended) = with_shared_memory(&rig, megabytes, &script) else { return };
+        assert_eq!(ended.status.code(), Some(1), "{megabytes} MB: {}", ended.stderr);
+        let errors: Vec<_> = ended.stderr.lines().filter(|l| l.starts_with("error: ")).collect();
+        assert_eq!(errors.len(), 1, "{}", ended.stderr);
+        assert!(errors[0].contains("/dev/shm"), "{}", ended.stderr);
+    }
+}
