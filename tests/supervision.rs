@@ -243,7 +243,7 @@ fn shared_memory_that_others_fill_costs_a_run_nothing() {
     // Whatever is left once frames flow is taken by somebody else.
     let script = format!(
         "$SEMIDENSE run {SMALL} & run=$!; \
-         until $SEMIDENSE status --once 2>/dev/null | grep -q '^mapper .*mapping'; do sleep 0.2; done; \
+         until $SEMIDENSE status --once --json 2>/dev/null | grep -q '\"mapping\"'; do sleep 0.2; done; \
          dd if=/dev/zero of=/dev/shm/foreign bs=64k 2>/dev/null; \
          $SEMIDENSE status --once >&2; echo status $? >&2; wait $run"
     );
