@@ -1,43 +1,172 @@
-//! What a recording or an output folder can be wrong in: one line that names the place, exit code 1,
-//! no panic, nothing left behind.
+//! Every bad input that we can think of: what is tried, what is said and the exit code. Nothing panics, nothing
+//! hangs, nothing is left behind; `docs/bad-inputs.md` is what this test saw.
 
 #[allow(dead_code, reason = "every test uses its part of what they share")]
 mod support;
 
+mod bad_input_table;
+
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Command, Stdio};
 
+use bad_input_table::{Row, SECTIONS};
 use support::{Ended, Rig, finish};
 
-/// Frames of the recording that is broken; each image has a line of the list, after two of comment.
-const FRAMES: usize = 5;
-const COMMENT_LINES: usize = 2;
+/// Frames of the recording that is broken.
+const FRAMES: usize = 20;
+
+/// Set it to write the page anew: `SEMIDENSE_WRITE_DOCS=1 cargo test --release --test bad_input`.
+const WRITE_VARIABLE: &str = "SEMIDENSE_WRITE_DOCS";
+
+/// What rows may call besides the programs of the system. Each starts in a folder with a recording of twenty frames
+/// (`recording`, TUM layout, 160x120) and a rig for it (`rig.toml`).
+const PRELUDE: &str = r#"
+image() { ls recording/rgb/*.png | sed -n "$1p"; }
+change() { sed -i "$2" "$1"; }
+until_said() {
+    word=$1; shift
+    "$@" 2> said & until grep -q "$word" said; do sleep 0.1; done
+    kill -INT $!; wait $!; code=$?
+    cat said >&2
+    return $code
+}
+halve() { truncate -s $(($(stat -c %s "$1") / 2)) "$1"; }
+"#;
+
+const RIG: &str =
+    "model = \"pinhole\"\nwidth = 160\nheight = 120\nfx = 131\nfy = 131\ncx = 79.5\ncy = 59.5\n";
 
 /// A small recording in TUM layout.
 fn recording(rig: &Rig) -> PathBuf {
     let folder = rig.folder().join("recording");
     let mut command = rig.command(&["simulate", "--force", "--output"]);
     command.arg(&folder).args(["--frames", &FRAMES.to_string()]);
-    command.args(["--width", "64", "--height", "48", "--focal", "52"]);
+    command.args(["--width", "160", "--height", "120", "--focal", "131"]);
     let ended = finish(command);
     assert!(ended.status.success(), "{}", ended.stderr);
     folder
 }
 
-/// The image of a frame.
-fn image(folder: &Path, frame: usize) -> PathBuf {
-    let list = fs::read_to_string(folder.join("rgb.txt")).unwrap();
-    let line = list.lines().nth(COMMENT_LINES + frame).unwrap();
-    folder.join(line.split_whitespace().nth(1).unwrap())
+/// A shell in the folder of `rig` whose `semidense` is the real one.
+fn shell(rig: &Rig, script: &str) -> Command {
+    // By its name on the path, so that programs like `timeout` find it too.
+    let programs = rig.folder().join("bin");
+    if fs::create_dir(&programs).is_ok() {
+        let binary = env!("CARGO_BIN_EXE_semidense");
+        std::os::unix::fs::symlink(binary, programs.join("semidense")).unwrap();
+    }
+    let paths = std::env::var("PATH").unwrap_or_default();
+    let mut command = Command::new("bash");
+    command
+        .arg("-c")
+        .arg(format!("{PRELUDE}\n{script}"))
+        .env("PATH", format!("{}:{paths}", programs.display()))
+        .current_dir(rig.folder())
+        .env("SEMIDENSE_ROOT", rig.root())
+        .env_remove("XDG_RUNTIME_DIR")
+        .env("LC_ALL", "C.UTF-8")
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped());
+    command
 }
 
-/// Changes the lines of a list.
-fn rewrite(list: &Path, change: impl Fn(&mut Vec<String>)) {
-    let mut lines: Vec<String> =
-        fs::read_to_string(list).unwrap().lines().map(str::to_owned).collect();
-    change(&mut lines);
-    fs::write(list, lines.join("\n") + "\n").unwrap();
+/// What is said, as the page has it: the error, else the first warning, and the last line of the result where that
+/// tells of images that were left out. What differs from machine to machine is replaced.
+fn said(ended: &Ended, rig: &Rig) -> String {
+    let find = |start: &str| ended.stderr.lines().find(|line| line.contains(start));
+    let line = find("error: ").or_else(|| find("waiting: ")).or_else(|| find(" WARN "));
+    let line = line.or_else(|| find("warning: ")).unwrap_or_default();
+    let line = match line.split_once(" WARN ") {
+        Some((_, text)) => format!("warning: {text}"),
+        None => line.to_owned(),
+    };
+    let last = ended.stdout.lines().last().filter(|line| line.contains("left out"));
+    let line = last.map_or(line.clone(), |last| format!("{line}<br>{last}"));
+    let line = line.replace(&rig.folder().display().to_string(), "…");
+    let mut text = String::new();
+    let mut words = line.split(' ').peekable();
+    while let Some(word) = words.next() {
+        let is_measured = words.peek() == Some(&"MB") && word.parse::<u64>().is_ok();
+        text += if is_measured { "N" } else { word };
+        text += " ";
+    }
+    text.trim_end().to_owned()
+}
+
+/// Runs a row; its line of the page, or what is wrong with what was said.
+fn observe(row: &Row, template: &Path) -> Result<String, String> {
+    let rig = Rig::new();
+    let copied = Command::new("cp").arg("-r").arg(template).arg(rig.folder()).status();
+    assert!(copied.unwrap().success());
+    fs::write(rig.folder().join("rig.toml"), RIG).unwrap();
+    let made = finish(shell(&rig, &format!("set -e\n{}", row.setup)));
+    let ended = finish(shell(&rig, row.command));
+    let (code, said, stderr) = (ended.status.code(), said(&ended, &rig), &ended.stderr);
+    let errors = stderr.lines().filter(|line| line.starts_with("error: ")).count();
+    let left = rig.leftovers();
+    let missing: Vec<_> = row.words.iter().filter(|word| !said.contains(**word)).collect();
+    let is_as_told = made.status.success()
+        && code == Some(row.code)
+        && !stderr.contains("panicked")
+        && errors == usize::from(matches!(row.code, 1 | 2))
+        && missing.is_empty()
+        && left.is_empty();
+    if !is_as_told {
+        return Err(format!(
+            "{} ({}): exit {code:?}, {errors} errors, without {missing:?}, left {left:?}\n  said {said}\n  {}{stderr}{}",
+            row.tried, row.command, made.stderr, ended.stdout
+        ));
+    }
+    // What a table of Markdown would read as something else.
+    let cell = |text: &str| text.replace('|', "\\|").replace('*', "\\*");
+    let command = row.command.replace('|', "\\|");
+    Ok(format!("| {} | `{command}` | {} | {} |\n", cell(row.tried), cell(&said), row.code))
+}
+
+#[test]
+fn every_bad_input_has_its_line_and_its_exit_code() {
+    let rig = Rig::new();
+    let template = recording(&rig);
+    // Mostly they wait for processes to start: the sections go side by side.
+    let seen: Vec<Vec<Result<String, String>>> = std::thread::scope(|scope| {
+        let observe_all = |section: &'static bad_input_table::Section| {
+            let template = &template;
+            move || section.rows.iter().map(|row| observe(row, template)).collect()
+        };
+        let threads: Vec<_> = SECTIONS.iter().map(|s| scope.spawn(observe_all(s))).collect();
+        threads.into_iter().map(|thread| thread.join().unwrap()).collect()
+    });
+    let mut page = bad_input_table::INTRODUCTION.to_owned();
+    let (mut rows, mut faults) = (0, Vec::new());
+    for (section, seen) in SECTIONS.iter().zip(seen) {
+        page += &format!(
+            "\n## {}\n\n| tried | command | said | exit |\n|---|---|---|---|\n",
+            section.title
+        );
+        for row in seen {
+            match row {
+                Ok(line) => page += &line,
+                Err(wrong) => faults.push(wrong),
+            }
+            rows += 1;
+        }
+    }
+    assert!(faults.is_empty(), "{}", faults.join("\n\n"));
+    assert!(rows >= 40, "{rows} rows");
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/docs/bad-inputs.md");
+    if std::env::var_os(WRITE_VARIABLE).is_some() {
+        fs::write(path, &page).unwrap();
+    }
+    let written = fs::read_to_string(path).unwrap_or_default();
+    for (seen, stands) in page.lines().zip(written.lines()) {
+        assert_eq!(
+            seen, stands,
+            "docs/bad-inputs.md is out of date: write it with {WRITE_VARIABLE}=1"
+        );
+    }
+    assert_eq!(page.lines().count(), written.lines().count(), "write it with {WRITE_VARIABLE}=1");
 }
 
 /// Exit code 1 and exactly one error, with these words.
@@ -52,135 +181,23 @@ fn assert_refused(ended: &Ended, words: &[&str], what: &str) {
 }
 
 #[test]
-fn recordings_that_are_wrong_are_refused_by_run_and_replay() {
-    type Break = fn(&Path);
-    let cases: &[(&str, Break, &[&str])] = &[
-        (
-            "missing image",
-            |d| fs::remove_file(image(d, 3)).unwrap(),
-            &["rgb/", "cannot be read: No such file"],
-        ),
-        ("empty image", |d| fs::write(image(d, 2), "").unwrap(), &["rgb/", "is empty"]),
-        (
-            "truncated image",
-            |d| {
-                let bytes = fs::read(image(d, 2)).unwrap();
-                fs::write(image(d, 2), &bytes[..bytes.len() / 2]).unwrap();
-            },
-            &["rgb/", "damaged PNG"],
-        ),
-        (
-            "a rig of another size",
-            |d| fs::write(d.join("camera.txt"), "100 100 50 50 320 240\n").unwrap(),
-            &["64x48", "320x240", "rig"],
-        ),
-        (
-            "a camera of not-a-number",
-            |d| fs::write(d.join("camera.txt"), "nan 100 50 50 64 48\n").unwrap(),
-            &["camera.txt", "nan"],
-        ),
-        ("no camera", |d| fs::remove_file(d.join("camera.txt")).unwrap(), &["camera.txt", "--rig"]),
-        (
-            "stamps that go back",
-            |d| rewrite(&d.join("rgb.txt"), |l| l.swap(COMMENT_LINES + 1, COMMENT_LINES + 2)),
-            &["rgb.txt, line 5", "earlier"],
-        ),
-        (
-            "two equal stamps",
-            |d| {
-                rewrite(&d.join("rgb.txt"), |l| {
-                    l[COMMENT_LINES + 1] = l[COMMENT_LINES].clone();
-                });
-            },
-            &["rgb.txt, line 4", "same time stamp"],
-        ),
-        (
-            "a line without stamp",
-            |d| {
-                rewrite(&d.join("rgb.txt"), |l| {
-                    let line = l[COMMENT_LINES + 1].clone();
-                    l[COMMENT_LINES + 1] = line.split_whitespace().nth(1).unwrap().to_owned();
-                });
-            },
-            &["rgb.txt, line 4", "timestamp"],
-        ),
-        (
-            "a stamp that is none",
-            |d| rewrite(&d.join("rgb.txt"), |l| l[COMMENT_LINES] = "inf rgb/x.png".to_owned()),
-            &["rgb.txt, line 3", "inf"],
-        ),
-        ("no frame", |d| fs::write(d.join("rgb.txt"), "# none\n").unwrap(), &["no frames"]),
-    ];
-    for (what, broken, words) in cases {
-        let rig = Rig::new();
-        let folder = recording(&rig);
-        broken(&folder);
-        let source = format!("tum:{}", folder.display());
-        let output = rig.output();
-        let output = output.to_str().unwrap();
-        for arguments in [vec!["run", "--strict", &source], vec!["replay", "--strict", &source]] {
-            let ended = finish(rig.command(&[&arguments[..], &["--output", output]].concat()));
-            assert_refused(&ended, words, what);
-            assert_eq!(rig.leftovers(), Vec::<String>::new(), "{what}");
-        }
-    }
-}
-
-#[test]
-fn an_output_folder_that_cannot_be_made_is_refused_before_any_work() {
-    let rig = Rig::new();
-    let file = rig.folder().join("file");
-    fs::write(&file, "x").unwrap();
-    let below = file.join("output");
-    for output in [file.to_str().unwrap(), below.to_str().unwrap(), "/proc/output"] {
-        for command in [&["run"][..], &["replay", "sim"], &["simulate"]] {
-            let ended = finish(rig.command(&[command, &["--output", output]].concat()));
-            // The simulator names the folder that it writes until all of it is there.
-            let name = Path::new(output).file_name().unwrap().to_str().unwrap();
-            assert_refused(&ended, &[name], output);
-            assert!(!ended.stderr.contains("preparing"), "{}", ended.stderr);
-        }
-    }
-    assert_eq!(rig.leftovers(), Vec::<String>::new());
-}
-
-#[test]
-fn a_folder_that_is_not_there_is_named() {
-    let rig = Rig::new();
-    let output = rig.output();
-    for kind in ["tum", "euroc", "images"] {
-        let source = format!("{kind}:/nowhere/at-all");
-        for arguments in [vec!["run", "--source", &source], vec!["replay", &source]] {
-            let output = output.to_str().unwrap();
-            let ended = finish(rig.command(&[&arguments[..], &["--output", output]].concat()));
-            assert_refused(&ended, &[&source, "no folder /nowhere/at-all"], kind);
-        }
-    }
-}
-
-#[test]
-fn a_rig_of_another_camera_is_warned_of_in_one_line() {
+fn paths_of_any_bytes_are_accepted() {
     let rig = Rig::new();
     let folder = recording(&rig);
-    let (camera, output) = (rig.folder().join("other.toml"), rig.output());
-    let source = format!("tum:{}", folder.display());
-    for (focal, is_warned) in [(52.0, false), (60.0, true)] {
-        let text = format!(
-            "model = \"pinhole\"\nwidth = 64\nheight = 48\nfx = {focal}\nfy = {focal}\ncx = 31.5\ncy = 23.5\n"
-        );
-        fs::write(&camera, text).unwrap();
-        for arguments in [vec!["run", "--source", &source], vec!["replay", &source]] {
-            let mut command = rig.command(&arguments);
-            command.arg("--rig").arg(&camera).arg("--output").arg(&output);
-            let ended = finish(command);
-            // Nothing can be tracked on so few pictures.
-            assert_eq!(ended.status.code(), Some(3), "{}", ended.stderr);
-            let warnings: Vec<_> =
-                ended.stderr.lines().filter(|line| line.contains("camera.txt")).collect();
-            assert_eq!(warnings.len(), usize::from(is_warned), "{}", ended.stderr);
-            assert!(warnings.iter().all(|line| line.contains("other.toml")), "{warnings:?}");
-        }
-    }
+    let odd = r"$(printf 'b\xffd $x')";
+    fs::write(rig.folder().join("rig.toml"), RIG).unwrap();
+    let script = format!(
+        "set -e\nmv '{}' \"{odd}\"; cp rig.toml \"{odd}.toml\"; echo > \"{odd}.conf\"\n\
+         semidense --config \"{odd}.conf\" run \"{odd}\" --rig \"{odd}.toml\" --output \"{odd}-run\"\n\
+         semidense --config \"{odd}.conf\" replay \"tum:{odd}\" --rig \"{odd}.toml\" --output \"{odd}-replay\"\n\
+         cmp \"{odd}-run/trajectory_online.txt\" \"{odd}-replay/trajectory_online.txt\"\n\
+         semidense simulate --frames 1 --output \"{odd}-sim\" --json\n\
+         semidense evaluate \"{odd}/groundtruth.txt\" \"{odd}/groundtruth.txt\" --plot \"{odd}.svg\"",
+        folder.display()
+    );
+    let ended = finish(shell(&rig, &script));
+    assert!(ended.status.success(), "{}", ended.stderr);
+    assert_eq!(rig.leftovers(), Vec::<String>::new());
 }
 
 /// The binary in a shell whose children may write files of a few kilobytes at most: to a program a
