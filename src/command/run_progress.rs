@@ -7,7 +7,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::command::print::note;
 use crate::command::progress::LINE_PERIOD;
-use crate::service::supervisor::RunProgress;
+use crate::service::run_progress::RunProgress;
 use crate::slam::pose::TrackingState;
 
 /// Shows the progress of a run.

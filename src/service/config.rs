@@ -12,6 +12,7 @@ use crate::capture::input_file;
 use crate::capture::simulator::params::SimulatorParams;
 use crate::capture::source::SourceParams;
 use crate::capture::v4l::params::CameraParams;
+pub use crate::service::config_error::ConfigError;
 use crate::service::results::ResultsParams;
 use crate::service::schedule::SchedulingParams;
 use crate::slam::mapper::MapperParams;
@@ -165,35 +166,6 @@ impl Default for Config {
             simulator: SimulatorParams::default(),
         }
     }
-}
-
-/// Why a configuration is refused; one line that names the place.
-#[derive(Debug, thiserror::Error)]
-pub enum ConfigError {
-    /// The file cannot be read.
-    #[error("{path}: cannot be read: {source}; check --config")]
-    Read {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
-    /// A key or a value is not understood.
-    #[error("{place}: {reason}")]
-    Syntax {
-        /// File and line, or the option.
-        place: String,
-        /// What is wrong.
-        reason: String,
-    },
-    /// A value is out of range.
-    #[error("{place}: {source}")]
-    Value {
-        /// File, or the option.
-        place: String,
-        /// Key, value, what is allowed.
-        source: ParameterError,
-    },
 }
 
 impl Config {

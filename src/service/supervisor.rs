@@ -21,12 +21,12 @@ use crate::service::position::{position_key, read_position};
 use crate::service::recorder::Recorder;
 use crate::service::recording::{RecordParts, RunCounters};
 use crate::service::results::{EndOfRun, RestartCause, RunMode, RunRecord};
+use crate::service::run_progress::RunProgress;
 use crate::service::schedule::peak_rss_bytes;
 use crate::service::shutdown::Shutdown;
 use crate::service::supervised::{Death, Supervised};
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::mapper::Map;
-use crate::slam::pose::TrackingState;
 use crate::wire::command::CommandClient;
 use crate::wire::place::{Claim, Place, PlaceError};
 use crate::wire::port::{Access, Hub, OpenError, ReceiveError, WaitError, wait};
@@ -58,26 +58,6 @@ pub struct RunOptions {
     pub journal: Option<JournalOptions>,
     /// Options that every child gets: where the configuration comes from.
     pub arguments: Vec<OsString>,
-}
-
-/// How far a run is, for whoever watches.
-#[derive(Debug, Clone, PartialEq)]
-pub enum RunProgress {
-    /// There is no camera, for this reason; it is used as soon as it is there.
-    Waiting(String),
-    /// The processes start, and the source is prepared: (done, total) of that work.
-    Preparing(u64, u64),
-    /// Frames come.
-    Running {
-        /// Poses so far.
-        frames: u64,
-        /// Frames there will be, 0 where unknown.
-        total: u64,
-        /// State of the last frame.
-        state: Option<TrackingState>,
-        /// Keyframes in the map.
-        keyframes: u64,
-    },
 }
 
 /// How a run ended.
@@ -146,7 +126,9 @@ pub fn run(
     let mut ended = supervisor.watch(shutdown, observe)?;
     supervisor.stop(CAPTURE, shutdown);
     supervisor.settle(&ended, shutdown)?;
-    let mut map = match options.keeps_map.then(|| supervisor.final_map(shutdown)).transpose() {
+    // Without a pose there is no map; a mapper that is still starting would be waited for in vain.
+    let has_map = options.keeps_map && supervisor.recorder.num_poses() > 0;
+    let mut map = match has_map.then(|| supervisor.final_map(shutdown)).transpose() {
         Ok(map) => map.unwrap_or_default(),
         Err(error) => {
             if ended == Ended::Finished {

@@ -10,6 +10,7 @@ pub mod limits;
 pub mod message;
 pub mod open_error;
 pub mod place;
+pub mod place_error;
 pub mod port;
 mod root_folder;
 pub mod topic;

@@ -10,6 +10,7 @@ use iceoryx2::prelude::{Config, FileName, Path as IpcPath, SemanticString};
 use rustix::fs::{Access, FallocateFlags, FlockOperation};
 
 use crate::wire::limits::{check_address_space, raise_open_files};
+pub use crate::wire::place_error::PlaceError;
 use crate::wire::root_folder::{is_mine, usual_root};
 
 /// The folder under systemd, where every unit has the same one.
@@ -32,93 +33,9 @@ const POSITION_SUFFIX: &str = ".position";
 const CLAIM_SUFFIX: &str = ".lock";
 
 /// Longest folder: the socket of a listener lies in it, and a socket's path has at most 107 bytes.
-const MAX_ROOT_BYTES: usize = 48;
+pub(in crate::wire) const MAX_ROOT_BYTES: usize = 48;
 /// Longest name of an instance: it is part of every topic's name.
 const MAX_INSTANCE_BYTES: usize = 32;
-
-/// Why an instance cannot live there.
-#[derive(Debug, thiserror::Error)]
-pub enum PlaceError {
-    /// The name of the instance.
-    #[error("instance `{0}` is not a name: use 1 to 32 of the characters a-z, A-Z, 0-9, _ and -")]
-    Instance(String),
-    /// The folder's path is too long.
-    #[error("{0}: the runtime folder may have at most {MAX_ROOT_BYTES} bytes; set {ROOT_VARIABLE}")]
-    TooLong(PathBuf),
-    /// The folder's path has bytes that a service cannot have.
-    #[error(
-        "{0}: the runtime folder's path may have letters, digits and the like, all of them UTF-8; set {ROOT_VARIABLE}"
-    )]
-    Characters(PathBuf),
-    /// The folder belongs to someone else.
-    #[error("{0}: the runtime folder belongs to another user; set {ROOT_VARIABLE} to one of yours")]
-    Foreign(PathBuf),
-    /// The folder or a file in it cannot be made.
-    #[error("{path}: {source}; set {ROOT_VARIABLE} to a folder that can be written")]
-    Io {
-        /// What.
-        path: PathBuf,
-        /// Why.
-        source: io::Error,
-    },
-    /// There is one already.
-    #[error(
-        "{process} of instance `{instance}` already runs as process {holder}: stop it, or choose another --instance"
-    )]
-    Taken {
-        /// Kind of process.
-        process: String,
-        /// Instance.
-        instance: String,
-        /// Process id of the one that runs.
-        holder: String,
-    },
-    /// Too few files may be open at a time.
-    #[error(
-        "a process may have {limit} files open here where {needed} are needed: raise the limit (ulimit -n 1024, LimitNOFILE= of a systemd unit, docker run --ulimit nofile=1024)"
-    )]
-    OpenFiles {
-        /// The limit.
-        limit: u64,
-        /// What is needed.
-        needed: u64,
-    },
-    /// Too little address space.
-    #[error(
-        "a process may have {limit_mb} MB of address space here where {needed_mb} MB are needed: raise the limit (ulimit -v unlimited, LimitAS= of a systemd unit)"
-    )]
-    AddressSpace {
-        /// The limit.
-        limit_mb: u64,
-        /// What is needed.
-        needed_mb: u64,
-    },
-    /// There is no shared memory.
-    #[error(
-        "{SHARED_MEMORY}: {0}: there is no shared memory here; mount a tmpfs there (a container: docker run --shm-size=128m)"
-    )]
-    NoSharedMemory(io::Error),
-    /// Shared memory ran out while what was promised was taken.
-    #[error(
-        "{SHARED_MEMORY} is full: {missing_kb} kB of {needed_kb} kB could not be reserved; enlarge it (mount -o remount,size=…, or docker run --shm-size=…) or remove what other programs left there"
-    )]
-    Reservation {
-        /// Could not be had.
-        missing_kb: u64,
-        /// Were wanted.
-        needed_kb: u64,
-    },
-    /// Too little shared memory.
-    #[error(
-        "{SHARED_MEMORY} has {free_mb} MB free where {needed_mb} MB are needed: enlarge it (mount -o remount,size=…, or docker run --shm-size=…)"
-    )]
-    SharedMemory {
-        /// Free.
-        free_mb: u64,
-        /// Needed.
-        needed_mb: u64,
-    },
-}
 
 /// Where an instance lives.
 #[derive(Debug, Clone, PartialEq, Eq)]
