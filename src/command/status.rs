@@ -181,7 +181,7 @@ impl<'a> Watch<'a> {
         if self.poses.is_none() {
             self.poses = match hub.subscriber(&POSE) {
                 Ok(poses) => Some(poses),
-                Err(OpenError::NotRunning { .. }) => None,
+                Err(error) if error.is_absence() => None,
                 Err(error) => return Err(error.into()),
             };
         }
@@ -235,7 +235,7 @@ fn pose_row(pose: &PoseMessage, now: i64) -> Value {
 fn listen(hub: &Hub, topic: &Topic) -> Result<Option<Peer>, OpenError> {
     match Peer::open(hub, topic) {
         Ok(peer) => Ok(Some(peer)),
-        Err(OpenError::NotRunning { .. }) => Ok(None),
+        Err(error) if error.is_absence() => Ok(None),
         Err(error) => Err(error),
     }
 }

@@ -13,8 +13,9 @@ use crate::service::health::ProcessState;
 use crate::service::liveness::Liveness;
 use crate::service::peers::Peer;
 use crate::service::results::RestartCause;
-use crate::wire::place::{SHARED_MEMORY, free_shared_memory};
+use crate::wire::place::SHARED_MEMORY;
 use crate::wire::port::ReceiveError;
+use crate::wire::shared_memory::free_shared_memory;
 use crate::wire::topic::CAPTURE_HEALTH;
 
 /// Pause before the second restart in a row; it doubles up to the longest. The first comes at once.

@@ -13,5 +13,6 @@ pub mod place;
 pub mod place_error;
 pub mod port;
 mod root_folder;
+pub mod shared_memory;
 pub mod topic;
 mod version;

@@ -55,6 +55,13 @@ pub enum OpenError {
     },
 }
 
+impl OpenError {
+    /// Whether nobody offers the topic, as far as can be seen from here.
+    pub fn is_absence(&self) -> bool {
+        matches!(self, Self::NotRunning { .. } | Self::Elsewhere { .. })
+    }
+}
+
 pub(in crate::wire) fn not_running(place: &Place) -> OpenError {
     if let Some(holder) = place.running() {
         return OpenError::Elsewhere { instance: place.instance.clone(), holder };

@@ -156,7 +156,7 @@ mod tests {
     fn names_are_unique_and_carry_the_version() {
         let mut names: Vec<_> =
             table(&intrinsics(640, 480)).iter().map(|(t, _)| t.service_name("rig1")).collect();
-        assert!(names.contains(&"rig1/v4/capture/frame".to_owned()));
+        assert!(names.contains(&format!("rig1/v{WIRE_VERSION}/capture/frame")));
         names.sort();
         names.dedup();
         assert_eq!(names.len(), 9);

@@ -1,0 +1,112 @@
+//! Shared memory: what is free, and taking what has been promised.
+
+use std::fs::{self, OpenOptions};
+use std::io;
+use std::os::unix::fs::MetadataExt;
+use std::path::Path;
+
+use rustix::fs::{Access, FallocateFlags};
+
+use crate::wire::limits::check_address_space;
+use crate::wire::place::{Place, PlaceError, SHARED_MEMORY};
+
+impl Place {
+    /// Takes all memory that the segments of this place have promised, where some of it is still to be had on
+    /// first use only.
+    pub(in crate::wire) fn reserve_shared_memory(&self) -> Result<(), PlaceError> {
+        reserve(Path::new(SHARED_MEMORY), &self.prefix)
+    }
+
+    /// Checks that shared memory has room for a process and its connections to all topics.
+    pub(in crate::wire) fn check_room_to_join(&self) -> Result<(), PlaceError> {
+        /// Twice what the supervisor takes, which listens to most.
+        const JOIN_BYTES: u64 = 1 << 20;
+        self.check_shared_memory(JOIN_BYTES)
+    }
+
+    /// Checks that shared memory has `needed` bytes left, and the address space room for them: what is
+    /// missing is not an error later but the death of the process.
+    pub fn check_shared_memory(&self, needed: u64) -> Result<(), PlaceError> {
+        check_address_space(needed)?;
+        let none = |cause| PlaceError::NoSharedMemory(io::Error::from(cause));
+        rustix::fs::access(SHARED_MEMORY, Access::WRITE_OK | Access::EXEC_OK).map_err(none)?;
+        let stat = rustix::fs::statvfs(SHARED_MEMORY).map_err(none)?;
+        let free = stat.f_bavail.saturating_mul(stat.f_frsize);
+        if free >= needed {
+            return Ok(());
+        }
+        Err(PlaceError::SharedMemory { free_mb: free >> 20, needed_mb: (needed >> 20) + 1 })
+    }
+}
+
+/// What is free of shared memory, bytes.
+pub fn free_shared_memory() -> Option<u64> {
+    let stat = rustix::fs::statvfs(SHARED_MEMORY).ok()?;
+    Some(stat.f_bavail.saturating_mul(stat.f_frsize))
+}
+
+/// Takes what the segments whose names begin with `prefix` in `folder` have promised and not got: they are made
+/// sparse, and a page that is not there when it is touched ends the process (SIGBUS). Milliseconds for what is new,
+/// a fraction of one where all is taken.
+fn reserve(folder: &Path, prefix: &str) -> Result<(), PlaceError> {
+    /// What `st_blocks` counts in.
+    const BLOCK_BYTES: u64 = 512;
+    let (mut needed, mut missing) = (0, 0);
+    for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+        if !entry.file_name().to_string_lossy().starts_with(prefix) {
+            continue;
+        }
+        // Segments come and go: one that is gone needs nothing.
+        let Ok(found) = entry.metadata() else { continue };
+        let lacks = found.len().saturating_sub(found.blocks().saturating_mul(BLOCK_BYTES));
+        if lacks == 0 {
+            continue;
+        }
+        // Written only: a segment that is being made may be open for nothing else.
+        let Ok(file) = OpenOptions::new().write(true).open(entry.path()) else { continue };
+        needed += lacks;
+        let taken = rustix::fs::fallocate(&file, FallocateFlags::KEEP_SIZE, 0, found.len());
+        // A file system that cannot reserve leaves it as it was.
+        if taken == Err(rustix::io::Errno::NOSPC) {
+            missing += lacks;
+        }
+    }
+    match missing {
+        0 => Ok(()),
+        _ => Err(PlaceError::Reservation {
+            missing_kb: missing.div_ceil(1 << 10),
+            needed_kb: needed.div_ceil(1 << 10),
+        }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs::File;
+
+    #[test]
+    fn what_segments_promise_is_taken() {
+        // The kernel's own tmpfs, under names that no process of ours has.
+        let prefix = format!("semidense-reserve-test-{}-", std::process::id());
+        let segment = Path::new(SHARED_MEMORY).join(format!("{prefix}x"));
+        let foreign = Path::new(SHARED_MEMORY).join(format!("x{prefix}"));
+        for path in [&segment, &foreign] {
+            File::create(path).unwrap().set_len(1 << 20).unwrap();
+        }
+        reserve(Path::new(SHARED_MEMORY), &prefix).unwrap();
+        let bytes = |path: &Path| 512 * fs::metadata(path).unwrap().blocks();
+        let (taken, left) = (bytes(&segment), bytes(&foreign));
+        let length = fs::metadata(&segment).unwrap().len();
+        [segment, foreign].iter().for_each(|path| fs::remove_file(path).unwrap());
+        assert_eq!((taken, left, length), (1 << 20, 0, 1 << 20));
+    }
+
+    #[test]
+    fn too_little_shared_memory_is_said() {
+        let place = Place::new("rig", "/tmp/x").unwrap();
+        assert!(place.check_shared_memory(0).is_ok());
+        let error = place.check_shared_memory(u64::MAX).unwrap_err().to_string();
+        assert!(error.starts_with("/dev/shm has"), "{error}");
+    }
+}
