@@ -86,9 +86,11 @@ fn a_replay_says_what_a_budget_buys_and_what_the_covariance_is_worth() {
 #[test]
 fn the_floor_of_the_covariance_is_for_readers_only() {
     let folder = tempfile::tempdir().unwrap();
-    let runs = ["0", "1", "50"].map(|image_px| {
-        let floor = format!("tracking.covariance_floor.image_px={image_px}");
-        let arguments = ["sim", "--frames", "80", "--json", "--set", &floor];
+    // Both shares of the floor: with one alone the other would bound the normalised error.
+    let runs = [("0", "0"), ("1", "0.1"), ("50", "1")].map(|(image_px, ratio)| {
+        let about = format!("tracking.covariance_floor.image_px={image_px}");
+        let along = format!("tracking.covariance_floor.translation_ratio={ratio}");
+        let arguments = ["sim", "--frames", "80", "--json", "--set", &about, "--set", &along];
         let dir = folder.path().join(image_px);
         let output = replay(&[&arguments[..], &HALF_SIZE].concat(), &dir);
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
@@ -173,16 +175,20 @@ fn results_are_of_the_frames_before_one_that_cannot_be_read() {
         .collect();
     images.sort();
     std::fs::write(&images[5], b"no image").unwrap();
-    let replayed = Command::new(env!("CARGO_BIN_EXE_semidense"))
-        .arg("replay")
-        .arg(format!("tum:{}", recording.display()))
-        .arg("--output")
-        .arg(&output)
-        .output()
-        .unwrap();
-    let said = String::from_utf8_lossy(&replayed.stderr).into_owned();
-    assert_eq!(replayed.status.code(), Some(1), "{said}");
+    let source = format!("tum:{}", recording.display());
+    let replayed = |strict: &[&str]| {
+        let replayed = replay(&[&[source.as_str()], strict].concat(), &output);
+        let said = String::from_utf8_lossy(&replayed.stderr).into_owned();
+        let summary = std::fs::read_to_string(output.join("summary.json")).unwrap();
+        (replayed.status.code(), said, serde_json::from_str::<Value>(&summary).unwrap())
+    };
+    let (code, said, summary) = replayed(&["--strict"]);
+    assert_eq!(code, Some(1), "{said}");
     assert!(said.contains("the results are of the 5 frames before"), "{said}");
-    let summary = std::fs::read_to_string(output.join("summary.json")).unwrap();
-    assert_eq!(serde_json::from_str::<Value>(&summary).unwrap()["frames_in"], 5);
+    assert_eq!(summary["frames_in"], 5);
+    let (code, said, summary) = replayed(&[]);
+    // It goes on to the end, where seven frames were too few to start a map.
+    assert_eq!(code, Some(3), "{said}");
+    assert!(said.contains("is neither PNG nor JPEG"), "{said}");
+    assert_eq!((&summary["frames_in"], &summary["frames_refused"]), (&7.into(), &1.into()));
 }
