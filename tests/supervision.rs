@@ -146,21 +146,34 @@ fn a_replay_that_is_ended_by_any_signal_keeps_its_results() {
     }
 }
 
+/// Whoever hangs is killed and started again, and the summary says why.
+fn a_hanging_process_is_started_again(process: usize) {
+    let mut live = Live::start(&["--set", "supervisor.watchdog_s=2"]);
+    live.until_frames(TRACKER, 45);
+    let stopped = live.pid(process);
+    live.send(&[process], Signal::STOP);
+    live.until_replaced(process, stopped);
+    let (code, stderr, summary, rig) = live.end();
+    assert_eq!(code, Some(0), "{stderr}");
+    let cause = summary["restart_causes"][0]["cause"].as_str().unwrap_or_default();
+    assert!(cause.contains("was stopped"), "{summary}");
+    assert!(cause.starts_with(HEALTH_TOPICS[process].owner), "{summary}");
+    assert!(stamps(&rig).is_sorted_by(|one, next| one < next));
+}
+
 #[test]
-fn a_process_that_hangs_is_started_again_and_said() {
-    for process in [CAPTURE, TRACKER, MAPPER] {
-        let mut live = Live::start(&["--set", "supervisor.watchdog_s=2"]);
-        live.until_frames(TRACKER, 45);
-        let stopped = live.pid(process);
-        live.send(&[process], Signal::STOP);
-        live.until_replaced(process, stopped);
-        let (code, stderr, summary, rig) = live.end();
-        assert_eq!(code, Some(0), "{stderr}");
-        let cause = summary["restart_causes"][0]["cause"].as_str().unwrap_or_default();
-        assert!(cause.contains("was stopped"), "{summary}");
-        assert!(cause.starts_with(HEALTH_TOPICS[process].owner), "{summary}");
-        assert!(stamps(&rig).is_sorted_by(|one, next| one < next));
-    }
+fn a_capture_that_hangs_is_started_again_and_said() {
+    a_hanging_process_is_started_again(CAPTURE);
+}
+
+#[test]
+fn a_tracker_that_hangs_is_started_again_and_said() {
+    a_hanging_process_is_started_again(TRACKER);
+}
+
+#[test]
+fn a_mapper_that_hangs_is_started_again_and_said() {
+    a_hanging_process_is_started_again(MAPPER);
 }
 
 #[test]
