@@ -144,7 +144,7 @@ fn journal() -> Vec<u8> {
         folder: "/".to_owned(),
         config: "instance = \"rig\"\n".to_owned(),
         poses_given: false,
-        began_secs: 1,
+        began_nanos: 1,
     };
     let world_from_keyframe = Sim3::new(SE3::identity(), 2.0);
     let without_depth = Keyframe { image: Vec::new(), points: Vec::new(), ..keyframe() };

@@ -132,6 +132,6 @@ pub fn run_start(config: &Config, source: &SourceName, rig: Option<&Path>) -> Ru
         folder: folder.to_string_lossy().into_owned(),
         config: config.to_text(),
         poses_given: false,
-        began_secs: since.map_or(0, |since| since.as_secs()),
+        began_nanos: since.map_or(0, |since| since.as_nanos() as u64),
     }
 }

@@ -40,14 +40,14 @@ pub struct RunStart {
     pub config: String,
     /// Whether poses were given and not estimated.
     pub poses_given: bool,
-    /// When, seconds since 1970.
-    pub began_secs: u64,
+    /// When, nanoseconds since 1970: two runs may begin in one second.
+    pub began_nanos: u64,
 }
 
 impl RunStart {
     /// When the run began.
     pub fn began(&self) -> SystemTime {
-        UNIX_EPOCH.checked_add(Duration::from_secs(self.began_secs)).unwrap_or(UNIX_EPOCH)
+        UNIX_EPOCH.checked_add(Duration::from_nanos(self.began_nanos)).unwrap_or(UNIX_EPOCH)
     }
 }
 
@@ -321,7 +321,7 @@ mod tests {
             folder: "/x".into(),
             config: "instance = \"x\"\n".into(),
             poses_given: false,
-            began_secs: 5,
+            began_nanos: 5,
         };
         let frame = FrameView {
             sequence: 7,

@@ -83,11 +83,24 @@ impl Writer {
         }
     }
 
-    /// Appends records. What the disk refuses is cut off again, and tried with the next.
+    /// Appends records. On a full disk depth makes room for them, the oldest first: a run without poses is
+    /// lost, one without some depth is not. What is still refused is tried with the next.
     fn append(&mut self, records: &[u8]) -> io::Result<()> {
         if self.waiting.len() < MAX_WAITING_BYTES {
             self.waiting.extend_from_slice(records);
         }
+        let mut written = self.append_waiting();
+        while written.as_ref().is_err_and(is_out_of_room)
+            && let Some((oldest, _)) = self.files.pop_front()
+        {
+            fs::remove_file(oldest)?;
+            written = self.append_waiting();
+        }
+        written
+    }
+
+    /// Appends what waits. What the disk refuses is cut off again.
+    fn append_waiting(&mut self) -> io::Result<()> {
         let written = self.log.write_all(&self.waiting).and_then(|()| self.log.sync_data());
         match written {
             Ok(()) => {
@@ -127,4 +140,8 @@ impl Writer {
         }
         Ok(())
     }
+}
+
+fn is_out_of_room(error: &io::Error) -> bool {
+    matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)
 }
