@@ -19,8 +19,9 @@ pub struct Recorder {
     steps: Subscriber<StepMessage, ()>,
     recording: Recording,
     last_step: Option<StepMessage>,
-    /// The journal and what only it needs.
-    journal: Option<(Journal, KeyframeFeed)>,
+    journal: Option<Journal>,
+    /// What only the journal needs; none without one, and after it has failed.
+    keyframes: Option<KeyframeFeed>,
 }
 
 impl Recorder {
@@ -32,7 +33,8 @@ impl Recorder {
             steps: hub.subscriber(&STEP)?,
             recording: Recording::default(),
             last_step: None,
-            journal: journal.zip(keyframes),
+            journal,
+            keyframes,
         })
     }
 
@@ -58,26 +60,36 @@ impl Recorder {
             self.keep(|| Record::Step(Step { step_nanos, change_nanos, start_frame }));
             self.last_step = Some(*step);
         }
-        if let Some((journal, keyframes)) = &mut self.journal {
-            keyframes.collect(journal, false)?;
-        }
+        self.collect_keyframes(false);
         Ok(self.recording.num_poses() + self.recording.num_steps() > before)
     }
 
+    /// Gives the journal the keyframes that came. Without them the run goes on, and what is left of it after
+    /// a kill has no depth: worth a warning, not the end of a run.
+    fn collect_keyframes(&mut self, is_end: bool) {
+        let (Some(journal), Some(keyframes)) = (&mut self.journal, &mut self.keyframes) else {
+            return;
+        };
+        if let Err(error) = keyframes.collect(journal, is_end) {
+            tracing::warn!("the journal gets no more keyframes: {error}");
+            self.keyframes = None;
+        }
+    }
+
     fn keep(&mut self, record: impl FnOnce() -> Record) {
-        if let Some((journal, _)) = &mut self.journal {
+        if let Some(journal) = &mut self.journal {
             journal.append(&record());
         }
     }
 
     /// Whether what was counted is due in the journal.
     pub fn wants_counters(&self) -> bool {
-        self.journal.as_ref().is_some_and(|(journal, _)| journal.wants_counters())
+        self.journal.as_ref().is_some_and(Journal::wants_counters)
     }
 
     /// Keeps what was counted until now.
     pub fn count(&mut self, counters: RunCounters) {
-        if let Some((journal, _)) = &mut self.journal {
+        if let Some(journal) = &mut self.journal {
             journal.count(counters);
         }
     }
@@ -99,24 +111,18 @@ impl Recorder {
 
     /// Completes the map of a mapper that has died on the way, or that gave none, with what the journal
     /// kept: at most `max_bytes` of depth.
-    pub fn complete_map(&mut self, map: &mut Map, max_bytes: u64) -> Result<(), ReceiveError> {
-        if let Some((journal, keyframes)) = &mut self.journal {
-            keyframes.collect(journal, true)?;
+    pub fn complete_map(&mut self, map: &mut Map, max_bytes: u64) {
+        self.collect_keyframes(true);
+        if let Some(journal) = &mut self.journal {
             complete(map, journal.map(max_bytes));
             map.forget_depth_beyond(usize::try_from(max_bytes).unwrap_or(usize::MAX));
         }
-        Ok(())
     }
 
     /// The record of the whole run, and its journal with all of it.
     pub fn into_record(mut self, parts: RecordParts) -> (RunRecord, Option<Journal>) {
         self.count(parts.counters);
-        let journal = self.journal.take().map(|(mut journal, mut keyframes)| {
-            if let Err(error) = keyframes.collect(&mut journal, true) {
-                tracing::warn!("mapper/keyframe: {error}");
-            }
-            journal
-        });
-        (self.recording.into_record(parts), journal)
+        self.collect_keyframes(true);
+        (self.recording.into_record(parts), self.journal)
     }
 }

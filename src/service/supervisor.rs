@@ -139,7 +139,7 @@ pub fn run(
     };
     if options.keeps_map && (supervisor.restarts() > 0 || map.keyframes.is_empty()) {
         let max_bytes = config.mapping.max_map_bytes() as u64;
-        supervisor.recorder.complete_map(&mut map, max_bytes)?;
+        supervisor.recorder.complete_map(&mut map, max_bytes);
     }
     let refused = supervisor.refused()?;
     if let (Ended::Finished, Some(cause)) = (&ended, &supervisor.bus_error) {
