@@ -29,6 +29,11 @@ const MIN_POINTS: usize = 50;
 const ITERATIONS: usize = 10;
 /// Residual with half the weight, in median absolute residuals.
 const HALF_WEIGHT_MEDIANS: f64 = 2.0;
+/// Least error of half the weight: single precision depth is not better, and weights keep their scale.
+const MIN_HALF_WEIGHT: f64 = 1e-6;
+/// Least standard deviation of X, Y and ln d that the modes before leave over: with less, one cannot be told from
+/// the others. 1 % of depth, or of the focal length along the image.
+const MIN_SPREAD: f64 = 0.01;
 
 impl DepthModes {
     /// The modes of `keyframe`, whose depth in metres is `metres_per_unit / d`; `None` where too few points have
@@ -63,12 +68,12 @@ impl DepthModes {
                 normal += weight * phi * phi.transpose();
                 right += weight * *error * phi;
             }
-            modes = normal.cholesky()?.solve(&right);
+            modes = solve(normal, &right)?;
             let mut residuals: Vec<f64> =
                 samples.iter().map(|(phi, error)| (error - phi.dot(&modes)).abs()).collect();
             let middle = residuals.len() / 2;
             let median = *residuals.select_nth_unstable_by(middle, f64::total_cmp).1;
-            half_weight = HALF_WEIGHT_MEDIANS * median.max(f64::MIN_POSITIVE);
+            half_weight = (HALF_WEIGHT_MEDIANS * median).max(MIN_HALF_WEIGHT);
         }
         let [scale, column, row, relief] = modes.into();
         modes.iter().all(|mode: &f64| mode.is_finite()).then_some(Self {
@@ -83,6 +88,15 @@ impl DepthModes {
     pub fn magnitudes(&self) -> [f64; 3] {
         [self.column.abs(), self.row.abs(), self.relief.abs()]
     }
+}
+
+/// The modes of `normal · modes = right`; `None` where the points do not tell two of them apart.
+fn solve(normal: Matrix4<f64>, right: &Vector4<f64>) -> Option<Vector4<f64>> {
+    let factors = normal.cholesky()?;
+    let pivots = factors.l_dirty().diagonal().map(|pivot| pivot * pivot);
+    // The first is the sum of the weights, the others sums of squares.
+    let is_apart = |k: usize| pivots[k] >= MIN_SPREAD * MIN_SPREAD * pivots[0];
+    (1..4).all(is_apart).then(|| factors.solve(right))
 }
 
 #[cfg(test)]
@@ -158,5 +172,51 @@ mod tests {
         assert!(DepthModes::of(&keyframe, &truth, 2.0).is_none());
         keyframe.points.truncate(MIN_POINTS - 1);
         assert!(DepthModes::of(&keyframe, &truth, 2.0).is_none());
+    }
+
+    /// What is left of `keyframe` where `is_seen`, with the errors of real depth, and its true depth at 2.7 m.
+    fn wall(is_seen: impl Fn(&DepthPoint) -> bool) -> (Keyframe, Image<f32>) {
+        let put = DepthModes { scale: 0.02, column: 0.1, row: -0.05, relief: 0.2 };
+        let (mut keyframe, mut truth) = keyframe(&put, 0.1);
+        keyframe.points.retain(is_seen);
+        truth.pixels_mut().fill(2.7);
+        (keyframe, truth)
+    }
+
+    #[test]
+    fn a_wall_at_one_depth_has_no_relief() {
+        let (keyframe, mut truth) = wall(|_| true);
+        assert_eq!(DepthModes::of(&keyframe, &truth, 2.0), None);
+        // Not in the last bit of single precision either.
+        truth.pixels_mut().iter_mut().step_by(3).for_each(|z| *z = z.next_up());
+        assert_eq!(DepthModes::of(&keyframe, &truth, 2.0), None);
+        // A wall that is not flat has some.
+        truth.pixels_mut().iter_mut().step_by(3).for_each(|z| *z *= 1.05);
+        assert!(DepthModes::of(&keyframe, &truth, 2.0).is_some());
+    }
+
+    #[test]
+    fn points_in_one_line_have_no_tilt_across_it() {
+        for is_seen in [|p: &DepthPoint| p.v == 17, |p: &DepthPoint| p.u == p.v + 20] {
+            let (keyframe, _) = wall(is_seen);
+            let (_, truth) =
+                self::keyframe(&DepthModes { scale: 0.0, column: 0.0, row: 0.0, relief: 0.0 }, 0.0);
+            assert!(keyframe.points.len() >= MIN_POINTS);
+            assert_eq!(DepthModes::of(&keyframe, &truth, 2.0), None);
+        }
+    }
+
+    #[test]
+    fn depth_without_an_error_is_weighed_like_any_other() {
+        let exact = DepthModes { scale: 0.0, column: 0.0, row: 0.0, relief: 0.0 };
+        let (mut keyframe, mut truth) = keyframe(&exact, 0.0);
+        // Most of it is exact to the last bit, and of one depth: the rest must not lose its weight.
+        for (k, (point, z)) in keyframe.points.iter_mut().zip(truth.pixels_mut()).enumerate() {
+            *z = if k % 4 == 0 { 4.0 } else { 2.0 };
+            let error = if k % 8 == 0 { 1e-9 } else { 0.0 };
+            point.inverse_depth = (2.0 / (f64::from(*z) * (1.0 + error))) as f32;
+        }
+        let found = DepthModes::of(&keyframe, &truth, 2.0).expect("two depths have relief");
+        assert!(found.magnitudes().iter().all(|&mode| mode < 1e-6), "{found:?}");
     }
 }
