@@ -42,20 +42,27 @@ impl Ending<'_> {
         let place = output.display().to_string();
         let results = Results::new(record, source, &self.config.results)?;
         let is_tracked = results.summary.frames_tracked > 0;
-        let keeps_earlier = !is_tracked && has_tracked_set(output);
+        // Poses without a map, of a run that failed: a full disk, a mapper that is gone.
+        let is_torn = matches!(record.ended, EndOfRun::Failed(_)) && results.summary.points == 0;
+        let keeps_earlier = (!is_tracked || is_torn) && has_tracked_set(output);
+        let keeps_journal = is_torn && is_tracked && keeps_earlier;
         if !keeps_earlier {
             results
                 .write(output, self.write_more)
                 .map_err(|error| not_written(&error, output, journal.as_ref()))?;
         }
-        if is_tracked {
+        if is_tracked && !keeps_earlier {
             self.output.become_latest().unwrap_or_else(|error| {
                 note(&format!(
                     "warning: {place} is written, but not linked as the latest ({error})"
                 ));
             });
         }
-        if let Some(Err(error)) = journal.map(Journal::finish) {
+        let kept = journal
+            .as_ref()
+            .filter(|_| keeps_journal)
+            .map(|journal| recover_command(journal.folder().parent().unwrap_or(output), true));
+        if let Some(Err(error)) = journal.filter(|_| !keeps_journal).map(Journal::finish) {
             note(&format!("warning: the journal of this run cannot be removed ({error})"));
         }
         if self.json {
@@ -66,9 +73,12 @@ impl Ending<'_> {
                 note(&format!("warning: {warning}"));
             }
         }
-        let where_to = match keeps_earlier {
-            true => format!("nothing is written: the earlier results in {place} are kept"),
-            false => format!("results in {place}"),
+        let where_to = match (keeps_earlier, kept) {
+            (true, Some(command)) => format!(
+                "the earlier results in {place} are kept, and the journal of this run: `{command}` writes what it has"
+            ),
+            (true, None) => format!("nothing is written: the earlier results in {place} are kept"),
+            (false, _) => format!("results in {place}"),
         };
         if !self.json {
             print(&format!("{where_to}{}\n", refused_text(&results.summary)))?;
@@ -96,18 +106,22 @@ fn not_written(error: &ResultsError, output: &Path, journal: Option<&Journal>) -
         "{error}; what was in {} is as it was, and the journal of this run is in {}: `{}` writes its results",
         output.display(),
         journal.folder().display(),
-        recover_command(journal.folder().parent().unwrap_or(output))
+        recover_command(journal.folder().parent().unwrap_or(output), false)
     )
 }
 
-/// What to type to recover the journal in a folder.
-fn recover_command(output: &Path) -> String {
+/// What to type to recover the journal in a folder, beside results that are there already or over them.
+fn recover_command(output: &Path, beside: bool) -> String {
+    let quoted = |path: String| {
+        let is_plain = |c: char| c.is_alphanumeric() || "/._-".contains(c);
+        match path.chars().all(is_plain) {
+            true => path,
+            false => format!("'{}'", path.replace('\'', r"'\''")),
+        }
+    };
     let path = output.display().to_string();
-    let is_plain = |c: char| c.is_alphanumeric() || "/._-".contains(c);
-    match path.chars().all(is_plain) {
-        true => format!("semidense recover {path}"),
-        false => format!("semidense recover '{}'", path.replace('\'', r"'\''")),
-    }
+    let elsewhere = format!(" --output {}", quoted(format!("{path}-recovered")));
+    format!("semidense recover {}{}", quoted(path), if beside { &elsewhere } else { "" })
 }
 
 /// Says where the journals of killed runs are and what to type.
@@ -116,7 +130,7 @@ pub fn note_unfinished(found: &[Unfinished]) {
         note(&format!(
             "a run was killed before its results were written; its journal is {}: `{}` writes them",
             unfinished.folder.display(),
-            recover_command(unfinished.output())
+            recover_command(unfinished.output(), has_tracked_set(unfinished.output()))
         ));
     }
 }

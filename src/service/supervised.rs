@@ -159,7 +159,8 @@ impl Supervised {
 
     /// It has ended: its life counts for the pause before the next.
     fn bury(&mut self) {
-        if self.child.as_ref().is_some_and(|child| child.age() > HEALTHY_LIFE) {
+        // One that never got ready died of its start, however long that took.
+        if self.was_ready && self.child.as_ref().is_some_and(|child| child.age() > HEALTHY_LIFE) {
             self.hasty_restarts = 0;
         }
         self.child = None;

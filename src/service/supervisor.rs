@@ -121,6 +121,8 @@ pub fn run(
     let source = open(&options.source, options.rig.as_deref(), &config.source_params())?;
     let place = Place::new(&config.instance, &config.root)?;
     let _claim = claim_all(&place)?;
+    // What a run before has left is not of this one.
+    place.forget_run();
     place.check_shared_memory(shared_memory_bytes(&source.intrinsics(), None))?;
     let mut supervisor = Supervisor::start(config, options, &place)?;
     let mut ended = supervisor.watch(shutdown, observe)?;
@@ -146,6 +148,7 @@ pub fn run(
         ended = Ended::Failed(cause.clone());
     }
     let (recorder, counters, restart_causes) = supervisor.finish(shutdown)?;
+    place.forget_run();
     let lost = counters.frames_in.saturating_sub(recorder.num_poses() as u64);
     if options.mode == Mode::Lockstep && ended == Ended::Finished && lost > 0 {
         ended = Ended::Failed(format!("{lost} of {} poses did not arrive", counters.frames_in));

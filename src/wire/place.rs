@@ -5,6 +5,7 @@ use std::fs::{self, DirBuilder, File, OpenOptions};
 use std::io::{self, Read, Seek, Write};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 use iceoryx2::prelude::{Config, FileName, Path as IpcPath, SemanticString};
 use rustix::fs::FlockOperation;
@@ -19,6 +20,11 @@ pub const SYSTEM_ROOT: &str = "/run/semidense";
 pub const ROOT_VARIABLE: &str = "SEMIDENSE_ROOT";
 /// Where the kernel keeps shared memory.
 pub const SHARED_MEMORY: &str = "/dev/shm";
+
+/// Longest wait for a process that joins or tidies up: both take milliseconds, on a busy machine a second.
+const LONGEST_HOLD: Duration = Duration::from_secs(10);
+/// Longest wait before tidying up, which the next process that leaves can do as well.
+const LONGEST_TIDY_WAIT: Duration = Duration::from_secs(1);
 
 /// Held while a process joins, and by the last one while it clears up.
 const JOIN_LOCK: &str = ".join.lock";
@@ -130,6 +136,15 @@ impl Place {
         self.root.join(format!("{}{POSITION_SUFFIX}", self.instance))
     }
 
+    /// Removes what processes of this instance keep for their successors. While the supervisor is claimed and
+    /// none of them runs.
+    pub fn forget_run(&self) {
+        for path in [self.checkpoint_path(), self.position_path()] {
+            // What is not there need not go; what cannot be removed is of another run by its key.
+            let _ = fs::remove_file(path);
+        }
+    }
+
     /// Takes from the group and all others what iceoryx2 gives them: its counter of nodes is the one
     /// segment that it makes for everybody.
     pub(in crate::wire) fn keep_to_user(&self) {
@@ -163,11 +178,15 @@ impl Place {
     pub(in crate::wire) fn hold(&self) -> Result<File, PlaceError> {
         let path = self.root.join(JOIN_LOCK);
         let io = |source| PlaceError::Io { path: path.clone(), source };
+        let end = Instant::now() + LONGEST_HOLD;
         loop {
             let file = open_lock(&path).map_err(io)?;
-            rustix::fs::flock(&file, FlockOperation::LockShared).map_err(|e| io(e.into()))?;
-            if is_same_file(&file, &path) {
-                return Ok(file);
+            if lock_until(&file, FlockOperation::NonBlockingLockShared, end) {
+                if is_same_file(&file, &path) {
+                    return Ok(file);
+                }
+            } else {
+                return Err(PlaceError::Held(path));
             }
         }
     }
@@ -178,8 +197,10 @@ impl Place {
     pub fn tidy(&self) {
         let path = self.root.join(JOIN_LOCK);
         let Ok(lock) = open_lock(&path) else { return };
-        // Waits for whoever joins or tidies up: of two that leave together, the second must look.
-        let is_alone = rustix::fs::flock(&lock, FlockOperation::LockExclusive).is_ok()
+        // Waits for whoever joins or tidies up: of two that leave together, the second must look. One that is
+        // stopped meanwhile leaves it to the next.
+        let end = Instant::now() + LONGEST_TIDY_WAIT;
+        let is_alone = lock_until(&lock, FlockOperation::NonBlockingLockExclusive, end)
             && is_same_file(&lock, &path);
         if !is_alone {
             return;
@@ -276,6 +297,21 @@ impl Drop for Claim {
     }
 }
 
+/// Tries to lock until `end`; whether it is locked.
+fn lock_until(file: &File, operation: FlockOperation, end: Instant) -> bool {
+    /// Between two attempts.
+    const PAUSE: Duration = Duration::from_millis(2);
+    loop {
+        if rustix::fs::flock(file, operation).is_ok() {
+            return true;
+        }
+        if Instant::now() >= end {
+            return false;
+        }
+        std::thread::sleep(PAUSE);
+    }
+}
+
 fn open_lock(path: &Path) -> io::Result<File> {
     const USER_ALONE: u32 = 0o600;
     let mut options = OpenOptions::new();
@@ -336,6 +372,25 @@ mod tests {
         drop(place.claim("capture").unwrap());
         place.tidy();
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn tidying_does_not_wait_for_ever_for_one_that_joins() {
+        let folder = tempfile::tempdir().unwrap();
+        let place = Place::new("rig", folder.path().to_str().unwrap()).unwrap();
+        place.create().unwrap();
+        let joining = place.hold().unwrap();
+        let end = Instant::now();
+        assert!(!lock_until(
+            &open_lock(&folder.path().join(JOIN_LOCK)).unwrap(),
+            FlockOperation::NonBlockingLockExclusive,
+            end
+        ));
+        place.tidy();
+        assert!(folder.path().join(JOIN_LOCK).exists());
+        drop(joining);
+        place.tidy();
+        assert!(!folder.path().join(JOIN_LOCK).exists());
     }
 
     #[test]

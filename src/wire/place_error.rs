@@ -30,6 +30,11 @@ pub enum PlaceError {
         /// Why.
         source: io::Error,
     },
+    /// A process that joins does not get ready.
+    #[error(
+        "{0}: another process has held this lock for ten seconds; is one of semidense's stopped (ps -o pid,stat,cmd -C semidense)? Continue or kill it"
+    )]
+    Held(PathBuf),
     /// There is one already.
     #[error(
         "{process} of instance `{instance}` already runs as process {holder}: stop it, or choose another --instance"

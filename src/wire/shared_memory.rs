@@ -2,13 +2,14 @@
 
 use std::fs::{self, OpenOptions};
 use std::io;
-use std::os::unix::fs::MetadataExt;
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::Path;
 
-use rustix::fs::{Access, FallocateFlags};
+use rustix::fs::{Access, FallocateFlags, OFlags};
 
 use crate::wire::limits::check_address_space;
 use crate::wire::place::{Place, PlaceError, SHARED_MEMORY};
+use crate::wire::root_folder::is_mine;
 
 impl Place {
     /// Takes all memory that the segments of this place have promised, where some of it is still to be had on
@@ -56,14 +57,21 @@ fn reserve(folder: &Path, prefix: &str) -> Result<(), PlaceError> {
         if !entry.file_name().to_string_lossy().starts_with(prefix) {
             continue;
         }
-        // Segments come and go: one that is gone needs nothing.
+        // Segments come and go: one that is gone needs nothing. Anybody may put a file with such a name there.
         let Ok(found) = entry.metadata() else { continue };
+        if !found.is_file() || !is_mine(&found) {
+            continue;
+        }
         let lacks = found.len().saturating_sub(found.blocks().saturating_mul(BLOCK_BYTES));
         if lacks == 0 {
             continue;
         }
         // Written only: a segment that is being made may be open for nothing else.
-        let Ok(file) = OpenOptions::new().write(true).open(entry.path()) else { continue };
+        let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32;
+        let open = OpenOptions::new().write(true).custom_flags(flags).open(entry.path());
+        let Some(file) = open.ok().filter(|file| file.metadata().is_ok_and(|m| m.is_file())) else {
+            continue;
+        };
         needed += lacks;
         let taken = rustix::fs::fallocate(&file, FallocateFlags::KEEP_SIZE, 0, found.len());
         // A file system that cannot reserve leaves it as it was.
@@ -100,6 +108,15 @@ mod tests {
         let length = fs::metadata(&segment).unwrap().len();
         [segment, foreign].iter().for_each(|path| fs::remove_file(path).unwrap());
         assert_eq!((taken, left, length), (1 << 20, 0, 1 << 20));
+    }
+
+    #[test]
+    fn a_pipe_with_the_name_of_a_segment_is_passed_over() {
+        let folder = tempfile::tempdir().unwrap();
+        let pipe = std::ffi::CString::new(folder.path().join("x_pipe").to_str().unwrap()).unwrap();
+        rustix::fs::mkfifoat(rustix::fs::CWD, &pipe, rustix::fs::Mode::from(0o600)).unwrap();
+        std::os::unix::fs::symlink("/dev/zero", folder.path().join("x_link")).unwrap();
+        reserve(folder.path(), "x_").unwrap();
     }
 
     #[test]

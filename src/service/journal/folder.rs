@@ -1,12 +1,13 @@
 //! Where journals are, and which of them belong to runs that were killed.
 
 use std::fs::{self, File};
-use std::io;
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use rustix::fs::FlockOperation;
 
+use crate::service::atomic_file::write_privately;
 use crate::service::results::output_folder::{PARENT, utc_stamp};
 use crate::wire::place::Place;
 
@@ -76,7 +77,7 @@ impl Pointer {
         place.create().map_err(io::Error::other)?;
         let name = format!("{}.{}{POINTER_SUFFIX}", place.instance, std::process::id());
         let path = place.root.join(name);
-        fs::write(&path, folder.as_os_str().as_bytes())?;
+        write_privately(&path, |file| file.write_all(folder.as_os_str().as_bytes()))?;
         Ok(Self(path))
     }
 

@@ -7,9 +7,10 @@ use crate::slam::evaluation::statistics::percentile;
 const MIN_FRAMES: usize = 30;
 
 /// Median whitened residual above which the calibration is doubted. Six recordings with their own
-/// calibration have 0.72 to 1.03. Above it are, of six each, five with focal lengths twice as long, five with
-/// half of them, five with 0.8 and three with 1.25 of them, and all twelve with another distortion.
-const DOUBTED_RESIDUAL: f64 = 1.1;
+/// calibration have 0.72 to 1.03 and a seventh, which was not looked at when the figure was chosen, 1.30: a
+/// warning that is false is worse than one that is missing. Above 1.3 are four of six with focal lengths
+/// twice as long, three with half of them, and ten of twelve with another distortion.
+const DOUBTED_RESIDUAL: f64 = 1.4;
 
 /// Median over the tracked frames of the root mean square residual over its standard deviation; 1 where
 /// everything is as modelled. `None` of few frames.
@@ -37,8 +38,8 @@ mod tests {
     #[test]
     fn only_large_residuals_are_doubted() {
         assert_eq!(calibration_warning(None), None);
-        assert_eq!(calibration_warning(Some(1.03)), None);
-        assert!(calibration_warning(Some(1.36)).unwrap().contains("1.36"));
+        assert_eq!(calibration_warning(Some(1.31)), None);
+        assert!(calibration_warning(Some(1.46)).unwrap().contains("1.46"));
         assert_eq!(whitened_residual_median(&[]), None);
     }
 }

@@ -189,7 +189,7 @@ pub struct Summary {
     /// Each time the map was found to contradict itself: the frame, and why. Known in a replay.
     pub map_rejections: Option<Vec<RejectionSummary>>,
     /// Median over the tracked frames of residuals over their standard deviation: 1 where all is as modelled, above
-    /// 1.1 the calibration is doubted; null of less than 30 frames.
+    /// 1.4 the calibration is doubted; null of less than 30 frames.
     pub whitened_residual_median: Option<f64>,
     /// From the first frame to the first whose pose is claimed; null where none is.
     pub initialization_secs: Option<f64>,

@@ -206,8 +206,8 @@ fn cards(summary: &Summary) -> String {
         card("Tracking a frame", format!("{:.1} ms", times.p50), note);
     }
     if let Some(times) = summary.latency_ms {
-        let misses = summary.deadline_misses.unwrap_or(0);
-        let note = format!("median; p99 {:.1} ms; {misses} after the deadline", times.p99);
+        let late = summary.deadline_misses.map(|misses| format!("; {misses} after the deadline"));
+        let note = format!("median; p99 {:.1} ms{}", times.p99, late.unwrap_or_default());
         card("Latency", format!("{:.1} ms", times.p50), note);
     }
     if let Some(factor) = summary.realtime_factor {
