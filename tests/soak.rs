@@ -6,7 +6,7 @@
 mod support;
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs;
+use std::fs::{self, File};
 use std::io::Write;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
@@ -179,6 +179,8 @@ impl Rigged {
         }
         command.args(["--live", "--source", "loop:1000000:30:sim", "--instance", name]);
         command.args(["--set", "supervisor.max_restarts=1000"]);
+        // A file is never full: many restarts say much.
+        command.stderr(File::create(Self::said(&output)).unwrap());
         let run = command.spawn().unwrap();
         let place = Place::new(name, rig.root().to_str().unwrap()).unwrap();
         let hub = until("a run", || Hub::join(&place, "observer", Access::Observer).ok());
@@ -187,6 +189,11 @@ impl Rigged {
         let open = |topic| until("a process", || Peer::open(&hub, topic).ok());
         let peers = HEALTH_TOPICS.iter().map(open).collect();
         Self { run, output, watch, peers, began: [Instant::now(); 3] }
+    }
+
+    /// What the run writes on standard error.
+    fn said(output: &Path) -> PathBuf {
+        output.with_extension("stderr")
     }
 
     fn name(victims: &[usize]) -> String {
@@ -248,7 +255,8 @@ impl Rigged {
         drop((self.peers, self.watch));
         signal(&run, Signal::INT);
         let ended = end(run);
-        assert_eq!(ended.status.code(), Some(130), "{}", ended.stderr);
+        let said = fs::read_to_string(Self::said(&output)).unwrap();
+        assert_eq!(ended.status.code(), Some(130), "{said}");
         let summary = fs::read_to_string(output.join("summary.json")).unwrap();
         let summary: Value = serde_json::from_str(&summary).unwrap();
         let of = |name: &str| summary[name].as_u64().unwrap();

@@ -5,10 +5,11 @@
 mod support;
 
 use std::fs;
-use std::io::Write;
+use std::io::{PipeReader, PipeWriter, Write};
 use std::process::Child;
 use std::time::Duration;
 
+use rustix::fs::{OFlags, fcntl_getfl, fcntl_setfl};
 use rustix::process::{Pid, Signal, kill_process};
 use semidense::service::peers::{HEALTH_TOPICS, Peer};
 use semidense::wire::port::Hub;
@@ -39,6 +40,10 @@ impl Live {
         let source = format!("loop:{FRAMES}:30:sim");
         let mut command = rig.run(40, &["--live", "--source", &source]);
         let run = command.args(arguments).spawn().unwrap();
+        Self::watch(rig, run)
+    }
+
+    fn watch(rig: Rig, run: Child) -> Self {
         let hub = rig.observe();
         let open = |topic| until("a process", || Peer::open(&hub, topic).ok());
         let peers = HEALTH_TOPICS.iter().map(open).collect();
@@ -144,6 +149,36 @@ fn a_replay_that_is_ended_by_any_signal_keeps_its_results() {
         let ended = end(replay);
         assert_eq!(ended.status.code(), Some(130), "{ending:?}: {}", ended.stderr);
     }
+}
+
+/// A pipe into which nothing more goes, and who does not read it.
+fn full_pipe() -> (PipeReader, PipeWriter) {
+    let (reader, mut writer) = std::io::pipe().unwrap();
+    let blocking = fcntl_getfl(&writer).unwrap();
+    fcntl_setfl(&writer, blocking | OFlags::NONBLOCK).unwrap();
+    while writer.write(b"x").is_ok() {}
+    fcntl_setfl(&writer, blocking).unwrap();
+    (reader, writer)
+}
+
+#[test]
+fn a_standard_error_that_nobody_reads_holds_nothing_up() {
+    let (unread, full) = full_pipe();
+    let rig = Rig::new();
+    let mut command = rig.run(40, &["--live", "--source", "loop:1000000:30:sim"]);
+    let run = command.stderr(full).spawn().unwrap();
+    drop(command);
+    let mut live = Live::watch(rig, run);
+    live.until_frames(TRACKER, 90);
+    let before = live.pid(TRACKER);
+    live.send(&[TRACKER], Signal::KILL);
+    live.until_replaced(TRACKER, before);
+    live.until_frames(TRACKER, 30);
+    signal(&live.run, Signal::INT);
+    let (code, _, summary, _rig) = live.end();
+    drop(unread);
+    assert_eq!(code, Some(130));
+    assert_eq!(summary["restarts_by_process"]["tracker"], 1, "{summary}");
 }
 
 /// Whoever hangs is killed and started again, and the summary says why.

@@ -7,9 +7,10 @@ use clap::{Args, Subcommand, ValueEnum};
 
 use crate::capture::source::SourceName;
 use crate::command::print::{note, print};
-use crate::command::run_progress::RunDisplay;
+use crate::command::run_progress::start_display;
 use crate::command::{CommandResult, CommonArguments, INTERRUPTED};
 use crate::service::config::Config;
+use crate::service::error_log::ErrorLog;
 use crate::service::latency_bench::{Disturbance, Measurement, Trial, TrialError, try_out};
 use crate::service::results::summary::Percentiles;
 use crate::service::shutdown::Shutdown;
@@ -82,7 +83,12 @@ pub struct LatencyArguments {
 const MAX_FRAMES: f64 = 5_184_000.0;
 
 /// Runs it.
-pub fn run(config: &Config, common: &CommonArguments, arguments: BenchArguments) -> CommandResult {
+pub fn run(
+    config: &Config,
+    common: &CommonArguments,
+    log: &ErrorLog,
+    arguments: BenchArguments,
+) -> CommandResult {
     let Bench::Latency(arguments) = arguments.what;
     let frames = (arguments.fps * arguments.seconds).round();
     if !(1.0..=MAX_FRAMES).contains(&frames) {
@@ -103,10 +109,11 @@ pub fn run(config: &Config, common: &CommonArguments, arguments: BenchArguments)
                 let scheduling = if real_time { "real time" } else { "ordinary" };
                 note(&format!("{}, {scheduling}:", disturbance.name()));
             }
-            let mut display = RunDisplay::new(arguments.json);
+            let display = start_display(arguments.json)?;
             let options = common.without_instance().to_arguments();
-            let tried =
-                try_out(config, &trial, &source, &options, &shutdown, &mut |p| display.show(p));
+            let tried = try_out(config, &trial, &source, &options, log, &shutdown, &mut |p| {
+                display.show(p)
+            });
             display.finish();
             match tried {
                 Err(TrialError::Interrupted) => return Ok(ExitCode::from(INTERRUPTED)),

@@ -26,6 +26,7 @@ use std::ffi::{OsStr, OsString};
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::time::Duration;
 
 use clap::{Args, CommandFactory, Parser, Subcommand, ValueEnum};
 use tracing_subscriber::EnvFilter;
@@ -35,6 +36,7 @@ use tracing_subscriber::prelude::*;
 use crate::command::print::{PrintError, note};
 use crate::service::child::{ERROR_PREFIX, follow_supervisor};
 use crate::service::config::{Config, ConfigError, SYSTEM_FOLDER, file_for};
+use crate::service::error_log::ErrorLog;
 use crate::wire::limits::check_address_space;
 use crate::wire::place::Place;
 
@@ -43,6 +45,9 @@ const INTERRUPTED: u8 = 130;
 
 /// Exit code of a run that has tracked nothing.
 const NOTHING_TRACKED: u8 = 3;
+
+/// How long the end of a command waits for its log to be written.
+const LAST_LINES: Duration = Duration::from_secs(1);
 
 /// Heading of the options that every command has.
 const COMMON: &str = "Common options";
@@ -167,32 +172,22 @@ pub fn command_line() -> clap::Command {
 /// Parses the command line and runs the chosen subcommand.
 pub fn main() -> ExitCode {
     let line = CommandLine::parse();
-    let outcome = prepare(&line.common).and_then(|config| {
-        let place = Place::new(&config.instance, &config.root)?;
-        if let Some(occupied) = &place.occupied {
-            note(&format!(
-                "warning: {} is not a folder of this user alone; {} is used in its place",
-                occupied.display(),
-                place.root.display()
-            ));
+    let log = match ErrorLog::start() {
+        Ok(log) => log,
+        Err(error) => {
+            note(&format!("{ERROR_PREFIX}no thread for the log can be started ({error})"));
+            return ExitCode::FAILURE;
         }
-        let outcome = match line.command {
-            Subcommands::Run(arguments) => run::run(&config, &line.common, arguments),
-            Subcommands::Capture(arguments) => capture::run(&config, arguments),
-            Subcommands::Tracker(arguments) => tracker::run(&config, arguments),
-            Subcommands::Mapper(arguments) => mapper::run(&config, arguments),
-            Subcommands::Replay(arguments) => replay::run(&config, arguments),
-            Subcommands::Recover(arguments) => recover::run(&config, &arguments),
-            Subcommands::Simulate(arguments) => simulate::run(&config, &arguments),
-            Subcommands::Evaluate(arguments) => evaluate::run(&arguments),
-            Subcommands::Status(arguments) => status::run(&config, arguments),
-            Subcommands::Cameras(arguments) => cameras::run(arguments),
-            Subcommands::Doctor(arguments) => doctor::run(&config, arguments),
-            Subcommands::Bench(arguments) => bench::run(&config, &line.common, arguments),
-        };
-        place.tidy();
-        outcome
-    });
+    };
+    let outcome = run_subcommand(line, &log);
+    // What is said last comes after the log.
+    log.wait_written(LAST_LINES);
+    if log.dropped_lines() > 0 {
+        let dropped = log.dropped_lines();
+        note(&format!(
+            "warning: {dropped} lines of the log were dropped: nobody read them in time"
+        ));
+    }
     outcome.unwrap_or_else(|error| {
         if error.downcast_ref::<PrintError>().is_some_and(PrintError::is_reader_gone) {
             return ExitCode::SUCCESS;
@@ -201,6 +196,35 @@ pub fn main() -> ExitCode {
         note(&format!("{ERROR_PREFIX}{line}"));
         ExitCode::FAILURE
     })
+}
+
+/// Reads the configuration and runs the chosen subcommand.
+fn run_subcommand(line: CommandLine, log: &ErrorLog) -> CommandResult {
+    let config = prepare(&line.common, log)?;
+    let place = Place::new(&config.instance, &config.root)?;
+    if let Some(occupied) = &place.occupied {
+        note(&format!(
+            "warning: {} is not a folder of this user alone; {} is used in its place",
+            occupied.display(),
+            place.root.display()
+        ));
+    }
+    let outcome = match line.command {
+        Subcommands::Run(arguments) => run::run(&config, &line.common, log, arguments),
+        Subcommands::Capture(arguments) => capture::run(&config, arguments),
+        Subcommands::Tracker(arguments) => tracker::run(&config, arguments),
+        Subcommands::Mapper(arguments) => mapper::run(&config, arguments),
+        Subcommands::Replay(arguments) => replay::run(&config, arguments),
+        Subcommands::Recover(arguments) => recover::run(&config, &arguments),
+        Subcommands::Simulate(arguments) => simulate::run(&config, &arguments),
+        Subcommands::Evaluate(arguments) => evaluate::run(&arguments),
+        Subcommands::Status(arguments) => status::run(&config, arguments),
+        Subcommands::Cameras(arguments) => cameras::run(arguments),
+        Subcommands::Doctor(arguments) => doctor::run(&config, arguments),
+        Subcommands::Bench(arguments) => bench::run(&config, &line.common, log, arguments),
+    };
+    place.tidy();
+    outcome
 }
 
 /// The filter of `--log`. A word alone must be a level: the filter's own reader takes every other word
@@ -220,9 +244,9 @@ fn log_filter(text: &str) -> Result<EnvFilter, String> {
 }
 
 /// Spans are logged as they end, with the time that they took, where the level shows them.
-fn start_log(filter: EnvFilter, format: LogFormat) -> Result<(), Box<dyn Error>> {
+fn start_log(filter: EnvFilter, format: LogFormat, log: &ErrorLog) -> Result<(), Box<dyn Error>> {
     let lines = tracing_subscriber::fmt::layer()
-        .with_writer(std::io::stderr)
+        .with_writer(log.clone())
         .with_ansi(std::io::stderr().is_terminal())
         .with_target(false)
         .with_span_events(FmtSpan::CLOSE);
@@ -239,10 +263,10 @@ fn start_log(filter: EnvFilter, format: LogFormat) -> Result<(), Box<dyn Error>>
     Ok(())
 }
 
-fn prepare(common: &CommonArguments) -> Result<Config, Box<dyn Error>> {
+fn prepare(common: &CommonArguments, log: &ErrorLog) -> Result<Config, Box<dyn Error>> {
     follow_supervisor()?;
     check_address_space(0)?;
-    start_log(log_filter(&common.log)?, common.log_format)?;
+    start_log(log_filter(&common.log)?, common.log_format, log)?;
     let config = common.load()?;
     tracing::info!("configuration:\n{}", config.to_text());
     Ok(config)

@@ -2,6 +2,11 @@
 
 use std::io::{self, Write};
 
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+
+/// How long a line waits for a standard error that takes nothing: stopped by Ctrl-S, or a pipe that nobody reads.
+const LONGEST_WAIT: Timespec = Timespec { tv_sec: 1, tv_nsec: 0 };
+
 /// Standard output takes no more.
 #[derive(Debug, thiserror::Error)]
 #[error("standard output: {0}; write it to a place with room")]
@@ -21,7 +26,13 @@ pub fn print(text: &str) -> Result<(), PrintError> {
     Ok(stdout.flush()?)
 }
 
-/// Prints a line on standard error; nobody is left to be told when that fails.
+/// Prints a line on standard error; nobody is left to be told when that fails. Nothing waits for ever for
+/// somebody to read it.
 pub fn note(line: &str) {
-    let _ = writeln!(io::stderr(), "{line}");
+    let stderr = io::stderr();
+    let mut ready = [PollFd::new(&stderr, PollFlags::OUT)];
+    // An error, or somebody who has gone, is met by the write.
+    if !matches!(poll(&mut ready, Some(&LONGEST_WAIT)), Ok(0)) {
+        let _ = (&stderr).write_all(format!("{line}\n").as_bytes());
+    }
 }

@@ -8,9 +8,10 @@ use clap::Args;
 use crate::command::capture::{ModeArguments, SourceArguments, usual_mode};
 use crate::command::ending::{Ending, note_unfinished, run_start};
 use crate::command::print::note;
-use crate::command::run_progress::RunDisplay;
+use crate::command::run_progress::start_display;
 use crate::command::{CommandResult, CommonArguments, INTERRUPTED};
 use crate::service::config::Config;
+use crate::service::error_log::ErrorLog;
 use crate::service::journal::folder::unfinished;
 use crate::service::journal::log::RunStart;
 use crate::service::journal::{Journal, JournalOptions};
@@ -39,7 +40,12 @@ pub struct RunArguments {
 }
 
 /// Runs it.
-pub fn run(config: &Config, common: &CommonArguments, arguments: RunArguments) -> CommandResult {
+pub fn run(
+    config: &Config,
+    common: &CommonArguments,
+    log: &ErrorLog,
+    arguments: RunArguments,
+) -> CommandResult {
     let mut child_arguments = common.to_arguments();
     if arguments.source.strict {
         child_arguments.extend(["--set".into(), "capture.strict=true".into()]);
@@ -66,10 +72,12 @@ pub fn run(config: &Config, common: &CommonArguments, arguments: RunArguments) -
         keeps_map: true,
         journal: Some(journal),
         arguments: child_arguments,
+        log: log.clone(),
     };
-    let mut display = RunDisplay::new(arguments.json);
-    let mut outcome = supervise(config, &options, &shutdown, &mut |p| display.show(p))?;
+    let display = start_display(arguments.json)?;
+    let outcome = supervise(config, &options, &shutdown, &mut |p| display.show(p));
     display.finish();
+    let mut outcome = outcome?;
     if outcome.record.poses.is_empty() && outcome.ended != Ended::Finished {
         // There is nothing that could be lost.
         drop(outcome.journal.take().map(Journal::finish));

@@ -1,18 +1,29 @@
-//! How a run is shown: a bar on a terminal, plain lines otherwise.
+//! How a run is shown: a bar on a terminal, plain lines otherwise. It is shown by a thread of its own, so that the
+//! supervisor does not wait for a terminal that is stopped or a pipe that nobody reads.
 
-use std::io::IsTerminal;
+use std::io::{self, IsTerminal};
 use std::time::Instant;
 
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::command::print::note;
 use crate::command::progress::LINE_PERIOD;
+use crate::service::progress_thread::ProgressThread;
 use crate::service::run_progress::RunProgress;
 use crate::slam::pose::TrackingState;
 
-/// Shows the progress of a run.
+/// Starts the thread that shows the progress of a run: nothing if quiet, else what suits the terminal.
+pub fn start_display(is_quiet: bool) -> io::Result<ProgressThread> {
+    let mut shown = Shown::new(is_quiet);
+    ProgressThread::start(move |progress| match progress {
+        Some(progress) => shown.show(progress),
+        None => shown.finish(),
+    })
+}
+
+/// What the user sees.
 #[derive(Debug)]
-pub struct RunDisplay {
+struct Shown {
     bar: Option<ProgressBar>,
     is_quiet: bool,
     /// When the last plain line came, or the run began.
@@ -21,9 +32,8 @@ pub struct RunDisplay {
     waits_for: Option<String>,
 }
 
-impl RunDisplay {
-    /// Quiet, or what suits the terminal.
-    pub fn new(is_quiet: bool) -> Self {
+impl Shown {
+    fn new(is_quiet: bool) -> Self {
         let bar = (!is_quiet && std::io::stderr().is_terminal()).then(|| {
             let bar = ProgressBar::new(0);
             let style = ProgressStyle::with_template("{prefix:9} {bar:40} {pos}/{len} {msg}");
@@ -33,8 +43,7 @@ impl RunDisplay {
         Self { bar, is_quiet, last_line: Instant::now(), waits_for: None }
     }
 
-    /// Shows how far it is.
-    pub fn show(&mut self, progress: &RunProgress) {
+    fn show(&mut self, progress: &RunProgress) {
         let (prefix, done, total, message) = match progress {
             RunProgress::Waiting(reason) => return self.show_waiting(reason),
             RunProgress::Preparing(done, total) => ("preparing", *done, *total, String::new()),
@@ -75,7 +84,7 @@ impl RunDisplay {
     }
 
     /// Takes the bar away.
-    pub fn finish(&self) {
+    fn finish(&self) {
         self.bar.iter().for_each(ProgressBar::finish_and_clear);
     }
 }

@@ -15,6 +15,7 @@ use rustix::fs::MemfdFlags;
 use rustix::process::{Pid, Signal};
 
 use crate::capture::source::SourceName;
+use crate::service::error_log::ErrorLog;
 use crate::service::liveness::Liveness;
 use crate::service::manager_notice::VARIABLES;
 use crate::service::mode::Mode;
@@ -27,6 +28,12 @@ const FRAMES_VARIABLE: &str = "SEMIDENSE_PREPARED_FRAMES";
 const FRAMES_ON_STDIN: &str = "stdin";
 /// What the last line of a command that fails begins with.
 pub const ERROR_PREFIX: &str = "error: ";
+/// How long a killed process may take to end: one that the kernel does not let go, as in a driver that hangs, is left.
+const LONGEST_DEATH: Duration = Duration::from_secs(2);
+/// How long after a process's end its last words are waited for: somebody else may hold its standard error.
+const LAST_WORDS: Duration = Duration::from_secs(1);
+/// Pause between two looks at either.
+const LOOK_PAUSE: Duration = Duration::from_millis(2);
 
 /// Why a supervised process must not start.
 #[derive(Debug, thiserror::Error)]
@@ -91,13 +98,14 @@ pub struct Child {
 impl Child {
     /// Starts the subcommand `name` of this binary, in a process group of its own, so that a Ctrl-C
     /// at the terminal reaches only the supervisor. `run` names the run that it belongs to; `frames`
-    /// is where it keeps frames that it prepares.
+    /// is where it keeps frames that it prepares; its log goes to `log`.
     pub fn start(
         name: &'static str,
         arguments: &[OsString],
         root: &Path,
         run: &str,
         frames: Option<&File>,
+        log: &ErrorLog,
     ) -> io::Result<Self> {
         let frames = frames.map(File::try_clone).transpose()?;
         let mut command = Command::new(std::env::current_exe()?);
@@ -121,9 +129,9 @@ impl Child {
         let reader = match process.stderr.take() {
             None => None,
             Some(stderr) => {
-                let fault = Arc::clone(&fault);
+                let (fault, log) = (Arc::clone(&fault), log.clone());
                 let thread = std::thread::Builder::new().name(format!("semidense-{name}-log"));
-                Some(thread.spawn(move || forward(stderr, &fault))?)
+                Some(thread.spawn(move || forward(stderr, &fault, log))?)
             }
         };
         Ok(Self { name, process, started: Instant::now(), fault, reader })
@@ -157,17 +165,16 @@ impl Child {
         }
     }
 
-    /// Kills it and waits for its end.
+    /// Kills it and waits for its end, but not for ever.
     pub fn kill(&mut self) {
         let _ = self.process.kill();
-        let _ = self.process.wait();
+        wait_at_most(LONGEST_DEATH, || !matches!(self.process.try_wait(), Ok(None)));
     }
 
     /// What it said when it failed. Call it after its end.
     pub fn fault(&mut self) -> Option<String> {
         if let Some(reader) = self.reader.take() {
-            // A panic there would have been a write to a closed terminal.
-            let _ = reader.join();
+            wait_at_most(LAST_WORDS, || reader.is_finished());
         }
         self.fault.lock().unwrap_or_else(PoisonError::into_inner).take()
     }
@@ -179,16 +186,23 @@ impl Drop for Child {
     }
 }
 
+/// Looks again and again whether something is over, at most for `longest`.
+fn wait_at_most(longest: Duration, mut is_over: impl FnMut() -> bool) {
+    let start = Instant::now();
+    while !is_over() && start.elapsed() < longest {
+        std::thread::sleep(LOOK_PAUSE);
+    }
+}
+
 /// Passes a child's log on; its error is kept for the supervisor's own last line.
-fn forward(stderr: ChildStderr, fault: &Mutex<Option<String>>) {
+fn forward(stderr: ChildStderr, fault: &Mutex<Option<String>>, mut log: ErrorLog) {
     for line in BufReader::new(stderr).split(b'\n').map_while(Result::ok) {
         let line = String::from_utf8_lossy(&line);
         match line.strip_prefix(ERROR_PREFIX) {
             Some(error) => {
                 *fault.lock().unwrap_or_else(PoisonError::into_inner) = Some(error.to_owned());
             }
-            // A closed terminal is no reason to stop reading.
-            None => drop(writeln!(io::stderr(), "{line}")),
+            None => drop(log.write_all(format!("{line}\n").as_bytes())),
         }
     }
 }

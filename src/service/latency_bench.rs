@@ -12,6 +12,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::capture::source::SourceName;
 use crate::service::config::Config;
+use crate::service::error_log::ErrorLog;
 use crate::service::mode::Mode;
 use crate::service::results::RecordedPose;
 use crate::service::results::summary::Percentiles;
@@ -147,6 +148,7 @@ pub fn try_out(
     trial: &Trial,
     source: &SourceName,
     arguments: &[OsString],
+    log: &ErrorLog,
     shutdown: &Shutdown,
     observe: &mut dyn FnMut(&RunProgress),
 ) -> Result<Measurement, TrialError> {
@@ -170,6 +172,7 @@ pub fn try_out(
         output: PathBuf::new(),
         keeps_map: false,
         journal: None,
+        log: log.clone(),
         arguments: arguments
             .iter()
             .cloned()

@@ -1,5 +1,4 @@
-//! The supervisor: starts the three processes, watches them, collects what they publish, ends them
-//! in order, and leaves nothing behind.
+//! Starts the three processes, watches them, collects what they publish, ends them in order, leaves nothing behind.
 
 use std::ffi::OsString;
 use std::fs::File;
@@ -12,6 +11,7 @@ use crate::service::checkpoint::read_checkpoint;
 use crate::service::child::{Child, memory_for_frames};
 use crate::service::clock::now_nanos;
 use crate::service::config::Config;
+use crate::service::error_log::ErrorLog;
 use crate::service::final_map::{FinalMapError, final_map};
 use crate::service::health::{ProcessState, cause};
 use crate::service::journal::{Journal, JournalOptions};
@@ -58,6 +58,8 @@ pub struct RunOptions {
     pub journal: Option<JournalOptions>,
     /// Options that every child gets: where the configuration comes from.
     pub arguments: Vec<OsString>,
+    /// Where the log of the children goes.
+    pub log: ErrorLog,
 }
 
 /// How a run ended.
@@ -276,7 +278,7 @@ impl<'a> Supervisor<'a> {
         }
         let is_capture = name == HEALTH_TOPICS[CAPTURE].owner;
         let frames = self.frames.as_ref().filter(|_| is_capture);
-        Child::start(name, &arguments, &self.place.root, &self.run, frames)
+        Child::start(name, &arguments, &self.place.root, &self.run, frames, &self.options.log)
             .map_err(|source| RunError::Child { process: name, source })
     }
 

@@ -1,0 +1,67 @@
+//! Hands the progress of a run to a thread that shows it, so that the run never waits for a terminal that is stopped
+//! or a pipe that nobody reads.
+
+use std::io;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use crossbeam::queue::ArrayQueue;
+
+use crate::service::run_progress::RunProgress;
+
+/// How long the end waits for the thread.
+const LONGEST_FINISH: Duration = Duration::from_secs(1);
+/// Pause between two looks whether it has ended.
+const LOOK_PAUSE: Duration = Duration::from_millis(2);
+
+/// The thread and what it is handed.
+#[derive(Debug)]
+pub struct ProgressThread {
+    thread: JoinHandle<()>,
+    handed: Arc<Handed>,
+}
+
+/// The newest replaces what was not shown yet.
+#[derive(Debug)]
+struct Handed {
+    newest: ArrayQueue<RunProgress>,
+    is_over: AtomicBool,
+}
+
+impl ProgressThread {
+    /// Starts it with what shows progress; `None` is the end.
+    pub fn start(mut show: impl FnMut(Option<&RunProgress>) + Send + 'static) -> io::Result<Self> {
+        let newest = ArrayQueue::new(1);
+        let handed = Arc::new(Handed { newest, is_over: AtomicBool::new(false) });
+        let taken = Arc::clone(&handed);
+        let thread = std::thread::Builder::new().name("semidense-display".to_owned());
+        let thread = thread.spawn(move || {
+            while !taken.is_over.load(Ordering::Acquire) {
+                match taken.newest.pop() {
+                    Some(progress) => show(Some(&progress)),
+                    None => std::thread::park(),
+                }
+            }
+            show(None);
+        })?;
+        Ok(Self { thread, handed })
+    }
+
+    /// Hands over how far it is, without waiting.
+    pub fn show(&self, progress: &RunProgress) {
+        self.handed.newest.force_push(progress.clone());
+        self.thread.thread().unpark();
+    }
+
+    /// Ends it; one that cannot write is not waited for.
+    pub fn finish(self) {
+        self.handed.is_over.store(true, Ordering::Release);
+        self.thread.thread().unpark();
+        let start = Instant::now();
+        while !self.thread.is_finished() && start.elapsed() < LONGEST_FINISH {
+            std::thread::sleep(LOOK_PAUSE);
+        }
+    }
+}
