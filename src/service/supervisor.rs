@@ -20,7 +20,8 @@ use crate::service::peers::{HEALTH_TOPICS, Peer};
 use crate::service::position::{position_key, read_position};
 use crate::service::recorder::Recorder;
 use crate::service::recording::{RecordParts, RunCounters};
-use crate::service::results::{EndOfRun, RestartCause, RunMode, RunRecord};
+use crate::service::results::{RestartCause, RunMode, RunRecord};
+pub use crate::service::run_progress::Ended;
 use crate::service::run_progress::RunProgress;
 use crate::service::schedule::peak_rss_bytes;
 use crate::service::shutdown::Shutdown;
@@ -60,17 +61,6 @@ pub struct RunOptions {
     pub arguments: Vec<OsString>,
     /// Where the log of the children goes.
     pub log: ErrorLog,
-}
-
-/// How a run ended.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Ended {
-    /// With the end of the source.
-    Finished,
-    /// By a signal.
-    Interrupted,
-    /// Because a process failed; says which and why.
-    Failed(String),
 }
 
 /// A run that is over: its record is whole up to its end.
@@ -166,16 +156,8 @@ pub fn run(
         deadline_ms,
         counters,
     });
-    let record = RunRecord { ended: end_of_run(&ended), refused, restart_causes, ..record };
+    let record = RunRecord { ended: (&ended).into(), refused, restart_causes, ..record };
     Ok(RunOutcome { record, journal, source, ended })
-}
-
-fn end_of_run(ended: &Ended) -> EndOfRun {
-    match ended {
-        Ended::Finished => EndOfRun::Finished,
-        Ended::Interrupted => EndOfRun::Interrupted,
-        Ended::Failed(cause) => EndOfRun::Failed(cause.clone()),
-    }
 }
 
 /// The journal of the run. Without one it goes on.

@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 
 use iceoryx2::prelude::{Config, FileName, Path as IpcPath, SemanticString};
 use rustix::fs::FlockOperation;
+use rustix::thread::Timespec;
 
 use crate::wire::limits::raise_open_files;
 pub use crate::wire::place_error::PlaceError;
@@ -300,7 +301,7 @@ impl Drop for Claim {
 /// Tries to lock until `end`; whether it is locked.
 fn lock_until(file: &File, operation: FlockOperation, end: Instant) -> bool {
     /// Between two attempts.
-    const PAUSE: Duration = Duration::from_millis(2);
+    const PAUSE: Timespec = Timespec { tv_sec: 0, tv_nsec: 2_000_000 };
     loop {
         if rustix::fs::flock(file, operation).is_ok() {
             return true;
@@ -308,7 +309,8 @@ fn lock_until(file: &File, operation: FlockOperation, end: Instant) -> bool {
         if Instant::now() >= end {
             return false;
         }
-        std::thread::sleep(PAUSE);
+        // Interrupted or not, the end decides.
+        drop(rustix::thread::nanosleep(&PAUSE));
     }
 }
 
