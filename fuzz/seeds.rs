@@ -196,6 +196,7 @@ fn messages() -> [Vec<u8>; 7] {
         progress_done: 0,
         progress_total: 0,
         frames: 9,
+        rate_hz: 30.0,
         dropped: 0,
         gaps: 0,
         refused: 0,

@@ -25,11 +25,12 @@ use crate::wire::place::Place;
 use crate::wire::port::{Access, Hub, OpenError, Subscriber, wait};
 use crate::wire::topic::{POSE, Topic};
 
-/// Time between two looks: rates are taken over it.
+/// Time between two looks.
 const PERIOD: Duration = Duration::from_secs(1);
-/// Looks after which `--once` shows what it has: two reports are a second apart, a process that
-/// starts or ends may give only one.
-const MAX_LOOKS: usize = 4;
+/// The same where one look is all: processes answer whoever joins within their next frame.
+const ONCE_PERIOD: Duration = Duration::from_millis(50);
+/// Looks after which `--once` shows what it has: a process that hangs or ends answers no more. Three seconds.
+const MAX_LOOKS: usize = 60;
 /// A process that has said nothing for so long is not there any more.
 const STALE_NANOS: i64 = 3_000_000_000;
 
@@ -59,15 +60,15 @@ pub fn run(config: &Config, arguments: StatusArguments) -> CommandResult {
     let mut watch = Watch::open(&hub, &place, &config.instance)?;
     let shutdown = Shutdown::install()?;
     let is_live = std::io::stdout().is_terminal() && !arguments.once && !arguments.json;
+    let period = if arguments.once { ONCE_PERIOD } else { PERIOD };
     for looks in 1.. {
-        wait(&[], Some(shutdown.descriptor()), PERIOD)?;
+        wait(&[], Some(shutdown.descriptor()), period)?;
         if shutdown.is_requested() {
             break;
         }
-        let look = watch.look(&hub, arguments.once)?;
-        // A rate takes two reports of a process; one that is alone or silent has none.
+        let look = watch.look(&hub)?;
         let has_ended = look["ended"] == true;
-        if arguments.once && looks < MAX_LOOKS && !is_measured(&look) && !has_ended {
+        if arguments.once && looks < MAX_LOOKS && !watch.is_complete(&look) {
             continue;
         }
         let clear = if is_live { CLEAR_SCREEN } else { "" };
@@ -92,18 +93,11 @@ fn terminal_width() -> usize {
     size.map_or(USUAL_WIDTH, |size| usize::from(size.ws_col)).max(1)
 }
 
-/// Whether every process that speaks has given two reports.
-fn is_measured(look: &Value) -> bool {
-    let processes = HEALTH_TOPICS.iter().map(|topic| &look[topic.owner]);
-    processes.into_iter().all(|row| row.is_null() || !row["rate_hz"].is_null())
-}
-
 /// What is listened to.
 struct Watch<'a> {
     place: &'a Place,
     instance: String,
     peers: Vec<Option<Peer>>,
-    before: Vec<Option<HealthMessage>>,
     poses: Option<Subscriber<PoseMessage, ()>>,
     last_pose: Option<PoseMessage>,
 }
@@ -117,25 +111,26 @@ impl<'a> Watch<'a> {
             // Its error says that nothing runs, unless this has changed just now.
             Peer::open(hub, &HEALTH_TOPICS[0])?;
         }
-        let before = vec![None; peers.len()];
-        Ok(Self {
-            place,
-            instance: instance.to_owned(),
-            peers,
-            before,
-            poses: None,
-            last_pose: None,
-        })
+        Ok(Self { place, instance: instance.to_owned(), peers, poses: None, last_pose: None })
     }
 
-    /// One look. `keeps_first`: rates are taken since the first report, to be done soonest.
-    fn look(&mut self, hub: &Hub, keeps_first: bool) -> CommandValue {
+    /// Whether every process that is there has said how it is, and the tracker its pose.
+    fn is_complete(&self, look: &Value) -> bool {
+        let is_heard = |topic: &Topic| {
+            let id = self.place.claimant(topic.owner);
+            let is_there = id.is_some_and(|id| Liveness::of(id) != Liveness::Gone);
+            !is_there || !look[topic.owner].is_null()
+        };
+        let counts_frames = look["tracker"]["frames"].as_u64().is_some_and(|frames| frames > 0);
+        HEALTH_TOPICS.iter().all(is_heard) && (!counts_frames || !look["pose"].is_null())
+    }
+
+    /// One look.
+    fn look(&mut self, hub: &Hub) -> CommandValue {
         let mut look = json!({ "instance": self.instance, "source": null, "uptime_secs": null, "keyframes": null });
         let now = now_nanos();
         let (mut heard, mut ended) = (0, 0);
-        for ((topic, peer), before) in
-            HEALTH_TOPICS.iter().zip(&mut self.peers).zip(&mut self.before)
-        {
+        for (topic, peer) in HEALTH_TOPICS.iter().zip(&mut self.peers) {
             if peer.is_none() {
                 // It may have come up since the last look.
                 *peer = listen(hub, topic)?;
@@ -156,7 +151,7 @@ impl<'a> Watch<'a> {
             let state = state_of(health, reported.map(|state| state.name()), now);
             heard += 1;
             ended += usize::from(state == NOT_RUNNING);
-            look[topic.owner] = row(health, state, before.as_ref(), now);
+            look[topic.owner] = row(health, state, now);
             match topic.owner {
                 "capture" => look["source"] = json!(source(health)),
                 "mapper" => look["keyframes"] = json!(health.total),
@@ -166,9 +161,6 @@ impl<'a> Watch<'a> {
             let own = look[topic.owner]["uptime_secs"].as_f64().unwrap_or_default();
             // A process that was started again is younger than the run.
             look["uptime_secs"] = json!(known.max(own));
-            if !(keeps_first && before.is_some()) {
-                *before = Some(*health);
-            }
         }
         self.hear_poses(hub)?;
         look["pose"] = self.last_pose.as_ref().map_or(Value::Null, |pose| pose_row(pose, now));
@@ -241,12 +233,9 @@ fn listen(hub: &Hub, topic: &Topic) -> Result<Option<Peer>, OpenError> {
 }
 
 /// One process as JSON.
-fn row(health: &HealthMessage, state: &str, before: Option<&HealthMessage>, now: i64) -> Value {
-    let rate_hz = before.and_then(|before| {
-        let nanos = health.published_nanos - before.published_nanos;
-        let frames = health.frames.checked_sub(before.frames)?;
-        (nanos > 0).then(|| frames as f64 * 1e9 / nanos as f64)
-    });
+fn row(health: &HealthMessage, state: &str, now: i64) -> Value {
+    let is_running = ["running", "stale"].contains(&state);
+    let rate_hz = (is_running && health.rate_hz.is_finite()).then_some(health.rate_hz);
     json!({
         "state": state,
         "cause": cause(health),

@@ -137,9 +137,8 @@ pub struct Health {
     message: HealthMessage,
     changed: bool,
     notice: ManagerNotice,
-    /// Frames that had been counted when the rate was told last, and when that was.
-    told: (u64, i64),
-    rate_hz: f64,
+    /// Frames that had been counted when the rate was taken last, and when that was.
+    rated: (u64, i64),
 }
 
 impl Health {
@@ -153,6 +152,7 @@ impl Health {
             progress_done: 0,
             progress_total: 0,
             frames: 0,
+            rate_hz: f64::NAN,
             dropped: 0,
             gaps: 0,
             refused: 0,
@@ -179,8 +179,8 @@ impl Health {
         };
         let publisher = hub.publisher(topic, 1)?;
         let notice = ManagerNotice::from_environment();
-        let told = (0, message.started_nanos);
-        let mut health = Self { publisher, message, changed: true, notice, told, rate_hz: 0.0 };
+        let rated = (0, message.started_nanos);
+        let mut health = Self { publisher, message, changed: true, notice, rated };
         health.report();
         Ok(health)
     }
@@ -261,21 +261,26 @@ impl Health {
         }
         self.message.published_nanos = now;
         self.message.peak_rss_bytes = peak_rss_bytes().unwrap_or(0);
+        self.take_rate(now);
         self.changed = false;
         if let Err(error) = self.publisher.send((), &[self.message]) {
             tracing::warn!("{error}");
         }
-        self.tell_status(now);
+        self.tell_status();
+    }
+
+    /// Frames a second since the rate was taken last, when that is a second ago.
+    fn take_rate(&mut self, now: i64) {
+        let (frames, since) = self.rated;
+        if now - since >= REPORT_PERIOD_NANOS {
+            let secs = (now - since) as f64 * 1e-9;
+            self.message.rate_hz = self.message.frames.saturating_sub(frames) as f64 / secs;
+            self.rated = (self.message.frames, now);
+        }
     }
 
     /// The state, its cause and the figures as a line for the service manager.
-    fn tell_status(&mut self, now: i64) {
-        let (frames, since) = self.told;
-        if now - since >= REPORT_PERIOD_NANOS {
-            let secs = (now - since) as f64 * 1e-9;
-            self.rate_hz = self.message.frames.saturating_sub(frames) as f64 / secs;
-            self.told = (self.message.frames, now);
-        }
+    fn tell_status(&mut self) {
         let state = ProcessState::from_code(self.message.state).unwrap_or(ProcessState::Failed);
         if matches!(state, ProcessState::Finished | ProcessState::Failed) {
             self.notice.stopping();
@@ -284,7 +289,8 @@ impl Health {
         // Our own text, cut at a character.
         let cause = str::from_utf8(&self.message.cause[..length]).unwrap_or_default();
         let separator = if cause.is_empty() { "" } else { ": " };
-        let (name, rate_hz) = (state.name(), self.rate_hz);
+        // Before the first second is over nothing is known of the rate.
+        let (name, rate_hz) = (state.name(), self.message.rate_hz.max(0.0));
         let HealthMessage { frames, deadline_misses, refused, .. } = self.message;
         self.notice.status(format_args!(
             "{name}{separator}{cause} ({rate_hz:.1} frames/s, {frames} frames, {deadline_misses} late, {refused} refused)"

@@ -180,6 +180,9 @@ impl<'a> Shell<'a> {
             self.output.serve_late_joiners();
             while let Some((frame, pose)) = self.next_pair()? {
                 self.step(&frame, &pose)?;
+                // A map that is behind has no pause between its steps.
+                self.answer_commands()?;
+                self.output.serve_late_joiners();
                 if shutdown.is_requested() {
                     return Ok(());
                 }

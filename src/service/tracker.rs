@@ -131,12 +131,16 @@ impl<'a> Shell<'a> {
 
     fn track_until(&mut self, shutdown: &Shutdown) -> Result<(), TrackerError> {
         while !shutdown.is_requested() {
-            if let Some(frame) = self.await_frame(shutdown)? {
-                self.step(&frame)?;
-            }
+            let mut awaited = self.await_frame(shutdown)?;
             self.poses.serve_late_joiners();
-            while let Some(frame) = self.next_frame()? {
+            while let Some(frame) = take_or(&mut awaited, || self.next_frame())? {
                 self.step(&frame)?;
+                // Frames that take longer than their period leave no pause between them.
+                self.poses.serve_late_joiners();
+                self.health.report();
+                if shutdown.is_requested() {
+                    return Ok(());
+                }
             }
             self.look_for_silence();
             self.health.report();
@@ -311,6 +315,14 @@ impl<'a> Shell<'a> {
         counters.deadline_misses += u64::from(late);
         Ok(())
     }
+}
+
+/// What has come already, else what comes now.
+fn take_or<T, E>(
+    come: &mut Option<T>,
+    next: impl FnOnce() -> Result<Option<T>, E>,
+) -> Result<Option<T>, E> {
+    come.take().map_or_else(next, |come| Ok(Some(come)))
 }
 
 /// A state and its reason, for whoever looks on.

@@ -224,8 +224,8 @@ pub struct KeyframePoseMessage {
 
 /// Message of `<process>/health`.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ZeroCopySend)]
-#[type_name("semidense.Health.v3")]
+#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
+#[type_name("semidense.Health.v4")]
 pub struct HealthMessage {
     /// CLOCK_MONOTONIC when it was published.
     pub published_nanos: i64,
@@ -241,6 +241,8 @@ pub struct HealthMessage {
     pub progress_total: u64,
     /// Frames sent, tracked or mapped.
     pub frames: u64,
+    /// The same a second, over about the last second; NaN before one is over.
+    pub rate_hz: f64,
     /// Frames that came too late to be handled.
     pub dropped: u64,
     /// Frames that the source lost.
