@@ -71,7 +71,9 @@ soon "stamps of another clock: its notice" 30 says 'stamped as they arrive'
 soon "and frames flow" 30 flows
 control wrap_timestamp=0
 control inject_fatal_streaming_error=1
+# Noticed within a frame; opened again up to two seconds later. What is not open cannot be unplugged.
 sleep 1
+soon "stamps of our own clock again: frames flow" 30 flows
 
 echo "-- unplugged"
 control disconnect=1
