@@ -95,8 +95,9 @@ impl Watch {
                 let secs = (pose.capture_nanos - last.capture_nanos) as f64 * 1e-9;
                 assert!(
                     step < LARGEST_STEP * secs.max(1.0),
-                    "a jump of {step} at frame {}",
-                    pose.sequence
+                    "a jump of {step} from {} to {}",
+                    described(&last),
+                    described(&pose)
                 );
             }
             self.last_tracked = Some(pose);
@@ -114,6 +115,23 @@ impl Watch {
         });
         start.elapsed()
     }
+}
+
+/// What of a pose tells why it is where it is.
+fn described(pose: &PoseEstimate) -> String {
+    let (quality, place) = (&pose.quality, pose.world_from_camera.translation);
+    format!(
+        "frame {}, epoch {}, {:?} on keyframe {} revision {} at {place:.3?}, in view {:.2}, inliers {:.2}, whitened \
+         residual {:.2}",
+        pose.sequence,
+        pose.epoch,
+        pose.state,
+        pose.keyframe_id,
+        pose.revision,
+        quality.in_view_ratio,
+        quality.inlier_ratio,
+        quality.whitened_rmse
+    )
 }
 
 fn distance(one: &SE3, other: &SE3) -> f64 {
