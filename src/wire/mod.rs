@@ -14,5 +14,6 @@ pub mod place_error;
 pub mod port;
 mod root_folder;
 pub mod shared_memory;
+mod tidy;
 pub mod topic;
 mod version;

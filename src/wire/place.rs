@@ -24,20 +24,21 @@ pub const SHARED_MEMORY: &str = "/dev/shm";
 
 /// Longest wait for a process that joins or tidies up: both take milliseconds, on a busy machine a second.
 const LONGEST_HOLD: Duration = Duration::from_secs(10);
-/// Longest wait before tidying up, which the next process that leaves can do as well.
-const LONGEST_TIDY_WAIT: Duration = Duration::from_secs(1);
 
 /// Held while a process joins, and by the last one while it clears up.
-const JOIN_LOCK: &str = ".join.lock";
+pub(in crate::wire) const JOIN_LOCK: &str = ".join.lock";
+
+/// The processes of an instance, by the names under which they claim it.
+pub(in crate::wire) const MEMBERS: [&str; 3] = ["capture", "tracker", "mapper"];
 
 /// End of the name of the mapper's checkpoint, behind the instance.
-const CHECKPOINT_SUFFIX: &str = ".checkpoint";
+pub(in crate::wire) const CHECKPOINT_SUFFIX: &str = ".checkpoint";
 
 /// End of the name of the file with capture's place in its source, behind the instance.
-const POSITION_SUFFIX: &str = ".position";
+pub(in crate::wire) const POSITION_SUFFIX: &str = ".position";
 
 /// End of the name of a claim's file, behind the instance and the process.
-const CLAIM_SUFFIX: &str = ".lock";
+pub(in crate::wire) const CLAIM_SUFFIX: &str = ".lock";
 
 /// Longest folder: the socket of a listener lies in it, and a socket's path has at most 107 bytes.
 pub(in crate::wire) const MAX_ROOT_BYTES: usize = 48;
@@ -97,7 +98,7 @@ impl Place {
     /// Id of the process that claimed to be the only `process` of this instance last; it may have been killed
     /// since.
     pub fn claimant(&self, process: &str) -> Option<u32> {
-        let path = self.root.join(format!("{}.{process}{CLAIM_SUFFIX}", self.instance));
+        let path = self.claim_path_of(&self.instance, process);
         fs::read_to_string(path).ok()?.trim().parse().ok()
     }
 
@@ -107,7 +108,7 @@ impl Place {
         self.create()?;
         // Keeps away who tidies up and would hold the lock for a moment.
         let _joining = self.hold()?;
-        let path = self.root.join(format!("{}.{process}{CLAIM_SUFFIX}", self.instance));
+        let path = self.claim_path_of(&self.instance, process);
         let io = |source| PlaceError::Io { path: path.clone(), source };
         loop {
             let mut file = open_lock(&path).map_err(io)?;
@@ -129,12 +130,20 @@ impl Place {
 
     /// Where the mapper keeps what it needs to go on after its death.
     pub fn checkpoint_path(&self) -> PathBuf {
-        self.root.join(format!("{}{CHECKPOINT_SUFFIX}", self.instance))
+        self.kept_path(&self.instance, CHECKPOINT_SUFFIX)
     }
 
     /// Where capture keeps its place in the source.
     pub fn position_path(&self) -> PathBuf {
-        self.root.join(format!("{}{POSITION_SUFFIX}", self.instance))
+        self.kept_path(&self.instance, POSITION_SUFFIX)
+    }
+
+    pub(in crate::wire) fn kept_path(&self, instance: &str, suffix: &str) -> PathBuf {
+        self.root.join(format!("{instance}{suffix}"))
+    }
+
+    pub(in crate::wire) fn claim_path_of(&self, instance: &str, process: &str) -> PathBuf {
+        self.root.join(format!("{instance}.{process}{CLAIM_SUFFIX}"))
     }
 
     /// Removes what processes of this instance keep for their successors. While the supervisor is claimed and
@@ -157,7 +166,7 @@ impl Place {
     }
 
     /// The segments of [`SHARED_MEMORY`] in which iceoryx2 counts the nodes below the root.
-    fn node_counters(&self) -> impl Iterator<Item = PathBuf> {
+    pub(in crate::wire) fn node_counters(&self) -> impl Iterator<Item = PathBuf> {
         let entries = fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
         entries.map(|entry| entry.path()).filter(|path| {
             let name = path.file_name().unwrap_or_default().to_string_lossy();
@@ -192,95 +201,16 @@ impl Place {
         }
     }
 
-    /// Removes what iceoryx2 leaves behind on purpose when its last node is gone: its counter of
-    /// nodes and its empty folders; and the claims of processes that were killed. Does nothing while
-    /// anybody is here or joins.
-    pub fn tidy(&self) {
-        let path = self.root.join(JOIN_LOCK);
-        let Ok(lock) = open_lock(&path) else { return };
-        // Waits for whoever joins or tidies up: of two that leave together, the second must look. One that is
-        // stopped meanwhile leaves it to the next.
-        let end = Instant::now() + LONGEST_TIDY_WAIT;
-        let is_alone = lock_until(&lock, FlockOperation::NonBlockingLockExclusive, end)
-            && is_same_file(&lock, &path);
-        if !is_alone {
-            return;
-        }
-        // What cannot be removed is removed by the next one.
-        let is_empty =
-            |folder: &Path| fs::read_dir(folder).map_or(true, |mut f| f.next().is_none());
-        self.remove_failed_nodes();
-        if is_empty(&self.root.join("nodes")) {
-            self.node_counters().for_each(|path| drop(fs::remove_file(path)));
-            self.remove_dead_claims();
-            let _ = fs::remove_dir(self.root.join("nodes"));
-            // Without a node nobody has a service open: what is left there is of the dead.
-            let _ = fs::remove_dir_all(self.root.join("services"));
-            self.events().for_each(|path| drop(fs::remove_file(path)));
-            let _ = fs::remove_file(&path);
-        }
-    }
-
-    /// Removes the folders of nodes that never came to life: a start that failed leaves one without its
-    /// `.node_monitor`, and nobody could ever tell that it is dead. While nobody may join.
-    fn remove_failed_nodes(&self) {
-        let nodes = self.root.join("nodes");
-        for entry in fs::read_dir(&nodes).into_iter().flatten().flatten() {
-            let id = entry.file_name().to_string_lossy().into_owned();
-            let has_monitor = || {
-                let mut others = fs::read_dir(&nodes).into_iter().flatten().flatten();
-                others.any(|other| {
-                    let name = other.file_name().to_string_lossy().into_owned();
-                    name.contains(&id) && name.contains(".node_monitor")
-                })
-            };
-            if entry.file_type().is_ok_and(|kind| kind.is_dir()) && !has_monitor() {
-                let _ = fs::remove_dir_all(entry.path());
-            }
-        }
-    }
-
-    /// The sockets of events in the folder.
-    fn events(&self) -> impl Iterator<Item = PathBuf> {
-        let entries = fs::read_dir(&self.root).into_iter().flatten().flatten();
-        entries.map(|entry| entry.path()).filter(|path| {
-            let name = path.file_name().unwrap_or_default().to_string_lossy();
-            name.starts_with(&self.prefix) && name.ends_with(".event")
-        })
-    }
-
     /// The process id of a member of the instance that runs, by its claim.
     pub(in crate::wire) fn running(&self) -> Option<String> {
-        ["capture", "tracker", "mapper"].iter().find_map(|process| {
-            let path = self.root.join(format!("{}.{process}{CLAIM_SUFFIX}", self.instance));
+        MEMBERS.iter().find_map(|process| {
+            let path = self.claim_path_of(&self.instance, process);
             let mut file = File::open(path).ok()?;
             rustix::fs::flock(&file, FlockOperation::NonBlockingLockShared).err()?;
             let mut holder = String::new();
             file.read_to_string(&mut holder).ok()?;
             Some(holder.trim().to_owned())
         })
-    }
-
-    /// Removes the files of claims that nobody holds any more. While nobody may join.
-    fn remove_dead_claims(&self) {
-        for entry in fs::read_dir(&self.root).into_iter().flatten().flatten() {
-            let path = entry.path();
-            let name = entry.file_name().to_string_lossy().into_owned();
-            if name.ends_with(CHECKPOINT_SUFFIX)
-                || name.ends_with(POSITION_SUFFIX)
-                || name.contains(CHECKPOINT_SUFFIX) && name.ends_with(".tmp")
-            {
-                // Nobody is left who would go on from it.
-                let _ = fs::remove_file(&path);
-            }
-            if name == JOIN_LOCK || !name.ends_with(CLAIM_SUFFIX) {
-                continue;
-            }
-            let Ok(file) = File::open(&path) else { continue };
-            if rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive).is_ok() {
-                let _ = fs::remove_file(&path);
-            }
-        }
     }
 }
 
@@ -299,7 +229,7 @@ impl Drop for Claim {
 }
 
 /// Tries to lock until `end`; whether it is locked.
-fn lock_until(file: &File, operation: FlockOperation, end: Instant) -> bool {
+pub(in crate::wire) fn lock_until(file: &File, operation: FlockOperation, end: Instant) -> bool {
     /// Between two attempts.
     const PAUSE: Timespec = Timespec { tv_sec: 0, tv_nsec: 2_000_000 };
     loop {
@@ -314,23 +244,24 @@ fn lock_until(file: &File, operation: FlockOperation, end: Instant) -> bool {
     }
 }
 
-fn open_lock(path: &Path) -> io::Result<File> {
+pub(in crate::wire) fn open_lock(path: &Path) -> io::Result<File> {
     const USER_ALONE: u32 = 0o600;
     let mut options = OpenOptions::new();
     options.read(true).write(true).create(true).truncate(false).mode(USER_ALONE).open(path)
 }
 
-fn is_same_file(file: &File, path: &Path) -> bool {
+pub(in crate::wire) fn is_same_file(file: &File, path: &Path) -> bool {
     match (file.metadata(), fs::metadata(path)) {
         (Ok(open), Ok(named)) => (open.dev(), open.ino()) == (named.dev(), named.ino()),
         _ => false,
     }
 }
 
-/// Names in shared memory are global, so folders that differ need prefixes that differ.
+/// Names in shared memory are global: folders that differ need prefixes that differ, of which none begins with
+/// another.
 fn prefix_of(root: &Path) -> String {
     if root == Path::new(SYSTEM_ROOT) {
-        return "semidense_".to_owned();
+        return "semidense_system_".to_owned();
     }
     // FNV-1a, 32 bits.
     const OFFSET: u32 = 0x811c_9dc5;
@@ -357,9 +288,14 @@ mod tests {
     #[test]
     fn every_folder_has_its_prefix() {
         let prefix = |root| Place::new("rig", root).unwrap().prefix;
-        assert_eq!(prefix(SYSTEM_ROOT), "semidense_");
-        assert_ne!(prefix("/tmp/a"), prefix("/tmp/b"));
-        assert!(prefix("/tmp/a").starts_with("semidense_"));
+        let roots = [SYSTEM_ROOT, "/tmp/a", "/tmp/b", "/run/user/1000/semidense"];
+        for one in roots {
+            assert!(prefix(one).starts_with("semidense_"), "{one}");
+            // What belongs to a folder is found by the beginning of its name.
+            for other in roots.into_iter().filter(|&other| other != one) {
+                assert!(!prefix(other).starts_with(&prefix(one)), "{other} is taken for {one}");
+            }
+        }
     }
 
     #[test]
@@ -372,59 +308,6 @@ mod tests {
         assert!(place.claim("tracker").is_ok());
         drop(first);
         drop(place.claim("capture").unwrap());
-        place.tidy();
-        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
-    }
-
-    #[test]
-    fn tidying_does_not_wait_for_ever_for_one_that_joins() {
-        let folder = tempfile::tempdir().unwrap();
-        let place = Place::new("rig", folder.path().to_str().unwrap()).unwrap();
-        place.create().unwrap();
-        let joining = place.hold().unwrap();
-        let end = Instant::now();
-        assert!(!lock_until(
-            &open_lock(&folder.path().join(JOIN_LOCK)).unwrap(),
-            FlockOperation::NonBlockingLockExclusive,
-            end
-        ));
-        place.tidy();
-        assert!(folder.path().join(JOIN_LOCK).exists());
-        drop(joining);
-        place.tidy();
-        assert!(!folder.path().join(JOIN_LOCK).exists());
-    }
-
-    #[test]
-    fn claims_of_the_dead_are_cleared_and_others_kept() {
-        let folder = tempfile::tempdir().unwrap();
-        let place = Place::new("rig", folder.path().to_str().unwrap()).unwrap();
-        let dead = folder.path().join("rig.supervisor.lock");
-        fs::write(&dead, "4194304\n").unwrap();
-        fs::write(place.position_path(), "").unwrap();
-        let foreign = folder.path().join("notes.txt");
-        fs::write(&foreign, "").unwrap();
-        let living = place.claim("capture").unwrap();
-        place.tidy();
-        assert!(!dead.exists() && foreign.exists() && !place.position_path().exists());
-        assert!(place.claim("capture").is_err(), "the living one still holds its claim");
-        drop(living);
-    }
-
-    #[test]
-    fn what_a_failed_start_left_is_cleared() {
-        let folder = tempfile::tempdir().unwrap();
-        let place = Place::new("rig", folder.path().to_str().unwrap()).unwrap();
-        let nodes = folder.path().join("nodes");
-        fs::create_dir_all(nodes.join("123")).unwrap();
-        fs::write(nodes.join("123/x.details"), "").unwrap();
-        fs::create_dir_all(nodes.join("456")).unwrap();
-        fs::write(nodes.join("p_456.node_monitor"), "").unwrap();
-        place.tidy();
-        assert!(!nodes.join("123").exists() && nodes.join("456").exists());
-        fs::remove_file(nodes.join("p_456.node_monitor")).unwrap();
-        fs::create_dir(folder.path().join("services")).unwrap();
-        fs::write(folder.path().join("services/x.service"), "").unwrap();
         place.tidy();
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
     }

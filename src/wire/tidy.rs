@@ -1,0 +1,290 @@
+//! What a process that leaves removes from the folder of its instance and from shared memory, where nobody else is
+//! left who needs it.
+
+use std::collections::BTreeSet;
+use std::fs::{self, File};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant, SystemTime};
+
+use rustix::fs::FlockOperation;
+
+use crate::wire::place::{
+    CHECKPOINT_SUFFIX, CLAIM_SUFFIX, JOIN_LOCK, MEMBERS, POSITION_SUFFIX, Place, is_same_file,
+    lock_until, open_lock,
+};
+
+/// Longest wait before tidying up, which the next process that leaves can do as well.
+const LONGEST_TIDY_WAIT: Duration = Duration::from_secs(1);
+/// How long what a killed process has kept waits for its successor: the service manager starts one after at most
+/// five seconds, and a machine that is busy takes a few more.
+const SUCCESSOR_WAIT: Duration = Duration::from_secs(30);
+
+impl Place {
+    /// Removes what iceoryx2 leaves behind on purpose when its last node is gone: its counter of
+    /// nodes and its empty folders; and what processes that were killed have left, unless a successor may still
+    /// come for it. Does nothing while anybody is here or joins.
+    pub fn tidy(&self) {
+        let path = self.root.join(JOIN_LOCK);
+        let Ok(lock) = open_lock(&path) else { return };
+        // Waits for whoever joins or tidies up: of two that leave together, the second must look. One that is
+        // stopped meanwhile leaves it to the next.
+        let end = Instant::now() + LONGEST_TIDY_WAIT;
+        let is_alone = lock_until(&lock, FlockOperation::NonBlockingLockExclusive, end)
+            && is_same_file(&lock, &path);
+        if !is_alone {
+            return;
+        }
+        // What cannot be removed is removed by the next one.
+        let is_empty =
+            |folder: &Path| fs::read_dir(folder).map_or(true, |mut f| f.next().is_none());
+        self.remove_failed_nodes();
+        if is_empty(&self.root.join("nodes")) {
+            self.node_counters().for_each(|path| drop(fs::remove_file(path)));
+            self.remove_abandoned();
+            let _ = fs::remove_dir(self.root.join("nodes"));
+            // Without a node nobody has a service open: what is left there is of the dead.
+            let _ = fs::remove_dir_all(self.root.join("services"));
+            self.events().for_each(|path| drop(fs::remove_file(path)));
+            let _ = fs::remove_file(&path);
+        }
+    }
+
+    /// Removes the folders of nodes that never came to life: a start that failed leaves one without its
+    /// `.node_monitor`, and nobody could ever tell that it is dead. While nobody may join.
+    fn remove_failed_nodes(&self) {
+        let nodes = self.root.join("nodes");
+        for entry in fs::read_dir(&nodes).into_iter().flatten().flatten() {
+            let id = entry.file_name().to_string_lossy().into_owned();
+            let has_monitor = || {
+                let mut others = fs::read_dir(&nodes).into_iter().flatten().flatten();
+                others.any(|other| {
+                    let name = other.file_name().to_string_lossy().into_owned();
+                    name.contains(&id) && name.contains(".node_monitor")
+                })
+            };
+            if entry.file_type().is_ok_and(|kind| kind.is_dir()) && !has_monitor() {
+                let _ = fs::remove_dir_all(entry.path());
+            }
+        }
+    }
+
+    /// The sockets of events in the folder.
+    fn events(&self) -> impl Iterator<Item = PathBuf> {
+        let entries = fs::read_dir(&self.root).into_iter().flatten().flatten();
+        entries.map(|entry| entry.path()).filter(|path| {
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            name.starts_with(&self.prefix) && name.ends_with(".event")
+        })
+    }
+
+    /// Removes checkpoints, positions and dead claims of instances for which no successor is waited for. While
+    /// nobody may join.
+    fn remove_abandoned(&self) {
+        let files = self.instance_files();
+        let instances: BTreeSet<&str> =
+            files.iter().map(|(instance, ..)| instance.as_str()).collect();
+        let waiting: BTreeSet<&str> =
+            instances.into_iter().filter(|instance| self.awaits_successor(instance)).collect();
+        for (instance, kind, path) in &files {
+            let is_needed = match kind {
+                // Its writer is dead: nobody completes it.
+                Kind::Unfinished => false,
+                Kind::Kept => waiting.contains(instance.as_str()),
+                Kind::Claim => waiting.contains(instance.as_str()) || is_held(path),
+            };
+            if !is_needed {
+                let _ = fs::remove_file(path);
+            }
+        }
+    }
+
+    /// Whether a process of `instance` may come and go on from what is kept for it: one holds its claim and has
+    /// not joined yet, or one was killed, which leaves its claim, so lately that its successor is still due.
+    fn awaits_successor(&self, instance: &str) -> bool {
+        let claims = MEMBERS.map(|member| self.claim_path_of(instance, member));
+        let mut there = claims.iter().filter(|path| path.exists()).peekable();
+        if there.peek().is_none() {
+            return false;
+        }
+        let kept = [
+            self.kept_path(instance, CHECKPOINT_SUFFIX),
+            self.kept_path(instance, POSITION_SUFFIX),
+        ];
+        there.any(|path| is_held(path)) || kept.iter().any(|path| is_young(path))
+    }
+
+    /// The files of all instances in the folder, with the name of each one's instance.
+    fn instance_files(&self) -> Vec<(String, Kind, PathBuf)> {
+        let entries = fs::read_dir(&self.root).into_iter().flatten().flatten();
+        let described = entries.filter_map(|entry| {
+            let name = entry.file_name().to_string_lossy().into_owned();
+            let kind = Kind::of(&name)?;
+            // A file that is not finished begins with a dot; an instance's name has none.
+            let instance = name.trim_start_matches('.').split('.').next()?.to_owned();
+            Some((instance, kind, entry.path()))
+        });
+        described.collect()
+    }
+}
+
+/// What a file of an instance is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    /// A checkpoint or a position.
+    Kept,
+    /// A checkpoint that was being written.
+    Unfinished,
+    /// The claim of a process.
+    Claim,
+}
+
+impl Kind {
+    /// By its name; `None` of files that are none of ours.
+    fn of(name: &str) -> Option<Self> {
+        if name.ends_with(CHECKPOINT_SUFFIX) || name.ends_with(POSITION_SUFFIX) {
+            return Some(Self::Kept);
+        }
+        if name.contains(CHECKPOINT_SUFFIX) && name.ends_with(".tmp") {
+            return Some(Self::Unfinished);
+        }
+        (name != JOIN_LOCK && name.ends_with(CLAIM_SUFFIX)).then_some(Self::Claim)
+    }
+}
+
+/// Whether a process holds a claim. One that cannot be looked at counts as held.
+fn is_held(claim: &Path) -> bool {
+    File::open(claim).map_or(true, |file| {
+        rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive).is_err()
+    })
+}
+
+/// Whether a file was written so lately that a successor of its writer may still come. A stamp in the future is
+/// as good as one in the past: the clock may have been set.
+fn is_young(path: &Path) -> bool {
+    let written = fs::metadata(path).and_then(|found| found.modified());
+    let age = |written: SystemTime| match SystemTime::now().duration_since(written) {
+        Ok(age) => age,
+        Err(ahead) => ahead.duration(),
+    };
+    written.is_ok_and(|written| age(written) < SUCCESSOR_WAIT)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A place in a folder of its own.
+    fn place() -> (tempfile::TempDir, Place) {
+        let folder = tempfile::tempdir().unwrap();
+        let place = Place::new("rig", folder.path().to_str().unwrap()).unwrap();
+        (folder, place)
+    }
+
+    /// Leaves the claim of a process that was killed.
+    fn killed(place: &Place, process: &str) -> PathBuf {
+        let path = place.root.join(format!("rig.{process}.lock"));
+        fs::write(&path, "4194304\n").unwrap();
+        path
+    }
+
+    /// Makes a file older than successors are waited for.
+    fn age(path: &Path) {
+        let long_ago = SystemTime::now() - 2 * SUCCESSOR_WAIT;
+        File::options().write(true).open(path).unwrap().set_modified(long_ago).unwrap();
+    }
+
+    #[test]
+    fn tidying_does_not_wait_for_ever_for_one_that_joins() {
+        let (folder, place) = place();
+        place.create().unwrap();
+        let joining = place.hold().unwrap();
+        let end = Instant::now();
+        assert!(!lock_until(
+            &open_lock(&folder.path().join(JOIN_LOCK)).unwrap(),
+            FlockOperation::NonBlockingLockExclusive,
+            end
+        ));
+        place.tidy();
+        assert!(folder.path().join(JOIN_LOCK).exists());
+        drop(joining);
+        place.tidy();
+        assert!(!folder.path().join(JOIN_LOCK).exists());
+    }
+
+    #[test]
+    fn what_killed_processes_kept_waits_for_their_successors() {
+        let (folder, place) = place();
+        let kept = [place.checkpoint_path(), place.position_path()];
+        let other = folder.path().join("rig2.checkpoint");
+        for path in kept.iter().chain([&other]) {
+            fs::write(path, "x").unwrap();
+        }
+        let unfinished = folder.path().join(".rig.checkpoint.17.tmp");
+        fs::write(&unfinished, "x").unwrap();
+        let claims = ["capture", "tracker", "mapper", "supervisor"].map(|p| killed(&place, p));
+        // As `status` does when it leaves while all of them wait for their restart.
+        place.tidy();
+        assert!(kept.iter().chain(&claims).all(|path| path.exists()));
+        assert!(!other.exists(), "it has no process that was killed");
+        assert!(!unfinished.exists());
+        // The newest of both counts: a map that does not change is written seldom.
+        age(&kept[0]);
+        place.tidy();
+        assert!(kept[0].exists());
+        age(&kept[1]);
+        place.tidy();
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn what_is_kept_waits_for_one_that_is_about_to_join() {
+        let (_folder, place) = place();
+        fs::write(place.checkpoint_path(), "x").unwrap();
+        age(&place.checkpoint_path());
+        let coming = place.claim("mapper").unwrap();
+        place.tidy();
+        assert!(place.checkpoint_path().exists());
+        // Its claim goes with it when it ends in order.
+        drop(coming);
+        place.tidy();
+        assert!(!place.checkpoint_path().exists());
+    }
+
+    #[test]
+    fn claims_of_the_dead_are_cleared_and_others_kept() {
+        let (folder, place) = place();
+        let dead = killed(&place, "supervisor");
+        fs::write(place.position_path(), "").unwrap();
+        let foreign = folder.path().join("notes.txt");
+        fs::write(&foreign, "").unwrap();
+        place.tidy();
+        assert!(!dead.exists() && foreign.exists() && !place.position_path().exists());
+        let dead = killed(&place, "supervisor");
+        let other = folder.path().join("rig2.tracker.lock");
+        fs::write(&other, "4194304\n").unwrap();
+        let living = place.claim("capture").unwrap();
+        place.tidy();
+        assert!(place.claim("capture").is_err(), "the living one still holds its claim");
+        assert!(dead.exists() && !other.exists());
+        drop(living);
+        place.tidy();
+        assert!(!dead.exists());
+    }
+
+    #[test]
+    fn what_a_failed_start_left_is_cleared() {
+        let (folder, place) = place();
+        let nodes = folder.path().join("nodes");
+        fs::create_dir_all(nodes.join("123")).unwrap();
+        fs::write(nodes.join("123/x.details"), "").unwrap();
+        fs::create_dir_all(nodes.join("456")).unwrap();
+        fs::write(nodes.join("p_456.node_monitor"), "").unwrap();
+        place.tidy();
+        assert!(!nodes.join("123").exists() && nodes.join("456").exists());
+        fs::remove_file(nodes.join("p_456.node_monitor")).unwrap();
+        fs::create_dir(folder.path().join("services")).unwrap();
+        fs::write(folder.path().join("services/x.service"), "").unwrap();
+        place.tidy();
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+    }
+}
