@@ -82,9 +82,6 @@ impl FrameSource for Looped {
                 Ok(Some(_)) if num_known > 0 => num_known -= 1,
                 Ok(Some(_)) => {
                     self.kept.push(pixels.clone()).map_err(|source| self.unkept(source))?;
-                    if !progress(self.kept.len().min(total), total) {
-                        return Ok(());
-                    }
                 }
                 Ok(None) => break,
                 // A hole in what is repeated would come back with every turn: the image is left out.
@@ -92,6 +89,10 @@ impl FrameSource for Looped {
                     self.notices.push_back(format!("left out: {error}"))
                 }
                 Err(error) => return Err(error),
+            }
+            // Also where nothing new came: it is the sign of life of whoever prepares.
+            if !progress(self.kept.len().min(total), total) {
+                return Ok(());
             }
         }
         self.kept.complete().map_err(|source| self.unkept(source))
@@ -171,6 +172,55 @@ mod tests {
             assert!(pixels == frames[place], "frame {sequence}");
         }
         assert!(looped.next_into(&mut pixels).unwrap().is_none());
+    }
+
+    /// A source of so many frames, each second of which is damaged.
+    struct Damaged(u64, u64);
+
+    impl FrameSource for Damaged {
+        fn intrinsics(&self) -> Intrinsics {
+            Intrinsics { fx: 50.0, fy: 50.0, cx: 16.0, cy: 12.0, width: 32, height: 24 }
+        }
+
+        fn num_frames(&self) -> Option<usize> {
+            Some(self.1 as usize)
+        }
+
+        fn next_into(&mut self, _pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
+            let sequence = self.0;
+            self.0 += 1;
+            if sequence >= self.1 {
+                return Ok(None);
+            }
+            if sequence % 2 == 1 {
+                let (name, reason) = ("test".to_owned(), "it is odd".to_owned());
+                return Err(SourceError::BrokenFrame { name, reason });
+            }
+            let capture_nanos = sequence as i64;
+            Ok(Some(FrameStamp { sequence, capture_nanos, exposure_nanos: 0, gain: 0.0 }))
+        }
+    }
+
+    #[test]
+    fn every_frame_that_is_read_is_a_sign_of_life() {
+        let file = tempfile::tempfile().unwrap();
+        let name: SourceName = "loop:100:30:sim".parse().unwrap();
+        let prepare = |most: usize| {
+            let inner = Box::new(Damaged(0, 20));
+            let mut looped = Looped::new(name.clone(), inner, 100, 30.0);
+            looped.keep_prepared_in(file.try_clone().unwrap()).unwrap();
+            let mut signs = 0;
+            looped
+                .prepare(&mut |_, _| {
+                    signs += 1;
+                    signs < most
+                })
+                .unwrap();
+            signs
+        };
+        // Killed in the middle of its preparation; the next one passes what is kept already.
+        assert_eq!(prepare(11), 11);
+        assert_eq!(prepare(usize::MAX), 20);
     }
 
     #[test]
