@@ -45,13 +45,6 @@ pub fn hold(log: &Path) -> io::Result<Option<File>> {
     }
 }
 
-/// Holds the log of one's own journal; who only looks whether it is held lets go at once.
-pub(super) fn hold_own(log: &Path) -> io::Result<File> {
-    let file = File::open(log)?;
-    rustix::fs::flock(&file, FlockOperation::LockExclusive)?;
-    Ok(file)
-}
-
 /// Removes a journal: its own files, and the folder where nothing else is in it.
 pub fn remove_folder(folder: &Path) -> io::Result<()> {
     for entry in fs::read_dir(folder)? {

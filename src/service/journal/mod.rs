@@ -15,11 +15,12 @@ mod writer;
 use std::fs::File;
 use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use crate::service::journal::folder::{Pointer, begin_folder, hold, hold_own, remove_folder};
+use crossbeam::channel::{SendTimeoutError, Sender, TrySendError, bounded};
+
+use crate::service::journal::folder::{Pointer, begin_folder, hold, remove_folder};
 use crate::service::journal::log::{Record, RunStart, log_header};
 use crate::service::journal::recovered::read_map_of;
 use crate::service::journal::writer::{Entry, Writer};
@@ -34,6 +35,12 @@ const PERIOD: Duration = Duration::from_secs(1);
 const QUEUE: usize = 4;
 /// Longest wait for the disk at the end.
 const END_TIMEOUT: Duration = Duration::from_secs(60);
+/// Longest wait for a disk that was waited for in vain already.
+const SECOND_TIMEOUT: Duration = Duration::from_secs(5);
+/// Pause between two looks for the end of the thread.
+const LOOK_PAUSE: Duration = Duration::from_millis(2);
+/// Most bytes of log that wait for a disk that hangs: an hour of poses.
+const MAX_PENDING_BYTES: usize = 64 << 20;
 
 /// Where a journal is kept, and how much.
 #[derive(Debug, Clone)]
@@ -55,8 +62,12 @@ pub struct Journal {
     pending: Vec<u8>,
     counted: Instant,
     handed_over: Instant,
-    entries: Option<SyncSender<Entry>>,
+    entries: Option<Sender<Entry>>,
     thread: Option<JoinHandle<()>>,
+    /// How long the disk may take at the end.
+    timeout: Duration,
+    /// Whether records are left out because the disk hangs.
+    leaves_out: bool,
     /// Says that the run goes on.
     _hold: File,
 }
@@ -65,43 +76,43 @@ impl Journal {
     /// Begins the journal of a run of the instance at `place`.
     pub fn begin(options: &JournalOptions, place: &Place) -> io::Result<Self> {
         let folder = begin_folder(&options.output)?;
-        let log = folder.join(folder::LOG);
         let mut first = log_header();
         Record::Start(Box::new(options.start.clone())).write(&mut first);
         let writer = Writer::create(&folder, &first, options.max_depth_bytes)?;
-        let (entries, received) = sync_channel(QUEUE);
+        let held = writer.hold()?;
+        let (entries, received) = bounded(QUEUE);
         let thread = std::thread::Builder::new()
             .name("semidense-journal".to_owned())
             .spawn(move || writer.write_all(&received))?;
         let pointer = Pointer::set(place, &folder)
             .inspect_err(|error| tracing::debug!("no pointer to the journal ({error})"));
-        Ok(Self {
-            _hold: hold_own(&log)?,
-            pointer: pointer.ok(),
-            folder,
-            pending: Vec::new(),
-            counted: Instant::now(),
-            handed_over: Instant::now(),
-            entries: Some(entries),
-            thread: Some(thread),
-        })
+        let mut journal = Self::of(folder, held, Some((entries, thread)));
+        journal.pointer = pointer.ok();
+        Ok(journal)
     }
 
     /// Holds the journal that a killed run has left in `folder`, so that nobody else makes results of it; `None`
     /// where somebody does.
     pub fn take_over(folder: &Path) -> io::Result<Option<Self>> {
         let held = hold(&folder.join(folder::LOG))?;
-        Ok(held.map(|held| Self {
-            folder: folder.to_owned(),
-            // Who looks for it next removes it.
+        // Who looks for its pointer next removes it.
+        Ok(held.map(|held| Self::of(folder.to_owned(), held, None)))
+    }
+
+    fn of(folder: PathBuf, held: File, writing: Option<(Sender<Entry>, JoinHandle<()>)>) -> Self {
+        let (entries, thread) = writing.unzip();
+        Self {
+            folder,
             pointer: None,
             pending: Vec::new(),
             counted: Instant::now(),
             handed_over: Instant::now(),
-            entries: None,
-            thread: None,
+            entries,
+            thread,
+            timeout: END_TIMEOUT,
+            leaves_out: false,
             _hold: held,
-        }))
+        }
     }
 
     /// Where it is.
@@ -111,7 +122,16 @@ impl Journal {
 
     /// Takes in a record. Never waits for the disk.
     pub fn append(&mut self, record: &Record) {
-        record.write(&mut self.pending);
+        let has_room = self.pending.len() < MAX_PENDING_BYTES;
+        if has_room {
+            record.write(&mut self.pending);
+        } else if !self.leaves_out {
+            let folder = self.folder.display();
+            tracing::warn!(
+                "{folder}: the disk does not answer; what comes now is missing in the journal"
+            );
+        }
+        self.leaves_out = !has_room;
         self.tick();
     }
 
@@ -150,43 +170,104 @@ impl Journal {
         }
     }
 
-    /// Waits until everything is on the disk, or for a bounded time.
-    pub fn flush(&mut self) {
-        let (done, is_done) = sync_channel(1);
-        let Some(entries) = &self.entries else { return };
+    /// Waits until everything is on the disk, or for a bounded time; whether it is.
+    pub fn flush(&mut self) -> bool {
+        let Some(entries) = &self.entries else { return true };
+        let end = Instant::now() + self.timeout;
+        let (done, is_done) = bounded(1);
         let pending = std::mem::take(&mut self.pending);
-        let sent = entries.send(Entry::Log(pending)).and_then(|()| entries.send(Entry::Mark(done)));
-        if sent.is_ok() {
-            let _ = is_done.recv_timeout(END_TIMEOUT);
+        let is_whole = match entries.send_deadline(Entry::Log(pending), end) {
+            Ok(()) => {
+                let marked = entries.send_deadline(Entry::Mark(done), end);
+                marked.is_ok() && is_done.recv_deadline(end).is_ok()
+            }
+            Err(SendTimeoutError::Timeout(entry) | SendTimeoutError::Disconnected(entry)) => {
+                if let Entry::Log(pending) = entry {
+                    self.pending = pending;
+                }
+                false
+            }
+        };
+        if !is_whole && self.timeout > SECOND_TIMEOUT {
+            let (folder, seconds) = (self.folder.display(), self.timeout.as_secs());
+            tracing::warn!("{folder}: the disk has not taken the journal within {seconds} s");
+            self.timeout = SECOND_TIMEOUT;
         }
+        is_whole
     }
 
-    /// The map as the journal has it, at most `max_bytes` of depth.
+    /// The map as the journal has it, at most `max_bytes` of depth; none where the disk does not answer.
     pub fn map(&mut self, max_bytes: u64) -> Map {
-        self.flush();
-        read_map_of(&self.folder, max_bytes)
+        match self.flush() {
+            true => read_map_of(&self.folder, max_bytes),
+            false => Map::default(),
+        }
     }
 
     /// The results are written, or there are none: the journal goes.
     pub fn finish(mut self) -> io::Result<()> {
-        self.close();
+        if !self.close() {
+            return Err(io::Error::new(io::ErrorKind::TimedOut, "its disk does not answer"));
+        }
         remove_folder(&self.folder)?;
         drop(self.pointer.take().map(Pointer::clear));
         Ok(())
     }
 
-    fn close(&mut self) {
+    /// Ends the thread, which is left alone where its disk hangs; whether it has ended.
+    fn close(&mut self) -> bool {
         self.flush();
         self.entries = None;
-        if let Some(thread) = self.thread.take() {
-            // A panic of the thread has been reported where it happened.
-            drop(thread.join());
+        let end = Instant::now() + self.timeout;
+        while self.thread.as_ref().is_some_and(|thread| !thread.is_finished()) {
+            if Instant::now() >= end {
+                self.thread = None;
+                return false;
+            }
+            std::thread::sleep(LOOK_PAUSE);
         }
+        // A panic of the thread has been reported where it happened.
+        drop(self.thread.take().map(JoinHandle::join));
+        true
     }
 }
 
 impl Drop for Journal {
     fn drop(&mut self) {
         self.close();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::service::journal::log::Step;
+
+    #[test]
+    fn a_disk_that_hangs_holds_up_neither_the_run_nor_its_end() {
+        let folder = tempfile::tempdir().unwrap();
+        let held = tempfile::tempfile().unwrap();
+        let (entries, received) = bounded(QUEUE);
+        let (release, hangs) = bounded::<()>(0);
+        let thread = std::thread::spawn(move || {
+            // As in a write that does not come back.
+            let _ = hangs.recv();
+            drop(received);
+        });
+        let mut journal = Journal::of(folder.path().to_owned(), held, Some((entries, thread)));
+        journal.timeout = Duration::from_millis(20);
+        let record = Record::Step(Step { step_nanos: 1, change_nanos: 2, start_frame: 3 });
+        let mut bytes = Vec::new();
+        record.write(&mut bytes);
+        for _ in 0..MAX_PENDING_BYTES / bytes.len() + 1000 {
+            journal.append(&record);
+            // Each is due.
+            journal.handed_over -= PERIOD;
+        }
+        assert!(journal.leaves_out && journal.pending.len() < MAX_PENDING_BYTES + bytes.len());
+        assert!(!journal.flush());
+        assert!(journal.map(u64::MAX).keyframes.is_empty());
+        assert!(journal.finish().is_err());
+        drop(release);
     }
 }

@@ -3,8 +3,11 @@
 use std::collections::VecDeque;
 use std::fs::{self, File};
 use std::io::{self, Write};
+use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
-use std::sync::mpsc::{Receiver, SyncSender};
+
+use crossbeam::channel::{Receiver, Sender};
+use rustix::fs::FlockOperation;
 
 use crate::service::journal::folder::{LOG, keyframe_file};
 use crate::service::map_file::write_map_into;
@@ -13,6 +16,8 @@ use crate::slam::mapper::Map;
 
 /// Most bytes of log that wait for room on a full disk; ten hours of poses.
 const MAX_WAITING_BYTES: usize = 512 << 20;
+/// Name of the log until it is held and begun.
+const UNBEGUN_LOG: &str = "log.new";
 
 /// What the thread is handed.
 #[derive(Debug)]
@@ -22,7 +27,29 @@ pub(super) enum Entry {
     /// A keyframe's newest state.
     Keyframe(Box<Keyframe>),
     /// Answered when everything before is on the disk.
-    Mark(SyncSender<()>),
+    Mark(Sender<()>),
+}
+
+/// Whether the disk refuses something, for a warning on each change: on a full disk a write succeeds now and
+/// then, which is no change.
+#[derive(Debug, Default)]
+struct Refusals {
+    is_said: bool,
+    successes: u32,
+}
+
+impl Refusals {
+    /// So many successes in a row end it: about a minute of them.
+    const CALM: u32 = 60;
+
+    /// Counts an outcome; whether it is a refusal that has not been said.
+    fn is_news(&mut self, is_refused: bool) -> bool {
+        self.successes = if is_refused { 0 } else { self.successes.saturating_add(1) };
+        if self.successes >= Self::CALM {
+            self.is_said = false;
+        }
+        is_refused && !std::mem::replace(&mut self.is_said, true)
+    }
 }
 
 /// Writes what it is handed.
@@ -37,16 +64,24 @@ pub(super) struct Writer {
     /// Files with depth, oldest first, and their bytes.
     files: VecDeque<(PathBuf, u64)>,
     max_depth_bytes: u64,
-    is_refused: bool,
+    log_refusals: Refusals,
+    depth_refusals: Refusals,
 }
 
 impl Writer {
-    /// Begins a log in `folder` with `first`, which is on the disk when this returns.
+    /// Begins a log in `folder` with `first`, which is on the disk when this returns. The log is held before it
+    /// has its name: one that nobody holds is that of a run that was killed.
     pub fn create(folder: &Path, first: &[u8], max_depth_bytes: u64) -> io::Result<Self> {
-        let mut log = File::create_new(folder.join(LOG))?;
-        log.write_all(first)?;
+        let unbegun = folder.join(UNBEGUN_LOG);
+        let log = File::create_new(&unbegun)?;
+        rustix::fs::flock(&log, FlockOperation::NonBlockingLockExclusive)?;
+        log.write_all_at(first, 0)?;
         log.sync_all()?;
+        fs::rename(unbegun, folder.join(LOG))?;
         File::open(folder)?.sync_all()?;
+        if let Some(output) = folder.parent() {
+            File::open(output)?.sync_all()?;
+        }
         Ok(Self {
             folder: folder.to_owned(),
             log,
@@ -54,31 +89,50 @@ impl Writer {
             waiting: Vec::new(),
             files: VecDeque::new(),
             max_depth_bytes,
-            is_refused: false,
+            log_refusals: Refusals::default(),
+            depth_refusals: Refusals::default(),
         })
+    }
+
+    /// What keeps the log held, also when the thread is gone.
+    pub fn hold(&self) -> io::Result<File> {
+        self.log.try_clone()
     }
 
     /// Writes until nobody hands anything over any more.
     pub fn write_all(mut self, entries: &Receiver<Entry>) {
         for entry in entries {
-            let outcome = match entry {
-                Entry::Log(records) => self.append(&records),
-                Entry::Keyframe(keyframe) => self.write_keyframe(*keyframe),
-                Entry::Mark(done) => {
-                    let _ = done.try_send(());
-                    continue;
-                }
-            };
-            match outcome {
-                Ok(()) => self.is_refused = false,
-                Err(error) if !self.is_refused => {
-                    self.is_refused = true;
-                    let folder = self.folder.display();
-                    tracing::warn!(
-                        "{folder}: the journal is behind ({error}); a kill would now cost more than a second of the run"
-                    );
-                }
-                Err(_) => {}
+            if let Some(warning) = self.write(entry) {
+                tracing::warn!("{}: {warning}", self.folder.display());
+            }
+        }
+    }
+
+    /// Writes what it is handed; gives what there is to say.
+    fn write(&mut self, entry: Entry) -> Option<String> {
+        match entry {
+            Entry::Log(records) => {
+                let error = self.append(&records).err();
+                let is_news = self.log_refusals.is_news(error.is_some());
+                error.filter(|_| is_news).map(|error| {
+                    format!(
+                        "the journal is behind ({error}); a kill would now cost more than a second of the run"
+                    )
+                })
+            }
+            Entry::Keyframe(keyframe) => {
+                let error = self.write_keyframe(*keyframe).err();
+                let is_news = self.depth_refusals.is_news(error.is_some());
+                error.filter(|_| is_news).map(|error| {
+                    format!(
+                        "the journal cannot take the depth of a keyframe ({error}); a kill would now cost depth of the map"
+                    )
+                })
+            }
+            Entry::Mark(done) => {
+                // Who has asked may have given up.
+                let _ = done.try_send(());
+                None
             }
         }
     }
@@ -99,18 +153,18 @@ impl Writer {
         written
     }
 
-    /// Appends what waits. What the disk refuses is cut off again.
+    /// Appends what waits, behind the last whole record: what a refused attempt has left there is overwritten.
     fn append_waiting(&mut self) -> io::Result<()> {
-        let written = self.log.write_all(&self.waiting).and_then(|()| self.log.sync_data());
-        match written {
+        let written = self.log.write_all_at(&self.waiting, self.good_bytes);
+        match written.and_then(|()| self.log.sync_data()) {
             Ok(()) => {
                 self.good_bytes += self.waiting.len() as u64;
                 self.waiting = Vec::new();
                 Ok(())
             }
             Err(error) => {
-                self.log.set_len(self.good_bytes)?;
-                io::Seek::seek(&mut self.log, io::SeekFrom::Start(self.good_bytes))?;
+                // It only takes room from others.
+                drop(self.log.set_len(self.good_bytes));
                 Err(error)
             }
         }
@@ -144,4 +198,97 @@ impl Writer {
 
 fn is_out_of_room(error: &io::Error) -> bool {
     matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::service::journal::folder::hold;
+    use crate::service::journal::log::{LogEnd, Record, Step, log_header, read_log};
+    use crate::slam::geometry::intrinsics::Intrinsics;
+    use crate::slam::geometry::se3::SE3;
+    use crate::slam::geometry::sim3::Sim3;
+    use crate::slam::keyframe::MapState;
+
+    fn step(nanos: u64) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        Record::Step(Step { step_nanos: nanos, change_nanos: 0, start_frame: 0 }).write(&mut bytes);
+        bytes
+    }
+
+    fn keyframe() -> Entry {
+        Entry::Keyframe(Box::new(Keyframe {
+            keyframe_id: 1,
+            epoch: 0,
+            revision: 1,
+            sequence: 1,
+            capture_nanos: 1,
+            map_state: MapState::Established,
+            world_from_keyframe: Sim3::new(SE3::identity(), 1.0),
+            intrinsics: Intrinsics { fx: 9.0, fy: 9.0, cx: 4.0, cy: 4.0, width: 9, height: 9 },
+            image: vec![0; 81],
+            points: Vec::new(),
+        }))
+    }
+
+    fn writer(folder: &Path) -> Writer {
+        Writer::create(folder, &log_header(), 1 << 20).unwrap()
+    }
+
+    #[test]
+    fn a_log_is_held_as_long_as_it_is_there() {
+        let folder = tempfile::tempdir().unwrap();
+        let seen = folder.path().join(LOG);
+        let writer = writer(folder.path());
+        assert!(hold(&seen).unwrap().is_none());
+        let held = writer.hold().unwrap();
+        drop(writer);
+        assert!(hold(&seen).unwrap().is_none());
+        drop(held);
+        assert!(hold(&seen).unwrap().is_some());
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_full_disk_is_said_once_also_where_some_of_it_is_written() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut writer = writer(folder.path());
+        let log = std::mem::replace(
+            &mut writer.log,
+            File::options().write(true).open("/dev/full").unwrap(),
+        );
+        let said: Vec<String> = (0..2 * Refusals::CALM)
+            .flat_map(|n| [writer.write(Entry::Log(step(n.into()))), writer.write(keyframe())])
+            .flatten()
+            .collect();
+        assert_eq!(said.len(), 1, "{said:?}");
+        assert!(said[0].contains("the journal is behind"), "{said:?}");
+        // It is emptied, and what has waited is written; after a while a full disk is news again.
+        writer.log = log;
+        for n in 0..Refusals::CALM {
+            assert_eq!(writer.write(Entry::Log(step(n.into()))), None);
+        }
+        let mut steps = 0;
+        let log = File::open(folder.path().join(LOG)).unwrap();
+        assert_eq!(read_log(log, &mut |_| steps += 1), LogEnd::Whole);
+        assert_eq!(steps, 3 * Refusals::CALM);
+        writer.log = File::options().write(true).open("/dev/full").unwrap();
+        assert!(writer.write(Entry::Log(step(0))).is_some());
+    }
+
+    #[test]
+    fn what_a_refused_attempt_has_left_is_overwritten() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut writer = writer(folder.path());
+        assert_eq!(writer.write(Entry::Log(step(1))), None);
+        // Torn, and the disk refused to cut it off.
+        let path = folder.path().join(LOG);
+        let end = fs::metadata(&path).unwrap().len();
+        io::Seek::seek(&mut writer.log, io::SeekFrom::Start(end)).unwrap();
+        writer.log.write_all(&step(2)[..9]).unwrap();
+        assert_eq!(writer.write(Entry::Log(step(2))), None);
+        let mut found = Vec::new();
+        read_log(File::open(path).unwrap(), &mut |record| found.push(format!("{record:?}")));
+        assert_eq!(found.len(), 2, "{found:?}");
+    }
 }
