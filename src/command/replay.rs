@@ -23,8 +23,8 @@ use crate::service::replay::{
 };
 use crate::service::results::debug_pictures::write_debug_pictures;
 use crate::service::results::output_folder::OutputFolder;
-use crate::service::results::set::DEBUG_FOLDER;
-use crate::service::results::{EndOfRun, RunRecord};
+use crate::service::results::set::{DEBUG_FOLDER, foreign_debug};
+use crate::service::results::{EndOfRun, ResultsError, RunRecord};
 use crate::service::shutdown::Shutdown;
 use crate::slam::pose::TrackingState;
 use crate::wire::place::Place;
@@ -96,6 +96,9 @@ pub fn run(config: &Config, args: ReplayArgs) -> Result<ExitCode, Box<dyn Error>
     let shutdown = Shutdown::install()?;
     let place = Place::new(&config.instance, &config.root)?;
     let output = OutputFolder::prepare(args.output.as_deref())?;
+    if let Some(file) = foreign_debug(output.path()).filter(|_| args.debug_images) {
+        return Err(ResultsError::Foreign(file).into());
+    }
     note_unfinished(&unfinished(Some(&place), output.path()));
     let mut params = config.source_params();
     let simulator = &mut params.simulator;

@@ -44,6 +44,8 @@ pub struct ResultSet {
 impl ResultSet {
     /// Begins a set inside the folder `output`; what killed processes left half written there goes.
     pub fn begin(output: &Path) -> io::Result<Self> {
+        // Nobody else clears up between the making of the folder and its being held.
+        let _alone = lock(output)?;
         remove_abandoned(output)?;
         let folder = output.join(format!("{PARTIAL}{}", std::process::id()));
         fs::create_dir(&folder)?;
@@ -94,6 +96,12 @@ pub fn foreign_file(output: &Path) -> io::Result<Option<PathBuf>> {
         }
     }
     Ok(None)
+}
+
+/// What stands in `output` where a folder of pictures would be and is none: the user's.
+pub fn foreign_debug(output: &Path) -> Option<PathBuf> {
+    let debug = output.join(DEBUG_FOLDER);
+    (fs::symlink_metadata(&debug).is_ok() && !debug.is_dir()).then_some(debug)
 }
 
 /// Whether `output` holds a set.
@@ -148,9 +156,18 @@ fn move_up(output: &Path) -> io::Result<()> {
     move_files(&complete, output)?;
     let debug = complete.join(DEBUG_FOLDER);
     if debug.exists() {
-        fs::create_dir_all(output.join(DEBUG_FOLDER))?;
-        move_files(&debug, &output.join(DEBUG_FOLDER))?;
-        fs::remove_dir(debug)?;
+        match foreign_debug(output) {
+            None => {
+                fs::create_dir_all(output.join(DEBUG_FOLDER))?;
+                move_files(&debug, &output.join(DEBUG_FOLDER))?;
+                fs::remove_dir(debug)?;
+            }
+            // It came during the run. The results are worth more than the pictures.
+            Some(file) => {
+                tracing::warn!("{}: no folder, so that no pictures are written", file.display());
+                fs::remove_dir_all(debug)?;
+            }
+        }
     }
     fs::remove_dir(complete)?;
     File::open(output)?.sync_all()
@@ -192,7 +209,7 @@ fn is_debug_picture(name: &str) -> bool {
     })
 }
 
-/// Removes sets that processes were writing when they died.
+/// Removes sets that processes were writing when they died. While the folder is locked.
 fn remove_abandoned(output: &Path) -> io::Result<()> {
     for entry in fs::read_dir(output)? {
         let path = entry?.path();
@@ -201,8 +218,12 @@ fn remove_abandoned(output: &Path) -> io::Result<()> {
             continue;
         }
         let Ok(folder) = File::open(&path) else { continue };
-        if rustix::fs::flock(&folder, FlockOperation::NonBlockingLockExclusive).is_ok() {
-            fs::remove_dir_all(&path)?;
+        if rustix::fs::flock(&folder, FlockOperation::NonBlockingLockExclusive).is_ok()
+            && let Err(error) = fs::remove_dir_all(&path)
+            // Its writer has removed it just now.
+            && error.kind() != io::ErrorKind::NotFound
+        {
+            return Err(error);
         }
     }
     Ok(())
@@ -335,6 +356,45 @@ mod tests {
         rustix::fs::flock(&held, FlockOperation::LockExclusive).unwrap();
         drop(ResultSet::begin(folder.path()).unwrap());
         assert!(!abandoned.exists() && living.exists());
+    }
+
+    #[test]
+    fn a_file_of_the_user_in_the_place_of_the_pictures_survives() {
+        let folder = tempfile::tempdir().unwrap();
+        let output = folder.path();
+        assert_eq!(foreign_debug(output), None);
+        let mine = output.join(DEBUG_FOLDER);
+        fs::write(&mine, "mine").unwrap();
+        assert_eq!(foreign_debug(output), Some(mine.clone()));
+        commit(output, "first", 2);
+        commit(output, "second", 0);
+        let found = content(output);
+        assert!(all_of(&found, "second") && found.len() == FILES.len() + 1, "{found:?}");
+        assert_eq!(fs::read_to_string(mine).unwrap(), "mine");
+    }
+
+    #[test]
+    fn sets_that_begin_side_by_side_do_not_take_each_others_folder() {
+        let folder = tempfile::tempdir().unwrap();
+        let output = folder.path();
+        let is_over = std::sync::atomic::AtomicBool::new(false);
+        std::thread::scope(|scope| {
+            // As other processes do when they begin a set of their own.
+            let clearing = scope.spawn(|| {
+                while !is_over.load(std::sync::atomic::Ordering::Relaxed) {
+                    let _alone = lock(output).unwrap();
+                    remove_abandoned(output).unwrap();
+                }
+            });
+            let taken = (0..300).filter(|_| {
+                let set = ResultSet::begin(output);
+                !set.is_ok_and(|set| fs::write(set.folder().join("map.ply"), "x").is_ok())
+            });
+            let taken = taken.count();
+            is_over.store(true, std::sync::atomic::Ordering::Relaxed);
+            clearing.join().unwrap();
+            assert_eq!(taken, 0);
+        });
     }
 
     #[test]
