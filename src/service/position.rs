@@ -95,6 +95,9 @@ impl PositionKeeper {
     }
 }
 
+/// Stamp of a frame of a camera without a clock.
+const NO_STAMP: i64 = 0;
+
 /// How far the capture before had come, until the first frame behind it.
 #[derive(Debug, Default)]
 pub struct Predecessor {
@@ -105,8 +108,11 @@ pub struct Predecessor {
 
 impl Predecessor {
     /// Whether a frame is no newer than its last. A source that gives only such frames has another clock by
-    /// now.
+    /// now, or none at all.
     pub fn is_ahead_of(&mut self, stamp: &FrameStamp) -> bool {
+        if stamp.capture_nanos == NO_STAMP {
+            self.last_nanos = None;
+        }
         let is_ahead = self.last_nanos.is_some_and(|last| stamp.capture_nanos <= last);
         self.frames_behind += u32::from(is_ahead);
         if !is_ahead || self.frames_behind > MAX_FRAMES_BEHIND {
@@ -244,6 +250,21 @@ mod tests {
         }
         let other = position_key("run 2", "sim", None);
         assert_eq!(PositionFile::open(&path, other).unwrap().1, None);
+    }
+
+    #[test]
+    fn frames_before_the_last_one_are_left_out_where_there_is_a_clock() {
+        let at =
+            |capture_nanos| FrameStamp { sequence: 0, capture_nanos, exposure_nanos: 0, gain: 0.0 };
+        let behind = |last, stamps: &[i64]| {
+            let mut predecessor = Predecessor { last_nanos: Some(last), ..Predecessor::default() };
+            stamps.iter().filter(|&&nanos| predecessor.is_ahead_of(&at(nanos))).count()
+        };
+        assert_eq!(behind(70, &[50, 60, 70, 80, 75]), 3);
+        let other_clock: Vec<i64> = (1..100).collect();
+        assert_eq!(behind(1000, &other_clock), MAX_FRAMES_BEHIND as usize);
+        assert_eq!(behind(0, &[0; 100]), 0, "no clock");
+        assert_eq!(behind(1000, &[0; 100]), 0, "no clock any more");
     }
 
     #[test]

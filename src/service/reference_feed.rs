@@ -174,10 +174,13 @@ fn open_until_stopped(place: &Place, shared: &Shared) -> Option<Opened> {
         hub.reserve()?;
         Ok((ports.0, ports.1, hub))
     };
+    let mut said = SaidOnce::default();
     while !shared.stop.load(Ordering::Acquire) {
         match open() {
             Ok(opened) => return Some(opened),
-            Err(error) => tracing::error!("no keyframes yet: {error}"),
+            Err(error) => {
+                said.news(&error).inspect(|news| tracing::error!("no keyframes yet: {news}"));
+            }
         }
         // A pause; where it cannot be waited the next attempt comes sooner.
         drop(wait(&[], None, WAKE_PERIOD));
@@ -189,6 +192,7 @@ fn prepare_until_stopped(place: &Place, params: &ReferenceParams, shared: &Share
     let Some((mut inbox, steps, _hub)) = open_until_stopped(place, shared) else { return };
     // Until the first keyframe. Here and not in the frame loop: it maps memory of the mapper's.
     let mut steps: Option<Subscriber<StepMessage, ()>> = Some(steps);
+    let mut said = SaidOnce::default();
     while !shared.stop.load(Ordering::Acquire) {
         if let Err(error) = wait(&[inbox.events()], None, WAKE_PERIOD) {
             tracing::error!("no keyframes any more: {error}");
@@ -197,6 +201,7 @@ fn prepare_until_stopped(place: &Place, params: &ReferenceParams, shared: &Share
         match inbox.newest() {
             Ok(None) => {}
             Ok(Some(keyframe)) => {
+                said = SaidOnce::default();
                 // What the tracker has not taken yet is older: it goes.
                 let reference = prepare(&keyframe, shared.used.pop(), params);
                 if let Some(last) = steps.take().and_then(|steps| last_pose(&steps)) {
@@ -206,8 +211,23 @@ fn prepare_until_stopped(place: &Place, params: &ReferenceParams, shared: &Share
                     drop(shared.used.push(older));
                 }
             }
-            Err(error) => tracing::warn!("{error}"),
+            Err(error) => {
+                said.news(&error).inspect(|news| tracing::warn!("{news}"));
+            }
         }
+    }
+}
+
+/// Keeps an error that comes again and again from filling the log.
+#[derive(Debug, Default)]
+struct SaidOnce(String);
+
+impl SaidOnce {
+    /// The text of an error that is another than the last.
+    fn news(&mut self, error: &dyn std::error::Error) -> Option<String> {
+        let text = error.to_string();
+        (text != self.0).then(|| self.0.clone_from(&text))?;
+        Some(text)
     }
 }
 
@@ -215,4 +235,18 @@ fn last_pose(steps: &Subscriber<StepMessage, ()>) -> Option<LastPose> {
     let newest = steps.newest();
     let newest = newest.inspect_err(|error| tracing::warn!("{error}")).ok()??;
     LastPose::of(newest.payload().first()?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_error_is_said_once_for_each_change() {
+        let error = |text: &str| io::Error::other(text.to_owned());
+        let mut said = SaidOnce::default();
+        let news: Vec<_> =
+            ["a", "a", "b", "b", "a"].iter().filter_map(|text| said.news(&error(text))).collect();
+        assert_eq!(news, ["a", "b", "a"]);
+    }
 }
