@@ -31,6 +31,7 @@ use crate::slam::two_frame::evidence::{
 };
 use crate::slam::two_frame::fit::{
     FitInput, FitParams, FitScratch, Freedom, common_error, depth_variances, fit_level,
+    pose_covariance,
 };
 use crate::slam::two_frame::hypothesis::Hypotheses;
 use crate::slam::two_frame::points::Points;
@@ -343,9 +344,11 @@ impl TwoFrameInitializer {
         let floor = self.params.fit.image_noise.powi(2);
         let noise = residual_variance(joint, &mut self.sorted).max(floor);
         let match_variance = self.params.match_noise_px.powi(2);
-        depth_variances(state, joint, noise, match_variance, &mut self.variances);
+        let covariance = pose_covariance(state, joint);
+        let covariance = covariance.as_ref();
+        depth_variances(covariance, joint, noise, match_variance, &mut self.variances);
         let evidence = judge(state, joint, &self.variances, rotation, &mut self.sorted);
-        let common_error = common_error(state, joint, noise);
+        let common_error = common_error(covariance, state, joint, noise);
         self.least_residual = self.least_residual.min(evidence.median_residual);
         let evidence = Evidence {
             rival,

@@ -257,20 +257,22 @@ fn is_sane(step: &SVector<f64, NUM_UNKNOWNS>) -> bool {
     step.iter().all(|x| x.is_finite()) && step.iter().take(7).all(|x| x.abs() < LARGEST)
 }
 
+/// Covariance of pose and brightness for residuals of variance 1.
+pub type PoseCovariance = SMatrix<f64, NUM_UNKNOWNS, NUM_UNKNOWNS>;
+
 /// Variance of each point's inverse depth with the length of the translation held: its own residuals',
-/// and what the uncertainty of the pose adds. `noise` is the variance of a residual, `match_variance_px`
+/// and what the uncertainty of the pose adds, by [`pose_covariance`]. `noise` is the variance of a residual, `match_variance_px`
 /// that of what interpolation and sampling misplace, pixels²; infinite where a point is not visible.
 pub fn depth_variances(
-    state: &State,
+    pose_covariance: Option<&PoseCovariance>,
     system: &System,
     noise: f32,
     match_variance_px: f32,
     variances: &mut Vec<f32>,
 ) {
-    let pose_covariance = pose_covariance(state, system);
     variances.clear();
     variances.extend(system.points().map(|point| {
-        let Some(pose_covariance) = &pose_covariance else { return f32::INFINITY };
+        let Some(pose_covariance) = pose_covariance else { return f32::INFINITY };
         if !point.visible || !(point.information > 0.0) || !(point.squared_speed > 0.0) {
             return f32::INFINITY;
         }
@@ -282,8 +284,13 @@ pub fn depth_variances(
 
 /// Median over the visible points of the relative error that the uncertainty of the pose gives all depths
 /// together, infinite where it cannot be told; `noise` is the variance of a residual.
-pub fn common_error(state: &State, system: &System, noise: f32) -> f64 {
-    let Some(pose_covariance) = pose_covariance(state, system) else { return f64::INFINITY };
+pub fn common_error(
+    pose_covariance: Option<&PoseCovariance>,
+    state: &State,
+    system: &System,
+    noise: f32,
+) -> f64 {
+    let Some(pose_covariance) = pose_covariance else { return f64::INFINITY };
     let is_placed =
         |(point, d): &(PointSystem, &f32)| point.visible && point.information > 0.0 && **d > 0.0;
     let points = system.points().zip(&state.inverse_depths).filter(is_placed);
@@ -299,10 +306,7 @@ pub fn common_error(state: &State, system: &System, noise: f32) -> f64 {
 
 /// Inverse of the pose's normal equations after elimination of the depths, scale held; `None` where
 /// they are not positive definite.
-fn pose_covariance(
-    state: &State,
-    system: &System,
-) -> Option<SMatrix<f64, NUM_UNKNOWNS, NUM_UNKNOWNS>> {
+pub fn pose_covariance(state: &State, system: &System) -> Option<PoseCovariance> {
     let mut hessian = system.hessian;
     for point in system.points().filter(|p| p.visible && p.information > 0.0) {
         let mixed = SVector::from(point.mixed.map(f64::from));
