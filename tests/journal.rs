@@ -5,13 +5,13 @@ mod support;
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Command};
 
 use rustix::process::{Pid, Signal};
 use semidense::service::peers::Peer;
 use semidense::wire::topic::MAPPER_HEALTH;
 use serde_json::Value;
-use support::{Ended, Rig, end, finish, signal, small_camera, until};
+use support::{Ended, Rig, end, finish, signal, small_camera, until, with_mount};
 
 /// The files of a run.
 const FILES: [&str; 7] = [
@@ -237,10 +237,10 @@ fn a_full_disk_leaves_the_set_before_and_the_journal() {
     let settings = settings.join(" ");
     // The first run fits; then everything but so many kB is taken before the second begins.
     let script = format!(
-        "mount -t tmpfs -o size=8m tmpfs {mount} || exit 99
-         {binary} replay sim --frames 20 --output {mount}/out {settings} >/dev/null 2>&1 || exit 98
+        "{binary} replay sim --frames 20 --output {mount}/out {settings} >/dev/null 2>&1 || exit 98
          cat {mount}/out/* | cksum > {mount}/sum
-         for free in $FREE; do
+         # Room for nothing but the journal, for some files, for all but the last.
+         for free in 120 400 900 1500; do
              dd if=/dev/zero of={mount}/ballast bs=1024 count=$(($(df -k --output=avail {mount} | tail -n 1) - free)) 2>/dev/null
              {binary} replay sim --frames 40 --output {mount}/out {settings} >/dev/null 2>{mount}/../said
              echo \"code $?\"; grep '^error' {mount}/../said
@@ -255,21 +255,8 @@ fn a_full_disk_leaves_the_set_before_and_the_journal() {
         mount = mount.display(),
     );
     fs::create_dir(&mount).unwrap();
-    let ended = finish({
-        let mut command = Command::new("unshare");
-        command.args(["--mount", "--map-root-user", "sh", "-c", &script]);
-        // Room for nothing but the journal, for some files, for all but the last.
-        command.env("FREE", "120 400 900 1500").env("SEMIDENSE_ROOT", rig.root());
-        command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
-        command
-    });
-    if ended.status.code() == Some(99) || ended.stderr.contains("unshare") {
-        eprintln!(
-            "no file system can be mounted here: a full disk is not tried ({})",
-            ended.stderr
-        );
-        return;
-    }
+    let mounting = format!("mount -t tmpfs -o size=8m tmpfs {}", mount.display());
+    let Some(ended) = with_mount(&rig, &mounting, &script) else { return };
     assert!(ended.status.success(), "{}{}", ended.stdout, ended.stderr);
     let rounds: Vec<&str> = ended.stdout.split("code ").skip(1).collect();
     assert_eq!(rounds.len(), 4, "{}", ended.stdout);

@@ -1,5 +1,6 @@
 //! The real binary: three processes over shared memory, from the first frame to the results.
 
+#[allow(dead_code, reason = "every test uses its part of what they share")]
 mod support;
 
 use std::collections::BTreeMap;

@@ -1,7 +1,9 @@
 //! What the tests of the real binary share: an instance of its own for each test, and watch-dogs.
 
+use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
 use semidense::wire::place::{Place, SHARED_MEMORY};
@@ -101,20 +103,69 @@ pub fn until<T>(what: &str, mut ask: impl FnMut() -> Option<T>) -> T {
     }
 }
 
-/// Waits for the end of a child; one that hangs is killed and fails the test.
+/// Waits for the end of a child; one that hangs is killed and fails the test. What it says is read meanwhile: a
+/// full pipe holds nobody up.
 pub fn end(mut child: Child) -> Ended {
+    let stdout = child.stdout.take().map(read_all);
+    let stderr = child.stderr.take().map(read_all);
     let start = Instant::now();
-    while child.try_wait().unwrap().is_none() {
+    let status = loop {
+        if let Some(status) = child.try_wait().unwrap() {
+            break Some(status);
+        }
         if start.elapsed() > WATCH_DOG {
             child.kill().unwrap();
-            let output = child.wait_with_output().unwrap();
-            panic!("it hangs; it said: {}", String::from_utf8_lossy(&output.stderr));
+            child.wait().unwrap();
+            break None;
         }
         std::thread::sleep(Duration::from_millis(10));
+    };
+    let text = |read: Option<Receiver<String>>| {
+        let said = |read: Receiver<String>| read.recv_timeout(WATCH_DOG);
+        read.map_or(Ok(String::new()), said).expect("somebody else holds its standard error")
+    };
+    let (stdout, stderr) = (text(stdout), text(stderr));
+    let Some(status) = status else { panic!("it hangs; it said: {stderr}") };
+    Ended { status, stdout, stderr }
+}
+
+/// Reads to the end on a thread of its own.
+fn read_all(mut pipe: impl Read + Send + 'static) -> Receiver<String> {
+    let (sender, receiver) = channel();
+    std::thread::spawn(move || {
+        let mut bytes = Vec::new();
+        pipe.read_to_end(&mut bytes).unwrap();
+        // Who has waited in vain is gone.
+        let _ = sender.send(String::from_utf8_lossy(&bytes).into_owned());
+    });
+    receiver
+}
+
+/// Set where tests that need mounts of their own cannot run and are to be left out.
+const WITHOUT_MOUNTS: &str = "SEMIDENSE_TEST_WITHOUT_MOUNTS";
+
+/// `script` in a shell with mounts of its own, after `mount`, with the binary in $SEMIDENSE; as root, or as one
+/// who is root in a namespace of users. Where neither is allowed the test fails, or with [`WITHOUT_MOUNTS`] there
+/// is no result.
+pub fn with_mount(rig: &Rig, mount: &str, script: &str) -> Option<Ended> {
+    let shell = |options: &[&str], script: &str| {
+        let binary = rig.command(&[]).get_program().to_owned();
+        let mut command = Command::new("unshare");
+        command.args(options).args(["--mount", "sh", "-c", script]).env("SEMIDENSE", binary);
+        command.env("SEMIDENSE_ROOT", rig.root()).env("OUTPUT", rig.output());
+        command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        command
+    };
+    let ways: [&[&str]; 2] = [&[], &["--user", "--map-root-user"]];
+    let may =
+        |way: &&&[&str]| shell(way, mount).output().is_ok_and(|output| output.status.success());
+    match ways.iter().find(may) {
+        Some(way) => Some(finish(shell(way, &format!("{mount} && {script}")))),
+        None if std::env::var_os(WITHOUT_MOUNTS).is_some() => None,
+        None => panic!(
+            "this user may not mount (unshare --mount, unshare --user): run the test as root, or leave it out with {WITHOUT_MOUNTS}=1"
+        ),
     }
-    let output = child.wait_with_output().unwrap();
-    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-    Ended { status: output.status, stdout: text(&output.stdout), stderr: text(&output.stderr) }
 }
 
 /// Starts a command and waits for its end.
