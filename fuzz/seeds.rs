@@ -131,7 +131,7 @@ fn map_bytes() -> Vec<u8> {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("map");
     let second = Keyframe { keyframe_id: 1, epoch: 1, ..keyframe() };
-    write_map(&path, &Map { keyframes: vec![keyframe(), second], free_epoch: 17 })
+    write_map(&path, &Map { keyframes: vec![keyframe(), second], free_epoch: 17 }, &mut || ())
         .expect("written");
     std::fs::read(path).expect("read")
 }

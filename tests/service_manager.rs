@@ -9,7 +9,8 @@ use std::os::unix::net::UnixDatagram;
 use std::process::Child;
 
 use rustix::process::Signal;
-use support::{Rig, signal, small_camera, until};
+use semidense::wire::command::{Command, CommandClient};
+use support::{Rig, WATCH_DOG, signal, small_camera, until};
 
 /// Time between two heartbeats that the manager allows: loops wake ten times in a second.
 const WATCHDOG_US: &str = "800000";
@@ -146,4 +147,22 @@ fn the_children_of_a_supervisor_leave_its_manager_alone() {
     assert!(ended.status.success(), "{}", ended.stderr);
     let nothing = socket.recv(&mut [0; 64]).unwrap_err();
     assert_eq!(nothing.kind(), ErrorKind::WouldBlock);
+}
+
+#[test]
+fn a_mapper_that_has_written_its_map_does_again_what_it_did() {
+    let rig = Rig::new();
+    let mut mapper = Manager::start(&rig, &["mapper", "--live"]);
+    mapper.until_heard(0, "a status", |message| message.starts_with("STATUS=ready ("));
+    let commands = CommandClient::open(&rig.observe()).unwrap();
+    let map = rig.folder().join("map.bin");
+    let from = mapper.heard.len();
+    commands.ask(&Command::SaveMap(map.clone()), WATCH_DOG, || true).unwrap();
+    assert!(map.exists());
+    mapper.until_heard(from, "its writing", |message| {
+        message.starts_with("STATUS=running: the map is being written")
+    });
+    mapper.until_heard(from, "what it did before", |message| message.starts_with("STATUS=ready ("));
+    drop(commands);
+    mapper.stop();
 }

@@ -5,16 +5,20 @@
 mod support;
 
 use std::fs;
-use std::io::{PipeReader, PipeWriter, Write};
+use std::io::{PipeReader, PipeWriter, Read, Write};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::Path;
 use std::process::Child;
+use std::thread::JoinHandle;
 use std::time::Duration;
 
-use rustix::fs::{OFlags, fcntl_getfl, fcntl_setfl};
+use rustix::fs::{Mode, OFlags, fcntl_getfl, fcntl_setfl};
 use rustix::process::{Pid, Signal, kill_process};
 use semidense::service::peers::{HEALTH_TOPICS, Peer};
+use semidense::wire::command::{Command, CommandClient};
 use semidense::wire::port::Hub;
 use serde_json::Value;
-use support::{Rig, end, finish, signal, until};
+use support::{Rig, WATCH_DOG, end, signal, until, with_mount};
 
 const CAPTURE: usize = 0;
 const TRACKER: usize = 1;
@@ -243,6 +247,43 @@ fn a_mapper_that_hangs_at_the_end_does_not_hold_up_the_results() {
     assert!(summary["keyframes"].as_u64().unwrap() > 0, "the checkpoint serves: {summary}");
 }
 
+/// A disk that takes a few kilobytes in a second: a pipe in the place of the file that the mapper fills.
+fn slow_disk(path: &Path) -> JoinHandle<usize> {
+    rustix::fs::mkfifoat(rustix::fs::CWD, path, Mode::RUSR | Mode::WUSR).unwrap();
+    let mut options = fs::OpenOptions::new();
+    options.read(true).write(true).custom_flags(OFlags::NONBLOCK.bits() as i32);
+    let mut pipe = options.open(path).unwrap();
+    let name = path.to_owned();
+    std::thread::spawn(move || {
+        let (mut taken, mut bytes) = (0, [0; 2048]);
+        // Renamed when it is filled.
+        while name.exists() {
+            // Nothing yet, or no more.
+            taken += pipe.read(&mut bytes).unwrap_or(0);
+            std::thread::sleep(Duration::from_millis(40));
+        }
+        taken
+    })
+}
+
+#[test]
+fn a_mapper_that_writes_its_map_to_a_slow_disk_is_let_alone() {
+    let mut live = Live::start(&["--set", "supervisor.watchdog_s=2"]);
+    live.until_frames(MAPPER, 90);
+    let mapper = live.pid(MAPPER).as_raw_nonzero();
+    let map = live.rig.folder().join("map.bin");
+    let disk = slow_disk(&live.rig.folder().join(format!(".map.bin.{mapper}.tmp")));
+    let commands = CommandClient::open(&live._hub).unwrap();
+    commands.ask(&Command::SaveMap(map), WATCH_DOG, || true).unwrap();
+    drop(commands);
+    // Twice as much as it takes within the watchdog's time.
+    let taken = disk.join().unwrap();
+    assert!(taken > 200_000, "{taken} bytes");
+    let (code, stderr, summary, _rig) = live.end();
+    assert_eq!(code, Some(0), "{stderr}");
+    assert_eq!(summary["restarts"], 0, "{summary}");
+}
+
 #[test]
 fn a_mapper_that_dies_before_it_numbers_anything_leaves_the_first_numbers() {
     let mut live = Live::start(&[]);
@@ -259,26 +300,10 @@ fn a_mapper_that_dies_before_it_numbers_anything_leaves_the_first_numbers() {
     assert_eq!(first.split_whitespace().nth(KEYFRAME_ID), Some("0"), "{first}");
 }
 
-/// Runs `script` in a shell with a /dev/shm of its own, of `megabytes`; `None` where that is not allowed here.
+/// Runs `script` in a shell with a /dev/shm of its own, of `megabytes`.
 fn with_shared_memory(rig: &Rig, megabytes: u32, script: &str) -> Option<support::Ended> {
     let mount = format!("mount -t tmpfs -o size={megabytes}m tmpfs /dev/shm");
-    let shell = |script: &str| {
-        let mut command = rig.command(&[]);
-        let binary = command.get_program().to_owned();
-        command = std::process::Command::new("unshare");
-        command.args(["--mount", "sh", "-c", script]).env("SEMIDENSE", binary);
-        command.env("SEMIDENSE_ROOT", rig.root()).env("OUTPUT", rig.output());
-        command.stdin(std::process::Stdio::null());
-        command.stdout(std::process::Stdio::piped()).stderr(std::process::Stdio::piped());
-        command
-    };
-    let may = shell(&mount).status().is_ok_and(|status| status.success());
-    if !may {
-        let line = "skipped: this user may not mount a /dev/shm of its own (unshare --mount)";
-        let _ = writeln!(std::io::stderr(), "{line}");
-        return None;
-    }
-    Some(finish(shell(&format!("{mount} && {script}"))))
+    with_mount(rig, &mount, script)
 }
 
 /// Options of a small live run, for a shell.

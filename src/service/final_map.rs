@@ -52,7 +52,7 @@ pub fn final_map(
     let timeout = Duration::from_secs_f64(config.save_timeout_s);
     let watchdog = Duration::from_secs_f64(config.watchdog_s);
     mapper.listen()?;
-    if mapper.silence(watchdog).is_some() {
+    if mapper.is_silent(watchdog) {
         return Err(FinalMapError::Silent);
     }
     let mut is_able = |child: &mut Child| matches!(child.poll(), Ok(None)) && !child.is_stopped();
@@ -69,7 +69,7 @@ pub fn final_map(
     let map = match answer {
         Ok(()) => read_map(&path).map_err(FinalMapError::File),
         Err(_) if is_gone => Err(FinalMapError::Gone),
-        Err(_) if !has_begun => Err(FinalMapError::Silent),
+        Err(CommandError::NoAnswer(_)) if !has_begun => Err(FinalMapError::Silent),
         Err(error) => Err(error.into()),
     };
     if let Err(error) = std::fs::remove_file(&path)

@@ -130,6 +130,14 @@ pub fn scheduling_name(code: u32) -> &'static str {
     }
 }
 
+/// A state with its cause, as a process has said it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct StateAndCause {
+    state: u32,
+    cause: [u8; TEXT_BYTES],
+    cause_bytes: u32,
+}
+
 /// Counts, and publishes when it is time: to everybody who subscribes, and to the service manager.
 #[derive(Debug)]
 pub struct Health {
@@ -223,13 +231,24 @@ impl Health {
 
     /// Enters a state; the next report goes out at once.
     pub fn enter(&mut self, state: ProcessState, cause: &str) {
-        let (text, length) = text_bytes(cause);
-        let known = (self.message.state, self.message.cause) == (state.code(), text);
-        if known {
+        let (cause, cause_bytes) = text_bytes(cause);
+        self.go_back_to(StateAndCause { state: state.code(), cause, cause_bytes });
+    }
+
+    /// The state that was entered last.
+    pub fn entered(&self) -> StateAndCause {
+        let HealthMessage { state, cause, cause_bytes, .. } = self.message;
+        StateAndCause { state, cause, cause_bytes }
+    }
+
+    /// Enters a state that [`Health::entered`] has given.
+    pub fn go_back_to(&mut self, wanted: StateAndCause) {
+        if wanted == self.entered() {
             return;
         }
+        let StateAndCause { state, cause, cause_bytes } = wanted;
         (self.message.state, self.message.cause, self.message.cause_bytes) =
-            (state.code(), text, length);
+            (state, cause, cause_bytes);
         self.changed = true;
         self.report();
     }

@@ -67,17 +67,28 @@ pub enum MapFileError {
     Trailing(PathBuf),
 }
 
-/// Writes `map` under a temporary name and renames it to `path`.
-pub fn write_map(path: &Path, map: &Map) -> io::Result<()> {
-    write_atomically(path, |file| write_map_into(file, map))
+/// Writes `map` under a temporary name and renames it to `path`. `each` is called before each keyframe: a large
+/// map on a slow disk takes longer than a process may be silent.
+pub fn write_map(path: &Path, map: &Map, each: &mut dyn FnMut()) -> io::Result<()> {
+    write_atomically(path, |file| {
+        write_head(file, map)?;
+        map.keyframes.iter().try_for_each(|keyframe| {
+            each();
+            write_keyframe(file, keyframe)
+        })
+    })
 }
 
 /// Writes the bytes of `map`.
 pub fn write_map_into(file: &mut impl Write, map: &Map) -> io::Result<()> {
+    write_head(file, map)?;
+    map.keyframes.iter().try_for_each(|keyframe| write_keyframe(file, keyframe))
+}
+
+fn write_head(file: &mut impl Write, map: &Map) -> io::Result<()> {
     file.write_all(&MAGIC)?;
     file.write_all(&map.free_epoch.to_le_bytes())?;
-    file.write_all(&(map.keyframes.len() as u64).to_le_bytes())?;
-    map.keyframes.iter().try_for_each(|keyframe| write_keyframe(file, keyframe))
+    file.write_all(&(map.keyframes.len() as u64).to_le_bytes())
 }
 
 fn write_keyframe(file: &mut impl Write, keyframe: &Keyframe) -> io::Result<()> {
@@ -279,7 +290,7 @@ mod tests {
     fn a_map_survives_the_file_bit_for_bit() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("map.bin");
-        write_map(&path, &map()).unwrap();
+        write_map(&path, &map(), &mut || ()).unwrap();
         let read = read_map(&path).unwrap();
         assert_eq!((read.keyframes, read.free_epoch), (map().keyframes, 18));
     }
@@ -288,7 +299,7 @@ mod tests {
     fn every_cut_and_every_wrong_byte_is_survived() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("map.bin");
-        write_map(&path, &map()).unwrap();
+        write_map(&path, &map(), &mut || ()).unwrap();
         let whole = std::fs::read(&path).unwrap();
         for length in 0..whole.len() {
             std::fs::write(&path, &whole[..length]).unwrap();

@@ -330,8 +330,11 @@ impl<'a> Shell<'a> {
         Ok(self.commands.answer(|command| match command {
             Command::SaveMap(path) => {
                 // It may take longer than the pause between two signs of life.
+                let before = health.entered();
                 health.enter(ProcessState::Running, WRITES_MAP);
-                save_map(mapper, &path)
+                let saved = save_map(mapper, &path, &mut || health.report());
+                health.go_back_to(before);
+                saved
             }
         })?)
     }
@@ -374,10 +377,10 @@ impl Kept {
     }
 }
 
-fn save_map(mapper: Option<&Mapper>, path: &Path) -> Result<(), String> {
+fn save_map(mapper: Option<&Mapper>, path: &Path, each: &mut dyn FnMut()) -> Result<(), String> {
     let empty = Map::default();
     let map = mapper.map_or(&empty, Mapper::map);
-    write_map(path, map).map_err(|e| format!("{}: {e}", path.display()))
+    write_map(path, map, each).map_err(|e| format!("{}: {e}", path.display()))
 }
 
 /// Everything that the mapper publishes.

@@ -34,6 +34,7 @@ pub mod refused_images;
 pub mod rehearsal;
 pub mod replay;
 pub mod results;
+pub mod run_error;
 pub mod run_progress;
 pub mod schedule;
 pub mod shutdown;

@@ -9,8 +9,9 @@ use std::time::{Duration, Instant};
 use rustix::process::Signal;
 
 use crate::service::child::Child;
-use crate::service::health::ProcessState;
+use crate::service::health::{ProcessState, cause};
 use crate::service::liveness::Liveness;
+use crate::service::mapper::WRITES_MAP;
 use crate::service::peers::Peer;
 use crate::service::results::RestartCause;
 use crate::wire::place::SHARED_MEMORY;
@@ -119,25 +120,27 @@ impl Supervised {
         Ok(())
     }
 
-    /// For how long it has given no sign of life, where that is longer than `watchdog` allows.
-    pub fn silence(&self, watchdog: Duration) -> Option<Duration> {
+    /// Whether it has given no sign of life for longer than `watchdog` allows.
+    pub fn is_silent(&self, watchdog: Duration) -> bool {
         if watchdog.is_zero() || self.child.is_none() {
-            return None;
+            return false;
         }
         let has_spoken = self.peer.last().is_some();
         let allowed = if has_spoken { watchdog } else { watchdog.max(FIRST_SIGN) };
         let is_at_its_end =
             matches!(self.peer.state(), Some(ProcessState::Finished | ProcessState::Failed));
+        let writes_map = self.peer.last().is_some_and(|last| cause(last) == WRITES_MAP);
         let silence = self.last_look.duration_since(self.last_sign);
-        // One that is at its end has said its last word, and has as long as any other to leave.
-        (silence > allowed + if is_at_its_end { FIRST_SIGN } else { Duration::ZERO })
-            .then_some(silence)
+        // One that is at its end has said its last word, and has as long as any other to leave. One that writes
+        // its map gives a sign between two keyframes, each of which a slow disk may hold up.
+        let extra = if is_at_its_end || writes_map { FIRST_SIGN } else { Duration::ZERO };
+        silence > allowed + extra
     }
 
     /// How it ended, if it did; one that gives no sign of life is killed. An end in order (`None` within)
     /// is no death.
     pub fn poll(&mut self, watchdog: Duration) -> io::Result<Option<Option<Death>>> {
-        let silence = self.silence(watchdog);
+        let is_silent = self.is_silent(watchdog);
         let name = self.peer.name();
         let Some(child) = &mut self.child else { return Ok(None) };
         if let Some(status) = child.poll()? {
@@ -149,11 +152,13 @@ impl Supervised {
             let is_end = status.success() && name == CAPTURE_HEALTH.owner;
             return Ok(Some((!is_end).then(|| death(name, status, fault))));
         }
-        let Some(silence) = silence else { return Ok(None) };
+        if !is_silent {
+            return Ok(None);
+        }
         let liveness = Liveness::of(child.id());
         child.kill();
         self.bury();
-        let cause = hang(name, silence, liveness);
+        let cause = hang(name, liveness);
         Ok(Some(Some(Death { cause, is_fault: false, is_bus_error: false })))
     }
 
@@ -168,10 +173,10 @@ impl Supervised {
 
     /// Whether it is worth starting again after this death: a process that names a fault of its own would
     /// meet it again, unless it is one that has just taken the place of another and found the place not yet
-    /// cleared.
-    pub fn may_restart(&self, death: &Death, max_restarts: u32) -> bool {
-        let is_lasting = death.is_fault && (self.was_ready || self.restarts() == 0);
-        !is_lasting && self.hasty_restarts < max_restarts
+    /// cleared, or another was killed at that time (`kill_is_felt`), whose half-made ports it has met.
+    pub fn may_restart(&self, death: &Death, kill_is_felt: bool, max_restarts: u32) -> bool {
+        let is_own = death.is_fault && (self.was_ready || self.restarts() == 0);
+        (kill_is_felt || !is_own) && self.hasty_restarts < max_restarts
     }
 
     /// Plans the next start: at once for a process that had lived, later and later for one that dies of
@@ -233,14 +238,14 @@ fn bus_error(name: &str, free_bytes: Option<u64>) -> String {
     }
 }
 
-fn hang(name: &str, silence: Duration, liveness: Liveness) -> String {
-    let seconds = silence.as_secs();
+/// Without the time: equal causes are one line of the summary, with their number.
+fn hang(name: &str, liveness: Liveness) -> String {
     match liveness {
         Liveness::Stopped => format!(
-            "{name} was stopped (SIGSTOP or a debugger) and gave no sign of life for {seconds} s; it was killed (supervisor.watchdog_s)"
+            "{name} was stopped (SIGSTOP or a debugger) and gave no sign of life for longer than supervisor.watchdog_s; it was killed"
         ),
         _ => format!(
-            "{name} hung: no sign of life for {seconds} s; it was killed (supervisor.watchdog_s)"
+            "{name} hung: no sign of life for longer than supervisor.watchdog_s; it was killed"
         ),
     }
 }

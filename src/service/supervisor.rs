@@ -2,11 +2,10 @@
 
 use std::ffi::OsString;
 use std::fs::File;
-use std::io;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use crate::capture::source::{FrameSource, SourceError, SourceName, open};
+use crate::capture::source::{FrameSource, SourceName, open};
 use crate::service::checkpoint::read_checkpoint;
 use crate::service::child::{Child, memory_for_frames};
 use crate::service::clock::now_nanos;
@@ -21,6 +20,7 @@ use crate::service::position::{position_key, read_position};
 use crate::service::recorder::Recorder;
 use crate::service::recording::{RecordParts, RunCounters};
 use crate::service::results::{RestartCause, RunMode, RunRecord};
+pub use crate::service::run_error::RunError;
 pub use crate::service::run_progress::Ended;
 use crate::service::run_progress::RunProgress;
 use crate::service::schedule::peak_rss_bytes;
@@ -30,7 +30,7 @@ use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::mapper::Map;
 use crate::wire::command::CommandClient;
 use crate::wire::place::{Claim, Place, PlaceError};
-use crate::wire::port::{Access, Hub, OpenError, ReceiveError, WaitError, wait};
+use crate::wire::port::{Access, Hub, wait};
 use crate::wire::topic::shared_memory_bytes;
 
 /// Longest sleep without a look at children, signals and progress.
@@ -39,6 +39,9 @@ const WAKE_PERIOD: Duration = Duration::from_millis(50);
 const SILENCE: Duration = Duration::from_millis(500);
 /// Time between two looks for shared memory that is promised and not taken.
 const RESERVE_PERIOD: Duration = Duration::from_secs(1);
+/// How long after a kill a process may still fail of it: opening what one that was killed in its start has left
+/// half made is tried fifty times, half a second each.
+const KILL_IS_FELT: Duration = Duration::from_secs(30);
 /// Pause between two looks for the end or the answer of a process.
 const ANSWER_PAUSE: Duration = Duration::from_millis(5);
 
@@ -75,34 +78,6 @@ pub struct RunOutcome {
     pub ended: Ended,
 }
 
-/// Why a run does not start, or its record cannot be made.
-#[derive(Debug, thiserror::Error)]
-pub enum RunError {
-    /// The place is not right, or taken.
-    #[error(transparent)]
-    Place(#[from] PlaceError),
-    /// A topic cannot be opened.
-    #[error(transparent)]
-    Open(#[from] OpenError),
-    /// The source cannot be opened.
-    #[error(transparent)]
-    Source(#[from] SourceError),
-    /// Poses cannot be received.
-    #[error(transparent)]
-    Receive(#[from] ReceiveError),
-    /// Waiting failed.
-    #[error(transparent)]
-    Wait(#[from] WaitError),
-    /// A process cannot be started or watched.
-    #[error("{process}: cannot be started or watched ({source})")]
-    Child {
-        /// Which.
-        process: &'static str,
-        /// Why.
-        source: io::Error,
-    },
-}
-
 /// Runs the three processes to the end of the source, to a signal, or to a failure.
 pub fn run(
     config: &Config,
@@ -116,7 +91,22 @@ pub fn run(
     // What a run before has left is not of this one.
     place.forget_run();
     place.check_shared_memory(shared_memory_bytes(&source.intrinsics(), None))?;
-    let mut supervisor = Supervisor::start(config, options, &place)?;
+    let outcome = supervise(config, options, &place, source, shutdown, observe);
+    // However it ended, nobody goes on from here.
+    place.forget_run();
+    outcome
+}
+
+/// Runs them from their start to the record of the run.
+fn supervise(
+    config: &Config,
+    options: &RunOptions,
+    place: &Place,
+    source: Box<dyn FrameSource>,
+    shutdown: &Shutdown,
+    observe: &mut dyn FnMut(&RunProgress),
+) -> Result<RunOutcome, RunError> {
+    let mut supervisor = Supervisor::start(config, options, place)?;
     let mut ended = supervisor.watch(shutdown, observe)?;
     supervisor.stop(CAPTURE, shutdown);
     supervisor.settle(&ended, shutdown)?;
@@ -140,7 +130,6 @@ pub fn run(
         ended = Ended::Failed(cause.clone());
     }
     let (recorder, counters, restart_causes) = supervisor.finish(shutdown)?;
-    place.forget_run();
     let lost = counters.frames_in.saturating_sub(recorder.num_poses() as u64);
     if options.mode == Mode::Lockstep && ended == Ended::Finished && lost > 0 {
         ended = Ended::Failed(format!("{lost} of {} poses did not arrive", counters.frames_in));
@@ -202,6 +191,8 @@ struct Supervisor<'a> {
     of_ended: RunCounters,
     /// Why a process last died of memory that was not there: a run that meets it is no success.
     bus_error: Option<String>,
+    /// When a process was last killed, or hung.
+    killed: Option<Instant>,
     /// When shared memory was last taken, and whether some of it was not to be had.
     reserved: Instant,
     is_short: bool,
@@ -226,6 +217,7 @@ impl<'a> Supervisor<'a> {
             hub,
             of_ended: RunCounters::default(),
             bus_error: None,
+            killed: None,
             reserved: Instant::now(),
             is_short: false,
         };
@@ -328,7 +320,7 @@ impl<'a> Supervisor<'a> {
     /// ends the run (lockstep: a frame without an answer cannot be made good).
     fn check_processes(&mut self) -> Result<Option<Ended>, RunError> {
         let watchdog = Duration::from_secs_f64(self.config.supervisor.watchdog_s);
-        let mut has_died = false;
+        let mut deaths = Vec::new();
         for index in [CAPTURE, TRACKER, MAPPER] {
             let process = &mut self.processes[index];
             let name = process.name();
@@ -338,20 +330,25 @@ impl<'a> Supervisor<'a> {
             match ended {
                 None => {}
                 Some(None) => return Ok(Some(Ended::Finished)),
-                Some(Some(death)) => {
-                    has_died = true;
-                    let counted = self.counted(index);
-                    self.of_ended.add(&counted);
-                    self.processes[index].peer.forget();
-                    if let Some(failed) = self.mourn(index, death) {
-                        return Ok(Some(failed));
-                    }
-                }
+                Some(Some(death)) => deaths.push((index, death)),
             }
         }
-        if has_died {
-            self.hub.clean_up();
+        if deaths.is_empty() {
+            return Ok(None);
         }
+        // All of them first: what one names as its fault may be the end of another.
+        if deaths.iter().any(|(_, death)| !death.is_fault) {
+            self.killed = Some(Instant::now());
+        }
+        for (index, death) in deaths {
+            let counted = self.counted(index);
+            self.of_ended.add(&counted);
+            self.processes[index].peer.forget();
+            if let Some(failed) = self.mourn(index, death) {
+                return Ok(Some(failed));
+            }
+        }
+        self.hub.clean_up();
         Ok(None)
     }
 
@@ -362,7 +359,9 @@ impl<'a> Supervisor<'a> {
         }
         let process = &mut self.processes[index];
         let is_live = self.options.mode == Mode::Live;
-        if !is_live || !process.may_restart(&death, self.config.supervisor.max_restarts) {
+        let kill_is_felt = self.killed.is_some_and(|killed| killed.elapsed() < KILL_IS_FELT);
+        let max_restarts = self.config.supervisor.max_restarts;
+        if !is_live || !process.may_restart(&death, kill_is_felt, max_restarts) {
             return Some(Ended::Failed(death.cause));
         }
         tracing::warn!("{}; it is started again", death.cause);

@@ -1,0 +1,35 @@
+//! Why a supervised run comes to nothing.
+
+use std::io;
+
+use crate::capture::source::SourceError;
+use crate::wire::place::PlaceError;
+use crate::wire::port::{OpenError, ReceiveError, WaitError};
+
+/// Why a run does not start, or its record cannot be made.
+#[derive(Debug, thiserror::Error)]
+pub enum RunError {
+    /// The place is not right, or taken.
+    #[error(transparent)]
+    Place(#[from] PlaceError),
+    /// A topic cannot be opened.
+    #[error(transparent)]
+    Open(#[from] OpenError),
+    /// The source cannot be opened.
+    #[error(transparent)]
+    Source(#[from] SourceError),
+    /// Poses cannot be received.
+    #[error(transparent)]
+    Receive(#[from] ReceiveError),
+    /// Waiting failed.
+    #[error(transparent)]
+    Wait(#[from] WaitError),
+    /// A process cannot be started or watched.
+    #[error("{process}: cannot be started or watched ({source})")]
+    Child {
+        /// Which.
+        process: &'static str,
+        /// Why.
+        source: io::Error,
+    },
+}
