@@ -12,7 +12,7 @@ use crate::command::{CommandResult, CommonArguments, INTERRUPTED};
 use crate::service::config::Config;
 use crate::service::error_log::ErrorLog;
 use crate::service::latency_bench::{Disturbance, Measurement, Trial, TrialError, try_out};
-use crate::service::results::summary::Percentiles;
+use crate::service::results::times::Percentiles;
 use crate::service::shutdown::Shutdown;
 
 /// Measure on this machine

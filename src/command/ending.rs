@@ -41,7 +41,7 @@ impl Ending<'_> {
         let output = self.output.path();
         let place = output.display().to_string();
         let results = Results::new(record, source, &self.config.results)?;
-        let is_tracked = results.summary.frames_tracked > 0;
+        let is_tracked = results.summary.frames.frames_tracked > 0;
         // Poses without a map, of a run that failed: a full disk, a mapper that is gone.
         let is_torn = matches!(record.ended, EndOfRun::Failed(_)) && results.summary.points == 0;
         let keeps_earlier = (!is_tracked || is_torn) && has_tracked_set(output);

@@ -191,15 +191,7 @@ impl<'a> Shell<'a> {
         let claim = place.claim("capture")?;
         place.check_shared_memory(shared_memory_bytes(&intrinsics, Some("capture")))?;
         let hub = Hub::join(&place, "capture", Access::Member)?;
-        let (position, left) = match options.mode {
-            // A run in lockstep ends with any of its processes.
-            Mode::Lockstep => (PositionKeeper::default(), None),
-            Mode::Live => {
-                let source = options.source.to_string();
-                let key = position_key(&run_from_environment(), &source, options.rig.as_deref());
-                PositionKeeper::open_or_warn(&place.position_path(), key)
-            }
-        };
+        let (position, left) = open_position(&place, options);
         // A supervisor knows whether there was a capture before; without one the tracker is asked too.
         let asks_tracker = options.mode == Mode::Live && left.is_none() && !is_supervised();
         let mut health = Health::open(&hub, &CAPTURE_HEALTH)?;
@@ -461,6 +453,19 @@ impl<'a> Shell<'a> {
         self.frames.serve_late_joiners();
         self.health.report();
         if self.shutdown.is_requested() { Err(CaptureError::Interrupted) } else { Ok(()) }
+    }
+}
+
+/// Keeps the place in the source, and gives where a capture of the same run has died.
+fn open_position(place: &Place, options: &CaptureOptions) -> (PositionKeeper, Option<Position>) {
+    match options.mode {
+        // A run in lockstep ends with any of its processes.
+        Mode::Lockstep => (PositionKeeper::default(), None),
+        Mode::Live => {
+            let source = options.source.to_string();
+            let key = position_key(&run_from_environment(), &source, options.rig.as_deref());
+            PositionKeeper::open_or_warn(&place.position_path(), key)
+        }
     }
 }
 

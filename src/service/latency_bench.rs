@@ -15,7 +15,7 @@ use crate::service::config::Config;
 use crate::service::error_log::ErrorLog;
 use crate::service::mode::Mode;
 use crate::service::results::RecordedPose;
-use crate::service::results::summary::Percentiles;
+use crate::service::results::times::Percentiles;
 use crate::service::run_progress::RunProgress;
 use crate::service::shutdown::Shutdown;
 use crate::service::supervisor::{Ended, RunError, RunOptions, RunOutcome, run};

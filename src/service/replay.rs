@@ -16,6 +16,7 @@ use crate::service::schedule::peak_rss_bytes;
 use crate::slam::alignment::reference::Reference;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::frame::FrameView;
+use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::mapper::situation::{Situation, StartFrame};
 use crate::slam::mapper::{Map, Mapper, MapperParams, StepOutcome};
@@ -240,20 +241,7 @@ impl<'a> Replay<'a> {
         let Some(pose) = self.pose(&frame) else {
             return Ok((TrackingState::Initializing, StepOutcome::default()));
         };
-        let sensor_depth = match self.config.initial_depth {
-            DepthOrigin::Images => None,
-            DepthOrigin::Sensor => match source.depth_at(stamp.capture_nanos) {
-                Err(error) if error.is_passing() && !self.config.strict => {
-                    tracing::warn!("left out: {error}");
-                    None
-                }
-                depth => depth?,
-            },
-        };
-        let sensor_expected = self.config.initial_depth == DepthOrigin::Sensor;
-        if sensor_expected && sensor_depth.is_none() && self.record.frames_in == 1 {
-            return Err(ReplayError::NoSensorDepth(self.record.source.clone()));
-        }
+        let sensor_depth = self.sensor_depth(source, stamp)?;
         let was_rejected = matches!(self.mapper.situation(), Situation::Rejected(_));
         let begin = Instant::now();
         let mut change = None;
@@ -275,18 +263,41 @@ impl<'a> Replay<'a> {
             self.record.keyframe_step_nanos.push(step_nanos);
             self.record.keyframe_nanos.push(change_nanos);
         }
-        if outcome.needs_publishing()
-            && self.config.poses == PoseOrigin::Tracker
-            && let Some(keyframe) = self.mapper.keyframe()
-        {
-            let mut reference = self
-                .spare
-                .take()
-                .unwrap_or_else(|| Box::new(Reference::new(self.config.tracker.reference.clone())));
-            reference.prepare_into(keyframe);
-            self.spare = self.tracker.adopt(reference);
+        if outcome.needs_publishing() && self.config.poses == PoseOrigin::Tracker {
+            self.hand_on_keyframe();
         }
         Ok((pose.state, outcome))
+    }
+
+    /// The depth camera's image of a frame, where the first depth comes from it.
+    fn sensor_depth(
+        &self,
+        source: &mut dyn FrameSource,
+        stamp: &FrameStamp,
+    ) -> Result<Option<Image<f32>>, ReplayError> {
+        if self.config.initial_depth == DepthOrigin::Images {
+            return Ok(None);
+        }
+        let sensor_depth = match source.depth_at(stamp.capture_nanos) {
+            Err(error) if error.is_passing() && !self.config.strict => {
+                tracing::warn!("left out: {error}");
+                None
+            }
+            depth => depth?,
+        };
+        if sensor_depth.is_none() && self.record.frames_in == 1 {
+            return Err(ReplayError::NoSensorDepth(self.record.source.clone()));
+        }
+        Ok(sensor_depth)
+    }
+
+    /// Gives the tracker the mapper's keyframe, in the memory of the one before.
+    fn hand_on_keyframe(&mut self) {
+        let Some(keyframe) = self.mapper.keyframe() else { return };
+        let new = || Box::new(Reference::new(self.config.tracker.reference.clone()));
+        let mut reference = self.spare.take().unwrap_or_else(new);
+        reference.prepare_into(keyframe);
+        self.spare = self.tracker.adopt(reference);
     }
 
     /// The frame's pose, estimated or given; `None` where ground truth has none for it.

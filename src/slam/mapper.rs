@@ -288,6 +288,17 @@ impl Mapper {
             return self.recover(frame, pose, sensor_depth);
         }
         self.recovery.end();
+        self.observe(frame, pose, sensor_depth, change_begins)
+    }
+
+    /// Takes a tracked frame into the keyframe, and changes to another where that is due.
+    fn observe(
+        &mut self,
+        frame: &FrameView<'_>,
+        pose: &PoseEstimate,
+        sensor_depth: Option<&Image<f32>>,
+        change_begins: &mut dyn FnMut(),
+    ) -> StepOutcome {
         self.frames_on_keyframe += 1;
         let initializing = self.map_state() == MapState::Initializing;
         self.guess_unit(pose);
@@ -323,16 +334,21 @@ impl Mapper {
         let keyframe_changed =
             self.unpublished as f64 > self.params.publish_change_ratio * points as f64;
         if keyframe_changed {
-            self.refine();
-            self.keep_unit_mean();
-            self.publish_depth();
-            let points = self.keyframe().map_or(0, |keyframe| keyframe.points.len());
-            let lost_depth = self.consistency.count_points(points, &self.params.consistency);
-            if let Some(contradiction) = lost_depth {
-                self.reject(contradiction);
-            }
+            self.publish_change();
         }
         StepOutcome { keyframe_changed, observations, ..Default::default() }
+    }
+
+    /// Smooths and publishes the keyframe's depth; a map that has lost too much of it contradicts itself.
+    fn publish_change(&mut self) {
+        self.refine();
+        self.keep_unit_mean();
+        self.publish_depth();
+        let points = self.keyframe().map_or(0, |keyframe| keyframe.points.len());
+        let lost_depth = self.consistency.count_points(points, &self.params.consistency);
+        if let Some(contradiction) = lost_depth {
+            self.reject(contradiction);
+        }
     }
 
     /// The keyframe in force, once there is one.

@@ -19,6 +19,7 @@ pub mod report;
 pub mod set;
 pub mod summary;
 pub mod summary_text;
+pub mod times;
 pub mod untracked;
 pub mod weight_picture;
 

@@ -4,11 +4,11 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::{Deserialize, Serialize};
 
-use crate::service::health::{bucket, bucket_end_ms};
 use crate::service::results::alignment_levels::{LevelSummary, alignment_levels};
 use crate::service::results::budget_curve::BudgetCurve;
 use crate::service::results::calibration::whitened_residual_median;
 use crate::service::results::poses::longest_epoch;
+use crate::service::results::times::{LatencySummary, Percentiles, track_nanos};
 use crate::service::results::untracked::Untracked;
 use crate::service::results::{
     EndOfRun, RecordedPose, Rejection, RestartCause, RunMode, RunRecord,
@@ -18,57 +18,7 @@ use crate::slam::evaluation::depth_error::DepthStatistics;
 use crate::slam::evaluation::grade::{Grade, GradeInput};
 use crate::slam::evaluation::map_consistency::MapConsistency;
 use crate::slam::evaluation::normalized_error::NormalizedErrors;
-use crate::slam::evaluation::statistics::percentile;
-use crate::slam::pose::{NO_KEYFRAME, TrackingState};
-use crate::wire::message::HISTOGRAM_BUCKETS;
-
-/// Percentiles of a time in milliseconds.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Percentiles {
-    /// Median.
-    pub p50: f64,
-    /// 95 of 100 are not longer.
-    pub p95: f64,
-    /// 99 of 100 are not longer.
-    pub p99: f64,
-    /// 999 of 1000 are not longer.
-    pub p999: f64,
-    /// Longest.
-    pub max: f64,
-}
-
-impl Percentiles {
-    /// Percentiles (nearest rank) of times in nanoseconds; `None` of none.
-    pub fn of(nanos: impl Iterator<Item = u64>) -> Option<Self> {
-        let mut millis: Vec<f64> = nanos.map(|n| n as f64 * 1e-6).collect();
-        millis.sort_by(f64::total_cmp);
-        let at = |share| percentile(&millis, share);
-        let (p50, p95, p99) = (at(0.5)?, at(0.95)?, at(0.99)?);
-        Some(Self { p50, p95, p99, p999: at(0.999)?, max: at(1.0)? })
-    }
-}
-
-/// How often each time came.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Histogram {
-    /// Upper ends of the buckets that are not empty, milliseconds: half octaves.
-    pub below_ms: Vec<f64>,
-    /// How often a time fell into each.
-    pub counts: Vec<u64>,
-}
-
-impl Histogram {
-    /// Histogram of times in nanoseconds; `None` of none.
-    pub fn of(nanos: impl Iterator<Item = u64>) -> Option<Self> {
-        let mut counts = [0; HISTOGRAM_BUCKETS];
-        nanos.for_each(|nanos| counts[bucket(nanos)] += 1);
-        let filled: Vec<usize> = (0..HISTOGRAM_BUCKETS).filter(|&i| counts[i] > 0).collect();
-        (!filled.is_empty()).then(|| Self {
-            below_ms: filled.iter().map(|&i| bucket_end_ms(i)).collect(),
-            counts: filled.iter().map(|&i| counts[i]).collect(),
-        })
-    }
-}
+use crate::slam::pose::TrackingState;
 
 /// A trajectory against ground truth; all null where there is none. Lengths in the ground truth's
 /// unit (metres), errors after the alignment.
@@ -152,6 +102,62 @@ impl From<&NormalizedErrors> for NeesSummary {
     }
 }
 
+/// Depth of the keyframes against ground truth; all null where there is none.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct DepthSummary {
+    /// Pixels of keyframes whose true depth is known.
+    pub depth_pixels: Option<u64>,
+    /// Median relative depth error over them.
+    pub depth_relative_error_median: Option<f64>,
+    /// The same over the half with the smallest σ/d.
+    pub depth_relative_error_median_best_half: Option<f64>,
+    /// Share of them whose true inverse depth is within 1, 2 and 3 reported σ.
+    pub depth_coverage: Option<[f64; 3]>,
+    /// Share of the keyframes' pixels that have depth.
+    pub depth_density: Option<f64>,
+    /// Depth errors common to a keyframe, medians of their magnitude: relative error for each unit of the ray
+    /// along columns, along rows, and for each unit of ln d (relief).
+    pub depth_modes: Option<[f64; 3]>,
+}
+
+impl From<DepthStatistics> for DepthSummary {
+    fn from(depth: DepthStatistics) -> Self {
+        Self {
+            depth_pixels: Some(depth.compared as u64),
+            depth_relative_error_median: Some(depth.relative_error_median),
+            depth_relative_error_median_best_half: Some(depth.relative_error_median_best_half),
+            depth_coverage: Some(depth.coverage),
+            depth_density: Some(depth.density),
+            depth_modes: depth.modes,
+        }
+    }
+}
+
+/// Frames by their state.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct FrameCounts {
+    /// Frames whose pose is claimed.
+    pub frames_tracked: u64,
+    /// Of them those whose pose is worse than it should be.
+    pub frames_degraded: u64,
+    /// Frames before the map could be trusted.
+    pub frames_initializing: u64,
+    /// Frames whose pose is not claimed.
+    pub frames_lost: u64,
+}
+
+impl FrameCounts {
+    fn of(poses: &[RecordedPose]) -> Self {
+        let count = |is: fn(TrackingState) -> bool| count_states(poses, is);
+        Self {
+            frames_tracked: count(TrackingState::is_tracked),
+            frames_degraded: count(|s| matches!(s, TrackingState::Degraded(_))),
+            frames_initializing: count(|s| s == TrackingState::Initializing),
+            frames_lost: count(is_lost),
+        }
+    }
+}
+
 /// The figures of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
@@ -172,14 +178,9 @@ pub struct Summary {
     pub frames_refused: u64,
     /// How many they are, which is the first, and what is wrong with it; null where there are none.
     pub refused: Option<String>,
-    /// Frames whose pose is claimed.
-    pub frames_tracked: u64,
-    /// Of them those whose pose is worse than it should be.
-    pub frames_degraded: u64,
-    /// Frames before the map could be trusted.
-    pub frames_initializing: u64,
-    /// Frames whose pose is not claimed.
-    pub frames_lost: u64,
+    /// Frames by their state.
+    #[serde(flatten)]
+    pub frames: FrameCounts,
     /// Frames that the tracker never saw.
     pub frames_dropped: u64,
     /// Holes in the source's sequence.
@@ -206,16 +207,9 @@ pub struct Summary {
     /// The epoch that is compared with ground truth: the one with the most tracked frames. Each epoch
     /// has a frame and a scale of its own; `matched_poses` says how many frames its figures cover.
     pub evaluated_epoch: Option<u32>,
-    /// From a frame's stamp to its pose's publication.
-    pub latency_ms: Option<Percentiles>,
-    /// From a frame's sending to the tracker's look at it.
-    pub wake_ms: Option<Percentiles>,
-    /// How often each latency came.
-    pub latency_histogram: Option<Histogram>,
-    /// How often each time in the tracker came.
-    pub track_histogram: Option<Histogram>,
-    /// How often each wake-up time came.
-    pub wake_histogram: Option<Histogram>,
+    /// How late poses were.
+    #[serde(flatten)]
+    pub latency: LatencySummary,
     /// Time that the tracker was allowed for a frame.
     pub deadline_ms: Option<f64>,
     /// Frames published later than that.
@@ -262,19 +256,9 @@ pub struct Summary {
     /// Errors of the tracked poses against their covariance, with the map's own depth.
     #[serde(flatten)]
     pub nees: NeesSummary,
-    /// Pixels of keyframes whose true depth is known.
-    pub depth_pixels: Option<u64>,
-    /// Median relative depth error over them.
-    pub depth_relative_error_median: Option<f64>,
-    /// The same over the half with the smallest σ/d.
-    pub depth_relative_error_median_best_half: Option<f64>,
-    /// Share of them whose true inverse depth is within 1, 2 and 3 reported σ.
-    pub depth_coverage: Option<[f64; 3]>,
-    /// Share of the keyframes' pixels that have depth.
-    pub depth_density: Option<f64>,
-    /// Depth errors common to a keyframe, medians of their magnitude: relative error for each unit of the ray
-    /// along columns, along rows, and for each unit of ln d (relief).
-    pub depth_modes: Option<[f64; 3]>,
+    /// Depth of the keyframes against ground truth.
+    #[serde(flatten)]
+    pub depth: DepthSummary,
 }
 
 /// One time that the map was found to contradict itself.
@@ -302,37 +286,25 @@ impl Summary {
         nees: Option<&NormalizedErrors>,
         depth: Option<DepthStatistics>,
     ) -> Self {
-        let count = |is: fn(TrackingState) -> bool| count_states(&record.poses, is);
         let (recorded_secs, wall_secs) =
             (record.recorded_nanos as f64 * 1e-9, record.wall_nanos as f64 * 1e-9);
         let traces: Vec<_> = record.poses.iter().filter_map(|pose| pose.trace).collect();
         const BYTES_PER_MB: f64 = 1_048_576.0;
-        let (ended, failure) = match &record.ended {
-            EndOfRun::Finished => ("finished", None),
-            EndOfRun::Interrupted => ("interrupted", None),
-            EndOfRun::Failed(cause) => ("failed", Some(cause)),
-            EndOfRun::Recovered => ("recovered", None),
-        };
+        let (ended, failure) = end_in_words(&record.ended);
         Self {
             mode: record.mode,
             source: record.source.clone(),
-            ended: ended.to_owned(),
-            failure: failure.cloned(),
+            ended,
+            failure,
             grade: grade(record),
             frames_in: record.frames_in,
             frames_refused: record.frames_refused,
             refused: record.refused.clone(),
-            frames_tracked: count(TrackingState::is_tracked),
-            frames_degraded: count(|s| matches!(s, TrackingState::Degraded(_))),
-            frames_initializing: count(|s| s == TrackingState::Initializing),
-            frames_lost: count(is_lost),
+            frames: FrameCounts::of(&record.poses),
             frames_dropped: record.frames_dropped,
             gaps: record.gaps,
             lost_count: count_losses(&record.poses),
-            map_rejections: record
-                .rejections
-                .as_ref()
-                .map(|all| all.iter().map(RejectionSummary::from).collect()),
+            map_rejections: rejections(record),
             whitened_residual_median: whitened_residual_median(&record.poses),
             initialization_secs: initialization_secs(&record.poses),
             untracked: Untracked::of(record).map(|why| why.to_string()),
@@ -341,11 +313,7 @@ impl Summary {
             epoch: record.poses.last().map_or(0, |pose| pose.estimate.epoch),
             epochs: count_epochs(&record.poses),
             evaluated_epoch: trajectory.and_then(|_| longest_epoch(record)),
-            latency_ms: Percentiles::of(record.poses.iter().filter_map(|p| p.latency_nanos)),
-            wake_ms: Percentiles::of(record.poses.iter().filter_map(|p| p.wake_nanos)),
-            latency_histogram: Histogram::of(record.poses.iter().filter_map(|p| p.latency_nanos)),
-            track_histogram: Histogram::of(track_nanos(record)),
-            wake_histogram: Histogram::of(record.poses.iter().filter_map(|p| p.wake_nanos)),
+            latency: LatencySummary::of(&record.poses),
             deadline_ms: record.deadline_nanos.map(|n| n as f64 * 1e-6),
             deadline_misses: record.deadline_misses,
             page_faults: record.page_faults,
@@ -353,7 +321,7 @@ impl Summary {
             restarts_by_process: restarts_by_process(&record.restart_causes),
             restart_causes: record.restart_causes.clone(),
             frames_skipped_by_mapper: record.frames_skipped_by_mapper,
-            track_ms: Percentiles::of(track_nanos(record)),
+            track_ms: Percentiles::of(track_nanos(&record.poses)),
             pyramid_ms: Percentiles::of(traces.iter().map(|trace| trace.pyramid_nanos)),
             alignment_levels: alignment_levels(&traces),
             map_ms: Percentiles::of(record.map_nanos.iter().copied()),
@@ -367,14 +335,25 @@ impl Summary {
             trajectory: trajectory.map(TrajectorySummary::from).unwrap_or_default(),
             online: online.map(TrajectorySummary::from).unwrap_or_default(),
             nees: nees.map(NeesSummary::from).unwrap_or_default(),
-            depth_pixels: depth.map(|d| d.compared as u64),
-            depth_relative_error_median: depth.map(|d| d.relative_error_median),
-            depth_relative_error_median_best_half: depth.map(|d| d.relative_error_median_best_half),
-            depth_coverage: depth.map(|d| d.coverage),
-            depth_density: depth.map(|d| d.density),
-            depth_modes: depth.and_then(|d| d.modes),
+            depth: depth.map(DepthSummary::from).unwrap_or_default(),
         }
     }
+}
+
+/// How a run ended in a word, and what failed.
+fn end_in_words(ended: &EndOfRun) -> (String, Option<String>) {
+    let (word, failure) = match ended {
+        EndOfRun::Finished => ("finished", None),
+        EndOfRun::Interrupted => ("interrupted", None),
+        EndOfRun::Failed(cause) => ("failed", Some(cause.clone())),
+        EndOfRun::Recovered => ("recovered", None),
+    };
+    (word.to_owned(), failure)
+}
+
+fn rejections(record: &RunRecord) -> Option<Vec<RejectionSummary>> {
+    let all = record.rejections.as_ref()?;
+    Some(all.iter().map(RejectionSummary::from).collect())
 }
 
 /// The grade of a run.
@@ -395,16 +374,10 @@ fn grade(record: &RunRecord) -> Grade {
     })
 }
 
-/// Times in the tracker. A frame without a keyframe costs nothing and tells nothing.
 fn restarts_by_process(causes: &[RestartCause]) -> BTreeMap<String, u64> {
     let mut sums = BTreeMap::new();
     causes.iter().for_each(|cause| *sums.entry(cause.process.clone()).or_default() += cause.count);
     sums
-}
-
-fn track_nanos(record: &RunRecord) -> impl Iterator<Item = u64> {
-    let has_keyframe = |pose: &&RecordedPose| pose.estimate.keyframe_id != NO_KEYFRAME;
-    record.poses.iter().filter(has_keyframe).filter_map(|pose| pose.track_nanos)
 }
 
 fn is_lost(state: TrackingState) -> bool {

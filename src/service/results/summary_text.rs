@@ -2,7 +2,8 @@
 
 use std::fmt::Write;
 
-use crate::service::results::summary::{Percentiles, Summary, TrajectorySummary};
+use crate::service::results::summary::{Summary, TrajectorySummary};
+use crate::service::results::times::Percentiles;
 use crate::slam::evaluation::grade::Grade;
 
 /// The lines, each ended.
@@ -39,9 +40,10 @@ pub fn summary_text(summary: &Summary) -> String {
     if let Some(error) = trajectory_errors(&summary.online) {
         line("online", error);
     }
-    if let (Some(all), Some(best)) =
-        (summary.depth_relative_error_median, summary.depth_relative_error_median_best_half)
-    {
+    if let (Some(all), Some(best)) = (
+        summary.depth.depth_relative_error_median,
+        summary.depth.depth_relative_error_median_best_half,
+    ) {
         line(
             "depth",
             format!(
@@ -55,7 +57,7 @@ pub fn summary_text(summary: &Summary) -> String {
         ("track", summary.track_ms),
         ("map", summary.map_ms),
         ("keyframe", summary.keyframe_ms),
-        ("latency", summary.latency_ms),
+        ("latency", summary.latency.latency_ms),
     ];
     for (name, percentiles) in times {
         if let Some(percentiles) = percentiles {
@@ -96,8 +98,8 @@ fn frames(summary: &Summary) -> String {
     format!(
         "{} in, {} tracked, {} lost in {} losses, {} dropped, {} gaps{skipped}; {initialised}",
         summary.frames_in,
-        summary.frames_tracked,
-        summary.frames_lost,
+        summary.frames.frames_tracked,
+        summary.frames.frames_lost,
         summary.lost_count,
         summary.frames_dropped,
         summary.gaps

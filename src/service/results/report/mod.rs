@@ -177,9 +177,9 @@ fn cards(summary: &Summary) -> String {
              <p class=\"note\">{note}</p></div>"
         );
     };
-    let share = 100.0 * summary.frames_tracked as f64 / summary.frames_in.max(1) as f64;
+    let share = 100.0 * summary.frames.frames_tracked as f64 / summary.frames_in.max(1) as f64;
     let losses = match summary.lost_count {
-        _ if summary.frames_tracked == 0 => "never initialised".to_owned(),
+        _ if summary.frames.frames_tracked == 0 => "never initialised".to_owned(),
         0 => "never lost".to_owned(),
         1 => "lost once".to_owned(),
         n => format!("lost {n} times"),
@@ -194,8 +194,8 @@ fn cards(summary: &Summary) -> String {
         let note = "largest / smallest scale of 100 frames".to_owned();
         card("Scale drift", format!("&times; {ratio:.2}"), note);
     }
-    if let Some(error) = summary.depth_relative_error_median {
-        let best = summary.depth_relative_error_median_best_half.unwrap_or(error);
+    if let Some(error) = summary.depth.depth_relative_error_median {
+        let best = summary.depth.depth_relative_error_median_best_half.unwrap_or(error);
         let note = format!("median; {:.1} % in the surer half", 100.0 * best);
         card("Depth error", format!("{:.1} %", 100.0 * error), note);
     }
@@ -205,7 +205,7 @@ fn cards(summary: &Summary) -> String {
         let note = format!("median; p99 {:.1} ms", times.p99);
         card("Tracking a frame", format!("{:.1} ms", times.p50), note);
     }
-    if let Some(times) = summary.latency_ms {
+    if let Some(times) = summary.latency.latency_ms {
         let late = summary.deadline_misses.map(|misses| format!("; {misses} after the deadline"));
         let note = format!("median; p99 {:.1} ms{}", times.p99, late.unwrap_or_default());
         card("Latency", format!("{:.1} ms", times.p50), note);

@@ -1,0 +1,93 @@
+//! Times of a run as percentiles and histograms.
+
+use serde::{Deserialize, Serialize};
+
+use crate::service::health::{bucket, bucket_end_ms};
+use crate::service::results::RecordedPose;
+use crate::slam::evaluation::statistics::percentile;
+use crate::slam::pose::NO_KEYFRAME;
+use crate::wire::message::HISTOGRAM_BUCKETS;
+
+/// Percentiles of a time in milliseconds.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Percentiles {
+    /// Median.
+    pub p50: f64,
+    /// 95 of 100 are not longer.
+    pub p95: f64,
+    /// 99 of 100 are not longer.
+    pub p99: f64,
+    /// 999 of 1000 are not longer.
+    pub p999: f64,
+    /// Longest.
+    pub max: f64,
+}
+
+impl Percentiles {
+    /// Percentiles (nearest rank) of times in nanoseconds; `None` of none.
+    pub fn of(nanos: impl Iterator<Item = u64>) -> Option<Self> {
+        let mut millis: Vec<f64> = nanos.map(|n| n as f64 * 1e-6).collect();
+        millis.sort_by(f64::total_cmp);
+        let at = |share| percentile(&millis, share);
+        let (p50, p95, p99) = (at(0.5)?, at(0.95)?, at(0.99)?);
+        Some(Self { p50, p95, p99, p999: at(0.999)?, max: at(1.0)? })
+    }
+}
+
+/// How often each time came.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Histogram {
+    /// Upper ends of the buckets that are not empty, milliseconds: half octaves.
+    pub below_ms: Vec<f64>,
+    /// How often a time fell into each.
+    pub counts: Vec<u64>,
+}
+
+impl Histogram {
+    /// Histogram of times in nanoseconds; `None` of none.
+    pub fn of(nanos: impl Iterator<Item = u64>) -> Option<Self> {
+        let mut counts = [0; HISTOGRAM_BUCKETS];
+        nanos.for_each(|nanos| counts[bucket(nanos)] += 1);
+        let filled: Vec<usize> = (0..HISTOGRAM_BUCKETS).filter(|&i| counts[i] > 0).collect();
+        (!filled.is_empty()).then(|| Self {
+            below_ms: filled.iter().map(|&i| bucket_end_ms(i)).collect(),
+            counts: filled.iter().map(|&i| counts[i]).collect(),
+        })
+    }
+}
+
+/// How late poses were, and what the tracker took of it.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct LatencySummary {
+    /// From a frame's stamp to its pose's publication.
+    pub latency_ms: Option<Percentiles>,
+    /// From a frame's sending to the tracker's look at it.
+    pub wake_ms: Option<Percentiles>,
+    /// How often each latency came.
+    pub latency_histogram: Option<Histogram>,
+    /// How often each time in the tracker came.
+    pub track_histogram: Option<Histogram>,
+    /// How often each wake-up time came.
+    pub wake_histogram: Option<Histogram>,
+}
+
+impl LatencySummary {
+    /// Of the poses of a run.
+    pub fn of(poses: &[RecordedPose]) -> Self {
+        let latencies = || poses.iter().filter_map(|pose| pose.latency_nanos);
+        let wakes = || poses.iter().filter_map(|pose| pose.wake_nanos);
+        Self {
+            latency_ms: Percentiles::of(latencies()),
+            wake_ms: Percentiles::of(wakes()),
+            latency_histogram: Histogram::of(latencies()),
+            track_histogram: Histogram::of(track_nanos(poses)),
+            wake_histogram: Histogram::of(wakes()),
+        }
+    }
+}
+
+/// Times in the tracker, nanoseconds. A frame without a keyframe costs nothing and tells nothing.
+pub fn track_nanos(poses: &[RecordedPose]) -> impl Iterator<Item = u64> {
+    let has_keyframe = |pose: &&RecordedPose| pose.estimate.keyframe_id != NO_KEYFRAME;
+    poses.iter().filter(has_keyframe).filter_map(|pose| pose.track_nanos)
+}
