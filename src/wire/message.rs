@@ -340,7 +340,7 @@ mod tests {
         assert_layout::<StepMessage>(136, 8, "semidense.Step.v4");
         assert_layout::<GraphHeader>(16, 8, "semidense.GraphHeader.v1");
         assert_layout::<KeyframePoseMessage>(72, 8, "semidense.KeyframePose.v1");
-        assert_layout::<HealthMessage>(1880, 8, "semidense.Health.v3");
+        assert_layout::<HealthMessage>(1888, 8, "semidense.Health.v4");
         assert_layout::<CommandRequest>(4104, 4, "semidense.CommandRequest.v1");
         assert_layout::<CommandResponse>(200, 4, "semidense.CommandResponse.v1");
     }
