@@ -264,6 +264,8 @@ fn signal_name(signal: i32) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::wire::place::Place;
+    use crate::wire::port::{Access, Hub};
 
     #[test]
     fn the_first_restart_is_at_once_and_the_pauses_grow_to_a_bound() {
@@ -272,6 +274,28 @@ mod tests {
         assert_eq!(back_off(2), 2 * FIRST_BACK_OFF);
         assert!((3..40).all(|n| back_off(n) > back_off(2) && back_off(n) <= LONGEST_BACK_OFF));
         assert_eq!(back_off(u32::MAX), LONGEST_BACK_OFF);
+    }
+
+    #[test]
+    fn a_fault_of_its_own_is_met_again_and_that_of_a_kill_is_not() {
+        let folder = tempfile::tempdir_in("/tmp").unwrap();
+        let place = Place::new("rig", folder.path().to_str().unwrap()).unwrap();
+        let hub = Hub::join(&place, "supervisor", Access::Member).unwrap();
+        let mut process = Supervised::new(Peer::open(&hub, &CAPTURE_HEALTH).unwrap());
+        let fault = death("capture", ExitStatus::from_raw(1 << 8), Some("no port".to_owned()));
+        let kill = death("capture", ExitStatus::from_raw(9), None);
+        let may =
+            |process: &Supervised, death, kill_is_felt| process.may_restart(death, kill_is_felt, 2);
+        assert!(!may(&process, &fault, false), "its first start");
+        assert!(may(&process, &fault, true) && may(&process, &kill, false));
+        process.plan_restart(fault.clone());
+        assert!(may(&process, &fault, false), "it came into the place of another");
+        process.was_ready = true;
+        assert!(!may(&process, &fault, false) && may(&process, &fault, true));
+        process.plan_restart(fault.clone());
+        assert!(!may(&process, &fault, true) && !may(&process, &kill, false), "too often");
+        drop((process, hub));
+        place.tidy();
     }
 
     #[test]
