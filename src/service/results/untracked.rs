@@ -3,8 +3,11 @@
 use std::fmt;
 
 use crate::service::results::{RunMode, RunRecord};
+use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::evaluation::statistics::percentile;
+use crate::slam::keyframe::Keyframe;
 use crate::slam::mapper::situation::StartFrame;
+use crate::slam::pose::{LostReason, TrackingState};
 
 /// Fewest frames from which a map can begin and one be tracked on it: a start is confirmed by its third.
 const FEWEST_FRAMES: u64 = 5;
@@ -49,6 +52,31 @@ impl StartTally {
     }
 }
 
+/// The machine handled too few of the frames.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Slowness {
+    /// Frames from the source.
+    pub frames_in: u64,
+    /// Of them, the frames that the mapper had no time for.
+    pub skipped: u64,
+    /// Median time of the mapper for a frame, milliseconds; 0 where it handled none.
+    pub map_ms: f64,
+    /// Time between two frames, milliseconds.
+    pub period_ms: f64,
+}
+
+impl fmt::Display for Slowness {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { frames_in, skipped, map_ms, period_ms } = self;
+        write!(
+            f,
+            "the machine is too slow: the mapper had no time for {skipped} of {frames_in} frames \
+             ({map_ms:.1} ms for one, one every {period_ms:.1} ms); lower the rate or the image size, give it more \
+             CPUs, or use --lockstep for a recording"
+        )
+    }
+}
+
 /// Why nothing was tracked, and what to do.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Untracked {
@@ -56,21 +84,21 @@ pub enum Untracked {
     NoFrame,
     /// There were too few.
     FewFrames(u64),
+    /// Poses were to be given, but none is near a frame.
+    NoGivenPose,
     /// Too few of them could be handled.
-    TooSlow {
-        /// Frames that the source gave.
-        frames_in: u64,
-        /// Of them those that the mapper had no time for.
-        skipped: u64,
-        /// Median time of the mapper for a frame, milliseconds; 0 where it had none.
-        map_ms: f64,
-        /// Time between two frames, milliseconds.
-        period_ms: f64,
-    },
+    TooSlow(Slowness),
     /// Most frames came to this, so many of so many.
     Seen(StartFrame, u64, u64),
     /// A map began, but no frame could be tracked on it.
-    LostAtOnce,
+    LostAtOnce {
+        /// Sequence of the frame on which it began.
+        began: u64,
+        /// Why its first frame was lost.
+        reason: LostReason,
+        /// The machine was too slow as well.
+        slowness: Option<Slowness>,
+    },
 }
 
 impl Untracked {
@@ -83,6 +111,12 @@ impl Untracked {
         if frames_in == 0 {
             return Some(Self::NoFrame);
         }
+        if record.depth_scale == DepthScale::Given && record.poses.is_empty() {
+            return Some(Self::NoGivenPose);
+        }
+        if let Some(lost) = Self::lost_at_once(record, frames_in) {
+            return Some(lost);
+        }
         let tally = record.start;
         let most = [
             (tally.dark, StartFrame::Dark),
@@ -94,31 +128,50 @@ impl Untracked {
             (tally.little_parallax, StartFrame::LittleParallax),
         ];
         let (count, seen) = most.into_iter().max_by_key(|(count, _)| *count)?;
-        let handled = record.map_nanos.len() as u64;
-        let skipped = frames_in.saturating_sub(handled);
-        let is_slow = record.mode == RunMode::Live && 3 * skipped > frames_in;
-        // Between frames that are far apart nothing can be proven; what they show of light and of a camera that
-        // stands they show all the same.
+        // Between frames that are far apart nothing can be proven; darkness and a camera that stands still show
+        // all the same.
         let is_far_apart =
             matches!(seen, StartFrame::Unmatched | StartFrame::Turned | StartFrame::LittleParallax);
-        if is_slow && (is_far_apart || tally.sum() < FEWEST_FRAMES) {
-            return Some(Self::too_slow(record, frames_in, skipped));
+        let slowness = slowness(record, frames_in);
+        if let Some(slowness) = slowness.filter(|_| is_far_apart || tally.sum() < FEWEST_FRAMES) {
+            return Some(Self::TooSlow(slowness));
         }
         Some(match count {
             _ if frames_in < FEWEST_FRAMES => Self::FewFrames(frames_in),
-            0 => Self::LostAtOnce,
-            _ => Self::Seen(seen, count, tally.sum()),
+            _ => Self::Seen(if count == 0 { StartFrame::Begun } else { seen }, count, tally.sum()),
         })
     }
 
-    fn too_slow(record: &RunRecord, frames_in: u64, skipped: u64) -> Self {
-        let mut times: Vec<f64> = record.map_nanos.iter().map(|&n| n as f64 * 1e-6).collect();
-        times.sort_by(f64::total_cmp);
-        let period_ms =
-            record.recorded_nanos as f64 * 1e-6 / frames_in.saturating_sub(1).max(1) as f64;
-        let map_ms = percentile(&times, 0.5).unwrap_or(0.0);
-        Self::TooSlow { frames_in, skipped, map_ms, period_ms }
+    /// Of a run with lost frames: a frame is lost only where there is a map.
+    fn lost_at_once(record: &RunRecord, frames_in: u64) -> Option<Self> {
+        let mut estimates = record.poses.iter().map(|pose| &pose.estimate);
+        let (lost, reason) = estimates.find_map(|estimate| match estimate.state {
+            TrackingState::Lost(reason) => Some((estimate, reason)),
+            _ => None,
+        })?;
+        let is_its = |keyframe: &&Keyframe| {
+            (keyframe.epoch, keyframe.keyframe_id) == (lost.epoch, lost.keyframe_id)
+        };
+        let keyframe = record.map.keyframes.iter().find(is_its);
+        Some(Self::LostAtOnce {
+            began: keyframe.map_or(lost.sequence, |keyframe| keyframe.sequence),
+            reason,
+            slowness: slowness(record, frames_in),
+        })
     }
+}
+
+/// Whether a live run left out so many frames that the rest are too far apart.
+fn slowness(record: &RunRecord, frames_in: u64) -> Option<Slowness> {
+    let skipped = frames_in.saturating_sub(record.map_nanos.len() as u64);
+    if record.mode != RunMode::Live || 3 * skipped <= frames_in {
+        return None;
+    }
+    let mut times: Vec<f64> = record.map_nanos.iter().map(|&n| n as f64 * 1e-6).collect();
+    times.sort_by(f64::total_cmp);
+    let period_ms = record.recorded_nanos as f64 * 1e-6 / frames_in.saturating_sub(1).max(1) as f64;
+    let map_ms = percentile(&times, 0.5).unwrap_or(0.0);
+    Some(Slowness { frames_in, skipped, map_ms, period_ms })
 }
 
 impl fmt::Display for Untracked {
@@ -127,29 +180,48 @@ impl fmt::Display for Untracked {
             Self::NoFrame => f.write_str("the source gave no frame"),
             Self::FewFrames(frames) => write!(
                 f,
-                "{frames} frames are too few: a map begins once the camera has moved sideways for some frames"
+                "{frames} frames are too few: a map begins after the camera has moved sideways for some frames"
             ),
-            Self::TooSlow { frames_in, skipped, map_ms, period_ms } => write!(
-                f,
-                "the machine is too slow: the mapper had no time for {skipped} of {frames_in} frames \
-                 ({map_ms:.1} ms for one, one every {period_ms:.1} ms); lower the rate or the image size, give it more \
-                 CPUs, or use --lockstep for a recording"
+            Self::TooSlow(slowness) => slowness.fmt(f),
+            Self::NoGivenPose => f.write_str(
+                "no frame has a true pose near its stamp; check that images and ground truth have the same clock",
             ),
+            Self::Seen(seen, _, 0) => f.write_str(advice(seen)),
             Self::Seen(seen, count, all) => {
                 write!(f, "{} ({count} of {all} frames of the start)", advice(seen))
             }
-            Self::LostAtOnce => f.write_str(
-                "a map began, but no frame could be tracked on it; move the camera more slowly at first",
-            ),
+            Self::LostAtOnce { began, reason, slowness } => {
+                write!(
+                    f,
+                    "a map began at frame {began}, the tracker lost it at once: {}; ",
+                    loss_text(reason)
+                )?;
+                match slowness {
+                    Some(slowness) => slowness.fmt(f),
+                    None => f.write_str("move the camera more slowly, or raise the frame rate"),
+                }
+            }
         }
+    }
+}
+
+fn loss_text(reason: LostReason) -> &'static str {
+    match reason {
+        LostReason::Diverged => "the view changed too much",
+        LostReason::TooFewInliers => "too few points matched",
+        LostReason::NoPoints => "its keyframe had no usable points",
+        LostReason::UnusableFrame => "the images have no contrast",
+        LostReason::MapRejected => "the map contradicted itself",
     }
 }
 
 fn advice(seen: StartFrame) -> &'static str {
     match seen {
-        StartFrame::Begun => "the start began anew with every frame",
+        StartFrame::Begun => {
+            "the start began anew again and again; move the camera sideways, smoothly and for longer"
+        }
         StartFrame::Dark => {
-            "the images are dark and show no texture; give more light or exposure, and check the lens cap"
+            "the images are dark and show no texture; add light or exposure, and check the lens cap"
         }
         StartFrame::Overexposed => {
             "the images are overexposed and show no texture; lower exposure or gain"
@@ -167,5 +239,67 @@ fn advice(seen: StartFrame) -> &'static str {
         StartFrame::LittleParallax => {
             "the camera moved too little, or towards what it sees; move it sideways by a few per cent of the distance"
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::service::recording::{RecordParts, Recording, RunCounters};
+    use crate::slam::frame::FrameView;
+    use crate::slam::mapper::Map;
+    use crate::slam::pose::PoseEstimate;
+    use crate::wire::conversion::{PoseTiming, pose_message};
+
+    /// A live run of `frames` frames with these states from its tenth on, of which the mapper handled `handled`
+    /// and found them too little like the first.
+    fn record(frames: u64, handled: u64, state: TrackingState) -> RunRecord {
+        let mut recording = Recording::default();
+        for sequence in 0..frames {
+            let frame = FrameView {
+                sequence,
+                capture_nanos: sequence as i64 * 100_000_000,
+                exposure_nanos: 0,
+                width: 0,
+                height: 0,
+                pixels: &[],
+            };
+            let mut estimate = PoseEstimate::unknown(&frame);
+            if sequence >= 10 {
+                (estimate.state, estimate.keyframe_id) = (state, 3);
+            }
+            recording.take_pose(&pose_message(&estimate, &PoseTiming::default())).unwrap();
+        }
+        const UNMATCHED: u32 = 5;
+        (0..handled).for_each(|_| recording.take_step(40_000_000, 0, UNMATCHED));
+        recording.into_record(RecordParts {
+            mode: RunMode::Live,
+            source: "x".to_owned(),
+            map: Map::default(),
+            ground_truth: Vec::new(),
+            depth_scale: DepthScale::MedianRatio,
+            is_depth_from_sensor: false,
+            deadline_ms: 0.0,
+            counters: RunCounters { frames_in: frames, ..RunCounters::default() },
+        })
+    }
+
+    #[test]
+    fn lost_frames_tell_that_a_map_began() {
+        let lost = TrackingState::Lost(LostReason::TooFewInliers);
+        let text = |record: &RunRecord| Untracked::of(record).unwrap().to_string();
+        let of_lost = text(&record(60, 60, lost));
+        let expected =
+            "a map began at frame 10, the tracker lost it at once: too few points matched; move";
+        assert!(of_lost.starts_with(expected), "{of_lost}");
+        let slow = text(&record(60, 20, lost));
+        assert!(slow.contains("lost it at once") && slow.contains("40 of 60 frames"), "{slow}");
+        let without_map = text(&record(60, 60, TrackingState::Initializing));
+        assert!(
+            without_map.contains("differ too much") && without_map.contains("(60 of 60"),
+            "{without_map}"
+        );
+        assert!(text(&record(60, 20, TrackingState::Initializing)).contains("too slow"));
+        assert_eq!(Untracked::of(&record(60, 60, TrackingState::Tracking)), None);
     }
 }
