@@ -220,10 +220,11 @@ pub fn journal(bytes: &[u8]) {
     assert!(found.counters.frames_in >= poses as u64);
     let record = found.recording.into_record(RecordParts {
         mode: found.start.mode,
-        source: found.start.source,
+        source: found.start.source.to_string_lossy().into_owned(),
         map,
         ground_truth: Vec::new(),
         depth_scale: DepthScale::MedianRatio,
+        is_depth_from_sensor: found.start.is_depth_from_sensor,
         deadline_ms: 0.0,
         counters: found.counters,
     });

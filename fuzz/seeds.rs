@@ -139,11 +139,12 @@ fn map_bytes() -> Vec<u8> {
 fn journal() -> Vec<u8> {
     let start = RunStart {
         mode: RunMode::Live,
-        source: "sim".to_owned(),
+        source: "sim".into(),
         rig: None,
-        folder: "/".to_owned(),
+        folder: "/".into(),
         config: "instance = \"rig\"\n".to_owned(),
         poses_given: false,
+        is_depth_from_sensor: false,
         began_nanos: 1,
     };
     let world_from_keyframe = Sim3::new(SE3::identity(), 2.0);
@@ -154,7 +155,7 @@ fn journal() -> Vec<u8> {
         Record::Step(Step { step_nanos: 5, change_nanos: 3, start_frame: 1 }),
         Record::Keyframe(Box::new(without_depth)),
         Record::KeyframePose(0, KeyframePose { keyframe_id: 0, world_from_keyframe }),
-        Record::Counters(RunCounters { frames_in: 2, ..RunCounters::default() }),
+        Record::Counters(Box::new(RunCounters { frames_in: 2, ..RunCounters::default() })),
     ];
     let mut bytes = log_header();
     records.iter().for_each(|record| record.write(&mut bytes));

@@ -48,7 +48,7 @@ fn what_is_no_camera_ends_the_run() {
     let rig = Rig::new();
     for command in ["run", "capture"] {
         let ended = finish(start(&rig, command, "v4l:/dev/null", &["--rig", WEBCAM]));
-        assert_refused(&ended, &["/dev/null: is no camera", "it is no video device"]);
+        assert_refused(&ended, &["/dev/null: is not a camera", "it is no video device"]);
     }
     assert_eq!(rig.leftovers(), Vec::<String>::new());
 }
@@ -72,6 +72,27 @@ fn a_missing_camera_is_a_state() {
     // Said once, however often it is tried.
     assert_eq!(ended.stderr.matches("there is no camera").count(), 1, "{}", ended.stderr);
     assert_eq!(rig.leftovers(), Vec::<String>::new());
+}
+
+#[test]
+fn a_run_says_once_that_it_waits_for_a_camera() {
+    let rig = Rig::new();
+    for more in [&[][..], &["--json"]] {
+        let arguments = [&["--rig", WEBCAM], more].concat();
+        let mut child = start(&rig, "run", "v4l:usb-nobody-has-this", &arguments).spawn().unwrap();
+        let mut said = std::io::BufReader::new(child.stderr.take().unwrap());
+        let mut lines = String::new();
+        while !lines.contains("there is no camera") {
+            assert!(std::io::BufRead::read_line(&mut said, &mut lines).unwrap() > 0, "{lines}");
+        }
+        assert!(lines.contains("waiting: there is no camera"), "{lines}");
+        // A second line would come with it.
+        std::thread::sleep(std::time::Duration::from_millis(500));
+        signal(&child, Signal::INT);
+        std::io::Read::read_to_string(&mut said, &mut lines).unwrap();
+        assert_eq!(end(child).status.code(), Some(130), "{lines}");
+        assert_eq!(lines.matches("there is no camera").count(), 1, "{lines}");
+    }
 }
 
 #[test]

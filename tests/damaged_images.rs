@@ -112,6 +112,7 @@ fn a_strict_run_ends_at_the_first_damaged_image() {
         let error = ended.stderr.lines().find(|line| line.starts_with("error: ")).unwrap();
         assert!(error.contains(image(&folder, 9).to_str().unwrap()), "{error}");
         assert!(error.contains("damaged PNG"), "{error}");
+        assert!(error.ends_with("the results are of the 9 frames before"), "{error}");
     }
 }
 

@@ -146,7 +146,7 @@ fn a_run_whose_supervisor_is_killed_is_recovered() {
     assert_eq!(rig.leftovers(), Vec::<String>::new());
     let again = finish(rig.command(&["recover", output.to_str().unwrap()]));
     assert_eq!(again.status.code(), Some(1), "{}", again.stderr);
-    assert!(again.stderr.contains("has no journal"), "{}", again.stderr);
+    assert!(again.stderr.contains("holds no journal"), "{}", again.stderr);
 }
 
 #[test]
@@ -357,7 +357,7 @@ fn a_run_is_recovered_without_its_source() {
     fs::rename(&recording, rig.folder().join("elsewhere")).unwrap();
     let ended = finish(rig.command(&["recover", output.to_str().unwrap()]));
     assert!(ended.status.success(), "{}", ended.stderr);
-    assert!(ended.stderr.contains("no figures against ground truth"), "{}", ended.stderr);
+    assert!(ended.stderr.contains("no comparison with ground truth"), "{}", ended.stderr);
     assert!(summary(&output)["ate_rmse_m"].is_null());
     assert!(summary(&output)["frames_tracked"].as_u64().unwrap() > 400);
 }

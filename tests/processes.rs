@@ -138,7 +138,12 @@ fn who_comes_late_gets_the_keyframe_and_status_sees_all_three() {
 
     let second = finish(rig.run(20, &[]));
     assert_eq!(second.status.code(), Some(1));
-    assert_one_error(&second.stderr, "already runs as process");
+    assert_one_error(&second.stderr, "is in use by semidense, process");
+    let elsewhere = rig.folder().join("elsewhere");
+    let third = finish(rig.command(&["run", "--output", elsewhere.to_str().unwrap()]));
+    assert_eq!(third.status.code(), Some(1));
+    assert_one_error(&third.stderr, "already runs as process");
+    assert!(!elsewhere.exists());
 
     drop((tracker, inbox, hub, late));
     signal(&child, Signal::INT);
@@ -244,7 +249,7 @@ fn bad_input_gives_one_line_and_leaves_nothing() {
     let usage = finish(rig.command(&["run", "--nonsense"]));
     assert_eq!(usage.status.code(), Some(2));
     let status = finish(rig.command(&["status", "--once"]));
-    assert_one_error(&status.stderr, "nothing runs under the name `semidense`");
+    assert_one_error(&status.stderr, "nothing is running as instance `semidense`");
 }
 
 /// A recording whose second image is cut in half.

@@ -18,7 +18,7 @@ use semidense::service::peers::{HEALTH_TOPICS, Peer};
 use semidense::wire::command::{Command, CommandClient};
 use semidense::wire::port::Hub;
 use serde_json::Value;
-use support::{Rig, WATCH_DOG, end, signal, until, with_mount};
+use support::{Rig, WATCH_DOG, end, finish, signal, until, with_mount};
 
 const CAPTURE: usize = 0;
 const TRACKER: usize = 1;
@@ -325,7 +325,7 @@ fn shared_memory_that_others_fill_costs_a_run_nothing() {
     assert!(!ended.stderr.contains("SIGBUS"), "{}", ended.stderr);
     // Nobody new has room, and it is said.
     assert!(ended.stderr.contains("status 1"), "{}", ended.stderr);
-    assert!(ended.stderr.contains("error: /dev/shm has 0 MB free"), "{}", ended.stderr);
+    assert!(ended.stderr.contains("error: /dev/shm has only 0 MB free"), "{}", ended.stderr);
     let summary = fs::read_to_string(rig.output().join("summary.json")).unwrap();
     let summary: Value = serde_json::from_str(&summary).unwrap();
     assert_eq!(summary["restarts"], 0, "{summary}");
@@ -343,4 +343,35 @@ fn shared_memory_that_is_too_small_is_said_in_one_line_at_the_start() {
         assert_eq!(errors.len(), 1, "{}", ended.stderr);
         assert!(errors[0].contains("/dev/shm"), "{}", ended.stderr);
     }
+}
+
+/// What `status` says of a live run once.
+fn status(rig: &Rig) -> Value {
+    let ended = finish(rig.command(&["status", "--once", "--json"]));
+    assert!(ended.status.success(), "{}", ended.stderr);
+    serde_json::from_str(&ended.stdout).unwrap()
+}
+
+#[test]
+fn status_knows_the_age_of_the_run_and_its_keyframes_whoever_died_or_is_stopped() {
+    let mut live = Live::start(&[]);
+    live.until_frames(MAPPER, 60);
+    let all = [CAPTURE, TRACKER, MAPPER];
+    let before = all.map(|process| live.pid(process));
+    live.send(&all, Signal::KILL);
+    all.iter().for_each(|&process| live.until_replaced(process, before[process]));
+    live.until_frames(MAPPER, 30);
+    live.send(&[MAPPER], Signal::STOP);
+    let status = status(&live.rig);
+    live.send(&[MAPPER], Signal::CONT);
+    assert_eq!(status["mapper"]["state"], "stopped", "{status}");
+    assert!(status["keyframes"].as_u64().is_some_and(|keyframes| keyframes > 0), "{status}");
+    let up = |value: &Value| value["uptime_secs"].as_f64().unwrap();
+    // They were killed two seconds after the start at the earliest.
+    assert!(up(&status) > up(&status["capture"]) + 1.0, "{status}");
+    let sent = &status["capture"]["latency_ms"];
+    assert!(sent["p50"].as_f64() <= sent["p99"].as_f64() && sent["p50"].is_number(), "{status}");
+    let (code, stderr, summary, _) = live.end();
+    assert_eq!(code, Some(0), "{stderr}");
+    assert!(summary["send_ms"]["p99"].as_f64().unwrap() > 0.0, "{summary}");
 }

@@ -14,7 +14,7 @@ use crate::service::journal::log::RunStart;
 use crate::service::results::calibration::calibration_warning;
 use crate::service::results::output_folder::OutputFolder;
 use crate::service::results::set::has_tracked_set;
-use crate::service::results::summary_text::{refused_text, summary_text};
+use crate::service::results::summary_text::{recovery_text, refused_text, summary_text};
 use crate::service::results::{EndOfRun, Results, ResultsError, RunMode, RunRecord};
 
 /// Where and how results are given out.
@@ -54,7 +54,7 @@ impl Ending<'_> {
         if is_tracked && !keeps_earlier {
             self.output.become_latest().unwrap_or_else(|error| {
                 note(&format!(
-                    "warning: {place} is written, but not linked as the latest ({error})"
+                    "warning: results in {place} are written, but output/latest cannot be linked to them ({error})"
                 ));
             });
         }
@@ -63,7 +63,7 @@ impl Ending<'_> {
             .filter(|_| keeps_journal)
             .map(|journal| recover_command(journal.folder().parent().unwrap_or(output), true));
         if let Some(Err(error)) = journal.filter(|_| !keeps_journal).map(Journal::finish) {
-            note(&format!("warning: the journal of this run cannot be removed ({error})"));
+            note(&format!("warning: cannot remove the journal of this run ({error})"));
         }
         if self.json {
             print(&format!("{}\n", serde_json::to_string_pretty(&results.summary)?))?;
@@ -75,13 +75,15 @@ impl Ending<'_> {
         }
         let where_to = match (keeps_earlier, kept) {
             (true, Some(command)) => format!(
-                "the earlier results in {place} are kept, and the journal of this run: `{command}` writes what it has"
+                "the earlier results in {place} are kept, and so is the journal of this run: `{command}` writes its results"
             ),
-            (true, None) => format!("nothing is written: the earlier results in {place} are kept"),
+            (true, None) => format!("nothing was written, the earlier results in {place} are kept"),
             (false, _) => format!("results in {place}"),
         };
         if !self.json {
-            print(&format!("{where_to}{}\n", refused_text(&results.summary)))?;
+            let (recovery, refused) =
+                (recovery_text(&results.summary), refused_text(&results.summary));
+            print(&format!("{where_to}{recovery}{refused}\n"))?;
         }
         match &record.ended {
             EndOfRun::Failed(cause) => Err(cause.as_str().into()),
@@ -89,12 +91,12 @@ impl Ending<'_> {
                 note(&format!("interrupted: {where_to}"));
                 Ok(ExitCode::from(INTERRUPTED))
             }
-            EndOfRun::Finished | EndOfRun::Recovered if !is_tracked => {
+            EndOfRun::Finished | EndOfRun::Recovered(_) if !is_tracked => {
                 let why = results.summary.untracked.as_deref().unwrap_or_default();
                 note(&format!("nothing was tracked: {why}; {where_to}"));
                 Ok(ExitCode::from(NOTHING_TRACKED))
             }
-            EndOfRun::Finished | EndOfRun::Recovered => Ok(ExitCode::SUCCESS),
+            EndOfRun::Finished | EndOfRun::Recovered(_) => Ok(ExitCode::SUCCESS),
         }
     }
 }
@@ -103,7 +105,7 @@ impl Ending<'_> {
 fn not_written(error: &ResultsError, output: &Path, journal: Option<&Journal>) -> String {
     let Some(journal) = journal else { return error.to_string() };
     format!(
-        "{error}; what was in {} is as it was, and the journal of this run is in {}: `{}` writes its results",
+        "{error}; {} is unchanged and the journal of this run is in {}: `{}` writes its results",
         output.display(),
         journal.folder().display(),
         recover_command(journal.folder().parent().unwrap_or(output), false)
@@ -128,7 +130,7 @@ fn recover_command(output: &Path, beside: bool) -> String {
 pub fn note_unfinished(found: &[Unfinished]) {
     for unfinished in found {
         note(&format!(
-            "a run was killed before its results were written; its journal is {}: `{}` writes them",
+            "a run was killed before its results were written; its journal is {}: write them with `{}`",
             unfinished.folder.display(),
             recover_command(unfinished.output(), has_tracked_set(unfinished.output()))
         ));
@@ -141,11 +143,12 @@ pub fn run_start(config: &Config, source: &SourceName, rig: Option<&Path>) -> Ru
     let since = SystemTime::now().duration_since(UNIX_EPOCH);
     RunStart {
         mode: RunMode::Replay,
-        source: source.to_string(),
-        rig: rig.map(|rig| rig.to_string_lossy().into_owned()),
-        folder: folder.to_string_lossy().into_owned(),
+        source: source.to_os_string(),
+        rig: rig.map(|rig| rig.as_os_str().to_owned()),
+        folder: folder.into_os_string(),
         config: config.to_text(),
         poses_given: false,
+        is_depth_from_sensor: false,
         began_nanos: since.map_or(0, |since| since.as_nanos() as u64),
     }
 }

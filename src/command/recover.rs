@@ -2,36 +2,39 @@
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
+use std::process::ExitCode;
 
 use clap::Args;
 
 use crate::capture::source::{FrameSource, FrameStamp, SourceError, SourceName, open};
-use crate::command::CommandResult;
 use crate::command::ending::{Ending, note_unfinished};
 use crate::command::print::note;
+use crate::command::{CommandResult, NOTHING_TRACKED};
 use crate::service::config::Config;
 use crate::service::journal::Journal;
 use crate::service::journal::folder::{Unfinished, unfinished};
 use crate::service::journal::log::RunStart;
 use crate::service::journal::recovered::Recovered;
 use crate::service::recording::RecordParts;
-use crate::service::results::output_folder::{OutputFolder, PARENT};
+use crate::service::results::output_folder::{OutputFolder, PARENT, utc_text};
 use crate::service::results::set::has_set_since;
+use crate::service::results::summary::without_depth;
 use crate::service::results::{EndOfRun, RunRecord};
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::mapper::Map;
 use crate::wire::place::Place;
 
-/// Write the results of a run that was killed, from the journal that it has left
+/// Write the results of a run that was killed, from the journal it left
 #[derive(Debug, Args)]
 pub struct RecoverArguments {
-    /// Output folder of the run [default: the newest run of this instance that was killed]
+    /// Output folder of the run [default: the newest killed run of this instance]
     #[arg(value_name = "DIR")]
     folder: Option<PathBuf>,
-    /// Another folder for the results
+    /// Write the results into another folder
     #[arg(long, value_name = "DIR")]
     output: Option<PathBuf>,
-    /// Keep the journal, to recover the run again
+    /// Keep the journal, so that the run can be recovered again
     #[arg(long)]
     keep: bool,
     /// Print the summary as JSON
@@ -48,22 +51,84 @@ pub fn run(config: &Config, arguments: &RecoverArguments) -> CommandResult {
     let output = std::path::absolute(output)?;
     if arguments.output.is_none() && has_set_since(&output, recovered.start.began()) {
         return Err(format!(
-            "{} has results of a later run: name another folder with --output",
+            "{} holds results of a later run: choose another folder with --output",
             output.display()
         )
         .into());
     }
-    let output = OutputFolder::prepare(Some(&output))?;
     let held = Journal::take_over(&found.folder)?.ok_or_else(|| {
-        format!("{} is being written or recovered by another process", found.folder.display())
+        format!(
+            "{} is in use by another process, which writes or recovers it: wait until it has ended",
+            found.folder.display()
+        )
     })?;
+    // Before the folder is locked: nothing is to be written into it.
+    if recovered.recording.num_poses() == 0 {
+        let outcome = nothing_to_recover(&recovered, held, arguments.keep);
+        forget_removed_journals(&place);
+        return outcome;
+    }
+    let output = OutputFolder::of_recovery(&output)?;
     let start = recovered.start.clone();
     let config = Config::from_text(&start.config, "the journal's configuration")?;
     let mut source = source_of(&start, &config);
     let record = record_of(recovered, &config, &found.folder, source.as_ref());
+    if let Some(warning) = depth_warning(&record.map, &config, &found.folder) {
+        note(&format!("warning: {warning}"));
+    }
     let ending =
         Ending { output: &output, config: &config, json: arguments.json, write_more: &|_| Ok(()) };
-    ending.finish(&record, source.as_mut(), (!arguments.keep).then_some(held))
+    let outcome = ending.finish(&record, source.as_mut(), (!arguments.keep).then_some(held));
+    forget_removed_journals(&place);
+    outcome
+}
+
+/// Looking for journals removes the pointers to those that are gone.
+fn forget_removed_journals(place: &Place) {
+    drop(unfinished(Some(place), Path::new(PARENT)));
+}
+
+/// A run that was killed before its first pose: its journal goes, and its folder where nothing else is in it.
+fn nothing_to_recover(recovered: &Recovered, journal: Journal, keep: bool) -> CommandResult {
+    let folder = journal.folder().to_owned();
+    let journal_text = match keep {
+        true => format!("its journal is {}", folder.display()),
+        false => "its journal is removed".to_owned(),
+    };
+    if !keep {
+        journal.finish()?;
+        drop(folder.parent().map(OutputFolder::of_recovery));
+    }
+    note(&format!(
+        "nothing to recover: the run that ended at {} was killed before its first pose; no results are written, {journal_text}",
+        utc_text(recovered.ended)
+    ));
+    Ok(ExitCode::from(NOTHING_TRACKED))
+}
+
+/// What to say where keyframes have no depth, and why.
+fn depth_warning(map: &Map, config: &Config, journal: &Path) -> Option<String> {
+    /// A disk with less room than a few keyframes is full.
+    const FULL_BYTES: u64 = 8 << 20;
+    let missing = without_depth(map);
+    let all = map.keyframes.len();
+    let bytes: usize =
+        map.keyframes.iter().map(|k| k.image.len() + size_of_val(&k.points[..])).sum();
+    let free = rustix::fs::statvfs(journal).map(|disk| disk.f_bavail.saturating_mul(disk.f_frsize));
+    let why = if bytes >= config.mapping.max_map_bytes() {
+        "only the newest is kept (mapping.max_map_megabytes)".to_owned()
+    } else if let Ok(free) = free.as_ref().map(|free| free >> 20)
+        && free < FULL_BYTES >> 20
+    {
+        format!(
+            "the disk is full ({free} MB free), and the journal gave up depth to keep the poses"
+        )
+    } else {
+        "it was not on the disk yet when the run was killed, or the disk was full".to_owned()
+    };
+    (missing > 0).then(|| {
+        format!("depth of {missing} of {all} keyframes is missing: {why}; trajectory and keyframe poses are not affected")
+    })
 }
 
 /// The journal that is meant: the newest one of the folder, or of all.
@@ -71,9 +136,7 @@ fn find(place: &Place, folder: Option<&Path>) -> Result<Unfinished, Box<dyn Erro
     let mut found = match folder {
         Some(folder) => {
             if !folder.is_dir() {
-                return Err(
-                    format!("there is no folder {}; check the path", folder.display()).into()
-                );
+                return Err(format!("{} is not a folder; check the path", folder.display()).into());
             }
             let wanted = folder.canonicalize()?;
             let all = unfinished(None, folder).into_iter();
@@ -82,9 +145,9 @@ fn find(place: &Place, folder: Option<&Path>) -> Result<Unfinished, Box<dyn Erro
         None => unfinished(Some(place), Path::new(PARENT)),
     };
     let newest = found.pop().ok_or_else(|| match folder {
-        Some(folder) => format!("{} has no journal of a run that was killed", folder.display()),
+        Some(folder) => format!("{} holds no journal of a killed run; check the path", folder.display()),
         None => format!(
-            "instance `{}` has left no journal, and there is none in ./{PARENT}: name the output folder of the run",
+            "no killed run of instance `{}` was found, nor one in ./{PARENT}: name the output folder of the run",
             place.instance
         ),
     })?;
@@ -95,17 +158,17 @@ fn find(place: &Place, folder: Option<&Path>) -> Result<Unfinished, Box<dyn Erro
 /// The source of the run once more, for its true poses and depth; none where it cannot be opened.
 fn source_of(start: &RunStart, config: &Config) -> Box<dyn FrameSource> {
     let opened = || -> Result<Box<dyn FrameSource>, Box<dyn Error>> {
-        let name: SourceName = start.source.parse()?;
+        let name = SourceName::parse(&start.source)?;
         if name.is_camera() {
             return Ok(Box::new(NoSource));
         }
         // Its paths are relative to where the run was started.
         std::env::set_current_dir(&start.folder)
-            .map_err(|error| format!("{}: {error}", start.folder))?;
+            .map_err(|error| format!("{}: {error}", start.folder.display()))?;
         Ok(open(&name, start.rig.as_deref().map(Path::new), &config.source_params())?)
     };
     opened().unwrap_or_else(|error| {
-        note(&format!("no figures against ground truth: the source cannot be opened ({error})"));
+        note(&format!("no comparison with ground truth: the source cannot be opened ({error})"));
         Box::new(NoSource)
     })
 }
@@ -121,15 +184,16 @@ fn record_of(
     let depth_scale = if start.poses_given { DepthScale::Given } else { DepthScale::MedianRatio };
     let parts = RecordParts {
         mode: start.mode,
-        source: start.source.clone(),
+        source: start.source.to_string_lossy().into_owned(),
         map: recovered.map(folder, config.mapping.max_map_bytes() as u64),
         ground_truth: source.ground_truth().to_vec(),
         depth_scale,
+        is_depth_from_sensor: start.is_depth_from_sensor,
         deadline_ms: config.tracker.deadline_ms,
         counters: recovered.counters,
     };
     let record = recovered.recording.into_record(parts);
-    RunRecord { ended: EndOfRun::Recovered, ..record }
+    RunRecord { ended: EndOfRun::Recovered(recovered.ended), ..record }
 }
 
 /// A source that is not there any more, or never had any truth.

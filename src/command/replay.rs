@@ -29,34 +29,43 @@ use crate::service::shutdown::Shutdown;
 use crate::slam::pose::TrackingState;
 use crate::wire::place::Place;
 
+/// What a replay can take; a camera gives no frame twice.
+const SOURCE_HELP: &str = "Where frames come from: DIR (its layout is detected), sim, sim:SCENE, tum:DIR, euroc:DIR, images:DIR, \
+     or loop:FRAMES:HZ:SOURCE, which plays another source back and forth, FRAMES frames at HZ [default: capture.source \
+     of the configuration, which is sim]. A camera cannot be replayed: use `semidense run`";
+const RIG_HELP: &str = "Rig file with the camera's calibration, for recordings without their own [default: capture.rig of the \
+     configuration, for the source configured there]";
+
 /// Where poses come from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
 enum Poses {
     /// The tracker estimates them
     #[default]
     Tracker,
-    /// The source's ground truth; only the mapper is at work
+    /// The source's ground truth; only the mapper runs
     Groundtruth,
 }
 
 /// Where the first depth of a keyframe comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
 enum InitialDepth {
-    /// Images alone
+    /// The images alone
     #[default]
     Images,
     /// The source's depth camera
     Sensor,
 }
 
-/// Run a recorded or simulated sequence in one process: every frame, the same bits on every run
+/// Replay a recorded or simulated sequence in one process: every frame, bit-identical on every run
 #[derive(Debug, Args)]
+#[command(mut_arg("source", |source| source.help(SOURCE_HELP)), mut_arg("rig", |rig| rig.help(RIG_HELP)))]
 pub struct ReplayArgs {
     /// Where frames come from and how the camera is.
     #[command(flatten)]
     source: SourceArguments,
     /// Folder for trajectory.txt, trajectory_online.txt, keyframes.txt, map.ply, map.pcd, summary.json
-    /// and report.html [default: a new one below ./output, named by the time (UTC); output/latest leads to the newest]
+    /// and report.html [default: a new folder under ./output named by the time (UTC); output/latest links to the
+    /// newest]
     #[arg(long, value_name = "DIR")]
     output: Option<PathBuf>,
     /// Where the first depth of a keyframe comes from
@@ -65,17 +74,17 @@ pub struct ReplayArgs {
     /// Where poses come from
     #[arg(long, value_enum, default_value_t)]
     poses: Poses,
-    /// Write pictures of every keyframe's inverse depth, variance, density and weights for three
+    /// Write images of every keyframe's inverse depth, variance, density and weights for three
     /// motions into DIR/debug
     #[arg(long)]
     debug_images: bool,
-    /// Stop after as many frames
+    /// Stop after N frames
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     frames: Option<u32>,
     /// Seed of the simulator [default: simulator.seed]
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
-    /// Threads of the mapper; the result does not depend on it [default: mapper.threads]
+    /// Threads of the mapper; they do not change the result [default: mapper.threads]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: Option<u16>,
     /// Print the summary as JSON
@@ -88,7 +97,9 @@ pub fn run(config: &Config, args: ReplayArgs) -> Result<ExitCode, Box<dyn Error>
     let is_strict = config.capture.strict || args.source.strict;
     let (name, rig) = args.source.clone().source_and_rig(&config.capture)?;
     if name.is_camera() {
-        return Err(format!("{name}: a camera cannot be replayed; semidense run {name}").into());
+        return Err(
+            format!("{name}: a camera cannot be replayed; use `semidense run {name}`").into()
+        );
     }
     let args = &args;
     let capture = CaptureConfig { strict: is_strict, ..config.capture.clone() };
@@ -117,6 +128,7 @@ pub fn run(config: &Config, args: ReplayArgs) -> Result<ExitCode, Box<dyn Error>
         output: output.path().to_owned(),
         start: RunStart {
             poses_given: args.poses == Poses::Groundtruth,
+            is_depth_from_sensor: args.initial_depth == InitialDepth::Sensor,
             ..run_start(
                 &Config { simulator: params.simulator, ..config.clone() },
                 &name,
@@ -186,7 +198,7 @@ fn record(
     let progress = Progress::new("replay", total);
     let mut journal = begin_journal()
         .inspect_err(|error| {
-            tracing::warn!("no journal is kept ({error}); a kill would lose the replay")
+            tracing::warn!("no journal is kept ({error}): a kill would lose the replay")
         })
         .ok();
     let replayed = replay(source, source_name, &config, &mut |frame| {

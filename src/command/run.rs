@@ -22,7 +22,7 @@ use crate::service::shutdown::Shutdown;
 use crate::service::supervisor::{Ended, RunOptions, run as supervise};
 use crate::wire::place::Place;
 
-/// Start capture, tracker and mapper on a source, watch them, and write the results
+/// Run capture, tracker and mapper on a source, supervise them and write the results
 #[derive(Debug, Args)]
 pub struct RunArguments {
     /// Where frames come from and how the camera is.
@@ -30,11 +30,11 @@ pub struct RunArguments {
     source: SourceArguments,
     #[command(flatten)]
     mode: ModeArguments,
-    /// Folder for trajectory, keyframes, map, summary and report [default: a new one below ./output, named by the
-    /// time (UTC); output/latest leads to the newest]
+    /// Folder for trajectory, keyframes, map, summary and report [default: a new folder under ./output named by the
+    /// time (UTC); output/latest links to the newest]
     #[arg(long, value_name = "DIR")]
     output: Option<PathBuf>,
-    /// Print the summary as JSON, and no progress
+    /// Print the summary as JSON and show no progress
     #[arg(long)]
     json: bool,
 }
@@ -53,9 +53,10 @@ pub fn run(
     let (source, rig) = arguments.source.source_and_rig(&config.capture)?;
     let mode = arguments.mode.mode(usual_mode(&source));
     let place = Place::new(&config.instance, &config.root)?;
+    // First: a signal must find the folder's owner ready to remove it.
+    let shutdown = Shutdown::install()?;
     let output = OutputFolder::prepare(arguments.output.as_deref())?;
     note_unfinished(&unfinished(Some(&place), output.path()));
-    let shutdown = Shutdown::install()?;
     let journal = JournalOptions {
         output: output.path().to_owned(),
         start: RunStart {

@@ -75,10 +75,10 @@ impl Shown {
             return;
         }
         self.waits_for = Some(reason.to_owned());
-        let line = format!("waiting: {reason}; Ctrl-C ends");
+        let line = format!("waiting: {reason}; Ctrl-C stops the run");
         match &self.bar {
             Some(bar) => bar.println(line),
-            None if self.is_quiet => {}
+            // Not progress: without it a quiet run would seem to hang.
             None => note(&line),
         }
     }

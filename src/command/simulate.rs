@@ -3,8 +3,6 @@
 use std::error::Error;
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::{Args, ValueEnum};
 use rayon::prelude::*;
@@ -19,6 +17,7 @@ use crate::command::INTERRUPTED;
 use crate::command::print::{note, print};
 use crate::command::progress::Progress;
 use crate::service::config::Config;
+use crate::service::shutdown::Shutdown;
 
 /// Frames written between two looks at progress and Ctrl-C.
 const FRAMES_PER_BATCH: usize = 8;
@@ -45,26 +44,26 @@ enum Scene {
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum Motion {
-    /// A walk with the camera in the hand
+    /// Walking with a handheld camera
     Handheld,
-    /// To and fro on a straight line across the view
+    /// Back and forth on a straight line across the view
     Straight,
     /// Turning about the optical centre
     Rotation,
-    /// Nothing moves
+    /// The camera stands still
     Standing,
 }
 
 /// Write a simulated sequence as a dataset: images, exact depth, exact poses
 ///
-/// What is not said is taken from the configuration, section `simulator`. The same values and seed
-/// give the same bytes, on any number of threads.
+/// Values that are not given are taken from the section `simulator` of the configuration. The same values and
+/// seed give the same bytes on any number of threads.
 #[derive(Debug, Args)]
 pub struct SimulateArgs {
-    /// Folder of the dataset; refused when it is not empty
+    /// Folder for the dataset; must be new or empty
     #[arg(long, value_name = "DIR")]
     output: PathBuf,
-    /// Replace the dataset that is in the folder
+    /// Replace a dataset in the folder
     #[arg(long)]
     force: bool,
     /// Layout of the files
@@ -73,16 +72,16 @@ pub struct SimulateArgs {
     /// Print the summary as JSON
     #[arg(long)]
     json: bool,
-    /// What is seen
+    /// Scene
     #[arg(long, value_enum)]
     scene: Option<Scene>,
     /// Number of frames
     #[arg(long, value_name = "N")]
     frames: Option<usize>,
-    /// Chooses textures, path and noise
+    /// Seed of textures, path and noise
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
-    /// Frames a second
+    /// Frames per second
     #[arg(long, value_name = "HZ")]
     rate: Option<f64>,
     /// Image width in pixels
@@ -94,7 +93,7 @@ pub struct SimulateArgs {
     /// Focal length in pixels
     #[arg(long, value_name = "PX")]
     focal: Option<f64>,
-    /// Factor on every length of world and path
+    /// Factor for all lengths of world and path
     #[arg(long, value_name = "FACTOR")]
     world_scale: Option<f64>,
     #[command(flatten, next_help_heading = "Motion")]
@@ -111,10 +110,10 @@ struct MotionArgs {
     /// Mean speed in m/s
     #[arg(long, value_name = "M/S")]
     speed: Option<f64>,
-    /// Mean rate of turning in degrees a second
+    /// Mean turn rate in degrees per second
     #[arg(long, value_name = "DEG/S")]
     turn: Option<f64>,
-    /// Factor on the tremor of the hand
+    /// Factor for hand tremor
     #[arg(long, value_name = "FACTOR")]
     tremor: Option<f64>,
 }
@@ -162,6 +161,8 @@ struct Summary {
 
 /// Renders, writes the dataset and prints its summary.
 pub fn run(config: &Config, args: &SimulateArgs) -> Result<ExitCode, Box<dyn Error>> {
+    // First: a signal must find the writer ready to remove what it has begun.
+    let shutdown = Shutdown::install()?;
     let mut simulator = Simulator::new(params(&config.simulator, args))?;
     let layout = match args.layout {
         Layout::Tum => DatasetLayout::Tum,
@@ -170,9 +171,7 @@ pub fn run(config: &Config, args: &SimulateArgs) -> Result<ExitCode, Box<dyn Err
     let params = simulator.params();
     let (camera, rate_hz) = (*simulator.camera(), params.rate_hz);
     let writer = DatasetWriter::create(&args.output, layout, camera, rate_hz, args.force)?;
-    let interrupted = Arc::new(AtomicBool::new(false));
-    signal_hook::flag::register(signal_hook::consts::SIGINT, Arc::clone(&interrupted))?;
-    let Some(gradient_share) = write_frames(&mut simulator, &writer, &interrupted)? else {
+    let Some(gradient_share) = write_frames(&mut simulator, &writer, &shutdown)? else {
         note(&format!("interrupted: nothing was written to {}", args.output.display()));
         return Ok(ExitCode::from(INTERRUPTED));
     };
@@ -192,18 +191,18 @@ pub fn run(config: &Config, args: &SimulateArgs) -> Result<ExitCode, Box<dyn Err
     Ok(ExitCode::SUCCESS)
 }
 
-/// Renders and writes all frames; the mean share of textured pixels, `None` after Ctrl-C.
+/// Renders and writes all frames; the mean share of textured pixels, `None` after a signal.
 fn write_frames(
     simulator: &mut Simulator,
     writer: &DatasetWriter,
-    interrupted: &AtomicBool,
+    shutdown: &Shutdown,
 ) -> Result<Option<f64>, DatasetError> {
     let frames = simulator.params().frames;
     let progress = Progress::new("simulate", Some(frames));
     let mut shares = 0.0;
     // Rendered and written batch by batch: memory stays small however long the sequence is.
     for first in (0..frames).step_by(FRAMES_PER_BATCH) {
-        if interrupted.load(Ordering::Relaxed) {
+        if shutdown.is_requested() {
             progress.finish();
             return Ok(None);
         }

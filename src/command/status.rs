@@ -13,11 +13,12 @@ use crate::command::CommandResult;
 use crate::command::ending::note_unfinished;
 use crate::command::print::print;
 use crate::command::status_text::{legend, status_text};
+use crate::service::checkpoint::read_checkpoint;
 use crate::service::clock::now_nanos;
 use crate::service::config::Config;
 use crate::service::health::{cause, percentile_ms, scheduling_name, source, warning};
 use crate::service::journal::folder::unfinished;
-use crate::service::liveness::Liveness;
+use crate::service::liveness::{Liveness, age};
 use crate::service::peers::{HEALTH_TOPICS, Peer};
 use crate::service::shutdown::Shutdown;
 use crate::wire::message::{HealthMessage, PoseMessage};
@@ -34,6 +35,9 @@ const MAX_LOOKS: usize = 60;
 /// A process that has said nothing for so long is not there any more.
 const STALE_NANOS: i64 = 3_000_000_000;
 
+/// What the process of `semidense run` claims to be.
+const SUPERVISOR: &str = "supervisor";
+
 /// Width of a terminal that does not tell its own, columns.
 const USUAL_WIDTH: usize = 80;
 
@@ -44,10 +48,10 @@ const CLEAR_SCREEN: &str = "\x1b[2J\x1b[H";
 #[derive(Debug, Args)]
 #[command(after_help = legend())]
 pub struct StatusArguments {
-    /// Show it once and end
+    /// Show the status once and exit
     #[arg(long)]
     once: bool,
-    /// One JSON object for each look
+    /// Print one JSON object per update
     #[arg(long)]
     json: bool,
 }
@@ -159,13 +163,25 @@ impl<'a> Watch<'a> {
             }
             let known = look["uptime_secs"].as_f64().unwrap_or_default();
             let own = look[topic.owner]["uptime_secs"].as_f64().unwrap_or_default();
-            // A process that was started again is younger than the run.
+            // Without a supervisor the oldest tells best: one that was restarted is younger than the run.
             look["uptime_secs"] = json!(known.max(own));
+        }
+        if let Some(age) = self.place.claimant(SUPERVISOR).and_then(age) {
+            look["uptime_secs"] = json!(age.as_secs_f64());
+        }
+        if look["keyframes"].is_null() {
+            look["keyframes"] = json!(self.keyframes_of_checkpoint());
         }
         self.hear_poses(hub)?;
         look["pose"] = self.last_pose.as_ref().map_or(Value::Null, |pose| pose_row(pose, now));
         look["ended"] = json!(heard > 0 && ended == heard);
         Ok(look)
+    }
+
+    /// Keyframes by the newest checkpoint of a mapper that says nothing: one that is stopped, or has died.
+    fn keyframes_of_checkpoint(&self) -> Option<usize> {
+        let map = read_checkpoint(&self.place.checkpoint_path()).ok()??;
+        Some(map.keyframes.len())
     }
 
     /// Keeps the newest pose.

@@ -28,42 +28,42 @@ const COLUMNS: [Column; 8] = [
         width: 6,
         rank: 1,
         value: (&["rate_hz"], 1),
-        legend: "frames a second",
+        legend: "frames per second",
     },
     Column {
         heading: "drop",
         width: 5,
         rank: 4,
         value: (&["dropped"], 0),
-        legend: "passed over for a newer frame",
+        legend: "skipped for a newer frame",
     },
     Column {
         heading: "late",
         width: 5,
         rank: 3,
         value: (&["deadline_misses"], 0),
-        legend: "done after the deadline",
+        legend: "finished after the deadline",
     },
     Column {
         heading: "p50",
         width: 7,
         rank: 5,
         value: (&["latency_ms", "p50"], 2),
-        legend: "half of the latencies are shorter, ms from the frame's stamp",
+        legend: "median ms: capture from stamp to sending, tracker from stamp to pose, mapper per frame",
     },
     Column {
         heading: "p99",
         width: 7,
         rank: 2,
         value: (&["latency_ms", "p99"], 2),
-        legend: "99 of 100 latencies are shorter, ms",
+        legend: "99th percentile of the same",
     },
     Column {
         heading: "MB",
         width: 5,
         rank: 6,
         value: (&["peak_rss_mb"], 0),
-        legend: "most memory held so far",
+        legend: "peak memory",
     },
     Column {
         heading: "up",
@@ -101,11 +101,11 @@ pub fn status_text(look: &Value, width: usize) -> String {
 
 /// One line for each column: for `--help`.
 pub fn legend() -> String {
-    let mut text = "Columns (fewer where the terminal is narrow):\n  state   as published; `stopped` by a signal, `silent` for 3 s, `not running`\n".to_owned();
+    let mut text = "Columns (fewer on a narrow terminal):\n  state   as the process reports it; or `stopped` by a signal, `silent` for 3 s, `not running`\n".to_owned();
     for column in &COLUMNS {
         text += &format!("  {:7} {}\n", column.heading, column.legend);
     }
-    text + "It ends when all processes of the run have ended."
+    text + "Exits when all processes of the run have ended."
 }
 
 /// The columns that fit, the most important first to be kept.
@@ -127,10 +127,11 @@ fn headline(look: &Value) -> String {
     let mut parts = vec![text("instance")];
     parts.extend(Some(text("source")).filter(|source| !source.is_empty()));
     parts.extend(look["uptime_secs"].as_f64().map(|secs| format!("up {}", clock(secs))));
-    parts.extend(look["keyframes"].as_u64().map(|count| match count {
-        1 => "1 keyframe".to_owned(),
-        count => format!("{count} keyframes"),
-    }));
+    parts.push(match look["keyframes"].as_u64() {
+        None => "keyframes unknown".to_owned(),
+        Some(1) => "1 keyframe".to_owned(),
+        Some(count) => format!("{count} keyframes"),
+    });
     parts.join(", ")
 }
 
@@ -254,7 +255,7 @@ mod tests {
             ] {
                 assert!(shown.contains(part), "{width}, {part}: {text}");
             }
-            assert!(shown.contains("rate: frames a second"), "{text}");
+            assert!(shown.contains("rate: frames per second"), "{text}");
         }
         assert!(status_text(&look(), 80).contains("12.50"));
         assert!(status_text(&look(), 45).contains("30.0"));

@@ -12,9 +12,7 @@ use crate::service::config::Config;
 use crate::service::health::{Health, ProcessState};
 use crate::service::mode::Mode;
 use crate::service::peers::Peer;
-use crate::service::position::{
-    Position, PositionKeeper, Predecessor, position_key, run_from_environment,
-};
+use crate::service::position::{Position, PositionKeeper, Predecessor};
 use crate::service::refused_images::RefusedImages;
 use crate::service::schedule::{apply, in_force};
 use crate::service::shutdown::Shutdown;
@@ -69,11 +67,11 @@ pub enum CaptureError {
     #[error(transparent)]
     Wait(#[from] WaitError),
     /// Size and intrinsics of no camera.
-    #[error("{0}: its size and intrinsics belong to no camera; check its camera file or rig")]
+    #[error("{0}: its size and intrinsics are not those of a camera; check its camera file or rig")]
     Intrinsics(SourceName),
     /// A process that must be there is not.
     #[error(
-        "{process} did not get ready within {seconds} s; start it, or raise capture.connect_timeout_s"
+        "{process} was not ready within {seconds} s; start it, or raise capture.connect_timeout_s"
     )]
     NotReady {
         /// Which.
@@ -83,7 +81,7 @@ pub enum CaptureError {
     },
     /// The map does not take in a frame.
     #[error(
-        "the mapper did not take in frame {sequence} within {seconds} s; raise capture.step_timeout_s if it is only slow"
+        "the mapper did not finish frame {sequence} within {seconds} s; raise capture.step_timeout_s if it is just slow"
     )]
     NoStep {
         /// Which frame.
@@ -191,7 +189,8 @@ impl<'a> Shell<'a> {
         let claim = place.claim("capture")?;
         place.check_shared_memory(shared_memory_bytes(&intrinsics, Some("capture")))?;
         let hub = Hub::join(&place, "capture", Access::Member)?;
-        let (position, left) = open_position(&place, options);
+        let (source_name, path) = (options.source.to_string(), place.position_path());
+        let (position, left) = PositionKeeper::of_run(&path, options.mode, &source_name, rig);
         // A supervisor knows whether there was a capture before; without one the tracker is asked too.
         let asks_tracker = options.mode == Mode::Live && left.is_none() && !is_supervised();
         let mut health = Health::open(&hub, &CAPTURE_HEALTH)?;
@@ -234,7 +233,9 @@ impl<'a> Shell<'a> {
         if let Some(file) = prepared_frames()
             && let Err(error) = self.source.keep_prepared_in(file)
         {
-            tracing::warn!("capture: frames are prepared again after a restart ({error})");
+            tracing::warn!(
+                "capture: after a restart the source would have to be prepared again ({error})"
+            );
         }
         let (health, shutdown) = (&mut self.health, self.shutdown);
         self.source.prepare(&mut |done, total| {
@@ -325,7 +326,7 @@ impl<'a> Shell<'a> {
         match arrival {
             Arrival::Frame => {
                 if self.absence.take().is_some() {
-                    tracing::warn!("capture: frames come again");
+                    tracing::warn!("capture: frames are coming again");
                 }
                 let left_out = self.refused.text();
                 self.health.enter(ProcessState::Running, left_out.as_deref().unwrap_or_default());
@@ -335,7 +336,10 @@ impl<'a> Shell<'a> {
             Arrival::Absent(reason) => {
                 self.health.enter(ProcessState::Stale, &reason);
                 if self.absence.as_ref() != Some(&reason) {
-                    tracing::warn!("capture: {reason}");
+                    // A supervisor shows it itself.
+                    if !is_supervised() {
+                        tracing::warn!("capture: {reason}");
+                    }
                     self.absence = Some(reason);
                 }
             }
@@ -393,7 +397,12 @@ impl<'a> Shell<'a> {
         // Before it is sent: a frame that is lost between the two is better than one that is sent twice.
         let counters = self.health.counters();
         self.position.note_or_warn(&Position::at(&stamp, counters.frames, counters.gaps));
-        loan.send(self.header(&stamp, clock_nanos))?;
+        let header = self.header(&stamp, clock_nanos);
+        if self.mode == Mode::Live {
+            // A deadline counts from the arrival: what is late before that is told here.
+            self.health.count_latency(header.sent_nanos.saturating_sub(clock_nanos).max(0) as u64);
+        }
+        loan.send(header)?;
         Ok(Sent::Frame(stamp.sequence))
     }
 
@@ -453,19 +462,6 @@ impl<'a> Shell<'a> {
         self.frames.serve_late_joiners();
         self.health.report();
         if self.shutdown.is_requested() { Err(CaptureError::Interrupted) } else { Ok(()) }
-    }
-}
-
-/// Keeps the place in the source, and gives where a capture of the same run has died.
-fn open_position(place: &Place, options: &CaptureOptions) -> (PositionKeeper, Option<Position>) {
-    match options.mode {
-        // A run in lockstep ends with any of its processes.
-        Mode::Lockstep => (PositionKeeper::default(), None),
-        Mode::Live => {
-            let source = options.source.to_string();
-            let key = position_key(&run_from_environment(), &source, options.rig.as_deref());
-            PositionKeeper::open_or_warn(&place.position_path(), key)
-        }
     }
 }
 

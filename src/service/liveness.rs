@@ -1,6 +1,7 @@
 //! Whether a process of this machine runs, is stopped, or is there no more, by `/proc`.
 
 use std::fs;
+use std::time::Duration;
 
 /// What the kernel says of a process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -31,6 +32,23 @@ impl Liveness {
     }
 }
 
+/// For how long the process with this id has lived; `None` where there is none.
+pub fn age(process_id: u32) -> Option<Duration> {
+    let stat = fs::read_to_string(format!("/proc/{process_id}/stat")).ok()?;
+    let now = rustix::time::clock_gettime(rustix::time::ClockId::Boottime);
+    let now = Duration::new(u64::try_from(now.tv_sec).ok()?, u32::try_from(now.tv_nsec).ok()?);
+    let began = began_ticks(&stat)? as f64 / rustix::param::clock_ticks_per_second() as f64;
+    Some(now.saturating_sub(Duration::try_from_secs_f64(began).ok()?))
+}
+
+/// Clock ticks from the start of the machine to that of the process, by the contents of `/proc/ID/stat`.
+fn began_ticks(stat: &str) -> Option<u64> {
+    /// `starttime` is the 22nd field, the state behind the name the third.
+    const AFTER_STATE: usize = 22 - 3;
+    let (_, rest) = stat.rsplit_once(')')?;
+    rest.split_whitespace().nth(AFTER_STATE)?.parse().ok()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -43,5 +61,14 @@ mod tests {
         assert_eq!(Liveness::from_stat("7 (semidense) Z 1 7"), Liveness::Gone);
         assert_eq!(Liveness::from_stat(""), Liveness::Gone);
         assert_eq!(Liveness::of(std::process::id()), Liveness::Running);
+    }
+    #[test]
+    fn a_process_has_an_age() {
+        let stat = "7 (a) b) S 1 7 7 0 -1 4194560 0 0 0 0 0 0 0 0 20 0 1 0 4711 0 0";
+        assert_eq!(began_ticks(stat), Some(4711));
+        assert_eq!(began_ticks(""), None);
+        let (own, first) = (age(std::process::id()).unwrap(), age(1).unwrap());
+        assert!(own <= first && own < Duration::from_secs(86_400), "{own:?} {first:?}");
+        assert_eq!(age(u32::MAX), None);
     }
 }

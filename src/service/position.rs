@@ -7,6 +7,7 @@ use std::os::unix::fs::{FileExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
 use crate::capture::source::FrameStamp;
+use crate::service::mode::Mode;
 
 /// Environment variable by which a supervisor names its run, so that the file of an earlier one is not taken.
 pub const RUN_VARIABLE: &str = "SEMIDENSE_RUN";
@@ -69,6 +70,22 @@ pub struct PositionKeeper {
 }
 
 impl PositionKeeper {
+    /// Keeps the place in `source` in the file at `path`, and gives where a capture of the same run has died. In
+    /// lockstep nothing is kept: such a run ends with any of its processes.
+    pub fn of_run(
+        path: &Path,
+        mode: Mode,
+        source: &str,
+        rig: Option<&Path>,
+    ) -> (Self, Option<Position>) {
+        match mode {
+            Mode::Lockstep => (Self::default(), None),
+            Mode::Live => {
+                Self::open_or_warn(path, position_key(&run_from_environment(), source, rig))
+            }
+        }
+    }
+
     /// Opens the file at `path`; with it the position that a capture of the same key has left there.
     pub fn open_or_warn(path: &Path, key: u64) -> (Self, Option<Position>) {
         match PositionFile::open(path, key) {

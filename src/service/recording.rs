@@ -9,7 +9,7 @@ use crate::slam::mapper::Map;
 use crate::slam::pose::TrackingState;
 use crate::slam::trajectory::StampedPose;
 use crate::wire::conversion::{MessageError, pose_from_message, start_frame_from_code};
-use crate::wire::message::PoseMessage;
+use crate::wire::message::{HISTOGRAM_BUCKETS, PoseMessage};
 
 /// What only the supervisor knows of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -29,6 +29,39 @@ pub struct RunCounters {
     pub page_faults: u64,
     /// Largest resident memory of all processes together, bytes.
     pub peak_rss_bytes: u64,
+    /// Live: how late capture sent frames after their stamp.
+    pub send_counts: TimeCounts,
+}
+
+/// Times by the buckets of [`crate::service::health::bucket`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(into = "Vec<u64>", from = "Vec<u64>")]
+pub struct TimeCounts(pub [u64; HISTOGRAM_BUCKETS]);
+
+impl TimeCounts {
+    fn add(&mut self, others: &Self) {
+        let pairs = self.0.iter_mut().zip(&others.0);
+        pairs.for_each(|(sum, count)| *sum = sum.saturating_add(*count));
+    }
+}
+
+impl Default for TimeCounts {
+    fn default() -> Self {
+        Self([0; HISTOGRAM_BUCKETS])
+    }
+}
+
+impl From<TimeCounts> for Vec<u64> {
+    fn from(counts: TimeCounts) -> Self {
+        counts.0.to_vec()
+    }
+}
+
+impl From<Vec<u64>> for TimeCounts {
+    /// Buckets that are missing are empty.
+    fn from(counts: Vec<u64>) -> Self {
+        Self(std::array::from_fn(|i| counts.get(i).copied().unwrap_or(0)))
+    }
 }
 
 impl RunCounters {
@@ -39,6 +72,7 @@ impl RunCounters {
         self.gaps += counted.gaps;
         self.deadline_misses += counted.deadline_misses;
         self.page_faults += counted.page_faults;
+        self.send_counts.add(&counted.send_counts);
     }
 }
 
@@ -67,6 +101,8 @@ pub struct RecordParts {
     pub ground_truth: Vec<StampedPose>,
     /// Where metres come from when depth is compared.
     pub depth_scale: DepthScale,
+    /// Whether keyframes took their first depth from the source's depth camera.
+    pub is_depth_from_sensor: bool,
     /// The tracker's deadline as it is configured, milliseconds.
     pub deadline_ms: f64,
     /// What was counted.
@@ -152,12 +188,14 @@ impl Recording {
             map: parts.map,
             ground_truth: parts.ground_truth,
             depth_scale: parts.depth_scale,
+            is_depth_from_sensor: parts.is_depth_from_sensor,
             gaps: counters.gaps,
             restarts: counters.restarts,
             restart_causes: Vec::new(),
             frames_skipped_by_mapper: (!is_replay).then_some(skipped as u64),
             deadline_nanos: is_live.then_some(deadline_nanos),
             deadline_misses: is_live.then_some(counters.deadline_misses),
+            send_counts: is_live.then_some(counters.send_counts),
             page_faults: (!is_replay).then_some(counters.page_faults),
             map_nanos: self.map_nanos,
             keyframe_step_nanos: self.keyframe_step_nanos,

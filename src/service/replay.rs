@@ -217,7 +217,10 @@ impl<'a> Replay<'a> {
             given_poses: Vec::new(),
             rehearsal: Rehearsal::new(frames_to_come(source, config)),
             spare: None,
-            record: empty_record(source_name, ground_truth, given),
+            record: RunRecord {
+                is_depth_from_sensor: config.initial_depth == DepthOrigin::Sensor,
+                ..empty_record(source_name, ground_truth, given)
+            },
             stamps: None,
         })
     }
@@ -382,6 +385,7 @@ fn empty_record(source_name: &str, ground_truth: Vec<StampedPose>, poses_given: 
         map: Default::default(),
         ground_truth,
         depth_scale,
+        is_depth_from_sensor: false,
         frames_in: 0,
         frames_refused: 0,
         refused: None,
@@ -392,6 +396,7 @@ fn empty_record(source_name: &str, ground_truth: Vec<StampedPose>, poses_given: 
         frames_skipped_by_mapper: None,
         deadline_nanos: None,
         deadline_misses: None,
+        send_counts: None,
         page_faults: None,
         map_nanos: Vec::new(),
         keyframe_step_nanos: Vec::new(),

@@ -1,6 +1,7 @@
 //! Starts the three processes, watches them, collects what they publish, ends them in order, leaves nothing behind.
 
 use std::ffi::OsString;
+use std::fmt::Write;
 use std::fs::File;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
@@ -18,7 +19,7 @@ use crate::service::mode::Mode;
 use crate::service::peers::{HEALTH_TOPICS, Peer};
 use crate::service::position::{position_key, read_position};
 use crate::service::recorder::Recorder;
-use crate::service::recording::{RecordParts, RunCounters};
+use crate::service::recording::{RecordParts, RunCounters, TimeCounts};
 use crate::service::results::{RestartCause, RunMode, RunRecord};
 pub use crate::service::run_error::RunError;
 pub use crate::service::run_progress::Ended;
@@ -126,10 +127,14 @@ fn supervise(
         supervisor.recorder.complete_map(&mut map, max_bytes);
     }
     let refused = supervisor.refused()?;
+    let is_cut = matches!(ended, Ended::Failed(_));
     if let (Ended::Finished, Some(cause)) = (&ended, &supervisor.bus_error) {
         ended = Ended::Failed(cause.clone());
     }
     let (recorder, counters, restart_causes) = supervisor.finish(shutdown)?;
+    if let (Ended::Failed(cause), true, frames @ 1..) = (&mut ended, is_cut, recorder.num_poses()) {
+        let _ = write!(cause, "; the results are of the {frames} frames before");
+    }
     let lost = counters.frames_in.saturating_sub(recorder.num_poses() as u64);
     if options.mode == Mode::Lockstep && ended == Ended::Finished && lost > 0 {
         ended = Ended::Failed(format!("{lost} of {} poses did not arrive", counters.frames_in));
@@ -142,6 +147,7 @@ fn supervise(
         map,
         ground_truth: truth,
         depth_scale: DepthScale::MedianRatio,
+        is_depth_from_sensor: false,
         deadline_ms,
         counters,
     });
@@ -364,7 +370,7 @@ impl<'a> Supervisor<'a> {
         if !is_live || !process.may_restart(&death, kill_is_felt, max_restarts) {
             return Some(Ended::Failed(death.cause));
         }
-        tracing::warn!("{}; it is started again", death.cause);
+        tracing::warn!("{}; restarting it", death.cause);
         process.plan_restart(death);
         None
     }
@@ -384,6 +390,7 @@ impl<'a> Supervisor<'a> {
                 counted.frames_in = health.frames.max(place.frames);
                 counted.gaps = health.gaps.max(place.gaps);
                 counted.frames_refused = health.refused;
+                counted.send_counts = TimeCounts(health.latency_counts);
             }
             TRACKER => {
                 counted.deadline_misses = health.deadline_misses;
@@ -406,7 +413,7 @@ impl<'a> Supervisor<'a> {
                 Ok(Some(_)) | Err(_) => return,
             }
         }
-        tracing::warn!("{name} does not stop; it is killed");
+        tracing::warn!("{name} does not stop; killing it");
         child.kill();
     }
 

@@ -4,11 +4,13 @@
 //! payload. A process that dies tears the last record at most: reading ends at the first record that is not
 //! whole, and what came before counts.
 
+use std::ffi::OsString;
 use std::io::Read;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
 
+use crate::service::journal::any_bytes;
 use crate::service::map_file::{keyframe_bytes, parse_keyframe};
 use crate::service::recording::RunCounters;
 use crate::service::results::RunMode;
@@ -30,16 +32,22 @@ const MAX_LOG_BYTES: u64 = 32 << 30;
 pub struct RunStart {
     /// How it is driven.
     pub mode: RunMode,
-    /// Where the frames come from.
-    pub source: String,
+    /// Where the frames come from; a path in it may have any bytes.
+    #[serde(with = "any_bytes")]
+    pub source: OsString,
     /// The camera's rig file.
-    pub rig: Option<String>,
+    #[serde(with = "any_bytes::optional")]
+    pub rig: Option<OsString>,
     /// The folder that relative paths are relative to.
-    pub folder: String,
+    #[serde(with = "any_bytes")]
+    pub folder: OsString,
     /// The whole configuration, as TOML.
     pub config: String,
     /// Whether poses were given and not estimated.
     pub poses_given: bool,
+    /// Whether keyframes took their first depth from the source's depth camera.
+    #[serde(default)]
+    pub is_depth_from_sensor: bool,
     /// When, nanoseconds since 1970: two runs may begin in one second.
     pub began_nanos: u64,
 }
@@ -72,7 +80,7 @@ pub enum Record {
     /// A step of the mapper.
     Step(Step),
     /// What was counted until now.
-    Counters(RunCounters),
+    Counters(Box<RunCounters>),
     /// A keyframe without image and points.
     Keyframe(Box<Keyframe>),
     /// A keyframe's pose has changed.
@@ -304,6 +312,8 @@ fn read_pose(bytes: &mut &[u8]) -> Option<PoseMessage> {
 
 #[cfg(test)]
 mod tests {
+    use std::os::unix::ffi::OsStringExt;
+
     use super::*;
     use crate::slam::frame::FrameView;
     use crate::slam::geometry::intrinsics::Intrinsics;
@@ -316,11 +326,12 @@ mod tests {
     fn records() -> Vec<Record> {
         let start = RunStart {
             mode: RunMode::Live,
-            source: "tum:a \"b\"\n".into(),
+            source: OsString::from_vec(b"tum:a \"b\"\n\xff".to_vec()),
             rig: None,
             folder: "/x".into(),
             config: "instance = \"x\"\n".into(),
             poses_given: false,
+            is_depth_from_sensor: true,
             began_nanos: 5,
         };
         let frame = FrameView {
@@ -351,7 +362,11 @@ mod tests {
             Record::Start(Box::new(start)),
             Record::Pose(Box::new(pose)),
             Record::Step(Step { step_nanos: 5, change_nanos: 6, start_frame: 2 }),
-            Record::Counters(RunCounters { frames_in: 8, gaps: 9, ..RunCounters::default() }),
+            Record::Counters(Box::new(RunCounters {
+                frames_in: 8,
+                gaps: 9,
+                ..RunCounters::default()
+            })),
             Record::Keyframe(Box::new(keyframe)),
             Record::KeyframePose(1, KeyframePose { keyframe_id: 3, world_from_keyframe }),
         ]

@@ -5,6 +5,7 @@
 //! second. The folder goes when the results are written; who finds one that nobody holds finds a run that was
 //! killed, and [`recovered`] makes its record.
 
+mod any_bytes;
 pub mod feed;
 pub mod folder;
 pub mod log;
@@ -143,7 +144,7 @@ impl Journal {
     /// Takes in what was counted until now.
     pub fn count(&mut self, counters: RunCounters) {
         self.counted = Instant::now();
-        self.append(&Record::Counters(counters));
+        self.append(&Record::Counters(Box::new(counters)));
     }
 
     /// Takes in the newest state of a keyframe; gives it back where the disk is behind. Never waits.

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
+use std::time::SystemTime;
 
 use crate::service::journal::folder::{LOG, keyframe_file};
 use crate::service::journal::log::{Record, RunStart, read_log};
@@ -24,7 +25,7 @@ pub enum JournalError {
         source: std::io::Error,
     },
     /// The log is something else.
-    #[error("{0}: this is no journal of this version of semidense")]
+    #[error("{0} is not a journal of this version of semidense")]
     Unknown(PathBuf),
 }
 
@@ -35,6 +36,8 @@ pub struct Recovered {
     pub start: RunStart,
     /// Its poses and times.
     pub recording: Recording,
+    /// When the log was written last: about the end of the run.
+    pub ended: SystemTime,
     /// What was counted last; frames at least as many as poses.
     pub counters: RunCounters,
     /// Keyframes by epoch and id, without image and points.
@@ -47,7 +50,9 @@ impl Recovered {
         let path = folder.join(LOG);
         let file = File::open(&path)
             .map_err(|source| JournalError::Read { path: path.clone(), source })?;
-        Self::from_log(BufReader::new(file)).ok_or(JournalError::Unknown(path))
+        let written = file.metadata().and_then(|found| found.modified());
+        let found = Self::from_log(BufReader::new(file)).ok_or(JournalError::Unknown(path))?;
+        Ok(Self { ended: written.unwrap_or(found.ended), ..found })
     }
 
     /// What a log holds; `None` where it does not begin with the start of a run.
@@ -63,6 +68,7 @@ impl Recovered {
 
     fn of(start: RunStart) -> Self {
         Self {
+            ended: start.began(),
             start,
             recording: Recording::default(),
             counters: RunCounters::default(),
@@ -79,7 +85,7 @@ impl Recovered {
             Record::Step(step) => {
                 self.recording.take_step(step.step_nanos, step.change_nanos, step.start_frame)
             }
-            Record::Counters(counters) => self.counters = counters,
+            Record::Counters(counters) => self.counters = *counters,
             Record::Keyframe(keyframe) => {
                 self.keyframes.insert((keyframe.epoch, keyframe.keyframe_id), *keyframe);
             }

@@ -11,6 +11,7 @@ pub mod debug_pictures;
 pub mod depth_maps;
 pub mod lettering;
 pub mod output_folder;
+pub mod output_lock;
 pub mod pcd;
 pub mod pictures;
 pub mod ply;
@@ -25,13 +26,16 @@ pub mod weight_picture;
 
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
+use std::time::SystemTime;
 
 use serde::{Deserialize, Serialize};
 
 use crate::capture::source::{FrameSource, SourceError};
 use crate::service::alignment_stamps::AlignmentTrace;
 use crate::service::atomic_file::write_atomically;
+use crate::service::recording::TimeCounts;
 use crate::service::results::budget_curve::BudgetSample;
+use crate::service::results::depth_maps::DepthEvaluation;
 use crate::service::results::ply::CloudPoint;
 use crate::service::results::report::{ReportInput, report};
 use crate::service::results::set::ResultSet;
@@ -93,8 +97,8 @@ pub enum EndOfRun {
     Interrupted,
     /// Because something failed; says what.
     Failed(String),
-    /// It was killed: this is what its journal has of it.
-    Recovered,
+    /// It was killed at about this time: this is what its journal has of it.
+    Recovered(SystemTime),
 }
 
 /// Why a process was started again, and how often for this.
@@ -125,6 +129,9 @@ pub struct RunRecord {
     pub ground_truth: Vec<StampedPose>,
     /// Where metres come from when depth is compared.
     pub depth_scale: DepthScale,
+    /// Whether keyframes took their first depth from the source's depth camera: held against that camera, it
+    /// tells nothing.
+    pub is_depth_from_sensor: bool,
     /// Frames that the source gave.
     pub frames_in: u64,
     /// Images of the source that could not be used and were left out.
@@ -145,6 +152,8 @@ pub struct RunRecord {
     pub deadline_nanos: Option<u64>,
     /// Frames published after the deadline; `None` without one.
     pub deadline_misses: Option<u64>,
+    /// How late capture sent frames after their stamp; `None` but of live runs.
+    pub send_counts: Option<TimeCounts>,
     /// Page faults of the tracker's frame loop since it was warm; `None` in one process.
     pub page_faults: Option<u64>,
     /// Time in the mapper, one for each frame it handled.
@@ -222,6 +231,16 @@ pub enum ResultsError {
         "{0} was not written by semidense and would be replaced: move it away, or choose another folder with --output"
     )]
     Foreign(PathBuf),
+    /// Another process writes there.
+    #[error(
+        "{folder} is in use by semidense, process {process}: wait until that has ended, or choose another folder with --output"
+    )]
+    Held {
+        /// The folder.
+        folder: PathBuf,
+        /// Id of the process.
+        process: String,
+    },
     /// True depth that cannot be read.
     #[error("cannot read the depth of a keyframe for evaluation: {0}")]
     Depth(#[from] SourceError),
@@ -258,7 +277,10 @@ impl<'a> Results<'a> {
             evaluate_trajectory(estimate, truth, params.alignment, MAX_DIFFERENCE_NANOS).ok()
         };
         let (evaluation, online_evaluation) = (evaluate(&trajectory), evaluate(&online));
-        let depth = depth_maps::evaluate_depth(record, depth_source)?;
+        let depth = match record.is_depth_from_sensor {
+            true => DepthEvaluation::default(),
+            false => depth_maps::evaluate_depth(record, depth_source)?,
+        };
         let cloud = ply::point_cloud(&record.map, params.max_relative_std_dev);
         let summary = Summary::new(
             record,

@@ -1,5 +1,6 @@
 //! Where the results of a run go: the folder that the user names, or a new one for each run.
 
+use std::ffi::OsStr;
 use std::fs::{self, File};
 use std::io;
 use std::os::unix::fs::symlink;
@@ -9,6 +10,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use rustix::fs::{Mode, OFlags};
 
 use crate::service::results::ResultsError;
+use crate::service::results::output_lock::{Locking, OutputLock};
 use crate::service::results::set::{finish_commit, foreign_file};
 
 /// Folder of the folders, below the one that the program is started in.
@@ -19,26 +21,67 @@ pub const LATEST: &str = "latest";
 /// Most runs that start in the same second in the same folder.
 const MAX_SAME_SECOND: u32 = 1000;
 
-/// The folder of a run's results; made by the program, it goes with the run where nothing was written.
+/// The folder of a run's results, locked for this process. Where the program has made it, it is removed with the
+/// value if nothing was written.
 #[derive(Debug)]
 pub struct OutputFolder {
     path: PathBuf,
-    is_new: bool,
+    /// Folders to remove if they stay empty, the innermost first.
+    made: Vec<PathBuf>,
+    kind: Kind,
+    /// Taken before the folders are removed.
+    lock: Option<OutputLock>,
+}
+
+/// Where the folder's name comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    /// From the user.
+    Named,
+    /// From the time: it is of this run.
+    New,
+    /// From a run that was killed and is recovered.
+    Recovered,
 }
 
 impl OutputFolder {
     /// The folder that is `named`, else a new one in [`PARENT`], named by the second (UTC) of its making.
-    /// Looks that it can be written, so that a folder without room or permission is noticed before the run.
+    /// Checks that it can be written, so that a folder without room or permission is noticed before the run,
+    /// and locks it.
     pub fn prepare(named: Option<&Path>) -> Result<Self, ResultsError> {
-        let folder = match named {
-            Some(path) => Self { path: path.to_owned(), is_new: false },
+        match named {
+            Some(path) => Self::open(path, missing_folders(path), Kind::Named),
             None => {
-                let made = new_folder(Path::new(PARENT), &utc_stamp(SystemTime::now()));
-                let path = made.map_err(|source| write_error(Path::new(PARENT), source))?;
-                Self { path, is_new: true }
+                let parent = Path::new(PARENT);
+                let mut made = missing_folders(parent);
+                let path = new_folder(parent, &utc_stamp(SystemTime::now()))
+                    .map_err(|source| write_error(parent, source))?;
+                made.insert(0, path.clone());
+                Self::open(&path, made, Kind::New)
             }
-        };
-        prepare_output(&folder.path)?;
+        }
+    }
+
+    /// The folder of a run that was killed.
+    pub fn of_recovery(path: &Path) -> Result<Self, ResultsError> {
+        let mut made = missing_folders(path);
+        if made.is_empty() && path.file_name().is_some_and(is_stamp) {
+            // Made by the run that was killed.
+            made.push(path.to_owned());
+        }
+        Self::open(path, made, Kind::Recovered)
+    }
+
+    fn open(path: &Path, made: Vec<PathBuf>, kind: Kind) -> Result<Self, ResultsError> {
+        let mut folder = Self { path: path.to_owned(), made, kind, lock: None };
+        let locking = fs::create_dir_all(path).and_then(|()| OutputLock::take(path));
+        match locking.map_err(|source| write_error(path, source))? {
+            Locking::Locked(lock) => folder.lock = Some(lock),
+            Locking::HeldBy(process) => {
+                return Err(ResultsError::Held { folder: path.to_owned(), process });
+            }
+        }
+        prepare_output(path)?;
         Ok(folder)
     }
 
@@ -47,14 +90,25 @@ impl OutputFolder {
         &self.path
     }
 
-    /// Of a folder that was made for the run: links [`LATEST`] to it. A `latest` of the user's own stays.
+    /// Links [`LATEST`] to a folder that was made for the run, and to that of a recovered run unless a newer run
+    /// has the link. A `latest` of the user's own stays.
     pub fn become_latest(&self) -> io::Result<()> {
         let (Some(parent), Some(name)) = (self.path.parent(), self.path.file_name()) else {
             return Ok(());
         };
         let latest = parent.join(LATEST);
         let is_link = fs::symlink_metadata(&latest).map_or(true, |found| found.is_symlink());
-        if !self.is_new || !is_link {
+        let is_newest = || match fs::read_link(&latest) {
+            // Names are in the order of time.
+            Ok(newest) => newest.as_os_str() <= name || !latest.exists(),
+            Err(_) => true,
+        };
+        let is_run = match self.kind {
+            Kind::New => true,
+            Kind::Named => false,
+            Kind::Recovered => is_stamp(name) && is_newest(),
+        };
+        if !is_run || !is_link {
             return Ok(());
         }
         let temporary = parent.join(format!(".{LATEST}.{}", std::process::id()));
@@ -66,15 +120,31 @@ impl OutputFolder {
 
 impl Drop for OutputFolder {
     fn drop(&mut self) {
-        if self.is_new {
-            // Only an empty folder can be removed so.
-            drop(fs::remove_dir(&self.path));
-            drop(self.path.parent().map(fs::remove_dir));
-        }
+        drop(self.lock.take());
+        // Only an empty folder can be removed so.
+        self.made.iter().for_each(|folder| drop(fs::remove_dir(folder)));
     }
 }
 
-/// Makes the folder where it is missing, looks that it can be written and that it holds no file of the user's
+/// The folders that have to be made for `folder`, itself first.
+fn missing_folders(folder: &Path) -> Vec<PathBuf> {
+    let named = |path: &&Path| !path.as_os_str().is_empty();
+    let missing = folder.ancestors().take_while(named).take_while(|path| !path.exists());
+    missing.map(Path::to_owned).collect()
+}
+
+/// Whether a folder has the name that [`new_folder`] gives.
+fn is_stamp(name: &OsStr) -> bool {
+    const FORM: &[u8] = b"0000-00-00T00-00-00Z";
+    let fits = |(byte, form): (&u8, &u8)| match form {
+        b'0' => byte.is_ascii_digit(),
+        form => byte == form,
+    };
+    let bytes = name.as_encoded_bytes();
+    bytes.len() >= FORM.len() && bytes.iter().zip(FORM).all(fits)
+}
+
+/// Makes the folder where it is missing, checks that it can be written and that it holds no file of the user's
 /// that results would replace, and finishes what a killed process has left half done.
 pub fn prepare_output(folder: &Path) -> Result<(), ResultsError> {
     let attempt = || {
@@ -126,12 +196,23 @@ fn new_folder(parent: &Path, stamp: &str) -> io::Result<PathBuf> {
 
 /// `2026-11-22T03-15-00Z`: UTC, in order by name, and without a character that shells or Windows dislike.
 pub fn utc_stamp(time: SystemTime) -> String {
+    let [year, month, day, hour, minute, second] = utc(time);
+    format!("{year:04}-{month:02}-{day:02}T{hour:02}-{minute:02}-{second:02}Z")
+}
+
+/// `2026-11-22T03:15:00Z`: UTC as RFC 3339 has it.
+pub fn utc_text(time: SystemTime) -> String {
+    let [year, month, day, hour, minute, second] = utc(time);
+    format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}Z")
+}
+
+/// Year, month, day, hour, minute, second.
+fn utc(time: SystemTime) -> [u64; 6] {
     const SECS_PER_DAY: u64 = 86_400;
     let secs = time.duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs());
     let (days, of_day) = (secs / SECS_PER_DAY, secs % SECS_PER_DAY);
     let (year, month, day) = date_of(days);
-    let (hour, minute, second) = (of_day / 3600, of_day / 60 % 60, of_day % 60);
-    format!("{year:04}-{month:02}-{day:02}T{hour:02}-{minute:02}-{second:02}Z")
+    [year, month, day, of_day / 3600, of_day / 60 % 60, of_day % 60]
 }
 
 /// Year, month and day of a number of days since 1970-01-01, in the Gregorian calendar: years are counted from
@@ -164,7 +245,54 @@ mod tests {
             (4_107_542_400, "2100-03-01T00-00-00Z"),
         ] {
             assert_eq!(utc_stamp(UNIX_EPOCH + Duration::from_secs(secs)), stamp);
+            assert!(is_stamp(OsStr::new(stamp)) && is_stamp(OsStr::new(&format!("{stamp}-2"))));
         }
+        assert!(
+            !is_stamp(OsStr::new("2026-11-22")) && !is_stamp(OsStr::new("my-old-recording-000"))
+        );
+        let time = UNIX_EPOCH + Duration::from_secs(1_795_317_300);
+        assert_eq!(utc_text(time), "2026-11-22T03:15:00Z");
+    }
+
+    #[test]
+    fn a_folder_that_was_made_goes_if_it_stays_empty_and_another_process_cannot_have_it() {
+        let root = tempfile::tempdir().unwrap();
+        let outer = root.path().join("a");
+        let inner = outer.join("b/c");
+        let stamped = root.path().join("2026-11-22T03-15-00Z");
+        fs::create_dir(&stamped).unwrap();
+        drop(OutputFolder::of_recovery(&stamped).unwrap());
+        assert!(!stamped.exists(), "the run that was killed had made it");
+        let folder = OutputFolder::prepare(Some(&inner)).unwrap();
+        let error = OutputFolder::prepare(Some(&inner)).unwrap_err().to_string();
+        let held = format!("process {}", std::process::id());
+        assert!(error.contains(&held) && error.contains("--output"), "{error}");
+        assert!(inner.exists(), "the refused one removes nothing");
+        drop(folder);
+        assert!(!outer.exists() && root.path().exists());
+        fs::create_dir(&outer).unwrap();
+        drop(OutputFolder::prepare(Some(&outer)).unwrap());
+        assert!(outer.exists(), "it is the user's");
+    }
+
+    #[test]
+    fn a_recovered_run_has_the_link_unless_a_newer_one_has_it() {
+        let root = tempfile::tempdir().unwrap();
+        let latest = root.path().join(LATEST);
+        let recover = |name: &str| {
+            let path = root.path().join(name);
+            fs::create_dir_all(&path).unwrap();
+            fs::write(path.join("x"), "x").unwrap();
+            OutputFolder::of_recovery(&path).unwrap().become_latest().unwrap();
+            fs::read_link(&latest).ok()
+        };
+        assert_eq!(recover("mine"), None);
+        let [old, new] = ["2026-11-22T03-15-00Z", "2026-11-22T03-15-07Z"];
+        assert_eq!(recover(old), Some(old.into()));
+        assert_eq!(recover(new), Some(new.into()));
+        assert_eq!(recover(old), Some(new.into()));
+        fs::remove_dir_all(root.path().join(new)).unwrap();
+        assert_eq!(recover(old), Some(old.into()), "the link led nowhere");
     }
 
     #[test]
@@ -188,7 +316,7 @@ mod tests {
         let make = |stamp| {
             let path = new_folder(folder.path(), stamp).unwrap();
             fs::write(path.join("x"), "x").unwrap();
-            OutputFolder { path, is_new: true }
+            OutputFolder { path: path.clone(), made: vec![path], kind: Kind::New, lock: None }
         };
         let link = folder.path().join(LATEST);
         for stamp in ["1", "2"] {

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::service::results::alignment_levels::{LevelSummary, alignment_levels};
 use crate::service::results::budget_curve::BudgetCurve;
 use crate::service::results::calibration::whitened_residual_median;
+use crate::service::results::output_folder::utc_text;
 use crate::service::results::poses::longest_epoch;
 use crate::service::results::times::{LatencySummary, Percentiles, track_nanos};
 use crate::service::results::untracked::Untracked;
@@ -14,10 +15,11 @@ use crate::service::results::{
     EndOfRun, RecordedPose, Rejection, RestartCause, RunMode, RunRecord,
 };
 use crate::slam::evaluation::TrajectoryEvaluation;
-use crate::slam::evaluation::depth_error::DepthStatistics;
+use crate::slam::evaluation::depth_error::{DepthScale, DepthStatistics};
 use crate::slam::evaluation::grade::{Grade, GradeInput};
 use crate::slam::evaluation::map_consistency::MapConsistency;
 use crate::slam::evaluation::normalized_error::NormalizedErrors;
+use crate::slam::mapper::Map;
 use crate::slam::pose::TrackingState;
 
 /// A trajectory against ground truth; all null where there is none. Lengths in the ground truth's
@@ -170,6 +172,8 @@ pub struct Summary {
     pub ended: String,
     /// What failed.
     pub failure: Option<String>,
+    /// When the run ended from whose journal this was recovered (UTC); null of any other run.
+    pub recovered_run_end: Option<String>,
     /// What the run is worth by what can be known without ground truth.
     pub grade: Grade,
     /// Frames that the source gave.
@@ -198,6 +202,8 @@ pub struct Summary {
     pub untracked: Option<String>,
     /// Keyframes of the final map.
     pub keyframes: u64,
+    /// Of them those whose depth is not held: the oldest of a long run, or what a recovery could not find.
+    pub keyframes_without_depth: u64,
     /// Points of `map.ply`.
     pub points: u64,
     /// Life of the map at the end, from 0.
@@ -207,6 +213,8 @@ pub struct Summary {
     /// The epoch that is compared with ground truth: the one with the most tracked frames. Each epoch
     /// has a frame and a scale of its own; `matched_poses` says how many frames its figures cover.
     pub evaluated_epoch: Option<u32>,
+    /// From a frame's stamp to its sending by capture: what is late before the tracker's deadline begins. Live only.
+    pub send_ms: Option<Percentiles>,
     /// How late poses were.
     #[serde(flatten)]
     pub latency: LatencySummary,
@@ -296,6 +304,10 @@ impl Summary {
             source: record.source.clone(),
             ended,
             failure,
+            recovered_run_end: match record.ended {
+                EndOfRun::Recovered(time) => Some(utc_text(time)),
+                _ => None,
+            },
             grade: grade(record),
             frames_in: record.frames_in,
             frames_refused: record.frames_refused,
@@ -309,10 +321,12 @@ impl Summary {
             initialization_secs: initialization_secs(&record.poses),
             untracked: Untracked::of(record).map(|why| why.to_string()),
             keyframes: record.map.keyframes.len() as u64,
+            keyframes_without_depth: without_depth(&record.map),
             points: points as u64,
             epoch: record.poses.last().map_or(0, |pose| pose.estimate.epoch),
             epochs: count_epochs(&record.poses),
             evaluated_epoch: trajectory.and_then(|_| longest_epoch(record)),
+            send_ms: record.send_counts.as_ref().and_then(Percentiles::of_counts),
             latency: LatencySummary::of(&record.poses),
             deadline_ms: record.deadline_nanos.map(|n| n as f64 * 1e-6),
             deadline_misses: record.deadline_misses,
@@ -346,7 +360,7 @@ fn end_in_words(ended: &EndOfRun) -> (String, Option<String>) {
         EndOfRun::Finished => ("finished", None),
         EndOfRun::Interrupted => ("interrupted", None),
         EndOfRun::Failed(cause) => ("failed", Some(cause.clone())),
-        EndOfRun::Recovered => ("recovered", None),
+        EndOfRun::Recovered(_) => ("recovered", None),
     };
     (word.to_owned(), failure)
 }
@@ -354,6 +368,11 @@ fn end_in_words(ended: &EndOfRun) -> (String, Option<String>) {
 fn rejections(record: &RunRecord) -> Option<Vec<RejectionSummary>> {
     let all = record.rejections.as_ref()?;
     Some(all.iter().map(RejectionSummary::from).collect())
+}
+
+/// Keyframes that have a pose alone.
+pub fn without_depth(map: &Map) -> u64 {
+    map.keyframes.iter().filter(|keyframe| keyframe.points.is_empty()).count() as u64
 }
 
 /// The grade of a run.
@@ -367,6 +386,7 @@ fn grade(record: &RunRecord) -> Grade {
         frames_lost: count_states(&record.poses, is_lost),
         losses: count_losses(&record.poses),
         epochs: count_epochs(&record.poses),
+        are_poses_given: record.depth_scale == DepthScale::Given,
         rejections: record.rejections.as_ref().map_or(0, |all| all.len() as u64),
         frames,
         width: keyframes.first().map_or(0, |keyframe| keyframe.intrinsics.width),

@@ -20,8 +20,14 @@ pub fn summary_text(summary: &Summary) -> String {
     line(
         "map",
         format!(
-            "{} keyframes, {} points, epoch {}",
-            summary.keyframes, summary.points, summary.epoch
+            "{} keyframes{}, {} points, epoch {}",
+            summary.keyframes,
+            match summary.keyframes_without_depth {
+                0 => String::new(),
+                count => format!(" ({count} without depth)"),
+            },
+            summary.points,
+            summary.epoch
         ),
     );
     for restart in &summary.restart_causes {
@@ -31,7 +37,8 @@ pub fn summary_text(summary: &Summary) -> String {
         line("rejected", format!("map at frame {}: {}", rejection.sequence, rejection.reason));
     }
     if let Some(epoch) = summary.evaluated_epoch.filter(|_| summary.epochs > 1) {
-        let figures = format!("of epoch {epoch}, the longest of {}", summary.epochs);
+        let figures =
+            format!("below are those of epoch {epoch}, the longest of {}", summary.epochs);
         line("errors", figures);
     }
     if let Some(error) = trajectory_errors(&summary.trajectory) {
@@ -47,7 +54,7 @@ pub fn summary_text(summary: &Summary) -> String {
         line(
             "depth",
             format!(
-                "median relative error {:.1} %, {:.1} % over the surer half",
+                "median relative error {:.1} %, {:.1} % over the more certain half",
                 100.0 * all,
                 100.0 * best
             ),
@@ -57,12 +64,19 @@ pub fn summary_text(summary: &Summary) -> String {
         ("track", summary.track_ms),
         ("map", summary.map_ms),
         ("keyframe", summary.keyframe_ms),
+        ("sent after", summary.send_ms),
         ("latency", summary.latency.latency_ms),
     ];
     for (name, percentiles) in times {
         if let Some(percentiles) = percentiles {
-            line(&format!("{name} time"), times_text(&percentiles));
+            line(name, times_text(&percentiles));
         }
+    }
+    if let (Some(deadline_ms), Some(misses)) = (summary.deadline_ms, summary.deadline_misses) {
+        line(
+            "deadline",
+            format!("{misses} poses later than {deadline_ms:.2} ms after the frame arrived"),
+        );
     }
     line("run", run(summary));
     line("grade", grade_text(&summary.grade));
@@ -73,6 +87,13 @@ pub fn summary_text(summary: &Summary) -> String {
 fn grade_text(grade: &Grade) -> String {
     let reasons: Vec<&str> = grade.reasons.iter().take(2).map(String::as_str).collect();
     format!("{}: {}", grade.level.name(), reasons.join("; "))
+}
+
+/// What the last line of a recovery says of the run; empty of any other run.
+pub fn recovery_text(summary: &Summary) -> String {
+    summary.recovered_run_end.as_ref().map_or(String::new(), |end| {
+        format!(", recovered from the journal of a run that ended at {end}")
+    })
 }
 
 /// What the last line of a run says of images that could not be used; empty where all could.
@@ -89,20 +110,23 @@ pub fn refused_text(summary: &Summary) -> String {
 fn frames(summary: &Summary) -> String {
     let initialised = match summary.initialization_secs {
         Some(secs) => format!("initialised after {secs:.2} s"),
+        None if summary.frames.frames_lost > 0 => {
+            "a map began, no frame was tracked on it".to_owned()
+        }
         None => "never initialised".to_owned(),
     };
     let skipped = match summary.frames_skipped_by_mapper {
         None | Some(0) => String::new(),
         Some(frames) => format!(", {frames} skipped by the mapper"),
     };
+    let lost = match (summary.frames.frames_lost, summary.lost_count) {
+        (0, _) => "never lost".to_owned(),
+        (frames, 0 | 1) => format!("{frames} lost"),
+        (frames, times) => format!("{frames} lost ({times} times)"),
+    };
     format!(
-        "{} in, {} tracked, {} lost in {} losses, {} dropped, {} gaps{skipped}; {initialised}",
-        summary.frames_in,
-        summary.frames.frames_tracked,
-        summary.frames.frames_lost,
-        summary.lost_count,
-        summary.frames_dropped,
-        summary.gaps
+        "{} in, {} tracked, {lost}, {} dropped, {} gaps{skipped}; {initialised}",
+        summary.frames_in, summary.frames.frames_tracked, summary.frames_dropped, summary.gaps
     )
 }
 

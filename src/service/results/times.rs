@@ -2,7 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::service::health::{bucket, bucket_end_ms};
+use crate::service::health::{bucket, bucket_end_ms, percentile_ms};
+use crate::service::recording::TimeCounts;
 use crate::service::results::RecordedPose;
 use crate::slam::evaluation::statistics::percentile;
 use crate::slam::pose::NO_KEYFRAME;
@@ -29,6 +30,13 @@ impl Percentiles {
         let mut millis: Vec<f64> = nanos.map(|n| n as f64 * 1e-6).collect();
         millis.sort_by(f64::total_cmp);
         let at = |share| percentile(&millis, share);
+        let (p50, p95, p99) = (at(0.5)?, at(0.95)?, at(0.99)?);
+        Some(Self { p50, p95, p99, p999: at(0.999)?, max: at(1.0)? })
+    }
+
+    /// Percentiles of times that were counted: right to a few per cent, the longest is where its bucket ends.
+    pub fn of_counts(counts: &TimeCounts) -> Option<Self> {
+        let at = |share| percentile_ms(&counts.0, share);
         let (p50, p95, p99) = (at(0.5)?, at(0.95)?, at(0.99)?);
         Some(Self { p50, p95, p99, p999: at(0.999)?, max: at(1.0)? })
     }

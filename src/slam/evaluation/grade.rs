@@ -59,6 +59,8 @@ pub struct GradeInput {
     pub losses: u64,
     /// Parts of the map with a frame and a scale of their own.
     pub epochs: u64,
+    /// Whether poses were given: then all parts have their scale.
+    pub are_poses_given: bool,
     /// How often the map was found to contradict itself; 0 where that is not known.
     pub rejections: u64,
     /// First to last frame.
@@ -88,8 +90,11 @@ impl Grade {
         let mut findings = vec![misfit(input)];
         findings.extend(losses(input));
         if input.epochs > 1 {
-            let parts =
-                format!("the map is in {} parts, each with a scale of its own", input.epochs);
+            let what = match input.are_poses_given {
+                true => "depth was begun anew for each",
+                false => "each with a scale of its own",
+            };
+            let parts = format!("the map is in {} parts, {what}", input.epochs);
             findings.push((GradeLevel::Doubtful, parts));
         }
         if input.rejections > 0 {
@@ -122,13 +127,13 @@ fn misfit(input: &GradeInput) -> (GradeLevel, String) {
     let Some(misfit) = misfit else {
         let pairs = figures.wide_pairs;
         let reason = format!(
-            "too few keyframes see the same place from apart ({pairs} pairs, {MIN_WIDE_PAIRS} are needed)"
+            "too few keyframes far apart see the same place ({pairs} pairs, {MIN_WIDE_PAIRS} are needed)"
         );
         return (GradeLevel::NotJudged, reason);
     };
     let share = misfit / input.width.max(1) as f64;
     let (level, verb) = match share {
-        share if share <= GOOD_MISFIT => (GradeLevel::Good, "agree to"),
+        share if share <= GOOD_MISFIT => (GradeLevel::Good, "agree to within"),
         share if share <= POOR_MISFIT => (GradeLevel::Doubtful, "disagree by"),
         _ => (GradeLevel::Poor, "disagree by"),
     };
@@ -158,12 +163,12 @@ fn losses(input: &GradeInput) -> Option<(GradeLevel, String)> {
 fn caveat(input: &GradeInput) -> String {
     let (span, frames) = (input.consistency.longest_span_frames, input.frames);
     if span == 0 {
-        return "without ground truth and without places seen twice, drift cannot be seen"
+        return "without ground truth and without a place that is seen twice, drift cannot be detected"
             .to_owned();
     }
     format!(
-        "places were seen again over {span} of {frames} frames at most; drift between places that are \
-         seen only once, and an error that all keyframes share, cannot be seen without ground truth"
+        "places were seen again after at most {span} of {frames} frames; drift between places that are \
+         seen only once, and an error that all keyframes share, cannot be detected without ground truth"
     )
 }
 

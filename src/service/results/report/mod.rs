@@ -14,6 +14,7 @@ pub mod views;
 use std::fmt::Write;
 
 use crate::service::results::colour::Picture;
+use crate::service::results::output_folder::utc_text;
 use crate::service::results::pictures::{
     RELATIVE_STD_DEV_RANGE, density_picture, inverse_depth_picture, variance_picture,
 };
@@ -62,7 +63,7 @@ pub struct ReportInput<'a> {
 pub fn report(input: &ReportInput<'_>) -> String {
     let summary = input.summary;
     let mode = match summary.mode {
-        RunMode::Replay => "replay, one process, every frame",
+        RunMode::Replay => "replay in one process, every frame",
         RunMode::Lockstep => "lockstep run, every frame",
         RunMode::Live => "live run, newest frame wins",
     };
@@ -108,14 +109,15 @@ fn notices(summary: &Summary, ended: &EndOfRun) -> String {
 fn end_notice(ended: &EndOfRun) -> String {
     let text = match ended {
         EndOfRun::Finished => return String::new(),
-        EndOfRun::Interrupted => "Interrupted: this is the run until then.".to_owned(),
+        EndOfRun::Interrupted => "Interrupted: these are the results up to then.".to_owned(),
         EndOfRun::Failed(cause) => {
-            format!("Failed: {}. This is the run until then.", escaped(cause))
+            format!("Failed: {}. These are the results up to then.", escaped(cause))
         }
-        EndOfRun::Recovered => {
-            "The run was killed: recovered from its journal, which may lack the last two seconds."
-                .to_owned()
-        }
+        EndOfRun::Recovered(time) => format!(
+            "Recovered from the journal of a run that ended at {}: it was killed, and its last two seconds may be \
+             missing.",
+            utc_text(*time)
+        ),
     };
     format!("<p class=\"notice\">{text}</p>")
 }
@@ -126,7 +128,7 @@ fn map(input: &ReportInput<'_>) -> String {
     let Some(png) = picture.and_then(|picture| picture.png()) else { return String::new() };
     format!(
         "<section><h2>Map</h2><figure><img alt=\"map from above\" src=\"{}\"><figcaption>{} points \
-         from above, <span class=\"scale near-far\"></span> low to high; the camera's way in \
+         from above, <span class=\"scale near-far\"></span> low to high; the camera's path in \
          white.</figcaption></figure></section>",
         png_address(&png),
         grouped(input.cloud.len() as u64)
@@ -141,10 +143,9 @@ fn budget(input: &ReportInput<'_>) -> String {
         return String::new();
     }
     let mut html = format!(
-        "<section><h2>Quality and budget</h2><p>{} frames aligned again and stopped early: how far the \
-         keyframe's points then lie, on average over the image, from where the pose without a \
-         deadline puts them. Each curve begins with the prediction and one step from it; 0.001 px is \
-         no difference.</p>\
+        "<section><h2>Quality and budget</h2><p>{} frames were aligned again and stopped early: mean distance in the image between the \
+         keyframe's points at that pose and at the pose without a deadline. Each curve starts at the \
+         prediction, followed by one step; 0.001 px means no difference.</p>\
          <div class=\"charts\">",
         samples.len()
     );
@@ -179,6 +180,9 @@ fn cards(summary: &Summary) -> String {
     };
     let share = 100.0 * summary.frames.frames_tracked as f64 / summary.frames_in.max(1) as f64;
     let losses = match summary.lost_count {
+        _ if summary.frames.frames_tracked == 0 && summary.frames.frames_lost > 0 => {
+            "lost at once".to_owned()
+        }
         _ if summary.frames.frames_tracked == 0 => "never initialised".to_owned(),
         0 => "never lost".to_owned(),
         1 => "lost once".to_owned(),
@@ -191,12 +195,12 @@ fn cards(summary: &Summary) -> String {
         card("Position error (ATE)", length(ate), note);
     }
     if let Some(ratio) = trajectory.window_scale_ratio {
-        let note = "largest / smallest scale of 100 frames".to_owned();
+        let note = "largest / smallest scale of 100-frame windows".to_owned();
         card("Scale drift", format!("&times; {ratio:.2}"), note);
     }
     if let Some(error) = summary.depth.depth_relative_error_median {
         let best = summary.depth.depth_relative_error_median_best_half.unwrap_or(error);
-        let note = format!("median; {:.1} % in the surer half", 100.0 * best);
+        let note = format!("median; {:.1} % in the more certain half", 100.0 * best);
         card("Depth error", format!("{:.1} %", 100.0 * error), note);
     }
     let points = format!("{} points", grouped(summary.points));
@@ -206,7 +210,7 @@ fn cards(summary: &Summary) -> String {
         card("Tracking a frame", format!("{:.1} ms", times.p50), note);
     }
     if let Some(times) = summary.latency.latency_ms {
-        let late = summary.deadline_misses.map(|misses| format!("; {misses} after the deadline"));
+        let late = summary.deadline_misses.map(|misses| format!("; {misses} late"));
         let note = format!("median; p99 {:.1} ms{}", times.p99, late.unwrap_or_default());
         card("Latency", format!("{:.1} ms", times.p50), note);
     }
@@ -302,7 +306,7 @@ fn depth_maps(input: &ReportInput<'_>) -> String {
     let spread = |i: usize| keyframes[i * (keyframes.len() - 1) / (shown - 1).max(1)];
     let mut html = format!(
         "<section><h2>Depth</h2><p>Inverse depth of {shown} of {} keyframes: \
-         <span class=\"scale near-far\"></span> far to near. Points whose standard deviation is \
+         <span class=\"scale near-far\"></span> far to near. Shown are points whose standard deviation is \
          at most {:.0} % of their inverse depth.</p><div class=\"pictures\">",
         keyframes.len(),
         100.0 * input.max_relative_std_dev
@@ -322,9 +326,9 @@ fn depth_maps(input: &ReportInput<'_>) -> String {
     let [low, high] = RELATIVE_STD_DEV_RANGE;
     let _ = write!(
         html,
-        "</div><p>All points of one of them; their standard deviation over inverse depth, \
+        "</div><p>One keyframe with all its points; the relative standard deviation of its inverse depth, \
          <span class=\"scale sure-unsure\"></span> {:.1} % to {:.0} % (logarithmic); the share of \
-         pixels that have depth, 0 to 100 % on the same scale.</p><div class=\"pictures wide\">",
+         pixels with depth, 0 to 100 % on the same scale.</p><div class=\"pictures wide\">",
         100.0 * low,
         100.0 * high
     );
