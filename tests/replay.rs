@@ -129,7 +129,7 @@ fn a_name_that_is_none_is_refused_before_the_work() {
         .output()
         .unwrap();
     assert_eq!(replayed.status.code(), Some(1));
-    assert!(String::from_utf8_lossy(&replayed.stderr).contains("`a/b` is not a name"));
+    assert!(String::from_utf8_lossy(&replayed.stderr).contains("`a/b` is not a valid name"));
     assert!(!folder.path().join("output").exists());
 }
 

@@ -307,16 +307,16 @@ fn a_bad_recording_is_one_clear_line() {
             "40 24",
             "rgb/0.png: is 32x24 pixels where the rig says 40x24",
         ),
-        ("tum", "camera.txt", "32 24", "32", "camera.txt: height = 0: allowed is 16 to 8192"),
+        ("tum", "camera.txt", "32 24", "32", "camera.txt: height = 0: must be 16 to 8192"),
         (
             "tum",
             "camera.txt",
             " 0 0",
             " 0",
-            "camera.txt: coefficients = [-0.1, 0.02, 0.0]: allowed",
+            "camera.txt: coefficients = [-0.1, 0.02, 0.0]: must be",
         ),
         ("tum", "camera.txt", "30 31 15.5 11.5 32 24 -0.1 0.02 0 0", "30 31", "has 2 numbers"),
-        ("tum", "camera.txt", "15.5", "35.5", "camera.txt: cx = 35.5: allowed is 0 to 31"),
+        ("tum", "camera.txt", "15.5", "35.5", "camera.txt: cx = 35.5: must be 0 to 31"),
         ("euroc", cam, "0001,", "0001", "data.csv, line 2: needs `timestamp,filename`"),
         (
             "euroc",
@@ -337,7 +337,7 @@ fn a_bad_recording_is_one_clear_line() {
         ("euroc", truth, ",0,0,1,0,0,0,0.1,0.2,0.3,0,0,0,0,0,0", "", "line 2: needs `timestamp,px"),
         ("images", "rig.toml", "rate_hz = 20", "", "has no times.txt and "),
         ("images", "rig.toml", "rate_hz", "rate", "rig.toml, line 8: unknown field `rate`"),
-        ("images", "rig.toml", "= 20", "= nan", "rig.toml: rate_hz = NaN: allowed is 0.1 to 1000"),
+        ("images", "rig.toml", "= 20", "= nan", "rig.toml: rate_hz = NaN: must be 0.1 to 1000"),
     ] {
         let (_folder, source) = opened(kind, |root| {
             let text = fs::read_to_string(root.join(file)).expect("there");
@@ -364,12 +364,12 @@ fn what_is_missing_is_named() {
         ("euroc", "mav0/cam0/sensor.yaml", None, "sensor.yaml: cannot be read"),
         ("euroc", "mav0/cam0/data.csv", None, "data.csv: cannot be read"),
         ("euroc", "mav0/cam0/data.csv", Some("#\n"), "data.csv: has no frames"),
-        ("images", "times.txt", Some("1\n2\n"), "times.txt: has 2 stamps for 5 images"),
+        ("images", "times.txt", Some("1\n2\n"), "times.txt: has 2 time stamps for 5 images"),
         ("images", "times.txt", Some("1\n2\n3\n4\n5\n6\n"), "line 6: there are only 5 images"),
         ("images", "times.txt", Some("1\n2 3\n"), "line 2: every line needs one stamp"),
         ("images", "times.txt", Some("a 3\n"), "line 1: there is no image `a`"),
-        ("images", "times.txt", Some("frame8 3 -1\n"), "line 1: the exposure is -1: allowed is"),
-        ("images", "times.txt", Some("# none\n"), "times.txt: has 0 stamps for 5 images"),
+        ("images", "times.txt", Some("frame8 3 -1\n"), "line 1: the exposure is -1: must be"),
+        ("images", "times.txt", Some("# none\n"), "times.txt: has 0 time stamps for 5 images"),
         ("images", "rig.toml", None, "has no camera.txt; name the camera with --rig FILE"),
         ("images", "frame11.png", Some(""), "frame11.png: is empty"),
     ] {
@@ -413,10 +413,7 @@ fn source_names_are_parsed_and_explained() {
     }
     for (name, expected) in [
         ("", "No such file"),
-        (
-            "ros:topic",
-            "this kind is not known; sources are a folder (TUM, EuRoC or images), sim[:SCENE]",
-        ),
+        ("ros:topic", "unknown kind; sources are a folder (TUM, EuRoC or images), sim[:SCENE]"),
         ("tum", "the folder is missing"),
         ("images:", "the folder is missing"),
         ("v4l:", "the device is missing, as in v4l:/dev/video0"),

@@ -61,7 +61,7 @@ pub enum DecodeError {
 #[derive(Debug, thiserror::Error)]
 pub enum ImageFileError {
     /// The file cannot be opened or read.
-    #[error("{}: cannot be read: {source}; copy it there or remove it from the sequence", path.display())]
+    #[error("{}: cannot be read: {source}; restore it or remove it from the sequence", path.display())]
     Read {
         /// The file.
         path: PathBuf,

@@ -171,7 +171,7 @@ fn exposure_nanos(row: &Row<'_>, text: &str) -> Result<u64, SourceError> {
     let exposure_ms = row.number(text)?;
     if !(0.0..=LONGEST_EXPOSURE_MS).contains(&exposure_ms) {
         let range = format!("0 to {LONGEST_EXPOSURE_MS} milliseconds");
-        return Err(row.error(format!("the exposure is {exposure_ms}: allowed is {range}")));
+        return Err(row.error(format!("the exposure is {exposure_ms}: must be {range}")));
     }
     Ok((exposure_ms * NANOS_PER_MILLISECOND).round() as u64)
 }

@@ -35,7 +35,7 @@ pub fn decode_gray_into(
         .jpeg_set_out_colorspace(ColorSpace::Luma);
     let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
     decoder.decode_headers().map_err(|e| damaged(e.to_string()))?;
-    let found = decoder.dimensions().ok_or_else(|| damaged("it names no size".to_owned()))?;
+    let found = decoder.dimensions().ok_or_else(|| damaged("it has no image size".to_owned()))?;
     if found != (width, height) || gray.len() != width * height {
         return Err(DecodeError::Size { found, expected: (width, height) });
     }

@@ -327,7 +327,7 @@ mod tests {
         }
         for (model, focal) in [("pinhole", 50.0), ("pinhole", 90000.0), ("equidistant", 100.0)] {
             let error = rig(model, focal).unwrap_err();
-            assert!(error.starts_with(&format!("x.toml: fx = {focal}: allowed is")), "{error}");
+            assert!(error.starts_with(&format!("x.toml: fx = {focal}: must be")), "{error}");
         }
     }
 
@@ -338,16 +338,16 @@ mod tests {
         let path = Path::new("rigs/mine.toml");
         assert!(Rig::from_toml(path, GOOD).is_ok());
         for (from, to, expected) in [
-            ("width = 640", "width = 8", "rigs/mine.toml: width = 8: allowed is 16 to 8192"),
-            ("height = 480", "height = 9000", "height = 9000: allowed is 16 to 8192"),
+            ("width = 640", "width = 8", "rigs/mine.toml: width = 8: must be 16 to 8192"),
+            ("height = 480", "height = 9000", "height = 9000: must be 16 to 8192"),
             ("height = 480", "height = -1", "rigs/mine.toml, line 3: "),
-            ("fx = 500", "fx = 0", "fx = 0: allowed is 1 to 100000"),
-            ("fy = 500.0", "fy = inf", "fy = inf: allowed is 1 to 100000"),
-            ("cx = 320", "cx = 640", "cx = 640: allowed is 0 to 639"),
-            ("cy = 240", "cy = -3", "cy = -3: allowed is 0 to 479"),
-            ("[0.1, ", "[nan, ", "coefficients[0] = NaN: allowed is -1000 to 1000"),
-            ("[0.1, ", "[", "coefficients = [0.0, 0.0, 0.0]: allowed is 4, 5 or 8 numbers"),
-            ("radtan", "pinhole", "allowed is none with model = \"pinhole\""),
+            ("fx = 500", "fx = 0", "fx = 0: must be 1 to 100000"),
+            ("fy = 500.0", "fy = inf", "fy = inf: must be 1 to 100000"),
+            ("cx = 320", "cx = 640", "cx = 640: must be 0 to 639"),
+            ("cy = 240", "cy = -3", "cy = -3: must be 0 to 479"),
+            ("[0.1, ", "[nan, ", "coefficients[0] = NaN: must be -1000 to 1000"),
+            ("[0.1, ", "[", "coefficients = [0.0, 0.0, 0.0]: must be 4, 5 or 8 numbers"),
+            ("radtan", "pinhole", "must be none with model = \"pinhole\""),
             ("radtan", "fov", "line 1: unknown variant `fov`, expected one of"),
             ("cy = 240", "", "missing field `cy`"),
             ("cy = 240", "cy = 240\nvignette = 1", "line 8: unknown field `vignette`"),

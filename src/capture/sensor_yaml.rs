@@ -222,7 +222,7 @@ distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
     fn what_is_wrong_is_named_with_its_line() {
         for (from, to, expected) in [
             ("resolution: [752, 480]", "resolution: [752]", "line 17: needs 2 numbers, has 1"),
-            ("[752, 480]", "[752, 4.5]", "height = 0: allowed is 16 to 8192"),
+            ("[752, 480]", "[752, 4.5]", "height = 0: must be 16 to 8192"),
             ("radial-tangential", "double-sphere", "line 20: distortion_model is `double-sphere`"),
             ("camera_model: pinhole", "camera_model: omni", "line 18: camera_model is `omni`"),
             ("458.654", "nan", "line 19: `nan` is not a finite number"),

@@ -90,7 +90,7 @@ pub enum SourceError {
         folder: PathBuf,
     },
     /// The folder has the layout of another kind of source.
-    #[error("source `{name}`: the folder has not this layout; it looks like {likely}")]
+    #[error("source `{name}`: the folder does not have this layout; it looks like {likely}")]
     Layout {
         /// The source.
         name: String,
@@ -116,7 +116,7 @@ pub enum SourceError {
         problem: String,
     },
     /// There is not a single frame.
-    #[error("{}: has no frames; check that it is the recording that was meant", path.display())]
+    #[error("{}: has no frames; check that this is the right recording", path.display())]
     Empty {
         /// The list or folder.
         path: PathBuf,
@@ -142,7 +142,7 @@ pub enum SourceError {
         rig: PathBuf,
     },
     /// A list of stamps ends before the images do.
-    #[error("{}: has {stamps} stamps for {images} images; give one to each", path.display())]
+    #[error("{}: has {stamps} time stamps for {images} images; give each image one", path.display())]
     FewStamps {
         /// The list.
         path: PathBuf,
@@ -170,7 +170,7 @@ pub enum SourceError {
     Image(#[from] ImageFileError),
     /// A camera without a calibration.
     #[error(
-        "v4l:{name}: a camera needs a rig file, which says what its lens is: name it with --rig FILE (webcam.toml of config/rigs or /usr/share/semidense/rigs is a start, for a first try at 640x480)"
+        "v4l:{name}: a camera needs a rig file with its calibration: name it with --rig FILE (for a first try at 640x480, webcam.toml in config/rigs or /usr/share/semidense/rigs will do)"
     )]
     CameraRig {
         /// The camera.

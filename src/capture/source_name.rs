@@ -182,7 +182,7 @@ fn recognise(path: &Path) -> Result<SourceName, SourceError> {
     let kind = match std::fs::metadata(path) {
         Ok(metadata) => metadata.file_type(),
         Err(_) if has_kind(path) => {
-            return error(format!("this kind is not known; sources are {SOURCE_FORMS}"));
+            return error(format!("unknown kind; sources are {SOURCE_FORMS}"));
         }
         Err(cause) => {
             return error(format!("{cause}; sources are {SOURCE_FORMS}"));
@@ -218,13 +218,13 @@ fn what_a_file_is(path: &Path) -> String {
     if has_ending(path, &VIDEO_ENDINGS) {
         let (video, frames) = (quoted(path), quoted(&path.with_extension("frames")));
         return format!(
-            "this is a video: make a folder of images with times of it, mkdir {frames} && ffmpeg -i {video} -fps_mode passthrough \
+            "this is a video: make a folder of images and times from it, mkdir {frames} && ffmpeg -i {video} -fps_mode passthrough \
              -pix_fmt gray {frames}/%06d.png && ffprobe -v error -select_streams v:0 -show_entries frame=pts_time \
              -of default=nw=1:nk=1 {video} > {frames}/times.txt, and name that folder with --rig FILE for the camera"
         );
     }
     if has_ending(path, &ARCHIVE_ENDINGS) {
-        return "this is an archive: unpack it and name the folder".to_owned();
+        return "this is an archive: unpack it and name its folder".to_owned();
     }
     if has_ending(path, &BAG_ENDINGS) {
         return "this is a ROS bag: export its images into a folder with a times.txt and name that"
@@ -253,7 +253,7 @@ fn nothing_known_in(folder: &Path) -> String {
     if entries.len() > MAX_LISTED {
         names.push(format!("and {} more", entries.len() - MAX_LISTED));
     }
-    let found = if names.is_empty() { "it is empty".to_owned() } else { names.join(", ") };
+    let found = if names.is_empty() { "nothing: it is empty".to_owned() } else { names.join(", ") };
     let hint =
         inner.map_or(String::new(), |inner| format!("; there is a recording in it: {inner}"));
     format!(

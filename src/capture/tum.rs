@@ -52,7 +52,7 @@ fn read_images(folder: &Path, list: &Path) -> Result<Vec<ListedImage>, SourceErr
     let mut images: Vec<ListedImage> = Vec::new();
     for row in rows(list, &text) {
         let (stamp, name) = row.text().split_once(char::is_whitespace).ok_or_else(|| {
-            row.error("needs `timestamp filename`; write the missing one or remove the line")
+            row.error("needs `timestamp filename`; complete the line or remove it")
         })?;
         let nanos = row.seconds(stamp)?;
         row.check_after(images.last().map(|image| image.nanos), nanos)?;

@@ -1,4 +1,4 @@
-//! `semidense bench latency`: how late poses are, at rest and under load.
+//! `semidense bench latency`: the latency of poses, idle and under load.
 
 use std::ffi::OsString;
 use std::process::ExitCode;
@@ -15,7 +15,7 @@ use crate::service::latency_bench::{Disturbance, Measurement, Trial, TrialError,
 use crate::service::results::times::Percentiles;
 use crate::service::shutdown::Shutdown;
 
-/// Measure on this machine
+/// Measure performance on this machine
 #[derive(Debug, Args)]
 pub struct BenchArguments {
     #[command(subcommand)]
@@ -27,16 +27,16 @@ enum Bench {
     Latency(LatencyArguments),
 }
 
-/// What goes on beside the pipeline.
+/// Load next to the pipeline.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Beside {
     /// Each of the following in turn
     All,
-    /// Nothing
+    /// No load
     Idle,
-    /// A busy thread for each CPU
+    /// One busy thread per CPU
     BusyCpus,
-    /// A mapper with more to do than it can
+    /// A mapper with more work than it can do
     SaturatedMapper,
     /// A subscriber that reads slowly
     SlowReader,
@@ -47,34 +47,34 @@ enum Beside {
 /// Scheduling of capture and tracker.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum RealTime {
-    /// As the configuration says
+    /// As configured
     Off,
-    /// FIFO priorities, locked memory, a tracker that is awake when a frame is expected
+    /// FIFO priorities, locked memory, and a tracker that is awake when a frame is due
     On,
-    /// First off, then on
+    /// Off, then on
     Both,
 }
 
-/// Run capture, tracker and mapper live and print how late poses are: at rest and under load, with and
+/// Run capture, tracker and mapper live and report the latency of poses, idle and under load, with and
 /// without real-time scheduling
 #[derive(Debug, Args)]
 pub struct LatencyArguments {
-    /// What is captured, back and forth; the default room is rendered first
+    /// Source to play back and forth; the default room is rendered first
     #[arg(long, value_name = "SOURCE", default_value = "sim")]
     source: OsString,
-    /// Frames in a second
+    /// Frames per second
     #[arg(long, value_name = "HZ", default_value_t = 30.0)]
     fps: f64,
-    /// Seconds of each trial
+    /// Duration of each trial in seconds
     #[arg(long, value_name = "SECONDS", default_value_t = 30.0)]
     seconds: f64,
-    /// What goes on beside
+    /// Load next to the pipeline
     #[arg(long, value_enum, default_value_t = Beside::All)]
     load: Beside,
     /// Scheduling of capture and tracker
     #[arg(long, value_enum, default_value_t = RealTime::Both)]
     realtime: RealTime,
-    /// Print JSON: one object for each trial
+    /// Print JSON, one object per trial
     #[arg(long)]
     json: bool,
 }
@@ -93,7 +93,7 @@ pub fn run(
     let frames = (arguments.fps * arguments.seconds).round();
     if !(1.0..=MAX_FRAMES).contains(&frames) {
         return Err(format!(
-            "--fps {} for --seconds {}: that are {frames} frames; allowed are 1 to {MAX_FRAMES}",
+            "--fps {} for --seconds {} is {frames} frames; choose 1 to {MAX_FRAMES}",
             arguments.fps, arguments.seconds
         )
         .into());
@@ -151,7 +151,7 @@ fn real_times(real_time: RealTime) -> Vec<bool> {
 fn table(measurements: &[Measurement]) -> String {
     let mut lines = vec![format!(
         "{:16} {:9} {:>6} {:>28} {:>28} {:>5} {:>5} {:>6} {:>9}",
-        "beside",
+        "load",
         "schedule",
         "frames",
         "latency p50/p99/p99.9/max",
@@ -182,7 +182,7 @@ fn table(measurements: &[Measurement]) -> String {
     }
     if let Some(deadline_ms) = measurements.first().and_then(|m| m.deadline_ms) {
         lines.push(format!(
-            "times in ms; late: published more than {deadline_ms:.1} ms after the frame arrived; faults: page faults of the frame loop when warm"
+            "times in ms; late: poses published more than {deadline_ms:.1} ms after their frame arrived; faults: page faults of the warm frame loop"
         ));
     }
     lines.join("\n") + "\n"

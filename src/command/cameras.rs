@@ -11,8 +11,8 @@ use crate::command::print::print;
 
 /// List the cameras of this machine: names, formats, sizes, rates and controls
 ///
-/// `v4l:` takes a camera by its path, its number or one of its names; names stay with the camera when it
-/// is plugged in elsewhere (usb-…) or with the plug (pci-…). Formats in brackets cannot be read.
+/// `v4l:` takes a camera's path, its number or one of its names. A usb-… name stays with the camera, a
+/// pci-… name with the port. Formats in parentheses are not supported.
 #[derive(Debug, Args)]
 pub struct CamerasArguments {
     /// Print the list as JSON
@@ -26,7 +26,8 @@ pub fn run(arguments: CamerasArguments) -> CommandResult {
     print(&match arguments.json {
         true => format!("{}\n", serde_json::to_string_pretty(&found)?),
         false if found.is_empty() => {
-            "no cameras: /dev has no video node that gives pictures; recordings and the simulator work without\n".to_owned()
+            "no cameras: /dev has no video capture device; recordings and the simulator need none\n"
+                .to_owned()
         }
         false => found.iter().map(text_of).collect(),
     })?;
@@ -37,8 +38,8 @@ fn text_of(camera: &CameraReport) -> String {
     let mut lines = vec![format!("{}  {}", camera.path.display(), camera.card)];
     let state = match camera.access {
         Access::Free => "free",
-        Access::Busy => "busy: another program streams from it",
-        Access::Forbidden => "may not be opened: usermod -aG video USER, and a new login",
+        Access::Busy => "busy: another program is streaming from it",
+        Access::Forbidden => "permission denied: run usermod -aG video USER and log in again",
         Access::Unusable => "cannot be opened",
     };
     let problem = camera.problem.as_ref().filter(|_| camera.access == Access::Unusable);
@@ -79,7 +80,7 @@ fn control_line(control: &ControlReport) -> String {
     let item = item.map_or(String::new(), |(_, name)| format!(" ({name})"));
     let fixed = if control.fixed { ", cannot be set now" } else { "" };
     format!(
-        "  control   {}: {value}{item}, {} to {} in steps of {}, by default {}{fixed}",
+        "  control   {}: {value}{item}, {} to {} in steps of {}, default {}{fixed}",
         control.name, control.minimum, control.maximum, control.step, control.default
     )
 }

@@ -28,19 +28,20 @@ pub struct CaptureArguments {
 /// Where frames come from.
 #[derive(Debug, Clone, Args)]
 pub struct SourceArguments {
-    /// Where frames come from: DIR (its layout is recognised), sim, sim:SCENE, tum:DIR, euroc:DIR,
-    /// images:DIR, v4l:DEVICE, or loop:FRAMES:HZ:SOURCE, another source back and forth, FRAMES in all at
-    /// HZ a second [default: capture.source of the configuration, which is sim]
+    /// Where frames come from: DIR (its layout is detected), sim, sim:SCENE, tum:DIR, euroc:DIR,
+    /// images:DIR, v4l:DEVICE, or loop:FRAMES:HZ:SOURCE, which plays another source back and forth, FRAMES frames
+    /// at HZ [default: capture.source of the configuration, which is sim]
     #[arg(value_name = "SOURCE")]
     source: Option<OsString>,
     /// The same as SOURCE, as scripts of earlier versions have it
     #[arg(long = "source", value_name = "SOURCE", hide = true, conflicts_with = "source")]
     source_option: Option<OsString>,
-    /// Rig file with the camera's calibration; a camera (v4l) needs one [default: capture.rig of the configuration, for the source that stands there]
+    /// Rig file with the camera's calibration; required for a camera (v4l) [default: capture.rig of the
+    /// configuration, for the source configured there]
     #[arg(long, value_name = "FILE")]
     rig: Option<PathBuf>,
-    /// End with an error at an image of a recording that is damaged or missing; otherwise it is left out,
-    /// counted and named [default: capture.strict of the configuration]
+    /// Stop with an error at a damaged or missing image of a recording; otherwise it is left out, counted and
+    /// named [default: capture.strict of the configuration]
     #[arg(long)]
     pub strict: bool,
 }
@@ -58,8 +59,8 @@ impl SourceArguments {
                 let source = SourceName::parse(&source)?;
                 if let (Some(rig), None) = (configured, &self.rig) {
                     note(&format!(
-                        "warning: capture.rig ({}) is for the source of the configuration and not used for {source}; \
-                         --rig FILE names one",
+                        "warning: capture.rig ({}) belongs to the configured source and is not used for {source}; \
+                         name a rig with --rig FILE",
                         rig.display()
                     ));
                 }
@@ -73,10 +74,10 @@ impl SourceArguments {
 /// How frames are paced.
 #[derive(Debug, Clone, Copy, Args)]
 pub struct ModeArguments {
-    /// Every frame in order, the same result on every run [default for recordings and simulator]
+    /// Process every frame in order; every run gives the same result [default for recordings and the simulator]
     #[arg(long, conflicts_with = "live")]
     pub lockstep: bool,
-    /// At the pace of the stamps, the newest frame wins [default for cameras]
+    /// Keep the pace of the time stamps; the newest frame wins [default for cameras]
     #[arg(long)]
     pub live: bool,
 }

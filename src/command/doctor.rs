@@ -1,4 +1,4 @@
-//! `semidense doctor`: what on this machine will cost latency or break.
+//! `semidense doctor`: what on this machine will cost latency or fail.
 
 use std::process::ExitCode;
 
@@ -9,10 +9,10 @@ use crate::command::print::print;
 use crate::service::config::Config;
 use crate::service::doctor::{Finding, Machine, Severity, examine};
 
-/// Look for what on this machine will cost latency or break, and say how to mend it
+/// Check what on this machine will cost latency or fail, and say how to fix it
 ///
-/// Looks at limits, CPU governor, real-time throttling, clock source, shared memory, permissions and
-/// cameras. Exits with 1 when something will not work.
+/// Checks limits, CPU governor, real-time throttling, clock source, shared memory, permissions and
+/// cameras. Exits with 1 if something will not work.
 #[derive(Debug, Args)]
 pub struct DoctorArguments {
     /// Print the findings as JSON
@@ -39,7 +39,7 @@ fn line(finding: &Finding) -> String {
     };
     let remedy = match finding.remedy.is_empty() {
         true => String::new(),
-        false => format!("{:31} mend it: {}\n", "", finding.remedy),
+        false => format!("{:31} fix: {}\n", "", finding.remedy),
     };
     format!("{severity:8} {:21} {}\n{remedy}", finding.subject, finding.found)
 }

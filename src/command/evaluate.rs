@@ -31,10 +31,10 @@ enum Align {
 
 /// Compare a trajectory with ground truth: absolute and relative errors, scale
 ///
-/// Files are in TUM layout (timestamp tx ty tz qx qy qz qw) or EuRoC ground truth (CSV). EuRoC's poses
-/// are the body's and are moved to the camera by the T_BS of cam0/sensor.yaml, also those of an estimate in
-/// that layout. Each pose of the shorter trajectory is compared with the one nearest in time of
-/// the longer; figures are those of the Python package evo.
+/// Files are in TUM layout (timestamp tx ty tz qx qy qz qw) or EuRoC ground truth (CSV). EuRoC poses are
+/// those of the body; they are moved to the camera with T_BS of cam0/sensor.yaml, as is an estimate in that
+/// layout. Each pose of the shorter trajectory is compared with the pose of the longer one that is nearest in
+/// time; the figures are those of the Python package evo.
 #[derive(Debug, Args)]
 pub struct EvaluateArgs {
     /// Estimated trajectory
@@ -43,20 +43,20 @@ pub struct EvaluateArgs {
     /// True trajectory
     #[arg(value_name = "GT")]
     truth: PathBuf,
-    /// What is fitted before positions are compared
+    /// Alignment before positions are compared
     #[arg(long, value_enum, default_value = "sim3")]
     align: Align,
-    /// Largest difference of stamps taken for the same instant, seconds
+    /// Largest difference between matched time stamps, in seconds
     #[arg(long, value_name = "SECS", default_value_t = 0.02, value_parser = parse_difference)]
     max_difference: f64,
-    /// sensor.yaml of the camera, where it does not lie beside EuRoC ground truth; says of ground truth in any
-    /// layout that its poses are the body's
+    /// sensor.yaml of the camera, if it is not next to EuRoC ground truth; with ground truth in another layout it
+    /// also says that its poses are those of the body
     #[arg(long, value_name = "FILE")]
     sensor: Option<PathBuf>,
     /// Print the figures as JSON, with the keys of summary.json
     #[arg(long)]
     json: bool,
-    /// Write a plot of both trajectories and of the error
+    /// Write a plot of both trajectories and the error
     #[arg(long, value_name = "FILE.svg")]
     plot: Option<PathBuf>,
 }
@@ -66,7 +66,7 @@ fn parse_difference(text: &str) -> Result<f64, String> {
     const LONGEST_SECS: f64 = 3600.0;
     let secs: f64 = text.parse().map_err(|_| "expected seconds, such as 0.02".to_owned())?;
     let allowed = (0.0..=LONGEST_SECS).contains(&secs);
-    allowed.then_some(secs).ok_or_else(|| format!("allowed is 0 to {LONGEST_SECS} s"))
+    allowed.then_some(secs).ok_or_else(|| format!("expected 0 to {LONGEST_SECS} s"))
 }
 
 /// Reads both files, compares them and prints the figures.
@@ -111,8 +111,8 @@ fn move_to_camera(
     let Some(path) = args.sensor.clone().or_else(beside) else {
         if truth.is_euroc {
             note(&format!(
-                "warning: the poses of {} are the body's and no cam0/sensor.yaml lies beside its folder: \
-                 relative errors are about other axes than the camera's; name the file with --sensor",
+                "warning: {} holds poses of the body and there is no cam0/sensor.yaml next to its folder: relative \
+                 errors are not about the camera's axes; name the file with --sensor",
                 args.truth.display()
             ));
         }
@@ -125,7 +125,7 @@ fn move_to_camera(
         pose.world_from_camera = pose.world_from_camera * body_from_camera;
     }
     let what = if with_estimate { "estimate and ground truth" } else { "ground truth" };
-    note(&format!("{what} of the body, moved to the camera by {}", path.display()));
+    note(&format!("{what}: poses of the body, moved to the camera with {}", path.display()));
     Ok(())
 }
 

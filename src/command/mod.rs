@@ -61,7 +61,7 @@ pub type CommandResult = Result<ExitCode, Box<dyn Error>>;
     version,
     about = "Real-time semi-dense direct visual SLAM for robot computers",
     after_help = "Start with `semidense run`: it simulates a camera in a furnished room, tracks it, maps the room,\n\
-                  and writes trajectory, map and figures into a new folder below ./output.\n\
+                  and writes trajectory, map and report into a new folder under ./output.\n\
                   Then `semidense run DIR` for a recording, `semidense run v4l:0 --rig FILE` for a camera.\n\n\
                   Exit codes: 0 done, 1 failed, 2 wrong usage, 3 nothing was tracked, 130 interrupted before the end (results so far are written)."
 )]
@@ -75,20 +75,20 @@ struct CommandLine {
 /// Options that every command has.
 #[derive(Debug, Clone, Args)]
 pub struct CommonArguments {
-    /// Configuration file [default: /etc/semidense/NAME.toml of the instance, else
-    /// /etc/semidense/semidense.toml, where they exist]
+    /// Configuration file [default: /etc/semidense/NAME.toml for the instance NAME, else
+    /// /etc/semidense/semidense.toml, if it exists]
     #[arg(long, global = true, help_heading = COMMON, value_name = "FILE")]
     pub config: Option<PathBuf>,
-    /// Set one key of the configuration, as in mapper.threads=2; may be repeated
+    /// Set one configuration key, e.g. mapper.threads=2; may be repeated
     #[arg(long, global = true, help_heading = COMMON, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
-    /// Name of the instance: two of different names run side by side [default: semidense]
+    /// Name of the instance; instances with different names run side by side [default: semidense]
     #[arg(long, global = true, help_heading = COMMON, value_name = "NAME")]
     pub instance: Option<String>,
-    /// What to log: error, warn, info, debug or trace, also by module
+    /// What to log: error, warn, info, debug or trace, also per module (semidense::service=debug)
     #[arg(long, global = true, help_heading = COMMON, value_name = "LEVEL", default_value = "warn")]
     pub log: String,
-    /// How to log: lines of text or JSON on standard error, or the systemd journal
+    /// How to log: text or JSON lines on standard error, or the systemd journal
     #[arg(long, global = true, help_heading = COMMON, value_name = "FORMAT", value_enum, default_value_t)]
     pub log_format: LogFormat,
 }
@@ -99,7 +99,7 @@ pub enum LogFormat {
     /// Lines of text on standard error
     #[default]
     Text,
-    /// One JSON object a line on standard error
+    /// One JSON object per line on standard error
     Json,
     /// The systemd journal, with its fields
     Journald,
@@ -175,7 +175,7 @@ pub fn main() -> ExitCode {
     let log = match ErrorLog::start() {
         Ok(log) => log,
         Err(error) => {
-            note(&format!("{ERROR_PREFIX}no thread for the log can be started ({error})"));
+            note(&format!("{ERROR_PREFIX}cannot start the log thread ({error})"));
             return ExitCode::FAILURE;
         }
     };
@@ -185,7 +185,7 @@ pub fn main() -> ExitCode {
     if log.dropped_lines() > 0 {
         let dropped = log.dropped_lines();
         note(&format!(
-            "warning: {dropped} lines of the log were dropped: nobody read them in time"
+            "warning: {dropped} log lines were dropped because standard error was not read in time"
         ));
     }
     outcome.unwrap_or_else(|error| {
@@ -204,7 +204,7 @@ fn run_subcommand(line: CommandLine, log: &ErrorLog) -> CommandResult {
     let place = Place::new(&config.instance, &config.root)?;
     if let Some(occupied) = &place.occupied {
         note(&format!(
-            "warning: {} is not a folder of this user alone; {} is used in its place",
+            "warning: {} is not private to this user; using {} instead",
             occupied.display(),
             place.root.display()
         ));
@@ -237,7 +237,7 @@ fn log_filter(text: &str) -> Result<EnvFilter, String> {
     for directive in text.split(',') {
         let level = directive.rsplit_once('=').map_or(directive, |(_, level)| level);
         if !is_level(level) {
-            return Err(format!("--log {text}: `{}` is no level; {form}", level.trim()));
+            return Err(format!("--log {text}: `{}` is not a log level; {form}", level.trim()));
         }
     }
     EnvFilter::try_new(text).map_err(|error| format!("--log {text}: {error}; {form}"))
@@ -255,8 +255,9 @@ fn start_log(filter: EnvFilter, format: LogFormat, log: &ErrorLog) -> Result<(),
         LogFormat::Text => registry.with(lines).init(),
         LogFormat::Json => registry.with(lines.json()).init(),
         LogFormat::Journald => {
-            let journal = tracing_journald::layer()
-                .map_err(|error| format!("--log-format journald: no journal here ({error})"))?;
+            let journal = tracing_journald::layer().map_err(|error| {
+                format!("--log-format journald: there is no systemd journal here ({error})")
+            })?;
             registry.with(journal).init();
         }
     }

@@ -9,7 +9,7 @@ const LONGEST_WAIT: Timespec = Timespec { tv_sec: 1, tv_nsec: 0 };
 
 /// Standard output takes no more.
 #[derive(Debug, thiserror::Error)]
-#[error("standard output: {0}; write it to a place with room")]
+#[error("cannot write to standard output: {0}; redirect it to a place with room")]
 pub struct PrintError(#[from] io::Error);
 
 impl PrintError {

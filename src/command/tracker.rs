@@ -11,7 +11,7 @@ use crate::service::mode::Mode;
 use crate::service::shutdown::Shutdown;
 use crate::service::tracker::run as run_shell;
 
-/// Track every frame against the keyframe in force and publish its pose
+/// Track every frame against the active keyframe and publish its pose
 #[derive(Debug, Args)]
 pub struct TrackerArguments {
     #[command(flatten)]

@@ -85,7 +85,7 @@ fn write(path: &Path, map: &Map) -> io::Result<()> {
 fn write_or_warn(path: &Path, map: &Map) {
     if let Err(error) = write(path, map) {
         tracing::warn!(
-            "{}: no checkpoint ({error}); a mapper that dies will begin anew",
+            "{}: cannot write the checkpoint ({error}); a restarted mapper would begin a new map",
             path.display()
         );
     }

@@ -39,10 +39,10 @@ const LOOK_PAUSE: Duration = Duration::from_millis(2);
 #[derive(Debug, thiserror::Error)]
 pub enum FollowError {
     /// The supervisor has died before this process could follow it.
-    #[error("the supervisor has gone")]
+    #[error("the supervisor is gone")]
     Gone,
     /// The kernel refuses.
-    #[error("the kernel does not tell when the supervisor dies ({0})")]
+    #[error("cannot watch whether the supervisor lives ({0})")]
     Kernel(io::Error),
 }
 
@@ -66,8 +66,9 @@ pub fn memory_for_frames(source: &SourceName, mode: Mode) -> Option<File> {
         return None;
     }
     let memory = rustix::fs::memfd_create("semidense-frames", MemfdFlags::CLOEXEC);
-    let said =
-        memory.inspect_err(|error| tracing::warn!("a capture that dies prepares anew ({error})"));
+    let said = memory.inspect_err(|error| {
+        tracing::warn!("after a restart, capture would have to prepare the source again ({error})")
+    });
     said.ok().map(File::from)
 }
 

@@ -1,4 +1,4 @@
-//! What on this machine will cost latency or break: each finding with the line that mends it.
+//! What on this machine will cost latency or fail: each finding with the command that fixes it.
 
 mod cameras;
 mod processes;
@@ -37,7 +37,7 @@ pub struct Finding {
     pub severity: Severity,
     /// What was found.
     pub found: String,
-    /// The line that mends it; empty where nothing needs mending.
+    /// The line that fixes it; empty where nothing needs fixing.
     pub remedy: String,
 }
 
@@ -111,7 +111,7 @@ fn real_time_limit(config: &Config) -> Finding {
         return Finding::ok(SUBJECT, if is_root { "root: any priority".to_owned() } else { found });
     }
     let remedy = format!(
-        "LimitRTPRIO={wanted} in the unit, or `{} - rtprio {wanted}` in /etc/security/limits.conf and a new login",
+        "LimitRTPRIO={wanted} in the unit, or `{} - rtprio {wanted}` in /etc/security/limits.conf, then log in again",
         user()
     );
     let found = format!("priorities up to {found}, {wanted} wanted");
@@ -130,10 +130,10 @@ fn memory_limit(config: &Config) -> Finding {
         return Finding::ok(SUBJECT, found);
     }
     let remedy = format!(
-        "LimitMEMLOCK=infinity in the unit, or `{} - memlock unlimited` in /etc/security/limits.conf and a new login",
+        "LimitMEMLOCK=infinity in the unit, or `{} - memlock unlimited` in /etc/security/limits.conf, then log in again",
         user()
     );
-    let found = format!("{} MB may be locked", limit.unwrap_or(0) >> 20);
+    let found = format!("{} MB may be locked, which is too little", limit.unwrap_or(0) >> 20);
     match config.tracker.scheduling.lock_memory {
         true => Finding::error(SUBJECT, found, remedy),
         false => Finding::warning(SUBJECT, found, remedy),
@@ -192,7 +192,7 @@ fn runtime_folder(config: &Config) -> Finding {
         Err(error) => Finding::error(
             SUBJECT,
             error.to_string(),
-            "run as the user who owns it, or set SEMIDENSE_ROOT to a folder of yours",
+            "run as the user who owns it, or set SEMIDENSE_ROOT to a folder of your own",
         ),
     }
 }
@@ -214,12 +214,11 @@ impl Machine {
                     "sysctl kernel.sched_rt_runtime_us=950000",
                 )
             }
-            (Some(runtime), Some(period)) if runtime >= 0 => Finding::ok(
-                SUBJECT,
-                format!("{runtime} of {period} µs: enough, nothing here spins"),
-            ),
+            (Some(runtime), Some(period)) if runtime >= 0 => {
+                Finding::ok(SUBJECT, format!("{runtime} of {period} µs: enough"))
+            }
             (Some(_), _) => Finding::ok(SUBJECT, "off"),
-            _ => Finding::ok(SUBJECT, "the kernel does not say"),
+            _ => Finding::ok(SUBJECT, "unknown: the kernel does not tell"),
         }
     }
 
@@ -227,11 +226,11 @@ impl Machine {
         const SUBJECT: &str = "CPU governor";
         let path = "sys/devices/system/cpu/cpu0/cpufreq/scaling_governor";
         match self.read(path).as_deref() {
-            None => Finding::ok(SUBJECT, "none: the clock does not change here"),
+            None => Finding::ok(SUBJECT, "none: the CPU clock is fixed"),
             Some("performance") => Finding::ok(SUBJECT, "performance"),
             Some(other) => Finding::warning(
                 SUBJECT,
-                format!("{other}: the first milliseconds after a pause are slow"),
+                format!("{other}: the first milliseconds after idling are slow"),
                 "cpupower frequency-set -g performance",
             ),
         }
@@ -241,7 +240,7 @@ impl Machine {
         const SUBJECT: &str = "clock source";
         let folder = "sys/devices/system/clocksource/clocksource0";
         let Some(current) = self.read(&format!("{folder}/current_clocksource")) else {
-            return Finding::ok(SUBJECT, "the kernel does not say");
+            return Finding::ok(SUBJECT, "unknown: the kernel does not tell");
         };
         let slow = ["hpet", "acpi_pm", "jiffies", "refined-jiffies"];
         if !slow.contains(&current.as_str()) {
@@ -249,7 +248,7 @@ impl Machine {
         }
         Finding::warning(
             SUBJECT,
-            format!("{current}: every look at the clock costs a microsecond"),
+            format!("{current}: reading the clock takes a microsecond each time"),
             format!(
                 "echo tsc > /{folder}/current_clocksource, or tsc=reliable on the kernel's command line"
             ),
@@ -267,7 +266,7 @@ impl Machine {
         if count >= 2 {
             return Finding::ok(SUBJECT, found);
         }
-        Finding::warning(SUBJECT, found, "give it two: the mapper takes one for itself")
+        Finding::warning(SUBJECT, found, "give it two or more: the mapper takes one for itself")
     }
 }
 

@@ -19,7 +19,7 @@ use crate::wire::port::ReceiveError;
 #[derive(Debug, thiserror::Error)]
 pub enum FinalMapError {
     /// It does not answer.
-    #[error("the mapper gives no sign of life; the map is that of its last checkpoint")]
+    #[error("the mapper does not respond; the map is that of its last checkpoint")]
     Silent,
     /// It has ended.
     #[error("the mapper is gone; the map is that of its last checkpoint")]

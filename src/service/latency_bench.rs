@@ -138,7 +138,7 @@ pub enum TrialError {
     #[error(transparent)]
     Place(#[from] PlaceError),
     /// No thread for the disturbance.
-    #[error("a thread for the disturbance cannot be started ({0})")]
+    #[error("cannot start a thread for the load ({0})")]
     Thread(std::io::Error),
 }
 

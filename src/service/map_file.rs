@@ -40,7 +40,7 @@ pub enum MapFileError {
         source: io::Error,
     },
     /// The file is something else.
-    #[error("{0}: this is no map of this version")]
+    #[error("{0} is not a map of this version")]
     Magic(PathBuf),
     /// More than any map has.
     #[error("{path}: {what} = {count} is more than any map has")]
@@ -63,7 +63,7 @@ pub enum MapFileError {
         source: MessageError,
     },
     /// There is more than the map.
-    #[error("{0}: there are bytes after the map's end")]
+    #[error("{0} has bytes after the end of the map")]
     Trailing(PathBuf),
 }
 

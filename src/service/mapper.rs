@@ -70,7 +70,7 @@ pub enum MapperError {
     #[error("mapping: {0}")]
     Parameter(#[from] ParameterError),
     /// No threads.
-    #[error("the pool of {threads} threads cannot be made ({reason}); set mapper.threads")]
+    #[error("cannot start {threads} mapper threads ({reason}); lower mapper.threads")]
     Pool {
         /// How many were wanted.
         threads: usize,
@@ -348,7 +348,7 @@ fn nanos_since(begin: i64) -> u64 {
 /// What a dead mapper has left, and the keeper of our own. Without either the mapper works too.
 fn open_checkpoint(path: &Path) -> (Option<Kept>, Option<Map>) {
     let left = read_checkpoint(path).unwrap_or_else(|error| {
-        tracing::warn!("the map begins anew: {error}");
+        tracing::warn!("starting a new map: {error}");
         None
     });
     let mut reservation = left.clone().unwrap_or_default();

@@ -92,7 +92,7 @@ impl PositionKeeper {
             Ok((file, left)) => (Self { file: Some(file) }, left),
             Err(error) => {
                 let path = path.display();
-                tracing::warn!("{path}: the place in the source cannot be kept ({error})");
+                tracing::warn!("{path}: cannot save the position in the source ({error})");
                 (Self::default(), None)
             }
         }
@@ -101,7 +101,7 @@ impl PositionKeeper {
     /// Writes the position of a frame that is about to be sent. A file that refuses is said once.
     pub fn note_or_warn(&mut self, position: &Position) {
         if let Some(Err(error)) = self.file.as_mut().map(|file| file.note(position)) {
-            tracing::warn!("the place in the source is not kept any more ({error})");
+            tracing::warn!("the position in the source is not saved any more ({error})");
             self.file = None;
         }
     }

@@ -233,7 +233,7 @@ fn bus_error(name: &str, free_bytes: Option<u64>) -> String {
             free >> 10
         ),
         _ => format!(
-            "{name} was killed by SIGBUS: a page that it had mapped was not there; look at {SHARED_MEMORY} (full?) and at the disk of the recording"
+            "{name} was killed by SIGBUS: a page it had mapped was not available; check the free space of {SHARED_MEMORY} and of the disk of the recording"
         ),
     }
 }
@@ -252,7 +252,9 @@ fn hang(name: &str, liveness: Liveness) -> String {
 
 fn signal_name(signal: i32) -> String {
     match Signal::from_named_raw(signal) {
-        Some(Signal::KILL) => "SIGKILL (by hand, or by the kernel for want of memory)".to_owned(),
+        Some(Signal::KILL) => {
+            "SIGKILL (by hand, or by the kernel because memory ran out)".to_owned()
+        }
         Some(Signal::SEGV) => "SIGSEGV".to_owned(),
         Some(Signal::ABORT) => "SIGABRT".to_owned(),
         Some(Signal::TERM) => "SIGTERM".to_owned(),

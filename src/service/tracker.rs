@@ -59,7 +59,7 @@ pub enum TrackerError {
     #[error("tracking: {0}")]
     Parameter(#[from] ParameterError),
     /// The thread that prepares keyframes cannot be started.
-    #[error("the thread that prepares keyframes cannot be started ({0})")]
+    #[error("cannot start the thread that prepares keyframes ({0})")]
     Thread(std::io::Error),
 }
 
@@ -328,13 +328,15 @@ fn take_or<T, E>(
 /// A state and its reason, for whoever looks on.
 fn state_text(state: TrackingState) -> &'static str {
     match state {
-        TrackingState::Initializing => "initializing: the mapper has no map to trust yet",
+        TrackingState::Initializing => "initializing: there is no trusted map yet",
         TrackingState::Tracking => "tracking",
-        TrackingState::Degraded(DegradedReason::Budget) => "degraded: the time ran out",
+        TrackingState::Degraded(DegradedReason::Budget) => "degraded: out of time",
         TrackingState::Degraded(DegradedReason::LowOverlap) => {
             "degraded: little of the keyframe is in view"
         }
-        TrackingState::Degraded(DegradedReason::HighResidual) => "degraded: the images fit badly",
+        TrackingState::Degraded(DegradedReason::HighResidual) => {
+            "degraded: the images fit the map badly"
+        }
         TrackingState::Degraded(DegradedReason::Gap) => "degraded: frames are missing",
         TrackingState::Lost(LostReason::Diverged) => "lost: the keyframe is out of view",
         TrackingState::Lost(LostReason::TooFewInliers) => "lost: too few points match",

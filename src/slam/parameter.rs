@@ -5,7 +5,7 @@ use std::ops::RangeInclusive;
 
 /// A parameter with a value that its algorithm cannot work with.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[error("{key} = {value}: allowed is {allowed}")]
+#[error("{key} = {value}: must be {allowed}")]
 pub struct ParameterError {
     /// The key as it stands in the configuration, dotted below the algorithm's table.
     pub key: String,

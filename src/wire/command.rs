@@ -40,7 +40,7 @@ pub enum CommandError {
     #[error("mapper: {0}")]
     Refused(String),
     /// No answer came.
-    #[error("the mapper gave no answer within {0:?}")]
+    #[error("the mapper did not answer within {0:?}")]
     NoAnswer(Duration),
 }
 

@@ -39,7 +39,7 @@ pub enum MessageError {
         field: &'static str,
     },
     /// Size and intrinsics that no camera has.
-    #[error("size {width} × {height} and its intrinsics belong to no camera")]
+    #[error("size {width} × {height} and intrinsics are not those of a camera")]
     InvalidIntrinsics {
         /// Width in pixels.
         width: u32,

@@ -10,7 +10,7 @@ pub enum OpenError {
     #[error(transparent)]
     Place(#[from] PlaceError),
     /// iceoryx2 cannot make a node there.
-    #[error("{root}: this process cannot join there: {reason}")]
+    #[error("cannot join the instance in {root}: {reason}")]
     Node {
         /// Folder.
         root: String,
@@ -18,7 +18,7 @@ pub enum OpenError {
         reason: String,
     },
     /// Nobody offers this topic.
-    #[error("nothing runs under the name `{instance}` in {root}")]
+    #[error("nothing is running as instance `{instance}` in {root}")]
     NotRunning {
         /// Instance.
         instance: String,

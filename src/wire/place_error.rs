@@ -9,14 +9,18 @@ use crate::wire::place::{MAX_ROOT_BYTES, ROOT_VARIABLE, SHARED_MEMORY};
 #[derive(Debug, thiserror::Error)]
 pub enum PlaceError {
     /// The name of the instance.
-    #[error("instance `{0}` is not a name: use 1 to 32 of the characters a-z, A-Z, 0-9, _ and -")]
+    #[error(
+        "instance `{0}` is not a valid name: use 1 to 32 of the characters a-z, A-Z, 0-9, _ and -"
+    )]
     Instance(String),
     /// The folder's path is too long.
-    #[error("{0}: the runtime folder may have at most {MAX_ROOT_BYTES} bytes; set {ROOT_VARIABLE}")]
+    #[error(
+        "{0}: the path of the runtime folder may have at most {MAX_ROOT_BYTES} bytes; set {ROOT_VARIABLE}"
+    )]
     TooLong(PathBuf),
     /// The folder's path has bytes that a service cannot have.
     #[error(
-        "{0}: the runtime folder's path may have letters, digits and the like, all of them UTF-8; set {ROOT_VARIABLE}"
+        "{0}: the path of the runtime folder has characters that are not allowed; set {ROOT_VARIABLE}"
     )]
     Characters(PathBuf),
     /// The folder belongs to someone else.
@@ -32,7 +36,7 @@ pub enum PlaceError {
     },
     /// A process that joins does not get ready.
     #[error(
-        "{0}: another process has held this lock for ten seconds; is one of semidense's stopped (ps -o pid,stat,cmd -C semidense)? Continue or kill it"
+        "{0}: another process has held this lock for ten seconds: if a semidense process is stopped (ps -o pid,stat,cmd -C semidense), continue or kill it"
     )]
     Held(PathBuf),
     /// There is one already.
@@ -49,7 +53,7 @@ pub enum PlaceError {
     },
     /// Too few files may be open at a time.
     #[error(
-        "a process may have {limit} files open here where {needed} are needed: raise the limit (ulimit -n 1024, LimitNOFILE= of a systemd unit, docker run --ulimit nofile=1024)"
+        "only {limit} open files are allowed here, {needed} are needed: raise the limit (ulimit -n 1024, LimitNOFILE= of a systemd unit, docker run --ulimit nofile=1024)"
     )]
     OpenFiles {
         /// The limit.
@@ -59,7 +63,7 @@ pub enum PlaceError {
     },
     /// Too little address space.
     #[error(
-        "a process may have {limit_mb} MB of address space here where {needed_mb} MB are needed: raise the limit (ulimit -v unlimited, LimitAS= of a systemd unit)"
+        "only {limit_mb} MB of address space are allowed here, {needed_mb} MB are needed: raise the limit (ulimit -v unlimited, LimitAS= of a systemd unit)"
     )]
     AddressSpace {
         /// The limit.
@@ -84,7 +88,7 @@ pub enum PlaceError {
     },
     /// Too little shared memory.
     #[error(
-        "{SHARED_MEMORY} has {free_mb} MB free where {needed_mb} MB are needed: enlarge it (mount -o remount,size=…, or docker run --shm-size=…)"
+        "{SHARED_MEMORY} has only {free_mb} MB free, {needed_mb} MB are needed: enlarge it (mount -o remount,size=…, or docker run --shm-size=…)"
     )]
     SharedMemory {
         /// Free.

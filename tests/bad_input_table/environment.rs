@@ -49,7 +49,7 @@ pub const CONFIGURATION: &[Row] = &[
         &["expected a number"],
     ),
     row("an instance that is no name", "", "semidense run --instance a/b", 1, &["a/b"]),
-    row("a log level that is none", "", "semidense run --log loud", 1, &["--log loud"]),
+    row("a word that is not a log level", "", "semidense run --log loud", 1, &["--log loud"]),
     row("an option that is not known", "", "semidense run --fast", 2, &["--fast"]),
 ];
 
@@ -130,7 +130,7 @@ pub const TRAJECTORIES: &[Row] = &[
         &["e:1: 3 columns"],
     ),
     row(
-        "a number that is none",
+        "something that is not a number",
         "echo '1 0 nan 0 0 0 0 1' > e",
         "semidense evaluate e recording/groundtruth.txt",
         1,
@@ -165,14 +165,14 @@ pub const LIMITS: &[Row] = &[
         "",
         "ulimit -n 12; semidense run recording",
         1,
-        &["12 files open", "ulimit -n"],
+        &["only 12 open files", "ulimit -n"],
     ),
     row(
         "32 open files",
         "",
         "ulimit -n 32; semidense run recording",
         1,
-        &["32 files open", "ulimit -n"],
+        &["only 32 open files", "ulimit -n"],
     ),
     row(
         "100 MB of address space",
@@ -195,5 +195,5 @@ pub const LIMITS: &[Row] = &[
         1,
         &["file", "SEMIDENSE_ROOT"],
     ),
-    row("nothing that runs", "", "semidense status --once", 1, &["nothing runs"]),
+    row("nothing that runs", "", "semidense status --once", 1, &["nothing is running"]),
 ];

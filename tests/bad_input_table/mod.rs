@@ -29,9 +29,9 @@ pub struct Section {
 pub const INTRODUCTION: &str = "\
 # Bad inputs
 
-What semidense says to inputs that are wrong, and its exit code: 0 done (what was left out is said), 1 failed, 2 a command \
-line that is not understood, 3 nothing was tracked, 130 ended by Ctrl-C. Every row is run by `tests/bad_input.rs`, which fails when the program says something else \
-than stands here; `SEMIDENSE_WRITE_DOCS=1 cargo test --release --test bad_input` writes the page. `recording` is a folder \
+The messages of semidense for wrong inputs, and its exit code: 0 done (it says what was left out), 1 failed, 2 wrong \
+command line, 3 nothing was tracked, 130 stopped by Ctrl-C. Every row is run by `tests/bad_input.rs`, which fails when the \
+program says anything else than this page; `SEMIDENSE_WRITE_DOCS=1 cargo test --release --test bad_input` writes the page. `recording` is a folder \
 in TUM layout with twenty images of 160x120 pixels, `rig.toml` its camera, `…` the folder where the command runs, N a number \
 that depends on the machine.
 ";
@@ -60,8 +60,8 @@ pub const SECTIONS: &[Section] = &[
 
 const SOURCES: &[Row] = &[
     row("a folder that is not there", "", "semidense run nowhere", 1, &["nowhere", "No such file"]),
-    row("the same with its kind", "", "semidense replay tum:nowhere", 1, &["no folder nowhere"]),
-    row("a kind that is not known", "", "semidense run ros:topic", 1, &["this kind is not known"]),
+    row("the same with its layout", "", "semidense replay tum:nowhere", 1, &["no folder nowhere"]),
+    row("a kind that is not known", "", "semidense run ros:topic", 1, &["unknown kind"]),
     row("no folder after the kind", "", "semidense run euroc:", 1, &["the folder is missing"]),
     row("a scene that is not known", "", "semidense run sim:moon", 1, &["sim:moon"]),
     row("an empty folder", "mkdir empty", "semidense run empty", 1, &["it is empty", "rgb.txt"]),
@@ -284,7 +284,7 @@ const LISTS: &[Row] = &[
         "mv recording/rgb images; echo 1 > images/times.txt",
         "semidense run images --rig rig.toml",
         1,
-        &["1 stamps for 20 images"],
+        &["1 time stamps for 20 images"],
     ),
     row(
         "images without stamps or rate",
@@ -320,7 +320,7 @@ const RIGS: &[Row] = &[
         &["unknown field `lens`"],
     ),
     row(
-        "a number that is none",
+        "something that is not a number",
         "echo 'nan 131 79.5 59.5 160 120' > recording/camera.txt",
         "semidense run recording",
         1,
@@ -385,6 +385,6 @@ const CAMERAS: &[Row] = &[
         "",
         "until_said waiting semidense run v4l:/dev/video99 --rig rig.toml --output out",
         130,
-        &["waiting: there is no camera /dev/video99", "Ctrl-C ends"],
+        &["waiting: there is no camera /dev/video99", "Ctrl-C stops the run"],
     ),
 ];

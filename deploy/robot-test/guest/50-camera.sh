@@ -18,7 +18,7 @@ expect "without a rig: one line that says so" "$seen" sh -c "echo '$seen' | grep
 for one in scaler cropping composing; do control enable_capture_$one=0; done
 seen=$(timeout 60 $user semidense capture --instance odd --source v4l:0 --rig "$work/rig.toml" 2>&1)
 code=$?
-expect "a size that is not granted: an error with the sizes" "$code, $seen" sh -c "test $code = 1 && echo '$seen' | grep -q 'gives 640x480 .* where ${width}x'"
+expect "a size that is not granted: an error with the sizes" "$code, $seen" sh -c "test $code = 1 && echo '$seen' | grep -q 'delivers 640x480 .* instead of ${width}x'"
 for one in scaler cropping composing; do control enable_capture_$one=1; done
 
 echo "-- states"
@@ -27,7 +27,7 @@ begin
 soon "forbidden: a state with its reason" 30 capture_is stale
 expect "forbidden: the remedy" "$(count cause)" sh -c "grep -q 'usermod -aG video' $work/log"
 seen=$(doctor)
-expect "doctor: forbidden" "$seen" sh -c "echo '$seen' | grep -q 'may not be opened'"
+expect "doctor: forbidden" "$seen" sh -c "echo '$seen' | grep -q 'has no permission to open it'"
 v4l2-ctl -d "$camera" --stream-mmap --stream-count=100000 > /dev/null 2>&1 &
 thief=$!
 sleep 1

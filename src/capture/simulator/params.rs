@@ -28,7 +28,7 @@ impl FromStr for SceneKind {
             "room" => Ok(Self::Room),
             "plane" => Ok(Self::Plane),
             "corridor" => Ok(Self::Corridor),
-            _ => Err("there is no such scene; scenes are room, plane and corridor"),
+            _ => Err("unknown scene; scenes are room, plane and corridor"),
         }
     }
 }
@@ -237,7 +237,7 @@ mod tests {
             params.validate().unwrap_err().to_string()
         };
         assert!(SimulatorParams::default().validate().is_ok());
-        assert!(refused(&|p| p.frames = 0).starts_with("frames = 0: allowed is"));
+        assert!(refused(&|p| p.frames = 0).starts_with("frames = 0: must be"));
         assert!(refused(&|p| p.width = 1 << 40).starts_with("width ="));
         assert!(refused(&|p| p.focal_px = f64::NAN).starts_with("focal_px = NaN"));
         assert!(refused(&|p| p.motion.mean_speed_m_s = -1.0).starts_with("motion.mean_speed_m_s"));

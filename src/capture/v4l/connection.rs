@@ -403,7 +403,7 @@ fn refusal(error: Errno, path: &dyn std::fmt::Display) -> String {
 fn open_fault(name: &str, failure: OpenFailure) -> Fault {
     match failure {
         OpenFailure::Missing => Fault::passing(format!(
-            "there is no camera {name}; plug it in (semidense cameras lists those that there are)"
+            "there is no camera {name}; plug it in (`semidense cameras` lists the cameras)"
         )),
         OpenFailure::Refused(path, error) => {
             Fault::passing(format!("{}: {}", path.display(), refusal(error, &path.display())))

@@ -133,7 +133,7 @@ pub fn cameras(dev: &Path) -> Vec<CameraReport> {
     nodes(dev).iter().filter_map(|path| report(dev, path)).collect()
 }
 
-/// Whether a node can be used; `None` for what is no camera.
+/// Whether a node can be used; `None` for what is not a camera.
 pub fn access(path: &Path) -> Option<Access> {
     match KernelDevice::open(path) {
         Ok(mut device) => is_camera(&device).then(|| device_access(&mut device).0),
@@ -263,7 +263,7 @@ mod tests {
         }
         assert_eq!(nodes(dev.path()), [dev.path().join("video2"), dev.path().join("video10")]);
         assert!(nodes(Path::new("/nowhere")).is_empty());
-        // A file that is no device is no camera.
+        // A file that is no device is not a camera.
         assert_eq!(cameras(dev.path()), []);
     }
 

@@ -39,7 +39,7 @@ pub struct Grant {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum NegotiationError {
     /// No capture device that streams.
-    #[error("is no camera that this program can read: {0}")]
+    #[error("is not a camera that can be used: {0}")]
     NoCamera(&'static str),
     /// None of our formats.
     #[error(
@@ -50,7 +50,7 @@ pub enum NegotiationError {
         offered: String,
     },
     /// Not the rig's size.
-    #[error("gives {found} where {wanted} is asked for; it offers {offered}")]
+    #[error("delivers {found} instead of {wanted}; it offers {offered}")]
     Size {
         /// What it gives.
         found: String,
@@ -227,7 +227,7 @@ mod tests {
         let error = negotiate(&mut camera.device(), &wish(None, None)).unwrap_err();
         assert_eq!(
             error.to_string(),
-            "gives 320x240 YUYV where 640x480 is asked for; it offers 320x240, 1280x720"
+            "delivers 320x240 YUYV instead of 640x480; it offers 320x240, 1280x720"
         );
         let grey = negotiate(&mut camera.device(), &wish(Some(PixelFormat::Grey), None));
         assert_eq!(grey.unwrap_err(), NegotiationError::NoFormat { offered: "YUYV".to_owned() });

@@ -206,7 +206,7 @@ mod tests {
             change(&mut params);
             params.validate().unwrap_err().to_string()
         };
-        assert_eq!(wrong(|p| p.buffers = 2), "buffers = 2: allowed is 3 to 5");
+        assert_eq!(wrong(|p| p.buffers = 2), "buffers = 2: must be 3 to 5");
         assert!(wrong(|p| p.exposure_us = Setting::Value(0)).starts_with("exposure_us = 0"));
         assert!(wrong(|p| p.rate_hz = f64::NAN).starts_with("rate_hz = NaN"));
         assert!(wrong(|p| p.stall_s = 0.0).starts_with("stall_s"));

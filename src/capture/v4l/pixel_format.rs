@@ -72,7 +72,7 @@ impl PixelFormat {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum BrokenPicture {
     /// Fewer bytes than the picture has.
-    #[error("{found} of {needed} bytes came")]
+    #[error("only {found} of {needed} bytes came")]
     Short {
         /// Bytes that came.
         found: usize,

@@ -81,7 +81,7 @@ fn errors_name_place_key_value_and_range() {
     let error = load("[mapper]\n\nthread = 3\n");
     assert!(error.contains("x.toml:3: `thread = 3`: unknown field `thread`"), "{error}");
     let error = load("[tracker]\ndeadline_ms = -1.0\n");
-    assert!(error.ends_with("x.toml: tracker.deadline_ms = -1: allowed is 0 to 10000"), "{error}");
+    assert!(error.ends_with("x.toml: tracker.deadline_ms = -1: must be 0 to 10000"), "{error}");
     let error = load("[tracker]\ndeadline_ms = nan\n");
     assert!(error.contains("tracker.deadline_ms = NaN"), "{error}");
     assert!(load("[mapper]\nthreads = \"x\"\n").contains("x.toml:2: `threads = \"x\"`"));

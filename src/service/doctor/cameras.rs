@@ -22,7 +22,7 @@ impl Machine {
             .filter_map(|path| Some(self.camera(path, (self.camera_access)(path)?)))
             .collect();
         if findings.is_empty() {
-            let found = "none: recordings and the simulator work without";
+            let found = "none: recordings and the simulator need none";
             return vec![Finding::ok(SUBJECT, found)];
         }
         findings.into_iter().chain(self.service_user()).collect()
@@ -35,17 +35,17 @@ impl Machine {
             Access::Free => Finding::ok(SUBJECT, name.to_string()),
             Access::Forbidden => Finding::warning(
                 SUBJECT,
-                format!("{name} may not be opened by {}", user()),
-                format!("usermod -aG {VIDEO_GROUP} {}, and a new login", user()),
+                format!("{name}: {} has no permission to open it", user()),
+                format!("usermod -aG {VIDEO_GROUP} {}, then log in again", user()),
             ),
             Access::Unusable => Finding::warning(
                 SUBJECT,
                 format!("{name} cannot be opened"),
-                "unplug it and plug it in again; `dmesg` has the driver's word",
+                "unplug it and plug it in again; see `dmesg` for the driver's error",
             ),
             Access::Busy => match self.holder(path) {
                 Some((_, program)) if program == env!("CARGO_PKG_NAME") => {
-                    Finding::ok(SUBJECT, format!("{name} streams for {program}"))
+                    Finding::ok(SUBJECT, format!("{name} is in use by {program}"))
                 }
                 Some((process, program)) => Finding::warning(
                     SUBJECT,
@@ -55,7 +55,9 @@ impl Machine {
                 None => Finding::warning(
                     SUBJECT,
                     format!("{name} is in use by another program"),
-                    format!("sudo fuser {name} names it; end it, unless it is semidense itself"),
+                    format!(
+                        "find it with `sudo fuser {name}` and stop it, unless it is semidense itself"
+                    ),
                 ),
             },
         }
@@ -153,7 +155,7 @@ mod tests {
             ["Ok ", "dev/video0"],
             ["Warning ", "usermod -aG video "],
             ["Warning ", "video2 is in use by cheese (process 71) | kill 71"],
-            ["Ok ", "video3 streams for semidense"],
+            ["Ok ", "video3 is in use by semidense"],
             ["Warning ", "video4 cannot be opened"],
             ["Warning semidense is not in the group video", "usermod -aG video semidense"],
         ]) {

@@ -81,8 +81,7 @@ impl Machine {
         };
         let mut findings = Vec::new();
         let mut complain = |found: String, line: String| {
-            let remedy =
-                format!("{line} in the unit semidense-{name}@.service, and a restart of it");
+            let remedy = format!("{line} in the unit semidense-{name}@.service, then restart it");
             findings.push(Finding::warning(SUBJECT, found, remedy));
         };
         let wants_real_time = matches!(scheduling.policy, Policy::Fifo | Policy::Deadline);

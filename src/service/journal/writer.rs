@@ -116,7 +116,7 @@ impl Writer {
                 let is_news = self.log_refusals.is_news(error.is_some());
                 error.filter(|_| is_news).map(|error| {
                     format!(
-                        "the journal cannot be written ({error}); a kill now would cost more than the last second of the run"
+                        "the journal is behind ({error}); a kill would now cost more than a second of the run"
                     )
                 })
             }
@@ -125,7 +125,7 @@ impl Writer {
                 let is_news = self.depth_refusals.is_news(error.is_some());
                 error.filter(|_| is_news).map(|error| {
                     format!(
-                        "the journal cannot take the depth of a keyframe ({error}); a kill now would cost depth of the map"
+                        "the journal cannot take the depth of a keyframe ({error}); a kill would now cost depth of the map"
                     )
                 })
             }

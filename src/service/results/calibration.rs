@@ -26,8 +26,8 @@ pub fn whitened_residual_median(poses: &[RecordedPose]) -> Option<f64> {
 pub fn calibration_warning(whitened_residual_median: Option<f64>) -> Option<String> {
     let residual = whitened_residual_median.filter(|residual| *residual > DOUBTED_RESIDUAL)?;
     Some(format!(
-        "the images fit the map badly (whitened residual {residual:.2} where 1 is expected): does the rig belong to this camera \
-         and image size? Strong blur or a rolling shutter look the same"
+        "the images fit the map badly (whitened residual {residual:.2}, 1 is expected): check that the rig belongs to this \
+         camera and image size; strong blur or a rolling shutter look the same"
     ))
 }
 

@@ -42,7 +42,7 @@ const INTERVAL_NANOS: i64 = 1_000_000_000;
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum EvaluationError {
     /// A stamp or pose that is no number; a broken file or a diverged estimate.
-    #[error("pose {index} of the {which} is not finite: remove it or mend its source")]
+    #[error("pose {index} of the {which} is not finite: remove it or fix its source")]
     NotFinite {
         /// `estimate` or `ground truth`.
         which: &'static str,

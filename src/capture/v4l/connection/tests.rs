@@ -179,7 +179,7 @@ fn a_camera_that_can_never_serve_is_an_error_until_it_has() {
     let fake =
         Fake::with_formats(&[(super::super::pixel_format::PixelFormat::Grey, &[(320, 240)], 30)]);
     let error = camera(&fake).await_frame(None, 10).unwrap_err();
-    assert!(error.contains("/dev/video0: gives 320x240 GREY where 640x480"), "{error}");
+    assert!(error.contains("/dev/video0: delivers 320x240 GREY instead of 640x480"), "{error}");
     assert!(error.contains("--rig"), "{error}");
     fake.refuse_opening(Some(OpenFailure::Ambiguous(vec!["a".into(), "b".into()])));
     let error = camera(&fake).await_frame(None, 10).unwrap_err();

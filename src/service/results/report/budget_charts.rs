@@ -32,8 +32,8 @@ pub fn budget_charts(samples: &[BudgetSample], curve: Option<&BudgetCurve>) -> V
         by_time.iter().map(|(time, px)| [*time, px[index].max(LEAST_PX)]).collect()
     };
     let mut by_iterations = chart(
-        "Pose after so many iterations",
-        "iterations, all levels together",
+        "Pose error by iterations",
+        "iterations on all levels",
         by_iterations(&curve.displacement_px_p50),
         by_iterations(&curve.displacement_px_p90),
     );
@@ -44,7 +44,7 @@ pub fn budget_charts(samples: &[BudgetSample], curve: Option<&BudgetCurve>) -> V
         mark: Mark::Dots(2.4),
         ..line
     }));
-    vec![by_iterations, chart("Pose after so long", "time in the tracker [ms]", share(0), share(1))]
+    vec![by_iterations, chart("Pose error by time", "time in the tracker [ms]", share(0), share(1))]
 }
 
 fn chart(title: &'static str, x_label: &str, half: Vec<[f64; 2]>, most: Vec<[f64; 2]>) -> Chart {
@@ -52,7 +52,7 @@ fn chart(title: &'static str, x_label: &str, half: Vec<[f64; 2]>, most: Vec<[f64
     Chart {
         title,
         x_label: x_label.into(),
-        y_label: "from the final pose [px]".into(),
+        y_label: "distance to the final pose [px]".into(),
         height: 260.0,
         scaling: Scaling::Decades,
         series: vec![line("90 % of frames", ERROR, most), line("median", ESTIMATE, half)],

@@ -86,7 +86,7 @@ pub fn trajectory_charts(
         ];
         Chart {
             title,
-            x_label: format!("along the path's longest extent [{unit}]"),
+            x_label: format!("along the longest extent of the path [{unit}]"),
             y_label: format!("{y_label} [{unit}]"),
             height: 420.0,
             scaling: Scaling::Equal,
@@ -213,9 +213,9 @@ pub fn time_charts(record: &RunRecord) -> Vec<Chart> {
     let deadline = record.deadline_nanos.map(|n| n as f64 * 1e-6);
     let mut charts = Vec::new();
     for (over_time, occurrence, colour, samples, limit) in [
-        ("Tracking time", "Tracking time, how often", ESTIMATE, track, None),
-        ("Mapping time", "Mapping time, how often", MAPPING, map, None),
-        ("Latency from stamp to pose", "Latency, how often", ONLINE, latency, deadline),
+        ("Tracking time", "Distribution of tracking time", ESTIMATE, track, None),
+        ("Mapping time", "Distribution of mapping time", MAPPING, map, None),
+        ("Latency from stamp to pose", "Distribution of latency", ONLINE, latency, deadline),
     ] {
         if !samples.is_empty() {
             charts.push(time_chart(over_time, colour, samples.clone()));

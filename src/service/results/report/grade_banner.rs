@@ -38,12 +38,12 @@ fn figures(grade: &Grade) -> Vec<(&'static str, String)> {
     let px = |value: Option<f64>| value.map(|px| format!("{px:.2} px"));
     let percent = |value: Option<f64>| value.map(|share| format!("{:.1} %", 100.0 * share));
     [
-        ("pairs of keyframes from apart", Some(figures.wide_pairs.to_string())),
+        ("pairs of keyframes far apart", Some(figures.wide_pairs.to_string())),
         ("widest pair", Some(format!("{} frames", figures.longest_span_frames))),
-        ("misfit from apart", px(figures.wide_misfit_px)),
-        ("misfit of neighbours", px(figures.near_misfit_px)),
-        ("places found again", percent(figures.wide_found)),
-        ("difference of depth", percent(figures.wide_depth_difference)),
+        ("misfit of pairs far apart", px(figures.wide_misfit_px)),
+        ("misfit of neighbouring keyframes", px(figures.near_misfit_px)),
+        ("patches found again", percent(figures.wide_found)),
+        ("depth difference", percent(figures.wide_depth_difference)),
         ("depths within 3 sigma", percent(figures.wide_depth_within_3_sigma)),
         ("tilt between depths", percent(figures.wide_depth_tilt)),
     ]
