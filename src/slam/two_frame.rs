@@ -257,8 +257,13 @@ impl TwoFrameInitializer {
         let mut evidence = self.judge();
         let would_prove = self.confirmed + 1 >= self.params.confirming_frames;
         if would_prove && evidence.missing(&self.params.evidence).is_none() {
+            let before = self.joint.best().0.clone();
             self.refit();
             evidence = self.judge();
+            if evidence.missing(&self.params.evidence).is_some() {
+                // Without the priors it went astray: the next frame is not fitted from there.
+                *self.joint.best().0 = before;
+            }
         }
         self.witnesses.push(self.pyramid.levels(), &self.rotation, self.params.max_witnesses);
         let missing = evidence.missing(&self.params.evidence);
