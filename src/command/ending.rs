@@ -14,6 +14,7 @@ use crate::service::journal::log::RunStart;
 use crate::service::results::calibration::calibration_warning;
 use crate::service::results::output_folder::OutputFolder;
 use crate::service::results::set::has_tracked_set;
+use crate::service::results::summary::Summary;
 use crate::service::results::summary_text::{recovery_text, refused_text, summary_text};
 use crate::service::results::{EndOfRun, Results, ResultsError, RunMode, RunRecord};
 
@@ -85,19 +86,24 @@ impl Ending<'_> {
                 (recovery_text(&results.summary), refused_text(&results.summary));
             print(&format!("{where_to}{recovery}{refused}\n"))?;
         }
-        match &record.ended {
-            EndOfRun::Failed(cause) => Err(cause.as_str().into()),
-            EndOfRun::Interrupted => {
-                note(&format!("interrupted: {where_to}"));
-                Ok(ExitCode::from(INTERRUPTED))
-            }
-            EndOfRun::Finished | EndOfRun::Recovered(_) if !is_tracked => {
-                let why = results.summary.untracked.as_deref().unwrap_or_default();
-                note(&format!("nothing was tracked: {why}; {where_to}"));
-                Ok(ExitCode::from(NOTHING_TRACKED))
-            }
-            EndOfRun::Finished | EndOfRun::Recovered(_) => Ok(ExitCode::SUCCESS),
+        conclude(&record.ended, &results.summary, &where_to)
+    }
+}
+
+/// What is said last, and the exit code.
+fn conclude(ended: &EndOfRun, summary: &Summary, where_to: &str) -> CommandResult {
+    match ended {
+        EndOfRun::Failed(cause) => Err(cause.as_str().into()),
+        EndOfRun::Interrupted => {
+            note(&format!("interrupted: {where_to}"));
+            Ok(ExitCode::from(INTERRUPTED))
         }
+        EndOfRun::Finished | EndOfRun::Recovered(_) if summary.frames.frames_tracked == 0 => {
+            let why = summary.untracked.as_deref().unwrap_or_default();
+            note(&format!("nothing was tracked: {why}; {where_to}"));
+            Ok(ExitCode::from(NOTHING_TRACKED))
+        }
+        EndOfRun::Finished | EndOfRun::Recovered(_) => Ok(ExitCode::SUCCESS),
     }
 }
 

@@ -180,20 +180,7 @@ fn record(
     if !goes_on() {
         return Ok(None);
     }
-    let config = ReplayConfig {
-        tracker: config.tracking.clone(),
-        mapper: config.mapping.clone(),
-        poses: match args.poses {
-            Poses::Tracker => PoseOrigin::Tracker,
-            Poses::Groundtruth => PoseOrigin::GroundTruth,
-        },
-        initial_depth: match args.initial_depth {
-            InitialDepth::Images => DepthOrigin::Images,
-            InitialDepth::Sensor => DepthOrigin::Sensor,
-        },
-        max_frames: args.frames.map(|frames| frames as usize),
-        strict: config.capture.strict,
-    };
+    let config = replay_config(config, args);
     let total = source.num_frames().map(|n| n.min(config.max_frames.unwrap_or(n)));
     let progress = Progress::new("replay", total);
     let mut journal = begin_journal()
@@ -222,6 +209,24 @@ fn record(
         }
     };
     Ok(Some(Replayed { record: RunRecord { ended, ..record }, journal }))
+}
+
+/// How the command line wants it replayed.
+fn replay_config(config: &Config, args: &ReplayArgs) -> ReplayConfig {
+    ReplayConfig {
+        tracker: config.tracking.clone(),
+        mapper: config.mapping.clone(),
+        poses: match args.poses {
+            Poses::Tracker => PoseOrigin::Tracker,
+            Poses::Groundtruth => PoseOrigin::GroundTruth,
+        },
+        initial_depth: match args.initial_depth {
+            InitialDepth::Images => DepthOrigin::Images,
+            InitialDepth::Sensor => DepthOrigin::Sensor,
+        },
+        max_frames: args.frames.map(|frames| frames as usize),
+        strict: config.capture.strict,
+    }
 }
 
 fn state_word(frame: &ReplayProgress<'_>) -> &'static str {

@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use crate::service::results::summary::{Summary, TrajectorySummary};
+use crate::service::results::summary::{DepthSummary, Summary, TrajectorySummary};
 use crate::service::results::times::Percentiles;
 use crate::slam::evaluation::grade::Grade;
 
@@ -47,18 +47,8 @@ pub fn summary_text(summary: &Summary) -> String {
     if let Some(error) = trajectory_errors(&summary.online) {
         line("online", error);
     }
-    if let (Some(all), Some(best)) = (
-        summary.depth.depth_relative_error_median,
-        summary.depth.depth_relative_error_median_best_half,
-    ) {
-        line(
-            "depth",
-            format!(
-                "median relative error {:.1} %, {:.1} % over the more certain half",
-                100.0 * all,
-                100.0 * best
-            ),
-        );
+    if let Some(errors) = depth_errors(&summary.depth) {
+        line("depth", errors);
     }
     let times = [
         ("track", summary.track_ms),
@@ -81,6 +71,12 @@ pub fn summary_text(summary: &Summary) -> String {
     line("run", run(summary));
     line("grade", grade_text(&summary.grade));
     text
+}
+
+fn depth_errors(depth: &DepthSummary) -> Option<String> {
+    let all = 100.0 * depth.depth_relative_error_median?;
+    let best = 100.0 * depth.depth_relative_error_median_best_half?;
+    Some(format!("median relative error {all:.1} %, {best:.1} % over the more certain half"))
 }
 
 /// The level and at most two reasons; what it cannot see is in the report.
