@@ -281,6 +281,25 @@ fn a_run_without_truth_keyframes_or_a_tracked_frame_is_reported_too() {
 }
 
 #[test]
+fn what_was_given_is_not_judged_as_if_it_was_estimated() {
+    let poses = |epochs: u32| {
+        let mut poses: Vec<_> = (0..60).map(|i| pose(i, TrackingState::Tracking, 0)).collect();
+        poses[30..].iter_mut().for_each(|pose| pose.estimate.epoch = epochs - 1);
+        poses
+    };
+    let of = |record: &RunRecord| written(tempfile::tempdir().unwrap().path(), record).0;
+    let estimated = record(poses(2), vec![keyframe(0)], true);
+    let summary = of(&estimated);
+    assert!(summary["depth_relative_error_median"].is_number());
+    assert!(summary["grade"]["reasons"].to_string().contains("a scale of its own"), "{summary}");
+    let from_sensor = RunRecord { is_depth_from_sensor: true, ..estimated.clone() };
+    assert!(of(&from_sensor)["depth_relative_error_median"].is_null());
+    let given = RunRecord { depth_scale: DepthScale::Given, ..estimated };
+    let reasons = of(&given)["grade"]["reasons"].to_string();
+    assert!(reasons.contains("2 parts") && !reasons.contains("scale"), "{reasons}");
+}
+
+#[test]
 fn a_long_run_makes_a_small_report() {
     let folder = tempfile::tempdir().unwrap();
     let poses = (0..15_000).map(|i| pose(i, TrackingState::Tracking, 0)).collect();
