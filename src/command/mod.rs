@@ -34,6 +34,7 @@ use tracing_subscriber::fmt::format::FmtSpan;
 use tracing_subscriber::prelude::*;
 
 use crate::command::print::{PrintError, note};
+use crate::service::child::tidy_up;
 use crate::service::child::{ERROR_PREFIX, follow_supervisor};
 use crate::service::config::{Config, ConfigError, SYSTEM_FOLDER, file_for};
 use crate::service::error_log::ErrorLog;
@@ -223,7 +224,7 @@ fn run_subcommand(line: CommandLine, log: &ErrorLog) -> CommandResult {
         Subcommands::Doctor(arguments) => doctor::run(&config, arguments),
         Subcommands::Bench(arguments) => bench::run(&config, &line.common, log, arguments),
     };
-    place.tidy();
+    tidy_up(&place);
     outcome
 }
 

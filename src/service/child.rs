@@ -20,6 +20,7 @@ use crate::service::liveness::Liveness;
 use crate::service::manager_notice::VARIABLES;
 use crate::service::mode::Mode;
 use crate::service::position::RUN_VARIABLE;
+use crate::wire::place::Place;
 
 /// Environment variable with the process id of the supervisor.
 pub const SUPERVISOR_VARIABLE: &str = "SEMIDENSE_SUPERVISOR";
@@ -83,6 +84,28 @@ pub fn follow_supervisor() -> Result<(), FollowError> {
         .map_err(|e| FollowError::Kernel(e.into()))?;
     let parent = rustix::process::getppid().map(Pid::as_raw_nonzero).map(std::num::NonZeroI32::get);
     if parent == Some(supervisor) { Ok(()) } else { Err(FollowError::Gone) }
+}
+
+/// What a process does last: removes what is left where nobody else is there, of this instance and, where its
+/// supervisor was killed, of that. The threads of a killed process hold its locks for some time after its children
+/// have heard of its death, and until then it cannot be told from a living one.
+pub fn tidy_up(place: &Place) {
+    /// Longest time that a killed process takes to be gone, on a busy machine.
+    const LONGEST_DEATH: Duration = Duration::from_secs(2);
+    const PAUSE: Duration = Duration::from_millis(20);
+    let end = Instant::now() + LONGEST_DEATH;
+    place.tidy();
+    while is_orphaned() && place.has_nodes() && Instant::now() < end {
+        std::thread::sleep(PAUSE);
+        place.tidy();
+    }
+}
+
+/// Whether a supervisor has started this process and is not its parent any more.
+fn is_orphaned() -> bool {
+    let parent = rustix::process::getppid().map(|parent| parent.as_raw_nonzero().get());
+    let supervisor = std::env::var(SUPERVISOR_VARIABLE).ok().and_then(|pid| pid.parse().ok());
+    supervisor.is_some() && supervisor != parent
 }
 
 /// A running child. Killed when dropped while it still runs.
