@@ -9,7 +9,7 @@ use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::geometry::sim3::Sim3;
 use semidense::slam::keyframe::{DepthPoint, Keyframe, KeyframePose, MapState};
-use semidense::slam::mapper::Map;
+use semidense::slam::map::Map;
 use semidense::slam::pose::{PoseEstimate, TrackingState};
 use semidense::wire::conversion::{
     PoseTiming, keyframe_header, keyframe_image_header, pose_message, rigid_message,
@@ -121,6 +121,8 @@ fn keyframe() -> Keyframe {
         capture_nanos: 5,
         map_state: MapState::Established,
         world_from_keyframe: Sim3::new(SE3::identity(), 1.5),
+        map_from_keyframe: Sim3::new(SE3::identity(), 1.5),
+        map_revision: 0,
         intrinsics: CAMERA,
         image: (0..CAMERA.width * CAMERA.height).map(|i| (i * i % 251) as u8).collect(),
         points: (0..24).map(|u| DepthPoint { u, ..point }).collect(),
@@ -131,8 +133,12 @@ fn map_bytes() -> Vec<u8> {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let path = folder.path().join("map");
     let second = Keyframe { keyframe_id: 1, epoch: 1, ..keyframe() };
-    write_map(&path, &Map { keyframes: vec![keyframe(), second], free_epoch: 17 }, &mut || ())
-        .expect("written");
+    write_map(
+        &path,
+        &Map { keyframes: vec![keyframe(), second], free_epoch: 17, ..Map::default() },
+        &mut || (),
+    )
+    .expect("written");
     std::fs::read(path).expect("read")
 }
 
@@ -147,14 +153,14 @@ fn journal() -> Vec<u8> {
         is_depth_from_sensor: false,
         began_nanos: 1,
     };
-    let world_from_keyframe = Sim3::new(SE3::identity(), 2.0);
+    let map_from_keyframe = Sim3::new(SE3::identity(), 2.0);
     let without_depth = Keyframe { image: Vec::new(), points: Vec::new(), ..keyframe() };
     let records = [
         Record::Start(Box::new(start)),
         Record::Pose(Box::new(pose_message(&pose(1), &PoseTiming::default()))),
         Record::Step(Step { step_nanos: 5, change_nanos: 3, start_frame: 1 }),
         Record::Keyframe(Box::new(without_depth)),
-        Record::KeyframePose(0, KeyframePose { keyframe_id: 0, world_from_keyframe }),
+        Record::KeyframePose(0, KeyframePose { keyframe_id: 0, revision: 1, map_from_keyframe }),
         Record::Counters(Box::new(RunCounters { frames_in: 2, ..RunCounters::default() })),
     ];
     let mut bytes = log_header();
@@ -229,9 +235,11 @@ fn messages() -> [Vec<u8>; 7] {
     };
     let graph = KeyframePoseMessage {
         keyframe_id: 1,
-        world_from_keyframe: similarity_message(&keyframe.world_from_keyframe),
+        revision: 3,
+        map_from_keyframe: similarity_message(&keyframe.map_from_keyframe),
     };
-    let mut request = CommandRequest { kind: 0, path_bytes: 6, path: [0; PATH_BYTES] };
+    let mut request =
+        CommandRequest { keyframe_id: 0, kind: 0, path_bytes: 6, path: [0; PATH_BYTES] };
     request.path[..6].copy_from_slice(b"/tmp/x");
     let response = CommandResponse { status: 1, text_bytes: 2, text: [b't'; TEXT_BYTES] };
     [

@@ -47,7 +47,7 @@ fn room(seed: u64, poses: PoseOrigin) -> Outcome {
         errors.add(keyframe, &truth, record.depth_scale);
         // The unit of estimated poses is not metres: only what differs within a keyframe can be judged.
         let unit = match record.depth_scale {
-            DepthScale::Given => keyframe.world_from_keyframe.scale,
+            DepthScale::Given => keyframe.map_from_keyframe.scale,
             DepthScale::MedianRatio => 1.0,
         };
         let found = DepthModes::of(keyframe, &truth, unit).unwrap();

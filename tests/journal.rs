@@ -28,7 +28,7 @@ const FILES: [&str; 7] = [
 const ENDLESS: &str = "loop:200000:30:sim";
 
 /// Of its log a pose takes this many bytes at least.
-const POSE_BYTES: u64 = 430;
+const POSE_BYTES: u64 = 650;
 
 fn command(rig: &Rig, arguments: &[&str]) -> Command {
     let mut command = rig.command(arguments);

@@ -6,6 +6,7 @@ mod support;
 use std::collections::BTreeMap;
 use std::fs;
 use std::io::{BufRead, BufReader};
+use std::time::Duration;
 
 use rustix::process::{Pid, Signal};
 use semidense::capture::source::{SourceName, open};
@@ -13,11 +14,17 @@ use semidense::service::config::Config;
 use semidense::service::peers::{HEALTH_TOPICS, Peer};
 use semidense::service::replay::{ReplayConfig, replay};
 use semidense::service::results::RecordedPose;
-use semidense::wire::conversion::pose_from_message;
+use semidense::slam::keyframe::DepthPoint;
+use semidense::wire::command::{Command, CommandClient};
+use semidense::wire::conversion::{keyframe_from_messages, pose_from_message};
 use semidense::wire::keyframe_inbox::KeyframeInbox;
-use semidense::wire::message::PoseMessage;
+use semidense::wire::message::{
+    GraphHeader, KeyframeHeader, KeyframeImageHeader, KeyframePoseMessage, PoseMessage,
+};
 use semidense::wire::port::{Hub, Subscriber};
-use semidense::wire::topic::{POSE, TRACKER_HEALTH};
+use semidense::wire::topic::{
+    EARLIER_KEYFRAME, EARLIER_KEYFRAME_IMAGE, GRAPH, POSE, TRACKER_HEALTH,
+};
 use serde_json::Value;
 use support::{Rig, end, finish, signal, small_camera, until};
 
@@ -303,4 +310,47 @@ fn status_sees_who_runs_without_capture() {
     assert_eq!(watched.status.code(), Some(0), "{}", watched.stderr);
     let nobody = finish(rig.command(&["status", "--once"]));
     assert_eq!(nobody.status.code(), Some(1), "{}", nobody.stdout);
+}
+
+/// A reader that came late, or whose keyframe was corrected since, asks for the depth of any keyframe of the graph.
+#[test]
+fn depth_of_an_earlier_keyframe_comes_on_request() {
+    let rig = Rig::new();
+    let child = rig.run(2000, &["--live"]).spawn().unwrap();
+    let hub = rig.observe();
+    let graphs: Subscriber<KeyframePoseMessage, GraphHeader> =
+        until("the graph", || hub.subscriber(&GRAPH).ok());
+    let mut graph = Vec::new();
+    until("three keyframes", || {
+        if let Some(message) = graphs.newest().unwrap() {
+            graph = message.payload().to_vec();
+        }
+        (graph.len() >= 3).then_some(())
+    });
+    let depths: Subscriber<DepthPoint, KeyframeHeader> = hub.subscriber(&EARLIER_KEYFRAME).unwrap();
+    let images: Subscriber<u8, KeyframeImageHeader> =
+        hub.subscriber(&EARLIER_KEYFRAME_IMAGE).unwrap();
+    let commands = CommandClient::open(&hub).unwrap();
+    for wanted in &graph[..2] {
+        let ask = Command::SendKeyframe(wanted.keyframe_id);
+        commands.ask(&ask, Duration::from_secs(60), || true).unwrap();
+        let (depth, image) =
+            until("the keyframe", || Some((depths.newest().unwrap()?, images.newest().unwrap()?)));
+        let keyframe = keyframe_from_messages(
+            depth.header(),
+            depth.payload(),
+            image.header(),
+            image.payload(),
+        )
+        .unwrap();
+        assert_eq!(keyframe.keyframe_id, wanted.keyframe_id);
+        assert!(keyframe.revision >= wanted.revision && keyframe.points.len() > 100);
+    }
+    let unknown = Command::SendKeyframe(123_456);
+    let refused = commands.ask(&unknown, Duration::from_secs(60), || true).unwrap_err();
+    assert!(refused.to_string().contains("no keyframe 123456"), "{refused}");
+    drop((graphs, depths, images, commands, hub));
+    signal(&child, Signal::INT);
+    assert_eq!(end(child).status.code(), Some(130));
+    assert_eq!(rig.leftovers(), Vec::<String>::new());
 }

@@ -122,7 +122,7 @@ fn count_tracked(record: &RunRecord, frames: std::ops::Range<usize>) -> usize {
 fn error_ratio(record: &RunRecord, epoch: u32) -> f64 {
     let tracked: Vec<StampedPose> = estimates(record)
         .filter(|e| e.state.is_tracked() && e.epoch == epoch)
-        .map(|e| StampedPose { nanos: e.capture_nanos, world_from_camera: e.world_from_camera })
+        .map(|e| StampedPose { nanos: e.capture_nanos, world_from_camera: e.map_from_camera })
         .collect();
     let truth = &record.ground_truth;
     let evaluation =
@@ -157,6 +157,14 @@ fn after_a_blackout_a_known_view_is_found_again() {
     assert!(estimates(&record).all(|e| e.epoch == 0), "it is the same map");
     let ratio = error_ratio(&record, 0);
     assert!(ratio < 0.02, "{ratio}");
+    // In the map it is back where it was; odometry goes on from where it was lost.
+    let tracked: Vec<_> = estimates(&record).filter(|e| e.state.is_tracked()).collect();
+    let found = tracked.iter().position(|e| e.sequence >= 160).unwrap();
+    let (last, first) = (tracked[found - 1], tracked[found]);
+    let step = |one: &SE3, other: &SE3| (one.translation - other.translation).norm();
+    let jump = step(&last.world_from_camera, &first.world_from_camera);
+    let back = step(&last.map_from_camera, &first.map_from_camera);
+    assert!(jump < 0.03 && back > 5.0 * jump, "odometry jumps by {jump}, the map pose by {back}");
 
     let without_search =
         RecoveryParams { num_keyframes: 0, lost_timeout_secs: 1e3, ..RecoveryParams::default() };
@@ -187,7 +195,7 @@ fn after_a_blackout_a_new_view_begins_a_new_epoch() {
     // The new epoch begins near where the camera was last known to be.
     let last = estimates(&record).rfind(|e| e.epoch == 0 && e.state.is_tracked()).unwrap();
     let first = record.map.keyframes.iter().find(|k| k.epoch == 1).unwrap();
-    assert_eq!(first.world_from_keyframe.rigid, last.world_from_camera);
+    assert_eq!(first.map_from_keyframe.rigid, last.world_from_camera);
 }
 
 #[test]
@@ -224,7 +232,7 @@ fn a_camera_that_comes_to_rest_stays_where_it_is() {
     let last = record.map.keyframes.last().unwrap();
     assert!(last.sequence < REST as u64 + 5, "no keyframe is made at rest: {}", last.sequence);
     // In shares of the mean depth: a few millimetres in a room of a few metres.
-    let unit = last.world_from_keyframe.scale;
+    let unit = last.map_from_keyframe.scale;
     let first = resting[0].world_from_camera.translation;
     let furthest = resting
         .iter()
@@ -252,11 +260,15 @@ fn a_map_whose_poses_are_wrong_is_rejected() {
         // Three degrees are thirteen pixels.
         let rotation = if index < WRONG { 0.0 } else { 3_f64.to_radians() };
         let wrong = SE3::exp(&Vector6::new(0.0, 0.0, 0.0, rotation, 0.0, rotation));
+        let world_from_camera = room.poses[0].inverse() * room.poses[index] * wrong;
         let (keyframe_id, epoch) =
             mapper.keyframe().map_or((NO_KEYFRAME, 0), |k| (k.keyframe_id, k.epoch));
         let pose = PoseEstimate {
             state: TrackingState::Tracking,
-            world_from_camera: room.poses[0].inverse() * room.poses[index] * wrong,
+            world_from_camera,
+            keyframe_from_camera: mapper
+                .keyframe()
+                .map_or(SE3::identity(), |k| k.world_from_keyframe.locate(&world_from_camera)),
             keyframe_id,
             epoch,
             proposes_keyframe: index % 15 == 0,

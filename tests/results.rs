@@ -16,7 +16,7 @@ use semidense::slam::geometry::se3::SE3;
 use semidense::slam::geometry::sim3::Sim3;
 use semidense::slam::image::buffer::Image;
 use semidense::slam::keyframe::{DepthPoint, Keyframe, MapState};
-use semidense::slam::mapper::Map;
+use semidense::slam::map::Map;
 use semidense::slam::mapper::consistency::Contradiction;
 use semidense::slam::pose::{
     Brightness, DegradedReason, LostReason, PoseEstimate, Quality, TrackingState,
@@ -78,6 +78,8 @@ fn pose(i: usize, state: TrackingState, keyframe_id: u64) -> RecordedPose {
         keyframe_id,
         state,
         world_from_camera,
+        map_revision: 0,
+        map_from_camera: world_from_camera,
         keyframe_from_camera: world_from_keyframe(0).locate(&world_from_camera),
         covariance: [0.0; 21],
         alignment_covariance: [0.0; 21],
@@ -124,6 +126,8 @@ fn keyframe(keyframe_id: u64) -> Keyframe {
         capture_nanos: nanos(keyframe_id as usize * 10),
         map_state: MapState::Established,
         world_from_keyframe: world_from_keyframe(keyframe_id),
+        map_from_keyframe: world_from_keyframe(keyframe_id),
+        map_revision: 0,
         intrinsics: INTRINSICS,
         image: vec![90; 32 * 24],
         points: points.collect(),

@@ -34,7 +34,7 @@ fn positions(record: &RunRecord) -> Vec<(u64, nalgebra::Vector3<f64>)> {
 /// Median over the points of all keyframes of depth in world units.
 fn median_depth(record: &RunRecord) -> f64 {
     let of_keyframe = record.map.keyframes.iter().flat_map(|keyframe| {
-        let scale = keyframe.world_from_keyframe.scale;
+        let scale = keyframe.map_from_keyframe.scale;
         keyframe.points.iter().map(move |point| scale / f64::from(point.inverse_depth))
     });
     let mut depths: Vec<f64> = of_keyframe.collect();

@@ -52,6 +52,8 @@ pub fn keyframe(camera: &Intrinsics) -> Keyframe {
         capture_nanos: 0,
         map_state: MapState::Established,
         world_from_keyframe: Sim3::identity(),
+        map_from_keyframe: Sim3::identity(),
+        map_revision: 0,
         intrinsics: *camera,
         points: points.collect(),
         image,

@@ -159,7 +159,7 @@ pub fn track(
             let begin = Instant::now();
             let estimate = tracker.track(&frame, &mut |_| true);
             let track_ms = begin.elapsed().as_secs_f64() * 1e3;
-            let unit_m = keyframe.world_from_keyframe.scale;
+            let unit_m = keyframe.map_from_keyframe.scale;
             let place = Sim3::new(*true_keyframe, unit_m);
             let current_from_keyframe = estimate.keyframe_from_camera.inverse();
             let error = (current_from_keyframe * place.locate(&true_pose)).log();
@@ -267,6 +267,8 @@ fn make_keyframe(
         capture_nanos: stamp.capture_nanos,
         map_state: MapState::Established,
         world_from_keyframe: Sim3::new(world_from_camera, 1.0 / mean),
+        map_from_keyframe: Sim3::new(world_from_camera, 1.0 / mean),
+        map_revision: 0,
         intrinsics: *intrinsics,
         image: pixels.to_vec(),
         points: points.collect(),

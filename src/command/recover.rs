@@ -22,7 +22,7 @@ use crate::service::results::summary::without_depth;
 use crate::service::results::{EndOfRun, RunRecord};
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::geometry::intrinsics::Intrinsics;
-use crate::slam::mapper::Map;
+use crate::slam::map::Map;
 use crate::wire::place::Place;
 
 /// Write the results of a run that was killed, from the journal it left

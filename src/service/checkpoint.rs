@@ -11,12 +11,83 @@ use std::thread::JoinHandle;
 use crossbeam::queue::ArrayQueue;
 
 use crate::service::atomic_file::write_privately;
+use crate::service::clock::now_nanos;
 use crate::service::map_file::{MapFileError, read_map, write_map_into};
-use crate::slam::mapper::Map;
+use crate::slam::keyframe::Keyframe;
+use crate::slam::map::Map;
+use crate::slam::mapper::{Mapper, StepOutcome};
 
-/// Writes the newest checkpoint. The file stays unless the process ends in order.
+/// Keyframes that a successor gets with image and depth, beside the active one: a window's.
+const KEPT_KEYFRAMES: usize = 20;
+/// Keyframes that wait to be written; a disk that is slower than that loses the oldest of them.
+const WAITING_KEYFRAMES: usize = 4;
+/// Time between two checkpoints of a keyframe whose depth improves; a new keyframe has one at once.
+const PERIOD_NANOS: i64 = 1_000_000_000;
+
+/// The checkpoint of a mapper, and what it writes before it gives its first number.
 #[derive(Debug)]
-pub struct Checkpoint {
+pub struct Kept {
+    checkpoint: Checkpoint,
+    reservation: Option<Map>,
+    /// CLOCK_MONOTONIC when the last was handed over.
+    handed_nanos: i64,
+}
+
+impl Kept {
+    /// What a dead mapper has left at `path`, and the keeper of our own. Without either the mapper works too.
+    pub fn open(path: &Path) -> (Option<Self>, Option<Map>) {
+        let left = read_checkpoint(path).unwrap_or_else(|error| {
+            tracing::warn!("starting a new map: {error}");
+            None
+        });
+        let mut reservation = left.clone().unwrap_or_default();
+        reservation.reserve_epochs();
+        match Checkpoint::keep(path) {
+            Ok(checkpoint) => {
+                let reservation = Some(reservation);
+                (Some(Self { checkpoint, reservation, handed_nanos: 0 }), left)
+            }
+            Err(error) => {
+                tracing::warn!("there will be no checkpoints ({error})");
+                (None, left)
+            }
+        }
+    }
+
+    /// From now on numbers are given: who comes after gives others.
+    pub fn reserve(&mut self) {
+        if let Some(map) = self.reservation.take() {
+            self.checkpoint.put_now(&map);
+        }
+    }
+
+    /// Hands over what a step has changed: the keyframe that was left, and the active one's state where it is
+    /// another or the last was handed over some time ago.
+    pub fn follow(&mut self, mapper: &mut Mapper, outcome: &StepOutcome) {
+        let is_new = outcome.needs_image();
+        if let Some(left) = mapper.take_left() {
+            self.checkpoint.put_keyframe(left.clone());
+        }
+        let is_due = outcome.keyframe_changed
+            && now_nanos().saturating_sub(self.handed_nanos) > PERIOD_NANOS;
+        if (is_new || is_due)
+            && let Some(map) = mapper.checkpoint()
+        {
+            self.checkpoint.put(map);
+            self.handed_nanos = now_nanos();
+        }
+    }
+
+    /// Nobody needs to go on from here: the files are removed with this.
+    pub fn end_in_order(&mut self) {
+        self.checkpoint.is_over = true;
+    }
+}
+
+/// Writes the newest checkpoint, and the keyframes before it once each. The files stay unless the process ends
+/// in order.
+#[derive(Debug)]
+struct Checkpoint {
     path: PathBuf,
     shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
@@ -26,14 +97,19 @@ pub struct Checkpoint {
 #[derive(Debug)]
 struct Shared {
     newest: ArrayQueue<Map>,
+    left: ArrayQueue<Keyframe>,
     stop: AtomicBool,
 }
 
 impl Checkpoint {
     /// Keeps the checkpoint in the file `path`; what a mapper before has left there stays until the first.
-    pub fn keep(path: &Path) -> io::Result<Self> {
+    fn keep(path: &Path) -> io::Result<Self> {
         remove_unfinished(path);
-        let shared = Arc::new(Shared { newest: ArrayQueue::new(1), stop: AtomicBool::new(false) });
+        let shared = Arc::new(Shared {
+            newest: ArrayQueue::new(1),
+            left: ArrayQueue::new(WAITING_KEYFRAMES),
+            stop: AtomicBool::new(false),
+        });
         let (theirs, file) = (Arc::clone(&shared), path.to_owned());
         let thread = std::thread::Builder::new()
             .name("semidense-checkpoint".to_owned())
@@ -41,20 +117,21 @@ impl Checkpoint {
         Ok(Self { path: path.to_owned(), shared, thread: Some(thread), is_over: false })
     }
 
-    /// Nobody needs to go on from here: the file is removed with this.
-    pub fn end_in_order(&mut self) {
-        self.is_over = true;
-    }
-
     /// Writes a state before it returns, unless the disk refuses, which is said in the log; the next one may
     /// fit. Before the first [`Checkpoint::put`].
-    pub fn put_now(&self, map: &Map) {
+    fn put_now(&self, map: &Map) {
         write_or_warn(&self.path, map);
     }
 
     /// Hands over the newest state; one that was not written yet is older and goes.
-    pub fn put(&self, map: Map) {
+    fn put(&self, map: Map) {
         drop(self.shared.newest.force_push(map));
+        self.wake();
+    }
+
+    /// Hands over a keyframe that is not active any more.
+    fn put_keyframe(&self, keyframe: Keyframe) {
+        drop(self.shared.left.force_push(keyframe));
         self.wake();
     }
 
@@ -73,6 +150,9 @@ impl Drop for Checkpoint {
         }
         if self.is_over {
             drop(fs::remove_file(&self.path));
+            keyframe_files(&self.path)
+                .into_iter()
+                .for_each(|(_, file)| drop(fs::remove_file(file)));
         }
     }
 }
@@ -93,13 +173,46 @@ fn write_or_warn(path: &Path, map: &Map) {
 
 fn write_until_stopped(path: &Path, shared: &Shared) {
     while !shared.stop.load(Ordering::Acquire) {
-        match shared.newest.pop() {
-            None => std::thread::park(),
-            Some(map) => {
-                write_or_warn(path, &map);
-            }
+        // A keyframe first: the state that comes after it lists it.
+        if let Some(keyframe) = shared.left.pop() {
+            write_keyframe(path, keyframe);
+        } else if let Some(map) = shared.newest.pop() {
+            write_or_warn(path, &map);
+        } else {
+            std::thread::park();
         }
     }
+}
+
+/// Writes a keyframe into a file of its own; of more than are kept the oldest go.
+fn write_keyframe(path: &Path, keyframe: Keyframe) {
+    let file = keyframe_file(path, keyframe.keyframe_id);
+    write_or_warn(&file, &Map { keyframes: vec![keyframe], ..Map::default() });
+    let files = keyframe_files(path);
+    let surplus = files.len().saturating_sub(KEPT_KEYFRAMES);
+    files.into_iter().take(surplus).for_each(|(_, file)| drop(fs::remove_file(file)));
+}
+
+/// Where a keyframe before the active one is kept.
+fn keyframe_file(path: &Path, keyframe_id: u64) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(format!(".{keyframe_id}"));
+    PathBuf::from(name)
+}
+
+/// Those that there are, the oldest first.
+fn keyframe_files(path: &Path) -> Vec<(u64, PathBuf)> {
+    let (Some(folder), Some(name)) = (path.parent(), path.file_name()) else { return Vec::new() };
+    let beginning = format!("{}.", name.to_string_lossy());
+    let entries = fs::read_dir(folder).into_iter().flatten().flatten();
+    let mut files: Vec<(u64, PathBuf)> = entries
+        .filter_map(|entry| {
+            let name = entry.file_name().to_string_lossy().into_owned();
+            Some((name.strip_prefix(&beginning)?.parse().ok()?, entry.path()))
+        })
+        .collect();
+    files.sort_unstable();
+    files
 }
 
 /// Removes what mappers that were killed while they wrote have left.
@@ -115,17 +228,35 @@ fn remove_unfinished(path: &Path) {
     }
 }
 
-/// The checkpoint that a killed mapper left at `path`; `None` where there is none.
+/// The checkpoint that a killed mapper left at `path`, with image and depth of the keyframes before the active one
+/// as far as they can be read; `None` where there is none.
 pub fn read_checkpoint(path: &Path) -> Result<Option<Map>, MapFileError> {
-    match path.exists() {
-        true => read_map(path).map(Some),
-        false => Ok(None),
+    if !path.exists() {
+        return Ok(None);
     }
+    let mut map = read_map(path)?;
+    let without_depth = map.keyframes.iter_mut().rev().filter(|keyframe| !keyframe.has_depth());
+    for keyframe in without_depth.take(KEPT_KEYFRAMES) {
+        // One that was never written, or is torn, is missed by nobody who has lived without it.
+        let Ok(kept) = read_map(&keyframe_file(path, keyframe.keyframe_id)) else { continue };
+        let of_same = |kept: &Keyframe| {
+            (kept.keyframe_id, kept.epoch, kept.intrinsics)
+                == (keyframe.keyframe_id, keyframe.epoch, keyframe.intrinsics)
+        };
+        if let Some(kept) = kept.keyframes.into_iter().next().filter(of_same) {
+            (keyframe.image, keyframe.points) = (kept.image, kept.points);
+        }
+    }
+    Ok(Some(map))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::slam::geometry::intrinsics::Intrinsics;
+    use crate::slam::geometry::se3::SE3;
+    use crate::slam::geometry::sim3::Sim3;
+    use crate::slam::keyframe::{DepthPoint, MapState};
     use std::os::unix::fs::PermissionsExt;
     use std::time::{Duration, Instant};
 
@@ -154,7 +285,63 @@ mod tests {
         drop(kept);
         assert!(path.exists(), "a panic or an error is no end in order");
         kept = Checkpoint::keep(&path).unwrap();
-        kept.end_in_order();
+        kept.is_over = true;
+        drop(kept);
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+    }
+
+    fn keyframe(keyframe_id: u64) -> Keyframe {
+        let place = Sim3::new(SE3::identity(), 1.0 + keyframe_id as f64);
+        let point = DepthPoint { u: 9, v: 9, inverse_depth: 1.0, variance: 0.1, intensity: 9.0 };
+        Keyframe {
+            keyframe_id,
+            epoch: 0,
+            revision: 1,
+            sequence: keyframe_id,
+            capture_nanos: 1,
+            map_state: MapState::Established,
+            world_from_keyframe: place,
+            map_from_keyframe: place,
+            map_revision: 0,
+            intrinsics: Intrinsics { fx: 20.0, fy: 20.0, cx: 8.0, cy: 7.5, width: 17, height: 16 },
+            image: vec![keyframe_id as u8; 17 * 16],
+            points: vec![point; 3],
+        }
+    }
+
+    #[test]
+    fn a_successor_has_image_and_depth_of_the_last_keyframes() {
+        const LAST: u64 = 25;
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("rig.checkpoint");
+        let kept = Checkpoint::keep(&path).unwrap();
+        let written = |id: u64| keyframe_file(&path, id);
+        for id in 0..LAST {
+            kept.put_keyframe(keyframe(id));
+            until(|| written(id).exists());
+        }
+        until(|| keyframe_files(&path).len() == KEPT_KEYFRAMES);
+        let poses =
+            (0..LAST).map(|id| Keyframe { image: Vec::new(), points: Vec::new(), ..keyframe(id) });
+        let moved = Sim3::new(SE3::identity(), 9.0);
+        let mut keyframes: Vec<_> = poses.chain([keyframe(LAST)]).collect();
+        keyframes[10].map_from_keyframe = moved;
+        kept.put_now(&Map { keyframes, active: Some(LAST), ..Map::default() });
+        // One is torn, one is of another run.
+        fs::write(written(7), "semidense").unwrap();
+        fs::copy(written(9), written(8)).unwrap();
+        let read = read_checkpoint(&path).unwrap().unwrap();
+        let with_depth: Vec<u64> =
+            read.keyframes.iter().filter(|k| k.has_depth()).map(|k| k.keyframe_id).collect();
+        let expected: Vec<u64> = (5..=LAST).filter(|id| ![7, 8].contains(id)).collect();
+        assert_eq!(with_depth, expected);
+        assert_eq!((read.active, read.keyframes[20].image[0]), (Some(LAST), 20));
+        assert_eq!(
+            read.keyframes[10].map_from_keyframe, moved,
+            "places are those of the last state"
+        );
+        let mut kept = kept;
+        kept.is_over = true;
         drop(kept);
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
     }

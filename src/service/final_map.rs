@@ -11,7 +11,7 @@ use crate::service::map_file::{MapFileError, read_map};
 use crate::service::mapper::WRITES_MAP;
 use crate::service::shutdown::Shutdown;
 use crate::service::supervised::Supervised;
-use crate::slam::mapper::Map;
+use crate::slam::map::Map;
 use crate::wire::command::{Command, CommandClient, CommandError};
 use crate::wire::port::ReceiveError;
 

@@ -45,7 +45,9 @@ pub fn given_pose(
         revision: 0,
         keyframe_id: NO_KEYFRAME,
         state: TrackingState::Tracking,
+        map_revision: 0,
         world_from_camera,
+        map_from_camera: world_from_camera,
         keyframe_from_camera: SE3::identity(),
         covariance: [0.0; 21],
         alignment_covariance: [0.0; 21],
@@ -55,9 +57,10 @@ pub fn given_pose(
     };
     if let Some(keyframe) = keyframe {
         estimate.epoch = keyframe.epoch;
-        estimate.revision = keyframe.revision;
+        (estimate.revision, estimate.map_revision) = (keyframe.revision, keyframe.map_revision);
         estimate.keyframe_id = keyframe.keyframe_id;
         estimate.keyframe_from_camera = keyframe.world_from_keyframe.locate(&world_from_camera);
+        estimate.map_from_camera = keyframe.map_from_keyframe.place(&estimate.keyframe_from_camera);
         let view = view_of(keyframe, &estimate.keyframe_from_camera, tracker);
         estimate.quality = view.quality;
         estimate.proposes_keyframe = view.proposes_keyframe;
@@ -143,6 +146,8 @@ mod tests {
             capture_nanos: 0,
             map_state: MapState::Established,
             world_from_keyframe: Sim3::new(SE3::identity(), 2.0),
+            map_from_keyframe: Sim3::new(SE3::identity(), 2.0),
+            map_revision: 0,
             intrinsics: Intrinsics {
                 fx: 100.0,
                 fy: 100.0,

@@ -13,14 +13,15 @@ use crate::capture::input_file;
 use crate::service::atomic_file::write_atomically;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS};
-use crate::slam::mapper::Map;
+use crate::slam::map::Map;
+use crate::slam::pose::NO_KEYFRAME;
 use crate::wire::conversion::{
     MessageError, check_points, code_from_map_state, map_state_from_code, similarity_from_message,
     similarity_message,
 };
 
 /// First bytes of the file, with the version of the layout.
-const MAGIC: [u8; 16] = *b"semidense map 3\n";
+const MAGIC: [u8; 16] = *b"semidense map 4\n";
 /// Largest id or revision: what comes after it must not overflow.
 const MAX_NUMBER: u64 = u64::MAX / 2;
 /// Largest number of an epoch, for the same reason.
@@ -88,12 +89,16 @@ pub fn write_map_into(file: &mut impl Write, map: &Map) -> io::Result<()> {
 fn write_head(file: &mut impl Write, map: &Map) -> io::Result<()> {
     file.write_all(&MAGIC)?;
     file.write_all(&map.free_epoch.to_le_bytes())?;
+    file.write_all(&map.revision.to_le_bytes())?;
+    file.write_all(&map.active.unwrap_or(NO_KEYFRAME).to_le_bytes())?;
     file.write_all(&(map.keyframes.len() as u64).to_le_bytes())
 }
 
 fn write_keyframe(file: &mut impl Write, keyframe: &Keyframe) -> io::Result<()> {
     let k = &keyframe.intrinsics;
-    for number in [keyframe.keyframe_id, keyframe.revision, keyframe.sequence] {
+    let numbers =
+        [keyframe.keyframe_id, keyframe.revision, keyframe.map_revision, keyframe.sequence];
+    for number in numbers {
         file.write_all(&number.to_le_bytes())?;
     }
     file.write_all(&keyframe.capture_nanos.to_le_bytes())?;
@@ -101,8 +106,9 @@ fn write_keyframe(file: &mut impl Write, keyframe: &Keyframe) -> io::Result<()> 
     for number in [keyframe.epoch, state, k.width as u32, k.height as u32] {
         file.write_all(&number.to_le_bytes())?;
     }
-    let pose = similarity_message(&keyframe.world_from_keyframe);
-    for number in pose.into_iter().chain([k.fx, k.fy, k.cx, k.cy]) {
+    let in_world = similarity_message(&keyframe.world_from_keyframe);
+    let in_map = similarity_message(&keyframe.map_from_keyframe);
+    for number in in_world.into_iter().chain(in_map).chain([k.fx, k.fy, k.cx, k.cy]) {
         file.write_all(&number.to_le_bytes())?;
     }
     file.write_all(&(keyframe.points.len() as u64).to_le_bytes())?;
@@ -130,7 +136,10 @@ pub fn parse_map(path: &Path, bytes: impl Read) -> Result<Map, MapFileError> {
     if reader.bytes::<16>()? != MAGIC {
         return Err(MapFileError::Magic(path.to_owned()));
     }
-    let mut map = Map { free_epoch: reader.epoch()?, ..Map::default() };
+    let free_epoch = reader.epoch()?;
+    let revision = reader.count("map revision", MAX_NUMBER)?;
+    let active = Some(reader.u64()?).filter(|&id| id != NO_KEYFRAME);
+    let mut map = Map { free_epoch, revision, active, ..Map::default() };
     let count = reader.count("keyframes", MAX_KEYFRAMES)?;
     for index in 0..count {
         map.keyframes.push(reader.keyframe(index)?);
@@ -209,14 +218,13 @@ impl<R: Read> Reader<'_, R> {
         let path = self.path.to_owned();
         let wrong = move |source| MapFileError::Keyframe { path: path.clone(), index, source };
         let keyframe_id = self.count("keyframe id", MAX_NUMBER)?;
-        let (revision, sequence) = (self.count("revision", MAX_NUMBER)?, self.u64()?);
+        let revision = self.count("revision", MAX_NUMBER)?;
+        let map_revision = self.count("map revision", MAX_NUMBER)?;
+        let sequence = self.u64()?;
         let capture_nanos = i64::from_le_bytes(self.bytes()?);
         let (epoch, state, width, height) = (self.epoch()?, self.u32()?, self.u32()?, self.u32()?);
-        let mut numbers = [0.0; 12];
-        for number in &mut numbers {
-            *number = self.f64()?;
-        }
-        let [pose @ .., fx, fy, cx, cy] = numbers;
+        let (in_world, in_map) = (self.numbers()?, self.numbers()?);
+        let [fx, fy, cx, cy] = self.numbers()?;
         let intrinsics =
             Intrinsics { fx, fy, cx, cy, width: width as usize, height: height as usize };
         if !intrinsics.is_valid() {
@@ -242,12 +250,23 @@ impl<R: Read> Reader<'_, R> {
             sequence,
             capture_nanos,
             map_state: map_state_from_code(state).map_err(&wrong)?,
-            world_from_keyframe: similarity_from_message(&pose, "world_from_keyframe")
+            world_from_keyframe: similarity_from_message(&in_world, "world_from_keyframe")
                 .map_err(&wrong)?,
+            map_from_keyframe: similarity_from_message(&in_map, "map_from_keyframe")
+                .map_err(&wrong)?,
+            map_revision,
             intrinsics,
             image,
             points,
         })
+    }
+
+    fn numbers<const N: usize>(&mut self) -> Result<[f64; N], MapFileError> {
+        let mut numbers = [0.0; N];
+        for number in &mut numbers {
+            *number = self.f64()?;
+        }
+        Ok(numbers)
     }
 
     fn point(&mut self) -> Result<DepthPoint, MapFileError> {
@@ -278,12 +297,14 @@ mod tests {
             capture_nanos: -5,
             map_state: MapState::Established,
             world_from_keyframe: Sim3::new(rigid, 1.7),
+            map_from_keyframe: Sim3::new(rigid.inverse(), 2.3),
+            map_revision: 3,
             intrinsics: Intrinsics { fx: 20.0, fy: 21.0, cx: 8.0, cy: 7.5, width: 17, height: 16 },
             image: (0..17 * 16).map(|i| (i % 251) as u8).collect(),
             points: vec![point; 5],
         };
         let keyframes = vec![keyframe.clone(), Keyframe { keyframe_id: 8, ..keyframe }];
-        Map { keyframes, free_epoch: 18 }
+        Map { keyframes, free_epoch: 18, revision: 4, active: Some(7) }
     }
 
     #[test]
@@ -292,7 +313,8 @@ mod tests {
         let path = folder.path().join("map.bin");
         write_map(&path, &map(), &mut || ()).unwrap();
         let read = read_map(&path).unwrap();
-        assert_eq!((read.keyframes, read.free_epoch), (map().keyframes, 18));
+        assert_eq!((read.free_epoch, read.revision, read.active), (18, 4, Some(7)));
+        assert_eq!(read.keyframes, map().keyframes);
     }
 
     #[test]

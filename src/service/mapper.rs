@@ -1,47 +1,38 @@
 //! The mapper process: pairs frames with their poses, lets the map take them in, publishes it.
 
+mod output;
+
 use std::path::Path;
 use std::time::Duration;
 
-use crate::service::checkpoint::{Checkpoint, read_checkpoint};
+use crate::service::checkpoint::Kept;
 use crate::service::child::is_supervised;
 use crate::service::clock::now_nanos;
 use crate::service::config::Config;
 use crate::service::frame_order::{Arrival, FrameOrder, SILENCE};
 use crate::service::health::{Health, ProcessState};
 use crate::service::map_file::write_map;
+use crate::service::mapper::output::Output;
 use crate::service::mode::Mode;
 use crate::service::pairing::Pairing;
 use crate::service::schedule::{apply, in_force};
 use crate::service::shutdown::Shutdown;
 use crate::slam::geometry::intrinsics::Intrinsics;
-use crate::slam::keyframe::{DepthPoint, Keyframe, KeyframePose, MAX_KEYFRAME_POINTS};
-use crate::slam::mapper::{Map, Mapper, StepOutcome};
+use crate::slam::map::Map;
+use crate::slam::mapper::Mapper;
 use crate::slam::parameter::ParameterError;
-use crate::slam::pose::{NO_KEYFRAME, PoseEstimate};
+use crate::slam::pose::PoseEstimate;
 use crate::wire::command::{Command, CommandError, CommandServer};
-use crate::wire::conversion::{
-    code_from_map_state, code_from_start_frame, frame_from_message, keyframe_header,
-    keyframe_image_header, keyframe_pose_message, pose_from_message, rigid_message,
-};
-use crate::wire::message::{
-    FrameHeader, GraphHeader, KeyframeHeader, KeyframeImageHeader, KeyframePoseMessage,
-    PoseMessage, StepMessage,
-};
+use crate::wire::conversion::{code_from_map_state, frame_from_message, pose_from_message};
+use crate::wire::message::{FrameHeader, PoseMessage};
 use crate::wire::place::{Claim, Place, PlaceError};
 use crate::wire::port::{
-    Access, Hub, OpenError, Publisher, ReceiveError, Received, SendError, Subscriber, WaitError,
-    wait,
+    Access, Hub, OpenError, ReceiveError, Received, SendError, Subscriber, WaitError, wait,
 };
-use crate::wire::topic::{
-    FRAME, GRAPH, KEYFRAME, KEYFRAME_IMAGE, MAPPER_HEALTH, MAX_GRAPH_KEYFRAMES, POSE, STEP,
-};
+use crate::wire::topic::{FRAME, MAPPER_HEALTH, POSE};
 
 /// Longest sleep without a look at signals and health.
 const WAKE_PERIOD: Duration = Duration::from_millis(100);
-/// Time between two checkpoints of a keyframe whose depth improves; a new keyframe has one at once.
-const CHECKPOINT_PERIOD_NANOS: i64 = 1_000_000_000;
-
 /// What a mapper says of itself before it writes its map, which may take long.
 pub const WRITES_MAP: &str = "the map is being written";
 
@@ -93,7 +84,7 @@ pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), Mappe
         Ok(()) => {
             // A supervisor that did not ask for the end starts another, which continues from the checkpoint.
             if !is_supervised() {
-                shell.kept.iter_mut().for_each(|kept| kept.checkpoint.end_in_order());
+                shell.kept.iter_mut().for_each(|kept| kept.end_in_order());
             }
             shell.health.enter(ProcessState::Finished, "stopped");
         }
@@ -119,9 +110,8 @@ struct Shell<'a> {
     output: Output,
     health: Health,
     mapper: Option<(Intrinsics, Mapper)>,
-    /// Live: what a successor goes on from, and when it was written last.
+    /// Live: what a successor goes on from.
     kept: Option<Kept>,
-    checkpoint_nanos: i64,
     /// What a mapper that died has left for this one, until the first frame.
     left: Option<Map>,
     /// The last pose that was claimed.
@@ -139,7 +129,7 @@ impl<'a> Shell<'a> {
         let (kept, left) = match mode {
             // A run in lockstep ends with any of its processes.
             Mode::Lockstep => (None, None),
-            Mode::Live => open_checkpoint(&place.checkpoint_path()),
+            Mode::Live => Kept::open(&place.checkpoint_path()),
         };
         let threads = config.mapper.threads;
         let pool = rayon::ThreadPoolBuilder::new()
@@ -162,7 +152,6 @@ impl<'a> Shell<'a> {
             health: Health::open(&hub, &MAPPER_HEALTH)?,
             mapper: None,
             kept,
-            checkpoint_nanos: 0,
             left,
             last_pose: None,
             pool,
@@ -273,8 +262,8 @@ impl<'a> Shell<'a> {
         if pose.state.is_tracked() {
             self.last_pose = Some(*pose);
         }
-        if mapper.keyframe().is_some() {
-            self.kept.iter_mut().for_each(Kept::reserve);
+        if let (Some(kept), Some(_)) = (&mut self.kept, mapper.keyframe()) {
+            kept.reserve();
         }
         tracing::trace_span!("publish").in_scope(|| self.output.publish(mapper, &outcome))?;
         let change_nanos = change.filter(|_| outcome.keyframe_created).map_or(0, nanos_since);
@@ -286,14 +275,8 @@ impl<'a> Shell<'a> {
         self.output.publish(mapper, &finished)?;
         let durations = [step_nanos, change_nanos];
         self.output.publish_step(mapper, frame.sequence, durations, self.last_pose.as_ref())?;
-        let is_new = outcome.needs_image();
-        let is_due = outcome.keyframe_changed
-            && now_nanos().saturating_sub(self.checkpoint_nanos) > CHECKPOINT_PERIOD_NANOS;
-        if let Some(kept) = self.kept.as_ref().filter(|_| is_new || is_due)
-            && let Some(map) = mapper.checkpoint()
-        {
-            kept.checkpoint.put(map);
-            self.checkpoint_nanos = now_nanos();
+        if let Some(kept) = &mut self.kept {
+            kept.follow(mapper, &outcome);
         }
         self.health.enter(ProcessState::Running, &mapper.situation().to_string());
         let counters = self.health.counters();
@@ -326,8 +309,12 @@ impl<'a> Shell<'a> {
     }
 
     fn answer_commands(&mut self) -> Result<(), MapperError> {
-        let (mapper, health) = (self.mapper.as_ref().map(|(_, mapper)| mapper), &mut self.health);
+        let mapper = self.mapper.as_ref().map(|(_, mapper)| mapper);
+        let (health, output) = (&mut self.health, &self.output);
         Ok(self.commands.answer(|command| match command {
+            Command::SendKeyframe(keyframe_id) => {
+                output.publish_earlier(mapper.map(Mapper::map), keyframe_id)
+            }
             Command::SaveMap(path) => {
                 // It may take longer than the pause between two signs of life.
                 let before = health.entered();
@@ -345,144 +332,8 @@ fn nanos_since(begin: i64) -> u64 {
     u64::try_from(now_nanos() - begin).unwrap_or(0)
 }
 
-/// What a dead mapper has left, and the keeper of our own. Without either the mapper works too.
-fn open_checkpoint(path: &Path) -> (Option<Kept>, Option<Map>) {
-    let left = read_checkpoint(path).unwrap_or_else(|error| {
-        tracing::warn!("starting a new map: {error}");
-        None
-    });
-    let mut reservation = left.clone().unwrap_or_default();
-    reservation.reserve_epochs();
-    match Checkpoint::keep(path) {
-        Ok(checkpoint) => (Some(Kept { checkpoint, reservation: Some(reservation) }), left),
-        Err(error) => {
-            tracing::warn!("there will be no checkpoints ({error})");
-            (None, left)
-        }
-    }
-}
-
-/// The checkpoint of this mapper, and what it writes before it gives its first number.
-struct Kept {
-    checkpoint: Checkpoint,
-    reservation: Option<Map>,
-}
-
-impl Kept {
-    /// From now on numbers are given: who comes after gives others.
-    fn reserve(&mut self) {
-        if let Some(map) = self.reservation.take() {
-            self.checkpoint.put_now(&map);
-        }
-    }
-}
-
 fn save_map(mapper: Option<&Mapper>, path: &Path, each: &mut dyn FnMut()) -> Result<(), String> {
     let empty = Map::default();
     let map = mapper.map_or(&empty, Mapper::map);
     write_map(path, map, each).map_err(|e| format!("{}: {e}", path.display()))
-}
-
-/// Everything that the mapper publishes.
-struct Output {
-    steps: Publisher<StepMessage, ()>,
-    depths: Publisher<DepthPoint, KeyframeHeader>,
-    graphs: Publisher<KeyframePoseMessage, GraphHeader>,
-    /// Open from the first frame on: it must know the size of the images.
-    images: Option<Publisher<u8, KeyframeImageHeader>>,
-}
-
-impl Output {
-    fn open(hub: &Hub) -> Result<Self, OpenError> {
-        Ok(Self {
-            steps: hub.publisher(&STEP, 1)?,
-            depths: hub.publisher(&KEYFRAME, MAX_KEYFRAME_POINTS)?,
-            graphs: hub.publisher(&GRAPH, MAX_GRAPH_KEYFRAMES)?,
-            images: None,
-        })
-    }
-
-    fn open_images(&mut self, hub: &Hub, intrinsics: &Intrinsics) -> Result<(), OpenError> {
-        let pixels = intrinsics.width * intrinsics.height;
-        self.images = Some(hub.publisher(&KEYFRAME_IMAGE, pixels)?);
-        hub.reserve()
-    }
-
-    fn serve_late_joiners(&self) {
-        self.steps.serve_late_joiners();
-        self.depths.serve_late_joiners();
-        self.graphs.serve_late_joiners();
-        self.images.iter().for_each(Publisher::serve_late_joiners);
-    }
-
-    /// Image before depth: who sees the depth has the image.
-    fn publish(&self, mapper: &Mapper, outcome: &StepOutcome) -> Result<(), SendError> {
-        let Some(keyframe) = mapper.keyframe() else { return Ok(()) };
-        if outcome.needs_image() {
-            self.publish_image(keyframe)?;
-        }
-        if outcome.needs_publishing() {
-            self.depths.send(keyframe_header(keyframe), &keyframe.points)?;
-        }
-        if outcome.graph_changed {
-            self.publish_graph(mapper.map(), keyframe)?;
-        }
-        Ok(())
-    }
-
-    /// After everything else of the frame: who sees the step has all.
-    fn publish_step(
-        &self,
-        mapper: &Mapper,
-        sequence: u64,
-        [step_nanos, change_nanos]: [u64; 2],
-        pose: Option<&PoseEstimate>,
-    ) -> Result<(), SendError> {
-        let keyframe = mapper.keyframe();
-        let epoch = keyframe.map_or(0, |k| k.epoch);
-        let pose = pose.filter(|pose| pose.epoch == epoch);
-        let step = StepMessage {
-            sequence,
-            keyframe_id: keyframe.map_or(NO_KEYFRAME, |k| k.keyframe_id),
-            revision: keyframe.map_or(0, |k| k.revision),
-            step_nanos,
-            change_nanos,
-            keyframes: mapper.map().keyframes.len() as u64,
-            points: keyframe.map_or(0, |k| k.points.len() as u64),
-            pose_nanos: pose.map_or(0, |pose| pose.capture_nanos),
-            world_from_camera: pose
-                .map_or_else(Default::default, |pose| rigid_message(&pose.world_from_camera)),
-            has_pose: u32::from(pose.is_some()),
-            epoch,
-            start_frame: code_from_start_frame(mapper.start_frame()),
-            reserved: 0,
-        };
-        self.steps.send((), &[step])
-    }
-
-    fn publish_image(&self, keyframe: &Keyframe) -> Result<(), SendError> {
-        match &self.images {
-            Some(images) => images.send(keyframe_image_header(keyframe), &keyframe.image),
-            None => Ok(()),
-        }
-    }
-
-    /// The keyframes of the epoch; the newest where there are more than a message holds.
-    fn publish_graph(&self, map: &Map, newest: &Keyframe) -> Result<(), SendError> {
-        let is_of_epoch = |keyframe: &&Keyframe| keyframe.epoch == newest.epoch;
-        let count = map.keyframes.iter().filter(is_of_epoch).count();
-        let poses: Vec<KeyframePoseMessage> = map
-            .keyframes
-            .iter()
-            .filter(is_of_epoch)
-            .skip(count.saturating_sub(MAX_GRAPH_KEYFRAMES))
-            .map(|keyframe| {
-                let (keyframe_id, world_from_keyframe) =
-                    (keyframe.keyframe_id, keyframe.world_from_keyframe);
-                keyframe_pose_message(&KeyframePose { keyframe_id, world_from_keyframe })
-            })
-            .collect();
-        let header = GraphHeader { revision: newest.revision, epoch: newest.epoch, reserved: 0 };
-        self.graphs.send(header, &poses)
-    }
 }

@@ -6,7 +6,7 @@ use crate::service::journal::log::{Record, Step};
 use crate::service::journal::recovered::complete;
 use crate::service::recording::{RecordParts, Recording, RunCounters};
 use crate::service::results::RunRecord;
-use crate::slam::mapper::Map;
+use crate::slam::map::Map;
 use crate::slam::pose::TrackingState;
 use crate::wire::message::{PoseMessage, StepMessage};
 use crate::wire::port::{Events, Hub, OpenError, ReceiveError, Subscriber};

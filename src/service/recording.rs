@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::service::results::untracked::StartTally;
 use crate::service::results::{RecordedPose, RunMode, RunRecord};
 use crate::slam::evaluation::depth_error::DepthScale;
-use crate::slam::mapper::Map;
+use crate::slam::map::Map;
 use crate::slam::pose::TrackingState;
 use crate::slam::trajectory::StampedPose;
 use crate::wire::conversion::{MessageError, pose_from_message, start_frame_from_code};

@@ -28,7 +28,7 @@ use crate::service::schedule::peak_rss_bytes;
 use crate::service::shutdown::Shutdown;
 use crate::service::supervised::{Death, Supervised};
 use crate::slam::evaluation::depth_error::DepthScale;
-use crate::slam::mapper::Map;
+use crate::slam::map::Map;
 use crate::wire::command::CommandClient;
 use crate::wire::place::{Claim, Place, PlaceError};
 use crate::wire::port::{Access, Hub, wait};

@@ -30,8 +30,6 @@ pub const fn most_keyframe_bytes(num_pixels: usize) -> usize {
 /// Whether the map behind a keyframe can be trusted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MapState {
-    /// Depth is still random or unproven: poses on it are `Initializing`.
-    Initializing,
     /// Depth is proven: poses on it are claimed.
     Established,
     /// The map contradicted itself: poses on it are `Lost` until a new keyframe or epoch.
@@ -53,8 +51,12 @@ pub struct Keyframe {
     pub capture_nanos: i64,
     /// Whether its depth can be trusted.
     pub map_state: MapState,
-    /// Its pose, with the scale of its depth.
+    /// Where odometry has it, with its unit: never jumps while it is active.
     pub world_from_keyframe: Sim3,
+    /// Where the map has it, with its unit: moves with every correction of the map.
+    pub map_from_keyframe: Sim3,
+    /// How often the map had been corrected by then.
+    pub map_revision: u64,
     /// Intrinsics of its image.
     pub intrinsics: Intrinsics,
     /// Rectified grey image, `width * height` bytes.
@@ -68,6 +70,16 @@ pub struct Keyframe {
 pub struct KeyframePose {
     /// The keyframe.
     pub keyframe_id: u64,
-    /// Its pose, with the scale of its depth.
-    pub world_from_keyframe: Sim3,
+    /// Revision of its depth.
+    pub revision: u64,
+    /// Where the map has it, with its unit.
+    pub map_from_keyframe: Sim3,
+}
+
+impl KeyframePose {
+    /// Of a keyframe.
+    pub fn of(keyframe: &Keyframe) -> Self {
+        let Keyframe { keyframe_id, revision, map_from_keyframe, .. } = *keyframe;
+        Self { keyframe_id, revision, map_from_keyframe }
+    }
 }

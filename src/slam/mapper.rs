@@ -2,9 +2,11 @@
 
 mod change;
 pub mod consistency;
-mod memory;
+mod correction;
+mod depth_buffers;
 pub mod observation;
 mod past;
+mod phase;
 pub mod recovery;
 mod resume;
 pub mod reuse;
@@ -16,27 +18,30 @@ use serde::{Deserialize, Serialize};
 use crate::slam::depth::candidate::CandidateParams;
 use crate::slam::depth::gaussian::{GaussianParams, ObservationCounts};
 use crate::slam::depth::immature::IntervalParams;
-use crate::slam::depth::interval::IntervalFilter;
-use crate::slam::depth::map::DepthMap;
 use crate::slam::depth::matching::MatchingParams;
 use crate::slam::depth::propagation::PropagationParams;
-use crate::slam::depth::regularisation::{RegularisationParams, RegularisationScratch};
+use crate::slam::depth::regularisation::RegularisationParams;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::buffer::Image;
 use crate::slam::image::quads::QuadImage;
-use crate::slam::initializer::InitializerParams;
 use crate::slam::keyframe::{Keyframe, MAX_KEYFRAME_POINTS, MapState};
+use crate::slam::map::Map;
 use crate::slam::mapper::change::Unfinished;
-use crate::slam::mapper::consistency::{Consistency, ConsistencyParams, Contradiction};
+use crate::slam::mapper::consistency::ConsistencyParams;
+use crate::slam::mapper::depth_buffers::DepthBuffers;
 use crate::slam::mapper::observation::DepthFilter;
 use crate::slam::mapper::past::PastFrames;
-use crate::slam::mapper::recovery::{Recovery, RecoveryParams};
+use crate::slam::mapper::phase::{Active, Phase};
+use crate::slam::mapper::recovery::{Finder, RecoveryParams};
 use crate::slam::mapper::reuse::ReuseParams;
-use crate::slam::mapper::situation::{Situation, StartFrame, StartProgress};
+use crate::slam::mapper::situation::{Situation, StartFrame};
+use crate::slam::mapper::start::Start;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::{NO_KEYFRAME, PoseEstimate, TrackingState};
-use crate::slam::two_frame::TwoFrameInitializer;
+use crate::slam::two_frame::TwoFrameParams;
 
 /// Tuning of the mapper.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -51,7 +56,7 @@ pub struct MapperParams {
     /// quarter (0.7 instead of 1.0 %), 4 no further, and each is a search over all depths for every
     /// new pixel.
     pub num_seed_frames: usize,
-    /// Frames kept for that, newest first, beside the keyframe in force: bounds the memory (one byte a pixel each).
+    /// Frames kept for that, newest first, beside the active keyframe: bounds the memory (one byte a pixel each).
     pub max_past_frames: usize,
     /// The depth is smoothed and published again when this share of it has changed: a map that
     /// hardly changed costs the tracker as much to prepare as a new one.
@@ -77,8 +82,8 @@ pub struct MapperParams {
     pub propagation: PropagationParams,
     /// Smoothing.
     pub regularisation: RegularisationParams,
-    /// The start.
-    pub initializer: InitializerParams,
+    /// The start of a map.
+    pub two_frame: TwoFrameParams,
     /// When the map is rejected.
     pub consistency: ConsistencyParams,
     /// When an earlier keyframe is taken up again.
@@ -104,7 +109,7 @@ impl Default for MapperParams {
             candidates: CandidateParams::default(),
             propagation: PropagationParams::default(),
             regularisation: RegularisationParams::default(),
-            initializer: InitializerParams::default(),
+            two_frame: TwoFrameParams::default(),
             consistency: ConsistencyParams::default(),
             reuse: ReuseParams::default(),
             recovery: RecoveryParams::default(),
@@ -112,7 +117,15 @@ impl Default for MapperParams {
     }
 }
 
+/// Bytes in the megabyte of the configuration.
+const BYTES_PER_MEGABYTE: usize = 1_000_000;
+
 impl MapperParams {
+    /// Bytes of image and depth that the map may hold.
+    pub fn max_map_bytes(&self) -> usize {
+        self.max_map_megabytes * BYTES_PER_MEGABYTE
+    }
+
     /// Checks every value.
     pub fn validate(&self) -> Result<(), ParameterError> {
         check_range("min_gradient", self.min_gradient, 0.5..=100.0)?;
@@ -128,7 +141,7 @@ impl MapperParams {
         self.candidates.validate().map_err(|e| e.within("candidates"))?;
         self.propagation.validate().map_err(|e| e.within("propagation"))?;
         self.regularisation.validate().map_err(|e| e.within("regularisation"))?;
-        self.initializer.validate().map_err(|e| e.within("initializer"))?;
+        self.two_frame.validate().map_err(|e| e.within("two_frame"))?;
         self.consistency.validate().map_err(|e| e.within("consistency"))?;
         self.reuse.validate().map_err(|e| e.within("reuse"))?;
         self.recovery.validate().map_err(|e| e.within("recovery"))
@@ -138,11 +151,11 @@ impl MapperParams {
 /// What changed in one step, and what has to be published.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct StepOutcome {
-    /// The keyframe in force was made in this step: publish its image too.
+    /// The active keyframe was made in this step: publish its image too.
     pub keyframe_created: bool,
-    /// An earlier keyframe is in force again: publish its image too.
+    /// An earlier keyframe is active again: publish its image too.
     pub keyframe_restored: bool,
-    /// The keyframe in force has other depth or another state than before: publish it.
+    /// The active keyframe has other depth or another state than before: publish it.
     pub keyframe_changed: bool,
     /// A keyframe's pose changed, or one was added: publish the graph.
     pub graph_changed: bool,
@@ -151,24 +164,15 @@ pub struct StepOutcome {
 }
 
 impl StepOutcome {
-    /// Whether the keyframe in force is another one or another revision than before.
+    /// Whether the active keyframe is another one or another revision than before.
     pub fn needs_publishing(&self) -> bool {
         self.keyframe_created || self.keyframe_restored || self.keyframe_changed
     }
 
-    /// Whether another keyframe than before is in force.
+    /// Whether another keyframe than before is active.
     pub fn needs_image(&self) -> bool {
         self.keyframe_created || self.keyframe_restored
     }
-}
-
-/// All keyframes of all epochs, with their final depth. Each epoch has a scale and a drift of its own.
-#[derive(Debug, Clone, Default)]
-pub struct Map {
-    /// Keyframes in order of creation.
-    pub keyframes: Vec<Keyframe>,
-    /// Numbers of epochs from here on are given by nobody yet; see [`Mapper::checkpoint`].
-    pub free_epoch: u32,
 }
 
 /// Keeps the map.
@@ -177,36 +181,26 @@ pub struct Mapper {
     params: MapperParams,
     intrinsics: Intrinsics,
     map: Map,
-    /// Place in the map of the keyframe in force; `None` before the first.
-    in_force: Option<usize>,
-    /// The depth map of the keyframe in force, and memory for the next.
-    depth: DepthMap,
-    next_depth: DepthMap,
-    regularisation: RegularisationScratch,
-    /// The immature points of the keyframe in force.
-    points: IntervalFilter,
-    frame: QuadImage,
+    phase: Phase,
+    /// The keyframe that frames are tracked on; `None` before the first.
+    active: Option<Active>,
+    /// Where the active epoch's map lies in odometry's world: a similarity, since a correction may change units.
+    world_from_map: Sim3,
+    depth: DepthBuffers,
+    start: Start,
+    finder: Finder,
     past: PastFrames,
-    two_frame: TwoFrameInitializer,
-    /// Sequence and stamp of the two-frame start's first frame.
-    first_stamp: Option<(u64, i64)>,
-    start_progress: StartProgress,
-    /// What the last frame came to, where it was one of a two-frame start.
-    start_frame: Option<StartFrame>,
-    recovery: Recovery,
-    consistency: Consistency,
-    contradiction: Option<Contradiction>,
-    /// Whether the unit of the first keyframe is still to be found.
-    is_unit_open: bool,
+    /// The keyframe that was active before, until somebody asks for it.
+    left: Option<u64>,
+    /// Memory for the frame at hand.
+    frame: QuadImage,
+    /// What the active keyframe wants when it is published.
+    unfinished: Option<Unfinished>,
+    /// Counts up with every change of a keyframe's depth, pose or state.
     revision: u64,
     next_keyframe_id: u64,
     /// Numbers of epochs below may have been given by a mapper that died.
     first_free_epoch: u32,
-    frames_on_keyframe: u64,
-    /// Hypotheses changed since the depth was smoothed and published.
-    unpublished: usize,
-    /// What the keyframe in force wants when it is published.
-    unfinished: Option<Unfinished>,
 }
 
 impl Mapper {
@@ -217,36 +211,27 @@ impl Mapper {
         Ok(Self {
             intrinsics,
             map: Map::default(),
-            in_force: None,
-            depth: DepthMap::with_size(width, height),
-            next_depth: DepthMap::with_size(width, height),
-            regularisation: RegularisationScratch::with_size(width, height),
-            points: IntervalFilter::default(),
-            frame: QuadImage::with_size(width, height),
-            // The keyframe in force is one more.
+            phase: Phase::default(),
+            active: None,
+            world_from_map: Sim3::identity(),
+            depth: DepthBuffers::with_size(width, height),
+            start: Start::new(intrinsics, &params.two_frame)?,
+            finder: Finder::new(&intrinsics),
+            // The active keyframe is one more.
             past: PastFrames::with_capacity(params.max_past_frames + 1),
-            two_frame: TwoFrameInitializer::new(intrinsics, params.initializer.two_frame.clone())
-                .map_err(|e| e.within("initializer.two_frame"))?,
-            first_stamp: None,
-            start_progress: StartProgress::default(),
-            start_frame: None,
-            recovery: Recovery::new(&intrinsics),
-            consistency: Consistency::default(),
-            contradiction: None,
-            is_unit_open: false,
+            left: None,
+            frame: QuadImage::with_size(width, height),
+            unfinished: None,
             revision: 0,
             next_keyframe_id: 0,
             first_free_epoch: 0,
-            frames_on_keyframe: 0,
-            unpublished: 0,
-            unfinished: None,
             params,
         })
     }
 
     /// Takes in one tracked frame. `sensor_depth` (metres, 0 where none) initialises the depth of
     /// new keyframes where a depth camera may be used. `change_begins` is called when
-    /// the frame is observed and another keyframe is to be put in force, for who measures that.
+    /// the frame is observed and another keyframe is to become active, for who measures that.
     pub fn step(
         &mut self,
         frame: &FrameView<'_>,
@@ -255,7 +240,7 @@ impl Mapper {
         change_begins: &mut dyn FnMut(),
     ) -> StepOutcome {
         let finished = self.finish_keyframe();
-        self.start_frame = None;
+        self.start.last_frame = None;
         let outcome = self.take_in(frame, pose, sensor_depth, change_begins);
         let keyframe_changed = outcome.keyframe_changed || finished.keyframe_changed;
         StepOutcome { keyframe_changed, ..outcome }
@@ -273,49 +258,50 @@ impl Mapper {
         {
             return StepOutcome::default();
         }
-        let Some(keyframe) = self.keyframe() else { return self.start(frame, pose, sensor_depth) };
-        if pose.keyframe_id == NO_KEYFRAME || pose.epoch != keyframe.epoch {
-            // The tracker has not seen this epoch yet.
-            return StepOutcome::default();
-        }
+        let Some(keyframe) = self.keyframe() else { return self.begin(frame, pose, sensor_depth) };
         let is_lost = matches!(pose.state, TrackingState::Lost(_));
-        if !is_lost && pose.keyframe_id != keyframe.keyframe_id {
-            // The tracker has not seen this keyframe yet: its proposal and its brightness are about
-            // another one.
+        if !self.is_about(pose, keyframe, is_lost) {
             return StepOutcome::default();
         }
-        if is_lost || !pose.world_from_camera.is_finite() || self.is_rejected() {
+        let is_usable = pose.world_from_camera.is_finite() && pose.keyframe_from_camera.is_finite();
+        if is_lost || !is_usable || keyframe.map_state == MapState::Rejected {
             return self.recover(frame, pose, sensor_depth);
         }
-        self.recovery.end();
-        self.observe(frame, pose, sensor_depth, change_begins)
+        self.phase = Phase::Mapping;
+        self.extend(frame, pose, sensor_depth, change_begins)
     }
 
-    /// Takes a tracked frame into the keyframe, and changes to another where that is due.
-    fn observe(
+    /// Whether a pose is about the active keyframe: the tracker may not have seen this keyframe, or this epoch,
+    /// yet, and then its proposal and its brightness are about another one.
+    fn is_about(&self, pose: &PoseEstimate, active: &Keyframe, is_lost: bool) -> bool {
+        if !is_lost {
+            return pose.keyframe_id == active.keyframe_id;
+        }
+        // An epoch that was joined to another has changed its number.
+        let epoch = self.map.get(pose.keyframe_id).map_or(pose.epoch, |keyframe| keyframe.epoch);
+        pose.keyframe_id != NO_KEYFRAME && epoch == active.epoch
+    }
+
+    /// A tracked frame: observe, judge, then change the keyframe or remember the frame.
+    fn extend(
         &mut self,
         frame: &FrameView<'_>,
         pose: &PoseEstimate,
         sensor_depth: Option<&Image<f32>>,
         change_begins: &mut dyn FnMut(),
     ) -> StepOutcome {
-        self.frames_on_keyframe += 1;
-        let initializing = self.map_state() == MapState::Initializing;
-        self.guess_unit(pose);
+        self.guess_unit(&pose.keyframe_from_camera);
         let observations = self.observe_frame(frame, pose);
-        self.unpublished += observations.fused + observations.created;
-        let points = self.keyframe().map_or(0, |keyframe| keyframe.points.len());
-        let contradiction =
-            self.consistency.observe(&observations, points, &self.params.consistency);
-        if let Some(contradiction) = contradiction.filter(|_| !initializing) {
+        self.depth.unpublished += observations.fused + observations.created;
+        let points = self.num_points();
+        let params = &self.params.consistency;
+        let Some(active) = &mut self.active else { return StepOutcome::default() };
+        active.frames += 1;
+        let due = active.frames >= self.params.min_keyframe_interval;
+        if let Some(contradiction) = active.consistency.observe(&observations, points, params) {
             self.reject(contradiction);
             return StepOutcome { keyframe_changed: true, observations, ..Default::default() };
         }
-        if initializing {
-            self.refine();
-            return self.continue_start(frame, pose, observations, sensor_depth);
-        }
-        let due = self.frames_on_keyframe >= self.params.min_keyframe_interval;
         if pose.proposes_keyframe && due {
             change_begins();
             let is_reused = self.reuse_keyframe(frame, pose);
@@ -330,48 +316,44 @@ impl Mapper {
                 observations,
             };
         }
-        self.remember(frame, pose);
+        self.past.push(frame.pixels, pose.keyframe_id, pose.keyframe_from_camera, pose.brightness);
         let keyframe_changed =
-            self.unpublished as f64 > self.params.publish_change_ratio * points as f64;
+            self.depth.unpublished as f64 > self.params.publish_change_ratio * points as f64;
         if keyframe_changed {
-            self.publish_change();
+            self.depth.refine(&self.params);
+            self.depth.keep_unit_mean();
+            self.publish_depth();
+            self.count_points();
         }
         StepOutcome { keyframe_changed, observations, ..Default::default() }
     }
 
-    /// Smooths and publishes the keyframe's depth; a map that has lost too much of it contradicts itself.
-    fn publish_change(&mut self) {
-        self.refine();
-        self.keep_unit_mean();
-        self.publish_depth();
-        let points = self.keyframe().map_or(0, |keyframe| keyframe.points.len());
-        let lost_depth = self.consistency.count_points(points, &self.params.consistency);
-        if let Some(contradiction) = lost_depth {
-            self.reject(contradiction);
-        }
+    /// The active keyframe, once there is one.
+    pub fn keyframe(&self) -> Option<&Keyframe> {
+        self.map.keyframes.get(self.active.as_ref()?.index)
     }
 
-    /// The keyframe in force, once there is one.
-    pub fn keyframe(&self) -> Option<&Keyframe> {
-        self.map.keyframes.get(self.in_force?)
+    /// The keyframe that was left since the last call, once its depth is final for now: after
+    /// [`Mapper::finish_keyframe`].
+    pub fn take_left(&mut self) -> Option<&Keyframe> {
+        let left = self.left.take()?;
+        self.map.get(left).filter(|keyframe| keyframe.has_depth())
     }
 
     /// What the mapper is doing, and why.
     pub fn situation(&self) -> Situation {
-        let state = self.keyframe().map(|keyframe| keyframe.map_state);
-        match (state, self.contradiction) {
-            (None, _) => Situation::Starting(self.start_progress),
-            _ if self.recovery.is_restarting => Situation::Restarting(self.start_progress),
-            (Some(MapState::Rejected), Some(why)) => Situation::Rejected(why),
-            _ if self.recovery.is_under_way() => Situation::Lost,
-            (Some(MapState::Initializing), _) => Situation::Unproven,
-            _ => Situation::Mapping,
+        match self.phase {
+            Phase::Starting => Situation::Starting(self.start.progress),
+            Phase::Mapping => Situation::Mapping,
+            Phase::Lost(_) => Situation::Lost,
+            Phase::Rejected(why, _) => Situation::Rejected(why),
+            Phase::Restarting(_) => Situation::Restarting(self.start.progress),
         }
     }
 
     /// What the last frame came to, where it was one of a two-frame start.
     pub fn start_frame(&self) -> Option<StartFrame> {
-        self.start_frame
+        self.start.last_frame
     }
 
     /// Every keyframe.
@@ -379,29 +361,67 @@ impl Mapper {
         &self.map
     }
 
-    fn map_state(&self) -> MapState {
-        self.keyframe().map_or(MapState::Initializing, |k| k.map_state)
+    fn num_points(&self) -> usize {
+        self.keyframe().map_or(0, |keyframe| keyframe.points.len())
     }
 
-    fn is_rejected(&self) -> bool {
-        self.map_state() == MapState::Rejected
+    /// Rejects a map that has lost almost all of its depth.
+    fn count_points(&mut self) {
+        let (points, params) = (self.num_points(), &self.params.consistency);
+        let Some(active) = &mut self.active else { return };
+        if let Some(contradiction) = active.consistency.count_points(points, params) {
+            self.reject(contradiction);
+        }
     }
 
     fn keyframe_mut(&mut self) -> Option<&mut Keyframe> {
-        self.map.keyframes.get_mut(self.in_force?)
+        self.map.keyframes.get_mut(self.active.as_ref()?.index)
     }
 
-    /// Leaves the depth that was reached with the keyframe in force.
+    /// Leaves the depth that was reached with the active keyframe.
     fn leave_keyframe(&mut self) {
-        if self.unpublished > 0 && !self.is_rejected() {
+        let is_rejected = self.keyframe().is_some_and(|k| k.map_state == MapState::Rejected);
+        if self.depth.unpublished > 0 && !is_rejected {
             self.publish_depth();
         }
     }
 
-    /// Puts a keyframe of the map in force.
+    /// Makes a keyframe of the map the active one, placed in the world as its map is.
     fn enter_keyframe(&mut self, index: usize) {
-        self.in_force = Some(index);
-        self.consistency = Consistency::default();
-        (self.frames_on_keyframe, self.unpublished) = (0, 0);
+        self.left = self.keyframe().map_or(self.left, |keyframe| Some(keyframe.keyframe_id));
+        self.active = Some(Active::new(index));
+        self.depth.unpublished = 0;
+        self.depth.plant_points(&self.params);
+        self.publish_depth();
     }
+
+    /// Writes the active depth, the place in the world and the revisions into the active keyframe.
+    fn publish_depth(&mut self) {
+        self.revision += 1;
+        let (revision, map_revision) = (self.revision, self.map.revision);
+        let world_from_map = self.world_from_map;
+        let Some(active) = &self.active else { return };
+        let Some(keyframe) = self.map.keyframes.get_mut(active.index) else { return };
+        (keyframe.revision, keyframe.map_revision) = (revision, map_revision);
+        keyframe.world_from_keyframe = world_from_map * keyframe.map_from_keyframe;
+        self.depth.write_into(keyframe);
+    }
+
+    /// Chooses where the map lies in the world so that a camera at `map_from_camera` is at `world_from_camera`:
+    /// odometry stands still. Exact poses are the world's own, and need no anchor.
+    fn anchor(&mut self, map_from_camera: &SE3, pose: &PoseEstimate) {
+        let is_exact = pose.alignment_covariance.iter().all(|entry| *entry == 0.0);
+        if !is_exact && pose.world_from_camera.is_finite() {
+            self.world_from_map =
+                anchored(self.world_from_map.scale, map_from_camera, &pose.world_from_camera);
+        }
+    }
+}
+
+/// `world_from_map` of this scale that takes one pose of a camera to the other.
+fn anchored(scale: f64, map_from_camera: &SE3, world_from_camera: &SE3) -> Sim3 {
+    let rotation = world_from_camera.rotation * map_from_camera.rotation.inverse();
+    let translation =
+        world_from_camera.translation - rotation * map_from_camera.translation * scale;
+    Sim3::new(SE3 { rotation, translation }, scale)
 }

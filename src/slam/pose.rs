@@ -100,8 +100,12 @@ pub struct PoseEstimate {
     pub keyframe_id: u64,
     /// What it is worth.
     pub state: TrackingState,
+    /// How often the map had been corrected when that keyframe was published.
+    pub map_revision: u64,
     /// Odometry pose; never jumps within an epoch.
     pub world_from_camera: SE3,
+    /// Pose in the map, the best estimate; jumps where the map is corrected.
+    pub map_from_camera: SE3,
     /// Pose relative to the keyframe, translation in keyframe units.
     pub keyframe_from_camera: SE3,
     /// Upper triangle, row-major, of the covariance of the left increment (translation, rotation)
@@ -132,7 +136,9 @@ impl PoseEstimate {
             revision: 0,
             keyframe_id: NO_KEYFRAME,
             state: TrackingState::Initializing,
+            map_revision: 0,
             world_from_camera: SE3::identity(),
+            map_from_camera: SE3::identity(),
             keyframe_from_camera: SE3::identity(),
             covariance: [0.0; 21],
             alignment_covariance: [0.0; 21],

@@ -131,11 +131,12 @@ impl Tracker {
         let before = self.reference.replace(reference);
         let (old, new) = (before.as_deref(), self.reference.as_deref());
         if let (Some(old), Some(new)) = (old, new) {
-            if old.epoch() != new.epoch() {
+            // A keyframe whose epoch was joined to another has another number for the same place.
+            if old.epoch() != new.epoch() && old.keyframe_id() != new.keyframe_id() {
                 self.memory.motion = Motion::default();
                 self.memory.was_lost = false;
             }
-            if old.epoch() != new.epoch() || old.keyframe_id() != new.keyframe_id() {
+            if old.keyframe_id() != new.keyframe_id() {
                 self.memory.brightness = Brightness::default();
                 self.memory.coarse_fit = None;
             }
@@ -333,11 +334,16 @@ impl Tracker {
         let covariance = alignment.covariance(&self.params.alignment);
         let keyframe_from_camera = alignment.state.current_from_keyframe.inverse();
         let world_from_camera = reference.world_from_keyframe().place(&keyframe_from_camera);
+        let map_from_camera = reference.map_from_keyframe().place(&keyframe_from_camera);
         let covariance = match (verdict, covariance) {
             (TrackingState::Lost(reason), _) => {
                 return self.lost(frame, reference, reason, quality);
             }
-            (_, Some(covariance)) if world_from_camera.is_finite() => covariance,
+            (_, Some(covariance))
+                if world_from_camera.is_finite() && map_from_camera.is_finite() =>
+            {
+                covariance
+            }
             _ => return self.lost(frame, reference, LostReason::TooFewInliers, quality),
         };
         let translation = &alignment.state.current_from_keyframe.translation;
@@ -347,12 +353,12 @@ impl Tracker {
         self.memory.brightness = alignment.state.brightness;
         let state = match reference.map_state() {
             MapState::Established => verdict,
-            MapState::Initializing => TrackingState::Initializing,
             MapState::Rejected => TrackingState::Lost(LostReason::MapRejected),
         };
         PoseEstimate {
             state,
             world_from_camera,
+            map_from_camera,
             keyframe_from_camera,
             covariance: upper_triangle(|row, column| published[(row, column)]),
             alignment_covariance: upper_triangle(|row, column| covariance[(row, column)]),
@@ -393,6 +399,9 @@ impl Tracker {
             // Beyond all numbers where the keyframe's unit is absurdly small.
             .filter(SE3::is_finite);
         let keyframe_from_camera = located.unwrap_or_else(SE3::identity);
+        let placed = reference
+            .map(|reference| reference.map_from_keyframe().place(&keyframe_from_camera))
+            .filter(SE3::is_finite);
         let unknown = upper_triangle(|row, column| match row == column {
             true => UNKNOWN_VARIANCE,
             false => 0.0,
@@ -404,7 +413,9 @@ impl Tracker {
             revision: reference.map_or(0, Reference::revision),
             keyframe_id: reference.map_or(NO_KEYFRAME, Reference::keyframe_id),
             state,
+            map_revision: reference.map_or(0, Reference::map_revision),
             world_from_camera,
+            map_from_camera: placed.unwrap_or(world_from_camera),
             keyframe_from_camera,
             covariance: unknown,
             alignment_covariance: unknown,

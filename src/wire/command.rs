@@ -22,6 +22,8 @@ const ANSWER_PAUSE: Duration = Duration::from_millis(10);
 pub enum Command {
     /// Write the whole map to this file.
     SaveMap(PathBuf),
+    /// Send the depth and the image of this keyframe on `mapper/earlier_keyframe`.
+    SendKeyframe(u64),
 }
 
 /// Why a question was not asked, not understood or not answered.
@@ -63,13 +65,20 @@ pub fn text_from_bytes(bytes: &[u8; TEXT_BYTES], length: u32) -> String {
 }
 
 fn request_of(command: &Command) -> Result<CommandRequest, CommandError> {
-    let Command::SaveMap(path) = command;
+    let mut request =
+        CommandRequest { keyframe_id: 0, kind: 0, path_bytes: 0, path: [0; PATH_BYTES] };
+    let path = match command {
+        Command::SaveMap(path) => path,
+        Command::SendKeyframe(keyframe_id) => {
+            (request.kind, request.keyframe_id) = (1, *keyframe_id);
+            return Ok(request);
+        }
+    };
     let bytes = path.as_os_str().as_encoded_bytes();
     if bytes.len() > PATH_BYTES {
         return Err(CommandError::PathTooLong(path.clone()));
     }
-    let mut request =
-        CommandRequest { kind: 0, path_bytes: bytes.len() as u32, path: [0; PATH_BYTES] };
+    request.path_bytes = bytes.len() as u32;
     request.path[..bytes.len()].copy_from_slice(bytes);
     Ok(request)
 }
@@ -81,6 +90,7 @@ pub fn command_of(request: &CommandRequest) -> Result<Command, CommandError> {
     let path = Path::new(std::ffi::OsStr::from_bytes(&request.path[..length]));
     match request.kind {
         0 => Ok(Command::SaveMap(path.to_owned())),
+        1 => Ok(Command::SendKeyframe(request.keyframe_id)),
         kind => Err(CommandError::Unknown(kind)),
     }
 }

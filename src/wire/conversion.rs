@@ -214,7 +214,6 @@ pub fn start_frame_from_code(code: u32) -> Option<StartFrame> {
 /// The state of a map as a code.
 pub fn code_from_map_state(state: MapState) -> u32 {
     match state {
-        MapState::Initializing => 0,
         MapState::Established => 1,
         MapState::Rejected => 2,
     }
@@ -223,7 +222,6 @@ pub fn code_from_map_state(state: MapState) -> u32 {
 /// The state of a map from its code.
 pub fn map_state_from_code(code: u32) -> Result<MapState, MessageError> {
     match code {
-        0 => Ok(MapState::Initializing),
         1 => Ok(MapState::Established),
         2 => Ok(MapState::Rejected),
         code => Err(MessageError::UnknownCode { field: "map_state", code }),
@@ -260,7 +258,9 @@ pub fn pose_message(pose: &PoseEstimate, timing: &PoseTiming) -> PoseMessage {
         state,
         reason,
         proposes_keyframe: u32::from(pose.proposes_keyframe),
+        map_revision: pose.map_revision,
         world_from_camera: rigid_message(&pose.world_from_camera),
+        map_from_camera: rigid_message(&pose.map_from_camera),
         keyframe_from_camera: rigid_message(&pose.keyframe_from_camera),
         covariance: pose.covariance,
         alignment_covariance: pose.alignment_covariance,
@@ -311,7 +311,9 @@ pub fn pose_from_message(message: &PoseMessage) -> Result<PoseEstimate, MessageE
         revision: message.revision,
         keyframe_id: message.keyframe_id,
         state: state_from_codes(message.state, message.reason)?,
+        map_revision: message.map_revision,
         world_from_camera: rigid_from_message(&message.world_from_camera, "world_from_camera")?,
+        map_from_camera: rigid_from_message(&message.map_from_camera, "map_from_camera")?,
         keyframe_from_camera: rigid_from_message(
             &message.keyframe_from_camera,
             "keyframe_from_camera",
@@ -333,6 +335,8 @@ pub fn keyframe_header(keyframe: &Keyframe) -> KeyframeHeader {
         sequence: keyframe.sequence,
         capture_nanos: keyframe.capture_nanos,
         world_from_keyframe: similarity_message(&keyframe.world_from_keyframe),
+        map_from_keyframe: similarity_message(&keyframe.map_from_keyframe),
+        map_revision: keyframe.map_revision,
         intrinsics: [k.fx, k.fy, k.cx, k.cy],
         epoch: keyframe.epoch,
         map_state: code_from_map_state(keyframe.map_state),
@@ -383,6 +387,8 @@ pub fn keyframe_from_messages(
             &header.world_from_keyframe,
             "world_from_keyframe",
         )?,
+        map_from_keyframe: similarity_from_message(&header.map_from_keyframe, "map_from_keyframe")?,
+        map_revision: header.map_revision,
         intrinsics,
         image: image.to_vec(),
         points: points.to_vec(),
@@ -412,7 +418,8 @@ pub fn check_points(points: &[DepthPoint], intrinsics: &Intrinsics) -> Result<()
 pub fn keyframe_pose_message(pose: &KeyframePose) -> KeyframePoseMessage {
     KeyframePoseMessage {
         keyframe_id: pose.keyframe_id,
-        world_from_keyframe: similarity_message(&pose.world_from_keyframe),
+        revision: pose.revision,
+        map_from_keyframe: similarity_message(&pose.map_from_keyframe),
     }
 }
 
@@ -420,9 +427,10 @@ pub fn keyframe_pose_message(pose: &KeyframePose) -> KeyframePoseMessage {
 pub fn keyframe_pose_from_message(
     message: &KeyframePoseMessage,
 ) -> Result<KeyframePose, MessageError> {
-    let world_from_keyframe =
-        similarity_from_message(&message.world_from_keyframe, "world_from_keyframe")?;
-    Ok(KeyframePose { keyframe_id: message.keyframe_id, world_from_keyframe })
+    let map_from_keyframe =
+        similarity_from_message(&message.map_from_keyframe, "map_from_keyframe")?;
+    let KeyframePoseMessage { keyframe_id, revision, .. } = *message;
+    Ok(KeyframePose { keyframe_id, revision, map_from_keyframe })
 }
 
 #[cfg(test)]

@@ -50,7 +50,7 @@ pub struct FrameHeader {
 /// Message of `tracker/pose`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
-#[type_name("semidense.Pose.v3")]
+#[type_name("semidense.Pose.v4")]
 pub struct PoseMessage {
     /// Sequence of the frame.
     pub sequence: u64,
@@ -77,8 +77,13 @@ pub struct PoseMessage {
     pub reason: u32,
     /// 1 when the tracker asks for a new keyframe here.
     pub proposes_keyframe: u32,
-    /// Odometry pose.
+    /// How often the map had been corrected when the keyframe was published: `map_from_camera` jumps where this
+    /// grows.
+    pub map_revision: u64,
+    /// Odometry pose: never jumps within an epoch, and drifts.
     pub world_from_camera: RigidMessage,
+    /// Pose in the map, the best estimate: jumps where the map is corrected.
+    pub map_from_camera: RigidMessage,
     /// Pose relative to the keyframe, keyframe units.
     pub keyframe_from_camera: RigidMessage,
     /// Upper triangle, row-major, of the covariance of the left increment (translation, rotation) of
@@ -115,7 +120,7 @@ pub struct PoseMessage {
 /// Header of `mapper/keyframe`; the payload is its [`DepthPoint`]s.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
-#[type_name("semidense.KeyframeHeader.v1")]
+#[type_name("semidense.KeyframeHeader.v2")]
 pub struct KeyframeHeader {
     /// Its id.
     pub keyframe_id: u64,
@@ -125,13 +130,17 @@ pub struct KeyframeHeader {
     pub sequence: u64,
     /// Stamp of its frame, nanoseconds.
     pub capture_nanos: i64,
-    /// Its pose and the scale of its depth.
+    /// Where odometry has it, and its unit: poses follow from this.
     pub world_from_keyframe: SimilarityMessage,
+    /// Where the map has it, and its unit.
+    pub map_from_keyframe: SimilarityMessage,
+    /// How often the map had been corrected by then.
+    pub map_revision: u64,
     /// fx, fy, cx, cy in pixels.
     pub intrinsics: [f64; 4],
     /// Life of the map.
     pub epoch: u32,
-    /// 0 initializing, 1 established, 2 rejected.
+    /// 1 established, 2 rejected.
     pub map_state: u32,
     /// Width of its image, pixels.
     pub width: u32,
@@ -201,10 +210,12 @@ pub struct StepMessage {
 /// Header of `mapper/graph`; the payload is one [`KeyframePoseMessage`] per keyframe.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ZeroCopySend)]
-#[type_name("semidense.GraphHeader.v1")]
+#[type_name("semidense.GraphHeader.v2")]
 pub struct GraphHeader {
-    /// Revision of the map.
+    /// Newest revision of a keyframe in it.
     pub revision: u64,
+    /// How often the map had been corrected by then.
+    pub map_revision: u64,
     /// Life of the map.
     pub epoch: u32,
     /// Zero.
@@ -214,12 +225,14 @@ pub struct GraphHeader {
 /// The pose of one keyframe in `mapper/graph`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
-#[type_name("semidense.KeyframePose.v1")]
+#[type_name("semidense.KeyframePose.v2")]
 pub struct KeyframePoseMessage {
     /// The keyframe.
     pub keyframe_id: u64,
-    /// Its pose.
-    pub world_from_keyframe: SimilarityMessage,
+    /// Revision of its depth: another one than a reader has is asked for with a request.
+    pub revision: u64,
+    /// Where the map has it, and its unit.
+    pub map_from_keyframe: SimilarityMessage,
 }
 
 /// Message of `<process>/health`.
@@ -295,9 +308,11 @@ pub struct HealthMessage {
 /// Request of `mapper/command`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, ZeroCopySend)]
-#[type_name("semidense.CommandRequest.v1")]
+#[type_name("semidense.CommandRequest.v2")]
 pub struct CommandRequest {
-    /// 0 save the map to `path`.
+    /// The keyframe that is asked for; otherwise 0.
+    pub keyframe_id: u64,
+    /// 0 save the map to `path`, 1 send keyframe `keyframe_id` on `mapper/earlier_keyframe`.
     pub kind: u32,
     /// Bytes of `path` that are used.
     pub path_bytes: u32,
@@ -333,15 +348,15 @@ mod tests {
     #[test]
     fn layouts_are_pinned() {
         assert_layout::<FrameHeader>(88, 8, "semidense.FrameHeader.v2");
-        assert_layout::<PoseMessage>(600, 8, "semidense.Pose.v3");
-        assert_layout::<KeyframeHeader>(144, 8, "semidense.KeyframeHeader.v1");
+        assert_layout::<PoseMessage>(664, 8, "semidense.Pose.v4");
+        assert_layout::<KeyframeHeader>(216, 8, "semidense.KeyframeHeader.v2");
         assert_layout::<DepthPoint>(16, 4, "semidense.DepthPoint.v1");
         assert_layout::<KeyframeImageHeader>(24, 8, "semidense.KeyframeImageHeader.v1");
         assert_layout::<StepMessage>(136, 8, "semidense.Step.v4");
-        assert_layout::<GraphHeader>(16, 8, "semidense.GraphHeader.v1");
-        assert_layout::<KeyframePoseMessage>(72, 8, "semidense.KeyframePose.v1");
+        assert_layout::<GraphHeader>(24, 8, "semidense.GraphHeader.v2");
+        assert_layout::<KeyframePoseMessage>(80, 8, "semidense.KeyframePose.v2");
         assert_layout::<HealthMessage>(1888, 8, "semidense.Health.v4");
-        assert_layout::<CommandRequest>(4104, 4, "semidense.CommandRequest.v1");
+        assert_layout::<CommandRequest>(4112, 8, "semidense.CommandRequest.v2");
         assert_layout::<CommandResponse>(200, 4, "semidense.CommandResponse.v1");
     }
 }

@@ -149,8 +149,8 @@ impl Place {
     /// Removes what processes of this instance keep for their successors. While the supervisor is claimed and
     /// none of them runs.
     pub fn forget_run(&self) {
-        for path in [self.checkpoint_path(), self.position_path()] {
-            // What is not there need not go; what cannot be removed is of another run by its key.
+        for path in self.kept_files() {
+            // What cannot be removed is of another run by its key.
             let _ = fs::remove_file(path);
         }
     }

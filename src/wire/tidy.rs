@@ -6,6 +6,8 @@ use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime};
 
+use iceoryx2::node::NodeState;
+use iceoryx2::prelude::*;
 use rustix::fs::FlockOperation;
 
 use crate::wire::place::{
@@ -37,6 +39,7 @@ impl Place {
         // What cannot be removed is removed by the next one.
         let is_empty =
             |folder: &Path| fs::read_dir(folder).map_or(true, |mut f| f.next().is_none());
+        self.remove_dead_nodes();
         self.remove_failed_nodes();
         if is_empty(&self.root.join("nodes")) {
             self.node_counters().for_each(|path| drop(fs::remove_file(path)));
@@ -47,6 +50,26 @@ impl Place {
             self.events().for_each(|path| drop(fs::remove_file(path)));
             let _ = fs::remove_file(&path);
         }
+    }
+
+    /// Whether nodes, living or dead, are below the root.
+    pub fn has_nodes(&self) -> bool {
+        fs::read_dir(self.root.join("nodes")).is_ok_and(|mut nodes| nodes.next().is_some())
+    }
+
+    /// Removes what killed processes have left in shared memory. Who leaves last may be the only one to do it.
+    fn remove_dead_nodes(&self) {
+        let Ok(config) = self.transport_config() else { return };
+        if !self.has_nodes() {
+            return;
+        }
+        // What cannot be listed or removed is removed by the next.
+        let _ = Node::<ipc::Service>::list(&config, |state| {
+            if let NodeState::Dead(node) = state {
+                let _ = node.try_remove_stale_resources();
+            }
+            CallbackProgression::Continue
+        });
     }
 
     /// Removes the folders of nodes that never came to life: a start that failed leaves one without its
@@ -113,6 +136,14 @@ impl Place {
         there.any(|path| is_held(path)) || kept.iter().any(|path| is_young(path))
     }
 
+    /// What processes of this instance keep for their successors.
+    pub(in crate::wire) fn kept_files(&self) -> impl Iterator<Item = PathBuf> {
+        let is_ours = |(instance, kind, _): &(String, Kind, PathBuf)| {
+            *instance == self.instance && matches!(kind, Kind::Kept | Kind::Unfinished)
+        };
+        self.instance_files().into_iter().filter(is_ours).map(|(.., path)| path)
+    }
+
     /// The files of all instances in the folder, with the name of each one's instance.
     fn instance_files(&self) -> Vec<(String, Kind, PathBuf)> {
         let entries = fs::read_dir(&self.root).into_iter().flatten().flatten();
@@ -125,6 +156,14 @@ impl Place {
         });
         described.collect()
     }
+}
+
+/// Whether this is the name of a checkpoint, or of a keyframe that belongs to one: `NAME.checkpoint.ID`.
+fn is_checkpoint(name: &str) -> bool {
+    let id = name.split_once(CHECKPOINT_SUFFIX).map(|(_, id)| id);
+    id.is_some_and(|id| {
+        id.strip_prefix('.').map_or(id.is_empty(), |id| id.bytes().all(|b| b.is_ascii_digit()))
+    })
 }
 
 /// What a file of an instance is.
@@ -141,11 +180,11 @@ enum Kind {
 impl Kind {
     /// By its name; `None` of files that are none of ours.
     fn of(name: &str) -> Option<Self> {
-        if name.ends_with(CHECKPOINT_SUFFIX) || name.ends_with(POSITION_SUFFIX) {
-            return Some(Self::Kept);
-        }
         if name.contains(CHECKPOINT_SUFFIX) && name.ends_with(".tmp") {
             return Some(Self::Unfinished);
+        }
+        if is_checkpoint(name) || name.ends_with(POSITION_SUFFIX) {
+            return Some(Self::Kept);
         }
         (name != JOIN_LOCK && name.ends_with(CLAIM_SUFFIX)).then_some(Self::Claim)
     }

@@ -64,6 +64,20 @@ pub const KEYFRAME: Topic = Topic {
 };
 /// Image of the keyframe in force.
 pub const KEYFRAME_IMAGE: Topic = Topic { noun: "keyframe_image", ..KEYFRAME };
+/// Depth of a keyframe that is not the active one, for the one reader that asks for it: whenever the map's graph has another
+/// revision of it than the reader.
+pub const EARLIER_KEYFRAME: Topic = Topic {
+    owner: "mapper",
+    noun: "earlier_keyframe",
+    subscribers: 1,
+    buffer: 1,
+    borrowed: 1,
+    history: 0,
+    loans: 1,
+};
+/// Image of that keyframe.
+pub const EARLIER_KEYFRAME_IMAGE: Topic =
+    Topic { noun: "earlier_keyframe_image", ..EARLIER_KEYFRAME };
 /// Frames that are in the map.
 pub const STEP: Topic = Topic { owner: "mapper", noun: "step", ..POSE };
 /// Poses of all keyframes.
@@ -121,6 +135,8 @@ pub fn table(intrinsics: &Intrinsics) -> Vec<(Topic, usize)> {
         (POSE, size_of::<PoseMessage>()),
         (KEYFRAME, size_of::<KeyframeHeader>() + points),
         (KEYFRAME_IMAGE, size_of::<KeyframeImageHeader>() + image),
+        (EARLIER_KEYFRAME, size_of::<KeyframeHeader>() + points),
+        (EARLIER_KEYFRAME_IMAGE, size_of::<KeyframeImageHeader>() + image),
         (STEP, size_of::<StepMessage>()),
         (GRAPH, size_of::<GraphHeader>() + graph),
         (CAPTURE_HEALTH, size_of::<HealthMessage>()),
@@ -159,7 +175,7 @@ mod tests {
         assert!(names.contains(&format!("rig1/v{WIRE_VERSION}/capture/frame")));
         names.sort();
         names.dedup();
-        assert_eq!(names.len(), 9);
+        assert_eq!(names.len(), 11);
     }
 
     #[test]

@@ -38,6 +38,8 @@ pub fn keyframe(keyframe_id: u64) -> Keyframe {
         capture_nanos: 0,
         map_state: MapState::Established,
         world_from_keyframe: Sim3::identity(),
+        map_from_keyframe: Sim3::identity(),
+        map_revision: 0,
         intrinsics: CAMERA,
         points: points.collect(),
         image,

@@ -78,11 +78,10 @@ impl KeyframeFeed {
             Err(error) => tracing::warn!("mapper/keyframe: {error}"),
             Ok(keyframe) => {
                 let (revision, key) = (keyframe.revision, (keyframe.epoch, keyframe.keyframe_id));
-                let (keyframe_id, world_from_keyframe) =
-                    (keyframe.keyframe_id, keyframe.world_from_keyframe);
+                let pose = KeyframePose::of(&keyframe);
                 if journal.put_keyframe(keyframe).is_none() {
                     self.kept = Some((revision, Instant::now()));
-                    self.poses.insert(key, KeyframePose { keyframe_id, world_from_keyframe });
+                    self.poses.insert(key, pose);
                 }
             }
         }
@@ -95,7 +94,9 @@ impl KeyframeFeed {
         for message in graph.payload() {
             let Ok(pose) = keyframe_pose_from_message(message) else { continue };
             let known = self.poses.get_mut(&(epoch, pose.keyframe_id));
-            if let Some(known) = known.filter(|known| **known != pose) {
+            let is_moved =
+                |known: &&mut KeyframePose| known.map_from_keyframe != pose.map_from_keyframe;
+            if let Some(known) = known.filter(is_moved) {
                 *known = pose;
                 journal.append(&Record::KeyframePose(epoch, pose));
             }

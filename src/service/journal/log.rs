@@ -19,7 +19,7 @@ use crate::wire::conversion::{similarity_from_message, similarity_message};
 use crate::wire::message::PoseMessage;
 
 /// First bytes of the file, with the version of the layout.
-const MAGIC: [u8; 16] = *b"semidense log 2\n";
+const MAGIC: [u8; 16] = *b"semidense log 3\n";
 /// Bytes before kind and payload.
 const PREFIX_BYTES: usize = 8;
 /// Largest record: the configuration is a tenth of it.
@@ -132,8 +132,8 @@ impl Record {
             }
             Self::KeyframePose(epoch, pose) => {
                 log.push(Self::KEYFRAME_POSE);
-                write_u64s(log, &[u64::from(*epoch), pose.keyframe_id]);
-                write_f64s(log, &similarity_message(&pose.world_from_keyframe));
+                write_u64s(log, &[u64::from(*epoch), pose.keyframe_id, pose.revision]);
+                write_f64s(log, &similarity_message(&pose.map_from_keyframe));
             }
         }
     }
@@ -156,9 +156,9 @@ impl Record {
                 Self::Step(Step { step_nanos, change_nanos, start_frame })
             }
             Self::KEYFRAME_POSE => {
-                let [epoch, keyframe_id] = read_u64s(&mut bytes)?;
+                let [epoch, keyframe_id, revision] = read_u64s(&mut bytes)?;
                 let pose = similarity_from_message(&read_f64s(&mut bytes)?, "pose").ok()?;
-                let pose = KeyframePose { keyframe_id, world_from_keyframe: pose };
+                let pose = KeyframePose { keyframe_id, revision, map_from_keyframe: pose };
                 Self::KeyframePose(u32::try_from(epoch).ok()?, pose)
             }
             _ => return None,
@@ -258,10 +258,11 @@ fn read_numbers<T: Copy + Default, const N: usize, const SIZE: usize>(
 fn write_pose(p: &PoseMessage, bytes: &mut Vec<u8>) {
     write_u64s(bytes, &[p.sequence, p.capture_nanos.cast_unsigned()]);
     write_u64s(bytes, &[p.published_nanos.cast_unsigned(), p.latency_nanos, p.track_nanos]);
-    write_u64s(bytes, &[p.wake_nanos, p.revision, p.keyframe_id]);
+    write_u64s(bytes, &[p.wake_nanos, p.revision, p.map_revision, p.keyframe_id]);
     write_u32s(bytes, &[p.epoch, p.state, p.reason, p.proposes_keyframe]);
     write_u32s(bytes, &[p.iterations, p.finest_level, p.points]);
     write_f64s(bytes, &p.world_from_camera);
+    write_f64s(bytes, &p.map_from_camera);
     write_f64s(bytes, &p.keyframe_from_camera);
     write_f64s(bytes, &p.covariance);
     write_f64s(bytes, &p.alignment_covariance);
@@ -272,10 +273,11 @@ fn write_pose(p: &PoseMessage, bytes: &mut Vec<u8>) {
 
 fn read_pose(bytes: &mut &[u8]) -> Option<PoseMessage> {
     let [sequence, capture, published, latency_nanos, track_nanos] = read_u64s(bytes)?;
-    let [wake_nanos, revision, keyframe_id] = read_u64s(bytes)?;
+    let [wake_nanos, revision, map_revision, keyframe_id] = read_u64s(bytes)?;
     let [epoch, state, reason, proposes_keyframe] = read_u32s(bytes)?;
     let [iterations, finest_level, points] = read_u32s(bytes)?;
-    let (world_from_camera, keyframe_from_camera) = (read_f64s(bytes)?, read_f64s(bytes)?);
+    let (world_from_camera, map_from_camera) = (read_f64s(bytes)?, read_f64s(bytes)?);
+    let keyframe_from_camera = read_f64s(bytes)?;
     let (covariance, alignment_covariance) = (read_f64s(bytes)?, read_f64s(bytes)?);
     let brightness = read_f64s(bytes)?;
     let [in_view_ratio, inlier_ratio, whitened_rmse] = read_f64s(bytes)?;
@@ -293,7 +295,9 @@ fn read_pose(bytes: &mut &[u8]) -> Option<PoseMessage> {
         state,
         reason,
         proposes_keyframe,
+        map_revision,
         world_from_camera,
+        map_from_camera,
         keyframe_from_camera,
         covariance,
         alignment_covariance,
@@ -345,7 +349,7 @@ mod tests {
         let timing = PoseTiming { published_nanos: 11, latency_nanos: 12, ..Default::default() };
         let mut pose = pose_message(&PoseEstimate::unknown(&frame), &timing);
         pose.covariance[20] = 0.125;
-        let world_from_keyframe = Sim3::new(SE3::identity(), 1.5);
+        let map_from_keyframe = Sim3::new(SE3::identity(), 1.5);
         let keyframe = Keyframe {
             keyframe_id: 3,
             epoch: 1,
@@ -353,7 +357,9 @@ mod tests {
             sequence: 7,
             capture_nanos: -5,
             map_state: MapState::Established,
-            world_from_keyframe,
+            map_from_keyframe,
+            world_from_keyframe: map_from_keyframe,
+            map_revision: 0,
             intrinsics: Intrinsics { fx: 20.0, fy: 21.0, cx: 8.0, cy: 7.5, width: 17, height: 16 },
             image: Vec::new(),
             points: Vec::new(),
@@ -368,7 +374,10 @@ mod tests {
                 ..RunCounters::default()
             })),
             Record::Keyframe(Box::new(keyframe)),
-            Record::KeyframePose(1, KeyframePose { keyframe_id: 3, world_from_keyframe }),
+            Record::KeyframePose(
+                1,
+                KeyframePose { keyframe_id: 3, revision: 5, map_from_keyframe },
+            ),
         ]
     }
 

@@ -27,7 +27,7 @@ use crate::service::journal::recovered::read_map_of;
 use crate::service::journal::writer::{Entry, Writer};
 use crate::service::recording::RunCounters;
 use crate::slam::keyframe::Keyframe;
-use crate::slam::mapper::Map;
+use crate::slam::map::Map;
 use crate::wire::place::Place;
 
 /// Time between two hand-overs to the thread: that much of a run a kill may cost.

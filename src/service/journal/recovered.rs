@@ -10,8 +10,8 @@ use crate::service::journal::folder::{LOG, keyframe_file};
 use crate::service::journal::log::{Record, RunStart, read_log};
 use crate::service::map_file::read_map;
 use crate::service::recording::{Recording, RunCounters};
-use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
-use crate::slam::mapper::Map;
+use crate::slam::keyframe::Keyframe;
+use crate::slam::map::Map;
 
 /// Why a journal cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -91,7 +91,7 @@ impl Recovered {
             }
             Record::KeyframePose(epoch, pose) => {
                 if let Some(keyframe) = self.keyframes.get_mut(&(epoch, pose.keyframe_id)) {
-                    keyframe.world_from_keyframe = pose.world_from_keyframe;
+                    keyframe.map_from_keyframe = pose.map_from_keyframe;
                 }
             }
         }
@@ -99,12 +99,9 @@ impl Recovered {
         self.counters.frames_in = frames_in;
     }
 
-    /// The map, with at most `max_bytes` of depth from the files in `folder`, the newest first. A start
-    /// that was never proven is no part of it.
+    /// The map, with at most `max_bytes` of depth from the files in `folder`, the newest first.
     pub fn map(&self, folder: &Path, max_bytes: u64) -> Map {
-        let proven = |keyframe: &&Keyframe| keyframe.map_state != MapState::Initializing;
-        let mut keyframes: Vec<Keyframe> =
-            self.keyframes.values().filter(proven).cloned().collect();
+        let mut keyframes: Vec<Keyframe> = self.keyframes.values().cloned().collect();
         let mut bytes = 0;
         for keyframe in keyframes.iter_mut().rev() {
             if bytes > max_bytes {
@@ -118,7 +115,7 @@ impl Recovered {
                 bytes += (keyframe.image.len() + size_of_val(&keyframe.points[..])) as u64;
             }
         }
-        Map { keyframes, free_epoch: 0 }
+        Map { keyframes, ..Map::default() }
     }
 }
 
@@ -127,20 +124,10 @@ pub(super) fn read_map_of(folder: &Path, max_bytes: u64) -> Map {
     Recovered::read(folder).map_or_else(|_| Map::default(), |found| found.map(folder, max_bytes))
 }
 
-/// Gives a keyframe image and depth of another state of it, in the unit that its pose has now.
+/// Gives a keyframe image and depth of another state of it: its unit is its own in each.
 fn take_depth(keyframe: &mut Keyframe, from: Keyframe) {
-    let factor = (keyframe.world_from_keyframe.scale / from.world_from_keyframe.scale) as f32;
     keyframe.image = from.image;
     keyframe.points = from.points;
-    if factor != 1.0 {
-        keyframe.points.iter_mut().for_each(|point| {
-            *point = DepthPoint {
-                inverse_depth: point.inverse_depth * factor,
-                variance: point.variance * factor * factor,
-                ..*point
-            };
-        });
-    }
 }
 
 /// Completes the map of a mapper that has died on the way with what the journal kept: depth that the mapper no

@@ -12,7 +12,7 @@ use rustix::fs::FlockOperation;
 use crate::service::journal::folder::{LOG, keyframe_file};
 use crate::service::map_file::write_map_into;
 use crate::slam::keyframe::Keyframe;
-use crate::slam::mapper::Map;
+use crate::slam::map::Map;
 
 /// Most bytes of log that wait for room on a full disk; ten hours of poses.
 const MAX_WAITING_BYTES: usize = 512 << 20;
@@ -175,7 +175,7 @@ impl Writer {
         let path = self.folder.join(keyframe_file(keyframe.epoch, keyframe.keyframe_id));
         let temporary = path.with_extension("tmp");
         let mut bytes = Vec::new();
-        write_map_into(&mut bytes, &Map { keyframes: vec![keyframe], free_epoch: 0 })?;
+        write_map_into(&mut bytes, &Map { keyframes: vec![keyframe], ..Map::default() })?;
         let written = File::create(&temporary).and_then(|mut file| {
             file.write_all(&bytes)?;
             file.sync_data()
@@ -225,6 +225,8 @@ mod tests {
             capture_nanos: 1,
             map_state: MapState::Established,
             world_from_keyframe: Sim3::new(SE3::identity(), 1.0),
+            map_from_keyframe: Sim3::new(SE3::identity(), 1.0),
+            map_revision: 0,
             intrinsics: Intrinsics { fx: 9.0, fy: 9.0, cx: 4.0, cy: 4.0, width: 9, height: 9 },
             image: vec![0; 81],
             points: Vec::new(),

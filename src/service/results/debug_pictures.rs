@@ -9,7 +9,7 @@ use crate::service::results::ResultsError;
 use crate::service::results::colour::Picture;
 use crate::service::results::pictures::{density_picture, inverse_depth_picture, variance_picture};
 use crate::service::results::weight_picture::weight_picture;
-use crate::slam::mapper::Map;
+use crate::slam::map::Map;
 use crate::slam::tracker::TrackerParams;
 
 /// Writes `keyframe-NNNN-{inverse-depth,variance,density,weights}.png` for every keyframe into `dir`.

@@ -45,7 +45,7 @@ use crate::service::trajectory_file::write_trajectory;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::evaluation::umeyama::Alignment;
 use crate::slam::evaluation::{MAX_DIFFERENCE_NANOS, TrajectoryEvaluation, evaluate_trajectory};
-use crate::slam::mapper::Map;
+use crate::slam::map::Map;
 use crate::slam::mapper::consistency::Contradiction;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::PoseEstimate;

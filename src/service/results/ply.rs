@@ -7,7 +7,7 @@ use nalgebra::Vector3;
 
 use crate::service::atomic_file::write_atomically;
 use crate::slam::keyframe::{Keyframe, MapState};
-use crate::slam::mapper::Map;
+use crate::slam::map::Map;
 
 /// A point of the cloud.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -44,7 +44,7 @@ fn keyframe_points(
         }
         let (u, v) = (f64::from(point.u), f64::from(point.v));
         let in_keyframe = Vector3::new((u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.0) / d;
-        let in_world = keyframe.world_from_keyframe * in_keyframe;
+        let in_world = keyframe.map_from_keyframe * in_keyframe;
         Some(CloudPoint {
             position: [in_world.x as f32, in_world.y as f32, in_world.z as f32],
             intensity: point.intensity,

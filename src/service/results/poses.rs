@@ -10,7 +10,7 @@ use crate::service::trajectory_file::tum_line;
 use crate::slam::evaluation::MAX_DIFFERENCE_NANOS;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::evaluation::normalized_error::{NormalizedErrors, normalized_errors};
-use crate::slam::mapper::Map;
+use crate::slam::map::Map;
 use crate::slam::pose::PoseEstimate;
 use crate::slam::trajectory::StampedPose;
 
@@ -26,24 +26,25 @@ pub const ONLINE_COMMENT: &str = "world_from_camera of every tracked frame as it
 pub fn longest_epoch(record: &RunRecord) -> Option<u32> {
     let mut frames = BTreeMap::new();
     for pose in record.poses.iter().filter(|pose| pose.estimate.state.is_tracked()) {
-        *frames.entry(pose.estimate.epoch).or_insert(0_usize) += 1;
+        *frames.entry(final_epoch(record, &pose.estimate)).or_insert(0_usize) += 1;
     }
     frames.into_iter().rev().max_by_key(|&(_, count)| count).map(|(epoch, _)| epoch)
 }
 
-/// Every tracked frame, of one epoch or of all, on the final pose of its keyframe. A frame whose
-/// keyframe the final map does not hold keeps its published pose.
+/// Every tracked frame, of one epoch or of all, on the final place of its keyframe, in the map. A frame whose
+/// keyframe the final map does not hold keeps its published place.
 pub fn final_trajectory(record: &RunRecord, epoch: Option<u32>) -> Vec<StampedPose> {
-    let places: HashMap<(u32, u64), _> = record
-        .map
-        .keyframes
-        .iter()
-        .map(|k| ((k.epoch, k.keyframe_id), k.world_from_keyframe))
-        .collect();
-    tracked(record, epoch, |estimate| match places.get(&(estimate.epoch, estimate.keyframe_id)) {
-        Some(world_from_keyframe) => world_from_keyframe.place(&estimate.keyframe_from_camera),
-        None => estimate.world_from_camera,
+    let keyframes = record.map.keyframes.iter();
+    let places: HashMap<u64, _> = keyframes.map(|k| (k.keyframe_id, k.map_from_keyframe)).collect();
+    tracked(record, epoch, |estimate| match places.get(&estimate.keyframe_id) {
+        Some(map_from_keyframe) => map_from_keyframe.place(&estimate.keyframe_from_camera),
+        None => estimate.map_from_camera,
     })
+}
+
+/// The epoch that a frame belongs to in the end: its own may have been joined to another.
+fn final_epoch(record: &RunRecord, estimate: &PoseEstimate) -> u32 {
+    record.map.get(estimate.keyframe_id).map_or(estimate.epoch, |keyframe| keyframe.epoch)
 }
 
 /// Every tracked frame, of one epoch or of all, as it was published.
@@ -60,7 +61,7 @@ pub fn normalized_errors_of(record: &RunRecord, epoch: Option<u32>) -> Option<No
     let in_epoch = |of: u32| epoch.is_none_or(|epoch| of == epoch);
     let estimates = record.poses.iter().map(|pose| &pose.estimate);
     let tracked: Vec<&PoseEstimate> =
-        estimates.filter(|e| e.state.is_tracked() && in_epoch(e.epoch)).collect();
+        estimates.filter(|e| e.state.is_tracked() && in_epoch(final_epoch(record, e))).collect();
     let keyframes = record.map.keyframes.iter().filter(|keyframe| in_epoch(keyframe.epoch));
     let stamps: Vec<(u64, i64)> = keyframes.map(|k| (k.keyframe_id, k.capture_nanos)).collect();
     normalized_errors(&tracked, &stamps, &record.ground_truth, MAX_DIFFERENCE_NANOS)
@@ -74,7 +75,7 @@ fn tracked(
     let estimates = record.poses.iter().map(|pose| &pose.estimate);
     estimates
         .filter(|estimate| estimate.state.is_tracked())
-        .filter(|estimate| epoch.is_none_or(|epoch| estimate.epoch == epoch))
+        .filter(|estimate| epoch.is_none_or(|epoch| final_epoch(record, estimate) == epoch))
         .map(|estimate| StampedPose {
             nanos: estimate.capture_nanos,
             world_from_camera: world_from_camera(estimate),
@@ -93,13 +94,13 @@ pub fn write_keyframes(path: &Path, map: &Map) -> io::Result<()> {
         map.keyframes.iter().try_for_each(|k| {
             let pose = StampedPose {
                 nanos: k.capture_nanos,
-                world_from_camera: k.world_from_keyframe.rigid,
+                world_from_camera: k.map_from_keyframe.rigid,
             };
             writeln!(
                 file,
                 "{} {} {} {} {} {} {:?}",
                 tum_line(&pose),
-                k.world_from_keyframe.scale,
+                k.map_from_keyframe.scale,
                 k.keyframe_id,
                 k.sequence,
                 k.epoch,

@@ -19,7 +19,7 @@ use crate::slam::evaluation::depth_error::{DepthScale, DepthStatistics};
 use crate::slam::evaluation::grade::{Grade, GradeInput};
 use crate::slam::evaluation::map_consistency::MapConsistency;
 use crate::slam::evaluation::normalized_error::NormalizedErrors;
-use crate::slam::mapper::Map;
+use crate::slam::map::Map;
 use crate::slam::pose::TrackingState;
 
 /// A trajectory against ground truth; all null where there is none. Lengths in the ground truth's

@@ -247,7 +247,7 @@ mod tests {
     use super::*;
     use crate::service::recording::{RecordParts, Recording, RunCounters};
     use crate::slam::frame::FrameView;
-    use crate::slam::mapper::Map;
+    use crate::slam::map::Map;
     use crate::slam::pose::PoseEstimate;
     use crate::wire::conversion::{PoseTiming, pose_message};
 

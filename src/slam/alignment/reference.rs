@@ -74,6 +74,8 @@ pub struct Reference {
     sequence: u64,
     map_state: MapState,
     world_from_keyframe: Sim3,
+    map_from_keyframe: Sim3,
+    map_revision: u64,
     intrinsics: Intrinsics,
     mean_inverse_depth: f64,
     finest_level: usize,
@@ -94,8 +96,10 @@ impl Reference {
             epoch: 0,
             revision: 0,
             sequence: 0,
-            map_state: MapState::Initializing,
+            map_state: MapState::Established,
             world_from_keyframe: Sim3::identity(),
+            map_from_keyframe: Sim3::identity(),
+            map_revision: 0,
             intrinsics: Intrinsics { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, width: 0, height: 0 },
             mean_inverse_depth: 1.0,
             levels: vec![LevelPoints::default(); MAX_LEVELS],
@@ -121,9 +125,12 @@ impl Reference {
         self.revision = keyframe.revision;
         self.sequence = keyframe.sequence;
         self.map_state = keyframe.map_state;
-        let placed = keyframe.world_from_keyframe.is_valid();
-        self.world_from_keyframe =
-            if placed { keyframe.world_from_keyframe } else { Sim3::identity() };
+        let placed =
+            keyframe.world_from_keyframe.is_valid() && keyframe.map_from_keyframe.is_valid();
+        let place = |place: Sim3| if placed { place } else { Sim3::identity() };
+        self.world_from_keyframe = place(keyframe.world_from_keyframe);
+        self.map_from_keyframe = place(keyframe.map_from_keyframe);
+        self.map_revision = keyframe.map_revision;
         self.intrinsics = keyframe.intrinsics;
         self.mean_inverse_depth = 1.0;
         self.levels.iter_mut().for_each(LevelPoints::clear);
@@ -221,6 +228,16 @@ impl Reference {
     /// The keyframe's pose with the scale of its depth.
     pub fn world_from_keyframe(&self) -> &Sim3 {
         &self.world_from_keyframe
+    }
+
+    /// Where the map has the keyframe.
+    pub fn map_from_keyframe(&self) -> &Sim3 {
+        &self.map_from_keyframe
+    }
+
+    /// How often the map had been corrected by then.
+    pub fn map_revision(&self) -> u64 {
+        self.map_revision
     }
 
     /// Intrinsics of level 0.

@@ -130,6 +130,8 @@ impl Plane {
             capture_nanos: 0,
             map_state: MapState::Established,
             world_from_keyframe: Sim3::identity(),
+            map_from_keyframe: Sim3::identity(),
+            map_revision: 0,
             intrinsics: *at,
             image,
             points,

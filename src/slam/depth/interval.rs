@@ -219,7 +219,13 @@ impl IntervalFilter {
 
     /// Multiplies every interval by `factor`.
     pub fn rescale(&mut self, factor: f32) {
-        self.points.iter_mut().for_each(|p| p.rescale(factor));
+        self.rescale_by(|_, _| factor);
+    }
+
+    /// The same with a factor of its own for every pixel `(u, v)`.
+    pub fn rescale_by(&mut self, factor_at: impl Fn(usize, usize) -> f32) {
+        let factor = |p: &ImmaturePoint| factor_at(usize::from(p.u), usize::from(p.v));
+        self.points.iter_mut().for_each(|p| p.rescale(factor(p)));
     }
 }
 

@@ -354,9 +354,15 @@ impl DepthMap {
 
     /// Multiplies every inverse depth by `factor` and every variance by its square.
     pub fn rescale(&mut self, factor: f32) {
+        self.rescale_by(|_, _| factor);
+    }
+
+    /// The same with a factor of its own for every pixel `(u, v)`.
+    pub fn rescale_by(&mut self, factor_at: impl Fn(usize, usize) -> f32 + Sync) {
         let rows = self.hypotheses.pixels_mut().par_chunks_exact_mut(self.image.width());
-        rows.with_min_len(BAND_ROWS).for_each(|row| {
-            for h in row.iter_mut().filter(|h| h.is_some()) {
+        rows.with_min_len(BAND_ROWS).enumerate().for_each(|(v, row)| {
+            for (u, h) in row.iter_mut().enumerate().filter(|(_, h)| h.is_some()) {
+                let factor = factor_at(u, v);
                 h.inverse_depth *= factor;
                 h.smoothed *= factor;
                 h.variance *= factor * factor;

@@ -123,7 +123,7 @@ struct Compared {
 /// Metres in a keyframe unit.
 fn metres_per_unit(keyframe: &Keyframe, compared: &[Compared], scale: DepthScale) -> Option<f64> {
     match scale {
-        DepthScale::Given => Some(keyframe.world_from_keyframe.scale),
+        DepthScale::Given => Some(keyframe.map_from_keyframe.scale),
         DepthScale::MedianRatio => {
             median(&compared.iter().map(|c| c.z_true * c.d).collect::<Vec<_>>())
         }
@@ -146,7 +146,9 @@ mod tests {
             sequence: 0,
             capture_nanos: 0,
             map_state: MapState::Established,
+            map_from_keyframe: Sim3::new(SE3::identity(), scale),
             world_from_keyframe: Sim3::new(SE3::identity(), scale),
+            map_revision: 0,
             intrinsics: Intrinsics {
                 fx: 20.0,
                 fy: 20.0,

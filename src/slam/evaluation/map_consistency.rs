@@ -124,7 +124,9 @@ mod tests {
             sequence: 10 * index,
             capture_nanos: 0,
             map_state: MapState::Established,
+            map_from_keyframe: Sim3::new(rigid, scale),
             world_from_keyframe: Sim3::new(rigid, scale),
+            map_revision: 0,
             intrinsics: Intrinsics {
                 fx: FOCAL,
                 fy: FOCAL,
@@ -180,9 +182,9 @@ mod tests {
         (map[0].image, map[0].points) = (Vec::new(), Vec::new());
         map[1].epoch = 1;
         map[2].map_state = MapState::Rejected;
-        map[3].world_from_keyframe =
+        map[3].map_from_keyframe =
             Sim3::new(SE3::exp(&Vector6::new(9.0, 0.0, 0.0, 0.0, 0.0, 0.0)), 1.0);
-        map[4].world_from_keyframe.scale = f64::NAN;
+        map[4].map_from_keyframe.scale = f64::NAN;
         for point in &mut map[4].points[..50] {
             (point.inverse_depth, point.variance) = (f32::INFINITY, f32::NAN);
         }

@@ -42,7 +42,7 @@ pub struct Projection {
 impl<'a> SharedView<'a> {
     /// By the final poses and scales of both.
     pub fn new(from: &'a Keyframe, into: &'a Keyframe) -> Self {
-        let into_from_from = into.world_from_keyframe.inverse() * from.world_from_keyframe;
+        let into_from_from = into.map_from_keyframe.inverse() * from.map_from_keyframe;
         Self { from, into, into_from_from }
     }
 

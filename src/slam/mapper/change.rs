@@ -3,14 +3,15 @@
 
 use crate::slam::depth::epipolar::TwoView;
 use crate::slam::depth::gaussian::{ObservedPixels, Observer, observe};
-use crate::slam::depth::map::{DepthMap, KnownColumns, for_each_known};
 use crate::slam::depth::matching::MatchingParams;
 use crate::slam::depth::propagation::propagate;
 use crate::slam::frame::FrameView;
+use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::buffer::Image;
-use crate::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS, MapState};
+use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::mapper::consistency::judge_change;
+use crate::slam::mapper::depth_buffers::write_depth;
 use crate::slam::mapper::observation::DepthFilter;
 use crate::slam::mapper::start::take_sensor_depth;
 use crate::slam::mapper::{Mapper, StepOutcome};
@@ -19,8 +20,10 @@ use crate::slam::pose::{Brightness, PoseEstimate};
 /// What a new keyframe still wants when it is published.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Unfinished {
-    /// Place in the map of the keyframe before, whose depth map is the mapper's `next_depth`.
+    /// Place in the map of the keyframe before, whose depth map is the spare one.
     before: usize,
+    /// Length of the unit of that depth in its keyframe's.
+    unit: f64,
     /// Hypotheses of that.
     known: usize,
     /// Its mean inverse depth over what the new keyframe had when it was carried over.
@@ -32,53 +35,57 @@ pub(super) struct Unfinished {
 }
 
 impl Mapper {
-    /// Makes `frame` the keyframe: carries the depth over, smooths it, rescales.
+    /// Makes `frame`, tracked on the active keyframe, the next one: carries the depth over, smooths it, rescales.
     pub(super) fn change_keyframe(
         &mut self,
         frame: &FrameView<'_>,
         pose: &PoseEstimate,
         sensor_depth: Option<&Image<f32>>,
     ) {
-        let (Some(index), Some(before)) = (self.in_force, self.keyframe()) else { return };
-        let epoch = before.epoch;
-        let world_from_before = before.world_from_keyframe;
-        let brightness = pose.brightness;
-        let before_from_frame = world_from_before.locate(&pose.world_from_camera);
-        if self.unpublished > 0 {
-            self.refine();
+        let (Some(active), Some(before)) = (self.active, self.keyframe()) else { return };
+        let (epoch, map_from_before) = (before.epoch, before.map_from_keyframe);
+        if self.depth.unpublished > 0 {
+            self.depth.refine(&self.params);
         }
+        let (unit, is_unit_open) = (self.depth.unit, self.depth.is_unit_open);
+        self.carry_over(frame.pixels, &pose.keyframe_from_camera, pose.brightness);
+        let map_from_frame = map_from_before.place(&pose.keyframe_from_camera);
+        let carried_unit = map_from_before.scale * unit;
+        if let Some(sensor) = sensor_depth {
+            take_sensor_depth(&mut self.depth.active, sensor, carried_unit);
+        }
+        self.depth.refine(&self.params);
+        let factor = self.depth.normalise();
+        // Without any depth there was nothing to be rescaled by.
+        self.depth.is_unit_open = is_unit_open && self.depth.active.num_hypotheses() == 0;
+        self.unfinished = Some(Unfinished {
+            before: active.index,
+            unit,
+            known: self.depth.spare.num_hypotheses(),
+            // The mean of a first keyframe without depth was not 1.
+            depth_ratio: self.depth.spare.mean_inverse_depth().map_or(1.0, |mean| mean * factor),
+            has_new_pixels: sensor_depth.is_none(),
+            line_noise_px: self.matching_at(pose).line_noise_px,
+        });
+        self.add_keyframe(frame, Sim3::new(map_from_frame, carried_unit * factor), epoch);
+    }
 
-        let (min_gradient, max_candidates) = (self.params.min_gradient, self.params.max_candidates);
-        self.next_depth.restart(frame.pixels, min_gradient, max_candidates);
-        let frame_from_before = before_from_frame.inverse();
+    /// The active depth on the pixels of a frame that stands at `keyframe_from_camera`; the depth before is the
+    /// spare one then.
+    fn carry_over(&mut self, pixels: &[u8], keyframe_from_camera: &SE3, brightness: Brightness) {
+        let mut frame_from_before = keyframe_from_camera.inverse();
+        frame_from_before.translation /= self.depth.unit;
+        self.depth.swap();
+        self.depth.restart(pixels, &self.params);
         propagate(
-            &self.depth,
-            &mut self.next_depth,
+            &self.depth.spare,
+            &mut self.depth.active,
             &self.intrinsics,
             &frame_from_before,
             brightness,
             &self.params.propagation,
         );
-        std::mem::swap(&mut self.depth, &mut self.next_depth);
         self.past.rebase(brightness);
-        let mut world_from_keyframe = Sim3::new(pose.world_from_camera, world_from_before.scale);
-        if let Some(sensor) = sensor_depth {
-            take_sensor_depth(&mut self.depth, sensor, world_from_keyframe.scale);
-        }
-        self.refine();
-        let factor = self.rescale_to_unit_mean();
-        world_from_keyframe.scale *= factor;
-        // Without any depth there was nothing to be rescaled by.
-        self.is_unit_open &= self.depth.num_hypotheses() == 0;
-        self.unfinished = Some(Unfinished {
-            before: index,
-            known: self.next_depth.num_hypotheses(),
-            // The mean of a first keyframe without depth was not 1.
-            depth_ratio: self.next_depth.mean_inverse_depth().map_or(1.0, |mean| mean * factor),
-            has_new_pixels: sensor_depth.is_none(),
-            line_noise_px: self.matching_at(pose).line_noise_px,
-        });
-        self.add_keyframe(frame, world_from_keyframe, MapState::Established, epoch);
     }
 
     /// What a new keyframe can wait for until it is published: the last depth of the one before goes
@@ -91,17 +98,18 @@ impl Mapper {
         // One whose depth was forgotten stays without.
         if let Some(before) = before.filter(|before| !before.image.is_empty()) {
             before.revision = self.revision;
-            write_depth(&self.next_depth, before);
+            write_depth(&self.depth.spare, unfinished.unit, before);
         }
         let searches = self.params.depth_filter == DepthFilter::Gaussian;
         let mut keyframe_changed = false;
         if searches && unfinished.has_new_pixels && self.seed_from_past(unfinished.line_noise_px) {
-            self.refine();
-            self.keep_unit_mean();
+            self.depth.refine(&self.params);
+            self.depth.keep_unit_mean();
             self.publish_depth();
             keyframe_changed = true;
         }
-        let (known, mean) = (self.depth.num_hypotheses(), self.depth.mean_inverse_depth());
+        let depth = &self.depth.active;
+        let (known, mean) = (depth.num_hypotheses(), depth.mean_inverse_depth());
         let depth_ratio = unfinished.depth_ratio / mean.unwrap_or(1.0);
         let params = &self.params.consistency;
         if let Some(contradiction) = judge_change(unfinished.known, known, depth_ratio, params) {
@@ -119,7 +127,7 @@ impl Mapper {
         /// Baselines shorter than this share of the mean depth tell nothing.
         const MIN_BASELINE: f64 = 0.01;
         let Some(keyframe) = self.keyframe() else { return false };
-        let world_from_keyframe = keyframe.world_from_keyframe;
+        let map_from_keyframe = keyframe.map_from_keyframe;
         let matching = MatchingParams { line_noise_px, ..self.params.matching.clone() };
         let mut least = MIN_BASELINE;
         let mut used = 0;
@@ -127,7 +135,12 @@ impl Mapper {
             if used >= self.params.num_seed_frames {
                 break;
             }
-            let keyframe_from_camera = world_from_keyframe.locate(&past.world_from_camera);
+            let tracked_on = (past.keyframe_id, &past.keyframe_from_camera);
+            let Some(map_from_camera) = self.map.place(tracked_on.0, tracked_on.1) else {
+                continue;
+            };
+            let mut keyframe_from_camera = map_from_keyframe.locate(&map_from_camera);
+            keyframe_from_camera.translation /= self.depth.unit;
             let baseline = keyframe_from_camera.translation.norm();
             if baseline < least {
                 continue;
@@ -139,88 +152,46 @@ impl Mapper {
                 brightness: past.brightness,
                 pixels: ObservedPixels::New,
             };
-            observe(&mut self.depth, &observer, &matching, &self.params.gaussian);
+            observe(&mut self.depth.active, &observer, &matching, &self.params.gaussian);
             least = baseline * BASELINE_STEP;
             used += 1;
         }
         used > 0
     }
 
-    /// Rescales the depth map to mean inverse depth 1; the factor belongs to the keyframe's scale.
-    pub(super) fn rescale_to_unit_mean(&mut self) -> f64 {
-        let Some(mean) = self.depth.mean_inverse_depth().filter(|m| *m > 0.0) else { return 1.0 };
-        let factor = 1.0 / mean;
-        self.depth.rescale(factor as f32);
-        self.points.rescale(factor as f32);
-        factor
-    }
-
+    /// Makes `frame`, whose depth is the active one, a keyframe of the map, and active.
     pub(super) fn add_keyframe(
         &mut self,
         frame: &FrameView<'_>,
-        world_from_keyframe: Sim3,
-        map_state: MapState,
+        map_from_keyframe: Sim3,
         epoch: u32,
     ) {
+        let keyframe_id = self.next_keyframe_id;
         self.map.keyframes.push(Keyframe {
-            keyframe_id: self.next_keyframe_id,
+            keyframe_id,
             epoch,
             revision: self.revision,
             sequence: frame.sequence,
             capture_nanos: frame.capture_nanos,
-            map_state,
-            world_from_keyframe,
+            map_state: MapState::Established,
+            world_from_keyframe: self.world_from_map * map_from_keyframe,
+            map_from_keyframe,
+            map_revision: self.map.revision,
             intrinsics: self.intrinsics,
             image: frame.pixels.to_vec(),
             points: Vec::new(),
         });
         self.map.forget_depth_beyond(self.params.max_map_bytes());
         self.next_keyframe_id += 1;
-        self.past.push(frame.pixels, world_from_keyframe.rigid, Brightness::default());
+        self.past.push(frame.pixels, keyframe_id, SE3::identity(), Brightness::default());
         self.enter_keyframe(self.map.keyframes.len() - 1);
-        self.plant_points();
-        self.publish_depth();
     }
-
-    /// Writes the depth map into the keyframe in force.
-    pub(super) fn publish_depth(&mut self) {
-        self.revision += 1;
-        let in_force = self.in_force;
-        if let Some(keyframe) = in_force.and_then(|index| self.map.keyframes.get_mut(index)) {
-            keyframe.revision = self.revision;
-            write_depth(&self.depth, keyframe);
-        }
-    }
-
-    pub(super) fn remember(&mut self, frame: &FrameView<'_>, pose: &PoseEstimate) {
-        self.past.push(frame.pixels, pose.world_from_camera, pose.brightness);
-    }
-}
-
-/// Makes the hypotheses of `depth` the points of its keyframe.
-fn write_depth(depth: &DepthMap, keyframe: &mut Keyframe) {
-    keyframe.points.clear();
-    keyframe.points.reserve_exact(depth.num_hypotheses().min(MAX_KEYFRAME_POINTS));
-    let image = &depth.image.intensity;
-    let mut columns = KnownColumns::default();
-    for v in 0..image.height() {
-        let (row, intensities) = (depth.hypotheses.row(v), image.row(v));
-        for_each_known(row, &mut columns, |known| {
-            keyframe.points.extend(known.iter().map(|&u| {
-                let (h, intensity) = (&row[usize::from(u)], intensities[usize::from(u)]);
-                let (inverse_depth, variance) = (h.smoothed, h.variance);
-                DepthPoint { u, v: v as u16, inverse_depth, variance, intensity }
-            }));
-        });
-    }
-    keyframe.points.retain(|point| point.inverse_depth > 0.0);
-    keyframe.points.truncate(MAX_KEYFRAME_POINTS);
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::slam::geometry::se3::SE3;
+    use crate::slam::keyframe::DepthPoint;
     use crate::slam::mapper::MapperParams;
     use crate::slam::pose::TrackingState;
     use crate::slam::test_scene::{CAMERA, Scene};
@@ -256,6 +227,9 @@ mod tests {
                 state: TrackingState::Tracking,
                 keyframe_id: mapper.keyframe().map_or(u64::MAX, |k| k.keyframe_id),
                 world_from_camera,
+                keyframe_from_camera: mapper
+                    .keyframe()
+                    .map_or(SE3::identity(), |k| k.world_from_keyframe.locate(&world_from_camera)),
                 proposes_keyframe: k == 4,
                 ..PoseEstimate::unknown(&frame)
             };

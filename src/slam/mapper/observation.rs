@@ -1,12 +1,12 @@
-//! What a frame tells of the depth of the keyframe in force, by the filter that was chosen.
+//! What a frame tells of the depth of the active keyframe, by the filter that was chosen.
 
 use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::epipolar::TwoView;
 use crate::slam::depth::gaussian::{ObservationCounts, ObservedPixels, Observer, observe};
 use crate::slam::depth::immature::TraceFrame;
-use crate::slam::depth::regularisation::regularise;
 use crate::slam::frame::FrameView;
+use crate::slam::geometry::se3::SE3;
 use crate::slam::mapper::Mapper;
 use crate::slam::pose::PoseEstimate;
 
@@ -25,15 +25,13 @@ pub enum DepthFilter {
 }
 
 impl Mapper {
-    /// Observes the depth of the keyframe in force in `frame`.
+    /// Observes the depth of the active keyframe in `frame`.
     pub(super) fn observe_frame(
         &mut self,
         frame: &FrameView<'_>,
         pose: &PoseEstimate,
     ) -> ObservationCounts {
-        let Some(keyframe) = self.keyframe() else { return ObservationCounts::default() };
-        let keyframe_from_camera = keyframe.world_from_keyframe.locate(&pose.world_from_camera);
-        let view = TwoView::new(&self.intrinsics, &keyframe_from_camera.inverse());
+        let view = self.view_of(&pose.keyframe_from_camera);
         self.frame.fill(frame.pixels);
         let brightness = pose.brightness;
         let pixels = match self.params.depth_filter {
@@ -43,7 +41,7 @@ impl Mapper {
         let observer = Observer { image: &self.frame, view, brightness, pixels };
         let traced = TraceFrame { image: &self.frame, view, brightness };
         let matching = self.matching_at(pose);
-        let (depth, points) = (&mut self.depth, &mut self.points);
+        let (depth, points) = (&mut self.depth.active, &mut self.depth.points);
         let (gaussian, interval) = (&self.params.gaussian, &self.params.interval);
         match self.params.depth_filter {
             DepthFilter::Gaussian => observe(depth, &observer, &matching, gaussian),
@@ -59,22 +57,10 @@ impl Mapper {
         }
     }
 
-    /// Chooses the points that the interval filter traces from the keyframe in force.
-    pub(super) fn plant_points(&mut self) {
-        match self.params.depth_filter {
-            DepthFilter::Gaussian => {}
-            DepthFilter::Interval => {
-                self.points.restart_with_known(&mut self.depth, &self.params.candidates);
-            }
-            DepthFilter::Both => self.points.restart_where_empty(&self.depth),
-        }
-    }
-
-    /// Smooths what was observed; points of the interval filter have no neighbours to agree with.
-    pub(super) fn refine(&mut self) {
-        if self.params.depth_filter != DepthFilter::Interval {
-            regularise(&mut self.depth, &mut self.regularisation, &self.params.regularisation);
-        }
-        self.unpublished = 0;
+    /// The view of a frame from the active keyframe, in the unit of its depth buffer.
+    pub(super) fn view_of(&self, keyframe_from_camera: &SE3) -> TwoView {
+        let mut frame_from_keyframe = keyframe_from_camera.inverse();
+        frame_from_keyframe.translation /= self.depth.unit;
+        TwoView::new(&self.intrinsics, &frame_from_keyframe)
     }
 }

@@ -10,9 +10,11 @@ use crate::slam::pose::Brightness;
 pub(super) struct PastFrame {
     /// Grey values, level 0.
     pub(super) pixels: Vec<u8>,
-    /// Where it was taken.
-    pub(super) world_from_camera: SE3,
-    /// Its brightness against the keyframe in force.
+    /// The keyframe that it was tracked on.
+    pub(super) keyframe_id: u64,
+    /// Where it was taken, in that keyframe's unit.
+    pub(super) keyframe_from_camera: SE3,
+    /// Its brightness against the active keyframe.
     pub(super) brightness: Brightness,
 }
 
@@ -35,13 +37,20 @@ impl PastFrames {
     }
 
     /// Files a copy of a frame.
-    pub(super) fn push(&mut self, pixels: &[u8], world_from_camera: SE3, brightness: Brightness) {
+    pub(super) fn push(
+        &mut self,
+        pixels: &[u8],
+        keyframe_id: u64,
+        keyframe_from_camera: SE3,
+        brightness: Brightness,
+    ) {
         let full = self.frames.len() >= self.capacity;
         let oldest = if full { self.frames.pop_front() } else { None };
         let mut memory = oldest.map(|frame| frame.pixels).unwrap_or_default();
         memory.clear();
         memory.extend_from_slice(pixels);
-        self.frames.push_back(PastFrame { pixels: memory, world_from_camera, brightness });
+        let frame = PastFrame { pixels: memory, keyframe_id, keyframe_from_camera, brightness };
+        self.frames.push_back(frame);
     }
 
     /// Expresses every brightness against a new keyframe, whose brightness against the one before is
@@ -67,8 +76,8 @@ mod tests {
     fn brightness_follows_the_keyframe() {
         let mut past = PastFrames::with_capacity(4);
         // I_f = e^0.3 I_k + 5 and I_n = e^0.1 I_k − 2: a grey of 100 in the new keyframe.
-        past.push(&[2], SE3::identity(), Brightness::default());
-        past.push(&[1], SE3::identity(), Brightness { a: 0.3, b: 5.0 });
+        past.push(&[2], 0, SE3::identity(), Brightness::default());
+        past.push(&[1], 0, SE3::identity(), Brightness { a: 0.3, b: 5.0 });
         past.rebase(Brightness { a: 0.1, b: -2.0 });
         let shown = |b: Brightness| b.a.exp() * 100.0 + b.b;
         let in_keyframe = (100.0 + 2.0) / 0.1f64.exp();
@@ -83,7 +92,7 @@ mod tests {
     fn the_oldest_gives_way() {
         let mut past = PastFrames::with_capacity(2);
         for i in 0..5u8 {
-            past.push(&[i], SE3::identity(), Brightness::default());
+            past.push(&[i], 0, SE3::identity(), Brightness::default());
         }
         let kept: Vec<u8> = past.newest_first().map(|f| f.pixels[0]).collect();
         assert_eq!(kept, [4, 3]);

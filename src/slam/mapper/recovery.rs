@@ -18,6 +18,7 @@ use crate::slam::image::buffer::Image;
 use crate::slam::image::sums::SumPyramid;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
 use crate::slam::mapper::consistency::Contradiction;
+use crate::slam::mapper::phase::{Loss, Phase};
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::{Brightness, PoseEstimate};
@@ -41,9 +42,6 @@ pub struct RecoveryParams {
     pub lost_timeout_secs: f64,
 }
 
-/// Longest time that two lost frames are taken to be apart: the slowest camera's period.
-const LONGEST_STEP_NANOS: i64 = 5_000_000_000;
-
 impl Default for RecoveryParams {
     fn default() -> Self {
         Self {
@@ -65,25 +63,17 @@ impl RecoveryParams {
     }
 }
 
-/// The search, its memory, and how long it has been going on.
+/// Looks for the camera on keyframes; owns the memory for that.
 #[derive(Debug)]
-pub(super) struct Recovery {
+pub(super) struct Finder {
     aligner: Aligner,
     verdict: VerdictParams,
     reference: Reference,
     pyramid: SumPyramid,
-    /// Stamp of the last lost frame; `None` while the camera is where it is thought to be.
-    last_nanos: Option<i64>,
-    /// Time of the stamps since the first.
-    lost_nanos: i64,
-    /// Keyframes searched since then.
-    searched: usize,
-    /// Whether a new epoch is being begun.
-    pub(super) is_restarting: bool,
 }
 
-impl Recovery {
-    /// A search in images of `intrinsics`. What it finds is only proposed, and the tracker judges by
+impl Finder {
+    /// For images of `intrinsics`. What it finds is only proposed, and the tracker judges by
     /// its own parameters, so that the defaults do here; portable, so that every CPU finds the same.
     pub(super) fn new(intrinsics: &Intrinsics) -> Self {
         let Intrinsics { width, height, .. } = *intrinsics;
@@ -95,50 +85,27 @@ impl Recovery {
             verdict: VerdictParams::default(),
             pyramid: SumPyramid::with_size(width, height, levels, finest_level(levels, &reference)),
             reference: Reference::new(reference),
-            last_nanos: None,
-            lost_nanos: 0,
-            searched: 0,
-            is_restarting: false,
         }
     }
 
-    /// The camera is found.
-    pub(super) fn end(&mut self) {
-        (self.last_nanos, self.lost_nanos) = (None, 0);
-        (self.searched, self.is_restarting) = (0, false);
-    }
-
-    /// Whether the camera is lost.
-    pub(super) fn is_under_way(&self) -> bool {
-        self.last_nanos.is_some()
-    }
-
-    /// How long it has been lost, seconds, with another lost frame. A step of the clock, back or far
-    /// forwards, is no time in which anything was searched.
-    fn lost_secs(&mut self, nanos: i64) -> f64 {
-        let step = nanos.saturating_sub(self.last_nanos.replace(nanos).unwrap_or(nanos));
-        self.lost_nanos = self.lost_nanos.saturating_add(step.clamp(0, LONGEST_STEP_NANOS));
-        self.lost_nanos as f64 * 1e-9
-    }
-
-    /// The next of `keyframes`, newest first and in turn, that shows what `pixels` do.
+    /// The next of `keyframes`, newest first and in turn after so many `searched`, that shows what `pixels` do, and
+    /// the camera's pose on it.
     fn find(
         &mut self,
         keyframes: &[Keyframe],
-        in_force: usize,
+        active: usize,
+        searched: &mut usize,
         pixels: &[u8],
         params: &RecoveryParams,
-    ) -> Option<usize> {
-        let epoch = keyframes.get(in_force)?.epoch;
-        // The tracker itself looks around the keyframe in force.
+    ) -> Option<(usize, SE3)> {
+        let epoch = keyframes.get(active)?.epoch;
+        // The tracker itself looks around the active keyframe.
         let is_eligible = |index: &usize| {
             let keyframe = &keyframes[*index];
-            *index != in_force
+            *index != active
                 && keyframe.epoch == epoch
                 && keyframe.map_state == MapState::Established
-                // The oldest of a large map keep only their poses.
-                && !keyframe.image.is_empty()
-                && !keyframe.points.is_empty()
+                && keyframe.has_depth()
         };
         let newest_first = (0..keyframes.len()).rev().filter(is_eligible);
         let candidates: Vec<usize> = newest_first.take(params.num_keyframes).collect();
@@ -147,10 +114,11 @@ impl Recovery {
         }
         self.pyramid.fill(pixels);
         for _ in 0..params.keyframes_per_frame.min(candidates.len()) {
-            let index = candidates[self.searched % candidates.len()];
-            self.searched += 1;
-            if self.shows(&keyframes[index], params.rotation_deg.to_radians()) {
-                return Some(index);
+            let index = candidates[*searched % candidates.len()];
+            *searched += 1;
+            let rotation_rad = params.rotation_deg.to_radians();
+            if let Some(found) = self.find_near(&keyframes[index], rotation_rad) {
+                return Some((index, found));
             }
         }
         None
@@ -171,8 +139,9 @@ impl Recovery {
         self.verdict.judge(&found, &quality_of(&found), true, 0).is_tracked().then_some(found)
     }
 
-    /// Whether the frame in the pyramid can be aligned to `keyframe` from some view near it.
-    fn shows(&mut self, keyframe: &Keyframe, rotation_rad: f64) -> bool {
+    /// `keyframe_from_camera` of the frame in the pyramid, where it can be aligned to `keyframe` from some view
+    /// near it.
+    fn find_near(&mut self, keyframe: &Keyframe, rotation_rad: f64) -> Option<SE3> {
         self.reference.prepare_into(keyframe);
         let (aligner, reference, pyramid) = (&self.aligner, &self.reference, &self.pyramid);
         let mut best: Option<(Alignment, NormalEquations)> = None;
@@ -186,9 +155,11 @@ impl Recovery {
                 best = Some((other, explained));
             }
         }
-        let Some((mut best, _)) = best else { return false };
+        let (mut best, _) = best?;
         aligner.descend(reference, pyramid, &mut best, &mut |_| true);
-        self.verdict.judge(&best, &quality_of(&best), true, 0).is_tracked()
+        let verdict = self.verdict.judge(&best, &quality_of(&best), true, 0);
+        let keyframe_from_camera = best.state.current_from_keyframe.inverse();
+        (verdict.is_tracked() && keyframe_from_camera.is_finite()).then_some(keyframe_from_camera)
     }
 }
 
@@ -201,26 +172,30 @@ impl Mapper {
         pose: &PoseEstimate,
         sensor_depth: Option<&Image<f32>>,
     ) -> StepOutcome {
-        let lost_secs = self.recovery.lost_secs(frame.capture_nanos);
-        if let Some(in_force) = self.in_force {
+        let mut loss = self.phase.loss();
+        let lost_secs = loss.lasted_secs(frame.capture_nanos);
+        if let Some(active) = self.active {
             let (keyframes, params) = (&self.map.keyframes, &self.params.recovery);
-            let found = self.recovery.find(keyframes, in_force, frame.pixels, params);
-            if let Some(index) = found {
-                return self.restore_keyframe(index);
+            let searched = &mut loss.searched;
+            let found = self.finder.find(keyframes, active.index, searched, frame.pixels, params);
+            if let Some((index, keyframe_from_camera)) = found {
+                return self.restore_keyframe(index, &keyframe_from_camera, pose);
             }
         }
+        self.phase = self.phase.with_loss(loss);
         if lost_secs < self.params.recovery.lost_timeout_secs {
             return StepOutcome::default();
         }
-        if !std::mem::replace(&mut self.recovery.is_restarting, true) {
-            self.forget_start();
+        if !matches!(self.phase, Phase::Restarting(_)) {
+            self.start.forget();
+            self.phase = Phase::Restarting(loss);
         }
-        self.start(frame, pose, sensor_depth)
+        self.begin(frame, pose, sensor_depth)
     }
 
-    /// Declares the keyframe in force contradictory: nothing is claimed on it any more.
+    /// Declares the active keyframe contradictory: nothing is claimed on it any more.
     pub(super) fn reject(&mut self, contradiction: Contradiction) {
-        self.contradiction = Some(contradiction);
+        self.phase = Phase::Rejected(contradiction, Loss::default());
         self.revision += 1;
         let revision = self.revision;
         if let Some(keyframe) = self.keyframe_mut() {
@@ -229,28 +204,26 @@ impl Mapper {
         }
     }
 
-    /// Puts an earlier keyframe in force again, with the depth it was left with.
-    fn restore_keyframe(&mut self, index: usize) -> StepOutcome {
+    /// Makes an earlier keyframe active again, with the depth it was left with. The camera was found on it;
+    /// odometry goes on from its last pose.
+    fn restore_keyframe(
+        &mut self,
+        index: usize,
+        keyframe_from_camera: &SE3,
+        pose: &PoseEstimate,
+    ) -> StepOutcome {
         self.leave_keyframe();
-        let Some(keyframe) = self.map.keyframes.get_mut(index) else {
+        let Some(keyframe) = self.map.keyframes.get(index) else {
             return StepOutcome::default();
         };
-        let (min_gradient, max_candidates) = (self.params.min_gradient, self.params.max_candidates);
-        self.depth.restart(&keyframe.image, min_gradient, max_candidates);
-        self.revision += 1;
-        keyframe.revision = self.revision;
-        self.restore_points(index);
-        self.enter_keyframe(index);
-        self.plant_points();
+        self.depth.restart(&keyframe.image, &self.params);
+        restore_points(&mut self.depth.active, &keyframe.points);
+        let map_from_camera = keyframe.map_from_keyframe.place(keyframe_from_camera);
+        self.anchor(&map_from_camera, pose);
         self.past.clear();
+        self.phase = Phase::Mapping;
+        self.enter_keyframe(index);
         StepOutcome { keyframe_restored: true, keyframe_changed: true, ..Default::default() }
-    }
-
-    /// Puts the points of the keyframe at `index` into the depth map.
-    pub(super) fn restore_points(&mut self, index: usize) {
-        if let Some(keyframe) = self.map.keyframes.get(index) {
-            restore_points(&mut self.depth, &keyframe.points);
-        }
     }
 }
 
@@ -315,6 +288,8 @@ mod tests {
             capture_nanos: 0,
             map_state: MapState::Established,
             world_from_keyframe: Sim3::new(world_from_camera, 1.0),
+            map_from_keyframe: Sim3::new(world_from_camera, 1.0),
+            map_revision: 0,
             intrinsics: CAMERA,
             points: points.collect(),
             image: view.noisy(1.0, keyframe_id),
@@ -353,11 +328,16 @@ mod tests {
         let keyframes =
             [keyframe(&scene, 0, home), keyframe(&scene, 1, away), keyframe(&scene, 2, elsewhere)];
         let params = RecoveryParams { keyframes_per_frame: 3, ..Default::default() };
-        let find = |recovery: &mut Recovery, view: SE3| {
+        let mut searched = 0;
+        let mut find = |finder: &mut Finder, view: SE3| {
             let pixels = scene.render(&CAMERA, &view).noisy(2.0, 9);
-            recovery.find(&keyframes, 2, &pixels, &params)
+            let (index, found) = finder.find(&keyframes, 2, &mut searched, &pixels, &params)?;
+            let placed = keyframes[index].map_from_keyframe.place(&found);
+            let error = (view.inverse() * placed).log().norm();
+            assert!(error < 0.02, "found {error} away from where it is");
+            Some(index)
         };
-        let mut recovery = Recovery::new(&CAMERA);
+        let mut recovery = Finder::new(&CAMERA);
         let near_home = at([0.1, -0.05, 0.1, 0.05, 0.1, -0.05]);
         assert_eq!(find(&mut recovery, near_home), Some(0));
         assert_eq!(find(&mut recovery, away * near_home), Some(1));
@@ -375,30 +355,17 @@ mod tests {
         let in_force = keyframe(&scene, 3, at([0.0, 0.0, 0.0, 0.0, 2.0, 0.0]));
         let pixels = known.image.clone();
         let params = RecoveryParams::default();
-        let mut recovery = Recovery::new(&CAMERA);
+        let (mut finder, mut searched) = (Finder::new(&CAMERA), 0);
+        let mut find = |keyframes: &[Keyframe]| {
+            let found = finder.find(keyframes, 2, &mut searched, &pixels, &params);
+            (found.map(|(index, _)| index), searched)
+        };
         let without = [rejected, other_epoch, in_force.clone()];
-        assert_eq!(recovery.find(&without, 2, &pixels, &params), None);
-        assert_eq!(recovery.searched, 0);
+        assert_eq!(find(&without), (None, 0));
         let far = keyframe(&scene, 1, at([0.0, 0.0, 0.0, 0.0, -2.0, 0.0]));
         let with = [known, far, in_force];
-        assert_eq!(recovery.find(&with, 2, &pixels, &params), None, "the newest is first");
-        assert_eq!(recovery.find(&with, 2, &pixels, &params), Some(0));
-    }
-
-    #[test]
-    fn steps_of_the_clock_neither_delay_nor_end_a_search() {
-        const SECOND: i64 = 1_000_000_000;
-        let mut recovery = Recovery::new(&CAMERA);
-        let mut secs = |stamp: i64| recovery.lost_secs(stamp);
-        assert_eq!(secs(100 * SECOND), 0.0);
-        assert_eq!(secs(101 * SECOND), 1.0);
-        // An hour back, and on from there.
-        assert_eq!(secs(-3500 * SECOND), 1.0);
-        assert_eq!(secs(-3499 * SECOND), 2.0);
-        assert_eq!(secs(i64::MIN), 2.0);
-        assert_eq!(secs(i64::MAX), 7.0, "a leap counts as the longest period");
-        recovery.end();
-        assert_eq!(recovery.lost_secs(0), 0.0);
+        assert_eq!(find(&with), (None, 1), "the newest is first");
+        assert_eq!(find(&with), (Some(0), 2));
     }
 
     #[test]

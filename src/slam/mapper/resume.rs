@@ -1,8 +1,10 @@
 //! What of the map a mapper needs to go on after its death, and how it goes on.
 
 use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::map::Map;
+use crate::slam::mapper::phase::Phase;
 use crate::slam::mapper::recovery::restore_points;
-use crate::slam::mapper::{Map, Mapper, StepOutcome};
+use crate::slam::mapper::{Mapper, StepOutcome};
 
 /// More keyframes than are made between two checkpoints, and more revisions.
 const UNKNOWN_KEYFRAMES: u64 = 1000;
@@ -32,7 +34,13 @@ impl Mapper {
             false => Keyframe { image: Vec::new(), points: Vec::new(), ..*keyframe },
         });
         let free_epoch = self.next_epoch().saturating_add(UNKNOWN_EPOCHS);
-        Some(Map { keyframes: keyframes.collect(), free_epoch })
+        let active = Some(in_force.keyframe_id);
+        Some(Map {
+            keyframes: keyframes.collect(),
+            revision: self.map.revision,
+            active,
+            free_epoch,
+        })
     }
 
     /// Takes over from the mapper of another camera: its keyframes stay in the map, and epochs, ids and
@@ -63,18 +71,20 @@ impl Mapper {
         self.revision = newest_revision.saturating_add(UNKNOWN_REVISIONS);
         self.next_keyframe_id = newest_id.saturating_add(UNKNOWN_KEYFRAMES);
         self.first_free_epoch = map.free_epoch;
-        let Some(index) = map.keyframes.iter().rposition(fits) else {
+        let was_active = map.active.and_then(|active| map.index_of(active));
+        let was_active = was_active.filter(|&index| fits(&map.keyframes[index]));
+        let Some(index) = was_active.or_else(|| map.keyframes.iter().rposition(fits)) else {
             return StepOutcome::default();
         };
-        self.map = map;
-        let (min_gradient, max_candidates) = (self.params.min_gradient, self.params.max_candidates);
-        let keyframe = &mut self.map.keyframes[index];
-        keyframe.revision = self.revision;
-        self.depth.restart(&keyframe.image, min_gradient, max_candidates);
-        restore_points(&mut self.depth, &keyframe.points);
+        self.map = Map { active: None, ..map };
+        let keyframe = &self.map.keyframes[index];
+        self.depth.restart(&keyframe.image, &self.params);
+        restore_points(&mut self.depth.active, &keyframe.points);
+        // Where odometry had it when it died.
+        self.world_from_map = keyframe.world_from_keyframe * keyframe.map_from_keyframe.inverse();
         self.past.clear();
+        self.phase = Phase::Mapping;
         self.enter_keyframe(index);
-        self.plant_points();
         StepOutcome {
             keyframe_restored: true,
             keyframe_changed: true,
@@ -106,6 +116,8 @@ mod tests {
             capture_nanos: 0,
             map_state: MapState::Established,
             world_from_keyframe: Sim3::identity(),
+            map_from_keyframe: Sim3::identity(),
+            map_revision: 0,
             intrinsics: CAMERA,
             image: (0..CAMERA.width * CAMERA.height).map(|i| (i * i % 251) as u8).collect(),
             points: vec![point],
@@ -134,7 +146,7 @@ mod tests {
     #[test]
     fn an_established_epoch_goes_on_and_the_one_after_it_is_new() {
         let mut first = mapper();
-        first.resume(Map { keyframes: vec![keyframe(2)], free_epoch: 7 });
+        first.resume(Map { keyframes: vec![keyframe(2)], free_epoch: 7, ..Map::default() });
         assert_eq!(first.keyframe().unwrap().epoch, 2);
         // It is lost, begins an epoch with this number that is never proven, and dies.
         let unproven = first.next_epoch();

@@ -3,14 +3,12 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::slam::depth::epipolar::TwoView;
-use crate::slam::depth::matching::is_inside;
 use crate::slam::depth::propagation::propagate;
 use crate::slam::frame::FrameView;
-use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
-use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::keyframe::MapState;
 use crate::slam::mapper::Mapper;
+use crate::slam::mapper::recovery::restore_points;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::{Brightness, PoseEstimate};
 
@@ -49,13 +47,16 @@ impl ReuseParams {
 }
 
 impl Mapper {
-    /// Puts the nearest earlier keyframe in force again, if one is near enough, shows the frame and
+    /// Makes the nearest earlier keyframe active again, if one is near enough, shows the frame and
     /// agrees with its pose. Its depth is what it was left with and what the present keyframe adds.
     pub(super) fn reuse_keyframe(&mut self, frame: &FrameView<'_>, pose: &PoseEstimate) -> bool {
-        let Some(index) = self.nearest_keyframe(&pose.world_from_camera) else { return false };
+        let Some(present) = self.keyframe() else { return false };
+        let map_from_camera = present.map_from_keyframe.place(&pose.keyframe_from_camera);
+        let Some((index, expected)) = self.nearest_keyframe(&map_from_camera) else {
+            return false;
+        };
         let keyframe = &self.map.keyframes[index];
-        let expected = keyframe.world_from_keyframe.locate(&pose.world_from_camera);
-        let Some(measured) = self.recovery.locate(keyframe, frame.pixels, &expected) else {
+        let Some(measured) = self.finder.locate(keyframe, frame.pixels, &expected) else {
             return false;
         };
         let camera_from_keyframe = measured.state.current_from_keyframe;
@@ -64,37 +65,30 @@ impl Mapper {
         if !(disagreement <= self.params.reuse.max_disagreement) {
             return false;
         }
-        let brightness = between(pose.brightness, measured.state.brightness);
-        self.take_up(index, brightness);
+        let map_from_camera = keyframe.map_from_keyframe.place(&camera_from_keyframe.inverse());
+        self.anchor(&map_from_camera, pose);
+        self.take_up(index, between(pose.brightness, measured.state.brightness));
         true
     }
 
-    /// The keyframe of the epoch with the smallest distance to the camera, if that is small enough.
-    fn nearest_keyframe(&self, world_from_camera: &SE3) -> Option<usize> {
+    /// The other keyframe of the epoch with the smallest distance to the camera, if that is small enough, and
+    /// the camera's pose on it.
+    fn nearest_keyframe(&self, map_from_camera: &SE3) -> Option<(usize, SE3)> {
         let present = self.keyframe()?;
         let params = &self.params.reuse;
+        let reach = params.max_distance.sqrt() / params.distance_weight.max(f64::MIN_POSITIVE);
         let mut nearest = None;
         let mut least = params.max_distance;
-        for (index, keyframe) in self.map.keyframes.iter().enumerate() {
+        for (index, view) in self.map.seen_from(present.epoch, map_from_camera, reach) {
+            let keyframe = &self.map.keyframes[index];
             let is_eligible = keyframe.keyframe_id != present.keyframe_id
-                && keyframe.epoch == present.epoch
-                && keyframe.map_state == MapState::Established
-                // The oldest of a large map keep only their poses.
-                && !keyframe.image.is_empty()
-                && !keyframe.points.is_empty();
-            if !is_eligible {
-                continue;
-            }
-            let keyframe_from_camera = keyframe.world_from_keyframe.locate(world_from_camera);
+                && keyframe.map_state == MapState::Established;
             let from_distance =
-                (params.distance_weight * keyframe_from_camera.translation.norm()).powi(2);
-            if from_distance >= least {
-                continue;
-            }
-            let unused = 1.0 - usage(keyframe, &keyframe_from_camera);
-            let distance = from_distance + (params.usage_weight * unused).powi(2);
-            if distance < least {
-                (nearest, least) = (Some(index), distance);
+                params.distance_weight * view.keyframe_from_camera.translation.norm();
+            let from_usage = params.usage_weight * (1.0 - view.usage);
+            let distance = from_distance * from_distance + from_usage * from_usage;
+            if is_eligible && distance < least {
+                (nearest, least) = (Some((index, view.keyframe_from_camera)), distance);
             }
         }
         nearest
@@ -102,48 +96,31 @@ impl Mapper {
 
     /// Leaves the present keyframe for that at `index`, whose image is `brightness` of the present one's.
     fn take_up(&mut self, index: usize, brightness: Brightness) {
-        self.is_unit_open = false;
-        if self.unpublished > 0 {
-            self.refine();
+        if self.depth.unpublished > 0 {
+            self.depth.refine(&self.params);
         }
         self.publish_depth();
-        let Some(present) = self.keyframe().map(|keyframe| keyframe.world_from_keyframe) else {
+        let Some(present) = self.keyframe().map(|keyframe| keyframe.map_from_keyframe) else {
             return;
         };
+        let present_unit = present.scale * self.depth.unit;
         let keyframe = &self.map.keyframes[index];
-        let world_from_keyframe = keyframe.world_from_keyframe;
-        std::mem::swap(&mut self.depth, &mut self.next_depth);
-        self.next_depth.rescale((world_from_keyframe.scale / present.scale) as f32);
-        let (min_gradient, max_candidates) = (self.params.min_gradient, self.params.max_candidates);
-        self.depth.restart(&keyframe.image, min_gradient, max_candidates);
+        let map_from_keyframe = keyframe.map_from_keyframe;
+        self.depth.swap();
+        self.depth.spare.rescale((map_from_keyframe.scale / present_unit) as f32);
+        self.depth.restart(&keyframe.image, &self.params);
         propagate(
-            &self.next_depth,
-            &mut self.depth,
+            &self.depth.spare,
+            &mut self.depth.active,
             &self.intrinsics,
-            &world_from_keyframe.locate(&present.rigid),
+            &map_from_keyframe.locate(&present.rigid),
             brightness,
             &self.params.propagation,
         );
-        self.restore_points(index);
+        restore_points(&mut self.depth.active, &keyframe.points);
         self.past.clear();
         self.enter_keyframe(index);
-        self.plant_points();
-        self.publish_depth();
     }
-}
-
-/// Share of a keyframe's points that a camera sees; every so many are enough for a share.
-fn usage(keyframe: &Keyframe, keyframe_from_camera: &SE3) -> f64 {
-    const STRIDE: usize = 16;
-    let Intrinsics { width, height, .. } = keyframe.intrinsics;
-    let view = TwoView::new(&keyframe.intrinsics, &keyframe_from_camera.inverse());
-    let (mut seen, mut all) = (0u32, 0u32);
-    for point in keyframe.points.iter().step_by(STRIDE) {
-        let at = view.line(f32::from(point.u), f32::from(point.v)).project(point.inverse_depth);
-        seen += u32::from(at.is_some_and(|at| is_inside(width, height, at.u, at.v)));
-        all += 1;
-    }
-    f64::from(seen) / f64::from(all.max(1))
 }
 
 /// The brightness of image 2 against image 1, from that of one frame against each: with
@@ -167,13 +144,16 @@ mod tests {
         scene: Scene,
         mapper: Mapper,
         sequence: u64,
+        state: TrackingState,
+        is_exact: bool,
     }
 
     impl Walk {
         fn new() -> Self {
             let params = MapperParams { min_keyframe_interval: 1, ..MapperParams::default() };
             let mapper = Mapper::new(CAMERA, params).unwrap();
-            Self { scene: Scene::new(3), mapper, sequence: 0 }
+            let (scene, state) = (Scene::new(3), TrackingState::Tracking);
+            Self { scene, mapper, sequence: 0, state, is_exact: true }
         }
 
         /// A frame taken at `place` metres to the right, said to be at `claimed`; a keyframe is asked for.
@@ -194,9 +174,13 @@ mod tests {
             self.sequence += 1;
             let keyframe_id = self.mapper.keyframe().map_or(u64::MAX, |k| k.keyframe_id);
             let pose = PoseEstimate {
-                state: TrackingState::Tracking,
+                state: self.state,
+                alignment_covariance: [if self.is_exact { 0.0 } else { 1e-9 }; 21],
                 keyframe_id,
                 world_from_camera: at(claimed),
+                keyframe_from_camera: self.mapper.keyframe().map_or(SE3::identity(), |keyframe| {
+                    keyframe.world_from_keyframe.locate(&at(claimed))
+                }),
                 proposes_keyframe: true,
                 ..PoseEstimate::unknown(&frame)
             };
@@ -223,6 +207,33 @@ mod tests {
             walk.step(0.0, 0.0);
             walk.step(1.2, 1.2);
             assert_eq!(walk.step(0.1, 0.3).keyframe_restored, is_restored);
+        }
+    }
+
+    #[test]
+    fn odometry_stands_still_where_an_earlier_keyframe_is_taken_up_or_found() {
+        use crate::slam::pose::LostReason;
+        let place = |walk: &Walk, x: f64| {
+            let keyframe = walk.mapper.keyframe().unwrap();
+            let at = SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() };
+            // Exact depth: the keyframe's place in the map is where it was taken.
+            keyframe.world_from_keyframe.place(&keyframe.map_from_keyframe.locate(&at))
+        };
+        let is_tracked_or_lost =
+            [TrackingState::Tracking, TrackingState::Lost(LostReason::Diverged)];
+        for state in is_tracked_or_lost {
+            let mut walk = Walk::new();
+            walk.step(0.0, 0.0);
+            walk.step(1.2, 1.2);
+            // Near the first keyframe, by an odometry that has drifted by a centimetre, or was lost on the way.
+            let drifted = if state == TrackingState::Tracking { 0.11 } else { 0.9 };
+            walk.state = state;
+            walk.is_exact = false;
+            let outcome = walk.step(0.1, drifted);
+            assert!(outcome.keyframe_restored, "{state:?}");
+            assert_eq!(walk.mapper.keyframe().unwrap().keyframe_id, 0);
+            let jump = (place(&walk, 0.1).translation.x - drifted).abs();
+            assert!(jump < 0.005, "{state:?}: odometry jumps by {jump}");
         }
     }
 

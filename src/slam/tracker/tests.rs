@@ -219,10 +219,6 @@ fn without_keyframe_or_trust_nothing_is_claimed() {
     let mut tracker = Tracker::new(camera, TrackerParams::default()).unwrap();
     let estimate = tracker.track(&frame(0, &image), &mut always);
     assert_eq!(estimate.state, TrackingState::Initializing);
-    keyframe.map_state = MapState::Initializing;
-    tracker.adopt(Box::new(Reference::prepare(&keyframe)));
-    let estimate = tracker.track(&frame(1, &image), &mut always);
-    assert_eq!(estimate.state, TrackingState::Initializing);
     keyframe.map_state = MapState::Rejected;
     tracker.adopt(Box::new(Reference::prepare(&keyframe)));
     let estimate = tracker.track(&frame(2, &image), &mut always);

@@ -18,7 +18,9 @@ fn pose() -> PoseEstimate {
         revision: 99,
         keyframe_id: NO_KEYFRAME,
         state: TrackingState::Lost(LostReason::NoPoints),
+        map_revision: 5,
         world_from_camera: transform(),
+        map_from_camera: transform().inverse(),
         keyframe_from_camera: transform().inverse(),
         covariance: std::array::from_fn(|i| 0.1 / (i as f64 + 3.0)),
         alignment_covariance: std::array::from_fn(|i| 0.01 / (i as f64 + 3.0)),
@@ -38,6 +40,8 @@ fn keyframe() -> Keyframe {
         capture_nanos: 1_000,
         map_state: MapState::Established,
         world_from_keyframe: Sim3::new(transform(), 1.3),
+        map_from_keyframe: Sim3::new(transform(), 1.3),
+        map_revision: 0,
         intrinsics: Intrinsics { fx: 20.0, fy: 21.0, cx: 9.5, cy: 8.5, width: 20, height: 18 },
         image: (0..20 * 18).map(|i| (i % 256) as u8).collect(),
         points: vec![point; 3],
@@ -57,12 +61,17 @@ fn poses_survive_bit_for_bit() {
     assert_eq!(read, pose());
     let bits = |t: &SE3| rigid_message(t).map(f64::to_bits);
     assert_eq!(bits(&read.world_from_camera), bits(&pose().world_from_camera));
+    assert_eq!(bits(&read.map_from_camera), bits(&pose().map_from_camera));
 }
 
 #[test]
 fn keyframes_survive_bit_for_bit() {
     assert_eq!(read(&keyframe()).unwrap(), keyframe());
-    let pose = KeyframePose { keyframe_id: 4, world_from_keyframe: Sim3::new(transform(), 2.0) };
+    let pose = KeyframePose {
+        keyframe_id: 4,
+        revision: 7,
+        map_from_keyframe: Sim3::new(transform(), 2.0),
+    };
     assert_eq!(keyframe_pose_from_message(&keyframe_pose_message(&pose)).unwrap(), pose);
 }
 

@@ -113,7 +113,7 @@ fn truth_in_time(input: &ReportInput<'_>) -> Vec<StampedPose> {
 fn keyframe_poses(record: &RunRecord) -> Vec<StampedPose> {
     let pose = |k: &crate::slam::keyframe::Keyframe| StampedPose {
         nanos: k.capture_nanos,
-        world_from_camera: k.world_from_keyframe.rigid,
+        world_from_camera: k.map_from_keyframe.rigid,
     };
     record.map.keyframes.iter().map(pose).collect()
 }

@@ -315,7 +315,7 @@ fn depth_maps(input: &ReportInput<'_>) -> String {
         let (picture, range) = inverse_depth_picture(keyframe, input.max_relative_std_dev);
         let depths = match range {
             Some([far, near]) => {
-                let scale = keyframe.world_from_keyframe.scale;
+                let scale = keyframe.map_from_keyframe.scale;
                 format!("{:.2} to {:.2} map units", scale / near, scale / far)
             }
             None => "no points".to_owned(),

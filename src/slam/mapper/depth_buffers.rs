@@ -1,0 +1,133 @@
+//! The depth of the active keyframe while it is estimated, and the memory for the next.
+
+use crate::slam::depth::interval::IntervalFilter;
+use crate::slam::depth::map::{DepthMap, KnownColumns, for_each_known};
+use crate::slam::depth::regularisation::{RegularisationScratch, regularise};
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS};
+use crate::slam::map::LogPlane;
+use crate::slam::mapper::MapperParams;
+use crate::slam::mapper::observation::DepthFilter;
+
+/// Owner of all that the filters work on.
+#[derive(Debug)]
+pub(super) struct DepthBuffers {
+    /// The depth map of the active keyframe.
+    pub(super) active: DepthMap,
+    /// Memory for the next; after a change the depth map of the keyframe before.
+    pub(super) spare: DepthMap,
+    /// The immature points of the active keyframe.
+    pub(super) points: IntervalFilter,
+    regularisation: RegularisationScratch,
+    /// Length of the unit of `active` in the keyframe's: 1 but where poses are given, and so the keyframe's unit,
+    /// before anything is known of how far away things are.
+    pub(super) unit: f64,
+    /// Whether that unit is still to be found.
+    pub(super) is_unit_open: bool,
+    /// Hypotheses changed since the depth was smoothed and published.
+    pub(super) unpublished: usize,
+}
+
+impl DepthBuffers {
+    /// Empty, for images of this size.
+    pub(super) fn with_size(width: usize, height: usize) -> Self {
+        Self {
+            active: DepthMap::with_size(width, height),
+            spare: DepthMap::with_size(width, height),
+            points: IntervalFilter::default(),
+            regularisation: RegularisationScratch::with_size(width, height),
+            unit: 1.0,
+            is_unit_open: false,
+            unpublished: 0,
+        }
+    }
+
+    /// Begins the active depth anew on `pixels`, in the keyframe's unit.
+    pub(super) fn restart(&mut self, pixels: &[u8], params: &MapperParams) {
+        self.active.restart(pixels, params.min_gradient, params.max_candidates);
+        (self.unit, self.is_unit_open) = (1.0, false);
+    }
+
+    /// The active depth becomes the spare one, and the other way round.
+    pub(super) fn swap(&mut self) {
+        std::mem::swap(&mut self.active, &mut self.spare);
+    }
+
+    /// Chooses the points that the interval filter traces.
+    pub(super) fn plant_points(&mut self, params: &MapperParams) {
+        match params.depth_filter {
+            DepthFilter::Gaussian => {}
+            DepthFilter::Interval => {
+                self.points.restart_with_known(&mut self.active, &params.candidates);
+            }
+            DepthFilter::Both => self.points.restart_where_empty(&self.active),
+        }
+    }
+
+    /// Smooths what was observed; points of the interval filter have no neighbours to agree with.
+    pub(super) fn refine(&mut self, params: &MapperParams) {
+        if params.depth_filter != DepthFilter::Interval {
+            regularise(&mut self.active, &mut self.regularisation, &params.regularisation);
+        }
+        self.unpublished = 0;
+    }
+
+    /// Rescales to mean inverse depth 1; the factor by which the unit of the depth has grown.
+    pub(super) fn normalise(&mut self) -> f64 {
+        let Some(mean) = self.active.mean_inverse_depth().filter(|m| *m > 0.0) else { return 1.0 };
+        let factor = 1.0 / mean;
+        self.active.rescale(factor as f32);
+        self.points.rescale(factor as f32);
+        factor
+    }
+
+    /// While the unit is open: the mean inverse depth is kept at 1, the keyframe's unit stays.
+    pub(super) fn keep_unit_mean(&mut self) {
+        if self.is_unit_open {
+            self.unit *= self.normalise();
+        }
+    }
+
+    /// Changes the unit by `factor`, that of all there is.
+    pub(super) fn grow_unit(&mut self, factor: f64) {
+        self.unit *= factor;
+        self.active.rescale(factor as f32);
+        self.points.rescale(factor as f32);
+    }
+
+    /// Moves the active depth by a plane on its logarithm.
+    pub(super) fn correct(&mut self, plane: &LogPlane, intrinsics: &Intrinsics) {
+        if !plane.is_identity() {
+            let factor_at = |u, v| plane.factor(intrinsics, u as f64, v as f64) as f32;
+            self.active.rescale_by(factor_at);
+            self.points.rescale_by(factor_at);
+        }
+    }
+
+    /// Makes the active depth the points of its keyframe.
+    pub(super) fn write_into(&self, keyframe: &mut Keyframe) {
+        write_depth(&self.active, self.unit, keyframe);
+    }
+}
+
+/// Makes the hypotheses of `depth`, whose unit is so many of the keyframe's, the points of the keyframe.
+pub(super) fn write_depth(depth: &DepthMap, unit: f64, keyframe: &mut Keyframe) {
+    keyframe.points.clear();
+    keyframe.points.reserve_exact(depth.num_hypotheses().min(MAX_KEYFRAME_POINTS));
+    let image = &depth.image.intensity;
+    let inverse_unit = (1.0 / unit) as f32;
+    let mut columns = KnownColumns::default();
+    for v in 0..image.height() {
+        let (row, intensities) = (depth.hypotheses.row(v), image.row(v));
+        for_each_known(row, &mut columns, |known| {
+            keyframe.points.extend(known.iter().map(|&u| {
+                let (h, intensity) = (&row[usize::from(u)], intensities[usize::from(u)]);
+                let inverse_depth = h.smoothed * inverse_unit;
+                let variance = h.variance * (inverse_unit * inverse_unit);
+                DepthPoint { u, v: v as u16, inverse_depth, variance, intensity }
+            }));
+        });
+    }
+    keyframe.points.retain(|point| point.inverse_depth > 0.0);
+    keyframe.points.truncate(MAX_KEYFRAME_POINTS);
+}

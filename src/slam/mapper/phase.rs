@@ -1,0 +1,100 @@
+//! What the mapper is doing from frame to frame, with what each of it needs.
+
+use crate::slam::mapper::consistency::{Consistency, Contradiction};
+
+/// Longest time that two lost frames are taken to be apart: the slowest camera's period.
+const LONGEST_STEP_NANOS: i64 = 5_000_000_000;
+
+/// What is done with the next frame.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) enum Phase {
+    /// There is no map: it goes to the start of one.
+    #[default]
+    Starting,
+    /// Its depth is observed.
+    Mapping,
+    /// The camera is lost: it is looked for on recent keyframes.
+    Lost(Loss),
+    /// The map contradicted itself: the camera is looked for on earlier keyframes.
+    Rejected(Contradiction, Loss),
+    /// The camera has been lost for long: looked for as before, and the frame goes to the start of a new epoch
+    /// too. Whichever is first wins.
+    Restarting(Loss),
+}
+
+/// How long the camera has been lost, and where it was looked for.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct Loss {
+    /// Stamp of the last lost frame.
+    last_nanos: Option<i64>,
+    /// Time of the stamps since the first.
+    lost_nanos: i64,
+    /// Keyframes searched since then.
+    pub(super) searched: usize,
+}
+
+impl Phase {
+    /// The loss that goes on, or a new one.
+    pub(super) fn loss(&self) -> Loss {
+        match *self {
+            Self::Lost(loss) | Self::Rejected(_, loss) | Self::Restarting(loss) => loss,
+            Self::Starting | Self::Mapping => Loss::default(),
+        }
+    }
+
+    /// The same phase, this far into the loss.
+    pub(super) fn with_loss(self, loss: Loss) -> Self {
+        match self {
+            Self::Restarting(_) => Self::Restarting(loss),
+            Self::Rejected(why, _) => Self::Rejected(why, loss),
+            Self::Starting | Self::Mapping | Self::Lost(_) => Self::Lost(loss),
+        }
+    }
+}
+
+impl Loss {
+    /// How long it has lasted, seconds, with another lost frame. A step of the clock, back or far
+    /// forwards, is no time in which anything was searched.
+    pub(super) fn lasted_secs(&mut self, nanos: i64) -> f64 {
+        let step = nanos.saturating_sub(self.last_nanos.replace(nanos).unwrap_or(nanos));
+        self.lost_nanos = self.lost_nanos.saturating_add(step.clamp(0, LONGEST_STEP_NANOS));
+        self.lost_nanos as f64 * 1e-9
+    }
+}
+
+/// The keyframe that frames are tracked on and whose depth is observed.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Active {
+    /// Its place in the map.
+    pub(super) index: usize,
+    /// Frames that were observed on it.
+    pub(super) frames: u64,
+    /// Whether it still agrees with itself.
+    pub(super) consistency: Consistency,
+}
+
+impl Active {
+    /// The keyframe at `index`, before its first frame.
+    pub(super) fn new(index: usize) -> Self {
+        Self { index, frames: 0, consistency: Consistency::default() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn steps_of_the_clock_neither_delay_nor_end_a_search() {
+        const SECOND: i64 = 1_000_000_000;
+        let mut loss = Loss::default();
+        let mut secs = |stamp: i64| loss.lasted_secs(stamp);
+        assert_eq!(secs(100 * SECOND), 0.0);
+        assert_eq!(secs(101 * SECOND), 1.0);
+        // An hour back, and on from there.
+        assert_eq!(secs(-3500 * SECOND), 1.0);
+        assert_eq!(secs(-3499 * SECOND), 2.0);
+        assert_eq!(secs(i64::MIN), 2.0);
+        assert_eq!(secs(i64::MAX), 7.0, "a leap counts as the longest period");
+    }
+}
