@@ -64,5 +64,5 @@ fn a_trial_without_frames_is_refused() {
     let rig = Rig::new();
     let ended = finish(rig.command(&["bench", "latency", "--seconds", "0"]));
     assert_eq!(ended.status.code(), Some(1));
-    assert!(ended.stderr.contains("allowed are 1 to"), "{}", ended.stderr);
+    assert!(ended.stderr.contains("is 0 frames; choose 1 to"), "{}", ended.stderr);
 }

