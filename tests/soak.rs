@@ -42,6 +42,8 @@ const BYTES_OF_A_FRAME: f64 = 2048.0;
 const LARGEST_STEP: f64 = 0.5;
 /// Who dies sooner after its start is started again later and later.
 const HASTY: Duration = Duration::from_secs(2);
+/// Keyframes that a mapper keeps for its successor; one more while it writes.
+const MOST_KEPT_KEYFRAMES: usize = 21;
 /// Memory that a process may take more than at the beginning: pages of other code, a fuller map.
 const MEMORY_SLACK: f64 = 1.5;
 
@@ -148,10 +150,16 @@ fn files(rig: &Rig) -> BTreeMap<String, usize> {
     };
     let shared = names(Path::new(SHARED_MEMORY)).into_iter().filter(|n| n.starts_with(&prefix));
     let mut counts = BTreeMap::new();
+    let mut keyframes = 0;
     for name in shared.chain(names(&rig.root())) {
         let kind = name.rsplit('.').next().unwrap_or_default().to_owned();
-        *counts.entry(kind).or_default() += 1;
+        // What a mapper keeps of the keyframes before the active one, `NAME.checkpoint.ID`.
+        match kind.parse::<u64>() {
+            Ok(_) => keyframes += 1,
+            Err(_) => *counts.entry(kind).or_default() += 1,
+        }
     }
+    assert!(keyframes <= 2 * MOST_KEPT_KEYFRAMES, "{keyframes} keyframes are kept of two rigs");
     counts
 }
 
