@@ -134,7 +134,8 @@ pub struct MapperConfig {
 #[serde(deny_unknown_fields, default)]
 pub struct SupervisorConfig {
     /// Live: how often in a row processes that die within two seconds of their start are started again
-    /// before the run is given up. Who has lived longer is always started again.
+    /// before the run is given up. A process that has lived longer is always restarted, and so is one that was
+    /// ready and was killed (SIGKILL), up to ten times in a row.
     pub max_restarts: u32,
     /// Longest time without a sign of life of a process before it is killed, seconds; live it is started again,
     /// in lockstep the run ends. 0 waits for ever.

@@ -25,6 +25,9 @@ const FIRST_BACK_OFF: Duration = Duration::from_millis(50);
 const LONGEST_BACK_OFF: Duration = Duration::from_secs(5);
 /// A process that has lived so long did not die of its start: the pauses begin anew.
 const HEALTHY_LIFE: Duration = Duration::from_secs(2);
+/// Kills from outside in a row, of processes that were ready, that are no sign of a fault: an operator or a test
+/// kills at any rate. The kernel, where memory runs out, would kill the next one too: from then on they count.
+const KILLS_AT_ONCE: u32 = 10;
 /// Shortest time that a process has for its first sign of life: it is loaded, reads its configuration and
 /// joins the others, on a machine that may be busy.
 const FIRST_SIGN: Duration = Duration::from_secs(30);
@@ -43,6 +46,8 @@ pub struct Death {
     pub is_fault: bool,
     /// Whether memory that it had mapped was not there.
     pub is_bus_error: bool,
+    /// Whether it was killed by SIGKILL, and not by its supervisor.
+    pub is_kill: bool,
 }
 
 /// One of the three processes.
@@ -55,6 +60,8 @@ pub struct Supervised {
     due: Option<Instant>,
     /// Restarts in a row of processes that died young.
     hasty_restarts: u32,
+    /// Kills in a row that did not count as that.
+    kills: u32,
     /// Causes of the restarts so far, each with how often.
     causes: Vec<(String, u64)>,
     last_sign: Instant,
@@ -71,6 +78,7 @@ impl Supervised {
             child: None,
             due: Some(now),
             hasty_restarts: 0,
+            kills: 0,
             causes: Vec::new(),
             last_sign: now,
             last_look: now,
@@ -159,14 +167,14 @@ impl Supervised {
         child.kill();
         self.bury();
         let cause = hang(name, liveness);
-        Ok(Some(Some(Death { cause, is_fault: false, is_bus_error: false })))
+        Ok(Some(Some(Death { cause, is_fault: false, is_bus_error: false, is_kill: false })))
     }
 
     /// It has ended: its life counts for the pause before the next.
     fn bury(&mut self) {
         // One that never got ready died of its start, however long that took.
         if self.was_ready && self.child.as_ref().is_some_and(|child| child.age() > HEALTHY_LIFE) {
-            self.hasty_restarts = 0;
+            (self.hasty_restarts, self.kills) = (0, 0);
         }
         self.child = None;
     }
@@ -176,14 +184,25 @@ impl Supervised {
     /// cleared, or another was killed at that time (`kill_is_felt`), whose half-made ports it has met.
     pub fn may_restart(&self, death: &Death, kill_is_felt: bool, max_restarts: u32) -> bool {
         let is_own = death.is_fault && (self.was_ready || self.restarts() == 0);
-        (kill_is_felt || !is_own) && self.hasty_restarts < max_restarts
+        (kill_is_felt || !is_own)
+            && (self.is_mere_kill(death) || self.hasty_restarts < max_restarts)
+    }
+
+    /// Whether this death says nothing of the process: it was ready, and somebody killed it.
+    fn is_mere_kill(&self, death: &Death) -> bool {
+        death.is_kill && self.was_ready && self.kills < KILLS_AT_ONCE
     }
 
     /// Plans the next start: at once for a process that had lived, later and later for one that dies of
     /// its start.
     pub fn plan_restart(&mut self, death: Death) {
-        self.due = Some(Instant::now() + back_off(self.hasty_restarts));
-        self.hasty_restarts += 1;
+        if self.is_mere_kill(&death) {
+            self.due = Some(Instant::now());
+            self.kills += 1;
+        } else {
+            self.due = Some(Instant::now() + back_off(self.hasty_restarts));
+            self.hasty_restarts += 1;
+        }
         match self.causes.iter_mut().find(|(cause, _)| *cause == death.cause) {
             Some((_, count)) => *count += 1,
             None => self.causes.push((death.cause, 1)),
@@ -222,7 +241,8 @@ fn death(name: &str, status: ExitStatus, fault: Option<String>) -> Death {
         (None, Some(signal)) => format!("{name} was killed by {}", signal_name(signal)),
         (None, None) => format!("{name} ended with {status} in the middle of the run"),
     };
-    Death { cause, is_fault, is_bus_error }
+    let is_kill = status.signal() == Some(Signal::KILL.as_raw());
+    Death { cause, is_fault, is_bus_error, is_kill }
 }
 
 /// What a SIGBUS means: a page that was promised and is not there.
@@ -295,7 +315,17 @@ mod tests {
         process.was_ready = true;
         assert!(!may(&process, &fault, false) && may(&process, &fault, true));
         process.plan_restart(fault.clone());
-        assert!(!may(&process, &fault, true) && !may(&process, &kill, false), "too often");
+        assert!(!may(&process, &fault, true), "too often");
+        // Kills of one that was ready say nothing of it, until there are many.
+        for _ in 0..KILLS_AT_ONCE {
+            assert!(may(&process, &kill, false));
+            process.plan_restart(kill.clone());
+            assert!(process.due.is_some_and(|due| due <= Instant::now()), "at once");
+        }
+        assert!(!may(&process, &kill, false), "too many");
+        process.kills = 0;
+        process.was_ready = false;
+        assert!(!may(&process, &kill, false), "of its start");
         drop((process, hub));
         place.tidy();
     }
