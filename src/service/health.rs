@@ -13,6 +13,10 @@ const REPORT_PERIOD_NANOS: i64 = 1_000_000_000;
 /// Time between two reports of progress: smooth to the eye, nothing for the machine.
 const PROGRESS_PERIOD_NANOS: i64 = 100_000_000;
 
+/// Shortest time between two reports of rare events: they go out at once, so that a kill loses none, but a process
+/// that counts one with every frame must not do more reporting than work.
+const EVENT_PERIOD_NANOS: i64 = 10_000_000;
+
 /// What a process is doing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ProcessState {
@@ -147,6 +151,8 @@ pub struct Health {
     notice: ManagerNotice,
     /// Frames that had been counted when the rate was taken last, and when that was.
     rated: (u64, i64),
+    /// Rare events that the last report told.
+    told_events: u64,
 }
 
 impl Health {
@@ -188,7 +194,8 @@ impl Health {
         let publisher = hub.publisher(topic, 1)?;
         let notice = ManagerNotice::from_environment();
         let rated = (0, message.started_nanos);
-        let mut health = Self { publisher, message, changed: true, notice, rated };
+        let told_events = 0;
+        let mut health = Self { publisher, message, changed: true, notice, rated, told_events };
         health.report();
         Ok(health)
     }
@@ -275,9 +282,14 @@ impl Health {
         self.publisher.serve_late_joiners();
         let now = now_nanos();
         self.notice.beat(now);
-        if !self.changed && now - self.message.published_nanos < REPORT_PERIOD_NANOS {
+        let since = now - self.message.published_nanos;
+        let events = events(&self.message);
+        let is_due = since >= REPORT_PERIOD_NANOS
+            || (events != self.told_events && since >= EVENT_PERIOD_NANOS);
+        if !self.changed && !is_due {
             return;
         }
+        self.told_events = events;
         self.message.published_nanos = now;
         self.message.peak_rss_bytes = peak_rss_bytes().unwrap_or(0);
         self.take_rate(now);
@@ -317,9 +329,26 @@ impl Health {
     }
 }
 
+/// Events that are counted and are rare, all together: what must not be lost with a process that is killed.
+fn events(message: &HealthMessage) -> u64 {
+    let counts = [
+        message.dropped,
+        message.gaps,
+        message.refused,
+        message.disordered,
+        message.resized,
+        message.deadline_misses,
+        message.page_faults,
+    ];
+    counts.iter().fold(0, |sum, count| sum.wrapping_add(*count))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::wire::place::Place;
+    use crate::wire::port::{Access, Subscriber};
+    use crate::wire::topic::TRACKER_HEALTH;
 
     #[test]
     fn buckets_are_half_octaves() {
@@ -349,6 +378,21 @@ mod tests {
             "one latency is not below itself"
         );
         assert!(percentile_ms(&[u64::MAX; HISTOGRAM_BUCKETS], 0.5).is_some());
+    }
+
+    #[test]
+    fn a_rare_event_is_reported_before_the_next_second() {
+        let folder = tempfile::tempdir_in("/tmp").unwrap();
+        let place = Place::new("rig", folder.path().to_str().unwrap()).unwrap();
+        let hub = Hub::join(&place, "tracker", Access::Member).unwrap();
+        let heard: Subscriber<HealthMessage, ()> = hub.subscriber(&TRACKER_HEALTH).unwrap();
+        let mut health = Health::open(&hub, &TRACKER_HEALTH).unwrap();
+        while heard.receive().unwrap().is_some() {}
+        health.counters().deadline_misses += 1;
+        health.message.published_nanos = now_nanos() - 2 * EVENT_PERIOD_NANOS;
+        health.report();
+        let report = heard.receive().unwrap().map(|message| message.payload()[0]);
+        assert_eq!(report.map(|report| report.deadline_misses), Some(1));
     }
 
     #[test]

@@ -186,6 +186,8 @@ pub struct Mapper {
     active: Option<Active>,
     /// Where the active epoch's map lies in odometry's world: a similarity, since a correction may change units.
     world_from_map: Sim3,
+    /// Where odometry had the camera last; a tracker that has lost it, or was restarted, may not know.
+    last_world_from_camera: Option<SE3>,
     depth: DepthBuffers,
     start: Start,
     finder: Finder,
@@ -214,6 +216,7 @@ impl Mapper {
             phase: Phase::default(),
             active: None,
             world_from_map: Sim3::identity(),
+            last_world_from_camera: None,
             depth: DepthBuffers::with_size(width, height),
             start: Start::new(intrinsics, &params.two_frame)?,
             finder: Finder::new(&intrinsics),
@@ -290,6 +293,7 @@ impl Mapper {
         sensor_depth: Option<&Image<f32>>,
         change_begins: &mut dyn FnMut(),
     ) -> StepOutcome {
+        self.last_world_from_camera = Some(pose.world_from_camera);
         self.guess_unit(&pose.keyframe_from_camera);
         let observations = self.observe_frame(frame, pose);
         self.depth.unpublished += observations.fused + observations.created;
@@ -407,13 +411,12 @@ impl Mapper {
         self.depth.write_into(keyframe);
     }
 
-    /// Chooses where the map lies in the world so that a camera at `map_from_camera` is at `world_from_camera`:
-    /// odometry stands still. Exact poses are the world's own, and need no anchor.
-    fn anchor(&mut self, map_from_camera: &SE3, pose: &PoseEstimate) {
-        let is_exact = pose.alignment_covariance.iter().all(|entry| *entry == 0.0);
-        if !is_exact && pose.world_from_camera.is_finite() {
+    /// Chooses where the map lies in the world so that a camera at `map_from_camera` is where odometry had it last:
+    /// that stands still.
+    fn anchor(&mut self, map_from_camera: &SE3) {
+        if let Some(world_from_camera) = self.last_world_from_camera {
             self.world_from_map =
-                anchored(self.world_from_map.scale, map_from_camera, &pose.world_from_camera);
+                anchored(self.world_from_map.scale, map_from_camera, &world_from_camera);
         }
     }
 }

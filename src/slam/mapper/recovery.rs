@@ -179,7 +179,7 @@ impl Mapper {
             let searched = &mut loss.searched;
             let found = self.finder.find(keyframes, active.index, searched, frame.pixels, params);
             if let Some((index, keyframe_from_camera)) = found {
-                return self.restore_keyframe(index, &keyframe_from_camera, pose);
+                return self.restore_keyframe(index, &keyframe_from_camera);
             }
         }
         self.phase = self.phase.with_loss(loss);
@@ -206,12 +206,7 @@ impl Mapper {
 
     /// Makes an earlier keyframe active again, with the depth it was left with. The camera was found on it;
     /// odometry goes on from its last pose.
-    fn restore_keyframe(
-        &mut self,
-        index: usize,
-        keyframe_from_camera: &SE3,
-        pose: &PoseEstimate,
-    ) -> StepOutcome {
+    fn restore_keyframe(&mut self, index: usize, keyframe_from_camera: &SE3) -> StepOutcome {
         self.leave_keyframe();
         let Some(keyframe) = self.map.keyframes.get(index) else {
             return StepOutcome::default();
@@ -219,7 +214,7 @@ impl Mapper {
         self.depth.restart(&keyframe.image, &self.params);
         restore_points(&mut self.depth.active, &keyframe.points);
         let map_from_camera = keyframe.map_from_keyframe.place(keyframe_from_camera);
-        self.anchor(&map_from_camera, pose);
+        self.anchor(&map_from_camera);
         self.past.clear();
         self.phase = Phase::Mapping;
         self.enter_keyframe(index);

@@ -157,6 +157,7 @@ impl Mapper {
         self.active = None;
         self.phase = Phase::Mapping;
         self.world_from_map = Sim3::identity();
+        self.last_world_from_camera = None;
         self.past.clear();
         self.depth.restart(pixels, &self.params);
     }
