@@ -3,6 +3,7 @@
 #[allow(dead_code, reason = "every test uses its part of what they share")]
 #[path = "support/counting_allocator.rs"]
 mod counting_allocator;
+#[allow(dead_code, reason = "every test uses its part of what they share")]
 #[path = "support/waves.rs"]
 mod waves;
 

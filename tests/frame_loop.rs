@@ -12,7 +12,6 @@ use std::fs;
 use std::io::Write;
 use std::time::{Duration, Instant};
 
-use semidense::service::clock::now_nanos;
 use semidense::service::config::Config;
 use semidense::service::mode::Mode;
 use semidense::service::schedule::in_force;
@@ -32,7 +31,7 @@ use semidense::wire::port::{Access, Hub, Publisher, Subscriber, wait};
 use semidense::wire::topic::{FRAME, KEYFRAME, KEYFRAME_IMAGE, POSE, TRACKER_HEALTH};
 
 use counting_allocator::{allocations, count_here};
-use waves::{CAMERA, image, keyframe};
+use waves::{CAMERA, header, image, keyframe};
 
 /// Frames until everything has been touched.
 const WARM_UP: u64 = 150;
@@ -44,22 +43,6 @@ const PAUSE: Duration = Duration::from_millis(2);
 const UNLOCKED_PAGE_FAULTS: u64 = 20;
 /// Far above anything that is expected: it ends a test that hangs.
 const WATCH_DOG: Duration = Duration::from_secs(120);
-
-fn header(sequence: u64) -> FrameHeader {
-    let now = now_nanos();
-    FrameHeader {
-        sequence,
-        capture_nanos: now,
-        clock_nanos: now,
-        sent_nanos: now,
-        exposure_nanos: 0,
-        intrinsics: [CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy],
-        width: CAMERA.width as u32,
-        height: CAMERA.height as u32,
-        stride: CAMERA.width as u32,
-        gain: 0.0,
-    }
-}
 
 /// What stands for capture and mapper.
 struct Others {

@@ -7,7 +7,6 @@ mod waves;
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
-use semidense::service::clock::now_nanos;
 use semidense::service::config::Config;
 use semidense::service::mode::Mode;
 use semidense::service::shutdown::Shutdown;
@@ -18,28 +17,12 @@ use semidense::wire::place::Place;
 use semidense::wire::port::{Access, Hub, Subscriber};
 use semidense::wire::topic::{FRAME, KEYFRAME, KEYFRAME_IMAGE, TRACKER_HEALTH};
 
-use waves::{CAMERA, image, keyframe};
+use waves::{CAMERA, header, image, keyframe};
 
 /// Reports without any change of state that are waited for: one a second.
 const REPORTS: usize = 3;
 /// Far above anything that is expected: it ends a test that hangs.
 const PATIENCE: Duration = Duration::from_secs(60);
-
-fn header(sequence: u64) -> FrameHeader {
-    let now = now_nanos();
-    FrameHeader {
-        sequence,
-        capture_nanos: now,
-        clock_nanos: now,
-        sent_nanos: now,
-        exposure_nanos: 0,
-        intrinsics: [CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy],
-        width: CAMERA.width as u32,
-        height: CAMERA.height as u32,
-        stride: CAMERA.width as u32,
-        gain: 0.0,
-    }
-}
 
 /// Sends frames without a pause until somebody says that it is enough.
 fn flood(place: &Place, enough: &Receiver<()>) {

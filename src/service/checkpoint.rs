@@ -40,7 +40,7 @@ impl Kept {
             tracing::warn!("starting a new map: {error}");
             None
         });
-        let mut reservation = left.clone().unwrap_or_default();
+        let mut reservation = left.as_ref().map_or_else(Map::default, as_written);
         reservation.reserve_epochs();
         match Checkpoint::keep(path) {
             Ok(checkpoint) => {
@@ -182,6 +182,16 @@ fn write_until_stopped(path: &Path, shared: &Shared) {
             std::thread::park();
         }
     }
+}
+
+/// A checkpoint as it was in its file: the keyframes before the active one have files of their own.
+fn as_written(read: &Map) -> Map {
+    let is_active = |keyframe: &Keyframe| Some(keyframe.keyframe_id) == read.active;
+    let written = |keyframe: &Keyframe| match is_active(keyframe) {
+        true => keyframe.clone(),
+        false => keyframe.without_depth(),
+    };
+    Map { keyframes: read.keyframes.iter().map(written).collect(), ..*read }
 }
 
 /// Writes a keyframe into a file of its own; of more than are kept the oldest go.
@@ -335,6 +345,8 @@ mod tests {
             read.keyframes.iter().filter(|k| k.has_depth()).map(|k| k.keyframe_id).collect();
         let expected: Vec<u64> = (5..=LAST).filter(|id| ![7, 8].contains(id)).collect();
         assert_eq!(with_depth, expected);
+        let written = as_written(&read);
+        assert_eq!(written.keyframes.iter().filter(|k| k.has_depth()).count(), 1);
         assert_eq!((read.active, read.keyframes[20].image[0]), (Some(LAST), 20));
         assert_eq!(
             read.keyframes[10].map_from_keyframe, moved,

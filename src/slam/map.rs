@@ -226,6 +226,11 @@ impl Keyframe {
         !self.image.is_empty() && !self.points.is_empty()
     }
 
+    /// The same without image and points.
+    pub fn without_depth(&self) -> Self {
+        Self { image: Vec::new(), points: Vec::new(), ..*self }
+    }
+
     /// Share of its points that a camera sees; every so many are enough for a share.
     pub fn usage(&self, keyframe_from_camera: &SE3) -> f64 {
         const STRIDE: usize = 16;

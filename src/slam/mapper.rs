@@ -402,13 +402,19 @@ impl Mapper {
     /// Writes the active depth, the place in the world and the revisions into the active keyframe.
     fn publish_depth(&mut self) {
         self.revision += 1;
-        let (revision, map_revision) = (self.revision, self.map.revision);
-        let world_from_map = self.world_from_map;
+        self.publish_place();
         let Some(active) = &self.active else { return };
         let Some(keyframe) = self.map.keyframes.get_mut(active.index) else { return };
+        self.depth.write_into(keyframe);
+    }
+
+    /// Writes the place in the world and the revisions into the active keyframe.
+    fn publish_place(&mut self) {
+        let (revision, map_revision) = (self.revision, self.map.revision);
+        let world_from_map = self.world_from_map;
+        let Some(keyframe) = self.keyframe_mut() else { return };
         (keyframe.revision, keyframe.map_revision) = (revision, map_revision);
         keyframe.world_from_keyframe = world_from_map * keyframe.map_from_keyframe;
-        self.depth.write_into(keyframe);
     }
 
     /// Chooses where the map lies in the world so that a camera at `map_from_camera` is where odometry had it last:

@@ -1,12 +1,31 @@
 //! Smooth waves on a wall at depth 1: frames that can be tracked, and a keyframe of them.
 
+use semidense::service::clock::now_nanos;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::sim3::Sim3;
 use semidense::slam::keyframe::{DepthPoint, Keyframe, MapState};
+use semidense::wire::message::FrameHeader;
 
 /// What they are seen with.
 pub const CAMERA: Intrinsics =
     Intrinsics { fx: 260.0, fy: 260.0, cx: 159.5, cy: 119.5, width: 320, height: 240 };
+
+/// Of a frame that is sent now.
+pub fn header(sequence: u64) -> FrameHeader {
+    let now = now_nanos();
+    FrameHeader {
+        sequence,
+        capture_nanos: now,
+        clock_nanos: now,
+        sent_nanos: now,
+        exposure_nanos: 0,
+        intrinsics: [CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy],
+        width: CAMERA.width as u32,
+        height: CAMERA.height as u32,
+        stride: CAMERA.width as u32,
+        gain: 0.0,
+    }
+}
 
 /// The waves, shifted by `shift` pixels.
 pub fn image(shift: f64) -> Vec<u8> {

@@ -27,7 +27,7 @@ impl Mapper {
             // The active keyframe stays where odometry has it, in the unit that it has there.
             self.world_from_map = self.world_from_map * before * active.map_from_keyframe.inverse();
         }
-        self.publish_places();
+        self.publish_place();
         Ok(StepOutcome { keyframe_changed: true, graph_changed: true, ..finished })
     }
 
@@ -36,15 +36,5 @@ impl Mapper {
         let keyframe_id = self.keyframe()?.keyframe_id;
         let corrected = correction.keyframes.iter().find(|k| k.keyframe_id == keyframe_id);
         corrected.map(|corrected| corrected.depth)
-    }
-
-    /// Writes places and revisions into the active keyframe; its depth is corrected already.
-    fn publish_places(&mut self) {
-        let (revision, map_revision) = (self.revision, self.map.revision);
-        let world_from_map = self.world_from_map;
-        if let Some(keyframe) = self.keyframe_mut() {
-            (keyframe.revision, keyframe.map_revision) = (revision, map_revision);
-            keyframe.world_from_keyframe = world_from_map * keyframe.map_from_keyframe;
-        }
     }
 }

@@ -31,7 +31,7 @@ impl Mapper {
         let of_epoch = self.map.keyframes.iter().filter(|k| k.epoch == in_force.epoch);
         let keyframes = of_epoch.map(|keyframe| match std::ptr::eq(keyframe, in_force) {
             true => keyframe.clone(),
-            false => Keyframe { image: Vec::new(), points: Vec::new(), ..*keyframe },
+            false => keyframe.without_depth(),
         });
         let free_epoch = self.next_epoch().saturating_add(UNKNOWN_EPOCHS);
         let active = Some(in_force.keyframe_id);
