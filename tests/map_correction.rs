@@ -246,7 +246,7 @@ fn depth_is_corrected_where_it_is_observed_too() {
     let mut run = Run::new(footage);
     run.show_all(0..CORRECTED_AT);
     let before = run.mapper.map().clone();
-    let plane = LogPlane { offset: 0.05, per_x: 0.04, per_y: -0.03 };
+    let plane = LogPlane { offset: 0.4, per_x: 0.04, per_y: -0.03 };
     let active = run.mapper.keyframe().unwrap().keyframe_id;
     let mut correction = moved(&before, |place| *place);
     correction.keyframes.iter_mut().for_each(|corrected| corrected.depth = plane);
@@ -260,14 +260,18 @@ fn depth_is_corrected_where_it_is_observed_too() {
         }
     }
     let corrected = run.mapper.map().get(active).unwrap().clone();
-    run.show_all(CORRECTED_AT..CORRECTED_AT + 1);
-    // One frame changes depth by its own little, not back by the plane.
+    let published = (CORRECTED_AT..FRAMES).find(|&frame| {
+        run.show_all(frame..frame + 1);
+        run.mapper.map().get(active).unwrap().revision > corrected.revision
+    });
+    assert!(published.is_some(), "its depth is never published again");
+    // The frames change depth by their own little, not back by the plane.
     let observed = run.mapper.map().get(active).unwrap();
     let mean = |points: &[semidense::slam::keyframe::DepthPoint]| {
         points.iter().map(|p| f64::from(p.inverse_depth)).sum::<f64>() / points.len() as f64
     };
     let kept = mean(&observed.points) / mean(&corrected.points);
-    assert!((kept - 1.0).abs() < 0.02, "the depth went to {kept} of itself");
+    assert!((kept - 1.0).abs() < 0.1, "the depth went to {kept} of itself");
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("map.bin");
     write_map(&path, run.mapper.map(), &mut || ()).unwrap();
