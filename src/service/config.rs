@@ -1,11 +1,16 @@
 //! The configuration: every parameter struct under one roof, read once, checked once.
 //!
 //! Precedence: built-in < `semidense.toml` < `--set key=value`; a rig file is the camera's alone.
-//! Unknown keys are refused; an error names the place, the key, the value and what is allowed.
+//! Unknown keys are refused; an error names the place, the key, the value and what is allowed. A file has two
+//! parts, see `layout`: what a user may want to set, and `[expert]`.
 
+mod layout;
+
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
+use toml::de::DeTable;
 use toml::{Table, Value};
 
 use crate::capture::input_file;
@@ -26,7 +31,7 @@ const MAX_FILE_BYTES: u64 = 1 << 20;
 /// Read for every instance that has no file of its own.
 const COMMON_FILE: &str = "semidense.toml";
 
-/// Everything that can be set.
+/// Everything that can be set. In a file most of it stands below `[expert]`, see `layout`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
@@ -176,8 +181,7 @@ impl Config {
         if let Some(path) = file {
             let text = input_file::read_text(path, MAX_FILE_BYTES)
                 .map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
-            Self::from_text(&text, &path.display().to_string())?;
-            table = text.parse().unwrap_or_default();
+            (_, table) = Self::read(&text, &path.display().to_string())?;
             place_rig(&mut table, path);
         }
         let mut config = Self::from_table(&table, "the built-in configuration")?;
@@ -195,36 +199,55 @@ impl Config {
         SourceParams { simulator: self.simulator.clone(), camera: self.capture.camera.clone() }
     }
 
-    /// The configuration as TOML, every key.
+    /// The configuration as TOML, every key, in the two parts of the shipped file.
     pub fn to_text(&self) -> String {
-        // Every field is a plain value: nothing that TOML cannot say.
-        toml::to_string(self).unwrap_or_default()
+        // Every field is a plain value: nothing that TOML cannot say. As text, numbers keep their shortest form.
+        let flat = toml::to_string(self).unwrap_or_default().parse().unwrap_or_default();
+        toml::to_string(&layout::split(flat)).unwrap_or_default()
     }
 
     /// Reads the text of a configuration that came from `file`; what it does not name has its default.
     pub fn from_text(text: &str, file: &str) -> Result<Self, ConfigError> {
-        let config: Self = toml::from_str(text).map_err(|error| {
-            let before = error.span().and_then(|span| text.get(..span.start));
+        Self::read(text, file).map(|(config, _)| config)
+    }
+
+    /// The configuration of a text, and the keys that the text names, none of them below `[expert]`.
+    fn read(text: &str, file: &str) -> Result<(Self, Table), ConfigError> {
+        let syntax = |span: Option<Range<usize>>, message: &str| {
+            let before = span.as_ref().and_then(|span| text.get(..span.start));
             let line = before.map_or(1, |before| before.matches('\n').count() + 1);
-            ConfigError::Syntax { place: format!("{file}:{line}"), reason: one_line(&error, text) }
-        })?;
-        config
-            .validate()
-            .map_err(|source| ConfigError::Value { place: file.to_owned(), source })?;
-        Ok(config)
+            ConfigError::Syntax {
+                place: format!("{file}:{line}"),
+                reason: one_line(message, span, text),
+            }
+        };
+        let of_parser = |error: toml::de::Error| syntax(error.span(), error.message());
+        let mut root = DeTable::parse(text).map_err(of_parser)?;
+        layout::merge(root.get_mut()).map_err(|e| syntax(Some(e.span), &e.reason))?;
+        let config =
+            Self::deserialize(toml::Deserializer::from(root.clone())).map_err(of_parser)?;
+        config.check(file)?;
+        let table = Table::deserialize(toml::Deserializer::from(root)).map_err(of_parser)?;
+        Ok((config, table))
     }
 
     fn from_table(table: &Table, place: &str) -> Result<Self, ConfigError> {
         let config: Self = table.clone().try_into().map_err(|error: toml::de::Error| {
             let known = Table::try_from(Self::default()).unwrap_or_default();
             let unknown = unknown_key(table, &known, "");
-            let reason = unknown.unwrap_or_else(|| one_line(&error, ""));
+            let reason = unknown.unwrap_or_else(|| one_line(error.message(), None, ""));
             ConfigError::Syntax { place: place.to_owned(), reason }
         })?;
-        config
-            .validate()
-            .map_err(|source| ConfigError::Value { place: place.to_owned(), source })?;
+        config.check(place)?;
         Ok(config)
+    }
+
+    /// Checks every value; an error names `place` and the key as the shipped file lists it.
+    fn check(&self, place: &str) -> Result<(), ConfigError> {
+        self.validate().map_err(|source| {
+            let source = ParameterError { key: layout::listed(&source.key), ..source };
+            ConfigError::Value { place: place.to_owned(), source }
+        })
     }
 
     /// Checks every value.
@@ -304,12 +327,11 @@ fn without_types(message: &str) -> String {
 }
 
 /// The parser's message with the line it points at, on one line.
-fn one_line(error: &toml::de::Error, text: &str) -> String {
-    let message = error.message().split_whitespace().collect::<Vec<_>>().join(" ");
+fn one_line(message: &str, span: Option<Range<usize>>, text: &str) -> String {
+    let message = message.split_whitespace().collect::<Vec<_>>().join(" ");
     let message = without_types(&message);
-    let start = error.span().map(|span| span.start);
-    let line = start.and_then(|start| {
-        let begin = text.get(..start)?.rfind('\n').map_or(0, |newline| newline + 1);
+    let line = span.and_then(|span| {
+        let begin = text.get(..span.start)?.rfind('\n').map_or(0, |newline| newline + 1);
         text.get(begin..)?.lines().next()
     });
     match line.map(str::trim) {
@@ -346,7 +368,7 @@ fn apply(table: &mut Table, setting: &str) -> Result<(), String> {
         .ok()
         .and_then(|mut parsed| (parsed.len() == 1).then(|| parsed.remove("value"))?)
         .unwrap_or_else(|| Value::String(value.to_owned()));
-    let mut keys: Vec<&str> = path.split('.').map(str::trim).collect();
+    let mut keys: Vec<&str> = layout::plain(path.trim()).split('.').map(str::trim).collect();
     let last = keys.pop().filter(|key| !key.is_empty()).ok_or_else(|| form.to_owned())?;
     let mut table = table;
     for key in keys {

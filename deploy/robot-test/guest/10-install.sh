@@ -22,9 +22,9 @@ cat > /etc/semidense/robot.toml <<'CONFIG'
 [capture]
 source = "loop:100000:5:tum:/var/lib/robot-sim"
 # Fewer points and frames to choose between than usual: the start is what takes longest on an emulated CPU.
-[mapping.two_frame]
+[expert.mapping.two_frame]
 max_witnesses = 2
-[mapping.two_frame.candidates]
+[expert.mapping.two_frame.candidates]
 wanted = 400
 CONFIG
 # An emulated CPU on a busy machine may hold a process up for longer than a robot's watchdog allows.

@@ -39,6 +39,56 @@ fn the_shipped_file_lists_every_key_with_its_default() {
 }
 
 #[test]
+fn a_key_is_the_same_with_and_without_expert() {
+    let read = |text: &str| Config::from_text(text, "x.toml");
+    let expected = set(&["mapping.matching.line_noise_px=0.5"]).unwrap();
+    assert_eq!(expected.mapping.matching.line_noise_px, 0.5);
+    assert_eq!(set(&["expert.mapping.matching.line_noise_px=0.5"]).unwrap(), expected);
+    assert_eq!(read("[mapping.matching]\nline_noise_px = 0.5\n").unwrap(), expected);
+    assert_eq!(read("[expert.mapping.matching]\nline_noise_px = 0.5\n").unwrap(), expected);
+    // Tables may be spread over both parts, single keys may not.
+    let spread =
+        "[mapping]\ndepth_filter = \"both\"\n[expert.mapping.matching]\nline_noise_px = 0.5\n";
+    assert_eq!(read(spread).unwrap().mapping.matching, expected.mapping.matching);
+    let twice = "[mapping]\nmin_gradient = 4.0\n[expert.mapping]\nmin_gradient = 6.0\n";
+    let error = read(twice).unwrap_err().to_string();
+    let told = "x.toml:2: `min_gradient = 4.0`: `mapping.min_gradient` is also given as \
+                `expert.mapping.min_gradient`: keep one";
+    assert_eq!(error, told);
+    // What comes later wins, whichever way it is written.
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("x.toml");
+    std::fs::write(&path, "[expert.mapping]\nmin_gradient = 6.0\n").unwrap();
+    for setting in ["mapping.min_gradient=7.0", "expert.mapping.min_gradient=7.0"] {
+        let config = Config::load(Some(&path), &[setting.to_owned()]).unwrap();
+        assert_eq!(config.mapping.min_gradient, 7.0, "{setting}");
+    }
+    assert_eq!(Config::load(Some(&path), &[]).unwrap().mapping.min_gradient, 6.0);
+    // The configuration as text is read back as what it was.
+    assert_eq!(read(&expected.to_text()).unwrap(), expected);
+}
+
+#[test]
+fn errors_below_expert_name_line_and_listed_key() {
+    let error = |text: &str| Config::from_text(text, "x.toml").unwrap_err().to_string();
+    let told = error("[expert.tracking]\n\nmin_contrast = \"x\"\n");
+    assert!(told.starts_with("x.toml:3: `min_contrast = \"x\"`: invalid type"), "{told}");
+    let told = error("[expert.tracking]\nmin_contrast = -1.0\n");
+    assert!(told.starts_with("x.toml: expert.tracking.min_contrast = -1: must be"), "{told}");
+    let told = error("[tracker]\ndeadline_ms = 1.0\n[expert.tracker]\nmin_contrast = 1.0\n");
+    assert!(told.starts_with("x.toml:4: `min_contrast = 1.0`: unknown field"), "{told}");
+    let told = error("expert = 3\n");
+    assert!(told.starts_with("x.toml:1: `expert = 3`: expected keys below it"), "{told}");
+    assert!(
+        error("[expert.expert.mapping]\nmin_gradient = 6.0\n").contains("unknown field `expert`")
+    );
+    let told = set(&["expert.mapping.min_gradint=6.0"]).unwrap_err();
+    assert!(told.contains("unknown key `mapping.min_gradint`; keys of `mapping` are "), "{told}");
+    let told = set(&["tracking.min_contrast=-1.0"]).unwrap_err();
+    assert!(told.contains("expert.tracking.min_contrast = -1: must be"), "{told}");
+}
+
+#[test]
 fn later_words_win() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("semidense.toml");
@@ -110,4 +160,42 @@ fn bad_settings_are_refused() {
     assert!(set(&["instance.x=1"]).is_err());
     assert!(set(&["=1"]).is_err());
     assert!(set(&["mapper.threads=1\nx=2"]).is_err());
+}
+
+#[test]
+fn the_shipped_file_says_what_every_number_may_be() {
+    let text = include_str!("../../../config/semidense.toml");
+    let mut all = Vec::new();
+    keys(&text.parse().unwrap(), "", &mut all);
+    let mut checked = 0;
+    for (key, value) in all {
+        // Too large, too small: one of them is refused with what is allowed.
+        let wrong: &[&str] = match value {
+            Value::Float(_) => &["1e30", "-1e30"],
+            Value::Integer(_) => &["100000000", "255", "0"],
+            _ => continue,
+        };
+        let refused = wrong.iter().find_map(|wrong| {
+            let error = set(&[&format!("{key}={wrong}")]).err()?;
+            error.split_once(": must be ").map(|(_, allowed)| allowed.to_owned())
+        });
+        let Some(allowed) = refused else { continue };
+        let comment = comment_of(text, &key);
+        assert!(comment.contains(&allowed), "{key}: {allowed} is not in: {comment}");
+        checked += 1;
+    }
+    assert!(checked > 100, "{checked}");
+}
+
+/// The comment above a key of a file, on one line.
+fn comment_of(text: &str, key: &str) -> String {
+    let (table, name) = key.rsplit_once('.').unwrap_or(("", key));
+    let header = format!("[{table}]");
+    let lines: Vec<&str> = text.lines().collect();
+    let begin = lines.iter().position(|line| *line == header).unwrap_or(0);
+    let of_key = |line: &&str| line.strip_prefix(name).is_some_and(|rest| rest.starts_with(" = "));
+    let end = begin + lines[begin..].iter().position(of_key).unwrap();
+    let above = lines[..end].iter().rev().take_while(|line| line.starts_with('#'));
+    let words: Vec<&str> = above.map(|line| line.trim_start_matches("# ")).collect();
+    words.into_iter().rev().collect::<Vec<_>>().join(" ")
 }

@@ -1,0 +1,142 @@
+//! The two parts of a configuration file: keys that a user may want at the top, all others below `[expert]`.
+//!
+//! `expert.` belongs to the file, not to the program: a key is the same with and without it. A key that moves from one
+//! part to the other breaks no file and no script, and each algorithm keeps its parameters in one struct.
+
+use std::ops::Range;
+
+use toml::de::{DeTable, DeValue};
+use toml::{Table, Value};
+
+/// The table that holds what nobody has to set.
+const EXPERT: &str = "expert";
+
+/// Keys outside `[expert]`: what a camera, a robot, a recording or a first try may need.
+const USER_KEYS: [&str; 36] = [
+    "instance",
+    "root",
+    "capture.source",
+    "capture.rig",
+    "capture.strict",
+    "capture.scheduling.policy",
+    "capture.scheduling.priority",
+    "capture.scheduling.cpus",
+    "capture.scheduling.lock_memory",
+    "capture.camera.format",
+    "capture.camera.rate_hz",
+    "capture.camera.exposure_us",
+    "capture.camera.gain",
+    "capture.camera.white_balance_k",
+    "capture.camera.focus",
+    "tracker.deadline_ms",
+    "tracker.early_wake_us",
+    "tracker.stale_periods",
+    "tracker.scheduling.policy",
+    "tracker.scheduling.priority",
+    "tracker.scheduling.cpus",
+    "tracker.scheduling.lock_memory",
+    "mapper.threads",
+    "mapper.scheduling.policy",
+    "mapper.scheduling.priority",
+    "mapper.scheduling.cpus",
+    "mapper.scheduling.lock_memory",
+    "mapping.depth_filter",
+    "mapping.max_map_megabytes",
+    "supervisor.watchdog_s",
+    "results.max_relative_std_dev",
+    "results.alignment",
+    "simulator.scene",
+    "simulator.seed",
+    "simulator.frames",
+    "simulator.motion.mean_speed_m_s",
+];
+
+/// What is wrong with the two parts of a file.
+#[derive(Debug, PartialEq, Eq)]
+pub struct LayoutError {
+    /// What.
+    pub reason: String,
+    /// Bytes of the text that it is about.
+    pub span: Range<usize>,
+}
+
+/// The dotted `key` as the shipped file lists it.
+pub fn listed(key: &str) -> String {
+    if USER_KEYS.contains(&key) { key.to_owned() } else { format!("{EXPERT}.{key}") }
+}
+
+/// The dotted `key` without `expert.`.
+pub fn plain(key: &str) -> &str {
+    key.strip_prefix(EXPERT).and_then(|rest| rest.strip_prefix('.')).unwrap_or(key)
+}
+
+/// Moves what stands below `[expert]` to its place without it. A key that stands in both places is an error.
+pub fn merge(root: &mut DeTable) -> Result<(), LayoutError> {
+    let Some(expert) = root.remove(EXPERT) else { return Ok(()) };
+    let span = expert.span();
+    match expert.into_inner() {
+        DeValue::Table(expert) => merge_into(root, expert, ""),
+        _ => Err(LayoutError { reason: "expected keys below it".to_owned(), span }),
+    }
+}
+
+fn merge_into<'a>(
+    table: &mut DeTable<'a>,
+    from: DeTable<'a>,
+    prefix: &str,
+) -> Result<(), LayoutError> {
+    for (key, value) in from {
+        let path = format!("{prefix}{}", key.get_ref());
+        let Some(there) = table.get_mut(&key) else {
+            table.insert(key, value);
+            continue;
+        };
+        let span = there.span();
+        match (there.get_mut(), value.into_inner()) {
+            (DeValue::Table(there), DeValue::Table(inner)) => {
+                merge_into(there, inner, &format!("{path}."))?;
+            }
+            _ => {
+                let reason = format!("`{path}` is also given as `{EXPERT}.{path}`: keep one");
+                return Err(LayoutError { reason, span });
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The `flat` table of all keys in two parts, as in the shipped file.
+pub fn split(flat: Table) -> Table {
+    let mut expert = Table::new();
+    let mut user = split_table(flat, "", &mut expert);
+    user.insert(EXPERT.to_owned(), Value::Table(expert));
+    user
+}
+
+/// Takes the keys of `table` that are not a user's into `expert`, and gives what is left.
+fn split_table(table: Table, prefix: &str, expert: &mut Table) -> Table {
+    let mut user = Table::new();
+    for (key, value) in table {
+        let path = format!("{prefix}{key}");
+        match value {
+            Value::Table(inner) => {
+                let mut below = Table::new();
+                let kept = split_table(inner, &format!("{path}."), &mut below);
+                let put = |table: &mut Table, inner: Table| {
+                    if !inner.is_empty() {
+                        table.insert(key.clone(), Value::Table(inner));
+                    }
+                };
+                put(&mut user, kept);
+                put(expert, below);
+            }
+            value if USER_KEYS.contains(&path.as_str()) => {
+                user.insert(key, value);
+            }
+            value => {
+                expert.insert(key, value);
+            }
+        }
+    }
+    user
+}
