@@ -89,7 +89,7 @@ pub struct TrajectoryEvaluation {
     pub rpe_rotation_deg_1s: Option<ErrorStatistics>,
     /// Length of the way between the matched ground-truth positions.
     pub path_length: f64,
-    /// Scale of each window of 100 matches, by the index of its first match.
+    /// Scale of each window of 100 matches up to the last match, by the index of its first match.
     pub window_scales: Vec<(usize, f64)>,
     /// Largest over smallest of [`Self::window_scales`]; `None` below two windows.
     pub window_scale_ratio: Option<f64>,

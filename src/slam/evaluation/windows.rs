@@ -11,14 +11,24 @@ pub const SCALE_WINDOW: usize = 100;
 /// Matches of a window whose shape is measured: 1 s at 30 Hz, too short for drift to show.
 pub const SHAPE_WINDOW: usize = 30;
 
-/// Index of the first match and Sim(3) scale of each whole window of [`SCALE_WINDOW`] consecutive
-/// matches; windows that stand still have no scale and are left out.
+/// First matches of consecutive windows of `length` among `count` matches. Where they leave a rest one more ends
+/// at the last match, so that the end of a run counts: it has matches in common with the one before, as a shorter
+/// one would say less.
+fn starts(count: usize, length: usize) -> impl Iterator<Item = usize> {
+    let whole = (0..count / length).map(move |i| i * length);
+    let has_rest = count > length && !count.is_multiple_of(length);
+    whole.chain(has_rest.then(|| count - length))
+}
+
+/// Index of the first match and Sim(3) scale of windows of [`SCALE_WINDOW`] matches up to the last one; windows that
+/// stand still have no scale and are left out.
 pub fn scale_windows(estimate: &[StampedPose], truth: &[StampedPose]) -> Vec<(usize, f64)> {
-    let windows = estimate.chunks_exact(SCALE_WINDOW).zip(truth.chunks_exact(SCALE_WINDOW));
-    let scale = |(i, (e, t)): (usize, (&[StampedPose], &[StampedPose]))| {
-        umeyama(e, t, Alignment::Sim3).ok().map(|fit| (i * SCALE_WINDOW, fit.scale))
+    let scale = |first: usize| {
+        let window = first..first + SCALE_WINDOW;
+        let (e, t) = (estimate.get(window.clone())?, truth.get(window)?);
+        umeyama(e, t, Alignment::Sim3).ok().map(|fit| (first, fit.scale))
     };
-    windows.enumerate().filter_map(scale).collect()
+    starts(estimate.len(), SCALE_WINDOW).filter_map(scale).collect()
 }
 
 /// Largest over smallest scale; `None` below two windows.
@@ -30,15 +40,72 @@ pub fn scale_ratio(window_scales: &[(usize, f64)]) -> Option<f64> {
     Some(scales.clone().fold(0.0, f64::max) / scales.fold(f64::INFINITY, f64::min))
 }
 
-/// Median position error over all whole windows of [`SHAPE_WINDOW`] consecutive matches, each
-/// aligned by itself; `None` where there is no window that can be aligned.
+/// Median position error over windows of [`SHAPE_WINDOW`] matches, each aligned by itself; `None` where there is no window that can be aligned.
 pub fn window_error(
     estimate: &[StampedPose],
     truth: &[StampedPose],
     alignment: Alignment,
 ) -> Option<f64> {
-    let windows = estimate.chunks_exact(SHAPE_WINDOW).zip(truth.chunks_exact(SHAPE_WINDOW));
-    let errors = windows
-        .filter_map(|(e, t)| umeyama(e, t, alignment).ok().map(|fit| absolute_errors(e, t, &fit)));
-    median(&errors.flatten().collect::<Vec<_>>())
+    median(&shape_errors(estimate, truth, alignment))
+}
+
+/// Position errors in windows of [`SHAPE_WINDOW`] matches up to the last one, each window aligned by itself and each
+/// match counted once.
+fn shape_errors(estimate: &[StampedPose], truth: &[StampedPose], alignment: Alignment) -> Vec<f64> {
+    let mut errors = Vec::with_capacity(estimate.len());
+    let mut counted = 0;
+    for first in starts(estimate.len(), SHAPE_WINDOW) {
+        let window = first..first + SHAPE_WINDOW;
+        let Some((e, t)) = estimate.get(window.clone()).zip(truth.get(window.clone())) else {
+            break;
+        };
+        if let Ok(fit) = umeyama(e, t, alignment) {
+            errors.extend(absolute_errors(e, t, &fit).into_iter().skip(counted - first));
+        }
+        counted = window.end;
+    }
+    errors
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::geometry::se3::SE3;
+
+    /// A walk on a spiral, `scaled` from match to match.
+    fn walk(count: usize, scaled: impl Fn(usize) -> f64) -> (Vec<StampedPose>, Vec<StampedPose>) {
+        let at = |i: usize, scale: f64| {
+            let t = i as f64 * 0.1;
+            let mut world_from_camera = SE3::identity();
+            world_from_camera.translation = [t.cos(), t.sin(), 0.1 * t].into();
+            world_from_camera.translation *= scale;
+            StampedPose { nanos: i as i64, world_from_camera }
+        };
+        (0..count).map(|i| (at(i, scaled(i)), at(i, 1.0))).unzip()
+    }
+
+    #[test]
+    fn the_end_of_a_run_that_fills_no_window_counts() {
+        assert_eq!(starts(250, 100).collect::<Vec<_>>(), [0, 100, 150]);
+        assert_eq!(starts(200, 100).collect::<Vec<_>>(), [0, 100]);
+        assert_eq!(starts(99, 100).count(), 0);
+        // The scale doubles in the last 50 of 250 matches: whole windows alone say 1.
+        let (estimate, truth) = walk(250, |i| if i < 200 { 1.0 } else { 2.0 });
+        let ratio = scale_ratio(&scale_windows(&estimate, &truth)).unwrap();
+        assert!(ratio > 1.2, "{ratio}");
+        // Two windows need more matches than one.
+        let (estimate, truth) = walk(100, |_| 1.0);
+        assert_eq!(scale_ratio(&scale_windows(&estimate, &truth)), None);
+    }
+
+    #[test]
+    fn every_match_counts_once_in_the_shape() {
+        // The last 10 of 40 matches are off, which only a window up to the end can show.
+        let off = |i: usize| if i < 30 { 1.0 } else { 1.0 + 0.1 * (i % 2) as f64 };
+        let (estimate, truth) = walk(40, off);
+        let errors = shape_errors(&estimate, &truth, Alignment::Sim3);
+        assert_eq!(errors.len(), 40);
+        assert!(errors[..30].iter().all(|error| *error < 1e-9), "{errors:?}");
+        assert!(errors[30..].iter().all(|error| *error > 1e-4), "{errors:?}");
+    }
 }

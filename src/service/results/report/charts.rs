@@ -170,12 +170,16 @@ pub fn scale_over_time(input: &ReportInput<'_>) -> Option<Chart> {
     }
     let pairs = &evaluation.association.pairs;
     let time = |i: usize| pairs.get(i).map(|p| secs(input.record, input.trajectory[p.0].nanos));
+    // The last window may have matches in common with the one before.
+    let mut drawn = 0;
     let points: Vec<[f64; 2]> = evaluation
         .window_scales
         .iter()
         .flat_map(|&(i, scale)| {
             let ratio = scale / evaluation.alignment.scale;
-            [(i, ratio), (i + SCALE_WINDOW - 1, ratio)]
+            let from = i.max(drawn);
+            drawn = i + SCALE_WINDOW;
+            [(from, ratio), (drawn - 1, ratio)]
         })
         .filter_map(|(i, ratio)| time(i).map(|t| [t, ratio]))
         .collect();
