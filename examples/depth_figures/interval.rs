@@ -108,7 +108,7 @@ const ROWS: usize = 2;
 fn stories(sequence: &Sequence, params: &IntervalParams) -> Vec<Story> {
     let (width, height) = (sequence.keyframe.width(), sequence.keyframe.height());
     let mut candidates = Vec::new();
-    let wanted = CandidateParams { wanted: 600, ..CandidateParams::default() };
+    let wanted = CandidateParams { wanted: 600 };
     CandidateSelector::default().choose(&sequence.keyframe, &wanted, &mut candidates);
     let mut best: [Option<Story>; COLUMNS * ROWS] = [const { None }; COLUMNS * ROWS];
     for candidate in candidates {

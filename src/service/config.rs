@@ -224,30 +224,33 @@ impl Config {
         let of_parser = |error: toml::de::Error| syntax(error.span(), error.message());
         let mut root = DeTable::parse(text).map_err(of_parser)?;
         layout::merge(root.get_mut()).map_err(|e| syntax(Some(e.span), &e.reason))?;
-        let config =
+        let mut config =
             Self::deserialize(toml::Deserializer::from(root.clone())).map_err(of_parser)?;
-        config.check(file)?;
+        config.complete(file)?;
         let table = Table::deserialize(toml::Deserializer::from(root)).map_err(of_parser)?;
         Ok((config, table))
     }
 
     fn from_table(table: &Table, place: &str) -> Result<Self, ConfigError> {
-        let config: Self = table.clone().try_into().map_err(|error: toml::de::Error| {
+        let mut config: Self = table.clone().try_into().map_err(|error: toml::de::Error| {
             let known = Table::try_from(Self::default()).unwrap_or_default();
             let unknown = unknown_key(table, &known, "");
             let reason = unknown.unwrap_or_else(|| one_line(error.message(), None, ""));
             ConfigError::Syntax { place: place.to_owned(), reason }
         })?;
-        config.check(place)?;
+        config.complete(place)?;
         Ok(config)
     }
 
-    /// Checks every value; an error names `place` and the key as the shipped file lists it.
-    fn check(&self, place: &str) -> Result<(), ConfigError> {
+    /// Checks every value, where an error names `place` and the key as the shipped file lists it, and gives the
+    /// mapper what it shares with the tracker.
+    fn complete(&mut self, place: &str) -> Result<(), ConfigError> {
         self.validate().map_err(|source| {
             let source = ParameterError { key: layout::listed(&source.key), ..source };
             ConfigError::Value { place: place.to_owned(), source }
-        })
+        })?;
+        self.mapping.reuse.distance = self.tracking.keyframe_distance();
+        Ok(())
     }
 
     /// Checks every value.

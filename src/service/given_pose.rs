@@ -74,8 +74,7 @@ struct View {
     proposes_keyframe: bool,
 }
 
-/// The choice of a keyframe: `(w_d ‖t‖ d̄)² + (w_u (1 − usage))² > 1` (Engel, Schöps, Cremers 2014,
-/// §3.2, with the share of points out of view).
+/// What a tracker would find out about the view.
 fn view_of(keyframe: &Keyframe, keyframe_from_camera: &SE3, tracker: &TrackerParams) -> View {
     let k = keyframe.intrinsics;
     let camera_from_keyframe = keyframe_from_camera.inverse();
@@ -99,10 +98,8 @@ fn view_of(keyframe: &Keyframe, keyframe_from_camera: &SE3, tracker: &TrackerPar
     }
     let points = keyframe.points.len().max(1) as f64;
     let in_view_ratio = f64::from(in_view) / points;
-    let distance =
-        tracker.keyframe_distance_weight * keyframe_from_camera.translation.norm() * inverse_depths
-            / points;
-    let unused = tracker.keyframe_usage_weight * (1.0 - in_view_ratio);
+    let translation = keyframe_from_camera.translation.norm() * inverse_depths / points;
+    let distance = tracker.keyframe_distance().distance(translation, in_view_ratio);
     View {
         quality: Quality {
             in_view_ratio,
@@ -112,7 +109,7 @@ fn view_of(keyframe: &Keyframe, keyframe_from_camera: &SE3, tracker: &TrackerPar
             mean_squared_flow: squared_flow / f64::from(in_view.max(1)),
             ..Quality::default()
         },
-        proposes_keyframe: distance.powi(2) + unused.powi(2) > 1.0,
+        proposes_keyframe: distance > 1.0,
     }
 }
 
@@ -121,7 +118,7 @@ mod tests {
     use super::*;
     use crate::slam::geometry::intrinsics::Intrinsics;
     use crate::slam::geometry::sim3::Sim3;
-    use crate::slam::keyframe::{DepthPoint, MapState};
+    use crate::slam::keyframe::DepthPoint;
 
     fn at(nanos: i64, x: f64) -> StampedPose {
         let mut world_from_camera = SE3::identity();
@@ -140,24 +137,13 @@ mod tests {
         });
         Keyframe {
             keyframe_id: 4,
-            epoch: 0,
             revision: 9,
-            sequence: 0,
-            capture_nanos: 0,
-            map_state: MapState::Established,
-            world_from_keyframe: Sim3::new(SE3::identity(), 2.0),
-            map_from_keyframe: Sim3::new(SE3::identity(), 2.0),
-            map_revision: 0,
-            intrinsics: Intrinsics {
-                fx: 100.0,
-                fy: 100.0,
-                cx: 49.5,
-                cy: 49.5,
-                width: 100,
-                height: 100,
-            },
-            image: vec![0; 10_000],
-            points: points.collect(),
+            ..Keyframe::at(
+                Sim3::new(SE3::identity(), 2.0),
+                Intrinsics::pinhole(100, 100, 100.0),
+                points.collect(),
+                vec![0; 10_000],
+            )
         }
     }
 

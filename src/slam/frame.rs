@@ -1,5 +1,7 @@
 //! A frame as the algorithms see it: one rectified grey image with its stamp and sequence.
 
+use crate::slam::geometry::intrinsics::Intrinsics;
+
 /// A borrowed rectified grey image, whether it lies in shared memory or in a buffer.
 #[derive(Debug, Clone, Copy)]
 pub struct FrameView<'a> {
@@ -17,7 +19,13 @@ pub struct FrameView<'a> {
     pub pixels: &'a [u8],
 }
 
-impl FrameView<'_> {
+impl<'a> FrameView<'a> {
+    /// A frame of this camera, of unknown exposure.
+    pub fn new(camera: &Intrinsics, sequence: u64, capture_nanos: i64, pixels: &'a [u8]) -> Self {
+        let Intrinsics { width, height, .. } = *camera;
+        Self { sequence, capture_nanos, exposure_nanos: 0, width, height, pixels }
+    }
+
     /// Whether the pixels are as many as the size says.
     pub fn is_consistent(&self) -> bool {
         self.width.checked_mul(self.height) == Some(self.pixels.len())

@@ -27,6 +27,37 @@ pub const fn most_keyframe_bytes(num_pixels: usize) -> usize {
     num_pixels + MAX_KEYFRAME_POINTS * size_of::<DepthPoint>()
 }
 
+/// What counts in the distance of a camera from a keyframe (Engel, Schöps, Cremers 2014, §3.4, with the share of
+/// points in view).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct DistanceWeights {
+    /// w_d: a translation of 1/w_d of the mean depth alone is a distance of 1.
+    pub translation: f64,
+    /// w_u: 1/w_u of the points out of view alone is a distance of 1.
+    pub usage: f64,
+}
+
+impl Default for DistanceWeights {
+    fn default() -> Self {
+        Self { translation: 3.0, usage: 4.0 }
+    }
+}
+
+impl DistanceWeights {
+    /// `(w_d ‖t‖ d̄)² + (w_u (1 − usage))²` of a camera `translation` mean depths away that sees a share `usage` of
+    /// the keyframe's points. Beyond 1 a new keyframe is asked for.
+    pub fn distance(&self, translation: f64, usage: f64) -> f64 {
+        let from_translation = self.translation * translation;
+        let from_usage = self.usage * (1.0 - usage);
+        from_translation * from_translation + from_usage * from_usage
+    }
+
+    /// The translation, in mean depths, that alone is a `distance`: nothing further away is nearer than that.
+    pub fn reach(&self, distance: f64) -> f64 {
+        distance.sqrt() / self.translation.max(f64::MIN_POSITIVE)
+    }
+}
+
 /// Whether the map behind a keyframe can be trusted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MapState {
@@ -65,6 +96,31 @@ pub struct Keyframe {
     pub points: Vec<DepthPoint>,
 }
 
+impl Keyframe {
+    /// A keyframe at `place`, with its unit, in map and odometry; its numbers and stamps are 0.
+    pub fn at(
+        place: Sim3,
+        intrinsics: Intrinsics,
+        points: Vec<DepthPoint>,
+        image: Vec<u8>,
+    ) -> Self {
+        Self {
+            keyframe_id: 0,
+            epoch: 0,
+            revision: 0,
+            sequence: 0,
+            capture_nanos: 0,
+            map_state: MapState::Established,
+            world_from_keyframe: place,
+            map_from_keyframe: place,
+            map_revision: 0,
+            intrinsics,
+            image,
+            points,
+        }
+    }
+}
+
 /// The pose of one keyframe in the map.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct KeyframePose {
@@ -81,5 +137,20 @@ impl KeyframePose {
     pub fn of(keyframe: &Keyframe) -> Self {
         let Keyframe { keyframe_id, revision, map_from_keyframe, .. } = *keyframe;
         Self { keyframe_id, revision, map_from_keyframe }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::DistanceWeights;
+
+    #[test]
+    fn each_weight_is_what_its_share_of_the_limit_says() {
+        let weights = DistanceWeights { translation: 2.0, usage: 4.0 };
+        assert_eq!(weights.distance(0.5, 1.0), 1.0);
+        assert_eq!(weights.distance(0.0, 0.75), 1.0);
+        assert_eq!(weights.distance(0.25, 0.875), 0.5);
+        assert_eq!(weights.reach(1.0), 0.5);
+        assert_eq!(weights.distance(weights.reach(0.5), 1.0), 0.5);
     }
 }

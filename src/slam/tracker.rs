@@ -12,7 +12,7 @@ use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::sums::{SumPyramid, grey_per_sum};
-use crate::slam::keyframe::MapState;
+use crate::slam::keyframe::{DistanceWeights, MapState};
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::{
     Brightness, LostReason, NO_KEYFRAME, PoseEstimate, Quality, TrackingState,
@@ -62,13 +62,21 @@ impl Default for TrackerParams {
             hypothesis_rotation_deg: 3.0,
             recovery_rotation_deg: 6.0,
             min_contrast: 2.0,
-            keyframe_distance_weight: 3.0,
-            keyframe_usage_weight: 4.0,
+            keyframe_distance_weight: DistanceWeights::default().translation,
+            keyframe_usage_weight: DistanceWeights::default().usage,
         }
     }
 }
 
 impl TrackerParams {
+    /// The weights of the distance at which a keyframe is asked for.
+    pub fn keyframe_distance(&self) -> DistanceWeights {
+        DistanceWeights {
+            translation: self.keyframe_distance_weight,
+            usage: self.keyframe_usage_weight,
+        }
+    }
+
     /// Checks every value.
     pub fn validate(&self) -> Result<(), ParameterError> {
         self.reference.validate().map_err(|error| error.within("reference"))?;
@@ -431,7 +439,7 @@ impl Tracker {
         }
     }
 
-    /// The weighted distance of a keyframe (LSD14 §3.4): (w_d ‖t‖ d̄)² + (w_u (1 − usage))² > 1.
+    /// Whether the camera is so far from the keyframe that a new one is due.
     fn proposes_keyframe(
         &self,
         reference: &Reference,
@@ -439,10 +447,8 @@ impl Tracker {
         quality: &Quality,
     ) -> bool {
         let translation = alignment.state.current_from_keyframe.translation.norm();
-        let distance = translation * reference.mean_inverse_depth();
-        let from_distance = self.params.keyframe_distance_weight * distance;
-        let from_usage = self.params.keyframe_usage_weight * (1.0 - quality.in_view_ratio);
-        from_distance * from_distance + from_usage * from_usage > 1.0
+        let in_mean_depths = translation * reference.mean_inverse_depth();
+        self.params.keyframe_distance().distance(in_mean_depths, quality.in_view_ratio) > 1.0
     }
 }
 

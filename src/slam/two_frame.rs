@@ -66,7 +66,7 @@ pub struct TwoFrameParams {
 impl Default for TwoFrameParams {
     fn default() -> Self {
         Self {
-            candidates: CandidateParams { wanted: 1500, ..CandidateParams::default() },
+            candidates: CandidateParams { wanted: 1500 },
             fit: FitParams::default(),
             evidence: EvidenceParams::default(),
             min_points: 200,

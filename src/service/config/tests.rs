@@ -1,6 +1,7 @@
 //! The configuration against its shipped file, and what is wrong said in one line.
 
 use super::*;
+use crate::slam::keyframe::DistanceWeights;
 
 fn set(settings: &[&str]) -> Result<Config, String> {
     let settings: Vec<String> = settings.iter().map(|s| (*s).to_owned()).collect();
@@ -86,6 +87,16 @@ fn errors_below_expert_name_line_and_listed_key() {
     assert!(told.contains("unknown key `mapping.min_gradint`; keys of `mapping` are "), "{told}");
     let told = set(&["tracking.min_contrast=-1.0"]).unwrap_err();
     assert!(told.contains("expert.tracking.min_contrast = -1: must be"), "{told}");
+}
+
+#[test]
+fn tracker_and_mapper_agree_on_how_far_a_keyframe_is() {
+    let mut expected = DistanceWeights::default();
+    assert_eq!(Config::default().mapping.reuse.distance, expected);
+    expected.translation = 2.0;
+    let config = set(&["tracking.keyframe_distance_weight=2.0"]).unwrap();
+    assert_eq!(config.mapping.reuse.distance, expected);
+    assert_eq!(Config::from_text(&config.to_text(), "x.toml").unwrap(), config);
 }
 
 #[test]

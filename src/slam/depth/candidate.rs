@@ -12,26 +12,24 @@ use crate::slam::parameter::{ParameterError, check_range};
 pub struct CandidateParams {
     /// Pixels wanted. The choice stays within a tenth above it; less where texture is missing.
     pub wanted: usize,
-    /// Side of the regions that have their own threshold, pixels: large against texture, small
-    /// against the image.
-    pub region_px: usize,
-    /// How far a gradient must rise above the median of its region, grey levels a pixel. The noise of
-    /// a camera, 3 grey levels, gives a gradient of 2.
-    pub threshold_offset: f32,
 }
+
+/// Side of the regions that have their own threshold, pixels: large against texture, small against the image.
+const REGION_PX: usize = 32;
+/// How far a gradient must rise above the median of its region, grey levels a pixel. The noise of a camera, 3 grey
+/// levels, gives a gradient of 2.
+const THRESHOLD_OFFSET: f32 = 4.0;
 
 impl Default for CandidateParams {
     fn default() -> Self {
-        Self { wanted: 2000, region_px: 32, threshold_offset: 4.0 }
+        Self { wanted: 2000 }
     }
 }
 
 impl CandidateParams {
     /// Checks every value.
     pub fn validate(&self) -> Result<(), ParameterError> {
-        check_range("wanted", self.wanted, 10..=100_000)?;
-        check_range("region_px", self.region_px, 8..=256)?;
-        check_range("threshold_offset", self.threshold_offset, 0.5..=100.0)
+        check_range("wanted", self.wanted, 10..=100_000)
     }
 }
 
@@ -50,8 +48,7 @@ pub struct CandidateSelector {
     squared_gradient: Vec<f32>,
     thresholds: Vec<f32>,
     smoothed_thresholds: Vec<f32>,
-    /// Side of a region in pixels, and regions a row.
-    side: usize,
+    /// Regions a row.
     columns: usize,
 }
 
@@ -78,7 +75,7 @@ impl CandidateSelector {
         if width <= 2 * BORDER_PX || height <= 2 * BORDER_PX {
             return;
         }
-        self.measure(image, params);
+        self.measure(image);
         let wanted = params.wanted.max(1) as f64;
         let mut block = ((width * height) as f64 / wanted).sqrt().max(1.0);
         for _ in 0..MAX_ROUNDS {
@@ -95,22 +92,21 @@ impl CandidateSelector {
 
     /// Squared gradients, and the threshold of each region: its median gradient plus the offset,
     /// averaged with the neighbouring regions.
-    fn measure(&mut self, image: &GradientImage, params: &CandidateParams) {
+    fn measure(&mut self, image: &GradientImage) {
         let (width, height) = (image.width(), image.height());
         let gradients = image.gradient_u.pixels().iter().zip(image.gradient_v.pixels());
         self.squared_gradient.clear();
         self.squared_gradient.extend(gradients.map(|(gu, gv)| gu * gu + gv * gv));
-        let side = params.region_px.max(1);
-        self.side = side;
-        self.columns = width.div_ceil(side);
-        let rows = height.div_ceil(side);
+        self.columns = width.div_ceil(REGION_PX);
+        let rows = height.div_ceil(REGION_PX);
         self.thresholds.clear();
         for region in 0..rows * self.columns {
-            let (left, top) = (region % self.columns * side, region / self.columns * side);
+            let (left, top) =
+                (region % self.columns * REGION_PX, region / self.columns * REGION_PX);
             let mut histogram = [0u32; 256];
             let mut count = 0;
-            for v in top..(top + side).min(height) {
-                let row = v * width + left..v * width + (left + side).min(width);
+            for v in top..(top + REGION_PX).min(height) {
+                let row = v * width + left..v * width + (left + REGION_PX).min(width);
                 for squared in &self.squared_gradient[row] {
                     histogram[(squared.sqrt() as usize).min(255)] += 1;
                     count += 1;
@@ -121,7 +117,7 @@ impl CandidateSelector {
                 below += n;
                 2 * below >= count
             });
-            self.thresholds.push(median.unwrap_or(0) as f32 + params.threshold_offset);
+            self.thresholds.push(median.unwrap_or(0) as f32 + THRESHOLD_OFFSET);
         }
         self.smoothed_thresholds.clear();
         for region in 0..rows * self.columns {
@@ -193,7 +189,7 @@ impl CandidateSelector {
     }
 
     fn threshold(&self, u: usize, v: usize) -> f32 {
-        self.smoothed_thresholds[v / self.side * self.columns + u / self.side]
+        self.smoothed_thresholds[v / REGION_PX * self.columns + u / REGION_PX]
     }
 }
 
@@ -219,7 +215,7 @@ mod tests {
         let mut image = GradientImage::with_size(CAMERA.width, CAMERA.height);
         image.fill(pixels);
         let mut chosen = Vec::new();
-        let params = CandidateParams { wanted, ..CandidateParams::default() };
+        let params = CandidateParams { wanted };
         CandidateSelector::default().choose(&image, &params, &mut chosen);
         chosen
     }

@@ -271,8 +271,7 @@ mod tests {
 
     use super::*;
 
-    const CAMERA: Intrinsics =
-        Intrinsics { fx: 120.0, fy: 120.0, cx: 79.5, cy: 59.5, width: 160, height: 120 };
+    const CAMERA: Intrinsics = Intrinsics::pinhole(160, 120, 120.0);
 
     fn textured() -> Vec<u8> {
         (0..CAMERA.width * CAMERA.height)

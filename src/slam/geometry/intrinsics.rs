@@ -21,6 +21,12 @@ pub struct Intrinsics {
 }
 
 impl Intrinsics {
+    /// Of a camera with square pixels whose optical axis meets the middle of its image.
+    pub const fn pinhole(width: usize, height: usize, focal_px: f64) -> Self {
+        let (cx, cy) = (0.5 * (width as f64 - 1.0), 0.5 * (height as f64 - 1.0));
+        Self { fx: focal_px, fy: focal_px, cx, cy, width, height }
+    }
+
     /// The intrinsics of pyramid level `level`: sizes halve and truncate, `c_l = (c_0 + ½)/2^l − ½`.
     pub fn at_level(&self, level: usize) -> Self {
         let factor = f64::powi(0.5, level as i32);

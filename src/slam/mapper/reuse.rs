@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use crate::slam::depth::propagation::propagate;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
-use crate::slam::keyframe::MapState;
+use crate::slam::keyframe::{DistanceWeights, MapState};
 use crate::slam::mapper::Mapper;
 use crate::slam::mapper::recovery::restore_points;
 use crate::slam::parameter::{ParameterError, check_range};
@@ -17,13 +17,12 @@ use crate::slam::pose::{Brightness, PoseEstimate};
 #[serde(deny_unknown_fields, default)]
 pub struct ReuseParams {
     /// Largest distance of the camera from a keyframe that is taken up again, where the tracker asks
-    /// for a new one at 1: `(w_d ‖t‖ d̄)² + (w_u (1 − usage))²` (LSD14 §3.4). Half of it leaves as much
-    /// to go before the next change; 0 makes a new keyframe every time.
+    /// for a new one at 1. Half of it leaves as much to go before the next change; 0 makes a new keyframe
+    /// every time.
     pub max_distance: f64,
-    /// w_d of that distance.
-    pub distance_weight: f64,
-    /// w_u of that distance: usage is the share of the keyframe's points that the camera sees.
-    pub usage_weight: f64,
+    /// The tracker's weights of that distance, which whoever has the configuration of both passes on.
+    #[serde(skip)]
+    pub distance: DistanceWeights,
     /// How far the pose measured on the keyframe may be from the one expected, translation in mean
     /// depths plus rotation in radians: 0.02 is 10 px at f = 525. Beyond it the map has drifted, and
     /// taking the keyframe up would make the poses jump.
@@ -32,7 +31,7 @@ pub struct ReuseParams {
 
 impl Default for ReuseParams {
     fn default() -> Self {
-        Self { max_distance: 0.5, distance_weight: 3.0, usage_weight: 4.0, max_disagreement: 0.02 }
+        Self { max_distance: 0.5, distance: DistanceWeights::default(), max_disagreement: 0.02 }
     }
 }
 
@@ -40,8 +39,6 @@ impl ReuseParams {
     /// Checks every value.
     pub fn validate(&self) -> Result<(), ParameterError> {
         check_range("max_distance", self.max_distance, 0.0..=1.0)?;
-        check_range("distance_weight", self.distance_weight, 0.0..=1e3)?;
-        check_range("usage_weight", self.usage_weight, 0.0..=1e3)?;
         check_range("max_disagreement", self.max_disagreement, 0.0..=1.0)
     }
 }
@@ -80,17 +77,15 @@ impl Mapper {
     fn nearest_keyframe(&self, map_from_camera: &SE3) -> Option<(usize, SE3)> {
         let present = self.keyframe()?;
         let params = &self.params.reuse;
-        let reach = params.max_distance.sqrt() / params.distance_weight.max(f64::MIN_POSITIVE);
+        let reach = params.distance.reach(params.max_distance);
         let mut nearest = None;
         let mut least = params.max_distance;
         for (index, view) in self.map.seen_from(present.epoch, map_from_camera, reach) {
             let keyframe = &self.map.keyframes[index];
             let is_eligible = keyframe.keyframe_id != present.keyframe_id
                 && keyframe.map_state == MapState::Established;
-            let from_distance =
-                params.distance_weight * view.keyframe_from_camera.translation.norm();
-            let from_usage = params.usage_weight * (1.0 - view.usage);
-            let distance = from_distance * from_distance + from_usage * from_usage;
+            let translation = view.keyframe_from_camera.translation.norm();
+            let distance = params.distance.distance(translation, view.usage);
             if is_eligible && distance < least {
                 (nearest, least) = (Some((index, view.keyframe_from_camera)), distance);
             }
@@ -167,14 +162,8 @@ mod tests {
             let pixels = view.noisy(1.0, self.sequence);
             let mut depth = view.inverse_depth.clone();
             depth.pixels_mut().iter_mut().for_each(|d| *d = 1.0 / *d);
-            let frame = FrameView {
-                sequence: self.sequence,
-                capture_nanos: self.sequence as i64 * 33_333_333,
-                exposure_nanos: 0,
-                width: CAMERA.width,
-                height: CAMERA.height,
-                pixels: &pixels,
-            };
+            let frame =
+                FrameView::new(&CAMERA, self.sequence, self.sequence as i64 * 33_333_333, &pixels);
             self.sequence += 1;
             let keyframe_id = self.mapper.keyframe().map_or(u64::MAX, |k| k.keyframe_id);
             let pose = PoseEstimate {

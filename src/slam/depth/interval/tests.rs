@@ -90,7 +90,7 @@ fn coverage(noise: f64, seeds: u64) -> Coverage {
     for seed in 1..=seeds {
         let sequence = Sequence::new(seed, 12, noise);
         let mut filter = IntervalFilter::default();
-        let wanted = CandidateParams { wanted: 1000, ..CandidateParams::default() };
+        let wanted = CandidateParams { wanted: 1000 };
         filter.restart(&sequence.keyframe, &wanted);
         for i in 0..sequence.frames.len() {
             let ended: Vec<bool> = filter.points().iter().map(|p| p.is_ended()).collect();
@@ -138,7 +138,7 @@ fn the_interval_shrinks_as_the_baseline_grows() {
     let sequence = Sequence::new(4, 16, 1.0);
     let mut filter = IntervalFilter::default();
     let params = IntervalParams::default();
-    filter.restart(&sequence.keyframe, &CandidateParams { wanted: 500, ..Default::default() });
+    filter.restart(&sequence.keyframe, &CandidateParams { wanted: 500 });
     let starts: Vec<(u16, u16)> = filter.points().iter().map(|p| (p.u, p.v)).collect();
     let mut histories = Vec::new();
     for start in starts {
@@ -171,7 +171,7 @@ fn the_interval_shrinks_as_the_baseline_grows() {
 fn a_scaled_world_gives_the_same_verdicts() {
     let sequence = Sequence::new(2, 6, 2.0);
     let params = IntervalParams::default();
-    let wanted = CandidateParams { wanted: 300, ..Default::default() };
+    let wanted = CandidateParams { wanted: 300 };
     let poses = path(2, 7);
     // A power of two leaves the digits as they are, so that even ties fall the same way.
     let factor = 8.0;
@@ -202,7 +202,7 @@ fn the_brightness_of_a_frame_is_taken_out() {
     let mut outliers = [0, 0];
     for (known, outliers) in [true, false].into_iter().zip(&mut outliers) {
         let mut filter = IntervalFilter::default();
-        filter.restart(&sequence.keyframe, &CandidateParams { wanted: 500, ..Default::default() });
+        filter.restart(&sequence.keyframe, &CandidateParams { wanted: 500 });
         for i in 0..4 {
             let brightness = Brightness { a: 0.7f64.ln(), b: 50.0 };
             let shown = |grey: &u8| (0.7 * f32::from(*grey) + 50.0).round() as u8;

@@ -8,8 +8,7 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::image::quads::QuadImage;
 use crate::slam::image::quads_kernel::PortableSampler;
 
-const CAMERA: Intrinsics =
-    Intrinsics { fx: 200.0, fy: 200.0, cx: 99.5, cy: 74.5, width: 200, height: 150 };
+const CAMERA: Intrinsics = Intrinsics::pinhole(200, 150, 200.0);
 const PLANE_INVERSE_DEPTH: f64 = 0.8;
 
 /// A smooth texture on a fronto-parallel plane, seen by a camera at `current_from_keyframe`.
