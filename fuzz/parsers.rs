@@ -417,9 +417,8 @@ impl View {
 
     fn frame(&self) -> FrameView<'_> {
         let Self { sequence, capture_nanos, .. } = *self;
-        let Intrinsics { width, height, .. } = self.intrinsics;
         let pixels = &self.pixels[..];
-        FrameView { sequence, capture_nanos, exposure_nanos: 0, width, height, pixels }
+        FrameView::new(&self.intrinsics, sequence, capture_nanos, pixels)
     }
 }
 

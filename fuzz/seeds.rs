@@ -8,7 +8,7 @@ use semidense::slam::frame::FrameView;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::geometry::sim3::Sim3;
-use semidense::slam::keyframe::{DepthPoint, Keyframe, KeyframePose, MapState};
+use semidense::slam::keyframe::{DepthPoint, Keyframe, KeyframePose};
 use semidense::slam::map::Map;
 use semidense::slam::pose::{PoseEstimate, TrackingState};
 use semidense::wire::conversion::{
@@ -32,8 +32,7 @@ pub struct Seed {
     pub bytes: Vec<u8>,
 }
 
-const CAMERA: Intrinsics =
-    Intrinsics { fx: 25.0, fy: 25.0, cx: 19.5, cy: 15.5, width: 40, height: 32 };
+const CAMERA: Intrinsics = Intrinsics::pinhole(40, 32, 25.0);
 
 /// At least one seed of each target, and one for each kind that its first byte can name.
 pub fn seeds() -> Vec<Seed> {
@@ -114,18 +113,14 @@ fn images() -> Vec<Vec<u8>> {
 fn keyframe() -> Keyframe {
     let point = DepthPoint { u: 3, v: 15, inverse_depth: 0.7, variance: 0.01, intensity: 128.5 };
     Keyframe {
-        keyframe_id: 0,
-        epoch: 0,
         revision: 1,
-        sequence: 0,
         capture_nanos: 5,
-        map_state: MapState::Established,
-        world_from_keyframe: Sim3::new(SE3::identity(), 1.5),
-        map_from_keyframe: Sim3::new(SE3::identity(), 1.5),
-        map_revision: 0,
-        intrinsics: CAMERA,
-        image: (0..CAMERA.width * CAMERA.height).map(|i| (i * i % 251) as u8).collect(),
-        points: (0..24).map(|u| DepthPoint { u, ..point }).collect(),
+        ..Keyframe::at(
+            Sim3::new(SE3::identity(), 1.5),
+            CAMERA,
+            (0..24).map(|u| DepthPoint { u, ..point }).collect(),
+            (0..CAMERA.width * CAMERA.height).map(|i| (i * i % 251) as u8).collect(),
+        )
     }
 }
 

@@ -42,14 +42,12 @@ fn a_frame_and_a_keyframe_allocate_nothing_after_warm_up() {
         reference.prepare_into(keyframe);
         spare = tracker.adopt(reference);
         for (sequence, pixels) in pixels.iter().enumerate() {
-            let frame = FrameView {
-                sequence: (index * 100 + sequence) as u64,
-                capture_nanos: (index * 100 + sequence) as i64 * 33_000_000,
-                exposure_nanos: 0,
-                width: CAMERA.width,
-                height: CAMERA.height,
+            let frame = FrameView::new(
+                &CAMERA,
+                (index * 100 + sequence) as u64,
+                (index * 100 + sequence) as i64 * 33_000_000,
                 pixels,
-            };
+            );
             tracked += usize::from(tracker.track(&frame, &mut |_| true).state.is_tracked());
         }
     }

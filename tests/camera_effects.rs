@@ -29,11 +29,8 @@ fn outcome(seed: u64, sensor: &SensorParams) -> Outcome {
     let params = SimulatorParams {
         seed,
         frames: FRAMES,
-        width: 320,
-        height: 240,
-        focal_px: 262.5,
         sensor: sensor.clone(),
-        ..SimulatorParams::default()
+        ..SimulatorParams::half_size()
     };
     let mut source = Simulator::new(params).unwrap();
     source.prepare(&mut |_, _| true).unwrap();

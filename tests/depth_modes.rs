@@ -30,14 +30,7 @@ struct Outcome {
 }
 
 fn room(seed: u64, poses: PoseOrigin) -> Outcome {
-    let params = SimulatorParams {
-        seed,
-        frames: FRAMES,
-        width: 320,
-        height: 240,
-        focal_px: 262.5,
-        ..SimulatorParams::default()
-    };
+    let params = SimulatorParams { seed, frames: FRAMES, ..SimulatorParams::half_size() };
     let mut simulator = Simulator::new(params).unwrap();
     let config = ReplayConfig { poses, ..ReplayConfig::default() };
     let record = replay(&mut simulator, "room", &config, &mut |_| true).unwrap();

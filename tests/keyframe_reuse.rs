@@ -23,14 +23,7 @@ struct Outcome {
 
 fn to_and_fro(max_distance: f64) -> Outcome {
     let motion = MotionParams { kind: MotionKind::Straight, ..MotionParams::default() };
-    let params = SimulatorParams {
-        frames: FRAMES,
-        motion,
-        width: 320,
-        height: 240,
-        focal_px: 262.5,
-        ..SimulatorParams::default()
-    };
+    let params = SimulatorParams { frames: FRAMES, motion, ..SimulatorParams::half_size() };
     let mut simulator = Simulator::new(params).unwrap();
     let reuse = ReuseParams { max_distance, ..ReuseParams::default() };
     let mapper = MapperParams { reuse, ..MapperParams::default() };

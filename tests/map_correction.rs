@@ -42,10 +42,7 @@ fn footage() -> Footage {
         seed: 3,
         frames: FRAMES,
         sensor: SensorParams { noise_std_dev: 2.0, ..SensorParams::default() },
-        width: 320,
-        height: 240,
-        focal_px: 262.5,
-        ..SimulatorParams::default()
+        ..SimulatorParams::half_size()
     };
     let mut source = Simulator::new(params).unwrap();
     let intrinsics = source.intrinsics();
@@ -74,10 +71,9 @@ impl<'a> Run<'a> {
 
     /// Shows a frame as the next one.
     fn show(&mut self, pixels: &[u8]) {
-        let Intrinsics { width, height, .. } = self.footage.intrinsics;
         let sequence = self.poses.len() as u64;
         let capture_nanos = sequence as i64 * PERIOD_NANOS;
-        let frame = FrameView { sequence, capture_nanos, exposure_nanos: 0, width, height, pixels };
+        let frame = FrameView::new(&self.footage.intrinsics, sequence, capture_nanos, pixels);
         let pose = self.tracker.track(&frame, &mut |_| true);
         self.poses.push(pose);
         let stepped = self.mapper.step(&frame, &pose, None, &mut || {});

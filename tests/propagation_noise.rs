@@ -8,8 +8,7 @@ use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::pose::Brightness;
 
-const CAMERA: Intrinsics =
-    Intrinsics { fx: 130.0, fy: 130.0, cx: 95.5, cy: 71.5, width: 192, height: 144 };
+const CAMERA: Intrinsics = Intrinsics::pinhole(192, 144, 130.0);
 
 /// Pixels between two hypotheses: none meets another after the motion.
 const SPACING: usize = 12;

@@ -46,10 +46,7 @@ fn footage(seed: u64, kind: MotionKind, frames: usize, noise_std_dev: f64) -> Fo
         frames,
         motion: MotionParams { kind, ..MotionParams::default() },
         sensor: SensorParams { noise_std_dev, ..SensorParams::default() },
-        width: 320,
-        height: 240,
-        focal_px: 262.5,
-        ..SimulatorParams::default()
+        ..SimulatorParams::half_size()
     };
     let mut source = Simulator::new(params).unwrap();
     let intrinsics = source.intrinsics();
@@ -249,14 +246,8 @@ fn a_map_whose_poses_are_wrong_is_rejected() {
     let mut mapper = Mapper::new(room.intrinsics, MapperParams::default()).unwrap();
     let mut rejected_at = None;
     for (index, pixels) in room.frames.iter().enumerate() {
-        let frame = FrameView {
-            sequence: index as u64,
-            capture_nanos: index as i64 * PERIOD_NANOS,
-            exposure_nanos: 0,
-            width: room.intrinsics.width,
-            height: room.intrinsics.height,
-            pixels,
-        };
+        let frame =
+            FrameView::new(&room.intrinsics, index as u64, index as i64 * PERIOD_NANOS, pixels);
         // Three degrees are thirteen pixels.
         let rotation = if index < WRONG { 0.0 } else { 3_f64.to_radians() };
         let wrong = SE3::exp(&Vector6::new(0.0, 0.0, 0.0, rotation, 0.0, rotation));

@@ -15,7 +15,7 @@ use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::geometry::sim3::Sim3;
 use semidense::slam::image::buffer::Image;
-use semidense::slam::keyframe::{DepthPoint, Keyframe, MapState};
+use semidense::slam::keyframe::{DepthPoint, Keyframe};
 use semidense::slam::map::Map;
 use semidense::slam::mapper::consistency::Contradiction;
 use semidense::slam::pose::{
@@ -24,8 +24,7 @@ use semidense::slam::pose::{
 use semidense::slam::trajectory::StampedPose;
 use serde_json::Value;
 
-const INTRINSICS: Intrinsics =
-    Intrinsics { fx: 30.0, fy: 30.0, cx: 15.5, cy: 11.5, width: 32, height: 24 };
+const INTRINSICS: Intrinsics = Intrinsics::pinhole(32, 24, 30.0);
 
 /// A source whose only use is its depth: 4 m at every pixel of every frame.
 struct Wall;
@@ -120,17 +119,15 @@ fn keyframe(keyframe_id: u64) -> Keyframe {
     });
     Keyframe {
         keyframe_id,
-        epoch: 0,
         revision: 1,
         sequence: keyframe_id * 10,
         capture_nanos: nanos(keyframe_id as usize * 10),
-        map_state: MapState::Established,
-        world_from_keyframe: world_from_keyframe(keyframe_id),
-        map_from_keyframe: world_from_keyframe(keyframe_id),
-        map_revision: 0,
-        intrinsics: INTRINSICS,
-        image: vec![90; 32 * 24],
-        points: points.collect(),
+        ..Keyframe::at(
+            world_from_keyframe(keyframe_id),
+            INTRINSICS,
+            points.collect(),
+            vec![90; 32 * 24],
+        )
     }
 }
 

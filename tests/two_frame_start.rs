@@ -115,10 +115,7 @@ fn params(kind: MotionKind, seed: u64, frames: usize, noise_std_dev: f64) -> Sim
         frames,
         motion: MotionParams { kind, ..MotionParams::default() },
         sensor: SensorParams { noise_std_dev, ..SensorParams::default() },
-        width: 320,
-        height: 240,
-        focal_px: 262.5,
-        ..SimulatorParams::default()
+        ..SimulatorParams::half_size()
     }
 }
 

@@ -3,7 +3,7 @@
 use semidense::slam::frame::FrameView;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::sim3::Sim3;
-use semidense::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS, MapState};
+use semidense::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS};
 
 /// The sizes that cameras have: VGA, EuRoC, HD.
 pub const SIZES: [(usize, usize); 3] = [(640, 480), (752, 480), (1280, 720)];
@@ -44,30 +44,10 @@ pub fn keyframe(camera: &Intrinsics) -> Keyframe {
         variance: 1e-3,
         intensity: f32::from(image[i]),
     });
-    Keyframe {
-        keyframe_id: 0,
-        epoch: 0,
-        revision: 0,
-        sequence: 0,
-        capture_nanos: 0,
-        map_state: MapState::Established,
-        world_from_keyframe: Sim3::identity(),
-        map_from_keyframe: Sim3::identity(),
-        map_revision: 0,
-        intrinsics: *camera,
-        points: points.collect(),
-        image,
-    }
+    Keyframe::at(Sim3::identity(), *camera, points.collect(), image)
 }
 
 /// Frame `sequence` of a recording at 30 Hz.
 pub fn frame<'a>(sequence: u64, camera: &Intrinsics, pixels: &'a [u8]) -> FrameView<'a> {
-    FrameView {
-        sequence,
-        capture_nanos: sequence as i64 * 33_000_000,
-        exposure_nanos: 0,
-        width: camera.width,
-        height: camera.height,
-        pixels,
-    }
+    FrameView::new(camera, sequence, sequence as i64 * 33_000_000, pixels)
 }

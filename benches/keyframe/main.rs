@@ -248,14 +248,7 @@ fn whole(sequence: &Sequence, pools: &[rayon::ThreadPool]) {
             let mut mapper =
                 Mapper::new(camera, MapperParams::default()).expect("default values are valid");
             for (k, pixels) in sequence.frames.iter().enumerate() {
-                let frame = FrameView {
-                    sequence: k as u64,
-                    capture_nanos: k as i64 * 33_333_333,
-                    exposure_nanos: 0,
-                    width: camera.width,
-                    height: camera.height,
-                    pixels,
-                };
+                let frame = FrameView::new(&camera, k as u64, k as i64 * 33_333_333, pixels);
                 let pose = PoseEstimate {
                     state: TrackingState::Tracking,
                     keyframe_id: mapper.keyframe().map_or(u64::MAX, |k| k.keyframe_id),

@@ -83,12 +83,9 @@ fn run_cases(
             scene: case.scene,
             seed: case.seed,
             frames: arguments.frames,
-            width: 320,
-            height: 240,
-            focal_px: 262.5,
             rate_hz: 10.0,
             sensor: SensorParams { noise_std_dev: case.image_noise, ..SensorParams::default() },
-            ..SimulatorParams::default()
+            ..SimulatorParams::half_size()
         })?;
         let mut recorded = Recorded::new(Box::new(simulator), arguments.frames)?;
         for &depth_noise in case.depth_noises {

@@ -13,7 +13,7 @@ use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::geometry::sim3::Sim3;
 use semidense::slam::image::buffer::Image;
-use semidense::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS, MapState};
+use semidense::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS};
 use semidense::slam::pose::PoseEstimate;
 use semidense::slam::tracker::{Tracker, TrackerParams};
 use semidense::slam::trajectory::StampedPose;
@@ -261,16 +261,14 @@ fn make_keyframe(
     });
     Keyframe {
         keyframe_id,
-        epoch: 0,
         revision: keyframe_id,
         sequence: stamp.sequence,
         capture_nanos: stamp.capture_nanos,
-        map_state: MapState::Established,
-        world_from_keyframe: Sim3::new(world_from_camera, 1.0 / mean),
-        map_from_keyframe: Sim3::new(world_from_camera, 1.0 / mean),
-        map_revision: 0,
-        intrinsics: *intrinsics,
-        image: pixels.to_vec(),
-        points: points.collect(),
+        ..Keyframe::at(
+            Sim3::new(world_from_camera, 1.0 / mean),
+            *intrinsics,
+            points.collect(),
+            pixels.to_vec(),
+        )
     }
 }

@@ -201,7 +201,7 @@ struct NoSource;
 
 impl FrameSource for NoSource {
     fn intrinsics(&self) -> Intrinsics {
-        Intrinsics { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, width: 1, height: 1 }
+        Intrinsics::pinhole(1, 1, 1.0)
     }
 
     fn num_frames(&self) -> Option<usize> {

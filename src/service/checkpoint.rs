@@ -266,7 +266,7 @@ mod tests {
     use crate::slam::geometry::intrinsics::Intrinsics;
     use crate::slam::geometry::se3::SE3;
     use crate::slam::geometry::sim3::Sim3;
-    use crate::slam::keyframe::{DepthPoint, MapState};
+    use crate::slam::keyframe::DepthPoint;
     use std::os::unix::fs::PermissionsExt;
     use std::time::{Duration, Instant};
 
@@ -305,17 +305,15 @@ mod tests {
         let point = DepthPoint { u: 9, v: 9, inverse_depth: 1.0, variance: 0.1, intensity: 9.0 };
         Keyframe {
             keyframe_id,
-            epoch: 0,
             revision: 1,
             sequence: keyframe_id,
             capture_nanos: 1,
-            map_state: MapState::Established,
-            world_from_keyframe: place,
-            map_from_keyframe: place,
-            map_revision: 0,
-            intrinsics: Intrinsics { fx: 20.0, fy: 20.0, cx: 8.0, cy: 7.5, width: 17, height: 16 },
-            image: vec![keyframe_id as u8; 17 * 16],
-            points: vec![point; 3],
+            ..Keyframe::at(
+                place,
+                Intrinsics::pinhole(17, 16, 20.0),
+                vec![point; 3],
+                vec![keyframe_id as u8; 17 * 16],
+            )
         }
     }
 

@@ -58,8 +58,7 @@ impl Finding {
 }
 
 /// The largest camera that is usual: what shared memory must hold.
-const LARGE_CAMERA: Intrinsics =
-    Intrinsics { fx: 1000.0, fy: 1000.0, cx: 639.5, cy: 359.5, width: 1280, height: 720 };
+const LARGE_CAMERA: Intrinsics = Intrinsics::pinhole(1280, 720, 1000.0);
 /// The smallest limit of locked memory that a tracker needs, bytes.
 const MIN_LOCKED_BYTES: u64 = 512 << 20;
 

@@ -151,6 +151,6 @@ mod tests {
         assert_eq!(weights.distance(0.0, 0.75), 1.0);
         assert_eq!(weights.distance(0.25, 0.875), 0.5);
         assert_eq!(weights.reach(1.0), 0.5);
-        assert_eq!(weights.distance(weights.reach(0.5), 1.0), 0.5);
+        assert_eq!(weights.distance(weights.reach(0.25), 1.0), 0.25);
     }
 }

@@ -8,8 +8,7 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;
 
 /// A camera of about 63° × 49°.
-pub const CAMERA: Intrinsics =
-    Intrinsics { fx: 260.0, fy: 260.0, cx: 159.5, cy: 119.5, width: 320, height: 240 };
+pub const CAMERA: Intrinsics = Intrinsics::pinhole(320, 240, 260.0);
 
 /// One rendered frame.
 pub struct Rendering {

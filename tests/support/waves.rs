@@ -3,12 +3,11 @@
 use semidense::service::clock::now_nanos;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::sim3::Sim3;
-use semidense::slam::keyframe::{DepthPoint, Keyframe, MapState};
+use semidense::slam::keyframe::{DepthPoint, Keyframe};
 use semidense::wire::message::FrameHeader;
 
 /// What they are seen with.
-pub const CAMERA: Intrinsics =
-    Intrinsics { fx: 260.0, fy: 260.0, cx: 159.5, cy: 119.5, width: 320, height: 240 };
+pub const CAMERA: Intrinsics = Intrinsics::pinhole(320, 240, 260.0);
 
 /// Of a frame that is sent now.
 pub fn header(sequence: u64) -> FrameHeader {
@@ -51,16 +50,7 @@ pub fn keyframe(keyframe_id: u64) -> Keyframe {
     });
     Keyframe {
         keyframe_id,
-        epoch: 0,
         revision: keyframe_id,
-        sequence: 0,
-        capture_nanos: 0,
-        map_state: MapState::Established,
-        world_from_keyframe: Sim3::identity(),
-        map_from_keyframe: Sim3::identity(),
-        map_revision: 0,
-        intrinsics: CAMERA,
-        points: points.collect(),
-        image,
+        ..Keyframe::at(Sim3::identity(), CAMERA, points.collect(), image)
     }
 }

@@ -8,14 +8,7 @@ use crate::capture::simulator::scene::Block;
 use crate::capture::simulator::summary::{gradient_share, summarize};
 
 fn small(scene: SceneKind) -> SimulatorParams {
-    SimulatorParams {
-        scene,
-        frames: 12,
-        width: 320,
-        height: 240,
-        focal_px: 262.5,
-        ..Default::default()
-    }
+    SimulatorParams { scene, frames: 12, ..SimulatorParams::half_size() }
 }
 
 fn noiseless(mut params: SimulatorParams) -> SimulatorParams {

@@ -323,7 +323,6 @@ mod tests {
     use crate::slam::geometry::intrinsics::Intrinsics;
     use crate::slam::geometry::se3::SE3;
     use crate::slam::geometry::sim3::Sim3;
-    use crate::slam::keyframe::MapState;
     use crate::slam::pose::PoseEstimate;
     use crate::wire::conversion::{PoseTiming, pose_message};
 
@@ -356,13 +355,12 @@ mod tests {
             revision: 9,
             sequence: 7,
             capture_nanos: -5,
-            map_state: MapState::Established,
-            map_from_keyframe,
-            world_from_keyframe: map_from_keyframe,
-            map_revision: 0,
-            intrinsics: Intrinsics { fx: 20.0, fy: 21.0, cx: 8.0, cy: 7.5, width: 17, height: 16 },
-            image: Vec::new(),
-            points: Vec::new(),
+            ..Keyframe::at(
+                map_from_keyframe,
+                Intrinsics { fx: 20.0, fy: 21.0, cx: 8.0, cy: 7.5, width: 17, height: 16 },
+                Vec::new(),
+                Vec::new(),
+            )
         };
         vec![
             Record::Start(Box::new(start)),

@@ -208,7 +208,6 @@ mod tests {
     use crate::slam::geometry::intrinsics::Intrinsics;
     use crate::slam::geometry::se3::SE3;
     use crate::slam::geometry::sim3::Sim3;
-    use crate::slam::keyframe::MapState;
 
     fn step(nanos: u64) -> Vec<u8> {
         let mut bytes = Vec::new();
@@ -219,17 +218,15 @@ mod tests {
     fn keyframe() -> Entry {
         Entry::Keyframe(Box::new(Keyframe {
             keyframe_id: 1,
-            epoch: 0,
             revision: 1,
             sequence: 1,
             capture_nanos: 1,
-            map_state: MapState::Established,
-            world_from_keyframe: Sim3::new(SE3::identity(), 1.0),
-            map_from_keyframe: Sim3::new(SE3::identity(), 1.0),
-            map_revision: 0,
-            intrinsics: Intrinsics { fx: 9.0, fy: 9.0, cx: 4.0, cy: 4.0, width: 9, height: 9 },
-            image: vec![0; 81],
-            points: Vec::new(),
+            ..Keyframe::at(
+                Sim3::new(SE3::identity(), 1.0),
+                Intrinsics::pinhole(9, 9, 9.0),
+                Vec::new(),
+                vec![0; 81],
+            )
         }))
     }
 

@@ -3,7 +3,7 @@
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
-use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
+use crate::slam::keyframe::{DepthPoint, Keyframe};
 
 /// A small fixed generator (SplitMix64), so that tests do not depend on a crate's version.
 pub struct Noise(pub u64);
@@ -124,17 +124,8 @@ impl Plane {
         }
         Keyframe {
             keyframe_id: 3,
-            epoch: 0,
             revision: 1,
-            sequence: 0,
-            capture_nanos: 0,
-            map_state: MapState::Established,
-            world_from_keyframe: Sim3::identity(),
-            map_from_keyframe: Sim3::identity(),
-            map_revision: 0,
-            intrinsics: *at,
-            image,
-            points,
+            ..Keyframe::at(Sim3::identity(), *at, points, image)
         }
     }
 }

@@ -136,30 +136,15 @@ mod tests {
     use crate::slam::geometry::intrinsics::Intrinsics;
     use crate::slam::geometry::se3::SE3;
     use crate::slam::geometry::sim3::Sim3;
-    use crate::slam::keyframe::{DepthPoint, MapState};
+    use crate::slam::keyframe::DepthPoint;
 
     fn keyframe(points: Vec<DepthPoint>, scale: f64) -> Keyframe {
-        Keyframe {
-            keyframe_id: 0,
-            epoch: 0,
-            revision: 0,
-            sequence: 0,
-            capture_nanos: 0,
-            map_state: MapState::Established,
-            map_from_keyframe: Sim3::new(SE3::identity(), scale),
-            world_from_keyframe: Sim3::new(SE3::identity(), scale),
-            map_revision: 0,
-            intrinsics: Intrinsics {
-                fx: 20.0,
-                fy: 20.0,
-                cx: 10.0,
-                cy: 10.0,
-                width: 20,
-                height: 20,
-            },
-            image: vec![0; 400],
+        Keyframe::at(
+            Sim3::new(SE3::identity(), scale),
+            Intrinsics { fx: 20.0, fy: 20.0, cx: 10.0, cy: 10.0, width: 20, height: 20 },
             points,
-        }
+            vec![0; 400],
+        )
     }
 
     fn point(u: u16, inverse_depth: f32, variance: f32) -> DepthPoint {

@@ -105,7 +105,7 @@ mod tests {
     use crate::slam::geometry::intrinsics::Intrinsics;
     use crate::slam::geometry::se3::SE3;
     use crate::slam::geometry::sim3::Sim3;
-    use crate::slam::keyframe::{DepthPoint, MapState};
+    use crate::slam::keyframe::DepthPoint;
 
     const CAMERA: Intrinsics =
         Intrinsics { fx: 100.0, fy: 110.0, cx: 59.5, cy: 39.5, width: 120, height: 80 };
@@ -134,20 +134,12 @@ mod tests {
                 });
             }
         }
-        let keyframe = Keyframe {
-            keyframe_id: 0,
-            epoch: 0,
-            revision: 0,
-            sequence: 0,
-            capture_nanos: 0,
-            map_state: MapState::Established,
-            map_from_keyframe: Sim3::new(SE3::identity(), 2.0),
-            world_from_keyframe: Sim3::new(SE3::identity(), 2.0),
-            map_revision: 0,
-            intrinsics: CAMERA,
-            image: vec![0; CAMERA.width * CAMERA.height],
+        let keyframe = Keyframe::at(
+            Sim3::new(SE3::identity(), 2.0),
+            CAMERA,
             points,
-        };
+            vec![0; CAMERA.width * CAMERA.height],
+        );
         (keyframe, truth)
     }
 

@@ -119,24 +119,13 @@ mod tests {
         let rigid = SE3::exp(&Vector6::new(x, 0.0, 0.0, 0.0, 0.0, 0.0));
         Keyframe {
             keyframe_id: index,
-            epoch: 0,
-            revision: 0,
             sequence: 10 * index,
-            capture_nanos: 0,
-            map_state: MapState::Established,
-            map_from_keyframe: Sim3::new(rigid, scale),
-            world_from_keyframe: Sim3::new(rigid, scale),
-            map_revision: 0,
-            intrinsics: Intrinsics {
-                fx: FOCAL,
-                fy: FOCAL,
-                cx: 0.5 * (WIDTH as f64 - 1.0),
-                cy: 0.5 * (HEIGHT as f64 - 1.0),
-                width: WIDTH,
-                height: HEIGHT,
-            },
-            image: (0..WIDTH * HEIGHT).map(pixel).collect(),
-            points: points.collect(),
+            ..Keyframe::at(
+                Sim3::new(rigid, scale),
+                Intrinsics::pinhole(WIDTH, HEIGHT, FOCAL),
+                points.collect(),
+                (0..WIDTH * HEIGHT).map(pixel).collect(),
+            )
         }
     }
 

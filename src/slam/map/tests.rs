@@ -1,22 +1,18 @@
 //! Memory, places and corrections of the map.
 
 use super::*;
-use crate::slam::keyframe::{MAX_KEYFRAME_POINTS, MapState, most_keyframe_bytes};
+use crate::slam::keyframe::{MAX_KEYFRAME_POINTS, most_keyframe_bytes};
 
 fn keyframe(keyframe_id: u64) -> Keyframe {
     Keyframe {
         keyframe_id,
-        epoch: 0,
-        revision: 0,
         sequence: keyframe_id,
-        capture_nanos: 0,
-        map_state: MapState::Established,
-        world_from_keyframe: Sim3::identity(),
-        map_from_keyframe: Sim3::identity(),
-        map_revision: 0,
-        intrinsics: Intrinsics { fx: 20.0, fy: 20.0, cx: 9.5, cy: 9.5, width: 20, height: 20 },
-        image: vec![7; 400],
-        points: vec![DepthPoint::default(); 25],
+        ..Keyframe::at(
+            Sim3::identity(),
+            Intrinsics::pinhole(20, 20, 20.0),
+            vec![DepthPoint::default(); 25],
+            vec![7; 400],
+        )
     }
 }
 

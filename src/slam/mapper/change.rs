@@ -215,14 +215,7 @@ mod tests {
             let mut depth = view.inverse_depth.clone();
             depth.pixels_mut().iter_mut().for_each(|d| *d = 1.0 / *d);
             let pixels = view.noisy(1.0, k);
-            let frame = FrameView {
-                sequence: k,
-                capture_nanos: k as i64 * 33_333_333,
-                exposure_nanos: 0,
-                width: CAMERA.width,
-                height: CAMERA.height,
-                pixels: &pixels,
-            };
+            let frame = FrameView::new(&CAMERA, k, k as i64 * 33_333_333, &pixels);
             let pose = PoseEstimate {
                 state: TrackingState::Tracking,
                 keyframe_id: mapper.keyframe().map_or(u64::MAX, |k| k.keyframe_id),

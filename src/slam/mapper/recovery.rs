@@ -277,17 +277,14 @@ mod tests {
         });
         Keyframe {
             keyframe_id,
-            epoch: 0,
             revision: 1,
             sequence: keyframe_id,
-            capture_nanos: 0,
-            map_state: MapState::Established,
-            world_from_keyframe: Sim3::new(world_from_camera, 1.0),
-            map_from_keyframe: Sim3::new(world_from_camera, 1.0),
-            map_revision: 0,
-            intrinsics: CAMERA,
-            points: points.collect(),
-            image: view.noisy(1.0, keyframe_id),
+            ..Keyframe::at(
+                Sim3::new(world_from_camera, 1.0),
+                CAMERA,
+                points.collect(),
+                view.noisy(1.0, keyframe_id),
+            )
         }
     }
 

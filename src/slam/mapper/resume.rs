@@ -113,14 +113,12 @@ mod tests {
             epoch,
             revision: 5,
             sequence: 1,
-            capture_nanos: 0,
-            map_state: MapState::Established,
-            world_from_keyframe: Sim3::identity(),
-            map_from_keyframe: Sim3::identity(),
-            map_revision: 0,
-            intrinsics: CAMERA,
-            image: (0..CAMERA.width * CAMERA.height).map(|i| (i * i % 251) as u8).collect(),
-            points: vec![point],
+            ..Keyframe::at(
+                Sim3::identity(),
+                CAMERA,
+                vec![point],
+                (0..CAMERA.width * CAMERA.height).map(|i| (i * i % 251) as u8).collect(),
+            )
         }
     }
 

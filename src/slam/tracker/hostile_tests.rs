@@ -150,8 +150,7 @@ fn stamp() -> impl Strategy<Value = i64> {
 }
 
 fn view(pixels: &[u8], sequence: u64, capture_nanos: i64) -> FrameView<'_> {
-    let Intrinsics { width, height, .. } = CAMERA;
-    FrameView { sequence, capture_nanos, exposure_nanos: 0, width, height, pixels }
+    FrameView::new(&CAMERA, sequence, capture_nanos, pixels)
 }
 
 proptest! {
@@ -201,14 +200,7 @@ fn the_smallest_images_neither_panic_nor_lie() {
         for (sequence, image) in
             [&keyframe.image, &vec![0; width * height], &keyframe.image].into_iter().enumerate()
         {
-            let view = FrameView {
-                sequence: sequence as u64,
-                capture_nanos: sequence as i64,
-                exposure_nanos: 0,
-                width,
-                height,
-                pixels: image,
-            };
+            let view = FrameView::new(&camera, sequence as u64, sequence as i64, image);
             let estimate = tracker.track(&view, &mut |_| true);
             assert!(is_clean(&estimate), "{estimate:?}");
             assert_eq!(

@@ -17,14 +17,7 @@ fn always(_level: usize) -> bool {
 
 fn frame(sequence: u64, pixels: &[u8]) -> FrameView<'_> {
     let camera = small_camera();
-    FrameView {
-        sequence,
-        capture_nanos: sequence as i64 * 33_333_333,
-        exposure_nanos: 0,
-        width: camera.width,
-        height: camera.height,
-        pixels,
-    }
+    FrameView::new(&camera, sequence, sequence as i64 * 33_333_333, pixels)
 }
 
 fn tracker_on(keyframe: &Keyframe) -> Tracker {

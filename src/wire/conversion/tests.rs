@@ -38,13 +38,12 @@ fn keyframe() -> Keyframe {
         revision: 8,
         sequence: 30,
         capture_nanos: 1_000,
-        map_state: MapState::Established,
-        world_from_keyframe: Sim3::new(transform(), 1.3),
-        map_from_keyframe: Sim3::new(transform(), 1.3),
-        map_revision: 0,
-        intrinsics: Intrinsics { fx: 20.0, fy: 21.0, cx: 9.5, cy: 8.5, width: 20, height: 18 },
-        image: (0..20 * 18).map(|i| (i % 256) as u8).collect(),
-        points: vec![point; 3],
+        ..Keyframe::at(
+            Sim3::new(transform(), 1.3),
+            Intrinsics { fx: 20.0, fy: 21.0, cx: 9.5, cy: 8.5, width: 20, height: 18 },
+            vec![point; 3],
+            (0..20 * 18).map(|i| (i % 256) as u8).collect(),
+        )
     }
 }
 
