@@ -323,6 +323,32 @@ mod tests {
     }
 
     #[test]
+    fn brightness_is_that_of_the_target_against_the_source() {
+        // Darker and less contrast: nothing is clipped.
+        let brightness = Brightness { a: -0.3, b: 20.0 };
+        let gain = brightness.a.exp();
+        let shown = |grey: u8| (gain * f64::from(grey) + brightness.b).round() as u8;
+        let shown: Vec<u8> = textured().into_iter().map(shown).collect();
+        let params = PropagationParams {
+            max_residual: 2.0,
+            residual_per_gradient: 0.0,
+            ..PropagationParams::default()
+        };
+        let kept = |brightness: Brightness| {
+            let (source, mut target) = (map_with(1.0, 1e-4), map_with(1.0, 1e-4));
+            target.restart(&shown, 1.0, usize::MAX);
+            propagate(&source, &mut target, &CAMERA, &SE3::identity(), brightness, &params);
+            target.num_hypotheses() as f64 / source.num_hypotheses() as f64
+        };
+        let opposite = Brightness { a: -brightness.a, b: -brightness.b / gain };
+        let (right, wrong) = (kept(brightness), kept(opposite));
+        assert!(right > 0.9 && wrong < 0.2, "{right} {wrong}");
+        // Each half of it matters.
+        let half = kept(Brightness { b: -brightness.b, ..brightness });
+        assert!(half < 0.2, "{half}");
+    }
+
+    #[test]
     fn the_nearer_of_two_surfaces_wins_and_equal_ones_fuse() {
         let at = |d: f32, variance: f32| Hypothesis {
             inverse_depth: d,

@@ -258,6 +258,50 @@ mod tests {
         }
     }
 
+    /// Points that the second keyframe has of the first one's depth, where its image is of this brightness against
+    /// the first and the tracker says so, or says `told`.
+    fn carried(brightness: Brightness, told: Brightness) -> usize {
+        let scene = Scene::new(3);
+        let params = MapperParams { min_keyframe_interval: 1, ..MapperParams::default() };
+        let mut mapper = Mapper::new(CAMERA, params).unwrap();
+        for k in 0..2u64 {
+            let x = 0.05 * k as f64;
+            let world_from_camera = SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() };
+            let mut view = scene.render(&CAMERA, &world_from_camera);
+            let mut depth = view.inverse_depth.clone();
+            depth.pixels_mut().iter_mut().for_each(|d| *d = 1.0 / *d);
+            if k == 1 {
+                let relit = |grey: f32| brightness.a.exp() as f32 * grey + brightness.b as f32;
+                view.intensity.pixels_mut().iter_mut().for_each(|grey| *grey = relit(*grey));
+            }
+            let pixels = view.noisy(1.0, k);
+            let frame = FrameView::new(&CAMERA, k, k as i64 * 33_333_333, &pixels);
+            let pose = PoseEstimate {
+                state: TrackingState::Tracking,
+                keyframe_id: mapper.keyframe().map_or(u64::MAX, |k| k.keyframe_id),
+                world_from_camera,
+                keyframe_from_camera: mapper
+                    .keyframe()
+                    .map_or(SE3::identity(), |k| k.world_from_keyframe.locate(&world_from_camera)),
+                brightness: told,
+                proposes_keyframe: true,
+                ..PoseEstimate::unknown(&frame)
+            };
+            mapper.step(&frame, &pose, (k == 0).then_some(&depth), &mut || {});
+        }
+        assert_eq!(mapper.map.keyframes.len(), 2);
+        mapper.map.keyframes[1].points.len()
+    }
+
+    #[test]
+    fn depth_is_carried_over_a_change_of_brightness_in_its_direction() {
+        let brightness = Brightness { a: -0.4, b: 10.0 };
+        let same = carried(Brightness::default(), Brightness::default());
+        let right = carried(brightness, brightness);
+        let wrong = carried(brightness, Brightness { a: 0.4, b: -10.0 / (-0.4f64).exp() });
+        assert!(4 * right > 3 * same && 2 * wrong < same, "{right} {wrong} of {same}");
+    }
+
     #[test]
     fn errors_of_estimated_poses_are_none_of_given_ones_in_past_frames_either() {
         let with_line_noise = |line_noise_px| {
