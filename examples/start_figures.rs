@@ -10,12 +10,12 @@ use std::process::ExitCode;
 use std::time::Instant;
 
 use clap::Parser;
-use nalgebra::{Matrix4, Vector4};
 use semidense::capture::source::{FrameSource, SourceName, SourceParams, open};
+use semidense::slam::evaluation::start_error::StartErrors;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::image::buffer::Image;
-use semidense::slam::two_frame::{InitOutcome, InitState, TwoFrameInitializer, TwoFrameParams};
+use semidense::slam::two_frame::{InitState, TwoFrameInitializer, TwoFrameParams};
 
 /// Starts from many first frames of each source.
 #[derive(Debug, Parser)]
@@ -43,15 +43,8 @@ struct Arguments {
     brief: bool,
 }
 
-/// A start whose direction is further off than this is wrong, degrees: half of it would be noise of a
-/// short baseline, a wrong minimum is further off.
-const WRONG_DIRECTION_DEG: f64 = 30.0;
-/// A start whose depths are further off than this in the median is wrong.
-const WRONG_DEPTH: f64 = 0.15;
-
 /// One frame of a source.
 struct Frame {
-    nanos: i64,
     pixels: Vec<u8>,
     world_from_camera: SE3,
     depth: Option<Image<f32>>,
@@ -63,21 +56,10 @@ struct Start {
     late: usize,
     /// Length of the translation in mean depths.
     translation: f64,
-    direction_error_deg: f64,
-    rotation_error_deg: f64,
-    /// NaN where the source has no depth.
-    median_depth_error: f64,
-    /// Slopes of ln(inverse depth / true) along columns, rows and the logarithm of the true inverse depth;
-    /// NaN where the source has no depth. A relief of −0.3 is a scene flattened by 30 %.
-    modes: [f64; 3],
     /// What the evidence says of errors common to all depths.
     common_error: f64,
-}
-
-impl Start {
-    fn is_wrong(&self) -> bool {
-        self.direction_error_deg > WRONG_DIRECTION_DEG || self.median_depth_error > WRONG_DEPTH
-    }
+    /// Against the ground truth.
+    errors: StartErrors,
 }
 
 fn main() -> ExitCode {
@@ -110,22 +92,19 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
                 }
                 continue;
             };
-            wrongs += usize::from(start.is_wrong());
+            let is_wrong = start.errors.is_wrong();
+            wrongs += usize::from(is_wrong);
             lates.push(start.late as f64);
             if !arguments.brief {
+                let Start { late, translation, common_error, errors } = start;
+                let StartErrors { direction_deg, rotation_deg, depth, modes, shape, .. } = errors;
                 println!(
-                    "{name} from {first:2}: after {:2} frames, moved {:.4}, direction {:5.1}°, rotation \
-                     {:.2}°, depth {:.3}, common {:.3}, modes {:+.2} {:+.2} {:+.2}{}",
-                    start.late,
-                    start.translation,
-                    start.direction_error_deg,
-                    start.rotation_error_deg,
-                    start.median_depth_error,
-                    start.common_error,
-                    start.modes[0],
-                    start.modes[1],
-                    start.modes[2],
-                    if start.is_wrong() { "  WRONG" } else { "" },
+                    "{name} from {first:2}: after {late:2} frames, moved {translation:.4}, direction \
+                     {direction_deg:5.1}°, rotation {rotation_deg:.2}°, common {common_error:.3}, depth {:.3?}, \
+                     shape {shape:.3?}, modes {:+.2?}{}",
+                    depth.map(|depth| depth.relative_error_median),
+                    modes.map(|modes| [modes.column, modes.row, modes.relief]),
+                    if is_wrong { "  WRONG" } else { "" },
                 );
             }
         }
@@ -162,7 +141,7 @@ fn read(source: &mut dyn FrameSource, most: usize) -> Result<Vec<Frame>, Box<dyn
         let nearest = source.ground_truth().iter().min_by_key(|p| p.nanos.abs_diff(nanos));
         let world_from_camera = nearest.ok_or("a source without ground truth")?.world_from_camera;
         let depth = source.depth_at(nanos)?;
-        frames.push(Frame { nanos, pixels: pixels.clone(), world_from_camera, depth });
+        frames.push(Frame { pixels: pixels.clone(), world_from_camera, depth });
     }
     Ok(frames)
 }
@@ -177,7 +156,7 @@ fn start(
     let mut initializer = TwoFrameInitializer::new(intrinsics, TwoFrameParams::default())?;
     let mut first = &frames[0];
     initializer.begin(&first.pixels);
-    for (i, frame) in frames.iter().enumerate().skip(1).step_by(stride) {
+    for (i, frame) in frames.iter().enumerate().step_by(stride).skip(1) {
         let begun = Instant::now();
         let outcome = initializer.step(&frame.pixels);
         millis.push(begun.elapsed().as_secs_f64() * 1e3);
@@ -185,82 +164,19 @@ fn start(
             InitState::Failed(_) => first = frame,
             InitState::Waiting(_) => {}
             InitState::Proven => {
-                return Ok(Some(figures(intrinsics, &initializer, &outcome, first, frame, i)));
+                let truth = first.world_from_camera.inverse() * frame.world_from_camera;
+                let (found, depths) = (&outcome.first_from_current, initializer.depths());
+                let depth = first.depth.as_ref();
+                return Ok(Some(Start {
+                    late: i,
+                    translation: outcome.evidence.translation,
+                    common_error: outcome.evidence.common_error,
+                    errors: StartErrors::of(found, depths, &intrinsics, &truth, depth),
+                }));
             }
         }
     }
     Ok(None)
-}
-
-fn figures(
-    intrinsics: Intrinsics,
-    initializer: &TwoFrameInitializer,
-    outcome: &InitOutcome,
-    first: &Frame,
-    frame: &Frame,
-    late: usize,
-) -> Start {
-    debug_assert!(first.nanos <= frame.nanos);
-    let truth = first.world_from_camera.inverse() * frame.world_from_camera;
-    let found = outcome.first_from_current;
-    let lengths = found.translation.norm() * truth.translation.norm();
-    let cosine = found.translation.dot(&truth.translation) / lengths;
-    let depth = first.depth.as_ref();
-    let mut products: Vec<f64> = depth.map_or_else(Vec::new, |depth| {
-        let product = |d: semidense::slam::two_frame::InitialDepth| {
-            f64::from(d.inverse_depth * depth.at(usize::from(d.u), usize::from(d.v)))
-        };
-        initializer.depths().map(product).filter(|product| *product > 0.0).collect()
-    });
-    let scale = quantile(&mut products, 0.5);
-    let mut errors: Vec<f64> = products.iter().map(|p| (scale / p - 1.0).abs()).collect();
-    Start {
-        late,
-        translation: outcome.evidence.translation,
-        direction_error_deg: cosine.clamp(-1.0, 1.0).acos().to_degrees(),
-        rotation_error_deg: found.rotation.angle_to(&truth.rotation).to_degrees(),
-        median_depth_error: quantile(&mut errors, 0.5),
-        modes: depth.map_or([f64::NAN; 3], |depth| modes(intrinsics, initializer, depth)),
-        common_error: outcome.evidence.common_error,
-    }
-}
-
-/// Slopes of ln(d / d_true) over (X, Y, ln d_true), X and Y the ray's coordinates: least squares, reweighted
-/// against points on occluding edges.
-fn modes(k: Intrinsics, initializer: &TwoFrameInitializer, depth: &Image<f32>) -> [f64; 3] {
-    /// Deviations beyond this many median deviations lose weight.
-    const HUBER: f64 = 2.0;
-    const ROUNDS: usize = 10;
-    let rows: Vec<(Vector4<f64>, f64)> = initializer
-        .depths()
-        .filter_map(|d| {
-            let (u, v) = (usize::from(d.u), usize::from(d.v));
-            let inverse = 1.0 / f64::from(depth.at(u, v));
-            let ray = ((f64::from(d.u) - k.cx) / k.fx, (f64::from(d.v) - k.cy) / k.fy);
-            let log_ratio = (f64::from(d.inverse_depth) / inverse).ln();
-            (inverse.is_finite() && log_ratio.is_finite())
-                .then(|| (Vector4::new(ray.0, ray.1, inverse.ln(), 1.0), log_ratio))
-        })
-        .collect();
-    let mut weights = vec![1.0; rows.len()];
-    let mut slopes = Vector4::zeros();
-    for _ in 0..ROUNDS {
-        let (mut hessian, mut right) = (Matrix4::zeros(), Vector4::zeros());
-        for ((row, y), w) in rows.iter().zip(&weights) {
-            hessian += row * row.transpose() * *w;
-            right += row * (*y * *w);
-        }
-        let Some(solved) = hessian.cholesky().map(|factor| factor.solve(&right)) else {
-            return [f64::NAN; 3];
-        };
-        slopes = solved;
-        let residual = |(row, y): &(Vector4<f64>, f64)| (y - row.dot(&slopes)).abs();
-        let mut sizes: Vec<f64> = rows.iter().map(residual).collect();
-        let limit = HUBER * 1.4826 * quantile(&mut sizes.clone(), 0.5).max(1e-6);
-        sizes.iter_mut().for_each(|size| *size = (limit / *size).min(1.0));
-        weights = sizes;
-    }
-    [slopes[0], slopes[1], slopes[2]]
 }
 
 /// A quantile; NaN of nothing.

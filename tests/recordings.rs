@@ -1,28 +1,10 @@
 //! The readers against recordings of real cameras, where these are on the machine.
 
-use std::io::Write;
-use std::path::PathBuf;
+#[path = "support/recordings.rs"]
+mod recordings;
 
+use recordings::recording;
 use semidense::capture::source::{SourceName, SourceParams, open};
-
-/// The folder of a development recording; `None`, and a word about it, where it is not there.
-fn recording(name: &str) -> Option<PathBuf> {
-    let root = std::env::var_os("SEMIDENSE_DATA").map_or_else(
-        || PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data"),
-        PathBuf::from,
-    );
-    let folder = root.join(name);
-    if folder.is_dir() {
-        return Some(folder);
-    }
-    // Not `println!`, which the test runner swallows: a skipped test should not look like a passed one.
-    let skipped = folder.display();
-    let _ = writeln!(
-        std::io::stderr(),
-        "skipped: {skipped} is not there; SEMIDENSE_DATA names its parent"
-    );
-    None
-}
 
 #[test]
 fn every_recording_is_read_whole() {

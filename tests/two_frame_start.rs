@@ -1,17 +1,21 @@
 //! The two-frame start on simulated sequences: it starts where there is parallax, with the right pose
 //! and depth, and never where there is none.
 
-use std::path::PathBuf;
+#[path = "support/recordings.rs"]
+mod recordings;
 
+use recordings::{recording, say};
 use semidense::capture::simulator::Simulator;
 use semidense::capture::simulator::params::{
     MotionKind, MotionParams, SceneKind, SensorParams, SimulatorParams,
 };
 use semidense::capture::source::{FrameSource, SourceName, SourceParams, open};
+use semidense::slam::evaluation::start_error::StartErrors;
+use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::image::buffer::Image;
 use semidense::slam::two_frame::evidence::EvidenceParams;
-use semidense::slam::two_frame::{InitOutcome, InitState, TwoFrameInitializer, TwoFrameParams};
+use semidense::slam::two_frame::{InitState, TwoFrameInitializer, TwoFrameParams};
 
 /// Largest error of the direction of a start that is proven by earlier frames and not by a long
 /// translation, degrees: it is of some 2 px, and its map is mended by the frames that follow.
@@ -19,94 +23,70 @@ const EARLY_DIRECTION_DEG: f64 = 20.0;
 
 /// What a start came to.
 #[derive(Debug)]
-#[allow(dead_code, reason = "printed as a whole")]
 struct Start {
-    /// Frames it took, failed starts included.
+    /// Frames from the first one of all to the proof, failed starts included.
     frames: usize,
     /// Length of the translation in mean depths.
     translation: f64,
-    /// True length of the translation, metres.
-    baseline_m: f64,
-    direction_error_deg: f64,
-    rotation_error_deg: f64,
-    median_depth_error: f64,
-    /// Share of the points whose depth is right within two standard deviations.
-    within_two_sigmas: f64,
+    errors: StartErrors,
 }
 
-/// The ground truth nearest to a stamp.
-fn pose_at(source: &dyn FrameSource, nanos: i64) -> SE3 {
+impl Start {
+    /// Median relative error of its depths, where the truth is known.
+    fn depth_error(&self) -> Option<f64> {
+        self.errors.depth.map(|depth| depth.relative_error_median)
+    }
+}
+
+/// One frame of a source.
+struct Frame {
+    pixels: Vec<u8>,
+    world_from_camera: SE3,
+    depth: Option<Image<f32>>,
+}
+
+/// A frame of a source, with its true pose and depth; `None` after the last.
+fn next(source: &mut dyn FrameSource) -> Option<Frame> {
+    let camera = source.intrinsics();
+    let mut pixels = vec![0; camera.width * camera.height];
+    let nanos = source.next_into(&mut pixels).unwrap()?.capture_nanos;
     let nearest = source.ground_truth().iter().min_by_key(|p| p.nanos.abs_diff(nanos));
-    nearest.expect("a source with ground truth").world_from_camera
+    let world_from_camera = nearest.expect("a source with ground truth").world_from_camera;
+    let depth = source.depth_at(nanos).unwrap();
+    Some(Frame { pixels, world_from_camera, depth })
 }
 
-/// The first start on a source after its first `skip` frames.
-fn start(source: &mut dyn FrameSource, skip: usize) -> Option<Start> {
-    let intrinsics = source.intrinsics();
-    let mut initializer = TwoFrameInitializer::new(intrinsics, TwoFrameParams::default()).unwrap();
-    let mut pixels = vec![0; intrinsics.width * intrinsics.height];
+/// The first start on these frames.
+fn start<'a>(camera: Intrinsics, frames: impl Iterator<Item = &'a Frame>) -> Option<Start> {
+    let mut initializer = TwoFrameInitializer::new(camera, TwoFrameParams::default()).unwrap();
     let mut first = None;
-    let mut tried = 0;
-    while let Some(stamp) = source.next_into(&mut pixels).unwrap() {
-        if (stamp.sequence as usize) < skip {
-            continue;
-        }
-        let outcome = initializer.step(&pixels);
-        tried += 1;
-        let nanos = stamp.capture_nanos;
+    for (index, frame) in frames.enumerate() {
+        let outcome = initializer.step(&frame.pixels);
         match outcome.state {
-            InitState::Failed(_) => first = Some(nanos),
-            InitState::Waiting(_) => first = first.or(Some(nanos)),
+            InitState::Failed(_) => first = Some(frame),
+            InitState::Waiting(_) => first = first.or(Some(frame)),
             InitState::Proven => {
-                let first = first.expect("a start takes two frames");
-                let truth = pose_at(source, first).inverse() * pose_at(source, nanos);
-                let depth = source.depth_at(first).unwrap();
-                return Some(figures(&initializer, outcome, &truth, depth, tried));
+                let first: &Frame = first.expect("a start takes two frames");
+                let truth = first.world_from_camera.inverse() * frame.world_from_camera;
+                let (found, depths) = (&outcome.first_from_current, initializer.depths());
+                let errors = StartErrors::of(found, depths, &camera, &truth, first.depth.as_ref());
+                let translation = outcome.evidence.translation;
+                return Some(Start { frames: index, translation, errors });
             }
         }
     }
     None
 }
 
-fn figures(
-    initializer: &TwoFrameInitializer,
-    outcome: InitOutcome,
-    truth: &SE3,
-    depth: Option<Image<f32>>,
-    frames: usize,
-) -> Start {
-    let found = outcome.first_from_current;
-    let cosine = found.translation.normalize().dot(&truth.translation.normalize());
-    let mut start = Start {
-        frames,
-        direction_error_deg: cosine.clamp(-1.0, 1.0).acos().to_degrees(),
-        rotation_error_deg: found.rotation.angle_to(&truth.rotation).to_degrees(),
-        translation: outcome.evidence.translation,
-        baseline_m: truth.translation.norm(),
-        median_depth_error: f64::NAN,
-        within_two_sigmas: f64::NAN,
-    };
-    let Some(depth) = depth else { return start };
-    let known = |z: &f64| *z > 0.0;
-    let mut scaled: Vec<(f64, f64)> = initializer
-        .depths()
-        .map(|d| (d, f64::from(depth.at(usize::from(d.u), usize::from(d.v)))))
-        .filter(|(_, z)| known(z))
-        .map(|(d, z)| (f64::from(d.inverse_depth) * z, f64::from(d.variance.sqrt()) * z))
-        .collect();
-    scaled.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let scale = scaled[scaled.len() / 2].0;
-    let within = scaled.iter().filter(|(product, sigma)| (product - scale).abs() < 2.0 * sigma);
-    start.within_two_sigmas = within.count() as f64 / scaled.len() as f64;
-    let mut errors: Vec<f64> =
-        scaled.iter().map(|(product, _)| (scale / product - 1.0).abs()).collect();
-    errors.sort_by(f64::total_cmp);
-    start.median_depth_error = errors[errors.len() / 2];
-    start
+/// Up to `most` frames of a source.
+fn read(source: &mut dyn FrameSource, most: usize) -> Vec<Frame> {
+    std::iter::from_fn(|| next(source)).take(most).collect()
 }
 
 fn simulated(params: SimulatorParams) -> Option<Start> {
-    start(&mut Simulator::new(params).unwrap(), 0)
+    let mut simulator = Simulator::new(params).unwrap();
+    let frames = read(&mut simulator, usize::MAX);
+    start(simulator.intrinsics(), frames.iter())
 }
 
 fn params(kind: MotionKind, seed: u64, frames: usize, noise_std_dev: f64) -> SimulatorParams {
@@ -124,8 +104,8 @@ fn a_hand_held_camera_starts() {
     for seed in 1..=5 {
         let start = simulated(params(MotionKind::Handheld, seed, 60, 2.0)).unwrap();
         println!("handheld {seed}: {start:.3?}");
-        assert!(start.median_depth_error <= 0.1, "{seed}: {start:?}");
-        assert!(start.direction_error_deg <= allowed_deg(&start, 6.0), "{seed}: {start:?}");
+        assert!(start.depth_error().unwrap() <= 0.1, "{seed}: {start:?}");
+        assert!(start.errors.direction_deg <= allowed_deg(&start, 6.0), "{seed}: {start:?}");
     }
 }
 
@@ -135,8 +115,8 @@ fn a_camera_on_a_rail_starts_in_every_scene() {
         let params = SimulatorParams { scene, ..params(MotionKind::Straight, 2, 60, 2.0) };
         let start = simulated(params).unwrap();
         println!("rail {scene:?}: {start:.3?}");
-        assert!(start.median_depth_error <= 0.1, "{scene:?}: {start:?}");
-        assert!(start.direction_error_deg <= allowed_deg(&start, 6.0), "{scene:?}: {start:?}");
+        assert!(start.depth_error().unwrap() <= 0.1, "{scene:?}: {start:?}");
+        assert!(start.errors.direction_deg <= allowed_deg(&start, 6.0), "{scene:?}: {start:?}");
     }
 }
 
@@ -162,19 +142,8 @@ fn allowed_deg(start: &Start, direction_deg: f64) -> f64 {
     if is_early { direction_deg.max(EARLY_DIRECTION_DEG) } else { direction_deg }
 }
 
-/// The folder of a development recording; `None`, and a word about it, where it is not there.
-fn recording(name: &str) -> Option<PathBuf> {
-    let root = std::env::var_os("SEMIDENSE_DATA").map_or_else(
-        || PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data"),
-        PathBuf::from,
-    );
-    let folder = root.join(name);
-    if folder.is_dir() {
-        return Some(folder);
-    }
-    println!("skipped: {} is not there; SEMIDENSE_DATA names its parent", folder.display());
-    None
-}
+/// Frames of a source within which a start must be proven.
+const PATIENCE: usize = 60;
 
 /// Starts of a recording after so many frames, with the largest error of direction and depth that the
 /// ground truth lets us ask for: `truth_error_m` across a baseline of some centimetres turns its direction.
@@ -186,18 +155,22 @@ fn assert_recording_starts(
     truth_error_m: f64,
 ) {
     let Some(folder) = recording(name) else { return };
+    let mut source = open(&SourceName::Tum(folder), None, &SourceParams::default()).unwrap();
+    let most = skips.last().unwrap() + PATIENCE;
+    let frames = read(source.as_mut(), most);
     for &skip in skips {
-        let mut source =
-            open(&SourceName::Tum(folder.clone()), None, &SourceParams::default()).unwrap();
-        let start = start(source.as_mut(), skip).unwrap();
+        let start = start(source.intrinsics(), frames[skip..].iter()).unwrap();
         println!("{name} from {skip}: {start:.3?}");
-        let truth_deg = (truth_error_m / start.baseline_m).min(1.0).asin().to_degrees();
+        let truth_deg = (truth_error_m / start.errors.baseline_m).min(1.0).asin().to_degrees();
         assert!(
-            start.direction_error_deg <= allowed_deg(&start, direction_deg) + truth_deg,
+            start.errors.direction_deg <= allowed_deg(&start, direction_deg) + truth_deg,
             "{name} from {skip}: {start:?}"
         );
         // Where the first frame has no depth there is nothing to compare.
-        assert!(!(start.median_depth_error > depth), "{name} from {skip}: {start:?}");
+        assert!(
+            !start.depth_error().is_some_and(|error| error > depth),
+            "{name} from {skip}: {start:?}"
+        );
     }
 }
 
@@ -222,4 +195,62 @@ fn the_rendered_office_starts() {
 #[test]
 fn the_rendered_desk_starts() {
     assert_recording_starts("tsukuba", &[0, 40, 80], 5.0, 0.1, 0.0);
+}
+
+/// First frames of a recording that are tried, and how far they are apart.
+const FIRST_FRAMES: usize = 12;
+const APART: usize = 3;
+
+/// Starts a recording from each of its first frames with every `stride`-th frame, prints what each came to, and
+/// gives how many started and how many of them were wrong.
+fn starts(name: &str, stride: usize) -> Option<(usize, usize)> {
+    let folder = recording(name)?;
+    let mut source = open(&SourceName::Tum(folder), None, &SourceParams::default()).unwrap();
+    let frames = read(source.as_mut(), FIRST_FRAMES * APART + PATIENCE);
+    let (mut started, mut wrong) = (0, 0);
+    for first in (0..FIRST_FRAMES).map(|i| i * APART) {
+        let rest = frames.iter().skip(first).take(PATIENCE).step_by(stride);
+        let Some(Start { frames, translation, errors }) = start(source.intrinsics(), rest) else {
+            say(&format!("{name} / {stride} from {first}: no start"));
+            continue;
+        };
+        started += 1;
+        wrong += usize::from(errors.is_wrong());
+        let StartErrors { direction_deg, rotation_deg, depth, modes, shape, .. } = &errors;
+        say(&format!(
+            "{name} / {stride} from {first}: frame {frames}, moved {translation:.4}, direction {direction_deg:.1}°, \
+             rotation {rotation_deg:.2}°, depth {:.3?}, shape {shape:.3?}, modes {:+.2?}{}",
+            depth.map(|depth| depth.relative_error_median),
+            modes.map(|modes| [modes.column, modes.row, modes.relief]),
+            if errors.is_wrong() { "  WRONG" } else { "" }
+        ));
+    }
+    Some((started, wrong))
+}
+
+const RECORDINGS: [&str; 4] = ["redkitchen", "fr1-floor", "tsukuba", "icl-office3"];
+
+/// Over all recordings: how many of the first frames started, and how many starts were wrong.
+fn all_starts(stride: usize) -> Option<(usize, usize)> {
+    let found: Option<Vec<_>> = RECORDINGS.iter().map(|name| starts(name, stride)).collect();
+    let sum = |(a, b): (usize, usize), (c, d): (usize, usize)| (a + c, b + d);
+    let (started, wrong) = found?.into_iter().fold((0, 0), sum);
+    let tried = RECORDINGS.len() * FIRST_FRAMES;
+    say(&format!("one frame in {stride}: {started} of {tried} first frames start, {wrong} wrong"));
+    Some((started, wrong))
+}
+
+#[test]
+#[ignore = "a minute and a half with the next one; the CI runs both"]
+fn no_start_from_any_first_frame_is_wrong() {
+    let Some((started, wrong)) = all_starts(1) else { return };
+    assert_eq!((started, wrong), (RECORDINGS.len() * FIRST_FRAMES, 0));
+}
+
+#[test]
+#[ignore = "see above"]
+fn where_two_of_three_frames_are_skipped_hardly_a_start_is_wrong() {
+    let Some((started, wrong)) = all_starts(3) else { return };
+    // Two on the floor have the right motion and a depth whose shape is 16 % off, just beyond the limit.
+    assert!(started >= 46 && wrong <= 2, "{started} started, {wrong} wrong");
 }

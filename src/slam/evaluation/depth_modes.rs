@@ -39,21 +39,7 @@ impl DepthModes {
     /// The modes of `keyframe`, whose depth in metres is `metres_per_unit / d`; `None` where too few points have
     /// true depth, or all at one depth or in one line.
     pub fn of(keyframe: &Keyframe, true_depth: &Image<f32>, metres_per_unit: f64) -> Option<Self> {
-        let camera = &keyframe.intrinsics;
-        let mut samples: Vec<(Vector4<f64>, f64)> = Vec::new();
-        for point in &keyframe.points {
-            let (u, v) = (usize::from(point.u), usize::from(point.v));
-            if u >= true_depth.width() || v >= true_depth.height() {
-                continue;
-            }
-            let (z_true, d) = (f64::from(true_depth.at(u, v)), f64::from(point.inverse_depth));
-            if !(z_true > 0.0 && z_true.is_finite() && d > 0.0 && d.is_finite()) {
-                continue;
-            }
-            let (x, y) = ((u as f64 - camera.cx) / camera.fx, (v as f64 - camera.cy) / camera.fy);
-            let error = (metres_per_unit / (d * z_true)).ln();
-            samples.push((Vector4::new(1.0, x, y, -z_true.ln()), error));
-        }
+        let mut samples = samples(keyframe, true_depth, metres_per_unit);
         if samples.len() < MIN_POINTS {
             return None;
         }
@@ -84,10 +70,46 @@ impl DepthModes {
         })
     }
 
+    /// Standard deviation, over the points of `keyframe` that have true depth, of the relative error that tilt and
+    /// relief together make of it: where depth is nearly a plane one of them can stand for the other, and only their
+    /// sum says how wrong the shape is.
+    pub fn spread(&self, keyframe: &Keyframe, true_depth: &Image<f32>) -> f64 {
+        let modes = Vector4::new(0.0, self.column, self.row, self.relief);
+        let errors: Vec<f64> =
+            samples(keyframe, true_depth, 1.0).iter().map(|(phi, _)| phi.dot(&modes)).collect();
+        let count = errors.len().max(1) as f64;
+        let mean = errors.iter().sum::<f64>() / count;
+        (errors.iter().map(|error| (error - mean).powi(2)).sum::<f64>() / count).sqrt()
+    }
+
     /// Tilt along columns and rows and relief, without their sign.
     pub fn magnitudes(&self) -> [f64; 3] {
         [self.column.abs(), self.row.abs(), self.relief.abs()]
     }
+}
+
+/// Of each point with true depth: 1, X, Y and ln d_true, and the logarithm of its depth over the true one.
+fn samples(
+    keyframe: &Keyframe,
+    true_depth: &Image<f32>,
+    metres_per_unit: f64,
+) -> Vec<(Vector4<f64>, f64)> {
+    let camera = &keyframe.intrinsics;
+    let mut samples: Vec<(Vector4<f64>, f64)> = Vec::new();
+    for point in &keyframe.points {
+        let (u, v) = (usize::from(point.u), usize::from(point.v));
+        if u >= true_depth.width() || v >= true_depth.height() {
+            continue;
+        }
+        let (z_true, d) = (f64::from(true_depth.at(u, v)), f64::from(point.inverse_depth));
+        if !(z_true > 0.0 && z_true.is_finite() && d > 0.0 && d.is_finite()) {
+            continue;
+        }
+        let (x, y) = ((u as f64 - camera.cx) / camera.fx, (v as f64 - camera.cy) / camera.fy);
+        let error = (metres_per_unit / (d * z_true)).ln();
+        samples.push((Vector4::new(1.0, x, y, -z_true.ln()), error));
+    }
+    samples
 }
 
 /// The modes of `normal · modes = right`; `None` where the points do not tell two of them apart.
@@ -153,6 +175,11 @@ mod tests {
             assert!((found.row - put.row).abs() < 0.005, "{found:?}");
             assert!((found.relief - put.relief).abs() < 0.005, "{found:?}");
             assert!((found.scale - put.scale).abs() < 0.01, "{found:?}");
+            // Of the columns alone: X is even over 1.2.
+            let column = DepthModes { row: 0.0, relief: 0.0, ..put };
+            let expected = put.column * 1.2 / 12f64.sqrt();
+            let spread = column.spread(&keyframe, &truth);
+            assert!((spread - expected).abs() < 1e-3, "{spread}, not {expected}");
         }
     }
 

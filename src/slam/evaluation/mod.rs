@@ -3,7 +3,7 @@
 //! The trajectory figures are those of the Python package `evo` on the same files: nearest stamps
 //! without interpolation ([`association`]), Umeyama alignment ([`mod@umeyama`]), absolute and relative
 //! errors ([`trajectory_error`]); [`normalized_error`] holds pose errors against their covariance. [`windows`] adds how the scale wanders, [`depth_error`] what the
-//! depth maps and their variances are worth, [`depth_modes`] what is wrong with the whole of one. Without any truth, [`map_consistency`] holds the keyframes
+//! depth maps and their variances are worth, [`depth_modes`] what is wrong with the whole of one, [`start_error`] what a start is worth. Without any truth, [`map_consistency`] holds the keyframes
 //! against each other ([`shared_view`], [`patch_misfit`], [`depth_agreement`]), and [`grade`] says what
 //! that is worth.
 
@@ -16,6 +16,7 @@ pub mod map_consistency;
 pub mod normalized_error;
 pub mod patch_misfit;
 pub mod shared_view;
+pub mod start_error;
 pub mod statistics;
 pub mod trajectory_error;
 pub mod umeyama;
