@@ -219,7 +219,7 @@ impl TwoFrameInitializer {
             return false;
         }
         self.pyramid.fill(pixels);
-        self.gradients.fill_from(self.pyramid.level(0));
+        self.gradients.fill(pixels);
         let found = self.points.choose(&self.gradients, &self.pyramid, &self.params.candidates);
         if found < self.params.min_points {
             return false;

@@ -59,30 +59,6 @@ impl GradientImage {
         });
     }
 
-    /// Takes the brightness of an image of the same size and differentiates it.
-    pub fn fill_from(&mut self, image: &Image<f32>) {
-        for (out, &intensity) in self.intensity.pixels_mut().iter_mut().zip(image.pixels()) {
-            *out = intensity;
-        }
-        self.differentiate();
-    }
-
-    fn differentiate(&mut self) {
-        let (width, height) = (self.intensity.width(), self.intensity.height());
-        let image = self.intensity.pixels();
-        for v in 1..height - 1 {
-            let inner = v * width + 1..v * width + width - 1;
-            for (out, i) in
-                self.gradient_u.pixels_mut()[inner.clone()].iter_mut().zip(inner.clone())
-            {
-                *out = 0.5 * (image[i + 1] - image[i - 1]);
-            }
-            for (out, i) in self.gradient_v.pixels_mut()[inner.clone()].iter_mut().zip(inner) {
-                *out = 0.5 * (image[i + width] - image[i - width]);
-            }
-        }
-    }
-
     /// ‖g‖ of the pixels of row `v` that are not on the border, grey levels a pixel.
     #[inline(always)]
     fn strengths(&self, v: usize) -> impl Iterator<Item = f32> {

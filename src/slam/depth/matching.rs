@@ -8,7 +8,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::epipolar::{EpipolarLine, Projection, TwoView};
 use crate::slam::depth::map::{BORDER_PX, GradientImage};
-use crate::slam::image::buffer::Image;
 use crate::slam::image::quads_kernel::{Sampled, Sampler};
 use crate::slam::parameter::{ParameterError, check_range};
 
@@ -444,21 +443,6 @@ pub fn is_inside(width: usize, height: usize, u: f32, v: f32) -> bool {
         && v >= MARGIN_PX
         && u < width as f32 - 1.0 - MARGIN_PX
         && v < height as f32 - 1.0 - MARGIN_PX
-}
-
-/// Bilinear sample; positions outside take the nearest pixel inside.
-#[inline]
-pub fn bilinear(image: &Image<f32>, u: f32, v: f32) -> f32 {
-    let (width, height) = (image.width(), image.height());
-    let u = u.max(0.0).min((width - 2) as f32);
-    let v = v.max(0.0).min((height - 2) as f32);
-    let (column, row) = (u as usize, v as usize);
-    let (fu, fv) = (u - column as f32, v - row as f32);
-    let i = row * width + column;
-    let pixels = image.pixels();
-    let upper = pixels[i] + fu * (pixels[i + 1] - pixels[i]);
-    let lower = pixels[i + width] + fu * (pixels[i + width + 1] - pixels[i + width]);
-    upper + fv * (lower - upper)
 }
 
 #[cfg(test)]

@@ -13,7 +13,6 @@ use crate::slam::depth::epipolar::{MIN_DEPTH_RATIO, TwoView};
 use crate::slam::depth::map::{
     Arrival, BAND_ROWS, BORDER_PX, DepthMap, Hypothesis, KnownColumns, for_each_known,
 };
-use crate::slam::depth::matching::bilinear;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::parameter::{ParameterError, check_range};
@@ -201,7 +200,7 @@ impl<'a> Way<'a> {
             return None;
         }
         let expected = self.gain * intensity + self.offset;
-        let residual = (bilinear(&image.intensity, u, v) - expected).abs();
+        let residual = (image.intensity.bilinear(u, v) - expected).abs();
         let gradient_u = f64::from(image.gradient_u.pixels()[index]);
         let gradient_v = f64::from(image.gradient_v.pixels()[index]);
         let gradient = (gradient_u * gradient_u + gradient_v * gradient_v).sqrt() as f32;

@@ -51,3 +51,40 @@ impl<T: Copy> Image<T> {
         &self.pixels[v * self.width..(v + 1) * self.width]
     }
 }
+
+impl Image<f32> {
+    /// Bilinear sample; positions outside take the nearest pixel inside.
+    #[inline]
+    pub fn bilinear(&self, u: f32, v: f32) -> f32 {
+        let u = u.max(0.0).min((self.width - 2) as f32);
+        let v = v.max(0.0).min((self.height - 2) as f32);
+        let (column, row) = (u as usize, v as usize);
+        let (fu, fv) = (u - column as f32, v - row as f32);
+        let i = row * self.width + column;
+        let (pixels, below) = (&self.pixels, i + self.width);
+        let upper = pixels[i] + fu * (pixels[i + 1] - pixels[i]);
+        let lower = pixels[below] + fu * (pixels[below + 1] - pixels[below]);
+        upper + fv * (lower - upper)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Image;
+
+    #[test]
+    fn samples_are_bilinear_and_stay_inside() {
+        // 0, 10, 20, below them 100, 110, 120 and 200, 210, 220.
+        let greys = (0..9).map(|i| (100 * (i / 3) + 10 * (i % 3)) as f32).collect();
+        let image = Image::try_from_pixels(3, 3, greys).unwrap();
+        for (u, v, expected) in [
+            (0.25, 0.5, 52.5f32),
+            (1.0, 0.0, 10.0),
+            (-7.0, -1.0, 0.0),
+            (9.0, 0.0, 10.0),
+            (f32::NAN, 0.0, 0.0),
+        ] {
+            assert_eq!(image.bilinear(u, v), expected, "{u} {v}");
+        }
+    }
+}

@@ -12,7 +12,6 @@ use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::mapper::consistency::judge_change;
 use crate::slam::mapper::depth_buffers::write_depth;
-use crate::slam::mapper::observation::DepthFilter;
 use crate::slam::mapper::start::take_sensor_depth;
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::pose::{Brightness, PoseEstimate};
@@ -100,7 +99,7 @@ impl Mapper {
             before.revision = self.revision;
             write_depth(&self.depth.spare, unfinished.unit, before);
         }
-        let searches = self.params.depth_filter == DepthFilter::Gaussian;
+        let searches = self.params.depth_filter.searches_past();
         let mut keyframe_changed = false;
         if searches && unfinished.has_new_pixels && self.seed_from_past(unfinished.line_noise_px) {
             self.depth.refine(&self.params);

@@ -7,7 +7,6 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS};
 use crate::slam::map::LogPlane;
 use crate::slam::mapper::MapperParams;
-use crate::slam::mapper::observation::DepthFilter;
 
 /// Owner of all that the filters work on.
 #[derive(Debug)]
@@ -55,18 +54,17 @@ impl DepthBuffers {
 
     /// Chooses the points that the interval filter traces.
     pub(super) fn plant_points(&mut self, params: &MapperParams) {
-        match params.depth_filter {
-            DepthFilter::Gaussian => {}
-            DepthFilter::Interval => {
-                self.points.restart_with_known(&mut self.active, &params.candidates);
-            }
-            DepthFilter::Both => self.points.restart_where_empty(&self.active),
+        let filter = params.depth_filter;
+        match filter.has_points() {
+            true if filter.is_dense() => self.points.restart_where_empty(&self.active),
+            true => self.points.restart_with_known(&mut self.active, &params.candidates),
+            false => {}
         }
     }
 
-    /// Smooths what was observed; points of the interval filter have no neighbours to agree with.
+    /// Smooths what was observed, where it is dense.
     pub(super) fn refine(&mut self, params: &MapperParams) {
-        if params.depth_filter != DepthFilter::Interval {
+        if params.depth_filter.is_dense() {
             regularise(&mut self.active, &mut self.regularisation, &params.regularisation);
         }
         self.unpublished = 0;

@@ -24,6 +24,33 @@ pub enum DepthFilter {
     Both,
 }
 
+/// The one place that tells the filters apart.
+impl DepthFilter {
+    /// Which pixels the Gaussian filter observes; `None` where the points of the interval filter are alone.
+    fn observed(self) -> Option<ObservedPixels> {
+        match self {
+            Self::Gaussian => Some(ObservedPixels::All),
+            Self::Both => Some(ObservedPixels::Known),
+            Self::Interval => None,
+        }
+    }
+
+    /// Whether points of the interval filter are traced.
+    pub(super) fn has_points(self) -> bool {
+        self != Self::Gaussian
+    }
+
+    /// Whether depth is smoothed: evenly chosen points have no neighbours to agree with.
+    pub(super) fn is_dense(self) -> bool {
+        self.observed().is_some()
+    }
+
+    /// Whether new pixels are searched in frames from before their keyframe: points wait for those that follow.
+    pub(super) fn searches_past(self) -> bool {
+        !self.has_points()
+    }
+}
+
 impl Mapper {
     /// Observes the depth of the active keyframe in `frame`.
     pub(super) fn observe_frame(
@@ -33,28 +60,25 @@ impl Mapper {
     ) -> ObservationCounts {
         let view = self.view_of(&pose.keyframe_from_camera);
         self.frame.fill(frame.pixels);
-        let brightness = pose.brightness;
-        let pixels = match self.params.depth_filter {
-            DepthFilter::Gaussian => ObservedPixels::All,
-            DepthFilter::Interval | DepthFilter::Both => ObservedPixels::Known,
-        };
-        let observer = Observer { image: &self.frame, view, brightness, pixels };
-        let traced = TraceFrame { image: &self.frame, view, brightness };
+        let (image, brightness) = (&self.frame, pose.brightness);
         let matching = self.matching_at(pose);
+        let filter = self.params.depth_filter;
         let (depth, points) = (&mut self.depth.active, &mut self.depth.points);
-        let (gaussian, interval) = (&self.params.gaussian, &self.params.interval);
-        match self.params.depth_filter {
-            DepthFilter::Gaussian => observe(depth, &observer, &matching, gaussian),
-            DepthFilter::Interval => {
-                points.trace(&traced, interval);
-                points.write_into(depth, interval)
-            }
-            DepthFilter::Both => {
-                let counts = observe(depth, &observer, &matching, gaussian);
-                points.trace(&traced, interval);
-                ObservationCounts { created: points.hand_over(depth, interval), ..counts }
-            }
+        let mut counts = ObservationCounts::default();
+        if let Some(pixels) = filter.observed() {
+            let observer = Observer { image, view, brightness, pixels };
+            counts = observe(depth, &observer, &matching, &self.params.gaussian);
         }
+        if filter.has_points() {
+            let interval = &self.params.interval;
+            points.trace(&TraceFrame { image, view, brightness }, interval);
+            // Beside the Gaussian filter a mature point is its to go on with.
+            counts = match filter.is_dense() {
+                true => ObservationCounts { created: points.hand_over(depth, interval), ..counts },
+                false => points.write_into(depth, interval),
+            };
+        }
+        counts
     }
 
     /// The view of a frame from the active keyframe, in the unit of its depth buffer.

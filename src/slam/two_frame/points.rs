@@ -3,7 +3,7 @@
 
 use crate::slam::depth::candidate::{CandidateParams, CandidateSelector};
 use crate::slam::depth::map::GradientImage;
-use crate::slam::depth::matching::{PATTERN, bilinear};
+use crate::slam::depth::matching::PATTERN;
 use crate::slam::image::buffer::Image;
 use crate::slam::image::pyramid::Pyramid;
 use crate::slam::two_frame::lanes::{LANES, Lanes};
@@ -114,10 +114,10 @@ fn fill_lane(
     }
     for (k, (x, y)) in PATTERN.iter().enumerate() {
         let (x, y) = (u + *x as f32, v + *y as f32);
-        let gu = 0.5 * (bilinear(image, x + 1.0, y) - bilinear(image, x - 1.0, y));
-        let gv = 0.5 * (bilinear(image, x, y + 1.0) - bilinear(image, x, y - 1.0));
+        let gu = 0.5 * (image.bilinear(x + 1.0, y) - image.bilinear(x - 1.0, y));
+        let gv = 0.5 * (image.bilinear(x, y + 1.0) - image.bilinear(x, y - 1.0));
         let half = HALF_WEIGHT_GRADIENT * HALF_WEIGHT_GRADIENT;
-        block.intensities[k][l] = bilinear(image, x, y);
+        block.intensities[k][l] = image.bilinear(x, y);
         block.weights[k][l] = half / (half + gu * gu + gv * gv);
         block.weight[l] += block.weights[k][l];
     }

@@ -436,7 +436,7 @@ fn a_point_counts_as_it_does_alone() {
             let pose = &state.current_from_first;
             let q = pose.rotation_matrix() * ray + pose.translation * 0.4f32 as f64;
             let (u, v) = (k.fx * q.x / q.z + k.cx, k.fy * q.y / q.z + k.cy);
-            let seen = crate::slam::depth::matching::bilinear(image, u as f32, v as f32);
+            let seen = image.bilinear(u as f32, v as f32);
             let expected = 0.02f64.exp() as f32 * patch.intensities[s][l] - 1.0;
             let size = (seen - expected).abs();
             let cost = if size <= 9.0 { size * size } else { 9.0 * (2.0 * size - 9.0) };
