@@ -73,7 +73,6 @@ fn a_replay_says_what_a_budget_buys_and_what_the_covariance_is_worth() {
     assert!(median[0] > 0.0 && median.last() < median.first(), "{median:?}");
     assert!(median.iter().zip(&most).all(|(median, most)| median <= most), "{median:?} {most:?}");
     assert!(summary["nees_frames"].as_u64().unwrap() > 40);
-    assert!(summary["nees_mean"].as_f64().unwrap() > 0.0);
     let weights = folder.path().join("debug/keyframe-0000-weights.png");
     assert!(std::fs::read(weights).unwrap().starts_with(b"\x89PNG"));
     let report = std::fs::read_to_string(folder.path().join("report.html")).unwrap();
@@ -84,13 +83,12 @@ fn a_replay_says_what_a_budget_buys_and_what_the_covariance_is_worth() {
 }
 
 #[test]
-fn the_floor_of_the_covariance_is_for_readers_only() {
+fn what_the_covariance_allows_for_is_for_readers_only() {
     let folder = tempfile::tempdir().unwrap();
-    // Both shares of the floor: with one alone the other would bound the normalised error.
-    let runs = [("0", "0"), ("1", "0.1"), ("50", "1")].map(|(image_px, ratio)| {
-        let about = format!("tracking.covariance_floor.image_px={image_px}");
-        let along = format!("tracking.covariance_floor.translation_ratio={ratio}");
-        let arguments = ["sim", "--frames", "80", "--json", "--set", &about, "--set", &along];
+    let runs = [("0", "0"), ("0.02", "2.8"), ("5", "50")].map(|(image_px, ratio)| {
+        let image = format!("tracking.covariance_floor.image_px={image_px}");
+        let tiles = format!("tracking.covariance_floor.misfit_ratio={ratio}");
+        let arguments = ["sim", "--frames", "80", "--json", "--set", &image, "--set", &tiles];
         let dir = folder.path().join(image_px);
         let output = replay(&[&arguments[..], &HALF_SIZE].concat(), &dir);
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
@@ -98,9 +96,32 @@ fn the_floor_of_the_covariance_is_for_readers_only() {
         let files = ["trajectory.txt", "trajectory_online.txt", "keyframes.txt", "map.ply"];
         (files.map(|name| std::fs::read(dir.join(name)).unwrap()), summary)
     });
-    assert!(runs[0].0 == runs[1].0 && runs[0].0 == runs[2].0, "the mapper sees the floor");
+    assert!(runs[0].0 == runs[1].0 && runs[0].0 == runs[2].0, "the map depends on it");
     let [none, usual, wide] = runs.map(|(_, summary)| summary["nees_median"].as_f64().unwrap());
-    assert!(none > 3.0 * usual && usual > 3.0 * wide, "{none} {usual} {wide}");
+    assert!(none > 1.1 * usual && usual > 3.0 * wide, "{none} {usual} {wide}");
+}
+
+/// With the map's own depth, where errors are alike over a keyframe. Measured: 1.0 and 0.9; without the common errors and
+/// the displacement of the image 5.3 and 7.5, with a displacement of a whole pixel 0.02.
+#[test]
+fn the_published_covariance_is_as_wide_as_the_errors_in_a_simulated_room() {
+    for seed in ["1", "4"] {
+        let folder = tempfile::tempdir().unwrap();
+        let seed = format!("simulator.seed={seed}");
+        let arguments = ["sim", "--frames", "200", "--json", "--set", &seed];
+        let output = replay(&[&arguments[..], &HALF_SIZE].concat(), folder.path());
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let summary: Value = serde_json::from_slice(&output.stdout).unwrap();
+        let figure = |name: &str| summary[name].as_f64().unwrap();
+        assert!(figure("nees_frames") > 150.0);
+        let median = figure("nees_median");
+        assert!((0.4..=3.0).contains(&median), "{seed}: {median}");
+        // The errors of the depth itself over what its keyframes claim: 0.67 is right.
+        let modes = summary["depth_modes_whitened"].as_array().unwrap();
+        let modes: Vec<f64> = modes.iter().map(|mode| mode.as_f64().unwrap()).collect();
+        assert!(modes.iter().all(|&mode| mode < 1.5), "{seed}: {modes:?}");
+        assert!(modes.iter().any(|&mode| mode > 0.3), "{seed}: {modes:?}");
+    }
 }
 
 #[test]

@@ -3,7 +3,7 @@
 //!
 //! Layout: magic, then the first free epoch (u32), the number of keyframes (u64), then each keyframe: id, revision, sequence
 //! (u64), stamp (i64), epoch, map state, width, height (u32), pose (8 × f64), intrinsics
-//! (4 × f64), number of points (u64), points (u16, u16, 3 × f32), number of image bytes (u64, 0 where the
+//! (4 × f64), covariance of common depth errors (6 × f64), number of points (u64), points (u16, u16, 3 × f32), number of image bytes (u64, 0 where the
 //! image was given up), image bytes.
 
 use std::io::{self, BufReader, Read, Write};
@@ -16,12 +16,12 @@ use crate::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS};
 use crate::slam::map::Map;
 use crate::slam::pose::NO_KEYFRAME;
 use crate::wire::conversion::{
-    MessageError, check_points, code_from_map_state, map_state_from_code, similarity_from_message,
-    similarity_message,
+    MessageError, check_points, code_from_map_state, map_state_from_code,
+    mode_covariance_from_message, similarity_from_message, similarity_message,
 };
 
 /// First bytes of the file, with the version of the layout.
-const MAGIC: [u8; 16] = *b"semidense map 4\n";
+const MAGIC: [u8; 16] = *b"semidense map 5\n";
 /// Largest id or revision: what comes after it must not overflow.
 const MAX_NUMBER: u64 = u64::MAX / 2;
 /// Largest number of an epoch, for the same reason.
@@ -108,7 +108,9 @@ fn write_keyframe(file: &mut impl Write, keyframe: &Keyframe) -> io::Result<()> 
     }
     let in_world = similarity_message(&keyframe.world_from_keyframe);
     let in_map = similarity_message(&keyframe.map_from_keyframe);
-    for number in in_world.into_iter().chain(in_map).chain([k.fx, k.fy, k.cx, k.cy]) {
+    let intrinsics = [k.fx, k.fy, k.cx, k.cy];
+    let modes = keyframe.mode_covariance.upper_triangle();
+    for number in in_world.into_iter().chain(in_map).chain(intrinsics).chain(modes) {
         file.write_all(&number.to_le_bytes())?;
     }
     file.write_all(&(keyframe.points.len() as u64).to_le_bytes())?;
@@ -230,6 +232,7 @@ impl<R: Read> Reader<'_, R> {
         if !intrinsics.is_valid() {
             return Err(wrong(MessageError::InvalidIntrinsics { width, height }));
         }
+        let mode_covariance = mode_covariance_from_message(&self.numbers()?).map_err(&wrong)?;
         let num_points = self.count("points", MAX_KEYFRAME_POINTS as u64)?;
         let points = (0..num_points).map(|_| self.point()).collect::<Result<Vec<_>, _>>()?;
         check_points(&points, &intrinsics).map_err(&wrong)?;
@@ -255,6 +258,7 @@ impl<R: Read> Reader<'_, R> {
             map_from_keyframe: similarity_from_message(&in_map, "map_from_keyframe")
                 .map_err(&wrong)?,
             map_revision,
+            mode_covariance,
             intrinsics,
             image,
             points,
@@ -283,6 +287,7 @@ mod tests {
     use crate::slam::geometry::se3::SE3;
     use crate::slam::geometry::sim3::Sim3;
     use crate::slam::keyframe::MapState;
+    use crate::slam::modes::ModeCovariance;
     use nalgebra::Vector6;
 
     fn map() -> Map {
@@ -299,6 +304,7 @@ mod tests {
             world_from_keyframe: Sim3::new(rigid, 1.7),
             map_from_keyframe: Sim3::new(rigid.inverse(), 2.3),
             map_revision: 3,
+            mode_covariance: ModeCovariance::of_std_devs([0.1, 0.2, 0.3]),
             intrinsics: Intrinsics { fx: 20.0, fy: 21.0, cx: 8.0, cy: 7.5, width: 17, height: 16 },
             image: (0..17 * 16).map(|i| (i % 251) as u8).collect(),
             points: vec![point; 5],

@@ -2,6 +2,7 @@
 
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::sim3::Sim3;
+use crate::slam::modes::ModeCovariance;
 
 /// One pixel with depth, as it goes over the wire.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -92,6 +93,8 @@ pub struct Keyframe {
     pub intrinsics: Intrinsics,
     /// Rectified grey image, `width * height` bytes.
     pub image: Vec<u8>,
+    /// How uncertain the errors are that all of its depth shares.
+    pub mode_covariance: ModeCovariance,
     /// Pixels with depth in row-major order, at most [`MAX_KEYFRAME_POINTS`].
     pub points: Vec<DepthPoint>,
 }
@@ -114,6 +117,7 @@ impl Keyframe {
             world_from_keyframe: place,
             map_from_keyframe: place,
             map_revision: 0,
+            mode_covariance: ModeCovariance::ZERO,
             intrinsics,
             image,
             points,

@@ -4,6 +4,7 @@ mod change;
 pub mod consistency;
 mod correction;
 mod depth_buffers;
+pub mod modes;
 pub mod observation;
 mod past;
 mod phase;
@@ -32,6 +33,7 @@ use crate::slam::map::Map;
 use crate::slam::mapper::change::Unfinished;
 use crate::slam::mapper::consistency::ConsistencyParams;
 use crate::slam::mapper::depth_buffers::DepthBuffers;
+use crate::slam::mapper::modes::{KeyframeModes, ModeParams, in_unit};
 use crate::slam::mapper::observation::DepthFilter;
 use crate::slam::mapper::past::PastFrames;
 use crate::slam::mapper::phase::{Active, Phase};
@@ -80,6 +82,8 @@ pub struct MapperParams {
     pub candidates: CandidateParams,
     /// The step to a new keyframe.
     pub propagation: PropagationParams,
+    /// How uncertain errors are that a keyframe's depth shares.
+    pub modes: ModeParams,
     /// Smoothing.
     pub regularisation: RegularisationParams,
     /// The start of a map.
@@ -108,6 +112,7 @@ impl Default for MapperParams {
             interval: IntervalParams::default(),
             candidates: CandidateParams::default(),
             propagation: PropagationParams::default(),
+            modes: ModeParams::default(),
             regularisation: RegularisationParams::default(),
             two_frame: TwoFrameParams::default(),
             consistency: ConsistencyParams::default(),
@@ -140,6 +145,7 @@ impl MapperParams {
         self.interval.validate().map_err(|e| e.within("interval"))?;
         self.candidates.validate().map_err(|e| e.within("candidates"))?;
         self.propagation.validate().map_err(|e| e.within("propagation"))?;
+        self.modes.validate().map_err(|e| e.within("modes"))?;
         self.regularisation.validate().map_err(|e| e.within("regularisation"))?;
         self.two_frame.validate().map_err(|e| e.within("two_frame"))?;
         self.consistency.validate().map_err(|e| e.within("consistency"))?;
@@ -189,6 +195,7 @@ pub struct Mapper {
     /// Where odometry had the camera last; a tracker that has lost it, or was restarted, may not know.
     last_world_from_camera: Option<SE3>,
     depth: DepthBuffers,
+    modes: KeyframeModes,
     start: Start,
     finder: Finder,
     past: PastFrames,
@@ -218,6 +225,7 @@ impl Mapper {
             world_from_map: Sim3::identity(),
             last_world_from_camera: None,
             depth: DepthBuffers::with_size(width, height),
+            modes: KeyframeModes::default(),
             start: Start::new(intrinsics, &params.two_frame)?,
             finder: Finder::new(&intrinsics),
             // The active keyframe is one more.
@@ -295,7 +303,10 @@ impl Mapper {
     ) -> StepOutcome {
         self.last_world_from_camera = Some(pose.world_from_camera);
         self.guess_unit(&pose.keyframe_from_camera);
+        let (unit, modes) = (self.depth.unit, &self.params.modes);
+        self.modes.consider(&self.depth.active, unit, &self.intrinsics, pose, modes);
         let observations = self.observe_frame(frame, pose);
+        self.modes.observed(&self.depth.active, &in_unit(&pose.keyframe_from_camera, unit));
         self.depth.unpublished += observations.fused + observations.created;
         let points = self.num_points();
         let params = &self.params.consistency;
@@ -394,6 +405,9 @@ impl Mapper {
     fn enter_keyframe(&mut self, index: usize) {
         self.left = self.keyframe().map_or(self.left, |keyframe| Some(keyframe.keyframe_id));
         self.active = Some(Active::new(index));
+        if let Some(keyframe) = self.map.keyframes.get(index) {
+            self.modes.enter(&keyframe.mode_covariance, &self.params.modes);
+        }
         self.depth.unpublished = 0;
         self.depth.plant_points(&self.params);
         self.publish_depth();
@@ -406,6 +420,7 @@ impl Mapper {
         let Some(active) = &self.active else { return };
         let Some(keyframe) = self.map.keyframes.get_mut(active.index) else { return };
         self.depth.write_into(keyframe);
+        keyframe.mode_covariance = self.modes.published(&self.params.modes);
     }
 
     /// Writes the place in the world and the revisions into the active keyframe.

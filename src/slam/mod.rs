@@ -12,6 +12,7 @@ pub mod image;
 pub mod keyframe;
 pub mod map;
 pub mod mapper;
+pub mod modes;
 pub mod parameter;
 pub mod pose;
 #[cfg(test)]

@@ -83,6 +83,9 @@ pub struct Quality {
     pub points: u32,
     /// Mean squared optical flow from the keyframe to here, pixels² at level 0.
     pub mean_squared_flow: f64,
+    /// Standard deviation by which the whole image may be displaced unseen, pixels at level 0: from what displaces its
+    /// tiles against each other. The covariance holds it.
+    pub displacement_px: f64,
 }
 
 /// The tracker's word on one frame.
@@ -109,11 +112,10 @@ pub struct PoseEstimate {
     /// Pose relative to the keyframe, translation in keyframe units.
     pub keyframe_from_camera: SE3,
     /// Upper triangle, row-major, of the covariance of the left increment (translation, rotation)
-    /// of `current_from_keyframe`, keyframe units and radians: that of the alignment, raised by the
-    /// floor of [`CovarianceFloorParams`] for errors that all points share. This is what is published. It
-    /// says nothing about the drift of the keyframe itself.
-    ///
-    /// [`CovarianceFloorParams`]: crate::slam::tracker::covariance_floor::CovarianceFloorParams
+    /// of `current_from_keyframe`, keyframe units and radians: noise of single points, errors that the
+    /// whole depth of the keyframe shares, and displacements of the whole image
+    /// ([`covariance_floor`](crate::slam::tracker::covariance_floor)). This is what is published. It says nothing about
+    /// the drift of the keyframe itself.
     pub covariance: [f64; 21],
     /// The same of the alignment alone, as if the errors of distant points were independent: too sure to
     /// be fused. The mapper weighs matches with it.

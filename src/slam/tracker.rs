@@ -17,7 +17,7 @@ use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::{
     Brightness, LostReason, NO_KEYFRAME, PoseEstimate, Quality, TrackingState,
 };
-use crate::slam::tracker::covariance_floor::CovarianceFloorParams;
+use crate::slam::tracker::covariance_floor::{CovarianceFloorParams, displacement_covariance};
 use crate::slam::tracker::motion::{Motion, hypotheses, turned};
 use crate::slam::tracker::verdict::{VerdictParams, fits_better, is_better, quality_of};
 
@@ -31,7 +31,7 @@ pub struct TrackerParams {
     pub alignment: AlignmentParams,
     /// What the result is worth.
     pub verdict: VerdictParams,
-    /// What the published covariance may not fall below.
+    /// What the published covariance holds beside noise and common errors of depth.
     pub covariance_floor: CovarianceFloorParams,
     /// The coarsest level fits badly, and other motions are tried, when its whitened RMSE is
     /// above this many times the last good one. DSO gives a level up at 1.5.
@@ -343,7 +343,14 @@ impl Tracker {
         alignment: &Alignment,
         missing: u64,
     ) -> PoseEstimate {
-        let quality = quality_of(alignment);
+        let quality = Quality {
+            displacement_px: self.params.covariance_floor.displacement_px(
+                &alignment.scatter.misfit,
+                alignment.state.sums.mean_energy(),
+                &self.intrinsics,
+            ),
+            ..quality_of(alignment)
+        };
         let verdict = self.params.verdict.judge(alignment, &quality, self.memory.was_lost, missing);
         let covariance = alignment.covariance(&self.params.alignment);
         let keyframe_from_camera = alignment.state.current_from_keyframe.inverse();
@@ -360,9 +367,13 @@ impl Tracker {
             }
             _ => return self.lost(frame, reference, LostReason::TooFewInliers, quality),
         };
-        let translation = &alignment.state.current_from_keyframe.translation;
-        let published =
-            self.params.covariance_floor.raised(&covariance, &self.intrinsics, translation);
+        let published = covariance
+            + alignment.covariance_from_modes(reference).unwrap_or_default()
+            + displacement_covariance(
+                quality.displacement_px,
+                &self.intrinsics,
+                reference.mean_inverse_depth(),
+            );
         self.memory.motion.observe(frame.capture_nanos, &world_from_camera);
         self.memory.brightness = alignment.state.brightness;
         let state = match reference.map_state() {
@@ -461,6 +472,7 @@ fn upper_triangle(entry: impl Fn(usize, usize) -> f64) -> [f64; 21] {
 fn is_finite(quality: &Quality) -> bool {
     [quality.whitened_rmse, quality.residual_rmse, quality.mean_squared_flow]
         .iter()
+        .chain(&[quality.displacement_px])
         .all(|figure| figure.is_finite())
 }
 

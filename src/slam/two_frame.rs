@@ -15,7 +15,7 @@ pub mod system;
 mod system_kernel;
 pub mod witness;
 
-use nalgebra::Vector3;
+use nalgebra::{Matrix6, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::candidate::CandidateParams;
@@ -127,6 +127,9 @@ pub struct InitOutcome {
     pub first_from_current: SE3,
     /// Brightness of the frame against the first.
     pub brightness: Brightness,
+    /// Covariance of the left increment (translation, rotation) of its inverse, with the length of the translation
+    /// held: the common errors of the depths come from it.
+    pub pose_covariance: Matrix6<f64>,
     /// How far the rotation that explains the frame best moves the middle of the image, pixels.
     pub rotation_px: f64,
 }
@@ -159,6 +162,7 @@ pub struct TwoFrameInitializer {
     rotation_scratch: FitScratch,
     /// The latest result: pose, brightness, inverse depth of each point and its variance.
     current_from_first: SE3,
+    pose_covariance: Matrix6<f64>,
     brightness: Brightness,
     inverse_depths: Vec<f32>,
     variances: Vec<f32>,
@@ -199,6 +203,7 @@ impl TwoFrameInitializer {
             rotation: state,
             rotation_scratch: FitScratch::default(),
             current_from_first: SE3::identity(),
+            pose_covariance: Matrix6::zeros(),
             brightness: Brightness::default(),
             inverse_depths: Vec::new(),
             variances: Vec::new(),
@@ -368,7 +373,12 @@ impl TwoFrameInitializer {
             visible.map(|(_, d)| f64::from(*d)).sum::<f64>() / joint.num_visible.max(1) as f64;
         /// A mean below this is not a scale but a failed fit.
         const MIN_MEAN: f64 = 0.05;
+        self.pose_covariance = covariance.map_or_else(Matrix6::zeros, |covariance| {
+            covariance.fixed_view::<6, 6>(0, 0) * f64::from(noise)
+        });
         if mean > MIN_MEAN {
+            self.pose_covariance.rows_mut(0, 3).scale_mut(mean);
+            self.pose_covariance.columns_mut(0, 3).scale_mut(mean);
             let factor = (1.0 / mean) as f32;
             state.current_from_first.translation *= mean;
             state.inverse_depths.iter_mut().for_each(|d| *d *= factor);
@@ -403,6 +413,7 @@ impl TwoFrameInitializer {
             state,
             evidence,
             first_from_current: self.current_from_first.inverse(),
+            pose_covariance: self.pose_covariance,
             brightness: self.brightness,
         }
     }

@@ -10,6 +10,7 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{DepthPoint, Keyframe, KeyframePose, MAX_KEYFRAME_POINTS, MapState};
 use crate::slam::mapper::situation::StartFrame;
+use crate::slam::modes::ModeCovariance;
 use crate::slam::pose::{
     Brightness, DegradedReason, LostReason, PoseEstimate, Quality, TrackingState,
 };
@@ -270,6 +271,7 @@ pub fn pose_message(pose: &PoseEstimate, timing: &PoseTiming) -> PoseMessage {
         whitened_rmse: quality.whitened_rmse,
         residual_rmse: quality.residual_rmse,
         mean_squared_flow: quality.mean_squared_flow,
+        displacement_px: quality.displacement_px,
         iterations: quality.iterations,
         finest_level: quality.finest_level,
         points: quality.points,
@@ -295,10 +297,12 @@ pub fn pose_from_message(message: &PoseMessage) -> Result<PoseEstimate, MessageE
         finest_level: message.finest_level,
         points: message.points,
         mean_squared_flow: message.mean_squared_flow,
+        displacement_px: message.displacement_px,
     };
     let ratios = [quality.in_view_ratio, quality.inlier_ratio, quality.mean_squared_flow];
     finite("quality", &ratios)?;
-    finite("quality", &[quality.whitened_rmse, quality.residual_rmse])?;
+    let errors = [quality.whitened_rmse, quality.residual_rmse, quality.displacement_px];
+    finite("quality", &errors)?;
     let proposes_keyframe = match message.proposes_keyframe {
         0 => false,
         1 => true,
@@ -338,6 +342,7 @@ pub fn keyframe_header(keyframe: &Keyframe) -> KeyframeHeader {
         map_from_keyframe: similarity_message(&keyframe.map_from_keyframe),
         map_revision: keyframe.map_revision,
         intrinsics: [k.fx, k.fy, k.cx, k.cy],
+        mode_covariance: keyframe.mode_covariance.upper_triangle(),
         epoch: keyframe.epoch,
         map_state: code_from_map_state(keyframe.map_state),
         width: k.width as u32,
@@ -389,10 +394,19 @@ pub fn keyframe_from_messages(
         )?,
         map_from_keyframe: similarity_from_message(&header.map_from_keyframe, "map_from_keyframe")?,
         map_revision: header.map_revision,
+        mode_covariance: mode_covariance_from_message(&header.mode_covariance)?,
         intrinsics,
         image: image.to_vec(),
         points: points.to_vec(),
     })
+}
+
+/// The covariance of common errors of depth from its upper triangle, checked.
+pub fn mode_covariance_from_message(
+    upper_triangle: &[f64; 6],
+) -> Result<ModeCovariance, MessageError> {
+    ModeCovariance::from_upper_triangle(*upper_triangle)
+        .ok_or(MessageError::InvalidNumber { field: "mode_covariance" })
 }
 
 /// Checks that every point lies in the image and is finite, and that there are not too many.

@@ -50,7 +50,7 @@ pub struct FrameHeader {
 /// Message of `tracker/pose`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
-#[type_name("semidense.Pose.v4")]
+#[type_name("semidense.Pose.v5")]
 pub struct PoseMessage {
     /// Sequence of the frame.
     pub sequence: u64,
@@ -87,10 +87,11 @@ pub struct PoseMessage {
     /// Pose relative to the keyframe, keyframe units.
     pub keyframe_from_camera: RigidMessage,
     /// Upper triangle, row-major, of the covariance of the left increment (translation, rotation) of
-    /// `current_from_keyframe`, keyframe units and radians. Raised by a floor for errors that all points
-    /// share (`tracking.covariance_floor`), which is measured on recordings and not calibrated to a
-    /// camera: check the `nees_…` figures of a recording of your own before you fuse it. It does not hold
-    /// the drift of the keyframe itself, nor that of the scale.
+    /// `current_from_keyframe`, keyframe units and radians. Noise of single points, errors that the whole
+    /// depth of the keyframe shares (its `mode_covariance`) and displacements of the whole image
+    /// (`displacement_px`). Calibrated on simulated and recorded sequences: check the `nees_…` figures of a
+    /// recording of your own before you fuse it. It does not hold the drift of the keyframe itself, nor that of
+    /// the scale.
     pub covariance: [f64; 21],
     /// The same of the alignment alone, for the mapper. Too sure by up to a hundred in standard
     /// deviation: never fuse it.
@@ -107,6 +108,8 @@ pub struct PoseMessage {
     pub residual_rmse: f64,
     /// Mean squared optical flow, pixels².
     pub mean_squared_flow: f64,
+    /// Standard deviation by which the whole image may be displaced unseen, pixels; `covariance` holds it.
+    pub displacement_px: f64,
     /// Iterations, all levels.
     pub iterations: u32,
     /// Finest level that was solved; the number of all levels where none was.
@@ -120,7 +123,7 @@ pub struct PoseMessage {
 /// Header of `mapper/keyframe`; the payload is its [`DepthPoint`]s.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
-#[type_name("semidense.KeyframeHeader.v2")]
+#[type_name("semidense.KeyframeHeader.v3")]
 pub struct KeyframeHeader {
     /// Its id.
     pub keyframe_id: u64,
@@ -138,6 +141,9 @@ pub struct KeyframeHeader {
     pub map_revision: u64,
     /// fx, fy, cx, cy in pixels.
     pub intrinsics: [f64; 4],
+    /// Upper triangle, row-major, of the covariance of the errors that all of its depth shares: relative errors of
+    /// inverse depth for each unit of X, of Y (the ray's coordinates) and of ln d.
+    pub mode_covariance: [f64; 6],
     /// Life of the map.
     pub epoch: u32,
     /// 1 established, 2 rejected.
@@ -348,8 +354,8 @@ mod tests {
     #[test]
     fn layouts_are_pinned() {
         assert_layout::<FrameHeader>(88, 8, "semidense.FrameHeader.v2");
-        assert_layout::<PoseMessage>(664, 8, "semidense.Pose.v4");
-        assert_layout::<KeyframeHeader>(216, 8, "semidense.KeyframeHeader.v2");
+        assert_layout::<PoseMessage>(672, 8, "semidense.Pose.v5");
+        assert_layout::<KeyframeHeader>(264, 8, "semidense.KeyframeHeader.v3");
         assert_layout::<DepthPoint>(16, 4, "semidense.DepthPoint.v1");
         assert_layout::<KeyframeImageHeader>(24, 8, "semidense.KeyframeImageHeader.v1");
         assert_layout::<StepMessage>(136, 8, "semidense.Step.v4");

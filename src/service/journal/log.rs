@@ -19,7 +19,7 @@ use crate::wire::conversion::{similarity_from_message, similarity_message};
 use crate::wire::message::PoseMessage;
 
 /// First bytes of the file, with the version of the layout.
-const MAGIC: [u8; 16] = *b"semidense log 3\n";
+const MAGIC: [u8; 16] = *b"semidense log 4\n";
 /// Bytes before kind and payload.
 const PREFIX_BYTES: usize = 8;
 /// Largest record: the configuration is a tenth of it.
@@ -268,7 +268,7 @@ fn write_pose(p: &PoseMessage, bytes: &mut Vec<u8>) {
     write_f64s(bytes, &p.alignment_covariance);
     write_f64s(bytes, &p.brightness);
     write_f64s(bytes, &[p.in_view_ratio, p.inlier_ratio, p.whitened_rmse]);
-    write_f64s(bytes, &[p.residual_rmse, p.mean_squared_flow]);
+    write_f64s(bytes, &[p.residual_rmse, p.mean_squared_flow, p.displacement_px]);
 }
 
 fn read_pose(bytes: &mut &[u8]) -> Option<PoseMessage> {
@@ -281,7 +281,7 @@ fn read_pose(bytes: &mut &[u8]) -> Option<PoseMessage> {
     let (covariance, alignment_covariance) = (read_f64s(bytes)?, read_f64s(bytes)?);
     let brightness = read_f64s(bytes)?;
     let [in_view_ratio, inlier_ratio, whitened_rmse] = read_f64s(bytes)?;
-    let [residual_rmse, mean_squared_flow] = read_f64s(bytes)?;
+    let [residual_rmse, mean_squared_flow, displacement_px] = read_f64s(bytes)?;
     Some(PoseMessage {
         sequence,
         capture_nanos: capture.cast_signed(),
@@ -307,6 +307,7 @@ fn read_pose(bytes: &mut &[u8]) -> Option<PoseMessage> {
         whitened_rmse,
         residual_rmse,
         mean_squared_flow,
+        displacement_px,
         iterations,
         finest_level,
         points,

@@ -120,6 +120,8 @@ pub struct DepthSummary {
     /// Depth errors common to a keyframe, medians of their magnitude: relative error for each unit of the ray
     /// along columns, along rows, and for each unit of ln d (relief).
     pub depth_modes: Option<[f64; 3]>,
+    /// The same over the standard deviation that each keyframe claims: 0.67 is right, more is too sure.
+    pub depth_modes_whitened: Option<[f64; 3]>,
 }
 
 impl From<DepthStatistics> for DepthSummary {
@@ -131,6 +133,7 @@ impl From<DepthStatistics> for DepthSummary {
             depth_coverage: Some(depth.coverage),
             depth_density: Some(depth.density),
             depth_modes: depth.modes,
+            depth_modes_whitened: depth.whitened_modes,
         }
     }
 }

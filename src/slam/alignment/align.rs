@@ -116,6 +116,8 @@ pub struct AlignedState {
     pub current_from_keyframe: SE3,
     /// Brightness against the keyframe.
     pub brightness: Brightness,
+    /// Translation at which (∂r/∂d)² V weighed the residuals, keyframe units.
+    pub variance_translation: Vector3<f64>,
     /// The sums at this state, priors included.
     pub sums: NormalEquations,
 }
@@ -174,6 +176,15 @@ impl Alignment {
         let step = pose_step(&self.state.sums.damped_step(0.0)?);
         Some(covariance + step * step.transpose())
     }
+
+    /// What the common errors of the depth of `reference` add to that: (−M⁻¹H) P (−M⁻¹H)ᵀ; `None` where the images
+    /// do not determine the pose.
+    pub fn covariance_from_modes(&self, reference: &Reference) -> Option<Matrix6<f64>> {
+        let centre = reference.level(self.level).centre();
+        let translation = &self.state.current_from_keyframe.translation;
+        let moved = self.scatter.d_pose_d_modes(&self.state.sums, translation, &centre)?;
+        Some(moved * reference.mode_covariance().matrix() * moved.transpose())
+    }
 }
 
 /// Aligns frames to references.
@@ -226,7 +237,12 @@ impl Aligner {
             sums.fix(6);
             sums.fix(7);
         }
-        AlignedState { current_from_keyframe: *current_from_keyframe, brightness, sums }
+        AlignedState {
+            current_from_keyframe: *current_from_keyframe,
+            brightness,
+            variance_translation: *variance_translation,
+            sums,
+        }
     }
 
     /// Aligns `frame` to `reference` from a first guess, from the coarsest level both have down
@@ -408,17 +424,18 @@ impl Aligner {
         state.sums
     }
 
-    /// Takes the figures of the state that an alignment ended in.
+    /// Takes the figures of the state that an alignment ended in, with the weights that its sums have.
     fn measure(&self, reference: &Reference, frame: &SumPyramid, alignment: &mut Alignment) {
         let level = alignment.level;
-        let AlignedState { current_from_keyframe, brightness, .. } = &alignment.state;
+        let AlignedState { current_from_keyframe, brightness, variance_translation, .. } =
+            &alignment.state;
         let at = Evaluation::new(
             &reference.intrinsics().at_level(level),
             level,
             current_from_keyframe,
             *brightness,
             &self.params.weighting(level),
-            &current_from_keyframe.translation,
+            variance_translation,
         );
         let points = reference.level(level);
         let squared_pixel = f64::from(1u32 << (2 * level));

@@ -6,6 +6,7 @@
 
 mod accumulate_kernel;
 mod lanes_kernel;
+mod mode_kernel;
 #[cfg(target_arch = "aarch64")]
 mod neon_kernel;
 mod portable_kernel;

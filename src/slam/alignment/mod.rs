@@ -7,6 +7,9 @@ pub mod align;
 pub mod displacement;
 pub mod fusion;
 pub mod kernel;
+pub mod misfit;
+#[cfg(test)]
+mod mode_tests;
 pub mod normal_equations;
 pub mod points;
 pub mod reference;

@@ -1,5 +1,7 @@
 //! Points of one pyramid level in blocks of lanes.
 
+use nalgebra::Vector3;
+
 /// Points of one block: one register of AVX-512, two of AVX2, four of NEON.
 pub const LANES: usize = 16;
 
@@ -79,6 +81,10 @@ pub struct TileRun {
 #[derive(Debug, Clone, Default)]
 pub struct LevelPoints {
     blocks: Vec<PointBlock>,
+    /// ln d by block, apart: only the figures of a frame's last state need it.
+    log_inverse_depths: Vec<[f32; LANES]>,
+    /// Sums of x, y and ln d.
+    sums: [f64; 3],
     runs: Vec<TileRun>,
     len: usize,
 }
@@ -87,6 +93,8 @@ impl LevelPoints {
     /// Forgets the points and keeps the memory.
     pub fn clear(&mut self) {
         self.blocks.clear();
+        self.log_inverse_depths.clear();
+        self.sums = [0.0; 3];
         self.runs.clear();
         self.len = 0;
     }
@@ -97,6 +105,15 @@ impl LevelPoints {
         let lane = self.len % LANES;
         if lane == 0 {
             self.blocks.push(PointBlock::PADDING);
+            self.log_inverse_depths.push([0.0; LANES]);
+        }
+        let log_inverse_depth = point.inverse_depth.max(f32::MIN_POSITIVE).ln();
+        let place = [point.ray_x, point.ray_y, log_inverse_depth];
+        for (sum, coordinate) in self.sums.iter_mut().zip(place) {
+            *sum += f64::from(coordinate);
+        }
+        if let Some(block) = self.log_inverse_depths.last_mut() {
+            block[lane] = log_inverse_depth;
         }
         if let Some(block) = self.blocks.last_mut() {
             block.ray_x[lane] = point.ray_x;
@@ -124,6 +141,17 @@ impl LevelPoints {
     /// The blocks; lanes beyond [`LevelPoints::len`] are never in view.
     pub fn blocks(&self) -> &[PointBlock] {
         &self.blocks
+    }
+
+    /// ln d of the points, by block.
+    pub fn log_inverse_depths(&self) -> &[[f32; LANES]] {
+        &self.log_inverse_depths
+    }
+
+    /// Mean of (x, y, ln d) over the points: where a common error of depth, a plane over these three, leaves the
+    /// mean depth alone.
+    pub fn centre(&self) -> Vector3<f64> {
+        Vector3::from(self.sums) / self.len.max(1) as f64
     }
 
     /// Number of points.

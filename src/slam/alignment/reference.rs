@@ -11,6 +11,7 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::sums::{MAX_LEVELS, SumPyramid, grey_per_sum};
 use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::modes::ModeCovariance;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::NO_KEYFRAME;
 
@@ -78,6 +79,7 @@ pub struct Reference {
     map_revision: u64,
     intrinsics: Intrinsics,
     mean_inverse_depth: f64,
+    mode_covariance: ModeCovariance,
     finest_level: usize,
     levels: Vec<LevelPoints>,
     pyramid: SumPyramid,
@@ -102,6 +104,7 @@ impl Reference {
             map_revision: 0,
             intrinsics: Intrinsics { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, width: 0, height: 0 },
             mean_inverse_depth: 1.0,
+            mode_covariance: ModeCovariance::ZERO,
             levels: vec![LevelPoints::default(); MAX_LEVELS],
             pyramid: SumPyramid::default(),
             fusion: DepthFusion::default(),
@@ -133,6 +136,7 @@ impl Reference {
         self.map_revision = keyframe.map_revision;
         self.intrinsics = keyframe.intrinsics;
         self.mean_inverse_depth = 1.0;
+        self.mode_covariance = keyframe.mode_covariance;
         self.levels.iter_mut().for_each(LevelPoints::clear);
         let Intrinsics { width, height, .. } = keyframe.intrinsics;
         let usable =
@@ -248,6 +252,11 @@ impl Reference {
     /// Mean inverse depth of all points of the keyframe, 1/keyframe units.
     pub fn mean_inverse_depth(&self) -> f64 {
         self.mean_inverse_depth
+    }
+
+    /// How uncertain the errors are that all depth of the keyframe shares.
+    pub fn mode_covariance(&self) -> &ModeCovariance {
+        &self.mode_covariance
     }
 
     /// Finest level with points prepared.

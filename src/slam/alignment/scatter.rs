@@ -7,12 +7,14 @@
 //! one tile are. M is the curvature of the cost, which Huber's weights overstate: beyond k the
 //! gradient of a residual no longer grows.
 
-use nalgebra::SMatrix;
+use nalgebra::{SMatrix, Vector3};
 
+use crate::slam::alignment::misfit::TileMisfit;
 use crate::slam::alignment::normal_equations::{NormalEquations, UNKNOWNS};
 use crate::slam::alignment::points::LevelPoints;
 use crate::slam::alignment::residual::{Evaluation, point_terms};
 use crate::slam::image::buffer::Image;
+use crate::slam::modes::NUM_MODES;
 
 /// Tiles along u and v: some 170 with points in a usual keyframe, where eight unknowns need tens.
 /// Between 8×6 and 40×30 the calibration depends little on it.
@@ -31,6 +33,9 @@ pub fn tile_of(u: usize, v: usize, width: usize, height: usize) -> u16 {
     (share(v, rows, height) * columns + share(u, columns, width)) as u16
 }
 
+/// Unknowns of the pose.
+const POSE: usize = 6;
+
 /// Where fewer tiles than this have points, their scatter is too few numbers to trust, and
 /// the information stands in for it.
 const TRUSTED_TILES: f64 = UNKNOWNS as f64;
@@ -44,11 +49,22 @@ pub struct GradientScatter {
     pub curvature_ratio: f64,
     /// Tiles with points in view.
     pub tiles: u32,
+    /// H = Σ w J (∂r/∂d) d φᵀ, φ = (X, Y, ln d): by how much a unit of each common error of depth changes the
+    /// gradient.
+    pub d_gradient_d_modes: SMatrix<f64, UNKNOWNS, NUM_MODES>,
+    /// By how much tiles of the image are displaced.
+    pub misfit: TileMisfit,
 }
 
 impl Default for GradientScatter {
     fn default() -> Self {
-        Self { outer: SMatrix::zeros(), curvature_ratio: 1.0, tiles: 0 }
+        Self {
+            outer: SMatrix::zeros(),
+            curvature_ratio: 1.0,
+            tiles: 0,
+            d_gradient_d_modes: SMatrix::zeros(),
+            misfit: TileMisfit::default(),
+        }
     }
 }
 
@@ -59,6 +75,8 @@ pub struct TileSum {
     pub gradient: [f32; UNKNOWNS],
     /// Σ w; positive where a point is in view.
     pub weight: f32,
+    /// Upper triangle of Σ w J Jᵀ of the rotations about x and y, which move a tile along v and u.
+    pub information: [f32; 3],
 }
 
 /// Sums over the points of all tiles.
@@ -68,11 +86,17 @@ pub struct ScatterSums {
     pub tiles: [TileSum; NUM_TILES],
     /// Σ w of the points whose Huber weight is 1.
     pub quadratic: f32,
+    /// Σ w J (∂r/∂d) d φᵀ.
+    pub d_gradient_d_modes: SMatrix<f64, UNKNOWNS, NUM_MODES>,
 }
 
 impl Default for ScatterSums {
     fn default() -> Self {
-        Self { tiles: [TileSum::default(); NUM_TILES], quadratic: 0.0 }
+        Self {
+            tiles: [TileSum::default(); NUM_TILES],
+            quadratic: 0.0,
+            d_gradient_d_modes: SMatrix::zeros(),
+        }
     }
 }
 
@@ -90,8 +114,23 @@ impl GradientScatter {
             let v = (at.focal[1] * point.ray_y + at.centre[1]).round() as usize;
             let tile = &mut sums.tiles[usize::from(tile_of(u, v, image.width(), image.height()))];
             tile.weight += weight;
+            let [about_x, about_y] = [terms.jacobian[3], terms.jacobian[4]];
+            let products = [about_x * about_x, about_x * about_y, about_y * about_y];
+            for (sum, product) in tile.information.iter_mut().zip(products) {
+                *sum += weight * product;
+            }
             for (sum, derivative) in tile.gradient.iter_mut().zip(terms.jacobian) {
                 *sum += weight * derivative * terms.residual;
+            }
+            // (∂r/∂d) d, at the inverse depth that the Jacobian is taken at.
+            let [tx, ty, tz] = at.translation;
+            let [jx, jy, jz, ..] = terms.jacobian;
+            let change = f64::from(weight * (jx * tx + jy * ty + jz * tz));
+            let modes = [point.ray_x, point.ray_y, point.inverse_depth.ln()];
+            for (mode, shape) in modes.map(f64::from).into_iter().enumerate() {
+                for (i, derivative) in terms.jacobian.map(f64::from).into_iter().enumerate() {
+                    sums.d_gradient_d_modes[(i, mode)] += change * derivative * shape;
+                }
             }
         }
         Self::from_sums(&sums)
@@ -99,7 +138,11 @@ impl GradientScatter {
 
     /// S and the curvature from the sums of the tiles.
     pub fn from_sums(sums: &ScatterSums) -> Self {
-        let mut scatter = Self::default();
+        let mut scatter = Self {
+            d_gradient_d_modes: sums.d_gradient_d_modes,
+            misfit: TileMisfit::of(&sums.tiles),
+            ..Self::default()
+        };
         let mut weights = 0.0;
         for tile in sums.tiles.iter().filter(|tile| tile.weight > 0.0) {
             weights += f64::from(tile.weight);
@@ -127,5 +170,24 @@ impl GradientScatter {
         let stand_in = TRUSTED_TILES / f64::from(self.tiles.max(1));
         let covariance = inverse * (self.outer + sums.information * stand_in) * inverse;
         covariance.iter().all(|x| x.is_finite()).then_some(covariance)
+    }
+
+    /// By how much the solution at the state whose sums are `sums` moves for each unit of a common error of depth:
+    /// −M⁻¹ H, rows as of the left increment; `None` where the sums do not determine all unknowns. The mean
+    /// over the points, `centre`, is taken off each shape φ: a constant error is one of the keyframe's unit and
+    /// moves the translation in its own direction alone, since H of a constant is M (t, 0).
+    ///
+    /// Huber's weights need no curvature here: M and H lose the same share of it.
+    pub fn d_pose_d_modes(
+        &self,
+        sums: &NormalEquations,
+        translation: &Vector3<f64>,
+        centre: &Vector3<f64>,
+    ) -> Option<SMatrix<f64, POSE, NUM_MODES>> {
+        let moved = sums.information.cholesky()?.solve(&self.d_gradient_d_modes);
+        let mut moved = moved.fixed_rows::<POSE>(0).into_owned();
+        let mut along = moved.fixed_rows_mut::<3>(0);
+        along -= translation * centre.transpose();
+        moved.iter().all(|x| x.is_finite()).then_some(-moved)
     }
 }

@@ -7,6 +7,7 @@
 
 pub mod candidate;
 mod carrying_kernel;
+pub mod common_error;
 pub mod epipolar;
 pub mod gaussian;
 pub mod immature;

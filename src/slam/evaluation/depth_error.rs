@@ -24,7 +24,9 @@ pub struct DepthErrors {
     /// |error of d| / σ.
     whitened_error: Vec<f64>,
     /// Errors common to a keyframe, of each that has enough points.
-    modes: Vec<DepthModes>,
+    modes: Vec<[f64; 3]>,
+    /// The same over their standard deviations.
+    whitened_modes: Vec<[f64; 3]>,
     /// Points, with or without true depth.
     points: usize,
     /// Pixels of the keyframes.
@@ -47,6 +49,8 @@ pub struct DepthStatistics {
     /// Medians over the keyframes of the tilt of depth along columns and rows and of the error of its relief,
     /// as [`DepthModes`] defines them, without their sign; `None` where no keyframe has enough points.
     pub modes: Option<[f64; 3]>,
+    /// The same over the standard deviation that each keyframe claims: 0.67 is right, more is too sure.
+    pub whitened_modes: Option<[f64; 3]>,
 }
 
 impl DepthErrors {
@@ -72,7 +76,13 @@ impl DepthErrors {
             })
             .collect();
         let Some(s) = metres_per_unit(keyframe, &compared, scale) else { return };
-        self.modes.extend(DepthModes::of(keyframe, true_depth, s));
+        if let Some(modes) = DepthModes::of(keyframe, true_depth, s) {
+            let (errors, std_devs) = (modes.magnitudes(), keyframe.mode_covariance.std_devs());
+            self.modes.push(errors);
+            let whitened = std::array::from_fn(|mode| errors[mode] / std_devs[mode]);
+            // A keyframe that claims no uncertainty, as one with a sensor's depth, is not judged by it.
+            self.whitened_modes.extend(whitened.iter().all(|e| e.is_finite()).then_some(whitened));
+        }
         for Compared { z_true, d, sigma } in compared {
             self.relative_error.push((s / d - z_true).abs() / z_true);
             self.relative_std_dev.push(sigma / d);
@@ -98,19 +108,16 @@ impl DepthErrors {
             relative_error_median_best_half: median(&best)?,
             coverage: [within(1.0), within(2.0), within(3.0)],
             density: self.points as f64 / self.pixels as f64,
-            modes: self.median_modes(),
+            modes: medians(&self.modes),
+            whitened_modes: medians(&self.whitened_modes),
         })
     }
 }
 
-impl DepthErrors {
-    /// Medians of the modes' magnitudes.
-    fn median_modes(&self) -> Option<[f64; 3]> {
-        let of = |mode: usize| {
-            median(&self.modes.iter().map(|modes| modes.magnitudes()[mode]).collect::<Vec<_>>())
-        };
-        Some([of(0)?, of(1)?, of(2)?])
-    }
+/// Medians of each of three figures over all keyframes.
+fn medians(figures: &[[f64; 3]]) -> Option<[f64; 3]> {
+    let of = |mode: usize| median(&figures.iter().map(|modes| modes[mode]).collect::<Vec<_>>());
+    Some([of(0)?, of(1)?, of(2)?])
 }
 
 /// One pixel: true depth (metres), estimated inverse depth and its σ (keyframe units).

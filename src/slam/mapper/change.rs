@@ -12,6 +12,7 @@ use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::mapper::consistency::judge_change;
 use crate::slam::mapper::depth_buffers::write_depth;
+use crate::slam::mapper::modes::in_unit;
 use crate::slam::mapper::start::take_sensor_depth;
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::pose::{Brightness, PoseEstimate};
@@ -47,6 +48,8 @@ impl Mapper {
             self.depth.refine(&self.params);
         }
         let (unit, is_unit_open) = (self.depth.unit, self.depth.is_unit_open);
+        let frame_from_before = in_unit(&pose.keyframe_from_camera, unit);
+        self.modes.carry(&frame_from_before, &self.intrinsics, &self.params.modes);
         self.carry_over(frame.pixels, &pose.keyframe_from_camera, pose.brightness);
         let map_from_frame = map_from_before.place(&pose.keyframe_from_camera);
         let carried_unit = map_from_before.scale * unit;
@@ -72,8 +75,7 @@ impl Mapper {
     /// The active depth on the pixels of a frame that stands at `keyframe_from_camera`; the depth before is the
     /// spare one then.
     fn carry_over(&mut self, pixels: &[u8], keyframe_from_camera: &SE3, brightness: Brightness) {
-        let mut frame_from_before = keyframe_from_camera.inverse();
-        frame_from_before.translation /= self.depth.unit;
+        let frame_from_before = in_unit(keyframe_from_camera, self.depth.unit);
         self.depth.swap();
         self.depth.restart(pixels, &self.params);
         propagate(
@@ -176,6 +178,7 @@ impl Mapper {
             world_from_keyframe: self.world_from_map * map_from_keyframe,
             map_from_keyframe,
             map_revision: self.map.revision,
+            mode_covariance: self.modes.published(&self.params.modes),
             intrinsics: self.intrinsics,
             image: frame.pixels.to_vec(),
             points: Vec::new(),

@@ -159,6 +159,7 @@ impl Mapper {
         self.world_from_map = Sim3::identity();
         self.last_world_from_camera = None;
         self.past.clear();
+        self.modes.forget();
         self.depth.restart(pixels, &self.params);
     }
 
@@ -184,9 +185,14 @@ impl Mapper {
             pixels: ObservedPixels::All,
         };
         let (matching, gaussian) = (&self.params.matching, &self.params.gaussian);
+        let current_from_first = start.first_from_current.inverse();
+        let covariance = &start.pose_covariance;
+        self.modes.begin(&self.depth.active, &self.intrinsics, &current_from_first, covariance);
         let observations = observe(&mut self.depth.active, &observer, matching, gaussian);
+        self.modes.observed(&self.depth.active, &current_from_first);
         self.depth.refine(&self.params);
         let scale = self.depth.normalise();
+        self.modes.rescale(scale);
         let first_frame = FrameView {
             sequence: first.0,
             capture_nanos: first.1,

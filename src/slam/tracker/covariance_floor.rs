@@ -1,36 +1,38 @@
-//! What a published covariance may not fall below: errors that no point of the image knows of.
+//! What a published covariance holds beside noise and the keyframe's common depth errors: displacements of the whole
+//! image, of which the residuals show only the part that differs from tile to tile.
 //!
-//! The covariance of the alignment takes the errors of distant points for independent. Depth that is
-//! tilted or flattened over a whole keyframe, what the lens model leaves, a rolling shutter: these move
-//! all points together, and the residuals do not show them. Until they are estimated, this floor on the
-//! diagonal stands for them:
 //! ```text
-//! Σ_published = Σ_alignment + diag(σ_t² I, σ_ω² I)      σ_t = translation_ratio ‖t‖      σ_ω = image_px / f
+//! Σ_published = Σ_alignment + (M⁻¹H) P (M⁻¹H)ᵀ + diag(σ_t² I, σ_ω² I)
+//! σ_ω² = (image_px / f)² + (misfit_ratio · misfit)²      σ_t = σ_ω / d̄
 //! ```
-//! Only what is published is raised: matching, keyframes and verdicts use the covariance of the alignment.
+//! `misfit` is by how much tiles of this very image are displaced beyond the noise of single pixels: 0.03 px in the
+//! simulator, 0.3 to 0.5 px where lens, rolling shutter and the shape of the depth come in. It tells cameras apart
+//! that one constant cannot serve. Only what is published has it: matching, keyframes and verdicts use the covariance
+//! of the alignment.
 
-use nalgebra::{Matrix6, Vector3};
+use nalgebra::Matrix6;
 use serde::{Deserialize, Serialize};
 
+use crate::slam::alignment::misfit::TileMisfit;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::parameter::{ParameterError, check_range};
 
-/// Floor under the published covariance of a pose.
+/// Displacement of the whole image that the published covariance of a pose allows for.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CovarianceFloorParams {
-    /// Standard deviation by which the image as a whole may be displaced, pixels: divided by the
-    /// focal length it is that of the rotation about each axis. 1 px is what consecutive keyframes of
-    /// recordings disagree by (0.5 to 3 px; 0.3 px in the simulator).
+    /// Standard deviation by which an image may be displaced whatever it shows, pixels: what interpolation leaves
+    /// of an exact image.
     pub image_px: f64,
-    /// Standard deviation of the translation along each axis, as a share of the translation since the
-    /// keyframe: tilt and relief of depth turn and stretch it. Recordings: 2 to 20 %.
-    pub translation_ratio: f64,
+    /// Displacement of the whole image for one of its tiles beyond noise. The errors behind both are smooth, so that
+    /// more of them is common to the image than differs between its tiles. Calibrated on the map's own depth over
+    /// rooms and recordings.
+    pub misfit_ratio: f64,
 }
 
 impl Default for CovarianceFloorParams {
     fn default() -> Self {
-        Self { image_px: 1.0, translation_ratio: 0.1 }
+        Self { image_px: 0.02, misfit_ratio: 2.8 }
     }
 }
 
@@ -38,53 +40,67 @@ impl CovarianceFloorParams {
     /// Checks every value.
     pub fn validate(&self) -> Result<(), ParameterError> {
         check_range("image_px", self.image_px, 0.0..=100.0)?;
-        check_range("translation_ratio", self.translation_ratio, 0.0..=10.0)
+        check_range("misfit_ratio", self.misfit_ratio, 0.0..=100.0)
     }
 
-    /// `covariance` (translation, rotation) of the left increment of a `current_from_keyframe` with
-    /// this translation, raised by the floor.
-    pub fn raised(
+    /// Standard deviation of the displacement of an image, pixels, whose tiles and mean whitened squared residual are
+    /// these.
+    pub fn displacement_px(
         &self,
-        covariance: &Matrix6<f64>,
+        misfit: &TileMisfit,
+        mean_energy: f64,
         intrinsics: &Intrinsics,
-        translation: &Vector3<f64>,
-    ) -> Matrix6<f64> {
-        let along = self.translation_ratio * translation.norm();
-        let about = self.image_px / intrinsics.fx.min(intrinsics.fy);
-        let mut raised = *covariance;
-        for axis in 0..3 {
-            raised[(axis, axis)] += along * along;
-            raised[(axis + 3, axis + 3)] += about * about;
-        }
-        raised
+    ) -> f64 {
+        let of_tiles = misfit.beyond_noise(mean_energy).sqrt() * shortest_focal(intrinsics);
+        self.image_px.hypot(self.misfit_ratio * of_tiles)
     }
+}
+
+/// Covariance (translation, rotation) of the left increment of a pose whose image is displaced by this standard
+/// deviation in pixels: about each axis, and along each for points at the mean inverse depth.
+pub fn displacement_covariance(
+    displacement_px: f64,
+    intrinsics: &Intrinsics,
+    mean_inverse_depth: f64,
+) -> Matrix6<f64> {
+    let about = displacement_px / shortest_focal(intrinsics);
+    let along = about / mean_inverse_depth;
+    let variances = [along, along, along, about, about, about].map(|std_dev| std_dev * std_dev);
+    Matrix6::from_diagonal(&variances.into())
+}
+
+fn shortest_focal(intrinsics: &Intrinsics) -> f64 {
+    intrinsics.fx.min(intrinsics.fy)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    const CAMERA: Intrinsics =
+        Intrinsics { fx: 500.0, fy: 400.0, cx: 0.0, cy: 0.0, width: 64, height: 48 };
+
     #[test]
-    fn the_floor_is_added_and_scales_with_lens_and_translation() {
-        let camera = Intrinsics { fx: 500.0, fy: 400.0, cx: 0.0, cy: 0.0, width: 64, height: 48 };
-        let floor = CovarianceFloorParams { image_px: 2.0, translation_ratio: 0.1 };
-        let alignment = Matrix6::from_fn(|i, j| if i == j { 1e-6 } else { 1e-8 });
-        let raised = floor.raised(&alignment, &camera, &Vector3::new(0.0, 0.3, 0.4));
-        let added = raised - alignment;
-        for i in 0..6 {
-            for j in 0..6 {
-                let expected = match (i == j, i < 3) {
-                    (false, _) => 0.0,
-                    (true, true) => 0.05 * 0.05,
-                    (true, false) => 0.005 * 0.005,
-                };
-                assert!((added[(i, j)] - expected).abs() < 1e-12, "{i} {j}");
-            }
-        }
-        let none = CovarianceFloorParams { image_px: 0.0, translation_ratio: 0.0 };
-        assert_eq!(none.raised(&alignment, &camera, &Vector3::x()), alignment);
-        assert!(none.validate().is_ok());
-        let broken = CovarianceFloorParams { image_px: f64::NAN, ..none };
-        assert!(broken.validate().is_err());
+    fn tiles_that_are_displaced_widen_it() {
+        let floor = CovarianceFloorParams { image_px: 0.3, misfit_ratio: 2.0 };
+        // A tile of noise alone, and one that is displaced by 0.2 px beside it.
+        let noise = (0.1f64 / 400.0).powi(2);
+        let misfit = |beyond_px: f64| TileMisfit {
+            variance: 0.5 * noise + (beyond_px / 400.0).powi(2),
+            noise,
+        };
+        let of = |beyond_px: f64| floor.displacement_px(&misfit(beyond_px), 0.5, &CAMERA);
+        assert!((of(0.0) - 0.3).abs() < 1e-9);
+        assert!((of(0.2) - 0.5).abs() < 1e-9);
+        assert!(CovarianceFloorParams { image_px: f64::NAN, ..floor }.validate().is_err());
+        assert!(CovarianceFloorParams::default().validate().is_ok());
+    }
+
+    #[test]
+    fn it_scales_with_lens_and_depth() {
+        let covariance = displacement_covariance(2.0, &CAMERA, 0.5);
+        assert!((covariance[(4, 4)].sqrt() - 0.005).abs() < 1e-12);
+        assert!((covariance[(1, 1)].sqrt() - 0.01).abs() < 1e-12);
+        assert_eq!(covariance[(0, 4)], 0.0);
     }
 }

@@ -122,6 +122,7 @@ pub fn quality_of(alignment: &Alignment) -> Quality {
         finest_level: solved as u32,
         points: sums.in_view,
         mean_squared_flow: alignment.mean_squared_flow,
+        displacement_px: 0.0,
     }
 }
 

@@ -38,6 +38,7 @@ fn keyframe() -> Keyframe {
         revision: 8,
         sequence: 30,
         capture_nanos: 1_000,
+        mode_covariance: ModeCovariance::of_std_devs([0.01, 0.02, 0.05]),
         ..Keyframe::at(
             Sim3::new(transform(), 1.3),
             Intrinsics { fx: 20.0, fy: 21.0, cx: 9.5, cy: 8.5, width: 20, height: 18 },
@@ -101,6 +102,13 @@ fn hostile_keyframes_are_refused() {
     assert!(with(&|k| k.intrinsics.fx = f64::INFINITY).is_err());
     assert!(with(&|k| k.intrinsics.width = 1 << 30).is_err());
     assert!(with(&|k| k.world_from_keyframe.scale = 0.0).is_err());
+    for broken in [[f64::NAN; 6], [0.1, 1.0, 0.0, 0.1, 0.0, 0.1]] {
+        let mut header = keyframe_header(&good);
+        header.mode_covariance = broken;
+        let image_header = keyframe_image_header(&good);
+        let read = keyframe_from_messages(&header, &good.points, &image_header, &good.image);
+        assert_eq!(read, Err(MessageError::InvalidNumber { field: "mode_covariance" }));
+    }
     let (header, mut image_header) = (keyframe_header(&good), keyframe_image_header(&good));
     image_header.keyframe_id = 5;
     let other = keyframe_from_messages(&header, &good.points, &image_header, &good.image);

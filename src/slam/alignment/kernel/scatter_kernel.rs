@@ -1,5 +1,5 @@
-//! The gradient of the cost by tile of the image, for any instruction set:
-//! `GradientScatter::reference` in lanes.
+//! The gradient of the cost by tile of the image, and what common errors of depth do to it, for any
+//! instruction set: `GradientScatter::reference` in lanes.
 //!
 //! The whitened columns hold all of it: √w J · √w r is a point's gradient, √w · √w its weight, and
 //! its Huber weight is 1 where (√w r)² ≤ k². Points lie row by row, so that a block meets a few
@@ -9,11 +9,16 @@ use crate::slam::alignment::kernel::accumulate_kernel::{
     CHUNK_BLOCKS, RESIDUAL, Statistics, Whitened, whiten,
 };
 use crate::slam::alignment::kernel::lanes_kernel::Lanes;
+use crate::slam::alignment::kernel::mode_kernel::{ModeSums, add_modes};
 use crate::slam::alignment::normal_equations::UNKNOWNS;
 use crate::slam::alignment::points::{LANES, LevelPoints, TileRun};
 use crate::slam::alignment::residual::Evaluation;
 use crate::slam::alignment::scatter::{GradientScatter, NUM_TILES, ScatterSums};
 use crate::slam::image::buffer::Image;
+
+/// The columns of the rotations about x and y.
+const ABOUT_X: usize = 3;
+const ABOUT_Y: usize = 4;
 
 /// The column of −√w: the derivative by the offset is −1.
 const WEIGHT: usize = 7;
@@ -24,10 +29,15 @@ const WEIGHT: usize = 7;
 struct TileSums {
     gradient: [[f32; LANES]; UNKNOWNS],
     weight: [f32; LANES],
+    information: [[f32; LANES]; 3],
 }
 
 impl TileSums {
-    const ZERO: Self = Self { gradient: [[0.0; LANES]; UNKNOWNS], weight: [0.0; LANES] };
+    const ZERO: Self = Self {
+        gradient: [[0.0; LANES]; UNKNOWNS],
+        weight: [0.0; LANES],
+        information: [[0.0; LANES]; 3],
+    };
 }
 
 /// Ones where a run is, read at an offset: sixteen zeros, sixteen ones, sixteen zeros.
@@ -53,6 +63,8 @@ pub unsafe fn scatter<L: Lanes>(
     let mut columns = [Whitened::ZERO; CHUNK_BLOCKS];
     let mut tiles = [TileSums::ZERO; NUM_TILES];
     let mut sums = ScatterSums::default();
+    let mut mode_sums = ModeSums::ZERO;
+    let mut logs = points.log_inverse_depths();
     let mut runs = points.runs();
     // SAFETY: this function's own contract; all pointers go to blocks of sixteen floats.
     unsafe {
@@ -65,6 +77,9 @@ pub unsafe fn scatter<L: Lanes>(
                     quadratic = quadratic.add(quadratic_weight::<L>(whitened, lane, at.huber));
                 }
             }
+            let (chunk_logs, later_logs) = logs.split_at(blocks.len().min(logs.len()));
+            logs = later_logs;
+            add_modes::<L>(blocks, chunk_logs, &columns, at.translation, &mut mode_sums);
             let first_block = chunk * CHUNK_BLOCKS;
             let is_here = |run: &TileRun| (run.block as usize) < first_block + blocks.len();
             let (here, rest) = runs.split_at(runs.partition_point(is_here));
@@ -82,8 +97,10 @@ pub unsafe fn scatter<L: Lanes>(
         sums.weight = total(&tile.weight);
         if sums.weight > 0.0 {
             sums.gradient = std::array::from_fn(|i| total(&tile.gradient[i]));
+            sums.information = std::array::from_fn(|i| total(&tile.information[i]));
         }
     }
+    sums.d_gradient_d_modes = mode_sums.total();
     GradientScatter::from_sums(&sums)
 }
 
@@ -122,6 +139,12 @@ unsafe fn add_run<L: Lanes>(whitened: &Whitened, run: &TileRun, tile: &mut TileS
             let root = column(WEIGHT);
             for (index, sum) in tile.gradient.iter_mut().enumerate() {
                 column(index).mul_add(residual, L::load(sum.as_ptr())).store(sum.as_mut_ptr());
+            }
+            let (about_x, about_y) = (column(ABOUT_X), column(ABOUT_Y));
+            let factors = [(about_x, about_x), (about_x, about_y), (about_y, about_y)];
+            for ((one, other), sum) in factors.into_iter().zip(&mut tile.information) {
+                let one = one.mul(mask);
+                one.mul_add(other, L::load(sum.as_ptr())).store(sum.as_mut_ptr());
             }
             let sum = &mut tile.weight;
             root.mul(mask).mul_add(root, L::load(sum.as_ptr())).store(sum.as_mut_ptr());

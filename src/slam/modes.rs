@@ -1,0 +1,105 @@
+//! Errors of depth that are common to a whole keyframe, and how uncertain they are.
+//!
+//! A relative error of inverse depth is split into what is common, δd/d = φᵀm with φ = (X, Y, ln d), X and Y the
+//! ray's coordinates, and the rest, which each point has for itself. m is tilt along columns, tilt along rows and
+//! relief. A constant error is not among them: it is the keyframe's unit, which no image shows.
+
+use nalgebra::{Matrix3, Vector3};
+
+/// Common errors of a keyframe's depth.
+pub const NUM_MODES: usize = 3;
+
+/// Largest standard deviation of a mode that is accepted: an error of ten times the depth for each unit of φ.
+const MAX_STD_DEV: f64 = 10.0;
+
+/// Standard deviation of a mode of which nothing is known: depth may be twice or half as much across the image.
+const IGNORANCE: f64 = 1.0;
+
+/// Covariance P of the common errors of a keyframe's relative inverse depth: tilt along columns, along rows, relief.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct ModeCovariance {
+    upper_triangle: [f64; 6],
+}
+
+impl ModeCovariance {
+    /// Without any common error.
+    pub const ZERO: Self = Self { upper_triangle: [0.0; 6] };
+
+    /// With these standard deviations, independent of each other.
+    pub fn of_std_devs([column, row, relief]: [f64; NUM_MODES]) -> Self {
+        Self { upper_triangle: [column * column, 0.0, 0.0, row * row, 0.0, relief * relief] }
+    }
+
+    /// Of a symmetric matrix.
+    pub fn of(matrix: &Matrix3<f64>) -> Self {
+        let m = |i, j| 0.5 * (matrix[(i, j)] + matrix[(j, i)]);
+        Self { upper_triangle: [m(0, 0), m(0, 1), m(0, 2), m(1, 1), m(1, 2), m(2, 2)] }
+    }
+
+    /// Of a symmetric matrix that came out of sums: what is beyond all sense is taken for complete ignorance.
+    pub fn bounded(matrix: &Matrix3<f64>) -> Self {
+        let covariance = Self::of(matrix);
+        let largest = covariance.std_devs().max();
+        match Self::from_upper_triangle(covariance.upper_triangle) {
+            Some(covariance) if largest <= IGNORANCE => covariance,
+            _ => Self::of_std_devs([IGNORANCE; NUM_MODES]),
+        }
+    }
+
+    /// Of its upper triangle, row by row; `None` where that is no covariance, or one beyond all sense.
+    pub fn from_upper_triangle(upper_triangle: [f64; 6]) -> Option<Self> {
+        /// Eigenvalues may be this share of the largest below zero, by rounding.
+        const TOLERANCE: f64 = 1e-9;
+        let covariance = Self { upper_triangle };
+        if !upper_triangle.iter().all(|x| x.is_finite()) {
+            return None;
+        }
+        let eigenvalues = covariance.matrix().symmetric_eigenvalues();
+        let (least, largest) = (eigenvalues.min(), eigenvalues.max());
+        let is_one = largest <= MAX_STD_DEV * MAX_STD_DEV && least >= -TOLERANCE * largest.abs();
+        is_one.then_some(covariance)
+    }
+
+    /// Its upper triangle, row by row.
+    pub fn upper_triangle(&self) -> [f64; 6] {
+        self.upper_triangle
+    }
+
+    /// The whole matrix.
+    pub fn matrix(&self) -> Matrix3<f64> {
+        let [a, b, c, d, e, f] = self.upper_triangle;
+        Matrix3::new(a, b, c, b, d, e, c, e, f)
+    }
+
+    /// Standard deviations of the modes.
+    pub fn std_devs(&self) -> Vector3<f64> {
+        self.matrix().diagonal().map(|variance| variance.max(0.0).sqrt())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_no_covariance_is_refused() {
+        let good = ModeCovariance::of_std_devs([0.1, 0.2, 0.3]);
+        assert_eq!(ModeCovariance::from_upper_triangle(good.upper_triangle()), Some(good));
+        assert!((good.std_devs() - Vector3::new(0.1, 0.2, 0.3)).norm() < 1e-12);
+        assert_eq!(ModeCovariance::from_upper_triangle([0.0; 6]), Some(ModeCovariance::ZERO));
+        assert_eq!(ModeCovariance::bounded(&good.matrix()), good);
+        for broken in [Matrix3::from_diagonal_element(f64::NAN), Matrix3::identity() * 9.0] {
+            assert_eq!(ModeCovariance::bounded(&broken), ModeCovariance::of_std_devs([1.0; 3]));
+        }
+        for bad in [
+            [f64::NAN, 0.0, 0.0, 1.0, 0.0, 1.0],
+            [1.0, 0.0, 0.0, f64::INFINITY, 0.0, 1.0],
+            [-1.0, 0.0, 0.0, 1.0, 0.0, 1.0],
+            // Correlated by more than 1.
+            [1.0, 2.0, 0.0, 1.0, 0.0, 1.0],
+            [1e9, 0.0, 0.0, 1.0, 0.0, 1.0],
+        ] {
+            assert_eq!(ModeCovariance::from_upper_triangle(bad), None, "{bad:?}");
+        }
+    }
+}
