@@ -39,10 +39,9 @@ pub struct AlignmentParams {
     pub offset_prior_std_dev: f64,
     /// Most iterations of each level, finest first.
     pub max_iterations: [u32; MAX_LEVELS],
-    /// A level is done when a step would move the image by less than this, pixels of the level.
-    pub step_tolerance_px: f64,
-    /// … and change its brightness by less than this, grey levels.
-    pub step_tolerance_grey: f64,
+    /// A level is done when a step is shorter than this, in standard deviations of the unknowns by the level's own
+    /// information: √(δᵀMδ), the Newton decrement. What is left after that is a small part of what is claimed.
+    pub step_tolerance: f64,
     /// A level is done when a step keeps more than this share of the mean energy.
     pub energy_tolerance: f64,
     /// Smallest share of the level's points that must be in view.
@@ -67,8 +66,7 @@ impl Default for AlignmentParams {
             gain_prior_std_dev: 0.5,
             offset_prior_std_dev: 30.0,
             max_iterations: [8, 12, 20, 30, 40],
-            step_tolerance_px: 0.01,
-            step_tolerance_grey: 0.1,
+            step_tolerance: 0.3,
             energy_tolerance: 0.999,
             min_in_view: 0.05,
             simd: SimdMode::Auto,
@@ -90,8 +88,7 @@ impl AlignmentParams {
         for (level, &iterations) in self.max_iterations.iter().enumerate() {
             check_range(&format!("max_iterations[{level}]"), iterations, 1..=1000)?;
         }
-        check_range("step_tolerance_px", self.step_tolerance_px, 1e-6..=1.0)?;
-        check_range("step_tolerance_grey", self.step_tolerance_grey, 1e-6..=255.0)?;
+        check_range("step_tolerance", self.step_tolerance, 1e-6..=10.0)?;
         check_range("energy_tolerance", self.energy_tolerance, 0.5..=1.0)?;
         check_range("min_in_view", self.min_in_view, 0.0..=1.0)?;
         check_range("covariance_inflation", self.covariance_inflation, 1e-3..=1e6)
@@ -382,9 +379,7 @@ impl Aligner {
             let in_view = f64::from(candidate.sums.in_view);
             let keeps_view = in_view >= MIN_KEPT_IN_VIEW * f64::from(state.sums.in_view);
             let ratio = candidate.sums.mean_energy() / state.sums.mean_energy();
-            let relit = TYPICAL_GREY * step[6].abs() + step[7].abs();
-            let is_small =
-                moved_px < self.params.step_tolerance_px && relit < self.params.step_tolerance_grey;
+            let is_small = state.sums.decrement(&step) < self.params.step_tolerance;
             if keeps_view && in_view >= min_in_view && ratio < TOLERATED_RISE {
                 state = candidate;
                 lambda = if lambda <= FIRST_DAMPING { 0.0 } else { 0.5 * lambda };
@@ -443,9 +438,6 @@ impl Aligner {
         alignment.scatter = self.kernel.scatter(points, frame.level(level), &at);
     }
 }
-
-/// Brightness at which a step in the gain is weighed against one in the offset.
-const TYPICAL_GREY: f64 = 128.0;
 
 /// λ after the first failure, and the bound below which a success sets it to zero.
 const FIRST_DAMPING: f64 = 0.2;

@@ -54,8 +54,7 @@ fn with_error(keyframe: &Keyframe, m: &Vector3<f64>, centre: &Vector3<f64>) -> K
 /// An aligner that goes on until nothing moves any more.
 fn patient() -> Aligner {
     Aligner::new(AlignmentParams {
-        step_tolerance_px: 1e-6,
-        step_tolerance_grey: 1e-5,
+        step_tolerance: 1e-4,
         energy_tolerance: 1.0,
         ..AlignmentParams::default()
     })

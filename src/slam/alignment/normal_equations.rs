@@ -70,6 +70,11 @@ impl NormalEquations {
         step.iter().all(|x| x.is_finite()).then_some(step)
     }
 
+    /// Length of `step` in standard deviations: √(δᵀMδ), M the information.
+    pub fn decrement(&self, step: &SVector<f64, UNKNOWNS>) -> f64 {
+        step.dot(&(self.information * step)).max(0.0).sqrt()
+    }
+
     /// Covariance of the pose with the brightness marginalised, before calibration; `None` where
     /// the information does not determine all unknowns.
     pub fn pose_covariance(&self) -> Option<Matrix6<f64>> {
