@@ -373,6 +373,9 @@ fn apply(table: &mut Table, setting: &str) -> Result<(), String> {
         .unwrap_or_else(|| Value::String(value.to_owned()));
     let mut keys: Vec<&str> = layout::plain(path.trim()).split('.').map(str::trim).collect();
     let last = keys.pop().filter(|key| !key.is_empty()).ok_or_else(|| form.to_owned())?;
+    if keys.is_empty() && last == layout::EXPERT {
+        return Err("it has keys below it, as in expert.mapping.min_gradient=5.0".to_owned());
+    }
     let mut table = table;
     for key in keys {
         let entry = table.entry(key).or_insert_with(|| Value::Table(Table::new()));

@@ -9,7 +9,7 @@ use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
 /// The table that holds what nobody has to set.
-const EXPERT: &str = "expert";
+pub const EXPERT: &str = "expert";
 
 /// Keys outside `[expert]`: what a camera, a robot, a recording or a first try may need.
 const USER_KEYS: [&str; 36] = [

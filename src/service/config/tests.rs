@@ -85,6 +85,7 @@ fn errors_below_expert_name_line_and_listed_key() {
     );
     let told = set(&["expert.mapping.min_gradint=6.0"]).unwrap_err();
     assert!(told.contains("unknown key `mapping.min_gradint`; keys of `mapping` are "), "{told}");
+    assert!(set(&["expert=2"]).unwrap_err().starts_with("--set expert=2: it has keys below it"));
     let told = set(&["tracking.min_contrast=-1.0"]).unwrap_err();
     assert!(told.contains("expert.tracking.min_contrast = -1: must be"), "{told}");
 }
