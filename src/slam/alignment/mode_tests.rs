@@ -171,3 +171,30 @@ fn the_covariance_holds_a_pose_on_tilted_depth() {
         assert!(with < RARE, "{m}: {with}");
     }
 }
+
+/// With a coarse rule far more than the claimed standard deviation could be left.
+#[test]
+fn what_an_alignment_leaves_is_a_small_part_of_what_it_claims() {
+    let left = |step_tolerance: f64| {
+        let mut worst = 0.0f64;
+        for seed in 0..8 {
+            let turn = 0.004 * f64::from(seed);
+            let pose = SE3::exp(&Vector6::new(0.1, 0.02 + turn, -0.05, turn, -0.03, 0.01));
+            let (keyframe, frame) = keyframe_and_frame(&pose);
+            let reference = Reference::prepare(&keyframe);
+            let params = AlignmentParams {
+                step_tolerance,
+                energy_tolerance: 1.0,
+                ..AlignmentParams::default()
+            };
+            let (start, brightness) = (SE3::identity(), Brightness::default());
+            let aligner = Aligner::new(params);
+            let sums =
+                aligner.align(&reference, &frame, &start, brightness, &mut |_| true).state.sums;
+            worst = worst.max(sums.decrement(&sums.damped_step(0.0).unwrap()));
+        }
+        worst
+    };
+    let (usual, coarse) = (left(AlignmentParams::default().step_tolerance), left(10.0));
+    assert!(usual < 0.3 && coarse > 2.0 * usual, "{usual} {coarse}");
+}
