@@ -111,7 +111,7 @@ fn observe(
     let patch = Patch::new(&map.image, u, v, 1.0, 0.0);
     let frame = Sampled { image: frame, sampler: PortableSampler };
     let found = search(frame, &line, &patch, &conditioning, &from, &to, params).ok()?;
-    Some(f64::from((found.inverse_depth - truth) / found.variance.sqrt()))
+    Some(f64::from((found.inverse_depth - truth) / found.uncertainty.variance.sqrt()))
 }
 
 /// Standard normal.

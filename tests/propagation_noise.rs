@@ -97,10 +97,10 @@ fn normalized_spreads(target_from_source: &SE3) -> Vec<f64> {
             source.hypotheses.pixels_mut()[point.at.1 * CAMERA.width + point.at.0] = Hypothesis {
                 inverse_depth,
                 variance: (std_dev * std_dev) as f32,
+                independent: (std_dev * std_dev) as f32,
                 smoothed: inverse_depth,
                 validity: 5,
-                propagated: false,
-                failures: 0,
+                ..Hypothesis::NONE
             };
         }
         target.hypotheses.pixels_mut().fill(Hypothesis::NONE);

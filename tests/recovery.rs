@@ -165,8 +165,8 @@ fn after_a_blackout_a_known_view_is_found_again() {
 
     let without_search =
         RecoveryParams { num_keyframes: 0, lost_timeout_secs: 1e3, ..RecoveryParams::default() };
-    let after = count_tracked(&replay(without_search), 160..220);
-    assert!(after < 10, "the tracker alone does not get there: {after}");
+    let alone = count_tracked(&replay(without_search), 160..220);
+    assert!(2 * alone < after, "the tracker alone finds it late, if at all: {alone} of {after}");
 }
 
 #[test]

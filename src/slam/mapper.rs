@@ -19,6 +19,7 @@ use serde::{Deserialize, Serialize};
 use crate::slam::depth::candidate::CandidateParams;
 use crate::slam::depth::gaussian::{GaussianParams, ObservationCounts};
 use crate::slam::depth::immature::IntervalParams;
+use crate::slam::depth::line_noise::{LineNoise, LineNoiseParams};
 use crate::slam::depth::matching::MatchingParams;
 use crate::slam::depth::propagation::PropagationParams;
 use crate::slam::depth::regularisation::RegularisationParams;
@@ -73,6 +74,8 @@ pub struct MapperParams {
     pub depth_filter: DepthFilter,
     /// Search along the epipolar line.
     pub matching: MatchingParams,
+    /// How far epipolar lines are misplaced, from the matches.
+    pub line_noise: LineNoiseParams,
     /// The Gaussian filter.
     pub gaussian: GaussianParams,
     /// The interval filter.
@@ -108,6 +111,7 @@ impl Default for MapperParams {
             min_keyframe_interval: 2,
             depth_filter: DepthFilter::default(),
             matching: MatchingParams::default(),
+            line_noise: LineNoiseParams::default(),
             gaussian: GaussianParams::default(),
             interval: IntervalParams::default(),
             candidates: CandidateParams::default(),
@@ -141,6 +145,7 @@ impl MapperParams {
         check_range("max_map_megabytes", self.max_map_megabytes, 16..=1_000_000)?;
         check_range("min_keyframe_interval", self.min_keyframe_interval, 1..=1000)?;
         self.matching.validate().map_err(|e| e.within("matching"))?;
+        self.line_noise.validate().map_err(|e| e.within("line_noise"))?;
         self.gaussian.validate().map_err(|e| e.within("gaussian"))?;
         self.interval.validate().map_err(|e| e.within("interval"))?;
         self.candidates.validate().map_err(|e| e.within("candidates"))?;
@@ -196,6 +201,8 @@ pub struct Mapper {
     last_world_from_camera: Option<SE3>,
     depth: DepthBuffers,
     modes: KeyframeModes,
+    /// By how much the lines of estimated poses are misplaced.
+    line_noise: LineNoise,
     start: Start,
     finder: Finder,
     past: PastFrames,
@@ -224,6 +231,7 @@ impl Mapper {
             active: None,
             world_from_map: Sim3::identity(),
             last_world_from_camera: None,
+            line_noise: LineNoise::new(params.matching.line_noise_px),
             depth: DepthBuffers::with_size(width, height),
             modes: KeyframeModes::default(),
             start: Start::new(intrinsics, &params.two_frame)?,

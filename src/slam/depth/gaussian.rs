@@ -5,6 +5,8 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::epipolar::TwoView;
+use crate::slam::depth::gain::{Gain, Uncertainty};
+use crate::slam::depth::line_noise::Innovations;
 use crate::slam::depth::map::{BORDER_PX, DepthMap, GradientImage, Hypothesis};
 use crate::slam::depth::matching::{
     Match, MatchingParams, Miss, Patch, condition, is_inside, search,
@@ -26,14 +28,9 @@ pub struct GaussianParams {
     /// An observation further off than this many joint standard deviations contradicts. A gate of 1,
     /// the literature's, rejects a third of the right ones.
     pub gate_sigmas: f32,
-    /// A pixel is observed only when one match promises a variance below this many times its own:
-    /// waiting for baseline costs nothing and gains more than averaging equal views.
+    /// A pixel is observed only when a match promises to leave less than this share of its variance: frames that
+    /// follow each other share the error of their poses, so waiting for baseline gains more than looking again.
     pub max_variance_ratio: f32,
-    /// Share of the match variance that is common to all observations of a pixel: the keyframe's own
-    /// noise, the pose's error and the interpolation of the same patch are in each. The variance never
-    /// falls below this share of the best single observation; at 1 repeated views are averaged but
-    /// not believed more, which is what the coverage of the simulated room asks for.
-    pub common_noise_ratio: f32,
     /// Factor on the variance before each fusion: the world and the poses are never quite still.
     pub process_inflation: f32,
     /// Factor on the variance after a contradiction.
@@ -52,8 +49,7 @@ impl Default for GaussianParams {
         Self {
             search_sigmas: 2.0,
             gate_sigmas: 2.5,
-            max_variance_ratio: 0.7,
-            common_noise_ratio: 1.0,
+            max_variance_ratio: 0.2,
             process_inflation: 1.01,
             contradiction_inflation: 1.2,
             max_std_dev: 0.5,
@@ -68,8 +64,7 @@ impl GaussianParams {
     pub fn validate(&self) -> Result<(), ParameterError> {
         check_range("search_sigmas", self.search_sigmas, 0.5..=10.0)?;
         check_range("gate_sigmas", self.gate_sigmas, 0.5..=10.0)?;
-        check_range("max_variance_ratio", self.max_variance_ratio, 0.1..=100.0)?;
-        check_range("common_noise_ratio", self.common_noise_ratio, 0.0..=1.0)?;
+        check_range("max_variance_ratio", self.max_variance_ratio, 0.01..=1.0)?;
         check_range("process_inflation", self.process_inflation, 1.0..=2.0)?;
         check_range("contradiction_inflation", self.contradiction_inflation, 1.0..=10.0)?;
         check_range("max_std_dev", self.max_std_dev, 0.01..=10.0)?;
@@ -94,6 +89,30 @@ pub struct ObservationCounts {
     pub failed: usize,
     /// New hypotheses.
     pub created: usize,
+    /// Searches for an even sample of the hypotheses of which nothing was to be learnt, to see whether they still
+    /// hold: those with something to learn are often those that failed before.
+    pub probed: usize,
+    /// Of them, contradicting or without a match.
+    pub refuted: usize,
+}
+
+/// What one frame did to the map, and how well it fitted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Observation {
+    /// By number of pixels.
+    pub counts: ObservationCounts,
+    /// How far matches were from where known depth put them.
+    pub innovations: Innovations,
+}
+
+impl Observation {
+    /// Of two parts of the map together.
+    pub fn plus(self, other: Self) -> Self {
+        Self {
+            counts: self.counts.plus(other.counts),
+            innovations: self.innovations.plus(other.innovations),
+        }
+    }
 }
 
 impl ObservationCounts {
@@ -104,6 +123,8 @@ impl ObservationCounts {
             fused: self.fused + other.fused,
             failed: self.failed + other.failed,
             created: self.created + other.created,
+            probed: self.probed + other.probed,
+            refuted: self.refuted + other.refuted,
         }
     }
 }
@@ -140,7 +161,7 @@ pub fn observe(
     observer: &Observer<'_>,
     matching: &MatchingParams,
     params: &GaussianParams,
-) -> ObservationCounts {
+) -> Observation {
     let (width, height) = (map.image.width(), map.image.height());
     let pixel = PixelObserver {
         image: &map.image,
@@ -159,8 +180,13 @@ pub fn observe(
         .enumerate()
         .filter(|(v, _)| (BORDER_PX..height - BORDER_PX).contains(v))
         .map(|(v, row)| observe_row(&pixel, row, v))
-        .reduce(ObservationCounts::default, ObservationCounts::plus)
+        .reduce(Observation::default, Observation::plus)
 }
+
+/// Of so many pixels one is probed.
+const PROBE_STEP: usize = 32;
+/// Columns by which the probed pixels of a row are displaced against those of the row above: no column has all.
+const PROBE_ROW_SHIFT: usize = 11;
 
 /// Columns that are listed at a time, on the stack.
 const BLOCK: usize = 512;
@@ -185,8 +211,8 @@ impl PixelObserver<'_> {
         sampler: S,
         row: &mut [Hypothesis],
         v: usize,
-    ) -> ObservationCounts {
-        let mut counts = ObservationCounts::default();
+    ) -> Observation {
+        let mut seen = Observation::default();
         let candidates = self.candidates.row(v);
         let skips_propagated = self.observer.pixels == ObservedPixels::New;
         let creates = self.observer.pixels != ObservedPixels::Known;
@@ -201,14 +227,14 @@ impl PixelObserver<'_> {
                 num_unknown += usize::from(!is_some & candidates[u] & creates);
             }
             for columns in known[..num_known].chunks(LANES) {
-                self.update_promising(sampler, row, columns, v, &mut counts);
+                self.update_promising(sampler, row, columns, v, &mut seen);
             }
             for &u in &unknown[..num_unknown] {
                 let u = usize::from(u);
-                self.create(sampler, &mut row[u], u, v, &mut counts);
+                self.create(sampler, &mut row[u], u, v, &mut seen.counts);
             }
         }
-        counts
+        seen
     }
 
     /// Updates those of the `columns` of row `v`, at most [`LANES`], whose match promises something.
@@ -219,14 +245,15 @@ impl PixelObserver<'_> {
         row: &mut [Hypothesis],
         columns: &[u16],
         v: usize,
-        counts: &mut ObservationCounts,
+        seen: &mut Observation,
     ) {
         let mut pixels = PixelLanes::default();
         for (k, u) in columns.iter().map(|&u| usize::from(u)).enumerate() {
             let hypothesis = &row[u];
             pixels.u[k] = u as f32;
             pixels.inverse_depth[k] = hypothesis.smoothed;
-            pixels.enough[k] = self.params.max_variance_ratio * hypothesis.variance;
+            pixels.variance[k] = hypothesis.variance;
+            pixels.independent[k] = hypothesis.independent;
             let structure = &self.structure.row(v)[u];
             for (plane, &sum) in pixels.structure.iter_mut().zip(structure) {
                 plane[k] = sum;
@@ -234,11 +261,14 @@ impl PixelObserver<'_> {
         }
         let Observer { image: frame, view, .. } = self.observer;
         let size = (frame.width(), frame.height());
-        let promises = promises(&pixels, v as f32, view, size, self.gain, self.matching);
+        let enough = self.params.max_variance_ratio;
+        let promises = promises(&pixels, v as f32, view, size, self.gain, enough, self.matching);
         for (&u, &promises) in columns.iter().zip(&promises) {
+            let u = usize::from(u);
             if promises {
-                let u = usize::from(u);
-                self.update(sampler, &mut row[u], u, v, counts);
+                self.update(sampler, &mut row[u], u, v, seen);
+            } else if (u + PROBE_ROW_SHIFT * v).is_multiple_of(PROBE_STEP) {
+                self.probe(sampler, &row[u], u, v, &mut seen.counts);
             }
         }
     }
@@ -251,8 +281,9 @@ impl PixelObserver<'_> {
         hypothesis: &mut Hypothesis,
         u: usize,
         v: usize,
-        counts: &mut ObservationCounts,
+        seen: &mut Observation,
     ) {
+        let Observation { counts, innovations } = seen;
         let centre = hypothesis.smoothed;
         let Observer { image: frame, view, .. } = self.observer;
         let line = view.line(u as f32, v as f32);
@@ -264,8 +295,8 @@ impl PixelObserver<'_> {
         let structure = &self.structure.row(v)[u];
         let conditioning = condition(view, &line, &at, structure, self.gain, self.matching);
         let Some(conditioning) = conditioning else { return };
-        let enough = self.params.max_variance_ratio * hypothesis.variance;
-        if conditioning.expected_variance() > enough {
+        let left = Gain::of(hypothesis.uncertainty(), conditioning.promise()).left;
+        if left.variance > self.params.max_variance_ratio * hypothesis.variance {
             return;
         }
         // No further than the search goes: half its length to either side.
@@ -281,6 +312,11 @@ impl PixelObserver<'_> {
         match search(frame, &line, &patch, &conditioning, &from, &to, self.matching) {
             Ok(found) => {
                 counts.attempted += 1;
+                let innovation = found.inverse_depth - hypothesis.inverse_depth;
+                innovations.add(
+                    innovation / conditioning.inverse_depth_per_px,
+                    conditioning.own_std_dev(),
+                );
                 if self.fuse(hypothesis, &found) {
                     counts.fused += 1;
                 } else {
@@ -299,13 +335,56 @@ impl PixelObserver<'_> {
         }
     }
 
+    /// Whether a hypothesis holds in the frame; it is not changed.
+    #[inline(always)]
+    fn probe<S: Sampler>(
+        &self,
+        sampler: S,
+        hypothesis: &Hypothesis,
+        u: usize,
+        v: usize,
+        counts: &mut ObservationCounts,
+    ) {
+        let Observer { image: frame, view, .. } = self.observer;
+        let line = view.line(u as f32, v as f32);
+        let Some(at) = line
+            .project(hypothesis.smoothed)
+            .filter(|p| is_inside(frame.width(), frame.height(), p.u, p.v))
+        else {
+            return;
+        };
+        let structure = &self.structure.row(v)[u];
+        let conditioning = condition(view, &line, &at, structure, self.gain, self.matching);
+        let Some(conditioning) = conditioning else { return };
+        let patch = Patch::new(self.image, u, v, self.gain, self.offset);
+        let frame = Sampled { image: frame, sampler };
+        let found = search(frame, &line, &patch, &conditioning, &at, &at, self.matching);
+        match found {
+            Ok(found) => {
+                counts.probed += 1;
+                let difference = found.inverse_depth - hypothesis.inverse_depth;
+                let joint = hypothesis.variance + found.uncertainty.variance;
+                let gate = self.params.gate_sigmas;
+                counts.refuted += usize::from(difference * difference > gate * gate * joint);
+            }
+            Err(Miss::Mismatch) => {
+                counts.probed += 1;
+                counts.refuted += 1;
+            }
+            Err(Miss::Ambiguous | Miss::OutOfView | Miss::TooLong) => {}
+        }
+    }
+
     /// Product of Gaussians; false when the observation contradicts.
     fn fuse(&self, hypothesis: &mut Hypothesis, found: &Match) -> bool {
-        let prior = hypothesis.variance * self.params.process_inflation;
+        let inflation = self.params.process_inflation;
+        let (prior, independent) =
+            (hypothesis.variance * inflation, hypothesis.independent * inflation);
         let difference = found.inverse_depth - hypothesis.inverse_depth;
         let gate = self.params.gate_sigmas;
-        if difference * difference > gate * gate * (prior + found.variance) {
+        if difference * difference > gate * gate * (prior + found.uncertainty.variance) {
             hypothesis.variance = prior * self.params.contradiction_inflation;
+            hypothesis.independent = independent * self.params.contradiction_inflation;
             hypothesis.validity = hypothesis.validity.saturating_sub(1);
             let too_uncertain = hypothesis.variance > self.params.max_std_dev.powi(2);
             if hypothesis.validity == 0 || too_uncertain {
@@ -313,11 +392,11 @@ impl PixelObserver<'_> {
             }
             return false;
         }
-        let weight = prior / (prior + found.variance);
-        let fused = prior * found.variance / (prior + found.variance);
+        let known = Uncertainty { variance: prior, independent };
+        let Gain { weight, left } = Gain::of(known, found.uncertainty);
         hypothesis.inverse_depth += weight * difference;
         hypothesis.smoothed += weight * (found.inverse_depth - hypothesis.smoothed);
-        hypothesis.variance = fused.max(self.params.common_noise_ratio * found.variance).min(prior);
+        (hypothesis.variance, hypothesis.independent) = (left.variance, left.independent);
         hypothesis.validity = (hypothesis.validity + 1).min(MAX_VALIDITY);
         if !(hypothesis.inverse_depth > 0.0 && hypothesis.smoothed > 0.0) {
             hypothesis.reject();
@@ -359,12 +438,13 @@ impl PixelObserver<'_> {
         match search(frame, &line, &patch, &conditioning, &from, &to, self.matching) {
             Ok(found)
                 if found.inverse_depth > 0.0
-                    && found.variance < self.params.max_std_dev.powi(2) =>
+                    && found.uncertainty.variance < self.params.max_std_dev.powi(2) =>
             {
                 counts.created += 1;
                 *hypothesis = Hypothesis {
                     inverse_depth: found.inverse_depth,
-                    variance: found.variance,
+                    variance: found.uncertainty.variance,
+                    independent: found.uncertainty.independent,
                     smoothed: found.inverse_depth,
                     validity: NEW_VALIDITY,
                     propagated: false,

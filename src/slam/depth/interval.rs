@@ -80,6 +80,7 @@ impl MatureDepth {
         Hypothesis {
             inverse_depth: self.inverse_depth,
             variance: self.variance,
+            independent: self.variance,
             smoothed: self.inverse_depth,
             validity,
             propagated: false,

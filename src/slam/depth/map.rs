@@ -3,6 +3,7 @@
 
 use rayon::prelude::*;
 
+use crate::slam::depth::gain::Uncertainty;
 use crate::slam::depth::matching::PATTERN;
 use crate::slam::image::buffer::Image;
 
@@ -13,6 +14,11 @@ pub const BORDER_PX: usize = 4;
 /// Rows that a thread takes at least, where a row is cheap: waking another thread costs as much as
 /// thousands of pixels.
 pub(super) const BAND_ROWS: usize = 60;
+
+/// Grey level of a pixel without any light.
+const BLACK: f32 = 0.0;
+/// Grey level of a pixel that could be any brighter.
+const WHITE: f32 = 255.0;
 
 /// A keyframe's image with its gradients, level 0.
 #[derive(Debug, Clone)]
@@ -67,6 +73,21 @@ impl GradientImage {
         u.iter().zip(v).map(|(gu, gv)| (gu * gu + gv * gv).sqrt())
     }
 
+    /// Whether the pixels of row `v` that are not on the border, and the four beside each, are neither black nor
+    /// white: where the sensor ends, brightness is not what was seen and gradients are not where they appear.
+    #[inline(always)]
+    fn unsaturated(&self, v: usize) -> impl Iterator<Item = bool> {
+        let (first, end) = (BORDER_PX, self.width() - BORDER_PX);
+        let row = |v: usize, from: usize, to: usize| &self.intensity.row(v)[from..to];
+        let beside = row(v, first - 1, end - 1).iter().zip(row(v, first + 1, end + 1));
+        let above_below = row(v - 1, first, end).iter().zip(row(v + 1, first, end));
+        row(v, first, end).iter().zip(beside).zip(above_below).map(|((at, (l, r)), (a, b))| {
+            let darkest = at.min(*l).min(*r).min(*a).min(*b);
+            let brightest = at.max(*l).max(*r).max(*a).max(*b);
+            (darkest > BLACK) & (brightest < WHITE)
+        })
+    }
+
     /// Width in pixels.
     pub fn width(&self) -> usize {
         self.intensity.width()
@@ -85,6 +106,8 @@ pub struct Hypothesis {
     pub inverse_depth: f32,
     /// Its variance; negative where the pixel has no hypothesis.
     pub variance: f32,
+    /// The part of `variance` that differs from one observation to the next; the rest is common to all.
+    pub independent: f32,
     /// Inverse depth smoothed over consistent neighbours: what is published and searched around.
     pub smoothed: f32,
     /// How often it was confirmed less how often it failed; at 0 it is dropped.
@@ -100,6 +123,7 @@ impl Hypothesis {
     pub const NONE: Self = Self {
         inverse_depth: 0.0,
         variance: -1.0,
+        independent: 0.0,
         smoothed: 0.0,
         validity: 0,
         propagated: false,
@@ -110,6 +134,12 @@ impl Hypothesis {
     #[inline]
     pub fn is_some(&self) -> bool {
         self.variance >= 0.0
+    }
+
+    /// How uncertain it is.
+    #[inline(always)]
+    pub fn uncertainty(&self) -> Uncertainty {
+        Uncertainty { variance: self.variance, independent: self.independent }
     }
 
     /// Removes the hypothesis and remembers that this pixel failed.
@@ -258,7 +288,10 @@ impl DepthMap {
             row.fill(false);
             if (BORDER_PX..height - BORDER_PX).contains(&v) {
                 let strengths = image.strengths(v);
-                row[BORDER_PX..].iter_mut().zip(strengths).for_each(|(c, s)| *c = enough(s));
+                let seen = strengths.zip(image.unsaturated(v));
+                row[BORDER_PX..].iter_mut().zip(seen).for_each(|(c, (s, unsaturated))| {
+                    *c = enough(s) & unsaturated;
+                });
             }
             row.iter().map(|&candidate| usize::from(candidate)).sum::<usize>()
         });
@@ -342,6 +375,7 @@ impl DepthMap {
                 h.inverse_depth *= factor;
                 h.smoothed *= factor;
                 h.variance *= factor * factor;
+                h.independent *= factor * factor;
             }
         });
     }
@@ -350,6 +384,25 @@ impl DepthMap {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn black_and_white_pixels_and_their_neighbours_carry_no_depth() {
+        let (width, height) = (24, 16);
+        let stripes = |light: u8| {
+            let grey = move |i: usize| if i % width % 4 < 2 { 40 } else { light };
+            (0..width * height).map(grey).collect::<Vec<u8>>()
+        };
+        let candidates = |pixels: &[u8]| {
+            let mut map = DepthMap::with_size(width, height);
+            map.restart(pixels, 5.0, usize::MAX);
+            map.candidates.pixels().iter().filter(|c| **c).count()
+        };
+        assert!(candidates(&stripes(200)) > 50);
+        assert_eq!(candidates(&stripes(255)), 0);
+        let mut dark = stripes(200);
+        dark[8 * width + 10] = 0;
+        assert_eq!(candidates(&stripes(200)) - candidates(&dark), 5);
+    }
 
     #[test]
     fn gradients_are_central_differences() {
@@ -381,7 +434,7 @@ mod tests {
     fn candidates_and_their_structure_are_those_of_each_pixel() {
         let (width, height) = (61, 45);
         let pixels: Vec<u8> =
-            (0..width * height).map(|i| ((i * i * 31 + i * 7) % 251) as u8).collect();
+            (0..width * height).map(|i| ((i * i * 31 + i * 7) % 251 + 2) as u8).collect();
         let mut map = DepthMap::with_size(width, height);
         map.restart(&pixels, 40.0, 700);
         let (gu, gv) = (map.image.gradient_u.pixels(), map.image.gradient_v.pixels());

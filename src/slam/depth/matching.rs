@@ -7,6 +7,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::epipolar::{EpipolarLine, Projection, TwoView};
+use crate::slam::depth::gain::Uncertainty;
 use crate::slam::depth::map::{BORDER_PX, GradientImage};
 use crate::slam::image::quads_kernel::{Sampled, Sampler};
 use crate::slam::parameter::{ParameterError, check_range};
@@ -26,10 +27,13 @@ pub struct MatchingParams {
     /// Standard deviation of the image noise, grey levels. Cameras in rooms have 2 to 4.
     pub image_noise: f32,
     /// Standard deviation by which errors of an estimated pose beyond its covariance misplace the epipolar
-    /// line, pixels. A pose that is given without covariance has none. The covariance takes the errors of
+    /// line, pixels, until the matches have shown it. A pose that is given without covariance has none. The covariance takes the errors of
     /// points for independent; what is common to a keyframe's depth is in every pose on it and comes back with
     /// every match. `docs/depth-noise.md` has the figures.
     pub line_noise_px: f32,
+    /// Share of that variance that differs from one frame to the next; the rest moves all matches of a pixel
+    /// together.
+    pub independent_line_ratio: f32,
     /// The same of errors of the calibration, which are in every match, pixels.
     pub calibration_noise_px: f32,
     /// Standard deviation that interpolation and sampling leave in a match, pixels: measured without
@@ -37,7 +41,8 @@ pub struct MatchingParams {
     pub sampling_noise_px: f32,
     /// Standard deviation that the slant of surfaces leaves in a match, pixels for a disparity of one
     /// focal length. The patch is taken for one at a single depth: on a surface slanted by θ a sample
-    /// r pixels off the centre is misplaced by r tan θ times the disparity in focal lengths. r is 1 to 2.
+    /// r pixels off the centre is misplaced by r tan θ times the disparity in focal lengths. r is 1 to 2, and
+    /// most surfaces are slanted by less than 45°.
     pub slant_noise_px: f32,
     /// Longest segment that is searched, pixels: beyond it repeated structure wins.
     pub max_search_px: f32,
@@ -58,9 +63,10 @@ impl Default for MatchingParams {
         Self {
             image_noise: 3.0,
             line_noise_px: 1.0,
+            independent_line_ratio: 0.25,
             calibration_noise_px: 0.03,
             sampling_noise_px: 0.08,
-            slant_noise_px: 1.5,
+            slant_noise_px: 0.7,
             max_search_px: 40.0,
             min_line_gradient: 2.0,
             max_residual: 10.0,
@@ -73,10 +79,9 @@ impl Default for MatchingParams {
 impl MatchingParams {
     /// By how much the epipolar line is misplaced when the pose is uncertain by `pose_noise_px`, no more than
     /// any search reaches. A pose that is certain is given: then only the calibration errs.
-    pub fn line_noise_with(&self, pose_noise_px: f64) -> f32 {
+    pub fn line_noise_with(&self, line_noise_px: f32, pose_noise_px: f64) -> f32 {
         let is_estimated = pose_noise_px > 0.0;
-        let of_pose =
-            if is_estimated { self.line_noise_px.hypot(pose_noise_px as f32) } else { 0.0 };
+        let of_pose = if is_estimated { line_noise_px.hypot(pose_noise_px as f32) } else { 0.0 };
         of_pose.hypot(self.calibration_noise_px).min(self.max_search_px)
     }
 
@@ -84,6 +89,7 @@ impl MatchingParams {
     pub fn validate(&self) -> Result<(), ParameterError> {
         check_range("image_noise", self.image_noise, 0.1..=50.0)?;
         check_range("line_noise_px", self.line_noise_px, 0.0..=5.0)?;
+        check_range("independent_line_ratio", self.independent_line_ratio, 0.0..=1.0)?;
         check_range("calibration_noise_px", self.calibration_noise_px, 0.0..=5.0)?;
         check_range("sampling_noise_px", self.sampling_noise_px, 0.0..=2.0)?;
         check_range("slant_noise_px", self.slant_noise_px, 0.0..=20.0)?;
@@ -135,6 +141,11 @@ pub struct Conditioning {
     squared_gradient: f32,
     /// Variance of the match along the line, pixels².
     pub match_variance: f32,
+    /// The part of it that differs from one frame to the next, pixels²: the frame's own noise, sampling, and a
+    /// share of the line's misplacement.
+    pub independent_variance: f32,
+    /// Without the line's misplacement, pixels².
+    own_variance: f32,
     /// ∂d/∂λ: inverse depth a pixel along the line.
     pub inverse_depth_per_px: f32,
 }
@@ -144,8 +155,8 @@ pub struct Conditioning {
 pub struct Match {
     /// Observed inverse depth.
     pub inverse_depth: f32,
-    /// Its variance.
-    pub variance: f32,
+    /// How uncertain it is.
+    pub uncertainty: Uncertainty,
     /// Mean squared residual of the patch, grey levels².
     pub mean_squared_residual: f32,
 }
@@ -219,21 +230,41 @@ pub fn condition(
     let photometric = noise * measured / (information * information);
     let slant = params.slant_noise_px * view.disparity(line, at);
     let sampling = params.sampling_noise_px * params.sampling_noise_px + slant * slant;
+    // The keyframe's noise is in every match, the slant too.
+    let independent = params.independent_line_ratio * geometric
+        + photometric / (1.0 + gain * gain)
+        + params.sampling_noise_px * params.sampling_noise_px;
     Some(Conditioning {
         direction,
         along,
         warp,
         squared_gradient: (measured + product(across, across)) / samples,
         match_variance: geometric + photometric + sampling,
+        independent_variance: independent,
+        own_variance: photometric + sampling,
         inverse_depth_per_px: 1.0 / speed,
     })
 }
 
 impl Conditioning {
-    /// Variance that a match would give the inverse depth.
+    /// How uncertain a match would leave the inverse depth.
     #[inline(always)]
-    pub fn expected_variance(&self) -> f32 {
-        self.inverse_depth_per_px.powi(2) * self.match_variance
+    pub fn promise(&self) -> Uncertainty {
+        self.times(self.inverse_depth_per_px * self.inverse_depth_per_px)
+    }
+
+    /// Standard deviation that noise of the images, sampling and slant leave in a match, pixels.
+    #[inline(always)]
+    pub fn own_std_dev(&self) -> f32 {
+        self.own_variance.sqrt()
+    }
+
+    #[inline(always)]
+    fn times(&self, factor: f32) -> Uncertainty {
+        Uncertainty {
+            variance: factor * self.match_variance,
+            independent: factor * self.independent_variance,
+        }
     }
 }
 
@@ -323,7 +354,7 @@ pub fn search<S: Sampler>(
     let alpha = 1.0 / (vu * vu + vv * vv).sqrt().max(f32::MIN_POSITIVE);
     Ok(Match {
         inverse_depth,
-        variance: alpha * alpha * conditioning.match_variance,
+        uncertainty: conditioning.times(alpha * alpha),
         mean_squared_residual,
     })
 }

@@ -2,14 +2,14 @@
 //!
 //! One source for all: no operation is fused or reordered, so every version gives the same bits.
 
-use crate::slam::depth::gaussian::{ObservationCounts, PixelObserver};
+use crate::slam::depth::gaussian::{Observation, PixelObserver};
 use crate::slam::depth::map::Hypothesis;
 #[cfg(target_arch = "x86_64")]
 use crate::slam::image::quads_kernel::Avx2Sampler;
 use crate::slam::image::quads_kernel::PortableSampler;
 
 /// A version of [`PixelObserver::observe_row`].
-pub(super) type RowKernel = fn(&PixelObserver<'_>, &mut [Hypothesis], usize) -> ObservationCounts;
+pub(super) type RowKernel = fn(&PixelObserver<'_>, &mut [Hypothesis], usize) -> Observation;
 
 /// The best version for this processor.
 pub(super) fn row_kernel() -> RowKernel {
@@ -38,17 +38,13 @@ fn observe_row_portable(
     pixel: &PixelObserver<'_>,
     row: &mut [Hypothesis],
     v: usize,
-) -> ObservationCounts {
+) -> Observation {
     pixel.observe_row(PortableSampler, row, v)
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn observe_row_avx2(
-    pixel: &PixelObserver<'_>,
-    row: &mut [Hypothesis],
-    v: usize,
-) -> ObservationCounts {
+fn observe_row_avx2(pixel: &PixelObserver<'_>, row: &mut [Hypothesis], v: usize) -> Observation {
     // SAFETY: this function asks for AVX2.
     let sampler = unsafe { Avx2Sampler::new() };
     pixel.observe_row(sampler, row, v)
@@ -56,11 +52,7 @@ fn observe_row_avx2(
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,avx512f,avx512vl,avx512bw,avx512dq")]
-fn observe_row_avx512(
-    pixel: &PixelObserver<'_>,
-    row: &mut [Hypothesis],
-    v: usize,
-) -> ObservationCounts {
+fn observe_row_avx512(pixel: &PixelObserver<'_>, row: &mut [Hypothesis], v: usize) -> Observation {
     // SAFETY: this function asks for AVX2.
     let sampler = unsafe { Avx2Sampler::new() };
     pixel.observe_row(sampler, row, v)

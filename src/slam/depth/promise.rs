@@ -5,6 +5,7 @@
 //! one that the judgement of a single pixel does, so both decide alike to the last bit.
 
 use crate::slam::depth::epipolar::{MIN_DEPTH_RATIO, TwoView};
+use crate::slam::depth::gain::{Gain, Uncertainty};
 use crate::slam::depth::matching::{DETERMINANT, MARGIN_PX, MatchingParams, PATTERN};
 
 /// Pixels that are judged at a time: a register of the widest vector unit.
@@ -19,14 +20,16 @@ pub struct PixelLanes {
     pub u: Lanes,
     /// Inverse depth that is searched around.
     pub inverse_depth: Lanes,
-    /// Variance below which a match must promise to be, or the pixel is not worth a search.
-    pub enough: Lanes,
+    /// Variance of the inverse depth.
+    pub variance: Lanes,
+    /// The independent part of that.
+    pub independent: Lanes,
     /// Σ (g_u², g_u g_v, g_v²) over the patch.
     pub structure: [Lanes; 3],
 }
 
 /// Whether each pixel of row `v` is seen within a frame of `size` (width, height), and one match there
-/// promises a variance of no more than `enough`.
+/// promises to leave no more than the share `enough` of its variance.
 #[inline(always)]
 pub fn promises(
     pixels: &PixelLanes,
@@ -34,6 +37,7 @@ pub fn promises(
     view: &TwoView,
     size: (usize, usize),
     gain: f32,
+    enough: f32,
     params: &MatchingParams,
 ) -> [bool; LANES] {
     let (m, kt) = (&view.rotation, &view.translation);
@@ -99,8 +103,17 @@ pub fn promises(
         let slant = params.slant_noise_px * parallax[k];
         let sampling = params.sampling_noise_px * params.sampling_noise_px + slant * slant;
         let match_variance = geometric + photometric + sampling;
-        let expected = inverse_depth_per_px[k].powi(2) * match_variance;
-        promises[k] &= (information >= least) & !(expected > pixels.enough[k]);
+        let independent = params.independent_line_ratio * geometric
+            + photometric / (1.0 + gain * gain)
+            + params.sampling_noise_px * params.sampling_noise_px;
+        let factor = inverse_depth_per_px[k] * inverse_depth_per_px[k];
+        let (variance, known) = (pixels.variance[k], pixels.independent[k]);
+        let left = Gain::of(
+            Uncertainty { variance, independent: known },
+            Uncertainty { variance: factor * match_variance, independent: factor * independent },
+        )
+        .left;
+        promises[k] &= (information >= least) & !(left.variance > enough * variance);
     }
     promises
 }
@@ -118,6 +131,7 @@ mod tests {
     fn a_register_of_pixels_is_judged_as_each_of_them() {
         let camera =
             Intrinsics { fx: 200.0, fy: 190.0, cx: 99.5, cy: 74.5, width: 200, height: 150 };
+        const ENOUGH: f32 = 0.7;
         let params = MatchingParams::default();
         let (mut kept, mut judged) = (0, 0);
         for i in 0..400usize {
@@ -137,7 +151,8 @@ mod tests {
             for k in 0..LANES {
                 pixels.u[k] = 4.0 + (i * 3 + k * 11) as f32 % 190.0;
                 pixels.inverse_depth[k] = 3.0 * random(k, 17);
-                pixels.enough[k] = 1e-5 * 1e4f32.powf(random(k, 29));
+                pixels.variance[k] = 1e-5 * 1e4f32.powf(random(k, 29));
+                pixels.independent[k] = pixels.variance[k] * random(k, 13);
                 let (gu, gv) = (30.0 * random(k, 7), 30.0 * random(k, 3));
                 let (uu, uv, vv) = (8.0 * gu * gu, 6.0 * gu * gv, 8.0 * gv * gv);
                 for (plane, sum) in pixels.structure.iter_mut().zip([uu, uv, vv]) {
@@ -145,7 +160,7 @@ mod tests {
                 }
             }
             let together =
-                promises(&pixels, v, &view, (camera.width, camera.height), gain, &params);
+                promises(&pixels, v, &view, (camera.width, camera.height), gain, ENOUGH, &params);
             for k in 0..LANES {
                 let line = view.line(pixels.u[k], v);
                 let alone = line
@@ -155,7 +170,11 @@ mod tests {
                         let structure = pixels.structure.map(|plane| plane[k]);
                         condition(&view, &line, &at, &structure, gain, &params)
                     })
-                    .is_some_and(|c| !(c.expected_variance() > pixels.enough[k]));
+                    .is_some_and(|c| {
+                        let (variance, independent) = (pixels.variance[k], pixels.independent[k]);
+                        let known = Uncertainty { variance, independent };
+                        !(Gain::of(known, c.promise()).left.variance > ENOUGH * variance)
+                    });
                 assert_eq!(together[k], alone, "motion {i}, pixel {k}");
                 kept += usize::from(alone);
                 judged += 1;

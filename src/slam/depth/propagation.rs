@@ -220,6 +220,7 @@ fn carry(from: &Hypothesis, depth_ratio: f32, r_z: f32, params: &PropagationPara
     Hypothesis {
         inverse_depth,
         variance: stretch * stretch * from.variance + process * process,
+        independent: stretch * stretch * from.independent + process * process,
         smoothed: inverse_depth,
         validity: from.validity.min(params.max_validity),
         propagated: true,
@@ -259,6 +260,11 @@ pub fn joined(one: Hypothesis, other: &Hypothesis) -> Option<Hypothesis> {
         smoothed: inverse_depth,
         // They share observations: the mean of two is no more certain than the better one.
         variance: one.variance.min(other.variance),
+        independent: if other.variance < one.variance {
+            other.independent
+        } else {
+            one.independent
+        },
         validity: one.validity.max(other.validity),
         ..one
     })
@@ -291,6 +297,7 @@ mod tests {
                 *h = Hypothesis {
                     inverse_depth: d,
                     variance,
+                    independent: variance,
                     smoothed: d,
                     validity: 5,
                     propagated: false,
@@ -352,6 +359,7 @@ mod tests {
         let at = |d: f32, variance: f32| Hypothesis {
             inverse_depth: d,
             variance,
+            independent: variance,
             smoothed: d,
             validity: 5,
             propagated: true,

@@ -252,6 +252,7 @@ fn fill(out: &mut Hypothesis, sums: &FillingSums, lane: usize) {
     *out = Hypothesis {
         inverse_depth: mean,
         variance,
+        independent: scatter,
         smoothed: mean,
         validity: NEW_VALIDITY / 2,
         propagated: false,
@@ -273,6 +274,7 @@ mod tests {
         map.hypotheses.pixels_mut()[v * 32 + u] = Hypothesis {
             inverse_depth: d,
             variance,
+            independent: variance,
             smoothed: d,
             validity: 5,
             propagated: false,
@@ -401,6 +403,7 @@ mod tests {
             let known = Hypothesis {
                 inverse_depth,
                 variance,
+                independent: variance,
                 smoothed: 0.5,
                 validity: 9,
                 ..Hypothesis::NONE

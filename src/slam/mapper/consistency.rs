@@ -83,12 +83,13 @@ impl Consistency {
     ) -> Option<Contradiction> {
         /// Fewer searches than this say nothing about the map.
         const MIN_SEARCHES: usize = 200;
-        /// Nor do those of so small a share of it: where nearly all is certain already only what
-        /// failed before is searched for.
-        const MIN_SEARCHED_RATIO: f64 = 0.1;
+        /// Nor do those of so small a share of it: where most of the view is new, what is seen of the map
+        /// is its edge.
+        const MIN_SEARCHED_RATIO: f64 = 0.02;
         let enough = MIN_SEARCHED_RATIO * points as f64;
-        if counts.attempted >= MIN_SEARCHES && counts.attempted as f64 >= enough {
-            let failed_ratio = counts.failed as f64 / counts.attempted as f64;
+        let searched = counts.attempted + counts.probed;
+        if searched >= MIN_SEARCHES && searched as f64 >= enough {
+            let failed_ratio = (counts.failed + counts.refuted) as f64 / searched as f64;
             let has_failed = failed_ratio > params.max_failed_ratio;
             self.failed_frames = if has_failed { self.failed_frames + 1 } else { 0 };
         } else {
@@ -131,7 +132,7 @@ mod tests {
     use super::*;
 
     fn counts(attempted: usize, failed: usize) -> ObservationCounts {
-        ObservationCounts { attempted, failed, fused: attempted - failed, created: 0 }
+        ObservationCounts { attempted, failed, fused: attempted - failed, ..Default::default() }
     }
 
     #[test]
@@ -146,8 +147,9 @@ mod tests {
         }
         let few = (0..50).filter_map(|_| watched.observe(&counts(100, 100), 500, &params)).count();
         assert_eq!(few, 0);
-        // A map of which only a twentieth is not certain yet.
-        let rest = (0..50).filter_map(|_| watched.observe(&counts(1000, 900), 20_000, &params));
+        // A map of which only a twentieth is not certain yet: the sample of the others holds.
+        let certain = ObservationCounts { probed: 600, refuted: 20, ..counts(1000, 900) };
+        let rest = (0..50).filter_map(|_| watched.observe(&certain, 20_000, &params));
         assert_eq!(rest.count(), 0);
         let last = (0..params.max_failed_frames)
             .map(|_| watched.observe(&counts(1000, 900), 5000, &params))

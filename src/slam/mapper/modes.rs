@@ -179,8 +179,7 @@ mod tests {
                         smoothed: d,
                         variance: (0.05 * d).powi(2),
                         validity: 9,
-                        propagated: false,
-                        failures: 0,
+                        ..Hypothesis::NONE
                     };
                 }
             }

@@ -67,7 +67,9 @@ impl Mapper {
         let mut counts = ObservationCounts::default();
         if let Some(pixels) = filter.observed() {
             let observer = Observer { image, view, brightness, pixels };
-            counts = observe(depth, &observer, &matching, &self.params.gaussian);
+            let seen = observe(depth, &observer, &matching, &self.params.gaussian);
+            self.line_noise.observe(&seen.innovations, &self.params.line_noise);
+            counts = seen.counts;
         }
         if filter.has_points() {
             let interval = &self.params.interval;

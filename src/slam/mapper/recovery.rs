@@ -242,6 +242,7 @@ pub(super) fn restore_points(map: &mut DepthMap, points: &[DepthPoint]) {
             let restored = Hypothesis {
                 inverse_depth: point.inverse_depth,
                 variance: point.variance,
+                independent: point.variance,
                 smoothed: point.inverse_depth,
                 validity: MAX_VALIDITY / 2,
                 propagated: true,

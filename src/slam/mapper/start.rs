@@ -111,7 +111,7 @@ impl Mapper {
         let matching = &self.params.matching;
         let pose_noise_px = pose_noise_px(&self.intrinsics, &pose.alignment_covariance);
         MatchingParams {
-            line_noise_px: matching.line_noise_with(pose_noise_px),
+            line_noise_px: matching.line_noise_with(self.line_noise.std_dev_px(), pose_noise_px),
             ..matching.clone()
         }
     }
@@ -188,7 +188,7 @@ impl Mapper {
         let current_from_first = start.first_from_current.inverse();
         let covariance = &start.pose_covariance;
         self.modes.begin(&self.depth.active, &self.intrinsics, &current_from_first, covariance);
-        let observations = observe(&mut self.depth.active, &observer, matching, gaussian);
+        let observations = observe(&mut self.depth.active, &observer, matching, gaussian).counts;
         self.modes.observed(&self.depth.active, &current_from_first);
         self.depth.refine(&self.params);
         let scale = self.depth.normalise();
@@ -238,6 +238,7 @@ pub(super) fn take_sensor_depth(map: &mut DepthMap, sensor: &Image<f32>, scale: 
         *hypothesis = Hypothesis {
             inverse_depth,
             variance: (SENSOR_STD_DEV_RATIO * inverse_depth).powi(2),
+            independent: (SENSOR_STD_DEV_RATIO * inverse_depth).powi(2),
             smoothed: inverse_depth,
             validity: NEW_VALIDITY,
             propagated: true,

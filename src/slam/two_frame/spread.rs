@@ -9,7 +9,11 @@ const CELL_PX: usize = 16;
 /// Points that a pixel takes its depth from.
 const NUM_NEAREST: usize = 4;
 /// Standard deviation by which inverse depths of a surface differ, a pixel of distance, relative.
-const SLOPE_STD_DEV_RATIO: f32 = 0.005;
+const SLOPE_STD_DEV_RATIO: f32 = 0.002;
+
+/// Variance of a pixel over the mean squared difference of the points around it: it lies between them, and mostly on
+/// the surface of the nearest. Chosen by the share of truth within one σ on recordings with depth.
+const SPREAD_RATIO: f32 = 0.15;
 
 /// Standard deviation of a pixel with a single point near it, relative.
 const LONELY_STD_DEV_RATIO: f32 = 0.2;
@@ -68,13 +72,14 @@ fn hypothesis_from(depths: &[InitialDepth], nearest: &[(f32, usize); NUM_NEAREST
         let squared = |n: &(f32, usize)| (depths[n.1].inverse_depth - point.inverse_depth).powi(2);
         let (sum, count) = others.fold((0.0, 0u8), |(s, c), n| (s + squared(n), c + 1));
         let alone = (LONELY_STD_DEV_RATIO * point.inverse_depth).powi(2);
-        spread = if count == 0 { alone } else { sum / f32::from(count) };
+        spread = if count == 0 { alone } else { SPREAD_RATIO * sum / f32::from(count) };
     }
     let slope = SLOPE_STD_DEV_RATIO * point.inverse_depth;
     let variance = point.variance + spread + slope * slope * squared_distance;
     Hypothesis {
         inverse_depth: point.inverse_depth,
         variance,
+        independent: variance - point.variance,
         smoothed: point.inverse_depth,
         validity: NEW_VALIDITY,
         propagated: false,

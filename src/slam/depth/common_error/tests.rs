@@ -24,8 +24,7 @@ fn depth() -> DepthMap {
                 smoothed: d,
                 variance: (RELATIVE_STD_DEV * d).powi(2),
                 validity: 9,
-                propagated: false,
-                failures: 0,
+                ..Hypothesis::NONE
             };
         }
     }

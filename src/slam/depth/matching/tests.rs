@@ -83,7 +83,9 @@ fn matches_hold_the_true_inverse_depth_within_their_variance() {
             };
             let error = f64::from(found_match.inverse_depth) - PLANE_INVERSE_DEPTH;
             found += 1;
-            within += usize::from(error.abs() <= 3.0 * f64::from(found_match.variance).sqrt());
+            within += usize::from(
+                error.abs() <= 3.0 * f64::from(found_match.uncertainty.variance).sqrt(),
+            );
             errors.push(error.abs());
         }
     }
