@@ -182,7 +182,7 @@ proptest! {
             prop_assert!(is_clean(&estimate), "{estimate:?}");
         }
         // A sound keyframe of the next epoch, and all is forgotten.
-        let next = Keyframe { epoch: good.epoch + 1, ..good.clone() };
+        let next = Keyframe { keyframe_id: 4, epoch: good.epoch + 1, ..good.clone() };
         tracker.adopt(Box::new(Reference::prepare(&next)));
         let estimate = tracker.track(&view(&good.image, 9, 9), &mut |_| true);
         prop_assert!(estimate.state.is_tracked(), "{estimate:?}");
