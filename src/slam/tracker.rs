@@ -95,7 +95,7 @@ impl TrackerParams {
 /// Variance of what is not known, keyframe units² and radians²: large and finite.
 pub const UNKNOWN_VARIANCE: f64 = 1.0e6;
 
-/// Tracks frames against the reference in force.
+/// Tracks frames against the active reference.
 #[derive(Debug)]
 pub struct Tracker {
     params: TrackerParams,
@@ -133,7 +133,7 @@ impl Tracker {
         })
     }
 
-    /// Puts a prepared reference in force and gives back the one before, for its memory. The
+    /// Makes a prepared reference the active one and gives back the one before, for its memory. The
     /// first of another epoch forgets where the camera was.
     pub fn adopt(&mut self, reference: Box<Reference>) -> Option<Box<Reference>> {
         let before = self.reference.replace(reference);
@@ -165,7 +165,7 @@ impl Tracker {
         self.memory.was_lost = true;
     }
 
-    /// The reference in force.
+    /// The active reference.
     pub fn reference(&self) -> Option<&Reference> {
         self.reference.as_deref()
     }

@@ -185,7 +185,7 @@ pub struct KeyframeImageHeader {
 pub struct StepMessage {
     /// Sequence of the frame.
     pub sequence: u64,
-    /// The keyframe in force from the next frame on, all ones before the first.
+    /// The keyframe that is active from the next frame on, all ones before the first.
     pub keyframe_id: u64,
     /// Its revision.
     pub revision: u64,
@@ -196,7 +196,7 @@ pub struct StepMessage {
     pub change_nanos: u64,
     /// Keyframes in the map.
     pub keyframes: u64,
-    /// Points with depth of the keyframe in force.
+    /// Points with depth of the active keyframe.
     pub points: u64,
     /// Stamp of the last frame whose pose was claimed, nanoseconds.
     pub pose_nanos: i64,

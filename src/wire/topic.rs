@@ -52,7 +52,7 @@ pub const POSE: Topic = Topic {
     history: 1,
     loans: 2,
 };
-/// Depth of the keyframe in force: only the newest counts.
+/// Depth of the active keyframe: only the newest counts.
 pub const KEYFRAME: Topic = Topic {
     owner: "mapper",
     noun: "keyframe",
@@ -62,7 +62,7 @@ pub const KEYFRAME: Topic = Topic {
     history: 1,
     loans: 1,
 };
-/// Image of the keyframe in force.
+/// Image of the active keyframe.
 pub const KEYFRAME_IMAGE: Topic = Topic { noun: "keyframe_image", ..KEYFRAME };
 /// Depth of a keyframe that is not the active one, for the one reader that asks for it: whenever the map's graph has another
 /// revision of it than the reader.

@@ -21,7 +21,7 @@ impl Map {
 }
 
 impl Mapper {
-    /// The keyframe in force with its image and depth, and the poses of the others of its epoch; `None`
+    /// The active keyframe with its image and depth, and the poses of the others of its epoch; `None`
     /// where there is no established keyframe to go on from.
     pub fn checkpoint(&self) -> Option<Map> {
         let in_force = self.keyframe()?;
@@ -52,7 +52,7 @@ impl Mapper {
         self.first_free_epoch = before.first_free_epoch;
     }
 
-    /// Goes on from a checkpoint: its keyframe is in force again, the epoch and all ids go on. Does nothing
+    /// Goes on from a checkpoint: its keyframe is active again, the epoch and all ids go on. Does nothing
     /// with a map that this camera cannot have made.
     pub fn resume(&mut self, map: Map) -> StepOutcome {
         let fits = |keyframe: &Keyframe| {
