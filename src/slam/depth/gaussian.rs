@@ -4,12 +4,12 @@
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::slam::depth::epipolar::TwoView;
+use crate::slam::depth::epipolar::{EpipolarLine, Projection, TwoView};
 use crate::slam::depth::gain::{Gain, Uncertainty};
 use crate::slam::depth::line_noise::Innovations;
 use crate::slam::depth::map::{BORDER_PX, DepthMap, GradientImage, Hypothesis};
 use crate::slam::depth::matching::{
-    Match, MatchingParams, Miss, Patch, condition, is_inside, search,
+    Conditioning, Match, MatchingParams, Miss, Patch, condition, is_inside, search,
 };
 use crate::slam::depth::observation_kernel::row_kernel;
 use crate::slam::depth::promise::{LANES, PixelLanes, promises};
@@ -273,6 +273,25 @@ impl PixelObserver<'_> {
         }
     }
 
+    /// The epipolar line of a pixel, where it falls with this inverse depth, and how well a match could be placed
+    /// there; `None` where the frame does not see it or would tell nothing.
+    #[inline(always)]
+    fn conditioned(
+        &self,
+        inverse_depth: f32,
+        u: usize,
+        v: usize,
+    ) -> Option<(EpipolarLine, Projection, Conditioning)> {
+        let Observer { image: frame, view, .. } = self.observer;
+        let line = view.line(u as f32, v as f32);
+        let at = line
+            .project(inverse_depth)
+            .filter(|p| is_inside(frame.width(), frame.height(), p.u, p.v))?;
+        let structure = &self.structure.row(v)[u];
+        let conditioning = condition(view, &line, &at, structure, self.gain, self.matching)?;
+        Some((line, at, conditioning))
+    }
+
     /// Observes a pixel that has a hypothesis.
     #[inline(always)]
     fn update<S: Sampler>(
@@ -285,16 +304,7 @@ impl PixelObserver<'_> {
     ) {
         let Observation { counts, innovations } = seen;
         let centre = hypothesis.smoothed;
-        let Observer { image: frame, view, .. } = self.observer;
-        let line = view.line(u as f32, v as f32);
-        let Some(at) =
-            line.project(centre).filter(|p| is_inside(frame.width(), frame.height(), p.u, p.v))
-        else {
-            return;
-        };
-        let structure = &self.structure.row(v)[u];
-        let conditioning = condition(view, &line, &at, structure, self.gain, self.matching);
-        let Some(conditioning) = conditioning else { return };
+        let Some((line, _, conditioning)) = self.conditioned(centre, u, v) else { return };
         let left = Gain::of(hypothesis.uncertainty(), conditioning.promise()).left;
         if left.variance > self.params.max_variance_ratio * hypothesis.variance {
             return;
@@ -308,7 +318,7 @@ impl PixelObserver<'_> {
             return;
         };
         let patch = Patch::new(self.image, u, v, self.gain, self.offset);
-        let frame = Sampled { image: frame, sampler };
+        let frame = Sampled { image: self.observer.image, sampler };
         match search(frame, &line, &patch, &conditioning, &from, &to, self.matching) {
             Ok(found) => {
                 counts.attempted += 1;
@@ -345,19 +355,11 @@ impl PixelObserver<'_> {
         v: usize,
         counts: &mut ObservationCounts,
     ) {
-        let Observer { image: frame, view, .. } = self.observer;
-        let line = view.line(u as f32, v as f32);
-        let Some(at) = line
-            .project(hypothesis.smoothed)
-            .filter(|p| is_inside(frame.width(), frame.height(), p.u, p.v))
-        else {
+        let Some((line, at, conditioning)) = self.conditioned(hypothesis.smoothed, u, v) else {
             return;
         };
-        let structure = &self.structure.row(v)[u];
-        let conditioning = condition(view, &line, &at, structure, self.gain, self.matching);
-        let Some(conditioning) = conditioning else { return };
         let patch = Patch::new(self.image, u, v, self.gain, self.offset);
-        let frame = Sampled { image: frame, sampler };
+        let frame = Sampled { image: self.observer.image, sampler };
         let found = search(frame, &line, &patch, &conditioning, &at, &at, self.matching);
         match found {
             Ok(found) => {

@@ -405,6 +405,16 @@ mod tests {
     }
 
     #[test]
+    fn both_parts_of_a_variance_change_with_the_unit() {
+        let mut map = DepthMap::with_size(16, 16);
+        let known = Hypothesis { variance: 3.0, independent: 1.0, ..Hypothesis::NONE };
+        map.hypotheses.pixels_mut()[100] = known;
+        map.rescale(2.0);
+        let left = map.hypotheses.pixels()[100].uncertainty();
+        assert_eq!(left, Uncertainty { variance: 12.0, independent: 4.0 });
+    }
+
+    #[test]
     fn gradients_are_central_differences() {
         let (width, height) = (20, 16);
         let pixels: Vec<u8> =

@@ -27,9 +27,9 @@ pub struct MatchingParams {
     /// Standard deviation of the image noise, grey levels. Cameras in rooms have 2 to 4.
     pub image_noise: f32,
     /// Standard deviation by which errors of an estimated pose beyond its covariance misplace the epipolar
-    /// line, pixels, until the matches have shown it. A pose that is given without covariance has none. The covariance takes the errors of
-    /// points for independent; what is common to a keyframe's depth is in every pose on it and comes back with
-    /// every match. `docs/depth-noise.md` has the figures.
+    /// line, pixels, until the matches have shown it. A pose that is given without covariance has none. The
+    /// covariance takes the errors of points for independent; what is common to a keyframe's depth is in every
+    /// pose on it and comes back with every match. `docs/depth-noise.md` has the figures.
     pub line_noise_px: f32,
     /// Share of that variance that differs from one frame to the next; the rest moves all matches of a pixel
     /// together.

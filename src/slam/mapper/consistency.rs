@@ -11,8 +11,8 @@ use crate::slam::parameter::{ParameterError, check_range};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ConsistencyParams {
-    /// Share of a frame's searches that may fail. Recordings stay below 0.57, nearly all of their
-    /// frames below 0.4.
+    /// Share of a frame's searches, those of the even sample among them, that may fail. Without the sample
+    /// recordings stayed below 0.57, nearly all of their frames below 0.4.
     pub max_failed_ratio: f64,
     /// Frames in a row with more failures that reject the map: one alone may be a blink.
     pub max_failed_frames: u32,
