@@ -348,7 +348,7 @@ impl TwoFrameInitializer {
 
     /// Variances and figures of the latest fit; then the scale goes to mean inverse depth 1.
     fn judge(&mut self) -> Evidence {
-        let rival = self.joint.rival();
+        let (rival, heard) = (self.joint.rival(), self.joint.heard());
         let (state, scratch) = self.joint.best();
         let (joint, rotation) = (&scratch.system, &self.rotation_scratch.system);
         let floor = self.params.fit.image_noise.powi(2);
@@ -362,7 +362,7 @@ impl TwoFrameInitializer {
         self.least_residual = self.least_residual.min(evidence.median_residual);
         let evidence = Evidence {
             rival,
-            witnesses: self.witnesses.len(),
+            witnesses: heard,
             common_error,
             // Images without noise leave next to nothing while the camera hardly moves.
             least_residual: self.least_residual.max(self.params.fit.image_noise.into()),

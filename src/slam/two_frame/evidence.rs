@@ -133,7 +133,7 @@ pub struct Evidence {
     pub least_residual: f64,
     /// The second best motion; `None` where there is no other.
     pub rival: Option<Rival>,
-    /// Earlier frames that were asked.
+    /// Earlier frames that were asked which motion they show.
     pub witnesses: usize,
 }
 

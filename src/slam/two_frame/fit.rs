@@ -155,7 +155,15 @@ pub fn fit_level(
                 joint_step(scratch, state, damping)
             }
         };
-        let Some(step) = step else { break };
+        let Some(step) = step else {
+            // The model is good for less than the step that it asks for.
+            damping *= FAILURE_FACTOR;
+            failures += 1;
+            if failures >= MAX_FAILURES {
+                break;
+            }
+            continue;
+        };
         let mut next = State {
             inverse_depths: std::mem::take(&mut scratch.trial_depths),
             ..moved(state, &step)

@@ -44,6 +44,8 @@ pub struct Hypotheses {
     /// How many of the first ones are results of the frame before.
     survivors: usize,
     rival: Option<Rival>,
+    /// Earlier frames that were asked about the latest one.
+    heard: usize,
 }
 
 impl Hypotheses {
@@ -54,12 +56,14 @@ impl Hypotheses {
             energy: f64::INFINITY,
             scratch: FitScratch::default(),
         };
-        Self { all: (0..MAX_HYPOTHESES).map(empty).collect(), used: 0, survivors: 0, rival: None }
+        let all = (0..MAX_HYPOTHESES).map(empty).collect();
+        Self { all, used: 0, survivors: 0, rival: None, heard: 0 }
     }
 
     /// Forgets what earlier frames have shown.
     pub fn restart(&mut self) {
-        (self.used, self.survivors, self.rival) = (0, 0, None);
+        (self.used, self.survivors) = (0, 0);
+        (self.rival, self.heard) = (None, 0);
     }
 
     /// Fits all hypotheses to a frame. `rotation` is its fit without translation; `with_directions` adds
@@ -94,7 +98,7 @@ impl Hypotheses {
             all[..self.survivors].par_iter_mut().for_each(|h| fit_down_to(0, coarse, h));
             all[..self.survivors].sort_by(|a, b| a.energy.total_cmp(&b.energy));
         }
-        self.rival = None;
+        (self.rival, self.heard) = (None, 0);
         if with_directions && self.survivors > 1 {
             self.hear(input, witnesses, params);
         }
@@ -104,6 +108,7 @@ impl Hypotheses {
     fn hear(&mut self, input: &FitInput<'_>, witnesses: &Witnesses, params: &FitParams) {
         /// Cosine of 30°: nearer directions are the same motion, seen inaccurately.
         const RIVAL_COSINE: f64 = 0.87;
+        self.heard = witnesses.len();
         let together =
             |h: &Hypothesis| h.energy + witnesses.energy(input, &h.state.inverse_depths, params);
         let (mut best, mut other) = (together(&self.all[0]), together(&self.all[1]));
@@ -129,6 +134,11 @@ impl Hypotheses {
     /// The second best motion of the latest frame, if the two can be told apart by their direction.
     pub fn rival(&self) -> Option<Rival> {
         self.rival
+    }
+
+    /// How many earlier frames were asked about the latest one: none where there is but one motion.
+    pub fn heard(&self) -> usize {
+        self.heard
     }
 
     /// The best fit with its normal equations at the finest level; before any fit the state given first.

@@ -357,6 +357,41 @@ fn a_change_of_brightness_is_no_parallax_and_is_found() {
 }
 
 #[test]
+fn a_step_that_goes_too_far_is_damped_and_taken() {
+    let (first, _, _) = two_views(0.0);
+    let dark: Vec<u8> = first.iter().map(|&grey| (f32::from(grey) / 3.0).round() as u8).collect();
+    let mut initializer = TwoFrameInitializer::new(CAMERA, TwoFrameParams::default()).unwrap();
+    assert!(initializer.begin(&dark));
+    initializer.pyramid.fill(&first);
+    let input = input(initializer.pyramid.levels(), &initializer.intrinsics, &initializer.points);
+    // Three times as bright, which the first step takes for a logarithm of 2: more than one step may change.
+    for freedom in [Freedom::Rotation, Freedom::Pose, Freedom::Everything] {
+        let mut state = initializer.rotation.clone();
+        let mut scratch = FitScratch::default();
+        fit_level(&input, 0, freedom, &mut state, &mut scratch, &initializer.params.fit);
+        assert!(
+            (state.brightness.a.exp() - 3.0).abs() < 0.2,
+            "{freedom:?}: {:?}",
+            state.brightness
+        );
+    }
+}
+
+#[test]
+fn earlier_frames_that_were_not_asked_are_no_witnesses() {
+    let standing = |frame| Scene::new(5).render(&CAMERA, &SE3::identity()).noisy(2.0, frame);
+    let mut initializer = TwoFrameInitializer::new(CAMERA, TwoFrameParams::default()).unwrap();
+    assert!(initializer.begin(&standing(1)));
+    for frame in 2..6 {
+        assert_eq!(initializer.step(&standing(frame)).evidence.witnesses, 0);
+    }
+    assert_eq!(initializer.witnesses.len(), 4);
+    let (_, outcomes) = run(Motion::Sideways, 1, 2.0, 40);
+    let asked = outcomes.iter().map(|outcome| outcome.evidence.witnesses).max();
+    assert!(asked > Some(3), "{asked:?}");
+}
+
+#[test]
 fn hostile_frames_are_refused_and_a_start_begins_again_by_itself() {
     let (first, second, _) = two_views(2.0);
     let blank = vec![100; first.len()];
