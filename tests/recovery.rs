@@ -1,12 +1,18 @@
 //! Loss and recovery over the whole recipe: a blackout before a known view and before a new one, a
-//! standing camera, and a map that contradicts itself.
+//! standing camera, and maps that contradict themselves: by their poses, and from the start.
+
+#[path = "support/recordings.rs"]
+mod recordings;
 
 use nalgebra::Vector6;
+use recordings::recording;
 use semidense::capture::simulator::Simulator;
 use semidense::capture::simulator::params::{
     MotionKind, MotionParams, SensorParams, SimulatorParams,
 };
-use semidense::capture::source::{FrameSource, FrameStamp, SourceError};
+use semidense::capture::source::{
+    FrameSource, FrameStamp, SourceError, SourceName, SourceParams, open,
+};
 use semidense::service::replay::{ReplayConfig, replay};
 use semidense::service::results::RunRecord;
 use semidense::slam::evaluation::umeyama::Alignment;
@@ -48,7 +54,11 @@ fn footage(seed: u64, kind: MotionKind, frames: usize, noise_std_dev: f64) -> Fo
         sensor: SensorParams { noise_std_dev, ..SensorParams::default() },
         ..SimulatorParams::half_size()
     };
-    let mut source = Simulator::new(params).unwrap();
+    film(&mut Simulator::new(params).unwrap())
+}
+
+/// All frames of a source.
+fn film(source: &mut dyn FrameSource) -> Footage {
     let intrinsics = source.intrinsics();
     let mut pixels = vec![0; intrinsics.width * intrinsics.height];
     let (mut taken, mut poses) = (Vec::new(), Vec::new());
@@ -277,4 +287,32 @@ fn a_map_whose_poses_are_wrong_is_rejected() {
     let (index, state) = rejected_at.unwrap();
     assert!((WRONG..WRONG + 10).contains(&index), "{index}");
     assert_eq!(state, MapState::Rejected);
+}
+
+#[test]
+fn a_start_with_the_wrong_motion_is_rejected_and_another_begun() {
+    /// A plane seen from two places has two explanations, and here the wrong one fits better.
+    const FIRST: usize = 6;
+    let Some(folder) = recording("fr1-floor") else { return };
+    let mut source = open(&SourceName::Tum(folder), None, &SourceParams::default()).unwrap();
+    let floor = film(source.as_mut());
+    let mut script = Script::new(floor.intrinsics);
+    script.show(&floor, FIRST..floor.frames.len());
+    let mut config = ReplayConfig::default();
+    let evidence = &mut config.mapper.two_frame.evidence;
+    (evidence.min_rival_excess, evidence.min_turning_rival_excess) = (0.0, 0.0);
+    let record = script.replay(&config);
+    let of_epoch = |epoch| record.map.keyframes.iter().filter(move |k| k.epoch == epoch);
+    assert!(of_epoch(0).count() > 1 && of_epoch(1).count() > 1);
+    assert!(of_epoch(0).all(|keyframe| keyframe.map_state == MapState::Rejected));
+    assert!(of_epoch(1).all(|keyframe| keyframe.map_state == MapState::Established));
+    let [first, second] = [0, 1].map(|epoch| {
+        let mut claimed = estimates(&record).filter(|e| e.epoch == epoch && e.state.is_tracked());
+        let first = claimed.next().unwrap().sequence;
+        (first, claimed.next_back().unwrap().sequence)
+    });
+    // At once, and not after the seconds for which a lost camera is looked for.
+    assert!(first.1 - first.0 < 40 && second.0 - first.1 < 15, "{first:?} {second:?}");
+    let (wrong, right) = (error_ratio(&record, 0), error_ratio(&record, 1));
+    assert!(right < 0.01 && wrong > 2.0 * right, "{wrong} {right}");
 }

@@ -32,7 +32,7 @@ use crate::slam::image::quads::QuadImage;
 use crate::slam::keyframe::{Keyframe, MAX_KEYFRAME_POINTS, MapState};
 use crate::slam::map::Map;
 use crate::slam::mapper::change::Unfinished;
-use crate::slam::mapper::consistency::ConsistencyParams;
+use crate::slam::mapper::consistency::{ConsistencyParams, Contradiction, START_KEYFRAMES};
 use crate::slam::mapper::depth_buffers::DepthBuffers;
 use crate::slam::mapper::modes::{KeyframeModes, ModeParams, in_unit};
 use crate::slam::mapper::observation::DepthFilter;
@@ -317,13 +317,26 @@ impl Mapper {
         self.modes.observed(&self.depth.active, &in_unit(&pose.keyframe_from_camera, unit));
         self.depth.unpublished += observations.fused + observations.created;
         let points = self.num_points();
+        let is_first = self.num_epoch_keyframes() <= START_KEYFRAMES;
         let params = &self.params.consistency;
         let Some(active) = &mut self.active else { return StepOutcome::default() };
         active.frames += 1;
         let due = active.frames >= self.params.min_keyframe_interval;
-        if let Some(contradiction) = active.consistency.observe(&observations, points, params) {
+        let mut contradiction = active.consistency.observe(&observations, points, params);
+        if is_first {
+            let displacement = pose.quality.displacement_px / self.intrinsics.width as f64;
+            let of_start = active.consistency.observe_start(&observations, displacement, params);
+            contradiction = of_start.or(contradiction);
+        }
+        if let Some(contradiction) = contradiction {
             self.reject(contradiction);
-            return StepOutcome { keyframe_changed: true, observations, ..Default::default() };
+            let graph_changed = contradiction == Contradiction::WrongStart;
+            return StepOutcome {
+                keyframe_changed: true,
+                graph_changed,
+                observations,
+                ..Default::default()
+            };
         }
         if pose.proposes_keyframe && due {
             change_begins();
@@ -382,6 +395,13 @@ impl Mapper {
     /// Every keyframe.
     pub fn map(&self) -> &Map {
         &self.map
+    }
+
+    /// Keyframes of the active epoch, counted up to one more than judge its start.
+    fn num_epoch_keyframes(&self) -> usize {
+        let Some(active) = self.keyframe() else { return 0 };
+        let of_epoch = self.map.keyframes.iter().rev().filter(|k| k.epoch == active.epoch);
+        of_epoch.take(START_KEYFRAMES + 1).count()
     }
 
     fn num_points(&self) -> usize {

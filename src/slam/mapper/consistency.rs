@@ -22,6 +22,12 @@ pub struct ConsistencyParams {
     /// Largest ratio, either way, of mean inverse depths of a keyframe and the next one. A keyframe
     /// comes after a third of the mean depth: walking up to a wall gives 1.5, recordings 0.74 to 1.32.
     pub max_depth_ratio: f64,
+    /// Share of the even sample of hypotheses that may fail in a frame of the first keyframes, where the frame is also
+    /// displaced against the keyframe by more than noise: more is what a wrong start of the map leaves.
+    pub max_start_refuted_ratio: f64,
+    /// Frames in a row with more that reject the start. Of 16 starts of a plane with the wrong one of its two motions
+    /// 15 had as many, of 45 right ones none; 4 at most where the depth was good to a sixth.
+    pub max_start_refuted_frames: u32,
 }
 
 impl Default for ConsistencyParams {
@@ -31,6 +37,8 @@ impl Default for ConsistencyParams {
             max_failed_frames: 5,
             min_kept_ratio: 0.1,
             max_depth_ratio: 2.5,
+            max_start_refuted_ratio: 0.45,
+            max_start_refuted_frames: 6,
         }
     }
 }
@@ -41,7 +49,9 @@ impl ConsistencyParams {
         check_range("max_failed_ratio", self.max_failed_ratio, 0.0..=1.0)?;
         check_range("max_failed_frames", self.max_failed_frames, 1..=1000)?;
         check_range("min_kept_ratio", self.min_kept_ratio, 0.0..=1.0)?;
-        check_range("max_depth_ratio", self.max_depth_ratio, 1.0..=1e6)
+        check_range("max_depth_ratio", self.max_depth_ratio, 1.0..=1e6)?;
+        check_range("max_start_refuted_ratio", self.max_start_refuted_ratio, 0.0..=1.0)?;
+        check_range("max_start_refuted_frames", self.max_start_refuted_frames, 1..=1000)
     }
 }
 
@@ -54,6 +64,8 @@ pub enum Contradiction {
     LostDepth,
     /// The mean depth jumped from one keyframe to the next.
     ScaleJump,
+    /// Frames on the first keyframes do not fit the depth that the map began with.
+    WrongStart,
 }
 
 impl fmt::Display for Contradiction {
@@ -62,6 +74,9 @@ impl fmt::Display for Contradiction {
             Self::FailedSearches => "frame after frame most searches for depth fail",
             Self::LostDepth => "almost no depth is left",
             Self::ScaleJump => "the mean depth jumped from one keyframe to the next",
+            Self::WrongStart => {
+                "frames on the first keyframes do not fit the depth that it began with"
+            }
         })
     }
 }
@@ -70,10 +85,36 @@ impl fmt::Display for Contradiction {
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Consistency {
     failed_frames: u32,
+    refuted_frames: u32,
     most_points: usize,
 }
 
+/// Keyframes of an epoch whose frames judge its start, the first included.
+pub(super) const START_KEYFRAMES: usize = 4;
+
+/// Fewer searches than this say nothing about the map.
+const MIN_SEARCHES: usize = 200;
+
 impl Consistency {
+    /// Takes in what a frame on one of the first keyframes said of an even sample of its depth, and by how much the
+    /// tiles of the image are displaced, in image widths.
+    pub(super) fn observe_start(
+        &mut self,
+        counts: &ObservationCounts,
+        displacement: f64,
+        params: &ConsistencyParams,
+    ) -> Option<Contradiction> {
+        /// Displacement that shutter and lens seldom reach: 1.3 px of 640.
+        const MIN_DISPLACEMENT: f64 = 1.3 / 640.0;
+        let allowed = params.max_start_refuted_ratio * counts.probed as f64;
+        let is_refuted = counts.probed >= MIN_SEARCHES
+            && counts.refuted as f64 > allowed
+            && displacement > MIN_DISPLACEMENT;
+        self.refuted_frames = if is_refuted { self.refuted_frames + 1 } else { 0 };
+        (self.refuted_frames >= params.max_start_refuted_frames)
+            .then_some(Contradiction::WrongStart)
+    }
+
     /// Takes in what a frame did to a map of `points`.
     pub(super) fn observe(
         &mut self,
@@ -81,9 +122,7 @@ impl Consistency {
         points: usize,
         params: &ConsistencyParams,
     ) -> Option<Contradiction> {
-        /// Fewer searches than this say nothing about the map.
-        const MIN_SEARCHES: usize = 200;
-        /// Nor do those of so small a share of it: where most of the view is new, what is seen of the map
+        /// Nor do searches of so small a share of it: where most of the view is new, what is seen of the map
         /// is its edge.
         const MIN_SEARCHED_RATIO: f64 = 0.02;
         let enough = MIN_SEARCHED_RATIO * points as f64;
@@ -155,6 +194,32 @@ mod tests {
             .map(|_| watched.observe(&counts(1000, 900), 5000, &params))
             .last();
         assert_eq!(last, Some(Some(Contradiction::FailedSearches)));
+    }
+
+    #[test]
+    fn frames_that_refute_the_first_depth_in_a_row_reject_the_start() {
+        let params = ConsistencyParams::default();
+        let saying = |refuted| ObservationCounts { probed: 1000, refuted, ..counts(1000, 100) };
+        let shifted = 2.0 / 640.0;
+        let after = |frames: u32, refuted, displacement| {
+            let mut watched = Consistency::default();
+            let mut last = None;
+            for _ in 0..frames {
+                last = watched.observe_start(&saying(refuted), displacement, &params);
+            }
+            last
+        };
+        let enough = params.max_start_refuted_frames;
+        assert_eq!(after(enough, 500, shifted), Some(Contradiction::WrongStart));
+        assert_eq!(after(enough - 1, 500, shifted), None);
+        assert_eq!(after(50, 400, shifted), None);
+        assert_eq!(after(50, 500, 1.0 / 640.0), None);
+        assert_eq!(after(50, 500, f64::NAN), None);
+        let mut watched = Consistency::default();
+        for frame in 0..50 {
+            let refuted = if frame % enough == 0 { 100 } else { 500 };
+            assert_eq!(watched.observe_start(&saying(refuted), shifted, &params), None);
+        }
     }
 
     #[test]

@@ -183,22 +183,31 @@ impl Mapper {
             }
         }
         self.phase = self.phase.with_loss(loss);
-        if lost_secs < self.params.recovery.lost_timeout_secs {
+        let is_restarting = matches!(self.phase, Phase::Restarting(_));
+        // Of a wrong start there is nothing to be found again.
+        let is_wrong = matches!(self.phase, Phase::Rejected(Contradiction::WrongStart, _));
+        let is_late = lost_secs >= self.params.recovery.lost_timeout_secs;
+        if !(is_restarting || is_wrong || is_late) {
             return StepOutcome::default();
         }
-        if !matches!(self.phase, Phase::Restarting(_)) {
+        if !is_restarting {
             self.start.forget();
             self.phase = Phase::Restarting(loss);
         }
         self.begin(frame, pose, sensor_depth)
     }
 
-    /// Declares the active keyframe contradictory: nothing is claimed on it any more.
+    /// Declares the active keyframe contradictory, or all of its epoch where its start was wrong: nothing is claimed
+    /// on them any more.
     pub(super) fn reject(&mut self, contradiction: Contradiction) {
         self.phase = Phase::Rejected(contradiction, Loss::default());
         self.revision += 1;
-        let revision = self.revision;
-        if let Some(keyframe) = self.keyframe_mut() {
+        let Some(active) = self.keyframe() else { return };
+        let (id, epoch, revision) = (active.keyframe_id, active.epoch, self.revision);
+        let whole_epoch = contradiction == Contradiction::WrongStart;
+        let is_concerned =
+            |k: &&mut Keyframe| k.keyframe_id == id || whole_epoch && k.epoch == epoch;
+        for keyframe in self.map.keyframes.iter_mut().filter(is_concerned) {
             keyframe.map_state = MapState::Rejected;
             keyframe.revision = revision;
         }
