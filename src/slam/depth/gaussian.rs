@@ -147,8 +147,8 @@ pub struct Observer<'a> {
 pub enum ObservedPixels {
     /// Hypotheses, and pixels that may get one.
     All,
-    /// Without the hypotheses that came from the keyframe before: they already hold what frames from
-    /// before this keyframe have to say.
+    /// Without the hypotheses that already hold what the frame has to say: those that came from the keyframe before,
+    /// where it is from before this keyframe, and the points of a start in the frame that proved it.
     New,
     /// Hypotheses alone: others bring new ones.
     Known,

@@ -112,7 +112,7 @@ pub struct Hypothesis {
     pub smoothed: f32,
     /// How often it was confirmed less how often it failed; at 0 it is dropped.
     pub validity: u8,
-    /// Whether it came from the keyframe before and carries that keyframe's observations.
+    /// Whether it holds what earlier frames say: those of the keyframe before, or the two of a start.
     pub propagated: bool,
     /// Failures of a pixel without hypothesis: it is tried less often the more it failed.
     pub failures: u8,

@@ -182,7 +182,7 @@ impl Mapper {
             image: &self.frame,
             view: self.view_of(&start.first_from_current),
             brightness: start.brightness,
-            pixels: ObservedPixels::All,
+            pixels: ObservedPixels::New,
         };
         let (matching, gaussian) = (&self.params.matching, &self.params.gaussian);
         let current_from_first = start.first_from_current.inverse();

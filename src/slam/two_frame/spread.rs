@@ -82,7 +82,8 @@ fn hypothesis_from(depths: &[InitialDepth], nearest: &[(f32, usize); NUM_NEAREST
         independent: variance - point.variance,
         smoothed: point.inverse_depth,
         validity: NEW_VALIDITY,
-        propagated: false,
+        // The pixels around a point have not been looked for in the second frame.
+        propagated: on_point,
         failures: 0,
     }
 }

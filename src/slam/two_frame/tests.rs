@@ -309,6 +309,13 @@ fn a_start_fills_the_depth_map_around_its_points() {
     initializer.fill(&mut map);
     let candidates = map.candidates.pixels().iter().filter(|c| **c).count();
     assert!(map.num_hypotheses() * 10 > candidates * 9, "{} of {candidates}", map.num_hypotheses());
+    // The points hold what the second frame says, the pixels around them do not.
+    let points: Vec<_> = initializer.depths().map(|d| (d.u, d.v)).collect();
+    for (v, u) in (0..CAMERA.height).flat_map(|v| (0..CAMERA.width).map(move |u| (v, u))) {
+        let hypothesis = map.hypotheses.at(u, v);
+        let is_point = points.contains(&(u as u16, v as u16));
+        assert_eq!(hypothesis.propagated, hypothesis.is_some() && is_point, "{u}, {v}");
+    }
     let (mut within, mut good) = (0, 0);
     for (h, truth) in
         map.hypotheses.pixels().iter().zip(truth.pixels()).filter(|(h, _)| h.is_some())
