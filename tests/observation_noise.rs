@@ -13,6 +13,7 @@ use semidense::slam::depth::pose_noise::pose_noise_px as predicted_px;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::image::buffer::Image;
+use semidense::slam::image::noise::ImageNoise;
 use semidense::slam::image::quads::QuadImage;
 use semidense::slam::image::quads_kernel::{PortableSampler, Sampled};
 
@@ -55,9 +56,9 @@ fn normalized_errors(noise_std_dev: f64, pose_noise_px: f64) -> Vec<f64> {
     /// Every so many rows and columns are observed.
     const SPACING: usize = 6;
     // A pixel is rounded: 1/√12 grey levels.
-    let image_noise = (noise_std_dev.powi(2) + 1.0 / 12.0).sqrt() as f32;
-    let mut params =
-        MatchingParams { image_noise, line_noise_px: 0.0, ..MatchingParams::default() };
+    let pixel_std_dev = (noise_std_dev.powi(2) + 1.0 / 12.0).sqrt() as f32;
+    let noise = ImageNoise { pixel_std_dev, ..ImageNoise::DEFAULT };
+    let mut params = MatchingParams { noise, line_noise_px: 0.0, ..MatchingParams::default() };
     let mut errors = Vec::new();
     for seed in 1..=2 {
         let Sequence { intrinsics, map, depth, frames } = sequence(seed, noise_std_dev);

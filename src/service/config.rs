@@ -20,6 +20,7 @@ use crate::capture::v4l::params::CameraParams;
 pub use crate::service::config_error::ConfigError;
 use crate::service::results::ResultsParams;
 use crate::service::schedule::SchedulingParams;
+use crate::slam::image::noise::ImageNoise;
 use crate::slam::mapper::MapperParams;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::tracker::TrackerParams;
@@ -49,6 +50,8 @@ pub struct Config {
     pub mapper: MapperConfig,
     /// Who starts and watches the three.
     pub supervisor: SupervisorConfig,
+    /// The noise of the camera's images, for tracking and mapping alike.
+    pub noise: ImageNoise,
     /// How tracking computes.
     pub tracking: TrackerParams,
     /// How mapping computes.
@@ -166,6 +169,7 @@ impl Default for Config {
             tracker: TrackerConfig::default(),
             mapper: MapperConfig::default(),
             supervisor: SupervisorConfig::default(),
+            noise: ImageNoise::default(),
             tracking: TrackerParams::default(),
             mapping: MapperParams::default(),
             results: ResultsParams::default(),
@@ -223,7 +227,9 @@ impl Config {
         };
         let of_parser = |error: toml::de::Error| syntax(error.span(), error.message());
         let mut root = DeTable::parse(text).map_err(of_parser)?;
-        layout::merge(root.get_mut()).map_err(|e| syntax(Some(e.span), &e.reason))?;
+        layout::merge(root.get_mut())
+            .and_then(|()| layout::find_moved(root.get_ref()))
+            .map_err(|e| syntax(Some(e.span), &e.reason))?;
         let mut config =
             Self::deserialize(toml::Deserializer::from(root.clone())).map_err(of_parser)?;
         config.complete(file)?;
@@ -242,15 +248,25 @@ impl Config {
         Ok(config)
     }
 
-    /// Checks every value, where an error names `place` and the key as the shipped file lists it, and gives the
-    /// mapper what it shares with the tracker.
+    /// Checks every value, where an error names `place` and the key as the shipped file lists it, and passes on what
+    /// is shared.
     fn complete(&mut self, place: &str) -> Result<(), ConfigError> {
         self.validate().map_err(|source| {
             let source = ParameterError { key: layout::listed(&source.key), ..source };
             ConfigError::Value { place: place.to_owned(), source }
         })?;
-        self.mapping.reuse.distance = self.tracking.keyframe_distance();
+        self.share();
         Ok(())
+    }
+
+    /// Gives tracker and mapper what they have in common.
+    fn share(&mut self) {
+        let (tracking, mapping) = (&mut self.tracking, &mut self.mapping);
+        mapping.reuse.distance = tracking.keyframe_distance();
+        tracking.alignment.noise = self.noise;
+        tracking.reference.selection.noise = self.noise;
+        mapping.matching.noise = self.noise;
+        mapping.two_frame.fit.noise = self.noise;
     }
 
     /// Checks every value.
@@ -280,6 +296,7 @@ impl Config {
         }
         check_range("supervisor.stop_timeout_s", supervisor.stop_timeout_s, seconds.clone())?;
         check_range("supervisor.save_timeout_s", supervisor.save_timeout_s, seconds)?;
+        self.noise.validate().map_err(|e| e.within("noise"))?;
         self.tracking.validate().map_err(|e| e.within("tracking"))?;
         self.mapping.validate().map_err(|e| e.within("mapping"))?;
         self.results.validate().map_err(|e| e.within("results"))?;
@@ -371,7 +388,11 @@ fn apply(table: &mut Table, setting: &str) -> Result<(), String> {
         .ok()
         .and_then(|mut parsed| (parsed.len() == 1).then(|| parsed.remove("value"))?)
         .unwrap_or_else(|| Value::String(value.to_owned()));
-    let mut keys: Vec<&str> = layout::plain(path.trim()).split('.').map(str::trim).collect();
+    let key = layout::plain(path.trim());
+    if let Some(now) = layout::moved(key) {
+        return Err(format!("`{key}` is `{now}` now"));
+    }
+    let mut keys: Vec<&str> = key.split('.').map(str::trim).collect();
     let last = keys.pop().filter(|key| !key.is_empty()).ok_or_else(|| form.to_owned())?;
     if keys.is_empty() && last == layout::EXPERT {
         return Err("it has keys below it, as in expert.mapping.min_gradient=5.0".to_owned());

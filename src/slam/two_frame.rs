@@ -351,7 +351,7 @@ impl TwoFrameInitializer {
         let (rival, heard) = (self.joint.rival(), self.joint.heard());
         let (state, scratch) = self.joint.best();
         let (joint, rotation) = (&scratch.system, &self.rotation_scratch.system);
-        let floor = self.params.fit.image_noise.powi(2);
+        let floor = self.params.fit.noise.pixel_std_dev.powi(2);
         let noise = residual_variance(joint, &mut self.sorted).max(floor);
         let match_variance = self.params.match_noise_px.powi(2);
         let covariance = pose_covariance(state, joint);
@@ -365,7 +365,7 @@ impl TwoFrameInitializer {
             witnesses: heard,
             common_error,
             // Images without noise leave next to nothing while the camera hardly moves.
-            least_residual: self.least_residual.max(self.params.fit.image_noise.into()),
+            least_residual: self.least_residual.max(self.params.fit.noise.pixel_std_dev.into()),
             ..evidence
         };
         let visible = joint.points().zip(&state.inverse_depths).filter(|(p, _)| p.visible);

@@ -51,6 +51,15 @@ const USER_KEYS: [&str; 36] = [
     "simulator.motion.mean_speed_m_s",
 ];
 
+/// Keys that were replaced, and what by: one model of the camera's noise by what each algorithm had of its own.
+const MOVED_KEYS: [(&str, &str); 5] = [
+    ("tracking.alignment.pixel_noise", "noise.pixel_std_dev"),
+    ("tracking.alignment.model_noise", "noise.model_std_dev"),
+    ("tracking.reference.selection.intensity_std_dev", "noise.model_std_dev"),
+    ("mapping.matching.image_noise", "noise.pixel_std_dev"),
+    ("mapping.two_frame.fit.image_noise", "noise.pixel_std_dev"),
+];
+
 /// What is wrong with the two parts of a file.
 #[derive(Debug, PartialEq, Eq)]
 pub struct LayoutError {
@@ -68,6 +77,25 @@ pub fn listed(key: &str) -> String {
 /// The dotted `key` without `expert.`.
 pub fn plain(key: &str) -> &str {
     key.strip_prefix(EXPERT).and_then(|rest| rest.strip_prefix('.')).unwrap_or(key)
+}
+
+/// What has replaced the dotted `key`, as the shipped file lists it; `None` of one that is in use or never was.
+pub fn moved(key: &str) -> Option<String> {
+    MOVED_KEYS.iter().find(|(before, _)| *before == key).map(|(_, now)| listed(now))
+}
+
+/// Refuses a key that was replaced, in a table without `[expert]`, and says by which.
+pub fn find_moved(root: &DeTable) -> Result<(), LayoutError> {
+    for (before, now) in MOVED_KEYS {
+        let mut keys = before.split('.');
+        let first = keys.next().and_then(|key| root.get(key));
+        let found = keys.fold(first, |value, key| value?.get_ref().as_table()?.get(key));
+        if let Some(value) = found {
+            let reason = format!("`{before}` is `{}` now", listed(now));
+            return Err(LayoutError { reason, span: value.span() });
+        }
+    }
+    Ok(())
 }
 
 /// Moves what stands below `[expert]` to its place without it. A key that stands in both places is an error.

@@ -1,6 +1,7 @@
 //! The configuration against its shipped file, and what is wrong said in one line.
 
 use super::*;
+use crate::slam::image::noise::ImageNoise;
 use crate::slam::keyframe::DistanceWeights;
 
 fn set(settings: &[&str]) -> Result<Config, String> {
@@ -172,6 +173,30 @@ fn bad_settings_are_refused() {
     assert!(set(&["instance.x=1"]).is_err());
     assert!(set(&["=1"]).is_err());
     assert!(set(&["mapper.threads=1\nx=2"]).is_err());
+}
+
+#[test]
+fn the_noise_of_the_camera_is_the_same_for_all_and_what_it_replaced_is_told() {
+    let config = set(&["noise.pixel_std_dev=2.0", "expert.noise.model_std_dev=5.0"]).unwrap();
+    let noise = ImageNoise { pixel_std_dev: 2.0, model_std_dev: 5.0 };
+    let (tracking, mapping) = (&config.tracking, &config.mapping);
+    assert_eq!(config.noise, noise);
+    assert_eq!((tracking.alignment.noise, tracking.reference.selection.noise), (noise, noise));
+    assert_eq!((mapping.matching.noise, mapping.two_frame.fit.noise), (noise, noise));
+    let pixel = ["tracking.alignment.pixel_noise", "mapping.matching.image_noise"];
+    let model = ["tracking.alignment.model_noise"];
+    let replaced = pixel.map(|key| (key, "pixel")).into_iter();
+    for (key, now) in replaced.chain(model.map(|key| (key, "model"))) {
+        let expected = format!("`{key}` is `expert.noise.{now}_std_dev` now");
+        let told = set(&[&format!("{key}=2.0")]).unwrap_err();
+        assert!(told.ends_with(&expected), "{told}");
+        let (table, name) = key.rsplit_once('.').unwrap();
+        for table in [table.to_owned(), format!("expert.{table}")] {
+            let text = format!("# Mine.\n[{table}]\n{name} = 2.0\n");
+            let told = Config::from_text(&text, "mine.toml").unwrap_err().to_string();
+            assert!(told.contains("mine.toml:3") && told.contains(&expected), "{told}");
+        }
+    }
 }
 
 #[test]

@@ -10,6 +10,7 @@ use crate::slam::alignment::residual::{Evaluation, Weighting, mean_squared_flow}
 use crate::slam::alignment::scatter::GradientScatter;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
+use crate::slam::image::noise::ImageNoise;
 use crate::slam::image::sums::{MAX_LEVELS, SumPyramid};
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::Brightness;
@@ -18,12 +19,9 @@ use crate::slam::pose::Brightness;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct AlignmentParams {
-    /// Noise of one pixel of level 0, grey levels. Averages down by two with each level.
-    pub pixel_noise: f32,
-    /// What does not average down with the levels (interpolation, reflections, occlusion),
-    /// grey levels: floor of σ_I. 4 needs a tenth fewer iterations than 2; errors on recordings
-    /// differ by up to a tenth, either way.
-    pub model_noise: f32,
+    /// The camera's noise, which the configuration has once for all.
+    #[serde(skip)]
+    pub noise: ImageNoise,
     /// Whether the variance of the inverse depth weighs the residuals (LSD14 §3.3); off only to
     /// see what it buys.
     pub use_depth_variance: bool,
@@ -57,8 +55,7 @@ pub struct AlignmentParams {
 impl Default for AlignmentParams {
     fn default() -> Self {
         Self {
-            pixel_noise: 2.5,
-            model_noise: 4.0,
+            noise: ImageNoise::default(),
             use_depth_variance: true,
             huber: 1.5,
             inlier_gate: 2.5,
@@ -78,9 +75,6 @@ impl Default for AlignmentParams {
 impl AlignmentParams {
     /// Checks every value.
     pub fn validate(&self) -> Result<(), ParameterError> {
-        check_range("pixel_noise", self.pixel_noise, 0.0..=100.0)?;
-        // Without a floor a noise-free image would weigh its residuals infinitely.
-        check_range("model_noise", self.model_noise, 0.01..=100.0)?;
         check_range("huber", self.huber, 0.1..=100.0)?;
         check_range("inlier_gate", self.inlier_gate, 0.1..=100.0)?;
         check_range("gain_prior_std_dev", self.gain_prior_std_dev, 1e-3..=1e3)?;
@@ -96,9 +90,8 @@ impl AlignmentParams {
 
     /// The weighting of residuals on `level`.
     pub fn weighting(&self, level: usize) -> Weighting {
-        let averaged = self.pixel_noise / (1u32 << level) as f32;
         Weighting {
-            intensity_variance: averaged * averaged + self.model_noise * self.model_noise,
+            intensity_variance: self.noise.variance(level),
             use_depth_variance: self.use_depth_variance,
             huber: self.huber,
             inlier_gate: self.inlier_gate,

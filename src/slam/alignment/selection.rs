@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::slam::alignment::fusion::Candidates;
 use crate::slam::image::buffer::Image;
+use crate::slam::image::noise::ImageNoise;
 use crate::slam::image::sums::grey_per_sum;
 use crate::slam::parameter::{ParameterError, check_range};
 
@@ -14,8 +15,9 @@ use crate::slam::parameter::{ParameterError, check_range};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SelectionParams {
-    /// Noise of a brightness difference, grey levels: how strong a gradient must be to count.
-    pub intensity_std_dev: f32,
+    /// The camera's noise, which tells how strong a gradient must be to count and which the configuration has once for all.
+    #[serde(skip)]
+    pub noise: ImageNoise,
     /// Translation, in shares of the mean depth, at which noise in the image and in the depth are
     /// weighed against each other. A keyframe is replaced at about a third.
     pub typical_translation: f32,
@@ -23,14 +25,13 @@ pub struct SelectionParams {
 
 impl Default for SelectionParams {
     fn default() -> Self {
-        Self { intensity_std_dev: 4.0, typical_translation: 0.1 }
+        Self { noise: ImageNoise::default(), typical_translation: 0.1 }
     }
 }
 
 impl SelectionParams {
     /// Checks every value.
     pub fn validate(&self) -> Result<(), ParameterError> {
-        check_range("intensity_std_dev", self.intensity_std_dev, 0.1..=100.0)?;
         check_range("typical_translation", self.typical_translation, 0.0..=10.0)
     }
 }
@@ -85,7 +86,7 @@ impl Selection {
         pixels_per_inverse_depth: f32,
     ) {
         let grey = 0.5 * grey_per_sum(level);
-        let noise = params.intensity_std_dev * params.intensity_std_dev;
+        let noise = params.noise.variance(level);
         let from_depth = pixels_per_inverse_depth * pixels_per_inverse_depth;
         let (width, pixels) = (image.width(), image.pixels());
         let (right, bottom) = (width - 1, image.height() - 1);

@@ -20,6 +20,7 @@ use nalgebra::{Matrix3, Matrix4, Matrix6, SMatrix, Vector3, Vector4, Vector6};
 use crate::slam::depth::map::{DepthMap, Hypothesis};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
+use crate::slam::image::noise::ImageNoise;
 use crate::slam::modes::NUM_MODES;
 
 /// What a mode matrix by pose unknowns is.
@@ -33,8 +34,10 @@ const MAX_SAMPLES: usize = 1500;
 const ROW_STEP: usize = 5;
 /// Relative standard deviation of depth below which points weigh alike: surfaces are not flat to a pixel.
 const LEAST_RELATIVE_STD_DEV: f64 = 0.02;
-/// Variance of the difference of two images, grey levels², as the alignment has it.
-const INTENSITY_VARIANCE: f64 = 35.0;
+/// Level that frames are aligned on in the end.
+const ALIGNED_LEVEL: usize = 1;
+/// Variance of the difference of two images there, grey levels²: what a pose makes of it weighs points alike.
+const INTENSITY_VARIANCE: f64 = 2.0 * ImageNoise::DEFAULT.variance(ALIGNED_LEVEL) as f64;
 /// Nearest that a point may come, in shares of its depth.
 const NEAREST_DEPTH_RATIO: f64 = 0.1;
 /// cos² between gradient and epipolar line below which no match is made.

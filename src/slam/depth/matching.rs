@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 use crate::slam::depth::epipolar::{EpipolarLine, Projection, TwoView};
 use crate::slam::depth::gain::Uncertainty;
 use crate::slam::depth::map::{BORDER_PX, GradientImage};
+use crate::slam::image::noise::ImageNoise;
 use crate::slam::image::quads_kernel::{Sampled, Sampler};
 use crate::slam::parameter::{ParameterError, check_range};
 
@@ -24,8 +25,9 @@ pub const MAX_STEPS: usize = 100;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MatchingParams {
-    /// Standard deviation of the image noise, grey levels. Cameras in rooms have 2 to 4.
-    pub image_noise: f32,
+    /// The camera's noise, which the configuration has once for all.
+    #[serde(skip)]
+    pub noise: ImageNoise,
     /// Standard deviation by which errors of an estimated pose beyond its covariance misplace the epipolar
     /// line, pixels, until the matches have shown it. A pose that is given without covariance has none. The
     /// covariance takes the errors of points for independent; what is common to a keyframe's depth is in every
@@ -61,7 +63,7 @@ pub struct MatchingParams {
 impl Default for MatchingParams {
     fn default() -> Self {
         Self {
-            image_noise: 3.0,
+            noise: ImageNoise::default(),
             line_noise_px: 1.0,
             independent_line_ratio: 0.25,
             calibration_noise_px: 0.03,
@@ -87,7 +89,6 @@ impl MatchingParams {
 
     /// Checks every value.
     pub fn validate(&self) -> Result<(), ParameterError> {
-        check_range("image_noise", self.image_noise, 0.1..=50.0)?;
         check_range("line_noise_px", self.line_noise_px, 0.0..=5.0)?;
         check_range("independent_line_ratio", self.independent_line_ratio, 0.0..=1.0)?;
         check_range("calibration_noise_px", self.calibration_noise_px, 0.0..=5.0)?;
@@ -217,7 +218,8 @@ pub fn condition(
     let samples = PATTERN.len() as f32;
     // Noise of the keyframe gives gradient where there is none: of a central difference half its variance.
     let squared_along = along.0 * along.0 + along.1 * along.1;
-    let by_noise = 0.5 * samples * (gain * params.image_noise).powi(2) * squared_along;
+    let pixel_std_dev = params.noise.pixel_std_dev;
+    let by_noise = 0.5 * samples * (gain * pixel_std_dev).powi(2) * squared_along;
     let information = measured - by_noise;
     if !(information >= samples * params.min_line_gradient * params.min_line_gradient) {
         return None;
@@ -225,7 +227,7 @@ pub fn condition(
     let tangent = product(along, across) / information;
     let geometric = params.line_noise_px * params.line_noise_px * (1.0 + tangent * tangent);
     // Noise of the frame, and of the keyframe as brightened.
-    let noise = (1.0 + gain * gain) * params.image_noise * params.image_noise;
+    let noise = (1.0 + gain * gain) * pixel_std_dev * pixel_std_dev;
     // The match is where Σ ĝ r = 0, ĝ with noise: its variance is σ² Σ ĝ²/(Σ ĝ g)².
     let photometric = noise * measured / (information * information);
     let slant = params.slant_noise_px * view.disparity(line, at);
@@ -342,7 +344,8 @@ pub fn search<S: Sampler>(
     if !(mean_squared_residual <= limit) {
         return Err(Miss::Mismatch);
     }
-    let noise_floor = 2.0 * params.image_noise * params.image_noise * PATTERN.len() as f32;
+    let pixel_std_dev = params.noise.pixel_std_dev;
+    let noise_floor = 2.0 * pixel_std_dev * pixel_std_dev * PATTERN.len() as f32;
     if second < params.min_ambiguity_ratio * cost.max(noise_floor) {
         return Err(Miss::Ambiguous);
     }

@@ -85,7 +85,8 @@ pub fn promises(
     }
     // What a match there would be worth.
     let samples = PATTERN.len() as f32;
-    let noise = (1.0 + gain * gain) * params.image_noise * params.image_noise;
+    let pixel_std_dev = params.noise.pixel_std_dev;
+    let noise = (1.0 + gain * gain) * pixel_std_dev * pixel_std_dev;
     let least = samples * params.min_line_gradient * params.min_line_gradient;
     let [structure_uu, structure_uv, structure_vv] = &pixels.structure;
     for k in 0..LANES {
@@ -95,7 +96,7 @@ pub fn promises(
         let (a, b) = (along_u[k], along_v[k]);
         let (c, d) = (across_u[k], across_v[k]);
         let measured = uu * a * a + uv * (a * b + b * a) + vv * b * b;
-        let by_noise = 0.5 * samples * (gain * params.image_noise).powi(2) * (a * a + b * b);
+        let by_noise = 0.5 * samples * (gain * pixel_std_dev).powi(2) * (a * a + b * b);
         let information = measured - by_noise;
         let tangent = (uu * a * c + uv * (a * d + b * c) + vv * b * d) / information;
         let geometric = params.line_noise_px * params.line_noise_px * (1.0 + tangent * tangent);

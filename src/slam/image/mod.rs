@@ -2,6 +2,7 @@
 
 pub mod buffer;
 pub mod gray;
+pub mod noise;
 pub mod pyramid;
 pub mod quads;
 pub mod quads_kernel;

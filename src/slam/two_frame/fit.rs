@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;
+use crate::slam::image::noise::ImageNoise;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::two_frame::elimination::{Elimination, PriorWeights, prior_energy};
 use crate::slam::two_frame::evidence::median;
@@ -18,8 +19,9 @@ use crate::slam::two_frame::system_kernel::system_kernels;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct FitParams {
-    /// Standard deviation of the image noise, grey levels: weighs images against priors.
-    pub image_noise: f32,
+    /// The camera's noise, which weighs images against priors and which the configuration has once for all.
+    #[serde(skip)]
+    pub noise: ImageNoise,
     /// Standard deviation of an inverse depth about its neighbours' median; the mean is 1.
     pub neighbour_std_dev: f32,
     /// Standard deviation of an inverse depth about 1: loose, rooms vary by more than a factor of 2.
@@ -33,7 +35,7 @@ pub struct FitParams {
 impl Default for FitParams {
     fn default() -> Self {
         Self {
-            image_noise: 3.0,
+            noise: ImageNoise::default(),
             neighbour_std_dev: 0.5,
             depth_std_dev: 1.0,
             max_iterations: 20,
@@ -45,7 +47,6 @@ impl Default for FitParams {
 impl FitParams {
     /// Checks every value.
     pub fn validate(&self) -> Result<(), ParameterError> {
-        check_range("image_noise", self.image_noise, 0.1..=50.0)?;
         check_range("neighbour_std_dev", self.neighbour_std_dev, 0.01..=100.0)?;
         check_range("depth_std_dev", self.depth_std_dev, 0.01..=100.0)?;
         check_range("max_iterations", self.max_iterations, 1..=1000)?;
@@ -71,7 +72,7 @@ impl FitParams {
 
     fn prior_weights(&self) -> PriorWeights {
         // A residual is the difference of two noisy values.
-        let noise = 2.0 * self.image_noise * self.image_noise;
+        let noise = 2.0 * self.noise.pixel_std_dev * self.noise.pixel_std_dev;
         PriorWeights {
             neighbour: noise / self.neighbour_std_dev.powi(2),
             depth: noise / self.depth_std_dev.powi(2),

@@ -5,6 +5,7 @@ use nalgebra::Vector6;
 use super::*;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
+use crate::slam::image::noise::ImageNoise;
 use crate::slam::image::quads::QuadImage;
 use crate::slam::image::quads_kernel::PortableSampler;
 
@@ -58,8 +59,11 @@ fn image(pixels: &[u8]) -> GradientImage {
 
 #[test]
 fn matches_hold_the_true_inverse_depth_within_their_variance() {
-    let params =
-        MatchingParams { image_noise: 0.5, line_noise_px: 0.02, ..MatchingParams::default() };
+    let params = MatchingParams {
+        noise: ImageNoise { pixel_std_dev: 0.5, ..ImageNoise::DEFAULT },
+        line_noise_px: 0.02,
+        ..MatchingParams::default()
+    };
     let motion = SE3::exp(&Vector6::new(0.06, 0.02, 0.03, 0.02, -0.03, 0.05));
     let (keyframe, frame) = (image(&render(&SE3::identity())), quads(&render(&motion)));
     let view = TwoView::new(&CAMERA, &motion);
