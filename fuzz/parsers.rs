@@ -10,6 +10,7 @@ use semidense::capture::image_file::decode_gray_into;
 use semidense::capture::rig::Rig;
 use semidense::capture::source::{FrameSource, SourceName, open};
 use semidense::capture::{png_image, sensor_yaml};
+use semidense::service::adjustments::message::adjustment_from_message;
 use semidense::service::config::Config;
 use semidense::service::frame_order::FrameOrder;
 use semidense::service::health::{ProcessState, cause, percentile_ms, warning};
@@ -32,7 +33,7 @@ use semidense::wire::conversion::{
     pose_from_message, pose_message, rigid_from_message,
 };
 use semidense::wire::message::{
-    CommandRequest, CommandResponse, FrameHeader, HealthMessage, KeyframeHeader,
+    AdjustmentMessage, CommandRequest, CommandResponse, FrameHeader, HealthMessage, KeyframeHeader,
     KeyframeImageHeader, KeyframePoseMessage, PoseMessage, StepMessage,
 };
 
@@ -284,6 +285,9 @@ pub fn message(bytes: &[u8]) {
         4 => {
             let Some(step) = take::<StepMessage>(&mut rest) else { return };
             let _ = rigid_from_message(&step.world_from_camera, "world_from_camera");
+            while let Some(message) = take::<AdjustmentMessage>(&mut rest) {
+                let _ = adjustment_from_message(&message);
+            }
         }
         5 => {
             let Some(health) = take::<HealthMessage>(&mut rest) else { return };
@@ -474,6 +478,7 @@ pub mod plain {
         DepthPoint,
         KeyframePoseMessage,
         StepMessage,
+        AdjustmentMessage,
         HealthMessage,
         CommandRequest,
         CommandResponse

@@ -16,8 +16,8 @@ use semidense::wire::conversion::{
     similarity_message,
 };
 use semidense::wire::message::{
-    CommandRequest, CommandResponse, FrameHeader, HISTOGRAM_BUCKETS, HealthMessage,
-    KeyframePoseMessage, PATH_BYTES, StepMessage, TEXT_BYTES,
+    AdjustmentMessage, CommandRequest, CommandResponse, FrameHeader, HISTOGRAM_BUCKETS,
+    HealthMessage, KeyframePoseMessage, PATH_BYTES, StepMessage, TEXT_BYTES,
 };
 
 use super::test_images::{flat_block_jpeg, png_of};
@@ -213,6 +213,10 @@ fn messages() -> [Vec<u8>; 7] {
         latency_counts: [1; HISTOGRAM_BUCKETS],
         work_counts: [0; HISTOGRAM_BUCKETS],
         wake_counts: [2; HISTOGRAM_BUCKETS],
+        adjustments: 5,
+        adjustments_merged: 2,
+        adjustments_dropped: 1,
+        adjustment_counts: [3; HISTOGRAM_BUCKETS],
         scheduling: 1,
         priority: 70,
         memory_locked: 1,
@@ -249,7 +253,7 @@ fn messages() -> [Vec<u8>; 7] {
         ]
         .concat(),
         [bytes_of(&graph), bytes_of(&graph)].concat(),
-        bytes_of(&step),
+        [bytes_of(&step), bytes_of(&AdjustmentMessage::default())].concat(),
         bytes_of(&health),
         [bytes_of(&request), bytes_of(&response)].concat(),
     ]

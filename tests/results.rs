@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use semidense::capture::source::{FrameSource, FrameStamp, SourceError};
+use semidense::service::adjustments::{AdjustmentRecord, Fate};
 use semidense::service::alignment_stamps::{AlignmentTrace, LevelTrace};
 use semidense::service::results::output_folder::prepare_output;
 use semidense::service::results::untracked::StartTally;
@@ -22,6 +23,8 @@ use semidense::slam::pose::{
     Brightness, DegradedReason, LostReason, PoseEstimate, Quality, TrackingState,
 };
 use semidense::slam::trajectory::StampedPose;
+use semidense::slam::window::Adjustment;
+use semidense::slam::window::confirmed::ConfirmedPoint;
 use serde_json::Value;
 
 const INTRINSICS: Intrinsics = Intrinsics::pinhole(32, 24, 30.0);
@@ -158,6 +161,7 @@ fn record(poses: Vec<RecordedPose>, keyframes: Vec<Keyframe>, with_truth: bool) 
         map_nanos: vec![2_000_000; frames],
         keyframe_step_nanos: vec![5_000_000; 3],
         keyframe_nanos: vec![3_000_000; 3],
+        adjustments: Vec::new(),
         start: StartTally::default(),
         rejections: None,
         budget_samples: Vec::new(),
@@ -245,7 +249,58 @@ fn figures_and_files_of_a_run_with_truth_and_a_loss() {
     let header = std::str::from_utf8(&pcd[..data]).unwrap();
     assert!(header.contains("\nWIDTH 38\nHEIGHT 1\n") && header.contains("\nPOINTS 38\n"));
     let names: Vec<_> = std::fs::read_dir(&dir).unwrap().map(|e| e.unwrap().file_name()).collect();
-    assert_eq!(names.len(), 7, "nothing temporary is left: {names:?}");
+    assert_eq!(names.len(), 8, "nothing temporary is left: {names:?}");
+}
+
+#[test]
+fn joint_estimates_are_in_summary_and_report_and_their_points_in_a_file() {
+    let estimate = |sequence: u64, fate| AdjustmentRecord {
+        sequence,
+        frames: 3,
+        nanos: 1_000_000 * sequence,
+        fate,
+        adjustment: Adjustment {
+            inlier_ratio: 0.9,
+            rms_grey: 0.1 * sequence as f64,
+            ..Adjustment::default()
+        },
+    };
+    let fates = [(10, Fate::Entered), (20, Fate::Merged), (30, Fate::Dropped)];
+    let point = |keyframe_id: u64, u: u16| ConfirmedPoint {
+        keyframe_id,
+        u,
+        v: 3,
+        confirmations: 7,
+        inverse_depth: 0.25,
+        intensity: 99.0,
+    };
+    let poses = (0..60).map(|i| pose(i, TrackingState::Tracking, u64::from(i >= 40))).collect();
+    let mut record = record(poses, vec![keyframe(0), keyframe(1)], false);
+    record.adjustments = fates.map(|(sequence, fate)| estimate(sequence, fate)).to_vec();
+    // One whose keyframe is gone has no place.
+    record.map.confirmed = vec![point(0, 1), point(1, 1), point(5, 1)];
+    let folder = tempfile::tempdir().unwrap();
+    let (summary, report) = written(folder.path(), &record);
+    for (key, value) in [
+        ("adjustments", 2.0),
+        ("adjustments_merged", 1.0),
+        ("adjustments_dropped", 1.0),
+        ("adjustment_frames_max", 3.0),
+        ("adjustment_inlier_ratio_median", 0.9),
+        ("adjustment_rms_grey_median", 2.0),
+    ] {
+        assert_eq!(summary[key].as_f64(), Some(value), "{key}");
+    }
+    assert_eq!(summary["adjustment_ms"]["max"], 30.0);
+    assert!(report.contains("Joint estimation") && report.contains("Inliers of joint estimates"));
+    let ply = std::fs::read(folder.path().join("points.ply")).unwrap();
+    let begin = ply.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
+    assert_eq!(ply.len() - begin, 2 * 24, "2 points of six numbers");
+    let number = |at: usize| f32::from_le_bytes(ply[begin + at..][..4].try_into().unwrap());
+    let count = |at: usize| u32::from_le_bytes(ply[begin + at..][..4].try_into().unwrap());
+    assert!((number(8) - 2.0).abs() < 1e-6, "4 keyframe units are 2 map units");
+    assert!((number(24) - number(0) - 1.0).abs() < 1e-6, "the second keyframe has moved by 1");
+    assert_eq!((number(12), count(16), count(20), count(44)), (99.0, 7, 0, 1));
 }
 
 #[test]

@@ -6,8 +6,9 @@ use semidense::capture::simulator::params::SimulatorParams;
 use semidense::service::replay::{DepthOrigin, PoseOrigin, ReplayConfig, replay};
 use semidense::service::results::RunRecord;
 
-/// Share of the path by which trajectories may differ where a sensor's metres enter as f32.
-const TOLERANCE: f64 = 1e-3;
+/// Share of the path by which trajectories may differ where a sensor's metres enter as f32, and the joint estimation
+/// may end a step earlier or later for it.
+const TOLERANCE: f64 = 3e-3;
 
 fn record(world_scale: f64, poses: PoseOrigin, initial_depth: DepthOrigin) -> RunRecord {
     let params = SimulatorParams {

@@ -63,8 +63,8 @@ pub struct ReplayArgs {
     /// Where frames come from and how the camera is.
     #[command(flatten)]
     source: SourceArguments,
-    /// Folder for trajectory.txt, trajectory_online.txt, keyframes.txt, map.ply, map.pcd, summary.json
-    /// and report.html [default: a new folder under ./output named by the time (UTC); output/latest links to the
+    /// Folder for trajectory.txt, trajectory_online.txt, keyframes.txt, map.ply, map.pcd, points.ply,
+    /// summary.json and report.html [default: a new folder under ./output named by the time (UTC); output/latest links to the
     /// newest]
     #[arg(long, value_name = "DIR")]
     output: Option<PathBuf>,

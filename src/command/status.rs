@@ -24,7 +24,7 @@ use crate::service::shutdown::Shutdown;
 use crate::wire::message::{HealthMessage, PoseMessage};
 use crate::wire::place::Place;
 use crate::wire::port::{Access, Hub, OpenError, Subscriber, wait};
-use crate::wire::topic::{POSE, Topic};
+use crate::wire::topic::{MAPPER_HEALTH, POSE, Topic};
 
 /// Time between two looks.
 const PERIOD: Duration = Duration::from_secs(1);
@@ -155,7 +155,7 @@ impl<'a> Watch<'a> {
             let state = state_of(health, reported.map(|state| state.name()), now);
             heard += 1;
             ended += usize::from(state == NOT_RUNNING);
-            look[topic.owner] = row(health, state, now);
+            look[topic.owner] = row(topic, health, state, now);
             match topic.owner {
                 "capture" => look["source"] = json!(source(health)),
                 "mapper" => look["keyframes"] = json!(health.total),
@@ -249,10 +249,19 @@ fn listen(hub: &Hub, topic: &Topic) -> Result<Option<Peer>, OpenError> {
 }
 
 /// One process as JSON.
-fn row(health: &HealthMessage, state: &str, now: i64) -> Value {
+fn row(topic: &Topic, health: &HealthMessage, state: &str, now: i64) -> Value {
     let is_running = ["running", "stale"].contains(&state);
     let rate_hz = (is_running && health.rate_hz.is_finite()).then_some(health.rate_hz);
+    let time = |share| percentile_ms(&health.adjustment_counts, share);
+    let adjustments = json!({
+        "entered": health.adjustments,
+        "merged": health.adjustments_merged,
+        "dropped": health.adjustments_dropped,
+        "cpu_ms": { "p50": time(0.5), "p95": time(0.95), "p99": time(0.99), "max": time(1.0) },
+    });
+    let is_mapper = topic.owner == MAPPER_HEALTH.owner;
     json!({
+        "adjustments": is_mapper.then_some(adjustments),
         "state": state,
         "cause": cause(health),
         "process_id": health.process_id,

@@ -105,6 +105,7 @@ pub fn legend() -> String {
     for column in &COLUMNS {
         text += &format!("  {:7} {}\n", column.heading, column.legend);
     }
+    text += "Below the mapper: joint estimates of keyframes that entered the map, of them those merged with a map that had newer keyframes, and those dropped because the map had changed.\n";
     text + "Exits when all processes of the run have ended."
 }
 
@@ -178,7 +179,21 @@ fn process_lines(name: &str, row: &Value, columns: &[&Column], width: usize) -> 
             lines.extend(wrapped(&format!("  {label}{text}"), width, 4));
         }
     }
+    lines.extend(joint_line(&row["adjustments"]).iter().flat_map(|line| wrapped(line, width, 4)));
     lines
+}
+
+/// What the mapper's joint estimation of keyframes did; nothing before its first estimate.
+fn joint_line(adjustments: &Value) -> Option<String> {
+    let (p50, p99) = (&adjustments["cpu_ms"]["p50"], &adjustments["cpu_ms"]["p99"]);
+    Some(format!(
+        "  joint estimation of keyframes: {} entered ({} merged), {} dropped; median {:.1} ms, p99 {:.1} ms of a CPU",
+        adjustments["entered"].as_u64()?,
+        adjustments["merged"].as_u64()?,
+        adjustments["dropped"].as_u64()?,
+        p50.as_f64()?,
+        p99.as_f64()?,
+    ))
 }
 
 /// Lines of at most `width` characters, broken at spaces; all but the first indented. Only a word that is
@@ -225,6 +240,7 @@ mod tests {
             "state": "running", "cause": "degraded: little of the keyframe is in view",
             "frames": 123_456, "rate_hz": 29.97, "dropped": 12, "deadline_misses": 3, "uptime_secs": 4120.0,
             "latency_ms": {"p50": 3.25, "p99": 12.5}, "peak_rss_mb": 182.0,
+            "adjustments": {"entered": 41, "merged": 3, "dropped": 1, "cpu_ms": {"p50": 21.25, "p99": 60.5}},
             "warning": "real-time scheduling was refused; raise RLIMIT_RTPRIO to 70 for this user",
         });
         json!({
@@ -252,6 +268,7 @@ mod tests {
                 "x 1.20 y -0.05 z 3.00",
                 "21 ms ago",
                 "mapper not running",
+                "41 entered (3 merged), 1 dropped; median 21.2 ms, p99 60.5 ms of a CPU",
             ] {
                 assert!(shown.contains(part), "{width}, {part}: {text}");
             }

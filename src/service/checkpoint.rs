@@ -61,12 +61,17 @@ impl Kept {
         }
     }
 
-    /// Hands over what a step has changed: the keyframe that was left, and the active one's state where it is
-    /// another or the last was handed over some time ago.
+    /// Hands over what a step or a correction has changed: the keyframe that was left, and the state where another
+    /// keyframe is active, the map was corrected, or the last was handed over some time ago.
     pub fn follow(&mut self, mapper: &mut Mapper, outcome: &StepOutcome) {
-        let is_new = outcome.needs_image();
-        if let Some(left) = mapper.take_left() {
-            self.checkpoint.put_keyframe(left.clone());
+        let is_corrected = outcome.graph_changed && !outcome.needs_image();
+        let is_new = outcome.needs_image() || is_corrected;
+        let left = mapper.take_left().map(|left| left.keyframe_id);
+        // The depth of the one before the active is what a correction changes most; the others are in their files
+        // as they were when they were left, and a successor estimates them again.
+        let before = is_corrected.then(|| before_active(mapper)).flatten();
+        if let Some(keyframe) = left.or(before).and_then(|id| mapper.map().get(id)) {
+            self.checkpoint.put_keyframe(keyframe.clone());
         }
         let is_due = outcome.keyframe_changed
             && now_nanos().saturating_sub(self.handed_nanos) > PERIOD_NANOS;
@@ -82,6 +87,13 @@ impl Kept {
     pub fn end_in_order(&mut self) {
         self.checkpoint.is_over = true;
     }
+}
+
+/// The newest keyframe with depth beside the active one.
+fn before_active(mapper: &Mapper) -> Option<u64> {
+    let active = mapper.keyframe()?.keyframe_id;
+    let mut others = mapper.map().keyframes.iter().rev().filter(|of| of.keyframe_id != active);
+    others.find(|keyframe| keyframe.has_depth()).map(|keyframe| keyframe.keyframe_id)
 }
 
 /// Writes the newest checkpoint, and the keyframes before it once each. The files stay unless the process ends
@@ -191,7 +203,12 @@ fn as_written(read: &Map) -> Map {
         true => keyframe.clone(),
         false => keyframe.without_depth(),
     };
-    Map { keyframes: read.keyframes.iter().map(written).collect(), ..*read }
+    Map {
+        keyframes: read.keyframes.iter().map(written).collect(),
+        frames: Vec::new(),
+        confirmed: Vec::new(),
+        ..*read
+    }
 }
 
 /// Writes a keyframe into a file of its own; of more than are kept the oldest go.

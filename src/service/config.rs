@@ -19,7 +19,7 @@ use crate::capture::source::SourceParams;
 use crate::capture::v4l::params::CameraParams;
 pub use crate::service::config_error::ConfigError;
 use crate::service::results::ResultsParams;
-use crate::service::schedule::SchedulingParams;
+use crate::service::schedule::{Background, SchedulingParams};
 use crate::slam::image::noise::ImageNoise;
 use crate::slam::mapper::MapperParams;
 use crate::slam::parameter::{ParameterError, check_range};
@@ -132,6 +132,9 @@ impl Default for TrackerConfig {
 pub struct MapperConfig {
     /// Threads of its pool; 0 is one for each CPU. The map does not depend on it.
     pub threads: usize,
+    /// Live: when its thread runs that estimates keyframes jointly, which no frame waits for: `idle`, when a CPU has
+    /// nothing else to do, or `other`, as its other threads, where idle leaves it no time.
+    pub background: Background,
     /// What it asks of the kernel, for all its threads. It has no deadline: leave it on other CPUs than
     /// the tracker where there are enough.
     pub scheduling: SchedulingParams,

@@ -1,5 +1,6 @@
 //! The health of a process: state, counters and latencies, published once a second and on change.
 
+use crate::service::adjustments::{AdjustmentRecord, Fate};
 use crate::service::clock::now_nanos;
 use crate::service::manager_notice::ManagerNotice;
 use crate::service::schedule::{InForce, Policy, Refusal, peak_rss_bytes};
@@ -181,6 +182,10 @@ impl Health {
             latency_counts: [0; HISTOGRAM_BUCKETS],
             work_counts: [0; HISTOGRAM_BUCKETS],
             wake_counts: [0; HISTOGRAM_BUCKETS],
+            adjustments: 0,
+            adjustments_merged: 0,
+            adjustments_dropped: 0,
+            adjustment_counts: [0; HISTOGRAM_BUCKETS],
             scheduling: scheduling_code(None),
             priority: 0,
             memory_locked: 0,
@@ -223,6 +228,23 @@ impl Health {
     /// Takes down the time from the sending of a frame to the look at it.
     pub fn count_wake(&mut self, nanos: u64) {
         self.message.wake_counts[bucket(nanos)] += 1;
+    }
+
+    /// Takes down a joint estimate of keyframes.
+    pub fn count_adjustment(&mut self, record: &AdjustmentRecord) {
+        self.message.adjustment_counts[bucket(record.nanos)] += 1;
+        match record.fate {
+            Fate::Entered | Fate::Merged => self.message.adjustments += 1,
+            Fate::Dropped => self.message.adjustments_dropped += 1,
+        }
+        self.message.adjustments_merged += u64::from(record.fate == Fate::Merged);
+    }
+
+    /// Says what the process has to do without from now on.
+    pub fn warn(&mut self, warning: &str) {
+        (self.message.warning, self.message.warning_bytes) = text_bytes(warning);
+        self.changed = true;
+        self.report();
     }
 
     /// Says what the kernel does for this process and what it refused; the first refusal as a text.

@@ -4,7 +4,9 @@
 //! Layout: magic, then the first free epoch (u32), the number of keyframes (u64), then each keyframe: id, revision, sequence
 //! (u64), stamp (i64), epoch, map state, width, height (u32), pose (8 × f64), intrinsics
 //! (4 × f64), covariance of common depth errors (6 × f64), number of points (u64), points (u16, u16, 3 × f32), number of image bytes (u64, 0 where the
-//! image was given up), image bytes.
+//! image was given up), image bytes. Then the number of frames that were aligned again (u64), each: sequence, keyframe
+//! (u64), pose relative to that (7 × f64); and the number of points of the joint estimation (u64), each: keyframe (u64),
+//! u, v (u16), confirmations (u32), inverse depth, brightness (f32).
 
 use std::io::{self, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
@@ -13,21 +15,28 @@ use crate::capture::input_file;
 use crate::service::atomic_file::write_atomically;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS};
-use crate::slam::map::Map;
+use crate::slam::map::{FramePlace, Map};
 use crate::slam::pose::NO_KEYFRAME;
+use crate::slam::window::confirmed::ConfirmedPoint;
 use crate::wire::conversion::{
     MessageError, check_points, code_from_map_state, map_state_from_code,
-    mode_covariance_from_message, similarity_from_message, similarity_message,
+    mode_covariance_from_message, rigid_from_message, rigid_message, similarity_from_message,
+    similarity_message,
 };
 
 /// First bytes of the file, with the version of the layout.
-const MAGIC: [u8; 16] = *b"semidense map 5\n";
+const MAGIC: [u8; 16] = *b"semidense map 6\n";
 /// Largest id or revision: what comes after it must not overflow.
 const MAX_NUMBER: u64 = u64::MAX / 2;
 /// Largest number of an epoch, for the same reason.
 const MAX_EPOCH: u64 = (u32::MAX / 2) as u64;
 /// More keyframes than an hour at one each 30 ms: a broken number, not a map.
 const MAX_KEYFRAMES: u64 = 120_000;
+
+/// More frames than ten days at 30 Hz.
+const MAX_FRAMES: u64 = 26_000_000;
+/// Points of the joint estimation that the largest map of the largest window has.
+const MAX_CONFIRMED: u64 = MAX_KEYFRAMES * 5000;
 
 /// Why a map cannot be read.
 #[derive(Debug, thiserror::Error)]
@@ -63,6 +72,16 @@ pub enum MapFileError {
         /// What is wrong.
         source: MessageError,
     },
+    /// A frame is broken.
+    #[error("{path}: frame {sequence}: {source}")]
+    Frame {
+        /// The file.
+        path: PathBuf,
+        /// Its sequence.
+        sequence: u64,
+        /// What is wrong.
+        source: MessageError,
+    },
     /// There is more than the map.
     #[error("{0} has bytes after the end of the map")]
     Trailing(PathBuf),
@@ -76,14 +95,17 @@ pub fn write_map(path: &Path, map: &Map, each: &mut dyn FnMut()) -> io::Result<(
         map.keyframes.iter().try_for_each(|keyframe| {
             each();
             write_keyframe(file, keyframe)
-        })
+        })?;
+        each();
+        write_rest(file, map)
     })
 }
 
 /// Writes the bytes of `map`.
 pub fn write_map_into(file: &mut impl Write, map: &Map) -> io::Result<()> {
     write_head(file, map)?;
-    map.keyframes.iter().try_for_each(|keyframe| write_keyframe(file, keyframe))
+    map.keyframes.iter().try_for_each(|keyframe| write_keyframe(file, keyframe))?;
+    write_rest(file, map)
 }
 
 fn write_head(file: &mut impl Write, map: &Map) -> io::Result<()> {
@@ -125,6 +147,27 @@ fn write_keyframe(file: &mut impl Write, keyframe: &Keyframe) -> io::Result<()> 
     file.write_all(&keyframe.image)
 }
 
+/// Frames that were aligned again and points of the joint estimation.
+fn write_rest(file: &mut impl Write, map: &Map) -> io::Result<()> {
+    file.write_all(&(map.frames.len() as u64).to_le_bytes())?;
+    for frame in &map.frames {
+        file.write_all(&frame.sequence.to_le_bytes())?;
+        file.write_all(&frame.keyframe_id.to_le_bytes())?;
+        for number in rigid_message(&frame.keyframe_from_camera) {
+            file.write_all(&number.to_le_bytes())?;
+        }
+    }
+    file.write_all(&(map.confirmed.len() as u64).to_le_bytes())?;
+    map.confirmed.iter().try_for_each(|point| {
+        file.write_all(&point.keyframe_id.to_le_bytes())?;
+        file.write_all(&point.u.to_le_bytes())?;
+        file.write_all(&point.v.to_le_bytes())?;
+        file.write_all(&point.confirmations.to_le_bytes())?;
+        file.write_all(&point.inverse_depth.to_le_bytes())?;
+        file.write_all(&point.intensity.to_le_bytes())
+    })
+}
+
 /// Reads the map that [`write_map`] wrote.
 pub fn read_map(path: &Path) -> Result<Map, MapFileError> {
     let file = input_file::open(path)
@@ -146,10 +189,31 @@ pub fn parse_map(path: &Path, bytes: impl Read) -> Result<Map, MapFileError> {
     for index in 0..count {
         map.keyframes.push(reader.keyframe(index)?);
     }
+    for _ in 0..reader.count("frames", MAX_FRAMES)? {
+        map.frames.push(reader.frame()?);
+    }
+    // By their sequence a frame is looked up.
+    map.frames.sort_by_key(|frame| frame.sequence);
+    for _ in 0..reader.count("points", MAX_CONFIRMED)? {
+        let point = reader.confirmed()?;
+        // One without its keyframe has no place.
+        map.confirmed.extend(Some(point).filter(|point| is_placed(&map, point)));
+    }
     match reader.file.read(&mut [0]) {
         Ok(0) => Ok(map),
         _ => Err(MapFileError::Trailing(path.to_owned())),
     }
+}
+
+/// Whether a point lies in the image of its keyframe, at a distance.
+fn is_placed(map: &Map, point: &ConfirmedPoint) -> bool {
+    let is_distance = point.inverse_depth.is_finite() && point.inverse_depth > 0.0;
+    is_distance
+        && point.intensity.is_finite()
+        && map.get(point.keyframe_id).is_some_and(|keyframe| {
+            let k = &keyframe.intrinsics;
+            usize::from(point.u) < k.width && usize::from(point.v) < k.height
+        })
 }
 
 /// The bytes of one keyframe, as in the file.
@@ -265,6 +329,26 @@ impl<R: Read> Reader<'_, R> {
         })
     }
 
+    fn frame(&mut self) -> Result<FramePlace, MapFileError> {
+        let (sequence, keyframe_id) = (self.u64()?, self.u64()?);
+        let keyframe_from_camera =
+            rigid_from_message(&self.numbers()?, "keyframe_from_camera").map_err(|source| {
+                MapFileError::Frame { path: self.path.to_owned(), sequence, source }
+            })?;
+        Ok(FramePlace { sequence, keyframe_id, keyframe_from_camera })
+    }
+
+    fn confirmed(&mut self) -> Result<ConfirmedPoint, MapFileError> {
+        Ok(ConfirmedPoint {
+            keyframe_id: self.u64()?,
+            u: u16::from_le_bytes(self.bytes()?),
+            v: u16::from_le_bytes(self.bytes()?),
+            confirmations: self.u32()?,
+            inverse_depth: self.f32()?,
+            intensity: self.f32()?,
+        })
+    }
+
     fn numbers<const N: usize>(&mut self) -> Result<[f64; N], MapFileError> {
         let mut numbers = [0.0; N];
         for number in &mut numbers {
@@ -310,7 +394,23 @@ mod tests {
             points: vec![point; 5],
         };
         let keyframes = vec![keyframe.clone(), Keyframe { keyframe_id: 8, ..keyframe }];
-        Map { keyframes, free_epoch: 18, revision: 4, active: Some(7) }
+        let frame = FramePlace { sequence: 100, keyframe_id: 7, keyframe_from_camera: rigid };
+        let confirmed = ConfirmedPoint {
+            keyframe_id: 8,
+            u: 16,
+            v: 3,
+            confirmations: 5,
+            inverse_depth: 0.3,
+            intensity: 77.0,
+        };
+        Map {
+            keyframes,
+            frames: vec![frame, FramePlace { sequence: 101, ..frame }],
+            confirmed: vec![confirmed; 3],
+            free_epoch: 18,
+            revision: 4,
+            active: Some(7),
+        }
     }
 
     #[test]
@@ -321,6 +421,19 @@ mod tests {
         let read = read_map(&path).unwrap();
         assert_eq!((read.free_epoch, read.revision, read.active), (18, 4, Some(7)));
         assert_eq!(read.keyframes, map().keyframes);
+        assert_eq!((read.frames, read.confirmed), (map().frames, map().confirmed));
+    }
+
+    #[test]
+    fn points_of_the_joint_estimation_lie_in_their_keyframes() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("map.bin");
+        let mut wrong = map();
+        wrong.confirmed[0].keyframe_id = 9;
+        wrong.confirmed[1].u = 17;
+        wrong.confirmed.push(ConfirmedPoint { inverse_depth: f32::NAN, ..wrong.confirmed[2] });
+        write_map(&path, &wrong, &mut || ()).unwrap();
+        assert_eq!(read_map(&path).unwrap().confirmed, map().confirmed[2..]);
     }
 
     #[test]

@@ -5,6 +5,7 @@ mod output;
 use std::path::Path;
 use std::time::Duration;
 
+use crate::service::adjustments::{Adjustments, Entry};
 use crate::service::checkpoint::Kept;
 use crate::service::child::is_supervised;
 use crate::service::clock::now_nanos;
@@ -15,7 +16,7 @@ use crate::service::map_file::write_map;
 use crate::service::mapper::output::Output;
 use crate::service::mode::Mode;
 use crate::service::pairing::Pairing;
-use crate::service::schedule::{apply, in_force};
+use crate::service::schedule::{Background, apply, in_force};
 use crate::service::shutdown::Shutdown;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::map::Map;
@@ -60,6 +61,9 @@ pub enum MapperError {
     /// The configuration does not fit the frames.
     #[error("mapping: {0}")]
     Parameter(#[from] ParameterError),
+    /// No thread for the joint estimation.
+    #[error("cannot start the thread that estimates keyframes jointly ({0})")]
+    Thread(std::io::Error),
     /// No threads.
     #[error("cannot start {threads} mapper threads ({reason}); lower mapper.threads")]
     Pool {
@@ -110,6 +114,7 @@ struct Shell<'a> {
     output: Output,
     health: Health,
     mapper: Option<(Intrinsics, Mapper)>,
+    adjustments: Adjustments,
     /// Live: what a successor goes on from.
     kept: Option<Kept>,
     /// What a mapper that died has left for this one, until the first frame.
@@ -151,6 +156,7 @@ impl<'a> Shell<'a> {
             output: Output::open(&hub)?,
             health: Health::open(&hub, &MAPPER_HEALTH)?,
             mapper: None,
+            adjustments: start_adjustments(config, mode).map_err(MapperError::Thread)?,
             kept,
             left,
             last_pose: None,
@@ -165,8 +171,10 @@ impl<'a> Shell<'a> {
     fn map_until(&mut self, shutdown: &Shutdown) -> Result<(), MapperError> {
         while !shutdown.is_requested() {
             let events = [self.frames.events(), self.poses.events(), self.commands.events()];
-            wait(&events, Some(shutdown.descriptor()), WAKE_PERIOD)?;
+            let adjusted = self.adjustments.descriptor();
+            wait(&events, adjusted.into_iter().chain([shutdown.descriptor()]), WAKE_PERIOD)?;
             self.output.serve_late_joiners();
+            self.pick_up_adjustment()?;
             while let Some((frame, pose)) = self.next_pair()? {
                 self.step(&frame, &pose)?;
                 // A map that is behind has no pause between its steps.
@@ -273,10 +281,14 @@ impl<'a> Shell<'a> {
         let step_nanos = nanos_since(begin);
         let _span = tracing::trace_span!("publish").entered();
         self.output.publish(mapper, &finished)?;
+        let adjusted = self.adjustments.after_frame(mapper, frame.sequence);
+        self.output.publish(mapper, &adjusted)?;
+        tell_adjustments(&mut self.adjustments, &self.output, &mut self.health)?;
         let durations = [step_nanos, change_nanos];
         self.output.publish_step(mapper, frame.sequence, durations, self.last_pose.as_ref())?;
         if let Some(kept) = &mut self.kept {
             kept.follow(mapper, &outcome);
+            kept.follow(mapper, &adjusted);
         }
         self.health.enter(ProcessState::Running, &mapper.situation().to_string());
         let counters = self.health.counters();
@@ -290,6 +302,18 @@ impl<'a> Shell<'a> {
         Ok(())
     }
 
+    /// Live: a joint estimate that is ready enters the map, and goes out, though no frame comes.
+    fn pick_up_adjustment(&mut self) -> Result<(), MapperError> {
+        let Some((_, mapper)) = &mut self.mapper else { return Ok(()) };
+        let outcome = self.adjustments.pick_up(mapper);
+        self.output.publish(mapper, &outcome)?;
+        if let Some(kept) = &mut self.kept {
+            kept.follow(mapper, &outcome);
+        }
+        tell_adjustments(&mut self.adjustments, &self.output, &mut self.health)?;
+        Ok(())
+    }
+
     /// A mapper for another camera: the first, which goes on from what a dead one has left, or one in
     /// mid-stream, which begins an epoch.
     fn change_camera(&mut self, intrinsics: Intrinsics) -> Result<(), MapperError> {
@@ -298,6 +322,7 @@ impl<'a> Shell<'a> {
         if let Some((_, before)) = self.mapper.take() {
             self.health.counters().resized += 1;
             mapper.succeed(before);
+            self.adjustments.orphan();
         }
         if let Some(map) = self.left.take() {
             self.kept.iter_mut().for_each(Kept::reserve);
@@ -309,21 +334,53 @@ impl<'a> Shell<'a> {
     }
 
     fn answer_commands(&mut self) -> Result<(), MapperError> {
-        let mapper = self.mapper.as_ref().map(|(_, mapper)| mapper);
-        let (health, output) = (&mut self.health, &self.output);
+        let mut mapper = self.mapper.as_mut().map(|(_, mapper)| mapper);
+        let (health, output, adjustments) = (&mut self.health, &self.output, &mut self.adjustments);
         Ok(self.commands.answer(|command| match command {
             Command::SendKeyframe(keyframe_id) => {
-                output.publish_earlier(mapper.map(Mapper::map), keyframe_id)
+                output.publish_earlier(mapper.as_deref().map(Mapper::map), keyframe_id)
             }
             Command::SaveMap(path) => {
                 // It may take longer than the pause between two signs of life.
                 let before = health.entered();
                 health.enter(ProcessState::Running, WRITES_MAP);
-                let saved = save_map(mapper, &path, &mut || health.report());
+                // It is asked for when the recording is over.
+                let outcome = mapper.as_deref_mut().map(|mapper| adjustments.finish(mapper));
+                if let (Some(mapper), Some(outcome)) = (mapper.as_deref(), outcome) {
+                    let told = output
+                        .publish(mapper, &outcome)
+                        .and_then(|()| tell_adjustments(adjustments, output, health));
+                    told.map_err(|error| error.to_string())?;
+                }
+                let saved = save_map(mapper.as_deref(), &path, &mut || health.report());
                 health.go_back_to(before);
                 saved
             }
         })?)
+    }
+}
+
+/// Publishes and counts joint estimates that are over; says it when there will be no more.
+fn tell_adjustments(
+    adjustments: &mut Adjustments,
+    output: &Output,
+    health: &mut Health,
+) -> Result<(), SendError> {
+    for record in adjustments.take_records() {
+        health.count_adjustment(&record);
+        output.publish_adjustment(&record)?;
+    }
+    adjustments.take_failure().iter().for_each(|failure| health.warn(failure));
+    Ok(())
+}
+
+/// The joint estimation of keyframes, as the mode wants it.
+fn start_adjustments(config: &Config, mode: Mode) -> std::io::Result<Adjustments> {
+    let delay = Entry::AfterFrames(config.mapping.window.delay_frames as u64);
+    match mode {
+        // The frames wait for it.
+        Mode::Lockstep => Adjustments::start(delay, Background::Other),
+        Mode::Live => Adjustments::start(Entry::WhenReady, config.mapper.background),
     }
 }
 

@@ -1,5 +1,6 @@
 //! Process shells: clock, threads, scheduling, configuration, health, results; one loop a process.
 
+pub mod adjustments;
 pub mod alignment_stamps;
 pub mod atomic_file;
 pub mod budget;

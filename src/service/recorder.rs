@@ -1,5 +1,6 @@
 //! Collects what a run publishes until its results are written, and keeps its journal.
 
+use crate::service::adjustments::message::adjustment_from_message;
 use crate::service::journal::Journal;
 use crate::service::journal::feed::KeyframeFeed;
 use crate::service::journal::log::{Record, Step};
@@ -8,15 +9,16 @@ use crate::service::recording::{RecordParts, Recording, RunCounters};
 use crate::service::results::RunRecord;
 use crate::slam::map::Map;
 use crate::slam::pose::TrackingState;
-use crate::wire::message::{PoseMessage, StepMessage};
+use crate::wire::message::{AdjustmentMessage, PoseMessage, StepMessage};
 use crate::wire::port::{Events, Hub, OpenError, ReceiveError, Subscriber};
-use crate::wire::topic::{POSE, STEP};
+use crate::wire::topic::{ADJUSTMENT, POSE, STEP};
 
 /// Poses and steps as they come in.
 #[derive(Debug)]
 pub struct Recorder {
     poses: Subscriber<PoseMessage, ()>,
     steps: Subscriber<StepMessage, ()>,
+    adjustments: Subscriber<AdjustmentMessage, ()>,
     recording: Recording,
     last_step: Option<StepMessage>,
     journal: Option<Journal>,
@@ -31,6 +33,7 @@ impl Recorder {
         Ok(Self {
             poses: hub.subscriber(&POSE)?,
             steps: hub.subscriber(&STEP)?,
+            adjustments: hub.subscriber(&ADJUSTMENT)?,
             recording: Recording::default(),
             last_step: None,
             journal,
@@ -59,6 +62,16 @@ impl Recorder {
             self.recording.take_step(step_nanos, change_nanos, start_frame);
             self.keep(|| Record::Step(Step { step_nanos, change_nanos, start_frame }));
             self.last_step = Some(*step);
+        }
+        while let Some(message) = self.adjustments.receive()? {
+            let Some(adjustment) = message.payload().first() else { continue };
+            match adjustment_from_message(adjustment) {
+                Err(error) => tracing::warn!("mapper/adjustment: {error}"),
+                Ok(record) => {
+                    self.recording.take_adjustment(record);
+                    self.keep(|| Record::Adjustment(*adjustment));
+                }
+            }
         }
         self.collect_keyframes(false);
         Ok(self.recording.num_poses() + self.recording.num_steps() > before)

@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::service::adjustments::AdjustmentRecord;
 use crate::service::results::untracked::StartTally;
 use crate::service::results::{RecordedPose, RunMode, RunRecord};
 use crate::slam::evaluation::depth_error::DepthScale;
@@ -83,6 +84,7 @@ pub struct Recording {
     map_nanos: Vec<u64>,
     keyframe_step_nanos: Vec<u64>,
     keyframe_nanos: Vec<u64>,
+    adjustments: Vec<AdjustmentRecord>,
     start: StartTally,
     /// CLOCK_MONOTONIC of the first frame and of the last pose.
     span_nanos: Option<(i64, i64)>,
@@ -136,6 +138,11 @@ impl Recording {
             self.keyframe_step_nanos.push(step_nanos);
             self.keyframe_nanos.push(change_nanos);
         }
+    }
+
+    /// Takes in a joint estimate of keyframes that is over.
+    pub fn take_adjustment(&mut self, adjustment: AdjustmentRecord) {
+        self.adjustments.push(adjustment);
     }
 
     /// Poses so far.
@@ -200,6 +207,7 @@ impl Recording {
             map_nanos: self.map_nanos,
             keyframe_step_nanos: self.keyframe_step_nanos,
             keyframe_nanos: self.keyframe_nanos,
+            adjustments: self.adjustments,
             start: self.start,
             rejections: None,
             budget_samples: Vec::new(),

@@ -1,18 +1,20 @@
-//! The whole recipe in one process and one thread of control: every frame, in order.
+//! The whole recipe in one process: every frame, in order.
 //!
 //! Frame N: track, map, and if the keyframe changed prepare it and give it to the tracker, where it
-//! is in force from frame N+1 on. Lockstep runs do the same over shared memory and give the same
+//! is active from frame N+1 on. Keyframes are estimated jointly beside that, on a thread of its own, and the
+//! estimate enters a fixed number of frames later. Lockstep runs do the same over shared memory and give the same
 //! bits; times are measured here, around the calls.
 
 use std::time::Instant;
 
 use crate::capture::source::{FrameSource, FrameStamp, SourceError};
+use crate::service::adjustments::{Adjustments, Entry};
 use crate::service::alignment_stamps::AlignmentStamps;
 use crate::service::given_pose::{given_pose, truth_in_first_camera};
 use crate::service::refused_images::RefusedImages;
 use crate::service::rehearsal::Rehearsal;
 use crate::service::results::{RecordedPose, Rejection, RunMode, RunRecord};
-use crate::service::schedule::peak_rss_bytes;
+use crate::service::schedule::{Background, peak_rss_bytes};
 use crate::slam::alignment::reference::Reference;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::frame::FrameView;
@@ -98,6 +100,9 @@ pub enum ReplayError {
         /// Why it ended.
         cause: SourceError,
     },
+    /// No thread.
+    #[error("cannot start the thread that estimates keyframes jointly ({0})")]
+    Thread(std::io::Error),
     /// A parameter out of its range.
     #[error("configuration: {0}")]
     Parameter(#[from] ParameterError),
@@ -190,6 +195,7 @@ struct Replay<'a> {
     /// Memory of the reference that the tracker gave back.
     spare: Option<Box<Reference>>,
     record: RunRecord,
+    adjustments: Adjustments,
     stamps: Option<(FrameStamp, FrameStamp)>,
 }
 
@@ -208,13 +214,18 @@ impl<'a> Replay<'a> {
         if given && ground_truth.is_empty() {
             return Err(ReplayError::NoGroundTruth(source_name.to_owned()));
         }
+        let mut mapping = config.mapper.clone();
+        if given {
+            // Poses that are given are not estimated.
+            mapping.window.num_free = 0;
+        }
         Ok(Self {
             config,
             width: intrinsics.width,
             height: intrinsics.height,
             num_pixels: intrinsics.width * intrinsics.height,
             tracker: Tracker::new(intrinsics, config.tracker.clone())?,
-            mapper: Mapper::new(intrinsics, config.mapper.clone())?,
+            mapper: Mapper::new(intrinsics, mapping)?,
             given_poses: Vec::new(),
             rehearsal: Rehearsal::new(frames_to_come(source, config)),
             spare: None,
@@ -222,6 +233,11 @@ impl<'a> Replay<'a> {
                 is_depth_from_sensor: config.initial_depth == DepthOrigin::Sensor,
                 ..empty_record(source_name, ground_truth, given)
             },
+            adjustments: Adjustments::start(
+                Entry::AfterFrames(config.mapper.window.delay_frames as u64),
+                Background::Other,
+            )
+            .map_err(ReplayError::Thread)?,
             stamps: None,
         })
     }
@@ -261,6 +277,7 @@ impl<'a> Replay<'a> {
             let rejection = Rejection { sequence: frame.sequence, contradiction };
             self.record.rejections.get_or_insert_default().push(rejection);
         }
+        self.adjust(frame.sequence, &mut outcome);
         self.record.map_nanos.push(step_nanos);
         self.record.start.count(self.mapper.start_frame());
         if let Some(change_nanos) = change_nanos.filter(|_| outcome.keyframe_created) {
@@ -271,6 +288,14 @@ impl<'a> Replay<'a> {
             self.hand_on_keyframe();
         }
         Ok((pose.state, outcome))
+    }
+
+    /// Lets the joint estimate of keyframes in that is due with this frame, and hands over what is new.
+    fn adjust(&mut self, sequence: u64, outcome: &mut StepOutcome) {
+        let entered = self.adjustments.after_frame(&mut self.mapper, sequence);
+        outcome.keyframe_changed |= entered.keyframe_changed;
+        outcome.graph_changed |= entered.graph_changed;
+        self.record.adjustments.extend(self.adjustments.take_records());
     }
 
     /// The depth camera's image of a frame, where the first depth comes from it.
@@ -360,8 +385,10 @@ impl<'a> Replay<'a> {
         }
     }
 
-    fn finish(self, begin: Instant) -> Result<RunRecord, ReplayError> {
+    fn finish(mut self, begin: Instant) -> Result<RunRecord, ReplayError> {
+        self.adjustments.finish(&mut self.mapper);
         let mut record = self.record;
+        record.adjustments.extend(self.adjustments.take_records());
         let Some((first, last)) = self.stamps else {
             return Err(ReplayError::Empty(record.source));
         };
@@ -402,6 +429,7 @@ fn empty_record(source_name: &str, ground_truth: Vec<StampedPose>, poses_given: 
         map_nanos: Vec::new(),
         keyframe_step_nanos: Vec::new(),
         keyframe_nanos: Vec::new(),
+        adjustments: Vec::new(),
         start: Default::default(),
         rejections: Some(Vec::new()),
         budget_samples: Vec::new(),

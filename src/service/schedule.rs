@@ -25,6 +25,17 @@ pub enum Policy {
     Deadline,
 }
 
+/// How the kernel chooses when a thread runs that no frame waits for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Background {
+    /// Only when a CPU has nothing else to do (SCHED_IDLE): everything else takes the CPU from it at once.
+    #[default]
+    Idle,
+    /// As the other threads of its process.
+    Other,
+}
+
 /// What a process asks of the kernel for its frame loop.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -99,6 +110,14 @@ pub enum Refusal {
         /// What the kernel says.
         reason: String,
     },
+    /// No lower priority.
+    #[error(
+        "idle scheduling refused ({reason}): allow sched_setattr, or set mapper.background = \"other\""
+    )]
+    Background {
+        /// What the kernel says.
+        reason: String,
+    },
     /// Not these CPUs.
     #[error(
         "CPUs {cpus:?} refused ({reason}): name CPUs that exist and that the unit's CPUAffinity= allows"
@@ -139,6 +158,7 @@ pub struct InForce {
 /// Policy numbers of the kernel (linux/sched.h).
 const SCHED_OTHER: u32 = 0;
 const SCHED_FIFO: u32 = 1;
+const SCHED_IDLE: u32 = 5;
 const SCHED_DEADLINE: u32 = 6;
 /// Threads that are made later do not inherit the policy (linux/sched.h).
 const SCHED_FLAG_RESET_ON_FORK: u64 = 1;
@@ -183,6 +203,17 @@ pub fn apply(params: &SchedulingParams) -> Vec<Refusal> {
     }
     refusals.extend(apply_policy(params).err());
     refusals
+}
+
+/// Makes the calling thread one that no frame waits for. The kernel refuses this to nobody, a sandbox may.
+pub fn apply_background(background: Background) -> Result<(), Refusal> {
+    let policy = match background {
+        Background::Idle => SCHED_IDLE,
+        Background::Other => return Ok(()),
+    };
+    let size = size_of::<SchedAttr>() as u32;
+    set_attributes(&SchedAttr { size, policy, ..SchedAttr::default() })
+        .map_err(|error| Refusal::Background { reason: error.to_string() })
 }
 
 fn apply_policy(params: &SchedulingParams) -> Result<(), Refusal> {

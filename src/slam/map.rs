@@ -11,12 +11,18 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{DepthPoint, Keyframe};
+use crate::slam::window::confirmed::ConfirmedPoint;
+use crate::slam::window::frames::PlacedFrame;
 
 /// All keyframes of all epochs, with their depth. Each epoch has a scale and a drift of its own.
 #[derive(Debug, Clone, Default)]
 pub struct Map {
     /// Keyframes in order of creation.
     pub keyframes: Vec<Keyframe>,
+    /// Frames that were aligned again after they were tracked, in the order of their sequence.
+    pub frames: Vec<FramePlace>,
+    /// Of a map that is complete: points of the joint estimation.
+    pub confirmed: Vec<ConfirmedPoint>,
     /// How often the map was corrected.
     pub revision: u64,
     /// Of a checkpoint: the keyframe that was active.
@@ -24,6 +30,17 @@ pub struct Map {
     /// Numbers of epochs from here on are given by nobody yet; see
     /// [`Mapper::checkpoint`](crate::slam::mapper::Mapper::checkpoint).
     pub free_epoch: u32,
+}
+
+/// Where a frame is relative to its keyframe.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FramePlace {
+    /// Its sequence.
+    pub sequence: u64,
+    /// The keyframe.
+    pub keyframe_id: u64,
+    /// In the keyframe's unit.
+    pub keyframe_from_camera: SE3,
 }
 
 /// What is known better of the map than before: new places, depth and epochs, all at once.
@@ -144,6 +161,25 @@ impl Map {
     /// `map_from_camera` of a frame that is known relative to a keyframe.
     pub fn place(&self, keyframe_id: u64, keyframe_from_camera: &SE3) -> Option<SE3> {
         Some(self.get(keyframe_id)?.map_from_keyframe.place(keyframe_from_camera))
+    }
+
+    /// Keeps where a frame is that was aligned again.
+    pub fn place_frame(&mut self, placed: &PlacedFrame) {
+        let Some(keyframe) = self.get(placed.keyframe_id) else { return };
+        let mut keyframe_from_camera = placed.keyframe_from_camera;
+        keyframe_from_camera.translation /= keyframe.map_from_keyframe.scale;
+        let PlacedFrame { sequence, keyframe_id, .. } = *placed;
+        let frame = FramePlace { sequence, keyframe_id, keyframe_from_camera };
+        match self.frames.binary_search_by_key(&sequence, |known| known.sequence) {
+            Ok(known) => self.frames[known] = frame,
+            Err(place) => self.frames.insert(place, frame),
+        }
+    }
+
+    /// Where a frame is, if it was aligned again.
+    pub fn frame(&self, sequence: u64) -> Option<&FramePlace> {
+        let place = self.frames.binary_search_by_key(&sequence, |known| known.sequence).ok()?;
+        self.frames.get(place)
     }
 
     /// Keyframes of `epoch` with image and depth that a camera sees points of, by their places in the list, with

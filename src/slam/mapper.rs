@@ -4,6 +4,7 @@ mod change;
 pub mod consistency;
 mod correction;
 mod depth_buffers;
+mod joint;
 pub mod modes;
 pub mod observation;
 mod past;
@@ -45,6 +46,9 @@ use crate::slam::mapper::start::Start;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::{NO_KEYFRAME, PoseEstimate, TrackingState};
 use crate::slam::two_frame::TwoFrameParams;
+use crate::slam::window::Window;
+use crate::slam::window::frames::TrackedFrame;
+use crate::slam::window::params::WindowParams;
 
 /// Tuning of the mapper.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -97,6 +101,8 @@ pub struct MapperParams {
     pub reuse: ReuseParams,
     /// What is done when the camera is lost.
     pub recovery: RecoveryParams,
+    /// The joint estimation of keyframes.
+    pub window: WindowParams,
 }
 
 impl Default for MapperParams {
@@ -122,6 +128,7 @@ impl Default for MapperParams {
             consistency: ConsistencyParams::default(),
             reuse: ReuseParams::default(),
             recovery: RecoveryParams::default(),
+            window: WindowParams::default(),
         }
     }
 }
@@ -155,7 +162,8 @@ impl MapperParams {
         self.two_frame.validate().map_err(|e| e.within("two_frame"))?;
         self.consistency.validate().map_err(|e| e.within("consistency"))?;
         self.reuse.validate().map_err(|e| e.within("reuse"))?;
-        self.recovery.validate().map_err(|e| e.within("recovery"))
+        self.recovery.validate().map_err(|e| e.within("recovery"))?;
+        self.window.validate().map_err(|e| e.within("window"))
     }
 }
 
@@ -206,6 +214,12 @@ pub struct Mapper {
     start: Start,
     finder: Finder,
     past: PastFrames,
+    /// Keyframes that are estimated together; away while that is done.
+    window: Option<Box<Window>>,
+    /// Frames that were tracked since it was given away.
+    tracked: Vec<TrackedFrame>,
+    /// Memory for more of them.
+    spare_pixels: Vec<Vec<u8>>,
     /// The keyframe that was active before, until somebody asks for it.
     left: Option<u64>,
     /// Memory for the frame at hand.
@@ -238,6 +252,10 @@ impl Mapper {
             finder: Finder::new(&intrinsics),
             // The active keyframe is one more.
             past: PastFrames::with_capacity(params.max_past_frames + 1),
+            window: (params.window.num_free > 0)
+                .then(|| Box::new(Window::new(intrinsics, params.window.clone()))),
+            tracked: Vec::new(),
+            spare_pixels: Vec::new(),
             left: None,
             frame: QuadImage::with_size(width, height),
             unfinished: None,
@@ -310,6 +328,7 @@ impl Mapper {
         change_begins: &mut dyn FnMut(),
     ) -> StepOutcome {
         self.last_world_from_camera = Some(pose.world_from_camera);
+        self.keep_frame(frame, pose);
         self.guess_unit(&pose.keyframe_from_camera);
         let (unit, modes) = (self.depth.unit, &self.params.modes);
         self.modes.consider(&self.depth.active, unit, &self.intrinsics, pose, modes);

@@ -20,3 +20,4 @@ pub mod test_scene;
 pub mod tracker;
 pub mod trajectory;
 pub mod two_frame;
+pub mod window;

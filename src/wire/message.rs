@@ -241,10 +241,42 @@ pub struct KeyframePoseMessage {
     pub map_from_keyframe: SimilarityMessage,
 }
 
+/// Message of `mapper/adjustment`: a joint estimate of keyframes is over.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
+#[type_name("semidense.Adjustment.v1")]
+pub struct AdjustmentMessage {
+    /// Sequence of the last frame before it entered the map.
+    pub sequence: u64,
+    /// Frames from its beginning until then.
+    pub frames: u64,
+    /// CPU time that it took, nanoseconds.
+    pub cpu_nanos: u64,
+    /// Newest keyframe that took part.
+    pub keyframe_id: u64,
+    /// Share of the comparisons of a point with a keyframe that count.
+    pub inlier_ratio: f64,
+    /// Root mean square of the residuals that count, grey levels.
+    pub rms_grey: f64,
+    /// What became of it: 0 it entered the map, 1 it entered a map with newer keyframes, which followed, 2 it was
+    /// dropped because the map had changed.
+    pub fate: u32,
+    /// Keyframes whose poses were free.
+    pub free: u32,
+    /// Keyframes that held them in place.
+    pub fixed: u32,
+    /// Points.
+    pub points: u32,
+    /// Comparisons of a point with a keyframe.
+    pub comparisons: u32,
+    /// Steps tried.
+    pub iterations: u32,
+}
+
 /// Message of `<process>/health`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
-#[type_name("semidense.Health.v4")]
+#[type_name("semidense.Health.v5")]
 pub struct HealthMessage {
     /// CLOCK_MONOTONIC when it was published.
     pub published_nanos: i64,
@@ -291,6 +323,14 @@ pub struct HealthMessage {
     pub work_counts: [u64; HISTOGRAM_BUCKETS],
     /// The same of the time from the sending of a frame to the look at it.
     pub wake_counts: [u64; HISTOGRAM_BUCKETS],
+    /// Mapper: joint estimates of keyframes that entered the map.
+    pub adjustments: u64,
+    /// Mapper: of them those that entered a map with newer keyframes, which followed.
+    pub adjustments_merged: u64,
+    /// Mapper: joint estimates that were dropped because the map had changed.
+    pub adjustments_dropped: u64,
+    /// Mapper: the same as `latency_counts` of the CPU time of joint estimates.
+    pub adjustment_counts: [u64; HISTOGRAM_BUCKETS],
     /// Scheduling in force: 0 other, 1 FIFO, 2 deadline, 3 unknown.
     pub scheduling: u32,
     /// Priority of FIFO scheduling, else 0.
@@ -361,7 +401,8 @@ mod tests {
         assert_layout::<StepMessage>(136, 8, "semidense.Step.v4");
         assert_layout::<GraphHeader>(24, 8, "semidense.GraphHeader.v2");
         assert_layout::<KeyframePoseMessage>(80, 8, "semidense.KeyframePose.v2");
-        assert_layout::<HealthMessage>(1888, 8, "semidense.Health.v4");
+        assert_layout::<AdjustmentMessage>(72, 8, "semidense.Adjustment.v1");
+        assert_layout::<HealthMessage>(2296, 8, "semidense.Health.v5");
         assert_layout::<CommandRequest>(4112, 8, "semidense.CommandRequest.v2");
         assert_layout::<CommandResponse>(200, 4, "semidense.CommandResponse.v1");
     }

@@ -416,16 +416,16 @@ impl Wake {
     }
 }
 
-/// Waits until one of `events` wakes, `interrupt` is readable, or `timeout` is over. It may also
+/// Waits until one of `events` wakes, one of `interrupts` is readable, or `timeout` is over. It may also
 /// return early: the caller looks at its ports and its clock.
-pub fn wait(
-    events: &[&Events],
-    interrupt: Option<BorrowedFd<'_>>,
+pub fn wait<'a>(
+    events: &[&'a Events],
+    interrupts: impl IntoIterator<Item = BorrowedFd<'a>>,
     timeout: Duration,
 ) -> Result<(), WaitError> {
     let timeout =
         Timespec { tv_sec: timeout.as_secs() as i64, tv_nsec: timeout.subsec_nanos().into() };
-    let mut descriptors = events.iter().map(|e| e.descriptor()).chain(interrupt);
+    let mut descriptors = events.iter().map(|e| e.descriptor()).chain(interrupts);
     let polled = match descriptors.next() {
         None => rustix::event::poll(&mut [], Some(&timeout)),
         // An array: a frame loop that waits must not allocate.

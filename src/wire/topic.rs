@@ -3,12 +3,12 @@
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{DepthPoint, MAX_KEYFRAME_POINTS};
 use crate::wire::message::{
-    FrameHeader, GraphHeader, HealthMessage, KeyframeHeader, KeyframeImageHeader,
-    KeyframePoseMessage, PoseMessage, StepMessage,
+    AdjustmentMessage, FrameHeader, GraphHeader, HealthMessage, KeyframeHeader,
+    KeyframeImageHeader, KeyframePoseMessage, PoseMessage, StepMessage,
 };
 
 /// Version in every topic's name; counts up when a message changes.
-pub const WIRE_VERSION: u32 = 7;
+pub const WIRE_VERSION: u32 = 8;
 
 /// Most keyframes in one message of `mapper/graph`; the newest are sent when there are more.
 pub const MAX_GRAPH_KEYFRAMES: usize = 4096;
@@ -80,6 +80,8 @@ pub const EARLIER_KEYFRAME_IMAGE: Topic =
     Topic { noun: "earlier_keyframe_image", ..EARLIER_KEYFRAME };
 /// Frames that are in the map.
 pub const STEP: Topic = Topic { owner: "mapper", noun: "step", ..POSE };
+/// Joint estimates of keyframes: some a second.
+pub const ADJUSTMENT: Topic = Topic { owner: "mapper", noun: "adjustment", buffer: 64, ..POSE };
 /// Poses of all keyframes.
 pub const GRAPH: Topic = Topic { noun: "graph", ..KEYFRAME };
 /// Health of capture.
@@ -138,6 +140,7 @@ pub fn table(intrinsics: &Intrinsics) -> Vec<(Topic, usize)> {
         (EARLIER_KEYFRAME, size_of::<KeyframeHeader>() + points),
         (EARLIER_KEYFRAME_IMAGE, size_of::<KeyframeImageHeader>() + image),
         (STEP, size_of::<StepMessage>()),
+        (ADJUSTMENT, size_of::<AdjustmentMessage>()),
         (GRAPH, size_of::<GraphHeader>() + graph),
         (CAPTURE_HEALTH, size_of::<HealthMessage>()),
         (TRACKER_HEALTH, size_of::<HealthMessage>()),
@@ -175,7 +178,7 @@ mod tests {
         assert!(names.contains(&format!("rig1/v{WIRE_VERSION}/capture/frame")));
         names.sort();
         names.dedup();
-        assert_eq!(names.len(), 11);
+        assert_eq!(names.len(), 12);
     }
 
     #[test]

@@ -16,10 +16,10 @@ use crate::service::recording::RunCounters;
 use crate::service::results::RunMode;
 use crate::slam::keyframe::{Keyframe, KeyframePose};
 use crate::wire::conversion::{similarity_from_message, similarity_message};
-use crate::wire::message::PoseMessage;
+use crate::wire::message::{AdjustmentMessage, PoseMessage};
 
 /// First bytes of the file, with the version of the layout.
-const MAGIC: [u8; 16] = *b"semidense log 4\n";
+const MAGIC: [u8; 16] = *b"semidense log 5\n";
 /// Bytes before kind and payload.
 const PREFIX_BYTES: usize = 8;
 /// Largest record: the configuration is a tenth of it.
@@ -79,6 +79,8 @@ pub enum Record {
     Pose(Box<PoseMessage>),
     /// A step of the mapper.
     Step(Step),
+    /// A joint estimate of keyframes is over.
+    Adjustment(AdjustmentMessage),
     /// What was counted until now.
     Counters(Box<RunCounters>),
     /// A keyframe without image and points.
@@ -94,6 +96,7 @@ impl Record {
     const COUNTERS: u8 = 4;
     const KEYFRAME: u8 = 5;
     const KEYFRAME_POSE: u8 = 6;
+    const ADJUSTMENT: u8 = 7;
 
     /// Appends the record's bytes to `log`.
     pub fn write(&self, log: &mut Vec<u8>) {
@@ -121,6 +124,12 @@ impl Record {
                 log.push(Self::STEP);
                 write_u64s(log, &[step.step_nanos, step.change_nanos]);
                 write_u32s(log, &[step.start_frame]);
+            }
+            Self::Adjustment(a) => {
+                log.push(Self::ADJUSTMENT);
+                write_u64s(log, &[a.sequence, a.frames, a.cpu_nanos, a.keyframe_id]);
+                write_f64s(log, &[a.inlier_ratio, a.rms_grey]);
+                write_u32s(log, &[a.fate, a.free, a.fixed, a.points, a.comparisons, a.iterations]);
             }
             Self::Counters(counters) => {
                 log.push(Self::COUNTERS);
@@ -155,6 +164,7 @@ impl Record {
                 let [start_frame] = read_u32s(&mut bytes)?;
                 Self::Step(Step { step_nanos, change_nanos, start_frame })
             }
+            Self::ADJUSTMENT => Self::Adjustment(read_adjustment(&mut bytes)?),
             Self::KEYFRAME_POSE => {
                 let [epoch, keyframe_id, revision] = read_u64s(&mut bytes)?;
                 let pose = similarity_from_message(&read_f64s(&mut bytes)?, "pose").ok()?;
@@ -253,6 +263,26 @@ fn read_numbers<T: Copy + Default, const N: usize, const SIZE: usize>(
         (*number, *bytes) = (from(*first), rest);
     }
     Some(numbers)
+}
+
+fn read_adjustment(bytes: &mut &[u8]) -> Option<AdjustmentMessage> {
+    let [sequence, frames, cpu_nanos, keyframe_id] = read_u64s(bytes)?;
+    let [inlier_ratio, rms_grey] = read_f64s(bytes)?;
+    let [fate, free, fixed, points, comparisons, iterations] = read_u32s(bytes)?;
+    Some(AdjustmentMessage {
+        sequence,
+        frames,
+        cpu_nanos,
+        keyframe_id,
+        inlier_ratio,
+        rms_grey,
+        fate,
+        free,
+        fixed,
+        points,
+        comparisons,
+        iterations,
+    })
 }
 
 fn write_pose(p: &PoseMessage, bytes: &mut Vec<u8>) {
@@ -367,6 +397,20 @@ mod tests {
             Record::Start(Box::new(start)),
             Record::Pose(Box::new(pose)),
             Record::Step(Step { step_nanos: 5, change_nanos: 6, start_frame: 2 }),
+            Record::Adjustment(AdjustmentMessage {
+                sequence: 1,
+                frames: 2,
+                cpu_nanos: 3,
+                keyframe_id: 4,
+                inlier_ratio: 0.5,
+                rms_grey: 6.0,
+                fate: 1,
+                free: 8,
+                fixed: 9,
+                points: 10,
+                comparisons: 11,
+                iterations: 12,
+            }),
             Record::Counters(Box::new(RunCounters {
                 frames_in: 8,
                 gaps: 9,

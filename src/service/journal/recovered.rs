@@ -6,6 +6,7 @@ use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
+use crate::service::adjustments::message::adjustment_from_message;
 use crate::service::journal::folder::{LOG, keyframe_file};
 use crate::service::journal::log::{Record, RunStart, read_log};
 use crate::service::map_file::read_map;
@@ -84,6 +85,11 @@ impl Recovered {
             Record::Pose(pose) => drop(self.recording.take_pose(&pose)),
             Record::Step(step) => {
                 self.recording.take_step(step.step_nanos, step.change_nanos, step.start_frame)
+            }
+            Record::Adjustment(message) => {
+                if let Ok(record) = adjustment_from_message(&message) {
+                    self.recording.take_adjustment(record);
+                }
             }
             Record::Counters(counters) => self.counters = *counters,
             Record::Keyframe(keyframe) => {

@@ -4,12 +4,13 @@ use std::collections::HashMap;
 use std::io;
 use std::time::{Duration, Instant};
 
+use crate::service::adjustments::message::adjustment_message;
 use crate::service::journal::log::{Record, Step};
 use crate::service::journal::{Journal, JournalOptions};
 use crate::service::recording::RunCounters;
 use crate::service::replay::ReplayProgress;
 use crate::service::results::RunRecord;
-use crate::slam::keyframe::Keyframe;
+use crate::slam::keyframe::{Keyframe, KeyframePose};
 use crate::wire::conversion::{PoseTiming, code_from_start_frame, pose_message};
 use crate::wire::place::Place;
 
@@ -21,9 +22,10 @@ const PERIOD: Duration = Duration::from_secs(2);
 pub struct ReplayJournal {
     journal: Journal,
     begin: Instant,
-    /// Poses and steps that the journal has.
+    /// Poses, steps and joint estimates that the journal has.
     poses: usize,
     steps: usize,
+    adjustments: usize,
     /// Revisions that the journal has, by epoch and keyframe.
     revisions: HashMap<(u32, u64), u64>,
     active: Option<(u32, u64)>,
@@ -38,6 +40,7 @@ impl ReplayJournal {
             begin: Instant::now(),
             poses: 0,
             steps: 0,
+            adjustments: 0,
             revisions: HashMap::new(),
             active: None,
             looked: Instant::now(),
@@ -79,17 +82,29 @@ impl ReplayJournal {
             let (step_nanos, change_nanos) = (*step, 0);
             self.journal.append(&Record::Step(Step { step_nanos, change_nanos, start_frame }));
         }
+        for adjustment in &record.adjustments[self.adjustments..] {
+            self.journal.append(&Record::Adjustment(adjustment_message(adjustment)));
+        }
         (self.poses, self.steps) = (record.poses.len(), record.map_nanos.len());
+        self.adjustments = record.adjustments.len();
     }
 
-    /// Gives the journal every keyframe of which it has an older state.
+    /// Gives the journal every keyframe of which it has an older state. Of older keyframes, of which a correction
+    /// moves many, the places alone: their depth hardly changes any more, and takes 2 MB each.
     fn take_keyframes(&mut self, keyframes: &[Keyframe]) {
-        for keyframe in keyframes.iter().filter(|keyframe| !keyframe.points.is_empty()) {
+        const WITH_DEPTH: usize = 3;
+        let older = keyframes.len().saturating_sub(WITH_DEPTH);
+        let held = keyframes.iter().enumerate().filter(|(_, keyframe)| keyframe.has_depth());
+        for (index, keyframe) in held {
             let key = (keyframe.epoch, keyframe.keyframe_id);
-            if self.revisions.get(&key) == Some(&keyframe.revision) {
+            let known = self.revisions.get(&key);
+            if known == Some(&keyframe.revision) {
                 continue;
             }
-            if self.journal.put_keyframe(keyframe.clone()).is_some() {
+            if known.is_some() && index < older {
+                let pose = KeyframePose::of(keyframe);
+                self.journal.append(&Record::KeyframePose(keyframe.epoch, pose));
+            } else if self.journal.put_keyframe(keyframe.clone()).is_some() {
                 return;
             }
             self.revisions.insert(key, keyframe.revision);

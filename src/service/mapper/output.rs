@@ -1,5 +1,7 @@
 //! What the mapper publishes: the active keyframe, the graph, steps, and earlier keyframes on request.
 
+use crate::service::adjustments::AdjustmentRecord;
+use crate::service::adjustments::message::adjustment_message;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{DepthPoint, Keyframe, KeyframePose, MAX_KEYFRAME_POINTS};
 use crate::slam::map::Map;
@@ -10,17 +12,19 @@ use crate::wire::conversion::{
     rigid_message,
 };
 use crate::wire::message::{
-    GraphHeader, KeyframeHeader, KeyframeImageHeader, KeyframePoseMessage, StepMessage,
+    AdjustmentMessage, GraphHeader, KeyframeHeader, KeyframeImageHeader, KeyframePoseMessage,
+    StepMessage,
 };
 use crate::wire::port::{Hub, OpenError, Publisher, SendError};
 use crate::wire::topic::{
-    EARLIER_KEYFRAME, EARLIER_KEYFRAME_IMAGE, GRAPH, KEYFRAME, KEYFRAME_IMAGE, MAX_GRAPH_KEYFRAMES,
-    STEP,
+    ADJUSTMENT, EARLIER_KEYFRAME, EARLIER_KEYFRAME_IMAGE, GRAPH, KEYFRAME, KEYFRAME_IMAGE,
+    MAX_GRAPH_KEYFRAMES, STEP,
 };
 
 /// Everything that the mapper publishes.
 pub(super) struct Output {
     steps: Publisher<StepMessage, ()>,
+    adjustments: Publisher<AdjustmentMessage, ()>,
     depths: Publisher<DepthPoint, KeyframeHeader>,
     graphs: Publisher<KeyframePoseMessage, GraphHeader>,
     earlier_depths: Publisher<DepthPoint, KeyframeHeader>,
@@ -32,6 +36,7 @@ impl Output {
     pub(super) fn open(hub: &Hub) -> Result<Self, OpenError> {
         Ok(Self {
             steps: hub.publisher(&STEP, 1)?,
+            adjustments: hub.publisher(&ADJUSTMENT, 1)?,
             depths: hub.publisher(&KEYFRAME, MAX_KEYFRAME_POINTS)?,
             graphs: hub.publisher(&GRAPH, MAX_GRAPH_KEYFRAMES)?,
             earlier_depths: hub.publisher(&EARLIER_KEYFRAME, MAX_KEYFRAME_POINTS)?,
@@ -52,6 +57,7 @@ impl Output {
 
     pub(super) fn serve_late_joiners(&self) {
         self.steps.serve_late_joiners();
+        self.adjustments.serve_late_joiners();
         self.depths.serve_late_joiners();
         self.graphs.serve_late_joiners();
         self.earlier_depths.serve_late_joiners();
@@ -91,6 +97,10 @@ impl Output {
             .send(keyframe_image_header(keyframe), &keyframe.image)
             .and_then(|()| self.earlier_depths.send(keyframe_header(keyframe), &keyframe.points));
         sent.map_err(|error| error.to_string())
+    }
+
+    pub(super) fn publish_adjustment(&self, record: &AdjustmentRecord) -> Result<(), SendError> {
+        self.adjustments.send((), &[adjustment_message(record)])
     }
 
     /// After everything else of the frame: who sees the step has all.

@@ -9,6 +9,8 @@ pub mod calibration;
 pub mod colour;
 pub mod debug_pictures;
 pub mod depth_maps;
+pub mod joint;
+pub mod joint_points;
 pub mod lettering;
 pub mod output_folder;
 pub mod output_lock;
@@ -31,6 +33,7 @@ use std::time::SystemTime;
 use serde::{Deserialize, Serialize};
 
 use crate::capture::source::{FrameSource, SourceError};
+use crate::service::adjustments::AdjustmentRecord;
 use crate::service::alignment_stamps::AlignmentTrace;
 use crate::service::atomic_file::write_atomically;
 use crate::service::recording::TimeCounts;
@@ -163,6 +166,8 @@ pub struct RunRecord {
     /// Of each of those, the time from the observed frame to a keyframe that others can have: carrying,
     /// smoothing, live also publishing.
     pub keyframe_nanos: Vec<u64>,
+    /// Joint estimates of keyframes, in the order of their entry.
+    pub adjustments: Vec<AdjustmentRecord>,
     /// What frames came to while there was no map.
     pub start: StartTally,
     /// Frames at which the map was found to contradict itself, and how; known in a replay.
@@ -302,7 +307,7 @@ impl<'a> Results<'a> {
         })
     }
 
-    /// Writes `trajectory.txt`, `trajectory_online.txt`, `keyframes.txt`, `map.ply`, `map.pcd`,
+    /// Writes `trajectory.txt`, `trajectory_online.txt`, `keyframes.txt`, `map.ply`, `map.pcd`, `points.ply`,
     /// `summary.json` and `report.html` into `dir`, which [`output_folder::prepare_output`] has made: all of
     /// them, in the place of an earlier run's, or none. `write_more` writes what belongs to the set
     /// besides, into the folder that it is given.
@@ -337,6 +342,7 @@ impl<'a> Results<'a> {
         })?;
         write("keyframes.txt", &|path| poses::write_keyframes(path, &record.map))?;
         write("map.ply", &|path| ply::write_ply(path, &self.cloud))?;
+        write("points.ply", &|path| joint_points::write_points(path, &record.map))?;
         write("map.pcd", &|path| pcd::write_pcd(path, &self.cloud))?;
         write("summary.json", &|path| {
             write_atomically(path, |file| {
@@ -373,7 +379,8 @@ fn needed_bytes(record: &RunRecord, points: usize, page: usize) -> u64 {
     /// Largest `summary.json`.
     const SUMMARY_BYTES: usize = 50_000;
     let lines = 2 * POSE_BYTES * record.poses.len() + KEYFRAME_BYTES * record.map.keyframes.len();
-    (2 * POINT_BYTES * points + lines + page + SUMMARY_BYTES) as u64
+    let points = 2 * points + record.map.confirmed.len();
+    (POINT_BYTES * points + lines + page + SUMMARY_BYTES) as u64
 }
 
 /// What to say where a file cannot be written: how much is lacking, where it is room.

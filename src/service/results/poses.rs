@@ -36,9 +36,17 @@ pub fn longest_epoch(record: &RunRecord) -> Option<u32> {
 pub fn final_trajectory(record: &RunRecord, epoch: Option<u32>) -> Vec<StampedPose> {
     let keyframes = record.map.keyframes.iter();
     let places: HashMap<u64, _> = keyframes.map(|k| (k.keyframe_id, k.map_from_keyframe)).collect();
-    tracked(record, epoch, |estimate| match places.get(&estimate.keyframe_id) {
-        Some(map_from_keyframe) => map_from_keyframe.place(&estimate.keyframe_from_camera),
-        None => estimate.map_from_camera,
+    tracked(record, epoch, |estimate| {
+        let relative = record
+            .map
+            .frame(estimate.sequence)
+            .map_or((estimate.keyframe_id, &estimate.keyframe_from_camera), |aligned| {
+                (aligned.keyframe_id, &aligned.keyframe_from_camera)
+            });
+        match places.get(&relative.0) {
+            Some(map_from_keyframe) => map_from_keyframe.place(relative.1),
+            None => estimate.map_from_camera,
+        }
     })
 }
 

@@ -13,12 +13,13 @@ use std::time::SystemTime;
 use rustix::fs::FlockOperation;
 
 /// Files of every set, with what each begins with: a file of that name that begins otherwise is the user's.
-const FILES: [(&str, &str); 7] = [
+const FILES: [(&str, &str); 8] = [
     ("summary.json", "{\n  \"mode\": \""),
     ("trajectory.txt", "# world_from_camera of every tracked frame"),
     ("trajectory_online.txt", "# world_from_camera of every tracked frame"),
     ("keyframes.txt", "# world_from_keyframe; lengths in the keyframe"),
     ("map.ply", "ply\nformat binary_little_endian 1.0\ncomment x y z in map units"),
+    ("points.ply", "ply\nformat binary_little_endian 1.0\ncomment points of the joint estimation"),
     ("map.pcd", "# .PCD v0.7 - x y z in map units"),
     ("report.html", "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">"),
 ];

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::service::results::alignment_levels::{LevelSummary, alignment_levels};
 use crate::service::results::budget_curve::BudgetCurve;
 use crate::service::results::calibration::whitened_residual_median;
+use crate::service::results::joint::JointSummary;
 use crate::service::results::output_folder::utc_text;
 use crate::service::results::poses::longest_epoch;
 use crate::service::results::times::{LatencySummary, Percentiles, track_nanos};
@@ -249,6 +250,9 @@ pub struct Summary {
     /// Of those, from the observed frame to a keyframe that others can have: carrying, smoothing, live
     /// also publishing. What follows, depth for new pixels, is published as its next revision.
     pub keyframe_ms: Option<Percentiles>,
+    /// Joint estimates of keyframes.
+    #[serde(flatten)]
+    pub joint: JointSummary,
     /// Quality of a pose as a function of the iterations it is given; of replays.
     pub budget_curve: Option<BudgetCurve>,
     /// First to last stamp.
@@ -344,6 +348,7 @@ impl Summary {
             map_ms: Percentiles::of(record.map_nanos.iter().copied()),
             keyframe_step_ms: Percentiles::of(record.keyframe_step_nanos.iter().copied()),
             keyframe_ms: Percentiles::of(record.keyframe_nanos.iter().copied()),
+            joint: JointSummary::of(&record.adjustments),
             budget_curve: BudgetCurve::of(&record.budget_samples),
             recorded_secs,
             wall_secs,

@@ -2,6 +2,7 @@
 
 use std::fmt::Write;
 
+use crate::service::results::joint::JointSummary;
 use crate::service::results::summary::{DepthSummary, Summary, TrajectorySummary};
 use crate::service::results::times::Percentiles;
 use crate::slam::evaluation::grade::Grade;
@@ -61,6 +62,9 @@ pub fn summary_text(summary: &Summary) -> String {
         if let Some(percentiles) = percentiles {
             line(name, times_text(&percentiles));
         }
+    }
+    if let Some(text) = joint_text(&summary.joint) {
+        line("joint", text);
     }
     if let (Some(deadline_ms), Some(misses)) = (summary.deadline_ms, summary.deadline_misses) {
         line(
@@ -136,6 +140,15 @@ fn trajectory_errors(trajectory: &TrajectorySummary) -> Option<String> {
         let _ = write!(text, ", scale drift x{ratio:.2}");
     }
     Some(text)
+}
+
+/// What the joint estimation of keyframes did; nothing where it had nothing to do.
+fn joint_text(joint: &JointSummary) -> Option<String> {
+    let times = times_text(joint.adjustment_ms.as_ref()?);
+    let JointSummary { adjustments, adjustments_merged, adjustments_dropped, .. } = *joint;
+    Some(format!(
+        "{adjustments} estimates of keyframes ({adjustments_merged} merged), {adjustments_dropped} dropped; {times}"
+    ))
 }
 
 fn times_text(p: &Percentiles) -> String {

@@ -1,11 +1,13 @@
 //! Bilinear samples of a [`QuadImage`] in vector registers.
 
-use crate::slam::image::quads::QuadImage;
+use crate::slam::image::quads::{Corners, QuadImage};
 
 /// A way to take eight bilinear samples; all ways give the same bits.
 pub trait Sampler: Copy {
     /// What [`QuadImage::sample`] explains.
     fn sample(self, image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> [f32; 8];
+    /// What [`QuadImage::corners`] explains.
+    fn corners(self, image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> Corners;
 }
 
 /// An image and the way to sample it.
@@ -25,6 +27,11 @@ impl Sampler for PortableSampler {
     #[inline(always)]
     fn sample(self, image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> [f32; 8] {
         image.sample(u, v)
+    }
+
+    #[inline(always)]
+    fn corners(self, image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> Corners {
+        image.corners(u, v)
     }
 }
 
@@ -49,6 +56,12 @@ impl Sampler for Avx2Sampler {
     fn sample(self, image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> [f32; 8] {
         // SAFETY: who made the sampler vouched for AVX2.
         unsafe { sample_avx2(image, u, v) }
+    }
+
+    #[inline(always)]
+    fn corners(self, image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> Corners {
+        // SAFETY: who made the sampler vouched for AVX2.
+        unsafe { corners_avx2(image, u, v) }
     }
 }
 
@@ -87,6 +100,39 @@ unsafe fn sample_avx2(image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> [f32; 8]
     }
 }
 
+/// # Safety
+/// As of [`sample_avx2`].
+#[cfg(target_arch = "x86_64")]
+#[inline(always)]
+unsafe fn corners_avx2(image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> Corners {
+    use std::arch::x86_64::*;
+
+    let quads = image.quads();
+    let mut corners = Corners::default();
+    // SAFETY: as in `sample_avx2`.
+    unsafe {
+        let (u, v) = (_mm256_loadu_ps(u.as_ptr()), _mm256_loadu_ps(v.as_ptr()));
+        let (column, row) = (_mm256_cvttps_epi32(u), _mm256_cvttps_epi32(v));
+        let fu = _mm256_sub_ps(u, _mm256_cvtepi32_ps(column));
+        let fv = _mm256_sub_ps(v, _mm256_cvtepi32_ps(row));
+        let width = _mm256_set1_epi32(image.width() as i32);
+        let index = _mm256_add_epi32(_mm256_mullo_epi32(row, width), column);
+        let last = _mm256_set1_epi32((quads.len() - 1) as i32);
+        let index = _mm256_min_epu32(index, last);
+        let quad = _mm256_i32gather_epi32::<4>(quads.as_ptr().cast(), index);
+        let byte = _mm256_set1_epi32(255);
+        let store = |to: &mut [f32; 8], of: __m256| _mm256_storeu_ps(to.as_mut_ptr(), of);
+        let grey = |bytes: __m256i| _mm256_cvtepi32_ps(_mm256_and_si256(bytes, byte));
+        store(&mut corners.upper_left, grey(quad));
+        store(&mut corners.upper_right, grey(_mm256_srli_epi32::<8>(quad)));
+        store(&mut corners.lower_left, grey(_mm256_srli_epi32::<16>(quad)));
+        store(&mut corners.lower_right, grey(_mm256_srli_epi32::<24>(quad)));
+        store(&mut corners.du, fu);
+        store(&mut corners.dv, fv);
+    }
+    corners
+}
+
 #[cfg(all(test, target_arch = "x86_64"))]
 mod tests {
     use super::*;
@@ -108,6 +154,7 @@ mod tests {
             let v: [f32; 8] = std::array::from_fn(|k| place(5 * i + 3 * k, height));
             let bits = |samples: [f32; 8]| samples.map(f32::to_bits);
             assert_eq!(bits(sampler.sample(&image, &u, &v)), bits(image.sample(&u, &v)));
+            assert_eq!(sampler.corners(&image, &u, &v), image.corners(&u, &v));
         }
         let wild = [f32::NAN, f32::INFINITY, -5.0, 1e9, -1e9, 0.0, 36.0, 200.0];
         let _harmless = sampler.sample(&image, &wild, &[22.5; 8]);

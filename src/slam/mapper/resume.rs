@@ -37,6 +37,8 @@ impl Mapper {
         let active = Some(in_force.keyframe_id);
         Some(Map {
             keyframes: keyframes.collect(),
+            frames: Vec::new(),
+            confirmed: Vec::new(),
             revision: self.map.revision,
             active,
             free_epoch,

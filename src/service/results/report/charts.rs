@@ -23,13 +23,13 @@ const ONLINE: &str = "#e59a1a";
 /// … of errors,
 pub const ERROR: &str = "#d6455d";
 /// … of the mapper.
-const MAPPING: &str = "#1f9d78";
+pub const MAPPING: &str = "#1f9d78";
 
 /// Bars of a histogram.
 const BARS: usize = 40;
 
 /// Seconds from the first frame.
-fn secs(record: &RunRecord, nanos: i64) -> f64 {
+pub fn secs(record: &RunRecord, nanos: i64) -> f64 {
     let first = record.poses.first().map_or(0, |pose| pose.estimate.capture_nanos);
     nanos.saturating_sub(first) as f64 * 1e-9
 }

@@ -1,0 +1,275 @@
+//! Keyframes are estimated jointly on a thread of its own, while frames go on: what is handed over, when it comes back
+//! into the map, and what is counted.
+//!
+//! One estimate is away at a time. A keyframe that is added meanwhile waits for the next, which takes in all new ones.
+
+pub mod message;
+mod thread;
+
+use std::io;
+use std::os::fd::BorrowedFd;
+use std::time::{Duration, Instant};
+
+use crate::service::adjustments::thread::{AdjustmentThread, Finished, Missing, Optimise};
+use crate::service::schedule::Background;
+use crate::slam::keyframe::MapState;
+use crate::slam::mapper::{Mapper, StepOutcome};
+use crate::slam::window::{Adjustment, Window};
+
+/// Live: longest wait for estimates after the last frame, twenty times what they take.
+const LAST_ADJUSTMENTS: Duration = Duration::from_secs(5);
+
+/// When an estimate enters the map.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Entry {
+    /// So many frames after it began; it is waited for. The same map in every run.
+    AfterFrames(u64),
+    /// Between two frames as soon as it is ready. No frame waits.
+    WhenReady,
+}
+
+/// What became of an estimate.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Fate {
+    /// It entered the map.
+    Entered,
+    /// It entered a map that had got another keyframe meanwhile, which followed.
+    Merged,
+    /// The map had changed so much that it no longer fitted.
+    Dropped,
+}
+
+/// An estimate that is over.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AdjustmentRecord {
+    /// Sequence of the last frame before it entered.
+    pub sequence: u64,
+    /// Frames from its beginning until then.
+    pub frames: u64,
+    /// CPU time that it took, nanoseconds.
+    pub nanos: u64,
+    /// What became of it.
+    pub fate: Fate,
+    /// What it came to.
+    pub adjustment: Adjustment,
+}
+
+/// The estimate that is away, and the map that it was taken from.
+#[derive(Debug, Clone, Copy)]
+struct Away {
+    /// Frames that had been counted when it began.
+    began: u64,
+    epoch: u32,
+    map_revision: u64,
+    newest: Option<u64>,
+    /// Whether the mapper that it was taken from is gone.
+    is_orphan: bool,
+}
+
+/// The joint estimation of a mapper's keyframes.
+pub struct Adjustments {
+    entry: Entry,
+    /// None where it is switched off, or has failed.
+    thread: Option<AdjustmentThread>,
+    away: Option<Away>,
+    /// Frames so far, and the sequence of the last.
+    frames: u64,
+    sequence: u64,
+    records: Vec<AdjustmentRecord>,
+    failure: Option<String>,
+}
+
+impl Adjustments {
+    /// Starts the thread.
+    pub fn start(entry: Entry, background: Background) -> io::Result<Self> {
+        Self::start_with(entry, background, Box::new(Window::optimise))
+    }
+
+    fn start_with(entry: Entry, background: Background, optimise: Optimise) -> io::Result<Self> {
+        let thread = Some(AdjustmentThread::start(background, optimise)?);
+        let (records, failure) = (Vec::new(), None);
+        Ok(Self { entry, thread, away: None, frames: 0, sequence: 0, records, failure })
+    }
+
+    /// Readable when an estimate is ready: then [`Adjustments::pick_up`].
+    pub fn descriptor(&self) -> Option<BorrowedFd<'_>> {
+        self.thread.as_ref().map(AdjustmentThread::descriptor)
+    }
+
+    /// What is over since the last call.
+    pub fn take_records(&mut self) -> impl Iterator<Item = AdjustmentRecord> {
+        std::mem::take(&mut self.records).into_iter()
+    }
+
+    /// Why there is no joint estimation any more; `None` where there is, and once it was asked for.
+    pub fn take_failure(&mut self) -> Option<String> {
+        self.failure.take()
+    }
+
+    /// After each frame of the mapper, whose keyframe is finished: lets in what is due, hands over what is new. What
+    /// is to be published then.
+    pub fn after_frame(&mut self, mapper: &mut Mapper, sequence: u64) -> StepOutcome {
+        self.frames += 1;
+        self.sequence = sequence;
+        let before = self.let_in(mapper);
+        self.begin(mapper);
+        // One that is due with its own frame.
+        joined(before, self.let_in(mapper))
+    }
+
+    /// Between two frames: lets in what is ready, where no frame needs to be waited for.
+    pub fn pick_up(&mut self, mapper: &mut Mapper) -> StepOutcome {
+        match self.entry {
+            Entry::AfterFrames(_) => StepOutcome::default(),
+            Entry::WhenReady => {
+                let outcome = self.let_in(mapper);
+                self.begin(mapper);
+                outcome
+            }
+        }
+    }
+
+    /// After the last frame: lets in what is away, then estimates all keyframes once more and aligns the last frames
+    /// again. It is waited for; live, where something else may have the CPU, not for long.
+    pub fn finish(&mut self, mapper: &mut Mapper) -> StepOutcome {
+        let deadline = Instant::now() + LAST_ADJUSTMENTS;
+        let outcome = self.let_all_in(mapper, deadline);
+        self.begin_with(mapper, Mapper::begin_last_adjustment);
+        let outcome = joined(outcome, self.let_all_in(mapper, deadline));
+        mapper.keep_confirmed();
+        outcome
+    }
+
+    /// Lets in what is away.
+    fn let_all_in(&mut self, mapper: &mut Mapper, deadline: Instant) -> StepOutcome {
+        let mut outcome = StepOutcome::default();
+        loop {
+            let (Some(away), Some(thread)) = (self.away, &self.thread) else { return outcome };
+            let back = match self.entry {
+                Entry::AfterFrames(_) => thread.wait(),
+                Entry::WhenReady => {
+                    thread.wait_at_most(deadline.saturating_duration_since(Instant::now()))
+                }
+            };
+            if back.as_ref().is_err_and(|missing| *missing == Missing::Unfinished) {
+                return outcome;
+            }
+            outcome = joined(outcome, self.end(mapper, &away, back));
+        }
+    }
+
+    /// The mapper is replaced by one for another camera: what is away is of no use to that.
+    pub fn orphan(&mut self) {
+        self.away.iter_mut().for_each(|away| away.is_orphan = true);
+    }
+
+    /// Hands over what is new, where nothing is away.
+    fn begin(&mut self, mapper: &mut Mapper) {
+        self.begin_with(mapper, Mapper::begin_adjustment);
+    }
+
+    fn begin_with(
+        &mut self,
+        mapper: &mut Mapper,
+        begin: impl FnOnce(&mut Mapper) -> Option<Box<Window>>,
+    ) {
+        let (None, Some(thread)) = (self.away, &self.thread) else { return };
+        let Some(window) = begin(mapper) else { return };
+        self.away = Some(Away {
+            began: self.frames,
+            epoch: mapper.keyframe().map_or(0, |keyframe| keyframe.epoch),
+            map_revision: mapper.map().revision,
+            newest: newest(mapper),
+            is_orphan: false,
+        });
+        thread.hand_over(window);
+    }
+
+    /// Lets in what is due.
+    fn let_in(&mut self, mapper: &mut Mapper) -> StepOutcome {
+        let (Some(away), Some(thread)) = (self.away, &self.thread) else {
+            return StepOutcome::default();
+        };
+        let back = match self.entry {
+            Entry::AfterFrames(frames) if self.frames < away.began.saturating_add(frames) => {
+                Err(Missing::Unfinished)
+            }
+            Entry::AfterFrames(_) => thread.wait(),
+            Entry::WhenReady => thread.poll(),
+        };
+        self.end(mapper, &away, back)
+    }
+
+    fn end(
+        &mut self,
+        mapper: &mut Mapper,
+        away: &Away,
+        back: Result<Finished, Missing>,
+    ) -> StepOutcome {
+        let finished = match back {
+            Ok(finished) => finished,
+            Err(Missing::Unfinished) => return StepOutcome::default(),
+            Err(Missing::Ended) => {
+                self.give_up();
+                return StepOutcome::default();
+            }
+        };
+        self.away = None;
+        let fate = fate(mapper, away);
+        if let Some(adjustment) = finished.adjustment {
+            let frames = self.frames.saturating_sub(away.began);
+            let (sequence, nanos) = (self.sequence, finished.nanos);
+            self.records.push(AdjustmentRecord { sequence, frames, nanos, fate, adjustment });
+        }
+        match fate {
+            _ if away.is_orphan => StepOutcome::default(),
+            Fate::Dropped => {
+                mapper.drop_adjustment(finished.window);
+                StepOutcome::default()
+            }
+            Fate::Entered | Fate::Merged => mapper.end_adjustment(finished.window),
+        }
+    }
+
+    /// The thread has panicked: from now on keyframes are not estimated jointly.
+    fn give_up(&mut self) {
+        self.away = None;
+        let message = self.thread.take().map(AdjustmentThread::panic_message).unwrap_or_default();
+        let failure = format!(
+            "the joint estimation of keyframes has failed ({message}); mapping continues without it, and drifts more: please report this"
+        );
+        tracing::error!("{failure}");
+        self.failure = Some(failure);
+    }
+}
+
+fn newest(mapper: &Mapper) -> Option<u64> {
+    mapper.map().keyframes.last().map(|keyframe| keyframe.keyframe_id)
+}
+
+/// What becomes of an estimate in the map as it is now.
+fn fate(mapper: &Mapper, away: &Away) -> Fate {
+    let is_same_map = mapper.keyframe().is_some_and(|active| {
+        active.epoch == away.epoch
+            && active.map_state == MapState::Established
+            // Another correction has moved what it was taken from.
+            && mapper.map().revision == away.map_revision
+    });
+    match (is_same_map && !away.is_orphan, newest(mapper) == away.newest) {
+        (false, _) => Fate::Dropped,
+        (true, false) => Fate::Merged,
+        (true, true) => Fate::Entered,
+    }
+}
+
+/// What is to be published after both.
+fn joined(one: StepOutcome, other: StepOutcome) -> StepOutcome {
+    StepOutcome {
+        keyframe_changed: one.keyframe_changed || other.keyframe_changed,
+        graph_changed: one.graph_changed || other.graph_changed,
+        ..one
+    }
+}
+
+#[cfg(test)]
+mod tests;

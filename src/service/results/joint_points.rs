@@ -1,0 +1,47 @@
+//! Points of the joint estimation as a point cloud, binary little-endian PLY: the sparse part of the map that many
+//! keyframes agree on.
+
+use std::io::{self, Write};
+use std::path::Path;
+
+use nalgebra::Vector3;
+
+use crate::service::atomic_file::write_atomically;
+use crate::slam::map::Map;
+use crate::slam::window::confirmed::ConfirmedPoint;
+
+/// Writes the points of a map.
+pub fn write_points(path: &Path, map: &Map) -> io::Result<()> {
+    let placed = map.confirmed.iter().filter_map(|point| Some((position(map, point)?, point)));
+    let points: Vec<([f32; 3], &ConfirmedPoint)> = placed.collect();
+    write_atomically(path, |file| {
+        write!(
+            file,
+            "ply\nformat binary_little_endian 1.0\n\
+             comment points of the joint estimation: x y z in map units, confirmations: keyframes that agree\n\
+             element vertex {}\n\
+             property float x\nproperty float y\nproperty float z\n\
+             property float intensity\nproperty uint confirmations\nproperty uint keyframe\n\
+             end_header\n",
+            points.len()
+        )?;
+        points.iter().try_for_each(|(position, point)| {
+            for number in position.iter().chain([&point.intensity]) {
+                file.write_all(&number.to_le_bytes())?;
+            }
+            file.write_all(&point.confirmations.to_le_bytes())?;
+            file.write_all(&(point.keyframe_id as u32).to_le_bytes())
+        })
+    })
+}
+
+/// Where a point is in the world, map units; `None` where its keyframe is gone.
+fn position(map: &Map, point: &ConfirmedPoint) -> Option<[f32; 3]> {
+    let keyframe = map.get(point.keyframe_id)?;
+    let k = &keyframe.intrinsics;
+    let (u, v) = (f64::from(point.u), f64::from(point.v));
+    let ray = Vector3::new((u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.0);
+    let in_world = keyframe.map_from_keyframe * (ray / f64::from(point.inverse_depth));
+    let position = [in_world.x as f32, in_world.y as f32, in_world.z as f32];
+    position.iter().all(|x| x.is_finite()).then_some(position)
+}

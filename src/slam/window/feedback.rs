@@ -1,0 +1,82 @@
+//! What the window says to the map: new places, units and depth.
+
+use crate::slam::geometry::sim3::Sim3;
+use crate::slam::keyframe::Keyframe;
+use crate::slam::map::{Correction, KeyframeCorrection, LogPlane, Map};
+use crate::slam::window::plane::{Correspondence, fit};
+use crate::slam::window::{Window, selection};
+
+impl Window {
+    /// What of the map is known better since the last adjustment: the keyframes that were free move, and their depth is
+    /// moved to where their points are.
+    pub fn correction(&self, map: &Map) -> Correction {
+        let mut keyframes: Vec<KeyframeCorrection> = Vec::new();
+        for &id in &self.moved {
+            let Some(keyframe) = map.get(id) else { continue };
+            keyframes.extend(self.corrected(keyframe));
+        }
+        let followers = self.followers(map, &keyframes);
+        keyframes.extend(followers);
+        Correction { keyframes, joins: Vec::new() }
+    }
+
+    /// Keyframes that are not estimated, newer ones and rejected ones: each goes where the last before it that moved goes.
+    fn followers(&self, map: &Map, moved: &[KeyframeCorrection]) -> Vec<KeyframeCorrection> {
+        let leader = |keyframe: &Keyframe| {
+            let before = moved.iter().filter(|of| of.keyframe_id < keyframe.keyframe_id);
+            let leader = before.max_by_key(|of| of.keyframe_id)?;
+            let was = map.get(leader.keyframe_id)?;
+            (was.epoch == keyframe.epoch)
+                .then(|| leader.map_from_keyframe * was.map_from_keyframe.inverse())
+        };
+        let newest = moved.iter().map(|of| of.keyframe_id).max();
+        let follows = |keyframe: &&Keyframe| {
+            Some(keyframe.keyframe_id) > newest || self.get(keyframe.keyframe_id).is_none()
+        };
+        let others = map.keyframes.iter().filter(follows);
+        others
+            .filter_map(|keyframe| {
+                Some(KeyframeCorrection {
+                    keyframe_id: keyframe.keyframe_id,
+                    map_from_keyframe: leader(keyframe)? * keyframe.map_from_keyframe,
+                    depth: LogPlane::default(),
+                })
+            })
+            .collect()
+    }
+
+    fn corrected(&self, keyframe: &Keyframe) -> Option<KeyframeCorrection> {
+        let known = self.get(keyframe.keyframe_id)?;
+        let place = known.camera_from_map.inverse();
+        let unit = keyframe.map_from_keyframe.scale;
+        let better = match known.is_host {
+            true => self.of_own_points(keyframe),
+            false => {
+                let index =
+                    self.keyframes.iter().position(|k| k.keyframe_id == keyframe.keyframe_id)?;
+                self.projected_into(index, &keyframe.points)
+            }
+        };
+        // Depth in the unit of the map is larger by e^offset, so that the unit is shorter.
+        let [offset, per_x, per_y] = fit(&better).unwrap_or_default();
+        Some(KeyframeCorrection {
+            keyframe_id: keyframe.keyframe_id,
+            map_from_keyframe: Sim3::new(place, unit * (-offset).exp()),
+            depth: LogPlane { offset: 0.0, per_x, per_y },
+        })
+    }
+
+    fn of_own_points(&self, keyframe: &Keyframe) -> Vec<Correspondence> {
+        let Some(known) = self.get(keyframe.keyframe_id) else { return Vec::new() };
+        let unit = keyframe.map_from_keyframe.scale;
+        let points = known.points.iter().filter(|point| point.is_alive && point.confirmations > 0);
+        points
+            .filter_map(|point| {
+                let dense = selection::at_pixel(&keyframe.points, point.u, point.v)?;
+                let depth = f64::from(dense.inverse_depth) / unit;
+                let ray = point.ray.map(f64::from);
+                Some(Correspondence { ray, log_ratio: (point.inverse_depth / depth).ln() })
+            })
+            .collect()
+    }
+}

@@ -1,0 +1,439 @@
+//! Joint estimation of the poses of a few keyframes and the inverse depths of their points: photometric bundle
+//! adjustment (Engel, Koltun, Cremers 2018 §2; Zubizarreta, Aguinaga, Montiel 2020).
+//!
+//! A point belongs to the keyframe that it was chosen in, its host, and is compared with every keyframe that sees it.
+//! [`comparison_kernel`] is one such comparison with its derivatives, `system` the normal equations of all with the
+//! points eliminated, `solver` the iterations, [`Window::optimise`] the recipe. Keyframes that have left the window
+//! and see the same things hold it in place; nothing is marginalised, and the filter's variance is no prior.
+
+pub mod comparison_kernel;
+mod conclusion;
+pub mod confirmed;
+mod feedback;
+pub mod frames;
+pub mod keyframe;
+pub mod params;
+mod plane;
+mod selection;
+mod solver;
+mod system;
+mod unit;
+mod view;
+
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::keyframe::{DepthPoint, MapState};
+use crate::slam::map::Map;
+use crate::slam::window::comparison_kernel::{Robustness, SAMPLES};
+use crate::slam::window::frames::WindowFrames;
+use crate::slam::window::keyframe::{WindowKeyframe, WindowPoint, num_levels};
+use crate::slam::window::params::WindowParams;
+use crate::slam::window::plane::Correspondence;
+use crate::slam::window::solver::Solver;
+use crate::slam::window::system::{Level, Members};
+use crate::slam::window::unit::Unit;
+use crate::slam::window::view::Sight;
+
+/// Levels of the alignment of a new keyframe, and of an adjustment.
+const ALIGNMENT_LEVELS: [usize; 4] = [3, 2, 1, 0];
+const ADJUSTED_LEVELS: [usize; 3] = [2, 1, 0];
+/// Keyframes before a new one that it is aligned to.
+const NUM_ALIGNED_TO: usize = 4;
+/// Most iterations of a level of that alignment.
+const MAX_ALIGNMENT_ITERATIONS: u32 = 10;
+/// Points that two keyframes must see both for the one to hold the other in place.
+const FEWEST_COMMON: usize = 20;
+/// Keyframes that are held in place where no older one sees the same things.
+const NUM_HELD: usize = 2;
+
+/// What an adjustment came to.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Adjustment {
+    /// Newest keyframe that took part.
+    pub keyframe_id: u64,
+    /// Keyframes whose poses were free.
+    pub free: usize,
+    /// Keyframes that held them in place.
+    pub fixed: usize,
+    /// Points.
+    pub points: usize,
+    /// Comparisons of a point with a keyframe, at the finest level.
+    pub comparisons: usize,
+    /// Share of them that count.
+    pub inlier_ratio: f64,
+    /// Root mean square of the residuals that count, grey levels.
+    pub rms_grey: f64,
+    /// Steps tried, of all levels.
+    pub iterations: u32,
+}
+
+/// Keyframes and points that are estimated together. It keeps its own copy of what it needs, so that it can work while
+/// the map goes on; [`Window::take_in`] and [`Window::correction`] are the two places where they meet.
+#[derive(Debug, Clone)]
+pub struct Window {
+    params: WindowParams,
+    camera: Intrinsics,
+    keyframes: Vec<WindowKeyframe>,
+    /// Depth of keyframes whose points are still to be chosen, by keyframe.
+    candidates: Vec<(u64, Vec<DepthPoint>)>,
+    /// Keyframes from here on have not been aligned.
+    unaligned: Vec<u64>,
+    solver: Solver,
+    /// Keyframes that moved last.
+    moved: Vec<u64>,
+    frames: WindowFrames,
+    is_last: bool,
+}
+
+impl Window {
+    /// An empty one for images of `camera`.
+    pub fn new(camera: Intrinsics, params: WindowParams) -> Self {
+        Self {
+            params,
+            camera,
+            keyframes: Vec::new(),
+            candidates: Vec::new(),
+            unaligned: Vec::new(),
+            solver: Solver::default(),
+            moved: Vec::new(),
+            frames: WindowFrames::default(),
+            is_last: false,
+        }
+    }
+
+    /// Takes in what is new in the map, whose keyframe `active` is still being observed. False where there is nothing
+    /// to be estimated.
+    pub fn take_in(&mut self, map: &Map, active: u64) -> bool {
+        self.moved.clear();
+        // What a mapper that died has left is where it was estimated to be.
+        let is_resumed = self.keyframes.is_empty() && map.keyframes.len() > 1;
+        let held = |id: u64| {
+            map.get(id).is_some_and(|k| k.has_depth() && k.map_state == MapState::Established)
+        };
+        self.keyframes.retain(|keyframe| held(keyframe.keyframe_id));
+        self.unaligned.retain(|&id| held(id));
+        self.candidates.retain(|(id, _)| held(*id));
+        for keyframe in map.keyframes.iter().filter(|k| held(k.keyframe_id)) {
+            let id = keyframe.keyframe_id;
+            let camera_from_map = keyframe.map_from_keyframe.rigid.inverse();
+            let unit = keyframe.map_from_keyframe.scale;
+            match self.keyframes.iter_mut().find(|known| known.keyframe_id == id) {
+                Some(known) => {
+                    (known.camera_from_map, known.unit) = (camera_from_map, unit);
+                    if known.epoch != keyframe.epoch {
+                        // Its epoch was joined to another, which has another unit: its points are chosen anew.
+                        known.epoch = keyframe.epoch;
+                        known.points.clear();
+                        known.is_host = false;
+                    }
+                }
+                None => {
+                    self.keyframes.push(WindowKeyframe {
+                        keyframe_id: id,
+                        epoch: keyframe.epoch,
+                        pixels: keyframe.image.clone(),
+                        images: Vec::new(),
+                        camera_from_map,
+                        unit,
+                        points: Vec::new(),
+                        is_host: false,
+                    });
+                    if !is_resumed || id == active {
+                        self.unaligned.push(id);
+                    }
+                }
+            }
+            let is_known = |this: &Self| {
+                let is_host = this.get(id).is_none_or(|known| known.is_host);
+                is_host || this.candidates.iter().any(|(of, _)| *of == id)
+            };
+            if id != active && !is_known(self) {
+                self.candidates.push((id, keyframe.points.clone()));
+            }
+        }
+        !self.unaligned.is_empty()
+    }
+
+    fn get(&self, keyframe_id: u64) -> Option<&WindowKeyframe> {
+        self.keyframes.iter().find(|keyframe| keyframe.keyframe_id == keyframe_id)
+    }
+
+    /// From now on there are no more frames: the next estimate is of all keyframes, and of all frames that wait.
+    pub fn conclude(&mut self) {
+        self.is_last = true;
+    }
+
+    /// Estimates the newest keyframes and all points that they and older ones see; `None` where there is too little.
+    pub fn optimise(&mut self) -> Option<Adjustment> {
+        let mut is_new = false;
+        while let Some(&id) = self.unaligned.first() {
+            self.unaligned.remove(0);
+            let Some(index) = self.keyframes.iter().position(|k| k.keyframe_id == id) else {
+                continue;
+            };
+            self.choose_points_before(index);
+            self.align(index);
+            is_new = true;
+        }
+        let newest = self.keyframes.len().checked_sub(1)?;
+        let mut adjustment = None;
+        if is_new {
+            let chosen = self.choose_members(newest);
+            adjustment = self.adjust(&chosen);
+            self.place_frames(newest, chosen.is_first);
+            self.leave(&chosen.members);
+        }
+        if std::mem::take(&mut self.is_last) {
+            adjustment = self.adjust_all(newest).or(adjustment);
+            self.place_rest();
+            self.leave(&[]);
+        }
+        adjustment
+    }
+
+    /// The images of those that take no part any more are given up.
+    fn leave(&mut self, members: &[usize]) {
+        for (index, keyframe) in self.keyframes.iter_mut().enumerate() {
+            if !members.contains(&index) {
+                keyframe.images = Vec::new();
+            }
+        }
+    }
+
+    /// Chooses points in the keyframes before one, whose depth is final for now.
+    fn choose_points_before(&mut self, index: usize) {
+        let newest = self.keyframes[index].keyframe_id;
+        let (ready, wait) =
+            std::mem::take(&mut self.candidates).into_iter().partition(|(id, _)| *id < newest);
+        self.candidates = wait;
+        let ready: Vec<(u64, Vec<DepthPoint>)> = ready;
+        for (id, points) in ready {
+            let Some(host) = self.keyframes.iter().position(|k| k.keyframe_id == id) else {
+                continue;
+            };
+            self.become_host(host, &points);
+        }
+    }
+
+    fn become_host(&mut self, host: usize, points: &[DepthPoint]) {
+        let plane = plane::fit(&self.projected_into(host, points)).unwrap_or_default();
+        let params = &self.params;
+        let keyframe = &mut self.keyframes[host];
+        keyframe.take_part(&self.camera);
+        let chosen = selection::choose(
+            points,
+            &keyframe.pixels,
+            &self.camera,
+            params.points,
+            params.min_gradient,
+            params.max_relative_deviation,
+        );
+        keyframe.points = chosen
+            .iter()
+            .map(|point| {
+                let mut of = WindowPoint::new(
+                    (point.u, point.v),
+                    f64::from(point.inverse_depth) / keyframe.unit,
+                    &keyframe.images,
+                    &self.camera,
+                    params,
+                );
+                let [x, y] = of.ray.map(f64::from);
+                of.inverse_depth *= (plane[0] + plane[1] * x + plane[2] * y).exp();
+                of
+            })
+            .collect();
+        keyframe.is_host = true;
+    }
+
+    /// Points of other keyframes of the epoch where one has depth too.
+    fn projected_into(&self, index: usize, points: &[DepthPoint]) -> Vec<Correspondence> {
+        let to = &self.keyframes[index];
+        let mut found = Vec::new();
+        for host in
+            self.keyframes.iter().filter(|k| k.epoch == to.epoch && k.keyframe_id != to.keyframe_id)
+        {
+            let sight =
+                Sight::new(&(to.camera_from_map * host.camera_from_map.inverse()), &self.camera);
+            for point in host.points.iter().filter(|point| point.is_alive) {
+                let Some(seen) = sight.project(point) else { continue };
+                let Some(known) = selection::near(points, seen.u, seen.v) else { continue };
+                let depth = f64::from(known.inverse_depth) / to.unit;
+                let deviation = f64::from(known.variance).sqrt() / f64::from(known.inverse_depth);
+                if !(deviation <= self.params.max_relative_deviation) {
+                    continue;
+                }
+                found.push(Correspondence {
+                    ray: [
+                        (seen.u - self.camera.cx) / self.camera.fx,
+                        (seen.v - self.camera.cy) / self.camera.fy,
+                    ],
+                    log_ratio: (seen.inverse_depth / depth).ln(),
+                });
+            }
+        }
+        found
+    }
+
+    /// Aligns a keyframe alone to the points of those before it.
+    fn align(&mut self, index: usize) {
+        let epoch = self.keyframes[index].epoch;
+        let hosts = (0..index)
+            .rev()
+            .filter(|&k| self.keyframes[k].epoch == epoch && self.keyframes[k].is_host);
+        let mut members: Vec<usize> = hosts.take(NUM_ALIGNED_TO).collect();
+        if members.is_empty() {
+            return;
+        }
+        members.push(index);
+        let newest = members.len() - 1;
+        let free: Vec<_> = (0..members.len()).map(|k| (k == newest).then_some(0)).collect();
+        let members = Members { members: &members, free: &free, depths_are_free: false };
+        self.run(&members, &ALIGNMENT_LEVELS, MAX_ALIGNMENT_ITERATIONS, |_, observer| {
+            observer == newest
+        });
+    }
+
+    /// Who takes part in the estimation of the newest keyframes.
+    fn choose_members(&self, newest: usize) -> Chosen {
+        let epoch = self.keyframes[newest].epoch;
+        let of_epoch: Vec<usize> =
+            (0..=newest).filter(|&k| self.keyframes[k].epoch == epoch).collect();
+        let is_first = of_epoch.len() <= self.params.num_first;
+        let num_free =
+            if is_first { of_epoch.len() } else { self.params.num_free.min(of_epoch.len()) };
+        let (older, free) = of_epoch.split_at(of_epoch.len() - num_free);
+        let mut fixed = self.covisible(older, &free[free.len().saturating_sub(2)..]);
+        let mut free = free.to_vec();
+        // The gauge.
+        let held = match (fixed.is_empty(), older.is_empty()) {
+            (_, true) => 1,
+            (true, false) => NUM_HELD.min(free.len()),
+            (false, false) => 0,
+        };
+        fixed.extend(free.drain(..held));
+        Chosen::new(fixed, &free, is_first)
+    }
+
+    /// Of the older keyframes those that see most of what the newest see.
+    fn covisible(&self, older: &[usize], newest: &[usize]) -> Vec<usize> {
+        let common = |one: usize, other: usize| {
+            let (host, observer) = (&self.keyframes[one], &self.keyframes[other]);
+            let sight = Sight::new(
+                &(observer.camera_from_map * host.camera_from_map.inverse()),
+                &self.camera,
+            );
+            let alive = host.points.iter().filter(|point| point.is_alive);
+            alive.filter(|point| sight.project(point).is_some()).count()
+        };
+        let mut seen: Vec<(usize, usize)> = older
+            .iter()
+            .map(|&of| (newest.iter().map(|&new| common(of, new) + common(new, of)).sum(), of))
+            .filter(|(count, _)| *count > FEWEST_COMMON)
+            .collect();
+        seen.sort_unstable_by(|one, other| other.cmp(one));
+        seen.truncate(self.params.num_fixed);
+        seen.into_iter().map(|(_, of)| of).collect()
+    }
+
+    fn adjust(&mut self, chosen: &Chosen) -> Option<Adjustment> {
+        let num_free = chosen.free.iter().flatten().count();
+        if num_free == 0 {
+            return None;
+        }
+        let members =
+            Members { members: &chosen.members, free: &chosen.free, depths_are_free: true };
+        let iterations = match chosen.is_first {
+            true => self.params.max_first_iterations,
+            false => self.params.max_iterations,
+        };
+        self.solver.iterations = 0;
+        let unit = Unit::of(&self.keyframes, &members);
+        if !self.run(&members, &ADJUSTED_LEVELS, iterations, |_, _| true) {
+            return None;
+        }
+        if let Some(unit) = unit {
+            unit.restore(&mut self.keyframes, members.members);
+        }
+        let moved = members
+            .members
+            .iter()
+            .zip(members.free)
+            .filter(|(_, free)| free.is_some())
+            .map(|(&index, _)| self.keyframes[index].keyframe_id);
+        self.moved.extend(moved);
+        let points = self.confirm(&members);
+        let system = &self.solver.system;
+        Some(Adjustment {
+            keyframe_id: self.keyframes[*chosen.members.last()?].keyframe_id,
+            free: num_free,
+            fixed: members.members.len() - num_free,
+            points,
+            comparisons: system.compared,
+            inlier_ratio: system.inliers as f64 / system.compared.max(1) as f64,
+            rms_grey: (system.inlier_cost / (SAMPLES * system.inliers.max(1)) as f64).sqrt(),
+            iterations: self.solver.iterations,
+        })
+    }
+
+    /// Adjusts what is free, level by level; false where something is not determined.
+    fn run(
+        &mut self,
+        members: &Members<'_>,
+        levels: &[usize],
+        iterations: u32,
+        mut may: impl FnMut(usize, usize) -> bool,
+    ) -> bool {
+        for &index in members.members {
+            self.keyframes[index].take_part(&self.camera);
+        }
+        let robustness = Robustness {
+            huber_grey: self.params.huber_grey,
+            most_energy: SAMPLES as f32 * self.params.truncation_grey.powi(2),
+        };
+        let finest = num_levels(&self.camera) - 1;
+        levels.iter().filter(|&&level| level <= finest).all(|&level| {
+            let at = Level { camera: &self.camera, level, robustness };
+            self.solver.views.find(&self.keyframes, members.members, &self.camera, &mut may);
+            let converged = self.params.converged_decrement;
+            self.solver.adjust(&mut self.keyframes, members, &at, iterations, converged)
+        })
+    }
+
+    /// Counts who agrees with each point, and lets those go that nobody agrees with; the number of the others.
+    fn confirm(&mut self, members: &Members<'_>) -> usize {
+        let mut points = 0;
+        let counts = self.solver.system.inliers_by_point();
+        for ((host, view), inliers) in self.solver.views.with_hosts().zip(counts) {
+            let point = &mut self.keyframes[members.members[host]].points[view.point];
+            point.confirmations = inliers;
+            point.is_alive = inliers > 0;
+            points += usize::from(point.is_alive);
+        }
+        points
+    }
+}
+
+impl Chosen {
+    fn new(fixed: Vec<usize>, free: &[usize], is_first: bool) -> Self {
+        let mut members = fixed;
+        members.extend(free);
+        members.sort_unstable();
+        let mut numbers = 0..;
+        let number = |member| if free.contains(member) { numbers.next() } else { None };
+        let free = members.iter().map(number).collect();
+        Self { members, free, is_first }
+    }
+}
+
+/// Who takes part.
+struct Chosen {
+    /// Places in the list of keyframes.
+    members: Vec<usize>,
+    /// For each its number among the free ones.
+    free: Vec<Option<usize>>,
+    /// Whether the epoch has just begun.
+    is_first: bool,
+}
+
+#[cfg(test)]
+mod tests;

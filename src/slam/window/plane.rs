@@ -1,0 +1,75 @@
+//! A smooth correction of a keyframe's depth from few points that are known better.
+
+use nalgebra::{Matrix3, Vector3};
+
+/// One point that is known better.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Correspondence {
+    /// Its ray at depth 1.
+    pub ray: [f64; 2],
+    /// Logarithm of its inverse depth over what the keyframe has there.
+    pub log_ratio: f64,
+}
+
+/// `log_ratio ≈ offset + per_x X + per_y Y` for most of the points: offset and slopes. A single offset where there are
+/// too few points for a plane, `None` where there are too few for that.
+pub fn fit(points: &[Correspondence]) -> Option<[f64; 3]> {
+    /// Points that a plane wants: ten for each of its numbers.
+    const FEWEST_FOR_PLANE: usize = 30;
+    /// Points that an offset wants.
+    const FEWEST_FOR_OFFSET: usize = 10;
+    /// Iterations: the weights have settled long before.
+    const ITERATIONS: usize = 15;
+    /// Largest slope: over an image 60° wide a factor of three from side to side. More is a wrong fit.
+    const STEEPEST: f64 = 1.0;
+    if points.len() < FEWEST_FOR_OFFSET {
+        return None;
+    }
+    let middle = median(points.iter().map(|point| point.log_ratio).collect());
+    if points.len() < FEWEST_FOR_PLANE {
+        return Some([middle, 0.0, 0.0]);
+    }
+    let mut plane = Vector3::new(middle, 0.0, 0.0);
+    let shape = |point: &Correspondence| Vector3::new(1.0, point.ray[0], point.ray[1]);
+    for _ in 0..ITERATIONS {
+        let residual = |point: &Correspondence| point.log_ratio - shape(point).dot(&plane);
+        let spread = spread(points.iter().map(|point| residual(point).abs()).collect());
+        let (mut normal, mut right) = (Matrix3::identity() * 1e-9, Vector3::zeros());
+        for point in points {
+            let weight = weight_of(residual(point).abs() / spread);
+            let shape = shape(point);
+            normal += weight * shape * shape.transpose();
+            right += weight * point.log_ratio * shape;
+        }
+        plane = normal.cholesky()?.solve(&right);
+    }
+    let [offset, per_x, per_y] = plane.into();
+    let is_finite = offset.is_finite() && per_x.is_finite() && per_y.is_finite();
+    is_finite.then(|| [offset, per_x.clamp(-STEEPEST, STEEPEST), per_y.clamp(-STEEPEST, STEEPEST)])
+}
+
+/// Weight of a residual, standard deviations: full within 1.5, none beyond 4.
+fn weight_of(residual: f64) -> f64 {
+    match residual {
+        r if r <= 1.5 => 1.0,
+        r if r <= 4.0 => 1.5 / r,
+        _ => 0.0,
+    }
+}
+
+/// Standard deviation of normal errors whose sizes these are.
+fn spread(sizes: Vec<f64>) -> f64 {
+    const SIGMA_OF_MEDIAN: f64 = 1.4826;
+    /// Depth is never known better than to a millionth.
+    const LEAST: f64 = 1e-6;
+    (SIGMA_OF_MEDIAN * median(sizes)).max(LEAST)
+}
+
+/// The upper median; 0 of none.
+fn median(mut values: Vec<f64>) -> f64 {
+    if values.is_empty() {
+        return 0.0;
+    }
+    let middle = values.len() / 2;
+    *values.select_nth_unstable_by(middle, f64::total_cmp).1
+}

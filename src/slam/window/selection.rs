@@ -1,0 +1,63 @@
+//! Which points of a keyframe's depth take part in the joint estimation.
+
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::keyframe::DepthPoint;
+
+/// Pixels at the border that no point is chosen in: pattern and gradients stay inside.
+const BORDER_PX: u16 = 4;
+
+/// The surest points with gradient, at most one in each of `num_cells` cells of the image, cell after cell.
+pub fn choose(
+    points: &[DepthPoint],
+    pixels: &[u8],
+    camera: &Intrinsics,
+    num_cells: usize,
+    min_gradient: f64,
+    max_relative_deviation: f64,
+) -> Vec<DepthPoint> {
+    let (width, height) = (camera.width, camera.height);
+    let side = ((width * height) as f64 / num_cells.max(1) as f64).sqrt().max(1.0);
+    let columns = (width as f64 / side).ceil() as usize;
+    let rows = (height as f64 / side).ceil() as usize;
+    let mut best: Vec<Option<(f32, DepthPoint)>> = vec![None; columns * rows];
+    let most = (max_relative_deviation * max_relative_deviation) as f32;
+    let inside = |at: u16, side: usize| at >= BORDER_PX && usize::from(at + BORDER_PX) + 1 < side;
+    for point in points {
+        if !(inside(point.u, width) && inside(point.v, height) && point.inverse_depth > 0.0) {
+            continue;
+        }
+        let relative = point.variance / (point.inverse_depth * point.inverse_depth);
+        let (u, v) = (usize::from(point.u), usize::from(point.v));
+        let cell = (v as f64 / side) as usize * columns + (u as f64 / side) as usize;
+        let is_better = best[cell].is_none_or(|(least, _)| relative < least);
+        if relative <= most && is_better && gradient(pixels, width, u, v) >= min_gradient {
+            best[cell] = Some((relative, *point));
+        }
+    }
+    best.into_iter().flatten().map(|(_, point)| point).collect()
+}
+
+/// Gradient by central differences, grey levels a pixel.
+fn gradient(pixels: &[u8], width: usize, u: usize, v: usize) -> f64 {
+    let at = |u: usize, v: usize| f64::from(pixels[v * width + u]);
+    (0.5 * (at(u + 1, v) - at(u - 1, v))).hypot(0.5 * (at(u, v + 1) - at(u, v - 1)))
+}
+
+/// The point of a keyframe, whose points are in row-major order, that is at a pixel.
+pub fn at_pixel(points: &[DepthPoint], u: u16, v: u16) -> Option<&DepthPoint> {
+    let place = points.binary_search_by_key(&(v, u), |point| (point.v, point.u)).ok()?;
+    points.get(place)
+}
+
+/// The nearest to a position, within a pixel of it.
+pub fn near(points: &[DepthPoint], u: f64, v: f64) -> Option<&DepthPoint> {
+    let (column, row) = (u.round(), v.round());
+    if !(column >= 1.0 && row >= 1.0 && column < 65_535.0 && row < 65_535.0) {
+        return None;
+    }
+    let (column, row) = (column as u16, row as u16);
+    let around = (row - 1..=row + 1).flat_map(|v| (column - 1..=column + 1).map(move |u| (u, v)));
+    let distance = |p: &DepthPoint| (f64::from(p.u) - u).hypot(f64::from(p.v) - v);
+    let found = around.filter_map(|(u, v)| at_pixel(points, u, v));
+    found.min_by(|one, other| distance(one).total_cmp(&distance(other)))
+}

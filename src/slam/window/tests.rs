@@ -1,0 +1,419 @@
+//! Derivatives against differences, lanes against the explanation, and windows of a rendered room solved from a
+//! perturbed truth.
+
+use nalgebra::Vector6;
+
+use super::comparison_kernel::{
+    Look, POSE, Pair, PairSums, Robustness, SAMPLES, Seen, compare_portable, kernel, sum,
+};
+use super::solver::Solver;
+use super::*;
+use crate::slam::depth::matching::PATTERN;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::image::quads::QuadImage;
+use crate::slam::test_scene::{CAMERA, Random, Scene};
+
+const EASY: Robustness = Robustness { huber_grey: 1e3, most_energy: f32::INFINITY };
+
+/// A smooth image, so that a bilinear sample is hardly ever between two slopes.
+fn waves(phase: f32) -> QuadImage {
+    let pixels: Vec<u8> = (0..CAMERA.width * CAMERA.height)
+        .map(|i| {
+            let (u, v) = ((i % CAMERA.width) as f32, (i / CAMERA.width) as f32);
+            let wave = 60.0 * (0.11 * u + phase).sin() * (0.09 * v).cos()
+                + 50.0 * (0.1 * v + 0.04 * u).cos();
+            (128.0 + wave).round() as u8
+        })
+        .collect();
+    let mut image = QuadImage::with_size(CAMERA.width, CAMERA.height);
+    image.fill(&pixels);
+    image
+}
+
+/// What the pattern around a position looks like, every sample of weight 1.
+fn look(image: &QuadImage, u: f32, v: f32) -> Look {
+    let samples =
+        image.sample(&PATTERN.map(|(du, _)| u + du as f32), &PATTERN.map(|(_, dv)| v + dv as f32));
+    let mean = sum(&samples) / SAMPLES as f32;
+    Look { shape: samples.map(|grey| grey / mean), weight: [1.0; SAMPLES] }
+}
+
+fn ray(u: f64, v: f64) -> [f32; 2] {
+    [((u - CAMERA.cx) / CAMERA.fx) as f32, ((v - CAMERA.cy) / CAMERA.fy) as f32]
+}
+
+/// Cost of a comparison and half its gradient, by pose of the observer and by depth.
+fn compared(
+    image: &QuadImage,
+    look: &Look,
+    ray: [f32; 2],
+    pose: &SE3,
+    depth: f64,
+) -> (f64, [f64; POSE + 1]) {
+    let mut lanes = PairSums::default();
+    let pair = Pair::new(pose, &CAMERA);
+    let seen = compare_portable(image, &pair, look, ray, depth as f32, &EASY, &mut lanes);
+    let Seen::Same(cost, sums) = seen else { panic!("{seen:?}") };
+    let mut gradient = [0.0; POSE + 1];
+    (0..POSE).for_each(|m| gradient[m] = f64::from(sum(&lanes.right[m])));
+    gradient[POSE] = f64::from(sums.depth_right);
+    (f64::from(cost), gradient)
+}
+
+#[test]
+fn derivatives_are_those_of_the_cost() {
+    let (host, observer) = (waves(0.0), waves(0.4));
+    let pose = SE3::exp(&Vector6::from([0.1, -0.05, 0.08, 0.02, -0.03, 0.05]));
+    for (u, v, depth) in [(80.0, 60.0, 0.4), (200.0, 150.0, 0.9), (150.0, 40.0, 0.2)] {
+        let look = look(&host, u as f32, v as f32);
+        let at = |pose: &SE3, depth: f64| compared(&observer, &look, ray(u, v), pose, depth);
+        let found = at(&pose, depth).1;
+        // A two hundredth of a pixel to each side: hardly a sample leaves its four pixels, between which the gradient is exact.
+        let pixels = 0.005 / CAMERA.fx;
+        let length = found.iter().take(3).map(|g| g * g).sum::<f64>().sqrt();
+        for m in 0..=POSE {
+            let h = [pixels / depth, pixels, 0.0005 * depth][[0, 0, 0, 1, 1, 1, 2][m]];
+            let moved = |h: f64| match m {
+                POSE => at(&pose, depth + h).0,
+                _ => {
+                    at(
+                        &(SE3::exp(&Vector6::from_fn(|r, _| if r == m { h } else { 0.0 })) * pose),
+                        depth,
+                    )
+                    .0
+                }
+            };
+            let numeric = (moved(h) - moved(-h)) / (4.0 * h);
+            // Those of translation and rotation differ by the depth.
+            let size = if m < 3 { length } else { length / depth };
+            assert!(
+                (found[m] - numeric).abs() < 0.05 * size,
+                "{u} {v} by {m}: {} {numeric}",
+                found[m]
+            );
+        }
+    }
+}
+
+#[test]
+fn lanes_give_the_bits_of_the_explanation() {
+    let mut random = Random::new(4);
+    let pixels: Vec<u8> =
+        (0..CAMERA.width * CAMERA.height).map(|_| (255.0 * random.uniform()) as u8).collect();
+    let mut image = QuadImage::with_size(CAMERA.width, CAMERA.height);
+    image.fill(&pixels);
+    let robustness = Robustness { huber_grey: 9.0, most_energy: 8.0 * 900.0 };
+    let kernel = kernel();
+    let mut counts = [0; 3];
+    for _ in 0..500 {
+        let mut next = |low: f64, high: f64| low + (high - low) * random.uniform();
+        let pose = SE3::exp(&Vector6::from_fn(|_, _| next(-0.2, 0.2)));
+        let (u, v, depth) = (next(4.0, 315.0), next(4.0, 235.0), next(0.0, 2.0) as f32);
+        let pair = Pair::new(&pose, &CAMERA);
+        let look = look(&image, u as f32, v as f32);
+        let (mut one, mut other) = (PairSums::default(), PairSums::default());
+        let seen = compare_portable(&image, &pair, &look, ray(u, v), depth, &robustness, &mut one);
+        let fast = kernel(&image, &pair, &look, ray(u, v), depth, &robustness, &mut other);
+        assert_eq!(seen, fast);
+        assert_eq!(one, other);
+        counts[[matches!(seen, Seen::Outside), matches!(seen, Seen::Other), true]
+            .iter()
+            .position(|&is| is)
+            .unwrap()] += 1;
+    }
+    assert!(counts.iter().all(|&count| count > 20), "{counts:?}");
+}
+
+#[test]
+fn numbers_that_are_none_are_outside() {
+    let image = waves(0.0);
+    let look = look(&image, 100.0, 100.0);
+    let pair = Pair::new(&SE3::identity(), &CAMERA);
+    for (ray, depth) in
+        [([f32::NAN, 0.0], 1.0), ([0.0, 0.0], f32::NAN), ([f32::INFINITY, 0.0], 1.0)]
+    {
+        let seen =
+            compare_portable(&image, &pair, &look, ray, depth, &EASY, &mut PairSums::default());
+        let is_harmless = match seen {
+            Seen::Outside | Seen::Other => true,
+            Seen::Same(cost, sums) => cost.is_finite() && sums.depth.is_finite(),
+        };
+        assert!(is_harmless, "{ray:?} {depth}: {seen:?}");
+    }
+}
+
+/// Keyframes of a room with points, of which the first and those in `held` stay where they are.
+#[derive(Clone)]
+struct Room {
+    keyframes: Vec<WindowKeyframe>,
+    held: Vec<usize>,
+}
+
+/// Four views of the room with exact depth at every place with gradient, every keyframe a host.
+fn room(brightness: impl Fn(usize, f64) -> (f64, f64)) -> Room {
+    let scene = Scene::new(3);
+    let poses = [
+        [0.0; 6],
+        [0.12, 0.02, 0.03, 0.01, -0.02, 0.0],
+        [0.25, -0.03, 0.05, -0.01, -0.05, 0.02],
+        [0.36, 0.05, -0.02, 0.02, -0.08, -0.02],
+    ];
+    let keyframes = poses.into_iter().enumerate().map(|(index, pose)| {
+        let world_from_camera = SE3::exp(&Vector6::from(pose));
+        let mut view = scene.render(&CAMERA, &world_from_camera);
+        for (i, grey) in view.intensity.pixels_mut().iter_mut().enumerate() {
+            let [x, y] = ray((i % CAMERA.width) as f64, (i / CAMERA.width) as f64);
+            let (gain, offset) = brightness(index, f64::from(x * x + y * y));
+            *grey = gain as f32 * *grey + offset as f32;
+        }
+        let mut keyframe = WindowKeyframe {
+            keyframe_id: index as u64,
+            epoch: 0,
+            pixels: view.noisy(1.0, index as u64),
+            images: Vec::new(),
+            camera_from_map: world_from_camera.inverse(),
+            unit: 1.0,
+            points: Vec::new(),
+            is_host: true,
+        };
+        keyframe.take_part(&CAMERA);
+        let dense: Vec<DepthPoint> = (0..CAMERA.width * CAMERA.height)
+            .map(|i| DepthPoint {
+                u: (i % CAMERA.width) as u16,
+                v: (i / CAMERA.width) as u16,
+                inverse_depth: view.inverse_depth.pixels()[i],
+                variance: 1e-6,
+                intensity: 0.0,
+            })
+            .collect();
+        let params = WindowParams::default();
+        let chosen = selection::choose(&dense, &keyframe.pixels, &CAMERA, 400, 8.0, 0.3);
+        let images = &keyframe.images;
+        let points = chosen.iter().map(|of| {
+            WindowPoint::new((of.u, of.v), f64::from(of.inverse_depth), images, &CAMERA, &params)
+        });
+        keyframe.points = points.collect();
+        keyframe
+    });
+    Room { keyframes: keyframes.collect(), held: vec![0] }
+}
+
+impl Room {
+    /// Poses and depths off by what a map may have: a centimetre and half a degree, 5 % of noise, and `modes` (column,
+    /// row, relief) in the depth of every keyframe.
+    fn perturbed(&self, modes: [f64; 3]) -> Self {
+        let mut room = self.clone();
+        let mut random = Random::new(5);
+        for (index, keyframe) in room.keyframes.iter_mut().enumerate() {
+            let twist =
+                Vector6::from_fn(|row, _| random.normal() * if row < 3 { 0.01 } else { 0.008 });
+            if !self.held.contains(&index) {
+                keyframe.camera_from_map = SE3::exp(&twist) * keyframe.camera_from_map;
+            }
+            for point in &mut keyframe.points {
+                let [x, y] = point.ray.map(f64::from);
+                let mode = modes[0] * x + modes[1] * y + modes[2] * point.inverse_depth.ln();
+                point.inverse_depth *= (mode + 0.05 * random.normal()).exp();
+            }
+        }
+        room
+    }
+
+    /// Solves it; share of the comparisons that count.
+    fn solve(&mut self) -> f64 {
+        let members: Vec<usize> = (0..self.keyframes.len()).collect();
+        let mut count = 0;
+        let free: Vec<Option<usize>> = members
+            .iter()
+            .map(|member| {
+                (!self.held.contains(member)).then(|| {
+                    count += 1;
+                    count - 1
+                })
+            })
+            .collect();
+        let members = Members { members: &members, free: &free, depths_are_free: true };
+        let robustness = Robustness { huber_grey: 9.0, most_energy: 8.0 * 144.0 };
+        let mut solver = Solver::default();
+        for level in ADJUSTED_LEVELS {
+            let at = Level { camera: &CAMERA, level, robustness };
+            solver.views.find(&self.keyframes, members.members, &CAMERA, |_, _| true);
+            assert!(solver.adjust(&mut self.keyframes, &members, &at, 15, 1e-4));
+        }
+        solver.system.inliers as f64 / solver.system.compared as f64
+    }
+
+    /// Largest error of a pose relative to the first (translation over the baseline, rotation in degrees), and the
+    /// median relative error of the depths, after the unit is that of the truth.
+    fn errors(&self, truth: &Self) -> (f64, f64, f64) {
+        let unit = self.unit(truth);
+        let errors =
+            self.ratios(truth).into_iter().map(|ratio| (ratio / unit - 1.0).abs()).collect();
+        let (mut translation, mut rotation) = (0.0f64, 0.0f64);
+        let relative = |of: &Self, k: usize| {
+            of.keyframes[k].camera_from_map * of.keyframes[0].camera_from_map.inverse()
+        };
+        for k in 1..self.keyframes.len() {
+            let (mut found, right) = (relative(self, k), relative(truth, k));
+            found.translation *= unit;
+            let off = (found.translation - right.translation).norm() / right.translation.norm();
+            translation = translation.max(off);
+            rotation = rotation.max(found.rotation.angle_to(&right.rotation).to_degrees());
+        }
+        (translation, rotation, median(errors))
+    }
+
+    fn ratios(&self, truth: &Self) -> Vec<f64> {
+        let points =
+            |of: &Self| of.keyframes.iter().flat_map(|k| k.points.clone()).collect::<Vec<_>>();
+        let pairs = points(self).into_iter().zip(points(truth));
+        pairs.map(|(found, right)| found.inverse_depth / right.inverse_depth).collect()
+    }
+
+    fn unit(&self, truth: &Self) -> f64 {
+        median(self.ratios(truth))
+    }
+
+    /// Slopes of the logarithm of the depth's error over column, row and relief.
+    fn modes(&self, truth: &Self) -> [f64; 3] {
+        let (mut normal, mut right) = (nalgebra::Matrix4::zeros(), nalgebra::Vector4::zeros());
+        for (found, truth) in self.keyframes.iter().zip(&truth.keyframes) {
+            for (found, truth) in found.points.iter().zip(&truth.points) {
+                let error = (found.inverse_depth / truth.inverse_depth).ln();
+                if error.abs() > 0.2 {
+                    continue;
+                }
+                let [x, y] = truth.ray.map(f64::from);
+                let shape = nalgebra::Vector4::new(1.0, x, y, truth.inverse_depth.ln());
+                normal += shape * shape.transpose();
+                right += error * shape;
+            }
+        }
+        let slopes = normal.try_inverse().unwrap() * right;
+        [slopes[1], slopes[2], slopes[3]]
+    }
+}
+
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}
+
+/// Solves and holds what is left to bounds. Depths start 3 to 4 % off, poses 15 % of the baseline and 1°.
+fn assert_solved(room: &mut Room, truth: &Room) -> f64 {
+    let before = room.errors(truth);
+    let inlier_ratio = room.solve();
+    let (translation, rotation, depth) = room.errors(truth);
+    assert!(before.0 > 0.08 && before.1 > 0.5 && before.2 > 0.03, "{before:?}");
+    assert!(translation < 0.015 && rotation < 0.07, "{translation} {rotation}");
+    assert!(depth < 0.01, "{depth}");
+    inlier_ratio
+}
+
+#[test]
+fn a_window_returns_to_the_truth_from_noise_and_from_each_mode() {
+    let truth = room(|_, _| (1.0, 0.0));
+    for modes in [[0.0; 3], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]] {
+        let mut room = truth.perturbed(modes);
+        let inlier_ratio = assert_solved(&mut room, &truth);
+        assert!(inlier_ratio > 0.9, "{inlier_ratio}");
+        let left = room.modes(&truth);
+        assert!(left.iter().all(|slope| slope.abs() < 0.02), "{left:?}");
+    }
+}
+
+#[test]
+fn neither_brightness_nor_a_vignette_needs_a_model() {
+    // Each frame darker than the one before; the corners lose a third.
+    let truth = room(|index, squared_radius| {
+        (((1.0 - 0.1 * index as f64) * (1.0 - 0.5 * squared_radius)), 0.0)
+    });
+    assert_solved(&mut truth.perturbed([0.0; 3]), &truth);
+}
+
+#[test]
+fn what_one_keyframe_alone_shows_is_left_out() {
+    let truth = room(|_, _| (1.0, 0.0));
+    let mut room = truth.perturbed([0.0; 3]);
+    // Something stands before a sixth of the view of one keyframe.
+    let mut random = Random::new(9);
+    let hidden = &mut room.keyframes[2];
+    for row in 60..180 {
+        for column in 120..220 {
+            hidden.pixels[row * CAMERA.width + column] = (255.0 * random.uniform()) as u8;
+        }
+    }
+    hidden.images.clear();
+    hidden.take_part(&CAMERA);
+    hidden.points.clear();
+    let mut right = truth.clone();
+    right.keyframes[2].points.clear();
+    let inlier_ratio = assert_solved(&mut room, &right);
+    assert!((0.7..0.95).contains(&inlier_ratio), "{inlier_ratio}");
+}
+
+#[test]
+fn held_keyframes_keep_the_others_in_place_and_in_their_unit() {
+    let truth = Room { held: vec![0, 3], ..room(|_, _| (1.0, 0.0)) };
+    let mut room = truth.perturbed([0.0, 0.0, 0.1]);
+    let points = room.keyframes.iter_mut().flat_map(|keyframe| &mut keyframe.points);
+    points.for_each(|point| point.inverse_depth *= 1.1);
+    room.solve();
+    for held in [0, 3] {
+        assert_eq!(room.keyframes[held].camera_from_map, truth.keyframes[held].camera_from_map);
+    }
+    let unit = room.unit(&truth);
+    assert!((unit - 1.0).abs() < 0.005, "{unit}");
+}
+
+#[test]
+fn any_similarity_of_the_start_gives_the_same_window() {
+    let truth = room(|_, _| (1.0, 0.0));
+    let start = truth.perturbed([0.0; 3]);
+    let mut moved = start.clone();
+    let moved_from_map = SE3::exp(&Vector6::from([1.0, -2.0, 0.5, 0.3, 0.9, -1.2]));
+    let scale = 2.5;
+    for keyframe in &mut moved.keyframes {
+        keyframe.camera_from_map = keyframe.camera_from_map * moved_from_map.inverse();
+        keyframe.camera_from_map.translation *= scale;
+        keyframe.points.iter_mut().for_each(|point| point.inverse_depth /= scale);
+    }
+    let mut one = start.clone();
+    one.solve();
+    moved.solve();
+    let (one_left, moved_left) = (one.errors(&truth), moved.errors(&truth));
+    let mut twice = start.clone();
+    twice.solve();
+    assert_eq!(twice.keyframes[3].points, one.keyframes[3].points);
+    // What f32 rounds may end a level one step earlier or later.
+    assert!((one_left.0 - moved_left.0).abs() < 0.002, "{one_left:?} {moved_left:?}");
+    assert!((one_left.2 - moved_left.2).abs() < 0.001, "{one_left:?} {moved_left:?}");
+}
+
+#[test]
+fn the_unit_stays_where_one_keyframe_holds_it() {
+    let truth = room(|_, _| (1.0, 0.0));
+    let members: Vec<usize> = (0..truth.keyframes.len()).collect();
+    let free = [None, Some(0), Some(1), Some(2)];
+    let members = Members { members: &members, free: &free, depths_are_free: true };
+    let unit = super::unit::Unit::of(&truth.keyframes, &members).unwrap();
+    // The same window in a unit that is longer.
+    let mut longer = truth.clone();
+    let anchor = truth.keyframes[0].camera_from_map;
+    for keyframe in &mut longer.keyframes {
+        keyframe.points.iter_mut().for_each(|point| point.inverse_depth *= 1.7);
+        let mut from_anchor = keyframe.camera_from_map * anchor.inverse();
+        from_anchor.translation /= 1.7;
+        keyframe.camera_from_map = from_anchor * anchor;
+    }
+    unit.restore(&mut longer.keyframes, members.members);
+    let (translation, rotation, depth) = longer.errors(&truth);
+    assert!(
+        translation < 1e-9 && rotation < 1e-6 && depth < 1e-9,
+        "{translation} {rotation} {depth}"
+    );
+    assert!((longer.unit(&truth) - 1.0).abs() < 1e-9);
+    let two = [None, None, Some(0), Some(1)];
+    let held = Members { free: &two, ..members };
+    assert!(super::unit::Unit::of(&truth.keyframes, &held).is_none());
+}
