@@ -1,0 +1,47 @@
+//! The unit of a window that only one keyframe holds: no image sees it, so that it would wander.
+
+use crate::slam::window::keyframe::WindowKeyframe;
+use crate::slam::window::system::Members;
+
+/// The depths of the one keyframe that stays, before an adjustment.
+pub(super) struct Unit {
+    anchor: usize,
+    inverse_depths: Vec<f64>,
+}
+
+impl Unit {
+    /// Where exactly one keyframe stays.
+    pub(super) fn of(keyframes: &[WindowKeyframe], members: &Members<'_>) -> Option<Self> {
+        let pairs = members.members.iter().zip(members.free);
+        let mut fixed = pairs.filter(|(_, free)| free.is_none()).map(|(&member, _)| member);
+        let (Some(anchor), None) = (fixed.next(), fixed.next()) else { return None };
+        let points = keyframes[anchor].points.iter();
+        Some(Self { anchor, inverse_depths: points.map(|point| point.inverse_depth).collect() })
+    }
+
+    /// Scales depths and places about that keyframe, so that the median of its depths has not changed.
+    pub(super) fn restore(&self, keyframes: &mut [WindowKeyframe], members: &[usize]) {
+        let points = keyframes[self.anchor].points.iter().zip(&self.inverse_depths);
+        let alive = points.filter(|(point, _)| point.is_alive);
+        let mut ratios: Vec<f64> = alive.map(|(now, before)| now.inverse_depth / before).collect();
+        if ratios.is_empty() {
+            return;
+        }
+        let middle = ratios.len() / 2;
+        let factor = *ratios.select_nth_unstable_by(middle, f64::total_cmp).1;
+        if !(factor.is_finite() && factor > 0.0) {
+            return;
+        }
+        let anchor_from_map = keyframes[self.anchor].camera_from_map;
+        let map_from_anchor = anchor_from_map.inverse();
+        for &member in members {
+            let keyframe = &mut keyframes[member];
+            keyframe.points.iter_mut().for_each(|point| point.inverse_depth /= factor);
+            if member != self.anchor {
+                let mut camera_from_anchor = keyframe.camera_from_map * map_from_anchor;
+                camera_from_anchor.translation *= factor;
+                keyframe.camera_from_map = camera_from_anchor * anchor_from_map;
+            }
+        }
+    }
+}
