@@ -65,35 +65,55 @@ impl Sampler for Avx2Sampler {
     }
 }
 
+/// The grey values around eight positions, in the order of [`Corners`], and where the positions lie between them.
+///
 /// # Safety
 /// The processor has AVX2. Without the attribute that says so, because only that goes into the loop of
 /// the caller whatever its size.
 #[cfg(target_arch = "x86_64")]
 #[inline(always)]
-unsafe fn sample_avx2(image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> [f32; 8] {
+unsafe fn gather_avx2(
+    image: &QuadImage,
+    u: &[f32; 8],
+    v: &[f32; 8],
+) -> [std::arch::x86_64::__m256; 6] {
     use std::arch::x86_64::*;
 
     let quads = image.quads();
-    // SAFETY: AVX2 is this function's contract. What is loaded and stored are arrays of eight numbers,
-    // and every index is at most that of the last pixel, unsigned: images have less than 2³¹ pixels.
+    // SAFETY: AVX2 is this function's contract. What is loaded are arrays of eight numbers, and every index is at
+    // most that of the last pixel, unsigned: images have less than 2³¹ pixels.
     unsafe {
         let (u, v) = (_mm256_loadu_ps(u.as_ptr()), _mm256_loadu_ps(v.as_ptr()));
         let (column, row) = (_mm256_cvttps_epi32(u), _mm256_cvttps_epi32(v));
-        let fu = _mm256_sub_ps(u, _mm256_cvtepi32_ps(column));
-        let fv = _mm256_sub_ps(v, _mm256_cvtepi32_ps(row));
+        let du = _mm256_sub_ps(u, _mm256_cvtepi32_ps(column));
+        let dv = _mm256_sub_ps(v, _mm256_cvtepi32_ps(row));
         let width = _mm256_set1_epi32(image.width() as i32);
         let index = _mm256_add_epi32(_mm256_mullo_epi32(row, width), column);
         let last = _mm256_set1_epi32((quads.len() - 1) as i32);
         let index = _mm256_min_epu32(index, last);
         let quad = _mm256_i32gather_epi32::<4>(quads.as_ptr().cast(), index);
         let byte = _mm256_set1_epi32(255);
-        let p00 = _mm256_cvtepi32_ps(_mm256_and_si256(quad, byte));
-        let p10 = _mm256_cvtepi32_ps(_mm256_and_si256(_mm256_srli_epi32::<8>(quad), byte));
-        let p01 = _mm256_cvtepi32_ps(_mm256_and_si256(_mm256_srli_epi32::<16>(quad), byte));
-        let p11 = _mm256_cvtepi32_ps(_mm256_srli_epi32::<24>(quad));
-        let upper = _mm256_add_ps(p00, _mm256_mul_ps(fu, _mm256_sub_ps(p10, p00)));
-        let lower = _mm256_add_ps(p01, _mm256_mul_ps(fu, _mm256_sub_ps(p11, p01)));
-        let samples = _mm256_add_ps(upper, _mm256_mul_ps(fv, _mm256_sub_ps(lower, upper)));
+        let upper_left = _mm256_cvtepi32_ps(_mm256_and_si256(quad, byte));
+        let upper_right = _mm256_cvtepi32_ps(_mm256_and_si256(_mm256_srli_epi32::<8>(quad), byte));
+        let lower_left = _mm256_cvtepi32_ps(_mm256_and_si256(_mm256_srli_epi32::<16>(quad), byte));
+        let lower_right = _mm256_cvtepi32_ps(_mm256_srli_epi32::<24>(quad));
+        [upper_left, upper_right, lower_left, lower_right, du, dv]
+    }
+}
+
+/// # Safety
+/// As of [`gather_avx2`].
+#[cfg(target_arch = "x86_64")]
+#[inline(always)]
+unsafe fn sample_avx2(image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> [f32; 8] {
+    use std::arch::x86_64::*;
+
+    // SAFETY: this function's own contract; what is stored to are eight numbers.
+    unsafe {
+        let [p00, p10, p01, p11, du, dv] = gather_avx2(image, u, v);
+        let upper = _mm256_add_ps(p00, _mm256_mul_ps(du, _mm256_sub_ps(p10, p00)));
+        let lower = _mm256_add_ps(p01, _mm256_mul_ps(du, _mm256_sub_ps(p11, p01)));
+        let samples = _mm256_add_ps(upper, _mm256_mul_ps(dv, _mm256_sub_ps(lower, upper)));
         let mut out = [0.0; 8];
         _mm256_storeu_ps(out.as_mut_ptr(), samples);
         out
@@ -101,36 +121,19 @@ unsafe fn sample_avx2(image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> [f32; 8]
 }
 
 /// # Safety
-/// As of [`sample_avx2`].
+/// As of [`gather_avx2`].
 #[cfg(target_arch = "x86_64")]
 #[inline(always)]
 unsafe fn corners_avx2(image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> Corners {
-    use std::arch::x86_64::*;
-
-    let quads = image.quads();
-    let mut corners = Corners::default();
-    // SAFETY: as in `sample_avx2`.
-    unsafe {
-        let (u, v) = (_mm256_loadu_ps(u.as_ptr()), _mm256_loadu_ps(v.as_ptr()));
-        let (column, row) = (_mm256_cvttps_epi32(u), _mm256_cvttps_epi32(v));
-        let fu = _mm256_sub_ps(u, _mm256_cvtepi32_ps(column));
-        let fv = _mm256_sub_ps(v, _mm256_cvtepi32_ps(row));
-        let width = _mm256_set1_epi32(image.width() as i32);
-        let index = _mm256_add_epi32(_mm256_mullo_epi32(row, width), column);
-        let last = _mm256_set1_epi32((quads.len() - 1) as i32);
-        let index = _mm256_min_epu32(index, last);
-        let quad = _mm256_i32gather_epi32::<4>(quads.as_ptr().cast(), index);
-        let byte = _mm256_set1_epi32(255);
-        let store = |to: &mut [f32; 8], of: __m256| _mm256_storeu_ps(to.as_mut_ptr(), of);
-        let grey = |bytes: __m256i| _mm256_cvtepi32_ps(_mm256_and_si256(bytes, byte));
-        store(&mut corners.upper_left, grey(quad));
-        store(&mut corners.upper_right, grey(_mm256_srli_epi32::<8>(quad)));
-        store(&mut corners.lower_left, grey(_mm256_srli_epi32::<16>(quad)));
-        store(&mut corners.lower_right, grey(_mm256_srli_epi32::<24>(quad)));
-        store(&mut corners.du, fu);
-        store(&mut corners.dv, fv);
-    }
-    corners
+    // SAFETY: this function's own contract; what is stored to are eight numbers each.
+    let [upper_left, upper_right, lower_left, lower_right, du, dv] = unsafe {
+        gather_avx2(image, u, v).map(|lanes| {
+            let mut out = [0.0; 8];
+            std::arch::x86_64::_mm256_storeu_ps(out.as_mut_ptr(), lanes);
+            out
+        })
+    };
+    Corners { upper_left, upper_right, lower_left, lower_right, du, dv }
 }
 
 #[cfg(all(test, target_arch = "x86_64"))]

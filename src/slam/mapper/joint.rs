@@ -10,17 +10,25 @@ impl Mapper {
     /// The keyframes to be estimated together, where one has been added since the last time: to be given back with
     /// [`Mapper::end_adjustment`] after [`Window::optimise`], which may take its time.
     pub fn begin_adjustment(&mut self) -> Option<Box<Window>> {
+        let (mut window, is_new) = self.take_window()?;
+        if !is_new {
+            self.window = Some(window);
+            return None;
+        }
+        window.take_frames(&mut self.tracked, &mut self.spare_pixels);
+        Some(window)
+    }
+
+    /// The window with what is new in the map, and whether anything is. `None` where it is away, and before there is
+    /// anything to be estimated.
+    fn take_window(&mut self) -> Option<(Box<Window>, bool)> {
         let active = self.keyframe()?.keyframe_id;
         if self.depth.is_unit_open {
             return None;
         }
         let mut window = self.window.take()?;
-        if window.take_in(&self.map, active) {
-            window.take_frames(&mut self.tracked, &mut self.spare_pixels);
-            return Some(window);
-        }
-        self.window = Some(window);
-        None
+        let is_new = window.take_in(&self.map, active);
+        Some((window, is_new))
     }
 
     /// Takes the keyframes back and moves the map to where they are now.
@@ -48,12 +56,7 @@ impl Mapper {
     /// As [`Mapper::begin_adjustment`], where no more frames come: of all keyframes, new or not, and of the frames that
     /// still wait.
     pub fn begin_last_adjustment(&mut self) -> Option<Box<Window>> {
-        let active = self.keyframe()?.keyframe_id;
-        if self.depth.is_unit_open {
-            return None;
-        }
-        let mut window = self.window.take()?;
-        window.take_in(&self.map, active);
+        let (mut window, _) = self.take_window()?;
         window.take_frames(&mut self.tracked, &mut self.spare_pixels);
         window.conclude();
         Some(window)

@@ -6,7 +6,6 @@
 use crate::slam::geometry::se3::SE3;
 use crate::slam::window::Window;
 use crate::slam::window::keyframe::WindowKeyframe;
-use crate::slam::window::system::Members;
 
 /// Frames aligned with one adjustment: twice as many as come between two keyframes, so that those of an epoch's first
 /// keyframes are made up for without delaying it.
@@ -116,7 +115,6 @@ impl Window {
             return None;
         }
         members.push(self.keyframes.len());
-        let newest = members.len() - 1;
         self.keyframes.push(WindowKeyframe {
             keyframe_id: u64::MAX,
             epoch,
@@ -127,10 +125,7 @@ impl Window {
             points: Vec::new(),
             is_host: false,
         });
-        let free: Vec<_> = (0..members.len()).map(|k| (k == newest).then_some(0)).collect();
-        let members = Members { members: &members, free: &free, depths_are_free: false };
-        let is_aligned =
-            self.run(&members, &FRAME_LEVELS, MAX_ITERATIONS, |_, observer| observer == newest);
+        let is_aligned = self.align_last(&members, &FRAME_LEVELS, MAX_ITERATIONS);
         let placed = self.keyframes.pop()?;
         frame.pixels = placed.pixels;
         let system = &self.solver.system;

@@ -285,12 +285,15 @@ impl Window {
             return;
         }
         members.push(index);
-        let newest = members.len() - 1;
-        let free: Vec<_> = (0..members.len()).map(|k| (k == newest).then_some(0)).collect();
-        let members = Members { members: &members, free: &free, depths_are_free: false };
-        self.run(&members, &ALIGNMENT_LEVELS, MAX_ALIGNMENT_ITERATIONS, |_, observer| {
-            observer == newest
-        });
+        self.align_last(&members, &ALIGNMENT_LEVELS, MAX_ALIGNMENT_ITERATIONS);
+    }
+
+    /// Aligns the last of the members alone to the points of the others; false where its pose is not determined.
+    fn align_last(&mut self, members: &[usize], levels: &[usize], iterations: u32) -> bool {
+        let last = members.len() - 1;
+        let free: Vec<_> = (0..members.len()).map(|k| (k == last).then_some(0)).collect();
+        let members = Members { members, free: &free, depths_are_free: false };
+        self.run(&members, levels, iterations, |_, observer| observer == last)
     }
 
     /// Who takes part in the estimation of the newest keyframes.
@@ -302,16 +305,8 @@ impl Window {
         let num_free =
             if is_first { of_epoch.len() } else { self.params.num_free.min(of_epoch.len()) };
         let (older, free) = of_epoch.split_at(of_epoch.len() - num_free);
-        let mut fixed = self.covisible(older, &free[free.len().saturating_sub(2)..]);
-        let mut free = free.to_vec();
-        // The gauge.
-        let held = match (fixed.is_empty(), older.is_empty()) {
-            (_, true) => 1,
-            (true, false) => NUM_HELD.min(free.len()),
-            (false, false) => 0,
-        };
-        fixed.extend(free.drain(..held));
-        Chosen::new(fixed, &free, is_first)
+        let fixed = self.covisible(older, &free[free.len().saturating_sub(2)..]);
+        Chosen::new(fixed, free, older.is_empty(), is_first)
     }
 
     /// Of the older keyframes those that see most of what the newest see.
@@ -414,9 +409,17 @@ impl Window {
 }
 
 impl Chosen {
-    fn new(fixed: Vec<usize>, free: &[usize], is_first: bool) -> Self {
+    /// Those of `free` are, but for who holds the gauge: the first where nothing is older, the two oldest where no
+    /// other keyframe sees the same things.
+    fn new(fixed: Vec<usize>, free: &[usize], is_oldest: bool, is_first: bool) -> Self {
+        let held = match (is_oldest, fixed.is_empty()) {
+            (true, _) => 1,
+            (false, true) => NUM_HELD.min(free.len()),
+            (false, false) => 0,
+        };
         let mut members = fixed;
         members.extend(free);
+        let free = &free[held..];
         members.sort_unstable();
         let mut numbers = 0..;
         let number = |member| if free.contains(member) { numbers.next() } else { None };

@@ -66,7 +66,7 @@ fn spread(sizes: Vec<f64>) -> f64 {
 }
 
 /// The upper median; 0 of none.
-fn median(mut values: Vec<f64>) -> f64 {
+pub(super) fn median(mut values: Vec<f64>) -> f64 {
     if values.is_empty() {
         return 0.0;
     }

@@ -1,6 +1,7 @@
 //! The unit of a window that only one keyframe holds: no image sees it, so that it would wander.
 
 use crate::slam::window::keyframe::WindowKeyframe;
+use crate::slam::window::plane::median;
 use crate::slam::window::system::Members;
 
 /// The depths of the one keyframe that stays, before an adjustment.
@@ -23,12 +24,8 @@ impl Unit {
     pub(super) fn restore(&self, keyframes: &mut [WindowKeyframe], members: &[usize]) {
         let points = keyframes[self.anchor].points.iter().zip(&self.inverse_depths);
         let alive = points.filter(|(point, _)| point.is_alive);
-        let mut ratios: Vec<f64> = alive.map(|(now, before)| now.inverse_depth / before).collect();
-        if ratios.is_empty() {
-            return;
-        }
-        let middle = ratios.len() / 2;
-        let factor = *ratios.select_nth_unstable_by(middle, f64::total_cmp).1;
+        // 0 where no point is left.
+        let factor = median(alive.map(|(now, before)| now.inverse_depth / before).collect());
         if !(factor.is_finite() && factor > 0.0) {
             return;
         }
