@@ -10,7 +10,9 @@ use super::solver::Solver;
 use super::*;
 use crate::slam::depth::matching::PATTERN;
 use crate::slam::geometry::se3::SE3;
+use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::quads::QuadImage;
+use crate::slam::keyframe::Keyframe;
 use crate::slam::test_scene::{CAMERA, Random, Scene};
 
 const EASY: Robustness = Robustness { huber_grey: 1e3, most_energy: f32::INFINITY };
@@ -416,4 +418,81 @@ fn the_unit_stays_where_one_keyframe_holds_it() {
     let two = [None, None, Some(0), Some(1)];
     let held = Members { free: &two, ..members };
     assert!(super::unit::Unit::of(&truth.keyframes, &held).is_none());
+}
+
+#[test]
+fn a_plane_is_found_among_points_that_are_wrong() {
+    let mut random = Random::new(2);
+    let mut points: Vec<Correspondence> = (0..200)
+        .map(|_| {
+            let ray = [random.uniform() - 0.5, random.uniform() - 0.5];
+            let noise = 0.01 * random.normal();
+            Correspondence { ray, log_ratio: 0.3 - 0.2 * ray[0] + 0.1 * ray[1] + noise }
+        })
+        .collect();
+    points.iter_mut().step_by(5).for_each(|point| point.log_ratio += 1.0);
+    let found = plane::fit(&points).unwrap();
+    for (found, expected) in found.iter().zip([0.3, -0.2, 0.1]) {
+        assert!((found - expected).abs() < 0.01, "{found} {expected}");
+    }
+    // Too few for a plane, and too few for anything.
+    let [offset, per_x, per_y] = plane::fit(&points[..20]).unwrap();
+    assert!((offset - 0.3).abs() < 0.15 && (per_x, per_y) == (0.0, 0.0));
+    assert!(plane::fit(&points[..9]).is_none());
+}
+
+/// A keyframe of a map with its unit, without depth.
+fn in_map(keyframe_id: u64, epoch: u32, x: f64, unit: f64) -> Keyframe {
+    let place = SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() };
+    let keyframe = Keyframe::at(Sim3::new(place, unit), CAMERA, Vec::new(), Vec::new());
+    Keyframe { keyframe_id, epoch, ..keyframe }
+}
+
+#[test]
+fn keyframes_that_are_not_estimated_follow_the_last_before_them_that_moved() {
+    let mut window = Window::new(CAMERA, WindowParams::default());
+    let room = room(|_, _| (1.0, 0.0));
+    for (id, x) in [(3, 1.0), (5, 2.0)] {
+        let mut keyframe = room.keyframes[0].clone();
+        (keyframe.keyframe_id, keyframe.is_host) = (id, false);
+        keyframe.points.clear();
+        keyframe.camera_from_map.translation = [-x, 0.5, 0.0].into();
+        window.keyframes.push(keyframe);
+        window.moved.push(id);
+    }
+    // 4 was rejected, 6 came meanwhile, 2 stays, 7 is of another epoch.
+    let mut map = Map::default();
+    let others = [(2, 0, 0.5), (3, 0, 1.0), (4, 0, 1.5), (5, 0, 2.0), (6, 0, 2.5), (7, 1, 0.0)];
+    map.keyframes.extend(others.map(|(id, epoch, x)| in_map(id, epoch, x, 1.0)));
+    let correction = window.correction(&map);
+    let mut moved: Vec<_> = correction.keyframes.iter().map(|of| of.keyframe_id).collect();
+    moved.sort_unstable();
+    assert_eq!(moved, [3, 4, 5, 6]);
+    for of in &correction.keyframes {
+        let was = map.get(of.keyframe_id).unwrap().map_from_keyframe.rigid.translation;
+        let by = of.map_from_keyframe.rigid.translation - was;
+        assert!((by.y + 0.5).abs() < 1e-12 && by.x.abs() < 1e-12, "{} by {by}", of.keyframe_id);
+    }
+}
+
+#[test]
+fn a_frame_is_kept_in_the_unit_of_its_keyframe() {
+    let mut map = Map::default();
+    map.keyframes.push(in_map(3, 0, 1.0, 2.0));
+    let placed = |sequence, keyframe_id, x: f64| frames::PlacedFrame {
+        sequence,
+        keyframe_id,
+        keyframe_from_camera: SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() },
+    };
+    for of in [placed(9, 3, 5.0), placed(8, 3, 1.0), placed(9, 3, 3.0), placed(7, 4, 1.0)] {
+        map.place_frame(&of);
+    }
+    let kept: Vec<_> =
+        map.frames.iter().map(|of| (of.sequence, of.keyframe_from_camera.translation.x)).collect();
+    assert_eq!(kept, [(8, 0.5), (9, 1.5)]);
+    assert_eq!(
+        map.place(3, &map.frame(9).unwrap().keyframe_from_camera).unwrap().translation.x,
+        4.0
+    );
+    assert!(map.frame(7).is_none());
 }
