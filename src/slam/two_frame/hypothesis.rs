@@ -2,9 +2,9 @@
 //!
 //! With little parallax the energy has several minima (near and far exchanged, a translation taken for
 //! a rotation), and a fit that began in the wrong one stays there while the baseline grows. So each
-//! frame is fitted from where the two best fits of the frame before ended, from rest, from the mirrored
-//! solution and, once there is something to see, from a small step in each direction. Of the two best
-//! the earlier frames choose.
+//! frame is fitted from where the two best fits of the frame before ended, from there aligned with the
+//! depths that they found, from rest, from the mirrored solution and, once there is something to see,
+//! from a small step in each direction. Of the two best the earlier frames choose.
 
 use nalgebra::{Vector3, Vector6};
 use rayon::prelude::*;
@@ -14,8 +14,8 @@ use crate::slam::two_frame::fit::{FitInput, FitParams, FitScratch, Freedom, fit_
 use crate::slam::two_frame::system::State;
 use crate::slam::two_frame::witness::Witnesses;
 
-/// Survivors, rest, mirror and six directions.
-const MAX_HYPOTHESES: usize = NUM_SURVIVORS + 2 + 6;
+/// Survivors, the same aligned first, rest, mirror and six directions.
+const MAX_HYPOTHESES: usize = 2 * NUM_SURVIVORS + 2 + 6;
 /// Fits that go on to the finest level and to the next frame.
 const NUM_SURVIVORS: usize = 2;
 
@@ -78,11 +78,10 @@ impl Hypotheses {
         params: &FitParams,
     ) {
         self.propose(rotation, with_directions);
-        let fit_down_to = |finest: usize, from: usize, hypothesis: &mut Hypothesis| {
+        let fit_down_to = |finest: usize, from: usize, freedom, hypothesis: &mut Hypothesis| {
             for level in (finest..from).rev() {
                 let (state, scratch) = (&mut hypothesis.state, &mut hypothesis.scratch);
-                hypothesis.energy =
-                    fit_level(input, level, Freedom::Everything, state, scratch, params);
+                hypothesis.energy = fit_level(input, level, freedom, state, scratch, params);
             }
         };
         /// Level down to which every start is fitted: on 160 pixels across, one level coarser, a wrong
@@ -91,11 +90,14 @@ impl Hypotheses {
         let levels = input.images.len();
         let coarse = COARSE_LEVEL.min(levels - 1);
         let all = &mut self.all[..self.used];
-        all.par_iter_mut().for_each(|h| fit_down_to(coarse, levels, h));
+        let aligned = self.survivors..2 * self.survivors;
+        all[aligned].par_iter_mut().for_each(|h| fit_down_to(coarse, levels, Freedom::Pose, h));
+        all.par_iter_mut().for_each(|h| fit_down_to(coarse, levels, Freedom::Everything, h));
         all.sort_by(|a, b| a.energy.total_cmp(&b.energy));
         self.survivors = bring_forward_distinct(all);
         if coarse > 0 {
-            all[..self.survivors].par_iter_mut().for_each(|h| fit_down_to(0, coarse, h));
+            let best = all[..self.survivors].par_iter_mut();
+            best.for_each(|h| fit_down_to(0, coarse, Freedom::Everything, h));
             all[..self.survivors].sort_by(|a, b| a.energy.total_cmp(&b.energy));
         }
         (self.rival, self.heard) = (None, 0);
@@ -147,9 +149,15 @@ impl Hypotheses {
         (&mut best.state, &best.scratch)
     }
 
-    /// Sets the starts behind the survivors.
+    /// Sets the starts behind the survivors. First come the survivors once more, to be aligned with the depths that they
+    /// have before these are free: where the camera moved on by many pixels, depths end in wrong minima before the pose
+    /// is right.
     fn propose(&mut self, rotation: &State, with_directions: bool) {
         self.used = self.survivors;
+        for survivor in 0..self.survivors {
+            let state = self.all[survivor].state.clone();
+            self.add(&state, state.current_from_first, |d| d);
+        }
         self.add(rotation, rotation.current_from_first, |_| 1.0);
         if self.survivors > 0 {
             let best = self.all[0].state.clone();
