@@ -9,6 +9,7 @@ pub mod evidence;
 pub mod fit;
 pub mod hypothesis;
 pub mod lanes;
+mod lead;
 pub mod points;
 pub mod spread;
 pub mod system;
@@ -34,6 +35,7 @@ use crate::slam::two_frame::fit::{
     pose_covariance,
 };
 use crate::slam::two_frame::hypothesis::Hypotheses;
+use crate::slam::two_frame::lead::Lead;
 use crate::slam::two_frame::points::Points;
 use crate::slam::two_frame::spread::spread;
 use crate::slam::two_frame::system::State;
@@ -173,6 +175,7 @@ pub struct TwoFrameInitializer {
     least_residual: f64,
     /// Direction from the first camera to the one before, in the first frame.
     heading: Vector3<f64>,
+    lead: Lead,
     frames: u32,
     confirmed: u32,
     mismatches: u32,
@@ -211,6 +214,7 @@ impl TwoFrameInitializer {
             least_residual: f64::INFINITY,
             sorted: Vec::new(),
             heading: Vector3::zeros(),
+            lead: Lead::default(),
             frames: 0,
             confirmed: 0,
             mismatches: 0,
@@ -242,6 +246,7 @@ impl TwoFrameInitializer {
         self.variances.clear();
         self.significance = 0.0;
         self.least_residual = f64::INFINITY;
+        self.lead = Lead::default();
         (self.frames, self.confirmed, self.mismatches) = (0, 0, 0);
         true
     }
@@ -271,8 +276,13 @@ impl TwoFrameInitializer {
             }
         }
         self.witnesses.push(self.pyramid.levels(), &self.rotation, self.params.max_witnesses);
+        let travelled = self.current_from_first.inverse().translation;
+        let heading = travelled / travelled.norm().max(f64::MIN_POSITIVE);
+        let excess = evidence.rival.map_or(0.0, |rival| rival.excess);
+        let is_ahead = self.lead.observe(&heading, excess);
         let missing = evidence.missing(&self.params.evidence);
-        self.count_confirmation(missing.is_none());
+        let missing = missing.or((!is_ahead).then_some(Waiting::Rival));
+        self.count_confirmation(missing.is_none(), &heading);
         self.mismatches = if missing == Some(Waiting::Match) { self.mismatches + 1 } else { 0 };
         let state = match missing {
             None if self.confirmed >= self.params.confirming_frames => InitState::Proven,
@@ -392,18 +402,16 @@ impl TwoFrameInitializer {
     }
 
     /// Counts the frames in a row that prove the parallax and agree on where the camera went.
-    fn count_confirmation(&mut self, proves: bool) {
+    fn count_confirmation(&mut self, proves: bool, heading: &Vector3<f64>) {
         /// Cosine of 20°: a hand does not turn its path by more within a frame, a wrong minimum does.
         const MIN_AGREEMENT: f64 = 0.94;
-        let travelled = self.current_from_first.inverse().translation;
-        let heading = travelled / travelled.norm().max(f64::MIN_POSITIVE);
         let agrees = heading.dot(&self.heading) >= MIN_AGREEMENT;
         self.confirmed = match (proves, agrees) {
             (true, true) => self.confirmed + 1,
             (true, false) => 1,
             (false, _) => 0,
         };
-        self.heading = heading;
+        self.heading = *heading;
     }
 
     fn outcome(&self, state: InitState, evidence: Evidence) -> InitOutcome {

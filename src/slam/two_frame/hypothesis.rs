@@ -19,6 +19,9 @@ const MAX_HYPOTHESES: usize = 2 * NUM_SURVIVORS + 2 + 6;
 /// Fits that go on to the finest level and to the next frame.
 const NUM_SURVIVORS: usize = 2;
 
+/// Cosine of 30°: nearer directions are the same motion, seen inaccurately.
+pub(super) const RIVAL_COSINE: f64 = 0.87;
+
 /// One start and where it came to.
 #[derive(Debug)]
 struct Hypothesis {
@@ -108,8 +111,6 @@ impl Hypotheses {
 
     /// Puts that survivor first whose depths explain this frame and the earlier ones best.
     fn hear(&mut self, input: &FitInput<'_>, witnesses: &Witnesses, params: &FitParams) {
-        /// Cosine of 30°: nearer directions are the same motion, seen inaccurately.
-        const RIVAL_COSINE: f64 = 0.87;
         self.heard = witnesses.len();
         let together =
             |h: &Hypothesis| h.energy + witnesses.energy(input, &h.state.inverse_depths, params);
