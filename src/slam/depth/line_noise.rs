@@ -12,7 +12,8 @@ use crate::slam::parameter::{ParameterError, check_range};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LineNoiseParams {
-    /// Line noise over the scatter of matches along the line: what is common to all frames does not show in it.
+    /// Line noise over the scatter of matches along the line. What is common to all frames does not show in it; the
+    /// share of true depths within one standard deviation is what it was chosen by.
     pub scatter_ratio: f32,
     /// Least line noise, pixels: the scatter of a frame that hardly moved says little.
     pub min_px: f32,
@@ -24,7 +25,7 @@ pub struct LineNoiseParams {
 
 impl Default for LineNoiseParams {
     fn default() -> Self {
-        Self { scatter_ratio: 2.0, min_px: 0.05, max_px: 3.0, averaged_frames: 10.0 }
+        Self { scatter_ratio: 0.5, min_px: 0.05, max_px: 3.0, averaged_frames: 10.0 }
     }
 }
 
@@ -161,7 +162,7 @@ mod tests {
 
     #[test]
     fn the_estimate_follows_the_matches_and_stays_within_its_bounds() {
-        let params = LineNoiseParams::default();
+        let params = LineNoiseParams { scatter_ratio: 2.0, ..LineNoiseParams::default() };
         let mut line_noise = LineNoise::new(1.0);
         let (mut still, mut wild) = (Innovations::default(), Innovations::default());
         for _ in 0..1000 {
