@@ -1,7 +1,8 @@
 //! What the joint estimation costs: `cargo bench --bench window`.
 //!
 //! First one comparison of a pattern with its derivatives, by kernel; then an estimate of the newest keyframes after
-//! each new one of a walk through the simulated room, on one core, against the number of keyframes that there are.
+//! each new one of a walk through the simulated room, with the frames since the one before, on one core, against the
+//! number of keyframes that there are: 100, or `cargo bench --bench window -- 1000`.
 
 use std::hint::black_box;
 use std::time::Instant;
@@ -10,22 +11,24 @@ use rustix::time::{ClockId, clock_gettime};
 use semidense::capture::simulator::Simulator;
 use semidense::capture::simulator::params::SimulatorParams;
 use semidense::capture::source::FrameSource;
+use semidense::slam::alignment::kernel::Kernel;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::geometry::sim3::Sim3;
-use semidense::slam::image::quads::QuadImage;
+use semidense::slam::image::buffer::Image;
 use semidense::slam::keyframe::{DepthPoint, Keyframe};
 use semidense::slam::map::Map;
 use semidense::slam::window::Window;
-use semidense::slam::window::comparison_kernel::{
-    Kernel, Look, Pair, PairSums, Robustness, SAMPLES, Seen, compare_portable, kernel,
+use semidense::slam::window::comparison::{
+    Compared, LANES, Look, Pair, PairSums, Patterns, Robustness, SAMPLES, Wanted,
 };
+use semidense::slam::window::frames::TrackedFrame;
 use semidense::slam::window::params::WindowParams;
 
 /// Frames from a keyframe to the next.
 const INTERVAL: usize = 12;
-/// Frames in all.
-const FRAMES: usize = 1_200;
+/// Keyframes, unless a number is given.
+const KEYFRAMES: usize = 100;
 /// Patterns of a kernel's measurement: the points of a keyframe in seven others.
 const PATTERNS: usize = 2_100;
 /// Repetitions of it.
@@ -34,89 +37,103 @@ const REPEATS: usize = 200;
 const MIN_STEP: i32 = 8;
 
 fn main() {
-    let params = SimulatorParams { frames: FRAMES, ..SimulatorParams::default() };
+    let number = std::env::args().find_map(|argument| argument.parse().ok());
+    let keyframes: usize = number.unwrap_or(KEYFRAMES);
+    let params = SimulatorParams { frames: keyframes * INTERVAL, ..SimulatorParams::default() };
     let mut simulator =
         Simulator::new(params).expect("default values are valid but for the frames");
     let camera = simulator.intrinsics();
     let frame = simulator.raw_frame(0).expect("within the sequence").into_owned();
     comparisons(&camera, &frame);
-    walk(&mut simulator, &camera);
+    walk(&mut simulator, &camera, keyframes);
 }
 
 /// Nanoseconds of a comparison, by kernel.
 fn comparisons(camera: &Intrinsics, pixels: &[u8]) {
-    let mut image = QuadImage::with_size(camera.width, camera.height);
-    image.fill(pixels);
+    let image = Image::try_from_pixels(camera.width, camera.height, pixels.to_vec())
+        .expect("a frame has the camera's pixels");
     let observer_from_host = SE3 { translation: [0.05, 0.01, 0.0].into(), ..SE3::identity() };
-    let pair = Pair::new(&observer_from_host, camera);
+    let wanted = Wanted { poses: true, depths: true, host: true };
+    let pair = Pair::new(&observer_from_host, camera, wanted);
     // All count: the derivatives are made for each.
     let robustness = Robustness { huber_grey: 9.0, most_energy: f32::INFINITY };
     let look = Look { shape: [1.0; SAMPLES], weight: [0.5; SAMPLES] };
-    let rays: Vec<[f32; 2]> = (0..PATTERNS)
-        .map(|i| {
-            let (u, v) =
-                (60 + (i * 37) % (camera.width - 120), 60 + (i * 53) % (camera.height - 120));
-            let at =
-                |pixel: usize, centre: f64, focal: f64| ((pixel as f64 - centre) / focal) as f32;
-            [at(u, camera.cx, camera.fx), at(v, camera.cy, camera.fy)]
-        })
-        .collect();
+    let mut patterns = vec![Patterns::NONE; PATTERNS.div_ceil(LANES)];
+    for i in 0..PATTERNS {
+        let (u, v) = (60 + (i * 37) % (camera.width - 120), 60 + (i * 53) % (camera.height - 120));
+        let at = |pixel: usize, centre: f64, focal: f64| ((pixel as f64 - centre) / focal) as f32;
+        let ray = [at(u, camera.cx, camera.fx), at(v, camera.cy, camera.fy)];
+        patterns[i / LANES].set(i % LANES, &look, ray);
+        patterns[i / LANES].inverse_depth[i % LANES] = 0.5;
+    }
     println!(
         "one comparison of {SAMPLES} samples with derivatives, ns, best of {REPEATS} × {PATTERNS}"
     );
-    let kernels: [(&str, Kernel); 2] =
-        [("portable", compare_portable), ("this processor's", kernel())];
-    for (name, compare) in kernels {
+    let mut seen = vec![Compared::NONE; patterns.len()];
+    for kernel in Kernel::available() {
         let mut best = f64::INFINITY;
         for _ in 0..REPEATS {
             let mut sums = PairSums::default();
             let begin = Instant::now();
-            let mut seen = 0;
-            for ray in &rays {
-                let compared = compare(&image, &pair, &look, *ray, 0.5, &robustness, &mut sums);
-                seen += usize::from(matches!(compared, Seen::Same(..)));
-            }
-            best = best.min(begin.elapsed().as_secs_f64() / seen.max(1) as f64);
+            kernel.compare(&image, &pair, &patterns, &robustness, &mut seen, &mut sums);
+            let elapsed = begin.elapsed().as_secs_f64();
+            let counted = seen.iter().flat_map(|of| of.cost).filter(|cost| cost.is_finite());
+            best = best.min(elapsed / counted.count().max(1) as f64);
             black_box(&sums);
         }
-        println!("{name:20} {:6.1}", 1e9 * best);
+        println!("{:20} {:6.1}", format!("{kernel:?}"), 1e9 * best);
     }
 }
 
-/// Milliseconds of an estimate, against the number of keyframes.
-fn walk(simulator: &mut Simulator, camera: &Intrinsics) {
+/// Milliseconds of an estimate with the frames that are aligned again, against the number of keyframes.
+fn walk(simulator: &mut Simulator, camera: &Intrinsics, keyframes: usize) {
     let truth = simulator.ground_truth().to_vec();
+    let world_from_first = truth[0].world_from_camera;
     let mut window = Window::new(*camera, WindowParams::default());
     let mut map = Map::default();
+    let (mut frames, mut spare) = (Vec::new(), Vec::new());
     let mut times = Vec::new();
     println!("\nestimate after each new keyframe, ms of one core");
     println!(
-        "{:>9} {:>9} {:>12} {:>12} {:>9} {:>9}",
-        "keyframes", "free+held", "comparisons", "iterations", "snapshot", "estimate"
+        "{:>9} {:>9} {:>12} {:>12} {:>7} {:>9} {:>9}",
+        "keyframes", "free+held", "comparisons", "iterations", "frames", "snapshot", "estimate"
     );
-    for (id, index) in (0..FRAMES).step_by(INTERVAL).enumerate() {
-        let place = truth[0].world_from_camera.inverse() * truth[index].world_from_camera;
+    for id in 0..keyframes {
+        let index = id * INTERVAL;
+        let world_from_keyframe = truth[index].world_from_camera;
+        let place = world_from_first.inverse() * world_from_keyframe;
         map.keyframes.push(keyframe(simulator, camera, id as u64, index, place));
         let begin = cpu_secs();
-        if !window.take_in(&map, id as u64) {
-            continue;
+        if window.take_in(&map, id as u64) {
+            window.take_frames(&mut frames, &mut spare);
+            let snapshot = cpu_secs() - begin;
+            let begin = cpu_secs();
+            let adjusted = window.optimise();
+            let estimate = cpu_secs() - begin;
+            let placed = window.take_placed().len();
+            if id >= WindowParams::default().num_first {
+                times.push(estimate);
+            }
+            if let Some(adjusted) = adjusted
+                && (id + 1) % (keyframes / 10).max(1) == 0
+            {
+                let members = format!("{}+{}", adjusted.free, adjusted.fixed);
+                let (compared, iterations) = (adjusted.comparisons, adjusted.iterations);
+                let [snapshot, estimate] = [snapshot, estimate].map(|secs| 1e3 * secs);
+                println!(
+                    "{:9} {members:>9} {compared:12} {iterations:12} {placed:7} {snapshot:9.2} {estimate:9.1}",
+                    id + 1
+                );
+            }
         }
-        let snapshot = cpu_secs() - begin;
-        let begin = cpu_secs();
-        let adjusted = window.optimise();
-        let estimate = cpu_secs() - begin;
-        let Some(adjusted) = adjusted else { continue };
-        if id > WindowParams::default().num_first {
-            times.push(estimate);
-        }
-        if id % 10 == 9 {
-            let members = format!("{}+{}", adjusted.free, adjusted.fixed);
-            let (compared, iterations) = (adjusted.comparisons, adjusted.iterations);
-            let [snapshot, estimate] = [snapshot, estimate].map(|secs| 1e3 * secs);
-            println!(
-                "{:9} {members:>9} {compared:12} {iterations:12} {snapshot:9.2} {estimate:9.1}",
-                id + 1
-            );
+        for between in index + 1..index + INTERVAL {
+            let world_from_camera = truth[between].world_from_camera;
+            frames.push(TrackedFrame {
+                sequence: between as u64,
+                keyframe_id: id as u64,
+                keyframe_from_camera: world_from_keyframe.inverse() * world_from_camera,
+                pixels: simulator.raw_frame(between).expect("within the sequence").into_owned(),
+            });
         }
     }
     times.sort_by(f64::total_cmp);

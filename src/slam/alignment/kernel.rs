@@ -5,11 +5,11 @@
 //! the same bits on every CPU. `residual::accumulate_reference` is the explanation of all.
 
 mod accumulate_kernel;
-mod lanes_kernel;
+pub(in crate::slam) mod lanes_kernel;
 mod mode_kernel;
 #[cfg(target_arch = "aarch64")]
 mod neon_kernel;
-mod portable_kernel;
+pub(in crate::slam) mod portable_kernel;
 mod scatter_kernel;
 #[cfg(target_arch = "x86_64")]
 mod x86_kernel;

@@ -8,23 +8,6 @@ pub struct QuadImage {
     quads: Vec<u32>,
 }
 
-/// The four pixels around each of eight positions, grey levels, and where the positions lie between them.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Corners {
-    /// The pixel itself.
-    pub upper_left: [f32; 8],
-    /// Its right neighbour.
-    pub upper_right: [f32; 8],
-    /// Its lower one.
-    pub lower_left: [f32; 8],
-    /// The lower right one.
-    pub lower_right: [f32; 8],
-    /// From the pixel to the right, 0 to 1.
-    pub du: [f32; 8],
-    /// And down.
-    pub dv: [f32; 8],
-}
-
 impl QuadImage {
     /// A black image.
     pub fn with_size(width: usize, height: usize) -> Self {
@@ -60,25 +43,6 @@ impl QuadImage {
     /// All pixels with their neighbours, lowest byte first: the pixel, right, lower, lower right.
     pub fn quads(&self) -> &[u32] {
         &self.quads
-    }
-
-    /// The pixels around eight positions, each at least a pixel from the border; elsewhere some pixels.
-    #[inline(always)]
-    pub fn corners(&self, u: &[f32; 8], v: &[f32; 8]) -> Corners {
-        let mut corners = Corners::default();
-        let last = self.quads.len() - 1;
-        for k in 0..8 {
-            let (column, row) = (u[k] as i32, v[k] as i32);
-            let index = row.wrapping_mul(self.width as i32).wrapping_add(column);
-            let quad = self.quads[(index as u32 as usize).min(last)];
-            corners.upper_left[k] = (quad & 255) as f32;
-            corners.upper_right[k] = (quad >> 8 & 255) as f32;
-            corners.lower_left[k] = (quad >> 16 & 255) as f32;
-            corners.lower_right[k] = (quad >> 24) as f32;
-            corners.du[k] = u[k] - column as f32;
-            corners.dv[k] = v[k] - row as f32;
-        }
-        corners
     }
 
     /// Bilinear samples at eight positions, each at least a pixel from the border; elsewhere the

@@ -1,13 +1,11 @@
 //! Bilinear samples of a [`QuadImage`] in vector registers.
 
-use crate::slam::image::quads::{Corners, QuadImage};
+use crate::slam::image::quads::QuadImage;
 
 /// A way to take eight bilinear samples; all ways give the same bits.
 pub trait Sampler: Copy {
     /// What [`QuadImage::sample`] explains.
     fn sample(self, image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> [f32; 8];
-    /// What [`QuadImage::corners`] explains.
-    fn corners(self, image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> Corners;
 }
 
 /// An image and the way to sample it.
@@ -27,11 +25,6 @@ impl Sampler for PortableSampler {
     #[inline(always)]
     fn sample(self, image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> [f32; 8] {
         image.sample(u, v)
-    }
-
-    #[inline(always)]
-    fn corners(self, image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> Corners {
-        image.corners(u, v)
     }
 }
 
@@ -57,83 +50,41 @@ impl Sampler for Avx2Sampler {
         // SAFETY: who made the sampler vouched for AVX2.
         unsafe { sample_avx2(image, u, v) }
     }
-
-    #[inline(always)]
-    fn corners(self, image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> Corners {
-        // SAFETY: who made the sampler vouched for AVX2.
-        unsafe { corners_avx2(image, u, v) }
-    }
 }
 
-/// The grey values around eight positions, in the order of [`Corners`], and where the positions lie between them.
-///
 /// # Safety
 /// The processor has AVX2. Without the attribute that says so, because only that goes into the loop of
 /// the caller whatever its size.
 #[cfg(target_arch = "x86_64")]
 #[inline(always)]
-unsafe fn gather_avx2(
-    image: &QuadImage,
-    u: &[f32; 8],
-    v: &[f32; 8],
-) -> [std::arch::x86_64::__m256; 6] {
+unsafe fn sample_avx2(image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> [f32; 8] {
     use std::arch::x86_64::*;
 
     let quads = image.quads();
-    // SAFETY: AVX2 is this function's contract. What is loaded are arrays of eight numbers, and every index is at
-    // most that of the last pixel, unsigned: images have less than 2³¹ pixels.
+    // SAFETY: AVX2 is this function's contract. What is loaded and stored are arrays of eight numbers,
+    // and every index is at most that of the last pixel, unsigned: images have less than 2³¹ pixels.
     unsafe {
         let (u, v) = (_mm256_loadu_ps(u.as_ptr()), _mm256_loadu_ps(v.as_ptr()));
         let (column, row) = (_mm256_cvttps_epi32(u), _mm256_cvttps_epi32(v));
-        let du = _mm256_sub_ps(u, _mm256_cvtepi32_ps(column));
-        let dv = _mm256_sub_ps(v, _mm256_cvtepi32_ps(row));
+        let fu = _mm256_sub_ps(u, _mm256_cvtepi32_ps(column));
+        let fv = _mm256_sub_ps(v, _mm256_cvtepi32_ps(row));
         let width = _mm256_set1_epi32(image.width() as i32);
         let index = _mm256_add_epi32(_mm256_mullo_epi32(row, width), column);
         let last = _mm256_set1_epi32((quads.len() - 1) as i32);
         let index = _mm256_min_epu32(index, last);
         let quad = _mm256_i32gather_epi32::<4>(quads.as_ptr().cast(), index);
         let byte = _mm256_set1_epi32(255);
-        let upper_left = _mm256_cvtepi32_ps(_mm256_and_si256(quad, byte));
-        let upper_right = _mm256_cvtepi32_ps(_mm256_and_si256(_mm256_srli_epi32::<8>(quad), byte));
-        let lower_left = _mm256_cvtepi32_ps(_mm256_and_si256(_mm256_srli_epi32::<16>(quad), byte));
-        let lower_right = _mm256_cvtepi32_ps(_mm256_srli_epi32::<24>(quad));
-        [upper_left, upper_right, lower_left, lower_right, du, dv]
-    }
-}
-
-/// # Safety
-/// As of [`gather_avx2`].
-#[cfg(target_arch = "x86_64")]
-#[inline(always)]
-unsafe fn sample_avx2(image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> [f32; 8] {
-    use std::arch::x86_64::*;
-
-    // SAFETY: this function's own contract; what is stored to are eight numbers.
-    unsafe {
-        let [p00, p10, p01, p11, du, dv] = gather_avx2(image, u, v);
-        let upper = _mm256_add_ps(p00, _mm256_mul_ps(du, _mm256_sub_ps(p10, p00)));
-        let lower = _mm256_add_ps(p01, _mm256_mul_ps(du, _mm256_sub_ps(p11, p01)));
-        let samples = _mm256_add_ps(upper, _mm256_mul_ps(dv, _mm256_sub_ps(lower, upper)));
+        let p00 = _mm256_cvtepi32_ps(_mm256_and_si256(quad, byte));
+        let p10 = _mm256_cvtepi32_ps(_mm256_and_si256(_mm256_srli_epi32::<8>(quad), byte));
+        let p01 = _mm256_cvtepi32_ps(_mm256_and_si256(_mm256_srli_epi32::<16>(quad), byte));
+        let p11 = _mm256_cvtepi32_ps(_mm256_srli_epi32::<24>(quad));
+        let upper = _mm256_add_ps(p00, _mm256_mul_ps(fu, _mm256_sub_ps(p10, p00)));
+        let lower = _mm256_add_ps(p01, _mm256_mul_ps(fu, _mm256_sub_ps(p11, p01)));
+        let samples = _mm256_add_ps(upper, _mm256_mul_ps(fv, _mm256_sub_ps(lower, upper)));
         let mut out = [0.0; 8];
         _mm256_storeu_ps(out.as_mut_ptr(), samples);
         out
     }
-}
-
-/// # Safety
-/// As of [`gather_avx2`].
-#[cfg(target_arch = "x86_64")]
-#[inline(always)]
-unsafe fn corners_avx2(image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> Corners {
-    // SAFETY: this function's own contract; what is stored to are eight numbers each.
-    let [upper_left, upper_right, lower_left, lower_right, du, dv] = unsafe {
-        gather_avx2(image, u, v).map(|lanes| {
-            let mut out = [0.0; 8];
-            std::arch::x86_64::_mm256_storeu_ps(out.as_mut_ptr(), lanes);
-            out
-        })
-    };
-    Corners { upper_left, upper_right, lower_left, lower_right, du, dv }
 }
 
 #[cfg(all(test, target_arch = "x86_64"))]
@@ -157,7 +108,6 @@ mod tests {
             let v: [f32; 8] = std::array::from_fn(|k| place(5 * i + 3 * k, height));
             let bits = |samples: [f32; 8]| samples.map(f32::to_bits);
             assert_eq!(bits(sampler.sample(&image, &u, &v)), bits(image.sample(&u, &v)));
-            assert_eq!(sampler.corners(&image, &u, &v), image.corners(&u, &v));
         }
         let wild = [f32::NAN, f32::INFINITY, -5.0, 1e9, -1e9, 0.0, 36.0, 200.0];
         let _harmless = sampler.sample(&image, &wild, &[22.5; 8]);

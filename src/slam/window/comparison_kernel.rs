@@ -1,318 +1,441 @@
-//! One point compared with one keyframe: eight residuals, their derivatives and their sums.
+//! The comparison in lanes: each lane is a point, the samples of its pattern come one after the other.
 //!
-//! `X' = R X + t` with (R, t) = `observer_from_host`, X at the host's pixel and the point's inverse depth d; with the
-//! image of the observer I and its gradient g at π(X'):
-//!
-//! `r_k = I(π(X'_k)) − m h_k`, `h_k` the host's samples over their mean, `m` the mean of the observer's: every pattern
-//! has a gain of its own, so that vignette, exposure and response need no model. It costs one degree of freedom of
-//! eight. `j = (g_x f_x/z', g_y f_y/z', −(g_x f_x x' + g_y f_y y')/z'²)`, `∂r/∂δ = (j, X'×j)` for the observer's pose
-//! (left increment), `∂r/∂d = j·t/d`; then `J_k ← J_k − h_k · mean(J)`. X' is scaled by d throughout, so that points at
-//! infinity are finite.
-//!
-//! The eight samples of the pattern are the lanes. One source for all processors: no operation is fused or reordered,
-//! so every version gives the same bits.
+//! Nothing is summed across lanes and nothing is fused, so that all instruction sets give the same bits.
 
-use crate::slam::depth::matching::PATTERN;
-use crate::slam::geometry::intrinsics::Intrinsics;
-use crate::slam::geometry::se3::SE3;
-use crate::slam::image::quads::QuadImage;
-#[cfg(target_arch = "x86_64")]
-use crate::slam::image::quads_kernel::Avx2Sampler;
-use crate::slam::image::quads_kernel::{PortableSampler, Sampler};
+use crate::slam::alignment::kernel::Kernel;
+use crate::slam::alignment::kernel::lanes_kernel::Lanes;
+use crate::slam::alignment::kernel::portable_kernel::FourLanes;
+use crate::slam::image::buffer::Image;
+use crate::slam::window::comparison::{
+    BORDER_PX, Compared, LANES, Lane, POSE, Pair, PairSums, Patterns, Robustness, SAMPLES, fits,
+};
 
-/// Samples of a pattern.
-pub const SAMPLES: usize = PATTERN.len();
-/// Parameters of a pose.
-pub const POSE: usize = 6;
-/// Entries of the upper triangle of a pose's normal equations.
-pub const TRIANGLE: usize = POSE * (POSE + 1) / 2;
 /// Smallest z'/z of a point: nearer than a twentieth of its distance it is not seen as it was.
 const MIN_DEPTH_RATIO: f32 = 0.05;
-/// Pixels at the border of an observer that are not read.
-const BORDER_PX: f32 = 1.0;
 
-type Lanes = [f32; SAMPLES];
-
-/// What a point looks like in its host, at one level.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Look {
-    /// Samples over their mean.
-    pub shape: Lanes,
-    /// Weight by the gradient: sub-pixel errors show there. All 0 where the pattern leaves the image or is dark.
-    pub weight: Lanes,
-}
-
-impl Look {
-    /// Whether there is a pattern at all.
-    pub fn is_whole(&self) -> bool {
-        self.weight[0] > 0.0
-    }
-}
-
-/// How residuals count.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Robustness {
-    /// Residuals beyond grow linearly, grey levels.
-    pub huber_grey: f32,
-    /// Energy above which a comparison is of something else.
-    pub most_energy: f32,
-}
-
-/// Where an observer stands from a host, at one level.
-#[derive(Debug, Clone, Copy)]
-pub struct Pair {
-    rotation: [[f32; 3]; 3],
-    translation: [f32; 3],
-    /// R times what the pattern's offsets add to the ray.
-    offsets: [Lanes; 3],
-    focal: [f32; 2],
-    centre: [f32; 2],
-    /// Largest position that is read.
-    last: [f32; 2],
-}
-
-/// Sums of a comparison that belong to its point.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct PointSums {
-    /// Σ w J ∂r/∂d of the observer's pose.
-    pub mixed: [f32; POSE],
-    /// Σ w (∂r/∂d)².
-    pub depth: f32,
-    /// Σ w r ∂r/∂d.
-    pub depth_right: f32,
-}
-
-/// Sums of the comparisons of a host with an observer, by lane.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct PairSums {
-    /// Σ w J Jᵀ of the observer's pose, rows of the upper triangle.
-    pub pose: [Lanes; TRIANGLE],
-    /// Σ w J r.
-    pub right: [Lanes; POSE],
-}
-
-impl Default for PairSums {
-    fn default() -> Self {
-        Self { pose: [[0.0; SAMPLES]; TRIANGLE], right: [[0.0; SAMPLES]; POSE] }
-    }
-}
-
-/// What a comparison came to.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Seen {
-    /// A sample is outside the image or behind the camera.
-    Outside,
-    /// Something else is seen: it counts the most that it may.
-    Other,
-    /// It counts, with this robust cost, grey levels².
-    Same(f32, PointSums),
-}
-
-impl Pair {
-    /// Of images of `camera`, which is that of the level.
-    pub fn new(observer_from_host: &SE3, camera: &Intrinsics) -> Self {
-        let of = observer_from_host.rotation_matrix();
-        let rotation = [0, 1, 2].map(|row| [0, 1, 2].map(|column| of[(row, column)] as f32));
-        let translation = [0, 1, 2].map(|row| observer_from_host.translation[row] as f32);
-        let Intrinsics { fx, fy, cx, cy, width, height } = *camera;
-        let offsets = [0, 1, 2].map(|row| {
-            PATTERN.map(|(du, dv)| {
-                (of[(row, 0)] * f64::from(du) / fx + of[(row, 1)] * f64::from(dv) / fy) as f32
-            })
-        });
-        let last = |side: usize| side as f32 - 2.0 - BORDER_PX;
-        Self {
-            rotation,
-            translation,
-            offsets,
-            focal: [fx as f32, fy as f32],
-            centre: [cx as f32, cy as f32],
-            last: [last(width), last(height)],
+impl Kernel {
+    /// Compares the points of `patterns` with an observer and adds those that count to the sums of the pair. As many
+    /// blocks of `compared` are written as there are patterns; none where the image is smaller than the pair's camera.
+    pub fn compare(
+        self,
+        image: &Image<u8>,
+        pair: &Pair,
+        patterns: &[Patterns],
+        robustness: &Robustness,
+        compared: &mut [Compared],
+        sums: &mut PairSums,
+    ) {
+        if !fits(image, pair) {
+            compared.fill(Compared::NONE);
+            return;
+        }
+        match self {
+            // SAFETY: plain arithmetic needs no instructions; the bounds were checked above.
+            Self::Portable => unsafe {
+                compare::<FourLanes>(image, pair, patterns, robustness, compared, sums);
+            },
+            // SAFETY: only `available` makes this value, after it has found AVX2; the bounds were checked above.
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2 => unsafe {
+                compare_avx2(image, pair, patterns, robustness, compared, sums);
+            },
+            // SAFETY: as above with AVX-512F.
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512 => unsafe {
+                compare_avx512(image, pair, patterns, robustness, compared, sums);
+            },
+            // SAFETY: as above with NEON.
+            #[cfg(target_arch = "aarch64")]
+            Self::Neon => unsafe {
+                compare_neon(image, pair, patterns, robustness, compared, sums);
+            },
         }
     }
 }
 
-/// A version of the comparison: of the image, where the observer stands, the point's look, ray and inverse depth.
-pub type Kernel = fn(&QuadImage, &Pair, &Look, [f32; 2], f32, &Robustness, &mut PairSums) -> Seen;
-
-/// The best version for this processor.
-pub fn kernel() -> Kernel {
-    #[cfg(target_arch = "x86_64")]
-    if std::arch::is_x86_feature_detected!("avx2") {
-        let has_avx512 = std::arch::is_x86_feature_detected!("avx512f")
-            && std::arch::is_x86_feature_detected!("avx512vl")
-            && std::arch::is_x86_feature_detected!("avx512bw")
-            && std::arch::is_x86_feature_detected!("avx512dq");
-        if has_avx512 {
-            return |image, pair, look, ray, depth, robustness, sums| {
-                // SAFETY: the processor has these, as was just asked.
-                unsafe { compare_avx512(image, pair, look, ray, depth, robustness, sums) }
-            };
-        }
-        return |image, pair, look, ray, depth, robustness, sums| {
-            // SAFETY: the processor has AVX2, as was just asked.
-            unsafe { compare_avx2(image, pair, look, ray, depth, robustness, sums) }
-        };
-    }
-    compare_portable
-}
-
-/// The explanation of the others.
-pub fn compare_portable(
-    image: &QuadImage,
-    pair: &Pair,
-    look: &Look,
-    ray: [f32; 2],
-    inverse_depth: f32,
-    robustness: &Robustness,
-    sums: &mut PairSums,
-) -> Seen {
-    compare(PortableSampler, image, pair, look, ray, inverse_depth, robustness, sums)
-}
-
+/// # Safety
+/// The processor has AVX2; the image is as large as the pair's camera says.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn compare_avx2(
-    image: &QuadImage,
+unsafe fn compare_avx2(
+    image: &Image<u8>,
     pair: &Pair,
-    look: &Look,
-    ray: [f32; 2],
-    inverse_depth: f32,
+    patterns: &[Patterns],
     robustness: &Robustness,
+    compared: &mut [Compared],
     sums: &mut PairSums,
-) -> Seen {
-    // SAFETY: this function asks for AVX2.
-    let sampler = unsafe { Avx2Sampler::new() };
-    compare(sampler, image, pair, look, ray, inverse_depth, robustness, sums)
+) {
+    use std::arch::x86_64::__m256;
+    // SAFETY: this function's own contract.
+    unsafe { compare::<__m256>(image, pair, patterns, robustness, compared, sums) }
 }
 
+/// # Safety
+/// The processor has AVX-512F; the image is as large as the pair's camera says.
 #[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2,avx512f,avx512vl,avx512bw,avx512dq")]
-fn compare_avx512(
-    image: &QuadImage,
+#[target_feature(enable = "avx512f")]
+unsafe fn compare_avx512(
+    image: &Image<u8>,
     pair: &Pair,
-    look: &Look,
-    ray: [f32; 2],
-    inverse_depth: f32,
+    patterns: &[Patterns],
     robustness: &Robustness,
+    compared: &mut [Compared],
     sums: &mut PairSums,
-) -> Seen {
-    // SAFETY: this function asks for AVX2.
-    let sampler = unsafe { Avx2Sampler::new() };
-    compare(sampler, image, pair, look, ray, inverse_depth, robustness, sums)
+) {
+    use std::arch::x86_64::__m512;
+    // SAFETY: this function's own contract.
+    unsafe { compare::<__m512>(image, pair, patterns, robustness, compared, sums) }
 }
 
-/// Compares a point, whose ray at depth 1 and inverse depth in the host these are, and adds to the sums of the pair
-/// where it counts.
-#[inline(always)]
-#[allow(clippy::too_many_arguments, reason = "one call a pattern; a struct would be made for each")]
-fn compare<S: Sampler>(
-    sampler: S,
-    image: &QuadImage,
+/// # Safety
+/// The processor has NEON; the image is as large as the pair's camera says.
+#[cfg(target_arch = "aarch64")]
+#[target_feature(enable = "neon")]
+unsafe fn compare_neon(
+    image: &Image<u8>,
     pair: &Pair,
-    look: &Look,
-    ray: [f32; 2],
-    inverse_depth: f32,
+    patterns: &[Patterns],
     robustness: &Robustness,
+    compared: &mut [Compared],
     sums: &mut PairSums,
-) -> Seen {
-    let centre: [f32; 3] = std::array::from_fn(|row| {
-        let of = &pair.rotation[row];
-        of[0] * ray[0] + of[1] * ray[1] + of[2] + inverse_depth * pair.translation[row]
-    });
-    // X' d, and where it is seen.
-    let scaled: [Lanes; 3] =
-        std::array::from_fn(|row| std::array::from_fn(|k| centre[row] + pair.offsets[row][k]));
-    let nearness: Lanes = std::array::from_fn(|k| 1.0 / scaled[2][k]);
-    let x: Lanes = std::array::from_fn(|k| scaled[0][k] * nearness[k]);
-    let y: Lanes = std::array::from_fn(|k| scaled[1][k] * nearness[k]);
-    let u: Lanes = std::array::from_fn(|k| pair.focal[0] * x[k] + pair.centre[0]);
-    let v: Lanes = std::array::from_fn(|k| pair.focal[1] * y[k] + pair.centre[1]);
-    let is_inside = (0..SAMPLES).fold(true, |inside, k| {
-        inside
-            & (scaled[2][k] >= MIN_DEPTH_RATIO)
-            & (u[k] >= BORDER_PX)
-            & (u[k] <= pair.last[0])
-            & (v[k] >= BORDER_PX)
-            & (v[k] <= pair.last[1])
-    });
-    if !is_inside {
-        return Seen::Outside;
-    }
-    let corners = sampler.corners(image, &u, &v);
-    let mut observed = [0.0; SAMPLES];
-    let mut gradient = [[0.0; SAMPLES]; 2];
-    for k in 0..SAMPLES {
-        let upper = corners.upper_right[k] - corners.upper_left[k];
-        let lower = corners.lower_right[k] - corners.lower_left[k];
-        let top = corners.upper_left[k] + corners.du[k] * upper;
-        let bottom = corners.lower_left[k] + corners.du[k] * lower;
-        observed[k] = top + corners.dv[k] * (bottom - top);
-        gradient[0][k] = upper + corners.dv[k] * (lower - upper);
-        gradient[1][k] = bottom - top;
-    }
-    let observed_mean = mean(&observed);
-    let residual: Lanes = std::array::from_fn(|k| observed[k] - observed_mean * look.shape[k]);
-    let mut weight = [0.0; SAMPLES];
-    let mut cost = [0.0; SAMPLES];
-    for k in 0..SAMPLES {
-        let huber = (robustness.huber_grey / residual[k].abs().max(robustness.huber_grey)).min(1.0);
-        weight[k] = look.weight[k] * huber;
-        cost[k] = weight[k] * (2.0 - huber) * residual[k] * residual[k];
-    }
-    let energy = sum(&cost);
-    if !(energy <= robustness.most_energy) {
-        return Seen::Other;
-    }
-    // j/d.
-    let along_x: Lanes = std::array::from_fn(|k| gradient[0][k] * pair.focal[0] * nearness[k]);
-    let along_y: Lanes = std::array::from_fn(|k| gradient[1][k] * pair.focal[1] * nearness[k]);
-    let along_z: Lanes = std::array::from_fn(|k| -(along_x[k] * x[k] + along_y[k] * y[k]));
-    let mut jacobian = [[0.0; SAMPLES]; POSE + 1];
-    for k in 0..SAMPLES {
-        jacobian[0][k] = inverse_depth * along_x[k];
-        jacobian[1][k] = inverse_depth * along_y[k];
-        jacobian[2][k] = inverse_depth * along_z[k];
-        jacobian[3][k] = scaled[1][k] * along_z[k] - scaled[2][k] * along_y[k];
-        jacobian[4][k] = scaled[2][k] * along_x[k] - scaled[0][k] * along_z[k];
-        jacobian[5][k] = scaled[0][k] * along_y[k] - scaled[1][k] * along_x[k];
-        jacobian[6][k] = along_x[k] * pair.translation[0]
-            + along_y[k] * pair.translation[1]
-            + along_z[k] * pair.translation[2];
-    }
-    for row in &mut jacobian {
-        let common = mean(row);
-        for k in 0..SAMPLES {
-            row[k] -= look.shape[k] * common;
-        }
-    }
-    let mut entry = 0;
-    for a in 0..POSE {
-        let weighted: Lanes = std::array::from_fn(|k| weight[k] * jacobian[a][k]);
-        for row in &jacobian[a..POSE] {
-            for k in 0..SAMPLES {
-                sums.pose[entry][k] += weighted[k] * row[k];
+) {
+    use std::arch::aarch64::float32x4_t;
+    // SAFETY: this function's own contract.
+    unsafe { compare::<float32x4_t>(image, pair, patterns, robustness, compared, sums) }
+}
+
+/// # Safety
+/// The processor has the instructions of `L`; the image is as large as the pair's camera says.
+#[inline(always)]
+unsafe fn compare<L: Lanes>(
+    image: &Image<u8>,
+    pair: &Pair,
+    patterns: &[Patterns],
+    robustness: &Robustness,
+    compared: &mut [Compared],
+    sums: &mut PairSums,
+) {
+    // SAFETY: this function's own contract; `lane` + N is at most sixteen.
+    unsafe {
+        for (of, out) in patterns.iter().zip(compared) {
+            for lane in (0..LANES).step_by(L::N) {
+                let warped = warp::<L>(of, lane, pair, image);
+                let seen = weigh::<L>(of, lane, &warped, robustness, &mut out.cost);
+                let motion = Motion::of(pair, &warped);
+                if pair.wanted.depths {
+                    derive_depths(lane, pair, &motion, &seen, out);
+                }
+                if pair.wanted.poses {
+                    derive_poses(lane, &motion, &seen, sums);
+                }
             }
-            entry += 1;
-        }
-        for k in 0..SAMPLES {
-            sums.right[a][k] += weighted[k] * residual[k];
         }
     }
-    let weighted: Lanes = std::array::from_fn(|k| weight[k] * jacobian[POSE][k]);
-    let product = |row: &Lanes| sum(&std::array::from_fn(|k| weighted[k] * row[k]));
-    let mixed = std::array::from_fn(|a| product(&jacobian[a]));
-    let depth = product(&jacobian[POSE]);
-    Seen::Same(energy, PointSums { mixed, depth, depth_right: product(&residual) })
 }
 
-/// In an order that vectors add in.
-#[inline(always)]
-pub fn sum(of: &Lanes) -> f32 {
-    ((of[0] + of[4]) + (of[2] + of[6])) + ((of[1] + of[5]) + (of[3] + of[7]))
+/// Some points in the observer's image.
+struct Warped<L: Lanes> {
+    /// All samples are inside the image.
+    inside: L::Mask,
+    /// X' over its depth.
+    x: L,
+    y: L,
+    /// Inverse depth in the observer over that in the host.
+    nearness: L,
+    inverse_depth: L,
+    observed: [L; SAMPLES],
+    gradient_u: [L; SAMPLES],
+    gradient_v: [L; SAMPLES],
 }
 
+/// What the samples of some points sum to.
+struct Weighed<L> {
+    /// M.
+    uu: L,
+    uv: L,
+    vv: L,
+    /// b.
+    right_u: L,
+    right_v: L,
+}
+
+/// # Safety
+/// As [`compare`].
 #[inline(always)]
-fn mean(of: &Lanes) -> f32 {
-    sum(of) * (1.0 / SAMPLES as f32)
+unsafe fn warp<L: Lanes>(of: &Patterns, lane: usize, pair: &Pair, image: &Image<u8>) -> Warped<L> {
+    // SAFETY: this function's own contract.
+    unsafe {
+        let (zero, one) = (L::splat(0.0), L::splat(1.0));
+        let depth = load::<L>(&of.inverse_depth, lane);
+        let ray = [load::<L>(&of.ray[0], lane), load::<L>(&of.ray[1], lane)];
+        let c0 = turned::<L>(pair, 0, ray, depth);
+        let c1 = turned::<L>(pair, 1, ray, depth);
+        let c2 = turned::<L>(pair, 2, ray, depth);
+        let mut inside = c2.at_least(L::splat(MIN_DEPTH_RATIO));
+        let nearness = one.div(L::select(inside, c2, one));
+        let (fx, fy) = (L::splat(pair.focal[0]), L::splat(pair.focal[1]));
+        let (cx, cy) = (L::splat(pair.centre[0]), L::splat(pair.centre[1]));
+        let first = L::splat(BORDER_PX);
+        let (last_u, last_v) = (L::splat(pair.last[0]), L::splat(pair.last[1]));
+        let mut positions = [(zero, zero); SAMPLES];
+        for k in 0..SAMPLES {
+            // 1/(z + o) = n / (1 + e), e = o n, a hundredth at most: exact to e³.
+            let e = nearness.mul(L::splat(-pair.offsets[2][k]));
+            let near = nearness.add(nearness.mul(e.add(e.mul(e))));
+            let u = fx.mul(c0.add(L::splat(pair.offsets[0][k])).mul(near)).add(cx);
+            let v = fy.mul(c1.add(L::splat(pair.offsets[1][k])).mul(near)).add(cy);
+            inside = L::both(inside, L::both(u.at_least(first), last_u.at_least(u)));
+            inside = L::both(inside, L::both(v.at_least(first), last_v.at_least(v)));
+            positions[k] = (u, v);
+        }
+        let (mut observed, mut gradient_u, mut gradient_v) =
+            ([zero; SAMPLES], [zero; SAMPLES], [zero; SAMPLES]);
+        for k in 0..SAMPLES {
+            let (u, v) = positions[k];
+            let at = L::sample_bytes(image.pixels(), image.width(), u, v);
+            let upper = at.upper_right.sub(at.upper_left);
+            let lower = at.lower_right.sub(at.lower_left);
+            let top = at.upper_left.add(at.du.mul(upper));
+            let bottom = at.lower_left.add(at.du.mul(lower));
+            gradient_v[k] = bottom.sub(top);
+            observed[k] = top.add(at.dv.mul(gradient_v[k]));
+            gradient_u[k] = upper.add(at.dv.mul(lower.sub(upper)));
+        }
+        // Elsewhere harmless numbers: 0 · NaN would be NaN.
+        Warped {
+            inside,
+            x: L::select(inside, c0.mul(nearness), zero),
+            y: L::select(inside, c1.mul(nearness), zero),
+            nearness: L::select(inside, nearness, zero),
+            inverse_depth: L::select(inside, depth, zero),
+            observed,
+            gradient_u,
+            gradient_v,
+        }
+    }
+}
+
+/// A coordinate of X' d at the pattern's centre.
+///
+/// # Safety
+/// As [`compare`].
+#[inline(always)]
+unsafe fn turned<L: Lanes>(pair: &Pair, row: usize, ray: [L; 2], depth: L) -> L {
+    let ([a, b, c], t) = (pair.rotation[row], pair.translation[row]);
+    // SAFETY: this function's own contract.
+    unsafe {
+        let turned = L::splat(a).mul(ray[0]).add(L::splat(b).mul(ray[1])).add(L::splat(c));
+        turned.add(depth.mul(L::splat(t)))
+    }
+}
+
+/// # Safety
+/// As [`compare`].
+#[inline(always)]
+unsafe fn weigh<L: Lanes>(
+    of: &Patterns,
+    lane: usize,
+    warped: &Warped<L>,
+    robustness: &Robustness,
+    costs: &mut Lane,
+) -> Weighed<L> {
+    // SAFETY: this function's own contract.
+    unsafe {
+        let (zero, two) = (L::splat(0.0), L::splat(2.0));
+        let largest = L::splat(robustness.huber_grey);
+        let observed_mean = mean::<L>(&warped.observed);
+        let (mean_u, mean_v) = (mean::<L>(&warped.gradient_u), mean::<L>(&warped.gradient_v));
+        let mut energy = zero;
+        let (mut uu, mut uv, mut vv) = (zero, zero, zero);
+        let (mut right_u, mut right_v) = (zero, zero);
+        for k in 0..SAMPLES {
+            let shape = load::<L>(&of.shape[k], lane);
+            let residual = warped.observed[k].sub(observed_mean.mul(shape));
+            let size = residual.max(zero.sub(residual));
+            let huber = largest.div(size.max(largest));
+            let weight = load::<L>(&of.weight[k], lane).mul(huber);
+            let weighted = weight.mul(residual);
+            energy = energy.add(weighted.mul(residual).mul(two.sub(huber)));
+            let u = warped.gradient_u[k].sub(shape.mul(mean_u));
+            let v = warped.gradient_v[k].sub(shape.mul(mean_v));
+            let along = weight.mul(u);
+            uu = uu.add(along.mul(u));
+            uv = uv.add(along.mul(v));
+            vv = vv.add(weight.mul(v).mul(v));
+            right_u = right_u.add(weighted.mul(u));
+            right_v = right_v.add(weighted.mul(v));
+        }
+        let same = L::both(warped.inside, L::splat(robustness.most_energy).at_least(energy));
+        let cost = L::select(same, energy, L::splat(f32::INFINITY));
+        store(L::select(warped.inside, cost, L::splat(f32::NAN)), costs, lane);
+        Weighed {
+            uu: L::select(same, uu, zero),
+            uv: L::select(same, uv, zero),
+            vv: L::select(same, vv, zero),
+            right_u: L::select(same, right_u, zero),
+            right_v: L::select(same, right_v, zero),
+        }
+    }
+}
+
+/// # Safety
+/// As [`compare`].
+#[inline(always)]
+unsafe fn mean<L: Lanes>(of: &[L; SAMPLES]) -> L {
+    // SAFETY: this function's own contract.
+    unsafe {
+        let even = of[0].add(of[4]).add(of[2].add(of[6]));
+        let odd = of[1].add(of[5]).add(of[3].add(of[7]));
+        even.add(odd).mul(L::splat(1.0 / SAMPLES as f32))
+    }
+}
+
+/// ∂π/∂p and ∂π/∂d at the pattern's centre, column and row of the image.
+struct Motion<L> {
+    u: [L; POSE],
+    v: [L; POSE],
+    depth_u: L,
+    depth_v: L,
+}
+
+impl<L: Lanes> Motion<L> {
+    /// # Safety
+    /// As [`compare`].
+    #[inline(always)]
+    unsafe fn of(pair: &Pair, warped: &Warped<L>) -> Self {
+        // SAFETY: this function's own contract.
+        unsafe {
+            let (zero, one) = (L::splat(0.0), L::splat(1.0));
+            let (fx, fy) = (L::splat(pair.focal[0]), L::splat(pair.focal[1]));
+            let [tx, ty, tz] = pair.translation;
+            let (x, y, depth) = (warped.x, warped.y, warped.inverse_depth);
+            let (along_u, along_v) = (fx.mul(warped.nearness), fy.mul(warped.nearness));
+            let (moved_u, moved_v) = (depth.mul(along_u), depth.mul(along_v));
+            let both = x.mul(y);
+            let u = [
+                moved_u,
+                zero,
+                zero.sub(moved_u.mul(x)),
+                zero.sub(fx.mul(both)),
+                fx.mul(one.add(x.mul(x))),
+                zero.sub(fx.mul(y)),
+            ];
+            let v = [
+                zero,
+                moved_v,
+                zero.sub(moved_v.mul(y)),
+                zero.sub(fy.mul(one.add(y.mul(y)))),
+                fy.mul(both),
+                fy.mul(x),
+            ];
+            let depth_u = along_u.mul(L::splat(tx).sub(x.mul(L::splat(tz))));
+            let depth_v = along_v.mul(L::splat(ty).sub(y.mul(L::splat(tz))));
+            Self { u, v, depth_u, depth_v }
+        }
+    }
+
+    /// A row of (∂π/∂p)ᵀ times (a, b).
+    ///
+    /// # Safety
+    /// As [`compare`].
+    #[inline(always)]
+    unsafe fn along(&self, row: usize, a: L, b: L) -> L {
+        // SAFETY: this function's own contract.
+        unsafe {
+            match row {
+                0 => self.u[0].mul(a),
+                1 => self.v[1].mul(b),
+                _ => self.u[row].mul(a).add(self.v[row].mul(b)),
+            }
+        }
+    }
+}
+
+/// The sums of the points.
+///
+/// # Safety
+/// As [`compare`].
+#[inline(always)]
+unsafe fn derive_depths<L: Lanes>(
+    lane: usize,
+    pair: &Pair,
+    motion: &Motion<L>,
+    weighed: &Weighed<L>,
+    out: &mut Compared,
+) {
+    // SAFETY: this function's own contract.
+    unsafe {
+        let (u, v) = (motion.depth_u, motion.depth_v);
+        let a = weighed.uu.mul(u).add(weighed.uv.mul(v));
+        let b = weighed.uv.mul(u).add(weighed.vv.mul(v));
+        store(u.mul(a).add(v.mul(b)), &mut out.depth, lane);
+        store(u.mul(weighed.right_u).add(v.mul(weighed.right_v)), &mut out.depth_right, lane);
+        let mut mixed = [L::splat(0.0); POSE];
+        for row in 0..POSE {
+            mixed[row] = motion.along(row, a, b);
+            store(mixed[row], &mut out.observer[row], lane);
+        }
+        if pair.wanted.host {
+            for column in 0..POSE {
+                let mut carried = L::splat(0.0);
+                for row in 0..POSE {
+                    carried = carried.add(L::splat(pair.by_host[row][column]).mul(mixed[row]));
+                }
+                store(carried, &mut out.host[column], lane);
+            }
+        }
+    }
+}
+
+/// The sums of the pair.
+///
+/// # Safety
+/// As [`compare`].
+#[inline(always)]
+unsafe fn derive_poses<L: Lanes>(
+    lane: usize,
+    motion: &Motion<L>,
+    weighed: &Weighed<L>,
+    sums: &mut PairSums,
+) {
+    // SAFETY: this function's own contract.
+    unsafe {
+        let mut entry = 0;
+        for row in 0..POSE {
+            // A column of M ∂π/∂p.
+            let (u, v) = (motion.u[row], motion.v[row]);
+            let a = weighed.uu.mul(u).add(weighed.uv.mul(v));
+            let b = weighed.uv.mul(u).add(weighed.vv.mul(v));
+            for column in row..POSE {
+                add(motion.along(column, a, b), &mut sums.pose[entry], lane);
+                entry += 1;
+            }
+            let right = motion.along(row, weighed.right_u, weighed.right_v);
+            add(right, &mut sums.right[row], lane);
+        }
+    }
+}
+
+/// # Safety
+/// As [`compare`]; `lane` + N is at most sixteen.
+#[inline(always)]
+unsafe fn load<L: Lanes>(from: &Lane, lane: usize) -> L {
+    // SAFETY: this function's own contract.
+    unsafe { L::load(from.as_ptr().add(lane)) }
+}
+
+/// # Safety
+/// As [`load`].
+#[inline(always)]
+unsafe fn store<L: Lanes>(value: L, to: &mut Lane, lane: usize) {
+    // SAFETY: this function's own contract.
+    unsafe { value.store(to.as_mut_ptr().add(lane)) }
+}
+
+/// # Safety
+/// As [`load`].
+#[inline(always)]
+unsafe fn add<L: Lanes>(value: L, to: &mut Lane, lane: usize) {
+    // SAFETY: this function's own contract.
+    unsafe { store(load::<L>(to, lane).add(value), to, lane) }
 }

@@ -4,7 +4,7 @@
 
 use crate::slam::window::{Adjustment, Chosen, Window};
 
-/// Keyframes that are free at once: bounds memory (their images, 5.3 bytes a pixel: 1.6 MB each at 640×480) and time.
+/// Keyframes that are free at once: bounds memory (the equations, about 170 bytes a comparison) and time.
 const PIECE: usize = 40;
 /// Keyframes from one piece to the next: each is free twice, among those before it and among those after it.
 const STEP: usize = 20;

@@ -4,6 +4,7 @@
 //! pose relative to the keyframe and stay there when the keyframe moves.
 
 use crate::slam::geometry::se3::SE3;
+use crate::slam::image::buffer::Image;
 use crate::slam::window::Window;
 use crate::slam::window::keyframe::WindowKeyframe;
 
@@ -114,20 +115,22 @@ impl Window {
         if members.is_empty() {
             return None;
         }
+        let (width, height) = (self.camera.width, self.camera.height);
+        let pixels = std::mem::take(&mut frame.pixels);
+        let image = Image::try_from_pixels(width, height, pixels)?;
         members.push(self.keyframes.len());
         self.keyframes.push(WindowKeyframe {
             keyframe_id: u64::MAX,
             epoch,
-            pixels: std::mem::take(&mut frame.pixels),
-            images: Vec::new(),
+            images: vec![image],
             camera_from_map: host_from_camera.inverse() * host_from_map,
             unit: 1.0,
             points: Vec::new(),
             is_host: false,
         });
         let is_aligned = self.align_last(&members, &FRAME_LEVELS, MAX_ITERATIONS);
-        let placed = self.keyframes.pop()?;
-        frame.pixels = placed.pixels;
+        let mut placed = self.keyframes.pop()?;
+        frame.pixels = placed.images.swap_remove(0).into_pixels();
         let system = &self.solver.system;
         let agrees = system.inliers >= FEWEST_INLIERS
             && system.inliers as f64 >= LEAST_INLIER_RATIO * system.compared as f64;

@@ -3,8 +3,8 @@
 use crate::slam::depth::matching::PATTERN;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
-use crate::slam::image::quads::QuadImage;
-use crate::slam::window::comparison_kernel::{Look, SAMPLES, sum};
+use crate::slam::image::buffer::Image;
+use crate::slam::window::comparison::{Look, SAMPLES, sum_of_samples};
 use crate::slam::window::params::WindowParams;
 
 /// Pyramid levels that an adjustment may use.
@@ -19,10 +19,8 @@ pub struct WindowKeyframe {
     pub keyframe_id: u64,
     /// Its epoch.
     pub epoch: u32,
-    /// Grey values, level 0.
-    pub pixels: Vec<u8>,
-    /// The same to be sampled, by level; empty while it takes no part.
-    pub images: Vec<QuadImage>,
+    /// Grey values by level; level 0 alone while it takes no part.
+    pub images: Vec<Image<u8>>,
     /// Where it is, in the unit of the map.
     pub camera_from_map: SE3,
     /// Length of its unit in that of the map.
@@ -53,22 +51,17 @@ pub struct WindowPoint {
 }
 
 impl WindowKeyframe {
-    /// Makes its images, unless it has them.
+    /// Makes its coarser images, unless it has them.
     pub fn take_part(&mut self, camera: &Intrinsics) {
-        if !self.images.is_empty() || self.pixels.len() != camera.width * camera.height {
-            return;
+        while self.images.len() < num_levels(camera) {
+            let Some(finer) = self.images.last() else { return };
+            self.images.push(halve(finer));
         }
-        let mut pixels = self.pixels.clone();
-        let (mut width, mut height) = (camera.width, camera.height);
-        for level in 0..num_levels(camera) {
-            if level > 0 {
-                pixels = halve(&pixels, width, height);
-                (width, height) = (width / 2, height / 2);
-            }
-            let mut image = QuadImage::with_size(width, height);
-            image.fill(&pixels);
-            self.images.push(image);
-        }
+    }
+
+    /// Gives its coarser images up.
+    pub fn leave(&mut self) {
+        self.images.truncate(1);
     }
 }
 
@@ -80,16 +73,18 @@ pub fn num_levels(camera: &Intrinsics) -> usize {
 }
 
 /// 2×2 means, rounded: half a grey level is far below the noise.
-fn halve(fine: &[u8], width: usize, height: usize) -> Vec<u8> {
-    let (columns, rows) = (width / 2, height / 2);
-    let mut coarse = Vec::with_capacity(columns * rows);
-    for v in 0..rows {
-        let upper = &fine[2 * v * width..][..2 * columns];
-        let lower = &fine[(2 * v + 1) * width..][..2 * columns];
-        coarse.extend(upper.chunks_exact(2).zip(lower.chunks_exact(2)).map(|(up, low)| {
-            let sum = [up[0], up[1], low[0], low[1]].map(u16::from).iter().sum::<u16>();
-            ((sum + 2) / 4) as u8
-        }));
+fn halve(fine: &Image<u8>) -> Image<u8> {
+    let (columns, rows) = (fine.width() / 2, fine.height() / 2);
+    let mut coarse = Image::filled(columns, rows, 0);
+    for (v, row) in coarse.pixels_mut().chunks_exact_mut(columns).enumerate() {
+        let pairs = fine.row(2 * v).chunks_exact(2).zip(fine.row(2 * v + 1).chunks_exact(2));
+        for (mean, (upper, lower)) in row.iter_mut().zip(pairs) {
+            let sum = u16::from(upper[0])
+                + u16::from(upper[1])
+                + u16::from(lower[0])
+                + u16::from(lower[1]);
+            *mean = ((sum + 2) / 4) as u8;
+        }
     }
     coarse
 }
@@ -99,7 +94,7 @@ impl WindowPoint {
     pub fn new(
         (u, v): (u16, u16),
         inverse_depth: f64,
-        images: &[QuadImage],
+        images: &[Image<u8>],
         camera: &Intrinsics,
         params: &WindowParams,
     ) -> Self {
@@ -116,19 +111,17 @@ impl WindowPoint {
 }
 
 /// What the pattern around a pixel looks like.
-fn look_at(image: &QuadImage, u: f32, v: f32, half_weight_gradient: f32) -> Look {
+fn look_at(image: &Image<u8>, u: f32, v: f32, half_weight_gradient: f32) -> Look {
     let reach = 3.0;
     let inside = |at: f32, side: usize| at >= reach && at < side as f32 - 1.0 - reach;
     if !(inside(u, image.width()) && inside(v, image.height())) {
         return Look::default();
     }
     let moved = |by: (f32, f32)| {
-        let u = PATTERN.map(|(du, _)| u + du as f32 + by.0);
-        let v = PATTERN.map(|(_, dv)| v + dv as f32 + by.1);
-        image.sample(&u, &v)
+        PATTERN.map(|(du, dv)| sample(image, u + du as f32 + by.0, v + dv as f32 + by.1))
     };
     let here = moved((0.0, 0.0));
-    let mean = sum(&here) / SAMPLES as f32;
+    let mean = sum_of_samples(&here) / SAMPLES as f32;
     if !(mean >= DARKEST) {
         return Look::default();
     }
@@ -140,4 +133,16 @@ fn look_at(image: &QuadImage, u: f32, v: f32, half_weight_gradient: f32) -> Look
         squared / (squared + du * du + dv * dv)
     });
     Look { shape: here.map(|grey| grey / mean), weight }
+}
+
+/// The bilinear sample at a position that is at least a pixel inside.
+fn sample(image: &Image<u8>, u: f32, v: f32) -> f32 {
+    let (column, row) = (u as usize, v as usize);
+    let (du, dv) = (u - column as f32, v - row as f32);
+    let [upper, lower] = [row, row + 1].map(|row| {
+        let (left, right) =
+            (f32::from(image.at(column, row)), f32::from(image.at(column + 1, row)));
+        left + du * (right - left)
+    });
+    upper + dv * (lower - upper)
 }

@@ -2,13 +2,15 @@
 //! adjustment (Engel, Koltun, Cremers 2018 §2; Zubizarreta, Aguinaga, Montiel 2020).
 //!
 //! A point belongs to the keyframe that it was chosen in, its host, and is compared with every keyframe that sees it.
-//! [`comparison_kernel`] is one such comparison with its derivatives, `system` the normal equations of all with the
+//! [`comparison`] is one such comparison with its derivatives, `system` the normal equations of all with the
 //! points eliminated, `solver` the iterations, [`Window::optimise`] the recipe. Keyframes that have left the window
 //! and see the same things hold it in place; nothing is marginalised, and the filter's variance is no prior.
 
-pub mod comparison_kernel;
+pub mod comparison;
+mod comparison_kernel;
 mod conclusion;
 pub mod confirmed;
+mod elimination_kernel;
 mod feedback;
 pub mod frames;
 pub mod keyframe;
@@ -20,10 +22,13 @@ mod system;
 mod unit;
 mod view;
 
+use std::collections::{HashMap, HashSet};
+
 use crate::slam::geometry::intrinsics::Intrinsics;
-use crate::slam::keyframe::{DepthPoint, MapState};
+use crate::slam::image::buffer::Image;
+use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
 use crate::slam::map::Map;
-use crate::slam::window::comparison_kernel::{Robustness, SAMPLES};
+use crate::slam::window::comparison::{Robustness, SAMPLES};
 use crate::slam::window::frames::WindowFrames;
 use crate::slam::window::keyframe::{WindowKeyframe, WindowPoint, num_levels};
 use crate::slam::window::params::WindowParams;
@@ -106,55 +111,66 @@ impl Window {
         self.moved.clear();
         // What a mapper that died has left is where it was estimated to be.
         let is_resumed = self.keyframes.is_empty() && map.keyframes.len() > 1;
-        let held = |id: u64| {
-            map.get(id).is_some_and(|k| k.has_depth() && k.map_state == MapState::Established)
-        };
-        self.keyframes.retain(|keyframe| held(keyframe.keyframe_id));
-        self.unaligned.retain(|&id| held(id));
-        self.candidates.retain(|(id, _)| held(*id));
-        for keyframe in map.keyframes.iter().filter(|k| held(k.keyframe_id)) {
+        let is_held = |k: &&Keyframe| k.has_depth() && k.map_state == MapState::Established;
+        let held: Vec<&Keyframe> = map.keyframes.iter().filter(is_held).collect();
+        let ids: HashSet<u64> = held.iter().map(|keyframe| keyframe.keyframe_id).collect();
+        self.keyframes.retain(|keyframe| ids.contains(&keyframe.keyframe_id));
+        self.unaligned.retain(|id| ids.contains(id));
+        self.candidates.retain(|(id, _)| ids.contains(id));
+        let places = self.keyframes.iter().enumerate().map(|(place, of)| (of.keyframe_id, place));
+        let places: HashMap<u64, usize> = places.collect();
+        for keyframe in held {
             let id = keyframe.keyframe_id;
-            let camera_from_map = keyframe.map_from_keyframe.rigid.inverse();
-            let unit = keyframe.map_from_keyframe.scale;
-            match self.keyframes.iter_mut().find(|known| known.keyframe_id == id) {
-                Some(known) => {
-                    (known.camera_from_map, known.unit) = (camera_from_map, unit);
-                    if known.epoch != keyframe.epoch {
-                        // Its epoch was joined to another, which has another unit: its points are chosen anew.
-                        known.epoch = keyframe.epoch;
-                        known.points.clear();
-                        known.is_host = false;
-                    }
-                }
-                None => {
-                    self.keyframes.push(WindowKeyframe {
-                        keyframe_id: id,
-                        epoch: keyframe.epoch,
-                        pixels: keyframe.image.clone(),
-                        images: Vec::new(),
-                        camera_from_map,
-                        unit,
-                        points: Vec::new(),
-                        is_host: false,
-                    });
-                    if !is_resumed || id == active {
-                        self.unaligned.push(id);
-                    }
-                }
+            let mut is_host = false;
+            match places.get(&id) {
+                Some(&place) => is_host = self.update(place, keyframe),
+                None if !self.add(keyframe) => continue,
+                None if !is_resumed || id == active => self.unaligned.push(id),
+                None => {}
             }
-            let is_known = |this: &Self| {
-                let is_host = this.get(id).is_none_or(|known| known.is_host);
-                is_host || this.candidates.iter().any(|(of, _)| *of == id)
-            };
-            if id != active && !is_known(self) {
+            if id != active && !is_host && !self.candidates.iter().any(|(of, _)| *of == id) {
                 self.candidates.push((id, keyframe.points.clone()));
             }
         }
         !self.unaligned.is_empty()
     }
 
+    /// Moves a keyframe to where the map has it; whether its points are chosen.
+    fn update(&mut self, place: usize, from: &Keyframe) -> bool {
+        let known = &mut self.keyframes[place];
+        known.camera_from_map = from.map_from_keyframe.rigid.inverse();
+        known.unit = from.map_from_keyframe.scale;
+        if known.epoch != from.epoch {
+            // Its epoch was joined to another, which has another unit: its points are chosen anew.
+            known.epoch = from.epoch;
+            known.points.clear();
+            known.is_host = false;
+        }
+        known.is_host
+    }
+
+    /// Adds a keyframe; false where its image is not of the camera's size.
+    fn add(&mut self, keyframe: &Keyframe) -> bool {
+        let (width, height) = (self.camera.width, self.camera.height);
+        let image = Image::try_from_pixels(width, height, keyframe.image.clone());
+        let Some(image) = image else { return false };
+        self.keyframes.push(WindowKeyframe {
+            keyframe_id: keyframe.keyframe_id,
+            epoch: keyframe.epoch,
+            images: vec![image],
+            camera_from_map: keyframe.map_from_keyframe.rigid.inverse(),
+            unit: keyframe.map_from_keyframe.scale,
+            points: Vec::new(),
+            is_host: false,
+        });
+        true
+    }
+
     fn get(&self, keyframe_id: u64) -> Option<&WindowKeyframe> {
-        self.keyframes.iter().find(|keyframe| keyframe.keyframe_id == keyframe_id)
+        let place = self.keyframes.binary_search_by_key(&keyframe_id, |of| of.keyframe_id);
+        // They are in order but where epochs were joined.
+        let is_it = |of: &&WindowKeyframe| of.keyframe_id == keyframe_id;
+        place.map(|place| &self.keyframes[place]).ok().or_else(|| self.keyframes.iter().find(is_it))
     }
 
     /// From now on there are no more frames: the next estimate is of all keyframes, and of all frames that wait.
@@ -194,7 +210,7 @@ impl Window {
     fn leave(&mut self, members: &[usize]) {
         for (index, keyframe) in self.keyframes.iter_mut().enumerate() {
             if !members.contains(&index) {
-                keyframe.images = Vec::new();
+                keyframe.leave();
             }
         }
     }
@@ -221,7 +237,7 @@ impl Window {
         keyframe.take_part(&self.camera);
         let chosen = selection::choose(
             points,
-            &keyframe.pixels,
+            keyframe.images[0].pixels(),
             &self.camera,
             params.points,
             params.min_gradient,
@@ -254,6 +270,9 @@ impl Window {
         {
             let sight =
                 Sight::new(&(to.camera_from_map * host.camera_from_map.inverse()), &self.camera);
+            if !sight.may_see(&host.points) {
+                continue;
+            }
             for point in host.points.iter().filter(|point| point.is_alive) {
                 let Some(seen) = sight.project(point) else { continue };
                 let Some(known) = selection::near(points, seen.u, seen.v) else { continue };
@@ -317,8 +336,11 @@ impl Window {
                 &(observer.camera_from_map * host.camera_from_map.inverse()),
                 &self.camera,
             );
+            if !sight.may_see(&host.points) {
+                return 0;
+            }
             let alive = host.points.iter().filter(|point| point.is_alive);
-            alive.filter(|point| sight.project(point).is_some()).count()
+            alive.filter(|point| sight.sees(point)).count()
         };
         let mut seen: Vec<(usize, usize)> = older
             .iter()
@@ -388,7 +410,9 @@ impl Window {
         let finest = num_levels(&self.camera) - 1;
         levels.iter().filter(|&&level| level <= finest).all(|&level| {
             let at = Level { camera: &self.camera, level, robustness };
-            self.solver.views.find(&self.keyframes, members.members, &self.camera, &mut may);
+            let views = &mut self.solver.views;
+            views.find(&self.keyframes, members.members, &self.camera, &mut may);
+            views.look(&self.keyframes, members.members, level);
             let converged = self.params.converged_decrement;
             self.solver.adjust(&mut self.keyframes, members, &at, iterations, converged)
         })
@@ -397,9 +421,12 @@ impl Window {
     /// Counts who agrees with each point, and lets those go that nobody agrees with; the number of the others.
     fn confirm(&mut self, members: &Members<'_>) -> usize {
         let mut points = 0;
-        let counts = self.solver.system.inliers_by_point();
-        for ((host, view), inliers) in self.solver.views.with_hosts().zip(counts) {
-            let point = &mut self.keyframes[members.members[host]].points[view.point];
+        let views = &self.solver.views;
+        for (view, inliers) in views.points.iter().zip(self.solver.system.inliers_by_point()) {
+            if views.links(view).is_empty() {
+                continue;
+            }
+            let point = &mut self.keyframes[members.members[view.host]].points[view.point];
             point.confirmations = inliers;
             point.is_alive = inliers > 0;
             points += usize::from(point.is_alive);
@@ -438,5 +465,7 @@ struct Chosen {
     is_first: bool,
 }
 
+#[cfg(test)]
+mod comparison_tests;
 #[cfg(test)]
 mod tests;

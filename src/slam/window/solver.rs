@@ -3,7 +3,7 @@
 use nalgebra::Vector6;
 
 use crate::slam::geometry::se3::SE3;
-use crate::slam::window::comparison_kernel::POSE;
+use crate::slam::window::comparison::POSE;
 use crate::slam::window::keyframe::WindowKeyframe;
 use crate::slam::window::system::{Level, Members, Step, System};
 use crate::slam::window::view::Views;
@@ -48,6 +48,7 @@ impl Solver {
         max_iterations: u32,
         converged_decrement: f64,
     ) -> bool {
+        self.views.fetch_depths(keyframes, members.members);
         let mut cost = self.system.linearise(keyframes, members, &self.views, at, None);
         let (mut damping, mut failures) = (FIRST_DAMPING, 0);
         for _ in 0..max_iterations {
@@ -65,6 +66,7 @@ impl Solver {
             }
             self.remember(keyframes, members);
             self.apply(keyframes, members);
+            self.views.fetch_depths(keyframes, members.members);
             let before = Some(&self.system);
             let moved = self.trial.linearise(keyframes, members, &self.views, at, before);
             if moved < cost {
@@ -92,11 +94,11 @@ impl Solver {
         self.poses.clear();
         self.poses.extend(members.members.iter().map(|&index| keyframes[index].camera_from_map));
         self.depths.clear();
-        let points = self.views.with_hosts();
         self.depths.extend(
-            points.map(|(host, view)| {
-                keyframes[members.members[host]].points[view.point].inverse_depth
-            }),
+            self.views
+                .points
+                .iter()
+                .map(|view| keyframes[members.members[view.host]].points[view.point].inverse_depth),
         );
     }
 
@@ -104,8 +106,8 @@ impl Solver {
         for (&index, pose) in members.members.iter().zip(&self.poses) {
             keyframes[index].camera_from_map = *pose;
         }
-        for ((host, view), depth) in self.views.with_hosts().zip(&self.depths) {
-            keyframes[members.members[host]].points[view.point].inverse_depth = *depth;
+        for (view, depth) in self.views.points.iter().zip(&self.depths) {
+            keyframes[members.members[view.host]].points[view.point].inverse_depth = *depth;
         }
     }
 
@@ -120,8 +122,8 @@ impl Solver {
         if !members.depths_are_free {
             return;
         }
-        for ((host, view), change) in self.views.with_hosts().zip(&self.step.depths) {
-            let depth = &mut keyframes[members.members[host]].points[view.point].inverse_depth;
+        for (view, change) in self.views.points.iter().zip(&self.step.depths) {
+            let depth = &mut keyframes[members.members[view.host]].points[view.point].inverse_depth;
             let (least, most) = (*depth / MAX_DEPTH_FACTOR, *depth * MAX_DEPTH_FACTOR);
             *depth = (*depth + change).clamp(least, most);
         }

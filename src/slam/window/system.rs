@@ -4,27 +4,37 @@
 //! observer's times −Ad(C_j C_i⁻¹). Points are independent given the poses, so that each is eliminated by itself:
 //! `S = H − Σ h hᵀ/H_dd`.
 
+use std::ops::Range;
+
 use nalgebra::{DMatrix, DVector, Matrix6, Vector6};
 
+use crate::slam::alignment::kernel::{Kernel, SimdMode};
 use crate::slam::geometry::intrinsics::Intrinsics;
-use crate::slam::window::comparison_kernel::{
-    POSE, Pair, PairSums, PointSums, Robustness, Seen, kernel, sum,
+use crate::slam::window::comparison::{
+    Compared, LANES, POSE, Pair, PairSums, Robustness, Wanted, sum,
+};
+use crate::slam::window::elimination_kernel::{
+    Block, PADDED, PointRow, RowBlock, eliminate, lower,
 };
 use crate::slam::window::keyframe::WindowKeyframe;
-use crate::slam::window::view::{PointView, Views};
+use crate::slam::window::view::{PairView, Views};
 
 /// The normal equations at one state. Its memory is kept from one to the next.
 #[derive(Debug, Clone, Default)]
 pub struct System {
-    /// Of the free poses, in their order; row after row, both triangles.
-    hessian: Vec<f64>,
+    /// Of the free poses, in their order: the lower triangle, block by block.
+    hessian: Vec<Block>,
     /// Right side.
     right: Vec<f64>,
     points: Vec<PointPart>,
     /// Σ w J ∂r/∂d of the observer, by comparison.
-    mixed: Vec<[f32; POSE]>,
+    mixed: Vec<[f32; PADDED]>,
     /// Cost of each comparison; NaN where it was never inside the image.
     costs: Vec<f32>,
+    /// What those of one pair came to.
+    seen: Vec<Compared>,
+    /// What is eliminated, and what it leaves.
+    elimination: Elimination,
     /// Number of free poses.
     pub num_free: usize,
     /// Comparisons that count.
@@ -35,15 +45,27 @@ pub struct System {
     pub inlier_cost: f64,
 }
 
+/// Points that are eliminated at a time: their rows stay in the second-level cache.
+const CHUNK: usize = 256;
+
+/// Memory of a solution.
+#[derive(Debug, Clone, Default)]
+struct Elimination {
+    points: Vec<PointRow>,
+    rows: Vec<RowBlock>,
+    reduced: Vec<Block>,
+    right: Vec<f64>,
+}
+
 /// The part of the normal equations of one point.
 #[derive(Debug, Clone, Copy, Default)]
 struct PointPart {
+    /// Σ w J ∂r/∂d of its host.
+    host: [f64; POSE],
     /// H_dd; 0 where nothing saw it.
     hessian: f64,
     /// Its right side.
     right: f64,
-    /// Σ w J ∂r/∂d of its host.
-    host: [f64; POSE],
     inliers: u32,
 }
 
@@ -96,17 +118,6 @@ fn pose_sums(lanes: &PairSums) -> (Matrix6<f64>, Vector6<f64>) {
     (pose, right)
 }
 
-/// Transposed: a row vector of the observer's pose becomes one of the host's.
-fn carried(by_host: &[[f32; POSE]; POSE], of: &[f32; POSE]) -> [f32; POSE] {
-    let mut out = [0.0; POSE];
-    for (row, value) in by_host.iter().zip(of) {
-        for (to, entry) in out.iter_mut().zip(row) {
-            *to += entry * value;
-        }
-    }
-    out
-}
-
 impl System {
     /// Linearises at the state that `keyframes` are in and returns the cost, of which that of comparisons that were
     /// not inside the image `before` is left out, and of those that are not any more is what it was.
@@ -118,44 +129,28 @@ impl System {
         at: &Level<'_>,
         before: Option<&System>,
     ) -> f64 {
-        let compare = kernel();
+        let kernel = Kernel::choose(SimdMode::Auto);
         let camera = at.camera.at_level(at.level);
         self.restart(members, views);
         let mut cost = 0.0;
-        let mut pairs = Vec::with_capacity(members.members.len());
-        for (host, host_views) in views.of_hosts() {
-            let host_pose = keyframes[members.members[host]].camera_from_map.inverse();
-            pairs.clear();
-            pairs.extend(members.members.iter().map(|&observer| {
-                let observer_from_host = keyframes[observer].camera_from_map * host_pose;
-                let by_host = -observer_from_host.adjoint();
-                let rows = std::array::from_fn(|r| std::array::from_fn(|c| by_host[(r, c)] as f32));
-                (Pair::new(&observer_from_host, &camera), by_host, rows, PairSums::default())
-            }));
-            let points = &keyframes[members.members[host]].points;
-            let host_is_free = members.free[host].is_some();
-            for view in host_views {
-                let point = &points[view.point];
-                let (look, depth) = (&point.looks[at.level], point.inverse_depth as f32);
-                let mut part = PointPart::default();
-                for place in view.first..view.first + view.count {
-                    let observer = views.observers[place];
-                    let image = &keyframes[members.members[observer]].images[at.level];
-                    let (pair, _, by_host, sums) = &mut pairs[observer];
-                    let seen = match look.is_whole() {
-                        true => compare(image, pair, look, point.ray, depth, &at.robustness, sums),
-                        false => Seen::Outside,
-                    };
-                    let was = before.map(|system| system.costs[place]);
-                    cost += f64::from(self.note(place, &seen, was, at));
-                    if let Seen::Same(_, sums) = seen {
-                        part.add(&sums, host_is_free.then_some(by_host));
-                        self.mixed[place] = sums.mixed;
-                    }
-                }
-                self.points.push(part);
+        for of in &views.pairs {
+            let [host, observer] = [of.host, of.observer].map(|k| &keyframes[members.members[k]]);
+            let [host_is_free, is_free] = [of.host, of.observer].map(|k| members.free[k].is_some());
+            let observer_from_host = observer.camera_from_map * host.camera_from_map.inverse();
+            let wanted = Wanted {
+                poses: host_is_free || is_free,
+                depths: members.depths_are_free,
+                host: host_is_free,
+            };
+            let pair = Pair::new(&observer_from_host, &camera, wanted);
+            let (image, mut sums) = (&observer.images[at.level], PairSums::default());
+            let patterns = &views.patterns[of.blocks()];
+            self.seen.resize(patterns.len(), Compared::NONE);
+            kernel.compare(image, &pair, patterns, &at.robustness, &mut self.seen, &mut sums);
+            cost += self.note(of, &wanted, views, at, before);
+            if wanted.poses {
+                self.add_pair(of, members, &Pair::by_host(&observer_from_host), &sums);
             }
-            self.add_pairs(host, members, &pairs);
         }
         cost
     }
@@ -165,68 +160,95 @@ impl System {
         let size = POSE * num_free;
         self.num_free = num_free;
         self.hessian.clear();
-        self.hessian.resize(size * size, 0.0);
+        self.hessian.resize(lower(num_free, 0), [[0.0; PADDED]; POSE]);
         self.right.clear();
         self.right.resize(size, 0.0);
         self.points.clear();
+        self.points.resize(views.points.len(), PointPart::default());
         self.mixed.clear();
-        self.mixed.resize(views.observers.len(), [0.0; POSE]);
+        self.mixed.resize(views.slots.len(), [0.0; PADDED]);
         self.costs.clear();
-        self.costs.resize(views.observers.len(), f32::NAN);
+        self.costs.resize(views.slots.len(), f32::NAN);
         (self.inliers, self.compared, self.inlier_cost) = (0, 0, 0.0);
     }
 
-    /// Keeps what a comparison costs and returns what of it can be compared with the state before.
-    fn note(&mut self, place: usize, seen: &Seen, was: Option<f32>, at: &Level<'_>) -> f32 {
-        let cost = match seen {
-            Seen::Outside => was.unwrap_or(f32::NAN),
-            Seen::Other => at.robustness.most_energy,
-            Seen::Same(cost, _) => *cost,
-        };
-        self.costs[place] = cost;
-        self.compared += usize::from(!matches!(seen, Seen::Outside));
-        if let Seen::Same(cost, _) = seen {
-            self.inliers += 1;
-            self.inlier_cost += f64::from(*cost);
+    /// Keeps what the comparisons of a pair came to and returns what of their cost can be compared with the state
+    /// before.
+    fn note(
+        &mut self,
+        of: &PairView,
+        wanted: &Wanted,
+        views: &Views,
+        at: &Level<'_>,
+        before: Option<&System>,
+    ) -> f64 {
+        let most = at.robustness.most_energy;
+        let mut totals = [0.0f64; LANES];
+        for (block, seen) in of.blocks().zip(&self.seen) {
+            let places = LANES * block..LANES * (block + 1);
+            let costs = &mut self.costs[places.clone()];
+            let was = before.map(|system| &system.costs[places.clone()]);
+            for lane in 0..LANES {
+                let found = seen.cost[lane];
+                let (was, is_new) = match was {
+                    Some(was) => (was[lane], was[lane].is_nan()),
+                    None => (f32::NAN, false),
+                };
+                let cost = if found.is_nan() { was } else { found.min(most) };
+                costs[lane] = cost;
+                let is_same = found < f32::INFINITY;
+                self.compared += usize::from(!found.is_nan());
+                self.inliers += usize::from(is_same);
+                self.inlier_cost += f64::from(if is_same { found } else { 0.0 });
+                totals[lane] += f64::from(if is_new || cost.is_nan() { 0.0 } else { cost });
+            }
+            for (lane, &slot) in views.slots[places.clone()].iter().enumerate() {
+                self.points[slot].add(seen, lane, wanted);
+            }
+            if wanted.depths && wanted.poses {
+                for (lane, mixed) in self.mixed[places].iter_mut().enumerate() {
+                    for (to, of) in mixed.iter_mut().zip(&seen.observer) {
+                        *to = of[lane];
+                    }
+                }
+            }
         }
-        let is_new = was.is_some_and(f32::is_nan);
-        if is_new || cost.is_nan() { 0.0 } else { cost }
+        totals.iter().sum()
     }
 
-    #[allow(clippy::type_complexity, reason = "what a pair is made of")]
-    fn add_pairs(
+    fn add_pair(
         &mut self,
-        host: usize,
+        of: &PairView,
         members: &Members<'_>,
-        pairs: &[(Pair, Matrix6<f64>, [[f32; POSE]; POSE], PairSums)],
+        by_host: &Matrix6<f64>,
+        lanes: &PairSums,
     ) {
-        for (observer, (_, by_host, _, lanes)) in pairs.iter().enumerate() {
-            let (i, j) = (members.free[host], members.free[observer]);
-            if observer == host || (i.is_none() && j.is_none()) {
-                continue;
-            }
-            let (pose, right) = pose_sums(lanes);
-            if let Some(j) = j {
-                self.add_block(j, j, &pose);
-                self.add_right(j, &right);
-            }
-            if let Some(i) = i {
-                self.add_block(i, i, &(by_host.transpose() * pose * by_host));
-                self.add_right(i, &(by_host.transpose() * right));
-            }
-            if let (Some(i), Some(j)) = (i, j) {
-                let between = pose * by_host;
+        let (i, j) = (members.free[of.host], members.free[of.observer]);
+        let (pose, right) = pose_sums(lanes);
+        if let Some(j) = j {
+            self.add_block(j, j, &pose);
+            self.add_right(j, &right);
+        }
+        if let Some(i) = i {
+            self.add_block(i, i, &(by_host.transpose() * pose * by_host));
+            self.add_right(i, &(by_host.transpose() * right));
+        }
+        if let (Some(i), Some(j)) = (i, j) {
+            let between = pose * by_host;
+            if j > i {
                 self.add_block(j, i, &between);
+            } else {
                 self.add_block(i, j, &between.transpose());
             }
         }
     }
 
+    /// Adds to the lower triangle.
     fn add_block(&mut self, row: usize, column: usize, block: &Matrix6<f64>) {
-        let size = POSE * self.num_free;
+        let to = &mut self.hessian[lower(row, column)];
         for r in 0..POSE {
             for c in 0..POSE {
-                self.hessian[(POSE * row + r) * size + POSE * column + c] += block[(r, c)];
+                to[r][c] += block[(r, c)];
             }
         }
     }
@@ -237,63 +259,102 @@ impl System {
         }
     }
 
-    /// The row of the poses that a point has to do with, and the first and last of its entries that are not 0.
-    fn row_of(&self, host: Option<usize>, view: &PointView, part: &PointPart, to: &mut Row<'_>) {
-        to.clear();
-        if let Some(host) = host {
-            to.add(host, &part.host);
-        }
-        for place in view.first..view.first + view.count {
-            if let Some(free) = to.free[to.views.observers[place]] {
-                to.add(free, &self.mixed[place].map(f64::from));
+    /// The rows of some points that are eliminated.
+    fn collect(
+        &self,
+        points: Range<usize>,
+        members: &Members<'_>,
+        views: &Views,
+        damping: f64,
+        to: &mut Elimination,
+    ) {
+        to.points.clear();
+        to.rows.clear();
+        for (part, view) in self.points[points.clone()].iter().zip(&views.points[points]) {
+            if !(part.hessian > 0.0) {
+                continue;
             }
+            let first = to.rows.len();
+            let [h0, h1, h2, h3, h4, h5] = part.host;
+            let mut host = members.free[view.host].map(|pose| {
+                let values = [h0, h1, h2, h3, h4, h5, 0.0, 0.0];
+                (view.host, RowBlock { pose, values })
+            });
+            for link in views.links(view) {
+                to.rows.extend(host.take_if(|(place, _)| *place < link.observer).map(|of| of.1));
+                if let Some(pose) = members.free[link.observer] {
+                    to.rows.push(RowBlock { pose, values: self.mixed[link.place].map(f64::from) });
+                }
+            }
+            to.rows.extend(host.map(|of| of.1));
+            let inverse = 1.0 / (part.hessian * (1.0 + damping));
+            let count = to.rows.len() - first;
+            to.points.push(PointRow { first, count, inverse, right: part.right });
         }
     }
 
     /// The increments of poses and inverse depths that a share `damping` added to each diagonal element gives; false
     /// where the poses are not determined.
     pub fn solve(
-        &self,
+        &mut self,
         members: &Members<'_>,
         views: &Views,
         damping: f64,
         step: &mut Step,
     ) -> bool {
-        let size = POSE * self.num_free;
-        let mut reduced = self.hessian.clone();
-        let mut right = self.right.clone();
-        for k in 0..size {
-            reduced[k * size + k] *= 1.0 + damping;
-        }
-        let mut row = Row::new(size, members.free, views);
-        if members.depths_are_free {
-            for (part, (host, view)) in self.points.iter().zip(views.with_hosts()) {
-                if !(part.hessian > 0.0) {
-                    continue;
-                }
-                self.row_of(members.free[host], view, part, &mut row);
-                row.eliminate(
-                    1.0 / (part.hessian * (1.0 + damping)),
-                    part.right,
-                    &mut reduced,
-                    &mut right,
-                );
-            }
+        let mut memory = std::mem::take(&mut self.elimination);
+        let is_solved = self.solve_with(&mut memory, members, views, damping, step);
+        self.elimination = memory;
+        is_solved
+    }
+
+    fn solve_with(
+        &self,
+        memory: &mut Elimination,
+        members: &Members<'_>,
+        views: &Views,
+        damping: f64,
+        step: &mut Step,
+    ) -> bool {
+        memory.reduced.clone_from(&self.hessian);
+        memory.right.clone_from(&self.right);
+        for pose in 0..self.num_free {
+            let diagonal = &mut memory.reduced[lower(pose, pose)];
+            (0..POSE).for_each(|k| diagonal[k][k] *= 1.0 + damping);
         }
         step.depths.clear();
-        let Some(poses) = solve_scaled(&mut reduced, &right) else { return false };
+        step.depths.resize(self.points.len(), 0.0);
+        if members.depths_are_free {
+            let kernel = Kernel::choose(SimdMode::Auto);
+            for first in (0..self.points.len()).step_by(CHUNK) {
+                let some = first..(first + CHUNK).min(self.points.len());
+                self.collect(some, members, views, damping, memory);
+                let Elimination { points, rows, reduced, right } = &mut *memory;
+                eliminate(kernel, points, rows, reduced, right);
+            }
+        }
+        let Some(poses) = solve_scaled(&memory.reduced, &memory.right) else { return false };
         step.poses.clear();
         step.poses.extend(poses.iter());
         step.decrement = -dot(&self.right, &step.poses);
-        for (part, (host, view)) in self.points.iter().zip(views.with_hosts()) {
-            let mut change = 0.0;
-            if members.depths_are_free && part.hessian > 0.0 {
-                self.row_of(members.free[host], view, part, &mut row);
-                let along = row.along(&step.poses);
-                change = -(part.right + along) / (part.hessian * (1.0 + damping));
-                step.decrement -= part.right * change;
+        if members.depths_are_free {
+            for ((change, part), view) in
+                step.depths.iter_mut().zip(&self.points).zip(&views.points)
+            {
+                if !(part.hessian > 0.0) {
+                    continue;
+                }
+                let of = |pose: usize| &step.poses[POSE * pose..][..POSE];
+                let mut along =
+                    members.free[view.host].map_or(0.0, |pose| dot(&part.host, of(pose)));
+                for link in views.links(view) {
+                    if let Some(pose) = members.free[link.observer] {
+                        along += dot(&self.mixed[link.place].map(f64::from), of(pose));
+                    }
+                }
+                *change = -(part.right + along) / (part.hessian * (1.0 + damping));
+                step.decrement -= part.right * *change;
             }
-            step.depths.push(change);
         }
         true
     }
@@ -305,62 +366,18 @@ impl System {
 }
 
 impl PointPart {
-    fn add(&mut self, sums: &PointSums, by_host: Option<&[[f32; POSE]; POSE]>) {
-        self.hessian += f64::from(sums.depth);
-        self.right += f64::from(sums.depth_right);
-        self.inliers += 1;
-        if let Some(by_host) = by_host {
-            let carried = carried(by_host, &sums.mixed);
-            self.host.iter_mut().zip(carried).for_each(|(to, of)| *to += f64::from(of));
+    /// Adds a comparison, which is all 0 where it does not count.
+    #[inline(always)]
+    fn add(&mut self, seen: &Compared, lane: usize, wanted: &Wanted) {
+        self.inliers += u32::from(seen.cost[lane] < f32::INFINITY);
+        if !wanted.depths {
+            return;
         }
-    }
-}
-
-/// A row of the poses, dense, with the blocks that are not 0.
-struct Row<'a> {
-    values: Vec<f64>,
-    blocks: Vec<usize>,
-    free: &'a [Option<usize>],
-    views: &'a Views,
-}
-
-impl<'a> Row<'a> {
-    fn new(size: usize, free: &'a [Option<usize>], views: &'a Views) -> Self {
-        Self { values: vec![0.0; size], blocks: Vec::with_capacity(size / POSE), free, views }
-    }
-
-    fn clear(&mut self) {
-        for &block in &self.blocks {
-            self.values[POSE * block..][..POSE].fill(0.0);
-        }
-        self.blocks.clear();
-    }
-
-    /// Adds what belongs to a pose, each once.
-    fn add(&mut self, free: usize, of: &[f64; POSE]) {
-        self.values[POSE * free..][..POSE].copy_from_slice(of);
-        self.blocks.push(free);
-    }
-
-    fn along(&self, poses: &[f64]) -> f64 {
-        self.blocks
-            .iter()
-            .map(|&block| dot(&self.values[POSE * block..][..POSE], &poses[POSE * block..][..POSE]))
-            .sum()
-    }
-
-    /// Takes a point of this row out of the lower triangle of the equations of the poses.
-    fn eliminate(&self, inverse: f64, point_right: f64, reduced: &mut [f64], right: &mut [f64]) {
-        let size = self.values.len();
-        for &block in &self.blocks {
-            for row in POSE * block..POSE * (block + 1) {
-                let weighted = inverse * self.values[row];
-                right[row] -= weighted * point_right;
-                let end = POSE * (block + 1);
-                let entries = reduced[row * size..][..end].iter_mut();
-                for (entry, value) in entries.zip(&self.values[..end]) {
-                    *entry -= weighted * value;
-                }
+        self.hessian += f64::from(seen.depth[lane]);
+        self.right += f64::from(seen.depth_right[lane]);
+        if wanted.host {
+            for (to, of) in self.host.iter_mut().zip(&seen.host) {
+                *to += f64::from(of[lane]);
             }
         }
     }
@@ -370,21 +387,23 @@ fn dot(one: &[f64], other: &[f64]) -> f64 {
     one.iter().zip(other).map(|(a, b)| a * b).sum()
 }
 
-/// Solves `matrix · x = −right` of a lower triangle, after scaling to a unit diagonal; translations and rotations differ
+/// Solves `matrix · x = −right` of a lower triangle of blocks, after scaling to a unit diagonal; translations and rotations differ
 /// by the depth.
-fn solve_scaled(lower: &mut [f64], right: &[f64]) -> Option<DVector<f64>> {
+fn solve_scaled(blocks: &[Block], right: &[f64]) -> Option<DVector<f64>> {
     let size = right.len();
     if size == 0 {
         return Some(DVector::zeros(0));
     }
     /// Added to the unit diagonal: the gauge that nothing holds must not be singular.
     const REGULARISATION: f64 = 1e-9;
-    let scale =
-        DVector::from_fn(size, |k, _| 1.0 / lower[k * size + k].max(f64::MIN_POSITIVE).sqrt());
+    let entry = |row: usize, column: usize| {
+        blocks[lower(row / POSE, column / POSE)][row % POSE][column % POSE]
+    };
+    let scale = DVector::from_fn(size, |k, _| 1.0 / entry(k, k).max(f64::MIN_POSITIVE).sqrt());
     let matrix = DMatrix::from_fn(size, size, |row, column| {
         let (row, column) = (row.max(column), row.min(column));
         let regular = if row == column { REGULARISATION } else { 0.0 };
-        lower[row * size + column] * scale[row] * scale[column] + regular
+        entry(row, column) * scale[row] * scale[column] + regular
     });
     let right = DVector::from_fn(size, |k, _| right[k] * scale[k]);
     let step = -matrix.cholesky()?.solve(&right).component_mul(&scale);

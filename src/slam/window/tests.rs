@@ -1,147 +1,17 @@
-//! Derivatives against differences, lanes against the explanation, and windows of a rendered room solved from a
-//! perturbed truth.
+//! Windows of a rendered room solved from a perturbed truth, and what becomes of them in the map.
 
 use nalgebra::Vector6;
 
-use super::comparison_kernel::{
-    Look, POSE, Pair, PairSums, Robustness, SAMPLES, Seen, compare_portable, kernel, sum,
-};
+use super::comparison::Robustness;
 use super::solver::Solver;
 use super::*;
-use crate::slam::depth::matching::PATTERN;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
-use crate::slam::image::quads::QuadImage;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::test_scene::{CAMERA, Random, Scene};
 
-const EASY: Robustness = Robustness { huber_grey: 1e3, most_energy: f32::INFINITY };
-
-/// A smooth image, so that a bilinear sample is hardly ever between two slopes.
-fn waves(phase: f32) -> QuadImage {
-    let pixels: Vec<u8> = (0..CAMERA.width * CAMERA.height)
-        .map(|i| {
-            let (u, v) = ((i % CAMERA.width) as f32, (i / CAMERA.width) as f32);
-            let wave = 60.0 * (0.11 * u + phase).sin() * (0.09 * v).cos()
-                + 50.0 * (0.1 * v + 0.04 * u).cos();
-            (128.0 + wave).round() as u8
-        })
-        .collect();
-    let mut image = QuadImage::with_size(CAMERA.width, CAMERA.height);
-    image.fill(&pixels);
-    image
-}
-
-/// What the pattern around a position looks like, every sample of weight 1.
-fn look(image: &QuadImage, u: f32, v: f32) -> Look {
-    let samples =
-        image.sample(&PATTERN.map(|(du, _)| u + du as f32), &PATTERN.map(|(_, dv)| v + dv as f32));
-    let mean = sum(&samples) / SAMPLES as f32;
-    Look { shape: samples.map(|grey| grey / mean), weight: [1.0; SAMPLES] }
-}
-
 fn ray(u: f64, v: f64) -> [f32; 2] {
     [((u - CAMERA.cx) / CAMERA.fx) as f32, ((v - CAMERA.cy) / CAMERA.fy) as f32]
-}
-
-/// Cost of a comparison and half its gradient, by pose of the observer and by depth.
-fn compared(
-    image: &QuadImage,
-    look: &Look,
-    ray: [f32; 2],
-    pose: &SE3,
-    depth: f64,
-) -> (f64, [f64; POSE + 1]) {
-    let mut lanes = PairSums::default();
-    let pair = Pair::new(pose, &CAMERA);
-    let seen = compare_portable(image, &pair, look, ray, depth as f32, &EASY, &mut lanes);
-    let Seen::Same(cost, sums) = seen else { panic!("{seen:?}") };
-    let mut gradient = [0.0; POSE + 1];
-    (0..POSE).for_each(|m| gradient[m] = f64::from(sum(&lanes.right[m])));
-    gradient[POSE] = f64::from(sums.depth_right);
-    (f64::from(cost), gradient)
-}
-
-#[test]
-fn derivatives_are_those_of_the_cost() {
-    let (host, observer) = (waves(0.0), waves(0.4));
-    let pose = SE3::exp(&Vector6::from([0.1, -0.05, 0.08, 0.02, -0.03, 0.05]));
-    for (u, v, depth) in [(80.0, 60.0, 0.4), (200.0, 150.0, 0.9), (150.0, 40.0, 0.2)] {
-        let look = look(&host, u as f32, v as f32);
-        let at = |pose: &SE3, depth: f64| compared(&observer, &look, ray(u, v), pose, depth);
-        let found = at(&pose, depth).1;
-        // A two hundredth of a pixel to each side: hardly a sample leaves its four pixels, between which the gradient is exact.
-        let pixels = 0.005 / CAMERA.fx;
-        let length = found.iter().take(3).map(|g| g * g).sum::<f64>().sqrt();
-        for m in 0..=POSE {
-            let h = [pixels / depth, pixels, 0.0005 * depth][[0, 0, 0, 1, 1, 1, 2][m]];
-            let moved = |h: f64| match m {
-                POSE => at(&pose, depth + h).0,
-                _ => {
-                    at(
-                        &(SE3::exp(&Vector6::from_fn(|r, _| if r == m { h } else { 0.0 })) * pose),
-                        depth,
-                    )
-                    .0
-                }
-            };
-            let numeric = (moved(h) - moved(-h)) / (4.0 * h);
-            // Those of translation and rotation differ by the depth.
-            let size = if m < 3 { length } else { length / depth };
-            assert!(
-                (found[m] - numeric).abs() < 0.05 * size,
-                "{u} {v} by {m}: {} {numeric}",
-                found[m]
-            );
-        }
-    }
-}
-
-#[test]
-fn lanes_give_the_bits_of_the_explanation() {
-    let mut random = Random::new(4);
-    let pixels: Vec<u8> =
-        (0..CAMERA.width * CAMERA.height).map(|_| (255.0 * random.uniform()) as u8).collect();
-    let mut image = QuadImage::with_size(CAMERA.width, CAMERA.height);
-    image.fill(&pixels);
-    let robustness = Robustness { huber_grey: 9.0, most_energy: 8.0 * 900.0 };
-    let kernel = kernel();
-    let mut counts = [0; 3];
-    for _ in 0..500 {
-        let mut next = |low: f64, high: f64| low + (high - low) * random.uniform();
-        let pose = SE3::exp(&Vector6::from_fn(|_, _| next(-0.2, 0.2)));
-        let (u, v, depth) = (next(4.0, 315.0), next(4.0, 235.0), next(0.0, 2.0) as f32);
-        let pair = Pair::new(&pose, &CAMERA);
-        let look = look(&image, u as f32, v as f32);
-        let (mut one, mut other) = (PairSums::default(), PairSums::default());
-        let seen = compare_portable(&image, &pair, &look, ray(u, v), depth, &robustness, &mut one);
-        let fast = kernel(&image, &pair, &look, ray(u, v), depth, &robustness, &mut other);
-        assert_eq!(seen, fast);
-        assert_eq!(one, other);
-        counts[[matches!(seen, Seen::Outside), matches!(seen, Seen::Other), true]
-            .iter()
-            .position(|&is| is)
-            .unwrap()] += 1;
-    }
-    assert!(counts.iter().all(|&count| count > 20), "{counts:?}");
-}
-
-#[test]
-fn numbers_that_are_none_are_outside() {
-    let image = waves(0.0);
-    let look = look(&image, 100.0, 100.0);
-    let pair = Pair::new(&SE3::identity(), &CAMERA);
-    for (ray, depth) in
-        [([f32::NAN, 0.0], 1.0), ([0.0, 0.0], f32::NAN), ([f32::INFINITY, 0.0], 1.0)]
-    {
-        let seen =
-            compare_portable(&image, &pair, &look, ray, depth, &EASY, &mut PairSums::default());
-        let is_harmless = match seen {
-            Seen::Outside | Seen::Other => true,
-            Seen::Same(cost, sums) => cost.is_finite() && sums.depth.is_finite(),
-        };
-        assert!(is_harmless, "{ray:?} {depth}: {seen:?}");
-    }
 }
 
 /// Keyframes of a room with points, of which the first and those in `held` stay where they are.
@@ -168,11 +38,12 @@ fn room(brightness: impl Fn(usize, f64) -> (f64, f64)) -> Room {
             let (gain, offset) = brightness(index, f64::from(x * x + y * y));
             *grey = gain as f32 * *grey + offset as f32;
         }
+        let pixels = view.noisy(1.0, index as u64);
+        let image = Image::try_from_pixels(CAMERA.width, CAMERA.height, pixels).unwrap();
         let mut keyframe = WindowKeyframe {
             keyframe_id: index as u64,
             epoch: 0,
-            pixels: view.noisy(1.0, index as u64),
-            images: Vec::new(),
+            images: vec![image],
             camera_from_map: world_from_camera.inverse(),
             unit: 1.0,
             points: Vec::new(),
@@ -189,7 +60,7 @@ fn room(brightness: impl Fn(usize, f64) -> (f64, f64)) -> Room {
             })
             .collect();
         let params = WindowParams::default();
-        let chosen = selection::choose(&dense, &keyframe.pixels, &CAMERA, 400, 8.0, 0.3);
+        let chosen = selection::choose(&dense, keyframe.images[0].pixels(), &CAMERA, 400, 8.0, 0.3);
         let images = &keyframe.images;
         let points = chosen.iter().map(|of| {
             WindowPoint::new((of.u, of.v), f64::from(of.inverse_depth), images, &CAMERA, &params)
@@ -240,6 +111,7 @@ impl Room {
         for level in ADJUSTED_LEVELS {
             let at = Level { camera: &CAMERA, level, robustness };
             solver.views.find(&self.keyframes, members.members, &CAMERA, |_, _| true);
+            solver.views.look(&self.keyframes, members.members, level);
             assert!(solver.adjust(&mut self.keyframes, &members, &at, 15, 1e-4));
         }
         solver.system.inliers as f64 / solver.system.compared as f64
@@ -342,10 +214,11 @@ fn what_one_keyframe_alone_shows_is_left_out() {
     let hidden = &mut room.keyframes[2];
     for row in 60..180 {
         for column in 120..220 {
-            hidden.pixels[row * CAMERA.width + column] = (255.0 * random.uniform()) as u8;
+            let grey = (255.0 * random.uniform()) as u8;
+            hidden.images[0].pixels_mut()[row * CAMERA.width + column] = grey;
         }
     }
-    hidden.images.clear();
+    hidden.leave();
     hidden.take_part(&CAMERA);
     hidden.points.clear();
     let mut right = truth.clone();

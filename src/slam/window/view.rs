@@ -2,6 +2,7 @@
 
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
+use crate::slam::window::comparison::{LANES, Patterns};
 use crate::slam::window::keyframe::{WindowKeyframe, WindowPoint};
 use nalgebra::Vector3;
 
@@ -14,25 +15,66 @@ const MAX_DISTANCE_RATIO: f64 = 2.0;
 /// Nearest that a point may be to an observer, in its distance from its host.
 const MIN_DEPTH_RATIO: f64 = 0.05;
 
-/// A point and where the list of its observers is.
+/// The points of a host that an observer sees.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct PointView {
-    /// Place among its host's points.
-    pub point: usize,
-    /// First of its observers.
-    pub first: usize,
+pub struct PairView {
+    /// The host, by its place among the members.
+    pub host: usize,
+    /// The observer.
+    pub observer: usize,
+    /// First of its blocks of comparisons.
+    pub block: usize,
     /// Number of them.
     pub count: usize,
 }
 
-/// All comparisons of an adjustment, in their order: by host, point, observer.
+impl PairView {
+    /// Places of its comparisons.
+    pub fn places(&self) -> std::ops::Range<usize> {
+        let first = LANES * self.block;
+        first..first + self.count
+    }
+
+    /// Its blocks of comparisons.
+    pub fn blocks(&self) -> std::ops::Range<usize> {
+        self.block..self.block + self.count.div_ceil(LANES)
+    }
+}
+
+/// A point and where the list of its comparisons is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PointView {
+    /// Its host, by its place among the members.
+    pub host: usize,
+    /// Place among its host's points.
+    pub point: usize,
+    first: usize,
+    count: usize,
+}
+
+/// A comparison of a point.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Link {
+    /// The observer, by its place among the members.
+    pub observer: usize,
+    /// Place of the comparison.
+    pub place: usize,
+}
+
+/// All comparisons of an adjustment, in their order: by observer, host, point. One image after the other is read.
 #[derive(Debug, Clone, Default)]
 pub struct Views {
-    /// Members that see a point; of all points one after the other.
-    pub observers: Vec<usize>,
-    points: Vec<PointView>,
-    /// End of each host's part of the points.
-    ends: Vec<usize>,
+    /// The pairs of keyframes of which one sees points of the other.
+    pub pairs: Vec<PairView>,
+    /// Whose points are compared, by its place in `points`: of each comparison, those of a pair in blocks of which the
+    /// last may have room left, where it is 0.
+    pub slots: Vec<usize>,
+    /// What the points look like, by block.
+    pub patterns: Vec<Patterns>,
+    /// The living points of all members, by host.
+    pub points: Vec<PointView>,
+    links: Vec<Link>,
+    depths: Vec<f32>,
 }
 
 impl Views {
@@ -44,45 +86,96 @@ impl Views {
         camera: &Intrinsics,
         mut may: impl FnMut(usize, usize) -> bool,
     ) {
-        self.observers.clear();
+        self.pairs.clear();
+        self.slots.clear();
         self.points.clear();
-        self.ends.clear();
-        let mut seen_by = Vec::with_capacity(members.len());
         for (host, &index) in members.iter().enumerate() {
-            let map_from_host = keyframes[index].camera_from_map.inverse();
-            seen_by.clear();
-            for (observer, &other) in members.iter().enumerate() {
-                if observer != host && may(host, observer) {
-                    let observer_from_host = keyframes[other].camera_from_map * map_from_host;
-                    seen_by.push((observer, Sight::new(&observer_from_host, camera)));
-                }
-            }
-            for (point, of) in keyframes[index].points.iter().enumerate() {
-                if !of.is_alive {
+            let alive = keyframes[index].points.iter().enumerate().filter(|(_, of)| of.is_alive);
+            self.points.extend(alive.map(|(point, _)| PointView {
+                host,
+                point,
+                first: 0,
+                count: 0,
+            }));
+        }
+        for (observer, &other) in members.iter().enumerate() {
+            let mut end = 0;
+            for (host, &index) in members.iter().enumerate() {
+                let begin = end;
+                end += self.points[begin..].iter().take_while(|point| point.host == host).count();
+                if observer == host || begin == end || !may(host, observer) {
                     continue;
                 }
-                let first = self.observers.len();
-                let seeing = seen_by.iter().filter(|(_, sight)| sight.project(of).is_some());
-                self.observers.extend(seeing.map(|(observer, _)| *observer));
-                let count = self.observers.len() - first;
+                let map_from_host = keyframes[index].camera_from_map.inverse();
+                let sight = Sight::new(&(keyframes[other].camera_from_map * map_from_host), camera);
+                let first = self.slots.len();
+                let points = &keyframes[index].points;
+                let sees = |slot: &usize| sight.sees(&points[self.points[*slot].point]);
+                self.slots.extend((begin..end).filter(sees));
+                let count = self.slots.len() - first;
                 if count > 0 {
-                    self.points.push(PointView { point, first, count });
+                    self.pairs.push(PairView { host, observer, block: first / LANES, count });
+                    self.slots.resize(first + count.next_multiple_of(LANES), 0);
                 }
             }
-            self.ends.push(self.points.len());
+        }
+        self.link();
+    }
+
+    /// Lists the comparisons of each point.
+    fn link(&mut self) {
+        for pair in &self.pairs {
+            for place in pair.places() {
+                self.points[self.slots[place]].count += 1;
+            }
+        }
+        let mut end = 0;
+        for point in &mut self.points {
+            point.first = end;
+            end += point.count;
+            point.count = 0;
+        }
+        self.links.clear();
+        self.links.resize(end, Link::default());
+        for pair in &self.pairs {
+            for place in pair.places() {
+                let point = &mut self.points[self.slots[place]];
+                self.links[point.first + point.count] = Link { observer: pair.observer, place };
+                point.count += 1;
+            }
         }
     }
 
-    /// Each host with its points.
-    pub fn of_hosts(&self) -> impl Iterator<Item = (usize, &[PointView])> {
-        let begins = std::iter::once(0).chain(self.ends.iter().copied());
-        let parts = begins.zip(&self.ends).map(|(begin, &end)| &self.points[begin..end]);
-        parts.enumerate().filter(|(_, points)| !points.is_empty())
+    /// Fetches what the points look like at a level.
+    pub fn look(&mut self, keyframes: &[WindowKeyframe], members: &[usize], level: usize) {
+        self.patterns.clear();
+        self.patterns.resize(self.slots.len() / LANES, Patterns::NONE);
+        for pair in &self.pairs {
+            let points = &keyframes[members[pair.host]].points;
+            for place in pair.places() {
+                let point = &points[self.points[self.slots[place]].point];
+                let patterns = &mut self.patterns[place / LANES];
+                patterns.set(place % LANES, &point.looks[level], point.ray);
+            }
+        }
     }
 
-    /// Each point with its host.
-    pub fn with_hosts(&self) -> impl Iterator<Item = (usize, &PointView)> {
-        self.of_hosts().flat_map(|(host, points)| points.iter().map(move |point| (host, point)))
+    /// Fetches the depths of the points.
+    pub fn fetch_depths(&mut self, keyframes: &[WindowKeyframe], members: &[usize]) {
+        self.depths.clear();
+        self.depths.extend(
+            self.points
+                .iter()
+                .map(|view| keyframes[members[view.host]].points[view.point].inverse_depth as f32),
+        );
+        for (patterns, slots) in self.patterns.iter_mut().zip(self.slots.chunks_exact(LANES)) {
+            patterns.inverse_depth = std::array::from_fn(|lane| self.depths[slots[lane]]);
+        }
+    }
+
+    /// The comparisons of a point, by observer.
+    pub fn links(&self, point: &PointView) -> &[Link] {
+        &self.links[point.first..point.first + point.count]
     }
 }
 
@@ -117,20 +210,49 @@ impl Sight {
 
     /// Where the observer sees a point, if it does so well enough to be compared.
     pub fn project(&self, point: &WindowPoint) -> Option<Projected> {
+        let Intrinsics { fx, fy, cx, cy, .. } = self.camera;
+        let (_, scaled) = self.directions(point);
+        self.sees(point).then(|| Projected {
+            u: fx * scaled.x / scaled.z + cx,
+            v: fy * scaled.y / scaled.z + cy,
+            inverse_depth: point.inverse_depth / scaled.z,
+        })
+    }
+
+    /// Whether the observer sees a point well enough to be compared: in the image, from a side and a distance not too
+    /// different. Without a division or root, since it is asked of every point with every keyframe.
+    #[inline]
+    pub fn sees(&self, point: &WindowPoint) -> bool {
         let Intrinsics { fx, fy, cx, cy, width, height } = self.camera;
+        let (turned, scaled) = self.directions(point);
+        let inside = |at: f64, focal: f64, centre: f64, side: usize| {
+            let (at, last) = (focal * at, side as f64 - 1.0 - MARGIN_PX);
+            at > (MARGIN_PX - centre) * scaled.z && at < (last - centre) * scaled.z
+        };
+        let (host, observer) = (turned.norm_squared(), scaled.norm_squared());
+        let along = turned.dot(&scaled);
+        const MOST: f64 = MAX_DISTANCE_RATIO * MAX_DISTANCE_RATIO;
+        scaled.z >= MIN_DEPTH_RATIO
+            && inside(scaled.x, fx, cx, width)
+            && inside(scaled.y, fy, cy, height)
+            && along > 0.0
+            && along * along >= MIN_COSINE * MIN_COSINE * host * observer
+            && observer <= MOST * host
+            && host <= MOST * observer
+    }
+
+    /// False where the observer sees none of a few of the points, which are spread over the image: of all keyframes most
+    /// look elsewhere, and finding that out must not take longer with every keyframe.
+    pub fn may_see(&self, points: &[WindowPoint]) -> bool {
+        const STEP: usize = 8;
+        points.iter().filter(|point| point.is_alive).step_by(STEP).any(|point| self.sees(point))
+    }
+
+    /// The line of sight in the observer's axes, from the host at depth 1 and from the observer with the same scale.
+    #[inline]
+    fn directions(&self, point: &WindowPoint) -> (Vector3<f64>, Vector3<f64>) {
         let ray = Vector3::new(f64::from(point.ray[0]), f64::from(point.ray[1]), 1.0);
         let turned = self.rotation * ray;
-        let scaled = turned + point.inverse_depth * self.translation;
-        if !(scaled.z >= MIN_DEPTH_RATIO) {
-            return None;
-        }
-        let (u, v) = (fx * scaled.x / scaled.z + cx, fy * scaled.y / scaled.z + cy);
-        let inside = |at: f64, side: usize| at > MARGIN_PX && at < side as f64 - 1.0 - MARGIN_PX;
-        let ratio = scaled.norm() / turned.norm();
-        let is_seen = inside(u, width)
-            && inside(v, height)
-            && turned.dot(&scaled) >= MIN_COSINE * turned.norm() * scaled.norm()
-            && (1.0 / MAX_DISTANCE_RATIO..=MAX_DISTANCE_RATIO).contains(&ratio);
-        is_seen.then(|| Projected { u, v, inverse_depth: point.inverse_depth / scaled.z })
+        (turned, turned + point.inverse_depth * self.translation)
     }
 }

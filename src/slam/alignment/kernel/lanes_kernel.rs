@@ -41,4 +41,7 @@ pub trait Lanes: Copy {
     unsafe fn count(mask: Self::Mask) -> u32;
     /// The four pixels around (u, v) in rows of `stride`; all lie within `image`.
     unsafe fn sample(image: &[u16], stride: usize, u: Self, v: Self) -> Sample<Self>;
+    /// The same of bytes, at least `stride` + 4 of them; some pixels where (u, v) is not between the first column and
+    /// row and the last but two.
+    unsafe fn sample_bytes(image: &[u8], stride: usize, u: Self, v: Self) -> Sample<Self>;
 }

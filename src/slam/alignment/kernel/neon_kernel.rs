@@ -151,4 +151,37 @@ impl Lanes for float32x4_t {
             }
         }
     }
+    #[inline(always)]
+    unsafe fn sample_bytes(image: &[u8], stride: usize, u: Self, v: Self) -> Sample<Self> {
+        // SAFETY: the trait's contract; an index is at most that of the pixel with a row and four bytes behind it,
+        // unsigned, so that each load reads two bytes of the image.
+        unsafe {
+            let (column, row) = (vcvtq_s32_f32(u), vcvtq_s32_f32(v));
+            let index = vmlaq_s32(column, row, vdupq_n_s32(stride as i32));
+            let last = vdupq_n_u32((image.len() - stride - 4) as u32);
+            let upper = vminq_u32(vreinterpretq_u32_s32(index), last);
+            let lower = vaddq_u32(upper, vdupq_n_u32(stride as u32));
+            let pixels = image.as_ptr();
+            let pair =
+                |index: u32| u32::from(pixels.add(index as usize).cast::<u16>().read_unaligned());
+            // There is no gather; little-endian: the left pixel is the lower byte of a pair.
+            let pairs = |index: uint32x4_t| {
+                let pairs = vdupq_n_u32(pair(vgetq_lane_u32::<0>(index)));
+                let pairs = vsetq_lane_u32::<1>(pair(vgetq_lane_u32::<1>(index)), pairs);
+                let pairs = vsetq_lane_u32::<2>(pair(vgetq_lane_u32::<2>(index)), pairs);
+                vsetq_lane_u32::<3>(pair(vgetq_lane_u32::<3>(index)), pairs)
+            };
+            let (upper, lower) = (pairs(upper), pairs(lower));
+            let left = |pair: uint32x4_t| vcvtq_f32_u32(vandq_u32(pair, vdupq_n_u32(255)));
+            let right = |pair: uint32x4_t| vcvtq_f32_u32(vshrq_n_u32::<8>(pair));
+            Sample {
+                upper_left: left(upper),
+                upper_right: right(upper),
+                lower_left: left(lower),
+                lower_right: right(lower),
+                du: vsubq_f32(u, vcvtq_f32_s32(column)),
+                dv: vsubq_f32(v, vcvtq_f32_s32(row)),
+            }
+        }
+    }
 }

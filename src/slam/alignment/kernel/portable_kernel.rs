@@ -136,4 +136,22 @@ impl Lanes for FourLanes {
         let [upper_left, upper_right, lower_left, lower_right, du, dv] = pixels.map(Self);
         Sample { upper_left, upper_right, lower_left, lower_right, du, dv }
     }
+    #[inline(always)]
+    unsafe fn sample_bytes(image: &[u8], stride: usize, u: Self, v: Self) -> Sample<Self> {
+        let last = image.len() - stride - 4;
+        let mut pixels = [[0.0f32; 4]; 6];
+        for lane in 0..4 {
+            let (column, row) = (u.0[lane] as i32, v.0[lane] as i32);
+            let index = row.wrapping_mul(stride as i32).wrapping_add(column);
+            let upper = (index as u32 as usize).min(last);
+            pixels[0][lane] = f32::from(image[upper]);
+            pixels[1][lane] = f32::from(image[upper + 1]);
+            pixels[2][lane] = f32::from(image[upper + stride]);
+            pixels[3][lane] = f32::from(image[upper + stride + 1]);
+            pixels[4][lane] = u.0[lane] - column as f32;
+            pixels[5][lane] = v.0[lane] - row as f32;
+        }
+        let [upper_left, upper_right, lower_left, lower_right, du, dv] = pixels.map(Self);
+        Sample { upper_left, upper_right, lower_left, lower_right, du, dv }
+    }
 }

@@ -161,6 +161,32 @@ impl Lanes for __m256 {
             }
         }
     }
+    #[inline(always)]
+    unsafe fn sample_bytes(image: &[u8], stride: usize, u: Self, v: Self) -> Sample<Self> {
+        // SAFETY: the trait's contract; an index is at most that of the pixel with a row and four bytes behind it,
+        // unsigned, so that each gather reads four bytes of the image.
+        unsafe {
+            let (column, row) = (_mm256_cvttps_epi32(u), _mm256_cvttps_epi32(v));
+            let last = _mm256_set1_epi32((image.len() - stride - 4) as i32);
+            let stride = _mm256_set1_epi32(stride as i32);
+            let index = _mm256_add_epi32(_mm256_mullo_epi32(row, stride), column);
+            let index = _mm256_min_epu32(index, last);
+            let pixels = image.as_ptr().cast::<i32>();
+            let words = |index| _mm256_i32gather_epi32::<1>(pixels, index);
+            let (upper, lower) = (words(index), words(_mm256_add_epi32(index, stride)));
+            let byte = _mm256_set1_epi32(255);
+            let left = |word: __m256i| _mm256_cvtepi32_ps(_mm256_and_si256(word, byte));
+            let right = |word: __m256i| left(_mm256_srli_epi32::<8>(word));
+            Sample {
+                upper_left: left(upper),
+                upper_right: right(upper),
+                lower_left: left(lower),
+                lower_right: right(lower),
+                du: _mm256_sub_ps(u, _mm256_cvtepi32_ps(column)),
+                dv: _mm256_sub_ps(v, _mm256_cvtepi32_ps(row)),
+            }
+        }
+    }
 }
 
 impl Lanes for __m512 {
@@ -250,6 +276,32 @@ impl Lanes for __m512 {
             let low = _mm512_set1_epi32(0xFFFF);
             let left = |pair: __m512i| _mm512_cvtepi32_ps(_mm512_and_si512(pair, low));
             let right = |pair: __m512i| _mm512_cvtepi32_ps(_mm512_srli_epi32::<16>(pair));
+            Sample {
+                upper_left: left(upper),
+                upper_right: right(upper),
+                lower_left: left(lower),
+                lower_right: right(lower),
+                du: _mm512_sub_ps(u, _mm512_cvtepi32_ps(column)),
+                dv: _mm512_sub_ps(v, _mm512_cvtepi32_ps(row)),
+            }
+        }
+    }
+    #[inline(always)]
+    unsafe fn sample_bytes(image: &[u8], stride: usize, u: Self, v: Self) -> Sample<Self> {
+        // SAFETY: the trait's contract; an index is at most that of the pixel with a row and four bytes behind it,
+        // unsigned, so that each gather reads four bytes of the image.
+        unsafe {
+            let (column, row) = (_mm512_cvttps_epi32(u), _mm512_cvttps_epi32(v));
+            let last = _mm512_set1_epi32((image.len() - stride - 4) as i32);
+            let stride = _mm512_set1_epi32(stride as i32);
+            let index = _mm512_add_epi32(_mm512_mullo_epi32(row, stride), column);
+            let index = _mm512_min_epu32(index, last);
+            let pixels = image.as_ptr().cast::<i32>();
+            let words = |index| _mm512_i32gather_epi32::<1>(index, pixels);
+            let (upper, lower) = (words(index), words(_mm512_add_epi32(index, stride)));
+            let byte = _mm512_set1_epi32(255);
+            let left = |word: __m512i| _mm512_cvtepi32_ps(_mm512_and_si512(word, byte));
+            let right = |word: __m512i| left(_mm512_srli_epi32::<8>(word));
             Sample {
                 upper_left: left(upper),
                 upper_right: right(upper),
