@@ -14,6 +14,7 @@ use semidense::slam::frame::FrameView;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::geometry::sim3::Sim3;
+use semidense::slam::keyframe::Keyframe;
 use semidense::slam::map::{
     Correction, CorrectionError, EpochJoin, KeyframeCorrection, LogPlane, Map,
 };
@@ -107,7 +108,12 @@ fn moved(map: &Map, move_one: impl Fn(&Sim3) -> Sim3) -> Correction {
         map_from_keyframe: move_one(&keyframe.map_from_keyframe),
         depth: LogPlane::default(),
     });
-    Correction { keyframes: keyframes.collect(), joins: Vec::new() }
+    Correction { keyframes: keyframes.collect(), ..Correction::default() }
+}
+
+/// A correction that gives the whole map another place and unit.
+fn regauged(map: &Map, new_from_map: &Sim3) -> Correction {
+    Correction { unit: Some(new_from_map.scale), ..moved(map, |place| *new_from_map * *place) }
 }
 
 /// How far two poses are apart, in units of their own and radians together.
@@ -150,7 +156,7 @@ proptest! {
         plain.show_all(0..FRAMES);
         let mut corrected = Run::new(footage);
         corrected.show_all(0..CORRECTED_AT);
-        let correction = moved(corrected.mapper.map(), |place| new_from_map * *place);
+        let correction = regauged(corrected.mapper.map(), &new_from_map);
         prop_assert!(correction.keyframes.len() > 2, "a map worth correcting");
         corrected.apply(&correction);
         corrected.show_all(CORRECTED_AT..FRAMES);
@@ -212,10 +218,16 @@ fn what_moves_takes_its_frames_along() {
     let active = run.mapper.keyframe().unwrap().clone();
     run.apply(&correction);
     let anchored = run.mapper.keyframe().unwrap();
-    let moved_by = distance(&anchored.world_from_keyframe.rigid, &active.world_from_keyframe.rigid);
-    assert!(moved_by < 1e-9, "odometry's place of the active keyframe moved by {moved_by}");
-    assert_eq!(anchored.map_from_keyframe, bend(&active.map_from_keyframe));
     let last = run.poses[CORRECTED_AT - 1];
+    let again = anchored.world_from_keyframe.place(&last.keyframe_from_camera);
+    let moved_by = distance(&again, &last.world_from_camera);
+    assert!(moved_by < 1e-9, "odometry's place of the camera moved by {moved_by}");
+    assert_eq!(anchored.map_from_keyframe, bend(&active.map_from_keyframe));
+    // Its unit is the map's, which has not changed: the keyframe's, which has, is longer there too.
+    let unit = |keyframe: &Keyframe| {
+        keyframe.world_from_keyframe.scale / keyframe.map_from_keyframe.scale
+    };
+    assert!((unit(anchored) / unit(&active) - 1.0).abs() < 1e-12, "odometry's unit changes");
     run.show_all(CORRECTED_AT..CORRECTED_AT + 1);
     let next = run.poses[CORRECTED_AT];
     let step = distance(&last.world_from_camera, &next.world_from_camera);
@@ -282,7 +294,7 @@ fn a_successor_goes_on_from_the_corrected_map() {
     let mut run = Run::new(footage);
     run.show_all(0..CORRECTED_AT);
     let new_from_map = Sim3::new(SE3::exp(&Vector6::new(1.0, 2.0, 3.0, 0.1, 0.2, 0.3)), 2.0);
-    let correction = moved(run.mapper.map(), |place| new_from_map * *place);
+    let correction = regauged(run.mapper.map(), &new_from_map);
     run.apply(&correction);
     let died_with = run.mapper.keyframe().unwrap().clone();
     let mut successor = Mapper::new(footage.intrinsics, MapperParams::default()).unwrap();

@@ -50,6 +50,9 @@ pub struct Correction {
     pub keyframes: Vec<KeyframeCorrection>,
     /// Epochs that turn out to be parts of others; done first.
     pub joins: Vec<EpochJoin>,
+    /// Length of the unit that the map had in the one that it has now, where that changes for all of it alike:
+    /// odometry keeps its own.
+    pub unit: Option<f64>,
 }
 
 /// A keyframe's new place and depth. Frames that were tracked on it keep their pose relative to it, in its unit.
@@ -97,6 +100,9 @@ pub enum CorrectionError {
     /// The same of an epoch.
     #[error("the join of epoch {0} is not a similarity, or joins the epoch to itself")]
     Join(u32),
+    /// The unit is not finite, or not positive.
+    #[error("the map's unit is to be changed by a factor that is not positive and finite")]
+    Unit,
 }
 
 impl LogPlane {
@@ -137,6 +143,9 @@ impl Correction {
             |of: &&KeyframeCorrection| !(of.map_from_keyframe.is_valid() && of.depth.is_sane());
         if let Some(broken) = self.keyframes.iter().find(is_broken) {
             return Err(CorrectionError::Keyframe(broken.keyframe_id));
+        }
+        if self.unit.is_some_and(|unit| !(unit.is_finite() && unit > 0.0)) {
+            return Err(CorrectionError::Unit);
         }
         let is_broken =
             |join: &&EpochJoin| !join.into_from_epoch.is_valid() || join.epoch == join.into;

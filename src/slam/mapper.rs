@@ -207,6 +207,8 @@ pub struct Mapper {
     world_from_map: Sim3,
     /// Where odometry had the camera last; a tracker that has lost it, or was restarted, may not know.
     last_world_from_camera: Option<SE3>,
+    /// The keyframe that the last frame was tracked on, and where that was in its unit.
+    last_tracked: Option<(u64, SE3)>,
     depth: DepthBuffers,
     modes: KeyframeModes,
     /// By how much the lines of estimated poses are misplaced.
@@ -245,6 +247,7 @@ impl Mapper {
             active: None,
             world_from_map: Sim3::identity(),
             last_world_from_camera: None,
+            last_tracked: None,
             line_noise: LineNoise::new(params.matching.line_noise_px),
             depth: DepthBuffers::with_size(width, height),
             modes: KeyframeModes::default(),
@@ -328,6 +331,7 @@ impl Mapper {
         change_begins: &mut dyn FnMut(),
     ) -> StepOutcome {
         self.last_world_from_camera = Some(pose.world_from_camera);
+        self.last_tracked = Some((pose.keyframe_id, pose.keyframe_from_camera));
         self.keep_frame(frame, pose);
         self.guess_unit(&pose.keyframe_from_camera);
         let (unit, modes) = (self.depth.unit, &self.params.modes);

@@ -144,7 +144,9 @@ impl Tracker {
                 self.memory.motion = Motion::default();
                 self.memory.was_lost = false;
             }
-            if old.keyframe_id() != new.keyframe_id() {
+            if old.keyframe_id() == new.keyframe_id() {
+                self.memory.motion.follow(old.world_from_keyframe(), new.world_from_keyframe());
+            } else {
                 self.memory.brightness = Brightness::default();
                 self.memory.coarse_fit = None;
             }

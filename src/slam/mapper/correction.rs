@@ -1,11 +1,12 @@
 //! Corrections of the map from outside the step: poses, units, depth and joined epochs, consistent everywhere at
 //! once.
 //!
-//! Nothing else has to be told: frames are kept relative to their keyframes, the odometry's place of the active
-//! keyframe stands still, and the tracker gets the keyframe as another revision.
+//! Nothing else has to be told: frames are kept relative to their keyframes, odometry has the camera where it had it,
+//! and the tracker gets the keyframe as another revision.
 
+use crate::slam::geometry::se3::SE3;
 use crate::slam::map::{Correction, CorrectionError, LogPlane};
-use crate::slam::mapper::{Mapper, StepOutcome};
+use crate::slam::mapper::{Mapper, StepOutcome, anchored};
 
 impl Mapper {
     /// Applies a correction between two frames; what is to be published then. Refused as a whole where a number
@@ -14,21 +15,33 @@ impl Mapper {
         correction.validate()?;
         // The depth of the keyframe before is on its way from the buffers into the map.
         let finished = self.finish_keyframe();
-        let before = self.keyframe().map(|keyframe| keyframe.map_from_keyframe);
+        let epoch = self.keyframe().map(|keyframe| keyframe.epoch);
+        let before = self.last_map_from_camera();
         self.revision += 1;
         self.map.correct(correction, self.revision)?;
-        let Some(before) = before else {
+        let (Some(before), Some(after)) = (before, self.last_map_from_camera()) else {
             return Ok(StepOutcome { graph_changed: true, ..finished });
         };
         if let Some(plane) = self.active_plane(correction) {
             self.depth.correct(&plane, &self.intrinsics);
         }
-        if let Some(active) = self.keyframe() {
-            // The active keyframe stays where odometry has it, in the unit that it has there.
-            self.world_from_map = self.world_from_map * before * active.map_from_keyframe.inverse();
-        }
+        // The camera stays where odometry has it, and odometry goes on in the unit that it has.
+        let world_from_camera = self.world_from_map.place(&before);
+        let joined = correction.joins.iter().filter(|join| Some(join.epoch) == epoch);
+        let unit = joined.map(|join| join.into_from_epoch.scale).product::<f64>()
+            * correction.unit.unwrap_or(1.0);
+        self.world_from_map = anchored(self.world_from_map.scale / unit, &after, &world_from_camera);
         self.publish_place();
         Ok(StepOutcome { keyframe_changed: true, graph_changed: true, ..finished })
+    }
+
+    /// Where the last frame is that was tracked in the active epoch, or else the active keyframe.
+    fn last_map_from_camera(&self) -> Option<SE3> {
+        let active = self.keyframe()?;
+        let of_epoch = |id: u64| self.map.get(id).filter(|known| known.epoch == active.epoch);
+        let tracked = self.last_tracked.filter(|(id, _)| of_epoch(*id).is_some());
+        let (keyframe_id, at) = tracked.unwrap_or((active.keyframe_id, SE3::identity()));
+        self.map.place(keyframe_id, &at)
     }
 
     /// What the correction does to the active keyframe's depth; `None` where it is not in it.

@@ -158,6 +158,7 @@ impl Mapper {
         self.phase = Phase::Mapping;
         self.world_from_map = Sim3::identity();
         self.last_world_from_camera = None;
+        self.last_tracked = None;
         self.past.clear();
         self.modes.forget();
         self.depth.restart(pixels, &self.params);

@@ -1,10 +1,12 @@
 //! Where the camera will be: constant velocity in the world, and what else it may have done.
 //!
-//! Poses are kept in the world, so that a new keyframe or refined depth disturbs nothing.
+//! Poses are kept in the world, so that a new keyframe or refined depth disturbs nothing; where the map is corrected
+//! they follow their keyframe.
 
 use nalgebra::Vector6;
 
 use crate::slam::geometry::se3::SE3;
+use crate::slam::geometry::sim3::Sim3;
 
 /// A pose with its stamp.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -34,6 +36,20 @@ impl Motion {
             Some((twist, interval as f64))
         });
         self.last = Some(now);
+    }
+
+    /// The keyframe that the poses are known from has been moved: they stay where they are relative to it.
+    pub fn follow(&mut self, before: &Sim3, after: &Sim3) {
+        if before == after {
+            return;
+        }
+        if let Some(last) = &mut self.last {
+            last.world_from_camera = after.place(&before.locate(&last.world_from_camera));
+        }
+        if let Some((twist, _)) = &mut self.velocity {
+            let factor = after.scale / before.scale;
+            twist.fixed_rows_mut::<3>(0).scale_mut(factor);
+        }
     }
 
     /// Forgets the velocity: after a loss only the place is worth something.
@@ -115,6 +131,24 @@ mod tests {
         let expected = pose([1.0; 6]) * step * step * step;
         let predicted = motion.predict(99, 1.0).unwrap();
         assert!((predicted.inverse() * expected).log().norm() < 1e-12);
+    }
+
+    #[test]
+    fn what_the_keyframe_does_the_camera_does_too() {
+        let before = Sim3::new(pose([0.3, 0.1, 0.0, 0.1, 0.2, 0.0]), 2.0);
+        let after = Sim3::new(pose([-0.1, 0.4, 0.2, 0.0, 0.1, 0.3]), 2.5);
+        let relative = [pose([0.0; 6]), pose([0.1, 0.0, 0.02, 0.01, -0.03, 0.02])];
+        let seen_from = |keyframe: &Sim3| {
+            let mut motion = Motion::default();
+            motion.observe(0, &keyframe.place(&relative[0]));
+            motion.observe(33, &keyframe.place(&relative[1]));
+            motion
+        };
+        let mut moved = seen_from(&before);
+        moved.follow(&before, &after);
+        let (predicted, expected) = (moved.predict(66, 1.0), seen_from(&after).predict(66, 1.0));
+        let error = (predicted.unwrap().inverse() * expected.unwrap()).log().norm();
+        assert!(error < 1e-12, "{error}");
     }
 
     #[test]

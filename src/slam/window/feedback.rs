@@ -17,7 +17,7 @@ impl Window {
         }
         let followers = self.followers(map, &keyframes);
         keyframes.extend(followers);
-        Correction { keyframes, joins: Vec::new() }
+        Correction { keyframes, ..Correction::default() }
     }
 
     /// Keyframes that are not estimated, newer ones and rejected ones: each goes where the last before it that moved goes.
