@@ -220,6 +220,8 @@ pub struct Mapper {
     window: Option<Box<Window>>,
     /// Frames that were tracked since it was given away.
     tracked: Vec<TrackedFrame>,
+    /// Frames of a start that has not been proven.
+    early: Vec<TrackedFrame>,
     /// Memory for more of them.
     spare_pixels: Vec<Vec<u8>>,
     /// The keyframe that was active before, until somebody asks for it.
@@ -258,6 +260,7 @@ impl Mapper {
             window: (params.window.num_free > 0)
                 .then(|| Box::new(Window::new(intrinsics, params.window.clone()))),
             tracked: Vec::new(),
+            early: Vec::new(),
             spare_pixels: Vec::new(),
             left: None,
             frame: QuadImage::with_size(width, height),

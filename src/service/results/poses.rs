@@ -16,7 +16,7 @@ use crate::slam::trajectory::StampedPose;
 
 /// First line of `trajectory.txt`.
 pub const FINAL_COMMENT: &str =
-    "world_from_camera of every tracked frame: final pose of its keyframe x relative pose";
+    "world_from_camera of every frame with a pose: final pose of its keyframe x relative pose";
 
 /// First line of `trajectory_online.txt`.
 pub const ONLINE_COMMENT: &str = "world_from_camera of every tracked frame as it was published";
@@ -31,23 +31,34 @@ pub fn longest_epoch(record: &RunRecord) -> Option<u32> {
     frames.into_iter().rev().max_by_key(|&(_, count)| count).map(|(epoch, _)| epoch)
 }
 
-/// Every tracked frame, of one epoch or of all, on the final place of its keyframe, in the map. A frame whose
+/// Every frame with a pose, of one epoch or of all, on the final place of its keyframe, in the map: frames that were
+/// tracked, and those that came before their map began and were aligned to it afterwards. A tracked frame whose
 /// keyframe the final map does not hold keeps its published place.
 pub fn final_trajectory(record: &RunRecord, epoch: Option<u32>) -> Vec<StampedPose> {
     let keyframes = record.map.keyframes.iter();
-    let places: HashMap<u64, _> = keyframes.map(|k| (k.keyframe_id, k.map_from_keyframe)).collect();
-    tracked(record, epoch, |estimate| {
-        let relative = record
-            .map
-            .frame(estimate.sequence)
-            .map_or((estimate.keyframe_id, &estimate.keyframe_from_camera), |aligned| {
-                (aligned.keyframe_id, &aligned.keyframe_from_camera)
-            });
-        match places.get(&relative.0) {
-            Some(map_from_keyframe) => map_from_keyframe.place(relative.1),
-            None => estimate.map_from_camera,
-        }
-    })
+    let places: HashMap<u64, _> = keyframes.map(|k| (k.keyframe_id, k)).collect();
+    let estimates = record.poses.iter().map(|pose| &pose.estimate);
+    let with_pose = estimates.filter_map(|estimate| {
+        let (keyframe_id, at) = match record.map.frame(estimate.sequence) {
+            Some(aligned) => (aligned.keyframe_id, &aligned.keyframe_from_camera),
+            None if !estimate.state.is_tracked() => return None,
+            None => (estimate.keyframe_id, &estimate.keyframe_from_camera),
+        };
+        let (of, place) = match places.get(&keyframe_id) {
+            Some(keyframe) => (keyframe.epoch, keyframe.map_from_keyframe.place(at)),
+            None => (estimate.epoch, estimate.map_from_camera),
+        };
+        let nanos = estimate.capture_nanos;
+        epoch
+            .is_none_or(|epoch| of == epoch)
+            .then_some(StampedPose { nanos, world_from_camera: place })
+    });
+    with_pose.collect()
+}
+
+/// Whether a frame that came before its map began was aligned to it afterwards.
+pub fn is_placed_later(estimate: &PoseEstimate, map: &Map) -> bool {
+    !estimate.state.is_tracked() && map.frame(estimate.sequence).is_some()
 }
 
 /// The epoch that a frame belongs to in the end: its own may have been joined to another.
@@ -57,7 +68,16 @@ fn final_epoch(record: &RunRecord, estimate: &PoseEstimate) -> u32 {
 
 /// Every tracked frame, of one epoch or of all, as it was published.
 pub fn online_trajectory(record: &RunRecord, epoch: Option<u32>) -> Vec<StampedPose> {
-    tracked(record, epoch, |estimate| estimate.world_from_camera)
+    let estimates = record.poses.iter().map(|pose| &pose.estimate);
+    let in_epoch =
+        |estimate: &&PoseEstimate| epoch.is_none_or(|epoch| final_epoch(record, estimate) == epoch);
+    let tracked = estimates.filter(|estimate| estimate.state.is_tracked()).filter(in_epoch);
+    tracked
+        .map(|estimate| StampedPose {
+            nanos: estimate.capture_nanos,
+            world_from_camera: estimate.world_from_camera,
+        })
+        .collect()
 }
 
 /// Errors of the tracked frames of one epoch against their covariance; `None` without ground truth or where
@@ -73,22 +93,6 @@ pub fn normalized_errors_of(record: &RunRecord, epoch: Option<u32>) -> Option<No
     let keyframes = record.map.keyframes.iter().filter(|keyframe| in_epoch(keyframe.epoch));
     let stamps: Vec<(u64, i64)> = keyframes.map(|k| (k.keyframe_id, k.capture_nanos)).collect();
     normalized_errors(&tracked, &stamps, &record.ground_truth, MAX_DIFFERENCE_NANOS)
-}
-
-fn tracked(
-    record: &RunRecord,
-    epoch: Option<u32>,
-    world_from_camera: impl Fn(&crate::slam::pose::PoseEstimate) -> crate::slam::geometry::se3::SE3,
-) -> Vec<StampedPose> {
-    let estimates = record.poses.iter().map(|pose| &pose.estimate);
-    estimates
-        .filter(|estimate| estimate.state.is_tracked())
-        .filter(|estimate| epoch.is_none_or(|epoch| final_epoch(record, estimate) == epoch))
-        .map(|estimate| StampedPose {
-            nanos: estimate.capture_nanos,
-            world_from_camera: world_from_camera(estimate),
-        })
-        .collect()
 }
 
 /// Writes one line for each keyframe: its pose as in a TUM file, then what a map needs besides.

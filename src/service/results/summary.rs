@@ -9,7 +9,7 @@ use crate::service::results::budget_curve::BudgetCurve;
 use crate::service::results::calibration::whitened_residual_median;
 use crate::service::results::joint::JointSummary;
 use crate::service::results::output_folder::utc_text;
-use crate::service::results::poses::longest_epoch;
+use crate::service::results::poses::{is_placed_later, longest_epoch};
 use crate::service::results::times::{LatencySummary, Percentiles, track_nanos};
 use crate::service::results::untracked::Untracked;
 use crate::service::results::{
@@ -21,7 +21,7 @@ use crate::slam::evaluation::grade::{Grade, GradeInput};
 use crate::slam::evaluation::map_consistency::MapConsistency;
 use crate::slam::evaluation::normalized_error::NormalizedErrors;
 use crate::slam::map::Map;
-use crate::slam::pose::TrackingState;
+use crate::slam::pose::{PoseEstimate, TrackingState};
 
 /// A trajectory against ground truth; all null where there is none. Lengths in the ground truth's
 /// unit (metres), errors after the alignment.
@@ -142,23 +142,30 @@ impl From<DepthStatistics> for DepthSummary {
 /// Frames by their state.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct FrameCounts {
-    /// Frames whose pose is claimed.
+    /// Frames with a pose: claimed when they came, or found afterwards.
     pub frames_tracked: u64,
+    /// Of them those that came before their map began and were aligned to it afterwards.
+    #[serde(default)]
+    pub frames_tracked_later: u64,
     /// Of them those whose pose is worse than it should be.
     pub frames_degraded: u64,
-    /// Frames before the map could be trusted.
+    /// Frames before the map could be trusted that have none.
     pub frames_initializing: u64,
     /// Frames whose pose is not claimed.
     pub frames_lost: u64,
 }
 
 impl FrameCounts {
-    fn of(poses: &[RecordedPose]) -> Self {
+    fn of(poses: &[RecordedPose], map: &Map) -> Self {
         let count = |is: fn(TrackingState) -> bool| count_states(poses, is);
+        let later = || poses.iter().map(|pose| &pose.estimate).filter(|of| is_placed_later(of, map));
+        let is_initializing = |of: &&PoseEstimate| of.state == TrackingState::Initializing;
+        let initializing = count(|s| s == TrackingState::Initializing);
         Self {
-            frames_tracked: count(TrackingState::is_tracked),
+            frames_tracked: count(TrackingState::is_tracked) + later().count() as u64,
+            frames_tracked_later: later().count() as u64,
             frames_degraded: count(|s| matches!(s, TrackingState::Degraded(_))),
-            frames_initializing: count(|s| s == TrackingState::Initializing),
+            frames_initializing: initializing - later().filter(is_initializing).count() as u64,
             frames_lost: count(is_lost),
         }
     }
@@ -319,7 +326,7 @@ impl Summary {
             frames_in: record.frames_in,
             frames_refused: record.frames_refused,
             refused: record.refused.clone(),
-            frames: FrameCounts::of(&record.poses),
+            frames: FrameCounts::of(&record.poses, &record.map),
             frames_dropped: record.frames_dropped,
             gaps: record.gaps,
             lost_count: count_losses(&record.poses),

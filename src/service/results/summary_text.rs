@@ -124,8 +124,12 @@ fn frames(summary: &Summary) -> String {
         (frames, 0 | 1) => format!("{frames} lost"),
         (frames, times) => format!("{frames} lost ({times} times)"),
     };
+    let later = match summary.frames.frames_tracked_later {
+        0 => String::new(),
+        frames => format!(" ({frames} of them afterwards)"),
+    };
     format!(
-        "{} in, {} tracked, {lost}, {} dropped, {} gaps{skipped}; {initialised}",
+        "{} in, {} tracked{later}, {lost}, {} dropped, {} gaps{skipped}; {initialised}",
         summary.frames_in, summary.frames.frames_tracked, summary.frames_dropped, summary.gaps
     )
 }

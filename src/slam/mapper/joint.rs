@@ -1,10 +1,11 @@
 //! When keyframes are estimated together, and what becomes of it.
 
 use crate::slam::frame::FrameView;
+use crate::slam::geometry::se3::SE3;
 use crate::slam::mapper::{Mapper, StepOutcome};
-use crate::slam::pose::PoseEstimate;
+use crate::slam::pose::{NO_KEYFRAME, PoseEstimate};
 use crate::slam::window::Window;
-use crate::slam::window::frames::TrackedFrame;
+use crate::slam::window::frames::{PlacedFrame, TrackedFrame};
 
 impl Mapper {
     /// The keyframes to be estimated together, where one has been added since the last time: to be given back with
@@ -72,21 +73,54 @@ impl Mapper {
     /// Keeps a tracked frame until it is aligned again.
     pub(super) fn keep_frame(&mut self, frame: &FrameView<'_>, pose: &PoseEstimate) {
         let most = self.params.window.max_waiting_frames;
-        if self.params.window.num_free == 0 || most == 0 {
-            return;
+        if self.aligns_again() {
+            let (at, spare) = (&pose.keyframe_from_camera, &mut self.spare_pixels);
+            keep(&mut self.tracked, most, spare, frame, (pose.keyframe_id, at));
         }
-        if self.tracked.len() >= most {
-            self.spare_pixels.push(self.tracked.remove(0).pixels);
+    }
+
+    /// Keeps a frame from before its map begins.
+    pub(super) fn keep_early_frame(&mut self, frame: &FrameView<'_>) {
+        /// Two seconds at 30 Hz, one byte a pixel each.
+        const MOST: usize = 60;
+        if self.aligns_again() {
+            let (at, spare) = (&SE3::identity(), &mut self.spare_pixels);
+            keep(&mut self.early, MOST, spare, frame, (NO_KEYFRAME, at));
         }
-        let mut pixels = self.spare_pixels.pop().unwrap_or_default();
-        pixels.clear();
-        pixels.extend_from_slice(frame.pixels);
-        self.tracked.push(TrackedFrame {
-            sequence: frame.sequence,
-            keyframe_id: pose.keyframe_id,
-            keyframe_from_camera: pose.keyframe_from_camera,
-            pixels,
-        });
+    }
+
+    fn aligns_again(&self) -> bool {
+        self.params.window.num_free > 0 && self.params.window.max_waiting_frames > 0
+    }
+
+    /// Forgets frames from before a map that has not begun.
+    pub(super) fn drop_early_frames(&mut self) {
+        self.spare_pixels.extend(self.early.drain(..).map(|frame| frame.pixels));
+    }
+
+    /// A map has begun with two frames, its first keyframes, of which the second stands at `first_from_second`. Frames
+    /// from before the second will be aligned to it; where they are is guessed by an even motion.
+    pub(super) fn adopt_early_frames(&mut self, first_from_second: &SE3) {
+        let [.., first, second] = &self.map.keyframes[..] else { return };
+        let motion = first_from_second.log();
+        let begin = first.sequence;
+        let interval = second.sequence.saturating_sub(begin).max(1) as f64;
+        for mut frame in self.early.drain(..) {
+            if frame.sequence == begin {
+                self.spare_pixels.push(frame.pixels);
+                continue;
+            }
+            let share = (frame.sequence as f64 - begin as f64) / interval;
+            frame.keyframe_id = first.keyframe_id;
+            frame.keyframe_from_camera = SE3::exp(&(motion * share));
+            frame.is_guess = true;
+            self.tracked.push(frame);
+        }
+        for keyframe in [first, second].map(|keyframe| (keyframe.sequence, keyframe.keyframe_id)) {
+            let (sequence, keyframe_id) = keyframe;
+            let keyframe_from_camera = SE3::identity();
+            self.map.place_frame(&PlacedFrame { sequence, keyframe_id, keyframe_from_camera });
+        }
     }
 
     /// Takes the keyframes back and leaves the map as it is: it has changed meanwhile, so that the estimate is one of
@@ -96,4 +130,27 @@ impl Mapper {
         drop(window.take_placed());
         self.window = Some(window);
     }
+}
+
+/// Copies a frame to the end of a list of at most so many; the oldest gives way.
+fn keep(
+    frames: &mut Vec<TrackedFrame>,
+    most: usize,
+    spare: &mut Vec<Vec<u8>>,
+    frame: &FrameView<'_>,
+    (keyframe_id, at): (u64, &SE3),
+) {
+    if frames.len() >= most {
+        spare.push(frames.remove(0).pixels);
+    }
+    let mut pixels = spare.pop().unwrap_or_default();
+    pixels.clear();
+    pixels.extend_from_slice(frame.pixels);
+    frames.push(TrackedFrame {
+        sequence: frame.sequence,
+        keyframe_id,
+        keyframe_from_camera: *at,
+        is_guess: false,
+        pixels,
+    });
 }

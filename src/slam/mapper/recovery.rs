@@ -225,6 +225,7 @@ impl Mapper {
         let map_from_camera = keyframe.map_from_keyframe.place(keyframe_from_camera);
         self.anchor(&map_from_camera);
         self.past.clear();
+        self.drop_early_frames();
         self.phase = Phase::Mapping;
         self.enter_keyframe(index);
         StepOutcome { keyframe_restored: true, keyframe_changed: true, ..Default::default() }

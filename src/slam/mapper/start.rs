@@ -85,9 +85,13 @@ impl Mapper {
         if sensor_depth.is_none() && !is_given {
             return match self.start.step(frame) {
                 Some((first, proven)) => self.begin_proven(frame, pose, first, &proven),
-                None => StepOutcome::default(),
+                None => {
+                    self.keep_early_frame(frame);
+                    StepOutcome::default()
+                }
             };
         }
+        self.drop_early_frames();
         let (origin, _) = self.origin(pose);
         self.begin_epoch(frame.pixels);
         if let Some(sensor) = sensor_depth {
@@ -213,6 +217,7 @@ impl Mapper {
             ..PoseEstimate::unknown(frame)
         };
         self.change_keyframe(frame, &pose, None);
+        self.adopt_early_frames(&pose.keyframe_from_camera);
         StepOutcome {
             keyframe_created: true,
             keyframe_changed: true,

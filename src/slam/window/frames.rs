@@ -13,6 +13,8 @@ use crate::slam::window::keyframe::WindowKeyframe;
 const MOST_AT_ONCE: usize = 30;
 /// Levels that a frame is aligned on: it is within a pixel or two already.
 const FRAME_LEVELS: [usize; 2] = [1, 0];
+/// The same of a frame whose pose is a guess.
+const GUESS_LEVELS: [usize; 4] = [3, 2, 1, 0];
 /// Most iterations of a level.
 const MAX_ITERATIONS: u32 = 10;
 /// Keyframes before and after its own whose points a frame is aligned to.
@@ -22,7 +24,7 @@ const FEWEST_INLIERS: usize = 60;
 /// Share of the comparisons that must.
 const LEAST_INLIER_RATIO: f64 = 0.5;
 
-/// A frame that was tracked, to be aligned again.
+/// A frame that was tracked, to be aligned again, or one from before its map began.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrackedFrame {
     /// Its sequence.
@@ -31,6 +33,8 @@ pub struct TrackedFrame {
     pub keyframe_id: u64,
     /// Where it is, in the keyframe's unit.
     pub keyframe_from_camera: SE3,
+    /// Whether that is only a guess: nothing was known when the frame came.
+    pub is_guess: bool,
     /// Grey values.
     pub pixels: Vec<u8>,
 }
@@ -88,14 +92,14 @@ impl Window {
     fn place_frames_before(&mut self, end: usize, most: usize) {
         let mut waiting = std::mem::take(&mut self.frames.waiting);
         let mut left = most;
+        self.retrace(&mut waiting, end, &mut left);
         waiting.retain_mut(|frame| {
-            let of = |keyframe: &WindowKeyframe| keyframe.keyframe_id == frame.keyframe_id;
-            let index = self.keyframes.iter().position(of);
-            if left == 0 || index.is_some_and(|index| index >= end) {
+            let index = self.index_of(frame.keyframe_id);
+            if frame.is_guess || left == 0 || index.is_some_and(|index| index >= end) {
                 return true;
             }
             left -= 1;
-            let placed = index.and_then(|index| self.place_frame(index, frame));
+            let placed = index.and_then(|index| self.place_frame(index, frame, &FRAME_LEVELS));
             self.frames.placed.extend(placed);
             self.frames.spare.push(std::mem::take(&mut frame.pixels));
             false
@@ -103,7 +107,57 @@ impl Window {
         self.frames.waiting = waiting;
     }
 
-    fn place_frame(&mut self, index: usize, frame: &mut TrackedFrame) -> Option<PlacedFrame> {
+    fn index_of(&self, keyframe_id: u64) -> Option<usize> {
+        self.keyframes.iter().position(|keyframe| keyframe.keyframe_id == keyframe_id)
+    }
+
+    /// Aligns frames from before their map began, the newest first, each from where the one after it was and moved
+    /// on as that did; none before one that does not fit.
+    fn retrace(&mut self, waiting: &mut Vec<TrackedFrame>, end: usize, left: &mut usize) {
+        let mut after: Option<(u64, SE3, SE3)> = None;
+        while *left > 0 {
+            let is_ready = |frame: &TrackedFrame| {
+                frame.is_guess && self.index_of(frame.keyframe_id).is_none_or(|index| index < end)
+            };
+            let Some(place) = waiting.iter().rposition(is_ready) else { return };
+            let mut frame = waiting.remove(place);
+            *left -= 1;
+            let keyframe_id = frame.keyframe_id;
+            let guess = frame.keyframe_from_camera;
+            if let Some((_, of_after, guess_of_after)) =
+                after.filter(|(of, ..)| *of == keyframe_id)
+            {
+                frame.keyframe_from_camera = of_after * guess_of_after.inverse() * guess;
+            }
+            let index = self.index_of(keyframe_id);
+            let placed = index.and_then(|index| self.place_frame(index, &mut frame, &GUESS_LEVELS));
+            self.frames.spare.push(std::mem::take(&mut frame.pixels));
+            let (Some(placed), Some(index)) = (placed, index) else {
+                waiting.retain(|other| !(other.is_guess && other.keyframe_id == keyframe_id));
+                continue;
+            };
+            let mut found = placed.keyframe_from_camera;
+            found.translation /= self.keyframes[index].unit;
+            after = Some((keyframe_id, found, guess));
+            // Who goes on later begins here.
+            let correction = found * guess.inverse();
+            if *left == 0 {
+                for other in waiting.iter_mut() {
+                    if other.is_guess && other.keyframe_id == keyframe_id {
+                        other.keyframe_from_camera = correction * other.keyframe_from_camera;
+                    }
+                }
+            }
+            self.frames.placed.push(placed);
+        }
+    }
+
+    fn place_frame(
+        &mut self,
+        index: usize,
+        frame: &mut TrackedFrame,
+        levels: &[usize],
+    ) -> Option<PlacedFrame> {
         let keyframe = &self.keyframes[index];
         let (epoch, host_from_map) = (keyframe.epoch, keyframe.camera_from_map);
         let mut host_from_camera = frame.keyframe_from_camera;
@@ -128,7 +182,7 @@ impl Window {
             points: Vec::new(),
             is_host: false,
         });
-        let is_aligned = self.align_last(&members, &FRAME_LEVELS, MAX_ITERATIONS);
+        let is_aligned = self.align_last(&members, levels, MAX_ITERATIONS);
         let mut placed = self.keyframes.pop()?;
         frame.pixels = placed.images.swap_remove(0).into_pixels();
         let system = &self.solver.system;
