@@ -1,9 +1,11 @@
 //! The recipe of a map step: observe depth, regularise, choose keyframes, propagate.
 
+mod appearance;
 mod change;
 pub mod consistency;
 mod correction;
 mod depth_buffers;
+mod finder;
 mod joint;
 pub mod modes;
 pub mod observation;
@@ -35,11 +37,12 @@ use crate::slam::map::Map;
 use crate::slam::mapper::change::Unfinished;
 use crate::slam::mapper::consistency::{ConsistencyParams, Contradiction, START_KEYFRAMES};
 use crate::slam::mapper::depth_buffers::DepthBuffers;
+use crate::slam::mapper::finder::Finder;
 use crate::slam::mapper::modes::{KeyframeModes, ModeParams, in_unit};
 use crate::slam::mapper::observation::DepthFilter;
 use crate::slam::mapper::past::PastFrames;
 use crate::slam::mapper::phase::{Active, Phase};
-use crate::slam::mapper::recovery::{Finder, RecoveryParams};
+use crate::slam::mapper::recovery::RecoveryParams;
 use crate::slam::mapper::reuse::ReuseParams;
 use crate::slam::mapper::situation::{Situation, StartFrame};
 use crate::slam::mapper::start::Start;

@@ -139,8 +139,9 @@ impl Tracker {
         let before = self.reference.replace(reference);
         let (old, new) = (before.as_deref(), self.reference.as_deref());
         if let (Some(old), Some(new)) = (old, new) {
-            // A keyframe whose epoch was joined to another has another number for the same place.
-            if old.epoch() != new.epoch() && old.keyframe_id() != new.keyframe_id() {
+            // A keyframe whose epoch was joined to another has another number for the same place, and an earlier
+            // epoch that is taken up again lies where odometry has the camera.
+            if old.epoch() < new.epoch() && old.keyframe_id() != new.keyframe_id() {
                 self.memory.motion = Motion::default();
                 self.memory.was_lost = false;
             }

@@ -4,26 +4,18 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::slam::alignment::align::{Aligner, Alignment, AlignmentParams};
-use crate::slam::alignment::kernel::SimdMode;
-use crate::slam::alignment::normal_equations::NormalEquations;
-use crate::slam::alignment::reference::{Reference, ReferenceParams, finest_level, num_levels};
 use crate::slam::depth::gaussian::MAX_VALIDITY;
 use crate::slam::depth::map::{BORDER_PX, DepthMap, Hypothesis};
 use crate::slam::depth::propagation::joined;
 use crate::slam::frame::FrameView;
-use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;
-use crate::slam::image::sums::SumPyramid;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
 use crate::slam::mapper::consistency::Contradiction;
 use crate::slam::mapper::phase::{Loss, Phase};
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::parameter::{ParameterError, check_range};
-use crate::slam::pose::{Brightness, PoseEstimate};
-use crate::slam::tracker::motion::turned;
-use crate::slam::tracker::verdict::{VerdictParams, is_better, quality_of};
+use crate::slam::pose::PoseEstimate;
 
 /// Tuning of the recovery from a loss.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -63,106 +55,6 @@ impl RecoveryParams {
     }
 }
 
-/// Looks for the camera on keyframes; owns the memory for that.
-#[derive(Debug)]
-pub(super) struct Finder {
-    aligner: Aligner,
-    verdict: VerdictParams,
-    reference: Reference,
-    pyramid: SumPyramid,
-}
-
-impl Finder {
-    /// For images of `intrinsics`. What it finds is only proposed, and the tracker judges by
-    /// its own parameters, so that the defaults do here; portable, so that every CPU finds the same.
-    pub(super) fn new(intrinsics: &Intrinsics) -> Self {
-        let Intrinsics { width, height, .. } = *intrinsics;
-        let reference = ReferenceParams::default();
-        let levels = num_levels(width, height);
-        let alignment = AlignmentParams { simd: SimdMode::Portable, ..Default::default() };
-        Self {
-            aligner: Aligner::new(alignment),
-            verdict: VerdictParams::default(),
-            pyramid: SumPyramid::with_size(width, height, levels, finest_level(levels, &reference)),
-            reference: Reference::new(reference),
-        }
-    }
-
-    /// The next of `keyframes`, newest first and in turn after so many `searched`, that shows what `pixels` do, and
-    /// the camera's pose on it.
-    fn find(
-        &mut self,
-        keyframes: &[Keyframe],
-        active: usize,
-        searched: &mut usize,
-        pixels: &[u8],
-        params: &RecoveryParams,
-    ) -> Option<(usize, SE3)> {
-        let epoch = keyframes.get(active)?.epoch;
-        // The tracker itself looks around the active keyframe.
-        let is_eligible = |index: &usize| {
-            let keyframe = &keyframes[*index];
-            *index != active
-                && keyframe.epoch == epoch
-                && keyframe.map_state == MapState::Established
-                && keyframe.has_depth()
-        };
-        let newest_first = (0..keyframes.len()).rev().filter(is_eligible);
-        let candidates: Vec<usize> = newest_first.take(params.num_keyframes).collect();
-        if candidates.is_empty() {
-            return None;
-        }
-        self.pyramid.fill(pixels);
-        for _ in 0..params.keyframes_per_frame.min(candidates.len()) {
-            let index = candidates[*searched % candidates.len()];
-            *searched += 1;
-            let rotation_rad = params.rotation_deg.to_radians();
-            if let Some(found) = self.find_near(&keyframes[index], rotation_rad) {
-                return Some((index, found));
-            }
-        }
-        None
-    }
-
-    /// Aligns a frame to `keyframe` from where the camera is expected; `None` where it does not fit.
-    pub(super) fn locate(
-        &mut self,
-        keyframe: &Keyframe,
-        pixels: &[u8],
-        keyframe_from_camera: &SE3,
-    ) -> Option<Alignment> {
-        self.pyramid.fill(pixels);
-        self.reference.prepare_into(keyframe);
-        let (start, brightness) = (keyframe_from_camera.inverse(), Brightness::default());
-        let (reference, pyramid) = (&self.reference, &self.pyramid);
-        let found = self.aligner.align(reference, pyramid, &start, brightness, &mut |_| true);
-        self.verdict.judge(&found, &quality_of(&found), true, 0).is_tracked().then_some(found)
-    }
-
-    /// `keyframe_from_camera` of the frame in the pyramid, where it can be aligned to `keyframe` from some view
-    /// near it.
-    fn find_near(&mut self, keyframe: &Keyframe, rotation_rad: f64) -> Option<SE3> {
-        self.reference.prepare_into(keyframe);
-        let (aligner, reference, pyramid) = (&self.aligner, &self.reference, &self.pyramid);
-        let mut best: Option<(Alignment, NormalEquations)> = None;
-        for keyframe_from_camera in turned(&SE3::identity(), rotation_rad) {
-            let start = keyframe_from_camera.inverse();
-            let mut other = aligner.start(reference, pyramid, &start, Brightness::default());
-            let level = other.level;
-            aligner.solve_level(reference, pyramid, level, &mut other, &mut |_| true);
-            let explained = aligner.explanation(reference, pyramid, &other);
-            if best.as_ref().is_none_or(|(_, by_best)| is_better(&explained, by_best)) {
-                best = Some((other, explained));
-            }
-        }
-        let (mut best, _) = best?;
-        aligner.descend(reference, pyramid, &mut best, &mut |_| true);
-        let verdict = self.verdict.judge(&best, &quality_of(&best), true, 0);
-        let keyframe_from_camera = best.state.current_from_keyframe.inverse();
-        (verdict.is_tracked() && keyframe_from_camera.is_finite()).then_some(keyframe_from_camera)
-    }
-}
-
 impl Mapper {
     /// One frame of a loss: searches some keyframes; after the timeout gives the frame to a new
     /// start as well.
@@ -178,7 +70,9 @@ impl Mapper {
             let (keyframes, params) = (&self.map.keyframes, &self.params.recovery);
             let searched = &mut loss.searched;
             let found = self.finder.find(keyframes, active.index, searched, frame.pixels, params);
-            if let Some((index, keyframe_from_camera)) = found {
+            if let Some((index, keyframe_from_camera)) = found
+                && self.is_confirmed(index, &keyframe_from_camera, frame.pixels)
+            {
                 return self.restore_keyframe(index, &keyframe_from_camera);
             }
         }
@@ -195,6 +89,41 @@ impl Mapper {
             self.phase = Phase::Restarting(loss);
         }
         self.begin(frame, pose, sensor_depth)
+    }
+
+    /// Whether another keyframe that sees the same place has the camera there too, where there is one: one alone may
+    /// look like what it does not show.
+    fn is_confirmed(&mut self, index: usize, keyframe_from_camera: &SE3, pixels: &[u8]) -> bool {
+        /// Keyframes that are asked.
+        const MOST: usize = 3;
+        /// Largest distance of the camera from them, in their mean depths.
+        const REACH: f64 = 0.7;
+        /// Least share of their points that the camera must see.
+        const LEAST_USAGE: f64 = 0.5;
+        /// Largest difference of the two poses, translation in mean depths plus rotation in radians: a wrong place is
+        /// further off, and a map that has drifted by as much is none to go on with.
+        const MAX_DISAGREEMENT: f64 = 0.1;
+        let found = &self.map.keyframes[index];
+        let map_from_camera = found.map_from_keyframe.place(keyframe_from_camera);
+        let mut others: Vec<(f64, usize, SE3)> = self
+            .map
+            .seen_from(found.epoch, &map_from_camera, REACH)
+            .filter(|(other, view)| *other != index && view.usage >= LEAST_USAGE)
+            .filter(|(other, _)| self.map.keyframes[*other].map_state == MapState::Established)
+            .map(|(other, view)| (view.usage, other, view.keyframe_from_camera))
+            .collect();
+        others.sort_by(|one, other| other.0.total_cmp(&one.0));
+        others.truncate(MOST);
+        let mut agrees = |(_, other, expected): &(f64, usize, SE3)| {
+            let keyframe = &self.map.keyframes[*other];
+            let Some(measured) = self.finder.locate(keyframe, pixels, expected) else {
+                return false;
+            };
+            let error = (measured.state.current_from_keyframe * *expected).log();
+            let disagreement = error.fixed_rows::<3>(0).norm() + error.fixed_rows::<3>(3).norm();
+            disagreement <= MAX_DISAGREEMENT
+        };
+        others.is_empty() || others.iter().any(&mut agrees)
     }
 
     /// Declares the active keyframe contradictory, or all of its epoch where its start was wrong: nothing is claimed
@@ -223,6 +152,12 @@ impl Mapper {
         self.depth.restart(&keyframe.image, &self.params);
         restore_points(&mut self.depth.active, &keyframe.points);
         let map_from_camera = keyframe.map_from_keyframe.place(keyframe_from_camera);
+        // One of an earlier epoch brings the place and the unit back that its map has in odometry's world.
+        let world_from_map =
+            keyframe.world_from_keyframe * keyframe.map_from_keyframe.inverse();
+        if self.keyframe().is_some_and(|active| active.epoch != keyframe.epoch) {
+            self.world_from_map = world_from_map;
+        }
         self.anchor(&map_from_camera);
         self.past.clear();
         self.drop_early_frames();
@@ -269,39 +204,8 @@ pub(super) fn restore_points(map: &mut DepthMap, points: &[DepthPoint]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::slam::geometry::sim3::Sim3;
+    use crate::slam::mapper::finder::tests::keyframe;
     use crate::slam::test_scene::{CAMERA, Scene};
-    use nalgebra::Vector6;
-
-    /// A keyframe with exact depth at every fourth pixel.
-    fn keyframe(scene: &Scene, keyframe_id: u64, world_from_camera: SE3) -> Keyframe {
-        let view = scene.render(&CAMERA, &world_from_camera);
-        let pixels = (4..CAMERA.height - 4)
-            .step_by(2)
-            .flat_map(|v| (4..CAMERA.width - 4).step_by(2).map(move |u| (u, v)));
-        let points = pixels.map(|(u, v)| DepthPoint {
-            u: u as u16,
-            v: v as u16,
-            inverse_depth: view.inverse_depth.at(u, v),
-            variance: 1e-4,
-            intensity: view.intensity.at(u, v),
-        });
-        Keyframe {
-            keyframe_id,
-            revision: 1,
-            sequence: keyframe_id,
-            ..Keyframe::at(
-                Sim3::new(world_from_camera, 1.0),
-                CAMERA,
-                points.collect(),
-                view.noisy(1.0, keyframe_id),
-            )
-        }
-    }
-
-    fn at(twist: [f64; 6]) -> SE3 {
-        SE3::exp(&Vector6::from(twist))
-    }
 
     #[test]
     fn points_that_no_filter_could_have_left_are_not_restored() {
@@ -320,55 +224,6 @@ mod tests {
         restore_points(&mut map, &points);
         assert_eq!(map.num_hypotheses(), 1);
         assert!(map.hypotheses.row(40)[50].is_some());
-    }
-
-    #[test]
-    fn a_known_view_is_found_on_its_keyframe_and_an_unknown_one_on_none() {
-        let scene = Scene::new(3);
-        let home = at([0.0; 6]);
-        let away = at([0.0, 0.0, 0.0, 0.0, 1.2, 0.0]);
-        let elsewhere = at([0.0, 0.0, 0.0, 0.0, 2.8, 0.0]);
-        let keyframes =
-            [keyframe(&scene, 0, home), keyframe(&scene, 1, away), keyframe(&scene, 2, elsewhere)];
-        let params = RecoveryParams { keyframes_per_frame: 3, ..Default::default() };
-        let mut searched = 0;
-        let mut find = |finder: &mut Finder, view: SE3| {
-            let pixels = scene.render(&CAMERA, &view).noisy(2.0, 9);
-            let (index, found) = finder.find(&keyframes, 2, &mut searched, &pixels, &params)?;
-            let placed = keyframes[index].map_from_keyframe.place(&found);
-            let error = (view.inverse() * placed).log().norm();
-            assert!(error < 0.02, "found {error} away from where it is");
-            Some(index)
-        };
-        let mut recovery = Finder::new(&CAMERA);
-        let near_home = at([0.1, -0.05, 0.1, 0.05, 0.1, -0.05]);
-        assert_eq!(find(&mut recovery, near_home), Some(0));
-        assert_eq!(find(&mut recovery, away * near_home), Some(1));
-        assert_eq!(find(&mut recovery, at([0.0, 0.0, 0.0, 0.0, -1.5, 0.0])), None);
-        assert_eq!(find(&mut recovery, elsewhere), None, "the one in force is the tracker's");
-    }
-
-    #[test]
-    fn keyframes_take_turns_and_rejected_ones_and_other_epochs_are_left_out() {
-        let scene = Scene::new(3);
-        let known = keyframe(&scene, 0, SE3::identity());
-        let mut rejected = known.clone();
-        rejected.map_state = MapState::Rejected;
-        let other_epoch = Keyframe { epoch: 1, ..known.clone() };
-        let in_force = keyframe(&scene, 3, at([0.0, 0.0, 0.0, 0.0, 2.0, 0.0]));
-        let pixels = known.image.clone();
-        let params = RecoveryParams::default();
-        let (mut finder, mut searched) = (Finder::new(&CAMERA), 0);
-        let mut find = |keyframes: &[Keyframe]| {
-            let found = finder.find(keyframes, 2, &mut searched, &pixels, &params);
-            (found.map(|(index, _)| index), searched)
-        };
-        let without = [rejected, other_epoch, in_force.clone()];
-        assert_eq!(find(&without), (None, 0));
-        let far = keyframe(&scene, 1, at([0.0, 0.0, 0.0, 0.0, -2.0, 0.0]));
-        let with = [known, far, in_force];
-        assert_eq!(find(&with), (None, 1), "the newest is first");
-        assert_eq!(find(&with), (Some(0), 2));
     }
 
     #[test]

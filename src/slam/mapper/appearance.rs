@@ -1,0 +1,114 @@
+//! How alike two images look, wherever their cameras stand: small blurred images, correlated over small shifts
+//! (Klein, Murray 2008).
+
+/// Size of the small images.
+const COLUMNS: usize = 32;
+const ROWS: usize = 24;
+/// Largest shift that is tried either way, pixels of the small image: 6° of a view 60° wide.
+const REACH: usize = 3;
+/// Columns and rows that are compared at every shift.
+const INNER: [usize; 2] = [COLUMNS - 2 * REACH, ROWS - 2 * REACH];
+
+/// A small image.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Appearance {
+    greys: Vec<f32>,
+}
+
+impl Appearance {
+    /// Of an image, row after row; `None` where it is too small to have one.
+    pub(super) fn of(pixels: &[u8], width: usize, height: usize) -> Option<Self> {
+        if width < COLUMNS || height < ROWS || pixels.len() != width * height {
+            return None;
+        }
+        let mut greys = Vec::with_capacity(COLUMNS * ROWS);
+        for row in 0..ROWS {
+            let rows = row * height / ROWS..(row + 1) * height / ROWS;
+            for column in 0..COLUMNS {
+                let columns = column * width / COLUMNS..(column + 1) * width / COLUMNS;
+                let lines = rows.clone().map(|v| &pixels[v * width..][columns.clone()]);
+                let sum: u32 = lines.flatten().map(|&grey| u32::from(grey)).sum();
+                greys.push(sum as f32 / (rows.len() * columns.len()) as f32);
+            }
+        }
+        Some(Self { greys: blurred(&greys) })
+    }
+
+    /// Correlation at the best of the shifts, −1 to 1: what brightness and contrast do to an image does not count.
+    pub(super) fn similarity(&self, other: &Self) -> f32 {
+        let inner = self.part([REACH, REACH]);
+        let places = (0..=2 * REACH).flat_map(|y| (0..=2 * REACH).map(move |x| [x, y]));
+        places.map(|at| correlation(&inner, &other.part(at))).fold(-1.0, f32::max)
+    }
+
+    /// The part of the inner size that begins at a column and a row.
+    fn part(&self, [x, y]: [usize; 2]) -> [f32; INNER[0] * INNER[1]] {
+        std::array::from_fn(|k| self.greys[(y + k / INNER[0]) * COLUMNS + x + k % INNER[0]])
+    }
+}
+
+/// The same with a quarter of either neighbour, along rows and along columns.
+fn blurred(greys: &[f32]) -> Vec<f32> {
+    let of = |greys: &[f32], at: [usize; 2], step: [usize; 2]| {
+        let grey = |x: usize, y: usize| greys[y.min(ROWS - 1) * COLUMNS + x.min(COLUMNS - 1)];
+        let [x, y] = at;
+        let before = grey(x.saturating_sub(step[0]), y.saturating_sub(step[1]));
+        0.25 * (before + 2.0 * grey(x, y) + grey(x + step[0], y + step[1]))
+    };
+    let pass = |greys: &[f32], step: [usize; 2]| -> Vec<f32> {
+        (0..COLUMNS * ROWS).map(|k| of(greys, [k % COLUMNS, k / COLUMNS], step)).collect()
+    };
+    pass(&pass(greys, [1, 0]), [0, 1])
+}
+
+fn correlation(one: &[f32], other: &[f32]) -> f32 {
+    /// Variance, grey levels², below which there is nothing to be compared.
+    const LEAST_VARIANCE: f32 = 1.0;
+    let count = one.len() as f32;
+    let mean = |of: &[f32]| of.iter().sum::<f32>() / count;
+    let (mean_of_one, mean_of_other) = (mean(one), mean(other));
+    let [mut variance_of_one, mut variance_of_other, mut common] = [0.0; 3];
+    for (a, b) in one.iter().zip(other) {
+        let (a, b) = (a - mean_of_one, b - mean_of_other);
+        variance_of_one += a * a;
+        variance_of_other += b * b;
+        common += a * b;
+    }
+    match variance_of_one.min(variance_of_other) > LEAST_VARIANCE * count {
+        true => common / (variance_of_one * variance_of_other).sqrt(),
+        false => -1.0,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector6;
+
+    use super::*;
+    use crate::slam::geometry::se3::SE3;
+    use crate::slam::test_scene::{CAMERA, Scene};
+
+    fn seen(twist: [f64; 6], seed: u64) -> Appearance {
+        let view = Scene::new(3).render(&CAMERA, &SE3::exp(&Vector6::from(twist)));
+        Appearance::of(&view.noisy(2.0, seed), CAMERA.width, CAMERA.height).unwrap()
+    }
+
+    #[test]
+    fn a_place_is_known_again_after_a_small_turn_and_in_other_light() {
+        let here = seen([0.0; 6], 1);
+        let turned = seen([0.05, 0.0, 0.1, 0.05, 0.06, 0.02], 2);
+        let elsewhere = seen([0.0, 0.0, 0.0, 0.0, 1.5, 0.0], 3);
+        assert!(here.similarity(&turned) > 0.8, "{}", here.similarity(&turned));
+        assert!(here.similarity(&elsewhere) < 0.7, "{}", here.similarity(&elsewhere));
+        let darker = Appearance { greys: here.greys.iter().map(|grey| 0.4 * grey + 9.0).collect() };
+        assert!(here.similarity(&darker) > 0.999);
+    }
+
+    #[test]
+    fn what_shows_nothing_is_like_nothing() {
+        let wall = Appearance::of(&[70; 100 * 80], 100, 80).unwrap();
+        assert_eq!(wall.similarity(&wall), -1.0);
+        assert_eq!(Appearance::of(&[0; 20 * 80], 20, 80), None);
+        assert_eq!(Appearance::of(&[0; 99], 100, 80), None);
+    }
+}

@@ -1,0 +1,242 @@
+//! Finds the camera on keyframes: by what they look like first, then by alignment.
+
+use crate::slam::alignment::align::{Aligner, Alignment, AlignmentParams};
+use crate::slam::alignment::kernel::SimdMode;
+use crate::slam::alignment::normal_equations::NormalEquations;
+use crate::slam::alignment::reference::{Reference, ReferenceParams, finest_level, num_levels};
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::image::sums::SumPyramid;
+use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::mapper::appearance::Appearance;
+use crate::slam::mapper::recovery::RecoveryParams;
+use crate::slam::pose::Brightness;
+use crate::slam::tracker::motion::turned;
+use crate::slam::tracker::verdict::{VerdictParams, is_better, quality_of};
+
+/// Correlation of small images below which two places are not the same: those that were the same had 0.5 and more.
+const LEAST_SIMILARITY: f32 = 0.3;
+
+/// Looks for the camera on keyframes; owns the memory for that.
+#[derive(Debug)]
+pub(super) struct Finder {
+    aligner: Aligner,
+    verdict: VerdictParams,
+    reference: Reference,
+    pyramid: SumPyramid,
+    /// What keyframes look like, by their id, in order.
+    appearances: Vec<(u64, Option<Appearance>)>,
+}
+
+impl Finder {
+    /// For images of `intrinsics`. What it finds is only proposed, and the tracker judges by
+    /// its own parameters, so that the defaults do here; portable, so that every CPU finds the same.
+    pub(super) fn new(intrinsics: &Intrinsics) -> Self {
+        let Intrinsics { width, height, .. } = *intrinsics;
+        let reference = ReferenceParams::default();
+        let levels = num_levels(width, height);
+        let alignment = AlignmentParams { simd: SimdMode::Portable, ..Default::default() };
+        Self {
+            aligner: Aligner::new(alignment),
+            verdict: VerdictParams::default(),
+            pyramid: SumPyramid::with_size(width, height, levels, finest_level(levels, &reference)),
+            reference: Reference::new(reference),
+            appearances: Vec::new(),
+        }
+    }
+
+    /// Of `keyframes`, of all epochs, one that shows what `pixels` do, and the camera's pose on it. Tried are the one
+    /// that looks most like it, and in turn, after so many `searched`, others that do.
+    pub(super) fn find(
+        &mut self,
+        keyframes: &[Keyframe],
+        active: usize,
+        searched: &mut usize,
+        pixels: &[u8],
+        params: &RecoveryParams,
+    ) -> Option<(usize, SE3)> {
+        let camera = keyframes.get(active)?.intrinsics;
+        let seen = Appearance::of(pixels, camera.width, camera.height)?;
+        self.learn(keyframes);
+        let mut candidates = self.alike(keyframes, active, &seen);
+        candidates.truncate(params.num_keyframes);
+        let (first, others) = candidates.split_first()?;
+        self.pyramid.fill(pixels);
+        let rotation_rad = params.rotation_deg.to_radians();
+        for attempt in 0..params.keyframes_per_frame.min(candidates.len()) {
+            let index = match attempt {
+                0 => *first,
+                _ => {
+                    *searched += 1;
+                    others[(*searched - 1) % others.len()]
+                }
+            };
+            if let Some(found) = self.find_near(&keyframes[index], rotation_rad) {
+                return Some((index, found));
+            }
+        }
+        None
+    }
+
+    /// Keyframes that may be gone back to, those that look most like `seen` first, the newest of equals.
+    fn alike(&self, keyframes: &[Keyframe], active: usize, seen: &Appearance) -> Vec<usize> {
+        // The tracker itself looks around the active keyframe.
+        let is_eligible = |index: &usize| {
+            let keyframe = &keyframes[*index];
+            *index != active
+                && keyframe.map_state == MapState::Established
+                && keyframe.has_depth()
+        };
+        let newest_first = (0..keyframes.len()).rev().filter(is_eligible);
+        let similarity = |index: usize| {
+            let id = keyframes[index].keyframe_id;
+            let known = self.appearances.binary_search_by_key(&id, |(of, _)| *of).ok()?;
+            Some(self.appearances[known].1.as_ref()?.similarity(seen))
+        };
+        let mut rated: Vec<(f32, usize)> = newest_first
+            .filter_map(|index| Some((similarity(index)?, index)))
+            .filter(|(similarity, _)| *similarity > LEAST_SIMILARITY)
+            .collect();
+        rated.sort_by(|one, other| other.0.total_cmp(&one.0));
+        rated.into_iter().map(|(_, index)| index).collect()
+    }
+
+    /// Looks at keyframes that are new, so many at most.
+    fn learn(&mut self, keyframes: &[Keyframe]) {
+        /// 20 µs each at 640×480.
+        const MOST_AT_ONCE: usize = 100;
+        let known = self.appearances.last().map(|(id, _)| *id);
+        let new = keyframes.iter().filter(|keyframe| Some(keyframe.keyframe_id) > known);
+        for keyframe in new.take(MOST_AT_ONCE) {
+            let Intrinsics { width, height, .. } = keyframe.intrinsics;
+            let appearance = Appearance::of(&keyframe.image, width, height);
+            self.appearances.push((keyframe.keyframe_id, appearance));
+        }
+    }
+
+    /// Aligns a frame to `keyframe` from where the camera is expected; `None` where it does not fit.
+    pub(super) fn locate(
+        &mut self,
+        keyframe: &Keyframe,
+        pixels: &[u8],
+        keyframe_from_camera: &SE3,
+    ) -> Option<Alignment> {
+        self.pyramid.fill(pixels);
+        self.reference.prepare_into(keyframe);
+        let (start, brightness) = (keyframe_from_camera.inverse(), Brightness::default());
+        let (reference, pyramid) = (&self.reference, &self.pyramid);
+        let found = self.aligner.align(reference, pyramid, &start, brightness, &mut |_| true);
+        self.verdict.judge(&found, &quality_of(&found), true, 0).is_tracked().then_some(found)
+    }
+
+    /// `keyframe_from_camera` of the frame in the pyramid, where it can be aligned to `keyframe` from some view
+    /// near it.
+    fn find_near(&mut self, keyframe: &Keyframe, rotation_rad: f64) -> Option<SE3> {
+        self.reference.prepare_into(keyframe);
+        let (aligner, reference, pyramid) = (&self.aligner, &self.reference, &self.pyramid);
+        let mut best: Option<(Alignment, NormalEquations)> = None;
+        for keyframe_from_camera in turned(&SE3::identity(), rotation_rad) {
+            let start = keyframe_from_camera.inverse();
+            let mut other = aligner.start(reference, pyramid, &start, Brightness::default());
+            let level = other.level;
+            aligner.solve_level(reference, pyramid, level, &mut other, &mut |_| true);
+            let explained = aligner.explanation(reference, pyramid, &other);
+            if best.as_ref().is_none_or(|(_, by_best)| is_better(&explained, by_best)) {
+                best = Some((other, explained));
+            }
+        }
+        let (mut best, _) = best?;
+        aligner.descend(reference, pyramid, &mut best, &mut |_| true);
+        let verdict = self.verdict.judge(&best, &quality_of(&best), true, 0);
+        let keyframe_from_camera = best.state.current_from_keyframe.inverse();
+        (verdict.is_tracked() && keyframe_from_camera.is_finite()).then_some(keyframe_from_camera)
+    }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+    use crate::slam::geometry::sim3::Sim3;
+    use crate::slam::keyframe::DepthPoint;
+    use crate::slam::test_scene::{CAMERA, Scene};
+    use nalgebra::Vector6;
+
+    /// A keyframe with exact depth at every fourth pixel.
+    pub(in crate::slam::mapper) fn keyframe(scene: &Scene, keyframe_id: u64, world_from_camera: SE3) -> Keyframe {
+        let view = scene.render(&CAMERA, &world_from_camera);
+        let pixels = (4..CAMERA.height - 4)
+            .step_by(2)
+            .flat_map(|v| (4..CAMERA.width - 4).step_by(2).map(move |u| (u, v)));
+        let points = pixels.map(|(u, v)| DepthPoint {
+            u: u as u16,
+            v: v as u16,
+            inverse_depth: view.inverse_depth.at(u, v),
+            variance: 1e-4,
+            intensity: view.intensity.at(u, v),
+        });
+        Keyframe {
+            keyframe_id,
+            revision: 1,
+            sequence: keyframe_id,
+            ..Keyframe::at(
+                Sim3::new(world_from_camera, 1.0),
+                CAMERA,
+                points.collect(),
+                view.noisy(1.0, keyframe_id),
+            )
+        }
+    }
+
+    fn at(twist: [f64; 6]) -> SE3 {
+        SE3::exp(&Vector6::from(twist))
+    }
+
+    #[test]
+    fn a_known_view_is_found_on_its_keyframe_and_an_unknown_one_on_none() {
+        let scene = Scene::new(3);
+        let home = at([0.0; 6]);
+        let away = at([0.0, 0.0, 0.0, 0.0, 1.2, 0.0]);
+        let elsewhere = at([0.0, 0.0, 0.0, 0.0, 2.8, 0.0]);
+        let keyframes =
+            [keyframe(&scene, 0, home), keyframe(&scene, 1, away), keyframe(&scene, 2, elsewhere)];
+        let params = RecoveryParams { keyframes_per_frame: 3, ..Default::default() };
+        let mut searched = 0;
+        let mut find = |finder: &mut Finder, view: SE3| {
+            let pixels = scene.render(&CAMERA, &view).noisy(2.0, 9);
+            let (index, found) = finder.find(&keyframes, 2, &mut searched, &pixels, &params)?;
+            let placed = keyframes[index].map_from_keyframe.place(&found);
+            let error = (view.inverse() * placed).log().norm();
+            assert!(error < 0.02, "found {error} away from where it is");
+            Some(index)
+        };
+        let mut recovery = Finder::new(&CAMERA);
+        let near_home = at([0.1, -0.05, 0.1, 0.05, 0.1, -0.05]);
+        assert_eq!(find(&mut recovery, near_home), Some(0));
+        assert_eq!(find(&mut recovery, away * near_home), Some(1));
+        assert_eq!(find(&mut recovery, at([0.0, 0.0, 0.0, 0.0, -1.5, 0.0])), None);
+        assert_eq!(find(&mut recovery, elsewhere), None, "the one in force is the tracker's");
+    }
+
+    #[test]
+    fn keyframes_take_turns_and_rejected_ones_and_other_epochs_are_left_out() {
+        let scene = Scene::new(3);
+        let known = keyframe(&scene, 0, SE3::identity());
+        let mut rejected = known.clone();
+        rejected.map_state = MapState::Rejected;
+        let other_epoch = Keyframe { epoch: 1, ..known.clone() };
+        let in_force = keyframe(&scene, 3, at([0.0, 0.0, 0.0, 0.0, 2.0, 0.0]));
+        let pixels = known.image.clone();
+        let params = RecoveryParams::default();
+        let (mut finder, mut searched) = (Finder::new(&CAMERA), 0);
+        let mut find = |keyframes: &[Keyframe]| {
+            let found = finder.find(keyframes, 2, &mut searched, &pixels, &params);
+            (found.map(|(index, _)| index), searched)
+        };
+        let without = [rejected, other_epoch, in_force.clone()];
+        assert_eq!(find(&without), (None, 0));
+        let far = keyframe(&scene, 1, at([0.0, 0.0, 0.0, 0.0, -2.0, 0.0]));
+        let with = [known, far, in_force];
+        assert_eq!(find(&with), (None, 1), "the newest is first");
+        assert_eq!(find(&with), (Some(0), 2));
+    }
+}
