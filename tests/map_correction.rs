@@ -224,9 +224,8 @@ fn what_moves_takes_its_frames_along() {
     assert!(moved_by < 1e-9, "odometry's place of the camera moved by {moved_by}");
     assert_eq!(anchored.map_from_keyframe, bend(&active.map_from_keyframe));
     // Its unit is the map's, which has not changed: the keyframe's, which has, is longer there too.
-    let unit = |keyframe: &Keyframe| {
-        keyframe.world_from_keyframe.scale / keyframe.map_from_keyframe.scale
-    };
+    let unit =
+        |keyframe: &Keyframe| keyframe.world_from_keyframe.scale / keyframe.map_from_keyframe.scale;
     assert!((unit(anchored) / unit(&active) - 1.0).abs() < 1e-12, "odometry's unit changes");
     run.show_all(CORRECTED_AT..CORRECTED_AT + 1);
     let next = run.poses[CORRECTED_AT];

@@ -206,6 +206,60 @@ fn after_a_blackout_a_new_view_begins_a_new_epoch() {
 }
 
 #[test]
+fn back_at_a_place_of_an_earlier_epoch_the_camera_is_found_there() {
+    let room = footage(1, MotionKind::Handheld, 100, 2.0);
+    let elsewhere = footage(7, MotionKind::Handheld, 170, 2.0);
+    let mut script = Script::new(room.intrinsics);
+    script.show(&room, 0..100);
+    script.black_out(20);
+    script.show(&elsewhere, 0..170);
+    script.black_out(5);
+    script.show(&room, 40..90);
+    let record = script.replay(&ReplayConfig::default());
+    let between: Vec<_> = estimates(&record).skip(120).take(170).collect();
+    assert_eq!(between.last().unwrap().epoch, 1, "elsewhere there is another map");
+    let back: Vec<_> = estimates(&record).skip(295).collect();
+    let found = back.iter().filter(|e| e.epoch == 0 && e.state.is_tracked()).count();
+    println!("{found} of 50 tracked on the first map again");
+    assert!(found >= 40, "{found}");
+    assert!(back.iter().all(|e| e.epoch == 0 || !e.state.is_tracked()), "claimed elsewhere");
+    let ratio = error_ratio(&record, 0);
+    assert!(ratio < 0.02, "{ratio}");
+    // Odometry goes on from where it was lost.
+    let last = between.iter().rfind(|e| e.state.is_tracked()).unwrap();
+    let first = back.iter().find(|e| e.state.is_tracked()).unwrap();
+    let jump = (last.world_from_camera.translation - first.world_from_camera.translation).norm();
+    assert!(jump < 0.1, "odometry jumps by {jump}");
+}
+
+#[test]
+fn frames_from_before_the_map_began_have_a_pose_in_the_end() {
+    let room = footage(1, MotionKind::Handheld, 100, 2.0);
+    let mut script = Script::new(room.intrinsics);
+    script.show(&room, 0..100);
+    let record = script.replay(&ReplayConfig::default());
+    let begun = estimates(&record).position(|e| e.state.is_tracked()).unwrap();
+    assert!(begun > 2, "the map began at once");
+    let placed = |e: &PoseEstimate| {
+        let (keyframe_id, at) = match record.map.frame(e.sequence) {
+            Some(again) => (again.keyframe_id, again.keyframe_from_camera),
+            None => (e.keyframe_id, e.keyframe_from_camera),
+        };
+        let world_from_camera = record.map.place(keyframe_id, &at)?;
+        Some(StampedPose { nanos: e.capture_nanos, world_from_camera })
+    };
+    let all: Vec<StampedPose> = estimates(&record).filter_map(placed).collect();
+    assert_eq!(all.len(), 100, "every frame has a pose");
+    let error = |poses: &[StampedPose]| {
+        let truth = &record.ground_truth;
+        evaluate_trajectory(poses, truth, Alignment::Sim3, MAX_DIFFERENCE_NANOS).unwrap().ate
+    };
+    let (with, without) = (error(&all), error(&all[begun..]));
+    println!("{begun} frames before; ATE {} with them, {} without", with.rmse, without.rmse);
+    assert!(with.rmse < 1.5 * without.rmse, "{} {}", with.rmse, without.rmse);
+}
+
+#[test]
 fn a_standing_camera_never_initialises() {
     for (seed, noise_std_dev) in [(1, 2.0), (2, 4.0)] {
         let still = footage(seed, MotionKind::Standing, 75, noise_std_dev);

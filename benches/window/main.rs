@@ -132,6 +132,7 @@ fn walk(simulator: &mut Simulator, camera: &Intrinsics, keyframes: usize) {
                 sequence: between as u64,
                 keyframe_id: id as u64,
                 keyframe_from_camera: world_from_keyframe.inverse() * world_from_camera,
+                is_guess: false,
                 pixels: simulator.raw_frame(between).expect("within the sequence").into_owned(),
             });
         }

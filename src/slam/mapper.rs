@@ -488,21 +488,4 @@ impl Mapper {
         (keyframe.revision, keyframe.map_revision) = (revision, map_revision);
         keyframe.world_from_keyframe = world_from_map * keyframe.map_from_keyframe;
     }
-
-    /// Chooses where the map lies in the world so that a camera at `map_from_camera` is where odometry had it last:
-    /// that stands still.
-    fn anchor(&mut self, map_from_camera: &SE3) {
-        if let Some(world_from_camera) = self.last_world_from_camera {
-            self.world_from_map =
-                anchored(self.world_from_map.scale, map_from_camera, &world_from_camera);
-        }
-    }
-}
-
-/// `world_from_map` of this scale that takes one pose of a camera to the other.
-fn anchored(scale: f64, map_from_camera: &SE3, world_from_camera: &SE3) -> Sim3 {
-    let rotation = world_from_camera.rotation * map_from_camera.rotation.inverse();
-    let translation =
-        world_from_camera.translation - rotation * map_from_camera.translation * scale;
-    Sim3::new(SE3 { rotation, translation }, scale)
 }

@@ -2,6 +2,7 @@
 
 pub mod covariance_floor;
 pub mod motion;
+mod proposal;
 pub mod verdict;
 
 use serde::{Deserialize, Serialize};
@@ -49,6 +50,9 @@ pub struct TrackerParams {
     pub keyframe_distance_weight: f64,
     /// w_u of the keyframe distance: … or when 1/w_u of the points are out of view.
     pub keyframe_usage_weight: f64,
+    /// … or when its images are brighter or darker by this factor: depth is matched against the keyframe's own grey
+    /// values, which are coarse or saturated there (DSO18 §3.1).
+    pub keyframe_brightness_ratio: f64,
 }
 
 impl Default for TrackerParams {
@@ -64,6 +68,7 @@ impl Default for TrackerParams {
             min_contrast: 2.0,
             keyframe_distance_weight: DistanceWeights::default().translation,
             keyframe_usage_weight: DistanceWeights::default().usage,
+            keyframe_brightness_ratio: 1.6,
         }
     }
 }
@@ -88,7 +93,8 @@ impl TrackerParams {
         check_range("recovery_rotation_deg", self.recovery_rotation_deg, 0.0..=45.0)?;
         check_range("min_contrast", self.min_contrast, 0.0..=255.0)?;
         check_range("keyframe_distance_weight", self.keyframe_distance_weight, 0.0..=1e3)?;
-        check_range("keyframe_usage_weight", self.keyframe_usage_weight, 0.0..=1e3)
+        check_range("keyframe_usage_weight", self.keyframe_usage_weight, 0.0..=1e3)?;
+        check_range("keyframe_brightness_ratio", self.keyframe_brightness_ratio, 1.01..=1e6)
     }
 }
 
@@ -451,18 +457,6 @@ impl Tracker {
             quality: Quality::default(),
             proposes_keyframe: false,
         }
-    }
-
-    /// Whether the camera is so far from the keyframe that a new one is due.
-    fn proposes_keyframe(
-        &self,
-        reference: &Reference,
-        alignment: &Alignment,
-        quality: &Quality,
-    ) -> bool {
-        let translation = alignment.state.current_from_keyframe.translation.norm();
-        let in_mean_depths = translation * reference.mean_inverse_depth();
-        self.params.keyframe_distance().distance(in_mean_depths, quality.in_view_ratio) > 1.0
     }
 }
 

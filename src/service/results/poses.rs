@@ -16,7 +16,7 @@ use crate::slam::trajectory::StampedPose;
 
 /// First line of `trajectory.txt`.
 pub const FINAL_COMMENT: &str =
-    "world_from_camera of every frame with a pose: final pose of its keyframe x relative pose";
+    "world_from_camera of every tracked frame: final pose of its keyframe x relative pose";
 
 /// First line of `trajectory_online.txt`.
 pub const ONLINE_COMMENT: &str = "world_from_camera of every tracked frame as it was published";

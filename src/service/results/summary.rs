@@ -158,7 +158,8 @@ pub struct FrameCounts {
 impl FrameCounts {
     fn of(poses: &[RecordedPose], map: &Map) -> Self {
         let count = |is: fn(TrackingState) -> bool| count_states(poses, is);
-        let later = || poses.iter().map(|pose| &pose.estimate).filter(|of| is_placed_later(of, map));
+        let later =
+            || poses.iter().map(|pose| &pose.estimate).filter(|of| is_placed_later(of, map));
         let is_initializing = |of: &&PoseEstimate| of.state == TrackingState::Initializing;
         let initializing = count(|s| s == TrackingState::Initializing);
         Self {

@@ -79,6 +79,7 @@ pub struct Reference {
     map_revision: u64,
     intrinsics: Intrinsics,
     mean_inverse_depth: f64,
+    mean_grey: f64,
     mode_covariance: ModeCovariance,
     finest_level: usize,
     levels: Vec<LevelPoints>,
@@ -104,6 +105,7 @@ impl Reference {
             map_revision: 0,
             intrinsics: Intrinsics { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, width: 0, height: 0 },
             mean_inverse_depth: 1.0,
+            mean_grey: 0.0,
             mode_covariance: ModeCovariance::ZERO,
             levels: vec![LevelPoints::default(); MAX_LEVELS],
             pyramid: SumPyramid::default(),
@@ -136,6 +138,7 @@ impl Reference {
         self.map_revision = keyframe.map_revision;
         self.intrinsics = keyframe.intrinsics;
         self.mean_inverse_depth = 1.0;
+        self.mean_grey = 0.0;
         self.mode_covariance = keyframe.mode_covariance;
         self.levels.iter_mut().for_each(LevelPoints::clear);
         let Intrinsics { width, height, .. } = keyframe.intrinsics;
@@ -151,6 +154,8 @@ impl Reference {
             self.pyramid = SumPyramid::with_size(width, height, levels, finest);
         }
         self.pyramid.fill(&keyframe.image);
+        let greys: f64 = keyframe.points.iter().map(|point| f64::from(point.intensity)).sum();
+        self.mean_grey = greys / keyframe.points.len().max(1) as f64;
         self.fusion.fuse(&keyframe.points, width, height, levels, finest);
         self.mean_inverse_depth = self.fusion.mean_inverse_depth().unwrap_or(1.0);
         for level in finest..levels {
@@ -202,6 +207,11 @@ impl Reference {
             };
             self.levels[level].push(point, tile);
         }
+    }
+
+    /// Mean grey value of the keyframe's points; 0 without any.
+    pub fn mean_grey(&self) -> f64 {
+        self.mean_grey
     }
 
     /// The keyframe it was prepared from; [`NO_KEYFRAME`] before any.

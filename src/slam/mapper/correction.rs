@@ -5,8 +5,9 @@
 //! and the tracker gets the keyframe as another revision.
 
 use crate::slam::geometry::se3::SE3;
+use crate::slam::geometry::sim3::Sim3;
 use crate::slam::map::{Correction, CorrectionError, LogPlane};
-use crate::slam::mapper::{Mapper, StepOutcome, anchored};
+use crate::slam::mapper::{Mapper, StepOutcome};
 
 impl Mapper {
     /// Applies a correction between two frames; what is to be published then. Refused as a whole where a number
@@ -30,7 +31,8 @@ impl Mapper {
         let joined = correction.joins.iter().filter(|join| Some(join.epoch) == epoch);
         let unit = joined.map(|join| join.into_from_epoch.scale).product::<f64>()
             * correction.unit.unwrap_or(1.0);
-        self.world_from_map = anchored(self.world_from_map.scale / unit, &after, &world_from_camera);
+        self.world_from_map =
+            anchored(self.world_from_map.scale / unit, &after, &world_from_camera);
         self.publish_place();
         Ok(StepOutcome { keyframe_changed: true, graph_changed: true, ..finished })
     }
@@ -50,4 +52,21 @@ impl Mapper {
         let corrected = correction.keyframes.iter().find(|k| k.keyframe_id == keyframe_id);
         corrected.map(|corrected| corrected.depth)
     }
+
+    /// Chooses where the map lies in the world so that a camera at `map_from_camera` is where odometry had it last:
+    /// that stands still.
+    pub(super) fn anchor(&mut self, map_from_camera: &SE3) {
+        if let Some(world_from_camera) = self.last_world_from_camera {
+            self.world_from_map =
+                anchored(self.world_from_map.scale, map_from_camera, &world_from_camera);
+        }
+    }
+}
+
+/// `world_from_map` of this scale that takes one pose of a camera to the other.
+fn anchored(scale: f64, map_from_camera: &SE3, world_from_camera: &SE3) -> Sim3 {
+    let rotation = world_from_camera.rotation * map_from_camera.rotation.inverse();
+    let translation =
+        world_from_camera.translation - rotation * map_from_camera.translation * scale;
+    Sim3::new(SE3 { rotation, translation }, scale)
 }

@@ -17,6 +17,11 @@ use crate::slam::tracker::verdict::{VerdictParams, is_better, quality_of};
 /// Correlation of small images below which two places are not the same: those that were the same had 0.5 and more.
 const LEAST_SIMILARITY: f32 = 0.3;
 
+/// Points with which a keyframe shows enough of a place: one of a hundred pixels.
+fn least_points(camera: &Intrinsics) -> usize {
+    camera.width * camera.height / 100
+}
+
 /// Looks for the camera on keyframes; owns the memory for that.
 #[derive(Debug)]
 pub(super) struct Finder {
@@ -85,7 +90,7 @@ impl Finder {
             let keyframe = &keyframes[*index];
             *index != active
                 && keyframe.map_state == MapState::Established
-                && keyframe.has_depth()
+                && keyframe.points.len() >= least_points(&keyframe.intrinsics)
         };
         let newest_first = (0..keyframes.len()).rev().filter(is_eligible);
         let similarity = |index: usize| {
@@ -162,7 +167,11 @@ pub(super) mod tests {
     use nalgebra::Vector6;
 
     /// A keyframe with exact depth at every fourth pixel.
-    pub(in crate::slam::mapper) fn keyframe(scene: &Scene, keyframe_id: u64, world_from_camera: SE3) -> Keyframe {
+    pub(in crate::slam::mapper) fn keyframe(
+        scene: &Scene,
+        keyframe_id: u64,
+        world_from_camera: SE3,
+    ) -> Keyframe {
         let view = scene.render(&CAMERA, &world_from_camera);
         let pixels = (4..CAMERA.height - 4)
             .step_by(2)
@@ -218,25 +227,45 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn keyframes_take_turns_and_rejected_ones_and_other_epochs_are_left_out() {
+    fn those_that_look_most_alike_are_first_and_rejected_and_nearly_empty_ones_are_left_out() {
         let scene = Scene::new(3);
         let known = keyframe(&scene, 0, SE3::identity());
-        let mut rejected = known.clone();
-        rejected.map_state = MapState::Rejected;
-        let other_epoch = Keyframe { epoch: 1, ..known.clone() };
-        let in_force = keyframe(&scene, 3, at([0.0, 0.0, 0.0, 0.0, 2.0, 0.0]));
-        let pixels = known.image.clone();
-        let params = RecoveryParams::default();
-        let (mut finder, mut searched) = (Finder::new(&CAMERA), 0);
-        let mut find = |keyframes: &[Keyframe]| {
-            let found = finder.find(keyframes, 2, &mut searched, &pixels, &params);
-            (found.map(|(index, _)| index), searched)
+        let rejected = Keyframe { map_state: MapState::Rejected, ..known.clone() };
+        let empty = Keyframe { points: known.points[..50].to_vec(), ..known.clone() };
+        let numbered = |keyframes: Vec<Keyframe>| -> Vec<Keyframe> {
+            let ids = (0..).zip(keyframes);
+            ids.map(|(keyframe_id, keyframe)| Keyframe { keyframe_id, ..keyframe }).collect()
         };
-        let without = [rejected, other_epoch, in_force.clone()];
-        assert_eq!(find(&without), (None, 0));
-        let far = keyframe(&scene, 1, at([0.0, 0.0, 0.0, 0.0, -2.0, 0.0]));
-        let with = [known, far, in_force];
-        assert_eq!(find(&with), (None, 1), "the newest is first");
-        assert_eq!(find(&with), (Some(0), 2));
+        let active = keyframe(&scene, 3, at([0.0, 0.0, 0.0, 0.0, 2.0, 0.0]));
+        let pixels = known.image.clone();
+        let params = RecoveryParams { keyframes_per_frame: 1, ..RecoveryParams::default() };
+        let find = |keyframes: &[Keyframe], active: usize| {
+            let found = Finder::new(&CAMERA).find(keyframes, active, &mut 0, &pixels, &params);
+            found.map(|(index, _)| index)
+        };
+        let without = numbered(vec![rejected, empty, active.clone()]);
+        assert_eq!(find(&without, 2), None);
+        let far = |of: f64| keyframe(&scene, 1, at([0.0, 0.0, 0.0, 0.0, of, 0.0]));
+        let other_epoch = Keyframe { epoch: 1, ..known };
+        let with = numbered(vec![far(-2.0), other_epoch, far(1.0), far(-1.0), active]);
+        assert_eq!(find(&with, 4), Some(1), "an earlier keyframe, of another epoch");
+    }
+
+    #[test]
+    fn others_take_turns() {
+        let scene = Scene::new(3);
+        let (here, active) = (SE3::identity(), at([0.0, 0.0, 0.0, 0.0, 2.0, 0.0]));
+        // Looks like the frame, and has no depth that could explain it.
+        let mut wrong = keyframe(&scene, 0, here);
+        wrong.points.iter_mut().for_each(|point| point.inverse_depth = f32::NAN);
+        let side = at([0.3, 0.0, 0.0, 0.0, 0.05, 0.0]);
+        let keyframes = [wrong, keyframe(&scene, 1, side), keyframe(&scene, 2, active)];
+        let pixels = scene.render(&CAMERA, &at([0.12, 0.0, 0.0, 0.0, 0.02, 0.0])).noisy(2.0, 5);
+        let find = |keyframes_per_frame| {
+            let params = RecoveryParams { keyframes_per_frame, ..RecoveryParams::default() };
+            let found = Finder::new(&CAMERA).find(&keyframes, 2, &mut 0, &pixels, &params);
+            found.map(|(index, _)| index)
+        };
+        assert_eq!((find(1), find(2)), (None, Some(1)));
     }
 }

@@ -21,10 +21,10 @@ use crate::slam::pose::PoseEstimate;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RecoveryParams {
-    /// Recent keyframes of the epoch that are searched for the camera, in turn.
+    /// Keyframes, of all epochs, that the camera is looked for on: those that look most like its image.
     pub num_keyframes: usize,
-    /// Keyframes that are searched in one frame: each costs about as much as a keyframe's
-    /// preparation in the tracker, and a frame must stay bounded.
+    /// Of them those that are searched in one frame, the most alike and others in turn: each costs about as much as a
+    /// keyframe's preparation in the tracker, and a frame must stay bounded.
     pub keyframes_per_frame: usize,
     /// The camera is looked for where the keyframe was taken and turned so far about its axes,
     /// degrees; a coarse alignment reaches about as far on each side.
@@ -38,7 +38,7 @@ impl Default for RecoveryParams {
     fn default() -> Self {
         Self {
             num_keyframes: 20,
-            keyframes_per_frame: 1,
+            keyframes_per_frame: 2,
             rotation_deg: 6.0,
             lost_timeout_secs: 2.0,
         }
@@ -153,8 +153,7 @@ impl Mapper {
         restore_points(&mut self.depth.active, &keyframe.points);
         let map_from_camera = keyframe.map_from_keyframe.place(keyframe_from_camera);
         // One of an earlier epoch brings the place and the unit back that its map has in odometry's world.
-        let world_from_map =
-            keyframe.world_from_keyframe * keyframe.map_from_keyframe.inverse();
+        let world_from_map = keyframe.world_from_keyframe * keyframe.map_from_keyframe.inverse();
         if self.keyframe().is_some_and(|active| active.epoch != keyframe.epoch) {
             self.world_from_map = world_from_map;
         }

@@ -218,6 +218,20 @@ fn without_keyframe_or_trust_nothing_is_claimed() {
     assert_eq!(estimate.state, TrackingState::Lost(LostReason::MapRejected));
 }
 
+#[test]
+fn where_the_light_has_changed_much_another_keyframe_is_asked_for() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let keyframe = plane.keyframe(&camera, 2, 0.02);
+    let proposes = |light: (f64, f64)| {
+        let image = plane.render(&camera, &path(1), 2.0, light, 7);
+        let estimate = tracker_on(&keyframe).track(&frame(1, &image), &mut always);
+        assert_eq!(estimate.state, TrackingState::Tracking, "{light:?}");
+        estimate.proposes_keyframe
+    };
+    assert!(!proposes((1.0, 0.0)) && !proposes((1.2, 3.0)) && !proposes((0.85, -4.0)));
+    assert!(proposes((0.5, 0.0)) && proposes((0.6, -10.0)));
+}
+
 /// An image without noise, and many with noise of their own.
 struct Shot(Vec<f64>);
 

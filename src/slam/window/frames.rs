@@ -124,8 +124,7 @@ impl Window {
             *left -= 1;
             let keyframe_id = frame.keyframe_id;
             let guess = frame.keyframe_from_camera;
-            if let Some((_, of_after, guess_of_after)) =
-                after.filter(|(of, ..)| *of == keyframe_id)
+            if let Some((_, of_after, guess_of_after)) = after.filter(|(of, ..)| *of == keyframe_id)
             {
                 frame.keyframe_from_camera = of_after * guess_of_after.inverse() * guess;
             }
