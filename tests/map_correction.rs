@@ -366,6 +366,10 @@ fn a_broken_correction_is_refused_as_a_whole() {
     let join = EpochJoin { epoch: 0, into: 0, into_from_epoch: Sim3::identity() };
     let refused = run.mapper.apply(&Correction { joins: vec![join], ..Correction::default() });
     assert!(matches!(refused.unwrap_err(), CorrectionError::Join(0)));
+    for unit in [0.0, -1.0, f64::NAN, f64::INFINITY] {
+        let refused = run.mapper.apply(&Correction { unit: Some(unit), ..sane.clone() });
+        assert!(matches!(refused.unwrap_err(), CorrectionError::Unit), "{unit}");
+    }
     assert_eq!((run.mapper.map().revision, &run.mapper.map().keyframes), (0, &before.keyframes));
     // Of keyframes that are gone nothing is done.
     let mut unknown = sane;

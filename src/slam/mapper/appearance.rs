@@ -8,6 +8,8 @@ const ROWS: usize = 24;
 const REACH: usize = 3;
 /// Columns and rows that are compared at every shift.
 const INNER: [usize; 2] = [COLUMNS - 2 * REACH, ROWS - 2 * REACH];
+/// Their number.
+const COUNT: f32 = (INNER[0] * INNER[1]) as f32;
 
 /// A small image.
 #[derive(Debug, Clone, PartialEq)]
@@ -34,16 +36,21 @@ impl Appearance {
         Some(Self { greys: blurred(&greys) })
     }
 
-    /// Correlation at the best of the shifts, −1 to 1: what brightness and contrast do to an image does not count.
+    /// Correlation at the best of the shifts, −1 to 1: what brightness and contrast do to an image does not count. −1
+    /// where one of them shows nothing.
     pub(super) fn similarity(&self, other: &Self) -> f32 {
-        let inner = self.part([REACH, REACH]);
+        let mut inner: Vec<f32> = self.part([REACH, REACH]).flatten().copied().collect();
+        let mean = inner.iter().sum::<f32>() / COUNT;
+        inner.iter_mut().for_each(|grey| *grey -= mean);
+        let variance = inner.iter().map(|grey| grey * grey).sum::<f32>() / COUNT;
         let places = (0..=2 * REACH).flat_map(|y| (0..=2 * REACH).map(move |x| [x, y]));
-        places.map(|at| correlation(&inner, &other.part(at))).fold(-1.0, f32::max)
+        places.map(|at| correlation(&inner, variance, other.part(at))).fold(-1.0, f32::max)
     }
 
-    /// The part of the inner size that begins at a column and a row.
-    fn part(&self, [x, y]: [usize; 2]) -> [f32; INNER[0] * INNER[1]] {
-        std::array::from_fn(|k| self.greys[(y + k / INNER[0]) * COLUMNS + x + k % INNER[0]])
+    /// Rows of the part of the inner size that begins at a column and a row.
+    fn part(&self, [x, y]: [usize; 2]) -> impl Iterator<Item = &[f32]> + Clone {
+        let rows = self.greys[COLUMNS * y..].chunks_exact(COLUMNS).take(INNER[1]);
+        rows.map(move |row| &row[x..x + INNER[0]])
     }
 }
 
@@ -61,21 +68,21 @@ fn blurred(greys: &[f32]) -> Vec<f32> {
     pass(&pass(greys, [1, 0]), [0, 1])
 }
 
-fn correlation(one: &[f32], other: &[f32]) -> f32 {
+/// Of greys whose mean is 0 and whose variance is known with rows of others.
+fn correlation<'a>(centred: &[f32], variance: f32, rows: impl Iterator<Item = &'a [f32]>) -> f32 {
     /// Variance, grey levels², below which there is nothing to be compared.
     const LEAST_VARIANCE: f32 = 1.0;
-    let count = one.len() as f32;
-    let mean = |of: &[f32]| of.iter().sum::<f32>() / count;
-    let (mean_of_one, mean_of_other) = (mean(one), mean(other));
-    let [mut variance_of_one, mut variance_of_other, mut common] = [0.0; 3];
-    for (a, b) in one.iter().zip(other) {
-        let (a, b) = (a - mean_of_one, b - mean_of_other);
-        variance_of_one += a * a;
-        variance_of_other += b * b;
-        common += a * b;
+    let [mut sum, mut squares, mut common] = [0.0f32; 3];
+    for (ours, theirs) in centred.chunks_exact(INNER[0]).zip(rows) {
+        for (a, b) in ours.iter().zip(theirs) {
+            sum += b;
+            squares += b * b;
+            common += a * b;
+        }
     }
-    match variance_of_one.min(variance_of_other) > LEAST_VARIANCE * count {
-        true => common / (variance_of_one * variance_of_other).sqrt(),
+    let variance_of_other = squares / COUNT - (sum / COUNT) * (sum / COUNT);
+    match variance.min(variance_of_other) > LEAST_VARIANCE {
+        true => common / COUNT / (variance * variance_of_other).sqrt(),
         false => -1.0,
     }
 }

@@ -53,12 +53,13 @@ impl Mapper {
         corrected.map(|corrected| corrected.depth)
     }
 
-    /// Chooses where the map lies in the world so that a camera at `map_from_camera` is where odometry had it last:
-    /// that stands still.
-    pub(super) fn anchor(&mut self, map_from_camera: &SE3) {
-        if let Some(world_from_camera) = self.last_world_from_camera {
-            self.world_from_map =
-                anchored(self.world_from_map.scale, map_from_camera, &world_from_camera);
+    /// The camera has been found on a keyframe: chooses where the map lies in the world so that it is where odometry had
+    /// it last, which stands still.
+    pub(super) fn anchor(&mut self, keyframe_id: u64, keyframe_from_camera: &SE3) {
+        self.last_tracked = Some((keyframe_id, *keyframe_from_camera));
+        let map_from_camera = self.map.place(keyframe_id, keyframe_from_camera);
+        if let (Some(map), Some(world)) = (map_from_camera, self.last_world_from_camera) {
+            self.world_from_map = anchored(self.world_from_map.scale, &map, &world);
         }
     }
 }

@@ -14,7 +14,8 @@ use crate::slam::pose::Brightness;
 use crate::slam::tracker::motion::turned;
 use crate::slam::tracker::verdict::{VerdictParams, is_better, quality_of};
 
-/// Correlation of small images below which two places are not the same: those that were the same had 0.5 and more.
+/// Correlation of small images below which a keyframe is not tried: of 24 alignments that succeeded while the camera was
+/// lost in a recording 19 were at 0.8 and more, the others, at 0.44 to 0.65, on views turned by 22° to 57°.
 const LEAST_SIMILARITY: f32 = 0.3;
 
 /// Points with which a keyframe shows enough of a place: one of a hundred pixels.
@@ -108,7 +109,7 @@ impl Finder {
 
     /// Looks at keyframes that are new, so many at most.
     fn learn(&mut self, keyframes: &[Keyframe]) {
-        /// 20 µs each at 640×480.
+        /// 65 µs each at 640×480.
         const MOST_AT_ONCE: usize = 100;
         let known = self.appearances.last().map(|(id, _)| *id);
         let new = keyframes.iter().filter(|keyframe| Some(keyframe.keyframe_id) > known);
@@ -119,19 +120,26 @@ impl Finder {
         }
     }
 
-    /// Aligns a frame to `keyframe` from where the camera is expected; `None` where it does not fit.
+    /// Aligns a frame to `keyframe` from where the camera is expected; `None` where it does not fit, or ends further from
+    /// there than `max_disagreement`, translation in mean depths plus rotation in radians.
     pub(super) fn locate(
         &mut self,
         keyframe: &Keyframe,
         pixels: &[u8],
-        keyframe_from_camera: &SE3,
+        expected: &SE3,
+        max_disagreement: f64,
     ) -> Option<Alignment> {
         self.pyramid.fill(pixels);
         self.reference.prepare_into(keyframe);
-        let (start, brightness) = (keyframe_from_camera.inverse(), Brightness::default());
+        let (start, brightness) = (expected.inverse(), Brightness::default());
         let (reference, pyramid) = (&self.reference, &self.pyramid);
         let found = self.aligner.align(reference, pyramid, &start, brightness, &mut |_| true);
-        self.verdict.judge(&found, &quality_of(&found), true, 0).is_tracked().then_some(found)
+        if !self.verdict.judge(&found, &quality_of(&found), true, 0).is_tracked() {
+            return None;
+        }
+        let error = (found.state.current_from_keyframe * *expected).log();
+        let disagreement = error.fixed_rows::<3>(0).norm() + error.fixed_rows::<3>(3).norm();
+        (disagreement <= max_disagreement).then_some(found)
     }
 
     /// `keyframe_from_camera` of the frame in the pyramid, where it can be aligned to `keyframe` from some view

@@ -13,9 +13,9 @@ pub(super) enum Phase {
     Starting,
     /// Its depth is observed.
     Mapping,
-    /// The camera is lost: it is looked for on recent keyframes.
+    /// The camera is lost: it is looked for on keyframes of all epochs.
     Lost(Loss),
-    /// The map contradicted itself: the camera is looked for on earlier keyframes.
+    /// The map contradicted itself: the camera is looked for on others.
     Rejected(Contradiction, Loss),
     /// The camera has been lost for long: looked for as before, and the frame goes to the start of a new epoch
     /// too. Whichever is first wins.

@@ -1,6 +1,6 @@
-//! What the mapper does while the camera is lost: it looks for it on recent keyframes, and when that
-//! fails for long begins a new epoch beside the search. Whichever is first wins: until the new
-//! epoch's start is proven the old one can be found again.
+//! What the mapper does while the camera is lost: it looks for it on keyframes of all epochs, and when that fails for
+//! long begins a new epoch beside the search. Whichever is first wins: until the new epoch's start is proven the old
+//! ones can be found again.
 
 use serde::{Deserialize, Serialize};
 
@@ -116,12 +116,7 @@ impl Mapper {
         others.truncate(MOST);
         let mut agrees = |(_, other, expected): &(f64, usize, SE3)| {
             let keyframe = &self.map.keyframes[*other];
-            let Some(measured) = self.finder.locate(keyframe, pixels, expected) else {
-                return false;
-            };
-            let error = (measured.state.current_from_keyframe * *expected).log();
-            let disagreement = error.fixed_rows::<3>(0).norm() + error.fixed_rows::<3>(3).norm();
-            disagreement <= MAX_DISAGREEMENT
+            self.finder.locate(keyframe, pixels, expected, MAX_DISAGREEMENT).is_some()
         };
         others.is_empty() || others.iter().any(&mut agrees)
     }
@@ -151,13 +146,12 @@ impl Mapper {
         };
         self.depth.restart(&keyframe.image, &self.params);
         restore_points(&mut self.depth.active, &keyframe.points);
-        let map_from_camera = keyframe.map_from_keyframe.place(keyframe_from_camera);
-        // One of an earlier epoch brings the place and the unit back that its map has in odometry's world.
-        let world_from_map = keyframe.world_from_keyframe * keyframe.map_from_keyframe.inverse();
+        // One of another epoch brings the place and the unit back that its map has in odometry's world.
         if self.keyframe().is_some_and(|active| active.epoch != keyframe.epoch) {
-            self.world_from_map = world_from_map;
+            self.world_from_map =
+                keyframe.world_from_keyframe * keyframe.map_from_keyframe.inverse();
         }
-        self.anchor(&map_from_camera);
+        self.anchor(keyframe.keyframe_id, keyframe_from_camera);
         self.past.clear();
         self.drop_early_frames();
         self.phase = Phase::Mapping;
@@ -202,9 +196,67 @@ pub(super) fn restore_points(map: &mut DepthMap, points: &[DepthPoint]) {
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::Vector6;
+
     use super::*;
+    use crate::slam::geometry::sim3::Sim3;
+    use crate::slam::map::{Correction, KeyframeCorrection, LogPlane};
+    use crate::slam::mapper::MapperParams;
     use crate::slam::mapper::finder::tests::keyframe;
+    use crate::slam::mapper::phase::Active;
     use crate::slam::test_scene::{CAMERA, Scene};
+
+    /// A mapper whose keyframes, of exact depth, are at these places along a line.
+    fn mapper_with(places: &[f64]) -> Mapper {
+        let scene = Scene::new(3);
+        let mut mapper = Mapper::new(CAMERA, MapperParams::default()).unwrap();
+        let ids = (0..).zip(places);
+        mapper.map.keyframes = ids.map(|(id, &x)| keyframe(&scene, id, sideways(x))).collect();
+        mapper.active = Some(Active::new(0));
+        mapper
+    }
+
+    fn sideways(x: f64) -> SE3 {
+        SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() }
+    }
+
+    #[test]
+    fn a_place_is_believed_where_another_keyframe_has_the_camera_there_too() {
+        let pixels = Scene::new(3).render(&CAMERA, &sideways(0.1)).noisy(2.0, 9);
+        let mut mapper = mapper_with(&[0.0, 0.15]);
+        assert!(mapper.is_confirmed(0, &sideways(0.1), &pixels));
+        let turned = SE3::exp(&Vector6::new(0.1, 0.05, 0.0, 0.1, 0.25, 0.0));
+        assert!(!mapper.is_confirmed(0, &turned, &pixels), "the other one sees something else");
+        // Nobody else is there to be asked, or only one that is not believed.
+        assert!(mapper_with(&[0.0]).is_confirmed(0, &turned, &pixels));
+        mapper.map.keyframes[1].map_state = MapState::Rejected;
+        assert!(mapper.is_confirmed(0, &turned, &pixels));
+    }
+
+    #[test]
+    fn a_correction_right_after_the_camera_was_found_leaves_it_where_odometry_has_it() {
+        let mut mapper = mapper_with(&[0.0, 1.0]);
+        let last = sideways(0.1);
+        mapper.last_world_from_camera = Some(last);
+        mapper.last_tracked = Some((0, last));
+        let found = sideways(0.2);
+        mapper.restore_keyframe(1, &found);
+        let in_world = |mapper: &Mapper| {
+            mapper.keyframe().unwrap().world_from_keyframe.place(&found).translation.x
+        };
+        assert!((in_world(&mapper) - 0.1).abs() < 1e-12, "{}", in_world(&mapper));
+        // The two keyframes move apart.
+        let correction = Correction {
+            keyframes: vec![KeyframeCorrection {
+                keyframe_id: 1,
+                map_from_keyframe: Sim3::new(sideways(1.5), 1.1),
+                depth: LogPlane::default(),
+            }],
+            ..Correction::default()
+        };
+        mapper.apply(&correction).unwrap();
+        assert!((in_world(&mapper) - 0.1).abs() < 1e-12, "{}", in_world(&mapper));
+    }
 
     #[test]
     fn points_that_no_filter_could_have_left_are_not_restored() {

@@ -53,20 +53,15 @@ impl Mapper {
             return false;
         };
         let keyframe = &self.map.keyframes[index];
-        let Some(measured) = self.finder.locate(keyframe, frame.pixels, &expected) else {
+        let limit = self.params.reuse.max_disagreement;
+        let Some(measured) = self.finder.locate(keyframe, frame.pixels, &expected, limit) else {
             return false;
         };
-        let camera_from_keyframe = measured.state.current_from_keyframe;
-        let error = (camera_from_keyframe * expected).log();
-        let disagreement = error.fixed_rows::<3>(0).norm() + error.fixed_rows::<3>(3).norm();
-        if !(disagreement <= self.params.reuse.max_disagreement) {
-            return false;
-        }
-        let map_from_camera = keyframe.map_from_keyframe.place(&camera_from_keyframe.inverse());
+        let keyframe_from_camera = measured.state.current_from_keyframe.inverse();
         // Exact poses are the world's own, and need no anchor.
         let is_exact = pose.alignment_covariance.iter().all(|entry| *entry == 0.0);
         if !is_exact {
-            self.anchor(&map_from_camera);
+            self.anchor(keyframe.keyframe_id, &keyframe_from_camera);
         }
         self.take_up(index, between(pose.brightness, measured.state.brightness));
         true

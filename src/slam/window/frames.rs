@@ -114,7 +114,8 @@ impl Window {
     /// Aligns frames from before their map began, the newest first, each from where the one after it was and moved
     /// on as that did; none before one that does not fit.
     fn retrace(&mut self, waiting: &mut Vec<TrackedFrame>, end: usize, left: &mut usize) {
-        let mut after: Option<(u64, SE3, SE3)> = None;
+        // By how much the last one was found off its guess, and its keyframe.
+        let mut found_off: Option<(u64, SE3)> = None;
         while *left > 0 {
             let is_ready = |frame: &TrackedFrame| {
                 frame.is_guess && self.index_of(frame.keyframe_id).is_none_or(|index| index < end)
@@ -122,11 +123,9 @@ impl Window {
             let Some(place) = waiting.iter().rposition(is_ready) else { return };
             let mut frame = waiting.remove(place);
             *left -= 1;
-            let keyframe_id = frame.keyframe_id;
-            let guess = frame.keyframe_from_camera;
-            if let Some((_, of_after, guess_of_after)) = after.filter(|(of, ..)| *of == keyframe_id)
-            {
-                frame.keyframe_from_camera = of_after * guess_of_after.inverse() * guess;
+            let (keyframe_id, guess) = (frame.keyframe_id, frame.keyframe_from_camera);
+            if let Some((_, off)) = found_off.filter(|(of, _)| *of == keyframe_id) {
+                frame.keyframe_from_camera = off * guess;
             }
             let index = self.index_of(keyframe_id);
             let placed = index.and_then(|index| self.place_frame(index, &mut frame, &GUESS_LEVELS));
@@ -137,17 +136,13 @@ impl Window {
             };
             let mut found = placed.keyframe_from_camera;
             found.translation /= self.keyframes[index].unit;
-            after = Some((keyframe_id, found, guess));
-            // Who goes on later begins here.
-            let correction = found * guess.inverse();
-            if *left == 0 {
-                for other in waiting.iter_mut() {
-                    if other.is_guess && other.keyframe_id == keyframe_id {
-                        other.keyframe_from_camera = correction * other.keyframe_from_camera;
-                    }
-                }
-            }
+            found_off = Some((keyframe_id, found * guess.inverse()));
             self.frames.placed.push(placed);
+        }
+        // Those that are left begin there.
+        let Some((keyframe_id, off)) = found_off else { return };
+        for other in waiting.iter_mut().filter(|of| of.is_guess && of.keyframe_id == keyframe_id) {
+            other.keyframe_from_camera = off * other.keyframe_from_camera;
         }
     }
 
