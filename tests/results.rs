@@ -25,6 +25,7 @@ use semidense::slam::pose::{
 use semidense::slam::trajectory::StampedPose;
 use semidense::slam::window::Adjustment;
 use semidense::slam::window::confirmed::ConfirmedPoint;
+use semidense::slam::window::frames::PlacedFrame;
 use serde_json::Value;
 
 const INTRINSICS: Intrinsics = Intrinsics::pinhole(32, 24, 30.0);
@@ -182,6 +183,31 @@ fn written(dir: &Path, record: &RunRecord) -> (Value, String) {
     assert!(!report.contains("http://") || !report.contains("src=\"http"), "no network is needed");
     assert!(!report.contains("NaN"));
     (serde_json::from_str(&read("summary.json")).unwrap(), report)
+}
+
+#[test]
+fn frames_aligned_afterwards_count_where_the_map_was_tracked_on() {
+    let placed = |record: &RunRecord| -> RunRecord {
+        let mut record = record.clone();
+        for sequence in 0..3 {
+            let keyframe_from_camera = SE3::identity();
+            record.map.place_frame(&PlacedFrame { sequence, keyframe_id: 0, keyframe_from_camera });
+        }
+        record
+    };
+    let state =
+        |i, last| if i < last { TrackingState::Initializing } else { TrackingState::Tracking };
+    for (last, tracked, later) in [(8, 5, 3), (10, 0, 0)] {
+        let poses = (0..10).map(|i| pose(i, state(i, last), 0)).collect();
+        let record = placed(&record(poses, vec![keyframe(0)], false));
+        let folder = tempfile::tempdir().unwrap();
+        let (summary, _) = written(&folder.path().join("out"), &record);
+        assert_eq!(summary["frames_tracked"], tracked);
+        assert_eq!(summary["frames_tracked_later"], later);
+        assert_eq!(summary["untracked"].is_null(), tracked > 0);
+        let lines = std::fs::read_to_string(folder.path().join("out/trajectory.txt")).unwrap();
+        assert_eq!(lines.lines().filter(|line| !line.starts_with('#')).count(), tracked);
+    }
 }
 
 #[test]

@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use std::path::Path;
 
 use crate::service::atomic_file::write_atomically;
-use crate::service::results::RunRecord;
+use crate::service::results::{RecordedPose, RunRecord};
 use crate::service::trajectory_file::tum_line;
 use crate::slam::evaluation::MAX_DIFFERENCE_NANOS;
 use crate::slam::evaluation::depth_error::DepthScale;
@@ -33,8 +33,12 @@ pub fn longest_epoch(record: &RunRecord) -> Option<u32> {
 
 /// Every frame with a pose, of one epoch or of all, on the final place of its keyframe, in the map: frames that were
 /// tracked, and those that came before their map began and were aligned to it afterwards. A tracked frame whose
-/// keyframe the final map does not hold keeps its published place.
+/// keyframe the final map does not hold keeps its published place. None where no frame was tracked when it came: a map
+/// that began with the last frames is unproven.
 pub fn final_trajectory(record: &RunRecord, epoch: Option<u32>) -> Vec<StampedPose> {
+    if !is_any_tracked(&record.poses) {
+        return Vec::new();
+    }
     let keyframes = record.map.keyframes.iter();
     let places: HashMap<u64, _> = keyframes.map(|k| (k.keyframe_id, k)).collect();
     let estimates = record.poses.iter().map(|pose| &pose.estimate);
@@ -56,9 +60,19 @@ pub fn final_trajectory(record: &RunRecord, epoch: Option<u32>) -> Vec<StampedPo
     with_pose.collect()
 }
 
-/// Whether a frame that came before its map began was aligned to it afterwards.
-pub fn is_placed_later(estimate: &PoseEstimate, map: &Map) -> bool {
-    !estimate.state.is_tracked() && map.frame(estimate.sequence).is_some()
+/// Frames that came before their map began and were aligned to it afterwards.
+pub fn placed_later<'a>(
+    poses: &'a [RecordedPose],
+    map: &'a Map,
+) -> impl Iterator<Item = &'a PoseEstimate> {
+    let is_proven = is_any_tracked(poses);
+    let estimates = poses.iter().map(|pose| &pose.estimate);
+    estimates
+        .filter(move |of| is_proven && !of.state.is_tracked() && map.frame(of.sequence).is_some())
+}
+
+fn is_any_tracked(poses: &[RecordedPose]) -> bool {
+    poses.iter().any(|pose| pose.estimate.state.is_tracked())
 }
 
 /// The epoch that a frame belongs to in the end: its own may have been joined to another.

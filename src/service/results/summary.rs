@@ -9,7 +9,7 @@ use crate::service::results::budget_curve::BudgetCurve;
 use crate::service::results::calibration::whitened_residual_median;
 use crate::service::results::joint::JointSummary;
 use crate::service::results::output_folder::utc_text;
-use crate::service::results::poses::{is_placed_later, longest_epoch};
+use crate::service::results::poses::{longest_epoch, placed_later};
 use crate::service::results::times::{LatencySummary, Percentiles, track_nanos};
 use crate::service::results::untracked::Untracked;
 use crate::service::results::{
@@ -158,8 +158,7 @@ pub struct FrameCounts {
 impl FrameCounts {
     fn of(poses: &[RecordedPose], map: &Map) -> Self {
         let count = |is: fn(TrackingState) -> bool| count_states(poses, is);
-        let later =
-            || poses.iter().map(|pose| &pose.estimate).filter(|of| is_placed_later(of, map));
+        let later = || placed_later(poses, map);
         let is_initializing = |of: &&PoseEstimate| of.state == TrackingState::Initializing;
         let initializing = count(|s| s == TrackingState::Initializing);
         Self {
