@@ -235,11 +235,11 @@ impl Window {
         let params = &self.params;
         let keyframe = &mut self.keyframes[host];
         keyframe.take_part(&self.camera);
-        let chosen = selection::choose(
+        let chosen = selection::choose_spread(
             points,
             keyframe.images[0].pixels(),
             &self.camera,
-            params.points,
+            [params.points, params.max_points],
             params.min_gradient,
             params.max_relative_deviation,
         );
@@ -363,6 +363,7 @@ impl Window {
             true => self.params.max_first_iterations,
             false => self.params.max_iterations,
         };
+        self.thin_out(&chosen.members);
         self.solver.iterations = 0;
         let unit = Unit::of(&self.keyframes, &members);
         if !self.run(&members, &ADJUSTED_LEVELS, iterations, |_, _| true) {
@@ -387,9 +388,19 @@ impl Window {
             points,
             comparisons: system.compared,
             inlier_ratio: system.inliers as f64 / system.compared.max(1) as f64,
-            rms_grey: (system.inlier_cost / (SAMPLES * system.inliers.max(1)) as f64).sqrt(),
+            rms_grey: system.mean_squared_residual().sqrt(),
             iterations: self.solver.iterations,
         })
+    }
+
+    /// Lets points of hosts go that are too many to be estimated together: as many in all as a full window has.
+    fn thin_out(&mut self, members: &[usize]) {
+        let WindowParams { points, max_points, num_free, num_fixed, .. } = self.params;
+        let hosts = members.iter().filter(|&&member| self.keyframes[member].is_host).count();
+        let each = points * (num_free + num_fixed) / hosts.max(1);
+        for &member in members {
+            self.keyframes[member].points.truncate(each.clamp(points, max_points.max(points)));
+        }
     }
 
     /// Adjusts what is free, level by level; false where something is not determined.

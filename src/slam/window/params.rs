@@ -14,8 +14,10 @@ pub struct WindowParams {
     pub num_fixed: usize,
     /// The first keyframes of an epoch, in which all but the first are free.
     pub num_first: usize,
-    /// Points chosen in a keyframe.
+    /// Points of a keyframe in a full window.
     pub points: usize,
+    /// The same while there are few keyframes: as many in all as in a full window.
+    pub max_points: usize,
     /// Smallest gradient of a point, grey levels a pixel.
     pub min_gradient: f64,
     /// Largest standard deviation of a point that is chosen, over its inverse depth.
@@ -34,7 +36,8 @@ pub struct WindowParams {
     pub frame_lag: usize,
     /// Most frames that wait, one byte a pixel each; the oldest keep the pose that the tracker gave them.
     pub max_waiting_frames: usize,
-    /// A level is done when the next step would lower the cost by less than this share.
+    /// A level is done when the next step would lower the cost by less than this many mean squared residuals: a step of
+    /// one standard deviation in one direction lowers it by about one.
     pub converged_decrement: f64,
     /// In a replay and in lockstep: frames from a keyframe to the entry of its joint estimate, which is waited for, so
     /// that every run gives the same map. 3 are 100 ms at 30 Hz, about what it takes live, where it enters as soon as
@@ -49,16 +52,17 @@ impl Default for WindowParams {
             num_fixed: 8,
             num_first: 8,
             points: 300,
+            max_points: 1000,
             min_gradient: 8.0,
             max_relative_deviation: 0.3,
             huber_grey: 9.0,
             half_weight_gradient: 50.0,
             truncation_grey: 12.0,
             max_iterations: 4,
-            max_first_iterations: 15,
+            max_first_iterations: 40,
             frame_lag: 1,
             max_waiting_frames: 200,
-            converged_decrement: 1e-4,
+            converged_decrement: 0.1,
             delay_frames: 3,
         }
     }
@@ -71,6 +75,7 @@ impl WindowParams {
         check_range("num_fixed", self.num_fixed, 0..=50)?;
         check_range("num_first", self.num_first, 2..=50)?;
         check_range("points", self.points, 50..=5000)?;
+        check_range("max_points", self.max_points, 50..=5000)?;
         check_range("min_gradient", self.min_gradient, 0.0..=255.0)?;
         check_range("max_relative_deviation", self.max_relative_deviation, 0.001..=10.0)?;
         check_range("huber_grey", self.huber_grey, 0.1..=255.0)?;
@@ -80,7 +85,7 @@ impl WindowParams {
         check_range("max_first_iterations", self.max_first_iterations, 1..=1000)?;
         check_range("frame_lag", self.frame_lag, 0..=20)?;
         check_range("max_waiting_frames", self.max_waiting_frames, 0..=10_000)?;
-        check_range("converged_decrement", self.converged_decrement, 0.0..=1.0)?;
+        check_range("converged_decrement", self.converged_decrement, 0.0..=1e6)?;
         check_range("delay_frames", self.delay_frames, 0..=30)
     }
 }

@@ -1,10 +1,37 @@
 //! Which points of a keyframe's depth take part in the joint estimation.
 
+use std::collections::HashSet;
+
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::DepthPoint;
 
 /// Pixels at the border that no point is chosen in: pattern and gradients stay inside.
 const BORDER_PX: u16 = 4;
+
+/// As [`choose`], and then as many more as there are in up to `most_cells` cells, in an order of which every beginning
+/// is spread over the image.
+pub fn choose_spread(
+    points: &[DepthPoint],
+    pixels: &[u8],
+    camera: &Intrinsics,
+    [num_cells, most_cells]: [usize; 2],
+    min_gradient: f64,
+    max_relative_deviation: f64,
+) -> Vec<DepthPoint> {
+    /// Of the others every so many at a time.
+    const STEP: usize = 8;
+    let of = |cells| choose(points, pixels, camera, cells, min_gradient, max_relative_deviation);
+    let mut chosen = of(num_cells);
+    if most_cells > num_cells {
+        let known: HashSet<(u16, u16)> = chosen.iter().map(|point| (point.u, point.v)).collect();
+        let mut others = of(most_cells);
+        others.retain(|point| !known.contains(&(point.u, point.v)));
+        let spread = (0..STEP).flat_map(|first| others.iter().skip(first).step_by(STEP));
+        chosen.extend(spread);
+        chosen.truncate(most_cells);
+    }
+    chosen
+}
 
 /// The surest points with gradient, at most one in each of `num_cells` cells of the image, cell after cell.
 pub fn choose(

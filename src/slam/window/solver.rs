@@ -61,7 +61,8 @@ impl Solver {
                 damping = (damping * DAMPING_UP).max(LEAST_RAISED_DAMPING);
                 continue;
             }
-            if self.step.decrement < converged_decrement * cost {
+            let converged = converged_decrement * self.system.mean_squared_residual();
+            if self.step.decrement < converged {
                 break;
             }
             self.remember(keyframes, members);
@@ -73,7 +74,7 @@ impl Solver {
                 std::mem::swap(&mut self.system, &mut self.trial);
                 (damping, failures) = ((damping * DAMPING_DOWN).max(LEAST_DAMPING), 0);
                 // The linear model may promise more than kinks between pixels let it have.
-                let is_flat = cost - moved < converged_decrement * cost;
+                let is_flat = cost - moved < converged;
                 cost = moved;
                 if is_flat {
                     break;

@@ -11,7 +11,7 @@ use nalgebra::{DMatrix, DVector, Matrix6, Vector6};
 use crate::slam::alignment::kernel::{Kernel, SimdMode};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::window::comparison::{
-    Compared, LANES, POSE, Pair, PairSums, Robustness, Wanted, sum,
+    Compared, LANES, POSE, Pair, PairSums, Robustness, SAMPLES, Wanted, sum,
 };
 use crate::slam::window::elimination_kernel::{
     Block, PADDED, PointRow, RowBlock, eliminate, lower,
@@ -357,6 +357,11 @@ impl System {
             }
         }
         true
+    }
+
+    /// Of the comparisons that count, grey levels².
+    pub fn mean_squared_residual(&self) -> f64 {
+        self.inlier_cost / (SAMPLES * self.inliers.max(1)) as f64
     }
 
     /// Keyframes that agree with each point, in the order of the views.
