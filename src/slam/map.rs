@@ -12,6 +12,7 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{DepthPoint, Keyframe};
 use crate::slam::window::confirmed::ConfirmedPoint;
+use crate::slam::window::dense::RefinedDepth;
 use crate::slam::window::frames::PlacedFrame;
 
 /// All keyframes of all epochs, with their depth. Each epoch has a scale and a drift of its own.
@@ -238,6 +239,14 @@ impl Map {
         }
         self.revision += 1;
         Ok(())
+    }
+
+    /// Gives a keyframe depth that is known better, as `revision` of it.
+    pub fn refine(&mut self, refined: RefinedDepth, revision: u64) {
+        let Some(index) = self.index_of(refined.keyframe_id) else { return };
+        let keyframe = &mut self.keyframes[index];
+        keyframe.points = refined.points;
+        keyframe.revision = revision;
     }
 
     /// Takes image and depth from the oldest keyframes until the rest fit into `max_bytes`; their poses

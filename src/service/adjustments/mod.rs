@@ -129,13 +129,20 @@ impl Adjustments {
         }
     }
 
-    /// After the last frame: lets in what is away, then estimates all keyframes once more and aligns the last frames
-    /// again. It is waited for; live, where something else may have the CPU, not for long.
+    /// After the last frame: lets in what is away, then estimates all keyframes once more, aligns the last frames again
+    /// and refines the depth of the keyframes. It is waited for; live, where something else may have the CPU, not for long.
     pub fn finish(&mut self, mapper: &mut Mapper) -> StepOutcome {
         let deadline = Instant::now() + LAST_ADJUSTMENTS;
         let outcome = self.let_all_in(mapper, deadline);
         self.begin_with(mapper, Mapper::begin_last_adjustment);
-        let outcome = joined(outcome, self.let_all_in(mapper, deadline));
+        let mut outcome = joined(outcome, self.let_all_in(mapper, deadline));
+        let may_go_on = || match self.entry {
+            Entry::AfterFrames(_) => true,
+            Entry::WhenReady => Instant::now() < deadline,
+        };
+        while may_go_on() && mapper.refine_depth() {
+            outcome.graph_changed = true;
+        }
         mapper.keep_confirmed();
         outcome
     }

@@ -63,6 +63,19 @@ impl Mapper {
         Some(window)
     }
 
+    /// After the last estimate: refines the depth of the newest keyframe that has not been, from the keyframes around it;
+    /// false where there is none left.
+    pub fn refine_depth(&mut self) -> bool {
+        let Some(window) = &mut self.window else { return false };
+        let Some(keyframe_id) = window.next_unrefined() else { return false };
+        let refined = self.map.get(keyframe_id).and_then(|keyframe| window.refined(keyframe));
+        if let Some(refined) = refined {
+            self.revision += 1;
+            self.map.refine(refined, self.revision);
+        }
+        true
+    }
+
     /// Keeps the points that the joint estimate has in the map: to be called before it is written.
     pub fn keep_confirmed(&mut self) {
         if let Some(window) = &self.window {

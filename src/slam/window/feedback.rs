@@ -3,6 +3,7 @@
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::map::{Correction, KeyframeCorrection, LogPlane, Map};
+use crate::slam::window::keyframe::WindowKeyframe;
 use crate::slam::window::plane::{Correspondence, fit};
 use crate::slam::window::{Window, selection};
 
@@ -50,7 +51,7 @@ impl Window {
         let place = known.camera_from_map.inverse();
         let unit = keyframe.map_from_keyframe.scale;
         let better = match known.is_host {
-            true => self.of_own_points(keyframe),
+            true => self.of_own_points(known, keyframe),
             false => {
                 let index =
                     self.keyframes.iter().position(|k| k.keyframe_id == keyframe.keyframe_id)?;
@@ -66,10 +67,14 @@ impl Window {
         })
     }
 
-    fn of_own_points(&self, keyframe: &Keyframe) -> Vec<Correspondence> {
-        let Some(known) = self.get(keyframe.keyframe_id) else { return Vec::new() };
+    /// A keyframe's own points beside its depth.
+    pub(super) fn of_own_points(
+        &self,
+        host: &WindowKeyframe,
+        keyframe: &Keyframe,
+    ) -> Vec<Correspondence> {
         let unit = keyframe.map_from_keyframe.scale;
-        let points = known.points.iter().filter(|point| point.is_alive && point.confirmations > 0);
+        let points = host.points.iter().filter(|point| point.is_alive && point.confirmations > 0);
         points
             .filter_map(|point| {
                 let dense = selection::at_pixel(&keyframe.points, point.u, point.v)?;

@@ -107,7 +107,7 @@ impl Window {
         self.frames.waiting = waiting;
     }
 
-    fn index_of(&self, keyframe_id: u64) -> Option<usize> {
+    pub(super) fn index_of(&self, keyframe_id: u64) -> Option<usize> {
         self.keyframes.iter().position(|keyframe| keyframe.keyframe_id == keyframe_id)
     }
 

@@ -73,7 +73,7 @@ pub fn num_levels(camera: &Intrinsics) -> usize {
 }
 
 /// 2×2 means, rounded: half a grey level is far below the noise.
-fn halve(fine: &Image<u8>) -> Image<u8> {
+pub(super) fn halve(fine: &Image<u8>) -> Image<u8> {
     let (columns, rows) = (fine.width() / 2, fine.height() / 2);
     let mut coarse = Image::filled(columns, rows, 0);
     for (v, row) in coarse.pixels_mut().chunks_exact_mut(columns).enumerate() {
@@ -112,21 +112,22 @@ impl WindowPoint {
 
 /// What the pattern around a pixel looks like.
 fn look_at(image: &Image<u8>, u: f32, v: f32, half_weight_gradient: f32) -> Look {
-    let reach = 3.0;
+    let reach = CENTRE as f32;
     let inside = |at: f32, side: usize| at >= reach && at < side as f32 - 1.0 - reach;
     if !(inside(u, image.width()) && inside(v, image.height())) {
         return Look::default();
     }
-    let moved = |by: (f32, f32)| {
-        PATTERN.map(|(du, dv)| sample(image, u + du as f32 + by.0, v + dv as f32 + by.1))
+    let around = around(image, u, v);
+    let moved = |(right, down): (i32, i32)| {
+        PATTERN
+            .map(|(du, dv)| around[(CENTRE + dv + down) as usize][(CENTRE + du + right) as usize])
     };
-    let here = moved((0.0, 0.0));
+    let here = moved((0, 0));
     let mean = sum_of_samples(&here) / SAMPLES as f32;
     if !(mean >= DARKEST) {
         return Look::default();
     }
-    let (left, right, up, down) =
-        (moved((-1.0, 0.0)), moved((1.0, 0.0)), moved((0.0, -1.0)), moved((0.0, 1.0)));
+    let (left, right, up, down) = (moved((-1, 0)), moved((1, 0)), moved((0, -1)), moved((0, 1)));
     let squared = half_weight_gradient * half_weight_gradient;
     let weight = std::array::from_fn(|k| {
         let (du, dv) = (0.5 * (right[k] - left[k]), 0.5 * (down[k] - up[k]));
@@ -135,14 +136,27 @@ fn look_at(image: &Image<u8>, u: f32, v: f32, half_weight_gradient: f32) -> Look
     Look { shape: here.map(|grey| grey / mean), weight }
 }
 
-/// The bilinear sample at a position that is at least a pixel inside.
-fn sample(image: &Image<u8>, u: f32, v: f32) -> f32 {
+/// Pixels that pattern and differences reach to each side.
+const CENTRE: i32 = 3;
+/// As many and the middle.
+const SIDE: usize = 2 * CENTRE as usize + 1;
+
+/// The bilinear samples around a position that is so many pixels inside, a pixel apart.
+fn around(image: &Image<u8>, u: f32, v: f32) -> [[f32; SIDE]; SIDE] {
     let (column, row) = (u as usize, v as usize);
     let (du, dv) = (u - column as f32, v - row as f32);
-    let [upper, lower] = [row, row + 1].map(|row| {
-        let (left, right) =
-            (f32::from(image.at(column, row)), f32::from(image.at(column + 1, row)));
-        left + du * (right - left)
+    let (left, top) = (column - CENTRE as usize, row - CENTRE as usize);
+    let rows: [[f32; SIDE]; SIDE + 1] = std::array::from_fn(|k| {
+        let of = &image.row(top + k)[left..=left + SIDE];
+        std::array::from_fn(|x| {
+            let (left, right) = (f32::from(of[x]), f32::from(of[x + 1]));
+            left + du * (right - left)
+        })
     });
-    upper + dv * (lower - upper)
+    std::array::from_fn(|y| {
+        std::array::from_fn(|x| {
+            let (upper, lower) = (rows[y][x], rows[y + 1][x]);
+            upper + dv * (lower - upper)
+        })
+    })
 }

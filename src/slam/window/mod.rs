@@ -10,6 +10,7 @@ pub mod comparison;
 mod comparison_kernel;
 mod conclusion;
 pub mod confirmed;
+pub mod dense;
 mod elimination_kernel;
 mod feedback;
 pub mod frames;
@@ -87,6 +88,8 @@ pub struct Window {
     moved: Vec<u64>,
     frames: WindowFrames,
     is_last: bool,
+    /// Keyframes whose depth is still to be refined, once all else is done.
+    unrefined: Vec<u64>,
 }
 
 impl Window {
@@ -102,6 +105,7 @@ impl Window {
             moved: Vec::new(),
             frames: WindowFrames::default(),
             is_last: false,
+            unrefined: Vec::new(),
         }
     }
 
@@ -178,6 +182,11 @@ impl Window {
         self.is_last = true;
     }
 
+    /// After the last estimate: the keyframe whose depth is to be refined next, the newest first.
+    pub fn next_unrefined(&mut self) -> Option<u64> {
+        self.unrefined.pop()
+    }
+
     /// Estimates the newest keyframes and all points that they and older ones see; `None` where there is too little.
     pub fn optimise(&mut self) -> Option<Adjustment> {
         let mut is_new = false;
@@ -202,6 +211,7 @@ impl Window {
             adjustment = self.adjust_all(newest).or(adjustment);
             self.place_rest();
             self.leave(&[]);
+            self.unrefined = self.keyframes.iter().map(|keyframe| keyframe.keyframe_id).collect();
         }
         adjustment
     }
@@ -393,13 +403,20 @@ impl Window {
         })
     }
 
-    /// Lets points of hosts go that are too many to be estimated together: as many in all as a full window has.
+    /// Lets points of hosts go that are too many to be estimated together: as many in all as the first keyframes have.
     fn thin_out(&mut self, members: &[usize]) {
-        let WindowParams { points, max_points, num_free, num_fixed, .. } = self.params;
+        let WindowParams { points, max_points, num_first, .. } = self.params;
         let hosts = members.iter().filter(|&&member| self.keyframes[member].is_host).count();
-        let each = points * (num_free + num_fixed) / hosts.max(1);
+        let each = points * num_first / hosts.max(1);
         for &member in members {
             self.keyframes[member].points.truncate(each.clamp(points, max_points.max(points)));
+        }
+    }
+
+    fn robustness(&self) -> Robustness {
+        Robustness {
+            huber_grey: self.params.huber_grey,
+            most_energy: SAMPLES as f32 * self.params.truncation_grey.powi(2),
         }
     }
 
@@ -414,10 +431,7 @@ impl Window {
         for &index in members.members {
             self.keyframes[index].take_part(&self.camera);
         }
-        let robustness = Robustness {
-            huber_grey: self.params.huber_grey,
-            most_energy: SAMPLES as f32 * self.params.truncation_grey.powi(2),
-        };
+        let robustness = self.robustness();
         let finest = num_levels(&self.camera) - 1;
         levels.iter().filter(|&&level| level <= finest).all(|&level| {
             let at = Level { camera: &self.camera, level, robustness };
@@ -478,5 +492,7 @@ struct Chosen {
 
 #[cfg(test)]
 mod comparison_tests;
+#[cfg(test)]
+mod dense_tests;
 #[cfg(test)]
 mod tests;

@@ -16,7 +16,7 @@ pub struct WindowParams {
     pub num_first: usize,
     /// Points of a keyframe in a full window.
     pub points: usize,
-    /// The same while there are few keyframes: as many in all as in a full window.
+    /// The same while there are few keyframes: as many in all as `num_first` keyframes have.
     pub max_points: usize,
     /// Smallest gradient of a point, grey levels a pixel.
     pub min_gradient: f64,
@@ -62,7 +62,7 @@ impl Default for WindowParams {
             max_first_iterations: 40,
             frame_lag: 1,
             max_waiting_frames: 200,
-            converged_decrement: 0.1,
+            converged_decrement: 2.0,
             delay_frames: 3,
         }
     }

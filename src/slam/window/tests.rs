@@ -16,13 +16,13 @@ fn ray(u: f64, v: f64) -> [f32; 2] {
 
 /// Keyframes of a room with points, of which the first and those in `held` stay where they are.
 #[derive(Clone)]
-struct Room {
-    keyframes: Vec<WindowKeyframe>,
+pub(super) struct Room {
+    pub(super) keyframes: Vec<WindowKeyframe>,
     held: Vec<usize>,
 }
 
 /// Four views of the room with exact depth at every place with gradient, every keyframe a host.
-fn room(brightness: impl Fn(usize, f64) -> (f64, f64)) -> Room {
+pub(super) fn room(brightness: impl Fn(usize, f64) -> (f64, f64)) -> Room {
     let scene = Scene::new(3);
     let poses = [
         [0.0; 6],
