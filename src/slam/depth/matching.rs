@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::epipolar::{EpipolarLine, Projection, TwoView};
 use crate::slam::depth::gain::Uncertainty;
+use crate::slam::depth::line_search::{Along, MAX_STEPS};
 use crate::slam::depth::map::{BORDER_PX, GradientImage};
 use crate::slam::image::noise::ImageNoise;
 use crate::slam::image::quads_kernel::{Sampled, Sampler};
@@ -17,9 +18,6 @@ use crate::slam::parameter::{ParameterError, check_range};
 /// sample takes part in the central difference of another and noise does not bias the refinement.
 pub const PATTERN: [(i32, i32); 8] =
     [(0, -2), (-1, -1), (1, -1), (-2, 0), (0, 0), (2, 0), (-1, 1), (0, 2)];
-
-/// Most steps of one search: bounds the time a pixel can take.
-pub const MAX_STEPS: usize = 100;
 
 /// Tuning of the search.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -126,6 +124,16 @@ impl Patch {
             patch.gradient_v[k] = gain * image.gradient_v.pixels()[i];
         }
         patch
+    }
+
+    /// Gradient by sample along a step in the keyframe, grey levels a step.
+    #[inline(always)]
+    fn gradients_along(&self, (along_u, along_v): (f32, f32)) -> [f32; 8] {
+        let mut gradients = [0.0; 8];
+        for k in 0..PATTERN.len() {
+            gradients[k] = self.gradient_u[k] * along_u + self.gradient_v[k] * along_v;
+        }
+        gradients
     }
 }
 
@@ -305,37 +313,12 @@ pub fn search<S: Sampler>(
     ) {
         return Err(Miss::OutOfView);
     }
-    let along = Along::new(frame, patch, conditioning, middle);
+    let along = along(frame, patch, conditioning, middle);
     let steps =
         if length < MIN_SEARCH_PX { 0 } else { (length.ceil() as usize).min(MAX_STEPS - 1) };
-    let mut start = 0.0;
-    let mut second = f32::INFINITY;
-    // What the best place looks like is kept for the refinement.
-    let mut seen;
-    if steps == 0 {
-        seen = along.look(start);
-    } else {
-        let first = -0.5 * steps as f32;
-        seen = [0.0; 8];
-        let mut costs = [f32::INFINITY; MAX_STEPS];
-        let mut best = 0;
-        for step in 0..=steps {
-            let samples = along.look(first + step as f32);
-            costs[step] = along.compare(&samples).cost;
-            if costs[step] < costs[best] || step == 0 {
-                (best, seen) = (step, samples);
-            }
-        }
-        // Steps next to the minimum belong to it.
-        const SAME_MINIMUM_STEPS: usize = 2;
-        for (step, &cost) in costs[..=steps].iter().enumerate() {
-            if step.abs_diff(best) > SAME_MINIMUM_STEPS {
-                second = second.min(cost);
-            }
-        }
-        start = first + best as f32;
-    }
-    let (lambda, cost) = along.refine(start, &seen, REFINE_REACH_PX);
+    let best = if steps == 0 { along.only(0.0) } else { along.scan(-0.5 * steps as f32, steps) };
+    let gradients = patch.gradients_along(conditioning.along);
+    let (lambda, cost) = along.refine(&best, |_| gradients, REFINE_REACH_PX);
     let limit = params.max_residual * params.max_residual
         + params.residual_per_gradient
             * params.residual_per_gradient
@@ -346,7 +329,7 @@ pub fn search<S: Sampler>(
     }
     let pixel_std_dev = params.noise.pixel_std_dev;
     let noise_floor = 2.0 * pixel_std_dev * pixel_std_dev * PATTERN.len() as f32;
-    if second < params.min_ambiguity_ratio * cost.max(noise_floor) {
+    if best.second < params.min_ambiguity_ratio * cost.max(noise_floor) {
         return Err(Miss::Ambiguous);
     }
     let (u, v) = (middle.0 + lambda * du, middle.1 + lambda * dv);
@@ -362,108 +345,22 @@ pub fn search<S: Sampler>(
     })
 }
 
-/// The patch as a function of its place λ along the line, pixels from `middle`.
-struct Along<'a, S> {
-    frame: Sampled<'a, S>,
-    intensity: &'a [f32; 8],
-    direction: (f32, f32),
-    /// Position of each sample at λ = 0.
-    u: [f32; 8],
-    v: [f32; 8],
-    /// Gradient along the line by sample, grey levels a pixel of the frame.
-    line_gradients: [f32; 8],
-}
-
-/// The patch at one place.
-#[derive(Debug, Clone, Copy)]
-struct Evaluation {
-    /// Σ ρ(residual), ρ(r) = r² up to [`HUBER_GREY`], linear beyond.
-    cost: f32,
-    /// Half its derivative by λ.
-    gradient: f32,
-    /// Gauss–Newton's half second derivative.
-    information: f32,
-}
-
-/// Residuals beyond this many grey levels grow linearly (Engel, Koltun, Cremers 2018).
-const HUBER_GREY: f32 = 9.0;
-
-impl<'a, S: Sampler> Along<'a, S> {
-    #[inline(always)]
-    fn new(
-        frame: Sampled<'a, S>,
-        patch: &'a Patch,
-        conditioning: &Conditioning,
-        middle: (f32, f32),
-    ) -> Self {
-        let Conditioning { direction, along, warp, .. } = *conditioning;
-        let (mut u, mut v, mut line_gradients) = ([0.0; 8], [0.0; 8], [0.0; 8]);
-        for k in 0..PATTERN.len() {
-            let (x, y) = (PATTERN[k].0 as f32, PATTERN[k].1 as f32);
-            u[k] = middle.0 + (warp[0] * x + warp[1] * y);
-            v[k] = middle.1 + (warp[2] * x + warp[3] * y);
-            line_gradients[k] = patch.gradient_u[k] * along.0 + patch.gradient_v[k] * along.1;
-        }
-        Self { frame, intensity: &patch.intensity, direction, u, v, line_gradients }
-    }
-
-    /// The frame under the patch at `lambda`.
-    #[inline(always)]
-    fn look(&self, lambda: f32) -> [f32; 8] {
-        let (du, dv) = (lambda * self.direction.0, lambda * self.direction.1);
-        let Sampled { image, sampler } = self.frame;
-        sampler.sample(image, &self.u.map(|u| u + du), &self.v.map(|v| v + dv))
-    }
-
-    /// Compares what was seen there with the patch.
-    #[inline(always)]
-    fn compare(&self, samples: &[f32; 8]) -> Evaluation {
-        let line_gradients = &self.line_gradients;
-        let (mut costs, mut gradients, mut informations) = ([0.0; 8], [0.0; 8], [0.0; 8]);
-        for k in 0..PATTERN.len() {
-            let residual = samples[k] - self.intensity[k];
-            // 1 up to the bound, without a branch, so that the lanes go together.
-            let weight = HUBER_GREY / residual.abs().max(HUBER_GREY);
-            costs[k] = weight * (2.0 - weight) * residual * residual;
-            gradients[k] = weight * line_gradients[k] * residual;
-            informations[k] = weight * line_gradients[k] * line_gradients[k];
-        }
-        Evaluation { cost: sum(&costs), gradient: sum(&gradients), information: sum(&informations) }
-    }
-
-    /// Gauss–Newton along the line from `start`, where the frame was `seen`, each step clamped, undone when the cost rises: where it ends and
-    /// the cost there.
-    #[inline(always)]
-    fn refine(&self, start: f32, seen: &[f32; 8], reach: f32) -> (f32, f32) {
-        const MAX_ITERATIONS: usize = 4;
-        const MAX_STEP_PX: f32 = 0.75;
-        /// Keeps a patch without gradient from dividing by zero, grey levels².
-        const LEAST_INFORMATION: f32 = 1e-6;
-        /// Further steps change the depth less than the sampling noise does.
-        const CONVERGED_PX: f32 = 0.03;
-        let (mut lambda, mut at) = (start, self.compare(seen));
-        for _ in 0..MAX_ITERATIONS {
-            let step = -at.gradient / (at.information + LEAST_INFORMATION);
-            let next = (lambda + step.clamp(-MAX_STEP_PX, MAX_STEP_PX))
-                .clamp(start - reach, start + reach);
-            let moved = (next - lambda).abs();
-            let there = self.compare(&self.look(next));
-            if !(there.cost < at.cost) {
-                break;
-            }
-            (lambda, at) = (next, there);
-            if moved < CONVERGED_PX {
-                break;
-            }
-        }
-        (lambda, at.cost)
-    }
-}
-
-/// Sum in a fixed order that eight lanes can do.
+/// The patch of a keyframe pixel in a frame, from `middle` along its line.
 #[inline(always)]
-pub(super) fn sum(x: &[f32; 8]) -> f32 {
-    ((x[0] + x[4]) + (x[2] + x[6])) + ((x[1] + x[5]) + (x[3] + x[7]))
+fn along<'a, S: Sampler>(
+    frame: Sampled<'a, S>,
+    patch: &'a Patch,
+    conditioning: &Conditioning,
+    middle: (f32, f32),
+) -> Along<'a, S> {
+    let Conditioning { direction, warp, .. } = *conditioning;
+    let (mut u, mut v) = ([0.0; 8], [0.0; 8]);
+    for k in 0..PATTERN.len() {
+        let (x, y) = (PATTERN[k].0 as f32, PATTERN[k].1 as f32);
+        u[k] = middle.0 + (warp[0] * x + warp[1] * y);
+        v[k] = middle.1 + (warp[2] * x + warp[3] * y);
+    }
+    Along { frame, intensity: &patch.intensity, direction, u, v }
 }
 
 /// How far inside the frame a patch must be: it reaches 2 px, stretched by at most √3 (see

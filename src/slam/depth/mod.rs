@@ -14,6 +14,7 @@ pub mod gaussian;
 pub mod immature;
 pub mod interval;
 pub mod line_noise;
+pub mod line_search;
 pub mod map;
 pub mod matching;
 mod neighbour_sums;

@@ -1,0 +1,164 @@
+//! The search for a patch along a line of a frame: 1-px steps, then Gauss–Newton. Both filters search this way.
+
+use crate::slam::depth::matching::PATTERN;
+use crate::slam::image::quads_kernel::{Sampled, Sampler};
+
+/// Most places of one search: bounds the time a pixel can take.
+pub const MAX_STEPS: usize = 100;
+
+/// Residuals beyond this many grey levels grow linearly (Engel, Koltun, Cremers 2018).
+const HUBER_GREY: f32 = 9.0;
+
+/// The patch as a function of its place λ along the line, pixels from where λ is 0.
+pub(super) struct Along<'a, S> {
+    pub(super) frame: Sampled<'a, S>,
+    /// Brightness of the patch as the frame would show it.
+    pub(super) intensity: &'a [f32; 8],
+    /// Unit vector towards larger inverse depth.
+    pub(super) direction: (f32, f32),
+    /// Position of each sample at λ = 0.
+    pub(super) u: [f32; 8],
+    pub(super) v: [f32; 8],
+}
+
+/// The best of some places.
+pub(super) struct Best {
+    pub(super) lambda: f32,
+    /// What the frame looks like there: kept for the refinement.
+    pub(super) seen: [f32; 8],
+    /// Σ ρ(residual) there, ρ(r) = r² up to [`HUBER_GREY`], linear beyond.
+    pub(super) cost: f32,
+    /// The least that does not belong to the same minimum.
+    pub(super) second: f32,
+}
+
+/// The slope of the cost at one place.
+struct Slope {
+    /// Half its derivative by λ.
+    gradient: f32,
+    /// Gauss–Newton's half second derivative.
+    information: f32,
+}
+
+impl<S: Sampler> Along<'_, S> {
+    /// The place λ alone.
+    #[inline(always)]
+    pub(super) fn only(&self, lambda: f32) -> Best {
+        let seen = self.look(lambda);
+        Best { lambda, seen, cost: self.cost(&seen), second: f32::INFINITY }
+    }
+
+    /// The best of `first` and of `steps` places after it, a pixel apart; at most [`MAX_STEPS`] in all.
+    #[inline(always)]
+    pub(super) fn scan(&self, first: f32, steps: usize) -> Best {
+        /// Steps this near to the minimum belong to it.
+        const SAME_MINIMUM_STEPS: usize = 2;
+        let mut seen = [0.0; 8];
+        let mut costs = [f32::INFINITY; MAX_STEPS];
+        let mut best = 0;
+        for step in 0..=steps {
+            let samples = self.look(first + step as f32);
+            costs[step] = self.cost(&samples);
+            if costs[step] < costs[best] || step == 0 {
+                (best, seen) = (step, samples);
+            }
+        }
+        let mut second = f32::INFINITY;
+        for (step, &cost) in costs[..=steps].iter().enumerate() {
+            if step.abs_diff(best) > SAME_MINIMUM_STEPS {
+                second = second.min(cost);
+            }
+        }
+        Best { lambda: first + best as f32, seen, cost: costs[best], second }
+    }
+
+    /// Gauss–Newton along the line from `best`, each step clamped, undone when the cost rises: where it ends and the cost
+    /// there. `gradients_at` gives the gradients along the line by sample, grey levels a pixel.
+    #[inline(always)]
+    pub(super) fn refine(
+        &self,
+        best: &Best,
+        gradients_at: impl Fn(f32) -> [f32; 8],
+        reach: f32,
+    ) -> (f32, f32) {
+        const MAX_ITERATIONS: usize = 4;
+        const MAX_STEP_PX: f32 = 0.75;
+        /// Keeps a patch without gradient from dividing by zero, grey levels².
+        const LEAST_INFORMATION: f32 = 1e-6;
+        /// Further steps change the depth less than the sampling noise does.
+        const CONVERGED_PX: f32 = 0.03;
+        let start = best.lambda;
+        let (mut lambda, mut cost, mut seen) = (start, best.cost, best.seen);
+        for _ in 0..MAX_ITERATIONS {
+            let at = self.slope(&seen, &gradients_at(lambda));
+            let step = -at.gradient / (at.information + LEAST_INFORMATION);
+            let next = (lambda + step.clamp(-MAX_STEP_PX, MAX_STEP_PX))
+                .clamp(start - reach, start + reach);
+            let moved = (next - lambda).abs();
+            let there = self.look(next);
+            let cost_there = self.cost(&there);
+            if !(cost_there < cost) {
+                break;
+            }
+            (lambda, cost, seen) = (next, cost_there, there);
+            if moved < CONVERGED_PX {
+                break;
+            }
+        }
+        (lambda, cost)
+    }
+
+    /// Gradients of the frame along the line under the patch, grey levels a pixel.
+    #[inline(always)]
+    pub(super) fn gradients(&self, lambda: f32) -> [f32; 8] {
+        let (ahead, behind) = (self.look(lambda + 1.0), self.look(lambda - 1.0));
+        let mut gradients = [0.0; 8];
+        for k in 0..PATTERN.len() {
+            gradients[k] = 0.5 * (ahead[k] - behind[k]);
+        }
+        gradients
+    }
+
+    /// The frame under the patch.
+    #[inline(always)]
+    fn look(&self, lambda: f32) -> [f32; 8] {
+        let (du, dv) = (lambda * self.direction.0, lambda * self.direction.1);
+        let Sampled { image, sampler } = self.frame;
+        sampler.sample(image, &self.u.map(|u| u + du), &self.v.map(|v| v + dv))
+    }
+
+    #[inline(always)]
+    fn cost(&self, samples: &[f32; 8]) -> f32 {
+        let mut costs = [0.0; 8];
+        for k in 0..PATTERN.len() {
+            let residual = samples[k] - self.intensity[k];
+            let weight = weight(residual);
+            costs[k] = weight * (2.0 - weight) * residual * residual;
+        }
+        sum(&costs)
+    }
+
+    #[inline(always)]
+    fn slope(&self, samples: &[f32; 8], line_gradients: &[f32; 8]) -> Slope {
+        let (mut gradients, mut informations) = ([0.0; 8], [0.0; 8]);
+        for k in 0..PATTERN.len() {
+            let residual = samples[k] - self.intensity[k];
+            let weight = weight(residual);
+            gradients[k] = weight * line_gradients[k] * residual;
+            informations[k] = weight * line_gradients[k] * line_gradients[k];
+        }
+        Slope { gradient: sum(&gradients), information: sum(&informations) }
+    }
+}
+
+/// Huber's: 1 up to the bound, without a branch, so that the lanes go together.
+#[inline(always)]
+fn weight(residual: f32) -> f32 {
+    HUBER_GREY / residual.abs().max(HUBER_GREY)
+}
+
+/// Sum in a fixed order that eight lanes can do.
+#[inline(always)]
+pub(super) fn sum(x: &[f32; 8]) -> f32 {
+    ((x[0] + x[4]) + (x[2] + x[6])) + ((x[1] + x[5]) + (x[3] + x[7]))
+}
