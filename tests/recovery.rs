@@ -346,7 +346,7 @@ fn a_map_whose_poses_are_wrong_is_rejected() {
 #[test]
 fn a_start_with_the_wrong_motion_is_rejected_and_another_begun() {
     /// A plane seen from two places has two explanations, and here the wrong one fits better.
-    const FIRST: usize = 5;
+    const FIRST: usize = 3;
     let Some(folder) = recording("fr1-floor") else { return };
     let mut source = open(&SourceName::Tum(folder), None, &SourceParams::default()).unwrap();
     let floor = film(source.as_mut());
