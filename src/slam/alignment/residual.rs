@@ -39,10 +39,6 @@ pub(crate) const NEAREST_DEPTH_RATIO: f32 = 0.1;
 /// the gradient must stay finite.
 pub(crate) const SMALLEST_DETERMINANT: f32 = 0.1;
 
-/// Grey levels between which the frame shows how bright a point is. At the ends of the sensor's range, to rounding, it
-/// is at least as bright or as dark.
-pub(crate) const UNSATURATED: [f32; 2] = [0.5, 254.5];
-
 /// How residuals are weighted.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Weighting {
@@ -173,14 +169,10 @@ pub fn point_terms(image: &Image<u16>, at: &Evaluation, point: &Point) -> Option
     let weighing_derivative = (ax * vx + ay * vy - m * vz) * inverse_ratio;
     let from_depth = weighing_derivative * weighing_derivative * point.variance;
     let scale = d * inverse_ratio;
-    let residual = value - (predicted + at.offset);
-    let is_clipped =
-        (value > UNSATURATED[1] && residual < 0.0) || (value < UNSATURATED[0] && residual > 0.0);
-    let variance = at.intensity_variance + at.depth_variance_factor * from_depth;
     Some(PointTerms {
         projection: [u, v],
-        residual: if is_clipped { 0.0 } else { residual },
-        variance: if is_clipped { f32::INFINITY } else { variance },
+        residual: value - (predicted + at.offset),
+        variance: at.intensity_variance + at.depth_variance_factor * from_depth,
         inverse_depth_derivative,
         jacobian: [
             scale * ax,

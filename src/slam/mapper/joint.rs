@@ -44,7 +44,10 @@ impl Mapper {
         let correction = window.correction(&self.map);
         if !correction.keyframes.is_empty() {
             // Its numbers are checked: one that is broken leaves the map as it is.
-            outcome = self.apply(&correction).unwrap_or(outcome);
+            match self.apply(&correction) {
+                Ok(applied) => outcome = applied,
+                Err(_) => window.leave_unrefined(),
+            }
         }
         for placed in window.take_placed() {
             self.map.place_frame(&placed);
@@ -68,7 +71,8 @@ impl Mapper {
     pub fn refine_depth(&mut self) -> bool {
         let Some(window) = &mut self.window else { return false };
         let Some(keyframe_id) = window.next_unrefined() else { return false };
-        let refined = self.map.get(keyframe_id).and_then(|keyframe| window.refined(keyframe));
+        let keyframe = self.map.get(keyframe_id).filter(|keyframe| keyframe.has_depth());
+        let refined = keyframe.and_then(|keyframe| window.refined(keyframe));
         if let Some(refined) = refined {
             self.revision += 1;
             self.map.refine(refined, self.revision);
@@ -141,6 +145,7 @@ impl Mapper {
     pub fn drop_adjustment(&mut self, mut window: Box<Window>) {
         // They keep the poses that the tracker gave them.
         drop(window.take_placed());
+        window.leave_unrefined();
         self.window = Some(window);
     }
 }

@@ -5,6 +5,8 @@
 //! fused with what the filter had. The filter's value is where the descent begins and no prior of it: its errors are
 //! those of its poses, common to all pixels.
 
+use std::collections::HashSet;
+
 use rayon::prelude::*;
 
 use crate::slam::alignment::kernel::{Kernel, SimdMode};
@@ -49,6 +51,22 @@ pub struct RefinedDepth {
     pub points: Vec<DepthPoint>,
 }
 
+/// Whose depth is refined, once all else is done.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Refinement {
+    waiting: Vec<u64>,
+    /// Once only: what was fused is not the filter's any more.
+    done: HashSet<u64>,
+}
+
+impl Refinement {
+    /// All that are not yet.
+    pub fn begin(&mut self, keyframes: &[WindowKeyframe]) {
+        let ids = keyframes.iter().map(|keyframe| keyframe.keyframe_id);
+        self.waiting = ids.filter(|id| !self.done.contains(id)).collect();
+    }
+}
+
 /// What is known of a point.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct State {
@@ -74,6 +92,18 @@ struct Observers<'a> {
 }
 
 impl Window {
+    /// After the last estimate: the keyframe whose depth is to be refined next, the newest first.
+    pub fn next_unrefined(&mut self) -> Option<u64> {
+        let next = self.refinement.waiting.pop()?;
+        self.refinement.done.insert(next);
+        Some(next)
+    }
+
+    /// The estimate was not taken: depth is not refined from it.
+    pub fn leave_unrefined(&mut self) {
+        self.refinement.waiting.clear();
+    }
+
     /// Depth of a keyframe of the map, from those that see most of it; `None` where none does.
     pub fn refined(&self, keyframe: &Keyframe) -> Option<RefinedDepth> {
         let index = self.index_of(keyframe.keyframe_id)?;
@@ -245,7 +275,7 @@ impl State {
     /// Where the linear model has its minimum.
     fn stepped(&self) -> f32 {
         let Self { inverse_depth, hessian, right, .. } = *self;
-        if !(hessian > 0.0) {
+        if !(hessian > 0.0 && inverse_depth > 0.0) {
             return inverse_depth;
         }
         let stepped = inverse_depth - right / hessian;

@@ -30,6 +30,7 @@ use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
 use crate::slam::map::Map;
 use crate::slam::window::comparison::{Robustness, SAMPLES};
+use crate::slam::window::dense::Refinement;
 use crate::slam::window::frames::WindowFrames;
 use crate::slam::window::keyframe::{WindowKeyframe, WindowPoint, num_levels};
 use crate::slam::window::params::WindowParams;
@@ -88,8 +89,7 @@ pub struct Window {
     moved: Vec<u64>,
     frames: WindowFrames,
     is_last: bool,
-    /// Keyframes whose depth is still to be refined, once all else is done.
-    unrefined: Vec<u64>,
+    refinement: Refinement,
 }
 
 impl Window {
@@ -105,7 +105,7 @@ impl Window {
             moved: Vec::new(),
             frames: WindowFrames::default(),
             is_last: false,
-            unrefined: Vec::new(),
+            refinement: Refinement::default(),
         }
     }
 
@@ -182,11 +182,6 @@ impl Window {
         self.is_last = true;
     }
 
-    /// After the last estimate: the keyframe whose depth is to be refined next, the newest first.
-    pub fn next_unrefined(&mut self) -> Option<u64> {
-        self.unrefined.pop()
-    }
-
     /// Estimates the newest keyframes and all points that they and older ones see; `None` where there is too little.
     pub fn optimise(&mut self) -> Option<Adjustment> {
         let mut is_new = false;
@@ -211,7 +206,7 @@ impl Window {
             adjustment = self.adjust_all(newest).or(adjustment);
             self.place_rest();
             self.leave(&[]);
-            self.unrefined = self.keyframes.iter().map(|keyframe| keyframe.keyframe_id).collect();
+            self.refinement.begin(&self.keyframes);
         }
         adjustment
     }

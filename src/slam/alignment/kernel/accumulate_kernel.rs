@@ -8,7 +8,7 @@ use crate::slam::alignment::kernel::lanes_kernel::Lanes;
 use crate::slam::alignment::normal_equations::{NormalEquations, UNKNOWNS};
 use crate::slam::alignment::points::{LANES, LevelPoints, PointBlock};
 use crate::slam::alignment::residual::{
-    BORDER_PX, Evaluation, NEAREST_DEPTH_RATIO, SMALLEST_DETERMINANT, UNSATURATED,
+    BORDER_PX, Evaluation, NEAREST_DEPTH_RATIO, SMALLEST_DETERMINANT,
 };
 use crate::slam::image::buffer::Image;
 
@@ -131,11 +131,6 @@ pub unsafe fn whiten<L: Lanes>(
         let value = below.sub(above).mul_add(pixels.dv, above).mul(constant(at.grey_per_sum));
         let predicted = load(&block.intensity).mul(constant(at.gain));
         let residual = value.sub(predicted.add(constant(at.offset)));
-        // At the end of the sensor's range it is at least as far as predicted.
-        let [darkest, lightest] = UNSATURATED.map(constant);
-        let is_white = L::both(value.greater(lightest), zero.greater(residual));
-        let is_black = L::both(darkest.greater(value), residual.greater(zero));
-        let residual = L::select(is_black, zero, L::select(is_white, zero, residual));
 
         let d = load(&block.surrounding_inverse_depth);
         let depth_ratio = r6.mul_add(x, r7.mul_add(y, tz.mul_add(d, r8)));
@@ -160,7 +155,6 @@ pub unsafe fn whiten<L: Lanes>(
             from_depth.mul_add(constant(at.depth_variance_factor), constant(at.intensity_variance));
         let squared = residual.mul(residual);
         let information = one.div(variance);
-        let information = L::select(is_black, zero, L::select(is_white, zero, information));
         let normalized = squared.mul(information);
         let huber = L::min(constant(at.huber).div(normalized.sqrt()), one);
         let weight = L::select(in_view, huber.mul(information), zero);
