@@ -2,8 +2,8 @@
 //!
 //! The filter saw each pixel in frames near its keyframe, at the poses that the tracker had then. Keyframes are farther
 //! away and known better: each inverse depth goes to where they agree best (Gauss–Newton, coarse to fine), and that is
-//! fused with what the filter had. The filter's value is where the descent begins and no prior of it: its errors are
-//! those of its poses, common to all pixels.
+//! fused with what the filter had. In the descent the filter's value is the beginning and no prior: its errors are those
+//! of its poses, common to all pixels.
 
 use std::collections::HashSet;
 
@@ -12,6 +12,7 @@ use rayon::prelude::*;
 use crate::slam::alignment::kernel::{Kernel, SimdMode};
 use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::{DepthPoint, Keyframe};
+use crate::slam::map::LogPlane;
 use crate::slam::window::Window;
 use crate::slam::window::comparison::{
     Compared, LANES, Pair, PairSums, Patterns, Robustness, SAMPLES, Wanted,
@@ -174,11 +175,11 @@ impl Window {
     /// The keyframe's points, inverse depth in one over the unit of the map, moved to where its chosen points are.
     fn placed_points(&self, host: &WindowKeyframe, keyframe: &Keyframe) -> Vec<DepthPoint> {
         let [offset, per_x, per_y] = fit(&self.of_own_points(host, keyframe)).unwrap_or_default();
+        let plane = LogPlane { offset, per_x, per_y };
+        let unit = keyframe.map_from_keyframe.scale;
         let place = |point: &DepthPoint| {
-            let x = (f64::from(point.u) - self.camera.cx) / self.camera.fx;
-            let y = (f64::from(point.v) - self.camera.cy) / self.camera.fy;
-            let unit = keyframe.map_from_keyframe.scale;
-            let factor = ((offset + per_x * x + per_y * y).exp() / unit) as f32;
+            let (u, v) = (f64::from(point.u), f64::from(point.v));
+            let factor = (plane.factor(&self.camera, u, v) / unit) as f32;
             let (inverse_depth, variance) =
                 (point.inverse_depth * factor, point.variance * factor * factor);
             DepthPoint { inverse_depth, variance, ..*point }
