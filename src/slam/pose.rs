@@ -68,18 +68,19 @@ pub struct Brightness {
 pub struct Quality {
     /// Share of the keyframe's points that fall inside the frame, 0 to 1.
     pub in_view_ratio: f64,
-    /// Share of the points in view whose residual is explained by noise and depth variance, 0 to 1.
+    /// Share of the points compared (in view and not clipped by the sensor) whose residual is explained by noise and
+    /// depth variance, 0 to 1.
     pub inlier_ratio: f64,
     /// Root mean square of residual over its standard deviation, Huber-weighted; 1 when all is as modelled.
     pub whitened_rmse: f64,
-    /// Root mean square residual of the points in view, grey levels.
+    /// Root mean square residual of the points compared, grey levels.
     pub residual_rmse: f64,
     /// Iterations, all levels.
     pub iterations: u32,
     /// Finest pyramid level that was solved: a coarser one than usual where the frame was cut short
     /// by its deadline, the number of all levels where none was.
     pub finest_level: u32,
-    /// Points in view.
+    /// Points compared.
     pub points: u32,
     /// Mean squared optical flow from the keyframe to here, pixels² at level 0.
     pub mean_squared_flow: f64,

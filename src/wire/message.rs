@@ -100,7 +100,7 @@ pub struct PoseMessage {
     pub brightness: [f64; 2],
     /// Share of the keyframe's points in view.
     pub in_view_ratio: f64,
-    /// Share of these that are explained.
+    /// Share of those compared that are explained.
     pub inlier_ratio: f64,
     /// Residual over its standard deviation.
     pub whitened_rmse: f64,
@@ -114,7 +114,7 @@ pub struct PoseMessage {
     pub iterations: u32,
     /// Finest level that was solved; the number of all levels where none was.
     pub finest_level: u32,
-    /// Points in view.
+    /// Points compared: in view and not clipped by the sensor.
     pub points: u32,
     /// Zero.
     pub reserved: u32,

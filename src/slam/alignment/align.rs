@@ -42,7 +42,7 @@ pub struct AlignmentParams {
     pub step_tolerance: f64,
     /// A level is done when a step keeps more than this share of the mean energy.
     pub energy_tolerance: f64,
-    /// Smallest share of the level's points that must be in view.
+    /// Smallest share of the level's points that must be in view and not clipped by the sensor.
     pub min_in_view: f64,
     /// Which instructions are used.
     pub simd: SimdMode,
@@ -340,7 +340,7 @@ impl Aligner {
             self.evaluate(reference, frame, level, &current_from_keyframe, brightness, &held);
         let points = reference.level(level).len();
         let min_in_view = self.params.min_in_view * points as f64;
-        if f64::from(state.sums.in_view) < min_in_view.max(UNKNOWNS as f64) {
+        if f64::from(state.sums.compared) < min_in_view.max(UNKNOWNS as f64) {
             return true;
         }
         let intrinsics = reference.intrinsics().at_level(level);
@@ -369,11 +369,11 @@ impl Aligner {
                 Brightness { a: state.brightness.a + step[6], b: state.brightness.b + step[7] },
                 &held,
             );
-            let in_view = f64::from(candidate.sums.in_view);
-            let keeps_view = in_view >= MIN_KEPT_IN_VIEW * f64::from(state.sums.in_view);
+            let compared = f64::from(candidate.sums.compared);
+            let keeps_view = compared >= MIN_KEPT_IN_VIEW * f64::from(state.sums.compared);
             let ratio = candidate.sums.mean_energy() / state.sums.mean_energy();
             let is_small = state.sums.decrement(&step) < self.params.step_tolerance;
-            if keeps_view && in_view >= min_in_view && ratio < TOLERATED_RISE {
+            if keeps_view && compared >= min_in_view && ratio < TOLERATED_RISE {
                 state = candidate;
                 lambda = if lambda <= FIRST_DAMPING { 0.0 } else { 0.5 * lambda };
                 failures = 0;
@@ -446,8 +446,8 @@ const FLAT_STEP_PX: f64 = 0.1;
 /// Failures in a row after which a level is given up as converged: λ has grown by 2¹⁵ then.
 const MAX_FAILURES: u32 = 5;
 
-/// A step that pushes more than half of the points out of the image is a step into the dark, also
-/// when the rest fits better.
+/// A step that pushes more than half of the points out of the image, or beyond the range of the sensor, is a step
+/// into the dark, also when the rest fits better.
 const MIN_KEPT_IN_VIEW: f64 = 0.5;
 
 /// λ and the number of failures in a row after one more.

@@ -21,7 +21,9 @@ pub struct NormalEquations {
     pub squared_residual: f64,
     /// Points that fall inside the image.
     pub in_view: u32,
-    /// Points in view with |r| below the inlier gate.
+    /// Points in view that the sensor does not clip; all other sums are over these.
+    pub compared: u32,
+    /// Points compared with |r| below the inlier gate.
     pub inliers: u32,
 }
 
@@ -33,15 +35,16 @@ impl Default for NormalEquations {
             energy: 0.0,
             squared_residual: 0.0,
             in_view: 0,
+            compared: 0,
             inliers: 0,
         }
     }
 }
 
 impl NormalEquations {
-    /// Mean energy of the points in view; infinite without any.
+    /// Mean energy of the points compared; infinite without any.
     pub fn mean_energy(&self) -> f64 {
-        if self.in_view == 0 { f64::INFINITY } else { self.energy / f64::from(self.in_view) }
+        if self.compared == 0 { f64::INFINITY } else { self.energy / f64::from(self.compared) }
     }
 
     /// Adds a prior N(mean, 1/information) on unknown `index`, whose value is now `value`.

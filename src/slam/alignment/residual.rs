@@ -39,6 +39,10 @@ pub(crate) const NEAREST_DEPTH_RATIO: f32 = 0.1;
 /// the gradient must stay finite.
 pub(crate) const SMALLEST_DETERMINANT: f32 = 0.1;
 
+/// Grey levels between which the frame shows how bright a point is. At the ends of the sensor's range, to rounding, it
+/// is at least as bright or as dark.
+pub(crate) const UNCLIPPED_GREY: [f32; 2] = [0.5, 254.5];
+
 /// How residuals are weighted.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Weighting {
@@ -111,6 +115,8 @@ pub struct PointTerms {
     pub projection: [f32; 2],
     /// r, grey levels.
     pub residual: f32,
+    /// Whether the sensor clipped what is predicted to lie beyond its range: then r says nothing.
+    pub is_clipped: bool,
     /// σ_r², grey levels².
     pub variance: f32,
     /// ∂r/∂d, grey levels · keyframe units.
@@ -169,9 +175,12 @@ pub fn point_terms(image: &Image<u16>, at: &Evaluation, point: &Point) -> Option
     let weighing_derivative = (ax * vx + ay * vy - m * vz) * inverse_ratio;
     let from_depth = weighing_derivative * weighing_derivative * point.variance;
     let scale = d * inverse_ratio;
+    let residual = value - (predicted + at.offset);
+    let [darkest, lightest] = UNCLIPPED_GREY;
     Some(PointTerms {
         projection: [u, v],
-        residual: value - (predicted + at.offset),
+        residual,
+        is_clipped: (value > lightest && residual < 0.0) || (value < darkest && residual > 0.0),
         variance: at.intensity_variance + at.depth_variance_factor * from_depth,
         inverse_depth_derivative,
         jacobian: [
@@ -196,13 +205,17 @@ pub fn accumulate_reference(
     let mut sums = NormalEquations::default();
     for point in points.iter() {
         let Some(terms) = point_terms(image, at, &point) else { continue };
+        sums.in_view += 1;
+        if terms.is_clipped {
+            continue;
+        }
         let squared = terms.residual * terms.residual;
         let normalized = squared / terms.variance;
         let huber_weight = (at.huber / normalized.sqrt()).min(1.0);
         let weight = f64::from(huber_weight / terms.variance);
         sums.energy += f64::from(huber_weight * (2.0 - huber_weight) * normalized);
         sums.squared_residual += f64::from(squared);
-        sums.in_view += 1;
+        sums.compared += 1;
         sums.inliers += u32::from(normalized < at.inlier_gate_squared);
         let residual = f64::from(terms.residual);
         let jacobian = terms.jacobian.map(f64::from);

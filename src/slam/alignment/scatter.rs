@@ -105,7 +105,8 @@ impl GradientScatter {
     pub fn reference(points: &LevelPoints, image: &Image<u16>, at: &Evaluation) -> Self {
         let mut sums = ScatterSums::default();
         for point in points.iter() {
-            let Some(terms) = point_terms(image, at, &point) else { continue };
+            let terms = point_terms(image, at, &point).filter(|terms| !terms.is_clipped);
+            let Some(terms) = terms else { continue };
             let normalized = terms.residual * terms.residual / terms.variance;
             let huber = (at.huber / normalized.sqrt()).min(1.0);
             let weight = huber / terms.variance;

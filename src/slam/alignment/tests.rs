@@ -189,9 +189,62 @@ fn every_kernel_equals_the_reference() {
             ));
             // A point on the very border, or on the gate, may fall to either side by rounding.
             assert!(sums.in_view.abs_diff(expected.in_view) <= 2);
+            assert!(sums.compared.abs_diff(expected.compared) <= 2);
             assert!(sums.inliers.abs_diff(expected.inliers) <= 4);
         }
     }
+}
+
+#[test]
+fn pixels_that_the_sensor_clips_are_not_compared() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let reference = Reference::prepare(&plane.keyframe(&camera, 1, 0.01));
+    let points = reference.level(LEVEL);
+    let pose = move_of(9, 0.02);
+    // A third of the pixels is white in the one frame, black in the other; all is as predicted.
+    for (gain, offset) in [(1.6f64, 0.0), (1.6, -160.0)] {
+        let frame = plane.render(&camera, &pose, 1.0, (gain, offset), 8);
+        let clipped = frame.iter().filter(|grey| [0, 255].contains(*grey)).count();
+        assert!((frame.len() / 10..frame.len() / 2).contains(&clipped), "{clipped}");
+        let pyramid = pyramid(&frame);
+        let image = pyramid.level(LEVEL);
+        let at = evaluation(&pose.inverse(), Brightness { a: gain.ln(), b: offset });
+        let expected = accumulate_reference(points, image, &at);
+        let share = f64::from(expected.compared) / f64::from(expected.in_view);
+        assert!((0.5..0.95).contains(&share), "{share}");
+        let scattered = GradientScatter::reference(points, image, &at);
+        for kernel in Kernel::available() {
+            let sums = kernel.accumulate(points, image, &at);
+            assert!(sums.in_view.abs_diff(expected.in_view) <= 2);
+            assert!(sums.compared.abs_diff(expected.compared) <= 4, "{kernel:?} {sums:?}");
+            assert!(sums.inliers.abs_diff(expected.inliers) <= 4, "{kernel:?} {sums:?}");
+            assert!((sums.energy / expected.energy - 1.0).abs() < 2e-3);
+            let trace = expected.information.trace();
+            assert!((sums.information.trace() / trace - 1.0).abs() < 2e-3);
+            let outer = kernel.scatter(points, image, &at).outer;
+            assert!((outer.trace() / scattered.outer.trace() - 1.0).abs() < 0.02);
+            // What is left is as predicted, but for mixed pixels at the border of what is clipped.
+            assert!(f64::from(sums.inliers) > 0.95 * f64::from(sums.compared), "{sums:?}");
+        }
+    }
+}
+
+#[test]
+fn a_frame_that_is_overexposed_is_aligned_by_what_is_left() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let keyframe = plane.keyframe(&camera, 1, 0.01);
+    let reference = Reference::prepare(&keyframe);
+    let aligner = Aligner::new(AlignmentParams::default());
+    let truth = move_of(2, 0.05);
+    let frame = plane.render(&camera, &truth.inverse(), 1.0, (1.6, 0.0), 4);
+    let (start, even) = (SE3::identity(), Brightness::default());
+    let found = aligner.align(&reference, &pyramid(&frame), &start, even, &mut |_| true).state;
+    let gain = found.brightness.a.exp();
+    let error = (found.current_from_keyframe * truth.inverse()).log().norm();
+    // A third of the frame is white. Compared like the rest, that makes the gain 1.43; pixels at its border, white in
+    // part, leave 1.53.
+    assert!((gain - 1.6).abs() < 0.1, "{gain}");
+    assert!(error < 2e-3, "{error}");
 }
 
 #[test]

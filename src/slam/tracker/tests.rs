@@ -97,6 +97,31 @@ fn hostile_frames_neither_panic_nor_claim_a_pose() {
 }
 
 #[test]
+fn a_bright_or_dark_scene_does_not_make_white_or_black_frames_fit() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let exact = plane.keyframe(&camera, 2, 0.02);
+    let size = camera.width * camera.height;
+    // Near an end of the sensor's range a little gain and offset push every point beyond it.
+    for (from, to) in [(150.0f32, 250.0), (5.0, 60.0), (100.0, 254.0)] {
+        let mut keyframe = exact.clone();
+        let [low, high] = [keyframe.image.iter().min(), keyframe.image.iter().max()]
+            .map(|grey| f32::from(*grey.unwrap()));
+        let stretched = |grey: f32| from + (grey - low) / (high - low) * (to - from);
+        keyframe.image.iter_mut().for_each(|grey| *grey = stretched(f32::from(*grey)) as u8);
+        keyframe.points.iter_mut().for_each(|point| point.intensity = stretched(point.intensity));
+        for grey in [0, 1, 254, 255] {
+            let mut tracker = tracker_on(&keyframe);
+            for sequence in 0..5 {
+                let estimate = tracker.track(&frame(sequence, &vec![grey; size]), &mut always);
+                assert!(matches!(estimate.state, TrackingState::Lost(_)), "{grey}: {estimate:?}");
+            }
+            let estimate = tracker.track(&frame(9, &keyframe.image), &mut always);
+            assert!(estimate.state.is_tracked(), "{estimate:?}");
+        }
+    }
+}
+
+#[test]
 fn hostile_keyframes_neither_panic_nor_claim_a_pose() {
     let (plane, camera) = (small_plane(), small_camera());
     let good = plane.keyframe(&camera, 2, 0.02);

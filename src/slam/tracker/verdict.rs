@@ -11,11 +11,11 @@ use crate::slam::pose::{DegradedReason, LostReason, Quality, TrackingState};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct VerdictParams {
-    /// Fewest points in view, at the level solved: eight unknowns need many times as many.
+    /// Fewest points in view and not clipped by the sensor, at the level solved: eight unknowns need many times as many.
     pub min_points: u32,
-    /// Share of points in view below which a frame is lost.
+    /// Share of points in view and not clipped by the sensor below which a frame is lost.
     pub lost_in_view: f64,
-    /// Share of inliers among the points in view below which a frame is lost.
+    /// Share of inliers among those below which a frame is lost.
     pub lost_inliers: f64,
     /// What `lost_inliers` rises by until a lost tracker may claim a pose again: a wrong pose
     /// must not pass by chance.
@@ -79,7 +79,7 @@ impl VerdictParams {
             TrackingState::Lost(LostReason::NoPoints)
         } else if alignment.ending == Ending::NothingInView
             || quality.points < self.min_points
-            || quality.in_view_ratio < self.lost_in_view
+            || f64::from(quality.points) < self.lost_in_view * alignment.points as f64
             || (was_lost && !self.is_near(alignment))
         {
             TrackingState::Lost(LostReason::Diverged)
@@ -109,18 +109,18 @@ impl VerdictParams {
 /// The figures of an alignment.
 pub fn quality_of(alignment: &Alignment) -> Quality {
     let sums = &alignment.state.sums;
-    let in_view = f64::from(sums.in_view).max(1.0);
+    let compared = f64::from(sums.compared).max(1.0);
     // One that was cut short stands on the finest level, but was solved on coarser ones at most.
     let iterations = &alignment.iterations;
     let solved = iterations.iter().position(|&taken| taken > 0).unwrap_or(iterations.len());
     Quality {
         in_view_ratio: f64::from(sums.in_view) / alignment.points.max(1) as f64,
-        inlier_ratio: f64::from(sums.inliers) / in_view,
-        whitened_rmse: (sums.energy / in_view).sqrt(),
-        residual_rmse: (sums.squared_residual / in_view).sqrt(),
+        inlier_ratio: f64::from(sums.inliers) / compared,
+        whitened_rmse: (sums.energy / compared).sqrt(),
+        residual_rmse: (sums.squared_residual / compared).sqrt(),
         iterations: alignment.iterations.iter().sum(),
         finest_level: solved as u32,
-        points: sums.in_view,
+        points: sums.compared,
         mean_squared_flow: alignment.mean_squared_flow,
         displacement_px: 0.0,
     }
@@ -138,10 +138,10 @@ pub fn is_better(one: &NormalEquations, other: &NormalEquations) -> bool {
 /// Whether of two states near each other one fits better: by the energy, which tells more finely than a count
 /// of inliers, unless one of them gains by looking away.
 pub fn fits_better(one: &NormalEquations, other: &NormalEquations) -> bool {
-    /// Shares of points in view that differ by more are not compared by the energy of those.
+    /// Shares of points compared that differ by more are not compared by the energy of those.
     const SIMILAR_VIEW: f64 = 0.8;
-    let (one_in_view, other_in_view) = (f64::from(one.in_view), f64::from(other.in_view));
-    if one_in_view.min(other_in_view) < SIMILAR_VIEW * one_in_view.max(other_in_view) {
+    let counts = [one, other].map(|sums| f64::from(sums.compared));
+    if counts[0].min(counts[1]) < SIMILAR_VIEW * counts[0].max(counts[1]) {
         return is_better(one, other);
     }
     one.mean_energy() < other.mean_energy()

@@ -8,7 +8,7 @@ use crate::slam::alignment::kernel::lanes_kernel::Lanes;
 use crate::slam::alignment::normal_equations::{NormalEquations, UNKNOWNS};
 use crate::slam::alignment::points::{LANES, LevelPoints, PointBlock};
 use crate::slam::alignment::residual::{
-    BORDER_PX, Evaluation, NEAREST_DEPTH_RATIO, SMALLEST_DETERMINANT,
+    BORDER_PX, Evaluation, NEAREST_DEPTH_RATIO, SMALLEST_DETERMINANT, UNCLIPPED_GREY,
 };
 use crate::slam::image::buffer::Image;
 
@@ -39,6 +39,7 @@ pub struct Statistics<L> {
     energy: L,
     squared_residual: L,
     in_view: u32,
+    compared: u32,
     inliers: u32,
 }
 
@@ -49,7 +50,7 @@ impl<L: Lanes> Statistics<L> {
     pub unsafe fn zero() -> Self {
         // SAFETY: this function's own contract.
         let zero = unsafe { L::splat(0.0) };
-        Self { energy: zero, squared_residual: zero, in_view: 0, inliers: 0 }
+        Self { energy: zero, squared_residual: zero, in_view: 0, compared: 0, inliers: 0 }
     }
 }
 
@@ -131,6 +132,11 @@ pub unsafe fn whiten<L: Lanes>(
         let value = below.sub(above).mul_add(pixels.dv, above).mul(constant(at.grey_per_sum));
         let predicted = load(&block.intensity).mul(constant(at.gain));
         let residual = value.sub(predicted.add(constant(at.offset)));
+        // Where the sensor ends, a residual that points beyond its end says nothing.
+        let [darkest, lightest] = UNCLIPPED_GREY.map(constant);
+        let within = L::select(value.greater(lightest), residual, one);
+        let within = L::select(darkest.greater(value), zero.sub(residual), within);
+        let is_compared = L::both(in_view, within.at_least(zero));
 
         let d = load(&block.surrounding_inverse_depth);
         let depth_ratio = r6.mul_add(x, r7.mul_add(y, tz.mul_add(d, r8)));
@@ -157,16 +163,17 @@ pub unsafe fn whiten<L: Lanes>(
         let information = one.div(variance);
         let normalized = squared.mul(information);
         let huber = L::min(constant(at.huber).div(normalized.sqrt()), one);
-        let weight = L::select(in_view, huber.mul(information), zero);
+        let weight = L::select(is_compared, huber.mul(information), zero);
         let root = weight.sqrt();
 
         let inlier = constant(at.inlier_gate_squared).greater(normalized);
         statistics.in_view += L::count(in_view);
-        statistics.inliers += L::count(L::both(in_view, inlier));
+        statistics.compared += L::count(is_compared);
+        statistics.inliers += L::count(L::both(is_compared, inlier));
         let energy = huber.mul(constant(2.0).sub(huber)).mul(normalized);
-        statistics.energy = statistics.energy.add(L::select(in_view, energy, zero));
+        statistics.energy = statistics.energy.add(L::select(is_compared, energy, zero));
         statistics.squared_residual =
-            statistics.squared_residual.add(L::select(in_view, squared, zero));
+            statistics.squared_residual.add(L::select(is_compared, squared, zero));
 
         let store = |whitened: &mut Whitened, column: usize, value: L| {
             value.mul(root).store(whitened.0[column].as_mut_ptr().add(lane));
@@ -283,6 +290,7 @@ unsafe fn finish<L: Lanes>(sums: &Sums, statistics: &Statistics<L>) -> NormalEqu
     equations.energy = total(&energy);
     equations.squared_residual = total(&squared_residual);
     equations.in_view = statistics.in_view;
+    equations.compared = statistics.compared;
     equations.inliers = statistics.inliers;
     equations
 }
