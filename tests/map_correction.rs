@@ -107,6 +107,7 @@ fn moved(map: &Map, move_one: impl Fn(&Sim3) -> Sim3) -> Correction {
         keyframe_id: keyframe.keyframe_id,
         map_from_keyframe: move_one(&keyframe.map_from_keyframe),
         depth: LogPlane::default(),
+        modes: None,
     });
     Correction { keyframes: keyframes.collect(), ..Correction::default() }
 }

@@ -11,6 +11,7 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{DepthPoint, Keyframe};
+use crate::slam::modes::ModeCovariance;
 use crate::slam::window::confirmed::ConfirmedPoint;
 use crate::slam::window::dense::RefinedDepth;
 use crate::slam::window::frames::PlacedFrame;
@@ -65,6 +66,8 @@ pub struct KeyframeCorrection {
     pub map_from_keyframe: Sim3,
     /// What its inverse depths, in its unit, are multiplied by.
     pub depth: LogPlane,
+    /// How uncertain the errors are that all of its depth shares after that; as before where nothing is said.
+    pub modes: Option<ModeCovariance>,
 }
 
 /// A smooth correction of inverse depth: d ← d · exp(offset + per_x X + per_y Y), X and Y the coordinates of the
@@ -235,6 +238,7 @@ impl Map {
             let keyframe = &mut self.keyframes[index];
             keyframe.map_from_keyframe = corrected.map_from_keyframe;
             corrected.depth.apply(&keyframe.intrinsics, &mut keyframe.points);
+            keyframe.mode_covariance = corrected.modes.unwrap_or(keyframe.mode_covariance);
             keyframe.revision = revision;
         }
         self.revision += 1;

@@ -194,6 +194,7 @@ fn an_estimate_of_a_map_that_was_corrected_meanwhile_is_dropped() {
         keyframe_id: moved.keyframe_id,
         map_from_keyframe: moved.map_from_keyframe,
         depth: LogPlane::default(),
+        modes: None,
     };
     let correction = Correction { keyframes: vec![correction], ..Correction::default() };
     walk.mapper.apply(&correction).unwrap();

@@ -6,7 +6,7 @@
 
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
-use crate::slam::map::{Correction, CorrectionError, LogPlane};
+use crate::slam::map::{Correction, CorrectionError, KeyframeCorrection};
 use crate::slam::mapper::{Mapper, StepOutcome};
 
 impl Mapper {
@@ -23,8 +23,11 @@ impl Mapper {
         let (Some(before), Some(after)) = (before, self.last_map_from_camera()) else {
             return Ok(StepOutcome { graph_changed: true, ..finished });
         };
-        if let Some(plane) = self.active_plane(correction) {
-            self.depth.correct(&plane, &self.intrinsics);
+        if let Some(corrected) = self.active_correction(correction) {
+            self.depth.correct(&corrected.depth, &self.intrinsics);
+            if let Some(modes) = &corrected.modes {
+                self.modes.enter(modes, &self.params.modes);
+            }
         }
         // The camera stays where odometry has it, and odometry goes on in the unit that it has.
         let world_from_camera = self.world_from_map.place(&before);
@@ -46,11 +49,10 @@ impl Mapper {
         self.map.place(keyframe_id, &at)
     }
 
-    /// What the correction does to the active keyframe's depth; `None` where it is not in it.
-    fn active_plane(&self, correction: &Correction) -> Option<LogPlane> {
+    /// What the correction does to the active keyframe; `None` where it is not in it.
+    fn active_correction<'a>(&self, correction: &'a Correction) -> Option<&'a KeyframeCorrection> {
         let keyframe_id = self.keyframe()?.keyframe_id;
-        let corrected = correction.keyframes.iter().find(|k| k.keyframe_id == keyframe_id);
-        corrected.map(|corrected| corrected.depth)
+        correction.keyframes.iter().find(|k| k.keyframe_id == keyframe_id)
     }
 
     /// The camera has been found on a keyframe: chooses where the map lies in the world so that it is where odometry had

@@ -41,7 +41,10 @@ impl Mapper {
             self.publish_depth();
             outcome.keyframe_changed = true;
         }
-        let correction = window.correction(&self.map);
+        let mut correction = window.correction(&self.map);
+        for modes in correction.keyframes.iter_mut().filter_map(|of| of.modes.as_mut()) {
+            *modes = self.params.modes.of_estimate(modes);
+        }
         if !correction.keyframes.is_empty() {
             // Its numbers are checked: one that is broken leaves the map as it is.
             match self.apply(&correction) {

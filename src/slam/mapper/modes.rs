@@ -25,11 +25,14 @@ pub struct ModeParams {
     /// Inflation of the covariance of a frame's pose error where it goes into depth: errors of lens and shutter are
     /// alike in consecutive frames and do not average out.
     pub pose_inflation: f64,
+    /// Inflation of the covariance that the joint estimate gives: it takes residuals for independent, while those of
+    /// neighbouring samples and points are not (`docs/window.md`).
+    pub estimate_inflation: f64,
 }
 
 impl Default for ModeParams {
     fn default() -> Self {
-        Self { floor_std_dev: 0.003, pose_inflation: 9.0 }
+        Self { floor_std_dev: 0.003, pose_inflation: 9.0, estimate_inflation: 9.0 }
     }
 }
 
@@ -37,7 +40,13 @@ impl ModeParams {
     /// Checks every value.
     pub fn validate(&self) -> Result<(), ParameterError> {
         check_range("floor_std_dev", self.floor_std_dev, 0.0..=1.0)?;
-        check_range("pose_inflation", self.pose_inflation, 0.0..=1e6)
+        check_range("pose_inflation", self.pose_inflation, 0.0..=1e6)?;
+        check_range("estimate_inflation", self.estimate_inflation, 0.0..=1e6)
+    }
+
+    /// What a keyframe says of its modes after a joint estimate, by which they are as uncertain as this.
+    pub(super) fn of_estimate(&self, marginal: &ModeCovariance) -> ModeCovariance {
+        ModeCovariance::bounded(&(marginal.matrix() * self.estimate_inflation + self.floor()))
     }
 
     fn floor(&self) -> Matrix3<f64> {
@@ -60,7 +69,7 @@ impl KeyframeModes {
         self.joint = None;
     }
 
-    /// Takes over those of a keyframe that becomes active.
+    /// Takes over those of a keyframe that becomes active, or has been estimated.
     pub(super) fn enter(&mut self, of_keyframe: &ModeCovariance, params: &ModeParams) {
         self.covariance = of_keyframe.matrix() - params.floor();
     }
@@ -220,7 +229,8 @@ mod tests {
         begun_at: f64,
         place: Vector6<f64>,
     ) -> Vector3<f64> {
-        let params = ModeParams { floor_std_dev: 0.0, pose_inflation: 1.0 };
+        let params =
+            ModeParams { floor_std_dev: 0.0, pose_inflation: 1.0, ..ModeParams::default() };
         let (map, mut modes) = (depth(), KeyframeModes::default());
         let (after, pose) = (narrowed(&map), pose(place, displacement_px));
         modes.enter(&ModeCovariance::of_std_devs([begun_at; 3]), &params);
@@ -262,7 +272,8 @@ mod tests {
 
     #[test]
     fn a_keyframe_keeps_what_it_says_and_every_change_adds_what_no_model_knows() {
-        let params = ModeParams { floor_std_dev: 0.01, pose_inflation: 1.0 };
+        let params =
+            ModeParams { floor_std_dev: 0.01, pose_inflation: 1.0, ..ModeParams::default() };
         let mut modes = KeyframeModes::default();
         let said = ModeCovariance::of_std_devs([0.03, 0.05, 0.07]);
         modes.enter(&said, &params);

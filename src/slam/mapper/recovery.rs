@@ -251,6 +251,7 @@ mod tests {
                 keyframe_id: 1,
                 map_from_keyframe: Sim3::new(sideways(1.5), 1.1),
                 depth: LogPlane::default(),
+                modes: None,
             }],
             ..Correction::default()
         };

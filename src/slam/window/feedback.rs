@@ -41,6 +41,7 @@ impl Window {
                     keyframe_id: keyframe.keyframe_id,
                     map_from_keyframe: leader(keyframe)? * keyframe.map_from_keyframe,
                     depth: LogPlane::default(),
+                    modes: None,
                 })
             })
             .collect()
@@ -64,6 +65,7 @@ impl Window {
             keyframe_id: keyframe.keyframe_id,
             map_from_keyframe: Sim3::new(place, unit * (-offset).exp()),
             depth: LogPlane { offset: 0.0, per_x, per_y },
+            modes: self.modes_of(keyframe.keyframe_id),
         })
     }
 

@@ -12,9 +12,11 @@ mod conclusion;
 pub mod confirmed;
 pub mod dense;
 mod elimination_kernel;
+mod factors;
 mod feedback;
 pub mod frames;
 pub mod keyframe;
+mod marginals;
 pub mod params;
 mod plane;
 mod selection;
@@ -33,6 +35,7 @@ use crate::slam::window::comparison::{Robustness, SAMPLES};
 use crate::slam::window::dense::Refinement;
 use crate::slam::window::frames::WindowFrames;
 use crate::slam::window::keyframe::{WindowKeyframe, WindowPoint, num_levels};
+use crate::slam::window::marginals::Marginal;
 use crate::slam::window::params::WindowParams;
 use crate::slam::window::plane::Correspondence;
 use crate::slam::window::solver::Solver;
@@ -87,6 +90,8 @@ pub struct Window {
     solver: Solver,
     /// Keyframes that moved last.
     moved: Vec<u64>,
+    /// How uncertain those are.
+    marginals: Vec<Marginal>,
     frames: WindowFrames,
     is_last: bool,
     refinement: Refinement,
@@ -103,6 +108,7 @@ impl Window {
             unaligned: Vec::new(),
             solver: Solver::default(),
             moved: Vec::new(),
+            marginals: Vec::new(),
             frames: WindowFrames::default(),
             is_last: false,
             refinement: Refinement::default(),
@@ -113,6 +119,7 @@ impl Window {
     /// to be estimated.
     pub fn take_in(&mut self, map: &Map, active: u64) -> bool {
         self.moved.clear();
+        self.marginals.clear();
         // What a mapper that died has left is where it was estimated to be.
         let is_resumed = self.keyframes.is_empty() && map.keyframes.len() > 1;
         let is_held = |k: &&Keyframe| k.has_depth() && k.map_state == MapState::Established;
@@ -374,6 +381,7 @@ impl Window {
         if !self.run(&members, &ADJUSTED_LEVELS, iterations, |_, _| true) {
             return None;
         }
+        self.keep_marginals(&members);
         if let Some(unit) = unit {
             unit.restore(&mut self.keyframes, members.members);
         }
@@ -489,5 +497,7 @@ struct Chosen {
 mod comparison_tests;
 #[cfg(test)]
 mod dense_tests;
+#[cfg(test)]
+mod marginal_tests;
 #[cfg(test)]
 mod tests;

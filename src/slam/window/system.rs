@@ -6,7 +6,7 @@
 
 use std::ops::Range;
 
-use nalgebra::{DMatrix, DVector, Matrix6, Vector6};
+use nalgebra::{DVector, Matrix6, Vector6};
 
 use crate::slam::alignment::kernel::{Kernel, SimdMode};
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -16,7 +16,9 @@ use crate::slam::window::comparison::{
 use crate::slam::window::elimination_kernel::{
     Block, PADDED, PointRow, RowBlock, eliminate, lower,
 };
+use crate::slam::window::factors::{Factors, solve};
 use crate::slam::window::keyframe::WindowKeyframe;
+use crate::slam::window::marginals::Functional;
 use crate::slam::window::view::{PairView, Views};
 
 /// The normal equations at one state. Its memory is kept from one to the next.
@@ -316,24 +318,10 @@ impl System {
         damping: f64,
         step: &mut Step,
     ) -> bool {
-        memory.reduced.clone_from(&self.hessian);
-        memory.right.clone_from(&self.right);
-        for pose in 0..self.num_free {
-            let diagonal = &mut memory.reduced[lower(pose, pose)];
-            (0..POSE).for_each(|k| diagonal[k][k] *= 1.0 + damping);
-        }
+        self.reduce(memory, members, views, damping);
         step.depths.clear();
         step.depths.resize(self.points.len(), 0.0);
-        if members.depths_are_free {
-            let kernel = Kernel::choose(SimdMode::Auto);
-            for first in (0..self.points.len()).step_by(CHUNK) {
-                let some = first..(first + CHUNK).min(self.points.len());
-                self.collect(some, members, views, damping, memory);
-                let Elimination { points, rows, reduced, right } = &mut *memory;
-                eliminate(kernel, points, rows, reduced, right);
-            }
-        }
-        let Some(poses) = solve_scaled(&memory.reduced, &memory.right) else { return false };
+        let Some(poses) = solve(&memory.reduced, &memory.right) else { return false };
         step.poses.clear();
         step.poses.extend(poses.iter());
         step.decrement = -dot(&self.right, &step.poses);
@@ -357,6 +345,78 @@ impl System {
             }
         }
         true
+    }
+
+    /// Takes the points out of the equations of the poses.
+    fn reduce(&self, memory: &mut Elimination, members: &Members<'_>, views: &Views, damping: f64) {
+        memory.reduced.clone_from(&self.hessian);
+        memory.right.clone_from(&self.right);
+        for pose in 0..self.num_free {
+            let diagonal = &mut memory.reduced[lower(pose, pose)];
+            (0..POSE).for_each(|k| diagonal[k][k] *= 1.0 + damping);
+        }
+        if !members.depths_are_free {
+            return;
+        }
+        let kernel = Kernel::choose(SimdMode::Auto);
+        for first in (0..self.points.len()).step_by(CHUNK) {
+            let some = first..(first + CHUNK).min(self.points.len());
+            self.collect(some, members, views, damping, memory);
+            let Elimination { points, rows, reduced, right } = &mut *memory;
+            eliminate(kernel, points, rows, reduced, right);
+        }
+    }
+
+    /// What is left for the poses without damping, but for a stiffness along `stiffened`; `None` where they are not
+    /// determined.
+    pub fn factors(
+        &mut self,
+        members: &Members<'_>,
+        views: &Views,
+        stiffened: Option<&DVector<f64>>,
+    ) -> Option<Factors> {
+        let mut memory = std::mem::take(&mut self.elimination);
+        self.reduce(&mut memory, members, views, 0.0);
+        let factors = Factors::of(&memory.reduced, POSE * self.num_free, stiffened);
+        self.elimination = memory;
+        factors
+    }
+
+    /// A vector whose scalar product with that of another function of the same depths is gᵀ H⁻¹ g', `factors` those of
+    /// this system.
+    pub fn whitened(
+        &self,
+        factors: &Factors,
+        members: &Members<'_>,
+        views: &Views,
+        of: &Functional,
+    ) -> DVector<f64> {
+        let mut poses = of.poses.clone();
+        let mut depths = Vec::with_capacity(of.depths.len());
+        for &(slot, by_depth) in &of.depths {
+            let (part, view) = (&self.points[slot], &views.points[slot]);
+            if !(part.hessian > 0.0) {
+                depths.push(0.0);
+                continue;
+            }
+            depths.push(by_depth / part.hessian.sqrt());
+            let share = by_depth / part.hessian;
+            let mut take = |pose: usize, mixed: &[f64]| {
+                for (to, of) in poses.as_mut_slice()[POSE * pose..].iter_mut().zip(mixed) {
+                    *to -= share * of;
+                }
+            };
+            if let Some(pose) = members.free[view.host] {
+                take(pose, &part.host);
+            }
+            for link in views.links(view) {
+                if let Some(pose) = members.free[link.observer] {
+                    take(pose, &self.mixed[link.place].map(f64::from)[..POSE]);
+                }
+            }
+        }
+        let poses = factors.whiten(poses);
+        DVector::from_iterator(poses.len() + depths.len(), poses.iter().copied().chain(depths))
     }
 
     /// Of the comparisons that count, grey levels².
@@ -390,27 +450,4 @@ impl PointPart {
 
 fn dot(one: &[f64], other: &[f64]) -> f64 {
     one.iter().zip(other).map(|(a, b)| a * b).sum()
-}
-
-/// Solves `matrix · x = −right` of a lower triangle of blocks, after scaling to a unit diagonal; translations and rotations differ
-/// by the depth.
-fn solve_scaled(blocks: &[Block], right: &[f64]) -> Option<DVector<f64>> {
-    let size = right.len();
-    if size == 0 {
-        return Some(DVector::zeros(0));
-    }
-    /// Added to the unit diagonal: the gauge that nothing holds must not be singular.
-    const REGULARISATION: f64 = 1e-9;
-    let entry = |row: usize, column: usize| {
-        blocks[lower(row / POSE, column / POSE)][row % POSE][column % POSE]
-    };
-    let scale = DVector::from_fn(size, |k, _| 1.0 / entry(k, k).max(f64::MIN_POSITIVE).sqrt());
-    let matrix = DMatrix::from_fn(size, size, |row, column| {
-        let (row, column) = (row.max(column), row.min(column));
-        let regular = if row == column { REGULARISATION } else { 0.0 };
-        entry(row, column) * scale[row] * scale[column] + regular
-    });
-    let right = DVector::from_fn(size, |k, _| right[k] * scale[k]);
-    let step = -matrix.cholesky()?.solve(&right).component_mul(&scale);
-    step.iter().all(|x| x.is_finite()).then_some(step)
 }

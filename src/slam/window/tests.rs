@@ -23,6 +23,11 @@ pub(super) struct Room {
 
 /// Four views of the room with exact depth at every place with gradient, every keyframe a host.
 pub(super) fn room(brightness: impl Fn(usize, f64) -> (f64, f64)) -> Room {
+    noisy_room(brightness, 0)
+}
+
+/// The same with noise that depends on the seed.
+pub(super) fn noisy_room(brightness: impl Fn(usize, f64) -> (f64, f64), seed: u64) -> Room {
     let scene = Scene::new(3);
     let poses = [
         [0.0; 6],
@@ -38,7 +43,7 @@ pub(super) fn room(brightness: impl Fn(usize, f64) -> (f64, f64)) -> Room {
             let (gain, offset) = brightness(index, f64::from(x * x + y * y));
             *grey = gain as f32 * *grey + offset as f32;
         }
-        let pixels = view.noisy(1.0, index as u64);
+        let pixels = view.noisy(1.0, 4 * seed + index as u64);
         let image = Image::try_from_pixels(CAMERA.width, CAMERA.height, pixels).unwrap();
         let mut keyframe = WindowKeyframe {
             keyframe_id: index as u64,
@@ -94,6 +99,11 @@ impl Room {
 
     /// Solves it; share of the comparisons that count.
     fn solve(&mut self) -> f64 {
+        self.solve_with(&mut Solver::default()).0
+    }
+
+    /// The same, and how uncertain the solution is.
+    pub(super) fn solve_with(&mut self, solver: &mut Solver) -> (f64, Vec<Marginal>) {
         let members: Vec<usize> = (0..self.keyframes.len()).collect();
         let mut count = 0;
         let free: Vec<Option<usize>> = members
@@ -107,14 +117,14 @@ impl Room {
             .collect();
         let members = Members { members: &members, free: &free, depths_are_free: true };
         let robustness = Robustness { huber_grey: 9.0, most_energy: 8.0 * 144.0 };
-        let mut solver = Solver::default();
         for level in ADJUSTED_LEVELS {
             let at = Level { camera: &CAMERA, level, robustness };
             solver.views.find(&self.keyframes, members.members, &CAMERA, |_, _| true);
             solver.views.look(&self.keyframes, members.members, level);
             assert!(solver.adjust(&mut self.keyframes, &members, &at, 15, 1e-4));
         }
-        solver.system.inliers as f64 / solver.system.compared as f64
+        let inlier_ratio = solver.system.inliers as f64 / solver.system.compared as f64;
+        (inlier_ratio, marginals::marginals(&self.keyframes, &members, solver, &CAMERA))
     }
 
     /// Largest error of a pose relative to the first (translation over the baseline, rotation in degrees), and the

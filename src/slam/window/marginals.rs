@@ -1,0 +1,242 @@
+//! How uncertain what was estimated jointly is: the covariance of a keyframe's modes.
+//!
+//! With H the normal equations at the end and σ² the variance of a residual, the covariance of a linear function g of
+//! all that is free is σ² gᵀ H⁻¹ g. A point's depth only meets the poses that see it, so that with D the depths' part
+//! of H, S what is left for the poses, and g = (β, α):
+//! ```text
+//! gᵀ H⁻¹ g = αᵀ D⁻¹ α + (β − H_cd D⁻¹ α)ᵀ S⁻¹ (β − H_cd D⁻¹ α)
+//! ```
+//! The modes are the least-squares fit m = A δd'/d' over the points that the keyframe's depth is moved to: its own, or
+//! those of others as it sees them, whose inverse depth d' = d/z, with X' = R x + t d = (·, ·, z) and n = X'/z, follows
+//! depth and poses by
+//! ```text
+//! δd'/d' = δd (1/d − t_z/z) − d' ξ_tz − n_y ξ_ωx + n_x ξ_ωy
+//! ```
+
+use nalgebra::{DVector, Matrix3, Matrix4, SMatrix, Vector3, Vector4, Vector6};
+
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::modes::{ModeCovariance, NUM_MODES};
+use crate::slam::window::Window;
+use crate::slam::window::comparison::{POSE, Pair};
+use crate::slam::window::keyframe::{WindowKeyframe, WindowPoint};
+use crate::slam::window::solver::Solver;
+use crate::slam::window::system::{Members, System};
+use crate::slam::window::view::{Sight, Views};
+
+/// How uncertain a keyframe is that was estimated with others, by the noise of the residuals alone: they are taken for
+/// independent, which makes it too sure.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Marginal {
+    /// The keyframe.
+    pub keyframe_id: u64,
+    /// Covariance of the modes of its depth, as `slam::modes` has them.
+    pub modes: Matrix3<f64>,
+}
+
+/// A linear function of everything that is free.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Functional {
+    /// By entry of the left increments of the free poses.
+    pub poses: DVector<f64>,
+    /// By inverse depth, of some points by their place in the views.
+    pub depths: Vec<(usize, f64)>,
+}
+
+impl Functional {
+    /// That nothing changes.
+    pub fn zero(num_free: usize) -> Self {
+        Self { poses: DVector::zeros(POSE * num_free), depths: Vec::new() }
+    }
+
+    /// Adds a function of a free pose.
+    pub fn add_pose(&mut self, number: usize, of: &Vector6<f64>) {
+        let mut entries = self.poses.fixed_rows_mut::<POSE>(POSE * number);
+        entries += of;
+    }
+}
+
+/// Points that a fit of the modes wants: ten for each of its numbers, as the plane.
+const FEWEST_POINTS: usize = 40;
+
+/// A point as a keyframe has it.
+struct Seen {
+    /// Place among the points of the views.
+    slot: usize,
+    /// Who else moves it: its host, with where the keyframe stands from that; `None` of the keyframe's own.
+    from_host: Option<(usize, SE3)>,
+    /// (1, X, Y, ln d') there.
+    phi: Vector4<f64>,
+    /// ∂ ln d'/∂d.
+    by_depth: f64,
+    /// ∂ ln d'/∂ the left increment of the keyframe's pose.
+    by_pose: Vector6<f64>,
+}
+
+impl Window {
+    /// What the last adjustment says of a keyframe's modes.
+    pub(super) fn modes_of(&self, keyframe_id: u64) -> Option<ModeCovariance> {
+        let marginal = self.marginals.iter().find(|of| of.keyframe_id == keyframe_id)?;
+        Some(ModeCovariance::of(&marginal.modes))
+    }
+
+    /// Keeps those of the members that were free in the adjustment that the solver's system is of.
+    pub(super) fn keep_marginals(&mut self, members: &Members<'_>) {
+        for marginal in marginals(&self.keyframes, members, &mut self.solver, &self.camera) {
+            self.marginals.retain(|known| known.keyframe_id != marginal.keyframe_id);
+            self.marginals.push(marginal);
+        }
+    }
+}
+
+/// Of every member that was free in the adjustment that the solver's system is of.
+pub(super) fn marginals(
+    keyframes: &[WindowKeyframe],
+    members: &Members<'_>,
+    solver: &mut Solver,
+    camera: &Intrinsics,
+) -> Vec<Marginal> {
+    let (views, system) = (&solver.views, &mut solver.system);
+    // The unit that nothing holds is none of the modes: any stiffness serves.
+    let unit = unit_direction(keyframes, members, system.num_free);
+    let factors = system.factors(members, views, unit.as_ref());
+    let Some(factors) = factors else { return Vec::new() };
+    let (num_free, variance) = (system.num_free, system.mean_squared_residual());
+    let whiten = |of: &Functional| system.whitened(&factors, members, views, of);
+    let free = members.free.iter().enumerate().filter_map(|(k, number)| Some((k, (*number)?)));
+    let marginals = free.filter_map(|(member, number)| {
+        let seen = seen_by(keyframes, members, views, system, camera, member);
+        let of = mode_functionals(&seen, members, num_free, number)?.each_ref().map(whiten);
+        let modes = Matrix3::from_fn(|i, j| variance * of[i].dot(&of[j]));
+        let keyframe_id = keyframes[members.members[member]].keyframe_id;
+        Some(Marginal { keyframe_id, modes })
+    });
+    marginals.filter(|of| of.modes.iter().all(|x| x.is_finite())).collect()
+}
+
+/// How the free poses move when the unit of a window grows that only one keyframe holds in place; `None` where more do.
+fn unit_direction(
+    keyframes: &[WindowKeyframe],
+    members: &Members<'_>,
+    num_free: usize,
+) -> Option<DVector<f64>> {
+    let pairs = || members.members.iter().map(|&index| &keyframes[index]).zip(members.free);
+    let mut held = pairs().filter(|(_, free)| free.is_none());
+    let (Some((anchor, _)), None) = (held.next(), held.next()) else { return None };
+    let map_from_anchor = anchor.camera_from_map.inverse();
+    let mut along = DVector::zeros(POSE * num_free);
+    for (keyframe, number) in pairs() {
+        let Some(number) = *number else { continue };
+        let translation = (keyframe.camera_from_map * map_from_anchor).translation;
+        along.fixed_rows_mut::<3>(POSE * number).copy_from(&translation);
+    }
+    // Where all stand in one place there is no unit.
+    (along.norm() > 0.0).then_some(along)
+}
+
+/// The points that a member's depth is moved to, which something agrees with.
+fn seen_by(
+    keyframes: &[WindowKeyframe],
+    members: &Members<'_>,
+    views: &Views,
+    system: &System,
+    camera: &Intrinsics,
+    member: usize,
+) -> Vec<Seen> {
+    let to = &keyframes[members.members[member]];
+    let mut seen = Vec::new();
+    let mut sight: Option<(usize, SE3, Sight)> = None;
+    for (slot, (view, inliers)) in views.points.iter().zip(system.inliers_by_point()).enumerate() {
+        if inliers == 0 || to.is_host != (view.host == member) {
+            continue;
+        }
+        let host = &keyframes[members.members[view.host]];
+        let point = &host.points[view.point];
+        if view.host == member {
+            seen.push(own(slot, point));
+            continue;
+        }
+        let (_, to_from_host, sight) = match &sight {
+            Some(known) if known.0 == view.host => known,
+            _ => {
+                let to_from_host = to.camera_from_map * host.camera_from_map.inverse();
+                sight.insert((view.host, to_from_host, Sight::new(&to_from_host, camera)))
+            }
+        };
+        if sight.sees(point) {
+            seen.push(projected(slot, point, view.host, to_from_host));
+        }
+    }
+    seen
+}
+
+fn own(slot: usize, point: &WindowPoint) -> Seen {
+    let [x, y] = point.ray.map(f64::from);
+    Seen {
+        slot,
+        from_host: None,
+        phi: Vector4::new(1.0, x, y, point.inverse_depth.ln()),
+        by_depth: 1.0 / point.inverse_depth,
+        by_pose: Vector6::zeros(),
+    }
+}
+
+fn projected(slot: usize, point: &WindowPoint, host: usize, to_from_host: &SE3) -> Seen {
+    let [x, y] = point.ray.map(f64::from);
+    let d = point.inverse_depth;
+    let turned = to_from_host.rotation * Vector3::new(x, y, 1.0);
+    let warped = turned + to_from_host.translation * d;
+    let (x, y, inverse_depth) = (warped.x / warped.z, warped.y / warped.z, d / warped.z);
+    Seen {
+        slot,
+        from_host: Some((host, *to_from_host)),
+        phi: Vector4::new(1.0, x, y, inverse_depth.ln()),
+        by_depth: 1.0 / d - to_from_host.translation.z / warped.z,
+        by_pose: Vector6::new(0.0, 0.0, -inverse_depth, -y, x, 0.0),
+    }
+}
+
+/// The modes of a member, whose pose has this number, as functions of all that is free; `None` where its points do not
+/// tell them.
+fn mode_functionals(
+    seen: &[Seen],
+    members: &Members<'_>,
+    num_free: usize,
+    number: usize,
+) -> Option<[Functional; NUM_MODES]> {
+    if seen.len() < FEWEST_POINTS {
+        return None;
+    }
+    let fit = seen.iter().map(|of| of.phi * of.phi.transpose()).sum::<Matrix4<f64>>();
+    let fit = fit.cholesky()?;
+    let mut functionals = std::array::from_fn(|_| Functional::zero(num_free));
+    // Sums over the points of one host: they share its pose.
+    let mut of_host: Option<(usize, SE3, SMatrix<f64, NUM_MODES, POSE>)> = None;
+    let settle = |(host, to_from_host, sum): (usize, SE3, SMatrix<f64, NUM_MODES, POSE>),
+                  functionals: &mut [Functional; NUM_MODES]| {
+        let by_host = sum * Pair::by_host(&to_from_host);
+        for (mode, functional) in functionals.iter_mut().enumerate() {
+            functional.add_pose(number, &sum.row(mode).transpose());
+            if let Some(host) = members.free[host] {
+                functional.add_pose(host, &by_host.row(mode).transpose());
+            }
+        }
+    };
+    for of in seen {
+        let weight = fit.solve(&of.phi);
+        for (mode, functional) in functionals.iter_mut().enumerate() {
+            functional.depths.push((of.slot, weight[mode + 1] * of.by_depth));
+        }
+        let Some((host, to_from_host)) = of.from_host else { continue };
+        if of_host.as_ref().is_some_and(|(known, ..)| *known != host) {
+            settle(of_host.take()?, &mut functionals);
+        }
+        let (_, _, sum) = of_host.get_or_insert_with(|| (host, to_from_host, SMatrix::zeros()));
+        *sum += weight.fixed_rows::<NUM_MODES>(1) * of.by_pose.transpose();
+    }
+    if let Some(rest) = of_host.take() {
+        settle(rest, &mut functionals);
+    }
+    Some(functionals)
+}
