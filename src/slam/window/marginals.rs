@@ -60,6 +60,10 @@ impl Functional {
 /// Points that a fit of the modes wants: ten for each of its numbers, as the plane.
 const FEWEST_POINTS: usize = 40;
 
+/// Standard deviation of a point's inverse depth, over that depth, above which it tells nothing of the modes: a few that
+/// no baseline shows would otherwise be all that they are uncertain by.
+const LEAST_CERTAIN: f64 = 0.3;
+
 /// A point as a keyframe has it.
 struct Seen {
     /// Place among the points of the views.
@@ -153,6 +157,9 @@ fn seen_by(
         }
         let host = &keyframes[members.members[view.host]];
         let point = &host.points[view.point];
+        if !(system.depth_deviation(slot) <= LEAST_CERTAIN * point.inverse_depth) {
+            continue;
+        }
         if view.host == member {
             seen.push(own(slot, point));
             continue;

@@ -367,6 +367,12 @@ impl System {
         }
     }
 
+    /// Standard deviation of a point's inverse depth, by its place in the views, were all poses exact; infinite where
+    /// nothing sees it.
+    pub fn depth_deviation(&self, slot: usize) -> f64 {
+        (self.mean_squared_residual() / self.points[slot].hessian).sqrt()
+    }
+
     /// What is left for the poses without damping, but for a stiffness along `stiffened`; `None` where they are not
     /// determined.
     pub fn factors(
