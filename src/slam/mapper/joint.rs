@@ -42,8 +42,9 @@ impl Mapper {
             outcome.keyframe_changed = true;
         }
         let mut correction = window.correction(&self.map);
-        for modes in correction.keyframes.iter_mut().filter_map(|of| of.modes.as_mut()) {
-            *modes = self.params.modes.of_estimate(modes);
+        for keyframe in &mut correction.keyframes {
+            let marginal = window.marginal_of(keyframe.keyframe_id);
+            keyframe.modes = marginal.map(|of| self.modes.of_estimate(of, &self.params.modes));
         }
         if !correction.keyframes.is_empty() {
             // Its numbers are checked: one that is broken leaves the map as it is.

@@ -14,25 +14,34 @@ use crate::slam::modes::ModeCovariance;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::PoseEstimate;
 use crate::slam::tracker::covariance_floor::displacement_covariance;
+use crate::slam::window::marginals::Marginal;
 
 /// Tuning of the covariance of common depth errors.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ModeParams {
     /// Standard deviation of tilt and relief that every keyframe adds: relative depth error for each unit of the
-    /// ray's coordinates and of ln d. What no model knows; exact images and poses leave 0.003.
+    /// ray's coordinates and of ln d. What no model knows; exact images leave 0.0005 to 0.0015.
     pub floor_std_dev: f64,
     /// Inflation of the covariance of a frame's pose error where it goes into depth: errors of lens and shutter are
     /// alike in consecutive frames and do not average out.
     pub pose_inflation: f64,
-    /// Inflation of the covariance that the joint estimate gives: it takes residuals for independent, while those of
-    /// neighbouring samples and points are not (`docs/window.md`).
+    /// Inflation of the covariance that the joint estimate gives, which takes residuals for independent: those of
+    /// neighbouring samples share pixels.
     pub estimate_inflation: f64,
+    /// Share of the variance of an image's displacement that has the shape of a mode: what displaces images alike
+    /// everywhere goes into the poses. With 0.3 the depth of exact images errs by as much as P says.
+    pub displaced_share: f64,
 }
 
 impl Default for ModeParams {
     fn default() -> Self {
-        Self { floor_std_dev: 0.003, pose_inflation: 9.0, estimate_inflation: 9.0 }
+        Self {
+            floor_std_dev: 0.001,
+            pose_inflation: 9.0,
+            estimate_inflation: 2.0,
+            displaced_share: 0.3,
+        }
     }
 }
 
@@ -41,12 +50,8 @@ impl ModeParams {
     pub fn validate(&self) -> Result<(), ParameterError> {
         check_range("floor_std_dev", self.floor_std_dev, 0.0..=1.0)?;
         check_range("pose_inflation", self.pose_inflation, 0.0..=1e6)?;
-        check_range("estimate_inflation", self.estimate_inflation, 0.0..=1e6)
-    }
-
-    /// What a keyframe says of its modes after a joint estimate, by which they are as uncertain as this.
-    pub(super) fn of_estimate(&self, marginal: &ModeCovariance) -> ModeCovariance {
-        ModeCovariance::bounded(&(marginal.matrix() * self.estimate_inflation + self.floor()))
+        check_range("estimate_inflation", self.estimate_inflation, 0.0..=1e6)?;
+        check_range("displaced_share", self.displaced_share, 0.0..=1e6)
     }
 
     fn floor(&self) -> Matrix3<f64> {
@@ -60,6 +65,8 @@ pub(super) struct KeyframeModes {
     covariance: Matrix3<f64>,
     samples: SampledDepth,
     joint: Option<JointCovariance>,
+    /// Mean square of the displacements of late images, pixels².
+    squared_displacement: Option<f64>,
 }
 
 impl KeyframeModes {
@@ -77,6 +84,15 @@ impl KeyframeModes {
     /// What a keyframe says of its modes.
     pub(super) fn published(&self, params: &ModeParams) -> ModeCovariance {
         ModeCovariance::bounded(&(self.covariance + params.floor()))
+    }
+
+    /// What a keyframe says of its modes after a joint estimate by which they are as uncertain as this: noise, and what
+    /// displaces whole images here, of which P is to be for this camera.
+    pub(super) fn of_estimate(&self, marginal: &Marginal, params: &ModeParams) -> ModeCovariance {
+        let squared = self.squared_displacement.unwrap_or_default();
+        let displaced = marginal.of_displaced * squared * params.displaced_share;
+        let noise = marginal.modes * params.estimate_inflation;
+        ModeCovariance::bounded(&(noise + displaced + params.floor()))
     }
 
     /// The unit of the depth has grown by `factor` since the frame at hand was considered.
@@ -108,6 +124,11 @@ impl KeyframeModes {
         pose: &PoseEstimate,
         params: &ModeParams,
     ) {
+        /// Share of the newest image: about as many are averaged as lie between two keyframes.
+        const NEWEST: f64 = 0.1;
+        let squared = pose.quality.displacement_px.powi(2);
+        let mean = self.squared_displacement.get_or_insert(squared);
+        *mean += NEWEST * (squared - *mean);
         self.samples.take(depth, intrinsics);
         let noise = pose_noise(intrinsics, pose, unit) * params.pose_inflation;
         // A pose that is given without covariance is exact: it does not follow the depth.

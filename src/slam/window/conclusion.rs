@@ -2,7 +2,8 @@
 //!
 //! What the window froze early is free again: in rendered rooms the error of the trajectory is halved or better.
 
-use crate::slam::window::{Adjustment, Chosen, Window};
+use crate::slam::window::members::Chosen;
+use crate::slam::window::{Adjustment, Window};
 
 /// Keyframes that are free at once: bounds memory (the equations, about 170 bytes a comparison) and time.
 const PIECE: usize = 40;

@@ -65,7 +65,7 @@ impl Window {
             keyframe_id: keyframe.keyframe_id,
             map_from_keyframe: Sim3::new(place, unit * (-offset).exp()),
             depth: LogPlane { offset: 0.0, per_x, per_y },
-            modes: self.modes_of(keyframe.keyframe_id),
+            modes: None,
         })
     }
 

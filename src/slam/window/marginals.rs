@@ -13,11 +13,11 @@
 //! δd'/d' = δd (1/d − t_z/z) − d' ξ_tz − n_y ξ_ωx + n_x ξ_ωy
 //! ```
 
-use nalgebra::{DVector, Matrix3, Matrix4, SMatrix, Vector3, Vector4, Vector6};
+use nalgebra::{Cholesky, Const, DVector, Matrix3, Matrix4, SMatrix, Vector3, Vector4, Vector6};
 
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
-use crate::slam::modes::{ModeCovariance, NUM_MODES};
+use crate::slam::modes::NUM_MODES;
 use crate::slam::window::Window;
 use crate::slam::window::comparison::{POSE, Pair};
 use crate::slam::window::keyframe::{WindowKeyframe, WindowPoint};
@@ -33,6 +33,9 @@ pub struct Marginal {
     pub keyframe_id: u64,
     /// Covariance of the modes of its depth, as `slam::modes` has them.
     pub modes: Matrix3<f64>,
+    /// What it is of if images are displaced against each other by a pixel, alike all over: for lens and shutter, which
+    /// no number of points averages out.
+    pub of_displaced: Matrix3<f64>,
 }
 
 /// A linear function of everything that is free.
@@ -79,10 +82,9 @@ struct Seen {
 }
 
 impl Window {
-    /// What the last adjustment says of a keyframe's modes.
-    pub(super) fn modes_of(&self, keyframe_id: u64) -> Option<ModeCovariance> {
-        let marginal = self.marginals.iter().find(|of| of.keyframe_id == keyframe_id)?;
-        Some(ModeCovariance::of(&marginal.modes))
+    /// What the last adjustment says of a keyframe.
+    pub fn marginal_of(&self, keyframe_id: u64) -> Option<&Marginal> {
+        self.marginals.iter().find(|of| of.keyframe_id == keyframe_id)
     }
 
     /// Keeps those of the members that were free in the adjustment that the solver's system is of.
@@ -111,12 +113,17 @@ pub(super) fn marginals(
     let free = members.free.iter().enumerate().filter_map(|(k, number)| Some((k, (*number)?)));
     let marginals = free.filter_map(|(member, number)| {
         let seen = seen_by(keyframes, members, views, system, camera, member);
-        let of = mode_functionals(&seen, members, num_free, number)?.each_ref().map(whiten);
+        let fit = fit_of(&seen)?;
+        let of = mode_functionals(&seen, &fit, members, num_free, number)?.each_ref().map(whiten);
         let modes = Matrix3::from_fn(|i, j| variance * of[i].dot(&of[j]));
+        let parallax = mean_squared_parallax(&seen, keyframes, members, views, camera);
+        let of_one = fit.inverse().fixed_view::<NUM_MODES, NUM_MODES>(1, 1) * seen.len() as f64;
         let keyframe_id = keyframes[members.members[member]].keyframe_id;
-        Some(Marginal { keyframe_id, modes })
+        Some(Marginal { keyframe_id, modes, of_displaced: of_one / parallax })
     });
-    marginals.filter(|of| of.modes.iter().all(|x| x.is_finite())).collect()
+    let is_finite =
+        |of: &Marginal| of.modes.iter().chain(of.of_displaced.iter()).all(|x| x.is_finite());
+    marginals.filter(is_finite).collect()
 }
 
 /// How the free poses move when the unit of a window grows that only one keyframe holds in place; `None` where more do.
@@ -204,19 +211,54 @@ fn projected(slot: usize, point: &WindowPoint, host: usize, to_from_host: &SE3) 
     }
 }
 
-/// The modes of a member, whose pose has this number, as functions of all that is free; `None` where its points do not
-/// tell them.
+/// Mean square of how far, in pixels, a point moves in an image when its inverse depth is multiplied by e, over
+/// comparisons of the points that are seen.
+fn mean_squared_parallax(
+    seen: &[Seen],
+    keyframes: &[WindowKeyframe],
+    members: &Members<'_>,
+    views: &Views,
+    camera: &Intrinsics,
+) -> f64 {
+    /// So many points apart they stand for all.
+    const STRIDE: usize = 8;
+    let (mut sum, mut count) = (0.0, 0.0f64);
+    for view in seen.iter().step_by(STRIDE).map(|of| &views.points[of.slot]) {
+        let host = &keyframes[members.members[view.host]];
+        let point = &host.points[view.point];
+        let map_from_host = host.camera_from_map.inverse();
+        let ray = Vector3::new(f64::from(point.ray[0]), f64::from(point.ray[1]), 1.0);
+        for link in views.links(view) {
+            let observer = &keyframes[members.members[link.observer]];
+            let observer_from_host = observer.camera_from_map * map_from_host;
+            let moved = observer_from_host.translation * point.inverse_depth;
+            let warped = observer_from_host.rotation * ray + moved;
+            let along = |axis: usize, focal: f64| {
+                focal * (moved[axis] - warped[axis] / warped.z * moved.z) / warped.z
+            };
+            sum += along(0, camera.fx).powi(2) + along(1, camera.fy).powi(2);
+            count += 1.0;
+        }
+    }
+    sum / count
+}
+
+/// The equations of the modes, with the constant, over points; `None` where they do not tell them.
+fn fit_of(seen: &[Seen]) -> Option<Cholesky<f64, Const<4>>> {
+    if seen.len() < FEWEST_POINTS {
+        return None;
+    }
+    seen.iter().map(|of| of.phi * of.phi.transpose()).sum::<Matrix4<f64>>().cholesky()
+}
+
+/// The modes of a member, whose pose has this number, as functions of all that is free.
 fn mode_functionals(
     seen: &[Seen],
+    fit: &Cholesky<f64, Const<4>>,
     members: &Members<'_>,
     num_free: usize,
     number: usize,
 ) -> Option<[Functional; NUM_MODES]> {
-    if seen.len() < FEWEST_POINTS {
-        return None;
-    }
-    let fit = seen.iter().map(|of| of.phi * of.phi.transpose()).sum::<Matrix4<f64>>();
-    let fit = fit.cholesky()?;
     let mut functionals = std::array::from_fn(|_| Functional::zero(num_free));
     // Sums over the points of one host: they share its pose.
     let mut of_host: Option<(usize, SE3, SMatrix<f64, NUM_MODES, POSE>)> = None;

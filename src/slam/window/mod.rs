@@ -16,7 +16,8 @@ mod factors;
 mod feedback;
 pub mod frames;
 pub mod keyframe;
-mod marginals;
+pub mod marginals;
+mod members;
 pub mod params;
 mod plane;
 mod selection;
@@ -36,6 +37,7 @@ use crate::slam::window::dense::Refinement;
 use crate::slam::window::frames::WindowFrames;
 use crate::slam::window::keyframe::{WindowKeyframe, WindowPoint, num_levels};
 use crate::slam::window::marginals::Marginal;
+use crate::slam::window::members::Chosen;
 use crate::slam::window::params::WindowParams;
 use crate::slam::window::plane::Correspondence;
 use crate::slam::window::solver::Solver;
@@ -50,10 +52,6 @@ const ADJUSTED_LEVELS: [usize; 3] = [2, 1, 0];
 const NUM_ALIGNED_TO: usize = 4;
 /// Most iterations of a level of that alignment.
 const MAX_ALIGNMENT_ITERATIONS: u32 = 10;
-/// Points that two keyframes must see both for the one to hold the other in place.
-const FEWEST_COMMON: usize = 20;
-/// Keyframes that are held in place where no older one sees the same things.
-const NUM_HELD: usize = 2;
 
 /// What an adjustment came to.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -327,43 +325,6 @@ impl Window {
         self.run(&members, levels, iterations, |_, observer| observer == last)
     }
 
-    /// Who takes part in the estimation of the newest keyframes.
-    fn choose_members(&self, newest: usize) -> Chosen {
-        let epoch = self.keyframes[newest].epoch;
-        let of_epoch: Vec<usize> =
-            (0..=newest).filter(|&k| self.keyframes[k].epoch == epoch).collect();
-        let is_first = of_epoch.len() <= self.params.num_first;
-        let num_free =
-            if is_first { of_epoch.len() } else { self.params.num_free.min(of_epoch.len()) };
-        let (older, free) = of_epoch.split_at(of_epoch.len() - num_free);
-        let fixed = self.covisible(older, &free[free.len().saturating_sub(2)..]);
-        Chosen::new(fixed, free, older.is_empty(), is_first)
-    }
-
-    /// Of the older keyframes those that see most of what the newest see.
-    fn covisible(&self, older: &[usize], newest: &[usize]) -> Vec<usize> {
-        let common = |one: usize, other: usize| {
-            let (host, observer) = (&self.keyframes[one], &self.keyframes[other]);
-            let sight = Sight::new(
-                &(observer.camera_from_map * host.camera_from_map.inverse()),
-                &self.camera,
-            );
-            if !sight.may_see(&host.points) {
-                return 0;
-            }
-            let alive = host.points.iter().filter(|point| point.is_alive);
-            alive.filter(|point| sight.sees(point)).count()
-        };
-        let mut seen: Vec<(usize, usize)> = older
-            .iter()
-            .map(|&of| (newest.iter().map(|&new| common(of, new) + common(new, of)).sum(), of))
-            .filter(|(count, _)| *count > FEWEST_COMMON)
-            .collect();
-        seen.sort_unstable_by(|one, other| other.cmp(one));
-        seen.truncate(self.params.num_fixed);
-        seen.into_iter().map(|(_, of)| of).collect()
-    }
-
     fn adjust(&mut self, chosen: &Chosen) -> Option<Adjustment> {
         let num_free = chosen.free.iter().flatten().count();
         if num_free == 0 {
@@ -461,36 +422,6 @@ impl Window {
         }
         points
     }
-}
-
-impl Chosen {
-    /// Those of `free` are, but for who holds the gauge: the first where nothing is older, the two oldest where no
-    /// other keyframe sees the same things.
-    fn new(fixed: Vec<usize>, free: &[usize], is_oldest: bool, is_first: bool) -> Self {
-        let held = match (is_oldest, fixed.is_empty()) {
-            (true, _) => 1,
-            (false, true) => NUM_HELD.min(free.len()),
-            (false, false) => 0,
-        };
-        let mut members = fixed;
-        members.extend(free);
-        let free = &free[held..];
-        members.sort_unstable();
-        let mut numbers = 0..;
-        let number = |member| if free.contains(member) { numbers.next() } else { None };
-        let free = members.iter().map(number).collect();
-        Self { members, free, is_first }
-    }
-}
-
-/// Who takes part.
-struct Chosen {
-    /// Places in the list of keyframes.
-    members: Vec<usize>,
-    /// For each its number among the free ones.
-    free: Vec<Option<usize>>,
-    /// Whether the epoch has just begun.
-    is_first: bool,
 }
 
 #[cfg(test)]
