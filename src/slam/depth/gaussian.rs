@@ -183,8 +183,8 @@ pub fn observe(
         .reduce(Observation::default, Observation::plus)
 }
 
-/// Of so many pixels one is probed.
-const PROBE_STEP: usize = 32;
+/// Of so many pixels one is probed: the hypotheses that it stands for.
+pub const PROBE_STEP: usize = 32;
 /// Columns by which the probed pixels of a row are displaced against those of the row above: no column has all.
 const PROBE_ROW_SHIFT: usize = 11;
 

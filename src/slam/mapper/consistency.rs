@@ -4,15 +4,15 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::slam::depth::gaussian::ObservationCounts;
+use crate::slam::depth::gaussian::{ObservationCounts, PROBE_STEP};
 use crate::slam::parameter::{ParameterError, check_range};
 
 /// What a map that can be trusted does not do.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ConsistencyParams {
-    /// Share of a frame's searches, those of the even sample among them, that may fail. Without the sample
-    /// recordings stayed below 0.57, nearly all of their frames below 0.4.
+    /// Share of the hypotheses that a frame is searched for, or that its even sample stands for, whose search may
+    /// fail. By the searches alone recordings stayed below 0.57, nearly all of their frames below 0.4.
     pub max_failed_ratio: f64,
     /// Frames in a row with more failures that reject the map: one alone may be a blink.
     pub max_failed_frames: u32,
@@ -128,7 +128,11 @@ impl Consistency {
         let enough = MIN_SEARCHED_RATIO * points as f64;
         let searched = counts.attempted + counts.probed;
         if searched >= MIN_SEARCHES && searched as f64 >= enough {
-            let failed_ratio = (counts.failed + counts.refuted) as f64 / searched as f64;
+            // What is searched to be learnt from is often what failed before, where light or a reflection changed: of
+            // all that the keyframe knows it is the smaller part.
+            let of_all = |searched: usize, probed: usize| (searched + PROBE_STEP * probed) as f64;
+            let failed_ratio =
+                of_all(counts.failed, counts.refuted) / of_all(counts.attempted, counts.probed);
             let has_failed = failed_ratio > params.max_failed_ratio;
             self.failed_frames = if has_failed { self.failed_frames + 1 } else { 0 };
         } else {
@@ -190,6 +194,10 @@ mod tests {
         let certain = ObservationCounts { probed: 600, refuted: 20, ..counts(1000, 900) };
         let rest = (0..50).filter_map(|_| watched.observe(&certain, 20_000, &params));
         assert_eq!(rest.count(), 0);
+        // Light that has changed fails most of what is still to be learnt from, which is the smaller part.
+        let relit = ObservationCounts { probed: 271, refuted: 36, ..counts(3247, 3158) };
+        let relit = (0..50).filter_map(|_| watched.observe(&relit, 19_000, &params));
+        assert_eq!(relit.count(), 0);
         let last = (0..params.max_failed_frames)
             .map(|_| watched.observe(&counts(1000, 900), 5000, &params))
             .last();
