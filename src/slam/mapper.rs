@@ -16,6 +16,7 @@ mod resume;
 pub mod reuse;
 pub mod situation;
 mod start;
+mod turned_views;
 
 use serde::{Deserialize, Serialize};
 

@@ -273,10 +273,12 @@ impl Tracker {
                 self.memory.was_lost.then(|| turned(&first, views)).into_iter().flatten();
             let explain = |of: &Alignment| self.aligner.explanation(reference, &self.pyramid, of);
             let mut explained = explain(&best);
+            // A small gain explains any image, and would hide the pose that may be claimed.
+            let may_be = |of: &Alignment| !self.memory.was_lost || self.params.verdict.is_near(of);
             for hypothesis in hypotheses(&self.memory.motion, nanos, rotation).chain(at_keyframe) {
                 let other = self.align_coarsest(reference, &hypothesis, budget);
                 let by_other = explain(&other);
-                if is_better(&by_other, &explained) {
+                if may_be(&other) && (!may_be(&best) || is_better(&by_other, &explained)) {
                     (best, explained) = (other, by_other);
                 }
             }

@@ -2,8 +2,8 @@
 //! (Klein, Murray 2008).
 
 /// Size of the small images.
-const COLUMNS: usize = 32;
-const ROWS: usize = 24;
+pub(super) const COLUMNS: usize = 32;
+pub(super) const ROWS: usize = 24;
 /// Largest shift that is tried either way, pixels of the small image: 6° of a view 60° wide.
 const REACH: usize = 3;
 /// Columns and rows that are compared at every shift.
@@ -15,6 +15,8 @@ const COUNT: f32 = (INNER[0] * INNER[1]) as f32;
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Appearance {
     greys: Vec<f32>,
+    /// The same without what changes slowly over the image.
+    details: Vec<f32>,
 }
 
 impl Appearance {
@@ -33,7 +35,21 @@ impl Appearance {
                 greys.push(sum as f32 / (rows.len() * columns.len()) as f32);
             }
         }
-        Some(Self { greys: blurred(&greys) })
+        Some(Self::with(blurred(&greys)))
+    }
+
+    fn with(greys: Vec<f32>) -> Self {
+        /// Blurs that leave what is slow: of 1.4 pixels together, a twentieth of the image.
+        const BLURS: usize = 4;
+        let slow = (0..BLURS).fold(greys.clone(), |greys, _| blurred(&greys));
+        let details = greys.iter().zip(&slow).map(|(grey, slow)| grey - slow).collect();
+        Self { greys, details }
+    }
+
+    /// What changes from place to place, row after row: light and large surfaces do not count, so that it tells views
+    /// apart that share little.
+    pub(super) fn details(&self) -> &[f32] {
+        &self.details
     }
 
     /// Correlation at the best of the shifts, −1 to 1: what brightness and contrast do to an image does not count. −1
@@ -107,7 +123,7 @@ mod tests {
         let elsewhere = seen([0.0, 0.0, 0.0, 0.0, 1.5, 0.0], 3);
         assert!(here.similarity(&turned) > 0.8, "{}", here.similarity(&turned));
         assert!(here.similarity(&elsewhere) < 0.7, "{}", here.similarity(&elsewhere));
-        let darker = Appearance { greys: here.greys.iter().map(|grey| 0.4 * grey + 9.0).collect() };
+        let darker = Appearance::with(here.greys.iter().map(|grey| 0.4 * grey + 9.0).collect());
         assert!(here.similarity(&darker) > 0.999);
     }
 

@@ -10,6 +10,7 @@ use crate::slam::image::sums::SumPyramid;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::mapper::appearance::Appearance;
 use crate::slam::mapper::recovery::RecoveryParams;
+use crate::slam::mapper::turned_views::TurnedViews;
 use crate::slam::pose::Brightness;
 use crate::slam::tracker::motion::turned;
 use crate::slam::tracker::verdict::{VerdictParams, is_better, quality_of};
@@ -32,6 +33,8 @@ pub(super) struct Finder {
     pyramid: SumPyramid,
     /// What keyframes look like, by their id, in order.
     appearances: Vec<(u64, Option<Appearance>)>,
+    /// Made at the first loss that needs them: two megabytes.
+    turned_views: Option<TurnedViews>,
 }
 
 impl Finder {
@@ -48,6 +51,7 @@ impl Finder {
             pyramid: SumPyramid::with_size(width, height, levels, finest_level(levels, &reference)),
             reference: Reference::new(reference),
             appearances: Vec::new(),
+            turned_views: None,
         }
     }
 
@@ -77,7 +81,8 @@ impl Finder {
                     others[(*searched - 1) % others.len()]
                 }
             };
-            if let Some(found) = self.find_near(&keyframes[index], rotation_rad) {
+            let at_keyframe = SE3::identity();
+            if let Some(found) = self.find_near(&keyframes[index], &at_keyframe, rotation_rad) {
                 return Some((index, found));
             }
         }
@@ -86,25 +91,72 @@ impl Finder {
 
     /// Keyframes that may be gone back to, those that look most like `seen` first, the newest of equals.
     fn alike(&self, keyframes: &[Keyframe], active: usize, seen: &Appearance) -> Vec<usize> {
-        // The tracker itself looks around the active keyframe.
-        let is_eligible = |index: &usize| {
-            let keyframe = &keyframes[*index];
-            *index != active
-                && keyframe.map_state == MapState::Established
-                && keyframe.points.len() >= least_points(&keyframe.intrinsics)
-        };
-        let newest_first = (0..keyframes.len()).rev().filter(is_eligible);
-        let similarity = |index: usize| {
-            let id = keyframes[index].keyframe_id;
-            let known = self.appearances.binary_search_by_key(&id, |(of, _)| *of).ok()?;
-            Some(self.appearances[known].1.as_ref()?.similarity(seen))
-        };
-        let mut rated: Vec<(f32, usize)> = newest_first
-            .filter_map(|index| Some((similarity(index)?, index)))
+        let mut rated: Vec<(f32, usize)> = eligible(keyframes, active)
+            .filter_map(|index| Some((self.appearance(&keyframes[index])?.similarity(seen), index)))
             .filter(|(similarity, _)| *similarity > LEAST_SIMILARITY)
             .collect();
         rated.sort_by(|one, other| other.0.total_cmp(&one.0));
         rated.into_iter().map(|(_, index)| index).collect()
+    }
+
+    /// Of `keyframes`, in turn after so many `compared`, one that shows what `pixels` do from a camera turned far
+    /// against it, and the camera's pose on it.
+    pub(super) fn find_turned(
+        &mut self,
+        keyframes: &[Keyframe],
+        active: usize,
+        compared: &mut usize,
+        pixels: &[u8],
+        params: &RecoveryParams,
+    ) -> Option<(usize, SE3)> {
+        /// Keyframes that are compared in a frame: about a millisecond each.
+        const MOST_COMPARED: usize = 24;
+        /// Around a rotation that was found, half a step of them.
+        const ROTATION_DEG: f64 = 4.5;
+        /// How far the pose may be turned from there, degrees: a step of each rotation, and what nearness does. An
+        /// alignment that wanders further fits something else.
+        const MAX_ERROR_DEG: f64 = 15.0;
+        let most = params.keyframes_per_frame.min(params.num_keyframes);
+        let camera = keyframes.get(active).filter(|_| most > 0)?.intrinsics;
+        let seen = Appearance::of(pixels, camera.width, camera.height)?;
+        self.learn(keyframes);
+        let eligible: Vec<usize> = eligible(keyframes, active)
+            .filter(|&index| self.appearance(&keyframes[index]).is_some())
+            .collect();
+        let count = eligible.len().min(MOST_COMPARED);
+        let candidates: Vec<usize> =
+            (0..count).map(|k| eligible[(*compared + k) % eligible.len()]).collect();
+        *compared += count;
+        if self.turned_views.as_ref().is_none_or(|views| !views.is_for(&camera)) {
+            self.turned_views = Some(TurnedViews::new(&camera));
+        }
+        let details: Vec<&[f32]> = candidates
+            .iter()
+            .filter_map(|&index| Some(self.appearance(&keyframes[index])?.details()))
+            .collect();
+        let views = self.turned_views.as_ref()?.compare(seen.details(), &details);
+        let pairs = candidates.into_iter().zip(views);
+        let mut rated: Vec<_> = pairs.filter_map(|(index, view)| Some((index, view?))).collect();
+        rated.sort_by(|one, other| other.1.score.total_cmp(&one.1.score));
+        self.pyramid.fill(pixels);
+        for (index, view) in rated.into_iter().take(most) {
+            let expected = SE3 { rotation: view.rotation, ..SE3::identity() };
+            let found = self.find_near(&keyframes[index], &expected, ROTATION_DEG.to_radians());
+            let is_there = |found: &SE3| {
+                found.rotation.angle_to(&expected.rotation) <= MAX_ERROR_DEG.to_radians()
+            };
+            if let Some(found) = found.filter(is_there) {
+                return Some((index, found));
+            }
+        }
+        None
+    }
+
+    /// What a keyframe looks like, where that is known.
+    fn appearance(&self, keyframe: &Keyframe) -> Option<&Appearance> {
+        let id = keyframe.keyframe_id;
+        let known = self.appearances.binary_search_by_key(&id, |(of, _)| *of).ok()?;
+        self.appearances[known].1.as_ref()
     }
 
     /// Looks at keyframes that are new, so many at most.
@@ -143,16 +195,20 @@ impl Finder {
     }
 
     /// `keyframe_from_camera` of the frame in the pyramid, where it can be aligned to `keyframe` from some view
-    /// near it.
-    fn find_near(&mut self, keyframe: &Keyframe, rotation_rad: f64) -> Option<SE3> {
+    /// near the expected one.
+    fn find_near(&mut self, keyframe: &Keyframe, expected: &SE3, rotation_rad: f64) -> Option<SE3> {
         self.reference.prepare_into(keyframe);
         let (aligner, reference, pyramid) = (&self.aligner, &self.reference, &self.pyramid);
         let mut best: Option<(Alignment, NormalEquations)> = None;
-        for keyframe_from_camera in turned(&SE3::identity(), rotation_rad) {
+        for keyframe_from_camera in turned(expected, rotation_rad) {
             let start = keyframe_from_camera.inverse();
             let mut other = aligner.start(reference, pyramid, &start, Brightness::default());
             let level = other.level;
             aligner.solve_level(reference, pyramid, level, &mut other, &mut |_| true);
+            // A small gain explains any image, and would hide the pose that may be claimed.
+            if !self.verdict.is_near(&other) {
+                continue;
+            }
             let explained = aligner.explanation(reference, pyramid, &other);
             if best.as_ref().is_none_or(|(_, by_best)| is_better(&explained, by_best)) {
                 best = Some((other, explained));
@@ -164,6 +220,17 @@ impl Finder {
         let keyframe_from_camera = best.state.current_from_keyframe.inverse();
         (verdict.is_tracked() && keyframe_from_camera.is_finite()).then_some(keyframe_from_camera)
     }
+}
+
+/// Keyframes that may be gone back to, the newest first. The tracker itself looks around the active one.
+fn eligible(keyframes: &[Keyframe], active: usize) -> impl Iterator<Item = usize> {
+    let is_eligible = move |index: &usize| {
+        let keyframe = &keyframes[*index];
+        *index != active
+            && keyframe.map_state == MapState::Established
+            && keyframe.points.len() >= least_points(&keyframe.intrinsics)
+    };
+    (0..keyframes.len()).rev().filter(is_eligible)
 }
 
 #[cfg(test)]
@@ -232,6 +299,28 @@ pub(super) mod tests {
         assert_eq!(find(&mut recovery, away * near_home), Some(1));
         assert_eq!(find(&mut recovery, at([0.0, 0.0, 0.0, 0.0, -1.5, 0.0])), None);
         assert_eq!(find(&mut recovery, elsewhere), None, "the one in force is the tracker's");
+    }
+
+    #[test]
+    fn a_camera_that_is_rolled_far_is_found_with_its_roll() {
+        let scene = Scene::new(3);
+        let home = keyframe(&scene, 0, at([0.0; 6]));
+        let away = keyframe(&scene, 1, at([0.0, 0.0, 0.0, 0.0, 1.2, 0.0]));
+        let active = keyframe(&scene, 2, at([0.0, 0.0, 0.0, 0.0, 2.8, 0.0]));
+        let keyframes = [home, away, active];
+        let params = RecoveryParams::default();
+        let view = at([0.05, -0.05, 0.05, 0.0, 0.0, 0.0]) * at([0.0, 0.0, 0.0, 0.1, -0.1, 1.9]);
+        let pixels = scene.render(&CAMERA, &view).noisy(2.0, 9);
+        let mut finder = Finder::new(&CAMERA);
+        assert_eq!(finder.find(&keyframes, 2, &mut 0, &pixels, &params), None);
+        let mut compared = 0;
+        let found = finder.find_turned(&keyframes, 2, &mut compared, &pixels, &params);
+        let (index, found) = found.unwrap();
+        assert_eq!((index, compared), (0, 2));
+        let error = (view.inverse() * found).log().norm();
+        assert!(error < 0.02, "found {error} away from where it is");
+        let nowhere = scene.render(&CAMERA, &at([0.0, 0.0, 0.0, 0.0, -1.5, 0.0])).noisy(2.0, 9);
+        assert!(finder.find_turned(&keyframes, 2, &mut 0, &nowhere, &params).is_none());
     }
 
     #[test]

@@ -31,6 +31,8 @@ pub(super) struct Loss {
     lost_nanos: i64,
     /// Keyframes searched since then.
     pub(super) searched: usize,
+    /// Keyframes that were compared with turned views.
+    pub(super) compared: usize,
 }
 
 impl Phase {

@@ -11,7 +11,7 @@ use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
-use crate::slam::mapper::consistency::Contradiction;
+use crate::slam::mapper::consistency::{Contradiction, START_KEYFRAMES};
 use crate::slam::mapper::phase::{Loss, Phase};
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::parameter::{ParameterError, check_range};
@@ -75,6 +75,15 @@ impl Mapper {
             {
                 return self.restore_keyframe(index, &keyframe_from_camera);
             }
+            let (keyframes, params) = (&self.map.keyframes, &self.params.recovery);
+            let compared = &mut loss.compared;
+            let found =
+                self.finder.find_turned(keyframes, active.index, compared, frame.pixels, params);
+            if let Some((index, keyframe_from_camera)) = found
+                && self.is_confirmed(index, &keyframe_from_camera, frame.pixels)
+            {
+                return self.restore_keyframe(index, &keyframe_from_camera);
+            }
         }
         self.phase = self.phase.with_loss(loss);
         let is_restarting = matches!(self.phase, Phase::Restarting(_));
@@ -91,34 +100,37 @@ impl Mapper {
         self.begin(frame, pose, sensor_depth)
     }
 
-    /// Whether another keyframe that sees the same place has the camera there too, where there is one: one alone may
-    /// look like what it does not show.
+    /// Whether another keyframe that sees the same place has the camera there too: one alone may look like what it does
+    /// not show. It is believed alone only where the map is so young that there may be no other.
     fn is_confirmed(&mut self, index: usize, keyframe_from_camera: &SE3, pixels: &[u8]) -> bool {
         /// Keyframes that are asked.
         const MOST: usize = 3;
         /// Largest distance of the camera from them, in their mean depths.
         const REACH: f64 = 0.7;
-        /// Least share of their points that the camera must see.
-        const LEAST_USAGE: f64 = 0.5;
+        /// Least share of their points that the camera must see: one that is turned far sees no more of any.
+        const LEAST_USAGE: f64 = 0.2;
         /// Largest difference of the two poses, translation in mean depths plus rotation in radians: a wrong place is
         /// further off, and a map that has drifted by as much is none to go on with.
         const MAX_DISAGREEMENT: f64 = 0.1;
         let found = &self.map.keyframes[index];
+        let epoch = found.epoch;
         let map_from_camera = found.map_from_keyframe.place(keyframe_from_camera);
         let mut others: Vec<(f64, usize, SE3)> = self
             .map
-            .seen_from(found.epoch, &map_from_camera, REACH)
+            .seen_from(epoch, &map_from_camera, REACH)
             .filter(|(other, view)| *other != index && view.usage >= LEAST_USAGE)
             .filter(|(other, _)| self.map.keyframes[*other].map_state == MapState::Established)
             .map(|(other, view)| (view.usage, other, view.keyframe_from_camera))
             .collect();
         others.sort_by(|one, other| other.0.total_cmp(&one.0));
         others.truncate(MOST);
+        let of_epoch = self.map.keyframes.iter().filter(|keyframe| keyframe.epoch == epoch);
+        let is_young = of_epoch.take(START_KEYFRAMES + 1).count() <= START_KEYFRAMES;
         let mut agrees = |(_, other, expected): &(f64, usize, SE3)| {
             let keyframe = &self.map.keyframes[*other];
             self.finder.locate(keyframe, pixels, expected, MAX_DISAGREEMENT).is_some()
         };
-        others.is_empty() || others.iter().any(&mut agrees)
+        others.is_empty() && is_young || others.iter().any(&mut agrees)
     }
 
     /// Declares the active keyframe contradictory, or all of its epoch where its start was wrong: nothing is claimed
@@ -231,6 +243,19 @@ mod tests {
         assert!(mapper_with(&[0.0]).is_confirmed(0, &turned, &pixels));
         mapper.map.keyframes[1].map_state = MapState::Rejected;
         assert!(mapper.is_confirmed(0, &turned, &pixels));
+    }
+
+    #[test]
+    fn in_a_map_of_many_keyframes_a_place_that_no_other_sees_is_not_believed() {
+        let here = sideways(0.1);
+        let pixels = Scene::new(3).render(&CAMERA, &here).noisy(2.0, 9);
+        let confirms = |elsewhere: usize| {
+            let places = (0..elsewhere).map(|k| 30.0 + 0.3 * k as f64);
+            let places: Vec<f64> = std::iter::once(0.0).chain(places).collect();
+            mapper_with(&places).is_confirmed(0, &here, &pixels)
+        };
+        assert!(confirms(START_KEYFRAMES - 1), "the map is young");
+        assert!(!confirms(START_KEYFRAMES));
     }
 
     #[test]

@@ -99,7 +99,7 @@ impl VerdictParams {
     }
 
     /// Whether place and brightness are such as a camera that is found again has.
-    fn is_near(&self, alignment: &Alignment) -> bool {
+    pub fn is_near(&self, alignment: &Alignment) -> bool {
         let state = &alignment.state;
         state.current_from_keyframe.translation.norm() <= self.recovery_distance
             && state.brightness.a.abs() <= self.recovery_gain

@@ -1,0 +1,191 @@
+//! How alike two images look where one camera is turned far against the other, rolled above all: small images without
+//! their slow changes, compared over what both see.
+
+use nalgebra::{Rotation3, UnitQuaternion, Vector3};
+
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::mapper::appearance::{COLUMNS, ROWS};
+
+/// Pixels of a small image.
+const COUNT: usize = COLUMNS * ROWS;
+/// Pixels that are summed up side by side, in the same order on every CPU.
+const LANES: usize = 8;
+/// In place of a pixel that the camera does not see.
+const OUTSIDE: u16 = u16::MAX;
+
+/// Rotations that a camera may have against a keyframe, and what it sees of the keyframe's image then if nothing is near.
+#[derive(Debug)]
+pub(super) struct TurnedViews {
+    camera: Intrinsics,
+    /// `keyframe_from_camera`.
+    rotations: Vec<UnitQuaternion<f64>>,
+    /// For each of them, pixel by pixel of a keyframe's small image, the camera's pixel.
+    pixels: Vec<u16>,
+}
+
+/// Which of the rotations makes two images look most alike.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct TurnedView {
+    /// `keyframe_from_camera`.
+    pub(super) rotation: UnitQuaternion<f64>,
+    /// Correlation, more where more is seen by both.
+    pub(super) score: f32,
+}
+
+impl TurnedViews {
+    /// For two images of `camera`.
+    pub(super) fn new(camera: &Intrinsics) -> Self {
+        /// Steps of the rotation about the optical axis: all around.
+        const ROLLS: u32 = 24;
+        /// Steps of pan and tilt either way, degrees each: about what a coarse alignment reaches on both sides.
+        const STEPS: i32 = 4;
+        const STEP_DEG: f64 = 9.0;
+        /// Share of the keyframe's image that the camera must see: below a quarter chance finds likeness.
+        const LEAST_SEEN: usize = COUNT / 4;
+        let mut views = Self { camera: *camera, rotations: Vec::new(), pixels: Vec::new() };
+        let about = |axis, angle| UnitQuaternion::from_axis_angle(&axis, angle);
+        let step = |k: i32| STEP_DEG.to_radians() * f64::from(k);
+        for roll in (0..ROLLS).map(|k| std::f64::consts::TAU * f64::from(k) / f64::from(ROLLS)) {
+            for (tilt, pan) in (-STEPS..=STEPS).flat_map(|t| (-STEPS..=STEPS).map(move |p| (t, p)))
+            {
+                let rotation = about(Vector3::y_axis(), step(pan))
+                    * about(Vector3::x_axis(), step(tilt))
+                    * about(Vector3::z_axis(), roll);
+                let camera_from_keyframe = rotation.inverse().to_rotation_matrix();
+                let begin = views.pixels.len();
+                views
+                    .pixels
+                    .extend((0..COUNT).map(|pixel| seen_at(camera, &camera_from_keyframe, pixel)));
+                let seen = views.pixels[begin..].iter().filter(|&&at| at != OUTSIDE).count();
+                match seen >= LEAST_SEEN {
+                    true => views.rotations.push(rotation),
+                    false => views.pixels.truncate(begin),
+                }
+            }
+        }
+        views
+    }
+
+    /// Whether it is for this camera.
+    pub(super) fn is_for(&self, camera: &Intrinsics) -> bool {
+        self.camera == *camera
+    }
+
+    /// For each keyframe how it looks most like the frame. Both are details of
+    /// [`Appearance`](crate::slam::mapper::appearance::Appearance).
+    pub(super) fn compare(&self, frame: &[f32], keyframes: &[&[f32]]) -> Vec<Option<TurnedView>> {
+        let mut best: Vec<Option<TurnedView>> = vec![None; keyframes.len()];
+        let (mut seen, mut mask) = ([0.0f32; COUNT], [0.0f32; COUNT]);
+        for (rotation, pixels) in self.rotations.iter().zip(self.pixels.chunks_exact(COUNT)) {
+            for ((seen, mask), &at) in seen.iter_mut().zip(&mut mask).zip(pixels) {
+                let value = frame.get(usize::from(at));
+                (*seen, *mask) = value.map_or((0.0, 0.0), |&value| (value, 1.0));
+            }
+            let count: f32 = mask.iter().sum();
+            let mean = seen.iter().sum::<f32>() / count;
+            seen.iter_mut().zip(&mask).for_each(|(seen, mask)| *seen -= mean * mask);
+            let [squares, ..] = sums(&seen, &seen, &mask);
+            for (best, keyframe) in best.iter_mut().zip(keyframes) {
+                let [common, theirs, their_squares] = sums(keyframe, &seen, &mask);
+                let variances = squares * (their_squares - theirs * theirs / count);
+                let Some(score) = score(common, variances, count) else { continue };
+                if best.is_none_or(|best| score > best.score) {
+                    *best = Some(TurnedView { rotation: *rotation, score });
+                }
+            }
+        }
+        best
+    }
+}
+
+/// The pixel of the camera that sees what is far away at a pixel of the keyframe.
+fn seen_at(camera: &Intrinsics, camera_from_keyframe: &Rotation3<f64>, pixel: usize) -> u16 {
+    /// Least cosine of a ray and the optical axis: beyond it a view is stretched without limit.
+    const LEAST_COSINE: f64 = 0.2;
+    let scale_u = camera.width as f64 / COLUMNS as f64;
+    let scale_v = camera.height as f64 / ROWS as f64;
+    let u = ((pixel % COLUMNS) as f64 + 0.5) * scale_u - 0.5;
+    let v = ((pixel / COLUMNS) as f64 + 0.5) * scale_v - 0.5;
+    let ray = Vector3::new((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0);
+    let ray = camera_from_keyframe * ray.normalize();
+    if !(ray.z > LEAST_COSINE) {
+        return OUTSIDE;
+    }
+    let column = ((camera.fx * ray.x / ray.z + camera.cx + 0.5) / scale_u).floor();
+    let row = ((camera.fy * ray.y / ray.z + camera.cy + 0.5) / scale_v).floor();
+    let inside = (0.0..COLUMNS as f64).contains(&column) && (0.0..ROWS as f64).contains(&row);
+    if inside { (row as usize * COLUMNS + column as usize) as u16 } else { OUTSIDE }
+}
+
+/// Sums of a keyframe's values times the frame's, of its own where the mask is 1, and of their squares.
+fn sums(keyframe: &[f32], frame: &[f32; COUNT], mask: &[f32; COUNT]) -> [f32; 3] {
+    let mut lanes = [[0.0f32; LANES]; 3];
+    let chunks = keyframe.as_chunks::<LANES>().0.iter().zip(frame.as_chunks::<LANES>().0);
+    for ((theirs, ours), mask) in chunks.zip(mask.as_chunks::<LANES>().0) {
+        for k in 0..LANES {
+            let masked = theirs[k] * mask[k];
+            lanes[0][k] += theirs[k] * ours[k];
+            lanes[1][k] += masked;
+            lanes[2][k] += masked * theirs[k];
+        }
+    }
+    lanes.map(|lane| lane.iter().sum())
+}
+
+/// Correlation in standard deviations of chance, but for a factor (Fisher's transformation); `None` where there is
+/// nothing to be compared.
+fn score(common: f32, variances: f32, count: f32) -> Option<f32> {
+    /// Variance of the details, grey levels², below which an image shows nothing.
+    const LEAST_VARIANCE: f32 = 0.05;
+    /// What rounding may make of a perfect likeness.
+    const MOST: f32 = 0.999;
+    let least = LEAST_VARIANCE * count;
+    (variances > least * least)
+        .then(|| (common / variances.sqrt()).clamp(-MOST, MOST).atanh() * count.sqrt())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::geometry::se3::SE3;
+    use crate::slam::mapper::appearance::Appearance;
+    use crate::slam::test_scene::{CAMERA, Scene};
+
+    fn seen(pose: &SE3, seed: u64) -> Appearance {
+        let view = Scene::new(3).render(&CAMERA, pose);
+        Appearance::of(&view.noisy(2.0, seed), CAMERA.width, CAMERA.height).unwrap()
+    }
+
+    #[test]
+    fn a_rolled_and_tilted_view_is_known_and_how_it_is_turned() {
+        let views = TurnedViews::new(&CAMERA);
+        assert!(views.is_for(&CAMERA));
+        let about =
+            |axis, degrees: f64| UnitQuaternion::from_axis_angle(&axis, degrees.to_radians());
+        let turned = |roll, tilt| SE3 {
+            rotation: about(Vector3::x_axis(), tilt) * about(Vector3::z_axis(), roll),
+            ..SE3::identity()
+        };
+        let here = seen(&SE3::identity(), 1);
+        let away = SE3 { rotation: about(Vector3::y_axis(), 100.0), ..SE3::identity() };
+        let elsewhere = seen(&away, 2);
+        for (roll, tilt) in [(0.0, 0.0), (110.0, 0.0), (-70.0, 15.0), (180.0, -15.0)] {
+            let pose = turned(roll, tilt);
+            let frame = seen(&pose, 3);
+            let found = views.compare(frame.details(), &[here.details(), elsewhere.details()]);
+            let [Some(known), Some(other)] = found[..] else { panic!("{found:?}") };
+            let error_deg = known.rotation.angle_to(&pose.rotation).to_degrees();
+            assert!(error_deg < 12.0, "{roll} {tilt}: {error_deg}");
+            assert!(known.score > 1.2 * other.score, "{roll} {tilt}: {known:?} {other:?}");
+        }
+    }
+
+    #[test]
+    fn what_shows_nothing_is_like_nothing_however_it_is_turned() {
+        let views = TurnedViews::new(&CAMERA);
+        let here = seen(&SE3::identity(), 1);
+        let wall = [0.0; COUNT];
+        assert!(views.compare(&wall, &[here.details()])[0].is_none());
+        assert!(views.compare(here.details(), &[&wall])[0].is_none());
+    }
+}
