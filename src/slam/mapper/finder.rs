@@ -186,7 +186,11 @@ impl Finder {
         let (start, brightness) = (expected.inverse(), Brightness::default());
         let (reference, pyramid) = (&self.reference, &self.pyramid);
         let found = self.aligner.align(reference, pyramid, &start, brightness, &mut |_| true);
-        if !self.verdict.judge(&found, &quality_of(&found), true, 0).is_tracked() {
+        /// Share of inliers that agreement wants: less than a claim, since where it begins is known.
+        const LEAST_INLIERS: f64 = 0.65;
+        let quality = quality_of(&found);
+        let is_tracked = self.verdict.judge(&found, &quality, false, 0).is_tracked();
+        if !is_tracked || quality.inlier_ratio < LEAST_INLIERS {
             return None;
         }
         let error = (found.state.current_from_keyframe * *expected).log();
