@@ -35,6 +35,8 @@ pub(super) struct Finder {
     appearances: Vec<(u64, Option<Appearance>)>,
     /// Made at the first loss that needs them: two megabytes.
     turned_views: Option<TurnedViews>,
+    /// Place of a keyframe that was found and not confirmed: the next search leaves it out, lest it be all that is found.
+    doubted: Option<usize>,
 }
 
 impl Finder {
@@ -52,6 +54,7 @@ impl Finder {
             reference: Reference::new(reference),
             appearances: Vec::new(),
             turned_views: None,
+            doubted: None,
         }
     }
 
@@ -69,6 +72,8 @@ impl Finder {
         let seen = Appearance::of(pixels, camera.width, camera.height)?;
         self.learn(keyframes);
         let mut candidates = self.alike(keyframes, active, &seen);
+        let doubted = self.doubted.take();
+        candidates.retain(|index| Some(*index) != doubted);
         candidates.truncate(params.num_keyframes);
         let (first, others) = candidates.split_first()?;
         self.pyramid.fill(pixels);
@@ -121,6 +126,7 @@ impl Finder {
         let seen = Appearance::of(pixels, camera.width, camera.height)?;
         self.learn(keyframes);
         let eligible: Vec<usize> = eligible(keyframes, active)
+            .filter(|index| Some(*index) != self.doubted)
             .filter(|&index| self.appearance(&keyframes[index]).is_some())
             .collect();
         let count = eligible.len().min(MOST_COMPARED);
@@ -150,6 +156,11 @@ impl Finder {
             }
         }
         None
+    }
+
+    /// A keyframe was found that another contradicts, or none confirms.
+    pub(super) fn doubt(&mut self, index: usize) {
+        self.doubted = Some(index);
     }
 
     /// What a keyframe looks like, where that is known.
@@ -190,7 +201,8 @@ impl Finder {
         const LEAST_INLIERS: f64 = 0.65;
         let quality = quality_of(&found);
         let is_tracked = self.verdict.judge(&found, &quality, false, 0).is_tracked();
-        if !is_tracked || quality.inlier_ratio < LEAST_INLIERS {
+        let is_even = self.verdict.has_likely_gain(&found);
+        if !is_tracked || !is_even || quality.inlier_ratio < LEAST_INLIERS {
             return None;
         }
         let error = (found.state.current_from_keyframe * *expected).log();

@@ -6,6 +6,7 @@ use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::pose::{NO_KEYFRAME, PoseEstimate};
 use crate::slam::window::Window;
 use crate::slam::window::frames::{PlacedFrame, TrackedFrame};
+use crate::slam::window::marginals::Marginal;
 
 impl Mapper {
     /// The keyframes to be estimated together, where one has been added since the last time: to be given back with
@@ -41,11 +42,8 @@ impl Mapper {
             self.publish_depth();
             outcome.keyframe_changed = true;
         }
-        let mut correction = window.correction(&self.map);
-        for keyframe in &mut correction.keyframes {
-            let marginal = window.marginal_of(keyframe.keyframe_id);
-            keyframe.modes = marginal.map(|of| self.modes.of_estimate(of, &self.params.modes));
-        }
+        let modes_of = |marginal: &Marginal| self.modes.of_estimate(marginal, &self.params.modes);
+        let correction = window.correction(&self.map, modes_of);
         if !correction.keyframes.is_empty() {
             // Its numbers are checked: one that is broken leaves the map as it is.
             match self.apply(&correction) {

@@ -70,19 +70,21 @@ impl Mapper {
             let (keyframes, params) = (&self.map.keyframes, &self.params.recovery);
             let searched = &mut loss.searched;
             let found = self.finder.find(keyframes, active.index, searched, frame.pixels, params);
-            if let Some((index, keyframe_from_camera)) = found
-                && self.is_confirmed(index, &keyframe_from_camera, frame.pixels)
-            {
-                return self.restore_keyframe(index, &keyframe_from_camera);
+            if let Some((index, keyframe_from_camera)) = found {
+                if self.is_confirmed(index, &keyframe_from_camera, frame.pixels) {
+                    return self.restore_keyframe(index, &keyframe_from_camera);
+                }
+                self.finder.doubt(index);
             }
             let (keyframes, params) = (&self.map.keyframes, &self.params.recovery);
             let compared = &mut loss.compared;
             let found =
                 self.finder.find_turned(keyframes, active.index, compared, frame.pixels, params);
-            if let Some((index, keyframe_from_camera)) = found
-                && self.is_confirmed(index, &keyframe_from_camera, frame.pixels)
-            {
-                return self.restore_keyframe(index, &keyframe_from_camera);
+            if let Some((index, keyframe_from_camera)) = found {
+                if self.is_confirmed(index, &keyframe_from_camera, frame.pixels) {
+                    return self.restore_keyframe(index, &keyframe_from_camera);
+                }
+                self.finder.doubt(index);
             }
         }
         self.phase = self.phase.with_loss(loss);

@@ -87,7 +87,7 @@ impl TurnedViews {
             let [squares, ..] = sums(&seen, &seen, &mask);
             for (best, keyframe) in best.iter_mut().zip(keyframes) {
                 let [common, theirs, their_squares] = sums(keyframe, &seen, &mask);
-                let variances = squares * (their_squares - theirs * theirs / count);
+                let variances = [squares, their_squares - theirs * theirs / count];
                 let Some(score) = score(common, variances, count) else { continue };
                 if best.is_none_or(|best| score > best.score) {
                     *best = Some(TurnedView { rotation: *rotation, score });
@@ -134,14 +134,14 @@ fn sums(keyframe: &[f32], frame: &[f32; COUNT], mask: &[f32; COUNT]) -> [f32; 3]
 
 /// Correlation in standard deviations of chance, but for a factor (Fisher's transformation); `None` where there is
 /// nothing to be compared.
-fn score(common: f32, variances: f32, count: f32) -> Option<f32> {
+fn score(common: f32, [ours, theirs]: [f32; 2], count: f32) -> Option<f32> {
     /// Variance of the details, grey levels², below which an image shows nothing.
     const LEAST_VARIANCE: f32 = 0.05;
     /// What rounding may make of a perfect likeness.
     const MOST: f32 = 0.999;
     let least = LEAST_VARIANCE * count;
-    (variances > least * least)
-        .then(|| (common / variances.sqrt()).clamp(-MOST, MOST).atanh() * count.sqrt())
+    (ours > least && theirs > least)
+        .then(|| (common / (ours * theirs).sqrt()).clamp(-MOST, MOST).atanh() * count.sqrt())
 }
 
 #[cfg(test)]

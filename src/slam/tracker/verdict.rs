@@ -27,7 +27,7 @@ pub struct VerdictParams {
     /// Largest logarithm of the gain, either way, with which a lost tracker may claim a pose: a small gain flattens any
     /// image. Where the camera was before, automatic exposure is about what it was; wrong places had 0.7 to 1.
     pub recovery_gain: f64,
-    /// Share of points in view below which a pose is degraded.
+    /// Share of points in view and not clipped by the sensor below which a pose is degraded.
     pub degraded_in_view: f64,
     /// Whitened RMSE above which a pose is degraded.
     pub degraded_whitened_rmse: f64,
@@ -73,6 +73,7 @@ impl VerdictParams {
         was_lost: bool,
         missing: u64,
     ) -> TrackingState {
+        let compared = f64::from(quality.points) / alignment.points.max(1) as f64;
         let inliers = self.lost_inliers + if was_lost { self.recovery_margin } else { 0.0 };
         if !alignment.state.current_from_keyframe.is_finite() {
             TrackingState::Lost(LostReason::Diverged)
@@ -80,17 +81,15 @@ impl VerdictParams {
             TrackingState::Lost(LostReason::NoPoints)
         } else if alignment.ending == Ending::NothingInView
             || quality.points < self.min_points
-            || f64::from(quality.points) < self.lost_in_view * alignment.points as f64
+            || compared < self.lost_in_view
             || (was_lost && !self.is_near(alignment))
         {
             TrackingState::Lost(LostReason::Diverged)
-        } else if quality.inlier_ratio < inliers
-            || (was_lost && quality.in_view_ratio < self.degraded_in_view)
-        {
+        } else if quality.inlier_ratio < inliers || (was_lost && compared < self.degraded_in_view) {
             TrackingState::Lost(LostReason::TooFewInliers)
         } else if alignment.ending == Ending::OutOfBudget {
             TrackingState::Degraded(DegradedReason::Budget)
-        } else if quality.in_view_ratio < self.degraded_in_view {
+        } else if compared < self.degraded_in_view {
             TrackingState::Degraded(DegradedReason::LowOverlap)
         } else if quality.whitened_rmse > self.degraded_whitened_rmse {
             TrackingState::Degraded(DegradedReason::HighResidual)
@@ -103,9 +102,13 @@ impl VerdictParams {
 
     /// Whether place and brightness are such as a camera that is found again has.
     pub fn is_near(&self, alignment: &Alignment) -> bool {
-        let state = &alignment.state;
-        state.current_from_keyframe.translation.norm() <= self.recovery_distance
-            && state.brightness.a.abs() <= self.recovery_gain
+        alignment.state.current_from_keyframe.translation.norm() <= self.recovery_distance
+            && self.has_likely_gain(alignment)
+    }
+
+    /// Whether the brightness is such.
+    pub fn has_likely_gain(&self, alignment: &Alignment) -> bool {
+        alignment.state.brightness.a.abs() <= self.recovery_gain
     }
 }
 

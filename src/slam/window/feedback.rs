@@ -3,18 +3,25 @@
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::map::{Correction, KeyframeCorrection, LogPlane, Map};
+use crate::slam::modes::ModeCovariance;
 use crate::slam::window::keyframe::WindowKeyframe;
+use crate::slam::window::marginals::Marginal;
 use crate::slam::window::plane::{Correspondence, fit};
 use crate::slam::window::{Window, selection};
 
 impl Window {
     /// What of the map is known better since the last adjustment: the keyframes that were free move, and their depth is
     /// moved to where their points are.
-    pub fn correction(&self, map: &Map) -> Correction {
+    /// `modes_of` says what a marginal makes of the modes of a keyframe's depth.
+    pub fn correction(
+        &self,
+        map: &Map,
+        modes_of: impl Fn(&Marginal) -> ModeCovariance,
+    ) -> Correction {
         let mut keyframes: Vec<KeyframeCorrection> = Vec::new();
         for &id in &self.moved {
             let Some(keyframe) = map.get(id) else { continue };
-            keyframes.extend(self.corrected(keyframe));
+            keyframes.extend(self.corrected(keyframe, &modes_of));
         }
         let followers = self.followers(map, &keyframes);
         keyframes.extend(followers);
@@ -47,7 +54,11 @@ impl Window {
             .collect()
     }
 
-    fn corrected(&self, keyframe: &Keyframe) -> Option<KeyframeCorrection> {
+    fn corrected(
+        &self,
+        keyframe: &Keyframe,
+        modes_of: impl Fn(&Marginal) -> ModeCovariance,
+    ) -> Option<KeyframeCorrection> {
         let known = self.get(keyframe.keyframe_id)?;
         let place = known.camera_from_map.inverse();
         let unit = keyframe.map_from_keyframe.scale;
@@ -60,12 +71,16 @@ impl Window {
             }
         };
         // Depth in the unit of the map is larger by e^offset, so that the unit is shorter.
-        let [offset, per_x, per_y] = fit(&better).unwrap_or_default();
+        let plane = fit(&better);
+        // Depth that was not moved to the points is no surer than before.
+        let is_tilted = plane.is_some_and(|[_, per_x, per_y]| (per_x, per_y) != (0.0, 0.0));
+        let modes = self.marginal_of(keyframe.keyframe_id).filter(|_| is_tilted).map(modes_of);
+        let [offset, per_x, per_y] = plane.unwrap_or_default();
         Some(KeyframeCorrection {
             keyframe_id: keyframe.keyframe_id,
             map_from_keyframe: Sim3::new(place, unit * (-offset).exp()),
             depth: LogPlane { offset: 0.0, per_x, per_y },
-            modes: None,
+            modes,
         })
     }
 

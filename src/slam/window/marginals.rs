@@ -23,10 +23,10 @@ use crate::slam::window::comparison::{POSE, Pair};
 use crate::slam::window::keyframe::{WindowKeyframe, WindowPoint};
 use crate::slam::window::solver::Solver;
 use crate::slam::window::system::{Members, System};
-use crate::slam::window::view::{Sight, Views};
+use crate::slam::window::view::{MIN_DEPTH_RATIO, Sight, Views};
 
 /// How uncertain a keyframe is that was estimated with others, by the noise of the residuals alone: they are taken for
-/// independent, which makes it too sure.
+/// independent, and the keyframes that hold the others in place for exact, which makes it too sure.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Marginal {
     /// The keyframe.
@@ -89,10 +89,13 @@ impl Window {
 
     /// Keeps those of the members that were free in the adjustment that the solver's system is of.
     pub(super) fn keep_marginals(&mut self, members: &Members<'_>) {
-        for marginal in marginals(&self.keyframes, members, &mut self.solver, &self.camera) {
-            self.marginals.retain(|known| known.keyframe_id != marginal.keyframe_id);
-            self.marginals.push(marginal);
+        let free = members.members.iter().zip(members.free).filter(|(_, free)| free.is_some());
+        for (&member, _) in free {
+            let moved = self.keyframes[member].keyframe_id;
+            self.marginals.retain(|known| known.keyframe_id != moved);
         }
+        let found = marginals(&self.keyframes, members, &mut self.solver, &self.camera);
+        self.marginals.extend(found);
     }
 }
 
@@ -233,6 +236,10 @@ fn mean_squared_parallax(
             let observer_from_host = observer.camera_from_map * map_from_host;
             let moved = observer_from_host.translation * point.inverse_depth;
             let warped = observer_from_host.rotation * ray + moved;
+            // Seen when the comparisons were chosen; the estimate may have moved it since.
+            if !(warped.z >= MIN_DEPTH_RATIO) {
+                continue;
+            }
             let along = |axis: usize, focal: f64| {
                 focal * (moved[axis] - warped[axis] / warped.z * moved.z) / warped.z
             };

@@ -347,7 +347,7 @@ fn keyframes_that_are_not_estimated_follow_the_last_before_them_that_moved() {
     let mut map = Map::default();
     let others = [(2, 0, 0.5), (3, 0, 1.0), (4, 0, 1.5), (5, 0, 2.0), (6, 0, 2.5), (7, 1, 0.0)];
     map.keyframes.extend(others.map(|(id, epoch, x)| in_map(id, epoch, x, 1.0)));
-    let correction = window.correction(&map);
+    let correction = window.correction(&map, |_| ModeCovariance::ZERO);
     let mut moved: Vec<_> = correction.keyframes.iter().map(|of| of.keyframe_id).collect();
     moved.sort_unstable();
     assert_eq!(moved, [3, 4, 5, 6]);

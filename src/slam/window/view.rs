@@ -13,7 +13,7 @@ const MIN_COSINE: f64 = 0.766;
 /// Largest ratio of the distances from which a point is seen: beyond, a pattern covers something else.
 const MAX_DISTANCE_RATIO: f64 = 2.0;
 /// Nearest that a point may be to an observer, in its distance from its host.
-const MIN_DEPTH_RATIO: f64 = 0.05;
+pub(super) const MIN_DEPTH_RATIO: f64 = 0.05;
 
 /// The points of a host that an observer sees.
 #[derive(Debug, Clone, Copy, PartialEq)]
