@@ -8,6 +8,7 @@ use super::*;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::Keyframe;
+use crate::slam::modes::ModeCovariance;
 use crate::slam::test_scene::{CAMERA, Random, Scene};
 
 fn ray(u: f64, v: f64) -> [f32; 2] {
