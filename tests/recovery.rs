@@ -133,6 +133,7 @@ fn error_ratio(record: &RunRecord, epoch: u32) -> f64 {
     evaluation.ate.rmse / evaluation.path_length
 }
 
+/// Errors over the tracked frames of an epoch.
 fn error_of(record: &RunRecord, epoch: u32) -> TrajectoryEvaluation {
     let tracked: Vec<StampedPose> = estimates(record)
         .filter(|e| e.state.is_tracked() && e.epoch == epoch)
@@ -241,7 +242,7 @@ fn back_at_a_place_of_an_earlier_epoch_the_camera_is_found_there() {
 
 #[test]
 fn a_camera_that_comes_back_elsewhere_is_not_claimed_where_it_is_not() {
-    // Frames that are seen before, between and after two blackouts, while which the camera moves on.
+    // Frames that are seen before, between and after two blackouts, during which the camera moves on.
     for (name, most_m, seen) in [
         ("redkitchen", 0.08, [0..175, 224..350, 399..500]),
         ("redkitchen", 0.08, [20..188, 235..356, 403..500]),
