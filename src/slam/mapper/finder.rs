@@ -318,6 +318,24 @@ pub(super) mod tests {
     }
 
     #[test]
+    fn one_that_was_not_confirmed_leaves_the_next_frame_to_others() {
+        let scene = Scene::new(3);
+        let [one, other] = [0.0, 0.05].map(|x| at([x, 0.0, 0.0, 0.0, 0.0, 0.0]));
+        let active = keyframe(&scene, 2, at([0.0, 0.0, 0.0, 0.0, 2.8, 0.0]));
+        let keyframes = [keyframe(&scene, 0, one), keyframe(&scene, 1, other), active];
+        let pixels = scene.render(&CAMERA, &at([0.01, 0.0, 0.0, 0.0, 0.0, 0.0])).noisy(2.0, 9);
+        let mut finder = Finder::new(&CAMERA);
+        let params = RecoveryParams::default();
+        let mut find = |doubted: Option<usize>| {
+            doubted.into_iter().for_each(|index| finder.doubt(index));
+            finder.find(&keyframes, 2, &mut 0, &pixels, &params).unwrap().0
+        };
+        let first = find(None);
+        assert_eq!(find(Some(first)), 1 - first);
+        assert_eq!(find(None), first);
+    }
+
+    #[test]
     fn a_camera_that_is_rolled_far_is_found_with_its_roll() {
         let scene = Scene::new(3);
         let home = keyframe(&scene, 0, at([0.0; 6]));
