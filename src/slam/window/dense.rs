@@ -2,8 +2,8 @@
 //!
 //! The filter saw each pixel in frames near its keyframe, at the poses that the tracker had then. Keyframes are farther
 //! away and known better: each inverse depth goes to where they agree best (Gauss–Newton, coarse to fine), and that is
-//! fused with what the filter had. In the descent the filter's value is the beginning and no prior: its errors are those
-//! of its poses, common to all pixels.
+//! fused with what the filter had, and with the pixels beside it. In the descent the filter's value is the beginning and
+//! no prior: its errors are those of its poses, common to all pixels.
 
 use std::collections::HashSet;
 
@@ -18,6 +18,7 @@ use crate::slam::window::comparison::{
     Compared, LANES, Pair, PairSums, Patterns, Robustness, SAMPLES, Wanted,
 };
 use crate::slam::window::keyframe::{WindowKeyframe, WindowPoint, halve, num_levels};
+use crate::slam::window::neighbours::{Single, smoothed};
 use crate::slam::window::plane::fit;
 
 /// Keyframes that a keyframe's depth is compared with, those that see most of it: with eight, which are farther off,
@@ -34,14 +35,14 @@ const SAMPLES_TOGETHER: f64 = 2.0;
 /// Depths that differ by more standard deviations than this are not of the same thing: the filter's stays.
 const MOST_APART: f64 = 3.0;
 /// By how much its variance grows then: it is half as sure.
-const CONTRADICTED: f32 = 4.0;
+const CONTRADICTED: f64 = 4.0;
 /// Variance over that of a point on which filter and keyframes agree, for each squared standard deviation that they are
 /// apart; with 2 instead of 1 one in a hundred true depths more lies within two standard deviations.
 const DOUBT: f64 = 2.0;
 /// Of the filter's standard deviation what no keyframe takes away: lens, shutter and slanted surfaces misplace a pixel in
 /// all of them alike. Chosen by the share of true depths within one standard deviation: between 0.6 and 0.8 in
 /// freiburg1_floor, ICL office3 and rooms.
-const COMMON: f64 = 0.45;
+const COMMON: f64 = 0.415;
 
 /// Depth of a keyframe as it is known better.
 #[derive(Debug, Clone, PartialEq)]
@@ -130,12 +131,14 @@ impl Window {
         let found: Vec<State> = found.into_iter().flatten().collect();
         let squared = mean_squared_residual(&found);
         let unit = keyframe.map_from_keyframe.scale as f32;
-        let fused = points.iter().zip(&found).map(|(point, found)| {
-            let DepthPoint { inverse_depth, variance, .. } = fused(point, found, squared);
-            let (inverse_depth, variance) = (inverse_depth * unit, variance * unit * unit);
-            DepthPoint { inverse_depth, variance, ..*point }
+        let fuse = |(point, found): (&DepthPoint, &State)| fused(point, found, squared);
+        let singles: Vec<Single> = points.iter().zip(&found).map(fuse).collect();
+        let smooth = smoothed(&points, &singles, self.camera.width).into_iter().map(|point| {
+            let (inverse_depth, variance) =
+                (point.inverse_depth * unit, point.variance * unit * unit);
+            DepthPoint { inverse_depth, variance, ..point }
         });
-        Some(RefinedDepth { keyframe_id: keyframe.keyframe_id, points: fused.collect() })
+        Some(RefinedDepth { keyframe_id: keyframe.keyframe_id, points: smooth.collect() })
     }
 
     /// Its images on the levels that are used.
@@ -298,24 +301,33 @@ fn mean_squared_residual(found: &[State]) -> f64 {
 }
 
 /// The mean of what the filter has and what the keyframes say, weighted by their certainty.
-fn fused(filter: &DepthPoint, found: &State, mean_squared_residual: f64) -> DepthPoint {
+fn fused(filter: &DepthPoint, found: &State, mean_squared_residual: f64) -> Single {
+    let (was, of_filter) = (f64::from(filter.inverse_depth), f64::from(filter.variance));
+    let common = COMMON * COMMON * of_filter;
+    // So much less sure than the filter by itself.
+    let unchanged = |doubt: f64| Single {
+        inverse_depth: was,
+        own: doubt * (of_filter - common),
+        common: doubt * common,
+        most: doubt * of_filter,
+    };
     if found.inliers == 0 || !(found.hessian > 0.0) {
-        return *filter;
+        return unchanged(1.0);
     }
     let of_keyframes = SAMPLES_TOGETHER * mean_squared_residual / f64::from(found.hessian);
-    let of_filter = f64::from(filter.variance);
-    let (was, is) = (f64::from(filter.inverse_depth), f64::from(found.inverse_depth));
+    let is = f64::from(found.inverse_depth);
     let apart = (is - was).powi(2) / (of_keyframes + of_filter);
     if !(apart <= MOST_APART * MOST_APART) {
-        return DepthPoint { variance: CONTRADICTED * filter.variance, ..*filter };
+        return unchanged(CONTRADICTED);
     }
     let share = of_filter / (of_filter + of_keyframes);
-    let common = COMMON * COMMON * of_filter;
     // What contradicts is less certain than what agrees.
-    let variance = (share * of_keyframes + common).min(of_filter) * (DOUBT * apart).max(1.0);
-    DepthPoint {
-        inverse_depth: (was + share * (is - was)) as f32,
-        variance: variance as f32,
-        ..*filter
+    let doubt = (DOUBT * apart).max(1.0);
+    let own = share * of_keyframes;
+    Single {
+        inverse_depth: was + share * (is - was),
+        own: doubt * own,
+        common: doubt * common,
+        most: doubt * (own + common).min(of_filter),
     }
 }

@@ -18,6 +18,7 @@ pub mod frames;
 pub mod keyframe;
 pub mod marginals;
 mod members;
+mod neighbours;
 pub mod params;
 mod plane;
 mod selection;

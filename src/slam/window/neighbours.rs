@@ -1,0 +1,165 @@
+//! Depth of a pixel together with that of the pixels beside it.
+//!
+//! What a pixel's own noise does is averaged over those neighbours that can be of the same surface; what displaces all of
+//! them alike stays. Once only, for depth that is final: a mean is no observation.
+
+use crate::slam::keyframe::DepthPoint;
+
+/// Standard deviation by which inverse depth changes from a pixel to the next on a slanted surface, a share of it.
+const SLANT: f64 = 0.005;
+/// Neighbours whose inverse depth is farther away than this many standard deviations are of another surface.
+const MOST_APART: f64 = 2.0;
+/// Pixels side by side that err together: their patterns share most samples.
+const PIXELS_TOGETHER: f64 = 3.0;
+
+/// What is known of a pixel's inverse depth by itself.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Single {
+    /// Inverse depth.
+    pub inverse_depth: f64,
+    /// Part of the variance that is the pixel's own.
+    pub own: f64,
+    /// Part that it shares with the pixels beside it.
+    pub common: f64,
+    /// Variance of both, at most.
+    pub most: f64,
+}
+
+/// The points, each the mean of itself and its neighbours in the image; `singles` are in their order.
+///
+/// A pixel at an edge of depth, of whose neighbours some are of another surface, is less sure by their share: which of
+/// the surfaces it is of is not known.
+pub fn smoothed(points: &[DepthPoint], singles: &[Single], width: usize) -> Vec<DepthPoint> {
+    let places = Places::new(points, width);
+    let smooth = |(point, single): (&DepthPoint, &Single)| {
+        let (mut sum, mut weights, mut others, mut apart) = (0.0, 0.0, 0.0f64, 0.0);
+        for (place, squared_distance) in places.around(point) {
+            let neighbour = &singles[place];
+            let squared = (neighbour.inverse_depth - single.inverse_depth).powi(2);
+            others += 1.0;
+            if !(squared <= MOST_APART * MOST_APART * (neighbour.most + single.most)) {
+                apart += 1.0;
+                continue;
+            }
+            let slant = (SLANT * single.inverse_depth).powi(2) * squared_distance;
+            let weight = 1.0 / (neighbour.own + slant);
+            sum += weight * neighbour.inverse_depth;
+            weights += weight;
+        }
+        let own = single.own.min(PIXELS_TOGETHER / weights);
+        let doubt = 1.0 + apart / others;
+        let variance = (own + single.common).min(single.most) * doubt * doubt;
+        let inverse_depth = (sum / weights) as f32;
+        let is_sane = inverse_depth > 0.0 && inverse_depth.is_finite() && variance.is_finite();
+        match is_sane {
+            true => DepthPoint { inverse_depth, variance: variance as f32, ..*point },
+            false => *point,
+        }
+    };
+    points.iter().zip(singles).map(smooth).collect()
+}
+
+/// Where in a list of points those of a pixel and its neighbours are.
+struct Places {
+    /// By pixel with a border of one, row by row; the number of points where there is none.
+    places: Vec<u32>,
+    stride: usize,
+    num_points: u32,
+}
+
+impl Places {
+    fn new(points: &[DepthPoint], width: usize) -> Self {
+        let stride = width + 2;
+        let rows = points.iter().map(|point| usize::from(point.v) + 3).max().unwrap_or_default();
+        let num_points = points.len() as u32;
+        let mut places = vec![num_points; stride * rows];
+        for (point, place) in points.iter().zip(0..) {
+            if usize::from(point.u) < width {
+                places[(usize::from(point.v) + 1) * stride + usize::from(point.u) + 1] = place;
+            }
+        }
+        Self { places, stride, num_points }
+    }
+
+    /// Those of a pixel and the eight around it, with their squared distance in pixels.
+    fn around(&self, point: &DepthPoint) -> impl Iterator<Item = (usize, f64)> {
+        let first = usize::from(point.v) * self.stride + usize::from(point.u);
+        let at = move |k: usize| {
+            let (row, column) = (k / 3, k % 3);
+            let place = *self.places.get(first + row * self.stride + column)?;
+            let squared = row.abs_diff(1).pow(2) + column.abs_diff(1).pow(2);
+            (place < self.num_points).then_some((place as usize, squared as f64))
+        };
+        (0..9).filter_map(at)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const WIDTH: usize = 40;
+
+    /// A plane of 40 × 30 pixels, inverse depth 1, with noise of 1 %; its right half at inverse depth `right`.
+    fn plane(right: f64) -> (Vec<DepthPoint>, Vec<Single>) {
+        let at = |k: usize| (k % WIDTH, k / WIDTH);
+        let points = (0..WIDTH * 30).map(|k| DepthPoint {
+            u: at(k).0 as u16,
+            v: at(k).1 as u16,
+            inverse_depth: 1.0,
+            variance: 1.0,
+            ..DepthPoint::default()
+        });
+        let mut seed = 7u64;
+        let mut noise = || {
+            seed = seed
+                .wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1_442_695_040_888_963_407);
+            ((seed >> 33) as f64 / f64::from(1u32 << 31) - 0.5) * 12f64.sqrt() * 0.01
+        };
+        let singles = (0..WIDTH * 30).map(|k| {
+            let inverse_depth = if at(k).0 < WIDTH / 2 { 1.0 } else { right } + noise();
+            Single { inverse_depth, own: 1e-4, common: 1e-6, most: 1.01e-4 }
+        });
+        (points.collect(), singles.collect())
+    }
+
+    fn rms(points: &[DepthPoint], of: impl Fn(&DepthPoint) -> f64) -> f64 {
+        (points.iter().map(|p| of(p).powi(2)).sum::<f64>() / points.len() as f64).sqrt()
+    }
+
+    #[test]
+    fn noise_of_a_plane_is_averaged_and_what_is_common_stays() {
+        let (points, singles) = plane(1.0);
+        let smooth = smoothed(&points, &singles, WIDTH);
+        let left = rms(&smooth, |p| f64::from(p.inverse_depth) - 1.0);
+        assert!((0.003..0.005).contains(&left), "{left}");
+        let claimed = rms(&smooth, |p| f64::from(p.variance).sqrt());
+        assert!(left < claimed && claimed < 0.01, "{left} {claimed}");
+        let common = vec![Single { own: 1e-12, common: 1e-4, ..singles[0] }; points.len()];
+        let kept = smoothed(&points, &common, WIDTH)[500].variance;
+        assert!((kept - 1e-4).abs() < 1e-6, "{kept}");
+    }
+
+    #[test]
+    fn an_edge_of_depth_stays_and_is_less_sure() {
+        let (points, singles) = plane(1.2);
+        let smooth = smoothed(&points, &singles, WIDTH);
+        let of = |side: usize| -> Vec<DepthPoint> {
+            smooth.iter().filter(|p| usize::from(p.u) == side).copied().collect()
+        };
+        let [before, after, inside] = [WIDTH / 2 - 1, WIDTH / 2, WIDTH / 4].map(of);
+        assert!(rms(&before, |p| f64::from(p.inverse_depth) - 1.0) < 0.008);
+        assert!(rms(&after, |p| f64::from(p.inverse_depth) - 1.2) < 0.008);
+        let sure = |points: &[DepthPoint]| rms(points, |p| f64::from(p.variance).sqrt());
+        assert!(sure(&before) > 1.2 * sure(&inside), "{} {}", sure(&before), sure(&inside));
+    }
+
+    #[test]
+    fn a_point_alone_stays_as_it_is() {
+        let (points, singles) = plane(1.0);
+        let [smooth] = smoothed(&points[77..78], &singles[77..78], WIDTH)[..] else { panic!() };
+        assert_eq!(smooth.inverse_depth, singles[77].inverse_depth as f32);
+        assert_eq!(smooth.variance, singles[77].most as f32);
+    }
+}
