@@ -14,6 +14,7 @@ pub mod map;
 pub mod mapper;
 pub mod modes;
 pub mod parameter;
+pub mod place_covariance;
 pub mod pose;
 #[cfg(test)]
 pub mod test_scene;

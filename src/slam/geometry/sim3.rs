@@ -2,7 +2,7 @@
 
 use std::ops::Mul;
 
-use nalgebra::Vector3;
+use nalgebra::{Matrix6, Vector3};
 
 use crate::slam::geometry::se3::SE3;
 
@@ -24,6 +24,14 @@ impl Sim3 {
     /// A similarity from its rigid part and its scale.
     pub fn new(rigid: SE3, scale: f64) -> Self {
         Self { rigid, scale }
+    }
+
+    /// The similarity of this scale that takes one rigid pose to another: `a_from_b` of `a_from_camera` and
+    /// `b_from_camera`.
+    pub fn between(b_from_camera: &SE3, a_from_camera: &SE3, scale: f64) -> Self {
+        let rotation = a_from_camera.rotation * b_from_camera.rotation.inverse();
+        let translation = a_from_camera.translation - rotation * b_from_camera.translation * scale;
+        Self::new(SE3 { rotation, translation }, scale)
     }
 
     /// The inverse: `b_from_a` of `a_from_b`.
@@ -48,6 +56,14 @@ impl Sim3 {
         let mut relative = self.rigid.inverse() * *world_from_camera;
         relative.translation /= self.scale;
         relative
+    }
+
+    /// What a left increment ξ of a rigid pose becomes where the pose is moved by this similarity: `self · exp(ξ) · pose`
+    /// is `exp(rigid_adjoint · ξ) · self · pose`.
+    pub fn rigid_adjoint(&self) -> Matrix6<f64> {
+        let mut adjoint = self.rigid.adjoint();
+        adjoint.fixed_view_mut::<3, 3>(0, 0).scale_mut(self.scale);
+        adjoint
     }
 
     /// Whether every number is finite and the scale positive.

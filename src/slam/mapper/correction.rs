@@ -34,8 +34,8 @@ impl Mapper {
         let joined = correction.joins.iter().filter(|join| Some(join.epoch) == epoch);
         let unit = joined.map(|join| join.into_from_epoch.scale).product::<f64>()
             * correction.unit.unwrap_or(1.0);
-        self.world_from_map =
-            anchored(self.world_from_map.scale / unit, &after, &world_from_camera);
+        let scale = self.world_from_map.scale / unit;
+        self.world_from_map = Sim3::between(&after, &world_from_camera, scale);
         self.publish_place();
         Ok(StepOutcome { keyframe_changed: true, graph_changed: true, ..finished })
     }
@@ -61,15 +61,7 @@ impl Mapper {
         self.last_tracked = Some((keyframe_id, *keyframe_from_camera));
         let map_from_camera = self.map.place(keyframe_id, keyframe_from_camera);
         if let (Some(map), Some(world)) = (map_from_camera, self.last_world_from_camera) {
-            self.world_from_map = anchored(self.world_from_map.scale, &map, &world);
+            self.world_from_map = Sim3::between(&map, &world, self.world_from_map.scale);
         }
     }
-}
-
-/// `world_from_map` of this scale that takes one pose of a camera to the other.
-fn anchored(scale: f64, map_from_camera: &SE3, world_from_camera: &SE3) -> Sim3 {
-    let rotation = world_from_camera.rotation * map_from_camera.rotation.inverse();
-    let translation =
-        world_from_camera.translation - rotation * map_from_camera.translation * scale;
-    Sim3::new(SE3 { rotation, translation }, scale)
 }

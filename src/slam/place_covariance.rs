@@ -1,0 +1,330 @@
+//! How uncertain the place of a keyframe in the map is, and what that makes of the poses on it.
+//!
+//! The place is `map_from_keyframe` with its unit s. Its errors are (ξ, λ): the left increment of its rigid part,
+//! `exp(ξ) map_from_keyframe`, ξ = (translation, rotation) in map units and radians, and the unit s e^λ. All left
+//! increments turn about the one origin of the map, so that what a keyframe errs by its cameras err by too. With Δ from
+//! the keyframe to the camera, in the map, and ε the left increment of `current_from_keyframe`:
+//! ```text
+//! ξ_camera = ξ + (λ Δ, 0) − Ad(map_from_camera) diag(s, s, s, 1, 1, 1) ε
+//! ```
+//! A position p errs by δp = ξ_t + ξ_ω × p. The first keyframe of an epoch is the gauge and errs by nothing.
+
+use nalgebra::{Matrix6, SMatrix, SVector, Vector3};
+
+use crate::slam::geometry::se3::SE3;
+use crate::slam::geometry::sim3::Sim3;
+
+/// What the place of a keyframe errs by: six numbers of its pose, one of its unit.
+pub const PLACE_ERRORS: usize = 7;
+/// Entries of the upper triangle of their covariance.
+pub const PLACE_ENTRIES: usize = 28;
+
+/// A covariance of (ξ, λ).
+pub type PlaceMatrix = SMatrix<f64, PLACE_ERRORS, PLACE_ERRORS>;
+
+/// Variances of a place of which nothing is known: of its pose as of a pose that is not claimed, of the logarithm of
+/// its unit a factor of e. None is larger.
+const IGNORANCE: [f64; PLACE_ERRORS] = [1e6, 1e6, 1e6, 1e6, 1e6, 1e6, 1.0];
+
+/// Covariance of the errors (ξ, λ) of a keyframe's place.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PlaceCovariance {
+    upper_triangle: [f64; PLACE_ENTRIES],
+}
+
+impl Default for PlaceCovariance {
+    fn default() -> Self {
+        Self::ZERO
+    }
+}
+
+/// A keyframe's place and how uncertain it is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct UncertainPlace {
+    /// Where the map has it, with its unit.
+    pub map_from_keyframe: Sim3,
+    /// Of that.
+    pub covariance: PlaceCovariance,
+}
+
+impl PlaceCovariance {
+    /// Of a place that is exact.
+    pub const ZERO: Self = Self { upper_triangle: [0.0; PLACE_ENTRIES] };
+
+    /// Of a place of which nothing is known.
+    pub fn unknown() -> Self {
+        Self::of(&PlaceMatrix::from_diagonal(&IGNORANCE.into()))
+    }
+
+    fn of(matrix: &PlaceMatrix) -> Self {
+        let mut entries = entries();
+        let mean = |(i, j)| 0.5 * (matrix[(i, j)] + matrix[(j, i)]);
+        Self { upper_triangle: std::array::from_fn(|_| entries.next().map_or(0.0, mean)) }
+    }
+
+    /// Of a symmetric matrix that came out of sums: what is beyond all sense is taken for complete ignorance.
+    pub fn bounded(matrix: &PlaceMatrix) -> Self {
+        let covariance = Self::of(matrix);
+        Self::from_upper_triangle(covariance.upper_triangle).unwrap_or_else(Self::unknown)
+    }
+
+    /// Of its upper triangle, row by row; `None` where that is no covariance, or one beyond all sense.
+    pub fn from_upper_triangle(upper_triangle: [f64; PLACE_ENTRIES]) -> Option<Self> {
+        /// Eigenvalues of the correlations may be so far below zero, by rounding.
+        const TOLERANCE: f64 = 1e-9;
+        let covariance = Self { upper_triangle };
+        let matrix = covariance.matrix();
+        let is_bounded = upper_triangle.iter().all(|x| x.is_finite())
+            && (0..PLACE_ERRORS).all(|k| (0.0..=IGNORANCE[k]).contains(&matrix[(k, k)]));
+        if !is_bounded {
+            return None;
+        }
+        // Lengths and angles have no common scale.
+        let deviations = deviations(&matrix);
+        let correlation = scaled(&matrix, &deviations.map(|of| 1.0 / of));
+        (correlation.symmetric_eigenvalues().min() >= -TOLERANCE).then_some(covariance)
+    }
+
+    /// Its upper triangle, row by row.
+    pub fn upper_triangle(&self) -> [f64; PLACE_ENTRIES] {
+        self.upper_triangle
+    }
+
+    /// The whole matrix.
+    pub fn matrix(&self) -> PlaceMatrix {
+        let mut matrix = PlaceMatrix::zeros();
+        for ((i, j), value) in entries().zip(self.upper_triangle) {
+            (matrix[(i, j)], matrix[(j, i)]) = (value, value);
+        }
+        matrix
+    }
+
+    /// The same in the map that `by` makes of this one.
+    pub fn transported(&self, by: &Sim3) -> Self {
+        let by = transport(by);
+        Self::bounded(&(by * self.matrix() * by.transpose()))
+    }
+}
+
+impl UncertainPlace {
+    /// The gauge.
+    pub fn exact(map_from_keyframe: Sim3) -> Self {
+        Self { map_from_keyframe, covariance: PlaceCovariance::ZERO }
+    }
+
+    /// Covariance of the left increment of `map_from_camera`, map units and radians, of a camera that stands at
+    /// `keyframe_from_camera` with this covariance of the left increment of `current_from_keyframe`, both in the
+    /// keyframe's unit.
+    pub fn of_camera(&self, keyframe_from_camera: &SE3, covariance: &Matrix6<f64>) -> Matrix6<f64> {
+        let sum = self.with_camera(keyframe_from_camera, covariance);
+        let mut pose = sum.fixed_view::<6, 6>(0, 0).into_owned();
+        // By rounding alone a variance is below zero.
+        (0..6).for_each(|k| pose[(k, k)] = pose[(k, k)].max(0.0));
+        pose
+    }
+
+    /// The place of a keyframe that is made where that camera stands, its unit as uncertain as this one's.
+    pub fn of_next(
+        &self,
+        keyframe_from_camera: &SE3,
+        covariance: &Matrix6<f64>,
+    ) -> PlaceCovariance {
+        PlaceCovariance::bounded(&self.with_camera(keyframe_from_camera, covariance))
+    }
+
+    fn with_camera(&self, keyframe_from_camera: &SE3, covariance: &Matrix6<f64>) -> PlaceMatrix {
+        let map_from_camera = self.map_from_keyframe.place(keyframe_from_camera);
+        let mut by_camera = map_from_camera.adjoint();
+        by_camera.fixed_columns_mut::<3>(0).scale_mut(self.map_from_keyframe.scale);
+        let mut sum = self.at(&map_from_camera.translation);
+        let mut pose = sum.fixed_view_mut::<6, 6>(0, 0);
+        pose += by_camera * covariance * by_camera.transpose();
+        sum
+    }
+
+    /// What it makes of the errors of something that stands at `position` in the map and is exact relative to it.
+    fn at(&self, position: &Vector3<f64>) -> PlaceMatrix {
+        let mut by_place = PlaceMatrix::identity();
+        let lever = position - self.map_from_keyframe.rigid.translation;
+        by_place.fixed_view_mut::<3, 1>(0, 6).copy_from(&lever);
+        by_place * self.covariance.matrix() * by_place.transpose()
+    }
+
+    /// Of a keyframe that goes where its leader goes, from `was` to `is`: the leader's, and what lies between them,
+    /// which is what it was uncertain by beyond the leader.
+    pub fn following(&self, was: &Self, is: &Self) -> PlaceCovariance {
+        let moved = is.map_from_keyframe * was.map_from_keyframe.inverse();
+        let own = self.covariance.matrix();
+        let beyond = own - was.at(&self.map_from_keyframe.rigid.translation);
+        let between = positive_part(&beyond, &deviations(&own));
+        let by = transport(&moved);
+        let position = moved * self.map_from_keyframe.rigid.translation;
+        PlaceCovariance::bounded(&(is.at(&position) + by * between * by.transpose()))
+    }
+}
+
+/// Rows and columns of the upper triangle.
+fn entries() -> impl Iterator<Item = (usize, usize)> {
+    (0..PLACE_ERRORS).flat_map(|row| (row..PLACE_ERRORS).map(move |column| (row, column)))
+}
+
+/// What (ξ, λ) become in the map that `by` makes of this one.
+fn transport(by: &Sim3) -> PlaceMatrix {
+    let mut matrix = PlaceMatrix::identity();
+    matrix.fixed_view_mut::<6, 6>(0, 0).copy_from(&by.rigid_adjoint());
+    matrix
+}
+
+/// Standard deviations; 1 of what is exact.
+fn deviations(covariance: &PlaceMatrix) -> SVector<f64, PLACE_ERRORS> {
+    covariance.diagonal().map(|variance| if variance > 0.0 { variance.sqrt() } else { 1.0 })
+}
+
+/// Rows and columns times `by`.
+fn scaled(matrix: &PlaceMatrix, by: &SVector<f64, PLACE_ERRORS>) -> PlaceMatrix {
+    PlaceMatrix::from_fn(|row, column| matrix[(row, column)] * by[row] * by[column])
+}
+
+/// A symmetric matrix without what is negative in it, its entries measured in `unit`.
+fn positive_part(matrix: &PlaceMatrix, unit: &SVector<f64, PLACE_ERRORS>) -> PlaceMatrix {
+    let mut eigen = scaled(matrix, &unit.map(|of| 1.0 / of)).symmetric_eigen();
+    eigen.eigenvalues.apply(|value| *value = value.max(0.0));
+    scaled(&eigen.recompose(), unit)
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector6;
+
+    use super::*;
+
+    /// Small enough that products of errors do not show.
+    const STEP: f64 = 1e-6;
+
+    fn place() -> Sim3 {
+        Sim3::new(SE3::exp(&Vector6::new(3.0, -2.0, 1.5, 0.4, -0.7, 0.2)), 1.7)
+    }
+
+    fn camera() -> SE3 {
+        SE3::exp(&Vector6::new(0.2, -0.3, 0.4, 0.1, 0.2, -0.3))
+    }
+
+    /// Errors of a place, of a size that goes with `salt`.
+    fn errors(salt: f64) -> SVector<f64, PLACE_ERRORS> {
+        SVector::from_fn(|row, _| (salt + 1.3 * row as f64).sin())
+    }
+
+    fn of_errors(errors: &SVector<f64, PLACE_ERRORS>) -> PlaceCovariance {
+        PlaceCovariance::bounded(&(errors * errors.transpose()))
+    }
+
+    /// The place that errs by so much.
+    fn off(place: &Sim3, by: &SVector<f64, PLACE_ERRORS>) -> Sim3 {
+        let pose = SE3::exp(&by.fixed_rows::<6>(0).into_owned());
+        Sim3::new(pose * place.rigid, place.scale * by[6].exp())
+    }
+
+    /// By how much one place is off another.
+    fn difference(from: &Sim3, to: &Sim3) -> SVector<f64, PLACE_ERRORS> {
+        let mut found = SVector::<f64, PLACE_ERRORS>::zeros();
+        found.fixed_rows_mut::<6>(0).copy_from(&(to.rigid * from.rigid.inverse()).log());
+        found[6] = (to.scale / from.scale).ln();
+        found / STEP
+    }
+
+    fn assert_near(found: &PlaceMatrix, expected: &SVector<f64, PLACE_ERRORS>) {
+        let error = (found - expected * expected.transpose()).norm();
+        assert!(error < 1e-4 * (1.0 + found.norm()), "{found}{expected}");
+    }
+
+    #[test]
+    fn a_camera_errs_as_its_keyframe_and_its_pose_on_it_make_it() {
+        let relative = Vector6::new(0.5, -0.4, 0.3, 0.6, -0.2, 0.1);
+        for (of_place, of_pose) in [(1.0, 0.0), (0.0, 1.0), (-0.7, 0.9)] {
+            let (by, relative) = (errors(0.3) * of_place, relative * of_pose);
+            let standing = |map_from_keyframe: &Sim3, twist: Vector6<f64>| {
+                let current_from_keyframe = SE3::exp(&twist) * camera().inverse();
+                let rigid = map_from_keyframe.place(&current_from_keyframe.inverse());
+                Sim3::new(rigid, map_from_keyframe.scale)
+            };
+            let exact = standing(&place(), Vector6::zeros());
+            let expected =
+                difference(&exact, &standing(&off(&place(), &(by * STEP)), relative * STEP));
+            // Place and pose err independently: each way alone, or their sum.
+            let covariance = relative * relative.transpose();
+            let known = UncertainPlace { map_from_keyframe: place(), covariance: of_errors(&by) };
+            let found = known.with_camera(&camera(), &covariance);
+            if of_place == 0.0 || of_pose == 0.0 {
+                assert_near(&found, &expected);
+                assert_near(&known.of_next(&camera(), &covariance).matrix(), &expected);
+            }
+            let alone = |place: f64, pose: f64| {
+                let covariance = of_errors(&(by * place));
+                UncertainPlace { covariance, ..known }
+                    .of_camera(&camera(), &(relative * relative.transpose() * pose))
+            };
+            let sum = alone(1.0, 0.0) + alone(0.0, 1.0);
+            assert!((known.of_camera(&camera(), &covariance) - sum).norm() < 1e-9);
+        }
+    }
+
+    #[test]
+    fn errors_move_with_the_map() {
+        let by = Sim3::new(SE3::exp(&Vector6::new(-1.0, 2.0, 0.5, 0.3, 0.9, -0.4)), 2.5);
+        let errors = errors(1.1);
+        let expected = difference(&(by * place()), &(by * off(&place(), &(errors * STEP))));
+        assert_near(&of_errors(&errors).transported(&by).matrix(), &expected);
+    }
+
+    #[test]
+    fn a_follower_errs_as_its_leader_and_by_what_lies_between() {
+        let covariance = Matrix6::from_diagonal_element(1e-4);
+        let leader = |size: f64, moved: &Sim3| UncertainPlace {
+            map_from_keyframe: *moved * place(),
+            covariance: PlaceCovariance::bounded(&(PlaceMatrix::identity() * size)),
+        };
+        let next = |leader: &UncertainPlace| UncertainPlace {
+            map_from_keyframe: Sim3::new(
+                leader.map_from_keyframe.place(&camera()),
+                1.3 * leader.map_from_keyframe.scale,
+            ),
+            covariance: leader.of_next(&camera(), &covariance),
+        };
+        let moved = Sim3::new(SE3::exp(&Vector6::new(0.1, 0.2, -0.1, 0.05, 0.1, 0.0)), 1.1);
+        for (before, after) in [(1e-2, 1e-4), (1e-4, 1e-2)] {
+            let (was, is) = (leader(before, &Sim3::identity()), leader(after, &moved));
+            let found = next(&was).following(&was, &is).matrix();
+            // As if it had been made on the leader where that is now.
+            let expected = next(&is).covariance.matrix();
+            assert!((found - expected).norm() < 1e-9 * expected.norm(), "{found}{expected}");
+        }
+        // One that was surer than its leader is as sure as that.
+        let (was, is) = (leader(1e-2, &Sim3::identity()), leader(1e-4, &Sim3::identity()));
+        let sure = UncertainPlace { covariance: PlaceCovariance::ZERO, ..was };
+        let found = sure.following(&was, &is).matrix();
+        assert!((found - is.covariance.matrix()).norm() < 1e-12, "{found}");
+    }
+
+    #[test]
+    fn what_is_no_covariance_is_refused() {
+        let good = of_errors(&errors(0.5));
+        assert_eq!(PlaceCovariance::from_upper_triangle(good.upper_triangle()), Some(good));
+        assert_eq!(PlaceCovariance::bounded(&good.matrix()), good);
+        let unknown = PlaceCovariance::unknown();
+        for fine in [unknown, PlaceCovariance::ZERO] {
+            assert_eq!(PlaceCovariance::from_upper_triangle(fine.upper_triangle()), Some(fine));
+        }
+        let with = |index: usize, value: f64| {
+            let mut triangle = [0.0; PLACE_ENTRIES];
+            triangle[index] = value;
+            triangle
+        };
+        // The last is a correlation of what does not vary.
+        for bad in [with(0, f64::NAN), with(0, -1e-9), with(0, 2e6), with(27, 2.0), with(1, 1e-3)] {
+            assert_eq!(PlaceCovariance::from_upper_triangle(bad), None, "{bad:?}");
+        }
+        let correlated = good.matrix() + PlaceMatrix::from_fn(|i, j| f64::from(u8::from(i != j)));
+        assert_eq!(PlaceCovariance::bounded(&correlated), unknown);
+        assert_eq!(PlaceCovariance::bounded(&PlaceMatrix::from_element(f64::NAN)), unknown);
+    }
+}
