@@ -1,11 +1,15 @@
 //! What the marginals say beside how much estimates of the same room differ with the noise of its images.
 
-use nalgebra::{Matrix4, Vector3, Vector4};
+use nalgebra::{Matrix3, Matrix4, SVector, Vector3, Vector4};
 
 use super::keyframe::WindowKeyframe;
 use super::solver::Solver;
+use super::system::Members;
 use super::tests::{Room, noisy_room};
+use super::unit::Unit;
 use super::view::Sight;
+use crate::slam::mapper::modes::ModeParams;
+use crate::slam::place_covariance::PLACE_ERRORS;
 use crate::slam::test_scene::CAMERA;
 
 /// Modes of the error of a keyframe's depth: over its own points, or over those of the others as it sees them.
@@ -70,5 +74,61 @@ fn they_say_how_much_noise_moves_the_modes() {
             assert!((0.6..1.5).contains(&ratio), "{mode}: {ratio} of {}", said[mode].sqrt());
         }
         assert!(said.max().sqrt() < 0.01, "{said}");
+    }
+}
+
+/// What the place of a keyframe errs by: the left increment of its pose, and the logarithm of the unit that its own depth
+/// has.
+fn place_errors(room: &Room, truth: &Room, keyframe: usize) -> SVector<f64, PLACE_ERRORS> {
+    let [found, exact] = [room, truth].map(|room| &room.keyframes[keyframe]);
+    let pose = (found.camera_from_map.inverse() * exact.camera_from_map).log();
+    let (mut fit, mut right) = (Matrix3::zeros(), Vector3::zeros());
+    for (found, exact) in found.points.iter().zip(&exact.points) {
+        let error = (found.inverse_depth / exact.inverse_depth).ln();
+        if error.abs() < 0.2 {
+            let phi = Vector3::new(1.0, f64::from(exact.ray[0]), f64::from(exact.ray[1]));
+            fit += phi * phi.transpose();
+            right += error * phi;
+        }
+    }
+    let mut errors = SVector::<f64, PLACE_ERRORS>::zeros();
+    errors.fixed_rows_mut::<6>(0).copy_from(&pose);
+    errors[6] = -(fit.try_inverse().unwrap() * right)[0];
+    errors
+}
+
+/// Standard deviations over noises of the place of the last keyframe but one, over what is said, where these hold the
+/// window.
+fn place_ratios(held: &[usize]) -> SVector<f64, PLACE_ERRORS> {
+    const TIMES: u64 = 24;
+    let [mut sum, mut squares, mut said] = [SVector::<f64, PLACE_ERRORS>::zeros(); 3];
+    for seed in 0..TIMES {
+        let mut truth = noisy_room(|_, _| (1.0, 0.0), seed);
+        truth.held = held.to_vec();
+        let mut room = truth.clone();
+        let (_, marginals) = room.solve_with(&mut Solver::default());
+        let members: Vec<usize> = (0..room.keyframes.len()).collect();
+        let free: Vec<_> = members.iter().map(|k| (!held.contains(k)).then_some(0)).collect();
+        let members = Members { members: &members, free: &free, depths_are_free: true };
+        if let Some(unit) = Unit::of(&truth.keyframes, &members) {
+            unit.restore(&mut room.keyframes, members.members);
+        }
+        let errors = place_errors(&room, &truth, 2);
+        sum += errors;
+        squares += errors.component_mul(&errors);
+        let marginal = marginals.iter().find(|of| of.keyframe_id == 2).unwrap();
+        said += marginal.place.unwrap().noise.diagonal();
+    }
+    let times = TIMES as f64;
+    let scatter = squares / times - (sum / times).component_mul(&(sum / times));
+    let inflation = ModeParams::default().estimate_inflation;
+    scatter.component_div(&(said * inflation / times)).map(f64::sqrt)
+}
+
+#[test]
+fn they_say_how_much_noise_moves_places_and_units() {
+    for held in [&[0][..], &[0, 1]] {
+        let ratios = place_ratios(held);
+        assert!(ratios.iter().all(|ratio| (0.4..1.3).contains(ratio)), "{held:?}{ratios}");
     }
 }

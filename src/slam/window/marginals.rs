@@ -1,4 +1,4 @@
-//! How uncertain what was estimated jointly is: the covariance of a keyframe's modes.
+//! How uncertain what was estimated jointly is: the covariance of a keyframe's modes and of its place.
 //!
 //! With H the normal equations at the end and σ² the variance of a residual, the covariance of a linear function g of
 //! all that is free is σ² gᵀ H⁻¹ g. A point's depth only meets the poses that see it, so that with D the depths' part
@@ -13,14 +13,19 @@
 //! δd'/d' = δd (1/d − t_z/z) − d' ξ_tz − n_y ξ_ωx + n_x ξ_ωy
 //! ```
 
-use nalgebra::{Cholesky, Const, DVector, Matrix3, Matrix4, SMatrix, Vector3, Vector4, Vector6};
+use nalgebra::{
+    Cholesky, Const, DVector, Matrix3, Matrix4, SMatrix, SVector, Vector1, Vector3, Vector4,
+    Vector6,
+};
 
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::modes::NUM_MODES;
+use crate::slam::place_covariance::PlaceMatrix;
 use crate::slam::window::Window;
 use crate::slam::window::comparison::{POSE, Pair};
 use crate::slam::window::keyframe::{WindowKeyframe, WindowPoint};
+use crate::slam::window::place_marginals::{Gauge, PlaceMarginal, place_of_displaced, unit_fit};
 use crate::slam::window::solver::Solver;
 use crate::slam::window::system::{Members, System};
 use crate::slam::window::view::{MIN_DEPTH_RATIO, Sight, Views};
@@ -36,6 +41,8 @@ pub struct Marginal {
     /// What it is of if images are displaced against each other by a pixel, alike all over: for lens and shutter, which
     /// no number of points averages out.
     pub of_displaced: Matrix3<f64>,
+    /// Its place; `None` where one keyframe alone holds the others and has no depth that would hold their unit.
+    pub place: Option<PlaceMarginal>,
 }
 
 /// A linear function of everything that is free.
@@ -68,13 +75,13 @@ const FEWEST_POINTS: usize = 40;
 const LEAST_CERTAIN: f64 = 0.3;
 
 /// A point as a keyframe has it.
-struct Seen {
+pub(super) struct Seen {
     /// Place among the points of the views.
     slot: usize,
     /// Who else moves it: its host, with where the keyframe stands from that; `None` of the keyframe's own.
     from_host: Option<(usize, SE3)>,
     /// (1, X, Y, ln d') there.
-    phi: Vector4<f64>,
+    pub(super) phi: Vector4<f64>,
     /// ∂ ln d'/∂d.
     by_depth: f64,
     /// ∂ ln d'/∂ the left increment of the keyframe's pose.
@@ -107,22 +114,35 @@ pub(super) fn marginals(
     camera: &Intrinsics,
 ) -> Vec<Marginal> {
     let (views, system) = (&solver.views, &mut solver.system);
-    // The unit that nothing holds is none of the modes: any stiffness serves.
+    // The unit that nothing holds is none of the modes: any stiffness serves. Of places it is taken out.
     let unit = unit_direction(keyframes, members, system.num_free);
     let factors = system.factors(members, views, unit.as_ref());
     let Some(factors) = factors else { return Vec::new() };
     let (num_free, variance) = (system.num_free, system.mean_squared_residual());
     let whiten = |of: &Functional| system.whitened(&factors, members, views, of);
+    let gauge = Gauge::new(unit, keyframes, members, views, system, whiten);
     let free = members.free.iter().enumerate().filter_map(|(k, number)| Some((k, (*number)?)));
     let marginals = free.filter_map(|(member, number)| {
         let seen = seen_by(keyframes, members, views, system, camera, member);
         let fit = fit_of(&seen)?;
-        let of = mode_functionals(&seen, &fit, members, num_free, number)?.each_ref().map(whiten);
+        let modes_of = |of: &Seen| fit.solve(&of.phi).fixed_rows::<NUM_MODES>(1).into_owned();
+        let of = functionals(&seen, modes_of, members, num_free, number)?.each_ref().map(whiten);
         let modes = Matrix3::from_fn(|i, j| variance * of[i].dot(&of[j]));
         let parallax = mean_squared_parallax(&seen, keyframes, members, views, camera);
         let of_one = fit.inverse().fixed_view::<NUM_MODES, NUM_MODES>(1, 1) * seen.len() as f64;
-        let keyframe_id = keyframes[members.members[member]].keyframe_id;
-        Some(Marginal { keyframe_id, modes, of_displaced: of_one / parallax })
+        let keyframe = &keyframes[members.members[member]];
+        let place = unit_fit(&seen).zip(gauge.as_ref()).and_then(|(fit, gauge)| {
+            let unit_of = |of: &Seen| Vector1::new(-fit.solve(&of.phi.xyz()).x);
+            let [unit] = functionals(&seen, unit_of, members, num_free, number)?;
+            let map_from_camera = keyframe.camera_from_map.inverse();
+            let errors = gauge.errors(&map_from_camera, number, &unit, whiten);
+            let noise = PlaceMatrix::from_fn(|i, j| variance * errors[i].dot(&errors[j]));
+            let of_displaced = place_of_displaced(&seen, &map_from_camera, camera, &fit, parallax);
+            Some(PlaceMarginal { noise, of_displaced })
+        });
+        let place = place.filter(PlaceMarginal::is_finite);
+        let keyframe_id = keyframe.keyframe_id;
+        Some(Marginal { keyframe_id, modes, of_displaced: of_one / parallax, place })
     });
     let is_finite =
         |of: &Marginal| of.modes.iter().chain(of.of_displaced.iter()).all(|x| x.is_finite());
@@ -258,38 +278,38 @@ fn fit_of(seen: &[Seen]) -> Option<Cholesky<f64, Const<4>>> {
     seen.iter().map(|of| of.phi * of.phi.transpose()).sum::<Matrix4<f64>>().cholesky()
 }
 
-/// The modes of a member, whose pose has this number, as functions of all that is free.
-fn mode_functionals(
+/// Weighted sums of ln d' over the points of a member, whose pose has this number, as functions of all that is free.
+fn functionals<const N: usize>(
     seen: &[Seen],
-    fit: &Cholesky<f64, Const<4>>,
+    weights_of: impl Fn(&Seen) -> SVector<f64, N>,
     members: &Members<'_>,
     num_free: usize,
     number: usize,
-) -> Option<[Functional; NUM_MODES]> {
+) -> Option<[Functional; N]> {
     let mut functionals = std::array::from_fn(|_| Functional::zero(num_free));
     // Sums over the points of one host: they share its pose.
-    let mut of_host: Option<(usize, SE3, SMatrix<f64, NUM_MODES, POSE>)> = None;
-    let settle = |(host, to_from_host, sum): (usize, SE3, SMatrix<f64, NUM_MODES, POSE>),
-                  functionals: &mut [Functional; NUM_MODES]| {
+    let mut of_host: Option<(usize, SE3, SMatrix<f64, N, POSE>)> = None;
+    let settle = |(host, to_from_host, sum): (usize, SE3, SMatrix<f64, N, POSE>),
+                  functionals: &mut [Functional; N]| {
         let by_host = sum * Pair::by_host(&to_from_host);
-        for (mode, functional) in functionals.iter_mut().enumerate() {
-            functional.add_pose(number, &sum.row(mode).transpose());
+        for (row, functional) in functionals.iter_mut().enumerate() {
+            functional.add_pose(number, &sum.row(row).transpose());
             if let Some(host) = members.free[host] {
-                functional.add_pose(host, &by_host.row(mode).transpose());
+                functional.add_pose(host, &by_host.row(row).transpose());
             }
         }
     };
     for of in seen {
-        let weight = fit.solve(&of.phi);
-        for (mode, functional) in functionals.iter_mut().enumerate() {
-            functional.depths.push((of.slot, weight[mode + 1] * of.by_depth));
+        let weights = weights_of(of);
+        for (weight, functional) in weights.iter().zip(&mut functionals) {
+            functional.depths.push((of.slot, weight * of.by_depth));
         }
         let Some((host, to_from_host)) = of.from_host else { continue };
         if of_host.as_ref().is_some_and(|(known, ..)| *known != host) {
             settle(of_host.take()?, &mut functionals);
         }
         let (_, _, sum) = of_host.get_or_insert_with(|| (host, to_from_host, SMatrix::zeros()));
-        *sum += weight.fixed_rows::<NUM_MODES>(1) * of.by_pose.transpose();
+        *sum += weights * of.by_pose.transpose();
     }
     if let Some(rest) = of_host.take() {
         settle(rest, &mut functionals);

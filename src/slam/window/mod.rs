@@ -20,6 +20,7 @@ pub mod marginals;
 mod members;
 mod neighbours;
 pub mod params;
+pub mod place_marginals;
 mod plane;
 mod selection;
 mod solver;

@@ -19,7 +19,7 @@ fn ray(u: f64, v: f64) -> [f32; 2] {
 #[derive(Clone)]
 pub(super) struct Room {
     pub(super) keyframes: Vec<WindowKeyframe>,
-    held: Vec<usize>,
+    pub(super) held: Vec<usize>,
 }
 
 /// Four views of the room with exact depth at every place with gradient, every keyframe a host.
