@@ -108,6 +108,7 @@ fn moved(map: &Map, move_one: impl Fn(&Sim3) -> Sim3) -> Correction {
         map_from_keyframe: move_one(&keyframe.map_from_keyframe),
         depth: LogPlane::default(),
         modes: None,
+        place: None,
     });
     Correction { keyframes: keyframes.collect(), ..Correction::default() }
 }

@@ -85,6 +85,7 @@ fn pose(i: usize, state: TrackingState, keyframe_id: u64) -> RecordedPose {
         map_from_camera: world_from_camera,
         keyframe_from_camera: world_from_keyframe(0).locate(&world_from_camera),
         covariance: [0.0; 21],
+        map_covariance: [0.0; 21],
         alignment_covariance: [0.0; 21],
         brightness: Brightness::default(),
         quality: Quality::default(),

@@ -50,6 +50,7 @@ pub fn given_pose(
         map_from_camera: world_from_camera,
         keyframe_from_camera: SE3::identity(),
         covariance: [0.0; 21],
+        map_covariance: [0.0; 21],
         alignment_covariance: [0.0; 21],
         brightness: Brightness::default(),
         quality: Quality::default(),

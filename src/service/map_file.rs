@@ -3,7 +3,7 @@
 //!
 //! Layout: magic, then the first free epoch (u32), the number of keyframes (u64), then each keyframe: id, revision, sequence
 //! (u64), stamp (i64), epoch, map state, width, height (u32), pose (8 × f64), intrinsics
-//! (4 × f64), covariance of common depth errors (6 × f64), number of points (u64), points (u16, u16, 3 × f32), number of image bytes (u64, 0 where the
+//! (4 × f64), covariance of common depth errors (6 × f64) and of the place (28 × f64), number of points (u64), points (u16, u16, 3 × f32), number of image bytes (u64, 0 where the
 //! image was given up), image bytes. Then the number of frames that were aligned again (u64), each: sequence, keyframe
 //! (u64), pose relative to that (7 × f64); and the number of points of the joint estimation (u64), each: keyframe (u64),
 //! u, v (u16), confirmations (u32), inverse depth, brightness (f32).
@@ -20,12 +20,12 @@ use crate::slam::pose::NO_KEYFRAME;
 use crate::slam::window::confirmed::ConfirmedPoint;
 use crate::wire::conversion::{
     MessageError, check_points, code_from_map_state, map_state_from_code,
-    mode_covariance_from_message, rigid_from_message, rigid_message, similarity_from_message,
-    similarity_message,
+    mode_covariance_from_message, place_covariance_from_message, rigid_from_message, rigid_message,
+    similarity_from_message, similarity_message,
 };
 
 /// First bytes of the file, with the version of the layout.
-const MAGIC: [u8; 16] = *b"semidense map 6\n";
+const MAGIC: [u8; 16] = *b"semidense map 7\n";
 /// Largest id or revision: what comes after it must not overflow.
 const MAX_NUMBER: u64 = u64::MAX / 2;
 /// Largest number of an epoch, for the same reason.
@@ -132,7 +132,8 @@ fn write_keyframe(file: &mut impl Write, keyframe: &Keyframe) -> io::Result<()> 
     let in_map = similarity_message(&keyframe.map_from_keyframe);
     let intrinsics = [k.fx, k.fy, k.cx, k.cy];
     let modes = keyframe.mode_covariance.upper_triangle();
-    for number in in_world.into_iter().chain(in_map).chain(intrinsics).chain(modes) {
+    let place = keyframe.place_covariance.upper_triangle();
+    for number in in_world.into_iter().chain(in_map).chain(intrinsics).chain(modes).chain(place) {
         file.write_all(&number.to_le_bytes())?;
     }
     file.write_all(&(keyframe.points.len() as u64).to_le_bytes())?;
@@ -297,6 +298,7 @@ impl<R: Read> Reader<'_, R> {
             return Err(wrong(MessageError::InvalidIntrinsics { width, height }));
         }
         let mode_covariance = mode_covariance_from_message(&self.numbers()?).map_err(&wrong)?;
+        let place_covariance = place_covariance_from_message(&self.numbers()?).map_err(&wrong)?;
         let num_points = self.count("points", MAX_KEYFRAME_POINTS as u64)?;
         let points = (0..num_points).map(|_| self.point()).collect::<Result<Vec<_>, _>>()?;
         check_points(&points, &intrinsics).map_err(&wrong)?;
@@ -323,6 +325,7 @@ impl<R: Read> Reader<'_, R> {
                 .map_err(&wrong)?,
             map_revision,
             mode_covariance,
+            place_covariance,
             intrinsics,
             image,
             points,
@@ -372,6 +375,7 @@ mod tests {
     use crate::slam::geometry::sim3::Sim3;
     use crate::slam::keyframe::MapState;
     use crate::slam::modes::ModeCovariance;
+    use crate::slam::place_covariance::{PlaceCovariance, PlaceMatrix};
     use nalgebra::Vector6;
 
     fn map() -> Map {
@@ -389,6 +393,7 @@ mod tests {
             map_from_keyframe: Sim3::new(rigid.inverse(), 2.3),
             map_revision: 3,
             mode_covariance: ModeCovariance::of_std_devs([0.1, 0.2, 0.3]),
+            place_covariance: PlaceCovariance::bounded(&(PlaceMatrix::identity() * 0.01)),
             intrinsics: Intrinsics { fx: 20.0, fy: 21.0, cx: 8.0, cy: 7.5, width: 17, height: 16 },
             image: (0..17 * 16).map(|i| (i % 251) as u8).collect(),
             points: vec![point; 5],

@@ -95,6 +95,7 @@ mod tests {
             map_from_camera: SE3::identity(),
             keyframe_from_camera: SE3::identity(),
             covariance: [0.0; 21],
+            map_covariance: [0.0; 21],
             alignment_covariance: [0.0; 21],
             brightness: Brightness::default(),
             quality: Quality::default(),

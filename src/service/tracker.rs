@@ -367,6 +367,7 @@ fn unclaimed(estimate: &PoseEstimate) -> PoseEstimate {
         world_from_camera: identity,
         keyframe_from_camera: identity,
         covariance,
+        map_covariance: covariance,
         alignment_covariance: covariance,
         brightness: Default::default(),
         quality: Default::default(),

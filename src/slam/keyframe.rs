@@ -3,6 +3,7 @@
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::modes::ModeCovariance;
+use crate::slam::place_covariance::{PlaceCovariance, UncertainPlace};
 
 /// One pixel with depth, as it goes over the wire.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -95,6 +96,9 @@ pub struct Keyframe {
     pub image: Vec<u8>,
     /// How uncertain the errors are that all of its depth shares.
     pub mode_covariance: ModeCovariance,
+    /// How uncertain its place in the map is, relative to the keyframes that held those it was estimated with; of the
+    /// first one of an epoch zero.
+    pub place_covariance: PlaceCovariance,
     /// Pixels with depth in row-major order, at most [`MAX_KEYFRAME_POINTS`].
     pub points: Vec<DepthPoint>,
 }
@@ -118,10 +122,17 @@ impl Keyframe {
             map_from_keyframe: place,
             map_revision: 0,
             mode_covariance: ModeCovariance::ZERO,
+            place_covariance: PlaceCovariance::ZERO,
             intrinsics,
             image,
             points,
         }
+    }
+
+    /// Where the map has it, and how uncertain that is.
+    pub fn uncertain_place(&self) -> UncertainPlace {
+        let Self { map_from_keyframe, place_covariance: covariance, .. } = *self;
+        UncertainPlace { map_from_keyframe, covariance }
     }
 }
 

@@ -12,6 +12,7 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{DepthPoint, Keyframe};
 use crate::slam::modes::ModeCovariance;
+use crate::slam::place_covariance::PlaceCovariance;
 use crate::slam::window::confirmed::ConfirmedPoint;
 use crate::slam::window::dense::RefinedDepth;
 use crate::slam::window::frames::PlacedFrame;
@@ -68,6 +69,8 @@ pub struct KeyframeCorrection {
     pub depth: LogPlane,
     /// How uncertain the errors are that all of its depth shares after that; as before where nothing is said.
     pub modes: Option<ModeCovariance>,
+    /// How uncertain the new place is; where nothing is said, as the old one was.
+    pub place: Option<PlaceCovariance>,
 }
 
 /// A smooth correction of inverse depth: d ← d · exp(offset + per_x X + per_y Y), X and Y the coordinates of the
@@ -230,12 +233,21 @@ impl Map {
             for keyframe in self.keyframes.iter_mut().filter(|k| k.epoch == join.epoch) {
                 keyframe.epoch = join.into;
                 keyframe.map_from_keyframe = join.into_from_epoch * keyframe.map_from_keyframe;
+                // The join itself is taken for exact.
+                keyframe.place_covariance =
+                    keyframe.place_covariance.transported(&join.into_from_epoch);
                 keyframe.revision = revision;
             }
         }
         for corrected in &correction.keyframes {
             let Some(index) = self.index_of(corrected.keyframe_id) else { continue };
             let keyframe = &mut self.keyframes[index];
+            let moved = || {
+                let (was, is) = (keyframe.map_from_keyframe, corrected.map_from_keyframe);
+                let unit = correction.unit.unwrap_or(1.0);
+                keyframe.place_covariance.transported(&Sim3::between(&was.rigid, &is.rigid, unit))
+            };
+            keyframe.place_covariance = corrected.place.unwrap_or_else(moved);
             keyframe.map_from_keyframe = corrected.map_from_keyframe;
             corrected.depth.apply(&keyframe.intrinsics, &mut keyframe.points);
             keyframe.mode_covariance = corrected.modes.unwrap_or(keyframe.mode_covariance);

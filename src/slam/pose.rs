@@ -116,9 +116,13 @@ pub struct PoseEstimate {
     /// of `current_from_keyframe`, keyframe units and radians: noise of single points, errors that the
     /// whole depth of the keyframe shares, and displacements of the whole image
     /// ([`covariance_floor`](crate::slam::tracker::covariance_floor)). This is what is published. It says nothing about
-    /// the drift of the keyframe itself.
+    /// the place of the keyframe itself.
     pub covariance: [f64; 21],
-    /// The same of the alignment alone, as if the errors of distant points were independent: too sure to
+    /// Upper triangle, row-major, of the covariance of the left increment (translation, rotation) of `map_from_camera`, map
+    /// units and radians ([`place_covariance`](crate::slam::place_covariance)): what the keyframe's place is
+    /// uncertain by, and `covariance`. Relative to the keyframes that held those that were estimated with it.
+    pub map_covariance: [f64; 21],
+    /// The same as `covariance` of the alignment alone, as if the errors of distant points were independent: too sure to
     /// be fused. The mapper weighs matches with it.
     pub alignment_covariance: [f64; 21],
     /// Brightness against the keyframe.
@@ -144,6 +148,7 @@ impl PoseEstimate {
             map_from_camera: SE3::identity(),
             keyframe_from_camera: SE3::identity(),
             covariance: [0.0; 21],
+            map_covariance: [0.0; 21],
             alignment_covariance: [0.0; 21],
             brightness: Brightness::default(),
             quality: Quality::default(),

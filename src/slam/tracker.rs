@@ -385,6 +385,7 @@ impl Tracker {
                 &self.intrinsics,
                 reference.mean_inverse_depth(),
             );
+        let in_map = reference.uncertain_place().of_camera(&keyframe_from_camera, &published);
         self.memory.motion.observe(frame.capture_nanos, &world_from_camera);
         self.memory.brightness = alignment.state.brightness;
         let state = match reference.map_state() {
@@ -397,6 +398,7 @@ impl Tracker {
             map_from_camera,
             keyframe_from_camera,
             covariance: upper_triangle(|row, column| published[(row, column)]),
+            map_covariance: upper_triangle(|row, column| in_map[(row, column)]),
             alignment_covariance: upper_triangle(|row, column| covariance[(row, column)]),
             brightness: alignment.state.brightness,
             proposes_keyframe: self.proposes_keyframe(reference, alignment, &quality),
@@ -454,6 +456,7 @@ impl Tracker {
             map_from_camera: placed.unwrap_or(world_from_camera),
             keyframe_from_camera,
             covariance: unknown,
+            map_covariance: unknown,
             alignment_covariance: unknown,
             brightness: Brightness::default(),
             quality: Quality::default(),
@@ -463,7 +466,7 @@ impl Tracker {
 }
 
 /// The upper triangle of a 6×6 matrix, row by row.
-fn upper_triangle(entry: impl Fn(usize, usize) -> f64) -> [f64; 21] {
+pub(in crate::slam) fn upper_triangle(entry: impl Fn(usize, usize) -> f64) -> [f64; 21] {
     let mut entries = (0..6).flat_map(|row| (row..6).map(move |column| (row, column)));
     std::array::from_fn(|_| entries.next().map_or(0.0, |(row, column)| entry(row, column)))
 }

@@ -11,6 +11,7 @@ use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{DepthPoint, Keyframe, KeyframePose, MAX_KEYFRAME_POINTS, MapState};
 use crate::slam::mapper::situation::StartFrame;
 use crate::slam::modes::ModeCovariance;
+use crate::slam::place_covariance::{PLACE_ENTRIES, PlaceCovariance};
 use crate::slam::pose::{
     Brightness, DegradedReason, LostReason, PoseEstimate, Quality, TrackingState,
 };
@@ -21,6 +22,9 @@ use crate::wire::message::{
 
 /// Farthest a sent quaternion may be from unit length: rounding, not another transform.
 const QUATERNION_TOLERANCE: f64 = 1e-6;
+
+/// Variances in the upper triangle of a covariance of six numbers.
+const DIAGONAL: [usize; 6] = [0, 6, 11, 15, 18, 20];
 
 /// A message that cannot be what it says.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
@@ -264,6 +268,7 @@ pub fn pose_message(pose: &PoseEstimate, timing: &PoseTiming) -> PoseMessage {
         map_from_camera: rigid_message(&pose.map_from_camera),
         keyframe_from_camera: rigid_message(&pose.keyframe_from_camera),
         covariance: pose.covariance,
+        map_covariance: pose.map_covariance,
         alignment_covariance: pose.alignment_covariance,
         brightness: [pose.brightness.a, pose.brightness.b],
         in_view_ratio: quality.in_view_ratio,
@@ -286,6 +291,10 @@ pub fn pose_from_message(message: &PoseMessage) -> Result<PoseEstimate, MessageE
         if all { Ok(()) } else { Err(MessageError::InvalidNumber { field }) }
     };
     finite("covariance", &message.covariance)?;
+    finite("map_covariance", &message.map_covariance)?;
+    if DIAGONAL.iter().any(|&entry| message.map_covariance[entry] < 0.0) {
+        return Err(MessageError::InvalidNumber { field: "map_covariance" });
+    }
     finite("alignment_covariance", &message.alignment_covariance)?;
     finite("brightness", &message.brightness)?;
     let quality = Quality {
@@ -323,6 +332,7 @@ pub fn pose_from_message(message: &PoseMessage) -> Result<PoseEstimate, MessageE
             "keyframe_from_camera",
         )?,
         covariance: message.covariance,
+        map_covariance: message.map_covariance,
         alignment_covariance: message.alignment_covariance,
         brightness: Brightness { a: message.brightness[0], b: message.brightness[1] },
         quality,
@@ -343,6 +353,7 @@ pub fn keyframe_header(keyframe: &Keyframe) -> KeyframeHeader {
         map_revision: keyframe.map_revision,
         intrinsics: [k.fx, k.fy, k.cx, k.cy],
         mode_covariance: keyframe.mode_covariance.upper_triangle(),
+        place_covariance: keyframe.place_covariance.upper_triangle(),
         epoch: keyframe.epoch,
         map_state: code_from_map_state(keyframe.map_state),
         width: k.width as u32,
@@ -395,6 +406,7 @@ pub fn keyframe_from_messages(
         map_from_keyframe: similarity_from_message(&header.map_from_keyframe, "map_from_keyframe")?,
         map_revision: header.map_revision,
         mode_covariance: mode_covariance_from_message(&header.mode_covariance)?,
+        place_covariance: place_covariance_from_message(&header.place_covariance)?,
         intrinsics,
         image: image.to_vec(),
         points: points.to_vec(),
@@ -407,6 +419,14 @@ pub fn mode_covariance_from_message(
 ) -> Result<ModeCovariance, MessageError> {
     ModeCovariance::from_upper_triangle(*upper_triangle)
         .ok_or(MessageError::InvalidNumber { field: "mode_covariance" })
+}
+
+/// The covariance of a keyframe's place from its upper triangle, checked.
+pub fn place_covariance_from_message(
+    upper_triangle: &[f64; PLACE_ENTRIES],
+) -> Result<PlaceCovariance, MessageError> {
+    PlaceCovariance::from_upper_triangle(*upper_triangle)
+        .ok_or(MessageError::InvalidNumber { field: "place_covariance" })
 }
 
 /// Checks that every point lies in the image and is finite, and that there are not too many.

@@ -6,6 +6,7 @@
 use iceoryx2::prelude::ZeroCopySend;
 
 use crate::slam::keyframe::DepthPoint;
+use crate::slam::place_covariance::PLACE_ENTRIES;
 
 /// Bytes of a text in a message; longer ones are cut.
 pub const TEXT_BYTES: usize = 192;
@@ -50,7 +51,7 @@ pub struct FrameHeader {
 /// Message of `tracker/pose`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
-#[type_name("semidense.Pose.v5")]
+#[type_name("semidense.Pose.v6")]
 pub struct PoseMessage {
     /// Sequence of the frame.
     pub sequence: u64,
@@ -93,7 +94,12 @@ pub struct PoseMessage {
     /// recording of your own before you fuse it. It does not hold the drift of the keyframe itself, nor that of
     /// the scale.
     pub covariance: [f64; 21],
-    /// The same of the alignment alone, for the mapper. Too sure by up to a hundred in standard
+    /// Upper triangle, row-major, of the covariance of the left increment ξ (translation, rotation) of `map_from_camera`,
+    /// `exp(ξ) map_from_camera`, map units and radians: `covariance`, and the keyframe's `place_covariance`. The
+    /// increment turns about the map's origin: a position p errs by ξ_t + ξ_ω × p. It is relative to the keyframes
+    /// that held those that were estimated together: drift from before those is not in it.
+    pub map_covariance: [f64; 21],
+    /// The same as `covariance` of the alignment alone, for the mapper. Too sure by up to a hundred in standard
     /// deviation: never fuse it.
     pub alignment_covariance: [f64; 21],
     /// Brightness against the keyframe: a, b.
@@ -123,7 +129,7 @@ pub struct PoseMessage {
 /// Header of `mapper/keyframe`; the payload is its [`DepthPoint`]s.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
-#[type_name("semidense.KeyframeHeader.v3")]
+#[type_name("semidense.KeyframeHeader.v4")]
 pub struct KeyframeHeader {
     /// Its id.
     pub keyframe_id: u64,
@@ -144,6 +150,9 @@ pub struct KeyframeHeader {
     /// Upper triangle, row-major, of the covariance of the errors that all of its depth shares: relative errors of
     /// inverse depth for each unit of X, of Y (the ray's coordinates) and of ln d.
     pub mode_covariance: [f64; 6],
+    /// Upper triangle, row-major, of the covariance of the keyframe's place: of the left increment (translation,
+    /// rotation) of the rigid part of `map_from_keyframe`, map units and radians, and of the logarithm of its unit.
+    pub place_covariance: [f64; PLACE_ENTRIES],
     /// Life of the map.
     pub epoch: u32,
     /// 1 established, 2 rejected.
@@ -394,8 +403,8 @@ mod tests {
     #[test]
     fn layouts_are_pinned() {
         assert_layout::<FrameHeader>(88, 8, "semidense.FrameHeader.v2");
-        assert_layout::<PoseMessage>(672, 8, "semidense.Pose.v5");
-        assert_layout::<KeyframeHeader>(264, 8, "semidense.KeyframeHeader.v3");
+        assert_layout::<PoseMessage>(840, 8, "semidense.Pose.v6");
+        assert_layout::<KeyframeHeader>(488, 8, "semidense.KeyframeHeader.v4");
         assert_layout::<DepthPoint>(16, 4, "semidense.DepthPoint.v1");
         assert_layout::<KeyframeImageHeader>(24, 8, "semidense.KeyframeImageHeader.v1");
         assert_layout::<StepMessage>(136, 8, "semidense.Step.v4");

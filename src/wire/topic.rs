@@ -8,7 +8,7 @@ use crate::wire::message::{
 };
 
 /// Version in every topic's name; counts up when a message changes.
-pub const WIRE_VERSION: u32 = 8;
+pub const WIRE_VERSION: u32 = 9;
 
 /// Most keyframes in one message of `mapper/graph`; the newest are sent when there are more.
 pub const MAX_GRAPH_KEYFRAMES: usize = 4096;
@@ -42,12 +42,12 @@ pub const FRAME: Topic = Topic {
     history: 0,
     loans: 2,
 };
-/// Poses: small, so the buffer is deep enough that a recorder that stalls loses none.
+/// Poses: small, so the buffer is deep enough that a recorder that stalls for half a minute loses none.
 pub const POSE: Topic = Topic {
     owner: "tracker",
     noun: "pose",
     subscribers: 8,
-    buffer: 1024,
+    buffer: 1000,
     borrowed: 2,
     history: 1,
     loans: 2,

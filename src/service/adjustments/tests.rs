@@ -195,6 +195,7 @@ fn an_estimate_of_a_map_that_was_corrected_meanwhile_is_dropped() {
         map_from_keyframe: moved.map_from_keyframe,
         depth: LogPlane::default(),
         modes: None,
+        place: None,
     };
     let correction = Correction { keyframes: vec![correction], ..Correction::default() };
     walk.mapper.apply(&correction).unwrap();

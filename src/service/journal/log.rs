@@ -19,7 +19,7 @@ use crate::wire::conversion::{similarity_from_message, similarity_message};
 use crate::wire::message::{AdjustmentMessage, PoseMessage};
 
 /// First bytes of the file, with the version of the layout.
-const MAGIC: [u8; 16] = *b"semidense log 5\n";
+const MAGIC: [u8; 16] = *b"semidense log 6\n";
 /// Bytes before kind and payload.
 const PREFIX_BYTES: usize = 8;
 /// Largest record: the configuration is a tenth of it.
@@ -85,7 +85,7 @@ pub enum Record {
     Counters(Box<RunCounters>),
     /// A keyframe without image and points.
     Keyframe(Box<Keyframe>),
-    /// A keyframe's pose has changed.
+    /// A keyframe's pose has changed; how uncertain it is stays what it was.
     KeyframePose(u32, KeyframePose),
 }
 
@@ -295,6 +295,7 @@ fn write_pose(p: &PoseMessage, bytes: &mut Vec<u8>) {
     write_f64s(bytes, &p.map_from_camera);
     write_f64s(bytes, &p.keyframe_from_camera);
     write_f64s(bytes, &p.covariance);
+    write_f64s(bytes, &p.map_covariance);
     write_f64s(bytes, &p.alignment_covariance);
     write_f64s(bytes, &p.brightness);
     write_f64s(bytes, &[p.in_view_ratio, p.inlier_ratio, p.whitened_rmse]);
@@ -308,7 +309,8 @@ fn read_pose(bytes: &mut &[u8]) -> Option<PoseMessage> {
     let [iterations, finest_level, points] = read_u32s(bytes)?;
     let (world_from_camera, map_from_camera) = (read_f64s(bytes)?, read_f64s(bytes)?);
     let keyframe_from_camera = read_f64s(bytes)?;
-    let (covariance, alignment_covariance) = (read_f64s(bytes)?, read_f64s(bytes)?);
+    let (covariance, map_covariance) = (read_f64s(bytes)?, read_f64s(bytes)?);
+    let alignment_covariance = read_f64s(bytes)?;
     let brightness = read_f64s(bytes)?;
     let [in_view_ratio, inlier_ratio, whitened_rmse] = read_f64s(bytes)?;
     let [residual_rmse, mean_squared_flow, displacement_px] = read_f64s(bytes)?;
@@ -330,6 +332,7 @@ fn read_pose(bytes: &mut &[u8]) -> Option<PoseMessage> {
         map_from_camera,
         keyframe_from_camera,
         covariance,
+        map_covariance,
         alignment_covariance,
         brightness,
         in_view_ratio,
@@ -378,7 +381,7 @@ mod tests {
         };
         let timing = PoseTiming { published_nanos: 11, latency_nanos: 12, ..Default::default() };
         let mut pose = pose_message(&PoseEstimate::unknown(&frame), &timing);
-        pose.covariance[20] = 0.125;
+        (pose.covariance[20], pose.map_covariance[20]) = (0.125, 0.25);
         let map_from_keyframe = Sim3::new(SE3::identity(), 1.5);
         let keyframe = Keyframe {
             keyframe_id: 3,

@@ -13,6 +13,7 @@ use crate::slam::image::sums::{MAX_LEVELS, SumPyramid, grey_per_sum};
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::modes::ModeCovariance;
 use crate::slam::parameter::{ParameterError, check_range};
+use crate::slam::place_covariance::{PlaceCovariance, UncertainPlace};
 use crate::slam::pose::NO_KEYFRAME;
 
 /// Which points of a keyframe are aligned.
@@ -76,6 +77,7 @@ pub struct Reference {
     map_state: MapState,
     world_from_keyframe: Sim3,
     map_from_keyframe: Sim3,
+    place_covariance: PlaceCovariance,
     map_revision: u64,
     intrinsics: Intrinsics,
     mean_inverse_depth: f64,
@@ -102,6 +104,7 @@ impl Reference {
             map_state: MapState::Established,
             world_from_keyframe: Sim3::identity(),
             map_from_keyframe: Sim3::identity(),
+            place_covariance: PlaceCovariance::ZERO,
             map_revision: 0,
             intrinsics: Intrinsics { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, width: 0, height: 0 },
             mean_inverse_depth: 1.0,
@@ -135,6 +138,7 @@ impl Reference {
         let place = |place: Sim3| if placed { place } else { Sim3::identity() };
         self.world_from_keyframe = place(keyframe.world_from_keyframe);
         self.map_from_keyframe = place(keyframe.map_from_keyframe);
+        self.place_covariance = keyframe.place_covariance;
         self.map_revision = keyframe.map_revision;
         self.intrinsics = keyframe.intrinsics;
         self.mean_inverse_depth = 1.0;
@@ -247,6 +251,12 @@ impl Reference {
     /// Where the map has the keyframe.
     pub fn map_from_keyframe(&self) -> &Sim3 {
         &self.map_from_keyframe
+    }
+
+    /// The same, and how uncertain that is.
+    pub fn uncertain_place(&self) -> UncertainPlace {
+        let Self { map_from_keyframe, place_covariance: covariance, .. } = *self;
+        UncertainPlace { map_from_keyframe, covariance }
     }
 
     /// How often the map had been corrected by then.

@@ -1,7 +1,10 @@
 //! Memory, places and corrections of the map.
 
+use nalgebra::Vector6;
+
 use super::*;
 use crate::slam::keyframe::{MAX_KEYFRAME_POINTS, most_keyframe_bytes};
+use crate::slam::place_covariance::PlaceMatrix;
 
 fn keyframe(keyframe_id: u64) -> Keyframe {
     Keyframe {
@@ -36,4 +39,40 @@ fn the_oldest_lose_their_depth_and_keep_their_pose() {
     assert_eq!(map.keyframes.iter().map(|k| k.image.len()).sum::<usize>(), 800);
     map.forget_depth_beyond(0);
     assert!(!map.keyframes[4].points.is_empty());
+}
+
+#[test]
+fn the_covariance_of_a_place_moves_with_it_or_is_what_a_correction_says() {
+    let deviations = Vector6::new(0.1, 0.2, 0.3, 0.01, 0.02, 0.03).push(0.05);
+    let matrix = PlaceMatrix::from_diagonal(&deviations.component_mul(&deviations));
+    let uncertain = Keyframe { place_covariance: PlaceCovariance::bounded(&matrix), ..keyframe(1) };
+    let by = Sim3::new(SE3::exp(&Vector6::new(1.0, -2.0, 0.5, 0.3, 0.2, -0.4)), 2.5);
+    let corrected = |place, unit| {
+        let mut map = Map { keyframes: vec![uncertain.clone()], ..Map::default() };
+        let corrected = KeyframeCorrection {
+            keyframe_id: 1,
+            map_from_keyframe: by * uncertain.map_from_keyframe,
+            depth: LogPlane::default(),
+            modes: None,
+            place,
+        };
+        let correction = Correction { keyframes: vec![corrected], joins: Vec::new(), unit };
+        map.correct(&correction, 7).unwrap();
+        map.keyframes[0].place_covariance
+    };
+    let mut joined = Map { keyframes: vec![uncertain.clone()], ..Map::default() };
+    let join = EpochJoin { epoch: 0, into: 3, into_from_epoch: by };
+    joined.correct(&Correction { joins: vec![join], ..Correction::default() }, 7).unwrap();
+    // Of a keyframe at the map's origin: lengths in the new unit, and about the new origin.
+    let expected = uncertain.place_covariance.transported(&by).matrix();
+    assert!(expected[(3, 3)] > 1e-5 && (expected - matrix).norm() > 0.1);
+    for found in [corrected(None, Some(2.5)), joined.keyframes[0].place_covariance] {
+        assert!((found.matrix() - expected).norm() < 1e-9, "{}", found.matrix());
+    }
+    // Its own unit alone is longer, the map's is the same.
+    let longer = corrected(None, None).matrix();
+    let rigid = uncertain.place_covariance.transported(&Sim3::new(by.rigid, 1.0)).matrix();
+    assert!((longer - rigid).norm() < 1e-9, "{longer}");
+    let said = PlaceCovariance::bounded(&(matrix * 0.5));
+    assert_eq!(corrected(Some(said), None), said);
 }

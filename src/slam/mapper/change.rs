@@ -1,6 +1,7 @@
 //! The step to a new keyframe: carry the depth over, smooth it, rescale, publish; then, what can wait
 //! until it is published: the last depth of the keyframe before, and a look back for new pixels.
 
+use crate::slam::depth::common_error::full_covariance;
 use crate::slam::depth::epipolar::TwoView;
 use crate::slam::depth::gaussian::{ObservedPixels, Observer, observe};
 use crate::slam::depth::matching::MatchingParams;
@@ -15,6 +16,7 @@ use crate::slam::mapper::depth_buffers::write_depth;
 use crate::slam::mapper::modes::in_unit;
 use crate::slam::mapper::start::take_sensor_depth;
 use crate::slam::mapper::{Mapper, StepOutcome};
+use crate::slam::place_covariance::UncertainPlace;
 use crate::slam::pose::{Brightness, PoseEstimate};
 
 /// What a new keyframe still wants when it is published.
@@ -44,6 +46,9 @@ impl Mapper {
     ) {
         let (Some(active), Some(before)) = (self.active, self.keyframe()) else { return };
         let (epoch, map_from_before) = (before.epoch, before.map_from_keyframe);
+        let place_covariance = before
+            .uncertain_place()
+            .of_next(&pose.keyframe_from_camera, &full_covariance(&pose.covariance));
         if self.depth.unpublished > 0 {
             self.depth.refine(&self.params);
         }
@@ -69,7 +74,11 @@ impl Mapper {
             has_new_pixels: sensor_depth.is_none(),
             line_noise_px: self.matching_at(pose).line_noise_px,
         });
-        self.add_keyframe(frame, Sim3::new(map_from_frame, carried_unit * factor), epoch);
+        let place = UncertainPlace {
+            map_from_keyframe: Sim3::new(map_from_frame, carried_unit * factor),
+            covariance: place_covariance,
+        };
+        self.add_keyframe(frame, &place, epoch);
     }
 
     /// The active depth on the pixels of a frame that stands at `keyframe_from_camera`; the depth before is the
@@ -164,9 +173,10 @@ impl Mapper {
     pub(super) fn add_keyframe(
         &mut self,
         frame: &FrameView<'_>,
-        map_from_keyframe: Sim3,
+        place: &UncertainPlace,
         epoch: u32,
     ) {
+        let UncertainPlace { map_from_keyframe, covariance: place_covariance } = *place;
         let keyframe_id = self.next_keyframe_id;
         self.map.keyframes.push(Keyframe {
             keyframe_id,
@@ -179,6 +189,7 @@ impl Mapper {
             map_from_keyframe,
             map_revision: self.map.revision,
             mode_covariance: self.modes.published(&self.params.modes),
+            place_covariance,
             intrinsics: self.intrinsics,
             image: frame.pixels.to_vec(),
             points: Vec::new(),
@@ -195,6 +206,8 @@ mod tests {
     use super::*;
     use crate::slam::keyframe::DepthPoint;
     use crate::slam::mapper::MapperParams;
+    use crate::slam::mapper::reuse::ReuseParams;
+    use crate::slam::place_covariance::PlaceCovariance;
     use crate::slam::pose::TrackingState;
     use crate::slam::test_scene::{CAMERA, Scene};
 
@@ -331,5 +344,44 @@ mod tests {
         mapper.finish_keyframe();
         assert!(mapper.map.keyframes[0].points.is_empty());
         assert!(!mapper.map.keyframes[1].points.is_empty());
+    }
+
+    #[test]
+    fn a_new_keyframe_is_as_uncertain_as_the_one_before_and_its_pose_on_it() {
+        let scene = Scene::new(3);
+        let reuse = ReuseParams { max_distance: 0.0, ..ReuseParams::default() };
+        let params = MapperParams { min_keyframe_interval: 1, reuse, ..MapperParams::default() };
+        let mut mapper = Mapper::new(CAMERA, params).unwrap();
+        for k in 0..3u64 {
+            let x = 0.05 * k as f64;
+            let world_from_camera = SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() };
+            let view = scene.render(&CAMERA, &world_from_camera);
+            let mut depth = view.inverse_depth.clone();
+            depth.pixels_mut().iter_mut().for_each(|d| *d = 1.0 / *d);
+            let pixels = view.noisy(1.0, k);
+            let frame = FrameView::new(&CAMERA, k, k as i64 * 33_333_333, &pixels);
+            let mut pose = PoseEstimate {
+                state: TrackingState::Tracking,
+                world_from_camera,
+                proposes_keyframe: true,
+                ..PoseEstimate::unknown(&frame)
+            };
+            let mut expected = PlaceCovariance::ZERO;
+            if let Some(keyframe) = mapper.keyframe() {
+                pose.keyframe_id = keyframe.keyframe_id;
+                pose.keyframe_from_camera = keyframe.world_from_keyframe.locate(&world_from_camera);
+                (pose.covariance[0], pose.covariance[20]) = (1e-4, 1e-6);
+                let covariance = full_covariance(&pose.covariance);
+                let place = keyframe.uncertain_place();
+                expected = place.of_next(&pose.keyframe_from_camera, &covariance);
+            }
+            mapper.step(&frame, &pose, Some(&depth), &mut || {});
+            let keyframe = mapper.keyframe().unwrap();
+            assert_eq!((keyframe.keyframe_id, keyframe.place_covariance), (k, expected));
+        }
+        let grown = mapper.map.keyframes.iter().map(|k| k.place_covariance.matrix()[(5, 5)]);
+        let grown: Vec<f64> = grown.collect();
+        assert!(grown[0] == 0.0 && (grown[1] - 1e-6).abs() < 1e-9, "{grown:?}");
+        assert!((grown[2] - 2e-6).abs() < 1e-9, "{grown:?}");
     }
 }

@@ -42,8 +42,11 @@ impl Mapper {
             self.publish_depth();
             outcome.keyframe_changed = true;
         }
-        let modes_of = |marginal: &Marginal| self.modes.of_estimate(marginal, &self.params.modes);
-        let correction = window.correction(&self.map, modes_of);
+        let params = &self.params.modes;
+        let said_of = |of: &Marginal| {
+            (self.modes.of_estimate(of, params), self.modes.place_of_estimate(of, params))
+        };
+        let correction = window.correction(&self.map, said_of);
         if !correction.keyframes.is_empty() {
             // Its numbers are checked: one that is broken leaves the map as it is.
             match self.apply(&correction) {

@@ -12,9 +12,11 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::modes::ModeCovariance;
 use crate::slam::parameter::{ParameterError, check_range};
+use crate::slam::place_covariance::PlaceCovariance;
 use crate::slam::pose::PoseEstimate;
 use crate::slam::tracker::covariance_floor::displacement_covariance;
 use crate::slam::window::marginals::Marginal;
+use crate::slam::window::place_marginals::PlaceMarginal;
 
 /// Tuning of the covariance of common depth errors.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -93,6 +95,18 @@ impl KeyframeModes {
         let displaced = marginal.of_displaced * squared * params.displaced_share;
         let noise = marginal.modes * params.estimate_inflation;
         ModeCovariance::bounded(&(noise + displaced + params.floor()))
+    }
+
+    /// What a keyframe says of its place after that estimate: of noise and of its image's displacement, which all goes into
+    /// its pose; `None` where the estimate says nothing.
+    pub(super) fn place_of_estimate(
+        &self,
+        marginal: &Marginal,
+        params: &ModeParams,
+    ) -> Option<PlaceCovariance> {
+        let PlaceMarginal { noise, of_displaced } = marginal.place?;
+        let displaced = of_displaced * self.squared_displacement.unwrap_or_default();
+        Some(PlaceCovariance::bounded(&(noise * params.estimate_inflation + displaced)))
     }
 
     /// The unit of the depth has grown by `factor` since the frame at hand was considered.

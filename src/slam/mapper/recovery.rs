@@ -279,6 +279,7 @@ mod tests {
                 map_from_keyframe: Sim3::new(sideways(1.5), 1.1),
                 depth: LogPlane::default(),
                 modes: None,
+                place: None,
             }],
             ..Correction::default()
         };

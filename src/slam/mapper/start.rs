@@ -14,7 +14,9 @@ use crate::slam::mapper::phase::Phase;
 use crate::slam::mapper::situation::{StartFrame, StartProgress};
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::parameter::ParameterError;
+use crate::slam::place_covariance::UncertainPlace;
 use crate::slam::pose::{PoseEstimate, TrackingState};
+use crate::slam::tracker::upper_triangle;
 use crate::slam::two_frame::evidence::Waiting;
 use crate::slam::two_frame::{InitOutcome, InitState, TwoFrameInitializer, TwoFrameParams};
 
@@ -101,7 +103,8 @@ impl Mapper {
         let scale = self.depth.normalise();
         let map_from_camera = if is_given { pose.world_from_camera } else { origin };
         let epoch = self.next_epoch();
-        self.add_keyframe(frame, Sim3::new(map_from_camera, scale), epoch);
+        let place = UncertainPlace::exact(Sim3::new(map_from_camera, scale));
+        self.add_keyframe(frame, &place, epoch);
         StepOutcome {
             keyframe_created: true,
             keyframe_changed: true,
@@ -204,7 +207,8 @@ impl Mapper {
             pixels: &first_pixels,
             ..*frame
         };
-        self.add_keyframe(&first_frame, Sim3::new(origin, unit * scale), epoch);
+        let place = UncertainPlace::exact(Sim3::new(origin, unit * scale));
+        self.add_keyframe(&first_frame, &place, epoch);
         let mut keyframe_from_camera = start.first_from_current;
         keyframe_from_camera.translation /= scale;
         let pose = PoseEstimate {
@@ -212,6 +216,10 @@ impl Mapper {
             epoch,
             world_from_camera: Sim3::new(origin, unit).place(&start.first_from_current),
             keyframe_from_camera,
+            covariance: upper_triangle(|row, column| {
+                let unit = |of: usize| if of < 3 { scale } else { 1.0 };
+                start.pose_covariance[(row, column)] / (unit(row) * unit(column))
+            }),
             brightness: start.brightness,
             keyframe_id: self.next_keyframe_id - 1,
             ..PoseEstimate::unknown(frame)

@@ -1,15 +1,18 @@
 //! The tracker on a plane with exact poses, and on frames that no camera should send.
 
-use nalgebra::Vector6;
+use nalgebra::{Matrix6, Vector6};
 
 use crate::slam::alignment::reference::Reference;
 use crate::slam::alignment::scene::{Noise, Plane, small_camera, small_plane};
+use crate::slam::depth::common_error::full_covariance;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
+use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::place_covariance::{PlaceCovariance, PlaceMatrix, UncertainPlace};
 use crate::slam::pose::{DegradedReason, LostReason, PoseEstimate, TrackingState};
-use crate::slam::tracker::{Tracker, TrackerParams};
+use crate::slam::tracker::{Tracker, TrackerParams, UNKNOWN_VARIANCE};
 
 fn always(_level: usize) -> bool {
     true
@@ -38,6 +41,7 @@ pub(super) fn is_clean(estimate: &PoseEstimate) -> bool {
     estimate.world_from_camera.is_finite()
         && estimate.keyframe_from_camera.is_finite()
         && estimate.covariance.iter().all(|x| x.is_finite())
+        && estimate.map_covariance.iter().all(|x| x.is_finite())
         && [estimate.brightness.a, estimate.brightness.b].iter().all(|x| x.is_finite())
         && [quality.in_view_ratio, quality.inlier_ratio, quality.whitened_rmse]
             .iter()
@@ -62,6 +66,35 @@ fn a_path_over_a_plane_is_followed() {
         assert!(placed.log().norm() < 1e-9, "the keyframe stands at the world's origin");
         assert!(is_clean(&estimate) && estimate.quality.whitened_rmse < 1.2);
     }
+}
+
+#[test]
+fn a_pose_in_the_map_is_as_uncertain_as_its_keyframe_and_its_pose_on_it() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let image = plane.render(&camera, &path(3), 2.0, (1.0, 0.0), 7);
+    let estimate = |deviation: f64| {
+        let mut keyframe = plane.keyframe(&camera, 2, 0.02);
+        keyframe.map_from_keyframe = Sim3::new(path(30), 0.5);
+        let place = PlaceMatrix::from_diagonal_element(deviation * deviation);
+        keyframe.place_covariance = PlaceCovariance::bounded(&place);
+        tracker_on(&keyframe).track(&frame(0, &image), &mut always)
+    };
+    let (exact, uncertain) = (estimate(0.0), estimate(0.1));
+    assert_eq!(exact.covariance, uncertain.covariance);
+    let matrices = [&exact.map_covariance, &uncertain.map_covariance].map(full_covariance);
+    let place = UncertainPlace::exact(Sim3::new(path(30), 0.5));
+    let of_pose = place.of_camera(&exact.keyframe_from_camera, &full_covariance(&exact.covariance));
+    assert!((matrices[0] - of_pose).norm() < 1e-12 * of_pose.norm(), "{}", matrices[0]);
+    // The pose on the keyframe does not turn a place's increment, but its unit moves the camera along.
+    let along = exact.map_from_camera.translation - place.map_from_keyframe.rigid.translation;
+    let mut expected = Matrix6::from_diagonal_element(0.01);
+    let mut positions = expected.fixed_view_mut::<3, 3>(0, 0);
+    positions += along * along.transpose() * 0.01;
+    assert!((matrices[1] - matrices[0] - expected).norm() < 1e-12, "{}", matrices[1]);
+    let lost = tracker_on(&plane.keyframe(&camera, 2, 0.02))
+        .track(&frame(0, &vec![0; camera.width * camera.height]), &mut always);
+    assert_eq!(lost.map_covariance, lost.covariance);
+    assert_eq!(lost.map_covariance[0], UNKNOWN_VARIANCE);
 }
 
 #[test]

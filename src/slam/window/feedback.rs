@@ -4,24 +4,24 @@ use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::map::{Correction, KeyframeCorrection, LogPlane, Map};
 use crate::slam::modes::ModeCovariance;
+use crate::slam::place_covariance::{PlaceCovariance, UncertainPlace};
 use crate::slam::window::keyframe::WindowKeyframe;
 use crate::slam::window::marginals::Marginal;
 use crate::slam::window::plane::{Correspondence, fit};
 use crate::slam::window::{Window, selection};
 
+/// What is made of a marginal: the covariance of the modes of a keyframe's depth, and of its place.
+pub type Said = (ModeCovariance, Option<PlaceCovariance>);
+
 impl Window {
     /// What of the map is known better since the last adjustment: the keyframes that were free move, and their depth is
     /// moved to where their points are.
-    /// `modes_of` says what a marginal makes of the modes of a keyframe's depth.
-    pub fn correction(
-        &self,
-        map: &Map,
-        modes_of: impl Fn(&Marginal) -> ModeCovariance,
-    ) -> Correction {
+    /// `said_of` says what a marginal makes of a keyframe.
+    pub fn correction(&self, map: &Map, said_of: impl Fn(&Marginal) -> Said) -> Correction {
         let mut keyframes: Vec<KeyframeCorrection> = Vec::new();
         for &id in &self.moved {
             let Some(keyframe) = map.get(id) else { continue };
-            keyframes.extend(self.corrected(keyframe, &modes_of));
+            keyframes.extend(self.corrected(keyframe, &said_of));
         }
         let followers = self.followers(map, &keyframes);
         keyframes.extend(followers);
@@ -30,12 +30,18 @@ impl Window {
 
     /// Keyframes that are not estimated, newer ones and rejected ones: each goes where the last before it that moved goes.
     fn followers(&self, map: &Map, moved: &[KeyframeCorrection]) -> Vec<KeyframeCorrection> {
-        let leader = |keyframe: &Keyframe| {
+        let follow = |keyframe: &Keyframe| {
             let before = moved.iter().filter(|of| of.keyframe_id < keyframe.keyframe_id);
             let leader = before.max_by_key(|of| of.keyframe_id)?;
-            let was = map.get(leader.keyframe_id)?;
-            (was.epoch == keyframe.epoch)
-                .then(|| leader.map_from_keyframe * was.map_from_keyframe.inverse())
+            let was = map.get(leader.keyframe_id).filter(|was| was.epoch == keyframe.epoch)?;
+            let map_from_keyframe = leader.map_from_keyframe
+                * was.map_from_keyframe.inverse()
+                * keyframe.map_from_keyframe;
+            let place = leader.place.map(|covariance| {
+                let is = UncertainPlace { map_from_keyframe: leader.map_from_keyframe, covariance };
+                keyframe.uncertain_place().following(&was.uncertain_place(), &is)
+            });
+            Some((map_from_keyframe, place))
         };
         let newest = moved.iter().map(|of| of.keyframe_id).max();
         let follows = |keyframe: &&Keyframe| {
@@ -44,11 +50,13 @@ impl Window {
         let others = map.keyframes.iter().filter(follows);
         others
             .filter_map(|keyframe| {
+                let (map_from_keyframe, place) = follow(keyframe)?;
                 Some(KeyframeCorrection {
                     keyframe_id: keyframe.keyframe_id,
-                    map_from_keyframe: leader(keyframe)? * keyframe.map_from_keyframe,
+                    map_from_keyframe,
                     depth: LogPlane::default(),
                     modes: None,
+                    place,
                 })
             })
             .collect()
@@ -57,7 +65,7 @@ impl Window {
     fn corrected(
         &self,
         keyframe: &Keyframe,
-        modes_of: impl Fn(&Marginal) -> ModeCovariance,
+        said_of: impl Fn(&Marginal) -> Said,
     ) -> Option<KeyframeCorrection> {
         let known = self.get(keyframe.keyframe_id)?;
         let place = known.camera_from_map.inverse();
@@ -74,13 +82,15 @@ impl Window {
         let plane = fit(&better);
         // Depth that was not moved to the points is no surer than before.
         let is_tilted = plane.is_some_and(|[_, per_x, per_y]| (per_x, per_y) != (0.0, 0.0));
-        let modes = self.marginal_of(keyframe.keyframe_id).filter(|_| is_tilted).map(modes_of);
+        let said = self.marginal_of(keyframe.keyframe_id).map(said_of);
+        let modes = said.map(|(modes, _)| modes).filter(|_| is_tilted);
         let [offset, per_x, per_y] = plane.unwrap_or_default();
         Some(KeyframeCorrection {
             keyframe_id: keyframe.keyframe_id,
             map_from_keyframe: Sim3::new(place, unit * (-offset).exp()),
             depth: LogPlane { offset: 0.0, per_x, per_y },
             modes,
+            place: said.and_then(|(_, place)| place),
         })
     }
 

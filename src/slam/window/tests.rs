@@ -1,6 +1,6 @@
 //! Windows of a rendered room solved from a perturbed truth, and what becomes of them in the map.
 
-use nalgebra::Vector6;
+use nalgebra::{Matrix3, Vector6};
 
 use super::comparison::Robustness;
 use super::solver::Solver;
@@ -9,6 +9,7 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::modes::ModeCovariance;
+use crate::slam::place_covariance::{PlaceCovariance, PlaceMatrix};
 use crate::slam::test_scene::{CAMERA, Random, Scene};
 
 fn ray(u: f64, v: f64) -> [f32; 2] {
@@ -348,7 +349,18 @@ fn keyframes_that_are_not_estimated_follow_the_last_before_them_that_moved() {
     let mut map = Map::default();
     let others = [(2, 0, 0.5), (3, 0, 1.0), (4, 0, 1.5), (5, 0, 2.0), (6, 0, 2.5), (7, 1, 0.0)];
     map.keyframes.extend(others.map(|(id, epoch, x)| in_map(id, epoch, x, 1.0)));
-    let correction = window.correction(&map, |_| ModeCovariance::ZERO);
+    // What is said of 5 goes for who follows it, and what lies between beside.
+    let [said, own] =
+        [1e-4, 4e-4].map(|of| PlaceCovariance::bounded(&(PlaceMatrix::identity() * of)));
+    map.keyframes[4].place_covariance = own;
+    let none = Matrix3::zeros();
+    window.marginals.push(Marginal {
+        keyframe_id: 5,
+        modes: none,
+        of_displaced: none,
+        place: None,
+    });
+    let correction = window.correction(&map, |_| (ModeCovariance::ZERO, Some(said)));
     let mut moved: Vec<_> = correction.keyframes.iter().map(|of| of.keyframe_id).collect();
     moved.sort_unstable();
     assert_eq!(moved, [3, 4, 5, 6]);
@@ -356,6 +368,14 @@ fn keyframes_that_are_not_estimated_follow_the_last_before_them_that_moved() {
         let was = map.get(of.keyframe_id).unwrap().map_from_keyframe.rigid.translation;
         let by = of.map_from_keyframe.rigid.translation - was;
         assert!((by.y + 0.5).abs() < 1e-12 && by.x.abs() < 1e-12, "{} by {by}", of.keyframe_id);
+        let least = match of.keyframe_id {
+            5 => Some(1e-4),
+            6 => Some(5e-4),
+            _ => None,
+        };
+        let rotation = of.place.map(|place| place.matrix()[(5, 5)]);
+        assert!(least.zip(rotation).is_none_or(|(least, found)| (found - least).abs() < 1e-12));
+        assert_eq!(least.is_some(), rotation.is_some(), "{}", of.keyframe_id);
     }
 }
 

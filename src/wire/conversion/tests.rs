@@ -4,6 +4,7 @@ use nalgebra::Vector6;
 use proptest::prelude::*;
 
 use super::*;
+use crate::slam::place_covariance::PlaceMatrix;
 use crate::slam::pose::NO_KEYFRAME;
 
 fn transform() -> SE3 {
@@ -23,6 +24,7 @@ fn pose() -> PoseEstimate {
         map_from_camera: transform().inverse(),
         keyframe_from_camera: transform().inverse(),
         covariance: std::array::from_fn(|i| 0.1 / (i as f64 + 3.0)),
+        map_covariance: std::array::from_fn(|i| 0.2 / (i as f64 + 3.0)),
         alignment_covariance: std::array::from_fn(|i| 0.01 / (i as f64 + 3.0)),
         brightness: Brightness { a: 0.1, b: -3.0 },
         quality: Quality { in_view_ratio: 0.9, points: 123, ..Quality::default() },
@@ -39,6 +41,7 @@ fn keyframe() -> Keyframe {
         sequence: 30,
         capture_nanos: 1_000,
         mode_covariance: ModeCovariance::of_std_devs([0.01, 0.02, 0.05]),
+        place_covariance: PlaceCovariance::bounded(&(PlaceMatrix::identity() * 0.01)),
         ..Keyframe::at(
             Sim3::new(transform(), 1.3),
             Intrinsics { fx: 20.0, fy: 21.0, cx: 9.5, cy: 8.5, width: 20, height: 18 },
@@ -109,10 +112,37 @@ fn hostile_keyframes_are_refused() {
         let read = keyframe_from_messages(&header, &good.points, &image_header, &good.image);
         assert_eq!(read, Err(MessageError::InvalidNumber { field: "mode_covariance" }));
     }
+    let with = |index: usize, value: f64| {
+        let mut triangle = good.place_covariance.upper_triangle();
+        triangle[index] = value;
+        triangle
+    };
+    // Not a number, negative, correlated by more than 1, beyond all sense.
+    for broken in [with(5, f64::NAN), with(7, -0.01), with(1, 0.02), with(27, 1e9)] {
+        let mut header = keyframe_header(&good);
+        header.place_covariance = broken;
+        let image_header = keyframe_image_header(&good);
+        let read = keyframe_from_messages(&header, &good.points, &image_header, &good.image);
+        assert_eq!(read, Err(MessageError::InvalidNumber { field: "place_covariance" }));
+    }
     let (header, mut image_header) = (keyframe_header(&good), keyframe_image_header(&good));
     image_header.keyframe_id = 5;
     let other = keyframe_from_messages(&header, &good.points, &image_header, &good.image);
     assert_eq!(other, Err(MessageError::OtherKeyframe { keyframe_id: 4, image_id: 5 }));
+}
+
+#[test]
+fn poses_of_broken_covariance_are_refused() {
+    let with = |index: usize, value: f64| {
+        let mut message = pose_message(&pose(), &PoseTiming::default());
+        message.map_covariance[index] = value;
+        pose_from_message(&message)
+    };
+    assert!(with(1, -0.1).is_ok() && with(20, 0.0).is_ok());
+    for (index, value) in [(1, f64::NAN), (0, -1e-9), (20, -0.1), (11, f64::INFINITY)] {
+        let refused = Err(MessageError::InvalidNumber { field: "map_covariance" });
+        assert_eq!(with(index, value), refused, "{index} {value}");
+    }
 }
 
 #[test]
@@ -148,11 +178,13 @@ proptest! {
         message.proposes_keyframe = codes[2];
         message.world_from_camera = std::array::from_fn(number);
         message.covariance = std::array::from_fn(|i| number(i + 7));
+        message.map_covariance = std::array::from_fn(|i| number(i + 5));
         message.alignment_covariance = std::array::from_fn(|i| number(i + 8));
         message.residual_rmse = number(31);
         if let Ok(read) = pose_from_message(&message) {
             prop_assert!(read.world_from_camera.is_finite());
             prop_assert!(read.covariance.iter().all(|c| c.is_finite()));
+            prop_assert!(read.map_covariance.iter().all(|c| c.is_finite()));
         }
     }
 
