@@ -292,7 +292,7 @@ impl<'a> Results<'a> {
             cloud.len(),
             evaluation.as_ref(),
             online_evaluation.as_ref(),
-            poses::normalized_errors_of(record, epoch).as_ref(),
+            poses::normalized_errors_of(record, epoch),
             depth.statistics,
         );
         Ok(Self {

@@ -9,7 +9,9 @@ use crate::service::results::{RecordedPose, RunRecord};
 use crate::service::trajectory_file::tum_line;
 use crate::slam::evaluation::MAX_DIFFERENCE_NANOS;
 use crate::slam::evaluation::depth_error::DepthScale;
-use crate::slam::evaluation::normalized_error::{NormalizedErrors, normalized_errors};
+use crate::slam::evaluation::normalized_error::{
+    NormalizedErrors, map_normalized_errors, normalized_errors,
+};
 use crate::slam::map::Map;
 use crate::slam::pose::PoseEstimate;
 use crate::slam::trajectory::StampedPose;
@@ -94,11 +96,14 @@ pub fn online_trajectory(record: &RunRecord, epoch: Option<u32>) -> Vec<StampedP
         .collect()
 }
 
-/// Errors of the tracked frames of one epoch against their covariance; `None` without ground truth or where
-/// it was given.
-pub fn normalized_errors_of(record: &RunRecord, epoch: Option<u32>) -> Option<NormalizedErrors> {
+/// Errors of the tracked frames of one epoch against their covariance, on their keyframes and in the map; `None` without
+/// ground truth or where it was given.
+pub fn normalized_errors_of(
+    record: &RunRecord,
+    epoch: Option<u32>,
+) -> [Option<NormalizedErrors>; 2] {
     if record.depth_scale == DepthScale::Given {
-        return None;
+        return [None, None];
     }
     let in_epoch = |of: u32| epoch.is_none_or(|epoch| of == epoch);
     let estimates = record.poses.iter().map(|pose| &pose.estimate);
@@ -106,7 +111,11 @@ pub fn normalized_errors_of(record: &RunRecord, epoch: Option<u32>) -> Option<No
         estimates.filter(|e| e.state.is_tracked() && in_epoch(final_epoch(record, e))).collect();
     let keyframes = record.map.keyframes.iter().filter(|keyframe| in_epoch(keyframe.epoch));
     let stamps: Vec<(u64, i64)> = keyframes.map(|k| (k.keyframe_id, k.capture_nanos)).collect();
-    normalized_errors(&tracked, &stamps, &record.ground_truth, MAX_DIFFERENCE_NANOS)
+    let truth = &record.ground_truth;
+    [
+        normalized_errors(&tracked, &stamps, truth, MAX_DIFFERENCE_NANOS),
+        map_normalized_errors(&tracked, truth, MAX_DIFFERENCE_NANOS),
+    ]
 }
 
 /// Writes one line for each keyframe: its pose as in a TUM file, then what a map needs besides.

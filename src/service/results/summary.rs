@@ -75,7 +75,7 @@ impl From<&TrajectoryEvaluation> for TrajectorySummary {
     }
 }
 
-/// Normalised estimation errors squared of `current_from_keyframe`; all null without ground truth.
+/// Normalised estimation errors squared of a pose; all null without ground truth.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct NeesSummary {
     /// Frames compared.
@@ -278,6 +278,8 @@ pub struct Summary {
     /// Errors of the tracked poses against their covariance, with the map's own depth.
     #[serde(flatten)]
     pub nees: NeesSummary,
+    /// The same of their places in the map, as they were published.
+    pub map_nees: NeesSummary,
     /// Depth of the keyframes against ground truth.
     #[serde(flatten)]
     pub depth: DepthSummary,
@@ -299,13 +301,14 @@ impl From<&Rejection> for RejectionSummary {
 }
 
 impl Summary {
-    /// The figures of `record`, with `points` in the cloud and what the evaluations gave.
+    /// The figures of `record`, with `points` in the cloud and what the evaluations gave: `nees` on keyframes and in the
+    /// map.
     pub fn new(
         record: &RunRecord,
         points: usize,
         trajectory: Option<&TrajectoryEvaluation>,
         online: Option<&TrajectoryEvaluation>,
-        nees: Option<&NormalizedErrors>,
+        nees: [Option<NormalizedErrors>; 2],
         depth: Option<DepthStatistics>,
     ) -> Self {
         let (recorded_secs, wall_secs) =
@@ -363,7 +366,8 @@ impl Summary {
             peak_rss_mb: record.peak_rss_bytes.map(|bytes| bytes as f64 / BYTES_PER_MB),
             trajectory: trajectory.map(TrajectorySummary::from).unwrap_or_default(),
             online: online.map(TrajectorySummary::from).unwrap_or_default(),
-            nees: nees.map(NeesSummary::from).unwrap_or_default(),
+            nees: nees[0].as_ref().map(NeesSummary::from).unwrap_or_default(),
+            map_nees: nees[1].as_ref().map(NeesSummary::from).unwrap_or_default(),
             depth: depth.map(DepthSummary::from).unwrap_or_default(),
         }
     }

@@ -2,15 +2,16 @@
 //!
 //! e = log(T_est T_true⁻¹), T = current_from_keyframe with its translation in keyframe units. With a
 //! right covariance eᵀ Σ⁻¹ e is χ² distributed: 6 in the mean, 3 for translation and rotation
-//! alone, and below 12.6 in 95 % of the frames.
+//! alone, and below 12.6 in 95 % of the frames. The same of `map_from_camera`, whose errors are its left increments.
 
 use std::collections::BTreeMap;
 
-use nalgebra::{Matrix6, Vector6};
+use nalgebra::{Matrix3, Matrix6, Rotation3, UnitQuaternion, Vector3, Vector6};
 
 use crate::slam::evaluation::association::nearest;
 use crate::slam::evaluation::statistics::median;
 use crate::slam::geometry::se3::SE3;
+use crate::slam::geometry::sim3::Sim3;
 use crate::slam::pose::PoseEstimate;
 use crate::slam::trajectory::StampedPose;
 
@@ -118,6 +119,50 @@ pub fn normalized_errors(
     NormalizedErrors::of(&errors)
 }
 
+/// Normalised errors of `map_from_camera` of `estimates` (tracked frames of one epoch), as it was published, against
+/// `truth` in the map: turned by the mean of the rotations between the two, and then where positions are nearest to each
+/// other. `None` where nothing can be compared.
+pub fn map_normalized_errors(
+    estimates: &[&PoseEstimate],
+    truth: &[StampedPose],
+    max_difference_nanos: i64,
+) -> Option<NormalizedErrors> {
+    let matched = estimates.iter().filter_map(|estimate| {
+        let index = nearest(truth, estimate.capture_nanos, max_difference_nanos)?;
+        let exact = truth[index].world_from_camera;
+        Some((estimate.map_from_camera, exact, estimate.map_covariance))
+    });
+    let matched: Vec<(SE3, SE3, [f64; 21])> = matched.collect();
+    let map_from_truth = similarity(matched.iter().map(|of| (of.0, of.1)))?;
+    let errors = matched.iter().filter_map(|(found, exact, covariance)| {
+        let exact = map_from_truth.place(exact);
+        normalized(&(exact * found.inverse()).log(), covariance)
+    });
+    NormalizedErrors::of(&errors.collect::<Vec<_>>())
+}
+
+/// `found_from_exact` of poses of one camera. Positions alone leave the rotation about a straight way open, and turn the
+/// map by a few of their errors over its length, far beyond what rotations are uncertain by.
+fn similarity(poses: impl Iterator<Item = (SE3, SE3)> + Clone) -> Option<Sim3> {
+    let count = poses.clone().count() as f64;
+    let turned = |(found, exact): (SE3, SE3)| (found * exact.inverse()).rotation_matrix();
+    let svd = poses.clone().map(turned).sum::<Matrix3<f64>>().svd(true, true);
+    let rotation = Rotation3::from_matrix_unchecked(svd.u? * svd.v_t?);
+    let means = poses.clone().fold([Vector3::zeros(); 2], |[one, other], (found, exact)| {
+        [one + found.translation / count, other + exact.translation / count]
+    });
+    let (mut product, mut squared) = (0.0, 0.0);
+    for (found, exact) in poses {
+        let exact = rotation * (exact.translation - means[1]);
+        product += exact.dot(&(found.translation - means[0]));
+        squared += exact.norm_squared();
+    }
+    let scale = product / squared;
+    let translation = means[0] - rotation * means[1] * scale;
+    let rotation = UnitQuaternion::from_rotation_matrix(&rotation);
+    Some(Sim3::new(SE3 { rotation, translation }, scale)).filter(Sim3::is_valid)
+}
+
 /// Length of a keyframe unit in the truth's: s of min Σ |s t_est − t_true|²; `None` where it is not positive.
 fn unit_length(frames: &[(&PoseEstimate, SE3)]) -> Option<f64> {
     let (mut product, mut squared) = (0.0, 0.0);
@@ -206,5 +251,30 @@ mod tests {
         assert_eq!(measure(&estimates, &[]), None);
         estimates.iter_mut().for_each(|estimate| estimate.covariance = [0.0; 21]);
         assert_eq!(measure(&estimates, &truth), None, "no covariance, no norm");
+    }
+
+    #[test]
+    fn errors_of_places_in_the_map_are_six_in_the_mean_wherever_the_map_lies() {
+        let (truth, mut estimates, _) = run(40);
+        let twist = Vector6::new(4.0, -2.0, 1.0, 0.5, -1.0, 0.3);
+        let map_from_truth = Sim3::new(SE3::exp(&twist), 0.4);
+        let mut noise = Noise(5);
+        for (estimate, exact) in estimates.iter_mut().zip(&truth) {
+            let error = Vector6::from_fn(|row, _| STD_DEV[row] * noise.normal());
+            estimate.map_from_camera =
+                SE3::exp(&error).inverse() * map_from_truth.place(&exact.world_from_camera);
+            estimate.map_covariance = covariance(1.0);
+        }
+        let measure = |estimates: &[PoseEstimate], truth: &[StampedPose]| {
+            let estimates: Vec<&PoseEstimate> = estimates.iter().collect();
+            map_normalized_errors(&estimates, truth, 1_000_000)
+        };
+        let errors = measure(&estimates, &truth).unwrap();
+        assert_eq!(errors.frames, 800);
+        assert!((errors.mean - 6.0).abs() < 0.5, "{errors:?}");
+        estimates.iter_mut().for_each(|estimate| estimate.map_covariance = covariance(0.25));
+        assert!((measure(&estimates, &truth).unwrap().mean - 24.0).abs() < 2.0);
+        assert_eq!(measure(&estimates, &[]), None);
+        assert_eq!(measure(&estimates[..1], &truth), None, "one place has no scale");
     }
 }
