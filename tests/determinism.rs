@@ -81,3 +81,23 @@ fn no_depth_filter_depends_on_the_number_of_threads() {
         assert_same(&replayed[0], &replayed[1], &format!("{filter}, 1 and 3 threads"));
     }
 }
+
+#[test]
+fn points_from_either_filter_do_not_depend_on_the_number_of_threads() {
+    let rig = Rig::new();
+    let [gaussian, interval] = ["gaussian", "interval"].map(|source| {
+        let chosen = format!("mapping.window.points_from=\"{source}\"");
+        let replayed = ["1", "2", "4"].map(|threads| {
+            let output = rig.folder().join(format!("{source}-{threads}"));
+            let arguments = ["replay", "sim", "--threads", threads, "--set", &chosen];
+            let figures = summary(rig.command(&arguments), &output);
+            assert!(figures["adjustments"].as_u64().unwrap() >= 3, "{source}: {figures}");
+            contents(&output)
+        });
+        assert_same(&replayed[0], &replayed[1], &format!("points from {source}, 1 and 2 threads"));
+        assert_same(&replayed[0], &replayed[2], &format!("points from {source}, 1 and 4 threads"));
+        replayed.into_iter().next().unwrap()
+    });
+    let points = FILES.iter().position(|name| *name == "points.ply").unwrap();
+    assert!(gaussian[points] != interval[points], "the switch changes no point");
+}

@@ -7,6 +7,7 @@ mod correction;
 mod depth_buffers;
 mod finder;
 mod joint;
+mod maturing;
 pub mod modes;
 pub mod observation;
 mod past;

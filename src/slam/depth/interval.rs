@@ -108,6 +108,11 @@ impl IntervalFilter {
         self.points.extend(points);
     }
 
+    /// Without points.
+    pub fn clear(&mut self) {
+        self.points.clear();
+    }
+
     /// Starts over at every pixel of `map` that may carry depth and has none.
     pub fn restart_where_empty(&mut self, map: &DepthMap) {
         let width = map.image.width();

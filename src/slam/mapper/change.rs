@@ -49,6 +49,8 @@ impl Mapper {
         let place_covariance = before
             .uncertain_place()
             .of_next(&pose.keyframe_from_camera, &full_covariance(&pose.covariance));
+        let before_id = before.keyframe_id;
+        self.depth.leave_points(before_id, &self.params);
         if self.depth.unpublished > 0 {
             self.depth.refine(&self.params);
         }

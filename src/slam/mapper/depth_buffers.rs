@@ -7,6 +7,7 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS};
 use crate::slam::map::LogPlane;
 use crate::slam::mapper::MapperParams;
+use crate::slam::mapper::maturing::Maturing;
 
 /// Owner of all that the filters work on.
 #[derive(Debug)]
@@ -17,6 +18,8 @@ pub(super) struct DepthBuffers {
     pub(super) spare: DepthMap,
     /// The immature points of the active keyframe.
     pub(super) points: IntervalFilter,
+    /// Points that will be estimated jointly; none unless the interval filter gives them.
+    pub(super) maturing: Maturing,
     regularisation: RegularisationScratch,
     /// Length of the unit of `active` in the keyframe's: 1 but where poses are given, and so the keyframe's unit,
     /// before anything is known of how far away things are.
@@ -34,6 +37,7 @@ impl DepthBuffers {
             active: DepthMap::with_size(width, height),
             spare: DepthMap::with_size(width, height),
             points: IntervalFilter::default(),
+            maturing: Maturing::default(),
             regularisation: RegularisationScratch::with_size(width, height),
             unit: 1.0,
             is_unit_open: false,
@@ -44,6 +48,7 @@ impl DepthBuffers {
     /// Begins the active depth anew on `pixels`, in the keyframe's unit.
     pub(super) fn restart(&mut self, pixels: &[u8], params: &MapperParams) {
         self.active.restart(pixels, params.min_gradient, params.max_candidates);
+        self.maturing.clear();
         (self.unit, self.is_unit_open) = (1.0, false);
     }
 
@@ -54,6 +59,9 @@ impl DepthBuffers {
 
     /// Chooses the points that the interval filter traces.
     pub(super) fn plant_points(&mut self, params: &MapperParams) {
+        if params.window.traces_candidates() {
+            self.maturing.restart(&self.active.image, &params.candidates);
+        }
         let filter = params.depth_filter;
         match filter.has_points() {
             true if filter.is_dense() => self.points.restart_where_empty(&self.active),
@@ -76,6 +84,7 @@ impl DepthBuffers {
         let factor = 1.0 / mean;
         self.active.rescale(factor as f32);
         self.points.rescale(factor as f32);
+        self.maturing.rescale(factor as f32);
         factor
     }
 
@@ -91,6 +100,7 @@ impl DepthBuffers {
         self.unit *= factor;
         self.active.rescale(factor as f32);
         self.points.rescale(factor as f32);
+        self.maturing.rescale(factor as f32);
     }
 
     /// Moves the active depth by a plane on its logarithm.
@@ -99,7 +109,13 @@ impl DepthBuffers {
             let factor_at = |u, v| plane.factor(intrinsics, u as f64, v as f64) as f32;
             self.active.rescale_by(factor_at);
             self.points.rescale_by(factor_at);
+            self.maturing.rescale_by(factor_at);
         }
+    }
+
+    /// Keeps those of the points to be estimated jointly that are mature, where the keyframe is left.
+    pub(super) fn leave_points(&mut self, keyframe_id: u64, params: &MapperParams) {
+        self.maturing.leave(keyframe_id, &self.active.image, self.unit, &params.interval);
     }
 
     /// Makes the active depth the points of its keyframe.

@@ -29,6 +29,7 @@ impl Mapper {
             return None;
         }
         let mut window = self.window.take()?;
+        window.take_mature(self.depth.maturing.left());
         let is_new = window.take_in(&self.map, active);
         Some((window, is_new))
     }

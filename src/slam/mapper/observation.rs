@@ -71,6 +71,7 @@ impl Mapper {
             self.line_noise.observe(&seen.innovations, &self.params.line_noise);
             counts = seen.counts;
         }
+        self.depth.maturing.trace(&TraceFrame { image, view, brightness }, &self.params.interval);
         if filter.has_points() {
             let interval = &self.params.interval;
             points.trace(&TraceFrame { image, view, brightness }, interval);

@@ -94,9 +94,9 @@ impl Mapper {
             self.depth.refine(&self.params);
         }
         self.publish_depth();
-        let Some(present) = self.keyframe().map(|keyframe| keyframe.map_from_keyframe) else {
-            return;
-        };
+        let Some(keyframe) = self.keyframe() else { return };
+        let (present_id, present) = (keyframe.keyframe_id, keyframe.map_from_keyframe);
+        self.depth.leave_points(present_id, &self.params);
         let present_unit = present.scale * self.depth.unit;
         let keyframe = &self.map.keyframes[index];
         let map_from_keyframe = keyframe.map_from_keyframe;

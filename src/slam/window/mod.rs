@@ -6,6 +6,7 @@
 //! points eliminated, `solver` the iterations, [`Window::optimise`] the recipe. Keyframes that have left the window
 //! and see the same things hold it in place; nothing is marginalised, and the filter's variance is no prior.
 
+pub mod candidates;
 pub mod comparison;
 mod comparison_kernel;
 mod conclusion;
@@ -34,6 +35,7 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
 use crate::slam::map::Map;
+use crate::slam::window::candidates::{Candidates, MaturePoints};
 use crate::slam::window::comparison::{Robustness, SAMPLES};
 use crate::slam::window::dense::Refinement;
 use crate::slam::window::frames::WindowFrames;
@@ -83,8 +85,10 @@ pub struct Window {
     params: WindowParams,
     camera: Intrinsics,
     keyframes: Vec<WindowKeyframe>,
-    /// Depth of keyframes whose points are still to be chosen, by keyframe.
-    candidates: Vec<(u64, Vec<DepthPoint>)>,
+    /// Keyframes whose points are still to be chosen.
+    candidates: Vec<Candidates>,
+    /// Mature points of keyframes that are still to be taken in.
+    mature: Vec<MaturePoints>,
     /// Keyframes from here on have not been aligned.
     unaligned: Vec<u64>,
     solver: Solver,
@@ -105,6 +109,7 @@ impl Window {
             camera,
             keyframes: Vec::new(),
             candidates: Vec::new(),
+            mature: Vec::new(),
             unaligned: Vec::new(),
             solver: Solver::default(),
             moved: Vec::new(),
@@ -127,7 +132,7 @@ impl Window {
         let ids: HashSet<u64> = held.iter().map(|keyframe| keyframe.keyframe_id).collect();
         self.keyframes.retain(|keyframe| ids.contains(&keyframe.keyframe_id));
         self.unaligned.retain(|id| ids.contains(id));
-        self.candidates.retain(|(id, _)| ids.contains(id));
+        self.candidates.retain(|of| ids.contains(&of.keyframe_id));
         let places = self.keyframes.iter().enumerate().map(|(place, of)| (of.keyframe_id, place));
         let places: HashMap<u64, usize> = places.collect();
         for keyframe in held {
@@ -139,10 +144,12 @@ impl Window {
                 None if !is_resumed || id == active => self.unaligned.push(id),
                 None => {}
             }
-            if id != active && !is_host && !self.candidates.iter().any(|(of, _)| *of == id) {
-                self.candidates.push((id, keyframe.points.clone()));
+            if id != active && !is_host && !self.candidates.iter().any(|of| of.keyframe_id == id) {
+                let (depth, mature) = (keyframe.points.clone(), self.mature_of(id));
+                self.candidates.push(Candidates { keyframe_id: id, depth, mature });
             }
         }
+        self.mature.clear();
         !self.unaligned.is_empty()
     }
 
@@ -230,25 +237,25 @@ impl Window {
     /// Chooses points in the keyframes before one, whose depth is final for now.
     fn choose_points_before(&mut self, index: usize) {
         let newest = self.keyframes[index].keyframe_id;
-        let (ready, wait) =
-            std::mem::take(&mut self.candidates).into_iter().partition(|(id, _)| *id < newest);
+        let (ready, wait) = std::mem::take(&mut self.candidates)
+            .into_iter()
+            .partition(|of| of.keyframe_id < newest);
         self.candidates = wait;
-        let ready: Vec<(u64, Vec<DepthPoint>)> = ready;
-        for (id, points) in ready {
-            let Some(host) = self.keyframes.iter().position(|k| k.keyframe_id == id) else {
-                continue;
-            };
-            self.become_host(host, &points);
+        let ready: Vec<Candidates> = ready;
+        for candidates in ready {
+            let Some(host) = self.index_of(candidates.keyframe_id) else { continue };
+            self.become_host(host, &candidates);
         }
     }
 
-    fn become_host(&mut self, host: usize, points: &[DepthPoint]) {
-        let plane = plane::fit(&self.projected_into(host, points)).unwrap_or_default();
+    fn become_host(&mut self, host: usize, candidates: &Candidates) {
+        // Poses on the keyframe's depth are what its candidates were traced with: the plane is that of both.
+        let plane = plane::fit(&self.projected_into(host, &candidates.depth)).unwrap_or_default();
         let params = &self.params;
         let keyframe = &mut self.keyframes[host];
         keyframe.take_part(&self.camera);
         let chosen = selection::choose_spread(
-            points,
+            candidates.points(),
             keyframe.images[0].pixels(),
             &self.camera,
             [params.points, params.max_points],

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::slam::parameter::{ParameterError, check_range};
+use crate::slam::window::candidates::PointSource;
 
 /// Tuning of the joint estimation.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -14,6 +15,8 @@ pub struct WindowParams {
     pub num_fixed: usize,
     /// The first keyframes of an epoch, in which all but the first are free.
     pub num_first: usize,
+    /// Which filter gives the points.
+    pub points_from: PointSource,
     /// Points of a keyframe in a full window.
     pub points: usize,
     /// The same while there are few keyframes: as many in all as `num_first` keyframes have.
@@ -51,6 +54,7 @@ impl Default for WindowParams {
             num_free: 7,
             num_fixed: 8,
             num_first: 8,
+            points_from: PointSource::default(),
             points: 300,
             max_points: 1000,
             min_gradient: 8.0,
@@ -69,6 +73,11 @@ impl Default for WindowParams {
 }
 
 impl WindowParams {
+    /// Whether candidates are traced for it, beside the depth of the active keyframe.
+    pub fn traces_candidates(&self) -> bool {
+        self.num_free > 0 && self.points_from == PointSource::Interval
+    }
+
     /// Checks every value.
     pub fn validate(&self) -> Result<(), ParameterError> {
         check_range("num_free", self.num_free, 0..=50)?;

@@ -1,0 +1,186 @@
+//! Points of the active keyframe that will be estimated jointly once the interval filter is sure of them, beside the
+//! Gaussian map that frames are tracked on.
+
+use crate::slam::depth::candidate::CandidateParams;
+use crate::slam::depth::immature::{IntervalParams, TraceFrame};
+use crate::slam::depth::interval::IntervalFilter;
+use crate::slam::depth::map::GradientImage;
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::keyframe::DepthPoint;
+use crate::slam::map::Correction;
+use crate::slam::window::candidates::MaturePoints;
+
+/// Candidates of the active keyframe, in the unit of its depth buffer, and what became of those of keyframes that were
+/// left.
+#[derive(Debug, Default)]
+pub(super) struct Maturing {
+    filter: IntervalFilter,
+    /// Whether a frame was searched for them.
+    is_traced: bool,
+    left: Vec<MaturePoints>,
+}
+
+impl Maturing {
+    /// Chooses the pixels of a new active keyframe.
+    pub(super) fn restart(&mut self, image: &GradientImage, params: &CandidateParams) {
+        self.filter.restart(image, params);
+        self.is_traced = false;
+    }
+
+    /// Forgets the candidates of the active keyframe.
+    pub(super) fn clear(&mut self) {
+        self.filter.clear();
+        self.is_traced = false;
+    }
+
+    /// Searches them in a frame.
+    pub(super) fn trace(&mut self, frame: &TraceFrame<'_>, params: &IntervalParams) {
+        if !self.filter.points().is_empty() {
+            self.filter.trace(frame, params);
+            self.is_traced = true;
+        }
+    }
+
+    /// Keeps those that are mature, of the keyframe that is being left, whose depth buffer has a unit of so many of its
+    /// own. One on which no frame was tracked leaves none: its depth is all that is known of it.
+    pub(super) fn leave(
+        &mut self,
+        keyframe_id: u64,
+        image: &GradientImage,
+        unit: f64,
+        params: &IntervalParams,
+    ) {
+        if self.is_traced {
+            let inverse_unit = (1.0 / unit) as f32;
+            let points = self.filter.mature(params).map(|of| DepthPoint {
+                u: of.u,
+                v: of.v,
+                inverse_depth: of.inverse_depth * inverse_unit,
+                variance: of.variance * (inverse_unit * inverse_unit),
+                intensity: image.intensity.at(usize::from(of.u), usize::from(of.v)),
+            });
+            self.left.push(MaturePoints { keyframe_id, points: points.collect() });
+        }
+        self.clear();
+    }
+
+    /// Multiplies the inverse depths of the active keyframe's by `factor`.
+    pub(super) fn rescale(&mut self, factor: f32) {
+        self.filter.rescale(factor);
+    }
+
+    /// The same with a factor of its own for every pixel `(u, v)`.
+    pub(super) fn rescale_by(&mut self, factor_at: impl Fn(usize, usize) -> f32) {
+        self.filter.rescale_by(factor_at);
+    }
+
+    /// Moves what is kept of keyframes that were left as their depth is moved.
+    pub(super) fn correct(&mut self, correction: &Correction, intrinsics: &Intrinsics) {
+        for left in &mut self.left {
+            let mut corrected = correction.keyframes.iter();
+            if let Some(corrected) = corrected.find(|of| of.keyframe_id == left.keyframe_id) {
+                corrected.depth.apply(intrinsics, &mut left.points);
+            }
+        }
+    }
+
+    /// What is kept of keyframes that were left; whoever takes them in takes them from there.
+    pub(super) fn left(&mut self) -> &mut Vec<MaturePoints> {
+        &mut self.left
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::depth::epipolar::TwoView;
+    use crate::slam::geometry::se3::SE3;
+    use crate::slam::geometry::sim3::Sim3;
+    use crate::slam::image::quads::QuadImage;
+    use crate::slam::map::{KeyframeCorrection, LogPlane};
+    use crate::slam::pose::Brightness;
+    use crate::slam::test_scene::{CAMERA, Rendering, Scene};
+
+    /// Length of the unit of the depth buffer in the keyframe's.
+    const UNIT: f64 = 2.0;
+    const KEYFRAME: u64 = 5;
+
+    fn at(x: f64) -> SE3 {
+        SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() }
+    }
+
+    /// Candidates of the room's first view, after so many frames, and the view.
+    fn traced(frames: u64) -> (Maturing, GradientImage, Rendering) {
+        let scene = Scene::new(3);
+        let view = scene.render(&CAMERA, &at(0.0));
+        let mut image = GradientImage::with_size(CAMERA.width, CAMERA.height);
+        image.fill(&view.noisy(1.0, 0));
+        let mut maturing = Maturing::default();
+        maturing.restart(&image, &CandidateParams::default());
+        let mut quads = QuadImage::with_size(CAMERA.width, CAMERA.height);
+        for k in 1..=frames {
+            let x = 0.03 * k as f64;
+            quads.fill(&scene.render(&CAMERA, &at(x)).noisy(1.0, k));
+            let view = TwoView::new(&CAMERA, &at(-x / UNIT));
+            let frame = TraceFrame { image: &quads, view, brightness: Brightness::default() };
+            maturing.trace(&frame, &IntervalParams::default());
+        }
+        (maturing, image, view)
+    }
+
+    #[test]
+    fn what_is_mature_is_left_in_the_keyframes_unit_and_nothing_else() {
+        let params = IntervalParams::default();
+        for frames in [1, 8] {
+            let (mut maturing, image, view) = traced(frames);
+            let of_filter = maturing.filter.points().iter();
+            let mature: Vec<_> = of_filter.filter(|p| p.is_mature(&params)).cloned().collect();
+            let all = maturing.filter.points().len();
+            maturing.leave(KEYFRAME, &image, UNIT, &params);
+            assert!(maturing.filter.points().is_empty());
+            let [left] = &maturing.left()[..] else { panic!("one keyframe was left") };
+            let pixels = |points: &[DepthPoint]| -> Vec<_> {
+                points.iter().map(|point| (point.u, point.v)).collect()
+            };
+            assert_eq!(left.keyframe_id, KEYFRAME);
+            let of_mature: Vec<_> = mature.iter().map(|point| (point.u, point.v)).collect();
+            assert_eq!(pixels(&left.points), of_mature);
+            // One frame's baseline makes none sure, and eight not all.
+            let fewest = if frames == 1 { 0 } else { 500 };
+            assert!((fewest..all).contains(&of_mature.len()), "{} of {all}", of_mature.len());
+            let is_right = |point: &&DepthPoint| {
+                let (u, v) = (usize::from(point.u), usize::from(point.v));
+                (point.inverse_depth / view.inverse_depth.at(u, v) - 1.0).abs() < 0.1
+            };
+            let right = left.points.iter().filter(is_right).count();
+            assert!(10 * right >= 9 * of_mature.len(), "{right} of {} right", of_mature.len());
+        }
+    }
+
+    #[test]
+    fn a_keyframe_without_a_frame_leaves_no_list() {
+        let (mut maturing, image, _) = traced(0);
+        maturing.leave(KEYFRAME, &image, UNIT, &IntervalParams::default());
+        assert!(maturing.left().is_empty());
+    }
+
+    #[test]
+    fn what_was_left_moves_with_its_keyframe() {
+        let (mut maturing, image, _) = traced(8);
+        maturing.leave(KEYFRAME, &image, UNIT, &IntervalParams::default());
+        let before = maturing.left()[0].points.clone();
+        let doubled = |keyframe_id| KeyframeCorrection {
+            keyframe_id,
+            map_from_keyframe: Sim3::identity(),
+            depth: LogPlane { offset: 2f64.ln(), ..LogPlane::default() },
+            modes: None,
+        };
+        for (keyframe_id, factor) in [(KEYFRAME + 1, 1.0), (KEYFRAME, 2.0)] {
+            let keyframes = vec![doubled(keyframe_id)];
+            maturing.correct(&Correction { keyframes, ..Correction::default() }, &CAMERA);
+            for (now, before) in maturing.left()[0].points.iter().zip(&before) {
+                assert!((now.inverse_depth / (factor * before.inverse_depth) - 1.0).abs() < 1e-5);
+            }
+        }
+    }
+}

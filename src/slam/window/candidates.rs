@@ -1,0 +1,114 @@
+//! Where the points of a keyframe come from.
+
+use serde::{Deserialize, Serialize};
+
+use crate::slam::keyframe::DepthPoint;
+use crate::slam::window::Window;
+
+/// From which filter points enter the joint estimation; `docs/depth-filters.md` compares them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PointSource {
+    /// The surest pixels of the keyframe's depth.
+    #[default]
+    Gaussian,
+    /// Pixels chosen when the keyframe is made and traced as intervals through the frames that follow: those that are
+    /// mature when the next keyframe comes (Engel, Koltun, Cremers 2018 §2.2).
+    Interval,
+}
+
+/// Points of the interval filter that were mature when their keyframe was left.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MaturePoints {
+    /// The keyframe.
+    pub keyframe_id: u64,
+    /// Their depth, in the keyframe's unit, in the order in which their pixels were chosen.
+    pub points: Vec<DepthPoint>,
+}
+
+/// What a keyframe's points will be chosen from.
+#[derive(Debug, Clone)]
+pub(super) struct Candidates {
+    pub(super) keyframe_id: u64,
+    /// Its depth.
+    pub(super) depth: Vec<DepthPoint>,
+    /// Its mature points, where they are what is chosen from.
+    pub(super) mature: Option<Vec<DepthPoint>>,
+}
+
+impl Candidates {
+    /// What is chosen from.
+    pub(super) fn points(&self) -> &[DepthPoint] {
+        self.mature.as_deref().unwrap_or(&self.depth)
+    }
+}
+
+impl Window {
+    /// Takes the mature points of keyframes that were left since the last time; [`Window::take_in`] finds them there. A
+    /// keyframe without any list has its points from its depth.
+    pub fn take_mature(&mut self, mature: &mut Vec<MaturePoints>) {
+        self.mature.append(mature);
+    }
+
+    /// The mature points of a keyframe as they were last given.
+    pub(super) fn mature_of(&mut self, keyframe_id: u64) -> Option<Vec<DepthPoint>> {
+        let place = self.mature.iter().rposition(|of| of.keyframe_id == keyframe_id)?;
+        Some(self.mature.remove(place).points)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::geometry::se3::SE3;
+    use crate::slam::geometry::sim3::Sim3;
+    use crate::slam::keyframe::Keyframe;
+    use crate::slam::map::Map;
+    use crate::slam::test_scene::{CAMERA, Scene};
+    use crate::slam::window::params::WindowParams;
+
+    /// Two keyframes of a room with exact depth everywhere.
+    fn map() -> Map {
+        let scene = Scene::new(3);
+        let keyframes = [0.0, 0.1].into_iter().enumerate().map(|(k, x)| {
+            let place = SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() };
+            let view = scene.render(&CAMERA, &place);
+            let points = view.inverse_depth.pixels().iter().enumerate();
+            let points = points.map(|(i, &inverse_depth)| DepthPoint {
+                u: (i % CAMERA.width) as u16,
+                v: (i / CAMERA.width) as u16,
+                inverse_depth,
+                variance: 1e-4,
+                intensity: 0.0,
+            });
+            let pixels = view.noisy(1.0, k as u64);
+            let keyframe = Keyframe::at(Sim3::new(place, 1.0), CAMERA, points.collect(), pixels);
+            Keyframe { keyframe_id: k as u64, ..keyframe }
+        });
+        Map { keyframes: keyframes.collect(), ..Map::default() }
+    }
+
+    /// Pixels of the first keyframe's points after its mature ones were given as such of a keyframe.
+    fn chosen(map: &Map, mature: &[DepthPoint], keyframe_id: u64) -> Vec<(u16, u16)> {
+        let mut window = Window::new(CAMERA, WindowParams::default());
+        let mut given = vec![MaturePoints { keyframe_id, points: mature.to_vec() }];
+        window.take_mature(&mut given);
+        assert!(given.is_empty() && window.take_in(map, 1));
+        window.optimise();
+        assert!(window.mature.is_empty() && window.keyframes[0].is_host);
+        window.keyframes[0].points.iter().map(|point| (point.u, point.v)).collect()
+    }
+
+    #[test]
+    fn mature_points_are_chosen_from_where_there_are_any_and_depth_elsewhere() {
+        let map = map();
+        let every = |step| map.keyframes[0].points.iter().step_by(step).copied();
+        let mature: Vec<DepthPoint> = every(37).collect();
+        let is_mature = |of: &(u16, u16)| mature.iter().any(|point| (point.u, point.v) == *of);
+        let of_mature = chosen(&map, &mature, 0);
+        assert!(of_mature.len() > 300 && of_mature.iter().all(is_mature), "{}", of_mature.len());
+        let of_depth = chosen(&map, &mature, 1);
+        assert!(of_depth.len() > 300 && !of_depth.iter().all(is_mature));
+        assert!(chosen(&map, &[], 0).is_empty());
+    }
+}
