@@ -2,7 +2,9 @@
 //!
 //! First one comparison of a pattern with its derivatives, by kernel; then an estimate of the newest keyframes after
 //! each new one of a walk through the simulated room, with the frames since the one before, on one core, against the
-//! number of keyframes that there are: 100, or `cargo bench --bench window -- 1000`.
+//! number of keyframes that there are: 100, or a number that is given. The plot of the documentation is made by
+//! `cargo bench --bench window -- 1000 --without-frames --plot docs/window-cost.svg`: most of the time of a long walk is
+//! the simulator's, which renders the frames between keyframes.
 
 use std::hint::black_box;
 use std::time::Instant;
@@ -11,6 +13,7 @@ use rustix::time::{ClockId, clock_gettime};
 use semidense::capture::simulator::Simulator;
 use semidense::capture::simulator::params::SimulatorParams;
 use semidense::capture::source::FrameSource;
+use semidense::service::results::report::chart::{Chart, Mark, Scaling, Series, svg_file};
 use semidense::slam::alignment::kernel::Kernel;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
@@ -18,12 +21,13 @@ use semidense::slam::geometry::sim3::Sim3;
 use semidense::slam::image::buffer::Image;
 use semidense::slam::keyframe::{DepthPoint, Keyframe};
 use semidense::slam::map::Map;
-use semidense::slam::window::Window;
+use semidense::slam::modes::ModeCovariance;
 use semidense::slam::window::comparison::{
     Compared, LANES, Look, Pair, PairSums, Patterns, Robustness, SAMPLES, Wanted,
 };
 use semidense::slam::window::frames::TrackedFrame;
 use semidense::slam::window::params::WindowParams;
+use semidense::slam::window::{Adjustment, Window};
 
 /// Frames from a keyframe to the next.
 const INTERVAL: usize = 12;
@@ -45,7 +49,12 @@ fn main() {
     let camera = simulator.intrinsics();
     let frame = simulator.raw_frame(0).expect("within the sequence").into_owned();
     comparisons(&camera, &frame);
-    walk(&mut simulator, &camera, keyframes);
+    let has_frames = std::env::args().all(|argument| argument != "--without-frames");
+    let costs = walk(&mut simulator, &camera, keyframes, has_frames);
+    table(&costs);
+    if let Some(path) = std::env::args().skip_while(|argument| argument != "--plot").nth(1) {
+        plot(&costs, &path).expect("the plot can be written");
+    }
 }
 
 /// Nanoseconds of a comparison, by kernel.
@@ -85,19 +94,35 @@ fn comparisons(camera: &Intrinsics, pixels: &[u8]) {
     }
 }
 
-/// Milliseconds of an estimate with the frames that are aligned again, against the number of keyframes.
-fn walk(simulator: &mut Simulator, camera: &Intrinsics, keyframes: usize) {
+/// What a new keyframe costs.
+struct Cost {
+    /// Keyframes that there are then.
+    keyframes: usize,
+    free: usize,
+    fixed: usize,
+    comparisons: usize,
+    /// Copy of what is new in the map, the estimate with the frames that are aligned again, if any, and what it makes of
+    /// the map: CPU time of one core, seconds.
+    snapshot: f64,
+    estimate: f64,
+    correction: f64,
+    /// What the process holds beside the map's images and depth, bytes.
+    memory: f64,
+}
+
+/// Costs of each new keyframe of a walk.
+fn walk(
+    simulator: &mut Simulator,
+    camera: &Intrinsics,
+    keyframes: usize,
+    has_frames: bool,
+) -> Vec<Cost> {
     let truth = simulator.ground_truth().to_vec();
     let world_from_first = truth[0].world_from_camera;
     let mut window = Window::new(*camera, WindowParams::default());
     let mut map = Map::default();
     let (mut frames, mut spare) = (Vec::new(), Vec::new());
-    let mut times = Vec::new();
-    println!("\nestimate after each new keyframe, ms of one core");
-    println!(
-        "{:>9} {:>9} {:>12} {:>12} {:>7} {:>9} {:>9}",
-        "keyframes", "free+held", "comparisons", "iterations", "frames", "snapshot", "estimate"
-    );
+    let mut costs = Vec::new();
     for id in 0..keyframes {
         let index = id * INTERVAL;
         let world_from_keyframe = truth[index].world_from_camera;
@@ -110,23 +135,27 @@ fn walk(simulator: &mut Simulator, camera: &Intrinsics, keyframes: usize) {
             let begin = cpu_secs();
             let adjusted = window.optimise();
             let estimate = cpu_secs() - begin;
-            let placed = window.take_placed().len();
-            if id >= WindowParams::default().num_first {
-                times.push(estimate);
-            }
-            if let Some(adjusted) = adjusted
-                && (id + 1) % (keyframes / 10).max(1) == 0
-            {
-                let members = format!("{}+{}", adjusted.free, adjusted.fixed);
-                let (compared, iterations) = (adjusted.comparisons, adjusted.iterations);
-                let [snapshot, estimate] = [snapshot, estimate].map(|secs| 1e3 * secs);
-                println!(
-                    "{:9} {members:>9} {compared:12} {iterations:12} {placed:7} {snapshot:9.2} {estimate:9.1}",
-                    id + 1
-                );
+            let begin = cpu_secs();
+            black_box(window.correction(&map, |_| ModeCovariance::ZERO));
+            let correction = cpu_secs() - begin;
+            drop(window.take_placed());
+            spare.clear();
+            if let Some(Adjustment { free, fixed, comparisons, .. }) = adjusted {
+                let (keyframes, memory) = (id + 1, resident_bytes() - map_bytes(&map));
+                costs.push(Cost {
+                    keyframes,
+                    free,
+                    fixed,
+                    comparisons,
+                    snapshot,
+                    estimate,
+                    correction,
+                    memory,
+                });
             }
         }
-        for between in index + 1..index + INTERVAL {
+        let end = if has_frames { index + INTERVAL } else { index };
+        for between in index + 1..end {
             let world_from_camera = truth[between].world_from_camera;
             frames.push(TrackedFrame {
                 sequence: between as u64,
@@ -137,14 +166,106 @@ fn walk(simulator: &mut Simulator, camera: &Intrinsics, keyframes: usize) {
             });
         }
     }
-    times.sort_by(f64::total_cmp);
-    let at = |share: f64| 1e3 * times[((times.len() - 1) as f64 * share) as usize];
+    costs
+}
+
+/// Medians of the keyframes from one row to the next.
+fn table(costs: &[Cost]) {
+    println!("\nafter each new keyframe, medians from row to row; ms of one core");
+    println!(
+        "{:>9} {:>9} {:>12} {:>9} {:>9} {:>11} {:>10}",
+        "keyframes", "free+held", "comparisons", "snapshot", "estimate", "correction", "memory, MB"
+    );
+    let mut begin = 0;
+    for end in (10..100).step_by(10).chain((100..).step_by(100)) {
+        let row: Vec<&Cost> =
+            costs.iter().filter(|cost| (begin + 1..=end).contains(&cost.keyframes)).collect();
+        let Some(last) = row.last().filter(|last| last.keyframes == end) else { break };
+        let of = |value: fn(&Cost) -> f64| share_of(row.iter().map(|cost| value(cost)), 0.5);
+        println!(
+            "{end:9} {:>9} {:12.0} {:9.2} {:9.1} {:11.2} {:10.1}",
+            format!("{:.0}+{:.0}", of(|cost| cost.free as f64), of(|cost| cost.fixed as f64)),
+            of(|cost| cost.comparisons as f64),
+            1e3 * of(|cost| cost.snapshot),
+            1e3 * of(|cost| cost.estimate),
+            1e3 * of(|cost| cost.correction),
+            1e-6 * last.memory,
+        );
+        begin = end;
+    }
+    let after_first =
+        costs.iter().filter(|cost| cost.keyframes > WindowParams::default().num_first);
+    let estimates: Vec<f64> = after_first.map(|cost| 1e3 * cost.estimate).collect();
     println!(
         "after the first keyframes: {:.1} ms median, {:.1} p99 of {}",
-        at(0.5),
-        at(0.99),
-        times.len()
+        share_of(estimates.iter().copied(), 0.5),
+        share_of(estimates.iter().copied(), 0.99),
+        estimates.len()
     );
+    if let [first, .., last] = costs {
+        let keyframes = (last.keyframes - first.keyframes) as f64;
+        let each = (last.memory - first.memory) / keyframes;
+        println!("memory beside the map's images and depth: {:.2} MB a keyframe", 1e-6 * each);
+    }
+}
+
+/// Every keyframe's costs as dots, and their medians.
+fn plot(costs: &[Cost], path: &str) -> std::io::Result<()> {
+    let chart = |title, value: fn(&Cost) -> f64| {
+        let points: Vec<[f64; 2]> =
+            costs.iter().map(|cost| [cost.keyframes as f64, 1e3 * value(cost)]).collect();
+        let medians = points.chunks((points.len() / 20).max(1)).map(|chunk| {
+            let x = chunk.iter().map(|[x, _]| x).sum::<f64>() / chunk.len() as f64;
+            [x, share_of(chunk.iter().map(|[_, y]| *y), 0.5)]
+        });
+        let median = Series {
+            name: "median",
+            colour: "#d6455d",
+            mark: Mark::Line,
+            points: medians.collect(),
+        };
+        let each = Series { name: "", colour: "#b4bccb", mark: Mark::Dots(1.2), points };
+        Chart {
+            title,
+            x_label: "keyframes".to_owned(),
+            y_label: "ms of one core".to_owned(),
+            height: 260.0,
+            scaling: Scaling::FromZero,
+            series: vec![each, median],
+        }
+    };
+    let charts = [
+        chart("An estimate of the newest keyframes", |cost| cost.estimate),
+        chart("Mapper: copy of what is new, and the correction", |cost| {
+            cost.snapshot + cost.correction
+        }),
+    ];
+    std::fs::write(path, svg_file(&charts, 2))
+}
+
+/// The value that this share of the others is below; 0 of none.
+fn share_of(values: impl Iterator<Item = f64>, share: f64) -> f64 {
+    let mut values: Vec<f64> = values.collect();
+    values.sort_by(f64::total_cmp);
+    let place = (values.len().saturating_sub(1) as f64 * share) as usize;
+    values.get(place).copied().unwrap_or(0.0)
+}
+
+/// Bytes of memory that the process holds.
+fn resident_bytes() -> f64 {
+    /// Bytes of a page.
+    const PAGE: f64 = 4096.0;
+    let text = std::fs::read_to_string("/proc/self/statm").unwrap_or_default();
+    let pages = text.split_whitespace().nth(1).and_then(|pages| pages.parse::<f64>().ok());
+    PAGE * pages.unwrap_or(0.0)
+}
+
+/// Bytes of the map's images and depth.
+fn map_bytes(map: &Map) -> f64 {
+    let bytes = |keyframe: &Keyframe| {
+        keyframe.image.capacity() + keyframe.points.capacity() * size_of::<DepthPoint>()
+    };
+    map.keyframes.iter().map(bytes).sum::<usize>() as f64
 }
 
 /// A keyframe at its true place, with exact depth where there is gradient.
@@ -178,6 +299,7 @@ fn keyframe(
             });
         }
     }
+    points.shrink_to_fit();
     let mut keyframe = Keyframe::at(Sim3::new(place, 1.0), *camera, points, image);
     keyframe.keyframe_id = id;
     keyframe

@@ -73,8 +73,7 @@ impl Window {
         let better = match known.is_host {
             true => self.of_own_points(known, keyframe),
             false => {
-                let index =
-                    self.keyframes.iter().position(|k| k.keyframe_id == keyframe.keyframe_id)?;
+                let index = self.index_of(keyframe.keyframe_id)?;
                 self.projected_into(index, &keyframe.points)
             }
         };

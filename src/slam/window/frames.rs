@@ -107,10 +107,6 @@ impl Window {
         self.frames.waiting = waiting;
     }
 
-    pub(super) fn index_of(&self, keyframe_id: u64) -> Option<usize> {
-        self.keyframes.iter().position(|keyframe| keyframe.keyframe_id == keyframe_id)
-    }
-
     /// Aligns frames from before their map began, the newest first, each from where the one after it was and moved
     /// on as that did; none before one that does not fit.
     fn retrace(&mut self, waiting: &mut Vec<TrackedFrame>, end: usize, left: &mut usize) {

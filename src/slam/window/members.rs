@@ -1,12 +1,18 @@
 //! Which keyframes are estimated together, and which of them stay where they are.
 
+use nalgebra::Vector3;
+
 use crate::slam::window::Window;
+use crate::slam::window::keyframe::WindowKeyframe;
 use crate::slam::window::view::Sight;
 
 /// Points that two keyframes must see both for the one to hold the other in place.
 const FEWEST_COMMON: usize = 20;
 /// Keyframes that are held in place where no older one sees the same things.
 const NUM_HELD: usize = 2;
+/// Keyframes whose points are looked for one by one in another, the nearest: seven times those that are held, so that
+/// nearly all of those that see most are among them, and a long run costs no more than a short one.
+const NUM_NEAREST: usize = 60;
 
 /// Who takes part.
 pub(super) struct Chosen {
@@ -34,6 +40,11 @@ impl Window {
 
     /// Of the older keyframes those that see most of what the newest see.
     pub(super) fn covisible(&self, older: &[usize], newest: &[usize]) -> Vec<usize> {
+        self.most_common(&self.nearest(older, newest), newest)
+    }
+
+    /// The same, all looked at closely.
+    fn most_common(&self, older: &[usize], newest: &[usize]) -> Vec<usize> {
         let common = |one: usize, other: usize| {
             let (host, observer) = (&self.keyframes[one], &self.keyframes[other]);
             let sight = Sight::new(
@@ -55,6 +66,50 @@ impl Window {
         seen.truncate(self.params.num_fixed);
         seen.into_iter().map(|(_, of)| of).collect()
     }
+
+    /// Of some keyframes, by their places in the list, those that stand and look nearest to where others do, in the order
+    /// in which they are given; all where they are few.
+    pub(super) fn nearest(&self, of: &[usize], to: &[usize]) -> Vec<usize> {
+        if of.len() <= NUM_NEAREST {
+            return of.to_vec();
+        }
+        let targets: Vec<Stand> = to.iter().map(|&to| Stand::of(&self.keyframes[to])).collect();
+        let apart = |of: usize| {
+            let stand = Stand::of(&self.keyframes[of]);
+            targets.iter().map(|target| stand.apart(target)).sum::<f64>()
+        };
+        let mut places: Vec<(f64, usize)> =
+            of.iter().enumerate().map(|(place, &of)| (apart(of), place)).collect();
+        let by_distance = |one: &(f64, usize), other: &(f64, usize)| {
+            one.0.total_cmp(&other.0).then(one.1.cmp(&other.1))
+        };
+        places.select_nth_unstable_by(NUM_NEAREST, by_distance);
+        places.truncate(NUM_NEAREST);
+        places.sort_unstable_by_key(|(_, place)| *place);
+        places.into_iter().map(|(_, place)| of[place]).collect()
+    }
+}
+
+/// Where a keyframe stands and what it looks at, in the map.
+struct Stand {
+    at: Vector3<f64>,
+    /// In the middle of its image, as far off as its depth is in the mean.
+    seen: Vector3<f64>,
+}
+
+impl Stand {
+    fn of(keyframe: &WindowKeyframe) -> Self {
+        let map_from_camera = keyframe.camera_from_map.inverse();
+        let at = map_from_camera.translation;
+        // A keyframe's unit is its mean depth.
+        let seen = at + map_from_camera.rotation * (keyframe.unit * Vector3::z());
+        Self { at, seen }
+    }
+
+    /// The larger, the less they see in common.
+    fn apart(&self, other: &Self) -> f64 {
+        (self.at - other.at).norm_squared() + (self.seen - other.seen).norm_squared()
+    }
 }
 
 impl Chosen {
@@ -74,5 +129,80 @@ impl Chosen {
         let number = |member| if free.contains(member) { numbers.next() } else { None };
         let free = members.iter().map(number).collect();
         Self { members, free, is_first }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector6;
+
+    use super::*;
+    use crate::slam::geometry::se3::SE3;
+    use crate::slam::image::buffer::Image;
+    use crate::slam::test_scene::{CAMERA, Random};
+    use crate::slam::window::keyframe::WindowPoint;
+    use crate::slam::window::params::WindowParams;
+
+    const RADIUS: f64 = 3.0;
+
+    /// A window of keyframes of a camera that wanders about the middle of a round room and turns, 30 to a turn.
+    fn wandering(keyframes: usize) -> Window {
+        let mut random = Random::new(9);
+        let blank = [Image::filled(CAMERA.width, CAMERA.height, 100)];
+        let mut window = Window::new(CAMERA, WindowParams::default());
+        let hosts = (0..keyframes).map(|k| {
+            let angle = std::f64::consts::TAU * k as f64 / 30.0;
+            let mut twist = Vector6::from_fn(|_, _| 0.05 * random.normal());
+            twist[4] += angle;
+            let mut map_from_camera = SE3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, twist[4], 0.0));
+            map_from_camera.translation = Vector3::from_fn(|_, _| 0.4 * random.normal());
+            let grid =
+                (0..15).flat_map(|row| (0..20).map(move |column| (8 + 16 * column, 8 + 16 * row)));
+            let points = grid.map(|pixel: (u16, u16)| {
+                let mut point = WindowPoint::new(pixel, 1.0, &blank, &CAMERA, &window.params);
+                let [x, y] = point.ray.map(f64::from);
+                let ray = map_from_camera.rotation * Vector3::new(x, y, 1.0);
+                // Where the ray meets the wall: |at + z ray| = radius.
+                let (at, squared) = (map_from_camera.translation, ray.norm_squared());
+                let half = at.dot(&ray) / squared;
+                let rest = (at.norm_squared() - RADIUS * RADIUS) / squared;
+                point.inverse_depth = 1.0 / (-half + (half * half - rest).sqrt());
+                point
+            });
+            WindowKeyframe {
+                keyframe_id: k as u64,
+                epoch: 0,
+                images: Vec::new(),
+                camera_from_map: map_from_camera.inverse(),
+                unit: RADIUS,
+                points: points.collect(),
+                is_host: true,
+            }
+        });
+        let hosts: Vec<WindowKeyframe> = hosts.collect();
+        window.keyframes = hosts;
+        window
+    }
+
+    #[test]
+    fn few_keyframes_are_all_looked_at_and_of_many_those_that_see_most() {
+        let window = wandering(600);
+        let few: Vec<usize> = (100..100 + NUM_NEAREST).collect();
+        assert_eq!(window.nearest(&few, &[599]), few);
+        let many: Vec<usize> = (0..590).collect();
+        let nearest = window.nearest(&many, &[598, 599]);
+        assert_eq!(nearest.len(), NUM_NEAREST);
+        assert!(nearest.is_sorted());
+        let (mut same, mut all) = (0, 0);
+        for newest in (500..600).step_by(5) {
+            let (older, newest): (Vec<usize>, _) =
+                ((0..newest - 7).collect(), [newest - 1, newest]);
+            let best = window.most_common(&older, &newest);
+            let found = window.covisible(&older, &newest);
+            all += best.len();
+            same += best.iter().filter(|of| found.contains(of)).count();
+        }
+        assert_eq!(all, 20 * window.params.num_fixed);
+        assert!(10 * same >= 9 * all, "{same} of {all}");
     }
 }

@@ -29,8 +29,6 @@ mod system;
 mod unit;
 mod view;
 
-use std::collections::{HashMap, HashSet};
-
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
@@ -84,6 +82,7 @@ pub struct Adjustment {
 pub struct Window {
     params: WindowParams,
     camera: Intrinsics,
+    /// In the order of their creation.
     keyframes: Vec<WindowKeyframe>,
     /// Keyframes whose points are still to be chosen.
     candidates: Vec<Candidates>,
@@ -129,17 +128,17 @@ impl Window {
         let is_resumed = self.keyframes.is_empty() && map.keyframes.len() > 1;
         let is_held = |k: &&Keyframe| k.has_depth() && k.map_state == MapState::Established;
         let held: Vec<&Keyframe> = map.keyframes.iter().filter(is_held).collect();
-        let ids: HashSet<u64> = held.iter().map(|keyframe| keyframe.keyframe_id).collect();
-        self.keyframes.retain(|keyframe| ids.contains(&keyframe.keyframe_id));
-        self.unaligned.retain(|id| ids.contains(id));
-        self.candidates.retain(|of| ids.contains(&of.keyframe_id));
-        let places = self.keyframes.iter().enumerate().map(|(place, of)| (of.keyframe_id, place));
-        let places: HashMap<u64, usize> = places.collect();
+        let mut ids: Vec<u64> = held.iter().map(|keyframe| keyframe.keyframe_id).collect();
+        ids.sort_unstable();
+        let is_known = |id: u64| ids.binary_search(&id).is_ok();
+        self.keyframes.retain(|keyframe| is_known(keyframe.keyframe_id));
+        self.unaligned.retain(|id| is_known(*id));
+        self.candidates.retain(|of| is_known(of.keyframe_id));
         for keyframe in held {
             let id = keyframe.keyframe_id;
             let mut is_host = false;
-            match places.get(&id) {
-                Some(&place) => is_host = self.update(place, keyframe),
+            match self.index_of(id) {
+                Some(place) => is_host = self.update(place, keyframe),
                 None if !self.add(keyframe) => continue,
                 None if !is_resumed || id == active => self.unaligned.push(id),
                 None => {}
@@ -172,23 +171,28 @@ impl Window {
         let (width, height) = (self.camera.width, self.camera.height);
         let image = Image::try_from_pixels(width, height, keyframe.image.clone());
         let Some(image) = image else { return false };
-        self.keyframes.push(WindowKeyframe {
-            keyframe_id: keyframe.keyframe_id,
+        let id = keyframe.keyframe_id;
+        let place = self.keyframes.partition_point(|of| of.keyframe_id < id);
+        let added = WindowKeyframe {
+            keyframe_id: id,
             epoch: keyframe.epoch,
             images: vec![image],
             camera_from_map: keyframe.map_from_keyframe.rigid.inverse(),
             unit: keyframe.map_from_keyframe.scale,
             points: Vec::new(),
             is_host: false,
-        });
+        };
+        self.keyframes.insert(place, added);
         true
     }
 
     fn get(&self, keyframe_id: u64) -> Option<&WindowKeyframe> {
-        let place = self.keyframes.binary_search_by_key(&keyframe_id, |of| of.keyframe_id);
-        // They are in order but where epochs were joined.
-        let is_it = |of: &&WindowKeyframe| of.keyframe_id == keyframe_id;
-        place.map(|place| &self.keyframes[place]).ok().or_else(|| self.keyframes.iter().find(is_it))
+        self.keyframes.get(self.index_of(keyframe_id)?)
+    }
+
+    /// A keyframe's place in the list, which is in the order of their creation.
+    fn index_of(&self, keyframe_id: u64) -> Option<usize> {
+        self.keyframes.binary_search_by_key(&keyframe_id, |of| of.keyframe_id).ok()
     }
 
     /// From now on there are no more frames: the next estimate is of all keyframes, and of all frames that wait.
@@ -201,9 +205,7 @@ impl Window {
         let mut is_new = false;
         while let Some(&id) = self.unaligned.first() {
             self.unaligned.remove(0);
-            let Some(index) = self.keyframes.iter().position(|k| k.keyframe_id == id) else {
-                continue;
-            };
+            let Some(index) = self.index_of(id) else { continue };
             self.choose_points_before(index);
             self.align(index);
             is_new = true;
@@ -283,10 +285,15 @@ impl Window {
     /// Points of other keyframes of the epoch where one has depth too.
     fn projected_into(&self, index: usize, points: &[DepthPoint]) -> Vec<Correspondence> {
         let to = &self.keyframes[index];
+        let is_host = |&k: &usize| {
+            let of = &self.keyframes[k];
+            of.epoch == to.epoch && k != index && !of.points.is_empty()
+        };
+        let hosts: Vec<usize> = (0..self.keyframes.len()).filter(is_host).collect();
+        let rows = selection::Rows::of(points, self.camera.height);
         let mut found = Vec::new();
-        for host in
-            self.keyframes.iter().filter(|k| k.epoch == to.epoch && k.keyframe_id != to.keyframe_id)
-        {
+        for host in self.nearest(&hosts, &[index]) {
+            let host = &self.keyframes[host];
             let sight =
                 Sight::new(&(to.camera_from_map * host.camera_from_map.inverse()), &self.camera);
             if !sight.may_see(&host.points) {
@@ -294,7 +301,7 @@ impl Window {
             }
             for point in host.points.iter().filter(|point| point.is_alive) {
                 let Some(seen) = sight.project(point) else { continue };
-                let Some(known) = selection::near(points, seen.u, seen.v) else { continue };
+                let Some(known) = rows.near(seen.u, seen.v) else { continue };
                 let depth = f64::from(known.inverse_depth) / to.unit;
                 let deviation = f64::from(known.variance).sqrt() / f64::from(known.inverse_depth);
                 if !(deviation <= self.params.max_relative_deviation) {
@@ -382,7 +389,9 @@ impl Window {
         let hosts = members.iter().filter(|&&member| self.keyframes[member].is_host).count();
         let each = points * num_first / hosts.max(1);
         for &member in members {
-            self.keyframes[member].points.truncate(each.clamp(points, max_points.max(points)));
+            let kept = &mut self.keyframes[member].points;
+            kept.truncate(each.clamp(points, max_points.max(points)));
+            kept.shrink_to_fit();
         }
     }
 

@@ -76,15 +76,35 @@ pub fn at_pixel(points: &[DepthPoint], u: u16, v: u16) -> Option<&DepthPoint> {
     points.get(place)
 }
 
-/// The nearest to a position, within a pixel of it.
-pub fn near(points: &[DepthPoint], u: f64, v: f64) -> Option<&DepthPoint> {
-    let (column, row) = (u.round(), v.round());
-    if !(column >= 1.0 && row >= 1.0 && column < 65_535.0 && row < 65_535.0) {
-        return None;
+/// The points of a keyframe by row: many positions are looked up.
+pub struct Rows<'a> {
+    points: &'a [DepthPoint],
+    /// Where each row begins, and the end.
+    begins: Vec<usize>,
+}
+
+impl<'a> Rows<'a> {
+    /// Of points in row-major order, in an image of so many rows.
+    pub fn of(points: &'a [DepthPoint], rows: usize) -> Self {
+        let begin = |row: usize| points.partition_point(|point| usize::from(point.v) < row);
+        Self { points, begins: (0..=rows).map(begin).collect() }
     }
-    let (column, row) = (column as u16, row as u16);
-    let around = (row - 1..=row + 1).flat_map(|v| (column - 1..=column + 1).map(move |u| (u, v)));
-    let distance = |p: &DepthPoint| (f64::from(p.u) - u).hypot(f64::from(p.v) - v);
-    let found = around.filter_map(|(u, v)| at_pixel(points, u, v));
-    found.min_by(|one, other| distance(one).total_cmp(&distance(other)))
+
+    /// The nearest to a position, within a pixel of it.
+    pub fn near(&self, u: f64, v: f64) -> Option<&'a DepthPoint> {
+        let (column, row) = (u.round(), v.round());
+        if !(column >= 1.0 && row >= 1.0 && column < 65_535.0 && row < 65_535.0) {
+            return None;
+        }
+        let (column, row) = (column as u16, usize::from(row as u16));
+        let around = (row - 1..=row + 1).flat_map(|row| {
+            let bounds = self.begins.get(row).zip(self.begins.get(row + 1));
+            let of_row =
+                bounds.map_or(&self.points[..0], |(&begin, &end)| &self.points[begin..end]);
+            let first = of_row.partition_point(|point| point.u < column - 1);
+            of_row[first..].iter().take_while(move |point| point.u <= column + 1)
+        });
+        let distance = |p: &DepthPoint| (f64::from(p.u) - u).hypot(f64::from(p.v) - v);
+        around.min_by(|one, other| distance(one).total_cmp(&distance(other)))
+    }
 }
