@@ -174,6 +174,7 @@ mod tests {
             map_from_keyframe: Sim3::identity(),
             depth: LogPlane { offset: 2f64.ln(), ..LogPlane::default() },
             modes: None,
+            place: None,
         };
         for (keyframe_id, factor) in [(KEYFRAME + 1, 1.0), (KEYFRAME, 2.0)] {
             let keyframes = vec![doubled(keyframe_id)];
