@@ -378,13 +378,22 @@ fn a_map_whose_poses_are_wrong_is_rejected() {
 
 #[test]
 fn a_start_with_the_wrong_motion_is_rejected_and_another_begun() {
-    /// A plane seen from two places has two explanations, and here the wrong one fits better.
-    const FIRST: usize = 3;
+    // A plane seen from two places has two explanations, and here the wrong one fits better.
+    wrong_start(3);
+}
+
+#[test]
+fn a_start_with_the_wrong_motion_that_the_joint_estimate_bends_until_it_fits_is_rejected() {
+    wrong_start(5);
+}
+
+/// A start on the floor from a frame on, with the wrong one of its motions.
+fn wrong_start(first_frame: usize) {
     let Some(folder) = recording("fr1-floor") else { return };
     let mut source = open(&SourceName::Tum(folder), None, &SourceParams::default()).unwrap();
     let floor = film(source.as_mut());
     let mut script = Script::new(floor.intrinsics);
-    script.show(&floor, FIRST..floor.frames.len());
+    script.show(&floor, first_frame..floor.frames.len());
     let mut config = ReplayConfig::default();
     let evidence = &mut config.mapper.two_frame.evidence;
     (evidence.min_rival_excess, evidence.min_turning_rival_excess) = (0.0, 0.0);

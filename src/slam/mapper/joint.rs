@@ -2,6 +2,8 @@
 
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
+use crate::slam::mapper::consistency::Contradiction;
+use crate::slam::mapper::phase::Phase;
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::pose::{NO_KEYFRAME, PoseEstimate};
 use crate::slam::window::Window;
@@ -43,6 +45,10 @@ impl Mapper {
             self.publish_depth();
             outcome.keyframe_changed = true;
         }
+        if let Some(rejected) = self.reject_refuted(&mut window) {
+            self.window = Some(window);
+            return rejected;
+        }
         let params = &self.params.modes;
         let said_of = |of: &Marginal| {
             (self.modes.of_estimate(of, params), self.modes.place_of_estimate(of, params))
@@ -61,6 +67,19 @@ impl Mapper {
         self.window = Some(window);
         outcome.keyframe_changed |= finished.keyframe_changed;
         outcome
+    }
+
+    /// Rejects the epoch that is mapped where the estimate has refuted its start.
+    fn reject_refuted(&mut self, window: &mut Window) -> Option<StepOutcome> {
+        let refuted = window.take_refuted_epoch()?;
+        let is_mapped = self.keyframe()?.epoch == refuted;
+        if !(is_mapped && matches!(self.phase, Phase::Mapping | Phase::Lost(_))) {
+            return None;
+        }
+        drop(window.take_placed());
+        window.leave_unrefined();
+        self.reject(Contradiction::WrongStart);
+        Some(StepOutcome { keyframe_changed: true, graph_changed: true, ..Default::default() })
     }
 
     /// As [`Mapper::begin_adjustment`], where no more frames come: of all keyframes, new or not, and of the frames that

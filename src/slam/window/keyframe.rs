@@ -13,7 +13,7 @@ pub const LEVELS: usize = 4;
 const DARKEST: f32 = 1.0;
 
 /// A keyframe whose place is estimated jointly with others.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct WindowKeyframe {
     /// Its id in the map.
     pub keyframe_id: u64,

@@ -23,6 +23,7 @@ mod neighbours;
 pub mod params;
 pub mod place_marginals;
 mod plane;
+mod rival;
 mod selection;
 mod solver;
 mod system;
@@ -98,6 +99,8 @@ pub struct Window {
     frames: WindowFrames,
     is_last: bool,
     refinement: Refinement,
+    /// The epoch whose start was found to be wrong.
+    refuted_epoch: Option<u32>,
 }
 
 impl Window {
@@ -116,6 +119,7 @@ impl Window {
             frames: WindowFrames::default(),
             is_last: false,
             refinement: Refinement::default(),
+            refuted_epoch: None,
         }
     }
 
@@ -195,6 +199,11 @@ impl Window {
         self.keyframes.binary_search_by_key(&keyframe_id, |of| of.keyframe_id).ok()
     }
 
+    /// The epoch whose start the last estimate has refuted: told once.
+    pub fn take_refuted_epoch(&mut self) -> Option<u32> {
+        self.refuted_epoch.take()
+    }
+
     /// From now on there are no more frames: the next estimate is of all keyframes, and of all frames that wait.
     pub fn conclude(&mut self) {
         self.is_last = true;
@@ -215,6 +224,9 @@ impl Window {
         if is_new {
             let chosen = self.choose_members(newest);
             adjustment = self.adjust(&chosen);
+            if adjustment.is_some() && self.is_refuted(&chosen) {
+                self.refuted_epoch = Some(self.keyframes[newest].epoch);
+            }
             self.place_frames(newest, chosen.is_first);
             self.leave(&chosen.members);
         }
