@@ -136,7 +136,7 @@ fn walk(
             let adjusted = window.optimise();
             let estimate = cpu_secs() - begin;
             let begin = cpu_secs();
-            black_box(window.correction(&map, |_| ModeCovariance::ZERO));
+            black_box(window.correction(&map, |_| (ModeCovariance::ZERO, None)));
             let correction = cpu_secs() - begin;
             drop(window.take_placed());
             spare.clear();

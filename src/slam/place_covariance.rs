@@ -13,6 +13,7 @@ use nalgebra::{Matrix6, SMatrix, SVector, Vector3};
 
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
+use crate::slam::pose::UNKNOWN_VARIANCE;
 
 /// What the place of a keyframe errs by: six numbers of its pose, one of its unit.
 pub const PLACE_ERRORS: usize = 7;
@@ -24,7 +25,14 @@ pub type PlaceMatrix = SMatrix<f64, PLACE_ERRORS, PLACE_ERRORS>;
 
 /// Variances of a place of which nothing is known: of its pose as of a pose that is not claimed, of the logarithm of
 /// its unit a factor of e. None is larger.
-const IGNORANCE: [f64; PLACE_ERRORS] = [1e6, 1e6, 1e6, 1e6, 1e6, 1e6, 1.0];
+const IGNORANCE: [f64; PLACE_ERRORS] = {
+    let mut variances = [UNKNOWN_VARIANCE; PLACE_ERRORS];
+    variances[PLACE_ERRORS - 1] = 1.0;
+    variances
+};
+
+/// By rounding, variances may be this share of the largest below zero, and so may eigenvalues of the correlations.
+const ROUNDING: f64 = 1e-9;
 
 /// Covariance of the errors (ξ, λ) of a keyframe's place.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -62,16 +70,28 @@ impl PlaceCovariance {
         Self { upper_triangle: std::array::from_fn(|_| entries.next().map_or(0.0, mean)) }
     }
 
-    /// Of a symmetric matrix that came out of sums: what is beyond all sense is taken for complete ignorance.
+    /// Of a symmetric matrix that came out of sums. What by rounding alone has a variance below zero is taken for exact,
+    /// and what is less sure than ignorance for as sure as that, its correlations as they are; what is no covariance
+    /// even so is taken for complete ignorance.
     pub fn bounded(matrix: &PlaceMatrix) -> Self {
         let covariance = Self::of(matrix);
-        Self::from_upper_triangle(covariance.upper_triangle).unwrap_or_else(Self::unknown)
+        let matrix = covariance.matrix();
+        let variances = matrix.diagonal();
+        let least = -ROUNDING * variances.max();
+        // Rows and columns times the same: what was a covariance stays one.
+        let factors = SVector::<f64, PLACE_ERRORS>::from_fn(|k, _| match variances[k] {
+            variance if (least..0.0).contains(&variance) => 0.0,
+            variance if variance > IGNORANCE[k] => (IGNORANCE[k] / variance).sqrt(),
+            _ => 1.0,
+        });
+        let mut within = scaled(&matrix, &factors);
+        // Rounding may leave it above.
+        (0..PLACE_ERRORS).for_each(|k| within[(k, k)] = within[(k, k)].min(IGNORANCE[k]));
+        Self::from_upper_triangle(Self::of(&within).upper_triangle).unwrap_or_else(Self::unknown)
     }
 
     /// Of its upper triangle, row by row; `None` where that is no covariance, or one beyond all sense.
     pub fn from_upper_triangle(upper_triangle: [f64; PLACE_ENTRIES]) -> Option<Self> {
-        /// Eigenvalues of the correlations may be so far below zero, by rounding.
-        const TOLERANCE: f64 = 1e-9;
         let covariance = Self { upper_triangle };
         let matrix = covariance.matrix();
         let is_bounded = upper_triangle.iter().all(|x| x.is_finite())
@@ -82,7 +102,7 @@ impl PlaceCovariance {
         // Lengths and angles have no common scale.
         let deviations = deviations(&matrix);
         let correlation = scaled(&matrix, &deviations.map(|of| 1.0 / of));
-        (correlation.symmetric_eigenvalues().min() >= -TOLERANCE).then_some(covariance)
+        (correlation.symmetric_eigenvalues().min() >= -ROUNDING).then_some(covariance)
     }
 
     /// Its upper triangle, row by row.
@@ -97,6 +117,11 @@ impl PlaceCovariance {
             (matrix[(i, j)], matrix[(j, i)]) = (value, value);
         }
         matrix
+    }
+
+    /// Whether a variance is as large as any may be.
+    fn is_at_bound(&self) -> bool {
+        self.matrix().diagonal().iter().zip(IGNORANCE).any(|(&variance, bound)| variance >= bound)
     }
 
     /// The same in the map that `by` makes of this one.
@@ -114,10 +139,13 @@ impl UncertainPlace {
 
     /// Covariance of the left increment of `map_from_camera`, map units and radians, of a camera that stands at
     /// `keyframe_from_camera` with this covariance of the left increment of `current_from_keyframe`, both in the
-    /// keyframe's unit.
+    /// keyframe's unit. Where the place is beyond all numbers nothing is known.
     pub fn of_camera(&self, keyframe_from_camera: &SE3, covariance: &Matrix6<f64>) -> Matrix6<f64> {
         let sum = self.with_camera(keyframe_from_camera, covariance);
         let mut pose = sum.fixed_view::<6, 6>(0, 0).into_owned();
+        if !pose.iter().all(|x| x.is_finite()) {
+            return Matrix6::from_diagonal_element(UNKNOWN_VARIANCE);
+        }
         // By rounding alone a variance is below zero.
         (0..6).for_each(|k| pose[(k, k)] = pose[(k, k)].max(0.0));
         pose
@@ -154,11 +182,20 @@ impl UncertainPlace {
     /// which is what it was uncertain by beyond the leader.
     pub fn following(&self, was: &Self, is: &Self) -> PlaceCovariance {
         let moved = is.map_from_keyframe * was.map_from_keyframe.inverse();
+        let position = moved * self.map_from_keyframe.rigid.translation;
+        // A variance at its bound was larger: the difference of two of which one was clipped, and the other not or
+        // elsewhere, is nothing that lies between them.
+        if was.covariance.is_at_bound() {
+            return PlaceCovariance::bounded(&is.at(&position));
+        }
+        // Unknown for a reason of its own: its leader does not change that.
+        if self.covariance.is_at_bound() {
+            return self.covariance;
+        }
         let own = self.covariance.matrix();
         let beyond = own - was.at(&self.map_from_keyframe.rigid.translation);
         let between = positive_part(&beyond, &deviations(&own));
         let by = transport(&moved);
-        let position = moved * self.map_from_keyframe.rigid.translation;
         PlaceCovariance::bounded(&(is.at(&position) + by * between * by.transpose()))
     }
 }
@@ -169,7 +206,7 @@ fn entries() -> impl Iterator<Item = (usize, usize)> {
 }
 
 /// What (ξ, λ) become in the map that `by` makes of this one.
-fn transport(by: &Sim3) -> PlaceMatrix {
+pub fn transport(by: &Sim3) -> PlaceMatrix {
     let mut matrix = PlaceMatrix::identity();
     matrix.fixed_view_mut::<6, 6>(0, 0).copy_from(&by.rigid_adjoint());
     matrix
@@ -303,6 +340,58 @@ mod tests {
         let sure = UncertainPlace { covariance: PlaceCovariance::ZERO, ..was };
         let found = sure.following(&was, &is).matrix();
         assert!((found - is.covariance.matrix()).norm() < 1e-12, "{found}");
+    }
+
+    #[test]
+    fn what_is_no_surer_than_ignorance_leaves_the_rest_as_it_is() {
+        let good = of_errors(&errors(0.5)).matrix() + PlaceMatrix::identity() * 1e-3;
+        // The unit alone is unknown, and far beyond all sense.
+        for beyond in [1.1, 1e9, 1e300] {
+            let mut scales = SVector::<f64, PLACE_ERRORS>::repeat(1.0);
+            scales[6] = (beyond / good[(6, 6)]).sqrt();
+            let found = PlaceCovariance::bounded(&scaled(&good, &scales)).matrix();
+            scales[6] = (1.0 / good[(6, 6)]).sqrt();
+            let expected = scaled(&good, &scales);
+            assert!((found - expected).norm() < 1e-12 * expected.norm(), "{beyond}{found}");
+            assert_eq!(found[(6, 6)], 1.0);
+        }
+        // A direction in which it is exact, but for rounding.
+        let mut rounded = good;
+        rounded.fixed_view_mut::<1, PLACE_ERRORS>(2, 0).fill(1e-12);
+        rounded.fixed_view_mut::<PLACE_ERRORS, 1>(0, 2).fill(1e-12);
+        rounded[(2, 2)] = -1e-15;
+        let found = PlaceCovariance::bounded(&rounded).matrix();
+        let is_of_it = |i: usize, j: usize| i == 2 || j == 2;
+        let left = PlaceMatrix::from_fn(|i, j| if is_of_it(i, j) { 0.0 } else { good[(i, j)] });
+        assert_eq!(found, left);
+        rounded[(2, 2)] = -1e-3;
+        assert_eq!(PlaceCovariance::bounded(&rounded), PlaceCovariance::unknown());
+    }
+
+    #[test]
+    fn beside_a_variance_at_its_bound_a_follower_is_as_sure_as_its_leader() {
+        let with = |covariance| UncertainPlace { map_from_keyframe: place(), covariance };
+        let sure = with(of_errors(&(errors(0.7) * 1e-3)));
+        let unknown = with(PlaceCovariance::unknown());
+        // Its leader was unknown, and so it was made; its pose was clipped and that of the leader was not.
+        let mut clipped = PlaceMatrix::identity() * 1e-2;
+        clipped[(6, 6)] = 1.0;
+        let follower = UncertainPlace {
+            map_from_keyframe: Sim3::new(place().place(&camera()), 1.3),
+            covariance: PlaceCovariance::bounded(&(clipped * 2.0)),
+        };
+        let position = follower.map_from_keyframe.rigid.translation;
+        let expected = sure.at(&position);
+        let is_as_sure = |follower: &UncertainPlace, was: &UncertainPlace| {
+            let off = follower.following(was, &sure).matrix() - expected;
+            off.norm() < 1e-9 * expected.norm()
+        };
+        for was in [unknown, with(PlaceCovariance::bounded(&clipped))] {
+            assert!(is_as_sure(&follower, &was));
+        }
+        let open = PlaceMatrix::identity() * 1e-2;
+        let follower = UncertainPlace { covariance: PlaceCovariance::bounded(&open), ..follower };
+        assert!(is_as_sure(&follower, &unknown) && !is_as_sure(&follower, &sure));
     }
 
     #[test]

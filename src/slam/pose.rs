@@ -6,6 +6,9 @@ use crate::slam::geometry::se3::SE3;
 /// The id of no keyframe: before the mapper has made the first.
 pub const NO_KEYFRAME: u64 = u64::MAX;
 
+/// Variance of what is not known, units² of whatever it is measured in and radians²: large and finite.
+pub const UNKNOWN_VARIANCE: f64 = 1.0e6;
+
 /// What a pose is worth.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TrackingState {

@@ -16,7 +16,7 @@ use crate::slam::image::sums::{SumPyramid, grey_per_sum};
 use crate::slam::keyframe::{DistanceWeights, MapState};
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::{
-    Brightness, LostReason, NO_KEYFRAME, PoseEstimate, Quality, TrackingState,
+    Brightness, LostReason, NO_KEYFRAME, PoseEstimate, Quality, TrackingState, UNKNOWN_VARIANCE,
 };
 use crate::slam::tracker::covariance_floor::{CovarianceFloorParams, displacement_covariance};
 use crate::slam::tracker::motion::{Motion, hypotheses, turned};
@@ -97,9 +97,6 @@ impl TrackerParams {
         check_range("keyframe_brightness_ratio", self.keyframe_brightness_ratio, 1.01..=1e6)
     }
 }
-
-/// Variance of what is not known, keyframe units² and radians²: large and finite.
-pub const UNKNOWN_VARIANCE: f64 = 1.0e6;
 
 /// Tracks frames against the active reference.
 #[derive(Debug)]

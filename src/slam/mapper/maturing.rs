@@ -10,6 +10,10 @@ use crate::slam::keyframe::DepthPoint;
 use crate::slam::map::Correction;
 use crate::slam::window::candidates::MaturePoints;
 
+/// Keyframes of which points are kept until they are taken: some that come during an estimate. Where nobody takes any, as
+/// while a start or the window is away, the oldest are forgotten, whose depth is what their points come from then.
+const MOST_LEFT: usize = 16;
+
 /// Candidates of the active keyframe, in the unit of its depth buffer, and what became of those of keyframes that were
 /// left.
 #[derive(Debug, Default)]
@@ -59,7 +63,11 @@ impl Maturing {
                 variance: of.variance * (inverse_unit * inverse_unit),
                 intensity: image.intensity.at(usize::from(of.u), usize::from(of.v)),
             });
-            self.left.push(MaturePoints { keyframe_id, points: points.collect() });
+            let points = points.collect();
+            self.left.retain(|left| left.keyframe_id != keyframe_id);
+            let surplus = (self.left.len() + 1).saturating_sub(MOST_LEFT);
+            self.left.drain(..surplus);
+            self.left.push(MaturePoints { keyframe_id, points });
         }
         self.clear();
     }
@@ -155,6 +163,18 @@ mod tests {
             let right = left.points.iter().filter(is_right).count();
             assert!(10 * right >= 9 * of_mature.len(), "{right} of {} right", of_mature.len());
         }
+    }
+
+    #[test]
+    fn what_nobody_takes_is_kept_of_the_last_keyframes_once_each() {
+        let (mut maturing, image, _) = traced(1);
+        let last = MOST_LEFT as u64 + 3;
+        for keyframe_id in (0..=last).flat_map(|id| [id, id]) {
+            maturing.is_traced = true;
+            maturing.leave(keyframe_id, &image, UNIT, &IntervalParams::default());
+        }
+        let kept: Vec<u64> = maturing.left().iter().map(|left| left.keyframe_id).collect();
+        assert_eq!(kept, Vec::from_iter(4..=last));
     }
 
     #[test]

@@ -1,14 +1,17 @@
 //! Whatever frames and keyframes hold: no panic, nothing non-finite, and a good frame is tracked after it.
 
-use nalgebra::Vector6;
+use nalgebra::{Matrix6, Vector6};
 use proptest::prelude::*;
 
 use crate::slam::alignment::reference::Reference;
 use crate::slam::alignment::scene::{Noise, Plane};
+use crate::slam::depth::common_error::full_covariance;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
+use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::Keyframe;
+use crate::slam::pose::UNKNOWN_VARIANCE;
 use crate::slam::tracker::tests::is_clean;
 use crate::slam::tracker::{Tracker, TrackerParams};
 
@@ -55,6 +58,7 @@ struct Harm {
     intensity: f32,
     place: Option<(u16, u16)>,
     scale: f64,
+    map_scale: f64,
     image: Picture,
 }
 
@@ -62,16 +66,21 @@ fn harm() -> impl Strategy<Value = Harm> {
     let points = prop::sample::select(vec![0, 1, 2, 7, 60, 100_000]);
     let number = || prop::option::of(hostile_number());
     let place = prop::option::of(any::<(u16, u16)>());
-    let scale = prop::sample::select(vec![1.0, 1.0, 1.0, 0.0, -1.0, 1e-300, 1e300, f64::NAN]);
-    (points, 1usize..5, number(), number(), hostile_number(), place, scale, picture()).prop_map(
-        |(points, stride, inverse_depth, variance, intensity, place, scale, image)| Harm {
+    let scale = || {
+        let scales = vec![1.0, 1.0, 1.0, 0.0, -1.0, 1e-300, 1e200, 1e300, f64::NAN];
+        prop::sample::select(scales)
+    };
+    let scales = (scale(), scale());
+    (points, 1usize..5, number(), number(), hostile_number(), place, scales, picture()).prop_map(
+        |(points, stride, inverse_depth, variance, intensity, place, scales, image)| Harm {
             points,
             stride,
             inverse_depth,
             variance,
             intensity,
             place,
-            scale,
+            scale: scales.0,
+            map_scale: scales.1,
             image,
         },
     )
@@ -87,6 +96,7 @@ impl Harm {
             (point.u, point.v) = self.place.unwrap_or((point.u, point.v));
         }
         keyframe.world_from_keyframe.scale = self.scale;
+        keyframe.map_from_keyframe.scale = self.map_scale;
         keyframe.image = self.image.pixels(&keyframe.image);
         keyframe
     }
@@ -186,6 +196,22 @@ proptest! {
         tracker.adopt(Box::new(Reference::prepare(&next)));
         let estimate = tracker.track(&view(&good.image, 9, 9), &mut |_| true);
         prop_assert!(estimate.state.is_tracked(), "{estimate:?}");
+    }
+}
+
+#[test]
+fn where_a_place_is_beyond_all_numbers_nothing_is_known_of_the_pose_in_the_map() {
+    let good = plane().keyframe(&CAMERA, 2, 0.02);
+    for (x, scale) in [(1.0, 1e200), (1e160, 1.0)] {
+        let place = SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() };
+        let hostile = Keyframe { map_from_keyframe: Sim3::new(place, scale), ..good.clone() };
+        let mut tracker = Tracker::new(CAMERA, TrackerParams::default()).unwrap();
+        tracker.adopt(Box::new(Reference::prepare(&hostile)));
+        let estimate = tracker.track(&view(&good.image, 0, 0), &mut |_| true);
+        assert!(is_clean(&estimate) && estimate.state.is_tracked(), "{estimate:?}");
+        let unknown = Matrix6::from_diagonal_element(UNKNOWN_VARIANCE);
+        assert_eq!(full_covariance(&estimate.map_covariance), unknown);
+        assert!(full_covariance(&estimate.covariance).norm() < 1.0);
     }
 }
 

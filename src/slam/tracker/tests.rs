@@ -11,8 +11,10 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::place_covariance::{PlaceCovariance, PlaceMatrix, UncertainPlace};
-use crate::slam::pose::{DegradedReason, LostReason, PoseEstimate, TrackingState};
-use crate::slam::tracker::{Tracker, TrackerParams, UNKNOWN_VARIANCE};
+use crate::slam::pose::{
+    DegradedReason, LostReason, PoseEstimate, TrackingState, UNKNOWN_VARIANCE,
+};
+use crate::slam::tracker::{Tracker, TrackerParams};
 
 fn always(_level: usize) -> bool {
     true
@@ -39,6 +41,7 @@ fn path(index: u64) -> SE3 {
 pub(super) fn is_clean(estimate: &PoseEstimate) -> bool {
     let quality = &estimate.quality;
     estimate.world_from_camera.is_finite()
+        && estimate.map_from_camera.is_finite()
         && estimate.keyframe_from_camera.is_finite()
         && estimate.covariance.iter().all(|x| x.is_finite())
         && estimate.map_covariance.iter().all(|x| x.is_finite())

@@ -2,8 +2,14 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::DepthPoint;
-use crate::slam::window::Window;
+use crate::slam::window::params::WindowParams;
+use crate::slam::window::{Window, selection};
+
+/// Fewer mature points than this hold neither a keyframe's pose nor a plane through its depth, which wants 30 of them:
+/// they are chosen from its depth then.
+const FEWEST_MATURE: usize = 40;
 
 /// From which filter points enter the joint estimation; `docs/depth-filters.md` compares them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -32,20 +38,37 @@ pub(super) struct Candidates {
     pub(super) keyframe_id: u64,
     /// Its depth.
     pub(super) depth: Vec<DepthPoint>,
-    /// Its mature points, where they are what is chosen from.
+    /// Its mature points, which are chosen from where they are not too few.
     pub(super) mature: Option<Vec<DepthPoint>>,
 }
 
 impl Candidates {
-    /// What is chosen from.
-    pub(super) fn points(&self) -> &[DepthPoint] {
-        self.mature.as_deref().unwrap_or(&self.depth)
+    /// Those of the keyframe's points that are estimated, in an order of which every beginning is spread over its image.
+    pub(super) fn choose(
+        &self,
+        pixels: &[u8],
+        camera: &Intrinsics,
+        params: &WindowParams,
+    ) -> Vec<DepthPoint> {
+        let choose = |points: &[DepthPoint]| {
+            selection::choose_spread(
+                points,
+                pixels,
+                camera,
+                [params.points, params.max_points],
+                params.min_gradient,
+                params.max_relative_deviation,
+            )
+        };
+        let of_mature = self.mature.as_deref().map(choose);
+        let are_enough = |chosen: &Vec<DepthPoint>| chosen.len() >= FEWEST_MATURE;
+        of_mature.filter(are_enough).unwrap_or_else(|| choose(&self.depth))
     }
 }
 
 impl Window {
     /// Takes the mature points of keyframes that were left since the last time; [`Window::take_in`] finds them there. A
-    /// keyframe without any list has its points from its depth.
+    /// keyframe without a list, or of whose list too few can be chosen, has its points from its depth.
     pub fn take_mature(&mut self, mature: &mut Vec<MaturePoints>) {
         self.mature.append(mature);
     }
@@ -100,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn mature_points_are_chosen_from_where_there_are_any_and_depth_elsewhere() {
+    fn mature_points_are_chosen_from_where_they_are_enough_and_depth_elsewhere() {
         let map = map();
         let every = |step| map.keyframes[0].points.iter().step_by(step).copied();
         let mature: Vec<DepthPoint> = every(37).collect();
@@ -109,6 +132,9 @@ mod tests {
         assert!(of_mature.len() > 300 && of_mature.iter().all(is_mature), "{}", of_mature.len());
         let of_depth = chosen(&map, &mature, 1);
         assert!(of_depth.len() > 300 && !of_depth.iter().all(is_mature));
-        assert!(chosen(&map, &[], 0).is_empty());
+        // None, and a few too few.
+        for few in [&[][..], &mature[..FEWEST_MATURE - 1]] {
+            assert_eq!(chosen(&map, few, 0), of_depth, "{}", few.len());
+        }
     }
 }

@@ -89,7 +89,8 @@ impl Window {
             map_from_keyframe: Sim3::new(place, unit * (-offset).exp()),
             depth: LogPlane { offset: 0.0, per_x, per_y },
             modes,
-            place: said.and_then(|(_, place)| place),
+            // Its unit is that of the points only where they gave it.
+            place: said.and_then(|(_, place)| place).filter(|_| plane.is_some()),
         })
     }
 

@@ -2,7 +2,11 @@
 
 use nalgebra::{Matrix3, Matrix4, SVector, Vector3, Vector4};
 
+use super::Window;
 use super::keyframe::WindowKeyframe;
+use super::members::Chosen;
+use super::params::WindowParams;
+use super::place_marginals::PlaceMarginal;
 use super::solver::Solver;
 use super::system::Members;
 use super::tests::{Room, noisy_room};
@@ -106,12 +110,13 @@ fn place_ratios(held: &[usize]) -> SVector<f64, PLACE_ERRORS> {
         let mut truth = noisy_room(|_, _| (1.0, 0.0), seed);
         truth.held = held.to_vec();
         let mut room = truth.clone();
-        let (_, marginals) = room.solve_with(&mut Solver::default());
+        let (_, mut marginals) = room.solve_with(&mut Solver::default());
         let members: Vec<usize> = (0..room.keyframes.len()).collect();
         let free: Vec<_> = members.iter().map(|k| (!held.contains(k)).then_some(0)).collect();
         let members = Members { members: &members, free: &free, depths_are_free: true };
         if let Some(unit) = Unit::of(&truth.keyframes, &members) {
-            unit.restore(&mut room.keyframes, members.members);
+            let by = unit.restore(&mut room.keyframes, members.members).unwrap();
+            marginals.iter_mut().for_each(|of| of.transport(&by));
         }
         let errors = place_errors(&room, &truth, 2);
         sum += errors;
@@ -130,5 +135,31 @@ fn they_say_how_much_noise_moves_places_and_units() {
     for held in [&[0][..], &[0, 1]] {
         let ratios = place_ratios(held);
         assert!(ratios.iter().all(|ratio| (0.4..1.3).contains(ratio)), "{held:?}{ratios}");
+    }
+}
+
+#[test]
+fn places_are_as_uncertain_as_the_unit_makes_them_that_is_kept() {
+    // The depths of the keyframe that holds the window are nearer than all else has them.
+    let mut room = noisy_room(|_, _| (1.0, 0.0), 1);
+    room.keyframes[0].points.iter_mut().for_each(|point| point.inverse_depth *= 1.2);
+    let mut window = Window::new(CAMERA, WindowParams::default());
+    window.keyframes = room.keyframes;
+    // Estimated again, all is in the unit that it begins with.
+    let [(first, shorter), (second, same)] = [(); 2].map(|()| {
+        let before = window.keyframes[3].camera_from_map.translation.norm();
+        window.adjust(&Chosen::new(Vec::new(), &[0, 1, 2, 3], true, true)).unwrap();
+        let places = [1, 2, 3].map(|id| window.marginal_of(id).unwrap().place.unwrap());
+        let after = window.keyframes[3].camera_from_map.translation.norm();
+        (places, after / before)
+    });
+    assert!(shorter < 0.9 && (same - 1.0).abs() < 0.02, "{shorter} {same}");
+    for (first, second) in first.iter().zip(&second) {
+        for of in [|place: &PlaceMarginal| place.noise, |place: &PlaceMarginal| place.of_displaced]
+        {
+            let positions = |place| of(place).fixed_view::<3, 3>(0, 0).trace();
+            let ratio = positions(first) / positions(second);
+            assert!((0.9..1.1).contains(&ratio), "{ratio}");
+        }
     }
 }

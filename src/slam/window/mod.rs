@@ -268,14 +268,7 @@ impl Window {
         let params = &self.params;
         let keyframe = &mut self.keyframes[host];
         keyframe.take_part(&self.camera);
-        let chosen = selection::choose_spread(
-            candidates.points(),
-            keyframe.images[0].pixels(),
-            &self.camera,
-            [params.points, params.max_points],
-            params.min_gradient,
-            params.max_relative_deviation,
-        );
+        let chosen = candidates.choose(keyframe.images[0].pixels(), &self.camera, params);
         keyframe.points = chosen
             .iter()
             .map(|point| {
@@ -370,10 +363,14 @@ impl Window {
         if !self.run(&members, &ADJUSTED_LEVELS, iterations, |_, _| true) {
             return None;
         }
-        self.keep_marginals(&members);
-        if let Some(unit) = unit {
-            unit.restore(&mut self.keyframes, members.members);
+        let mut found =
+            marginals::marginals(&self.keyframes, &members, &mut self.solver, &self.camera);
+        // They are in the unit of the equations.
+        let restored = unit.and_then(|unit| unit.restore(&mut self.keyframes, members.members));
+        if let Some(by) = restored {
+            found.iter_mut().for_each(|of| of.transport(&by));
         }
+        self.keep_marginals(&members, found);
         let moved = members
             .members
             .iter()

@@ -36,13 +36,14 @@ pub fn smoothed(points: &[DepthPoint], singles: &[Single], width: usize) -> Vec<
         for (place, squared_distance) in places.around(point) {
             let neighbour = &singles[place];
             let squared = (neighbour.inverse_depth - single.inverse_depth).powi(2);
+            let slant = (SLANT * single.inverse_depth).powi(2) * squared_distance;
+            let weight = 1.0 / (neighbour.own + slant);
+            let is_sure = weight > 0.0 && weight.is_finite();
             others += 1.0;
-            if !(squared <= MOST_APART * MOST_APART * (neighbour.most + single.most)) {
+            if !(is_sure && squared <= MOST_APART * MOST_APART * (neighbour.most + single.most)) {
                 apart += 1.0;
                 continue;
             }
-            let slant = (SLANT * single.inverse_depth).powi(2) * squared_distance;
-            let weight = 1.0 / (neighbour.own + slant);
             sum += weight * neighbour.inverse_depth;
             weights += weight;
         }
@@ -50,7 +51,11 @@ pub fn smoothed(points: &[DepthPoint], singles: &[Single], width: usize) -> Vec<
         let doubt = 1.0 + apart / others;
         let variance = (own + single.common).min(single.most) * doubt * doubt;
         let inverse_depth = (sum / weights) as f32;
-        let is_sane = inverse_depth > 0.0 && inverse_depth.is_finite() && variance.is_finite();
+        let is_sane = inverse_depth > 0.0
+            && inverse_depth.is_finite()
+            && single.own > 0.0
+            && variance > 0.0
+            && variance.is_finite();
         match is_sane {
             true => DepthPoint { inverse_depth, variance: variance as f32, ..*point },
             false => *point,
@@ -153,6 +158,25 @@ mod tests {
         assert!(rms(&after, |p| f64::from(p.inverse_depth) - 1.2) < 0.008);
         let sure = |points: &[DepthPoint]| rms(points, |p| f64::from(p.variance).sqrt());
         assert!(sure(&before) > 1.2 * sure(&inside), "{} {}", sure(&before), sure(&inside));
+    }
+
+    #[test]
+    fn a_neighbour_of_no_variance_counts_as_one_that_is_apart() {
+        let (points, singles) = plane(1.0);
+        let with = |single: Single| {
+            let mut singles = singles.clone();
+            singles[500] = single;
+            smoothed(&points, &singles, WIDTH)
+        };
+        let expected = with(Single { inverse_depth: 100.0, ..singles[500] });
+        for own in [-1e-4, -1.0, f64::NAN, f64::INFINITY] {
+            let smooth = with(Single { own, ..singles[500] });
+            for beside in [459, 460, 461, 499, 501, 539, 540, 541] {
+                assert_eq!(smooth[beside], expected[beside], "{own} {beside}");
+            }
+            // With a variance of any size, its neighbours say where it is; with none it stays.
+            assert!(own > 0.0 || smooth[500] == points[500], "{own}");
+        }
     }
 
     #[test]

@@ -13,7 +13,8 @@ use nalgebra::{Cholesky, Const, DVector, Matrix3};
 
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
-use crate::slam::place_covariance::{PLACE_ERRORS, PlaceMatrix};
+use crate::slam::geometry::sim3::Sim3;
+use crate::slam::place_covariance::{PLACE_ERRORS, PlaceMatrix, transport};
 use crate::slam::tracker::covariance_floor::displacement_covariance;
 use crate::slam::window::comparison::POSE;
 use crate::slam::window::keyframe::WindowKeyframe;
@@ -31,6 +32,14 @@ pub struct PlaceMarginal {
 }
 
 impl PlaceMarginal {
+    /// Moves it into the map that `by` makes of this one.
+    pub(super) fn transport(&mut self, by: &Sim3) {
+        let by = transport(by);
+        for matrix in [&mut self.noise, &mut self.of_displaced] {
+            *matrix = by * *matrix * by.transpose();
+        }
+    }
+
     /// Whether every number is.
     pub(super) fn is_finite(&self) -> bool {
         self.noise.iter().chain(self.of_displaced.iter()).all(|x| x.is_finite())

@@ -293,7 +293,12 @@ fn the_unit_stays_where_one_keyframe_holds_it() {
         from_anchor.translation /= 1.7;
         keyframe.camera_from_map = from_anchor * anchor;
     }
-    unit.restore(&mut longer.keyframes, members.members);
+    let moved = longer.clone();
+    let by = unit.restore(&mut longer.keyframes, members.members).unwrap();
+    for (was, is) in moved.keyframes.iter().zip(&longer.keyframes) {
+        let was = by.place(&was.camera_from_map.inverse());
+        assert!((is.camera_from_map * was).log().norm() < 1e-9);
+    }
     let (translation, rotation, depth) = longer.errors(&truth);
     assert!(
         translation < 1e-9 && rotation < 1e-6 && depth < 1e-9,
@@ -345,6 +350,23 @@ fn keyframes_that_are_not_estimated_follow_the_last_before_them_that_moved() {
         window.keyframes.push(keyframe);
         window.moved.push(id);
     }
+    // Of 5 there is depth that its unit can be taken from, of 3 there is none.
+    let points: Vec<WindowPoint> = room.keyframes[0]
+        .points
+        .iter()
+        .map(|point| WindowPoint { confirmations: 1, ..point.clone() })
+        .collect();
+    let mut depth: Vec<DepthPoint> = points
+        .iter()
+        .map(|point| DepthPoint {
+            u: point.u,
+            v: point.v,
+            inverse_depth: point.inverse_depth as f32,
+            ..DepthPoint::default()
+        })
+        .collect();
+    depth.sort_by_key(|point| (point.v, point.u));
+    (window.keyframes[1].points, window.keyframes[1].is_host) = (points, true);
     // 4 was rejected, 6 came meanwhile, 2 stays, 7 is of another epoch.
     let mut map = Map::default();
     let others = [(2, 0, 0.5), (3, 0, 1.0), (4, 0, 1.5), (5, 0, 2.0), (6, 0, 2.5), (7, 1, 0.0)];
@@ -352,14 +374,12 @@ fn keyframes_that_are_not_estimated_follow_the_last_before_them_that_moved() {
     // What is said of 5 goes for who follows it, and what lies between beside.
     let [said, own] =
         [1e-4, 4e-4].map(|of| PlaceCovariance::bounded(&(PlaceMatrix::identity() * of)));
+    map.keyframes[3].points = depth;
     map.keyframes[4].place_covariance = own;
     let none = Matrix3::zeros();
-    window.marginals.push(Marginal {
-        keyframe_id: 5,
-        modes: none,
-        of_displaced: none,
-        place: None,
-    });
+    let said_nothing =
+        |keyframe_id| Marginal { keyframe_id, modes: none, of_displaced: none, place: None };
+    window.marginals.extend([3, 5].map(said_nothing));
     let correction = window.correction(&map, |_| (ModeCovariance::ZERO, Some(said)));
     let mut moved: Vec<_> = correction.keyframes.iter().map(|of| of.keyframe_id).collect();
     moved.sort_unstable();

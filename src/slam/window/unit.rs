@@ -1,5 +1,7 @@
 //! The unit of a window that only one keyframe holds: no image sees it, so that it would wander.
 
+use crate::slam::geometry::se3::SE3;
+use crate::slam::geometry::sim3::Sim3;
 use crate::slam::window::keyframe::WindowKeyframe;
 use crate::slam::window::plane::median;
 use crate::slam::window::system::Members;
@@ -20,14 +22,19 @@ impl Unit {
         Some(Self { anchor, inverse_depths: points.map(|point| point.inverse_depth).collect() })
     }
 
-    /// Scales depths and places about that keyframe, so that the median of its depths has not changed.
-    pub(super) fn restore(&self, keyframes: &mut [WindowKeyframe], members: &[usize]) {
+    /// Scales depths and places about that keyframe, so that the median of its depths has not changed; what that makes of
+    /// the map. `None`, and nothing is changed, where no depth is left.
+    pub(super) fn restore(
+        &self,
+        keyframes: &mut [WindowKeyframe],
+        members: &[usize],
+    ) -> Option<Sim3> {
         let points = keyframes[self.anchor].points.iter().zip(&self.inverse_depths);
         let alive = points.filter(|(point, _)| point.is_alive);
         // 0 where no point is left.
         let factor = median(alive.map(|(now, before)| now.inverse_depth / before).collect());
         if !(factor.is_finite() && factor > 0.0) {
-            return;
+            return None;
         }
         let anchor_from_map = keyframes[self.anchor].camera_from_map;
         let map_from_anchor = anchor_from_map.inverse();
@@ -40,5 +47,7 @@ impl Unit {
                 keyframe.camera_from_map = camera_from_anchor * anchor_from_map;
             }
         }
+        let about = Sim3::new(SE3::identity(), factor);
+        Some(Sim3::new(map_from_anchor, 1.0) * about * Sim3::new(anchor_from_map, 1.0))
     }
 }
