@@ -101,3 +101,24 @@ fn points_from_either_filter_do_not_depend_on_the_number_of_threads() {
     let points = FILES.iter().position(|name| *name == "points.ply").unwrap();
     assert!(gaussian[points] != interval[points], "the switch changes no point");
 }
+
+#[test]
+fn passes_over_all_keyframes_do_not_depend_on_the_number_of_threads() {
+    let rig = Rig::new();
+    let of = |name: &str, threads: &str, every: &str| {
+        let output = rig.folder().join(name);
+        let mut arguments = vec!["replay", "sim", "--threads", threads];
+        // Keyframes of a short sequence are few: a pass begins with the third.
+        let every = format!("mapping.window.pass_every={every}");
+        for chosen in [&every, "mapping.window.num_first=2", "mapping.window.num_free=2"] {
+            arguments.extend(["--set", chosen]);
+        }
+        let figures = summary(rig.command(&arguments), &output);
+        (contents(&output), figures["adjustments"].as_u64().unwrap())
+    };
+    let [(one, estimates), (two, _), (four, _)] = ["1", "2", "4"].map(|n| of(n, n, "1"));
+    assert_same(&one, &two, "passes, 1 and 2 threads");
+    assert_same(&one, &four, "passes, 1 and 4 threads");
+    let (_, without) = of("without", "1", "0");
+    assert!(estimates > without, "no piece was estimated: {estimates} of {without}");
+}

@@ -279,4 +279,6 @@ fn joined(one: StepOutcome, other: StepOutcome) -> StepOutcome {
 }
 
 #[cfg(test)]
+mod pass_tests;
+#[cfg(test)]
 mod tests;

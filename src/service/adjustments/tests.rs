@@ -12,19 +12,23 @@ use crate::slam::pose::{PoseEstimate, TrackingState};
 use crate::slam::test_scene::{CAMERA, Scene};
 
 /// Frames between two keyframes.
-const KEYFRAME_INTERVAL: u64 = 4;
+pub(super) const KEYFRAME_INTERVAL: u64 = 4;
 
 /// A camera that moves sideways, with exact poses, depth for its first keyframe, and a keyframe at every
 /// fourth frame.
-struct Walk {
+pub(super) struct Walk {
     scene: Scene,
-    mapper: Mapper,
-    frames: u64,
+    pub(super) mapper: Mapper,
+    pub(super) frames: u64,
 }
 
 impl Walk {
     fn new() -> Self {
-        let mapper = Mapper::new(CAMERA, MapperParams::default()).unwrap();
+        Self::with(MapperParams::default())
+    }
+
+    pub(super) fn with(params: MapperParams) -> Self {
+        let mapper = Mapper::new(CAMERA, params).unwrap();
         Self { scene: Scene::new(3), mapper, frames: 0 }
     }
 
@@ -55,7 +59,7 @@ impl Walk {
     }
 
     /// The next frame; what the joint estimation did with it.
-    fn go(&mut self, adjustments: &mut Adjustments) -> StepOutcome {
+    pub(super) fn go(&mut self, adjustments: &mut Adjustments) -> StepOutcome {
         let sequence = self.frames;
         self.step();
         adjustments.after_frame(&mut self.mapper, sequence)
@@ -69,7 +73,7 @@ impl Walk {
     }
 }
 
-fn start(entry: Entry, optimise: Optimise) -> Adjustments {
+pub(super) fn start(entry: Entry, optimise: Optimise) -> Adjustments {
     Adjustments::start_with(entry, Background::Other, optimise).unwrap()
 }
 

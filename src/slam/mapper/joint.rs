@@ -11,15 +11,17 @@ use crate::slam::window::frames::{PlacedFrame, TrackedFrame};
 use crate::slam::window::marginals::Marginal;
 
 impl Mapper {
-    /// The keyframes to be estimated together, where one has been added since the last time: to be given back with
-    /// [`Mapper::end_adjustment`] after [`Window::optimise`], which may take its time.
+    /// The keyframes to be estimated together, where one has been added since the last time, or else where a piece of a
+    /// pass over all is due and the camera is not lost: to be given back with [`Mapper::end_adjustment`] after
+    /// [`Window::optimise`], which may take its time.
     pub fn begin_adjustment(&mut self) -> Option<Box<Window>> {
         let (mut window, is_new) = self.take_window()?;
-        if !is_new {
+        if is_new {
+            window.take_frames(&mut self.tracked, &mut self.spare_pixels);
+        } else if !(matches!(self.phase, Phase::Mapping) && window.begin_piece()) {
             self.window = Some(window);
             return None;
         }
-        window.take_frames(&mut self.tracked, &mut self.spare_pixels);
         Some(window)
     }
 
@@ -55,6 +57,7 @@ impl Mapper {
         };
         let correction = window.correction(&self.map, said_of);
         if !correction.keyframes.is_empty() {
+            window.watch(&self.map, &correction);
             // Its numbers are checked: one that is broken leaves the map as it is.
             match self.apply(&correction) {
                 Ok(applied) => outcome = applied,
@@ -171,6 +174,7 @@ impl Mapper {
         // They keep the poses that the tracker gave them.
         drop(window.take_placed());
         window.leave_unrefined();
+        window.repeat_piece();
         self.window = Some(window);
     }
 }

@@ -10,14 +10,12 @@ const PIECE: usize = 40;
 /// Keyframes from one piece to the next: each is free twice, among those before it and among those after it.
 const STEP: usize = 20;
 /// Newest keyframes that are estimated once more: six pieces take a few seconds.
-const MOST: usize = 120;
+pub(super) const MOST: usize = 120;
 
 impl Window {
     /// Estimates all keyframes of the newest one's epoch, piece by piece.
     pub(super) fn adjust_all(&mut self, newest: usize) -> Option<Adjustment> {
-        let epoch = self.keyframes[newest].epoch;
-        let of_epoch: Vec<usize> =
-            (0..=newest).filter(|&k| self.keyframes[k].epoch == epoch).collect();
+        let of_epoch = self.of_epoch_up_to(newest);
         let mut last = None;
         let mut begin = of_epoch.len().saturating_sub(MOST);
         loop {
@@ -35,7 +33,7 @@ impl Window {
     }
 
     /// The keyframes from `begin` to `end` of an epoch's, and those beside them that hold them in place.
-    fn choose_piece(&self, of_epoch: &[usize], begin: usize, end: usize) -> Chosen {
+    pub(super) fn choose_piece(&self, of_epoch: &[usize], begin: usize, end: usize) -> Chosen {
         let (before, piece) = of_epoch[..end].split_at(begin);
         let after = &of_epoch[end..];
         let ends = [piece[0], piece[piece.len() - 1]];

@@ -28,12 +28,16 @@ impl Window {
         Correction { keyframes, ..Correction::default() }
     }
 
-    /// Keyframes that are not estimated, newer ones and rejected ones: each goes where the last before it that moved goes.
+    /// Keyframes that are not estimated, newer ones and rejected ones: each goes where the last before it that is goes,
+    /// and stays where that stays.
     fn followers(&self, map: &Map, moved: &[KeyframeCorrection]) -> Vec<KeyframeCorrection> {
         let follow = |keyframe: &Keyframe| {
-            let before = moved.iter().filter(|of| of.keyframe_id < keyframe.keyframe_id);
-            let leader = before.max_by_key(|of| of.keyframe_id)?;
-            let was = map.get(leader.keyframe_id).filter(|was| was.epoch == keyframe.epoch)?;
+            let of_epoch = |of: &&WindowKeyframe| of.epoch == keyframe.epoch;
+            let before =
+                self.keyframes.iter().rev().find(|of| of.keyframe_id < keyframe.keyframe_id);
+            let id = before.filter(of_epoch)?.keyframe_id;
+            let leader = moved.iter().find(|of| of.keyframe_id == id)?;
+            let was = map.get(id).filter(|was| was.epoch == keyframe.epoch)?;
             let map_from_keyframe = leader.map_from_keyframe
                 * was.map_from_keyframe.inverse()
                 * keyframe.map_from_keyframe;
@@ -43,10 +47,7 @@ impl Window {
             });
             Some((map_from_keyframe, place))
         };
-        let newest = moved.iter().map(|of| of.keyframe_id).max();
-        let follows = |keyframe: &&Keyframe| {
-            Some(keyframe.keyframe_id) > newest || self.get(keyframe.keyframe_id).is_none()
-        };
+        let follows = |keyframe: &&Keyframe| self.get(keyframe.keyframe_id).is_none();
         let others = map.keyframes.iter().filter(follows);
         others
             .filter_map(|keyframe| {

@@ -27,15 +27,19 @@ pub(super) struct Chosen {
 impl Window {
     /// Who takes part in the estimation of the newest keyframes.
     pub(super) fn choose_members(&self, newest: usize) -> Chosen {
-        let epoch = self.keyframes[newest].epoch;
-        let of_epoch: Vec<usize> =
-            (0..=newest).filter(|&k| self.keyframes[k].epoch == epoch).collect();
+        let of_epoch = self.of_epoch_up_to(newest);
         let is_first = of_epoch.len() <= self.params.num_first;
         let num_free =
             if is_first { of_epoch.len() } else { self.params.num_free.min(of_epoch.len()) };
         let (older, free) = of_epoch.split_at(of_epoch.len() - num_free);
         let fixed = self.covisible(older, &free[free.len().saturating_sub(2)..]);
         Chosen::new(fixed, free, older.is_empty(), is_first)
+    }
+
+    /// The keyframes up to one that are of its epoch.
+    pub(super) fn of_epoch_up_to(&self, newest: usize) -> Vec<usize> {
+        let epoch = self.keyframes[newest].epoch;
+        (0..=newest).filter(|&k| self.keyframes[k].epoch == epoch).collect()
     }
 
     /// Of the older keyframes those that see most of what the newest see.

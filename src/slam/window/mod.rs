@@ -21,6 +21,7 @@ pub mod marginals;
 mod members;
 mod neighbours;
 pub mod params;
+mod pass;
 pub mod place_marginals;
 mod plane;
 mod rival;
@@ -42,6 +43,7 @@ use crate::slam::window::keyframe::{WindowKeyframe, WindowPoint, num_levels};
 use crate::slam::window::marginals::Marginal;
 use crate::slam::window::members::Chosen;
 use crate::slam::window::params::WindowParams;
+use crate::slam::window::pass::Pass;
 use crate::slam::window::plane::Correspondence;
 use crate::slam::window::solver::Solver;
 use crate::slam::window::system::{Level, Members};
@@ -98,6 +100,7 @@ pub struct Window {
     marginals: Vec<Marginal>,
     frames: WindowFrames,
     is_last: bool,
+    pass: Pass,
     refinement: Refinement,
     /// The epoch whose start was found to be wrong.
     refuted_epoch: Option<u32>,
@@ -118,6 +121,7 @@ impl Window {
             marginals: Vec::new(),
             frames: WindowFrames::default(),
             is_last: false,
+            pass: Pass::default(),
             refinement: Refinement::default(),
             refuted_epoch: None,
         }
@@ -128,6 +132,7 @@ impl Window {
     pub fn take_in(&mut self, map: &Map, active: u64) -> bool {
         self.moved.clear();
         self.marginals.clear();
+        self.pass.leave_piece();
         // What a mapper that died has left is where it was estimated to be.
         let is_resumed = self.keyframes.is_empty() && map.keyframes.len() > 1;
         let is_held = |k: &&Keyframe| k.has_depth() && k.map_state == MapState::Established;
@@ -217,6 +222,7 @@ impl Window {
             let Some(index) = self.index_of(id) else { continue };
             self.choose_points_before(index);
             self.align(index);
+            self.pass.added += 1;
             is_new = true;
         }
         let newest = self.keyframes.len().checked_sub(1)?;
@@ -235,6 +241,8 @@ impl Window {
             self.place_rest();
             self.leave(&[]);
             self.refinement.begin(&self.keyframes);
+        } else if !is_new {
+            adjustment = self.adjust_piece(newest);
         }
         adjustment
     }
@@ -457,5 +465,7 @@ mod comparison_tests;
 mod dense_tests;
 #[cfg(test)]
 mod marginal_tests;
+#[cfg(test)]
+mod pass_tests;
 #[cfg(test)]
 mod tests;

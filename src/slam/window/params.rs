@@ -39,6 +39,12 @@ pub struct WindowParams {
     pub frame_lag: usize,
     /// Most frames that wait, one byte a pixel each; the oldest keep the pose that the tracker gave them.
     pub max_waiting_frames: usize,
+    /// Keyframes that come from the beginning of one pass over all, in spare time, to that of the next: 10 are more than
+    /// the window frees, so that each has settled once before it is freed again. 0 makes none.
+    pub pass_every: usize,
+    /// Keyframes that are free at once in a pass. A new keyframe waits for one piece at most: 14 and the eight that hold
+    /// them take about 90 ms of one core, twice what a keyframe's own estimate takes.
+    pub pass_piece: usize,
     /// A level is done when the next step would lower the cost by less than this many mean squared residuals: a step of
     /// one standard deviation in one direction lowers it by about one.
     pub converged_decrement: f64,
@@ -66,6 +72,8 @@ impl Default for WindowParams {
             max_first_iterations: 40,
             frame_lag: 1,
             max_waiting_frames: 200,
+            pass_every: 0,
+            pass_piece: 14,
             converged_decrement: 2.0,
             delay_frames: 3,
         }
@@ -94,6 +102,8 @@ impl WindowParams {
         check_range("max_first_iterations", self.max_first_iterations, 1..=1000)?;
         check_range("frame_lag", self.frame_lag, 0..=20)?;
         check_range("max_waiting_frames", self.max_waiting_frames, 0..=10_000)?;
+        check_range("pass_every", self.pass_every, 0..=10_000)?;
+        check_range("pass_piece", self.pass_piece, 2..=40)?;
         check_range("converged_decrement", self.converged_decrement, 0.0..=1e6)?;
         check_range("delay_frames", self.delay_frames, 0..=30)
     }

@@ -12,7 +12,7 @@ use crate::slam::modes::ModeCovariance;
 use crate::slam::place_covariance::{PlaceCovariance, PlaceMatrix};
 use crate::slam::test_scene::{CAMERA, Random, Scene};
 
-fn ray(u: f64, v: f64) -> [f32; 2] {
+pub(super) fn ray(u: f64, v: f64) -> [f32; 2] {
     [((u - CAMERA.cx) / CAMERA.fx) as f32, ((v - CAMERA.cy) / CAMERA.fy) as f32]
 }
 
@@ -332,7 +332,7 @@ fn a_plane_is_found_among_points_that_are_wrong() {
 }
 
 /// A keyframe of a map with its unit, without depth.
-fn in_map(keyframe_id: u64, epoch: u32, x: f64, unit: f64) -> Keyframe {
+pub(super) fn in_map(keyframe_id: u64, epoch: u32, x: f64, unit: f64) -> Keyframe {
     let place = SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() };
     let keyframe = Keyframe::at(Sim3::new(place, unit), CAMERA, Vec::new(), Vec::new());
     Keyframe { keyframe_id, epoch, ..keyframe }

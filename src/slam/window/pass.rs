@@ -1,0 +1,125 @@
+//! All keyframes estimated once more while frames come, a piece at a time, whenever no new keyframe waits.
+//!
+//! The window frees the newest keyframes only: what a loop or a better plane says of older ones goes unused until a pass
+//! frees them too. It is what the conclusion is after the last frame, in smaller pieces.
+
+use crate::slam::map::{Correction, Map};
+use crate::slam::window::conclusion::MOST;
+use crate::slam::window::{Adjustment, Window};
+
+/// A change of the newest keyframe's unit (logarithm) or tilt (for each unit of the ray's coordinates) above which what
+/// those around it were estimated with was wrong: in recordings one of 80 estimates after an epoch's first keyframes is
+/// beyond it, in rendered rooms none is beyond 0.02.
+const LEAST_JUMP: f64 = 0.1;
+/// The same over its standard deviation, where one is known.
+const LEAST_JUMP_SIGMAS: f64 = 5.0;
+
+/// How far a pass has come, and what calls for the next.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Pass {
+    /// Keyframes that came since the last one began.
+    pub added: usize,
+    has_jumped: bool,
+    /// Where it goes on; `None` where none is under way.
+    next: Option<Place>,
+    /// Where the piece begins that is being estimated.
+    piece: Option<Place>,
+}
+
+/// A keyframe that a piece begins with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Place {
+    epoch: u32,
+    keyframe_id: u64,
+}
+
+impl Pass {
+    /// The piece that was away has entered.
+    pub fn leave_piece(&mut self) {
+        self.piece = None;
+    }
+}
+
+impl Window {
+    /// Whether a piece of a pass is to be estimated, by [`Window::optimise`]: to be asked where no new keyframe waits.
+    pub fn begin_piece(&mut self) -> bool {
+        self.pass.leave_piece();
+        let Some(newest) = self.keyframes.len().checked_sub(1) else { return false };
+        let of_epoch = self.of_epoch_up_to(newest);
+        let pass_every = self.params.pass_every;
+        if pass_every == 0 || self.is_short(&of_epoch) {
+            return false;
+        }
+        let oldest = &self.keyframes[of_epoch[of_epoch.len().saturating_sub(MOST)]];
+        let start = Place { epoch: oldest.epoch, keyframe_id: oldest.keyframe_id };
+        let pass = &mut self.pass;
+        // One of an epoch that was left, or has become part of another, ends there.
+        pass.next = pass.next.filter(|next| next.epoch == start.epoch);
+        if pass.next.is_none() && (pass.has_jumped || pass.added >= pass_every) {
+            *pass = Pass { next: Some(start), ..Pass::default() };
+        }
+        pass.piece = pass.next;
+        pass.piece.is_some()
+    }
+
+    /// Whether so few are all free with every new keyframe.
+    fn is_short(&self, of_epoch: &[usize]) -> bool {
+        of_epoch.len() <= self.params.num_first.max(self.params.num_free)
+    }
+
+    /// Estimates the piece that was begun; `None` where none was.
+    pub(super) fn adjust_piece(&mut self, newest: usize) -> Option<Adjustment> {
+        let piece = self.pass.piece?;
+        let of_epoch = self.of_epoch_up_to(newest);
+        let length = self.params.pass_piece;
+        let place =
+            of_epoch.partition_point(|&k| self.keyframes[k].keyframe_id < piece.keyframe_id);
+        // The last one is as long as the others.
+        let begin = place.min(of_epoch.len().saturating_sub(length));
+        let end = (begin + length).min(of_epoch.len());
+        let mut chosen = self.choose_piece(&of_epoch, begin, end);
+        chosen.is_first = false;
+        let adjustment = self.adjust(&chosen);
+        self.leave(&chosen.members);
+        // Each keyframe is free twice, among those before it and among those after it.
+        let next = of_epoch.get(begin + length / 2).filter(|_| end < of_epoch.len());
+        let keyframe_id = next.map(|&next| self.keyframes[next].keyframe_id);
+        self.pass.next = keyframe_id.map(|keyframe_id| Place { keyframe_id, ..piece });
+        adjustment
+    }
+
+    /// The last estimate was not taken: a piece is estimated again.
+    pub fn repeat_piece(&mut self) {
+        if let Some(piece) = self.pass.piece.take() {
+            self.pass.next = Some(piece);
+        }
+    }
+
+    /// Whether the last estimate was of a piece of a pass.
+    pub fn is_piece(&self) -> bool {
+        self.pass.piece.is_some()
+    }
+
+    /// Takes note of a correction of the newest keyframes: where the newest one's unit or plane jumps, those before were
+    /// estimated with a wrong one and a pass is due.
+    pub fn watch(&mut self, map: &Map, correction: &Correction) {
+        let Some(newest) = self.keyframes.len().checked_sub(1) else { return };
+        if self.is_piece() || self.is_short(&self.of_epoch_up_to(newest)) {
+            return;
+        }
+        let id = self.keyframes[newest].keyframe_id;
+        let corrected = correction.keyframes.iter().find(|of| of.keyframe_id == id);
+        let (Some(was), Some(is)) = (map.get(id), corrected) else { return };
+        let unit = (is.map_from_keyframe.scale / was.map_from_keyframe.scale).ln();
+        let of_unit = is.place.map(|place| place.matrix()[(6, 6)].sqrt());
+        let of_tilt = is.modes.map(|modes| modes.std_devs());
+        let jumps = [
+            (unit, of_unit),
+            (is.depth.per_x, of_tilt.map(|of| of.x)),
+            (is.depth.per_y, of_tilt.map(|of| of.y)),
+        ];
+        self.pass.has_jumped |= jumps.iter().any(|(by, deviation)| {
+            by.abs() > LEAST_JUMP.max(LEAST_JUMP_SIGMAS * deviation.unwrap_or(0.0))
+        });
+    }
+}
