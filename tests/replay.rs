@@ -119,7 +119,6 @@ fn the_published_covariance_is_as_wide_as_the_errors_in_a_simulated_room() {
         // The errors of the depth itself over what its keyframes claim: 0.67 is right.
         let modes = summary["depth_modes_whitened"].as_array().unwrap();
         let modes: Vec<f64> = modes.iter().map(|mode| mode.as_f64().unwrap()).collect();
-        println!("{seed}: {modes:?}");
         assert!(modes.iter().all(|&mode| mode < 1.5), "{seed}: {modes:?}");
         assert!(modes.iter().any(|&mode| mode > 0.1), "{seed}: {modes:?}");
     }

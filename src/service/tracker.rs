@@ -15,7 +15,9 @@ use crate::service::shutdown::Shutdown;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::parameter::ParameterError;
-use crate::slam::pose::{DegradedReason, LostReason, PoseEstimate, TrackingState};
+use crate::slam::pose::{
+    DegradedReason, LostReason, PoseEstimate, TrackingState, UNKNOWN_VARIANCE,
+};
 use crate::slam::tracker::Tracker;
 use crate::wire::conversion::{
     PoseTiming, codes_from_state, frame_from_message, pose_from_message, pose_message,
@@ -353,8 +355,6 @@ fn state_text(state: TrackingState) -> &'static str {
 
 /// The same frame, lost, without a number that could be broken.
 fn unclaimed(estimate: &PoseEstimate) -> PoseEstimate {
-    /// A variance that says "unknown": large and finite.
-    const UNKNOWN_VARIANCE: f64 = 1e6;
     let identity = crate::slam::geometry::se3::SE3::identity();
     let mut covariance = [0.0; 21];
     let mut diagonal = 0;
@@ -365,6 +365,7 @@ fn unclaimed(estimate: &PoseEstimate) -> PoseEstimate {
     PoseEstimate {
         state: TrackingState::Lost(LostReason::Diverged),
         world_from_camera: identity,
+        map_from_camera: identity,
         keyframe_from_camera: identity,
         covariance,
         map_covariance: covariance,

@@ -220,6 +220,14 @@ mod tests {
         points: Vec<Vec<DepthPoint>>,
     }
 
+    /// What a camera sees of the room: depth, and an image with the noise of a seed.
+    fn seen(scene: &Scene, world_from_camera: &SE3, seed: u64) -> (Image<f32>, Vec<u8>) {
+        let view = scene.render(&CAMERA, world_from_camera);
+        let mut depth = view.inverse_depth.clone();
+        depth.pixels_mut().iter_mut().for_each(|d| *d = 1.0 / *d);
+        (depth, view.noisy(1.0, seed))
+    }
+
     /// A camera that moves sideways with exact poses, exact depth for its first keyframe alone; a
     /// keyframe is asked for at the fifth step. What the steps and their rests gave, and the mapper.
     fn walk(params: MapperParams, steps: u64, finishes: bool) -> (Vec<[Taken; 2]>, Mapper) {
@@ -228,10 +236,7 @@ mod tests {
         let outcomes = (0..steps).map(|k| {
             let x = 0.08 * k as f64;
             let world_from_camera = SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() };
-            let view = scene.render(&CAMERA, &world_from_camera);
-            let mut depth = view.inverse_depth.clone();
-            depth.pixels_mut().iter_mut().for_each(|d| *d = 1.0 / *d);
-            let pixels = view.noisy(1.0, k);
+            let (depth, pixels) = seen(&scene, &world_from_camera, k);
             let frame = FrameView::new(&CAMERA, k, k as i64 * 33_333_333, &pixels);
             let pose = PoseEstimate {
                 state: TrackingState::Tracking,
@@ -357,10 +362,7 @@ mod tests {
         for k in 0..3u64 {
             let x = 0.05 * k as f64;
             let world_from_camera = SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() };
-            let view = scene.render(&CAMERA, &world_from_camera);
-            let mut depth = view.inverse_depth.clone();
-            depth.pixels_mut().iter_mut().for_each(|d| *d = 1.0 / *d);
-            let pixels = view.noisy(1.0, k);
+            let (depth, pixels) = seen(&scene, &world_from_camera, k);
             let frame = FrameView::new(&CAMERA, k, k as i64 * 33_333_333, &pixels);
             let mut pose = PoseEstimate {
                 state: TrackingState::Tracking,

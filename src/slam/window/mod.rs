@@ -132,6 +132,7 @@ impl Window {
     pub fn take_in(&mut self, map: &Map, active: u64) -> bool {
         self.moved.clear();
         self.marginals.clear();
+        self.refuted_epoch = None;
         self.pass.leave_piece();
         // What a mapper that died has left is where it was estimated to be.
         let is_resumed = self.keyframes.is_empty() && map.keyframes.len() > 1;

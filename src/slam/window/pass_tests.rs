@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use nalgebra::{Matrix3, Vector6};
 
-use super::tests::in_map;
+use super::tests::{exact_host, in_map};
 use super::*;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::map::{Correction, KeyframeCorrection, LogPlane};
@@ -35,33 +35,7 @@ fn walk() -> Window {
             SE3::exp(&Vector6::from([0.1 * k as f64, 0.0, 0.0, 0.0, -0.01 * k as f64, 0.0]));
         let view = scene.render(&CAMERA, &map_from_camera);
         let pixels = view.noisy(1.0, k as u64);
-        let image = Image::try_from_pixels(CAMERA.width, CAMERA.height, pixels).unwrap();
-        let mut keyframe = WindowKeyframe {
-            keyframe_id: k as u64,
-            epoch: 0,
-            images: vec![image],
-            camera_from_map: map_from_camera.inverse(),
-            unit: 1.0,
-            points: Vec::new(),
-            is_host: true,
-        };
-        keyframe.take_part(&CAMERA);
-        let point = |i: usize| DepthPoint {
-            u: (i % CAMERA.width) as u16,
-            v: (i / CAMERA.width) as u16,
-            inverse_depth: view.inverse_depth.pixels()[i],
-            variance: 1e-6,
-            intensity: 0.0,
-        };
-        let dense: Vec<DepthPoint> = (0..CAMERA.width * CAMERA.height).map(point).collect();
-        let images = &keyframe.images;
-        let chosen = selection::choose(&dense, images[0].pixels(), &CAMERA, 300, 8.0, 0.3);
-        let new = |of: &DepthPoint| {
-            let depth = f64::from(of.inverse_depth);
-            WindowPoint::new((of.u, of.v), depth, images, &CAMERA, &window.params)
-        };
-        keyframe.points = chosen.iter().map(new).collect();
-        window.keyframes.push(keyframe);
+        window.keyframes.push(exact_host(k as u64, &map_from_camera, pixels, &view, 300));
     }
     window.pass.added = window.params.pass_every;
     window

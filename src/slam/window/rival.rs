@@ -5,7 +5,7 @@
 //! itself, and the joint estimate bends it until it fits; but the keyframes that follow fit the right one better. So the
 //! first keyframes are estimated once more from the other motion, and the costs are compared.
 
-use nalgebra::{Matrix3, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 
 use crate::slam::geometry::se3::SE3;
 use crate::slam::window::members::Chosen;
@@ -20,7 +20,8 @@ const FEWEST_KEYFRAMES: usize = 4;
 const REFUTED: f64 = 0.95;
 /// Least share of the comparisons that the rival must make too: one that sees little costs little.
 const LEAST_COMPARED: f64 = 0.8;
-/// Least inverse depth of a point on the rival's plane, as a share of the median: a plane may rise above the horizon.
+/// Least inverse depth of a point on the rival's plane, as a share of that on the optical axis: a plane may rise above the
+/// horizon.
 const FARTHEST: f64 = 0.1;
 
 /// What a plane n, n · X = 1 in the first camera, does to a second view: H = R + t nᵀ.
@@ -38,13 +39,17 @@ impl Window {
         }
         let cost = self.mean_cost();
         let compared = self.solver.system.compared;
-        let kept: Vec<_> =
-            chosen.members.iter().map(|&member| self.keyframes[member].clone()).collect();
+        let keep = |&member: &usize| {
+            let keyframe = &self.keyframes[member];
+            (keyframe.camera_from_map, keyframe.points.clone())
+        };
+        let kept: Vec<_> = chosen.members.iter().map(keep).collect();
         let is_better = self.become_rival(chosen)
             && self.mean_cost() < REFUTED * cost
             && self.solver.system.compared as f64 >= LEAST_COMPARED * compared as f64;
         for (&member, kept) in chosen.members.iter().zip(kept) {
-            self.keyframes[member] = kept;
+            let keyframe = &mut self.keyframes[member];
+            (keyframe.camera_from_map, keyframe.points) = kept;
         }
         is_better
     }
@@ -145,10 +150,9 @@ impl PlaneMotion {
         let homography = rotation + camera_from_first.translation * normal.transpose();
         let svd = homography.svd(false, true);
         let rows = svd.v_t?;
-        let mut order = [0, 1, 2];
-        order.sort_by(|&i, &j| svd.singular_values[j].total_cmp(&svd.singular_values[i]));
-        let [s1, s2, s3] = order.map(|i| svd.singular_values[i]);
-        let [v1, v2, v3] = order.map(|i| rows.row(i).transpose());
+        // The largest first.
+        let [s1, s2, s3] = svd.singular_values.into();
+        let [v1, v2, v3] = [0, 1, 2].map(|i| rows.row(i).transpose());
         let homography = homography / s2;
         let (a, c) = ((s1 / s2).powi(2) - 1.0, 1.0 - (s3 / s2).powi(2));
         /// Below this the two views differ by a rotation.
@@ -174,7 +178,8 @@ impl PlaneMotion {
         // As far away along the optical axis as the plane was.
         let factor = normal.z / direction.z;
         let (normal, translation) = (direction * factor, translation / factor);
-        let rotation = UnitQuaternion::from_matrix(&rotation);
+        let rotation = Rotation3::from_matrix_unchecked(rotation);
+        let rotation = UnitQuaternion::from_rotation_matrix(&rotation);
         let is_finite = normal.iter().chain(&translation).all(|x| x.is_finite());
         is_finite.then_some(Self { camera_from_first: SE3 { rotation, translation }, normal })
     }

@@ -10,7 +10,7 @@ use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::modes::ModeCovariance;
 use crate::slam::place_covariance::{PlaceCovariance, PlaceMatrix};
-use crate::slam::test_scene::{CAMERA, Random, Scene};
+use crate::slam::test_scene::{CAMERA, Random, Rendering, Scene};
 
 pub(super) fn ray(u: f64, v: f64) -> [f32; 2] {
     [((u - CAMERA.cx) / CAMERA.fx) as f32, ((v - CAMERA.cy) / CAMERA.fy) as f32]
@@ -46,36 +46,45 @@ pub(super) fn noisy_room(brightness: impl Fn(usize, f64) -> (f64, f64), seed: u6
             *grey = gain as f32 * *grey + offset as f32;
         }
         let pixels = view.noisy(1.0, 4 * seed + index as u64);
-        let image = Image::try_from_pixels(CAMERA.width, CAMERA.height, pixels).unwrap();
-        let mut keyframe = WindowKeyframe {
-            keyframe_id: index as u64,
-            epoch: 0,
-            images: vec![image],
-            camera_from_map: world_from_camera.inverse(),
-            unit: 1.0,
-            points: Vec::new(),
-            is_host: true,
-        };
-        keyframe.take_part(&CAMERA);
-        let dense: Vec<DepthPoint> = (0..CAMERA.width * CAMERA.height)
-            .map(|i| DepthPoint {
-                u: (i % CAMERA.width) as u16,
-                v: (i / CAMERA.width) as u16,
-                inverse_depth: view.inverse_depth.pixels()[i],
-                variance: 1e-6,
-                intensity: 0.0,
-            })
-            .collect();
-        let params = WindowParams::default();
-        let chosen = selection::choose(&dense, keyframe.images[0].pixels(), &CAMERA, 400, 8.0, 0.3);
-        let images = &keyframe.images;
-        let points = chosen.iter().map(|of| {
-            WindowPoint::new((of.u, of.v), f64::from(of.inverse_depth), images, &CAMERA, &params)
-        });
-        keyframe.points = points.collect();
-        keyframe
+        exact_host(index as u64, &world_from_camera, pixels, &view, 400)
     });
     Room { keyframes: keyframes.collect(), held: vec![0] }
+}
+
+/// A keyframe with this image of a view and the exact depth of places with gradient, one in each of so many cells.
+pub(super) fn exact_host(
+    keyframe_id: u64,
+    map_from_camera: &SE3,
+    pixels: Vec<u8>,
+    view: &Rendering,
+    num_cells: usize,
+) -> WindowKeyframe {
+    let mut keyframe = WindowKeyframe {
+        keyframe_id,
+        epoch: 0,
+        images: vec![Image::try_from_pixels(CAMERA.width, CAMERA.height, pixels).unwrap()],
+        camera_from_map: map_from_camera.inverse(),
+        unit: 1.0,
+        points: Vec::new(),
+        is_host: true,
+    };
+    keyframe.take_part(&CAMERA);
+    let dense: Vec<DepthPoint> = (0..CAMERA.width * CAMERA.height)
+        .map(|i| DepthPoint {
+            u: (i % CAMERA.width) as u16,
+            v: (i / CAMERA.width) as u16,
+            inverse_depth: view.inverse_depth.pixels()[i],
+            variance: 1e-6,
+            intensity: 0.0,
+        })
+        .collect();
+    let (images, params) = (&keyframe.images, WindowParams::default());
+    let chosen = selection::choose(&dense, images[0].pixels(), &CAMERA, num_cells, 8.0, 0.3);
+    let points = chosen.iter().map(|of| {
+        WindowPoint::new((of.u, of.v), f64::from(of.inverse_depth), images, &CAMERA, &params)
+    });
+    keyframe.points = points.collect();
+    keyframe
 }
 
 impl Room {
