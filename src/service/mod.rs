@@ -28,6 +28,7 @@ pub mod pairing;
 pub mod peers;
 pub mod position;
 pub mod progress_thread;
+pub mod read_ahead;
 pub mod recorder;
 pub mod recording;
 pub mod reference_feed;

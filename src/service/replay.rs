@@ -11,6 +11,7 @@ use crate::capture::source::{FrameSource, FrameStamp, SourceError};
 use crate::service::adjustments::{Adjustments, Entry};
 use crate::service::alignment_stamps::AlignmentStamps;
 use crate::service::given_pose::{given_pose, truth_in_first_camera};
+use crate::service::read_ahead::{ReadAhead, ReadingPlan};
 use crate::service::refused_images::RefusedImages;
 use crate::service::rehearsal::Rehearsal;
 use crate::service::results::{RecordedPose, Rejection, RunMode, RunRecord};
@@ -101,7 +102,9 @@ pub enum ReplayError {
         cause: SourceError,
     },
     /// No thread.
-    #[error("cannot start the thread that estimates keyframes jointly ({0})")]
+    #[error(
+        "cannot start a thread of the replay ({0}): end other programs or raise the limit of processes (ulimit -u)"
+    )]
     Thread(std::io::Error),
     /// A parameter out of its range.
     #[error("configuration: {0}")]
@@ -134,37 +137,17 @@ pub fn replay(
 ) -> Result<RunRecord, ReplayError> {
     let mut replay = Replay::new(source, source_name, config)?;
     let total = frames_to_come(source, config);
-    let mut pixels = vec![0; replay.num_pixels];
+    let plan = ReadingPlan {
+        max_frames: config.max_frames.unwrap_or(usize::MAX),
+        with_depth: config.initial_depth == DepthOrigin::Sensor,
+        is_strict: config.strict,
+    };
     let begin = Instant::now();
     let mut refused = RefusedImages::default();
-    let mut fault = None;
-    while replay.record.frames_in < config.max_frames.map_or(u64::MAX, |n| n as u64) {
-        let stamp = match source.next_into(&mut pixels) {
-            Ok(Some(stamp)) => stamp,
-            Ok(None) => break,
-            Err(error) if error.is_passing() && !config.strict => {
-                refused.refuse(&error);
-                replay.leave_out();
-                continue;
-            }
-            Err(cause) if replay.record.frames_in > 0 => {
-                fault = Some(cause);
-                break;
-            }
-            Err(cause) => return Err(cause.into()),
-        };
-        refused.accept();
-        let (state, outcome) = replay.step(source, &stamp, &pixels)?;
-        let done = replay.record.frames_in as usize;
-        let (record, map, keyframe) =
-            (&replay.record, replay.mapper.map(), replay.mapper.keyframe());
-        let start_frame = replay.mapper.start_frame();
-        let progress =
-            ReplayProgress { done, total, state, outcome, record, map, start_frame, keyframe };
-        if !observe(&progress) {
-            break;
-        }
-    }
+    let fault = std::thread::scope(|scope| {
+        let frames = ReadAhead::start(scope, source, plan).map_err(ReplayError::Thread)?;
+        replay.run(&frames, total, &mut refused, observe)
+    })?;
     if let Some(error) = refused.error() {
         return Err(error.into());
     }
@@ -181,12 +164,14 @@ fn frames_to_come(source: &dyn FrameSource, config: &ReplayConfig) -> Option<usi
     source.num_frames().map(|n| n.min(config.max_frames.unwrap_or(n)))
 }
 
+/// The depth camera's image of a frame, where there is one.
+type SensorDepth = Result<Option<Image<f32>>, SourceError>;
+
 /// A replay under way.
 struct Replay<'a> {
     config: &'a ReplayConfig,
     width: usize,
     height: usize,
-    num_pixels: usize,
     tracker: Tracker,
     mapper: Mapper,
     /// Poses to be given, the first camera's frame as the world; made at the first frame.
@@ -223,7 +208,6 @@ impl<'a> Replay<'a> {
             config,
             width: intrinsics.width,
             height: intrinsics.height,
-            num_pixels: intrinsics.width * intrinsics.height,
             tracker: Tracker::new(intrinsics, config.tracker.clone())?,
             mapper: Mapper::new(intrinsics, mapping)?,
             given_poses: Vec::new(),
@@ -242,12 +226,48 @@ impl<'a> Replay<'a> {
         })
     }
 
+    /// All frames; what ended them where they did not come to their end.
+    fn run(
+        &mut self,
+        frames: &ReadAhead,
+        total: Option<usize>,
+        refused: &mut RefusedImages,
+        observe: &mut dyn FnMut(&ReplayProgress<'_>) -> bool,
+    ) -> Result<Option<SourceError>, ReplayError> {
+        while let Some(read) = frames.next() {
+            let stamp = match read.stamp {
+                Ok(Some(stamp)) => stamp,
+                Ok(None) => break,
+                Err(error) if error.is_passing() && !self.config.strict => {
+                    refused.refuse(&error);
+                    self.leave_out();
+                    frames.give_back(read.pixels);
+                    continue;
+                }
+                Err(cause) if self.record.frames_in > 0 => return Ok(Some(cause)),
+                Err(cause) => return Err(cause.into()),
+            };
+            refused.accept();
+            let (state, outcome) = self.step(&stamp, &read.pixels, read.sensor_depth)?;
+            frames.give_back(read.pixels);
+            let done = self.record.frames_in as usize;
+            let (record, map, keyframe) = (&self.record, self.mapper.map(), self.mapper.keyframe());
+            let start_frame = self.mapper.start_frame();
+            let progress =
+                ReplayProgress { done, total, state, outcome, record, map, start_frame, keyframe };
+            if !observe(&progress) {
+                break;
+            }
+        }
+        Ok(None)
+    }
+
     /// One frame: track, map, hand the keyframe on.
     fn step(
         &mut self,
-        source: &mut dyn FrameSource,
         stamp: &FrameStamp,
         pixels: &[u8],
+        sensor_depth: SensorDepth,
     ) -> Result<(TrackingState, StepOutcome), ReplayError> {
         self.count(stamp);
         let frame = FrameView {
@@ -261,7 +281,7 @@ impl<'a> Replay<'a> {
         let Some(pose) = self.pose(&frame) else {
             return Ok((TrackingState::Initializing, StepOutcome::default()));
         };
-        let sensor_depth = self.sensor_depth(source, stamp)?;
+        let sensor_depth = self.sensor_depth(sensor_depth)?;
         let was_rejected = matches!(self.mapper.situation(), Situation::Rejected(_));
         let begin = Instant::now();
         let mut change = None;
@@ -299,15 +319,11 @@ impl<'a> Replay<'a> {
     }
 
     /// The depth camera's image of a frame, where the first depth comes from it.
-    fn sensor_depth(
-        &self,
-        source: &mut dyn FrameSource,
-        stamp: &FrameStamp,
-    ) -> Result<Option<Image<f32>>, ReplayError> {
+    fn sensor_depth(&self, read: SensorDepth) -> Result<Option<Image<f32>>, ReplayError> {
         if self.config.initial_depth == DepthOrigin::Images {
             return Ok(None);
         }
-        let sensor_depth = match source.depth_at(stamp.capture_nanos) {
+        let sensor_depth = match read {
             Err(error) if error.is_passing() && !self.config.strict => {
                 tracing::warn!("left out: {error}");
                 None

@@ -1,0 +1,98 @@
+//! Frames of a recording are read and decoded on a thread of their own, a few ahead of who takes them.
+
+use std::thread::Scope;
+
+use crossbeam::channel::{Receiver, Sender, bounded};
+
+use crate::capture::source::{FrameSource, FrameStamp, SourceError};
+use crate::slam::image::buffer::Image;
+
+/// Frames that are read before they are asked for. One is enough while decoding is faster than mapping; the others
+/// bridge the frames that take long.
+const MOST_AHEAD: usize = 3;
+
+/// What is read, and until when.
+#[derive(Debug, Clone, Copy)]
+pub struct ReadingPlan {
+    /// Frames after which nothing more is read.
+    pub max_frames: usize,
+    /// Whether the depth camera's images are read too.
+    pub with_depth: bool,
+    /// Whether the first image that cannot be used is the last that is read.
+    pub is_strict: bool,
+}
+
+/// One frame, or why there is none.
+#[derive(Debug)]
+pub struct ReadFrame {
+    /// The frame's stamp, `None` after the last.
+    pub stamp: Result<Option<FrameStamp>, SourceError>,
+    /// Its `width * height` pixels.
+    pub pixels: Vec<u8>,
+    /// The depth camera's image, where it was asked for and there is one.
+    pub sensor_depth: Result<Option<Image<f32>>, SourceError>,
+}
+
+/// Frames in their order, as they were read.
+#[derive(Debug)]
+pub struct ReadAhead {
+    frames: Receiver<ReadFrame>,
+    spare: Sender<Vec<u8>>,
+}
+
+impl ReadAhead {
+    /// Starts to read `source` on a thread of `scope`, which ends when this is dropped.
+    pub fn start<'scope>(
+        scope: &'scope Scope<'scope, '_>,
+        source: &'scope mut dyn FrameSource,
+        plan: ReadingPlan,
+    ) -> std::io::Result<Self> {
+        let camera = source.intrinsics();
+        let (to_taker, frames) = bounded(MOST_AHEAD);
+        // One more is with who takes them.
+        let (spare, memory) = bounded(MOST_AHEAD + 1);
+        for _ in 0..MOST_AHEAD + 1 {
+            // Its other end is held here.
+            let _ = spare.send(vec![0; camera.width * camera.height]);
+        }
+        std::thread::Builder::new()
+            .name("semidense-read".to_owned())
+            .spawn_scoped(scope, move || read(source, plan, &memory, &to_taker))?;
+        Ok(Self { frames, spare })
+    }
+
+    /// The next frame; `None` where no more are read.
+    pub fn next(&self) -> Option<ReadFrame> {
+        self.frames.recv().ok()
+    }
+
+    /// Takes back the memory of a frame.
+    pub fn give_back(&self, pixels: Vec<u8>) {
+        // The thread may have ended, and then needs none.
+        let _ = self.spare.try_send(pixels);
+    }
+}
+
+/// Reads until the end, an error that is one for good, or until nobody takes frames any more.
+fn read(
+    source: &mut dyn FrameSource,
+    plan: ReadingPlan,
+    memory: &Receiver<Vec<u8>>,
+    to_taker: &Sender<ReadFrame>,
+) {
+    let mut num_read = 0;
+    while num_read < plan.max_frames {
+        let Ok(mut pixels) = memory.recv() else { return };
+        let stamp = source.next_into(&mut pixels);
+        let (is_last, sensor_depth) = match &stamp {
+            Ok(Some(stamp)) if plan.with_depth => (false, source.depth_at(stamp.capture_nanos)),
+            Ok(Some(_)) => (false, Ok(None)),
+            Ok(None) => (true, Ok(None)),
+            Err(error) => (plan.is_strict || !error.is_passing(), Ok(None)),
+        };
+        num_read += usize::from(matches!(stamp, Ok(Some(_))));
+        if to_taker.send(ReadFrame { stamp, pixels, sensor_depth }).is_err() || is_last {
+            return;
+        }
+    }
+}
