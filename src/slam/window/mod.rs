@@ -104,6 +104,8 @@ pub struct Window {
     refinement: Refinement,
     /// The epoch whose start was found to be wrong.
     refuted_epoch: Option<u32>,
+    /// The epoch whose start was found to be right.
+    confirmed_epoch: Option<u32>,
 }
 
 impl Window {
@@ -124,6 +126,7 @@ impl Window {
             pass: Pass::default(),
             refinement: Refinement::default(),
             refuted_epoch: None,
+            confirmed_epoch: None,
         }
     }
 

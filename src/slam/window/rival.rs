@@ -18,6 +18,9 @@ const FEWEST_KEYFRAMES: usize = 4;
 /// Cost of the rival over that of the start below which the start is wrong. Wrong starts of the floor have 0.49 to 0.87,
 /// right ones of all recordings and rooms 1.21 and more.
 const REFUTED: f64 = 0.95;
+/// The same above which the start is right, and is not asked about again: wrong ones have at most 0.92, right ones 1.48 and
+/// more but for a few, which are asked about to the end.
+const CONFIRMED: f64 = 1.4;
 /// Least share of the comparisons that the rival must make too: one that sees little costs little.
 const LEAST_COMPARED: f64 = 0.8;
 /// Least inverse depth of a point on the rival's plane, as a share of that on the optical axis: a plane may rise above the
@@ -34,7 +37,9 @@ struct PlaneMotion {
 impl Window {
     /// Whether the rival of an epoch's start explains its first keyframes, which were just estimated, clearly better.
     pub(super) fn is_refuted(&mut self, chosen: &Chosen) -> bool {
-        if !chosen.is_first || chosen.members.len() < FEWEST_KEYFRAMES {
+        let epoch = self.keyframes[chosen.members[0]].epoch;
+        let is_early = chosen.members.len() < FEWEST_KEYFRAMES;
+        if !chosen.is_first || is_early || self.confirmed_epoch == Some(epoch) {
             return false;
         }
         let cost = self.mean_cost();
@@ -44,14 +49,17 @@ impl Window {
             (keyframe.camera_from_map, keyframe.points.clone())
         };
         let kept: Vec<_> = chosen.members.iter().map(keep).collect();
-        let is_better = self.become_rival(chosen)
-            && self.mean_cost() < REFUTED * cost
+        let is_comparable = self.become_rival(chosen)
             && self.solver.system.compared as f64 >= LEAST_COMPARED * compared as f64;
+        let of_rival = self.mean_cost();
         for (&member, kept) in chosen.members.iter().zip(kept) {
             let keyframe = &mut self.keyframes[member];
             (keyframe.camera_from_map, keyframe.points) = kept;
         }
-        is_better
+        if is_comparable && of_rival > CONFIRMED * cost {
+            self.confirmed_epoch = Some(epoch);
+        }
+        is_comparable && of_rival < REFUTED * cost
     }
 
     /// Mean cost of a comparison at the state of the solver, those that see something else included.
@@ -227,6 +235,8 @@ mod tests {
         let right = window.keyframes.clone();
         assert!(!window.is_refuted(&chosen));
         assert!(window.keyframes == right, "asking changes nothing");
+        assert_eq!(window.confirmed_epoch, Some(0), "it is not asked about again");
+        window.confirmed_epoch = None;
         assert!(window.become_rival(&chosen));
         assert!(window.is_refuted(&chosen));
     }
