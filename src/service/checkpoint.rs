@@ -66,11 +66,15 @@ impl Kept {
     pub fn follow(&mut self, mapper: &mut Mapper, outcome: &StepOutcome) {
         let is_corrected = outcome.graph_changed && !outcome.needs_image();
         let is_new = outcome.needs_image() || is_corrected;
-        let left = mapper.take_left().map(|left| left.keyframe_id);
+        let mut is_left = false;
+        while let Some(keyframe) = mapper.take_left() {
+            self.checkpoint.put_keyframe(keyframe.clone());
+            is_left = true;
+        }
         // The depth of the one before the active is what a correction changes most; the others are in their files
-        // as they were when they were left, and a successor estimates them again.
+        // as they were when they were left or refined, and a successor estimates them again.
         let before = is_corrected.then(|| before_active(mapper)).flatten();
-        if let Some(keyframe) = left.or(before).and_then(|id| mapper.map().get(id)) {
+        if let Some(keyframe) = before.filter(|_| !is_left).and_then(|id| mapper.map().get(id)) {
             self.checkpoint.put_keyframe(keyframe.clone());
         }
         let is_due = outcome.keyframe_changed

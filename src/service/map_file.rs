@@ -2,7 +2,7 @@
 //! it. Everything read is checked: a broken file gives an error that names what is wrong.
 //!
 //! Layout: magic, then the first free epoch (u32), the number of keyframes (u64), then each keyframe: id, revision, sequence
-//! (u64), stamp (i64), epoch, map state, width, height (u32), pose (8 × f64), intrinsics
+//! (u64), stamp (i64), epoch, map state, whether its depth is refined (0 or 1), width, height (u32), pose (8 × f64), intrinsics
 //! (4 × f64), covariance of common depth errors (6 × f64) and of the place (28 × f64), number of points (u64), points (u16, u16, 3 × f32), number of image bytes (u64, 0 where the
 //! image was given up), image bytes. Then the number of frames that were aligned again (u64), each: sequence, keyframe
 //! (u64), pose relative to that (7 × f64); and the number of points of the joint estimation (u64), each: keyframe (u64),
@@ -25,11 +25,11 @@ use crate::wire::conversion::{
 };
 
 /// First bytes of the file, with the version of the layout.
-const MAGIC: [u8; 16] = *b"semidense map 7\n";
+const MAGIC: [u8; 16] = *b"semidense map 8\n";
 /// Largest id or revision: what comes after it must not overflow.
 const MAX_NUMBER: u64 = u64::MAX / 2;
 /// Largest number of an epoch, for the same reason.
-const MAX_EPOCH: u64 = (u32::MAX / 2) as u64;
+const MAX_EPOCH: u32 = u32::MAX / 2;
 /// More keyframes than an hour at one each 30 ms: a broken number, not a map.
 const MAX_KEYFRAMES: u64 = 120_000;
 
@@ -125,7 +125,8 @@ fn write_keyframe(file: &mut impl Write, keyframe: &Keyframe) -> io::Result<()> 
     }
     file.write_all(&keyframe.capture_nanos.to_le_bytes())?;
     let state = code_from_map_state(keyframe.map_state);
-    for number in [keyframe.epoch, state, k.width as u32, k.height as u32] {
+    let is_refined = u32::from(keyframe.is_refined);
+    for number in [keyframe.epoch, state, is_refined, k.width as u32, k.height as u32] {
         file.write_all(&number.to_le_bytes())?;
     }
     let in_world = similarity_message(&keyframe.world_from_keyframe);
@@ -270,8 +271,12 @@ impl<R: Read> Reader<'_, R> {
     }
 
     fn epoch(&mut self) -> Result<u32, MapFileError> {
-        let epoch = self.u32()?;
-        self.at_most("epoch", u64::from(epoch), MAX_EPOCH).map(|_| epoch)
+        self.count_u32("epoch", MAX_EPOCH)
+    }
+
+    fn count_u32(&mut self, what: &'static str, most: u32) -> Result<u32, MapFileError> {
+        let count = self.u32()?;
+        self.at_most(what, u64::from(count), u64::from(most)).map(|_| count)
     }
 
     fn at_most(&self, what: &'static str, count: u64, most: u64) -> Result<u64, MapFileError> {
@@ -289,7 +294,9 @@ impl<R: Read> Reader<'_, R> {
         let map_revision = self.count("map revision", MAX_NUMBER)?;
         let sequence = self.u64()?;
         let capture_nanos = i64::from_le_bytes(self.bytes()?);
-        let (epoch, state, width, height) = (self.epoch()?, self.u32()?, self.u32()?, self.u32()?);
+        let (epoch, state) = (self.epoch()?, self.u32()?);
+        let is_refined = self.count_u32("refined", 1)? == 1;
+        let (width, height) = (self.u32()?, self.u32()?);
         let (in_world, in_map) = (self.numbers()?, self.numbers()?);
         let [fx, fy, cx, cy] = self.numbers()?;
         let intrinsics =
@@ -326,6 +333,7 @@ impl<R: Read> Reader<'_, R> {
             map_revision,
             mode_covariance,
             place_covariance,
+            is_refined,
             intrinsics,
             image,
             points,
@@ -394,6 +402,7 @@ mod tests {
             map_revision: 3,
             mode_covariance: ModeCovariance::of_std_devs([0.1, 0.2, 0.3]),
             place_covariance: PlaceCovariance::bounded(&(PlaceMatrix::identity() * 0.01)),
+            is_refined: true,
             intrinsics: Intrinsics { fx: 20.0, fy: 21.0, cx: 8.0, cy: 7.5, width: 17, height: 16 },
             image: (0..17 * 16).map(|i| (i % 251) as u8).collect(),
             points: vec![point; 5],

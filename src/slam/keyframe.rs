@@ -99,6 +99,8 @@ pub struct Keyframe {
     /// How uncertain its place in the map is, relative to the keyframes that held those it was estimated with; of the
     /// first one of an epoch zero.
     pub place_covariance: PlaceCovariance,
+    /// Whether its depth was observed again in the keyframes around it, which is done once.
+    pub is_refined: bool,
     /// Pixels with depth in row-major order, at most [`MAX_KEYFRAME_POINTS`].
     pub points: Vec<DepthPoint>,
 }
@@ -123,6 +125,7 @@ impl Keyframe {
             map_revision: 0,
             mode_covariance: ModeCovariance::ZERO,
             place_covariance: PlaceCovariance::ZERO,
+            is_refined: false,
             intrinsics,
             image,
             points,

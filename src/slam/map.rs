@@ -261,7 +261,7 @@ impl Map {
     pub fn refine(&mut self, refined: RefinedDepth, revision: u64) {
         let Some(index) = self.index_of(refined.keyframe_id) else { return };
         let keyframe = &mut self.keyframes[index];
-        keyframe.points = refined.points;
+        (keyframe.points, keyframe.is_refined) = (refined.points, true);
         keyframe.revision = revision;
     }
 

@@ -19,6 +19,8 @@ pub mod situation;
 mod start;
 mod turned_views;
 
+use std::collections::VecDeque;
+
 use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::candidate::CandidateParams;
@@ -229,8 +231,8 @@ pub struct Mapper {
     early: Vec<TrackedFrame>,
     /// Memory for more of them.
     spare_pixels: Vec<Vec<u8>>,
-    /// The keyframe that was active before, until somebody asks for it.
-    left: Option<u64>,
+    /// Keyframes whose depth is final for now, until somebody asks for them.
+    left: VecDeque<u64>,
     /// Memory for the frame at hand.
     frame: QuadImage,
     /// What the active keyframe wants when it is published.
@@ -267,7 +269,7 @@ impl Mapper {
             tracked: Vec::new(),
             early: Vec::new(),
             spare_pixels: Vec::new(),
-            left: None,
+            left: VecDeque::new(),
             frame: QuadImage::with_size(width, height),
             unfinished: None,
             revision: 0,
@@ -400,13 +402,6 @@ impl Mapper {
         self.map.keyframes.get(self.active.as_ref()?.index)
     }
 
-    /// The keyframe that was left since the last call, once its depth is final for now: after
-    /// [`Mapper::finish_keyframe`].
-    pub fn take_left(&mut self) -> Option<&Keyframe> {
-        let left = self.left.take()?;
-        self.map.get(left).filter(|keyframe| keyframe.has_depth())
-    }
-
     /// What the mapper is doing, and why.
     pub fn situation(&self) -> Situation {
         match self.phase {
@@ -462,7 +457,9 @@ impl Mapper {
 
     /// Makes a keyframe of the map the active one, placed in the world as its map is.
     fn enter_keyframe(&mut self, index: usize) {
-        self.left = self.keyframe().map_or(self.left, |keyframe| Some(keyframe.keyframe_id));
+        if let Some(left) = self.keyframe().map(|keyframe| keyframe.keyframe_id) {
+            self.tell_left(left);
+        }
         self.active = Some(Active::new(index));
         if let Some(keyframe) = self.map.keyframes.get(index) {
             self.modes.enter(&keyframe.mode_covariance, &self.params.modes);

@@ -407,6 +407,7 @@ pub fn keyframe_from_messages(
         map_revision: header.map_revision,
         mode_covariance: mode_covariance_from_message(&header.mode_covariance)?,
         place_covariance: place_covariance_from_message(&header.place_covariance)?,
+        is_refined: false,
         intrinsics,
         image: image.to_vec(),
         points: points.to_vec(),

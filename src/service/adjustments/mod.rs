@@ -172,7 +172,9 @@ impl Adjustments {
 
     /// Hands over what is new, where nothing is away.
     fn begin(&mut self, mapper: &mut Mapper) {
-        self.begin_with(mapper, Mapper::begin_adjustment);
+        // In lockstep and replay depth is refined after the last frame, with the poses that are final then.
+        let may_refine = self.entry == Entry::WhenReady;
+        self.begin_with(mapper, |mapper| mapper.begin_adjustment(may_refine));
     }
 
     fn begin_with(
@@ -280,5 +282,7 @@ fn joined(one: StepOutcome, other: StepOutcome) -> StepOutcome {
 
 #[cfg(test)]
 mod pass_tests;
+#[cfg(test)]
+mod refinement_tests;
 #[cfg(test)]
 mod tests;

@@ -6,6 +6,7 @@ use super::*;
 use crate::service::checkpoint::{Kept, read_checkpoint};
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
+use crate::slam::keyframe::DepthPoint;
 use crate::slam::map::{Correction, KeyframeCorrection, LogPlane};
 use crate::slam::mapper::MapperParams;
 use crate::slam::pose::{PoseEstimate, TrackingState};
@@ -65,6 +66,18 @@ impl Walk {
         adjustments.after_frame(&mut self.mapper, sequence)
     }
 
+    /// Relative errors of a keyframe's depth.
+    pub(super) fn depth_errors(&self, keyframe_id: u64) -> Vec<f64> {
+        let keyframe = self.mapper.map().get(keyframe_id).unwrap();
+        let place = keyframe.map_from_keyframe;
+        let truth = self.scene.render(&CAMERA, &place.rigid).inverse_depth;
+        let error = |point: &DepthPoint| {
+            let exact = truth.at(usize::from(point.u), usize::from(point.v));
+            (f64::from(point.inverse_depth) / place.scale / f64::from(exact)).ln().abs()
+        };
+        keyframe.points.iter().map(error).collect()
+    }
+
     fn places(&self) -> Vec<[f64; 4]> {
         let keyframes = self.mapper.map().keyframes.iter();
         let place =
@@ -87,7 +100,7 @@ fn held() -> (Optimise, Sender<()>) {
     (Box::new(optimise), let_go)
 }
 
-fn until(mut holds: impl FnMut() -> bool) {
+pub(super) fn until(mut holds: impl FnMut() -> bool) {
     let start = Instant::now();
     while !holds() {
         assert!(start.elapsed() < Duration::from_secs(60), "waited in vain");

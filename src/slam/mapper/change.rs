@@ -192,6 +192,7 @@ impl Mapper {
             map_revision: self.map.revision,
             mode_covariance: self.modes.published(&self.params.modes),
             place_covariance,
+            is_refined: false,
             intrinsics: self.intrinsics,
             image: frame.pixels.to_vec(),
             points: Vec::new(),

@@ -7,18 +7,29 @@ use crate::slam::mapper::phase::Phase;
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::pose::{NO_KEYFRAME, PoseEstimate};
 use crate::slam::window::Window;
+use crate::slam::window::dense::RefinedDepth;
 use crate::slam::window::frames::{PlacedFrame, TrackedFrame};
 use crate::slam::window::marginals::Marginal;
 
 impl Mapper {
     /// The keyframes to be estimated together, where one has been added since the last time, or else where a piece of a
-    /// pass over all is due and the camera is not lost: to be given back with [`Mapper::end_adjustment`] after
-    /// [`Window::optimise`], which may take its time.
-    pub fn begin_adjustment(&mut self) -> Option<Box<Window>> {
+    /// pass over all is due and the camera is not lost, or else, with `may_refine`, where the depth of one that has settled
+    /// can be refined: to be given back with [`Mapper::end_adjustment`] after [`Window::optimise`], which may take its time.
+    pub fn begin_adjustment(&mut self, may_refine: bool) -> Option<Box<Window>> {
         let (mut window, is_new) = self.take_window()?;
-        if is_new {
-            window.take_frames(&mut self.tracked, &mut self.spare_pixels);
-        } else if !(matches!(self.phase, Phase::Mapping) && window.begin_piece()) {
+        let is_mapping = matches!(self.phase, Phase::Mapping);
+        let active = self.keyframe().map(|keyframe| keyframe.keyframe_id);
+        let is_begun = match active {
+            _ if is_new => {
+                window.take_frames(&mut self.tracked, &mut self.spare_pixels);
+                true
+            }
+            Some(active) if is_mapping => {
+                window.begin_piece() || (may_refine && window.begin_refinement(&self.map, active))
+            }
+            _ => false,
+        };
+        if !is_begun {
             self.window = Some(window);
             return None;
         }
@@ -40,6 +51,11 @@ impl Mapper {
 
     /// Takes the keyframes back and moves the map to where they are now.
     pub fn end_adjustment(&mut self, mut window: Box<Window>) -> StepOutcome {
+        if let Some(refined) = window.take_refined() {
+            self.take_refined(refined);
+            self.window = Some(window);
+            return StepOutcome::default();
+        }
         let finished = self.finish_keyframe();
         let mut outcome = StepOutcome::default();
         if self.depth.unpublished > 0 {
@@ -99,13 +115,24 @@ impl Mapper {
     pub fn refine_depth(&mut self) -> bool {
         let Some(window) = &mut self.window else { return false };
         let Some(keyframe_id) = window.next_unrefined() else { return false };
-        let keyframe = self.map.get(keyframe_id).filter(|keyframe| keyframe.has_depth());
+        let keyframe = self.map.get(keyframe_id).filter(|of| of.has_depth() && !of.is_refined);
         let refined = keyframe.and_then(|keyframe| window.refined(keyframe));
         if let Some(refined) = refined {
             self.revision += 1;
             self.map.refine(refined, self.revision);
         }
         true
+    }
+
+    /// Gives a keyframe the depth that was refined while frames came, unless it is being observed again.
+    fn take_refined(&mut self, refined: RefinedDepth) {
+        let keyframe_id = refined.keyframe_id;
+        if self.keyframe().is_some_and(|active| active.keyframe_id == keyframe_id) {
+            return;
+        }
+        self.revision += 1;
+        self.map.refine(refined, self.revision);
+        self.tell_left(keyframe_id);
     }
 
     /// Keeps the points that the joint estimate has in the map: to be called before it is written.

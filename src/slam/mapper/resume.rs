@@ -21,6 +21,26 @@ impl Map {
 }
 
 impl Mapper {
+    /// A keyframe that was left or refined, once its depth is final for now: after [`Mapper::finish_keyframe`], until
+    /// there is none.
+    pub fn take_left(&mut self) -> Option<&Keyframe> {
+        while let Some(left) = self.left.pop_front() {
+            if self.map.get(left).is_some_and(Keyframe::has_depth) {
+                return self.map.get(left);
+            }
+        }
+        None
+    }
+
+    /// Somebody may want to keep a keyframe's depth.
+    pub(super) fn tell_left(&mut self, keyframe_id: u64) {
+        /// Keyframes that are told of, where nobody asks.
+        const MOST: usize = 8;
+        self.left.retain(|&id| id != keyframe_id);
+        self.left.truncate(MOST - 1);
+        self.left.push_back(keyframe_id);
+    }
+
     /// The active keyframe with its image and depth, and the poses of the others of its epoch; `None`
     /// where there is no established keyframe to go on from.
     pub fn checkpoint(&self) -> Option<Map> {

@@ -160,7 +160,9 @@ impl Mapper {
     /// Leaves the active keyframe and begins depth on `pixels`, in a world of its own.
     fn begin_epoch(&mut self, pixels: &[u8]) {
         self.leave_keyframe();
-        self.left = self.keyframe().map(|keyframe| keyframe.keyframe_id);
+        if let Some(left) = self.keyframe().map(|keyframe| keyframe.keyframe_id) {
+            self.tell_left(left);
+        }
         self.active = None;
         self.phase = Phase::Mapping;
         self.world_from_map = Sim3::identity();

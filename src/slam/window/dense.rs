@@ -12,13 +12,14 @@ use rayon::prelude::*;
 use crate::slam::alignment::kernel::{Kernel, SimdMode};
 use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::{DepthPoint, Keyframe};
-use crate::slam::map::LogPlane;
+use crate::slam::map::{LogPlane, Map};
 use crate::slam::window::Window;
 use crate::slam::window::comparison::{
     Compared, LANES, Pair, PairSums, Patterns, Robustness, SAMPLES, Wanted,
 };
 use crate::slam::window::keyframe::{WindowKeyframe, WindowPoint, halve, num_levels};
 use crate::slam::window::neighbours::{Single, smoothed};
+use crate::slam::window::params::WindowParams;
 use crate::slam::window::plane::fit;
 
 /// Keyframes that a keyframe's depth is compared with, those that see most of it: with eight, which are farther off,
@@ -57,8 +58,11 @@ pub struct RefinedDepth {
 #[derive(Debug, Clone, Default)]
 pub(super) struct Refinement {
     waiting: Vec<u64>,
-    /// Once only: what was fused is not the filter's any more.
+    /// Once only: what was fused is not the filter's any more, and what nothing sees will not be seen.
     done: HashSet<u64>,
+    /// The one that is away to be refined while frames come, and what became of it.
+    begun: Option<Box<Keyframe>>,
+    refined: Option<RefinedDepth>,
 }
 
 impl Refinement {
@@ -103,7 +107,47 @@ impl Window {
 
     /// The estimate was not taken: depth is not refined from it.
     pub fn leave_unrefined(&mut self) {
-        self.refinement.waiting.clear();
+        let Refinement { waiting, done, begun, refined } = &mut self.refinement;
+        waiting.clear();
+        let begun = begun.take().map(|of| of.keyframe_id);
+        for id in begun.into_iter().chain(refined.take().map(|of| of.keyframe_id)) {
+            done.remove(&id);
+        }
+    }
+
+    /// While frames come: takes the newest keyframe that is not free with every new one any more and has not been refined,
+    /// for [`Window::optimise`]; false where there is none. To be asked where nothing else is to be estimated.
+    pub fn begin_refinement(&mut self, map: &Map, active: u64) -> bool {
+        let Some(newest) = self.keyframes.len().checked_sub(1) else { return false };
+        let of_epoch = self.of_epoch_up_to(newest);
+        let WindowParams { num_free, num_first, .. } = self.params;
+        if of_epoch.len() <= num_first {
+            return false;
+        }
+        let settled = &of_epoch[..of_epoch.len().saturating_sub(num_free)];
+        let keyframe = settled.iter().rev().find_map(|&index| {
+            let id = self.keyframes[index].keyframe_id;
+            let is_open = id != active && !self.refinement.done.contains(&id);
+            map.get(id).filter(|of| is_open && of.has_depth() && !of.is_refined)
+        });
+        let Some(keyframe) = keyframe else { return false };
+        self.moved.clear();
+        self.marginals.clear();
+        self.refinement.done.insert(keyframe.keyframe_id);
+        self.refinement.begun = Some(Box::new(keyframe.clone()));
+        true
+    }
+
+    /// Refines the keyframe that was begun with; false where none was.
+    pub(super) fn refine_begun(&mut self) -> bool {
+        let Some(keyframe) = self.refinement.begun.take() else { return false };
+        self.refinement.refined = self.refined(&keyframe);
+        true
+    }
+
+    /// Depth that was refined while frames came.
+    pub fn take_refined(&mut self) -> Option<RefinedDepth> {
+        self.refinement.refined.take()
     }
 
     /// Depth of a keyframe of the map, from those that see most of it; `None` where none does.
@@ -126,8 +170,12 @@ impl Window {
             .map(|(level, steps)| self.observers(host, &observers, &of_observers, level, steps))
             .collect();
         let points = self.placed_points(host, keyframe);
-        let found: Vec<Vec<State>> =
-            points.par_chunks(CHUNK).map(|chunk| self.descend(chunk, &of_host, &levels)).collect();
+        let descend = |chunk: &[DepthPoint]| self.descend(chunk, &of_host, &levels);
+        // The thread of the joint estimation works alone beside the frames.
+        let found: Vec<Vec<State>> = match rayon::current_thread_index() {
+            Some(_) => points.par_chunks(CHUNK).map(descend).collect(),
+            None => points.chunks(CHUNK).map(descend).collect(),
+        };
         let found: Vec<State> = found.into_iter().flatten().collect();
         let squared = mean_squared_residual(&found);
         let unit = keyframe.map_from_keyframe.scale as f32;

@@ -220,6 +220,9 @@ impl Window {
 
     /// Estimates the newest keyframes and all points that they and older ones see; `None` where there is too little.
     pub fn optimise(&mut self) -> Option<Adjustment> {
+        if self.refine_begun() {
+            return None;
+        }
         let mut is_new = false;
         while let Some(&id) = self.unaligned.first() {
             self.unaligned.remove(0);

@@ -1,0 +1,65 @@
+//! Depth that is refined while frames come.
+
+use super::tests::{Walk, start, until};
+use super::*;
+use crate::slam::mapper::MapperParams;
+use crate::slam::window::params::WindowParams;
+
+/// Two keyframes free: the third before the newest has settled.
+fn short_window() -> MapperParams {
+    let window = WindowParams { num_first: 2, num_free: 2, ..WindowParams::default() };
+    MapperParams { window, ..MapperParams::default() }
+}
+
+/// 19 frames with five keyframes, each estimate in the map before the next frame.
+fn walk(entry: Entry) -> (Walk, Vec<u64>) {
+    let mut adjustments = start(entry, Box::new(Window::optimise));
+    let mut walk = Walk::with(short_window());
+    let mut left = Vec::new();
+    for _ in 0..19 {
+        walk.go(&mut adjustments);
+        until(|| {
+            adjustments.pick_up(&mut walk.mapper);
+            adjustments.away.is_none() || entry != Entry::WhenReady
+        });
+        left.extend(std::iter::from_fn(|| walk.mapper.take_left().map(|of| of.keyframe_id)));
+    }
+    (walk, left)
+}
+
+fn refined(walk: &Walk) -> Vec<u64> {
+    let of_map = walk.mapper.map().keyframes.iter();
+    of_map.filter(|keyframe| keyframe.is_refined).map(|keyframe| keyframe.keyframe_id).collect()
+}
+
+#[test]
+fn keyframes_that_have_settled_are_refined_and_told_of() {
+    let (live, left) = walk(Entry::WhenReady);
+    assert_eq!(live.mapper.map().keyframes.len(), 5);
+    assert_eq!(refined(&live), [0, 1, 2]);
+    for id in [0, 1, 2] {
+        let told = left.iter().filter(|&&of| of == id).count();
+        assert!(told >= 2, "keyframe {id}: when it was left and when it was refined: {left:?}");
+    }
+    let (lockstep, _) = walk(Entry::AfterFrames(1));
+    assert!(refined(&lockstep).is_empty(), "there it is done after the last frame");
+    let points = |walk: &Walk| walk.mapper.map().get(1).unwrap().points.clone();
+    assert_ne!(points(&live), points(&lockstep));
+    // Poses are exact here, so that the filter's depth is as good: 0.2 %.
+    let mut errors = live.depth_errors(1);
+    errors.sort_by(f64::total_cmp);
+    assert!(errors[errors.len() / 2] < 0.005, "{}", errors[errors.len() / 2]);
+}
+
+#[test]
+fn depth_that_was_dropped_is_refined_later() {
+    let (mut live, _) = walk(Entry::AfterFrames(1));
+    let mut first = live.mapper.begin_adjustment(true).unwrap();
+    assert_eq!(first.optimise(), None);
+    live.mapper.drop_adjustment(first);
+    assert!(refined(&live).is_empty());
+    let mut again = live.mapper.begin_adjustment(true).unwrap();
+    again.optimise();
+    live.mapper.end_adjustment(again);
+    assert_eq!(refined(&live), [1], "the newest that has settled in the estimate before");
+}
