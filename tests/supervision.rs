@@ -4,6 +4,7 @@
 #[allow(dead_code, reason = "every test uses its part of what they share")]
 mod support;
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::io::{PipeReader, PipeWriter, Read, Write};
 use std::os::unix::fs::OpenOptionsExt;
@@ -16,7 +17,9 @@ use rustix::fs::{Mode, OFlags, fcntl_getfl, fcntl_setfl};
 use rustix::process::{Pid, Signal, kill_process};
 use semidense::service::peers::{HEALTH_TOPICS, Peer};
 use semidense::wire::command::{Command, CommandClient};
-use semidense::wire::port::Hub;
+use semidense::wire::message::{GraphHeader, KeyframePoseMessage, SimilarityMessage};
+use semidense::wire::port::{Hub, Subscriber};
+use semidense::wire::topic::GRAPH;
 use serde_json::Value;
 use support::{Rig, WATCH_DOG, end, finish, signal, until, with_mount};
 
@@ -29,7 +32,7 @@ struct Live {
     rig: Rig,
     run: Child,
     peers: Vec<Peer>,
-    _hub: Hub,
+    hub: Hub,
 }
 
 /// Frames of the source: ten seconds at 30 Hz.
@@ -51,7 +54,7 @@ impl Live {
         let hub = rig.observe();
         let open = |topic| until("a process", || Peer::open(&hub, topic).ok());
         let peers = HEALTH_TOPICS.iter().map(open).collect();
-        Self { rig, run, peers, _hub: hub }
+        Self { rig, run, peers, hub }
     }
 
     fn until_frames(&mut self, process: usize, frames: u64) {
@@ -77,7 +80,7 @@ impl Live {
 
     /// Waits for the end; exit code, standard error and the summary.
     fn end(self) -> (Option<i32>, String, Value, Rig) {
-        drop((self.peers, self._hub));
+        drop((self.peers, self.hub));
         let ended = end(self.run);
         let text = fs::read_to_string(self.rig.output().join("summary.json")).unwrap_or_default();
         let summary = serde_json::from_str(&text).unwrap_or(Value::Null);
@@ -273,7 +276,7 @@ fn a_mapper_that_writes_its_map_to_a_slow_disk_is_let_alone() {
     let mapper = live.pid(MAPPER).as_raw_nonzero();
     let map = live.rig.folder().join("map.bin");
     let disk = slow_disk(&live.rig.folder().join(format!(".map.bin.{mapper}.tmp")));
-    let commands = CommandClient::open(&live._hub).unwrap();
+    let commands = CommandClient::open(&live.hub).unwrap();
     commands.ask(&Command::SaveMap(map), WATCH_DOG, || true).unwrap();
     drop(commands);
     // Twice as much as it takes within the watchdog's time.
@@ -298,6 +301,66 @@ fn a_mapper_that_dies_before_it_numbers_anything_leaves_the_first_numbers() {
     let first = keyframes.lines().find(|line| !line.starts_with('#')).unwrap();
     const KEYFRAME_ID: usize = 9;
     assert_eq!(first.split_whitespace().nth(KEYFRAME_ID), Some("0"), "{first}");
+}
+
+/// Where the keyframes of an epoch are, by id.
+type Places = BTreeMap<u64, SimilarityMessage>;
+
+/// Every graph that was published since the last call.
+fn graphs(graph: &Subscriber<KeyframePoseMessage, GraphHeader>) -> Vec<(GraphHeader, Places)> {
+    let next = || graph.receive().unwrap();
+    let received = std::iter::from_fn(next).map(|message| {
+        let places = message.payload().iter().map(|of| (of.keyframe_id, of.map_from_keyframe));
+        (*message.header(), places.collect())
+    });
+    received.collect()
+}
+
+#[test]
+fn a_mapper_that_dies_during_an_estimate_leaves_a_map_as_it_was_published() {
+    // Estimates that take long, so that each death falls into one.
+    let slow = ["--live", "--set", "mapping.window.max_first_iterations=200"];
+    let rig = Rig::new();
+    let run = rig.run(450, &slow).spawn().unwrap();
+    let mut live = Live::watch(rig, run);
+    let graph = until("the graph", || live.hub.subscriber(&GRAPH).ok());
+    let mut published: Vec<(GraphHeader, Places)> = Vec::new();
+    for least in [3, 4] {
+        // An estimate begins when its keyframe has been published.
+        let mut known = 0;
+        until("a new keyframe", || {
+            let new = graphs(&graph);
+            let largest = new.iter().map(|(_, places)| places.len()).max().unwrap_or(0);
+            let is_new = known > 0 && largest > known && largest >= least;
+            known = known.max(largest);
+            published.extend(new);
+            is_new.then_some(())
+        });
+        let before = live.pid(MAPPER);
+        live.send(&[MAPPER], Signal::KILL);
+        live.until_replaced(MAPPER, before);
+        published.extend(graphs(&graph));
+        let newest = published.iter().map(|(header, _)| header.revision).max().unwrap();
+        // The successor leaves numbers out.
+        let successor = until("the successor's graph", || {
+            let new = graphs(&graph);
+            let first = new.iter().find(|(header, _)| header.revision > newest + 1000).cloned();
+            published.extend(new.into_iter().filter(|(header, _)| header.revision <= newest));
+            first
+        });
+        let (header, places) = &successor;
+        assert_eq!(header.epoch, published.last().unwrap().0.epoch);
+        assert!(places.len() + 1 >= least, "at most the newest is lost: {places:?}");
+        let is_like = |(_, of): &(GraphHeader, Places)| {
+            places.iter().all(|(id, place)| of.get(id) == Some(place))
+        };
+        assert!(published.iter().any(is_like), "{places:?} were never published so");
+        published.push(successor);
+    }
+    drop(graph);
+    let (code, stderr, summary, _rig) = live.end();
+    assert_eq!(code, Some(0), "{stderr}");
+    assert_eq!((&summary["restarts"], &summary["epoch"]), (&Value::from(2), &Value::from(0)));
 }
 
 /// Runs `script` in a shell with a /dev/shm of its own, of `megabytes`.
