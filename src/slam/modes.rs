@@ -60,6 +60,13 @@ impl ModeCovariance {
         is_one.then_some(covariance)
     }
 
+    /// Of depth whose relief is off by `error` and stays so.
+    pub fn with_relief_error(&self, error: f64) -> Self {
+        let mut matrix = self.matrix();
+        matrix[(2, 2)] += error * error;
+        Self::bounded(&matrix)
+    }
+
     /// Its upper triangle, row by row.
     pub fn upper_triangle(&self) -> [f64; 6] {
         self.upper_triangle

@@ -7,7 +7,7 @@ use crate::slam::modes::ModeCovariance;
 use crate::slam::place_covariance::{PlaceCovariance, UncertainPlace};
 use crate::slam::window::keyframe::WindowKeyframe;
 use crate::slam::window::marginals::Marginal;
-use crate::slam::window::plane::{Correspondence, fit};
+use crate::slam::window::plane::{Correspondence, fit, relief_left};
 use crate::slam::window::{Window, selection};
 
 /// What is made of a marginal: the covariance of the modes of a keyframe's depth, and of its place.
@@ -83,7 +83,9 @@ impl Window {
         // Depth that was not moved to the points is no surer than before.
         let is_tilted = plane.is_some_and(|[_, per_x, per_y]| (per_x, per_y) != (0.0, 0.0));
         let said = self.marginal_of(keyframe.keyframe_id).map(said_of);
-        let modes = said.map(|(modes, _)| modes).filter(|_| is_tilted);
+        // The plane leaves the depth's own relief, while the estimate speaks of that of the points.
+        let relief = plane.map_or(0.0, |plane| relief_left(&better, &plane));
+        let modes = said.map(|(modes, _)| modes.with_relief_error(relief)).filter(|_| is_tilted);
         let [offset, per_x, per_y] = plane.unwrap_or_default();
         Some(KeyframeCorrection {
             keyframe_id: keyframe.keyframe_id,
@@ -108,7 +110,11 @@ impl Window {
                 let dense = selection::at_pixel(&keyframe.points, point.u, point.v)?;
                 let depth = f64::from(dense.inverse_depth) / unit;
                 let ray = point.ray.map(f64::from);
-                Some(Correspondence { ray, log_ratio: (point.inverse_depth / depth).ln() })
+                Some(Correspondence {
+                    ray,
+                    log_ratio: (point.inverse_depth / depth).ln(),
+                    log_inverse_depth: depth.ln(),
+                })
             })
             .collect()
     }

@@ -333,6 +333,7 @@ impl Window {
                         (seen.v - self.camera.cy) / self.camera.fy,
                     ],
                     log_ratio: (seen.inverse_depth / depth).ln(),
+                    log_inverse_depth: depth.ln(),
                 });
             }
         }

@@ -1,6 +1,6 @@
 //! A smooth correction of a keyframe's depth from few points that are known better.
 
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{Matrix3, Matrix4, Vector3, Vector4};
 
 /// One point that is known better.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -9,6 +9,25 @@ pub struct Correspondence {
     pub ray: [f64; 2],
     /// Logarithm of its inverse depth over what the keyframe has there.
     pub log_ratio: f64,
+    /// Logarithm of what the keyframe has there, in the unit of the map.
+    pub log_inverse_depth: f64,
+}
+
+/// What is left of the relief when a plane has been taken out: `log_ratio - plane ≈ offset + relief ln d`.
+pub fn relief_left(points: &[Correspondence], plane: &[f64; 3]) -> f64 {
+    let residual = |point: &Correspondence| {
+        point.log_ratio - plane[0] - plane[1] * point.ray[0] - plane[2] * point.ray[1]
+    };
+    let spread = spread(points.iter().map(|point| residual(point).abs()).collect());
+    let (mut normal, mut right) = (Matrix4::identity() * 1e-9, Vector4::zeros());
+    for point in points {
+        let residual = residual(point);
+        let weight = weight_of(residual.abs() / spread);
+        let shape = Vector4::new(1.0, point.ray[0], point.ray[1], point.log_inverse_depth);
+        normal += weight * shape * shape.transpose();
+        right += weight * residual * shape;
+    }
+    normal.cholesky().map_or(0.0, |of| of.solve(&right).w)
 }
 
 /// `log_ratio ≈ offset + per_x X + per_y Y` for most of the points: offset and slopes. A single offset where there are

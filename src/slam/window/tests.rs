@@ -326,7 +326,10 @@ fn a_plane_is_found_among_points_that_are_wrong() {
         .map(|_| {
             let ray = [random.uniform() - 0.5, random.uniform() - 0.5];
             let noise = 0.01 * random.normal();
-            Correspondence { ray, log_ratio: 0.3 - 0.2 * ray[0] + 0.1 * ray[1] + noise }
+            let log_inverse_depth = 0.4 * random.normal();
+            let plane = 0.3 - 0.2 * ray[0] + 0.1 * ray[1];
+            let log_ratio = plane + 0.05 * log_inverse_depth + noise;
+            Correspondence { ray, log_ratio, log_inverse_depth }
         })
         .collect();
     points.iter_mut().step_by(5).for_each(|point| point.log_ratio += 1.0);
@@ -334,6 +337,8 @@ fn a_plane_is_found_among_points_that_are_wrong() {
     for (found, expected) in found.iter().zip([0.3, -0.2, 0.1]) {
         assert!((found - expected).abs() < 0.01, "{found} {expected}");
     }
+    let relief = plane::relief_left(&points, &found);
+    assert!((relief - 0.05).abs() < 0.01, "{relief}");
     // Too few for a plane, and too few for anything.
     let [offset, per_x, per_y] = plane::fit(&points[..20]).unwrap();
     assert!((offset - 0.3).abs() < 0.15 && (per_x, per_y) == (0.0, 0.0));
