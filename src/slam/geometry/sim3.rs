@@ -1,10 +1,21 @@
 //! Similarity transforms Sim(3): a rigid transform and the scale gauge of a keyframe.
+//!
+//! A twist is `(translation, rotation, log scale)`: the velocity of a point p is υ + ω × p + λ p. Increments act from
+//! the **left**: `exp(twist) * a_from_b`.
 
 use std::ops::Mul;
 
-use nalgebra::{Matrix6, Vector3};
+use nalgebra::{Matrix3, Matrix6, SMatrix, SVector, UnitQuaternion, Vector3};
 
-use crate::slam::geometry::se3::SE3;
+use crate::slam::geometry::se3::{SE3, hat};
+
+/// A twist of Sim(3): translation, rotation, log scale.
+pub type Twist7 = SVector<f64, 7>;
+/// A matrix over twists of Sim(3).
+pub type Matrix7 = SMatrix<f64, 7, 7>;
+
+/// Most terms of a series below. A twist with an angle of π and a scale of e^5 needs 40; a residual needs five to ten.
+const MAX_TERMS: u32 = 60;
 
 /// A similarity `point_in_a = scale * rotation * point_in_b + translation`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -58,6 +69,37 @@ impl Sim3 {
         relative
     }
 
+    /// The exponential of a twist.
+    pub fn exp(twist: &Twist7) -> Self {
+        let (upsilon, omega, log_scale) = parts(twist);
+        let translation = translation_jacobian(&omega, log_scale) * upsilon;
+        let rotation = UnitQuaternion::from_scaled_axis(omega);
+        Self::new(SE3 { rotation, translation }, log_scale.exp())
+    }
+
+    /// The twist whose exponential this is; the rotation angle lies in [0, π]. Not finite where the similarity is not
+    /// valid.
+    pub fn log(&self) -> Twist7 {
+        let (omega, log_scale) = (self.rigid.rotation.scaled_axis(), self.scale.ln());
+        // Its eigenvalues are (e^z − 1)/z at z = λ and λ ± iθ: not 0 for angles below 2π.
+        let inverse = translation_jacobian(&omega, log_scale).try_inverse();
+        let upsilon = inverse.unwrap_or(Matrix3::repeat(f64::NAN)) * self.rigid.translation;
+        let mut twist = Twist7::zeros();
+        twist.fixed_rows_mut::<3>(0).copy_from(&upsilon);
+        twist.fixed_rows_mut::<3>(3).copy_from(&omega);
+        twist[6] = log_scale;
+        twist
+    }
+
+    /// The adjoint: `exp(adjoint * twist) = self * exp(twist) * self⁻¹`.
+    pub fn adjoint(&self) -> Matrix7 {
+        let mut adjoint = Matrix7::zeros();
+        adjoint.fixed_view_mut::<6, 6>(0, 0).copy_from(&self.rigid_adjoint());
+        adjoint.fixed_view_mut::<3, 1>(0, 6).copy_from(&-self.rigid.translation);
+        adjoint[(6, 6)] = 1.0;
+        adjoint
+    }
+
     /// What a left increment ξ of a rigid pose becomes where the pose is moved by this similarity: `self · exp(ξ) · pose`
     /// is `exp(rigid_adjoint · ξ) · self · pose`.
     pub fn rigid_adjoint(&self) -> Matrix6<f64> {
@@ -92,6 +134,68 @@ impl Mul<Vector3<f64>> for Sim3 {
     }
 }
 
+/// The translation, rotation and log scale of a twist.
+fn parts(twist: &Twist7) -> (Vector3<f64>, Vector3<f64>, f64) {
+    (twist.fixed_rows::<3>(0).into_owned(), twist.fixed_rows::<3>(3).into_owned(), twist[6])
+}
+
+/// ∫₀¹ exp(τ(λI + ω^)) dτ, which carries the translation of a twist to the translation: Σ Mᵏ/(k+1)! with M = λI + ω^.
+/// The series needs no case for small angles, small scales or both.
+fn translation_jacobian(omega: &Vector3<f64>, log_scale: f64) -> Matrix3<f64> {
+    let generator = hat(omega) + Matrix3::identity() * log_scale;
+    let (mut term, mut sum) = (Matrix3::identity(), Matrix3::identity());
+    for k in 1..MAX_TERMS {
+        term = generator * term / f64::from(k + 1);
+        sum += term;
+        if term.norm_squared() < f64::EPSILON.powi(2) * sum.norm_squared() {
+            break;
+        }
+    }
+    sum
+}
+
+/// The inverse of the left Jacobian J of Sim(3), exp(ξ + δ) ≈ exp(J δ) exp(ξ): log(exp(δ) exp(ξ)) ≈ ξ + J⁻¹ δ.
+///
+/// J = Σ adᵏ/(k+1)! with ad = [M, υ^, −υ; 0, ω^, 0; 0, 0, 0]. Its powers keep that shape, [Mᵏ, X, y; 0, ω^ᵏ, 0; 0, 0, 0],
+/// so that only the upper blocks are summed; the inverse is made by blocks, too. NaN where the twist is not finite.
+pub fn left_jacobian_inverse(twist: &Twist7) -> Matrix7 {
+    let (upsilon, omega, log_scale) = parts(twist);
+    let (upsilon_hat, omega_hat) = (hat(&upsilon), hat(&omega));
+    let generator = omega_hat + Matrix3::identity() * log_scale;
+    // adᵏ/(k+1)!, and the sum over k; k = 1 here.
+    let (mut motion, mut turn) = (generator * 0.5, omega_hat * 0.5);
+    let (mut lever, mut stretch) = (upsilon_hat * 0.5, upsilon * -0.5);
+    let mut sum_motion = Matrix3::identity() + motion;
+    let mut sum_turn = Matrix3::identity() + turn;
+    let (mut sum_lever, mut sum_stretch) = (lever, stretch);
+    for k in 2..MAX_TERMS {
+        let share = 1.0 / f64::from(k + 1);
+        lever = (generator * lever + upsilon_hat * turn) * share;
+        stretch = generator * stretch * share;
+        motion = generator * motion * share;
+        turn = omega_hat * turn * share;
+        sum_motion += motion;
+        sum_turn += turn;
+        sum_lever += lever;
+        sum_stretch += stretch;
+        let size = |m: &Matrix3<f64>| m.norm_squared();
+        let added = size(&motion) + size(&turn) + size(&lever) + stretch.norm_squared();
+        if added < f64::EPSILON.powi(2) * (size(&sum_motion) + size(&sum_lever)) {
+            break;
+        }
+    }
+    let nan = Matrix3::repeat(f64::NAN);
+    let motion = sum_motion.try_inverse().unwrap_or(nan);
+    let turn = sum_turn.try_inverse().unwrap_or(nan);
+    let mut inverse = Matrix7::zeros();
+    inverse.fixed_view_mut::<3, 3>(0, 0).copy_from(&motion);
+    inverse.fixed_view_mut::<3, 3>(0, 3).copy_from(&(-motion * sum_lever * turn));
+    inverse.fixed_view_mut::<3, 1>(0, 6).copy_from(&(-motion * sum_stretch));
+    inverse.fixed_view_mut::<3, 3>(3, 3).copy_from(&turn);
+    inverse[(6, 6)] = 1.0;
+    inverse
+}
+
 #[cfg(test)]
 mod tests {
     use nalgebra::Vector6;
@@ -104,7 +208,69 @@ mod tests {
             .prop_map(|(twist, scale)| Sim3::new(SE3::exp(&Vector6::from(twist)), scale))
     }
 
+    fn twist() -> impl Strategy<Value = Twist7> {
+        // Angles up to 3 rad keep away from the branch of the logarithm at π.
+        proptest::array::uniform7(-1.7f64..1.7).prop_map(Twist7::from)
+    }
+
+    fn difference(a: &Sim3, b: &Sim3) -> f64 {
+        (a.inverse() * *b).log().norm()
+    }
+
     proptest! {
+        #[test]
+        fn log_inverts_exp(xi in twist()) {
+            prop_assert!((Sim3::exp(&xi).log() - xi).norm() < 1e-9);
+        }
+
+        #[test]
+        fn small_twists_keep_their_digits(xi in twist(), exponents in proptest::array::uniform3(-12.0f64..0.0)) {
+            // Each part small by itself: no case of a closed form decides.
+            let mut xi = xi;
+            for (part, exponent) in [(0..3, exponents[0]), (3..6, exponents[1]), (6..7, exponents[2])] {
+                part.for_each(|i| xi[i] *= 10f64.powf(exponent));
+            }
+            prop_assert!((Sim3::exp(&xi).log() - xi).norm() < 1e-12);
+        }
+
+        #[test]
+        fn without_scale_it_is_a_rigid_transform(xi in twist()) {
+            let rigid = Vector6::from_iterator(xi.iter().copied());
+            let mut xi = xi;
+            xi[6] = 0.0;
+            let exp = Sim3::exp(&xi);
+            prop_assert!(exp.scale == 1.0);
+            prop_assert!((exp.rigid.translation - SE3::exp(&rigid).translation).norm() < 1e-12);
+        }
+
+        #[test]
+        fn a_twist_is_one_motion(xi in twist(), a in 0.0f64..1.0) {
+            let both = Sim3::exp(&(xi * a)) * Sim3::exp(&(xi * (1.0 - a)));
+            prop_assert!(difference(&both, &Sim3::exp(&xi)) < 1e-9);
+        }
+
+        #[test]
+        fn adjoint_moves_a_twist_to_the_left(a in similarity(), xi in twist()) {
+            let xi = xi * 0.3;
+            let left = Sim3::exp(&(a.adjoint() * xi)) * a;
+            prop_assert!(difference(&left, &(a * Sim3::exp(&xi))) < 1e-7);
+        }
+
+        #[test]
+        fn inverse_jacobian_is_that_of_the_logarithm(xi in twist()) {
+            const STEP: f64 = 1e-5;
+            let jacobian = left_jacobian_inverse(&xi);
+            for i in 0..7 {
+                let moved = |step: f64| {
+                    let mut delta = Twist7::zeros();
+                    delta[i] = step;
+                    (Sim3::exp(&delta) * Sim3::exp(&xi)).log()
+                };
+                let numeric = (moved(STEP) - moved(-STEP)) / (2.0 * STEP);
+                prop_assert!((jacobian.column(i) - numeric).norm() < 1e-6, "{i}: {}", jacobian.column(i) - numeric);
+            }
+        }
+
         #[test]
         fn product_acts_as_composition(a in similarity(), b in similarity(), p in proptest::array::uniform3(-5.0f64..5.0)) {
             let p = Vector3::from(p);
