@@ -8,6 +8,7 @@ pub mod depth;
 pub mod evaluation;
 pub mod frame;
 pub mod geometry;
+pub mod graph;
 pub mod image;
 pub mod keyframe;
 pub mod map;

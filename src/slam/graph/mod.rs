@@ -1,0 +1,121 @@
+//! The pose graph: keyframes at similarities, measurements between them, and the places that fit best (Engel, Schöps,
+//! Cremers 2014, §3.6).
+//!
+//! [`optimise`] is the recipe: [`pose_graph`] is what goes in, [`residual`] what a measurement says, [`robust`] what a false
+//! one may do; the normal equations are solved by a sparse Cholesky factorisation over blocks (`ordering`, `fronts`,
+//! `factorisation`, `dense_kernel`) within Levenberg–Marquardt (`solver`). [`marginal`] says how sure the result is.
+//! All sums are in a fixed order and no operation is fused: results are the same bits on every CPU.
+
+mod dense_kernel;
+mod factorisation;
+mod fronts;
+pub mod marginal;
+mod ordering;
+pub mod pose_graph;
+pub mod residual;
+pub mod robust;
+mod solver;
+mod system;
+#[cfg(test)]
+mod tests;
+
+use crate::slam::alignment::kernel::{Kernel, SimdMode};
+use crate::slam::graph::pose_graph::{PoseGraph, VertexId};
+use crate::slam::graph::solver::solve;
+use crate::slam::graph::system::error;
+
+/// How a graph is solved.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct GraphParams {
+    /// Most factorisations.
+    pub max_iterations: u32,
+    /// Whether all keyframes have one unit, as with stereo: scales stay as they are, and what constraints say of them does
+    /// not count.
+    pub is_scale_known: bool,
+    /// Instructions of the factorisation; all give the same bits.
+    pub kernel: Kernel,
+}
+
+impl Default for GraphParams {
+    fn default() -> Self {
+        Self {
+            // A closed loop needs five to ten.
+            max_iterations: 100,
+            is_scale_known: false,
+            kernel: Kernel::choose(SimdMode::Auto),
+        }
+    }
+}
+
+/// What came of it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Outcome {
+    /// Σ ρ(rᵀΛr) before.
+    pub initial_cost: f64,
+    /// The same after.
+    pub cost: f64,
+    /// Σ rᵀΛr after, without kernels.
+    pub chi2: f64,
+    /// Factorisations that were made.
+    pub iterations: u32,
+    /// Whether the last step was too small to matter.
+    pub is_converged: bool,
+}
+
+/// Why a graph is not solved; it is as it was.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum SolveError {
+    /// A vertex is connected to no fixed one, so that its place is not determined.
+    #[error("vertex {} is not connected to a fixed one", .0.index())]
+    Disconnected(VertexId),
+    /// The errors at the start are not finite.
+    #[error("the errors of the constraints are not finite")]
+    NotFinite,
+    /// The constraints do not determine all places.
+    #[error("the constraints do not determine the places of all vertices")]
+    Singular,
+}
+
+/// Moves the vertices that are not fixed to where the constraints fit best. Where the iterations end before it has
+/// converged, the best places so far are kept.
+pub fn optimise(graph: &mut PoseGraph, params: &GraphParams) -> Result<Outcome, SolveError> {
+    check_gauge(graph)?;
+    if params.is_scale_known { solve::<6>(graph, params) } else { solve::<7>(graph, params) }
+}
+
+/// How well each constraint fits: rᵀΛr, and the weight ρ' that its kernel leaves it.
+pub fn fits(graph: &PoseGraph, is_scale_known: bool) -> Vec<(f64, f64)> {
+    let places: Vec<_> = graph.vertices().iter().map(|v| v.map_from_keyframe).collect();
+    let of = |constraint| {
+        let e = if is_scale_known {
+            error::<6>(constraint, &places)
+        } else {
+            error::<7>(constraint, &places)
+        };
+        (e, constraint.kernel.at(e).weight)
+    };
+    graph.constraints().iter().map(of).collect()
+}
+
+/// Checks that every vertex is connected to a fixed one.
+fn check_gauge(graph: &PoseGraph) -> Result<(), SolveError> {
+    let mut neighbours = vec![Vec::new(); graph.vertices().len()];
+    for constraint in graph.constraints() {
+        let (i, j) = (constraint.i.index(), constraint.j.index());
+        neighbours[i].push(j);
+        neighbours[j].push(i);
+    }
+    let mut is_reached: Vec<bool> = graph.vertices().iter().map(|v| v.is_fixed).collect();
+    let mut waiting: Vec<usize> = (0..is_reached.len()).filter(|&v| is_reached[v]).collect();
+    while let Some(vertex) = waiting.pop() {
+        for &other in &neighbours[vertex] {
+            if !std::mem::replace(&mut is_reached[other], true) {
+                waiting.push(other);
+            }
+        }
+    }
+    match is_reached.iter().position(|&is_reached| !is_reached) {
+        Some(vertex) => Err(SolveError::Disconnected(VertexId(vertex))),
+        None => Ok(()),
+    }
+}

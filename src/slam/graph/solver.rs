@@ -1,0 +1,95 @@
+//! Levenberg–Marquardt on the places of a pose graph.
+
+use crate::slam::geometry::sim3::{Sim3, Twist7};
+use crate::slam::graph::factorisation::Factorisation;
+use crate::slam::graph::pose_graph::PoseGraph;
+use crate::slam::graph::system::{System, cost, error};
+use crate::slam::graph::{GraphParams, Outcome, SolveError};
+
+/// Damping of the first step, as a share of each diagonal element: odometry is a good start.
+const FIRST_DAMPING: f64 = 1e-5;
+/// Factors after a step that lowers the cost, and after one that does not.
+const DAMPING_DOWN: f64 = 0.1;
+const DAMPING_UP: f64 = 10.0;
+/// Least damping, of no effect but to let the next one rise; beyond the most no step is worth the name.
+const LEAST_DAMPING: f64 = 1e-12;
+const MOST_DAMPING: f64 = 1e8;
+/// The places have converged when a step would lower the cost by less than this, and by less than this share of it: a
+/// thousandth of a standard deviation in one direction lowers it by a millionth.
+const CONVERGED_DECREASE: f64 = 1e-6;
+const CONVERGED_SHARE: f64 = 1e-9;
+
+/// Moves the free vertices to the least cost; `graph` is as before where there is an error.
+pub(super) fn solve<const D: usize>(
+    graph: &mut PoseGraph,
+    params: &GraphParams,
+) -> Result<Outcome, SolveError> {
+    let mut places: Vec<Sim3> = graph.vertices().iter().map(|v| v.map_from_keyframe).collect();
+    let mut system = System::<D>::new(graph);
+    let mut factorisation =
+        Factorisation::<D>::new(system.num_nodes(), &system.pairs, params.kernel);
+    let constraints = graph.constraints();
+    let initial_cost = cost::<D>(constraints, &places);
+    let mut current = initial_cost;
+    if !initial_cost.is_finite() {
+        return Err(SolveError::NotFinite);
+    }
+    let (mut damping, mut iterations, mut is_converged) = (FIRST_DAMPING, 0, false);
+    let (mut step, mut moved) = (Vec::new(), places.clone());
+    let mut is_linearised = false;
+    while iterations < params.max_iterations && damping <= MOST_DAMPING {
+        if !is_linearised {
+            system.linearise(constraints, &places);
+            is_linearised = true;
+        }
+        iterations += 1;
+        if !factorisation.factorise(&system.blocks, damping) {
+            damping *= DAMPING_UP;
+            if damping > MOST_DAMPING {
+                return Err(SolveError::Singular);
+            }
+            continue;
+        }
+        step.clear();
+        step.extend(system.gradient.iter().map(|value| -value));
+        factorisation.solve(&mut step);
+        let expected = expected_decrease(&system, &step, damping);
+        for ((place, moved), node) in places.iter().zip(&mut moved).zip(&system.node_of) {
+            *moved = node.map_or(*place, |node| *place * increment::<D>(&step[D * node..][..D]));
+        }
+        let trial = cost::<D>(constraints, &moved);
+        let is_lower = trial < current;
+        let decrease = current - trial;
+        if is_lower {
+            std::mem::swap(&mut places, &mut moved);
+            (current, is_linearised) = (trial, false);
+            damping = (damping * DAMPING_DOWN).max(LEAST_DAMPING);
+        } else {
+            damping *= DAMPING_UP;
+        }
+        let flat = CONVERGED_DECREASE + CONVERGED_SHARE * current;
+        if expected <= flat && decrease <= flat {
+            is_converged = true;
+            break;
+        }
+    }
+    let chi2 = constraints.iter().map(|constraint| error::<D>(constraint, &places)).sum();
+    graph.places_mut().zip(places).for_each(|(into, place)| *into = place);
+    Ok(Outcome { initial_cost, cost: current, chi2, iterations, is_converged })
+}
+
+/// What the linear equations promise: −2gᵀδ − δᵀHδ with (H + μ diag H) δ = −g.
+fn expected_decrease<const D: usize>(system: &System<D>, step: &[f64], damping: f64) -> f64 {
+    let slope: f64 = system.gradient.iter().zip(step).map(|(g, d)| g * d).sum();
+    let damped = |(node, step): (usize, &[f64])| -> f64 {
+        let block = &system.blocks[node];
+        step.iter().enumerate().map(|(k, d)| block[(k, k)] * d * d).sum()
+    };
+    damping * step.chunks_exact(D).enumerate().map(damped).sum::<f64>() - slope
+}
+
+fn increment<const D: usize>(step: &[f64]) -> Sim3 {
+    let mut twist = Twist7::zeros();
+    twist.as_mut_slice()[..D].copy_from_slice(step);
+    Sim3::exp(&twist)
+}
