@@ -4,7 +4,7 @@
 //! [`optimise`] is the recipe: [`pose_graph`] is what goes in, [`residual`] what a measurement says, [`robust`] what a false
 //! one may do; the normal equations are solved by a sparse Cholesky factorisation over blocks (`ordering`, `fronts`,
 //! `factorisation`, `dense_kernel`) within Levenberg–Marquardt (`solver`). [`marginal`] says how sure the result is.
-//! All sums are in a fixed order and no operation is fused: results are the same bits on every CPU.
+//! All sums are in a fixed order and no operation is fused: results do not depend on the vector unit.
 
 mod dense_kernel;
 mod factorisation;
