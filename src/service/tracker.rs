@@ -345,6 +345,9 @@ fn state_text(state: TrackingState) -> &'static str {
             "degraded: the images fit the map badly"
         }
         TrackingState::Degraded(DegradedReason::Gap) => "degraded: frames are missing",
+        TrackingState::Degraded(DegradedReason::Turning) => {
+            "degraded: known depth is out of view, the last view holds the rotation"
+        }
         TrackingState::Lost(LostReason::Diverged) => "lost: the keyframe is out of view",
         TrackingState::Lost(LostReason::TooFewInliers) => "lost: too few points match",
         TrackingState::Lost(LostReason::NoPoints) => "lost: the keyframe has no usable points",

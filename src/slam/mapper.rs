@@ -51,7 +51,7 @@ use crate::slam::mapper::reuse::ReuseParams;
 use crate::slam::mapper::situation::{Situation, StartFrame};
 use crate::slam::mapper::start::Start;
 use crate::slam::parameter::{ParameterError, check_range};
-use crate::slam::pose::{NO_KEYFRAME, PoseEstimate, TrackingState};
+use crate::slam::pose::{DegradedReason, NO_KEYFRAME, PoseEstimate, TrackingState};
 use crate::slam::two_frame::TwoFrameParams;
 use crate::slam::window::Window;
 use crate::slam::window::frames::TrackedFrame;
@@ -314,7 +314,13 @@ impl Mapper {
             return StepOutcome::default();
         }
         let is_usable = pose.world_from_camera.is_finite() && pose.keyframe_from_camera.is_finite();
-        if is_lost || !is_usable || keyframe.map_state == MapState::Rejected {
+        let is_turning = pose.state == TrackingState::Degraded(DegradedReason::Turning);
+        let is_trusted = is_usable && keyframe.map_state == MapState::Established;
+        if is_turning && is_trusted {
+            self.last_world_from_camera = Some(pose.world_from_camera);
+            self.last_tracked = Some((pose.keyframe_id, pose.keyframe_from_camera));
+        }
+        if is_lost || is_turning || !is_trusted {
             return self.recover(frame, pose, sensor_depth);
         }
         self.phase = Phase::Mapping;
@@ -371,7 +377,7 @@ impl Mapper {
                 ..Default::default()
             };
         }
-        if pose.proposes_keyframe && due {
+        if pose.proposes_keyframe && due && !self.leaves_depth_behind(frame, pose) {
             change_begins();
             let is_reused = self.reuse_keyframe(frame, pose);
             if !is_reused {

@@ -40,6 +40,8 @@ pub enum DegradedReason {
     HighResidual,
     /// Frames are missing between this one and the one before.
     Gap,
+    /// The known depth is out of view: the last view with a pose holds the rotation, and the translation as far as it is small.
+    Turning,
 }
 
 /// Why a pose is not claimed.

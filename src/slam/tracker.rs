@@ -3,6 +3,8 @@
 pub mod covariance_floor;
 pub mod motion;
 mod proposal;
+mod report;
+mod turning;
 pub mod verdict;
 
 use serde::{Deserialize, Serialize};
@@ -15,11 +17,10 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::image::sums::{SumPyramid, grey_per_sum};
 use crate::slam::keyframe::{DistanceWeights, MapState};
 use crate::slam::parameter::{ParameterError, check_range};
-use crate::slam::pose::{
-    Brightness, LostReason, NO_KEYFRAME, PoseEstimate, Quality, TrackingState, UNKNOWN_VARIANCE,
-};
-use crate::slam::tracker::covariance_floor::{CovarianceFloorParams, displacement_covariance};
+use crate::slam::pose::{Brightness, DegradedReason, LostReason, PoseEstimate, TrackingState};
+use crate::slam::tracker::covariance_floor::CovarianceFloorParams;
 use crate::slam::tracker::motion::{Motion, hypotheses, turned};
+use crate::slam::tracker::turning::{Turning, may_turn};
 use crate::slam::tracker::verdict::{VerdictParams, fits_better, is_better, quality_of};
 
 /// Tuning of the tracker.
@@ -43,6 +44,9 @@ pub struct TrackerParams {
     /// Rotation about each axis of the views near the keyframe's own that a lost tracker tries,
     /// degrees: as far as a coarse alignment reaches, so that the views join.
     pub recovery_rotation_deg: f64,
+    /// Standard deviation of the translation, in mean depths, up to which a pose is claimed where the known depth is out of
+    /// view and the last view with a pose holds the camera; 0 claims none. Beyond it only the rotation is known.
+    pub max_turning_deviation: f64,
     /// Standard deviation of the coarsest level, grey levels, below which a frame has no
     /// contrast: covered lens, overexposure, a white wall.
     pub min_contrast: f64,
@@ -65,6 +69,7 @@ impl Default for TrackerParams {
             poor_fit_ratio: 1.5,
             hypothesis_rotation_deg: 3.0,
             recovery_rotation_deg: 6.0,
+            max_turning_deviation: 1.0,
             min_contrast: 2.0,
             keyframe_distance_weight: DistanceWeights::default().translation,
             keyframe_usage_weight: DistanceWeights::default().usage,
@@ -91,6 +96,7 @@ impl TrackerParams {
         check_range("poor_fit_ratio", self.poor_fit_ratio, 1.0..=100.0)?;
         check_range("hypothesis_rotation_deg", self.hypothesis_rotation_deg, 0.0..=45.0)?;
         check_range("recovery_rotation_deg", self.recovery_rotation_deg, 0.0..=45.0)?;
+        check_range("max_turning_deviation", self.max_turning_deviation, 0.0..=10.0)?;
         check_range("min_contrast", self.min_contrast, 0.0..=255.0)?;
         check_range("keyframe_distance_weight", self.keyframe_distance_weight, 0.0..=1e3)?;
         check_range("keyframe_usage_weight", self.keyframe_usage_weight, 0.0..=1e3)?;
@@ -107,6 +113,7 @@ pub struct Tracker {
     reference: Option<Box<Reference>>,
     pyramid: SumPyramid,
     memory: Memory,
+    turning: Turning,
 }
 
 /// What a tracker remembers from frame to frame.
@@ -115,7 +122,10 @@ pub struct Memory {
     motion: Motion,
     brightness: Brightness,
     last_sequence: Option<u64>,
+    /// Whether the frame before was not tracked on a keyframe.
     was_lost: bool,
+    /// That of the last pose that was claimed, and keyframe_id.
+    covariance: [f64; 21],
     coarse_fit: Option<f64>,
 }
 
@@ -126,11 +136,17 @@ impl Tracker {
         let Intrinsics { width, height, .. } = intrinsics;
         let levels = num_levels(width, height);
         let finest = finest_level(levels, &params.reference);
+        let pyramid = SumPyramid::with_size(width, height, levels, finest);
         Ok(Self {
             intrinsics,
             aligner: Aligner::new(params.alignment.clone()),
             reference: None,
-            pyramid: SumPyramid::with_size(width, height, levels, finest),
+            turning: Turning::new(
+                Reference::new(params.reference.clone()),
+                &pyramid,
+                &params.alignment,
+            ),
+            pyramid,
             memory: Memory::default(),
             params,
         })
@@ -147,9 +163,12 @@ impl Tracker {
             if old.epoch() < new.epoch() && old.keyframe_id() != new.keyframe_id() {
                 self.memory.motion = Motion::default();
                 self.memory.was_lost = false;
+                self.turning.end();
             }
             if old.keyframe_id() == new.keyframe_id() {
-                self.memory.motion.follow(old.world_from_keyframe(), new.world_from_keyframe());
+                let (before, after) = (old.world_from_keyframe(), new.world_from_keyframe());
+                self.memory.motion.follow(before, after);
+                self.turning.follow(before, after);
             } else {
                 self.memory.brightness = Brightness::default();
                 self.memory.coarse_fit = None;
@@ -180,6 +199,7 @@ impl Tracker {
     pub fn reset(&mut self) {
         self.reference = None;
         self.memory = Memory::default();
+        self.turning.end();
     }
 
     /// Tracks one frame. `budget` is asked before each iteration with the pyramid level it would
@@ -189,22 +209,38 @@ impl Tracker {
         frame: &FrameView<'_>,
         budget: &mut dyn FnMut(usize) -> bool,
     ) -> PoseEstimate {
+        let before = self.memory.clone();
         let missing = self.count_missing(frame.sequence);
         let Some(reference) = self.reference.take() else {
             return self.unclaimed(frame, None, TrackingState::Initializing);
         };
         let estimate = match self.refusal(&reference, frame) {
-            Some(reason) => self.unclaimed(frame, Some(&reference), TrackingState::Lost(reason)),
+            Some(reason) => {
+                self.turning.end();
+                self.unclaimed(frame, Some(&reference), TrackingState::Lost(reason))
+            }
             None => {
                 let (alignment, coarse_fit) = self.align(&reference, frame, budget);
                 let estimate = self.report(&reference, frame, &alignment, missing);
                 // A bar set by a frame that was lost, or cut short, would let the next one pass.
                 let is_lost = matches!(estimate.state, TrackingState::Lost(_));
                 self.memory.coarse_fit = coarse_fit.filter(|_| !is_lost).or(self.memory.coarse_fit);
-                estimate
+                let is_trusted = reference.map_state() == MapState::Established;
+                let held = match is_trusted && may_turn(estimate.state) {
+                    true => self.turn(&reference, frame, &before, budget),
+                    false => None,
+                };
+                if held.is_none() {
+                    self.turning.end();
+                }
+                held.unwrap_or(estimate)
             }
         };
-        self.memory.was_lost = matches!(estimate.state, TrackingState::Lost(_));
+        self.memory.was_lost = matches!(
+            estimate.state,
+            TrackingState::Lost(_) | TrackingState::Degraded(DegradedReason::Turning)
+        );
+        self.memory.covariance = estimate.covariance;
         self.reference = Some(reference);
         estimate
     }
@@ -223,8 +259,10 @@ impl Tracker {
         budget: &mut dyn FnMut(usize) -> bool,
     ) -> PoseEstimate {
         let own = std::mem::replace(&mut self.memory, memory.clone());
+        let turning = self.turning.pause();
         let estimate = self.track(frame, budget);
         self.memory = own;
+        self.turning.resume(turning, &mut self.pyramid);
         estimate
     }
 
@@ -244,6 +282,7 @@ impl Tracker {
         if *reference.intrinsics() != self.intrinsics {
             return Some(LostReason::NoPoints);
         }
+        self.turning.keep(&mut self.pyramid, frame.sequence);
         self.pyramid.fill(frame.pixels);
         let flat = contrast(&self.pyramid) < self.params.min_contrast;
         flat.then_some(LostReason::UnusableFrame)
@@ -272,6 +311,9 @@ impl Tracker {
             let mut explained = explain(&best);
             // A small gain explains any image, and would hide the pose that may be claimed.
             let may_be = |of: &Alignment| !self.memory.was_lost || self.params.verdict.is_near(of);
+            // A view of little contrast has inliers anywhere.
+            let is_view = reference.translation_information() > 0.0;
+            let is_better = if is_view { fits_better } else { is_better };
             for hypothesis in hypotheses(&self.memory.motion, nanos, rotation).chain(at_keyframe) {
                 let other = self.align_coarsest(reference, &hypothesis, budget);
                 let by_other = explain(&other);
@@ -342,137 +384,12 @@ impl Tracker {
             || quality.inlier_ratio < self.params.verdict.lost_inliers
             || quality.in_view_ratio < self.params.verdict.degraded_in_view
     }
-
-    /// Judges the alignment and puts the estimate together.
-    fn report(
-        &mut self,
-        reference: &Reference,
-        frame: &FrameView<'_>,
-        alignment: &Alignment,
-        missing: u64,
-    ) -> PoseEstimate {
-        let quality = Quality {
-            displacement_px: self.params.covariance_floor.displacement_px(
-                &alignment.scatter.misfit,
-                alignment.state.sums.mean_energy(),
-                &self.intrinsics,
-            ),
-            ..quality_of(alignment)
-        };
-        let verdict = self.params.verdict.judge(alignment, &quality, self.memory.was_lost, missing);
-        let covariance = alignment.covariance(&self.params.alignment);
-        let keyframe_from_camera = alignment.state.current_from_keyframe.inverse();
-        let world_from_camera = reference.world_from_keyframe().place(&keyframe_from_camera);
-        let map_from_camera = reference.map_from_keyframe().place(&keyframe_from_camera);
-        let covariance = match (verdict, covariance) {
-            (TrackingState::Lost(reason), _) => {
-                return self.lost(frame, reference, reason, quality);
-            }
-            (_, Some(covariance))
-                if world_from_camera.is_finite() && map_from_camera.is_finite() =>
-            {
-                covariance
-            }
-            _ => return self.lost(frame, reference, LostReason::TooFewInliers, quality),
-        };
-        let published = covariance
-            + alignment.covariance_from_modes(reference).unwrap_or_default()
-            + displacement_covariance(
-                quality.displacement_px,
-                &self.intrinsics,
-                reference.mean_inverse_depth(),
-            );
-        let in_map = reference.uncertain_place().of_camera(&keyframe_from_camera, &published);
-        self.memory.motion.observe(frame.capture_nanos, &world_from_camera);
-        self.memory.brightness = alignment.state.brightness;
-        let state = match reference.map_state() {
-            MapState::Established => verdict,
-            MapState::Rejected => TrackingState::Lost(LostReason::MapRejected),
-        };
-        PoseEstimate {
-            state,
-            world_from_camera,
-            map_from_camera,
-            keyframe_from_camera,
-            covariance: upper_triangle(|row, column| published[(row, column)]),
-            map_covariance: upper_triangle(|row, column| in_map[(row, column)]),
-            alignment_covariance: upper_triangle(|row, column| covariance[(row, column)]),
-            brightness: alignment.state.brightness,
-            proposes_keyframe: self.proposes_keyframe(reference, alignment, &quality),
-            quality,
-            ..self.unclaimed(frame, Some(reference), state)
-        }
-    }
-
-    /// The estimate of a frame that could not be aligned: the last pose again, not claimed.
-    fn lost(
-        &mut self,
-        frame: &FrameView<'_>,
-        reference: &Reference,
-        reason: LostReason,
-        quality: Quality,
-    ) -> PoseEstimate {
-        self.memory.motion.stop();
-        self.memory.brightness = Brightness::default();
-        let quality = if is_finite(&quality) { quality } else { Quality::default() };
-        PoseEstimate {
-            quality,
-            ..self.unclaimed(frame, Some(reference), TrackingState::Lost(reason))
-        }
-    }
-
-    /// An estimate that claims nothing and repeats the last pose.
-    fn unclaimed(
-        &self,
-        frame: &FrameView<'_>,
-        reference: Option<&Reference>,
-        state: TrackingState,
-    ) -> PoseEstimate {
-        let world_from_camera = self.memory.motion.last().unwrap_or_else(SE3::identity);
-        let located = reference
-            .map(|reference| reference.world_from_keyframe().locate(&world_from_camera))
-            // Beyond all numbers where the keyframe's unit is absurdly small.
-            .filter(SE3::is_finite);
-        let keyframe_from_camera = located.unwrap_or_else(SE3::identity);
-        let placed = reference
-            .map(|reference| reference.map_from_keyframe().place(&keyframe_from_camera))
-            .filter(SE3::is_finite);
-        let unknown = upper_triangle(|row, column| match row == column {
-            true => UNKNOWN_VARIANCE,
-            false => 0.0,
-        });
-        PoseEstimate {
-            sequence: frame.sequence,
-            capture_nanos: frame.capture_nanos,
-            epoch: reference.map_or(0, Reference::epoch),
-            revision: reference.map_or(0, Reference::revision),
-            keyframe_id: reference.map_or(NO_KEYFRAME, Reference::keyframe_id),
-            state,
-            map_revision: reference.map_or(0, Reference::map_revision),
-            world_from_camera,
-            map_from_camera: placed.unwrap_or(world_from_camera),
-            keyframe_from_camera,
-            covariance: unknown,
-            map_covariance: unknown,
-            alignment_covariance: unknown,
-            brightness: Brightness::default(),
-            quality: Quality::default(),
-            proposes_keyframe: false,
-        }
-    }
 }
 
 /// The upper triangle of a 6×6 matrix, row by row.
 pub(in crate::slam) fn upper_triangle(entry: impl Fn(usize, usize) -> f64) -> [f64; 21] {
     let mut entries = (0..6).flat_map(|row| (row..6).map(move |column| (row, column)));
     std::array::from_fn(|_| entries.next().map_or(0.0, |(row, column)| entry(row, column)))
-}
-
-fn is_finite(quality: &Quality) -> bool {
-    [quality.whitened_rmse, quality.residual_rmse, quality.mean_squared_flow]
-        .iter()
-        .chain(&[quality.displacement_px])
-        .all(|figure| figure.is_finite())
 }
 
 /// Standard deviation of the coarsest level, grey levels.

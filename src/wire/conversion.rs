@@ -159,6 +159,7 @@ pub fn codes_from_state(state: TrackingState) -> (u32, u32) {
                 DegradedReason::LowOverlap => 1,
                 DegradedReason::HighResidual => 2,
                 DegradedReason::Gap => 3,
+                DegradedReason::Turning => 4,
             },
         ),
         TrackingState::Lost(reason) => (
@@ -183,6 +184,7 @@ pub fn state_from_codes(state: u32, reason: u32) -> Result<TrackingState, Messag
         (2, 1) => TrackingState::Degraded(DegradedReason::LowOverlap),
         (2, 2) => TrackingState::Degraded(DegradedReason::HighResidual),
         (2, 3) => TrackingState::Degraded(DegradedReason::Gap),
+        (2, 4) => TrackingState::Degraded(DegradedReason::Turning),
         (3, 0) => TrackingState::Lost(LostReason::Diverged),
         (3, 1) => TrackingState::Lost(LostReason::TooFewInliers),
         (3, 2) => TrackingState::Lost(LostReason::NoPoints),

@@ -219,6 +219,12 @@ impl Aligner {
             variance_translation,
         );
         let mut sums = self.kernel.accumulate(reference.level(level), frame.level(level), &at);
+        let of_translation = reference.translation_information();
+        if of_translation > 0.0 {
+            for axis in 0..3 {
+                sums.add_prior(axis, current_from_keyframe.translation[axis], 0.0, of_translation);
+            }
+        }
         if self.params.estimate_brightness {
             let information = |std_dev: f64| 1.0 / (std_dev * std_dev);
             sums.add_prior(6, brightness.a, 0.0, information(self.params.gain_prior_std_dev));

@@ -21,4 +21,5 @@ pub mod selection;
 pub mod surroundings;
 #[cfg(test)]
 mod tests;
+pub mod unknown_depth;
 pub mod weights;

@@ -10,7 +10,7 @@ use crate::slam::alignment::surroundings::Surroundings;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::sums::{MAX_LEVELS, SumPyramid, grey_per_sum};
-use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
 use crate::slam::modes::ModeCovariance;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::place_covariance::{PlaceCovariance, UncertainPlace};
@@ -83,6 +83,7 @@ pub struct Reference {
     mean_inverse_depth: f64,
     mean_grey: f64,
     mode_covariance: ModeCovariance,
+    translation_information: f64,
     finest_level: usize,
     levels: Vec<LevelPoints>,
     pyramid: SumPyramid,
@@ -110,6 +111,7 @@ impl Reference {
             mean_inverse_depth: 1.0,
             mean_grey: 0.0,
             mode_covariance: ModeCovariance::ZERO,
+            translation_information: 0.0,
             levels: vec![LevelPoints::default(); MAX_LEVELS],
             pyramid: SumPyramid::default(),
             fusion: DepthFusion::default(),
@@ -144,6 +146,7 @@ impl Reference {
         self.mean_inverse_depth = 1.0;
         self.mean_grey = 0.0;
         self.mode_covariance = keyframe.mode_covariance;
+        self.translation_information = 0.0;
         self.levels.iter_mut().for_each(LevelPoints::clear);
         let Intrinsics { width, height, .. } = keyframe.intrinsics;
         let usable =
@@ -158,9 +161,57 @@ impl Reference {
             self.pyramid = SumPyramid::with_size(width, height, levels, finest);
         }
         self.pyramid.fill(&keyframe.image);
-        let greys: f64 = keyframe.points.iter().map(|point| f64::from(point.intensity)).sum();
-        self.mean_grey = greys / keyframe.points.len().max(1) as f64;
-        self.fusion.fuse(&keyframe.points, width, height, levels, finest);
+        self.pack(&keyframe.points);
+    }
+
+    /// Prepares a view with these points, which stands where frames are measured from, in the memory of this reference. Its
+    /// pyramid, which has the levels of this camera, is taken over; the one before is left in its place.
+    pub(super) fn prepare_view(
+        &mut self,
+        intrinsics: &Intrinsics,
+        pyramid: &mut SumPyramid,
+        points: &[DepthPoint],
+        mode_covariance: ModeCovariance,
+    ) {
+        self.keyframe_id = NO_KEYFRAME;
+        self.map_state = MapState::Established;
+        self.world_from_keyframe = Sim3::identity();
+        self.map_from_keyframe = Sim3::identity();
+        self.place_covariance = PlaceCovariance::ZERO;
+        self.intrinsics = *intrinsics;
+        self.mean_inverse_depth = 1.0;
+        self.mode_covariance = mode_covariance;
+        self.levels.iter_mut().for_each(LevelPoints::clear);
+        self.finest_level = pyramid.finest_level();
+        let Intrinsics { width, height, .. } = *intrinsics;
+        let (levels, finest) = (pyramid.num_levels(), pyramid.finest_level());
+        if !self.pyramid.has_size(width, height, levels, finest) {
+            self.pyramid = SumPyramid::with_size(width, height, levels, finest);
+        }
+        std::mem::swap(&mut self.pyramid, pyramid);
+        self.pack(points);
+    }
+
+    /// Places the view in world and map, with how far from it frames are expected, a standard deviation in its units.
+    pub fn stand_at(&mut self, world_from_view: &Sim3, expected_distance: f64) {
+        self.world_from_keyframe = *world_from_view;
+        self.map_from_keyframe = *world_from_view;
+        self.translation_information = 1.0 / (expected_distance * expected_distance);
+    }
+
+    /// Information of the prior that frames are where the keyframe is, about each axis, 1/keyframe units²; 0 for a
+    /// keyframe with depth.
+    pub fn translation_information(&self) -> f64 {
+        self.translation_information
+    }
+
+    /// Fuses points of the image in the pyramid and packs those of every level.
+    fn pack(&mut self, points: &[DepthPoint]) {
+        let greys: f64 = points.iter().map(|point| f64::from(point.intensity)).sum();
+        self.mean_grey = greys / points.len().max(1) as f64;
+        let Intrinsics { width, height, .. } = self.intrinsics;
+        let (levels, finest) = (self.pyramid.num_levels(), self.finest_level);
+        self.fusion.fuse(points, width, height, levels, finest);
         self.mean_inverse_depth = self.fusion.mean_inverse_depth().unwrap_or(1.0);
         for level in finest..levels {
             self.pack_level(level);

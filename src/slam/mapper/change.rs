@@ -83,6 +83,40 @@ impl Mapper {
         self.add_keyframe(frame, &place, epoch);
     }
 
+    /// Whether a keyframe made of `frame` would have next to none of the depth: the camera has turned away from it. Frames
+    /// are tracked on the keyframe at hand then as long as they see it.
+    pub(super) fn leaves_depth_behind(
+        &mut self,
+        frame: &FrameView<'_>,
+        pose: &PoseEstimate,
+    ) -> bool {
+        /// Points with which a keyframe can be tracked on: those that a start needs.
+        const FEWEST: usize = 200;
+        /// So many of the keyframe's points in view make looking closer unnecessary.
+        const ENOUGH_IN_VIEW: f64 = 4000.0;
+        let is_exact = pose.alignment_covariance.iter().all(|entry| *entry == 0.0);
+        let known = self.depth.active.num_hypotheses();
+        let in_view = pose.quality.in_view_ratio * known as f64;
+        if is_exact || known < FEWEST || in_view >= ENOUGH_IN_VIEW {
+            return false;
+        }
+        let frame_from_before = in_unit(&pose.keyframe_from_camera, self.depth.unit);
+        let (min_gradient, most) = (self.params.min_gradient, self.params.max_candidates);
+        self.depth.swap();
+        self.depth.active.restart(frame.pixels, min_gradient, most);
+        propagate(
+            &self.depth.spare,
+            &mut self.depth.active,
+            &self.intrinsics,
+            &frame_from_before,
+            pose.brightness,
+            &self.params.propagation,
+        );
+        let carried = self.depth.active.num_hypotheses();
+        self.depth.swap();
+        carried < FEWEST.max((self.params.consistency.min_kept_ratio * known as f64) as usize)
+    }
+
     /// The active depth on the pixels of a frame that stands at `keyframe_from_camera`; the depth before is the
     /// spare one then.
     fn carry_over(&mut self, pixels: &[u8], keyframe_from_camera: &SE3, brightness: Brightness) {

@@ -65,7 +65,9 @@ impl Mapper {
         sensor_depth: Option<&Image<f32>>,
     ) -> StepOutcome {
         let mut loss = self.phase.loss();
-        let lost_secs = loss.lasted_secs(frame.capture_nanos);
+        // A view that holds the camera is no loss, and nothing to begin another map with.
+        let is_held = pose.state.is_tracked() && !matches!(self.phase, Phase::Rejected(..));
+        let lost_secs = if is_held { 0.0 } else { loss.lasted_secs(frame.capture_nanos) };
         if let Some(active) = self.active {
             let (keyframes, params) = (&self.map.keyframes, &self.params.recovery);
             let searched = &mut loss.searched;
@@ -88,6 +90,9 @@ impl Mapper {
             }
         }
         self.phase = self.phase.with_loss(loss);
+        if is_held {
+            return StepOutcome::default();
+        }
         let is_restarting = matches!(self.phase, Phase::Restarting(_));
         // Of a wrong start there is nothing to be found again.
         let is_wrong = matches!(self.phase, Phase::Rejected(Contradiction::WrongStart, _));

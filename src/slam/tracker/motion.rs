@@ -62,6 +62,11 @@ impl Motion {
         self.last.map(|last| last.world_from_camera)
     }
 
+    /// The same with its stamp, nanoseconds.
+    pub fn last_seen(&self) -> Option<(i64, SE3)> {
+        self.last.map(|last| (last.nanos, last.world_from_camera))
+    }
+
     /// The pose at `nanos` if the camera moved on with `factor` of its velocity; `None` before
     /// the first pose.
     pub fn predict(&self, nanos: i64, factor: f64) -> Option<SE3> {

@@ -1,0 +1,158 @@
+//! What is said of a frame: judged, with its covariance, or not claimed.
+
+use crate::slam::alignment::align::Alignment;
+use crate::slam::alignment::reference::Reference;
+use crate::slam::frame::FrameView;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::keyframe::MapState;
+use crate::slam::pose::{
+    Brightness, LostReason, NO_KEYFRAME, PoseEstimate, Quality, TrackingState, UNKNOWN_VARIANCE,
+};
+use crate::slam::tracker::covariance_floor::displacement_covariance;
+use crate::slam::tracker::verdict::quality_of;
+use crate::slam::tracker::{Tracker, upper_triangle};
+
+impl Tracker {
+    /// Judges the alignment and puts the estimate together.
+    pub(super) fn report(
+        &mut self,
+        reference: &Reference,
+        frame: &FrameView<'_>,
+        alignment: &Alignment,
+        missing: u64,
+    ) -> PoseEstimate {
+        let quality = Quality {
+            displacement_px: self.params.covariance_floor.displacement_px(
+                &alignment.scatter.misfit,
+                alignment.state.sums.mean_energy(),
+                &self.intrinsics,
+            ),
+            ..quality_of(alignment)
+        };
+        let found =
+            reference.world_from_keyframe().place(&alignment.state.current_from_keyframe.inverse());
+        let has_jumped = missing == 0 && self.has_jumped(reference, frame.capture_nanos, &found);
+        let must_be_sure = self.memory.was_lost || has_jumped;
+        let verdict = self.params.verdict.judge(alignment, &quality, must_be_sure, missing);
+        let covariance = alignment.covariance(&self.params.alignment);
+        let keyframe_from_camera = alignment.state.current_from_keyframe.inverse();
+        let world_from_camera = reference.world_from_keyframe().place(&keyframe_from_camera);
+        let map_from_camera = reference.map_from_keyframe().place(&keyframe_from_camera);
+        let covariance = match (verdict, covariance) {
+            (TrackingState::Lost(reason), _) => {
+                return self.lost(frame, reference, reason, quality);
+            }
+            (_, Some(covariance))
+                if world_from_camera.is_finite() && map_from_camera.is_finite() =>
+            {
+                covariance
+            }
+            _ => return self.lost(frame, reference, LostReason::TooFewInliers, quality),
+        };
+        let published = covariance
+            + alignment.covariance_from_modes(reference).unwrap_or_default()
+            + displacement_covariance(
+                quality.displacement_px,
+                &self.intrinsics,
+                reference.mean_inverse_depth(),
+            );
+        let in_map = reference.uncertain_place().of_camera(&keyframe_from_camera, &published);
+        self.memory.motion.observe(frame.capture_nanos, &world_from_camera);
+        self.memory.brightness = alignment.state.brightness;
+        let state = match reference.map_state() {
+            MapState::Established => verdict,
+            MapState::Rejected => TrackingState::Lost(LostReason::MapRejected),
+        };
+        PoseEstimate {
+            state,
+            world_from_camera,
+            map_from_camera,
+            keyframe_from_camera,
+            covariance: upper_triangle(|row, column| published[(row, column)]),
+            map_covariance: upper_triangle(|row, column| in_map[(row, column)]),
+            alignment_covariance: upper_triangle(|row, column| covariance[(row, column)]),
+            brightness: alignment.state.brightness,
+            proposes_keyframe: self.proposes_keyframe(reference, alignment, &quality),
+            quality,
+            ..self.unclaimed(frame, Some(reference), state)
+        }
+    }
+
+    /// Whether a camera would be elsewhere than an even motion takes it by more than hands or wheels do: what is found
+    /// there must be as sure as after a loss. The last points at the edge of a view fit nearly anything.
+    fn has_jumped(&self, reference: &Reference, nanos: i64, world_from_camera: &SE3) -> bool {
+        /// Largest change of the rotation from one frame to the next, radians: 9°.
+        const MOST_ROTATION_RAD: f64 = 0.15;
+        /// The same of the translation, in mean depths.
+        const MOST_TRANSLATION: f64 = 0.15;
+        let Some(predicted) = self.memory.motion.predict(nanos, 1.0) else { return false };
+        let off = predicted.inverse() * *world_from_camera;
+        let mean_depth = reference.world_from_keyframe().scale / reference.mean_inverse_depth();
+        off.rotation.angle() > MOST_ROTATION_RAD
+            || off.translation.norm() > MOST_TRANSLATION * mean_depth
+    }
+
+    /// The estimate of a frame that could not be aligned: the last pose again, not claimed.
+    pub(super) fn lost(
+        &mut self,
+        frame: &FrameView<'_>,
+        reference: &Reference,
+        reason: LostReason,
+        quality: Quality,
+    ) -> PoseEstimate {
+        self.memory.motion.stop();
+        self.memory.brightness = Brightness::default();
+        let quality = if is_finite(&quality) { quality } else { Quality::default() };
+        PoseEstimate {
+            quality,
+            ..self.unclaimed(frame, Some(reference), TrackingState::Lost(reason))
+        }
+    }
+
+    /// An estimate that claims nothing and repeats the last pose.
+    pub(super) fn unclaimed(
+        &self,
+        frame: &FrameView<'_>,
+        reference: Option<&Reference>,
+        state: TrackingState,
+    ) -> PoseEstimate {
+        let world_from_camera = self.memory.motion.last().unwrap_or_else(SE3::identity);
+        let located = reference
+            .map(|reference| reference.world_from_keyframe().locate(&world_from_camera))
+            // Beyond all numbers where the keyframe's unit is absurdly small.
+            .filter(SE3::is_finite);
+        let keyframe_from_camera = located.unwrap_or_else(SE3::identity);
+        let placed = reference
+            .map(|reference| reference.map_from_keyframe().place(&keyframe_from_camera))
+            .filter(SE3::is_finite);
+        let unknown = upper_triangle(|row, column| match row == column {
+            true => UNKNOWN_VARIANCE,
+            false => 0.0,
+        });
+        PoseEstimate {
+            sequence: frame.sequence,
+            capture_nanos: frame.capture_nanos,
+            epoch: reference.map_or(0, Reference::epoch),
+            revision: reference.map_or(0, Reference::revision),
+            keyframe_id: reference.map_or(NO_KEYFRAME, Reference::keyframe_id),
+            state,
+            map_revision: reference.map_or(0, Reference::map_revision),
+            world_from_camera,
+            map_from_camera: placed.unwrap_or(world_from_camera),
+            keyframe_from_camera,
+            covariance: unknown,
+            map_covariance: unknown,
+            alignment_covariance: unknown,
+            brightness: Brightness::default(),
+            quality: Quality::default(),
+            proposes_keyframe: false,
+        }
+    }
+}
+
+fn is_finite(quality: &Quality) -> bool {
+    [quality.whitened_rmse, quality.residual_rmse, quality.mean_squared_flow]
+        .iter()
+        .chain(&[quality.displacement_px])
+        .all(|figure| figure.is_finite())
+}

@@ -1,0 +1,336 @@
+//! Holds the pose where the known depth is out of view: frames are aligned to the last view that had a pose, all of
+//! whose pixels take part with a depth that is not known.
+//!
+//! That holds the rotation, and the translation as far as it is small; each view that takes over adds its
+//! uncertainty, and no depth is learnt meanwhile. It ends where a keyframe fits again, or where the translation is no
+//! longer known.
+
+use nalgebra::{Matrix3, Matrix6};
+
+use crate::slam::alignment::align::{Aligner, Alignment, AlignmentParams};
+use crate::slam::alignment::reference::Reference;
+use crate::slam::alignment::unknown_depth::UnknownDepth;
+use crate::slam::depth::common_error::full_covariance;
+use crate::slam::frame::FrameView;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::geometry::sim3::Sim3;
+use crate::slam::image::sums::SumPyramid;
+use crate::slam::pose::{
+    Brightness, DegradedReason, LostReason, PoseEstimate, Quality, TrackingState,
+};
+use crate::slam::tracker::covariance_floor::displacement_covariance;
+use crate::slam::tracker::verdict::quality_of;
+use crate::slam::tracker::{Memory, Tracker, upper_triangle};
+
+/// Standard deviation of the mean depth of what is seen, as a share of the keyframe's: half or twice as far.
+const MEAN_DEPTH_STD_DEV: f64 = 0.7;
+
+/// Change of the exposure since the view: of the logarithm of the gain, and of the offset in grey levels. Some frames
+/// pass at most; more freedom flattens a view of little contrast until it fits anything.
+const GAIN_STD_DEV: f64 = 0.05;
+const OFFSET_STD_DEV: f64 = 5.0;
+
+/// Points of the view that a frame must show, at the finest level.
+const FEWEST_POINTS: u32 = 500;
+
+/// Largest standard deviation of the rotation from the view, radians: 3°, as far as the next alignment reaches.
+const MOST_ROTATION_STD_DEV: f64 = 0.05;
+
+/// Largest logarithm of the gain, either way, with which a frame is held: a blurred frame has that much less contrast
+/// than a sharp one.
+const MOST_GAIN: f64 = 0.7;
+
+/// Largest change of the rotation from one frame to the next, radians, once it is held: 9° from one frame to the next at 30 Hz are an angular
+/// acceleration that hands do not reach.
+const MOST_CHANGE_RAD: f64 = 0.15;
+
+/// Share of the points compared that the rotation must explain by the image's noise alone.
+const LEAST_INLIERS: f64 = 0.8;
+
+/// Speed of a hand-held camera, mean depths a second: a standard deviation. So far from the view frames are expected;
+/// what a turning camera shows hardly tells a translation from a rotation.
+const SPEED: f64 = 0.3;
+/// The alignment holds frames to half of that: a translation that is free takes what is not understood, and with
+/// the variance that comes with it explains any image.
+const TIGHTNESS: f64 = 0.5;
+/// Time since the view that this is applied to: of the fastest camera, and as long as the camera may drift anywhere.
+const LEAST_SECONDS: f64 = 0.001;
+const MOST_SECONDS: f64 = 1.0;
+
+/// The view that frames are aligned to, and the frame before.
+#[derive(Debug)]
+pub(super) struct Turning {
+    unknown: UnknownDepth,
+    /// Expects about the same exposure.
+    aligner: Aligner,
+    /// Lent while a frame is aligned to it.
+    view: Option<Box<Reference>>,
+    place: Option<Place>,
+    /// Whether no frame has been held to it: the motion is that on the keyframe's last points.
+    is_first: bool,
+    /// How well the last one fitted on the coarsest level.
+    coarse_fit: Option<f64>,
+    /// The frame before, and its sequence.
+    before: SumPyramid,
+    before_sequence: Option<u64>,
+    filled_sequence: Option<u64>,
+}
+
+/// Where the view is.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Place {
+    /// In units of the mean depth.
+    world_from_view: Sim3,
+    /// Where the camera was when the known depth was last seen.
+    origin: SE3,
+    /// Time from the last keyframe's to the view, seconds.
+    since_secs: f64,
+    /// Stamp of the view.
+    nanos: i64,
+    /// Of the left increment of `view_from_keyframe`, in the same units.
+    covariance: Matrix6<f64>,
+}
+
+impl Turning {
+    /// With memory for frames like `pyramid`.
+    pub(super) fn new(view: Reference, pyramid: &SumPyramid, params: &AlignmentParams) -> Self {
+        let params = AlignmentParams {
+            gain_prior_std_dev: GAIN_STD_DEV,
+            offset_prior_std_dev: OFFSET_STD_DEV,
+            ..params.clone()
+        };
+        Self {
+            unknown: UnknownDepth::default(),
+            aligner: Aligner::new(params),
+            view: Some(Box::new(view)),
+            place: None,
+            is_first: true,
+            coarse_fit: None,
+            before: pyramid.clone(),
+            before_sequence: None,
+            filled_sequence: None,
+        }
+    }
+
+    /// Keeps the frame in `pyramid`, into which another will be filled.
+    pub(super) fn keep(&mut self, pyramid: &mut SumPyramid, sequence: u64) {
+        std::mem::swap(&mut self.before, pyramid);
+        self.before_sequence = self.filled_sequence.replace(sequence);
+    }
+
+    /// Before a frame is rehearsed: nothing is held meanwhile.
+    pub(super) fn pause(&mut self) -> (Option<Place>, [Option<u64>; 2]) {
+        let sequences = [self.before_sequence.take(), self.filled_sequence.take()];
+        (self.place.take(), sequences)
+    }
+
+    /// After it: `pyramid` was filled once more.
+    pub(super) fn resume(
+        &mut self,
+        (place, [before, filled]): (Option<Place>, [Option<u64>; 2]),
+        pyramid: &mut SumPyramid,
+    ) {
+        std::mem::swap(&mut self.before, pyramid);
+        self.place = place;
+        (self.before_sequence, self.filled_sequence) = (before, filled);
+    }
+
+    /// The keyframe fits again, or nothing does.
+    pub(super) fn end(&mut self) {
+        self.place = None;
+    }
+
+    /// The keyframe that poses are known from has been moved.
+    pub(super) fn follow(&mut self, before: &Sim3, after: &Sim3) {
+        if let Some(place) = self.place.as_mut().filter(|_| before != after) {
+            place.world_from_view = *after * before.inverse() * place.world_from_view;
+            place.origin = after.place(&before.locate(&place.origin));
+        }
+    }
+}
+
+impl Tracker {
+    /// Holds a frame that was lost on `reference` to the view before. `before` is what was remembered then.
+    pub(super) fn turn(
+        &mut self,
+        reference: &Reference,
+        frame: &FrameView<'_>,
+        before: &Memory,
+        budget: &mut dyn FnMut(usize) -> bool,
+    ) -> Option<PoseEstimate> {
+        let unit = reference.world_from_keyframe().scale / reference.mean_inverse_depth();
+        if self.turning.place.is_none() {
+            self.begin_turning(before, reference, unit)?;
+        }
+        let place = self.turning.place?;
+        let mut view = self.turning.view.take()?;
+        let lost = std::mem::replace(&mut self.memory, Memory { ..before.clone() });
+        (self.memory.brightness, self.memory.coarse_fit) =
+            (Brightness::default(), self.turning.coarse_fit);
+        // The motion on the keyframe's last points may be anything.
+        self.memory.was_lost = self.turning.is_first;
+        let step = frame.capture_nanos.saturating_sub(place.nanos) as f64 * 1e-9;
+        let step = step.clamp(LEAST_SECONDS, MOST_SECONDS);
+        view.stand_at(&place.world_from_view, TIGHTNESS * SPEED * step);
+        let since = place.since_secs;
+        let place = Place { since_secs: since + step, ..place };
+        // A camera that moves on evenly: its distance grows with the time, not with the root of it.
+        let distance_variance = SPEED * SPEED * (place.since_secs.powi(2) - since.powi(2));
+        std::mem::swap(&mut self.aligner, &mut self.turning.aligner);
+        let (alignment, coarse_fit) = self.align(&view, frame, budget);
+        std::mem::swap(&mut self.aligner, &mut self.turning.aligner);
+        let estimate = self.held(reference, &view, frame, &alignment, &place, distance_variance);
+        self.turning.view = Some(view);
+        let Some((estimate, covariance)) = estimate else {
+            self.memory = lost;
+            return None;
+        };
+        (self.turning.is_first, self.turning.coarse_fit) = (false, coarse_fit);
+        self.memory.motion.observe(frame.capture_nanos, &estimate.world_from_camera);
+        self.memory.brightness = Brightness::default();
+        self.memory.coarse_fit = before.coarse_fit;
+        // Frames that follow each other are blurred alike, and show nearly the same.
+        let world_from_view = Sim3::new(estimate.world_from_camera, place.world_from_view.scale);
+        let Self { turning, pyramid, intrinsics, .. } = self;
+        let view = turning.view.as_deref_mut()?;
+        turning.unknown.prepare(view, intrinsics, pyramid);
+        let nanos = frame.capture_nanos;
+        turning.place = Some(Place { world_from_view, nanos, covariance, ..place });
+        Some(estimate)
+    }
+
+    /// Takes the frame before for the view, where it had a pose.
+    fn begin_turning(&mut self, before: &Memory, reference: &Reference, unit: f64) -> Option<()> {
+        let Self { turning, intrinsics, .. } = self;
+        let is_before =
+            turning.before_sequence.is_some() && turning.before_sequence == before.last_sequence;
+        let (nanos, world_from_camera) =
+            before.motion.last_seen().filter(|_| is_before && !before.was_lost)?;
+        let mut covariance = full_covariance(&before.covariance);
+        scale_translation(&mut covariance, reference.mean_inverse_depth());
+        let world_from_view = Sim3::new(world_from_camera, unit);
+        let view = turning.view.as_deref_mut()?;
+        turning.unknown.prepare(view, intrinsics, &mut turning.before);
+        turning.before_sequence = None;
+        (turning.is_first, turning.coarse_fit) = (true, None);
+        turning.place = Some(Place {
+            world_from_view,
+            origin: world_from_camera,
+            since_secs: 0.0,
+            nanos,
+            covariance,
+        });
+        Some(())
+    }
+
+    /// The estimate of a frame that is aligned to the view, and the covariance in units of the mean depth; `None` where
+    /// it does not fit as well as after a loss, or its translation is not known any more.
+    fn held(
+        &self,
+        reference: &Reference,
+        view: &Reference,
+        frame: &FrameView<'_>,
+        alignment: &Alignment,
+        place: &Place,
+        distance_variance: f64,
+    ) -> Option<(PoseEstimate, Matrix6<f64>)> {
+        let quality = Quality {
+            displacement_px: self.params.covariance_floor.displacement_px(
+                &alignment.scatter.misfit,
+                alignment.state.sums.mean_energy(),
+                &self.intrinsics,
+            ),
+            ..quality_of(alignment)
+        };
+        let fits = self.params.verdict.judge(alignment, &quality, false, 0);
+        let is_seen = quality.points >= FEWEST_POINTS
+            && matches!(
+                fits,
+                TrackingState::Tracking | TrackingState::Degraded(DegradedReason::LowOverlap)
+            );
+        // By the image's noise alone: parallax that the uncertain depth would explain is no rotation.
+        let explained = self.aligner.explanation(view, &self.pyramid, alignment);
+        let inliers = f64::from(explained.inliers) / f64::from(explained.compared.max(1));
+        let is_even = alignment.state.brightness.a.abs() <= MOST_GAIN;
+        let predicted = self.memory.motion.predict(frame.capture_nanos, 1.0)?;
+        let expected = place.world_from_view.locate(&predicted).inverse();
+        let change = expected.rotation.angle_to(&alignment.state.current_from_keyframe.rotation);
+        let is_smooth = self.turning.is_first || change <= MOST_CHANGE_RAD;
+        if !is_smooth || !is_seen || inliers < LEAST_INLIERS || !is_even {
+            return None;
+        }
+        let current_from_view = alignment.state.current_from_keyframe;
+        let of_step = alignment.covariance(&self.params.alignment)?
+            + from_prior(alignment, view.translation_information(), distance_variance)?
+            + alignment.covariance_from_modes(view).unwrap_or_default()
+            + displacement_covariance(quality.displacement_px, &self.intrinsics, 1.0);
+        let of_rotation =
+            of_step.fixed_view::<3, 3>(3, 3).into_owned().symmetric_eigenvalues().max();
+        if !(of_rotation.sqrt() <= MOST_ROTATION_STD_DEV) {
+            return None;
+        }
+        let adjoint = current_from_view.adjoint();
+        let covariance = of_step + adjoint * place.covariance * adjoint.transpose();
+        let world_from_camera = place.world_from_view.place(&current_from_view.inverse());
+        // The mean depth of what is in view is not that of the keyframe, by one factor for the whole way.
+        let way = (world_from_camera.inverse() * place.origin).translation;
+        let way = way * (MEAN_DEPTH_STD_DEV / place.world_from_view.scale);
+        let mut published = covariance;
+        let mut translations = published.fixed_view_mut::<3, 3>(0, 0);
+        translations += way * way.transpose();
+        let translation: Matrix3<f64> = published.fixed_view::<3, 3>(0, 0).into_owned();
+        let deviation = translation.symmetric_eigenvalues().max().sqrt();
+        if !(deviation <= self.params.max_turning_deviation) {
+            return None;
+        }
+        let keyframe_from_camera = reference.world_from_keyframe().locate(&world_from_camera);
+        let map_from_camera = reference.map_from_keyframe().place(&keyframe_from_camera);
+        if !(world_from_camera.is_finite() && map_from_camera.is_finite()) {
+            return None;
+        }
+        scale_translation(&mut published, 1.0 / reference.mean_inverse_depth());
+        let in_map = reference.uncertain_place().of_camera(&keyframe_from_camera, &published);
+        let state = TrackingState::Degraded(DegradedReason::Turning);
+        let published = upper_triangle(|row, column| published[(row, column)]);
+        let estimate = PoseEstimate {
+            state,
+            world_from_camera,
+            map_from_camera,
+            keyframe_from_camera,
+            covariance: published,
+            map_covariance: upper_triangle(|row, column| in_map[(row, column)]),
+            alignment_covariance: published,
+            brightness: Brightness::default(),
+            quality,
+            proposes_keyframe: false,
+            ..self.unclaimed(frame, Some(reference), state)
+        };
+        Some((estimate, covariance))
+    }
+}
+
+/// What of a pose's covariance comes from where the camera has gone in truth while the prior held it at the view:
+/// M⁻¹ Λ Σ Λ M⁻¹, Λ the information of the prior.
+fn from_prior(alignment: &Alignment, information: f64, variance: f64) -> Option<Matrix6<f64>> {
+    let inverse = alignment.state.sums.information.cholesky()?.inverse();
+    let moved = inverse.fixed_view::<6, 3>(0, 0).into_owned() * information;
+    Some(moved * moved.transpose() * variance)
+}
+
+/// Whether a frame that was lost for this reason may be held to the view before.
+pub(super) fn may_turn(state: TrackingState) -> bool {
+    use LostReason::{Diverged, NoPoints, TooFewInliers};
+    matches!(state, TrackingState::Lost(Diverged | TooFewInliers | NoPoints))
+}
+
+/// Multiplies the translations by `factor`.
+fn scale_translation(covariance: &mut Matrix6<f64>, factor: f64) {
+    for k in 0..3 {
+        covariance.row_mut(k).scale_mut(factor);
+        covariance.column_mut(k).scale_mut(factor);
+    }
+}
+
+#[cfg(test)]
+#[path = "turning_tests.rs"]
+mod tests;

@@ -1,0 +1,97 @@
+//! A camera that pans on from the depth that is known, in the room of the tests.
+
+use nalgebra::Vector6;
+
+use crate::slam::alignment::reference::Reference;
+use crate::slam::depth::common_error::full_covariance;
+use crate::slam::frame::FrameView;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::geometry::sim3::Sim3;
+use crate::slam::keyframe::{DepthPoint, Keyframe};
+use crate::slam::pose::{DegradedReason, PoseEstimate, TrackingState};
+use crate::slam::test_scene::{CAMERA, Scene};
+use crate::slam::tracker::{Tracker, TrackerParams};
+
+const TURNING: TrackingState = TrackingState::Degraded(DegradedReason::Turning);
+
+/// A keyframe at the origin with exact depth.
+fn keyframe(scene: &Scene) -> Keyframe {
+    let view = scene.render(&CAMERA, &SE3::identity());
+    let pixels = (4..CAMERA.height - 4)
+        .step_by(2)
+        .flat_map(|v| (4..CAMERA.width - 4).step_by(2).map(move |u| (u, v)));
+    let points = pixels.map(|(u, v)| DepthPoint {
+        u: u as u16,
+        v: v as u16,
+        inverse_depth: view.inverse_depth.at(u, v),
+        variance: 1e-4,
+        intensity: view.intensity.at(u, v),
+    });
+    Keyframe::at(Sim3::identity(), CAMERA, points.collect(), view.noisy(2.0, 1))
+}
+
+/// Where a camera stands that pans by 2.5° a frame and is carried along by so many metres.
+fn panned(frame: u64, metres_a_frame: f64) -> SE3 {
+    let frames = frame as f64;
+    let angle = 2.5f64.to_radians() * frames;
+    let mut pose = SE3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, angle, 0.0));
+    pose.translation.x = metres_a_frame * frames;
+    pose
+}
+
+/// What is said of a pan of so many frames.
+fn pan(params: TrackerParams, frames: u64, metres_a_frame: f64) -> Vec<PoseEstimate> {
+    let scene = Scene::new(3);
+    let mut tracker = Tracker::new(CAMERA, params).unwrap();
+    tracker.adopt(Box::new(Reference::prepare(&keyframe(&scene))));
+    let say = |frame: u64| {
+        let pixels = scene.render(&CAMERA, &panned(frame, metres_a_frame)).noisy(2.0, 10 + frame);
+        let frame = FrameView::new(&CAMERA, frame, frame as i64 * 33_333_333, &pixels);
+        tracker.track(&frame, &mut |_| true)
+    };
+    (0..frames).map(say).collect()
+}
+
+#[test]
+fn a_pan_away_from_all_depth_is_held_with_a_covariance_that_is_honest() {
+    const FRAMES: u64 = 40;
+    for metres_a_frame in [0.0, 0.004] {
+        let said = pan(TrackerParams::default(), FRAMES, metres_a_frame);
+        let held = said.iter().filter(|estimate| estimate.state == TURNING).count();
+        assert!(held > 10, "{held} frames were held");
+        assert!(said.iter().all(|estimate| estimate.state.is_tracked()));
+        let mut worst = 0.0f64;
+        for (frame, estimate) in (0..).zip(&said).filter(|(_, of)| of.state == TURNING) {
+            let truth = panned(frame, metres_a_frame);
+            let error = (estimate.keyframe_from_camera.inverse() * truth).log();
+            let covariance = full_covariance(&estimate.covariance);
+            let nees = error.dot(&(covariance.try_inverse().unwrap() * error));
+            worst = worst.max(nees);
+            let rotation = error.fixed_rows::<3>(3).norm();
+            assert!(rotation < 0.06, "frame {frame}: {rotation}");
+            assert!(!estimate.proposes_keyframe);
+        }
+        // Of six degrees of freedom 99.9 % are below.
+        assert!(worst < 22.5, "{metres_a_frame}: {worst}");
+        let deviation = |of: &PoseEstimate| of.covariance[0].sqrt();
+        // Where there is no parallax the camera has not moved, and noise adds up; a way has the error of its depth.
+        let way = metres_a_frame * FRAMES as f64 / 4.0;
+        let least = f64::max(2.0 * deviation(&said[3]), 0.3 * way);
+        let last = deviation(said.last().unwrap());
+        assert!(last > least, "{metres_a_frame}: {last} of {least}");
+    }
+}
+
+#[test]
+fn nothing_is_held_where_that_is_switched_off_or_after_a_frame_that_was_lost() {
+    let off = TrackerParams { max_turning_deviation: 0.0, ..TrackerParams::default() };
+    let said = pan(off, 40, 0.0);
+    assert!(said.iter().all(|estimate| estimate.state != TURNING));
+    assert!(!said.last().unwrap().state.is_tracked());
+    // As far as the translation may be unknown, and no further.
+    let short = TrackerParams { max_turning_deviation: 0.003, ..TrackerParams::default() };
+    let said = pan(short, 40, 0.0);
+    let last_held = said.iter().rposition(|estimate| estimate.state == TURNING).unwrap();
+    assert!(said[last_held + 1..].iter().all(|estimate| !estimate.state.is_tracked()));
+    assert!(last_held < 39);
+}
