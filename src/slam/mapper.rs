@@ -5,6 +5,7 @@ mod change;
 pub mod consistency;
 mod correction;
 mod depth_buffers;
+mod doubt;
 mod finder;
 mod joint;
 mod maturing;
@@ -39,8 +40,9 @@ use crate::slam::image::quads::QuadImage;
 use crate::slam::keyframe::{Keyframe, MAX_KEYFRAME_POINTS, MapState};
 use crate::slam::map::Map;
 use crate::slam::mapper::change::Unfinished;
-use crate::slam::mapper::consistency::{ConsistencyParams, Contradiction, START_KEYFRAMES};
+use crate::slam::mapper::consistency::{ConsistencyParams, START_KEYFRAMES};
 use crate::slam::mapper::depth_buffers::DepthBuffers;
+use crate::slam::mapper::doubt::Doubt;
 use crate::slam::mapper::finder::Finder;
 use crate::slam::mapper::modes::{KeyframeModes, ModeParams, in_unit};
 use crate::slam::mapper::observation::DepthFilter;
@@ -225,6 +227,10 @@ pub struct Mapper {
     past: PastFrames,
     /// Keyframes that are estimated together; away while that is done.
     window: Option<Box<Window>>,
+    /// Whether anybody has asked for them.
+    is_estimated: bool,
+    /// Whether the map has contradicted itself.
+    doubt: Doubt,
     /// Frames that were tracked since it was given away.
     tracked: Vec<TrackedFrame>,
     /// Frames of a start that has not been proven.
@@ -266,6 +272,8 @@ impl Mapper {
             past: PastFrames::with_capacity(params.max_past_frames + 1),
             window: (params.window.num_free > 0)
                 .then(|| Box::new(Window::new(intrinsics, params.window.clone()))),
+            is_estimated: false,
+            doubt: Doubt::None,
             tracked: Vec::new(),
             early: Vec::new(),
             spare_pixels: Vec::new(),
@@ -356,26 +364,11 @@ impl Mapper {
         self.modes.observed(&self.depth.active, &in_unit(&pose.keyframe_from_camera, unit));
         self.depth.unpublished += observations.fused + observations.created;
         let points = self.num_points();
-        let is_first = self.num_epoch_keyframes() <= START_KEYFRAMES;
-        let params = &self.params.consistency;
         let Some(active) = &mut self.active else { return StepOutcome::default() };
         active.frames += 1;
         let due = active.frames >= self.params.min_keyframe_interval;
-        let mut contradiction = active.consistency.observe(&observations, points, params);
-        if is_first {
-            let displacement = pose.quality.displacement_px / self.intrinsics.width as f64;
-            let of_start = active.consistency.observe_start(&observations, displacement, params);
-            contradiction = of_start.or(contradiction);
-        }
-        if let Some(contradiction) = contradiction {
-            self.reject(contradiction);
-            let graph_changed = contradiction == Contradiction::WrongStart;
-            return StepOutcome {
-                keyframe_changed: true,
-                graph_changed,
-                observations,
-                ..Default::default()
-            };
+        if let Some(rejected) = self.judge_frame(&observations, pose) {
+            return rejected;
         }
         if pose.proposes_keyframe && due && !self.leaves_depth_behind(frame, pose) {
             change_begins();
@@ -445,7 +438,7 @@ impl Mapper {
         let (points, params) = (self.num_points(), &self.params.consistency);
         let Some(active) = &mut self.active else { return };
         if let Some(contradiction) = active.consistency.count_points(points, params) {
-            self.reject(contradiction);
+            self.contradict(contradiction);
         }
     }
 

@@ -159,8 +159,7 @@ impl Mapper {
         let depth_ratio = unfinished.depth_ratio / mean.unwrap_or(1.0);
         let params = &self.params.consistency;
         if let Some(contradiction) = judge_change(unfinished.known, known, depth_ratio, params) {
-            self.reject(contradiction);
-            keyframe_changed = true;
+            keyframe_changed |= self.contradict(contradiction);
         }
         StepOutcome { keyframe_changed, ..Default::default() }
     }

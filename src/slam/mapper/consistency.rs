@@ -142,6 +142,11 @@ impl Consistency {
         (self.failed_frames >= params.max_failed_frames).then_some(Contradiction::FailedSearches)
     }
 
+    /// Frames that failed did so on a map that has been estimated again since.
+    pub(super) fn forget_failures(&mut self) {
+        (self.failed_frames, self.refuted_frames) = (0, 0);
+    }
+
     /// Takes in how many points the keyframe has now.
     pub(super) fn count_points(
         &mut self,
@@ -165,9 +170,13 @@ pub(super) fn judge_change(
     if (after as f64) < params.min_kept_ratio * before as f64 {
         return Some(Contradiction::LostDepth);
     }
+    (!is_plausible_ratio(depth_ratio, params)).then_some(Contradiction::ScaleJump)
+}
+
+/// Whether mean depths of one keyframe and the next may have this ratio.
+pub(super) fn is_plausible_ratio(ratio: f64, params: &ConsistencyParams) -> bool {
     let bound = params.max_depth_ratio;
-    let is_plausible = depth_ratio <= bound && depth_ratio * bound >= 1.0;
-    (!is_plausible).then_some(Contradiction::ScaleJump)
+    ratio <= bound && ratio * bound >= 1.0
 }
 
 #[cfg(test)]

@@ -17,10 +17,15 @@ impl Mapper {
     /// can be refined: to be given back with [`Mapper::end_adjustment`] after [`Window::optimise`], which may take its time.
     pub fn begin_adjustment(&mut self, may_refine: bool) -> Option<Box<Window>> {
         let (mut window, is_new) = self.take_window()?;
+        self.is_estimated = true;
         let is_mapping = matches!(self.phase, Phase::Mapping);
         let active = self.keyframe().map(|keyframe| keyframe.keyframe_id);
+        let is_doubted = self.doubt.hand_over();
+        if is_doubted {
+            window.reconsider();
+        }
         let is_begun = match active {
-            _ if is_new => {
+            _ if is_new || is_doubted => {
                 window.take_frames(&mut self.tracked, &mut self.spare_pixels);
                 true
             }
@@ -84,7 +89,7 @@ impl Mapper {
             self.map.place_frame(&placed);
         }
         self.window = Some(window);
-        outcome.keyframe_changed |= finished.keyframe_changed;
+        outcome.keyframe_changed |= finished.keyframe_changed | self.settle_doubt();
         outcome
     }
 
@@ -202,6 +207,7 @@ impl Mapper {
         drop(window.take_placed());
         window.leave_unrefined();
         window.repeat_piece();
+        self.doubt.take_back();
         self.window = Some(window);
     }
 }

@@ -12,6 +12,7 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
 use crate::slam::mapper::consistency::{Contradiction, START_KEYFRAMES};
+use crate::slam::mapper::doubt::Doubt;
 use crate::slam::mapper::phase::{Loss, Phase};
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::parameter::{ParameterError, check_range};
@@ -144,6 +145,7 @@ impl Mapper {
     /// on them any more.
     pub(super) fn reject(&mut self, contradiction: Contradiction) {
         self.phase = Phase::Rejected(contradiction, Loss::default());
+        self.doubt = Doubt::None;
         self.revision += 1;
         let Some(active) = self.keyframe() else { return };
         let (id, epoch, revision) = (active.keyframe_id, active.epoch, self.revision);
@@ -174,6 +176,7 @@ impl Mapper {
         self.past.clear();
         self.drop_early_frames();
         self.phase = Phase::Mapping;
+        self.doubt = Doubt::None;
         self.enter_keyframe(index);
         StepOutcome { keyframe_restored: true, keyframe_changed: true, ..Default::default() }
     }

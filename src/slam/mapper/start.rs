@@ -10,6 +10,7 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::mapper::doubt::Doubt;
 use crate::slam::mapper::phase::Phase;
 use crate::slam::mapper::situation::{StartFrame, StartProgress};
 use crate::slam::mapper::{Mapper, StepOutcome};
@@ -165,6 +166,7 @@ impl Mapper {
         }
         self.active = None;
         self.phase = Phase::Mapping;
+        self.doubt = Doubt::None;
         self.world_from_map = Sim3::identity();
         self.last_world_from_camera = None;
         self.last_tracked = None;

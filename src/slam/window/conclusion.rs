@@ -32,6 +32,18 @@ impl Window {
         }
     }
 
+    /// Estimates the newest keyframes of the epoch, as many as are free at once.
+    pub(super) fn adjust_newest(&mut self, newest: usize) -> Option<Adjustment> {
+        let of_epoch = self.of_epoch_up_to(newest);
+        let (begin, end) = (of_epoch.len().saturating_sub(PIECE), of_epoch.len());
+        let chosen = self.choose_piece(&of_epoch, begin, end);
+        let adjustment = self.adjust(&chosen);
+        self.leave(&chosen.members);
+        self.moved.sort_unstable();
+        self.moved.dedup();
+        adjustment
+    }
+
     /// The keyframes from `begin` to `end` of an epoch's, and those beside them that hold them in place.
     pub(super) fn choose_piece(&self, of_epoch: &[usize], begin: usize, end: usize) -> Chosen {
         let (before, piece) = of_epoch[..end].split_at(begin);

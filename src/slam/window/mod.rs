@@ -100,6 +100,8 @@ pub struct Window {
     marginals: Vec<Marginal>,
     frames: WindowFrames,
     is_last: bool,
+    /// Whether the newest keyframes are all to be free in the next estimate.
+    reconsiders: bool,
     pass: Pass,
     refinement: Refinement,
     /// The epoch whose start was found to be wrong.
@@ -123,6 +125,7 @@ impl Window {
             marginals: Vec::new(),
             frames: WindowFrames::default(),
             is_last: false,
+            reconsiders: false,
             pass: Pass::default(),
             refinement: Refinement::default(),
             refuted_epoch: None,
@@ -218,6 +221,11 @@ impl Window {
         self.is_last = true;
     }
 
+    /// The map contradicts itself: the next estimate is of the newest keyframes with all of them free.
+    pub fn reconsider(&mut self) {
+        self.reconsiders = true;
+    }
+
     /// Estimates the newest keyframes and all points that they and older ones see; `None` where there is too little.
     pub fn optimise(&mut self) -> Option<Adjustment> {
         if self.refine_begun() {
@@ -248,6 +256,8 @@ impl Window {
             self.place_rest();
             self.leave(&[]);
             self.refinement.begin(&self.keyframes);
+        } else if std::mem::take(&mut self.reconsiders) {
+            adjustment = self.adjust_newest(newest).or(adjustment);
         } else if !is_new {
             adjustment = self.adjust_piece(newest);
         }

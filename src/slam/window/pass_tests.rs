@@ -94,6 +94,22 @@ fn a_pass_straightens_a_bend_and_leaves_the_first_keyframe() {
 }
 
 #[test]
+fn a_map_that_is_reconsidered_is_straightened_at_once() {
+    let truth = walk();
+    let mut window = truth.clone();
+    window.params.pass_every = 0;
+    bend(&mut window, 0.01);
+    let before = error(&window, &truth);
+    assert_eq!(window.clone().optimise(), None, "nothing is due otherwise");
+    window.reconsider();
+    window.optimise().unwrap();
+    let after = error(&window, &truth);
+    assert!(before > 0.004 && after < 0.5 * before, "{before} {after}");
+    assert_eq!(window.moved, (1..KEYFRAMES as u64).collect::<Vec<_>>());
+    assert_eq!(window.optimise(), None, "once");
+}
+
+#[test]
 fn a_piece_that_was_dropped_is_estimated_again_and_a_new_keyframe_does_not_restart_the_pass() {
     let mut window = walk();
     let first = piece(&mut window);

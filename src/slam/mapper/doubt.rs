@@ -1,0 +1,209 @@
+//! A map that contradicts itself is estimated once more, with all of its newest keyframes free, and rejected where it
+//! contradicts itself again.
+//!
+//! That helps where keyframes were left at wrong places or with wrong units, not where depth is lost or the start was
+//! wrong. The estimate is one like the others: it goes to their thread next and enters as they do.
+
+use crate::slam::depth::gaussian::ObservationCounts;
+use crate::slam::mapper::consistency::{Contradiction, START_KEYFRAMES, is_plausible_ratio};
+use crate::slam::mapper::{Mapper, StepOutcome};
+use crate::slam::pose::PoseEstimate;
+
+/// Frames until the estimate must have entered: it waits for one that is away, and takes as long as a few itself. Poses
+/// are claimed meanwhile.
+const MOST_FRAMES: u32 = 20;
+
+/// Keyframes that must come without a contradiction before a map is estimated once more for another.
+const TRUSTED_AFTER: u64 = 4;
+
+/// What a contradiction has led to.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(super) enum Doubt {
+    /// There was none, or long ago.
+    #[default]
+    None,
+    /// The map is to be estimated once more.
+    Raised {
+        /// Why.
+        contradiction: Contradiction,
+        /// Frames since.
+        frames: u32,
+        /// Whether the estimate is under way.
+        is_away: bool,
+    },
+    /// It has been, when this was the active keyframe.
+    Settled(u64),
+}
+
+impl Doubt {
+    /// Whether the next estimate is to be of a map in doubt: it goes away with it.
+    pub(super) fn hand_over(&mut self) -> bool {
+        let Self::Raised { is_away, .. } = self else { return false };
+        *is_away = true;
+        true
+    }
+
+    /// The estimate was not taken: the next one is to be it.
+    pub(super) fn take_back(&mut self) {
+        if let Self::Raised { is_away, .. } = self {
+            *is_away = false;
+        }
+    }
+}
+
+impl Mapper {
+    /// Judges what a frame did to the depth of the active keyframe; the outcome where that rejects the map.
+    pub(super) fn judge_frame(
+        &mut self,
+        observations: &ObservationCounts,
+        pose: &PoseEstimate,
+    ) -> Option<StepOutcome> {
+        let points = self.num_points();
+        let is_first = self.num_epoch_keyframes() <= START_KEYFRAMES;
+        let params = &self.params.consistency;
+        let active = self.active.as_mut()?;
+        let mut contradiction = active.consistency.observe(observations, points, params);
+        if is_first {
+            let displacement = pose.quality.displacement_px / self.intrinsics.width as f64;
+            let of_start = active.consistency.observe_start(observations, displacement, params);
+            contradiction = of_start.or(contradiction);
+        }
+        let is_rejected = contradiction.is_some_and(|contradiction| self.contradict(contradiction));
+        if !(is_rejected || self.has_waited_in_vain()) {
+            return None;
+        }
+        Some(StepOutcome {
+            keyframe_changed: true,
+            graph_changed: contradiction == Some(Contradiction::WrongStart),
+            observations: *observations,
+            ..Default::default()
+        })
+    }
+
+    /// The map contradicts itself: it is put in doubt, or rejected, and then this is true.
+    pub(super) fn contradict(&mut self, contradiction: Contradiction) -> bool {
+        let may_help =
+            matches!(contradiction, Contradiction::FailedSearches | Contradiction::ScaleJump);
+        let active = self.keyframe().map_or(0, |keyframe| keyframe.keyframe_id);
+        let is_new = match self.doubt {
+            Doubt::None => true,
+            Doubt::Raised { .. } if may_help => return false,
+            Doubt::Raised { .. } => false,
+            Doubt::Settled(then) => active >= then.saturating_add(TRUSTED_AFTER),
+        };
+        if may_help && is_new && self.is_estimated {
+            self.doubt = Doubt::Raised { contradiction, frames: 0, is_away: false };
+            return false;
+        }
+        self.reject(contradiction);
+        true
+    }
+
+    /// Counts another frame of a map in doubt; rejects it where nobody has estimated it again.
+    fn has_waited_in_vain(&mut self) -> bool {
+        let Doubt::Raised { contradiction, frames, .. } = &mut self.doubt else { return false };
+        *frames += 1;
+        let (contradiction, is_late) = (*contradiction, *frames > MOST_FRAMES);
+        if is_late {
+            self.reject(contradiction);
+        }
+        is_late
+    }
+
+    /// An estimate has entered: where it was that of a map in doubt, what is left of it is judged anew. True where that
+    /// rejects the map.
+    pub(super) fn settle_doubt(&mut self) -> bool {
+        let Doubt::Raised { contradiction, is_away: true, .. } = self.doubt else { return false };
+        let Some(active) = &mut self.active else { return false };
+        active.consistency.forget_failures();
+        let Some(keyframe) = self.keyframe() else { return false };
+        let (id, epoch, unit) =
+            (keyframe.keyframe_id, keyframe.epoch, keyframe.map_from_keyframe.scale);
+        self.doubt = Doubt::Settled(id);
+        let known = self.map.keyframes.iter().rev().filter(|k| k.epoch == epoch);
+        let before = known.clone().find(|k| k.keyframe_id < id);
+        // A keyframe's unit is its mean depth.
+        let ratio = before.map_or(1.0, |before| unit / before.map_from_keyframe.scale);
+        let jumps = contradiction == Contradiction::ScaleJump
+            && !is_plausible_ratio(ratio, &self.params.consistency);
+        if jumps {
+            self.reject(contradiction);
+        }
+        jumps
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::geometry::se3::SE3;
+    use crate::slam::mapper::MapperParams;
+    use crate::slam::mapper::finder::tests::keyframe;
+    use crate::slam::mapper::phase::{Active, Phase};
+    use crate::slam::test_scene::{CAMERA, Scene};
+
+    /// A mapper on the first of two keyframes, whose map is estimated jointly or not.
+    fn mapper(is_estimated: bool) -> Mapper {
+        let scene = Scene::new(3);
+        let mut mapper = Mapper::new(CAMERA, MapperParams::default()).unwrap();
+        let side = SE3 { translation: [0.2, 0.0, 0.0].into(), ..SE3::identity() };
+        mapper.map.keyframes =
+            vec![keyframe(&scene, 0, SE3::identity()), keyframe(&scene, 1, side)];
+        mapper.active = Some(Active::new(1));
+        mapper.phase = Phase::Mapping;
+        mapper.is_estimated = is_estimated;
+        mapper
+    }
+
+    fn is_rejected(mapper: &Mapper) -> bool {
+        matches!(mapper.phase, Phase::Rejected(..))
+    }
+
+    #[test]
+    fn a_contradiction_is_estimated_again_first_and_rejects_the_second_time() {
+        let mut mapper = mapper(true);
+        assert!(!mapper.contradict(Contradiction::FailedSearches) && !is_rejected(&mapper));
+        // As long as it waits others change nothing.
+        assert!(!mapper.contradict(Contradiction::FailedSearches));
+        let window = mapper.begin_adjustment().unwrap();
+        let mut window = window;
+        window.optimise();
+        mapper.end_adjustment(window);
+        assert!(!is_rejected(&mapper));
+        assert_eq!(mapper.doubt, Doubt::Settled(1));
+        assert!(mapper.contradict(Contradiction::FailedSearches) && is_rejected(&mapper));
+    }
+
+    #[test]
+    fn what_an_estimate_cannot_help_rejects_at_once() {
+        for contradiction in [Contradiction::LostDepth, Contradiction::WrongStart] {
+            let mut mapper = mapper(true);
+            assert!(mapper.contradict(contradiction) && is_rejected(&mapper));
+        }
+        let mut without = mapper(false);
+        assert!(without.contradict(Contradiction::ScaleJump) && is_rejected(&without));
+    }
+
+    #[test]
+    fn a_unit_that_still_jumps_afterwards_rejects() {
+        for (scale, rejects) in [(1.0, false), (3.0, true)] {
+            let mut mapper = mapper(true);
+            assert!(!mapper.contradict(Contradiction::ScaleJump));
+            assert!(mapper.doubt.hand_over());
+            mapper.map.keyframes[1].map_from_keyframe.scale = scale;
+            assert_eq!((mapper.settle_doubt(), is_rejected(&mapper)), (rejects, rejects));
+        }
+    }
+
+    #[test]
+    fn a_map_that_nobody_estimates_again_is_rejected_in_time() {
+        let mut mapper = mapper(true);
+        mapper.contradict(Contradiction::FailedSearches);
+        // One that was dropped is estimated again.
+        assert!(mapper.doubt.hand_over());
+        mapper.doubt.take_back();
+        let waits = (0..100).take_while(|_| !mapper.has_waited_in_vain()).count();
+        assert_eq!(waits, MOST_FRAMES as usize);
+        assert!(is_rejected(&mapper));
+    }
+}
