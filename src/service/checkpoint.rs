@@ -276,6 +276,8 @@ pub fn read_checkpoint(path: &Path) -> Result<Option<Map>, MapFileError> {
         };
         if let Some(kept) = kept.keyframes.into_iter().next().filter(of_same) {
             (keyframe.image, keyframe.points) = (kept.image, kept.points);
+            // Of the points that are taken: the state may be older than they are, or newer.
+            keyframe.is_refined = kept.is_refined;
         }
     }
     Ok(Some(map))

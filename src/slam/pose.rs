@@ -111,7 +111,7 @@ pub struct PoseEstimate {
     pub state: TrackingState,
     /// How often the map had been corrected when that keyframe was published.
     pub map_revision: u64,
-    /// Odometry pose; never jumps within an epoch.
+    /// Odometry pose; never jumps within an epoch, but where a view was held ([`DegradedReason::Turning`]) and ends.
     pub world_from_camera: SE3,
     /// Pose in the map, the best estimate; jumps where the map is corrected.
     pub map_from_camera: SE3,

@@ -126,6 +126,8 @@ pub struct Memory {
     was_lost: bool,
     /// That of the last pose that was claimed, and keyframe_id.
     covariance: [f64; 21],
+    /// Unit of that covariance's translations, in the world's.
+    unit: f64,
     coarse_fit: Option<f64>,
 }
 
@@ -143,6 +145,7 @@ impl Tracker {
             reference: None,
             turning: Turning::new(
                 Reference::new(params.reference.clone()),
+                &intrinsics,
                 &pyramid,
                 &params.alignment,
             ),
@@ -230,8 +233,9 @@ impl Tracker {
                     true => self.turn(&reference, frame, &before, budget),
                     false => None,
                 };
-                if held.is_none() {
-                    self.turning.end();
+                if held.is_none() && self.turning.end() {
+                    // The way from where it was held to where it is was made in one frame of no camera.
+                    self.memory.motion.stop();
                 }
                 held.unwrap_or(estimate)
             }
@@ -241,6 +245,7 @@ impl Tracker {
             TrackingState::Lost(_) | TrackingState::Degraded(DegradedReason::Turning)
         );
         self.memory.covariance = estimate.covariance;
+        self.memory.unit = reference.world_from_keyframe().scale;
         self.reference = Some(reference);
         estimate
     }

@@ -73,7 +73,7 @@ pub struct PoseMessage {
     pub epoch: u32,
     /// 0 initializing, 1 tracking, 2 degraded, 3 lost.
     pub state: u32,
-    /// Why: degraded 0 budget, 1 low overlap, 2 high residual, 3 gap; lost 0 diverged, 1 too few
+    /// Why: degraded 0 budget, 1 low overlap, 2 high residual, 3 gap, 4 turning; lost 0 diverged, 1 too few
     /// inliers, 2 no points, 3 unusable frame, 4 map rejected; otherwise 0.
     pub reason: u32,
     /// 1 when the tracker asks for a new keyframe here.
@@ -81,7 +81,7 @@ pub struct PoseMessage {
     /// How often the map had been corrected when the keyframe was published: `map_from_camera` jumps where this
     /// grows.
     pub map_revision: u64,
-    /// Odometry pose: never jumps within an epoch, and drifts.
+    /// Odometry pose: never jumps within an epoch, but from a turning pose to the next that is none, and drifts.
     pub world_from_camera: RigidMessage,
     /// Pose in the map, the best estimate: jumps where the map is corrected.
     pub map_from_camera: RigidMessage,

@@ -26,6 +26,8 @@ pub(super) enum Doubt {
     Raised {
         /// Why.
         contradiction: Contradiction,
+        /// The active keyframe then.
+        keyframe_id: u64,
         /// Frames since.
         frames: u32,
         /// Whether the estimate is under way.
@@ -92,7 +94,8 @@ impl Mapper {
             Doubt::Settled(then) => active >= then.saturating_add(TRUSTED_AFTER),
         };
         if may_help && is_new && self.is_estimated {
-            self.doubt = Doubt::Raised { contradiction, frames: 0, is_away: false };
+            self.doubt =
+                Doubt::Raised { contradiction, keyframe_id: active, frames: 0, is_away: false };
             return false;
         }
         self.reject(contradiction);
@@ -113,13 +116,18 @@ impl Mapper {
     /// An estimate has entered: where it was that of a map in doubt, what is left of it is judged anew. True where that
     /// rejects the map.
     pub(super) fn settle_doubt(&mut self) -> bool {
-        let Doubt::Raised { contradiction, is_away: true, .. } = self.doubt else { return false };
+        let Doubt::Raised { contradiction, keyframe_id: id, is_away: true, .. } = self.doubt else {
+            return false;
+        };
         let Some(active) = &mut self.active else { return false };
         active.consistency.forget_failures();
-        let Some(keyframe) = self.keyframe() else { return false };
-        let (id, epoch, unit) =
-            (keyframe.keyframe_id, keyframe.epoch, keyframe.map_from_keyframe.scale);
-        self.doubt = Doubt::Settled(id);
+        let Some(active) = self.keyframe().map(|keyframe| keyframe.keyframe_id) else {
+            return false;
+        };
+        self.doubt = Doubt::Settled(active);
+        // That which jumped: another may be active by now.
+        let Some(keyframe) = self.map.get(id) else { return false };
+        let (epoch, unit) = (keyframe.epoch, keyframe.map_from_keyframe.scale);
         let known = self.map.keyframes.iter().rev().filter(|k| k.epoch == epoch);
         let before = known.clone().find(|k| k.keyframe_id < id);
         // A keyframe's unit is its mean depth.
@@ -165,7 +173,7 @@ mod tests {
         assert!(!mapper.contradict(Contradiction::FailedSearches) && !is_rejected(&mapper));
         // As long as it waits others change nothing.
         assert!(!mapper.contradict(Contradiction::FailedSearches));
-        let window = mapper.begin_adjustment().unwrap();
+        let window = mapper.begin_adjustment(false).unwrap();
         let mut window = window;
         window.optimise();
         mapper.end_adjustment(window);

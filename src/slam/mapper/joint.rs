@@ -2,6 +2,7 @@
 
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
+use crate::slam::keyframe::Keyframe;
 use crate::slam::mapper::consistency::Contradiction;
 use crate::slam::mapper::phase::Phase;
 use crate::slam::mapper::{Mapper, StepOutcome};
@@ -57,9 +58,9 @@ impl Mapper {
     /// Takes the keyframes back and moves the map to where they are now.
     pub fn end_adjustment(&mut self, mut window: Box<Window>) -> StepOutcome {
         if let Some(refined) = window.take_refined() {
-            self.take_refined(refined);
+            let graph_changed = self.take_refined(refined, &mut window);
             self.window = Some(window);
-            return StepOutcome::default();
+            return StepOutcome { graph_changed, ..Default::default() };
         }
         let finished = self.finish_keyframe();
         let mut outcome = StepOutcome::default();
@@ -129,15 +130,20 @@ impl Mapper {
         true
     }
 
-    /// Gives a keyframe the depth that was refined while frames came, unless it is being observed again.
-    fn take_refined(&mut self, refined: RefinedDepth) {
+    /// Gives a keyframe the depth that was refined while frames came; false where it has got other depth meanwhile, is
+    /// being observed, or has been forgotten.
+    fn take_refined(&mut self, refined: RefinedDepth, window: &mut Window) -> bool {
         let keyframe_id = refined.keyframe_id;
-        if self.keyframe().is_some_and(|active| active.keyframe_id == keyframe_id) {
-            return;
+        let is_active = self.keyframe().is_some_and(|active| active.keyframe_id == keyframe_id);
+        let is_same = |of: &&Keyframe| of.has_depth() && of.revision == refined.of_revision;
+        if is_active || self.map.get(keyframe_id).filter(is_same).is_none() {
+            window.refine_later(keyframe_id);
+            return false;
         }
         self.revision += 1;
         self.map.refine(refined, self.revision);
         self.tell_left(keyframe_id);
+        true
     }
 
     /// Keeps the points that the joint estimate has in the map: to be called before it is written.

@@ -37,8 +37,9 @@ impl Mapper {
         /// Keyframes that are told of, where nobody asks.
         const MOST: usize = 8;
         self.left.retain(|&id| id != keyframe_id);
-        self.left.truncate(MOST - 1);
         self.left.push_back(keyframe_id);
+        let surplus = self.left.len().saturating_sub(MOST);
+        self.left.drain(..surplus);
     }
 
     /// The active keyframe with its image and depth, and the poses of the others of its epoch; `None`

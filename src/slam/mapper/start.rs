@@ -84,7 +84,8 @@ impl Mapper {
         pose: &PoseEstimate,
         sensor_depth: Option<&Image<f32>>,
     ) -> StepOutcome {
-        let is_given = pose.state.is_tracked();
+        // After a map was rejected a pose on it may still come, which nobody has given.
+        let is_given = pose.state.is_tracked() && matches!(self.phase, Phase::Starting);
         if sensor_depth.is_none() && !is_given {
             return match self.start.step(frame) {
                 Some((first, proven)) => self.begin_proven(frame, pose, first, &proven),

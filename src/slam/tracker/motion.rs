@@ -57,6 +57,26 @@ impl Motion {
         self.velocity = None;
     }
 
+    /// How fast the camera moved last, world units a second; `None` where that is not known.
+    pub fn speed(&self) -> Option<f64> {
+        /// Nanoseconds in a second.
+        const SECOND: f64 = 1e9;
+        let (twist, interval) = self.velocity?;
+        Some(twist.fixed_rows::<3>(0).norm() * SECOND / interval)
+    }
+
+    /// By how far the next frame, at `nanos`, may be from an even motion, in intervals of 30 Hz since the last pose (at
+    /// least one) and in what the camera has moved last; `None` where that is not known.
+    pub fn step(&self, nanos: i64) -> Option<(f64, SE3)> {
+        /// A frame at 30 Hz, nanoseconds.
+        const INTERVAL: f64 = 1e9 / 30.0;
+        self.velocity?;
+        let last = self.last?;
+        let intervals = nanos.saturating_sub(last.nanos) as f64 / INTERVAL;
+        let predicted = self.predict(nanos, 1.0)?;
+        Some((intervals.max(1.0), last.world_from_camera.inverse() * predicted))
+    }
+
     /// The last good pose, `None` before the first.
     pub fn last(&self) -> Option<SE3> {
         self.last.map(|last| last.world_from_camera)

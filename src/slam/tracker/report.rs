@@ -81,15 +81,23 @@ impl Tracker {
     /// Whether a camera would be elsewhere than an even motion takes it by more than hands or wheels do: what is found
     /// there must be as sure as after a loss. The last points at the edge of a view fit nearly anything.
     fn has_jumped(&self, reference: &Reference, nanos: i64, world_from_camera: &SE3) -> bool {
-        /// Largest change of the rotation from one frame to the next, radians: 9°.
+        /// Largest change of the rotation from one frame to the next at 30 Hz, radians: 9°.
         const MOST_ROTATION_RAD: f64 = 0.15;
         /// The same of the translation, in mean depths.
         const MOST_TRANSLATION: f64 = 0.15;
-        let Some(predicted) = self.memory.motion.predict(nanos, 1.0) else { return false };
+        /// Share of its last step by which a fast camera may brake or turn in one frame.
+        const MOST_OF_STEP: f64 = 0.5;
+        let motion = &self.memory.motion;
+        let (Some((intervals, step)), Some(predicted)) =
+            (motion.step(nanos), motion.predict(nanos, 1.0))
+        else {
+            return false;
+        };
         let off = predicted.inverse() * *world_from_camera;
         let mean_depth = reference.world_from_keyframe().scale / reference.mean_inverse_depth();
-        off.rotation.angle() > MOST_ROTATION_RAD
-            || off.translation.norm() > MOST_TRANSLATION * mean_depth
+        let most = |least: f64, of_step: f64| (least * intervals).max(MOST_OF_STEP * of_step);
+        off.rotation.angle() > most(MOST_ROTATION_RAD, step.rotation.angle())
+            || off.translation.norm() > most(MOST_TRANSLATION * mean_depth, step.translation.norm())
     }
 
     /// The estimate of a frame that could not be aligned: the last pose again, not claimed.

@@ -1,9 +1,9 @@
 //! Holds the pose where the known depth is out of view: frames are aligned to the last view that had a pose, all of
 //! whose pixels take part with a depth that is not known.
 //!
-//! That holds the rotation, and the translation as far as it is small; each view that takes over adds its
-//! uncertainty, and no depth is learnt meanwhile. It ends where a keyframe fits again, or where the translation is no
-//! longer known.
+//! That holds the rotation. The position stays where it was when the known depth was last seen, and becomes uncertain with
+//! a hand's speed; each view that takes over adds its uncertainty, and no depth is learnt meanwhile. It ends where a
+//! keyframe fits again, or where the position is no longer known.
 
 use nalgebra::{Matrix3, Matrix6};
 
@@ -12,6 +12,7 @@ use crate::slam::alignment::reference::Reference;
 use crate::slam::alignment::unknown_depth::UnknownDepth;
 use crate::slam::depth::common_error::full_covariance;
 use crate::slam::frame::FrameView;
+use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::sums::SumPyramid;
@@ -21,9 +22,6 @@ use crate::slam::pose::{
 use crate::slam::tracker::covariance_floor::displacement_covariance;
 use crate::slam::tracker::verdict::quality_of;
 use crate::slam::tracker::{Memory, Tracker, upper_triangle};
-
-/// Standard deviation of the mean depth of what is seen, as a share of the keyframe's: half or twice as far.
-const MEAN_DEPTH_STD_DEV: f64 = 0.7;
 
 /// Change of the exposure since the view: of the logarithm of the gain, and of the offset in grey levels. Some frames
 /// pass at most; more freedom flattens a view of little contrast until it fits anything.
@@ -81,26 +79,38 @@ pub(super) struct Turning {
 pub(super) struct Place {
     /// In units of the mean depth.
     world_from_view: Sim3,
-    /// Where the camera was when the known depth was last seen.
-    origin: SE3,
     /// Time from the last keyframe's to the view, seconds.
     since_secs: f64,
     /// Stamp of the view.
     nanos: i64,
+    /// How fast the camera may move, mean depths a second.
+    speed: f64,
     /// Of the left increment of `view_from_keyframe`, in the same units.
     covariance: Matrix6<f64>,
 }
 
 impl Turning {
-    /// With memory for frames like `pyramid`.
-    pub(super) fn new(view: Reference, pyramid: &SumPyramid, params: &AlignmentParams) -> Self {
+    /// With memory for frames like `pyramid`, of a camera with these intrinsics.
+    pub(super) fn new(
+        mut view: Reference,
+        intrinsics: &Intrinsics,
+        pyramid: &SumPyramid,
+        params: &AlignmentParams,
+    ) -> Self {
+        let mut unknown = UnknownDepth::default();
+        // A view with a gradient everywhere: no frame needs more memory.
+        let pixels = intrinsics.width * intrinsics.height;
+        let steep: Vec<u8> = (0..pixels).map(|place| (place * 37 % 256) as u8).collect();
+        let mut textured = pyramid.clone();
+        textured.fill(&steep);
+        unknown.prepare(&mut view, intrinsics, &mut textured);
         let params = AlignmentParams {
             gain_prior_std_dev: GAIN_STD_DEV,
             offset_prior_std_dev: OFFSET_STD_DEV,
             ..params.clone()
         };
         Self {
-            unknown: UnknownDepth::default(),
+            unknown,
             aligner: Aligner::new(params),
             view: Some(Box::new(view)),
             place: None,
@@ -135,16 +145,15 @@ impl Turning {
         (self.before_sequence, self.filled_sequence) = (before, filled);
     }
 
-    /// The keyframe fits again, or nothing does.
-    pub(super) fn end(&mut self) {
-        self.place = None;
+    /// The keyframe fits again, or nothing does; whether a view was held.
+    pub(super) fn end(&mut self) -> bool {
+        self.place.take().is_some()
     }
 
     /// The keyframe that poses are known from has been moved.
     pub(super) fn follow(&mut self, before: &Sim3, after: &Sim3) {
         if let Some(place) = self.place.as_mut().filter(|_| before != after) {
             place.world_from_view = *after * before.inverse() * place.world_from_view;
-            place.origin = after.place(&before.locate(&place.origin));
         }
     }
 }
@@ -160,22 +169,24 @@ impl Tracker {
     ) -> Option<PoseEstimate> {
         let unit = reference.world_from_keyframe().scale / reference.mean_inverse_depth();
         if self.turning.place.is_none() {
-            self.begin_turning(before, reference, unit)?;
+            self.begin_turning(before, unit)?;
         }
         let place = self.turning.place?;
         let mut view = self.turning.view.take()?;
-        let lost = std::mem::replace(&mut self.memory, Memory { ..before.clone() });
+        let last_sequence = self.memory.last_sequence;
+        let held = Memory { last_sequence, ..before.clone() };
+        let lost = std::mem::replace(&mut self.memory, held);
         (self.memory.brightness, self.memory.coarse_fit) =
             (Brightness::default(), self.turning.coarse_fit);
         // The motion on the keyframe's last points may be anything.
         self.memory.was_lost = self.turning.is_first;
         let step = frame.capture_nanos.saturating_sub(place.nanos) as f64 * 1e-9;
         let step = step.clamp(LEAST_SECONDS, MOST_SECONDS);
-        view.stand_at(&place.world_from_view, TIGHTNESS * SPEED * step);
+        view.stand_at(&place.world_from_view, TIGHTNESS * place.speed * step);
         let since = place.since_secs;
         let place = Place { since_secs: since + step, ..place };
         // A camera that moves on evenly: its distance grows with the time, not with the root of it.
-        let distance_variance = SPEED * SPEED * (place.since_secs.powi(2) - since.powi(2));
+        let distance_variance = place.speed.powi(2) * (place.since_secs.powi(2) - since.powi(2));
         std::mem::swap(&mut self.aligner, &mut self.turning.aligner);
         let (alignment, coarse_fit) = self.align(&view, frame, budget);
         std::mem::swap(&mut self.aligner, &mut self.turning.aligner);
@@ -200,26 +211,22 @@ impl Tracker {
     }
 
     /// Takes the frame before for the view, where it had a pose.
-    fn begin_turning(&mut self, before: &Memory, reference: &Reference, unit: f64) -> Option<()> {
+    fn begin_turning(&mut self, before: &Memory, unit: f64) -> Option<()> {
         let Self { turning, intrinsics, .. } = self;
         let is_before =
             turning.before_sequence.is_some() && turning.before_sequence == before.last_sequence;
         let (nanos, world_from_camera) =
             before.motion.last_seen().filter(|_| is_before && !before.was_lost)?;
         let mut covariance = full_covariance(&before.covariance);
-        scale_translation(&mut covariance, reference.mean_inverse_depth());
+        scale_translation(&mut covariance, before.unit / unit);
+        // As fast as it was.
+        let speed = before.motion.speed().map_or(SPEED, |speed| SPEED.max(speed / unit));
         let world_from_view = Sim3::new(world_from_camera, unit);
         let view = turning.view.as_deref_mut()?;
         turning.unknown.prepare(view, intrinsics, &mut turning.before);
         turning.before_sequence = None;
         (turning.is_first, turning.coarse_fit) = (true, None);
-        turning.place = Some(Place {
-            world_from_view,
-            origin: world_from_camera,
-            since_secs: 0.0,
-            nanos,
-            covariance,
-        });
+        turning.place = Some(Place { world_from_view, since_secs: 0.0, nanos, speed, covariance });
         Some(())
     }
 
@@ -259,11 +266,16 @@ impl Tracker {
         if !is_smooth || !is_seen || inliers < LEAST_INLIERS || !is_even {
             return None;
         }
-        let current_from_view = alignment.state.current_from_keyframe;
-        let of_step = alignment.covariance(&self.params.alignment)?
+        // What turns and what moves look alike over a step: added up, translations would run away by a scene in seconds.
+        let rotation = alignment.state.current_from_keyframe.rotation;
+        let current_from_view = SE3 { rotation, ..SE3::identity() };
+        let mut of_step = alignment.covariance(&self.params.alignment)?
             + from_prior(alignment, view.translation_information(), distance_variance)?
             + alignment.covariance_from_modes(view).unwrap_or_default()
             + displacement_covariance(quality.displacement_px, &self.intrinsics, 1.0);
+        of_step.fixed_view_mut::<3, 6>(0, 0).fill(0.0);
+        of_step.fixed_view_mut::<6, 3>(0, 0).fill(0.0);
+        (0..3).for_each(|axis| of_step[(axis, axis)] = distance_variance);
         let of_rotation =
             of_step.fixed_view::<3, 3>(3, 3).into_owned().symmetric_eigenvalues().max();
         if !(of_rotation.sqrt() <= MOST_ROTATION_STD_DEV) {
@@ -272,12 +284,7 @@ impl Tracker {
         let adjoint = current_from_view.adjoint();
         let covariance = of_step + adjoint * place.covariance * adjoint.transpose();
         let world_from_camera = place.world_from_view.place(&current_from_view.inverse());
-        // The mean depth of what is in view is not that of the keyframe, by one factor for the whole way.
-        let way = (world_from_camera.inverse() * place.origin).translation;
-        let way = way * (MEAN_DEPTH_STD_DEV / place.world_from_view.scale);
         let mut published = covariance;
-        let mut translations = published.fixed_view_mut::<3, 3>(0, 0);
-        translations += way * way.transpose();
         let translation: Matrix3<f64> = published.fixed_view::<3, 3>(0, 0).into_owned();
         let deviation = translation.symmetric_eigenvalues().max().sqrt();
         if !(deviation <= self.params.max_turning_deviation) {
@@ -288,7 +295,8 @@ impl Tracker {
         if !(world_from_camera.is_finite() && map_from_camera.is_finite()) {
             return None;
         }
-        scale_translation(&mut published, 1.0 / reference.mean_inverse_depth());
+        let unit = reference.world_from_keyframe().scale;
+        scale_translation(&mut published, place.world_from_view.scale / unit);
         let in_map = reference.uncertain_place().of_camera(&keyframe_from_camera, &published);
         let state = TrackingState::Degraded(DegradedReason::Turning);
         let published = upper_triangle(|row, column| published[(row, column)]);

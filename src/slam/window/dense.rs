@@ -50,6 +50,8 @@ const COMMON: f64 = 0.415;
 pub struct RefinedDepth {
     /// The keyframe.
     pub keyframe_id: u64,
+    /// Revision of the keyframe that it was refined from.
+    pub of_revision: u64,
     /// Its points, inverse depth in one over the keyframe's unit.
     pub points: Vec<DepthPoint>,
 }
@@ -138,6 +140,11 @@ impl Window {
         true
     }
 
+    /// A keyframe has got other depth since it was begun with: it is refined another time.
+    pub fn refine_later(&mut self, keyframe_id: u64) {
+        self.refinement.done.remove(&keyframe_id);
+    }
+
     /// Refines the keyframe that was begun with; false where none was.
     pub(super) fn refine_begun(&mut self) -> bool {
         let Some(keyframe) = self.refinement.begun.take() else { return false };
@@ -186,7 +193,8 @@ impl Window {
                 (point.inverse_depth * unit, point.variance * unit * unit);
             DepthPoint { inverse_depth, variance, ..point }
         });
-        Some(RefinedDepth { keyframe_id: keyframe.keyframe_id, points: smooth.collect() })
+        let (keyframe_id, of_revision) = (keyframe.keyframe_id, keyframe.revision);
+        Some(RefinedDepth { keyframe_id, of_revision, points: smooth.collect() })
     }
 
     /// Its images on the levels that are used.

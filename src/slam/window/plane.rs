@@ -13,21 +13,39 @@ pub struct Correspondence {
     pub log_inverse_depth: f64,
 }
 
-/// What is left of the relief when a plane has been taken out: `log_ratio - plane ≈ offset + relief ln d`.
+/// What is left of the relief when a plane has been taken out: `log_ratio - plane ≈ offset + relief ln d`; 0 where depths
+/// do not differ by more than their noise.
 pub fn relief_left(points: &[Correspondence], plane: &[f64; 3]) -> f64 {
+    /// Variance of depths beyond a plane over that of their noise, from which on there is relief to be judged.
+    const LEAST_RATIO: f64 = 4.0;
+    /// Largest relief: flat instead of deep by half. More is a wrong fit.
+    const MOST: f64 = 0.5;
     let residual = |point: &Correspondence| {
         point.log_ratio - plane[0] - plane[1] * point.ray[0] - plane[2] * point.ray[1]
     };
     let spread = spread(points.iter().map(|point| residual(point).abs()).collect());
-    let (mut normal, mut right) = (Matrix4::identity() * 1e-9, Vector4::zeros());
+    let (mut normal, mut right, mut total) = (Matrix4::zeros(), Vector4::zeros(), 0.0);
     for point in points {
         let residual = residual(point);
         let weight = weight_of(residual.abs() / spread);
         let shape = Vector4::new(1.0, point.ray[0], point.ray[1], point.log_inverse_depth);
         normal += weight * shape * shape.transpose();
         right += weight * residual * shape;
+        total += weight;
     }
-    normal.cholesky().map_or(0.0, |of| of.solve(&right).w)
+    // Beyond the plane: variance of ln d and its covariance with the residual.
+    let of_plane = normal.fixed_view::<3, 3>(0, 0).into_owned();
+    let across = normal.fixed_view::<3, 1>(0, 3).into_owned();
+    let Some(inverse) = of_plane.cholesky().map(|of| of.inverse()) else { return 0.0 };
+    let taken = inverse * across;
+    let variance = (normal[(3, 3)] - taken.dot(&across)) / total;
+    let covariance = (right.w - taken.dot(&right.fixed_view::<3, 1>(0, 0))) / total;
+    // The keyframe's noise is in both, with opposite signs.
+    let noise = spread * spread;
+    if !(variance > LEAST_RATIO * noise) {
+        return 0.0;
+    }
+    ((covariance + noise) / (variance - noise)).clamp(-MOST, MOST)
 }
 
 /// `log_ratio ≈ offset + per_x X + per_y Y` for most of the points: offset and slopes. A single offset where there are

@@ -87,7 +87,7 @@ fn every_state_has_its_codes() {
             seen += 1;
         }
     }
-    assert_eq!(seen, 2 + 4 + 5);
+    assert_eq!(seen, 2 + 5 + 5);
 }
 
 #[test]
