@@ -1,6 +1,6 @@
 //! The recipe of a map step: observe depth, regularise, choose keyframes, propagate.
 
-mod appearance;
+pub(in crate::slam) mod appearance;
 mod change;
 pub mod consistency;
 mod correction;
@@ -18,7 +18,7 @@ mod resume;
 pub mod reuse;
 pub mod situation;
 mod start;
-mod turned_views;
+pub(in crate::slam) mod turned_views;
 
 use std::collections::VecDeque;
 

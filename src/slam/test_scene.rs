@@ -82,6 +82,10 @@ pub struct Scene {
     seed: u64,
     room: Cuboid,
     boxes: [Cuboid; 4],
+    /// Length after which the texture of every surface repeats, metres.
+    period: Option<f64>,
+    /// Factor of the texture's contrast.
+    contrast: f64,
 }
 
 impl Scene {
@@ -100,7 +104,39 @@ impl Scene {
         ];
         let room =
             Cuboid { low: Vector3::new(-2.5, -1.6, -2.0), high: Vector3::new(2.5, 1.6, 4.2) };
-        Self { seed, room, boxes }
+        Self { seed, room, boxes, period: None, contrast: 1.0 }
+    }
+
+    /// The same room, its walls with the same texture, with the boxes of the room of another seed moved by as many metres
+    /// along x.
+    pub fn refurnished(self, seed: u64, by: f64) -> Self {
+        let boxes = Self::new(seed).boxes.map(|Cuboid { low, high }| {
+            let by = Vector3::new(by, 0.0, 0.0);
+            Cuboid { low: low + by, high: high + by }
+        });
+        Self { boxes, ..self }
+    }
+
+    /// The same texture on walls this many times as far away.
+    pub fn resized(self, factor: f64) -> Self {
+        let room = Cuboid { low: self.room.low * factor, high: self.room.high * factor };
+        Self { room, ..self }
+    }
+
+    /// The same with a texture of this share of the contrast.
+    pub fn with_contrast(self, contrast: f64) -> Self {
+        Self { contrast, ..self }
+    }
+
+    /// A corridor along z without boxes whose texture repeats.
+    pub fn corridor(seed: u64, period: f64) -> Self {
+        let far = Vector3::new(0.0, 0.0, 1000.0);
+        let room =
+            Cuboid { low: Vector3::new(-1.2, -1.1, -20.0), high: Vector3::new(1.2, 1.3, 60.0) };
+        let scene = Self::new(seed);
+        let boxes =
+            scene.boxes.map(|Cuboid { low, high }| Cuboid { low: low + far, high: high + far });
+        Self { room, boxes, period: Some(period), ..scene }
     }
 
     /// Renders the view of a camera; every pixel is the mean of 2×2 rays.
@@ -131,7 +167,8 @@ impl Scene {
             1 => (at.x, at.z),
             _ => (at.x, at.y),
         };
-        self.texture(surface * 3 + axis as u64, x, y)
+        let repeated = |x: f64| self.period.map_or(x, |period| x.rem_euclid(period));
+        self.texture(surface * 3 + axis as u64, repeated(x), repeated(y))
     }
 
     /// Distance along the ray (depth, for rays of unit depth), axis of the face and surface.
@@ -156,7 +193,7 @@ impl Scene {
             + 50.0 * lattice_noise(surface ^ 0x55, x / 0.2, y / 0.2)
             + 60.0 * lattice_noise(surface ^ 0xAA, x / 0.7, y / 0.7);
         let stripes = 25.0 * ((4.0 * x + 1.5 * y).sin() * 12.0).tanh();
-        128.0 + noise + stripes
+        128.0 + self.contrast * (noise + stripes)
     }
 }
 

@@ -6,6 +6,7 @@
 //! `factorisation`, `dense_kernel`) within Levenberg–Marquardt (`solver`). [`marginal`] says how sure the result is.
 //! All sums are in a fixed order and no operation is fused: results do not depend on the vector unit.
 
+pub mod constraint;
 mod dense_kernel;
 mod factorisation;
 mod fronts;

@@ -2,8 +2,8 @@
 //! (Klein, Murray 2008).
 
 /// Size of the small images.
-pub(super) const COLUMNS: usize = 32;
-pub(super) const ROWS: usize = 24;
+pub(in crate::slam) const COLUMNS: usize = 32;
+pub(in crate::slam) const ROWS: usize = 24;
 /// Largest shift that is tried either way, pixels of the small image: 6° of a view 60° wide.
 const REACH: usize = 3;
 /// Columns and rows that are compared at every shift.
@@ -13,7 +13,7 @@ const COUNT: f32 = (INNER[0] * INNER[1]) as f32;
 
 /// A small image.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Appearance {
+pub(in crate::slam) struct Appearance {
     greys: Vec<f32>,
     /// The same without what changes slowly over the image.
     details: Vec<f32>,
@@ -21,7 +21,7 @@ pub(super) struct Appearance {
 
 impl Appearance {
     /// Of an image, row after row; `None` where it is too small to have one.
-    pub(super) fn of(pixels: &[u8], width: usize, height: usize) -> Option<Self> {
+    pub(in crate::slam) fn of(pixels: &[u8], width: usize, height: usize) -> Option<Self> {
         if width < COLUMNS || height < ROWS || pixels.len() != width * height {
             return None;
         }
@@ -48,13 +48,13 @@ impl Appearance {
 
     /// What changes from place to place, row after row: light and large surfaces do not count, so that it tells views
     /// apart that share little.
-    pub(super) fn details(&self) -> &[f32] {
+    pub(in crate::slam) fn details(&self) -> &[f32] {
         &self.details
     }
 
     /// Correlation at the best of the shifts, −1 to 1: what brightness and contrast do to an image does not count. −1
     /// where one of them shows nothing.
-    pub(super) fn similarity(&self, other: &Self) -> f32 {
+    pub(in crate::slam) fn similarity(&self, other: &Self) -> f32 {
         let mut inner: Vec<f32> = self.part([REACH, REACH]).flatten().copied().collect();
         let mean = inner.iter().sum::<f32>() / COUNT;
         inner.iter_mut().for_each(|grey| *grey -= mean);

@@ -15,7 +15,7 @@ const OUTSIDE: u16 = u16::MAX;
 
 /// Rotations that a camera may have against a keyframe, and what it sees of the keyframe's image then if nothing is near.
 #[derive(Debug)]
-pub(super) struct TurnedViews {
+pub(in crate::slam) struct TurnedViews {
     camera: Intrinsics,
     /// `keyframe_from_camera`.
     rotations: Vec<UnitQuaternion<f64>>,
@@ -25,16 +25,16 @@ pub(super) struct TurnedViews {
 
 /// Which of the rotations makes two images look most alike.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct TurnedView {
+pub(in crate::slam) struct TurnedView {
     /// `keyframe_from_camera`.
-    pub(super) rotation: UnitQuaternion<f64>,
+    pub(in crate::slam) rotation: UnitQuaternion<f64>,
     /// Correlation, more where more is seen by both.
-    pub(super) score: f32,
+    pub(in crate::slam) score: f32,
 }
 
 impl TurnedViews {
     /// For two images of `camera`.
-    pub(super) fn new(camera: &Intrinsics) -> Self {
+    pub(in crate::slam) fn new(camera: &Intrinsics) -> Self {
         /// Steps of the rotation about the optical axis: all around.
         const ROLLS: u32 = 24;
         /// Steps of pan and tilt either way, degrees each: about what a coarse alignment reaches on both sides.
@@ -67,13 +67,17 @@ impl TurnedViews {
     }
 
     /// Whether it is for this camera.
-    pub(super) fn is_for(&self, camera: &Intrinsics) -> bool {
+    pub(in crate::slam) fn is_for(&self, camera: &Intrinsics) -> bool {
         self.camera == *camera
     }
 
     /// For each keyframe how it looks most like the frame. Both are details of
     /// [`Appearance`](crate::slam::mapper::appearance::Appearance).
-    pub(super) fn compare(&self, frame: &[f32], keyframes: &[&[f32]]) -> Vec<Option<TurnedView>> {
+    pub(in crate::slam) fn compare(
+        &self,
+        frame: &[f32],
+        keyframes: &[&[f32]],
+    ) -> Vec<Option<TurnedView>> {
         let mut best: Vec<Option<TurnedView>> = vec![None; keyframes.len()];
         let (mut seen, mut mask) = ([0.0f32; COUNT], [0.0f32; COUNT]);
         for (rotation, pixels) in self.rotations.iter().zip(self.pixels.chunks_exact(COUNT)) {

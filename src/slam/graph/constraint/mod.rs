@@ -1,0 +1,225 @@
+//! The relative similarity of two keyframes by direct alignment of image and depth (Engel, Schöps, Cremers 2014, §3.5).
+//!
+//! [`ConstraintSolver::measure`] is the recipe: each keyframe is aligned to the other (`residual`, `align`, from a given
+//! similarity or from one that `start` finds), each alignment must pass for itself (`verdict`), and both must agree
+//! within what they claim (`covariance`). What is left becomes a constraint of the pose graph.
+
+mod align;
+mod covariance;
+mod residual;
+mod rivals;
+mod start;
+mod verdict;
+mod view;
+
+#[cfg(test)]
+mod tests;
+
+use crate::slam::alignment::align::AlignmentParams;
+use crate::slam::alignment::reference::ReferenceParams;
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::sim3::{Matrix7, Sim3};
+use crate::slam::graph::pose_graph::{Constraint, VertexId};
+use crate::slam::graph::robust::RobustKernel;
+use crate::slam::image::sums::MAX_LEVELS;
+use crate::slam::keyframe::Keyframe;
+use crate::slam::mapper::turned_views::TurnedViews;
+use crate::slam::tracker::covariance_floor::CovarianceFloorParams;
+
+pub use covariance::TileAgreement;
+pub use verdict::{GateParams, Refusal};
+pub use view::KeyframeView;
+
+/// Tuning of the measurement.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ConstraintParams {
+    /// Points and finest level of each keyframe.
+    pub reference: ReferenceParams,
+    /// Noise, robust weights, priors of the brightness and most iterations.
+    pub alignment: AlignmentParams,
+    /// A level is done when a step is shorter than this, in standard deviations by the level's own information.
+    pub step_tolerance: f64,
+    /// Standard deviation of depth that is looked up beside the pixel it belongs to, as a share of it.
+    pub depth_model_ratio: f64,
+    /// The same on coarser levels, where a pose is still wrong by pixels: depth holds the scale there and no more.
+    pub coarse_depth_ratio: f64,
+    /// Inflation of the covariance that the scatter over tiles gives.
+    pub covariance_inflation: f64,
+    /// Displacement of whole images.
+    pub displacement: CovarianceFloorParams,
+    /// Standard deviation of ln s that remains however much depth is compared.
+    pub scale_std_dev: f64,
+    /// What is accepted.
+    pub gates: GateParams,
+}
+
+impl Default for ConstraintParams {
+    fn default() -> Self {
+        /// Points of a level, finest first: a third of a frame's, since nine unknowns need no more and two alignments
+        /// are made.
+        const POINT_BUDGET: [usize; MAX_LEVELS] = [4000, 4000, 3000, 2000, 1200];
+        let reference = ReferenceParams { point_budget: POINT_BUDGET, ..Default::default() };
+        Self {
+            reference,
+            alignment: AlignmentParams::default(),
+            step_tolerance: 0.1,
+            depth_model_ratio: 0.01,
+            coarse_depth_ratio: 0.2,
+            covariance_inflation: 2.2,
+            displacement: CovarianceFloorParams::default(),
+            scale_std_dev: 0.005,
+            gates: GateParams::default(),
+        }
+    }
+}
+
+/// One keyframe aligned to another.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct KeyframeAlignment {
+    /// The similarity.
+    pub j_from_i: Sim3,
+    /// Covariance of its left increment (translation, rotation, log scale), in units of j.
+    pub covariance: Matrix7,
+    /// Logarithm of the gain of j's image against i's.
+    pub log_gain: f64,
+    /// Share of i's points in view in j and not clipped there.
+    pub usage: f64,
+    /// Share of those that are inliers.
+    pub inlier_share: f64,
+    /// How far tiles of the images agree.
+    pub agreement: TileAgreement,
+    /// Share of the points in view that meet depth of j.
+    pub depth_share: f64,
+    /// Share of those whose depths agree.
+    pub depth_inlier_share: f64,
+    /// Distance of the cameras, mean depths of i.
+    pub distance: f64,
+}
+
+/// An accepted measurement.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Measurement {
+    /// The similarity: both alignments, weighted by their information.
+    pub j_from_i: Sim3,
+    /// Covariance of its left increment (translation, rotation, log scale), in units of j. Both alignments see the same
+    /// pixels, so that it is their mean information, not the sum.
+    pub covariance: Matrix7,
+    /// The alignment of i to j, and of j to i.
+    pub alignments: [KeyframeAlignment; 2],
+    /// Squared normalised difference of the two, χ² with seven degrees of freedom if both are as sure as they claim.
+    pub reciprocal_chi2: f64,
+}
+
+impl Measurement {
+    /// As a constraint of the pose graph between the vertices of keyframes i and j.
+    pub fn constraint(&self, i: VertexId, j: VertexId, kernel: RobustKernel) -> Option<Constraint> {
+        let information = self.covariance.cholesky()?.inverse();
+        Some(Constraint { i, j, j_from_i: self.j_from_i, information, kernel })
+    }
+}
+
+/// Measures similarities between keyframes of one camera.
+#[derive(Debug)]
+pub struct ConstraintSolver {
+    params: ConstraintParams,
+    turned_views: TurnedViews,
+}
+
+impl ConstraintSolver {
+    /// For keyframes of `intrinsics`.
+    pub fn new(intrinsics: &Intrinsics, params: ConstraintParams) -> Self {
+        Self { params, turned_views: TurnedViews::new(intrinsics) }
+    }
+
+    /// Prepares a keyframe for measurements.
+    pub fn view(&self, keyframe: &Keyframe) -> KeyframeView {
+        KeyframeView::new(keyframe, &self.params.reference)
+    }
+
+    /// Measures `j_from_i` from an initial one, or from nothing.
+    pub fn measure(
+        &self,
+        i: &KeyframeView,
+        j: &KeyframeView,
+        initial: Option<&Sim3>,
+    ) -> Result<Measurement, Refusal> {
+        let forward = self.align(i, j, initial)?;
+        let backward = self.align(j, i, Some(&forward.j_from_i.inverse()))?;
+        let gates = &self.params.gates;
+        gates.judge(&forward)?;
+        gates.judge(&backward)?;
+        let measurement = fuse(forward, backward).ok_or(Refusal::Undetermined)?;
+        gates.judge_reciprocity(measurement.reciprocal_chi2)?;
+        gates.judge_certainty(&measurement, j.reference.mean_inverse_depth())?;
+        if rivals::has_rival([i, j], &forward.j_from_i, &self.params) {
+            return Err(Refusal::Ambiguous);
+        }
+        Ok(measurement)
+    }
+
+    /// Aligns i to j, whatever comes of it.
+    pub fn align(
+        &self,
+        i: &KeyframeView,
+        j: &KeyframeView,
+        initial: Option<&Sim3>,
+    ) -> Result<KeyframeAlignment, Refusal> {
+        let (views, params) = ([i, j], &self.params);
+        let camera = i.reference.intrinsics();
+        if camera != j.reference.intrinsics() || !self.turned_views.is_for(camera) {
+            return Err(Refusal::OtherCamera);
+        }
+        let finest = i.levels().start;
+        if views.iter().any(|view| view.reference.level(finest).len() < params.gates.min_points) {
+            return Err(Refusal::TooFewPoints);
+        }
+        if initial.is_some_and(|j_from_i| !j_from_i.is_valid()) {
+            return Err(Refusal::InvalidStart);
+        }
+        let start = start::find(views, initial, &self.turned_views, params);
+        let start = start.ok_or(Refusal::NothingAlike)?;
+        let (state, sums) = align::descend(views, &start, params).ok_or(Refusal::NothingInView)?;
+        if (sums.compared as usize) < params.gates.min_points {
+            return Err(Refusal::LittleOverlap);
+        }
+        let scatter = covariance::Scatter::measure(views, finest, &state, params);
+        let covariance =
+            scatter.covariance(views, &sums, &state, params).ok_or(Refusal::Undetermined)?;
+        let [met, agreeing] = scatter.depths();
+        // Noise of single depths moves single points by a pixel, and fine texture would not correlate.
+        let judged = (finest + 1).min(i.levels().end - 1);
+        let compared = f64::from(sums.compared);
+        Ok(KeyframeAlignment {
+            j_from_i: state.j_from_i(),
+            covariance,
+            log_gain: state.brightness.a,
+            usage: compared / i.reference.level(finest).len() as f64,
+            inlier_share: f64::from(sums.inliers) / compared,
+            agreement: covariance::Scatter::measure(views, judged, &state, params).agreement(),
+            depth_share: f64::from(met) / compared,
+            depth_inlier_share: f64::from(agreeing) / f64::from(met.max(1)),
+            distance: state.rigid.translation.norm() * i.reference.mean_inverse_depth(),
+        })
+    }
+}
+
+/// Both alignments as one of `j_from_i`; `None` where a covariance has no inverse.
+fn fuse(forward: KeyframeAlignment, backward: KeyframeAlignment) -> Option<Measurement> {
+    // S_ji S_ij and the left increment of S_ji⁻¹: −Ad(S_ji⁻¹) times that of S_ji.
+    let adjoint = forward.j_from_i.adjoint();
+    let of_backward = adjoint * backward.covariance * adjoint.transpose();
+    let difference = (forward.j_from_i * backward.j_from_i).log();
+    let whitening = (forward.covariance + of_backward).cholesky()?;
+    let reciprocal_chi2 = difference.dot(&whitening.solve(&difference));
+    let informations =
+        [forward.covariance.cholesky()?.inverse(), of_backward.cholesky()?.inverse()];
+    let sum = (informations[0] + informations[1]).cholesky()?;
+    // From the forward one to the other: exp(−difference) forward.
+    let step = sum.solve(&(informations[1] * -difference));
+    Some(Measurement {
+        j_from_i: Sim3::exp(&step) * forward.j_from_i,
+        covariance: sum.inverse() * 2.0,
+        alignments: [forward, backward],
+        reciprocal_chi2,
+    })
+}

@@ -1,0 +1,121 @@
+//! Where an alignment of two keyframes begins of which nothing is known: at the rotation that makes their small images
+//! most alike, and around it.
+
+use nalgebra::{UnitQuaternion, Vector3, Vector6};
+
+use super::ConstraintParams;
+use super::align::solve_level;
+use super::residual::State;
+use super::view::KeyframeView;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::geometry::sim3::Sim3;
+use crate::slam::mapper::turned_views::TurnedViews;
+use crate::slam::pose::Brightness;
+use crate::slam::tracker::motion::turned;
+
+/// Half a step of the rotations that are compared, degrees: the search around them.
+const AROUND_DEG: f64 = 4.5;
+/// Translations that are tried with a rotation that keeps the middle of the view about in place, mean depths.
+const ASIDE: f64 = 0.3;
+/// The same around a similarity that is given.
+const GIVEN_DEG: f64 = 3.0;
+const GIVEN_ASIDE: f64 = 0.1;
+/// Starts that are followed down to the next finer level.
+const MOST_FOLLOWED: usize = 3;
+
+/// The best state after the two coarsest levels, from an initial `j_from_i` or from nothing; `None` where the images have
+/// nothing in common.
+pub(super) fn find(
+    views: [&KeyframeView; 2],
+    initial: Option<&Sim3>,
+    turned_views: &TurnedViews,
+    params: &ConstraintParams,
+) -> Option<State> {
+    let coarsest = views[0].levels().next_back()?;
+    let unit = 1.0 / views[0].reference.mean_inverse_depth();
+    let given = initial.map(State::of);
+    let starts = match &given {
+        Some(given) => around(&given.rigid, GIVEN_DEG, unit * GIVEN_ASIDE),
+        None => rotations(views, turned_views)?
+            .into_iter()
+            .map(|rotation| SE3 { rotation, translation: Vector3::zeros() })
+            .flat_map(|at| around(&at, AROUND_DEG, unit * ASIDE))
+            .collect(),
+    };
+    let mut solved: Vec<(f64, State)> = Vec::new();
+    for rigid in starts {
+        let given_scale = given.map_or(0.0, |given| given.log_scale);
+        let state = State { rigid, log_scale: given_scale, brightness: Brightness::default() };
+        let state = State { log_scale: log_scale(views, coarsest, &state, params), ..state };
+        solved.extend(follow(views, coarsest, &state, params));
+    }
+    solved.sort_by(|one, other| other.0.total_cmp(&one.0));
+    solved.truncate(MOST_FOLLOWED);
+    let level = coarsest.saturating_sub(1).max(views[0].levels().start);
+    let followed = solved.into_iter().filter_map(|(_, state)| follow(views, level, &state, params));
+    followed.reduce(|one, other| if other.0 > one.0 { other } else { one }).map(|(_, state)| state)
+}
+
+/// Solves a level, with the share that is explained; `None` where only a gain that is not plausible explains it, which
+/// would hide the right pose.
+fn follow(
+    views: [&KeyframeView; 2],
+    level: usize,
+    state: &State,
+    params: &ConstraintParams,
+) -> Option<(f64, State)> {
+    let (state, sums) = solve_level(views, level, state, params)?;
+    let is_even = state.brightness.a.abs() <= params.gates.max_log_gain;
+    is_even.then(|| (explained(views, level, sums.inliers), state))
+}
+
+/// Share of all points of a level that are inliers.
+fn explained(views: [&KeyframeView; 2], level: usize, inliers: u32) -> f64 {
+    f64::from(inliers) / views[0].reference.level(level).len().max(1) as f64
+}
+
+/// `j_from_i` of the rotations to begin with: none, and the one that makes the images most alike.
+fn rotations(
+    [i, j]: [&KeyframeView; 2],
+    turned_views: &TurnedViews,
+) -> Option<Vec<UnitQuaternion<f64>>> {
+    let (here, there) = (i.appearance.as_ref()?, j.appearance.as_ref()?);
+    let best = turned_views.compare(there.details(), &[here.details()]);
+    let mut rotations = vec![UnitQuaternion::identity()];
+    // Its rotation is i_from_j.
+    rotations.extend(best.first()?.map(|best| best.rotation.inverse()));
+    Some(rotations)
+}
+
+/// Poses around one: turned by `degrees`, and moved by `aside`, units of i, with a turn that keeps the view.
+fn around(at: &SE3, degrees: f64, aside: f64) -> Vec<SE3> {
+    let turn_rad = degrees.to_radians();
+    // From the left, in the frame of j: turns of the camera about itself.
+    let mut poses: Vec<SE3> = turned(&SE3::identity(), turn_rad).map(|turn| turn * *at).collect();
+    for axis in [Vector3::x(), Vector3::y(), Vector3::z()] {
+        for by in [-aside, aside] {
+            let turn = turn_rad * by.signum();
+            let turn = Vector6::new(0.0, 0.0, 0.0, turn * axis.y, -turn * axis.x, 0.0);
+            poses.push(SE3 { translation: axis * by, ..SE3::exp(&turn) } * *at);
+        }
+    }
+    poses
+}
+
+/// ln s with the median of the depth residuals taken off, over the points that meet depth: the scale that makes depths agree.
+fn log_scale(
+    views: [&KeyframeView; 2],
+    level: usize,
+    state: &State,
+    params: &ConstraintParams,
+) -> f64 {
+    let at = params.level(views, level, state, state);
+    let depths = at.terms().filter_map(|terms| terms.depth);
+    let mut residuals: Vec<f64> = depths.map(|depth| depth.residual).collect();
+    if residuals.is_empty() {
+        return state.log_scale;
+    }
+    let middle = residuals.len() / 2;
+    let median = *residuals.select_nth_unstable_by(middle, f64::total_cmp).1;
+    state.log_scale + median
+}
