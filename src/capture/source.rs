@@ -253,10 +253,9 @@ pub fn open(
         SourceName::Simulator { scene } => {
             let mut params = params.simulator.clone();
             if let Some(scene) = scene {
-                params.scene = scene.parse().map_err(|problem: &str| SourceError::Name {
-                    name: name.to_string(),
-                    problem: problem.to_owned(),
-                })?;
+                params = params.with_scene(scene.parse().map_err(|problem: &str| {
+                    SourceError::Name { name: name.to_string(), problem: problem.to_owned() }
+                })?);
             }
             Ok(Box::new(Simulator::unpainted(params)?))
         }

@@ -40,6 +40,10 @@ enum Scene {
     Plane,
     /// A corridor of 24 x 2.4 x 2.6 m
     Corridor,
+    /// Four furnished rooms about a corridor, walked through twice
+    Flat,
+    /// Two rooms exactly alike on a corridor that repeats
+    Twins,
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
@@ -261,8 +265,9 @@ fn params(configured: &SimulatorParams, args: &SimulateArgs) -> SimulatorParams 
         Scene::Room => SceneKind::Room,
         Scene::Plane => SceneKind::Plane,
         Scene::Corridor => SceneKind::Corridor,
+        Scene::Flat => SceneKind::Flat,
+        Scene::Twins => SceneKind::Twins,
     });
-    set(&mut params.scene, &scene);
     set(&mut params.seed, &args.seed);
     set(&mut params.frames, &args.frames);
     set(&mut params.rate_hz, &args.rate);
@@ -290,5 +295,9 @@ fn params(configured: &SimulatorParams, args: &SimulateArgs) -> SimulatorParams 
     set(&mut params.sensor.exposure_ms, &sensor.exposure);
     set(&mut params.sensor.row_time_us, &sensor.row_time);
     set(&mut params.sensor.distortion, &sensor.distortion);
-    params
+    // Last: the length of a route is that at the speed and rate.
+    match scene {
+        Some(scene) => params.with_scene(scene),
+        None => params,
+    }
 }

@@ -1,15 +1,16 @@
-//! The scenes: a furnished room, a plane, a corridor.
+//! The scenes: a furnished room, a plane, a corridor; [`flat`](crate::capture::simulator::flat) has those with rooms.
 
 use std::f32::consts::FRAC_PI_2;
 
 use crate::capture::simulator::params::SceneKind;
 use crate::capture::simulator::pattern::Pattern;
 use crate::capture::simulator::scene::{Block, Builder, Cover, Scene, Stage};
+use crate::capture::simulator::{flat, twins};
 
 /// Builds a scene and paints its textures, in parallel on the current rayon pool.
 pub fn build(kind: SceneKind, seed: u64) -> Scene {
-    let Furnished { blocks, lamp, stage } = furnish(kind, seed);
-    Scene::new(blocks, lamp, stage, seed)
+    let Furnished { blocks, stage } = furnish(kind, seed);
+    Scene::new(blocks, stage, seed)
 }
 
 /// A scene without its textures.
@@ -17,8 +18,6 @@ pub fn build(kind: SceneKind, seed: u64) -> Scene {
 pub struct Furnished {
     /// Everything that can be seen.
     pub blocks: Vec<Block>,
-    /// The lamp, metres.
-    pub lamp: [f32; 3],
     /// Where a camera may walk.
     pub stage: Stage,
 }
@@ -29,12 +28,14 @@ pub fn furnish(kind: SceneKind, seed: u64) -> Furnished {
         SceneKind::Room => room(seed),
         SceneKind::Plane => plane(seed),
         SceneKind::Corridor => corridor(seed),
+        SceneKind::Flat => flat::flat(seed),
+        SceneKind::Twins => twins::twins(seed),
     }
 }
 
 /// 6 × 5 × 3 m. The camera walks in the west half and looks east.
 fn room(seed: u64) -> Furnished {
-    let mut b = Builder::new(seed);
+    let mut b = Builder::new(seed, [2.8, 2.4, 2.75]);
     let wall = Cover::of(Pattern::Plaster);
     let paper = Cover::of(Pattern::Wallpaper).enlarged(1.5);
     let covers = [
@@ -59,8 +60,9 @@ fn room(seed: u64) -> Furnished {
         heading_swing_rad: 0.87,
         elevation_rad: -0.16,
         elevation_swing_rad: 0.12,
+        route: None,
     };
-    Furnished { blocks: b.blocks, lamp: [2.8, 2.4, 2.75], stage }
+    Furnished { blocks: b.blocks, stage }
 }
 
 /// Rug, low table and what lies on it, dining table with chairs.
@@ -158,7 +160,7 @@ fn room_west(b: &mut Builder) {
 }
 
 /// A framed picture on a wall that runs along `turn_rad`, centred on height `z`.
-fn picture(
+pub fn picture(
     b: &mut Builder,
     at: [f32; 2],
     z: f32,
@@ -177,7 +179,7 @@ fn picture(
 
 /// A large printed table top seen from above.
 fn plane(seed: u64) -> Furnished {
-    let mut b = Builder::new(seed);
+    let mut b = Builder::new(seed, [0.0, 0.0, 3.0]);
     b.place(
         [0.0, 0.0],
         -0.1,
@@ -193,13 +195,14 @@ fn plane(seed: u64) -> Furnished {
         heading_swing_rad: 0.5,
         elevation_rad: -1.25,
         elevation_swing_rad: 0.1,
+        route: None,
     };
-    Furnished { blocks: b.blocks, lamp: [0.0, 0.0, 3.0], stage }
+    Furnished { blocks: b.blocks, stage }
 }
 
 /// 24 × 2.4 × 2.6 m with doors, pictures and boxes along the walls.
 fn corridor(seed: u64) -> Furnished {
-    let mut b = Builder::new(seed);
+    let mut b = Builder::new(seed, [12.0, 1.2, 2.4]);
     let (length, width) = (24.0, 2.4);
     let wall = Cover::of(Pattern::Wallpaper).with_middle(0.54);
     let covers = [
@@ -237,6 +240,7 @@ fn corridor(seed: u64) -> Furnished {
         heading_swing_rad: 0.35,
         elevation_rad: -0.08,
         elevation_swing_rad: 0.08,
+        route: None,
     };
-    Furnished { blocks: b.blocks, lamp: [12.0, 1.2, 2.4], stage }
+    Furnished { blocks: b.blocks, stage }
 }

@@ -29,17 +29,20 @@ use crate::slam::trajectory::StampedPose;
 
 mod canvas;
 mod cull;
+pub mod flat;
 pub mod furnish;
 pub mod lens;
 pub mod params;
 pub mod pattern;
 pub mod random;
 pub mod render;
+pub mod route;
 pub mod scene;
 pub mod sensor;
 pub mod summary;
 pub mod texture;
 pub mod trajectory;
+pub mod twins;
 
 /// Stamp of the first frame: one second, so that no reader takes it for a missing one.
 const FIRST_NANOS: i64 = 1_000_000_000;
@@ -308,3 +311,6 @@ impl FrameSource for Simulator {
 
 #[cfg(test)]
 mod tests;
+
+#[cfg(test)]
+mod route_tests;

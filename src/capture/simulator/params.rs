@@ -4,9 +4,13 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
+use crate::capture::simulator::furnish::furnish;
 use crate::slam::geometry::camera_model::{CameraModel, Distortion};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::parameter::{ParameterError, check_range};
+
+/// Most frames of a sequence: an hour and more at 25 Hz.
+const MAX_FRAMES: usize = 100_000;
 
 /// Which scene is seen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -18,6 +22,10 @@ pub enum SceneKind {
     Plane,
     /// A corridor of 24 × 2.4 × 2.6 m.
     Corridor,
+    /// Four furnished rooms about a corridor, 9 × 10 × 2.7 m, walked through in rounds.
+    Flat,
+    /// Two rooms that are exactly alike on a corridor that repeats, 13.8 × 5.8 × 2.7 m.
+    Twins,
 }
 
 impl FromStr for SceneKind {
@@ -28,7 +36,9 @@ impl FromStr for SceneKind {
             "room" => Ok(Self::Room),
             "plane" => Ok(Self::Plane),
             "corridor" => Ok(Self::Corridor),
-            _ => Err("unknown scene; scenes are room, plane and corridor"),
+            "flat" => Ok(Self::Flat),
+            "twins" => Ok(Self::Twins),
+            _ => Err("unknown scene; scenes are room, plane, corridor, flat and twins"),
         }
     }
 }
@@ -113,7 +123,8 @@ pub struct SimulatorParams {
     pub scene: SceneKind,
     /// Chooses textures, path and noise.
     pub seed: u64,
-    /// Number of frames; all are kept in memory (307 kB each at 640 × 480).
+    /// Number of frames; all are kept in memory (307 kB each at 640 × 480). A scene that is named where this is
+    /// the default is shown as a whole, see [`SimulatorParams::with_scene`].
     pub frames: usize,
     /// Frames a second.
     pub rate_hz: f64,
@@ -155,9 +166,24 @@ impl SimulatorParams {
         Self { width: width / 2, height: height / 2, focal_px: 0.5 * focal_px, ..Self::default() }
     }
 
+    /// The same of another scene. One with a route, as the flat, is walked through as often as shows all there is,
+    /// unless a number of frames other than the default is asked for.
+    pub fn with_scene(mut self, scene: SceneKind) -> Self {
+        self.scene = scene;
+        let stage = furnish(scene, self.seed).stage;
+        let speed = self.motion.mean_speed_m_s;
+        if let (Some(route), true) = (stage.route, self.frames == Self::default().frames) {
+            let duration_s = route.rounds as f64 * route.length_m() / speed;
+            // Out of range for a camera that hardly moves.
+            let frames = (duration_s * self.rate_hz).clamp(1.0, MAX_FRAMES as f64);
+            self.frames = frames.ceil() as usize;
+        }
+        self
+    }
+
     /// Refuses values that cannot be simulated; names the key and what is allowed.
     pub fn validate(&self) -> Result<(), ParameterError> {
-        check_range("frames", self.frames, 1..=100_000)?;
+        check_range("frames", self.frames, 1..=MAX_FRAMES)?;
         check_range("rate_hz", self.rate_hz, 1.0..=1000.0)?;
         check_range("width", self.width, 16..=4096)?;
         check_range("height", self.height, 16..=4096)?;

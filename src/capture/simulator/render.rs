@@ -262,7 +262,7 @@ impl Renderer<'_> {
             1 => [-sin * outward, cos * outward, 0.0],
             _ => [0.0, 0.0, outward],
         };
-        255.0 * reflectance * self.scene.light(in_world, normal)
+        255.0 * reflectance * block.light(in_world, normal)
     }
 }
 

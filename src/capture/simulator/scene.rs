@@ -2,6 +2,7 @@
 
 use crate::capture::simulator::pattern::{PATTERNS, Pattern, TEXTURE_SIZE, paint_all};
 use crate::capture::simulator::random::Stream;
+use crate::capture::simulator::route::Route;
 use crate::capture::simulator::texture::Texture;
 
 /// Texels a metre of a surface that is not made to measure: 2 mm a texel.
@@ -35,46 +36,11 @@ pub struct Block {
     pub faces: [Face; 6],
     /// A room: seen from inside.
     pub is_hollow: bool,
-}
-
-/// The free space of a scene: the ellipsoid a camera's path stays in, and where it looks.
-#[derive(Debug, Clone, Copy)]
-pub struct Stage {
-    /// Centre of the path, metres.
-    pub centre: [f64; 3],
-    /// Half axes of the path, metres.
-    pub reach: [f64; 3],
-    /// Where on its round the path starts: a range of phases, radians.
-    pub start_rad: (f64, f64),
-    /// Mean heading (about the vertical from +x towards +y), radians.
-    pub heading_rad: f64,
-    /// How far the heading swings to either side, radians.
-    pub heading_swing_rad: f64,
-    /// Mean elevation of the optical axis, radians, negative looks down.
-    pub elevation_rad: f64,
-    /// How far the elevation swings, radians.
-    pub elevation_swing_rad: f64,
-}
-
-/// Blocks, their textures and their light. The world is z up, in metres.
-#[derive(Debug, Clone)]
-pub struct Scene {
-    /// Everything that can be seen.
-    pub blocks: Vec<Block>,
-    /// What the faces refer to.
-    pub textures: Vec<Texture>,
-    /// The lamp, metres.
+    /// The lamp of its room, metres: light does not pass through walls.
     pub lamp: [f32; 3],
-    /// Where a camera may walk.
-    pub stage: Stage,
 }
 
-impl Scene {
-    /// A scene of blocks with freshly painted textures.
-    pub fn new(blocks: Vec<Block>, lamp: [f32; 3], stage: Stage, seed: u64) -> Self {
-        Self { blocks, textures: paint_all(seed), lamp, stage }
-    }
-
+impl Block {
     /// Light that falls on a point with this normal, as a factor on reflectance. It depends on
     /// nothing but the place, so a surface has one brightness from wherever it is seen.
     #[inline]
@@ -95,6 +61,45 @@ impl Scene {
     }
 }
 
+/// The free space of a scene: the ellipsoid a camera's path stays in, and where it looks.
+#[derive(Debug, Clone, Copy)]
+pub struct Stage {
+    /// Centre of the path, metres.
+    pub centre: [f64; 3],
+    /// Half axes of the path, metres.
+    pub reach: [f64; 3],
+    /// Where on its round the path starts: a range of phases, radians.
+    pub start_rad: (f64, f64),
+    /// Mean heading (about the vertical from +x towards +y), radians.
+    pub heading_rad: f64,
+    /// How far the heading swings to either side, radians.
+    pub heading_swing_rad: f64,
+    /// Mean elevation of the optical axis, radians, negative looks down.
+    pub elevation_rad: f64,
+    /// How far the elevation swings, radians.
+    pub elevation_swing_rad: f64,
+    /// Where a handheld camera walks instead of within the ellipsoid.
+    pub route: Option<&'static Route>,
+}
+
+/// Blocks, their textures and their light. The world is z up, in metres.
+#[derive(Debug, Clone)]
+pub struct Scene {
+    /// Everything that can be seen.
+    pub blocks: Vec<Block>,
+    /// What the faces refer to.
+    pub textures: Vec<Texture>,
+    /// Where a camera may walk.
+    pub stage: Stage,
+}
+
+impl Scene {
+    /// A scene of blocks with freshly painted textures.
+    pub fn new(blocks: Vec<Block>, stage: Stage, seed: u64) -> Self {
+        Self { blocks, textures: paint_all(seed), stage }
+    }
+}
+
 /// Puts blocks into a scene, each with its own cut of the textures.
 #[derive(Debug)]
 pub struct Builder {
@@ -102,6 +107,10 @@ pub struct Builder {
     pub blocks: Vec<Block>,
     /// Random choices of the scene.
     pub stream: Stream,
+    /// Where the origin of the places that are given lies in the world, metres.
+    pub origin: [f32; 2],
+    /// The lamp of what is placed, metres in the world.
+    pub lamp: [f32; 3],
 }
 
 /// How a block is covered.
@@ -140,9 +149,9 @@ impl Cover {
 }
 
 impl Builder {
-    /// An empty scene.
-    pub fn new(seed: u64) -> Self {
-        Self { blocks: Vec::new(), stream: Stream::new(seed, 0x5CE7) }
+    /// An empty scene with one lamp.
+    pub fn new(seed: u64, lamp: [f32; 3]) -> Self {
+        Self { blocks: Vec::new(), stream: Stream::new(seed, 0x5CE7), origin: [0.0; 2], lamp }
     }
 
     /// A face cut at random from a pattern.
@@ -162,11 +171,12 @@ impl Builder {
     pub fn place(&mut self, at: [f32; 2], base: f32, size: [f32; 3], turn_rad: f32, cover: Cover) {
         let faces = std::array::from_fn(|_| self.face(cover));
         self.blocks.push(Block {
-            centre: [at[0], at[1], base + 0.5 * size[2]],
+            centre: [self.origin[0] + at[0], self.origin[1] + at[1], base + 0.5 * size[2]],
             half: [0.5 * size[0], 0.5 * size[1], 0.5 * size[2]],
             turn: turn_rad.sin_cos(),
             faces,
             is_hollow: false,
+            lamp: self.lamp,
         });
     }
 
@@ -174,7 +184,9 @@ impl Builder {
     pub fn shell(&mut self, size: [f32; 3], covers: [Cover; 6]) {
         let faces = covers.map(|cover| self.face(cover));
         let half = size.map(|s| 0.5 * s);
-        self.blocks.push(Block { centre: half, half, turn: (0.0, 1.0), faces, is_hollow: true });
+        let lamp = self.lamp;
+        let turn = (0.0, 1.0);
+        self.blocks.push(Block { centre: half, half, turn, faces, is_hollow: true, lamp });
     }
 
     /// A table, chair seat or shelf board on four legs.

@@ -30,7 +30,7 @@ fn play(mut source: Simulator) -> (Vec<u8>, Vec<FrameStamp>) {
 }
 
 /// Distance from a point to the surface of a block.
-fn distance(block: &Block, point: &Vector3<f64>) -> f64 {
+pub fn distance(block: &Block, point: &Vector3<f64>) -> f64 {
     let (sin, cos) = (f64::from(block.turn.0), f64::from(block.turn.1));
     let d = point - Vector3::from(block.centre.map(f64::from));
     let local = [cos * d.x + sin * d.y, cos * d.y - sin * d.x, d.z];
@@ -176,7 +176,9 @@ fn rectified_frames(source: &mut Simulator, wanted: &[usize]) -> Vec<Vec<u8>> {
 
 #[test]
 fn exact_depth_and_poses_carry_one_frame_into_another() {
-    for scene in [SceneKind::Room, SceneKind::Plane, SceneKind::Corridor] {
+    for scene in
+        [SceneKind::Room, SceneKind::Plane, SceneKind::Corridor, SceneKind::Flat, SceneKind::Twins]
+    {
         let mut source =
             Simulator::new(noiseless(SimulatorParams { scene, ..Default::default() })).unwrap();
         let frames = rectified_frames(&mut source, &[100, 101, 105, 120]);

@@ -1,9 +1,10 @@
-//! Camera paths: sums of sinusoids with incommensurate periods, smooth in every derivative.
+//! Camera paths: sums of sinusoids with incommensurate periods, smooth in every derivative, or rounds on a route.
 
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 
 use crate::capture::simulator::params::{MotionKind, MotionParams};
 use crate::capture::simulator::random::Stream;
+use crate::capture::simulator::route::{Route, RoutePose};
 use crate::capture::simulator::scene::Stage;
 use crate::slam::geometry::se3::SE3;
 
@@ -35,30 +36,40 @@ fn sum(waves: &[Wave], phase: f64) -> f64 {
 #[derive(Debug, Clone)]
 pub struct Trajectory {
     stage: Stage,
+    /// What is walked along instead, and the seed of its rounds.
+    route: Option<(&'static Route, u64)>,
     /// Offsets from the stage's centre along x, y, z; functions of the walking phase.
     walk: [Vec<Wave>; 3],
     /// Heading, elevation and roll about their means; functions of the turning phase.
     turn: [Vec<Wave>; 3],
     /// Tremor of x, y, z (metres) and heading, elevation, roll (radians); functions of time.
     tremor: [Vec<Wave>; 6],
-    /// Walking phase a second.
+    /// Walking phase a second; on a route, waypoints a second.
     walk_rate: f64,
     /// Turning phase a second.
     turn_rate: f64,
 }
 
 impl Trajectory {
-    /// A path through the stage, paced so that mean speed and turning are as asked.
+    /// A path through the stage, paced so that mean speed and turning are as asked. A route has turns of its own,
+    /// and the mean speed holds over a round.
     pub fn new(stage: Stage, motion: &MotionParams, seed: u64) -> Self {
         let mut stream = Stream::new(seed, 0x7247);
+        let route = stage.route.filter(|_| motion.kind == MotionKind::Handheld);
         let mut path = Self {
             stage,
+            route: route.map(|route| (route, seed)),
             walk: walk_waves(&stage, motion.kind, &mut stream),
             turn: turn_waves(&stage, motion.kind, &mut stream),
             tremor: tremor_waves(motion, &mut stream),
             walk_rate: 0.0,
             turn_rate: 0.0,
         };
+        if let Some(route) = route {
+            path.walk_rate =
+                motion.mean_speed_m_s * route.waypoints.len() as f64 / route.length_m();
+            return path;
+        }
         path.walk_rate = pace(motion.mean_speed_m_s, |rate| {
             Self { walk_rate: rate, ..path.clone() }.mean_rates().0
         });
@@ -70,14 +81,25 @@ impl Trajectory {
     /// The camera pose at `time_s` from the start of the sequence, metres.
     pub fn world_from_camera(&self, time_s: f64) -> SE3 {
         let (walk, turn) = (self.walk_rate * time_s, self.turn_rate * time_s);
-        let centre = self.stage.centre;
-        let place = |k: usize| centre[k] + sum(&self.walk[k], walk) + sum(&self.tremor[k], time_s);
-        let angle = |k: usize| sum(&self.turn[k], turn) + sum(&self.tremor[3 + k], time_s);
-        let heading = self.stage.heading_rad + angle(0);
-        let elevation = self.stage.elevation_rad + angle(1);
+        let RoutePose { place, angles: [heading, elevation] } = match self.route {
+            Some((route, seed)) => route.at(walk, seed),
+            None => {
+                let offset = |k: usize| sum(&self.walk[k], walk);
+                RoutePose {
+                    place: Vector3::from(self.stage.centre)
+                        + Vector3::new(offset(0), offset(1), offset(2)),
+                    angles: [
+                        self.stage.heading_rad + sum(&self.turn[0], turn),
+                        self.stage.elevation_rad + sum(&self.turn[1], turn),
+                    ],
+                }
+            }
+        };
+        let tremor = |k: usize| sum(&self.tremor[k], time_s);
+        let roll = sum(&self.turn[2], turn) + tremor(5);
         SE3 {
-            rotation: looking(heading, elevation, angle(2)),
-            translation: Vector3::new(place(0), place(1), place(2)),
+            rotation: looking(heading + tremor(3), elevation + tremor(4), roll),
+            translation: place + Vector3::new(tremor(0), tremor(1), tremor(2)),
         }
     }
 
@@ -120,7 +142,7 @@ fn pace(target: f64, measure: impl Fn(f64) -> f64) -> f64 {
 
 /// Rotation of a camera (x right, y down, z forward) in a z-up world that looks along `heading`
 /// (about the vertical, from +x towards +y) and `elevation` (upwards), rolled clockwise.
-fn looking(heading: f64, elevation: f64, roll: f64) -> UnitQuaternion<f64> {
+pub fn looking(heading: f64, elevation: f64, roll: f64) -> UnitQuaternion<f64> {
     let forward = Vector3::new(
         heading.cos() * elevation.cos(),
         heading.sin() * elevation.cos(),
