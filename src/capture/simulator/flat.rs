@@ -75,14 +75,14 @@ static ROUND: [Waypoint; 43] = [
     waypoint(1.0, 8.0, 242.0, -9.0),
     waypoint(1.2, 7.2, 265.0, -8.0),
     waypoint(1.3, 6.5, 278.0, -7.0),
-    waypoint(1.3, 5.8, 290.0, -7.0),
-    // The corridor.
-    waypoint(1.6, 5.1, 305.0, -7.0),
-    waypoint(2.2, 4.9, 315.0, -8.0),
-    waypoint(2.8, 4.5, 300.0, -8.0),
-    waypoint(3.0, 3.9, 280.0, -8.0),
+    waypoint(1.3, 5.8, 286.0, -7.0),
+    // The corridor, looking through the door of A.
+    waypoint(1.6, 5.1, 298.0, -8.0),
+    waypoint(2.2, 5.0, 304.0, -9.0),
+    waypoint(2.8, 4.6, 290.0, -9.0),
+    waypoint(3.0, 3.9, 274.0, -9.0),
     // A again.
-    waypoint(3.1, 3.4, 265.0, -8.0),
+    waypoint(3.1, 3.4, 264.0, -9.0),
 ];
 
 static ROUTE: Route = Route { waypoints: &ROUND, turn_deg: 360.0, height_m: 1.4, rounds: 2 };
@@ -121,8 +121,7 @@ pub fn flat(seed: u64) -> Furnished {
     enclose(&mut b, ROOMS_M[2], ROOM_M, [paper, tiles, plaster, tiles, print, plaster], &doors_c);
     kitchen(&mut b);
     let doors_d = [Door::new(Side::East, 1.5, 2.5), Door::new(Side::South, 0.8, 1.8)];
-    let dark = plaster.with_middle(0.44);
-    let covers = [brick.with_middle(0.44), fabric, dark, dark, planks.enlarged(0.7), plaster];
+    let covers = [brick.with_middle(0.44), fabric, paper, plaster, planks.enlarged(0.7), plaster];
     enclose(&mut b, ROOMS_M[3], ROOM_M, covers, &doors_d);
     study(&mut b);
     let doors = [
@@ -131,7 +130,7 @@ pub fn flat(seed: u64) -> Furnished {
         Door::new(Side::North, 0.8, 1.8),
         Door::new(Side::North, 5.2, 6.2),
     ];
-    let covers = [paper, paper, fabric.with_middle(0.55), brick, carpet.enlarged(0.7), plaster];
+    let covers = [paper, paper, paper.enlarged(0.7), brick, carpet.enlarged(0.7), plaster];
     enclose(&mut b, CORRIDOR_M.0, CORRIDOR_M.1, covers, &doors);
     corridor(&mut b);
     Furnished { blocks: b.blocks, stage: stage(&ROUTE) }
@@ -367,6 +366,8 @@ fn corridor(b: &mut Builder) {
     b.place([3.4, 1.42], 0.0, [0.9, 0.3, 0.8], 0.0, wood.with_middle(0.6));
     b.stack([3.2, 1.42], 0.8, &[[0.2, 0.2, 0.25]], Cover::of(Pattern::Cardboard));
     b.stack([8.6, 1.25], 0.0, &[[0.5, 0.4, 0.5], [0.4, 0.3, 0.3]], Cover::of(Pattern::Cardboard));
+    b.place([0.9, 0.2], 0.0, [0.5, 0.3, 0.7], 0.0, Cover::of(Pattern::Planks).enlarged(0.4));
+    b.stack([2.1, 0.2], 0.0, &[[0.4, 0.3, 0.4], [0.3, 0.3, 0.3]], Cover::of(Pattern::Cover));
     b.place([0.3, 0.3], 0.0, [0.04, 0.04, 1.7], 0.4, wood.with_middle(0.3));
     b.place([0.3, 0.3], 1.0, [0.35, 0.3, 0.6], 0.4, Cover::of(Pattern::Fabric));
     for x in [1.0, 3.0, 5.0, 7.0] {
