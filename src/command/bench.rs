@@ -1,7 +1,11 @@
-//! `semidense bench latency`: the latency of poses, idle and under load.
+//! `semidense bench`: the latency of poses, idle and under load, and how a long run goes on.
 
 use std::ffi::OsString;
+use std::io::Write;
+use std::ops::RangeInclusive;
+use std::path::PathBuf;
 use std::process::ExitCode;
+use std::time::Duration;
 
 use clap::{Args, Subcommand, ValueEnum};
 
@@ -9,11 +13,14 @@ use crate::capture::source::SourceName;
 use crate::command::print::{note, print};
 use crate::command::run_progress::start_display;
 use crate::command::{CommandResult, CommonArguments, INTERRUPTED};
+use crate::service::atomic_file::write_atomically;
 use crate::service::config::Config;
 use crate::service::error_log::ErrorLog;
 use crate::service::latency_bench::{Disturbance, Measurement, Trial, TrialError, try_out};
+use crate::service::mode::Mode;
 use crate::service::results::times::Percentiles;
 use crate::service::shutdown::Shutdown;
+use crate::service::soak_bench::{Sample, Soak, Trend, csv, soak, trends};
 
 /// Measure performance on this machine
 #[derive(Debug, Args)]
@@ -25,6 +32,7 @@ pub struct BenchArguments {
 #[derive(Debug, Subcommand)]
 enum Bench {
     Latency(LatencyArguments),
+    Soak(SoakArguments),
 }
 
 /// Load next to the pipeline.
@@ -79,8 +87,39 @@ pub struct LatencyArguments {
     json: bool,
 }
 
+/// Run a source back and forth for long and report memory, time per frame and keyframes over time
+///
+/// The table has each quantity's mean over the second and the last quarter of the run, and the slope per hour
+/// after the first quarter.
+#[derive(Debug, Args)]
+pub struct SoakArguments {
+    /// Source to play back and forth; of the default flat the first 2000 frames, a round
+    #[arg(long, value_name = "SOURCE", default_value = "sim:flat")]
+    source: OsString,
+    /// Number of frames; 108000 are an hour at 30 Hz
+    #[arg(long, value_name = "N", default_value_t = 108_000)]
+    frames: u64,
+    /// Frames per second
+    #[arg(long, value_name = "HZ", default_value_t = 30.0)]
+    fps: f64,
+    /// Process every frame in order, as fast as possible, instead of live
+    #[arg(long)]
+    lockstep: bool,
+    /// Time from one sample to the next in seconds
+    #[arg(long, value_name = "SECONDS", default_value_t = 10.0)]
+    every: f64,
+    /// File for the samples as comma-separated values
+    #[arg(long, value_name = "FILE")]
+    csv: Option<PathBuf>,
+    /// Print the trends as JSON
+    #[arg(long)]
+    json: bool,
+}
+
 /// Most frames of a trial: a day at 60 Hz; poses are kept until its end.
 const MAX_FRAMES: f64 = 5_184_000.0;
+/// Rates at which a source can be repeated.
+const RATES_HZ: RangeInclusive<f64> = 0.01..=10_000.0;
 
 /// Runs it.
 pub fn run(
@@ -89,7 +128,75 @@ pub fn run(
     log: &ErrorLog,
     arguments: BenchArguments,
 ) -> CommandResult {
-    let Bench::Latency(arguments) = arguments.what;
+    match arguments.what {
+        Bench::Latency(arguments) => run_latency(config, common, log, &arguments),
+        Bench::Soak(arguments) => run_soak(config, common, log, &arguments),
+    }
+}
+
+fn run_soak(
+    config: &Config,
+    common: &CommonArguments,
+    log: &ErrorLog,
+    arguments: &SoakArguments,
+) -> CommandResult {
+    /// From a sample with each report of the processes to one an hour.
+    const PERIODS_S: RangeInclusive<f64> = 1.0..=3600.0;
+    let (frames, rate_hz) = (arguments.frames, arguments.fps);
+    if !(1..=MAX_FRAMES as u64).contains(&frames) {
+        return Err(format!("--frames {frames}: choose 1 to {MAX_FRAMES}").into());
+    }
+    if !RATES_HZ.contains(&rate_hz) {
+        return Err(format!("--fps {rate_hz}: choose {RATES_HZ:?}").into());
+    }
+    if !PERIODS_S.contains(&arguments.every) {
+        return Err(format!("--every {}: choose {PERIODS_S:?} seconds", arguments.every).into());
+    }
+    let mode = if arguments.lockstep { Mode::Lockstep } else { Mode::Live };
+    let period = Duration::from_secs_f64(arguments.every);
+    let source = SourceName::parse(&arguments.source)?;
+    let shutdown = Shutdown::install()?;
+    let display = start_display(arguments.json)?;
+    let options = common.without_instance().to_arguments();
+    let soaked = Soak { frames, rate_hz, mode, period };
+    let samples =
+        soak(config, &soaked, &source, &options, log, &shutdown, &mut |p| display.show(p));
+    display.finish();
+    let samples = samples?;
+    if let Some(path) = &arguments.csv {
+        write_atomically(path, |file| file.write_all(csv(&samples).as_bytes()))
+            .map_err(|error| format!("{}: cannot be written ({error})", path.display()))?;
+    }
+    let trends = trends(&samples);
+    print(&match arguments.json {
+        true => format!("{}\n", serde_json::to_string_pretty(&trends)?),
+        false => trend_table(&samples, &trends),
+    })?;
+    Ok(if shutdown.is_requested() { ExitCode::from(INTERRUPTED) } else { ExitCode::SUCCESS })
+}
+
+/// The trends as lines.
+fn trend_table(samples: &[Sample], trends: &[Trend]) -> String {
+    let Some(last) = samples.last().filter(|_| !trends.is_empty()) else {
+        return "too short for a trend: fewer than four samples\n".to_owned();
+    };
+    let mut lines = vec![
+        format!("{} frames, {} dropped, {:.0} s", last.frames, last.dropped, last.seconds),
+        format!("{:16} {:>14} {:>14} {:>14}", "", "second quarter", "last quarter", "per hour"),
+    ];
+    lines.extend(trends.iter().map(|trend| {
+        let Trend { name, second_quarter, last_quarter, per_hour } = trend;
+        format!("{name:16} {second_quarter:>14.2} {last_quarter:>14.2} {per_hour:>+14.2}")
+    }));
+    lines.join("\n") + "\n"
+}
+
+fn run_latency(
+    config: &Config,
+    common: &CommonArguments,
+    log: &ErrorLog,
+    arguments: &LatencyArguments,
+) -> CommandResult {
     let frames = (arguments.fps * arguments.seconds).round();
     if !(1.0..=MAX_FRAMES).contains(&frames) {
         return Err(format!(

@@ -152,8 +152,6 @@ pub fn try_out(
     shutdown: &Shutdown,
     observe: &mut dyn FnMut(&RunProgress),
 ) -> Result<Measurement, TrialError> {
-    let mut config = config.clone();
-    config.instance = format!("bench-{}", std::process::id());
     let mut settings = Vec::new();
     if trial.real_time {
         settings.extend(REAL_TIME);
@@ -161,25 +159,9 @@ pub fn try_out(
     if trial.disturbance == Disturbance::SaturatedMapper {
         settings.extend(SATURATED_MAPPER);
     }
-    let options = RunOptions {
-        source: SourceName::Looped {
-            num_frames: trial.frames,
-            rate_hz: trial.rate_hz,
-            inner: Box::new(source.clone()),
-        },
-        rig: None,
-        mode: Mode::Live,
-        output: PathBuf::new(),
-        keeps_map: false,
-        journal: None,
-        log: log.clone(),
-        arguments: arguments
-            .iter()
-            .cloned()
-            .chain(["--instance".into(), config.instance.clone().into()])
-            .chain(settings.iter().flat_map(|&set| ["--set".into(), set.into()]))
-            .collect(),
-    };
+    let (config, mut options) =
+        bench_options(config, trial.frames, trial.rate_hz, source, arguments, log);
+    options.arguments.extend(settings.iter().flat_map(|&set| ["--set".into(), set.into()]));
     let place = Place::new(&config.instance, &config.root)?;
     let disturber = Disturber::start(trial.disturbance, &place).map_err(TrialError::Thread)?;
     let stolen_before = stolen_ms();
@@ -192,6 +174,31 @@ pub fn try_out(
         Ended::Interrupted => Err(TrialError::Interrupted),
         Ended::Failed(cause) => Err(TrialError::Ended(cause.clone())),
     }
+}
+
+/// A run of a repeated source under an instance of its own, without results.
+pub(super) fn bench_options(
+    config: &Config,
+    num_frames: u64,
+    rate_hz: f64,
+    source: &SourceName,
+    arguments: &[OsString],
+    log: &ErrorLog,
+) -> (Config, RunOptions) {
+    let mut config = config.clone();
+    config.instance = format!("bench-{}", std::process::id());
+    let instance = ["--instance".into(), config.instance.clone().into()];
+    let options = RunOptions {
+        source: SourceName::Looped { num_frames, rate_hz, inner: Box::new(source.clone()) },
+        rig: None,
+        mode: Mode::Live,
+        output: PathBuf::new(),
+        keeps_map: false,
+        journal: None,
+        log: log.clone(),
+        arguments: arguments.iter().cloned().chain(instance).collect(),
+    };
+    (config, options)
 }
 
 fn measurement(trial: &Trial, outcome: &RunOutcome, stolen_ms: Option<f64>) -> Measurement {

@@ -40,6 +40,7 @@ pub mod run_error;
 pub mod run_progress;
 pub mod schedule;
 pub mod shutdown;
+pub mod soak_bench;
 pub mod supervised;
 pub mod supervisor;
 pub mod tracker;

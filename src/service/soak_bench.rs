@@ -1,0 +1,316 @@
+//! A long run under watch: memory of the processes, time per frame and keyframes, over time.
+
+use std::ffi::OsString;
+use std::fmt::Write;
+use std::time::{Duration, Instant};
+
+use serde::Serialize;
+
+use crate::capture::source::SourceName;
+use crate::service::config::Config;
+use crate::service::error_log::ErrorLog;
+use crate::service::health::percentile_ms;
+use crate::service::latency_bench::{TrialError, bench_options};
+use crate::service::mode::Mode;
+use crate::service::peers::{HEALTH_TOPICS, Peer};
+use crate::service::run_progress::RunProgress;
+use crate::service::shutdown::Shutdown;
+use crate::service::supervisor::{Ended, run};
+use crate::wire::message::{HISTOGRAM_BUCKETS, HealthMessage};
+use crate::wire::place::Place;
+use crate::wire::port::{Access, Hub};
+
+/// Places in [`HEALTH_TOPICS`].
+const TRACKER: usize = 1;
+const MAPPER: usize = 2;
+const BYTES_PER_MEGABYTE: f64 = 1e6;
+
+/// A run to be watched.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Soak {
+    /// Frames.
+    pub frames: u64,
+    /// Frames in a second.
+    pub rate_hz: f64,
+    /// Live or lockstep.
+    pub mode: Mode,
+    /// Time from one sample to the next.
+    pub period: Duration,
+}
+
+/// How the processes were at one instant, and the times of the frames since the sample before.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
+pub struct Sample {
+    /// From the first frame, seconds.
+    pub seconds: f64,
+    /// Frames that the tracker has had.
+    pub frames: u64,
+    /// Frames without a pose: a newer one had come.
+    pub dropped: u64,
+    /// Keyframes with image and depth.
+    pub keyframes: u64,
+    /// Time of the tracker on a frame, milliseconds.
+    pub track_p50_ms: f64,
+    /// 99 of 100 are not longer.
+    pub track_p99_ms: f64,
+    /// Time of the mapper on a frame.
+    pub map_p50_ms: f64,
+    /// 99 of 100 are not longer.
+    pub map_p99_ms: f64,
+    /// CPU time of a joint estimate.
+    pub adjust_p50_ms: f64,
+    /// 99 of 100 are not longer.
+    pub adjust_p99_ms: f64,
+    /// Resident memory of the processes without what they share, megabytes.
+    pub capture_mb: f64,
+    /// Of the tracker.
+    pub tracker_mb: f64,
+    /// Of the mapper.
+    pub mapper_mb: f64,
+    /// Of the process that watches and keeps the record of all poses.
+    pub supervisor_mb: f64,
+}
+
+/// A column of the samples.
+type Column = (&'static str, fn(&Sample) -> f64);
+
+/// The columns whose trend is reported.
+const COLUMNS: [Column; 11] = [
+    ("keyframes", |s| s.keyframes as f64),
+    ("track_p50_ms", |s| s.track_p50_ms),
+    ("track_p99_ms", |s| s.track_p99_ms),
+    ("map_p50_ms", |s| s.map_p50_ms),
+    ("map_p99_ms", |s| s.map_p99_ms),
+    ("adjust_p50_ms", |s| s.adjust_p50_ms),
+    ("adjust_p99_ms", |s| s.adjust_p99_ms),
+    ("capture_mb", |s| s.capture_mb),
+    ("tracker_mb", |s| s.tracker_mb),
+    ("mapper_mb", |s| s.mapper_mb),
+    ("supervisor_mb", |s| s.supervisor_mb),
+];
+
+/// How a quantity goes with time.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Trend {
+    /// Name of the column.
+    pub name: &'static str,
+    /// Mean of the second quarter of the samples: the first is warming up.
+    pub second_quarter: f64,
+    /// Mean of the last quarter.
+    pub last_quarter: f64,
+    /// Slope of the straight line through the last three quarters, for each hour.
+    pub per_hour: f64,
+}
+
+/// Runs it and returns the samples, also where it is interrupted.
+pub fn soak(
+    config: &Config,
+    soak: &Soak,
+    source: &SourceName,
+    arguments: &[OsString],
+    log: &ErrorLog,
+    shutdown: &Shutdown,
+    observe: &mut dyn FnMut(&RunProgress),
+) -> Result<Vec<Sample>, TrialError> {
+    let (config, mut options) =
+        bench_options(config, soak.frames, soak.rate_hz, source, arguments, log);
+    options.mode = soak.mode;
+    let place = Place::new(&config.instance, &config.root)?;
+    let mut watch = Watch::new(place, soak.period);
+    let outcome = run(&config, &options, shutdown, &mut |progress| {
+        observe(progress);
+        if matches!(progress, RunProgress::Running { .. }) {
+            watch.look();
+        }
+    })?;
+    match outcome.ended {
+        Ended::Finished | Ended::Interrupted => Ok(watch.samples),
+        Ended::Failed(cause) => Err(TrialError::Ended(cause)),
+    }
+}
+
+/// Who listens to the processes while they run.
+struct Watch {
+    place: Place,
+    period: Duration,
+    peers: Option<(Hub, [Peer; 3])>,
+    started: Option<Instant>,
+    next: Instant,
+    before: [Counts; 3],
+    samples: Vec<Sample>,
+}
+
+type Counts = [u64; HISTOGRAM_BUCKETS];
+
+impl Watch {
+    fn new(place: Place, period: Duration) -> Self {
+        let before = [[0; HISTOGRAM_BUCKETS]; 3];
+        let (peers, started) = (None, None);
+        Self { place, period, peers, started, next: Instant::now(), before, samples: Vec::new() }
+    }
+
+    /// Takes a sample where one is due; whoever cannot be heard yet is asked again at the next look.
+    fn look(&mut self) {
+        let started = *self.started.get_or_insert_with(Instant::now);
+        if self.peers.is_none() {
+            self.peers = listen(&self.place);
+        }
+        let Some((hub, peers)) = &mut self.peers else { return };
+        // What is to come to somebody who joined late is sent when connections are looked at.
+        let _ = hub;
+        let heard = peers.iter_mut().map(|peer| peer.update().ok().flatten().copied());
+        let heard: Option<Vec<HealthMessage>> = heard.collect();
+        let Some(heard) = heard.filter(|_| Instant::now() >= self.next) else { return };
+        self.next = Instant::now() + self.period;
+        let [tracker, mapper] = [TRACKER, MAPPER].map(|process| &heard[process]);
+        let counts = [tracker.work_counts, mapper.work_counts, mapper.adjustment_counts];
+        let times: Vec<[f64; 2]> =
+            counts.iter().zip(&self.before).map(|(now, before)| since(now, before)).collect();
+        self.before = counts;
+        let memory = |process: u32| resident_mb(&process.to_string());
+        self.samples.push(Sample {
+            seconds: started.elapsed().as_secs_f64(),
+            frames: tracker.frames,
+            dropped: tracker.dropped,
+            keyframes: mapper.total,
+            track_p50_ms: times[0][0],
+            track_p99_ms: times[0][1],
+            map_p50_ms: times[1][0],
+            map_p99_ms: times[1][1],
+            adjust_p50_ms: times[2][0],
+            adjust_p99_ms: times[2][1],
+            capture_mb: memory(heard[0].process_id),
+            tracker_mb: memory(tracker.process_id),
+            mapper_mb: memory(mapper.process_id),
+            supervisor_mb: resident_mb("self"),
+        });
+    }
+}
+
+fn listen(place: &Place) -> Option<(Hub, [Peer; 3])> {
+    let hub = Hub::join(place, "soak", Access::Observer).ok()?;
+    let peers: Vec<Peer> =
+        HEALTH_TOPICS.iter().map(|topic| Peer::open(&hub, topic).ok()).collect::<Option<_>>()?;
+    Some((hub, peers.try_into().ok()?))
+}
+
+/// Median and 99 of 100 of the times that were counted since; NaN where none was.
+fn since(now: &Counts, before: &Counts) -> [f64; 2] {
+    // A process that was started again counts from 0.
+    let counts = std::array::from_fn(|i| now[i].saturating_sub(before[i]));
+    [0.5, 0.99].map(|share| percentile_ms(&counts, share).unwrap_or(f64::NAN))
+}
+
+/// Resident anonymous memory of a process, megabytes; NaN where it is gone.
+fn resident_mb(process: &str) -> f64 {
+    const BYTES_PER_KB: f64 = 1024.0;
+    let status = std::fs::read_to_string(format!("/proc/{process}/status")).unwrap_or_default();
+    let line = status.lines().find_map(|line| line.strip_prefix("RssAnon:"));
+    let kilobytes = line.and_then(|line| line.split_whitespace().next()?.parse::<f64>().ok());
+    kilobytes.map_or(f64::NAN, |kilobytes| kilobytes * BYTES_PER_KB / BYTES_PER_MEGABYTE)
+}
+
+/// How each quantity goes with time; none of fewer than four samples.
+pub fn trends(samples: &[Sample]) -> Vec<Trend> {
+    let quarter = samples.len() / 4;
+    if quarter == 0 {
+        return Vec::new();
+    }
+    let (warm, last) = (&samples[quarter..], &samples[samples.len() - quarter..]);
+    let of = |(name, value): &Column| Trend {
+        name,
+        second_quarter: mean(&warm[..quarter], *value),
+        last_quarter: mean(last, *value),
+        per_hour: slope(warm, *value) * 3600.0,
+    };
+    COLUMNS.iter().map(of).collect()
+}
+
+/// Mean of the values that are numbers.
+fn mean(samples: &[Sample], value: fn(&Sample) -> f64) -> f64 {
+    let values = samples.iter().map(value).filter(|value| value.is_finite());
+    let (sum, count) = values.fold((0.0, 0.0), |(sum, count), value| (sum + value, count + 1.0));
+    sum / count
+}
+
+/// Slope of the straight line of least squares, for each second.
+fn slope(samples: &[Sample], value: fn(&Sample) -> f64) -> f64 {
+    let points = || {
+        let all = samples.iter().map(|sample| (sample.seconds, value(sample)));
+        all.filter(|(_, value)| value.is_finite())
+    };
+    let count = points().count() as f64;
+    let (seconds, values) = points().fold((0.0, 0.0), |(s, v), (x, y)| (s + x, v + y));
+    let (middle, level) = (seconds / count, values / count);
+    let (above, below) = points().fold((0.0, 0.0), |(above, below), (x, y)| {
+        (above + (x - middle) * (y - level), below + (x - middle) * (x - middle))
+    });
+    if below > 0.0 { above / below } else { 0.0 }
+}
+
+/// The samples as lines with commas, the first with the names of the columns; what is not known is left empty.
+pub fn csv(samples: &[Sample]) -> String {
+    let names = COLUMNS.map(|(name, _)| name).join(",");
+    let mut text = format!("seconds,frames,dropped,{names}\n");
+    for sample in samples {
+        let Sample { seconds, frames, dropped, .. } = sample;
+        // Writing to a string does not fail.
+        let _ = write!(text, "{seconds:.1},{frames},{dropped}");
+        for (_, value) in COLUMNS {
+            let value = value(sample);
+            let _ = if value.is_finite() { write!(text, ",{value:.3}") } else { write!(text, ",") };
+        }
+        text.push('\n');
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn samples() -> Vec<Sample> {
+        let sample = |k: u32| Sample {
+            seconds: 10.0 * f64::from(k),
+            frames: 300 * u64::from(k),
+            // 40 an hour, and flat.
+            keyframes: 40 * u64::from(k) / 360,
+            mapper_mb: 100.0 + 40.0 * 10.0 * f64::from(k) / 3600.0,
+            track_p50_ms: if k == 390 { f64::NAN } else { 3.0 },
+            ..Sample::default()
+        };
+        (0..400).map(sample).collect()
+    }
+
+    #[test]
+    fn what_grows_has_a_slope_and_what_is_flat_has_none() {
+        let trends = trends(&samples());
+        let of = |name: &str| *trends.iter().find(|trend| trend.name == name).unwrap();
+        assert!((of("mapper_mb").per_hour - 40.0).abs() < 1e-6, "{:?}", of("mapper_mb"));
+        assert!((of("keyframes").per_hour - 40.0).abs() < 1.0, "{:?}", of("keyframes"));
+        let track = of("track_p50_ms");
+        assert!(track.per_hour.abs() < 1e-9 && track.last_quarter == 3.0, "{track:?}");
+        assert!(of("mapper_mb").last_quarter > of("mapper_mb").second_quarter + 20.0);
+        assert_eq!(super::trends(&samples()[..3]), []);
+    }
+
+    #[test]
+    fn a_line_has_as_many_values_as_names_and_none_is_not_a_number() {
+        let text = csv(&samples());
+        let columns = text.lines().next().unwrap().split(',').count();
+        assert_eq!(text.lines().count(), 401);
+        assert!(text.lines().all(|line| line.split(',').count() == columns), "{text}");
+        assert!(!text.contains("NaN"));
+    }
+
+    #[test]
+    fn times_are_of_the_frames_since_the_sample_before() {
+        let (mut now, mut before) = ([0; HISTOGRAM_BUCKETS], [0; HISTOGRAM_BUCKETS]);
+        (now[10], before[10], now[20]) = (1000, 1000, 5);
+        let [median, _] = since(&now, &before);
+        assert!(median > percentile_ms(&before, 0.99).unwrap());
+        before[20] = 5;
+        assert!(since(&now, &before)[0].is_nan());
+        assert!(resident_mb("self") > 1.0 && resident_mb("none").is_nan());
+    }
+}
