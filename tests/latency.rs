@@ -1,4 +1,4 @@
-//! `semidense bench latency`: that its report is complete; what it measures is for people, not for a test.
+//! `semidense bench`: that its reports are complete; what it measures is for people, not for a test.
 
 #[allow(dead_code, reason = "every test uses its part of what they share")]
 mod support;
@@ -65,4 +65,29 @@ fn a_trial_without_frames_is_refused() {
     let ended = finish(rig.command(&["bench", "latency", "--seconds", "0"]));
     assert_eq!(ended.status.code(), Some(1));
     assert!(ended.stderr.contains("is 0 frames; choose 1 to"), "{}", ended.stderr);
+}
+
+#[test]
+fn a_soak_reports_every_trend_and_its_samples() {
+    let rig = Rig::new();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("soak.csv");
+    let mut command = rig.command(&["bench", "soak", "--json", "--source", "sim"]);
+    command.args(["--frames", "300", "--every", "1", "--csv"]).arg(&path);
+    for setting in small_camera(40) {
+        command.args(["--set", &format!("simulator.{setting}")]);
+    }
+    let ended = finish(command);
+    assert!(ended.status.success(), "{}", ended.stderr);
+    assert_eq!(rig.leftovers(), Vec::<String>::new());
+    let trends: Vec<Value> = serde_json::from_str(&ended.stdout).unwrap();
+    let names: Vec<&str> = trends.iter().map(|trend| trend["name"].as_str().unwrap()).collect();
+    assert!(["keyframes", "track_p99_ms", "mapper_mb"].iter().all(|name| names.contains(name)));
+    let memory = trends.iter().find(|trend| trend["name"] == "mapper_mb").unwrap();
+    assert!(memory["last_quarter"].as_f64().unwrap() > 1.0, "{memory}");
+    let text = std::fs::read_to_string(path).unwrap();
+    let frames = |line: &str| line.split(',').nth(1).unwrap().parse::<u64>().unwrap();
+    let frames: Vec<u64> = text.lines().skip(1).map(frames).collect();
+    assert!(frames.len() >= 4 && frames.is_sorted(), "{text}");
+    assert!(*frames.last().unwrap() > 100, "{text}");
 }

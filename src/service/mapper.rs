@@ -294,7 +294,7 @@ impl<'a> Shell<'a> {
         let counters = self.health.counters();
         counters.frames += 1;
         counters.dropped = self.missing.saturating_add(self.pairing.dropped());
-        counters.total = mapper.map().keyframes.len() as u64;
+        counters.total = mapper.map().num_held() as u64;
         counters.detail = mapper.keyframe().map_or(0, |k| code_from_map_state(k.map_state));
         self.health.count_work(step_nanos);
         self.health.count_latency(step_nanos);

@@ -169,6 +169,11 @@ impl Map {
         self.keyframes.get(self.index_of(keyframe_id)?)
     }
 
+    /// Keyframes that have not been reduced to their poses.
+    pub fn num_held(&self) -> usize {
+        self.keyframes.iter().filter(|keyframe| !keyframe.image.is_empty()).count()
+    }
+
     /// Its place in the list: the newest are asked for most.
     pub fn index_of(&self, keyframe_id: u64) -> Option<usize> {
         self.keyframes.iter().rposition(|keyframe| keyframe.keyframe_id == keyframe_id)

@@ -18,6 +18,7 @@ mod resume;
 pub mod reuse;
 pub mod situation;
 mod start;
+mod thinning;
 pub(in crate::slam) mod turned_views;
 
 use std::collections::VecDeque;
@@ -52,6 +53,7 @@ use crate::slam::mapper::recovery::RecoveryParams;
 use crate::slam::mapper::reuse::ReuseParams;
 use crate::slam::mapper::situation::{Situation, StartFrame};
 use crate::slam::mapper::start::Start;
+use crate::slam::mapper::thinning::Thinning;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::{DegradedReason, NO_KEYFRAME, PoseEstimate, TrackingState};
 use crate::slam::two_frame::TwoFrameParams;
@@ -80,6 +82,9 @@ pub struct MapperParams {
     /// Most memory for images and depth of the keyframes of the map, megabytes: about 1.7 a keyframe at
     /// 640×480. Beyond it the oldest keep only their poses.
     pub max_map_megabytes: usize,
+    /// Keyframes with image and depth up to which all keep them. Where there are more, those whose points three others
+    /// show as well keep only their poses, so that a map of rooms that are seen over and over does not grow.
+    pub redundant_above: usize,
     /// At least so many frames lie between two keyframes.
     pub min_keyframe_interval: u64,
     /// Which filter estimates depth: `gaussian`, `interval` (sparse) or `both`. The Gaussian filter is
@@ -123,6 +128,7 @@ impl Default for MapperParams {
             max_past_frames: 40,
             publish_change_ratio: 0.2,
             max_map_megabytes: 512,
+            redundant_above: 120,
             min_keyframe_interval: 2,
             depth_filter: DepthFilter::default(),
             matching: MatchingParams::default(),
@@ -159,6 +165,7 @@ impl MapperParams {
         check_range("max_past_frames", self.max_past_frames, 1..=200)?;
         check_range("publish_change_ratio", self.publish_change_ratio, 0.0..=10.0)?;
         check_range("max_map_megabytes", self.max_map_megabytes, 16..=1_000_000)?;
+        check_range("redundant_above", self.redundant_above, 1..=1_000_000)?;
         check_range("min_keyframe_interval", self.min_keyframe_interval, 1..=1000)?;
         self.matching.validate().map_err(|e| e.within("matching"))?;
         self.line_noise.validate().map_err(|e| e.within("line_noise"))?;
@@ -229,6 +236,8 @@ pub struct Mapper {
     window: Option<Box<Window>>,
     /// Whether anybody has asked for them.
     is_estimated: bool,
+    /// Which keyframes others show as well.
+    thinning: Thinning,
     /// Whether the map has contradicted itself.
     doubt: Doubt,
     /// Frames that were tracked since it was given away.
@@ -273,6 +282,7 @@ impl Mapper {
             window: (params.window.num_free > 0)
                 .then(|| Box::new(Window::new(intrinsics, params.window.clone()))),
             is_estimated: false,
+            thinning: Thinning::default(),
             doubt: Doubt::None,
             tracked: Vec::new(),
             early: Vec::new(),

@@ -161,6 +161,7 @@ impl Mapper {
         if let Some(contradiction) = judge_change(unfinished.known, known, depth_ratio, params) {
             keyframe_changed |= self.contradict(contradiction);
         }
+        self.thin();
         StepOutcome { keyframe_changed, ..Default::default() }
     }
 

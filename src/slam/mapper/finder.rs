@@ -175,6 +175,15 @@ impl Finder {
         /// 65 µs each at 640×480.
         const MOST_AT_ONCE: usize = 100;
         let known = self.appearances.last().map(|(id, _)| *id);
+        // Those that keep only their poses are not looked for.
+        let mut held = keyframes.iter().filter(|of| of.has_depth()).map(|of| of.keyframe_id);
+        let mut next = held.next();
+        self.appearances.retain(|(id, _)| {
+            while next.is_some_and(|held| held < *id) {
+                next = held.next();
+            }
+            next == Some(*id)
+        });
         let new = keyframes.iter().filter(|keyframe| Some(keyframe.keyframe_id) > known);
         for keyframe in new.take(MOST_AT_ONCE) {
             let Intrinsics { width, height, .. } = keyframe.intrinsics;

@@ -1,0 +1,303 @@
+//! Redundant keyframes: one whose points several others show at least as well gives up image and depth, so that the map
+//! of rooms that are seen over and over stays as large as the rooms.
+//!
+//! Its pose stays and moves with that of a neighbour: frames that were tracked on it stay where they are in the map.
+
+use std::collections::BTreeSet;
+
+use nalgebra::Vector3;
+
+use crate::slam::depth::matching::is_inside;
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::sim3::Sim3;
+use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::map::{Correction, KeyframeCorrection, LogPlane, Map};
+use crate::slam::mapper::Mapper;
+
+/// Newest keyframes that are left alone: recovery looks at the last twenty, and estimates free the last seven.
+const NUM_NEWEST: usize = 24;
+/// Keyframes that are examined with each new one: more than are added, and about a millisecond.
+const NUM_EXAMINED: usize = 4;
+/// Keyframes that must show a point too: as many as an estimate needs to hold one in place, and one to spare.
+const NUM_OTHERS: usize = 3;
+/// Share of the points that must be shown by so many.
+const LEAST_SHARE: f64 = 0.9;
+/// Points that are looked at: the share is then known to 0.02.
+const MOST_POINTS: usize = 256;
+/// Another shows a point as well where it is at most so many times as far from it.
+const MOST_DISTANCE_RATIO: f64 = 1.25;
+/// And looks at it from a direction that differs by at most 20°: beyond, alignment finds other texture.
+const LEAST_COSINE: f64 = 0.94;
+/// Keyframes further away than so many mean depths see what they have in common from other directions.
+const REACH: f64 = 0.5;
+
+/// Which keyframes have given up their depth, and where they are now.
+#[derive(Debug, Default)]
+pub(super) struct Thinning {
+    /// Keyframes that are never taken out.
+    kept: BTreeSet<u64>,
+    attached: Vec<Attached>,
+    /// The last one that was examined: the next is the one before.
+    examined: Option<u64>,
+}
+
+/// A keyframe without depth that moves with another.
+#[derive(Debug, Clone, Copy)]
+struct Attached {
+    keyframe_id: u64,
+    to: u64,
+    to_from_keyframe: Sim3,
+}
+
+impl Thinning {
+    /// The correction with the keyframes that move with those in it.
+    pub fn follow(&self, correction: &Correction) -> Correction {
+        let mut extended = correction.clone();
+        let mut places: Vec<(u64, Sim3)> =
+            correction.keyframes.iter().map(|k| (k.keyframe_id, k.map_from_keyframe)).collect();
+        places.sort_unstable_by_key(|(id, _)| *id);
+        let find = |id: u64| {
+            let place = places.binary_search_by_key(&id, |(id, _)| *id).ok()?;
+            Some(places[place].1)
+        };
+        let followers = self.attached.iter().filter(|of| find(of.keyframe_id).is_none());
+        extended.keyframes.extend(followers.filter_map(|of| {
+            Some(KeyframeCorrection {
+                keyframe_id: of.keyframe_id,
+                map_from_keyframe: find(of.to)? * of.to_from_keyframe,
+                depth: LogPlane::default(),
+                modes: None,
+                place: None,
+            })
+        }));
+        extended
+    }
+
+    /// A keyframe moves with another from now on, and so does what moved with it.
+    fn attach(&mut self, keyframe_id: u64, to: u64, to_from_keyframe: Sim3) {
+        for of in self.attached.iter_mut().filter(|of| of.to == keyframe_id) {
+            (of.to, of.to_from_keyframe) = (to, to_from_keyframe * of.to_from_keyframe);
+        }
+        self.attached.push(Attached { keyframe_id, to, to_from_keyframe });
+    }
+
+    /// The next places in the list of keyframes to be examined, newest first and round again.
+    fn next(&mut self, map: &Map, may_go: impl Fn(&Keyframe) -> bool) -> Vec<usize> {
+        let eligible: Vec<usize> =
+            (0..map.keyframes.len()).rev().filter(|&k| may_go(&map.keyframes[k])).collect();
+        let id = |place: usize| map.keyframes[place].keyframe_id;
+        let start = eligible.partition_point(|&k| self.examined.is_some_and(|of| id(k) >= of));
+        let (before, after) = eligible.split_at(start);
+        let next: Vec<usize> = after.iter().chain(before).copied().take(NUM_EXAMINED).collect();
+        self.examined = next.last().map(|&last| id(last)).or(self.examined);
+        next
+    }
+}
+
+impl Mapper {
+    /// Keeps the image and depth of a keyframe, whatever others show: a loop is closed on it.
+    pub fn keep_keyframe(&mut self, keyframe_id: u64) {
+        self.thinning.kept.insert(keyframe_id);
+    }
+
+    /// Takes image and depth from keyframes of the active epoch that others show as well, where there are more than is
+    /// allowed. A bounded number is examined with each new keyframe.
+    pub(super) fn thin(&mut self) {
+        let Some(active) = self.keyframe() else { return };
+        let (active_id, epoch) = (active.keyframe_id, active.epoch);
+        let is_held = |of: &Keyframe| of.epoch == epoch && of.has_depth();
+        let held = self.map.keyframes.iter().filter(|of| is_held(of));
+        let mut ids: Vec<u64> = held.map(|of| of.keyframe_id).collect();
+        if ids.len() <= self.params.redundant_above.max(NUM_NEWEST) {
+            return;
+        }
+        ids.sort_unstable();
+        let oldest_of_newest = ids[ids.len() - NUM_NEWEST];
+        let kept = std::mem::take(&mut self.thinning.kept);
+        let may_go = |of: &Keyframe| {
+            is_held(of)
+                && of.map_state == MapState::Established
+                && of.keyframe_id < oldest_of_newest
+                && of.keyframe_id != active_id
+                && !kept.contains(&of.keyframe_id)
+        };
+        let mut excess = ids.len() - self.params.redundant_above;
+        for index in self.thinning.next(&self.map, may_go) {
+            if excess == 0 {
+                break;
+            }
+            let Some((to, to_from_keyframe)) = shown_by(&self.map, index) else { continue };
+            let keyframe = &mut self.map.keyframes[index];
+            (keyframe.image, keyframe.points) = (Vec::new(), Vec::new());
+            self.thinning.attach(keyframe.keyframe_id, to, to_from_keyframe);
+            excess -= 1;
+        }
+        self.thinning.kept = kept;
+    }
+}
+
+/// Of a keyframe whose points enough others show as well: the nearest of those, and where it stands on that.
+fn shown_by(map: &Map, index: usize) -> Option<(u64, Sim3)> {
+    let keyframe = &map.keyframes[index];
+    let place = keyframe.map_from_keyframe;
+    let forward = place.rigid.rotation * Vector3::z();
+    let distance =
+        |of: &Keyframe| (of.map_from_keyframe.rigid.translation - place.rigid.translation).norm();
+    let is_near = |of: &&Keyframe| {
+        of.keyframe_id != keyframe.keyframe_id
+            && of.epoch == keyframe.epoch
+            && of.has_depth()
+            && of.map_state == MapState::Established
+            && distance(of) < REACH * place.scale
+            && (of.map_from_keyframe.rigid.rotation * Vector3::z()).dot(&forward) > 0.0
+    };
+    let others: Vec<&Keyframe> = map.keyframes.iter().filter(is_near).collect();
+    if others.len() < NUM_OTHERS {
+        return None;
+    }
+    let views: Vec<Sim3> = others.iter().map(|of| of.map_from_keyframe.inverse() * place).collect();
+    let stride = keyframe.points.len().div_ceil(MOST_POINTS).max(1);
+    let (mut shown, mut all) = (0u32, 0u32);
+    for point in keyframe.points.iter().step_by(stride) {
+        let Intrinsics { fx, fy, cx, cy, .. } = keyframe.intrinsics;
+        let ray = Vector3::new((f64::from(point.u) - cx) / fx, (f64::from(point.v) - cy) / fy, 1.0);
+        let at = ray / f64::from(point.inverse_depth);
+        let showing = others.iter().zip(&views).filter(|(of, view)| shows(of, view, &at));
+        shown += u32::from(showing.take(NUM_OTHERS).count() == NUM_OTHERS);
+        all += 1;
+    }
+    if f64::from(shown) < LEAST_SHARE * f64::from(all) {
+        return None;
+    }
+    let nearest = others.iter().zip(views).min_by(|(one, _), (other, _)| {
+        distance(one).total_cmp(&distance(other)).then(one.keyframe_id.cmp(&other.keyframe_id))
+    });
+    nearest.map(|(of, view)| (of.keyframe_id, view))
+}
+
+/// Whether a keyframe shows a point as well as another, in whose frame and unit it is; `view` maps that into the
+/// keyframe's. What lies between would have to fit between two rays 20° apart at most.
+fn shows(keyframe: &Keyframe, view: &Sim3, at: &Vector3<f64>) -> bool {
+    let seen = *view * *at;
+    let from_other = seen - view.rigid.translation;
+    let (distance, other) = (seen.norm(), from_other.norm());
+    if seen.z <= 0.0
+        || distance > MOST_DISTANCE_RATIO * other
+        || seen.dot(&from_other) < LEAST_COSINE * distance * other
+    {
+        return false;
+    }
+    let Intrinsics { fx, fy, cx, cy, width, height } = keyframe.intrinsics;
+    let (u, v) = (fx * seen.x / seen.z + cx, fy * seen.y / seen.z + cy);
+    is_inside(width, height, u as f32, v as f32)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::geometry::se3::SE3;
+    use crate::slam::keyframe::DepthPoint;
+    use crate::slam::mapper::MapperParams;
+    use crate::slam::mapper::phase::Active;
+    use crate::slam::test_scene::CAMERA;
+
+    /// A keyframe at `x`, turned by `turn_rad` about the vertical, in front of a wall a unit away.
+    fn keyframe(keyframe_id: u64, x: f64, turn_rad: f64) -> Keyframe {
+        let rotation = SE3::exp(&[0.0, 0.0, 0.0, 0.0, turn_rad, 0.0].into()).rotation;
+        let place = SE3 { rotation, translation: Vector3::new(x, 0.0, 0.0) };
+        let point = |u: u16, v: u16| {
+            let ray = Vector3::new(
+                (f64::from(u) - CAMERA.cx) / CAMERA.fx,
+                (f64::from(v) - CAMERA.cy) / CAMERA.fy,
+                1.0,
+            );
+            // The wall is z = 1 of the map.
+            let inverse_depth = (rotation * ray).z as f32;
+            DepthPoint { u, v, inverse_depth, variance: 1e-4, intensity: 100.0 }
+        };
+        let sides = (CAMERA.width as u16, CAMERA.height as u16);
+        let rows = (8..sides.1 - 8).step_by(8);
+        let points = rows.flat_map(|v| (8..sides.0 - 8).step_by(8).map(move |u| point(u, v)));
+        let image = vec![100; CAMERA.width * CAMERA.height];
+        let place = Sim3::new(place, 1.0);
+        Keyframe { keyframe_id, ..Keyframe::at(place, CAMERA, points.collect(), image) }
+    }
+
+    /// A mapper whose camera has gone `rounds` times along ten places before a wall.
+    fn mapper(rounds: u64, redundant_above: usize) -> Mapper {
+        let params = MapperParams { redundant_above, ..MapperParams::default() };
+        let mut mapper = Mapper::new(CAMERA, params).unwrap();
+        let ids = 0..10 * rounds;
+        mapper.map.keyframes = ids.map(|k| keyframe(k, 0.2 * (k % 10) as f64, 0.0)).collect();
+        mapper.active = Some(Active::new(mapper.map.keyframes.len() - 1));
+        mapper
+    }
+
+    #[test]
+    fn a_keyframe_is_redundant_where_three_others_show_its_points_as_well() {
+        let near = |x: &[f64]| {
+            let at = x.iter().enumerate().map(|(k, x)| keyframe(k as u64, *x, 0.0));
+            Map { keyframes: at.collect(), ..Map::default() }
+        };
+        let (id, place) = shown_by(&near(&[0.0, 0.02, -0.01, 0.03]), 0).unwrap();
+        assert_eq!(id, 2);
+        assert!((place.rigid.translation.x - 0.01).abs() < 1e-12, "{place:?}");
+        assert!(shown_by(&near(&[0.0, 0.02, -0.01]), 0).is_none(), "two others");
+        assert!(shown_by(&near(&[0.0, 0.02, -0.01, 0.45]), 0).is_none(), "one from aside");
+        let mut map = near(&[0.0, 0.02, -0.01, 0.03]);
+        map.keyframes[3] = keyframe(3, 0.03, 0.4);
+        assert!(shown_by(&map, 0).is_none(), "one looks elsewhere");
+        let mut map = near(&[0.0, 0.02, -0.01, 0.03]);
+        // The same place seen from twice as far shows half the detail.
+        map.keyframes[3].map_from_keyframe.rigid.translation.z = -0.4;
+        assert!(shown_by(&map, 0).is_none(), "one from further away");
+        let mut map = near(&[0.0, 0.02, -0.01, 0.03]);
+        map.keyframes[1].epoch = 1;
+        assert!(shown_by(&map, 0).is_none(), "one of another epoch");
+    }
+
+    #[test]
+    fn rounds_along_the_same_places_leave_as_many_keyframes_as_places_want() {
+        let mut mapper = mapper(12, 30);
+        mapper.keep_keyframe(7);
+        for _ in 0..200 {
+            mapper.thin();
+        }
+        let held = mapper.map.num_held();
+        assert!((30..=60).contains(&held), "{held} of 120");
+        assert!(mapper.map.keyframes[7].has_depth(), "a keyframe that is to be kept");
+        assert!(mapper.map.keyframes[120 - NUM_NEWEST..].iter().all(Keyframe::has_depth));
+        assert_eq!(mapper.map.keyframes.len(), 120, "poses stay");
+        // A map that is not larger than allowed is left whole.
+        let mut small = self::mapper(12, 120);
+        small.thin();
+        assert_eq!(small.map.num_held(), 120);
+    }
+
+    #[test]
+    fn what_gave_up_its_depth_moves_with_a_neighbour() {
+        let mut mapper = mapper(12, 30);
+        for _ in 0..200 {
+            mapper.thin();
+        }
+        // All that have depth are turned, moved and scaled alike: so must be the others.
+        let moved = Sim3::new(SE3::exp(&[0.3, -0.1, 0.2, 0.1, 0.4, -0.2].into()), 1.3);
+        let held = mapper.map.keyframes.iter().filter(|of| of.has_depth());
+        let keyframes = held.map(|of| KeyframeCorrection {
+            keyframe_id: of.keyframe_id,
+            map_from_keyframe: moved * of.map_from_keyframe,
+            depth: LogPlane::default(),
+            modes: None,
+            place: None,
+        });
+        let correction = Correction { keyframes: keyframes.collect(), ..Correction::default() };
+        let before = mapper.map.clone();
+        assert!(before.num_held() < before.keyframes.len());
+        mapper.apply(&correction).unwrap();
+        for (was, is) in before.keyframes.iter().zip(&mapper.map.keyframes) {
+            let expected = moved * was.map_from_keyframe;
+            let error = (expected.inverse() * is.map_from_keyframe).log().norm();
+            assert!(error < 1e-9, "keyframe {}: {error}", was.keyframe_id);
+        }
+    }
+}
