@@ -1,4 +1,4 @@
-//! The scenes: a furnished room, a plane, a corridor; [`flat`](crate::capture::simulator::flat) has those with rooms.
+//! The scenes: a furnished room, a plane, a corridor; [`flat`] and [`twins`] have rooms of their own.
 
 use std::f32::consts::FRAC_PI_2;
 
