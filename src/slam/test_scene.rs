@@ -5,7 +5,9 @@ use nalgebra::Vector3;
 
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
+use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::buffer::Image;
+use crate::slam::keyframe::{DepthPoint, Keyframe};
 
 /// A camera of about 63° × 49°.
 pub const CAMERA: Intrinsics = Intrinsics::pinhole(320, 240, 260.0);
@@ -137,6 +139,28 @@ impl Scene {
         let boxes =
             scene.boxes.map(|Cuboid { low, high }| Cuboid { low: low + far, high: high + far });
         Self { room, boxes, period: Some(period), ..scene }
+    }
+
+    /// A keyframe of [`CAMERA`] with exact depth at every fourth pixel, and noise of this standard deviation.
+    pub fn keyframe(&self, keyframe_id: u64, world_from_camera: SE3, noise: f64) -> Keyframe {
+        let view = self.render(&CAMERA, &world_from_camera);
+        let pixels = (4..CAMERA.height - 4)
+            .step_by(2)
+            .flat_map(|v| (4..CAMERA.width - 4).step_by(2).map(move |u| (u, v)));
+        let points = pixels.map(|(u, v)| DepthPoint {
+            u: u as u16,
+            v: v as u16,
+            inverse_depth: view.inverse_depth.at(u, v),
+            variance: 1e-4,
+            intensity: view.intensity.at(u, v),
+        });
+        let (place, image) = (Sim3::new(world_from_camera, 1.0), view.noisy(noise, keyframe_id));
+        Keyframe {
+            keyframe_id,
+            revision: 1,
+            sequence: keyframe_id,
+            ..Keyframe::at(place, CAMERA, points.collect(), image)
+        }
     }
 
     /// Renders the view of a camera; every pixel is the mean of 2×2 rays.

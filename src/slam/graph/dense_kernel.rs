@@ -15,61 +15,49 @@ const LEAST_PIVOT: f64 = 1e-13;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct NotPositive(pub usize);
 
-/// Eliminates the first `pivots` of `size` columns of a symmetric matrix, lower triangle by columns: `factor` has the
-/// columns that are eliminated (`size` rows each), `rest` the others (`size - pivots` rows each). `least` has the original
-/// value of each pivot, and `packed` is scratch.
-pub(super) fn eliminate(
-    kernel: Kernel,
-    size: usize,
-    least: &[f64],
-    factor: &mut [f64],
-    rest: &mut [f64],
-    packed: &mut Vec<f64>,
-) -> Result<(), NotPositive> {
+/// A symmetric matrix of which the first columns, as many as `least` has, are to be eliminated: lower triangle by columns.
+pub(super) struct Part<'a> {
+    /// Rows of the matrix.
+    pub size: usize,
+    /// Original value of each pivot.
+    pub least: &'a [f64],
+    /// The columns that are eliminated, `size` rows each.
+    pub factor: &'a mut [f64],
+    /// The other columns, with their own rows alone.
+    pub rest: &'a mut [f64],
+    /// Scratch.
+    pub packed: &'a mut Vec<f64>,
+}
+
+/// Eliminates the columns; `factor` has the factor's then, and `rest` what is left.
+pub(super) fn eliminate(kernel: Kernel, part: Part<'_>) -> Result<(), NotPositive> {
     match kernel {
         // SAFETY: only `available` makes these values, after it has found AVX2 and AVX-512F.
         #[cfg(target_arch = "x86_64")]
-        Kernel::Avx2 => unsafe { eliminate_avx2(size, least, factor, rest, packed) },
+        Kernel::Avx2 => unsafe { eliminate_avx2(part) },
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
-        Kernel::Avx512 => unsafe { eliminate_avx512(size, least, factor, rest, packed) },
-        _ => eliminate_portable(size, least, factor, rest, packed),
+        Kernel::Avx512 => unsafe { eliminate_avx512(part) },
+        _ => eliminate_portable(part),
     }
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn eliminate_avx2(
-    size: usize,
-    least: &[f64],
-    factor: &mut [f64],
-    rest: &mut [f64],
-    packed: &mut Vec<f64>,
-) -> Result<(), NotPositive> {
-    eliminate_portable(size, least, factor, rest, packed)
+fn eliminate_avx2(part: Part<'_>) -> Result<(), NotPositive> {
+    eliminate_portable(part)
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2,avx512f")]
-fn eliminate_avx512(
-    size: usize,
-    least: &[f64],
-    factor: &mut [f64],
-    rest: &mut [f64],
-    packed: &mut Vec<f64>,
-) -> Result<(), NotPositive> {
-    eliminate_portable(size, least, factor, rest, packed)
+fn eliminate_avx512(part: Part<'_>) -> Result<(), NotPositive> {
+    eliminate_portable(part)
 }
 
 /// The explanation of the others.
 #[inline(always)]
-fn eliminate_portable(
-    size: usize,
-    least: &[f64],
-    factor: &mut [f64],
-    rest: &mut [f64],
-    packed: &mut Vec<f64>,
-) -> Result<(), NotPositive> {
+fn eliminate_portable(part: Part<'_>) -> Result<(), NotPositive> {
+    let Part { size, least, factor, rest, packed } = part;
     let pivots = least.len();
     for first in (0..pivots).step_by(PANEL) {
         let end = (first + PANEL).min(pivots);
@@ -206,6 +194,16 @@ mod tests {
         matrix
     }
 
+    fn eliminate_in(
+        kernel: Kernel,
+        size: usize,
+        least: &[f64],
+        factor: &mut [f64],
+        rest: &mut [f64],
+    ) -> Result<(), NotPositive> {
+        eliminate(kernel, Part { size, least, factor, rest, packed: &mut Vec::new() })
+    }
+
     fn run(kernel: Kernel, matrix: &[f64], size: usize, pivots: usize) -> (Vec<f64>, Vec<f64>) {
         let mut factor = matrix[..size * pivots].to_vec();
         let others = size - pivots;
@@ -214,7 +212,7 @@ mod tests {
             rest.extend_from_slice(&matrix[c * size + pivots..(c + 1) * size]);
         }
         let least: Vec<f64> = (0..pivots).map(|k| matrix[k * size + k]).collect();
-        eliminate(kernel, size, &least, &mut factor, &mut rest, &mut Vec::new()).unwrap();
+        eliminate_in(kernel, size, &least, &mut factor, &mut rest).unwrap();
         // Above the diagonal nothing is said.
         (0..pivots).for_each(|c| factor[c * size..c * size + c].fill(0.0));
         (0..others).for_each(|c| rest[c * others..c * others + c].fill(0.0));
@@ -248,11 +246,10 @@ mod tests {
     #[test]
     fn a_matrix_that_is_not_positive_is_refused() {
         let mut factor = vec![1.0, 1.0, 1.0, 1.0];
-        let singular =
-            eliminate(Kernel::Portable, 2, &[1.0, 1.0], &mut factor, &mut [], &mut Vec::new());
+        let singular = eliminate_in(Kernel::Portable, 2, &[1.0, 1.0], &mut factor, &mut []);
         assert_eq!(singular, Err(NotPositive(1)));
         let mut factor = vec![f64::NAN];
-        let nan = eliminate(Kernel::Portable, 1, &[1.0], &mut factor, &mut [], &mut Vec::new());
+        let nan = eliminate_in(Kernel::Portable, 1, &[1.0], &mut factor, &mut []);
         assert_eq!(nan, Err(NotPositive(0)));
     }
 }

@@ -3,7 +3,7 @@
 use nalgebra::SMatrix;
 
 use crate::slam::alignment::kernel::Kernel;
-use crate::slam::graph::dense_kernel::{NotPositive, eliminate};
+use crate::slam::graph::dense_kernel::{NotPositive, Part, eliminate};
 use crate::slam::graph::fronts::{Front, Plan};
 
 /// The factor of a symmetric positive definite matrix with blocks of `D` × `D`, and the memory to make it.
@@ -59,8 +59,10 @@ impl<const D: usize> Factorisation<D> {
                 extend_add::<D>(front, &child.places, &from, &mut factor, &mut rest);
                 self.spare.push(from);
             }
-            let packed = &mut self.packed;
-            let done = eliminate(self.kernel, size, &self.diagonal, &mut factor, &mut rest, packed);
+            let (factor_of, rest_of) = (&mut factor, &mut rest);
+            let (least, packed) = (&self.diagonal, &mut self.packed);
+            let part = Part { size, least, factor: factor_of, rest: rest_of, packed };
+            let done = eliminate(self.kernel, part);
             self.factors[number] = factor;
             self.rests[number] = rest;
             if let Err(NotPositive(_)) = done {

@@ -146,7 +146,6 @@ mod tests {
     use super::*;
     use crate::slam::geometry::se3::SE3;
     use crate::slam::mapper::MapperParams;
-    use crate::slam::mapper::finder::tests::keyframe;
     use crate::slam::mapper::phase::{Active, Phase};
     use crate::slam::test_scene::{CAMERA, Scene};
 
@@ -156,7 +155,7 @@ mod tests {
         let mut mapper = Mapper::new(CAMERA, MapperParams::default()).unwrap();
         let side = SE3 { translation: [0.2, 0.0, 0.0].into(), ..SE3::identity() };
         mapper.map.keyframes =
-            vec![keyframe(&scene, 0, SE3::identity()), keyframe(&scene, 1, side)];
+            vec![scene.keyframe(0, SE3::identity(), 1.0), scene.keyframe(1, side, 1.0)];
         mapper.active = Some(Active::new(1));
         mapper.phase = Phase::Mapping;
         mapper.is_estimated = is_estimated;
@@ -173,8 +172,7 @@ mod tests {
         assert!(!mapper.contradict(Contradiction::FailedSearches) && !is_rejected(&mapper));
         // As long as it waits others change nothing.
         assert!(!mapper.contradict(Contradiction::FailedSearches));
-        let window = mapper.begin_adjustment(false).unwrap();
-        let mut window = window;
+        let mut window = mapper.begin_adjustment(false).unwrap();
         window.optimise();
         mapper.end_adjustment(window);
         assert!(!is_rejected(&mapper));

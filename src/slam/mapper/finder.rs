@@ -259,41 +259,14 @@ fn eligible(keyframes: &[Keyframe], active: usize) -> impl Iterator<Item = usize
 }
 
 #[cfg(test)]
-pub(super) mod tests {
+mod tests {
     use super::*;
-    use crate::slam::geometry::sim3::Sim3;
-    use crate::slam::keyframe::DepthPoint;
     use crate::slam::test_scene::{CAMERA, Scene};
     use nalgebra::Vector6;
 
-    /// A keyframe with exact depth at every fourth pixel.
-    pub(in crate::slam::mapper) fn keyframe(
-        scene: &Scene,
-        keyframe_id: u64,
-        world_from_camera: SE3,
-    ) -> Keyframe {
-        let view = scene.render(&CAMERA, &world_from_camera);
-        let pixels = (4..CAMERA.height - 4)
-            .step_by(2)
-            .flat_map(|v| (4..CAMERA.width - 4).step_by(2).map(move |u| (u, v)));
-        let points = pixels.map(|(u, v)| DepthPoint {
-            u: u as u16,
-            v: v as u16,
-            inverse_depth: view.inverse_depth.at(u, v),
-            variance: 1e-4,
-            intensity: view.intensity.at(u, v),
-        });
-        Keyframe {
-            keyframe_id,
-            revision: 1,
-            sequence: keyframe_id,
-            ..Keyframe::at(
-                Sim3::new(world_from_camera, 1.0),
-                CAMERA,
-                points.collect(),
-                view.noisy(1.0, keyframe_id),
-            )
-        }
+    /// A keyframe with exact depth and little noise.
+    fn keyframe(scene: &Scene, keyframe_id: u64, world_from_camera: SE3) -> Keyframe {
+        scene.keyframe(keyframe_id, world_from_camera, 1.0)
     }
 
     fn at(twist: [f64; 6]) -> SE3 {

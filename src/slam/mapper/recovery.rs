@@ -224,7 +224,6 @@ mod tests {
     use crate::slam::geometry::sim3::Sim3;
     use crate::slam::map::{Correction, KeyframeCorrection, LogPlane};
     use crate::slam::mapper::MapperParams;
-    use crate::slam::mapper::finder::tests::keyframe;
     use crate::slam::mapper::phase::Active;
     use crate::slam::test_scene::{CAMERA, Scene};
 
@@ -233,7 +232,7 @@ mod tests {
         let scene = Scene::new(3);
         let mut mapper = Mapper::new(CAMERA, MapperParams::default()).unwrap();
         let ids = (0..).zip(places);
-        mapper.map.keyframes = ids.map(|(id, &x)| keyframe(&scene, id, sideways(x))).collect();
+        mapper.map.keyframes = ids.map(|(id, &x)| scene.keyframe(id, sideways(x), 1.0)).collect();
         mapper.active = Some(Active::new(0));
         mapper
     }
@@ -317,7 +316,7 @@ mod tests {
     #[test]
     fn a_depth_map_is_restored_from_its_points() {
         let scene = Scene::new(4);
-        let keyframe = keyframe(&scene, 0, SE3::identity());
+        let keyframe = scene.keyframe(0, SE3::identity(), 1.0);
         let mut map = DepthMap::with_size(CAMERA.width, CAMERA.height);
         map.restart(&keyframe.image, 5.0, 100_000);
         restore_points(&mut map, &keyframe.points);

@@ -21,14 +21,7 @@ impl Tracker {
         alignment: &Alignment,
         missing: u64,
     ) -> PoseEstimate {
-        let quality = Quality {
-            displacement_px: self.params.covariance_floor.displacement_px(
-                &alignment.scatter.misfit,
-                alignment.state.sums.mean_energy(),
-                &self.intrinsics,
-            ),
-            ..quality_of(alignment)
-        };
+        let quality = self.quality(alignment);
         let found =
             reference.world_from_keyframe().place(&alignment.state.current_from_keyframe.inverse());
         let has_jumped = missing == 0 && self.has_jumped(reference, frame.capture_nanos, &found);
@@ -76,6 +69,16 @@ impl Tracker {
             quality,
             ..self.unclaimed(frame, Some(reference), state)
         }
+    }
+
+    /// The figures of an alignment, with the displacement of the whole image.
+    pub(super) fn quality(&self, alignment: &Alignment) -> Quality {
+        let displacement_px = self.params.covariance_floor.displacement_px(
+            &alignment.scatter.misfit,
+            alignment.state.sums.mean_energy(),
+            &self.intrinsics,
+        );
+        Quality { displacement_px, ..quality_of(alignment) }
     }
 
     /// Whether a camera would be elsewhere than an even motion takes it by more than hands or wheels do: what is found

@@ -16,11 +16,8 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::sums::SumPyramid;
-use crate::slam::pose::{
-    Brightness, DegradedReason, LostReason, PoseEstimate, Quality, TrackingState,
-};
+use crate::slam::pose::{Brightness, DegradedReason, LostReason, PoseEstimate, TrackingState};
 use crate::slam::tracker::covariance_floor::displacement_covariance;
-use crate::slam::tracker::verdict::quality_of;
 use crate::slam::tracker::{Memory, Tracker, upper_triangle};
 
 /// Change of the exposure since the view: of the logarithm of the gain, and of the offset in grey levels. Some frames
@@ -38,7 +35,7 @@ const MOST_ROTATION_STD_DEV: f64 = 0.05;
 /// than a sharp one.
 const MOST_GAIN: f64 = 0.7;
 
-/// Largest change of the rotation from one frame to the next, radians, once it is held: 9° from one frame to the next at 30 Hz are an angular
+/// Largest change of the rotation from one frame to the next, radians, once it is held: 9° at 30 Hz are an angular
 /// acceleration that hands do not reach.
 const MOST_CHANGE_RAD: f64 = 0.15;
 
@@ -241,14 +238,7 @@ impl Tracker {
         place: &Place,
         distance_variance: f64,
     ) -> Option<(PoseEstimate, Matrix6<f64>)> {
-        let quality = Quality {
-            displacement_px: self.params.covariance_floor.displacement_px(
-                &alignment.scatter.misfit,
-                alignment.state.sums.mean_energy(),
-                &self.intrinsics,
-            ),
-            ..quality_of(alignment)
-        };
+        let quality = self.quality(alignment);
         let fits = self.params.verdict.judge(alignment, &quality, false, 0);
         let is_seen = quality.points >= FEWEST_POINTS
             && matches!(

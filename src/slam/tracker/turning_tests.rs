@@ -6,29 +6,11 @@ use crate::slam::alignment::reference::Reference;
 use crate::slam::depth::common_error::full_covariance;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
-use crate::slam::geometry::sim3::Sim3;
-use crate::slam::keyframe::{DepthPoint, Keyframe};
 use crate::slam::pose::{DegradedReason, PoseEstimate, TrackingState};
 use crate::slam::test_scene::{CAMERA, Scene};
 use crate::slam::tracker::{Tracker, TrackerParams};
 
 const TURNING: TrackingState = TrackingState::Degraded(DegradedReason::Turning);
-
-/// A keyframe at the origin with exact depth.
-fn keyframe(scene: &Scene) -> Keyframe {
-    let view = scene.render(&CAMERA, &SE3::identity());
-    let pixels = (4..CAMERA.height - 4)
-        .step_by(2)
-        .flat_map(|v| (4..CAMERA.width - 4).step_by(2).map(move |u| (u, v)));
-    let points = pixels.map(|(u, v)| DepthPoint {
-        u: u as u16,
-        v: v as u16,
-        inverse_depth: view.inverse_depth.at(u, v),
-        variance: 1e-4,
-        intensity: view.intensity.at(u, v),
-    });
-    Keyframe::at(Sim3::identity(), CAMERA, points.collect(), view.noisy(2.0, 1))
-}
 
 /// Where a camera stands that pans by 2.5° a frame and is carried along by so many metres.
 fn panned(frame: u64, metres_a_frame: f64) -> SE3 {
@@ -43,7 +25,7 @@ fn panned(frame: u64, metres_a_frame: f64) -> SE3 {
 fn pan(params: TrackerParams, frames: u64, metres_a_frame: f64) -> Vec<PoseEstimate> {
     let scene = Scene::new(3);
     let mut tracker = Tracker::new(CAMERA, params).unwrap();
-    tracker.adopt(Box::new(Reference::prepare(&keyframe(&scene))));
+    tracker.adopt(Box::new(Reference::prepare(&scene.keyframe(1, SE3::identity(), 2.0))));
     let say = |frame: u64| {
         let pixels = scene.render(&CAMERA, &panned(frame, metres_a_frame)).noisy(2.0, 10 + frame);
         let frame = FrameView::new(&CAMERA, frame, frame as i64 * 33_333_333, &pixels);
