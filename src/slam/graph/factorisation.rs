@@ -3,6 +3,7 @@
 use nalgebra::SMatrix;
 
 use crate::slam::alignment::kernel::Kernel;
+use crate::slam::graph::SolveError;
 use crate::slam::graph::dense_kernel::{NotPositive, Part, eliminate};
 use crate::slam::graph::fronts::{Front, Plan};
 
@@ -15,28 +16,34 @@ pub(super) struct Factorisation<const D: usize> {
     factors: Vec<Vec<f64>>,
     /// By front: what it adds to its parent, until that has taken it.
     rests: Vec<Vec<f64>>,
-    /// Memory of such parts that were taken.
-    spare: Vec<Vec<f64>>,
     packed: Vec<f64>,
     diagonal: Vec<f64>,
     local: Vec<f64>,
 }
 
 impl<const D: usize> Factorisation<D> {
-    /// For a matrix of `num_nodes` diagonal blocks and a block for each of `pairs` (row, column), which are distinct.
-    pub fn new(num_nodes: usize, pairs: &[(usize, usize)], kernel: Kernel) -> Self {
-        let plan = Plan::new(num_nodes, pairs);
+    /// For a matrix of `num_nodes` diagonal blocks and a block for each of `pairs` (row, column), which are distinct;
+    /// nothing large is allocated where that is more than `most_bytes`.
+    pub fn new(
+        num_nodes: usize,
+        pairs: &[(usize, usize)],
+        kernel: Kernel,
+        most_bytes: usize,
+    ) -> Result<Self, SolveError> {
+        let most_blocks = most_bytes / size_of::<SMatrix<f64, D, D>>();
+        let plan = Plan::new(num_nodes, pairs, most_blocks)
+            .filter(|plan| plan.most_blocks() <= most_blocks)
+            .ok_or(SolveError::TooLarge)?;
         let sizes = plan.fronts.iter().map(|front| D * D * front.nodes.len() * front.num_pivots);
-        Self {
+        Ok(Self {
             kernel,
             factors: sizes.map(|size| vec![0.0; size]).collect(),
             rests: vec![Vec::new(); plan.fronts.len()],
-            spare: Vec::new(),
             packed: Vec::new(),
             diagonal: Vec::new(),
             local: Vec::new(),
             plan,
-        }
+        })
     }
 
     /// Factorises the matrix whose blocks these are, diagonal ones first, with each diagonal element enlarged by the share
@@ -47,17 +54,14 @@ impl<const D: usize> Factorisation<D> {
             let size = D * front.nodes.len();
             let others = size - D * front.num_pivots;
             let mut factor = std::mem::take(&mut self.factors[number]);
-            let mut rest = self.spare.pop().unwrap_or_default();
+            let mut rest = vec![0.0; others * others];
             factor.fill(0.0);
-            rest.clear();
-            rest.resize(others * others, 0.0);
             enter(front, blocks, damping, &mut factor);
             self.diagonal.clear();
             self.diagonal.extend((0..D * front.num_pivots).map(|k| factor[k * size + k]));
             for child in &front.children {
                 let from = std::mem::take(&mut self.rests[child.front]);
                 extend_add::<D>(front, &child.places, &from, &mut factor, &mut rest);
-                self.spare.push(from);
             }
             let (factor_of, rest_of) = (&mut factor, &mut rest);
             let (least, packed) = (&self.diagonal, &mut self.packed);
@@ -211,7 +215,8 @@ mod tests {
             }
             let right = DVector::from_fn(D * nodes, |_, _| random.normal());
             let expected = dense.clone().cholesky().expect("diagonally dominant").solve(&right);
-            let mut factorisation = Factorisation::<D>::new(nodes, &pairs, Kernel::Portable);
+            let new = |most| Factorisation::<D>::new(nodes, &pairs, Kernel::Portable, most);
+            let mut factorisation = new(usize::MAX).unwrap();
             // Twice: the memory is used again.
             for _ in 0..2 {
                 assert!(factorisation.factorise(&blocks, 0.5));
@@ -220,6 +225,12 @@ mod tests {
                 let error = (DVector::from_vec(values) - &expected).norm() / expected.norm();
                 assert!(error < 1e-12, "seed {seed}: {error}");
             }
+            // As much as it takes, and a byte less.
+            let columns: usize = factorisation.factors.iter().map(|factor| 8 * factor.len()).sum();
+            let bytes = factorisation.plan.most_blocks() * size_of::<SMatrix<f64, D, D>>();
+            assert!(columns <= bytes, "seed {seed}: {columns} {bytes}");
+            assert!(new(bytes).is_ok());
+            assert_eq!(new(bytes - 1).err(), Some(SolveError::TooLarge));
         }
     }
 }

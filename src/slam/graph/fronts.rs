@@ -56,17 +56,32 @@ pub(super) struct Plan {
 
 impl Plan {
     /// The plan for a symmetric matrix of `num_nodes` diagonal blocks and a block for each of `pairs` (row, column), which
-    /// are distinct.
-    pub fn new(num_nodes: usize, pairs: &[(usize, usize)]) -> Self {
+    /// are distinct; `None` where the factor has more than `most_blocks` blocks.
+    pub fn new(num_nodes: usize, pairs: &[(usize, usize)], most_blocks: usize) -> Option<Self> {
         let mut neighbours = vec![Vec::new(); num_nodes];
         for &(row, column) in pairs {
             neighbours[row].push(column);
             neighbours[column].push(row);
         }
-        let groups = amalgamate(minimum_degree(&neighbours));
+        let groups = amalgamate(minimum_degree(&neighbours, most_blocks)?);
         let mut plan = Self { fronts: arrange(groups, num_nodes), num_nodes };
         plan.place_entries(pairs);
-        plan
+        Some(plan)
+    }
+
+    /// Most blocks that are in memory at a time: the columns of all fronts, and the lower right parts that wait for their
+    /// parents.
+    pub fn most_blocks(&self) -> usize {
+        let rest = |front: &Front| (front.nodes.len() - front.num_pivots).pow(2);
+        let (mut waiting, mut most) = (0, 0);
+        for front in &self.fronts {
+            waiting += rest(front);
+            most = most.max(waiting);
+            let of_children = front.children.iter().map(|child| rest(&self.fronts[child.front]));
+            waiting -= of_children.sum::<usize>();
+        }
+        let columns = self.fronts.iter().map(|front| front.nodes.len() * front.num_pivots);
+        columns.sum::<usize>() + most
     }
 
     /// Finds the front of each block: the one that eliminates the first of its nodes.

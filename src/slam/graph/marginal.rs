@@ -6,7 +6,7 @@ use crate::slam::geometry::sim3::{Matrix7, Sim3};
 use crate::slam::graph::factorisation::Factorisation;
 use crate::slam::graph::pose_graph::{PoseGraph, VertexId};
 use crate::slam::graph::system::System;
-use crate::slam::graph::{GraphParams, SolveError, check_gauge};
+use crate::slam::graph::{GraphParams, MAX_FACTOR_BYTES, SolveError, check_gauge};
 
 /// The equations at the places of a graph, factorised; each query solves for one or two keyframes. Kernels weigh as they
 /// do in the optimum; with known scale its variance is 0.
@@ -71,10 +71,10 @@ impl Marginals {
 
 impl<const D: usize> Queries<D> {
     fn new(graph: &PoseGraph, places: &[Sim3], params: &GraphParams) -> Result<Self, SolveError> {
-        let mut system = System::<D>::new(graph);
+        let mut system = System::<D>::new(graph)?;
         system.linearise(graph.constraints(), places);
-        let mut factorisation =
-            Factorisation::new(system.num_nodes(), &system.pairs, params.kernel);
+        let (nodes, pairs) = (system.num_nodes(), &system.pairs);
+        let mut factorisation = Factorisation::new(nodes, pairs, params.kernel, MAX_FACTOR_BYTES)?;
         if !factorisation.factorise(&system.blocks, 0.0) {
             return Err(SolveError::Singular);
         }

@@ -25,6 +25,11 @@ use crate::slam::graph::pose_graph::{PoseGraph, VertexId};
 use crate::slam::graph::solver::solve;
 use crate::slam::graph::system::error;
 
+/// Most memory of the equations of a graph, and of their factor with what waits to be added to it, bytes each: 1 GiB, a
+/// quarter of a small robot's. Public graphs of 5 000 keyframes need less; ten constraints a keyframe at random between as
+/// many need more.
+pub const MAX_FACTOR_BYTES: usize = 1 << 30;
+
 /// How a graph is solved.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct GraphParams {
@@ -59,7 +64,7 @@ pub struct Outcome {
     pub chi2: f64,
     /// Factorisations that were made.
     pub iterations: u32,
-    /// Whether the last step was too small to matter.
+    /// Whether a step without damping would lower the cost by too little to matter.
     pub is_converged: bool,
 }
 
@@ -72,6 +77,12 @@ pub enum SolveError {
     /// The errors at the start are not finite.
     #[error("the errors of the constraints are not finite")]
     NotFinite,
+    /// The equations or their factor would take more memory than [`MAX_FACTOR_BYTES`].
+    #[error(
+        "solving the graph takes more than {} MiB: its constraints connect too many keyframes far apart",
+        MAX_FACTOR_BYTES >> 20
+    )]
+    TooLarge,
     /// The constraints do not determine all places.
     #[error("the constraints do not determine the places of all vertices")]
     Singular,

@@ -16,15 +16,20 @@ pub(super) struct Column {
 }
 
 /// The order of elimination of the nodes of a graph, given by the neighbours of each, with the structure of the factor.
-/// Of several nodes of the same degree the first is taken.
-pub(super) fn minimum_degree(neighbours: &[Vec<usize>]) -> Vec<Column> {
+/// Of several nodes of the same degree the first is taken. `None` where the factor has more than `most_blocks` blocks.
+pub(super) fn minimum_degree(neighbours: &[Vec<usize>], most_blocks: usize) -> Option<Vec<Column>> {
     let mut quotient = Quotient::new(neighbours);
     let mut order = Vec::with_capacity(neighbours.len());
+    let mut blocks = 0;
     while let Some((_, pivot)) = quotient.queue.pop_first() {
         let rows = quotient.eliminate(pivot);
+        blocks += 1 + rows.len();
+        if blocks > most_blocks {
+            return None;
+        }
         order.push(Column { pivot, rows });
     }
-    order
+    Some(order)
 }
 
 struct Quotient {
@@ -161,7 +166,7 @@ mod tests {
     fn structure_is_that_of_elimination_in_this_order() {
         for seed in 0..20 {
             let neighbours = random_graph(40, 20 + 5 * seed as usize, seed);
-            let order = minimum_degree(&neighbours);
+            let order = minimum_degree(&neighbours, usize::MAX).unwrap();
             let mut pivots: Vec<usize> = order.iter().map(|column| column.pivot).collect();
             let plain = eliminate_plainly(&neighbours, &order);
             for (column, expected) in order.iter().zip(plain) {
@@ -177,12 +182,14 @@ mod tests {
     #[test]
     fn a_chain_and_a_star_have_no_fill_and_a_grid_little() {
         let fill = |neighbours: &[Vec<usize>]| -> usize {
-            minimum_degree(neighbours).iter().map(|column| column.rows.len()).sum()
+            let order = minimum_degree(neighbours, usize::MAX).unwrap();
+            order.iter().map(|column| column.rows.len()).sum()
         };
         let chain: Vec<Vec<usize>> = (0..50usize)
             .map(|k| [k.wrapping_sub(1), k + 1].into_iter().filter(|&n| n < 50).collect())
             .collect();
         assert_eq!(fill(&chain), 49);
+        assert!(minimum_degree(&chain, 99).is_some() && minimum_degree(&chain, 98).is_none());
         let star: Vec<Vec<usize>> =
             (0..50).map(|k| if k == 0 { (1..50).collect() } else { vec![0] }).collect();
         assert_eq!(fill(&star), 49);

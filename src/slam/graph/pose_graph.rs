@@ -7,8 +7,8 @@ use crate::slam::graph::robust::RobustKernel;
 pub const MAX_VERTICES: usize = 100_000;
 /// Most constraints of a graph: twenty a keyframe.
 pub const MAX_CONSTRAINTS: usize = 2_000_000;
-/// An information matrix may differ from its transpose, and be negative in a direction, by this share of its largest
-/// entry: what rounding to six digits leaves.
+/// An information matrix may differ from its transpose, and be negative in a direction, by this share of its diagonal
+/// (with which it is scaled to 1): what rounding to six digits leaves.
 const INFORMATION_ROUNDING: f64 = 1e-5;
 
 /// Number of a vertex in the order in which they were added.
@@ -148,14 +148,27 @@ impl PoseGraph {
     }
 }
 
-/// Whether a matrix is finite, symmetric and positive semi-definite, but for rounding.
+/// Whether a matrix is finite, symmetric and positive semi-definite, but for rounding. Metres, radians and logarithms have
+/// no common size: each direction is measured by its own diagonal element, so that units do not matter.
 fn is_information(matrix: &Matrix7) -> bool {
-    let largest = matrix.amax();
-    let tolerance = INFORMATION_ROUNDING * largest;
+    let diagonal = matrix.diagonal();
     // The sum of squares must be finite, too: products of the entries are made.
-    matrix.norm_squared().is_finite()
-        && (matrix - matrix.transpose()).amax() <= tolerance
-        && matrix.symmetric_eigenvalues().min() >= -tolerance
+    if !(matrix.norm_squared().is_finite() && diagonal.min() >= 0.0) {
+        return false;
+    }
+    let mut scaled = *matrix;
+    for (k, &element) in diagonal.iter().enumerate() {
+        // Of a direction in which nothing was measured all is 0, and is left so.
+        let factor = if element > 0.0 { 1.0 / element.sqrt() } else { 1.0 };
+        scaled.row_mut(k).scale_mut(factor);
+        scaled.column_mut(k).scale_mut(factor);
+        let is_unknown = element == 0.0;
+        if is_unknown && (matrix.row(k).amax() > 0.0 || matrix.column(k).amax() > 0.0) {
+            return false;
+        }
+    }
+    (scaled - scaled.transpose()).amax() <= INFORMATION_ROUNDING
+        && scaled.symmetric_eigenvalues().min() >= -INFORMATION_ROUNDING
 }
 
 #[cfg(test)]
@@ -203,6 +216,37 @@ mod tests {
         assert!(graph.constraints().is_empty());
         for information in [Matrix7::identity(), unknown_scale, Matrix7::zeros()] {
             assert_eq!(graph.add_constraint(Constraint { information, ..good }), Ok(()));
+        }
+    }
+
+    /// Rotations and translations that a rounded correlation of `correlation` ties together, the translations in other
+    /// units.
+    fn correlated(correlation: f64, unit: f64) -> Matrix7 {
+        let mut information = Matrix7::identity();
+        information[(0, 4)] = correlation;
+        information[(4, 0)] = correlation;
+        for k in 0..3 {
+            information.row_mut(k).scale_mut(unit);
+            information.column_mut(k).scale_mut(unit);
+        }
+        information
+    }
+
+    #[test]
+    fn what_is_an_information_does_not_depend_on_units() {
+        for unit in [1e-6, 1e-3, 1.0, 1e3, 1e6] {
+            assert!(is_information(&correlated(0.9, unit)), "{unit}");
+            assert!(is_information(&correlated(1.0 + 1e-6, unit)), "rounded, {unit}");
+            assert!(!is_information(&correlated(1.1, unit)), "{unit}");
+            let mut negative = correlated(0.0, unit);
+            negative[(5, 5)] = -1e-6;
+            assert!(!is_information(&negative), "{unit}");
+            let mut tied = correlated(0.0, unit);
+            (tied[(6, 6)], tied[(6, 0)], tied[(0, 6)]) = (0.0, 1e-6 * unit, 1e-6 * unit);
+            assert!(!is_information(&tied), "{unit}");
+            let mut asymmetric = correlated(0.5, unit);
+            asymmetric[(0, 4)] *= 1.01;
+            assert!(!is_information(&asymmetric), "{unit}");
         }
     }
 }

@@ -4,7 +4,7 @@ use crate::slam::geometry::sim3::{Sim3, Twist7};
 use crate::slam::graph::factorisation::Factorisation;
 use crate::slam::graph::pose_graph::PoseGraph;
 use crate::slam::graph::system::{System, cost, error};
-use crate::slam::graph::{GraphParams, Outcome, SolveError};
+use crate::slam::graph::{GraphParams, MAX_FACTOR_BYTES, Outcome, SolveError};
 
 /// Damping of the first step, as a share of each diagonal element: odometry is a good start.
 const FIRST_DAMPING: f64 = 1e-5;
@@ -18,32 +18,49 @@ const MOST_DAMPING: f64 = 1e8;
 /// thousandth of a standard deviation in one direction lowers it by a millionth.
 const CONVERGED_DECREASE: f64 = 1e-6;
 const CONVERGED_SHARE: f64 = 1e-9;
+/// After a step that lowered the cost by no more than this share the next has no damping: by then Gauss–Newton converges,
+/// and what is left of the cost is judged without another factorisation.
+const NEAR_SHARE: f64 = 1e-3;
 
 /// Moves the free vertices to the least cost; `graph` is as before where there is an error.
 pub(super) fn solve<const D: usize>(
     graph: &mut PoseGraph,
     params: &GraphParams,
 ) -> Result<Outcome, SolveError> {
+    solve_from::<D>(graph, params, FIRST_DAMPING)
+}
+
+fn solve_from<const D: usize>(
+    graph: &mut PoseGraph,
+    params: &GraphParams,
+    first_damping: f64,
+) -> Result<Outcome, SolveError> {
     let mut places: Vec<Sim3> = graph.vertices().iter().map(|v| v.map_from_keyframe).collect();
-    let mut system = System::<D>::new(graph);
-    let mut factorisation =
-        Factorisation::<D>::new(system.num_nodes(), &system.pairs, params.kernel);
+    let mut system = System::<D>::new(graph)?;
+    let (nodes, pairs) = (system.num_nodes(), &system.pairs);
+    let mut factorisation = Factorisation::<D>::new(nodes, pairs, params.kernel, MAX_FACTOR_BYTES)?;
     let constraints = graph.constraints();
     let initial_cost = cost::<D>(constraints, &places);
     let mut current = initial_cost;
     if !initial_cost.is_finite() {
         return Err(SolveError::NotFinite);
     }
-    let (mut damping, mut iterations, mut is_converged) = (FIRST_DAMPING, 0, false);
+    let (mut damping, mut iterations, mut is_converged) = (first_damping, 0, false);
     let (mut step, mut moved) = (Vec::new(), places.clone());
-    let mut is_linearised = false;
+    let (mut is_linearised, mut is_near) = (false, false);
     while iterations < params.max_iterations && damping <= MOST_DAMPING {
         if !is_linearised {
             system.linearise(constraints, &places);
             is_linearised = true;
         }
         iterations += 1;
-        if !factorisation.factorise(&system.blocks, damping) {
+        // Damping hides how far it is along what is hardly determined: a long chain bends at next to no cost.
+        let used = if is_near { 0.0 } else { damping };
+        if !factorisation.factorise(&system.blocks, used) {
+            if is_near {
+                // The best there is, of places that are not all determined.
+                break;
+            }
             damping *= DAMPING_UP;
             if damping > MOST_DAMPING {
                 return Err(SolveError::Singular);
@@ -53,14 +70,11 @@ pub(super) fn solve<const D: usize>(
         step.clear();
         step.extend(system.gradient.iter().map(|value| -value));
         factorisation.solve(&mut step);
-        let expected = expected_decrease(&system, &step, damping);
-        for ((place, moved), node) in places.iter().zip(&mut moved).zip(&system.node_of) {
-            *moved = node.map_or(*place, |node| *place * increment::<D>(&step[D * node..][..D]));
-        }
+        let expected = expected_decrease(&system, &step, used);
+        place_after(&places, &system, &step, &mut moved);
         let trial = cost::<D>(constraints, &moved);
-        let is_lower = trial < current;
         let decrease = current - trial;
-        if is_lower {
+        if trial < current {
             std::mem::swap(&mut places, &mut moved);
             (current, is_linearised) = (trial, false);
             damping = (damping * DAMPING_DOWN).max(LEAST_DAMPING);
@@ -68,10 +82,12 @@ pub(super) fn solve<const D: usize>(
             damping *= DAMPING_UP;
         }
         let flat = CONVERGED_DECREASE + CONVERGED_SHARE * current;
-        if expected <= flat && decrease <= flat {
+        let is_flat = expected <= flat && decrease <= flat;
+        if is_flat && is_near {
             is_converged = true;
             break;
         }
+        is_near = is_flat || (0.0..=NEAR_SHARE * current).contains(&decrease);
     }
     let chi2 = constraints.iter().map(|constraint| error::<D>(constraint, &places)).sum();
     graph.places_mut().zip(places).for_each(|(into, place)| *into = place);
@@ -88,8 +104,47 @@ fn expected_decrease<const D: usize>(system: &System<D>, step: &[f64], damping: 
     damping * step.chunks_exact(D).enumerate().map(damped).sum::<f64>() - slope
 }
 
+/// Where the step takes the places.
+fn place_after<const D: usize>(
+    places: &[Sim3],
+    system: &System<D>,
+    step: &[f64],
+    moved: &mut [Sim3],
+) {
+    for ((place, moved), node) in places.iter().zip(moved).zip(&system.node_of) {
+        *moved = node.map_or(*place, |node| *place * increment::<D>(&step[D * node..][..D]));
+    }
+}
+
 fn increment<const D: usize>(step: &[f64]) -> Sim3 {
     let mut twist = Twist7::zeros();
     twist.as_mut_slice()[..D].copy_from_slice(step);
     Sim3::exp(&twist)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::geometry::sim3::Matrix7;
+    use crate::slam::graph::pose_graph::Constraint;
+    use crate::slam::graph::robust::RobustKernel;
+
+    #[test]
+    fn convergence_is_judged_without_damping() {
+        let mut graph = PoseGraph::new();
+        let i = graph.add_vertex(Sim3::identity(), true).unwrap();
+        let off = Twist7::from([0.5, 0.0, 0.0, 0.0, 0.3, 0.0, 0.1]);
+        let j = graph.add_vertex(Sim3::exp(&off), false).unwrap();
+        let (j_from_i, kernel) = (Sim3::identity(), RobustKernel::None);
+        let information = Matrix7::identity();
+        graph.add_constraint(Constraint { i, j, j_from_i, information, kernel }).unwrap();
+        // So much that the first step promises nothing.
+        let outcome = solve_from::<7>(&mut graph, &GraphParams::default(), MOST_DAMPING).unwrap();
+        assert!(outcome.is_converged && outcome.cost < 1e-12, "{outcome:?}");
+        // Short of it that is not said.
+        let mut short = graph.clone();
+        short.places_mut().for_each(|place| *place = Sim3::exp(&off) * *place);
+        let params = GraphParams { max_iterations: 1, ..GraphParams::default() };
+        assert!(!solve_from::<7>(&mut short, &params, MOST_DAMPING).unwrap().is_converged);
+    }
 }

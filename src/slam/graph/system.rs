@@ -7,6 +7,7 @@ use nalgebra::SMatrix;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::graph::pose_graph::{Constraint, PoseGraph};
 use crate::slam::graph::residual::{linearise, part, residual, squared_error};
+use crate::slam::graph::{MAX_FACTOR_BYTES, SolveError};
 
 /// H and g of Σ ρ(rᵀΛr) over the first `D` parts of the residuals: H = Σ ρ' JᵀΛJ, g = Σ ρ' JᵀΛr.
 #[derive(Debug, Clone)]
@@ -24,8 +25,8 @@ pub(super) struct System<const D: usize> {
 }
 
 impl<const D: usize> System<D> {
-    /// The structure of the equations.
-    pub fn new(graph: &PoseGraph) -> Self {
+    /// The structure of the equations; their blocks may take [`MAX_FACTOR_BYTES`].
+    pub fn new(graph: &PoseGraph) -> Result<Self, SolveError> {
         let mut free = 0..;
         let number = |is_fixed: bool, free: &mut std::ops::RangeFrom<usize>| {
             if is_fixed { None } else { free.next() }
@@ -42,13 +43,17 @@ impl<const D: usize> System<D> {
         pairs.values_mut().zip(num_nodes..).for_each(|(block, number)| *block = number);
         let block_of =
             graph.constraints().iter().map(|c| pair_of(c).map(|pair| pairs[&pair])).collect();
-        Self {
-            blocks: vec![SMatrix::zeros(); num_nodes + pairs.len()],
+        let num_blocks = num_nodes + pairs.len();
+        if num_blocks > MAX_FACTOR_BYTES / size_of::<SMatrix<f64, D, D>>() {
+            return Err(SolveError::TooLarge);
+        }
+        Ok(Self {
+            blocks: vec![SMatrix::zeros(); num_blocks],
             gradient: vec![0.0; D * num_nodes],
             pairs: pairs.into_keys().collect(),
             node_of,
             block_of,
-        }
+        })
     }
 
     /// Number of free vertices.

@@ -220,6 +220,29 @@ fn fixed_vertices_stay_and_what_is_not_connected_is_an_error() {
 }
 
 #[test]
+fn a_graph_whose_factor_would_be_too_large_is_refused() {
+    // Connected at random its factor is dense: half of 5 000² blocks are 5 GB.
+    const KEYFRAMES: usize = 5000;
+    let mut random = Random::new(1);
+    let mut graph = PoseGraph::new();
+    let ids: Vec<VertexId> =
+        (0..KEYFRAMES).map(|k| graph.add_vertex(Sim3::identity(), k == 0).unwrap()).collect();
+    let information = information();
+    for k in 1..KEYFRAMES {
+        for other in 0..10 {
+            let far = (random.uniform() * k as f64) as usize;
+            let (i, j) = (ids[if other == 0 { k - 1 } else { far }], ids[k]);
+            let (j_from_i, kernel) = (Sim3::identity(), RobustKernel::None);
+            graph.add_constraint(Constraint { i, j, j_from_i, information, kernel }).unwrap();
+        }
+    }
+    let (before, params) = (graph.clone(), GraphParams::default());
+    assert_eq!(optimise(&mut graph, &params), Err(SolveError::TooLarge));
+    assert_eq!(graph, before);
+    assert!(matches!(Marginals::new(&graph, &params), Err(SolveError::TooLarge)));
+}
+
+#[test]
 fn nothing_to_do_is_done_at_once() {
     let mut graph = PoseGraph::new();
     let outcome = optimise(&mut graph, &GraphParams::default()).unwrap();
