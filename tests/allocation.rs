@@ -1,4 +1,4 @@
-//! After warm-up neither tracking a frame nor preparing a keyframe nor tracing points allocates.
+//! After warm-up neither tracking or holding a frame nor preparing a keyframe nor tracing points allocates.
 
 #[allow(dead_code, reason = "every test uses its part of what they share")]
 #[path = "support/counting_allocator.rs"]
@@ -16,7 +16,7 @@ use semidense::slam::depth::map::DepthMap;
 use semidense::slam::frame::FrameView;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::image::quads::QuadImage;
-use semidense::slam::pose::Brightness;
+use semidense::slam::pose::{Brightness, DegradedReason, TrackingState};
 use semidense::slam::tracker::{Tracker, TrackerParams};
 
 use counting_allocator::{allocations, count_everywhere};
@@ -55,6 +55,47 @@ fn a_frame_and_a_keyframe_allocate_nothing_after_warm_up() {
     assert_eq!(allocated, 0, "in two keyframes of 13 frames each");
     assert!(tracked > 20, "only {tracked} frames were tracked: this measures nothing");
     tracing_points_allocates_nothing();
+    holding_a_view_allocates_nothing();
+}
+
+/// A wall of waves around the camera, seen from its centre at this angle, radians.
+fn panorama(angle: f64) -> Vec<u8> {
+    let grey = |u: usize, v: usize| {
+        let (x, y) = ((u as f64 - CAMERA.cx) / CAMERA.fx, (v as f64 - CAMERA.cy) / CAMERA.fy);
+        let (along, up) = (260.0 * (x.atan() + angle), 260.0 * y / x.hypot(1.0));
+        let waves = 40.0 * (along * 0.19).sin() * (up * 0.13).cos();
+        128.0 + waves + 30.0 * (0.031 * along + 0.11 * up).sin() + 20.0 * (0.053 * along).cos()
+    };
+    (0..CAMERA.width * CAMERA.height)
+        .map(|i| grey(i % CAMERA.width, i / CAMERA.width) as u8)
+        .collect()
+}
+
+/// Pans away from a keyframe; what is tracked on it is in warm memory, and all that is held afterwards too.
+fn holding_a_view_allocates_nothing() {
+    const FRAMES: u64 = 40;
+    let mut tracker = Tracker::new(CAMERA, TrackerParams::default()).unwrap();
+    let known = panorama(0.0);
+    let mut known_here = keyframe(0);
+    for point in &mut known_here.points {
+        point.intensity =
+            f32::from(known[usize::from(point.v) * CAMERA.width + usize::from(point.u)]);
+    }
+    known_here.image = known;
+    tracker.adopt(Box::new(Reference::prepare(&known_here)));
+    let pixels: Vec<_> = (0..FRAMES).map(|k| panorama(0.045 * k as f64)).collect();
+    let (mut before, mut held) = (0, 0);
+    for (sequence, pixels) in (0..).zip(&pixels) {
+        if sequence == 4 {
+            before = allocations();
+        }
+        let frame = FrameView::new(&CAMERA, sequence, sequence as i64 * 33_000_000, pixels);
+        let estimate = tracker.track(&frame, &mut |_| true);
+        held += u64::from(estimate.state == TrackingState::Degraded(DegradedReason::Turning));
+        tracker.prepare_next();
+    }
+    assert_eq!(allocations() - before, 0, "in frames 4 to {FRAMES} of a pan");
+    assert!(held > 10, "only {held} frames were held: this measures nothing");
 }
 
 /// Two keyframes of points, each traced through some frames; the second one is in warm memory. Part of

@@ -201,6 +201,9 @@ impl<'a> Shell<'a> {
         let (estimate, track_nanos) = self.track(&frame, intrinsics, deadline_nanos)?;
         let wake_nanos = arrival_nanos.saturating_sub(header.sent_nanos);
         self.publish(&estimate, &header, [wake_nanos, track_nanos], deadline_nanos)?;
+        if let Some((_, tracker)) = &mut self.tracker {
+            tracker.prepare_next();
+        }
         self.count_page_faults();
         Ok(())
     }

@@ -212,6 +212,7 @@ impl Tracker {
         frame: &FrameView<'_>,
         budget: &mut dyn FnMut(usize) -> bool,
     ) -> PoseEstimate {
+        self.prepare_next();
         let before = self.memory.clone();
         let missing = self.count_missing(frame.sequence);
         let Some(reference) = self.reference.take() else {
@@ -231,12 +232,13 @@ impl Tracker {
                 let is_trusted = reference.map_state() == MapState::Established;
                 let held = match is_trusted && may_turn(estimate.state) {
                     true => self.turn(&reference, frame, &before, budget),
-                    false => None,
+                    false => {
+                        self.end_turning();
+                        let may_be_next = is_trusted && self.params.max_turning_deviation > 0.0;
+                        self.turning.look_ahead(&estimate, may_be_next);
+                        None
+                    }
                 };
-                if held.is_none() && self.turning.end() {
-                    // The way from where it was held to where it is was made in one frame of no camera.
-                    self.memory.motion.stop();
-                }
                 held.unwrap_or(estimate)
             }
         };
@@ -248,6 +250,13 @@ impl Tracker {
         self.memory.unit = reference.world_from_keyframe().scale;
         self.reference = Some(reference);
         estimate
+    }
+
+    /// What the next frame may need and the pose of this one need not wait for, some milliseconds where known depth is out
+    /// of view or nearly: to be called when the pose has been published. [`Self::track`] does it first where it was not.
+    pub fn prepare_next(&mut self) {
+        let Self { turning, intrinsics, pyramid, .. } = self;
+        turning.prepare(intrinsics, pyramid);
     }
 
     /// What it remembers of the frames so far, for [`Self::rehearse`].
@@ -263,6 +272,7 @@ impl Tracker {
         frame: &FrameView<'_>,
         budget: &mut dyn FnMut(usize) -> bool,
     ) -> PoseEstimate {
+        self.prepare_next();
         let own = std::mem::replace(&mut self.memory, memory.clone());
         let turning = self.turning.pause();
         let estimate = self.track(frame, budget);

@@ -48,9 +48,14 @@ const SPEED: f64 = 0.3;
 /// The alignment holds frames to half of that: a translation that is free takes what is not understood, and with
 /// the variance that comes with it explains any image.
 const TIGHTNESS: f64 = 0.5;
-/// Time since the view that this is applied to: of the fastest camera, and as long as the camera may drift anywhere.
+/// Time since the view that this is applied to: of the fastest camera, and as long as the camera may drift anywhere. After
+/// that no view is waited for either.
 const LEAST_SECONDS: f64 = 0.001;
 const MOST_SECONDS: f64 = 1.0;
+
+/// Share of the keyframe's points in view below which the view is prepared ahead: a camera that pans at 90°/s loses a
+/// twentieth of its image a frame, and depth is too little from a third to a tenth on.
+const AHEAD_IN_VIEW: f64 = 0.5;
 
 /// The view that frames are aligned to, and the frame before.
 #[derive(Debug)]
@@ -65,10 +70,26 @@ pub(super) struct Turning {
     is_first: bool,
     /// How well the last one fitted on the coarsest level.
     coarse_fit: Option<f64>,
-    /// The frame before, and its sequence.
+    /// The frame before.
     before: SumPyramid,
-    before_sequence: Option<u64>,
-    filled_sequence: Option<u64>,
+    /// What is where.
+    frames: Frames,
+    /// Whether the frame in the tracker's pyramid is to be the view.
+    is_due: bool,
+}
+
+/// Sequences of the frames that are kept: in the tracker's pyramid, before it, and in the view.
+#[derive(Debug, Clone, Copy, Default)]
+struct Frames {
+    filled: Option<u64>,
+    before: Option<u64>,
+    view: Option<u64>,
+}
+
+/// What is put aside while a frame is rehearsed.
+pub(super) struct Paused {
+    place: Option<Place>,
+    frames: Frames,
 }
 
 /// Where the view is.
@@ -114,36 +135,48 @@ impl Turning {
             is_first: true,
             coarse_fit: None,
             before: pyramid.clone(),
-            before_sequence: None,
-            filled_sequence: None,
+            frames: Frames::default(),
+            is_due: false,
         }
     }
 
     /// Keeps the frame in `pyramid`, into which another will be filled.
     pub(super) fn keep(&mut self, pyramid: &mut SumPyramid, sequence: u64) {
         std::mem::swap(&mut self.before, pyramid);
-        self.before_sequence = self.filled_sequence.replace(sequence);
+        self.frames.before = self.frames.filled.replace(sequence);
+    }
+
+    /// Makes the frame in `pyramid` the view, where it is to be that; what was in the view is left in its place.
+    pub(super) fn prepare(&mut self, intrinsics: &Intrinsics, pyramid: &mut SumPyramid) {
+        if !std::mem::take(&mut self.is_due) {
+            return;
+        }
+        let Some(view) = self.view.as_deref_mut() else { return };
+        self.unknown.prepare(view, intrinsics, pyramid);
+        self.frames.view = self.frames.filled.take();
+    }
+
+    /// A frame with a pose was tracked on a keyframe: where the next one may have left its depth the view is prepared ahead.
+    pub(super) fn look_ahead(&mut self, estimate: &PoseEstimate, may_be_next: bool) {
+        let is_at_edge = estimate.quality.in_view_ratio < AHEAD_IN_VIEW;
+        self.is_due = may_be_next && estimate.state.is_tracked() && is_at_edge;
     }
 
     /// Before a frame is rehearsed: nothing is held meanwhile.
-    pub(super) fn pause(&mut self) -> (Option<Place>, [Option<u64>; 2]) {
-        let sequences = [self.before_sequence.take(), self.filled_sequence.take()];
-        (self.place.take(), sequences)
+    pub(super) fn pause(&mut self) -> Paused {
+        Paused { place: self.place.take(), frames: std::mem::take(&mut self.frames) }
     }
 
     /// After it: `pyramid` was filled once more.
-    pub(super) fn resume(
-        &mut self,
-        (place, [before, filled]): (Option<Place>, [Option<u64>; 2]),
-        pyramid: &mut SumPyramid,
-    ) {
+    pub(super) fn resume(&mut self, paused: Paused, pyramid: &mut SumPyramid) {
         std::mem::swap(&mut self.before, pyramid);
-        self.place = place;
-        (self.before_sequence, self.filled_sequence) = (before, filled);
+        (self.place, self.frames) = (paused.place, paused.frames);
+        self.is_due = false;
     }
 
     /// The keyframe fits again, or nothing does; whether a view was held.
     pub(super) fn end(&mut self) -> bool {
+        self.is_due = false;
         self.place.take().is_some()
     }
 
@@ -166,7 +199,7 @@ impl Tracker {
     ) -> Option<PoseEstimate> {
         let unit = reference.world_from_keyframe().scale / reference.mean_inverse_depth();
         if self.turning.place.is_none() {
-            self.begin_turning(before, unit)?;
+            self.begin_turning(before, unit);
         }
         let place = self.turning.place?;
         let mut view = self.turning.view.take()?;
@@ -177,54 +210,67 @@ impl Tracker {
             (Brightness::default(), self.turning.coarse_fit);
         // The motion on the keyframe's last points may be anything.
         self.memory.was_lost = self.turning.is_first;
-        let step = frame.capture_nanos.saturating_sub(place.nanos) as f64 * 1e-9;
-        let step = step.clamp(LEAST_SECONDS, MOST_SECONDS);
+        let since_view = frame.capture_nanos.saturating_sub(place.nanos) as f64 * 1e-9;
+        let step = since_view.clamp(LEAST_SECONDS, MOST_SECONDS);
         view.stand_at(&place.world_from_view, TIGHTNESS * place.speed * step);
         let since = place.since_secs;
-        let place = Place { since_secs: since + step, ..place };
+        let next = Place { since_secs: since + step, ..place };
         // A camera that moves on evenly: its distance grows with the time, not with the root of it.
-        let distance_variance = place.speed.powi(2) * (place.since_secs.powi(2) - since.powi(2));
+        let distance_variance = place.speed.powi(2) * (next.since_secs.powi(2) - since.powi(2));
         std::mem::swap(&mut self.aligner, &mut self.turning.aligner);
         let (alignment, coarse_fit) = self.align(&view, frame, budget);
         std::mem::swap(&mut self.aligner, &mut self.turning.aligner);
-        let estimate = self.held(reference, &view, frame, &alignment, &place, distance_variance);
+        let estimate = self.held(reference, &view, frame, &alignment, &next, distance_variance);
         self.turning.view = Some(view);
         let Some((estimate, covariance)) = estimate else {
             self.memory = lost;
+            self.end_turning();
             return None;
         };
-        (self.turning.is_first, self.turning.coarse_fit) = (false, coarse_fit);
         self.memory.motion.observe(frame.capture_nanos, &estimate.world_from_camera);
         self.memory.brightness = Brightness::default();
         self.memory.coarse_fit = before.coarse_fit;
+        (self.turning.is_first, self.turning.coarse_fit) = (false, coarse_fit);
         // Frames that follow each other are blurred alike, and show nearly the same.
+        self.turning.is_due = true;
         let world_from_view = Sim3::new(estimate.world_from_camera, place.world_from_view.scale);
-        let Self { turning, pyramid, intrinsics, .. } = self;
-        let view = turning.view.as_deref_mut()?;
-        turning.unknown.prepare(view, intrinsics, pyramid);
         let nanos = frame.capture_nanos;
-        turning.place = Some(Place { world_from_view, nanos, covariance, ..place });
+        self.turning.place = Some(Place { world_from_view, nanos, covariance, ..next });
         Some(estimate)
     }
 
+    /// No view holds the camera from here on.
+    pub(super) fn end_turning(&mut self) {
+        if self.turning.end() {
+            // The way from where it was held to where it is was made in one frame of no camera.
+            self.memory.motion.stop();
+        }
+    }
+
     /// Takes the frame before for the view, where it had a pose.
-    fn begin_turning(&mut self, before: &Memory, unit: f64) -> Option<()> {
+    fn begin_turning(&mut self, before: &Memory, unit: f64) {
         let Self { turning, intrinsics, .. } = self;
-        let is_before =
-            turning.before_sequence.is_some() && turning.before_sequence == before.last_sequence;
-        let (nanos, world_from_camera) =
-            before.motion.last_seen().filter(|_| is_before && !before.was_lost)?;
+        let Some(last) = before.last_sequence.filter(|_| !before.was_lost) else { return };
+        let is_ahead = turning.frames.view == Some(last);
+        if !(is_ahead || turning.frames.before == Some(last)) {
+            return;
+        }
+        let (Some((nanos, world_from_camera)), Some(view)) =
+            (before.motion.last_seen(), turning.view.as_deref_mut())
+        else {
+            return;
+        };
+        if !is_ahead {
+            turning.unknown.prepare(view, intrinsics, &mut turning.before);
+            (turning.frames.view, turning.frames.before) = (Some(last), None);
+        }
         let mut covariance = full_covariance(&before.covariance);
         scale_translation(&mut covariance, before.unit / unit);
         // As fast as it was.
         let speed = before.motion.speed().map_or(SPEED, |speed| SPEED.max(speed / unit));
         let world_from_view = Sim3::new(world_from_camera, unit);
-        let view = turning.view.as_deref_mut()?;
-        turning.unknown.prepare(view, intrinsics, &mut turning.before);
-        turning.before_sequence = None;
         (turning.is_first, turning.coarse_fit) = (true, None);
         turning.place = Some(Place { world_from_view, since_secs: 0.0, nanos, speed, covariance });
-        Some(())
     }
 
     /// The estimate of a frame that is aligned to the view, and the covariance in units of the mean depth; `None` where

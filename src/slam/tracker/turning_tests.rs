@@ -65,6 +65,28 @@ fn a_pan_away_from_all_depth_is_held_with_a_covariance_that_is_honest() {
 }
 
 #[test]
+fn what_is_prepared_after_a_frame_changes_no_bit() {
+    let scene = Scene::new(3);
+    let run = |is_prepared: bool| {
+        let mut tracker = Tracker::new(CAMERA, TrackerParams::default()).unwrap();
+        tracker.adopt(Box::new(Reference::prepare(&scene.keyframe(1, SE3::identity(), 2.0))));
+        let say = |frame: u64| {
+            let pixels = scene.render(&CAMERA, &panned(frame, 0.0)).noisy(2.0, 10 + frame);
+            let seen = FrameView::new(&CAMERA, frame, frame as i64 * 33_333_333, &pixels);
+            let estimate = tracker.track(&seen, &mut |_| true);
+            if is_prepared {
+                tracker.prepare_next();
+            }
+            estimate
+        };
+        (0..30).map(say).collect::<Vec<_>>()
+    };
+    let said = run(true);
+    assert!(said.last().unwrap().state == TURNING);
+    assert_eq!(said, run(false));
+}
+
+#[test]
 fn nothing_is_held_where_that_is_switched_off_or_after_a_frame_that_was_lost() {
     let off = TrackerParams { max_turning_deviation: 0.0, ..TrackerParams::default() };
     let said = pan(off, 40, 0.0);
