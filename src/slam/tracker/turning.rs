@@ -7,7 +7,7 @@
 
 use nalgebra::{Matrix3, Matrix6};
 
-use crate::slam::alignment::align::{Aligner, Alignment, AlignmentParams};
+use crate::slam::alignment::align::{Aligner, Alignment, AlignmentParams, Ending};
 use crate::slam::alignment::reference::Reference;
 use crate::slam::alignment::unknown_depth::UnknownDepth;
 use crate::slam::depth::common_error::full_covariance;
@@ -52,6 +52,10 @@ const TIGHTNESS: f64 = 0.5;
 /// that no view is waited for either.
 const LEAST_SECONDS: f64 = 0.001;
 const MOST_SECONDS: f64 = 1.0;
+
+/// A frame that was cut short is displaced by this much at most, in pixels of the finest level: beyond that fewer of its
+/// points would be explained by noise.
+const CUT_SHORT_PX: f64 = 1.0;
 
 /// Share of the keyframe's points in view below which the view is prepared ahead: a camera that pans at 90°/s loses a
 /// twentieth of its image a frame, and depth is too little from a third to a tenth on.
@@ -222,20 +226,30 @@ impl Tracker {
         std::mem::swap(&mut self.aligner, &mut self.turning.aligner);
         let estimate = self.held(reference, &view, frame, &alignment, &next, distance_variance);
         self.turning.view = Some(view);
+        let is_cut_short = alignment.ending == Ending::OutOfBudget;
         let Some((estimate, covariance)) = estimate else {
             self.memory = lost;
-            self.end_turning();
+            if is_cut_short && (0.0..MOST_SECONDS).contains(&since_view) {
+                // It says nothing: the view waits for the next one, of which the same is expected.
+                self.memory.motion = before.motion.clone();
+            } else {
+                self.end_turning();
+            }
             return None;
         };
         self.memory.motion.observe(frame.capture_nanos, &estimate.world_from_camera);
         self.memory.brightness = Brightness::default();
         self.memory.coarse_fit = before.coarse_fit;
-        (self.turning.is_first, self.turning.coarse_fit) = (false, coarse_fit);
-        // Frames that follow each other are blurred alike, and show nearly the same.
-        self.turning.is_due = true;
-        let world_from_view = Sim3::new(estimate.world_from_camera, place.world_from_view.scale);
-        let nanos = frame.capture_nanos;
-        self.turning.place = Some(Place { world_from_view, nanos, covariance, ..next });
+        // One that was cut short is no view for the next: its error would stay.
+        if !is_cut_short {
+            (self.turning.is_first, self.turning.coarse_fit) = (false, coarse_fit);
+            // Frames that follow each other are blurred alike, and show nearly the same.
+            self.turning.is_due = true;
+            let world_from_view =
+                Sim3::new(estimate.world_from_camera, place.world_from_view.scale);
+            let nanos = frame.capture_nanos;
+            self.turning.place = Some(Place { world_from_view, nanos, covariance, ..next });
+        }
         Some(estimate)
     }
 
@@ -284,12 +298,17 @@ impl Tracker {
         place: &Place,
         distance_variance: f64,
     ) -> Option<(PoseEstimate, Matrix6<f64>)> {
-        let quality = self.quality(alignment);
+        let mut quality = self.quality(alignment);
+        if alignment.ending == Ending::OutOfBudget {
+            let unsolved_px = CUT_SHORT_PX * f64::from(1u32 << view.finest_level());
+            quality.displacement_px = quality.displacement_px.hypot(unsolved_px);
+        }
         let fits = self.params.verdict.judge(alignment, &quality, false, 0);
         let is_seen = quality.points >= FEWEST_POINTS
             && matches!(
                 fits,
-                TrackingState::Tracking | TrackingState::Degraded(DegradedReason::LowOverlap)
+                TrackingState::Tracking
+                    | TrackingState::Degraded(DegradedReason::LowOverlap | DegradedReason::Budget)
             );
         // By the image's noise alone: parallax that the uncertain depth would explain is no rotation.
         let explained = self.aligner.explanation(view, &self.pyramid, alignment);

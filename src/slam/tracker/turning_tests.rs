@@ -6,7 +6,7 @@ use crate::slam::alignment::reference::Reference;
 use crate::slam::depth::common_error::full_covariance;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
-use crate::slam::pose::{DegradedReason, PoseEstimate, TrackingState};
+use crate::slam::pose::{DegradedReason, LostReason, PoseEstimate, TrackingState};
 use crate::slam::test_scene::{CAMERA, Scene};
 use crate::slam::tracker::{Tracker, TrackerParams};
 
@@ -61,6 +61,47 @@ fn a_pan_away_from_all_depth_is_held_with_a_covariance_that_is_honest() {
         let least = f64::max(2.0 * deviation(&said[3]), 0.3 * way);
         let last = deviation(said.last().unwrap());
         assert!(last > least, "{metres_a_frame}: {last} of {least}");
+    }
+}
+
+/// As [`pan`] at constant pace with a jerk to the side in one frame, in which there is time for no iteration.
+fn pan_cut_short(frames: u64, cut_short: u64, jerk_rad: f64) -> Vec<(SE3, PoseEstimate)> {
+    let scene = Scene::new(3);
+    let mut tracker = Tracker::new(CAMERA, TrackerParams::default()).unwrap();
+    tracker.adopt(Box::new(Reference::prepare(&scene.keyframe(1, SE3::identity(), 2.0))));
+    let say = |frame: u64| {
+        let jerk = if frame >= cut_short { jerk_rad } else { 0.0 };
+        let truth = panned(frame, 0.0) * SE3::exp(&Vector6::new(0.0, 0.0, 0.0, jerk, 0.0, 0.0));
+        let pixels = scene.render(&CAMERA, &truth).noisy(2.0, 10 + frame);
+        let seen = FrameView::new(&CAMERA, frame, frame as i64 * 33_333_333, &pixels);
+        (truth, tracker.track(&seen, &mut |_| frame != cut_short))
+    };
+    (0..frames).map(say).collect()
+}
+
+#[test]
+fn a_held_frame_that_is_cut_short_ends_nothing() {
+    const CUT_SHORT: u64 = 25;
+    // Where the motion is even the pose expected fits; else nothing is said of this frame alone.
+    for (jerk_rad, state) in
+        [(0.0, TURNING), (0.06, TrackingState::Lost(LostReason::TooFewInliers))]
+    {
+        let said = pan_cut_short(40, CUT_SHORT, jerk_rad);
+        let at = |frame: u64| said[frame as usize].1;
+        assert_eq!(at(CUT_SHORT - 1).state, TURNING);
+        match (at(CUT_SHORT).state, state) {
+            (TrackingState::Lost(_), TrackingState::Lost(_)) => {}
+            (said, expected) => assert_eq!(said, expected, "{jerk_rad}"),
+        }
+        for (frame, (truth, estimate)) in said.iter().enumerate().skip(CUT_SHORT as usize + 1) {
+            assert_eq!(estimate.state, TURNING, "{jerk_rad}: frame {frame}");
+            let error = (estimate.keyframe_from_camera.inverse() * *truth).log();
+            let rotation = error.fixed_rows::<3>(3).norm();
+            assert!(rotation < 0.06, "{jerk_rad}: frame {frame}: {rotation}");
+        }
+        // Less sure than the frames beside it.
+        let deviation = |frame: u64| at(frame).covariance[20].sqrt();
+        assert!(deviation(CUT_SHORT) > 1.5 * deviation(CUT_SHORT + 1), "{jerk_rad}");
     }
 }
 
