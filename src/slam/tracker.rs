@@ -23,6 +23,9 @@ use crate::slam::tracker::motion::{Motion, hypotheses, turned};
 use crate::slam::tracker::turning::{Turning, may_turn};
 use crate::slam::tracker::verdict::{VerdictParams, fits_better, is_better, quality_of};
 
+/// Standard deviations by which a pose may differ from one that is held: of a hundred finds one is refused for nothing.
+pub const MOST_DEVIATIONS: f64 = 3.0;
+
 /// Tuning of the tracker.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]

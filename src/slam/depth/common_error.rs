@@ -328,6 +328,14 @@ impl JointCovariance {
     }
 }
 
+/// Largest standard deviation of the rotation of a pose (translation, rotation), radians.
+pub fn rotation_std_dev(covariance: &Matrix6<f64>) -> f64 {
+    let rotation = covariance.fixed_view::<3, 3>(3, 3).into_owned();
+    let largest = rotation.symmetric_eigenvalues().max();
+    // By rounding it may be below zero; what is no number stays none.
+    if largest < 0.0 { 0.0 } else { largest.sqrt() }
+}
+
 /// The symmetric matrix of an upper triangle, row by row.
 pub fn full_covariance(upper_triangle: &[f64; 21]) -> Matrix6<f64> {
     let mut entries = upper_triangle.iter();

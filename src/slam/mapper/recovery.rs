@@ -4,6 +4,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::slam::depth::common_error::{full_covariance, rotation_std_dev};
 use crate::slam::depth::gaussian::MAX_VALIDITY;
 use crate::slam::depth::map::{BORDER_PX, DepthMap, Hypothesis};
 use crate::slam::depth::propagation::joined;
@@ -16,7 +17,8 @@ use crate::slam::mapper::doubt::Doubt;
 use crate::slam::mapper::phase::{Loss, Phase};
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::parameter::{ParameterError, check_range};
-use crate::slam::pose::PoseEstimate;
+use crate::slam::pose::{DegradedReason, PoseEstimate, TrackingState};
+use crate::slam::tracker::MOST_DEVIATIONS;
 
 /// Tuning of the recovery from a loss.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -73,21 +75,15 @@ impl Mapper {
             let (keyframes, params) = (&self.map.keyframes, &self.params.recovery);
             let searched = &mut loss.searched;
             let found = self.finder.find(keyframes, active.index, searched, frame.pixels, params);
-            if let Some((index, keyframe_from_camera)) = found {
-                if self.is_confirmed(index, &keyframe_from_camera, frame.pixels) {
-                    return self.restore_keyframe(index, &keyframe_from_camera);
-                }
-                self.finder.doubt(index);
+            if let Some((index, at)) = self.believed(found, pose, frame.pixels) {
+                return self.restore_keyframe(index, &at);
             }
             let (keyframes, params) = (&self.map.keyframes, &self.params.recovery);
             let compared = &mut loss.compared;
             let found =
                 self.finder.find_turned(keyframes, active.index, compared, frame.pixels, params);
-            if let Some((index, keyframe_from_camera)) = found {
-                if self.is_confirmed(index, &keyframe_from_camera, frame.pixels) {
-                    return self.restore_keyframe(index, &keyframe_from_camera);
-                }
-                self.finder.doubt(index);
+            if let Some((index, at)) = self.believed(found, pose, frame.pixels) {
+                return self.restore_keyframe(index, &at);
             }
         }
         self.phase = self.phase.with_loss(loss);
@@ -106,6 +102,42 @@ impl Mapper {
             self.phase = Phase::Restarting(loss);
         }
         self.begin(frame, pose, sensor_depth)
+    }
+
+    /// What was found, where it is confirmed and not against the rotation that a view holds; the next search leaves it out
+    /// otherwise.
+    fn believed(
+        &mut self,
+        found: Option<(usize, SE3)>,
+        pose: &PoseEstimate,
+        pixels: &[u8],
+    ) -> Option<(usize, SE3)> {
+        let (index, keyframe_from_camera) = found?;
+        let is_possible = !self.contradicts_hold(pose, index, &keyframe_from_camera);
+        if is_possible && self.is_confirmed(index, &keyframe_from_camera, pixels) {
+            return found;
+        }
+        self.finder.doubt(index);
+        None
+    }
+
+    /// Whether a place in the epoch of a pose that a view holds turns the camera against it by more than it is uncertain.
+    fn contradicts_hold(&self, pose: &PoseEstimate, index: usize, at: &SE3) -> bool {
+        /// Rotation by which the map may have drifted since the place was mapped, radians.
+        const MOST_DRIFT_RAD: f64 = 0.15;
+        let (Some(known), Some(held_on)) =
+            (self.map.keyframes.get(index), self.map.get(pose.keyframe_id))
+        else {
+            return false;
+        };
+        let is_held = pose.state == TrackingState::Degraded(DegradedReason::Turning);
+        if !is_held || known.epoch != held_on.epoch {
+            return false;
+        }
+        let found = known.map_from_keyframe.place(at).rotation;
+        let uncertain = rotation_std_dev(&full_covariance(&pose.map_covariance));
+        found.angle_to(&pose.map_from_camera.rotation)
+            > MOST_DRIFT_RAD + MOST_DEVIATIONS * uncertain
     }
 
     /// Whether another keyframe that sees the same place has the camera there too: one alone may look like what it does
@@ -226,6 +258,32 @@ mod tests {
     use crate::slam::mapper::MapperParams;
     use crate::slam::mapper::phase::Active;
     use crate::slam::test_scene::{CAMERA, Scene};
+    use crate::slam::tracker::upper_triangle;
+
+    #[test]
+    fn a_place_that_is_turned_against_a_held_pose_is_not_believed() {
+        let scene = Scene::new(3);
+        let mapper = mapper_with(&[0.0, 0.1]);
+        let pixels = scene.render(&CAMERA, &SE3::identity()).noisy(1.0, 7);
+        let turned = |angle: f64| SE3::exp(&Vector6::new(0.0, 0.0, 0.0, angle, 0.0, 0.0));
+        let held = |angle: f64, deviation: f64, state: TrackingState| PoseEstimate {
+            state,
+            keyframe_id: 0,
+            map_from_camera: turned(angle),
+            map_covariance: upper_triangle(|row, column| match row == column {
+                true => deviation * deviation,
+                false => 0.0,
+            }),
+            ..PoseEstimate::unknown(&FrameView::new(&CAMERA, 5, 0, &pixels))
+        };
+        let turning = TrackingState::Degraded(DegradedReason::Turning);
+        let is_refused = |pose: PoseEstimate| mapper.contradicts_hold(&pose, 1, &SE3::identity());
+        assert!(is_refused(held(0.5, 0.02, turning)));
+        assert!(!is_refused(held(0.1, 0.02, turning)));
+        // As uncertain as that anything may be true.
+        assert!(!is_refused(held(0.5, 0.2, turning)));
+        assert!(!is_refused(held(0.5, 0.02, TrackingState::Tracking)));
+    }
 
     /// A mapper whose keyframes, of exact depth, are at these places along a line.
     fn mapper_with(places: &[f64]) -> Mapper {

@@ -24,6 +24,9 @@ impl Tracker {
         let quality = self.quality(alignment);
         let found =
             reference.world_from_keyframe().place(&alignment.state.current_from_keyframe.inverse());
+        if self.contradicts_hold(frame.capture_nanos, &found) {
+            return self.lost(frame, reference, LostReason::TooFewInliers, quality);
+        }
         let has_jumped = missing == 0 && self.has_jumped(reference, frame.capture_nanos, &found);
         let must_be_sure = self.memory.was_lost || has_jumped;
         let verdict = self.params.verdict.judge(alignment, &quality, must_be_sure, missing);

@@ -10,7 +10,7 @@ use nalgebra::{Matrix3, Matrix6};
 use crate::slam::alignment::align::{Aligner, Alignment, AlignmentParams, Ending};
 use crate::slam::alignment::reference::Reference;
 use crate::slam::alignment::unknown_depth::UnknownDepth;
-use crate::slam::depth::common_error::full_covariance;
+use crate::slam::depth::common_error::{full_covariance, rotation_std_dev};
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
@@ -18,7 +18,8 @@ use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::sums::SumPyramid;
 use crate::slam::pose::{Brightness, DegradedReason, LostReason, PoseEstimate, TrackingState};
 use crate::slam::tracker::covariance_floor::displacement_covariance;
-use crate::slam::tracker::{Memory, Tracker, upper_triangle};
+use crate::slam::tracker::verdict::quality_of;
+use crate::slam::tracker::{MOST_DEVIATIONS, Memory, Tracker, upper_triangle};
 
 /// Change of the exposure since the view: of the logarithm of the gain, and of the offset in grey levels. Some frames
 /// pass at most; more freedom flattens a view of little contrast until it fits anything.
@@ -56,6 +57,10 @@ const MOST_SECONDS: f64 = 1.0;
 /// A frame that was cut short is displaced by this much at most, in pixels of the finest level: beyond that fewer of its
 /// points would be explained by noise.
 const CUT_SHORT_PX: f64 = 1.0;
+
+/// How long a view may hold the camera though it has not turned away from the keyframe, seconds: what the blur of a jerk
+/// hides. What hides a keyframe for longer is no turn, and the mapper begins to count the loss.
+const MOST_IN_VIEW_SECS: f64 = 0.5;
 
 /// Share of the keyframe's points in view below which the view is prepared ahead: a camera that pans at 90°/s loses a
 /// twentieth of its image a frame, and depth is too little from a third to a tenth on.
@@ -103,6 +108,8 @@ pub(super) struct Place {
     world_from_view: Sim3,
     /// Time from the last keyframe's to the view, seconds.
     since_secs: f64,
+    /// How long the keyframe's points would have been in view since, seconds.
+    in_view_secs: f64,
     /// Stamp of the view.
     nanos: i64,
     /// How fast the camera may move, mean depths a second.
@@ -218,7 +225,7 @@ impl Tracker {
         let step = since_view.clamp(LEAST_SECONDS, MOST_SECONDS);
         view.stand_at(&place.world_from_view, TIGHTNESS * place.speed * step);
         let since = place.since_secs;
-        let next = Place { since_secs: since + step, ..place };
+        let mut next = Place { since_secs: since + step, ..place };
         // A camera that moves on evenly: its distance grows with the time, not with the root of it.
         let distance_variance = place.speed.powi(2) * (next.since_secs.powi(2) - since.powi(2));
         std::mem::swap(&mut self.aligner, &mut self.turning.aligner);
@@ -226,6 +233,11 @@ impl Tracker {
         std::mem::swap(&mut self.aligner, &mut self.turning.aligner);
         let estimate = self.held(reference, &view, frame, &alignment, &next, distance_variance);
         self.turning.view = Some(view);
+        let estimate = estimate.filter(|(estimate, _)| {
+            let is_seen = self.sees(reference, estimate);
+            next.in_view_secs = if is_seen { place.in_view_secs + step } else { 0.0 };
+            next.in_view_secs <= MOST_IN_VIEW_SECS
+        });
         let is_cut_short = alignment.ending == Ending::OutOfBudget;
         let Some((estimate, covariance)) = estimate else {
             self.memory = lost;
@@ -251,6 +263,31 @@ impl Tracker {
             self.turning.place = Some(Place { world_from_view, nanos, covariance, ..next });
         }
         Some(estimate)
+    }
+
+    /// Whether a keyframe's points would be in view from where a view holds the camera: it has not turned away from them then,
+    /// and something else hides them.
+    fn sees(&self, reference: &Reference, held: &PoseEstimate) -> bool {
+        let (aligner, pyramid) = (&self.aligner, &self.pyramid);
+        let at = held.keyframe_from_camera.inverse();
+        let seen = quality_of(&aligner.start(reference, pyramid, &at, Brightness::default()));
+        seen.in_view_ratio >= self.params.verdict.degraded_in_view
+    }
+
+    /// Whether a pose found at `nanos` is turned against the one that a view holds by more than that is uncertain and the
+    /// camera turns meanwhile: it looks like what the keyframe shows, and is elsewhere.
+    pub(super) fn contradicts_hold(&self, nanos: i64, world_from_camera: &SE3) -> bool {
+        /// A frame at 30 Hz, seconds.
+        const INTERVAL: f64 = 1.0 / 30.0;
+        let (Some(place), Some(predicted)) =
+            (&self.turning.place, self.memory.motion.predict(nanos, 1.0))
+        else {
+            return false;
+        };
+        let intervals = nanos.saturating_sub(place.nanos) as f64 * 1e-9 / INTERVAL;
+        let uncertain = rotation_std_dev(&place.covariance);
+        predicted.rotation.angle_to(&world_from_camera.rotation)
+            > MOST_CHANGE_RAD * intervals.max(1.0) + MOST_DEVIATIONS * uncertain
     }
 
     /// No view holds the camera from here on.
@@ -284,7 +321,14 @@ impl Tracker {
         let speed = before.motion.speed().map_or(SPEED, |speed| SPEED.max(speed / unit));
         let world_from_view = Sim3::new(world_from_camera, unit);
         (turning.is_first, turning.coarse_fit) = (true, None);
-        turning.place = Some(Place { world_from_view, since_secs: 0.0, nanos, speed, covariance });
+        turning.place = Some(Place {
+            world_from_view,
+            since_secs: 0.0,
+            in_view_secs: 0.0,
+            nanos,
+            speed,
+            covariance,
+        });
     }
 
     /// The estimate of a frame that is aligned to the view, and the covariance in units of the mean depth; `None` where
@@ -331,9 +375,8 @@ impl Tracker {
         of_step.fixed_view_mut::<3, 6>(0, 0).fill(0.0);
         of_step.fixed_view_mut::<6, 3>(0, 0).fill(0.0);
         (0..3).for_each(|axis| of_step[(axis, axis)] = distance_variance);
-        let of_rotation =
-            of_step.fixed_view::<3, 3>(3, 3).into_owned().symmetric_eigenvalues().max();
-        if !(of_rotation.sqrt() <= MOST_ROTATION_STD_DEV) {
+        // A comparison that is false of what is no number.
+        if !(rotation_std_dev(&of_step) <= MOST_ROTATION_STD_DEV) {
             return None;
         }
         let adjoint = current_from_view.adjoint();

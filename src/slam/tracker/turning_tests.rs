@@ -6,6 +6,8 @@ use crate::slam::alignment::reference::Reference;
 use crate::slam::depth::common_error::full_covariance;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
+use crate::slam::geometry::sim3::{Sim3, Twist7};
+use crate::slam::keyframe::Keyframe;
 use crate::slam::pose::{DegradedReason, LostReason, PoseEstimate, TrackingState};
 use crate::slam::test_scene::{CAMERA, Scene};
 use crate::slam::tracker::{Tracker, TrackerParams};
@@ -102,6 +104,52 @@ fn a_held_frame_that_is_cut_short_ends_nothing() {
         // Less sure than the frames beside it.
         let deviation = |frame: u64| at(frame).covariance[20].sqrt();
         assert!(deviation(CUT_SHORT) > 1.5 * deviation(CUT_SHORT + 1), "{jerk_rad}");
+    }
+}
+
+/// What is said of a pan by so many degrees a frame; after frame `at` the tracker gets another keyframe.
+fn pan_with(degrees: f64, frames: u64, at: u64, other: &Keyframe) -> Vec<TrackingState> {
+    let scene = Scene::new(3);
+    let mut tracker = Tracker::new(CAMERA, TrackerParams::default()).unwrap();
+    tracker.adopt(Box::new(Reference::prepare(&scene.keyframe(1, SE3::identity(), 2.0))));
+    let say = |frame: u64| {
+        let angle = (degrees * frame as f64).to_radians();
+        let truth = SE3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, angle, 0.0));
+        let pixels = scene.render(&CAMERA, &truth).noisy(2.0, 10 + frame);
+        let seen = FrameView::new(&CAMERA, frame, frame as i64 * 33_333_333, &pixels);
+        let state = tracker.track(&seen, &mut |_| true).state;
+        if frame == at {
+            tracker.adopt(Box::new(Reference::prepare(other)));
+        }
+        state
+    };
+    (0..frames).map(say).collect()
+}
+
+#[test]
+fn what_hides_a_keyframe_without_a_turn_is_not_held_for_long() {
+    // The keyframe shows another room at the same place.
+    let other = Scene::new(9).keyframe(2, SE3::identity(), 2.0);
+    let said = pan_with(0.3, 40, 3, &other);
+    let held = said.iter().filter(|&&state| state == TURNING).count();
+    assert!((10..=15).contains(&held), "{held} frames were held");
+    assert!(matches!(said.last(), Some(TrackingState::Lost(_))));
+}
+
+#[test]
+fn a_find_that_is_turned_against_what_is_held_is_refused() {
+    const AT: u64 = 24;
+    let found = Scene::new(3).keyframe(2, panned(AT, 0.0), 2.0);
+    let turned = Sim3::exp(&Twist7::from([0.0, 0.0, 0.0, 0.0, 0.0, 0.7, 0.0]));
+    let world_from_keyframe = turned * found.world_from_keyframe;
+    let elsewhere = Keyframe { world_from_keyframe, ..found.clone() };
+    for (keyframe, is_believed) in [(found, true), (elsewhere, false)] {
+        let said = pan_with(2.5, AT + 4, AT, &keyframe);
+        assert_eq!(said[AT as usize], TURNING);
+        let after = &said[AT as usize + 1..];
+        let is_found = after.iter().all(|&state| state == TrackingState::Tracking);
+        assert_eq!(is_found, is_believed, "{after:?}");
+        assert!(is_believed || after.iter().all(|&state| state == TURNING), "{after:?}");
     }
 }
 
