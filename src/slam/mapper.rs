@@ -310,7 +310,8 @@ impl Mapper {
         let finished = self.finish_keyframe();
         self.start.last_frame = None;
         let outcome = self.take_in(frame, pose, sensor_depth, change_begins);
-        let keyframe_changed = outcome.keyframe_changed || finished.keyframe_changed;
+        let is_told = self.tell_doubt();
+        let keyframe_changed = outcome.keyframe_changed || finished.keyframe_changed || is_told;
         StepOutcome { keyframe_changed, ..outcome }
     }
 

@@ -30,6 +30,11 @@ impl ModeCovariance {
         Self { upper_triangle: [column * column, 0.0, 0.0, row * row, 0.0, relief * relief] }
     }
 
+    /// Of depth of which nothing is known.
+    pub fn unknown() -> Self {
+        Self::of_std_devs([IGNORANCE; NUM_MODES])
+    }
+
     /// Of a symmetric matrix.
     pub fn of(matrix: &Matrix3<f64>) -> Self {
         let m = |i, j| 0.5 * (matrix[(i, j)] + matrix[(j, i)]);
@@ -42,7 +47,7 @@ impl ModeCovariance {
         let largest = covariance.std_devs().max();
         match Self::from_upper_triangle(covariance.upper_triangle) {
             Some(covariance) if largest <= IGNORANCE => covariance,
-            _ => Self::of_std_devs([IGNORANCE; NUM_MODES]),
+            _ => Self::unknown(),
         }
     }
 

@@ -2,16 +2,19 @@
 //! contradicts itself again.
 //!
 //! That helps where keyframes were left at wrong places or with wrong units, not where depth is lost or the start was
-//! wrong. The estimate is one like the others: it goes to their thread next and enters as they do.
+//! wrong. The estimate is one like the others: it goes to their thread next and enters as they do. Until it has entered,
+//! poses go on being claimed, with the covariance of a keyframe of whose depth nothing is known.
 
 use crate::slam::depth::gaussian::ObservationCounts;
 use crate::slam::mapper::consistency::{Contradiction, START_KEYFRAMES, is_plausible_ratio};
+use crate::slam::mapper::phase::Lasting;
 use crate::slam::mapper::{Mapper, StepOutcome};
+use crate::slam::modes::ModeCovariance;
 use crate::slam::pose::PoseEstimate;
 
-/// Frames until the estimate must have entered: it waits for one that is away, and takes as long as a few itself. Poses
-/// are claimed meanwhile.
-const MOST_FRAMES: u32 = 20;
+/// Time of the stamps until the estimate must have entered, seconds: it waits for one that is away, and takes a few tenths
+/// itself.
+const MOST_SECS: f64 = 0.7;
 
 /// Keyframes that must come without a contradiction before a map is estimated once more for another.
 const TRUSTED_AFTER: u64 = 4;
@@ -28,8 +31,10 @@ pub(super) enum Doubt {
         contradiction: Contradiction,
         /// The active keyframe then.
         keyframe_id: u64,
+        /// Time since.
+        lasting: Lasting,
         /// Frames since.
-        frames: u32,
+        frames: usize,
         /// Whether the estimate is under way.
         is_away: bool,
     },
@@ -71,7 +76,7 @@ impl Mapper {
             contradiction = of_start.or(contradiction);
         }
         let is_rejected = contradiction.is_some_and(|contradiction| self.contradict(contradiction));
-        if !(is_rejected || self.has_waited_in_vain()) {
+        if !(is_rejected || self.has_waited_in_vain(pose.capture_nanos)) {
             return None;
         }
         Some(StepOutcome {
@@ -94,23 +99,47 @@ impl Mapper {
             Doubt::Settled(then) => active >= then.saturating_add(TRUSTED_AFTER),
         };
         if may_help && is_new && self.is_estimated {
+            let (lasting, frames, is_away) = (Lasting::default(), 0, false);
             self.doubt =
-                Doubt::Raised { contradiction, keyframe_id: active, frames: 0, is_away: false };
+                Doubt::Raised { contradiction, keyframe_id: active, lasting, frames, is_away };
             return false;
         }
         self.reject(contradiction);
         true
     }
 
-    /// Counts another frame of a map in doubt; rejects it where nobody has estimated it again.
-    fn has_waited_in_vain(&mut self) -> bool {
-        let Doubt::Raised { contradiction, frames, .. } = &mut self.doubt else { return false };
+    /// Takes in another frame of a map in doubt; rejects it where nobody has estimated it again.
+    fn has_waited_in_vain(&mut self, nanos: i64) -> bool {
+        // In lockstep estimates enter after so many frames: one that is away, and its own.
+        let least_frames = 2 * (self.params.window.delay_frames + 1);
+        let Doubt::Raised { contradiction, lasting, frames, .. } = &mut self.doubt else {
+            return false;
+        };
         *frames += 1;
-        let (contradiction, is_late) = (*contradiction, *frames > MOST_FRAMES);
+        let is_late = lasting.secs(nanos) > MOST_SECS && *frames > least_frames;
+        let contradiction = *contradiction;
         if is_late {
             self.reject(contradiction);
         }
         is_late
+    }
+
+    /// Has the active keyframe of a map in doubt say that nothing is known of its depth, until an estimate says more; true
+    /// where that is new.
+    pub(super) fn tell_doubt(&mut self) -> bool {
+        if !matches!(self.doubt, Doubt::Raised { .. }) {
+            return false;
+        }
+        self.modes.enter(&ModeCovariance::unknown(), &self.params.modes);
+        let said = self.modes.published(&self.params.modes);
+        if self.keyframe().is_none_or(|keyframe| keyframe.mode_covariance == said) {
+            return false;
+        }
+        self.revision += 1;
+        self.publish_place();
+        let Some(keyframe) = self.keyframe_mut() else { return false };
+        keyframe.mode_covariance = said;
+        true
     }
 
     /// An estimate has entered: where it was that of a map in doubt, what is left of it is judged anew. True where that
@@ -159,6 +188,7 @@ mod tests {
         mapper.active = Some(Active::new(1));
         mapper.phase = Phase::Mapping;
         mapper.is_estimated = is_estimated;
+        mapper.revision = 1;
         mapper
     }
 
@@ -208,8 +238,44 @@ mod tests {
         // One that was dropped is estimated again.
         assert!(mapper.doubt.hand_over());
         mapper.doubt.take_back();
-        let waits = (0..100).take_while(|_| !mapper.has_waited_in_vain()).count();
-        assert_eq!(waits, MOST_FRAMES as usize);
+        assert!(!mapper.settle_doubt(), "another's estimate is not it");
+        assert!(matches!(mapper.doubt, Doubt::Raised { is_away: false, .. }));
+        let is_waiting =
+            |mapper: &mut Mapper, frame: i64| !mapper.has_waited_in_vain(frame * 10_000_000);
+        // At 100 Hz: frames that come faster are no longer time.
+        let waits = (0..500).take_while(|&frame| is_waiting(&mut mapper, frame)).count();
+        assert!((65..=75).contains(&waits), "{waits}");
         assert!(is_rejected(&mapper));
+    }
+
+    #[test]
+    fn frames_that_come_slowly_leave_an_estimate_as_many_as_it_takes() {
+        let mut mapper = mapper(true);
+        mapper.contradict(Contradiction::FailedSearches);
+        let is_waiting =
+            |mapper: &mut Mapper, frame: i64| !mapper.has_waited_in_vain(frame * 1_000_000_000);
+        let waits = (0..100).take_while(|&frame| is_waiting(&mut mapper, frame)).count();
+        assert_eq!(waits, 2 * (mapper.params.window.delay_frames + 1));
+    }
+
+    #[test]
+    fn as_long_as_a_map_is_in_doubt_its_keyframe_says_that_nothing_is_known() {
+        let mut mapper = mapper(true);
+        let deviations = |mapper: &Mapper| mapper.keyframe().unwrap().mode_covariance.std_devs();
+        let before = mapper.keyframe().unwrap().revision;
+        assert!(!mapper.tell_doubt() && deviations(&mapper).max() == 0.0);
+        mapper.contradict(Contradiction::FailedSearches);
+        assert!(mapper.tell_doubt() && deviations(&mapper).min() > 0.9);
+        assert!(mapper.keyframe().unwrap().revision > before);
+        // Once is enough, until somebody says otherwise.
+        assert!(!mapper.tell_doubt());
+        mapper.keyframe_mut().unwrap().mode_covariance = ModeCovariance::ZERO;
+        assert!(mapper.tell_doubt());
+        // The estimate says what is known.
+        let mut window = mapper.begin_adjustment(false).unwrap();
+        window.optimise();
+        mapper.end_adjustment(window);
+        assert_eq!(mapper.doubt, Doubt::Settled(1));
+        assert!(!mapper.tell_doubt() && deviations(&mapper).max() < 0.5);
     }
 }

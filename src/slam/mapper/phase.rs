@@ -2,7 +2,7 @@
 
 use crate::slam::mapper::consistency::{Consistency, Contradiction};
 
-/// Longest time that two lost frames are taken to be apart: the slowest camera's period.
+/// Longest time that two frames are taken to be apart: the slowest camera's period.
 const LONGEST_STEP_NANOS: i64 = 5_000_000_000;
 
 /// What is done with the next frame.
@@ -22,13 +22,19 @@ pub(super) enum Phase {
     Restarting(Loss),
 }
 
+/// Time of the frames' stamps since the first of some.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct Lasting {
+    /// Stamp of the last frame.
+    last_nanos: Option<i64>,
+    nanos: i64,
+}
+
 /// How long the camera has been lost, and where it was looked for.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Loss {
-    /// Stamp of the last lost frame.
-    last_nanos: Option<i64>,
-    /// Time of the stamps since the first.
-    lost_nanos: i64,
+    /// Since the first lost frame.
+    pub(super) lasting: Lasting,
     /// Keyframes searched since then.
     pub(super) searched: usize,
     /// Keyframes that were compared with turned views.
@@ -54,13 +60,13 @@ impl Phase {
     }
 }
 
-impl Loss {
-    /// How long it has lasted, seconds, with another lost frame. A step of the clock, back or far
-    /// forwards, is no time in which anything was searched.
-    pub(super) fn lasted_secs(&mut self, nanos: i64) -> f64 {
+impl Lasting {
+    /// How long it is with another frame, seconds. A step of the clock, back or far forwards, is no time in which anything
+    /// was done.
+    pub(super) fn secs(&mut self, nanos: i64) -> f64 {
         let step = nanos.saturating_sub(self.last_nanos.replace(nanos).unwrap_or(nanos));
-        self.lost_nanos = self.lost_nanos.saturating_add(step.clamp(0, LONGEST_STEP_NANOS));
-        self.lost_nanos as f64 * 1e-9
+        self.nanos = self.nanos.saturating_add(step.clamp(0, LONGEST_STEP_NANOS));
+        self.nanos as f64 * 1e-9
     }
 }
 
@@ -89,8 +95,8 @@ mod tests {
     #[test]
     fn steps_of_the_clock_neither_delay_nor_end_a_search() {
         const SECOND: i64 = 1_000_000_000;
-        let mut loss = Loss::default();
-        let mut secs = |stamp: i64| loss.lasted_secs(stamp);
+        let mut lasting = Lasting::default();
+        let mut secs = |stamp: i64| lasting.secs(stamp);
         assert_eq!(secs(100 * SECOND), 0.0);
         assert_eq!(secs(101 * SECOND), 1.0);
         // An hour back, and on from there.

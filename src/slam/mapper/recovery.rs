@@ -70,7 +70,7 @@ impl Mapper {
         let mut loss = self.phase.loss();
         // A view that holds the camera is no loss, and nothing to begin another map with.
         let is_held = pose.state.is_tracked() && !matches!(self.phase, Phase::Rejected(..));
-        let lost_secs = if is_held { 0.0 } else { loss.lasted_secs(frame.capture_nanos) };
+        let lost_secs = if is_held { 0.0 } else { loss.lasting.secs(frame.capture_nanos) };
         if let Some(active) = self.active {
             let (keyframes, params) = (&self.map.keyframes, &self.params.recovery);
             let searched = &mut loss.searched;
