@@ -1,6 +1,6 @@
 //! The recipe of a map step: observe depth, regularise, choose keyframes, propagate.
 
-pub(in crate::slam) mod appearance;
+pub mod appearance;
 mod change;
 pub mod consistency;
 mod correction;

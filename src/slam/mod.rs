@@ -16,6 +16,7 @@ pub mod mapper;
 pub mod modes;
 pub mod parameter;
 pub mod place_covariance;
+pub mod places;
 pub mod pose;
 #[cfg(test)]
 pub mod test_scene;

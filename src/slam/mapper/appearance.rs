@@ -13,7 +13,7 @@ const COUNT: f32 = (INNER[0] * INNER[1]) as f32;
 
 /// A small image.
 #[derive(Debug, Clone, PartialEq)]
-pub(in crate::slam) struct Appearance {
+pub struct Appearance {
     greys: Vec<f32>,
     /// The same without what changes slowly over the image.
     details: Vec<f32>,
@@ -21,7 +21,7 @@ pub(in crate::slam) struct Appearance {
 
 impl Appearance {
     /// Of an image, row after row; `None` where it is too small to have one.
-    pub(in crate::slam) fn of(pixels: &[u8], width: usize, height: usize) -> Option<Self> {
+    pub fn of(pixels: &[u8], width: usize, height: usize) -> Option<Self> {
         if width < COLUMNS || height < ROWS || pixels.len() != width * height {
             return None;
         }
@@ -54,7 +54,7 @@ impl Appearance {
 
     /// Correlation at the best of the shifts, −1 to 1: what brightness and contrast do to an image does not count. −1
     /// where one of them shows nothing.
-    pub(in crate::slam) fn similarity(&self, other: &Self) -> f32 {
+    pub fn similarity(&self, other: &Self) -> f32 {
         let mut inner: Vec<f32> = self.part([REACH, REACH]).flatten().copied().collect();
         let mean = inner.iter().sum::<f32>() / COUNT;
         inner.iter_mut().for_each(|grey| *grey -= mean);

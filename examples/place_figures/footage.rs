@@ -1,0 +1,170 @@
+//! Keyframes of a sequence, and what they share by the truth.
+
+use std::error::Error;
+use std::fs;
+use std::path::Path;
+
+use nalgebra::Vector3;
+use semidense::capture::source::{SourceParams, open};
+use semidense::service::trajectory_file::read_trajectory;
+use semidense::slam::geometry::intrinsics::Intrinsics;
+use semidense::slam::geometry::se3::SE3;
+use semidense::slam::image::buffer::Image;
+
+use crate::Arguments;
+
+/// A keyframe.
+pub struct Frame {
+    pub pixels: Vec<u8>,
+    world_from_camera: SE3,
+    depth: Option<Image<f32>>,
+}
+
+/// The keyframes of a sequence.
+pub struct Footage {
+    pub camera: Intrinsics,
+    pub frames: Vec<Frame>,
+    depths: Vec<f64>,
+}
+
+/// How much two keyframes share: the least and the most that it can be.
+#[derive(Debug, Clone, Copy)]
+pub struct Overlap {
+    pub least: f64,
+    pub most: f64,
+}
+
+impl Footage {
+    /// Frames with a true pose; of a source with depth those with depth.
+    pub fn read(arguments: &Arguments) -> Result<Self, Box<dyn Error>> {
+        let mut params = SourceParams::default();
+        params.simulator.seed = arguments.seed;
+        params.simulator.frames = arguments.frames.unwrap_or(params.simulator.frames);
+        let mut source = open(&arguments.source, None, &params)?;
+        source.prepare(&mut |_, _| true)?;
+        let camera = source.intrinsics();
+        let truth = match &arguments.truth {
+            Some(file) => read_trajectory(file)?,
+            None => source.ground_truth().to_vec(),
+        };
+        let mut pixels = vec![0; camera.width * camera.height];
+        let (mut frames, mut number) = (Vec::new(), 0);
+        while let Some(stamp) = source.next_into(&mut pixels)? {
+            number += 1;
+            if arguments.frames.is_some_and(|most| number > most) {
+                break;
+            }
+            if (number - 1) % arguments.stride != 0 {
+                continue;
+            }
+            /// Half a frame's period.
+            const NEAR_NANOS: u64 = 17_000_000;
+            let nearest = truth.iter().min_by_key(|p| p.nanos.abs_diff(stamp.capture_nanos));
+            let Some(pose) = nearest.filter(|p| p.nanos.abs_diff(stamp.capture_nanos) < NEAR_NANOS)
+            else {
+                continue;
+            };
+            let depth = source.depth_at(stamp.capture_nanos)?;
+            let world_from_camera = pose.world_from_camera;
+            frames.push(Frame { pixels: pixels.clone(), world_from_camera, depth });
+        }
+        Ok(Self { camera, frames, depths: arguments.depths.clone() })
+    }
+
+    /// The keyframes as they ask, darkened and rolled.
+    pub fn queries(&self, contrast: f32, roll_deg: f32) -> Vec<Vec<u8>> {
+        let (width, height) = (self.camera.width, self.camera.height);
+        let (sin, cos) = roll_deg.to_radians().sin_cos();
+        let of = |frame: &Frame| {
+            let image = frame.pixels.iter().map(|&grey| contrast * f32::from(grey)).collect();
+            let Some(image) = Image::try_from_pixels(width, height, image) else {
+                return Vec::new();
+            };
+            if roll_deg == 0.0 {
+                return image.pixels().iter().map(|grey| grey.round() as u8).collect();
+            }
+            let [u0, v0] = [width, height].map(|side| side as f32 / 2.0 - 0.5);
+            let at = |k: usize| {
+                let (x, y) = ((k % width) as f32 - u0, (k / width) as f32 - v0);
+                let (u, v) = (u0 + cos * x - sin * y, v0 + sin * x + cos * y);
+                let is_inside = u >= 0.0 && v >= 0.0 && u < width as f32 && v < height as f32;
+                if is_inside { image.bilinear(u, v).round() as u8 } else { 0 }
+            };
+            (0..width * height).map(at).collect()
+        };
+        self.frames.iter().map(of).collect()
+    }
+
+    /// Of every pair the share that each sees of the other.
+    pub fn overlaps(&self) -> Vec<Vec<Overlap>> {
+        let count = self.frames.len();
+        let one_way: Vec<Vec<Overlap>> =
+            (0..count).map(|i| (0..count).map(|j| self.seen(i, j)).collect()).collect();
+        let both = |i: usize, j: usize| {
+            let (a, b) = (one_way[i][j], one_way[j][i]);
+            Overlap { least: a.least.min(b.least), most: a.most.max(b.most) }
+        };
+        (0..count).map(|i| (0..count).map(|j| both(i, j)).collect()).collect()
+    }
+
+    /// Share of what frame `i` sees that `j` sees too: by depth, or between assumed depths.
+    fn seen(&self, i: usize, j: usize) -> Overlap {
+        let (i, j) = (&self.frames[i], &self.frames[j]);
+        let j_from_i = j.world_from_camera.inverse() * i.world_from_camera;
+        if let Some(depth) = &i.depth {
+            let at = |u: usize, v: usize| Some(f64::from(depth.at(u, v))).filter(|z| *z > 0.0);
+            let share = self.share(&j_from_i, at, j.depth.as_ref());
+            return Overlap { least: share, most: share };
+        }
+        let shares: Vec<f64> =
+            self.depths.iter().map(|&z| self.share(&j_from_i, |_, _| Some(z), None)).collect();
+        let mean = shares.iter().sum::<f64>() / shares.len() as f64;
+        Overlap { least: mean, most: shares.into_iter().fold(0.0, f64::max) }
+    }
+
+    fn share(
+        &self,
+        j_from_i: &SE3,
+        depth_at: impl Fn(usize, usize) -> Option<f64>,
+        theirs: Option<&Image<f32>>,
+    ) -> f64 {
+        /// Pixels from one that is looked at to the next.
+        const STEP: usize = 16;
+        /// Depths that differ by more hide each other.
+        const HIDDEN: f64 = 0.15;
+        let Intrinsics { width, height, fx, fy, cx, cy, .. } = self.camera;
+        let (mut all, mut seen) = (0, 0);
+        for v in (STEP / 2..height).step_by(STEP) {
+            for u in (STEP / 2..width).step_by(STEP) {
+                let Some(z) = depth_at(u, v) else { continue };
+                all += 1;
+                let ray = Vector3::new((u as f64 - cx) / fx, (v as f64 - cy) / fy, 1.0);
+                let point = j_from_i.rotation * (ray * z) + j_from_i.translation;
+                if point.z <= 0.0 {
+                    continue;
+                }
+                let (x, y) = (fx * point.x / point.z + cx + 0.5, fy * point.y / point.z + cy + 0.5);
+                if x < 0.0 || y < 0.0 || x >= width as f64 || y >= height as f64 {
+                    continue;
+                }
+                let there = theirs.map(|depth| f64::from(depth.at(x as usize, y as usize)));
+                let is_seen =
+                    there.is_none_or(|there| there <= 0.0 || (there / point.z).ln().abs() < HIDDEN);
+                seen += usize::from(is_seen);
+            }
+        }
+        f64::from(seen as u32) / f64::from(all.max(1) as u32)
+    }
+
+    /// Writes the keyframes as PGM files.
+    pub fn export(&self, folder: &Path) -> Result<(), Box<dyn Error>> {
+        fs::create_dir_all(folder)?;
+        for (number, frame) in self.frames.iter().enumerate() {
+            let mut file =
+                format!("P5\n{} {}\n255\n", self.camera.width, self.camera.height).into_bytes();
+            file.extend(&frame.pixels);
+            fs::write(folder.join(format!("{number:05}.pgm")), file)?;
+        }
+        Ok(())
+    }
+}

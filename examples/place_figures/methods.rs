@@ -1,0 +1,110 @@
+//! The methods that are compared: each says of every keyframe that asks how alike every other one is.
+
+use std::error::Error;
+use std::fs;
+use std::path::Path;
+use std::time::Instant;
+
+use clap::ValueEnum;
+use semidense::slam::mapper::appearance::Appearance;
+use semidense::slam::places::{Describer, PlaceIndex};
+
+use crate::ferns::Ferns;
+use crate::footage::Footage;
+
+/// A method.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Kind {
+    /// Binary descriptors in a tree.
+    Tree,
+    /// Small blurred images.
+    Small,
+    /// Random ferns.
+    Ferns,
+}
+
+/// What a method says.
+pub struct Scores {
+    /// For each query a number for each keyframe, larger the more alike, NaN where it says nothing.
+    pub of: Vec<Vec<f32>>,
+    /// What it costs, to be printed.
+    pub cost: String,
+}
+
+/// Of a method over all pairs.
+pub fn scores(kind: Kind, footage: &Footage, queries: &[Vec<u8>]) -> Scores {
+    match kind {
+        Kind::Tree => tree(footage, queries),
+        Kind::Small => small(footage, queries),
+        Kind::Ferns => Ferns::scores(footage, queries),
+    }
+}
+
+fn micros(began: Instant, count: usize) -> f64 {
+    1e6 * began.elapsed().as_secs_f64() / count.max(1) as f64
+}
+
+fn tree(footage: &Footage, queries: &[Vec<u8>]) -> Scores {
+    let (width, height) = (footage.camera.width, footage.camera.height);
+    let count = footage.frames.len();
+    let (mut describer, mut index) = (Describer::new(), PlaceIndex::new());
+    let began = Instant::now();
+    let described: Vec<_> =
+        footage.frames.iter().map(|f| describer.describe(&f.pixels, width, height)).collect();
+    let describe = micros(began, count);
+    let asking: Vec<_> = queries.iter().map(|q| describer.describe(q, width, height)).collect();
+    let began = Instant::now();
+    for (id, description) in (0..).zip(&described) {
+        description.iter().for_each(|description| index.insert(id, description));
+    }
+    let insert = micros(began, count);
+    let began = Instant::now();
+    let of = asking
+        .iter()
+        .enumerate()
+        .map(|(query, description)| {
+            let mut row = vec![f32::NAN; count];
+            let Some(description) = description else { return row };
+            for found in index.candidates(description, count, |id| id == query as u64) {
+                row[found.keyframe_id as usize] = found.score;
+            }
+            row
+        })
+        .collect();
+    let query = micros(began, count);
+    let features: usize = described.iter().flatten().map(|d| d.features().len()).sum();
+    let cost = format!(
+        "describe {describe:.0} µs, insert {insert:.0} µs, query {query:.0} µs, {} features, {} B a keyframe",
+        features / count.max(1),
+        index.bytes() / count.max(1)
+    );
+    Scores { of, cost }
+}
+
+fn small(footage: &Footage, queries: &[Vec<u8>]) -> Scores {
+    let (width, height) = (footage.camera.width, footage.camera.height);
+    let known: Vec<_> =
+        footage.frames.iter().map(|f| Appearance::of(&f.pixels, width, height)).collect();
+    let asking: Vec<_> = queries.iter().map(|q| Appearance::of(q, width, height)).collect();
+    let began = Instant::now();
+    let of = asking
+        .iter()
+        .map(|ours| {
+            let score = |theirs: &Option<Appearance>| match (ours, theirs) {
+                (Some(ours), Some(theirs)) => theirs.similarity(ours),
+                _ => f32::NAN,
+            };
+            known.iter().map(score).collect()
+        })
+        .collect();
+    let cost = format!("query {:.0} µs", micros(began, queries.len()));
+    Scores { of, cost }
+}
+
+/// Of a file: a line for each query.
+pub fn read_scores(file: &Path) -> Result<Scores, Box<dyn Error>> {
+    let text = fs::read_to_string(file)?;
+    let row = |line: &str| line.split_whitespace().map(str::parse).collect::<Result<Vec<f32>, _>>();
+    let of = text.lines().map(row).collect::<Result<_, _>>()?;
+    Ok(Scores { of, cost: String::new() })
+}

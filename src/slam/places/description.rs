@@ -1,0 +1,202 @@
+//! What an image looks like: corners at several scales, each with an orientation and a binary descriptor (Rublee et al.
+//! 2011).
+
+use serde::{Deserialize, Serialize};
+
+use super::corners::{Corner, CornerFinder};
+use super::pattern::{ORIENTATIONS, Pattern, RADIUS_PX, WORDS};
+use super::scales::{self, Scale};
+
+/// Most features of an image.
+pub const MAX_FEATURES: usize = 300;
+
+/// A corner and what is around it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Feature {
+    /// Where it is.
+    pub place: FeaturePlace,
+    /// Which of the pixels around it are darker than others.
+    pub bits: [u64; WORDS],
+}
+
+/// Where a feature is in its image.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FeaturePlace {
+    /// Column, pixels of the image.
+    pub u: u16,
+    /// Row.
+    pub v: u16,
+    /// Step of its direction, of 32 all around.
+    pub orientation: u8,
+    /// Scale that it was found on.
+    pub scale: u8,
+}
+
+/// What an image looks like.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Description {
+    /// Size of the image, pixels.
+    pub(super) width: u16,
+    pub(super) height: u16,
+    pub(super) features: Vec<Feature>,
+    /// For each feature, comparisons that noise may turn over; not kept.
+    #[serde(skip)]
+    pub(super) unsure: Vec<[u64; WORDS]>,
+}
+
+impl Description {
+    /// Its features.
+    pub fn features(&self) -> &[Feature] {
+        &self.features
+    }
+}
+
+/// Describes images; owns the memory for that.
+#[derive(Debug, Clone)]
+pub struct Describer {
+    pattern: Pattern,
+    scales: Vec<Scale>,
+    sums: Vec<u16>,
+    finder: CornerFinder,
+    corners: Vec<Corner>,
+    chosen: Vec<Corner>,
+}
+
+impl Default for Describer {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Describer {
+    /// For images of any size.
+    pub fn new() -> Self {
+        Self {
+            pattern: Pattern::new(),
+            scales: Vec::new(),
+            sums: Vec::new(),
+            finder: CornerFinder::default(),
+            corners: Vec::new(),
+            chosen: Vec::new(),
+        }
+    }
+
+    /// Of an image, row after row; `None` where it is too small, or shows nothing.
+    pub fn describe(&mut self, pixels: &[u8], width: usize, height: usize) -> Option<Description> {
+        /// Fewest pixels of a side: of a scale.
+        const LEAST_PX: usize = 72;
+        let is_sized = |side: usize| (LEAST_PX..=usize::from(u16::MAX)).contains(&side);
+        if !is_sized(width) || !is_sized(height) || pixels.len() != width * height {
+            return None;
+        }
+        scales::fill(&mut self.scales, pixels, width, height, &mut self.sums);
+        let mut description = Description {
+            width: width as u16,
+            height: height as u16,
+            features: Vec::with_capacity(MAX_FEATURES),
+            unsure: Vec::with_capacity(MAX_FEATURES),
+        };
+        let areas: Vec<usize> = self.scales.iter().map(|s| s.width * s.height).collect();
+        // The smallest scales first: what they leave over is for the larger ones.
+        for k in (0..self.scales.len()).rev() {
+            let left = MAX_FEATURES - description.features.len();
+            let share = areas[k] as f32 / areas[..=k].iter().sum::<usize>() as f32;
+            let budget = if k == 0 { left } else { (left as f32 * share).ceil() as usize };
+            let scale = &self.scales[k];
+            self.finder.find(
+                &scale.pixels,
+                scale.width,
+                scale.height,
+                MARGIN_PX,
+                &mut self.corners,
+            );
+            choose(&mut self.corners, scale, budget, &mut self.chosen);
+            for corner in &self.chosen {
+                let (feature, unsure) = feature(scale, k, corner, &self.pattern);
+                description.features.push(feature);
+                description.unsure.push(unsure);
+            }
+        }
+        (!description.features.is_empty()).then_some(description)
+    }
+}
+
+/// Pixels from the edge that a descriptor needs.
+const MARGIN_PX: usize = RADIUS_PX as usize + 1;
+
+/// The strongest corners, spread over the image.
+fn choose(corners: &mut [Corner], scale: &Scale, budget: usize, chosen: &mut Vec<Corner>) {
+    /// Parts of the image that share the corners.
+    const PARTS: [usize; 2] = [8, 6];
+    /// A part has at most so many times its share.
+    const MOST_SHARES: usize = 3;
+    let most = (MOST_SHARES * budget).div_ceil(PARTS[0] * PARTS[1]);
+    let mut counts = [0usize; PARTS[0] * PARTS[1]];
+    corners.sort_by(|one, other| other.strength.cmp(&one.strength));
+    chosen.clear();
+    for corner in corners.iter() {
+        if chosen.len() == budget {
+            break;
+        }
+        let column = usize::from(corner.u) * PARTS[0] / scale.width;
+        let row = usize::from(corner.v) * PARTS[1] / scale.height;
+        let count = &mut counts[row * PARTS[0] + column];
+        if *count < most {
+            *count += 1;
+            chosen.push(*corner);
+        }
+    }
+}
+
+/// A corner's feature, and which comparisons are close.
+fn feature(
+    scale: &Scale,
+    level: usize,
+    corner: &Corner,
+    pattern: &Pattern,
+) -> (Feature, [u64; WORDS]) {
+    let at = usize::from(corner.v) * scale.width + usize::from(corner.u);
+    let orientation = orientation(scale, at);
+    let width = scale.width as isize;
+    let grey = |[x, y]: [i8; 2]| {
+        let offset = y as isize * width + x as isize;
+        i32::from(scale.blurred[at.wrapping_add_signed(offset)])
+    };
+    let mut bits = [0u64; WORDS];
+    let mut differences = [0i16; 64 * WORDS];
+    let mut sum = 0i32;
+    for (k, [a, b]) in pattern.turned(orientation).iter().enumerate() {
+        let difference = grey(*a) - grey(*b);
+        bits[k / 64] |= u64::from(difference < 0) << (k % 64);
+        differences[k] = difference.abs() as i16;
+        sum += difference.abs();
+    }
+    // A third of the mean difference.
+    let limit = (sum / (3 * 64 * WORDS as i32)) as i16;
+    let mut unsure = [0u64; WORDS];
+    for (k, difference) in differences.iter().enumerate() {
+        unsure[k / 64] |= u64::from(*difference <= limit) << (k % 64);
+    }
+    let pixel = |k: u16| ((f32::from(k) + 0.5) * scale.factor - 0.5).round() as u16;
+    let place =
+        FeaturePlace { u: pixel(corner.u), v: pixel(corner.v), orientation, scale: level as u8 };
+    (Feature { place, bits }, unsure)
+}
+
+/// Direction of the centre of brightness (Rosin 1999).
+fn orientation(scale: &Scale, at: usize) -> u8 {
+    let (mut across, mut down) = (0i32, 0i32);
+    for y in -RADIUS_PX..=RADIUS_PX {
+        let half = ((RADIUS_PX * RADIUS_PX - y * y) as f32).sqrt() as i32;
+        let begin = at.wrapping_add_signed(y as isize * scale.width as isize - half as isize);
+        let row = &scale.blurred[begin..begin + 2 * half as usize + 1];
+        let mut sum = 0i32;
+        for (x, grey) in (-half..=half).zip(row) {
+            sum += i32::from(*grey);
+            across += x * i32::from(*grey);
+        }
+        down += y * sum;
+    }
+    let turns = (down as f64).atan2(across as f64) / std::f64::consts::TAU;
+    (turns * ORIENTATIONS as f64).round().rem_euclid(ORIENTATIONS as f64) as u8
+}

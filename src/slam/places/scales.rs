@@ -1,0 +1,120 @@
+//! An image at several scales, and the same blurred.
+
+/// Size relation of one scale to the next.
+pub(super) const SCALE_STEP: f32 = 1.25;
+
+/// One scale.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Scale {
+    pub(super) width: usize,
+    pub(super) height: usize,
+    pub(super) pixels: Vec<u8>,
+    /// Blurred by two pixels, against noise and small shifts.
+    pub(super) blurred: Vec<u8>,
+    /// Pixels of the image for one of this scale.
+    pub(super) factor: f32,
+}
+
+/// Fills `scales` with an image from its largest scale on.
+pub(super) fn fill(
+    scales: &mut Vec<Scale>,
+    pixels: &[u8],
+    width: usize,
+    height: usize,
+    scratch: &mut Vec<u16>,
+) {
+    let long = width.max(height);
+    let first = (long as f32 / LARGEST_PX as f32).max(1.0);
+    let of = |k: usize| first * SCALE_STEP.powi(k as i32);
+    let sized = |side: usize, k: usize| (side as f32 / of(k)).round() as usize;
+    let count =
+        (0..MOST_SCALES).take_while(|&k| sized(width.min(height), k) >= SMALLEST_PX).count();
+    scales.resize_with(count, Scale::default);
+    for k in 0..count {
+        let (before, rest) = scales.split_at_mut(k);
+        let scale = &mut rest[0];
+        (scale.width, scale.height) = (sized(width, k), sized(height, k));
+        scale.factor = of(k);
+        let to = [scale.width, scale.height];
+        match before.last() {
+            None if to == [width, height] => {
+                scale.pixels.clear();
+                scale.pixels.extend_from_slice(pixels);
+            }
+            None => resample(pixels, [width, height], &mut scale.pixels, to),
+            Some(larger) => {
+                resample(&larger.pixels, [larger.width, larger.height], &mut scale.pixels, to)
+            }
+        }
+        blur(&scale.pixels, scale.width, scratch, &mut scale.blurred);
+    }
+}
+/// Longer side of the largest scale: finer than that there is noise and compression.
+const LARGEST_PX: usize = 512;
+const MOST_SCALES: usize = 7;
+/// Shorter side of the smallest: two descriptors beside each other.
+const SMALLEST_PX: usize = 72;
+
+/// Means over the area of a pixel, where that is larger than one of the source; else bilinear.
+fn resample(
+    from: &[u8],
+    [width, height]: [usize; 2],
+    to: &mut Vec<u8>,
+    [columns, rows]: [usize; 2],
+) {
+    /// One in the fixed-point weights.
+    const ONE: u32 = 256;
+    let taps = |side: usize, count: usize| -> Vec<[u32; 3]> {
+        let ratio = side as f32 / count as f32;
+        (0..count)
+            .map(|k| {
+                let at = ((k as f32 + 0.5) * ratio - 0.5).clamp(0.0, (side - 1) as f32);
+                let index = (at as usize).min(side.saturating_sub(2));
+                let weight = ((at - index as f32) * ONE as f32).round() as u32;
+                [index as u32, ONE - weight, weight]
+            })
+            .collect()
+    };
+    let (across, down) = (taps(width, columns), taps(height, rows));
+    to.clear();
+    to.reserve(columns * rows);
+    for [row, upper, lower] in down {
+        let begin = row as usize * width;
+        let (above, below) = (&from[begin..begin + width], &from[begin + width..begin + 2 * width]);
+        to.extend(across.iter().map(|&[column, left, right]| {
+            let at = column as usize;
+            let mix = |row: &[u8]| left * u32::from(row[at]) + right * u32::from(row[at + 1]);
+            ((upper * mix(above) + lower * mix(below) + ONE * ONE / 2) / (ONE * ONE)) as u8
+        }));
+    }
+}
+
+/// Gaussian of two pixels; edges are repeated.
+fn blur(from: &[u8], width: usize, scratch: &mut Vec<u16>, to: &mut Vec<u8>) {
+    /// Their sum is 256.
+    const WEIGHTS: [u16; 7] = [18, 33, 49, 56, 49, 33, 18];
+    let height = from.len() / width.max(1);
+    scratch.clear();
+    scratch.resize(from.len(), 0);
+    let mut padded = vec![0u8; width + 6];
+    for (row, out) in from.chunks_exact(width).zip(scratch.chunks_exact_mut(width)) {
+        padded[..3].fill(row[0]);
+        padded[3..width + 3].copy_from_slice(row);
+        padded[width + 3..].fill(row[width - 1]);
+        for (k, out) in out.iter_mut().enumerate() {
+            let window = &padded[k..k + 7];
+            let sum: u16 = WEIGHTS.iter().zip(window).map(|(w, grey)| w * u16::from(*grey)).sum();
+            *out = sum >> 8;
+        }
+    }
+    to.clear();
+    to.resize(from.len(), 0);
+    for (v, out) in to.chunks_exact_mut(width).enumerate() {
+        let row = |k: usize| &scratch[(v + k).saturating_sub(3).min(height - 1) * width..][..width];
+        let rows: [&[u16]; 7] = std::array::from_fn(row);
+        for (k, out) in out.iter_mut().enumerate() {
+            let sum: u16 = WEIGHTS.iter().zip(rows).map(|(w, row)| w * row[k]).sum();
+            *out = (sum >> 8) as u8;
+        }
+    }
+}
