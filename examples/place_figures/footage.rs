@@ -156,8 +156,8 @@ impl Footage {
         f64::from(seen as u32) / f64::from(all.max(1) as u32)
     }
 
-    /// Writes the keyframes as PGM files.
-    pub fn export(&self, folder: &Path) -> Result<(), Box<dyn Error>> {
+    /// Writes the keyframes as PGM files, and what they share as `least/most`, a line for each keyframe.
+    pub fn export(&self, folder: &Path, overlaps: &[Vec<Overlap>]) -> Result<(), Box<dyn Error>> {
         fs::create_dir_all(folder)?;
         for (number, frame) in self.frames.iter().enumerate() {
             let mut file =
@@ -165,6 +165,12 @@ impl Footage {
             file.extend(&frame.pixels);
             fs::write(folder.join(format!("{number:05}.pgm")), file)?;
         }
+        let cell = |o: &Overlap| format!("{:.3}/{:.3}", o.least, o.most);
+        let line = |row: &Vec<Overlap>| row.iter().map(cell).collect::<Vec<_>>().join(" ");
+        fs::write(
+            folder.join("overlaps.txt"),
+            overlaps.iter().map(line).collect::<Vec<_>>().join("\n"),
+        )?;
         Ok(())
     }
 }

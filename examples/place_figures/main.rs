@@ -73,10 +73,10 @@ fn main() -> ExitCode {
 
 fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
     let footage = Footage::read(arguments)?;
-    if let Some(folder) = &arguments.export {
-        footage.export(folder)?;
-    }
     let overlaps = footage.overlaps();
+    if let Some(folder) = &arguments.export {
+        footage.export(folder, &overlaps)?;
+    }
     let revisits = judge::count_revisits(&overlaps, arguments.gap);
     println!(
         "{} keyframes, {revisits} that show a place seen {} before",

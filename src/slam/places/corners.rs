@@ -33,16 +33,20 @@ pub(super) struct Corner {
 #[derive(Debug, Clone, Default)]
 pub(super) struct CornerFinder {
     strengths: Vec<u16>,
+    /// Of the pixels of a row whether they can be corners, and room to find that out.
+    may_be: [Vec<u8>; 2],
 }
 
 impl CornerFinder {
-    /// Corners at least `margin` (3 or more) pixels from the edges, row after row, none beside a stronger one.
+    /// Corners at least `margin` (3 or more) pixels from the edges, whose circle differs by more
+    /// than `threshold` grey levels, row after row, none beside a stronger one.
     pub(super) fn find(
         &mut self,
         pixels: &[u8],
         width: usize,
         height: usize,
         margin: usize,
+        threshold: u8,
         found: &mut Vec<Corner>,
     ) {
         found.clear();
@@ -56,9 +60,15 @@ impl CornerFinder {
         let offsets = CIRCLE.map(|[x, y]| y as isize * width as isize + x as isize);
         self.strengths.clear();
         self.strengths.resize(width * height, 0);
+        let inner = width - 2 * margin;
+        self.may_be.iter_mut().for_each(|marks| marks.resize(inner, 0));
         for v in margin..height - margin {
-            for at in v * width + margin..(v + 1) * width - margin {
-                self.strengths[at] = strength(pixels, at, &offsets, width);
+            let begin = v * width + margin;
+            mark(pixels, begin, &offsets, threshold, &mut self.may_be);
+            for (k, may_be) in self.may_be[0].iter().enumerate() {
+                if *may_be != 0 {
+                    self.strengths[begin + k] = strength(pixels, begin + k, &offsets, threshold);
+                }
             }
         }
         let strengths = &self.strengths;
@@ -82,41 +92,54 @@ impl CornerFinder {
     }
 }
 
-/// 0 where there is no corner: nine pixels of the circle in a row all brighter or all darker.
-#[inline(always)]
-fn strength(pixels: &[u8], at: usize, offsets: &[isize; 16], width: usize) -> u16 {
-    /// Grey levels, beyond the noise of a small sensor; the strongest are taken.
-    const THRESHOLD: i32 = 8;
-    let centre = i32::from(pixels[at]);
-    let (low, high) = (centre - THRESHOLD, centre + THRESHOLD);
-    // Any nine in a row hold two of four that are a quarter apart.
-    let quarters = [at - 3 * width, at + 3, at + 3 * width, at - 3].map(|k| i32::from(pixels[k]));
-    let brighter = quarters.iter().filter(|&&grey| grey > high).count();
-    let darker = quarters.iter().filter(|&&grey| grey < low).count();
-    if brighter < 2 && darker < 2 {
-        return 0;
-    }
-    let (mut brighter, mut darker) = (0u32, 0u32);
-    let (mut above, mut below) = (0i32, 0i32);
-    for (k, offset) in offsets.iter().enumerate() {
-        let grey = i32::from(pixels[at.wrapping_add_signed(*offset)]);
-        if grey > high {
-            brighter |= 1 << k;
-            above += grey - high;
-        } else if grey < low {
-            darker |= 1 << k;
-            below += low - grey;
+/// Marks the pixels of a row, from the one `at`, that can be corners: any nine of the circle in a row hold one of any two
+/// that face each other.
+fn mark(
+    pixels: &[u8],
+    at: usize,
+    offsets: &[isize; 16],
+    threshold: u8,
+    [low, high]: &mut [Vec<u8>; 2],
+) {
+    let count = low.len();
+    low.fill(u8::MAX);
+    high.fill(0);
+    let row = |offset: isize| &pixels[at.wrapping_add_signed(offset)..][..count];
+    for (one, other) in offsets[..8].iter().zip(&offsets[8..]) {
+        let facing = row(*one).iter().zip(row(*other));
+        // The darker of each two, the brightest of those, and the other way round.
+        for ((low, high), (a, b)) in low.iter_mut().zip(high.iter_mut()).zip(facing) {
+            *low = (*low).min(*a.max(b));
+            *high = (*high).max(*a.min(b));
         }
     }
-    match (has_nine(brighter), has_nine(darker)) {
-        (true, _) => above as u16 + 1,
-        (_, true) => below as u16 + 1,
+    for ((low, high), centre) in low.iter_mut().zip(high).zip(row(0)) {
+        let is_brighter = *low > centre.saturating_add(threshold);
+        let is_darker = *high < centre.saturating_sub(threshold);
+        *low = u8::from(is_brighter | is_darker);
+    }
+}
+
+/// 0 where there is no corner: nine pixels of the circle in a row all brighter or all darker.
+#[inline(always)]
+fn strength(pixels: &[u8], at: usize, offsets: &[isize; 16], threshold: u8) -> u16 {
+    let circle = offsets.map(|offset| pixels[at.wrapping_add_signed(offset)]);
+    let centre = pixels[at];
+    let (low, high) = (centre.saturating_sub(threshold), centre.saturating_add(threshold));
+    let above = circle.map(|grey| grey.saturating_sub(high));
+    let below = circle.map(|grey| low.saturating_sub(grey));
+    let sum = |of: [u8; 16]| of.iter().map(|&grey| u16::from(grey)).sum();
+    match (has_nine(&above), has_nine(&below)) {
+        (true, _) => sum(above),
+        (_, true) => sum(below),
         _ => 0,
     }
 }
 
-/// Whether nine of the sixteen bits, which close a circle, are set in a row.
-fn has_nine(bits: u32) -> bool {
+/// Whether nine of the sixteen, which close a circle, are not 0 in a row.
+#[inline(always)]
+fn has_nine(around: &[u8; 16]) -> bool {
+    let bits = (0..16).fold(0u32, |bits, k| bits | u32::from(around[k] != 0) << k);
     let around = bits | bits << 16;
     let two = around & around >> 1;
     let four = two & two >> 2;

@@ -1,6 +1,8 @@
 //! What an image looks like: corners at several scales, each with an orientation and a binary descriptor (Rublee et al.
 //! 2011).
 
+use std::cmp::Reverse;
+
 use serde::{Deserialize, Serialize};
 
 use super::corners::{Corner, CornerFinder};
@@ -103,13 +105,13 @@ impl Describer {
             let share = areas[k] as f32 / areas[..=k].iter().sum::<usize>() as f32;
             let budget = if k == 0 { left } else { (left as f32 * share).ceil() as usize };
             let scale = &self.scales[k];
-            self.finder.find(
-                &scale.pixels,
-                scale.width,
-                scale.height,
-                MARGIN_PX,
-                &mut self.corners,
-            );
+            for threshold in THRESHOLDS {
+                let Scale { pixels, width, height, .. } = scale;
+                self.finder.find(pixels, *width, *height, MARGIN_PX, threshold, &mut self.corners);
+                if self.corners.len() >= LEAST_CORNERS * budget {
+                    break;
+                }
+            }
             choose(&mut self.corners, scale, budget, &mut self.chosen);
             for corner in &self.chosen {
                 let (feature, unsure) = feature(scale, k, corner, &self.pattern);
@@ -121,6 +123,11 @@ impl Describer {
     }
 }
 
+/// Grey levels by which the circle around a corner differs: of clear ones, and where there are few beyond the noise of a
+/// small sensor.
+const THRESHOLDS: [u8; 2] = [24, 8];
+/// Times as many corners as are wanted that are enough to choose from.
+const LEAST_CORNERS: usize = 3;
 /// Pixels from the edge that a descriptor needs.
 const MARGIN_PX: usize = RADIUS_PX as usize + 1;
 
@@ -130,9 +137,17 @@ fn choose(corners: &mut [Corner], scale: &Scale, budget: usize, chosen: &mut Vec
     const PARTS: [usize; 2] = [8, 6];
     /// A part has at most so many times its share.
     const MOST_SHARES: usize = 3;
+    /// Times as many corners as are wanted that are looked at: the strongest.
+    const MOST_CONSIDERED: usize = 10;
     let most = (MOST_SHARES * budget).div_ceil(PARTS[0] * PARTS[1]);
     let mut counts = [0usize; PARTS[0] * PARTS[1]];
-    corners.sort_by(|one, other| other.strength.cmp(&one.strength));
+    let strongest = |corner: &Corner| (Reverse(corner.strength), corner.v, corner.u);
+    let few = MOST_CONSIDERED * budget;
+    let corners = match corners.len() > few && few > 0 {
+        true => corners.select_nth_unstable_by_key(few, strongest).0,
+        false => corners,
+    };
+    corners.sort_unstable_by_key(strongest);
     chosen.clear();
     for corner in corners.iter() {
         if chosen.len() == budget {

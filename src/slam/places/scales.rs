@@ -78,21 +78,25 @@ fn resample(
     let (across, down) = (taps(width, columns), taps(height, rows));
     to.clear();
     to.reserve(columns * rows);
+    let mut mixed = vec![0u16; width];
     for [row, upper, lower] in down {
         let begin = row as usize * width;
         let (above, below) = (&from[begin..begin + width], &from[begin + width..begin + 2 * width]);
+        let (upper, lower) = (upper as u16, lower as u16);
+        for ((mixed, above), below) in mixed.iter_mut().zip(above).zip(below) {
+            // At most 255 × 256.
+            *mixed = upper * u16::from(*above) + lower * u16::from(*below);
+        }
         to.extend(across.iter().map(|&[column, left, right]| {
             let at = column as usize;
-            let mix = |row: &[u8]| left * u32::from(row[at]) + right * u32::from(row[at + 1]);
-            ((upper * mix(above) + lower * mix(below) + ONE * ONE / 2) / (ONE * ONE)) as u8
+            let sum = left * u32::from(mixed[at]) + right * u32::from(mixed[at + 1]);
+            ((sum + ONE * ONE / 2) / (ONE * ONE)) as u8
         }));
     }
 }
 
 /// Gaussian of two pixels; edges are repeated.
 fn blur(from: &[u8], width: usize, scratch: &mut Vec<u16>, to: &mut Vec<u8>) {
-    /// Their sum is 256.
-    const WEIGHTS: [u16; 7] = [18, 33, 49, 56, 49, 33, 18];
     let height = from.len() / width.max(1);
     scratch.clear();
     scratch.resize(from.len(), 0);
@@ -101,10 +105,10 @@ fn blur(from: &[u8], width: usize, scratch: &mut Vec<u16>, to: &mut Vec<u8>) {
         padded[..3].fill(row[0]);
         padded[3..width + 3].copy_from_slice(row);
         padded[width + 3..].fill(row[width - 1]);
-        for (k, out) in out.iter_mut().enumerate() {
-            let window = &padded[k..k + 7];
-            let sum: u16 = WEIGHTS.iter().zip(window).map(|(w, grey)| w * u16::from(*grey)).sum();
-            *out = sum >> 8;
+        let shifted: [&[u8]; 7] = std::array::from_fn(|k| &padded[k..k + width]);
+        for k in 0..width {
+            let greys = shifted.map(|row| u16::from(row[k]));
+            out[k] = weighted(greys) >> 8;
         }
     }
     to.clear();
@@ -112,9 +116,14 @@ fn blur(from: &[u8], width: usize, scratch: &mut Vec<u16>, to: &mut Vec<u8>) {
     for (v, out) in to.chunks_exact_mut(width).enumerate() {
         let row = |k: usize| &scratch[(v + k).saturating_sub(3).min(height - 1) * width..][..width];
         let rows: [&[u16]; 7] = std::array::from_fn(row);
-        for (k, out) in out.iter_mut().enumerate() {
-            let sum: u16 = WEIGHTS.iter().zip(rows).map(|(w, row)| w * row[k]).sum();
-            *out = (sum >> 8) as u8;
+        for k in 0..width {
+            out[k] = (weighted(rows.map(|row| row[k])) >> 8) as u8;
         }
     }
+}
+
+/// Weights of a Gaussian of two pixels; their sum is 256.
+#[inline(always)]
+fn weighted([a, b, c, d, e, f, g]: [u16; 7]) -> u16 {
+    18 * (a + g) + 33 * (b + f) + 49 * (c + e) + 56 * d
 }
