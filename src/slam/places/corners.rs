@@ -146,3 +146,46 @@ fn has_nine(around: &[u8; 16]) -> bool {
     let eight = four & four >> 4;
     eight & around >> 8 != 0
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SIZE: [usize; 2] = [60, 50];
+
+    fn corners(pixels: &[u8], margin: usize) -> Vec<[u16; 2]> {
+        let mut found = Vec::new();
+        CornerFinder::default().find(pixels, SIZE[0], SIZE[1], margin, 20, &mut found);
+        found.iter().map(|corner| [corner.u, corner.v]).collect()
+    }
+
+    /// A square of `inside` from column 20, row 15 to 39, 34.
+    fn square(inside: u8, outside: u8) -> Vec<u8> {
+        let is_inside =
+            |k: usize| (20..40).contains(&(k % SIZE[0])) && (15..35).contains(&(k / SIZE[0]));
+        (0..SIZE[0] * SIZE[1]).map(|k| if is_inside(k) { inside } else { outside }).collect()
+    }
+
+    #[test]
+    fn a_square_has_four_corners_bright_or_dark() {
+        for (inside, outside) in [(200, 100), (100, 200)] {
+            let found = corners(&square(inside, outside), 3);
+            assert_eq!(found.len(), 4, "{found:?}");
+            for corner in [[20, 15], [39, 15], [20, 34], [39, 34]] {
+                let is_near =
+                    |at: &[u16; 2]| at[0].abs_diff(corner[0]).max(at[1].abs_diff(corner[1])) <= 1;
+                assert!(found.iter().any(is_near), "{corner:?} of {found:?}");
+            }
+        }
+        assert!(corners(&square(110, 100), 3).is_empty(), "below the threshold");
+    }
+
+    #[test]
+    fn margins_and_sizes_are_kept() {
+        let square = square(200, 100);
+        assert_eq!(corners(&square, 14).len(), 4);
+        assert!(corners(&square, 20).is_empty(), "the corners are beside it");
+        assert!(corners(&square, 25).is_empty());
+        assert!(corners(&square[1..], 3).is_empty());
+    }
+}

@@ -10,7 +10,7 @@ use super::pattern::{ORIENTATIONS, Pattern, RADIUS_PX, WORDS};
 use super::scales::{self, Scale};
 
 /// Most features of an image.
-pub const MAX_FEATURES: usize = 300;
+pub const MAX_FEATURES: usize = 200;
 
 /// A corner and what is around it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -214,4 +214,108 @@ fn orientation(scale: &Scale, at: usize) -> u8 {
     }
     let turns = (down as f64).atan2(across as f64) / std::f64::consts::TAU;
     (turns * ORIENTATIONS as f64).round().rem_euclid(ORIENTATIONS as f64) as u8
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::geometry::se3::SE3;
+    use crate::slam::places::tree::distance;
+    use crate::slam::test_scene::{CAMERA, Scene};
+
+    fn image() -> Vec<u8> {
+        Scene::new(3).render(&CAMERA, &SE3::identity()).noisy(2.0, 1)
+    }
+
+    fn described(pixels: &[u8], width: usize, height: usize) -> Description {
+        Describer::new().describe(pixels, width, height).unwrap()
+    }
+
+    /// Share of the features of one that another has within a few pixels, turned by so many steps, with few other bits.
+    fn share_found(
+        one: &Description,
+        other: &Description,
+        turn: u8,
+        map: impl Fn(&FeaturePlace) -> [f32; 2],
+    ) -> f32 {
+        let found = one.features.iter().filter(|a| {
+            other.features.iter().any(|b| {
+                let [u, v] = map(&a.place);
+                let near = (u - f32::from(b.place.u)).hypot(v - f32::from(b.place.v)) <= 3.0;
+                let turned = (a.place.orientation + turn + 1 + 32 - b.place.orientation) % 32 <= 2;
+                near && turned && distance(&a.bits, &b.bits) <= 40
+            })
+        });
+        found.count() as f32 / one.features.len() as f32
+    }
+
+    #[test]
+    fn features_are_found_again_in_another_light() {
+        let pixels = image();
+        let (width, height) = (CAMERA.width, CAMERA.height);
+        let here = described(&pixels, width, height);
+        assert!(here.features.len() > 150, "{}", here.features.len());
+        let darker: Vec<u8> = pixels.iter().map(|&grey| grey / 2 + 9).collect();
+        let share =
+            share_found(&here, &described(&darker, width, height), 0, |p| [p.u.into(), p.v.into()]);
+        assert!(share > 0.6, "{share}");
+    }
+
+    #[test]
+    fn features_are_found_again_in_an_image_on_its_side() {
+        let pixels = image();
+        let (width, height) = (CAMERA.width, CAMERA.height);
+        // What was right is below: column u of the new image is row height − 1 − u of the old.
+        let turned: Vec<u8> = (0..width * height)
+            .map(|k| pixels[(height - 1 - k % height) * width + k / height])
+            .collect();
+        let here = described(&pixels, width, height);
+        let there = described(&turned, height, width);
+        let quarter = ORIENTATIONS as u8 / 4;
+        let to = |p: &FeaturePlace| [(height - 1) as f32 - f32::from(p.v), f32::from(p.u)];
+        let share = share_found(&here, &there, quarter, to);
+        assert!(share > 0.6, "{share}");
+        let unturned = share_found(&here, &there, 0, to);
+        assert!(unturned < 0.1, "{unturned}");
+    }
+
+    #[test]
+    fn features_are_found_again_at_half_the_size() {
+        let (width, height) = (CAMERA.width, CAMERA.height);
+        let pixels = image();
+        let half: Vec<u8> = (0..width / 2 * (height / 2))
+            .map(|k| {
+                let at = 2 * (k / (width / 2)) * width + 2 * (k % (width / 2));
+                let four = [at, at + 1, at + width, at + width + 1];
+                (four.iter().map(|&at| u32::from(pixels[at])).sum::<u32>() / 4) as u8
+            })
+            .collect();
+        let small = described(&half, width / 2, height / 2);
+        let here = described(&pixels, width, height);
+        let share = share_found(&small, &here, 0, |p| [2.0 * f32::from(p.u), 2.0 * f32::from(p.v)]);
+        assert!(share > 0.2, "{share}");
+        let beside =
+            share_found(&small, &here, 0, |p| [2.0 * f32::from(p.u) + 20.0, 2.0 * f32::from(p.v)]);
+        assert!(beside < 0.05, "{beside}");
+    }
+
+    #[test]
+    fn what_is_too_small_or_shows_nothing_has_no_description() {
+        let mut describer = Describer::new();
+        assert!(describer.describe(&[70; 320 * 240], 320, 240).is_none(), "a wall");
+        assert!(describer.describe(&[70; 40 * 40], 40, 40).is_none());
+        assert!(describer.describe(&[70; 100], 320, 240).is_none());
+        assert!(describer.describe(&[], 0, 0).is_none());
+        assert!(describer.describe(&[], usize::MAX, 2).is_none());
+    }
+
+    #[test]
+    fn a_describer_gives_the_same_whatever_it_saw_before() {
+        let pixels = image();
+        let mut used = Describer::new();
+        let _other = used.describe(&[9; 640 * 480], 640, 480);
+        let _small = used.describe(&pixels[..100 * 100], 100, 100);
+        let again = used.describe(&pixels, CAMERA.width, CAMERA.height);
+        assert_eq!(again, Describer::new().describe(&pixels, CAMERA.width, CAMERA.height));
+    }
 }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::arrangement::{Match, agreeing};
+use super::arrangement::{Arrangement, Match, arrange};
 use super::description::{Description, FeaturePlace, MAX_FEATURES};
 use super::tree::{Entry, Tree, distance};
 
@@ -20,6 +20,13 @@ pub struct Candidate {
     pub keyframe_id: u64,
     /// Features that both show, in the same arrangement.
     pub score: f32,
+    /// Angle by which the image is turned in its plane, radians: a direction in the keyframe's image plus this is the same in
+    /// the image.
+    pub turn_rad: f32,
+    /// A pixel of the image, the middle of the features that both show.
+    pub pixel: [f32; 2],
+    /// The keyframe's pixel that shows the same.
+    pub keyframe_pixel: [f32; 2],
 }
 
 /// A keyframe of the index.
@@ -133,19 +140,22 @@ impl PlaceIndex {
             (0..votes.len() as u32).filter(|&slot| votes[slot as usize] > 0).collect();
         ranked.sort_by_key(|&slot| std::cmp::Reverse((votes[slot as usize], slot)));
         ranked.truncate(MOST_ARRANGED);
-        let mut found: Vec<(u32, u32)> = ranked
+        let mut found: Vec<(Arrangement, u32)> = ranked
             .into_iter()
-            .map(|slot| {
+            .filter_map(|slot| {
                 let begin = matches.partition_point(|m| m.slot < slot);
                 let end = matches.partition_point(|m| m.slot <= slot);
-                (self.agreeing(description, &mut matches[begin..end]), slot)
+                Some((self.arranged(description, &mut matches[begin..end])?, slot))
             })
             .collect();
-        found.sort_by(|one, other| other.cmp(one));
+        found.sort_by_key(|(arrangement, slot)| std::cmp::Reverse((arrangement.agreeing, *slot)));
         found.truncate(most);
-        let candidate = |(score, slot): (u32, u32)| Candidate {
+        let candidate = |(arrangement, slot): (Arrangement, u32)| Candidate {
             keyframe_id: self.slots[slot as usize].keyframe_id,
-            score: score as f32,
+            score: arrangement.agreeing as f32,
+            turn_rad: arrangement.turn_rad,
+            pixel: arrangement.ours,
+            keyframe_pixel: arrangement.theirs,
         };
         found.into_iter().map(candidate).collect()
     }
@@ -154,7 +164,7 @@ impl PlaceIndex {
     fn matches(&self, description: &Description, is_excluded: &[bool]) -> Vec<Match> {
         let mut matches = Vec::new();
         let none = Default::default();
-        for (k, feature) in description.features.iter().enumerate() {
+        for (k, feature) in description.features.iter().take(MAX_FEATURES).enumerate() {
             let unsure = description.unsure.get(k).unwrap_or(&none);
             self.tree.visit(&feature.bits, unsure, LEAVES, &mut |entries| {
                 for entry in entries {
@@ -170,8 +180,8 @@ impl PlaceIndex {
         matches
     }
 
-    /// Matches with one keyframe that agree on an arrangement.
-    fn agreeing(&self, description: &Description, matches: &mut [Match]) -> u32 {
+    /// How the features of one keyframe that match lie.
+    fn arranged(&self, description: &Description, matches: &mut [Match]) -> Option<Arrangement> {
         matches.sort_by_key(|m| (m.distance, m.ours));
         let pairs: Vec<(FeaturePlace, FeaturePlace)> = matches
             .iter()
@@ -180,7 +190,7 @@ impl PlaceIndex {
                 Some((description.features[usize::from(m.ours)].place, *theirs))
             })
             .collect();
-        agreeing(&pairs, f32::from(description.width))
+        arrange(&pairs, f32::from(description.width))
     }
 
     /// Bytes of memory.
@@ -188,5 +198,107 @@ impl PlaceIndex {
         let places =
             |slot: &Slot| size_of::<Slot>() + slot.places.capacity() * size_of::<FeaturePlace>();
         self.tree.bytes() + self.slots.iter().map(places).sum::<usize>()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector6;
+
+    use super::*;
+    use crate::slam::geometry::se3::SE3;
+    use crate::slam::places::Describer;
+    use crate::slam::test_scene::{CAMERA, Scene};
+
+    fn seen(twist: [f64; 6], seed: u64) -> Description {
+        let pose = SE3::exp(&Vector6::from(twist));
+        let pixels = Scene::new(3).render(&CAMERA, &pose).noisy(2.0, seed);
+        Describer::new().describe(&pixels, CAMERA.width, CAMERA.height).unwrap()
+    }
+
+    fn panned(angle: f64) -> [f64; 6] {
+        [0.0, 0.0, 0.0, 0.0, angle, 0.0]
+    }
+
+    /// Views all around, 60° apart.
+    fn around() -> PlaceIndex {
+        let mut index = PlaceIndex::new();
+        for k in 0..6 {
+            index.insert(10 + k, &seen(panned(k as f64 * std::f64::consts::FRAC_PI_3), k));
+        }
+        index
+    }
+
+    fn ids(found: &[Candidate]) -> Vec<u64> {
+        found.iter().map(|candidate| candidate.keyframe_id).collect()
+    }
+
+    #[test]
+    fn a_place_is_found_from_aside_turned_and_rolled() {
+        let index = around();
+        for (twist, expected) in [
+            ([0.2, -0.1, 0.1, 0.0, 0.0, 0.0], 10),
+            ([0.0, 0.0, 0.0, 0.0, 0.2, 0.0], 10),
+            ([0.0, 0.0, 0.5, 0.0, 0.0, 0.0], 10),
+            ([0.0, 0.0, 0.0, 0.0, 0.0, 1.6], 10),
+            (panned(2.0 * std::f64::consts::FRAC_PI_3 + 0.1), 12),
+        ] {
+            let found = index.candidates(&seen(twist, 99), 2, |_| false);
+            assert_eq!(found[0].keyframe_id, expected, "{twist:?}: {found:?}");
+            assert!(
+                found.get(1).is_none_or(|other| 2.0 * other.score < found[0].score),
+                "{found:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn those_that_are_excluded_or_taken_out_are_not_found() {
+        let mut index = around();
+        let here = seen([0.0; 6], 99);
+        assert_eq!(ids(&index.candidates(&here, 1, |_| false)), [10]);
+        assert!(!ids(&index.candidates(&here, 6, |id| id == 10)).contains(&10));
+        assert_eq!(index.candidates(&here, 0, |_| false), []);
+        assert!(index.remove(10) && !index.remove(10));
+        assert_eq!((index.len(), index.contains(10)), (5, false));
+        assert!(!ids(&index.candidates(&here, 6, |_| false)).contains(&10));
+        index.insert(10, &here);
+        assert_eq!(ids(&index.candidates(&here, 1, |_| false)), [10]);
+    }
+
+    #[test]
+    fn what_is_taken_out_leaves_no_memory_and_no_trace() {
+        let views: Vec<Description> = (0..6).map(|k| seen(panned(f64::from(k)), 7)).collect();
+        let mut index = around();
+        let bytes = index.bytes();
+        for round in 0..100 {
+            let of = |k: usize| 100 + (6 * round + k) as u64;
+            (0..6).for_each(|k| index.insert(of(k), &views[k]));
+            (0..6).for_each(|k| assert!(index.remove(of(k))));
+        }
+        assert!(index.bytes() < 3 * bytes, "{bytes} B became {}", index.bytes());
+        let here = seen([0.0; 6], 99);
+        assert_eq!(ids(&index.candidates(&here, 1, |_| false)), [10]);
+    }
+
+    #[test]
+    fn of_equals_the_newest_is_first_and_an_id_is_entered_once() {
+        let mut index = PlaceIndex::new();
+        let here = seen([0.0; 6], 1);
+        [4, 9, 4].into_iter().for_each(|id| index.insert(id, &here));
+        assert_eq!(index.len(), 2);
+        assert_eq!(ids(&index.candidates(&here, 9, |_| false)), [4, 9]);
+    }
+
+    #[test]
+    fn a_description_that_was_kept_finds_and_is_found() {
+        let here = seen([0.0; 6], 1);
+        let kept: Description =
+            serde_json::from_str(&serde_json::to_string(&here).unwrap()).unwrap();
+        assert_eq!(kept.features(), here.features());
+        let mut index = around();
+        index.insert(50, &kept);
+        assert_eq!(ids(&index.candidates(&here, 1, |_| false)), [50]);
+        assert_eq!(ids(&around().candidates(&kept, 1, |_| false)), [10]);
     }
 }

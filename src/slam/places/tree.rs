@@ -106,12 +106,53 @@ impl Tree {
         }
     }
 
-    /// Takes entries out.
+    /// Takes entries out, and joins leaves that could be one.
     pub(super) fn retain(&mut self, is_kept: impl Fn(&Entry) -> bool) {
-        for node in &mut self.nodes {
-            if let Node::Leaf(entries) = node {
-                entries.retain(&is_kept);
+        // Children come after their parents.
+        for at in (0..self.nodes.len()).rev() {
+            match &mut self.nodes[at] {
+                Node::Leaf(entries) => entries.retain(&is_kept),
+                Node::Split { children, .. } => {
+                    let children = *children;
+                    if let Some(joined) = self.joined(children) {
+                        self.nodes[at] = Node::Leaf(joined);
+                    }
+                }
             }
+        }
+        self.pack();
+    }
+
+    /// The entries of two leaves that fill half a leaf at most.
+    fn joined(&mut self, [one, other]: [u32; 2]) -> Option<Vec<Entry>> {
+        let [Node::Leaf(unset), Node::Leaf(set)] =
+            self.nodes.get_disjoint_mut([one as usize, other as usize]).ok()?
+        else {
+            return None;
+        };
+        (2 * (unset.len() + set.len()) <= SPLIT_AT).then(|| {
+            let mut joined = std::mem::take(unset);
+            joined.append(set);
+            joined
+        })
+    }
+
+    /// Drops nodes that nothing leads to.
+    fn pack(&mut self) {
+        let mut old = std::mem::take(&mut self.nodes);
+        let mut order = vec![0usize];
+        let mut next = 0;
+        while let Some(&at) = order.get(next) {
+            let node = std::mem::replace(&mut old[at], Node::Leaf(Vec::new()));
+            self.nodes.push(match node {
+                Node::Split { bit, children } => {
+                    let first = order.len() as u32;
+                    order.extend(children.map(|child| child as usize));
+                    Node::Split { bit, children: [first, first + 1] }
+                }
+                leaf => leaf,
+            });
+            next += 1;
         }
     }
 
@@ -160,4 +201,92 @@ fn best_bit(entries: &[Entry]) -> Option<u16> {
 #[inline(always)]
 pub(super) fn distance(one: &[u64; WORDS], other: &[u64; WORDS]) -> u32 {
     one.iter().zip(other).map(|(a, b)| (a ^ b).count_ones()).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::test_scene::Random;
+
+    fn random_bits(random: &mut Random) -> [u64; WORDS] {
+        std::array::from_fn(|_| {
+            (0..64).fold(0, |word, _| word << 1 | u64::from(random.uniform() < 0.5))
+        })
+    }
+
+    fn found(tree: &Tree, bits: &[u64; WORDS], unsure: &[u64; WORDS], most: usize) -> Vec<u32> {
+        let mut slots = Vec::new();
+        tree.visit(bits, unsure, most, &mut |entries| slots.extend(entries.iter().map(|e| e.slot)));
+        slots
+    }
+
+    #[test]
+    fn what_was_entered_is_found_among_few() {
+        let mut random = Random::new(1);
+        let mut tree = Tree::new();
+        let all: Vec<_> = (0..5_000).map(|_| random_bits(&mut random)).collect();
+        for (slot, bits) in (0..).zip(&all) {
+            tree.insert(Entry { bits: *bits, slot, feature: 0 });
+        }
+        for (slot, bits) in (0..).zip(&all) {
+            let among = found(&tree, bits, &[0; WORDS], 1);
+            assert!(
+                among.contains(&slot) && among.len() <= SPLIT_AT,
+                "{slot} among {}",
+                among.len()
+            );
+        }
+    }
+
+    #[test]
+    fn a_bit_that_turned_over_is_met_where_it_was_unsure() {
+        let mut random = Random::new(2);
+        let mut tree = Tree::new();
+        let all: Vec<_> = (0..5_000).map(|_| random_bits(&mut random)).collect();
+        for (slot, bits) in (0..).zip(&all) {
+            tree.insert(Entry { bits: *bits, slot, feature: 0 });
+        }
+        let Node::Split { bit, .. } = tree.nodes[0] else { panic!("a leaf of 5000") };
+        let mut turned = all[0];
+        turned[usize::from(bit) / 64] ^= 1 << (bit % 64);
+        let unsure = std::array::from_fn(|k| all[0][k] ^ turned[k]);
+        assert!(!found(&tree, &turned, &[0; WORDS], 4).contains(&0));
+        assert!(found(&tree, &turned, &unsure, 2).contains(&0));
+        assert!(!found(&tree, &turned, &unsure, 1).contains(&0));
+        let leaf = found(&tree, &turned, &[u64::MAX; WORDS], 1).len();
+        assert!(
+            found(&tree, &turned, &[u64::MAX; WORDS], 99).len() <= MOST_LEAVES * SPLIT_AT.max(leaf)
+        );
+    }
+
+    #[test]
+    fn what_looks_the_same_a_thousand_times_is_kept_a_few_times() {
+        let mut tree = Tree::new();
+        (0..1_000).for_each(|slot| tree.insert(Entry { bits: [7; WORDS], slot, feature: 0 }));
+        assert_eq!(found(&tree, &[7; WORDS], &[0; WORDS], 1).len(), MOST_IN_LEAF);
+        tree.retain(|entry| entry.slot == 3);
+        assert_eq!(found(&tree, &[7; WORDS], &[0; WORDS], 1), [3]);
+    }
+
+    #[test]
+    fn taking_out_keeps_the_others_and_joins_leaves() {
+        let mut random = Random::new(3);
+        let mut tree = Tree::new();
+        let all: Vec<_> = (0..5_000).map(|_| random_bits(&mut random)).collect();
+        for (slot, bits) in (0..).zip(&all) {
+            tree.insert(Entry { bits: *bits, slot, feature: 0 });
+        }
+        let nodes = tree.nodes.len();
+        tree.retain(|entry| entry.slot % 50 == 0);
+        assert!(8 * tree.nodes.len() < nodes, "{nodes} nodes became {}", tree.nodes.len());
+        for (slot, bits) in (0..).zip(&all) {
+            assert_eq!(
+                found(&tree, bits, &[0; WORDS], 1).contains(&slot),
+                slot % 50 == 0,
+                "{slot}"
+            );
+        }
+        tree.retain(|_| false);
+        assert_eq!(tree.nodes.len(), 1);
+    }
 }
