@@ -231,6 +231,7 @@ impl Mapper {
             image: frame.pixels.to_vec(),
             points: Vec::new(),
         });
+        self.finder.learn(&self.map.keyframes);
         self.map.forget_depth_beyond(self.params.max_map_bytes());
         self.next_keyframe_id += 1;
         self.past.push(frame.pixels, keyframe_id, SE3::identity(), Brightness::default());
