@@ -32,6 +32,12 @@ struct Arguments {
     /// Every so many keyframes is taken.
     #[arg(long, default_value_t = 1)]
     stride: usize,
+    /// Errors against the map of the run, which was estimated jointly, instead of the ground truth: where that is worse.
+    #[arg(long)]
+    against_map: bool,
+    /// What the run's own search for loops came to, and no more.
+    #[arg(long)]
+    searches: bool,
     /// A line for each pair.
     #[arg(long)]
     all: bool,
@@ -71,6 +77,13 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
     };
     let name = arguments.source.to_string();
     let record = replay(source.as_mut(), &name, &config, &mut |_| true)?;
+    if arguments.searches {
+        for search in record.searches.iter().flatten() {
+            let (millis, report) = (1e-6 * search.nanos as f64, search.report);
+            println!("frame {} {millis:.0} ms {report:?}", search.sequence);
+        }
+        return Ok(());
+    }
     let solver = ConstraintSolver::new(&intrinsics, ConstraintParams::default());
     let mut placed = Vec::new();
     let begin = Instant::now();
@@ -78,11 +91,16 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
         let truth =
             record.ground_truth.iter().min_by_key(|p| p.nanos.abs_diff(keyframe.capture_nanos));
         let Some(truth) = truth else { continue };
-        let Some(unit) = unit_m(source.as_mut(), keyframe) else { continue };
+        let world_from_keyframe = if arguments.against_map {
+            keyframe.map_from_keyframe
+        } else {
+            let Some(unit) = unit_m(source.as_mut(), keyframe) else { continue };
+            Sim3::new(truth.world_from_camera, unit)
+        };
         placed.push(Placed {
             view: solver.view(keyframe),
             keyframe: keyframe.clone(),
-            world_from_keyframe: Sim3::new(truth.world_from_camera, unit),
+            world_from_keyframe,
         });
     }
     println!(

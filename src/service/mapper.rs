@@ -370,6 +370,8 @@ fn tell_adjustments(
         health.count_adjustment(&record);
         output.publish_adjustment(&record)?;
     }
+    // Health has no counters of them yet.
+    drop(adjustments.take_searches());
     adjustments.take_failure().iter().for_each(|failure| health.warn(failure));
     Ok(())
 }

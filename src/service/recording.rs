@@ -184,6 +184,7 @@ impl Recording {
         }
         let skipped = self.poses.len().saturating_sub(self.map_nanos.len());
         RunRecord {
+            searches: None,
             mode: parts.mode,
             source: parts.source,
             ended: Default::default(),

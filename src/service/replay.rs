@@ -316,6 +316,7 @@ impl<'a> Replay<'a> {
         outcome.keyframe_changed |= entered.keyframe_changed;
         outcome.graph_changed |= entered.graph_changed;
         self.record.adjustments.extend(self.adjustments.take_records());
+        self.record.searches.get_or_insert_default().extend(self.adjustments.take_searches());
     }
 
     /// The depth camera's image of a frame, where the first depth comes from it.
@@ -405,6 +406,7 @@ impl<'a> Replay<'a> {
         self.adjustments.finish(&mut self.mapper);
         let mut record = self.record;
         record.adjustments.extend(self.adjustments.take_records());
+        record.searches.get_or_insert_default().extend(self.adjustments.take_searches());
         let Some((first, last)) = self.stamps else {
             return Err(ReplayError::Empty(record.source));
         };
@@ -422,6 +424,7 @@ impl<'a> Replay<'a> {
 fn empty_record(source_name: &str, ground_truth: Vec<StampedPose>, poses_given: bool) -> RunRecord {
     let depth_scale = if poses_given { DepthScale::Given } else { DepthScale::MedianRatio };
     RunRecord {
+        searches: None,
         mode: RunMode::Replay,
         source: source_name.to_owned(),
         ended: Default::default(),

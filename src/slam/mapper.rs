@@ -2,6 +2,7 @@
 
 pub mod appearance;
 mod change;
+mod closing;
 pub mod consistency;
 mod correction;
 mod depth_buffers;
@@ -39,6 +40,7 @@ use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::buffer::Image;
 use crate::slam::image::quads::QuadImage;
 use crate::slam::keyframe::{Keyframe, MAX_KEYFRAME_POINTS, MapState};
+use crate::slam::loops::LoopParams;
 use crate::slam::map::Map;
 use crate::slam::mapper::change::Unfinished;
 use crate::slam::mapper::consistency::{ConsistencyParams, START_KEYFRAMES};
@@ -117,6 +119,8 @@ pub struct MapperParams {
     pub recovery: RecoveryParams,
     /// The joint estimation of keyframes.
     pub window: WindowParams,
+    /// The search for places that were seen before.
+    pub loops: LoopParams,
 }
 
 impl Default for MapperParams {
@@ -144,6 +148,7 @@ impl Default for MapperParams {
             reuse: ReuseParams::default(),
             recovery: RecoveryParams::default(),
             window: WindowParams::default(),
+            loops: LoopParams::default(),
         }
     }
 }
@@ -179,7 +184,8 @@ impl MapperParams {
         self.consistency.validate().map_err(|e| e.within("consistency"))?;
         self.reuse.validate().map_err(|e| e.within("reuse"))?;
         self.recovery.validate().map_err(|e| e.within("recovery"))?;
-        self.window.validate().map_err(|e| e.within("window"))
+        self.window.validate().map_err(|e| e.within("window"))?;
+        self.loops.validate().map_err(|e| e.within("loops"))
     }
 }
 
@@ -279,8 +285,10 @@ impl Mapper {
             finder: Finder::new(&intrinsics),
             // The active keyframe is one more.
             past: PastFrames::with_capacity(params.max_past_frames + 1),
-            window: (params.window.num_free > 0)
-                .then(|| Box::new(Window::new(intrinsics, params.window.clone()))),
+            window: (params.window.num_free > 0).then(|| {
+                let window = Window::new(intrinsics, params.window.clone());
+                Box::new(window.with_loops(params.loops.clone()))
+            }),
             is_estimated: false,
             thinning: Thinning::default(),
             doubt: Doubt::None,

@@ -11,6 +11,7 @@ pub mod geometry;
 pub mod graph;
 pub mod image;
 pub mod keyframe;
+pub mod loops;
 pub mod map;
 pub mod mapper;
 pub mod modes;

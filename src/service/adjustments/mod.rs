@@ -13,6 +13,7 @@ use std::time::{Duration, Instant};
 use crate::service::adjustments::thread::{AdjustmentThread, Finished, Missing, Optimise};
 use crate::service::schedule::Background;
 use crate::slam::keyframe::MapState;
+use crate::slam::loops::SearchReport;
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::window::{Adjustment, Window};
 
@@ -54,6 +55,17 @@ pub struct AdjustmentRecord {
     pub adjustment: Adjustment,
 }
 
+/// A search for a place that was seen before, which is over.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SearchRecord {
+    /// Sequence of the last frame before it was over.
+    pub sequence: u64,
+    /// CPU time that it took, nanoseconds.
+    pub nanos: u64,
+    /// What it came to.
+    pub report: SearchReport,
+}
+
 /// The estimate that is away, and the map that it was taken from.
 #[derive(Debug, Clone, Copy)]
 struct Away {
@@ -76,6 +88,7 @@ pub struct Adjustments {
     frames: u64,
     sequence: u64,
     records: Vec<AdjustmentRecord>,
+    searches: Vec<SearchRecord>,
     failure: Option<String>,
 }
 
@@ -87,8 +100,16 @@ impl Adjustments {
 
     fn start_with(entry: Entry, background: Background, optimise: Optimise) -> io::Result<Self> {
         let thread = Some(AdjustmentThread::start(background, optimise)?);
-        let (records, failure) = (Vec::new(), None);
-        Ok(Self { entry, thread, away: None, frames: 0, sequence: 0, records, failure })
+        Ok(Self {
+            entry,
+            thread,
+            away: None,
+            frames: 0,
+            sequence: 0,
+            records: Vec::new(),
+            searches: Vec::new(),
+            failure: None,
+        })
     }
 
     /// Readable when an estimate is ready: then [`Adjustments::pick_up`].
@@ -99,6 +120,11 @@ impl Adjustments {
     /// What is over since the last call.
     pub fn take_records(&mut self) -> impl Iterator<Item = AdjustmentRecord> {
         std::mem::take(&mut self.records).into_iter()
+    }
+
+    /// Searches for loops that are over since the last call.
+    pub fn take_searches(&mut self) -> impl Iterator<Item = SearchRecord> {
+        std::mem::take(&mut self.searches).into_iter()
     }
 
     /// Why there is no joint estimation any more; `None` where there is, and once it was asked for.
@@ -133,13 +159,21 @@ impl Adjustments {
     /// and refines the depth of the keyframes. It is waited for; live, where something else may have the CPU, not for long.
     pub fn finish(&mut self, mapper: &mut Mapper) -> StepOutcome {
         let deadline = Instant::now() + LAST_ADJUSTMENTS;
-        let outcome = self.let_all_in(mapper, deadline);
-        self.begin_with(mapper, Mapper::begin_last_adjustment);
-        let mut outcome = joined(outcome, self.let_all_in(mapper, deadline));
-        let may_go_on = || match self.entry {
+        let entry = self.entry;
+        let may_go_on = || match entry {
             Entry::AfterFrames(_) => true,
             Entry::WhenReady => Instant::now() < deadline,
         };
+        let mut outcome = self.let_all_in(mapper, deadline);
+        while may_go_on() {
+            self.begin_with(mapper, Mapper::begin_last_search);
+            if self.away.is_none() {
+                break;
+            }
+            outcome = joined(outcome, self.let_all_in(mapper, deadline));
+        }
+        self.begin_with(mapper, Mapper::begin_last_adjustment);
+        outcome = joined(outcome, self.let_all_in(mapper, deadline));
         while may_go_on() && mapper.refine_depth() {
             outcome.graph_changed = true;
         }
@@ -215,7 +249,7 @@ impl Adjustments {
         away: &Away,
         back: Result<Finished, Missing>,
     ) -> StepOutcome {
-        let finished = match back {
+        let mut finished = match back {
             Ok(finished) => finished,
             Err(Missing::Unfinished) => return StepOutcome::default(),
             Err(Missing::Ended) => {
@@ -225,6 +259,10 @@ impl Adjustments {
         };
         self.away = None;
         let fate = fate(mapper, away);
+        if let Some(report) = finished.window.take_search() {
+            let (sequence, nanos) = (self.sequence, finished.nanos);
+            self.searches.push(SearchRecord { sequence, nanos, report });
+        }
         if let Some(adjustment) = finished.adjustment {
             let frames = self.frames.saturating_sub(away.began);
             let (sequence, nanos) = (self.sequence, finished.nanos);

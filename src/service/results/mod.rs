@@ -12,6 +12,7 @@ pub mod depth_maps;
 pub mod joint;
 pub mod joint_points;
 pub mod lettering;
+pub mod loops;
 pub mod output_folder;
 pub mod output_lock;
 pub mod pcd;
@@ -33,7 +34,7 @@ use std::time::SystemTime;
 use serde::{Deserialize, Serialize};
 
 use crate::capture::source::{FrameSource, SourceError};
-use crate::service::adjustments::AdjustmentRecord;
+use crate::service::adjustments::{AdjustmentRecord, SearchRecord};
 use crate::service::alignment_stamps::AlignmentTrace;
 use crate::service::atomic_file::write_atomically;
 use crate::service::recording::TimeCounts;
@@ -168,6 +169,8 @@ pub struct RunRecord {
     pub keyframe_nanos: Vec<u64>,
     /// Joint estimates of keyframes, in the order of their entry.
     pub adjustments: Vec<AdjustmentRecord>,
+    /// Searches for places that were seen before; `None` where they are not told of.
+    pub searches: Option<Vec<SearchRecord>>,
     /// What frames came to while there was no map.
     pub start: StartTally,
     /// Frames at which the map was found to contradict itself, and how; known in a replay.

@@ -8,6 +8,7 @@ use crate::service::results::alignment_levels::{LevelSummary, alignment_levels};
 use crate::service::results::budget_curve::BudgetCurve;
 use crate::service::results::calibration::whitened_residual_median;
 use crate::service::results::joint::JointSummary;
+use crate::service::results::loops::LoopSummary;
 use crate::service::results::output_folder::utc_text;
 use crate::service::results::poses::{longest_epoch, placed_later};
 use crate::service::results::times::{LatencySummary, Percentiles, track_nanos};
@@ -260,6 +261,9 @@ pub struct Summary {
     /// Joint estimates of keyframes.
     #[serde(flatten)]
     pub joint: JointSummary,
+    /// The search for loops.
+    #[serde(flatten)]
+    pub loops: LoopSummary,
     /// Quality of a pose as a function of the iterations it is given; of replays.
     pub budget_curve: Option<BudgetCurve>,
     /// First to last stamp.
@@ -359,6 +363,7 @@ impl Summary {
             keyframe_step_ms: Percentiles::of(record.keyframe_step_nanos.iter().copied()),
             keyframe_ms: Percentiles::of(record.keyframe_nanos.iter().copied()),
             joint: JointSummary::of(&record.adjustments),
+            loops: LoopSummary::of(record.searches.as_deref(), record.map.keyframes.len()),
             budget_curve: BudgetCurve::of(&record.budget_samples),
             recorded_secs,
             wall_secs,

@@ -3,6 +3,7 @@
 use std::fmt::Write;
 
 use crate::service::results::joint::JointSummary;
+use crate::service::results::loops::LoopSummary;
 use crate::service::results::summary::{DepthSummary, Summary, TrajectorySummary};
 use crate::service::results::times::Percentiles;
 use crate::slam::evaluation::grade::Grade;
@@ -65,6 +66,9 @@ pub fn summary_text(summary: &Summary) -> String {
     }
     if let Some(text) = joint_text(&summary.joint) {
         line("joint", text);
+    }
+    if let Some(text) = loops_text(&summary.loops) {
+        line("loops", text);
     }
     if let (Some(deadline_ms), Some(misses)) = (summary.deadline_ms, summary.deadline_misses) {
         line(
@@ -152,6 +156,23 @@ fn joint_text(joint: &JointSummary) -> Option<String> {
     let JointSummary { adjustments, adjustments_merged, adjustments_dropped, .. } = *joint;
     Some(format!(
         "{adjustments} estimates of keyframes ({adjustments_merged} merged), {adjustments_dropped} dropped; {times}"
+    ))
+}
+
+/// What the search for loops came to; nothing where none was made.
+fn loops_text(loops: &LoopSummary) -> Option<String> {
+    let times = times_text(loops.loop_search_ms.as_ref()?);
+    let of = |count: Option<u64>| count.unwrap_or(0);
+    Some(format!(
+        "{} closed, {} held already, {} epochs joined; refused: {} other places, {} against the drift, {} unconfirmed, \
+         {} inconsistent; a search takes {times}",
+        of(loops.loops_closed),
+        of(loops.loops_held),
+        of(loops.epochs_joined),
+        of(loops.loops_refused),
+        of(loops.loops_against_drift),
+        of(loops.loops_unconfirmed),
+        of(loops.loops_inconsistent),
     ))
 }
 

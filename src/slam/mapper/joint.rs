@@ -31,7 +31,9 @@ impl Mapper {
                 true
             }
             Some(active) if is_mapping => {
-                window.begin_piece() || (may_refine && window.begin_refinement(&self.map, active))
+                window.begin_search(&self.map, false)
+                    || window.begin_piece()
+                    || (may_refine && window.begin_refinement(&self.map, active))
             }
             _ => false,
         };
@@ -61,6 +63,11 @@ impl Mapper {
             let graph_changed = self.take_refined(refined, &mut window);
             self.window = Some(window);
             return StepOutcome { graph_changed, ..Default::default() };
+        }
+        if let Some(closure) = window.take_closure() {
+            let outcome = self.close_loop(&closure, &mut window);
+            self.window = Some(window);
+            return outcome;
         }
         let finished = self.finish_keyframe();
         let mut outcome = StepOutcome::default();
@@ -213,6 +220,7 @@ impl Mapper {
         drop(window.take_placed());
         window.leave_unrefined();
         window.repeat_piece();
+        window.repeat_closure();
         self.doubt.take_back();
         self.window = Some(window);
     }

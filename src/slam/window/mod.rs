@@ -17,6 +17,7 @@ mod factors;
 mod feedback;
 pub mod frames;
 pub mod keyframe;
+mod looping;
 pub mod marginals;
 mod members;
 mod neighbours;
@@ -34,6 +35,7 @@ mod view;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
+use crate::slam::loops::{LoopParams, Loops};
 use crate::slam::map::Map;
 use crate::slam::window::candidates::{Candidates, MaturePoints};
 use crate::slam::window::comparison::{Robustness, SAMPLES};
@@ -104,6 +106,7 @@ pub struct Window {
     reconsiders: bool,
     pass: Pass,
     refinement: Refinement,
+    loops: Loops,
     /// The epoch whose start was found to be wrong.
     refuted_epoch: Option<u32>,
     /// The epoch whose start was found to be right.
@@ -128,6 +131,7 @@ impl Window {
             reconsiders: false,
             pass: Pass::default(),
             refinement: Refinement::default(),
+            loops: Loops::new(camera, LoopParams { num_candidates: 0, ..LoopParams::default() }),
             refuted_epoch: None,
             confirmed_epoch: None,
         }
@@ -228,7 +232,7 @@ impl Window {
 
     /// Estimates the newest keyframes and all points that they and older ones see; `None` where there is too little.
     pub fn optimise(&mut self) -> Option<Adjustment> {
-        if self.refine_begun() {
+        if self.refine_begun() || self.search_begun() {
             return None;
         }
         let mut is_new = false;
@@ -237,6 +241,7 @@ impl Window {
             let Some(index) = self.index_of(id) else { continue };
             self.choose_points_before(index);
             self.align(index);
+            self.tell_new(index);
             self.pass.added += 1;
             is_new = true;
         }
@@ -248,6 +253,7 @@ impl Window {
             if adjustment.is_some() && self.is_refuted(&chosen) {
                 self.refuted_epoch = Some(self.keyframes[newest].epoch);
             }
+            self.tell_estimate(&chosen);
             self.place_frames(newest, chosen.is_first);
             self.leave(&chosen.members);
         }

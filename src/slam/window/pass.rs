@@ -20,6 +20,8 @@ pub(super) struct Pass {
     /// Keyframes that came since the last one began.
     pub added: usize,
     has_jumped: bool,
+    /// A loop was closed: one is due, whether they are made or not.
+    is_called: bool,
     /// Where it goes on; `None` where none is under way.
     next: Option<Place>,
     /// Where the piece begins that is being estimated.
@@ -34,6 +36,11 @@ struct Place {
 }
 
 impl Pass {
+    /// One is to be made, from the beginning.
+    pub fn call(&mut self) {
+        (self.is_called, self.next) = (true, None);
+    }
+
     /// The piece that was away has entered.
     pub fn leave_piece(&mut self) {
         self.piece = None;
@@ -47,7 +54,8 @@ impl Window {
         let Some(newest) = self.keyframes.len().checked_sub(1) else { return false };
         let of_epoch = self.of_epoch_up_to(newest);
         let pass_every = self.params.pass_every;
-        if pass_every == 0 || self.is_short(&of_epoch) {
+        let is_made = pass_every > 0 || self.pass.is_called || self.pass.next.is_some();
+        if !is_made || self.is_short(&of_epoch) {
             return false;
         }
         let oldest = &self.keyframes[of_epoch[of_epoch.len().saturating_sub(MOST)]];
@@ -55,7 +63,9 @@ impl Window {
         let pass = &mut self.pass;
         // One of an epoch that was left, or has become part of another, ends there.
         pass.next = pass.next.filter(|next| next.epoch == start.epoch);
-        if pass.next.is_none() && (pass.has_jumped || pass.added >= pass_every) {
+        let is_due =
+            pass.is_called || pass_every > 0 && (pass.has_jumped || pass.added >= pass_every);
+        if pass.next.is_none() && is_due {
             *pass = Pass { next: Some(start), ..Pass::default() };
         }
         pass.piece = pass.next;

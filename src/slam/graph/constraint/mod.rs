@@ -143,10 +143,10 @@ impl ConstraintSolver {
         j: &KeyframeView,
         initial: Option<&Sim3>,
     ) -> Result<Measurement, Refusal> {
-        let forward = self.align(i, j, initial)?;
-        let backward = self.align(j, i, Some(&forward.j_from_i.inverse()))?;
         let gates = &self.params.gates;
+        let forward = self.align(i, j, initial)?;
         gates.judge(&forward)?;
+        let backward = self.align(j, i, Some(&forward.j_from_i.inverse()))?;
         gates.judge(&backward)?;
         let measurement = fuse(forward, backward).ok_or(Refusal::Undetermined)?;
         gates.judge_reciprocity(measurement.reciprocal_chi2)?;

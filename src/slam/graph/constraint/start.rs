@@ -49,11 +49,15 @@ pub(super) fn find(
         let state = State { log_scale: log_scale(views, coarsest, &state, params), ..state };
         solved.extend(follow(views, coarsest, &state, params));
     }
+    // What is not explained while the images are blurred will not be when they are sharp.
+    let least = params.gates.min_usage * params.gates.min_inliers;
+    solved.retain(|(explained, _)| *explained >= least);
     solved.sort_by(|one, other| other.0.total_cmp(&one.0));
     solved.truncate(MOST_FOLLOWED);
     let level = coarsest.saturating_sub(1).max(views[0].levels().start);
     let followed = solved.into_iter().filter_map(|(_, state)| follow(views, level, &state, params));
-    followed.reduce(|one, other| if other.0 > one.0 { other } else { one }).map(|(_, state)| state)
+    let best = followed.reduce(|one, other| if other.0 > one.0 { other } else { one });
+    best.filter(|(explained, _)| *explained >= least).map(|(_, state)| state)
 }
 
 /// Solves a level, with the share that is explained; `None` where only a gain that is not plausible explains it, which

@@ -1,0 +1,56 @@
+//! What the search for loops came to, in figures.
+
+use serde::{Deserialize, Serialize};
+
+use crate::service::adjustments::SearchRecord;
+use crate::service::results::times::Percentiles;
+use crate::slam::loops::SearchFate;
+
+/// The search for loops in a run; none of it is known where a run does not tell.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct LoopSummary {
+    /// Pairs of keyframes that were compared.
+    pub loop_pairs: Option<u64>,
+    /// Loops that moved the map.
+    pub loops_closed: Option<u64>,
+    /// Loops that the map already had so.
+    pub loops_held: Option<u64>,
+    /// Epochs that were joined to others.
+    pub epochs_joined: Option<u64>,
+    /// Places that looked alike and were further off than the map can have drifted.
+    pub loops_against_drift: Option<u64>,
+    /// Places that no second pair confirmed.
+    pub loops_unconfirmed: Option<u64>,
+    /// Places that contradicted other loops.
+    pub loops_inconsistent: Option<u64>,
+    /// Keyframes whose candidates were other places.
+    pub loops_refused: Option<u64>,
+    /// CPU time of a search.
+    pub loop_search_ms: Option<Percentiles>,
+    /// CPU time of all searches for each keyframe of the map, milliseconds.
+    pub loop_search_ms_per_keyframe: Option<f64>,
+}
+
+impl LoopSummary {
+    /// Of the searches of a run whose map has so many keyframes.
+    pub fn of(records: Option<&[SearchRecord]>, keyframes: usize) -> Self {
+        let Some(records) = records else { return Self::default() };
+        let count = |is: fn(&SearchFate) -> bool| {
+            Some(records.iter().filter(|record| is(&record.report.fate)).count() as u64)
+        };
+        let nanos: u64 = records.iter().map(|record| record.nanos).sum();
+        Self {
+            loop_pairs: Some(records.iter().map(|of| u64::from(of.report.compared)).sum()),
+            loops_closed: count(|fate| *fate == SearchFate::Closed),
+            loops_held: count(|fate| *fate == SearchFate::Held),
+            epochs_joined: count(|fate| *fate == SearchFate::Joined),
+            loops_against_drift: count(|fate| *fate == SearchFate::AgainstDrift),
+            loops_unconfirmed: count(|fate| *fate == SearchFate::Unconfirmed),
+            loops_inconsistent: count(|fate| *fate == SearchFate::Inconsistent),
+            loops_refused: count(|fate| matches!(fate, SearchFate::Refused(_))),
+            loop_search_ms: Percentiles::of(records.iter().map(|record| record.nanos)),
+            loop_search_ms_per_keyframe: (keyframes > 0)
+                .then(|| 1e-6 * nanos as f64 / keyframes as f64),
+        }
+    }
+}

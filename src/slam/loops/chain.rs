@@ -1,0 +1,126 @@
+//! What the keyframes say of each other without loops: each one's place against those that it was estimated with.
+//!
+//! The estimate gives the covariance P of the errors (ξ, λ) of a place against those that held it
+//! (`slam::place_covariance`). With S = `map_from_keyframe` of the newer keyframe the left increment of
+//! `newer_from_older` errs by −Ad(S⁻¹) (ξ, 0) − (0, 0, λ). Together the n links of a keyframe say what the estimate says
+//! of it, so that each has n times the covariance.
+
+use std::collections::BTreeMap;
+
+use crate::slam::geometry::sim3::{Matrix7, Sim3};
+use crate::slam::graph::constraint::Measurement;
+use crate::slam::graph::marginal::Marginals;
+use crate::slam::graph::pose_graph::{Constraint, PoseGraph, VertexId};
+use crate::slam::graph::robust::RobustKernel;
+use crate::slam::graph::{GraphParams, fits};
+use crate::slam::loops::{Link, Loops, Node};
+use crate::slam::place_covariance::PlaceCovariance;
+
+/// Standard deviations of a link: no less than this, whatever an estimate claims, and that of a keyframe that was not
+/// estimated: of translation in mean depths, of rotation in radians, of ln s. The least are an eighth of a pixel at f = 250
+/// and what is left of a scale that a thousand points hold; the others a step to the next keyframe by the tracker alone.
+const LEAST: [f64; 3] = [0.0005, 0.0005, 0.001];
+const UNESTIMATED: [f64; 3] = [0.03, 0.02, 0.05];
+
+/// The pose graph of an epoch.
+pub(super) struct Chain {
+    pub(super) graph: PoseGraph,
+    vertices: BTreeMap<u64, VertexId>,
+    /// Ids in the order of the vertices.
+    pub(super) ids: Vec<u64>,
+    /// Number of its links that are not loops.
+    num_links: usize,
+}
+
+impl Chain {
+    /// Of the epoch's nodes, in the order of their ids, with the loops that were found; `None` where a number is broken.
+    pub(super) fn new(loops: &Loops, nodes: &[Node], epoch: u32) -> Option<Self> {
+        let of_epoch: Vec<&Node> = nodes.iter().filter(|node| node.epoch == epoch).collect();
+        let mut graph = PoseGraph::new();
+        let mut vertices = BTreeMap::new();
+        let mut ids = Vec::new();
+        for (place, node) in of_epoch.iter().enumerate() {
+            let vertex = graph.add_vertex(node.map_from_keyframe, place == 0).ok()?;
+            vertices.insert(node.keyframe_id, vertex);
+            ids.push(node.keyframe_id);
+        }
+        let mut chain = Self { graph, vertices, ids, num_links: 0 };
+        for (place, node) in of_epoch.iter().enumerate().skip(1) {
+            let of = |id: &u64| {
+                let at = of_epoch[..place].binary_search_by_key(id, |node| node.keyframe_id);
+                of_epoch.get(at.ok()?)
+            };
+            let known = loops.held_by.get(&node.keyframe_id).into_iter().flatten();
+            let mut others: Vec<&Node> = known.filter_map(of).copied().collect();
+            let is_estimated = !others.is_empty();
+            if !is_estimated && !loops.beginnings.contains(&node.keyframe_id) {
+                others.push(of_epoch[place - 1]);
+            }
+            let covariance = link_covariance(
+                &node.map_from_keyframe,
+                is_estimated.then_some(&node.covariance),
+                loops.params.drift_inflation,
+            ) * others.len() as f64;
+            for other in others {
+                let j_from_i = node.map_from_keyframe.inverse() * other.map_from_keyframe;
+                chain.add(other.keyframe_id, node.keyframe_id, j_from_i, &covariance)?;
+                chain.num_links += 1;
+            }
+        }
+        for link in &loops.links {
+            chain.add_loop(link);
+        }
+        Some(chain)
+    }
+
+    /// Adds a loop; one of keyframes that the epoch does not have is left out.
+    pub(super) fn add_loop(&mut self, link: &Link) {
+        let Measurement { j_from_i, covariance, .. } = &link.measurement;
+        let _ = self.add(link.i, link.j, *j_from_i, covariance);
+    }
+
+    fn add(&mut self, i: u64, j: u64, j_from_i: Sim3, covariance: &Matrix7) -> Option<()> {
+        let (i, j) = (*self.vertices.get(&i)?, *self.vertices.get(&j)?);
+        let information = covariance.cholesky()?.inverse();
+        let kernel = RobustKernel::None;
+        self.graph.add_constraint(Constraint { i, j, j_from_i, information, kernel }).ok()
+    }
+
+    /// `j_from_i` by the places, and its covariance by links and loops.
+    pub(super) fn predicted(&self, i: u64, j: u64) -> Option<(Sim3, Matrix7)> {
+        let (i, j) = (*self.vertices.get(&i)?, *self.vertices.get(&j)?);
+        let place = |of| self.graph.map_from_keyframe(of).copied();
+        let covariance =
+            Marginals::new(&self.graph, &GraphParams::default()).ok()?.relative_covariance(j, i)?;
+        Some((place(j)?.inverse() * place(i)?, covariance))
+    }
+
+    /// rᵀΛr of the loops, the newest last.
+    pub(super) fn loop_errors(&self) -> Vec<f64> {
+        fits(&self.graph, false).iter().skip(self.num_links).map(|(e, _)| *e).collect()
+    }
+}
+
+/// Covariance of the left increment of `newer_from_older` by that of the newer one's place.
+pub(super) fn link_covariance(
+    map_from_newer: &Sim3,
+    place: Option<&PlaceCovariance>,
+    inflation: f64,
+) -> Matrix7 {
+    let of_deviations = |[translation, rotation, scale]: [f64; 3]| {
+        let (t, r) = (translation * translation, rotation * rotation);
+        Matrix7::from_diagonal(&[t, t, t, r, r, r, scale * scale].into())
+    };
+    let unestimated = of_deviations(UNESTIMATED);
+    let Some(place) = place else { return unestimated };
+    let mut by_errors = map_from_newer.inverse().adjoint();
+    by_errors.fixed_view_mut::<7, 1>(0, 6).fill(0.0);
+    by_errors[(6, 6)] = 1.0;
+    let covariance = by_errors * place.matrix() * by_errors.transpose() * inflation;
+    // An estimate that knows less than the tracker has failed.
+    let is_sure = (0..7).all(|k| covariance[(k, k)] <= unestimated[(k, k)]);
+    match is_sure {
+        true => covariance + of_deviations(LEAST),
+        false => unestimated,
+    }
+}

@@ -1,0 +1,91 @@
+//! What a loop does to the map: the pose graph of the epoch is solved with it, or two epochs become one.
+
+use crate::slam::geometry::sim3::Sim3;
+use crate::slam::graph::{GraphParams, optimise};
+use crate::slam::loops::chain::Chain;
+use crate::slam::loops::{Job, Link, Loops, Node, SearchFate};
+use crate::slam::map::EpochJoin;
+
+/// How the map is to be moved.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Closure {
+    /// Where each keyframe goes, in the order of their ids: what its place is multiplied by from the left.
+    pub moves: Vec<(u64, Sim3)>,
+    /// An epoch that becomes part of another.
+    pub join: Option<EpochJoin>,
+}
+
+impl Closure {
+    /// The move of a keyframe: its own, or of one that came later that of the last before it.
+    pub fn of(&self, keyframe_id: u64) -> Option<&Sim3> {
+        let place = self.moves.partition_point(|(id, _)| *id <= keyframe_id);
+        self.moves.get(place.checked_sub(1)?).map(|(_, by)| by)
+    }
+}
+
+impl Loops {
+    /// A loop is confirmed: it holds from now on, unless it contradicts those before.
+    pub(super) fn close(&mut self, job: &Job, confirmed: &[Link]) -> SearchFate {
+        let before = self.links.len();
+        self.links.extend(confirmed);
+        let fate = self.solve(job, confirmed.len());
+        if fate == SearchFate::Inconsistent {
+            self.links.truncate(before);
+        }
+        fate
+    }
+
+    /// What the newest loops do to the map: a pair, or those that join two epochs.
+    pub(super) fn solve(&mut self, job: &Job, num_newest: usize) -> SearchFate {
+        let first = self.links.len().checked_sub(num_newest).and_then(|at| self.links.get(at));
+        let Some(first) = first.copied() else { return SearchFate::Inconsistent };
+        let (Some(i), Some(j)) = (job.node(first.i), job.node(first.j)) else {
+            return SearchFate::Inconsistent;
+        };
+        match i.epoch == j.epoch {
+            true => self.solve_graph(job, i.epoch, num_newest),
+            false => self.join(job, &first, [i, j]),
+        }
+    }
+
+    fn join(&mut self, job: &Job, link: &Link, [i, j]: [&Node; 2]) -> SearchFate {
+        let is_newer = i.epoch > j.epoch;
+        let (newer, older) = if is_newer { (i, j) } else { (j, i) };
+        let j_from_i = link.measurement.j_from_i;
+        let older_from_newer = if is_newer { j_from_i } else { j_from_i.inverse() };
+        let into_from_epoch =
+            older.map_from_keyframe * older_from_newer * newer.map_from_keyframe.inverse();
+        let (epoch, into) = (newer.epoch, older.epoch);
+        let beginning = job.nodes.iter().find(|node| node.epoch == epoch);
+        self.beginnings.extend(beginning.map(|node| node.keyframe_id));
+        let join = Some(EpochJoin { epoch, into, into_from_epoch });
+        self.closure = Some(Closure { moves: Vec::new(), join });
+        SearchFate::Joined
+    }
+
+    fn solve_graph(&mut self, job: &Job, epoch: u32, num_newest: usize) -> SearchFate {
+        /// Mean χ²₇: a map that has its newest loop within it is as good as that.
+        const HELD_CHI2: f64 = 7.0;
+        /// χ²₇ that one of ten thousand true loops exceeds: with what holds the rest there is a false one.
+        const CONTRADICTED_CHI2: f64 = 29.9;
+        let Some(mut chain) = Chain::new(self, &job.nodes, epoch) else {
+            return SearchFate::Inconsistent;
+        };
+        let errors = chain.loop_errors();
+        if errors.iter().rev().take(num_newest).all(|&error| error <= HELD_CHI2) {
+            return SearchFate::Held;
+        }
+        let before: Vec<Sim3> =
+            chain.graph.vertices().iter().map(|v| v.map_from_keyframe).collect();
+        let solved = optimise(&mut chain.graph, &GraphParams::default());
+        let is_solved = solved.is_ok_and(|outcome| outcome.is_converged);
+        if !is_solved || !chain.loop_errors().iter().all(|&error| error <= CONTRADICTED_CHI2) {
+            return SearchFate::Inconsistent;
+        }
+        let after = chain.graph.vertices().iter().map(|v| v.map_from_keyframe);
+        let by = after.zip(before).map(|(is, was)| is * was.inverse());
+        let moves = chain.ids.iter().copied().zip(by).collect();
+        self.closure = Some(Closure { moves, join: None });
+        SearchFate::Closed
+    }
+}

@@ -1,0 +1,354 @@
+//! Loops: a keyframe sees a place again that it was not estimated with, and the map is moved so that both agree (Engel,
+//! Schöps, Cremers 2014, §3.5–3.6).
+//!
+//! [`Loops::plan`] chooses who is compared with whom, by what keyframes look like (`likeness`); [`Loops::run`] is the
+//! recipe: pairs are measured both ways (`graph::constraint`), one that the drift of the chain allows (`chain`) is confirmed
+//! by a second, independent pair (`search`), and then the pose graph of the epoch is solved (`closure`). It is slow and
+//! made in the background on copies; [`Loops::begin`] and [`Loops::take_closure`] are where it meets the map.
+
+mod chain;
+mod closure;
+mod likeness;
+mod search;
+#[cfg(test)]
+mod tests;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
+
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::sim3::Sim3;
+use crate::slam::graph::constraint::{ConstraintParams, ConstraintSolver, Measurement, Refusal};
+use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::loops::likeness::Likeness;
+use crate::slam::map::Map;
+use crate::slam::parameter::{ParameterError, check_range};
+use crate::slam::place_covariance::PlaceCovariance;
+
+pub use closure::Closure;
+
+/// Tuning of the search for loops.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct LoopParams {
+    /// Keyframes that look most alike with which one that has settled is compared; 0 looks for no loops.
+    pub num_candidates: usize,
+    /// Least correlation of the small images of two keyframes that are compared.
+    pub min_likeness: f32,
+    /// By how much the variance of a keyframe's place against those it was estimated with is larger than the estimate says:
+    /// what the window's model does not know adds up along a chain.
+    pub drift_inflation: f64,
+}
+
+impl Default for LoopParams {
+    fn default() -> Self {
+        Self { num_candidates: 3, min_likeness: 0.6, drift_inflation: 4.0 }
+    }
+}
+
+impl LoopParams {
+    /// Checks every value.
+    pub fn validate(&self) -> Result<(), ParameterError> {
+        check_range("num_candidates", self.num_candidates, 0..=50)?;
+        check_range("min_likeness", self.min_likeness, -1.0..=1.0)?;
+        check_range("drift_inflation", self.drift_inflation, 0.01..=1e4)
+    }
+}
+
+/// What a search came to.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum SearchFate {
+    /// No candidate is the same place; why the first one is not.
+    Refused(Refusal),
+    /// One may be: it is to be confirmed.
+    Proposed,
+    /// One would be, but is further off than the map can have drifted.
+    AgainstDrift,
+    /// No second pair says the same.
+    Unconfirmed,
+    /// Together with the loops before it contradicts the map.
+    Inconsistent,
+    /// The map has it so already: it holds from now on.
+    Held,
+    /// The map is moved.
+    Closed,
+    /// Two epochs are joined.
+    Joined,
+}
+
+/// A search that is over.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SearchReport {
+    /// The keyframe that was looked for in others.
+    pub keyframe_id: u64,
+    /// The candidate that most came of, or else the one most alike.
+    pub other: Option<u64>,
+    /// Pairs that were measured.
+    pub compared: u32,
+    /// What came of it.
+    pub fate: SearchFate,
+}
+
+/// A measurement between two keyframes, by their ids.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Link {
+    pub(crate) i: u64,
+    pub(crate) j: u64,
+    pub(crate) measurement: Measurement,
+}
+
+/// Two keyframes to be compared, with what is believed of them.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Pair {
+    i: u64,
+    j: u64,
+    j_from_i: Option<Sim3>,
+}
+
+/// What is to be done next.
+#[derive(Debug, Clone)]
+enum Stage {
+    /// Pairs are measured from nothing.
+    Search,
+    /// Pairs are measured that could confirm a loop.
+    Confirm(Box<Link>),
+    /// A correction was not taken: the graph is solved again.
+    Close { num_newest: usize },
+}
+
+#[derive(Debug, Clone)]
+struct Plan {
+    of: u64,
+    stage: Stage,
+    pairs: Vec<Pair>,
+}
+
+/// A keyframe's place when a search began.
+#[derive(Debug, Clone, Copy)]
+struct Node {
+    keyframe_id: u64,
+    epoch: u32,
+    map_from_keyframe: Sim3,
+    covariance: PlaceCovariance,
+}
+
+/// A plan with copies of what it needs.
+#[derive(Debug, Clone)]
+struct Job {
+    plan: Plan,
+    /// In the order of their ids.
+    keyframes: Vec<Keyframe>,
+    /// All of the map, in the order of their ids.
+    nodes: Vec<Node>,
+}
+
+impl Job {
+    fn keyframe(&self, id: u64) -> Option<&Keyframe> {
+        let place = self.keyframes.binary_search_by_key(&id, |k| k.keyframe_id).ok()?;
+        self.keyframes.get(place)
+    }
+
+    fn node(&self, id: u64) -> Option<&Node> {
+        let place = self.nodes.binary_search_by_key(&id, |node| node.keyframe_id).ok()?;
+        self.nodes.get(place)
+    }
+}
+
+/// The search for loops and what it has found.
+#[derive(Debug, Clone)]
+pub struct Loops {
+    params: LoopParams,
+    intrinsics: Intrinsics,
+    /// Made with the first search: three megabytes.
+    solver: Option<Arc<ConstraintSolver>>,
+    likeness: Likeness,
+    /// By keyframe those that it was estimated with, older and newer.
+    partners: BTreeMap<u64, BTreeSet<u64>>,
+    /// By keyframe the older ones that its place was estimated against.
+    held_by: BTreeMap<u64, Vec<u64>>,
+    /// Keyframes that nothing connects with the one before: the first of epochs that were joined to others.
+    beginnings: BTreeSet<u64>,
+    /// Keyframes up to this one have been searched.
+    searched_to: Option<u64>,
+    plan: Option<Plan>,
+    job: Option<Box<Job>>,
+    links: Vec<Link>,
+    closure: Option<Closure>,
+    report: Option<SearchReport>,
+}
+
+impl Loops {
+    /// Without any yet, for keyframes of `intrinsics`.
+    pub fn new(intrinsics: Intrinsics, params: LoopParams) -> Self {
+        Self {
+            params,
+            intrinsics,
+            solver: None,
+            likeness: Likeness::default(),
+            partners: BTreeMap::new(),
+            held_by: BTreeMap::new(),
+            beginnings: BTreeSet::new(),
+            searched_to: None,
+            plan: None,
+            job: None,
+            links: Vec::new(),
+            closure: None,
+            report: None,
+        }
+    }
+
+    /// Whether loops are looked for.
+    pub fn is_on(&self) -> bool {
+        self.params.num_candidates > 0
+    }
+
+    /// A keyframe is new; its image row after row.
+    pub fn insert(&mut self, keyframe_id: u64, pixels: &[u8], width: usize, height: usize) {
+        if self.is_on() {
+            self.likeness.insert(keyframe_id, pixels, width, height);
+        }
+    }
+
+    /// A keyframe was estimated with others, all but those in `held` free.
+    pub fn note_estimate(&mut self, newest: u64, others: &[u64], held: &[u64]) {
+        /// Keyframes before it that its place is estimated against, beside those that are held.
+        const NUM_BEFORE: usize = 2;
+        if !self.is_on() {
+            return;
+        }
+        for &other in others {
+            self.partners.entry(newest).or_default().insert(other);
+            self.partners.entry(other).or_default().insert(newest);
+            // Those that are free with it meet all that hold it.
+            if !held.contains(&other) {
+                for &of in held {
+                    self.partners.entry(other).or_default().insert(of);
+                    self.partners.entry(of).or_default().insert(other);
+                }
+            }
+        }
+        let before = others.iter().rev().filter(|other| !held.contains(other)).take(NUM_BEFORE);
+        let against: Vec<u64> = held.iter().chain(before).copied().collect();
+        self.held_by.insert(newest, against);
+    }
+
+    /// Chooses what is done next. `known` are the keyframes with image and depth, in the order of their ids; those from
+    /// `num_settled` on may still move.
+    pub fn plan(&mut self, known: &[u64], num_settled: usize) {
+        if self.plan.is_some() || !self.is_on() {
+            return;
+        }
+        for (place, &of) in known.iter().enumerate().take(num_settled) {
+            if self.searched_to.is_some_and(|to| of <= to) {
+                continue;
+            }
+            let pairs = self.candidates(known, place);
+            if !pairs.is_empty() {
+                self.plan = Some(Plan { of, stage: Stage::Search, pairs });
+                return;
+            }
+            self.searched_to = Some(of);
+        }
+    }
+
+    /// Keyframes that look like one and were not estimated with it or with those around it.
+    fn candidates(&self, known: &[u64], place: usize) -> Vec<Pair> {
+        /// Keyframes before and after one that see what it sees.
+        const AROUND: usize = 7;
+        let of = known[place];
+        let mut is_open = vec![true; known.len()];
+        let mut close = |at: usize| {
+            let end = known.len().min(at + AROUND + 1);
+            is_open[at.saturating_sub(AROUND)..end].fill(false);
+        };
+        close(place);
+        for partner in self.partners.get(&of).into_iter().flatten() {
+            known.binary_search(partner).into_iter().for_each(&mut close);
+        }
+        let open = known[..place].iter().zip(&is_open).filter(|(_, is_open)| **is_open);
+        let open: Vec<u64> = open.map(|(id, _)| *id).collect();
+        let LoopParams { num_candidates, min_likeness, .. } = self.params;
+        let alike = self.likeness.candidates(of, &open, num_candidates, min_likeness);
+        alike.into_iter().map(|j| Pair { i: of, j, j_from_i: None }).collect()
+    }
+
+    /// Takes copies of what the plan needs; false where there is nothing to do.
+    pub fn begin(&mut self, map: &Map) -> bool {
+        let Some(plan) = self.plan.take() else { return false };
+        let ids: BTreeSet<u64> = plan.pairs.iter().flat_map(|pair| [pair.i, pair.j]).collect();
+        let is_usable = |k: &&Keyframe| k.has_depth() && k.map_state == MapState::Established;
+        let keyframes = ids.iter().filter_map(|id| map.get(*id).filter(is_usable).cloned());
+        let keyframes: Vec<Keyframe> = keyframes.collect();
+        let mut nodes: Vec<Node> = map.keyframes.iter().map(Node::of).collect();
+        nodes.sort_by_key(|node| node.keyframe_id);
+        self.job = Some(Box::new(Job { plan, keyframes, nodes }));
+        true
+    }
+
+    /// Whether something was begun.
+    pub fn is_begun(&self) -> bool {
+        self.job.is_some()
+    }
+
+    /// Does what was begun.
+    pub fn run(&mut self) {
+        let Some(job) = self.job.take() else { return };
+        let of = job.plan.of;
+        let other = match &job.plan.stage {
+            Stage::Search => job.plan.pairs.first().map(|pair| pair.j),
+            Stage::Confirm(link) => Some(link.j),
+            Stage::Close { .. } => None,
+        };
+        let (compared, fate) = match &job.plan.stage {
+            Stage::Search => self.search(&job),
+            Stage::Confirm(link) => self.confirm(&job, link),
+            Stage::Close { num_newest } => (0, self.solve(&job, *num_newest)),
+        };
+        if fate != SearchFate::Proposed && self.searched_to.is_none_or(|to| to < of) {
+            self.searched_to = Some(of);
+        }
+        self.report = Some(SearchReport { keyframe_id: of, other, compared, fate });
+    }
+
+    /// What the last search came to: told once.
+    pub fn take_report(&mut self) -> Option<SearchReport> {
+        self.report.take()
+    }
+
+    /// How the map is to be moved: told once.
+    pub fn take_closure(&mut self) -> Option<Closure> {
+        self.closure.take()
+    }
+
+    /// The map has changed meanwhile, so that it was not moved: that is made again.
+    pub fn repeat_closure(&mut self) {
+        let Some(closure) = self.closure.take() else { return };
+        let num_newest = confirmations(closure.join.is_none()) + 1;
+        let of = self.links.last().map_or(0, |link| link.i);
+        self.plan = Some(Plan { of, stage: Stage::Close { num_newest }, pairs: Vec::new() });
+    }
+
+    fn solver(&mut self) -> Arc<ConstraintSolver> {
+        let intrinsics = &self.intrinsics;
+        let make = || Arc::new(ConstraintSolver::new(intrinsics, ConstraintParams::default()));
+        self.solver.get_or_insert_with(make).clone()
+    }
+}
+
+/// Pairs that must say what a loop says, within an epoch and between two.
+fn confirmations(is_one_epoch: bool) -> usize {
+    if is_one_epoch { 1 } else { 2 }
+}
+
+impl Node {
+    fn of(keyframe: &Keyframe) -> Self {
+        Self {
+            keyframe_id: keyframe.keyframe_id,
+            epoch: keyframe.epoch,
+            map_from_keyframe: keyframe.map_from_keyframe,
+            covariance: keyframe.place_covariance,
+        }
+    }
+}

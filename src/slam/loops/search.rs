@@ -1,0 +1,155 @@
+//! Whether two keyframes see the same place: measured, judged by the drift that the map can have, and confirmed by another
+//! pair.
+
+use crate::slam::geometry::sim3::{Matrix7, Sim3};
+use crate::slam::graph::constraint::{Measurement, Refusal};
+use crate::slam::loops::chain::{Chain, link_covariance};
+use crate::slam::loops::{Job, Link, Loops, Pair, Plan, SearchFate, Stage, confirmations};
+
+/// χ²₇ at 99 %, within which two things that were measured agree.
+const LARGEST_CHI2: f64 = 18.5;
+
+impl Loops {
+    /// Measures the candidates of a keyframe, and plans the confirmation of the first that may be its place.
+    pub(super) fn search(&mut self, job: &Job) -> (u32, SearchFate) {
+        let solver = self.solver();
+        let mut refusal = None;
+        let (mut compared, mut is_against_drift) = (0, false);
+        let Some(of) = job.keyframe(job.plan.of) else {
+            return (0, SearchFate::Refused(Refusal::TooFewPoints));
+        };
+        let view = solver.view(of);
+        for pair in &job.plan.pairs {
+            let Some(other) = job.keyframe(pair.j) else { continue };
+            compared += 1;
+            let measurement = match solver.measure(&view, &solver.view(other), None) {
+                Ok(measurement) => measurement,
+                Err(why) => {
+                    refusal.get_or_insert(why);
+                    continue;
+                }
+            };
+            let link = Link { i: pair.i, j: pair.j, measurement };
+            if !self.is_within_drift(job, &link) {
+                is_against_drift = true;
+                continue;
+            }
+            let pairs = confirming(job, &link);
+            self.plan = Some(Plan { of: pair.i, stage: Stage::Confirm(Box::new(link)), pairs });
+            return (compared, SearchFate::Proposed);
+        }
+        let refused = SearchFate::Refused(refusal.unwrap_or(Refusal::NothingAlike));
+        (compared, if is_against_drift { SearchFate::AgainstDrift } else { refused })
+    }
+
+    /// Whether the map can have drifted so far as a loop says; two epochs may lie anywhere.
+    fn is_within_drift(&self, job: &Job, link: &Link) -> bool {
+        let (Some(i), Some(j)) = (job.node(link.i), job.node(link.j)) else { return false };
+        if i.epoch != j.epoch {
+            return true;
+        }
+        let predicted =
+            Chain::new(self, &job.nodes, i.epoch).and_then(|chain| chain.predicted(link.i, link.j));
+        let Measurement { j_from_i, covariance, .. } = &link.measurement;
+        predicted.is_some_and(|(expected, of_chain)| {
+            is_within(&expected, j_from_i, &(of_chain + covariance))
+        })
+    }
+
+    /// Measures pairs beside a loop; one must say the same, of a loop between two epochs two.
+    pub(super) fn confirm(&mut self, job: &Job, link: &Link) -> (u32, SearchFate) {
+        let solver = self.solver();
+        let (Some(i), Some(j)) = (job.node(link.i), job.node(link.j)) else {
+            return (0, SearchFate::Unconfirmed);
+        };
+        let wanted = confirmations(i.epoch == j.epoch);
+        let mut compared = 0;
+        let mut confirmations = Vec::new();
+        for pair in &job.plan.pairs {
+            let (Some(one), Some(other)) = (job.keyframe(pair.i), job.keyframe(pair.j)) else {
+                continue;
+            };
+            compared += 1;
+            let views = [solver.view(one), solver.view(other)];
+            let measured = solver.measure(&views[0], &views[1], pair.j_from_i.as_ref());
+            let Ok(measurement) = measured else { continue };
+            let confirmation = Link { i: pair.i, j: pair.j, measurement };
+            if self.agrees(job, link, &confirmation) {
+                confirmations.push(confirmation);
+            }
+            if confirmations.len() == wanted {
+                confirmations.insert(0, *link);
+                return (compared, self.close(job, &confirmations));
+            }
+        }
+        (compared, SearchFate::Unconfirmed)
+    }
+
+    /// Whether one pair says of the map what another beside it says.
+    fn agrees(&self, job: &Job, link: &Link, confirmation: &Link) -> bool {
+        let place = |id| job.node(id).map(|node| node.map_from_keyframe);
+        let (Some(i), Some(j), Some(near_i), Some(near_j)) =
+            (place(link.i), place(link.j), place(confirmation.i), place(confirmation.j))
+        else {
+            return false;
+        };
+        // near_j_from_near_i by the loop and what lies beside it.
+        let (near_j_from_j, i_from_near_i) = (near_j.inverse() * j, i.inverse() * near_i);
+        let expected = near_j_from_j * link.measurement.j_from_i * i_from_near_i;
+        let along = |by: &Sim3, covariance: &Matrix7| {
+            let adjoint = by.adjoint();
+            adjoint * covariance * adjoint.transpose()
+        };
+        let of_link = |id| {
+            let node = job.node(id)?;
+            let inflation = self.params.drift_inflation;
+            Some(link_covariance(&node.map_from_keyframe, Some(&node.covariance), inflation))
+        };
+        let (Some(of_near_i), Some(of_near_j)) = (of_link(confirmation.i), of_link(confirmation.j))
+        else {
+            return false;
+        };
+        let covariance = confirmation.measurement.covariance
+            + along(&near_j_from_j, &link.measurement.covariance)
+            + of_near_j
+            + along(&expected, &of_near_i);
+        is_within(&expected, &confirmation.measurement.j_from_i, &covariance)
+    }
+}
+
+/// Whether a similarity is where it was expected, by the covariance of the left increment.
+fn is_within(expected: &Sim3, found: &Sim3, covariance: &Matrix7) -> bool {
+    let difference = (*found * expected.inverse()).log();
+    let chi2 = covariance.cholesky().map(|of| difference.dot(&of.solve(&difference)));
+    chi2.is_some_and(|chi2| chi2 <= LARGEST_CHI2)
+}
+
+/// Pairs of a neighbour of one keyframe with a neighbour of the other: no image is in both.
+fn confirming(job: &Job, link: &Link) -> Vec<Pair> {
+    let beside = |id: u64| {
+        let place = job.nodes.binary_search_by_key(&id, |node| node.keyframe_id).unwrap_or(0);
+        let epoch = job.nodes.get(place).map(|node| node.epoch);
+        let places = [place.checked_sub(1), place.checked_add(1)];
+        places.map(|at| at.and_then(|at| job.nodes.get(at)).filter(|of| Some(of.epoch) == epoch))
+    };
+    let places = [link.i, link.j].map(|id| job.node(id).map(|node| node.map_from_keyframe));
+    let [Some(i), Some(j)] = places else { return Vec::new() };
+    let (near_i, near_j) = (beside(link.i), beside(link.j));
+    let mut pairs = Vec::new();
+    for (one, other) in near_i
+        .iter()
+        .flatten()
+        .flat_map(|one| near_j.iter().flatten().map(move |other| (one, other)))
+    {
+        let j_from_i = other.map_from_keyframe.inverse()
+            * j
+            * link.measurement.j_from_i
+            * i.inverse()
+            * one.map_from_keyframe;
+        pairs.push(Pair { i: one.keyframe_id, j: other.keyframe_id, j_from_i: Some(j_from_i) });
+    }
+    // Those that look the same way first: the smallest turn and way between them.
+    let apart = |pair: &Pair| pair.j_from_i.map_or(f64::INFINITY, |of| of.log().norm());
+    pairs.sort_by(|one, other| apart(one).total_cmp(&apart(other)));
+    pairs
+}

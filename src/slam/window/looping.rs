@@ -1,0 +1,96 @@
+//! Where the search for loops meets the window: what it is told, when it is its turn, and what moves with the map.
+
+use crate::slam::geometry::sim3::Sim3;
+use crate::slam::loops::{Closure, LoopParams, Loops, SearchReport};
+use crate::slam::map::Map;
+use crate::slam::window::Window;
+use crate::slam::window::members::Chosen;
+
+impl Window {
+    /// The same, looking for loops.
+    pub fn with_loops(mut self, params: LoopParams) -> Self {
+        self.loops = Loops::new(self.camera, params);
+        self
+    }
+
+    /// Whether a keyframe that has settled is to be looked for in older ones, by [`Window::optimise`]: to be asked where
+    /// nothing else is to be estimated. Of a map that is complete, with `is_last`, all have settled.
+    pub fn begin_search(&mut self, map: &Map, is_last: bool) -> bool {
+        if is_last {
+            self.plan_search(0);
+        }
+        if !self.loops.begin(map) {
+            return false;
+        }
+        self.moved.clear();
+        self.marginals.clear();
+        true
+    }
+
+    /// Does a search that was begun; false where none was.
+    pub(super) fn search_begun(&mut self) -> bool {
+        let is_begun = self.loops.is_begun();
+        if is_begun {
+            self.loops.run();
+            self.plan_search(self.num_unsettled());
+        }
+        is_begun
+    }
+
+    /// Tells of a new keyframe.
+    pub(super) fn tell_new(&mut self, index: usize) {
+        let keyframe = &self.keyframes[index];
+        let (width, height) = (self.camera.width, self.camera.height);
+        self.loops.insert(keyframe.keyframe_id, keyframe.images[0].pixels(), width, height);
+    }
+
+    /// Tells of an estimate of the newest keyframes, and chooses what is searched next.
+    pub(super) fn tell_estimate(&mut self, chosen: &Chosen) {
+        let id = |member: usize| self.keyframes[member].keyframe_id;
+        let Some((&newest, others)) = chosen.members.split_last() else { return };
+        let all: Vec<u64> = others.iter().map(|&member| id(member)).collect();
+        let is_held = chosen.free.iter().map(Option::is_none);
+        let held = others.iter().zip(is_held).filter(|(_, is_held)| *is_held);
+        let held: Vec<u64> = held.map(|(&member, _)| id(member)).collect();
+        let newest = id(newest);
+        self.loops.note_estimate(newest, &all, &held);
+        self.plan_search(self.num_unsettled());
+    }
+
+    fn num_unsettled(&self) -> usize {
+        self.params.num_free.max(1)
+    }
+
+    /// Chooses what is searched next, the newest keyframes left out.
+    fn plan_search(&mut self, num_unsettled: usize) {
+        let known: Vec<u64> = self.keyframes.iter().map(|of| of.keyframe_id).collect();
+        self.loops.plan(&known, known.len().saturating_sub(num_unsettled));
+    }
+
+    /// What the last search came to: told once.
+    pub fn take_search(&mut self) -> Option<SearchReport> {
+        self.loops.take_report()
+    }
+
+    /// How the map is to be moved by a loop: told once.
+    pub fn take_closure(&mut self) -> Option<Closure> {
+        self.loops.take_closure()
+    }
+
+    /// The map was not moved by the loop that was found: it is to be solved again.
+    pub fn repeat_closure(&mut self) {
+        self.loops.repeat_closure();
+    }
+
+    /// The map was moved: points move with their hosts, and what the loop joins is to be estimated together.
+    pub fn follow(&mut self, closure: &Closure) {
+        for keyframe in &mut self.keyframes {
+            let Some(by) = closure.of(keyframe.keyframe_id) else { continue };
+            let place = *by * Sim3::new(keyframe.camera_from_map.inverse(), keyframe.unit);
+            keyframe.camera_from_map = place.rigid.inverse();
+            keyframe.unit = place.scale;
+            keyframe.points.iter_mut().for_each(|point| point.inverse_depth /= by.scale);
+        }
+        self.pass.call();
+    }
+}
