@@ -20,6 +20,7 @@ use semidense::slam::graph::constraint::{
     ConstraintParams, ConstraintSolver, KeyframeView, Measurement, Refusal,
 };
 use semidense::slam::keyframe::Keyframe;
+use semidense::slam::trajectory::StampedPose;
 
 /// Every pair of keyframes of a map, measured from nothing.
 #[derive(Debug, Parser)]
@@ -80,7 +81,22 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
     if arguments.searches {
         for search in record.searches.iter().flatten() {
             let (millis, report) = (1e-6 * search.nanos as f64, search.report);
-            println!("frame {} {millis:.0} ms {report:?}", search.sequence);
+            let place = |id: u64| {
+                let keyframe = record.map.get(id)?;
+                let nearest = |p: &&StampedPose| p.nanos.abs_diff(keyframe.capture_nanos);
+                Some(record.ground_truth.iter().min_by_key(nearest)?.world_from_camera)
+            };
+            let pair = report.measured.map(|(i, j, _)| [i, j]);
+            let pair = pair.or(report.other.map(|other| [report.keyframe_id, other]));
+            let apart = pair.and_then(|[i, j]| Some(place(j)?.inverse() * place(i)?));
+            let apart = apart.map(|apart| [apart.translation.norm(), apart.rotation.angle()]);
+            let found = report.measured.map(|(_, _, j_from_i)| {
+                [j_from_i.rigid.translation.norm(), j_from_i.rigid.rotation.angle(), j_from_i.scale]
+            });
+            println!(
+                "frame {} {millis:.0} ms {} {pair:?} truth {apart:.2?} measured {found:.2?} {:?}",
+                search.sequence, report.keyframe_id, report.fate
+            );
         }
         return Ok(());
     }

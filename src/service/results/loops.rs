@@ -44,7 +44,7 @@ impl LoopSummary {
             loops_closed: count(|fate| *fate == SearchFate::Closed),
             loops_held: count(|fate| *fate == SearchFate::Held),
             epochs_joined: count(|fate| *fate == SearchFate::Joined),
-            loops_against_drift: count(|fate| *fate == SearchFate::AgainstDrift),
+            loops_against_drift: count(|fate| matches!(fate, SearchFate::AgainstDrift(_))),
             loops_unconfirmed: count(|fate| *fate == SearchFate::Unconfirmed),
             loops_inconsistent: count(|fate| *fate == SearchFate::Inconsistent),
             loops_refused: count(|fate| matches!(fate, SearchFate::Refused(_))),

@@ -117,10 +117,5 @@ pub(super) fn link_covariance(
     by_errors.fixed_view_mut::<7, 1>(0, 6).fill(0.0);
     by_errors[(6, 6)] = 1.0;
     let covariance = by_errors * place.matrix() * by_errors.transpose() * inflation;
-    // An estimate that knows less than the tracker has failed.
-    let is_sure = (0..7).all(|k| covariance[(k, k)] <= unestimated[(k, k)]);
-    match is_sure {
-        true => covariance + of_deviations(LEAST),
-        false => unestimated,
-    }
+    covariance + of_deviations(LEAST)
 }

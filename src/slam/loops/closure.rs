@@ -3,6 +3,7 @@
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::graph::{GraphParams, optimise};
 use crate::slam::loops::chain::Chain;
+use crate::slam::loops::search::LARGEST_CHI2;
 use crate::slam::loops::{Job, Link, Loops, Node, SearchFate};
 use crate::slam::map::EpochJoin;
 
@@ -64,15 +65,13 @@ impl Loops {
     }
 
     fn solve_graph(&mut self, job: &Job, epoch: u32, num_newest: usize) -> SearchFate {
-        /// Mean χ²₇: a map that has its newest loop within it is as good as that.
-        const HELD_CHI2: f64 = 7.0;
         /// χ²₇ that one of ten thousand true loops exceeds: with what holds the rest there is a false one.
         const CONTRADICTED_CHI2: f64 = 29.9;
         let Some(mut chain) = Chain::new(self, &job.nodes, epoch) else {
             return SearchFate::Inconsistent;
         };
         let errors = chain.loop_errors();
-        if errors.iter().rev().take(num_newest).all(|&error| error <= HELD_CHI2) {
+        if errors.iter().rev().take(num_newest).all(|&error| error <= LARGEST_CHI2) {
             return SearchFate::Held;
         }
         let before: Vec<Sim3> =

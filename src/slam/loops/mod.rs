@@ -64,8 +64,8 @@ pub enum SearchFate {
     Refused(Refusal),
     /// One may be: it is to be confirmed.
     Proposed,
-    /// One would be, but is further off than the map can have drifted.
-    AgainstDrift,
+    /// One would be, but is further off than the map can have drifted: χ²₇ of that.
+    AgainstDrift(f64),
     /// No second pair says the same.
     Unconfirmed,
     /// Together with the loops before it contradicts the map.
@@ -89,6 +89,8 @@ pub struct SearchReport {
     pub compared: u32,
     /// What came of it.
     pub fate: SearchFate,
+    /// The last pair that passed for itself, with `j_from_i`: ids of i and j.
+    pub measured: Option<(u64, u64, Sim3)>,
 }
 
 /// A measurement between two keyframes, by their ids.
@@ -177,6 +179,10 @@ pub struct Loops {
     links: Vec<Link>,
     closure: Option<Closure>,
     report: Option<SearchReport>,
+    /// Of the search that is being made: see the report.
+    measured: Option<(u64, u64, Sim3)>,
+    /// The keyframe that was searched last and whose candidates are no places of it.
+    fruitless: Option<u64>,
 }
 
 impl Loops {
@@ -196,6 +202,8 @@ impl Loops {
             links: Vec::new(),
             closure: None,
             report: None,
+            measured: None,
+            fruitless: None,
         }
     }
 
@@ -237,6 +245,8 @@ impl Loops {
     /// Chooses what is done next. `known` are the keyframes with image and depth, in the order of their ids; those from
     /// `num_settled` on may still move.
     pub fn plan(&mut self, known: &[u64], num_settled: usize) {
+        /// Keyframes after one that was no loop which see the same, and are not searched.
+        const PAUSE: usize = 2;
         if self.plan.is_some() || !self.is_on() {
             return;
         }
@@ -244,7 +254,11 @@ impl Loops {
             if self.searched_to.is_some_and(|to| of <= to) {
                 continue;
             }
-            let pairs = self.candidates(known, place);
+            let is_after = |id| known[place.saturating_sub(PAUSE)..place].contains(&id);
+            let pairs = match self.fruitless.is_some_and(is_after) {
+                true => Vec::new(),
+                false => self.candidates(known, place),
+            };
             if !pairs.is_empty() {
                 self.plan = Some(Plan { of, stage: Stage::Search, pairs });
                 return;
@@ -309,7 +323,10 @@ impl Loops {
         if fate != SearchFate::Proposed && self.searched_to.is_none_or(|to| to < of) {
             self.searched_to = Some(of);
         }
-        self.report = Some(SearchReport { keyframe_id: of, other, compared, fate });
+        let is_fruitless = matches!(fate, SearchFate::Refused(_) | SearchFate::AgainstDrift(_));
+        self.fruitless = is_fruitless.then_some(of);
+        let measured = self.measured.take();
+        self.report = Some(SearchReport { keyframe_id: of, other, compared, fate, measured });
     }
 
     /// What the last search came to: told once.

@@ -7,14 +7,14 @@ use crate::slam::loops::chain::{Chain, link_covariance};
 use crate::slam::loops::{Job, Link, Loops, Pair, Plan, SearchFate, Stage, confirmations};
 
 /// χ²₇ at 99 %, within which two things that were measured agree.
-const LARGEST_CHI2: f64 = 18.5;
+pub(super) const LARGEST_CHI2: f64 = 18.5;
 
 impl Loops {
     /// Measures the candidates of a keyframe, and plans the confirmation of the first that may be its place.
     pub(super) fn search(&mut self, job: &Job) -> (u32, SearchFate) {
         let solver = self.solver();
         let mut refusal = None;
-        let (mut compared, mut is_against_drift) = (0, false);
+        let (mut compared, mut against_drift) = (0, None);
         let Some(of) = job.keyframe(job.plan.of) else {
             return (0, SearchFate::Refused(Refusal::TooFewPoints));
         };
@@ -30,8 +30,10 @@ impl Loops {
                 }
             };
             let link = Link { i: pair.i, j: pair.j, measurement };
-            if !self.is_within_drift(job, &link) {
-                is_against_drift = true;
+            self.measured = Some((link.i, link.j, measurement.j_from_i));
+            let chi2 = self.drift_chi2(job, &link);
+            if !(chi2 <= LARGEST_CHI2) {
+                against_drift.get_or_insert(SearchFate::AgainstDrift(chi2));
                 continue;
             }
             let pairs = confirming(job, &link);
@@ -39,20 +41,21 @@ impl Loops {
             return (compared, SearchFate::Proposed);
         }
         let refused = SearchFate::Refused(refusal.unwrap_or(Refusal::NothingAlike));
-        (compared, if is_against_drift { SearchFate::AgainstDrift } else { refused })
+        (compared, against_drift.unwrap_or(refused))
     }
 
-    /// Whether the map can have drifted so far as a loop says; two epochs may lie anywhere.
-    fn is_within_drift(&self, job: &Job, link: &Link) -> bool {
-        let (Some(i), Some(j)) = (job.node(link.i), job.node(link.j)) else { return false };
+    /// How far the map would have drifted for a loop to be true, χ²₇ by what chain and loop claim; 0 between two epochs,
+    /// which may lie anywhere, and not finite where it cannot be told.
+    fn drift_chi2(&self, job: &Job, link: &Link) -> f64 {
+        let (Some(i), Some(j)) = (job.node(link.i), job.node(link.j)) else { return f64::NAN };
         if i.epoch != j.epoch {
-            return true;
+            return 0.0;
         }
         let predicted =
             Chain::new(self, &job.nodes, i.epoch).and_then(|chain| chain.predicted(link.i, link.j));
         let Measurement { j_from_i, covariance, .. } = &link.measurement;
-        predicted.is_some_and(|(expected, of_chain)| {
-            is_within(&expected, j_from_i, &(of_chain + covariance))
+        predicted.map_or(f64::NAN, |(expected, of_chain)| {
+            chi2(&expected, j_from_i, &(of_chain + covariance))
         })
     }
 
@@ -113,15 +116,15 @@ impl Loops {
             + along(&near_j_from_j, &link.measurement.covariance)
             + of_near_j
             + along(&expected, &of_near_i);
-        is_within(&expected, &confirmation.measurement.j_from_i, &covariance)
+        chi2(&expected, &confirmation.measurement.j_from_i, &covariance) <= LARGEST_CHI2
     }
 }
 
-/// Whether a similarity is where it was expected, by the covariance of the left increment.
-fn is_within(expected: &Sim3, found: &Sim3, covariance: &Matrix7) -> bool {
+/// How far a similarity is from where it was expected, by the covariance of the left increment.
+fn chi2(expected: &Sim3, found: &Sim3, covariance: &Matrix7) -> f64 {
     let difference = (*found * expected.inverse()).log();
-    let chi2 = covariance.cholesky().map(|of| difference.dot(&of.solve(&difference)));
-    chi2.is_some_and(|chi2| chi2 <= LARGEST_CHI2)
+    let whitening = covariance.cholesky();
+    whitening.map_or(f64::NAN, |whitening| difference.dot(&whitening.solve(&difference)))
 }
 
 /// Pairs of a neighbour of one keyframe with a neighbour of the other: no image is in both.

@@ -1,1 +1,246 @@
+//! Loops of rendered rooms: true ones close, others do not.
 
+use super::*;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::geometry::sim3::Twist7;
+use crate::slam::graph::constraint::tests::{DepthError, USUAL, keyframe};
+use crate::slam::map::Correction;
+use crate::slam::place_covariance::PlaceMatrix;
+use crate::slam::test_scene::{Random, Scene};
+use nalgebra::Vector6;
+
+/// Length of the keyframes' units, metres.
+const UNIT: f64 = 2.5;
+
+/// Where a camera stands that is turned by so many degrees about the vertical.
+fn turned(at: [f64; 3], degrees: f64) -> SE3 {
+    let mut pose = SE3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, degrees.to_radians(), 0.0));
+    pose.translation = at.into();
+    pose
+}
+
+/// A camera that turns all around in twelve steps and once more sees what it saw at first: true places.
+fn round() -> Vec<SE3> {
+    let at = |k: usize| {
+        let wander = 0.05 * k as f64;
+        turned([0.3 * wander.sin(), 0.1 * (2.0 * wander).sin(), 0.2 * wander], 30.0 * k as f64)
+    };
+    (0..15).map(at).collect()
+}
+
+/// A map of keyframes with the drift of a chain, in which each was estimated against the one before it.
+struct Course {
+    map: Map,
+    loops: Loops,
+}
+
+impl Course {
+    /// Of images and true places in the map's unit, metres. Each step errs by `drift` standard deviations of what is
+    /// claimed: `claimed` of translation, metres, of rotation and of ln s.
+    fn new(views: Vec<(Keyframe, SE3)>, claimed: f64, drift: f64, seed: u64) -> Self {
+        let mut random = Random::new(seed);
+        let mut map = Map::default();
+        let params = LoopParams { drift_inflation: 1.0, ..LoopParams::default() };
+        let mut loops = Loops::new(views[0].0.intrinsics, params);
+        let mut error = Sim3::identity();
+        for (id, (image, place)) in (0u64..).zip(views) {
+            let at = place.translation;
+            let variance = if id == 0 { 0.0 } else { claimed * claimed };
+            // Errors of the step turn about the keyframe: as left increments of the map about its origin.
+            let about = SE3 { translation: at, ..SE3::identity() }.adjoint();
+            let mut covariance = PlaceMatrix::identity() * variance;
+            let of_pose = about * about.transpose() * variance;
+            covariance.fixed_view_mut::<6, 6>(0, 0).copy_from(&of_pose);
+            if id > 0 {
+                let step = Twist7::from_fn(|_, _| drift * claimed * random.normal());
+                let about = Sim3::new(SE3 { translation: at, ..SE3::identity() }, 1.0);
+                error = error * about * Sim3::exp(&step) * about.inverse();
+                loops.note_estimate(id, &[id - 1], &[]);
+            }
+            let keyframe = Keyframe {
+                keyframe_id: id,
+                map_from_keyframe: error * Sim3::new(place, image.map_from_keyframe.scale),
+                place_covariance: PlaceCovariance::bounded(&covariance),
+                ..image
+            };
+            let (width, height) = (keyframe.intrinsics.width, keyframe.intrinsics.height);
+            loops.insert(id, &keyframe.image, width, height);
+            map.keyframes.push(keyframe);
+        }
+        Self { map, loops }
+    }
+
+    fn of(scene: &Scene, places: &[SE3], claimed: f64, drift: f64, seed: u64) -> Self {
+        Self::new(views(scene, places), claimed, drift, seed)
+    }
+
+    /// Looks for all keyframes; applies what comes of it.
+    fn run(&mut self) -> Vec<SearchReport> {
+        let mut reports = Vec::new();
+        loop {
+            let known: Vec<u64> = self.map.keyframes.iter().map(|k| k.keyframe_id).collect();
+            self.loops.plan(&known, known.len());
+            if !self.loops.begin(&self.map) {
+                return reports;
+            }
+            self.loops.run();
+            reports.extend(self.loops.take_report());
+            if let Some(closure) = self.loops.take_closure() {
+                for keyframe in &mut self.map.keyframes {
+                    let Some(by) = closure.of(keyframe.keyframe_id) else { continue };
+                    keyframe.map_from_keyframe = *by * keyframe.map_from_keyframe;
+                }
+                let joins = closure.join.into_iter().collect();
+                self.map.correct(&Correction { joins, ..Correction::default() }, 0).unwrap();
+            }
+        }
+    }
+
+    /// Distance of a keyframe from where it stands against the first one, metres.
+    fn error(&self, index: usize, places: &[SE3]) -> f64 {
+        let found = self.map.keyframes[0].map_from_keyframe.inverse()
+            * self.map.keyframes[index].map_from_keyframe;
+        let truth = places[0].inverse() * places[index];
+        (found.rigid.translation * UNIT - truth.translation).norm()
+    }
+}
+
+fn views(scene: &Scene, places: &[SE3]) -> Vec<(Keyframe, SE3)> {
+    let view = |(seed, place): (u64, &SE3)| (keyframe(scene, place, UNIT, &USUAL, seed), *place);
+    (0u64..).zip(places).map(view).collect()
+}
+
+fn count(reports: &[SearchReport], is: impl Fn(&SearchFate) -> bool) -> usize {
+    reports.iter().filter(|report| is(&report.fate)).count()
+}
+
+fn moves_nothing(reports: &[SearchReport]) -> bool {
+    count(reports, |fate| {
+        matches!(fate, SearchFate::Closed | SearchFate::Held | SearchFate::Joined)
+    }) == 0
+}
+
+#[test]
+fn a_loop_takes_the_drift_out_of_the_map() {
+    let places = round();
+    for seed in 0..3 {
+        let mut course = Course::of(&Scene::new(seed), &places, 0.02, 1.0, seed);
+        let before = course.error(13, &places);
+        let reports = course.run();
+        assert!(count(&reports, |fate| *fate == SearchFate::Closed) > 0, "{reports:?}");
+        let after = course.error(13, &places);
+        assert!(after < 0.05 && after < 0.5 * before, "{seed}: {before} {after} {reports:?}");
+        // Far from both ends half of it is gone at most, and nothing is torn.
+        for pair in course.map.keyframes.windows(2) {
+            let step = pair[0].map_from_keyframe.inverse() * pair[1].map_from_keyframe;
+            assert!((step.scale - 1.0).abs() < 0.1 && step.rigid.translation.norm() < 0.2);
+        }
+    }
+}
+
+#[test]
+fn a_map_that_has_its_loop_stays_as_it_is() {
+    let places = round();
+    let mut course = Course::of(&Scene::new(1), &places, 0.02, 0.0, 0);
+    let before: Vec<Sim3> = course.map.keyframes.iter().map(|k| k.map_from_keyframe).collect();
+    let reports = course.run();
+    assert!(count(&reports, |fate| *fate == SearchFate::Held) > 0, "{reports:?}");
+    assert_eq!(count(&reports, |fate| *fate == SearchFate::Closed), 0, "{reports:?}");
+    let after: Vec<Sim3> = course.map.keyframes.iter().map(|k| k.map_from_keyframe).collect();
+    assert_eq!(before, after);
+}
+
+#[test]
+fn a_room_that_is_exactly_alike_is_another_one_where_the_map_cannot_have_drifted_so_far() {
+    // The same images; by the chain the last ones stand six metres aside.
+    let mut views = views(&Scene::new(2), &round());
+    views.iter_mut().skip(9).for_each(|(_, place)| place.translation.x += 6.0);
+    let mut course = Course::new(views, 0.02, 1.0, 4);
+    let reports = course.run();
+    assert!(moves_nothing(&reports), "{reports:?}");
+    assert!(count(&reports, |fate| matches!(fate, SearchFate::AgainstDrift(_))) > 0, "{reports:?}");
+}
+
+#[test]
+fn a_view_that_its_neighbours_contradict_is_not_believed() {
+    // One image of the room that was seen at first, in the middle of another; the map may have drifted by anything.
+    let places = round();
+    let mut views = views(&Scene::new(3), &places);
+    let others = self::views(&Scene::new(8), &places);
+    for (index, other) in others.into_iter().enumerate().skip(9) {
+        if index != 13 {
+            views[index] = other;
+        }
+    }
+    let mut course = Course::new(views, 0.05, 0.3, 5);
+    let reports = course.run();
+    assert!(moves_nothing(&reports), "{reports:?}");
+    assert!(count(&reports, |fate| *fate == SearchFate::Unconfirmed) > 0, "{reports:?}");
+}
+
+#[test]
+fn a_corridor_that_repeats_and_a_blank_wall_close_nothing() {
+    let along: Vec<SE3> = (0..14).map(|k| turned([0.0, 0.0, 0.6 * f64::from(k)], 0.0)).collect();
+    for claimed in [0.02, 0.1] {
+        let corridor = Scene::corridor(2, 1.2);
+        let mut course = Course::of(&corridor, &along, claimed, 1.0, 6);
+        let reports = course.run();
+        assert!(!reports.is_empty() && moves_nothing(&reports), "{reports:?}");
+    }
+    let wall = Scene::new(1).with_contrast(0.15);
+    let beside: Vec<SE3> = (0..14).map(|k| turned([0.4 * f64::from(k), 0.0, 0.0], 0.0)).collect();
+    let mut blank = views(&wall, &vec![turned([0.0; 3], 0.0); 14]);
+    blank.iter_mut().zip(&beside).for_each(|((_, place), beside)| *place = *beside);
+    let reports = Course::new(blank, 0.02, 1.0, 7).run();
+    assert!(moves_nothing(&reports), "{reports:?}");
+}
+
+#[test]
+fn two_epochs_that_see_the_same_become_one() {
+    let places: Vec<SE3> = (0..5).map(|k| turned([0.15 * f64::from(k), 0.0, 0.0], 0.0)).collect();
+    let scene = Scene::new(3);
+    let exact = DepthError { noise: 0.0, modes: 0.0 };
+    // The second epoch has another origin, and a unit of 2.5 m.
+    let origin = turned([0.3, -0.1, 0.2], 20.0);
+    let mut views = views(&scene, &places);
+    for (seed, place) in (50u64..).zip(&places) {
+        let view = keyframe(&scene, place, UNIT, &exact, seed);
+        let mut moved = origin * *place;
+        moved.translation /= 2.5;
+        let at = Sim3::new(moved, UNIT / 2.5);
+        views.push((Keyframe { epoch: 1, map_from_keyframe: at, ..view }, moved));
+    }
+    let far = views.split_off(5);
+    // Views between which nothing is alike, so that the epochs are not beside each other in the list.
+    let between = self::views(&Scene::new(9), &round()[4..12]);
+    views.extend(between);
+    views.extend(far);
+    let mut course = Course::new(views, 0.01, 0.0, 8);
+    let into_epoch = Sim3::new(origin, 2.5);
+    let reports = course.run();
+    assert_eq!(count(&reports, |fate| *fate == SearchFate::Joined), 1, "{reports:?}");
+    assert!(course.map.keyframes.iter().all(|keyframe| keyframe.epoch == 0));
+    let last = &course.map.keyframes[course.map.keyframes.len() - 1].map_from_keyframe;
+    let truth = places[4];
+    assert!((last.rigid.translation - truth.translation).norm() < 0.03, "{last:?} {into_epoch:?}");
+    assert!((last.scale / UNIT).ln().abs() < 0.02, "{last:?}");
+}
+
+#[test]
+fn a_closure_that_was_not_taken_is_made_again() {
+    let places = round();
+    let mut course = Course::of(&Scene::new(0), &places, 0.02, 1.0, 0);
+    let known: Vec<u64> = (0..15).collect();
+    let mut closed = None;
+    while closed.is_none() {
+        course.loops.plan(&known, known.len());
+        assert!(course.loops.begin(&course.map));
+        course.loops.run();
+        closed = course.loops.closure.clone();
+    }
+    course.loops.repeat_closure();
+    assert_eq!(course.loops.take_closure(), None);
+    assert!(course.loops.begin(&course.map));
+    course.loops.run();
+    assert_eq!(course.loops.take_closure(), closed);
+}

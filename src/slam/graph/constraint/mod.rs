@@ -13,7 +13,7 @@ mod verdict;
 mod view;
 
 #[cfg(test)]
-mod tests;
+pub(in crate::slam) mod tests;
 
 use crate::slam::alignment::align::AlignmentParams;
 use crate::slam::alignment::reference::ReferenceParams;

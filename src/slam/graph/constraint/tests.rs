@@ -15,17 +15,17 @@ use crate::slam::test_scene::{CAMERA, Random, Scene};
 
 /// What is wrong with the depth of a keyframe.
 #[derive(Debug, Clone, Copy)]
-struct DepthError {
+pub(in crate::slam) struct DepthError {
     /// Standard deviation of each point for itself, share of its inverse depth.
-    noise: f64,
+    pub(in crate::slam) noise: f64,
     /// Standard deviation of tilt and relief.
-    modes: f64,
+    pub(in crate::slam) modes: f64,
 }
 
-const USUAL: DepthError = DepthError { noise: 0.03, modes: 0.01 };
+pub(in crate::slam) const USUAL: DepthError = DepthError { noise: 0.03, modes: 0.01 };
 
 /// A keyframe with a unit of `unit` metres: depth at every second pixel with gradient.
-fn keyframe(
+pub(in crate::slam) fn keyframe(
     scene: &Scene,
     world_from_camera: &SE3,
     unit: f64,
