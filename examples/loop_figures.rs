@@ -94,8 +94,8 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
                 [j_from_i.rigid.translation.norm(), j_from_i.rigid.rotation.angle(), j_from_i.scale]
             });
             println!(
-                "frame {} {millis:.0} ms {} {pair:?} truth {apart:.2?} measured {found:.2?} {:?}",
-                search.sequence, report.keyframe_id, report.fate
+                "frame {} {millis:.0} ms {} {pair:?} likeness {} truth {apart:.2?} measured {found:.2?} {:?}",
+                search.sequence, report.keyframe_id, report.likeness, report.fate
             );
         }
         return Ok(());

@@ -19,10 +19,11 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::graph::constraint::{ConstraintParams, ConstraintSolver, Measurement, Refusal};
 use crate::slam::keyframe::{Keyframe, MapState};
-use crate::slam::loops::likeness::Likeness;
+use crate::slam::loops::likeness::{Alike, Likeness};
 use crate::slam::map::Map;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::place_covariance::PlaceCovariance;
@@ -35,8 +36,8 @@ pub use closure::Closure;
 pub struct LoopParams {
     /// Keyframes that look most alike with which one that has settled is compared; 0 looks for no loops.
     pub num_candidates: usize,
-    /// Least correlation of the small images of two keyframes that are compared.
-    pub min_likeness: f32,
+    /// Fewest features that two keyframes that are compared show in the same arrangement.
+    pub min_features: f32,
     /// By how much the variance of a keyframe's place against those it was estimated with is larger than the estimate says:
     /// what the window's model does not know adds up along a chain.
     pub drift_inflation: f64,
@@ -44,7 +45,7 @@ pub struct LoopParams {
 
 impl Default for LoopParams {
     fn default() -> Self {
-        Self { num_candidates: 3, min_likeness: 0.6, drift_inflation: 4.0 }
+        Self { num_candidates: 3, min_features: 12.0, drift_inflation: 4.0 }
     }
 }
 
@@ -52,7 +53,7 @@ impl LoopParams {
     /// Checks every value.
     pub fn validate(&self) -> Result<(), ParameterError> {
         check_range("num_candidates", self.num_candidates, 0..=50)?;
-        check_range("min_likeness", self.min_likeness, -1.0..=1.0)?;
+        check_range("min_features", self.min_features, 1.0..=1000.0)?;
         check_range("drift_inflation", self.drift_inflation, 0.01..=1e4)
     }
 }
@@ -85,6 +86,8 @@ pub struct SearchReport {
     pub keyframe_id: u64,
     /// The candidate that most came of, or else the one most alike.
     pub other: Option<u64>,
+    /// Features that the most alike shows in the same arrangement.
+    pub likeness: f32,
     /// Pairs that were measured.
     pub compared: u32,
     /// What came of it.
@@ -106,7 +109,8 @@ pub(crate) struct Link {
 struct Pair {
     i: u64,
     j: u64,
-    j_from_i: Option<Sim3>,
+    /// Of a search only the rotation is known.
+    j_from_i: Sim3,
 }
 
 /// What is to be done next.
@@ -125,6 +129,8 @@ struct Plan {
     of: u64,
     stage: Stage,
     pairs: Vec<Pair>,
+    /// Features that the most alike have in common.
+    likeness: f32,
 }
 
 /// A keyframe's place when a search began.
@@ -259,16 +265,17 @@ impl Loops {
                 true => Vec::new(),
                 false => self.candidates(known, place),
             };
-            if !pairs.is_empty() {
-                self.plan = Some(Plan { of, stage: Stage::Search, pairs });
+            if let Some((_, likeness)) = pairs.first().copied() {
+                let pairs = pairs.into_iter().map(|(pair, _)| pair).collect();
+                self.plan = Some(Plan { of, stage: Stage::Search, pairs, likeness });
                 return;
             }
-            self.searched_to = Some(of);
+            self.searched(of);
         }
     }
 
     /// Keyframes that look like one and were not estimated with it or with those around it.
-    fn candidates(&self, known: &[u64], place: usize) -> Vec<Pair> {
+    fn candidates(&self, known: &[u64], place: usize) -> Vec<(Pair, f32)> {
         /// Keyframes before and after one that see what it sees.
         const AROUND: usize = 7;
         let of = known[place];
@@ -283,9 +290,14 @@ impl Loops {
         }
         let open = known[..place].iter().zip(&is_open).filter(|(_, is_open)| **is_open);
         let open: Vec<u64> = open.map(|(id, _)| *id).collect();
-        let LoopParams { num_candidates, min_likeness, .. } = self.params;
-        let alike = self.likeness.candidates(of, &open, num_candidates, min_likeness);
-        alike.into_iter().map(|j| Pair { i: of, j, j_from_i: None }).collect()
+        let LoopParams { num_candidates, min_features, .. } = self.params;
+        let camera = &self.intrinsics;
+        let alike = self.likeness.candidates(of, &open, num_candidates, min_features, camera);
+        let pair = |alike: Alike| {
+            let rigid = SE3 { rotation: alike.rotation, ..SE3::identity() };
+            (Pair { i: of, j: alike.keyframe_id, j_from_i: Sim3::new(rigid, 1.0) }, alike.score)
+        };
+        alike.into_iter().map(pair).collect()
     }
 
     /// Takes copies of what the plan needs; false where there is nothing to do.
@@ -321,12 +333,14 @@ impl Loops {
             Stage::Close { num_newest } => (0, self.solve(&job, *num_newest)),
         };
         if fate != SearchFate::Proposed && self.searched_to.is_none_or(|to| to < of) {
-            self.searched_to = Some(of);
+            self.searched(of);
         }
         let is_fruitless = matches!(fate, SearchFate::Refused(_) | SearchFate::AgainstDrift(_));
         self.fruitless = is_fruitless.then_some(of);
-        let measured = self.measured.take();
-        self.report = Some(SearchReport { keyframe_id: of, other, compared, fate, measured });
+        let (measured, likeness) = (self.measured.take(), job.plan.likeness);
+        let keyframe_id = of;
+        let report = SearchReport { keyframe_id, other, likeness, compared, fate, measured };
+        self.report = Some(report);
     }
 
     /// What the last search came to: told once.
@@ -344,7 +358,13 @@ impl Loops {
         let Some(closure) = self.closure.take() else { return };
         let num_newest = confirmations(closure.join.is_none()) + 1;
         let of = self.links.last().map_or(0, |link| link.i);
-        self.plan = Some(Plan { of, stage: Stage::Close { num_newest }, pairs: Vec::new() });
+        let stage = Stage::Close { num_newest };
+        self.plan = Some(Plan { of, stage, pairs: Vec::new(), likeness: 0.0 });
+    }
+
+    fn searched(&mut self, keyframe_id: u64) {
+        self.searched_to = Some(keyframe_id);
+        self.likeness.forget(keyframe_id);
     }
 
     fn solver(&mut self) -> Arc<ConstraintSolver> {

@@ -22,7 +22,8 @@ impl Loops {
         for pair in &job.plan.pairs {
             let Some(other) = job.keyframe(pair.j) else { continue };
             compared += 1;
-            let measurement = match solver.measure(&view, &solver.view(other), None) {
+            let rotation = pair.j_from_i.rigid.rotation;
+            let measurement = match solver.measure_turned(&view, &solver.view(other), &rotation) {
                 Ok(measurement) => measurement,
                 Err(why) => {
                     refusal.get_or_insert(why);
@@ -37,7 +38,8 @@ impl Loops {
                 continue;
             }
             let pairs = confirming(job, &link);
-            self.plan = Some(Plan { of: pair.i, stage: Stage::Confirm(Box::new(link)), pairs });
+            let (of, likeness) = (pair.i, job.plan.likeness);
+            self.plan = Some(Plan { of, stage: Stage::Confirm(Box::new(link)), pairs, likeness });
             return (compared, SearchFate::Proposed);
         }
         let refused = SearchFate::Refused(refusal.unwrap_or(Refusal::NothingAlike));
@@ -74,7 +76,7 @@ impl Loops {
             };
             compared += 1;
             let views = [solver.view(one), solver.view(other)];
-            let measured = solver.measure(&views[0], &views[1], pair.j_from_i.as_ref());
+            let measured = solver.measure(&views[0], &views[1], Some(&pair.j_from_i));
             let Ok(measurement) = measured else { continue };
             let confirmation = Link { i: pair.i, j: pair.j, measurement };
             if self.agrees(job, link, &confirmation) {
@@ -149,10 +151,10 @@ fn confirming(job: &Job, link: &Link) -> Vec<Pair> {
             * link.measurement.j_from_i
             * i.inverse()
             * one.map_from_keyframe;
-        pairs.push(Pair { i: one.keyframe_id, j: other.keyframe_id, j_from_i: Some(j_from_i) });
+        pairs.push(Pair { i: one.keyframe_id, j: other.keyframe_id, j_from_i });
     }
     // Those that look the same way first: the smallest turn and way between them.
-    let apart = |pair: &Pair| pair.j_from_i.map_or(f64::INFINITY, |of| of.log().norm());
+    let apart = |pair: &Pair| pair.j_from_i.log().norm();
     pairs.sort_by(|one, other| apart(one).total_cmp(&apart(other)));
     pairs
 }

@@ -15,10 +15,13 @@ mod view;
 #[cfg(test)]
 pub(in crate::slam) mod tests;
 
+use nalgebra::UnitQuaternion;
+
 use crate::slam::alignment::align::AlignmentParams;
 use crate::slam::alignment::reference::ReferenceParams;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::sim3::{Matrix7, Sim3};
+use crate::slam::graph::constraint::start::Start;
 use crate::slam::graph::pose_graph::{Constraint, VertexId};
 use crate::slam::graph::robust::RobustKernel;
 use crate::slam::image::sums::MAX_LEVELS;
@@ -143,8 +146,27 @@ impl ConstraintSolver {
         j: &KeyframeView,
         initial: Option<&Sim3>,
     ) -> Result<Measurement, Refusal> {
+        self.measure_from(i, j, initial.map_or(Start::Nothing, Start::Similarity))
+    }
+
+    /// The same where about the rotation is known, as of places that look alike.
+    pub fn measure_turned(
+        &self,
+        i: &KeyframeView,
+        j: &KeyframeView,
+        j_from_i: &UnitQuaternion<f64>,
+    ) -> Result<Measurement, Refusal> {
+        self.measure_from(i, j, Start::Rotation(j_from_i))
+    }
+
+    fn measure_from(
+        &self,
+        i: &KeyframeView,
+        j: &KeyframeView,
+        start: Start<'_>,
+    ) -> Result<Measurement, Refusal> {
         let gates = &self.params.gates;
-        let forward = self.align(i, j, initial)?;
+        let forward = self.align_from(i, j, start)?;
         gates.judge(&forward)?;
         let backward = self.align(j, i, Some(&forward.j_from_i.inverse()))?;
         gates.judge(&backward)?;
@@ -164,6 +186,15 @@ impl ConstraintSolver {
         j: &KeyframeView,
         initial: Option<&Sim3>,
     ) -> Result<KeyframeAlignment, Refusal> {
+        self.align_from(i, j, initial.map_or(Start::Nothing, Start::Similarity))
+    }
+
+    fn align_from(
+        &self,
+        i: &KeyframeView,
+        j: &KeyframeView,
+        start: Start<'_>,
+    ) -> Result<KeyframeAlignment, Refusal> {
         let (views, params) = ([i, j], &self.params);
         let camera = i.reference.intrinsics();
         if camera != j.reference.intrinsics() || !self.turned_views.is_for(camera) {
@@ -173,10 +204,10 @@ impl ConstraintSolver {
         if views.iter().any(|view| view.reference.level(finest).len() < params.gates.min_points) {
             return Err(Refusal::TooFewPoints);
         }
-        if initial.is_some_and(|j_from_i| !j_from_i.is_valid()) {
+        if matches!(start, Start::Similarity(j_from_i) if !j_from_i.is_valid()) {
             return Err(Refusal::InvalidStart);
         }
-        let start = start::find(views, initial, &self.turned_views, params);
+        let start = start::find(views, start, &self.turned_views, params);
         let start = start.ok_or(Refusal::NothingAlike)?;
         let (state, sums) = align::descend(views, &start, params).ok_or(Refusal::NothingInView)?;
         if (sums.compared as usize) < params.gates.min_points {

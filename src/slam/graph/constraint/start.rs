@@ -23,28 +23,39 @@ const GIVEN_ASIDE: f64 = 0.1;
 /// Starts that are followed down to the next finer level.
 const MOST_FOLLOWED: usize = 3;
 
-/// The best state after the two coarsest levels, from an initial `j_from_i` or from nothing; `None` where the images have
-/// nothing in common.
+/// What is known of a similarity before it is measured.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Start<'a> {
+    Nothing,
+    /// About how the cameras are turned, `j_from_i`.
+    Rotation(&'a UnitQuaternion<f64>),
+    /// `j_from_i`.
+    Similarity(&'a Sim3),
+}
+
+/// The best state after the two coarsest levels; `None` where the images have nothing in common.
 pub(super) fn find(
     views: [&KeyframeView; 2],
-    initial: Option<&Sim3>,
+    start: Start<'_>,
     turned_views: &TurnedViews,
     params: &ConstraintParams,
 ) -> Option<State> {
     let coarsest = views[0].levels().next_back()?;
     let unit = 1.0 / views[0].reference.mean_inverse_depth();
-    let given = initial.map(State::of);
-    let starts = match &given {
-        Some(given) => around(&given.rigid, GIVEN_DEG, unit * GIVEN_ASIDE),
-        None => rotations(views, turned_views)?
-            .into_iter()
-            .map(|rotation| SE3 { rotation, translation: Vector3::zeros() })
-            .flat_map(|at| around(&at, AROUND_DEG, unit * ASIDE))
-            .collect(),
+    let from_rotations = |rotations: Vec<UnitQuaternion<f64>>| -> Vec<SE3> {
+        let poses = rotations.into_iter().map(|rotation| SE3 { rotation, ..SE3::identity() });
+        poses.flat_map(|at| around(&at, AROUND_DEG, unit * ASIDE)).collect()
+    };
+    let (starts, given_scale) = match start {
+        Start::Nothing => (from_rotations(rotations(views, turned_views)?), 0.0),
+        Start::Rotation(rotation) => (from_rotations(vec![*rotation]), 0.0),
+        Start::Similarity(given) => {
+            let given = State::of(given);
+            (around(&given.rigid, GIVEN_DEG, unit * GIVEN_ASIDE), given.log_scale)
+        }
     };
     let mut solved: Vec<(f64, State)> = Vec::new();
     for rigid in starts {
-        let given_scale = given.map_or(0.0, |given| given.log_scale);
         let state = State { rigid, log_scale: given_scale, brightness: Brightness::default() };
         let state = State { log_scale: log_scale(views, coarsest, &state, params), ..state };
         solved.extend(follow(views, coarsest, &state, params));
