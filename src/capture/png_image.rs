@@ -107,6 +107,16 @@ pub fn encode_gray(
     encode((width, height), (ColorType::Grayscale, depth), png::Compression::Fast, samples)
 }
 
+/// The bytes of a grey PNG of 8 bits that is to be small, and takes three times as long.
+pub fn encode_gray_small(
+    width: usize,
+    height: usize,
+    samples: &[u8],
+) -> Result<Vec<u8>, png::EncodingError> {
+    let format = (ColorType::Grayscale, BitDepth::Eight);
+    encode((width, height), format, png::Compression::Balanced, samples)
+}
+
 /// The bytes of a colour PNG; `samples` are rows of `width` times red, green, blue.
 pub fn encode_rgb(
     width: usize,

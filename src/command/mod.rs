@@ -9,6 +9,7 @@ pub mod capture;
 pub mod doctor;
 pub mod ending;
 pub mod evaluate;
+pub mod map;
 pub mod mapper;
 pub mod print;
 pub mod progress;
@@ -156,6 +157,7 @@ enum Subcommands {
     Tracker(tracker::TrackerArguments),
     Mapper(mapper::MapperArguments),
     Replay(replay::ReplayArgs),
+    Map(map::MapArguments),
     Recover(recover::RecoverArguments),
     Simulate(Box<simulate::SimulateArgs>),
     Evaluate(evaluate::EvaluateArgs),
@@ -216,6 +218,7 @@ fn run_subcommand(line: CommandLine, log: &ErrorLog) -> CommandResult {
         Subcommands::Tracker(arguments) => tracker::run(&config, arguments),
         Subcommands::Mapper(arguments) => mapper::run(&config, arguments),
         Subcommands::Replay(arguments) => replay::run(&config, arguments),
+        Subcommands::Map(arguments) => map::run(&config, arguments),
         Subcommands::Recover(arguments) => recover::run(&config, &arguments),
         Subcommands::Simulate(arguments) => simulate::run(&config, &arguments),
         Subcommands::Evaluate(arguments) => evaluate::run(&arguments),

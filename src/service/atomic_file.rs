@@ -16,6 +16,18 @@ pub fn write_atomically(
     write_with_mode(path, EVERYBODY, write)
 }
 
+/// The same, and the file is on the disk before it has its name: a power failure does not leave an empty one.
+pub fn write_durably(
+    path: &Path,
+    write: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>,
+) -> io::Result<()> {
+    write_atomically(path, |file| {
+        write(file)?;
+        file.flush()?;
+        file.get_ref().sync_data()
+    })
+}
+
 /// The same, and nobody but the user of the process may read the file.
 pub fn write_privately(
     path: &Path,

@@ -22,6 +22,7 @@ pub mod latency_bench;
 pub mod liveness;
 pub mod manager_notice;
 pub mod map_file;
+pub mod map_folder;
 pub mod mapper;
 pub mod mode;
 pub mod pairing;

@@ -1,0 +1,137 @@
+//! `semidense map`: maps on disk.
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use clap::{Args, Subcommand};
+
+use crate::command::CommandResult;
+use crate::command::print::{note, print};
+use crate::service::config::Config;
+use crate::service::map_folder::report::{MapReport, export};
+use crate::service::map_folder::{Loaded, load};
+use crate::service::results::output_folder::utc_text;
+
+/// Say what a map on disk holds, export it, or join two
+///
+/// A map is a folder that `run`, `replay` and the services begin or continue with --map DIR.
+#[derive(Debug, Args)]
+pub struct MapArguments {
+    #[command(subcommand)]
+    command: MapCommand,
+}
+
+#[derive(Debug, Subcommand)]
+enum MapCommand {
+    Info(InfoArguments),
+    Export(ExportArguments),
+}
+
+/// Check every file of a map and say what it holds; exit code 1 where something is damaged
+#[derive(Debug, Args)]
+struct InfoArguments {
+    /// The map's folder
+    #[arg(value_name = "DIR")]
+    folder: PathBuf,
+    /// Print it as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Write a map's points (map.ply) and the poses of its keyframes (keyframes.txt, TUM format)
+#[derive(Debug, Args)]
+struct ExportArguments {
+    /// The map's folder
+    #[arg(value_name = "DIR")]
+    folder: PathBuf,
+    /// Folder to write into
+    #[arg(long, value_name = "DIR")]
+    output: PathBuf,
+    /// The epoch to write: each has a place and a unit of its own [default: the one with the most keyframes]
+    #[arg(long, value_name = "N")]
+    epoch: Option<u32>,
+}
+
+/// Runs it.
+pub fn run(config: &Config, arguments: MapArguments) -> CommandResult {
+    match arguments.command {
+        MapCommand::Info(arguments) => info(&arguments),
+        MapCommand::Export(arguments) => export_map(config, &arguments),
+    }
+}
+
+/// All of a map, and a warning for each file that is damaged.
+fn load_all(folder: &Path) -> Result<Loaded, Box<dyn std::error::Error>> {
+    let loaded = load(folder, usize::MAX)?;
+    loaded.problems.iter().for_each(|problem| note(&format!("warning: {problem}")));
+    Ok(loaded)
+}
+
+fn info(arguments: &InfoArguments) -> CommandResult {
+    let loaded = load_all(&arguments.folder)?;
+    let report = MapReport::of(&arguments.folder, &loaded);
+    print(&match arguments.json {
+        true => format!("{}\n", serde_json::to_string_pretty(&report)?),
+        false => text_of(&report),
+    })?;
+    Ok(ExitCode::from(u8::from(!report.problems.is_empty())))
+}
+
+fn text_of(report: &MapReport) -> String {
+    const MEGABYTE: f64 = 1e6;
+    let [fx, fy, cx, cy] = report.intrinsics;
+    let saved = std::time::UNIX_EPOCH + std::time::Duration::from_secs(report.saved_secs);
+    let detail = serde_json::to_value(report.detail).ok();
+    let detail = detail.as_ref().and_then(serde_json::Value::as_str).unwrap_or_default();
+    let mut lines = vec![
+        format!("version    {}, {detail} detail", report.version),
+        format!(
+            "camera     {}x{}, fx {fx:.2}, fy {fy:.2}, cx {cx:.2}, cy {cy:.2}",
+            report.width, report.height
+        ),
+        format!(
+            "keyframes  {}, {} of them with depth, {} points",
+            report.keyframes, report.keyframes_with_depth, report.points
+        ),
+        format!("size       {:.1} MB", report.bytes as f64 / MEGABYTE),
+        format!(
+            "saved      {} (UTC), {} times; corrected {} times",
+            utc_text(saved),
+            report.saves,
+            report.revision
+        ),
+    ];
+    lines.extend(report.epochs.iter().map(|of| {
+        format!(
+            "epoch {:<4} {} keyframes, path {:.2} map units",
+            of.epoch, of.keyframes, of.path_length
+        )
+    }));
+    lines.join("\n") + "\n"
+}
+
+fn export_map(config: &Config, arguments: &ExportArguments) -> CommandResult {
+    let loaded = load_all(&arguments.folder)?;
+    let report = MapReport::of(&arguments.folder, &loaded);
+    let largest = report.epochs.iter().rev().max_by_key(|of| of.keyframes).map(|of| of.epoch);
+    let epoch = arguments.epoch.or(largest).ok_or_else(|| {
+        format!("{} holds no keyframes yet: there is nothing to export", arguments.folder.display())
+    })?;
+    if report.epochs.iter().all(|of| of.epoch != epoch) {
+        let known: Vec<String> = report.epochs.iter().map(|of| of.epoch.to_string()).collect();
+        return Err(format!(
+            "{} has no epoch {epoch}: it has {}",
+            arguments.folder.display(),
+            known.join(", ")
+        )
+        .into());
+    }
+    let most = config.results.max_relative_std_dev;
+    let (points, keyframes) = export(&arguments.output, &loaded.map, epoch, most)
+        .map_err(|error| format!("{}: {error}", arguments.output.display()))?;
+    print(&format!(
+        "{}: map.ply with {points} points, keyframes.txt with {keyframes} poses of epoch {epoch}\n",
+        arguments.output.display()
+    ))?;
+    Ok(ExitCode::SUCCESS)
+}

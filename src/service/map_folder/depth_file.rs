@@ -1,0 +1,516 @@
+//! The file of one keyframe in a map folder: its image and its depth, little-endian.
+//!
+//! Layout: magic, version, detail (u32), keyframe (u64), width, height, number of points, step of the
+//! image's grey levels, whether brightnesses follow (u32), bytes of the image (u64), smallest and largest logarithm of
+//! the inverse depths and of the standard deviations (4 × f32); one bit a pixel that says where points are; the image;
+//! the numbers of the points, in row-major order; the CRC-32 of all before it (u32).
+//!
+//! In full detail the image is as it is (step 0) and a point has its inverse depth and variance (f32), and its
+//! brightness (f32) where that is not the image's: the same bits come back. In small detail the image is a PNG of grey
+//! levels that are rounded to a step, and a point has logarithms of inverse depth (u16) and standard deviation (u8).
+
+use serde::{Deserialize, Serialize};
+
+use crate::capture::image_file::DecodeError;
+use crate::capture::png_image::{decode_gray_into, encode_gray_small};
+use crate::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS};
+use crate::wire::conversion::{MessageError, check_points};
+
+/// First bytes of the file.
+const MAGIC: [u8; 16] = *b"semidense depth\n";
+/// Version of the layout.
+const VERSION: u32 = 1;
+/// Bytes before the bits.
+const HEAD_BYTES: usize = 16 + 2 * 4 + 8 + 5 * 4 + 8 + 4 * 4;
+/// Bytes of the checksum.
+const CHECKSUM_BYTES: usize = 4;
+
+/// In small detail an image takes at most 1 bit in 4 of what it has (2 a pixel) where a step allows it…
+const SMALL_IMAGE_SHARE: usize = 4;
+/// …and so many pixels have one point: with the bits where they are, half a byte a pixel in all.
+const SMALL_PIXELS_PER_POINT: usize = 28;
+/// Steps of grey levels that are tried, the finest first; the last one is taken where none is small enough.
+const SMALL_STEPS: [u8; 5] = [1, 2, 4, 8, 16];
+/// Values of the two logarithms.
+const INVERSE_DEPTH_STEPS: f32 = u16::MAX as f32;
+const STD_DEV_STEPS: f32 = u8::MAX as f32;
+
+/// How much of a keyframe is kept on disk.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum MapDetail {
+    /// All of it: about 1.1 MB at 640×480, and the same bits come back.
+    #[default]
+    Full,
+    /// At most 0.15 MB at 640×480: grey levels are rounded, and one point in nine is kept, the best of each group.
+    Small,
+}
+
+/// Why the file of a keyframe cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum DepthFileError {
+    /// It is something else.
+    #[error("it is not a keyframe of a map")]
+    Magic,
+    /// Another version has written it.
+    #[error("it is of version {0}, and this program reads version {VERSION}")]
+    Version(u32),
+    /// It is cut short, or has more than it should.
+    #[error("it has {found} bytes instead of {expected}")]
+    Length {
+        /// Bytes that there are.
+        found: usize,
+        /// Bytes that its head asks for.
+        expected: usize,
+    },
+    /// A bit is wrong.
+    #[error("its checksum is wrong: it is damaged")]
+    Checksum,
+    /// It is the file of another keyframe, or of another image size.
+    #[error("it belongs to another keyframe")]
+    Foreign,
+    /// A number in its head is not possible.
+    #[error("{what} = {value} is not possible")]
+    Head {
+        /// Which.
+        what: &'static str,
+        /// Its value.
+        value: u64,
+    },
+    /// Its image cannot be decoded.
+    #[error("image: {0}")]
+    Image(#[from] DecodeError),
+    /// Its points are broken.
+    #[error(transparent)]
+    Points(#[from] MessageError),
+}
+
+/// Most bytes of the file of a keyframe with so many pixels.
+pub fn most_bytes(num_pixels: usize) -> usize {
+    // A PNG of noise is a little larger than its samples.
+    HEAD_BYTES + num_pixels.div_ceil(8) + 2 * num_pixels + 4096 + 12 * MAX_KEYFRAME_POINTS
+}
+
+/// Most points that small detail keeps of an image of so many pixels.
+fn most_small_points(num_pixels: usize) -> usize {
+    num_pixels.div_ceil(SMALL_PIXELS_PER_POINT).min(MAX_KEYFRAME_POINTS)
+}
+
+/// The bytes of a keyframe that has image and depth. Points out of order, and outside the image, are left out.
+pub fn encode(keyframe: &Keyframe, detail: MapDetail) -> Vec<u8> {
+    let (width, height) = (keyframe.intrinsics.width, keyframe.intrinsics.height);
+    let mut points = in_order(keyframe);
+    let (mut step, mut coded, mut is_own_brightness) = (0, keyframe.image.clone(), false);
+    match detail {
+        MapDetail::Full => {
+            is_own_brightness = points
+                .iter()
+                .any(|point| point.intensity != brightness(&keyframe.image, width, point));
+        }
+        MapDetail::Small => {
+            points = best_of_groups(&points, most_small_points(width * height));
+            (step, coded) = small_image(&keyframe.image, width, height);
+        }
+    }
+    let depths = Logarithms::of(points.iter().map(|point| point.inverse_depth));
+    let deviations = Logarithms::of(points.iter().map(|point| point.variance.sqrt()));
+    let mut bytes = Vec::with_capacity(most_bytes(width * height).min(1 << 21));
+    bytes.extend(MAGIC);
+    bytes.extend(VERSION.to_le_bytes());
+    bytes.extend(u32::from(detail == MapDetail::Small).to_le_bytes());
+    bytes.extend(keyframe.keyframe_id.to_le_bytes());
+    let own = u32::from(is_own_brightness);
+    for number in [width as u32, height as u32, points.len() as u32, u32::from(step), own] {
+        bytes.extend(number.to_le_bytes());
+    }
+    bytes.extend((coded.len() as u64).to_le_bytes());
+    for number in [depths.least, depths.most, deviations.least, deviations.most] {
+        bytes.extend(number.to_le_bytes());
+    }
+    let mut bits = vec![0u8; (width * height).div_ceil(8)];
+    for point in &points {
+        let pixel = usize::from(point.v) * width + usize::from(point.u);
+        bits[pixel / 8] |= 1 << (pixel % 8);
+    }
+    bytes.extend(bits);
+    bytes.extend(coded);
+    for point in &points {
+        match detail {
+            MapDetail::Full => {
+                bytes.extend(point.inverse_depth.to_le_bytes());
+                bytes.extend(point.variance.to_le_bytes());
+                if is_own_brightness {
+                    bytes.extend(point.intensity.to_le_bytes());
+                }
+            }
+            MapDetail::Small => {
+                let depth = depths.code(point.inverse_depth, INVERSE_DEPTH_STEPS) as u16;
+                bytes.extend(depth.to_le_bytes());
+                bytes.push(deviations.code(point.variance.sqrt(), STD_DEV_STEPS) as u8);
+            }
+        }
+    }
+    bytes.extend(crc32fast::hash(&bytes).to_le_bytes());
+    bytes
+}
+
+/// The checksum at the end of a file's bytes; 0 of one that has none.
+pub fn checksum_of(bytes: &[u8]) -> u32 {
+    bytes.last_chunk::<CHECKSUM_BYTES>().map_or(0, |bytes| u32::from_le_bytes(*bytes))
+}
+
+/// Gives `keyframe` the image and the points of its file. On an error it stays as it is.
+pub fn decode_into(bytes: &[u8], keyframe: &mut Keyframe) -> Result<(), DepthFileError> {
+    let mut rest = bytes;
+    let head = Head::take(&mut rest).ok_or(DepthFileError::Length {
+        found: bytes.len(),
+        expected: HEAD_BYTES + CHECKSUM_BYTES,
+    })?;
+    let sizes = head.check(keyframe)?;
+    let expected = HEAD_BYTES + sizes.bits + sizes.image + sizes.numbers + CHECKSUM_BYTES;
+    if bytes.len() != expected {
+        return Err(DepthFileError::Length { found: bytes.len(), expected });
+    }
+    let body = &bytes[..expected - CHECKSUM_BYTES];
+    if crc32fast::hash(body) != checksum_of(bytes) {
+        return Err(DepthFileError::Checksum);
+    }
+    let (bits, rest) = rest.split_at(sizes.bits);
+    let (coded, rest) = rest.split_at(sizes.image);
+    let numbers = &rest[..sizes.numbers];
+    let (width, height) = (keyframe.intrinsics.width, keyframe.intrinsics.height);
+    let image = match head.step {
+        0 => coded.to_vec(),
+        step => {
+            let mut image = vec![0; width * height];
+            decode_gray_into(coded, width, height, &mut Vec::new(), &mut image)?;
+            image.iter_mut().for_each(|code| *code = level(*code, step as u8));
+            image
+        }
+    };
+    let pixels = pixels_of(bits, width * height);
+    let num_pixels: usize = bits.iter().map(|byte| byte.count_ones() as usize).sum();
+    if num_pixels != head.num_points as usize {
+        return Err(DepthFileError::Head { what: "points", value: u64::from(head.num_points) });
+    }
+    let mut points = Vec::with_capacity(num_pixels);
+    for (pixel, number) in pixels.zip(numbers.chunks_exact(sizes.a_point.max(1))) {
+        let (u, v) = ((pixel % width) as u16, (pixel / width) as u16);
+        let intensity = f32::from(image.get(pixel).copied().unwrap_or_default());
+        points.push(head.point(number, DepthPoint { u, v, intensity, ..DepthPoint::default() }));
+    }
+    check_points(&points, &keyframe.intrinsics)?;
+    (keyframe.image, keyframe.points) = (image, points);
+    Ok(())
+}
+
+/// What stands before the bits.
+struct Head {
+    magic: [u8; 16],
+    version: u32,
+    detail: u32,
+    keyframe_id: u64,
+    width: u32,
+    height: u32,
+    num_points: u32,
+    step: u32,
+    is_own_brightness: u32,
+    image_bytes: u64,
+    depths: Logarithms,
+    deviations: Logarithms,
+}
+
+/// Bytes of the parts of a file.
+struct Sizes {
+    bits: usize,
+    image: usize,
+    numbers: usize,
+    a_point: usize,
+}
+
+impl Head {
+    fn take(bytes: &mut &[u8]) -> Option<Self> {
+        let magic = *bytes.split_off(..16)?.first_chunk()?;
+        let mut u32 = || Some(u32::from_le_bytes(*bytes.split_off(..4)?.first_chunk()?));
+        let (version, detail) = (u32()?, u32()?);
+        let keyframe_id = u64::from_le_bytes(*bytes.split_off(..8)?.first_chunk()?);
+        let mut u32 = || Some(u32::from_le_bytes(*bytes.split_off(..4)?.first_chunk()?));
+        let (width, height, num_points, step, is_own_brightness) =
+            (u32()?, u32()?, u32()?, u32()?, u32()?);
+        let image_bytes = u64::from_le_bytes(*bytes.split_off(..8)?.first_chunk()?);
+        let mut f32 = || Some(f32::from_le_bytes(*bytes.split_off(..4)?.first_chunk()?));
+        let depths = Logarithms { least: f32()?, most: f32()? };
+        let deviations = Logarithms { least: f32()?, most: f32()? };
+        Some(Self {
+            magic,
+            version,
+            detail,
+            keyframe_id,
+            width,
+            height,
+            num_points,
+            step,
+            is_own_brightness,
+            image_bytes,
+            depths,
+            deviations,
+        })
+    }
+
+    /// Checks what can be checked before anything is believed; how large the parts are then.
+    fn check(&self, of: &Keyframe) -> Result<Sizes, DepthFileError> {
+        if self.magic != MAGIC {
+            return Err(DepthFileError::Magic);
+        }
+        if self.version != VERSION {
+            return Err(DepthFileError::Version(self.version));
+        }
+        let (width, height) = (of.intrinsics.width, of.intrinsics.height);
+        let is_its = self.keyframe_id == of.keyframe_id
+            && (self.width as usize, self.height as usize) == (width, height);
+        if !is_its {
+            return Err(DepthFileError::Foreign);
+        }
+        let is_small = self.detail == 1;
+        let most_image = if is_small { most_bytes(width * height) } else { width * height };
+        let checks = [
+            ("detail", u64::from(self.detail), 1),
+            ("points", u64::from(self.num_points), MAX_KEYFRAME_POINTS as u64),
+            ("step", u64::from(self.step), if is_small { 255 } else { 0 }),
+            ("brightness", u64::from(self.is_own_brightness), u64::from(!is_small)),
+            ("image bytes", self.image_bytes, most_image as u64),
+        ];
+        let wrong = checks.into_iter().find(|(_, value, most)| value > most);
+        let least_image = if is_small { 0 } else { most_image as u64 };
+        let wrong = wrong
+            .or((self.image_bytes < least_image).then_some(("image bytes", self.image_bytes, 0)))
+            .or((is_small && self.step == 0).then_some(("step", 0, 0)));
+        if let Some((what, value, _)) = wrong {
+            return Err(DepthFileError::Head { what, value });
+        }
+        let a_point = match is_small {
+            true => 3,
+            false => 8 + 4 * self.is_own_brightness as usize,
+        };
+        Ok(Sizes {
+            bits: (width * height).div_ceil(8),
+            image: self.image_bytes as usize,
+            numbers: self.num_points as usize * a_point,
+            a_point,
+        })
+    }
+
+    /// A point from its numbers; `at` has the pixel and its brightness.
+    fn point(&self, numbers: &[u8], at: DepthPoint) -> DepthPoint {
+        let f32_at = |place: usize| {
+            let bytes = numbers.get(place..).and_then(|rest| rest.first_chunk::<4>());
+            bytes.map(|bytes| f32::from_le_bytes(*bytes))
+        };
+        if self.detail == 0 {
+            return DepthPoint {
+                inverse_depth: f32_at(0).unwrap_or_default(),
+                variance: f32_at(4).unwrap_or_default(),
+                intensity: f32_at(8).unwrap_or(at.intensity),
+                ..at
+            };
+        }
+        let [low, high, deviation] = numbers.first_chunk::<3>().copied().unwrap_or_default();
+        let code = f32::from(u16::from_le_bytes([low, high]));
+        let std_dev = self.deviations.value(f32::from(deviation), STD_DEV_STEPS);
+        DepthPoint {
+            inverse_depth: self.depths.value(code, INVERSE_DEPTH_STEPS),
+            variance: std_dev * std_dev,
+            ..at
+        }
+    }
+}
+
+/// The range of the logarithms of some numbers, which are coded in even steps of it.
+#[derive(Clone, Copy)]
+struct Logarithms {
+    least: f32,
+    most: f32,
+}
+
+impl Logarithms {
+    fn of(numbers: impl Iterator<Item = f32>) -> Self {
+        let logarithms = numbers.map(f32::ln).filter(|logarithm| logarithm.is_finite());
+        let range = logarithms.fold(None, |range: Option<Self>, of| match range {
+            Some(range) => Some(Self { least: range.least.min(of), most: range.most.max(of) }),
+            None => Some(Self { least: of, most: of }),
+        });
+        range.unwrap_or(Self { least: 0.0, most: 0.0 })
+    }
+
+    fn code(&self, number: f32, steps: f32) -> f32 {
+        let width = self.most - self.least;
+        let share = if width > 0.0 { (number.ln() - self.least) / width } else { 0.0 };
+        (share * steps).round().clamp(0.0, steps)
+    }
+
+    fn value(&self, code: f32, steps: f32) -> f32 {
+        (self.least + code / steps * (self.most - self.least)).exp()
+    }
+}
+
+/// The points that lie in the image, in row-major order, one a pixel.
+fn in_order(keyframe: &Keyframe) -> Vec<DepthPoint> {
+    let (width, height) = (keyframe.intrinsics.width, keyframe.intrinsics.height);
+    let inside = |p: &&DepthPoint| usize::from(p.u) < width && usize::from(p.v) < height;
+    let mut points: Vec<DepthPoint> = keyframe.points.iter().filter(inside).copied().collect();
+    let pixel = |point: &DepthPoint| (point.v, point.u);
+    if !points.is_sorted_by_key(pixel) {
+        points.sort_by_key(pixel);
+    }
+    points.dedup_by_key(|point| pixel(point));
+    points
+}
+
+/// At most so many points: of each group that follow one another the one that is known best.
+fn best_of_groups(points: &[DepthPoint], most: usize) -> Vec<DepthPoint> {
+    let group = points.len().div_ceil(most.max(1)).max(1);
+    let spread = |p: &DepthPoint| p.variance / (p.inverse_depth * p.inverse_depth);
+    let is_usable = |p: &&DepthPoint| p.inverse_depth > 0.0 && p.variance > 0.0;
+    let best = |group: &[DepthPoint]| {
+        group.iter().filter(is_usable).min_by(|a, b| spread(a).total_cmp(&spread(b))).copied()
+    };
+    points.chunks(group).filter_map(best).collect()
+}
+
+fn brightness(image: &[u8], width: usize, at: &DepthPoint) -> f32 {
+    let pixel = usize::from(at.v) * width + usize::from(at.u);
+    f32::from(image.get(pixel).copied().unwrap_or_default())
+}
+
+/// The image as a PNG of steps of grey levels, of the finest that is small enough, and that step.
+fn small_image(image: &[u8], width: usize, height: usize) -> (u8, Vec<u8>) {
+    let mut smallest = (0, Vec::new());
+    for step in SMALL_STEPS {
+        let codes: Vec<u8> = image.iter().map(|grey| grey / step).collect();
+        // Into memory, of the right size: it does not fail.
+        smallest = (step, encode_gray_small(width, height, &codes).unwrap_or_default());
+        if smallest.1.len() <= image.len() / SMALL_IMAGE_SHARE {
+            break;
+        }
+    }
+    smallest
+}
+
+/// The grey level in the middle of a step.
+fn level(code: u8, step: u8) -> u8 {
+    code.saturating_mul(step).saturating_add(step / 2)
+}
+
+/// The pixels whose bits are set, in order.
+fn pixels_of(bits: &[u8], num_pixels: usize) -> impl Iterator<Item = usize> {
+    let of_byte = |(index, byte): (usize, &u8)| {
+        let byte = *byte;
+        (0..8).filter(move |bit| byte >> bit & 1 == 1).map(move |bit| index * 8 + bit)
+    };
+    bits.iter().enumerate().flat_map(of_byte).filter(move |pixel| *pixel < num_pixels)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::geometry::intrinsics::Intrinsics;
+    use crate::slam::geometry::sim3::Sim3;
+
+    const WIDTH: usize = 65;
+    const HEIGHT: usize = 48;
+
+    fn keyframe(own_brightness: f32) -> Keyframe {
+        let image: Vec<u8> = (0..WIDTH * HEIGHT).map(|i| ((i * i) >> 4) as u8).collect();
+        let points = (0..WIDTH * HEIGHT).filter(|i| i % 3 == 1).map(|i| DepthPoint {
+            u: (i % WIDTH) as u16,
+            v: (i / WIDTH) as u16,
+            inverse_depth: 0.3 + (i % 97) as f32 * 0.01,
+            variance: 1e-4 * (1.0 + (i % 7) as f32),
+            intensity: f32::from(image[i]) + own_brightness,
+        });
+        let points = points.collect();
+        let camera = Intrinsics::pinhole(WIDTH, HEIGHT, 60.0);
+        let at = Keyframe::at(Sim3::identity(), camera, points, image);
+        Keyframe { keyframe_id: 5, revision: 9, ..at }
+    }
+
+    fn decoded(bytes: &[u8]) -> Result<Keyframe, DepthFileError> {
+        let mut into = keyframe(0.0).without_depth();
+        decode_into(bytes, &mut into).map(|()| into)
+    }
+
+    #[test]
+    fn full_detail_gives_the_same_bits_back() {
+        for own in [0.0, 0.25] {
+            let of = keyframe(own);
+            let bytes = encode(&of, MapDetail::Full);
+            assert!(decoded(&bytes).unwrap() == of, "{own}");
+            assert!(bytes.len() <= most_bytes(WIDTH * HEIGHT));
+        }
+        let mut none = keyframe(0.0);
+        none.points.clear();
+        assert!(decoded(&encode(&none, MapDetail::Full)).unwrap() == none);
+    }
+
+    #[test]
+    fn small_detail_takes_half_a_byte_a_pixel_and_stays_near() {
+        let mut of = keyframe(0.0);
+        // A view of a room, not of noise.
+        of.image = (0..WIDTH * HEIGHT).map(|i| ((i % WIDTH) * 3 + i / WIDTH) as u8).collect();
+        let bytes = encode(&of, MapDetail::Small);
+        assert!(bytes.len() <= HEAD_BYTES + 4 + WIDTH * HEIGHT / 2, "{}", bytes.len());
+        let small = decoded(&bytes).unwrap();
+        assert!(small.points.len() > 90, "{}", small.points.len());
+        for point in &small.points {
+            let pixel = |p: &&DepthPoint| (p.u, p.v) == (point.u, point.v);
+            let exact = of.points.iter().find(pixel).unwrap();
+            assert!((point.inverse_depth / exact.inverse_depth - 1.0).abs() < 1e-4);
+            assert!((point.variance / exact.variance - 1.0).abs() < 0.03);
+        }
+        let furthest = of.image.iter().zip(&small.image).map(|(a, b)| a.abs_diff(*b)).max();
+        assert!(furthest <= Some(8), "{furthest:?}");
+        // What was small stays the same when it is written again.
+        assert!(decoded(&encode(&small, MapDetail::Full)).unwrap() == small);
+    }
+
+    #[test]
+    fn every_cut_and_every_wrong_bit_is_an_error() {
+        for detail in [MapDetail::Full, MapDetail::Small] {
+            let whole = encode(&keyframe(0.0), detail);
+            for length in (0..whole.len()).step_by(7).chain([whole.len() - 1]) {
+                assert!(decoded(&whole[..length]).is_err(), "{length}");
+            }
+            assert!(decoded(&[&whole[..], &[0]].concat()).is_err());
+            for byte in (0..HEAD_BYTES).chain((HEAD_BYTES..whole.len()).step_by(11)) {
+                let mut broken = whole.clone();
+                broken[byte] ^= 1 << (byte % 8);
+                assert!(decoded(&broken).is_err(), "byte {byte}");
+            }
+        }
+    }
+
+    #[test]
+    fn hostile_sizes_and_numbers_with_a_right_checksum_are_refused() {
+        let whole = encode(&keyframe(0.0), MapDetail::Full);
+        let with = |at: usize, value: &[u8]| {
+            let mut bytes = whole.clone();
+            bytes[at..at + value.len()].copy_from_slice(value);
+            let end = bytes.len() - CHECKSUM_BYTES;
+            let checksum = crc32fast::hash(&bytes[..end]);
+            bytes[end..].copy_from_slice(&checksum.to_le_bytes());
+            decoded(&bytes)
+        };
+        let (points_at, image_bytes_at) = (40, 52);
+        for count in [1, 1041, u32::MAX] {
+            assert!(with(points_at, &count.to_le_bytes()).is_err(), "{count} points");
+        }
+        for count in [0, 1, u64::MAX] {
+            assert!(with(image_bytes_at, &count.to_le_bytes()).is_err(), "{count} image bytes");
+        }
+        assert!(matches!(with(16, &2u32.to_le_bytes()), Err(DepthFileError::Version(2))));
+        assert!(matches!(with(24, &6u64.to_le_bytes()), Err(DepthFileError::Foreign)));
+        let numbers = whole.len() - CHECKSUM_BYTES - 8;
+        assert!(matches!(with(numbers, &f32::NAN.to_le_bytes()), Err(DepthFileError::Points(_))));
+        assert!(with(HEAD_BYTES, &[0xff]).is_err(), "a bit more than there are points");
+    }
+}

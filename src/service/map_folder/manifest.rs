@@ -1,0 +1,371 @@
+//! The manifest of a map folder: which keyframes there are, where they are, and which file holds the depth of each.
+//!
+//! Layout, little-endian: magic, version (u32), then sections: tag (4 bytes), bytes (u64), payload; at the end the
+//! CRC-32 of all before it (u32). A section that this program does not know is left out where its tag begins with a
+//! lower-case letter, and makes the map one of another version otherwise.
+//!
+//! * `CAMR`: width, height (u32), fx, fy, cx, cy (f64).
+//! * `STAT`: detail (u32), first free epoch (u32), revision of the map, number of saves, seconds since 1970 (u64).
+//! * `KEYF`: number of keyframes (u64), each: bytes (u32) of the keyframe without image and points as in
+//!   [`map_file`](crate::service::map_file), these; then, 0 where it has no file, revision in the file's name, bytes
+//!   (u64), checksum, number of points (u32) of its file.
+
+use std::collections::BTreeMap;
+
+use crate::service::map_file::{keyframe_bytes, parse_keyframe};
+use crate::service::map_folder::depth_file::{MapDetail, most_bytes};
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::keyframe::{Keyframe, MAX_KEYFRAME_POINTS};
+
+/// First bytes of the file.
+const MAGIC: [u8; 16] = *b"semidense mapdir";
+/// Version of the layout.
+pub const VERSION: u32 = 1;
+const CAMERA: [u8; 4] = *b"CAMR";
+const STATE: [u8; 4] = *b"STAT";
+const KEYFRAMES: [u8; 4] = *b"KEYF";
+/// More keyframes than an hour at one each 30 ms: a broken number, not a map.
+const MAX_KEYFRAMES: usize = 120_000;
+/// Largest number of an epoch and of a revision: what comes after it must not overflow.
+const MAX_EPOCH: u32 = u32::MAX / 2;
+const MAX_REVISION: u64 = u64::MAX / 2;
+
+/// What a folder holds.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Manifest {
+    /// The camera that all keyframes were taken with.
+    pub camera: Intrinsics,
+    /// How much of a keyframe is kept.
+    pub detail: MapDetail,
+    /// Numbers of epochs from here on are given by nobody yet.
+    pub free_epoch: u32,
+    /// How often the map had been corrected.
+    pub revision: u64,
+    /// How often it was saved.
+    pub saves: u64,
+    /// When it was saved last, seconds since 1970.
+    pub saved_secs: u64,
+    /// Keyframes without image and points, in the order of their ids, with the file that has these.
+    pub keyframes: Vec<Listed>,
+}
+
+/// A keyframe of the list.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Listed {
+    /// The keyframe, without image and points.
+    pub keyframe: Keyframe,
+    /// Where those are; `None` where they have not been written, or were given up.
+    pub file: Option<DepthFile>,
+}
+
+/// The file of a keyframe.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct DepthFile {
+    /// Revision in its name.
+    pub revision: u64,
+    /// Its size.
+    pub bytes: u64,
+    /// The checksum at its end.
+    pub checksum: u32,
+    /// Points in it.
+    pub num_points: u32,
+}
+
+impl DepthFile {
+    /// Its name in the folder of keyframes.
+    pub fn name(&self, keyframe_id: u64) -> String {
+        format!("{keyframe_id}.{}", self.revision)
+    }
+}
+
+/// Why a manifest cannot be used.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum ManifestError {
+    /// It is something else.
+    #[error("it is not the manifest of a map")]
+    Magic,
+    /// Another version has written it.
+    #[error(
+        "the map is of version {0}, and this program reads version {VERSION}: use the program that made it"
+    )]
+    Version(u32),
+    /// It has a part that cannot be done without, which this program does not know.
+    #[error("the map has a part `{0}` that this program does not know: use a newer one")]
+    Section(String),
+    /// A bit is wrong, or something is missing.
+    #[error("it is damaged ({0})")]
+    Damaged(String),
+}
+
+fn damaged(what: &str) -> ManifestError {
+    ManifestError::Damaged(what.to_owned())
+}
+
+impl Manifest {
+    /// An empty map of a camera.
+    pub fn new(camera: Intrinsics, detail: MapDetail) -> Self {
+        Self {
+            camera,
+            detail,
+            free_epoch: 0,
+            revision: 0,
+            saves: 0,
+            saved_secs: 0,
+            keyframes: Vec::new(),
+        }
+    }
+
+    /// Its bytes.
+    pub fn to_bytes(&self) -> Vec<u8> {
+        let mut bytes = MAGIC.to_vec();
+        bytes.extend(VERSION.to_le_bytes());
+        let k = &self.camera;
+        let mut camera = Vec::new();
+        camera.extend((k.width as u32).to_le_bytes());
+        camera.extend((k.height as u32).to_le_bytes());
+        [k.fx, k.fy, k.cx, k.cy].iter().for_each(|number| camera.extend(number.to_le_bytes()));
+        push_section(&mut bytes, CAMERA, &camera);
+        let mut state = Vec::new();
+        state.extend(u32::from(self.detail == MapDetail::Small).to_le_bytes());
+        state.extend(self.free_epoch.to_le_bytes());
+        for number in [self.revision, self.saves, self.saved_secs] {
+            state.extend(number.to_le_bytes());
+        }
+        push_section(&mut bytes, STATE, &state);
+        let mut keyframes = Vec::new();
+        keyframes.extend((self.keyframes.len() as u64).to_le_bytes());
+        for listed in &self.keyframes {
+            let head = keyframe_bytes(&listed.keyframe);
+            keyframes.extend((head.len() as u32).to_le_bytes());
+            keyframes.extend(head);
+            let none = DepthFile { revision: 0, bytes: 0, checksum: 0, num_points: 0 };
+            let file = listed.file.unwrap_or(none);
+            keyframes.extend(file.revision.to_le_bytes());
+            keyframes.extend(file.bytes.to_le_bytes());
+            keyframes.extend(file.checksum.to_le_bytes());
+            keyframes.extend(file.num_points.to_le_bytes());
+        }
+        push_section(&mut bytes, KEYFRAMES, &keyframes);
+        bytes.extend(crc32fast::hash(&bytes).to_le_bytes());
+        bytes
+    }
+
+    /// The manifest of these bytes.
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, ManifestError> {
+        let mut rest = bytes;
+        if take::<16>(&mut rest)? != MAGIC {
+            return Err(ManifestError::Magic);
+        }
+        let version = u32::from_le_bytes(take(&mut rest)?);
+        if version != VERSION {
+            return Err(ManifestError::Version(version));
+        }
+        let (body, checksum) = bytes.split_last_chunk::<4>().ok_or_else(|| damaged("it is cut"))?;
+        if crc32fast::hash(body) != u32::from_le_bytes(*checksum) {
+            return Err(damaged("its checksum is wrong"));
+        }
+        rest = rest.get(..rest.len().saturating_sub(4)).unwrap_or_default();
+        let mut sections = BTreeMap::new();
+        while !rest.is_empty() {
+            let tag: [u8; 4] = take(&mut rest)?;
+            let length = usize::try_from(u64::from_le_bytes(take(&mut rest)?)).ok();
+            let payload = length.and_then(|length| rest.split_off(..length));
+            let payload = payload.ok_or_else(|| damaged("a part is cut"))?;
+            let is_known = [CAMERA, STATE, KEYFRAMES].contains(&tag);
+            if !is_known && !tag[0].is_ascii_lowercase() {
+                return Err(ManifestError::Section(tag.escape_ascii().to_string()));
+            }
+            sections.insert(tag, payload);
+        }
+        let part =
+            |tag: [u8; 4]| sections.get(&tag).copied().ok_or_else(|| damaged("a part is missing"));
+        let mut manifest = Self::new(camera_of(part(CAMERA)?)?, MapDetail::Full);
+        manifest.read_state(part(STATE)?)?;
+        manifest.read_keyframes(part(KEYFRAMES)?)?;
+        Ok(manifest)
+    }
+
+    fn read_state(&mut self, mut payload: &[u8]) -> Result<(), ManifestError> {
+        let payload = &mut payload;
+        self.detail = match u32::from_le_bytes(take(payload)?) {
+            0 => MapDetail::Full,
+            1 => MapDetail::Small,
+            _ => return Err(damaged("detail")),
+        };
+        self.free_epoch = u32::from_le_bytes(take(payload)?);
+        self.revision = u64::from_le_bytes(take(payload)?);
+        self.saves = u64::from_le_bytes(take(payload)?);
+        self.saved_secs = u64::from_le_bytes(take(payload)?);
+        let is_possible = self.free_epoch <= MAX_EPOCH
+            && [self.revision, self.saves].iter().all(|number| *number <= MAX_REVISION);
+        match is_possible && payload.is_empty() {
+            true => Ok(()),
+            false => Err(damaged("its numbers are not possible")),
+        }
+    }
+
+    fn read_keyframes(&mut self, mut payload: &[u8]) -> Result<(), ManifestError> {
+        let payload = &mut payload;
+        let count = usize::try_from(u64::from_le_bytes(take(payload)?)).unwrap_or(usize::MAX);
+        if count > MAX_KEYFRAMES {
+            return Err(damaged("more keyframes than any map has"));
+        }
+        for index in 0..count {
+            let at = |what: &str| damaged(&format!("keyframe {index}: {what}"));
+            let length = u32::from_le_bytes(take(payload)?) as usize;
+            let head = payload.split_off(..length).ok_or_else(|| at("it is cut"))?;
+            let keyframe = parse_keyframe(head).map_err(|error| at(&error.to_string()))?;
+            let file = DepthFile {
+                revision: u64::from_le_bytes(take(payload)?),
+                bytes: u64::from_le_bytes(take(payload)?),
+                checksum: u32::from_le_bytes(take(payload)?),
+                num_points: u32::from_le_bytes(take(payload)?),
+            };
+            let last = self.keyframes.last().map(|last| last.keyframe.keyframe_id);
+            let num_pixels = keyframe.intrinsics.width * keyframe.intrinsics.height;
+            let is_possible = last.is_none_or(|last| last < keyframe.keyframe_id)
+                && keyframe.intrinsics == self.camera
+                && keyframe.image.is_empty()
+                && keyframe.points.is_empty()
+                && file.bytes <= most_bytes(num_pixels) as u64
+                && file.num_points as usize <= MAX_KEYFRAME_POINTS
+                && file.revision <= MAX_REVISION;
+            if !is_possible {
+                return Err(at("its numbers are not possible"));
+            }
+            let file = Some(file).filter(|file| file.bytes > 0);
+            self.keyframes.push(Listed { keyframe, file });
+        }
+        if payload.is_empty() { Ok(()) } else { Err(damaged("bytes after the keyframes")) }
+    }
+
+    /// Bytes of all files of keyframes.
+    pub fn depth_bytes(&self) -> u64 {
+        self.keyframes.iter().filter_map(|listed| listed.file).map(|file| file.bytes).sum()
+    }
+
+    /// Names of all files of keyframes.
+    pub fn file_names(&self) -> impl Iterator<Item = String> {
+        let named = |listed: &Listed| Some(listed.file?.name(listed.keyframe.keyframe_id));
+        self.keyframes.iter().filter_map(named)
+    }
+}
+
+fn push_section(bytes: &mut Vec<u8>, tag: [u8; 4], payload: &[u8]) {
+    bytes.extend(tag);
+    bytes.extend((payload.len() as u64).to_le_bytes());
+    bytes.extend(payload);
+}
+
+fn take<const N: usize>(bytes: &mut &[u8]) -> Result<[u8; N], ManifestError> {
+    let taken = bytes.split_off(..N).and_then(|taken| taken.first_chunk().copied());
+    taken.ok_or_else(|| damaged("it is cut"))
+}
+
+fn camera_of(mut payload: &[u8]) -> Result<Intrinsics, ManifestError> {
+    let payload = &mut payload;
+    let width = u32::from_le_bytes(take(payload)?) as usize;
+    let height = u32::from_le_bytes(take(payload)?) as usize;
+    let mut number = || Ok(f64::from_le_bytes(take(payload)?));
+    let (fx, fy, cx, cy) = (number()?, number()?, number()?, number()?);
+    let camera = Intrinsics { fx, fy, cx, cy, width, height };
+    if camera.is_valid() { Ok(camera) } else { Err(damaged("its camera is not possible")) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::geometry::sim3::Sim3;
+
+    fn manifest() -> Manifest {
+        let camera = Intrinsics::pinhole(64, 48, 60.0);
+        let listed = |keyframe_id: u64| Listed {
+            keyframe: Keyframe {
+                keyframe_id,
+                revision: 3,
+                ..Keyframe::at(Sim3::identity(), camera, Vec::new(), Vec::new())
+            },
+            file: (keyframe_id != 4).then_some(DepthFile {
+                revision: 3,
+                bytes: 100 + keyframe_id,
+                checksum: 7,
+                num_points: 5,
+            }),
+        };
+        Manifest {
+            free_epoch: 3,
+            revision: 8,
+            saves: 2,
+            saved_secs: 1_700_000_000,
+            keyframes: vec![listed(2), listed(4), listed(9)],
+            ..Manifest::new(camera, MapDetail::Small)
+        }
+    }
+
+    /// With another body and a right checksum.
+    fn sealed(mut body: Vec<u8>) -> Vec<u8> {
+        body.extend(crc32fast::hash(&body).to_le_bytes());
+        body
+    }
+
+    fn body() -> Vec<u8> {
+        let mut bytes = manifest().to_bytes();
+        bytes.truncate(bytes.len() - 4);
+        bytes
+    }
+
+    #[test]
+    fn it_comes_back_from_its_bytes() {
+        assert_eq!(Manifest::from_bytes(&manifest().to_bytes()), Ok(manifest()));
+        assert_eq!(manifest().depth_bytes(), 211);
+        assert_eq!(manifest().file_names().collect::<Vec<_>>(), ["2.3", "9.3"]);
+    }
+
+    #[test]
+    fn every_cut_and_every_wrong_bit_is_an_error() {
+        let whole = manifest().to_bytes();
+        for length in 0..whole.len() {
+            assert!(Manifest::from_bytes(&whole[..length]).is_err(), "{length}");
+        }
+        for byte in 0..whole.len() {
+            let mut broken = whole.clone();
+            broken[byte] ^= 1 << (byte % 8);
+            assert!(Manifest::from_bytes(&broken).is_err(), "byte {byte}");
+        }
+    }
+
+    #[test]
+    fn hostile_numbers_with_a_right_checksum_are_refused() {
+        let last = body().len();
+        for (at, value) in [
+            (20 + 4, u64::MAX),    // length of the first section
+            (last - 24, u64::MAX), // revision of the last file
+            (last - 16, u64::MAX), // bytes of the last file
+            (last - 8, u64::MAX),  // checksum and points of the last file
+        ] {
+            let mut bytes = body();
+            bytes[at..at + 8].copy_from_slice(&value.to_le_bytes());
+            assert!(Manifest::from_bytes(&sealed(bytes)).is_err(), "at {at}");
+        }
+        let mut twice = manifest();
+        twice.keyframes[1] = twice.keyframes[0].clone();
+        assert!(Manifest::from_bytes(&twice.to_bytes()).is_err());
+        let mut foreign = manifest();
+        foreign.keyframes[1].keyframe.intrinsics.fx = 61.0;
+        assert!(Manifest::from_bytes(&foreign.to_bytes()).is_err());
+    }
+
+    #[test]
+    fn what_is_unknown_is_left_out_or_asks_for_a_newer_program() {
+        let with = |tag: &[u8; 4]| {
+            let mut bytes = body();
+            push_section(&mut bytes, *tag, b"something");
+            Manifest::from_bytes(&sealed(bytes))
+        };
+        assert_eq!(with(b"loop"), Ok(manifest()));
+        assert_eq!(with(b"LOOP"), Err(ManifestError::Section("LOOP".to_owned())));
+        let mut newer = manifest().to_bytes();
+        newer[16] = 2;
+        assert_eq!(Manifest::from_bytes(&newer), Err(ManifestError::Version(2)));
+    }
+}

@@ -1,0 +1,129 @@
+//! What a map folder holds, for whoever asks.
+
+use std::fs;
+use std::io;
+use std::path::Path;
+
+use serde::Serialize;
+
+use crate::service::map_folder::depth_file::MapDetail;
+use crate::service::map_folder::manifest::VERSION;
+use crate::service::map_folder::{KEYFRAMES, Loaded};
+use crate::service::results::ply::{point_cloud, write_ply};
+use crate::service::trajectory_file::write_trajectory;
+use crate::slam::map::Map;
+use crate::slam::trajectory::StampedPose;
+
+/// What a folder holds. Lengths are those of its epoch, whose unit the map has chosen.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct MapReport {
+    /// Version of the format.
+    pub version: u32,
+    /// How much of a keyframe is kept.
+    pub detail: MapDetail,
+    /// Size of its images, pixels.
+    pub width: usize,
+    /// The same.
+    pub height: usize,
+    /// Rectified intrinsics: fx, fy, cx, cy, pixels.
+    pub intrinsics: [f64; 4],
+    /// Keyframes of each epoch.
+    pub epochs: Vec<EpochReport>,
+    /// Keyframes in all.
+    pub keyframes: usize,
+    /// Of them those whose depth can be read.
+    pub keyframes_with_depth: usize,
+    /// Points of all keyframes.
+    pub points: usize,
+    /// How often the map was corrected.
+    pub revision: u64,
+    /// How often it was saved.
+    pub saves: u64,
+    /// When it was saved last, seconds since 1970.
+    pub saved_secs: u64,
+    /// Bytes that the folder takes.
+    pub bytes: u64,
+    /// What is damaged, a line for each file.
+    pub problems: Vec<String>,
+}
+
+/// An epoch: it has a unit and a place of its own.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct EpochReport {
+    /// Its number.
+    pub epoch: u32,
+    /// Its keyframes.
+    pub keyframes: usize,
+    /// Length of the path from keyframe to keyframe, map units.
+    pub path_length: f64,
+}
+
+impl MapReport {
+    /// Of a map that was read with all of its depth.
+    pub fn of(folder: &Path, loaded: &Loaded) -> Self {
+        let Loaded { manifest, map, problems, .. } = loaded;
+        let k = &manifest.camera;
+        Self {
+            version: VERSION,
+            detail: manifest.detail,
+            width: k.width,
+            height: k.height,
+            intrinsics: [k.fx, k.fy, k.cx, k.cy],
+            epochs: epochs_of(map),
+            keyframes: map.keyframes.len(),
+            keyframes_with_depth: map.keyframes.iter().filter(|of| of.has_depth()).count(),
+            points: map.keyframes.iter().map(|of| of.points.len()).sum(),
+            revision: manifest.revision,
+            saves: manifest.saves,
+            saved_secs: manifest.saved_secs,
+            bytes: bytes_in(folder) + bytes_in(&folder.join(KEYFRAMES)),
+            problems: problems.clone(),
+        }
+    }
+}
+
+fn epochs_of(map: &Map) -> Vec<EpochReport> {
+    let mut numbers: Vec<u32> = map.keyframes.iter().map(|keyframe| keyframe.epoch).collect();
+    numbers.sort_unstable();
+    numbers.dedup();
+    let report = |epoch: u32| {
+        let of_epoch = map.keyframes.iter().filter(|keyframe| keyframe.epoch == epoch);
+        let places: Vec<_> =
+            of_epoch.map(|keyframe| keyframe.map_from_keyframe.rigid.translation).collect();
+        let path_length = places.windows(2).map(|pair| (pair[1] - pair[0]).norm()).sum();
+        EpochReport { epoch, keyframes: places.len(), path_length }
+    };
+    numbers.into_iter().map(report).collect()
+}
+
+/// Bytes of the files of a folder.
+fn bytes_in(folder: &Path) -> u64 {
+    let entries = fs::read_dir(folder).into_iter().flatten().flatten();
+    let files = entries.filter_map(|entry| entry.metadata().ok()).filter(|of| of.is_file());
+    files.map(|metadata| metadata.len()).sum()
+}
+
+/// Writes a map's points (PLY) and the trajectory of its keyframes (TUM), of one epoch.
+pub fn export(
+    folder: &Path,
+    map: &Map,
+    epoch: u32,
+    max_relative_std_dev: f64,
+) -> io::Result<(usize, usize)> {
+    fs::create_dir_all(folder)?;
+    let of_epoch = map.keyframes.iter().filter(|keyframe| keyframe.epoch == epoch);
+    let map = Map { keyframes: of_epoch.cloned().collect(), ..Map::default() };
+    let cloud = point_cloud(&map, max_relative_std_dev);
+    write_ply(&folder.join("map.ply"), &cloud)?;
+    let poses: Vec<StampedPose> = map
+        .keyframes
+        .iter()
+        .map(|keyframe| StampedPose {
+            nanos: keyframe.capture_nanos,
+            world_from_camera: keyframe.map_from_keyframe.rigid,
+        })
+        .collect();
+    let comment = "map_from_keyframe of every keyframe, map units";
+    write_trajectory(&folder.join("keyframes.txt"), comment, &poses)?;
+    Ok((cloud.len(), poses.len()))
+}

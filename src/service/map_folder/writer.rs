@@ -1,0 +1,193 @@
+//! Writes a map folder: changed keyframes first, then the manifest that lists them.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use crate::service::atomic_file::write_durably;
+use crate::service::map_folder::depth_file::{MapDetail, checksum_of, encode};
+use crate::service::map_folder::manifest::{DepthFile, Listed, Manifest};
+use crate::service::map_folder::{BEFORE, KEYFRAMES, MANIFEST, MapFolderError, read_manifest};
+use crate::service::results::output_lock::{Locking, OutputLock};
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::keyframe::{Keyframe, MapState};
+
+/// What of a map is in its manifest.
+#[derive(Debug, Clone, Default)]
+pub struct MapHead {
+    /// Keyframes without image and points, in the order of their ids.
+    pub keyframes: Vec<Keyframe>,
+    /// How often the map was corrected.
+    pub revision: u64,
+    /// Numbers of epochs from here on are given by nobody yet.
+    pub free_epoch: u32,
+}
+
+/// A map folder that this process alone writes.
+#[derive(Debug)]
+pub struct MapWriter {
+    folder: PathBuf,
+    /// As saved last; `None` where nothing has been saved.
+    manifest: Option<Manifest>,
+    /// Its bytes.
+    manifest_bytes: Vec<u8>,
+    detail: MapDetail,
+    /// Files of keyframes, by their id, that the next manifest lists.
+    files: BTreeMap<u64, DepthFile>,
+    /// Names of the files there are.
+    names: BTreeSet<String>,
+    _lock: OutputLock,
+}
+
+impl MapWriter {
+    /// Takes a folder for this process: one that holds a map, or is empty, or does not exist yet. A map that is there
+    /// keeps its detail.
+    pub fn open(folder: &Path, detail: MapDetail) -> Result<Self, MapFolderError> {
+        let failed = |source| MapFolderError::Write { path: folder.to_owned(), source };
+        fs::create_dir_all(folder).map_err(failed)?;
+        let manifest = match read_manifest(folder) {
+            Ok((manifest, _)) => Some(manifest),
+            Err(MapFolderError::Missing(_)) if is_free(folder).map_err(failed)? => None,
+            Err(MapFolderError::Missing(_)) => {
+                return Err(MapFolderError::Foreign(folder.to_owned()));
+            }
+            Err(error) => return Err(error),
+        };
+        let lock = match OutputLock::take(folder).map_err(failed)? {
+            Locking::Locked(lock) => lock,
+            Locking::HeldBy(holder) => {
+                let by = if holder.is_empty() { holder } else { format!(" ({holder})") };
+                return Err(MapFolderError::Held { folder: folder.to_owned(), by });
+            }
+        };
+        fs::create_dir_all(folder.join(KEYFRAMES)).map_err(failed)?;
+        let mut writer = Self {
+            folder: folder.to_owned(),
+            manifest_bytes: manifest.as_ref().map(Manifest::to_bytes).unwrap_or_default(),
+            detail: manifest.as_ref().map_or(detail, |manifest| manifest.detail),
+            files: BTreeMap::new(),
+            names: BTreeSet::new(),
+            manifest,
+            _lock: lock,
+        };
+        writer.tidy().map_err(failed)?;
+        Ok(writer)
+    }
+
+    /// Removes what a killed process has left, and lists what there is.
+    fn tidy(&mut self) -> io::Result<()> {
+        let is_unfinished = |name: &str| name.starts_with('.') && name.ends_with(".tmp");
+        for entry in fs::read_dir(&self.folder)?.flatten() {
+            if is_unfinished(&entry.file_name().to_string_lossy()) {
+                drop(fs::remove_file(entry.path()));
+            }
+        }
+        let manifests = self.manifest.iter().flat_map(|manifest| &manifest.keyframes);
+        let files = manifests.filter_map(|of| Some((of.keyframe.keyframe_id, of.file?)));
+        self.files = files.collect();
+        for entry in fs::read_dir(self.folder.join(KEYFRAMES))?.flatten() {
+            self.names.insert(entry.file_name().to_string_lossy().into_owned());
+        }
+        Ok(())
+    }
+
+    /// The camera of the map that is there.
+    pub fn camera(&self) -> Option<&Intrinsics> {
+        self.manifest.as_ref().map(|manifest| &manifest.camera)
+    }
+
+    /// Where it writes.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// Writes image and depth of a keyframe, unless they are on the disk as they are. They belong to the map with the
+    /// next [`Self::save`].
+    pub fn put(&mut self, keyframe: &Keyframe) -> Result<(), MapFolderError> {
+        let bytes = encode(keyframe, self.detail);
+        let file = DepthFile {
+            revision: keyframe.revision,
+            bytes: bytes.len() as u64,
+            checksum: checksum_of(&bytes),
+            num_points: keyframe.points.len() as u32,
+        };
+        // A new revision may be of the pose alone.
+        let is_same =
+            |known: &DepthFile| (known.bytes, known.checksum) == (file.bytes, file.checksum);
+        if self.files.get(&keyframe.keyframe_id).is_some_and(is_same) {
+            return Ok(());
+        }
+        let name = file.name(keyframe.keyframe_id);
+        let path = self.folder.join(KEYFRAMES).join(&name);
+        write_durably(&path, |to| to.write_all(&bytes))
+            .map_err(|source| MapFolderError::Write { path, source })?;
+        self.names.insert(name);
+        self.files.insert(keyframe.keyframe_id, file);
+        Ok(())
+    }
+
+    /// Writes the manifest: from now on the map is this. Keyframes of another camera, and those that contradicted
+    /// themselves, are left out.
+    pub fn save(&mut self, camera: &Intrinsics, head: MapHead) -> Result<(), MapFolderError> {
+        let is_kept = |keyframe: &Keyframe| {
+            keyframe.intrinsics == *camera && keyframe.map_state == MapState::Established
+        };
+        let keyframes = head.keyframes.into_iter().filter(is_kept).map(|keyframe| {
+            let file = self.files.get(&keyframe.keyframe_id).copied();
+            Listed { keyframe, file }
+        });
+        let since = SystemTime::now().duration_since(UNIX_EPOCH);
+        let saves = self.manifest.as_ref().map_or(0, |before| before.saves);
+        let manifest = Manifest {
+            free_epoch: head.free_epoch,
+            revision: head.revision,
+            saves: saves.saturating_add(1),
+            saved_secs: since.map_or(0, |since| since.as_secs()),
+            keyframes: keyframes.collect(),
+            ..Manifest::new(*camera, self.detail)
+        };
+        let bytes = manifest.to_bytes();
+        self.write(BEFORE, |before| before.manifest_bytes.clone())?;
+        self.write(MANIFEST, |_| bytes.clone())?;
+        let before = self.manifest.replace(manifest);
+        self.manifest_bytes = bytes;
+        self.remove_unlisted(before.as_ref());
+        Ok(())
+    }
+
+    /// Writes a manifest; an empty one is none.
+    fn write(&self, name: &str, bytes: impl Fn(&Self) -> Vec<u8>) -> Result<(), MapFolderError> {
+        let (path, bytes) = (self.folder.join(name), bytes(self));
+        if bytes.is_empty() {
+            return Ok(());
+        }
+        write_durably(&path, |to| to.write_all(&bytes))
+            .map_err(|source| MapFolderError::Write { path, source })
+    }
+
+    /// Removes the files that neither this manifest nor the one before lists.
+    fn remove_unlisted(&mut self, before: Option<&Manifest>) {
+        let manifests = self.manifest.iter().chain(before);
+        let listed: BTreeSet<String> = manifests.flat_map(Manifest::file_names).collect();
+        let folder = self.folder.join(KEYFRAMES);
+        // One that cannot be removed is removed by the next process that tidies up.
+        self.names
+            .retain(|name| listed.contains(name) || fs::remove_file(folder.join(name)).is_err());
+        let in_map = self.manifest.iter().flat_map(|manifest| &manifest.keyframes);
+        let ids: BTreeSet<u64> = in_map.map(|listed| listed.keyframe.keyframe_id).collect();
+        self.files.retain(|id, _| ids.contains(id));
+    }
+}
+
+/// Whether a folder has nothing in it but what a process may have left that was killed before its first save.
+fn is_free(folder: &Path) -> io::Result<bool> {
+    for entry in fs::read_dir(folder)? {
+        let name = entry?.file_name().to_string_lossy().into_owned();
+        if name != KEYFRAMES && !name.starts_with('.') {
+            return Ok(false);
+        }
+    }
+    Ok(true)
+}
