@@ -1,5 +1,6 @@
 //! `semidense map`: maps on disk.
 
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -7,8 +8,9 @@ use clap::{Args, Subcommand};
 
 use crate::command::CommandResult;
 use crate::command::print::{note, print};
-use crate::service::config::Config;
+use crate::service::config::{Config, MapConfig};
 use crate::service::map_folder::report::{MapReport, export};
+use crate::service::map_folder::session::check;
 use crate::service::map_folder::{Loaded, load};
 use crate::service::results::output_folder::utc_text;
 
@@ -19,6 +21,44 @@ use crate::service::results::output_folder::utc_text;
 pub struct MapArguments {
     #[command(subcommand)]
     command: MapCommand,
+}
+
+/// The map on disk that a command begins or continues.
+#[derive(Debug, Clone, Args)]
+pub struct MapOptions {
+    /// Begin a map in this folder, or continue the one it holds: the camera is looked for in it, and mapping goes on there
+    /// [default: map.folder of the configuration, which is none]
+    #[arg(long, value_name = "DIR")]
+    map: Option<PathBuf>,
+    /// Only locate the camera in the map: nothing in its folder changes
+    #[arg(long)]
+    read_only: bool,
+}
+
+impl MapOptions {
+    /// The configuration with what the command line says. The folder is checked before anything is started.
+    pub fn of(&self, config: &Config) -> Result<MapConfig, Box<dyn std::error::Error>> {
+        let mut map = config.map.clone();
+        if let Some(folder) = &self.map {
+            let folder = std::path::absolute(folder)?;
+            map.folder = folder.into_os_string().into_string().map_err(|folder| {
+                format!("--map {}: name a folder whose name is UTF-8", folder.display())
+            })?;
+        }
+        map.read_only |= self.read_only;
+        if map.read_only && map.folder.is_empty() {
+            return Err("--read-only locates the camera in a map: name it with --map DIR".into());
+        }
+        check(&map)?;
+        Ok(map)
+    }
+
+    /// The same for a child process.
+    pub fn settings(map: &MapConfig) -> Vec<OsString> {
+        let folder = toml::Value::String(map.folder.clone());
+        let settings = [format!("map.folder={folder}"), format!("map.read_only={}", map.read_only)];
+        settings.into_iter().flat_map(|setting| ["--set".into(), setting.into()]).collect()
+    }
 }
 
 #[derive(Debug, Subcommand)]

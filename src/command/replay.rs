@@ -11,6 +11,7 @@ use crate::capture::source::{FrameSource, open, rig_remarks};
 use crate::command::INTERRUPTED;
 use crate::command::capture::SourceArguments;
 use crate::command::ending::{Ending, note_unfinished, run_start};
+use crate::command::map::MapOptions;
 use crate::command::print::note;
 use crate::command::progress::Progress;
 use crate::service::config::{CaptureConfig, Config};
@@ -68,6 +69,8 @@ pub struct ReplayArgs {
     /// newest]
     #[arg(long, value_name = "DIR")]
     output: Option<PathBuf>,
+    #[command(flatten)]
+    map: MapOptions,
     /// Where the first depth of a keyframe comes from
     #[arg(long, value_enum, default_value_t)]
     initial_depth: InitialDepth,
@@ -103,7 +106,11 @@ pub fn run(config: &Config, args: ReplayArgs) -> Result<ExitCode, Box<dyn Error>
     }
     let args = &args;
     let capture = CaptureConfig { strict: is_strict, ..config.capture.clone() };
-    let config = &Config { capture, ..config.clone() };
+    let map = args.map.of(config)?;
+    if args.poses == Poses::Groundtruth && !map.folder.is_empty() {
+        return Err("--poses groundtruth cannot be used with a map: its poses would be those of another world".into());
+    }
+    let config = &Config { capture, map, ..config.clone() };
     let shutdown = Shutdown::install()?;
     let place = Place::new(&config.instance, &config.root)?;
     let output = OutputFolder::prepare(args.output.as_deref())?;
@@ -200,7 +207,8 @@ fn record(
         Ok(record) => (record, EndOfRun::Interrupted),
         Err(error) => {
             let fault = error.to_string();
-            let ReplayError::Cut { record, .. } = error else {
+            let (ReplayError::Cut { record, .. } | ReplayError::Unsaved { record, .. }) = error
+            else {
                 // There is nothing that could be lost.
                 drop(journal.map(Journal::finish));
                 return Err(error.into());
@@ -216,6 +224,7 @@ fn replay_config(config: &Config, args: &ReplayArgs) -> ReplayConfig {
     ReplayConfig {
         tracker: config.tracking.clone(),
         mapper: config.mapping.clone(),
+        map: config.map.clone(),
         poses: match args.poses {
             Poses::Tracker => PoseOrigin::Tracker,
             Poses::Groundtruth => PoseOrigin::GroundTruth,

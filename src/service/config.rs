@@ -18,6 +18,7 @@ use crate::capture::simulator::params::SimulatorParams;
 use crate::capture::source::SourceParams;
 use crate::capture::v4l::params::CameraParams;
 pub use crate::service::config_error::ConfigError;
+use crate::service::map_folder::depth_file::MapDetail;
 use crate::service::results::ResultsParams;
 use crate::service::schedule::{Background, SchedulingParams};
 use crate::slam::image::noise::ImageNoise;
@@ -52,6 +53,8 @@ pub struct Config {
     pub supervisor: SupervisorConfig,
     /// The noise of the camera's images, for tracking and mapping alike.
     pub noise: ImageNoise,
+    /// The map on disk.
+    pub map: MapConfig,
     /// How tracking computes.
     pub tracking: TrackerParams,
     /// How mapping computes.
@@ -140,6 +143,19 @@ pub struct MapperConfig {
     pub scheduling: SchedulingParams,
 }
 
+/// The map on disk.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct MapConfig {
+    /// Folder of a map that a run begins or continues when `--map` does not say; empty for none. In a configuration
+    /// file a path is relative to that file.
+    pub folder: String,
+    /// Whether the camera is only located in it, as `--read-only` does: nothing in the folder changes.
+    pub read_only: bool,
+    /// How much of a keyframe is kept of a map that is begun: `full` or `small`.
+    pub detail: MapDetail,
+}
+
 /// Who starts and watches the three.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -173,6 +189,7 @@ impl Default for Config {
             mapper: MapperConfig::default(),
             supervisor: SupervisorConfig::default(),
             noise: ImageNoise::default(),
+            map: MapConfig::default(),
             tracking: TrackerParams::default(),
             mapping: MapperParams::default(),
             results: ResultsParams::default(),
@@ -189,7 +206,8 @@ impl Config {
             let text = input_file::read_text(path, MAX_FILE_BYTES)
                 .map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
             (_, table) = Self::read(&text, &path.display().to_string())?;
-            place_rig(&mut table, path);
+            place_beside(&mut table, path, ["capture", "rig"]);
+            place_beside(&mut table, path, ["map", "folder"]);
         }
         let mut config = Self::from_table(&table, "the built-in configuration")?;
         for setting in settings {
@@ -315,14 +333,14 @@ pub fn file_for(folder: &Path, instance: Option<&str>) -> Option<PathBuf> {
     own.into_iter().chain([folder.join(COMMON_FILE)]).find(|file| file.exists())
 }
 
-/// Makes a rig path of the configuration `file` relative to that file, wherever the program is started.
-fn place_rig(table: &mut Table, file: &Path) {
-    let capture = table.get_mut("capture").and_then(Value::as_table_mut);
-    let Some(Value::String(rig)) = capture.and_then(|capture| capture.get_mut("rig")) else {
+/// Makes a path of the configuration `file` relative to that file, wherever the program is started.
+fn place_beside(table: &mut Table, file: &Path, [part, key]: [&str; 2]) {
+    let part = table.get_mut(part).and_then(Value::as_table_mut);
+    let Some(Value::String(path)) = part.and_then(|part| part.get_mut(key)) else {
         return;
     };
-    if let (false, Some(folder)) = (rig.is_empty(), file.parent()) {
-        *rig = folder.join(&*rig).to_string_lossy().into_owned();
+    if let (false, Some(folder)) = (path.is_empty(), file.parent()) {
+        *path = folder.join(&*path).to_string_lossy().into_owned();
     }
 }
 

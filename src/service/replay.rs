@@ -10,7 +10,9 @@ use std::time::Instant;
 use crate::capture::source::{FrameSource, FrameStamp, SourceError};
 use crate::service::adjustments::{Adjustments, Entry};
 use crate::service::alignment_stamps::AlignmentStamps;
+use crate::service::config::MapConfig;
 use crate::service::given_pose::{given_pose, truth_in_first_camera};
+use crate::service::map_folder::session::{MapSession, MapSessionError};
 use crate::service::read_ahead::{ReadAhead, ReadingPlan};
 use crate::service::refused_images::RefusedImages;
 use crate::service::rehearsal::Rehearsal;
@@ -56,6 +58,8 @@ pub struct ReplayConfig {
     pub tracker: TrackerParams,
     /// Tuning of the mapper.
     pub mapper: MapperParams,
+    /// The map on disk that it begins or continues.
+    pub map: MapConfig,
     /// Where poses come from.
     pub poses: PoseOrigin,
     /// Where the first depth comes from.
@@ -100,6 +104,17 @@ pub enum ReplayError {
         record: Box<RunRecord>,
         /// Why it ended.
         cause: SourceError,
+    },
+    /// The map on disk cannot be used.
+    #[error(transparent)]
+    Map(#[from] MapSessionError),
+    /// The map could not be saved at the end.
+    #[error("{cause}")]
+    Unsaved {
+        /// Everything that was done.
+        record: Box<RunRecord>,
+        /// Why.
+        cause: MapSessionError,
     },
     /// No thread.
     #[error(
@@ -151,11 +166,12 @@ pub fn replay(
     if let Some(error) = refused.error() {
         return Err(error.into());
     }
-    let mut record = replay.finish(begin)?;
+    let (mut record, saved) = replay.finish(begin)?;
     (record.frames_refused, record.refused) = (refused.count(), refused.text());
-    match fault {
-        None => Ok(record),
-        Some(cause) => Err(ReplayError::Cut { record: Box::new(record), cause }),
+    match (fault, saved) {
+        (None, Ok(())) => Ok(record),
+        (None, Err(cause)) => Err(ReplayError::Unsaved { record: Box::new(record), cause }),
+        (Some(cause), _) => Err(ReplayError::Cut { record: Box::new(record), cause }),
     }
 }
 
@@ -167,6 +183,9 @@ fn frames_to_come(source: &dyn FrameSource, config: &ReplayConfig) -> Option<usi
 /// The depth camera's image of a frame, where there is one.
 type SensorDepth = Result<Option<Image<f32>>, SourceError>;
 
+/// Whether the map is on the disk at the end.
+type Saved = Result<(), MapSessionError>;
+
 /// A replay under way.
 struct Replay<'a> {
     config: &'a ReplayConfig,
@@ -174,6 +193,7 @@ struct Replay<'a> {
     height: usize,
     tracker: Tracker,
     mapper: Mapper,
+    map: Option<MapSession>,
     /// Poses to be given, the first camera's frame as the world; made at the first frame.
     given_poses: Vec<StampedPose>,
     rehearsal: Rehearsal,
@@ -204,12 +224,17 @@ impl<'a> Replay<'a> {
             // Poses that are given are not estimated.
             mapping.window.num_free = 0;
         }
+        let mut mapper = Mapper::new(intrinsics, mapping)?;
+        let map = MapSession::open(&config.map, config.mapper.max_map_bytes());
+        let mut map = map.map_err(MapSessionError::from)?;
+        map.as_mut().map_or(Ok(()), |map| map.begin(&mut mapper, &intrinsics))?;
         Ok(Self {
             config,
             width: intrinsics.width,
             height: intrinsics.height,
             tracker: Tracker::new(intrinsics, config.tracker.clone())?,
-            mapper: Mapper::new(intrinsics, mapping)?,
+            mapper,
+            map,
             given_poses: Vec::new(),
             rehearsal: Rehearsal::new(frames_to_come(source, config)),
             spare: None,
@@ -298,6 +323,7 @@ impl<'a> Replay<'a> {
             self.record.rejections.get_or_insert_default().push(rejection);
         }
         self.adjust(frame.sequence, &mut outcome);
+        self.map.iter_mut().for_each(|map| map.follow(&self.mapper, &outcome));
         self.record.map_nanos.push(step_nanos);
         self.record.start.count(self.mapper.start_frame());
         if let Some(change_nanos) = change_nanos.filter(|_| outcome.keyframe_created) {
@@ -343,7 +369,12 @@ impl<'a> Replay<'a> {
         let new = || Box::new(Reference::new(self.config.tracker.reference.clone()));
         let mut reference = self.spare.take().unwrap_or_else(new);
         reference.prepare_into(keyframe);
+        let is_found = Tracker::is_found_on(reference.keyframe_id());
+        let is_first = self.tracker.reference().is_none();
         self.spare = self.tracker.adopt(reference);
+        if is_first && is_found {
+            self.tracker.begin_lost();
+        }
     }
 
     /// The frame's pose, estimated or given; `None` where ground truth has none for it.
@@ -402,8 +433,10 @@ impl<'a> Replay<'a> {
         }
     }
 
-    fn finish(mut self, begin: Instant) -> Result<RunRecord, ReplayError> {
+    /// The record, and whether the map was saved.
+    fn finish(mut self, begin: Instant) -> Result<(RunRecord, Saved), ReplayError> {
         self.adjustments.finish(&mut self.mapper);
+        let saved = self.map.map_or(Ok(()), |mut map| map.save_all(&self.mapper, &mut || ()));
         let mut record = self.record;
         record.adjustments.extend(self.adjustments.take_records());
         record.searches.get_or_insert_default().extend(self.adjustments.take_searches());
@@ -417,7 +450,7 @@ impl<'a> Replay<'a> {
         record.wall_nanos = elapsed_nanos(begin).saturating_sub(rehearsal_nanos);
         record.map = self.mapper.map().clone();
         record.peak_rss_bytes = peak_rss_bytes();
-        Ok(record)
+        Ok((record, saved))
     }
 }
 

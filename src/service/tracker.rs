@@ -228,7 +228,7 @@ impl<'a> Shell<'a> {
             }
         };
         if let Some(reference) = self.references.newest()? {
-            let epoch = reference.epoch();
+            let (epoch, keyframe_id) = (reference.epoch(), reference.keyframe_id());
             let is_first = tracker.reference().is_none();
             if let Some(used) = tracker.adopt(reference) {
                 self.references.give_back(used);
@@ -238,7 +238,11 @@ impl<'a> Shell<'a> {
             match last {
                 Some(last) => tracker.resume_at(last.nanos, &last.world_from_camera),
                 // The map may be that of a mapper that died as well, and the camera anywhere on it.
-                None if is_first && self.mode == Mode::Live => tracker.begin_lost(),
+                None if is_first
+                    && (self.mode == Mode::Live || Tracker::is_found_on(keyframe_id)) =>
+                {
+                    tracker.begin_lost();
+                }
                 None => {}
             }
         }

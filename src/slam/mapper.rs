@@ -14,6 +14,7 @@ pub mod modes;
 pub mod observation;
 mod past;
 mod phase;
+pub mod prior;
 pub mod recovery;
 mod resume;
 pub mod reuse;
@@ -51,9 +52,10 @@ use crate::slam::mapper::modes::{KeyframeModes, ModeParams, in_unit};
 use crate::slam::mapper::observation::DepthFilter;
 use crate::slam::mapper::past::PastFrames;
 use crate::slam::mapper::phase::{Active, Phase};
+use crate::slam::mapper::prior::Prior;
 use crate::slam::mapper::recovery::RecoveryParams;
 use crate::slam::mapper::reuse::ReuseParams;
-use crate::slam::mapper::situation::{Situation, StartFrame};
+use crate::slam::mapper::situation::StartFrame;
 use crate::slam::mapper::start::Start;
 use crate::slam::mapper::thinning::Thinning;
 use crate::slam::parameter::{ParameterError, check_range};
@@ -223,6 +225,8 @@ pub struct Mapper {
     intrinsics: Intrinsics,
     map: Map,
     phase: Phase,
+    /// The map of earlier runs that it began in.
+    prior: Option<Prior>,
     /// The keyframe that frames are tracked on; `None` before the first.
     active: Option<Active>,
     /// Where the active epoch's map lies in odometry's world: a similarity, since a correction may change units.
@@ -274,6 +278,7 @@ impl Mapper {
             intrinsics,
             map: Map::default(),
             phase: Phase::default(),
+            prior: None,
             active: None,
             world_from_map: Sim3::identity(),
             last_world_from_camera: None,
@@ -335,7 +340,12 @@ impl Mapper {
         {
             return StepOutcome::default();
         }
-        let Some(keyframe) = self.keyframe() else { return self.begin(frame, pose, sensor_depth) };
+        let Some(keyframe) = self.keyframe() else {
+            return match self.is_localising() {
+                true => self.recover(frame, pose, sensor_depth),
+                false => self.begin(frame, pose, sensor_depth),
+            };
+        };
         let is_lost = matches!(pose.state, TrackingState::Lost(_));
         if !self.is_about(pose, keyframe, is_lost) {
             return StepOutcome::default();
@@ -351,7 +361,11 @@ impl Mapper {
             return self.recover(frame, pose, sensor_depth);
         }
         self.phase = Phase::Mapping;
-        self.extend(frame, pose, sensor_depth, change_begins)
+        self.note_certainty(pose);
+        match self.is_locating() {
+            true => self.locate_frame(frame, pose),
+            false => self.extend(frame, pose, sensor_depth, change_begins),
+        }
     }
 
     /// Whether a pose is about the active keyframe: the tracker may not have seen this keyframe, or this epoch,
@@ -418,17 +432,6 @@ impl Mapper {
     /// The active keyframe, once there is one.
     pub fn keyframe(&self) -> Option<&Keyframe> {
         self.map.keyframes.get(self.active.as_ref()?.index)
-    }
-
-    /// What the mapper is doing, and why.
-    pub fn situation(&self) -> Situation {
-        match self.phase {
-            Phase::Starting => Situation::Starting(self.start.progress),
-            Phase::Mapping => Situation::Mapping,
-            Phase::Lost(_) => Situation::Lost,
-            Phase::Rejected(why, _) => Situation::Rejected(why),
-            Phase::Restarting(_) => Situation::Restarting(self.start.progress),
-        }
     }
 
     /// What the last frame came to, where it was one of a two-frame start.

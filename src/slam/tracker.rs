@@ -196,6 +196,11 @@ impl Tracker {
         self.memory.was_lost = true;
     }
 
+    /// Whether a tracker's first keyframe is one that the camera was found on: the first of a map are its first two.
+    pub fn is_found_on(keyframe_id: u64) -> bool {
+        keyframe_id > 1
+    }
+
     /// The active reference.
     pub fn reference(&self) -> Option<&Reference> {
         self.reference.as_deref()

@@ -12,7 +12,7 @@ use toml::{Table, Value};
 pub const EXPERT: &str = "expert";
 
 /// Keys outside `[expert]`: what a camera, a robot, a recording or a first try may need.
-const USER_KEYS: [&str; 36] = [
+const USER_KEYS: [&str; 39] = [
     "instance",
     "root",
     "capture.source",
@@ -40,6 +40,9 @@ const USER_KEYS: [&str; 36] = [
     "mapper.scheduling.priority",
     "mapper.scheduling.cpus",
     "mapper.scheduling.lock_memory",
+    "map.folder",
+    "map.read_only",
+    "map.detail",
     "mapping.depth_filter",
     "mapping.max_map_megabytes",
     "supervisor.watchdog_s",

@@ -16,8 +16,10 @@
 //! the journal and the recorder's map write the numbers of a keyframe alike ([`map_file`](crate::service::map_file)).
 
 pub mod depth_file;
+pub mod keeper;
 pub mod manifest;
 pub mod report;
+pub mod session;
 pub mod writer;
 
 use std::io;

@@ -78,12 +78,12 @@ impl Finder {
     pub(super) fn find(
         &mut self,
         keyframes: &[Keyframe],
-        active: usize,
+        active: Option<usize>,
         searched: &mut usize,
         pixels: &[u8],
         params: &RecoveryParams,
     ) -> Option<(usize, SE3)> {
-        let camera = keyframes.get(active)?.intrinsics;
+        let camera = keyframes.get(active.unwrap_or(0))?.intrinsics;
         let seen = Appearance::of(pixels, camera.width, camera.height)?;
         self.learn(keyframes);
         let mut alike = self.alike(keyframes, active, &seen).into_iter();
@@ -127,7 +127,7 @@ impl Finder {
     fn sharing(
         &mut self,
         keyframes: &[Keyframe],
-        active: usize,
+        active: Option<usize>,
         pixels: &[u8],
         most: usize,
     ) -> Vec<(usize, SE3)> {
@@ -137,7 +137,9 @@ impl Finder {
         ids.sort_unstable();
         let index_of =
             |id: u64| ids.binary_search_by_key(&id, |(id, _)| *id).ok().map(|known| ids[known].1);
-        let camera = keyframes[active].intrinsics;
+        let Some(camera) = keyframes.get(active.unwrap_or(0)).map(|of| of.intrinsics) else {
+            return Vec::new();
+        };
         let Some(seen) = self.describer.describe(pixels, camera.width, camera.height) else {
             return Vec::new();
         };
@@ -151,7 +153,12 @@ impl Finder {
     }
 
     /// Keyframes that may be gone back to, those that look most like `seen` first, the newest of equals.
-    fn alike(&self, keyframes: &[Keyframe], active: usize, seen: &Appearance) -> Vec<usize> {
+    fn alike(
+        &self,
+        keyframes: &[Keyframe],
+        active: Option<usize>,
+        seen: &Appearance,
+    ) -> Vec<usize> {
         let mut rated: Vec<(f32, usize)> = eligible(keyframes, active)
             .take(MOST_COMPARED)
             .filter_map(|index| Some((self.appearance(&keyframes[index])?.similarity(seen), index)))
@@ -166,7 +173,7 @@ impl Finder {
     pub(super) fn find_turned(
         &mut self,
         keyframes: &[Keyframe],
-        active: usize,
+        active: Option<usize>,
         compared: &mut usize,
         pixels: &[u8],
         params: &RecoveryParams,
@@ -179,7 +186,7 @@ impl Finder {
         /// alignment that wanders further fits something else.
         const MAX_ERROR_DEG: f64 = 15.0;
         let most = params.keyframes_per_frame.min(params.num_keyframes);
-        let camera = keyframes.get(active).filter(|_| most > 0)?.intrinsics;
+        let camera = keyframes.get(active.unwrap_or(0)).filter(|_| most > 0)?.intrinsics;
         let seen = Appearance::of(pixels, camera.width, camera.height)?;
         self.learn(keyframes);
         let eligible: Vec<usize> = eligible(keyframes, active)
@@ -231,6 +238,15 @@ impl Finder {
     pub(super) fn learn(&mut self, keyframes: &[Keyframe]) {
         /// 2.5 ms each at 640×480.
         const MOST_AT_ONCE: usize = 10;
+        self.learn_new(keyframes, MOST_AT_ONCE);
+    }
+
+    /// Looks at all keyframes of a map that was there before the first frame.
+    pub(super) fn learn_all(&mut self, keyframes: &[Keyframe]) {
+        self.learn_new(keyframes, usize::MAX);
+    }
+
+    fn learn_new(&mut self, keyframes: &[Keyframe], most: usize) {
         let known = self.appearances.last().map(|(id, _)| *id);
         // Those that keep only their poses are not looked for.
         let mut held = keyframes.iter().filter(|of| of.has_depth()).map(|of| of.keyframe_id);
@@ -242,7 +258,7 @@ impl Finder {
             next == Some(*id)
         });
         let new = keyframes.iter().filter(|keyframe| Some(keyframe.keyframe_id) > known);
-        for keyframe in new.take(MOST_AT_ONCE) {
+        for keyframe in new.take(most) {
             let Intrinsics { width, height, .. } = keyframe.intrinsics;
             let appearance = Appearance::of(&keyframe.image, width, height);
             self.appearances.push((keyframe.keyframe_id, appearance));
@@ -323,10 +339,10 @@ fn rotation_of(candidate: &Candidate, camera: &Intrinsics) -> UnitQuaternion<f64
 }
 
 /// Keyframes that may be gone back to, the newest first. The tracker itself looks around the active one.
-fn eligible(keyframes: &[Keyframe], active: usize) -> impl Iterator<Item = usize> {
+fn eligible(keyframes: &[Keyframe], active: Option<usize>) -> impl Iterator<Item = usize> {
     let is_eligible = move |index: &usize| {
         let keyframe = &keyframes[*index];
-        *index != active
+        Some(*index) != active
             && keyframe.map_state == MapState::Established
             && keyframe.points.len() >= least_points(&keyframe.intrinsics)
     };
@@ -360,7 +376,8 @@ mod tests {
         let mut searched = 0;
         let mut find = |finder: &mut Finder, view: SE3| {
             let pixels = scene.render(&CAMERA, &view).noisy(2.0, 9);
-            let (index, found) = finder.find(&keyframes, 2, &mut searched, &pixels, &params)?;
+            let (index, found) =
+                finder.find(&keyframes, Some(2), &mut searched, &pixels, &params)?;
             let placed = keyframes[index].map_from_keyframe.place(&found);
             let error = (view.inverse() * placed).log().norm();
             assert!(error < 0.02, "found {error} away from where it is");
@@ -385,7 +402,7 @@ mod tests {
         let params = RecoveryParams::default();
         let mut find = |doubted: Option<usize>| {
             doubted.into_iter().for_each(|index| finder.doubt(index));
-            finder.find(&keyframes, 2, &mut 0, &pixels, &params).unwrap().0
+            finder.find(&keyframes, Some(2), &mut 0, &pixels, &params).unwrap().0
         };
         let first = find(None);
         assert_eq!(find(Some(first)), 1 - first);
@@ -403,17 +420,17 @@ mod tests {
         let view = at([0.05, -0.05, 0.05, 0.0, 0.0, 0.0]) * at([0.0, 0.0, 0.0, 0.1, -0.1, 1.9]);
         let pixels = scene.render(&CAMERA, &view).noisy(2.0, 9);
         let mut finder = Finder::new(&CAMERA);
-        let (index, found) = finder.find(&keyframes, 2, &mut 0, &pixels, &params).unwrap();
+        let (index, found) = finder.find(&keyframes, Some(2), &mut 0, &pixels, &params).unwrap();
         let error = (view.inverse() * found).log().norm();
         assert!(index == 0 && error < 0.02, "found {error} away from where it is, on {index}");
         let mut compared = 0;
-        let found = finder.find_turned(&keyframes, 2, &mut compared, &pixels, &params);
+        let found = finder.find_turned(&keyframes, Some(2), &mut compared, &pixels, &params);
         let (index, found) = found.unwrap();
         assert_eq!((index, compared), (0, 2));
         let error = (view.inverse() * found).log().norm();
         assert!(error < 0.02, "found {error} away from where it is");
         let nowhere = scene.render(&CAMERA, &at([0.0, 0.0, 0.0, 0.0, -1.5, 0.0])).noisy(2.0, 9);
-        assert!(finder.find_turned(&keyframes, 2, &mut 0, &nowhere, &params).is_none());
+        assert!(finder.find_turned(&keyframes, Some(2), &mut 0, &nowhere, &params).is_none());
     }
 
     #[test]
@@ -430,7 +447,8 @@ mod tests {
         let pixels = known.image.clone();
         let params = RecoveryParams { keyframes_per_frame: 1, ..RecoveryParams::default() };
         let find = |keyframes: &[Keyframe], active: usize| {
-            let found = Finder::new(&CAMERA).find(keyframes, active, &mut 0, &pixels, &params);
+            let found =
+                Finder::new(&CAMERA).find(keyframes, Some(active), &mut 0, &pixels, &params);
             found.map(|(index, _)| index)
         };
         let without = numbered(vec![rejected, empty, active.clone()]);
@@ -453,7 +471,7 @@ mod tests {
         let pixels = scene.render(&CAMERA, &at([0.12, 0.0, 0.0, 0.0, 0.02, 0.0])).noisy(2.0, 5);
         let find = |keyframes_per_frame| {
             let params = RecoveryParams { keyframes_per_frame, ..RecoveryParams::default() };
-            let found = Finder::new(&CAMERA).find(&keyframes, 2, &mut 0, &pixels, &params);
+            let found = Finder::new(&CAMERA).find(&keyframes, Some(2), &mut 0, &pixels, &params);
             found.map(|(index, _)| index)
         };
         assert_eq!((find(1), find(2)), (None, Some(1)));

@@ -71,23 +71,23 @@ impl Mapper {
         // A view that holds the camera is no loss, and nothing to begin another map with.
         let is_held = pose.state.is_tracked() && !matches!(self.phase, Phase::Rejected(..));
         let lost_secs = if is_held { 0.0 } else { loss.lasting.secs(frame.capture_nanos) };
-        if let Some(active) = self.active {
+        let active = self.active.map(|active| active.index);
+        if active.is_some() || self.is_localising() {
             let (keyframes, params) = (&self.map.keyframes, &self.params.recovery);
             let searched = &mut loss.searched;
-            let found = self.finder.find(keyframes, active.index, searched, frame.pixels, params);
+            let found = self.finder.find(keyframes, active, searched, frame.pixels, params);
             if let Some((index, at)) = self.believed(found, pose, frame.pixels) {
                 return self.restore_keyframe(index, &at);
             }
             let (keyframes, params) = (&self.map.keyframes, &self.params.recovery);
             let compared = &mut loss.compared;
-            let found =
-                self.finder.find_turned(keyframes, active.index, compared, frame.pixels, params);
+            let found = self.finder.find_turned(keyframes, active, compared, frame.pixels, params);
             if let Some((index, at)) = self.believed(found, pose, frame.pixels) {
                 return self.restore_keyframe(index, &at);
             }
         }
         self.phase = self.phase.with_loss(loss);
-        if is_held {
+        if is_held || self.is_locating() {
             return StepOutcome::default();
         }
         let is_restarting = matches!(self.phase, Phase::Restarting(_));
@@ -200,17 +200,26 @@ impl Mapper {
         self.depth.restart(&keyframe.image, &self.params);
         restore_points(&mut self.depth.active, &keyframe.points);
         // One of another epoch brings the place and the unit back that its map has in odometry's world.
-        if self.keyframe().is_some_and(|active| active.epoch != keyframe.epoch) {
-            self.world_from_map =
-                keyframe.world_from_keyframe * keyframe.map_from_keyframe.inverse();
+        let is_first = self.active.is_none();
+        if self.keyframe().is_none_or(|active| active.epoch != keyframe.epoch) {
+            self.world_from_map = Self::world_from_map_of(keyframe);
         }
         self.anchor(keyframe.keyframe_id, keyframe_from_camera);
         self.past.clear();
         self.drop_early_frames();
         self.phase = Phase::Mapping;
         self.doubt = Doubt::None;
+        if self.is_locating() {
+            return self.enter_unchanged(index);
+        }
         self.enter_keyframe(index);
-        StepOutcome { keyframe_restored: true, keyframe_changed: true, ..Default::default() }
+        StepOutcome {
+            keyframe_restored: true,
+            keyframe_changed: true,
+            // The rest of a map that was there before is told of with the first of it.
+            graph_changed: is_first,
+            ..Default::default()
+        }
     }
 }
 

@@ -104,7 +104,7 @@ impl Mapper {
         self.depth.restart(&keyframe.image, &self.params);
         restore_points(&mut self.depth.active, &keyframe.points);
         // Where odometry had it when it died.
-        self.world_from_map = keyframe.world_from_keyframe * keyframe.map_from_keyframe.inverse();
+        self.world_from_map = Self::world_from_map_of(keyframe);
         self.past.clear();
         self.phase = Phase::Mapping;
         self.enter_keyframe(index);

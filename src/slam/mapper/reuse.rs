@@ -43,38 +43,61 @@ impl ReuseParams {
     }
 }
 
+/// A keyframe near the camera, and what was measured on it.
+pub(super) struct NearKeyframe {
+    /// Its place in the map.
+    pub(super) index: usize,
+    pub(super) keyframe_id: u64,
+    /// In its unit.
+    pub(super) keyframe_from_camera: SE3,
+    /// Of the frame against it.
+    pub(super) brightness: Brightness,
+}
+
 impl Mapper {
     /// Makes the nearest earlier keyframe active again, if one is near enough, shows the frame and
     /// agrees with its pose. Its depth is what it was left with and what the present keyframe adds.
     pub(super) fn reuse_keyframe(&mut self, frame: &FrameView<'_>, pose: &PoseEstimate) -> bool {
-        let Some(present) = self.keyframe() else { return false };
-        let map_from_camera = present.map_from_keyframe.place(&pose.keyframe_from_camera);
-        let Some((index, expected)) = self.nearest_keyframe(&map_from_camera) else {
-            return false;
-        };
-        let keyframe = &self.map.keyframes[index];
-        let limit = self.params.reuse.max_disagreement;
-        let Some(measured) = self.finder.locate(keyframe, frame.pixels, &expected, limit) else {
-            return false;
-        };
-        let keyframe_from_camera = measured.state.current_from_keyframe.inverse();
+        let max_distance = self.params.reuse.max_distance;
+        let Some(near) = self.near_keyframe(frame, pose, max_distance) else { return false };
         // Exact poses are the world's own, and need no anchor.
         let is_exact = pose.alignment_covariance.iter().all(|entry| *entry == 0.0);
         if !is_exact {
-            self.anchor(keyframe.keyframe_id, &keyframe_from_camera);
+            self.anchor(near.keyframe_id, &near.keyframe_from_camera);
         }
-        self.take_up(index, between(pose.brightness, measured.state.brightness));
+        self.take_up(near.index, between(pose.brightness, near.brightness));
         true
+    }
+
+    /// The nearest other keyframe below a distance of the camera, where it shows the frame and agrees with its pose.
+    pub(super) fn near_keyframe(
+        &mut self,
+        frame: &FrameView<'_>,
+        pose: &PoseEstimate,
+        max_distance: f64,
+    ) -> Option<NearKeyframe> {
+        let present = self.keyframe()?;
+        let map_from_camera = present.map_from_keyframe.place(&pose.keyframe_from_camera);
+        let (index, expected) = self.nearest_keyframe(&map_from_camera, max_distance)?;
+        let keyframe = self.map.keyframes.get(index)?;
+        let limit = self.params.reuse.max_disagreement;
+        let measured = self.finder.locate(keyframe, frame.pixels, &expected, limit)?;
+        Some(NearKeyframe {
+            index,
+            keyframe_id: keyframe.keyframe_id,
+            keyframe_from_camera: measured.state.current_from_keyframe.inverse(),
+            brightness: measured.state.brightness,
+        })
     }
 
     /// The other keyframe of the epoch with the smallest distance to the camera, if that is small enough, and
     /// the camera's pose on it.
-    fn nearest_keyframe(&self, map_from_camera: &SE3) -> Option<(usize, SE3)> {
+    fn nearest_keyframe(&self, map_from_camera: &SE3, max_distance: f64) -> Option<(usize, SE3)> {
         let present = self.keyframe()?;
         let params = &self.params.reuse;
-        let reach = params.distance.reach(params.max_distance);
+        let reach = params.distance.reach(max_distance);
         let mut nearest = None;
-        let mut least = params.max_distance;
+        let mut least = max_distance;
         for (index, view) in self.map.seen_from(present.epoch, map_from_camera, reach) {
             let keyframe = &self.map.keyframes[index];
             let is_eligible = keyframe.keyframe_id != present.keyframe_id

@@ -2,7 +2,10 @@
 
 use std::fmt;
 
+use crate::slam::mapper::Mapper;
 use crate::slam::mapper::consistency::Contradiction;
+use crate::slam::mapper::phase::Phase;
+use crate::slam::pose::PoseEstimate;
 use crate::slam::two_frame::evidence::Waiting;
 use crate::slam::two_frame::{Failure, InitOutcome, InitState};
 
@@ -13,6 +16,10 @@ pub enum Situation {
     Starting(StartProgress),
     /// The first depth is random and not proven.
     Unproven,
+    /// The camera is looked for on so many keyframes of a map that was there before.
+    Localising(usize),
+    /// It was found there, and nothing has been added yet, or nothing is to be.
+    Localised(Certainty),
     /// The map can be trusted and grows.
     Mapping,
     /// The camera is lost; recent keyframes are searched for it.
@@ -23,11 +30,65 @@ pub enum Situation {
     Restarting(StartProgress),
 }
 
+/// How sure it is where the camera is in a map.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Certainty {
+    /// Share of the keyframe's points in view that the image agrees with, per cent.
+    pub inlier_percent: u32,
+    /// Standard deviation of the camera's position on the keyframe, thousandths of the mean depth.
+    pub position_permille: u32,
+}
+
+impl Certainty {
+    /// Of a pose on its keyframe, whose unit is the mean depth.
+    pub(super) fn of(pose: &PoseEstimate) -> Self {
+        /// Places of the variances of the translation in the covariance.
+        const VARIANCES: [usize; 3] = [0, 6, 11];
+        let variance: f64 = VARIANCES.iter().map(|&place| pose.covariance[place]).sum();
+        let std_dev = Some(variance.sqrt()).filter(|of| of.is_finite()).unwrap_or(f64::MAX);
+        Self {
+            inlier_percent: (100.0 * pose.quality.inlier_ratio).round() as u32,
+            position_permille: (1000.0 * std_dev).ceil() as u32,
+        }
+    }
+}
+
+impl fmt::Display for Certainty {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let tenths = (self.position_permille / 10, self.position_permille % 10);
+        write!(
+            f,
+            "{} % of the points agree, position within {}.{} % of the mean depth",
+            self.inlier_percent, tenths.0, tenths.1
+        )
+    }
+}
+
+impl Mapper {
+    /// What the mapper is doing, and why.
+    pub fn situation(&self) -> Situation {
+        match self.phase {
+            Phase::Starting => Situation::Starting(self.start.progress),
+            Phase::Mapping => self.certainty().map_or(Situation::Mapping, Situation::Localised),
+            Phase::Lost(_) | Phase::Restarting(_) if self.is_localising() => {
+                Situation::Localising(self.map.keyframes.len())
+            }
+            Phase::Lost(_) => Situation::Lost,
+            Phase::Rejected(why, _) => Situation::Rejected(why),
+            Phase::Restarting(_) => Situation::Restarting(self.start.progress),
+        }
+    }
+}
+
 impl fmt::Display for Situation {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Starting(progress) => write!(f, "starting: {progress}"),
             Self::Unproven => f.write_str("starting: random depth is not proven yet"),
+            Self::Localising(keyframes) => {
+                write!(f, "localising: looking for the camera on {keyframes} keyframes of the map")
+            }
+            Self::Localised(certainty) => write!(f, "localised in the map: {certainty}"),
             Self::Mapping => f.write_str("mapping"),
             Self::Lost => f.write_str("lost: looking for the camera on recent keyframes"),
             Self::Rejected(why) => write!(f, "map rejected: {why}"),

@@ -1,0 +1,192 @@
+//! Keeps a map on disk while it is made: on a thread of its own, so that no frame waits for a file.
+//!
+//! With every keyframe that is made, and every correction, what is new goes to the disk: a keyframe when it is left, and
+//! of those that have changed since they were written one, the one that has waited longest; then the manifest, with the
+//! newest place of all. So a save costs two keyframes at most, however large the map is, and a process that is killed
+//! leaves a map that lacks the keyframe it was at. What has changed and was not written yet is at the end.
+
+use std::collections::BTreeMap;
+use std::io;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+
+use crate::service::map_folder::writer::{MapHead, MapWriter};
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::map::Map;
+use crate::slam::mapper::{Mapper, StepOutcome};
+
+/// Keyframes that wait to be written; a disk that is slower than that gets the others later.
+const MOST_WAITING: usize = 8;
+
+/// Follows a mapper.
+#[derive(Debug)]
+pub struct MapKeeper {
+    camera: Intrinsics,
+    shared: Arc<Shared>,
+    thread: Option<JoinHandle<()>>,
+    /// Revisions of keyframes that were handed over, by their id.
+    handed: BTreeMap<u64, u64>,
+}
+
+#[derive(Debug)]
+struct Shared {
+    waiting: Mutex<Waiting>,
+    wake: Condvar,
+    writer: Mutex<MapWriter>,
+}
+
+/// What the thread is to write.
+#[derive(Debug, Default)]
+struct Waiting {
+    keyframes: BTreeMap<u64, Keyframe>,
+    head: Option<MapHead>,
+    is_over: bool,
+    /// Why the last save failed; `None` where it did not.
+    failure: Option<String>,
+}
+
+impl MapKeeper {
+    /// Keeps the map of `camera` in a folder whose map `loaded` is already there.
+    pub fn start(writer: MapWriter, camera: Intrinsics, loaded: &Map) -> io::Result<Self> {
+        let shared = Arc::new(Shared {
+            waiting: Mutex::default(),
+            wake: Condvar::new(),
+            writer: Mutex::new(writer),
+        });
+        let theirs = Arc::clone(&shared);
+        let thread = std::thread::Builder::new()
+            .name("semidense-save".to_owned())
+            .spawn(move || save_until_over(&theirs, &camera))?;
+        let handed = loaded.keyframes.iter().map(|of| (of.keyframe_id, of.revision));
+        Ok(Self { camera, shared, thread: Some(thread), handed: handed.collect() })
+    }
+
+    /// Hands over what a step or a correction has changed.
+    pub fn follow(&mut self, mapper: &Mapper, outcome: &StepOutcome) {
+        if !(outcome.needs_image() || outcome.graph_changed) {
+            return;
+        }
+        let (map, active) = (mapper.map(), mapper.keyframe().map(|keyframe| keyframe.keyframe_id));
+        let of_map = map.keyframes.iter().filter(|of| is_kept(of, &self.camera));
+        let left = of_map.filter(|of| Some(of.keyframe_id) != active);
+        let (mut new, mut changed) = (Vec::new(), None);
+        for keyframe in left {
+            match self.handed.get(&keyframe.keyframe_id) {
+                None => new.push(keyframe),
+                Some(handed) if *handed < keyframe.revision => {
+                    if changed.is_none_or(|(least, _)| *handed < least) {
+                        changed = Some((*handed, keyframe));
+                    }
+                }
+                Some(_) => {}
+            }
+        }
+        let head = head_of(mapper);
+        let mut waiting = locked(&self.shared.waiting);
+        for keyframe in new.into_iter().chain(changed.map(|(_, keyframe)| keyframe)) {
+            if waiting.keyframes.len() < MOST_WAITING {
+                self.handed.insert(keyframe.keyframe_id, keyframe.revision);
+                waiting.keyframes.insert(keyframe.keyframe_id, keyframe.clone());
+            }
+        }
+        waiting.head = Some(head);
+        drop(waiting);
+        self.shared.wake.notify_one();
+    }
+
+    /// Writes all that is not on the disk yet, before it returns. `each` is called before each keyframe: it may take
+    /// longer than a process may be silent.
+    pub fn save_all(&mut self, mapper: &Mapper, each: &mut dyn FnMut()) -> Result<(), String> {
+        let mut writer = locked(&self.shared.writer);
+        let mut waiting = locked(&self.shared.waiting);
+        waiting.head = None;
+        // What waits is older than what is written now, and what was written in vain is written again.
+        for keyframe_id in std::mem::take(&mut waiting.keyframes).into_keys() {
+            self.handed.remove(&keyframe_id);
+        }
+        if waiting.failure.is_some() {
+            self.handed.clear();
+        }
+        drop(waiting);
+        let camera = self.camera;
+        for keyframe in mapper.map().keyframes.iter().filter(|of| is_kept(of, &camera)) {
+            each();
+            if self.handed.get(&keyframe.keyframe_id) == Some(&keyframe.revision) {
+                continue;
+            }
+            writer.put(keyframe).map_err(|error| error.to_string())?;
+            self.handed.insert(keyframe.keyframe_id, keyframe.revision);
+        }
+        writer.save(&self.camera, head_of(mapper)).map_err(|error| error.to_string())
+    }
+
+    /// Why the last save failed.
+    pub fn failure(&self) -> Option<String> {
+        locked(&self.shared.waiting).failure.clone()
+    }
+}
+
+/// Whether a keyframe has what a file would hold.
+fn is_kept(keyframe: &Keyframe, camera: &Intrinsics) -> bool {
+    keyframe.has_depth()
+        && keyframe.map_state == MapState::Established
+        && keyframe.intrinsics == *camera
+}
+
+impl Drop for MapKeeper {
+    fn drop(&mut self) {
+        locked(&self.shared.waiting).is_over = true;
+        self.shared.wake.notify_one();
+        if let Some(thread) = self.thread.take() {
+            // A panic of the thread has been reported where it happened.
+            drop(thread.join());
+        }
+    }
+}
+
+/// The list of all keyframes.
+fn head_of(mapper: &Mapper) -> MapHead {
+    let map = mapper.map();
+    MapHead {
+        keyframes: map.keyframes.iter().map(Keyframe::without_depth).collect(),
+        revision: map.revision,
+        free_epoch: mapper.free_epoch(),
+    }
+}
+
+/// What is behind it is whole between any two of its changes, also where a thread has panicked.
+fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn save_until_over(shared: &Shared, camera: &Intrinsics) {
+    loop {
+        let mut waiting = locked(&shared.waiting);
+        while waiting.head.is_none() && !waiting.is_over {
+            waiting = shared.wake.wait(waiting).unwrap_or_else(PoisonError::into_inner);
+        }
+        let is_over = waiting.is_over;
+        drop(waiting);
+        save_waiting(shared, camera);
+        if is_over {
+            return;
+        }
+    }
+}
+
+/// One save of what waits.
+fn save_waiting(shared: &Shared, camera: &Intrinsics) {
+    let mut writer = locked(&shared.writer);
+    let mut waiting = locked(&shared.waiting);
+    let (keyframes, head) = (std::mem::take(&mut waiting.keyframes), waiting.head.take());
+    drop(waiting);
+    let Some(head) = head else { return };
+    let put = keyframes.values().try_for_each(|keyframe| writer.put(keyframe));
+    let failure = put.and_then(|()| writer.save(camera, head)).err().map(|error| error.to_string());
+    let mut waiting = locked(&shared.waiting);
+    if let (Some(failure), true) = (&failure, failure != waiting.failure) {
+        tracing::warn!("{failure}; the map on the disk is the one saved before");
+    }
+    waiting.failure = failure;
+}

@@ -1,0 +1,139 @@
+//! A process's use of a map folder: read at its start, kept while it maps, whole at its end.
+
+use std::path::PathBuf;
+
+use crate::service::config::MapConfig;
+use crate::service::map_folder::keeper::MapKeeper;
+use crate::service::map_folder::writer::MapWriter;
+use crate::service::map_folder::{Loaded, MapFolderError, load, read_manifest};
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::map::Map;
+use crate::slam::mapper::prior::{MapUse, PriorError};
+use crate::slam::mapper::{Mapper, StepOutcome};
+
+/// Why a process cannot use a map.
+#[derive(Debug, thiserror::Error)]
+pub enum MapSessionError {
+    /// The folder cannot be read or written.
+    #[error(transparent)]
+    Folder(#[from] MapFolderError),
+    /// The map cannot be begun in.
+    #[error("{folder}: {source}")]
+    Prior {
+        /// The map.
+        folder: PathBuf,
+        /// Why.
+        source: PriorError,
+    },
+    /// No thread.
+    #[error("cannot start the thread that saves the map ({0})")]
+    Thread(std::io::Error),
+    /// The last save failed.
+    #[error("{0}")]
+    Save(String),
+}
+
+/// A map that is used.
+#[derive(Debug)]
+pub struct MapSession {
+    folder: PathBuf,
+    map_use: MapUse,
+    /// Until the camera is known.
+    loaded: Option<Map>,
+    camera: Option<Intrinsics>,
+    writer: Option<MapWriter>,
+    keeper: Option<MapKeeper>,
+}
+
+impl MapSession {
+    /// Reads the map that the configuration names, with the threads of the pool it is called in; `None` where it names
+    /// none. What is damaged is told in the log.
+    pub fn open(config: &MapConfig, max_bytes: usize) -> Result<Option<Self>, MapFolderError> {
+        if config.folder.is_empty() {
+            return Ok(None);
+        }
+        let folder = PathBuf::from(&config.folder);
+        let map_use = if config.read_only { MapUse::Locate } else { MapUse::Extend };
+        let writer = match map_use {
+            MapUse::Extend => Some(MapWriter::open(&folder, config.detail)?),
+            MapUse::Locate => None,
+        };
+        let loaded = match &writer {
+            Some(writer) if writer.camera().is_none() => None,
+            _ => Some(load(&folder, max_bytes)?),
+        };
+        loaded.iter().for_each(|loaded| tell_what_is_missing(loaded, max_bytes));
+        let camera = loaded.as_ref().map(|loaded| loaded.manifest.camera);
+        let loaded = loaded.map(|loaded| loaded.map);
+        Ok(Some(Self { folder, map_use, loaded, camera, writer, keeper: None }))
+    }
+
+    /// Lets a mapper of `camera` begin in the map, before its first frame.
+    pub fn begin(
+        &mut self,
+        mapper: &mut Mapper,
+        camera: &Intrinsics,
+    ) -> Result<(), MapSessionError> {
+        if let Some(map) = self.camera.filter(|map| map != camera) {
+            let (map, camera) = (Box::new(map), Box::new(*camera));
+            return Err(MapFolderError::Camera { folder: self.folder.clone(), map, camera }.into());
+        }
+        let map = self.loaded.take().unwrap_or_default();
+        if let Some(writer) = self.writer.take() {
+            let keeper =
+                MapKeeper::start(writer, *camera, &map).map_err(MapSessionError::Thread)?;
+            self.keeper = Some(keeper);
+        }
+        let folder = self.folder.clone();
+        mapper
+            .begin_in(map, self.map_use)
+            .map_err(|source| MapSessionError::Prior { folder, source })
+    }
+
+    /// Keeps what a step or a correction has changed.
+    pub fn follow(&mut self, mapper: &Mapper, outcome: &StepOutcome) {
+        self.keeper.iter_mut().for_each(|keeper| keeper.follow(mapper, outcome));
+    }
+
+    /// Writes all that is not on the disk yet, before it returns; nothing where the map stays as it is. `each` is called
+    /// before each keyframe.
+    pub fn save_all(
+        &mut self,
+        mapper: &Mapper,
+        each: &mut dyn FnMut(),
+    ) -> Result<(), MapSessionError> {
+        let Some(keeper) = &mut self.keeper else { return Ok(()) };
+        keeper.save_all(mapper, each).map_err(MapSessionError::Save)
+    }
+
+    /// Why the last save failed.
+    pub fn failure(&self) -> Option<String> {
+        self.keeper.as_ref()?.failure()
+    }
+}
+
+/// Checks a map before anything is started: whether it can be read, or begun.
+pub fn check(config: &MapConfig) -> Result<(), MapFolderError> {
+    if config.folder.is_empty() {
+        return Ok(());
+    }
+    let folder = PathBuf::from(&config.folder);
+    match config.read_only {
+        true => read_manifest(&folder).map(drop),
+        false => MapWriter::open(&folder, config.detail).map(drop),
+    }
+}
+
+fn tell_what_is_missing(loaded: &Loaded, max_bytes: usize) {
+    const MEGABYTE: usize = 1_000_000;
+    loaded.problems.iter().for_each(|problem| tracing::warn!("{problem}"));
+    if loaded.without_memory > 0 {
+        tracing::warn!(
+            "{} of {} keyframes of the map are left without depth, so that the others take at most {} MB: raise \
+             mapping.max_map_megabytes to find the camera on them too",
+            loaded.without_memory,
+            loaded.map.keyframes.len(),
+            max_bytes / MEGABYTE
+        );
+    }
+}

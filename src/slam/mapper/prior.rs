@@ -1,0 +1,153 @@
+//! A map of earlier runs: the camera is looked for on its keyframes, and found there the map goes on, or is left as it
+//! is and only tells where the camera is.
+
+use crate::slam::frame::FrameView;
+use crate::slam::geometry::sim3::Sim3;
+use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::map::Map;
+use crate::slam::mapper::phase::{Active, Loss, Phase};
+use crate::slam::mapper::situation::Certainty;
+use crate::slam::mapper::{Mapper, StepOutcome};
+use crate::slam::pose::PoseEstimate;
+
+/// What is done with a map of earlier runs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MapUse {
+    /// It goes on.
+    Extend,
+    /// It stays as it is: no keyframe is added, and no depth and no place changes.
+    Locate,
+}
+
+/// Why a mapper cannot begin in a map.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum PriorError {
+    /// Keyframes of another camera.
+    #[error("keyframe {0} was taken with another camera")]
+    Camera(u64),
+    /// Nothing to be found.
+    #[error("the map has no keyframe with depth to find the camera on")]
+    Empty,
+}
+
+/// The map that a mapper has begun in.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Prior {
+    map_use: MapUse,
+    /// Ids below are those of its keyframes.
+    first_own: u64,
+    /// Of the last pose.
+    certainty: Certainty,
+}
+
+impl Mapper {
+    /// Begins in a map of earlier runs, before the first frame: its epochs, ids and revisions go on, and each frame is
+    /// looked for on its keyframes. Odometry begins where the map has the camera then.
+    pub fn begin_in(&mut self, map: Map, map_use: MapUse) -> Result<(), PriorError> {
+        let foreign = map.keyframes.iter().find(|of| of.intrinsics != self.intrinsics);
+        if let Some(foreign) = foreign {
+            return Err(PriorError::Camera(foreign.keyframe_id));
+        }
+        let is_usable = |of: &Keyframe| of.has_depth() && of.map_state == MapState::Established;
+        let is_empty = !map.keyframes.iter().any(is_usable);
+        let newest = |number: fn(&Keyframe) -> u64| map.keyframes.iter().map(number).max();
+        self.revision = newest(|keyframe| keyframe.revision).unwrap_or(0);
+        self.next_keyframe_id = newest(|keyframe| keyframe.keyframe_id).map_or(0, |id| id + 1);
+        self.first_free_epoch = map.free_epoch;
+        if map_use == MapUse::Locate {
+            // Nothing is estimated.
+            self.window = None;
+            self.params.window.num_free = 0;
+        } else if is_empty {
+            self.map.revision = map.revision;
+            return Ok(());
+        }
+        if is_empty {
+            return Err(PriorError::Empty);
+        }
+        self.map = map;
+        for keyframe in &mut self.map.keyframes {
+            keyframe.world_from_keyframe = keyframe.map_from_keyframe;
+        }
+        self.finder.learn_all(&self.map.keyframes);
+        self.phase = Phase::Lost(Loss::default());
+        let certainty = Certainty::default();
+        self.prior = Some(Prior { map_use, first_own: self.next_keyframe_id, certainty });
+        Ok(())
+    }
+
+    /// Numbers of epochs from here on are given by nobody yet.
+    pub fn free_epoch(&self) -> u32 {
+        self.next_epoch()
+    }
+
+    /// Whether the map stays as it is.
+    pub(super) fn is_locating(&self) -> bool {
+        self.prior.is_some_and(|prior| prior.map_use == MapUse::Locate)
+    }
+
+    /// The camera was not found yet on the map that was there before.
+    pub(super) fn is_localising(&self) -> bool {
+        self.prior.is_some() && self.active.is_none()
+    }
+
+    /// How sure the place is, as long as the keyframe that it was found on is one of the map that was there before.
+    pub(super) fn certainty(&self) -> Option<Certainty> {
+        let (prior, keyframe) = (self.prior?, self.keyframe()?);
+        let is_known = prior.map_use == MapUse::Locate || keyframe.keyframe_id < prior.first_own;
+        is_known.then_some(prior.certainty)
+    }
+
+    /// Keeps how sure a tracked pose is.
+    pub(super) fn note_certainty(&mut self, pose: &PoseEstimate) {
+        if let Some(prior) = &mut self.prior {
+            prior.certainty = Certainty::of(pose);
+        }
+    }
+
+    /// A tracked frame where the map stays as it is: near another keyframe that becomes the active one.
+    pub(super) fn locate_frame(
+        &mut self,
+        frame: &FrameView<'_>,
+        pose: &PoseEstimate,
+    ) -> StepOutcome {
+        /// Where the tracker asks for another keyframe: any that is nearer than that will do.
+        const MAX_DISTANCE: f64 = 1.0;
+        self.last_world_from_camera = Some(pose.world_from_camera);
+        self.last_tracked = Some((pose.keyframe_id, pose.keyframe_from_camera));
+        let Some(active) = &mut self.active else { return StepOutcome::default() };
+        active.frames += 1;
+        if !pose.proposes_keyframe || active.frames < self.params.min_keyframe_interval {
+            return StepOutcome::default();
+        }
+        match self.near_keyframe(frame, pose, MAX_DISTANCE) {
+            Some(near) => {
+                self.anchor(near.keyframe_id, &near.keyframe_from_camera);
+                self.enter_unchanged(near.index)
+            }
+            None => StepOutcome::default(),
+        }
+    }
+
+    /// Makes a keyframe of the map the active one, and leaves it as it is.
+    pub(super) fn enter_unchanged(&mut self, index: usize) -> StepOutcome {
+        let is_first = self.active.is_none();
+        self.active = Some(Active::new(index));
+        if let Some(keyframe) = self.map.keyframes.get(index) {
+            self.modes.enter(&keyframe.mode_covariance, &self.params.modes);
+        }
+        self.revision += 1;
+        self.publish_place();
+        StepOutcome {
+            keyframe_restored: true,
+            keyframe_changed: true,
+            graph_changed: is_first,
+            ..Default::default()
+        }
+    }
+
+    /// Where a keyframe's map lies in odometry's world as odometry had it last.
+    pub(super) fn world_from_map_of(keyframe: &Keyframe) -> Sim3 {
+        keyframe.world_from_keyframe * keyframe.map_from_keyframe.inverse()
+    }
+}
