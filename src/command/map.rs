@@ -3,18 +3,23 @@
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::time::{Duration, UNIX_EPOCH};
 
 use clap::{Args, Subcommand};
 
 use crate::command::CommandResult;
 use crate::command::print::{note, print};
 use crate::service::config::{Config, MapConfig};
+use crate::service::map_folder::merge::merge;
 use crate::service::map_folder::report::{MapReport, export};
 use crate::service::map_folder::session::check;
 use crate::service::map_folder::{Loaded, load};
 use crate::service::results::output_folder::utc_text;
+use crate::wire::command::{Command, CommandClient};
+use crate::wire::place::Place;
+use crate::wire::port::{Access, Hub};
 
-/// Say what a map on disk holds, export it, or join two
+/// Check, export, save and merge maps on disk
 ///
 /// A map is a folder that `run`, `replay` and the services begin or continue with --map DIR.
 #[derive(Debug, Args)]
@@ -65,6 +70,33 @@ impl MapOptions {
 enum MapCommand {
     Info(InfoArguments),
     Export(ExportArguments),
+    Save(SaveArguments),
+    Merge(MergeArguments),
+}
+
+/// Have the running mapper save its map now
+#[derive(Debug, Args)]
+struct SaveArguments {
+    /// Folder that holds no map yet [default: the one that the mapper was started with]
+    #[arg(value_name = "DIR")]
+    folder: Option<PathBuf>,
+}
+
+/// Write two maps of one camera into one
+///
+/// The epochs of both are kept, each with a place and a unit of its own, and the camera is found in either. They are not
+/// moved onto each other, even where they show the same place.
+#[derive(Debug, Args)]
+struct MergeArguments {
+    /// The first map: its numbers stay
+    #[arg(value_name = "A")]
+    first: PathBuf,
+    /// The second map: its keyframes and epochs get new numbers
+    #[arg(value_name = "B")]
+    second: PathBuf,
+    /// Folder of the new map
+    #[arg(long, value_name = "DIR")]
+    output: PathBuf,
 }
 
 /// Check every file of a map and say what it holds; exit code 1 where something is damaged
@@ -97,6 +129,8 @@ pub fn run(config: &Config, arguments: MapArguments) -> CommandResult {
     match arguments.command {
         MapCommand::Info(arguments) => info(&arguments),
         MapCommand::Export(arguments) => export_map(config, &arguments),
+        MapCommand::Save(arguments) => save(config, &arguments),
+        MapCommand::Merge(arguments) => merge_maps(&arguments),
     }
 }
 
@@ -120,7 +154,7 @@ fn info(arguments: &InfoArguments) -> CommandResult {
 fn text_of(report: &MapReport) -> String {
     const MEGABYTE: f64 = 1e6;
     let [fx, fy, cx, cy] = report.intrinsics;
-    let saved = std::time::UNIX_EPOCH + std::time::Duration::from_secs(report.saved_secs);
+    let saved = UNIX_EPOCH + Duration::from_secs(report.saved_secs);
     let detail = serde_json::to_value(report.detail).ok();
     let detail = detail.as_ref().and_then(serde_json::Value::as_str).unwrap_or_default();
     let mut lines = vec![
@@ -172,6 +206,29 @@ fn export_map(config: &Config, arguments: &ExportArguments) -> CommandResult {
     print(&format!(
         "{}: map.ply with {points} points, keyframes.txt with {keyframes} poses of epoch {epoch}\n",
         arguments.output.display()
+    ))?;
+    Ok(ExitCode::SUCCESS)
+}
+
+fn save(config: &Config, arguments: &SaveArguments) -> CommandResult {
+    let folder = arguments.folder.as_ref().map(std::path::absolute).transpose()?;
+    let place = Place::new(&config.instance, &config.root)?;
+    let hub = Hub::join(&place, "map-save", Access::Observer)?;
+    let timeout = Duration::from_secs_f64(config.supervisor.save_timeout_s);
+    let command = Command::SaveFolder(folder.clone().unwrap_or_default());
+    CommandClient::open(&hub)?.ask(&command, timeout, || true)?;
+    let place = folder.map_or("its folder".to_owned(), |folder| folder.display().to_string());
+    print(&format!("saved in {place}\n"))?;
+    Ok(ExitCode::SUCCESS)
+}
+
+fn merge_maps(arguments: &MergeArguments) -> CommandResult {
+    let (first, second) = (load_all(&arguments.first)?, load_all(&arguments.second)?);
+    let map = merge(&arguments.output, first, second, &arguments.second)?;
+    print(&format!(
+        "{}: {} keyframes; the epochs of both maps are kept apart\n",
+        arguments.output.display(),
+        map.keyframes.len()
     ))?;
     Ok(ExitCode::SUCCESS)
 }

@@ -6,6 +6,7 @@ use clap::Args;
 
 use crate::command::CommandResult;
 use crate::command::capture::ModeArguments;
+use crate::command::map::MapOptions;
 use crate::service::config::Config;
 use crate::service::mapper::run as run_shell;
 use crate::service::mode::Mode;
@@ -16,11 +17,14 @@ use crate::service::shutdown::Shutdown;
 pub struct MapperArguments {
     #[command(flatten)]
     mode: ModeArguments,
+    #[command(flatten)]
+    map: MapOptions,
 }
 
 /// Runs it.
 pub fn run(config: &Config, arguments: MapperArguments) -> CommandResult {
     let shutdown = Shutdown::install()?;
+    let config = &Config { map: arguments.map.of(config)?, ..config.clone() };
     run_shell(config, arguments.mode.mode(Mode::Live), &shutdown)?;
     Ok(ExitCode::SUCCESS)
 }

@@ -7,6 +7,7 @@ use clap::Args;
 
 use crate::command::capture::{ModeArguments, SourceArguments, usual_mode};
 use crate::command::ending::{Ending, note_unfinished, run_start};
+use crate::command::map::MapOptions;
 use crate::command::print::note;
 use crate::command::run_progress::start_display;
 use crate::command::{CommandResult, CommonArguments, INTERRUPTED};
@@ -30,6 +31,8 @@ pub struct RunArguments {
     source: SourceArguments,
     #[command(flatten)]
     mode: ModeArguments,
+    #[command(flatten)]
+    map: MapOptions,
     /// Folder for trajectory, keyframes, map, summary and report [default: a new folder under ./output named by the
     /// time (UTC); output/latest links to the newest]
     #[arg(long, value_name = "DIR")]
@@ -50,6 +53,11 @@ pub fn run(
     if arguments.source.strict {
         child_arguments.extend(["--set".into(), "capture.strict=true".into()]);
     }
+    let map = arguments.map.of(config)?;
+    if !map.folder.is_empty() {
+        child_arguments.extend(MapOptions::settings(&map));
+    }
+    let config = &Config { map, ..config.clone() };
     let (source, rig) = arguments.source.source_and_rig(&config.capture)?;
     let mode = arguments.mode.mode(usual_mode(&source));
     let place = Place::new(&config.instance, &config.root)?;

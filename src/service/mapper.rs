@@ -13,6 +13,8 @@ use crate::service::config::Config;
 use crate::service::frame_order::{Arrival, FrameOrder, SILENCE};
 use crate::service::health::{Health, ProcessState};
 use crate::service::map_file::write_map;
+use crate::service::map_folder::save_copy;
+use crate::service::map_folder::session::{MapSession, MapSessionError};
 use crate::service::mapper::output::Output;
 use crate::service::mode::Mode;
 use crate::service::pairing::Pairing;
@@ -20,7 +22,7 @@ use crate::service::schedule::{Background, apply, in_force};
 use crate::service::shutdown::Shutdown;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::map::Map;
-use crate::slam::mapper::Mapper;
+use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::parameter::ParameterError;
 use crate::slam::pose::PoseEstimate;
 use crate::wire::command::{Command, CommandError, CommandServer};
@@ -58,6 +60,9 @@ pub enum MapperError {
     /// Waiting failed.
     #[error(transparent)]
     Wait(#[from] WaitError),
+    /// The map on disk cannot be used.
+    #[error(transparent)]
+    Map(#[from] MapSessionError),
     /// The configuration does not fit the frames.
     #[error("mapping: {0}")]
     Parameter(#[from] ParameterError),
@@ -81,9 +86,11 @@ pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), Mappe
     refusals.iter().for_each(|refusal| tracing::warn!("mapper: {refusal}"));
     let mut shell = Shell::prepare(config, mode)?;
     shell.health.tell_scheduling(&in_force(), &refusals);
+    shell.load_map()?;
     shell.health.enter(ProcessState::Ready, "");
     shell.health.tell_ready();
     let outcome = shell.map_until(shutdown);
+    let outcome = outcome.and_then(|()| shell.save_map_folder());
     match &outcome {
         Ok(()) => {
             // A supervisor that did not ask for the end starts another, which continues from the checkpoint.
@@ -119,6 +126,8 @@ struct Shell<'a> {
     kept: Option<Kept>,
     /// What a mapper that died has left for this one, until the first frame.
     left: Option<Map>,
+    /// The map on disk.
+    map: Option<MapSession>,
     /// The last pose that was claimed.
     last_pose: Option<PoseEstimate>,
     pool: rayon::ThreadPool,
@@ -159,6 +168,7 @@ impl<'a> Shell<'a> {
             adjustments: start_adjustments(config, mode).map_err(MapperError::Thread)?,
             kept,
             left,
+            map: None,
             last_pose: None,
             pool,
             hub,
@@ -166,6 +176,25 @@ impl<'a> Shell<'a> {
         };
         shell.hub.reserve()?;
         Ok(shell)
+    }
+
+    /// Reads the map on disk, where one is named.
+    fn load_map(&mut self) -> Result<(), MapperError> {
+        let (map, max_bytes) = (&self.config.map, self.config.mapping.max_map_bytes());
+        if !map.folder.is_empty() {
+            let cause = format!("loading the map {}", map.folder);
+            self.health.enter(ProcessState::Preparing, &cause);
+        }
+        let session = self.pool.install(|| MapSession::open(map, max_bytes));
+        self.map = session.map_err(MapSessionError::from)?;
+        Ok(())
+    }
+
+    /// Writes what the map on disk does not have yet.
+    fn save_map_folder(&mut self) -> Result<(), MapperError> {
+        let (Some(map), Some((_, mapper))) = (&mut self.map, &self.mapper) else { return Ok(()) };
+        let health = &mut self.health;
+        Ok(map.save_all(mapper, &mut || health.report())?)
     }
 
     fn map_until(&mut self, shutdown: &Shutdown) -> Result<(), MapperError> {
@@ -290,6 +319,11 @@ impl<'a> Shell<'a> {
             kept.follow(mapper, &outcome);
             kept.follow(mapper, &adjusted);
         }
+        if let Some(map) = &mut self.map {
+            map.follow(mapper, &outcome);
+            map.follow(mapper, &adjusted);
+            map.take_failure().iter().for_each(|failure| self.health.warn(failure));
+        }
         self.health.enter(ProcessState::Running, &mapper.situation().to_string());
         let counters = self.health.counters();
         counters.frames += 1;
@@ -310,6 +344,7 @@ impl<'a> Shell<'a> {
         if let Some(kept) = &mut self.kept {
             kept.follow(mapper, &outcome);
         }
+        self.map.iter_mut().for_each(|map| map.follow(mapper, &outcome));
         tell_adjustments(&mut self.adjustments, &self.output, &mut self.health)?;
         Ok(())
     }
@@ -323,12 +358,20 @@ impl<'a> Shell<'a> {
             self.health.counters().resized += 1;
             mapper.succeed(before);
             self.adjustments.orphan();
+            if self.map.take().is_some() {
+                self.health.warn("another camera has come: its frames are not in the map on disk");
+            }
         }
-        if let Some(map) = self.left.take() {
+        let left = self.left.take();
+        if left.is_some() {
             self.kept.iter_mut().for_each(Kept::reserve);
-            let outcome = mapper.resume(map);
-            self.output.publish(&mapper, &outcome)?;
         }
+        let resumed = match (left, &mut self.map) {
+            (left, Some(map)) => map.begin(&mut mapper, &intrinsics, left)?,
+            (Some(left), None) => mapper.resume(left),
+            (None, None) => StepOutcome::default(),
+        };
+        self.output.publish(&mapper, &resumed)?;
         self.mapper = Some((intrinsics, mapper));
         Ok(())
     }
@@ -336,6 +379,7 @@ impl<'a> Shell<'a> {
     fn answer_commands(&mut self) -> Result<(), MapperError> {
         let mut mapper = self.mapper.as_mut().map(|(_, mapper)| mapper);
         let (health, output, adjustments) = (&mut self.health, &self.output, &mut self.adjustments);
+        let (map, detail) = (&mut self.map, self.config.map.detail);
         Ok(self.commands.answer(|command| match command {
             Command::SendKeyframe(keyframe_id) => {
                 output.publish_earlier(mapper.as_deref().map(Mapper::map), keyframe_id)
@@ -352,7 +396,25 @@ impl<'a> Shell<'a> {
                         .and_then(|()| tell_adjustments(adjustments, output, health));
                     told.map_err(|error| error.to_string())?;
                 }
-                let saved = save_map(mapper.as_deref(), &path, &mut || health.report());
+                let mut each = || health.report();
+                let mut saved = save_map(mapper.as_deref(), &path, &mut each);
+                if let (Some(map), Some(mapper)) = (map.as_mut(), mapper.as_deref()) {
+                    let kept = map.save_all(mapper, &mut each).map_err(|error| error.to_string());
+                    saved = saved.and(kept);
+                }
+                health.go_back_to(before);
+                saved
+            }
+            Command::SaveFolder(path) => {
+                let mapper = mapper.as_deref().ok_or("there is no map yet: no frame has come")?;
+                let before = health.entered();
+                health.enter(ProcessState::Running, WRITES_MAP);
+                let mut each = || health.report();
+                let saved = match map.as_mut().filter(|map| map.is_in(&path)) {
+                    Some(map) => map.save_all(mapper, &mut each).map_err(|error| error.to_string()),
+                    None => save_copy(&path, mapper, detail, &mut each)
+                        .map_err(|error| error.to_string()),
+                };
                 health.go_back_to(before);
                 saved
             }

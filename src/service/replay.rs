@@ -227,7 +227,9 @@ impl<'a> Replay<'a> {
         let mut mapper = Mapper::new(intrinsics, mapping)?;
         let map = MapSession::open(&config.map, config.mapper.max_map_bytes());
         let mut map = map.map_err(MapSessionError::from)?;
-        map.as_mut().map_or(Ok(()), |map| map.begin(&mut mapper, &intrinsics))?;
+        if let Some(map) = &mut map {
+            map.begin(&mut mapper, &intrinsics, None)?;
+        }
         Ok(Self {
             config,
             width: intrinsics.width,

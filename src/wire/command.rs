@@ -24,6 +24,8 @@ pub enum Command {
     SaveMap(PathBuf),
     /// Send the depth and the image of this keyframe on `mapper/earlier_keyframe`.
     SendKeyframe(u64),
+    /// Save the map into this folder; empty for the one that the mapper keeps it in.
+    SaveFolder(PathBuf),
 }
 
 /// Why a question was not asked, not understood or not answered.
@@ -69,6 +71,10 @@ fn request_of(command: &Command) -> Result<CommandRequest, CommandError> {
         CommandRequest { keyframe_id: 0, kind: 0, path_bytes: 0, path: [0; PATH_BYTES] };
     let path = match command {
         Command::SaveMap(path) => path,
+        Command::SaveFolder(path) => {
+            request.kind = 2;
+            path
+        }
         Command::SendKeyframe(keyframe_id) => {
             (request.kind, request.keyframe_id) = (1, *keyframe_id);
             return Ok(request);
@@ -91,6 +97,7 @@ pub fn command_of(request: &CommandRequest) -> Result<Command, CommandError> {
     match request.kind {
         0 => Ok(Command::SaveMap(path.to_owned())),
         1 => Ok(Command::SendKeyframe(request.keyframe_id)),
+        2 => Ok(Command::SaveFolder(path.to_owned())),
         kind => Err(CommandError::Unknown(kind)),
     }
 }
@@ -216,6 +223,8 @@ mod tests {
     fn a_command_survives_the_way() {
         let command = Command::SaveMap(PathBuf::from("/tmp/map.bin"));
         assert_eq!(command_of(&request_of(&command).unwrap()).unwrap(), command);
+        let folder = Command::SaveFolder(PathBuf::from("/var/lib/semidense/map"));
+        assert_eq!(command_of(&request_of(&folder).unwrap()).unwrap(), folder);
         let long = Command::SaveMap(PathBuf::from("x".repeat(PATH_BYTES + 1)));
         assert!(matches!(request_of(&long), Err(CommandError::PathTooLong(_))));
     }

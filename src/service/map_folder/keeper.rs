@@ -9,6 +9,7 @@ use std::collections::BTreeMap;
 use std::io;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
+use std::time::Instant;
 
 use crate::service::map_folder::writer::{MapHead, MapWriter};
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -42,7 +43,9 @@ struct Waiting {
     keyframes: BTreeMap<u64, Keyframe>,
     head: Option<MapHead>,
     is_over: bool,
-    /// Why the last save failed; `None` where it did not.
+    /// Whether something was not written.
+    has_failed: bool,
+    /// Why the last save failed, until that is told.
     failure: Option<String>,
 }
 
@@ -105,7 +108,7 @@ impl MapKeeper {
         for keyframe_id in std::mem::take(&mut waiting.keyframes).into_keys() {
             self.handed.remove(&keyframe_id);
         }
-        if waiting.failure.is_some() {
+        if std::mem::take(&mut waiting.has_failed) {
             self.handed.clear();
         }
         drop(waiting);
@@ -118,17 +121,18 @@ impl MapKeeper {
             writer.put(keyframe).map_err(|error| error.to_string())?;
             self.handed.insert(keyframe.keyframe_id, keyframe.revision);
         }
-        writer.save(&self.camera, head_of(mapper)).map_err(|error| error.to_string())
+        writer.save(&self.camera, head_of(mapper)).map_err(|error| error.to_string())?;
+        writer.settle().map_err(|error| error.to_string())
     }
 
-    /// Why the last save failed.
-    pub fn failure(&self) -> Option<String> {
-        locked(&self.shared.waiting).failure.clone()
+    /// Why the last save failed; told once.
+    pub fn take_failure(&mut self) -> Option<String> {
+        locked(&self.shared.waiting).failure.take()
     }
 }
 
 /// Whether a keyframe has what a file would hold.
-fn is_kept(keyframe: &Keyframe, camera: &Intrinsics) -> bool {
+pub(super) fn is_kept(keyframe: &Keyframe, camera: &Intrinsics) -> bool {
     keyframe.has_depth()
         && keyframe.map_state == MapState::Established
         && keyframe.intrinsics == *camera
@@ -146,7 +150,7 @@ impl Drop for MapKeeper {
 }
 
 /// The list of all keyframes.
-fn head_of(mapper: &Mapper) -> MapHead {
+pub(super) fn head_of(mapper: &Mapper) -> MapHead {
     let map = mapper.map();
     MapHead {
         keyframes: map.keyframes.iter().map(Keyframe::without_depth).collect(),
@@ -182,11 +186,13 @@ fn save_waiting(shared: &Shared, camera: &Intrinsics) {
     let (keyframes, head) = (std::mem::take(&mut waiting.keyframes), waiting.head.take());
     drop(waiting);
     let Some(head) = head else { return };
+    let begin = Instant::now();
     let put = keyframes.values().try_for_each(|keyframe| writer.put(keyframe));
     let failure = put.and_then(|()| writer.save(camera, head)).err().map(|error| error.to_string());
-    let mut waiting = locked(&shared.waiting);
-    if let (Some(failure), true) = (&failure, failure != waiting.failure) {
+    tracing::debug!("saved {} keyframes in {:?}", keyframes.len(), begin.elapsed());
+    if let Some(failure) = failure {
         tracing::warn!("{failure}; the map on the disk is the one saved before");
+        let mut waiting = locked(&shared.waiting);
+        (waiting.has_failed, waiting.failure) = (true, Some(failure));
     }
-    waiting.failure = failure;
 }

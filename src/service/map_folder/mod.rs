@@ -18,6 +18,7 @@
 pub mod depth_file;
 pub mod keeper;
 pub mod manifest;
+pub mod merge;
 pub mod report;
 pub mod session;
 pub mod writer;
@@ -29,12 +30,15 @@ use rayon::prelude::*;
 
 use crate::capture::input_file;
 use crate::service::map_folder::depth_file::{
-    DepthFileError, checksum_of, decode_into, most_bytes,
+    DepthFileError, MapDetail, checksum_of, decode_into, most_bytes,
 };
+use crate::service::map_folder::keeper::{head_of, is_kept};
 use crate::service::map_folder::manifest::{DepthFile, Listed, Manifest, ManifestError};
+use crate::service::map_folder::writer::{MapHead, MapWriter};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{DepthPoint, Keyframe};
 use crate::slam::map::Map;
+use crate::slam::mapper::Mapper;
 
 /// Names in the folder.
 const MANIFEST: &str = "manifest";
@@ -56,6 +60,12 @@ pub enum MapFolderError {
         "{0} is not a map, and not empty: name an empty folder, or one that does not exist yet"
     )]
     Foreign(PathBuf),
+    /// The folder holds a map that would be lost.
+    #[error("{0} holds a map already: name another folder")]
+    Taken(PathBuf),
+    /// There is nothing to be written.
+    #[error("there is no map yet: no keyframe has been made")]
+    Empty,
     /// It cannot be read.
     #[error("{path}: {source}")]
     Read {
@@ -140,6 +150,38 @@ pub fn load(folder: &Path, max_bytes: usize) -> Result<Loaded, MapFolderError> {
             return Ok(Loaded { manifest, map, without_memory, problems });
         }
     }
+}
+
+/// Writes the map of a mapper into a folder that holds none. `each` is called before each keyframe.
+pub fn save_copy(
+    folder: &Path,
+    mapper: &Mapper,
+    detail: MapDetail,
+    each: &mut dyn FnMut(),
+) -> Result<(), MapFolderError> {
+    let camera = mapper.keyframe().or(mapper.map().keyframes.last()).map(|of| of.intrinsics);
+    let camera = camera.ok_or(MapFolderError::Empty)?;
+    write_new(folder, &camera, detail, mapper.map(), head_of(mapper), each)
+}
+
+/// Writes a map into a folder that holds none.
+pub fn write_new(
+    folder: &Path,
+    camera: &Intrinsics,
+    detail: MapDetail,
+    map: &Map,
+    head: MapHead,
+    each: &mut dyn FnMut(),
+) -> Result<(), MapFolderError> {
+    let mut writer = MapWriter::open(folder, detail)?;
+    if writer.camera().is_some() {
+        return Err(MapFolderError::Taken(folder.to_owned()));
+    }
+    for keyframe in map.keyframes.iter().filter(|of| is_kept(of, camera)) {
+        each();
+        writer.put(keyframe)?;
+    }
+    writer.save(camera, head)
 }
 
 /// The manifest of a map, or the one before where that is damaged, and then what is.

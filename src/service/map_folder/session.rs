@@ -1,6 +1,6 @@
 //! A process's use of a map folder: read at its start, kept while it maps, whole at its end.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use crate::service::config::MapConfig;
 use crate::service::map_folder::keeper::MapKeeper;
@@ -68,12 +68,14 @@ impl MapSession {
         Ok(Some(Self { folder, map_use, loaded, camera, writer, keeper: None }))
     }
 
-    /// Lets a mapper of `camera` begin in the map, before its first frame.
+    /// Lets a mapper of `camera` begin in the map, before its first frame; where one that died has `left` a checkpoint and
+    /// the map goes on, it goes on from that.
     pub fn begin(
         &mut self,
         mapper: &mut Mapper,
         camera: &Intrinsics,
-    ) -> Result<(), MapSessionError> {
+        left: Option<Map>,
+    ) -> Result<StepOutcome, MapSessionError> {
         if let Some(map) = self.camera.filter(|map| map != camera) {
             let (map, camera) = (Box::new(map), Box::new(*camera));
             return Err(MapFolderError::Camera { folder: self.folder.clone(), map, camera }.into());
@@ -84,10 +86,21 @@ impl MapSession {
                 MapKeeper::start(writer, *camera, &map).map_err(MapSessionError::Thread)?;
             self.keeper = Some(keeper);
         }
+        let goes_on = |left: &Map| left.keyframes.iter().any(|of| of.intrinsics == *camera);
+        if let Some(left) = left.filter(|left| self.map_use == MapUse::Extend && goes_on(left)) {
+            return Ok(mapper.resume(left.over(map)));
+        }
         let folder = self.folder.clone();
         mapper
             .begin_in(map, self.map_use)
-            .map_err(|source| MapSessionError::Prior { folder, source })
+            .map_err(|source| MapSessionError::Prior { folder, source })?;
+        Ok(StepOutcome::default())
+    }
+
+    /// Whether it is the map in a folder; an empty name is that of every one.
+    pub fn is_in(&self, folder: &Path) -> bool {
+        let same = || Some(folder.canonicalize().ok()? == self.folder.canonicalize().ok()?);
+        folder.as_os_str().is_empty() || same().unwrap_or(false)
     }
 
     /// Keeps what a step or a correction has changed.
@@ -106,9 +119,9 @@ impl MapSession {
         keeper.save_all(mapper, each).map_err(MapSessionError::Save)
     }
 
-    /// Why the last save failed.
-    pub fn failure(&self) -> Option<String> {
-        self.keeper.as_ref()?.failure()
+    /// Why the last save failed; told once.
+    pub fn take_failure(&mut self) -> Option<String> {
+        self.keeper.as_mut()?.take_failure()
     }
 }
 

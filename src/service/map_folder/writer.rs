@@ -157,6 +157,13 @@ impl MapWriter {
         Ok(())
     }
 
+    /// The manifest before becomes this one too, at the end: the files of changed keyframes are there once.
+    pub fn settle(&mut self) -> Result<(), MapFolderError> {
+        self.write(BEFORE, |now| now.manifest_bytes.clone())?;
+        self.remove_unlisted(None);
+        Ok(())
+    }
+
     /// Writes a manifest; an empty one is none.
     fn write(&self, name: &str, bytes: impl Fn(&Self) -> Vec<u8>) -> Result<(), MapFolderError> {
         let (path, bytes) = (self.folder.join(name), bytes(self));

@@ -40,6 +40,27 @@ pub(super) struct Prior {
     certainty: Certainty,
 }
 
+impl Map {
+    /// What a mapper that died has left, over the map on the disk: keyframes that only that has are added, and those
+    /// without depth here get it from there.
+    pub fn over(mut self, older: Self) -> Self {
+        self.free_epoch = self.free_epoch.max(older.free_epoch);
+        self.revision = self.revision.max(older.revision);
+        for keyframe in older.keyframes {
+            match self.keyframes.iter_mut().find(|of| of.keyframe_id == keyframe.keyframe_id) {
+                None => self.keyframes.push(keyframe),
+                Some(known) if known.has_depth() || known.epoch != keyframe.epoch => {}
+                Some(known) => {
+                    (known.image, known.points) = (keyframe.image, keyframe.points);
+                    known.is_refined = keyframe.is_refined;
+                }
+            }
+        }
+        self.keyframes.sort_by_key(|keyframe| keyframe.keyframe_id);
+        self
+    }
+}
+
 impl Mapper {
     /// Begins in a map of earlier runs, before the first frame: its epochs, ids and revisions go on, and each frame is
     /// looked for on its keyframes. Odometry begins where the map has the camera then.

@@ -1,0 +1,79 @@
+//! Two maps in one folder.
+
+use std::path::Path;
+
+use crate::service::map_folder::writer::MapHead;
+use crate::service::map_folder::{Loaded, MapFolderError, write_new};
+use crate::slam::keyframe::Keyframe;
+use crate::slam::map::Map;
+
+/// Writes a map that holds all epochs of `first` and, under numbers of their own, those of `second` into a folder that
+/// holds none. Where they lie against each other stays unknown: the camera is found in either.
+pub fn merge(
+    folder: &Path,
+    first: Loaded,
+    second: Loaded,
+    second_folder: &Path,
+) -> Result<Map, MapFolderError> {
+    let (camera, other) = (first.manifest.camera, second.manifest.camera);
+    if camera != other {
+        let (map, camera) = (Box::new(other), Box::new(camera));
+        return Err(MapFolderError::Camera { folder: second_folder.to_owned(), map, camera });
+    }
+    let map = joined(first.map, second.map);
+    let head = MapHead {
+        keyframes: map.keyframes.iter().map(Keyframe::without_depth).collect(),
+        revision: map.revision,
+        free_epoch: map.free_epoch,
+    };
+    write_new(folder, &camera, first.manifest.detail, &map, head, &mut || ())?;
+    Ok(map)
+}
+
+/// Both maps, the ids and epochs of the second above those of the first.
+fn joined(first: Map, second: Map) -> Map {
+    let newest = |number: fn(&Keyframe) -> u64| {
+        first.keyframes.iter().map(number).max().map_or(0, |newest| newest.saturating_add(1))
+    };
+    let ids = newest(|keyframe| keyframe.keyframe_id);
+    let epochs = newest(|keyframe| u64::from(keyframe.epoch)).max(u64::from(first.free_epoch));
+    let epochs = u32::try_from(epochs).unwrap_or(u32::MAX);
+    let moved = second.keyframes.into_iter().map(|keyframe| Keyframe {
+        keyframe_id: keyframe.keyframe_id.saturating_add(ids),
+        epoch: keyframe.epoch.saturating_add(epochs),
+        ..keyframe
+    });
+    Map {
+        keyframes: first.keyframes.into_iter().chain(moved).collect(),
+        revision: first.revision.max(second.revision),
+        free_epoch: second.free_epoch.saturating_add(epochs),
+        ..Map::default()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::geometry::intrinsics::Intrinsics;
+    use crate::slam::geometry::sim3::Sim3;
+
+    #[test]
+    fn no_number_of_the_second_map_is_one_of_the_first() {
+        let camera = Intrinsics::pinhole(64, 48, 60.0);
+        let keyframe = |keyframe_id: u64, epoch: u32| Keyframe {
+            keyframe_id,
+            epoch,
+            ..Keyframe::at(Sim3::identity(), camera, Vec::new(), Vec::new())
+        };
+        let map = |of: &[(u64, u32)], free_epoch: u32| Map {
+            keyframes: of.iter().map(|&(id, epoch)| keyframe(id, epoch)).collect(),
+            free_epoch,
+            ..Map::default()
+        };
+        let both = joined(map(&[(0, 0), (7, 2)], 5), map(&[(0, 0), (3, 1)], 2));
+        let numbers: Vec<(u64, u32)> =
+            both.keyframes.iter().map(|of| (of.keyframe_id, of.epoch)).collect();
+        assert_eq!(numbers, [(0, 0), (7, 2), (8, 5), (11, 6)]);
+        assert_eq!(both.free_epoch, 7);
+    }
+}
