@@ -16,6 +16,8 @@ use semidense::service::frame_order::FrameOrder;
 use semidense::service::health::{ProcessState, cause, percentile_ms, warning};
 use semidense::service::journal::recovered::Recovered;
 use semidense::service::map_file::parse_map;
+use semidense::service::map_folder::depth_file::{MapDetail, decode_into, encode};
+use semidense::service::map_folder::manifest::Manifest;
 use semidense::service::pairing::Pairing;
 use semidense::service::recording::RecordParts;
 use semidense::service::trajectory_file::{parse_trajectory, tum_line};
@@ -24,7 +26,8 @@ use semidense::slam::evaluation::depth_error::DepthScale;
 use semidense::slam::frame::FrameView;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::rectification::Rectification;
-use semidense::slam::keyframe::DepthPoint;
+use semidense::slam::geometry::sim3::Sim3;
+use semidense::slam::keyframe::{DepthPoint, Keyframe};
 use semidense::slam::mapper::{Mapper, MapperParams};
 use semidense::slam::tracker::{Tracker, TrackerParams};
 use semidense::wire::command::{command_of, text_from_bytes};
@@ -209,6 +212,39 @@ pub fn map(bytes: &[u8]) {
         let unknown = semidense::slam::pose::PoseEstimate::unknown(&view.frame());
         mapper.step(&view.frame(), &unknown, None, &mut || {});
     }
+}
+
+/// A file of a map folder: an even first byte and a manifest, or an odd one and the image and depth of a keyframe.
+pub fn map_folder(bytes: &[u8]) {
+    let Some((kind, rest)) = bytes.split_first() else { return };
+    // The checksums are made right: fuzzing would hardly guess them.
+    let mut rest = rest.to_vec();
+    if let Some(body) = rest.len().checked_sub(4) {
+        let checksum = crc32(&rest[..body]).to_le_bytes();
+        rest[body..].copy_from_slice(&checksum);
+    }
+    if kind % 2 == 0 {
+        let Ok(manifest) = Manifest::from_bytes(&rest) else { return };
+        assert!(manifest.camera.is_valid());
+        let again = Manifest::from_bytes(&manifest.to_bytes()).expect("our own bytes");
+        assert_eq!(again.keyframes.len(), manifest.keyframes.len());
+        return;
+    }
+    let camera = Intrinsics::pinhole(40, 32, 25.0);
+    let mut keyframe = Keyframe::at(Sim3::identity(), camera, Vec::new(), Vec::new());
+    if decode_into(&rest, &mut keyframe).is_ok() {
+        assert_eq!(keyframe.image.len(), 40 * 32);
+        assert!(keyframe.points.iter().all(|point| point.u < 40 && point.v < 32));
+        let mut again = keyframe.without_depth();
+        decode_into(&encode(&keyframe, MapDetail::Full), &mut again).expect("our own bytes");
+        assert!(again.points == keyframe.points && again.image == keyframe.image);
+    }
+}
+
+/// The CRC-32 of zlib, bit by bit.
+fn crc32(bytes: &[u8]) -> u32 {
+    let step = |crc: u32, _| crc >> 1 ^ if crc & 1 == 1 { 0xedb8_8320 } else { 0 };
+    !bytes.iter().fold(!0, |crc, byte| (0..8).fold(crc ^ u32::from(*byte), step))
 }
 
 /// The log of a journal: what is read is a run that results can be made of.

@@ -2,6 +2,8 @@
 
 use semidense::service::journal::log::{Record, RunStart, Step, log_header};
 use semidense::service::map_file::write_map;
+use semidense::service::map_folder::depth_file::{MapDetail, encode};
+use semidense::service::map_folder::manifest::{DepthFile, Listed, Manifest};
 use semidense::service::recording::RunCounters;
 use semidense::service::results::RunMode;
 use semidense::slam::frame::FrameView;
@@ -77,6 +79,10 @@ pub fn seeds() -> Vec<Seed> {
         kind(1, b"mapper.threads=2\nsimulator.motion.mean_speed_m_s=1.0\ninstance=rig2\n"),
     );
     add("map", map_bytes());
+    add("map_folder", kind(0, &manifest()));
+    for detail in [MapDetail::Full, MapDetail::Small] {
+        add("map_folder", kind(1, &encode(&keyframe(), detail)));
+    }
     add("journal", journal());
     messages()
         .into_iter()
@@ -135,6 +141,15 @@ fn map_bytes() -> Vec<u8> {
     )
     .expect("written");
     std::fs::read(path).expect("read")
+}
+
+fn manifest() -> Vec<u8> {
+    let file = DepthFile { revision: 1, bytes: 3000, checksum: 7, num_points: 24 };
+    let listed = Listed { keyframe: keyframe().without_depth(), file: Some(file) };
+    let other = Keyframe { keyframe_id: 1, epoch: 1, ..keyframe().without_depth() };
+    let without = Listed { keyframe: other, file: None };
+    let empty = Manifest::new(CAMERA, MapDetail::Full);
+    Manifest { keyframes: vec![listed, without], ..empty }.to_bytes()
 }
 
 fn journal() -> Vec<u8> {

@@ -15,7 +15,7 @@ mod test_images;
 type Target = (&'static str, fn(&[u8]));
 
 /// Every target. A new one is listed here and in `fuzz/Cargo.toml`.
-const TARGETS: [Target; 9] = [
+const TARGETS: [Target; 10] = [
     ("trajectory", parsers::trajectory),
     ("rig", parsers::rig),
     ("lists", parsers::lists),
@@ -23,6 +23,7 @@ const TARGETS: [Target; 9] = [
     ("configuration", parsers::configuration),
     ("message", parsers::message),
     ("map", parsers::map),
+    ("map_folder", parsers::map_folder),
     ("journal", parsers::journal),
     ("pipeline", parsers::pipeline),
 ];

@@ -3,21 +3,24 @@
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::time::{Duration, UNIX_EPOCH};
+use std::time::{Duration, Instant, UNIX_EPOCH};
 
 use clap::{Args, Subcommand};
 
 use crate::command::CommandResult;
 use crate::command::print::{note, print};
 use crate::service::config::{Config, MapConfig};
+use crate::service::health::ProcessState;
 use crate::service::map_folder::merge::merge;
 use crate::service::map_folder::report::{MapReport, export};
 use crate::service::map_folder::session::check;
 use crate::service::map_folder::{Loaded, load};
+use crate::service::peers::Peer;
 use crate::service::results::output_folder::utc_text;
 use crate::wire::command::{Command, CommandClient};
 use crate::wire::place::Place;
-use crate::wire::port::{Access, Hub};
+use crate::wire::port::{Access, Hub, wait};
+use crate::wire::topic::MAPPER_HEALTH;
 
 /// Check, export, save and merge maps on disk
 ///
@@ -214,12 +217,34 @@ fn save(config: &Config, arguments: &SaveArguments) -> CommandResult {
     let folder = arguments.folder.as_ref().map(std::path::absolute).transpose()?;
     let place = Place::new(&config.instance, &config.root)?;
     let hub = Hub::join(&place, "map-save", Access::Observer)?;
+    let mut mapper = ready_mapper(&hub)?;
     let timeout = Duration::from_secs_f64(config.supervisor.save_timeout_s);
     let command = Command::SaveFolder(folder.clone().unwrap_or_default());
-    CommandClient::open(&hub)?.ask(&command, timeout, || true)?;
+    let is_alive = || {
+        let is_over = matches!(mapper.state(), Some(ProcessState::Finished | ProcessState::Failed));
+        mapper.update().is_ok() && !is_over
+    };
+    CommandClient::open(&hub)?.ask(&command, timeout, is_alive)?;
     let place = folder.map_or("its folder".to_owned(), |folder| folder.display().to_string());
     print(&format!("saved in {place}\n"))?;
     Ok(ExitCode::SUCCESS)
+}
+
+/// The running mapper, once it answers commands.
+fn ready_mapper(hub: &Hub) -> Result<Peer, Box<dyn std::error::Error>> {
+    /// Longer than the time between two signs of life.
+    const LONGEST: Duration = Duration::from_secs(3);
+    const PAUSE: Duration = Duration::from_millis(20);
+    let mut mapper = Peer::open(hub, &MAPPER_HEALTH)?;
+    let begin = Instant::now();
+    while begin.elapsed() < LONGEST {
+        mapper.update()?;
+        if mapper.is_ready() {
+            return Ok(mapper);
+        }
+        wait(&[], None, PAUSE)?;
+    }
+    Err("no mapper is running: a run with --map DIR saves its map by itself".into())
 }
 
 fn merge_maps(arguments: &MergeArguments) -> CommandResult {

@@ -181,11 +181,12 @@ impl<'a> Shell<'a> {
     /// Reads the map on disk, where one is named.
     fn load_map(&mut self) -> Result<(), MapperError> {
         let (map, max_bytes) = (&self.config.map, self.config.mapping.max_map_bytes());
+        let waits = self.mode == Mode::Lockstep;
         if !map.folder.is_empty() {
             let cause = format!("loading the map {}", map.folder);
             self.health.enter(ProcessState::Preparing, &cause);
         }
-        let session = self.pool.install(|| MapSession::open(map, max_bytes));
+        let session = self.pool.install(|| MapSession::open(map, max_bytes, waits));
         self.map = session.map_err(MapSessionError::from)?;
         Ok(())
     }

@@ -28,12 +28,16 @@ pub struct MapKeeper {
     thread: Option<JoinHandle<()>>,
     /// Revisions of keyframes that were handed over, by their id.
     handed: BTreeMap<u64, u64>,
+    /// Whether a save waits for the one before.
+    waits: bool,
 }
 
 #[derive(Debug)]
 struct Shared {
     waiting: Mutex<Waiting>,
     wake: Condvar,
+    /// The thread has nothing to do.
+    idle: Condvar,
     writer: Mutex<MapWriter>,
 }
 
@@ -43,6 +47,7 @@ struct Waiting {
     keyframes: BTreeMap<u64, Keyframe>,
     head: Option<MapHead>,
     is_over: bool,
+    is_busy: bool,
     /// Whether something was not written.
     has_failed: bool,
     /// Why the last save failed, until that is told.
@@ -50,11 +55,18 @@ struct Waiting {
 }
 
 impl MapKeeper {
-    /// Keeps the map of `camera` in a folder whose map `loaded` is already there.
-    pub fn start(writer: MapWriter, camera: Intrinsics, loaded: &Map) -> io::Result<Self> {
+    /// Keeps the map of `camera` in a folder whose map `loaded` is already there. Where frames may wait (`waits`) a save
+    /// waits for the one before, so that a kill costs a keyframe also where frames are faster than the disk.
+    pub fn start(
+        writer: MapWriter,
+        camera: Intrinsics,
+        loaded: &Map,
+        waits: bool,
+    ) -> io::Result<Self> {
         let shared = Arc::new(Shared {
             waiting: Mutex::default(),
             wake: Condvar::new(),
+            idle: Condvar::new(),
             writer: Mutex::new(writer),
         });
         let theirs = Arc::clone(&shared);
@@ -62,7 +74,7 @@ impl MapKeeper {
             .name("semidense-save".to_owned())
             .spawn(move || save_until_over(&theirs, &camera))?;
         let handed = loaded.keyframes.iter().map(|of| (of.keyframe_id, of.revision));
-        Ok(Self { camera, shared, thread: Some(thread), handed: handed.collect() })
+        Ok(Self { camera, shared, thread: Some(thread), handed: handed.collect(), waits })
     }
 
     /// Hands over what a step or a correction has changed.
@@ -87,6 +99,9 @@ impl MapKeeper {
         }
         let head = head_of(mapper);
         let mut waiting = locked(&self.shared.waiting);
+        while self.waits && (waiting.is_busy || waiting.head.is_some()) {
+            waiting = self.shared.idle.wait(waiting).unwrap_or_else(PoisonError::into_inner);
+        }
         for keyframe in new.into_iter().chain(changed.map(|(_, keyframe)| keyframe)) {
             if waiting.keyframes.len() < MOST_WAITING {
                 self.handed.insert(keyframe.keyframe_id, keyframe.revision);
@@ -171,8 +186,11 @@ fn save_until_over(shared: &Shared, camera: &Intrinsics) {
             waiting = shared.wake.wait(waiting).unwrap_or_else(PoisonError::into_inner);
         }
         let is_over = waiting.is_over;
+        waiting.is_busy = true;
         drop(waiting);
         save_waiting(shared, camera);
+        locked(&shared.waiting).is_busy = false;
+        shared.idle.notify_all();
         if is_over {
             return;
         }

@@ -43,12 +43,17 @@ pub struct MapSession {
     camera: Option<Intrinsics>,
     writer: Option<MapWriter>,
     keeper: Option<MapKeeper>,
+    waits: bool,
 }
 
 impl MapSession {
     /// Reads the map that the configuration names, with the threads of the pool it is called in; `None` where it names
-    /// none. What is damaged is told in the log.
-    pub fn open(config: &MapConfig, max_bytes: usize) -> Result<Option<Self>, MapFolderError> {
+    /// none. What is damaged is told in the log. `waits`: frames may wait for the disk.
+    pub fn open(
+        config: &MapConfig,
+        max_bytes: usize,
+        waits: bool,
+    ) -> Result<Option<Self>, MapFolderError> {
         if config.folder.is_empty() {
             return Ok(None);
         }
@@ -65,7 +70,7 @@ impl MapSession {
         loaded.iter().for_each(|loaded| tell_what_is_missing(loaded, max_bytes));
         let camera = loaded.as_ref().map(|loaded| loaded.manifest.camera);
         let loaded = loaded.map(|loaded| loaded.map);
-        Ok(Some(Self { folder, map_use, loaded, camera, writer, keeper: None }))
+        Ok(Some(Self { folder, map_use, loaded, camera, writer, keeper: None, waits }))
     }
 
     /// Lets a mapper of `camera` begin in the map, before its first frame; where one that died has `left` a checkpoint and
@@ -82,8 +87,8 @@ impl MapSession {
         }
         let map = self.loaded.take().unwrap_or_default();
         if let Some(writer) = self.writer.take() {
-            let keeper =
-                MapKeeper::start(writer, *camera, &map).map_err(MapSessionError::Thread)?;
+            let keeper = MapKeeper::start(writer, *camera, &map, self.waits)
+                .map_err(MapSessionError::Thread)?;
             self.keeper = Some(keeper);
         }
         let goes_on = |left: &Map| left.keyframes.iter().any(|of| of.intrinsics == *camera);

@@ -128,15 +128,15 @@ impl MapWriter {
         Ok(())
     }
 
-    /// Writes the manifest: from now on the map is this. Keyframes of another camera, and those that contradicted
-    /// themselves, are left out.
+    /// Writes the manifest: from now on the map is this. Keyframes of another camera, those that contradicted themselves
+    /// and those whose depth was never written are left out.
     pub fn save(&mut self, camera: &Intrinsics, head: MapHead) -> Result<(), MapFolderError> {
         let is_kept = |keyframe: &Keyframe| {
             keyframe.intrinsics == *camera && keyframe.map_state == MapState::Established
         };
-        let keyframes = head.keyframes.into_iter().filter(is_kept).map(|keyframe| {
-            let file = self.files.get(&keyframe.keyframe_id).copied();
-            Listed { keyframe, file }
+        let keyframes = head.keyframes.into_iter().filter(is_kept).filter_map(|keyframe| {
+            let file = Some(*self.files.get(&keyframe.keyframe_id)?);
+            Some(Listed { keyframe, file })
         });
         let since = SystemTime::now().duration_since(UNIX_EPOCH);
         let saves = self.manifest.as_ref().map_or(0, |before| before.saves);

@@ -172,3 +172,120 @@ impl Mapper {
         keyframe.world_from_keyframe * keyframe.map_from_keyframe.inverse()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::geometry::intrinsics::Intrinsics;
+    use crate::slam::geometry::se3::SE3;
+    use crate::slam::mapper::MapperParams;
+    use crate::slam::mapper::finder::tests::keyframe;
+    use crate::slam::mapper::situation::Situation;
+    use crate::slam::pose::TrackingState;
+    use crate::slam::test_scene::{CAMERA, Scene};
+
+    fn sideways(x: f64) -> SE3 {
+        SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() }
+    }
+
+    fn map(scene: &Scene) -> Map {
+        let keyframes = vec![keyframe(scene, 4, sideways(0.0)), keyframe(scene, 7, sideways(0.3))];
+        Map { keyframes, free_epoch: 3, ..Map::default() }
+    }
+
+    fn mapper_in(map: Map, map_use: MapUse) -> Mapper {
+        let mut mapper = Mapper::new(CAMERA, MapperParams::default()).unwrap();
+        mapper.begin_in(map, map_use).unwrap();
+        mapper
+    }
+
+    /// A frame taken at `x`, as the tracker tells of it.
+    fn step(mapper: &mut Mapper, scene: &Scene, sequence: u64, x: f64) -> StepOutcome {
+        let pixels = scene.render(&CAMERA, &sideways(x)).noisy(2.0, sequence);
+        let frame = FrameView::new(&CAMERA, sequence, sequence as i64 * 33_333_333, &pixels);
+        let unknown = PoseEstimate::unknown(&frame);
+        let pose = mapper.keyframe().map_or(unknown, |keyframe| PoseEstimate {
+            state: TrackingState::Tracking,
+            keyframe_id: keyframe.keyframe_id,
+            world_from_camera: sideways(x),
+            keyframe_from_camera: keyframe.map_from_keyframe.locate(&sideways(x)),
+            alignment_covariance: [1e-9; 21],
+            proposes_keyframe: true,
+            ..unknown
+        });
+        mapper.step(&frame, &pose, None, &mut || {})
+    }
+
+    #[test]
+    fn the_camera_is_found_on_a_map_that_stays_as_it_is() {
+        let scene = Scene::new(3);
+        let mut mapper = mapper_in(map(&scene), MapUse::Locate);
+        assert_eq!(mapper.situation(), Situation::Localising(2));
+        let found = step(&mut mapper, &scene, 0, 0.05);
+        assert!(found.keyframe_restored && found.graph_changed);
+        assert_eq!(mapper.keyframe().unwrap().keyframe_id, 4);
+        // It moves on, to where the other keyframe is nearer.
+        let outcomes: Vec<StepOutcome> =
+            (1..20).map(|k| step(&mut mapper, &scene, k, 0.05 + 0.0125 * k as f64)).collect();
+        assert!(outcomes.iter().all(|outcome| !outcome.keyframe_created));
+        assert!(outcomes.iter().any(|outcome| outcome.keyframe_restored));
+        assert_eq!(mapper.keyframe().unwrap().keyframe_id, 7);
+        assert!(matches!(mapper.situation(), Situation::Localised(_)));
+        for (now, before) in mapper.map().keyframes.iter().zip(map(&scene).keyframes) {
+            assert!(now.points == before.points && now.image == before.image);
+            assert_eq!(now.map_from_keyframe, before.map_from_keyframe);
+        }
+        assert_eq!(mapper.map().keyframes.len(), 2);
+        // One that is lost looks on, and begins nothing.
+        let noise: Vec<u8> =
+            (0..CAMERA.width * CAMERA.height).map(|i| (i * i * 31 % 253) as u8).collect();
+        for sequence in 20..40 {
+            let frame = FrameView::new(&CAMERA, sequence, sequence as i64 * 1_000_000_000, &noise);
+            let keyframe_id = mapper.keyframe().unwrap().keyframe_id;
+            let lost = PoseEstimate { keyframe_id, ..PoseEstimate::unknown(&frame) };
+            assert!(!mapper.step(&frame, &lost, None, &mut || {}).keyframe_created);
+        }
+    }
+
+    #[test]
+    fn a_map_goes_on_with_numbers_of_its_own() {
+        let scene = Scene::new(3);
+        let mut mapper = mapper_in(map(&scene), MapUse::Extend);
+        assert_eq!((mapper.free_epoch(), mapper.next_keyframe_id), (3, 8));
+        let found = step(&mut mapper, &scene, 0, 0.05);
+        assert!(found.keyframe_restored && found.graph_changed);
+        assert_eq!(mapper.keyframe().unwrap().epoch, 0);
+        assert!(matches!(mapper.situation(), Situation::Localised(_)));
+    }
+
+    #[test]
+    fn what_is_no_map_of_this_camera_is_refused() {
+        let scene = Scene::new(3);
+        let begin = |map: Map, map_use| {
+            Mapper::new(CAMERA, MapperParams::default()).unwrap().begin_in(map, map_use)
+        };
+        let mut foreign = map(&scene);
+        foreign.keyframes[1].intrinsics = Intrinsics { fx: CAMERA.fx + 1.0, ..CAMERA };
+        assert_eq!(begin(foreign, MapUse::Extend), Err(PriorError::Camera(7)));
+        assert_eq!(begin(Map::default(), MapUse::Locate), Err(PriorError::Empty));
+        assert_eq!(begin(Map::default(), MapUse::Extend), Ok(()));
+    }
+
+    #[test]
+    fn a_checkpoint_lies_over_the_map_on_the_disk() {
+        let scene = Scene::new(3);
+        let on_disk = map(&scene);
+        let mut moved = keyframe(&scene, 7, sideways(0.4)).without_depth();
+        moved.revision = 9;
+        let checkpoint = Map {
+            keyframes: vec![moved, keyframe(&scene, 8, sideways(0.5))],
+            free_epoch: 20,
+            ..Map::default()
+        };
+        let both = checkpoint.over(on_disk.clone());
+        let ids: Vec<u64> = both.keyframes.iter().map(|of| of.keyframe_id).collect();
+        assert_eq!((ids, both.free_epoch), (vec![4, 7, 8], 20));
+        assert_eq!(both.keyframes[1].map_from_keyframe.rigid, sideways(0.4));
+        assert!(both.keyframes[1].points == on_disk.keyframes[1].points);
+    }
+}
