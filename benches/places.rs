@@ -17,7 +17,8 @@ fn main() {
     for keyframe in 0..10_000u64 {
         let pixels = collage(keyframe, 0);
         let began = Instant::now();
-        let description = describer.describe(&pixels, SIZE[0], SIZE[1]).expect("it shows something");
+        let description =
+            describer.describe(&pixels, SIZE[0], SIZE[1]).expect("it shows something");
         describing += began.elapsed().as_secs_f64();
         let began = Instant::now();
         index.insert(keyframe, &description);

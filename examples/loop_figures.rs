@@ -71,6 +71,7 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
     let config = ReplayConfig {
         tracker: config.tracking,
         mapper: config.mapping,
+        map: Default::default(),
         poses: PoseOrigin::Tracker,
         initial_depth: DepthOrigin::Images,
         max_frames: arguments.frames,

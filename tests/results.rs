@@ -140,6 +140,7 @@ fn record(poses: Vec<RecordedPose>, keyframes: Vec<Keyframe>, with_truth: bool) 
     let frames = poses.len();
     let pose = |i| StampedPose { nanos: nanos(i), world_from_camera: truth(i) };
     RunRecord {
+        searches: None,
         mode: RunMode::Lockstep,
         source: "tum:a<script>\"b\"".to_owned(),
         ended: EndOfRun::Interrupted,

@@ -57,7 +57,6 @@ mod tests {
     use crate::slam::geometry::sim3::Sim3;
     use crate::slam::map::EpochJoin;
     use crate::slam::mapper::MapperParams;
-    use crate::slam::mapper::finder::tests::keyframe;
     use crate::slam::mapper::phase::Active;
     use crate::slam::test_scene::{CAMERA, Scene};
     use crate::slam::window::params::WindowParams;
@@ -71,7 +70,7 @@ mod tests {
         let scene = Scene::new(3);
         let mut mapper = Mapper::new(CAMERA, MapperParams::default()).unwrap();
         let ids = (0..).zip([0.0, 1.0]);
-        mapper.map.keyframes = ids.map(|(id, x)| keyframe(&scene, id, sideways(x))).collect();
+        mapper.map.keyframes = ids.map(|(id, x)| scene.keyframe(id, sideways(x), 1.0)).collect();
         mapper.active = Some(Active::new(1));
         mapper.last_tracked = Some((1, sideways(0.1)));
         mapper.last_world_from_camera = Some(sideways(1.1));

@@ -179,7 +179,6 @@ mod tests {
     use crate::slam::geometry::intrinsics::Intrinsics;
     use crate::slam::geometry::se3::SE3;
     use crate::slam::mapper::MapperParams;
-    use crate::slam::mapper::finder::tests::keyframe;
     use crate::slam::mapper::situation::Situation;
     use crate::slam::pose::TrackingState;
     use crate::slam::test_scene::{CAMERA, Scene};
@@ -189,7 +188,8 @@ mod tests {
     }
 
     fn map(scene: &Scene) -> Map {
-        let keyframes = vec![keyframe(scene, 4, sideways(0.0)), keyframe(scene, 7, sideways(0.3))];
+        let keyframes =
+            vec![scene.keyframe(4, sideways(0.0), 1.0), scene.keyframe(7, sideways(0.3), 1.0)];
         Map { keyframes, free_epoch: 3, ..Map::default() }
     }
 
@@ -275,10 +275,10 @@ mod tests {
     fn a_checkpoint_lies_over_the_map_on_the_disk() {
         let scene = Scene::new(3);
         let on_disk = map(&scene);
-        let mut moved = keyframe(&scene, 7, sideways(0.4)).without_depth();
+        let mut moved = scene.keyframe(7, sideways(0.4), 1.0).without_depth();
         moved.revision = 9;
         let checkpoint = Map {
-            keyframes: vec![moved, keyframe(&scene, 8, sideways(0.5))],
+            keyframes: vec![moved, scene.keyframe(8, sideways(0.5), 1.0)],
             free_epoch: 20,
             ..Map::default()
         };
