@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use semidense::service::journal::folder::unfinished;
 use semidense::service::journal::recovered::Recovered;
-use semidense::service::map_folder::load;
+use semidense::service::map_folder::{load, read_manifest};
 use semidense::service::trajectory_file::read_trajectory;
 use semidense::slam::map::Map;
 use serde_json::Value;
@@ -130,12 +130,17 @@ fn a_kill_at_any_instant_leaves_a_whole_map_at_most_a_keyframe_old() {
     let (mut saves, mut has_run) = (0, false);
     for trial in 0..12u64 {
         let mut child = with_map(&rig, "replay", &output, &map, &[]).spawn().unwrap();
-        // From before the first keyframe to after the last, in steps that meet every part of a save.
-        let wait = Duration::from_millis(150 + (trial * 389) % 2500);
+        // The first before any keyframe, the others so many saves later, and so long after that, which meets every part
+        // of the next one.
+        let wanted = saves + trial % 4 + u64::from(trial > 0);
+        let wait = Duration::from_millis(trial * 37 % 60);
         let begin = Instant::now();
-        while begin.elapsed() < wait && child.try_wait().unwrap().is_none() {
+        let has_saved = || read_manifest(&map).is_ok_and(|(of, _)| of.saves >= wanted);
+        while trial > 0 && !has_saved() && child.try_wait().unwrap().is_none() {
+            assert!(begin.elapsed() < support::WATCH_DOG, "nothing was saved");
             std::thread::sleep(Duration::from_millis(1));
         }
+        std::thread::sleep(wait);
         // It may have ended already, which is fine.
         drop(child.kill());
         drop(end(child));
@@ -143,18 +148,18 @@ fn a_kill_at_any_instant_leaves_a_whole_map_at_most_a_keyframe_old() {
         let made = journal.first().and_then(|found| Recovered::read(&found.folder).ok());
         match load(&map, usize::MAX) {
             Ok(loaded) => {
-                assert!(loaded.problems.is_empty(), "after {wait:?}: {:?}", loaded.problems);
-                assert!(loaded.manifest.saves >= saves, "after {wait:?}: an older map");
+                assert!(loaded.problems.is_empty(), "trial {trial}: {:?}", loaded.problems);
+                assert!(loaded.manifest.saves >= saves, "trial {trial}: an older map");
                 saves = loaded.manifest.saves;
                 has_run = true;
                 let made = made.map_or(0, |of| of.map(&journal[0].folder, 1 << 30).keyframes.len());
                 let kept = loaded.map.keyframes.len();
                 // One is being observed, and one may be on its way.
-                assert!(kept + 2 >= made, "after {wait:?}: {kept} of {made} keyframes");
-                assert!(loaded.map.keyframes.iter().all(|of| of.has_depth()), "after {wait:?}");
+                assert!(kept + 2 >= made, "trial {trial}: {kept} of {made} keyframes");
+                assert!(loaded.map.keyframes.iter().all(|of| of.has_depth()), "trial {trial}");
             }
             Err(error) => {
-                assert!(!has_run, "after {wait:?}: {error}");
+                assert!(!has_run, "trial {trial}: {error}");
                 assert!(error.to_string().contains("holds no map"), "{error}");
             }
         }
