@@ -238,13 +238,13 @@ fn a_running_mapper_saves_when_it_is_asked() {
     let mut command = rig.run(40, &["--live", "--source", source]);
     let mut child = command.arg("--map").arg(&map).spawn().unwrap();
     let copy = rig.folder().join("copy");
-    let saved = support::until("a saved map", || {
+    support::until("a saved map", || {
         let mut save = rig.command(&["map", "save"]);
         save.arg(&copy);
         finish(save).status.success().then_some(())
     });
     let again = finish(rig.command(&["map", "save"]));
-    assert!(again.status.success(), "{saved:?} {}", again.stderr);
+    assert!(again.status.success(), "{}", again.stderr);
     assert!(!loaded(&copy).keyframes.is_empty() && !loaded(&map).keyframes.is_empty());
     drop(child.kill());
     drop(child.wait());
