@@ -69,6 +69,7 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
     let intrinsics = source.intrinsics();
     let config = Config::default();
     let config = ReplayConfig {
+        map: Default::default(),
         tracker: config.tracking,
         mapper: config.mapping,
         map: Default::default(),
