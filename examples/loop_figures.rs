@@ -72,7 +72,6 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
         map: Default::default(),
         tracker: config.tracking,
         mapper: config.mapping,
-        map: Default::default(),
         poses: PoseOrigin::Tracker,
         initial_depth: DepthOrigin::Images,
         max_frames: arguments.frames,

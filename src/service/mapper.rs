@@ -21,10 +21,11 @@ use crate::service::pairing::Pairing;
 use crate::service::schedule::{Background, apply, in_force};
 use crate::service::shutdown::Shutdown;
 use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::loops::{SearchFate, SearchReport};
 use crate::slam::map::Map;
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::parameter::ParameterError;
-use crate::slam::pose::PoseEstimate;
+use crate::slam::pose::{NO_KEYFRAME, PoseEstimate};
 use crate::wire::command::{Command, CommandError, CommandServer};
 use crate::wire::conversion::{code_from_map_state, frame_from_message, pose_from_message};
 use crate::wire::message::{FrameHeader, PoseMessage};
@@ -433,10 +434,27 @@ fn tell_adjustments(
         health.count_adjustment(&record);
         output.publish_adjustment(&record)?;
     }
-    // Health has no counters of them yet.
-    drop(adjustments.take_searches());
+    for search in adjustments.take_searches() {
+        tell_search(&search.report);
+    }
     adjustments.take_failure().iter().for_each(|failure| health.warn(failure));
     Ok(())
+}
+
+/// Logs a loop that was closed and epochs that were joined: health has no counters of them yet.
+fn tell_search(report: &SearchReport) {
+    let (keyframe, other) = (report.keyframe_id, report.other.unwrap_or(NO_KEYFRAME));
+    match report.fate {
+        SearchFate::Closed => {
+            tracing::info!(
+                "loop closed: keyframe {keyframe} sees what {other} shows; the map moves"
+            )
+        }
+        SearchFate::Joined => {
+            tracing::info!("epochs joined: keyframe {keyframe} sees what {other} shows")
+        }
+        _ => {}
+    }
 }
 
 /// The joint estimation of keyframes, as the mode wants it.

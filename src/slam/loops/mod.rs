@@ -45,7 +45,7 @@ pub struct LoopParams {
 
 impl Default for LoopParams {
     fn default() -> Self {
-        Self { num_candidates: 3, min_features: 12.0, drift_inflation: 4.0 }
+        Self { num_candidates: 0, min_features: 20.0, drift_inflation: 4.0 }
     }
 }
 

@@ -131,7 +131,7 @@ impl Window {
             reconsiders: false,
             pass: Pass::default(),
             refinement: Refinement::default(),
-            loops: Loops::new(camera, LoopParams { num_candidates: 0, ..LoopParams::default() }),
+            loops: Loops::new(camera, LoopParams::default()),
             refuted_epoch: None,
             confirmed_epoch: None,
         }
