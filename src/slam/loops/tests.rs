@@ -40,7 +40,7 @@ impl Course {
     fn new(views: Vec<(Keyframe, SE3)>, claimed: f64, drift: f64, seed: u64) -> Self {
         let mut random = Random::new(seed);
         let mut map = Map::default();
-        let params = LoopParams { num_candidates: 3, min_features: 20.0, drift_inflation: 1.0 };
+        let params = LoopParams { num_candidates: 3, min_features: 12.0, drift_inflation: 1.0 };
         let mut loops = Loops::new(views[0].0.intrinsics, params);
         let mut error = Sim3::identity();
         for (id, (image, place)) in (0u64..).zip(views) {

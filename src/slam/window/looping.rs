@@ -4,7 +4,7 @@ use crate::slam::geometry::sim3::Sim3;
 use crate::slam::loops::{Closure, LoopParams, Loops, SearchReport};
 use crate::slam::map::Map;
 use crate::slam::window::Window;
-use crate::slam::window::members::Chosen;
+use crate::slam::window::members::{Chosen, FEWEST_COMMON};
 
 impl Window {
     /// The same, looking for loops.
@@ -44,25 +44,43 @@ impl Window {
         self.loops.insert(keyframe.keyframe_id, keyframe.images[0].pixels(), width, height);
     }
 
-    /// Tells of an estimate of the newest keyframes, and chooses what is searched next.
+    /// Tells of an estimate of the newest keyframes, right after it: who held the newest one.
     pub(super) fn tell_estimate(&mut self, chosen: &Chosen) {
-        let id = |member: usize| self.keyframes[member].keyframe_id;
         let Some((&newest, others)) = chosen.members.split_last() else { return };
-        let all: Vec<u64> = others.iter().map(|&member| id(member)).collect();
-        let is_held = chosen.free.iter().map(Option::is_none);
-        let held = others.iter().zip(is_held).filter(|(_, is_held)| *is_held);
-        let held: Vec<u64> = held.map(|(&member, _)| id(member)).collect();
-        let newest = id(newest);
+        let agreeing = self.agreeing_with_last(chosen);
+        let of = |member: &usize| self.keyframes[*member].keyframe_id;
+        // Those that stand in front of it behind a wall hold nothing.
+        let holds = others.iter().zip(&agreeing).filter(|(_, count)| **count >= FEWEST_COMMON);
+        let all: Vec<u64> = holds.map(|(member, _)| of(member)).collect();
+        let fixed = others.iter().zip(&chosen.free).filter(|(_, free)| free.is_none());
+        let held = fixed.map(|(member, _)| of(member)).filter(|id| all.contains(id));
+        let held: Vec<u64> = held.collect();
+        let newest = of(&newest);
         self.loops.note_estimate(newest, &all, &held);
-        self.plan_search(self.num_unsettled());
     }
 
-    fn num_unsettled(&self) -> usize {
+    /// By member how many comparisons with the last one count.
+    fn agreeing_with_last(&self, chosen: &Chosen) -> Vec<usize> {
+        let last = chosen.members.len() - 1;
+        let most_energy = self.robustness().most_energy;
+        let mut counts = vec![0; chosen.members.len()];
+        for pair in &self.solver.views.pairs {
+            let other = match (pair.host == last, pair.observer == last) {
+                (true, false) => pair.observer,
+                (false, true) => pair.host,
+                _ => continue,
+            };
+            counts[other] += self.solver.system.inliers_among(pair.places(), most_energy);
+        }
+        counts
+    }
+
+    pub(super) fn num_unsettled(&self) -> usize {
         self.params.num_free.max(1)
     }
 
     /// Chooses what is searched next, the newest keyframes left out.
-    fn plan_search(&mut self, num_unsettled: usize) {
+    pub(super) fn plan_search(&mut self, num_unsettled: usize) {
         let known: Vec<u64> = self.keyframes.iter().map(|of| of.keyframe_id).collect();
         self.loops.plan(&known, known.len().saturating_sub(num_unsettled));
     }

@@ -7,7 +7,7 @@ use crate::slam::window::keyframe::WindowKeyframe;
 use crate::slam::window::view::Sight;
 
 /// Points that two keyframes must see both for the one to hold the other in place.
-const FEWEST_COMMON: usize = 20;
+pub(super) const FEWEST_COMMON: usize = 20;
 /// Keyframes that are held in place where no older one sees the same things.
 const NUM_HELD: usize = 2;
 /// Keyframes whose points are looked for one by one in another, the nearest: seven times those that are held, so that

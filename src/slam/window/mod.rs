@@ -250,10 +250,13 @@ impl Window {
         if is_new {
             let chosen = self.choose_members(newest);
             adjustment = self.adjust(&chosen);
+            if adjustment.is_some() {
+                self.tell_estimate(&chosen);
+            }
             if adjustment.is_some() && self.is_refuted(&chosen) {
                 self.refuted_epoch = Some(self.keyframes[newest].epoch);
             }
-            self.tell_estimate(&chosen);
+            self.plan_search(self.num_unsettled());
             self.place_frames(newest, chosen.is_first);
             self.leave(&chosen.members);
         }

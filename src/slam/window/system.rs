@@ -430,6 +430,12 @@ impl System {
         self.inlier_cost / (SAMPLES * self.inliers.max(1)) as f64
     }
 
+    /// How many of the comparisons at some places count.
+    pub fn inliers_among(&self, places: std::ops::Range<usize>, most_energy: f32) -> usize {
+        let costs = self.costs.get(places).unwrap_or_default();
+        costs.iter().filter(|cost| **cost < most_energy).count()
+    }
+
     /// Keyframes that agree with each point, in the order of the views.
     pub fn inliers_by_point(&self) -> impl Iterator<Item = u32> {
         self.points.iter().map(|part| part.inliers)
