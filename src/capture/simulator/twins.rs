@@ -62,10 +62,10 @@ const fn twins_round() -> [Waypoint; 63] {
         waypoint(3.9, 5.1, 188.0, -8.0),
         waypoint(2.9, 5.2, 196.0, -8.0),
         waypoint(2.0, 5.3, 212.0, -8.0),
-        waypoint(1.4, 5.3, 236.0, -8.0),
-        waypoint(1.0, 5.3, 262.0, -8.0),
-        waypoint(0.8, 5.2, 288.0, -8.0),
-        waypoint(0.7, 5.1, 315.0, -8.0),
+        waypoint(1.4, 5.4, 236.0, -8.0),
+        waypoint(0.95, 5.45, 262.0, -8.0),
+        waypoint(0.65, 5.2, 288.0, -8.0),
+        waypoint(0.65, 4.85, 315.0, -8.0),
     ];
     let mut round = [BAY[0]; 63];
     let mut i = 0;

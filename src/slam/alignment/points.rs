@@ -99,6 +99,15 @@ impl LevelPoints {
         self.len = 0;
     }
 
+    /// Memory for so many points, however they lie: each may begin a run.
+    pub fn reserve(&mut self, points: usize) {
+        let missing = |len: usize, wanted: usize| wanted.saturating_sub(len);
+        let blocks = points.div_ceil(LANES);
+        self.blocks.reserve(missing(self.blocks.len(), blocks));
+        self.log_inverse_depths.reserve(missing(self.log_inverse_depths.len(), blocks));
+        self.runs.reserve(missing(self.runs.len(), points));
+    }
+
     /// Adds a point that lies in `tile` of the image.
     #[inline]
     pub fn push(&mut self, point: Point, tile: u16) {

@@ -224,6 +224,7 @@ impl Reference {
         let image = self.pyramid.level(level);
         let candidates = self.fusion.level(level);
         let budget = self.params.point_budget[level];
+        self.levels[level].reserve(budget.min(candidates.len()));
         let chosen = self.selection.choose(
             &self.params.selection,
             candidates,

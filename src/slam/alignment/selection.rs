@@ -64,6 +64,8 @@ impl Selection {
         budget: usize,
     ) -> &[u32] {
         self.chosen.clear();
+        // One more than are chosen, see `fill_quotas`.
+        self.chosen.reserve(budget.min(candidates.len()) + 1);
         if candidates.len() <= budget {
             self.chosen.extend(0..candidates.len() as u32);
             return &self.chosen;
