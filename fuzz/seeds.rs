@@ -1,5 +1,7 @@
 //! Small good inputs, from which fuzzing starts: made here, so that none is a file of somebody's.
 
+use std::sync::Arc;
+
 use semidense::service::journal::log::{Record, RunStart, Step, log_header};
 use semidense::service::map_file::write_map;
 use semidense::service::map_folder::depth_file::{MapDetail, encode};
@@ -12,6 +14,7 @@ use semidense::slam::geometry::se3::SE3;
 use semidense::slam::geometry::sim3::Sim3;
 use semidense::slam::keyframe::{DepthPoint, Keyframe, KeyframePose};
 use semidense::slam::map::Map;
+use semidense::slam::places::{Description, Feature, FeaturePlace};
 use semidense::slam::pose::{PoseEstimate, TrackingState};
 use semidense::wire::conversion::{
     PoseTiming, keyframe_header, keyframe_image_header, pose_message, rigid_message,
@@ -82,6 +85,7 @@ pub fn seeds() -> Vec<Seed> {
     add("map_folder", kind(0, &manifest()));
     for detail in [MapDetail::Full, MapDetail::Small] {
         add("map_folder", kind(1, &encode(&keyframe(), detail)));
+        add("map_folder", kind(1, &encode(&described(), detail)));
     }
     add("journal", journal());
     messages()
@@ -128,6 +132,13 @@ fn keyframe() -> Keyframe {
             (0..CAMERA.width * CAMERA.height).map(|i| (i * i % 251) as u8).collect(),
         )
     }
+}
+
+fn described() -> Keyframe {
+    let place = FeaturePlace { u: 5, v: 6, orientation: 7, scale: 1 };
+    let features = vec![Feature { place, bits: [1, 2, 3, 4] }; 20];
+    let description = Description::of_features(CAMERA.width, CAMERA.height, features);
+    Keyframe { description: description.map(Arc::new), ..keyframe() }
 }
 
 fn map_bytes() -> Vec<u8> {
@@ -232,6 +243,14 @@ fn messages() -> [Vec<u8>; 7] {
         adjustments_merged: 2,
         adjustments_dropped: 1,
         adjustment_counts: [3; HISTOGRAM_BUCKETS],
+        loop_searches: 0,
+        loops_closed: 1,
+        loops_held: 2,
+        epochs_joined: 3,
+        loops_refused: 4,
+        loops_against_drift: 5,
+        loops_unconfirmed: 6,
+        loops_inconsistent: 7,
         scheduling: 1,
         priority: 70,
         memory_locked: 1,

@@ -9,7 +9,7 @@ use std::path::Path;
 use std::process::Command;
 
 use serde_json::Value;
-use support::{Rig, finish};
+use support::{Rig, finish, small_camera};
 
 /// Half-size images of the default room: 3 s, enough for a map and its first new keyframes.
 const SETTINGS: [&str; 4] = [
@@ -63,6 +63,24 @@ fn threads_and_processes_do_not_change_a_bit() {
     summary(rig.command(&["run", "--set", "mapper.threads=2"]), &output);
     assert_same(&replayed[0], &contents(&output), "one process and three in lockstep");
     assert_eq!(rig.leftovers(), Vec::<String>::new());
+}
+
+#[test]
+fn poses_that_a_run_has_only_in_its_journal_are_those_of_a_replay() {
+    let rig = Rig::new();
+    // Three hundred are written at a time.
+    let long = "loop:900:30:sim";
+    let small = small_camera(90).map(|setting| format!("--set=simulator.{setting}"));
+    let finished = |arguments: &[&str], output: &Path| {
+        let mut command = rig.command(arguments);
+        command.args(&small).arg("--output").arg(output);
+        let ended = finish(command);
+        assert!(ended.status.success(), "{}", ended.stderr);
+        contents(output)
+    };
+    let replayed = finished(&["replay", long], &rig.folder().join("replay"));
+    let run = finished(&["run", "--source", long], &rig.folder().join("run"));
+    assert_same(&replayed, &run, "poses in memory and in the journal");
 }
 
 #[test]

@@ -6,12 +6,12 @@ mod support;
 use std::ffi::OsStr;
 use std::fs;
 use std::os::unix::ffi::OsStrExt;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Child, Command};
 
 use rustix::process::Signal;
 use serde_json::Value;
-use support::{Ended, Rig, end, finish, signal, small_camera, until};
+use support::{Ended, Rig, end, finish, journal_of, signal, small_camera, until};
 
 const INTERRUPTED: i32 = 130;
 const NOTHING_TRACKED: i32 = 3;
@@ -22,25 +22,12 @@ const ENDLESS: &str = "loop:200000:30:sim";
 /// So many frames that their preparation lasts until it is interrupted.
 const LONG_PREPARATION: &str = "simulator.frames=3000";
 
-/// Of its log a pose takes this many bytes at least.
-const POSE_BYTES: u64 = 430;
-
 fn command(rig: &Rig, arguments: &[&str]) -> Command {
     let mut command = rig.command(arguments);
     for setting in small_camera(60) {
         command.args(["--set", &format!("simulator.{setting}")]);
     }
     command
-}
-
-/// The journal in `folder`, once it holds so many poses.
-fn journal_of(folder: &Path, poses: u64) -> PathBuf {
-    until("a journal", || {
-        let mut entries = fs::read_dir(folder).ok()?.flatten().map(|entry| entry.path());
-        let journal = entries.find(|path| path.to_string_lossy().contains(".semidense-journal"))?;
-        let length = fs::metadata(journal.join("log")).ok()?.len();
-        (length >= poses * POSE_BYTES).then_some(journal)
-    })
 }
 
 fn kill(child: Child) {
@@ -179,7 +166,7 @@ fn of_a_run_that_was_killed_while_it_prepared_there_is_nothing_to_recover() {
         let entries = fs::read_dir(here.join("output")).ok()?.flatten();
         entries.map(|entry| entry.path()).find(|path| path.is_dir())
     });
-    let journal = journal_of(&output, 1);
+    let journal = journal_of(&output, 0);
     // They tidy up once the supervisor is gone.
     until("all processes", || {
         let claims = ["capture", "tracker", "mapper"].map(|name| rig.place().claimant(name));

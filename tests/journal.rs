@@ -11,7 +11,7 @@ use rustix::process::{Pid, Signal};
 use semidense::service::peers::Peer;
 use semidense::wire::topic::MAPPER_HEALTH;
 use serde_json::Value;
-use support::{Ended, Rig, end, finish, signal, small_camera, until, with_mount};
+use support::{Ended, Rig, end, finish, journal_of, signal, small_camera, until, with_mount};
 
 /// The files of a run.
 const FILES: [&str; 8] = [
@@ -27,9 +27,6 @@ const FILES: [&str; 8] = [
 
 /// A sequence without end in sight from few pictures: sixty frames to and fro.
 const ENDLESS: &str = "loop:200000:30:sim";
-
-/// Of its log a pose takes this many bytes at least.
-const POSE_BYTES: u64 = 650;
 
 fn command(rig: &Rig, arguments: &[&str]) -> Command {
     let mut command = rig.command(arguments);
@@ -62,18 +59,6 @@ fn assert_set(folder: &Path) {
 
 fn summary(folder: &Path) -> Value {
     serde_json::from_str(&fs::read_to_string(folder.join("summary.json")).unwrap()).unwrap()
-}
-
-/// The journal in `folder`, once it holds so many poses.
-fn journal_of(folder: &Path, poses: u64) -> PathBuf {
-    until("a journal", || {
-        let entries = fs::read_dir(folder).ok()?.flatten();
-        let journal = entries.map(|entry| entry.path()).find(|path| {
-            path.file_name().unwrap().to_string_lossy().starts_with(".semidense-journal")
-        })?;
-        let length = fs::metadata(journal.join("log")).ok()?.len();
-        (length >= poses * POSE_BYTES).then_some(journal)
-    })
 }
 
 /// Kills a run that has journaled some hundred frames, and says where its journal is.

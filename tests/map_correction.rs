@@ -285,7 +285,10 @@ fn depth_is_corrected_where_it_is_observed_too() {
     let path = folder.path().join("map.bin");
     write_map(&path, run.mapper.map(), &mut || ()).unwrap();
     let read = read_map(&path).unwrap();
-    assert_eq!((read.revision, &read.keyframes), (1, &run.mapper.map().keyframes));
+    // What a keyframe is found by is not in the file: it is made again from the image.
+    let mut written = run.mapper.map().keyframes.clone();
+    written.iter_mut().for_each(|keyframe| keyframe.description = None);
+    assert_eq!((read.revision, read.keyframes), (1, written));
 }
 
 /// A mapper that dies after a correction goes on from the corrected map, and odometry where it was.

@@ -23,6 +23,7 @@ use semidense::slam::frame::FrameView;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::keyframe::MapState;
+use semidense::slam::loops::SearchFate;
 use semidense::slam::mapper::recovery::RecoveryParams;
 use semidense::slam::mapper::situation::Situation;
 use semidense::slam::mapper::{Mapper, MapperParams};
@@ -411,4 +412,61 @@ fn wrong_start(first_frame: usize, most_frames: u64) {
     assert!(first.1 - first.0 < most_frames && second.0 - first.1 < 15, "{first:?} {second:?}");
     let (wrong, right) = (error_ratio(&record, 0), error_ratio(&record, 1));
     assert!(right < 0.01 && wrong > 2.0 * right, "{wrong} {right}");
+}
+
+/// A camera that loses itself, begins an epoch elsewhere and comes back to the first place: the frame at which it is back
+/// there, and the run.
+fn separated_and_back(num_candidates: usize) -> (usize, RunRecord) {
+    let motion = MotionParams { mean_turn_deg_s: 18.0, ..MotionParams::default() };
+    let params = SimulatorParams { seed: 1, frames: 600, motion, ..SimulatorParams::half_size() };
+    let room = film(&mut Simulator::new(params).unwrap());
+    let mut script = Script::new(room.intrinsics);
+    script.show(&room, 280..420);
+    script.black_out(80);
+    let begin = script.frames.len();
+    // It looks the other way, and turns back to the first place.
+    script.show(&room, 170..600);
+    let mut mapper = MapperParams::default();
+    mapper.loops.num_candidates = num_candidates;
+    let record = script.replay(&ReplayConfig { mapper, ..ReplayConfig::default() });
+    (begin + 280 - 170, record)
+}
+
+#[test]
+fn an_epoch_that_sees_a_place_of_the_one_before_it_becomes_part_of_it() {
+    let (back, record) = separated_and_back(MapperParams::default().loops.num_candidates);
+    assert!(estimates(&record).any(|e| e.epoch == 1 && e.state.is_tracked()), "none was begun");
+    let searches = record.searches.as_deref().unwrap_or_default();
+    let joins: Vec<u64> = searches
+        .iter()
+        .filter(|search| search.report.fate == SearchFate::Joined)
+        .map(|search| search.sequence)
+        .collect();
+    println!("joined at {joins:?}, back at {back}");
+    assert_eq!(joins.len(), 1, "it is told once");
+    assert!(record.map.keyframes.iter().all(|k| k.epoch == 0), "the older numbering stays");
+    let after: Vec<_> = estimates(&record).filter(|e| e.sequence > joins[0] + 20).collect();
+    assert!(after.iter().all(|e| e.epoch == 0));
+    // Frames of both lie in one map now, odometry has not moved.
+    let placed = |e: &PoseEstimate| {
+        let world_from_camera = record.map.place(e.keyframe_id, &e.keyframe_from_camera)?;
+        Some(StampedPose { nanos: e.capture_nanos, world_from_camera })
+    };
+    let tracked = || estimates(&record).filter(|e| e.state.is_tracked());
+    let poses: Vec<StampedPose> = tracked().filter_map(placed).collect();
+    let truth = &record.ground_truth;
+    let found = evaluate_trajectory(&poses, truth, Alignment::Sim3, MAX_DIFFERENCE_NANOS).unwrap();
+    println!("ATE {} over {} poses, path {}", found.ate.rmse, poses.len(), found.path_length);
+    assert!(found.ate.rmse < 0.01 * found.path_length, "{}", found.ate.rmse);
+    let of_odometry: Vec<_> =
+        tracked().filter(|e| e.sequence > joins[0].saturating_sub(5)).collect();
+    let steps = of_odometry.windows(2).map(|pair| {
+        (pair[1].world_from_camera.translation - pair[0].world_from_camera.translation).norm()
+    });
+    let mut steps: Vec<f64> = steps.take(20).collect();
+    steps.sort_by(f64::total_cmp);
+    assert!(steps[19] < 4.0 * steps[10], "odometry jumps: {steps:?}");
+    // Without the search it stays apart.
+    let (_, alone) = separated_and_back(0);
+    assert!(alone.map.keyframes.iter().any(|k| k.epoch == 1));
 }

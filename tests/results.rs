@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use semidense::capture::source::{FrameSource, FrameStamp, SourceError};
-use semidense::service::adjustments::{AdjustmentRecord, Fate};
+use semidense::service::adjustments::{AdjustmentRecord, Fate, SearchRecord};
 use semidense::service::alignment_stamps::{AlignmentTrace, LevelTrace};
 use semidense::service::results::output_folder::prepare_output;
 use semidense::service::results::untracked::StartTally;
@@ -15,8 +15,10 @@ use semidense::slam::evaluation::depth_error::DepthScale;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::geometry::sim3::Sim3;
+use semidense::slam::graph::constraint::Refusal;
 use semidense::slam::image::buffer::Image;
 use semidense::slam::keyframe::{DepthPoint, Keyframe};
+use semidense::slam::loops::{SearchFate, SearchReport};
 use semidense::slam::map::Map;
 use semidense::slam::mapper::consistency::Contradiction;
 use semidense::slam::pose::{
@@ -332,6 +334,54 @@ fn joint_estimates_are_in_summary_and_report_and_their_points_in_a_file() {
 }
 
 #[test]
+fn searches_for_loops_are_in_summary_and_report() {
+    let search = |keyframe_id: u64, fate| SearchRecord {
+        sequence: 5,
+        nanos: 2_000_000,
+        report: SearchReport {
+            keyframe_id,
+            other: Some(0),
+            likeness: 20.0,
+            compared: 1,
+            fate,
+            measured: None,
+        },
+    };
+    let poses = (0..60).map(|i| pose(i, TrackingState::Tracking, u64::from(i >= 40))).collect();
+    let mut record = record(poses, vec![keyframe(0), keyframe(1)], false);
+    let folder = tempfile::tempdir().unwrap();
+    let (_, report) = written(folder.path(), &record);
+    assert!(!report.contains("<h2>Loops</h2>"), "none was looked for");
+    let fates = [
+        SearchFate::Proposed,
+        SearchFate::Closed,
+        SearchFate::Refused(Refusal::FewInliers),
+        SearchFate::Refused(Refusal::NotReciprocal(20.0)),
+        SearchFate::Refused(Refusal::NotReciprocal(30.0)),
+        SearchFate::AgainstDrift(99.0),
+    ];
+    record.searches = Some(fates.map(|fate| search(1, fate)).to_vec());
+    let (summary, report) = written(tempfile::tempdir().unwrap().path(), &record);
+    for (key, value) in [
+        ("loop_searches", 5),
+        ("loops_closed", 1),
+        ("loops_refused", 3),
+        ("loops_against_drift", 1),
+    ] {
+        assert_eq!(summary[key].as_u64(), Some(value), "{key}");
+    }
+    for part in [
+        "<h2>Loops</h2>",
+        "5 keyframes searched, 1 closed, 0 held already",
+        "2 times both directions disagree; 1 times too few points are inliers",
+        "Loops from above",
+        "against the drift",
+    ] {
+        assert!(report.contains(part), "{part}");
+    }
+}
+
+#[test]
 fn of_several_epochs_the_longest_is_judged_and_all_are_written() {
     let mut poses: Vec<_> = (0..60).map(|i| pose(i, TrackingState::Tracking, 0)).collect();
     for pose in &mut poses[20..] {
@@ -378,6 +428,10 @@ fn what_was_given_is_not_judged_as_if_it_was_estimated() {
     let summary = of(&estimated);
     assert!(summary["depth_relative_error_median"].is_number());
     assert!(summary["grade"]["reasons"].to_string().contains("a scale of its own"), "{summary}");
+    let of_keyframes = summary["keyframe_depth"].as_array().unwrap();
+    assert_eq!(of_keyframes.len(), 1);
+    assert!(of_keyframes[0]["units_per_metre"].as_f64().unwrap() > 0.0, "{summary}");
+    assert!(summary["depth_scale_ratio"].is_null(), "of one keyframe");
     let from_sensor = RunRecord { is_depth_from_sensor: true, ..estimated.clone() };
     assert!(of(&from_sensor)["depth_relative_error_median"].is_null());
     let given = RunRecord { depth_scale: DepthScale::Given, ..estimated };

@@ -35,8 +35,8 @@ const MANY_KILLS: usize = 500;
 const IN_TIME_RATIO: f64 = 0.99;
 /// In time.
 const WITHOUT_POSES: Duration = Duration::from_secs(1);
-/// What the supervisor may keep of a frame until the end, bytes: its pose with all figures.
-const BYTES_OF_A_FRAME: f64 = 2048.0;
+/// What the supervisor may keep of a frame until the end, bytes: times. Its pose is in the journal.
+const BYTES_OF_A_FRAME: f64 = 100.0;
 /// The camera moves slowly to and fro: within the second that a restart may take it goes less than this
 /// between two poses, in units of the map (about a room's depth).
 const LARGEST_STEP: f64 = 0.5;

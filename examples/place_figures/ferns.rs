@@ -27,7 +27,11 @@ impl Ferns {
             .map(|ours| known.iter().map(|theirs| alike(ours, theirs)).collect())
             .collect();
         let micros = 1e6 * (busy_secs() - began) / queries.len().max(1) as f64;
-        Scores { of, cost: format!("query {micros:.0} µs, {FERNS} B a keyframe") }
+        Scores {
+            of,
+            candidates: Vec::new(),
+            cost: format!("query {micros:.0} µs, {FERNS} B a keyframe"),
+        }
     }
 
     fn new() -> Self {

@@ -7,9 +7,13 @@ use std::path::Path;
 use nalgebra::Vector3;
 use semidense::capture::source::{SourceParams, open};
 use semidense::service::trajectory_file::read_trajectory;
+use semidense::slam::depth::map::DepthMap;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
+use semidense::slam::geometry::sim3::Sim3;
 use semidense::slam::image::buffer::Image;
+use semidense::slam::keyframe::{DepthPoint, Keyframe};
+use semidense::slam::mapper::MapperParams;
 
 use crate::Arguments;
 
@@ -25,6 +29,20 @@ pub struct Footage {
     pub camera: Intrinsics,
     pub frames: Vec<Frame>,
     depths: Vec<f64>,
+}
+
+/// Errors that are the same on every run.
+struct Noise(u64);
+
+impl Noise {
+    /// Of about a normal distribution, standard deviation 1: the sum of twelve even ones.
+    fn normal(&mut self) -> f64 {
+        let mut even = || {
+            self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+            (self.0 >> 33) as f64 / (1u64 << 31) as f64
+        };
+        (0..12).map(|_| even()).sum::<f64>() - 6.0
+    }
 }
 
 /// How much two keyframes share: the least and the most that it can be.
@@ -93,6 +111,43 @@ impl Footage {
             (0..width * height).map(at).collect()
         };
         self.frames.iter().map(of).collect()
+    }
+
+    /// A frame as a keyframe with its place and unit, the mean depth: pixels of the mapper's choice, with depth that errs
+    /// by `depth_error` of it. `None` where it has none.
+    pub fn keyframe(&self, number: usize, depth_error: f64) -> Option<Keyframe> {
+        let frame = self.frames.get(number)?;
+        let depth = frame.depth.as_ref()?;
+        let params = MapperParams::default();
+        let mut map = DepthMap::with_size(self.camera.width, self.camera.height);
+        map.restart(&frame.pixels, params.min_gradient, params.max_candidates);
+        let mut noise = Noise(number as u64);
+        let mut points = Vec::new();
+        for (v, row) in (0..).zip(map.candidates.pixels().chunks_exact(self.camera.width)) {
+            for (u, _) in (0..).zip(row).filter(|(_, is_candidate)| **is_candidate) {
+                let [column, row] = [u, v].map(usize::from);
+                let z = f64::from(depth.at(column, row));
+                if !(z > 0.0 && z.is_finite()) {
+                    continue;
+                }
+                let inverse_depth = (1.0 + depth_error * noise.normal()).max(0.1) / z;
+                points.push(DepthPoint {
+                    u,
+                    v,
+                    inverse_depth: inverse_depth as f32,
+                    variance: (depth_error * inverse_depth).powi(2) as f32,
+                    intensity: f32::from(frame.pixels[row * self.camera.width + column]),
+                });
+            }
+        }
+        let sum: f64 = points.iter().map(|point| f64::from(point.inverse_depth)).sum();
+        let unit = points.len() as f64 / sum;
+        for point in &mut points {
+            point.inverse_depth *= unit as f32;
+            point.variance *= (unit * unit) as f32;
+        }
+        let place = Sim3::new(frame.world_from_camera, unit);
+        (sum > 0.0).then(|| Keyframe::at(place, self.camera, points, frame.pixels.clone()))
     }
 
     /// Of every pair the share that each sees of the other.

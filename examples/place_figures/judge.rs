@@ -4,11 +4,11 @@ use crate::footage::Overlap;
 use crate::methods::Scores;
 
 /// Keyframes of which each sees at least so much of the other show the same place.
-const SAME: f64 = 0.3;
+pub const SAME: f64 = 0.3;
 /// Those that share no more than this show different ones; what is between does not count.
-const OTHER: f64 = 0.05;
+pub const OTHER: f64 = 0.05;
 /// Candidates that a verification could look at.
-const FEW: usize = 3;
+pub const FEW: usize = 3;
 
 /// Queries that a place could be found for.
 pub fn count_revisits(overlaps: &[Vec<Overlap>], gap: usize) -> usize {

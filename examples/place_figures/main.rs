@@ -10,6 +10,7 @@ mod ferns;
 mod footage;
 mod judge;
 mod methods;
+mod verify;
 
 use std::error::Error;
 use std::path::PathBuf;
@@ -59,6 +60,10 @@ struct Arguments {
     /// Degrees by which every keyframe that asks is rolled.
     #[arg(long, default_value_t = 0.0)]
     roll: f32,
+    /// Align the tree's best candidates as the search for loops does, with true depth that errs by so much (0.01: 1 %),
+    /// independently from pixel to pixel.
+    #[arg(long, conflicts_with_all = ["roll", "contrast", "truth"])]
+    verify: Option<f64>,
 }
 
 fn main() -> ExitCode {
@@ -86,7 +91,7 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
     let queries = footage.queries(arguments.contrast, arguments.roll);
     let mut all: Vec<(String, Scores)> = Vec::new();
     for kind in &arguments.methods {
-        all.push((format!("{kind:?}"), methods::scores(*kind, &footage, &queries)));
+        all.push((format!("{kind:?}"), methods::scores(*kind, &footage, &queries, arguments.gap)));
     }
     if let Some(file) = &arguments.scores {
         all.push((file.display().to_string(), methods::read_scores(file)?));
@@ -94,6 +99,11 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
     for (name, scores) in &all {
         println!("{name}: {}", scores.cost);
         judge::judge(&overlaps, scores, arguments.gap);
+        if let Some(depth_error) = arguments.verify
+            && !scores.candidates.is_empty()
+        {
+            verify::verify(&footage, &overlaps, &scores.candidates, arguments.gap, depth_error);
+        }
     }
     Ok(())
 }

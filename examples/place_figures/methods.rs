@@ -6,7 +6,7 @@ use std::path::Path;
 
 use clap::ValueEnum;
 use semidense::slam::mapper::appearance::Appearance;
-use semidense::slam::places::{Describer, PlaceIndex};
+use semidense::slam::places::{Candidate, Describer, PlaceIndex};
 
 use crate::ferns::Ferns;
 use crate::footage::Footage;
@@ -26,14 +26,17 @@ pub enum Kind {
 pub struct Scores {
     /// For each query a number for each keyframe, larger the more alike, NaN where it says nothing.
     pub of: Vec<Vec<f32>>,
+    /// What the tree says where it is asked only for keyframes that may be found: for each query its candidates, best
+    /// first. Empty of other methods.
+    pub candidates: Vec<Vec<Candidate>>,
     /// What it costs, to be printed.
     pub cost: String,
 }
 
-/// Of a method over all pairs.
-pub fn scores(kind: Kind, footage: &Footage, queries: &[Vec<u8>]) -> Scores {
+/// Of a method over all pairs; `gap` keyframes before a query and what is newer need not be found.
+pub fn scores(kind: Kind, footage: &Footage, queries: &[Vec<u8>], gap: usize) -> Scores {
     match kind {
-        Kind::Tree => tree(footage, queries),
+        Kind::Tree => tree(footage, queries, gap),
         Kind::Small => small(footage, queries),
         Kind::Ferns => Ferns::scores(footage, queries),
     }
@@ -49,7 +52,7 @@ fn micros(began: f64, count: usize) -> f64 {
     1e6 * (busy_secs() - began) / count.max(1) as f64
 }
 
-fn tree(footage: &Footage, queries: &[Vec<u8>]) -> Scores {
+fn tree(footage: &Footage, queries: &[Vec<u8>], gap: usize) -> Scores {
     let (width, height) = (footage.camera.width, footage.camera.height);
     let count = footage.frames.len();
     let (mut describer, mut index) = (Describer::new(), PlaceIndex::new());
@@ -64,26 +67,28 @@ fn tree(footage: &Footage, queries: &[Vec<u8>]) -> Scores {
     }
     let insert = micros(began, count);
     let began = busy_secs();
-    let of = asking
-        .iter()
-        .enumerate()
-        .map(|(query, description)| {
-            let mut row = vec![f32::NAN; count];
-            let Some(description) = description else { return row };
-            for found in index.candidates(description, count, |id| id == query as u64) {
-                row[found.keyframe_id as usize] = found.score;
-            }
-            row
-        })
-        .collect();
+    let found_of = |query: usize, is_excluded: &dyn Fn(u64) -> bool| match &asking[query] {
+        Some(description) => index.candidates(description, count, is_excluded),
+        None => Vec::new(),
+    };
+    let all: Vec<_> = (0..count).map(|query| found_of(query, &|id| id == query as u64)).collect();
     let query = micros(began, count);
+    let row = |found: &Vec<Candidate>| {
+        let mut row = vec![f32::NAN; count];
+        found.iter().for_each(|of| row[of.keyframe_id as usize] = of.score);
+        row
+    };
+    let of = all.iter().map(row).collect();
+    let may_be_found = |id: u64, query: usize| id as usize + gap < query;
+    let candidates =
+        (0..count).map(|query| found_of(query, &|id| !may_be_found(id, query))).collect();
     let features: usize = described.iter().flatten().map(|d| d.features().len()).sum();
     let cost = format!(
         "describe {describe:.0} µs, insert {insert:.0} µs, query {query:.0} µs, {} features, {} B a keyframe",
         features / count.max(1),
         index.bytes() / count.max(1)
     );
-    Scores { of, cost }
+    Scores { of, candidates, cost }
 }
 
 fn small(footage: &Footage, queries: &[Vec<u8>]) -> Scores {
@@ -103,7 +108,7 @@ fn small(footage: &Footage, queries: &[Vec<u8>]) -> Scores {
         })
         .collect();
     let cost = format!("query {:.0} µs", micros(began, queries.len()));
-    Scores { of, cost }
+    Scores { of, candidates: Vec::new(), cost }
 }
 
 /// Of a file: a line for each query.
@@ -111,5 +116,5 @@ pub fn read_scores(file: &Path) -> Result<Scores, Box<dyn Error>> {
     let text = fs::read_to_string(file)?;
     let row = |line: &str| line.split_whitespace().map(str::parse).collect::<Result<Vec<f32>, _>>();
     let of = text.lines().map(row).collect::<Result<_, _>>()?;
-    Ok(Scores { of, cost: String::new() })
+    Ok(Scores { of, candidates: Vec::new(), cost: String::new() })
 }

@@ -1,6 +1,7 @@
 //! `semidense bench`: the latency of poses, idle and under load, and how a long run goes on.
 
 use std::ffi::OsString;
+use std::fs;
 use std::io::Write;
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
@@ -10,12 +11,14 @@ use std::time::Duration;
 use clap::{Args, Subcommand, ValueEnum};
 
 use crate::capture::source::SourceName;
+use crate::command::ending::run_start;
 use crate::command::print::{note, print};
 use crate::command::run_progress::start_display;
 use crate::command::{CommandResult, CommonArguments, INTERRUPTED};
 use crate::service::atomic_file::write_atomically;
 use crate::service::config::Config;
 use crate::service::error_log::ErrorLog;
+use crate::service::journal::JournalOptions;
 use crate::service::latency_bench::{Disturbance, Measurement, Trial, TrialError, try_out};
 use crate::service::mode::Mode;
 use crate::service::results::times::Percentiles;
@@ -158,10 +161,19 @@ fn run_soak(
     let shutdown = Shutdown::install()?;
     let display = start_display(arguments.json)?;
     let options = common.without_instance().to_arguments();
-    let soaked = Soak { frames, rate_hz, mode, period };
+    let output = std::env::temp_dir().join(format!("semidense-soak-{}", std::process::id()));
+    fs::create_dir(&output)
+        .map_err(|error| format!("{}: cannot be made ({error})", output.display()))?;
+    let journal = JournalOptions {
+        output: output.clone(),
+        start: run_start(config, &source, None),
+        max_depth_bytes: config.mapping.max_map_bytes() as u64,
+    };
+    let soaked = Soak { frames, rate_hz, mode, period, journal };
     let samples =
         soak(config, &soaked, &source, &options, log, &shutdown, &mut |p| display.show(p));
     display.finish();
+    drop(fs::remove_dir_all(&output));
     let samples = samples?;
     if let Some(path) = &arguments.csv {
         write_atomically(path, |file| file.write_all(csv(&samples).as_bytes()))

@@ -22,7 +22,7 @@ use crate::wire::place::Place;
 use crate::wire::port::{Access, Hub, wait};
 use crate::wire::topic::MAPPER_HEALTH;
 
-/// Check, export, save and merge maps on disk
+/// Check, export, save, load and merge maps on disk
 ///
 /// A map is a folder that `run`, `replay` and the services begin or continue with --map DIR.
 #[derive(Debug, Args)]
@@ -74,6 +74,7 @@ enum MapCommand {
     Info(InfoArguments),
     Export(ExportArguments),
     Save(SaveArguments),
+    Load(LoadArguments),
     Merge(MergeArguments),
 }
 
@@ -83,6 +84,21 @@ struct SaveArguments {
     /// Folder that holds no map yet [default: the one that the mapper was started with]
     #[arg(value_name = "DIR")]
     folder: Option<PathBuf>,
+}
+
+/// Have the running mapper go over to the map in another folder
+///
+/// It saves its own map first, where that has a folder, then looks for the camera in the other one and goes on there; a
+/// new epoch begins beside it where the camera is not found for two seconds. A map that does not fit is refused, and the
+/// mapper goes on in its own.
+#[derive(Debug, Args)]
+struct LoadArguments {
+    /// Folder of the map
+    #[arg(value_name = "DIR")]
+    folder: PathBuf,
+    /// Only locate the camera in the map: nothing in its folder changes
+    #[arg(long)]
+    read_only: bool,
 }
 
 /// Write two maps of one camera into one
@@ -133,6 +149,7 @@ pub fn run(config: &Config, arguments: MapArguments) -> CommandResult {
         MapCommand::Info(arguments) => info(&arguments),
         MapCommand::Export(arguments) => export_map(config, &arguments),
         MapCommand::Save(arguments) => save(config, &arguments),
+        MapCommand::Load(arguments) => load_running(config, &arguments),
         MapCommand::Merge(arguments) => merge_maps(&arguments),
     }
 }
@@ -215,19 +232,31 @@ fn export_map(config: &Config, arguments: &ExportArguments) -> CommandResult {
 
 fn save(config: &Config, arguments: &SaveArguments) -> CommandResult {
     let folder = arguments.folder.as_ref().map(std::path::absolute).transpose()?;
+    ask(config, "map-save", &Command::SaveFolder(folder.clone().unwrap_or_default()))?;
+    let place = folder.map_or("its folder".to_owned(), |folder| folder.display().to_string());
+    print(&format!("saved in {place}\n"))?;
+    Ok(ExitCode::SUCCESS)
+}
+
+fn load_running(config: &Config, arguments: &LoadArguments) -> CommandResult {
+    let folder = std::path::absolute(&arguments.folder)?;
+    let read_only = arguments.read_only;
+    ask(config, "map-load", &Command::LoadFolder { folder: folder.clone(), read_only })?;
+    print(&format!("loaded {}; the camera is looked for in it\n", folder.display()))?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Asks the running mapper, and waits until it has done what it is asked for.
+fn ask(config: &Config, name: &str, command: &Command) -> Result<(), Box<dyn std::error::Error>> {
     let place = Place::new(&config.instance, &config.root)?;
-    let hub = Hub::join(&place, "map-save", Access::Observer)?;
+    let hub = Hub::join(&place, name, Access::Observer)?;
     let mut mapper = ready_mapper(&hub)?;
     let timeout = Duration::from_secs_f64(config.supervisor.save_timeout_s);
-    let command = Command::SaveFolder(folder.clone().unwrap_or_default());
     let is_alive = || {
         let is_over = matches!(mapper.state(), Some(ProcessState::Finished | ProcessState::Failed));
         mapper.update().is_ok() && !is_over
     };
-    CommandClient::open(&hub)?.ask(&command, timeout, is_alive)?;
-    let place = folder.map_or("its folder".to_owned(), |folder| folder.display().to_string());
-    print(&format!("saved in {place}\n"))?;
-    Ok(ExitCode::SUCCESS)
+    Ok(CommandClient::open(&hub)?.ask(command, timeout, is_alive)?)
 }
 
 /// The running mapper, once it answers commands.
@@ -244,7 +273,7 @@ fn ready_mapper(hub: &Hub) -> Result<Peer, Box<dyn std::error::Error>> {
         }
         wait(&[], None, PAUSE)?;
     }
-    Err("no mapper is running: a run with --map DIR saves its map by itself".into())
+    Err("no mapper is running: a run with --map DIR loads and saves its map by itself".into())
 }
 
 fn merge_maps(arguments: &MergeArguments) -> CommandResult {

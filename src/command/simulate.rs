@@ -88,7 +88,7 @@ pub struct SimulateArgs {
     /// Frames per second
     #[arg(long, value_name = "HZ")]
     rate: Option<f64>,
-    /// Image width in pixels
+    /// Image width in pixels; the focal length follows, so that the view stays as wide
     #[arg(long, value_name = "PX")]
     width: Option<usize>,
     /// Image height in pixels
@@ -273,7 +273,9 @@ fn params(configured: &SimulatorParams, args: &SimulateArgs) -> SimulatorParams 
     set(&mut params.rate_hz, &args.rate);
     set(&mut params.width, &args.width);
     set(&mut params.height, &args.height);
-    set(&mut params.focal_px, &args.focal);
+    // A smaller image of the same view: one as narrow as the width alone would make it tells turns from paths badly.
+    let widened = args.width.map(|px| px as f64 / configured.width as f64);
+    set(&mut params.focal_px, &args.focal.or(widened.map(|by| by * configured.focal_px)));
     set(&mut params.world_scale, &args.world_scale);
     let motion = &args.motion;
     let kind = motion.motion.map(|kind| match kind {
@@ -299,5 +301,31 @@ fn params(configured: &SimulatorParams, args: &SimulateArgs) -> SimulatorParams 
     match scene {
         Some(scene) => params.with_scene(scene),
         None => params,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+
+    #[derive(Debug, Parser)]
+    struct Line {
+        #[command(flatten)]
+        args: SimulateArgs,
+    }
+
+    #[test]
+    fn a_smaller_image_shows_the_same_view_unless_told_otherwise() {
+        let configured = SimulatorParams::default();
+        let focal = |line: &str| {
+            let words = "simulate --output out ".to_owned() + line;
+            params(&configured, &Line::parse_from(words.split_whitespace()).args).focal_px
+        };
+        assert_eq!(focal(""), configured.focal_px);
+        assert_eq!(focal("--width 320 --height 240"), 0.5 * configured.focal_px);
+        assert_eq!(focal("--width 320 --focal 400"), 400.0);
+        assert_eq!(focal("--height 240"), configured.focal_px);
     }
 }

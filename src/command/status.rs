@@ -259,9 +259,20 @@ fn row(topic: &Topic, health: &HealthMessage, state: &str, now: i64) -> Value {
         "dropped": health.adjustments_dropped,
         "cpu_ms": { "p50": time(0.5), "p95": time(0.95), "p99": time(0.99), "max": time(1.0) },
     });
+    let loops = json!({
+        "searched": health.loop_searches,
+        "closed": health.loops_closed,
+        "held": health.loops_held,
+        "joined": health.epochs_joined,
+        "other_places": health.loops_refused,
+        "against_drift": health.loops_against_drift,
+        "unconfirmed": health.loops_unconfirmed,
+        "inconsistent": health.loops_inconsistent,
+    });
     let is_mapper = topic.owner == MAPPER_HEALTH.owner;
     json!({
         "adjustments": is_mapper.then_some(adjustments),
+        "loops": is_mapper.then_some(loops),
         "state": state,
         "cause": cause(health),
         "process_id": health.process_id,

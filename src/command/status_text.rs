@@ -179,7 +179,8 @@ fn process_lines(name: &str, row: &Value, columns: &[&Column], width: usize) -> 
             lines.extend(wrapped(&format!("  {label}{text}"), width, 4));
         }
     }
-    lines.extend(joint_line(&row["adjustments"]).iter().flat_map(|line| wrapped(line, width, 4)));
+    let lines_of = [joint_line(&row["adjustments"]), loop_line(&row["loops"])];
+    lines.extend(lines_of.iter().flatten().flat_map(|line| wrapped(line, width, 4)));
     lines
 }
 
@@ -193,6 +194,24 @@ fn joint_line(adjustments: &Value) -> Option<String> {
         adjustments["dropped"].as_u64()?,
         p50.as_f64()?,
         p99.as_f64()?,
+    ))
+}
+
+/// What the mapper's search for loops came to; nothing before the first.
+fn loop_line(loops: &Value) -> Option<String> {
+    let of = |key: &str| loops[key].as_u64();
+    of("searched").filter(|searched| *searched > 0)?;
+    Some(format!(
+        "  loops: {} keyframes searched, {} closed, {} held already, {} epochs joined; refused: {} other places, {} \
+         against the drift, {} unconfirmed, {} inconsistent",
+        of("searched")?,
+        of("closed")?,
+        of("held")?,
+        of("joined")?,
+        of("other_places")?,
+        of("against_drift")?,
+        of("unconfirmed")?,
+        of("inconsistent")?,
     ))
 }
 
@@ -241,6 +260,8 @@ mod tests {
             "frames": 123_456, "rate_hz": 29.97, "dropped": 12, "deadline_misses": 3, "uptime_secs": 4120.0,
             "latency_ms": {"p50": 3.25, "p99": 12.5}, "peak_rss_mb": 182.0,
             "adjustments": {"entered": 41, "merged": 3, "dropped": 1, "cpu_ms": {"p50": 21.25, "p99": 60.5}},
+            "loops": {"searched": 20, "closed": 2, "held": 3, "joined": 1, "other_places": 5, "against_drift": 4,
+                      "unconfirmed": 3, "inconsistent": 2},
             "warning": "real-time scheduling was refused; raise RLIMIT_RTPRIO to 70 for this user",
         });
         json!({
@@ -268,6 +289,8 @@ mod tests {
                 "x 1.20 y -0.05 z 3.00",
                 "21 ms ago",
                 "mapper not running",
+                "20 keyframes searched, 2 closed, 3 held already, 1 epochs joined; refused: 5 other places, 4 against",
+                "3 unconfirmed, 2 inconsistent",
                 "41 entered (3 merged), 1 dropped; median 21.2 ms, p99 60.5 ms of a CPU",
             ] {
                 assert!(shown.contains(part), "{width}, {part}: {text}");
@@ -276,6 +299,14 @@ mod tests {
         }
         assert!(status_text(&look(), 80).contains("12.50"));
         assert!(status_text(&look(), 45).contains("30.0"));
+    }
+
+    #[test]
+    fn where_no_loop_was_looked_for_nothing_is_said_of_loops() {
+        let mut look = look();
+        look["tracker"]["loops"]["searched"] = json!(0);
+        look["capture"]["loops"] = Value::Null;
+        assert!(!status_text(&look, 120).contains("loops:"));
     }
 
     #[test]

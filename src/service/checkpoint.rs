@@ -211,6 +211,7 @@ fn as_written(read: &Map) -> Map {
         keyframes: read.keyframes.iter().map(written).collect(),
         frames: Vec::new(),
         confirmed: Vec::new(),
+        loops: read.loops.clone(),
         ..*read
     }
 }

@@ -4,6 +4,7 @@ use crate::service::adjustments::{AdjustmentRecord, Fate};
 use crate::service::clock::now_nanos;
 use crate::service::manager_notice::ManagerNotice;
 use crate::service::schedule::{InForce, Policy, Refusal, peak_rss_bytes};
+use crate::slam::loops::SearchFate;
 use crate::wire::command::{text_bytes, text_from_bytes};
 use crate::wire::message::{HISTOGRAM_BUCKETS, HealthMessage, TEXT_BYTES};
 use crate::wire::port::{Hub, OpenError, Publisher};
@@ -186,6 +187,14 @@ impl Health {
             adjustments_merged: 0,
             adjustments_dropped: 0,
             adjustment_counts: [0; HISTOGRAM_BUCKETS],
+            loop_searches: 0,
+            loops_closed: 0,
+            loops_held: 0,
+            epochs_joined: 0,
+            loops_refused: 0,
+            loops_against_drift: 0,
+            loops_unconfirmed: 0,
+            loops_inconsistent: 0,
             scheduling: scheduling_code(None),
             priority: 0,
             memory_locked: 0,
@@ -238,6 +247,23 @@ impl Health {
             Fate::Dropped => self.message.adjustments_dropped += 1,
         }
         self.message.adjustments_merged += u64::from(record.fate == Fate::Merged);
+    }
+
+    /// Takes down a search for loops; one that proposes a loop goes on.
+    pub fn count_search(&mut self, fate: &SearchFate) {
+        let of = &mut self.message;
+        let count = match fate {
+            SearchFate::Proposed => return,
+            SearchFate::Closed => &mut of.loops_closed,
+            SearchFate::Held => &mut of.loops_held,
+            SearchFate::Joined => &mut of.epochs_joined,
+            SearchFate::Refused(_) => &mut of.loops_refused,
+            SearchFate::AgainstDrift(_) => &mut of.loops_against_drift,
+            SearchFate::Unconfirmed => &mut of.loops_unconfirmed,
+            SearchFate::Inconsistent => &mut of.loops_inconsistent,
+        };
+        *count += 1;
+        of.loop_searches += 1;
     }
 
     /// Says what the process has to do without from now on.
@@ -415,6 +441,26 @@ mod tests {
         health.report();
         let report = heard.receive().unwrap().map(|message| message.payload()[0]);
         assert_eq!(report.map(|report| report.deadline_misses), Some(1));
+    }
+
+    #[test]
+    fn searches_for_loops_are_counted_by_what_they_came_to() {
+        let folder = tempfile::tempdir_in("/tmp").unwrap();
+        let place = Place::new("rig", folder.path().to_str().unwrap()).unwrap();
+        let hub = Hub::join(&place, "tracker", Access::Member).unwrap();
+        let mut health = Health::open(&hub, &TRACKER_HEALTH).unwrap();
+        let fates = [
+            SearchFate::Proposed,
+            SearchFate::Closed,
+            SearchFate::Held,
+            SearchFate::Held,
+            SearchFate::AgainstDrift(99.0),
+        ];
+        fates.iter().for_each(|fate| health.count_search(fate));
+        let of = &health.message;
+        let counts = [of.loop_searches, of.loops_closed, of.loops_held, of.loops_against_drift];
+        assert_eq!(counts, [4, 1, 2, 1]);
+        assert_eq!((of.epochs_joined, of.loops_refused, of.loops_unconfirmed), (0, 0, 0));
     }
 
     #[test]

@@ -6,15 +6,19 @@
 //! (4 × f64), covariance of common depth errors (6 × f64) and of the place (28 × f64), number of points (u64), points (u16, u16, 3 × f32), number of image bytes (u64, 0 where the
 //! image was given up), image bytes. Then the number of frames that were aligned again (u64), each: sequence, keyframe
 //! (u64), pose relative to that (7 × f64); and the number of points of the joint estimation (u64), each: keyframe (u64),
-//! u, v (u16), confirmations (u32), inverse depth, brightness (f32).
+//! u, v (u16), confirmations (u32), inverse depth, brightness (f32). Then bytes of the loops (u64), and these
+//! ([`loop_bytes`]).
 
 use std::io::{self, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use crate::capture::input_file;
 use crate::service::atomic_file::write_atomically;
+use crate::service::loop_bytes::{LoopBytesError, MAX_LOOP_BYTES, loop_bytes, parse_loops};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS};
+use crate::slam::loops::known::KnownLoops;
 use crate::slam::map::{FramePlace, Map};
 use crate::slam::pose::NO_KEYFRAME;
 use crate::slam::window::confirmed::ConfirmedPoint;
@@ -25,7 +29,7 @@ use crate::wire::conversion::{
 };
 
 /// First bytes of the file, with the version of the layout.
-const MAGIC: [u8; 16] = *b"semidense map 8\n";
+const MAGIC: [u8; 16] = *b"semidense map 9\n";
 /// Largest id or revision: what comes after it must not overflow.
 const MAX_NUMBER: u64 = u64::MAX / 2;
 /// Largest number of an epoch, for the same reason.
@@ -81,6 +85,14 @@ pub enum MapFileError {
         sequence: u64,
         /// What is wrong.
         source: MessageError,
+    },
+    /// The loops are broken.
+    #[error("{path}: loops: {source}")]
+    Loops {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        source: LoopBytesError,
     },
     /// There is more than the map.
     #[error("{0} has bytes after the end of the map")]
@@ -167,7 +179,10 @@ fn write_rest(file: &mut impl Write, map: &Map) -> io::Result<()> {
         file.write_all(&point.confirmations.to_le_bytes())?;
         file.write_all(&point.inverse_depth.to_le_bytes())?;
         file.write_all(&point.intensity.to_le_bytes())
-    })
+    })?;
+    let loops = loop_bytes(&map.loops);
+    file.write_all(&(loops.len() as u64).to_le_bytes())?;
+    file.write_all(&loops)
 }
 
 /// Reads the map that [`write_map`] wrote.
@@ -201,6 +216,7 @@ pub fn parse_map(path: &Path, bytes: impl Read) -> Result<Map, MapFileError> {
         // One without its keyframe has no place.
         map.confirmed.extend(Some(point).filter(|point| is_placed(&map, point)));
     }
+    map.loops = Arc::new(reader.loops()?);
     match reader.file.read(&mut [0]) {
         Ok(0) => Ok(map),
         _ => Err(MapFileError::Trailing(path.to_owned())),
@@ -337,6 +353,7 @@ impl<R: Read> Reader<'_, R> {
             intrinsics,
             image,
             points,
+            description: None,
         })
     }
 
@@ -360,6 +377,16 @@ impl<R: Read> Reader<'_, R> {
         })
     }
 
+    fn loops(&mut self) -> Result<KnownLoops, MapFileError> {
+        let count = self.count("loop bytes", MAX_LOOP_BYTES)?;
+        let mut bytes = Vec::new();
+        let wrong = |source| MapFileError::Read { path: self.path.to_owned(), source };
+        // A broken number asks for no more than there is; what is missing is missed by the parser.
+        self.file.by_ref().take(count).read_to_end(&mut bytes).map_err(wrong)?;
+        parse_loops(&bytes)
+            .map_err(|source| MapFileError::Loops { path: self.path.to_owned(), source })
+    }
+
     fn numbers<const N: usize>(&mut self) -> Result<[f64; N], MapFileError> {
         let mut numbers = [0.0; N];
         for number in &mut numbers {
@@ -377,97 +404,4 @@ impl<R: Read> Reader<'_, R> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::slam::geometry::se3::SE3;
-    use crate::slam::geometry::sim3::Sim3;
-    use crate::slam::keyframe::MapState;
-    use crate::slam::modes::ModeCovariance;
-    use crate::slam::place_covariance::{PlaceCovariance, PlaceMatrix};
-    use nalgebra::Vector6;
-
-    fn map() -> Map {
-        let rigid = SE3::exp(&Vector6::new(0.3, -0.2, 0.1, 0.4, 0.5, -0.6));
-        let point =
-            DepthPoint { u: 3, v: 15, inverse_depth: 0.7, variance: 0.01, intensity: 128.5 };
-        let keyframe = Keyframe {
-            keyframe_id: 7,
-            epoch: 1,
-            revision: 42,
-            sequence: 99,
-            capture_nanos: -5,
-            map_state: MapState::Established,
-            world_from_keyframe: Sim3::new(rigid, 1.7),
-            map_from_keyframe: Sim3::new(rigid.inverse(), 2.3),
-            map_revision: 3,
-            mode_covariance: ModeCovariance::of_std_devs([0.1, 0.2, 0.3]),
-            place_covariance: PlaceCovariance::bounded(&(PlaceMatrix::identity() * 0.01)),
-            is_refined: true,
-            intrinsics: Intrinsics { fx: 20.0, fy: 21.0, cx: 8.0, cy: 7.5, width: 17, height: 16 },
-            image: (0..17 * 16).map(|i| (i % 251) as u8).collect(),
-            points: vec![point; 5],
-        };
-        let keyframes = vec![keyframe.clone(), Keyframe { keyframe_id: 8, ..keyframe }];
-        let frame = FramePlace { sequence: 100, keyframe_id: 7, keyframe_from_camera: rigid };
-        let confirmed = ConfirmedPoint {
-            keyframe_id: 8,
-            u: 16,
-            v: 3,
-            confirmations: 5,
-            inverse_depth: 0.3,
-            intensity: 77.0,
-        };
-        Map {
-            keyframes,
-            frames: vec![frame, FramePlace { sequence: 101, ..frame }],
-            confirmed: vec![confirmed; 3],
-            free_epoch: 18,
-            revision: 4,
-            active: Some(7),
-        }
-    }
-
-    #[test]
-    fn a_map_survives_the_file_bit_for_bit() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("map.bin");
-        write_map(&path, &map(), &mut || ()).unwrap();
-        let read = read_map(&path).unwrap();
-        assert_eq!((read.free_epoch, read.revision, read.active), (18, 4, Some(7)));
-        assert_eq!(read.keyframes, map().keyframes);
-        assert_eq!((read.frames, read.confirmed), (map().frames, map().confirmed));
-    }
-
-    #[test]
-    fn points_of_the_joint_estimation_lie_in_their_keyframes() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("map.bin");
-        let mut wrong = map();
-        wrong.confirmed[0].keyframe_id = 9;
-        wrong.confirmed[1].u = 17;
-        wrong.confirmed.push(ConfirmedPoint { inverse_depth: f32::NAN, ..wrong.confirmed[2] });
-        write_map(&path, &wrong, &mut || ()).unwrap();
-        assert_eq!(read_map(&path).unwrap().confirmed, map().confirmed[2..]);
-    }
-
-    #[test]
-    fn every_cut_and_every_wrong_byte_is_survived() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("map.bin");
-        write_map(&path, &map(), &mut || ()).unwrap();
-        let whole = std::fs::read(&path).unwrap();
-        for length in 0..whole.len() {
-            std::fs::write(&path, &whole[..length]).unwrap();
-            let error = read_map(&path).unwrap_err().to_string();
-            assert!(error.contains("map.bin") && error.lines().count() == 1, "{error}");
-        }
-        for index in 0..300 {
-            let mut broken = whole.clone();
-            broken[index] ^= 0xff;
-            std::fs::write(&path, &broken).unwrap();
-            let _ = read_map(&path); // an error or another value, never a panic
-        }
-        std::fs::write(&path, [whole, vec![0]].concat()).unwrap();
-        assert!(matches!(read_map(&path), Err(MapFileError::Trailing(_))));
-    }
-}
+mod tests;

@@ -1,8 +1,10 @@
 //! The mapper process: pairs frames with their poses, lets the map take them in, publishes it.
 
+mod commands;
+mod going_over;
 mod output;
 
-use std::path::Path;
+use std::rc::Rc;
 use std::time::Duration;
 
 use crate::service::adjustments::{Adjustments, Entry};
@@ -12,9 +14,8 @@ use crate::service::clock::now_nanos;
 use crate::service::config::Config;
 use crate::service::frame_order::{Arrival, FrameOrder, SILENCE};
 use crate::service::health::{Health, ProcessState};
-use crate::service::map_file::write_map;
-use crate::service::map_folder::save_copy;
 use crate::service::map_folder::session::{MapSession, MapSessionError};
+use crate::service::mapper::going_over::GoneOver;
 use crate::service::mapper::output::Output;
 use crate::service::mode::Mode;
 use crate::service::pairing::Pairing;
@@ -26,7 +27,7 @@ use crate::slam::map::Map;
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::parameter::ParameterError;
 use crate::slam::pose::{NO_KEYFRAME, PoseEstimate};
-use crate::wire::command::{Command, CommandError, CommandServer};
+use crate::wire::command::{CommandError, CommandServer};
 use crate::wire::conversion::{code_from_map_state, frame_from_message, pose_from_message};
 use crate::wire::message::{FrameHeader, PoseMessage};
 use crate::wire::place::{Claim, Place, PlaceError};
@@ -97,6 +98,7 @@ pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), Mappe
             // A supervisor that did not ask for the end starts another, which continues from the checkpoint.
             if !is_supervised() {
                 shell.kept.iter_mut().for_each(|kept| kept.end_in_order());
+                GoneOver::forget(&shell.place.loaded_map_path());
             }
             shell.health.enter(ProcessState::Finished, "stopped");
         }
@@ -118,7 +120,7 @@ struct Shell<'a> {
     missing: u64,
     /// CLOCK_MONOTONIC when the last frame arrived.
     last_arrival_nanos: Option<i64>,
-    commands: CommandServer,
+    commands: Rc<CommandServer>,
     output: Output,
     health: Health,
     mapper: Option<(Intrinsics, Mapper)>,
@@ -133,6 +135,7 @@ struct Shell<'a> {
     last_pose: Option<PoseEstimate>,
     pool: rayon::ThreadPool,
     hub: Hub,
+    place: Place,
     _claim: Claim,
 }
 
@@ -162,7 +165,7 @@ impl<'a> Shell<'a> {
             order: FrameOrder::default(),
             missing: 0,
             last_arrival_nanos: None,
-            commands: CommandServer::open(&hub)?,
+            commands: Rc::new(CommandServer::open(&hub)?),
             output: Output::open(&hub)?,
             health: Health::open(&hub, &MAPPER_HEALTH)?,
             mapper: None,
@@ -173,6 +176,7 @@ impl<'a> Shell<'a> {
             last_pose: None,
             pool,
             hub,
+            place,
             _claim: claim,
         };
         shell.hub.reserve()?;
@@ -181,13 +185,17 @@ impl<'a> Shell<'a> {
 
     /// Reads the map on disk, where one is named.
     fn load_map(&mut self) -> Result<(), MapperError> {
-        let (map, max_bytes) = (&self.config.map, self.config.mapping.max_map_bytes());
+        let (configured, max_bytes) = (&self.config.map, self.config.mapping.max_map_bytes());
+        let path = self.place.loaded_map_path();
+        let gone_over = self.kept.as_ref().and_then(|_| GoneOver::read(&path, configured));
+        let map = gone_over.as_ref().map_or(configured, |over| &over.to);
+        let numbering = gone_over.as_ref().map_or_else(Default::default, |over| over.numbering);
         let waits = self.mode == Mode::Lockstep;
         if !map.folder.is_empty() {
             let cause = format!("loading the map {}", map.folder);
             self.health.enter(ProcessState::Preparing, &cause);
         }
-        let session = self.pool.install(|| MapSession::open(map, max_bytes, waits));
+        let session = self.pool.install(|| MapSession::open(map, max_bytes, numbering, waits));
         self.map = session.map_err(MapSessionError::from)?;
         Ok(())
     }
@@ -377,51 +385,6 @@ impl<'a> Shell<'a> {
         self.mapper = Some((intrinsics, mapper));
         Ok(())
     }
-
-    fn answer_commands(&mut self) -> Result<(), MapperError> {
-        let mut mapper = self.mapper.as_mut().map(|(_, mapper)| mapper);
-        let (health, output, adjustments) = (&mut self.health, &self.output, &mut self.adjustments);
-        let (map, detail) = (&mut self.map, self.config.map.detail);
-        Ok(self.commands.answer(|command| match command {
-            Command::SendKeyframe(keyframe_id) => {
-                output.publish_earlier(mapper.as_deref().map(Mapper::map), keyframe_id)
-            }
-            Command::SaveMap(path) => {
-                // It may take longer than the pause between two signs of life.
-                let before = health.entered();
-                health.enter(ProcessState::Running, WRITES_MAP);
-                // It is asked for when the recording is over.
-                let outcome = mapper.as_deref_mut().map(|mapper| adjustments.finish(mapper));
-                if let (Some(mapper), Some(outcome)) = (mapper.as_deref(), outcome) {
-                    let told = output
-                        .publish(mapper, &outcome)
-                        .and_then(|()| tell_adjustments(adjustments, output, health));
-                    told.map_err(|error| error.to_string())?;
-                }
-                let mut each = || health.report();
-                let mut saved = save_map(mapper.as_deref(), &path, &mut each);
-                if let (Some(map), Some(mapper)) = (map.as_mut(), mapper.as_deref()) {
-                    let kept = map.save_all(mapper, &mut each).map_err(|error| error.to_string());
-                    saved = saved.and(kept);
-                }
-                health.go_back_to(before);
-                saved
-            }
-            Command::SaveFolder(path) => {
-                let mapper = mapper.as_deref().ok_or("there is no map yet: no frame has come")?;
-                let before = health.entered();
-                health.enter(ProcessState::Running, WRITES_MAP);
-                let mut each = || health.report();
-                let saved = match map.as_mut().filter(|map| map.is_in(&path)) {
-                    Some(map) => map.save_all(mapper, &mut each).map_err(|error| error.to_string()),
-                    None => save_copy(&path, mapper, detail, &mut each)
-                        .map_err(|error| error.to_string()),
-                };
-                health.go_back_to(before);
-                saved
-            }
-        })?)
-    }
 }
 
 /// Publishes and counts joint estimates that are over; says it when there will be no more.
@@ -435,13 +398,14 @@ fn tell_adjustments(
         output.publish_adjustment(&record)?;
     }
     for search in adjustments.take_searches() {
+        health.count_search(&search.report.fate);
         tell_search(&search.report);
     }
     adjustments.take_failure().iter().for_each(|failure| health.warn(failure));
     Ok(())
 }
 
-/// Logs a loop that was closed and epochs that were joined: health has no counters of them yet.
+/// Logs a loop that was closed and epochs that were joined.
 fn tell_search(report: &SearchReport) {
     let (keyframe, other) = (report.keyframe_id, report.other.unwrap_or(NO_KEYFRAME));
     match report.fate {
@@ -470,10 +434,4 @@ fn start_adjustments(config: &Config, mode: Mode) -> std::io::Result<Adjustments
 /// Time since an instant of CLOCK_MONOTONIC.
 fn nanos_since(begin: i64) -> u64 {
     u64::try_from(now_nanos() - begin).unwrap_or(0)
-}
-
-fn save_map(mapper: Option<&Mapper>, path: &Path, each: &mut dyn FnMut()) -> Result<(), String> {
-    let empty = Map::default();
-    let map = mapper.map_or(&empty, Mapper::map);
-    write_map(path, map, each).map_err(|e| format!("{}: {e}", path.display()))
 }

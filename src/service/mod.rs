@@ -20,6 +20,7 @@ pub mod health;
 pub mod journal;
 pub mod latency_bench;
 pub mod liveness;
+pub mod loop_bytes;
 pub mod manager_notice;
 pub mod map_file;
 pub mod map_folder;

@@ -74,6 +74,9 @@ impl Recorder {
             }
         }
         self.collect_keyframes(false);
+        if let Some(journal) = &self.journal {
+            self.recording.release(journal.poses_on_disk());
+        }
         Ok(self.recording.num_poses() + self.recording.num_steps() > before)
     }
 
@@ -132,7 +135,19 @@ impl Recorder {
         }
     }
 
-    /// The record of the whole run, and its journal with all of it.
+    /// Takes back the poses that only the journal has; how many cannot be read, which are lost.
+    pub fn take_back(&mut self) -> usize {
+        let num_released = self.recording.num_released();
+        let Some(journal) = self.journal.as_ref().filter(|_| num_released > 0) else { return 0 };
+        let missing = self.recording.take_back(|take| journal.read_poses(num_released, take));
+        if missing > 0 {
+            let folder = journal.folder().display();
+            tracing::warn!("{folder}: {missing} of {num_released} poses cannot be read back");
+        }
+        missing
+    }
+
+    /// The record of the whole run, after [`Recorder::take_back`], and its journal with all of it.
     pub fn into_record(mut self, parts: RecordParts) -> (RunRecord, Option<Journal>) {
         self.count(parts.counters);
         self.collect_keyframes(true);

@@ -80,7 +80,11 @@ impl RunCounters {
 /// Poses and steps of a run so far.
 #[derive(Debug, Default)]
 pub struct Recording {
+    /// The newest; those before them were released.
     poses: Vec<RecordedPose>,
+    num_released: usize,
+    /// Of the last frame.
+    state: Option<TrackingState>,
     map_nanos: Vec<u64>,
     keyframe_step_nanos: Vec<u64>,
     keyframe_nanos: Vec<u64>,
@@ -114,19 +118,43 @@ pub struct RecordParts {
 impl Recording {
     /// Takes in a pose as it was sent.
     pub fn take_pose(&mut self, message: &PoseMessage) -> Result<(), MessageError> {
-        let estimate = pose_from_message(message)?;
+        let pose = recorded(message)?;
         let latency = i64::try_from(message.latency_nanos).unwrap_or(i64::MAX);
         let sent_nanos = message.published_nanos.saturating_sub(latency);
         let first = self.span_nanos.map_or(sent_nanos, |(first, _)| first);
         self.span_nanos = Some((first, message.published_nanos));
-        self.poses.push(RecordedPose {
-            estimate,
-            latency_nanos: Some(message.latency_nanos),
-            track_nanos: Some(message.track_nanos),
-            trace: None,
-            wake_nanos: Some(message.wake_nanos),
-        });
+        self.state = Some(pose.estimate.state);
+        self.poses.push(pose);
         Ok(())
+    }
+
+    /// Forgets the first `num_kept` poses of the run, which are kept elsewhere: a kilobyte each.
+    pub fn release(&mut self, num_kept: usize) {
+        /// Room for so many is not given back.
+        const SPARE: usize = 256;
+        let count = num_kept.saturating_sub(self.num_released).min(self.poses.len());
+        if count > 0 {
+            self.poses.drain(..count);
+            self.num_released += count;
+            // After a disk that was full for long.
+            self.poses.shrink_to(2 * self.poses.len() + SPARE);
+        }
+    }
+
+    /// Poses that were released and not taken back.
+    pub fn num_released(&self) -> usize {
+        self.num_released
+    }
+
+    /// Takes back what was released, as `read` gives it, in order; how many poses are missing for good.
+    pub fn take_back(&mut self, read: impl FnOnce(&mut dyn FnMut(&PoseMessage))) -> usize {
+        let mut poses = Vec::with_capacity(self.num_poses());
+        // They could be read when they came.
+        read(&mut |message| poses.extend(recorded(message)));
+        let missing = self.num_released.saturating_sub(poses.len());
+        poses.append(&mut self.poses);
+        (self.poses, self.num_released) = (poses, 0);
+        missing
     }
 
     /// Takes in a step of the mapper: what it took, `change_nanos` 0 where no keyframe was made, and the
@@ -147,7 +175,7 @@ impl Recording {
 
     /// Poses so far.
     pub fn num_poses(&self) -> usize {
-        self.poses.len()
+        self.num_released + self.poses.len()
     }
 
     /// Steps of the mapper so far.
@@ -157,10 +185,10 @@ impl Recording {
 
     /// State of the last frame.
     pub fn state(&self) -> Option<TrackingState> {
-        self.poses.last().map(|pose| pose.estimate.state)
+        self.state
     }
 
-    /// The record of the whole run.
+    /// The record of the whole run, of which nothing is released any more.
     pub fn into_record(mut self, parts: RecordParts) -> RunRecord {
         let counters = &parts.counters;
         let stamps = |pose: Option<&RecordedPose>| pose.map_or(0, |p| p.estimate.capture_nanos);
@@ -216,5 +244,67 @@ impl Recording {
             wall_nanos: positive(wall_nanos),
             peak_rss_bytes: (counters.peak_rss_bytes > 0).then_some(counters.peak_rss_bytes),
         }
+    }
+}
+
+/// A pose as it was sent.
+fn recorded(message: &PoseMessage) -> Result<RecordedPose, MessageError> {
+    Ok(RecordedPose {
+        estimate: pose_from_message(message)?,
+        latency_nanos: Some(message.latency_nanos),
+        track_nanos: Some(message.track_nanos),
+        trace: None,
+        wake_nanos: Some(message.wake_nanos),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::frame::FrameView;
+    use crate::slam::pose::PoseEstimate;
+    use crate::wire::conversion::{PoseTiming, pose_message};
+
+    /// Of frame `sequence`, every figure its own.
+    fn message(sequence: u64) -> PoseMessage {
+        let frame = FrameView {
+            sequence,
+            capture_nanos: 33 * sequence as i64,
+            exposure_nanos: 0,
+            width: 0,
+            height: 0,
+            pixels: &[],
+        };
+        let timing = PoseTiming { latency_nanos: 7 * sequence, ..PoseTiming::default() };
+        let mut estimate = PoseEstimate::unknown(&frame);
+        if sequence > 5 {
+            (estimate.state, estimate.keyframe_id) = (TrackingState::Tracking, sequence / 9);
+        }
+        estimate.covariance[20] = 1.0 / (1.0 + sequence as f64);
+        pose_message(&estimate, &timing)
+    }
+
+    #[test]
+    fn poses_that_are_released_and_taken_back_make_the_same_record() {
+        let messages: Vec<PoseMessage> = (0..900).map(message).collect();
+        let (mut whole, mut released) = (Recording::default(), Recording::default());
+        for (number, message) in messages.iter().enumerate() {
+            whole.take_pose(message).unwrap();
+            released.take_pose(message).unwrap();
+            if number % 7 == 0 {
+                // Of what is not there nothing is released.
+                released.release(if number > 800 { 2000 } else { number / 2 });
+            }
+            assert_eq!(released.num_poses(), number + 1);
+            assert_eq!(released.state(), whole.state());
+        }
+        let num_released = released.num_released();
+        assert!(num_released > 800 && released.poses.capacity() < 600, "{num_released}");
+        let missing = released.take_back(|take| messages[..num_released].iter().for_each(take));
+        assert_eq!((missing, released.num_released()), (0, 0));
+        assert_eq!(format!("{released:?}"), format!("{whole:?}"));
+        released.release(10);
+        let missing = released.take_back(|take| messages[..8].iter().for_each(take));
+        assert_eq!((missing, released.num_poses()), (2, 898));
     }
 }

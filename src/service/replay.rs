@@ -225,7 +225,8 @@ impl<'a> Replay<'a> {
             mapping.window.num_free = 0;
         }
         let mut mapper = Mapper::new(intrinsics, mapping)?;
-        let map = MapSession::open(&config.map, config.mapper.max_map_bytes(), true);
+        let map =
+            MapSession::open(&config.map, config.mapper.max_map_bytes(), Default::default(), true);
         let mut map = map.map_err(MapSessionError::from)?;
         if let Some(map) = &mut map {
             map.begin(&mut mapper, &intrinsics, None)?;

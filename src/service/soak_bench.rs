@@ -10,6 +10,7 @@ use crate::capture::source::SourceName;
 use crate::service::config::Config;
 use crate::service::error_log::ErrorLog;
 use crate::service::health::percentile_ms;
+use crate::service::journal::{Journal, JournalOptions};
 use crate::service::latency_bench::{TrialError, bench_options};
 use crate::service::mode::Mode;
 use crate::service::peers::{HEALTH_TOPICS, Peer};
@@ -26,7 +27,7 @@ const MAPPER: usize = 2;
 const BYTES_PER_MEGABYTE: f64 = 1e6;
 
 /// A run to be watched.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone)]
 pub struct Soak {
     /// Frames.
     pub frames: u64,
@@ -36,6 +37,8 @@ pub struct Soak {
     pub mode: Mode,
     /// Time from one sample to the next.
     pub period: Duration,
+    /// Its journal, which holds the poses as that of any run does.
+    pub journal: JournalOptions,
 }
 
 /// How the processes were at one instant, and the times of the frames since the sample before.
@@ -67,7 +70,7 @@ pub struct Sample {
     pub tracker_mb: f64,
     /// Of the mapper.
     pub mapper_mb: f64,
-    /// Of the process that watches and keeps the record of all poses.
+    /// Of the process that watches and collects the poses.
     pub supervisor_mb: f64,
 }
 
@@ -115,6 +118,7 @@ pub fn soak(
     let (config, mut options) =
         bench_options(config, soak.frames, soak.rate_hz, source, arguments, log);
     options.mode = soak.mode;
+    options.journal = Some(soak.journal.clone());
     let place = Place::new(&config.instance, &config.root)?;
     let mut watch = Watch::new(place, soak.period);
     let outcome = run(&config, &options, shutdown, &mut |progress| {
@@ -123,6 +127,10 @@ pub fn soak(
             watch.look();
         }
     })?;
+    // There are no results that it could be needed for.
+    if let Some(Err(error)) = outcome.journal.map(Journal::finish) {
+        tracing::warn!("the journal of the soak stays: {error}");
+    }
     match outcome.ended {
         Ended::Finished | Ended::Interrupted => Ok(watch.samples),
         Ended::Failed(cause) => Err(TrialError::Ended(cause)),

@@ -131,7 +131,10 @@ fn supervise(
     if let (Ended::Finished, Some(cause)) = (&ended, &supervisor.bus_error) {
         ended = Ended::Failed(cause.clone());
     }
-    let (recorder, counters, restart_causes) = supervisor.finish(shutdown)?;
+    let (mut recorder, counters, restart_causes) = supervisor.finish(shutdown)?;
+    if let (Ended::Finished, missing @ 1..) = (&ended, recorder.take_back()) {
+        ended = Ended::Failed(format!("{missing} poses cannot be read back from the journal"));
+    }
     if let (Ended::Failed(cause), true, frames @ 1..) = (&mut ended, is_cut, recorder.num_poses()) {
         let _ = write!(cause, "; the results are of the {frames} frames before");
     }

@@ -1,9 +1,12 @@
 //! A keyframe: a frame with a semi-dense depth map and a place in the world.
 
+use std::sync::Arc;
+
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::modes::ModeCovariance;
 use crate::slam::place_covariance::{PlaceCovariance, UncertainPlace};
+use crate::slam::places::Description;
 
 /// One pixel with depth, as it goes over the wire.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -103,6 +106,8 @@ pub struct Keyframe {
     pub is_refined: bool,
     /// Pixels with depth in row-major order, at most [`MAX_KEYFRAME_POINTS`].
     pub points: Vec<DepthPoint>,
+    /// What its image looks like, by which it is found: the mapper's alone, which describes it once.
+    pub description: Option<Arc<Description>>,
 }
 
 impl Keyframe {
@@ -129,6 +134,7 @@ impl Keyframe {
             intrinsics,
             image,
             points,
+            description: None,
         }
     }
 

@@ -5,12 +5,15 @@
 //! scale is the keyframe's unit; it is chosen when the keyframe is made (mean inverse depth 1) and changes by
 //! a [`Correction`] only. A frame is kept relative to its keyframe, in the keyframe's unit, and so follows it.
 
+use std::sync::Arc;
+
 use crate::slam::depth::epipolar::TwoView;
 use crate::slam::depth::matching::is_inside;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{DepthPoint, Keyframe};
+use crate::slam::loops::known::KnownLoops;
 use crate::slam::modes::ModeCovariance;
 use crate::slam::place_covariance::PlaceCovariance;
 use crate::slam::window::confirmed::ConfirmedPoint;
@@ -26,6 +29,8 @@ pub struct Map {
     pub frames: Vec<FramePlace>,
     /// Of a map that is complete: points of the joint estimation.
     pub confirmed: Vec<ConfirmedPoint>,
+    /// Loops, and what the keyframes say of each other without them.
+    pub loops: Arc<KnownLoops>,
     /// How often the map was corrected.
     pub revision: u64,
     /// Of a checkpoint: the keyframe that was active.
@@ -280,8 +285,7 @@ impl Map {
                 return;
             }
             bytes -= depth_bytes(keyframe);
-            keyframe.image = Vec::new();
-            keyframe.points = Vec::new();
+            keyframe.forget_depth();
         }
     }
 }
@@ -301,9 +305,14 @@ impl Keyframe {
         !self.image.is_empty() && !self.points.is_empty()
     }
 
-    /// The same without image and points.
+    /// The same without image, its description and points.
     pub fn without_depth(&self) -> Self {
-        Self { image: Vec::new(), points: Vec::new(), ..*self }
+        Self { image: Vec::new(), points: Vec::new(), description: None, ..*self }
+    }
+
+    /// Gives up image, its description and points; the pose stays.
+    pub fn forget_depth(&mut self) {
+        (self.image, self.points, self.description) = (Vec::new(), Vec::new(), None);
     }
 
     /// Share of its points that a camera sees; every so many are enough for a share.

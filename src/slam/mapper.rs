@@ -1,5 +1,6 @@
 //! The recipe of a map step: observe depth, regularise, choose keyframes, propagate.
 
+mod another_map;
 pub mod appearance;
 mod change;
 mod closing;
@@ -206,7 +207,10 @@ impl Mapper {
         }
         let Some(keyframe) = self.keyframe() else {
             return match self.is_localising() {
-                true => self.recover(frame, pose, sensor_depth),
+                true => {
+                    self.follow_odometry(pose);
+                    self.recover(frame, pose, sensor_depth)
+                }
                 false => self.begin(frame, pose, sensor_depth),
             };
         };

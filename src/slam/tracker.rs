@@ -161,6 +161,8 @@ impl Tracker {
     /// Makes a prepared reference the active one and gives back the one before, for its memory. The
     /// first of another epoch forgets where the camera was.
     pub fn adopt(&mut self, reference: Box<Reference>) -> Option<Box<Reference>> {
+        /// Frames that a mapper may be behind with the first keyframe of an epoch: ten seconds at 30 Hz.
+        const MOST_FRAMES_BEHIND: u64 = 300;
         let before = self.reference.replace(reference);
         let (old, new) = (before.as_deref(), self.reference.as_deref());
         if let (Some(old), Some(new)) = (old, new) {
@@ -168,7 +170,11 @@ impl Tracker {
             // epoch that is taken up again lies where odometry has the camera.
             if old.epoch() < new.epoch() && old.keyframe_id() != new.keyframe_id() {
                 self.memory.motion = Motion::default();
-                self.memory.was_lost = false;
+                // On a keyframe that the mapper did not make just now, of a map that it has gone over to, the camera may
+                // be anywhere.
+                let age =
+                    self.memory.last_sequence.and_then(|last| last.checked_sub(new.sequence()));
+                self.memory.was_lost = age.is_none_or(|age| age > MOST_FRAMES_BEHIND);
                 self.turning.end();
             }
             if old.keyframe_id() == new.keyframe_id() {

@@ -26,6 +26,13 @@ pub enum Command {
     SendKeyframe(u64),
     /// Save the map into this folder; empty for the one that the mapper keeps it in.
     SaveFolder(PathBuf),
+    /// Go over to the map in this folder.
+    LoadFolder {
+        /// The folder.
+        folder: PathBuf,
+        /// Whether the camera is only located in it.
+        read_only: bool,
+    },
 }
 
 /// Why a question was not asked, not understood or not answered.
@@ -75,6 +82,10 @@ fn request_of(command: &Command) -> Result<CommandRequest, CommandError> {
             request.kind = 2;
             path
         }
+        Command::LoadFolder { folder, read_only } => {
+            request.kind = if *read_only { 4 } else { 3 };
+            folder
+        }
         Command::SendKeyframe(keyframe_id) => {
             (request.kind, request.keyframe_id) = (1, *keyframe_id);
             return Ok(request);
@@ -98,6 +109,7 @@ pub fn command_of(request: &CommandRequest) -> Result<Command, CommandError> {
         0 => Ok(Command::SaveMap(path.to_owned())),
         1 => Ok(Command::SendKeyframe(request.keyframe_id)),
         2 => Ok(Command::SaveFolder(path.to_owned())),
+        kind @ (3 | 4) => Ok(Command::LoadFolder { folder: path.to_owned(), read_only: kind == 4 }),
         kind => Err(CommandError::Unknown(kind)),
     }
 }
@@ -225,6 +237,10 @@ mod tests {
         assert_eq!(command_of(&request_of(&command).unwrap()).unwrap(), command);
         let folder = Command::SaveFolder(PathBuf::from("/var/lib/semidense/map"));
         assert_eq!(command_of(&request_of(&folder).unwrap()).unwrap(), folder);
+        for read_only in [false, true] {
+            let load = Command::LoadFolder { folder: PathBuf::from("/maps/a"), read_only };
+            assert_eq!(command_of(&request_of(&load).unwrap()).unwrap(), load);
+        }
         let long = Command::SaveMap(PathBuf::from("x".repeat(PATH_BYTES + 1)));
         assert!(matches!(request_of(&long), Err(CommandError::PathTooLong(_))));
     }

@@ -413,6 +413,7 @@ pub fn keyframe_from_messages(
         intrinsics,
         image: image.to_vec(),
         points: points.to_vec(),
+        description: None,
     })
 }
 

@@ -285,7 +285,7 @@ pub struct AdjustmentMessage {
 /// Message of `<process>/health`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
-#[type_name("semidense.Health.v5")]
+#[type_name("semidense.Health.v6")]
 pub struct HealthMessage {
     /// CLOCK_MONOTONIC when it was published.
     pub published_nanos: i64,
@@ -340,6 +340,22 @@ pub struct HealthMessage {
     pub adjustments_dropped: u64,
     /// Mapper: the same as `latency_counts` of the CPU time of joint estimates.
     pub adjustment_counts: [u64; HISTOGRAM_BUCKETS],
+    /// Mapper: keyframes that were looked for in older ones.
+    pub loop_searches: u64,
+    /// Mapper: loops that moved the map.
+    pub loops_closed: u64,
+    /// Mapper: loops that the map already had so.
+    pub loops_held: u64,
+    /// Mapper: epochs that were joined to others.
+    pub epochs_joined: u64,
+    /// Mapper: keyframes whose candidates were other places.
+    pub loops_refused: u64,
+    /// Mapper: places that were further off than the map can have drifted.
+    pub loops_against_drift: u64,
+    /// Mapper: places that no second pair confirmed.
+    pub loops_unconfirmed: u64,
+    /// Mapper: places that contradicted other loops.
+    pub loops_inconsistent: u64,
     /// Scheduling in force: 0 other, 1 FIFO, 2 deadline, 3 unknown.
     pub scheduling: u32,
     /// Priority of FIFO scheduling, else 0.
@@ -367,11 +383,12 @@ pub struct HealthMessage {
 pub struct CommandRequest {
     /// The keyframe that is asked for; otherwise 0.
     pub keyframe_id: u64,
-    /// 0 save the map to `path`, 1 send keyframe `keyframe_id` on `mapper/earlier_keyframe`.
+    /// 0 save the map to the file `path`, 1 send keyframe `keyframe_id` on `mapper/earlier_keyframe`, 2 save the map into
+    /// the folder `path`, 3 go over to the map in the folder `path`, 4 only locate the camera in that.
     pub kind: u32,
     /// Bytes of `path` that are used.
     pub path_bytes: u32,
-    /// Absolute path of the file.
+    /// Absolute path of the file or folder.
     pub path: [u8; PATH_BYTES],
 }
 
@@ -411,7 +428,7 @@ mod tests {
         assert_layout::<GraphHeader>(24, 8, "semidense.GraphHeader.v2");
         assert_layout::<KeyframePoseMessage>(80, 8, "semidense.KeyframePose.v2");
         assert_layout::<AdjustmentMessage>(72, 8, "semidense.Adjustment.v1");
-        assert_layout::<HealthMessage>(2296, 8, "semidense.Health.v5");
+        assert_layout::<HealthMessage>(2360, 8, "semidense.Health.v6");
         assert_layout::<CommandRequest>(4112, 8, "semidense.CommandRequest.v2");
         assert_layout::<CommandResponse>(200, 4, "semidense.CommandResponse.v1");
     }

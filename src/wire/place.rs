@@ -37,6 +37,9 @@ pub(in crate::wire) const CHECKPOINT_SUFFIX: &str = ".checkpoint";
 /// End of the name of the file with capture's place in its source, behind the instance.
 pub(in crate::wire) const POSITION_SUFFIX: &str = ".position";
 
+/// End of the name of the file that names the map which the mapper has gone over to, behind the instance.
+pub(in crate::wire) const LOADED_MAP_SUFFIX: &str = ".map";
+
 /// End of the name of a claim's file, behind the instance and the process.
 pub(in crate::wire) const CLAIM_SUFFIX: &str = ".lock";
 
@@ -131,6 +134,11 @@ impl Place {
     /// Where the mapper keeps what it needs to go on after its death.
     pub fn checkpoint_path(&self) -> PathBuf {
         self.kept_path(&self.instance, CHECKPOINT_SUFFIX)
+    }
+
+    /// Where the mapper keeps which map it has gone over to.
+    pub fn loaded_map_path(&self) -> PathBuf {
+        self.kept_path(&self.instance, LOADED_MAP_SUFFIX)
     }
 
     /// Where capture keeps its place in the source.

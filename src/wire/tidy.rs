@@ -11,8 +11,8 @@ use iceoryx2::prelude::*;
 use rustix::fs::FlockOperation;
 
 use crate::wire::place::{
-    CHECKPOINT_SUFFIX, CLAIM_SUFFIX, JOIN_LOCK, MEMBERS, POSITION_SUFFIX, Place, is_same_file,
-    lock_until, open_lock,
+    CHECKPOINT_SUFFIX, CLAIM_SUFFIX, JOIN_LOCK, LOADED_MAP_SUFFIX, MEMBERS, POSITION_SUFFIX, Place,
+    is_same_file, lock_until, open_lock,
 };
 
 /// Longest wait before tidying up, which the next process that leaves can do as well.
@@ -169,7 +169,7 @@ fn is_checkpoint(name: &str) -> bool {
 /// What a file of an instance is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Kind {
-    /// A checkpoint or a position.
+    /// A checkpoint, a position, or which map was gone over to.
     Kept,
     /// A checkpoint that was being written.
     Unfinished,
@@ -183,7 +183,10 @@ impl Kind {
         if name.contains(CHECKPOINT_SUFFIX) && name.ends_with(".tmp") {
             return Some(Self::Unfinished);
         }
-        if is_checkpoint(name) || name.ends_with(POSITION_SUFFIX) {
+        if is_checkpoint(name)
+            || name.ends_with(POSITION_SUFFIX)
+            || name.ends_with(LOADED_MAP_SUFFIX)
+        {
             return Some(Self::Kept);
         }
         (name != JOIN_LOCK && name.ends_with(CLAIM_SUFFIX)).then_some(Self::Claim)
@@ -253,7 +256,7 @@ mod tests {
     #[test]
     fn what_killed_processes_kept_waits_for_their_successors() {
         let (folder, place) = place();
-        let kept = [place.checkpoint_path(), place.position_path()];
+        let kept = [place.checkpoint_path(), place.position_path(), place.loaded_map_path()];
         let other = folder.path().join("rig2.checkpoint");
         for path in kept.iter().chain([&other]) {
             fs::write(path, "x").unwrap();

@@ -8,7 +8,7 @@ use crate::wire::message::{
 };
 
 /// Version in every topic's name; counts up when a message changes.
-pub const WIRE_VERSION: u32 = 9;
+pub const WIRE_VERSION: u32 = 10;
 
 /// Most keyframes in one message of `mapper/graph`; the newest are sent when there are more.
 pub const MAX_GRAPH_KEYFRAMES: usize = 4096;

@@ -1,11 +1,13 @@
 //! What the tests of the real binary share: an instance of its own for each test, and watch-dogs.
 
+use std::fs;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
+use semidense::service::journal::recovered::Recovered;
 use semidense::wire::place::{Place, SHARED_MEMORY};
 use semidense::wire::port::{Access, Hub};
 
@@ -101,6 +103,15 @@ pub fn until<T>(what: &str, mut ask: impl FnMut() -> Option<T>) -> T {
         assert!(start.elapsed() < WATCH_DOG, "waited in vain for {what}");
         std::thread::sleep(Duration::from_millis(10));
     }
+}
+
+/// The journal of the run that writes into `folder`, once it holds so many poses, lost ones too.
+pub fn journal_of(folder: &Path, poses: usize) -> PathBuf {
+    until("a journal", || {
+        let mut entries = fs::read_dir(folder).ok()?.flatten().map(|entry| entry.path());
+        let journal = entries.find(|path| path.to_string_lossy().contains(".semidense-journal"))?;
+        (Recovered::read(&journal).ok()?.recording.num_poses() >= poses).then_some(journal)
+    })
 }
 
 /// Waits for the end of a child; one that hangs is killed and fails the test. What it says is read meanwhile: a

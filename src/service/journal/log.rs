@@ -25,7 +25,7 @@ const PREFIX_BYTES: usize = 8;
 /// Largest record: the configuration is a tenth of it.
 const MAX_RECORD_BYTES: usize = 1 << 20;
 /// Largest log that is read: three weeks of poses at 30 Hz would be larger.
-const MAX_LOG_BYTES: u64 = 32 << 30;
+pub(super) const MAX_LOG_BYTES: u64 = 32 << 30;
 
 /// How a run was started: what it takes to open its source again.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

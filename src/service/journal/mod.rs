@@ -14,25 +14,31 @@ pub mod replayed;
 mod writer;
 
 use std::fs::File;
-use std::io;
+use std::io::{self, BufReader, Read};
+use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use crossbeam::channel::{SendTimeoutError, Sender, TrySendError, bounded};
 
 use crate::service::journal::folder::{Pointer, begin_folder, hold, remove_folder};
-use crate::service::journal::log::{Record, RunStart, log_header};
+use crate::service::journal::log::{Record, RunStart, log_header, read_log};
 use crate::service::journal::recovered::read_map_of;
 use crate::service::journal::writer::{Entry, Writer};
 use crate::service::recording::RunCounters;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::map::Map;
+use crate::wire::message::PoseMessage;
 use crate::wire::place::Place;
 
 /// Time between two hand-overs to the thread: that much of a run a kill may cost.
 const PERIOD: Duration = Duration::from_secs(1);
-/// Entries that may wait for the disk: two seconds of poses and a keyframe each.
+/// Bytes that are handed over before that: 300 poses, so that a run in lockstep holds no more than one at 30 Hz.
+const HAND_OVER_BYTES: usize = 256 << 10;
+/// Entries that may wait for the disk: at 30 Hz two seconds of poses and a keyframe each.
 const QUEUE: usize = 4;
 /// Longest wait for the disk at the end.
 const END_TIMEOUT: Duration = Duration::from_secs(60);
@@ -69,8 +75,12 @@ pub struct Journal {
     timeout: Duration,
     /// Whether records are left out because the disk hangs.
     leaves_out: bool,
-    /// Says that the run goes on.
-    _hold: File,
+    /// Poses that were taken in before any record was left out, and how many of them the thread has on the disk.
+    poses: u64,
+    has_hole: bool,
+    on_disk: Arc<AtomicU64>,
+    /// The log, held: says that the run goes on.
+    log: File,
 }
 
 impl Journal {
@@ -80,7 +90,7 @@ impl Journal {
         let mut first = log_header();
         Record::Start(Box::new(options.start.clone())).write(&mut first);
         let writer = Writer::create(&folder, &first, options.max_depth_bytes)?;
-        let held = writer.hold()?;
+        let (held, on_disk) = (writer.hold()?, writer.poses_on_disk());
         let (entries, received) = bounded(QUEUE);
         let thread = std::thread::Builder::new()
             .name("semidense-journal".to_owned())
@@ -88,7 +98,7 @@ impl Journal {
         let pointer = Pointer::set(place, &folder)
             .inspect_err(|error| tracing::debug!("no pointer to the journal ({error})"));
         let mut journal = Self::of(folder, held, Some((entries, thread)));
-        journal.pointer = pointer.ok();
+        (journal.pointer, journal.on_disk) = (pointer.ok(), on_disk);
         Ok(journal)
     }
 
@@ -112,7 +122,10 @@ impl Journal {
             thread,
             timeout: END_TIMEOUT,
             leaves_out: false,
-            _hold: held,
+            poses: 0,
+            has_hole: false,
+            on_disk: Arc::default(),
+            log: held,
         }
     }
 
@@ -126,6 +139,8 @@ impl Journal {
         let has_room = self.pending.len() < MAX_PENDING_BYTES;
         if has_room {
             record.write(&mut self.pending);
+            let is_counted = matches!(record, Record::Pose(_)) && !self.has_hole;
+            self.poses += u64::from(is_counted);
         } else if !self.leaves_out {
             let folder = self.folder.display();
             tracing::warn!(
@@ -133,7 +148,28 @@ impl Journal {
             );
         }
         self.leaves_out = !has_room;
+        self.has_hole |= !has_room;
         self.tick();
+    }
+
+    /// How many of the poses that were taken in, from the first on, are on the disk: [`Journal::read_poses`] gives them
+    /// back.
+    pub fn poses_on_disk(&self) -> usize {
+        usize::try_from(self.on_disk.load(Ordering::Acquire)).unwrap_or(usize::MAX)
+    }
+
+    /// Reads the first `count` poses from the disk; fewer where that refuses.
+    pub fn read_poses(&self, count: usize, take: &mut dyn FnMut(&PoseMessage)) {
+        let log = BufReader::new(ReadFromStart { file: &self.log, at: 0 });
+        let mut num_read = 0;
+        read_log(log, &mut |record| {
+            if let Record::Pose(pose) = record
+                && num_read < count
+            {
+                take(&pose);
+                num_read += 1;
+            }
+        });
     }
 
     /// Whether it is time for [`Journal::count`].
@@ -149,7 +185,7 @@ impl Journal {
 
     /// Takes in the newest state of a keyframe; gives it back where the disk is behind. Never waits.
     pub fn put_keyframe(&mut self, keyframe: Keyframe) -> Option<Keyframe> {
-        let without_depth = Keyframe { image: Vec::new(), points: Vec::new(), ..keyframe };
+        let without_depth = keyframe.without_depth();
         let entries = self.entries.as_ref()?;
         match entries.try_send(Entry::Keyframe(Box::new(keyframe))) {
             Ok(()) => self.append(&Record::Keyframe(Box::new(without_depth))),
@@ -161,12 +197,13 @@ impl Journal {
 
     /// Hands over what is due.
     fn tick(&mut self) {
-        if self.handed_over.elapsed() < PERIOD || self.pending.is_empty() {
+        let is_due = self.handed_over.elapsed() >= PERIOD || self.pending.len() >= HAND_OVER_BYTES;
+        if !is_due || self.pending.is_empty() {
             return;
         }
         let Some(entries) = &self.entries else { return };
-        match entries.try_send(Entry::Log(std::mem::take(&mut self.pending))) {
-            Err(TrySendError::Full(Entry::Log(pending))) => self.pending = pending,
+        match entries.try_send(Entry::Log(std::mem::take(&mut self.pending), self.poses)) {
+            Err(TrySendError::Full(Entry::Log(pending, _))) => self.pending = pending,
             _ => self.handed_over = Instant::now(),
         }
     }
@@ -177,13 +214,13 @@ impl Journal {
         let end = Instant::now() + self.timeout;
         let (done, is_done) = bounded(1);
         let pending = std::mem::take(&mut self.pending);
-        let is_whole = match entries.send_deadline(Entry::Log(pending), end) {
+        let is_whole = match entries.send_deadline(Entry::Log(pending, self.poses), end) {
             Ok(()) => {
                 let marked = entries.send_deadline(Entry::Mark(done), end);
                 marked.is_ok() && is_done.recv_deadline(end).is_ok()
             }
             Err(SendTimeoutError::Timeout(entry) | SendTimeoutError::Disconnected(entry)) => {
-                if let Entry::Log(pending) = entry {
+                if let Entry::Log(pending, _) = entry {
                     self.pending = pending;
                 }
                 false
@@ -233,6 +270,20 @@ impl Journal {
     }
 }
 
+/// Reads a file that another thread writes to: the place in it is not shared.
+struct ReadFromStart<'a> {
+    file: &'a File,
+    at: u64,
+}
+
+impl Read for ReadFromStart<'_> {
+    fn read(&mut self, bytes: &mut [u8]) -> io::Result<usize> {
+        let count = self.file.read_at(bytes, self.at)?;
+        self.at += count as u64;
+        Ok(count)
+    }
+}
+
 impl Drop for Journal {
     fn drop(&mut self) {
         self.close();
@@ -243,6 +294,75 @@ impl Drop for Journal {
 mod tests {
     use super::*;
     use crate::service::journal::log::Step;
+    use crate::service::recording::Recording;
+    use crate::slam::frame::FrameView;
+    use crate::slam::pose::PoseEstimate;
+    use crate::wire::conversion::{PoseTiming, pose_message};
+
+    fn pose(sequence: u64) -> PoseMessage {
+        let frame = FrameView {
+            sequence,
+            capture_nanos: sequence as i64,
+            exposure_nanos: 0,
+            width: 0,
+            height: 0,
+            pixels: &[],
+        };
+        pose_message(&PoseEstimate::unknown(&frame), &PoseTiming::default())
+    }
+
+    /// A journal in `folder` without pointer.
+    fn journal(folder: &Path) -> Journal {
+        let writer = Writer::create(folder, &log_header(), 1 << 20).unwrap();
+        let (held, on_disk) = (writer.hold().unwrap(), writer.poses_on_disk());
+        let (entries, received) = bounded(QUEUE);
+        let thread = std::thread::spawn(move || writer.write_all(&received));
+        let mut journal = Journal::of(folder.to_owned(), held, Some((entries, thread)));
+        journal.on_disk = on_disk;
+        journal
+    }
+
+    #[test]
+    fn poses_on_the_disk_need_no_memory_and_come_back() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut journal = journal(folder.path());
+        let mut recording = Recording::default();
+        for sequence in 0..3000 {
+            recording.take_pose(&pose(sequence)).unwrap();
+            journal.append(&Record::Pose(Box::new(pose(sequence))));
+            journal.append(&Record::Step(Step { step_nanos: 1, change_nanos: 0, start_frame: 0 }));
+            if sequence == 2000 {
+                assert!(journal.flush());
+                recording.release(journal.poses_on_disk());
+                assert_eq!(recording.num_released(), 2001, "what is on the disk is not held");
+            }
+        }
+        // The user has taken the folder away: the log is open.
+        std::fs::remove_file(folder.path().join(folder::LOG)).unwrap();
+        let mut found = Vec::new();
+        journal.read_poses(recording.num_released(), &mut |pose| found.push(*pose));
+        assert_eq!(found, (0..2001).map(pose).collect::<Vec<_>>());
+        assert_eq!(recording.take_back(|take| journal.read_poses(2001, take)), 0);
+        assert_eq!((recording.num_poses(), recording.num_released()), (3000, 0));
+    }
+
+    #[test]
+    fn poses_after_one_that_was_left_out_are_not_counted() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut journal = journal(folder.path());
+        let append = |journal: &mut Journal, sequence| {
+            journal.append(&Record::Pose(Box::new(pose(sequence))));
+        };
+        append(&mut journal, 0);
+        assert!(journal.flush());
+        // The disk has hung for an hour, and answers again.
+        journal.pending = vec![0; MAX_PENDING_BYTES];
+        append(&mut journal, 1);
+        journal.pending = Vec::new();
+        append(&mut journal, 2);
+        assert!(journal.flush());
+        assert_eq!(journal.poses_on_disk(), 1);
+    }
 
     #[test]
     fn a_disk_that_hangs_holds_up_neither_the_run_nor_its_end() {
@@ -265,7 +385,11 @@ mod tests {
             // Each is due.
             journal.handed_over -= PERIOD;
         }
-        assert!(journal.leaves_out && journal.pending.len() < MAX_PENDING_BYTES + bytes.len());
+        assert!(
+            journal.leaves_out
+                && journal.has_hole
+                && journal.pending.len() < MAX_PENDING_BYTES + bytes.len()
+        );
         assert!(!journal.flush());
         assert!(journal.map(u64::MAX).keyframes.is_empty());
         assert!(journal.finish().is_err());

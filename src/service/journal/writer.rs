@@ -5,11 +5,14 @@ use std::fs::{self, File};
 use std::io::{self, Write};
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use crossbeam::channel::{Receiver, Sender};
 use rustix::fs::FlockOperation;
 
 use crate::service::journal::folder::{LOG, keyframe_file};
+use crate::service::journal::log::MAX_LOG_BYTES;
 use crate::service::map_file::write_map_into;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::map::Map;
@@ -22,8 +25,8 @@ const UNBEGUN_LOG: &str = "log.new";
 /// What the thread is handed.
 #[derive(Debug)]
 pub(super) enum Entry {
-    /// Whole records of the log.
-    Log(Vec<u8>),
+    /// Whole records of the log, and how many poses there are with them from its beginning, without a hole.
+    Log(Vec<u8>, u64),
     /// A keyframe's newest state.
     Keyframe(Box<Keyframe>),
     /// Answered when everything before is on the disk.
@@ -61,6 +64,12 @@ pub(super) struct Writer {
     good_bytes: u64,
     /// Whole records that the disk has refused so far.
     waiting: Vec<u8>,
+    /// Poses from the beginning to the end of what waits, or to the first hole.
+    poses: u64,
+    /// Whether records were left out: what comes later has no place among the poses that are counted.
+    has_hole: bool,
+    /// Of those poses, how many are on the disk and can be read again.
+    on_disk: Arc<AtomicU64>,
     /// Files with depth, oldest first, and their bytes.
     files: VecDeque<(PathBuf, u64)>,
     max_depth_bytes: u64,
@@ -87,6 +96,9 @@ impl Writer {
             log,
             good_bytes: first.len() as u64,
             waiting: Vec::new(),
+            poses: 0,
+            has_hole: false,
+            on_disk: Arc::default(),
             files: VecDeque::new(),
             max_depth_bytes,
             log_refusals: Refusals::default(),
@@ -97,6 +109,11 @@ impl Writer {
     /// What keeps the log held, also when the thread is gone.
     pub fn hold(&self) -> io::Result<File> {
         self.log.try_clone()
+    }
+
+    /// How many poses, from the first without a hole, are on the disk.
+    pub fn poses_on_disk(&self) -> Arc<AtomicU64> {
+        Arc::clone(&self.on_disk)
     }
 
     /// Writes until nobody hands anything over any more.
@@ -111,8 +128,8 @@ impl Writer {
     /// Writes what it is handed; gives what there is to say.
     fn write(&mut self, entry: Entry) -> Option<String> {
         match entry {
-            Entry::Log(records) => {
-                let error = self.append(&records).err();
+            Entry::Log(records, poses) => {
+                let error = self.append(&records, poses).err();
                 let is_news = self.log_refusals.is_news(error.is_some());
                 error.filter(|_| is_news).map(|error| {
                     format!(
@@ -139,9 +156,13 @@ impl Writer {
 
     /// Appends records. On a full disk depth makes room for them, the oldest first: a run without poses is
     /// lost, one without some depth is not. What is still refused is tried with the next.
-    fn append(&mut self, records: &[u8]) -> io::Result<()> {
+    fn append(&mut self, records: &[u8], poses: u64) -> io::Result<()> {
+        self.has_hole |= self.waiting.len() >= MAX_WAITING_BYTES;
         if self.waiting.len() < MAX_WAITING_BYTES {
             self.waiting.extend_from_slice(records);
+        }
+        if !self.has_hole {
+            self.poses = poses;
         }
         let mut written = self.append_waiting();
         while written.as_ref().is_err_and(is_out_of_room)
@@ -160,6 +181,9 @@ impl Writer {
             Ok(()) => {
                 self.good_bytes += self.waiting.len() as u64;
                 self.waiting = Vec::new();
+                if self.good_bytes <= MAX_LOG_BYTES {
+                    self.on_disk.store(self.poses, Ordering::Release);
+                }
                 Ok(())
             }
             Err(error) => {
@@ -257,7 +281,7 @@ mod tests {
             File::options().write(true).open("/dev/full").unwrap(),
         );
         let said: Vec<String> = (0..2 * Refusals::CALM)
-            .flat_map(|n| [writer.write(Entry::Log(step(n.into()))), writer.write(keyframe())])
+            .flat_map(|n| [writer.write(Entry::Log(step(n.into()), 0)), writer.write(keyframe())])
             .flatten()
             .collect();
         assert_eq!(said.len(), 1, "{said:?}");
@@ -265,27 +289,52 @@ mod tests {
         // It is emptied, and what has waited is written; after a while a full disk is news again.
         writer.log = log;
         for n in 0..Refusals::CALM {
-            assert_eq!(writer.write(Entry::Log(step(n.into()))), None);
+            assert_eq!(writer.write(Entry::Log(step(n.into()), 0)), None);
         }
         let mut steps = 0;
         let log = File::open(folder.path().join(LOG)).unwrap();
         assert_eq!(read_log(log, &mut |_| steps += 1), LogEnd::Whole);
         assert_eq!(steps, 3 * Refusals::CALM);
         writer.log = File::options().write(true).open("/dev/full").unwrap();
-        assert!(writer.write(Entry::Log(step(0))).is_some());
+        assert!(writer.write(Entry::Log(step(0), 0)).is_some());
+    }
+
+    #[test]
+    fn only_poses_that_the_disk_has_taken_are_counted() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut writer = writer(folder.path());
+        let on_disk = writer.poses_on_disk();
+        let counted = || on_disk.load(Ordering::Acquire);
+        let full = File::options().write(true).open("/dev/full").unwrap();
+        writer.write(Entry::Log(step(0), 3));
+        assert_eq!(counted(), 3);
+        let log = std::mem::replace(&mut writer.log, full);
+        writer.write(Entry::Log(step(1), 5));
+        assert_eq!(counted(), 3);
+        writer.log = log;
+        writer.write(Entry::Log(step(2), 6));
+        assert_eq!(counted(), 6);
+        // More than may wait: what comes is left out, and what follows has no place.
+        writer.waiting = vec![0; MAX_WAITING_BYTES];
+        writer.log = File::options().write(true).open("/dev/full").unwrap();
+        writer.write(Entry::Log(step(3), 9));
+        (writer.log, writer.waiting) =
+            (File::create(folder.path().join("other")).unwrap(), Vec::new());
+        writer.write(Entry::Log(step(4), 12));
+        assert_eq!(counted(), 6);
     }
 
     #[test]
     fn what_a_refused_attempt_has_left_is_overwritten() {
         let folder = tempfile::tempdir().unwrap();
         let mut writer = writer(folder.path());
-        assert_eq!(writer.write(Entry::Log(step(1))), None);
+        assert_eq!(writer.write(Entry::Log(step(1), 0)), None);
         // Torn, and the disk refused to cut it off.
         let path = folder.path().join(LOG);
         let end = fs::metadata(&path).unwrap().len();
         io::Seek::seek(&mut writer.log, io::SeekFrom::Start(end)).unwrap();
         writer.log.write_all(&step(2)[..9]).unwrap();
-        assert_eq!(writer.write(Entry::Log(step(2))), None);
+        assert_eq!(writer.write(Entry::Log(step(2), 0)), None);
         let mut found = Vec::new();
         read_log(File::open(path).unwrap(), &mut |record| found.push(format!("{record:?}")));
         assert_eq!(found.len(), 2, "{found:?}");

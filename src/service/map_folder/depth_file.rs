@@ -2,12 +2,19 @@
 //!
 //! Layout: magic, version, detail (u32), keyframe (u64), width, height, number of points, step of the
 //! image's grey levels, whether brightnesses follow (u32), bytes of the image (u64), smallest and largest logarithm of
-//! the inverse depths and of the standard deviations (4 × f32); one bit a pixel that says where points are; the image;
-//! the numbers of the points, in row-major order; the CRC-32 of all before it (u32).
+//! the inverse depths and of the standard deviations (4 × f32), bytes of the places and of the description (u32); the
+//! description (`description`), with a checksum of its own, so that damage there costs nothing else; where points are
+//! (`pixels`); the image; the numbers of the points, in row-major order; the CRC-32 of all before it but the description
+//! (u32). Version 1 has no description and neither of the two numbers, and one bit a pixel for the places.
 //!
 //! In full detail the image is as it is (step 0) and a point has its inverse depth and variance (f32), and its
 //! brightness (f32) where that is not the image's: the same bits come back. In small detail the image is a PNG of grey
 //! levels that are rounded to a step, and a point has logarithms of inverse depth (u16) and standard deviation (u8).
+
+mod description;
+mod pixels;
+
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
@@ -19,15 +26,18 @@ use crate::wire::conversion::{MessageError, check_points};
 /// First bytes of the file.
 const MAGIC: [u8; 16] = *b"semidense depth\n";
 /// Version of the layout.
-const VERSION: u32 = 1;
-/// Bytes before the bits.
-const HEAD_BYTES: usize = 16 + 2 * 4 + 8 + 5 * 4 + 8 + 4 * 4;
+const VERSION: u32 = 2;
+/// The one before, which can still be read.
+const VERSION_BEFORE: u32 = 1;
+/// Bytes before the description, and before the places in the version before.
+const HEAD_BYTES: usize = HEAD_BYTES_BEFORE + 2 * 4;
+const HEAD_BYTES_BEFORE: usize = 16 + 2 * 4 + 8 + 5 * 4 + 8 + 4 * 4;
 /// Bytes of the checksum.
 const CHECKSUM_BYTES: usize = 4;
 
 /// In small detail an image takes at most 1 bit in 4 of what it has (2 a pixel) where a step allows it…
 const SMALL_IMAGE_SHARE: usize = 4;
-/// …and so many pixels have one point: with the bits where they are, half a byte a pixel in all.
+/// …and so many pixels have one point: with where they are, less than half a byte a pixel in all.
 const SMALL_PIXELS_PER_POINT: usize = 28;
 /// Steps of grey levels that are tried, the finest first; the last one is taken where none is small enough.
 const SMALL_STEPS: [u8; 5] = [1, 2, 4, 8, 16];
@@ -42,7 +52,7 @@ pub enum MapDetail {
     /// All of it: about 1.1 MB at 640×480, and the same bits come back.
     #[default]
     Full,
-    /// At most 0.15 MB at 640×480: grey levels are rounded, and one point in nine is kept, the best of each group.
+    /// At most 0.13 MB at 640×480: grey levels are rounded, and one point in nine is kept, the best of each group.
     Small,
 }
 
@@ -53,7 +63,7 @@ pub enum DepthFileError {
     #[error("it is not a keyframe of a map")]
     Magic,
     /// Another version has written it.
-    #[error("it is of version {0}, and this program reads version {VERSION}")]
+    #[error("it is of version {0}, and this program reads up to version {VERSION}")]
     Version(u32),
     /// It is cut short, or has more than it should.
     #[error("it has {found} bytes instead of {expected}")]
@@ -88,7 +98,9 @@ pub enum DepthFileError {
 /// Most bytes of the file of a keyframe with so many pixels.
 pub fn most_bytes(num_pixels: usize) -> usize {
     // A PNG of noise is a little larger than its samples.
-    HEAD_BYTES + num_pixels.div_ceil(8) + 2 * num_pixels + 4096 + 12 * MAX_KEYFRAME_POINTS
+    let image = 2 * num_pixels + 4096;
+    let points = pixels::bit_bytes(num_pixels) + 12 * MAX_KEYFRAME_POINTS;
+    HEAD_BYTES + description::MOST_BYTES + image + points + CHECKSUM_BYTES
 }
 
 /// Most points that small detail keeps of an image of so many pixels.
@@ -96,7 +108,7 @@ fn most_small_points(num_pixels: usize) -> usize {
     num_pixels.div_ceil(SMALL_PIXELS_PER_POINT).min(MAX_KEYFRAME_POINTS)
 }
 
-/// The bytes of a keyframe that has image and depth. Points out of order, and outside the image, are left out.
+/// The bytes of a keyframe that has image and depth, and the description where there is one. Points out of order, and outside the image, are left out.
 pub fn encode(keyframe: &Keyframe, detail: MapDetail) -> Vec<u8> {
     let (width, height) = (keyframe.intrinsics.width, keyframe.intrinsics.height);
     let mut points = in_order(keyframe);
@@ -114,6 +126,9 @@ pub fn encode(keyframe: &Keyframe, detail: MapDetail) -> Vec<u8> {
     }
     let depths = Logarithms::of(points.iter().map(|point| point.inverse_depth));
     let deviations = Logarithms::of(points.iter().map(|point| point.variance.sqrt()));
+    let pixel = |point: &DepthPoint| usize::from(point.v) * width + usize::from(point.u);
+    let places = pixels::encode(points.iter().map(pixel), width * height);
+    let described = keyframe.description.as_deref().map(description::encode).unwrap_or_default();
     let mut bytes = Vec::with_capacity(most_bytes(width * height).min(1 << 21));
     bytes.extend(MAGIC);
     bytes.extend(VERSION.to_le_bytes());
@@ -127,13 +142,11 @@ pub fn encode(keyframe: &Keyframe, detail: MapDetail) -> Vec<u8> {
     for number in [depths.least, depths.most, deviations.least, deviations.most] {
         bytes.extend(number.to_le_bytes());
     }
-    let mut bits = vec![0u8; (width * height).div_ceil(8)];
-    for point in &points {
-        let pixel = usize::from(point.v) * width + usize::from(point.u);
-        bits[pixel / 8] |= 1 << (pixel % 8);
+    bytes.extend((places.len() as u32).to_le_bytes());
+    bytes.extend((described.len() as u32).to_le_bytes());
+    for part in [described, places, coded] {
+        bytes.extend(part);
     }
-    bytes.extend(bits);
-    bytes.extend(coded);
     for point in &points {
         match detail {
             MapDetail::Full => {
@@ -150,8 +163,29 @@ pub fn encode(keyframe: &Keyframe, detail: MapDetail) -> Vec<u8> {
             }
         }
     }
-    bytes.extend(crc32fast::hash(&bytes).to_le_bytes());
+    bytes.extend([0; CHECKSUM_BYTES]);
+    seal(&mut bytes);
     bytes
+}
+
+/// Gives a file's bytes the checksum that they should have.
+pub fn seal(bytes: &mut [u8]) {
+    let checksum = expected_checksum(bytes);
+    if let Some(end) = bytes.last_chunk_mut::<CHECKSUM_BYTES>() {
+        *end = checksum.to_le_bytes();
+    }
+}
+
+/// The checksum of all but the description.
+fn expected_checksum(bytes: &[u8]) -> u32 {
+    let mut rest = bytes;
+    let described = Head::take(&mut rest).map_or(0, |head| head.description_bytes as usize);
+    let (head, body) = bytes.split_at(bytes.len() - rest.len());
+    let body = body.get(described..).unwrap_or_default();
+    let mut hasher = crc32fast::Hasher::new();
+    hasher.update(head);
+    hasher.update(&body[..body.len().saturating_sub(CHECKSUM_BYTES)]);
+    hasher.finalize()
 }
 
 /// The checksum at the end of a file's bytes; 0 of one that has none.
@@ -159,23 +193,25 @@ pub fn checksum_of(bytes: &[u8]) -> u32 {
     bytes.last_chunk::<CHECKSUM_BYTES>().map_or(0, |bytes| u32::from_le_bytes(*bytes))
 }
 
-/// Gives `keyframe` the image and the points of its file. On an error it stays as it is.
+/// Gives `keyframe` the image and the points of its file, and the description where that is whole. On an error it stays as
+/// it is.
 pub fn decode_into(bytes: &[u8], keyframe: &mut Keyframe) -> Result<(), DepthFileError> {
     let mut rest = bytes;
     let head = Head::take(&mut rest).ok_or(DepthFileError::Length {
         found: bytes.len(),
-        expected: HEAD_BYTES + CHECKSUM_BYTES,
+        expected: HEAD_BYTES_BEFORE + CHECKSUM_BYTES,
     })?;
     let sizes = head.check(keyframe)?;
-    let expected = HEAD_BYTES + sizes.bits + sizes.image + sizes.numbers + CHECKSUM_BYTES;
+    let parts = sizes.description + sizes.places + sizes.image + sizes.numbers;
+    let expected = bytes.len() - rest.len() + parts + CHECKSUM_BYTES;
     if bytes.len() != expected {
         return Err(DepthFileError::Length { found: bytes.len(), expected });
     }
-    let body = &bytes[..expected - CHECKSUM_BYTES];
-    if crc32fast::hash(body) != checksum_of(bytes) {
+    if expected_checksum(bytes) != checksum_of(bytes) {
         return Err(DepthFileError::Checksum);
     }
-    let (bits, rest) = rest.split_at(sizes.bits);
+    let (described, rest) = rest.split_at(sizes.description);
+    let (places, rest) = rest.split_at(sizes.places);
     let (coded, rest) = rest.split_at(sizes.image);
     let numbers = &rest[..sizes.numbers];
     let (width, height) = (keyframe.intrinsics.width, keyframe.intrinsics.height);
@@ -188,23 +224,22 @@ pub fn decode_into(bytes: &[u8], keyframe: &mut Keyframe) -> Result<(), DepthFil
             image
         }
     };
-    let pixels = pixels_of(bits, width * height);
-    let num_pixels: usize = bits.iter().map(|byte| byte.count_ones() as usize).sum();
-    if num_pixels != head.num_points as usize {
-        return Err(DepthFileError::Head { what: "points", value: u64::from(head.num_points) });
-    }
-    let mut points = Vec::with_capacity(num_pixels);
-    for (pixel, number) in pixels.zip(numbers.chunks_exact(sizes.a_point.max(1))) {
+    let pixels = pixels::decode(places, width * height, head.num_points as usize)
+        .ok_or(DepthFileError::Head { what: "points", value: u64::from(head.num_points) })?;
+    let mut points = Vec::with_capacity(pixels.len());
+    for (pixel, number) in pixels.into_iter().zip(numbers.chunks_exact(sizes.a_point.max(1))) {
         let (u, v) = ((pixel % width) as u16, (pixel / width) as u16);
         let intensity = f32::from(image.get(pixel).copied().unwrap_or_default());
         points.push(head.point(number, DepthPoint { u, v, intensity, ..DepthPoint::default() }));
     }
     check_points(&points, &keyframe.intrinsics)?;
+    let description = description::decode(described, &keyframe.intrinsics);
     (keyframe.image, keyframe.points) = (image, points);
+    keyframe.description = description.map(Arc::new);
     Ok(())
 }
 
-/// What stands before the bits.
+/// What stands before the parts.
 struct Head {
     magic: [u8; 16],
     version: u32,
@@ -218,11 +253,15 @@ struct Head {
     image_bytes: u64,
     depths: Logarithms,
     deviations: Logarithms,
+    /// `None` in the version before.
+    place_bytes: Option<u32>,
+    description_bytes: u32,
 }
 
 /// Bytes of the parts of a file.
 struct Sizes {
-    bits: usize,
+    description: usize,
+    places: usize,
     image: usize,
     numbers: usize,
     a_point: usize,
@@ -241,6 +280,13 @@ impl Head {
         let mut f32 = || Some(f32::from_le_bytes(*bytes.split_off(..4)?.first_chunk()?));
         let depths = Logarithms { least: f32()?, most: f32()? };
         let deviations = Logarithms { least: f32()?, most: f32()? };
+        let mut place_bytes = None;
+        let mut description_bytes = 0;
+        if version != VERSION_BEFORE {
+            let mut u32 = || Some(u32::from_le_bytes(*bytes.split_off(..4)?.first_chunk()?));
+            place_bytes = Some(u32()?);
+            description_bytes = u32()?;
+        }
         Some(Self {
             magic,
             version,
@@ -254,6 +300,8 @@ impl Head {
             image_bytes,
             depths,
             deviations,
+            place_bytes,
+            description_bytes,
         })
     }
 
@@ -262,7 +310,7 @@ impl Head {
         if self.magic != MAGIC {
             return Err(DepthFileError::Magic);
         }
-        if self.version != VERSION {
+        if ![VERSION_BEFORE, VERSION].contains(&self.version) {
             return Err(DepthFileError::Version(self.version));
         }
         let (width, height) = (of.intrinsics.width, of.intrinsics.height);
@@ -273,12 +321,16 @@ impl Head {
         }
         let is_small = self.detail == 1;
         let most_image = if is_small { most_bytes(width * height) } else { width * height };
+        let bit_bytes = pixels::bit_bytes(width * height);
+        let place_bytes = self.place_bytes.map_or(bit_bytes, |bytes| bytes as usize);
         let checks = [
             ("detail", u64::from(self.detail), 1),
             ("points", u64::from(self.num_points), MAX_KEYFRAME_POINTS as u64),
             ("step", u64::from(self.step), if is_small { 255 } else { 0 }),
             ("brightness", u64::from(self.is_own_brightness), u64::from(!is_small)),
             ("image bytes", self.image_bytes, most_image as u64),
+            ("place bytes", place_bytes as u64, bit_bytes as u64),
+            ("description bytes", self.description_bytes.into(), description::MOST_BYTES as u64),
         ];
         let wrong = checks.into_iter().find(|(_, value, most)| value > most);
         let least_image = if is_small { 0 } else { most_image as u64 };
@@ -293,7 +345,8 @@ impl Head {
             false => 8 + 4 * self.is_own_brightness as usize,
         };
         Ok(Sizes {
-            bits: (width * height).div_ceil(8),
+            description: self.description_bytes as usize,
+            places: place_bytes,
             image: self.image_bytes as usize,
             numbers: self.num_points as usize * a_point,
             a_point,
@@ -399,15 +452,6 @@ fn small_image(image: &[u8], width: usize, height: usize) -> (u8, Vec<u8>) {
 /// The grey level in the middle of a step.
 fn level(code: u8, step: u8) -> u8 {
     code.saturating_mul(step).saturating_add(step / 2)
-}
-
-/// The pixels whose bits are set, in order.
-fn pixels_of(bits: &[u8], num_pixels: usize) -> impl Iterator<Item = usize> {
-    let of_byte = |(index, byte): (usize, &u8)| {
-        let byte = *byte;
-        (0..8).filter(move |bit| byte >> bit & 1 == 1).map(move |bit| index * 8 + bit)
-    };
-    bits.iter().enumerate().flat_map(of_byte).filter(move |pixel| *pixel < num_pixels)
 }
 
 #[cfg(test)]

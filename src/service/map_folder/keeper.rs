@@ -11,6 +11,7 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Instant;
 
+use crate::service::map_folder::numbering::Numbering;
 use crate::service::map_folder::writer::{MapHead, MapWriter};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{Keyframe, MapState};
@@ -24,6 +25,7 @@ const MOST_WAITING: usize = 8;
 #[derive(Debug)]
 pub struct MapKeeper {
     camera: Intrinsics,
+    numbering: Numbering,
     shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
     /// Revisions of keyframes that were handed over, by their id.
@@ -55,12 +57,13 @@ struct Waiting {
 }
 
 impl MapKeeper {
-    /// Keeps the map of `camera` in a folder whose map `loaded` is already there. Where frames may wait (`waits`) a save
+    /// Keeps the map of `camera` in a folder whose map `loaded` is already there, there under other numbers. Where frames may wait (`waits`) a save
     /// waits for the one before, so that a kill costs a keyframe also where frames are faster than the disk.
     pub fn start(
         writer: MapWriter,
         camera: Intrinsics,
         loaded: &Map,
+        numbering: Numbering,
         waits: bool,
     ) -> io::Result<Self> {
         let shared = Arc::new(Shared {
@@ -74,7 +77,14 @@ impl MapKeeper {
             .name("semidense-save".to_owned())
             .spawn(move || save_until_over(&theirs, &camera))?;
         let handed = loaded.keyframes.iter().map(|of| (of.keyframe_id, of.revision));
-        Ok(Self { camera, shared, thread: Some(thread), handed: handed.collect(), waits })
+        Ok(Self {
+            camera,
+            numbering,
+            shared,
+            thread: Some(thread),
+            handed: handed.collect(),
+            waits,
+        })
     }
 
     /// Hands over what a step or a correction has changed.
@@ -97,15 +107,17 @@ impl MapKeeper {
                 Some(_) => {}
             }
         }
-        let head = head_of(mapper);
+        let head = self.numbering.head_on_disk(head_of(mapper));
         let mut waiting = locked(&self.shared.waiting);
         while self.waits && (waiting.is_busy || waiting.head.is_some()) {
             waiting = self.shared.idle.wait(waiting).unwrap_or_else(PoisonError::into_inner);
         }
         for keyframe in new.into_iter().chain(changed.map(|(_, keyframe)| keyframe)) {
-            if waiting.keyframes.len() < MOST_WAITING {
+            if waiting.keyframes.len() < MOST_WAITING
+                && let Some(on_disk) = self.numbering.on_disk(keyframe.clone())
+            {
                 self.handed.insert(keyframe.keyframe_id, keyframe.revision);
-                waiting.keyframes.insert(keyframe.keyframe_id, keyframe.clone());
+                waiting.keyframes.insert(keyframe.keyframe_id, on_disk);
             }
         }
         waiting.head = Some(head);
@@ -133,10 +145,13 @@ impl MapKeeper {
             if self.handed.get(&keyframe.keyframe_id) == Some(&keyframe.revision) {
                 continue;
             }
-            writer.put(keyframe).map_err(|error| error.to_string())?;
+            if let Some(on_disk) = self.numbering.on_disk(keyframe.clone()) {
+                writer.put(&on_disk).map_err(|error| error.to_string())?;
+            }
             self.handed.insert(keyframe.keyframe_id, keyframe.revision);
         }
-        writer.save(&self.camera, head_of(mapper)).map_err(|error| error.to_string())?;
+        let head = self.numbering.head_on_disk(head_of(mapper));
+        writer.save(&self.camera, head).map_err(|error| error.to_string())?;
         writer.settle().map_err(|error| error.to_string())
     }
 
@@ -169,6 +184,7 @@ pub(super) fn head_of(mapper: &Mapper) -> MapHead {
     let map = mapper.map();
     MapHead {
         keyframes: map.keyframes.iter().map(Keyframe::without_depth).collect(),
+        loops: map.loops.clone(),
         revision: map.revision,
         free_epoch: mapper.free_epoch(),
     }

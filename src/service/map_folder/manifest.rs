@@ -6,16 +6,20 @@
 //!
 //! * `CAMR`: width, height (u32), fx, fy, cx, cy (f64).
 //! * `STAT`: detail (u32), first free epoch (u32), revision of the map, number of saves, seconds since 1970 (u64).
+//! * `loop`: loops, as in [`loop_bytes`](crate::service::loop_bytes); left out where there are none.
 //! * `KEYF`: number of keyframes (u64), each: bytes (u32) of the keyframe without image and points as in
 //!   [`map_file`](crate::service::map_file), these; then, 0 where it has no file, revision in the file's name, bytes
 //!   (u64), checksum, number of points (u32) of its file.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
+use crate::service::loop_bytes::{loop_bytes, parse_loops};
 use crate::service::map_file::{keyframe_bytes, parse_keyframe};
 use crate::service::map_folder::depth_file::{MapDetail, most_bytes};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{Keyframe, MAX_KEYFRAME_POINTS};
+use crate::slam::loops::known::KnownLoops;
 
 /// First bytes of the file.
 const MAGIC: [u8; 16] = *b"semidense mapdir";
@@ -24,6 +28,7 @@ pub const VERSION: u32 = 1;
 const CAMERA: [u8; 4] = *b"CAMR";
 const STATE: [u8; 4] = *b"STAT";
 const KEYFRAMES: [u8; 4] = *b"KEYF";
+const LOOPS: [u8; 4] = *b"loop";
 /// More keyframes than an hour at one each 30 ms: a broken number, not a map.
 const MAX_KEYFRAMES: usize = 120_000;
 /// Largest number of an epoch and of a revision: what comes after it must not overflow.
@@ -39,6 +44,8 @@ pub struct Manifest {
     pub detail: MapDetail,
     /// Numbers of epochs from here on are given by nobody yet.
     pub free_epoch: u32,
+    /// Loops of the map.
+    pub loops: Arc<KnownLoops>,
     /// How often the map had been corrected.
     pub revision: u64,
     /// How often it was saved.
@@ -108,6 +115,7 @@ impl Manifest {
             camera,
             detail,
             free_epoch: 0,
+            loops: Arc::default(),
             revision: 0,
             saves: 0,
             saved_secs: 0,
@@ -146,6 +154,9 @@ impl Manifest {
             keyframes.extend(file.num_points.to_le_bytes());
         }
         push_section(&mut bytes, KEYFRAMES, &keyframes);
+        if !self.loops.is_empty() {
+            push_section(&mut bytes, LOOPS, &loop_bytes(&self.loops));
+        }
         bytes.extend(crc32fast::hash(&bytes).to_le_bytes());
         bytes
     }
@@ -171,7 +182,7 @@ impl Manifest {
             let length = usize::try_from(u64::from_le_bytes(take(&mut rest)?)).ok();
             let payload = length.and_then(|length| rest.split_off(..length));
             let payload = payload.ok_or_else(|| damaged("a part is cut"))?;
-            let is_known = [CAMERA, STATE, KEYFRAMES].contains(&tag);
+            let is_known = [CAMERA, STATE, KEYFRAMES, LOOPS].contains(&tag);
             if !is_known && !tag[0].is_ascii_lowercase() {
                 return Err(ManifestError::Section(tag.escape_ascii().to_string()));
             }
@@ -182,6 +193,10 @@ impl Manifest {
         let mut manifest = Self::new(camera_of(part(CAMERA)?)?, MapDetail::Full);
         manifest.read_state(part(STATE)?)?;
         manifest.read_keyframes(part(KEYFRAMES)?)?;
+        if let Some(loops) = sections.get(&LOOPS) {
+            let parsed = parse_loops(loops).map_err(|error| damaged(&error.to_string()))?;
+            manifest.loops = Arc::new(parsed);
+        }
         Ok(manifest)
     }
 
@@ -322,6 +337,17 @@ mod tests {
     }
 
     #[test]
+    fn loops_come_with_it_and_broken_ones_are_refused() {
+        let loops = Arc::new(crate::service::loop_bytes::tests::loops());
+        let with = Manifest { loops, ..manifest() };
+        assert_eq!(Manifest::from_bytes(&with.to_bytes()), Ok(with));
+        let mut bytes = body();
+        push_section(&mut bytes, LOOPS, b"something");
+        let error = Manifest::from_bytes(&sealed(bytes)).unwrap_err().to_string();
+        assert!(error.contains("loops"), "{error}");
+    }
+
+    #[test]
     fn every_cut_and_every_wrong_bit_is_an_error() {
         let whole = manifest().to_bytes();
         for length in 0..whole.len() {
@@ -362,8 +388,8 @@ mod tests {
             push_section(&mut bytes, *tag, b"something");
             Manifest::from_bytes(&sealed(bytes))
         };
-        assert_eq!(with(b"loop"), Ok(manifest()));
-        assert_eq!(with(b"LOOP"), Err(ManifestError::Section("LOOP".to_owned())));
+        assert_eq!(with(b"some"), Ok(manifest()));
+        assert_eq!(with(b"SOME"), Err(ManifestError::Section("SOME".to_owned())));
         let mut newer = manifest().to_bytes();
         newer[16] = 2;
         assert_eq!(Manifest::from_bytes(&newer), Err(ManifestError::Version(2)));

@@ -1,6 +1,7 @@
 //! Two maps in one folder.
 
 use std::path::Path;
+use std::sync::Arc;
 
 use crate::service::map_folder::writer::MapHead;
 use crate::service::map_folder::{Loaded, MapFolderError, write_new};
@@ -23,6 +24,7 @@ pub fn merge(
     let map = joined(first.map, second.map);
     let head = MapHead {
         keyframes: map.keyframes.iter().map(Keyframe::without_depth).collect(),
+        loops: map.loops.clone(),
         revision: map.revision,
         free_epoch: map.free_epoch,
     };
@@ -45,6 +47,7 @@ fn joined(first: Map, second: Map) -> Map {
     });
     Map {
         keyframes: first.keyframes.into_iter().chain(moved).collect(),
+        loops: Arc::new(Arc::unwrap_or_clone(first.loops).with(&second.loops, ids)),
         revision: first.revision.max(second.revision),
         free_epoch: second.free_epoch.saturating_add(epochs),
         ..Map::default()
@@ -54,6 +57,7 @@ fn joined(first: Map, second: Map) -> Map {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::service::loop_bytes::tests::loops;
     use crate::slam::geometry::intrinsics::Intrinsics;
     use crate::slam::geometry::sim3::Sim3;
 
@@ -75,5 +79,11 @@ mod tests {
             both.keyframes.iter().map(|of| (of.keyframe_id, of.epoch)).collect();
         assert_eq!(numbers, [(0, 0), (7, 2), (8, 5), (11, 6)]);
         assert_eq!(both.free_epoch, 7);
+        let looped = |of: &[(u64, u32)]| Map { loops: Arc::new(loops()), ..map(of, 1) };
+        let both = joined(looped(&[(0, 0), (7, 0)]), looped(&[(1, 0)])).loops;
+        let pairs: Vec<(u64, u64)> = both.links.iter().map(|link| (link.i, link.j)).collect();
+        assert_eq!(pairs, [(7, 3), (8, 3), (15, 11), (16, 11)]);
+        assert_eq!(both.held_by[&15], [13, 14]);
+        assert_eq!((both.beginnings.contains(&12), both.searched_to), (true, Some(16)));
     }
 }

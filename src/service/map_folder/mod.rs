@@ -19,6 +19,7 @@ pub mod depth_file;
 pub mod keeper;
 pub mod manifest;
 pub mod merge;
+pub mod numbering;
 pub mod report;
 pub mod session;
 pub mod writer;
@@ -249,6 +250,7 @@ fn read_keyframes(
     let (keyframes, problems): (Vec<_>, Vec<_>) = read.into_iter().unzip();
     let map = Map {
         keyframes,
+        loops: manifest.loops.clone(),
         revision: manifest.revision,
         free_epoch: manifest.free_epoch,
         ..Map::default()

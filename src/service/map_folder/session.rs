@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use crate::service::config::MapConfig;
 use crate::service::map_folder::keeper::MapKeeper;
+use crate::service::map_folder::numbering::Numbering;
 use crate::service::map_folder::writer::MapWriter;
 use crate::service::map_folder::{Loaded, MapFolderError, load, read_manifest};
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -43,15 +44,18 @@ pub struct MapSession {
     camera: Option<Intrinsics>,
     writer: Option<MapWriter>,
     keeper: Option<MapKeeper>,
+    numbering: Numbering,
     waits: bool,
 }
 
 impl MapSession {
     /// Reads the map that the configuration names, with the threads of the pool it is called in; `None` where it names
-    /// none. What is damaged is told in the log. `waits`: frames may wait for the disk.
+    /// none. What is damaged is told in the log. `waits`: frames may wait for the disk. The run gives other numbers than
+    /// the disk where it had a map before.
     pub fn open(
         config: &MapConfig,
         max_bytes: usize,
+        numbering: Numbering,
         waits: bool,
     ) -> Result<Option<Self>, MapFolderError> {
         if config.folder.is_empty() {
@@ -69,8 +73,9 @@ impl MapSession {
         };
         loaded.iter().for_each(|loaded| tell_what_is_missing(loaded, max_bytes));
         let camera = loaded.as_ref().map(|loaded| loaded.manifest.camera);
-        let loaded = loaded.map(|loaded| loaded.map);
-        Ok(Some(Self { folder, map_use, loaded, camera, writer, keeper: None, waits }))
+        let loaded = loaded.map(|loaded| numbering.in_run(loaded.map));
+        let keeper = None;
+        Ok(Some(Self { folder, map_use, loaded, camera, writer, keeper, numbering, waits }))
     }
 
     /// Lets a mapper of `camera` begin in the map, before its first frame; where one that died has `left` a checkpoint and
@@ -87,7 +92,7 @@ impl MapSession {
         }
         let map = self.loaded.take().unwrap_or_default();
         if let Some(writer) = self.writer.take() {
-            let keeper = MapKeeper::start(writer, *camera, &map, self.waits)
+            let keeper = MapKeeper::start(writer, *camera, &map, self.numbering, self.waits)
                 .map_err(MapSessionError::Thread)?;
             self.keeper = Some(keeper);
         }
@@ -140,6 +145,16 @@ pub fn check(config: &MapConfig) -> Result<(), MapFolderError> {
         true => read_manifest(&folder).map(drop),
         false => MapWriter::open(&folder, config.detail).map(drop),
     }
+}
+
+/// Checks that a folder holds a map of this camera that a running mapper could go over to.
+pub fn check_loadable(folder: &Path, camera: &Intrinsics) -> Result<(), MapFolderError> {
+    let (manifest, _) = read_manifest(folder)?;
+    if manifest.camera == *camera {
+        return Ok(());
+    }
+    let (map, camera) = (Box::new(manifest.camera), Box::new(*camera));
+    Err(MapFolderError::Camera { folder: folder.to_owned(), map, camera })
 }
 
 fn tell_what_is_missing(loaded: &Loaded, max_bytes: usize) {

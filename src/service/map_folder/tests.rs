@@ -1,6 +1,7 @@
 //! A map on disk comes back as it was, and what is damaged costs nothing but itself.
 
 use std::fs;
+use std::sync::Arc;
 
 use super::*;
 use crate::service::map_folder::depth_file::MapDetail;
@@ -8,6 +9,10 @@ use crate::service::map_folder::writer::{MapHead, MapWriter};
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::MapState;
+use crate::slam::mapper::MapperParams;
+use crate::slam::mapper::prior::MapUse;
+use crate::slam::places::Description;
+use crate::slam::test_scene::Scene;
 
 const CAMERA: Intrinsics =
     Intrinsics { fx: 60.0, fy: 61.0, cx: 32.0, cy: 24.0, width: 65, height: 48 };
@@ -35,7 +40,7 @@ fn keyframe(keyframe_id: u64, revision: u64) -> Keyframe {
 
 fn head(keyframes: &[Keyframe]) -> MapHead {
     let keyframes = keyframes.iter().map(Keyframe::without_depth).collect();
-    MapHead { keyframes, revision: 6, free_epoch: 4 }
+    MapHead { keyframes, revision: 6, free_epoch: 4, loops: Arc::default() }
 }
 
 /// Saves keyframes, all of them with their depth.
@@ -146,6 +151,35 @@ fn a_damaged_keyframe_costs_its_depth_and_nothing_else() {
         fs::write(path("2.1"), &whole[..length]).unwrap();
         assert_eq!(load(folder.path(), ALL).unwrap().problems.len(), 4);
     }
+}
+
+#[test]
+fn a_damaged_description_is_made_again_and_costs_nothing_else() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = Scene::new(3);
+    let mut kept = scene.keyframe(0, SE3::identity(), 1.0);
+    let camera = kept.intrinsics;
+    let mut other = Mapper::new(camera, MapperParams::default()).unwrap();
+    let begun = Map { keyframes: vec![kept.clone()], ..Map::default() };
+    other.begin_in(begun, MapUse::Extend).unwrap();
+    let made = other.map().keyframes[0].description.clone();
+    kept.description = made.clone();
+    let mut writer = open(folder.path());
+    writer.put(&kept).unwrap();
+    writer.save(&camera, head(std::slice::from_ref(&kept))).unwrap();
+    let whole = load(folder.path(), ALL).unwrap().map;
+    let features = |of: &Option<Arc<Description>>| of.as_ref().unwrap().features().to_vec();
+    assert_eq!(features(&whole.keyframes[0].description), features(&made));
+    let path = contents(&folder.path().join(KEYFRAMES))[0].0.clone();
+    let mut bytes = fs::read(&path).unwrap();
+    bytes[1000] ^= 4;
+    fs::write(&path, &bytes).unwrap();
+    let loaded = load(folder.path(), ALL).unwrap();
+    assert!(loaded.problems.is_empty() && loaded.map.keyframes[0].description.is_none());
+    assert!(loaded.map.keyframes[0].points == kept.points);
+    let mut mapper = Mapper::new(camera, MapperParams::default()).unwrap();
+    mapper.begin_in(loaded.map, MapUse::Extend).unwrap();
+    assert_eq!(mapper.map().keyframes[0].description, made);
 }
 
 #[test]

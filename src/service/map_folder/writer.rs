@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use crate::service::atomic_file::write_durably;
@@ -13,12 +14,15 @@ use crate::service::map_folder::{BEFORE, KEYFRAMES, MANIFEST, MapFolderError, re
 use crate::service::results::output_lock::{Locking, OutputLock};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::loops::known::KnownLoops;
 
 /// What of a map is in its manifest.
 #[derive(Debug, Clone, Default)]
 pub struct MapHead {
     /// Keyframes without image and points, in the order of their ids.
     pub keyframes: Vec<Keyframe>,
+    /// Its loops.
+    pub loops: Arc<KnownLoops>,
     /// How often the map was corrected.
     pub revision: u64,
     /// Numbers of epochs from here on are given by nobody yet.
@@ -142,6 +146,7 @@ impl MapWriter {
         let saves = self.manifest.as_ref().map_or(0, |before| before.saves);
         let manifest = Manifest {
             free_epoch: head.free_epoch,
+            loops: head.loops,
             revision: head.revision,
             saves: saves.saturating_add(1),
             saved_secs: since.map_or(0, |since| since.as_secs()),

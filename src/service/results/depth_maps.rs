@@ -2,16 +2,16 @@
 
 use crate::capture::source::{FrameSource, SourceError};
 use crate::service::results::RunRecord;
-use crate::slam::evaluation::depth_error::{DepthErrors, DepthStatistics};
+use crate::slam::evaluation::depth_error::{DepthErrors, DepthStatistics, KeyframeDepth};
 use crate::slam::keyframe::{Keyframe, MapState};
 
 /// What the depth maps are worth.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq, Default)]
 pub struct DepthEvaluation {
     /// Statistics over all keyframes with true depth; `None` where there is none.
     pub statistics: Option<DepthStatistics>,
-    /// Keyframes that have true depth.
-    pub keyframes: usize,
+    /// What the depth of each has in common, of all keyframes that have true depth.
+    pub keyframes: Vec<KeyframeDepth>,
 }
 
 /// Compares every established keyframe that has true depth.
@@ -20,7 +20,6 @@ pub fn evaluate_depth(
     source: &mut dyn FrameSource,
 ) -> Result<DepthEvaluation, SourceError> {
     let mut errors = DepthErrors::default();
-    let mut keyframes = 0;
     for keyframe in record.map.keyframes.iter().filter(|k| is_evaluated(k)) {
         let true_depth = match source.depth_at(keyframe.capture_nanos) {
             // One damaged file is no reason to lose the results.
@@ -32,10 +31,9 @@ pub fn evaluate_depth(
         };
         if let Some(true_depth) = true_depth {
             errors.add(keyframe, &true_depth, record.depth_scale);
-            keyframes += 1;
         }
     }
-    Ok(DepthEvaluation { statistics: errors.statistics(), keyframes })
+    Ok(DepthEvaluation { statistics: errors.statistics(), keyframes: errors.into_keyframes() })
 }
 
 /// Whether a keyframe's depth is proven and still held.

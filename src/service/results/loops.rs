@@ -9,6 +9,8 @@ use crate::slam::loops::SearchFate;
 /// The search for loops in a run; none of it is known where a run does not tell.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct LoopSummary {
+    /// Keyframes that were looked for in older ones.
+    pub loop_searches: Option<u64>,
     /// Pairs of keyframes that were compared.
     pub loop_pairs: Option<u64>,
     /// Loops that moved the map.
@@ -40,6 +42,7 @@ impl LoopSummary {
         };
         let nanos: u64 = records.iter().map(|record| record.nanos).sum();
         Self {
+            loop_searches: count(|fate| *fate != SearchFate::Proposed),
             loop_pairs: Some(records.iter().map(|of| u64::from(of.report.compared)).sum()),
             loops_closed: count(|fate| *fate == SearchFate::Closed),
             loops_held: count(|fate| *fate == SearchFate::Held),

@@ -296,7 +296,7 @@ impl<'a> Results<'a> {
             evaluation.as_ref(),
             online_evaluation.as_ref(),
             poses::normalized_errors_of(record, epoch),
-            depth.statistics,
+            depth,
         );
         Ok(Self {
             summary,

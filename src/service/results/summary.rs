@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::service::results::alignment_levels::{LevelSummary, alignment_levels};
 use crate::service::results::budget_curve::BudgetCurve;
 use crate::service::results::calibration::whitened_residual_median;
+use crate::service::results::depth_maps::DepthEvaluation;
 use crate::service::results::joint::JointSummary;
 use crate::service::results::loops::LoopSummary;
 use crate::service::results::output_folder::utc_text;
@@ -17,7 +18,7 @@ use crate::service::results::{
     EndOfRun, RecordedPose, Rejection, RestartCause, RunMode, RunRecord,
 };
 use crate::slam::evaluation::TrajectoryEvaluation;
-use crate::slam::evaluation::depth_error::{DepthScale, DepthStatistics};
+use crate::slam::evaluation::depth_error::{DepthScale, KeyframeDepth, depth_scale_ratio};
 use crate::slam::evaluation::grade::{Grade, GradeInput};
 use crate::slam::evaluation::map_consistency::MapConsistency;
 use crate::slam::evaluation::normalized_error::NormalizedErrors;
@@ -107,7 +108,7 @@ impl From<&NormalizedErrors> for NeesSummary {
 }
 
 /// Depth of the keyframes against ground truth; all null where there is none.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct DepthSummary {
     /// Pixels of keyframes whose true depth is known.
     pub depth_pixels: Option<u64>,
@@ -124,18 +125,28 @@ pub struct DepthSummary {
     pub depth_modes: Option<[f64; 3]>,
     /// The same over the standard deviation that each keyframe claims: 0.67 is right, more is too sure.
     pub depth_modes_whitened: Option<[f64; 3]>,
+    /// Largest over smallest map unit of the keyframes, by their depth: 1 where the scale does not drift.
+    #[serde(default)]
+    pub depth_scale_ratio: Option<f64>,
+    /// The same and the modes keyframe by keyframe.
+    #[serde(default)]
+    pub keyframe_depth: Vec<KeyframeDepth>,
 }
 
-impl From<DepthStatistics> for DepthSummary {
-    fn from(depth: DepthStatistics) -> Self {
+impl From<DepthEvaluation> for DepthSummary {
+    fn from(depth: DepthEvaluation) -> Self {
+        let statistics = depth.statistics;
         Self {
-            depth_pixels: Some(depth.compared as u64),
-            depth_relative_error_median: Some(depth.relative_error_median),
-            depth_relative_error_median_best_half: Some(depth.relative_error_median_best_half),
-            depth_coverage: Some(depth.coverage),
-            depth_density: Some(depth.density),
-            depth_modes: depth.modes,
-            depth_modes_whitened: depth.whitened_modes,
+            depth_pixels: statistics.map(|of| of.compared as u64),
+            depth_relative_error_median: statistics.map(|of| of.relative_error_median),
+            depth_relative_error_median_best_half: statistics
+                .map(|of| of.relative_error_median_best_half),
+            depth_coverage: statistics.map(|of| of.coverage),
+            depth_density: statistics.map(|of| of.density),
+            depth_modes: statistics.and_then(|of| of.modes),
+            depth_modes_whitened: statistics.and_then(|of| of.whitened_modes),
+            depth_scale_ratio: depth_scale_ratio(&depth.keyframes),
+            keyframe_depth: depth.keyframes,
         }
     }
 }
@@ -313,7 +324,7 @@ impl Summary {
         trajectory: Option<&TrajectoryEvaluation>,
         online: Option<&TrajectoryEvaluation>,
         nees: [Option<NormalizedErrors>; 2],
-        depth: Option<DepthStatistics>,
+        depth: DepthEvaluation,
     ) -> Self {
         let (recorded_secs, wall_secs) =
             (record.recorded_nanos as f64 * 1e-9, record.wall_nanos as f64 * 1e-9);
@@ -373,7 +384,7 @@ impl Summary {
             online: online.map(TrajectorySummary::from).unwrap_or_default(),
             nees: nees[0].as_ref().map(NeesSummary::from).unwrap_or_default(),
             map_nees: nees[1].as_ref().map(NeesSummary::from).unwrap_or_default(),
-            depth: depth.map(DepthSummary::from).unwrap_or_default(),
+            depth: depth.into(),
         }
     }
 }

@@ -84,7 +84,10 @@ pub fn summary_text(summary: &Summary) -> String {
 fn depth_errors(depth: &DepthSummary) -> Option<String> {
     let all = 100.0 * depth.depth_relative_error_median?;
     let best = 100.0 * depth.depth_relative_error_median_best_half?;
-    Some(format!("median relative error {all:.1} %, {best:.1} % over the more certain half"))
+    let unit =
+        depth.depth_scale_ratio.map(|ratio| format!(", unit of the keyframes within × {ratio:.2}"));
+    let unit = unit.unwrap_or_default();
+    Some(format!("median relative error {all:.1} %, {best:.1} % over the more certain half{unit}"))
 }
 
 /// The level and at most two reasons; what it cannot see is in the report.
@@ -160,12 +163,13 @@ fn joint_text(joint: &JointSummary) -> Option<String> {
 }
 
 /// What the search for loops came to; nothing where none was made.
-fn loops_text(loops: &LoopSummary) -> Option<String> {
+pub(super) fn loops_text(loops: &LoopSummary) -> Option<String> {
     let times = times_text(loops.loop_search_ms.as_ref()?);
     let of = |count: Option<u64>| count.unwrap_or(0);
     Some(format!(
-        "{} closed, {} held already, {} epochs joined; refused: {} other places, {} against the drift, {} unconfirmed, \
+        "{} keyframes searched, {} closed, {} held already, {} epochs joined; refused: {} other places, {} against the drift, {} unconfirmed, \
          {} inconsistent; a search takes {times}",
+        of(loops.loop_searches),
         of(loops.loops_closed),
         of(loops.loops_held),
         of(loops.epochs_joined),

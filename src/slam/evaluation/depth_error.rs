@@ -1,5 +1,7 @@
 //! Semi-dense depth against true depth, and the reported variances against the errors made.
 
+use serde::{Deserialize, Serialize};
+
 use crate::slam::evaluation::depth_modes::DepthModes;
 use crate::slam::evaluation::statistics::median;
 use crate::slam::image::buffer::Image;
@@ -14,9 +16,34 @@ pub enum DepthScale {
     Given,
 }
 
+/// The depth of one keyframe against the truth: what all of it has in common.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct KeyframeDepth {
+    /// The keyframe.
+    pub keyframe_id: u64,
+    /// Its stamp, nanoseconds.
+    pub capture_nanos: i64,
+    /// Map units in a true metre: the same everywhere in a map without drift of its scale.
+    pub units_per_metre: f64,
+    /// Relative depth error for each unit of the ray along columns, along rows, and for each unit of ln d (relief), as
+    /// [`DepthModes`] defines them; `None` with too few points.
+    pub modes: Option<[f64; 3]>,
+}
+
+/// Largest over smallest map unit of the keyframes; `None` below two.
+pub fn depth_scale_ratio(keyframes: &[KeyframeDepth]) -> Option<f64> {
+    if keyframes.len() < 2 {
+        return None;
+    }
+    let units = keyframes.iter().map(|of| of.units_per_metre);
+    Some(units.clone().fold(0.0, f64::max) / units.fold(f64::INFINITY, f64::min))
+}
+
 /// Pixels of one or more keyframes whose true depth is known.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct DepthErrors {
+    /// What each of the keyframes has in common.
+    keyframes: Vec<KeyframeDepth>,
     /// `|z·s − z_true| / z_true`.
     relative_error: Vec<f64>,
     /// σ/d as reported.
@@ -76,7 +103,14 @@ impl DepthErrors {
             })
             .collect();
         let Some(s) = metres_per_unit(keyframe, &compared, scale) else { return };
-        if let Some(modes) = DepthModes::of(keyframe, true_depth, s) {
+        let modes = DepthModes::of(keyframe, true_depth, s);
+        self.keyframes.push(KeyframeDepth {
+            keyframe_id: keyframe.keyframe_id,
+            capture_nanos: keyframe.capture_nanos,
+            units_per_metre: keyframe.map_from_keyframe.scale / s,
+            modes: modes.map(|of| [of.column, of.row, of.relief]),
+        });
+        if let Some(modes) = modes {
             let (errors, std_devs) = (modes.magnitudes(), keyframe.mode_covariance.std_devs());
             self.modes.push(errors);
             let whitened = std::array::from_fn(|mode| errors[mode] / std_devs[mode]);
@@ -89,6 +123,11 @@ impl DepthErrors {
             // In keyframe units the true inverse depth is s / z_true.
             self.whitened_error.push((d - s / z_true).abs() / sigma.max(f64::MIN_POSITIVE));
         }
+    }
+
+    /// What each keyframe that was compared has in common, in their order.
+    pub fn into_keyframes(self) -> Vec<KeyframeDepth> {
+        self.keyframes
     }
 
     /// The statistics; `None` where nothing could be compared.
@@ -180,10 +219,25 @@ mod tests {
             assert!(s.relative_error_median_best_half < 1e-9);
             assert_eq!(s.coverage, [0.6, 0.8, 1.0]);
             assert!((s.density - 6.0 / 400.0).abs() < 1e-12);
+            let [of] = errors.into_keyframes()[..] else { panic!("one keyframe") };
+            assert!((of.units_per_metre - 1.0).abs() < 1e-9 && of.modes.is_none(), "{of:?}");
         }
         let mut errors = DepthErrors::default();
         errors.add(&keyframe(points, 1.0), &truth, DepthScale::Given);
         assert!((errors.statistics().unwrap().relative_error_median - 0.5).abs() < 1e-6);
+    }
+
+    #[test]
+    fn a_unit_that_drifts_shows_in_the_ratio_of_all() {
+        let truth = Image::filled(20, 20, 4.0f32);
+        let mut errors = DepthErrors::default();
+        for unit in [2.0, 2.2, 1.6] {
+            errors.add(&keyframe(vec![point(0, 0.5, 0.01)], unit), &truth, DepthScale::MedianRatio);
+        }
+        let keyframes = errors.into_keyframes();
+        assert!((depth_scale_ratio(&keyframes).unwrap() - 2.2 / 1.6).abs() < 1e-9);
+        assert!((keyframes[1].units_per_metre - 1.1).abs() < 1e-9);
+        assert_eq!(depth_scale_ratio(&keyframes[..1]), None);
     }
 
     #[test]

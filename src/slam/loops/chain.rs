@@ -8,12 +8,12 @@
 use std::collections::BTreeMap;
 
 use crate::slam::geometry::sim3::{Matrix7, Sim3};
-use crate::slam::graph::constraint::Measurement;
 use crate::slam::graph::marginal::Marginals;
 use crate::slam::graph::pose_graph::{Constraint, PoseGraph, VertexId};
 use crate::slam::graph::robust::RobustKernel;
 use crate::slam::graph::{GraphParams, fits};
-use crate::slam::loops::{Link, Loops, Node};
+use crate::slam::loops::known::Link;
+use crate::slam::loops::{Loops, Node};
 use crate::slam::place_covariance::PlaceCovariance;
 
 /// Standard deviations of a link: no less than this, whatever an estimate claims, and that of a keyframe that was not
@@ -50,10 +50,10 @@ impl Chain {
                 let at = of_epoch[..place].binary_search_by_key(id, |node| node.keyframe_id);
                 of_epoch.get(at.ok()?)
             };
-            let known = loops.held_by.get(&node.keyframe_id).into_iter().flatten();
+            let known = loops.known.held_by.get(&node.keyframe_id).into_iter().flatten();
             let mut others: Vec<&Node> = known.filter_map(of).copied().collect();
             let is_estimated = !others.is_empty();
-            if !is_estimated && !loops.beginnings.contains(&node.keyframe_id) {
+            if !is_estimated && !loops.known.beginnings.contains(&node.keyframe_id) {
                 others.push(of_epoch[place - 1]);
             }
             let covariance = link_covariance(
@@ -67,7 +67,7 @@ impl Chain {
                 chain.num_links += 1;
             }
         }
-        for link in &loops.links {
+        for link in &loops.known.links {
             chain.add_loop(link);
         }
         Some(chain)
@@ -75,8 +75,7 @@ impl Chain {
 
     /// Adds a loop; one of keyframes that the epoch does not have is left out.
     pub(super) fn add_loop(&mut self, link: &Link) {
-        let Measurement { j_from_i, covariance, .. } = &link.measurement;
-        let _ = self.add(link.i, link.j, *j_from_i, covariance);
+        let _ = self.add(link.i, link.j, link.j_from_i, &link.covariance);
     }
 
     fn add(&mut self, i: u64, j: u64, j_from_i: Sim3, covariance: &Matrix7) -> Option<()> {
@@ -86,18 +85,32 @@ impl Chain {
         self.graph.add_constraint(Constraint { i, j, j_from_i, information, kernel }).ok()
     }
 
-    /// `j_from_i` by the places, and its covariance by links and loops.
-    pub(super) fn predicted(&self, i: u64, j: u64) -> Option<(Sim3, Matrix7)> {
-        let (i, j) = (*self.vertices.get(&i)?, *self.vertices.get(&j)?);
-        let place = |of| self.graph.map_from_keyframe(of).copied();
-        let covariance =
-            Marginals::new(&self.graph, &GraphParams::default()).ok()?.relative_covariance(j, i)?;
-        Some((place(j)?.inverse() * place(i)?, covariance))
+    /// What links and loops say of any two keyframes; `None` where the graph cannot be solved.
+    pub(super) fn into_predictions(self) -> Option<Predictions> {
+        let marginals = Marginals::new(&self.graph, &GraphParams::default()).ok()?;
+        Some(Predictions { chain: self, marginals })
     }
 
     /// rᵀΛr of the loops, the newest last.
     pub(super) fn loop_errors(&self) -> Vec<f64> {
         fits(&self.graph, false).iter().skip(self.num_links).map(|(e, _)| *e).collect()
+    }
+}
+
+/// What the keyframes of an epoch say of each other.
+pub(super) struct Predictions {
+    chain: Chain,
+    marginals: Marginals,
+}
+
+impl Predictions {
+    /// `j_from_i` by the places, and its covariance by links and loops.
+    pub(super) fn of(&mut self, i: u64, j: u64) -> Option<(Sim3, Matrix7)> {
+        let Chain { graph, vertices, .. } = &self.chain;
+        let (i, j) = (*vertices.get(&i)?, *vertices.get(&j)?);
+        let place = |of| graph.map_from_keyframe(of).copied();
+        let covariance = self.marginals.relative_covariance(j, i)?;
+        Some((place(j)?.inverse() * place(i)?, covariance))
     }
 }
 

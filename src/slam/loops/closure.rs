@@ -1,10 +1,13 @@
 //! What a loop does to the map: the pose graph of the epoch is solved with it, or two epochs become one.
 
+use std::sync::Arc;
+
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::graph::{GraphParams, optimise};
 use crate::slam::loops::chain::Chain;
+use crate::slam::loops::known::Link;
 use crate::slam::loops::search::LARGEST_CHI2;
-use crate::slam::loops::{Job, Link, Loops, Node, SearchFate};
+use crate::slam::loops::{Job, Loops, Node, SearchFate};
 use crate::slam::map::EpochJoin;
 
 /// How the map is to be moved.
@@ -27,18 +30,19 @@ impl Closure {
 impl Loops {
     /// A loop is confirmed: it holds from now on, unless it contradicts those before.
     pub(super) fn close(&mut self, job: &Job, confirmed: &[Link]) -> SearchFate {
-        let before = self.links.len();
-        self.links.extend(confirmed);
+        let before = self.known.links.len();
+        Arc::make_mut(&mut self.known).links.extend(confirmed);
         let fate = self.solve(job, confirmed.len());
         if fate == SearchFate::Inconsistent {
-            self.links.truncate(before);
+            Arc::make_mut(&mut self.known).links.truncate(before);
         }
         fate
     }
 
     /// What the newest loops do to the map: a pair, or those that join two epochs.
     pub(super) fn solve(&mut self, job: &Job, num_newest: usize) -> SearchFate {
-        let first = self.links.len().checked_sub(num_newest).and_then(|at| self.links.get(at));
+        let links = &self.known.links;
+        let first = links.len().checked_sub(num_newest).and_then(|at| links.get(at));
         let Some(first) = first.copied() else { return SearchFate::Inconsistent };
         let (Some(i), Some(j)) = (job.node(first.i), job.node(first.j)) else {
             return SearchFate::Inconsistent;
@@ -52,13 +56,13 @@ impl Loops {
     fn join(&mut self, job: &Job, link: &Link, [i, j]: [&Node; 2]) -> SearchFate {
         let is_newer = i.epoch > j.epoch;
         let (newer, older) = if is_newer { (i, j) } else { (j, i) };
-        let j_from_i = link.measurement.j_from_i;
+        let j_from_i = link.j_from_i;
         let older_from_newer = if is_newer { j_from_i } else { j_from_i.inverse() };
         let into_from_epoch =
             older.map_from_keyframe * older_from_newer * newer.map_from_keyframe.inverse();
         let (epoch, into) = (newer.epoch, older.epoch);
         let beginning = job.nodes.iter().find(|node| node.epoch == epoch);
-        self.beginnings.extend(beginning.map(|node| node.keyframe_id));
+        Arc::make_mut(&mut self.known).beginnings.extend(beginning.map(|node| node.keyframe_id));
         let join = Some(EpochJoin { epoch, into, into_from_epoch });
         self.closure = Some(Closure { moves: Vec::new(), join });
         SearchFate::Joined

@@ -1,19 +1,24 @@
 //! Which keyframes look like one, wherever they are thought to be.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
-use nalgebra::{UnitQuaternion, Vector3};
+use nalgebra::UnitQuaternion;
 
 use crate::slam::geometry::intrinsics::Intrinsics;
-use crate::slam::places::{Candidate, Describer, Description, PlaceIndex};
+use crate::slam::keyframe::Keyframe;
+use crate::slam::places::{Candidate, Description, PlaceIndex};
 
 /// What keyframes look like.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Likeness {
-    describer: Option<Describer>,
     index: PlaceIndex,
+    /// The newest that was offered.
+    offered_to: Option<u64>,
+    /// To be entered where there is time: in the thread of the search.
+    offered: Vec<(u64, Arc<Description>)>,
     /// Of those that are still to be looked for.
-    waiting: BTreeMap<u64, Description>,
+    waiting: BTreeMap<u64, Arc<Description>>,
 }
 
 /// A keyframe that looks like another.
@@ -27,12 +32,30 @@ pub(super) struct Alike {
 }
 
 impl Likeness {
-    /// Enters a keyframe; one whose image is too small to look like anything is left out.
-    pub(super) fn insert(&mut self, keyframe_id: u64, pixels: &[u8], width: usize, height: usize) {
-        let describer = self.describer.get_or_insert_default();
-        let Some(description) = describer.describe(pixels, width, height) else { return };
-        self.index.insert(keyframe_id, &description);
-        self.waiting.insert(keyframe_id, description);
+    /// Takes the descriptions of keyframes that are new; one whose image is too small to look like anything has none. From
+    /// which place on they are new.
+    pub(super) fn offer(&mut self, keyframes: &[Keyframe]) -> usize {
+        let new = keyframes.partition_point(|of| Some(of.keyframe_id) <= self.offered_to);
+        for keyframe in &keyframes[new..] {
+            self.offered_to = Some(keyframe.keyframe_id);
+            let description = keyframe.description.clone();
+            self.offered.extend(description.map(|of| (keyframe.keyframe_id, of)));
+        }
+        new
+    }
+
+    /// Enters what was offered, and takes out what is not `known` any more, which is in order.
+    pub(super) fn enter(&mut self, known: &[u64]) {
+        let is_gone = |id: &u64| known.binary_search(id).is_err();
+        let gone: Vec<u64> = self.index.keyframe_ids().filter(is_gone).collect();
+        for id in gone {
+            self.index.remove(id);
+            self.waiting.remove(&id);
+        }
+        for (keyframe_id, description) in self.offered.drain(..) {
+            self.index.insert(keyframe_id, &description);
+            self.waiting.insert(keyframe_id, description);
+        }
     }
 
     /// A keyframe and those before it will not be looked for any more.
@@ -62,7 +85,7 @@ impl Likeness {
             let Some(at) = place(candidate.keyframe_id) else { continue };
             if chosen.len() < most && chosen.iter().all(|(other, _)| other.abs_diff(at) > BESIDE) {
                 let Candidate { keyframe_id, score, .. } = candidate;
-                let rotation = rotation(&candidate, camera);
+                let rotation = candidate.rotation(camera);
                 chosen.push((at, Alike { keyframe_id, score, rotation }));
             }
         }
@@ -70,23 +93,12 @@ impl Likeness {
     }
 }
 
-/// `candidate_from_keyframe` by the pixels that show the same and the turn in the image's plane.
-fn rotation(candidate: &Candidate, camera: &Intrinsics) -> UnitQuaternion<f64> {
-    let ray = |[u, v]: [f32; 2]| {
-        let (x, y) = (f64::from(u) - camera.cx, f64::from(v) - camera.cy);
-        Vector3::new(x / camera.fx, y / camera.fy, 1.0)
-    };
-    let turn = -f64::from(candidate.turn_rad);
-    let about_axis = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), turn);
-    let [ours, theirs] = [about_axis * ray(candidate.pixel), ray(candidate.keyframe_pixel)];
-    let between = UnitQuaternion::rotation_between(&ours, &theirs);
-    between.unwrap_or_else(UnitQuaternion::identity) * about_axis
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::slam::geometry::se3::SE3;
+    use crate::slam::geometry::sim3::Sim3;
+    use crate::slam::places::Describer;
     use crate::slam::test_scene::{CAMERA, Scene};
     use nalgebra::Vector6;
 
@@ -98,13 +110,22 @@ mod tests {
         let turned = SE3::exp(&Vector6::new(0.05, 0.0, 0.0, 0.06, -0.15, 0.4));
         let away = SE3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, 2.6, 0.0));
         for (id, pose) in [(1, SE3::identity()), (5, away), (9, turned)] {
-            likeness.insert(id, &pixels(&pose), CAMERA.width, CAMERA.height);
+            let image = pixels(&pose);
+            let description = Describer::new().describe(&image, CAMERA.width, CAMERA.height);
+            likeness.offer(&[Keyframe {
+                keyframe_id: id,
+                description: description.map(Arc::new),
+                ..Keyframe::at(Sim3::identity(), CAMERA, Vec::new(), image)
+            }]);
         }
+        likeness.enter(&[1, 5, 9]);
         let found = likeness.candidates(9, &[1, 5], 3, 10.0, &CAMERA);
         assert_eq!(found.iter().map(|of| of.keyframe_id).collect::<Vec<_>>(), [1]);
         let error = found[0].rotation.angle_to(&turned.rotation);
         assert!(error < 0.12, "{error}");
+        likeness.enter(&[5, 9]);
+        assert!(likeness.candidates(9, &[1, 5], 3, 10.0, &CAMERA).is_empty(), "1 is gone");
         likeness.forget(9);
-        assert!(likeness.candidates(9, &[1, 5], 3, 10.0, &CAMERA).is_empty());
+        assert!(likeness.waiting.is_empty() && likeness.offered.is_empty());
     }
 }

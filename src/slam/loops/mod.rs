@@ -8,6 +8,7 @@
 
 mod chain;
 mod closure;
+pub mod known;
 mod likeness;
 mod search;
 #[cfg(test)]
@@ -21,8 +22,9 @@ use serde::{Deserialize, Serialize};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
-use crate::slam::graph::constraint::{ConstraintParams, ConstraintSolver, Measurement, Refusal};
+use crate::slam::graph::constraint::{ConstraintParams, ConstraintSolver, Refusal};
 use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::loops::known::{KnownLoops, Link};
 use crate::slam::loops::likeness::{Alike, Likeness};
 use crate::slam::map::Map;
 use crate::slam::parameter::{ParameterError, check_range};
@@ -45,7 +47,7 @@ pub struct LoopParams {
 
 impl Default for LoopParams {
     fn default() -> Self {
-        Self { num_candidates: 0, min_features: 20.0, drift_inflation: 4.0 }
+        Self { num_candidates: 3, min_features: 20.0, drift_inflation: 4.0 }
     }
 }
 
@@ -94,14 +96,6 @@ pub struct SearchReport {
     pub fate: SearchFate,
     /// The last pair that passed for itself, with `j_from_i`: ids of i and j.
     pub measured: Option<(u64, u64, Sim3)>,
-}
-
-/// A measurement between two keyframes, by their ids.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Link {
-    pub(crate) i: u64,
-    pub(crate) j: u64,
-    pub(crate) measurement: Measurement,
 }
 
 /// Two keyframes to be compared, with what is believed of them.
@@ -174,15 +168,12 @@ pub struct Loops {
     likeness: Likeness,
     /// By keyframe those that it was estimated with, older and newer.
     partners: BTreeMap<u64, BTreeSet<u64>>,
-    /// By keyframe the older ones that its place was estimated against.
-    held_by: BTreeMap<u64, Vec<u64>>,
-    /// Keyframes that nothing connects with the one before: the first of epochs that were joined to others.
-    beginnings: BTreeSet<u64>,
-    /// Keyframes up to this one have been searched.
-    searched_to: Option<u64>,
+    /// First keyframes of epochs, joined ones too: those on either side see different things.
+    epoch_starts: BTreeSet<u64>,
+    /// Shared with who keeps it.
+    known: Arc<KnownLoops>,
     plan: Option<Plan>,
     job: Option<Box<Job>>,
-    links: Vec<Link>,
     closure: Option<Closure>,
     report: Option<SearchReport>,
     /// Of the search that is being made: see the report.
@@ -200,12 +191,10 @@ impl Loops {
             solver: None,
             likeness: Likeness::default(),
             partners: BTreeMap::new(),
-            held_by: BTreeMap::new(),
-            beginnings: BTreeSet::new(),
-            searched_to: None,
+            epoch_starts: BTreeSet::new(),
+            known: Arc::default(),
             plan: None,
             job: None,
-            links: Vec::new(),
             closure: None,
             report: None,
             measured: None,
@@ -218,10 +207,13 @@ impl Loops {
         self.params.num_candidates > 0
     }
 
-    /// A keyframe is new; its image row after row.
-    pub fn insert(&mut self, keyframe_id: u64, pixels: &[u8], width: usize, height: usize) {
+    /// Takes the descriptions of the keyframes of a map, in the order of their ids, that are new since the last time.
+    pub fn offer(&mut self, keyframes: &[Keyframe]) {
         if self.is_on() {
-            self.likeness.insert(keyframe_id, pixels, width, height);
+            let new = self.likeness.offer(keyframes);
+            let pairs = keyframes[new.saturating_sub(1)..].windows(2);
+            let starts = pairs.filter(|pair| pair[0].epoch != pair[1].epoch);
+            self.epoch_starts.extend(starts.map(|pair| pair[1].keyframe_id));
         }
     }
 
@@ -245,7 +237,23 @@ impl Loops {
         }
         let before = others.iter().rev().filter(|other| !held.contains(other)).take(NUM_BEFORE);
         let against: Vec<u64> = held.iter().chain(before).copied().collect();
-        self.held_by.insert(newest, against);
+        Arc::make_mut(&mut self.known).held_by.insert(newest, against);
+    }
+
+    /// Goes on with what a mapper before knew of the loops of these keyframes. Those that it had searched are only found,
+    /// and so are those of which it is not known what they were estimated with.
+    pub fn take_up(&mut self, known: Arc<KnownLoops>, keyframes: &[Keyframe]) {
+        self.partners = known.partners();
+        self.known = known;
+        let last = self.known.last_searched(keyframes);
+        if self.known.searched_to != last {
+            Arc::make_mut(&mut self.known).searched_to = last;
+        }
+    }
+
+    /// What is known, to be kept with the map.
+    pub fn known(&self) -> &Arc<KnownLoops> {
+        &self.known
     }
 
     /// Chooses what is done next. `known` are the keyframes with image and depth, in the order of their ids; those from
@@ -256,8 +264,10 @@ impl Loops {
         if self.plan.is_some() || !self.is_on() {
             return;
         }
+        self.likeness.enter(known);
+        self.known.searched_to.into_iter().for_each(|to| self.likeness.forget(to));
         for (place, &of) in known.iter().enumerate().take(num_settled) {
-            if self.searched_to.is_some_and(|to| of <= to) {
+            if self.known.searched_to.is_some_and(|to| of <= to) {
                 continue;
             }
             let is_after = |id| known[place.saturating_sub(PAUSE)..place].contains(&id);
@@ -280,9 +290,12 @@ impl Loops {
         const AROUND: usize = 7;
         let of = known[place];
         let mut is_open = vec![true; known.len()];
+        let place_of = |id: &u64| known.partition_point(|known| known < id);
         let mut close = |at: usize| {
-            let end = known.len().min(at + AROUND + 1);
-            is_open[at.saturating_sub(AROUND)..end].fill(false);
+            let start = self.epoch_starts.range(..=known[at]).next_back().map_or(0, place_of);
+            let next = self.epoch_starts.range(known[at] + 1..).next();
+            let end = next.map_or(known.len(), place_of).min(at + AROUND + 1);
+            is_open[start.max(at.saturating_sub(AROUND))..end].fill(false);
         };
         close(place);
         for partner in self.partners.get(&of).into_iter().flatten() {
@@ -332,7 +345,7 @@ impl Loops {
             Stage::Confirm(link) => self.confirm(&job, link),
             Stage::Close { num_newest } => (0, self.solve(&job, *num_newest)),
         };
-        if fate != SearchFate::Proposed && self.searched_to.is_none_or(|to| to < of) {
+        if fate != SearchFate::Proposed && self.known.searched_to.is_none_or(|to| to < of) {
             self.searched(of);
         }
         let is_fruitless = matches!(fate, SearchFate::Refused(_) | SearchFate::AgainstDrift(_));
@@ -357,13 +370,13 @@ impl Loops {
     pub fn repeat_closure(&mut self) {
         let Some(closure) = self.closure.take() else { return };
         let num_newest = confirmations(closure.join.is_none()) + 1;
-        let of = self.links.last().map_or(0, |link| link.i);
+        let of = self.known.links.last().map_or(0, |link| link.i);
         let stage = Stage::Close { num_newest };
         self.plan = Some(Plan { of, stage, pairs: Vec::new(), likeness: 0.0 });
     }
 
     fn searched(&mut self, keyframe_id: u64) {
-        self.searched_to = Some(keyframe_id);
+        Arc::make_mut(&mut self.known).searched_to = Some(keyframe_id);
         self.likeness.forget(keyframe_id);
     }
 

@@ -1,10 +1,11 @@
 //! Whether two keyframes see the same place: measured, judged by the drift that the map can have, and confirmed by another
 //! pair.
 
-use crate::slam::geometry::sim3::{Matrix7, Sim3};
-use crate::slam::graph::constraint::{Measurement, Refusal};
+use crate::slam::geometry::sim3::{Matrix7, Sim3, Twist7};
+use crate::slam::graph::constraint::Refusal;
 use crate::slam::loops::chain::{Chain, link_covariance};
-use crate::slam::loops::{Job, Link, Loops, Pair, Plan, SearchFate, Stage, confirmations};
+use crate::slam::loops::known::Link;
+use crate::slam::loops::{Job, Loops, Pair, Plan, SearchFate, Stage, confirmations};
 
 /// χ²₇ at 99 %, within which two things that were measured agree.
 pub(super) const LARGEST_CHI2: f64 = 18.5;
@@ -15,24 +16,42 @@ impl Loops {
         let solver = self.solver();
         let mut refusal = None;
         let (mut compared, mut against_drift) = (0, None);
-        let Some(of) = job.keyframe(job.plan.of) else {
+        let (Some(of), Some(node)) = (job.keyframe(job.plan.of), job.node(job.plan.of)) else {
             return (0, SearchFate::Refused(Refusal::TooFewPoints));
         };
-        let view = solver.view(of);
+        let chain = Chain::new(self, &job.nodes, node.epoch);
+        let mut predictions = chain.and_then(Chain::into_predictions);
+        let mut view = None;
         for pair in &job.plan.pairs {
-            let Some(other) = job.keyframe(pair.j) else { continue };
+            let (Some(other), Some(at)) = (job.keyframe(pair.j), job.node(pair.j)) else {
+                continue;
+            };
+            // Two epochs may lie anywhere.
+            let is_one_epoch = at.epoch == node.epoch;
+            let predicted = predictions.as_mut().and_then(|of| of.of(pair.i, pair.j));
+            let predicted = predicted.filter(|_| is_one_epoch);
+            let least = predicted.as_ref().map_or(0.0, |(at, by)| least_chi2(at, by));
+            if least > LARGEST_CHI2 {
+                against_drift.get_or_insert(SearchFate::AgainstDrift(least));
+                continue;
+            }
             compared += 1;
+            let view = view.get_or_insert_with(|| solver.view(of));
             let rotation = pair.j_from_i.rigid.rotation;
-            let measurement = match solver.measure_turned(&view, &solver.view(other), &rotation) {
+            let measurement = match solver.measure_turned(view, &solver.view(other), &rotation) {
                 Ok(measurement) => measurement,
                 Err(why) => {
                     refusal.get_or_insert(why);
                     continue;
                 }
             };
-            let link = Link { i: pair.i, j: pair.j, measurement };
+            let link = Link::of(pair.i, pair.j, &measurement);
             self.measured = Some((link.i, link.j, measurement.j_from_i));
-            let chi2 = self.drift_chi2(job, &link);
+            let chi2 = match &predicted {
+                Some((expected, by)) => chi2(expected, &link.j_from_i, &(by + link.covariance)),
+                None if is_one_epoch => f64::NAN,
+                None => 0.0,
+            };
             if !(chi2 <= LARGEST_CHI2) {
                 against_drift.get_or_insert(SearchFate::AgainstDrift(chi2));
                 continue;
@@ -44,21 +63,6 @@ impl Loops {
         }
         let refused = SearchFate::Refused(refusal.unwrap_or(Refusal::NothingAlike));
         (compared, against_drift.unwrap_or(refused))
-    }
-
-    /// How far the map would have drifted for a loop to be true, χ²₇ by what chain and loop claim; 0 between two epochs,
-    /// which may lie anywhere, and not finite where it cannot be told.
-    fn drift_chi2(&self, job: &Job, link: &Link) -> f64 {
-        let (Some(i), Some(j)) = (job.node(link.i), job.node(link.j)) else { return f64::NAN };
-        if i.epoch != j.epoch {
-            return 0.0;
-        }
-        let predicted =
-            Chain::new(self, &job.nodes, i.epoch).and_then(|chain| chain.predicted(link.i, link.j));
-        let Measurement { j_from_i, covariance, .. } = &link.measurement;
-        predicted.map_or(f64::NAN, |(expected, of_chain)| {
-            chi2(&expected, j_from_i, &(of_chain + covariance))
-        })
     }
 
     /// Measures pairs beside a loop; one must say the same, of a loop between two epochs two.
@@ -78,7 +82,7 @@ impl Loops {
             let views = [solver.view(one), solver.view(other)];
             let measured = solver.measure(&views[0], &views[1], Some(&pair.j_from_i));
             let Ok(measurement) = measured else { continue };
-            let confirmation = Link { i: pair.i, j: pair.j, measurement };
+            let confirmation = Link::of(pair.i, pair.j, &measurement);
             if self.agrees(job, link, &confirmation) {
                 confirmations.push(confirmation);
             }
@@ -100,7 +104,7 @@ impl Loops {
         };
         // near_j_from_near_i by the loop and what lies beside it.
         let (near_j_from_j, i_from_near_i) = (near_j.inverse() * j, i.inverse() * near_i);
-        let expected = near_j_from_j * link.measurement.j_from_i * i_from_near_i;
+        let expected = near_j_from_j * link.j_from_i * i_from_near_i;
         let along = |by: &Sim3, covariance: &Matrix7| {
             let adjoint = by.adjoint();
             adjoint * covariance * adjoint.transpose()
@@ -114,12 +118,31 @@ impl Loops {
         else {
             return false;
         };
-        let covariance = confirmation.measurement.covariance
-            + along(&near_j_from_j, &link.measurement.covariance)
+        let covariance = confirmation.covariance
+            + along(&near_j_from_j, &link.covariance)
             + of_near_j
             + along(&expected, &of_near_i);
-        chi2(&expected, &confirmation.measurement.j_from_i, &covariance) <= LARGEST_CHI2
+        chi2(&expected, &confirmation.j_from_i, &covariance) <= LARGEST_CHI2
     }
+}
+
+/// χ² along the line between two keyframes by which the map would at least have drifted, whatever is measured between them
+/// and accepted: they are near each other then. What exceeds the limit need not be measured.
+fn least_chi2(expected: &Sim3, covariance: &Matrix7) -> f64 {
+    /// Distance within which all that is accepted lies, in units of a keyframe: one mean depth, which is its unit at first.
+    const REACH: f64 = 1.5;
+    /// Standard deviation of a measurement, of translation in units and of ln s: five times what is usual, and half of what
+    /// is accepted.
+    const LARGEST_DEVIATION: f64 = 0.05;
+    let distance = expected.rigid.translation.norm();
+    if distance <= REACH {
+        return 0.0;
+    }
+    let mut along = Twist7::zeros();
+    along.fixed_rows_mut::<3>(0).copy_from(&(expected.rigid.translation / distance));
+    along[6] = distance;
+    let of_measurement = LARGEST_DEVIATION.powi(2) * along.norm_squared();
+    (distance - REACH).powi(2) / (along.dot(&(covariance * along)) + of_measurement)
 }
 
 /// How far a similarity is from where it was expected, by the covariance of the left increment.
@@ -148,7 +171,7 @@ fn confirming(job: &Job, link: &Link) -> Vec<Pair> {
     {
         let j_from_i = other.map_from_keyframe.inverse()
             * j
-            * link.measurement.j_from_i
+            * link.j_from_i
             * i.inverse()
             * one.map_from_keyframe;
         pairs.push(Pair { i: one.keyframe_id, j: other.keyframe_id, j_from_i });

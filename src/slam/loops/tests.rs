@@ -4,8 +4,10 @@ use super::*;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Twist7;
 use crate::slam::graph::constraint::tests::{DepthError, USUAL, keyframe};
+use crate::slam::loops::chain::Chain;
 use crate::slam::map::Correction;
 use crate::slam::place_covariance::PlaceMatrix;
+use crate::slam::places::Describer;
 use crate::slam::test_scene::{Random, Scene};
 use nalgebra::Vector6;
 
@@ -63,9 +65,10 @@ impl Course {
                 place_covariance: PlaceCovariance::bounded(&covariance),
                 ..image
             };
-            let (width, height) = (keyframe.intrinsics.width, keyframe.intrinsics.height);
-            loops.insert(id, &keyframe.image, width, height);
-            map.keyframes.push(keyframe);
+            let Intrinsics { width, height, .. } = keyframe.intrinsics;
+            let description = Describer::new().describe(&keyframe.image, width, height);
+            map.keyframes.push(Keyframe { description: description.map(Arc::new), ..keyframe });
+            loops.offer(&map.keyframes);
         }
         Self { map, loops }
     }
@@ -224,6 +227,35 @@ fn two_epochs_that_see_the_same_become_one() {
     let truth = places[4];
     assert!((last.rigid.translation - truth.translation).norm() < 0.03, "{last:?} {into_epoch:?}");
     assert!((last.scale / UNIT).ln().abs() < 0.02, "{last:?}");
+}
+
+#[test]
+fn a_search_that_goes_on_from_what_was_kept_has_the_same_pose_graph() {
+    let places = round();
+    let mut course = Course::of(&Scene::new(0), &places, 0.02, 1.0, 0);
+    course.run();
+    let kept = course.loops.known().clone();
+    assert!(!kept.links.is_empty() && kept.held_by.len() == 14, "{kept:?}");
+    let keyframes = &course.map.keyframes;
+    let nodes: Vec<Node> = keyframes.iter().map(Node::of).collect();
+    let predicted = |loops: &Loops| {
+        Chain::new(loops, &nodes, 0).unwrap().into_predictions().unwrap().of(0, 13).unwrap()
+    };
+    let fresh = || Loops::new(course.loops.intrinsics, course.loops.params.clone());
+    let mut resumed = fresh();
+    resumed.take_up(kept.clone(), keyframes);
+    assert_eq!(predicted(&resumed), predicted(&course.loops));
+    assert_ne!(predicted(&resumed), predicted(&fresh()));
+    assert_eq!(resumed.known(), &kept);
+    // What was searched is not searched again; its keyframes are found.
+    let known: Vec<u64> = (0..15).collect();
+    resumed.offer(keyframes);
+    resumed.plan(&known, known.len());
+    assert!(!resumed.begin(&course.map));
+    // Of what was estimated with others nobody knows nothing is searched.
+    let mut lost = fresh();
+    lost.take_up(Arc::default(), keyframes);
+    assert_eq!(lost.known().searched_to, Some(14));
 }
 
 #[test]

@@ -230,8 +230,9 @@ impl Mapper {
             intrinsics: self.intrinsics,
             image: frame.pixels.to_vec(),
             points: Vec::new(),
+            description: None,
         });
-        self.finder.learn(&self.map.keyframes);
+        self.finder.learn(&mut self.map.keyframes);
         self.map.forget_depth_beyond(self.params.max_map_bytes());
         self.next_keyframe_id += 1;
         self.past.push(frame.pixels, keyframe_id, SE3::identity(), Brightness::default());

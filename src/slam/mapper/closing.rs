@@ -1,5 +1,7 @@
 //! What a loop does to the map that goes on meanwhile.
 
+use std::sync::Arc;
+
 use crate::slam::keyframe::Keyframe;
 use crate::slam::loops::Closure;
 use crate::slam::map::{Correction, KeyframeCorrection, LogPlane};
@@ -17,6 +19,23 @@ impl Mapper {
         }
         self.window = Some(window);
         None
+    }
+
+    /// The map is of a mapper before: what it holds is looked at, and found again from now on.
+    pub(super) fn take_over(&mut self) {
+        self.finder.learn_all(&mut self.map.keyframes);
+        self.take_up_loops();
+    }
+
+    /// The search for loops goes on with what is known of the map.
+    pub(super) fn take_up_loops(&mut self) {
+        self.window.iter_mut().for_each(|window| window.take_up_loops(&self.map));
+    }
+
+    /// The keyframes that were estimated, or searched, are here again; what is known of loops then is the map's.
+    pub(super) fn put_back(&mut self, window: Box<Window>) {
+        self.map.loops = Arc::clone(window.known_loops());
+        self.window = Some(window);
     }
 
     /// Moves the map as a loop has it; odometry stays where it is and keeps its unit.
@@ -54,8 +73,10 @@ impl Mapper {
 mod tests {
     use super::*;
     use crate::slam::geometry::se3::SE3;
-    use crate::slam::geometry::sim3::Sim3;
-    use crate::slam::map::EpochJoin;
+    use crate::slam::geometry::sim3::{Matrix7, Sim3};
+    use crate::slam::loops::LoopParams;
+    use crate::slam::loops::known::{KnownLoops, Link};
+    use crate::slam::map::{EpochJoin, Map};
     use crate::slam::mapper::MapperParams;
     use crate::slam::mapper::phase::Active;
     use crate::slam::test_scene::{CAMERA, Scene};
@@ -103,6 +124,45 @@ mod tests {
         assert!((in_world(&mapper, 0.1) - 1.1).abs() < 1e-12);
         assert!((in_world(&mapper, 0.4) - 1.4).abs() < 1e-12);
         assert_eq!(mapper.map.keyframes[0].map_from_keyframe, Sim3::identity());
+    }
+
+    #[test]
+    fn the_search_shares_the_descriptions_of_the_finder_and_does_not_search_what_was_there_before()
+    {
+        let scene = Scene::new(3);
+        let loops = LoopParams { num_candidates: 3, ..LoopParams::default() };
+        let params = MapperParams { loops, ..MapperParams::default() };
+        let mut mapper = Mapper::new(CAMERA, params).unwrap();
+        let places = (0..).zip([0.0, 0.1, 0.2]);
+        let keyframes = places.map(|(id, x)| scene.keyframe(id, sideways(x), 1.0)).collect();
+        mapper.resume(Map { keyframes, active: Some(2), free_epoch: 1, ..Map::default() });
+        let users = |mapper: &Mapper| -> Vec<usize> {
+            let held = mapper.map.keyframes.iter();
+            held.map(|of| of.description.as_ref().map_or(0, Arc::strong_count)).collect()
+        };
+        assert_eq!(users(&mapper), [1, 1, 1]);
+        mapper.depth.is_unit_open = false;
+        let (mut window, _) = mapper.take_window().unwrap();
+        assert_eq!(users(&mapper), [2, 2, 2], "offered");
+        assert!(!window.begin_search(&mapper.map, true), "they are entered and not searched");
+        assert_eq!(users(&mapper), [1, 1, 1]);
+    }
+
+    #[test]
+    fn loops_are_in_the_checkpoint_and_whoever_goes_on_from_it_has_them() {
+        let mut mapper = mapper();
+        let link = Link { i: 1, j: 0, j_from_i: Sim3::identity(), covariance: Matrix7::identity() };
+        let loops = Arc::new(KnownLoops { links: vec![link], ..KnownLoops::default() });
+        mapper.map.loops = loops;
+        mapper.take_up_loops();
+        let window = mapper.window.take().unwrap();
+        mapper.map.loops = Arc::default();
+        mapper.put_back(window);
+        let checkpoint = mapper.checkpoint().unwrap();
+        assert_eq!(checkpoint.loops.links, [link]);
+        let mut other = Mapper::new(CAMERA, MapperParams::default()).unwrap();
+        other.resume(checkpoint.over(Map::default()));
+        assert_eq!(other.window.as_ref().unwrap().known_loops().links, [link]);
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Finds the camera on keyframes: by what they look like first, then by alignment.
 
-use nalgebra::{UnitQuaternion, Vector3};
+use std::sync::Arc;
 
 use crate::slam::alignment::align::{Aligner, Alignment, AlignmentParams};
 use crate::slam::alignment::kernel::SimdMode;
@@ -77,7 +77,7 @@ impl Finder {
     /// `searched`, others that do.
     pub(super) fn find(
         &mut self,
-        keyframes: &[Keyframe],
+        keyframes: &mut [Keyframe],
         active: Option<usize>,
         searched: &mut usize,
         pixels: &[u8],
@@ -146,7 +146,7 @@ impl Finder {
         let found = self.places.candidates(&seen, most, |id| index_of(id).is_none());
         let found = found.into_iter().filter(|candidate| candidate.score >= LEAST_SHARED);
         let turned = |candidate: Candidate| {
-            let rotation = rotation_of(&candidate, &camera);
+            let rotation = candidate.rotation(&camera);
             Some((index_of(candidate.keyframe_id)?, SE3 { rotation, ..SE3::identity() }))
         };
         found.filter_map(turned).collect()
@@ -172,7 +172,7 @@ impl Finder {
     /// against it, and the camera's pose on it.
     pub(super) fn find_turned(
         &mut self,
-        keyframes: &[Keyframe],
+        keyframes: &mut [Keyframe],
         active: Option<usize>,
         compared: &mut usize,
         pixels: &[u8],
@@ -234,38 +234,51 @@ impl Finder {
         self.appearances[known].1.as_ref()
     }
 
-    /// Looks at keyframes that are new, so many at most.
-    pub(super) fn learn(&mut self, keyframes: &[Keyframe]) {
+    /// Looks at keyframes that are new, so many at most, and describes those that nobody has described.
+    pub(super) fn learn(&mut self, keyframes: &mut [Keyframe]) {
         /// 2.5 ms each at 640×480.
         const MOST_AT_ONCE: usize = 10;
         self.learn_new(keyframes, MOST_AT_ONCE);
     }
 
     /// Looks at all keyframes of a map that was there before the first frame.
-    pub(super) fn learn_all(&mut self, keyframes: &[Keyframe]) {
+    pub(super) fn learn_all(&mut self, keyframes: &mut [Keyframe]) {
         self.learn_new(keyframes, usize::MAX);
     }
 
-    fn learn_new(&mut self, keyframes: &[Keyframe], most: usize) {
+    fn learn_new(&mut self, keyframes: &mut [Keyframe], most: usize) {
         let known = self.appearances.last().map(|(id, _)| *id);
-        // Those that keep only their poses are not looked for.
-        let mut held = keyframes.iter().filter(|of| of.has_depth()).map(|of| of.keyframe_id);
-        let mut next = held.next();
-        self.appearances.retain(|(id, _)| {
-            while next.is_some_and(|held| held < *id) {
-                next = held.next();
-            }
-            next == Some(*id)
-        });
-        let new = keyframes.iter().filter(|keyframe| Some(keyframe.keyframe_id) > known);
+        self.forget_all_but(keyframes);
+        let new = keyframes.iter_mut().filter(|keyframe| Some(keyframe.keyframe_id) > known);
         for keyframe in new.take(most) {
             let Intrinsics { width, height, .. } = keyframe.intrinsics;
             let appearance = Appearance::of(&keyframe.image, width, height);
             self.appearances.push((keyframe.keyframe_id, appearance));
-            if let Some(description) = self.describer.describe(&keyframe.image, width, height) {
-                self.places.insert(keyframe.keyframe_id, &description);
+            if keyframe.description.is_none() {
+                let description = self.describer.describe(&keyframe.image, width, height);
+                keyframe.description = description.map(Arc::new);
+            }
+            if let Some(description) = &keyframe.description {
+                self.places.insert(keyframe.keyframe_id, description);
             }
         }
+    }
+
+    /// Those that keep only their poses are not looked for.
+    fn forget_all_but(&mut self, keyframes: &[Keyframe]) {
+        let mut held = keyframes.iter().filter(|of| of.has_depth()).map(|of| of.keyframe_id);
+        let mut next = held.next();
+        let places = &mut self.places;
+        self.appearances.retain(|(id, _)| {
+            while next.is_some_and(|held| held < *id) {
+                next = held.next();
+            }
+            let is_held = next == Some(*id);
+            if !is_held {
+                places.remove(*id);
+            }
+            is_held
+        });
     }
 
     /// Aligns a frame to `keyframe` from where the camera is expected; `None` where it does not fit, or ends further from
@@ -323,21 +336,6 @@ impl Finder {
     }
 }
 
-/// `keyframe_from_camera` that lays the features of an image on a keyframe's, of what is far away.
-fn rotation_of(candidate: &Candidate, camera: &Intrinsics) -> UnitQuaternion<f64> {
-    let ray = |[u, v]: [f32; 2]| {
-        let (x, y) = (f64::from(u) - camera.cx, f64::from(v) - camera.cy);
-        Vector3::new(x / camera.fx, y / camera.fy, 1.0)
-    };
-    let rolled =
-        UnitQuaternion::from_axis_angle(&Vector3::z_axis(), -f64::from(candidate.turn_rad));
-    let moved = UnitQuaternion::rotation_between(
-        &(rolled * ray(candidate.pixel)),
-        &ray(candidate.keyframe_pixel),
-    );
-    moved.unwrap_or_default() * rolled
-}
-
 /// Keyframes that may be gone back to, the newest first. The tracker itself looks around the active one.
 fn eligible(keyframes: &[Keyframe], active: Option<usize>) -> impl Iterator<Item = usize> {
     let is_eligible = move |index: &usize| {
@@ -350,130 +348,4 @@ fn eligible(keyframes: &[Keyframe], active: Option<usize>) -> impl Iterator<Item
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::slam::test_scene::{CAMERA, Scene};
-    use nalgebra::Vector6;
-
-    /// A keyframe with exact depth and little noise.
-    fn keyframe(scene: &Scene, keyframe_id: u64, world_from_camera: SE3) -> Keyframe {
-        scene.keyframe(keyframe_id, world_from_camera, 1.0)
-    }
-
-    fn at(twist: [f64; 6]) -> SE3 {
-        SE3::exp(&Vector6::from(twist))
-    }
-
-    #[test]
-    fn a_known_view_is_found_on_its_keyframe_and_an_unknown_one_on_none() {
-        let scene = Scene::new(3);
-        let home = at([0.0; 6]);
-        let away = at([0.0, 0.0, 0.0, 0.0, 1.2, 0.0]);
-        let elsewhere = at([0.0, 0.0, 0.0, 0.0, 2.8, 0.0]);
-        let keyframes =
-            [keyframe(&scene, 0, home), keyframe(&scene, 1, away), keyframe(&scene, 2, elsewhere)];
-        let params = RecoveryParams { keyframes_per_frame: 3, ..Default::default() };
-        let mut searched = 0;
-        let mut find = |finder: &mut Finder, view: SE3| {
-            let pixels = scene.render(&CAMERA, &view).noisy(2.0, 9);
-            let (index, found) =
-                finder.find(&keyframes, Some(2), &mut searched, &pixels, &params)?;
-            let placed = keyframes[index].map_from_keyframe.place(&found);
-            let error = (view.inverse() * placed).log().norm();
-            assert!(error < 0.02, "found {error} away from where it is");
-            Some(index)
-        };
-        let mut recovery = Finder::new(&CAMERA);
-        let near_home = at([0.1, -0.05, 0.1, 0.05, 0.1, -0.05]);
-        assert_eq!(find(&mut recovery, near_home), Some(0));
-        assert_eq!(find(&mut recovery, away * near_home), Some(1));
-        assert_eq!(find(&mut recovery, at([0.0, 0.0, 0.0, 0.0, -1.5, 0.0])), None);
-        assert_eq!(find(&mut recovery, elsewhere), None, "the one in force is the tracker's");
-    }
-
-    #[test]
-    fn one_that_was_not_confirmed_leaves_the_next_frame_to_others() {
-        let scene = Scene::new(3);
-        let [one, other] = [0.0, 0.05].map(|x| at([x, 0.0, 0.0, 0.0, 0.0, 0.0]));
-        let active = keyframe(&scene, 2, at([0.0, 0.0, 0.0, 0.0, 2.8, 0.0]));
-        let keyframes = [keyframe(&scene, 0, one), keyframe(&scene, 1, other), active];
-        let pixels = scene.render(&CAMERA, &at([0.01, 0.0, 0.0, 0.0, 0.0, 0.0])).noisy(2.0, 9);
-        let mut finder = Finder::new(&CAMERA);
-        let params = RecoveryParams::default();
-        let mut find = |doubted: Option<usize>| {
-            doubted.into_iter().for_each(|index| finder.doubt(index));
-            finder.find(&keyframes, Some(2), &mut 0, &pixels, &params).unwrap().0
-        };
-        let first = find(None);
-        assert_eq!(find(Some(first)), 1 - first);
-        assert_eq!(find(None), first);
-    }
-
-    #[test]
-    fn a_camera_that_is_rolled_far_is_found_with_its_roll_by_features_and_by_small_images() {
-        let scene = Scene::new(3);
-        let home = keyframe(&scene, 0, at([0.0; 6]));
-        let away = keyframe(&scene, 1, at([0.0, 0.0, 0.0, 0.0, 1.2, 0.0]));
-        let active = keyframe(&scene, 2, at([0.0, 0.0, 0.0, 0.0, 2.8, 0.0]));
-        let keyframes = [home, away, active];
-        let params = RecoveryParams::default();
-        let view = at([0.05, -0.05, 0.05, 0.0, 0.0, 0.0]) * at([0.0, 0.0, 0.0, 0.1, -0.1, 1.9]);
-        let pixels = scene.render(&CAMERA, &view).noisy(2.0, 9);
-        let mut finder = Finder::new(&CAMERA);
-        let (index, found) = finder.find(&keyframes, Some(2), &mut 0, &pixels, &params).unwrap();
-        let error = (view.inverse() * found).log().norm();
-        assert!(index == 0 && error < 0.02, "found {error} away from where it is, on {index}");
-        let mut compared = 0;
-        let found = finder.find_turned(&keyframes, Some(2), &mut compared, &pixels, &params);
-        let (index, found) = found.unwrap();
-        assert_eq!((index, compared), (0, 2));
-        let error = (view.inverse() * found).log().norm();
-        assert!(error < 0.02, "found {error} away from where it is");
-        let nowhere = scene.render(&CAMERA, &at([0.0, 0.0, 0.0, 0.0, -1.5, 0.0])).noisy(2.0, 9);
-        assert!(finder.find_turned(&keyframes, Some(2), &mut 0, &nowhere, &params).is_none());
-    }
-
-    #[test]
-    fn those_that_look_most_alike_are_first_and_rejected_and_nearly_empty_ones_are_left_out() {
-        let scene = Scene::new(3);
-        let known = keyframe(&scene, 0, SE3::identity());
-        let rejected = Keyframe { map_state: MapState::Rejected, ..known.clone() };
-        let empty = Keyframe { points: known.points[..50].to_vec(), ..known.clone() };
-        let numbered = |keyframes: Vec<Keyframe>| -> Vec<Keyframe> {
-            let ids = (0..).zip(keyframes);
-            ids.map(|(keyframe_id, keyframe)| Keyframe { keyframe_id, ..keyframe }).collect()
-        };
-        let active = keyframe(&scene, 3, at([0.0, 0.0, 0.0, 0.0, 2.0, 0.0]));
-        let pixels = known.image.clone();
-        let params = RecoveryParams { keyframes_per_frame: 1, ..RecoveryParams::default() };
-        let find = |keyframes: &[Keyframe], active: usize| {
-            let found =
-                Finder::new(&CAMERA).find(keyframes, Some(active), &mut 0, &pixels, &params);
-            found.map(|(index, _)| index)
-        };
-        let without = numbered(vec![rejected, empty, active.clone()]);
-        assert_eq!(find(&without, 2), None);
-        let far = |of: f64| keyframe(&scene, 1, at([0.0, 0.0, 0.0, 0.0, of, 0.0]));
-        let other_epoch = Keyframe { epoch: 1, ..known };
-        let with = numbered(vec![far(-2.0), other_epoch, far(1.0), far(-1.0), active]);
-        assert_eq!(find(&with, 4), Some(1), "an earlier keyframe, of another epoch");
-    }
-
-    #[test]
-    fn others_take_turns() {
-        let scene = Scene::new(3);
-        let (here, active) = (SE3::identity(), at([0.0, 0.0, 0.0, 0.0, 2.0, 0.0]));
-        // Looks like the frame, and has no depth that could explain it.
-        let mut wrong = keyframe(&scene, 0, here);
-        wrong.points.iter_mut().for_each(|point| point.inverse_depth = f32::NAN);
-        let side = at([0.3, 0.0, 0.0, 0.0, 0.05, 0.0]);
-        let keyframes = [wrong, keyframe(&scene, 1, side), keyframe(&scene, 2, active)];
-        let pixels = scene.render(&CAMERA, &at([0.12, 0.0, 0.0, 0.0, 0.02, 0.0])).noisy(2.0, 5);
-        let find = |keyframes_per_frame| {
-            let params = RecoveryParams { keyframes_per_frame, ..RecoveryParams::default() };
-            let found = Finder::new(&CAMERA).find(&keyframes, Some(2), &mut 0, &pixels, &params);
-            found.map(|(index, _)| index)
-        };
-        assert_eq!((find(1), find(2)), (None, Some(1)));
-    }
-}
+mod tests;

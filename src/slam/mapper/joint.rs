@@ -46,7 +46,7 @@ impl Mapper {
 
     /// The window with what is new in the map, and whether anything is. `None` where it is away, and before there is
     /// anything to be estimated.
-    fn take_window(&mut self) -> Option<(Box<Window>, bool)> {
+    pub(super) fn take_window(&mut self) -> Option<(Box<Window>, bool)> {
         let active = self.keyframe()?.keyframe_id;
         if self.depth.is_unit_open {
             return None;
@@ -54,6 +54,7 @@ impl Mapper {
         let mut window = self.window.take()?;
         window.take_mature(self.depth.maturing.left());
         let is_new = window.take_in(&self.map, active);
+        window.tell_looks(&self.map);
         Some((window, is_new))
     }
 
@@ -61,12 +62,12 @@ impl Mapper {
     pub fn end_adjustment(&mut self, mut window: Box<Window>) -> StepOutcome {
         if let Some(refined) = window.take_refined() {
             let graph_changed = self.take_refined(refined, &mut window);
-            self.window = Some(window);
+            self.put_back(window);
             return StepOutcome { graph_changed, ..Default::default() };
         }
         if let Some(closure) = window.take_closure() {
             let outcome = self.close_loop(&closure, &mut window);
-            self.window = Some(window);
+            self.put_back(window);
             return outcome;
         }
         let finished = self.finish_keyframe();
@@ -77,7 +78,7 @@ impl Mapper {
             outcome.keyframe_changed = true;
         }
         if let Some(rejected) = self.reject_refuted(&mut window) {
-            self.window = Some(window);
+            self.put_back(window);
             return rejected;
         }
         let params = &self.params.modes;
@@ -96,7 +97,7 @@ impl Mapper {
         for placed in window.take_placed() {
             self.map.place_frame(&placed);
         }
-        self.window = Some(window);
+        self.put_back(window);
         outcome.keyframe_changed |= finished.keyframe_changed | self.settle_doubt();
         outcome
     }
@@ -222,7 +223,7 @@ impl Mapper {
         window.repeat_piece();
         window.repeat_closure();
         self.doubt.take_back();
-        self.window = Some(window);
+        self.put_back(window);
     }
 }
 

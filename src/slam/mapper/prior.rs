@@ -46,13 +46,18 @@ impl Map {
     pub fn over(mut self, older: Self) -> Self {
         self.free_epoch = self.free_epoch.max(older.free_epoch);
         self.revision = self.revision.max(older.revision);
+        if self.loops.is_empty() {
+            self.loops = older.loops;
+        }
         for keyframe in older.keyframes {
             match self.keyframes.iter_mut().find(|of| of.keyframe_id == keyframe.keyframe_id) {
                 None => self.keyframes.push(keyframe),
-                Some(known) if known.has_depth() || known.epoch != keyframe.epoch => {}
+                Some(known) if known.epoch != keyframe.epoch => {}
+                Some(known) if known.has_depth() => known.description = keyframe.description,
                 Some(known) => {
                     (known.image, known.points) = (keyframe.image, keyframe.points);
                     known.is_refined = keyframe.is_refined;
+                    known.description = keyframe.description;
                 }
             }
         }
@@ -90,7 +95,7 @@ impl Mapper {
         for keyframe in &mut self.map.keyframes {
             keyframe.world_from_keyframe = keyframe.map_from_keyframe;
         }
-        self.finder.learn_all(&self.map.keyframes);
+        self.take_over();
         self.phase = Phase::Lost(Loss::default());
         let certainty = Certainty::default();
         self.prior = Some(Prior { map_use, first_own: self.next_keyframe_id, certainty });

@@ -1,5 +1,7 @@
 //! What of the map a mapper needs to go on after its death, and how it goes on.
 
+use std::sync::Arc;
+
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::map::Map;
 use crate::slam::mapper::phase::Phase;
@@ -60,6 +62,7 @@ impl Mapper {
             keyframes: keyframes.collect(),
             frames: Vec::new(),
             confirmed: Vec::new(),
+            loops: Arc::clone(&self.map.loops),
             revision: self.map.revision,
             active,
             free_epoch,
@@ -73,6 +76,7 @@ impl Mapper {
         self.revision = before.revision;
         self.next_keyframe_id = before.next_keyframe_id;
         self.first_free_epoch = before.first_free_epoch;
+        self.take_up_loops();
     }
 
     /// Goes on from a checkpoint: its keyframe is active again, the epoch and all ids go on. Does nothing
@@ -100,6 +104,7 @@ impl Mapper {
             return StepOutcome::default();
         };
         self.map = Map { active: None, ..map };
+        self.take_over();
         let keyframe = &self.map.keyframes[index];
         self.depth.restart(&keyframe.image, &self.params);
         restore_points(&mut self.depth.active, &keyframe.points);

@@ -71,7 +71,7 @@ impl Mapper {
             Phase::Starting => Situation::Starting(self.start.progress),
             Phase::Mapping => self.certainty().map_or(Situation::Mapping, Situation::Localised),
             Phase::Lost(_) | Phase::Restarting(_) if self.is_localising() => {
-                Situation::Localising(self.map.keyframes.len())
+                Situation::Localising(self.map.num_held())
             }
             Phase::Lost(_) => Situation::Lost,
             Phase::Rejected(why, _) => Situation::Rejected(why),

@@ -3,8 +3,6 @@
 //!
 //! Its pose stays and moves with that of a neighbour: frames that were tracked on it stay where they are in the map.
 
-use std::collections::BTreeSet;
-
 use nalgebra::Vector3;
 
 use crate::slam::depth::matching::is_inside;
@@ -34,8 +32,6 @@ const REACH: f64 = 0.5;
 /// Which keyframes have given up their depth, and where they are now.
 #[derive(Debug, Default)]
 pub(super) struct Thinning {
-    /// Keyframes that are never taken out.
-    kept: BTreeSet<u64>,
     attached: Vec<Attached>,
     /// The last one that was examined: the next is the one before.
     examined: Option<u64>,
@@ -95,13 +91,9 @@ impl Thinning {
 }
 
 impl Mapper {
-    /// Keeps the image and depth of a keyframe, whatever others show: a loop is closed on it.
-    pub fn keep_keyframe(&mut self, keyframe_id: u64) {
-        self.thinning.kept.insert(keyframe_id);
-    }
-
     /// Takes image and depth from keyframes of the active epoch that others show as well, where there are more than is
-    /// allowed. A bounded number is examined with each new keyframe.
+    /// allowed. A bounded number is examined with each new keyframe. Those that a loop is measured between stay: another
+    /// loop is confirmed beside it.
     pub(super) fn thin(&mut self) {
         let Some(active) = self.keyframe() else { return };
         let (active_id, epoch) = (active.keyframe_id, active.epoch);
@@ -113,7 +105,7 @@ impl Mapper {
         }
         ids.sort_unstable();
         let oldest_of_newest = ids[ids.len() - NUM_NEWEST];
-        let kept = std::mem::take(&mut self.thinning.kept);
+        let kept = self.map.loops.keyframe_ids();
         let may_go = |of: &Keyframe| {
             is_held(of)
                 && of.map_state == MapState::Established
@@ -128,11 +120,10 @@ impl Mapper {
             }
             let Some((to, to_from_keyframe)) = shown_by(&self.map, index) else { continue };
             let keyframe = &mut self.map.keyframes[index];
-            (keyframe.image, keyframe.points) = (Vec::new(), Vec::new());
+            keyframe.forget_depth();
             self.thinning.attach(keyframe.keyframe_id, to, to_from_keyframe);
             excess -= 1;
         }
-        self.thinning.kept = kept;
     }
 }
 
@@ -195,8 +186,12 @@ fn shows(keyframe: &Keyframe, view: &Sim3, at: &Vector3<f64>) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::sync::Arc;
+
     use crate::slam::geometry::se3::SE3;
+    use crate::slam::geometry::sim3::Matrix7;
     use crate::slam::keyframe::DepthPoint;
+    use crate::slam::loops::known::{KnownLoops, Link};
     use crate::slam::mapper::MapperParams;
     use crate::slam::mapper::phase::Active;
     use crate::slam::test_scene::CAMERA;
@@ -256,16 +251,22 @@ mod tests {
         assert!(shown_by(&map, 0).is_none(), "one of another epoch");
     }
 
+    fn loop_between(i: u64, j: u64) -> Link {
+        Link { i, j, j_from_i: Sim3::identity(), covariance: Matrix7::identity() }
+    }
+
     #[test]
     fn rounds_along_the_same_places_leave_as_many_keyframes_as_places_want() {
         let mut mapper = mapper(12, 30);
-        mapper.keep_keyframe(7);
+        mapper.map.loops =
+            Arc::new(KnownLoops { links: vec![loop_between(7, 12)], ..Default::default() });
         for _ in 0..200 {
             mapper.thin();
         }
         let held = mapper.map.num_held();
         assert!((30..=60).contains(&held), "{held} of 120");
-        assert!(mapper.map.keyframes[7].has_depth(), "a keyframe that is to be kept");
+        let has_depth = |id: usize| mapper.map.keyframes[id].has_depth();
+        assert!(has_depth(7) && has_depth(12), "keyframes with a loop");
         assert!(mapper.map.keyframes[120 - NUM_NEWEST..].iter().all(Keyframe::has_depth));
         assert_eq!(mapper.map.keyframes.len(), 120, "poses stay");
         // A map that is not larger than allowed is left whole.

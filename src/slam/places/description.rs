@@ -3,17 +3,15 @@
 
 use std::cmp::Reverse;
 
-use serde::{Deserialize, Serialize};
-
 use super::corners::{Corner, CornerFinder};
 use super::pattern::{ORIENTATIONS, Pattern, RADIUS_PX, WORDS};
-use super::scales::{self, Scale};
+use super::scales::{self, MOST_SCALES, Scale};
 
 /// Most features of an image.
 pub const MAX_FEATURES: usize = 200;
 
 /// A corner and what is around it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Feature {
     /// Where it is.
     pub place: FeaturePlace,
@@ -22,7 +20,7 @@ pub struct Feature {
 }
 
 /// Where a feature is in its image.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FeaturePlace {
     /// Column, pixels of the image.
     pub u: u16,
@@ -35,18 +33,32 @@ pub struct FeaturePlace {
 }
 
 /// What an image looks like.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Description {
     /// Size of the image, pixels.
     pub(super) width: u16,
     pub(super) height: u16,
     pub(super) features: Vec<Feature>,
-    /// For each feature, comparisons that noise may turn over; not kept.
-    #[serde(skip)]
+    /// For each feature, comparisons that noise may turn over; none where it was kept on disk.
     pub(super) unsure: Vec<[u64; WORDS]>,
 }
 
 impl Description {
+    /// Of an image of so many pixels, by features that were kept; `None` where one is not of such an image, or there are
+    /// none, or too many.
+    pub fn of_features(width: usize, height: usize, features: Vec<Feature>) -> Option<Self> {
+        let is_possible = |Feature { place, .. }: &Feature| {
+            usize::from(place.u) < width
+                && usize::from(place.v) < height
+                && usize::from(place.orientation) < ORIENTATIONS
+                && usize::from(place.scale) < MOST_SCALES
+        };
+        let is_some = (1..=MAX_FEATURES).contains(&features.len());
+        let (width, height) = (u16::try_from(width), u16::try_from(height));
+        (is_some && features.iter().all(is_possible)).then_some(())?;
+        Some(Self { width: width.ok()?, height: height.ok()?, features, unsure: Vec::new() })
+    }
+
     /// Its features.
     pub fn features(&self) -> &[Feature] {
         &self.features

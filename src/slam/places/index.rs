@@ -2,9 +2,12 @@
 
 use std::collections::BTreeMap;
 
+use nalgebra::{UnitQuaternion, Vector3};
+
 use super::arrangement::{Arrangement, Match, arrange};
 use super::description::{Description, FeaturePlace, MAX_FEATURES};
 use super::tree::{Entry, Tree, distance};
+use crate::slam::geometry::intrinsics::Intrinsics;
 
 /// Bits of 256 in which descriptors of the same corner differ at most.
 const MAX_DISTANCE: u32 = 50;
@@ -27,6 +30,21 @@ pub struct Candidate {
     pub pixel: [f32; 2],
     /// The keyframe's pixel that shows the same.
     pub keyframe_pixel: [f32; 2],
+}
+
+impl Candidate {
+    /// `keyframe_from_image`: lays the pixels that show the same on each other, with the turn in the image's plane.
+    pub fn rotation(&self, camera: &Intrinsics) -> UnitQuaternion<f64> {
+        let ray = |[u, v]: [f32; 2]| {
+            let (x, y) = (f64::from(u) - camera.cx, f64::from(v) - camera.cy);
+            Vector3::new(x / camera.fx, y / camera.fy, 1.0)
+        };
+        let turn = -f64::from(self.turn_rad);
+        let about_axis = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), turn);
+        let [ours, theirs] = [about_axis * ray(self.pixel), ray(self.keyframe_pixel)];
+        let between = UnitQuaternion::rotation_between(&ours, &theirs);
+        between.unwrap_or_else(UnitQuaternion::identity) * about_axis
+    }
 }
 
 /// A keyframe of the index.
@@ -72,6 +90,11 @@ impl PlaceIndex {
     /// Whether a keyframe is in it.
     pub fn contains(&self, keyframe_id: u64) -> bool {
         self.slot_of.contains_key(&keyframe_id)
+    }
+
+    /// The keyframes in it, in order.
+    pub fn keyframe_ids(&self) -> impl Iterator<Item = u64> {
+        self.slot_of.keys().copied()
     }
 
     /// Enters a keyframe, in place of what was known of it.
@@ -293,8 +316,8 @@ mod tests {
     #[test]
     fn a_description_that_was_kept_finds_and_is_found() {
         let here = seen([0.0; 6], 1);
-        let kept: Description =
-            serde_json::from_str(&serde_json::to_string(&here).unwrap()).unwrap();
+        let features = here.features().to_vec();
+        let kept = Description::of_features(CAMERA.width, CAMERA.height, features).unwrap();
         assert_eq!(kept.features(), here.features());
         let mut index = around();
         index.insert(50, &kept);

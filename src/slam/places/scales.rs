@@ -51,7 +51,8 @@ pub(super) fn fill(
 }
 /// Longer side of the largest scale: finer than that there is noise and compression.
 const LARGEST_PX: usize = 512;
-const MOST_SCALES: usize = 7;
+/// Scales of an image.
+pub(super) const MOST_SCALES: usize = 7;
 /// Shorter side of the smallest: two descriptors beside each other.
 const SMALLEST_PX: usize = 72;
 

@@ -111,7 +111,10 @@ impl Tree {
         // Children come after their parents.
         for at in (0..self.nodes.len()).rev() {
             match &mut self.nodes[at] {
-                Node::Leaf(entries) => entries.retain(&is_kept),
+                Node::Leaf(entries) => {
+                    entries.retain(&is_kept);
+                    entries.shrink_to_fit();
+                }
                 Node::Split { children, .. } => {
                     let children = *children;
                     if let Some(joined) = self.joined(children) {

@@ -48,8 +48,20 @@ impl Window {
     pub(super) fn choose_piece(&self, of_epoch: &[usize], begin: usize, end: usize) -> Chosen {
         let (before, piece) = of_epoch[..end].split_at(begin);
         let after = &of_epoch[end..];
-        let ends = [piece[0], piece[piece.len() - 1]];
         let outside: Vec<usize> = before.iter().chain(after).copied().collect();
-        Chosen::new(self.covisible(&outside, &ends), piece, before.is_empty(), true)
+        let (mut fixed, mut free) = (Vec::new(), Vec::new());
+        for group in self.groups(piece) {
+            let held_by = self.covisible(&outside, &[group[0], group[group.len() - 1]]);
+            let is_oldest = before.is_empty() && group[0] == piece[0];
+            // A group that nothing holds would go anywhere.
+            if !held_by.is_empty() || is_oldest || group.len() == piece.len() {
+                fixed.extend(held_by);
+                free.extend(group);
+            }
+        }
+        fixed.sort_unstable();
+        fixed.dedup();
+        free.sort_unstable();
+        Chosen::new(fixed, &free, before.is_empty(), true)
     }
 }

@@ -3,6 +3,7 @@
 use super::tests::{Room, room};
 use super::*;
 use crate::slam::geometry::sim3::Sim3;
+use crate::slam::keyframe::DepthPoint;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::test_scene::{CAMERA, Random};
 

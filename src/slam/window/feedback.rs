@@ -1,13 +1,14 @@
 //! What the window says to the map: new places, units and depth.
 
 use crate::slam::geometry::sim3::Sim3;
-use crate::slam::keyframe::Keyframe;
+use crate::slam::keyframe::{DepthPoint, Keyframe};
 use crate::slam::map::{Correction, KeyframeCorrection, LogPlane, Map};
 use crate::slam::modes::ModeCovariance;
 use crate::slam::place_covariance::{PlaceCovariance, UncertainPlace};
 use crate::slam::window::keyframe::WindowKeyframe;
 use crate::slam::window::marginals::Marginal;
 use crate::slam::window::plane::{Correspondence, fit, relief_left};
+use crate::slam::window::view::Sight;
 use crate::slam::window::{Window, selection};
 
 /// What is made of a marginal: the covariance of the modes of a keyframe's depth, and of its place.
@@ -117,5 +118,43 @@ impl Window {
                 })
             })
             .collect()
+    }
+
+    /// Points of other keyframes that one was seen to agree with, where it has depth too.
+    pub(super) fn projected_into(
+        &self,
+        index: usize,
+        points: &[DepthPoint],
+    ) -> Vec<Correspondence> {
+        let to = &self.keyframes[index];
+        let rows = selection::Rows::of(points, self.camera.height);
+        let mut found = Vec::new();
+        for of_host in to.agreed.chunk_by(|one, other| one.keyframe_id == other.keyframe_id) {
+            let Some(host) = self.get(of_host[0].keyframe_id).filter(|of| of.epoch == to.epoch)
+            else {
+                continue;
+            };
+            let sight =
+                Sight::new(&(to.camera_from_map * host.camera_from_map.inverse()), &self.camera);
+            let points = of_host.iter().filter_map(|of| host.points.get(of.point));
+            for point in points.filter(|point| point.is_alive) {
+                let Some(seen) = sight.project(point) else { continue };
+                let Some(known) = rows.near(seen.u, seen.v) else { continue };
+                let depth = f64::from(known.inverse_depth) / to.unit;
+                let deviation = f64::from(known.variance).sqrt() / f64::from(known.inverse_depth);
+                if !(deviation <= self.params.max_relative_deviation) {
+                    continue;
+                }
+                found.push(Correspondence {
+                    ray: [
+                        (seen.u - self.camera.cx) / self.camera.fx,
+                        (seen.v - self.camera.cy) / self.camera.fy,
+                    ],
+                    log_ratio: (seen.inverse_depth / depth).ln(),
+                    log_inverse_depth: depth.ln(),
+                });
+            }
+        }
+        found
     }
 }

@@ -7,6 +7,7 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;
 use crate::slam::window::Window;
 use crate::slam::window::keyframe::WindowKeyframe;
+use crate::slam::window::surface::Surface;
 
 /// Frames aligned with one adjustment: twice as many as come between two keyframes, so that those of an epoch's first
 /// keyframes are made up for without delaying it.
@@ -171,6 +172,8 @@ impl Window {
             unit: 1.0,
             points: Vec::new(),
             is_host: false,
+            agreed: Vec::new(),
+            surface: Surface::default(),
         });
         let is_aligned = self.align_last(&members, levels, MAX_ITERATIONS);
         let mut placed = self.keyframes.pop()?;

@@ -4,8 +4,10 @@ use crate::slam::depth::matching::PATTERN;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;
+use crate::slam::window::agreement::Agreed;
 use crate::slam::window::comparison::{Look, SAMPLES, sum_of_samples};
 use crate::slam::window::params::WindowParams;
+use crate::slam::window::surface::Surface;
 
 /// Pyramid levels that an adjustment may use.
 pub const LEVELS: usize = 4;
@@ -29,6 +31,10 @@ pub struct WindowKeyframe {
     pub points: Vec<WindowPoint>,
     /// Whether its points were chosen.
     pub is_host: bool,
+    /// Points of others that it agreed with when it was last aligned or estimated, until its own are chosen.
+    pub agreed: Vec<Agreed>,
+    /// How far it sees.
+    pub surface: Surface,
 }
 
 /// A point that is estimated jointly with others.

@@ -1,10 +1,16 @@
 //! Where the search for loops meets the window: what it is told, when it is its turn, and what moves with the map.
 
+use std::sync::Arc;
+
 use crate::slam::geometry::sim3::Sim3;
+use crate::slam::loops::known::KnownLoops;
 use crate::slam::loops::{Closure, LoopParams, Loops, SearchReport};
 use crate::slam::map::Map;
 use crate::slam::window::Window;
 use crate::slam::window::members::{Chosen, FEWEST_COMMON};
+
+/// Keyframes whose depth is not complete: the one that is observed, and the one before it, which gets its last depth.
+const UNFINISHED: usize = 2;
 
 impl Window {
     /// The same, looking for loops.
@@ -37,11 +43,19 @@ impl Window {
         is_begun
     }
 
-    /// Tells of a new keyframe.
-    pub(super) fn tell_new(&mut self, index: usize) {
-        let keyframe = &self.keyframes[index];
-        let (width, height) = (self.camera.width, self.camera.height);
-        self.loops.insert(keyframe.keyframe_id, keyframe.images[0].pixels(), width, height);
+    /// Tells what the keyframes of the map look like.
+    pub fn tell_looks(&mut self, map: &Map) {
+        self.loops.offer(&map.keyframes);
+    }
+
+    /// Takes up the loops of a map of a mapper before.
+    pub fn take_up_loops(&mut self, map: &Map) {
+        self.loops.take_up(map.loops.clone(), &map.keyframes);
+    }
+
+    /// Loops, and what held whom: to be kept with the map.
+    pub fn known_loops(&self) -> &Arc<KnownLoops> {
+        self.loops.known()
     }
 
     /// Tells of an estimate of the newest keyframes, right after it: who held the newest one.
@@ -82,6 +96,10 @@ impl Window {
     /// Chooses what is searched next, the newest keyframes left out.
     pub(super) fn plan_search(&mut self, num_unsettled: usize) {
         let known: Vec<u64> = self.keyframes.iter().map(|of| of.keyframe_id).collect();
+        // What lies in another epoch need not wait until it knows its place in its own: only its depth must be there.
+        let is_one_epoch = self.keyframes.windows(2).all(|pair| pair[0].epoch == pair[1].epoch);
+        let num_unsettled =
+            if is_one_epoch { num_unsettled } else { num_unsettled.min(UNFINISHED) };
         self.loops.plan(&known, known.len().saturating_sub(num_unsettled));
     }
 

@@ -8,6 +8,11 @@ use crate::slam::window::view::Sight;
 
 /// Points that two keyframes must see both for the one to hold the other in place.
 pub(super) const FEWEST_COMMON: usize = 20;
+/// Share of the points of two keyframes that the other must see for an estimate to tie them together: of one keyframe and
+/// the next it is half and more; what a few points at the border of an image say of a pose is little.
+const LINKING_SHARE: f64 = 0.2;
+/// Keyframes that a new one is aligned to.
+const NUM_ALIGNED_TO: usize = 4;
 /// Keyframes that are held in place where no older one sees the same things.
 const NUM_HELD: usize = 2;
 /// Keyframes whose points are looked for one by one in another, the nearest: seven times those that are held, so that
@@ -31,15 +36,74 @@ impl Window {
         let is_first = of_epoch.len() <= self.params.num_first;
         let num_free =
             if is_first { of_epoch.len() } else { self.params.num_free.min(of_epoch.len()) };
-        let (older, free) = of_epoch.split_at(of_epoch.len() - num_free);
-        let fixed = self.covisible(older, &free[free.len().saturating_sub(2)..]);
-        Chosen::new(fixed, free, older.is_empty(), is_first)
+        let (older, newest) = of_epoch.split_at(of_epoch.len() - num_free);
+        let free = match is_first {
+            true => newest.to_vec(),
+            false => self.groups(newest).pop().unwrap_or_default(),
+        };
+        let others: Vec<usize> = of_epoch.iter().copied().filter(|of| !free.contains(of)).collect();
+        let fixed = self.covisible(&others, &free[free.len().saturating_sub(2)..]);
+        Chosen::new(fixed, &free, older.is_empty(), is_first)
+    }
+
+    /// Keyframes in groups of those that see the same things, one by one: where the camera comes back to what older
+    /// keyframes see, the next new one may be made far from the one before, and nothing between them says where they
+    /// are to each other. Members are in the order of `of`, and so are the groups by their last ones.
+    pub(super) fn groups(&self, of: &[usize]) -> Vec<Vec<usize>> {
+        let mut groups: Vec<Vec<usize>> = Vec::new();
+        for &new in of {
+            let is_linked =
+                |group: &Vec<usize>| group.iter().rev().any(|&member| self.is_linked(member, new));
+            let (linked, apart): (Vec<_>, Vec<_>) = groups.into_iter().partition(is_linked);
+            groups = apart;
+            let mut joined: Vec<usize> = linked.into_iter().flatten().collect();
+            joined.sort_unstable();
+            joined.push(new);
+            groups.push(joined);
+        }
+        groups
+    }
+
+    /// Whether two keyframes see so much of each other's points that an estimate ties them together.
+    fn is_linked(&self, one: usize, other: usize) -> bool {
+        let alive = |of: usize| self.keyframes[of].points.iter().filter(|of| of.is_alive).count();
+        let common = self.common(one, other) as f64;
+        common > FEWEST_COMMON as f64
+            && common >= LINKING_SHARE * (alive(one) + alive(other)) as f64
+    }
+
+    /// Points of two keyframes that the other sees.
+    fn common(&self, one: usize, other: usize) -> usize {
+        self.seen_by(one, other) + self.seen_by(other, one)
+    }
+
+    /// Points of a keyframe that another sees and that nothing hides from it.
+    fn seen_by(&self, host: usize, observer: usize) -> usize {
+        let (host, observer) = (&self.keyframes[host], &self.keyframes[observer]);
+        let observer_from_host = observer.camera_from_map * host.camera_from_map.inverse();
+        let sight = Sight::new(&observer_from_host, &self.camera);
+        if !sight.may_see(&host.points) {
+            return 0;
+        }
+        let alive = host.points.iter().filter(|point| point.is_alive);
+        let seen = alive.filter_map(|point| sight.project(point));
+        seen.filter(|seen| !observer.surface.hides(seen, observer.unit)).count()
     }
 
     /// The keyframes up to one that are of its epoch.
     pub(super) fn of_epoch_up_to(&self, newest: usize) -> Vec<usize> {
         let epoch = self.keyframes[newest].epoch;
         (0..=newest).filter(|&k| self.keyframes[k].epoch == epoch).collect()
+    }
+
+    /// The hosts that a new keyframe is aligned to: of those that see most of what it sees the newest, in their order.
+    pub(super) fn hosts_to_align_to(&self, index: usize) -> Vec<usize> {
+        let epoch = self.keyframes[index].epoch;
+        let is_host = |&k: &usize| self.keyframes[k].epoch == epoch && self.keyframes[k].is_host;
+        let hosts: Vec<usize> = (0..index).filter(is_host).collect();
+        let mut nearest = self.covisible(&hosts, &[index]);
+        nearest.sort_unstable();
+        nearest.split_off(nearest.len().saturating_sub(NUM_ALIGNED_TO))
     }
 
     /// Of the older keyframes those that see most of what the newest see.
@@ -49,21 +113,9 @@ impl Window {
 
     /// The same, all looked at closely.
     fn most_common(&self, older: &[usize], newest: &[usize]) -> Vec<usize> {
-        let common = |one: usize, other: usize| {
-            let (host, observer) = (&self.keyframes[one], &self.keyframes[other]);
-            let sight = Sight::new(
-                &(observer.camera_from_map * host.camera_from_map.inverse()),
-                &self.camera,
-            );
-            if !sight.may_see(&host.points) {
-                return 0;
-            }
-            let alive = host.points.iter().filter(|point| point.is_alive);
-            alive.filter(|point| sight.sees(point)).count()
-        };
         let mut seen: Vec<(usize, usize)> = older
             .iter()
-            .map(|&of| (newest.iter().map(|&new| common(of, new) + common(new, of)).sum(), of))
+            .map(|&of| (newest.iter().map(|&new| self.common(of, new)).sum(), of))
             .filter(|(count, _)| *count > FEWEST_COMMON)
             .collect();
         seen.sort_unstable_by(|one, other| other.cmp(one));
@@ -143,9 +195,11 @@ mod tests {
     use super::*;
     use crate::slam::geometry::se3::SE3;
     use crate::slam::image::buffer::Image;
+    use crate::slam::keyframe::DepthPoint;
     use crate::slam::test_scene::{CAMERA, Random};
     use crate::slam::window::keyframe::WindowPoint;
     use crate::slam::window::params::WindowParams;
+    use crate::slam::window::surface::Surface;
 
     const RADIUS: f64 = 3.0;
 
@@ -181,6 +235,8 @@ mod tests {
                 unit: RADIUS,
                 points: points.collect(),
                 is_host: true,
+                agreed: Vec::new(),
+                surface: Surface::default(),
             }
         });
         let hosts: Vec<WindowKeyframe> = hosts.collect();
@@ -208,5 +264,87 @@ mod tests {
         }
         assert_eq!(all, 20 * window.params.num_fixed);
         assert!(10 * same >= 9 * all, "{same} of {all}");
+    }
+
+    /// A camera that turned, with `places` of its keyframes seen again: made anew, one after the other, after the 45th.
+    fn seen_again(places: &[usize]) -> Window {
+        let mut window = wandering(50);
+        let again: Vec<WindowKeyframe> =
+            places.iter().map(|&place| window.keyframes[place].clone()).collect();
+        window.keyframes.splice(45..45, again);
+        for (of, id) in window.keyframes.iter_mut().zip(0..) {
+            of.keyframe_id = id;
+        }
+        window
+    }
+
+    #[test]
+    fn the_newest_are_free_together_only_where_they_see_the_same_things() {
+        let mut window = seen_again(&[24, 25]);
+        window.keyframes.truncate(47);
+        let chosen = window.choose_members(46);
+        let free = chosen.members.iter().zip(&chosen.free).filter(|(_, free)| free.is_some());
+        assert_eq!(free.map(|(&member, _)| member).collect::<Vec<_>>(), [45, 46]);
+        assert!(chosen.members.contains(&24) && chosen.members.contains(&25), "what they see");
+        assert!(chosen.members.iter().all(|member| !(36..45).contains(member)));
+        // The camera has not been there before: all seven.
+        let chosen = window.choose_members(44);
+        assert_eq!(chosen.free.iter().flatten().count(), window.params.num_free);
+    }
+
+    #[test]
+    fn a_new_keyframe_is_aligned_to_what_sees_the_same_and_not_to_the_last_ones() {
+        let window = seen_again(&[24]);
+        let hosts = window.hosts_to_align_to(45);
+        assert_eq!(hosts.len(), NUM_ALIGNED_TO);
+        assert!(hosts.is_sorted() && hosts.contains(&24), "{hosts:?}");
+        assert!(hosts.iter().all(|&of| window.is_linked(of, 45)), "{hosts:?}");
+        // Where the camera goes on the last one is among them.
+        assert!(window.hosts_to_align_to(44).contains(&43));
+    }
+
+    #[test]
+    fn every_part_of_a_piece_is_held() {
+        let window = seen_again(&[24, 25]);
+        let all: Vec<usize> = (0..52).collect();
+        assert_eq!(window.groups(&all[40..]).len(), 2);
+        let chosen = window.choose_piece(&all, 40, 52);
+        assert_eq!(chosen.free.iter().flatten().count(), 12);
+        let held: Vec<usize> =
+            chosen.members.iter().copied().filter(|&member| member < 40).collect();
+        for free in 40..52 {
+            assert!(held.iter().any(|&of| window.is_linked(of, free)), "{free} by {held:?}");
+        }
+    }
+
+    #[test]
+    fn a_part_that_nothing_holds_stays_where_it_is() {
+        let mut window = seen_again(&[24, 25]);
+        for of in &mut window.keyframes[45..47] {
+            of.camera_from_map.translation.x += 1000.0;
+        }
+        let all: Vec<usize> = (0..52).collect();
+        let chosen = window.choose_piece(&all, 40, 52);
+        assert!(!chosen.members.contains(&45) && !chosen.members.contains(&46));
+        assert_eq!(chosen.free.iter().flatten().count(), 10);
+    }
+
+    #[test]
+    fn what_stands_before_a_keyframes_view_hides_the_others_points() {
+        let mut window = wandering(50);
+        let older: Vec<usize> = (0..40).collect();
+        let before = window.covisible(&older, &[48, 49]);
+        let wall = |v: u16| move |u: u16| (8 * u, 8 * v);
+        let pixels = (0..(CAMERA.height / 8) as u16)
+            .flat_map(|v| (0..(CAMERA.width / 8) as u16).map(wall(v)));
+        let near: Vec<DepthPoint> = pixels
+            .flat_map(|(u, v)| [(u, v); 4])
+            .map(|(u, v)| DepthPoint { u, v, inverse_depth: 5.0, variance: 1e-4, intensity: 0.0 })
+            .collect();
+        // It looks at a wall from near, and its own points are behind the others' backs.
+        window.keyframes[before[0]].surface = Surface::of(&near, &CAMERA);
+        window.keyframes[before[0]].points.clear();
+        let after = window.covisible(&older, &[48, 49]);
+        assert!(!after.contains(&before[0]), "{before:?} {after:?}");
     }
 }

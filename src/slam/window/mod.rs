@@ -6,6 +6,7 @@
 //! points eliminated, `solver` the iterations, [`Window::optimise`] the recipe. Keyframes that have left the window
 //! and see the same things hold it in place; nothing is marginalised, and the filter's variance is no prior.
 
+mod agreement;
 pub mod candidates;
 pub mod comparison;
 mod comparison_kernel;
@@ -27,14 +28,16 @@ pub mod place_marginals;
 mod plane;
 mod rival;
 mod selection;
+pub mod sighting;
 mod solver;
+mod surface;
 mod system;
 mod unit;
 mod view;
 
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::image::buffer::Image;
-use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
+use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::loops::{LoopParams, Loops};
 use crate::slam::map::Map;
 use crate::slam::window::candidates::{Candidates, MaturePoints};
@@ -46,17 +49,14 @@ use crate::slam::window::marginals::Marginal;
 use crate::slam::window::members::Chosen;
 use crate::slam::window::params::WindowParams;
 use crate::slam::window::pass::Pass;
-use crate::slam::window::plane::Correspondence;
 use crate::slam::window::solver::Solver;
+use crate::slam::window::surface::Surface;
 use crate::slam::window::system::{Level, Members};
 use crate::slam::window::unit::Unit;
-use crate::slam::window::view::Sight;
 
 /// Levels of the alignment of a new keyframe, and of an adjustment.
 const ALIGNMENT_LEVELS: [usize; 4] = [3, 2, 1, 0];
 const ADJUSTED_LEVELS: [usize; 3] = [2, 1, 0];
-/// Keyframes before a new one that it is aligned to.
-const NUM_ALIGNED_TO: usize = 4;
 /// Most iterations of a level of that alignment.
 const MAX_ALIGNMENT_ITERATIONS: u32 = 10;
 
@@ -201,6 +201,8 @@ impl Window {
             unit: keyframe.map_from_keyframe.scale,
             points: Vec::new(),
             is_host: false,
+            agreed: Vec::new(),
+            surface: Surface::of(&keyframe.points, &self.camera),
         };
         self.keyframes.insert(place, added);
         true
@@ -241,7 +243,6 @@ impl Window {
             let Some(index) = self.index_of(id) else { continue };
             self.choose_points_before(index);
             self.align(index);
-            self.tell_new(index);
             self.pass.added += 1;
             is_new = true;
         }
@@ -318,59 +319,19 @@ impl Window {
                 of
             })
             .collect();
-        keyframe.is_host = true;
+        (keyframe.is_host, keyframe.agreed) = (true, Vec::new());
     }
 
-    /// Points of other keyframes of the epoch where one has depth too.
-    fn projected_into(&self, index: usize, points: &[DepthPoint]) -> Vec<Correspondence> {
-        let to = &self.keyframes[index];
-        let is_host = |&k: &usize| {
-            let of = &self.keyframes[k];
-            of.epoch == to.epoch && k != index && !of.points.is_empty()
-        };
-        let hosts: Vec<usize> = (0..self.keyframes.len()).filter(is_host).collect();
-        let rows = selection::Rows::of(points, self.camera.height);
-        let mut found = Vec::new();
-        for host in self.nearest(&hosts, &[index]) {
-            let host = &self.keyframes[host];
-            let sight =
-                Sight::new(&(to.camera_from_map * host.camera_from_map.inverse()), &self.camera);
-            if !sight.may_see(&host.points) {
-                continue;
-            }
-            for point in host.points.iter().filter(|point| point.is_alive) {
-                let Some(seen) = sight.project(point) else { continue };
-                let Some(known) = rows.near(seen.u, seen.v) else { continue };
-                let depth = f64::from(known.inverse_depth) / to.unit;
-                let deviation = f64::from(known.variance).sqrt() / f64::from(known.inverse_depth);
-                if !(deviation <= self.params.max_relative_deviation) {
-                    continue;
-                }
-                found.push(Correspondence {
-                    ray: [
-                        (seen.u - self.camera.cx) / self.camera.fx,
-                        (seen.v - self.camera.cy) / self.camera.fy,
-                    ],
-                    log_ratio: (seen.inverse_depth / depth).ln(),
-                    log_inverse_depth: depth.ln(),
-                });
-            }
-        }
-        found
-    }
-
-    /// Aligns a keyframe alone to the points of those before it.
+    /// Aligns a keyframe alone to the points of those that see what it sees.
     fn align(&mut self, index: usize) {
-        let epoch = self.keyframes[index].epoch;
-        let hosts = (0..index)
-            .rev()
-            .filter(|&k| self.keyframes[k].epoch == epoch && self.keyframes[k].is_host);
-        let mut members: Vec<usize> = hosts.take(NUM_ALIGNED_TO).collect();
+        let mut members = self.hosts_to_align_to(index);
         if members.is_empty() {
             return;
         }
         members.push(index);
-        self.align_last(&members, &ALIGNMENT_LEVELS, MAX_ALIGNMENT_ITERATIONS);
+        if self.align_last(&members, &ALIGNMENT_LEVELS, MAX_ALIGNMENT_ITERATIONS) {
+            self.note_agreement(&members);
+        }
     }
 
     /// Aligns the last of the members alone to the points of the others; false where its pose is not determined.
@@ -398,6 +359,7 @@ impl Window {
         if !self.run(&members, &ADJUSTED_LEVELS, iterations, |_, _| true) {
             return None;
         }
+        self.note_agreement(&chosen.members);
         let mut found =
             marginals::marginals(&self.keyframes, &members, &mut self.solver, &self.camera);
         // They are in the unit of the equations.

@@ -7,10 +7,11 @@ use super::solver::Solver;
 use super::*;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
-use crate::slam::keyframe::Keyframe;
+use crate::slam::keyframe::{DepthPoint, Keyframe};
 use crate::slam::modes::ModeCovariance;
 use crate::slam::place_covariance::{PlaceCovariance, PlaceMatrix};
 use crate::slam::test_scene::{CAMERA, Random, Rendering, Scene};
+use crate::slam::window::plane::Correspondence;
 
 pub(super) fn ray(u: f64, v: f64) -> [f32; 2] {
     [((u - CAMERA.cx) / CAMERA.fx) as f32, ((v - CAMERA.cy) / CAMERA.fy) as f32]
@@ -67,6 +68,8 @@ pub(super) fn exact_host(
         unit: 1.0,
         points: Vec::new(),
         is_host: true,
+        agreed: Vec::new(),
+        surface: Surface::default(),
     };
     keyframe.take_part(&CAMERA);
     let dense: Vec<DepthPoint> = (0..CAMERA.width * CAMERA.height)

@@ -3,6 +3,7 @@
 use super::*;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::sim3::Sim3;
+use crate::slam::places::{Description, Feature, FeaturePlace};
 
 const WIDTH: usize = 65;
 const HEIGHT: usize = 48;
@@ -83,21 +84,103 @@ fn hostile_sizes_and_numbers_with_a_right_checksum_are_refused() {
     let with = |at: usize, value: &[u8]| {
         let mut bytes = whole.clone();
         bytes[at..at + value.len()].copy_from_slice(value);
-        let end = bytes.len() - CHECKSUM_BYTES;
-        let checksum = crc32fast::hash(&bytes[..end]);
-        bytes[end..].copy_from_slice(&checksum.to_le_bytes());
+        seal(&mut bytes);
         decoded(&bytes)
     };
-    let (points_at, image_bytes_at) = (40, 52);
+    let (points_at, image_bytes_at, place_bytes_at, description_bytes_at) = (40, 52, 76, 80);
     for count in [1, 1041, u32::MAX] {
         assert!(with(points_at, &count.to_le_bytes()).is_err(), "{count} points");
     }
     for count in [0, 1, u64::MAX] {
         assert!(with(image_bytes_at, &count.to_le_bytes()).is_err(), "{count} image bytes");
     }
-    assert!(matches!(with(16, &2u32.to_le_bytes()), Err(DepthFileError::Version(2))));
+    assert!(matches!(with(16, &3u32.to_le_bytes()), Err(DepthFileError::Version(3))));
+    for count in [0, 1, u32::MAX] {
+        assert!(with(place_bytes_at, &count.to_le_bytes()).is_err(), "{count} bytes of places");
+    }
+    for count in [1, 100, u32::MAX] {
+        assert!(with(description_bytes_at, &count.to_le_bytes()).is_err(), "{count} of looks");
+    }
     assert!(matches!(with(24, &6u64.to_le_bytes()), Err(DepthFileError::Foreign)));
     let numbers = whole.len() - CHECKSUM_BYTES - 8;
     assert!(matches!(with(numbers, &f32::NAN.to_le_bytes()), Err(DepthFileError::Points(_))));
     assert!(with(HEAD_BYTES, &[0xff]).is_err(), "a bit more than there are points");
+}
+
+/// A keyframe that is described.
+fn described() -> Keyframe {
+    let feature = |k: u16| Feature {
+        place: FeaturePlace {
+            u: k % 65,
+            v: k % 48,
+            orientation: (k % 32) as u8,
+            scale: (k % 7) as u8,
+        },
+        bits: [u64::from(k), 2, 3, u64::MAX],
+    };
+    let description = Description::of_features(WIDTH, HEIGHT, (0..200).map(feature).collect());
+    Keyframe { description: Some(Arc::new(description.unwrap())), ..keyframe(0.0) }
+}
+
+#[test]
+fn a_description_comes_back_and_damage_in_it_costs_nothing_else() {
+    let of = described();
+    for detail in [MapDetail::Full, MapDetail::Small] {
+        let whole = encode(&of, detail);
+        let without = encode(&keyframe(0.0), detail);
+        let length = whole.len() - without.len();
+        assert!(length <= 7700, "{length}");
+        let back = decoded(&whole).unwrap();
+        assert_eq!(back.description, of.description);
+        assert_ne!(checksum_of(&whole), checksum_of(&without), "its length is in the head");
+        for at in (0..length).step_by(5).chain([length - 1]) {
+            let mut broken = whole.clone();
+            broken[HEAD_BYTES + at] ^= 1 << (at % 8);
+            let read = decoded(&broken).unwrap();
+            assert!(read.description.is_none(), "byte {at}");
+            assert!(read.points == back.points && read.image == back.image, "byte {at}");
+        }
+        for at in (0..HEAD_BYTES).chain((HEAD_BYTES + length..whole.len()).step_by(11)) {
+            let mut broken = whole.clone();
+            broken[at] ^= 1 << (at % 8);
+            assert!(decoded(&broken).is_err(), "byte {at}");
+        }
+    }
+}
+
+#[test]
+fn a_description_of_what_is_not_in_the_image_is_none() {
+    let whole = encode(&described(), MapDetail::Full);
+    // The first feature's column, row, orientation, scale; with a right checksum.
+    for (at, value) in [(0, 65), (2, 48), (4, 32), (5, 7)] {
+        let mut bytes = whole.clone();
+        bytes[HEAD_BYTES + 4 + at] = value;
+        let end = HEAD_BYTES + 4 + 200 * 38;
+        let checksum = crc32fast::hash(&bytes[HEAD_BYTES..end]);
+        bytes[end..end + 4].copy_from_slice(&checksum.to_le_bytes());
+        assert!(decoded(&bytes).unwrap().description.is_none(), "{at}");
+        bytes[HEAD_BYTES + 4 + at] = whole[HEAD_BYTES + 4 + at];
+        let checksum = crc32fast::hash(&bytes[HEAD_BYTES..end]);
+        bytes[end..end + 4].copy_from_slice(&checksum.to_le_bytes());
+        assert!(decoded(&bytes).unwrap().description.is_some(), "{at}");
+    }
+}
+
+#[test]
+fn files_of_the_version_before_are_read() {
+    for detail in [MapDetail::Full, MapDetail::Small] {
+        let of = keyframe(0.0);
+        let now = encode(&of, detail);
+        let mut rest = &now[..];
+        let head = Head::take(&mut rest).unwrap();
+        let (places, rest) = rest.split_at(head.place_bytes.unwrap() as usize);
+        let mut bits = vec![0u8; pixels::bit_bytes(WIDTH * HEIGHT)];
+        let set = pixels::decode(places, WIDTH * HEIGHT, head.num_points as usize).unwrap();
+        set.iter().for_each(|pixel| bits[pixel / 8] |= 1 << (pixel % 8));
+        let mut before = [&now[..HEAD_BYTES_BEFORE], &bits, rest].concat();
+        before[16] = VERSION_BEFORE as u8;
+        seal(&mut before);
+        assert_eq!(crc32fast::hash(&before[..before.len() - 4]), checksum_of(&before));
+        assert!(decoded(&before).unwrap() == decoded(&now).unwrap());
+    }
 }

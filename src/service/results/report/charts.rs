@@ -15,11 +15,11 @@ use crate::slam::geometry::sim3::Sim3;
 use crate::slam::trajectory::StampedPose;
 
 /// Colours that can be told apart with any sight, on white and on black: of the truth,
-const TRUTH: &str = "#8b929c";
+pub const TRUTH: &str = "#8b929c";
 /// … of estimates,
 pub const ESTIMATE: &str = "#2f6fed";
 /// … of what was published,
-const ONLINE: &str = "#e59a1a";
+pub const ONLINE: &str = "#e59a1a";
 /// … of errors,
 pub const ERROR: &str = "#d6455d";
 /// … of the mapper.
@@ -110,7 +110,7 @@ fn truth_in_time(input: &ReportInput<'_>) -> Vec<StampedPose> {
     input.record.ground_truth.iter().filter(|pose| time.contains(&pose.nanos)).copied().collect()
 }
 
-fn keyframe_poses(record: &RunRecord) -> Vec<StampedPose> {
+pub(super) fn keyframe_poses(record: &RunRecord) -> Vec<StampedPose> {
     let pose = |k: &crate::slam::keyframe::Keyframe| StampedPose {
         nanos: k.capture_nanos,
         world_from_camera: k.map_from_keyframe.rigid,

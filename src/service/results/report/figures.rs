@@ -8,7 +8,7 @@ use crate::service::results::report::html::escaped;
 use crate::service::results::summary::Summary;
 
 /// What has a place of its own on the page.
-const DRAWN: [&str; 2] = ["budget_curve", "grade"];
+const DRAWN: [&str; 3] = ["budget_curve", "grade", "keyframe_depth"];
 
 /// The figures as a list, and those that are lists themselves as tables.
 pub fn figures(summary: &Summary) -> String {

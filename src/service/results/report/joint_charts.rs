@@ -1,11 +1,14 @@
-//! The charts of the joint estimation: how well it explains the images over the run, and its time.
+//! The charts of the joint estimation: how well it explains the images over the run, its time, and what it makes of the
+//! keyframes' depth.
 
 use std::collections::HashMap;
 
 use crate::service::adjustments::AdjustmentRecord;
 use crate::service::results::RunRecord;
 use crate::service::results::report::chart::{Chart, Mark, Scaling, Series};
-use crate::service::results::report::charts::{ERROR, ESTIMATE, MAPPING, secs};
+use crate::service::results::report::charts::{ERROR, ESTIMATE, MAPPING, ONLINE, secs};
+use crate::slam::evaluation::depth_error::KeyframeDepth;
+use crate::slam::evaluation::statistics::median;
 
 /// Residual, share of inliers and time of every joint estimate; none where there was none.
 pub fn joint_charts(record: &RunRecord) -> Vec<Chart> {
@@ -38,4 +41,39 @@ pub fn joint_charts(record: &RunRecord) -> Vec<Chart> {
         chart("Inliers of joint estimates", "of comparisons [%]", ESTIMATE, inliers),
         chart("CPU time of joint estimates", "[ms]", MAPPING, time),
     ]
+}
+
+/// The unit and the common errors of each keyframe's depth over the run; none without true depth.
+pub fn depth_charts(record: &RunRecord, keyframes: &[KeyframeDepth]) -> Vec<Chart> {
+    let points = |value: &dyn Fn(&KeyframeDepth) -> Option<f64>| -> Vec<[f64; 2]> {
+        let timed = keyframes.iter().map(|of| (secs(record, of.capture_nanos), value(of)));
+        timed.filter_map(|(time, value)| Some([time, value?])).collect()
+    };
+    let units: Vec<f64> = keyframes.iter().map(|of| of.units_per_metre).collect();
+    let Some(middle) = median(&units).filter(|_| units.len() > 1) else { return Vec::new() };
+    let chart = |title, y_label: &str, series| Chart {
+        title,
+        x_label: "time [s]".into(),
+        y_label: y_label.into(),
+        height: 230.0,
+        scaling: Scaling::Free,
+        series,
+    };
+    let series = |name, colour, points| Series { name, colour, mark: Mark::Dots(2.6), points };
+    let unit = points(&|of| Some(of.units_per_metre / middle));
+    let mode = |which: usize| points(&|of| of.modes.map(|modes| modes[which]));
+    let modes = vec![
+        series("along columns", ESTIMATE, mode(0)),
+        series("along rows", ONLINE, mode(1)),
+        series("relief", ERROR, mode(2)),
+    ];
+    let mut charts = vec![chart(
+        "Unit of the keyframes' depth",
+        "map units in a metre / their median",
+        vec![series("", MAPPING, unit)],
+    )];
+    if modes.iter().any(|of| !of.points.is_empty()) {
+        charts.push(chart("Common errors of depth", "for each unit", modes));
+    }
+    charts
 }

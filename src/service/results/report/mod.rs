@@ -9,6 +9,7 @@ pub mod figures;
 pub mod grade_banner;
 pub mod html;
 pub mod joint_charts;
+pub mod loop_section;
 pub mod map_picture;
 pub mod views;
 
@@ -28,7 +29,8 @@ use crate::service::results::report::charts::{
 use crate::service::results::report::figures::figures;
 use crate::service::results::report::grade_banner::grade_banner;
 use crate::service::results::report::html::{escaped, png_address};
-use crate::service::results::report::joint_charts::joint_charts;
+use crate::service::results::report::joint_charts::{depth_charts, joint_charts};
+use crate::service::results::report::loop_section::loop_section;
 use crate::service::results::report::map_picture::map_picture;
 use crate::service::results::summary::Summary;
 use crate::service::results::{EndOfRun, RunMode, RunRecord};
@@ -91,7 +93,10 @@ pub fn report(input: &ReportInput<'_>) -> String {
         error_over_time(input).into_iter().chain(scale_over_time(input)).collect();
     section(&mut page, "Error", &errors);
     page.push_str(&depth_maps(input));
+    let of_keyframes = &summary.depth.keyframe_depth;
+    section(&mut page, "Depth of the keyframes", &depth_charts(input.record, of_keyframes));
     section(&mut page, "Joint estimation", &joint_charts(input.record));
+    page.push_str(&loop_section(input));
     section(&mut page, "Time", &time_charts(input.record));
     page.push_str(&budget(input));
     page.push_str(&figures(summary));

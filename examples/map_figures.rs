@@ -1,0 +1,57 @@
+//! What a large map costs on the disk and how long it takes to begin in it: `cargo run --release --example map_figures --
+//! MAP_DIR NUM_KEYFRAMES`. The keyframes of a map are taken over and over, until there are so many.
+
+use std::path::Path;
+use std::time::Instant;
+
+use semidense::service::map_folder::depth_file::MapDetail;
+use semidense::service::map_folder::writer::MapHead;
+use semidense::service::map_folder::{load, write_new};
+use semidense::slam::keyframe::Keyframe;
+use semidense::slam::map::Map;
+use semidense::slam::mapper::prior::MapUse;
+use semidense::slam::mapper::{Mapper, MapperParams};
+
+/// Times that it is loaded: the best and the worst are told.
+const REPETITIONS: usize = 5;
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let [folder, count] = &arguments[..] else { return Err("MAP_DIR NUM_KEYFRAMES".into()) };
+    let count: usize = count.parse()?;
+    let few = load(Path::new(folder), usize::MAX)?;
+    let camera = few.manifest.camera;
+    // Described where they are not yet.
+    let mut mapper = Mapper::new(camera, MapperParams::default())?;
+    mapper.begin_in(few.map, MapUse::Extend)?;
+    for detail in [MapDetail::Full, MapDetail::Small] {
+        let folder = tempfile::tempdir()?;
+        let again = mapper.map().keyframes.iter().cycle().take(count);
+        let numbered = (0..).zip(again).map(|(keyframe_id, of)| {
+            let description = of.description.clone();
+            Keyframe { keyframe_id, description, ..of.clone() }
+        });
+        let map = Map { keyframes: numbered.collect(), ..Map::default() };
+        let keyframes = map.keyframes.iter().map(Keyframe::without_depth).collect();
+        let head = MapHead { keyframes, free_epoch: 1, ..MapHead::default() };
+        write_new(folder.path(), &camera, detail, &map, head, &mut || ())?;
+        drop(map);
+        for _ in 0..REPETITIONS {
+            let begin = Instant::now();
+            let loaded = load(folder.path(), usize::MAX)?;
+            let read = begin.elapsed();
+            let bytes = loaded.manifest.depth_bytes();
+            let described = loaded.map.keyframes.iter().filter(|of| of.description.is_some());
+            let described = described.count();
+            let mut mapper = Mapper::new(camera, MapperParams::default())?;
+            mapper.begin_in(loaded.map, MapUse::Extend)?;
+            println!(
+                "{detail:?}: {count} keyframes, {described} described, {:.1} MB, read {:.2} s, with what they look like {:.2} s",
+                1e-6 * bytes as f64,
+                read.as_secs_f64(),
+                begin.elapsed().as_secs_f64()
+            );
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,168 @@
+//! The loops of a map as bytes, little-endian, in its manifest and in a checkpoint.
+//!
+//! Layout: number of loops (u64), each: keyframes i and j (u64), `j_from_i` (8 × f64), covariance of its left increment
+//! (upper triangle, 28 × f64); number of keyframes of which it is known against whom they were estimated (u64), each:
+//! keyframe (u64), number (u32) and ids (u64) of the others; number of first keyframes of joined epochs (u64), these (u64);
+//! the last keyframe that was searched (u64, all bits set where there is none).
+
+use crate::slam::geometry::sim3::Matrix7;
+use crate::slam::loops::known::{KnownLoops, Link};
+use crate::slam::pose::NO_KEYFRAME;
+use crate::wire::conversion::{similarity_from_message, similarity_message};
+
+/// Most bytes of the loops of the largest map.
+pub const MAX_LOOP_BYTES: u64 = 64 << 20;
+/// Bytes of a loop.
+const LINK_BYTES: usize = 8 * (2 + 8 + 28);
+/// Side of the covariance of a similarity.
+const SIDE: usize = 7;
+
+/// Why loops cannot be used.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum LoopBytesError {
+    /// They are cut short, or there is more.
+    #[error("the loops are cut, or followed by something else")]
+    Length,
+    /// A number is not possible.
+    #[error("loop {0} is no measurement between two keyframes")]
+    Link(usize),
+}
+
+/// The bytes of some loops.
+pub fn loop_bytes(loops: &KnownLoops) -> Vec<u8> {
+    let mut bytes = Vec::with_capacity(64 + LINK_BYTES * loops.links.len());
+    bytes.extend((loops.links.len() as u64).to_le_bytes());
+    for link in &loops.links {
+        [link.i, link.j].iter().for_each(|id| bytes.extend(id.to_le_bytes()));
+        let of_covariance = upper_triangle().map(|(row, column)| link.covariance[(row, column)]);
+        for number in similarity_message(&link.j_from_i).into_iter().chain(of_covariance) {
+            bytes.extend(number.to_le_bytes());
+        }
+    }
+    bytes.extend((loops.held_by.len() as u64).to_le_bytes());
+    for (keyframe_id, by) in &loops.held_by {
+        bytes.extend(keyframe_id.to_le_bytes());
+        bytes.extend((by.len() as u32).to_le_bytes());
+        by.iter().for_each(|id| bytes.extend(id.to_le_bytes()));
+    }
+    bytes.extend((loops.beginnings.len() as u64).to_le_bytes());
+    loops.beginnings.iter().for_each(|id| bytes.extend(id.to_le_bytes()));
+    bytes.extend(loops.searched_to.unwrap_or(NO_KEYFRAME).to_le_bytes());
+    bytes
+}
+
+/// The loops of [`loop_bytes`], every number checked.
+pub fn parse_loops(mut bytes: &[u8]) -> Result<KnownLoops, LoopBytesError> {
+    let bytes = &mut bytes;
+    let mut loops = KnownLoops::default();
+    for index in 0..count(bytes, LINK_BYTES)? {
+        let (i, j) = (id(bytes)?, id(bytes)?);
+        let similarity = numbers(bytes)?;
+        let triangle: [f64; 28] = numbers(bytes)?;
+        let mut covariance = Matrix7::zeros();
+        for ((row, column), number) in upper_triangle().zip(triangle) {
+            (covariance[(row, column)], covariance[(column, row)]) = (number, number);
+        }
+        let j_from_i = similarity_from_message(&similarity, "j_from_i");
+        let is_sure = triangle.iter().all(|x| x.is_finite()) && covariance.cholesky().is_some();
+        match j_from_i {
+            Ok(j_from_i) if is_sure && i != j => {
+                loops.links.push(Link { i, j, j_from_i, covariance });
+            }
+            _ => return Err(LoopBytesError::Link(index)),
+        }
+    }
+    for _ in 0..count(bytes, 8 + 4)? {
+        let keyframe_id = id(bytes)?;
+        let others = u32::from_le_bytes(take(bytes)?) as usize;
+        let others = bytes.split_off(..others.saturating_mul(8)).ok_or(LoopBytesError::Length)?;
+        let others = others.chunks_exact(8).filter_map(|of| of.first_chunk());
+        loops.held_by.insert(keyframe_id, others.map(|of| u64::from_le_bytes(*of)).collect());
+    }
+    for _ in 0..count(bytes, 8)? {
+        loops.beginnings.insert(id(bytes)?);
+    }
+    loops.searched_to = Some(id(bytes)?).filter(|id| *id != NO_KEYFRAME);
+    if bytes.is_empty() { Ok(loops) } else { Err(LoopBytesError::Length) }
+}
+
+/// Rows and columns of the upper triangle, row by row.
+fn upper_triangle() -> impl Iterator<Item = (usize, usize)> {
+    (0..SIDE).flat_map(|row| (row..SIDE).map(move |column| (row, column)))
+}
+
+fn take<const N: usize>(bytes: &mut &[u8]) -> Result<[u8; N], LoopBytesError> {
+    let taken = bytes.split_off(..N).and_then(|taken| taken.first_chunk().copied());
+    taken.ok_or(LoopBytesError::Length)
+}
+
+fn id(bytes: &mut &[u8]) -> Result<u64, LoopBytesError> {
+    Ok(u64::from_le_bytes(take(bytes)?))
+}
+
+fn numbers<const N: usize>(bytes: &mut &[u8]) -> Result<[f64; N], LoopBytesError> {
+    let mut numbers = [0.0; N];
+    for number in &mut numbers {
+        *number = f64::from_le_bytes(take(bytes)?);
+    }
+    Ok(numbers)
+}
+
+/// A number of things of at least so many bytes each: no more than there are bytes for.
+fn count(bytes: &mut &[u8], least: usize) -> Result<usize, LoopBytesError> {
+    let count = usize::try_from(id(bytes)?).unwrap_or(usize::MAX);
+    if count <= bytes.len() / least { Ok(count) } else { Err(LoopBytesError::Length) }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+    use crate::slam::geometry::se3::SE3;
+    use crate::slam::geometry::sim3::Sim3;
+
+    /// Two loops, and what else there can be.
+    pub(in crate::service) fn loops() -> KnownLoops {
+        let rigid = SE3::exp(&[0.3, -0.2, 0.1, 0.4, 0.5, -0.6].into());
+        let mut covariance = Matrix7::identity() * 1e-4;
+        (covariance[(1, 4)], covariance[(4, 1)]) = (2e-5, 2e-5);
+        let link = Link { i: 7, j: 3, j_from_i: Sim3::new(rigid, 1.3), covariance };
+        KnownLoops {
+            links: vec![link, Link { i: 8, ..link }],
+            held_by: [(7, vec![5, 6]), (8, vec![]), (9, vec![7])].into(),
+            beginnings: [4].into(),
+            searched_to: Some(8),
+        }
+    }
+
+    #[test]
+    fn they_come_back_from_their_bytes() {
+        for loops in [loops(), KnownLoops::default()] {
+            assert_eq!(parse_loops(&loop_bytes(&loops)), Ok(loops));
+        }
+    }
+
+    #[test]
+    fn every_cut_and_hostile_numbers_are_refused() {
+        let whole = loop_bytes(&loops());
+        for length in 0..whole.len() {
+            assert!(parse_loops(&whole[..length]).is_err(), "{length}");
+        }
+        assert!(parse_loops(&[&whole[..], &[0]].concat()).is_err());
+        let with = |at: usize, value: u64| {
+            let mut bytes = whole.clone();
+            bytes[at..at + 8].copy_from_slice(&value.to_le_bytes());
+            parse_loops(&bytes)
+        };
+        let held_at = 8 + 2 * LINK_BYTES;
+        for (at, value) in [(0, u64::MAX), (0, 3), (held_at, u64::MAX), (held_at + 16, u64::MAX)] {
+            assert_eq!(with(at, value), Err(LoopBytesError::Length), "at {at}");
+        }
+        let nan = f64::NAN.to_bits();
+        let variance_at = 8 + 8 * (2 + 8);
+        for (at, value) in
+            [(8, 3), (24, nan), (variance_at, nan), (variance_at, (-1.0f64).to_bits())]
+        {
+            assert_eq!(with(at, value), Err(LoopBytesError::Link(0)), "at {at}");
+        }
+    }
+}

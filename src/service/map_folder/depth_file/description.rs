@@ -1,0 +1,52 @@
+//! What a keyframe looks like, in its file: number of features (u32), each column and row (u16), orientation, scale (u8)
+//! and descriptor (4 × u64); the CRC-32 of these (u32).
+
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::places::{Description, Feature, FeaturePlace, MAX_FEATURES};
+
+/// Bytes of a feature.
+const FEATURE_BYTES: usize = 2 + 2 + 1 + 1 + 4 * 8;
+/// Bytes of the number of features, and of the checksum.
+const NUMBER_BYTES: usize = 4;
+/// Most bytes of a description.
+pub(super) const MOST_BYTES: usize = 2 * NUMBER_BYTES + MAX_FEATURES * FEATURE_BYTES;
+
+/// Its bytes.
+pub(super) fn encode(description: &Description) -> Vec<u8> {
+    let features = description.features();
+    let mut bytes = Vec::with_capacity(MOST_BYTES);
+    bytes.extend((features.len() as u32).to_le_bytes());
+    for Feature { place, bits } in features {
+        bytes.extend(place.u.to_le_bytes());
+        bytes.extend(place.v.to_le_bytes());
+        bytes.extend([place.orientation, place.scale]);
+        bits.iter().for_each(|word| bytes.extend(word.to_le_bytes()));
+    }
+    bytes.extend(crc32fast::hash(&bytes).to_le_bytes());
+    bytes
+}
+
+/// The description of an image of `camera`; `None` where a bit is wrong, or there is none.
+pub(super) fn decode(bytes: &[u8], camera: &Intrinsics) -> Option<Description> {
+    let (body, checksum) = bytes.split_last_chunk::<NUMBER_BYTES>()?;
+    let (count, features) = body.split_first_chunk::<NUMBER_BYTES>()?;
+    let is_whole = crc32fast::hash(body) == u32::from_le_bytes(*checksum)
+        && features.len() % FEATURE_BYTES == 0
+        && features.len() / FEATURE_BYTES == u32::from_le_bytes(*count) as usize;
+    if !is_whole {
+        return None;
+    }
+    let features = features.chunks_exact(FEATURE_BYTES).map(feature);
+    Description::of_features(camera.width, camera.height, features.collect::<Option<_>>()?)
+}
+
+fn feature(mut bytes: &[u8]) -> Option<Feature> {
+    let mut u16 = || Some(u16::from_le_bytes(*bytes.split_off(..2)?.first_chunk()?));
+    let (u, v) = (u16()?, u16()?);
+    let [orientation, scale] = *bytes.split_off(..2)?.first_chunk()?;
+    let mut bits = [0; 4];
+    for word in &mut bits {
+        *word = u64::from_le_bytes(*bytes.split_off(..8)?.first_chunk()?);
+    }
+    Some(Feature { place: FeaturePlace { u, v, orientation, scale }, bits })
+}

@@ -1,0 +1,112 @@
+//! Numbers of a map that a running mapper goes over to: no keyframe and no epoch of it has one that the run has given
+//! already, and on the disk it keeps its own.
+
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
+
+use crate::service::map_folder::writer::MapHead;
+use crate::slam::keyframe::Keyframe;
+use crate::slam::loops::known::KnownLoops;
+use crate::slam::map::Map;
+use crate::slam::mapper::Mapper;
+
+/// By how much the numbers of a run are larger than those on the disk.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct Numbering {
+    /// Of keyframes.
+    pub ids: u64,
+    /// Of epochs.
+    pub epochs: u32,
+    /// Of corrections of the map.
+    pub revisions: u64,
+}
+
+impl Numbering {
+    /// Numbers that a mapper has not given yet.
+    pub fn above(mapper: &Mapper) -> Self {
+        Self {
+            ids: mapper.free_keyframe_id(),
+            epochs: mapper.free_epoch(),
+            revisions: mapper.map().revision,
+        }
+    }
+
+    /// A map as the run numbers it.
+    pub fn in_run(&self, map: Map) -> Map {
+        let renumbered = |keyframe: Keyframe| Keyframe {
+            keyframe_id: keyframe.keyframe_id.saturating_add(self.ids),
+            epoch: keyframe.epoch.saturating_add(self.epochs),
+            ..keyframe
+        };
+        Map {
+            keyframes: map.keyframes.into_iter().map(renumbered).collect(),
+            loops: Arc::new(KnownLoops::default().with(&map.loops, self.ids)),
+            revision: map.revision.saturating_add(self.revisions),
+            free_epoch: map.free_epoch.saturating_add(self.epochs),
+            ..map
+        }
+    }
+
+    /// A keyframe as the disk numbers it; `None` for those that the run had before.
+    pub fn on_disk(&self, keyframe: Keyframe) -> Option<Keyframe> {
+        let keyframe_id = keyframe.keyframe_id.checked_sub(self.ids)?;
+        let epoch = keyframe.epoch.checked_sub(self.epochs)?;
+        Some(Keyframe { keyframe_id, epoch, ..keyframe })
+    }
+
+    /// What is in a manifest, as the disk numbers it.
+    pub fn head_on_disk(&self, head: MapHead) -> MapHead {
+        if *self == Self::default() {
+            return head;
+        }
+        MapHead {
+            keyframes: head.keyframes.into_iter().filter_map(|of| self.on_disk(of)).collect(),
+            loops: Arc::new(head.loops.from(self.ids)),
+            revision: head.revision.saturating_sub(self.revisions),
+            free_epoch: head.free_epoch.saturating_sub(self.epochs),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::service::loop_bytes::tests::loops;
+    use crate::slam::geometry::intrinsics::Intrinsics;
+    use crate::slam::geometry::sim3::Sim3;
+
+    #[test]
+    fn a_map_is_on_the_disk_as_it_was_and_what_the_run_had_before_is_not() {
+        let camera = Intrinsics::pinhole(64, 48, 60.0);
+        let keyframe = |keyframe_id: u64, epoch: u32| Keyframe {
+            keyframe_id,
+            epoch,
+            ..Keyframe::at(Sim3::identity(), camera, Vec::new(), Vec::new())
+        };
+        let keyframes = vec![keyframe(0, 0), keyframe(3, 2)];
+        let loops = Arc::new(loops());
+        let map = Map { keyframes, loops, revision: 4, free_epoch: 3, ..Map::default() };
+        let numbering = Numbering { ids: 100, epochs: 7, revisions: 20 };
+        let in_run = numbering.in_run(map.clone());
+        let numbers: Vec<(u64, u32)> =
+            in_run.keyframes.iter().map(|of| (of.keyframe_id, of.epoch)).collect();
+        assert_eq!(numbers, [(100, 7), (103, 9)]);
+        assert_eq!((in_run.revision, in_run.free_epoch), (24, 10));
+        assert!(in_run.loops.links.iter().all(|link| link.i >= 100 && link.j >= 100));
+        let before = [keyframe(0, 0), keyframe(99, 6)];
+        let loops = Arc::new(KnownLoops::default().with(&in_run.loops, 0).with(&map.loops, 0));
+        assert_ne!(*loops, *in_run.loops);
+        let head = numbering.head_on_disk(MapHead {
+            keyframes: before.into_iter().chain(in_run.keyframes).collect(),
+            loops,
+            revision: in_run.revision,
+            free_epoch: in_run.free_epoch,
+        });
+        assert_eq!(head.keyframes, map.keyframes);
+        assert_eq!((head.revision, head.free_epoch), (4, 3));
+        assert_eq!(head.loops.links, map.loops.links);
+        assert_eq!(head.loops.held_by, map.loops.held_by);
+        assert_eq!(head.loops.beginnings, map.loops.beginnings);
+    }
+}

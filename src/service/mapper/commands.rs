@@ -1,0 +1,162 @@
+//! What the mapper does when it is asked: never on the frame path.
+
+use std::path::{Path, PathBuf};
+use std::rc::Rc;
+use std::thread;
+use std::time::Duration;
+
+use crate::service::checkpoint::Kept;
+use crate::service::config::MapConfig;
+use crate::service::health::ProcessState;
+use crate::service::map_file::write_map;
+use crate::service::map_folder::numbering::Numbering;
+use crate::service::map_folder::session::{MapSession, check_loadable};
+use crate::service::map_folder::{MapFolderError, save_copy};
+use crate::service::mapper::going_over::GoneOver;
+use crate::service::mapper::{MapperError, Shell, WRITES_MAP, tell_adjustments};
+use crate::service::mode::Mode;
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::map::Map;
+use crate::slam::mapper::Mapper;
+use crate::slam::mapper::situation::Situation;
+use crate::wire::command::Command;
+
+/// What a mapper says of itself while it reads another map, which may take long.
+const LOADS_MAP: &str = "another map is being loaded";
+/// Pause between two signs of life meanwhile.
+const LOADING_PAUSE: Duration = Duration::from_millis(20);
+const NO_FRAME: &str = "there is no map yet: no frame has come";
+
+impl Shell<'_> {
+    pub(super) fn answer_commands(&mut self) -> Result<(), MapperError> {
+        let commands = Rc::clone(&self.commands);
+        Ok(commands.answer(|command| match command {
+            Command::SendKeyframe(keyframe_id) => {
+                let map = self.mapper.as_ref().map(|(_, mapper)| mapper.map());
+                self.output.publish_earlier(map, keyframe_id)
+            }
+            Command::SaveMap(path) => self.saying(WRITES_MAP, |shell| shell.save_map(&path)),
+            Command::SaveFolder(path) => self.saying(WRITES_MAP, |shell| shell.save_folder(&path)),
+            Command::LoadFolder { folder, read_only } => {
+                self.saying(LOADS_MAP, |shell| shell.load_folder(folder, read_only))
+            }
+        })?)
+    }
+
+    /// Does what may take longer than the pause between two signs of life.
+    fn saying(
+        &mut self,
+        cause: &str,
+        act: impl FnOnce(&mut Self) -> Result<(), String>,
+    ) -> Result<(), String> {
+        let before = self.health.entered();
+        self.health.enter(ProcessState::Running, cause);
+        let outcome = act(self);
+        self.health.go_back_to(before);
+        outcome
+    }
+
+    fn save_map(&mut self, path: &Path) -> Result<(), String> {
+        // It is asked for when the recording is over.
+        if let Some((_, mapper)) = &mut self.mapper {
+            let outcome = self.adjustments.finish(mapper);
+            let told = self.output.publish(mapper, &outcome).and_then(|()| {
+                tell_adjustments(&mut self.adjustments, &self.output, &mut self.health)
+            });
+            told.map_err(|error| error.to_string())?;
+        }
+        let empty = Map::default();
+        let map = self.mapper.as_ref().map_or(&empty, |(_, mapper)| mapper.map());
+        let health = &mut self.health;
+        let saved = write_map(path, map, &mut || health.report())
+            .map_err(|error| format!("{}: {error}", path.display()));
+        saved.and(self.save_own_folder())
+    }
+
+    /// Saves the map in the folder that it is kept in, where there is one.
+    fn save_own_folder(&mut self) -> Result<(), String> {
+        self.save_map_folder().map_err(|error| error.to_string())
+    }
+
+    fn save_folder(&mut self, path: &Path) -> Result<(), String> {
+        let Some((_, mapper)) = &self.mapper else { return Err(NO_FRAME.to_owned()) };
+        if self.map.as_ref().is_some_and(|map| map.is_in(path)) {
+            return self.save_own_folder();
+        }
+        let (health, detail) = (&mut self.health, self.config.map.detail);
+        save_copy(path, mapper, detail, &mut || health.report()).map_err(|error| error.to_string())
+    }
+
+    /// Goes over to the map in another folder. Whatever is wrong with that, the map at hand goes on as it is.
+    fn load_folder(&mut self, folder: PathBuf, read_only: bool) -> Result<(), String> {
+        let Some((camera, mapper)) = &self.mapper else { return Err(NO_FRAME.to_owned()) };
+        let (camera, numbering) = (*camera, Numbering::above(mapper));
+        if self.map.as_ref().is_some_and(|map| map.is_in(&folder)) {
+            return Err(format!("{} is the map that the mapper is in", folder.display()));
+        }
+        check_loadable(&folder, &camera).map_err(|error| match error {
+            MapFolderError::Missing(_) => format!("{} holds no map", folder.display()),
+            error => error.to_string(),
+        })?;
+        let name = folder
+            .to_str()
+            .ok_or_else(|| format!("{}: name a folder whose name is UTF-8", folder.display()))?;
+        let map = MapConfig { folder: name.to_owned(), read_only, ..self.config.map.clone() };
+        let (session, mut next) = self.begin_in(&map, &camera, numbering)?;
+        self.save_own_folder()?;
+        let gone_over = GoneOver { from: self.config.map.folder.clone(), to: map, numbering };
+        self.forget_checkpoint(&gone_over)?;
+        if let Some((_, before)) = self.mapper.take() {
+            next.take_the_place_of(before);
+        }
+        self.adjustments.orphan();
+        tracing::info!("the mapper goes over to the map {}", folder.display());
+        (self.map, self.mapper) = (Some(session), Some((camera, next)));
+        Ok(())
+    }
+
+    /// A mapper that begins in a map, which is read beside signs of life.
+    fn begin_in(
+        &mut self,
+        map: &MapConfig,
+        camera: &Intrinsics,
+        numbering: Numbering,
+    ) -> Result<(MapSession, Mapper), String> {
+        let (mapping, pool) = (&self.config.mapping, &self.pool);
+        let waits = self.mode == Mode::Lockstep;
+        let begin = || -> Result<(MapSession, Mapper), String> {
+            let missing = || MapFolderError::Missing(PathBuf::from(&map.folder)).to_string();
+            let session = MapSession::open(map, mapping.max_map_bytes(), numbering, waits);
+            let session = session.map_err(|error| error.to_string())?;
+            let mut session = session.ok_or_else(missing)?;
+            let mut mapper =
+                Mapper::new(*camera, mapping.clone()).map_err(|error| error.to_string())?;
+            session.begin(&mut mapper, camera, None).map_err(|error| error.to_string())?;
+            match mapper.situation() {
+                Situation::Localising(_) => Ok((session, mapper)),
+                _ => Err(format!("{}: no keyframe to find the camera on", map.folder)),
+            }
+        };
+        let health = &mut self.health;
+        thread::scope(|scope| {
+            let loading = scope.spawn(|| pool.install(begin));
+            while !loading.is_finished() {
+                health.report();
+                thread::sleep(LOADING_PAUSE);
+            }
+            loading.join().unwrap_or_else(|_| Err("reading the map has failed".to_owned()))
+        })
+    }
+
+    /// Live: who comes after begins in the other map, not with what was left of this one.
+    fn forget_checkpoint(&mut self, gone_over: &GoneOver) -> Result<(), String> {
+        let Some(mut kept) = self.kept.take() else { return Ok(()) };
+        let (path, note) = (self.place.checkpoint_path(), self.place.loaded_map_path());
+        kept.end_in_order();
+        drop(kept);
+        let written = gone_over.write(&note);
+        self.kept = Kept::open(&path).0;
+        self.kept.iter_mut().for_each(Kept::reserve);
+        written.map_err(|error| format!("{}: {error}", note.display()))
+    }
+}

@@ -1,0 +1,81 @@
+//! Which map a running mapper has gone over to, for the one that comes after it if it dies.
+
+use std::fs;
+use std::io::{self, Write};
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use crate::capture::input_file;
+use crate::service::atomic_file::write_privately;
+use crate::service::config::MapConfig;
+use crate::service::map_folder::numbering::Numbering;
+
+/// Longest file: a path of the longest kind, every byte of it escaped.
+const MAX_BYTES: u64 = 1 << 15;
+
+/// A map that a mapper was not started with.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct GoneOver {
+    /// The folder of the configuration that it was started with: one that is started with another stays there.
+    pub(super) from: String,
+    /// The map.
+    pub(super) to: MapConfig,
+    /// Its numbers in this run.
+    pub(super) numbering: Numbering,
+}
+
+impl GoneOver {
+    /// What the mapper before has left at `path`, where it was started as this one is.
+    pub(super) fn read(path: &Path, configured: &MapConfig) -> Option<Self> {
+        let mut bytes = Vec::new();
+        match input_file::read_into(path, MAX_BYTES, &mut bytes) {
+            Ok(()) => {}
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return None,
+            Err(error) => {
+                tracing::warn!("{}: {error}; the map is the configured one", path.display());
+                return None;
+            }
+        }
+        let read: Result<Self, _> = serde_json::from_slice(&bytes);
+        let read = read.inspect_err(|error| {
+            tracing::warn!("{}: {error}; the map is the configured one", path.display());
+        });
+        read.ok().filter(|left| left.from == configured.folder)
+    }
+
+    /// Leaves it at `path`.
+    pub(super) fn write(&self, path: &Path) -> io::Result<()> {
+        let bytes = serde_json::to_vec(self)?;
+        write_privately(path, |file| file.write_all(&bytes))
+    }
+
+    /// Nobody is to go on from there.
+    pub(super) fn forget(path: &Path) {
+        // What is not there need not be removed; of another configuration it is not read.
+        drop(fs::remove_file(path));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_successor_goes_over_too_unless_it_was_started_with_another_map() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("rig.map");
+        let config = |folder: &str| MapConfig { folder: folder.to_owned(), ..MapConfig::default() };
+        assert_eq!(GoneOver::read(&path, &config("/a")), None);
+        let numbering = Numbering { ids: 3, epochs: 2, revisions: 1 };
+        let over = GoneOver { from: "/a".to_owned(), to: config("/b"), numbering };
+        over.write(&path).unwrap();
+        assert_eq!(GoneOver::read(&path, &config("/a")), Some(over));
+        assert_eq!(GoneOver::read(&path, &config("/c")), None);
+        fs::write(&path, "{}").unwrap();
+        assert_eq!(GoneOver::read(&path, &config("/a")), None);
+        GoneOver::forget(&path);
+        assert!(!path.exists());
+    }
+}

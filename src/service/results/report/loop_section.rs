@@ -1,0 +1,126 @@
+//! What the search for loops came to, and where.
+
+use std::collections::BTreeMap;
+use std::fmt::Write;
+
+use crate::service::adjustments::SearchRecord;
+use crate::service::results::RunRecord;
+use crate::service::results::report::ReportInput;
+use crate::service::results::report::chart::{Chart, Mark, Scaling, Series};
+use crate::service::results::report::charts::{
+    ERROR, ESTIMATE, MAPPING, ONLINE, TRUTH, keyframe_poses,
+};
+use crate::service::results::report::html::escaped;
+use crate::service::results::report::views::Views;
+use crate::service::results::summary_text::loops_text;
+use crate::slam::loops::SearchFate;
+
+/// Radius of a loop that holds, and of a place that was refused.
+const LOOP_RADIUS: f64 = 4.0;
+const REFUSED_RADIUS: f64 = 2.5;
+/// Loops that are drawn, the newest: what a path keeps without being thinned, three points each.
+const MOST_LINKS: usize = 1000;
+
+/// Figures, why places were refused, and a view of the map from above; nothing where no loop was looked for.
+pub fn loop_section(input: &ReportInput<'_>) -> String {
+    let Some(figures) = loops_text(&input.summary.loops) else { return String::new() };
+    let searches = input.record.searches.as_deref().unwrap_or_default();
+    let mut section = format!("<section><h2>Loops</h2><p>{}</p>", escaped(&figures));
+    let reasons = reasons(searches);
+    if !reasons.is_empty() {
+        let listed: Vec<String> =
+            reasons.iter().map(|(why, count)| format!("{count} times {}", escaped(why))).collect();
+        let _ = write!(
+            section,
+            "<p>Other places, by what the first candidate lacks: {}.</p>",
+            listed.join("; ")
+        );
+    }
+    let chart = from_above(input.record, searches);
+    let _ =
+        write!(section, "<div class=\"charts\"><figure>{}</figure></div></section>", chart.svg());
+    section
+}
+
+/// Why candidates were other places, and how often, the most frequent first.
+fn reasons(searches: &[SearchRecord]) -> Vec<(String, usize)> {
+    let mut counts: BTreeMap<String, usize> = BTreeMap::new();
+    for search in searches {
+        if let SearchFate::Refused(why) = search.report.fate {
+            // Without the value of what was measured.
+            let why = why.to_string();
+            let why = why.split(':').next().unwrap_or_default().to_owned();
+            *counts.entry(why).or_default() += 1;
+        }
+    }
+    let mut counts: Vec<(String, usize)> = counts.into_iter().collect();
+    counts.sort_by_key(|(_, count)| std::cmp::Reverse(*count));
+    counts
+}
+
+/// The keyframes' way, and what was found where; loops with a line between the keyframes.
+fn from_above(record: &RunRecord, searches: &[SearchRecord]) -> Chart {
+    let way = keyframe_poses(record);
+    let views = Views::of(&way);
+    let at = |id: u64| {
+        let keyframe = record.map.get(id)?;
+        Some(views.from_above(&keyframe.map_from_keyframe.rigid.translation))
+    };
+    let of = |is: fn(&SearchFate) -> bool| -> Vec<[f64; 2]> {
+        let found = searches.iter().filter(|search| is(&search.report.fate));
+        found.filter_map(|search| at(search.report.keyframe_id)).collect()
+    };
+    let links = record
+        .map
+        .loops
+        .links
+        .iter()
+        .rev()
+        .take(MOST_LINKS)
+        .filter_map(|link| Some([at(link.i)?, at(link.j)?]));
+    // A broken line: one piece for each loop.
+    let links = links.flat_map(|[i, j]| [i, j, [f64::NAN; 2]]).collect();
+    let series = |name, colour, mark, points| Series { name, colour, mark, points };
+    let dots = |radius| Mark::Dots(radius);
+    let path = way.iter().map(|pose| views.from_above(&pose.world_from_camera.translation));
+    Chart {
+        title: "Loops from above",
+        x_label: "[map units]".into(),
+        y_label: "[map units]".into(),
+        height: 480.0,
+        scaling: Scaling::Equal,
+        series: vec![
+            series("keyframes", TRUTH, Mark::Path, path.collect()),
+            series(
+                "other place",
+                ERROR,
+                dots(REFUSED_RADIUS),
+                of(|fate| {
+                    matches!(
+                        fate,
+                        SearchFate::Refused(_) | SearchFate::Unconfirmed | SearchFate::Inconsistent
+                    )
+                }),
+            ),
+            series(
+                "against the drift",
+                ONLINE,
+                dots(REFUSED_RADIUS),
+                of(|fate| matches!(fate, SearchFate::AgainstDrift(_))),
+            ),
+            series(
+                "held already",
+                ESTIMATE,
+                dots(LOOP_RADIUS),
+                of(|fate| *fate == SearchFate::Held),
+            ),
+            series(
+                "closed or joined",
+                MAPPING,
+                dots(LOOP_RADIUS),
+                of(|fate| matches!(fate, SearchFate::Closed | SearchFate::Joined)),
+            ),
+            series("loops of the map", MAPPING, Mark::Path, links),
+        ],
+    }
+}

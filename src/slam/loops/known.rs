@@ -1,0 +1,99 @@
+//! What the search for loops knows of a map, as it is kept with the map.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use crate::slam::geometry::sim3::{Matrix7, Sim3};
+use crate::slam::graph::constraint::Measurement;
+use crate::slam::keyframe::Keyframe;
+
+/// A loop: a measurement between two keyframes, by their ids.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Link {
+    /// One keyframe.
+    pub i: u64,
+    /// The other.
+    pub j: u64,
+    /// The similarity between them, in their units.
+    pub j_from_i: Sim3,
+    /// Covariance of its left increment (translation, rotation, log scale), in units of j.
+    pub covariance: Matrix7,
+}
+
+/// Loops of a map, and what its keyframes say of each other without them.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct KnownLoops {
+    /// Loops that hold, in the order in which they were found.
+    pub links: Vec<Link>,
+    /// By keyframe the older ones that its place was estimated against.
+    pub held_by: BTreeMap<u64, Vec<u64>>,
+    /// Keyframes that nothing connects with the one before: the first of epochs that were joined to others.
+    pub beginnings: BTreeSet<u64>,
+    /// Keyframes up to this one have been searched.
+    pub searched_to: Option<u64>,
+}
+
+impl Link {
+    pub(super) fn of(i: u64, j: u64, measurement: &Measurement) -> Self {
+        let Measurement { j_from_i, covariance, .. } = *measurement;
+        Self { i, j, j_from_i, covariance }
+    }
+}
+
+impl KnownLoops {
+    /// Whether nothing is known.
+    pub fn is_empty(&self) -> bool {
+        *self == Self::default()
+    }
+
+    /// Keyframes that a loop is measured between.
+    pub fn keyframe_ids(&self) -> BTreeSet<u64> {
+        self.links.iter().flat_map(|link| [link.i, link.j]).collect()
+    }
+
+    /// Of two maps in one, where the ids of the second are so much larger than they were.
+    pub fn with(mut self, second: &Self, ids: u64) -> Self {
+        let moved = |id: &u64| id.saturating_add(ids);
+        let links = second.links.iter().map(|of| Link { i: moved(&of.i), j: moved(&of.j), ..*of });
+        self.links.extend(links);
+        let held = second.held_by.iter();
+        self.held_by.extend(held.map(|(id, by)| (moved(id), by.iter().map(moved).collect())));
+        self.beginnings.extend(second.beginnings.iter().map(moved));
+        self.searched_to = second.searched_to.as_ref().map(moved).or(self.searched_to);
+        self
+    }
+
+    /// Of the keyframes from an id on, whose ids are smaller by as much.
+    pub fn from(&self, ids: u64) -> Self {
+        let moved = |id: u64| id.checked_sub(ids);
+        let link = |of: &Link| Some(Link { i: moved(of.i)?, j: moved(of.j)?, ..*of });
+        let held = |(&id, by): (&u64, &Vec<u64>)| {
+            Some((moved(id)?, by.iter().copied().filter_map(moved).collect()))
+        };
+        Self {
+            links: self.links.iter().filter_map(link).collect(),
+            held_by: self.held_by.iter().filter_map(held).collect(),
+            beginnings: self.beginnings.iter().copied().filter_map(moved).collect(),
+            searched_to: self.searched_to.and_then(moved),
+        }
+    }
+
+    /// By keyframe those that it was estimated with, older and newer, as far as they held each other.
+    pub(super) fn partners(&self) -> BTreeMap<u64, BTreeSet<u64>> {
+        let mut partners: BTreeMap<u64, BTreeSet<u64>> = BTreeMap::new();
+        for (&one, by) in &self.held_by {
+            for &other in by {
+                partners.entry(one).or_default().insert(other);
+                partners.entry(other).or_default().insert(one);
+            }
+        }
+        partners
+    }
+
+    /// The newest of some keyframes that cannot be searched any more: it was, or nobody knows what it was estimated with,
+    /// so that its neighbours would be taken for loops.
+    pub(super) fn last_searched(&self, keyframes: &[Keyframe]) -> Option<u64> {
+        let is_unknown = |id: &u64| !self.held_by.contains_key(id);
+        let unknown = keyframes.iter().map(|of| of.keyframe_id).filter(is_unknown).max();
+        self.searched_to.max(unknown)
+    }
+}

@@ -1,0 +1,173 @@
+//! The camera is found on known keyframes, and on no other.
+
+use super::*;
+use crate::slam::test_scene::{CAMERA, Scene};
+use nalgebra::Vector6;
+
+/// A keyframe with exact depth and little noise.
+fn keyframe(scene: &Scene, keyframe_id: u64, world_from_camera: SE3) -> Keyframe {
+    scene.keyframe(keyframe_id, world_from_camera, 1.0)
+}
+
+fn at(twist: [f64; 6]) -> SE3 {
+    SE3::exp(&Vector6::from(twist))
+}
+
+#[test]
+fn a_known_view_is_found_on_its_keyframe_and_an_unknown_one_on_none() {
+    let scene = Scene::new(3);
+    let home = at([0.0; 6]);
+    let away = at([0.0, 0.0, 0.0, 0.0, 1.2, 0.0]);
+    let elsewhere = at([0.0, 0.0, 0.0, 0.0, 2.8, 0.0]);
+    let keyframes =
+        [keyframe(&scene, 0, home), keyframe(&scene, 1, away), keyframe(&scene, 2, elsewhere)];
+    let params = RecoveryParams { keyframes_per_frame: 3, ..Default::default() };
+    let mut searched = 0;
+    let mut find = |finder: &mut Finder, view: SE3| {
+        let pixels = scene.render(&CAMERA, &view).noisy(2.0, 9);
+        let (index, found) =
+            finder.find(&mut keyframes.to_vec(), Some(2), &mut searched, &pixels, &params)?;
+        let placed = keyframes[index].map_from_keyframe.place(&found);
+        let error = (view.inverse() * placed).log().norm();
+        assert!(error < 0.02, "found {error} away from where it is");
+        Some(index)
+    };
+    let mut recovery = Finder::new(&CAMERA);
+    let near_home = at([0.1, -0.05, 0.1, 0.05, 0.1, -0.05]);
+    assert_eq!(find(&mut recovery, near_home), Some(0));
+    assert_eq!(find(&mut recovery, away * near_home), Some(1));
+    assert_eq!(find(&mut recovery, at([0.0, 0.0, 0.0, 0.0, -1.5, 0.0])), None);
+    assert_eq!(find(&mut recovery, elsewhere), None, "the one in force is the tracker's");
+}
+
+#[test]
+fn one_that_was_not_confirmed_leaves_the_next_frame_to_others() {
+    let scene = Scene::new(3);
+    let [one, other] = [0.0, 0.05].map(|x| at([x, 0.0, 0.0, 0.0, 0.0, 0.0]));
+    let active = keyframe(&scene, 2, at([0.0, 0.0, 0.0, 0.0, 2.8, 0.0]));
+    let keyframes = [keyframe(&scene, 0, one), keyframe(&scene, 1, other), active];
+    let pixels = scene.render(&CAMERA, &at([0.01, 0.0, 0.0, 0.0, 0.0, 0.0])).noisy(2.0, 9);
+    let mut finder = Finder::new(&CAMERA);
+    let params = RecoveryParams::default();
+    let mut find = |doubted: Option<usize>| {
+        doubted.into_iter().for_each(|index| finder.doubt(index));
+        finder.find(&mut keyframes.to_vec(), Some(2), &mut 0, &pixels, &params).unwrap().0
+    };
+    let first = find(None);
+    assert_eq!(find(Some(first)), 1 - first);
+    assert_eq!(find(None), first);
+}
+
+#[test]
+fn a_camera_that_is_rolled_far_is_found_with_its_roll_by_features_and_by_small_images() {
+    let scene = Scene::new(3);
+    let home = keyframe(&scene, 0, at([0.0; 6]));
+    let away = keyframe(&scene, 1, at([0.0, 0.0, 0.0, 0.0, 1.2, 0.0]));
+    let active = keyframe(&scene, 2, at([0.0, 0.0, 0.0, 0.0, 2.8, 0.0]));
+    let keyframes = [home, away, active];
+    let params = RecoveryParams::default();
+    let view = at([0.05, -0.05, 0.05, 0.0, 0.0, 0.0]) * at([0.0, 0.0, 0.0, 0.1, -0.1, 1.9]);
+    let pixels = scene.render(&CAMERA, &view).noisy(2.0, 9);
+    let mut finder = Finder::new(&CAMERA);
+    let (index, found) =
+        finder.find(&mut keyframes.to_vec(), Some(2), &mut 0, &pixels, &params).unwrap();
+    let error = (view.inverse() * found).log().norm();
+    assert!(index == 0 && error < 0.02, "found {error} away from where it is, on {index}");
+    let mut compared = 0;
+    let found =
+        finder.find_turned(&mut keyframes.to_vec(), Some(2), &mut compared, &pixels, &params);
+    let (index, found) = found.unwrap();
+    assert_eq!((index, compared), (0, 2));
+    let error = (view.inverse() * found).log().norm();
+    assert!(error < 0.02, "found {error} away from where it is");
+    let nowhere = scene.render(&CAMERA, &at([0.0, 0.0, 0.0, 0.0, -1.5, 0.0])).noisy(2.0, 9);
+    assert!(
+        finder.find_turned(&mut keyframes.to_vec(), Some(2), &mut 0, &nowhere, &params).is_none()
+    );
+}
+
+#[test]
+fn those_that_look_most_alike_are_first_and_rejected_and_nearly_empty_ones_are_left_out() {
+    let scene = Scene::new(3);
+    let known = keyframe(&scene, 0, SE3::identity());
+    let rejected = Keyframe { map_state: MapState::Rejected, ..known.clone() };
+    let empty = Keyframe { points: known.points[..50].to_vec(), ..known.clone() };
+    let numbered = |keyframes: Vec<Keyframe>| -> Vec<Keyframe> {
+        let ids = (0..).zip(keyframes);
+        ids.map(|(keyframe_id, keyframe)| Keyframe { keyframe_id, ..keyframe }).collect()
+    };
+    let active = keyframe(&scene, 3, at([0.0, 0.0, 0.0, 0.0, 2.0, 0.0]));
+    let pixels = known.image.clone();
+    let params = RecoveryParams { keyframes_per_frame: 1, ..RecoveryParams::default() };
+    let find = |keyframes: &[Keyframe], active: usize| {
+        let found = Finder::new(&CAMERA).find(
+            &mut keyframes.to_vec(),
+            Some(active),
+            &mut 0,
+            &pixels,
+            &params,
+        );
+        found.map(|(index, _)| index)
+    };
+    let without = numbered(vec![rejected, empty, active.clone()]);
+    assert_eq!(find(&without, 2), None);
+    let far = |of: f64| keyframe(&scene, 1, at([0.0, 0.0, 0.0, 0.0, of, 0.0]));
+    let other_epoch = Keyframe { epoch: 1, ..known };
+    let with = numbered(vec![far(-2.0), other_epoch, far(1.0), far(-1.0), active]);
+    assert_eq!(find(&with, 4), Some(1), "an earlier keyframe, of another epoch");
+}
+
+#[test]
+fn keyframes_that_gave_up_their_depth_leave_the_index() {
+    let scene = Scene::new(3);
+    let pan = |k: u64| at([0.0, 0.0, 0.0, 0.0, 0.3 * k as f64, 0.0]);
+    let mut keyframes: Vec<_> = (0..8).map(|k| keyframe(&scene, k, pan(k))).collect();
+    let mut finder = Finder::new(&CAMERA);
+    finder.learn_all(&mut keyframes);
+    assert_eq!(finder.places.len(), 8);
+    let bytes = finder.places.bytes();
+    for given_up in &mut keyframes[1..7] {
+        *given_up = given_up.without_depth();
+    }
+    finder.learn(&mut keyframes);
+    let left: Vec<u64> = (0..8).filter(|id| finder.places.contains(*id)).collect();
+    assert_eq!(left, [0, 7]);
+    assert!(2 * finder.places.bytes() < bytes, "{bytes} B, now {}", finder.places.bytes());
+}
+
+#[test]
+fn a_keyframe_is_described_once_and_found_by_the_description_that_it_came_with() {
+    let scene = Scene::new(3);
+    let away = at([0.0, 0.0, 0.0, 0.0, 1.2, 0.0]);
+    let mut keyframes = [keyframe(&scene, 0, at([0.0; 6])), keyframe(&scene, 1, away)];
+    Finder::new(&CAMERA).learn(&mut keyframes);
+    let made = keyframes.each_ref().map(|of| of.description.clone().unwrap());
+    // Another finder takes what is there, also where the image would say something else.
+    keyframes[0].description = Some(made[1].clone());
+    let mut finder = Finder::new(&CAMERA);
+    finder.learn_all(&mut keyframes);
+    assert!(Arc::ptr_eq(keyframes[0].description.as_ref().unwrap(), &made[1]));
+    let found = finder.places.candidates(&made[0], 2, |_| false);
+    assert!(found.iter().all(|of| of.score < 30.0), "{found:?}");
+    let found = finder.places.candidates(&made[1], 2, |_| false);
+    assert_eq!(found.iter().filter(|of| of.score > 100.0).count(), 2, "{found:?}");
+}
+
+#[test]
+fn others_take_turns() {
+    let scene = Scene::new(3);
+    let (here, active) = (SE3::identity(), at([0.0, 0.0, 0.0, 0.0, 2.0, 0.0]));
+    // Looks like the frame, and has no depth that could explain it.
+    let mut wrong = keyframe(&scene, 0, here);
+    wrong.points.iter_mut().for_each(|point| point.inverse_depth = f32::NAN);
+    let side = at([0.3, 0.0, 0.0, 0.0, 0.05, 0.0]);
+    let keyframes = [wrong, keyframe(&scene, 1, side), keyframe(&scene, 2, active)];
+    let pixels = scene.render(&CAMERA, &at([0.12, 0.0, 0.0, 0.0, 0.02, 0.0])).noisy(2.0, 5);
+    let find = |keyframes_per_frame| {
+        let params = RecoveryParams { keyframes_per_frame, ..RecoveryParams::default() };
+        let found =
+            Finder::new(&CAMERA).find(&mut keyframes.to_vec(), Some(2), &mut 0, &pixels, &params);
+        found.map(|(index, _)| index)
+    };
+    assert_eq!((find(1), find(2)), (None, Some(1)));
+}

@@ -1,0 +1,93 @@
+//! Which points of others a keyframe was seen to agree with.
+//!
+//! That a point projects into an image says nothing of what stands before it: through a wall a keyframe has the points of
+//! the next room in view, more of them than of its own surroundings where it looks at a wall from near.
+
+use crate::slam::window::Window;
+
+/// Share of the comparisons with a host's points that count, from which on some of them are seen: of those behind a wall
+/// one in ten to three does by chance, on a wall of little contrast more, of others four in five, and of a host seen
+/// through a door something between.
+const LEAST_SHARE: f64 = 0.3;
+
+/// A point that a keyframe agrees with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Agreed {
+    /// Its host.
+    pub keyframe_id: u64,
+    /// Its place among its host's points.
+    pub point: usize,
+}
+
+impl Window {
+    /// Keeps, right after an adjustment, which points those members agree with whose own points are still to be chosen:
+    /// theirs is the depth that is held against others' points.
+    pub(super) fn note_agreement(&mut self, members: &[usize]) {
+        let most_energy = self.robustness().most_energy;
+        let (views, system) = (&self.solver.views, &self.solver.system);
+        for (place, &member) in members.iter().enumerate() {
+            if self.keyframes[member].is_host {
+                continue;
+            }
+            let mut agreed = std::mem::take(&mut self.keyframes[member].agreed);
+            agreed.clear();
+            for pair in views.pairs.iter().filter(|pair| pair.observer == place) {
+                let inliers = system.inliers_among(pair.places(), most_energy);
+                if (inliers as f64) < LEAST_SHARE * pair.count as f64 {
+                    continue;
+                }
+                let keyframe_id = self.keyframes[members[pair.host]].keyframe_id;
+                let counts = |at: &usize| system.inliers_among(*at..*at + 1, most_energy) > 0;
+                let point = |at: usize| views.points[views.slots[at]].point;
+                let of_pair = pair.places().filter(counts);
+                agreed.extend(of_pair.map(|at| Agreed { keyframe_id, point: point(at) }));
+            }
+            self.keyframes[member].agreed = agreed;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::image::buffer::Image;
+    use crate::slam::keyframe::DepthPoint;
+    use crate::slam::test_scene::{CAMERA, Random};
+    use crate::slam::window::params::WindowParams;
+    use crate::slam::window::tests::room;
+
+    #[test]
+    fn a_new_keyframe_agrees_with_what_it_sees_and_not_with_what_is_hidden() {
+        let mut window = Window::new(CAMERA, WindowParams::default());
+        window.keyframes = room(|_, _| (1.0, 0.0)).keyframes;
+        let members: Vec<usize> = (0..window.keyframes.len()).collect();
+        let last = *members.last().unwrap();
+        (window.keyframes[last].is_host, window.keyframes[last].points) = (false, Vec::new());
+        assert!(window.align_last(&members, &[0], 0));
+        window.note_agreement(&members);
+        let seen = window.keyframes[last].agreed.len();
+        assert!(seen > 0 && seen <= window.solver.system.inliers, "{seen}");
+        assert!(members[..last].iter().all(|&of| window.keyframes[of].agreed.is_empty()));
+        let pixels = (8..CAMERA.width).flat_map(|u| (8..CAMERA.height).map(move |v| (u, v)));
+        let mut depth: Vec<DepthPoint> = pixels
+            .map(|(u, v)| DepthPoint {
+                u: u as u16,
+                v: v as u16,
+                inverse_depth: 1.0,
+                variance: 1e-4,
+                intensity: 0.0,
+            })
+            .collect();
+        depth.sort_by_key(|point| (point.v, point.u));
+        assert!(!window.projected_into(last, &depth).is_empty());
+        // Something else stands before all of it.
+        let mut random = Random::new(5);
+        let mut wall = Image::filled(CAMERA.width, CAMERA.height, 0u8);
+        wall.pixels_mut().fill_with(|| (128.0 + 40.0 * random.normal()).clamp(0.0, 255.0) as u8);
+        window.keyframes[last].images = vec![wall];
+        assert!(window.align_last(&members, &[0], 0));
+        window.note_agreement(&members);
+        assert_eq!(window.keyframes[last].agreed, []);
+        assert!(window.projected_into(last, &depth).is_empty(), "they say nothing of its depth");
+    }
+}
