@@ -42,6 +42,8 @@ const BYTES_OF_A_FRAME: f64 = 100.0;
 const LARGEST_STEP: f64 = 0.5;
 /// Who dies sooner after its start is started again later and later.
 const HASTY: Duration = Duration::from_secs(2);
+/// Files that have not changed for so long are counted.
+const SETTLED: Duration = Duration::from_secs(2);
 /// Keyframes that a mapper keeps for its successor; one more while it writes.
 const MOST_KEPT_KEYFRAMES: usize = 21;
 /// Memory that a process may take more than at the beginning: pages of other code, a fuller map.
@@ -161,6 +163,26 @@ fn files(rig: &Rig) -> BTreeMap<String, usize> {
     }
     assert!(keyframes <= 2 * MOST_KEPT_KEYFRAMES, "{keyframes} keyframes are kept of two rigs");
     counts
+}
+
+/// The files once nothing comes or goes any more: a process that has just started still makes some, and what the
+/// dead left is removed a little later.
+fn settled_files(rig: &Rig, watch: &mut Watch) -> BTreeMap<String, usize> {
+    let mut last = files(rig);
+    let mut since = Instant::now();
+    until("files that stay", || {
+        watch.look();
+        let now = files(rig);
+        if now != last {
+            (last, since) = (now, Instant::now());
+        }
+        (since.elapsed() > SETTLED).then(|| last.clone())
+    })
+}
+
+/// Whether there are no more files of any kind than before.
+fn has_no_more(now: &BTreeMap<String, usize>, before: &BTreeMap<String, usize>) -> bool {
+    now.iter().all(|(kind, count)| before.get(kind).is_some_and(|most| count <= most))
 }
 
 /// Shared memory that is taken, bytes.
@@ -329,7 +351,8 @@ fn soak(kills: usize, seed: u64) -> Vec<Pause> {
         let in_order = |rigged: &mut Rigged| (0..3).for_each(|index| drop(rigged.kill(&[index])));
         in_order(&mut rigged);
         meeting.wait(2, &mut rigged.watch);
-        let (files_before, shared_before) = (files(&rig), shared_bytes(&rig));
+        let files_before = settled_files(&rig, &mut rigged.watch);
+        let shared_before = shared_bytes(&rig);
         let memory_before = rigged.memory();
         meeting.wait(4, &mut rigged.watch);
         let pauses = rigged.soak(kills, seed);
@@ -337,11 +360,11 @@ fn soak(kills: usize, seed: u64) -> Vec<Pause> {
         meeting.wait(6, &mut rigged.watch);
         until("the leftovers of the dead to be gone", || {
             rigged.watch.look();
-            let is_same = files(&rig) == files_before;
-            if !is_same {
+            let is_gone = has_no_more(&files(&rig), &files_before);
+            if !is_gone {
                 std::thread::sleep(Duration::from_millis(200));
             }
-            is_same.then_some(())
+            is_gone.then_some(())
         });
         let (memory, shared) = (rigged.memory(), shared_bytes(&rig));
         let poses = rigged.watch.count as f64;
