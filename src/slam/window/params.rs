@@ -72,7 +72,7 @@ impl Default for WindowParams {
             max_first_iterations: 40,
             frame_lag: 1,
             max_waiting_frames: 200,
-            pass_every: 0,
+            pass_every: 30,
             pass_piece: 14,
             converged_decrement: 2.0,
             delay_frames: 3,
