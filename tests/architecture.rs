@@ -1,5 +1,5 @@
 //! The shape of the house: imports run down, `slam` is pure, foreign names stay in their room,
-//! files can be read in one sitting. The rule about imports is the table in the README.
+//! files can be read in one sitting. The rule about imports is the table in docs/development.md.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -66,10 +66,10 @@ fn sources(folder: &str) -> Vec<(String, Vec<String>)> {
         .collect()
 }
 
-/// The README's table `| room | may import | … |` as room → rooms.
+/// The table of docs/development.md, `| room | may import | … |` as room → rooms.
 fn allowed_imports() -> BTreeMap<String, Vec<String>> {
-    let readme = fs::read_to_string(root().join("README.md")).unwrap();
-    let rows = readme.lines().skip_while(|l| !l.starts_with("| room | may import")).skip(2);
+    let page = fs::read_to_string(root().join("docs/development.md")).unwrap();
+    let rows = page.lines().skip_while(|l| !l.starts_with("| room | may import")).skip(2);
     let table: BTreeMap<String, Vec<String>> = rows
         .take_while(|l| l.starts_with('|'))
         .map(|row| {
@@ -83,7 +83,7 @@ fn allowed_imports() -> BTreeMap<String, Vec<String>> {
             (words(cells[0]).concat(), words(cells[1]))
         })
         .collect();
-    assert_eq!(table.len(), 5, "the README's table of rooms: {table:?}");
+    assert_eq!(table.len(), 5, "the table of rooms in docs/development.md: {table:?}");
     table
 }
 
@@ -98,7 +98,7 @@ fn imports_run_down() {
         };
         let may = allowed
             .get(room)
-            .unwrap_or_else(|| panic!("{file}: {room} is not a room of the README's table"));
+            .unwrap_or_else(|| panic!("{file}: {room} is not in the table of docs/development.md"));
         for (number, line) in lines.iter().enumerate() {
             for (other, _) in
                 allowed.iter().filter(|(other, _)| *other != room && !may.contains(other))

@@ -57,8 +57,9 @@ struct Waiting {
 }
 
 impl MapKeeper {
-    /// Keeps the map of `camera` in a folder whose map `loaded` is already there, there under other numbers. Where frames may wait (`waits`) a save
-    /// waits for the one before, so that a kill costs a keyframe also where frames are faster than the disk.
+    /// Keeps the map of `camera` in a folder. `loaded` is the map that the folder holds already; its numbers of
+    /// keyframes may differ from those of the mapper. Where frames may wait (`waits`) a save waits for the one before,
+    /// so that a kill costs at most a keyframe where frames come faster than the disk writes.
     pub fn start(
         writer: MapWriter,
         camera: Intrinsics,
