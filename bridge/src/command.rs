@@ -1,0 +1,85 @@
+//! The command line: one short file a subcommand in `command/`.
+
+use std::error::Error;
+use std::io::{IsTerminal, Write};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use clap::{Args, Parser, Subcommand};
+use semidense::service::config::{Config, SYSTEM_FOLDER, file_for};
+use semidense::wire::place::Place;
+use tracing_subscriber::EnvFilter;
+
+/// Heading of the options that every command has.
+const COMMON: &str = "Common options";
+
+/// What a command may fail with: one line for the user.
+pub type CommandResult = Result<ExitCode, Box<dyn Error>>;
+
+#[derive(Debug, Parser)]
+#[command(
+    name = "semidense-bridge",
+    version,
+    about = "semidense out of shared memory: live page, recordings, ROS 2, a second machine",
+    after_help = "Each command reads the topics of a running instance; start one with `semidense run`.\n\
+                  `semidense view`, `record`, `ros2` and `zenoh` call this program.\n\n\
+                  Exit codes: 0 done, 1 failed, 2 wrong usage."
+)]
+struct CommandLine {
+    #[command(flatten)]
+    common: CommonArguments,
+    #[command(subcommand)]
+    command: Subcommands,
+}
+
+/// Options that every command has, as of `semidense`.
+#[derive(Debug, Clone, Args)]
+pub struct CommonArguments {
+    /// Configuration file [default: /etc/semidense/NAME.toml for the instance NAME, else
+    /// /etc/semidense/semidense.toml, if it exists]
+    #[arg(long, global = true, help_heading = COMMON, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// Name of the instance [default: semidense]
+    #[arg(long, global = true, help_heading = COMMON, value_name = "NAME")]
+    pub instance: Option<String>,
+    /// What to log on standard error: error, warn, info, debug or trace
+    #[arg(long, global = true, help_heading = COMMON, value_name = "LEVEL", default_value = "warn")]
+    pub log: String,
+}
+
+impl CommonArguments {
+    /// Where the instance lives, by command line, configuration and environment.
+    pub fn place(&self) -> Result<Place, Box<dyn Error>> {
+        let named: Vec<String> =
+            self.instance.iter().map(|name| format!("instance={name:?}")).collect();
+        let usual = || file_for(Path::new(SYSTEM_FOLDER), self.instance.as_deref());
+        let config = Config::load(self.config.clone().or_else(usual).as_deref(), &named)?;
+        Ok(Place::new(&config.instance, &config.root)?)
+    }
+}
+
+#[derive(Debug, Subcommand)]
+enum Subcommands {}
+
+/// Parses the command line and runs the chosen subcommand.
+pub fn main() -> ExitCode {
+    let line = CommandLine::parse();
+    run(line).unwrap_or_else(|error| {
+        let line = error.to_string().split_whitespace().collect::<Vec<_>>().join(" ");
+        // Standard error may be closed; there is nobody else to tell.
+        let _ = writeln!(std::io::stderr(), "error: {line}");
+        ExitCode::FAILURE
+    })
+}
+
+fn run(line: CommandLine) -> CommandResult {
+    let filter = EnvFilter::try_new(&line.common.log)
+        .map_err(|error| format!("--log {}: {error}", line.common.log))?;
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr)
+        .with_ansi(std::io::stderr().is_terminal())
+        .with_target(false)
+        .init();
+    match line.command {}
+}
