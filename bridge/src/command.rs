@@ -1,5 +1,7 @@
 //! The command line: one short file a subcommand in `command/`.
 
+pub mod view;
+
 use std::error::Error;
 use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
@@ -59,7 +61,9 @@ impl CommonArguments {
 }
 
 #[derive(Debug, Subcommand)]
-enum Subcommands {}
+enum Subcommands {
+    View(view::ViewArguments),
+}
 
 /// Parses the command line and runs the chosen subcommand.
 pub fn main() -> ExitCode {
@@ -81,5 +85,7 @@ fn run(line: CommandLine) -> CommandResult {
         .with_ansi(std::io::stderr().is_terminal())
         .with_target(false)
         .init();
-    match line.command {}
+    match line.command {
+        Subcommands::View(arguments) => view::run(&line.common, &arguments),
+    }
 }

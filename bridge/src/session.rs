@@ -254,7 +254,9 @@ impl Ports {
             let poses: Result<Vec<_>, _> =
                 newest.payload().iter().map(keyframe_pose_from_message).collect();
             match poses {
-                Ok(poses) => take(Event::Graph(Arc::new(Graph { header: *newest.header(), poses }))),
+                Ok(poses) => {
+                    take(Event::Graph(Arc::new(Graph { header: *newest.header(), poses })))
+                }
                 Err(_) => *refused += 1,
             }
         }
@@ -272,7 +274,9 @@ impl Ports {
         while let Some(message) = self.poses.receive()? {
             for message in message.payload() {
                 match pose_from_message(message) {
-                    Ok(estimate) => take(Event::Pose(Box::new(Pose { message: *message, estimate }))),
+                    Ok(estimate) => {
+                        take(Event::Pose(Box::new(Pose { message: *message, estimate })))
+                    }
                     Err(_) => *refused += 1,
                 }
             }

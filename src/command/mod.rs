@@ -4,6 +4,7 @@
 //! not understood, 3 nothing was tracked (one line says why), 130 interrupted (results so far are written).
 
 pub mod bench;
+pub mod bridge;
 pub mod cameras;
 pub mod capture;
 pub mod doctor;
@@ -165,6 +166,14 @@ enum Subcommands {
     Bench(bench::BenchArguments),
     Doctor(doctor::DoctorArguments),
     Cameras(cameras::CamerasArguments),
+    /// Serve a live web page: camera, map, state, latencies [in the package semidense-bridge]
+    View(bridge::BridgeArguments),
+    /// Record images, poses, keyframes and health into an MCAP file [in the package semidense-bridge]
+    Record(bridge::BridgeArguments),
+    /// Publish to ROS 2 without ROS being installed [in the package semidense-bridge]
+    Ros2(bridge::BridgeArguments),
+    /// Send to another machine, or receive there, over Zenoh [in the package semidense-bridge]
+    Zenoh(bridge::BridgeArguments),
 }
 
 /// The command line as `clap` knows it: what man page and shell completions are made of.
@@ -226,6 +235,10 @@ fn run_subcommand(line: CommandLine, log: &ErrorLog) -> CommandResult {
         Subcommands::Cameras(arguments) => cameras::run(arguments),
         Subcommands::Doctor(arguments) => doctor::run(&config, arguments),
         Subcommands::Bench(arguments) => bench::run(&config, &line.common, log, arguments),
+        Subcommands::View(arguments) => bridge::run(&line.common, "view", &arguments),
+        Subcommands::Record(arguments) => bridge::run(&line.common, "record", &arguments),
+        Subcommands::Ros2(arguments) => bridge::run(&line.common, "ros2", &arguments),
+        Subcommands::Zenoh(arguments) => bridge::run(&line.common, "zenoh", &arguments),
     };
     tidy_up(&place);
     outcome

@@ -1,0 +1,110 @@
+//! `semidense view`, `record`, `ros2`, `zenoh`: hand over to `semidense-bridge`, a program and package of its own.
+
+use std::ffi::{OsStr, OsString};
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use clap::Args;
+
+use crate::command::{CommandResult, CommonArguments};
+
+/// The program that they are in.
+const PROGRAM: &str = "semidense-bridge";
+
+/// What goes to the program as it stands: its own command line explains and checks it.
+#[derive(Debug, Args)]
+#[command(disable_help_flag = true)]
+pub struct BridgeArguments {
+    /// Arguments of the command; `--help` explains them
+    #[arg(trailing_var_arg = true, allow_hyphen_values = true, value_name = "ARGUMENTS")]
+    arguments: Vec<OsString>,
+}
+
+/// Why the program cannot be handed over to.
+#[derive(Debug, thiserror::Error)]
+pub enum BridgeError {
+    /// It is nowhere.
+    #[error(
+        "`semidense {command}` is part of {PROGRAM}, which is neither beside {own} nor on the PATH: install the package {PROGRAM} (`apt install ./semidense-bridge_*.deb`), or build it with `cargo build --release -p {PROGRAM}`"
+    )]
+    Missing {
+        /// The subcommand that was wanted.
+        command: &'static str,
+        /// This program.
+        own: PathBuf,
+    },
+    /// An option that it does not have.
+    #[error(
+        "`semidense {command}` has no {option}: write it into a configuration file and name that with --config"
+    )]
+    Option {
+        /// The subcommand.
+        command: &'static str,
+        /// The option.
+        option: &'static str,
+    },
+    /// It does not start.
+    #[error("cannot start {program}: {source}")]
+    Start {
+        /// The program.
+        program: PathBuf,
+        /// What the system says.
+        source: std::io::Error,
+    },
+}
+
+/// Becomes `semidense-bridge COMMAND ARGUMENTS`, with the options that every command has.
+pub fn run(
+    common: &CommonArguments,
+    command: &'static str,
+    arguments: &BridgeArguments,
+) -> CommandResult {
+    if !common.set.is_empty() {
+        return Err(BridgeError::Option { command, option: "--set" }.into());
+    }
+    let own = std::env::current_exe().unwrap_or_else(|_| PathBuf::from("semidense"));
+    let program = program(&own).ok_or(BridgeError::Missing { command, own })?;
+    let source = Command::new(&program)
+        .args(handed_on(common))
+        .arg(command)
+        .args(&arguments.arguments)
+        .exec();
+    Err(BridgeError::Start { program, source }.into())
+}
+
+/// The program: beside our own, which was installed or built with it, else on the path.
+pub fn program(own: &Path) -> Option<PathBuf> {
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    let beside = own.parent().map(Path::to_owned);
+    beside
+        .into_iter()
+        .chain(std::env::split_paths(&path))
+        .map(|f| f.join(PROGRAM))
+        .find(|p| p.is_file())
+}
+
+/// The options that every command of either program has.
+pub fn handed_on(common: &CommonArguments) -> Vec<OsString> {
+    let mut arguments: Vec<OsString> = Vec::new();
+    let mut push = |option: &str, value: &OsStr| arguments.extend([option.into(), value.into()]);
+    push("--log", common.log.as_ref());
+    common.config.iter().for_each(|file| push("--config", file.as_ref()));
+    common.instance.iter().for_each(|name| push("--instance", name.as_ref()));
+    arguments
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_program_beside_ours_comes_first() {
+        let folder = tempfile::tempdir().unwrap();
+        let own = folder.path().join("semidense");
+        let beside = folder.path().join(PROGRAM);
+        assert_ne!(program(&own), Some(beside.clone()));
+        std::fs::write(&beside, "").unwrap();
+        assert_eq!(program(&own), Some(beside));
+    }
+}
