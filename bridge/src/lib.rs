@@ -4,4 +4,5 @@
 //! [`session`] reads the topics of a running instance; every way out is a folder beside it.
 
 pub mod command;
+pub mod ros;
 pub mod session;

@@ -1,0 +1,178 @@
+//! Our axes and ROS's, and the covariance of a pose in them.
+//!
+//! Ours are those of the first camera: x right, y down, z forward. The frames `map` and `odom` have REP 103's: x
+//! forward, y left, z up. Both are as the first camera stood: `z` is up as far as that looked straight ahead. Lengths
+//! are map units. A camera keeps its own axes, which in ROS are those of an optical frame.
+
+use nalgebra::{Matrix3, Matrix6, UnitQuaternion, Vector3, Vector6};
+use semidense::slam::geometry::se3::{SE3, hat};
+
+use crate::ros::message;
+
+/// The rotation to REP 103's axes from ours: x forward is our z, y left our -x, z up our -y. As a quaternion it is
+/// exact, so a pose keeps all its digits.
+pub fn ros_from_world() -> SE3 {
+    let half = 0.5;
+    let quaternion = nalgebra::Quaternion::new(half, -half, half, -half);
+    SE3 { rotation: UnitQuaternion::new_unchecked(quaternion), translation: Vector3::zeros() }
+}
+
+/// A pose as a message.
+pub fn pose_message(pose: &SE3) -> message::Pose {
+    let [x, y, z, w] = pose.quaternion_xyzw();
+    let orientation = message::Quaternion { x, y, z, w };
+    message::Pose { position: vector_message(&pose.translation), orientation }
+}
+
+/// A transform as a message.
+pub fn transform_message(transform: &SE3) -> message::Transform {
+    let message::Pose { position, orientation } = pose_message(transform);
+    message::Transform { translation: position, rotation: orientation }
+}
+
+/// A vector as a message.
+pub fn vector_message(vector: &Vector3<f64>) -> message::Vector3 {
+    message::Vector3 { x: vector.x, y: vector.y, z: vector.z }
+}
+
+/// The matrix of an upper triangle, row-major.
+fn matrix(upper: &[f64; 21]) -> Matrix6<f64> {
+    let mut entries = upper.iter();
+    let mut matrix = Matrix6::zeros();
+    for row in 0..6 {
+        for column in row..6 {
+            let entry = entries.next().copied().unwrap_or_default();
+            matrix[(row, column)] = entry;
+            matrix[(column, row)] = entry;
+        }
+    }
+    matrix
+}
+
+/// A covariance as ROS has it: row-major. Symmetric to the last digit, as a filter may check.
+fn row_major(covariance: &Matrix6<f64>) -> [f64; 36] {
+    let symmetric = (covariance + covariance.transpose()) * 0.5;
+    std::array::from_fn(|at| symmetric[(at / 6, at % 6)])
+}
+
+/// Six numbers, two of three axes each, each turned by `rotation`.
+fn both_turned(rotation: &Matrix3<f64>) -> Matrix6<f64> {
+    let mut both = Matrix6::zeros();
+    both.fixed_view_mut::<3, 3>(0, 0).copy_from(rotation);
+    both.fixed_view_mut::<3, 3>(3, 3).copy_from(rotation);
+    both
+}
+
+/// Covariance of position and fixed-axis rotation in `map`, of the covariance of the left increment ξ of
+/// `map_from_camera`. That turns about the map's origin: a position p errs by ξ_t + ξ_ω × p.
+pub fn map_covariance(map_from_camera: &SE3, left_increment: &[f64; 21]) -> [f64; 36] {
+    let mut error_from_increment = Matrix6::identity();
+    error_from_increment
+        .fixed_view_mut::<3, 3>(0, 3)
+        .copy_from(&-hat(&map_from_camera.translation));
+    let jacobian = both_turned(&ros_from_world().rotation_matrix()) * error_from_increment;
+    row_major(&(jacobian * matrix(left_increment) * jacobian.transpose()))
+}
+
+/// Covariance of position and fixed-axis rotation in `odom`, of the covariance of the left increment ξ of
+/// `current_from_keyframe`, whose translation is in keyframe units: `unit` in the world. The camera then stands at
+/// `world_from_camera · exp(-ξ)`. The place of the keyframe itself, and so drift, is not in it.
+pub fn odometry_covariance(
+    world_from_camera: &SE3,
+    unit: f64,
+    left_increment: &[f64; 21],
+) -> [f64; 36] {
+    let ros_from_camera = (ros_from_world() * *world_from_camera).rotation_matrix();
+    let scale = Vector6::new(unit, unit, unit, 1.0, 1.0, 1.0);
+    // The sign of the increment does not matter to its covariance.
+    let jacobian = both_turned(&ros_from_camera) * Matrix6::from_diagonal(&scale);
+    row_major(&(jacobian * matrix(left_increment) * jacobian.transpose()))
+}
+
+/// The covariance of velocities in the camera's axes, linear then angular: only its form changes.
+pub fn velocity_covariance(upper: &[f64; 21]) -> [f64; 36] {
+    row_major(&matrix(upper))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A covariance without symmetries of its own.
+    fn covariance() -> ([f64; 21], Matrix6<f64>) {
+        let root = Matrix6::from_fn(|r, c| ((r * 7 + c * 3) % 5) as f64 * 0.3 - 0.4);
+        let full = root * root.transpose() + Matrix6::identity() * 0.1;
+        let pairs = (0..6).flat_map(|r| (r..6).map(move |c| (r, c)));
+        let upper: Vec<f64> = pairs.map(|(r, c)| full[(r, c)]).collect();
+        (upper.try_into().unwrap(), full)
+    }
+
+    fn somewhere() -> SE3 {
+        SE3::exp(&Vector6::new(3.0, -2.0, 5.0, 0.4, -0.9, 0.3))
+    }
+
+    /// What ROS measures between two poses: position, and the rotation about fixed axes that takes one orientation to
+    /// the other.
+    fn ros_error(from: &SE3, to: &SE3) -> Vector6<f64> {
+        let (from, to) = (ros_from_world() * *from, ros_from_world() * *to);
+        let position = to.translation - from.translation;
+        let rotation = (to.rotation * from.rotation.inverse()).scaled_axis();
+        Vector6::new(position.x, position.y, position.z, rotation.x, rotation.y, rotation.z)
+    }
+
+    /// The covariance in ROS of `full`, by differences: `moved` is the pose after an increment.
+    fn by_differences(moved: impl Fn(&Vector6<f64>) -> SE3, full: &Matrix6<f64>) -> Matrix6<f64> {
+        const STEP: f64 = 1e-6;
+        let mut jacobian = Matrix6::zeros();
+        for column in 0..6 {
+            let mut step = Vector6::zeros();
+            step[column] = STEP;
+            let difference = ros_error(&moved(&-step), &moved(&step)) / (2.0 * STEP);
+            jacobian.set_column(column, &difference);
+        }
+        jacobian * full * jacobian.transpose()
+    }
+
+    fn assert_same(found: &[f64; 36], expected: &Matrix6<f64>) {
+        for (at, found) in found.iter().enumerate() {
+            let expected = expected[(at / 6, at % 6)];
+            assert!((found - expected).abs() < 1e-7 * expected.abs().max(1.0), "{at}: {found}");
+        }
+    }
+
+    #[test]
+    fn axes_are_forward_left_up() {
+        let turned = |x, y, z| ros_from_world() * Vector3::new(x, y, z);
+        assert_eq!(turned(0.0, 0.0, 1.0), Vector3::x());
+        assert_eq!(turned(-1.0, 0.0, 0.0), Vector3::y());
+        assert_eq!(turned(0.0, -1.0, 0.0), Vector3::z());
+    }
+
+    #[test]
+    fn the_covariance_in_the_map_is_that_of_small_displacements() {
+        let (upper, full) = covariance();
+        let expected = by_differences(|xi| SE3::exp(xi) * somewhere(), &full);
+        assert_same(&map_covariance(&somewhere(), &upper), &expected);
+    }
+
+    #[test]
+    fn the_covariance_of_odometry_is_that_of_small_displacements() {
+        const UNIT: f64 = 2.5;
+        let (upper, full) = covariance();
+        let world_from_keyframe = SE3::exp(&Vector6::new(-1.0, 2.0, 0.5, -0.7, 0.2, 1.1));
+        let current_from_keyframe = SE3::exp(&Vector6::new(0.3, 0.1, -0.2, 0.1, 0.2, -0.3));
+        let placed = |xi: &Vector6<f64>| {
+            let mut keyframe_from_camera = (SE3::exp(xi) * current_from_keyframe).inverse();
+            keyframe_from_camera.translation *= UNIT;
+            world_from_keyframe * keyframe_from_camera
+        };
+        let expected = by_differences(placed, &full);
+        assert_same(&odometry_covariance(&placed(&Vector6::zeros()), UNIT, &upper), &expected);
+    }
+
+    #[test]
+    fn a_velocity_keeps_its_axes() {
+        let (upper, full) = covariance();
+        assert_same(&velocity_covariance(&upper), &full);
+    }
+}

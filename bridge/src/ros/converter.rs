@@ -1,0 +1,209 @@
+//! From what a session reads to ROS's messages.
+
+use std::collections::HashMap;
+
+use semidense::slam::keyframe::Keyframe;
+use semidense::wire::message::{FrameHeader, HealthMessage, PoseMessage};
+
+use crate::ros::axes::{
+    map_covariance, odometry_covariance, pose_message, ros_from_world, transform_message,
+};
+use crate::ros::diagnostics::diagnostics;
+use crate::ros::frame_ids::FrameIds;
+use crate::ros::keyframe_cloud::keyframe_cloud;
+use crate::ros::message::{
+    CameraInfo, DiagnosticArray, Header, Image, Odometry, PointCloud2, PoseArray,
+    PoseWithCovariance, PoseWithCovarianceStamped, RegionOfInterest, TfMessage, Time,
+    TransformStamped, Twist, TwistWithCovariance,
+};
+use crate::session::{Event, Frame, Graph, Pose};
+
+/// Variance of a velocity that is not known, in ROS's way of saying so: the first of the covariance.
+const UNKNOWN: f64 = -1.0;
+
+/// The messages of a pose that is claimed.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PoseMessages {
+    /// The best estimate, in the map.
+    pub pose: PoseWithCovarianceStamped,
+    /// Odometry.
+    pub odometry: Odometry,
+    /// map → odom → camera.
+    pub transforms: TfMessage,
+}
+
+/// Makes ROS's messages of one instance. It must see every event, in order, by [`Converter::observe`].
+#[derive(Debug, Clone)]
+pub struct Converter {
+    instance: String,
+    frames: FrameIds,
+    /// The unit of each keyframe in the world.
+    units: HashMap<u64, f64>,
+    /// From the stamps of frames to CLOCK_REALTIME, nanoseconds.
+    realtime_from_capture: Option<i64>,
+}
+
+impl Converter {
+    /// For an instance, with its frames' names.
+    pub fn new(instance: &str, frames: FrameIds) -> Self {
+        let instance = instance.to_owned();
+        Self { instance, frames, units: HashMap::new(), realtime_from_capture: None }
+    }
+
+    /// Takes what later messages need: units of keyframes, clocks.
+    pub fn observe(&mut self, event: &Event) {
+        match event {
+            Event::Joined => {
+                self.units.clear();
+                self.realtime_from_capture = None;
+            }
+            Event::Keyframe(keyframe) => {
+                self.units.insert(keyframe.keyframe_id, keyframe.world_from_keyframe.scale);
+            }
+            // Of keyframes from before the session only the map's unit is known, which is the world's but for the
+            // corrections of the scale since.
+            Event::Graph(graph) => graph.poses.iter().for_each(|pose| {
+                self.units.entry(pose.keyframe_id).or_insert(pose.map_from_keyframe.scale);
+            }),
+            Event::Frame(frame) => {
+                self.set_clock(frame.header.capture_nanos, frame_realtime(frame))
+            }
+            Event::Pose(pose) => self.set_clock(pose.message.capture_nanos, pose_realtime(pose)),
+            Event::Left | Event::Health(..) | Event::Adjustment(_) => {}
+        }
+    }
+
+    fn set_clock(&mut self, capture_nanos: i64, realtime_nanos: Option<i64>) {
+        if let Some(realtime_nanos) = realtime_nanos {
+            self.realtime_from_capture = Some(realtime_nanos.saturating_sub(capture_nanos));
+        }
+    }
+
+    /// The stamp of a frame in ROS: CLOCK_REALTIME of its exposure where known, else the stamp of its source.
+    pub fn stamp(&self, capture_nanos: i64) -> Time {
+        let offset = self.realtime_from_capture.unwrap_or_default();
+        Time::from_nanos(capture_nanos.saturating_add(offset))
+    }
+
+    fn header(&self, stamp: Time, frame_id: &str) -> Header {
+        Header { stamp, frame_id: frame_id.to_owned() }
+    }
+
+    /// The messages of a pose; `None` where it is not claimed (initializing, lost), or on a keyframe whose unit is not
+    /// known yet.
+    pub fn pose(&self, pose: &Pose) -> Option<PoseMessages> {
+        let Pose { message, estimate } = pose;
+        if !estimate.state.is_tracked() {
+            return None;
+        }
+        let unit = *self.units.get(&estimate.keyframe_id)?;
+        let realtime = pose_realtime(pose).map(Time::from_nanos);
+        let stamp = realtime.unwrap_or_else(|| self.stamp(message.capture_nanos));
+        let (in_map, in_world) = (estimate.map_from_camera, estimate.world_from_camera);
+        let map_from_camera = ros_from_world() * in_map;
+        let odom_from_camera = ros_from_world() * in_world;
+        let map_pose = PoseWithCovariance {
+            pose: pose_message(&map_from_camera),
+            covariance: map_covariance(&in_map, &estimate.map_covariance),
+        };
+        let odometry_pose = PoseWithCovariance {
+            pose: pose_message(&odom_from_camera),
+            covariance: odometry_covariance(&in_world, unit, &estimate.covariance),
+        };
+        let transform = |parent: &str, child: &str, parent_from_child| TransformStamped {
+            header: self.header(stamp, parent),
+            child_frame_id: child.to_owned(),
+            transform: transform_message(&parent_from_child),
+        };
+        let FrameIds { map, odom, camera } = &self.frames;
+        let map_from_odom = map_from_camera * odom_from_camera.inverse();
+        let transforms =
+            vec![transform(map, odom, map_from_odom), transform(odom, camera, odom_from_camera)];
+        Some(PoseMessages {
+            pose: PoseWithCovarianceStamped { header: self.header(stamp, map), pose: map_pose },
+            odometry: Odometry {
+                header: self.header(stamp, odom),
+                child_frame_id: camera.clone(),
+                pose: odometry_pose,
+                twist: twist(message),
+            },
+            transforms: TfMessage { transforms },
+        })
+    }
+
+    /// The depth of a keyframe as points in the map.
+    pub fn points(&self, keyframe: &Keyframe) -> PointCloud2 {
+        let stamp = self.stamp(keyframe.capture_nanos);
+        keyframe_cloud(keyframe, self.header(stamp, &self.frames.map))
+    }
+
+    /// Poses of all keyframes in the map, in the order of their ids; `stamp` is when the graph was read.
+    pub fn keyframes(&self, graph: &Graph, stamp: Time) -> PoseArray {
+        let place = |pose: &semidense::slam::keyframe::KeyframePose| {
+            pose_message(&(ros_from_world() * pose.map_from_keyframe.rigid))
+        };
+        let poses = graph.poses.iter().map(place).collect();
+        PoseArray { header: self.header(stamp, &self.frames.map), poses }
+    }
+
+    /// Stamp and optical frame of an image.
+    pub fn image_header(&self, frame: &Frame) -> Header {
+        let realtime = frame_realtime(frame).map(Time::from_nanos);
+        let stamp = realtime.unwrap_or_else(|| self.stamp(frame.header.capture_nanos));
+        self.header(stamp, &self.frames.camera)
+    }
+
+    /// The image, as `mono8`.
+    pub fn image(&self, frame: &Frame) -> Image {
+        let FrameHeader { width, height, stride, .. } = frame.header;
+        Image {
+            header: self.image_header(frame),
+            height,
+            width,
+            encoding: "mono8".to_owned(),
+            is_bigendian: 0,
+            step: stride,
+            data: frame.pixels.to_vec(),
+        }
+    }
+
+    /// The camera of the image: rectified, so without a lens.
+    pub fn camera_info(&self, frame: &Frame) -> CameraInfo {
+        let FrameHeader { width, height, intrinsics: [fx, fy, cx, cy], .. } = frame.header;
+        CameraInfo {
+            header: self.image_header(frame),
+            height,
+            width,
+            distortion_model: "plumb_bob".to_owned(),
+            d: vec![0.0; 5],
+            k: [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
+            r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+            p: [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
+            binning_x: 0,
+            binning_y: 0,
+            roi: RegionOfInterest::default(),
+        }
+    }
+
+    /// Health of the process `owner`; `stamp` is when it was read.
+    pub fn diagnostics(&self, owner: &str, health: &HealthMessage, stamp: Time) -> DiagnosticArray {
+        diagnostics(&self.instance, owner, health, self.header(stamp, ""))
+    }
+}
+
+/// CLOCK_REALTIME of a frame's exposure, where it is known.
+fn frame_realtime(_frame: &Frame) -> Option<i64> {
+    None
+}
+
+/// CLOCK_REALTIME of the exposure of a pose's frame, where it is known.
+fn pose_realtime(_pose: &Pose) -> Option<i64> {
+    None
+}
+
+/// Velocities of the camera in its own axes.
+fn twist(_message: &PoseMessage) -> TwistWithCovariance {
+    let mut covariance = [0.0; 36];
+    covariance[0] = UNKNOWN;
+    TwistWithCovariance { twist: Twist::default(), covariance }
+}

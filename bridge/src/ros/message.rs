@@ -1,0 +1,344 @@
+//! ROS 2's messages, field by field as their definitions have them.
+
+use serde::{Deserialize, Serialize};
+use serde_big_array::BigArray;
+
+/// A message with a ROS type.
+pub trait RosMessage: Serialize {
+    /// Its type: package and name, as `nav_msgs/Odometry`.
+    const TYPE: &'static str;
+}
+
+/// `builtin_interfaces/Time`: an instant, of CLOCK_REALTIME where it is known.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct Time {
+    /// Seconds.
+    pub sec: i32,
+    /// Nanoseconds after them.
+    pub nanosec: u32,
+}
+
+impl Time {
+    /// Nanoseconds in a second.
+    const SECOND: i64 = 1_000_000_000;
+
+    /// Of nanoseconds; what a `Time` cannot hold becomes its nearest end.
+    pub fn from_nanos(nanos: i64) -> Self {
+        let seconds = nanos.div_euclid(Self::SECOND);
+        match i32::try_from(seconds) {
+            Ok(sec) => Self { sec, nanosec: nanos.rem_euclid(Self::SECOND) as u32 },
+            Err(_) if seconds > 0 => Self { sec: i32::MAX, nanosec: 999_999_999 },
+            Err(_) => Self { sec: i32::MIN, nanosec: 0 },
+        }
+    }
+
+    /// In nanoseconds.
+    pub fn nanos(self) -> i64 {
+        i64::from(self.sec) * Self::SECOND + i64::from(self.nanosec)
+    }
+}
+
+/// `std_msgs/Header`.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct Header {
+    /// When what the message tells was.
+    pub stamp: Time,
+    /// The frame that its numbers are in.
+    pub frame_id: String,
+}
+
+/// `geometry_msgs/Point` and `geometry_msgs/Vector3`, which have the same fields.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct Vector3 {
+    /// Along x.
+    pub x: f64,
+    /// Along y.
+    pub y: f64,
+    /// Along z.
+    pub z: f64,
+}
+
+/// `geometry_msgs/Quaternion`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Quaternion {
+    /// x.
+    pub x: f64,
+    /// y.
+    pub y: f64,
+    /// z.
+    pub z: f64,
+    /// The real part.
+    pub w: f64,
+}
+
+impl Default for Quaternion {
+    fn default() -> Self {
+        Self { x: 0.0, y: 0.0, z: 0.0, w: 1.0 }
+    }
+}
+
+/// `geometry_msgs/Pose`.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct Pose {
+    /// Position.
+    pub position: Vector3,
+    /// Orientation.
+    pub orientation: Quaternion,
+}
+
+/// `geometry_msgs/PoseWithCovariance`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PoseWithCovariance {
+    /// The pose.
+    pub pose: Pose,
+    /// Row-major 6×6: position, then rotation about the fixed x, y and z axes of the header's frame.
+    #[serde(with = "BigArray")]
+    pub covariance: [f64; 36],
+}
+
+/// `geometry_msgs/PoseWithCovarianceStamped`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PoseWithCovarianceStamped {
+    /// Stamp and frame of the pose.
+    pub header: Header,
+    /// The pose.
+    pub pose: PoseWithCovariance,
+}
+
+/// `geometry_msgs/Twist`.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct Twist {
+    /// Velocity.
+    pub linear: Vector3,
+    /// Angular velocity, rad/s.
+    pub angular: Vector3,
+}
+
+/// `geometry_msgs/TwistWithCovariance`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TwistWithCovariance {
+    /// The velocities.
+    pub twist: Twist,
+    /// Row-major 6×6: linear, then angular.
+    #[serde(with = "BigArray")]
+    pub covariance: [f64; 36],
+}
+
+/// `nav_msgs/Odometry`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Odometry {
+    /// Stamp, and the frame of the pose.
+    pub header: Header,
+    /// The frame of the twist, and what the pose is the pose of.
+    pub child_frame_id: String,
+    /// The pose.
+    pub pose: PoseWithCovariance,
+    /// The velocities.
+    pub twist: TwistWithCovariance,
+}
+
+/// `geometry_msgs/PoseArray`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PoseArray {
+    /// Stamp and frame of the poses.
+    pub header: Header,
+    /// The poses.
+    pub poses: Vec<Pose>,
+}
+
+/// `geometry_msgs/Transform`.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct Transform {
+    /// Translation.
+    pub translation: Vector3,
+    /// Rotation.
+    pub rotation: Quaternion,
+}
+
+/// `geometry_msgs/TransformStamped`: where the child is in the header's frame.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TransformStamped {
+    /// Stamp and the parent.
+    pub header: Header,
+    /// The child.
+    pub child_frame_id: String,
+    /// `parent_from_child`.
+    pub transform: Transform,
+}
+
+/// `tf2_msgs/TFMessage`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TfMessage {
+    /// The transforms.
+    pub transforms: Vec<TransformStamped>,
+}
+
+/// `sensor_msgs/PointField`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PointField {
+    /// Its name.
+    pub name: String,
+    /// Bytes from the start of a point.
+    pub offset: u32,
+    /// The type of its numbers: [`PointField::FLOAT32`] and others.
+    pub datatype: u8,
+    /// How many numbers it has.
+    pub count: u32,
+}
+
+impl PointField {
+    /// Datatype of a 32-bit float.
+    pub const FLOAT32: u8 = 7;
+}
+
+/// `sensor_msgs/PointCloud2`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PointCloud2 {
+    /// Stamp and frame of the points.
+    pub header: Header,
+    /// Rows: 1 where the points have no order.
+    pub height: u32,
+    /// Points in a row.
+    pub width: u32,
+    /// What a point has.
+    pub fields: Vec<PointField>,
+    /// Whether numbers are big endian.
+    pub is_bigendian: bool,
+    /// Bytes of a point.
+    pub point_step: u32,
+    /// Bytes of a row.
+    pub row_step: u32,
+    /// The points.
+    #[serde(with = "serde_bytes")]
+    pub data: Vec<u8>,
+    /// Whether every number is finite.
+    pub is_dense: bool,
+}
+
+/// `sensor_msgs/Image`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Image {
+    /// Stamp and optical frame.
+    pub header: Header,
+    /// Height, pixels.
+    pub height: u32,
+    /// Width, pixels.
+    pub width: u32,
+    /// What a pixel is, as `mono8`.
+    pub encoding: String,
+    /// Whether numbers are big endian.
+    pub is_bigendian: u8,
+    /// Bytes from row to row.
+    pub step: u32,
+    /// The pixels.
+    #[serde(with = "serde_bytes")]
+    pub data: Vec<u8>,
+}
+
+/// `sensor_msgs/CompressedImage`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct CompressedImage {
+    /// Stamp and optical frame.
+    pub header: Header,
+    /// `jpeg` or `png`.
+    pub format: String,
+    /// The file.
+    #[serde(with = "serde_bytes")]
+    pub data: Vec<u8>,
+}
+
+/// `sensor_msgs/RegionOfInterest`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct RegionOfInterest {
+    /// First column.
+    pub x_offset: u32,
+    /// First row.
+    pub y_offset: u32,
+    /// Rows, 0 for all.
+    pub height: u32,
+    /// Columns, 0 for all.
+    pub width: u32,
+    /// Whether the region is to be rectified.
+    pub do_rectify: bool,
+}
+
+/// `sensor_msgs/CameraInfo`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct CameraInfo {
+    /// Stamp and optical frame.
+    pub header: Header,
+    /// Height of the image, pixels.
+    pub height: u32,
+    /// Width of the image, pixels.
+    pub width: u32,
+    /// `plumb_bob`, `rational_polynomial` or `equidistant`.
+    pub distortion_model: String,
+    /// Coefficients of the lens.
+    pub d: Vec<f64>,
+    /// Intrinsics of the raw image, row-major 3×3.
+    pub k: [f64; 9],
+    /// Rectification, row-major 3×3.
+    pub r: [f64; 9],
+    /// Projection of the rectified image, row-major 3×4.
+    pub p: [f64; 12],
+    /// Columns that one pixel is of, 0 for one.
+    pub binning_x: u32,
+    /// Rows that one pixel is of, 0 for one.
+    pub binning_y: u32,
+    /// The part of the sensor that the image is.
+    pub roi: RegionOfInterest,
+}
+
+/// `diagnostic_msgs/KeyValue`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct KeyValue {
+    /// What it is, with its unit.
+    pub key: String,
+    /// Its value.
+    pub value: String,
+}
+
+/// `diagnostic_msgs/DiagnosticStatus`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DiagnosticStatus {
+    /// 0 all right, 1 a warning, 2 an error, 3 nothing heard.
+    pub level: u8,
+    /// Whose it is.
+    pub name: String,
+    /// The state in a few words.
+    pub message: String,
+    /// The device.
+    pub hardware_id: String,
+    /// Figures.
+    pub values: Vec<KeyValue>,
+}
+
+/// `diagnostic_msgs/DiagnosticArray`.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DiagnosticArray {
+    /// When.
+    pub header: Header,
+    /// One for each process.
+    pub status: Vec<DiagnosticStatus>,
+}
+
+/// Names the types of the messages that have a topic.
+macro_rules! types {
+    ($($message:ident $name:literal),* $(,)?) => {$(
+        impl RosMessage for $message {
+            const TYPE: &'static str = $name;
+        }
+    )*};
+}
+
+types! {
+    PoseWithCovarianceStamped "geometry_msgs/PoseWithCovarianceStamped",
+    Odometry "nav_msgs/Odometry",
+    PoseArray "geometry_msgs/PoseArray",
+    TfMessage "tf2_msgs/TFMessage",
+    PointCloud2 "sensor_msgs/PointCloud2",
+    Image "sensor_msgs/Image",
+    CompressedImage "sensor_msgs/CompressedImage",
+    CameraInfo "sensor_msgs/CameraInfo",
+    DiagnosticArray "diagnostic_msgs/DiagnosticArray",
+}

@@ -1,0 +1,124 @@
+//! The topics, with the quality of service that ROS users expect.
+
+use crate::ros::message::{
+    CameraInfo, CompressedImage, DiagnosticArray, Image, Odometry, PointCloud2, PoseArray,
+    PoseWithCovarianceStamped, RosMessage, TfMessage,
+};
+
+/// Whether messages are sent again until they arrive.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Reliability {
+    /// Yes.
+    Reliable,
+    /// No: the next one is newer anyway.
+    BestEffort,
+}
+
+/// What a late subscriber gets.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Durability {
+    /// What comes from then on.
+    Volatile,
+    /// The last message too.
+    TransientLocal,
+}
+
+/// A topic of ROS.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RosTopic {
+    /// Its name; one that begins with `/` is the same for every instance, others are below the instance's name.
+    pub name: &'static str,
+    /// Its type, as `nav_msgs/Odometry`.
+    pub message_type: &'static str,
+    /// Whether messages are sent again until they arrive.
+    pub reliability: Reliability,
+    /// What a late subscriber gets.
+    pub durability: Durability,
+    /// Messages that a slow subscriber may be behind.
+    pub depth: usize,
+}
+
+impl RosTopic {
+    /// Its whole name for an instance.
+    pub fn full_name(&self, instance: &str) -> String {
+        if self.name.starts_with('/') {
+            self.name.to_owned()
+        } else {
+            format!("/{}/{}", name_part(instance), self.name)
+        }
+    }
+}
+
+/// An instance's name as a part of a topic's: ROS allows letters, digits and `_`, and no digit first.
+fn name_part(instance: &str) -> String {
+    let allowed = |c: char| if c.is_ascii_alphanumeric() { c } else { '_' };
+    let mut name: String = instance.chars().map(allowed).collect();
+    if !name.starts_with(|c: char| c.is_ascii_alphabetic()) {
+        name.insert_str(0, "rig_");
+    }
+    name
+}
+
+const fn sensor<T: RosMessage>(name: &'static str, depth: usize) -> RosTopic {
+    let (reliability, durability) = (Reliability::BestEffort, Durability::Volatile);
+    RosTopic { name, message_type: T::TYPE, reliability, durability, depth }
+}
+
+const fn reliable<T: RosMessage>(name: &'static str, depth: usize) -> RosTopic {
+    let (reliability, durability) = (Reliability::Reliable, Durability::Volatile);
+    RosTopic { name, message_type: T::TYPE, reliability, durability, depth }
+}
+
+/// Messages of a camera that a subscriber may be behind: ROS's profile for sensor data.
+const SENSOR_DEPTH: usize = 5;
+/// Transforms that a subscriber may be behind: that of tf2.
+const TF_DEPTH: usize = 100;
+/// Poses and others that a subscriber may be behind: ROS's default.
+const DEFAULT_DEPTH: usize = 10;
+
+/// The pose in the map, with covariance: the best estimate, may step when the map is revised.
+pub const POSE: RosTopic = reliable::<PoseWithCovarianceStamped>("pose", DEFAULT_DEPTH);
+/// Odometry: never jumps within an epoch, drifts.
+pub const ODOMETRY: RosTopic = reliable::<Odometry>("odom", DEFAULT_DEPTH);
+/// map → odom → camera.
+pub const TF: RosTopic = reliable::<TfMessage>("/tf", TF_DEPTH);
+/// The active keyframe's depth as points in the map.
+pub const POINTS: RosTopic = sensor::<PointCloud2>("points", SENSOR_DEPTH);
+/// The camera's image, rectified, grey.
+pub const IMAGE: RosTopic = sensor::<Image>("image_rect", SENSOR_DEPTH);
+/// The same, as JPEG or PNG.
+pub const COMPRESSED_IMAGE: RosTopic =
+    sensor::<CompressedImage>("image_rect/compressed", SENSOR_DEPTH);
+/// Intrinsics of the image.
+pub const CAMERA_INFO: RosTopic = sensor::<CameraInfo>("camera_info", SENSOR_DEPTH);
+/// Poses of all keyframes in the map; a late subscriber gets the last.
+pub const KEYFRAMES: RosTopic = RosTopic {
+    name: "keyframes",
+    message_type: PoseArray::TYPE,
+    reliability: Reliability::Reliable,
+    durability: Durability::TransientLocal,
+    depth: 1,
+};
+/// Health of the three processes.
+pub const DIAGNOSTICS: RosTopic = reliable::<DiagnosticArray>("/diagnostics", DEFAULT_DEPTH);
+
+/// All of them.
+pub const TOPICS: [RosTopic; 9] =
+    [POSE, ODOMETRY, TF, POINTS, IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, KEYFRAMES, DIAGNOSTICS];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ros::schema::{schema, type_hash};
+
+    #[test]
+    fn names_are_ros_names_and_types_are_known() {
+        assert_eq!(POSE.full_name("semidense"), "/semidense/pose");
+        assert_eq!(POSE.full_name("2-left"), "/rig_2_left/pose");
+        assert_eq!(TF.full_name("left"), "/tf");
+        for topic in TOPICS {
+            assert!(schema(topic.message_type).is_some(), "{}", topic.name);
+            assert!(type_hash(topic.message_type).is_some(), "{}", topic.name);
+        }
+    }
+}
