@@ -1,0 +1,771 @@
+"""The messages in shared memory. Generated from the Rust definitions: never edit it.
+
+SEMIDENSE_WRITE_WIRE=1 cargo test --test wire_table
+"""
+# ruff: noqa
+from __future__ import annotations
+
+import ctypes
+import enum
+from typing import NamedTuple, Optional
+
+WIRE_VERSION = 10
+MAX_KEYFRAME_POINTS = 100000
+# Where the buckets of a histogram end, milliseconds.
+BUCKET_ENDS_MS = (
+    0.0014142135623730952,
+    0.002,
+    0.0028284271247461905,
+    0.004,
+    0.005656854249492381,
+    0.008,
+    0.011313708498984762,
+    0.016,
+    0.022627416997969524,
+    0.032,
+    0.04525483399593905,
+    0.064,
+    0.0905096679918781,
+    0.128,
+    0.1810193359837562,
+    0.256,
+    0.3620386719675124,
+    0.512,
+    0.7240773439350248,
+    1.024,
+    1.4481546878700495,
+    2.048,
+    2.896309375740099,
+    4.096,
+    5.792618751480198,
+    8.192,
+    11.585237502960396,
+    16.384,
+    23.170475005920792,
+    32.768,
+    46.340950011841585,
+    65.536,
+    92.68190002368317,
+    131.072,
+    185.36380004736634,
+    262.144,
+    370.7276000947327,
+    524.288,
+    741.4552001894654,
+    1048.576,
+    1482.9104003789307,
+    2097.152,
+    2965.8208007578614,
+    4194.304,
+    5931.641601515723,
+    8388.608,
+    11863.283203031446,
+    16777.216,
+)
+
+
+class FrameHeader(ctypes.Structure):
+    """Header of `capture/frame`; the payload is the grey image."""
+
+    SIZE = 88
+    OFFSETS = {
+        "sequence": 0,
+        "capture_nanos": 8,
+        "clock_nanos": 16,
+        "sent_nanos": 24,
+        "exposure_nanos": 32,
+        "intrinsics": 40,
+        "width": 72,
+        "height": 76,
+        "stride": 80,
+        "gain": 84,
+    }
+    _fields_ = [
+        # Number of the frame at its source; a gap is a frame that is missing.
+        ("sequence", ctypes.c_uint64),
+        # Middle of the exposure, nanoseconds: CLOCK_MONOTONIC of a camera, else the recording's clock.
+        ("capture_nanos", ctypes.c_int64),
+        # CLOCK_MONOTONIC instant that latency counts from: the stamp of a camera, the paced instant of a recording played live, the sending in lockstep.
+        ("clock_nanos", ctypes.c_int64),
+        # CLOCK_MONOTONIC when it was sent: wake-ups are measured from here.
+        ("sent_nanos", ctypes.c_int64),
+        # Exposure time in nanoseconds, 0 where unknown.
+        ("exposure_nanos", ctypes.c_uint64),
+        # fx, fy, cx, cy in pixels.
+        ("intrinsics", ctypes.c_double * 4),
+        # Width in pixels.
+        ("width", ctypes.c_uint32),
+        # Height in pixels.
+        ("height", ctypes.c_uint32),
+        # Bytes from row to row; equal to the width.
+        ("stride", ctypes.c_uint32),
+        # Sensor gain, 0 where unknown.
+        ("gain", ctypes.c_float),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "semidense.FrameHeader.v2"
+
+
+class PoseMessage(ctypes.Structure):
+    """Message of `tracker/pose`."""
+
+    SIZE = 840
+    OFFSETS = {
+        "sequence": 0,
+        "capture_nanos": 8,
+        "published_nanos": 16,
+        "latency_nanos": 24,
+        "track_nanos": 32,
+        "wake_nanos": 40,
+        "revision": 48,
+        "keyframe_id": 56,
+        "epoch": 64,
+        "state": 68,
+        "reason": 72,
+        "proposes_keyframe": 76,
+        "map_revision": 80,
+        "world_from_camera": 88,
+        "map_from_camera": 144,
+        "keyframe_from_camera": 200,
+        "covariance": 256,
+        "map_covariance": 424,
+        "alignment_covariance": 592,
+        "brightness": 760,
+        "in_view_ratio": 776,
+        "inlier_ratio": 784,
+        "whitened_rmse": 792,
+        "residual_rmse": 800,
+        "mean_squared_flow": 808,
+        "displacement_px": 816,
+        "iterations": 824,
+        "finest_level": 828,
+        "points": 832,
+        "reserved": 836,
+    }
+    _fields_ = [
+        # Sequence of the frame.
+        ("sequence", ctypes.c_uint64),
+        # Stamp of the frame, nanoseconds.
+        ("capture_nanos", ctypes.c_int64),
+        # CLOCK_MONOTONIC when the pose was published.
+        ("published_nanos", ctypes.c_int64),
+        # From the frame's `clock_nanos` to `published_nanos`.
+        ("latency_nanos", ctypes.c_uint64),
+        # Time that tracking took.
+        ("track_nanos", ctypes.c_uint64),
+        # From the sending of the frame to the tracker's look at it.
+        ("wake_nanos", ctypes.c_uint64),
+        # Revision of the keyframe it was tracked on.
+        ("revision", ctypes.c_uint64),
+        # Keyframe it was tracked on, all ones before the first.
+        ("keyframe_id", ctypes.c_uint64),
+        # Life of the map.
+        ("epoch", ctypes.c_uint32),
+        # 0 initializing, 1 tracking, 2 degraded, 3 lost.
+        ("state", ctypes.c_uint32),
+        # Why: degraded 0 budget, 1 low overlap, 2 high residual, 3 gap, 4 turning; lost 0 diverged, 1 too few inliers, 2 no points, 3 unusable frame, 4 map rejected; otherwise 0.
+        ("reason", ctypes.c_uint32),
+        # 1 when the tracker asks for a new keyframe here.
+        ("proposes_keyframe", ctypes.c_uint32),
+        # How often the map had been corrected when the keyframe was published: `map_from_camera` jumps where this grows.
+        ("map_revision", ctypes.c_uint64),
+        # Odometry pose: never jumps within an epoch, but from a turning pose to the next that is none, and drifts.
+        ("world_from_camera", ctypes.c_double * 7),
+        # Pose in the map, the best estimate: jumps where the map is corrected.
+        ("map_from_camera", ctypes.c_double * 7),
+        # Pose relative to the keyframe, keyframe units.
+        ("keyframe_from_camera", ctypes.c_double * 7),
+        # Upper triangle, row-major, of the covariance of the left increment (translation, rotation) of `current_from_keyframe`, keyframe units and radians. Noise of single points, errors that the whole depth of the keyframe shares (its `mode_covariance`) and displacements of the whole image (`displacement_px`). Calibrated on simulated and recorded sequences: check the `nees_…` figures of a recording of your own before you fuse it. It does not hold the drift of the keyframe itself, nor that of the scale.
+        ("covariance", ctypes.c_double * 21),
+        # Upper triangle, row-major, of the covariance of the left increment ξ (translation, rotation) of `map_from_camera`, `exp(ξ) map_from_camera`, map units and radians: `covariance`, and the keyframe's `place_covariance`. The increment turns about the map's origin: a position p errs by ξ_t + ξ_ω × p. It is relative to the keyframes that held those that were estimated together: drift from before those is not in it.
+        ("map_covariance", ctypes.c_double * 21),
+        # The same as `covariance` of the alignment alone, for the mapper. Too sure by up to a hundred in standard deviation: never fuse it.
+        ("alignment_covariance", ctypes.c_double * 21),
+        # Brightness against the keyframe: a, b.
+        ("brightness", ctypes.c_double * 2),
+        # Share of the keyframe's points in view.
+        ("in_view_ratio", ctypes.c_double),
+        # Share of those compared that are explained.
+        ("inlier_ratio", ctypes.c_double),
+        # Residual over its standard deviation.
+        ("whitened_rmse", ctypes.c_double),
+        # Residual in grey levels.
+        ("residual_rmse", ctypes.c_double),
+        # Mean squared optical flow, pixels².
+        ("mean_squared_flow", ctypes.c_double),
+        # Standard deviation by which the whole image may be displaced unseen, pixels; `covariance` holds it.
+        ("displacement_px", ctypes.c_double),
+        # Iterations, all levels.
+        ("iterations", ctypes.c_uint32),
+        # Finest level that was solved; the number of all levels where none was.
+        ("finest_level", ctypes.c_uint32),
+        # Points compared: in view and not clipped by the sensor.
+        ("points", ctypes.c_uint32),
+        # Zero.
+        ("reserved", ctypes.c_uint32),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "semidense.Pose.v6"
+
+
+class KeyframeHeader(ctypes.Structure):
+    """Header of `mapper/keyframe`; the payload is its `DepthPoint`s."""
+
+    SIZE = 488
+    OFFSETS = {
+        "keyframe_id": 0,
+        "revision": 8,
+        "sequence": 16,
+        "capture_nanos": 24,
+        "world_from_keyframe": 32,
+        "map_from_keyframe": 96,
+        "map_revision": 160,
+        "intrinsics": 168,
+        "mode_covariance": 200,
+        "place_covariance": 248,
+        "epoch": 472,
+        "map_state": 476,
+        "width": 480,
+        "height": 484,
+    }
+    _fields_ = [
+        # Its id.
+        ("keyframe_id", ctypes.c_uint64),
+        # Counts up with every change of the map.
+        ("revision", ctypes.c_uint64),
+        # Sequence of its frame.
+        ("sequence", ctypes.c_uint64),
+        # Stamp of its frame, nanoseconds.
+        ("capture_nanos", ctypes.c_int64),
+        # Where odometry has it, and its unit: poses follow from this.
+        ("world_from_keyframe", ctypes.c_double * 8),
+        # Where the map has it, and its unit.
+        ("map_from_keyframe", ctypes.c_double * 8),
+        # How often the map had been corrected by then.
+        ("map_revision", ctypes.c_uint64),
+        # fx, fy, cx, cy in pixels.
+        ("intrinsics", ctypes.c_double * 4),
+        # Upper triangle, row-major, of the covariance of the errors that all of its depth shares: relative errors of inverse depth for each unit of X, of Y (the ray's coordinates) and of ln d.
+        ("mode_covariance", ctypes.c_double * 6),
+        # Upper triangle, row-major, of the covariance of the keyframe's place: of the left increment (translation, rotation) of the rigid part of `map_from_keyframe`, map units and radians, and of the logarithm of its unit.
+        ("place_covariance", ctypes.c_double * 28),
+        # Life of the map.
+        ("epoch", ctypes.c_uint32),
+        # 1 established, 2 rejected.
+        ("map_state", ctypes.c_uint32),
+        # Width of its image, pixels.
+        ("width", ctypes.c_uint32),
+        # Height of its image, pixels.
+        ("height", ctypes.c_uint32),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "semidense.KeyframeHeader.v4"
+
+
+class DepthPoint(ctypes.Structure):
+    """One pixel with depth, as it goes over the wire."""
+
+    SIZE = 16
+    OFFSETS = {
+        "u": 0,
+        "v": 2,
+        "inverse_depth": 4,
+        "variance": 8,
+        "intensity": 12,
+    }
+    _fields_ = [
+        # Column of the pixel, level 0.
+        ("u", ctypes.c_uint16),
+        # Row of the pixel, level 0.
+        ("v", ctypes.c_uint16),
+        # 1/z along the keyframe's optical axis, 1/keyframe units.
+        ("inverse_depth", ctypes.c_float),
+        # Variance of the inverse depth.
+        ("variance", ctypes.c_float),
+        # Brightness of the pixel, 0 to 255.
+        ("intensity", ctypes.c_float),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "semidense.DepthPoint.v1"
+
+
+class KeyframeImageHeader(ctypes.Structure):
+    """Header of `mapper/keyframe_image`; the payload is the grey image."""
+
+    SIZE = 24
+    OFFSETS = {
+        "keyframe_id": 0,
+        "epoch": 8,
+        "width": 12,
+        "height": 16,
+        "stride": 20,
+    }
+    _fields_ = [
+        # The keyframe.
+        ("keyframe_id", ctypes.c_uint64),
+        # Life of the map.
+        ("epoch", ctypes.c_uint32),
+        # Width in pixels.
+        ("width", ctypes.c_uint32),
+        # Height in pixels.
+        ("height", ctypes.c_uint32),
+        # Bytes from row to row; equal to the width.
+        ("stride", ctypes.c_uint32),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "semidense.KeyframeImageHeader.v1"
+
+
+class StepMessage(ctypes.Structure):
+    """Message of `mapper/step`: this frame is in the map."""
+
+    SIZE = 136
+    OFFSETS = {
+        "sequence": 0,
+        "keyframe_id": 8,
+        "revision": 16,
+        "step_nanos": 24,
+        "change_nanos": 32,
+        "keyframes": 40,
+        "points": 48,
+        "pose_nanos": 56,
+        "world_from_camera": 64,
+        "has_pose": 120,
+        "epoch": 124,
+        "start_frame": 128,
+        "reserved": 132,
+    }
+    _fields_ = [
+        # Sequence of the frame.
+        ("sequence", ctypes.c_uint64),
+        # The keyframe that is active from the next frame on, all ones before the first.
+        ("keyframe_id", ctypes.c_uint64),
+        # Its revision.
+        ("revision", ctypes.c_uint64),
+        # Time that the step took.
+        ("step_nanos", ctypes.c_uint64),
+        # Time of it in which a new keyframe was made and published, once the frame was observed; 0 where none was.
+        ("change_nanos", ctypes.c_uint64),
+        # Keyframes in the map.
+        ("keyframes", ctypes.c_uint64),
+        # Points with depth of the active keyframe.
+        ("points", ctypes.c_uint64),
+        # Stamp of the last frame whose pose was claimed, nanoseconds.
+        ("pose_nanos", ctypes.c_int64),
+        # That pose: where a tracker that is started again begins.
+        ("world_from_camera", ctypes.c_double * 7),
+        # 1 when there was such a frame in the epoch.
+        ("has_pose", ctypes.c_uint32),
+        # Life of the map.
+        ("epoch", ctypes.c_uint32),
+        # While there is no map, what the frame came to: 1 begun, 2 dark, 3 overexposed, 4 textureless, 5 unmatched, 6 still, 7 turned, 8 little parallax; otherwise 0.
+        ("start_frame", ctypes.c_uint32),
+        # Zero.
+        ("reserved", ctypes.c_uint32),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "semidense.Step.v4"
+
+
+class GraphHeader(ctypes.Structure):
+    """Header of `mapper/graph`; the payload is one `KeyframePoseMessage` per keyframe."""
+
+    SIZE = 24
+    OFFSETS = {
+        "revision": 0,
+        "map_revision": 8,
+        "epoch": 16,
+        "reserved": 20,
+    }
+    _fields_ = [
+        # Newest revision of a keyframe in it.
+        ("revision", ctypes.c_uint64),
+        # How often the map had been corrected by then.
+        ("map_revision", ctypes.c_uint64),
+        # Life of the map.
+        ("epoch", ctypes.c_uint32),
+        # Zero.
+        ("reserved", ctypes.c_uint32),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "semidense.GraphHeader.v2"
+
+
+class KeyframePoseMessage(ctypes.Structure):
+    """The pose of one keyframe in `mapper/graph`."""
+
+    SIZE = 80
+    OFFSETS = {
+        "keyframe_id": 0,
+        "revision": 8,
+        "map_from_keyframe": 16,
+    }
+    _fields_ = [
+        # The keyframe.
+        ("keyframe_id", ctypes.c_uint64),
+        # Revision of its depth: another one than a reader has is asked for with a request.
+        ("revision", ctypes.c_uint64),
+        # Where the map has it, and its unit.
+        ("map_from_keyframe", ctypes.c_double * 8),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "semidense.KeyframePose.v2"
+
+
+class AdjustmentMessage(ctypes.Structure):
+    """Message of `mapper/adjustment`: a joint estimate of keyframes is over."""
+
+    SIZE = 72
+    OFFSETS = {
+        "sequence": 0,
+        "frames": 8,
+        "cpu_nanos": 16,
+        "keyframe_id": 24,
+        "inlier_ratio": 32,
+        "rms_grey": 40,
+        "fate": 48,
+        "free": 52,
+        "fixed": 56,
+        "points": 60,
+        "comparisons": 64,
+        "iterations": 68,
+    }
+    _fields_ = [
+        # Sequence of the last frame before it entered the map.
+        ("sequence", ctypes.c_uint64),
+        # Frames from its beginning until then.
+        ("frames", ctypes.c_uint64),
+        # CPU time that it took, nanoseconds.
+        ("cpu_nanos", ctypes.c_uint64),
+        # Newest keyframe that took part.
+        ("keyframe_id", ctypes.c_uint64),
+        # Share of the comparisons of a point with a keyframe that count.
+        ("inlier_ratio", ctypes.c_double),
+        # Root mean square of the residuals that count, grey levels.
+        ("rms_grey", ctypes.c_double),
+        # What became of it: 0 it entered the map, 1 it entered a map with newer keyframes, which followed, 2 it was dropped because the map had changed.
+        ("fate", ctypes.c_uint32),
+        # Keyframes whose poses were free.
+        ("free", ctypes.c_uint32),
+        # Keyframes that held them in place.
+        ("fixed", ctypes.c_uint32),
+        # Points.
+        ("points", ctypes.c_uint32),
+        # Comparisons of a point with a keyframe.
+        ("comparisons", ctypes.c_uint32),
+        # Steps tried.
+        ("iterations", ctypes.c_uint32),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "semidense.Adjustment.v1"
+
+
+class HealthMessage(ctypes.Structure):
+    """Message of `<process>/health`."""
+
+    SIZE = 2360
+    OFFSETS = {
+        "published_nanos": 0,
+        "started_nanos": 8,
+        "process_id": 16,
+        "state": 20,
+        "progress_done": 24,
+        "progress_total": 32,
+        "frames": 40,
+        "rate_hz": 48,
+        "dropped": 56,
+        "gaps": 64,
+        "refused": 72,
+        "disordered": 80,
+        "resized": 88,
+        "deadline_misses": 96,
+        "page_faults": 104,
+        "total": 112,
+        "detail": 120,
+        "cause_bytes": 124,
+        "peak_rss_bytes": 128,
+        "latency_counts": 136,
+        "work_counts": 520,
+        "wake_counts": 904,
+        "adjustments": 1288,
+        "adjustments_merged": 1296,
+        "adjustments_dropped": 1304,
+        "adjustment_counts": 1312,
+        "loop_searches": 1696,
+        "loops_closed": 1704,
+        "loops_held": 1712,
+        "epochs_joined": 1720,
+        "loops_refused": 1728,
+        "loops_against_drift": 1736,
+        "loops_unconfirmed": 1744,
+        "loops_inconsistent": 1752,
+        "scheduling": 1760,
+        "priority": 1764,
+        "memory_locked": 1768,
+        "warning_bytes": 1772,
+        "warning": 1776,
+        "cause": 1968,
+        "source": 2160,
+        "source_bytes": 2352,
+        "reserved": 2356,
+    }
+    _fields_ = [
+        # CLOCK_MONOTONIC when it was published.
+        ("published_nanos", ctypes.c_int64),
+        # CLOCK_MONOTONIC when the process started.
+        ("started_nanos", ctypes.c_int64),
+        # Its process id.
+        ("process_id", ctypes.c_uint32),
+        # 0 starting, 1 preparing, 2 ready, 3 running, 4 finished, 5 failed, 6 stale.
+        ("state", ctypes.c_uint32),
+        # Preparing: how much of the work is done.
+        ("progress_done", ctypes.c_uint64),
+        # Preparing: how much work there is, 0 where unknown.
+        ("progress_total", ctypes.c_uint64),
+        # Frames sent, tracked or mapped.
+        ("frames", ctypes.c_uint64),
+        # The same a second, over about the last second; NaN before one is over.
+        ("rate_hz", ctypes.c_double),
+        # Frames that came too late to be handled.
+        ("dropped", ctypes.c_uint64),
+        # Frames that the source lost.
+        ("gaps", ctypes.c_uint64),
+        # Messages that were refused because they are broken.
+        ("refused", ctypes.c_uint64),
+        # Frames whose sequence or stamp does not come after the one before: repeated, out of order, or after a jump of the source's clock.
+        ("disordered", ctypes.c_uint64),
+        # Changes of the image size or the intrinsics.
+        ("resized", ctypes.c_uint64),
+        # Frames that took longer than the deadline.
+        ("deadline_misses", ctypes.c_uint64),
+        # Page faults of the frame loop since its first hundred frames.
+        ("page_faults", ctypes.c_uint64),
+        # Capture: frames there will be, 0 where unknown. Mapper: keyframes of the map.
+        ("total", ctypes.c_uint64),
+        # State of the last frame: as in `PoseMessage`, or of the map: as in `KeyframeHeader`.
+        ("detail", ctypes.c_uint32),
+        # Bytes of `cause` that are used.
+        ("cause_bytes", ctypes.c_uint32),
+        # Largest resident memory so far.
+        ("peak_rss_bytes", ctypes.c_uint64),
+        # How often each latency came, see `semidense::service::health`.
+        ("latency_counts", ctypes.c_uint64 * 48),
+        # The same of the time that the work on a frame took.
+        ("work_counts", ctypes.c_uint64 * 48),
+        # The same of the time from the sending of a frame to the look at it.
+        ("wake_counts", ctypes.c_uint64 * 48),
+        # Mapper: joint estimates of keyframes that entered the map.
+        ("adjustments", ctypes.c_uint64),
+        # Mapper: of them those that entered a map with newer keyframes, which followed.
+        ("adjustments_merged", ctypes.c_uint64),
+        # Mapper: joint estimates that were dropped because the map had changed.
+        ("adjustments_dropped", ctypes.c_uint64),
+        # Mapper: the same as `latency_counts` of the CPU time of joint estimates.
+        ("adjustment_counts", ctypes.c_uint64 * 48),
+        # Mapper: keyframes that were looked for in older ones.
+        ("loop_searches", ctypes.c_uint64),
+        # Mapper: loops that moved the map.
+        ("loops_closed", ctypes.c_uint64),
+        # Mapper: loops that the map already had so.
+        ("loops_held", ctypes.c_uint64),
+        # Mapper: epochs that were joined to others.
+        ("epochs_joined", ctypes.c_uint64),
+        # Mapper: keyframes whose candidates were other places.
+        ("loops_refused", ctypes.c_uint64),
+        # Mapper: places that were further off than the map can have drifted.
+        ("loops_against_drift", ctypes.c_uint64),
+        # Mapper: places that no second pair confirmed.
+        ("loops_unconfirmed", ctypes.c_uint64),
+        # Mapper: places that contradicted other loops.
+        ("loops_inconsistent", ctypes.c_uint64),
+        # Scheduling in force: 0 other, 1 FIFO, 2 deadline, 3 unknown.
+        ("scheduling", ctypes.c_uint32),
+        # Priority of FIFO scheduling, else 0.
+        ("priority", ctypes.c_uint32),
+        # 1 when the memory is locked.
+        ("memory_locked", ctypes.c_uint32),
+        # Bytes of `warning` that are used.
+        ("warning_bytes", ctypes.c_uint32),
+        # What the system refused and which limit to raise, UTF-8.
+        ("warning", ctypes.c_uint8 * 192),
+        # Why the state is what it is, UTF-8.
+        ("cause", ctypes.c_uint8 * 192),
+        # Capture: where its frames come from, as the user named it, UTF-8; long names lose their end.
+        ("source", ctypes.c_uint8 * 192),
+        # Bytes of `source` that are used.
+        ("source_bytes", ctypes.c_uint32),
+        # Zero.
+        ("reserved", ctypes.c_uint32),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "semidense.Health.v6"
+
+
+class CommandRequest(ctypes.Structure):
+    """Request of `mapper/command`."""
+
+    SIZE = 4112
+    OFFSETS = {
+        "keyframe_id": 0,
+        "kind": 8,
+        "path_bytes": 12,
+        "path": 16,
+    }
+    _fields_ = [
+        # The keyframe that is asked for; otherwise 0.
+        ("keyframe_id", ctypes.c_uint64),
+        # 0 save the map to the file `path`, 1 send keyframe `keyframe_id` on `mapper/earlier_keyframe`, 2 save the map into the folder `path`, 3 go over to the map in the folder `path`, 4 only locate the camera in that.
+        ("kind", ctypes.c_uint32),
+        # Bytes of `path` that are used.
+        ("path_bytes", ctypes.c_uint32),
+        # Absolute path of the file or folder.
+        ("path", ctypes.c_uint8 * 4096),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "semidense.CommandRequest.v2"
+
+
+class CommandResponse(ctypes.Structure):
+    """Response of `mapper/command`."""
+
+    SIZE = 200
+    OFFSETS = {
+        "status": 0,
+        "text_bytes": 4,
+        "text": 8,
+    }
+    _fields_ = [
+        # 0 done, 1 failed.
+        ("status", ctypes.c_uint32),
+        # Bytes of `text` that are used.
+        ("text_bytes", ctypes.c_uint32),
+        # What failed, UTF-8.
+        ("text", ctypes.c_uint8 * 192),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "semidense.CommandResponse.v1"
+
+
+class State(enum.IntEnum):
+    """What a pose is worth."""
+
+    INITIALIZING = 0
+    TRACKING = 1
+    DEGRADED = 2
+    LOST = 3
+
+
+class Reason(enum.Enum):
+    """Why a pose is degraded or lost: (code of the state, code of the reason)."""
+
+    BUDGET = (2, 0)
+    LOW_OVERLAP = (2, 1)
+    HIGH_RESIDUAL = (2, 2)
+    GAP = (2, 3)
+    TURNING = (2, 4)
+    DIVERGED = (3, 0)
+    TOO_FEW_INLIERS = (3, 1)
+    NO_POINTS = (3, 2)
+    UNUSABLE_FRAME = (3, 3)
+    MAP_REJECTED = (3, 4)
+
+
+class MapState(enum.IntEnum):
+    """What the mapper thinks of the map."""
+
+    ESTABLISHED = 1
+    REJECTED = 2
+
+
+class StartFrame(enum.IntEnum):
+    """What a frame came to while there is no map."""
+
+    BEGUN = 1
+    DARK = 2
+    OVEREXPOSED = 3
+    TEXTURELESS = 4
+    UNMATCHED = 5
+    STILL = 6
+    TURNED = 7
+    LITTLE_PARALLAX = 8
+
+
+class ProcessState(enum.IntEnum):
+    """What a process is doing."""
+
+    STARTING = 0
+    PREPARING = 1
+    READY = 2
+    RUNNING = 3
+    FINISHED = 4
+    FAILED = 5
+    STALE = 6
+
+
+class Scheduling(enum.IntEnum):
+    """Scheduling in force of a process."""
+
+    OTHER = 0
+    FIFO = 1
+    DEADLINE = 2
+    UNKNOWN = 3
+
+
+class Topic(NamedTuple):
+    """A data topic: its wake-up event has the same name."""
+
+    path: str
+    payload: type
+    header: Optional[type]
+    subscribers: int
+    buffer: int
+    borrowed: int
+    history: int
+
+
+TOPICS = {
+    "capture/frame": Topic("capture/frame", ctypes.c_uint8, FrameHeader, 5, 4, 4, 0),
+    "tracker/pose": Topic("tracker/pose", PoseMessage, None, 8, 1000, 2, 1),
+    "mapper/keyframe": Topic("mapper/keyframe", DepthPoint, KeyframeHeader, 5, 1, 2, 1),
+    "mapper/keyframe_image": Topic("mapper/keyframe_image", ctypes.c_uint8, KeyframeImageHeader, 5, 1, 2, 1),
+    "mapper/graph": Topic("mapper/graph", KeyframePoseMessage, GraphHeader, 5, 1, 2, 1),
+    "mapper/step": Topic("mapper/step", StepMessage, None, 8, 1000, 2, 1),
+    "mapper/adjustment": Topic("mapper/adjustment", AdjustmentMessage, None, 8, 64, 2, 1),
+    "capture/health": Topic("capture/health", HealthMessage, None, 8, 4, 2, 1),
+    "tracker/health": Topic("tracker/health", HealthMessage, None, 8, 4, 2, 1),
+    "mapper/health": Topic("mapper/health", HealthMessage, None, 8, 4, 2, 1),
+}
+COMMAND_TOPIC = "mapper/command"
+
+ROOT_VARIABLE = "SEMIDENSE_ROOT"
+SYSTEM_ROOT = "/run/semidense"
+PREFIXES = {
+    "/run/semidense": "semidense_system_",
+    "/tmp/semidense-1000": "semidense_feb30abd_",
+    "/run/user/1000/semidense": "semidense_349ed4c3_",
+    "/tmp/ä": "semidense_d8af776b_",
+}
