@@ -1,6 +1,7 @@
 //! The command line: one short file a subcommand in `command/`.
 
-pub mod view;
+pub mod record;
+mod view;
 
 use std::error::Error;
 use std::io::{IsTerminal, Write};
@@ -63,6 +64,7 @@ impl CommonArguments {
 #[derive(Debug, Subcommand)]
 enum Subcommands {
     View(view::ViewArguments),
+    Record(record::RecordArguments),
 }
 
 /// Parses the command line and runs the chosen subcommand.
@@ -87,5 +89,6 @@ fn run(line: CommandLine) -> CommandResult {
         .init();
     match line.command {
         Subcommands::View(arguments) => view::run(&line.common, &arguments),
+        Subcommands::Record(arguments) => record::run(&line.common, &arguments),
     }
 }

@@ -4,5 +4,7 @@
 //! [`session`] reads the topics of a running instance; every way out is a folder beside it.
 
 pub mod command;
+pub mod keyframe_pace;
+pub mod record;
 pub mod ros;
 pub mod session;

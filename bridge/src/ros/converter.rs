@@ -89,6 +89,18 @@ impl Converter {
         Header { stamp, frame_id: frame_id.to_owned() }
     }
 
+    /// Stamp of a pose, and the frame of its camera.
+    pub fn pose_header(&self, pose: &Pose) -> Header {
+        let realtime = pose_realtime(pose).map(Time::from_nanos);
+        let stamp = realtime.unwrap_or_else(|| self.stamp(pose.message.capture_nanos));
+        self.header(stamp, &self.frames.camera)
+    }
+
+    /// A stamp in the map.
+    pub fn map_header(&self, stamp: Time) -> Header {
+        self.header(stamp, &self.frames.map)
+    }
+
     /// The messages of a pose; `None` where it is not claimed (initializing, lost), or on a keyframe whose unit is not
     /// known yet.
     pub fn pose(&self, pose: &Pose) -> Option<PoseMessages> {
@@ -97,8 +109,7 @@ impl Converter {
             return None;
         }
         let unit = *self.units.get(&estimate.keyframe_id)?;
-        let realtime = pose_realtime(pose).map(Time::from_nanos);
-        let stamp = realtime.unwrap_or_else(|| self.stamp(message.capture_nanos));
+        let stamp = self.pose_header(pose).stamp;
         let (in_map, in_world) = (estimate.map_from_camera, estimate.world_from_camera);
         let map_from_camera = ros_from_world() * in_map;
         let odom_from_camera = ros_from_world() * in_world;
@@ -134,7 +145,7 @@ impl Converter {
     /// The depth of a keyframe as points in the map.
     pub fn points(&self, keyframe: &Keyframe) -> PointCloud2 {
         let stamp = self.stamp(keyframe.capture_nanos);
-        keyframe_cloud(keyframe, self.header(stamp, &self.frames.map))
+        keyframe_cloud(keyframe, self.map_header(stamp))
     }
 
     /// Poses of all keyframes in the map, in the order of their ids; `stamp` is when the graph was read.

@@ -72,6 +72,31 @@ const DEFINITIONS: &[(&str, &str)] = &[
         "diagnostic_msgs/DiagnosticArray",
         "std_msgs/Header header\ndiagnostic_msgs/DiagnosticStatus[] status\n",
     ),
+    (
+        "semidense_msgs/Frame",
+        "std_msgs/Header header\nuint64 sequence\nint64 capture_nanos\nint64 clock_nanos\n\
+         uint64 exposure_nanos\nfloat32 gain\n",
+    ),
+    (
+        "semidense_msgs/Pose",
+        "std_msgs/Header header\nuint64 sequence\nint64 capture_nanos\nuint64 latency_nanos\n\
+         uint64 track_nanos\nuint64 keyframe_id\nuint64 revision\nuint64 map_revision\nuint32 epoch\n\
+         uint32 state\nuint32 reason\nfloat64[7] world_from_camera\nfloat64[7] map_from_camera\n\
+         float64[7] keyframe_from_camera\nfloat64[21] covariance\nfloat64[21] map_covariance\n\
+         float64[2] brightness\nfloat64 in_view_ratio\nfloat64 inlier_ratio\nfloat64 residual_rmse\n\
+         uint32 points\nuint32 iterations\n",
+    ),
+    (
+        "semidense_msgs/Keyframe",
+        "std_msgs/Header header\nuint64 keyframe_id\nuint64 revision\nuint64 sequence\n\
+         uint64 map_revision\nuint32 epoch\nuint32 points\nfloat64[8] world_from_keyframe\n\
+         float64[8] map_from_keyframe\nfloat64[4] intrinsics\n",
+    ),
+    (
+        "semidense_msgs/Graph",
+        "std_msgs/Header header\nuint64 map_revision\nuint32 epoch\nuint64[] keyframe_ids\n\
+         uint64[] revisions\nfloat64[] map_from_keyframes\n",
+    ),
 ];
 
 /// Hashes of the types (REP 2011), by which ROS 2 since Iron sees that both ends mean the same message.

@@ -4,6 +4,7 @@ use crate::ros::message::{
     CameraInfo, CompressedImage, DiagnosticArray, Image, Odometry, PointCloud2, PoseArray,
     PoseWithCovarianceStamped, RosMessage, TfMessage,
 };
+use crate::ros::own_message::{FrameRecord, GraphRecord, KeyframeRecord, PoseRecord};
 
 /// Whether messages are sent again until they arrive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -102,7 +103,17 @@ pub const KEYFRAMES: RosTopic = RosTopic {
 /// Health of the three processes.
 pub const DIAGNOSTICS: RosTopic = reliable::<DiagnosticArray>("/diagnostics", DEFAULT_DEPTH);
 
-/// All of them.
+/// Of each image what `sensor_msgs` has no place for.
+pub const FRAME_RECORDS: RosTopic = reliable::<FrameRecord>("details/frame", DEFAULT_DEPTH);
+/// All of each pose.
+pub const POSE_RECORDS: RosTopic = reliable::<PoseRecord>("details/pose", DEFAULT_DEPTH);
+/// What a keyframe has besides its points.
+pub const KEYFRAME_RECORDS: RosTopic =
+    reliable::<KeyframeRecord>("details/keyframe", DEFAULT_DEPTH);
+/// What the map's graph has besides poses.
+pub const GRAPH_RECORDS: RosTopic = reliable::<GraphRecord>("details/graph", DEFAULT_DEPTH);
+
+/// All of ROS's types.
 pub const TOPICS: [RosTopic; 9] =
     [POSE, ODOMETRY, TF, POINTS, IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, KEYFRAMES, DIAGNOSTICS];
 

@@ -1,0 +1,184 @@
+//! `semidense-bridge record`.
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::time::{Duration, Instant};
+
+use clap::{Args, ValueEnum};
+use semidense::service::shutdown::Shutdown;
+
+use crate::command::{CommandResult, CommonArguments};
+use crate::record::queue::{QueueSender, queue};
+use crate::record::recorder::{RecordParams, RecordSummary, Recorder};
+use crate::ros::encoder::Moment;
+use crate::ros::images::ImageFormat;
+use crate::session::{Event, Session, Wants};
+
+/// Bytes that may wait for the disk: two seconds of a 640x480 camera at 100 Hz.
+const QUEUE_BYTES: u64 = 64 << 20;
+/// Longest wait for messages: how exact `--duration` is.
+const WAIT: Duration = Duration::from_millis(100);
+/// How long an instance is waited for before that is said.
+const PATIENCE: Duration = Duration::from_secs(1);
+
+/// Record what a running instance sends into an MCAP file
+#[derive(Debug, Args)]
+#[command(
+    after_help = "Records images, poses with covariance, odometry, tf, keyframes as point clouds, the map's graph and \
+                  health, as ROS 2 messages: Foxglove, rerun and `ros2 bag play` open the file, and `semidense replay \
+                  mcap:FILE` computes it again.\n\n\
+                  Waits for an instance, and ends with it, by Ctrl-C or after --duration. Killed, it leaves all but \
+                  the last second.\n\n\
+                  Examples:\n  semidense record --output run.mcap\n  \
+                  semidense record --output run.mcap --images jpeg --duration 60\n  \
+                  semidense record --output recordings/ --max-bytes 2000000000"
+)]
+pub struct RecordArguments {
+    /// File to write, which must not exist; in a folder, the file is named after the instance and the time
+    #[arg(long, short, value_name = "FILE")]
+    output: PathBuf,
+    /// How images are written
+    #[arg(long, value_enum, default_value_t = ImagesArgument::Png)]
+    images: ImagesArgument,
+    /// End after so many seconds of recording
+    #[arg(long, value_name = "SECONDS", value_parser = parse_seconds)]
+    duration: Option<Duration>,
+    /// Begin a new file (run_1.mcap, run_2.mcap, …) when one has so many bytes
+    #[arg(long, value_name = "BYTES", value_parser = clap::value_parser!(u64).range(1_000_000..))]
+    max_bytes: Option<u64>,
+    /// Begin a new file when one is so many seconds long
+    #[arg(long, value_name = "SECONDS", value_parser = parse_seconds)]
+    max_duration: Option<Duration>,
+}
+
+/// [`ImageFormat`] on the command line.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum ImagesArgument {
+    /// PNG: every pixel as it was; 1.6 ms and 170 kB for 640x480
+    Png,
+    /// JPEG: not exact, replays differ a little; 6 ms and 70 kB
+    Jpeg,
+    /// Pixels (mono8): no work, 307 kB; rerun shows them as depth
+    Raw,
+    /// No images; the recording cannot be replayed
+    None,
+}
+
+impl From<ImagesArgument> for ImageFormat {
+    fn from(argument: ImagesArgument) -> Self {
+        match argument {
+            ImagesArgument::Png => Self::Png,
+            ImagesArgument::Jpeg => Self::Jpeg,
+            ImagesArgument::Raw => Self::Raw,
+            ImagesArgument::None => Self::None,
+        }
+    }
+}
+
+/// A positive number of seconds.
+fn parse_seconds(text: &str) -> Result<Duration, String> {
+    /// A year: more is a mistake.
+    const MOST: f64 = 366.0 * 86_400.0;
+    let seconds = text.parse::<f64>().ok().filter(|s| *s > 0.0 && *s <= MOST);
+    seconds
+        .map(Duration::from_secs_f64)
+        .ok_or_else(|| "needs a number of seconds above 0".to_owned())
+}
+
+/// Runs it until the instance ends, a signal comes or the time is over.
+pub fn run(common: &CommonArguments, arguments: &RecordArguments) -> CommandResult {
+    let place = common.place()?;
+    let instance = place.instance.clone();
+    let params = RecordParams {
+        output: output_file(&arguments.output, &instance),
+        instance,
+        images: arguments.images.into(),
+        max_bytes: arguments.max_bytes,
+        max_duration: arguments.max_duration,
+    };
+    let shutdown = Shutdown::install()?;
+    let wants = Wants {
+        frames: params.images != ImageFormat::None,
+        keyframes: true,
+        graph: true,
+        ..Wants::default()
+    };
+    let mut session = Session::new(place, "record", wants);
+    let output = params.output.clone();
+    let recorder = Recorder::create(params)?;
+    let (sender, receiver) = queue(QUEUE_BYTES);
+    let thread = std::thread::Builder::new().name("recorder".to_owned());
+    let writing = thread.spawn(move || recorder.run(&receiver))?;
+    let began = read(&mut session, &sender, arguments.duration, &shutdown);
+    let counts = sender.counts().clone();
+    drop(sender);
+    let summary = writing.join().map_err(|_| "the recorder's thread failed")?;
+    let began = began?;
+    if let (None, Ok(_)) = (began, &summary) {
+        // Nothing came: an empty file would only stand in the way.
+        std::fs::remove_file(&output)?;
+        return Err(
+            "nothing was recorded: no instance was there; start one with `semidense run`".into()
+        );
+    }
+    print(&summary?, began, counts.dropped());
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Reads until the end and gives when recording began; `None` where no instance came.
+fn read(
+    session: &mut Session,
+    sender: &QueueSender,
+    duration: Option<Duration>,
+    shutdown: &Shutdown,
+) -> Result<Option<Instant>, crate::session::SessionError> {
+    let started = Instant::now();
+    let (mut began, mut has_ended, mut has_said) = (None, false, false);
+    while !shutdown.is_requested() && !has_ended {
+        session.read(Some(shutdown.descriptor()), WAIT, |event| {
+            let moment = Moment::now();
+            has_ended |= matches!(event, Event::Left);
+            began.get_or_insert(moment.instant);
+            has_ended |= !sender.put(moment, event);
+        })?;
+        if began.is_none() && !has_said && started.elapsed() > PATIENCE {
+            has_said = true;
+            tell("waiting for an instance: start one with `semidense run`");
+        }
+        has_ended |= duration.zip(began).is_some_and(|(most, began)| began.elapsed() >= most);
+    }
+    Ok(began)
+}
+
+/// A name of its own in a folder.
+fn output_file(output: &Path, instance: &str) -> PathBuf {
+    if !output.is_dir() {
+        return output.to_owned();
+    }
+    let nanos = Moment::now().realtime_nanos;
+    output.join(format!("{instance}-{}.mcap", nanos / 1_000_000_000))
+}
+
+fn tell(line: &str) {
+    // Standard error may be closed; there is nobody else to tell.
+    let _ = writeln!(std::io::stderr(), "{line}");
+}
+
+fn print(summary: &RecordSummary, began: Option<Instant>, dropped: u64) {
+    let count = |names: &[&str]| -> u64 {
+        names.iter().filter_map(|name| summary.messages.get(name)).sum()
+    };
+    let files: Vec<String> = summary.files.iter().map(|file| file.display().to_string()).collect();
+    let seconds = began.map_or(0.0, |began| began.elapsed().as_secs_f64());
+    // Nobody may read it any more.
+    let _ = writeln!(
+        std::io::stdout(),
+        "{}: {seconds:.1} s, {:.1} MB: {} images, {} poses, {} clouds, {dropped} dropped",
+        files.join(", "),
+        summary.bytes as f64 / 1e6,
+        count(&["image_rect", "image_rect/compressed"]),
+        count(&["details/pose"]),
+        count(&["points"]),
+    );
+}

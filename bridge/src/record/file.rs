@@ -1,0 +1,176 @@
+//! One MCAP file: written chunk by chunk, so that whatever ends the process leaves all but the last second.
+
+use std::collections::{BTreeMap, HashMap};
+use std::fs::File;
+use std::io::BufWriter;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use mcap::records::{MessageHeader, Metadata};
+use mcap::{McapError, WriteOptions, Writer};
+
+use crate::record::qos::offered_qos_profiles;
+use crate::ros::encoder::Encoded;
+use crate::ros::schema::{full_name, schema, type_hash};
+use crate::ros::topic::RosTopic;
+
+/// A chunk is written when its first message is so old: what a kill may cost.
+const CHUNK_PERIOD: Duration = Duration::from_secs(1);
+/// Or when it has so many bytes: memory, and what a reader must load for one message.
+const CHUNK_BYTES: u64 = 4 << 20;
+
+/// Why a recording cannot be written.
+#[derive(Debug, thiserror::Error)]
+pub enum FileError {
+    /// The file exists, or cannot be made.
+    #[error("{}: cannot be made: {source}; name another file with --output", path.display())]
+    Create {
+        /// The file.
+        path: PathBuf,
+        /// What the system says.
+        source: std::io::Error,
+    },
+    /// Writing failed.
+    #[error("{}: cannot be written: {source}; what was recorded before can be read", path.display())]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// What the system says.
+        source: McapError,
+    },
+    /// A topic without a definition.
+    #[error("the type {0} has no definition")]
+    Type(&'static str),
+}
+
+/// An MCAP file that is being written.
+pub struct RecordingFile {
+    path: PathBuf,
+    instance: String,
+    writer: Writer<BufWriter<File>>,
+    /// Channel of each topic, and messages in it.
+    channels: HashMap<&'static str, (u16, u32)>,
+    /// When the open chunk got its first message.
+    chunk_began: Option<Instant>,
+    /// Bytes of messages so far.
+    bytes: u64,
+}
+
+impl RecordingFile {
+    /// Makes a new file; one that exists is not touched.
+    pub fn create(path: &Path, instance: &str) -> Result<Self, FileError> {
+        let create = |source| FileError::Create { path: path.to_owned(), source };
+        let file = File::options().write(true).create_new(true).open(path).map_err(create)?;
+        // Chunks are gathered in memory: a length that is filled in later would be missing after a kill.
+        let options = WriteOptions::new()
+            .profile("ros2")
+            .library(concat!("semidense ", env!("CARGO_PKG_VERSION")))
+            .compression(None)
+            .chunk_size(Some(CHUNK_BYTES))
+            .disable_seeking(true);
+        let writer = options.create(BufWriter::new(file));
+        let writer = writer.map_err(|source| FileError::Write { path: path.to_owned(), source })?;
+        let mut file = Self {
+            path: path.to_owned(),
+            instance: instance.to_owned(),
+            writer,
+            channels: HashMap::new(),
+            chunk_began: None,
+            bytes: 0,
+        };
+        file.write_metadata()?;
+        Ok(file)
+    }
+
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Bytes of messages so far.
+    pub fn bytes(&self) -> u64 {
+        self.bytes
+    }
+
+    /// Messages so far, by the topic's name.
+    pub fn counts(&self) -> impl Iterator<Item = (&'static str, u32)> {
+        self.channels.iter().map(|(name, (_, count))| (*name, *count))
+    }
+
+    fn failed(&self, source: McapError) -> FileError {
+        FileError::Write { path: self.path.clone(), source }
+    }
+
+    /// The record by which `rosbag2` knows that the quality of service is noted in numbers; first, so that a recording
+    /// without end has it too.
+    fn write_metadata(&mut self) -> Result<(), FileError> {
+        let metadata = BTreeMap::from([
+            ("serialized_metadata".to_owned(), String::new()),
+            ("ROS_DISTRO".to_owned(), "humble".to_owned()),
+        ]);
+        let metadata = Metadata { name: "rosbag2".to_owned(), metadata };
+        self.writer.write_metadata(&metadata).map_err(|source| self.failed(source))
+    }
+
+    /// The channel of a topic.
+    fn channel(&mut self, topic: &'static RosTopic) -> Result<u16, FileError> {
+        if let Some((channel, _)) = self.channels.get(topic.name) {
+            return Ok(*channel);
+        }
+        let text = schema(topic.message_type).ok_or(FileError::Type(topic.message_type))?;
+        let type_name = full_name(topic.message_type);
+        let schema_id = self.writer.add_schema(&type_name, "ros2msg", text.as_bytes());
+        let schema_id = schema_id.map_err(|source| self.failed(source))?;
+        let mut notes =
+            BTreeMap::from([("offered_qos_profiles".to_owned(), offered_qos_profiles(topic))]);
+        notes.extend(type_hash(topic.message_type).map(|h| ("topic_type_hash".to_owned(), h)));
+        let name = topic.full_name(&self.instance);
+        let channel = self.writer.add_channel(schema_id, &name, "cdr", &notes);
+        let channel = channel.map_err(|source| self.failed(source))?;
+        self.channels.insert(topic.name, (channel, 0));
+        Ok(channel)
+    }
+
+    /// Writes a message that was read at `realtime_nanos`.
+    pub fn write(&mut self, message: Encoded<'_>, realtime_nanos: i64) -> Result<(), FileError> {
+        let channel_id = self.channel(message.topic)?;
+        let count = self.channels.get_mut(message.topic.name).map(|(_, count)| count);
+        let sequence = count.map_or(0, |count| {
+            *count += 1;
+            *count
+        });
+        let nanos = |nanos: i64| u64::try_from(nanos).unwrap_or_default();
+        let header = MessageHeader {
+            channel_id,
+            sequence,
+            log_time: nanos(realtime_nanos),
+            publish_time: nanos(message.stamp.nanos()),
+        };
+        let written = self.writer.write_to_known_channel(&header, message.bytes);
+        written.map_err(|source| self.failed(source))?;
+        self.bytes += message.bytes.len() as u64;
+        self.write_old_chunk()
+    }
+
+    /// Writes the open chunk where it is old enough.
+    pub fn write_old_chunk(&mut self) -> Result<(), FileError> {
+        let began = *self.chunk_began.get_or_insert_with(Instant::now);
+        if began.elapsed() < CHUNK_PERIOD {
+            return Ok(());
+        }
+        self.chunk_began = None;
+        self.writer.flush().map_err(|source| self.failed(source))
+    }
+
+    /// Writes what is left, and the index.
+    pub fn finish(mut self) -> Result<(), FileError> {
+        let finished = self.writer.finish().map(|_| ());
+        finished.map_err(|source| self.failed(source))?;
+        let sync = || -> std::io::Result<()> {
+            let file = self.writer.into_inner().into_inner().map_err(|e| e.into_error())?;
+            file.sync_all()
+        };
+        let path = self.path;
+        sync().map_err(|error| FileError::Write { path, source: McapError::Io(error) })
+    }
+}

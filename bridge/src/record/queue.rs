@@ -1,0 +1,121 @@
+//! A queue of events that never holds up whoever fills it: it has room for a number of bytes, and what does not fit is
+//! dropped and counted.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
+
+use semidense::slam::keyframe::DepthPoint;
+
+use crate::ros::encoder::Moment;
+use crate::session::Event;
+
+/// Events in the queue: what is not an image is small, and comes some hundred times a second.
+const MAX_EVENTS: usize = 4096;
+
+/// What came and went.
+#[derive(Debug, Default)]
+pub struct QueueCounts {
+    /// Bytes that wait.
+    pub bytes: AtomicU64,
+    /// Images that were dropped.
+    pub dropped_images: AtomicU64,
+    /// Other messages that were dropped.
+    pub dropped_messages: AtomicU64,
+}
+
+impl QueueCounts {
+    /// All that was dropped.
+    pub fn dropped(&self) -> u64 {
+        self.dropped_images.load(Ordering::Relaxed) + self.dropped_messages.load(Ordering::Relaxed)
+    }
+}
+
+/// An event and when it was read.
+pub type Stamped = (Moment, Event);
+
+/// The end that is filled.
+#[derive(Debug)]
+pub struct QueueSender {
+    sender: SyncSender<Stamped>,
+    counts: Arc<QueueCounts>,
+    capacity_bytes: u64,
+}
+
+/// The end that is emptied.
+#[derive(Debug)]
+pub struct QueueReceiver {
+    receiver: Receiver<Stamped>,
+    counts: Arc<QueueCounts>,
+}
+
+/// A queue with room for `capacity_bytes`.
+pub fn queue(capacity_bytes: u64) -> (QueueSender, QueueReceiver) {
+    let (sender, receiver) = sync_channel(MAX_EVENTS);
+    let counts = Arc::new(QueueCounts::default());
+    let sender = QueueSender { sender, counts: Arc::clone(&counts), capacity_bytes };
+    (sender, QueueReceiver { receiver, counts })
+}
+
+/// Memory that an event holds.
+fn bytes_of(event: &Event) -> u64 {
+    let bytes = match event {
+        Event::Frame(frame) => frame.pixels.len(),
+        Event::Keyframe(keyframe) => {
+            keyframe.image.len() + keyframe.points.len() * size_of::<DepthPoint>()
+        }
+        Event::Graph(graph) => size_of_val(&graph.poses[..]),
+        // A message of a kilobyte or two.
+        Event::Pose(_) | Event::Health(..) => 2048,
+        Event::Joined | Event::Left | Event::Adjustment(_) => 0,
+    };
+    bytes as u64
+}
+
+impl QueueSender {
+    /// Puts an event in, or drops and counts it. False once nobody empties the queue any more.
+    pub fn put(&self, moment: Moment, event: Event) -> bool {
+        let bytes = bytes_of(&event);
+        let is_image = matches!(event, Event::Frame(_));
+        let drop_one = || {
+            let dropped =
+                if is_image { &self.counts.dropped_images } else { &self.counts.dropped_messages };
+            dropped.fetch_add(1, Ordering::Relaxed);
+            true
+        };
+        if self.counts.bytes.load(Ordering::Relaxed) + bytes > self.capacity_bytes {
+            return drop_one();
+        }
+        // Counted first: it may be taken out before the next line.
+        self.counts.bytes.fetch_add(bytes, Ordering::Relaxed);
+        match self.sender.try_send((moment, event)) {
+            Ok(()) => true,
+            Err(error) => {
+                self.counts.bytes.fetch_sub(bytes, Ordering::Relaxed);
+                match error {
+                    TrySendError::Full(_) => drop_one(),
+                    TrySendError::Disconnected(_) => false,
+                }
+            }
+        }
+    }
+
+    /// What came and went.
+    pub fn counts(&self) -> &Arc<QueueCounts> {
+        &self.counts
+    }
+}
+
+impl QueueReceiver {
+    /// The next event; `None` once the queue is empty and nobody fills it any more.
+    pub fn take(&self) -> Option<Stamped> {
+        let (moment, event) = self.receiver.recv().ok()?;
+        self.counts.bytes.fetch_sub(bytes_of(&event), Ordering::Relaxed);
+        Some((moment, event))
+    }
+
+    /// What came and went.
+    pub fn counts(&self) -> &Arc<QueueCounts> {
+        &self.counts
+    }
+}

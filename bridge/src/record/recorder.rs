@@ -1,0 +1,193 @@
+//! The thread that writes what was queued, into one file or several.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use crate::record::file::{FileError, RecordingFile};
+use crate::record::queue::{QueueCounts, QueueReceiver};
+use crate::ros::encoder::{EncodeError, Encoded, EventEncoder, Moment, Sink};
+use crate::ros::images::ImageFormat;
+use crate::ros::message::{DiagnosticArray, DiagnosticStatus, Header, KeyValue, Time};
+use crate::ros::topic::{DIAGNOSTICS, RosTopic};
+use crate::session::Event;
+
+/// What is recorded, and where.
+#[derive(Debug, Clone)]
+pub struct RecordParams {
+    /// The file, or the first of several.
+    pub output: PathBuf,
+    /// The instance.
+    pub instance: String,
+    /// How images are written.
+    pub images: ImageFormat,
+    /// A new file is begun when one has so many bytes.
+    pub max_bytes: Option<u64>,
+    /// A new file is begun when one is so long.
+    pub max_duration: Option<Duration>,
+}
+
+/// Why recording ended early.
+#[derive(Debug, thiserror::Error)]
+pub enum RecordError {
+    /// The file.
+    #[error(transparent)]
+    File(#[from] FileError),
+    /// A message.
+    #[error(transparent)]
+    Encode(#[from] EncodeError),
+}
+
+/// What was recorded.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct RecordSummary {
+    /// The files.
+    pub files: Vec<PathBuf>,
+    /// Bytes of messages.
+    pub bytes: u64,
+    /// Messages by the topic's name.
+    pub messages: BTreeMap<&'static str, u64>,
+}
+
+/// Writes events into files.
+pub struct Recorder {
+    params: RecordParams,
+    encoder: EventEncoder,
+    file: RecordingFile,
+    began: Instant,
+    summary: RecordSummary,
+}
+
+/// The name of the file with this number: `run.mcap`, `run_1.mcap`, …
+fn numbered(path: &Path, number: usize) -> PathBuf {
+    if number == 0 {
+        return path.to_owned();
+    }
+    let mut name = path.file_stem().unwrap_or_default().to_owned();
+    name.push(format!("_{number}"));
+    if let Some(extension) = path.extension() {
+        name.push(".");
+        name.push(extension);
+    }
+    path.with_file_name(name)
+}
+
+/// A file as a sink of messages that were read at one moment.
+struct FileSink<'a> {
+    file: &'a mut RecordingFile,
+    realtime_nanos: i64,
+}
+
+impl Sink for FileSink<'_> {
+    type Error = RecordError;
+
+    fn wants(&self, _topic: &'static RosTopic) -> bool {
+        true
+    }
+
+    fn put(&mut self, message: Encoded<'_>) -> Result<(), RecordError> {
+        Ok(self.file.write(message, self.realtime_nanos)?)
+    }
+}
+
+impl Recorder {
+    /// Makes the file.
+    pub fn create(params: RecordParams) -> Result<Self, RecordError> {
+        let file = RecordingFile::create(&params.output, &params.instance)?;
+        let encoder = EventEncoder::new(&params.instance, params.images);
+        let summary = RecordSummary::default();
+        Ok(Self { params, encoder, file, began: Instant::now(), summary })
+    }
+
+    /// Writes what comes until nobody fills the queue any more.
+    pub fn run(mut self, queue: &QueueReceiver) -> Result<RecordSummary, RecordError> {
+        while let Some((moment, event)) = queue.take() {
+            self.write(&event, moment, queue.counts())?;
+            self.split_if_due()?;
+        }
+        let Moment { realtime_nanos, .. } = Moment::now();
+        self.encoder.finish(&mut FileSink { file: &mut self.file, realtime_nanos })?;
+        self.count();
+        self.file.finish()?;
+        Ok(self.summary)
+    }
+
+    fn write(
+        &mut self,
+        event: &Event,
+        moment: Moment,
+        counts: &QueueCounts,
+    ) -> Result<(), RecordError> {
+        let realtime_nanos = moment.realtime_nanos;
+        let mut sink = FileSink { file: &mut self.file, realtime_nanos };
+        self.encoder.put(event, moment, &mut sink)?;
+        // Once a second, with the pipeline's own health.
+        if matches!(event, Event::Health("capture", _)) {
+            let stamp = Time::from_nanos(realtime_nanos);
+            let status = own_status(&self.params.instance, stamp, counts, sink.file.bytes());
+            self.encoder.send(&DIAGNOSTICS, stamp, &status, &mut sink)?;
+        }
+        Ok(())
+    }
+
+    fn split_if_due(&mut self) -> Result<(), RecordError> {
+        let is_full = self.params.max_bytes.is_some_and(|most| self.file.bytes() >= most);
+        let is_long = self.params.max_duration.is_some_and(|most| self.began.elapsed() >= most);
+        if !is_full && !is_long {
+            return Ok(());
+        }
+        let path = numbered(&self.params.output, self.summary.files.len() + 1);
+        let next = RecordingFile::create(&path, &self.params.instance)?;
+        self.count();
+        std::mem::replace(&mut self.file, next).finish()?;
+        self.began = Instant::now();
+        Ok(())
+    }
+
+    /// Adds the file to the summary.
+    fn count(&mut self) {
+        self.summary.files.push(self.file.path().to_owned());
+        self.summary.bytes += self.file.bytes();
+        for (name, count) in self.file.counts() {
+            *self.summary.messages.entry(name).or_default() += u64::from(count);
+        }
+    }
+}
+
+/// How recording itself is doing.
+fn own_status(
+    instance: &str,
+    stamp: Time,
+    counts: &QueueCounts,
+    written_bytes: u64,
+) -> DiagnosticArray {
+    use std::sync::atomic::Ordering::Relaxed;
+    let dropped = counts.dropped();
+    let value = |key: &str, value: u64| KeyValue { key: key.to_owned(), value: value.to_string() };
+    let message = if dropped == 0 { "recording" } else { "dropped what came too fast" };
+    let status = DiagnosticStatus {
+        level: u8::from(dropped > 0),
+        name: format!("{instance}: record"),
+        message: message.to_owned(),
+        hardware_id: instance.to_owned(),
+        values: vec![
+            value("dropped_images", counts.dropped_images.load(Relaxed)),
+            value("dropped_messages", counts.dropped_messages.load(Relaxed)),
+            value("queued_bytes", counts.bytes.load(Relaxed)),
+            value("written_bytes", written_bytes),
+        ],
+    };
+    DiagnosticArray { header: Header { stamp, frame_id: String::new() }, status: vec![status] }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn files_are_numbered_before_their_ending() {
+        assert_eq!(numbered(Path::new("a/run.mcap"), 0), Path::new("a/run.mcap"));
+        assert_eq!(numbered(Path::new("a/run.mcap"), 2), Path::new("a/run_2.mcap"));
+        assert_eq!(numbered(Path::new("run"), 1), Path::new("run_1"));
+    }
+}

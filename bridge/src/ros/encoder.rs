@@ -1,0 +1,231 @@
+//! What a session reads as the bytes of ROS's messages, one topic at a time: for recordings and for Foxglove.
+
+use std::time::Instant;
+
+use semidense::slam::keyframe::Keyframe;
+use serde::Serialize;
+
+use crate::keyframe_pace::KeyframePace;
+use crate::ros::cdr::encode_into;
+use crate::ros::converter::Converter;
+use crate::ros::frame_ids::FrameIds;
+use crate::ros::images::{CompressError, ImageFormat, jpeg, png};
+use crate::ros::message::{CompressedImage, Header, Time};
+use crate::ros::own_message::{FrameRecord, GraphRecord, KeyframeRecord, PoseRecord};
+use crate::ros::topic::{
+    CAMERA_INFO, COMPRESSED_IMAGE, DIAGNOSTICS, FRAME_RECORDS, GRAPH_RECORDS, IMAGE,
+    KEYFRAME_RECORDS, KEYFRAMES, ODOMETRY, POINTS, POSE, POSE_RECORDS, RosTopic, TF,
+};
+use crate::session::{Event, Frame, Graph, Pose};
+
+/// When an event was read.
+#[derive(Debug, Clone, Copy)]
+pub struct Moment {
+    /// For periods.
+    pub instant: Instant,
+    /// CLOCK_REALTIME, for stamps.
+    pub realtime_nanos: i64,
+}
+
+impl Moment {
+    /// Now.
+    pub fn now() -> Self {
+        let since_epoch = std::time::SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default();
+        let realtime_nanos = i64::try_from(since_epoch.as_nanos()).unwrap_or(i64::MAX);
+        Self { instant: Instant::now(), realtime_nanos }
+    }
+}
+
+/// One message.
+#[derive(Debug, Clone, Copy)]
+pub struct Encoded<'a> {
+    /// Its topic.
+    pub topic: &'static RosTopic,
+    /// The stamp of what it tells.
+    pub stamp: Time,
+    /// Its bytes, with the header of CDR.
+    pub bytes: &'a [u8],
+}
+
+/// Why there is no message.
+#[derive(Debug, thiserror::Error)]
+pub enum EncodeError {
+    /// An image cannot be compressed.
+    #[error(transparent)]
+    Image(#[from] CompressError),
+    /// A message cannot be encoded.
+    #[error("a message cannot be encoded: {0}")]
+    Message(#[from] cdr_encoding::Error),
+}
+
+/// Whoever takes messages.
+pub trait Sink {
+    /// Why it cannot.
+    type Error: From<EncodeError>;
+
+    /// Whether anybody wants this topic: what nobody wants is not encoded.
+    fn wants(&self, topic: &'static RosTopic) -> bool;
+
+    /// Takes a message.
+    fn put(&mut self, message: Encoded<'_>) -> Result<(), Self::Error>;
+}
+
+/// Encodes the events of one instance, which it must see all of, in order.
+#[derive(Debug)]
+pub struct EventEncoder {
+    converter: Converter,
+    images: ImageFormat,
+    pace: KeyframePace,
+    bytes: Vec<u8>,
+}
+
+impl EventEncoder {
+    /// For an instance.
+    pub fn new(instance: &str, images: ImageFormat) -> Self {
+        let converter = Converter::new(instance, FrameIds::of_instance(instance));
+        Self { converter, images, pace: KeyframePace::default(), bytes: Vec::new() }
+    }
+
+    /// Puts what an event is in ROS into `sink`.
+    pub fn put<S: Sink>(
+        &mut self,
+        event: &Event,
+        now: Moment,
+        sink: &mut S,
+    ) -> Result<(), S::Error> {
+        self.converter.observe(event);
+        let read = Time::from_nanos(now.realtime_nanos);
+        match event {
+            Event::Frame(frame) => self.put_frame(frame, sink),
+            Event::Pose(pose) => self.put_pose(pose, sink),
+            Event::Keyframe(keyframe) => {
+                let ready = self.pace.take(keyframe.clone(), now.instant);
+                ready.iter().try_for_each(|keyframe| self.put_keyframe(keyframe, sink))
+            }
+            Event::Graph(graph) => self.put_graph(graph, read, sink),
+            Event::Health(owner, health) => {
+                if !sink.wants(&DIAGNOSTICS) {
+                    return Ok(());
+                }
+                let array = self.converter.diagnostics(owner, health, read);
+                self.send(&DIAGNOSTICS, read, &array, sink)
+            }
+            Event::Left => self.finish(sink),
+            Event::Joined | Event::Adjustment(_) => Ok(()),
+        }
+    }
+
+    /// Puts what was held back: at the end.
+    pub fn finish<S: Sink>(&mut self, sink: &mut S) -> Result<(), S::Error> {
+        match self.pace.finish() {
+            Some(keyframe) => self.put_keyframe(&keyframe, sink),
+            None => Ok(()),
+        }
+    }
+
+    /// Encodes a message and gives it to `sink`.
+    pub fn send<S: Sink>(
+        &mut self,
+        topic: &'static RosTopic,
+        stamp: Time,
+        message: &impl Serialize,
+        sink: &mut S,
+    ) -> Result<(), S::Error> {
+        encode_into(message, &mut self.bytes).map_err(EncodeError::from)?;
+        sink.put(Encoded { topic, stamp, bytes: &self.bytes })
+    }
+
+    fn put_frame<S: Sink>(&mut self, frame: &Frame, sink: &mut S) -> Result<(), S::Error> {
+        if self.images == ImageFormat::None {
+            return Ok(());
+        }
+        let header = self.converter.image_header(frame);
+        let stamp = header.stamp;
+        if sink.wants(&FRAME_RECORDS) {
+            let record = FrameRecord::new(header.clone(), &frame.header);
+            self.send(&FRAME_RECORDS, stamp, &record, sink)?;
+        }
+        if sink.wants(&CAMERA_INFO) {
+            let camera = self.converter.camera_info(frame);
+            self.send(&CAMERA_INFO, stamp, &camera, sink)?;
+        }
+        match self.images {
+            ImageFormat::Raw if sink.wants(&IMAGE) => {
+                let image = self.converter.image(frame);
+                self.send(&IMAGE, stamp, &image, sink)
+            }
+            ImageFormat::Png | ImageFormat::Jpeg if sink.wants(&COMPRESSED_IMAGE) => {
+                let image = compressed(self.images, frame, header).map_err(EncodeError::from)?;
+                self.send(&COMPRESSED_IMAGE, stamp, &image, sink)
+            }
+            _ => Ok(()),
+        }
+    }
+
+    fn put_pose<S: Sink>(&mut self, pose: &Pose, sink: &mut S) -> Result<(), S::Error> {
+        let header = self.converter.pose_header(pose);
+        let stamp = header.stamp;
+        if sink.wants(&POSE_RECORDS) {
+            let record = PoseRecord::new(header, &pose.message);
+            self.send(&POSE_RECORDS, stamp, &record, sink)?;
+        }
+        if ![&POSE, &ODOMETRY, &TF].into_iter().any(|topic| sink.wants(topic)) {
+            return Ok(());
+        }
+        let Some(messages) = self.converter.pose(pose) else { return Ok(()) };
+        if sink.wants(&TF) {
+            self.send(&TF, stamp, &messages.transforms, sink)?;
+        }
+        if sink.wants(&POSE) {
+            self.send(&POSE, stamp, &messages.pose, sink)?;
+        }
+        if sink.wants(&ODOMETRY) {
+            self.send(&ODOMETRY, stamp, &messages.odometry, sink)?;
+        }
+        Ok(())
+    }
+
+    fn put_keyframe<S: Sink>(&mut self, keyframe: &Keyframe, sink: &mut S) -> Result<(), S::Error> {
+        let stamp = self.converter.stamp(keyframe.capture_nanos);
+        if sink.wants(&POINTS) {
+            let cloud = self.converter.points(keyframe);
+            self.send(&POINTS, stamp, &cloud, sink)?;
+        }
+        if sink.wants(&KEYFRAME_RECORDS) {
+            let record = KeyframeRecord::new(self.converter.map_header(stamp), keyframe);
+            self.send(&KEYFRAME_RECORDS, stamp, &record, sink)?;
+        }
+        Ok(())
+    }
+
+    fn put_graph<S: Sink>(
+        &mut self,
+        graph: &Graph,
+        read: Time,
+        sink: &mut S,
+    ) -> Result<(), S::Error> {
+        if sink.wants(&KEYFRAMES) {
+            let poses = self.converter.keyframes(graph, read);
+            self.send(&KEYFRAMES, read, &poses, sink)?;
+        }
+        if sink.wants(&GRAPH_RECORDS) {
+            let record = GraphRecord::new(self.converter.map_header(read), graph);
+            self.send(&GRAPH_RECORDS, read, &record, sink)?;
+        }
+        Ok(())
+    }
+}
+
+/// A frame as PNG or JPEG.
+fn compressed(
+    format: ImageFormat,
+    frame: &Frame,
+    header: Header,
+) -> Result<CompressedImage, CompressError> {
+    let (width, height) = (frame.header.width, frame.header.height);
+    let (name, data) = match format {
+        ImageFormat::Jpeg => ("jpeg", jpeg(width, height, &frame.pixels)?),
+        _ => ("png", png(width, height, &frame.pixels)?),
+    };
+    Ok(CompressedImage { header, format: name.to_owned(), data })
+}

@@ -1,0 +1,56 @@
+//! Images as they are sent: pixels, PNG or JPEG.
+
+use jpeg_encoder::{ColorType, Encoder, EncodingError};
+
+/// How images are sent and recorded. Measured for grey 640x480 of a camera (`fr1-floor`): PNG 1.6 ms and 170 kB,
+/// JPEG 5.9 ms and 73 kB, pixels 307 kB.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum ImageFormat {
+    /// `CompressedImage` with a PNG: every pixel as it was, and an image to every viewer.
+    #[default]
+    Png,
+    /// `CompressedImage` with a JPEG: the smallest, and not quite what the tracker saw.
+    Jpeg,
+    /// `Image` with `mono8`: no work; rerun takes it for depth.
+    Raw,
+    /// None.
+    None,
+}
+
+/// Quality of JPEGs: below 90 blocks begin to show in gradients, on which direct tracking lives.
+const JPEG_QUALITY: u8 = 90;
+
+/// Why an image cannot be compressed.
+#[derive(Debug, thiserror::Error)]
+pub enum CompressError {
+    /// The PNG encoder refuses it.
+    #[error("an image cannot be written as PNG: {0}")]
+    Png(#[from] png::EncodingError),
+    /// The JPEG encoder refuses it.
+    #[error("an image cannot be written as JPEG: {0}")]
+    Jpeg(#[from] EncodingError),
+}
+
+/// A grey image of `width * height` pixels as PNG.
+pub fn png(width: u32, height: u32, pixels: &[u8]) -> Result<Vec<u8>, CompressError> {
+    // The fastest way that still compresses; of the filters Paeth's leaves the fewest bytes for the same time.
+    let mut bytes = Vec::with_capacity(pixels.len());
+    let mut encoder = png::Encoder::new(&mut bytes, width, height);
+    encoder.set_color(png::ColorType::Grayscale);
+    encoder.set_compression(png::Compression::Fastest);
+    encoder.set_filter(png::Filter::Paeth);
+    let mut writer = encoder.write_header()?;
+    writer.write_image_data(pixels)?;
+    writer.finish()?;
+    Ok(bytes)
+}
+
+/// A grey image of `width * height` pixels as JPEG.
+pub fn jpeg(width: u32, height: u32, pixels: &[u8]) -> Result<Vec<u8>, CompressError> {
+    // The largest side of a frame is far below what 16 bits hold; the encoder refuses a size that does not fit.
+    let side = |length: u32| u16::try_from(length).unwrap_or(u16::MAX);
+    let mut bytes = Vec::with_capacity(pixels.len() / 4);
+    let encoder = Encoder::new(&mut bytes, JPEG_QUALITY);
+    encoder.encode(pixels, side(width), side(height), ColorType::Luma)?;
+    Ok(bytes)
+}
