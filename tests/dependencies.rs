@@ -65,5 +65,7 @@ fn licences_allow_ours() {
 fn copyleft_is_refused() {
     assert!(is_allowed("MIT OR Apache-2.0") && is_allowed("MIT/Apache-2.0"));
     assert!(is_allowed("(MIT OR Apache-2.0) AND Unicode-3.0") && is_allowed("GPL-3.0 OR MIT"));
+    // Of two licences ours is the permissive one.
+    assert!(is_allowed("EPL-2.0 OR Apache-2.0") && !is_allowed("EPL-2.0"));
     assert!(!is_allowed("GPL-3.0") && !is_allowed("MIT AND LGPL-3.0") && !is_allowed("MPL-2.0"));
 }

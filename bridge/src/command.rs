@@ -2,6 +2,8 @@
 
 pub mod record;
 mod view;
+#[cfg(feature = "zenoh")]
+pub mod zenoh;
 
 use std::error::Error;
 use std::io::{IsTerminal, Write};
@@ -65,6 +67,8 @@ impl CommonArguments {
 enum Subcommands {
     View(view::ViewArguments),
     Record(record::RecordArguments),
+    #[cfg(feature = "zenoh")]
+    Zenoh(zenoh::ZenohArguments),
 }
 
 /// Parses the command line and runs the chosen subcommand.
@@ -79,8 +83,10 @@ pub fn main() -> ExitCode {
 }
 
 fn run(line: CommandLine) -> CommandResult {
-    let filter = EnvFilter::try_new(&line.common.log)
-        .map_err(|error| format!("--log {}: {error}", line.common.log))?;
+    // Zenoh warns of scouting that is off on purpose.
+    let log = format!("zenoh=error,{}", line.common.log);
+    let filter =
+        EnvFilter::try_new(&log).map_err(|error| format!("--log {}: {error}", line.common.log))?;
     tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(std::io::stderr)
@@ -90,5 +96,7 @@ fn run(line: CommandLine) -> CommandResult {
     match line.command {
         Subcommands::View(arguments) => view::run(&line.common, &arguments),
         Subcommands::Record(arguments) => record::run(&line.common, &arguments),
+        #[cfg(feature = "zenoh")]
+        Subcommands::Zenoh(arguments) => zenoh::run(&line.common, &arguments),
     }
 }

@@ -4,7 +4,11 @@
 //! [`session`] reads the topics of a running instance; every way out is a folder beside it.
 
 pub mod command;
+#[cfg(feature = "zenoh")]
+pub mod jpeg;
 pub mod keyframe_pace;
 pub mod record;
 pub mod ros;
 pub mod session;
+#[cfg(feature = "zenoh")]
+pub mod zenoh;

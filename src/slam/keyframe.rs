@@ -2,6 +2,8 @@
 
 use std::sync::Arc;
 
+use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
+
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::modes::ModeCovariance;
@@ -9,7 +11,7 @@ use crate::slam::place_covariance::{PlaceCovariance, UncertainPlace};
 use crate::slam::places::Description;
 
 /// One pixel with depth, as it goes over the wire.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, FromBytes, IntoBytes, Immutable, KnownLayout)]
 #[repr(C)]
 pub struct DepthPoint {
     /// Column of the pixel, level 0.

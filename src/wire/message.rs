@@ -4,6 +4,7 @@
 //! checked way to the types of `slam` is in [`crate::wire::conversion`].
 
 use iceoryx2::prelude::ZeroCopySend;
+use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 
 use crate::slam::keyframe::DepthPoint;
 use crate::slam::place_covariance::PLACE_ENTRIES;
@@ -22,7 +23,18 @@ pub type SimilarityMessage = [f64; 8];
 
 /// Header of `capture/frame`; the payload is the grey image.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
+#[derive(
+    Debug,
+    Clone,
+    Copy,
+    PartialEq,
+    Default,
+    ZeroCopySend,
+    FromBytes,
+    IntoBytes,
+    Immutable,
+    KnownLayout,
+)]
 #[type_name("semidense.FrameHeader.v2")]
 pub struct FrameHeader {
     /// Number of the frame at its source; a gap is a frame that is missing.
@@ -50,7 +62,9 @@ pub struct FrameHeader {
 
 /// Message of `tracker/pose`.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes, IntoBytes, Immutable, KnownLayout,
+)]
 #[type_name("semidense.Pose.v6")]
 pub struct PoseMessage {
     /// Sequence of the frame.
@@ -128,7 +142,18 @@ pub struct PoseMessage {
 
 /// Header of `mapper/keyframe`; the payload is its [`DepthPoint`]s.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
+#[derive(
+    Debug,
+    Clone,
+    Copy,
+    PartialEq,
+    Default,
+    ZeroCopySend,
+    FromBytes,
+    IntoBytes,
+    Immutable,
+    KnownLayout,
+)]
 #[type_name("semidense.KeyframeHeader.v4")]
 pub struct KeyframeHeader {
     /// Its id.
@@ -172,7 +197,19 @@ unsafe impl ZeroCopySend for DepthPoint {
 
 /// Header of `mapper/keyframe_image`; the payload is the grey image.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ZeroCopySend)]
+#[derive(
+    Debug,
+    Clone,
+    Copy,
+    PartialEq,
+    Eq,
+    Default,
+    ZeroCopySend,
+    FromBytes,
+    IntoBytes,
+    Immutable,
+    KnownLayout,
+)]
 #[type_name("semidense.KeyframeImageHeader.v1")]
 pub struct KeyframeImageHeader {
     /// The keyframe.
@@ -189,7 +226,18 @@ pub struct KeyframeImageHeader {
 
 /// Message of `mapper/step`: this frame is in the map.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
+#[derive(
+    Debug,
+    Clone,
+    Copy,
+    PartialEq,
+    Default,
+    ZeroCopySend,
+    FromBytes,
+    IntoBytes,
+    Immutable,
+    KnownLayout,
+)]
 #[type_name("semidense.Step.v4")]
 pub struct StepMessage {
     /// Sequence of the frame.
@@ -224,7 +272,19 @@ pub struct StepMessage {
 
 /// Header of `mapper/graph`; the payload is one [`KeyframePoseMessage`] per keyframe.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ZeroCopySend)]
+#[derive(
+    Debug,
+    Clone,
+    Copy,
+    PartialEq,
+    Eq,
+    Default,
+    ZeroCopySend,
+    FromBytes,
+    IntoBytes,
+    Immutable,
+    KnownLayout,
+)]
 #[type_name("semidense.GraphHeader.v2")]
 pub struct GraphHeader {
     /// Newest revision of a keyframe in it.
@@ -239,7 +299,18 @@ pub struct GraphHeader {
 
 /// The pose of one keyframe in `mapper/graph`.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
+#[derive(
+    Debug,
+    Clone,
+    Copy,
+    PartialEq,
+    Default,
+    ZeroCopySend,
+    FromBytes,
+    IntoBytes,
+    Immutable,
+    KnownLayout,
+)]
 #[type_name("semidense.KeyframePose.v2")]
 pub struct KeyframePoseMessage {
     /// The keyframe.
@@ -252,7 +323,18 @@ pub struct KeyframePoseMessage {
 
 /// Message of `mapper/adjustment`: a joint estimate of keyframes is over.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, Default, ZeroCopySend)]
+#[derive(
+    Debug,
+    Clone,
+    Copy,
+    PartialEq,
+    Default,
+    ZeroCopySend,
+    FromBytes,
+    IntoBytes,
+    Immutable,
+    KnownLayout,
+)]
 #[type_name("semidense.Adjustment.v1")]
 pub struct AdjustmentMessage {
     /// Sequence of the last frame before it entered the map.
@@ -284,7 +366,9 @@ pub struct AdjustmentMessage {
 
 /// Message of `<process>/health`.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, PartialEq, ZeroCopySend)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes, IntoBytes, Immutable, KnownLayout,
+)]
 #[type_name("semidense.Health.v6")]
 pub struct HealthMessage {
     /// CLOCK_MONOTONIC when it was published.
@@ -378,7 +462,7 @@ pub struct HealthMessage {
 
 /// Request of `mapper/command`.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, ZeroCopySend, FromBytes, IntoBytes, Immutable, KnownLayout)]
 #[type_name("semidense.CommandRequest.v2")]
 pub struct CommandRequest {
     /// The keyframe that is asked for; otherwise 0.
@@ -394,7 +478,7 @@ pub struct CommandRequest {
 
 /// Response of `mapper/command`.
 #[repr(C)]
-#[derive(Debug, Clone, Copy, ZeroCopySend)]
+#[derive(Debug, Clone, Copy, ZeroCopySend, FromBytes, IntoBytes, Immutable, KnownLayout)]
 #[type_name("semidense.CommandResponse.v1")]
 pub struct CommandResponse {
     /// 0 done, 1 failed.

@@ -1,0 +1,183 @@
+//! `semidense-bridge zenoh`: to another machine, and back into shared memory there.
+
+use std::io::Write;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use clap::{Args, Subcommand};
+use semidense::service::child::tidy_up;
+use semidense::service::shutdown::Shutdown;
+use semidense::wire::place::Place;
+
+use crate::command::{CommandResult, CommonArguments};
+use crate::zenoh::link::{Endpoint, Endpoints};
+use crate::zenoh::receiver::{ReceiveOptions, receive};
+use crate::zenoh::sender::{FrameOptions, SendOptions, send};
+
+/// Send to another machine, or receive there, over Zenoh
+#[derive(Debug, Args)]
+#[command(after_help = "\
+On the robot:          semidense run v4l:0 --rig FILE &
+                       semidense zenoh send --listen tcp/0.0.0.0:7447
+On the other machine:  semidense zenoh receive --connect tcp/ROBOT:7447 &
+                       semidense status
+
+Nothing is encrypted. Without --password-file everybody who reaches the port can read all and put in what they like:
+open it in a network that you trust, or leave it on 127.0.0.1 and go through ssh -L 7447:127.0.0.1:7447 ROBOT.")]
+pub struct ZenohArguments {
+    #[command(subcommand)]
+    direction: Direction,
+}
+
+#[derive(Debug, Subcommand)]
+enum Direction {
+    Send(SendArguments),
+    Receive(ReceiveArguments),
+}
+
+#[derive(Debug, Args)]
+struct LinkArguments {
+    /// Open a port for the other side: tcp/HOST:PORT, beyond this machine only where HOST says so (tcp/0.0.0.0:7447);
+    /// may be repeated
+    #[arg(long, value_name = "ENDPOINT")]
+    listen: Vec<Endpoint>,
+    /// Connect to a port of the other side, tcp/HOST:PORT, again and again until it answers; may be repeated
+    #[arg(long, value_name = "ENDPOINT")]
+    connect: Vec<Endpoint>,
+    /// File with one line `user:password` for both sides (mode 0600): who does not know it is refused. It does not
+    /// encrypt
+    #[arg(long, value_name = "FILE")]
+    password_file: Option<PathBuf>,
+}
+
+impl LinkArguments {
+    fn endpoints(&self) -> Endpoints {
+        let Self { listen, connect, password_file } = self;
+        Endpoints {
+            listen: listen.clone(),
+            connect: connect.clone(),
+            password_file: password_file.clone(),
+        }
+    }
+}
+
+/// Send poses, health, map graph and keyframes of the local instance, whenever it runs
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Listens on tcp/127.0.0.1:7447 where neither --listen nor --connect is given. The network never holds the pipeline up:
+what it does not take in time is dropped, the newest wins; --log info counts it every ten seconds.")]
+struct SendArguments {
+    #[command(flatten)]
+    link: LinkArguments,
+    /// Send the camera's frames too, as JPEG, as long as somebody receives them
+    #[arg(long)]
+    frames: bool,
+    /// Quality of the JPEG: at 80 some 40 kB for 640 × 480
+    #[arg(long, value_name = "1-100", default_value_t = 80, requires = "frames",
+          value_parser = clap::value_parser!(u8).range(1..=100))]
+    jpeg_quality: u8,
+    /// Most frames a second
+    #[arg(long, value_name = "HZ", default_value_t = 10.0, requires = "frames", value_parser = rate)]
+    frame_rate: f64,
+    /// Most revisions of a keyframe's depth a second; a new keyframe goes out at once
+    #[arg(long, value_name = "HZ", default_value_t = 1.0, value_parser = rate)]
+    keyframe_rate: f64,
+}
+
+/// Receive an instance of another machine and publish it here: every subscriber works as it does there
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Stamps of CLOCK_MONOTONIC are translated to the clock of this machine, by asking the robot for its own once a second;
+published_nanos then tells the age of a pose here. capture_nanos and realtime_nanos stay as the robot wrote them.
+While the link is down health is `stale` with the cause. Several robots: one receiver each, with another --as.")]
+#[command(group(clap::ArgGroup::new("link").args(["listen", "connect"]).required(true).multiple(true)))]
+struct ReceiveArguments {
+    #[command(flatten)]
+    link: LinkArguments,
+    /// Name of the instance on the robot
+    #[arg(long, value_name = "INSTANCE", default_value = "semidense")]
+    from: String,
+    /// Name of the instance here [default: as on the robot]
+    #[arg(long = "as", value_name = "INSTANCE")]
+    local: Option<String>,
+}
+
+/// A rate in Hz.
+fn rate(text: &str) -> Result<f64, String> {
+    /// Faster than any camera.
+    const MAX_HZ: f64 = 1000.0;
+    match text.parse::<f64>() {
+        Ok(rate_hz) if rate_hz > 0.0 && rate_hz <= MAX_HZ => Ok(rate_hz),
+        _ => Err(format!("write a number above 0 and up to {MAX_HZ}, in Hz")),
+    }
+}
+
+/// Runs it until a signal comes.
+pub fn run(common: &CommonArguments, arguments: &ZenohArguments) -> CommandResult {
+    match &arguments.direction {
+        Direction::Send(arguments) => run_send(common, arguments),
+        Direction::Receive(arguments) => run_receive(common, arguments),
+    }
+}
+
+fn run_send(common: &CommonArguments, arguments: &SendArguments) -> CommandResult {
+    let place = common.place()?;
+    let mut endpoints = arguments.link.endpoints();
+    if endpoints.listen.is_empty() && endpoints.connect.is_empty() {
+        endpoints.listen.push("tcp/127.0.0.1".parse()?);
+    }
+    let SendArguments { jpeg_quality, frame_rate, .. } = *arguments;
+    let frames = FrameOptions { jpeg_quality, rate_hz: frame_rate };
+    let options = SendOptions {
+        frames: arguments.frames.then_some(frames),
+        keyframe_rate_hz: arguments.keyframe_rate,
+        endpoints,
+    };
+    warn_of_open_port(&options.endpoints);
+    note(&format!("sending instance `{}` on {}", place.instance, options.endpoints));
+    let shutdown = Shutdown::install()?;
+    let outcome = send(&place, &options, &shutdown);
+    tidy_up(&place);
+    outcome?;
+    Ok(ExitCode::SUCCESS)
+}
+
+fn run_receive(common: &CommonArguments, arguments: &ReceiveArguments) -> CommandResult {
+    // The name from the robot is part of a key: it must be one that an instance can have.
+    Place::new(&arguments.from, "")?;
+    let named = common.instance.clone();
+    let instance = arguments.local.clone().or(named).unwrap_or_else(|| arguments.from.clone());
+    let place = CommonArguments { instance: Some(instance), ..common.clone() }.place()?;
+    let options =
+        ReceiveOptions { endpoints: arguments.link.endpoints(), from: arguments.from.clone() };
+    warn_of_open_port(&options.endpoints);
+    let shutdown = Shutdown::install()?;
+    let (from, local) = (&options.from, &place.instance);
+    note(&format!("receiving `{from}` from {} as instance `{local}`", options.endpoints));
+    let outcome = receive(&place, &options, &shutdown);
+    tidy_up(&place);
+    outcome?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Says what an open port means.
+fn warn_of_open_port(endpoints: &Endpoints) {
+    let open: Vec<String> =
+        endpoints.listen.iter().filter(|e| !e.is_local()).map(Endpoint::to_string).collect();
+    if open.is_empty() {
+        return;
+    }
+    let who = match endpoints.password_file {
+        Some(_) => "who knows the password can read and write, and the network can listen",
+        None => {
+            "everybody who reaches it can read and write, and the network can listen (--password-file asks for a password)"
+        }
+    };
+    note(&format!("warning: {} is open beyond this machine: {who}", open.join(", ")));
+}
+
+/// A line for the user.
+fn note(line: &str) {
+    // Standard error may be closed; there is nobody else to tell.
+    let _ = writeln!(std::io::stderr(), "{line}");
+}

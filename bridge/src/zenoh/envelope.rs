@@ -1,0 +1,231 @@
+//! What goes over the network: an envelope of 64 bytes, the message as it lies in shared memory, and its packed payload.
+//!
+//! Everything that arrives is taken for hostile: sizes, versions and codes are checked here, what the messages say where
+//! they are unpacked. Numbers are little-endian; a machine of the other order is refused by the first four bytes.
+
+use semidense::wire::topic::WIRE_VERSION;
+use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
+
+use crate::zenoh::kind::Kind;
+
+/// First four bytes, "SDZ1": format 1 of this envelope.
+const MAGIC: u32 = u32::from_le_bytes(*b"SDZ1");
+/// Most bytes of one message: the largest is the depth of a keyframe, 1.6 MB unpacked, or an image.
+pub const MAX_MESSAGE_BYTES: usize = 16 << 20;
+
+/// How a payload is packed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Packing {
+    /// As it is.
+    Plain,
+    /// LZ4 of columns, or of rows of an image.
+    Lz4,
+    /// JPEG.
+    Jpeg,
+}
+
+impl Packing {
+    const ALL: [Self; 3] = [Self::Plain, Self::Lz4, Self::Jpeg];
+}
+
+/// The envelope.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, FromBytes, IntoBytes, Immutable, KnownLayout)]
+pub struct Envelope {
+    /// Format of the envelope.
+    pub magic: u32,
+    /// Wire version of the message: messages of another one are not looked at.
+    pub wire_version: u32,
+    /// Code of the [`Kind`].
+    pub kind: u32,
+    /// Place of the [`Packing`] in the order of its declaration.
+    pub packing: u32,
+    /// The sending program: drawn at random at its start.
+    pub sender: u64,
+    /// Runs of the instance that the sender has seen: what came before belongs to another one.
+    pub run: u64,
+    /// Counts the messages of this kind from 1.
+    pub number: u64,
+    /// CLOCK_MONOTONIC of the sender when it was packed.
+    pub sent_nanos: i64,
+    /// CLOCK_REALTIME − CLOCK_MONOTONIC of the sender.
+    pub realtime_offset_nanos: i64,
+    /// Bytes of the message's fixed part.
+    pub header_bytes: u32,
+    /// Bytes of its payload before packing.
+    pub payload_bytes: u32,
+}
+
+/// Why something that arrived is refused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum EnvelopeError {
+    /// Not from this program.
+    #[error("{bytes} bytes are no message of semidense")]
+    Foreign {
+        /// How many came.
+        bytes: usize,
+    },
+    /// Of another version.
+    #[error("the robot speaks wire version {found}, this program {WIRE_VERSION}")]
+    Version {
+        /// Its version.
+        found: u32,
+    },
+    /// A code that stands for nothing, or a size that the message does not have.
+    #[error("an envelope with impossible codes or sizes")]
+    Broken,
+}
+
+/// A message as it arrived.
+#[derive(Debug, Clone, Copy)]
+pub struct Opened<'a> {
+    /// Its envelope.
+    pub envelope: Envelope,
+    /// What it is.
+    pub kind: Kind,
+    /// How its payload is packed.
+    pub packing: Packing,
+    /// Its fixed part.
+    pub header: &'a [u8],
+    /// Its payload, packed.
+    pub packed: &'a [u8],
+}
+
+/// What all messages of a sender have in common.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Origin {
+    /// The sending program.
+    pub sender: u64,
+    /// Runs that it has seen.
+    pub run: u64,
+    /// CLOCK_MONOTONIC now.
+    pub sent_nanos: i64,
+    /// CLOCK_REALTIME − CLOCK_MONOTONIC.
+    pub realtime_offset_nanos: i64,
+}
+
+/// A payload that is ready to be sent.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Packed {
+    /// How it is packed.
+    pub packing: Packing,
+    /// Bytes before that.
+    pub unpacked_bytes: usize,
+    /// The bytes.
+    pub bytes: Vec<u8>,
+}
+
+impl Packed {
+    /// No payload.
+    pub fn empty() -> Self {
+        Self { packing: Packing::Plain, unpacked_bytes: 0, bytes: Vec::new() }
+    }
+}
+
+/// The bytes of a message for the network.
+pub fn seal<T: IntoBytes + Immutable>(
+    origin: &Origin,
+    kind: Kind,
+    number: u64,
+    message: &T,
+    payload: &Packed,
+) -> Vec<u8> {
+    let header = message.as_bytes();
+    let envelope = Envelope {
+        magic: MAGIC,
+        wire_version: WIRE_VERSION,
+        kind: kind.code(),
+        packing: payload.packing as u32,
+        sender: origin.sender,
+        run: origin.run,
+        number,
+        sent_nanos: origin.sent_nanos,
+        realtime_offset_nanos: origin.realtime_offset_nanos,
+        header_bytes: header.len() as u32,
+        payload_bytes: payload.unpacked_bytes as u32,
+    };
+    [envelope.as_bytes(), header, &payload.bytes].concat()
+}
+
+/// Checks what arrived, up to the bytes of its message.
+pub fn open(bytes: &[u8]) -> Result<Opened<'_>, EnvelopeError> {
+    let foreign = EnvelopeError::Foreign { bytes: bytes.len() };
+    // What comes first tells the version, whatever follows.
+    let ([magic, found], _) = <[u32; 2]>::read_from_prefix(bytes).map_err(|_| foreign)?;
+    if magic != MAGIC {
+        return Err(foreign);
+    }
+    if found != WIRE_VERSION {
+        return Err(EnvelopeError::Version { found });
+    }
+    let (envelope, rest) = Envelope::read_from_prefix(bytes).map_err(|_| foreign)?;
+    let header_bytes = envelope.header_bytes as usize;
+    let is_too_large = bytes.len() > MAX_MESSAGE_BYTES || header_bytes > rest.len();
+    let kind = Kind::from_code(envelope.kind).filter(|_| !is_too_large);
+    let packing = Packing::ALL.get(envelope.packing as usize).copied();
+    let (Some(kind), Some(packing)) = (kind, packing) else {
+        return Err(EnvelopeError::Broken);
+    };
+    let (header, packed) = rest.split_at(header_bytes);
+    Ok(Opened { envelope, kind, packing, header, packed })
+}
+
+impl Opened<'_> {
+    /// Its fixed part, where it has the size of a `T`.
+    pub fn message<T: FromBytes>(&self) -> Result<T, EnvelopeError> {
+        T::read_from_bytes(self.header).map_err(|_| EnvelopeError::Broken)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const ORIGIN: Origin =
+        Origin { sender: 7, run: 1, sent_nanos: 5, realtime_offset_nanos: 1_700_000_000 };
+
+    fn sealed() -> Vec<u8> {
+        let payload = Packed { packing: Packing::Plain, unpacked_bytes: 3, bytes: vec![1, 2, 3] };
+        seal(&ORIGIN, Kind::Graph, 9, &[4_u64, 5], &payload)
+    }
+
+    #[test]
+    fn what_is_sealed_is_opened() {
+        let bytes = sealed();
+        let opened = open(&bytes).unwrap();
+        assert_eq!(
+            (opened.kind, opened.packing, opened.packed),
+            (Kind::Graph, Packing::Plain, &[1, 2, 3][..])
+        );
+        assert_eq!((opened.envelope.sender, opened.envelope.number), (7, 9));
+        assert_eq!(opened.message::<[u64; 2]>(), Ok([4, 5]));
+        assert_eq!(opened.message::<[u64; 3]>(), Err(EnvelopeError::Broken));
+    }
+
+    #[test]
+    fn another_version_is_refused_with_both() {
+        let mut bytes = sealed();
+        bytes[4..8].copy_from_slice(&(WIRE_VERSION + 1).to_le_bytes());
+        // Whatever that version has behind its number.
+        bytes.truncate(12);
+        let error = open(&bytes).unwrap_err().to_string();
+        let both = [format!("version {},", WIRE_VERSION + 1), format!("program {WIRE_VERSION}")];
+        assert!(both.iter().all(|version| error.contains(version)), "{error}");
+    }
+
+    #[test]
+    fn broken_ones_are_refused() {
+        let whole = sealed();
+        for length in 0..size_of::<Envelope>() + 16 {
+            assert!(open(&whole[..length]).is_err(), "{length} bytes");
+        }
+        for (place, wrong) in [(8, 99), (12, 99), (56, u32::MAX)] {
+            let mut bytes = whole.clone();
+            bytes[place..place + 4].copy_from_slice(&wrong.to_le_bytes());
+            assert_eq!(open(&bytes).unwrap_err(), EnvelopeError::Broken, "byte {place}");
+        }
+        assert_eq!(open(b"GET / HTTP/1.1").unwrap_err(), EnvelopeError::Foreign { bytes: 14 });
+        let huge = [&whole[..], &vec![0; MAX_MESSAGE_BYTES]].concat();
+        assert_eq!(open(&huge).unwrap_err(), EnvelopeError::Broken);
+    }
+}

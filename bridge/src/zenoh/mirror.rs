@@ -1,0 +1,163 @@
+//! The instance at the receiving end: the topics of the robot in shared memory, under a name of this machine.
+//!
+//! The names of its processes are claimed, so that neither a second receiver nor a pipeline of this machine can speak on the
+//! same topics.
+
+use semidense::service::clock::now_nanos;
+use semidense::service::health::ProcessState;
+use semidense::service::peers::HEALTH_TOPICS;
+use semidense::slam::keyframe::{DepthPoint, MAX_KEYFRAME_POINTS};
+use semidense::wire::command::text_bytes;
+use semidense::wire::message::{
+    AdjustmentMessage, FrameHeader, GraphHeader, HealthMessage, KeyframeHeader,
+    KeyframeImageHeader, KeyframePoseMessage, PoseMessage,
+};
+use semidense::wire::place::{Claim, Place};
+use semidense::wire::port::{Access, Hub, Publisher};
+use semidense::wire::topic::{
+    ADJUSTMENT, FRAME, GRAPH, KEYFRAME, KEYFRAME_IMAGE, MAX_GRAPH_KEYFRAMES, POSE,
+};
+use zerocopy::FromZeros;
+
+use crate::zenoh::error::ZenohError;
+use crate::zenoh::kind::Kind;
+use crate::zenoh::unpack::Arrival;
+
+/// Time between two reports of a silence, nanoseconds: as often as processes report.
+const REPORT_PERIOD_NANOS: i64 = 1_000_000_000;
+/// What the supervisor of a run claims.
+const SUPERVISOR: &str = "supervisor";
+
+/// The topics of one instance.
+pub struct Mirror {
+    poses: Publisher<PoseMessage, ()>,
+    adjustments: Publisher<AdjustmentMessage, ()>,
+    graphs: Publisher<KeyframePoseMessage, GraphHeader>,
+    keyframes: Publisher<DepthPoint, KeyframeHeader>,
+    /// With the pixels that they have room for.
+    images: (usize, Publisher<u8, KeyframeImageHeader>),
+    frames: (usize, Publisher<u8, FrameHeader>),
+    health: [Reported; 3],
+    hub: Hub,
+    _claims: Vec<Claim>,
+}
+
+/// The health of one process.
+struct Reported {
+    publisher: Publisher<HealthMessage, ()>,
+    /// As it came, with stamps of this machine.
+    last: HealthMessage,
+    /// CLOCK_MONOTONIC when it was published here.
+    told_nanos: i64,
+    is_silent: bool,
+}
+
+impl Mirror {
+    /// Claims the names of the processes and opens the topics.
+    pub fn open(place: &Place) -> Result<Self, ZenohError> {
+        let names = HEALTH_TOPICS.iter().map(|topic| topic.owner);
+        let claims: Result<Vec<Claim>, _> =
+            std::iter::once(SUPERVISOR).chain(names).map(|name| place.claim(name)).collect();
+        let claims = claims?;
+        let hub = Hub::join(place, "zenoh-receive", Access::Member)?;
+        let reported = |place: usize| -> Result<Reported, ZenohError> {
+            Ok(Reported {
+                publisher: hub.publisher(&HEALTH_TOPICS[place], 1)?,
+                last: HealthMessage::new_zeroed(),
+                told_nanos: i64::MIN,
+                is_silent: false,
+            })
+        };
+        let mirror = Self {
+            poses: hub.publisher(&POSE, 1)?,
+            adjustments: hub.publisher(&ADJUSTMENT, 1)?,
+            graphs: hub.publisher(&GRAPH, MAX_GRAPH_KEYFRAMES)?,
+            keyframes: hub.publisher(&KEYFRAME, MAX_KEYFRAME_POINTS)?,
+            // The topics are there for subscribers at once; their size is known with the first image.
+            images: (1, hub.publisher(&KEYFRAME_IMAGE, 1)?),
+            frames: (1, hub.publisher(&FRAME, 1)?),
+            health: [reported(0)?, reported(1)?, reported(2)?],
+            hub,
+            _claims: claims,
+        };
+        mirror.hub.reserve()?;
+        Ok(mirror)
+    }
+
+    /// Publishes what arrived; its stamps are those of this machine already.
+    pub fn publish(&mut self, arrival: &Arrival) -> Result<(), ZenohError> {
+        match arrival {
+            Arrival::Pose(message) => self.poses.send((), &[**message])?,
+            Arrival::Health(kind, message) => self.publish_health(*kind, message)?,
+            Arrival::Adjustment(message) => self.adjustments.send((), &[*message])?,
+            Arrival::Graph(header, poses) => self.graphs.send(*header, poses)?,
+            Arrival::Keyframe(header, points) => self.keyframes.send(**header, points)?,
+            Arrival::KeyframeImage(header, pixels) => {
+                if pixels.len() > self.images.0 {
+                    self.images =
+                        (pixels.len(), self.hub.publisher(&KEYFRAME_IMAGE, pixels.len())?);
+                    self.hub.reserve()?;
+                }
+                self.images.1.send(*header, pixels)?;
+            }
+            Arrival::Frame(header, pixels) => {
+                if pixels.len() > self.frames.0 {
+                    self.frames = (pixels.len(), self.hub.publisher(&FRAME, pixels.len())?);
+                    self.hub.reserve()?;
+                }
+                self.frames.1.send(*header, pixels)?;
+            }
+            Arrival::Presence(_) => {}
+        }
+        Ok(())
+    }
+
+    /// Gives the last keyframe, graph, pose and health to subscribers that came late.
+    pub fn serve_late_joiners(&self) {
+        self.poses.serve_late_joiners();
+        self.adjustments.serve_late_joiners();
+        self.graphs.serve_late_joiners();
+        self.keyframes.serve_late_joiners();
+        self.images.1.serve_late_joiners();
+        self.frames.1.serve_late_joiners();
+        self.health.iter().for_each(|reported| reported.publisher.serve_late_joiners());
+    }
+
+    /// Says once a second why nothing comes: health becomes stale and does not just stop. What has finished stays so.
+    pub fn tell_silence(&mut self, cause: &str) -> Result<(), ZenohError> {
+        let now = now_nanos();
+        for reported in &mut self.health {
+            let since = now.saturating_sub(reported.told_nanos);
+            if reported.is_silent && since < REPORT_PERIOD_NANOS {
+                continue;
+            }
+            let mut message = reported.last;
+            let has_ended = matches!(
+                ProcessState::from_code(message.state),
+                Some(ProcessState::Finished | ProcessState::Failed)
+            );
+            if !has_ended {
+                message.state = ProcessState::Stale.code();
+                (message.cause, message.cause_bytes) = text_bytes(cause);
+                message.rate_hz = 0.0;
+            }
+            message.published_nanos = now;
+            message.process_id = std::process::id();
+            reported.publisher.send((), &[message])?;
+            (reported.told_nanos, reported.is_silent) = (now, true);
+        }
+        Ok(())
+    }
+
+    /// The process id is this program's: the robot's means nothing to who looks here whether it is alive.
+    fn publish_health(&mut self, kind: Kind, message: &HealthMessage) -> Result<(), ZenohError> {
+        let place = Kind::HEALTH.iter().position(|of| *of == kind);
+        let Some(reported) = place.and_then(|place| self.health.get_mut(place)) else {
+            return Ok(());
+        };
+        reported.last = HealthMessage { process_id: std::process::id(), ..*message };
+        reported.publisher.send((), &[reported.last])?;
+        (reported.told_nanos, reported.is_silent) = (now_nanos(), false);
+        Ok(())
+    }
+}

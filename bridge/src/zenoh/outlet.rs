@@ -1,0 +1,125 @@
+//! What the sender's threads share: numbers, the run, and the last message of each kind for receivers that come late.
+
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use semidense::service::clock::now_nanos;
+use zenoh::bytes::ZBytes;
+use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
+
+use crate::zenoh::envelope::{Origin, Packed, seal};
+use crate::zenoh::kind::Kind;
+
+/// Says that the sender is there. Its envelope carries the sender's clock.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, FromBytes, IntoBytes, Immutable, KnownLayout)]
+pub struct Presence {
+    /// 1 while the instance runs, else 0.
+    pub is_joined: u64,
+    /// Number of the last message of each kind, by code.
+    pub newest: [u64; Kind::COUNT],
+}
+
+/// Numbers and keeps what is sent.
+#[derive(Debug)]
+pub struct Outlet {
+    sender: u64,
+    run: AtomicU64,
+    is_joined: AtomicBool,
+    numbers: [AtomicU64; Kind::COUNT],
+    bytes: [AtomicU64; Kind::COUNT],
+    kept: Mutex<[Option<ZBytes>; Kind::COUNT]>,
+}
+
+impl Outlet {
+    /// Nothing sent yet.
+    pub fn new(sender: u64) -> Self {
+        Self {
+            sender,
+            run: AtomicU64::new(0),
+            is_joined: AtomicBool::new(false),
+            numbers: Default::default(),
+            bytes: Default::default(),
+            kept: Mutex::default(),
+        }
+    }
+
+    /// An instance was joined.
+    pub fn begin_run(&self) {
+        self.run.fetch_add(1, Ordering::AcqRel);
+        *self.kept() = Default::default();
+        self.is_joined.store(true, Ordering::Release);
+    }
+
+    /// The instance is gone. What it said last stays for receivers that come late, but for the map: its keyframes are
+    /// no help without the run.
+    pub fn end_run(&self) {
+        self.is_joined.store(false, Ordering::Release);
+    }
+
+    /// The bytes of a message; of the kinds that are kept it is the last from now on.
+    pub fn seal<T: IntoBytes + Immutable>(
+        &self,
+        kind: Kind,
+        message: &T,
+        payload: &Packed,
+    ) -> ZBytes {
+        let number = self.numbers[kind as usize].fetch_add(1, Ordering::AcqRel) + 1;
+        let sealed = seal(&self.origin(), kind, number, message, payload);
+        self.bytes[kind as usize].fetch_add(sealed.len() as u64, Ordering::Relaxed);
+        let sealed = ZBytes::from(sealed);
+        if kind.is_kept() {
+            self.kept()[kind as usize] = Some(sealed.clone());
+        }
+        sealed
+    }
+
+    /// Runs that were seen.
+    pub fn run(&self) -> u64 {
+        self.run.load(Ordering::Acquire)
+    }
+
+    /// The last message of a kind that is kept.
+    pub fn last(&self, kind: Kind) -> Option<ZBytes> {
+        self.kept()[kind as usize].clone()
+    }
+
+    /// The answer to who asks whether the sender is there.
+    pub fn presence(&self) -> ZBytes {
+        let presence = Presence {
+            is_joined: u64::from(self.is_joined.load(Ordering::Acquire)),
+            newest: self.counts(),
+        };
+        ZBytes::from(seal(&self.origin(), Kind::Presence, 0, &presence, &Packed::empty()))
+    }
+
+    /// Messages sent so far, by kind.
+    pub fn counts(&self) -> [u64; Kind::COUNT] {
+        std::array::from_fn(|kind| self.numbers[kind].load(Ordering::Acquire))
+    }
+
+    /// Bytes sent so far, by kind.
+    pub fn bytes(&self) -> [u64; Kind::COUNT] {
+        std::array::from_fn(|kind| self.bytes[kind].load(Ordering::Relaxed))
+    }
+
+    fn origin(&self) -> Origin {
+        Origin {
+            sender: self.sender,
+            run: self.run.load(Ordering::Acquire),
+            sent_nanos: now_nanos(),
+            realtime_offset_nanos: realtime_offset_nanos(),
+        }
+    }
+
+    fn kept(&self) -> MutexGuard<'_, [Option<ZBytes>; Kind::COUNT]> {
+        self.kept.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// CLOCK_REALTIME − CLOCK_MONOTONIC of this machine.
+pub fn realtime_offset_nanos() -> i64 {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    i64::try_from(since.as_nanos()).unwrap_or(i64::MAX).saturating_sub(now_nanos())
+}

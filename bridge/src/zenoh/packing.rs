@@ -1,0 +1,145 @@
+//! Payloads made small for the network, without loss but for frames: points by columns, images by differences, then LZ4.
+//!
+//! Points lie row by row in the image, so that differences of u and v are nearly all small; the bytes of equal rank of the
+//! real numbers stand together, because exponents repeat and mantissas do not.
+
+use semidense::slam::keyframe::{DepthPoint, MAX_KEYFRAME_POINTS};
+use zerocopy::IntoBytes;
+
+use crate::zenoh::envelope::{Opened, Packed, Packing};
+
+/// Bytes of a point.
+const POINT_BYTES: usize = size_of::<DepthPoint>();
+
+/// A payload that is not what its envelope says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("a payload that does not unpack to what is announced")]
+pub struct UnpackError;
+
+/// Fixed-size elements as they are: graphs.
+pub fn pack_plain(bytes: &[u8]) -> Packed {
+    Packed { packing: Packing::Plain, unpacked_bytes: bytes.len(), bytes: bytes.to_vec() }
+}
+
+/// Depth of a keyframe.
+pub fn pack_points(points: &[DepthPoint]) -> Packed {
+    let mut planes = vec![0; points.len() * POINT_BYTES];
+    let mut before = [0; 2];
+    for (index, point) in points.iter().enumerate() {
+        let delta = [point.u.wrapping_sub(before[0]), point.v.wrapping_sub(before[1])];
+        before = [point.u, point.v];
+        let coded = DepthPoint { u: delta[0], v: delta[1], ..*point };
+        for (rank, byte) in coded.as_bytes().iter().enumerate() {
+            planes[rank * points.len() + index] = *byte;
+        }
+    }
+    lz4(&planes)
+}
+
+/// Depth of a keyframe, as it was.
+pub fn unpack_points(opened: &Opened<'_>) -> Result<Vec<DepthPoint>, UnpackError> {
+    let bytes = opened.envelope.payload_bytes as usize;
+    let count = bytes / POINT_BYTES;
+    if !bytes.is_multiple_of(POINT_BYTES) || count > MAX_KEYFRAME_POINTS {
+        return Err(UnpackError);
+    }
+    let planes = unlz4(opened, bytes)?;
+    let mut points = vec![DepthPoint::default(); count];
+    let mut before = [0_u16; 2];
+    for (index, point) in points.iter_mut().enumerate() {
+        for (rank, byte) in point.as_mut_bytes().iter_mut().enumerate() {
+            *byte = planes[rank * count + index];
+        }
+        (point.u, point.v) = (point.u.wrapping_add(before[0]), point.v.wrapping_add(before[1]));
+        before = [point.u, point.v];
+    }
+    Ok(points)
+}
+
+/// A grey image.
+pub fn pack_image(pixels: &[u8]) -> Packed {
+    let mut before = 0;
+    let difference = |pixel: &u8| {
+        let difference = pixel.wrapping_sub(before);
+        before = *pixel;
+        difference
+    };
+    lz4(&pixels.iter().map(difference).collect::<Vec<u8>>())
+}
+
+/// A grey image of `length` pixels, as it was.
+pub fn unpack_image(opened: &Opened<'_>, length: usize) -> Result<Vec<u8>, UnpackError> {
+    let mut pixels = unlz4(opened, length)?;
+    let mut before = 0_u8;
+    for pixel in &mut pixels {
+        *pixel = pixel.wrapping_add(before);
+        before = *pixel;
+    }
+    Ok(pixels)
+}
+
+/// Packs with LZ4.
+fn lz4(bytes: &[u8]) -> Packed {
+    let packed = lz4_flex::block::compress(bytes);
+    Packed { packing: Packing::Lz4, unpacked_bytes: bytes.len(), bytes: packed }
+}
+
+/// Exactly `length` bytes; never more, whatever is packed.
+fn unlz4(opened: &Opened<'_>, length: usize) -> Result<Vec<u8>, UnpackError> {
+    if opened.packing != Packing::Lz4 || opened.envelope.payload_bytes as usize != length {
+        return Err(UnpackError);
+    }
+    let mut bytes = vec![0; length];
+    let unpacked = lz4_flex::block::decompress_into(opened.packed, &mut bytes);
+    if unpacked.ok() == Some(length) { Ok(bytes) } else { Err(UnpackError) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::zenoh::envelope::{Origin, open, seal};
+    use crate::zenoh::kind::Kind;
+
+    const ORIGIN: Origin = Origin { sender: 1, run: 1, sent_nanos: 0, realtime_offset_nanos: 0 };
+
+    fn points(count: usize) -> Vec<DepthPoint> {
+        let point = |i: usize| DepthPoint {
+            u: (i * 3 % 640) as u16,
+            v: (i * 3 / 640) as u16,
+            inverse_depth: 1.0 / (1.0 + i as f32),
+            variance: 1e-3 * (i % 17) as f32,
+            intensity: (i % 256) as f32,
+        };
+        (0..count).map(point).collect()
+    }
+
+    fn sealed(payload: &Packed) -> Vec<u8> {
+        seal(&ORIGIN, Kind::Keyframe, 1, &0_u64, payload)
+    }
+
+    #[test]
+    fn every_bit_comes_back() {
+        for count in [0, 1, 1000] {
+            let points = points(count);
+            let bytes = sealed(&pack_points(&points));
+            assert_eq!(unpack_points(&open(&bytes).unwrap()), Ok(points));
+        }
+        let pixels: Vec<u8> = (0..4800_u32).map(|i| (i * i / 7) as u8).collect();
+        let bytes = sealed(&pack_image(&pixels));
+        assert_eq!(unpack_image(&open(&bytes).unwrap(), 4800), Ok(pixels));
+        assert_eq!(unpack_image(&open(&bytes).unwrap(), 4799), Err(UnpackError));
+    }
+
+    #[test]
+    fn hostile_payloads_are_refused() {
+        let good = pack_points(&points(100));
+        let cut = Packed { bytes: good.bytes[..good.bytes.len() / 2].to_vec(), ..good.clone() };
+        let more = Packed { unpacked_bytes: good.unpacked_bytes + POINT_BYTES, ..good.clone() };
+        let bomb = lz4(&vec![0; (MAX_KEYFRAME_POINTS + 1) * POINT_BYTES]);
+        let plain = Packed { packing: Packing::Plain, ..good };
+        for payload in [cut, more, bomb, plain] {
+            let bytes = sealed(&payload);
+            assert_eq!(unpack_points(&open(&bytes).unwrap()), Err(UnpackError));
+        }
+    }
+}

@@ -1,0 +1,100 @@
+//! Asks the sender once a second whether it is there: that gives its clock, and tells what was missed. What is kept there
+//! and missing here (a late start, a cut link, a dropped message) is fetched.
+
+use std::sync::mpsc::{Receiver, RecvTimeoutError};
+use std::time::{Duration, Instant};
+
+use semidense::service::clock::now_nanos;
+use zenoh::bytes::ZBytes;
+use zenoh::qos::{CongestionControl, Priority};
+use zenoh::query::{ConsolidationMode, QueryTarget};
+use zenoh::{Session, Wait};
+
+use crate::zenoh::clock_offset::ClockAnswer;
+use crate::zenoh::envelope::{EnvelopeError, open};
+use crate::zenoh::kind::Kind;
+use crate::zenoh::receiver::Shared;
+use crate::zenoh::unpack::{Arrival, unpack};
+
+/// Time between two questions.
+const PERIOD: Duration = Duration::from_secs(1);
+/// The same until the first answer.
+const FIRST_PERIOD: Duration = Duration::from_millis(200);
+/// Longest wait for an answer.
+const LONGEST_ANSWER: Duration = Duration::from_secs(2);
+
+/// Asks until the other end of `stop` is gone.
+pub fn poll(network: &Session, instance: &str, shared: &Shared, stop: &Receiver<()>) {
+    let mut period = FIRST_PERIOD;
+    let mut missing_before = Vec::new();
+    loop {
+        let missing = ask(network, instance, shared);
+        if let Some(missing) = missing {
+            // Twice in a row: what is only on its way needs no second copy. At the start nothing is on its way.
+            let is_first = period == FIRST_PERIOD;
+            let fetched = missing.iter().filter(|kind| is_first || missing_before.contains(*kind));
+            fetched.for_each(|kind| fetch(network, instance, shared, *kind));
+            missing_before = missing;
+            period = PERIOD;
+        }
+        if stop.recv_timeout(period) != Err(RecvTimeoutError::Timeout) {
+            return;
+        }
+    }
+}
+
+/// One question; the kinds that are missing, `None` where nobody answers.
+fn ask(network: &Session, instance: &str, shared: &Shared) -> Option<Vec<Kind>> {
+    let asked_nanos = now_nanos();
+    let mut missing = None;
+    get(network, &Kind::Presence.key(instance), Priority::RealTime, |bytes| {
+        let answered_nanos = now_nanos();
+        let bytes = bytes.to_bytes();
+        let opened = match open(&bytes) {
+            Ok(opened) if opened.kind == Kind::Presence => opened,
+            Err(EnvelopeError::Version { found }) => {
+                shared.remote().hear_foreign(found, Instant::now());
+                return;
+            }
+            _ => {
+                shared.remote().refused += 1;
+                return;
+            }
+        };
+        let Ok(Arrival::Presence(presence)) = unpack(&opened) else {
+            shared.remote().refused += 1;
+            return;
+        };
+        let remote_nanos = opened.envelope.sent_nanos;
+        let clock = ClockAnswer { asked_nanos, remote_nanos, answered_nanos };
+        let lacks = shared.remote().answer(&opened.envelope, &presence, clock, Instant::now());
+        missing.get_or_insert_with(Vec::new).extend(lacks);
+    });
+    missing
+}
+
+/// The last message of a kind.
+fn fetch(network: &Session, instance: &str, shared: &Shared, kind: Kind) {
+    get(network, &kind.key(instance), Priority::DataLow, |bytes| {
+        shared.arrive(kind, bytes.clone())
+    });
+}
+
+fn get(network: &Session, key: &str, priority: Priority, mut take: impl FnMut(&ZBytes)) {
+    let asked = network
+        .get(key)
+        // All answers, as they come: two robots with one name must be seen.
+        .target(QueryTarget::All)
+        .consolidation(ConsolidationMode::None)
+        .congestion_control(CongestionControl::Drop)
+        .priority(priority)
+        .express(true)
+        .timeout(LONGEST_ANSWER)
+        .wait();
+    let Ok(replies) = asked else { return };
+    while let Ok(reply) = replies.recv() {
+        if let Ok(sample) = reply.result() {
+            take(sample.payload());
+        }
+    }
+}

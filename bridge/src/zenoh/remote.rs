@@ -1,0 +1,185 @@
+//! What the receiver knows of the sender: which program speaks, what came and is missing, its clock, and when it was heard.
+
+use std::time::{Duration, Instant};
+
+use semidense::wire::topic::WIRE_VERSION;
+
+use crate::zenoh::clock_offset::{ClockAnswer, ClockOffset};
+use crate::zenoh::envelope::Envelope;
+use crate::zenoh::kind::Kind;
+use crate::zenoh::outlet::{Presence, realtime_offset_nanos};
+
+/// A sender that was not heard for so long gives way to another one under its name: it asks for presence once a second.
+const GIVES_WAY: Duration = Duration::from_millis(1500);
+/// Silence after which health says that the link is gone: processes report once a second.
+const LONGEST_SILENCE: Duration = Duration::from_secs(3);
+
+/// What is known of the sender.
+#[derive(Debug, Default)]
+pub struct Remote {
+    /// Translates its stamps.
+    pub clock: ClockOffset,
+    /// Messages that were refused because they are broken.
+    pub refused: u64,
+    sender: Option<u64>,
+    run: u64,
+    heard: Option<Instant>,
+    is_joined: Option<bool>,
+    /// Another wire version that was heard, and when.
+    foreign: Option<(u32, Instant)>,
+    /// When another program spoke under the same name.
+    rival: Option<Instant>,
+    received: [u64; Kind::COUNT],
+    lost: [u64; Kind::COUNT],
+}
+
+impl Remote {
+    /// Whether a message is to be used: of the program that is listened to, of its present run, and new.
+    pub fn admit(&mut self, envelope: &Envelope, kind: Kind, now: Instant) -> bool {
+        if !self.hear(envelope, now) || envelope.run < self.run {
+            return false;
+        }
+        self.run = envelope.run;
+        let received = &mut self.received[kind as usize];
+        if envelope.number <= *received {
+            return false;
+        }
+        if *received > 0 {
+            self.lost[kind as usize] += envelope.number - *received - 1;
+        }
+        *received = envelope.number;
+        true
+    }
+
+    /// Takes in an answer to the question for presence; the kinds that are kept there and missing here.
+    pub fn answer(
+        &mut self,
+        envelope: &Envelope,
+        presence: &Presence,
+        clock: ClockAnswer,
+        now: Instant,
+    ) -> Vec<Kind> {
+        if !self.hear(envelope, now) {
+            return Vec::new();
+        }
+        self.clock.take(clock);
+        self.is_joined = Some(presence.is_joined != 0);
+        let is_missing =
+            |kind: &Kind| presence.newest[*kind as usize] > self.received[*kind as usize];
+        Kind::ALL.into_iter().filter(|kind| kind.is_kept()).filter(is_missing).collect()
+    }
+
+    /// Takes in that something of another version came.
+    pub fn hear_foreign(&mut self, version: u32, now: Instant) {
+        if self.foreign.is_none_or(|(known, _)| known != version) {
+            tracing::warn!(
+                "the robot speaks wire version {version}, this program {WIRE_VERSION}: install the same version of semidense-bridge on both"
+            );
+        }
+        self.foreign = Some((version, now));
+    }
+
+    /// Why what is known is old; `None` while the sender and its instance are there.
+    pub fn silence(&self, instance: &str, endpoints: &str, now: Instant) -> Option<String> {
+        let is_recent = |heard: &Instant| now.saturating_duration_since(*heard) <= LONGEST_SILENCE;
+        if self.heard.as_ref().is_none_or(|heard| !is_recent(heard)) {
+            let foreign = self.foreign.as_ref().filter(|(_, heard)| is_recent(heard));
+            return Some(match foreign {
+                Some((version, _)) => format!(
+                    "the robot speaks wire version {version}, this program {WIRE_VERSION}: install the same version on both"
+                ),
+                None => format!(
+                    "no word of `{instance}` from {endpoints}: the link is down, or `semidense zenoh send` does not run there"
+                ),
+            });
+        }
+        if self.is_joined == Some(false) {
+            return Some(format!("the robot is there, but its instance `{instance}` does not run"));
+        }
+        self.rival.as_ref().filter(|heard| is_recent(heard)).map(|_| {
+            format!("two programs send as `{instance}`: give each robot a name of its own (--instance there, --from here)")
+        })
+    }
+
+    /// Messages of a kind that did not arrive.
+    pub fn lost(&self, kind: Kind) -> u64 {
+        self.lost[kind as usize]
+    }
+
+    /// Whether the envelope is of the program that is listened to; the first one is, and the next when that is gone.
+    fn hear(&mut self, envelope: &Envelope, now: Instant) -> bool {
+        if self.sender != Some(envelope.sender) {
+            let is_alive =
+                self.heard.is_some_and(|heard| now.saturating_duration_since(heard) < GIVES_WAY);
+            if self.sender.is_some() && is_alive {
+                if self.rival.is_none() {
+                    tracing::warn!("two programs send under the same name; one is listened to");
+                }
+                self.rival = Some(now);
+                return false;
+            }
+            self.begin(envelope.sender);
+        }
+        self.heard = Some(now);
+        self.clock.tell_realtime(envelope.realtime_offset_nanos, realtime_offset_nanos());
+        true
+    }
+
+    /// Another program: its numbers and its clock are new.
+    fn begin(&mut self, sender: u64) {
+        self.sender = Some(sender);
+        (self.run, self.is_joined) = (0, None);
+        self.received = [0; Kind::COUNT];
+        self.clock.reset();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::zenoh::envelope::{Origin, Packed, open, seal};
+
+    fn envelope(sender: u64, run: u64, number: u64) -> Envelope {
+        let origin = Origin { sender, run, sent_nanos: 0, realtime_offset_nanos: 0 };
+        open(&seal(&origin, Kind::Pose, number, &0_u64, &Packed::empty())).unwrap().envelope
+    }
+
+    const ANSWER: ClockAnswer = ClockAnswer { asked_nanos: 0, remote_nanos: 0, answered_nanos: 1 };
+
+    #[test]
+    fn a_message_is_used_once_and_what_is_missing_is_counted() {
+        let (mut remote, now) = (Remote::default(), Instant::now());
+        let mut admit = |run, number| remote.admit(&envelope(1, run, number), Kind::Pose, now);
+        assert!(admit(1, 5) && admit(1, 6) && !admit(1, 6) && admit(1, 9));
+        assert!(admit(2, 10) && !admit(1, 11), "of the run before");
+        assert_eq!(remote.lost(Kind::Pose), 2);
+    }
+
+    #[test]
+    fn another_program_is_heard_once_the_first_is_gone() {
+        let (mut remote, now) = (Remote::default(), Instant::now());
+        assert!(remote.admit(&envelope(1, 3, 50), Kind::Pose, now));
+        assert!(!remote.admit(&envelope(2, 1, 1), Kind::Pose, now));
+        assert!(remote.silence("rig", "x", now).unwrap().contains("two programs"));
+        let later = now + GIVES_WAY;
+        assert!(remote.admit(&envelope(2, 1, 1), Kind::Pose, later));
+    }
+
+    #[test]
+    fn silence_has_its_cause() {
+        let (mut remote, now) = (Remote::default(), Instant::now());
+        let cause = |remote: &Remote, now| remote.silence("rig", "tcp/robot:7447", now);
+        assert!(cause(&remote, now).unwrap().contains("tcp/robot:7447"));
+        remote.hear_foreign(WIRE_VERSION + 1, now);
+        let both = cause(&remote, now).unwrap();
+        assert!(both.contains(&format!("version {}", WIRE_VERSION + 1)), "{both}");
+        let mut presence = Presence { is_joined: 1, newest: [0; Kind::COUNT] };
+        presence.newest[Kind::Graph as usize] = 4;
+        let missing = remote.answer(&envelope(1, 1, 0), &presence, ANSWER, now);
+        assert_eq!((missing, cause(&remote, now)), (vec![Kind::Graph], None));
+        presence.is_joined = 0;
+        remote.answer(&envelope(1, 1, 0), &presence, ANSWER, now);
+        assert!(cause(&remote, now).unwrap().contains("does not run"));
+        assert!(cause(&remote, now + 2 * LONGEST_SILENCE).unwrap().contains("no word"));
+    }
+}

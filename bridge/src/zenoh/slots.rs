@@ -1,0 +1,121 @@
+//! A bounded queue between two threads: one slot for each kind, in the order of their importance; where a slot is full, its
+//! oldest goes. Putting never waits.
+
+use std::collections::VecDeque;
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+
+/// The queue.
+#[derive(Debug)]
+pub struct Slots<T> {
+    inner: Mutex<Inner<T>>,
+    filled: Condvar,
+}
+
+#[derive(Debug)]
+struct Inner<T> {
+    slots: Vec<Slot<T>>,
+    is_closed: bool,
+}
+
+#[derive(Debug)]
+struct Slot<T> {
+    items: VecDeque<T>,
+    depth: usize,
+    dropped: u64,
+}
+
+impl<T> Slots<T> {
+    /// A slot for each of `depths`: how many it holds.
+    pub fn new(depths: &[usize]) -> Self {
+        let slot =
+            |&depth: &usize| Slot { items: VecDeque::with_capacity(depth), depth, dropped: 0 };
+        let inner = Inner { slots: depths.iter().map(slot).collect(), is_closed: false };
+        Self { inner: Mutex::new(inner), filled: Condvar::new() }
+    }
+
+    /// Puts an item into `slot`; the oldest of a full one is dropped and counted.
+    pub fn put(&self, slot: usize, item: T) {
+        let mut inner = self.lock();
+        if let Some(slot) = inner.slots.get_mut(slot) {
+            if slot.items.len() >= slot.depth {
+                slot.items.pop_front();
+                slot.dropped += 1;
+            }
+            slot.items.push_back(item);
+        }
+        drop(inner);
+        self.filled.notify_one();
+    }
+
+    /// The oldest item of the first slot that has one.
+    pub fn try_take(&self) -> Option<T> {
+        self.lock().take()
+    }
+
+    /// The same, waiting for one; `None` once the queue is closed.
+    pub fn take(&self) -> Option<T> {
+        let mut inner = self.lock();
+        loop {
+            if inner.is_closed {
+                return None;
+            }
+            if let Some(item) = inner.take() {
+                return Some(item);
+            }
+            inner = self.filled.wait(inner).unwrap_or_else(PoisonError::into_inner);
+        }
+    }
+
+    /// Forgets what is in it: it belongs to a run that is over.
+    pub fn clear(&self) {
+        self.lock().slots.iter_mut().for_each(|slot| slot.items.clear());
+    }
+
+    /// Ends every [`Slots::take`].
+    pub fn close(&self) {
+        self.lock().is_closed = true;
+        self.filled.notify_all();
+    }
+
+    /// How many were dropped in `slot`.
+    pub fn dropped(&self, slot: usize) -> u64 {
+        self.lock().slots.get(slot).map_or(0, |slot| slot.dropped)
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Inner<T>> {
+        // Every change is complete when the lock is given back.
+        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl<T> Inner<T> {
+    fn take(&mut self) -> Option<T> {
+        self.slots.iter_mut().find_map(|slot| slot.items.pop_front())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_oldest_goes_and_the_first_slot_comes_first() {
+        let slots = Slots::new(&[2, 1]);
+        (0..5).for_each(|item| slots.put(0, item));
+        slots.put(1, 10);
+        slots.put(1, 11);
+        let taken: Vec<i32> = std::iter::from_fn(|| slots.try_take()).collect();
+        assert_eq!(taken, [3, 4, 11]);
+        assert_eq!([slots.dropped(0), slots.dropped(1)], [3, 1]);
+    }
+
+    #[test]
+    fn closing_ends_the_wait() {
+        let slots = Slots::<()>::new(&[1]);
+        std::thread::scope(|scope| {
+            let waiting = scope.spawn(|| slots.take());
+            slots.close();
+            assert_eq!(waiting.join().unwrap(), None);
+        });
+    }
+}
