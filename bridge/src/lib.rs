@@ -4,11 +4,13 @@
 //! [`session`] reads the topics of a running instance; every way out is a folder beside it.
 
 pub mod command;
+pub mod feed;
 #[cfg(feature = "zenoh")]
 pub mod jpeg;
 pub mod keyframe_pace;
 pub mod record;
 pub mod ros;
 pub mod session;
+pub mod web;
 #[cfg(feature = "zenoh")]
 pub mod zenoh;

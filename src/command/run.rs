@@ -1,10 +1,12 @@
 //! `semidense run`: the three processes, from the first frame to the report.
 
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Args;
 
+use crate::command::bridge::{BridgeError, handed_on, program};
 use crate::command::capture::{ModeArguments, SourceArguments, usual_mode};
 use crate::command::ending::{Ending, note_unfinished, run_start};
 use crate::command::map::MapOptions;
@@ -21,6 +23,7 @@ use crate::service::results::RunMode;
 use crate::service::results::output_folder::OutputFolder;
 use crate::service::shutdown::Shutdown;
 use crate::service::supervisor::{Ended, RunOptions, run as supervise};
+use crate::service::view_child::{ViewChild, ViewOptions};
 use crate::wire::place::Place;
 
 /// Run capture, tracker and mapper on a source, supervise them and write the results
@@ -40,7 +43,13 @@ pub struct RunArguments {
     /// Print the summary as JSON and show no progress
     #[arg(long)]
     json: bool,
+    /// Serve the live page meanwhile [default address: 127.0.0.1:8765] (needs the package semidense-bridge)
+    #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, require_equals = true, default_missing_value = USUAL_PAGE)]
+    view: Option<SocketAddr>,
 }
+
+/// Where the live page is served where nothing else is said.
+const USUAL_PAGE: &str = "127.0.0.1:8765";
 
 /// Runs it.
 pub fn run(
@@ -83,9 +92,16 @@ pub fn run(
         arguments: child_arguments,
         log: log.clone(),
     };
+    let mut page = arguments.view.map(|at| start_page(at, common, &place, log)).transpose()?;
     let display = start_display(arguments.json)?;
-    let outcome = supervise(config, &options, &shutdown, &mut |p| display.show(p));
+    let outcome = supervise(config, &options, &shutdown, &mut |progress| {
+        display.show(progress);
+        if let Some(address) = page.as_mut().and_then(ViewChild::look) {
+            note(&format!("live page: {address}"));
+        }
+    });
     display.finish();
+    drop(page);
     let mut outcome = outcome?;
     if outcome.record.poses.is_empty() && outcome.ended != Ended::Finished {
         // There is nothing that could be lost.
@@ -98,4 +114,21 @@ pub fn run(
     }
     let ending = Ending { output: &output, config, json: arguments.json, write_more: &|_| Ok(()) };
     ending.finish(&outcome.record, outcome.source.as_mut(), outcome.journal.take())
+}
+
+/// Starts the live page beside the run.
+fn start_page(
+    at: SocketAddr,
+    common: &CommonArguments,
+    place: &Place,
+    log: &ErrorLog,
+) -> Result<ViewChild, Box<dyn std::error::Error>> {
+    let own = std::env::current_exe()?;
+    // The instance may be named by `--set` as well.
+    let common = CommonArguments { instance: Some(place.instance.clone()), ..common.clone() };
+    let mut arguments = handed_on(&common);
+    arguments.extend(["view".into(), "--listen".into(), at.to_string().into()]);
+    let program = program(&own).ok_or(BridgeError::Missing { command: "run --view", own })?;
+    let (root, log) = (place.root.clone(), log.clone());
+    Ok(ViewChild::start(ViewOptions { program, arguments, root, log })?)
 }

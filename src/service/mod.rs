@@ -47,3 +47,4 @@ pub mod supervised;
 pub mod supervisor;
 pub mod tracker;
 pub mod trajectory_file;
+pub mod view_child;

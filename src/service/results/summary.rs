@@ -22,6 +22,7 @@ use crate::slam::evaluation::depth_error::{DepthScale, KeyframeDepth, depth_scal
 use crate::slam::evaluation::grade::{Grade, GradeInput};
 use crate::slam::evaluation::map_consistency::MapConsistency;
 use crate::slam::evaluation::normalized_error::NormalizedErrors;
+use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::map::Map;
 use crate::slam::pose::{PoseEstimate, TrackingState};
 
@@ -190,6 +191,8 @@ pub struct Summary {
     pub mode: RunMode,
     /// Where the frames came from.
     pub source: String,
+    /// The camera as its images came: rectified, pixels; null without a keyframe.
+    pub camera: Option<Intrinsics>,
     /// How it ended: `finished`, `interrupted`, `failed`, or `recovered` where it was killed and this comes from
     /// its journal.
     pub ended: String,
@@ -334,6 +337,7 @@ impl Summary {
         Self {
             mode: record.mode,
             source: record.source.clone(),
+            camera: record.map.keyframes.first().map(|keyframe| keyframe.intrinsics),
             ended,
             failure,
             recovered_run_end: match record.ended {

@@ -16,10 +16,15 @@ pub fn escaped(text: &str) -> String {
     out
 }
 
-/// The bytes of a PNG file as a `data:` address (base64, RFC 4648 §4).
+/// The bytes of a PNG file as a `data:` address.
 pub fn png_address(bytes: &[u8]) -> String {
+    String::from("data:image/png;base64,") + &base64(bytes)
+}
+
+/// Bytes as text (base64, RFC 4648 §4).
+pub fn base64(bytes: &[u8]) -> String {
     const LETTERS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
-    let mut out = String::from("data:image/png;base64,");
+    let mut out = String::new();
     out.reserve(bytes.len().div_ceil(3) * 4);
     for chunk in bytes.chunks(3) {
         let byte = |i: usize| u32::from(chunk.get(i).copied().unwrap_or(0));

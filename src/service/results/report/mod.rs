@@ -11,6 +11,8 @@ pub mod html;
 pub mod joint_charts;
 pub mod loop_section;
 pub mod map_picture;
+pub mod map_view;
+pub mod scene;
 pub mod views;
 
 use std::fmt::Write;
@@ -32,6 +34,7 @@ use crate::service::results::report::html::{escaped, png_address};
 use crate::service::results::report::joint_charts::{depth_charts, joint_charts};
 use crate::service::results::report::loop_section::loop_section;
 use crate::service::results::report::map_picture::map_picture;
+use crate::service::results::report::map_view::map_view;
 use crate::service::results::summary::Summary;
 use crate::service::results::{EndOfRun, RunMode, RunRecord};
 use crate::slam::evaluation::TrajectoryEvaluation;
@@ -87,6 +90,7 @@ pub fn report(input: &ReportInput<'_>) -> String {
     page.push_str(&grade_banner(&summary.grade));
     page.push_str(&cards(summary));
     page.push_str(&states(input.record));
+    page.push_str(&map_view(input));
     page.push_str(&map(input));
     section(&mut page, "Trajectory", &trajectory_views(input));
     let errors: Vec<Chart> =

@@ -1,0 +1,272 @@
+//! One thread reads an instance's topics for any number of clients.
+//!
+//! Each [`Listener`] has a bounded channel: one that does not keep up loses events, which are counted, and holds up neither
+//! the reading nor the others. A listener that comes late first gets the newest event of each kind.
+
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use semidense::wire::place::Place;
+
+use crate::session::{Event, Session, SessionError, Wants};
+
+/// Longest time until a change of the listeners or the end of the feed is noticed where no message comes.
+const WAKE_PERIOD: Duration = Duration::from_millis(100);
+/// Events that a listener has room for where it does not say: two seconds of poses at 30 Hz.
+pub const USUAL_DEPTH: usize = 64;
+
+/// Why a feed does not start.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot start the thread that reads the topics ({0})")]
+pub struct FeedError(#[from] std::io::Error);
+
+/// Reads the topics until it is dropped.
+#[derive(Debug)]
+pub struct Feed {
+    shared: Arc<Shared>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Feed {
+    /// Reads `wants` of the instance at `place` under the process name `name`, whenever it runs.
+    pub fn start(place: Place, name: &str, wants: Wants) -> Result<Self, FeedError> {
+        let shared = Arc::<Shared>::default();
+        let (theirs, name) = (Arc::clone(&shared), name.to_owned());
+        let thread = std::thread::Builder::new()
+            .name("feed".to_owned())
+            .spawn(move || read(Session::new(place, &name, wants), &theirs))?;
+        Ok(Self { shared, thread: Some(thread) })
+    }
+
+    /// A listener with room for `depth` events, [`USUAL_DEPTH`] as a rule.
+    pub fn listen(&self, depth: usize) -> Listener {
+        self.shared.lock().listen(depth)
+    }
+
+    /// Why the reading has ended; `None` while it goes on.
+    pub fn failure(&self) -> Option<String> {
+        self.shared.lock().failure.clone()
+    }
+
+    /// Events that listeners have lost since the start, all together.
+    pub fn lost(&self) -> u64 {
+        self.shared.lock().lost
+    }
+}
+
+impl Drop for Feed {
+    fn drop(&mut self) {
+        self.shared.is_over.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+/// Where a client's events arrive.
+#[derive(Debug)]
+pub struct Listener {
+    events: Receiver<Event>,
+    lost: Arc<AtomicU64>,
+}
+
+impl Listener {
+    /// The next event, `None` where none comes within `timeout`. An error when the feed is over.
+    pub fn next(&self, timeout: Duration) -> Result<Option<Event>, FeedOver> {
+        match self.events.recv_timeout(timeout) {
+            Ok(event) => Ok(Some(event)),
+            Err(RecvTimeoutError::Timeout) => Ok(None),
+            Err(RecvTimeoutError::Disconnected) => Err(FeedOver),
+        }
+    }
+
+    /// Events that this listener has lost because it was slow.
+    pub fn lost(&self) -> u64 {
+        self.lost.load(Ordering::Relaxed)
+    }
+}
+
+/// Nothing more will come: see [`Feed::failure`].
+#[derive(Debug, thiserror::Error)]
+#[error("the topics are not read any more")]
+pub struct FeedOver;
+
+#[derive(Debug, Default)]
+struct Shared {
+    state: Mutex<State>,
+    is_over: AtomicBool,
+}
+
+impl Shared {
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+fn read(mut session: Session, shared: &Shared) {
+    while !shared.is_over.load(Ordering::Relaxed) {
+        let outcome = session.read(None, WAKE_PERIOD, |event| shared.lock().give(&event));
+        if let Err(error @ (SessionError::Open(_) | SessionError::Wait(_))) = outcome {
+            shared.lock().failure = Some(error.to_string());
+            break;
+        }
+    }
+    // They hear that nothing more comes.
+    shared.lock().outlets.clear();
+}
+
+#[derive(Debug, Default)]
+struct State {
+    outlets: Vec<Outlet>,
+    recent: Recent,
+    lost: u64,
+    failure: Option<String>,
+}
+
+impl State {
+    fn give(&mut self, event: &Event) {
+        self.recent.keep(event);
+        let before: u64 = self.outlets.iter().map(Outlet::lost).sum();
+        self.outlets.retain_mut(|outlet| outlet.give(event));
+        self.lost += self.outlets.iter().map(Outlet::lost).sum::<u64>().saturating_sub(before);
+    }
+
+    fn listen(&mut self, depth: usize) -> Listener {
+        let recent = self.recent.events();
+        let (sender, events) = sync_channel(depth.max(recent.len()));
+        let lost = Arc::<AtomicU64>::default();
+        let mut outlet = Outlet { sender, lost: Arc::clone(&lost), owed: None };
+        if self.failure.is_none() {
+            for event in &recent {
+                outlet.give(event);
+            }
+            self.outlets.push(outlet);
+        }
+        Listener { events, lost }
+    }
+}
+
+/// The way to one listener.
+#[derive(Debug)]
+struct Outlet {
+    sender: SyncSender<Event>,
+    lost: Arc<AtomicU64>,
+    /// A beginning or end of a run that found no room: without it what comes later cannot be understood.
+    owed: Option<Event>,
+}
+
+impl Outlet {
+    fn lost(&self) -> u64 {
+        self.lost.load(Ordering::Relaxed)
+    }
+
+    /// Whether the listener is still there.
+    fn give(&mut self, event: &Event) -> bool {
+        if let Some(owed) = self.owed.take()
+            && let Err(error) = self.sender.try_send(owed)
+        {
+            let TrySendError::Full(owed) = error else { return false };
+            self.owed = Some(owed);
+        }
+        let outcome = match self.owed {
+            Some(_) => Err(TrySendError::Full(event.clone())),
+            None => self.sender.try_send(event.clone()),
+        };
+        match outcome {
+            Ok(()) => true,
+            Err(TrySendError::Disconnected(_)) => false,
+            Err(TrySendError::Full(event)) => {
+                self.lost.fetch_add(1, Ordering::Relaxed);
+                if matches!(event, Event::Joined | Event::Left) {
+                    self.owed = Some(event);
+                }
+                true
+            }
+        }
+    }
+}
+
+/// The newest event of each kind, for those who come late.
+#[derive(Debug, Default)]
+struct Recent {
+    is_joined: bool,
+    health: Vec<(&'static str, Event)>,
+    keyframe: Option<Event>,
+    graph: Option<Event>,
+    frame: Option<Event>,
+    pose: Option<Event>,
+}
+
+impl Recent {
+    fn keep(&mut self, event: &Event) {
+        match event {
+            Event::Joined => *self = Self { is_joined: true, ..Self::default() },
+            Event::Left => *self = Self::default(),
+            Event::Frame(_) => self.frame = Some(event.clone()),
+            Event::Pose(_) => self.pose = Some(event.clone()),
+            Event::Keyframe(_) => self.keyframe = Some(event.clone()),
+            Event::Graph(_) => self.graph = Some(event.clone()),
+            Event::Adjustment(_) => {}
+            Event::Health(process, _) => {
+                self.health.retain(|(of, _)| of != process);
+                self.health.push((process, event.clone()));
+            }
+        }
+    }
+
+    fn events(&self) -> Vec<Event> {
+        let joined = self.is_joined.then_some(Event::Joined);
+        let health = self.health.iter().map(|(_, event)| event.clone());
+        let rest = [&self.keyframe, &self.graph, &self.frame, &self.pose];
+        joined.into_iter().chain(health).chain(rest.into_iter().flatten().cloned()).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use semidense::wire::message::AdjustmentMessage;
+
+    fn adjustment() -> Event {
+        Event::Adjustment(AdjustmentMessage::default())
+    }
+
+    #[test]
+    fn a_slow_listener_loses_events_and_holds_up_nobody() {
+        let mut state = State::default();
+        let (slow, quick) = (state.listen(2), state.listen(8));
+        state.give(&Event::Joined);
+        (0..4).for_each(|_| state.give(&adjustment()));
+        assert_eq!((slow.lost(), quick.lost(), state.lost), (3, 0, 3));
+        assert_eq!(quick.events.try_iter().count(), 5);
+    }
+
+    #[test]
+    fn the_end_of_a_run_is_never_lost() {
+        let mut state = State::default();
+        let slow = state.listen(1);
+        state.give(&adjustment());
+        state.give(&Event::Left);
+        state.give(&adjustment());
+        assert!(matches!(slow.events.try_recv(), Ok(Event::Adjustment(_))));
+        state.give(&adjustment());
+        assert!(matches!(slow.events.try_recv(), Ok(Event::Left)));
+        state.give(&adjustment());
+        assert!(matches!(slow.events.try_recv(), Ok(Event::Adjustment(_))));
+    }
+
+    #[test]
+    fn who_comes_late_hears_that_the_run_is_there_and_who_is_gone_is_forgotten() {
+        let mut state = State::default();
+        state.give(&Event::Joined);
+        let late = state.listen(4);
+        assert!(matches!(late.events.try_recv(), Ok(Event::Joined)));
+        drop(late);
+        state.give(&Event::Left);
+        assert!(state.outlets.is_empty());
+        assert!(state.listen(4).events.try_recv().is_err(), "there is no run any more");
+    }
+}

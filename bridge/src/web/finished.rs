@@ -1,0 +1,348 @@
+//! A run that is over, read from its folder: `keyframes.txt`, `trajectory.txt`, `map.ply`, `summary.json`.
+
+use std::fs::{self, File};
+use std::io::{self, BufRead, BufReader, Read};
+use std::path::{Path, PathBuf};
+
+use semidense::service::results::report::scene::{SceneInput, SceneKeyframe, ScenePoint, pack};
+use semidense::service::trajectory_file::{TrajectoryFileError, nanos_from_secs, read_trajectory};
+use semidense::slam::geometry::intrinsics::Intrinsics;
+use semidense::slam::geometry::se3::SE3;
+use semidense::slam::geometry::sim3::Sim3;
+use semidense::slam::trajectory::StampedPose;
+use serde_json::Value;
+
+/// Most lines of a PLY's header.
+const MAX_HEADER_LINES: usize = 256;
+/// Most bytes of one point of a PLY: ours has 40.
+const MAX_POINT_BYTES: usize = 1024;
+/// Points that are read at a time.
+const CHUNK: usize = 4096;
+/// The camera where the folder does not say: 640 by 480, 62° wide.
+const USUAL_CAMERA: Intrinsics = Intrinsics::pinhole(640, 480, 530.0);
+
+/// Why a run cannot be shown.
+#[derive(Debug, thiserror::Error)]
+pub enum FinishedError {
+    /// A file that is not there, or cannot be read.
+    #[error("{path}: {source}; name the folder that a run has written, for example output/latest")]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// A file that says something else than it should.
+    #[error("{path}: {what}")]
+    Content {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        what: String,
+    },
+    /// The trajectory.
+    #[error(transparent)]
+    Trajectory(#[from] TrajectoryFileError),
+}
+
+/// Reads a run's folder and packs it for the page, with at most `max_points` points.
+pub fn read_run(folder: &Path, max_points: usize) -> Result<Vec<u8>, FinishedError> {
+    let keyframes = read_keyframes(&folder.join("keyframes.txt"))?;
+    let path: Vec<StampedPose> = read_trajectory(&folder.join("trajectory.txt"))?;
+    let points = read_points(&folder.join("map.ply"), max_points)?;
+    let intrinsics = camera(&read_summary(folder)).unwrap_or(USUAL_CAMERA);
+    Ok(pack(&SceneInput {
+        points: &points,
+        keyframes: &keyframes,
+        path: &path,
+        intrinsics: &intrinsics,
+        up: None,
+        max_points,
+    }))
+}
+
+fn open(path: &Path) -> Result<File, FinishedError> {
+    File::open(path).map_err(|source| FinishedError::Read { path: path.to_owned(), source })
+}
+
+/// The summary of a run; nothing where there is none.
+pub fn read_summary(folder: &Path) -> Value {
+    let bytes = fs::read(folder.join("summary.json")).unwrap_or_default();
+    serde_json::from_slice(&bytes).unwrap_or_default()
+}
+
+/// The camera as the summary has it.
+fn camera(summary: &Value) -> Option<Intrinsics> {
+    let camera: Intrinsics = serde_json::from_value(summary.get("camera")?.clone()).ok()?;
+    camera.is_valid().then_some(camera)
+}
+
+/// The keyframes of the epoch that has most of them: each has a place and a unit of its own.
+fn read_keyframes(path: &Path) -> Result<Vec<SceneKeyframe>, FinishedError> {
+    let text = fs::read_to_string(path)
+        .map_err(|source| FinishedError::Read { path: path.to_owned(), source })?;
+    let mut keyframes = Vec::new();
+    for (number, line) in text.lines().enumerate().filter(|(_, line)| !line.starts_with('#')) {
+        let keyframe = keyframe(line).ok_or_else(|| FinishedError::Content {
+            path: path.to_owned(),
+            what: format!("line {} is no keyframe", number + 1),
+        })?;
+        keyframes.push(keyframe);
+    }
+    let epochs: Vec<u32> = keyframes.iter().map(|(epoch, _)| *epoch).collect();
+    let count = |epoch: u32| epochs.iter().filter(|of| **of == epoch).count();
+    let largest =
+        epochs.iter().copied().max_by_key(|epoch| (count(*epoch), std::cmp::Reverse(*epoch)));
+    let mut keyframes: Vec<SceneKeyframe> = keyframes
+        .into_iter()
+        .filter_map(|(epoch, keyframe)| (Some(epoch) == largest).then_some(keyframe))
+        .collect();
+    keyframes.sort_by_key(|keyframe| keyframe.nanos);
+    Ok(keyframes)
+}
+
+/// A line: stamp, translation, quaternion, unit, id, sequence, epoch …
+fn keyframe(line: &str) -> Option<(u32, SceneKeyframe)> {
+    let words: Vec<&str> = line.split_whitespace().collect();
+    let numbers: Option<Vec<f64>> = words.get(1..9)?.iter().map(|word| word.parse().ok()).collect();
+    let [x, y, z, qx, qy, qz, qw, scale] = numbers?.try_into().ok()?;
+    let rigid = SE3::try_from_parts([qx, qy, qz, qw], [x, y, z])?;
+    let place = Sim3::new(rigid, scale);
+    let is_usable = scale > 0.0 && scale.is_finite();
+    let keyframe = SceneKeyframe {
+        keyframe_id: words.get(9)?.parse().ok()?,
+        nanos: nanos_from_secs(words[0])?,
+        place,
+    };
+    is_usable.then_some((words.get(11)?.parse().ok()?, keyframe))
+}
+
+/// Where a property stands in a point, and how it is written.
+#[derive(Debug, Clone, Copy)]
+struct Property {
+    offset: usize,
+    kind: Kind,
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Kind {
+    I8,
+    U8,
+    I16,
+    U16,
+    I32,
+    U32,
+    F32,
+    F64,
+}
+
+impl Kind {
+    fn of(name: &str) -> Option<Self> {
+        Some(match name {
+            "char" | "int8" => Self::I8,
+            "uchar" | "uint8" => Self::U8,
+            "short" | "int16" => Self::I16,
+            "ushort" | "uint16" => Self::U16,
+            "int" | "int32" => Self::I32,
+            "uint" | "uint32" => Self::U32,
+            "float" | "float32" => Self::F32,
+            "double" | "float64" => Self::F64,
+            _ => return None,
+        })
+    }
+
+    fn bytes(self) -> usize {
+        match self {
+            Self::I8 | Self::U8 => 1,
+            Self::I16 | Self::U16 => 2,
+            Self::I32 | Self::U32 | Self::F32 => 4,
+            Self::F64 => 8,
+        }
+    }
+}
+
+impl Property {
+    fn read(self, point: &[u8]) -> f64 {
+        let at = |n: usize| &point[self.offset..self.offset + n];
+        let two = || [at(2)[0], at(2)[1]];
+        let four = || [at(4)[0], at(4)[1], at(4)[2], at(4)[3]];
+        match self.kind {
+            Kind::I8 => f64::from(at(1)[0] as i8),
+            Kind::U8 => f64::from(at(1)[0]),
+            Kind::I16 => f64::from(i16::from_le_bytes(two())),
+            Kind::U16 => f64::from(u16::from_le_bytes(two())),
+            Kind::I32 => f64::from(i32::from_le_bytes(four())),
+            Kind::U32 => f64::from(u32::from_le_bytes(four())),
+            Kind::F32 => f64::from(f32::from_le_bytes(four())),
+            Kind::F64 => f64::from_le_bytes(std::array::from_fn(|i| at(8)[i])),
+        }
+    }
+}
+
+/// The header of a binary, little-endian PLY whose first element is its points.
+#[derive(Debug, Default)]
+struct Layout {
+    count: usize,
+    bytes: usize,
+    properties: Vec<(String, Property)>,
+}
+
+impl Layout {
+    fn read(file: &mut impl BufRead) -> Result<Self, String> {
+        let mut layout = Self::default();
+        let (mut is_binary, mut element) = (false, String::new());
+        for number in 0..MAX_HEADER_LINES {
+            let mut line = String::new();
+            let length = file.take(1 << 12).read_line(&mut line).map_err(|e| e.to_string())?;
+            let words: Vec<&str> = line.split_whitespace().collect();
+            match words.as_slice() {
+                _ if length == 0 => return Err("its header has no end".to_owned()),
+                ["ply"] if number == 0 => {}
+                _ if number == 0 => return Err("it is no PLY".to_owned()),
+                ["end_header"] if is_binary => return Ok(layout),
+                ["end_header"] => return Err("it is not binary and little-endian".to_owned()),
+                ["format", format, _] => is_binary = *format == "binary_little_endian",
+                ["element", name, count] => {
+                    if element.is_empty() && *name != "vertex" {
+                        return Err(format!("its first element is {name} and not vertex"));
+                    }
+                    (*name).clone_into(&mut element);
+                    if *name == "vertex" {
+                        layout.count = count.parse().map_err(|_| format!("{count} points"))?;
+                    }
+                }
+                ["property", kind, name] if element == "vertex" => layout.push(kind, name)?,
+                ["property", "list", ..] if element == "vertex" => {
+                    return Err("its points have lists".to_owned());
+                }
+                _ => {}
+            }
+        }
+        Err("its header is too long".to_owned())
+    }
+
+    fn push(&mut self, kind: &str, name: &str) -> Result<(), String> {
+        let kind = Kind::of(kind).ok_or_else(|| format!("its property {name} is a {kind}"))?;
+        self.properties.push((name.to_owned(), Property { offset: self.bytes, kind }));
+        self.bytes += kind.bytes();
+        if self.bytes > MAX_POINT_BYTES {
+            Err("its points are too large".to_owned())
+        } else {
+            Ok(())
+        }
+    }
+
+    fn property(&self, names: &[&str]) -> Option<Property> {
+        names.iter().find_map(|name| {
+            self.properties.iter().find(|(of, _)| of == name).map(|(_, property)| *property)
+        })
+    }
+}
+
+/// The points, an even part of them where they are more than `most`.
+fn read_points(path: &Path, most: usize) -> Result<Vec<ScenePoint>, FinishedError> {
+    let content = |what: String| FinishedError::Content { path: path.to_owned(), what };
+    let failed = |source| FinishedError::Read { path: path.to_owned(), source };
+    let mut file = BufReader::new(open(path)?);
+    let layout = Layout::read(&mut file).map_err(content)?;
+    let want = |name: &str| {
+        layout.property(&[name]).ok_or_else(|| content(format!("its points have no {name}")))
+    };
+    let position = [want("x")?, want("y")?, want("z")?];
+    let grey = layout.property(&["intensity", "green", "red"]);
+    let (std_dev, keyframe) = (layout.property(&["sigma"]), layout.property(&["keyframe"]));
+    let every = layout.count.div_ceil(most.max(1)).max(1);
+    let mut points = Vec::with_capacity(most.min(layout.count).min(1 << 16));
+    let mut chunk = vec![0; CHUNK * layout.bytes.max(1)];
+    let mut index = 0;
+    while index < layout.count {
+        let length = CHUNK.min(layout.count - index);
+        let bytes = &mut chunk[..length * layout.bytes];
+        file.read_exact(bytes).map_err(failed)?;
+        for point in bytes.chunks_exact(layout.bytes.max(1)) {
+            if index.is_multiple_of(every) {
+                points.push(ScenePoint {
+                    position: position.map(|property| property.read(point) as f32),
+                    grey: grey.map_or(255, |property| property.read(point) as u8),
+                    std_dev: std_dev.map_or(f32::NAN, |property| property.read(point) as f32),
+                    keyframe_id: keyframe.map(|property| property.read(point) as u64),
+                });
+            }
+            index += 1;
+        }
+    }
+    Ok(points)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn ply(header: &str, points: &[u8]) -> tempfile::NamedTempFile {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        fs::write(file.path(), [header.as_bytes(), points].concat()).unwrap();
+        file
+    }
+
+    const HEADER: &str = "ply\nformat binary_little_endian 1.0\ncomment x\nelement vertex 2\nproperty float x\n\
+        property uchar extra\nproperty float y\nproperty double z\nproperty uchar red\nproperty uchar green\nend_header\n";
+
+    fn point(x: f32, y: f32, z: f64) -> Vec<u8> {
+        [&x.to_le_bytes()[..], &[9], &y.to_le_bytes(), &z.to_le_bytes(), &[4, 5]].concat()
+    }
+
+    #[test]
+    fn any_layout_of_a_binary_ply_is_read() {
+        let file = ply(HEADER, &[point(1.0, 2.0, 3.0), point(4.0, 5.0, 6.0)].concat());
+        let points = read_points(file.path(), 10).unwrap();
+        assert_eq!((points[0].position, points[1].position), ([1.0, 2.0, 3.0], [4.0, 5.0, 6.0]));
+        assert_eq!((points[0].grey, points[0].keyframe_id), (5, None));
+        assert_eq!(read_points(file.path(), 1).unwrap().len(), 1);
+    }
+
+    #[test]
+    fn what_is_wrong_with_a_ply_is_said() {
+        let cases = [
+            (HEADER.replace("binary_little_endian", "ascii"), "not binary"),
+            (HEADER.replace("float y", "float b"), "no y"),
+            (HEADER.replace("double z", "list uchar int z"), "lists"),
+            (HEADER.replace("ply\n", "png\n"), "no PLY"),
+            (HEADER.replace("vertex 2", "vertex 3"), "fill whole buffer"),
+            (HEADER.replace("end_header\n", ""), "no end"),
+        ];
+        for (header, expected) in cases {
+            let points = if header.contains("end_header") {
+                [point(1.0, 2.0, 3.0), point(4.0, 5.0, 6.0)].concat()
+            } else {
+                Vec::new()
+            };
+            let error = read_points(ply(&header, &points).path(), 10).unwrap_err().to_string();
+            assert!(error.contains(expected), "{error} / {expected}");
+        }
+    }
+
+    #[test]
+    fn of_keyframes_the_largest_epoch_is_taken() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let line = |secs: f64, id: u64, epoch: u32| {
+            format!("{secs} 1 2 3 0 0 0 1 0.5 {id} 9 {epoch} 100 Established\n")
+        };
+        let text = format!("# c\n{}{}{}", line(1.0, 1, 0), line(3.0, 3, 1), line(2.0, 2, 1));
+        fs::write(file.path(), &text).unwrap();
+        let keyframes = read_keyframes(file.path()).unwrap();
+        assert_eq!(keyframes.iter().map(|k| k.keyframe_id).collect::<Vec<_>>(), [2, 3]);
+        fs::write(file.path(), text.replace("0.5", "NaN")).unwrap();
+        assert!(read_keyframes(file.path()).unwrap_err().to_string().contains("line 2"));
+    }
+
+    proptest! {
+        #[test]
+        fn damaged_headers_end_in_an_error_or_points(at in 0_usize..180, with in any::<u8>()) {
+            let mut header = HEADER.as_bytes().to_vec();
+            let at = at % header.len();
+            header[at] = with;
+            let _ = Layout::read(&mut header.as_slice()).map(|layout| layout.bytes);
+        }
+    }
+}

@@ -1,0 +1,162 @@
+//! Who may ask: pages of other sites must not, and beyond this machine only who knows the token.
+
+use std::fs::File;
+use std::io::{self, Read};
+use std::net::{IpAddr, SocketAddr};
+
+use crate::web::http::Head;
+
+/// Bytes of a token: 128 bits cannot be guessed.
+const TOKEN_BYTES: usize = 16;
+
+/// Why a request is refused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum Refusal {
+    /// It is addressed to a name that is not ours: a page of another site may be behind it.
+    #[error(
+        "this server does not answer to that name: use its IP address, localhost, or start it with --host NAME"
+    )]
+    Host,
+    /// A page of another site asks.
+    #[error("a page of another site may not ask: start the server with --allow-origin to let it")]
+    Origin,
+    /// The token is missing or another one.
+    #[error("open the address that `semidense view` has printed: it ends in ?token=…")]
+    Token,
+}
+
+/// What is asked of every request.
+#[derive(Debug, Clone, Default)]
+pub struct Guard {
+    /// Names besides IP addresses and localhost that this server is known by.
+    pub hosts: Vec<String>,
+    /// Other sites whose pages may ask.
+    pub origins: Vec<String>,
+    /// What must be known.
+    pub token: Option<String>,
+}
+
+impl Guard {
+    /// Checks a request.
+    pub fn check(&self, head: &Head) -> Result<(), Refusal> {
+        let host = head.header("host").ok_or(Refusal::Host)?;
+        if !self.answers_to(host) {
+            return Err(Refusal::Host);
+        }
+        let is_own = |origin: &str| origin.strip_prefix("http://") == Some(host);
+        let is_allowed = |origin: &str| self.origins.iter().any(|of| of == origin);
+        match head.header("origin") {
+            Some(origin) if !is_own(origin) && !is_allowed(origin) => return Err(Refusal::Origin),
+            // One that comes twice is not believed.
+            None if head.has("origin") => return Err(Refusal::Origin),
+            _ => {}
+        }
+        let Some(token) = &self.token else { return Ok(()) };
+        let bearer = head.header("authorization").and_then(|value| value.strip_prefix("Bearer "));
+        let given = [head.parameter("token"), head.cookie(COOKIE), bearer];
+        let is_known = given.into_iter().flatten().any(|given| is_same(given, token));
+        if is_known { Ok(()) } else { Err(Refusal::Token) }
+    }
+
+    /// A name that resolves here only because somebody's name server says so would let that somebody's pages in. An IP
+    /// address cannot be such a name.
+    fn answers_to(&self, host: &str) -> bool {
+        if host.parse::<SocketAddr>().is_ok() || host.parse::<IpAddr>().is_ok() {
+            return true;
+        }
+        let name = match host.rsplit_once(':') {
+            Some((name, port)) if port.parse::<u16>().is_ok() => name,
+            _ => host,
+        };
+        let bracketed = name.strip_prefix('[').and_then(|name| name.strip_suffix(']'));
+        bracketed.is_some_and(|name| name.parse::<IpAddr>().is_ok())
+            || name.eq_ignore_ascii_case("localhost")
+            || self.hosts.iter().any(|of| of.eq_ignore_ascii_case(name))
+    }
+}
+
+/// Name of the cookie that keeps the token.
+pub const COOKIE: &str = "semidense_token";
+
+/// Compares in a time that does not tell how much is right.
+fn is_same(given: &str, token: &str) -> bool {
+    let (given, token) = (given.as_bytes(), token.as_bytes());
+    given.len() == token.len() && given.iter().zip(token).fold(0, |sum, (a, b)| sum | (a ^ b)) == 0
+}
+
+/// A new token, from the kernel's random numbers.
+pub fn new_token() -> io::Result<String> {
+    let mut bytes = [0; TOKEN_BYTES];
+    File::open("/dev/urandom")?.read_exact(&mut bytes)?;
+    Ok(bytes.iter().map(|byte| format!("{byte:02x}")).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::web::http::parse_head;
+
+    fn head(lines: &str, query: &str) -> Head {
+        let text = format!("GET /{query} HTTP/1.1\r\n{lines}\r\n");
+        parse_head(text.as_bytes()).unwrap().unwrap()
+    }
+
+    #[test]
+    fn names_that_others_may_have_given_are_refused() {
+        let guard = Guard { hosts: vec!["robot.local".to_owned()], ..Guard::default() };
+        for good in [
+            "127.0.0.1:8765",
+            "localhost:8765",
+            "LOCALHOST",
+            "[::1]:8765",
+            "[::1]",
+            "10.0.0.7",
+            "robot.local:8765",
+        ] {
+            assert_eq!(guard.check(&head(&format!("Host: {good}\r\n"), "")), Ok(()), "{good}");
+        }
+        for bad in [
+            "evil.example",
+            "evil.example:8765",
+            "localhost.evil.example",
+            "127.0.0.1.evil.example:80",
+            "",
+        ] {
+            let refused = guard.check(&head(&format!("Host: {bad}\r\n"), ""));
+            assert_eq!(refused, Err(Refusal::Host), "{bad}");
+        }
+        assert_eq!(guard.check(&head("", "")), Err(Refusal::Host));
+    }
+
+    #[test]
+    fn pages_of_other_sites_are_refused() {
+        let guard =
+            Guard { origins: vec!["https://studio.example".to_owned()], ..Guard::default() };
+        let ask = |origin: &str| guard.check(&head(&format!("Host: localhost:1\r\n{origin}"), ""));
+        assert_eq!(ask("Origin: http://localhost:1\r\n"), Ok(()));
+        assert_eq!(ask("Origin: https://studio.example\r\n"), Ok(()));
+        for bad in ["http://localhost:2", "http://evil.example", "null", "https://localhost:1"] {
+            assert_eq!(ask(&format!("Origin: {bad}\r\n")), Err(Refusal::Origin), "{bad}");
+        }
+        let twice = "Origin: http://localhost:1\r\nOrigin: http://evil.example\r\n";
+        assert_eq!(ask(twice), Err(Refusal::Origin));
+    }
+
+    #[test]
+    fn who_does_not_know_the_token_is_refused() {
+        let token = new_token().unwrap();
+        assert_eq!(token.len(), 2 * TOKEN_BYTES);
+        assert_ne!(token, new_token().unwrap());
+        let guard = Guard { token: Some(token.clone()), ..Guard::default() };
+        let ask = |lines: &str, query: &str| {
+            guard.check(&head(&format!("Host: 10.0.0.7\r\n{lines}"), query))
+        };
+        assert_eq!(ask("", &format!("?token={token}")), Ok(()));
+        assert_eq!(ask(&format!("Cookie: {COOKIE}={token}\r\n"), ""), Ok(()));
+        assert_eq!(ask(&format!("Authorization: Bearer {token}\r\n"), ""), Ok(()));
+        for bad in ["", "?token=", "?token=0123", "?x=1"] {
+            assert_eq!(ask("", bad), Err(Refusal::Token), "{bad}");
+        }
+        assert_eq!(ask("", &format!("?token={token}0")), Err(Refusal::Token));
+    }
+}

@@ -1,0 +1,127 @@
+//! Keyframes that pages have not seen, or have in an older revision: the mapper is asked for them, a few a second, while a
+//! page is open.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use semidense::slam::keyframe::Keyframe;
+use semidense::wire::command::{Command, CommandClient, CommandError};
+use semidense::wire::conversion::keyframe_from_messages;
+use semidense::wire::message::{KeyframeHeader, KeyframeImageHeader};
+use semidense::wire::place::Place;
+use semidense::wire::port::{Access, Hub, OpenError, Subscriber};
+use semidense::wire::topic::{EARLIER_KEYFRAME, EARLIER_KEYFRAME_IMAGE};
+
+use semidense::slam::keyframe::DepthPoint;
+
+use crate::web::scene::Scene;
+
+/// Pause between two keyframes: each costs the mapper a copy of up to 2 MB, about a millisecond.
+const REQUEST_PAUSE: Duration = Duration::from_millis(60);
+/// Pause where nothing is missing or nobody looks.
+const IDLE_PAUSE: Duration = Duration::from_millis(300);
+/// Pause after a failure: another reader has the place, or the run has just ended.
+const FAILURE_PAUSE: Duration = Duration::from_secs(2);
+/// Longest wait for the mapper, which answers between two frames.
+const LONGEST_ANSWER: Duration = Duration::from_secs(2);
+
+/// Asks until `is_over`.
+pub fn follow(place: &Place, scene: &Arc<Scene>, is_over: &AtomicBool) {
+    let mut asking: Option<(u64, Asking)> = None;
+    while !is_over.load(Ordering::Relaxed) {
+        let (run, is_joined, wanted) = {
+            let state = scene.lock();
+            (state.run, state.is_joined, state.missing().first().copied())
+        };
+        if !is_joined || asking.as_ref().is_some_and(|(of, _)| *of != run) {
+            asking = None;
+        }
+        let Some(keyframe_id) = wanted.filter(|_| is_joined && scene.pages() > 0) else {
+            // The place is for one reader: it is given back while nothing is wanted.
+            asking = None;
+            std::thread::sleep(IDLE_PAUSE);
+            continue;
+        };
+        if asking.is_none() {
+            match Asking::open(place) {
+                Ok(opened) => {
+                    asking = Some((run, opened));
+                    note(scene, "");
+                }
+                Err(error) => {
+                    tracing::debug!("{error}");
+                    note(
+                        scene,
+                        "keyframes from before this page was started are missing: another reader asks for them",
+                    );
+                    std::thread::sleep(FAILURE_PAUSE);
+                    continue;
+                }
+            }
+        }
+        let Some((_, ports)) = &asking else { continue };
+        match ports.ask(keyframe_id) {
+            Ok(Some(keyframe)) if scene.lock().run == run => {
+                scene.lock().keep(&keyframe);
+                scene.tell();
+            }
+            Ok(_) => {}
+            Err(CommandError::Refused(_)) => scene.lock().give_up(keyframe_id),
+            Err(error) => {
+                tracing::debug!("{error}");
+                asking = None;
+                std::thread::sleep(FAILURE_PAUSE);
+            }
+        }
+        std::thread::sleep(REQUEST_PAUSE);
+    }
+}
+
+fn note(scene: &Scene, text: &str) {
+    let mut state = scene.lock();
+    if state.history_note != text {
+        text.clone_into(&mut state.history_note);
+        state.version += 1;
+    }
+}
+
+/// The ports for asking; the hub is dropped last.
+struct Asking {
+    depths: Subscriber<DepthPoint, KeyframeHeader>,
+    images: Subscriber<u8, KeyframeImageHeader>,
+    commands: CommandClient,
+    _hub: Hub,
+}
+
+impl Asking {
+    fn open(place: &Place) -> Result<Self, OpenError> {
+        let hub = Hub::join(place, "view-history", Access::Observer)?;
+        Ok(Self {
+            depths: hub.subscriber(&EARLIER_KEYFRAME)?,
+            images: hub.subscriber(&EARLIER_KEYFRAME_IMAGE)?,
+            commands: CommandClient::open(&hub)?,
+            _hub: hub,
+        })
+    }
+
+    /// The keyframe, `None` where it does not come although the mapper has sent it.
+    fn ask(&self, keyframe_id: u64) -> Result<Option<Keyframe>, CommandError> {
+        let begin = Instant::now();
+        let failed =
+            |error: semidense::wire::port::ReceiveError| CommandError::Transport(error.to_string());
+        self.commands.ask(&Command::SendKeyframe(keyframe_id), LONGEST_ANSWER, || {
+            begin.elapsed() < LONGEST_ANSWER
+        })?;
+        let (depth, image) =
+            (self.depths.newest().map_err(failed)?, self.images.newest().map_err(failed)?);
+        let (Some(depth), Some(image)) = (depth, image) else { return Ok(None) };
+        let keyframe = keyframe_from_messages(
+            depth.header(),
+            depth.payload(),
+            image.header(),
+            image.payload(),
+        );
+        Ok(keyframe.ok().filter(|keyframe| keyframe.keyframe_id == keyframe_id))
+    }
+}

@@ -1,0 +1,272 @@
+//! `/metrics`: health and poses as OpenMetrics text, for Prometheus.
+
+use std::fmt::Write;
+
+use semidense::service::clock::now_nanos;
+use semidense::service::health::{ProcessState, bucket_end_ms, source};
+use semidense::wire::message::{HISTOGRAM_BUCKETS, HealthMessage};
+
+use crate::web::scene::State;
+
+/// Type of the text.
+pub const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
+/// States of a pose, by their codes.
+const STATES: [&str; 4] = ["initializing", "tracking", "degraded", "lost"];
+/// States of a process.
+const PROCESS_STATES: u32 = 7;
+
+/// A counter or gauge of a process: name, what it is, value.
+type Figure = (&'static str, &'static str, fn(&HealthMessage) -> f64);
+
+const COUNTERS: [Figure; 8] = [
+    ("frames", "Frames sent (capture), tracked (tracker) or mapped (mapper)", |h| h.frames as f64),
+    ("frames_dropped", "Frames that came too late to be handled", |h| h.dropped as f64),
+    ("frame_gaps", "Frames that the source lost", |h| h.gaps as f64),
+    ("messages_refused", "Broken messages or images that were left out", |h| h.refused as f64),
+    (
+        "frames_disordered",
+        "Frames whose sequence or stamp does not come after the one before",
+        |h| h.disordered as f64,
+    ),
+    ("image_size_changes", "Changes of the image size or the intrinsics", |h| h.resized as f64),
+    ("deadline_misses", "Frames that took longer than the deadline", |h| h.deadline_misses as f64),
+    ("page_faults", "Page faults of the frame loop since its first hundred frames", |h| {
+        h.page_faults as f64
+    }),
+];
+
+const GAUGES: [Figure; 4] = [
+    ("frame_rate_hertz", "Frames a second over about the last second", |h| h.rate_hz),
+    ("uptime_seconds", "Time since the process started", |h| secs_since(h.started_nanos)),
+    ("report_age_seconds", "Time since the process said something", |h| {
+        secs_since(h.published_nanos)
+    }),
+    ("peak_resident_bytes", "Largest resident memory so far", |h| h.peak_rss_bytes as f64),
+];
+
+const MAPPER_COUNTERS: [Figure; 7] = [
+    ("joint_estimates", "Joint estimates of keyframes that entered the map", |h| {
+        h.adjustments as f64
+    }),
+    ("joint_estimates_merged", "Of them those that entered a map with newer keyframes", |h| {
+        h.adjustments_merged as f64
+    }),
+    (
+        "joint_estimates_dropped",
+        "Joint estimates that were dropped because the map had changed",
+        |h| h.adjustments_dropped as f64,
+    ),
+    ("loop_searches", "Keyframes that were looked for in older ones", |h| h.loop_searches as f64),
+    ("loops_closed", "Loops that moved the map", |h| h.loops_closed as f64),
+    ("loops_held", "Loops that the map already had so", |h| h.loops_held as f64),
+    ("epochs_joined", "Epochs that were joined to others", |h| h.epochs_joined as f64),
+];
+
+/// A histogram of a process: name, what it is, counts.
+type Histogram = (&'static str, &'static str, fn(&HealthMessage) -> &[u64; HISTOGRAM_BUCKETS]);
+
+const HISTOGRAMS: [Histogram; 3] = [
+    ("latency_seconds", "From the frame's stamp to what the process made of it", |h| {
+        &h.latency_counts
+    }),
+    ("work_seconds", "Time that the work on a frame took", |h| &h.work_counts),
+    ("wake_seconds", "From the sending of a frame to the look at it", |h| &h.wake_counts),
+];
+
+fn secs_since(nanos: i64) -> f64 {
+    now_nanos().saturating_sub(nanos).max(0) as f64 * 1e-9
+}
+
+/// The text; `pages` and `lost` are of the server itself.
+pub fn metrics(state: &State, instance: &str, pages: usize, lost: u64) -> String {
+    let mut text = Text::default();
+    text.family("semidense", "info", "The instance and where its frames come from");
+    let from = state.health.get("capture").map(source).unwrap_or_default();
+    text.line(
+        "semidense_info",
+        &[("name", instance), ("version", env!("CARGO_PKG_VERSION")), ("source", &from)],
+        1.0,
+    );
+    text.family("semidense_up", "gauge", "1 while the instance runs");
+    text.line("semidense_up", &[], f64::from(u8::from(state.is_joined)));
+    of_processes(&mut text, state);
+    of_mapper(&mut text, state);
+    of_poses(&mut text, state);
+    text.family("semidense_view_pages", "gauge", "Pages that are open");
+    text.line("semidense_view_pages", &[], pages as f64);
+    text.family(
+        "semidense_view_events_lost",
+        "counter",
+        "Events that this server's own readers lost because they were slow",
+    );
+    text.line("semidense_view_events_lost_total", &[], lost as f64);
+    text.0 + "# EOF\n"
+}
+
+fn of_processes(text: &mut Text, state: &State) {
+    text.family("semidense_process_state", "gauge", "1 for the state that the process is in");
+    for (process, health) in &state.health {
+        for name in (0..PROCESS_STATES).filter_map(ProcessState::from_code) {
+            let is_it = f64::from(u8::from(name.code() == health.state));
+            text.line(
+                "semidense_process_state",
+                &[("process", process), ("state", name.name())],
+                is_it,
+            );
+        }
+    }
+    for (name, help, value) in COUNTERS {
+        text.family(&format!("semidense_{name}"), "counter", help);
+        for (process, health) in &state.health {
+            text.line(&format!("semidense_{name}_total"), &[("process", process)], value(health));
+        }
+    }
+    for (name, help, value) in GAUGES {
+        text.family(&format!("semidense_{name}"), "gauge", help);
+        for (process, health) in &state.health {
+            text.line(&format!("semidense_{name}"), &[("process", process)], value(health));
+        }
+    }
+    for (name, help, counts) in HISTOGRAMS {
+        text.family(&format!("semidense_{name}"), "histogram", help);
+        for (process, health) in &state.health {
+            text.histogram(&format!("semidense_{name}"), process, counts(health));
+        }
+    }
+}
+
+fn of_mapper(text: &mut Text, state: &State) {
+    let Some(health) = state.health.get("mapper") else { return };
+    for (name, help, value) in MAPPER_COUNTERS {
+        text.family(&format!("semidense_{name}"), "counter", help);
+        text.line(&format!("semidense_{name}_total"), &[], value(health));
+    }
+    text.family("semidense_joint_estimate_cpu_seconds", "histogram", "CPU time of joint estimates");
+    text.histogram("semidense_joint_estimate_cpu_seconds", "mapper", &health.adjustment_counts);
+    text.family("semidense_keyframes", "gauge", "Keyframes of the map");
+    text.line("semidense_keyframes", &[], health.total as f64);
+}
+
+fn of_poses(text: &mut Text, state: &State) {
+    text.family(
+        "semidense_poses",
+        "counter",
+        "Poses by the state that they were in, since this server joined the run",
+    );
+    for (name, count) in STATES.iter().zip(state.poses_by_state) {
+        text.line("semidense_poses_total", &[("state", name)], count as f64);
+    }
+    let Some((_, pose)) = &state.pose else { return };
+    let pose = &pose.message;
+    text.family("semidense_tracking_state", "gauge", "1 for the state of the newest pose");
+    for (code, name) in STATES.iter().enumerate() {
+        let is_it = f64::from(u8::from(code == pose.state as usize));
+        text.line("semidense_tracking_state", &[("state", name)], is_it);
+    }
+    let gauges = [
+        (
+            "pose_age_seconds",
+            "Time since the newest pose was published",
+            secs_since(pose.published_nanos),
+        ),
+        ("pose_in_view_ratio", "Share of the keyframe's points in view", pose.in_view_ratio),
+        ("pose_inlier_ratio", "Share of those compared that are explained", pose.inlier_ratio),
+        ("epoch", "Life of the map", f64::from(pose.epoch)),
+        ("map_revision", "How often the map had been corrected", pose.map_revision as f64),
+    ];
+    for (name, help, value) in gauges {
+        text.family(&format!("semidense_{name}"), "gauge", help);
+        text.line(&format!("semidense_{name}"), &[], value);
+    }
+}
+
+/// The text as it grows.
+#[derive(Debug, Default)]
+struct Text(String);
+
+impl Text {
+    fn family(&mut self, name: &str, kind: &str, help: &str) {
+        let _ = write!(self.0, "# TYPE {name} {kind}\n# HELP {name} {help}.\n");
+    }
+
+    fn line(&mut self, name: &str, labels: &[(&str, &str)], value: f64) {
+        self.0.push_str(name);
+        for (i, (label, text)) in labels.iter().enumerate() {
+            let begin = if i == 0 { '{' } else { ',' };
+            let escaped = text.replace('\\', "\\\\").replace('"', "\\\"").replace('\n', "\\n");
+            let _ = write!(self.0, "{begin}{label}=\"{escaped}\"");
+        }
+        if !labels.is_empty() {
+            self.0.push('}');
+        }
+        let _ = match value {
+            value if value.is_nan() => writeln!(self.0, " NaN"),
+            value => writeln!(self.0, " {value}"),
+        };
+    }
+
+    /// Buckets as Prometheus has them, each with all below it. Times are counted by half octaves and not summed: the sum
+    /// takes each to be in the middle of its bucket, right to a few percent.
+    fn histogram(&mut self, name: &str, process: &str, counts: &[u64; HISTOGRAM_BUCKETS]) {
+        let (mut below, mut sum) = (0_u64, 0.0);
+        for (index, count) in counts.iter().enumerate() {
+            below = below.saturating_add(*count);
+            let end = bucket_end_ms(index) * 1e-3;
+            let begin = if index == 0 { 0.0 } else { bucket_end_ms(index - 1) * 1e-3 };
+            sum += *count as f64 * 0.5 * (begin + end);
+            // The last one holds all from its beginning on.
+            let le = if index + 1 == HISTOGRAM_BUCKETS {
+                "+Inf".to_owned()
+            } else {
+                format!("{end:.9}")
+            };
+            self.line(
+                &format!("{name}_bucket"),
+                &[("process", process), ("le", &le)],
+                below as f64,
+            );
+        }
+        self.line(&format!("{name}_count"), &[("process", process)], below as f64);
+        self.line(&format!("{name}_sum"), &[("process", process)], sum);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn buckets_hold_all_below_them() {
+        let mut counts = [0; HISTOGRAM_BUCKETS];
+        (counts[0], counts[20], counts[HISTOGRAM_BUCKETS - 1]) = (2, 3, 5);
+        let mut text = Text::default();
+        text.histogram("t_seconds", "p", &counts);
+        let value = |of: &str| {
+            text.0
+                .lines()
+                .find(|line| line.contains(of))
+                .unwrap()
+                .rsplit_once(' ')
+                .unwrap()
+                .1
+                .to_owned()
+        };
+        assert_eq!(
+            [value("le=\"0.000001414\""), value("le=\"+Inf\""), value("_count")],
+            ["2", "10", "10"]
+        );
+        let le: Vec<f64> = text
+            .0
+            .lines()
+            .filter_map(|line| line.split("le=\"").nth(1)?.split('"').next()?.parse().ok())
+            .collect();
+        assert!(le.is_sorted() && le.len() == HISTOGRAM_BUCKETS);
+    }
+
+    #[test]
+    fn labels_are_escaped() {
+        let mut text = Text::default();
+        text.line("a", &[("b", "x\"y\\z\n")], f64::NAN);
+        assert_eq!(text.0, "a{b=\"x\\\"y\\\\z\\n\"} NaN\n");
+    }
+}

@@ -1,0 +1,89 @@
+//! The camera's path so far, each pose relative to its keyframe, so that it follows the map's corrections.
+
+use semidense::slam::pose::NO_KEYFRAME;
+
+use crate::session::Pose;
+
+/// Poses that are kept: half an hour at 30 Hz. Beyond that every second one is given up.
+const MAX_POSES: usize = 1 << 16;
+/// Bytes of a pose in a message.
+const POSE_BYTES: usize = 32;
+
+/// One pose.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct PathPose {
+    secs: f64,
+    position_in_keyframe: [f32; 3],
+    keyframe_id: u32,
+    epoch: u32,
+    state: u32,
+}
+
+/// The path.
+#[derive(Debug, Default)]
+pub struct Path {
+    poses: Vec<PathPose>,
+    /// Of the poses that come, each how-many-th is kept.
+    every: u64,
+    seen: u64,
+    /// Counts how often poses were given up: what was sent before is void.
+    pub generation: u64,
+}
+
+impl Path {
+    /// Appends a pose.
+    pub fn push(&mut self, pose: &Pose) {
+        let message = &pose.message;
+        if message.keyframe_id == NO_KEYFRAME {
+            return;
+        }
+        self.seen += 1;
+        let [.., x, y, z] = message.keyframe_from_camera;
+        let is_same_state = self.poses.last().is_some_and(|last| last.state == message.state);
+        if is_same_state && !self.seen.is_multiple_of(self.every.max(1)) {
+            return;
+        }
+        self.poses.push(PathPose {
+            secs: message.capture_nanos as f64 * 1e-9,
+            position_in_keyframe: [x, y, z].map(|x| x as f32),
+            keyframe_id: message.keyframe_id as u32,
+            epoch: message.epoch,
+            state: message.state,
+        });
+        if self.poses.len() >= MAX_POSES {
+            let mut index = 0;
+            self.poses.retain(|_| {
+                index += 1;
+                index % 2 == 0
+            });
+            self.every = 2 * self.every.max(1);
+            self.generation += 1;
+        }
+    }
+
+    /// How many poses it has.
+    pub fn len(&self) -> usize {
+        self.poses.len()
+    }
+
+    /// Whether it has none.
+    pub fn is_empty(&self) -> bool {
+        self.poses.is_empty()
+    }
+
+    /// The poses from number `from` on: seconds f64, position f32 x 3, keyframe, epoch and state u32.
+    pub fn bytes_from(&self, from: usize) -> Vec<u8> {
+        let poses = self.poses.get(from..).unwrap_or_default();
+        let mut bytes = Vec::with_capacity(poses.len() * POSE_BYTES);
+        for pose in poses {
+            bytes.extend_from_slice(&pose.secs.to_le_bytes());
+            pose.position_in_keyframe
+                .iter()
+                .for_each(|x| bytes.extend_from_slice(&x.to_le_bytes()));
+            for number in [pose.keyframe_id, pose.epoch, pose.state] {
+                bytes.extend_from_slice(&number.to_le_bytes());
+            }
+        }
+        bytes
+    }
+}

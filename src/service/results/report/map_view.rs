@@ -1,0 +1,87 @@
+//! The 3D map in the report: the page's viewer with a thinned map in it, no other file needed.
+
+use std::fmt::Write;
+
+use nalgebra::Vector3;
+
+use crate::service::results::ply::CloudPoint;
+use crate::service::results::poses::longest_epoch;
+use crate::service::results::report::html::base64;
+use crate::service::results::report::scene::{
+    PLAYER, SceneInput, SceneKeyframe, ScenePoint, VIEWER, pack,
+};
+use crate::service::results::report::{ReportInput, grouped};
+use crate::slam::map::Map;
+
+/// Most points of the map in a report: 3.2 MB of text, which a browser opens at once.
+const MAX_POINTS: usize = 300_000;
+
+/// The section; nothing without points.
+pub fn map_view(input: &ReportInput<'_>) -> String {
+    let map = &input.record.map;
+    let Some(first) = map.keyframes.first().filter(|_| !input.cloud.is_empty()) else {
+        return String::new();
+    };
+    // Each epoch has a place and a unit of its own.
+    let epoch = longest_epoch(input.record);
+    let keyframes: Vec<SceneKeyframe> = map
+        .keyframes
+        .iter()
+        .filter(|k| epoch.is_none_or(|epoch| k.epoch == epoch))
+        .map(|k| SceneKeyframe {
+            keyframe_id: k.keyframe_id,
+            nanos: k.capture_nanos,
+            place: k.map_from_keyframe,
+        })
+        .collect();
+    let points = scene_points(map, input.cloud);
+    let block = pack(&SceneInput {
+        points: &points,
+        keyframes: &keyframes,
+        path: input.trajectory,
+        intrinsics: &first.intrinsics,
+        up: None,
+        max_points: MAX_POINTS,
+    });
+    let shown = points.len().min(MAX_POINTS);
+    let mut html =
+        format!("<section><style>{}</style><h2>Map in 3D</h2>", include_str!("map_view.css"));
+    html.push_str(include_str!("map_view.html"));
+    let _ = write!(
+        html,
+        "<p>{} of {} points; drag to turn, wheel or two fingers to zoom, shift-drag to move, double click for all of it. \
+         Blue: the camera's path; the slider shows the map as it grew. Lengths are map units. \
+         <code>semidense view</code> with this folder shows all points.</p>",
+        grouped(shown as u64),
+        grouped(points.len() as u64)
+    );
+    let _ =
+        write!(html, "<script type=\"text/plain\" id=\"map3d-data\">{}</script>", base64(&block));
+    let _ = write!(html, "<script>{VIEWER}</script><script>{PLAYER}</script>");
+    let _ = write!(html, "<script>{}</script></section>", include_str!("map_view.js"));
+    html
+}
+
+/// The points of the cloud for the view.
+fn scene_points(map: &Map, cloud: &[CloudPoint]) -> Vec<ScenePoint> {
+    let mut of = None;
+    cloud
+        .iter()
+        .map(|point| {
+            let keyframe_id = u64::from(point.keyframe_id);
+            if of.is_none_or(|(id, _)| id != keyframe_id) {
+                of = map.get(keyframe_id).map(|k| (keyframe_id, k.map_from_keyframe));
+            }
+            let std_dev = of.map_or(f64::NAN, |(_, place)| {
+                let depth = (place.inverse() * Vector3::from(point.position.map(f64::from))).z;
+                place.scale * f64::from(point.variance).sqrt() * depth * depth
+            });
+            ScenePoint {
+                position: point.position,
+                grey: point.intensity.clamp(0.0, 255.0) as u8,
+                std_dev: std_dev as f32,
+                keyframe_id: Some(keyframe_id),
+            }
+        })
+        .collect()
+}
