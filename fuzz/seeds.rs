@@ -194,6 +194,7 @@ fn frame_header(sequence: u64) -> FrameHeader {
         sequence,
         capture_nanos: 33_000_000 * sequence as i64,
         clock_nanos: 0,
+        realtime_nanos: 0,
         sent_nanos: 0,
         exposure_nanos: 5_000_000,
         intrinsics: [CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy],

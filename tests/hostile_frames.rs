@@ -28,6 +28,7 @@ fn header(sequence: u64, side: usize) -> FrameHeader {
         sequence,
         capture_nanos: 33_000_000 * sequence as i64,
         clock_nanos: 0,
+        realtime_nanos: i64::MIN,
         sent_nanos: 0,
         exposure_nanos: 0,
         intrinsics: [50.0, 50.0, 0.5 * side as f64, 0.5 * side as f64],

@@ -89,6 +89,7 @@ fn pose(i: usize, state: TrackingState, keyframe_id: u64) -> RecordedPose {
         covariance: [0.0; 21],
         map_covariance: [0.0; 21],
         alignment_covariance: [0.0; 21],
+        velocity: None,
         brightness: Brightness::default(),
         quality: Quality::default(),
         proposes_keyframe: false,

@@ -9,7 +9,7 @@ import ctypes
 import enum
 from typing import NamedTuple, Optional
 
-WIRE_VERSION = 10
+WIRE_VERSION = 11
 MAX_KEYFRAME_POINTS = 100000
 # Where the buckets of a histogram end, milliseconds.
 BUCKET_ENDS_MS = (
@@ -67,26 +67,29 @@ BUCKET_ENDS_MS = (
 class FrameHeader(ctypes.Structure):
     """Header of `capture/frame`; the payload is the grey image."""
 
-    SIZE = 88
+    SIZE = 96
     OFFSETS = {
         "sequence": 0,
         "capture_nanos": 8,
         "clock_nanos": 16,
-        "sent_nanos": 24,
-        "exposure_nanos": 32,
-        "intrinsics": 40,
-        "width": 72,
-        "height": 76,
-        "stride": 80,
-        "gain": 84,
+        "realtime_nanos": 24,
+        "sent_nanos": 32,
+        "exposure_nanos": 40,
+        "intrinsics": 48,
+        "width": 80,
+        "height": 84,
+        "stride": 88,
+        "gain": 92,
     }
     _fields_ = [
         # Number of the frame at its source; a gap is a frame that is missing.
         ("sequence", ctypes.c_uint64),
         # Middle of the exposure, nanoseconds: CLOCK_MONOTONIC of a camera, else the recording's clock.
         ("capture_nanos", ctypes.c_int64),
-        # CLOCK_MONOTONIC instant that latency counts from: the stamp of a camera, the paced instant of a recording played live, the sending in lockstep.
+        # CLOCK_MONOTONIC instant that latency counts from: a camera's stamp, the paced instant of a recording, or the sending.
         ("clock_nanos", ctypes.c_int64),
+        # CLOCK_REALTIME at `clock_nanos`, as the system clock stood when the frame was sent; 0 where unknown.
+        ("realtime_nanos", ctypes.c_int64),
         # CLOCK_MONOTONIC when it was sent: wake-ups are measured from here.
         ("sent_nanos", ctypes.c_int64),
         # Exposure time in nanoseconds, 0 where unknown.
@@ -105,50 +108,56 @@ class FrameHeader(ctypes.Structure):
 
     @staticmethod
     def type_name() -> str:
-        return "semidense.FrameHeader.v2"
+        return "semidense.FrameHeader.v3"
 
 
 class PoseMessage(ctypes.Structure):
     """Message of `tracker/pose`."""
 
-    SIZE = 840
+    SIZE = 1064
     OFFSETS = {
         "sequence": 0,
         "capture_nanos": 8,
-        "published_nanos": 16,
-        "latency_nanos": 24,
-        "track_nanos": 32,
-        "wake_nanos": 40,
-        "revision": 48,
-        "keyframe_id": 56,
-        "epoch": 64,
-        "state": 68,
-        "reason": 72,
-        "proposes_keyframe": 76,
-        "map_revision": 80,
-        "world_from_camera": 88,
-        "map_from_camera": 144,
-        "keyframe_from_camera": 200,
-        "covariance": 256,
-        "map_covariance": 424,
-        "alignment_covariance": 592,
-        "brightness": 760,
-        "in_view_ratio": 776,
-        "inlier_ratio": 784,
-        "whitened_rmse": 792,
-        "residual_rmse": 800,
-        "mean_squared_flow": 808,
-        "displacement_px": 816,
-        "iterations": 824,
-        "finest_level": 828,
-        "points": 832,
-        "reserved": 836,
+        "realtime_nanos": 16,
+        "published_nanos": 24,
+        "latency_nanos": 32,
+        "track_nanos": 40,
+        "wake_nanos": 48,
+        "revision": 56,
+        "keyframe_id": 64,
+        "epoch": 72,
+        "state": 76,
+        "reason": 80,
+        "proposes_keyframe": 84,
+        "map_revision": 88,
+        "world_from_camera": 96,
+        "map_from_camera": 152,
+        "keyframe_from_camera": 208,
+        "covariance": 264,
+        "map_covariance": 432,
+        "alignment_covariance": 600,
+        "linear_velocity": 768,
+        "angular_velocity": 792,
+        "velocity_covariance": 816,
+        "brightness": 984,
+        "in_view_ratio": 1000,
+        "inlier_ratio": 1008,
+        "whitened_rmse": 1016,
+        "residual_rmse": 1024,
+        "mean_squared_flow": 1032,
+        "displacement_px": 1040,
+        "iterations": 1048,
+        "finest_level": 1052,
+        "points": 1056,
+        "has_velocity": 1060,
     }
     _fields_ = [
         # Sequence of the frame.
         ("sequence", ctypes.c_uint64),
         # Stamp of the frame, nanoseconds.
         ("capture_nanos", ctypes.c_int64),
+        # `realtime_nanos` of the frame, bit for bit: CLOCK_REALTIME at its `clock_nanos`; 0 where unknown.
+        ("realtime_nanos", ctypes.c_int64),
         # CLOCK_MONOTONIC when the pose was published.
         ("published_nanos", ctypes.c_int64),
         # From the frame's `clock_nanos` to `published_nanos`.
@@ -183,6 +192,12 @@ class PoseMessage(ctypes.Structure):
         ("map_covariance", ctypes.c_double * 21),
         # The same as `covariance` of the alignment alone, for the mapper. Too sure by up to a hundred in standard deviation: never fuse it.
         ("alignment_covariance", ctypes.c_double * 21),
+        # Velocity of the camera at the frame's stamp, along its own axes (x right, y down, z forward), world units a second.
+        ("linear_velocity", ctypes.c_double * 3),
+        # The same about its own axes, radians a second.
+        ("angular_velocity", ctypes.c_double * 3),
+        # Upper triangle, row-major, of the covariance of both, linear first, without the error of the map's scale.
+        ("velocity_covariance", ctypes.c_double * 21),
         # Brightness against the keyframe: a, b.
         ("brightness", ctypes.c_double * 2),
         # Share of the keyframe's points in view.
@@ -203,13 +218,13 @@ class PoseMessage(ctypes.Structure):
         ("finest_level", ctypes.c_uint32),
         # Points compared: in view and not clipped by the sensor.
         ("points", ctypes.c_uint32),
-        # Zero.
-        ("reserved", ctypes.c_uint32),
+        # 1 where the velocity is known: this frame and the one before were tracked in one epoch; otherwise 0, and it is zero.
+        ("has_velocity", ctypes.c_uint32),
     ]
 
     @staticmethod
     def type_name() -> str:
-        return "semidense.Pose.v6"
+        return "semidense.Pose.v7"
 
 
 class KeyframeHeader(ctypes.Structure):
@@ -748,16 +763,16 @@ class Topic(NamedTuple):
 
 
 TOPICS = {
-    "capture/frame": Topic("capture/frame", ctypes.c_uint8, FrameHeader, 5, 4, 4, 0),
-    "tracker/pose": Topic("tracker/pose", PoseMessage, None, 8, 1000, 2, 1),
-    "mapper/keyframe": Topic("mapper/keyframe", DepthPoint, KeyframeHeader, 5, 1, 2, 1),
-    "mapper/keyframe_image": Topic("mapper/keyframe_image", ctypes.c_uint8, KeyframeImageHeader, 5, 1, 2, 1),
-    "mapper/graph": Topic("mapper/graph", KeyframePoseMessage, GraphHeader, 5, 1, 2, 1),
-    "mapper/step": Topic("mapper/step", StepMessage, None, 8, 1000, 2, 1),
-    "mapper/adjustment": Topic("mapper/adjustment", AdjustmentMessage, None, 8, 64, 2, 1),
-    "capture/health": Topic("capture/health", HealthMessage, None, 8, 4, 2, 1),
-    "tracker/health": Topic("tracker/health", HealthMessage, None, 8, 4, 2, 1),
-    "mapper/health": Topic("mapper/health", HealthMessage, None, 8, 4, 2, 1),
+    "capture/frame": Topic("capture/frame", ctypes.c_uint8, FrameHeader, 6, 4, 4, 0),
+    "tracker/pose": Topic("tracker/pose", PoseMessage, None, 9, 900, 2, 1),
+    "mapper/keyframe": Topic("mapper/keyframe", DepthPoint, KeyframeHeader, 6, 1, 1, 1),
+    "mapper/keyframe_image": Topic("mapper/keyframe_image", ctypes.c_uint8, KeyframeImageHeader, 6, 1, 1, 1),
+    "mapper/graph": Topic("mapper/graph", KeyframePoseMessage, GraphHeader, 6, 1, 1, 1),
+    "mapper/step": Topic("mapper/step", StepMessage, None, 6, 900, 2, 1),
+    "mapper/adjustment": Topic("mapper/adjustment", AdjustmentMessage, None, 9, 64, 2, 1),
+    "capture/health": Topic("capture/health", HealthMessage, None, 10, 4, 2, 1),
+    "tracker/health": Topic("tracker/health", HealthMessage, None, 10, 4, 2, 1),
+    "mapper/health": Topic("mapper/health", HealthMessage, None, 10, 4, 2, 1),
 }
 COMMAND_TOPIC = "mapper/command"
 

@@ -7,7 +7,7 @@ use crate::capture::source::{
     Arrival, FrameSource, FrameStamp, SourceError, SourceName, open, rig_remarks,
 };
 use crate::service::child::{is_supervised, prepared_frames};
-use crate::service::clock::{Pace, duration_from_nanos, now_nanos};
+use crate::service::clock::{Pace, duration_from_nanos, now_nanos, realtime_of};
 use crate::service::config::Config;
 use crate::service::health::{Health, ProcessState};
 use crate::service::mode::Mode;
@@ -429,6 +429,7 @@ impl<'a> Shell<'a> {
             sequence: stamp.sequence,
             capture_nanos: stamp.capture_nanos,
             clock_nanos,
+            realtime_nanos: realtime_of(clock_nanos),
             sent_nanos: now_nanos(),
             exposure_nanos: stamp.exposure_nanos,
             intrinsics: [k.fx, k.fy, k.cx, k.cy],

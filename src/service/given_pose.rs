@@ -52,6 +52,7 @@ pub fn given_pose(
         covariance: [0.0; 21],
         map_covariance: [0.0; 21],
         alignment_covariance: [0.0; 21],
+        velocity: None,
         brightness: Brightness::default(),
         quality: Quality::default(),
         proposes_keyframe: false,

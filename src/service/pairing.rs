@@ -97,6 +97,7 @@ mod tests {
             covariance: [0.0; 21],
             map_covariance: [0.0; 21],
             alignment_covariance: [0.0; 21],
+            velocity: None,
             brightness: Brightness::default(),
             quality: Quality::default(),
             proposes_keyframe: false,

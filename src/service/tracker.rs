@@ -306,6 +306,7 @@ impl<'a> Shell<'a> {
         // A camera's stamp may lie in the future of our clock.
         let positive = |nanos: i64| u64::try_from(nanos).unwrap_or(0);
         let timing = PoseTiming {
+            realtime_nanos: header.realtime_nanos,
             published_nanos,
             latency_nanos: positive(published_nanos.saturating_sub(header.clock_nanos)),
             track_nanos: positive(track_nanos),
@@ -380,6 +381,7 @@ fn unclaimed(estimate: &PoseEstimate) -> PoseEstimate {
         covariance,
         map_covariance: covariance,
         alignment_covariance: covariance,
+        velocity: None,
         brightness: Default::default(),
         quality: Default::default(),
         proposes_keyframe: false,

@@ -1,5 +1,7 @@
 //! What the tracker says of one frame: pose, covariance, state and quality.
 
+use nalgebra::Vector3;
+
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
 
@@ -94,6 +96,19 @@ pub struct Quality {
     pub displacement_px: f64,
 }
 
+/// How a camera moves at the stamp of a frame: its mean motion since the frame before.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Velocity {
+    /// Along the camera's own axes (x right, y down, z forward), world units a second.
+    pub linear: Vector3<f64>,
+    /// About the camera's own axes, radians a second.
+    pub angular: Vector3<f64>,
+    /// Upper triangle, row-major, of the covariance of (linear, angular), (world units/s)² and (rad/s)²: errors of both
+    /// poses, and what the velocity may have changed by within the interval
+    /// ([`velocity`](crate::slam::tracker::velocity)). The error of the map's scale is not in it.
+    pub covariance: [f64; 21],
+}
+
 /// The tracker's word on one frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PoseEstimate {
@@ -130,6 +145,9 @@ pub struct PoseEstimate {
     /// The same as `covariance` of the alignment alone, as if the errors of distant points were independent: too sure to
     /// be fused. The mapper weighs matches with it.
     pub alignment_covariance: [f64; 21],
+    /// How the camera moves; `None` where this frame or the one before has no pose, or they are of different epochs, and
+    /// at a view that is held ([`DegradedReason::Turning`]).
+    pub velocity: Option<Velocity>,
     /// Brightness against the keyframe.
     pub brightness: Brightness,
     /// Figures of the alignment.
@@ -155,6 +173,7 @@ impl PoseEstimate {
             covariance: [0.0; 21],
             map_covariance: [0.0; 21],
             alignment_covariance: [0.0; 21],
+            velocity: None,
             brightness: Brightness::default(),
             quality: Quality::default(),
             proposes_keyframe: false,

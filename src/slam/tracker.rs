@@ -5,6 +5,7 @@ pub mod motion;
 mod proposal;
 mod report;
 mod turning;
+pub mod velocity;
 pub mod verdict;
 
 use serde::{Deserialize, Serialize};
@@ -21,6 +22,7 @@ use crate::slam::pose::{Brightness, DegradedReason, LostReason, PoseEstimate, Tr
 use crate::slam::tracker::covariance_floor::CovarianceFloorParams;
 use crate::slam::tracker::motion::{Motion, hypotheses, turned};
 use crate::slam::tracker::turning::{Turning, may_turn};
+use crate::slam::tracker::velocity::VelocityMemory;
 use crate::slam::tracker::verdict::{VerdictParams, fits_better, is_better, quality_of};
 
 /// Standard deviations by which a pose may differ from one that is held: of a hundred finds one is refused for nothing.
@@ -123,6 +125,7 @@ pub struct Tracker {
 #[derive(Debug, Clone, Default)]
 pub struct Memory {
     motion: Motion,
+    velocity: VelocityMemory,
     brightness: Brightness,
     last_sequence: Option<u64>,
     /// Whether the frame before was not tracked on a keyframe.
@@ -170,6 +173,7 @@ impl Tracker {
             // epoch that is taken up again lies where odometry has the camera.
             if old.epoch() < new.epoch() && old.keyframe_id() != new.keyframe_id() {
                 self.memory.motion = Motion::default();
+                self.memory.velocity.forget();
                 // On a keyframe that the mapper did not make just now, of a map that it has gone over to, the camera may
                 // be anywhere.
                 let age =
@@ -180,6 +184,7 @@ impl Tracker {
             if old.keyframe_id() == new.keyframe_id() {
                 let (before, after) = (old.world_from_keyframe(), new.world_from_keyframe());
                 self.memory.motion.follow(before, after);
+                self.memory.velocity.follow(after.scale / before.scale);
                 self.turning.follow(before, after);
             } else {
                 self.memory.brightness = Brightness::default();
@@ -193,6 +198,7 @@ impl Tracker {
     /// is searched for around it, and must fit as well as after a loss.
     pub fn resume_at(&mut self, nanos: i64, world_from_camera: &SE3) {
         self.memory.motion.observe(nanos, world_from_camera);
+        self.memory.velocity.forget();
         self.memory.was_lost = true;
     }
 
@@ -260,6 +266,9 @@ impl Tracker {
             estimate.state,
             TrackingState::Lost(_) | TrackingState::Degraded(DegradedReason::Turning)
         );
+        if self.memory.was_lost {
+            self.memory.velocity.forget();
+        }
         self.memory.covariance = estimate.covariance;
         self.memory.unit = reference.world_from_keyframe().scale;
         self.reference = Some(reference);

@@ -2,6 +2,8 @@
 //!
 //! Going out and back in keeps every bit: lockstep and replay must agree to the last digit.
 
+mod velocity;
+
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
 use crate::slam::frame::FrameView;
@@ -19,6 +21,9 @@ use crate::wire::message::{
     FrameHeader, KeyframeHeader, KeyframeImageHeader, KeyframePoseMessage, PoseMessage,
     RigidMessage, SimilarityMessage,
 };
+
+use crate::wire::conversion::velocity::put_velocity;
+pub use crate::wire::conversion::velocity::velocity_from_message;
 
 /// Farthest a sent quaternion may be from unit length: rounding, not another transform.
 const QUATERNION_TOLERANCE: f64 = 1e-6;
@@ -238,6 +243,8 @@ pub fn map_state_from_code(code: u32) -> Result<MapState, MessageError> {
 /// When a pose was published and what it took.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct PoseTiming {
+    /// `realtime_nanos` of the frame.
+    pub realtime_nanos: i64,
     /// CLOCK_MONOTONIC at publication.
     pub published_nanos: i64,
     /// From the frame's instant to publication.
@@ -252,9 +259,10 @@ pub struct PoseTiming {
 pub fn pose_message(pose: &PoseEstimate, timing: &PoseTiming) -> PoseMessage {
     let (state, reason) = codes_from_state(pose.state);
     let quality = &pose.quality;
-    PoseMessage {
+    let mut message = PoseMessage {
         sequence: pose.sequence,
         capture_nanos: pose.capture_nanos,
+        realtime_nanos: timing.realtime_nanos,
         published_nanos: timing.published_nanos,
         latency_nanos: timing.latency_nanos,
         track_nanos: timing.track_nanos,
@@ -272,6 +280,9 @@ pub fn pose_message(pose: &PoseEstimate, timing: &PoseTiming) -> PoseMessage {
         covariance: pose.covariance,
         map_covariance: pose.map_covariance,
         alignment_covariance: pose.alignment_covariance,
+        linear_velocity: [0.0; 3],
+        angular_velocity: [0.0; 3],
+        velocity_covariance: [0.0; 21],
         brightness: [pose.brightness.a, pose.brightness.b],
         in_view_ratio: quality.in_view_ratio,
         inlier_ratio: quality.inlier_ratio,
@@ -282,8 +293,10 @@ pub fn pose_message(pose: &PoseEstimate, timing: &PoseTiming) -> PoseMessage {
         iterations: quality.iterations,
         finest_level: quality.finest_level,
         points: quality.points,
-        reserved: 0,
-    }
+        has_velocity: 0,
+    };
+    put_velocity(pose.velocity.as_ref(), &mut message);
+    message
 }
 
 /// The pose of a message, checked.
@@ -336,6 +349,7 @@ pub fn pose_from_message(message: &PoseMessage) -> Result<PoseEstimate, MessageE
         covariance: message.covariance,
         map_covariance: message.map_covariance,
         alignment_covariance: message.alignment_covariance,
+        velocity: velocity_from_message(message)?,
         brightness: Brightness { a: message.brightness[0], b: message.brightness[1] },
         quality,
         proposes_keyframe,

@@ -1,7 +1,6 @@
 //! The messages as they lie in shared memory: `#[repr(C)]`, scalars only, every bit pattern valid.
 //!
-//! A `type_name` carries the version of its message; size and alignment are pinned by a test. The
-//! checked way to the types of `slam` is in [`crate::wire::conversion`].
+//! A `type_name` carries the version of its message. The checked way to the types of `slam` is in [`crate::wire::conversion`].
 
 use iceoryx2::prelude::ZeroCopySend;
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
@@ -35,15 +34,16 @@ pub type SimilarityMessage = [f64; 8];
     Immutable,
     KnownLayout,
 )]
-#[type_name("semidense.FrameHeader.v2")]
+#[type_name("semidense.FrameHeader.v3")]
 pub struct FrameHeader {
     /// Number of the frame at its source; a gap is a frame that is missing.
     pub sequence: u64,
     /// Middle of the exposure, nanoseconds: CLOCK_MONOTONIC of a camera, else the recording's clock.
     pub capture_nanos: i64,
-    /// CLOCK_MONOTONIC instant that latency counts from: the stamp of a camera, the paced instant
-    /// of a recording played live, the sending in lockstep.
+    /// CLOCK_MONOTONIC instant that latency counts from: a camera's stamp, the paced instant of a recording, or the sending.
     pub clock_nanos: i64,
+    /// CLOCK_REALTIME at `clock_nanos`, as the system clock stood when the frame was sent; 0 where unknown.
+    pub realtime_nanos: i64,
     /// CLOCK_MONOTONIC when it was sent: wake-ups are measured from here.
     pub sent_nanos: i64,
     /// Exposure time in nanoseconds, 0 where unknown.
@@ -65,12 +65,14 @@ pub struct FrameHeader {
 #[derive(
     Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes, IntoBytes, Immutable, KnownLayout,
 )]
-#[type_name("semidense.Pose.v6")]
+#[type_name("semidense.Pose.v7")]
 pub struct PoseMessage {
     /// Sequence of the frame.
     pub sequence: u64,
     /// Stamp of the frame, nanoseconds.
     pub capture_nanos: i64,
+    /// `realtime_nanos` of the frame, bit for bit: CLOCK_REALTIME at its `clock_nanos`; 0 where unknown.
+    pub realtime_nanos: i64,
     /// CLOCK_MONOTONIC when the pose was published.
     pub published_nanos: i64,
     /// From the frame's `clock_nanos` to `published_nanos`.
@@ -92,8 +94,7 @@ pub struct PoseMessage {
     pub reason: u32,
     /// 1 when the tracker asks for a new keyframe here.
     pub proposes_keyframe: u32,
-    /// How often the map had been corrected when the keyframe was published: `map_from_camera` jumps where this
-    /// grows.
+    /// How often the map had been corrected when the keyframe was published: `map_from_camera` jumps where this grows.
     pub map_revision: u64,
     /// Odometry pose: never jumps within an epoch, but from a turning pose to the next that is none, and drifts.
     pub world_from_camera: RigidMessage,
@@ -116,6 +117,12 @@ pub struct PoseMessage {
     /// The same as `covariance` of the alignment alone, for the mapper. Too sure by up to a hundred in standard
     /// deviation: never fuse it.
     pub alignment_covariance: [f64; 21],
+    /// Velocity of the camera at the frame's stamp, along its own axes (x right, y down, z forward), world units a second.
+    pub linear_velocity: [f64; 3],
+    /// The same about its own axes, radians a second.
+    pub angular_velocity: [f64; 3],
+    /// Upper triangle, row-major, of the covariance of both, linear first, without the error of the map's scale.
+    pub velocity_covariance: [f64; 21],
     /// Brightness against the keyframe: a, b.
     pub brightness: [f64; 2],
     /// Share of the keyframe's points in view.
@@ -136,8 +143,8 @@ pub struct PoseMessage {
     pub finest_level: u32,
     /// Points compared: in view and not clipped by the sensor.
     pub points: u32,
-    /// Zero.
-    pub reserved: u32,
+    /// 1 where the velocity is known: this frame and the one before were tracked in one epoch; otherwise 0, and it is zero.
+    pub has_velocity: u32,
 }
 
 /// Header of `mapper/keyframe`; the payload is its [`DepthPoint`]s.
@@ -490,30 +497,4 @@ pub struct CommandResponse {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// A change of layout breaks every program that reads our topics: it needs a new version in
-    /// the `type_name` and in [`crate::wire::topic::WIRE_VERSION`].
-    fn assert_layout<T: ZeroCopySend>(size: usize, alignment: usize, name: &str) {
-        assert_eq!((size_of::<T>(), align_of::<T>()), (size, alignment), "{name}");
-        // SAFETY: it only returns a name.
-        assert_eq!(unsafe { <T as ZeroCopySend>::type_name() }, name);
-    }
-
-    #[test]
-    fn layouts_are_pinned() {
-        assert_layout::<FrameHeader>(88, 8, "semidense.FrameHeader.v2");
-        assert_layout::<PoseMessage>(840, 8, "semidense.Pose.v6");
-        assert_layout::<KeyframeHeader>(488, 8, "semidense.KeyframeHeader.v4");
-        assert_layout::<DepthPoint>(16, 4, "semidense.DepthPoint.v1");
-        assert_layout::<KeyframeImageHeader>(24, 8, "semidense.KeyframeImageHeader.v1");
-        assert_layout::<StepMessage>(136, 8, "semidense.Step.v4");
-        assert_layout::<GraphHeader>(24, 8, "semidense.GraphHeader.v2");
-        assert_layout::<KeyframePoseMessage>(80, 8, "semidense.KeyframePose.v2");
-        assert_layout::<AdjustmentMessage>(72, 8, "semidense.Adjustment.v1");
-        assert_layout::<HealthMessage>(2360, 8, "semidense.Health.v6");
-        assert_layout::<CommandRequest>(4112, 8, "semidense.CommandRequest.v2");
-        assert_layout::<CommandResponse>(200, 4, "semidense.CommandResponse.v1");
-    }
-}
+mod tests;

@@ -45,6 +45,18 @@ pub enum OpenError {
         /// Its version.
         found: u32,
     },
+    /// As many subscribe to the topic as it has places for.
+    #[error(
+        "topic {topic} has its {subscribers} subscribers: stop one of {holders}, or read what one of them passes on"
+    )]
+    TooManySubscribers {
+        /// Its name.
+        topic: String,
+        /// Places that it has.
+        subscribers: usize,
+        /// The processes that have them.
+        holders: String,
+    },
     /// A topic cannot be opened.
     #[error("topic {topic}: {reason}")]
     Topic {
@@ -76,7 +88,11 @@ pub(in crate::wire) fn topic_error(name: &str, error: &dyn std::fmt::Display) ->
 
 /// What iceoryx2 calls by the names of its types, with what the user can do about it.
 pub(in crate::wire) fn in_words(reason: &str) -> String {
-    const CAUSES: [(&[&str], &str); 3] = [
+    const CAUSES: [(&[&str], &str); 4] = [
+        (
+            &["ExceedsMaxNumberOfNodes", "ExceedsMaxSupported"],
+            "as many programs take part as there is room for; stop one that reads this instance",
+        ),
         (
             &["HangsInCreation", "ServiceInCorruptedState"],
             "another process has made it, but its shared memory is not in /dev/shm here; containers that share a runtime \
@@ -106,6 +122,8 @@ mod tests {
         assert!(hangs.contains("--ipc=host") && hangs.ends_with("HangsInCreation)"), "{hangs}");
         let files = in_words("EventCreateError(InternalFailure)");
         assert!(files.contains("ulimit -n"), "{files}");
+        let full = in_words("EventOpenError::ExceedsMaxNumberOfNodes");
+        assert!(full.starts_with("as many programs take part"), "{full}");
         assert_eq!(in_words("IncompatibleTypes"), "IncompatibleTypes");
     }
 }

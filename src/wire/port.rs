@@ -1,6 +1,8 @@
 //! Typed ports: send, receive, wait. Quality of service comes from the table in
 //! [`crate::wire::topic`]; every data topic has a wake-up event of the same name.
 
+mod subscribers;
+
 use std::fmt::Debug;
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
@@ -8,11 +10,13 @@ use std::time::Duration;
 use iceoryx2::port::listener::Listener;
 use iceoryx2::port::notifier::Notifier;
 use iceoryx2::port::publisher::Publisher as RawPublisher;
-use iceoryx2::port::subscriber::Subscriber as RawSubscriber;
+use iceoryx2::port::subscriber::{Subscriber as RawSubscriber, SubscriberCreateError};
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::*;
 use iceoryx2::sample::Sample;
 use iceoryx2::sample_mut::SampleMut;
+use iceoryx2::service::builder::event::EventOpenError;
+use iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenError;
 use iceoryx2::service::port_factory::event::PortFactory as EventFactory;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory as DataFactory;
 use rustix::event::{PollFd, PollFlags, Timespec};
@@ -21,6 +25,7 @@ use crate::wire::limits::raise_open_files;
 pub use crate::wire::open_error::OpenError;
 use crate::wire::open_error::{in_words, not_running, topic_error};
 use crate::wire::place::Place;
+use crate::wire::port::subscribers::too_many;
 use crate::wire::topic::Topic;
 use crate::wire::version::foreign_version;
 
@@ -158,7 +163,10 @@ impl Hub {
             .buffer_size(topic.buffer)
             .history_request(topic.history)
             .create()
-            .map_err(|e| topic_error(&name, &e))?;
+            .map_err(|error| match error {
+                SubscriberCreateError::ExceedsMaxSupportedSubscribers => too_many(&name, &service),
+                error => topic_error(&name, &error),
+            })?;
         let events = self.events(&name)?;
         let subscriber = Subscriber { port, events, topic: name };
         // Connects now, so that nothing sent from here on is missed.
@@ -212,7 +220,13 @@ impl Hub {
         };
         match self.access {
             // An observer demands nothing: the mirror of a network link has other sizes.
-            Access::Observer => builder().open().map_err(|_| not_running(&self.place)),
+            Access::Observer => builder().open().map_err(|error| match error {
+                PublishSubscribeOpenError::ExceedsMaxNumberOfNodes
+                | PublishSubscribeOpenError::InsufficientPermissions
+                | PublishSubscribeOpenError::IncompatibleTypes => topic_error(name, &error),
+                // There is none, or one that its processes are making or removing, or that is not to be seen from here.
+                _ => not_running(&self.place),
+            }),
             Access::Member => retry(name, || {
                 builder()
                     .max_publishers(MAX_PUBLISHERS)
@@ -230,7 +244,11 @@ impl Hub {
         let service_name = ServiceName::new(name).map_err(|e| topic_error(name, &e))?;
         let builder = || self.node.service_builder(&service_name).event();
         match self.access {
-            Access::Observer => builder().open().map_err(|_| not_running(&self.place)),
+            Access::Observer => builder().open().map_err(|error| match error {
+                EventOpenError::ExceedsMaxNumberOfNodes
+                | EventOpenError::InsufficientPermissions => topic_error(name, &error),
+                _ => not_running(&self.place),
+            }),
             // No deadline on the service: a network link could not mirror it.
             Access::Member => retry(name, || {
                 builder()
@@ -344,17 +362,27 @@ impl<T: Debug + ZeroCopySend, H: Debug + ZeroCopySend> Subscriber<T, H> {
     pub fn receive(&self) -> Result<Option<Received<T, H>>, ReceiveError> {
         match self.port.receive() {
             Ok(sample) => Ok(sample.map(|sample| Received { sample })),
-            Err(e) => Err(ReceiveError { topic: self.topic.clone(), reason: e.to_string() }),
+            Err(e) => Err(self.error(&e)),
         }
     }
 
-    /// The newest unread message; older ones are skipped.
+    fn error(&self, reason: &dyn std::fmt::Display) -> ReceiveError {
+        ReceiveError { topic: self.topic.clone(), reason: reason.to_string() }
+    }
+
+    /// The newest unread message; older ones are skipped. It holds one message at a time: a subscriber may hold no more than
+    /// the topic's `borrowed`, those that it has kept included.
     pub fn newest(&self) -> Result<Option<Received<T, H>>, ReceiveError> {
-        let mut newest = None;
-        while let Some(received) = self.receive()? {
-            newest = Some(received);
+        let mut newest = self.receive()?;
+        while newest.is_some() && self.has_unread()? {
+            drop(newest);
+            newest = self.receive()?;
         }
         Ok(newest)
+    }
+
+    fn has_unread(&self) -> Result<bool, ReceiveError> {
+        self.port.has_samples().map_err(|e| self.error(&e))
     }
 
     /// Its wake-ups, for [`wait`].

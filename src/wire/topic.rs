@@ -8,7 +8,7 @@ use crate::wire::message::{
 };
 
 /// Version in every topic's name; counts up when a message changes.
-pub const WIRE_VERSION: u32 = 10;
+pub const WIRE_VERSION: u32 = 11;
 
 /// Most keyframes in one message of `mapper/graph`; the newest are sent when there are more.
 pub const MAX_GRAPH_KEYFRAMES: usize = 4096;
@@ -20,7 +20,8 @@ pub struct Topic {
     pub owner: &'static str,
     /// What it carries.
     pub noun: &'static str,
-    /// How many may listen: our processes, two observers and one place for a network link.
+    /// How many may listen: our processes that do, and four observers (page, recorder, ROS 2, second machine); of what is small
+    /// more.
     pub subscribers: usize,
     /// Unread messages a subscriber keeps; the oldest go first.
     pub buffer: usize,
@@ -32,33 +33,35 @@ pub struct Topic {
     pub loans: usize,
 }
 
-/// Frames: the mapper keeps some while their poses are computed.
+/// Frames, for tracker, mapper and four observers: the mapper keeps some while their poses are computed.
 pub const FRAME: Topic = Topic {
     owner: "capture",
     noun: "frame",
-    subscribers: 5,
+    subscribers: 6,
     buffer: 4,
     borrowed: 4,
     history: 0,
     loans: 2,
 };
-/// Poses: small, so the buffer is deep enough that a recorder that stalls for half a minute loses none.
+/// Poses, for mapper, journal, capture, four observers, `status` and one of the user's own: small, so the buffer is deep enough
+/// that a recorder that stalls for 30 s at 30 Hz loses none.
 pub const POSE: Topic = Topic {
     owner: "tracker",
     noun: "pose",
-    subscribers: 8,
-    buffer: 1000,
+    subscribers: 9,
+    buffer: 900,
     borrowed: 2,
     history: 1,
     loans: 2,
 };
-/// Depth of the active keyframe: only the newest counts.
+/// Depth of the active keyframe, for tracker, journal and four observers: only the newest counts. It is up to 1.6 MB, so that
+/// a subscriber holds one at a time: who keeps one copies it.
 pub const KEYFRAME: Topic = Topic {
     owner: "mapper",
     noun: "keyframe",
-    subscribers: 5,
+    subscribers: 6,
     buffer: 1,
-    borrowed: 2,
+    borrowed: 1,
     history: 1,
     loans: 1,
 };
@@ -78,17 +81,17 @@ pub const EARLIER_KEYFRAME: Topic = Topic {
 /// Image of that keyframe.
 pub const EARLIER_KEYFRAME_IMAGE: Topic =
     Topic { noun: "earlier_keyframe_image", ..EARLIER_KEYFRAME };
-/// Frames that are in the map.
-pub const STEP: Topic = Topic { owner: "mapper", noun: "step", ..POSE };
+/// Frames that are in the map, for capture, tracker, journal and three others.
+pub const STEP: Topic = Topic { owner: "mapper", noun: "step", subscribers: 6, ..POSE };
 /// Joint estimates of keyframes: some a second.
 pub const ADJUSTMENT: Topic = Topic { owner: "mapper", noun: "adjustment", buffer: 64, ..POSE };
 /// Poses of all keyframes.
 pub const GRAPH: Topic = Topic { noun: "graph", ..KEYFRAME };
-/// Health of capture.
+/// Health of capture; of others it is for capture, supervisor, four observers and some that look once.
 pub const CAPTURE_HEALTH: Topic = Topic {
     owner: "capture",
     noun: "health",
-    subscribers: 8,
+    subscribers: 10,
     buffer: 4,
     borrowed: 2,
     history: 1,

@@ -1,6 +1,6 @@
 //! Smooth waves on a wall at depth 1: frames that can be tracked, and a keyframe of them.
 
-use semidense::service::clock::now_nanos;
+use semidense::service::clock::{now_nanos, realtime_of};
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::sim3::Sim3;
 use semidense::slam::keyframe::{DepthPoint, Keyframe};
@@ -16,6 +16,7 @@ pub fn header(sequence: u64) -> FrameHeader {
         sequence,
         capture_nanos: now,
         clock_nanos: now,
+        realtime_nanos: realtime_of(now),
         sent_nanos: now,
         exposure_nanos: 0,
         intrinsics: [CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy],

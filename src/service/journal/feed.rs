@@ -8,20 +8,21 @@ use crate::service::journal::log::Record;
 use crate::slam::keyframe::{DepthPoint, KeyframePose};
 use crate::wire::conversion::{keyframe_from_messages, keyframe_pose_from_message};
 use crate::wire::message::{GraphHeader, KeyframeHeader, KeyframeImageHeader, KeyframePoseMessage};
-use crate::wire::port::{Hub, OpenError, ReceiveError, Received, Subscriber};
+use crate::wire::port::{Hub, OpenError, ReceiveError, Subscriber};
 use crate::wire::topic::{GRAPH, KEYFRAME, KEYFRAME_IMAGE};
 
 /// Time between two states of the same keyframe in the journal: up to 2 MB each.
 const PERIOD: Duration = Duration::from_millis(1500);
 
-/// Follows the mapper's keyframes. Depth stays in shared memory until it goes to the journal.
+/// Follows the mapper's keyframes. What waits for the journal is copied: the last depth of a keyframe is only known for it when
+/// that of the next comes, and a subscriber holds one message at a time.
 #[derive(Debug)]
 pub struct KeyframeFeed {
     depths: Subscriber<DepthPoint, KeyframeHeader>,
     images: Subscriber<u8, KeyframeImageHeader>,
     graphs: Subscriber<KeyframePoseMessage, GraphHeader>,
-    depth: Option<Received<DepthPoint, KeyframeHeader>>,
-    image: Option<Received<u8, KeyframeImageHeader>>,
+    depth: Option<(KeyframeHeader, Vec<DepthPoint>)>,
+    image: Option<(KeyframeImageHeader, Vec<u8>)>,
     /// Revision that the journal has, and since when.
     kept: Option<(u64, Instant)>,
     /// Poses that the journal has, by epoch and keyframe.
@@ -46,16 +47,16 @@ impl KeyframeFeed {
     pub fn collect(&mut self, journal: &mut Journal, is_end: bool) -> Result<(), ReceiveError> {
         while let Some(depth) = self.depths.receive()? {
             let of = |header: &KeyframeHeader| (header.epoch, header.keyframe_id);
-            let before = self.depth.as_ref().map(|before| of(before.header()));
+            let before = self.depth.as_ref().map(|(before, _)| of(before));
             if before.is_some_and(|before| before != of(depth.header())) {
                 // The last of a keyframe, while its image is still here.
                 self.keep(journal);
                 self.kept = None;
             }
-            self.depth = Some(depth);
+            put(&mut self.depth, depth.header(), depth.payload());
         }
         while let Some(image) = self.images.receive()? {
-            self.image = Some(image);
+            put(&mut self.image, image.header(), image.payload());
         }
         let is_due = self.kept.is_none_or(|(_, at)| at.elapsed() >= PERIOD);
         if is_due || is_end {
@@ -66,15 +67,17 @@ impl KeyframeFeed {
 
     /// Gives the journal the newest state of the keyframe, where it has an older one.
     fn keep(&mut self, journal: &mut Journal) {
-        let (Some(depth), Some(image)) = (&self.depth, &self.image) else { return };
-        let (header, image_header) = (depth.header(), image.header());
+        let (Some((header, points)), Some((image_header, pixels))) = (&self.depth, &self.image)
+        else {
+            return;
+        };
         let is_known = self.kept.is_some_and(|(revision, _)| revision == header.revision);
         let same =
             (header.epoch, header.keyframe_id) == (image_header.epoch, image_header.keyframe_id);
         if is_known || !same {
             return;
         }
-        match keyframe_from_messages(header, depth.payload(), image_header, image.payload()) {
+        match keyframe_from_messages(header, points, image_header, pixels) {
             Err(error) => tracing::warn!("mapper/keyframe: {error}"),
             Ok(keyframe) => {
                 let (revision, key) = (keyframe.revision, (keyframe.epoch, keyframe.keyframe_id));
@@ -103,4 +106,12 @@ impl KeyframeFeed {
         }
         Ok(())
     }
+}
+
+/// Copies a message into the memory of the one before.
+fn put<H: Copy, T: Copy>(held: &mut Option<(H, Vec<T>)>, header: &H, payload: &[T]) {
+    let mut memory = held.take().map_or_else(Vec::new, |(_, memory)| memory);
+    memory.clear();
+    memory.extend_from_slice(payload);
+    *held = Some((*header, memory));
 }

@@ -19,7 +19,7 @@ use crate::wire::conversion::{similarity_from_message, similarity_message};
 use crate::wire::message::{AdjustmentMessage, PoseMessage};
 
 /// First bytes of the file, with the version of the layout.
-const MAGIC: [u8; 16] = *b"semidense log 6\n";
+const MAGIC: [u8; 16] = *b"semidense log 7\n";
 /// Bytes before kind and payload.
 const PREFIX_BYTES: usize = 8;
 /// Largest record: the configuration is a tenth of it.
@@ -287,36 +287,43 @@ fn read_adjustment(bytes: &mut &[u8]) -> Option<AdjustmentMessage> {
 
 fn write_pose(p: &PoseMessage, bytes: &mut Vec<u8>) {
     write_u64s(bytes, &[p.sequence, p.capture_nanos.cast_unsigned()]);
+    write_u64s(bytes, &[p.realtime_nanos.cast_unsigned()]);
     write_u64s(bytes, &[p.published_nanos.cast_unsigned(), p.latency_nanos, p.track_nanos]);
     write_u64s(bytes, &[p.wake_nanos, p.revision, p.map_revision, p.keyframe_id]);
     write_u32s(bytes, &[p.epoch, p.state, p.reason, p.proposes_keyframe]);
-    write_u32s(bytes, &[p.iterations, p.finest_level, p.points]);
+    write_u32s(bytes, &[p.iterations, p.finest_level, p.points, p.has_velocity]);
     write_f64s(bytes, &p.world_from_camera);
     write_f64s(bytes, &p.map_from_camera);
     write_f64s(bytes, &p.keyframe_from_camera);
     write_f64s(bytes, &p.covariance);
     write_f64s(bytes, &p.map_covariance);
     write_f64s(bytes, &p.alignment_covariance);
+    write_f64s(bytes, &p.linear_velocity);
+    write_f64s(bytes, &p.angular_velocity);
+    write_f64s(bytes, &p.velocity_covariance);
     write_f64s(bytes, &p.brightness);
     write_f64s(bytes, &[p.in_view_ratio, p.inlier_ratio, p.whitened_rmse]);
     write_f64s(bytes, &[p.residual_rmse, p.mean_squared_flow, p.displacement_px]);
 }
 
 fn read_pose(bytes: &mut &[u8]) -> Option<PoseMessage> {
-    let [sequence, capture, published, latency_nanos, track_nanos] = read_u64s(bytes)?;
+    let [sequence, capture, realtime, published, latency_nanos, track_nanos] = read_u64s(bytes)?;
     let [wake_nanos, revision, map_revision, keyframe_id] = read_u64s(bytes)?;
     let [epoch, state, reason, proposes_keyframe] = read_u32s(bytes)?;
-    let [iterations, finest_level, points] = read_u32s(bytes)?;
+    let [iterations, finest_level, points, has_velocity] = read_u32s(bytes)?;
     let (world_from_camera, map_from_camera) = (read_f64s(bytes)?, read_f64s(bytes)?);
     let keyframe_from_camera = read_f64s(bytes)?;
     let (covariance, map_covariance) = (read_f64s(bytes)?, read_f64s(bytes)?);
     let alignment_covariance = read_f64s(bytes)?;
+    let (linear_velocity, angular_velocity) = (read_f64s(bytes)?, read_f64s(bytes)?);
+    let velocity_covariance = read_f64s(bytes)?;
     let brightness = read_f64s(bytes)?;
     let [in_view_ratio, inlier_ratio, whitened_rmse] = read_f64s(bytes)?;
     let [residual_rmse, mean_squared_flow, displacement_px] = read_f64s(bytes)?;
     Some(PoseMessage {
         sequence,
         capture_nanos: capture.cast_signed(),
+        realtime_nanos: realtime.cast_signed(),
         published_nanos: published.cast_signed(),
         latency_nanos,
         track_nanos,
@@ -334,6 +341,9 @@ fn read_pose(bytes: &mut &[u8]) -> Option<PoseMessage> {
         covariance,
         map_covariance,
         alignment_covariance,
+        linear_velocity,
+        angular_velocity,
+        velocity_covariance,
         brightness,
         in_view_ratio,
         inlier_ratio,
@@ -344,7 +354,7 @@ fn read_pose(bytes: &mut &[u8]) -> Option<PoseMessage> {
         iterations,
         finest_level,
         points,
-        reserved: 0,
+        has_velocity,
     })
 }
 

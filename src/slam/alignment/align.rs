@@ -1,6 +1,6 @@
 //! Coarse to fine: iteratively re-weighted Gauss–Newton with Levenberg–Marquardt damping.
 
-use nalgebra::{Matrix6, SVector, Vector3};
+use nalgebra::{Matrix6, Matrix6x3, SVector, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::slam::alignment::kernel::{Kernel, SimdMode};
@@ -170,10 +170,16 @@ impl Alignment {
     /// What the common errors of the depth of `reference` add to that: (−M⁻¹H) P (−M⁻¹H)ᵀ; `None` where the images
     /// do not determine the pose.
     pub fn covariance_from_modes(&self, reference: &Reference) -> Option<Matrix6<f64>> {
+        let moved = self.d_pose_d_modes(reference)?;
+        Some(moved * reference.mode_covariance().matrix() * moved.transpose())
+    }
+
+    /// By what the left increment of `current_from_keyframe` moves for each common error of the depth of `reference`; `None`
+    /// where the images do not determine the pose.
+    pub fn d_pose_d_modes(&self, reference: &Reference) -> Option<Matrix6x3<f64>> {
         let centre = reference.level(self.level).centre();
         let translation = &self.state.current_from_keyframe.translation;
-        let moved = self.scatter.d_pose_d_modes(&self.state.sums, translation, &centre)?;
-        Some(moved * reference.mode_covariance().matrix() * moved.transpose())
+        self.scatter.d_pose_d_modes(&self.state.sums, translation, &centre)
     }
 }
 

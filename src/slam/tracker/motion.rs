@@ -57,6 +57,12 @@ impl Motion {
         self.velocity = None;
     }
 
+    /// The last step: twist of `before_from_last`, world units and radians, and the seconds it took; `None` where that is not
+    /// known.
+    pub fn last_step(&self) -> Option<(Vector6<f64>, f64)> {
+        self.velocity.map(|(twist, interval)| (twist, interval * 1e-9))
+    }
+
     /// How fast the camera moved last, world units a second; `None` where that is not known.
     pub fn speed(&self) -> Option<f64> {
         /// Nanoseconds in a second.

@@ -9,6 +9,7 @@ use crate::slam::pose::{
     Brightness, LostReason, NO_KEYFRAME, PoseEstimate, Quality, TrackingState, UNKNOWN_VARIANCE,
 };
 use crate::slam::tracker::covariance_floor::displacement_covariance;
+use crate::slam::tracker::velocity::PoseErrors;
 use crate::slam::tracker::verdict::quality_of;
 use crate::slam::tracker::{Tracker, upper_triangle};
 
@@ -45,13 +46,14 @@ impl Tracker {
             }
             _ => return self.lost(frame, reference, LostReason::TooFewInliers, quality),
         };
+        let displacement = displacement_covariance(
+            quality.displacement_px,
+            &self.intrinsics,
+            reference.mean_inverse_depth(),
+        );
         let published = covariance
             + alignment.covariance_from_modes(reference).unwrap_or_default()
-            + displacement_covariance(
-                quality.displacement_px,
-                &self.intrinsics,
-                reference.mean_inverse_depth(),
-            );
+            + displacement;
         let in_map = reference.uncertain_place().of_camera(&keyframe_from_camera, &published);
         self.memory.motion.observe(frame.capture_nanos, &world_from_camera);
         self.memory.brightness = alignment.state.brightness;
@@ -59,6 +61,14 @@ impl Tracker {
             MapState::Established => verdict,
             MapState::Rejected => TrackingState::Lost(LostReason::MapRejected),
         };
+        let errors = PoseErrors {
+            keyframe: (reference.keyframe_id(), reference.epoch()),
+            unit: reference.world_from_keyframe().scale,
+            own: covariance + displacement,
+            by_mode: alignment.d_pose_d_modes(reference).unwrap_or_default(),
+            modes: *reference.mode_covariance(),
+        };
+        let velocity = self.memory.velocity.observe(errors, self.memory.motion.last_step());
         PoseEstimate {
             state,
             world_from_camera,
@@ -67,6 +77,7 @@ impl Tracker {
             covariance: upper_triangle(|row, column| published[(row, column)]),
             map_covariance: upper_triangle(|row, column| in_map[(row, column)]),
             alignment_covariance: upper_triangle(|row, column| covariance[(row, column)]),
+            velocity: velocity.filter(|_| state.is_tracked()),
             brightness: alignment.state.brightness,
             proposes_keyframe: self.proposes_keyframe(reference, alignment, &quality),
             quality,
@@ -157,6 +168,7 @@ impl Tracker {
             covariance: unknown,
             map_covariance: unknown,
             alignment_covariance: unknown,
+            velocity: None,
             brightness: Brightness::default(),
             quality: Quality::default(),
             proposes_keyframe: false,

@@ -5,7 +5,7 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::slam::place_covariance::PlaceMatrix;
-use crate::slam::pose::NO_KEYFRAME;
+use crate::slam::pose::{NO_KEYFRAME, Velocity};
 
 fn transform() -> SE3 {
     SE3::exp(&Vector6::new(0.3, -0.2, 0.1, 0.4, 0.5, -0.6))
@@ -26,6 +26,11 @@ fn pose() -> PoseEstimate {
         covariance: std::array::from_fn(|i| 0.1 / (i as f64 + 3.0)),
         map_covariance: std::array::from_fn(|i| 0.2 / (i as f64 + 3.0)),
         alignment_covariance: std::array::from_fn(|i| 0.01 / (i as f64 + 3.0)),
+        velocity: Some(Velocity {
+            linear: [0.4, -0.1, 0.7].into(),
+            angular: [0.01, 0.2, -0.3].into(),
+            covariance: std::array::from_fn(|i| 0.3 / (i as f64 + 3.0)),
+        }),
         brightness: Brightness { a: 0.1, b: -3.0 },
         quality: Quality { in_view_ratio: 0.9, points: 123, ..Quality::default() },
         proposes_keyframe: true,
@@ -59,7 +64,13 @@ fn read(keyframe: &Keyframe) -> Result<Keyframe, MessageError> {
 
 #[test]
 fn poses_survive_bit_for_bit() {
-    let timing = PoseTiming { published_nanos: 5, latency_nanos: 4, track_nanos: 3, wake_nanos: 2 };
+    let timing = PoseTiming {
+        realtime_nanos: 6,
+        published_nanos: 5,
+        latency_nanos: 4,
+        track_nanos: 3,
+        wake_nanos: 2,
+    };
     let read = pose_from_message(&pose_message(&pose(), &timing)).unwrap();
     assert_eq!(read, pose());
     let bits = |t: &SE3| rigid_message(t).map(f64::to_bits);
@@ -146,6 +157,41 @@ fn poses_of_broken_covariance_are_refused() {
 }
 
 #[test]
+fn broken_velocities_are_refused() {
+    let good = pose_message(&pose(), &PoseTiming::default());
+    let read = |change: &dyn Fn(&mut PoseMessage)| {
+        let mut message = good;
+        change(&mut message);
+        pose_from_message(&message).map(|read| read.velocity.is_some())
+    };
+    assert_eq!(read(&|_| {}), Ok(true));
+    // Covariances of two axes may be negative.
+    assert_eq!(read(&|message| message.velocity_covariance[1] = -0.1), Ok(true));
+    assert_eq!(read(&|message| message.has_velocity = 0), Ok(false));
+    let unknown = Err(MessageError::UnknownCode { field: "has_velocity", code: 2 });
+    assert_eq!(read(&|message| message.has_velocity = 2), unknown);
+    let refused = Err(MessageError::InvalidNumber { field: "velocity" });
+    assert_eq!(read(&|message| message.linear_velocity[2] = f64::NAN), refused);
+    assert_eq!(read(&|message| message.angular_velocity[0] = f64::INFINITY), refused);
+    assert_eq!(read(&|message| message.velocity_covariance[1] = f64::NAN), refused);
+    for diagonal in [0, 6, 11, 15, 18, 20] {
+        assert_eq!(read(&|message| message.velocity_covariance[diagonal] = -1e-9), refused);
+    }
+}
+
+#[test]
+fn a_pose_without_velocity_says_so_in_zeros() {
+    let without = PoseEstimate { velocity: None, ..pose() };
+    let timing = PoseTiming { realtime_nanos: 1_700_000_000_123_456_789, ..PoseTiming::default() };
+    let message = pose_message(&without, &timing);
+    assert_eq!((message.has_velocity, message.realtime_nanos), (0, timing.realtime_nanos));
+    let zeros = ([0.0; 3], [0.0; 3], [0.0; 21]);
+    let [linear, angular] = [message.linear_velocity, message.angular_velocity];
+    assert_eq!((linear, angular, message.velocity_covariance), zeros);
+    assert_eq!(pose_from_message(&message), Ok(without));
+}
+
+#[test]
 fn hostile_frames_are_refused() {
     let pixels = vec![0; 20 * 18];
     let header = FrameHeader {
@@ -181,10 +227,14 @@ proptest! {
         message.map_covariance = std::array::from_fn(|i| number(i + 5));
         message.alignment_covariance = std::array::from_fn(|i| number(i + 8));
         message.residual_rmse = number(31);
+        message.has_velocity = codes[3];
+        message.linear_velocity = std::array::from_fn(|i| number(i + 3));
+        message.velocity_covariance = std::array::from_fn(|i| number(i + 11));
         if let Ok(read) = pose_from_message(&message) {
             prop_assert!(read.world_from_camera.is_finite());
             prop_assert!(read.covariance.iter().all(|c| c.is_finite()));
             prop_assert!(read.map_covariance.iter().all(|c| c.is_finite()));
+            prop_assert!(read.velocity.is_none_or(|v| v.covariance.iter().chain(&v.linear).all(|x| x.is_finite())));
         }
     }
 

@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use super::*;
 use crate::wire::message::{FrameHeader, PoseMessage};
-use crate::wire::topic::{FRAME, POSE, WIRE_VERSION};
+use crate::wire::topic::{FRAME, GRAPH, KEYFRAME, POSE, WIRE_VERSION};
 
 const LONG: Duration = Duration::from_secs(600);
 
@@ -65,6 +65,72 @@ fn a_slow_reader_loses_the_oldest_and_blocks_nobody() {
     let oldest = reader.receive().unwrap().unwrap().header().sequence;
     assert_eq!(oldest, 100 - FRAME.buffer as u64);
     assert_eq!(reader.newest().unwrap().unwrap().header().sequence, 99);
+}
+
+/// Of the messages it may hold a reader keeps all but one: the newest comes nevertheless.
+#[test]
+fn a_reader_that_holds_messages_still_gets_the_newest() {
+    let rig = Rig::new();
+    let hub = rig.join("capture");
+    let frames = hub.publisher::<u8, FrameHeader>(&FRAME, 1).unwrap();
+    let reader = hub.subscriber::<u8, FrameHeader>(&FRAME).unwrap();
+    let mut held = Vec::new();
+    for round in 0..FRAME.borrowed as u64 {
+        (0..3).for_each(|number| frames.send(header(10 * round + number), &[0]).unwrap());
+        held.push(reader.newest().unwrap().unwrap());
+        assert_eq!(held[round as usize].header().sequence, 10 * round + 2);
+        assert!(reader.newest().unwrap().is_none(), "it has been read");
+    }
+    frames.send(header(100), &[0]).unwrap();
+    let error = reader.newest().unwrap_err().to_string();
+    assert!(error.contains("capture/frame") && error.contains("Borrow"), "{error}");
+    held.clear();
+    assert_eq!(reader.newest().unwrap().unwrap().header().sequence, 100);
+    // Of keyframes there is no place for a second one beside the newest.
+    let graphs = hub.publisher::<u64, ()>(&GRAPH, 1).unwrap();
+    let reader = hub.subscriber::<u64, ()>(&GRAPH).unwrap();
+    for number in 0..9 {
+        graphs.send((), &[number]).unwrap();
+        assert_eq!(reader.newest().unwrap().unwrap().payload(), [number]);
+    }
+}
+
+#[test]
+fn the_reader_that_comes_too_late_is_told_who_has_the_places() {
+    let rig = Rig::new();
+    let hub = rig.join("mapper");
+    let _keyframes = hub.publisher::<u64, ()>(&KEYFRAME, 1).unwrap();
+    let observers: Vec<Hub> = (0..KEYFRAME.subscribers)
+        .map(|number| Hub::join(&rig.place, &format!("view-{number}"), Access::Observer).unwrap())
+        .collect();
+    let subscribe = |hub: &Hub| hub.subscriber::<u64, ()>(&KEYFRAME);
+    let mut open: Vec<_> = observers.iter().map(|hub| subscribe(hub).unwrap()).collect();
+    for access in [Access::Observer, Access::Member] {
+        let late = Hub::join(&rig.place, "late", access).unwrap();
+        let error = subscribe(&late).unwrap_err();
+        assert!(!error.is_absence(), "it runs: {error}");
+        let text = error.to_string();
+        let begin = format!(
+            "topic rig/v{WIRE_VERSION}/mapper/keyframe has its 6 subscribers: stop one of view-"
+        );
+        assert!(text.starts_with(&begin), "{text}");
+        let own = format!("view-5 (process {})", std::process::id());
+        assert!(text.contains(&own) && !text.contains("late"), "{text}");
+    }
+    open.pop();
+    assert!(subscribe(&Hub::join(&rig.place, "late", Access::Observer).unwrap()).is_ok());
+}
+
+#[test]
+fn an_observer_of_other_types_is_not_told_that_nothing_runs() {
+    let rig = Rig::new();
+    let hub = rig.join("tracker");
+    let _poses = hub.publisher::<PoseMessage, ()>(&POSE, 1).unwrap();
+    let observer = Hub::join(&rig.place, "observer", Access::Observer).unwrap();
+    let error = observer.subscriber::<u64, ()>(&POSE).unwrap_err();
+    assert!(!error.is_absence() && error.to_string().contains("IncompatibleTypes"), "{error}");
+    let absent = observer.subscriber::<u64, ()>(&KEYFRAME).unwrap_err();
+    assert!(absent.is_absence(), "{absent}");
 }
 
 #[test]

@@ -1,0 +1,153 @@
+//! How fast the camera moves: the step from the pose before, and how uncertain that is.
+//!
+//! ```text
+//! v = log(T₀⁻¹ T₁) / Δt          T = world_from_camera of the last two frames that were tracked, Δt between their stamps
+//! Σ_v = (A N₀ Aᵀ + N₁ + (A J₀ − J₁) P (A J₀ − J₁)ᵀ) / Δt² + (a Δt / 2)² I          A = Ad((T₀⁻¹ T₁)⁻¹)
+//! ```
+//! N are the errors that each pose has for itself. The common errors of the keyframe's depth, m with covariance P, move
+//! both poses: by J₀ m and J₁ m, whose difference is a relative error of the velocity. v is a mean over the interval: until
+//! its end the camera accelerates on by a Δt / 2, a from how v changed over the last intervals. Errors of a pose are those of
+//! the left increment of `current_from_keyframe`; the velocity is in the camera's axes, in which a steady turn is steady.
+
+use nalgebra::{Matrix6, Matrix6x3, Vector6};
+
+use crate::slam::geometry::se3::SE3;
+use crate::slam::modes::ModeCovariance;
+use crate::slam::pose::Velocity;
+use crate::slam::tracker::upper_triangle;
+
+/// Longest interval that has a velocity, seconds: what a camera does in more is no steady motion.
+const LONGEST_INTERVAL: f64 = 0.5;
+
+/// Share of the newest change in the mean over the last ones: a quarter of a second at 30 Hz.
+const NEWEST_SHARE: f64 = 0.125;
+
+/// What the common depth of a keyframe and noise make of one pose, keyframe units and radians.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct PoseErrors {
+    /// Keyframe and epoch that the pose is known from.
+    pub keyframe: (u64, u32),
+    /// World units of a keyframe unit.
+    pub unit: f64,
+    /// N: covariance of the errors that the pose has for itself.
+    pub own: Matrix6<f64>,
+    /// J: by what the pose moves for each common error of depth.
+    pub by_mode: Matrix6x3<f64>,
+    /// P: covariance of these.
+    pub modes: ModeCovariance,
+}
+
+/// What a tracker keeps of the frames before for the velocity of the next.
+#[derive(Debug, Clone, Default)]
+pub(super) struct VelocityMemory {
+    last: Option<PoseErrors>,
+    step: Option<Step>,
+    acceleration: Option<[f64; 2]>,
+}
+
+/// A mean velocity.
+#[derive(Debug, Clone, Copy)]
+struct Step {
+    /// World units and radians a second.
+    velocity: Vector6<f64>,
+    secs: f64,
+    /// Sum of the variances of the translation, and of the rotation, without acceleration.
+    variance: [f64; 2],
+}
+
+impl VelocityMemory {
+    /// There is no pose, or none that the next one follows from.
+    pub fn forget(&mut self) {
+        *self = Self::default();
+    }
+
+    /// The map's unit is `factor` times what it was.
+    pub fn follow(&mut self, factor: f64) {
+        if let Some(last) = &mut self.last {
+            last.unit *= factor;
+        }
+        if let Some(step) = &mut self.step {
+            step.velocity.fixed_rows_mut::<3>(0).scale_mut(factor);
+            step.variance[0] *= factor * factor;
+        }
+        if let Some([of_translation, _]) = &mut self.acceleration {
+            *of_translation *= factor * factor;
+        }
+    }
+
+    /// The velocity at a frame with these errors that came by `twist`, world units and radians, from the one before, in
+    /// `secs` seconds; `None` where that is not known, or there is no velocity.
+    pub fn observe(
+        &mut self,
+        errors: PoseErrors,
+        motion: Option<(Vector6<f64>, f64)>,
+    ) -> Option<Velocity> {
+        let before = self.last.replace(errors);
+        let last = self.last.as_ref()?;
+        let step = before.filter(|before| before.keyframe.1 == last.keyframe.1).zip(motion);
+        let step = step.filter(|(_, (_, secs))| (0.0..=LONGEST_INTERVAL).contains(secs));
+        let Some((before, (twist, secs))) = step else {
+            (self.step, self.acceleration) = (None, None);
+            return None;
+        };
+        let mut covariance = of_twist(&before, last, &twist) / (secs * secs);
+        let variance = [0, 3].map(|start| (start..start + 3).map(|k| covariance[(k, k)]).sum());
+        let step = Step { velocity: twist / secs, secs, variance };
+        let change = self.change(&step);
+        for k in 0..6 {
+            covariance[(k, k)] += change[k / 3];
+        }
+        self.step = Some(step);
+        let velocity = Velocity {
+            linear: step.velocity.fixed_rows::<3>(0).into_owned(),
+            angular: step.velocity.fixed_rows::<3>(3).into_owned(),
+            covariance: upper_triangle(|row, column| covariance[(row, column)]),
+        };
+        let mut numbers = step.velocity.iter().chain(&velocity.covariance);
+        numbers.all(|x| x.is_finite()).then_some(velocity)
+    }
+
+    /// Variance of each axis of the translation, and of the rotation, of what a velocity may change by from the middle of its
+    /// interval to the end.
+    fn change(&mut self, now: &Step) -> [f64; 2] {
+        let half = 0.5 * now.secs;
+        // The first step may be the camera's first as well.
+        let begun = [0, 3].map(|start| now.velocity.fixed_rows::<3>(start).norm_squared() / 3.0);
+        let Some(before) = self.step else { return begun };
+        let between = 0.5 * (before.secs + now.secs);
+        let acceleration = (now.velocity - before.velocity) / between;
+        let newest = [0, 1].map(|part| {
+            // Both have the pose between them: its error counts four times, those at the ends once.
+            let noise = 1.5 * (before.variance[part] + now.variance[part]) / (between * between);
+            (acceleration.fixed_rows::<3>(3 * part).norm_squared() - noise) / 3.0
+        });
+        let mean = self.acceleration.unwrap_or(newest);
+        let mean = [0, 1].map(|part| mean[part] + NEWEST_SHARE * (newest[part] - mean[part]));
+        self.acceleration = Some(mean);
+        [0, 1].map(|part| mean[part].max(newest[part]).max(0.0) * half * half)
+    }
+}
+
+/// Covariance of `twist`, the logarithm of `before_from_last`.
+fn of_twist(before: &PoseErrors, last: &PoseErrors, twist: &Vector6<f64>) -> Matrix6<f64> {
+    let in_world = |errors: &PoseErrors| {
+        let unit = errors.unit;
+        let mut own = errors.own;
+        let mut by_mode = errors.by_mode;
+        own.fixed_rows_mut::<3>(0).scale_mut(unit);
+        own.fixed_columns_mut::<3>(0).scale_mut(unit);
+        by_mode.fixed_rows_mut::<3>(0).scale_mut(unit);
+        (own, by_mode)
+    };
+    let ((own_before, mode_before), (own, mode)) = (in_world(before), in_world(last));
+    let last_from_before = SE3::exp(&-twist).adjoint();
+    let own_before = last_from_before * own_before * last_from_before.transpose();
+    let modes = last.modes.matrix();
+    if before.keyframe == last.keyframe {
+        let moved = last_from_before * mode_before - mode;
+        return own_before + own + moved * modes * moved.transpose();
+    }
+    // A keyframe stands where a frame before was tracked to be: by an error like that of the last one. The common errors of the
+    // one before have gone into it.
+    2.0 * own_before + own + mode * modes * mode.transpose()
+}
