@@ -13,7 +13,7 @@ use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::mapper::appearance::Appearance;
 use crate::slam::mapper::recovery::RecoveryParams;
 use crate::slam::mapper::turned_views::TurnedViews;
-use crate::slam::places::{Candidate, Describer, PlaceIndex};
+use crate::slam::places::{Describer, PlaceCandidate, PlaceIndex};
 use crate::slam::pose::Brightness;
 use crate::slam::tracker::motion::turned;
 use crate::slam::tracker::verdict::{VerdictParams, is_better, quality_of};
@@ -49,6 +49,19 @@ pub(super) struct Finder {
     turned_views: Option<TurnedViews>,
     /// Place of a keyframe that was found and not confirmed: the next search leaves it out, lest it be all that is found.
     doubted: Option<usize>,
+}
+
+/// Where a frame is on a keyframe, found from where it was expected.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Located {
+    /// In the keyframe's unit.
+    pub(super) keyframe_from_camera: SE3,
+    /// Of the frame against the keyframe.
+    pub(super) brightness: Brightness,
+    /// How far that is from where it was expected, translation in mean depths plus rotation in radians.
+    pub(super) disagreement: f64,
+    /// Whether it would be believed after a loss.
+    pub(super) is_sure: bool,
 }
 
 impl Finder {
@@ -145,7 +158,7 @@ impl Finder {
         };
         let found = self.places.candidates(&seen, most, |id| index_of(id).is_none());
         let found = found.into_iter().filter(|candidate| candidate.score >= LEAST_SHARED);
-        let turned = |candidate: Candidate| {
+        let turned = |candidate: PlaceCandidate| {
             let rotation = candidate.rotation(&camera);
             Some((index_of(candidate.keyframe_id)?, SE3 { rotation, ..SE3::identity() }))
         };
@@ -289,7 +302,7 @@ impl Finder {
         pixels: &[u8],
         expected: &SE3,
         max_disagreement: f64,
-    ) -> Option<Alignment> {
+    ) -> Option<Located> {
         self.pyramid.fill(pixels);
         self.reference.prepare_into(keyframe);
         let (start, brightness) = (expected.inverse(), Brightness::default());
@@ -305,7 +318,14 @@ impl Finder {
         }
         let error = (found.state.current_from_keyframe * *expected).log();
         let disagreement = error.fixed_rows::<3>(0).norm() + error.fixed_rows::<3>(3).norm();
-        (disagreement <= max_disagreement).then_some(found)
+        let is_sure = self.verdict.judge(&found, &quality, true, 0).is_tracked();
+        let located = Located {
+            keyframe_from_camera: found.state.current_from_keyframe.inverse(),
+            brightness: found.state.brightness,
+            disagreement,
+            is_sure,
+        };
+        (disagreement <= max_disagreement).then_some(located)
     }
 
     /// `keyframe_from_camera` of the frame in the pyramid, where it can be aligned to `keyframe` from some view

@@ -146,9 +146,10 @@ impl Mapper {
         if !pose.proposes_keyframe || active.frames < self.params.min_keyframe_interval {
             return StepOutcome::default();
         }
-        match self.near_keyframe(frame, pose, MAX_DISTANCE) {
+        let agrees = self.params.reuse.max_disagreement;
+        match self.near_keyframe(frame, pose, MAX_DISTANCE, agrees) {
             Some(near) => {
-                self.anchor(near.keyframe_id, &near.keyframe_from_camera);
+                self.anchor(near.keyframe_id, &near.located.keyframe_from_camera);
                 self.enter_unchanged(near.index)
             }
             None => StepOutcome::default(),

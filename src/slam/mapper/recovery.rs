@@ -22,7 +22,7 @@ use crate::slam::tracker::MOST_DEVIATIONS;
 
 /// Largest difference of two poses for one place, translation in mean depths plus rotation in radians: a wrong place is
 /// further off, and a map that has drifted by as much is none to go on with.
-const MAX_DISAGREEMENT: f64 = 0.1;
+pub(super) const MAX_DISAGREEMENT: f64 = 0.1;
 
 /// Tuning of the recovery from a loss.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -151,7 +151,12 @@ impl Mapper {
 
     /// Whether another keyframe that sees the same place has the camera there too: one alone may look like what it does
     /// not show. It is believed alone only where the map is so young that there may be no other.
-    fn is_confirmed(&mut self, index: usize, keyframe_from_camera: &SE3, pixels: &[u8]) -> bool {
+    pub(super) fn is_confirmed(
+        &mut self,
+        index: usize,
+        keyframe_from_camera: &SE3,
+        pixels: &[u8],
+    ) -> bool {
         /// Keyframes that are asked.
         const MOST: usize = 3;
         /// Largest distance of the camera from them, in their mean depths.
@@ -181,7 +186,12 @@ impl Mapper {
 
     /// Whether the points of the joint estimation, where they are at hand and in view, have the camera there too: they hang
     /// on several keyframes each, while a keyframe's depth may be its own.
-    fn points_agree(&mut self, index: usize, keyframe_from_camera: &SE3, pixels: &[u8]) -> bool {
+    pub(super) fn points_agree(
+        &mut self,
+        index: usize,
+        keyframe_from_camera: &SE3,
+        pixels: &[u8],
+    ) -> bool {
         /// Least share of the points in view that the image must agree with. Estimates have 0.9 and more, blurred images of
         /// the right place 0.44 and now and then less, another scene of little contrast 0.37. One that is refused for
         /// nothing costs a frame or two.
@@ -217,7 +227,11 @@ impl Mapper {
 
     /// Makes an earlier keyframe active again, with the depth it was left with. The camera was found on it;
     /// odometry goes on from its last pose.
-    fn restore_keyframe(&mut self, index: usize, keyframe_from_camera: &SE3) -> StepOutcome {
+    pub(super) fn restore_keyframe(
+        &mut self,
+        index: usize,
+        keyframe_from_camera: &SE3,
+    ) -> StepOutcome {
         self.leave_keyframe();
         let Some(keyframe) = self.map.keyframes.get(index) else {
             return StepOutcome::default();

@@ -1,5 +1,6 @@
 //! A keyframe that the camera has come back to is taken up again instead of making a new one beside it:
-//! where the camera goes to and fro the map does not grow.
+//! where the camera goes back and forth the map does not grow. One that has the camera elsewhere than the map expects
+//! tells of drift: where it is as sure as after a loss the camera goes on from there, and the drift ends.
 
 use serde::{Deserialize, Serialize};
 
@@ -8,7 +9,8 @@ use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::keyframe::{DistanceWeights, MapState};
 use crate::slam::mapper::Mapper;
-use crate::slam::mapper::recovery::restore_points;
+use crate::slam::mapper::finder::Located;
+use crate::slam::mapper::recovery::{MAX_DISAGREEMENT, restore_points};
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::{Brightness, PoseEstimate};
 
@@ -24,8 +26,8 @@ pub struct ReuseParams {
     #[serde(skip)]
     pub distance: DistanceWeights,
     /// How far the pose measured on the keyframe may be from the one expected, translation in mean
-    /// depths plus rotation in radians: 0.02 is 10 px at f = 525. Beyond it the map has drifted, and
-    /// taking the keyframe up would make the poses jump.
+    /// depths plus rotation in radians: 0.02 is 10 px at f = 525. Beyond it the map has drifted, and the keyframe is
+    /// gone back to where it is as sure as after a loss.
     pub max_disagreement: f64,
 }
 
@@ -48,46 +50,58 @@ pub(super) struct NearKeyframe {
     /// Its place in the map.
     pub(super) index: usize,
     pub(super) keyframe_id: u64,
-    /// In its unit.
-    pub(super) keyframe_from_camera: SE3,
-    /// Of the frame against it.
-    pub(super) brightness: Brightness,
+    pub(super) located: Located,
 }
 
 impl Mapper {
-    /// Makes the nearest earlier keyframe active again, if one is near enough, shows the frame and
-    /// agrees with its pose. Its depth is what it was left with and what the present keyframe adds.
+    /// Makes the nearest earlier keyframe active again, if one is near enough and shows the frame. Where it agrees with
+    /// the frame's pose its depth is what it was left with and what the present keyframe adds; where it has the camera
+    /// elsewhere, and is sure of it, the present keyframe has drifted and adds nothing.
     pub(super) fn reuse_keyframe(&mut self, frame: &FrameView<'_>, pose: &PoseEstimate) -> bool {
         let max_distance = self.params.reuse.max_distance;
-        let Some(near) = self.near_keyframe(frame, pose, max_distance) else { return false };
-        // Exact poses are the world's own, and need no anchor.
+        // Exact poses are the world's own: they need no anchor, and do not drift.
         let is_exact = pose.alignment_covariance.iter().all(|entry| *entry == 0.0);
-        if !is_exact {
-            self.anchor(near.keyframe_id, &near.keyframe_from_camera);
+        let agrees = self.params.reuse.max_disagreement;
+        let limit = if is_exact { agrees } else { agrees.max(MAX_DISAGREEMENT) };
+        let Some(near) = self.near_keyframe(frame, pose, max_distance, limit) else { return false };
+        if near.located.disagreement > agrees {
+            return self.return_to(&near, frame.pixels);
         }
-        self.take_up(near.index, between(pose.brightness, near.brightness));
+        if !is_exact {
+            self.anchor(near.keyframe_id, &near.located.keyframe_from_camera);
+        }
+        self.take_up(near.index, between(pose.brightness, near.located.brightness));
         true
     }
 
-    /// The nearest other keyframe below a distance of the camera, where it shows the frame and agrees with its pose.
+    /// Goes on from a keyframe that has the camera elsewhere than the map expects it, where that is as sure as it has to
+    /// be after a loss.
+    fn return_to(&mut self, near: &NearKeyframe, pixels: &[u8]) -> bool {
+        let at = &near.located.keyframe_from_camera;
+        let is_believed = near.located.is_sure
+            && self.is_confirmed(near.index, at, pixels)
+            && self.points_agree(near.index, at, pixels);
+        if is_believed {
+            self.restore_keyframe(near.index, at);
+        }
+        is_believed
+    }
+
+    /// The nearest other keyframe below a distance of the camera, where it shows the frame and has the camera at most
+    /// `max_disagreement` from where the frame's pose has it.
     pub(super) fn near_keyframe(
         &mut self,
         frame: &FrameView<'_>,
         pose: &PoseEstimate,
         max_distance: f64,
+        max_disagreement: f64,
     ) -> Option<NearKeyframe> {
         let present = self.keyframe()?;
         let map_from_camera = present.map_from_keyframe.place(&pose.keyframe_from_camera);
         let (index, expected) = self.nearest_keyframe(&map_from_camera, max_distance)?;
         let keyframe = self.map.keyframes.get(index)?;
-        let limit = self.params.reuse.max_disagreement;
-        let measured = self.finder.locate(keyframe, frame.pixels, &expected, limit)?;
-        Some(NearKeyframe {
-            index,
-            keyframe_id: keyframe.keyframe_id,
-            keyframe_from_camera: measured.state.current_from_keyframe.inverse(),
-            brightness: measured.state.brightness,
-        })
+        let located = self.finder.locate(keyframe, frame.pixels, &expected, max_disagreement)?;
+        Some(NearKeyframe { index, keyframe_id: keyframe.keyframe_id, located })
     }
 
     /// The other keyframe of the epoch with the smallest distance to the camera, if that is small enough, and

@@ -11,6 +11,7 @@ use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::map::{Correction, KeyframeCorrection, LogPlane, Map};
 use crate::slam::mapper::Mapper;
+use crate::slam::mapper::reuse::ReuseParams;
 
 /// Newest keyframes that are left alone: recovery looks at the last twenty, and estimates free the last seven.
 const NUM_NEWEST: usize = 24;
@@ -118,7 +119,10 @@ impl Mapper {
             if excess == 0 {
                 break;
             }
-            let Some((to, to_from_keyframe)) = shown_by(&self.map, index) else { continue };
+            let Some((to, to_from_keyframe)) = shown_by(&self.map, index, &self.params.reuse)
+            else {
+                continue;
+            };
             let keyframe = &mut self.map.keyframes[index];
             keyframe.forget_depth();
             self.thinning.attach(keyframe.keyframe_id, to, to_from_keyframe);
@@ -127,8 +131,9 @@ impl Mapper {
     }
 }
 
-/// Of a keyframe whose points enough others show as well: the nearest of those, and where it stands on that.
-fn shown_by(map: &Map, index: usize) -> Option<(u64, Sim3)> {
+/// Of a keyframe whose points enough others show as well, one of them from near enough to be taken up in its stead: the
+/// nearest of those, and where it stands on that.
+fn shown_by(map: &Map, index: usize, reuse: &ReuseParams) -> Option<(u64, Sim3)> {
     let keyframe = &map.keyframes[index];
     let place = keyframe.map_from_keyframe;
     let forward = place.rigid.rotation * Vector3::z();
@@ -149,20 +154,38 @@ fn shown_by(map: &Map, index: usize) -> Option<(u64, Sim3)> {
     let views: Vec<Sim3> = others.iter().map(|of| of.map_from_keyframe.inverse() * place).collect();
     let stride = keyframe.points.len().div_ceil(MOST_POINTS).max(1);
     let (mut shown, mut all) = (0u32, 0u32);
+    let mut shown_by_each = vec![0u32; others.len()];
     for point in keyframe.points.iter().step_by(stride) {
         let Intrinsics { fx, fy, cx, cy, .. } = keyframe.intrinsics;
         let ray = Vector3::new((f64::from(point.u) - cx) / fx, (f64::from(point.v) - cy) / fy, 1.0);
         let at = ray / f64::from(point.inverse_depth);
-        let showing = others.iter().zip(&views).filter(|(of, view)| shows(of, view, &at));
-        shown += u32::from(showing.take(NUM_OTHERS).count() == NUM_OTHERS);
+        let mut num_showing = 0;
+        for ((of, view), count) in others.iter().zip(&views).zip(&mut shown_by_each) {
+            let is_shown = shows(of, view, &at);
+            num_showing += usize::from(is_shown);
+            *count += u32::from(is_shown);
+        }
+        shown += u32::from(num_showing >= NUM_OTHERS);
         all += 1;
     }
     if f64::from(shown) < LEAST_SHARE * f64::from(all) {
         return None;
     }
-    let nearest = others.iter().zip(views).min_by(|(one, _), (other, _)| {
-        distance(one).total_cmp(&distance(other)).then(one.keyframe_id.cmp(&other.keyframe_id))
-    });
+    // Who comes back here must find one to be tracked on in its stead: where there is none the way back is mapped anew,
+    // and drifts.
+    let stands_in = |of: &Keyframe, count: u32| {
+        let usage = f64::from(count) / f64::from(all);
+        reuse.distance.distance(distance(of) / place.scale, usage) < reuse.max_distance
+    };
+    let nearest = others
+        .iter()
+        .zip(views)
+        .zip(shown_by_each)
+        .filter(|((of, _), count)| stands_in(of, *count))
+        .map(|(near, _)| near)
+        .min_by(|(one, _), (other, _)| {
+            distance(one).total_cmp(&distance(other)).then(one.keyframe_id.cmp(&other.keyframe_id))
+        });
     nearest.map(|(of, view)| (of.keyframe_id, view))
 }
 
@@ -234,21 +257,28 @@ mod tests {
             let at = x.iter().enumerate().map(|(k, x)| keyframe(k as u64, *x, 0.0));
             Map { keyframes: at.collect(), ..Map::default() }
         };
-        let (id, place) = shown_by(&near(&[0.0, 0.02, -0.01, 0.03]), 0).unwrap();
+        let (id, place) =
+            shown_by(&near(&[0.0, 0.02, -0.01, 0.03]), 0, &ReuseParams::default()).unwrap();
         assert_eq!(id, 2);
         assert!((place.rigid.translation.x - 0.01).abs() < 1e-12, "{place:?}");
-        assert!(shown_by(&near(&[0.0, 0.02, -0.01]), 0).is_none(), "two others");
-        assert!(shown_by(&near(&[0.0, 0.02, -0.01, 0.45]), 0).is_none(), "one from aside");
+        assert!(
+            shown_by(&near(&[0.0, 0.02, -0.01]), 0, &ReuseParams::default()).is_none(),
+            "two others"
+        );
+        assert!(
+            shown_by(&near(&[0.0, 0.02, -0.01, 0.45]), 0, &ReuseParams::default()).is_none(),
+            "one from aside"
+        );
         let mut map = near(&[0.0, 0.02, -0.01, 0.03]);
         map.keyframes[3] = keyframe(3, 0.03, 0.4);
-        assert!(shown_by(&map, 0).is_none(), "one looks elsewhere");
+        assert!(shown_by(&map, 0, &ReuseParams::default()).is_none(), "one looks elsewhere");
         let mut map = near(&[0.0, 0.02, -0.01, 0.03]);
         // The same place seen from twice as far shows half the detail.
         map.keyframes[3].map_from_keyframe.rigid.translation.z = -0.4;
-        assert!(shown_by(&map, 0).is_none(), "one from further away");
+        assert!(shown_by(&map, 0, &ReuseParams::default()).is_none(), "one from further away");
         let mut map = near(&[0.0, 0.02, -0.01, 0.03]);
         map.keyframes[1].epoch = 1;
-        assert!(shown_by(&map, 0).is_none(), "one of another epoch");
+        assert!(shown_by(&map, 0, &ReuseParams::default()).is_none(), "one of another epoch");
     }
 
     fn loop_between(i: u64, j: u64) -> Link {

@@ -37,7 +37,7 @@ fn a_known_view_is_found_on_its_keyframe_and_an_unknown_one_on_none() {
     assert_eq!(find(&mut recovery, near_home), Some(0));
     assert_eq!(find(&mut recovery, away * near_home), Some(1));
     assert_eq!(find(&mut recovery, at([0.0, 0.0, 0.0, 0.0, -1.5, 0.0])), None);
-    assert_eq!(find(&mut recovery, elsewhere), None, "the one in force is the tracker's");
+    assert_eq!(find(&mut recovery, elsewhere), None, "the active one is the tracker's");
 }
 
 #[test]
