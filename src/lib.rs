@@ -1,15 +1,58 @@
 //! Real-time semi-dense direct visual SLAM for robot computers.
 //!
+//! # Three ways to use it
+//!
+//! **The algorithm, in your own program.** Images in, poses and a map out, on your thread; needs none of the default
+//! features. See [`Odometry`]:
+//!
+//! ```
+//! use semidense::{FrameView, Intrinsics, Odometry, OdometryParams};
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! let camera = Intrinsics { fx: 262.0, fy: 262.0, cx: 159.5, cy: 119.5, width: 320, height: 240 };
+//! let mut odometry = Odometry::new(camera, OdometryParams::default())?;
+//! # let image = vec![100; 320 * 240];
+//! let pose = odometry.push(&FrameView::new(&camera, 0, 0, &image));
+//! println!("{:?}: {}", pose.state, pose.world_from_camera.translation);
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! **The topics of a running instance**, from any process of the same user: [`reader`] (feature `service`).
+//!
+//! **The program itself**, `semidense run`, `replay` and the processes that systemd starts: [`command`] is its command
+//! line, one short file a subcommand, and [`service`] what runs behind it (feature `service`).
+//!
 //! # Layout
-//! Imports run down: `command` → `service` → `slam`, `wire`, `capture`.
+//!
+//! Imports run down: [`command`] → [`service`] → [`slam`], [`wire`], [`capture`].
 //! * [`slam`] is pure: images and poses in, poses and depth out; no clock, thread, I/O or log.
 //! * [`capture`] brings frames in: dataset readers, the simulator, cameras.
-//! * [`wire`] is shared memory: the only place that names iceoryx2.
+//! * [`wire`] is shared memory: the only place that names iceoryx2. [`reader`] reads it.
 //! * [`service`] is the process shells: clock, threads, configuration, health, results.
-//! * [`command`] is the command line: one short file a subcommand.
+//! * [`command`] is the command line.
+//!
+//! # Features
+//!
+//! | feature | what | default |
+//! |---|---|---|
+//! | `service` | processes, topics, recordings, results, the program | yes |
+//! | `cameras` | V4L2 cameras as a source | yes |
+//!
+//! Without them (`default-features = false`) the algorithm builds with nalgebra, rayon, serde and thiserror alone.
 
+#[cfg(feature = "service")]
 pub mod capture;
+#[cfg(feature = "service")]
 pub mod command;
+#[cfg(feature = "service")]
+pub mod reader;
+#[cfg(feature = "service")]
 pub mod service;
 pub mod slam;
+#[cfg(feature = "service")]
 pub mod wire;
+
+pub use slam::frame::FrameView;
+pub use slam::geometry::intrinsics::Intrinsics;
+pub use slam::odometry::{Odometry, OdometryError, OdometryParams};

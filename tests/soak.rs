@@ -16,14 +16,14 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
 use semidense::service::health::ProcessState;
-use semidense::service::peers::{HEALTH_TOPICS, Peer};
+use semidense::service::peers::Peer;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::pose::PoseEstimate;
 use semidense::wire::conversion::pose_from_message;
 use semidense::wire::message::PoseMessage;
 use semidense::wire::place::{Place, SHARED_MEMORY};
 use semidense::wire::port::{Access, Hub, Subscriber};
-use semidense::wire::topic::POSE;
+use semidense::wire::topic::{HEALTH_TOPICS, POSE};
 use serde_json::Value;
 use support::{Rig, end, signal, until};
 
@@ -37,7 +37,7 @@ const IN_TIME_RATIO: f64 = 0.99;
 const WITHOUT_POSES: Duration = Duration::from_secs(1);
 /// What the supervisor may keep of a frame until the end, bytes: times. Its pose is in the journal.
 const BYTES_OF_A_FRAME: f64 = 100.0;
-/// The camera moves slowly to and fro: within the second that a restart may take it goes less than this
+/// The camera moves slowly back and forth: within the second that a restart may take it goes less than this
 /// between two poses, in units of the map (about a room's depth).
 const LARGEST_STEP: f64 = 0.5;
 /// Who dies sooner after its start is started again later and later.
@@ -257,7 +257,7 @@ impl Rigged {
         }
     }
 
-    /// Kills processes at the same time and looks that poses resume; how long they were missing.
+    /// Kills processes at the same time and checks that poses resume; how long they were missing.
     fn kill(&mut self, victims: &[usize]) -> Pause {
         let has_lived = victims.iter().all(|&index| self.began[index].elapsed() > HASTY);
         let pids: Vec<u32> = victims.iter().map(|&index| pid_of(&mut self.peers[index])).collect();

@@ -15,11 +15,12 @@ use std::time::Duration;
 
 use rustix::fs::{Mode, OFlags, fcntl_getfl, fcntl_setfl};
 use rustix::process::{Pid, Signal, kill_process};
-use semidense::service::peers::{HEALTH_TOPICS, Peer};
+use semidense::service::peers::Peer;
 use semidense::wire::command::{Command, CommandClient};
 use semidense::wire::message::{GraphHeader, KeyframePoseMessage, SimilarityMessage};
 use semidense::wire::port::{Hub, Subscriber};
 use semidense::wire::topic::GRAPH;
+use semidense::wire::topic::HEALTH_TOPICS;
 use serde_json::Value;
 use support::{Rig, WATCH_DOG, end, finish, signal, until, with_mount};
 

@@ -19,12 +19,12 @@ use crate::service::config::Config;
 use crate::service::health::{cause, percentile_ms, scheduling_name, source, warning};
 use crate::service::journal::folder::unfinished;
 use crate::service::liveness::{Liveness, age};
-use crate::service::peers::{HEALTH_TOPICS, Peer};
+use crate::service::peers::Peer;
 use crate::service::shutdown::Shutdown;
 use crate::wire::message::{HealthMessage, PoseMessage};
 use crate::wire::place::Place;
 use crate::wire::port::{Access, Hub, OpenError, Subscriber, wait};
-use crate::wire::topic::{MAPPER_HEALTH, POSE, Topic};
+use crate::wire::topic::{HEALTH_TOPICS, MAPPER_HEALTH, POSE, Topic};
 
 /// Time between two looks.
 const PERIOD: Duration = Duration::from_secs(1);

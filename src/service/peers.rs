@@ -3,10 +3,7 @@
 use crate::service::health::ProcessState;
 use crate::wire::message::HealthMessage;
 use crate::wire::port::{Hub, OpenError, ReceiveError, Subscriber};
-use crate::wire::topic::{CAPTURE_HEALTH, MAPPER_HEALTH, TRACKER_HEALTH, Topic};
-
-/// The health topics of all processes, in the order of the pipeline.
-pub const HEALTH_TOPICS: [Topic; 3] = [CAPTURE_HEALTH, TRACKER_HEALTH, MAPPER_HEALTH];
+use crate::wire::topic::Topic;
 
 /// Another process as seen through its health topic.
 #[derive(Debug)]

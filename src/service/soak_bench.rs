@@ -13,13 +13,14 @@ use crate::service::health::percentile_ms;
 use crate::service::journal::{Journal, JournalOptions};
 use crate::service::latency_bench::{TrialError, bench_options};
 use crate::service::mode::Mode;
-use crate::service::peers::{HEALTH_TOPICS, Peer};
+use crate::service::peers::Peer;
 use crate::service::run_progress::RunProgress;
 use crate::service::shutdown::Shutdown;
 use crate::service::supervisor::{Ended, run};
 use crate::wire::message::{HISTOGRAM_BUCKETS, HealthMessage};
 use crate::wire::place::Place;
 use crate::wire::port::{Access, Hub};
+use crate::wire::topic::HEALTH_TOPICS;
 
 /// Places in [`HEALTH_TOPICS`].
 const TRACKER: usize = 1;

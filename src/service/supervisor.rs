@@ -16,7 +16,7 @@ use crate::service::final_map::{FinalMapError, final_map};
 use crate::service::health::{ProcessState, cause};
 use crate::service::journal::{Journal, JournalOptions};
 use crate::service::mode::Mode;
-use crate::service::peers::{HEALTH_TOPICS, Peer};
+use crate::service::peers::Peer;
 use crate::service::position::{position_key, read_position};
 use crate::service::recorder::Recorder;
 use crate::service::recording::{RecordParts, RunCounters, TimeCounts};
@@ -32,7 +32,7 @@ use crate::slam::map::Map;
 use crate::wire::command::CommandClient;
 use crate::wire::place::{Claim, Place, PlaceError};
 use crate::wire::port::{Access, Hub, wait};
-use crate::wire::topic::shared_memory_bytes;
+use crate::wire::topic::{HEALTH_TOPICS, shared_memory_bytes};
 
 /// Longest sleep without a look at children, signals and progress.
 const WAKE_PERIOD: Duration = Duration::from_millis(50);

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+#[cfg(feature = "service")]
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -11,7 +12,8 @@ use crate::slam::place_covariance::{PlaceCovariance, UncertainPlace};
 use crate::slam::places::Description;
 
 /// One pixel with depth, as it goes over the wire.
-#[derive(Debug, Clone, Copy, PartialEq, Default, FromBytes, IntoBytes, Immutable, KnownLayout)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[cfg_attr(feature = "service", derive(FromBytes, IntoBytes, Immutable, KnownLayout))]
 #[repr(C)]
 pub struct DepthPoint {
     /// Column of the pixel, level 0.

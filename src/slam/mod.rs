@@ -15,6 +15,7 @@ pub mod loops;
 pub mod map;
 pub mod mapper;
 pub mod modes;
+pub mod odometry;
 pub mod parameter;
 pub mod place_covariance;
 pub mod places;

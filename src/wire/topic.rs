@@ -102,6 +102,9 @@ pub const TRACKER_HEALTH: Topic = Topic { owner: "tracker", ..CAPTURE_HEALTH };
 /// Health of the mapper.
 pub const MAPPER_HEALTH: Topic = Topic { owner: "mapper", ..CAPTURE_HEALTH };
 
+/// The health topics of all processes, in the order of the pipeline.
+pub const HEALTH_TOPICS: [Topic; 3] = [CAPTURE_HEALTH, TRACKER_HEALTH, MAPPER_HEALTH];
+
 /// The request/response service of the mapper.
 pub const MAPPER_COMMAND: &str = "mapper/command";
 

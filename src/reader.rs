@@ -1,0 +1,307 @@
+//! Reads the topics of an instance, whenever it runs: waits for it, notices its end, and joins the next one.
+//!
+//! ```no_run
+//! use std::time::Duration;
+//!
+//! use semidense::reader::{Event, Place, Session, Wants};
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! let place = Place::new("semidense", "")?;
+//! let mut session = Session::new(place, "my_robot", Wants { keyframes: true, ..Wants::default() });
+//! loop {
+//!     session.read(None, Duration::from_secs(1), |event| match event {
+//!         Event::Pose(pose) => println!("{:?} {}", pose.estimate.state, pose.estimate.world_from_camera.translation),
+//!         Event::Keyframe(keyframe) => println!("{} points", keyframe.points.len()),
+//!         _ => {}
+//!     })?;
+//! }
+//! # }
+//! ```
+//!
+//! Messages are checked where they come in; broken ones are counted and left out. A [`Session`] stays on the thread that
+//! opened it; what it gives is owned and may be sent to others. Who wants the bytes where they lie, without a copy, opens
+//! single topics with [`crate::wire::port::Hub`].
+
+use std::os::fd::BorrowedFd;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use crate::slam::frame::FrameView;
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::keyframe::{Keyframe, KeyframePose};
+use crate::slam::pose::PoseEstimate;
+use crate::wire::conversion::{frame_from_message, keyframe_pose_from_message, pose_from_message};
+use crate::wire::keyframe_inbox::{InboxError, KeyframeInbox};
+use crate::wire::message::{
+    AdjustmentMessage, FrameHeader, GraphHeader, HealthMessage, KeyframePoseMessage, PoseMessage,
+};
+pub use crate::wire::place::Place;
+use crate::wire::port::{
+    Access, Events, Hub, OpenError, ReceiveError, Subscriber, WaitError, wait,
+};
+use crate::wire::topic::{ADJUSTMENT, FRAME, GRAPH, HEALTH_TOPICS, POSE};
+
+/// An instance that has said nothing for so long is not there any more: processes report once a second.
+const LONGEST_SILENCE: Duration = Duration::from_secs(3);
+/// Time between two attempts to join an instance that is not there yet.
+const RETRY_PERIOD: Duration = Duration::from_millis(250);
+
+/// Which topics are read besides poses and health.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Wants {
+    /// Images of the camera; the newest wins where they are not taken in time.
+    pub frames: bool,
+    /// Keyframes: image and depth of the active one, and each revision of its depth.
+    pub keyframes: bool,
+    /// Poses of all keyframes in the map.
+    pub graph: bool,
+    /// Joint estimates.
+    pub adjustments: bool,
+}
+
+/// An image of the camera.
+#[derive(Debug, Clone)]
+pub struct Frame {
+    /// Its header.
+    pub header: FrameHeader,
+    /// Intrinsics of the image.
+    pub intrinsics: Intrinsics,
+    /// Rectified grey image, `width * height` bytes.
+    pub pixels: Arc<[u8]>,
+}
+
+/// A pose, checked, with the message it came in.
+#[derive(Debug, Clone, Copy)]
+pub struct Pose {
+    /// As it was sent: stamps and timing.
+    pub message: PoseMessage,
+    /// What it says.
+    pub estimate: PoseEstimate,
+}
+
+/// Poses of all keyframes in the map.
+#[derive(Debug, Clone)]
+pub struct Graph {
+    /// Epoch and revision.
+    pub header: GraphHeader,
+    /// One for each keyframe.
+    pub poses: Vec<KeyframePose>,
+}
+
+/// What comes out of shared memory.
+#[derive(Debug, Clone)]
+pub enum Event {
+    /// An instance was joined: what came before belongs to another run.
+    Joined,
+    /// The instance is gone; the session waits for the next one.
+    Left,
+    /// An image.
+    Frame(Arc<Frame>),
+    /// A pose.
+    Pose(Box<Pose>),
+    /// A keyframe, or a new revision of its depth.
+    Keyframe(Arc<Keyframe>),
+    /// The map's graph.
+    Graph(Arc<Graph>),
+    /// Health of the process with this name: capture, tracker or mapper.
+    Health(&'static str, Box<HealthMessage>),
+    /// A joint estimate of keyframes.
+    Adjustment(AdjustmentMessage),
+}
+
+/// Why reading failed.
+#[derive(Debug, thiserror::Error)]
+pub enum SessionError {
+    /// The instance cannot be joined, and waiting does not help.
+    #[error(transparent)]
+    Open(#[from] OpenError),
+    /// Waiting failed.
+    #[error(transparent)]
+    Wait(#[from] WaitError),
+}
+
+/// Topics of one instance.
+#[derive(Debug)]
+pub struct Session {
+    place: Place,
+    name: String,
+    wants: Wants,
+    ports: Option<Ports>,
+    tried: Option<Instant>,
+    heard: Instant,
+    refused: u64,
+}
+
+impl Session {
+    /// A session with the instance at `place` under the process name `name`; joins it when it is there.
+    pub fn new(place: Place, name: &str, wants: Wants) -> Self {
+        let name = name.to_owned();
+        Self { place, name, wants, ports: None, tried: None, heard: Instant::now(), refused: 0 }
+    }
+
+    /// The same, but an error where the instance does not run now.
+    pub fn join(place: Place, name: &str, wants: Wants) -> Result<Self, OpenError> {
+        let ports = Ports::open(&place, name, wants)?;
+        let mut session = Self::new(place, name, wants);
+        session.ports = Some(ports);
+        Ok(session)
+    }
+
+    /// Whether an instance is there.
+    pub fn is_joined(&self) -> bool {
+        self.ports.is_some()
+    }
+
+    /// Broken messages that were left out.
+    pub fn refused(&self) -> u64 {
+        self.refused
+    }
+
+    /// Waits for messages, until `interrupt` is readable, or for `timeout` at most, and gives what came to `take`, in the
+    /// order of each topic. An error is final.
+    pub fn read(
+        &mut self,
+        interrupt: Option<BorrowedFd<'_>>,
+        timeout: Duration,
+        mut take: impl FnMut(Event),
+    ) -> Result<(), SessionError> {
+        if self.ports.is_none() {
+            self.try_to_join(&mut take)?;
+        }
+        let Some(ports) = &mut self.ports else {
+            return Ok(wait(&[], interrupt, timeout.min(RETRY_PERIOD))?);
+        };
+        wait(&ports.events(), interrupt, timeout)?;
+        let mut num_taken = 0_usize;
+        let outcome = ports.take_all(&mut self.refused, &mut |event| {
+            num_taken += 1;
+            take(event);
+        });
+        if num_taken > 0 {
+            self.heard = Instant::now();
+        }
+        let is_silent = self.heard.elapsed() > LONGEST_SILENCE;
+        if outcome.is_err() || is_silent {
+            self.ports = None;
+            take(Event::Left);
+        }
+        Ok(())
+    }
+
+    /// An instance that is not there, or is only starting, is tried again; one of another version never fits.
+    fn try_to_join(&mut self, take: &mut impl FnMut(Event)) -> Result<(), SessionError> {
+        if self.tried.is_some_and(|tried| tried.elapsed() < RETRY_PERIOD) {
+            return Ok(());
+        }
+        self.tried = Some(Instant::now());
+        match Ports::open(&self.place, &self.name, self.wants) {
+            Ok(ports) => {
+                self.ports = Some(ports);
+                self.heard = Instant::now();
+                take(Event::Joined);
+                Ok(())
+            }
+            Err(error @ OpenError::Version { .. }) => Err(error.into()),
+            Err(error) => {
+                tracing::debug!("{error}");
+                Ok(())
+            }
+        }
+    }
+}
+
+/// The open topics; the hub is dropped last.
+#[derive(Debug)]
+struct Ports {
+    poses: Subscriber<PoseMessage, ()>,
+    health: Vec<(&'static str, Subscriber<HealthMessage, ()>)>,
+    frames: Option<Subscriber<u8, FrameHeader>>,
+    keyframes: Option<KeyframeInbox>,
+    graph: Option<Subscriber<KeyframePoseMessage, GraphHeader>>,
+    adjustments: Option<Subscriber<AdjustmentMessage, ()>>,
+    _hub: Hub,
+}
+
+impl Ports {
+    fn open(place: &Place, name: &str, wants: Wants) -> Result<Self, OpenError> {
+        let hub = Hub::join(place, name, Access::Observer)?;
+        let health: Result<Vec<_>, _> = HEALTH_TOPICS
+            .iter()
+            .map(|topic| hub.subscriber(topic).map(|port| (topic.owner, port)))
+            .collect();
+        Ok(Self {
+            poses: hub.subscriber(&POSE)?,
+            health: health?,
+            frames: wants.frames.then(|| hub.subscriber(&FRAME)).transpose()?,
+            keyframes: wants.keyframes.then(|| KeyframeInbox::open(&hub)).transpose()?,
+            graph: wants.graph.then(|| hub.subscriber(&GRAPH)).transpose()?,
+            adjustments: wants.adjustments.then(|| hub.subscriber(&ADJUSTMENT)).transpose()?,
+            _hub: hub,
+        })
+    }
+
+    /// What wakes a wait: poses and, where they are read, frames and keyframes. The rest comes with these, or once a second.
+    fn events(&self) -> Vec<&Events> {
+        let frames = self.frames.as_ref().map(Subscriber::events);
+        let keyframes = self.keyframes.as_ref().map(KeyframeInbox::events);
+        [Some(self.poses.events()), frames, keyframes].into_iter().flatten().collect()
+    }
+
+    /// Keyframes before poses: a pose names its keyframe.
+    fn take_all(
+        &mut self,
+        refused: &mut u64,
+        take: &mut dyn FnMut(Event),
+    ) -> Result<(), ReceiveError> {
+        for (owner, port) in &self.health {
+            while let Some(message) = port.receive()? {
+                message.payload().iter().for_each(|m| take(Event::Health(owner, Box::new(*m))));
+            }
+        }
+        if let Some(inbox) = &mut self.keyframes {
+            match inbox.newest() {
+                Ok(Some(keyframe)) => take(Event::Keyframe(Arc::new(keyframe))),
+                Ok(None) => {}
+                Err(InboxError::Message(_)) => *refused += 1,
+                Err(InboxError::Receive(error)) => return Err(error),
+            }
+        }
+        if let Some(newest) = self.graph.as_ref().map(Subscriber::newest).transpose()?.flatten() {
+            let poses: Result<Vec<_>, _> =
+                newest.payload().iter().map(keyframe_pose_from_message).collect();
+            match poses {
+                Ok(poses) => {
+                    take(Event::Graph(Arc::new(Graph { header: *newest.header(), poses })))
+                }
+                Err(_) => *refused += 1,
+            }
+        }
+        if let Some(port) = &self.frames {
+            while let Some(message) = port.receive()? {
+                match frame_from_message(message.header(), message.payload()) {
+                    Ok((FrameView { pixels, .. }, intrinsics)) => {
+                        let (header, pixels) = (*message.header(), Arc::from(pixels));
+                        take(Event::Frame(Arc::new(Frame { header, intrinsics, pixels })));
+                    }
+                    Err(_) => *refused += 1,
+                }
+            }
+        }
+        while let Some(message) = self.poses.receive()? {
+            for message in message.payload() {
+                match pose_from_message(message) {
+                    Ok(estimate) => {
+                        take(Event::Pose(Box::new(Pose { message: *message, estimate })))
+                    }
+                    Err(_) => *refused += 1,
+                }
+            }
+        }
+        if let Some(port) = &self.adjustments {
+            while let Some(message) = port.receive()? {
+                message.payload().iter().for_each(|m| take(Event::Adjustment(*m)));
+            }
+        }
+        Ok(())
+    }
+}

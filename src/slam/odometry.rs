@@ -1,0 +1,202 @@
+//! The whole algorithm without processes: images in, poses and a map out, on the caller's thread.
+//!
+//! [`Odometry`] calls tracker, mapper and joint estimation as `semidense replay` does and gives the same bits. The
+//! processes exist to do the same by a deadline.
+
+use serde::{Deserialize, Serialize};
+
+use crate::slam::alignment::reference::Reference;
+use crate::slam::frame::FrameView;
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::map::Map;
+use crate::slam::mapper::{Mapper, MapperParams, StepOutcome};
+use crate::slam::parameter::ParameterError;
+use crate::slam::pose::PoseEstimate;
+use crate::slam::tracker::{Tracker, TrackerParams};
+use crate::slam::window::Window;
+
+/// Tuning of tracker and mapper; the defaults are those of the program.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct OdometryParams {
+    /// How frames are tracked.
+    pub tracker: TrackerParams,
+    /// How depth and keyframes are made.
+    pub mapper: MapperParams,
+}
+
+/// Why there is no odometry for a camera.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum OdometryError {
+    /// Size and intrinsics that no camera has.
+    #[error(
+        "size {} × {} and intrinsics {}, {}, {}, {} are not those of a camera",
+        .0.width, .0.height, .0.fx, .0.fy, .0.cx, .0.cy
+    )]
+    Intrinsics(Intrinsics),
+    /// A parameter out of its range.
+    #[error(transparent)]
+    Parameter(#[from] ParameterError),
+}
+
+/// Poses and a semi-dense map from the rectified grey images of one camera.
+///
+/// ```
+/// use semidense::{FrameView, Intrinsics, Odometry, OdometryParams};
+///
+/// # fn main() -> Result<(), Box<dyn std::error::Error>> {
+/// let camera = Intrinsics { fx: 262.0, fy: 262.0, cx: 159.5, cy: 119.5, width: 320, height: 240 };
+/// let mut odometry = Odometry::new(camera, OdometryParams::default())?;
+/// # let images: Vec<Vec<u8>> = vec![vec![100; 320 * 240]; 2];
+/// for (number, image) in images.iter().enumerate() {
+///     let nanos = number as i64 * 33_333_333;
+///     let pose = odometry.push(&FrameView::new(&camera, number as u64, nanos, image));
+///     if pose.state.is_tracked() {
+///         println!("{}", pose.map_from_camera.translation);
+///     }
+/// }
+/// odometry.finish();
+/// for keyframe in odometry.keyframes() {
+///     println!("keyframe {}: {} points", keyframe.keyframe_id, keyframe.points.len());
+/// }
+/// # Ok(())
+/// # }
+/// ```
+///
+/// Depth is estimated on rayon's pool: the global one, or another around `push` (`ThreadPool::install`). A frame takes
+/// milliseconds, one after which keyframes are estimated jointly some 40 ms more.
+#[derive(Debug)]
+pub struct Odometry {
+    params: OdometryParams,
+    tracker: Tracker,
+    mapper: Mapper,
+    /// Memory of the reference that the tracker gave back.
+    spare: Option<Box<Reference>>,
+    estimate: Option<Estimate>,
+    frames: u64,
+}
+
+/// A joint estimate that is made and waits for its frame.
+#[derive(Debug)]
+struct Estimate {
+    window: Box<Window>,
+    /// Frames after which it enters the map.
+    due: u64,
+    epoch: u32,
+    map_revision: u64,
+}
+
+impl Odometry {
+    /// Odometry for images of `intrinsics`, rectified and without distortion.
+    pub fn new(intrinsics: Intrinsics, params: OdometryParams) -> Result<Self, OdometryError> {
+        if !intrinsics.is_valid() {
+            return Err(OdometryError::Intrinsics(intrinsics));
+        }
+        Ok(Self {
+            tracker: Tracker::new(intrinsics, params.tracker.clone())?,
+            mapper: Mapper::new(intrinsics, params.mapper.clone())?,
+            params,
+            spare: None,
+            estimate: None,
+            frames: 0,
+        })
+    }
+
+    /// Takes in the next frame and gives its pose. Sequence and stamp count up; a frame of another size is not tracked.
+    /// Until the camera has moved sideways by some per cent of the distance of what it sees there is no map, and poses
+    /// are `Initializing`.
+    pub fn push(&mut self, frame: &FrameView<'_>) -> PoseEstimate {
+        let pose = self.tracker.track(frame, &mut |_| true);
+        let mut outcome = self.mapper.step(frame, &pose, None, &mut || {});
+        outcome.keyframe_changed |= self.mapper.finish_keyframe().keyframe_changed;
+        self.frames += 1;
+        outcome.keyframe_changed |= self.let_in().keyframe_changed;
+        self.begin();
+        // One that is due with its own frame.
+        outcome.keyframe_changed |= self.let_in().keyframe_changed;
+        if outcome.needs_publishing() {
+            self.hand_on_keyframe();
+        }
+        pose
+    }
+
+    /// After the last frame: estimates all keyframes once more and refines their depth. More frames may follow.
+    pub fn finish(&mut self) {
+        self.end_estimate();
+        while let Some(window) = self.mapper.begin_last_search() {
+            self.estimate(window);
+            self.end_estimate();
+        }
+        if let Some(window) = self.mapper.begin_last_adjustment() {
+            self.estimate(window);
+            self.end_estimate();
+        }
+        while self.mapper.refine_depth() {}
+        self.mapper.keep_confirmed();
+        self.hand_on_keyframe();
+    }
+
+    /// All keyframes, in the order in which they were made: image, inverse depth with variance, place in the map.
+    pub fn keyframes(&self) -> &[Keyframe] {
+        &self.mapper.map().keyframes
+    }
+
+    /// The keyframe that frames are tracked on; `None` before the first.
+    pub fn active_keyframe(&self) -> Option<&Keyframe> {
+        self.mapper.keyframe()
+    }
+
+    /// Keyframes, and where each frame was when its keyframe had been estimated.
+    pub fn map(&self) -> &Map {
+        self.mapper.map()
+    }
+
+    /// Makes a joint estimate where one is due. It enters the map later, as where it is made beside the frames.
+    fn begin(&mut self) {
+        if self.estimate.is_none()
+            && let Some(window) = self.mapper.begin_adjustment(false)
+        {
+            self.estimate(window);
+        }
+    }
+
+    fn estimate(&mut self, mut window: Box<Window>) {
+        let epoch = self.mapper.keyframe().map_or(0, |keyframe| keyframe.epoch);
+        let map_revision = self.mapper.map().revision;
+        window.optimise();
+        let due = self.frames + self.params.mapper.window.delay_frames as u64;
+        self.estimate = Some(Estimate { window, due, epoch, map_revision });
+    }
+
+    fn let_in(&mut self) -> StepOutcome {
+        match self.estimate.as_ref().is_some_and(|estimate| self.frames >= estimate.due) {
+            true => self.end_estimate(),
+            false => StepOutcome::default(),
+        }
+    }
+
+    /// Lets the estimate in, unless the map that it was made of is no more.
+    fn end_estimate(&mut self) -> StepOutcome {
+        let Some(estimate) = self.estimate.take() else { return StepOutcome::default() };
+        let is_same_map = self.mapper.keyframe().is_some_and(|active| {
+            active.epoch == estimate.epoch
+                && active.map_state == MapState::Established
+                && self.mapper.map().revision == estimate.map_revision
+        });
+        if is_same_map {
+            return self.mapper.end_adjustment(estimate.window);
+        }
+        self.mapper.drop_adjustment(estimate.window);
+        StepOutcome::default()
+    }
+
+    /// Gives the tracker the mapper's keyframe, in the memory of the one before.
+    fn hand_on_keyframe(&mut self) {
+        let Some(keyframe) = self.mapper.keyframe() else { return };
+        let new = || Box::new(Reference::new(self.params.tracker.reference.clone()));
+        let mut reference = self.spare.take().unwrap_or_else(new);
+        reference.prepare_into(keyframe);
+        self.spare = self.tracker.adopt(reference);
+    }
+}
