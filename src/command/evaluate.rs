@@ -15,7 +15,7 @@ use crate::service::results::report::evaluation_plot::evaluation_plot;
 use crate::service::results::summary::TrajectorySummary;
 use crate::service::trajectory_file::{TrajectoryFile, read_trajectory_file};
 use crate::slam::evaluation::statistics::ErrorStatistics;
-use crate::slam::evaluation::umeyama::Alignment;
+use crate::slam::evaluation::umeyama::TrajectoryAlignment;
 use crate::slam::evaluation::{TrajectoryEvaluation, evaluate_trajectory};
 
 /// What is fitted before positions are compared.
@@ -76,9 +76,9 @@ pub fn run(args: &EvaluateArgs) -> Result<ExitCode, Box<dyn Error>> {
     move_to_camera(&mut estimate, &mut truth, args)?;
     let (estimate, truth) = (estimate.poses, truth.poses);
     let alignment = match args.align {
-        Align::Sim3 => Alignment::Sim3,
-        Align::Se3 => Alignment::SE3,
-        Align::None => Alignment::None,
+        Align::Sim3 => TrajectoryAlignment::Sim3,
+        Align::Se3 => TrajectoryAlignment::SE3,
+        Align::None => TrajectoryAlignment::None,
     };
     let max_difference_nanos = (args.max_difference * 1e9).round() as i64;
     let evaluation = evaluate_trajectory(&estimate, &truth, alignment, max_difference_nanos)
@@ -133,12 +133,12 @@ fn move_to_camera(
 fn evaluation_text(
     evaluation: &TrajectoryEvaluation,
     estimated: usize,
-    alignment: Alignment,
+    alignment: TrajectoryAlignment,
 ) -> String {
     let fitted = match alignment {
-        Alignment::Sim3 => format!("sim3, scale {:.6}", evaluation.alignment.scale),
-        Alignment::SE3 => "se3".to_owned(),
-        Alignment::None => "none".to_owned(),
+        TrajectoryAlignment::Sim3 => format!("sim3, scale {:.6}", evaluation.alignment.scale),
+        TrajectoryAlignment::SE3 => "se3".to_owned(),
+        TrajectoryAlignment::None => "none".to_owned(),
     };
     let mut lines = vec![
         format!("{} of {estimated} poses matched", evaluation.association.pairs.len()),

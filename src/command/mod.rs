@@ -7,6 +7,7 @@ pub mod bench;
 pub mod bridge;
 pub mod cameras;
 pub mod capture;
+pub mod config;
 pub mod doctor;
 pub mod ending;
 pub mod evaluate;
@@ -121,9 +122,13 @@ impl LogFormat {
 impl CommonArguments {
     /// Configuration with everything that was said on the command line.
     fn load(&self) -> Result<Config, ConfigError> {
+        Config::load(self.file().as_deref(), &self.settings())
+    }
+
+    /// What the command line sets, as `--set` does.
+    fn settings(&self) -> Vec<String> {
         let named = self.instance.iter().map(|name| format!("instance={name:?}"));
-        let settings: Vec<String> = self.set.iter().cloned().chain(named).collect();
-        Config::load(self.file().as_deref(), &settings)
+        self.set.iter().cloned().chain(named).collect()
     }
 
     /// The configuration file: the one that is named, else the usual one.
@@ -163,6 +168,7 @@ enum Subcommands {
     Simulate(Box<simulate::SimulateArgs>),
     Evaluate(evaluate::EvaluateArgs),
     Status(status::StatusArguments),
+    Config(config::ConfigArguments),
     Bench(bench::BenchArguments),
     Doctor(doctor::DoctorArguments),
     Cameras(cameras::CamerasArguments),
@@ -232,6 +238,7 @@ fn run_subcommand(line: CommandLine, log: &ErrorLog) -> CommandResult {
         Subcommands::Simulate(arguments) => simulate::run(&config, &arguments),
         Subcommands::Evaluate(arguments) => evaluate::run(&arguments),
         Subcommands::Status(arguments) => status::run(&config, arguments),
+        Subcommands::Config(arguments) => config::run(&line.common, &arguments),
         Subcommands::Cameras(arguments) => cameras::run(arguments),
         Subcommands::Doctor(arguments) => doctor::run(&config, arguments),
         Subcommands::Bench(arguments) => bench::run(&config, &line.common, log, arguments),

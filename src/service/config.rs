@@ -5,6 +5,7 @@
 //! parts, see `layout`: what a user may want to set, and `[expert]`.
 
 mod layout;
+mod origins;
 
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -17,6 +18,7 @@ use crate::capture::input_file;
 use crate::capture::simulator::params::SimulatorParams;
 use crate::capture::source::SourceParams;
 use crate::capture::v4l::params::CameraParams;
+pub use crate::service::config::origins::{KeyInForce, Origin};
 pub use crate::service::config_error::ConfigError;
 use crate::service::map_folder::depth_file::MapDetail;
 use crate::service::results::ResultsParams;
@@ -327,7 +329,7 @@ impl Config {
 
 /// The file in `folder` for `instance`: its own, else the one for all; `None` where there is neither.
 pub fn file_for(folder: &Path, instance: Option<&str>) -> Option<PathBuf> {
-    // A name that is none must not lead out of the folder; it is refused later.
+    // An invalid name must not lead out of the folder; it is refused later.
     let instance = instance.filter(|name| !name.contains('/'));
     let own = instance.map(|name| folder.join(format!("{name}.toml")));
     own.into_iter().chain([folder.join(COMMON_FILE)]).find(|file| file.exists())

@@ -41,6 +41,32 @@ fn the_shipped_file_lists_every_key_with_its_default() {
 }
 
 #[test]
+fn presets_load_and_change_what_they_name() {
+    let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/config/presets");
+    let mut num_presets = 0;
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        let keys = Config::keys_in_force(Some(&path), &[]).unwrap();
+        let (mut named, mut same) = (0, Vec::new());
+        for key in keys.iter().filter(|key| key.origin == Origin::File(path.clone())) {
+            assert!(!key.is_expert, "{}: {} is an expert's", path.display(), key.key);
+            named += 1;
+            // Priorities stand beside their policy for the reader.
+            if key.built_in.is_none() && !key.key.ends_with(".priority") {
+                same.push(&key.key);
+            }
+        }
+        assert!(
+            named > 0 && same.is_empty(),
+            "{}: {named} keys, as built in: {same:?}",
+            path.display()
+        );
+        num_presets += 1;
+    }
+    assert_eq!(num_presets, 4);
+}
+
+#[test]
 fn a_key_is_the_same_with_and_without_expert() {
     let read = |text: &str| Config::from_text(text, "x.toml");
     let expected = set(&["mapping.matching.line_noise_px=0.5"]).unwrap();
