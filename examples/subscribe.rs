@@ -33,7 +33,7 @@ fn subscribe() -> Result<(), Box<dyn Error>> {
     let place = Place::new(&instance, "")?;
     let hub = Hub::join(&place, "subscribe", Access::Observer)?;
     let poses: Subscriber<PoseMessage, ()> = hub.subscriber(&POSE)?;
-    // The keyframe in force comes at once, however late we are: it is the topic's history.
+    // The active keyframe comes at once, however late we join: it is the topic's history.
     let mut keyframes = KeyframeInbox::open(&hub)?;
     let shutdown = Shutdown::install()?;
     while !shutdown.is_requested() {

@@ -36,7 +36,7 @@ fn a_frame_and_a_keyframe_allocate_nothing_after_warm_up() {
         if index == 2 {
             before = allocations();
         }
-        // Two references take turns, as in the shell: one in force, one being prepared.
+        // Two references take turns, as in the shell: one active, one being prepared.
         let mut reference =
             spare.take().unwrap_or_else(|| Box::new(Reference::new(ReferenceParams::default())));
         reference.prepare_into(keyframe);

@@ -8,7 +8,7 @@ use semidense::capture::simulator::params::{SensorParams, SimulatorParams};
 use semidense::capture::source::FrameSource;
 use semidense::service::replay::{ReplayConfig, replay};
 use semidense::service::results::RunRecord;
-use semidense::slam::evaluation::umeyama::Alignment;
+use semidense::slam::evaluation::umeyama::TrajectoryAlignment;
 use semidense::slam::evaluation::{MAX_DIFFERENCE_NANOS, evaluate_trajectory};
 use semidense::slam::pose::TrackingState;
 use semidense::slam::trajectory::StampedPose;
@@ -38,7 +38,8 @@ fn outcome(seed: u64, sensor: &SensorParams) -> Outcome {
     let truth = source.ground_truth();
     let estimate = trajectory(&record);
     let evaluation =
-        evaluate_trajectory(&estimate, truth, Alignment::Sim3, MAX_DIFFERENCE_NANOS).unwrap();
+        evaluate_trajectory(&estimate, truth, TrajectoryAlignment::Sim3, MAX_DIFFERENCE_NANOS)
+            .unwrap();
     let is_lost = |state: TrackingState| matches!(state, TrackingState::Lost(_));
     Outcome {
         ate_per_path: evaluation.ate.rmse / evaluation.path_length,

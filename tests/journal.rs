@@ -25,7 +25,7 @@ const FILES: [&str; 8] = [
     "report.html",
 ];
 
-/// A sequence without end in sight from few pictures: sixty frames to and fro.
+/// A sequence without end in sight from few pictures: sixty frames back and forth.
 const ENDLESS: &str = "loop:200000:30:sim";
 
 fn command(rig: &Rig, arguments: &[&str]) -> Command {

@@ -1,11 +1,11 @@
-//! A camera that goes to and fro: keyframes it comes back to are taken up again, so that the map does not
+//! A camera that goes back and forth: keyframes it comes back to are taken up again, so that the map does not
 //! grow and the poses do not get worse.
 
 use semidense::capture::simulator::Simulator;
 use semidense::capture::simulator::params::{MotionKind, MotionParams, SimulatorParams};
 use semidense::service::replay::{ReplayConfig, replay};
 use semidense::service::results::RunRecord;
-use semidense::slam::evaluation::umeyama::Alignment;
+use semidense::slam::evaluation::umeyama::TrajectoryAlignment;
 use semidense::slam::evaluation::{MAX_DIFFERENCE_NANOS, evaluate_trajectory};
 use semidense::slam::mapper::MapperParams;
 use semidense::slam::mapper::reuse::ReuseParams;
@@ -29,7 +29,7 @@ fn to_and_fro(max_distance: f64) -> Outcome {
     let mapper = MapperParams { reuse, ..MapperParams::default() };
     let config = ReplayConfig { mapper, ..ReplayConfig::default() };
     let mut restored = 0;
-    let record = replay(&mut simulator, "to and fro", &config, &mut |progress| {
+    let record = replay(&mut simulator, "back and forth", &config, &mut |progress| {
         restored += usize::from(progress.outcome.keyframe_restored);
         true
     })
@@ -46,7 +46,8 @@ fn to_and_fro(max_distance: f64) -> Outcome {
     assert!(poses.len() * 10 > FRAMES * 9, "{} tracked", poses.len());
     let truth = &record.ground_truth;
     let evaluation =
-        evaluate_trajectory(&poses, truth, Alignment::Sim3, MAX_DIFFERENCE_NANOS).unwrap();
+        evaluate_trajectory(&poses, truth, TrajectoryAlignment::Sim3, MAX_DIFFERENCE_NANOS)
+            .unwrap();
     let (keyframes, ate) = (record.map.keyframes.len(), evaluation.ate.rmse);
     println!("max_distance {max_distance}: {keyframes} keyframes, {restored} restored, ATE {ate}");
     Outcome { record, restored, ate }

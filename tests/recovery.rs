@@ -15,7 +15,7 @@ use semidense::capture::source::{
 };
 use semidense::service::replay::{ReplayConfig, replay};
 use semidense::service::results::RunRecord;
-use semidense::slam::evaluation::umeyama::Alignment;
+use semidense::slam::evaluation::umeyama::TrajectoryAlignment;
 use semidense::slam::evaluation::{
     MAX_DIFFERENCE_NANOS, TrajectoryEvaluation, evaluate_trajectory,
 };
@@ -142,7 +142,8 @@ fn error_of(record: &RunRecord, epoch: u32) -> TrajectoryEvaluation {
         .collect();
     let truth = &record.ground_truth;
     let evaluation =
-        evaluate_trajectory(&tracked, truth, Alignment::Sim3, MAX_DIFFERENCE_NANOS).unwrap();
+        evaluate_trajectory(&tracked, truth, TrajectoryAlignment::Sim3, MAX_DIFFERENCE_NANOS)
+            .unwrap();
     println!(
         "epoch {epoch}: ATE {} over {} of {}",
         evaluation.ate.rmse,
@@ -286,7 +287,9 @@ fn frames_from_before_the_map_began_have_a_pose_in_the_end() {
     assert_eq!(all.len(), 100, "every frame has a pose");
     let error = |poses: &[StampedPose]| {
         let truth = &record.ground_truth;
-        evaluate_trajectory(poses, truth, Alignment::Sim3, MAX_DIFFERENCE_NANOS).unwrap().ate
+        evaluate_trajectory(poses, truth, TrajectoryAlignment::Sim3, MAX_DIFFERENCE_NANOS)
+            .unwrap()
+            .ate
     };
     let (with, without) = (error(&all), error(&all[begun..]));
     println!("{begun} frames before; ATE {} with them, {} without", with.rmse, without.rmse);
@@ -455,7 +458,8 @@ fn an_epoch_that_sees_a_place_of_the_one_before_it_becomes_part_of_it() {
     let tracked = || estimates(&record).filter(|e| e.state.is_tracked());
     let poses: Vec<StampedPose> = tracked().filter_map(placed).collect();
     let truth = &record.ground_truth;
-    let found = evaluate_trajectory(&poses, truth, Alignment::Sim3, MAX_DIFFERENCE_NANOS).unwrap();
+    let found = evaluate_trajectory(&poses, truth, TrajectoryAlignment::Sim3, MAX_DIFFERENCE_NANOS)
+        .unwrap();
     println!("ATE {} over {} poses, path {}", found.ate.rmse, poses.len(), found.path_length);
     assert!(found.ate.rmse < 0.01 * found.path_length, "{}", found.ate.rmse);
     let of_odometry: Vec<_> =

@@ -18,7 +18,7 @@ use semidense::slam::two_frame::evidence::EvidenceParams;
 use semidense::slam::two_frame::{InitState, TwoFrameInitializer, TwoFrameParams};
 
 /// Largest error of the direction of a start that is proven by earlier frames and not by a long
-/// translation, degrees: it is of some 2 px, and its map is mended by the frames that follow.
+/// translation, degrees: it is of some 2 px, and its map is corrected by the frames that follow.
 const EARLY_DIRECTION_DEG: f64 = 20.0;
 
 /// What a start came to.

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use clap::ValueEnum;
 use semidense::slam::mapper::appearance::Appearance;
-use semidense::slam::places::{Candidate, Describer, PlaceIndex};
+use semidense::slam::places::{Describer, PlaceCandidate, PlaceIndex};
 
 use crate::ferns::Ferns;
 use crate::footage::Footage;
@@ -28,7 +28,7 @@ pub struct Scores {
     pub of: Vec<Vec<f32>>,
     /// What the tree says where it is asked only for keyframes that may be found: for each query its candidates, best
     /// first. Empty of other methods.
-    pub candidates: Vec<Vec<Candidate>>,
+    pub candidates: Vec<Vec<PlaceCandidate>>,
     /// What it costs, to be printed.
     pub cost: String,
 }
@@ -73,7 +73,7 @@ fn tree(footage: &Footage, queries: &[Vec<u8>], gap: usize) -> Scores {
     };
     let all: Vec<_> = (0..count).map(|query| found_of(query, &|id| id == query as u64)).collect();
     let query = micros(began, count);
-    let row = |found: &Vec<Candidate>| {
+    let row = |found: &Vec<PlaceCandidate>| {
         let mut row = vec![f32::NAN; count];
         found.iter().for_each(|of| row[of.keyframe_id as usize] = of.score);
         row

@@ -6,7 +6,7 @@ use nalgebra::Vector3;
 use semidense::slam::geometry::sim3::Sim3;
 use semidense::slam::graph::constraint::{ConstraintParams, ConstraintSolver, Refusal};
 use semidense::slam::keyframe::Keyframe;
-use semidense::slam::places::Candidate;
+use semidense::slam::places::PlaceCandidate;
 
 use crate::footage::{Footage, Overlap};
 use crate::judge::{FEW, OTHER, SAME};
@@ -25,7 +25,7 @@ struct Verdict {
 pub fn verify(
     footage: &Footage,
     overlaps: &[Vec<Overlap>],
-    candidates: &[Vec<Candidate>],
+    candidates: &[Vec<PlaceCandidate>],
     gap: usize,
     depth_error: f64,
 ) {

@@ -1,4 +1,4 @@
-//! A recording played to and fro at a steady rate: frames without end for benches and soak tests.
+//! A recording played back and forth at a steady rate: frames without end for benches and soak tests.
 
 use std::collections::VecDeque;
 use std::fs::File;

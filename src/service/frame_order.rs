@@ -16,7 +16,7 @@ pub const SILENCE: &str = "no frames come: look at capture";
 
 /// What a frame is to the one before.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Arrival {
+pub enum FrameOrderOutcome {
     /// It comes after it; so many are missing between.
     Next {
         /// Frames that did not arrive.
@@ -52,19 +52,19 @@ impl FrameOrder {
     }
 
     /// Says what the next frame is. Hostile numbers are as good as any.
-    pub fn arrive(&mut self, header: &FrameHeader) -> Arrival {
+    pub fn arrive(&mut self, header: &FrameHeader) -> FrameOrderOutcome {
         let (sequence, stamp) = (header.sequence, header.capture_nanos);
         let Some((last_sequence, last_stamp)) = self.last else {
             self.last = Some((sequence, stamp));
-            return Arrival::Next { missing: 0 };
+            return FrameOrderOutcome::Next { missing: 0 };
         };
         if sequence <= last_sequence {
             self.repeated += 1;
             if self.repeated < RENUMBERED_FRAMES {
-                return Arrival::Repeated;
+                return FrameOrderOutcome::Repeated;
             }
             (self.last, self.repeated) = (Some((sequence, stamp)), 0);
-            return Arrival::Renumbered;
+            return FrameOrderOutcome::Renumbered;
         }
         (self.last, self.repeated) = (Some((sequence, stamp)), 0);
         let frames = sequence - last_sequence;
@@ -74,9 +74,9 @@ impl FrameOrder {
         match period.filter(|period| PERIODS_NANOS.contains(period)) {
             Some(period) => {
                 self.period_nanos = Some(period);
-                Arrival::Next { missing: frames - 1 }
+                FrameOrderOutcome::Next { missing: frames - 1 }
             }
-            None => Arrival::ClockJump,
+            None => FrameOrderOutcome::ClockJump,
         }
     }
 }
@@ -92,10 +92,10 @@ mod tests {
     #[test]
     fn holes_and_distances_are_found() {
         let mut order = FrameOrder::default();
-        assert_eq!(order.arrive(&frame(7, 0)), Arrival::Next { missing: 0 });
-        assert_eq!(order.arrive(&frame(8, 20)), Arrival::Next { missing: 0 });
+        assert_eq!(order.arrive(&frame(7, 0)), FrameOrderOutcome::Next { missing: 0 });
+        assert_eq!(order.arrive(&frame(8, 20)), FrameOrderOutcome::Next { missing: 0 });
         assert_eq!(order.period_nanos(), 20_000_000);
-        assert_eq!(order.arrive(&frame(11, 80)), Arrival::Next { missing: 2 });
+        assert_eq!(order.arrive(&frame(11, 80)), FrameOrderOutcome::Next { missing: 2 });
         assert_eq!(order.period_nanos(), 20_000_000);
     }
 
@@ -103,13 +103,13 @@ mod tests {
     fn repeated_frames_are_refused_until_the_source_counts_anew() {
         let mut order = FrameOrder::default();
         order.arrive(&frame(100, 0));
-        assert_eq!(order.arrive(&frame(100, 0)), Arrival::Repeated);
-        assert_eq!(order.arrive(&frame(99, 50)), Arrival::Repeated);
-        assert_eq!(order.arrive(&frame(101, 33)), Arrival::Next { missing: 0 });
+        assert_eq!(order.arrive(&frame(100, 0)), FrameOrderOutcome::Repeated);
+        assert_eq!(order.arrive(&frame(99, 50)), FrameOrderOutcome::Repeated);
+        assert_eq!(order.arrive(&frame(101, 33)), FrameOrderOutcome::Next { missing: 0 });
         let mut arrivals = (0..10).map(|i| order.arrive(&frame(i, 1000 + 33 * i as i64)));
-        assert!(arrivals.by_ref().take(9).all(|arrival| arrival == Arrival::Repeated));
-        assert_eq!(arrivals.next(), Some(Arrival::Renumbered));
-        assert_eq!(order.arrive(&frame(10, 1330)), Arrival::Next { missing: 0 });
+        assert!(arrivals.by_ref().take(9).all(|arrival| arrival == FrameOrderOutcome::Repeated));
+        assert_eq!(arrivals.next(), Some(FrameOrderOutcome::Renumbered));
+        assert_eq!(order.arrive(&frame(10, 1330)), FrameOrderOutcome::Next { missing: 0 });
     }
 
     #[test]
@@ -117,12 +117,12 @@ mod tests {
         let mut order = FrameOrder::default();
         order.arrive(&frame(0, 0));
         order.arrive(&frame(1, 40));
-        assert_eq!(order.arrive(&frame(2, 3_600_000)), Arrival::ClockJump);
-        assert_eq!(order.arrive(&frame(3, -5)), Arrival::ClockJump);
+        assert_eq!(order.arrive(&frame(2, 3_600_000)), FrameOrderOutcome::ClockJump);
+        assert_eq!(order.arrive(&frame(3, -5)), FrameOrderOutcome::ClockJump);
         assert_eq!(order.period_nanos(), 40_000_000);
         let hostile = FrameHeader { sequence: u64::MAX, capture_nanos: i64::MAX, ..frame(0, 0) };
-        assert_eq!(order.arrive(&hostile), Arrival::ClockJump);
+        assert_eq!(order.arrive(&hostile), FrameOrderOutcome::ClockJump);
         let back = FrameHeader { sequence: u64::MAX, capture_nanos: i64::MIN, ..frame(0, 0) };
-        assert_eq!(order.arrive(&back), Arrival::Repeated);
+        assert_eq!(order.arrive(&back), FrameOrderOutcome::Repeated);
     }
 }

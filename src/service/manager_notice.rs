@@ -53,7 +53,7 @@ impl Heartbeat {
 }
 
 impl ManagerNotice {
-    /// The manager that the environment names. A name that is none is a warning: the process is wanted
+    /// The manager that the environment names. An invalid name is a warning: the process is wanted
     /// more than its manager's knowledge of it.
     pub fn from_environment() -> Self {
         let variable = |name: &str| std::env::var(name).ok().filter(|value| !value.is_empty());

@@ -12,7 +12,7 @@ use crate::service::checkpoint::Kept;
 use crate::service::child::is_supervised;
 use crate::service::clock::now_nanos;
 use crate::service::config::Config;
-use crate::service::frame_order::{Arrival, FrameOrder, SILENCE};
+use crate::service::frame_order::{FrameOrder, FrameOrderOutcome, SILENCE};
 use crate::service::health::{Health, ProcessState};
 use crate::service::map_folder::session::{MapSession, MapSessionError};
 use crate::service::mapper::going_over::GoneOver;
@@ -260,15 +260,19 @@ impl<'a> Shell<'a> {
         self.last_arrival_nanos = Some(now_nanos());
         let arrival = self.order.arrive(&header);
         match arrival {
-            Arrival::Next { missing } => self.missing = self.missing.saturating_add(missing),
-            Arrival::ClockJump | Arrival::Renumbered | Arrival::Repeated => {
+            FrameOrderOutcome::Next { missing } => {
+                self.missing = self.missing.saturating_add(missing)
+            }
+            FrameOrderOutcome::ClockJump
+            | FrameOrderOutcome::Renumbered
+            | FrameOrderOutcome::Repeated => {
                 self.health.counters().disordered += 1;
             }
         }
-        if arrival == Arrival::Renumbered {
+        if arrival == FrameOrderOutcome::Renumbered {
             self.pairing.restart();
         }
-        if arrival != Arrival::Repeated {
+        if arrival != FrameOrderOutcome::Repeated {
             self.pairing.push_frame(header.sequence, frame);
         }
     }

@@ -144,7 +144,7 @@ pub enum Refusal {
     },
 }
 
-/// The scheduling that is in force, as the kernel tells it.
+/// The scheduling in effect, as the kernel reports it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct InForce {
     /// Policy of the calling thread; `None` where it is none that we know.

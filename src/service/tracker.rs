@@ -6,7 +6,7 @@ use crate::service::budget::IterationCosts;
 use crate::service::clock::now_nanos;
 use crate::service::config::Config;
 use crate::service::early_wake::Watch;
-use crate::service::frame_order::{Arrival, FrameOrder, SILENCE};
+use crate::service::frame_order::{FrameOrder, FrameOrderOutcome, SILENCE};
 use crate::service::health::{Health, ProcessState};
 use crate::service::mode::Mode;
 use crate::service::reference_feed::ReferenceFeed;
@@ -269,12 +269,14 @@ impl<'a> Shell<'a> {
         let arrival = self.order.arrive(header);
         let counters = self.health.counters();
         match arrival {
-            Arrival::Next { missing } => counters.dropped += missing,
-            Arrival::ClockJump | Arrival::Renumbered | Arrival::Repeated => {
+            FrameOrderOutcome::Next { missing } => counters.dropped += missing,
+            FrameOrderOutcome::ClockJump
+            | FrameOrderOutcome::Renumbered
+            | FrameOrderOutcome::Repeated => {
                 counters.disordered += 1;
             }
         }
-        arrival != Arrival::Repeated
+        arrival != FrameOrderOutcome::Repeated
     }
 
     /// Live: says it when frames have stopped coming. The next frame ends the state.

@@ -29,7 +29,7 @@ pub struct KeyframeInbox {
 }
 
 impl KeyframeInbox {
-    /// Opens it; a keyframe that is already in force comes too.
+    /// Opens it; the active keyframe comes at once.
     pub fn open(hub: &Hub) -> Result<Self, OpenError> {
         let depths = hub.subscriber(&KEYFRAME)?;
         let images = hub.subscriber(&KEYFRAME_IMAGE)?;

@@ -12,7 +12,7 @@ const TILE_PX: usize = 16;
 
 /// A block that may be seen, and the least depth at which it may be, metres.
 #[derive(Debug, Clone, Copy)]
-pub struct Candidate {
+pub struct NearBlock {
     /// Index into [`Scene::blocks`].
     pub block: u32,
     /// No ray meets it nearer than this.
@@ -25,8 +25,8 @@ pub struct TileLists {
     columns: usize,
     /// Start of each tile's part of `blocks`, and the end of the last.
     starts: Vec<usize>,
-    blocks: Vec<Candidate>,
-    boxes: Vec<(Candidate, Bounds)>,
+    blocks: Vec<NearBlock>,
+    boxes: Vec<(NearBlock, Bounds)>,
 }
 
 /// Bounds in x and y at z = 1.
@@ -54,7 +54,7 @@ impl Bounds {
 impl TileLists {
     /// Blocks that the ray of a pixel can meet.
     #[inline]
-    pub fn of_pixel(&self, u: usize, v: usize) -> &[Candidate] {
+    pub fn of_pixel(&self, u: usize, v: usize) -> &[NearBlock] {
         let tile = v / TILE_PX * self.columns + u / TILE_PX;
         &self.blocks[self.starts[tile]..self.starts[tile + 1]]
     }
@@ -96,7 +96,7 @@ impl TileLists {
                 nearest = nearest.min(include_block(block, &pose.inverse(), &mut bounds));
             }
             if nearest < f32::INFINITY {
-                self.boxes.push((Candidate { block: index as u32, nearest }, bounds));
+                self.boxes.push((NearBlock { block: index as u32, nearest }, bounds));
             }
         }
         self.boxes

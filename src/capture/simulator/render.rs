@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use crate::capture::simulator::cull::{Candidate, TileLists};
+use crate::capture::simulator::cull::{NearBlock, TileLists};
 use crate::capture::simulator::lens::{Lens, Ray};
 use crate::capture::simulator::scene::{Block, Scene};
 use crate::capture::simulator::texture::Footprint;
@@ -279,7 +279,7 @@ struct Share {
 
 /// The nearest surface along a ray among the blocks `near`, which are sorted by nearest depth.
 #[inline]
-fn first_hit(locals: &[LocalView], near: &[Candidate], x: f32, y: f32) -> Hit {
+fn first_hit(locals: &[LocalView], near: &[NearBlock], x: f32, y: f32) -> Hit {
     let (mut depth, mut block) = (f32::INFINITY, 0);
     for candidate in near {
         if candidate.nearest > depth {

@@ -28,7 +28,7 @@ const WHITE_BALANCE_TEMPERATURE: u32 = 0x0098_091a;
 const FOCUS_AUTO: u32 = 0x009a_090c;
 /// `V4L2_CID_FOCUS_ABSOLUTE`.
 const FOCUS_ABSOLUTE: u32 = 0x009a_090a;
-/// `V4L2_CTRL_FLAG_VOLATILE`: the device changes the value, and reading gives what is in force.
+/// `V4L2_CTRL_FLAG_VOLATILE`: the device changes the value, and reading gives its present value.
 const VOLATILE: u32 = 0x80;
 
 /// Microseconds of one step of the exposure control.

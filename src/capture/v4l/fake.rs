@@ -1,4 +1,4 @@
-//! A camera that is none: what it offers, gives and refuses is told by the test.
+//! A fake camera: the test says what it offers, delivers and refuses.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::os::fd::BorrowedFd;

@@ -68,7 +68,7 @@ pub struct ControlReport {
     pub step: i32,
     /// Value after plugging in.
     pub default: i32,
-    /// Value in force, where it can be read.
+    /// Present value, where it can be read.
     pub value: Option<i32>,
     /// Whether it cannot be set now: it is read-only, or an automatic has it.
     pub fixed: bool,

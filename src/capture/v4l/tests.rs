@@ -1,4 +1,4 @@
-//! A camera that is none as a source of frames.
+//! A fake camera as a source of frames.
 
 use std::os::fd::AsFd;
 

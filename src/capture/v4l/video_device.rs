@@ -1,5 +1,5 @@
 //! What a capture device does, call by call. The kernel's devices are those of `device.rs`;
-//! everything that decides works on this trait and is tested with a device that is none.
+//! everything that decides works on this trait and is tested with a fake device.
 
 use std::fmt;
 use std::os::fd::BorrowedFd;

@@ -47,7 +47,7 @@ use crate::service::results::summary::Summary;
 use crate::service::results::untracked::StartTally;
 use crate::service::trajectory_file::write_trajectory;
 use crate::slam::evaluation::depth_error::DepthScale;
-use crate::slam::evaluation::umeyama::Alignment;
+use crate::slam::evaluation::umeyama::TrajectoryAlignment;
 use crate::slam::evaluation::{MAX_DIFFERENCE_NANOS, TrajectoryEvaluation, evaluate_trajectory};
 use crate::slam::map::Map;
 use crate::slam::mapper::consistency::Contradiction;
@@ -70,7 +70,7 @@ pub enum RunMode {
 /// A pose as the tracker gave it, with what it cost.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RecordedPose {
-    /// The tracker's word.
+    /// The tracking result.
     pub estimate: PoseEstimate,
     /// From the frame's stamp to the publication; `None` where stamps are of another clock.
     pub latency_nanos: Option<u64>,
@@ -193,12 +193,12 @@ pub struct ResultsParams {
     /// to a tenth of its distance; larger values keep more points and more outliers.
     pub max_relative_std_dev: f64,
     /// What is fitted before positions are compared with the ground truth: `sim3`, `se3` or `none`.
-    pub alignment: Alignment,
+    pub alignment: TrajectoryAlignment,
 }
 
 impl Default for ResultsParams {
     fn default() -> Self {
-        Self { max_relative_std_dev: 0.1, alignment: Alignment::Sim3 }
+        Self { max_relative_std_dev: 0.1, alignment: TrajectoryAlignment::Sim3 }
     }
 }
 

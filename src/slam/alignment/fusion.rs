@@ -14,7 +14,7 @@ use crate::slam::keyframe::{DepthPoint, MAX_KEYFRAME_POINTS};
 
 /// One pixel with depth on some level.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Candidate {
+pub struct LevelPoint {
     /// Column on its level.
     pub u: u16,
     /// Row on its level.
@@ -30,7 +30,7 @@ pub struct Candidate {
 /// All pixels with depth of one level, row by row on the levels above 0.
 #[derive(Debug, Clone, Default)]
 pub struct Candidates {
-    points: Vec<Candidate>,
+    points: Vec<LevelPoint>,
 }
 
 impl Candidates {
@@ -45,12 +45,12 @@ impl Candidates {
     }
 
     /// One of them.
-    pub fn get(&self, index: usize) -> Candidate {
+    pub fn get(&self, index: usize) -> LevelPoint {
         self.points[index]
     }
 
     /// All of them.
-    pub fn as_slice(&self) -> &[Candidate] {
+    pub fn as_slice(&self) -> &[LevelPoint] {
         &self.points
     }
 
@@ -63,7 +63,7 @@ impl Candidates {
                 return None;
             }
             sum += f64::from(point.inverse_depth);
-            Some(Candidate {
+            Some(LevelPoint {
                 u: point.u,
                 v: point.v,
                 inverse_depth: point.inverse_depth,
@@ -93,7 +93,7 @@ const JUMP_SIGMAS: f32 = 3.0;
 struct Front(u64);
 
 impl Front {
-    fn of(child: &Candidate) -> Self {
+    fn of(child: &LevelPoint) -> Self {
         let bits = |value: f32| u64::from(value.to_bits());
         Self(bits(child.inverse_depth) << 32 | bits(child.noise))
     }
@@ -112,7 +112,7 @@ impl Front {
     }
 
     /// Whether depth jumps from here back to `child`.
-    fn hides(self, child: &Candidate) -> bool {
+    fn hides(self, child: &LevelPoint) -> bool {
         let nearest = self.inverse_depth();
         let step = nearest - child.inverse_depth - JUMP_RATIO * nearest;
         step > 0.0 && step * step > JUMP_SIGMAS * JUMP_SIGMAS * (child.noise + self.noise())
@@ -133,7 +133,7 @@ struct Cell {
 }
 
 impl Cell {
-    fn add(&mut self, child: &Candidate) {
+    fn add(&mut self, child: &LevelPoint) {
         let information = 1.0 / child.variance;
         self.information += information;
         self.weighted += information * child.inverse_depth;
@@ -234,7 +234,7 @@ impl Cells {
     }
 
     /// The cell of a child; an odd row or column at the end has none.
-    fn cell_of(&self, child: &Candidate) -> Option<usize> {
+    fn cell_of(&self, child: &LevelPoint) -> Option<usize> {
         let (u, v) = (usize::from(child.u / 2), usize::from(child.v / 2));
         (u < self.width && v < self.height).then(|| (v + 1) * self.stride() + u + 1)
     }
@@ -282,11 +282,11 @@ impl Cells {
 
     /// Adds a child to its cell; false where it lies behind a jump and is not added.
     #[inline(always)]
-    fn add(&mut self, child: &Candidate) -> bool {
+    fn add(&mut self, child: &LevelPoint) -> bool {
         let Some(index) = self.cell_of(child) else { return true };
         let stride = self.stride();
         // Only the neighbours that touch the child, not those across its parent; by arithmetic,
-        // because a branch on the side would be foretold wrong half of the time.
+        // because a branch on the side would be mispredicted half of the time.
         let beside = index + 2 * usize::from(child.u % 2) - 1;
         let across = index + 2 * usize::from(child.v % 2) * stride - stride;
         let hides = |index: usize| self.fronts[index].hides(child);
@@ -345,7 +345,7 @@ impl Cells {
                 continue;
             }
             let variance = cell.children / cell.information;
-            coarse.points.push(Candidate {
+            coarse.points.push(LevelPoint {
                 u: filled.u,
                 v: filled.v,
                 inverse_depth: cell.inverse_depth,

@@ -6,7 +6,7 @@
 //! and translation look alike (7 % on a plane with 10 % of noise). A Jacobian from the neighbours' depth, an instrumental variable, has the
 //! same zero without that pull, whatever the noise and however large it is believed to be.
 
-use crate::slam::alignment::fusion::{Candidate, Candidates};
+use crate::slam::alignment::fusion::{Candidates, LevelPoint};
 
 /// Side of a tile, pixels of the level: wide enough that the neighbours whose noise a point shares
 /// are few of many, and surfaces bend little within.
@@ -57,7 +57,7 @@ impl Surroundings {
     }
 
     /// Mean inverse depth around `candidate`, one of those measured, without its own.
-    pub fn without(&self, candidate: &Candidate) -> f32 {
+    pub fn without(&self, candidate: &LevelPoint) -> f32 {
         let tile = self.tiles.get(self.tile_of(candidate)).copied().unwrap_or_default();
         let own = 1.0 / candidate.variance;
         // Rounding must not leave a rest where the point is alone.
@@ -72,7 +72,7 @@ impl Surroundings {
         (others * mean + level * self.mean) / (others + level)
     }
 
-    fn tile_of(&self, candidate: &Candidate) -> usize {
+    fn tile_of(&self, candidate: &LevelPoint) -> usize {
         usize::from(candidate.v) / TILE_PX * self.columns + usize::from(candidate.u) / TILE_PX
     }
 }

@@ -5,33 +5,37 @@
 
 use std::ops::Range;
 
-use crate::slam::depth::map::Arrival;
-use crate::slam::depth::propagation::Way;
+use crate::slam::depth::map::Reprojected;
+use crate::slam::depth::propagation::Reprojection;
 
-/// A version of [`Way::carry_rows`].
-pub(super) type CarryingKernel = fn(&Way<'_>, Range<usize>, &mut Vec<Arrival>);
+/// A version of [`Reprojection::carry_rows`].
+pub(super) type CarryingKernel = fn(&Reprojection<'_>, Range<usize>, &mut Vec<Reprojected>);
 
 /// The best version for this processor.
 pub(super) fn carrying_kernel() -> CarryingKernel {
     #[cfg(target_arch = "x86_64")]
     if std::arch::is_x86_feature_detected!("avx2") {
-        return |way, rows, arrivals| {
+        return |way, rows, reprojected| {
             // SAFETY: the processor has AVX2, as was just asked.
-            unsafe { carry_rows_avx2(way, rows, arrivals) }
+            unsafe { carry_rows_avx2(way, rows, reprojected) }
         };
     }
     carry_rows_portable
 }
 
 /// The explanation of the others.
-fn carry_rows_portable(way: &Way<'_>, rows: Range<usize>, arrivals: &mut Vec<Arrival>) {
-    way.carry_rows(rows, arrivals)
+fn carry_rows_portable(
+    way: &Reprojection<'_>,
+    rows: Range<usize>,
+    reprojected: &mut Vec<Reprojected>,
+) {
+    way.carry_rows(rows, reprojected)
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn carry_rows_avx2(way: &Way<'_>, rows: Range<usize>, arrivals: &mut Vec<Arrival>) {
-    way.carry_rows(rows, arrivals)
+fn carry_rows_avx2(way: &Reprojection<'_>, rows: Range<usize>, reprojected: &mut Vec<Reprojected>) {
+    way.carry_rows(rows, reprojected)
 }
 
 #[cfg(test)]
@@ -62,7 +66,7 @@ mod tests {
         }
         let params = PropagationParams::default();
         let view = TwoView::new(&CAMERA, &new_from_old);
-        let way = Way::new(&maps[0], &maps[1], view, (1.02, -1.0), &params);
+        let way = Reprojection::new(&maps[0], &maps[1], view, (1.02, -1.0), &params);
         let rows = BORDER_PX..CAMERA.height - BORDER_PX;
         let (mut portable, mut fast) = (Vec::new(), Vec::new());
         carry_rows_portable(&way, rows.clone(), &mut portable);

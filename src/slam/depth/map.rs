@@ -226,11 +226,11 @@ pub struct DepthMap {
     /// Σ (g_u², g_u g_v, g_v²) over the matching pattern around each candidate.
     pub structure: Image<[f32; 3]>,
     /// Memory for what arrives from the keyframe before, by band of its rows.
-    pub(super) arrivals: Vec<Vec<Arrival>>,
+    pub(super) reprojected: Vec<Vec<Reprojected>>,
 }
 
 /// A hypothesis on its way to a pixel of this place in the image.
-pub(super) type Arrival = (u32, Hypothesis);
+pub(super) type Reprojected = (u32, Hypothesis);
 
 impl DepthMap {
     /// An empty map for images of this size.
@@ -240,7 +240,7 @@ impl DepthMap {
             hypotheses: Image::filled(width, height, Hypothesis::NONE),
             candidates: Image::filled(width, height, false),
             structure: Image::filled(width, height, [0.0; 3]),
-            arrivals: Vec::new(),
+            reprojected: Vec::new(),
         }
     }
 

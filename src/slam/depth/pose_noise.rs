@@ -23,7 +23,7 @@ pub fn pose_noise_px(intrinsics: &Intrinsics, covariance: &[f64; 21]) -> f64 {
         variance += quadratic_form(covariance, &along_u) + quadratic_form(covariance, &along_v);
     }
     let places = (PLACES.len() * PLACES.len()) as f64;
-    // A covariance that is none must not pass for that of an exact pose.
+    // An invalid covariance must not pass for that of an exact pose.
     if variance.is_finite() { (variance / (2.0 * places)).max(0.0).sqrt() } else { f64::INFINITY }
 }
 

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use crate::slam::depth::carrying_kernel::carrying_kernel;
 use crate::slam::depth::epipolar::{MIN_DEPTH_RATIO, TwoView};
 use crate::slam::depth::map::{
-    Arrival, BAND_ROWS, BORDER_PX, DepthMap, Hypothesis, KnownColumns, for_each_known,
+    BAND_ROWS, BORDER_PX, DepthMap, Hypothesis, KnownColumns, Reprojected, for_each_known,
 };
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
@@ -65,27 +65,27 @@ pub fn propagate(
     params: &PropagationParams,
 ) {
     let height = source.image.height();
-    let mut arrivals = std::mem::take(&mut target.arrivals);
-    arrivals.resize_with(height.div_ceil(BAND_ROWS), Vec::new);
+    let mut reprojected = std::mem::take(&mut target.reprojected);
+    reprojected.resize_with(height.div_ceil(BAND_ROWS), Vec::new);
     let view = TwoView::new(intrinsics, target_from_source);
     let brighter = (brightness.a.exp() as f32, brightness.b as f32);
-    let way = Way::new(source, target, view, brighter, params);
+    let way = Reprojection::new(source, target, view, brighter, params);
     let carry_rows = carrying_kernel();
-    arrivals.par_iter_mut().enumerate().for_each(|(band, arrivals)| {
-        arrivals.clear();
+    reprojected.par_iter_mut().enumerate().for_each(|(band, reprojected)| {
+        reprojected.clear();
         let (first, end) = (band * BAND_ROWS, (band + 1) * BAND_ROWS);
-        carry_rows(&way, first.max(BORDER_PX)..end.min(height - BORDER_PX), arrivals);
+        carry_rows(&way, first.max(BORDER_PX)..end.min(height - BORDER_PX), reprojected);
     });
     // In the order of the source's rows: who comes first to a pixel matters there.
     let present = target.hypotheses.pixels_mut();
-    for &(index, arriving) in arrivals.iter().flatten() {
+    for &(index, arriving) in reprojected.iter().flatten() {
         settle(&mut present[index as usize], arriving);
     }
-    target.arrivals = arrivals;
+    target.reprojected = reprojected;
 }
 
 /// What a hypothesis needs on its way from one keyframe to the next.
-pub(super) struct Way<'a> {
+pub(super) struct Reprojection<'a> {
     source: &'a DepthMap,
     target: &'a DepthMap,
     view: TwoView,
@@ -108,7 +108,7 @@ struct Places {
     inside: [bool; LANES],
 }
 
-impl<'a> Way<'a> {
+impl<'a> Reprojection<'a> {
     /// The way between two maps, seen like this; brightness grows by a gain and an offset.
     pub(super) fn new(
         source: &'a DepthMap,
@@ -122,7 +122,7 @@ impl<'a> Way<'a> {
 
     /// Carries the hypotheses of some source rows, in their order.
     #[inline(always)]
-    pub(super) fn carry_rows(&self, rows: Range<usize>, arrivals: &mut Vec<Arrival>) {
+    pub(super) fn carry_rows(&self, rows: Range<usize>, reprojected: &mut Vec<Reprojected>) {
         let mut columns = KnownColumns::default();
         for v in rows {
             let hypotheses = self.source.hypotheses.row(v);
@@ -130,7 +130,7 @@ impl<'a> Way<'a> {
                 for columns in known.chunks(LANES) {
                     let places = self.project(hypotheses, columns, v);
                     let inside = columns.iter().enumerate().filter(|(k, _)| places.inside[*k]);
-                    arrivals.extend(inside.filter_map(|(k, &u)| {
+                    reprojected.extend(inside.filter_map(|(k, &u)| {
                         let u = usize::from(u);
                         self.arrive(
                             &hypotheses[u],
@@ -190,7 +190,7 @@ impl<'a> Way<'a> {
         intensity: f32,
         places: &Places,
         k: usize,
-    ) -> Option<Arrival> {
+    ) -> Option<Reprojected> {
         let (image, params) = (&self.target.image, self.params);
         let (u, v) = (places.u[k], places.v[k]);
         // Through i32: what is inside fits, and the conversion is a single instruction.

@@ -93,7 +93,7 @@ mod tests {
     const WIDTH: usize = 320;
     const HEIGHT: usize = 240;
     const FOCAL: f64 = 300.0;
-    /// Way to the right from keyframe to keyframe, of the depth: 9 pixels.
+    /// Step to the right from keyframe to keyframe, as a share of the depth: 9 pixels.
     const STEP: f64 = 0.03;
 
     /// Texture of a wall at depth 1.

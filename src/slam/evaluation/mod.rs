@@ -27,7 +27,7 @@ use crate::slam::evaluation::statistics::ErrorStatistics;
 use crate::slam::evaluation::trajectory_error::{
     absolute_errors, path_length, relative_errors, successive_pairs, timed_pairs,
 };
-use crate::slam::evaluation::umeyama::{Alignment, AlignmentError, umeyama};
+use crate::slam::evaluation::umeyama::{AlignmentError, TrajectoryAlignment, umeyama};
 use crate::slam::evaluation::windows::{scale_windows, window_error};
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::trajectory::StampedPose;
@@ -102,7 +102,7 @@ pub struct TrajectoryEvaluation {
 pub fn evaluate_trajectory(
     estimate: &[StampedPose],
     truth: &[StampedPose],
-    alignment: Alignment,
+    alignment: TrajectoryAlignment,
     max_difference_nanos: i64,
 ) -> Result<TrajectoryEvaluation, EvaluationError> {
     check_finite(estimate, "estimate")?;
@@ -184,7 +184,8 @@ mod tests {
         let similarity = Sim3::new(SE3::exp(&Vector6::new(1.0, -2.0, 0.5, 0.3, 0.9, -1.2)), 0.25);
         let estimate = transformed(&truth, &similarity);
         let result =
-            evaluate_trajectory(&estimate, &truth, Alignment::Sim3, MAX_DIFFERENCE_NANOS).unwrap();
+            evaluate_trajectory(&estimate, &truth, TrajectoryAlignment::Sim3, MAX_DIFFERENCE_NANOS)
+                .unwrap();
         assert!(result.ate.max < 1e-9);
         assert!((result.alignment.scale - 4.0).abs() < 1e-9);
         assert!(result.rpe_translation.max < 1e-9 && result.rpe_rotation_deg.max < 1e-5);
@@ -192,7 +193,8 @@ mod tests {
         assert!((result.window_scale_ratio.unwrap() - 1.0).abs() < 1e-9);
         assert!(result.window_error.unwrap() < 1e-9);
         let rigid =
-            evaluate_trajectory(&estimate, &truth, Alignment::SE3, MAX_DIFFERENCE_NANOS).unwrap();
+            evaluate_trajectory(&estimate, &truth, TrajectoryAlignment::SE3, MAX_DIFFERENCE_NANOS)
+                .unwrap();
         assert_eq!(rigid.alignment.scale, 1.0);
         assert!(rigid.ate.rmse > 0.1);
     }
@@ -205,7 +207,8 @@ mod tests {
             pose.world_from_camera.translation *= if i < 100 { 1.0 } else { 2.0 };
         }
         let result =
-            evaluate_trajectory(&estimate, &truth, Alignment::Sim3, MAX_DIFFERENCE_NANOS).unwrap();
+            evaluate_trajectory(&estimate, &truth, TrajectoryAlignment::Sim3, MAX_DIFFERENCE_NANOS)
+                .unwrap();
         assert!((result.window_scale_ratio.unwrap() - 2.0).abs() < 1e-9);
         assert!(result.window_error.unwrap() < 1e-9);
         assert!(result.ate.rmse > 0.05);
@@ -215,7 +218,7 @@ mod tests {
     fn hostile_input_is_an_error_and_never_a_panic() {
         let truth = path(40);
         let evaluate = |estimate: &[StampedPose], truth: &[StampedPose]| {
-            evaluate_trajectory(estimate, truth, Alignment::Sim3, MAX_DIFFERENCE_NANOS)
+            evaluate_trajectory(estimate, truth, TrajectoryAlignment::Sim3, MAX_DIFFERENCE_NANOS)
         };
         assert!(matches!(evaluate(&[], &truth), Err(EvaluationError::TooFewMatches { .. })));
         assert!(matches!(evaluate(&truth, &[]), Err(EvaluationError::TooFewMatches { .. })));

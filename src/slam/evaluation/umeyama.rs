@@ -10,7 +10,7 @@ use crate::slam::trajectory::StampedPose;
 /// What may be fitted before positions are compared.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Alignment {
+pub enum TrajectoryAlignment {
     /// Rotation, translation and scale: for monocular maps.
     #[default]
     Sim3,
@@ -20,7 +20,7 @@ pub enum Alignment {
     None,
 }
 
-impl Alignment {
+impl TrajectoryAlignment {
     /// Matches below which the alignment is not fixed.
     pub fn poses_needed(self) -> usize {
         match self {
@@ -56,9 +56,9 @@ const STILL_RATIO: f64 = 1e-9;
 pub fn umeyama(
     estimate: &[StampedPose],
     truth: &[StampedPose],
-    alignment: Alignment,
+    alignment: TrajectoryAlignment,
 ) -> Result<Sim3, AlignmentError> {
-    if alignment == Alignment::None {
+    if alignment == TrajectoryAlignment::None {
         return Ok(Sim3::identity());
     }
     let (x_mean, y_mean) = (mean_position(estimate), mean_position(truth));
@@ -78,12 +78,12 @@ pub fn umeyama(
     }
     let (rotation, trace) = rotation_and_trace(&covariance)?;
     let scale = match alignment {
-        Alignment::Sim3 => {
+        TrajectoryAlignment::Sim3 => {
             check_moves(x_variance, &x_mean, "estimate")?;
             check_moves(y_variance, &y_mean, "ground truth")?;
             trace / x_variance
         }
-        Alignment::SE3 | Alignment::None => 1.0,
+        TrajectoryAlignment::SE3 | TrajectoryAlignment::None => 1.0,
     };
     if !(scale.is_finite() && scale > 0.0) {
         return Err(AlignmentError::NoScale);
@@ -149,7 +149,7 @@ mod tests {
     fn a_mirrored_copy_is_not_met_by_a_reflection() {
         let x = poses(&[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 3.0]]);
         let y = poses(&[[0.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 3.0]]);
-        let fit = umeyama(&x, &y, Alignment::Sim3).unwrap();
+        let fit = umeyama(&x, &y, TrajectoryAlignment::Sim3).unwrap();
         assert!((fit.rigid.rotation_matrix().determinant() - 1.0).abs() < 1e-12);
         assert!(fit.scale < 1.0);
     }
@@ -158,7 +158,7 @@ mod tests {
     fn positions_on_a_line_are_met_exactly() {
         let x = poses(&[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [3.0, 0.0, 0.0]]);
         let y = poses(&[[5.0, 0.0, 0.0], [5.0, 2.0, 0.0], [5.0, 6.0, 0.0]]);
-        let fit = umeyama(&x, &y, Alignment::Sim3).unwrap();
+        let fit = umeyama(&x, &y, TrajectoryAlignment::Sim3).unwrap();
         for (a, b) in x.iter().zip(&y) {
             let error = fit * a.world_from_camera.translation - b.world_from_camera.translation;
             assert!(error.norm() < 1e-12);
@@ -169,8 +169,11 @@ mod tests {
     fn standing_still_has_no_scale_but_a_place() {
         let x = poses(&[[1e6, 0.0, 0.0], [1e6, 0.0, 0.0], [1e6, 0.0, 0.0]]);
         let y = poses(&[[0.0, 1.0, 0.0], [0.0, 2.0, 0.0], [0.0, 3.0, 0.0]]);
-        assert_eq!(umeyama(&x, &y, Alignment::Sim3), Err(AlignmentError::StandsStill("estimate")));
-        let place = umeyama(&x, &y, Alignment::SE3).unwrap();
+        assert_eq!(
+            umeyama(&x, &y, TrajectoryAlignment::Sim3),
+            Err(AlignmentError::StandsStill("estimate"))
+        );
+        let place = umeyama(&x, &y, TrajectoryAlignment::SE3).unwrap();
         assert!((place * Vector3::new(1e6, 0.0, 0.0) - Vector3::new(0.0, 2.0, 0.0)).norm() < 1e-6);
     }
 }

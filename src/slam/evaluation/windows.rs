@@ -2,7 +2,7 @@
 
 use crate::slam::evaluation::statistics::median;
 use crate::slam::evaluation::trajectory_error::absolute_errors;
-use crate::slam::evaluation::umeyama::{Alignment, umeyama};
+use crate::slam::evaluation::umeyama::{TrajectoryAlignment, umeyama};
 use crate::slam::trajectory::StampedPose;
 
 /// Matches of a window whose scale is measured: 3 s at 30 Hz, long enough for a walk to fix it.
@@ -26,7 +26,7 @@ pub fn scale_windows(estimate: &[StampedPose], truth: &[StampedPose]) -> Vec<(us
     let scale = |first: usize| {
         let window = first..first + SCALE_WINDOW;
         let (e, t) = (estimate.get(window.clone())?, truth.get(window)?);
-        umeyama(e, t, Alignment::Sim3).ok().map(|fit| (first, fit.scale))
+        umeyama(e, t, TrajectoryAlignment::Sim3).ok().map(|fit| (first, fit.scale))
     };
     starts(estimate.len(), SCALE_WINDOW).filter_map(scale).collect()
 }
@@ -44,14 +44,18 @@ pub fn scale_ratio(window_scales: &[(usize, f64)]) -> Option<f64> {
 pub fn window_error(
     estimate: &[StampedPose],
     truth: &[StampedPose],
-    alignment: Alignment,
+    alignment: TrajectoryAlignment,
 ) -> Option<f64> {
     median(&shape_errors(estimate, truth, alignment))
 }
 
 /// Position errors in windows of [`SHAPE_WINDOW`] matches up to the last one, each window aligned by itself and each
 /// match counted once.
-fn shape_errors(estimate: &[StampedPose], truth: &[StampedPose], alignment: Alignment) -> Vec<f64> {
+fn shape_errors(
+    estimate: &[StampedPose],
+    truth: &[StampedPose],
+    alignment: TrajectoryAlignment,
+) -> Vec<f64> {
     let mut errors = Vec::with_capacity(estimate.len());
     let mut counted = 0;
     for first in starts(estimate.len(), SHAPE_WINDOW) {
@@ -103,7 +107,7 @@ mod tests {
         // The last 10 of 40 matches are off, which only a window up to the end can show.
         let off = |i: usize| if i < 30 { 1.0 } else { 1.0 + 0.1 * (i % 2) as f64 };
         let (estimate, truth) = walk(40, off);
-        let errors = shape_errors(&estimate, &truth, Alignment::Sim3);
+        let errors = shape_errors(&estimate, &truth, TrajectoryAlignment::Sim3);
         assert_eq!(errors.len(), 40);
         assert!(errors[..30].iter().all(|error| *error < 1e-9), "{errors:?}");
         assert!(errors[30..].iter().all(|error| *error > 1e-4), "{errors:?}");

@@ -7,7 +7,7 @@ use nalgebra::UnitQuaternion;
 
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::Keyframe;
-use crate::slam::places::{Candidate, Description, PlaceIndex};
+use crate::slam::places::{Description, PlaceCandidate, PlaceIndex};
 
 /// What keyframes look like.
 #[derive(Debug, Clone, Default)]
@@ -84,7 +84,7 @@ impl Likeness {
         for candidate in found.into_iter().filter(|of| of.score >= least) {
             let Some(at) = place(candidate.keyframe_id) else { continue };
             if chosen.len() < most && chosen.iter().all(|(other, _)| other.abs_diff(at) > BESIDE) {
-                let Candidate { keyframe_id, score, .. } = candidate;
+                let PlaceCandidate { keyframe_id, score, .. } = candidate;
                 let rotation = candidate.rotation(camera);
                 chosen.push((at, Alike { keyframe_id, score, rotation }));
             }

@@ -18,7 +18,7 @@ const MOST_ARRANGED: usize = 30;
 
 /// A keyframe that may show what an image does.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Candidate {
+pub struct PlaceCandidate {
     /// The keyframe.
     pub keyframe_id: u64,
     /// Features that both show, in the same arrangement.
@@ -32,7 +32,7 @@ pub struct Candidate {
     pub keyframe_pixel: [f32; 2],
 }
 
-impl Candidate {
+impl PlaceCandidate {
     /// `keyframe_from_image`: lays the pixels that show the same on each other, with the turn in the image's plane.
     pub fn rotation(&self, camera: &Intrinsics) -> UnitQuaternion<f64> {
         let ray = |[u, v]: [f32; 2]| {
@@ -149,7 +149,7 @@ impl PlaceIndex {
         description: &Description,
         most: usize,
         excluded: impl Fn(u64) -> bool,
-    ) -> Vec<Candidate> {
+    ) -> Vec<PlaceCandidate> {
         let is_excluded: Vec<bool> =
             self.slots.iter().map(|slot| slot.is_removed || excluded(slot.keyframe_id)).collect();
         let mut matches = self.matches(description, &is_excluded);
@@ -173,7 +173,7 @@ impl PlaceIndex {
             .collect();
         found.sort_by_key(|(arrangement, slot)| std::cmp::Reverse((arrangement.agreeing, *slot)));
         found.truncate(most);
-        let candidate = |(arrangement, slot): (Arrangement, u32)| Candidate {
+        let candidate = |(arrangement, slot): (Arrangement, u32)| PlaceCandidate {
             keyframe_id: self.slots[slot as usize].keyframe_id,
             score: arrangement.agreeing as f32,
             turn_rad: arrangement.turn_rad,
@@ -252,7 +252,7 @@ mod tests {
         index
     }
 
-    fn ids(found: &[Candidate]) -> Vec<u64> {
+    fn ids(found: &[PlaceCandidate]) -> Vec<u64> {
         found.iter().map(|candidate| candidate.keyframe_id).collect()
     }
 

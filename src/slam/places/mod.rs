@@ -14,4 +14,4 @@ mod scales;
 mod tree;
 
 pub use description::{Describer, Description, Feature, FeaturePlace, MAX_FEATURES};
-pub use index::{Candidate, PlaceIndex};
+pub use index::{PlaceCandidate, PlaceIndex};

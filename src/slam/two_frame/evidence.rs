@@ -19,7 +19,7 @@ pub struct EvidenceParams {
     /// image (Engel, Koltun, Cremers 2018 latch there).
     pub min_translation: f64,
     /// Shortest translation with which a start can be proven early, in mean depths: 2 px at 640. The
-    /// earlier frames must confirm it; its depths are good to a tenth, and later frames mend them.
+    /// earlier frames must confirm it; its depths are good to a tenth, and later frames correct them.
     pub min_early_translation: f64,
     /// Earlier frames that an early start needs.
     pub min_early_witnesses: usize,

@@ -24,7 +24,7 @@ pub(super) const RIVAL_COSINE: f64 = 0.87;
 
 /// One start and where it came to.
 #[derive(Debug)]
-struct Hypothesis {
+struct MotionHypothesis {
     state: State,
     energy: f64,
     scratch: FitScratch,
@@ -42,7 +42,7 @@ pub struct Rival {
 /// The hypotheses of one frame, best first after a fit.
 #[derive(Debug)]
 pub struct Hypotheses {
-    all: Vec<Hypothesis>,
+    all: Vec<MotionHypothesis>,
     used: usize,
     /// How many of the first ones are results of the frame before.
     survivors: usize,
@@ -54,7 +54,7 @@ pub struct Hypotheses {
 impl Hypotheses {
     /// Memory for all of them; every state the same.
     pub fn new(state: &State) -> Self {
-        let empty = |_| Hypothesis {
+        let empty = |_| MotionHypothesis {
             state: state.clone(),
             energy: f64::INFINITY,
             scratch: FitScratch::default(),
@@ -81,12 +81,13 @@ impl Hypotheses {
         params: &FitParams,
     ) {
         self.propose(rotation, with_directions);
-        let fit_down_to = |finest: usize, from: usize, freedom, hypothesis: &mut Hypothesis| {
-            for level in (finest..from).rev() {
-                let (state, scratch) = (&mut hypothesis.state, &mut hypothesis.scratch);
-                hypothesis.energy = fit_level(input, level, freedom, state, scratch, params);
-            }
-        };
+        let fit_down_to =
+            |finest: usize, from: usize, freedom, hypothesis: &mut MotionHypothesis| {
+                for level in (finest..from).rev() {
+                    let (state, scratch) = (&mut hypothesis.state, &mut hypothesis.scratch);
+                    hypothesis.energy = fit_level(input, level, freedom, state, scratch, params);
+                }
+            };
         /// Level down to which every start is fitted: on 160 pixels across, one level coarser, a wrong
         /// minimum of a recording looks better than the right one.
         const COARSE_LEVEL: usize = 1;
@@ -112,8 +113,9 @@ impl Hypotheses {
     /// Puts that survivor first whose depths explain this frame and the earlier ones best.
     fn hear(&mut self, input: &FitInput<'_>, witnesses: &Witnesses, params: &FitParams) {
         self.heard = witnesses.len();
-        let together =
-            |h: &Hypothesis| h.energy + witnesses.energy(input, &h.state.inverse_depths, params);
+        let together = |h: &MotionHypothesis| {
+            h.energy + witnesses.energy(input, &h.state.inverse_depths, params)
+        };
         let (mut best, mut other) = (together(&self.all[0]), together(&self.all[1]));
         if other < best {
             self.all.swap(0, 1);
@@ -186,7 +188,7 @@ impl Hypotheses {
 
 /// Moves the best hypothesis that went another way than the best of all to the second place; how many
 /// survive.
-fn bring_forward_distinct(sorted: &mut [Hypothesis]) -> usize {
+fn bring_forward_distinct(sorted: &mut [MotionHypothesis]) -> usize {
     /// Cosine of 15° between directions that count as the same.
     const SAME_COSINE: f64 = 0.966;
     let direction = |i: usize| heading(&sorted[i].state.current_from_first);

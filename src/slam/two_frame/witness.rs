@@ -13,7 +13,7 @@ use crate::slam::image::buffer::Image;
 use crate::slam::two_frame::fit::{FitInput, FitParams, FitScratch, Freedom, fit_level};
 use crate::slam::two_frame::system::State;
 
-/// Levels on which a witness is heard, coarse to fine: motions differ by pixels, and half of the
+/// Levels on which an earlier frame is used to score, coarse to fine: motions differ by pixels, and half of the
 /// resolution is a quarter of the time and memory.
 const LEVELS: std::ops::RangeInclusive<usize> = 1..=2;
 

@@ -1,4 +1,4 @@
-//! A camera that is none comes, goes, stalls, breaks and lies.
+//! A fake camera that appears, disappears, stalls, fails and gives wrong answers.
 
 use super::*;
 use crate::capture::v4l::fake::{Event, Fake, frame};
