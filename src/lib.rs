@@ -46,13 +46,13 @@ pub mod capture;
 #[cfg(feature = "service")]
 pub mod command;
 #[cfg(feature = "service")]
-pub mod reader;
-#[cfg(feature = "service")]
 pub mod service;
 pub mod slam;
 #[cfg(feature = "service")]
 pub mod wire;
 
+#[cfg(feature = "service")]
+pub use service::reader;
 pub use slam::frame::FrameView;
 pub use slam::geometry::intrinsics::Intrinsics;
 pub use slam::odometry::{Odometry, OdometryError, OdometryParams};

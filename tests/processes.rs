@@ -11,7 +11,7 @@ use std::time::Duration;
 use rustix::process::{Pid, Signal};
 use semidense::capture::source::{SourceName, open};
 use semidense::service::config::Config;
-use semidense::service::peers::{HEALTH_TOPICS, Peer};
+use semidense::service::peers::Peer;
 use semidense::service::replay::{ReplayConfig, replay};
 use semidense::service::results::RecordedPose;
 use semidense::slam::keyframe::DepthPoint;
@@ -23,7 +23,7 @@ use semidense::wire::message::{
 };
 use semidense::wire::port::{Hub, Subscriber};
 use semidense::wire::topic::{
-    EARLIER_KEYFRAME, EARLIER_KEYFRAME_IMAGE, GRAPH, POSE, TRACKER_HEALTH,
+    EARLIER_KEYFRAME, EARLIER_KEYFRAME_IMAGE, GRAPH, HEALTH_TOPICS, POSE, TRACKER_HEALTH,
 };
 use serde_json::Value;
 use support::{Rig, end, finish, signal, small_camera, until};

@@ -31,6 +31,7 @@ pub mod peers;
 pub mod position;
 pub mod progress_thread;
 pub mod read_ahead;
+pub mod reader;
 pub mod recorder;
 pub mod recording;
 pub mod reference_feed;

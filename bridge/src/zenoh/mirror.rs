@@ -5,7 +5,6 @@
 
 use semidense::service::clock::now_nanos;
 use semidense::service::health::ProcessState;
-use semidense::service::peers::HEALTH_TOPICS;
 use semidense::slam::keyframe::{DepthPoint, MAX_KEYFRAME_POINTS};
 use semidense::wire::command::text_bytes;
 use semidense::wire::message::{
@@ -15,7 +14,7 @@ use semidense::wire::message::{
 use semidense::wire::place::{Claim, Place};
 use semidense::wire::port::{Access, Hub, Publisher};
 use semidense::wire::topic::{
-    ADJUSTMENT, FRAME, GRAPH, KEYFRAME, KEYFRAME_IMAGE, MAX_GRAPH_KEYFRAMES, POSE,
+    ADJUSTMENT, FRAME, GRAPH, HEALTH_TOPICS, KEYFRAME, KEYFRAME_IMAGE, MAX_GRAPH_KEYFRAMES, POSE,
 };
 use zerocopy::FromZeros;
 
