@@ -1,0 +1,301 @@
+//! The functions of the header.
+
+use std::ffi::{CStr, c_char, c_int};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::time::Duration;
+
+use semidense::wire::place::Place;
+use semidense::wire::topic::WIRE_VERSION;
+
+use crate::reader::{Reader, open, wants};
+use crate::status::{Failure, Status, last_error, remember};
+use crate::table;
+use crate::types::{Frame, Graph, Keyframe, Pose, Transform};
+
+/// An open reader: closed by `semidense_close`, used by the thread that opened it alone.
+pub struct ReaderHandle {
+    _private: (),
+}
+
+/// Runs a call: what fails is kept for `semidense_last_error`, and so is a panic.
+fn call(act: impl FnOnce() -> Result<Status, Failure>) -> Status {
+    let failure = match catch_unwind(AssertUnwindSafe(act)) {
+        Ok(Ok(status)) => return status,
+        Ok(Err(failure)) => failure,
+        Err(_) => Failure::new(
+            Status::ErrorInternal,
+            "a fault of libsemidense: please report it with what standard error says",
+        ),
+    };
+    // A failure to keep the message is no reason to leave without a status.
+    let _ = catch_unwind(AssertUnwindSafe(|| remember(&failure.message)));
+    failure.status
+}
+
+fn bad(what: &str) -> Failure {
+    Failure::new(Status::ErrorArgument, what)
+}
+
+fn number(handle: *const ReaderHandle) -> usize {
+    handle.addr()
+}
+
+/// A text of the caller; `None` for null.
+///
+/// # Safety
+/// `text` is null or ends with a zero.
+unsafe fn text<'a>(text: *const c_char, name: &str) -> Result<Option<&'a str>, Failure> {
+    if text.is_null() {
+        return Ok(None);
+    }
+    // SAFETY: it is not null, and the caller promises the zero at its end.
+    let text = unsafe { CStr::from_ptr(text) };
+    text.to_str().map(Some).map_err(|_| bad(&format!("{name} is not UTF-8")))
+}
+
+/// Checks that something can be written to `out`.
+fn check_out<T>(out: *mut T, name: &str) -> Result<(), Failure> {
+    if out.is_null() {
+        return Err(bad(&format!("{name} is null")));
+    }
+    if !out.is_aligned() {
+        return Err(bad(&format!("{name} is not aligned for its type")));
+    }
+    Ok(())
+}
+
+/// Asks a reader, and writes what it gives to `out`.
+///
+/// # Safety
+/// `out` is null or may be written to.
+unsafe fn give<T>(
+    reader: *mut ReaderHandle,
+    out: *mut T,
+    ask: impl FnOnce(&mut Reader) -> Result<Result<T, Status>, Failure>,
+) -> Status {
+    call(|| {
+        check_out(out, "the structure to write to")?;
+        match table::with(number(reader), ask)? {
+            Ok(value) => {
+                // SAFETY: neither null nor misaligned, and the caller promises that it may be written to.
+                unsafe { out.write(value) };
+                Ok(Status::Ok)
+            }
+            Err(status) => Ok(status),
+        }
+    })
+}
+
+/// Waits for an instance and joins it.
+///
+/// `instance`: its name, null for "semidense". `root`: its folder, null for the usual one (SEMIDENSE_ROOT and so on).
+/// `wanted`: the sum of SEMIDENSE_WANT_… that are read. `timeout_ms`: how long to wait for it, -1 for ever, 0 when it must
+/// be there now. `reader` gets the reader; it is null after an error.
+///
+/// SEMIDENSE_STATUS_OK, or SEMIDENSE_STATUS_ERROR_NOT_RUNNING, …_WIRE_VERSION, …_TRANSPORT, …_ARGUMENT.
+///
+/// # Safety
+/// Texts are null or end with a zero; `reader` is null or may be written to.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn semidense_open(
+    instance: *const c_char,
+    root: *const c_char,
+    wanted: u32,
+    timeout_ms: i64,
+    reader: *mut *mut ReaderHandle,
+) -> Status {
+    call(|| {
+        check_out(reader, "reader")?;
+        // SAFETY: neither null nor misaligned, and the caller promises that it may be written to.
+        unsafe { reader.write(std::ptr::null_mut()) };
+        // SAFETY: the caller promises that texts are null or end with a zero.
+        let (instance, root) = unsafe { (text(instance, "instance")?, text(root, "root")?) };
+        let known = wants::POSES | wants::FRAMES | wants::KEYFRAMES | wants::GRAPH;
+        if wanted == 0 || wanted & !known != 0 {
+            return Err(bad("wanted is not a sum of SEMIDENSE_WANT_…"));
+        }
+        let place = Place::new(instance.unwrap_or("semidense"), root.unwrap_or(""))
+            .map_err(|error| bad(&error.to_string()))?;
+        let opened = open(&place, wanted, duration(timeout_ms))?;
+        let handle = std::ptr::without_provenance_mut(table::insert(opened)?);
+        // SAFETY: as above.
+        unsafe { reader.write(handle) };
+        Ok(Status::Ok)
+    })
+}
+
+/// Milliseconds; for ever where they are negative.
+fn duration(milliseconds: i64) -> Option<Duration> {
+    u64::try_from(milliseconds).ok().map(Duration::from_millis)
+}
+
+/// Leaves the instance. All that the reader has given is no longer valid. Null does nothing.
+#[unsafe(no_mangle)]
+pub extern "C" fn semidense_close(reader: *mut ReaderHandle) -> Status {
+    call(|| {
+        if !reader.is_null() {
+            drop(table::remove(number(reader))?);
+        }
+        Ok(Status::Ok)
+    })
+}
+
+/// A file descriptor for poll, select and epoll, or -1 after an error: when it is readable, call `semidense_wait` with a
+/// timeout of 0, then read until SEMIDENSE_STATUS_NONE. It belongs to the reader: do not read from it, do not close it.
+#[unsafe(no_mangle)]
+pub extern "C" fn semidense_descriptor(reader: *const ReaderHandle) -> c_int {
+    let mut descriptor = -1;
+    call(|| {
+        descriptor = table::with(number(reader), |reader| Ok(reader.descriptor()))?;
+        Ok(Status::Ok)
+    });
+    descriptor
+}
+
+/// Waits for messages, `timeout_ms` at most (-1: for ever).
+///
+/// SEMIDENSE_STATUS_OK: there may be something to read; read each kind until SEMIDENSE_STATUS_NONE. SEMIDENSE_STATUS_NONE:
+/// the time is over. SEMIDENSE_STATUS_ENDED: the run is over and all has been read; close the reader, and open another for
+/// the next run.
+#[unsafe(no_mangle)]
+pub extern "C" fn semidense_wait(reader: *mut ReaderHandle, timeout_ms: i64) -> Status {
+    call(|| table::with(number(reader), |reader| reader.wait(duration(timeout_ms))))
+}
+
+/// The oldest pose that has not been read: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. A thousand are kept.
+///
+/// # Safety
+/// `pose` is null or may be written to.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn semidense_next_pose(reader: *mut ReaderHandle, pose: *mut Pose) -> Status {
+    // SAFETY: the caller's promise.
+    unsafe { give(reader, pose, Reader::next_pose) }
+}
+
+/// The newest frame, where it has not been read: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. The one before is no longer valid,
+/// whatever the answer.
+///
+/// # Safety
+/// `frame` is null or may be written to.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn semidense_newest_frame(
+    reader: *mut ReaderHandle,
+    frame: *mut Frame,
+) -> Status {
+    // SAFETY: the caller's promise.
+    unsafe { give(reader, frame, Reader::newest_frame) }
+}
+
+/// The newest keyframe or revision of its depth, where it has not been read: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. The
+/// one before is no longer valid, whatever the answer. A reader that comes late gets the active one.
+///
+/// # Safety
+/// `keyframe` is null or may be written to.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn semidense_newest_keyframe(
+    reader: *mut ReaderHandle,
+    keyframe: *mut Keyframe,
+) -> Status {
+    // SAFETY: the caller's promise.
+    unsafe { give(reader, keyframe, Reader::newest_keyframe) }
+}
+
+/// The poses of all keyframes, where they have changed: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. The ones before are valid
+/// until the next SEMIDENSE_STATUS_OK.
+///
+/// # Safety
+/// `graph` is null or may be written to.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn semidense_newest_graph(
+    reader: *mut ReaderHandle,
+    graph: *mut Graph,
+) -> Status {
+    // SAFETY: the caller's promise.
+    unsafe { give(reader, graph, Reader::newest_graph) }
+}
+
+/// How many messages were left out because they are broken; 0 after an error.
+#[unsafe(no_mangle)]
+pub extern "C" fn semidense_refused(reader: *const ReaderHandle) -> u64 {
+    let mut refused = 0;
+    call(|| {
+        refused = table::with(number(reader), |reader| Ok(reader.refused()))?;
+        Ok(Status::Ok)
+    });
+    refused
+}
+
+/// Writes a transform as a 4×4 matrix, row by row; its rotation is multiplied by the scale.
+///
+/// # Safety
+/// `transform` is null or points to one; `matrix` is null or has room for 16 numbers.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn semidense_matrix(transform: *const Transform, matrix: *mut f64) -> Status {
+    call(|| {
+        check_out(transform.cast_mut(), "transform")?;
+        check_out(matrix, "matrix")?;
+        // SAFETY: neither null nor misaligned, and the caller promises that it is one.
+        let Transform { quaternion: [x, y, z, w], translation: t, scale: s } =
+            unsafe { transform.read() };
+        let rows = [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
+            [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
+            [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
+        ];
+        let mut values = [0.0; 16];
+        for (row, (rotation, translation)) in rows.iter().zip(t).enumerate() {
+            for (column, entry) in rotation.iter().enumerate() {
+                values[4 * row + column] = s * entry;
+            }
+            values[4 * row + 3] = translation;
+        }
+        values[15] = 1.0;
+        // SAFETY: neither null nor misaligned, and the caller promises room for 16 numbers.
+        unsafe { matrix.cast::<[f64; 16]>().write(values) };
+        Ok(Status::Ok)
+    })
+}
+
+/// Why the last call of this thread that failed did, in words: what, where, what to do. Never null; valid until the next
+/// failure of this thread.
+#[unsafe(no_mangle)]
+pub extern "C" fn semidense_last_error() -> *const c_char {
+    last_error()
+}
+
+/// The version of this library, as in "0.1.0".
+#[unsafe(no_mangle)]
+pub extern "C" fn semidense_version() -> *const c_char {
+    const VERSION: &CStr =
+        match CStr::from_bytes_with_nul(concat!(env!("CARGO_PKG_VERSION"), "\0").as_bytes()) {
+            Ok(version) => version,
+            Err(_) => c"",
+        };
+    VERSION.as_ptr()
+}
+
+/// The version of the messages that this library reads: that of the pipeline must be the same.
+#[unsafe(no_mangle)]
+pub extern "C" fn semidense_wire_version() -> u32 {
+    WIRE_VERSION
+}
+
+/// The name of a status, as in "SEMIDENSE_STATUS_OK".
+#[unsafe(no_mangle)]
+pub extern "C" fn semidense_status_name(status: c_int) -> *const c_char {
+    let name = [
+        (Status::Ok, c"SEMIDENSE_STATUS_OK"),
+        (Status::None, c"SEMIDENSE_STATUS_NONE"),
+        (Status::Ended, c"SEMIDENSE_STATUS_ENDED"),
+        (Status::ErrorArgument, c"SEMIDENSE_STATUS_ERROR_ARGUMENT"),
+        (Status::ErrorHandle, c"SEMIDENSE_STATUS_ERROR_HANDLE"),
+        (Status::ErrorNotRunning, c"SEMIDENSE_STATUS_ERROR_NOT_RUNNING"),
+        (Status::ErrorWireVersion, c"SEMIDENSE_STATUS_ERROR_WIRE_VERSION"),
+        (Status::ErrorTransport, c"SEMIDENSE_STATUS_ERROR_TRANSPORT"),
+        (Status::ErrorNotWanted, c"SEMIDENSE_STATUS_ERROR_NOT_WANTED"),
+        (Status::ErrorInternal, c"SEMIDENSE_STATUS_ERROR_INTERNAL"),
+    ]
+    .into_iter()
+    .find(|(known, _)| *known as c_int == status);
+    name.map_or(c"unknown status", |(_, name)| name).as_ptr()
+}

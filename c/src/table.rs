@@ -1,0 +1,60 @@
+//! The open readers of a thread. A handle is a number that is given once, and no address: it can be checked.
+
+use std::cell::RefCell;
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use crate::reader::Reader;
+use crate::status::{Failure, Status};
+
+/// Numbers begin where no address of an object can be, and are never given twice.
+static NEXT: AtomicUsize = AtomicUsize::new(1);
+
+thread_local! {
+    static READERS: RefCell<BTreeMap<usize, Reader>> = const { RefCell::new(BTreeMap::new()) };
+}
+
+/// The thread is ending, or the table is in use by a call further up.
+fn unusable() -> Failure {
+    Failure::new(Status::ErrorHandle, "the reader is in use by a call that has not returned")
+}
+
+fn unknown() -> Failure {
+    Failure::new(
+        Status::ErrorHandle,
+        "this reader is not open in this thread: it is null, closed, or was opened by another thread",
+    )
+}
+
+/// Keeps a reader; gives its number.
+pub fn insert(reader: Reader) -> Result<usize, Failure> {
+    let number = NEXT.fetch_add(1, Ordering::Relaxed);
+    let kept = READERS.try_with(|readers| {
+        readers.try_borrow_mut().map(|mut readers| readers.insert(number, reader)).map(drop)
+    });
+    kept.map_err(|_| unusable())?.map_err(|_| unusable())?;
+    Ok(number)
+}
+
+/// Lets `act` use the reader of this number.
+pub fn with<T>(
+    number: usize,
+    act: impl FnOnce(&mut Reader) -> Result<T, Failure>,
+) -> Result<T, Failure> {
+    READERS
+        .try_with(|readers| {
+            let mut readers = readers.try_borrow_mut().map_err(|_| unusable())?;
+            act(readers.get_mut(&number).ok_or_else(unknown)?)
+        })
+        .map_err(|_| unusable())?
+}
+
+/// Takes the reader out.
+pub fn remove(number: usize) -> Result<Reader, Failure> {
+    READERS
+        .try_with(|readers| {
+            let mut readers = readers.try_borrow_mut().map_err(|_| unusable())?;
+            readers.remove(&number).ok_or_else(unknown)
+        })
+        .map_err(|_| unusable())?
+}

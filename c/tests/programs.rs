@@ -1,0 +1,286 @@
+//! Programs in C and C++ against the library and a pipeline that runs.
+//!
+//! They are compiled with all warnings as errors and, where the compiler has them, with the sanitizers of addresses and
+//! undefined behaviour.
+
+use std::fs;
+use std::os::unix::fs::symlink;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::sync::OnceLock;
+use std::time::{Duration, Instant};
+
+use iceoryx2::prelude::*;
+use semidense::wire::place::Place;
+use semidense::wire::topic::WIRE_VERSION;
+use tempfile::TempDir;
+
+/// Far above anything that is expected: it ends a test that hangs.
+const WATCH_DOG: Duration = Duration::from_secs(120);
+
+const C: &[&str] = &["cc", "-std=c11"];
+const CPP: &[&str] = &["c++", "-std=c++17"];
+const STRICT: &[&str] = &["-Wall", "-Wextra", "-Wpedantic", "-Werror", "-g", "-D_DEFAULT_SOURCE"];
+const SANITIZERS: &str = "-fsanitize=address,undefined";
+
+fn root() -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR"))
+}
+
+/// Where cargo puts libraries and programs of this profile.
+fn built() -> PathBuf {
+    let test = std::env::current_exe().unwrap();
+    test.ancestors().nth(2).unwrap().to_owned()
+}
+
+/// Builds what `cargo test` does not: a library that Rust cannot link to, and, unless it is named with `SEMIDENSE_BIN`, the
+/// pipeline's program.
+fn build() {
+    static BUILT: OnceLock<()> = OnceLock::new();
+    BUILT.get_or_init(|| {
+        let mut command = Command::new(env!("CARGO"));
+        command.args(["build", "--quiet", "--locked", "--package", "semidense-c", "--lib"]);
+        if std::env::var_os("SEMIDENSE_BIN").is_none() {
+            command.args(["--package", "semidense", "--bin", "semidense"]);
+        }
+        if !cfg!(debug_assertions) {
+            command.arg("--release");
+        }
+        assert!(command.current_dir(root()).status().unwrap().success(), "cargo build");
+    });
+}
+
+/// The library as cargo names it.
+fn library() -> PathBuf {
+    built().join("libsemidense_c.so")
+}
+
+/// The pipeline's program: `SEMIDENSE_BIN`, else that of this profile.
+fn semidense() -> PathBuf {
+    let named = std::env::var_os("SEMIDENSE_BIN").map(PathBuf::from);
+    named.unwrap_or_else(|| built().join("semidense"))
+}
+
+/// An instance of its own, with a folder for programs and the library under its shared name.
+struct Rig {
+    folder: TempDir,
+    pipeline: Option<Child>,
+}
+
+impl Rig {
+    fn new() -> Self {
+        build();
+        let folder = tempfile::tempdir_in("/tmp").unwrap();
+        for name in ["libsemidense.so", "libsemidense.so.0"] {
+            symlink(library(), folder.path().join(name)).unwrap();
+        }
+        Self { folder, pipeline: None }
+    }
+
+    /// With a live run that goes on for longer than any test.
+    fn running() -> Self {
+        let mut rig = Self::new();
+        let mut command = rig.command(&semidense());
+        command.args(["run", "--live", "--source", "loop:1000000:30:sim", "--output"]);
+        command.arg(rig.folder.path().join("output"));
+        for setting in ["frames=60", "width=160", "height=120", "focal_px=131.0"] {
+            command.args(["--set", &format!("simulator.{setting}")]);
+        }
+        rig.pipeline = Some(command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap());
+        rig
+    }
+
+    fn place(&self) -> Place {
+        Place::new("semidense", self.folder.path().join("root").to_str().unwrap()).unwrap()
+    }
+
+    fn command(&self, program: &Path) -> Command {
+        let mut command = Command::new(program);
+        command.env("SEMIDENSE_ROOT", &self.place().root).stdin(Stdio::null());
+        command
+    }
+
+    /// Compiles a program and gives its path.
+    fn compile(&self, compiler: &[&str], source: &str, sanitize: bool) -> PathBuf {
+        let program = self.folder.path().join(Path::new(source).file_stem().unwrap());
+        let mut command = Command::new(compiler[0]);
+        command.args(&compiler[1..]).args(STRICT).arg(root().join(source));
+        command.arg("-I").arg(root().join("include")).arg("-o").arg(&program);
+        command.arg("-L").arg(self.folder.path()).arg("-lsemidense").arg("-pthread");
+        command.arg(format!("-Wl,-rpath,{}", self.folder.path().display()));
+        if sanitize && has_sanitizers() {
+            command.arg(SANITIZERS).arg("-fno-sanitize-recover=all");
+        }
+        let done = command.output().unwrap_or_else(|error| panic!("{}: {error}", compiler[0]));
+        assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+        program
+    }
+
+    fn run(&self, program: &Path, arguments: &[&str]) -> Output {
+        let child = self
+            .command(program)
+            .args(arguments)
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        end(child)
+    }
+
+    /// Ends the pipeline as Ctrl-C does.
+    fn stop(&mut self) {
+        if let Some(mut pipeline) = self.pipeline.take() {
+            let id = pipeline.id().to_string();
+            Command::new("kill").args(["-INT", &id]).status().unwrap();
+            pipeline.wait().unwrap();
+        }
+    }
+}
+
+impl Drop for Rig {
+    fn drop(&mut self) {
+        self.stop();
+    }
+}
+
+/// Waits for the end; a program that hangs is killed and fails the test.
+fn end(mut child: Child) -> Output {
+    let begun = Instant::now();
+    while child.try_wait().unwrap().is_none() {
+        if begun.elapsed() > WATCH_DOG {
+            child.kill().unwrap();
+            panic!("it hangs: {:?}", child.wait_with_output());
+        }
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    child.wait_with_output().unwrap()
+}
+
+/// Whether the compiler has the sanitizers with their libraries.
+fn has_sanitizers() -> bool {
+    static FOUND: OnceLock<bool> = OnceLock::new();
+    *FOUND.get_or_init(|| {
+        let folder = tempfile::tempdir().unwrap();
+        let (source, program) = (folder.path().join("x.c"), folder.path().join("x"));
+        fs::write(&source, "int main(void) { return 0; }").unwrap();
+        let compiled =
+            Command::new("cc").arg(SANITIZERS).arg(&source).arg("-o").arg(&program).output();
+        let has = compiled.is_ok_and(|done| done.status.success())
+            && Command::new(&program).status().is_ok_and(|status| status.success());
+        if !has {
+            eprintln!("no sanitizers here: the programs run without");
+        }
+        has
+    })
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
+
+#[test]
+fn a_program_in_c_reads_poses_and_ends_with_the_run() {
+    let mut rig = Rig::running();
+    let program = rig.compile(C, "examples/poses.c", true);
+    let done = rig.run(&program, &["semidense", "30"]);
+    let (out, error) = (text(&done.stdout), text(&done.stderr));
+    assert!(done.status.success(), "{error}");
+    let rows: Vec<Vec<&str>> = out.lines().map(|line| line.split(' ').collect()).collect();
+    assert_eq!(rows.len(), 30, "{out}");
+    let sequences: Vec<u64> = rows.iter().map(|row| row[0].parse().unwrap()).collect();
+    assert!(sequences.is_sorted_by(|a, b| a < b), "{sequences:?}");
+    assert!(rows.iter().any(|row| row[1] == "tracking"), "{out}");
+    for row in &rows {
+        let unit: f64 = row[5..9].iter().map(|q| q.parse::<f64>().unwrap().powi(2)).sum();
+        assert!((unit - 1.0).abs() < 1e-4, "{row:?}");
+    }
+    let child =
+        rig.command(&program).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    std::thread::sleep(Duration::from_secs(1));
+    rig.stop();
+    let done = end(child);
+    assert!(done.status.success() && !done.stdout.is_empty(), "{}", text(&done.stderr));
+}
+
+#[test]
+fn a_program_in_cpp_reads_keyframes_frames_and_the_graph() {
+    let rig = Rig::running();
+    let program = rig.compile(CPP, "examples/keyframes.cpp", true);
+    let done = rig.run(&program, &["semidense", "3"]);
+    let out = text(&done.stdout);
+    assert!(done.status.success() && done.stderr.is_empty(), "{}", text(&done.stderr));
+    let keyframes: Vec<&str> = out.lines().filter(|line| line.starts_with("keyframe")).collect();
+    assert_eq!(keyframes.len(), 3, "{out}");
+    assert!(out.lines().any(|line| line.starts_with("map revision")), "{out}");
+    assert!(
+        keyframes.iter().all(|line| line.contains("median depth") && !line.contains("nan")),
+        "{out}"
+    );
+}
+
+#[test]
+fn misuse_is_an_error_and_never_a_crash() {
+    let rig = Rig::running();
+    let done = rig.run(&rig.compile(C, "tests/misuse.c", true), &[]);
+    assert!(done.status.success(), "{}{}", text(&done.stdout), text(&done.stderr));
+    assert_eq!(text(&done.stdout), format!("{} wire {WIRE_VERSION}\n", env!("CARGO_PKG_VERSION")));
+}
+
+#[test]
+fn another_wire_version_is_refused_with_both_versions_in_c_and_cpp() {
+    let rig = Rig::new();
+    let place = rig.place();
+    place.create().unwrap();
+    let mut config = Config::default();
+    let path = iceoryx2::prelude::Path::new(place.root.as_os_str().as_encoded_bytes()).unwrap();
+    config.global.set_root_path(&path);
+    config.global.prefix = FileName::new(place.prefix.as_bytes()).unwrap();
+    set_log_level(LogLevel::Fatal);
+    let node = NodeBuilder::new().config(&config).create::<ipc::Service>().unwrap();
+    let other = WIRE_VERSION + 1;
+    let name = ServiceName::new(&format!("semidense/v{other}/tracker/pose")).unwrap();
+    let _service =
+        node.service_builder(&name).publish_subscribe::<[u64]>().open_or_create().unwrap();
+    let programs = [
+        rig.compile(C, "examples/poses.c", true),
+        rig.compile(CPP, "examples/keyframes.cpp", true),
+    ];
+    for program in programs {
+        let done = rig.run(&program, &[]);
+        let said = text(&done.stderr);
+        let both = format!("speaks wire version {other}, this program {WIRE_VERSION}");
+        assert!(!done.status.success() && said.contains(&both), "{}: {said}", program.display());
+    }
+}
+
+#[test]
+fn nothing_is_left_where_nothing_runs() {
+    let rig = Rig::new();
+    let program = rig.folder.path().join("absent.c");
+    let source = "#include <semidense.h>\nint main(void) { semidense_reader *r; return -semidense_open(0, 0, 15, 100, &r); }";
+    fs::write(&program, source).unwrap();
+    let done = rig.run(&rig.compile(C, program.to_str().unwrap(), true), &[]);
+    assert_eq!(done.status.code(), Some(3), "{}", text(&done.stderr));
+    assert!(!rig.place().root.exists());
+}
+
+#[test]
+fn the_library_exports_its_own_functions_alone_and_the_header_has_each() {
+    build();
+    let library = library();
+    let listed = Command::new("nm").args(["-D", "--defined-only"]).arg(&library).output().unwrap();
+    let symbols: Vec<String> = text(&listed.stdout)
+        .lines()
+        .filter_map(|line| line.split_whitespace().last().map(str::to_owned))
+        .collect();
+    let foreign: Vec<_> = symbols.iter().filter(|name| !name.starts_with("semidense_")).collect();
+    assert!(foreign.is_empty(), "{foreign:?}");
+    let header = fs::read_to_string(root().join("include/semidense.h")).unwrap();
+    let declared = header.matches("semidense_").count();
+    assert!(symbols.len() >= 14 && declared > symbols.len(), "{symbols:?}");
+    for symbol in &symbols {
+        assert!(header.contains(&format!("{symbol}(")), "{symbol} is not in the header");
+    }
+    let dynamic = Command::new("readelf").arg("-d").arg(&library).output().unwrap();
+    assert!(text(&dynamic.stdout).contains("[libsemidense.so.0]"), "the name with the version");
+}

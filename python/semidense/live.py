@@ -1,0 +1,163 @@
+"""One loop for one kind of message, and commands: what most programs need."""
+
+from __future__ import annotations
+
+import os
+import time
+from typing import Iterator, Optional, Type, cast
+
+import iceoryx2 as iox2
+
+from . import _wire
+from ._place import AnyPath, Place
+from ._ports import make_node, not_running, service_name
+from .errors import CommandFailed
+from .messages import Frame, Graph, Health, Keyframe, Pose, _text
+from .reader import M, Reader
+
+# Between two looks for an answer.
+ANSWER_PAUSE_SECS = 0.01
+PATH_BYTES = 4096
+_SAVE_FOLDER, _LOAD_FOLDER, _LOCATE_IN_FOLDER = 2, 3, 4
+
+
+def _stream(kind: Type[M], instance: str, root: Optional[AnyPath], timeout: Optional[float], follow: bool) -> Iterator[M]:
+    # Joined when it is called: what is wrong is said there, not at the first turn of the loop.
+    reader = Reader(kind, instance=instance, root=root, timeout=timeout, follow=follow)
+
+    def messages() -> Iterator[M]:
+        with reader:
+            yield from cast(Iterator[M], iter(reader))
+
+    return messages()
+
+
+def poses(
+    instance: str = "semidense",
+    *,
+    root: Optional[AnyPath] = None,
+    timeout: Optional[float] = None,
+    follow: bool = False,
+) -> Iterator[Pose]:
+    """Every pose as it is published, also of frames that are lost, until the run ends.
+
+    Waits for the instance for `timeout` seconds (None: for ever), then raises `NotRunning`. `root` is the folder of the
+    instance where it is not the usual one (`SEMIDENSE_ROOT`). With `follow` it goes on to the next run. A thousand poses
+    are kept for a loop that is late.
+    """
+    return _stream(Pose, instance, root, timeout, follow)
+
+
+def frames(
+    instance: str = "semidense",
+    *,
+    root: Optional[AnyPath] = None,
+    timeout: Optional[float] = None,
+    follow: bool = False,
+) -> Iterator[Frame]:
+    """Every image of the camera, without a copy; of a loop that is late the oldest are skipped (`sequence` shows it).
+
+    At most 4 may be held at a time, that of the loop included: keep `frame.copy()`.
+    """
+    return _stream(Frame, instance, root, timeout, follow)
+
+
+def keyframes(
+    instance: str = "semidense",
+    *,
+    root: Optional[AnyPath] = None,
+    timeout: Optional[float] = None,
+    follow: bool = False,
+) -> Iterator[Keyframe]:
+    """The active keyframe at once, then each new one and each revision of its depth; the newest wins.
+
+    Each is copied once and may be kept.
+    """
+    return _stream(Keyframe, instance, root, timeout, follow)
+
+
+def graph(
+    instance: str = "semidense",
+    *,
+    root: Optional[AnyPath] = None,
+    timeout: Optional[float] = None,
+    follow: bool = False,
+) -> Iterator[Graph]:
+    """The poses of all keyframes in the map: at once, then whenever they change; the newest wins."""
+    return _stream(Graph, instance, root, timeout, follow)
+
+
+def health(
+    instance: str = "semidense",
+    *,
+    root: Optional[AnyPath] = None,
+    timeout: Optional[float] = None,
+    follow: bool = False,
+) -> Iterator[Health]:
+    """What capture, tracker and mapper say of themselves: once a second and on every change."""
+    return _stream(Health, instance, root, timeout, follow)
+
+
+def save_map(
+    folder: Optional[AnyPath] = None,
+    instance: str = "semidense",
+    *,
+    root: Optional[AnyPath] = None,
+    timeout: float = 60.0,
+) -> None:
+    """Saves the map into `folder`, as `semidense map save`; into the one that the mapper keeps it in where that is None."""
+    _ask(_SAVE_FOLDER, folder, instance, root, timeout)
+
+
+def load_map(
+    folder: AnyPath,
+    instance: str = "semidense",
+    *,
+    read_only: bool = False,
+    root: Optional[AnyPath] = None,
+    timeout: float = 60.0,
+) -> None:
+    """Goes over to the map in `folder`, as `semidense map load`; with `read_only` the camera is only located in it."""
+    _ask(_LOCATE_IN_FOLDER if read_only else _LOAD_FOLDER, folder, instance, root, timeout)
+
+
+def _ask(kind: int, folder: Optional[AnyPath], instance: str, root: Optional[AnyPath], timeout: float) -> None:
+    path = b"" if folder is None else os.fsencode(os.path.abspath(os.fspath(folder)))
+    if len(path) > PATH_BYTES:
+        raise CommandFailed(f"{folder!r}: a path may have at most {PATH_BYTES} bytes")
+    place = Place(instance, root)
+    if not place.is_there():
+        raise not_running(place)
+    place.check_room()
+    with place.hold():
+        node = make_node(place, f"python-command-{os.getpid()}")
+        name = iox2.ServiceName.new(service_name(place, _wire.COMMAND_TOPIC))
+        builder = node.service_builder(name).request_response(_wire.CommandRequest, _wire.CommandResponse)
+        try:
+            client = builder.open().client_builder().create()
+            notifier = node.service_builder(name).event().open().notifier_builder().create()
+        except (iox2.RequestResponseOpenError, iox2.EventOpenError):
+            raise not_running(place) from None
+        except (iox2.ClientCreateError, iox2.NotifierCreateError) as error:
+            raise CommandFailed(f"mapper/command: {error}: others ask at this moment; try again") from None
+        place.reserve()
+    request = _wire.CommandRequest(kind=kind, path_bytes=len(path))
+    request.path[: len(path)] = path
+    pending = client.send_copy(request)
+    notifier.notify()
+    _answer(pending, place, timeout)
+
+
+def _answer(pending: object, place: Place, timeout: float) -> None:
+    end = time.monotonic() + timeout
+    while time.monotonic() < end:
+        response = pending.receive()  # type: ignore[attr-defined]
+        if response is not None:
+            answer = response.payload().contents
+            if answer.status != 0:
+                raise CommandFailed(f"mapper: {_text(answer.text, answer.text_bytes)}")
+            return
+        if place.running() is None:
+            raise not_running(place)
+        time.sleep(ANSWER_PAUSE_SECS)
+    raise CommandFailed(f"the mapper did not answer within {timeout:g} s")

@@ -1,0 +1,239 @@
+"""Reads one instance, whenever it runs: waits for it, gives what it sends, notices its end."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from types import TracebackType
+from typing import Any, Callable, Dict, Iterator, List, Optional, Tuple, Type, TypeVar, Union
+
+from ._place import AnyPath, Place
+from ._ports import Ports, Sample
+from ._wire import ProcessState
+from .errors import NotRunning
+from .messages import BrokenMessage, Frame, Graph, Health, Keyframe, Pose
+
+# Between two attempts to join an instance that is not there yet.
+RETRY_SECS = 0.1
+# Longest wait in one go: so late a Ctrl-C is heard, or the end of a run.
+WAIT_SECS = 0.1
+# Processes report once a second: one that has said nothing for so long is not there any more.
+LONGEST_SILENCE_SECS = 3.0
+
+Message = Union[Pose, Frame, Keyframe, Graph, Health]
+M = TypeVar("M", Pose, Frame, Keyframe, Graph, Health)
+
+_PATHS: Dict[type, Tuple[str, ...]] = {
+    Pose: ("tracker/pose",),
+    Frame: ("capture/frame",),
+    Keyframe: ("mapper/keyframe", "mapper/keyframe_image"),
+    Graph: ("mapper/graph",),
+    Health: ("capture/health", "tracker/health", "mapper/health"),
+}
+_HEALTH = _PATHS[Health]
+# Health comes once a second at least, with or without a wake-up.
+_WAKES: Dict[type, Tuple[str, ...]] = {
+    Pose: ("tracker/pose",),
+    Frame: ("capture/frame",),
+    Keyframe: ("mapper/keyframe",),
+    Graph: ("mapper/graph",),
+    Health: _HEALTH,
+}
+
+
+class Reader:
+    """Reads the named kinds of messages of one instance; for several kinds in one loop.
+
+    >>> with semidense.Reader(semidense.Pose, semidense.Keyframe) as reader:
+    ...     for message in reader:
+    ...         if isinstance(message, semidense.Pose): ...
+
+    It belongs to the thread that uses it.
+    """
+
+    def __init__(
+        self,
+        *kinds: Type[Message],
+        instance: str = "semidense",
+        root: Optional[AnyPath] = None,
+        timeout: Optional[float] = None,
+        follow: bool = False,
+    ) -> None:
+        """Waits for the instance for `timeout` seconds (None: for ever), else `NotRunning`.
+
+        With `follow` it goes on to the next run of the instance when one ends.
+        """
+        unknown = [kind for kind in kinds if kind not in _PATHS]
+        if unknown or not kinds:
+            raise TypeError(f"name what to read: Pose, Frame, Keyframe, Graph or Health, not {unknown}")
+        self.place = Place(instance, root)
+        self.refused = 0
+        """Messages that were left out because they are broken."""
+        self._kinds = tuple(dict.fromkeys(kinds))
+        self._timeout = timeout
+        self._follow = follow
+        self._ports: Optional[Ports] = None
+        self._states: Dict[str, ProcessState] = {}
+        self._heard = time.monotonic()
+        # Depth whose image has not come yet, and the newest image: it serves every revision of its keyframe's depth.
+        self._depth: Optional[Tuple[Any, Any]] = None
+        self._image: Optional[Tuple[Any, Any]] = None
+        self._join()
+
+    def _join(self) -> None:
+        end = None if self._timeout is None else time.monotonic() + self._timeout
+        while not self._try_to_join(end):
+            left = RETRY_SECS if end is None else min(RETRY_SECS, end - time.monotonic())
+            time.sleep(max(0.0, left))
+
+    def _try_to_join(self, end: Optional[float]) -> bool:
+        paths = tuple(dict.fromkeys(p for kind in (*self._kinds, Health) for p in _PATHS[kind]))
+        wakes = tuple(dict.fromkeys(p for kind in self._kinds for p in _WAKES[kind]))
+        try:
+            self._ports = Ports(self.place, f"python-{os.getpid()}", paths, wakes)
+        except NotRunning:
+            if end is not None and time.monotonic() >= end:
+                raise
+            return False
+        self._states.clear()
+        self._heard = time.monotonic()
+        return True
+
+    def read(self, timeout: float = 0.0) -> List[Message]:
+        """What has come, waiting `timeout` seconds at most for it; empty also when the run is over (`is_open`)."""
+        end = time.monotonic() + timeout
+        while True:
+            messages = list(self._take())
+            left = end - time.monotonic()
+            if messages or self._ports is None or left <= 0.0:
+                return messages
+            if self._is_over():
+                self.close()
+            else:
+                self._ports.wait(min(left, WAIT_SECS))
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the run that is read still goes on."""
+        return self._ports is not None
+
+    def __iter__(self) -> Iterator[Message]:
+        """Every message as it comes, until the run ends (with `follow`: for ever)."""
+        while True:
+            while self._ports is not None:
+                is_quiet = True
+                for message in self._take():
+                    is_quiet = False
+                    yield message
+                    del message
+                if not is_quiet or self._ports is None:
+                    continue
+                if self._is_over():
+                    self.close()
+                else:
+                    self._ports.wait(WAIT_SECS)
+            if not self._follow:
+                return
+            self._join()
+
+    def _is_over(self) -> bool:
+        """Whether tracker and mapper have ended, or nobody has said anything for long."""
+        ended = [self._states.get(process) is ProcessState.FINISHED for process in ("tracker", "mapper")]
+        return all(ended) or time.monotonic() - self._heard > LONGEST_SILENCE_SECS
+
+    def _receive(self, path: str) -> Optional[Sample]:
+        if self._ports is None:
+            return None
+        sample = self._ports.subscribers[path].receive()
+        if sample is not None:
+            self._heard = time.monotonic()
+        return sample
+
+    def _take(self) -> Iterator[Message]:
+        """All that is unread, keyframes before the poses that name them; the newest of what replaces the older."""
+        takes: Dict[type, Callable[[], Iterator[Message]]] = {
+            Keyframe: self._keyframe,
+            Graph: self._graph,
+            Frame: self._frames,
+            Pose: self._poses,
+        }
+        yield from self._health()
+        for kind, take in takes.items():
+            if kind in self._kinds:
+                yield from take()
+
+    def _checked(self, make: Callable[[], M]) -> Iterator[M]:
+        try:
+            message = make()
+        except BrokenMessage:
+            self.refused += 1
+            return
+        yield message
+
+    def _health(self) -> Iterator[Health]:
+        for path in _HEALTH:
+            process = path.split("/")[0]
+            while (sample := self._receive(path)) is not None:
+                for message in sample.payload():
+                    for health in self._checked(lambda m=message, p=process: Health(p, m)):  # type: ignore[misc]
+                        self._states[process] = health.state
+                        if Health in self._kinds:
+                            yield health
+
+    def _poses(self) -> Iterator[Pose]:
+        while (sample := self._receive("tracker/pose")) is not None:
+            for message in sample.payload():
+                yield from self._checked(lambda m=message: Pose(m))  # type: ignore[misc]
+
+    def _frames(self) -> Iterator[Frame]:
+        # One at a time: few may be held.
+        if (sample := self._receive("capture/frame")) is not None:
+            header, pixels = sample.header(), sample.array()
+            del sample
+            yield from self._checked(lambda h=header, p=pixels: Frame(h, p))  # type: ignore[misc]
+
+    def _graph(self) -> Iterator[Graph]:
+        if (sample := self._receive("mapper/graph")) is not None:
+            header, messages = sample.header(), sample.payload()
+            del sample
+            yield from self._checked(lambda: Graph(header, messages))
+
+    def _keyframe(self) -> Iterator[Keyframe]:
+        # Depth first: the mapper sends the image before it, so the image of what comes is here. Both are copied: there
+        # is room to hold one, and the loop still has the one before when the next comes.
+        if (depth := self._receive("mapper/keyframe")) is not None:
+            self._depth = (depth.header(), depth.copied_array())
+            del depth
+        if (image := self._receive("mapper/keyframe_image")) is not None:
+            self._image = (image.header(), image.copied_array())
+            del image
+        if self._depth is None or self._image is None:
+            return
+        (header, points), (image_header, pixels) = self._depth, self._image
+        if (header.keyframe_id, header.epoch) != (image_header.keyframe_id, image_header.epoch):
+            # The other half is on its way; a newer depth replaces this one.
+            return
+        self._depth = None
+        yield from self._checked(lambda: Keyframe(header, points, image_header, pixels))
+
+    def close(self) -> None:
+        """Leaves the instance; what has been given stays readable."""
+        self._depth = self._image = None
+        if self._ports is not None:
+            ports, self._ports = self._ports, None
+            with contextlib.suppress(Exception):
+                ports.close()
+
+    def __enter__(self) -> Reader:
+        """Itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: Optional[Type[BaseException]],
+        error: Optional[BaseException],
+        traceback: Optional[TracebackType],
+    ) -> None:
+        """Leaves the instance."""
+        self.close()
