@@ -170,6 +170,38 @@ fn play(source: &mut dyn FrameSource) {
     }
 }
 
+/// A bag.
+pub fn bag(bytes: &[u8]) {
+    /// Frames that are taken: a bag may hold thousands.
+    const MOST_FRAMES: usize = 100;
+    thread_local! {
+        static FOLDER: tempfile::TempDir = tempfile::tempdir().expect("a temporary folder");
+    }
+    FOLDER.with(|folder| {
+        let path = folder.path().join("bag.mcap");
+        fs::write(&path, bytes).expect("written");
+        let name = SourceName::Mcap { file: path, topic: None };
+        let Ok(mut source) = open(&name, None, &Default::default()) else { return };
+        let k = source.intrinsics();
+        if k.width * k.height > MAX_PIXELS {
+            return;
+        }
+        let mut pixels = vec![0; k.width * k.height];
+        let mut last = None;
+        for _ in 0..MOST_FRAMES {
+            match source.next_into(&mut pixels) {
+                Ok(Some(stamp)) => {
+                    assert!(last.is_none_or(|last| (stamp.sequence, stamp.capture_nanos) > last));
+                    last = Some((stamp.sequence, stamp.capture_nanos));
+                }
+                Ok(None) => break,
+                Err(error) if error.is_passing() => {}
+                Err(_) => break,
+            }
+        }
+    });
+}
+
 /// An image, as grey values and as depth.
 pub fn image(bytes: &[u8]) {
     let mut gray = [0; IMAGE_SIDE * IMAGE_SIDE];

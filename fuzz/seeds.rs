@@ -25,6 +25,7 @@ use semidense::wire::message::{
     HealthMessage, KeyframePoseMessage, PATH_BYTES, StepMessage, TEXT_BYTES,
 };
 
+use super::test_bag::{TestBag, camera_info, compressed_image, frame_record, image};
 use super::test_images::{flat_block_jpeg, png_of};
 use crate::parsers::{IMAGE_SIDE, SENSOR_YAML, plain};
 
@@ -35,6 +36,23 @@ pub struct Seed {
     pub target: &'static str,
     /// Its bytes.
     pub bytes: Vec<u8>,
+}
+
+/// A bag of ours: a camera, an image of each kind, chunks as they are.
+fn bag() -> Vec<u8> {
+    const SIDE: u32 = IMAGE_SIDE as u32;
+    let mut bag = TestBag::default();
+    let raw = bag.topic("/a/image", "sensor_msgs/msg/Image");
+    let camera = bag.topic("/a/camera_info", "sensor_msgs/msg/CameraInfo");
+    let frames = bag.topic("/a/details/frame", "semidense_msgs/msg/Frame");
+    let lens = [0.01, 0.0, 0.0, 0.0, 0.0];
+    bag.message(camera, 1, &camera_info(SIDE, SIDE, "plumb_bob", &lens, [20.0, 20.0, 7.5, 7.5], 0));
+    bag.message(frames, 2, &frame_record(2, 5, 2, 3));
+    bag.message(raw, 2, &image(2, SIDE, SIDE, "mono8", SIDE, &[9; IMAGE_SIDE * IMAGE_SIDE]));
+    bag.end_chunk("", <[u8]>::to_vec);
+    bag.message(raw, 3, &image(3, SIDE, SIDE, "rgb8", 3 * SIDE, &[9; 3 * IMAGE_SIDE * IMAGE_SIDE]));
+    bag.message(raw, 4, &compressed_image(4, "png", &[1, 2, 3]));
+    bag.finish()
 }
 
 const CAMERA: Intrinsics = Intrinsics::pinhole(40, 32, 25.0);
@@ -69,6 +87,7 @@ pub fn seeds() -> Vec<Seed> {
     lists.iter().zip(0..).for_each(|(list, index)| add("lists", kind(index, list)));
     add("lists", kind(3, b"1.25\n2.5\n"));
     images().into_iter().for_each(|bytes| add("image", bytes));
+    add("bag", bag());
     let file = include_str!("../config/semidense.toml");
     let plain: String =
         file.lines().filter(|l| !l.starts_with('#')).map(|l| format!("{l}\n")).collect();

@@ -8,6 +8,7 @@ use crate::capture::simulator::params::SimulatorParams;
 use crate::capture::source::{
     self, FrameSource, FrameStamp, SourceError, SourceName, SourceParams,
 };
+use crate::capture::test_bag::{TestBag, camera_info, compressed_image};
 use crate::capture::test_images::flat_block_jpeg;
 
 const WIDTH: usize = 32;
@@ -95,6 +96,24 @@ fn write_images(folder: &Path) {
     fs::write(folder.join("rig.toml"), format!("{RIG}rate_hz = 20\n")).expect("written");
 }
 
+/// The images of [`write_images`] with stamps to the nanosecond.
+fn write_mcap(folder: &Path) {
+    let mut bag = TestBag::default();
+    let images = bag.topic("/cam/image_raw/compressed", "sensor_msgs/msg/CompressedImage");
+    let camera = bag.topic("/cam/camera_info", "sensor_msgs/msg/CameraInfo");
+    let lens = [-0.1, 0.02, 0.0, 0.0];
+    let camera_message = camera_info(32, 24, "plumb_bob", &lens, [30.0, 31.0, 15.5, 11.5], 0);
+    for frame in 0..FRAMES {
+        let nanos = 1_000_000_000_000_000_001 + PERIOD_NANOS * frame as i64;
+        let file = folder.join("image");
+        write_image(&file, frame);
+        let content = fs::read(&file).expect("written");
+        bag.message(camera, nanos, &camera_message);
+        bag.message(images, nanos, &compressed_image(nanos, "png", &content));
+    }
+    fs::write(folder.join("bag.mcap"), bag.finish()).expect("written");
+}
+
 fn open(name: &SourceName, rig: Option<&Path>) -> Result<Box<dyn FrameSource>, SourceError> {
     let simulator = SimulatorParams {
         frames: FRAMES,
@@ -118,6 +137,7 @@ fn opened(
         "tum" => write_tum(root),
         "euroc" => write_euroc(root),
         "sim" => {}
+        "mcap" => write_mcap(root),
         _ => {
             write_images(root);
             rig = Some(root.join("rig.toml"));
@@ -144,7 +164,7 @@ fn play(source: &mut dyn FrameSource) -> Result<Vec<(FrameStamp, u8)>, SourceErr
 
 #[test]
 fn every_source_keeps_the_contract() {
-    for kind in ["tum", "euroc", "images", "sim"] {
+    for kind in ["tum", "euroc", "images", "mcap", "sim"] {
         let (_folder, source) = opened(kind, |_| {});
         let mut source = source.unwrap_or_else(|error| panic!("{kind}: {error}"));
         source.prepare(&mut |_, _| true).expect("prepared");
@@ -165,14 +185,18 @@ fn every_source_keeps_the_contract() {
         let mut pixels = vec![0; WIDTH * HEIGHT];
         assert!(source.next_into(&mut pixels).expect("the end stays").is_none(), "{kind}");
         let truth = source.ground_truth();
-        assert_eq!(truth.len(), if kind == "images" { 0 } else { FRAMES }, "{kind}");
+        assert_eq!(
+            truth.len(),
+            if matches!(kind, "images" | "mcap") { 0 } else { FRAMES },
+            "{kind}"
+        );
         assert!(truth.windows(2).all(|pair| pair[0].nanos < pair[1].nanos), "{kind}");
     }
 }
 
 #[test]
 fn frames_can_be_left_out_up_to_a_sequence() {
-    for kind in ["tum", "euroc", "images", "sim"] {
+    for kind in ["tum", "euroc", "images", "mcap", "sim"] {
         for (sequence, expected) in
             [(0, vec![1, 2, 3, 4]), (2, vec![3, 4]), (4, vec![]), (99, vec![])]
         {
@@ -208,9 +232,8 @@ fn a_bad_image_is_one_error_and_the_next_frame_follows() {
 
 #[test]
 fn stamps_keep_every_nanosecond() {
-    for (kind, first) in
-        [("tum", 1_000_000_000_000_000_001), ("euroc", 1_000_000_000_000_000_001), ("images", 0)]
-    {
+    const LATE: i64 = 1_000_000_000_000_000_001;
+    for (kind, first) in [("tum", LATE), ("euroc", LATE), ("mcap", LATE), ("images", 0)] {
         let (_folder, source) = opened(kind, |_| {});
         let frames = play(&mut *source.expect(kind)).expect(kind);
         assert_eq!(frames[0].0.capture_nanos, first, "{kind}");
@@ -406,10 +429,12 @@ fn what_is_missing_is_named() {
 
 #[test]
 fn source_names_are_parsed_and_explained() {
-    for name in ["sim", "sim:room", "tum:/a/b", "euroc:a:b", "images:.", "v4l:/dev/video0"] {
+    let cameras = ["v4l:/dev/video0", "stream:/run/frames", "ros2:/camera/image_raw"];
+    for name in ["sim", "sim:room", "tum:/a/b", "euroc:a:b", "images:."].into_iter().chain(cameras)
+    {
         let parsed: SourceName = name.parse().expect(name);
         assert_eq!(parsed.to_string(), name);
-        assert_eq!(parsed.is_camera(), name.starts_with("v4l"));
+        assert_eq!(parsed.is_camera(), cameras.contains(&name));
     }
     for (name, expected) in [
         ("", "No such file"),
@@ -417,6 +442,8 @@ fn source_names_are_parsed_and_explained() {
         ("tum", "the folder is missing"),
         ("images:", "the folder is missing"),
         ("v4l:", "the device is missing, as in v4l:/dev/video0"),
+        ("ros2:", "the topic is missing, as in ros2:/camera/image_raw"),
+        ("stream:", "the socket's path is missing"),
         ("sim:", "the scene's name is missing"),
         ("/", "no recording was recognised: looked for rgb.txt (TUM)"),
     ] {

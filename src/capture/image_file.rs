@@ -160,6 +160,16 @@ pub fn decode_gray_into(
     }
 }
 
+/// Width and height of PNG or JPEG bytes, pixels.
+pub fn image_size(bytes: &[u8]) -> Result<(usize, usize), DecodeError> {
+    // The size is the first thing that is compared; none is 0 x 0.
+    match decode_gray_into(bytes, 0, 0, &mut Vec::new(), &mut []) {
+        Err(DecodeError::Size { found, .. }) => Ok(found),
+        Err(error) => Err(error),
+        Ok(()) => Ok((0, 0)),
+    }
+}
+
 /// Writes an 8-bit grey PNG, under a temporary name first.
 pub fn write_gray_png(
     path: &Path,

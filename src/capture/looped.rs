@@ -135,6 +135,7 @@ impl FrameSource for Looped {
             capture_nanos: ((sequence + 1) as f64 * self.period_nanos) as i64,
             exposure_nanos: 0,
             gain: 0.0,
+            clocks: None,
         }))
     }
 }
@@ -197,7 +198,13 @@ mod tests {
                 return Err(SourceError::BrokenFrame { name, reason });
             }
             let capture_nanos = sequence as i64;
-            Ok(Some(FrameStamp { sequence, capture_nanos, exposure_nanos: 0, gain: 0.0 }))
+            Ok(Some(FrameStamp {
+                sequence,
+                capture_nanos,
+                exposure_nanos: 0,
+                gain: 0.0,
+                clocks: None,
+            }))
         }
     }
 

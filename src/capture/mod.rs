@@ -1,5 +1,6 @@
 //! Frames in: dataset readers, simulator, cameras. The only place that names image files and video devices.
 
+pub mod bag;
 #[cfg(test)]
 mod conformance;
 pub mod dataset_writer;
@@ -16,10 +17,14 @@ pub mod looped;
 pub mod png_image;
 pub mod recording;
 pub mod rig;
+pub mod ros_image;
 pub mod sensor_yaml;
 pub mod simulator;
 pub mod source;
 pub mod source_name;
+pub mod stream;
+#[cfg(test)]
+mod test_bag;
 #[cfg(test)]
 mod test_images;
 pub mod tum;

@@ -107,7 +107,7 @@ impl FrameSource for Recording {
             self.rectification.rectify_into(&self.raw, pixels);
         }
         let (capture_nanos, exposure_nanos) = (frame.nanos, frame.exposure_nanos);
-        Ok(Some(FrameStamp { sequence, capture_nanos, exposure_nanos, gain: 0.0 }))
+        Ok(Some(FrameStamp { sequence, capture_nanos, exposure_nanos, gain: 0.0, clocks: None }))
     }
 
     fn skip_to(&mut self, sequence: u64) -> Result<(), SourceError> {

@@ -4,6 +4,7 @@ use std::fs::File;
 use std::os::fd::BorrowedFd;
 use std::path::{Path, PathBuf};
 
+use crate::capture::bag::{self, BagError, BagImageError};
 use crate::capture::image_file::ImageFileError;
 use crate::capture::looped::Looped;
 use crate::capture::rig::{Rig, RigError};
@@ -11,7 +12,7 @@ use crate::capture::simulator::Simulator;
 use crate::capture::simulator::params::SimulatorParams;
 pub use crate::capture::source_name::SourceName;
 use crate::capture::v4l::params::CameraParams;
-use crate::capture::{euroc, image_folder, tum, v4l};
+use crate::capture::{euroc, image_folder, stream, tum, v4l};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::rectification::RectificationError;
 use crate::slam::image::buffer::Image;
@@ -29,6 +30,18 @@ pub struct FrameStamp {
     pub exposure_nanos: u64,
     /// Sensor gain, 0 where unknown.
     pub gain: f32,
+    /// The same instant by this machine's clocks, where the source knows it; otherwise capture finds it.
+    pub clocks: Option<FrameClocks>,
+}
+
+/// An instant by the clocks of this machine.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct FrameClocks {
+    /// CLOCK_MONOTONIC, nanoseconds: what latency counts from.
+    pub clock_nanos: i64,
+    /// CLOCK_REALTIME, nanoseconds, or what the sender has in its place: the stamp exactly as it came, so that who
+    /// reads poses can match them with the images by equality.
+    pub realtime_nanos: i64,
 }
 
 /// What waiting for a frame came to.
@@ -184,13 +197,45 @@ pub enum SourceError {
         /// Why, and what to do.
         reason: String,
     },
+    /// A stream of frames without a calibration.
+    #[error("{name}: needs a rig file with the camera's calibration: name it with --rig FILE")]
+    StreamRig {
+        /// The source.
+        name: String,
+    },
+    /// A stream that cannot serve.
+    #[error("{name}: {reason}")]
+    Stream {
+        /// The source.
+        name: String,
+        /// Why, and what to do.
+        reason: String,
+    },
     /// A frame came damaged; the next may be good.
-    #[error("v4l:{name}: a damaged frame: {reason}")]
+    #[error("{name}: a damaged frame: {reason}")]
     BrokenFrame {
-        /// The camera.
+        /// The source.
         name: String,
         /// What is wrong with it.
         reason: String,
+    },
+    /// A bag cannot be used.
+    #[error("{}: {problem}", path.display())]
+    Bag {
+        /// The file.
+        path: PathBuf,
+        /// Why, and what to do.
+        problem: BagError,
+    },
+    /// An image of a bag is not usable; the next may be good.
+    #[error("{}: an image on {topic} {problem}", path.display())]
+    BagImage {
+        /// The file.
+        path: PathBuf,
+        /// The topic.
+        topic: String,
+        /// What is wrong with it.
+        problem: BagImageError,
     },
     /// A recording without one image that can be used.
     #[error("none of its {count} images can be used; the first: {first}")]
@@ -216,7 +261,7 @@ impl SourceError {
     /// Whether only this frame is lost and the next may be good: a damaged frame of a camera, a damaged or
     /// missing image of a recording.
     pub fn is_passing(&self) -> bool {
-        matches!(self, Self::BrokenFrame { .. } | Self::Image(_))
+        matches!(self, Self::BrokenFrame { .. } | Self::Image(_) | Self::BagImage { .. })
     }
 }
 
@@ -247,6 +292,7 @@ pub fn open(
         SourceName::Tum(folder) => Ok(Box::new(tum::open(folder, rig)?)),
         SourceName::Euroc(folder) => Ok(Box::new(euroc::open(folder, rig)?)),
         SourceName::Images(folder) => Ok(Box::new(image_folder::open(folder, rig)?)),
+        SourceName::Mcap { file, topic } => Ok(Box::new(bag::open(file, topic.as_deref(), rig)?)),
         SourceName::Simulator { .. } if rig.is_some() => Err(unavailable(
             "the simulator takes no rig; its camera is in the table [simulator] of the configuration",
         )),
@@ -267,6 +313,12 @@ pub fn open(
             Ok(Box::new(Looped::new(name.clone(), source, *num_frames, *rate_hz)))
         }
         SourceName::Camera(device) => Ok(Box::new(v4l::open(device, rig, &params.camera)?)),
+        SourceName::Stream(path) => {
+            Ok(Box::new(stream::open_socket(path, rig, params.camera.stall_s)?))
+        }
+        SourceName::Ros2(topic) => {
+            Ok(Box::new(stream::open_ros2(topic, rig, params.camera.stall_s)?))
+        }
     }
 }
 

@@ -11,7 +11,7 @@ use crate::capture::source::SourceError;
 use crate::capture::{euroc, image_folder, tum};
 
 /// The forms of a source name, for errors and help.
-pub const SOURCE_FORMS: &str = "a folder (TUM, EuRoC or images), sim[:SCENE], tum:DIR, euroc:DIR, images:DIR, v4l:DEVICE and loop:FRAMES:HZ:SOURCE";
+pub const SOURCE_FORMS: &str = "a folder (TUM, EuRoC or images), sim[:SCENE], tum:DIR, euroc:DIR, images:DIR, mcap:FILE[:TOPIC], v4l:DEVICE, ros2:TOPIC, stream:SOCKET and loop:FRAMES:HZ:SOURCE";
 
 /// Endings of video files.
 const VIDEO_ENDINGS: [&str; 12] =
@@ -19,7 +19,7 @@ const VIDEO_ENDINGS: [&str; 12] =
 /// Endings of files in which recordings are packed.
 const ARCHIVE_ENDINGS: [&str; 6] = ["zip", "tgz", "gz", "tar", "7z", "xz"];
 /// Endings of what ROS records.
-const BAG_ENDINGS: [&str; 3] = ["bag", "db3", "mcap"];
+const BAG_ENDINGS: [&str; 2] = ["bag", "db3"];
 /// Names of a folder's content that an error lists.
 const MAX_LISTED: usize = 6;
 
@@ -37,8 +37,19 @@ pub enum SourceName {
     Euroc(PathBuf),
     /// `images:DIR`: a folder of images.
     Images(PathBuf),
+    /// `mcap:FILE[:TOPIC]`: a recording of ours, or a ROS 2 bag.
+    Mcap {
+        /// The file.
+        file: PathBuf,
+        /// The topic of the images, where one is named.
+        topic: Option<String>,
+    },
     /// `v4l:DEVICE`: a camera, by its path, its number or the name that udev gives it.
     Camera(String),
+    /// `stream:PATH`: a socket that another program sends frames to.
+    Stream(PathBuf),
+    /// `ros2:TOPIC`: images of a ROS 2 topic.
+    Ros2(String),
     /// `loop:FRAMES:HZ:SOURCE`: a recording back and forth, for benches and soak tests.
     Looped {
         /// Frames in all.
@@ -53,7 +64,7 @@ pub enum SourceName {
 impl SourceName {
     /// Whether frames come at their own pace, whether or not somebody takes them.
     pub fn is_camera(&self) -> bool {
-        matches!(self, Self::Camera(_))
+        matches!(self, Self::Camera(_) | Self::Stream(_) | Self::Ros2(_))
     }
 
     /// The folder of a recording; `None` for anything else.
@@ -61,7 +72,11 @@ impl SourceName {
         match self {
             Self::Tum(folder) | Self::Euroc(folder) | Self::Images(folder) => Some(folder),
             Self::Looped { inner, .. } => inner.folder(),
-            Self::Simulator { .. } | Self::Camera(_) => None,
+            Self::Mcap { .. }
+            | Self::Simulator { .. }
+            | Self::Camera(_)
+            | Self::Stream(_)
+            | Self::Ros2(_) => None,
         }
     }
 
@@ -93,9 +108,22 @@ impl SourceName {
             b"tum" => folder().map(Self::Tum),
             b"euroc" => folder().map(Self::Euroc),
             b"images" => folder().map(Self::Images),
+            b"mcap" => rest
+                .map(parse_mcap)
+                .unwrap_or_else(|| Err(error("the file is missing, as in mcap:run.mcap"))),
             b"v4l" => match text(rest)? {
                 None => Err(error("the device is missing, as in v4l:/dev/video0")),
                 Some(device) => Ok(Self::Camera(device)),
+            },
+            b"stream" if rest.is_some() => {
+                Ok(Self::Stream(rest.map(PathBuf::from).unwrap_or_default()))
+            }
+            b"stream" if bytes != kind => {
+                Err(error("the socket's path is missing, as in stream:/run/semidense/front.frames"))
+            }
+            b"ros2" if bytes != kind => match text(rest)? {
+                None => Err(error("the topic is missing, as in ros2:/camera/image_raw")),
+                Some(topic) => Ok(Self::Ros2(topic)),
             },
             _ => recognise(Path::new(name)),
         }
@@ -112,10 +140,18 @@ impl SourceName {
             Self::Tum(folder) => with("tum:", folder),
             Self::Euroc(folder) => with("euroc:", folder),
             Self::Images(folder) => with("images:", folder),
+            Self::Mcap { file, topic } => {
+                let mut name = with("mcap:", file);
+                topic.iter().for_each(|topic| name.push(format!(":{topic}")));
+                name
+            }
             Self::Looped { num_frames, rate_hz, inner } => {
                 with(&format!("loop:{num_frames}:{rate_hz}:"), Path::new(&inner.to_os_string()))
             }
-            Self::Simulator { .. } | Self::Camera(_) => OsString::from(self.to_string()),
+            Self::Stream(path) => with("stream:", path),
+            Self::Simulator { .. } | Self::Camera(_) | Self::Ros2(_) => {
+                OsString::from(self.to_string())
+            }
         }
     }
 
@@ -154,7 +190,13 @@ impl fmt::Display for SourceName {
             Self::Tum(folder) => write!(out, "tum:{}", folder.display()),
             Self::Euroc(folder) => write!(out, "euroc:{}", folder.display()),
             Self::Images(folder) => write!(out, "images:{}", folder.display()),
+            Self::Mcap { file, topic: None } => write!(out, "mcap:{}", file.display()),
+            Self::Mcap { file, topic: Some(topic) } => {
+                write!(out, "mcap:{}:{topic}", file.display())
+            }
             Self::Camera(device) => write!(out, "v4l:{device}"),
+            Self::Stream(path) => write!(out, "stream:{}", path.display()),
+            Self::Ros2(topic) => write!(out, "ros2:{topic}"),
             Self::Looped { num_frames, rate_hz, inner } => {
                 write!(out, "loop:{num_frames}:{rate_hz}:{inner}")
             }
@@ -164,6 +206,46 @@ impl fmt::Display for SourceName {
 
 fn name_error(name: &OsStr, problem: &str) -> SourceError {
     SourceError::Name { name: name.to_string_lossy().into_owned(), problem: problem.to_owned() }
+}
+
+/// `FILE[:TOPIC]`: a topic begins with `/`, and a file that is there is no topic. A folder stands for the one file in it.
+fn parse_mcap(rest: &OsStr) -> Result<SourceName, SourceError> {
+    let whole = Path::new(rest);
+    let bytes = rest.as_bytes();
+    let colon = bytes.windows(2).rposition(|pair| pair == b":/").filter(|_| !whole.exists());
+    let (file, topic) = match colon {
+        Some(colon) => (Path::new(OsStr::from_bytes(&bytes[..colon])), Some(&bytes[colon + 1..])),
+        None => (whole, None),
+    };
+    let topic = topic.map(|topic| String::from_utf8_lossy(topic).into_owned());
+    let file = if file.is_dir() { only_mcap(file)? } else { file.to_owned() };
+    Ok(SourceName::Mcap { file, topic })
+}
+
+/// The one MCAP file of a folder, as `ros2 bag record` makes it.
+fn only_mcap(folder: &Path) -> Result<PathBuf, SourceError> {
+    let files = mcap_files(folder);
+    match &files[..] {
+        [file] => Ok(file.clone()),
+        [] => Err(name_error(folder.as_os_str(), "there is no .mcap file in this folder")),
+        [first, ..] => {
+            let problem = format!(
+                "there are {} .mcap files in this folder: name one, as mcap:{}",
+                files.len(),
+                first.display()
+            );
+            Err(name_error(folder.as_os_str(), &problem))
+        }
+    }
+}
+
+/// The MCAP files of a folder in the order of their names.
+fn mcap_files(folder: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let mut files: Vec<PathBuf> =
+        entries.map(|e| e.path()).filter(|path| has_ending(path, &["mcap"])).collect();
+    files.sort();
+    files
 }
 
 /// `FRAMES:HZ:SOURCE`; `None` where it has another form.
@@ -189,7 +271,14 @@ fn recognise(path: &Path) -> Result<SourceName, SourceError> {
         }
     };
     if kind.is_dir() {
-        return SourceName::of_folder(path).map_or_else(|| error(nothing_known_in(path)), Ok);
+        return match SourceName::of_folder(path) {
+            Some(known) => Ok(known),
+            None if mcap_files(path).is_empty() => error(nothing_known_in(path)),
+            None => only_mcap(path).map(|file| SourceName::Mcap { file, topic: None }),
+        };
+    }
+    if kind.is_file() && has_ending(path, &["mcap"]) {
+        return Ok(SourceName::Mcap { file: path.to_owned(), topic: None });
     }
     let is_video_device = || path.to_string_lossy().contains("video") && kind.is_char_device();
     match path.to_str() {
@@ -227,7 +316,8 @@ fn what_a_file_is(path: &Path) -> String {
         return "this is an archive: unpack it and name its folder".to_owned();
     }
     if has_ending(path, &BAG_ENDINGS) {
-        return "this is a ROS bag: export its images into a folder with a times.txt and name that"
+        return "this is a ROS bag in an older format: convert it to MCAP (`ros2 bag convert`, or `rosbags-convert` from \
+                PyPI's rosbags) and name that"
             .to_owned();
     }
     if image_folder::is_called_image(path) || is_list {
@@ -268,7 +358,14 @@ mod tests {
 
     #[test]
     fn names_keep_every_byte_of_a_path() {
-        for name in [&b"tum:/a/\xff\xfe:b"[..], b"loop:5:30:images:/x", b"sim:room", b"v4l:0"] {
+        for name in [
+            &b"tum:/a/\xff\xfe:b"[..],
+            b"loop:5:30:images:/x",
+            b"sim:room",
+            b"v4l:0",
+            b"ros2:/a/b",
+            b"stream:/a\xff",
+        ] {
             let name = OsStr::from_bytes(name);
             assert_eq!(SourceName::parse(name).unwrap().to_os_string(), name);
         }

@@ -20,7 +20,7 @@ pub mod listing;
 pub mod negotiation;
 pub mod params;
 pub mod pixel_format;
-mod stamps;
+pub(in crate::capture) mod stamps;
 pub mod video_device;
 
 use std::os::fd::BorrowedFd;
@@ -136,7 +136,10 @@ impl<S: VideoSystem> FrameSource for CameraSource<S> {
         }
         let converted = self.convert(pixels);
         self.camera.release(converted.is_err());
-        converted.map_err(|reason| SourceError::BrokenFrame { name: self.name.clone(), reason })
+        converted.map_err(|reason| SourceError::BrokenFrame {
+            name: format!("v4l:{}", self.name),
+            reason,
+        })
     }
 
     fn skip_to(&mut self, _sequence: u64) -> Result<(), SourceError> {

@@ -294,6 +294,7 @@ impl FrameSource for Simulator {
             capture_nanos: self.nanos(frame),
             exposure_nanos,
             gain,
+            clocks: None,
         }))
     }
 

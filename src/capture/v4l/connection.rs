@@ -319,6 +319,7 @@ impl<S: VideoSystem> Camera<S> {
                 capture_nanos: taken.nanos,
                 exposure_nanos: stream.exposure.nanos,
                 gain: stream.exposure.gain,
+                clocks: None,
             };
             if let Some(older) = stream.held.replace(Held { filled, stamp }) {
                 self.losses.late += 1;

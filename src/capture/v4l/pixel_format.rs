@@ -3,6 +3,7 @@
 use super::kernel::FIELD_NONE;
 use super::video_device::{FourCc, Layout};
 use crate::capture::jpeg_image::decode_gray_into;
+use crate::slam::image::gray::{gray_from_interleaved, gray_from_rgb};
 
 /// A format that can be converted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -21,13 +22,17 @@ pub enum PixelFormat {
     Y12,
     /// 16 bits of grey.
     Y16,
+    /// Red, green, blue, a byte each.
+    Rgb3,
+    /// The same, blue first.
+    Bgr3,
     /// A JPEG for each frame.
     Mjpeg,
 }
 
 impl PixelFormat {
     /// All of them, the cheapest to convert first.
-    pub const ALL: [Self; 8] = [
+    pub const ALL: [Self; 10] = [
         Self::Grey,
         Self::Nv12,
         Self::Yuyv,
@@ -35,6 +40,8 @@ impl PixelFormat {
         Self::Y10,
         Self::Y12,
         Self::Y16,
+        Self::Rgb3,
+        Self::Bgr3,
         Self::Mjpeg,
     ];
 
@@ -48,6 +55,8 @@ impl PixelFormat {
             Self::Y10 => b"Y10 ",
             Self::Y12 => b"Y12 ",
             Self::Y16 => b"Y16 ",
+            Self::Rgb3 => b"RGB3",
+            Self::Bgr3 => b"BGR3",
             Self::Mjpeg => b"MJPG",
         })
     }
@@ -58,11 +67,12 @@ impl PixelFormat {
     }
 
     /// Bytes of a row whose grey values are needed; `None` for compressed pictures.
-    fn row_bytes(self, width: usize) -> Option<usize> {
+    pub(in crate::capture) fn row_bytes(self, width: usize) -> Option<usize> {
         match self {
             Self::Grey | Self::Nv12 => Some(width),
             // 4:2:2 without the last chroma: the last luma of an odd width is there nevertheless.
             Self::Yuyv | Self::Uyvy | Self::Y10 | Self::Y12 | Self::Y16 => width.checked_mul(2),
+            Self::Rgb3 | Self::Bgr3 => width.checked_mul(3),
             Self::Mjpeg => None,
         }
     }
@@ -127,6 +137,8 @@ pub fn unpack_gray(
             PixelFormat::Uyvy => every_second(&row[1..], gray),
             PixelFormat::Y10 => upper_bits::<2>(row, gray),
             PixelFormat::Y12 => upper_bits::<4>(row, gray),
+            PixelFormat::Rgb3 => gray_from_interleaved::<3>(row, gray),
+            PixelFormat::Bgr3 => gray_from_bgr(row, gray),
             PixelFormat::Y16 | PixelFormat::Mjpeg => upper_bits::<8>(row, gray),
         }
     }
@@ -142,6 +154,13 @@ fn every_second(row: &[u8], gray: &mut [u8]) {
     // An odd row ends with half a pair.
     if let (Some(gray), [last]) = (gray.get_mut(whole), row.chunks_exact(2).remainder()) {
         *gray = *last;
+    }
+}
+
+/// Colour with blue first.
+fn gray_from_bgr(row: &[u8], gray: &mut [u8]) {
+    for (gray, pixel) in gray.iter_mut().zip(row.chunks_exact(3)) {
+        *gray = gray_from_rgb([pixel[2], pixel[1], pixel[0]]);
     }
 }
 
@@ -179,6 +198,8 @@ mod tests {
             PixelFormat::Y10 => wide(2),
             PixelFormat::Y12 => wide(4),
             PixelFormat::Y16 => wide(8),
+            PixelFormat::Rgb3 => gray_from_rgb([row[3 * u], row[3 * u + 1], row[3 * u + 2]]),
+            PixelFormat::Bgr3 => gray_from_rgb([row[3 * u + 2], row[3 * u + 1], row[3 * u]]),
             PixelFormat::Mjpeg => unreachable!("compressed"),
         }
     }
@@ -237,7 +258,7 @@ mod tests {
             assert_eq!(PixelFormat::of(format.code()), Some(format));
         }
         assert_eq!(PixelFormat::Y16.code().to_string(), "Y16");
-        assert_eq!(PixelFormat::of(FourCc::new(b"RGB3")), None);
+        assert_eq!(PixelFormat::of(FourCc::new(b"RGB4")), None);
         assert_eq!(FourCc(0x0a).to_string(), "");
     }
 
@@ -270,6 +291,6 @@ mod tests {
         assert!(is_usable(&layout(b"MJPG", 0, 1)));
         assert!(!is_usable(&layout(b"YUYV", 640, 1)), "rows too short");
         assert!(!is_usable(&layout(b"GREY", 640, 4)), "interlaced");
-        assert!(!is_usable(&layout(b"RGB3", 1920, 1)), "not known");
+        assert!(!is_usable(&layout(b"RGB4", 2560, 1)), "not known");
     }
 }

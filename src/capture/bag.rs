@@ -1,0 +1,297 @@
+//! ROS 2 bags and our own recordings, in MCAP files: one topic of images as a source of frames.
+//!
+//! Read once from the start, message by message, so that a file without end (of a recorder that was killed) is played to
+//! the last whole chunk. Sizes in the file are never trusted.
+
+mod camera;
+mod chunk;
+mod contents;
+mod message;
+mod pixels;
+mod records;
+mod topics;
+
+#[cfg(test)]
+mod tests;
+
+use std::path::{Path, PathBuf};
+
+use crate::capture::bag::contents::Contents;
+use crate::capture::bag::message::{CompressedImage, FrameRecord, Image, Stamped};
+use crate::capture::bag::records::{Place, Records};
+use crate::capture::bag::topics::Kind;
+use crate::capture::image_file::{DecodeError, decode_gray_into};
+use crate::capture::rig::Rig;
+use crate::capture::source::{FrameSource, FrameStamp, Notice, SourceError};
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::rectification::Rectification;
+
+/// Why a bag cannot be used, or a message of it; the file and topic are named beside it.
+#[derive(Debug, thiserror::Error)]
+pub enum BagError {
+    /// The file cannot be read.
+    #[error("cannot be read: {0}; check the path and its permissions")]
+    Read(#[from] std::io::Error),
+    /// Another kind of file.
+    #[error("is no MCAP file; write a bag as one with `ros2 bag convert` or `mcap convert`")]
+    NotMcap,
+    /// A record that is not what its kind needs.
+    #[error("is damaged at byte {at}: {reason}; `mcap recover` saves what can be read")]
+    Damaged {
+        /// Where the record begins.
+        at: u64,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// No topic of images.
+    #[error("has no topic with images (sensor_msgs/Image or CompressedImage); it has {0}")]
+    NoImages(String),
+    /// Several topics of images.
+    #[error("has several topics with images: name one as mcap:FILE:TOPIC, of {0}")]
+    SeveralTopics(String),
+    /// The named topic is not there, or has no images.
+    #[error("has no images on the topic `{topic}`; topics with images are {known}")]
+    NoTopic {
+        /// The topic that was named.
+        topic: String,
+        /// Topics with images.
+        known: String,
+    },
+    /// Nothing says what the camera is.
+    #[error("has no CameraInfo beside `{0}`; name the camera with --rig FILE")]
+    NoCamera(String),
+    /// A `CameraInfo` that no rig can be made of.
+    #[error("CameraInfo of `{topic}`: {reason}; name the camera with --rig FILE")]
+    Camera {
+        /// The topic of the images.
+        topic: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The topic has no messages.
+    #[error("has no images on `{0}`; check that this is the right recording")]
+    Empty(String),
+}
+
+/// An image that cannot be used; the next may be good.
+#[derive(Debug, thiserror::Error)]
+pub enum BagImageError {
+    /// The message is not what its type says.
+    #[error("is not a message of its type: {0}")]
+    Message(#[from] message::CdrError),
+    /// The pixels are of a kind that is not read.
+    #[error("has the encoding `{0}`, which is not read; convert it to mono8 or rgb8")]
+    Encoding(String),
+    /// Fewer bytes than its size needs.
+    #[error("has {found} bytes where {width}x{height} pixels of {encoding} need {needed}")]
+    Length {
+        /// Bytes that are there.
+        found: usize,
+        /// Bytes that are needed.
+        needed: usize,
+        /// Width, pixels.
+        width: usize,
+        /// Height, pixels.
+        height: usize,
+        /// The encoding.
+        encoding: String,
+    },
+    /// It does not decode, or has another size than the camera's.
+    #[error(transparent)]
+    Decode(#[from] DecodeError),
+    /// Its stamp does not come after that of the image before.
+    #[error("has the stamp {nanos} ns, which does not come after the one before")]
+    Disordered {
+        /// Its stamp.
+        nanos: i64,
+    },
+    /// The chunk that it was in is damaged.
+    #[error("is lost with a part of the file that is damaged at byte {at}: {reason}")]
+    Chunk {
+        /// Where the record begins.
+        at: u64,
+        /// What is wrong with it.
+        reason: String,
+    },
+}
+
+/// The images of a topic as a source of frames.
+#[derive(Debug)]
+pub struct Bag {
+    path: PathBuf,
+    contents: Contents,
+    records: Records,
+    rectification: Rectification,
+    /// The raw image, where it is not the rectified one.
+    raw: Vec<u8>,
+    samples: Vec<u8>,
+    /// What our own recording says of the next image.
+    record: Option<FrameRecord>,
+    /// The source's number of the first frame.
+    first_sequence: Option<u64>,
+    /// Number that a frame without one of its own gets.
+    next: u64,
+    /// Stamp of the frame before.
+    last_nanos: Option<i64>,
+    notice: Option<Notice>,
+}
+
+/// Opens the images on `topic`, or on the only topic that has some. Without `rig` the `CameraInfo` beside them serves.
+pub fn open(path: &Path, topic: Option<&str>, rig: Option<&Path>) -> Result<Bag, SourceError> {
+    let bag = |problem| SourceError::Bag { path: path.to_owned(), problem };
+    let contents = Contents::read(path, topic).map_err(bag)?;
+    let (rig, rig_path) = match rig {
+        Some(rig) => (Rig::read(rig)?, rig.to_owned()),
+        None => (contents.rig(path).map_err(bag)?, path.to_owned()),
+    };
+    let rectification = Rectification::new(&rig.camera)
+        .map_err(|source| SourceError::Rectification { path: rig_path, source })?;
+    let Intrinsics { width, height, .. } = *rectification.intrinsics();
+    let raw = if rectification.is_identity() { Vec::new() } else { vec![0; width * height] };
+    let notice = contents.is_unfinished.then(|| Notice {
+        text: format!("{}: ends early; it is played to its last whole part", path.display()),
+        is_warning: true,
+    });
+    Ok(Bag {
+        path: path.to_owned(),
+        records: Records::open(path).map_err(bag)?,
+        contents,
+        rectification,
+        raw,
+        samples: Vec::new(),
+        record: None,
+        first_sequence: None,
+        next: 0,
+        last_nanos: None,
+        notice,
+    })
+}
+
+impl Bag {
+    /// Goes on to the next image; gives its stamp. `None` after the last.
+    fn advance(&mut self) -> Result<Option<FrameStamp>, SourceError> {
+        loop {
+            let found = match self.records.advance() {
+                Ok(found) => found,
+                Err(BagError::Damaged { at, reason }) => {
+                    return Err(self.lost(BagImageError::Chunk { at, reason }));
+                }
+                Err(problem) => {
+                    return Err(SourceError::Bag { path: self.path.clone(), problem });
+                }
+            };
+            match found {
+                None => return Ok(None),
+                Some(Place::Message { channel, log_nanos }) => {
+                    let data = self.records.message();
+                    if self.contents.is_frame_record(channel) {
+                        self.record = message::decode(data).ok();
+                    } else if self.contents.image_kind(channel).is_some() {
+                        let header = message::decode(data).map(|h: Stamped| h.stamp_nanos());
+                        return self.stamp(header, log_nanos).map(Some).map_err(|e| self.lost(e));
+                    }
+                }
+                Some(_) => {}
+            }
+        }
+    }
+
+    /// The stamp of an image whose header has `stamp`: our own recording's, where it says; that of the header; where
+    /// that was never set, when it was recorded.
+    fn stamp(
+        &mut self,
+        stamp: Result<i64, message::CdrError>,
+        log_nanos: i64,
+    ) -> Result<FrameStamp, BagImageError> {
+        let sequence = self.next;
+        self.next = self.next.saturating_add(1);
+        let stamp = stamp?;
+        let own = self.record.take().filter(|record| record.header.stamp_nanos() == stamp);
+        let frame = match own {
+            Some(own) => {
+                let first = *self.first_sequence.get_or_insert(own.sequence);
+                FrameStamp {
+                    // A damaged number must not go back.
+                    sequence: own.sequence.saturating_sub(first).max(sequence),
+                    capture_nanos: own.capture_nanos,
+                    exposure_nanos: own.exposure_nanos,
+                    gain: if own.gain.is_finite() { own.gain } else { 0.0 },
+                    clocks: None,
+                }
+            }
+            None => FrameStamp {
+                sequence,
+                capture_nanos: if stamp == 0 { log_nanos } else { stamp },
+                exposure_nanos: 0,
+                gain: 0.0,
+                clocks: None,
+            },
+        };
+        let nanos = frame.capture_nanos;
+        if self.last_nanos.is_some_and(|last| nanos <= last) {
+            return Err(BagImageError::Disordered { nanos });
+        }
+        self.last_nanos = Some(nanos);
+        self.next = frame.sequence.saturating_add(1);
+        Ok(frame)
+    }
+
+    fn lost(&self, problem: BagImageError) -> SourceError {
+        let (path, topic) = (self.path.clone(), self.contents.topic.clone());
+        SourceError::BagImage { path, topic, problem }
+    }
+
+    /// Decodes the image at hand into `pixels`.
+    fn decode_into(&mut self, pixels: &mut [u8]) -> Result<(), BagImageError> {
+        let Intrinsics { width, height, .. } = *self.rectification.intrinsics();
+        let is_identity = self.rectification.is_identity();
+        let gray = if is_identity { &mut *pixels } else { &mut self.raw[..] };
+        let data = self.records.message();
+        match self.contents.image_kind(self.records.channel()) {
+            Some(Kind::CompressedImage) => {
+                let image: CompressedImage<'_> = message::decode(data)?;
+                decode_gray_into(image.data, width, height, &mut self.samples, gray)?;
+            }
+            _ => pixels::gray_into(&message::decode::<Image<'_>>(data)?, width, height, gray)?,
+        }
+        if !is_identity {
+            self.rectification.rectify_into(&self.raw, pixels);
+        }
+        Ok(())
+    }
+}
+
+impl FrameSource for Bag {
+    fn intrinsics(&self) -> Intrinsics {
+        *self.rectification.intrinsics()
+    }
+
+    fn num_frames(&self) -> Option<usize> {
+        usize::try_from(self.contents.num_images).ok()
+    }
+
+    fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
+        let Intrinsics { width, height, .. } = self.intrinsics();
+        if pixels.len() != width * height {
+            return Err(SourceError::Buffer { found: pixels.len(), width, height });
+        }
+        let Some(stamp) = self.advance()? else { return Ok(None) };
+        self.decode_into(pixels).map_err(|problem| self.lost(problem))?;
+        Ok(Some(stamp))
+    }
+
+    fn skip_to(&mut self, sequence: u64) -> Result<(), SourceError> {
+        loop {
+            match self.advance() {
+                Ok(Some(stamp)) if stamp.sequence < sequence => {}
+                Err(error) if error.is_passing() => {}
+                Err(error) => return Err(error),
+                Ok(_) => return Ok(()),
+            }
+        }
+    }
+
+    fn take_notice(&mut self) -> Option<Notice> {
+        self.notice.take()
+    }
+}

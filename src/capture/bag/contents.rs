@@ -1,0 +1,193 @@
+//! What a file holds: its topics, and of the one that is played how many images there are and the camera.
+
+use std::collections::HashMap;
+use std::path::Path;
+
+use crate::capture::bag::BagError;
+use crate::capture::bag::camera::rig_of;
+use crate::capture::bag::message::{CameraInfo, decode};
+use crate::capture::bag::records::{Place, Records};
+use crate::capture::bag::topics::{
+    Channel, Channels, Kind, camera_topic, frame_record_topic, listed,
+};
+use crate::capture::rig::Rig;
+
+/// What is played of a file.
+#[derive(Debug)]
+pub struct Contents {
+    /// The topic of the images.
+    pub topic: String,
+    /// Images on it.
+    pub num_images: u64,
+    /// Whether the file ends before the end that a closed file has.
+    pub is_unfinished: bool,
+    /// Channels that are read: those of the images and what belongs to them.
+    channels: HashMap<u16, Kind>,
+}
+
+impl Contents {
+    /// Reads the summary of a file, or all of one that has none, and chooses the topic.
+    pub fn read(path: &Path, topic: Option<&str>) -> Result<Self, BagError> {
+        let mut records = Records::open(path)?;
+        let summary = if records.go_to_summary()? { read_channels(&mut records)? } else { None };
+        let (channels, is_unfinished) = match summary {
+            Some(channels) if is_possible(&channels, records.length()) => (channels, false),
+            _ => {
+                records = Records::open(path)?;
+                let channels = count_all(&mut records)?;
+                (channels, records.is_unfinished())
+            }
+        };
+        let topic = choose(&channels, topic)?;
+        let (camera, record) = (camera_topic(&topic), frame_record_topic(&topic));
+        let is_played = |channel: &Channel| match channel.kind? {
+            kind if kind.is_image() && channel.topic == topic => Some(kind),
+            Kind::CameraInfo if channel.topic == camera => Some(Kind::CameraInfo),
+            Kind::FrameRecord if channel.topic == record => Some(Kind::FrameRecord),
+            _ => None,
+        };
+        let num_images = channels
+            .values()
+            .filter(|c| is_played(c).is_some_and(Kind::is_image))
+            .map(|channel| channel.num_messages)
+            .fold(0, u64::saturating_add);
+        if num_images == 0 {
+            return Err(BagError::Empty(topic));
+        }
+        let channels =
+            channels.iter().filter_map(|(id, channel)| Some((*id, is_played(channel)?))).collect();
+        Ok(Self { topic, num_images, is_unfinished, channels })
+    }
+
+    /// The kind of image of a channel that is played.
+    pub fn image_kind(&self, channel: u16) -> Option<Kind> {
+        self.channels.get(&channel).copied().filter(|kind| kind.is_image())
+    }
+
+    /// Whether a channel holds our own recording's stamps of the images.
+    pub fn is_frame_record(&self, channel: u16) -> bool {
+        self.channels.get(&channel) == Some(&Kind::FrameRecord)
+    }
+
+    /// The camera by the first `CameraInfo` beside the images.
+    pub fn rig(&self, path: &Path) -> Result<Rig, BagError> {
+        let missing = || BagError::NoCamera(self.topic.clone());
+        if !self.channels.values().any(|kind| *kind == Kind::CameraInfo) {
+            return Err(missing());
+        }
+        let mut records = Records::open(path)?;
+        loop {
+            let place = match records.advance() {
+                // Whatever is damaged is told when it is reached in playing.
+                Err(BagError::Damaged { .. }) => continue,
+                other => other?,
+            };
+            let Some(place) = place else { return Err(missing()) };
+            let Place::Message { channel, .. } = place else { continue };
+            if self.channels.get(&channel) != Some(&Kind::CameraInfo) {
+                continue;
+            }
+            let wrong = |reason: String| BagError::Camera { topic: self.topic.clone(), reason };
+            let camera: CameraInfo =
+                decode(records.message()).map_err(|error| wrong(error.to_string()))?;
+            return rig_of(&camera, &self.topic, path).map_err(wrong);
+        }
+    }
+}
+
+/// Adds a schema or channel.
+fn note(place: Place, types: &mut HashMap<u16, String>, channels: &mut Channels) {
+    match place {
+        Place::Schema { id, name } => {
+            types.insert(id, name);
+        }
+        Place::Channel(channel) => {
+            let type_name = types.get(&channel.schema_id).cloned().unwrap_or_default();
+            let is_cdr = channel.message_encoding == "cdr";
+            let kind = Kind::of_type(&type_name).filter(|_| is_cdr);
+            let topic = channel.topic;
+            let new = Channel { topic, type_name, kind, num_messages: 0 };
+            channels.entry(channel.id).or_insert(new);
+        }
+        Place::Counts(counts) => {
+            for (id, count) in counts {
+                if let Some(channel) = channels.get_mut(&id) {
+                    channel.num_messages = count;
+                }
+            }
+        }
+        Place::Message { channel, .. } => {
+            if let Some(channel) = channels.get_mut(&channel) {
+                channel.num_messages += 1;
+            }
+        }
+    }
+}
+
+/// The channels by the summary; `None` where that lacks them or their counts.
+fn read_channels(records: &mut Records) -> Result<Option<Channels>, BagError> {
+    let (mut types, mut channels, mut has_counts) = (HashMap::new(), Channels::new(), false);
+    let mut counts = Vec::new();
+    loop {
+        match records.advance() {
+            Ok(Some(Place::Counts(found))) => {
+                (counts, has_counts) = (found, true);
+            }
+            Ok(Some(place @ (Place::Schema { .. } | Place::Channel(_)))) => {
+                note(place, &mut types, &mut channels);
+            }
+            Ok(Some(Place::Message { .. })) | Err(BagError::Damaged { .. }) => return Ok(None),
+            Ok(None) => break,
+            Err(error) => return Err(error),
+        }
+    }
+    note(Place::Counts(counts), &mut types, &mut channels);
+    Ok((has_counts && !channels.is_empty()).then_some(channels))
+}
+
+/// Whether a file of this length can hold the messages that its summary counts: none is shorter than a byte.
+fn is_possible(channels: &Channels, length: u64) -> bool {
+    channels.values().all(|channel| channel.num_messages <= length)
+}
+
+/// The channels and their messages by reading the whole file.
+fn count_all(records: &mut Records) -> Result<Channels, BagError> {
+    let (mut types, mut channels) = (HashMap::new(), Channels::new());
+    loop {
+        match records.advance() {
+            Ok(Some(place)) => note(place, &mut types, &mut channels),
+            Ok(None) => return Ok(channels),
+            Err(BagError::Damaged { .. }) => {}
+            Err(error) => return Err(error),
+        }
+    }
+}
+
+/// The topic that is played.
+fn choose(channels: &Channels, topic: Option<&str>) -> Result<String, BagError> {
+    let is_image = |channel: &&Channel| channel.kind.is_some_and(Kind::is_image);
+    let with_images = || channels.values().filter(is_image).map(|channel| channel.topic.as_str());
+    if let Some(topic) = topic {
+        return match with_images().any(|known| known == topic) {
+            true => Ok(topic.to_owned()),
+            false => {
+                Err(BagError::NoTopic { topic: topic.to_owned(), known: listed(with_images()) })
+            }
+        };
+    }
+    let mut names: Vec<&str> = channels
+        .values()
+        .filter(|channel| is_image(channel) && channel.num_messages > 0)
+        .map(|channel| channel.topic.as_str())
+        .collect();
+    names.sort_unstable();
+    names.dedup();
+    match names[..] {
+        [only] => Ok(only.to_owned()),
+        [] => {
+            let all = channels.values().map(|channel| channel.topic.as_str());
+            Err(BagError::NoImages(listed(all)))
+        }
+        _ => Err(BagError::SeveralTopics(listed(names.into_iter()))),
+    }
+}

@@ -1,0 +1,90 @@
+//! Which topics hold what.
+
+use std::collections::BTreeMap;
+
+/// What a topic's messages are, as far as they are read here.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// `sensor_msgs/Image`.
+    Image,
+    /// `sensor_msgs/CompressedImage`.
+    CompressedImage,
+    /// `sensor_msgs/CameraInfo`.
+    CameraInfo,
+    /// `semidense_msgs/Frame`.
+    FrameRecord,
+}
+
+impl Kind {
+    /// The kind of a type's name, with or without `msg` in it.
+    pub fn of_type(name: &str) -> Option<Self> {
+        match name.replacen("/msg/", "/", 1).as_str() {
+            "sensor_msgs/Image" => Some(Self::Image),
+            "sensor_msgs/CompressedImage" => Some(Self::CompressedImage),
+            "sensor_msgs/CameraInfo" => Some(Self::CameraInfo),
+            "semidense_msgs/Frame" => Some(Self::FrameRecord),
+            _ => None,
+        }
+    }
+
+    /// Whether it is a kind of image.
+    pub fn is_image(self) -> bool {
+        matches!(self, Self::Image | Self::CompressedImage)
+    }
+}
+
+/// A channel of the file: several may have the same topic.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Channel {
+    /// Its topic.
+    pub topic: String,
+    /// Name of its type; empty where it is not said.
+    pub type_name: String,
+    /// What its messages are; `None` for what is not read.
+    pub kind: Option<Kind>,
+    /// Messages in it.
+    pub num_messages: u64,
+}
+
+/// The channels by their numbers.
+pub type Channels = BTreeMap<u16, Channel>;
+
+/// The topic of the camera that belongs to images on `topic`: `camera_info` beside it, as ROS has it.
+pub fn camera_topic(topic: &str) -> String {
+    let images = base_topic(topic);
+    let namespace = images.rsplit_once('/').map_or("", |(namespace, _)| namespace);
+    format!("{namespace}/camera_info")
+}
+
+/// The topic of our own recording's stamps for images on `topic`.
+pub fn frame_record_topic(topic: &str) -> String {
+    let images = base_topic(topic);
+    let namespace = images.rsplit_once('/').map_or("", |(namespace, _)| namespace);
+    format!("{namespace}/details/frame")
+}
+
+/// Whether the images on `topic` are rectified already, by their name (`image_rect`, `image_rect_color`).
+pub fn is_rectified(topic: &str) -> bool {
+    base_topic(topic).rsplit('/').next().is_some_and(|name| name.contains("rect"))
+}
+
+/// The topic without the name that `image_transport` adds.
+fn base_topic(topic: &str) -> &str {
+    topic.strip_suffix("/compressed").unwrap_or(topic)
+}
+
+/// Topics as a list for an error.
+pub fn listed<'a>(topics: impl Iterator<Item = &'a str>) -> String {
+    /// More would not be read.
+    const MOST: usize = 20;
+    let mut names: Vec<&str> = topics.collect();
+    names.sort_unstable();
+    names.dedup();
+    let more = names.len().saturating_sub(MOST);
+    names.truncate(MOST);
+    match (names.is_empty(), more) {
+        (true, _) => "none".to_owned(),
+        (_, 0) => names.join(", "),
+        (_, more) => format!("{} and {more} more", names.join(", ")),
+    }
+}

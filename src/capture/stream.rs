@@ -1,0 +1,358 @@
+//! Frames that another program sends: `stream:PATH`, a socket that any program may write frames to, and `ros2:TOPIC`,
+//! for which `semidense-bridge` is started.
+//!
+//! A sender that is late, silent or gone is a state, as with a camera that is unplugged. The newest frame wins; what a
+//! sender says is checked before it is believed.
+
+mod feed;
+pub mod format;
+mod reader;
+
+use std::os::fd::{AsFd, BorrowedFd};
+use std::os::unix::net::UnixStream;
+use std::path::{Path, PathBuf};
+
+use rustix::time::{ClockId, clock_gettime};
+
+use self::feed::{Feed, Listener, Program, await_readable};
+use self::format::{StreamClock, StreamHeader};
+use self::reader::{FrameReader, Progress, StreamFault};
+use crate::capture::rig::Rig;
+use crate::capture::source::{
+    Arrival, FrameClocks, FrameLosses, FrameSource, FrameStamp, Notice, SourceError, SourceName,
+};
+use crate::capture::v4l::pixel_format::{PixelFormat, unpack_gray};
+use crate::capture::v4l::stamps::FrameNumbers;
+use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::rectification::Rectification;
+
+/// The program that reads ROS 2 topics.
+const BRIDGE: &str = "semidense-bridge";
+/// Its command that writes the images of a topic to its standard output.
+const BRIDGE_COMMAND: &str = "ros2-camera";
+/// Most frames that are taken at a look: a sender that never pauses must not keep capture from its other work.
+const MAX_FRAMES_A_LOOK: usize = 8;
+/// How long a reader that has not waited before is made to wait at a time, milliseconds.
+const READ_MILLIS: u32 = 1000;
+/// Frames whose stamps go back are refused; after so many in a row, a third of a second, it is the clock that has
+/// stepped.
+const MAX_REFUSED_IN_A_ROW: u32 = 10;
+
+/// Frames of another program, rectified: the newest that there is, without end.
+pub struct StreamSource {
+    name: String,
+    /// Before `feed`: a program ends when its stream is closed.
+    stream: Option<UnixStream>,
+    feed: Feed,
+    reader: FrameReader,
+    rectification: Rectification,
+    held: Option<(StreamHeader, FrameStamp)>,
+    /// The picture of the frame that is held.
+    picture: Vec<u8>,
+    /// The grey image, where it is not the rectified one.
+    raw: Vec<u8>,
+    /// Memory of the JPEG decoder.
+    samples: Vec<u8>,
+    numbers: FrameNumbers,
+    losses: FrameLosses,
+    notice: Option<Notice>,
+    /// Why the last sender was sent away.
+    fault: Option<String>,
+    stall_s: f64,
+    /// When the last frame came, or its sender.
+    newest_nanos: i64,
+    last_nanos: Option<i64>,
+    refused_in_a_row: u32,
+    has_streamed: bool,
+}
+
+/// Frames that a program sends to the socket at `path`; `stall_s`: silence that counts as absence.
+pub fn open_socket(
+    path: &Path,
+    rig: Option<&Path>,
+    stall_s: f64,
+) -> Result<StreamSource, SourceError> {
+    let name = SourceName::Stream(path.to_owned()).to_string();
+    StreamSource::new(name, Feed::Socket(Listener::new(path.to_owned())), rig, stall_s)
+}
+
+/// Images of a ROS 2 topic, by way of `semidense-bridge`.
+pub fn open_ros2(
+    topic: &str,
+    rig: Option<&Path>,
+    stall_s: f64,
+) -> Result<StreamSource, SourceError> {
+    let name = SourceName::Ros2(topic.to_owned()).to_string();
+    let arguments = vec![BRIDGE_COMMAND.to_owned(), topic.to_owned()];
+    StreamSource::new(name, Feed::Program(Program::new(bridge(), arguments)), rig, stall_s)
+}
+
+/// The program beside this one, else the one on the path.
+fn bridge() -> PathBuf {
+    let beside = std::env::current_exe().ok().map(|own| own.with_file_name(BRIDGE));
+    beside.filter(|path| path.is_file()).unwrap_or_else(|| PathBuf::from(BRIDGE))
+}
+
+fn nanos_of(clock: ClockId) -> i64 {
+    let now = clock_gettime(clock);
+    now.tv_sec.saturating_mul(1_000_000_000).saturating_add(now.tv_nsec)
+}
+
+impl StreamSource {
+    fn new(
+        name: String,
+        feed: Feed,
+        rig: Option<&Path>,
+        stall_s: f64,
+    ) -> Result<Self, SourceError> {
+        let path = rig.ok_or_else(|| SourceError::StreamRig { name: name.clone() })?;
+        let rectification = Rectification::new(&Rig::read(path)?.camera)
+            .map_err(|source| SourceError::Rectification { path: path.to_owned(), source })?;
+        let Intrinsics { width, height, .. } = *rectification.intrinsics();
+        let raw = if rectification.is_identity() { Vec::new() } else { vec![0; width * height] };
+        Ok(Self {
+            name,
+            stream: None,
+            feed,
+            reader: FrameReader::new((width as u32, height as u32)),
+            rectification,
+            held: None,
+            picture: Vec::new(),
+            raw,
+            samples: Vec::new(),
+            numbers: FrameNumbers::default(),
+            losses: FrameLosses::default(),
+            notice: None,
+            fault: None,
+            stall_s,
+            newest_nanos: i64::MIN,
+            last_nanos: None,
+            refused_in_a_row: 0,
+            has_streamed: false,
+        })
+    }
+
+    fn failed(&self, reason: String) -> SourceError {
+        SourceError::Stream { name: self.name.clone(), reason }
+    }
+
+    /// Takes a sender that has come, and all that it has sent; what that came to.
+    fn look(&mut self, now: i64) -> Result<Arrival, SourceError> {
+        match self.feed.connect(now) {
+            Ok(Some(stream)) => self.take_sender(stream, now),
+            Ok(None) => {}
+            Err(absence) if absence.passes || self.has_streamed => {
+                if self.stream.is_none() {
+                    return Ok(Arrival::Absent(self.fault.clone().unwrap_or(absence.reason)));
+                }
+            }
+            Err(absence) => return Err(self.failed(absence.reason)),
+        }
+        self.drain()?;
+        if self.held.is_some() {
+            self.has_streamed = true;
+            return Ok(Arrival::Frame);
+        }
+        if self.stream.is_none() {
+            let reason = self.fault.clone().unwrap_or_else(|| self.feed.absence());
+            return Ok(Arrival::Absent(reason));
+        }
+        let silent_nanos = now.saturating_sub(self.newest_nanos);
+        if silent_nanos as f64 > self.stall_s * 1e9 {
+            let seconds = self.stall_s;
+            return Ok(Arrival::Absent(format!("its sender sends no frame for {seconds} s")));
+        }
+        Ok(Arrival::Nothing)
+    }
+
+    /// One sender at a time: another is taken in the place of one that has gone silent.
+    fn take_sender(&mut self, stream: UnixStream, now: i64) {
+        let is_silent = now.saturating_sub(self.newest_nanos) as f64 > self.stall_s * 1e9;
+        if self.stream.is_some() && !is_silent {
+            self.remark("another program wants to send frames too; it is refused".to_owned());
+            return;
+        }
+        self.reader.restart();
+        self.numbers.restart();
+        self.stream = Some(stream);
+        self.newest_nanos = now;
+    }
+
+    fn remark(&mut self, text: String) {
+        self.notice = Some(Notice { text: format!("{}: {text}", self.name), is_warning: true });
+    }
+
+    /// Takes every frame that is whole and holds the newest good one.
+    fn drain(&mut self) -> Result<(), SourceError> {
+        for _ in 0..MAX_FRAMES_A_LOOK {
+            let Some(stream) = &mut self.stream else { return Ok(()) };
+            match self.reader.read(stream) {
+                Ok(Progress::Frame(header)) => self.hold(header),
+                Ok(Progress::Nothing) => return Ok(()),
+                Ok(Progress::Closed) => self.send_away(None),
+                Err(fault) => {
+                    self.losses.broken += 1;
+                    if matches!(fault, StreamFault::Size { .. }) && !self.has_streamed {
+                        return Err(
+                            self.failed(format!("{fault}; name the rig of that size with --rig"))
+                        );
+                    }
+                    self.send_away(Some(fault.to_string()));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Closes the stream. A sender that is at fault, and not just gone, is named until another comes.
+    fn send_away(&mut self, fault: Option<String>) {
+        self.stream = None;
+        self.feed.disconnected(nanos_of(ClockId::Monotonic));
+        if let Some(fault) = &fault {
+            self.remark(format!("{fault}; its sender was disconnected"));
+        }
+        self.fault = fault;
+    }
+
+    /// A frame is whole: it takes the place of one that nobody has read.
+    fn hold(&mut self, header: StreamHeader) {
+        let arrival_nanos = nanos_of(ClockId::Monotonic);
+        self.newest_nanos = arrival_nanos;
+        self.fault = None;
+        // Losses are differences: the lower half of the number tells them.
+        let (sequence, missing) = self.numbers.number(header.sequence as u32);
+        self.losses.missing += missing;
+        let (capture_nanos, clocks) = stamp_of(&header, arrival_nanos, nanos_of(ClockId::Realtime));
+        let before = self.held.map(|(_, stamp)| stamp.capture_nanos).or(self.last_nanos);
+        let is_old = before.is_some_and(|before| capture_nanos <= before);
+        self.refused_in_a_row = if is_old { self.refused_in_a_row + 1 } else { 0 };
+        if is_old && self.refused_in_a_row <= MAX_REFUSED_IN_A_ROW {
+            self.losses.broken += 1;
+            return;
+        }
+        self.refused_in_a_row = 0;
+        let stamp = FrameStamp {
+            sequence,
+            capture_nanos,
+            exposure_nanos: header.exposure_nanos,
+            gain: header.gain,
+            clocks: Some(clocks),
+        };
+        self.reader.swap_picture(&mut self.picture);
+        if self.held.replace((header, stamp)).is_some() {
+            self.losses.late += 1;
+        }
+        self.last_nanos = Some(capture_nanos);
+    }
+
+    /// Converts the frame that is held; why it is none.
+    fn convert(&mut self, header: &StreamHeader, pixels: &mut [u8]) -> Result<(), String> {
+        let Intrinsics { width, height, .. } = *self.rectification.intrinsics();
+        let bytes = self.picture.get(..header.bytes as usize).unwrap_or(&[]);
+        let stride = header.stride as usize;
+        let is_packed = header.format == PixelFormat::Grey && stride == width;
+        if let (true, Some(packed)) = (is_packed, bytes.get(..width * height)) {
+            self.rectification.rectify_into(packed, pixels);
+            return Ok(());
+        }
+        let is_identity = self.rectification.is_identity();
+        let gray = if is_identity { &mut *pixels } else { &mut self.raw[..] };
+        unpack_gray(header.format, bytes, stride, (width, height), &mut self.samples, gray)
+            .map_err(|broken| broken.to_string())?;
+        if !is_identity {
+            self.rectification.rectify_into(&self.raw, pixels);
+        }
+        Ok(())
+    }
+}
+
+/// The stamp that capture goes by, and the instant by this machine's clocks. A stamp of the wall clock is moved to
+/// CLOCK_MONOTONIC by what the two show as the frame arrives.
+fn stamp_of(header: &StreamHeader, arrival_nanos: i64, realtime_nanos: i64) -> (i64, FrameClocks) {
+    let stamp = header.stamp_nanos;
+    let to_realtime = realtime_nanos.saturating_sub(arrival_nanos);
+    match header.clock {
+        StreamClock::Monotonic => {
+            let realtime_nanos = stamp.saturating_add(to_realtime);
+            (stamp, FrameClocks { clock_nanos: stamp.min(arrival_nanos), realtime_nanos })
+        }
+        StreamClock::Realtime => {
+            let clock_nanos = stamp.saturating_sub(to_realtime);
+            let clocks =
+                FrameClocks { clock_nanos: clock_nanos.min(arrival_nanos), realtime_nanos: stamp };
+            (clock_nanos, clocks)
+        }
+        StreamClock::Other => {
+            (stamp, FrameClocks { clock_nanos: arrival_nanos, realtime_nanos: stamp })
+        }
+    }
+}
+
+impl FrameSource for StreamSource {
+    fn intrinsics(&self) -> Intrinsics {
+        *self.rectification.intrinsics()
+    }
+
+    fn num_frames(&self) -> Option<usize> {
+        None
+    }
+
+    fn await_frame(&mut self, wake: BorrowedFd<'_>, millis: u32) -> Result<Arrival, SourceError> {
+        let now = nanos_of(ClockId::Monotonic);
+        if self.look(now)? == Arrival::Frame {
+            return Ok(Arrival::Frame);
+        }
+        let retry_millis = self.feed.retry_nanos().filter(|_| self.stream.is_none()).map(|retry| {
+            u32::try_from(retry.saturating_sub(now).max(0) / 1_000_000 + 1).unwrap_or(u32::MAX)
+        });
+        let stream = self.stream.as_ref().map(AsFd::as_fd);
+        let descriptors = [Some(wake), self.feed.descriptor(), stream];
+        let millis = millis.min(retry_millis.unwrap_or(u32::MAX));
+        await_readable(descriptors.into_iter().flatten(), millis);
+        self.look(nanos_of(ClockId::Monotonic))
+    }
+
+    fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
+        let Intrinsics { width, height, .. } = *self.rectification.intrinsics();
+        if pixels.len() != width * height {
+            return Err(SourceError::Buffer { found: pixels.len(), width, height });
+        }
+        let (header, stamp) = loop {
+            if let Some(held) = self.held.take() {
+                break held;
+            }
+            match self.look(nanos_of(ClockId::Monotonic))? {
+                Arrival::Frame => {}
+                Arrival::Absent(reason) if self.stream.is_none() && self.has_streamed => {
+                    return Err(self.failed(reason));
+                }
+                _ => {
+                    let stream = self.stream.as_ref().map(AsFd::as_fd);
+                    let descriptors = [self.feed.descriptor(), stream];
+                    await_readable(descriptors.into_iter().flatten(), READ_MILLIS);
+                }
+            }
+        };
+        self.convert(&header, pixels).map_err(|reason| {
+            self.losses.broken += 1;
+            SourceError::BrokenFrame { name: self.name.clone(), reason }
+        })?;
+        Ok(Some(stamp))
+    }
+
+    fn skip_to(&mut self, _sequence: u64) -> Result<(), SourceError> {
+        // A sender's numbers begin with whoever takes them.
+        Ok(())
+    }
+
+    fn losses(&self) -> Option<FrameLosses> {
+        Some(self.losses)
+    }
+
+    fn take_notice(&mut self) -> Option<Notice> {
+        self.notice.take()
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,312 @@
+//! Where the sender of a stream comes from: a socket that any program may connect to, or a program that is started.
+
+use std::io::ErrorKind;
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::os::unix::fs::{FileTypeExt, PermissionsExt};
+use std::os::unix::net::{UnixListener, UnixStream};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+
+/// Pause before a sender is started, or a socket opened, again; doubled each time.
+const FIRST_PAUSE_NANOS: i64 = 200_000_000;
+/// The longest such pause.
+const LONGEST_PAUSE_NANOS: i64 = 5_000_000_000;
+/// A program that has lived so long did not fail of its start.
+const HEALTHY_NANOS: i64 = 10_000_000_000;
+/// How long a program may take to end once its stream is closed: it says goodbye to its peers.
+const GOODBYE_NANOS: i64 = 1_000_000_000;
+/// Exit code of a program that does not understand its command line: starting it again does not help.
+const WRONG_USAGE: i32 = 2;
+
+/// Why there is no sender.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Absence {
+    /// The reason, for the user.
+    pub reason: String,
+    /// Whether it may pass by itself.
+    pub passes: bool,
+}
+
+impl Absence {
+    fn passing(reason: String) -> Self {
+        Self { reason, passes: true }
+    }
+}
+
+/// Where the sender comes from.
+#[derive(Debug)]
+pub enum Feed {
+    /// It connects to a socket.
+    Socket(Listener),
+    /// It is started.
+    Program(Program),
+}
+
+impl Feed {
+    /// The stream of a sender that has come, once. `now` is CLOCK_MONOTONIC, nanoseconds.
+    pub fn connect(&mut self, now: i64) -> Result<Option<UnixStream>, Absence> {
+        let stream = match self {
+            Self::Socket(listener) => listener.connect(now)?,
+            Self::Program(program) => program.connect(now)?,
+        };
+        match stream {
+            Some(stream) => {
+                let refused = |error| Absence::passing(format!("its stream is refused ({error})"));
+                stream.set_nonblocking(true).map_err(refused)?;
+                Ok(Some(stream))
+            }
+            None => Ok(None),
+        }
+    }
+
+    /// What can be read when a sender comes.
+    pub fn descriptor(&self) -> Option<BorrowedFd<'_>> {
+        match self {
+            Self::Socket(listener) => listener.listener.as_ref().map(AsFd::as_fd),
+            Self::Program(_) => None,
+        }
+    }
+
+    /// When to try again, CLOCK_MONOTONIC, where nothing else tells.
+    pub fn retry_nanos(&self) -> Option<i64> {
+        match self {
+            Self::Socket(Listener { listener: Some(_), .. }) => None,
+            Self::Socket(listener) => Some(listener.pause.retry_nanos),
+            Self::Program(program) => Some(program.pause.retry_nanos),
+        }
+    }
+
+    /// Why nobody sends.
+    pub fn absence(&self) -> String {
+        match self {
+            Self::Socket(listener) => format!(
+                "nobody sends frames to {}; start the program that does",
+                listener.path.display()
+            ),
+            Self::Program(program) => program.last.clone(),
+        }
+    }
+
+    /// The stream has ended.
+    pub fn disconnected(&mut self, now: i64) {
+        if let Self::Program(program) = self {
+            program.ended(now);
+        }
+    }
+}
+
+/// Pauses that grow from failure to failure.
+#[derive(Debug, Default)]
+struct Pause {
+    next_nanos: i64,
+    retry_nanos: i64,
+}
+
+impl Pause {
+    fn begin(&mut self, now: i64) {
+        self.next_nanos = (2 * self.next_nanos).clamp(FIRST_PAUSE_NANOS, LONGEST_PAUSE_NANOS);
+        self.retry_nanos = now.saturating_add(self.next_nanos);
+    }
+}
+
+/// A socket that senders connect to, one at a time.
+#[derive(Debug)]
+pub struct Listener {
+    path: PathBuf,
+    listener: Option<UnixListener>,
+    pause: Pause,
+    last: String,
+}
+
+impl Listener {
+    /// Will listen at `path`.
+    pub fn new(path: PathBuf) -> Self {
+        Self { path, listener: None, pause: Pause::default(), last: String::new() }
+    }
+
+    fn connect(&mut self, now: i64) -> Result<Option<UnixStream>, Absence> {
+        let Some(listener) = &self.listener else {
+            if now < self.pause.retry_nanos {
+                return Err(Absence::passing(self.last.clone()));
+            }
+            match bind(&self.path) {
+                Ok(listener) => self.listener = Some(listener),
+                Err(absence) => {
+                    self.pause.begin(now);
+                    self.last.clone_from(&absence.reason);
+                    return Err(absence);
+                }
+            }
+            return Ok(None);
+        };
+        match listener.accept() {
+            Ok((stream, _)) => Ok(Some(stream)),
+            Err(error) if error.kind() == ErrorKind::WouldBlock => Ok(None),
+            Err(error) => {
+                let reason = format!("{}: no sender can connect ({error})", self.path.display());
+                Err(Absence::passing(reason))
+            }
+        }
+    }
+}
+
+impl Drop for Listener {
+    fn drop(&mut self) {
+        if self.listener.is_some() {
+            // Whoever starts next finds a socket without a listener otherwise, which it removes too.
+            let _ = std::fs::remove_file(&self.path);
+        }
+    }
+}
+
+/// Listens at `path`, for processes of this user. A socket that somebody has left there is removed.
+fn bind(path: &Path) -> Result<UnixListener, Absence> {
+    let at = |reason: String| format!("{}: {reason}", path.display());
+    let is_socket =
+        || std::fs::symlink_metadata(path).is_ok_and(|entry| entry.file_type().is_socket());
+    let listener = match UnixListener::bind(path) {
+        Err(error) if error.kind() == ErrorKind::AddrInUse && is_socket() => {
+            if UnixStream::connect(path).is_ok() {
+                let reason = "another process takes frames there; end it or name another path";
+                return Err(Absence::passing(at(reason.to_owned())));
+            }
+            std::fs::remove_file(path).and_then(|()| UnixListener::bind(path))
+        }
+        Err(error) if error.kind() == ErrorKind::AddrInUse => {
+            let reason = at("is a file; name a path where a socket can be made".to_owned());
+            return Err(Absence { reason, passes: false });
+        }
+        outcome => outcome,
+    };
+    let open = || {
+        let listener = listener?;
+        // Whoever may write to the socket may send: nobody but this user, before the first is accepted.
+        std::fs::set_permissions(path, PermissionsExt::from_mode(0o600))?;
+        listener.set_nonblocking(true)?;
+        Ok(listener)
+    };
+    open().map_err(|error: std::io::Error| Absence {
+        reason: at(format!("a socket cannot be made there ({error}); name a path in a folder of this user, of less than 108 bytes")),
+        passes: false,
+    })
+}
+
+/// A program that writes frames to its standard output, and ends when that is closed.
+#[derive(Debug)]
+pub struct Program {
+    program: PathBuf,
+    arguments: Vec<String>,
+    child: Option<Child>,
+    started_nanos: i64,
+    pause: Pause,
+    last: String,
+    /// It does not understand what it is told: there is no use in starting it again.
+    is_misused: bool,
+}
+
+impl Program {
+    /// Will start `program` with `arguments`.
+    pub fn new(program: PathBuf, arguments: Vec<String>) -> Self {
+        let last = format!("{} has not been started yet", program.display());
+        let pause = Pause::default();
+        Self { program, arguments, child: None, started_nanos: 0, pause, last, is_misused: false }
+    }
+
+    fn connect(&mut self, now: i64) -> Result<Option<UnixStream>, Absence> {
+        if self.child.is_some() {
+            return Ok(None);
+        }
+        if now < self.pause.retry_nanos || self.is_misused {
+            return Err(Absence { reason: self.last.clone(), passes: !self.is_misused });
+        }
+        match self.start() {
+            Ok(stream) => {
+                self.started_nanos = now;
+                Ok(Some(stream))
+            }
+            Err(error) => {
+                let program = self.program.display();
+                let is_missing = error.kind() == ErrorKind::NotFound;
+                self.last = match is_missing {
+                    true => format!("{program} is not there: install the package semidense-bridge"),
+                    false => format!("{program} cannot be started ({error})"),
+                };
+                self.pause.begin(now);
+                Err(Absence { reason: self.last.clone(), passes: !is_missing })
+            }
+        }
+    }
+
+    fn start(&mut self) -> std::io::Result<UnixStream> {
+        let (ours, theirs) = UnixStream::pair()?;
+        let child = Command::new(&self.program)
+            .args(&self.arguments)
+            .stdin(Stdio::null())
+            .stdout(Stdio::from(OwnedFd::from(theirs)))
+            .spawn()?;
+        self.child = Some(child);
+        Ok(ours)
+    }
+
+    /// Its stream is closed: it ends, or is ended.
+    fn ended(&mut self, now: i64) {
+        let Some(mut child) = self.child.take() else { return };
+        let program = self.program.display();
+        let status = wait_or_kill(&mut child);
+        self.last = match status {
+            Some(status) => format!("{program} has ended ({status}); it is started again"),
+            None => format!("{program} was stopped; it is started again"),
+        };
+        if status.and_then(|status| status.code()) == Some(WRONG_USAGE) {
+            self.last = format!("{program} does not understand `{}`", self.arguments.join(" "));
+            self.is_misused = true;
+        }
+        if now.saturating_sub(self.started_nanos) >= HEALTHY_NANOS {
+            self.pause = Pause::default();
+        }
+        self.pause.begin(now);
+    }
+}
+
+/// Waits for the end of a program that knows that it should end.
+fn wait_or_kill(child: &mut Child) -> Option<std::process::ExitStatus> {
+    const STEP_NANOS: i64 = 5_000_000;
+    for _ in 0..GOODBYE_NANOS / STEP_NANOS {
+        if let Ok(Some(status)) = child.try_wait() {
+            return Some(status);
+        }
+        pause(STEP_NANOS);
+    }
+    // What cannot be killed is gone already.
+    let _ = child.kill();
+    let _ = child.wait();
+    None
+}
+
+fn pause(nanos: i64) {
+    let timeout = Timespec { tv_sec: 0, tv_nsec: nanos };
+    let _ = poll(&mut [] as &mut [PollFd<'_>], Some(&timeout));
+}
+
+/// Waits until one of `descriptors` can be read, at most `millis`.
+pub fn await_readable<'a>(descriptors: impl Iterator<Item = BorrowedFd<'a>>, millis: u32) {
+    let mut polled: Vec<PollFd<'_>> =
+        descriptors.map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN)).collect();
+    let timeout = Timespec {
+        tv_sec: i64::from(millis / 1000),
+        tv_nsec: i64::from(millis % 1000) * 1_000_000,
+    };
+    // A signal ends the wait early; the caller looks at everything anyway.
+    let _ = poll(&mut polled, Some(&timeout));
+}
+
+impl Drop for Program {
+    fn drop(&mut self) {
+        // Its stream is closed by now.
+        if let Some(mut child) = self.child.take() {
+            wait_or_kill(&mut child);
+        }
+    }
+}
