@@ -444,3 +444,5 @@ fn contrast(pyramid: &SumPyramid) -> f64 {
 mod hostile_tests;
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod velocity_tests;

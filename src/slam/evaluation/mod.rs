@@ -18,8 +18,10 @@ pub mod patch_misfit;
 pub mod shared_view;
 pub mod start_error;
 pub mod statistics;
+pub mod surface_error;
 pub mod trajectory_error;
 pub mod umeyama;
+pub mod velocity_error;
 pub mod windows;
 
 use crate::slam::evaluation::association::{Association, associate};

@@ -19,7 +19,7 @@ use crate::slam::trajectory::StampedPose;
 pub const CHI_SQUARE_BOUND: f64 = 12.6;
 
 /// Frames on a keyframe below which the fit of its scale would swallow their error.
-const LEAST_FRAMES: usize = 5;
+pub(super) const LEAST_FRAMES: usize = 5;
 
 /// Normalised errors over many frames.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -164,7 +164,7 @@ fn similarity(poses: impl Iterator<Item = (SE3, SE3)> + Clone) -> Option<Sim3> {
 }
 
 /// Length of a keyframe unit in the truth's: s of min Σ |s t_est − t_true|²; `None` where it is not positive.
-fn unit_length(frames: &[(&PoseEstimate, SE3)]) -> Option<f64> {
+pub(super) fn unit_length(frames: &[(&PoseEstimate, SE3)]) -> Option<f64> {
     let (mut product, mut squared) = (0.0, 0.0);
     for (estimate, current_from_keyframe) in frames {
         let estimated = estimate.keyframe_from_camera.inverse().translation;

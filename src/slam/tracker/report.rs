@@ -64,7 +64,8 @@ impl Tracker {
         let errors = PoseErrors {
             keyframe: (reference.keyframe_id(), reference.epoch()),
             unit: reference.world_from_keyframe().scale,
-            own: covariance + displacement,
+            alignment: covariance,
+            displacement,
             by_mode: alignment.d_pose_d_modes(reference).unwrap_or_default(),
             modes: *reference.mode_covariance(),
         };

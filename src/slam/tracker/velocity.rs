@@ -3,9 +3,12 @@
 //! ```text
 //! v = log(T₀⁻¹ T₁) / Δt          T = world_from_camera of the last two frames that were tracked, Δt between their stamps
 //! Σ_v = (A N₀ Aᵀ + N₁ + (A J₀ − J₁) P (A J₀ − J₁)ᵀ) / Δt² + (a Δt / 2)² I          A = Ad((T₀⁻¹ T₁)⁻¹)
+//! N = OWN_SHARE (Σ_alignment + Σ_displacement)
 //! ```
-//! N are the errors that each pose has for itself. The common errors of the keyframe's depth, m with covariance P, move
-//! both poses: by J₀ m and J₁ m, whose difference is a relative error of the velocity. v is a mean over the interval: until
+//! N are the errors that each pose has for itself: a part of those of its alignment and of the displacement of its image, since
+//! noise of single points' depth, lens and rolling shutter displace successive images alike. The common errors of the
+//! keyframe's depth, m with covariance P, move both poses: by J₀ m and J₁ m, whose difference is a relative error of the
+//! velocity. Across a change of keyframe the errors of depth, of points and common, are others. v is a mean over the interval: until
 //! its end the camera accelerates on by a Δt / 2, a from how v changed over the last intervals. Errors of a pose are those of
 //! the left increment of `current_from_keyframe`; the velocity is in the camera's axes, in which a steady turn is steady.
 
@@ -19,6 +22,10 @@ use crate::slam::tracker::upper_triangle;
 /// Longest interval that has a velocity, seconds: what a camera does in more is no steady motion.
 const LONGEST_INTERVAL: f64 = 0.5;
 
+/// Part of a pose's variance that the pose before it on the same keyframe does not share. Calibrated on exact and recorded
+/// sequences: what poses differ by from frame to frame is half of what they are uncertain by, and less on exact images.
+const OWN_SHARE: f64 = 0.25;
+
 /// Share of the newest change in the mean over the last ones: a quarter of a second at 30 Hz.
 const NEWEST_SHARE: f64 = 0.125;
 
@@ -29,12 +36,21 @@ pub(super) struct PoseErrors {
     pub keyframe: (u64, u32),
     /// World units of a keyframe unit.
     pub unit: f64,
-    /// N: covariance of the errors that the pose has for itself.
-    pub own: Matrix6<f64>,
+    /// Covariance of the alignment.
+    pub alignment: Matrix6<f64>,
+    /// Covariance of the displacement of the whole image.
+    pub displacement: Matrix6<f64>,
     /// J: by what the pose moves for each common error of depth.
     pub by_mode: Matrix6x3<f64>,
     /// P: covariance of these.
     pub modes: ModeCovariance,
+}
+
+impl PoseErrors {
+    fn world_from_unit(&self) -> Matrix6<f64> {
+        let unit = self.unit;
+        Matrix6::from_diagonal(&Vector6::new(unit, unit, unit, 1.0, 1.0, 1.0))
+    }
 }
 
 /// What a tracker keeps of the frames before for the velocity of the next.
@@ -130,24 +146,18 @@ impl VelocityMemory {
 
 /// Covariance of `twist`, the logarithm of `before_from_last`.
 fn of_twist(before: &PoseErrors, last: &PoseErrors, twist: &Vector6<f64>) -> Matrix6<f64> {
-    let in_world = |errors: &PoseErrors| {
-        let unit = errors.unit;
-        let mut own = errors.own;
-        let mut by_mode = errors.by_mode;
-        own.fixed_rows_mut::<3>(0).scale_mut(unit);
-        own.fixed_columns_mut::<3>(0).scale_mut(unit);
-        by_mode.fixed_rows_mut::<3>(0).scale_mut(unit);
-        (own, by_mode)
-    };
-    let ((own_before, mode_before), (own, mode)) = (in_world(before), in_world(last));
     let last_from_before = SE3::exp(&-twist).adjoint();
-    let own_before = last_from_before * own_before * last_from_before.transpose();
-    let modes = last.modes.matrix();
-    if before.keyframe == last.keyframe {
-        let moved = last_from_before * mode_before - mode;
-        return own_before + own + moved * modes * moved.transpose();
-    }
-    // A keyframe stands where a frame before was tracked to be: by an error like that of the last one. The common errors of the
-    // one before have gone into it.
-    2.0 * own_before + own + mode * modes * mode.transpose()
+    let is_same = before.keyframe == last.keyframe;
+    let own = |errors: &PoseErrors| {
+        let of_points = if is_same { OWN_SHARE } else { 1.0 };
+        let own = errors.alignment * of_points + errors.displacement * OWN_SHARE;
+        let world = errors.world_from_unit();
+        world * own * world
+    };
+    let common = |errors: &PoseErrors| errors.world_from_unit() * errors.by_mode;
+    let moved = if is_same { last_from_before * common(before) } else { Matrix6x3::zeros() };
+    let moved = moved - common(last);
+    last_from_before * own(before) * last_from_before.transpose()
+        + own(last)
+        + moved * last.modes.matrix() * moved.transpose()
 }
