@@ -1,6 +1,8 @@
 //! The command line: one short file a subcommand in `command/`.
 
 pub mod record;
+#[cfg(feature = "ros2")]
+pub mod ros2;
 mod view;
 #[cfg(feature = "zenoh")]
 pub mod zenoh;
@@ -10,7 +12,7 @@ use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, CommandFactory, Parser, Subcommand};
 use semidense::service::config::{Config, SYSTEM_FOLDER, file_for};
 use semidense::wire::place::Place;
 use tracing_subscriber::EnvFilter;
@@ -66,9 +68,18 @@ impl CommonArguments {
 #[derive(Debug, Subcommand)]
 enum Subcommands {
     View(view::ViewArguments),
+    #[cfg(feature = "ros2")]
+    Ros2(ros2::Ros2Arguments),
+    #[cfg(feature = "ros2")]
+    Ros2Camera(ros2::Ros2CameraArguments),
     Record(record::RecordArguments),
     #[cfg(feature = "zenoh")]
     Zenoh(zenoh::ZenohArguments),
+}
+
+/// The command line, for manual and completions.
+pub fn command_line() -> clap::Command {
+    CommandLine::command()
 }
 
 /// Parses the command line and runs the chosen subcommand.
@@ -83,8 +94,9 @@ pub fn main() -> ExitCode {
 }
 
 fn run(line: CommandLine) -> CommandResult {
-    // Zenoh warns of scouting that is off on purpose.
-    let log = format!("zenoh=error,{}", line.common.log);
+    // Zenoh warns of scouting that is off on purpose; the middleware of ROS 2 without end where loopback has no
+    // multicast, as everywhere.
+    let log = format!("zenoh=error,rustdds=off,ros2_client=off,{}", line.common.log);
     let filter =
         EnvFilter::try_new(&log).map_err(|error| format!("--log {}: {error}", line.common.log))?;
     tracing_subscriber::fmt()
@@ -95,6 +107,10 @@ fn run(line: CommandLine) -> CommandResult {
         .init();
     match line.command {
         Subcommands::View(arguments) => view::run(&line.common, &arguments),
+        #[cfg(feature = "ros2")]
+        Subcommands::Ros2(arguments) => ros2::run(&line.common, &arguments),
+        #[cfg(feature = "ros2")]
+        Subcommands::Ros2Camera(arguments) => ros2::run_camera(&arguments),
         Subcommands::Record(arguments) => record::run(&line.common, &arguments),
         #[cfg(feature = "zenoh")]
         Subcommands::Zenoh(arguments) => zenoh::run(&line.common, &arguments),

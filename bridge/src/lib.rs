@@ -5,11 +5,14 @@
 
 pub mod command;
 pub mod feed;
+pub mod foxglove;
 #[cfg(feature = "zenoh")]
 pub mod jpeg;
 pub mod keyframe_pace;
 pub mod record;
 pub mod ros;
+#[cfg(feature = "ros2")]
+pub mod ros2;
 pub mod session;
 pub mod web;
 #[cfg(feature = "zenoh")]

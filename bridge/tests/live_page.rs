@@ -9,9 +9,9 @@ use std::process::{Child, Command, Stdio};
 
 use support::{Process, Rig, ask, finish, get, has_tool, semidense, succeed, tools, until};
 
-/// A live run that goes on until it is ended: the simulated camera goes round and round.
-const LONG: &[&str] = &["--live", "--set", "simulator.rate_hz=10"];
-const LONG_FRAMES: usize = 2000;
+/// A live run that goes on until it is ended: forty frames of the simulated camera back and forth.
+const LONG: &[&str] = &["--live", "--source", "loop:20000:10:sim"];
+const LONG_FRAMES: usize = 40;
 
 /// Where pictures are kept, to be looked at.
 fn pictures() -> PathBuf {
@@ -180,7 +180,8 @@ fn intruders_are_refused() {
         )),
         "403"
     );
-    assert_eq!(status(ask(&address, &[b'x'; 20_000])), "400");
+    assert_eq!(status(ask(&address, &[b'x'; 20_000])), "431");
+    assert_eq!(status(ask(&address, b"\x00\x01 no request\r\n\r\n")), "400");
     let long = format!("GET / HTTP/1.1\r\nA: {}\r\n\r\n", "x".repeat(20_000));
     assert_eq!(status(ask(&address, long.as_bytes())), "431");
     let upgrade = "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n";
@@ -254,7 +255,8 @@ fn a_page_that_is_stopped_or_killed_changes_no_result() {
 #[test]
 fn a_run_serves_its_page_and_outlives_it() {
     let rig = Rig::new();
-    let mut run = rig.run(150, &["--live", "--view=127.0.0.1:0", "--set", "simulator.rate_hz=20"]);
+    let mut run =
+        rig.run(LONG_FRAMES, &["--live", "--view=127.0.0.1:0", "--source", "loop:200:10:sim"]);
     let mut run = run.stderr(Stdio::piped()).spawn().unwrap();
     let mut stderr = BufReader::new(run.stderr.take().unwrap());
     let address = until("the address", || {

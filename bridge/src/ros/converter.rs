@@ -7,6 +7,7 @@ use semidense::wire::message::{FrameHeader, HealthMessage, PoseMessage};
 
 use crate::ros::axes::{
     map_covariance, odometry_covariance, pose_message, ros_from_world, transform_message,
+    vector_message, velocity_covariance,
 };
 use crate::ros::diagnostics::diagnostics;
 use crate::ros::frame_ids::FrameIds;
@@ -203,18 +204,25 @@ impl Converter {
 }
 
 /// CLOCK_REALTIME of a frame's exposure, where it is known.
-fn frame_realtime(_frame: &Frame) -> Option<i64> {
-    None
+fn frame_realtime(frame: &Frame) -> Option<i64> {
+    Some(frame.header.realtime_nanos).filter(|nanos| *nanos != 0)
 }
 
 /// CLOCK_REALTIME of the exposure of a pose's frame, where it is known.
-fn pose_realtime(_pose: &Pose) -> Option<i64> {
-    None
+fn pose_realtime(pose: &Pose) -> Option<i64> {
+    Some(pose.message.realtime_nanos).filter(|nanos| *nanos != 0)
 }
 
 /// Velocities of the camera in its own axes.
-fn twist(_message: &PoseMessage) -> TwistWithCovariance {
-    let mut covariance = [0.0; 36];
-    covariance[0] = UNKNOWN;
-    TwistWithCovariance { twist: Twist::default(), covariance }
+fn twist(message: &PoseMessage) -> TwistWithCovariance {
+    if message.has_velocity == 0 {
+        let mut covariance = [0.0; 36];
+        covariance[0] = UNKNOWN;
+        return TwistWithCovariance { twist: Twist::default(), covariance };
+    }
+    let twist = Twist {
+        linear: vector_message(&message.linear_velocity.into()),
+        angular: vector_message(&message.angular_velocity.into()),
+    };
+    TwistWithCovariance { twist, covariance: velocity_covariance(&message.velocity_covariance) }
 }

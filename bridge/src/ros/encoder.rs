@@ -102,7 +102,7 @@ impl EventEncoder {
                 let ready = self.pace.take(keyframe.clone(), now.instant);
                 ready.iter().try_for_each(|keyframe| self.put_keyframe(keyframe, sink))
             }
-            Event::Graph(graph) => self.put_graph(graph, read, sink),
+            Event::Graph(graph) => self.put_graph(graph, now.realtime_nanos, sink),
             Event::Health(owner, health) => {
                 if !sink.wants(&DIAGNOSTICS) {
                     return Ok(());
@@ -185,7 +185,12 @@ impl EventEncoder {
         Ok(())
     }
 
-    fn put_keyframe<S: Sink>(&mut self, keyframe: &Keyframe, sink: &mut S) -> Result<(), S::Error> {
+    /// Puts a keyframe, whether or not one was put a moment ago.
+    pub fn put_keyframe<S: Sink>(
+        &mut self,
+        keyframe: &Keyframe,
+        sink: &mut S,
+    ) -> Result<(), S::Error> {
         let stamp = self.converter.stamp(keyframe.capture_nanos);
         if sink.wants(&POINTS) {
             let cloud = self.converter.points(keyframe);
@@ -198,12 +203,14 @@ impl EventEncoder {
         Ok(())
     }
 
-    fn put_graph<S: Sink>(
+    /// Puts a graph that was read at `realtime_nanos`.
+    pub fn put_graph<S: Sink>(
         &mut self,
         graph: &Graph,
-        read: Time,
+        realtime_nanos: i64,
         sink: &mut S,
     ) -> Result<(), S::Error> {
+        let read = Time::from_nanos(realtime_nanos);
         if sink.wants(&KEYFRAMES) {
             let poses = self.converter.keyframes(graph, read);
             self.send(&KEYFRAMES, read, &poses, sink)?;

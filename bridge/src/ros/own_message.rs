@@ -72,6 +72,15 @@ pub struct PoseRecord {
     /// Of the left increment of `map_from_camera`.
     #[serde(with = "BigArray")]
     pub map_covariance: [f64; 21],
+    /// 1 where the velocity is known.
+    pub has_velocity: u32,
+    /// Of the camera, in its axes, world units a second.
+    pub linear_velocity: [f64; 3],
+    /// Of the camera, in its axes, rad/s.
+    pub angular_velocity: [f64; 3],
+    /// Linear, then angular: upper triangle, row-major.
+    #[serde(with = "BigArray")]
+    pub velocity_covariance: [f64; 21],
     /// Brightness against the keyframe: a, b.
     pub brightness: [f64; 2],
     /// Share of the keyframe's points in view.
@@ -106,6 +115,10 @@ impl PoseRecord {
             keyframe_from_camera: pose.keyframe_from_camera,
             covariance: pose.covariance,
             map_covariance: pose.map_covariance,
+            has_velocity: pose.has_velocity,
+            linear_velocity: pose.linear_velocity,
+            angular_velocity: pose.angular_velocity,
+            velocity_covariance: pose.velocity_covariance,
             brightness: pose.brightness,
             in_view_ratio: pose.in_view_ratio,
             inlier_ratio: pose.inlier_ratio,

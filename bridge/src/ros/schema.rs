@@ -83,7 +83,8 @@ const DEFINITIONS: &[(&str, &str)] = &[
          uint64 track_nanos\nuint64 keyframe_id\nuint64 revision\nuint64 map_revision\nuint32 epoch\n\
          uint32 state\nuint32 reason\nfloat64[7] world_from_camera\nfloat64[7] map_from_camera\n\
          float64[7] keyframe_from_camera\nfloat64[21] covariance\nfloat64[21] map_covariance\n\
-         float64[2] brightness\nfloat64 in_view_ratio\nfloat64 inlier_ratio\nfloat64 residual_rmse\n\
+         uint32 has_velocity\nfloat64[3] linear_velocity\nfloat64[3] angular_velocity\n\
+         float64[21] velocity_covariance\nfloat64[2] brightness\nfloat64 in_view_ratio\nfloat64 inlier_ratio\nfloat64 residual_rmse\n\
          uint32 points\nuint32 iterations\n",
     ),
     (

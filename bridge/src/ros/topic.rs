@@ -42,12 +42,22 @@ pub struct RosTopic {
 impl RosTopic {
     /// Its whole name for an instance.
     pub fn full_name(&self, instance: &str) -> String {
+        self.name_in(&namespace(instance))
+    }
+
+    /// Its whole name in a namespace, which begins with `/`.
+    pub fn name_in(&self, namespace: &str) -> String {
         if self.name.starts_with('/') {
             self.name.to_owned()
         } else {
-            format!("/{}/{}", name_part(instance), self.name)
+            format!("{}/{}", namespace.trim_end_matches('/'), self.name)
         }
     }
+}
+
+/// The namespace of an instance's topics.
+pub fn namespace(instance: &str) -> String {
+    format!("/{}", name_part(instance))
 }
 
 /// An instance's name as a part of a topic's: ROS allows letters, digits and `_`, and no digit first.
@@ -83,6 +93,14 @@ pub const POSE: RosTopic = reliable::<PoseWithCovarianceStamped>("pose", DEFAULT
 pub const ODOMETRY: RosTopic = reliable::<Odometry>("odom", DEFAULT_DEPTH);
 /// map → odom → camera.
 pub const TF: RosTopic = reliable::<TfMessage>("/tf", TF_DEPTH);
+/// The camera's body axes in its optical frame; never changes.
+pub const TF_STATIC: RosTopic = RosTopic {
+    name: "/tf_static",
+    message_type: TfMessage::TYPE,
+    reliability: Reliability::Reliable,
+    durability: Durability::TransientLocal,
+    depth: 1,
+};
 /// The active keyframe's depth as points in the map.
 pub const POINTS: RosTopic = sensor::<PointCloud2>("points", SENSOR_DEPTH);
 /// The camera's image, rectified, grey.

@@ -1,7 +1,7 @@
 //! As much of HTTP as the page needs: one request a connection, its head bounded in bytes and time.
 
 use std::io::{self, Read, Write};
-use std::net::TcpStream;
+use std::net::{Shutdown, TcpStream};
 use std::time::{Duration, Instant};
 
 /// Most bytes of a request's head: what browsers and scrapers send is a tenth of it.
@@ -10,6 +10,11 @@ pub const MAX_HEAD_BYTES: usize = 8 << 10;
 const MAX_HEADERS: usize = 64;
 /// Longest time in which a head must have come: a phone on bad wireless takes a second.
 const LONGEST_HEAD: Duration = Duration::from_secs(5);
+
+/// Longest wait, once it is answered, for the other end to close.
+const LONGEST_CLOSE: Duration = Duration::from_secs(1);
+/// Most bytes that are read meanwhile: a request that is refused may go on.
+const MOST_LEFT_BYTES: usize = 256 << 10;
 
 /// The head of a request.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -180,8 +185,25 @@ impl<'a> Answer<'a> {
         if !is_head_only {
             stream.write_all(self.body)?;
         }
-        stream.flush()
+        stream.flush()?;
+        close(stream)
     }
+}
+
+/// Closes in order: bytes that nobody has read would take the answer with them.
+fn close(stream: &mut TcpStream) -> io::Result<()> {
+    stream.shutdown(Shutdown::Write)?;
+    let end = Instant::now() + LONGEST_CLOSE;
+    let mut left = MOST_LEFT_BYTES;
+    let mut chunk = [0; 4096];
+    while left > 0 && Instant::now() < end {
+        stream.set_read_timeout(Some(LONGEST_CLOSE))?;
+        match stream.read(&mut chunk)? {
+            0 => break,
+            length => left = left.saturating_sub(length),
+        }
+    }
+    Ok(())
 }
 
 #[cfg(test)]

@@ -18,6 +18,8 @@ use crate::web::words::pose_json;
 
 /// Shortest time between two revisions of the active keyframe: each is half a megabyte for every page.
 const REVISION_PERIOD: Duration = Duration::from_secs(1);
+/// Time without a pose from which on images are shown without.
+const LONGEST_WAIT: Duration = Duration::from_millis(500);
 /// Points that are kept of all keyframes together where it is not said otherwise: 48 MB here and in each page.
 pub const USUAL_POINTS: usize = 6_000_000;
 
@@ -35,6 +37,8 @@ pub struct Scene {
 pub struct NewestFrame {
     /// The image.
     pub frame: Arc<Frame>,
+    /// Its own pose; `None` where no poses come.
+    pub pose: Option<Arc<Pose>>,
     /// Counts up with every one.
     pub number: u64,
     /// The image as JPEG, once a page has wanted it.
@@ -65,8 +69,11 @@ pub struct State {
     pub path: Path,
     /// The newest pose, and how many came.
     pub pose: Option<(u64, Arc<Pose>)>,
-    /// The newest frame.
+    /// The newest frame whose pose is known.
     pub frame: Option<NewestFrame>,
+    /// A frame that waits for its pose, which comes some milliseconds later.
+    waiting: Option<Arc<Frame>>,
+    posed: Instant,
     /// What each process says of itself, and how many such messages came.
     pub health: BTreeMap<&'static str, HealthMessage>,
     /// Counts up with every report.
@@ -94,6 +101,8 @@ impl State {
             path: Path::default(),
             pose: None,
             frame: None,
+            waiting: None,
+            posed: Instant::now(),
             health: BTreeMap::new(),
             reports: 0,
             poses_by_state: [0; 4],
@@ -111,11 +120,14 @@ impl State {
             Event::Left => {
                 // What was seen stays in view until another run begins.
                 self.pack_active();
-                (self.is_joined, self.frame) = (false, None);
+                (self.is_joined, self.frame, self.waiting) = (false, None, None);
             }
             Event::Frame(frame) => {
-                let number = self.frame.as_ref().map_or(1, |frame| frame.number + 1);
-                self.frame = Some(NewestFrame { frame, number, jpeg: Arc::default() });
+                // One that the tracker has left out is left out here, unless nothing is tracked at all.
+                let before = self.waiting.replace(frame);
+                if self.posed.elapsed() > LONGEST_WAIT {
+                    before.into_iter().for_each(|frame| self.show(frame, None));
+                }
             }
             Event::Pose(pose) => self.take_pose(*pose),
             Event::Keyframe(keyframe) => self.take_keyframe(keyframe, has_pages),
@@ -135,7 +147,17 @@ impl State {
             *count += 1;
         }
         let number = self.pose.as_ref().map_or(1, |(number, _)| number + 1);
-        self.pose = Some((number, Arc::new(pose)));
+        let pose = Arc::new(pose);
+        let is_own = |frame: &mut Arc<Frame>| frame.header.sequence == pose.message.sequence;
+        if let Some(frame) = self.waiting.take_if(is_own) {
+            self.show(frame, Some(Arc::clone(&pose)));
+        }
+        (self.pose, self.posed) = (Some((number, pose)), Instant::now());
+    }
+
+    fn show(&mut self, frame: Arc<Frame>, pose: Option<Arc<Pose>>) {
+        let number = self.frame.as_ref().map_or(1, |frame| frame.number + 1);
+        self.frame = Some(NewestFrame { frame, pose, number, jpeg: Arc::default() });
     }
 
     fn take_keyframe(&mut self, keyframe: Arc<Keyframe>, has_pages: bool) {

@@ -11,7 +11,8 @@ use tungstenite::WebSocket;
 use tungstenite::handshake::derive_accept_key;
 use tungstenite::protocol::{Role, WebSocketConfig};
 
-use crate::feed::Feed;
+use crate::feed::{Feed, USUAL_DEPTH};
+use crate::foxglove::{self, SUBPROTOCOLS};
 use crate::web::guard::{COOKIE, Guard, Refusal};
 use crate::web::http::{Answer, Head, HeadError, read_head};
 use crate::web::metrics::{CONTENT_TYPE, metrics};
@@ -29,8 +30,8 @@ const LONGEST_ANSWER: Duration = Duration::from_secs(30);
 const MAX_MESSAGE_BYTES: usize = 64 << 10;
 /// Pause after a connection that could not be taken: too many files are open.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
-/// Subprotocols of Foxglove's WebSocket.
-const FOXGLOVE: [&str; 2] = ["foxglove.sdk.v1", "foxglove.websocket.v1"];
+/// Clients of Foxglove's protocol at a time: each has its own messages encoded.
+const MAX_FOXGLOVE: usize = 8;
 
 /// The files of the page, in the program itself.
 const FILES: [(&str, &str, &str); 7] = [
@@ -93,6 +94,7 @@ pub struct Server {
     guard: Guard,
     shown: Shown,
     connections: AtomicUsize,
+    foxglove_clients: AtomicUsize,
     is_over: AtomicBool,
 }
 
@@ -108,6 +110,7 @@ impl Server {
             guard,
             shown,
             connections: AtomicUsize::new(0),
+            foxglove_clients: AtomicUsize::new(0),
             is_over: AtomicBool::new(false),
         }))
     }
@@ -250,8 +253,8 @@ impl Server {
     /// A WebSocket: Foxglove's, which names a subprotocol, or the page's.
     fn upgrade(&self, mut stream: TcpStream, head: Head) -> io::Result<()> {
         let wanted = |name: &&str| head.lists("sec-websocket-protocol", name);
-        if let Some(protocol) = FOXGLOVE.into_iter().find(wanted) {
-            return self.foxglove(stream, &head, protocol);
+        if let Some(protocol) = SUBPROTOCOLS.into_iter().find(wanted) {
+            return self.foxglove(stream, head, protocol);
         }
         let Shown::Live { scene, stream: options, .. } = &self.shown else {
             return Answer::refusal("404 Not Found", "this run is over: there is no stream\n")
@@ -269,9 +272,24 @@ impl Server {
         serve_stream(socket, scene, options, &self.is_over).map_err(io::Error::other)
     }
 
-    fn foxglove(&self, mut stream: TcpStream, _head: &Head, protocol: &str) -> io::Result<()> {
-        let text = format!("{protocol} is not served\n");
-        Answer::refusal("501 Not Implemented", &text).send(&mut stream, false)
+    fn foxglove(&self, mut stream: TcpStream, head: Head, protocol: &str) -> io::Result<()> {
+        let Shown::Live { feed, stream: options, .. } = &self.shown else {
+            return Answer::refusal("404 Not Found", "this run is over: nothing is sent\n")
+                .send(&mut stream, false);
+        };
+        let more = |n: usize| (n < MAX_FOXGLOVE).then_some(n + 1);
+        let clients = &self.foxglove_clients;
+        if clients.fetch_update(Ordering::Relaxed, Ordering::Relaxed, more).is_err() {
+            let text = format!("{MAX_FOXGLOVE} clients are served already: close one\n");
+            return Answer::refusal("503 Service Unavailable", &text).send(&mut stream, false);
+        }
+        let outcome = accept(stream, head, Some(protocol)).and_then(|socket| {
+            let listener = feed.listen(USUAL_DEPTH);
+            foxglove::serve(socket, &options.instance, |timeout| listener.next(timeout))
+                .map_err(io::Error::other)
+        });
+        clients.fetch_sub(1, Ordering::Relaxed);
+        outcome
     }
 }
 

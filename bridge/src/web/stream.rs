@@ -17,7 +17,7 @@ use crate::ros::images::jpeg;
 use crate::web::message::{binary, hello, text};
 use crate::web::packing::Packed;
 use crate::web::scene::{NewestFrame, Scene, State};
-use crate::web::words::health_json;
+use crate::web::words::{health_json, pose_json};
 
 /// Large messages that a page may have unanswered: enough to fill a link, few enough that what comes is new.
 const MAX_UNANSWERED: usize = 4;
@@ -136,6 +136,7 @@ impl Outgoing {
                         "t": header.capture_nanos as f64 * 1e-9,
                         "k": header.intrinsics,
                         "size": [header.width, header.height],
+                        "pose": newest.pose.as_deref().map(pose_json),
                     });
                     binary(&header, image)
                 })

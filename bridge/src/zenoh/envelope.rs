@@ -18,14 +18,16 @@ pub const MAX_MESSAGE_BYTES: usize = 16 << 20;
 pub enum Packing {
     /// As it is.
     Plain,
-    /// LZ4 of columns, or of rows of an image.
+    /// LZ4 of columns.
     Lz4,
+    /// PNG.
+    Png,
     /// JPEG.
     Jpeg,
 }
 
 impl Packing {
-    const ALL: [Self; 3] = [Self::Plain, Self::Lz4, Self::Jpeg];
+    const ALL: [Self; 4] = [Self::Plain, Self::Lz4, Self::Png, Self::Jpeg];
 }
 
 /// The envelope.

@@ -23,6 +23,14 @@ const RETRY_MS: [u32; 2] = [250, 1000];
 /// waits behind it. On a link of 10 Mbit/s that is 0.1 s.
 const SEND_BUFFER_BYTES: u32 = 64 << 10;
 
+/// Batches that Zenoh holds for each priority, at most 16 of 64 kB: poses while its own threads wait for a busy CPU, and
+/// the depth of a keyframe in one piece.
+const BATCHES: &str = "{ control: 2, real_time: 16, interactive_high: 8, interactive_low: 2, data_high: 2, data: 4, \
+                       data_low: 16, background: 8 }";
+/// How long a put waits for a place there before the message is dropped, and how long one of several batches, microseconds.
+/// Zenoh drops the newest, our own queues the oldest: while a put waits, those decide.
+const PUT_WAITS_MICROS: [u32; 2] = [50_000, 200_000];
+
 /// Where to listen or to connect to: `tcp/HOST:PORT`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Endpoint {
@@ -159,6 +167,15 @@ fn config(endpoints: &Endpoints) -> Result<Config, ZenohError> {
         ("transport/shared_memory/enabled", "false".into()),
         ("transport/link/rx/max_message_size", (MAX_MESSAGE_BYTES + (1 << 10)).to_string()),
         ("transport/link/tx/lease", LEASE_MS.to_string()),
+        ("transport/link/tx/queue/size", BATCHES.into()),
+        (
+            "transport/link/tx/queue/congestion_control/drop/wait_before_drop",
+            PUT_WAITS_MICROS[0].to_string(),
+        ),
+        (
+            "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments",
+            PUT_WAITS_MICROS[1].to_string(),
+        ),
         ("transport/link/tcp/so_sndbuf", SEND_BUFFER_BYTES.to_string()),
     ];
     if let Some(path) = &endpoints.password_file {

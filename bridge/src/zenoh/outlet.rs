@@ -2,9 +2,8 @@
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
-use std::time::{SystemTime, UNIX_EPOCH};
 
-use semidense::service::clock::now_nanos;
+use semidense::service::clock::{now_nanos, realtime_of};
 use zenoh::bytes::ZBytes;
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 
@@ -52,8 +51,7 @@ impl Outlet {
         self.is_joined.store(true, Ordering::Release);
     }
 
-    /// The instance is gone. What it said last stays for receivers that come late, but for the map: its keyframes are
-    /// no help without the run.
+    /// The instance is gone. What it said last stays for receivers that come late.
     pub fn end_run(&self) {
         self.is_joined.store(false, Ordering::Release);
     }
@@ -120,6 +118,5 @@ impl Outlet {
 
 /// CLOCK_REALTIME − CLOCK_MONOTONIC of this machine.
 pub fn realtime_offset_nanos() -> i64 {
-    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    i64::try_from(since.as_nanos()).unwrap_or(i64::MAX).saturating_sub(now_nanos())
+    realtime_of(0)
 }

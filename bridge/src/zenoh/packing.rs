@@ -1,11 +1,14 @@
-//! Payloads made small for the network, without loss but for frames: points by columns, images by differences, then LZ4.
+//! Payloads made small for the network, without loss but for frames: points by columns and LZ4, images as PNG.
 //!
 //! Points lie row by row in the image, so that differences of u and v are nearly all small; the bytes of equal rank of the
 //! real numbers stand together, because exponents repeat and mantissas do not.
 
+use std::io::Cursor;
+
 use semidense::slam::keyframe::{DepthPoint, MAX_KEYFRAME_POINTS};
 use zerocopy::IntoBytes;
 
+use crate::ros::images::{CompressError, png};
 use crate::zenoh::envelope::{Opened, Packed, Packing};
 
 /// Bytes of a point.
@@ -56,25 +59,28 @@ pub fn unpack_points(opened: &Opened<'_>) -> Result<Vec<DepthPoint>, UnpackError
     Ok(points)
 }
 
-/// A grey image.
-pub fn pack_image(pixels: &[u8]) -> Packed {
-    let mut before = 0;
-    let difference = |pixel: &u8| {
-        let difference = pixel.wrapping_sub(before);
-        before = *pixel;
-        difference
-    };
-    lz4(&pixels.iter().map(difference).collect::<Vec<u8>>())
+/// A grey image of `width` × `height` pixels.
+pub fn pack_image(pixels: &[u8], width: u32, height: u32) -> Result<Packed, CompressError> {
+    let bytes = png(width, height, pixels)?;
+    Ok(Packed { packing: Packing::Png, unpacked_bytes: pixels.len(), bytes })
 }
 
-/// A grey image of `length` pixels, as it was.
-pub fn unpack_image(opened: &Opened<'_>, length: usize) -> Result<Vec<u8>, UnpackError> {
-    let mut pixels = unlz4(opened, length)?;
-    let mut before = 0_u8;
-    for pixel in &mut pixels {
-        *pixel = pixel.wrapping_add(before);
-        before = *pixel;
+/// A grey image of `width` × `height` pixels, as it was; nothing is unpacked that has another size.
+pub fn unpack_image(opened: &Opened<'_>, width: u32, height: u32) -> Result<Vec<u8>, UnpackError> {
+    let length = width as usize * height as usize;
+    if opened.packing != Packing::Png || opened.envelope.payload_bytes as usize != length {
+        return Err(UnpackError);
     }
+    let limits = png::Limits { bytes: length.saturating_mul(2) };
+    let decoder = png::Decoder::new_with_limits(Cursor::new(opened.packed), limits);
+    let mut reader = decoder.read_info().map_err(|_| UnpackError)?;
+    let expected = (width, height, png::ColorType::Grayscale, png::BitDepth::Eight);
+    let header = reader.info();
+    if (header.width, header.height, header.color_type, header.bit_depth) != expected {
+        return Err(UnpackError);
+    }
+    let mut pixels = vec![0; length];
+    reader.next_frame(&mut pixels).map_err(|_| UnpackError)?;
     Ok(pixels)
 }
 
@@ -125,9 +131,12 @@ mod tests {
             assert_eq!(unpack_points(&open(&bytes).unwrap()), Ok(points));
         }
         let pixels: Vec<u8> = (0..4800_u32).map(|i| (i * i / 7) as u8).collect();
-        let bytes = sealed(&pack_image(&pixels));
-        assert_eq!(unpack_image(&open(&bytes).unwrap(), 4800), Ok(pixels));
-        assert_eq!(unpack_image(&open(&bytes).unwrap(), 4799), Err(UnpackError));
+        let bytes = sealed(&pack_image(&pixels, 80, 60).unwrap());
+        let opened = open(&bytes).unwrap();
+        assert_eq!(unpack_image(&opened, 80, 60), Ok(pixels));
+        for (width, height) in [(60, 80), (80, 59), (8192, 8192), (0, 0)] {
+            assert_eq!(unpack_image(&opened, width, height), Err(UnpackError));
+        }
     }
 
     #[test]

@@ -155,8 +155,12 @@ fn dropped(to: &Reader<'_>) -> [(&'static str, u64); 5] {
 impl Reader<'_> {
     fn take(&self, event: Event, frame_rate: &mut Rate, keyframes: &mut Latest) {
         match event {
-            Event::Joined => self.outlet.begin_run(),
+            Event::Joined => {
+                tracing::info!("joined the instance");
+                self.outlet.begin_run();
+            }
             Event::Left => {
+                tracing::info!("the instance is gone");
                 self.outlet.end_run();
                 keyframes.forget();
             }
@@ -251,19 +255,34 @@ fn put_large(
                 let id = Some((outlet.run(), keyframe.epoch, keyframe.keyframe_id));
                 if image_of != id {
                     image_of = id;
-                    let payload = pack_image(&keyframe.image);
-                    let header = keyframe_image_header(&keyframe);
-                    let bytes = outlet.seal(Kind::KeyframeImage, &header, &payload);
-                    put(publishers, Kind::KeyframeImage, bytes);
+                    put_keyframe_image(&keyframe, publishers, outlet);
                 }
-                let payload = pack_points(&keyframe.points);
-                let bytes = outlet.seal(Kind::Keyframe, &keyframe_header(&keyframe), &payload);
-                put(publishers, Kind::Keyframe, bytes);
+                put_depth(&keyframe, publishers, outlet);
             }
             Item::Frame(frame) => put_frame(&frame, publishers, outlet, jpeg_quality),
             _ => {}
         }
     }
+}
+
+fn put_keyframe_image(keyframe: &Keyframe, publishers: &[Publisher<'static>], outlet: &Outlet) {
+    let header = keyframe_image_header(keyframe);
+    match pack_image(&keyframe.image, header.width, header.height) {
+        Ok(payload) => {
+            let bytes = outlet.seal(Kind::KeyframeImage, &header, &payload);
+            put(publishers, Kind::KeyframeImage, bytes);
+        }
+        Err(error) => tracing::debug!("keyframe {}: {error}", keyframe.keyframe_id),
+    }
+}
+
+fn put_depth(keyframe: &Keyframe, publishers: &[Publisher<'static>], outlet: &Outlet) {
+    let payload = pack_points(&keyframe.points);
+    let (id, revision) = (keyframe.keyframe_id, keyframe.revision);
+    let (packed, unpacked) = (payload.bytes.len(), payload.unpacked_bytes);
+    tracing::debug!("keyframe {id} revision {revision}: {packed} bytes for {unpacked}");
+    let bytes = outlet.seal(Kind::Keyframe, &keyframe_header(keyframe), &payload);
+    put(publishers, Kind::Keyframe, bytes);
 }
 
 /// Frames are packed only where somebody takes them.

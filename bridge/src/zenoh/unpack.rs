@@ -77,8 +77,8 @@ pub fn unpack(opened: &Opened<'_>) -> Result<Arrival, ArrivalError> {
         Kind::Graph => Arrival::Graph(opened.message()?, graph(opened)?),
         Kind::KeyframeImage => {
             let header: KeyframeImageHeader = opened.message()?;
-            let length = image_length(header.width, header.height, header.stride)?;
-            Arrival::KeyframeImage(header, unpack_image(opened, length)?)
+            check_image(header.width, header.height, header.stride)?;
+            Arrival::KeyframeImage(header, unpack_image(opened, header.width, header.height)?)
         }
         Kind::Keyframe => {
             let header: KeyframeHeader = opened.message()?;
@@ -89,7 +89,7 @@ pub fn unpack(opened: &Opened<'_>) -> Result<Arrival, ArrivalError> {
         }
         Kind::Frame => {
             let header: FrameHeader = opened.message()?;
-            image_length(header.width, header.height, header.stride)?;
+            check_image(header.width, header.height, header.stride)?;
             if opened.packing != Packing::Jpeg {
                 return Err(UnpackError.into());
             }
@@ -102,13 +102,13 @@ pub fn unpack(opened: &Opened<'_>) -> Result<Arrival, ArrivalError> {
     })
 }
 
-/// Pixels of an image that is not too large.
-fn image_length(width: u32, height: u32, stride: u32) -> Result<usize, MessageError> {
+/// Checks that an image is not too large.
+fn check_image(width: u32, height: u32, stride: u32) -> Result<(), MessageError> {
     let length = (width as usize).saturating_mul(height as usize);
     if length == 0 || length > MAX_PIXELS || stride != width {
         return Err(MessageError::InvalidIntrinsics { width, height });
     }
-    Ok(length)
+    Ok(())
 }
 
 fn check_keyframe(header: &KeyframeHeader) -> Result<Intrinsics, MessageError> {

@@ -20,6 +20,7 @@ export async function launch() {
 /** A page that fails the test at its first error. */
 export async function open(browser, address, options = {}) {
   const context = await browser.newContext({ viewport: { width: 1280, height: 800 }, colorScheme: "dark", ...options });
+  context.setDefaultTimeout(LONGEST_WAIT);
   const page = await context.newPage();
   page.errors = [];
   page.on("console", (m) => { if (m.type() === "error" && !page.mayFail) page.errors.push(m.text()); });

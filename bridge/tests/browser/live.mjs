@@ -39,7 +39,7 @@ try {
   await late.context().close();
 
   await page.click("#save");
-  await page.waitForFunction(() => /^saved in |failed|not|cannot/.test(document.getElementById("saved").textContent), null, { timeout: 60000 });
+  await page.waitForFunction(() => /^saved in |failed|not|cannot/.test(document.getElementById("saved").textContent));
   const saved = await page.textContent("#saved");
   check("the map is saved", saved.startsWith("saved in "), saved);
   await checkPage(page, "live");

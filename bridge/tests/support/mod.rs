@@ -3,6 +3,13 @@
 
 #![allow(dead_code, reason = "every test uses its part of what they share")]
 
+#[cfg(any(feature = "ros2", feature = "zenoh"))]
+pub mod machines;
+#[cfg(any(feature = "ros2", feature = "zenoh"))]
+pub mod network;
+#[cfg(any(feature = "ros2", feature = "zenoh"))]
+pub mod robot;
+
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::path::{Path, PathBuf};
@@ -33,7 +40,11 @@ impl Rig {
 
     fn command(&self, program: &Path) -> Command {
         let mut command = Command::new(program);
+        // `semidense` finds the bridge there, wherever it is itself.
+        let bridge = Path::new(env!("CARGO_BIN_EXE_semidense-bridge")).parent().unwrap();
+        let path = std::env::var("PATH").unwrap_or_default();
         command
+            .env("PATH", format!("{}:{path}", bridge.display()))
             .env("SEMIDENSE_ROOT", self.folder().join("root"))
             .current_dir(self.folder())
             .stdin(Stdio::null())

@@ -51,7 +51,7 @@ const Overlay = (() => {
   return class Overlay {
     /** `clusterOf` gives the points of a keyframe by its id. */
     constructor(canvas, clusterOf) {
-      this.canvas = canvas; this.clusterOf = clusterOf; this.mode = "depth"; this.frame = null; this.poses = []; this.cluster = null; this.images = 0;
+      this.canvas = canvas; this.clusterOf = clusterOf; this.mode = "depth"; this.frame = null; this.cluster = null; this.images = 0;
       this.start();
       canvas.addEventListener("webglcontextlost", (e) => { e.preventDefault(); this.gl = null; });
       canvas.addEventListener("webglcontextrestored", () => { this.start(); this.draw(); });
@@ -76,8 +76,7 @@ const Overlay = (() => {
       this.gl.bindBuffer(this.gl.ARRAY_BUFFER, this.buffer);
       this.gl.bufferData(this.gl.ARRAY_BUFFER, cluster.data, this.gl.STATIC_DRAW);
     }
-    addPose(pose) { this.poses.push(pose); if (this.poses.length > 60) this.poses.shift(); }
-    clear() { this.frame = null; this.poses = []; this.cluster = null; }
+    clear() { this.frame = null; this.cluster = null; }
     async setFrame(header, jpeg) {
       const bitmap = await createImageBitmap(new Blob([jpeg], { type: "image/jpeg" }));
       const gl = this.gl;
@@ -92,15 +91,12 @@ const Overlay = (() => {
       this.frame = header; this.images++;
       this.draw();
     }
-    /** The pose of the frame, or of the one before it, and the points of the keyframe that it is relative to. */
+    /** The pose of the frame, and the points of the keyframe that it is relative to. */
     poseOfFrame() {
-      for (let i = this.poses.length - 1; i >= 0; i--) {
-        const pose = this.poses[i], late = this.frame.sequence - pose.sequence;
-        if (late < 0 || late > 3 || pose.code === 0 || pose.code === 3) continue;
-        const cluster = this.clusterOf(pose.keyframe);
-        return cluster ? { pose, cluster } : null;
-      }
-      return null;
+      const pose = this.frame.pose;
+      if (!pose || pose.code === 0 || pose.code === 3) return null;
+      const cluster = this.clusterOf(pose.keyframe);
+      return cluster ? { pose, cluster } : null;
     }
     draw(maxSigma = 1) {
       const gl = this.gl;

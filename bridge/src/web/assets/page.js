@@ -70,14 +70,13 @@ const handlers = {
     if (!m.joined && m.run === 0) showMessage("Waiting for a run", `No instance "${seen.instance}" is there yet. Start one with semidense run.`);
     else if (m.joined && !seen.pose) showMessage("Waiting for the first frame", "The processes are starting.");
     $("save").disabled = !m.joined;
-    if (!m.joined) showState("ended", m.run ? "the run has ended; the map stays until the next one begins" : "for a run", "none");
+    if (!m.joined) showState(m.run ? "ended" : "waiting", m.run ? "the map stays until the next run begins" : "for a run to begin", "none");
     figures();
   },
   health(m) { for (const p of m.processes) seen.health[p.process] = p; processes(); },
   pose(m) {
     seen.poses++; seen.pose = m; seen.lastPose = performance.now();
     hideMessage();
-    overlay.addPose(m);
     viewer.setEpoch(m.epoch);
     const c = viewer.clusters.get(m.keyframe) || viewer.clusters.values().next().value;
     if (m.code !== 0) viewer.setCamera({ place: m.place, state: m.code, covariance: m.code === 3 ? null : m.covariance, k: c && c.k, size: c && c.size });
@@ -118,10 +117,13 @@ const handlers = {
   },
   frame(m, data, at) {
     seen.frames++;
-    overlay.setFrame(m, new Uint8Array(data, at)).catch((error) => console.error(error)).finally(() => say({ ack: 1 }));
-    $("camera-note").textContent = overlay.shown ? `frame ${m.sequence}: ${grouped(overlay.shown)} points of keyframe ${overlay.shownKeyframe}, brought here by the pose` : `frame ${m.sequence}`;
+    overlay.setFrame(m, new Uint8Array(data, at)).then(() => cameraNote(m)).catch((error) => console.error(error)).finally(() => say({ ack: 1 }));
   },
 };
+
+function cameraNote(m) {
+  $("camera-note").textContent = overlay.shown ? `frame ${m.sequence}: ${grouped(overlay.shown)} points of keyframe ${overlay.shownKeyframe}, brought here by the pose` : `frame ${m.sequence}`;
+}
 
 // ---- words and figures ------------------------------------------------------------------------------------------
 function setLink(kind, words) { $("link").dataset.link = kind; $("link").textContent = words; }
@@ -272,13 +274,13 @@ function start() {
   controls();
   setInterval(() => {
     legend();
-    $("drawn").textContent = `${short(viewer.drawn)} of ${short(viewer.totalPoints)} points${viewer.fps ? `, ${Math.round(viewer.fps)} frames/s` : ""}`;
+    $("drawn").textContent = `${short(viewer.drawn)} of ${short(viewer.totalPoints)} points${viewer.fps && !viewer.isStill ? `, ${Math.round(viewer.fps)} frames/s` : ""}`;
     // Poses that stay away are no pose that holds.
     if (seen.joined && seen.pose && performance.now() - seen.lastPose > 3000) showState("no new poses", "for some seconds: the source pauses, or a process does not answer", "none");
   }, 400);
   // For tests and the curious.
-  window.stat = { get: () => ({ points: viewer.totalPoints, drawn: viewer.drawn, fps: viewer.fps, poses: seen.poses, keyframes: viewer.clusters.size, frames: overlay.images, overlay: overlay.shown || 0,
-    state: $("word").textContent, run: seen.run, joined: seen.joined, path: viewer.visiblePath, budget: viewer.budget, link: $("link").textContent, lit: viewer.litPixels() }), viewer: () => viewer };
+  window.stat = { get: () => ({ lit: viewer.litPixels(), points: viewer.totalPoints, drawn: viewer.drawn, fps: viewer.fps, poses: seen.poses, keyframes: viewer.clusters.size, frames: overlay.images, overlay: overlay.shown || 0,
+    state: $("word").textContent, run: seen.run, joined: seen.joined, path: viewer.visiblePath, budget: viewer.budget, link: $("link").textContent }), viewer: () => viewer };
   fetch("/api/mode").then((r) => r.json()).then((m) => m.mode === "finished" ? showFinished(m.folder, m.summary) : connect())
     .catch(() => connect());
 }

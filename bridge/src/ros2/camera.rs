@@ -1,0 +1,239 @@
+//! Images of a ROS 2 topic, written as a stream of frames that capture reads.
+
+use std::fs::File;
+use std::io::{self, Write};
+use std::os::fd::{AsFd, BorrowedFd};
+use std::os::unix::net::UnixStream;
+use std::path::PathBuf;
+use std::pin::pin;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use futures::{FutureExt, StreamExt, executor::block_on};
+use ros2_client::MessageInfo;
+use ros2_client::dds::Subscription;
+use rustix::event::{PollFd, PollFlags, poll};
+use rustix::stdio::stdout;
+use semidense::capture::stream::format::StreamHeader;
+use semidense::service::shutdown::Shutdown;
+use serde::de::DeserializeOwned;
+
+use crate::ros::message::{CameraInfo, CompressedImage, Image, RosMessage, Time};
+use crate::ros::topic::{self, RosTopic};
+use crate::ros2::camera_rig::{CameraRigError, camera_info_topic, is_rectified, rig_text};
+use crate::ros2::image_source::{GrayFrame, ImageError};
+use crate::ros2::network::Network;
+use crate::ros2::node::{NodeError, RosNode};
+use crate::ros2::publishing::realtime_nanos;
+
+/// Pause between two looks for a socket that is not there, or for a message.
+const RETRY_PERIOD: Duration = Duration::from_millis(100);
+
+/// Where frames go.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Output {
+    /// Standard output; this ends when it is closed.
+    Stdout,
+    /// The socket of `semidense capture stream:PATH`; it is connected to again when it is gone.
+    Socket(PathBuf),
+}
+
+/// What to read.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CameraParams {
+    /// Topic of the images, beginning with `/`; one that ends in `/compressed` is of `CompressedImage`.
+    pub topic: String,
+    /// Domain and reach.
+    pub network: Network,
+    /// Name of the node.
+    pub node: String,
+}
+
+/// Why images cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub enum CameraError {
+    /// The network cannot be joined.
+    #[error(transparent)]
+    Node(#[from] NodeError),
+    /// The system refuses.
+    #[error(transparent)]
+    Io(#[from] io::Error),
+    /// Nobody says what the camera is.
+    #[error(
+        "no CameraInfo came on {topic} within {seconds} s; name the camera's calibration with --rig FILE, or its topic with --camera-info"
+    )]
+    NoInfo {
+        /// Where it was expected.
+        topic: String,
+        /// How long.
+        seconds: u64,
+    },
+    /// The camera's calibration is of no use.
+    #[error("{topic}: {source}")]
+    Rig {
+        /// Where it came from.
+        topic: String,
+        /// What is wrong.
+        source: CameraRigError,
+    },
+    /// A signal came first.
+    #[error("interrupted")]
+    Interrupted,
+}
+
+/// A topic that is read with the quality of service of sensors, which any publisher's fits.
+fn sensor_topic() -> RosTopic {
+    topic::IMAGE
+}
+
+/// Waits for what ROS says about the camera and gives the text of its rig file.
+pub fn await_rig(
+    params: &CameraParams,
+    camera_info: Option<&str>,
+    longest: Duration,
+    shutdown: &Shutdown,
+) -> Result<String, CameraError> {
+    let topic = camera_info.map_or_else(|| camera_info_topic(&params.topic), str::to_owned);
+    let mut node = RosNode::new(&params.network, "/", &params.node)?;
+    let infos = node.subscription::<CameraInfo>(&sensor_topic(), &topic)?;
+    let begin = Instant::now();
+    loop {
+        if let Ok(Some((info, _))) = infos.take() {
+            let text = rig_text(&info, &topic, is_rectified(&params.topic));
+            return text.map_err(|source| CameraError::Rig { topic, source });
+        }
+        if shutdown.is_requested() {
+            return Err(CameraError::Interrupted);
+        }
+        if begin.elapsed() > longest {
+            return Err(CameraError::NoInfo { topic, seconds: longest.as_secs() });
+        }
+        thread::sleep(RETRY_PERIOD);
+    }
+}
+
+/// Writes frames until a signal comes, or standard output is closed.
+pub fn run(params: &CameraParams, output: &Output, shutdown: &Shutdown) -> Result<(), CameraError> {
+    let mut node = RosNode::new(&params.network, "/", &params.node)?;
+    let sink = Sink::open(output)?;
+    let (topic, quality) = (params.topic.clone(), sensor_topic());
+    let named = thread::Builder::new().name("images".to_owned());
+    let reading = if topic.ends_with("/compressed") {
+        let images = node.subscription::<CompressedImage>(&quality, &topic)?;
+        named.spawn(move || {
+            let unpack = |frame: &mut GrayFrame, image: &CompressedImage| {
+                frame.decode(image).map(|()| image.header.stamp)
+            };
+            forward(&images, &topic, unpack, sink)
+        })?
+    } else {
+        let images = node.subscription::<Image>(&quality, &topic)?;
+        named.spawn(move || {
+            let unpack = |frame: &mut GrayFrame, image: &Image| {
+                frame.unpack(image).map(|()| image.header.stamp)
+            };
+            forward(&images, &topic, unpack, sink)
+        })?
+    };
+    // The thread may wait for an image, or for capture, for ever; it ends with the process.
+    while !reading.is_finished() && !shutdown.is_requested() {
+        if is_closed(output, shutdown.descriptor()) {
+            break;
+        }
+    }
+    Ok(())
+}
+
+/// Waits a moment for a signal; whether standard output is closed.
+fn is_closed(output: &Output, interrupt: BorrowedFd<'_>) -> bool {
+    let timeout = rustix::event::Timespec { tv_sec: 0, tv_nsec: 200_000_000 };
+    let mut polled = vec![PollFd::from_borrowed_fd(interrupt, PollFlags::IN)];
+    if *output == Output::Stdout {
+        // A closed end is told without being asked for.
+        polled.push(PollFd::from_borrowed_fd(stdout(), PollFlags::empty()));
+    }
+    let _ = poll(&mut polled, Some(&timeout));
+    let gone = PollFlags::HUP | PollFlags::ERR;
+    polled.get(1).is_some_and(|output| output.revents().intersects(gone))
+}
+
+/// Takes the newest image, again and again, and writes it.
+fn forward<M: RosMessage + DeserializeOwned + 'static>(
+    images: &Subscription<M>,
+    topic: &str,
+    unpack: impl Fn(&mut GrayFrame, &M) -> Result<Time, ImageError>,
+    mut sink: Sink,
+) {
+    let mut stream = pin!(images.async_stream());
+    let mut frame = GrayFrame::default();
+    let mut last_refusal = String::new();
+    while let Some(first) = block_on(stream.next()) {
+        let mut newest: Option<(M, MessageInfo)> = first.ok();
+        while let Some(Some(next)) = stream.next().now_or_never() {
+            newest = next.ok().or(newest);
+        }
+        let Some((image, info)) = newest else { continue };
+        let stamp = match unpack(&mut frame, &image) {
+            Ok(stamp) => stamp,
+            Err(error) => {
+                let refusal = error.to_string();
+                // A camera that sends what is not known sends it thirty times a second.
+                if refusal != last_refusal {
+                    tracing::warn!("{topic}: {refusal}");
+                    last_refusal = refusal;
+                }
+                continue;
+            }
+        };
+        // The publisher's number: a gap is an image that was lost, or passed over here for a newer one.
+        let sequence = u64::try_from(info.sequence_number()).unwrap_or(0);
+        let header = frame.header(stamp, sequence, realtime_nanos());
+        if sink.write(&header, &frame.pixels).is_err() {
+            return;
+        }
+    }
+}
+
+/// Where frames are written.
+#[derive(Debug)]
+enum Sink {
+    Stdout(File),
+    Socket(PathBuf, Option<UnixStream>),
+}
+
+impl Sink {
+    fn open(output: &Output) -> io::Result<Self> {
+        Ok(match output {
+            Output::Stdout => Self::Stdout(File::from(stdout().as_fd().try_clone_to_owned()?)),
+            Output::Socket(path) => Self::Socket(path.clone(), None),
+        })
+    }
+
+    /// Writes a frame. A socket that is not there, or goes, loses the frame: the next one is as good.
+    fn write(&mut self, header: &StreamHeader, pixels: &[u8]) -> io::Result<()> {
+        match self {
+            Self::Stdout(file) => {
+                file.write_all(&header.to_bytes())?;
+                file.write_all(pixels)
+            }
+            Self::Socket(path, stream) => {
+                if stream.is_none() {
+                    *stream = UnixStream::connect(&*path)
+                        .inspect_err(|error| tracing::debug!("{}: {error}", path.display()))
+                        .ok();
+                }
+                let Some(open) = stream else {
+                    thread::sleep(RETRY_PERIOD);
+                    return Ok(());
+                };
+                let written =
+                    open.write_all(&header.to_bytes()).and_then(|()| open.write_all(pixels));
+                if let Err(error) = written {
+                    tracing::warn!("{}: {error}; connecting again", path.display());
+                    *stream = None;
+                }
+                Ok(())
+            }
+        }
+    }
+}

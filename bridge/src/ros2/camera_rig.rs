@@ -1,0 +1,144 @@
+//! A rig file of what ROS says about a camera (`sensor_msgs/CameraInfo`).
+
+use std::path::Path;
+
+use semidense::capture::rig::{Rig, RigError};
+
+use crate::ros::message::CameraInfo;
+
+/// Why there is no rig in it.
+#[derive(Debug, thiserror::Error)]
+pub enum CameraRigError {
+    /// It is not calibrated.
+    #[error("the camera is not calibrated: its CameraInfo has no focal length")]
+    Uncalibrated,
+    /// Images that are not those that were calibrated.
+    #[error(
+        "its images are binned or a part of the sensor's, which is not supported; name a rig of theirs with --rig"
+    )]
+    Part,
+    /// A lens that is not known.
+    #[error(
+        "its lens model `{0}` is not known: known are plumb_bob, rational_polynomial, equidistant and fisheye"
+    )]
+    Model(String),
+    /// Values that no camera has.
+    #[error(transparent)]
+    Rig(#[from] RigError),
+}
+
+/// The topic of the camera of images: beside them, as `image_transport` has it.
+pub fn camera_info_topic(images: &str) -> String {
+    let images = images.strip_suffix("/compressed").unwrap_or(images);
+    let folder = images.rsplit_once('/').map_or("", |(folder, _)| folder);
+    format!("{folder}/camera_info")
+}
+
+/// Whether a topic is of rectified images, whose camera is the matrix P without a lens.
+pub fn is_rectified(images: &str) -> bool {
+    let images = images.strip_suffix("/compressed").unwrap_or(images);
+    images.rsplit('/').next().is_some_and(|name| name.contains("rect"))
+}
+
+/// The text of a rig file, checked; `topic` is where it came from.
+pub fn rig_text(
+    info: &CameraInfo,
+    topic: &str,
+    is_rectified: bool,
+) -> Result<String, CameraRigError> {
+    let roi = &info.roi;
+    let is_part = (roi.width != 0 && roi.width != info.width)
+        || (roi.height != 0 && roi.height != info.height);
+    if info.binning_x > 1 || info.binning_y > 1 || is_part {
+        return Err(CameraRigError::Part);
+    }
+    let has_lens = info.d.iter().any(|coefficient| *coefficient != 0.0);
+    let (fx, fy, cx, cy) = match is_rectified {
+        true => (info.p[0], info.p[5], info.p[2], info.p[6]),
+        false => (info.k[0], info.k[4], info.k[2], info.k[5]),
+    };
+    if fx == 0.0 || fy == 0.0 {
+        return Err(CameraRigError::Uncalibrated);
+    }
+    let model = match info.distortion_model.as_str() {
+        _ if is_rectified || (!has_lens && info.distortion_model != "equidistant") => "pinhole",
+        "plumb_bob" | "rational_polynomial" => "radtan",
+        "equidistant" | "fisheye" => "equidistant",
+        other => return Err(CameraRigError::Model(other.to_owned())),
+    };
+    let coefficients = if model == "pinhole" { &[][..] } else { &info.d[..] };
+    let numbers: Vec<String> =
+        coefficients.iter().map(|number| format!("{number:?}").to_lowercase()).collect();
+    let text = format!(
+        "# Of the CameraInfo on {topic}.\nmodel = \"{model}\"\nwidth = {}\nheight = {}\nfx = {fx:?}\nfy = {fy:?}\n\
+         cx = {cx:?}\ncy = {cy:?}\ncoefficients = [{}]\n",
+        info.width,
+        info.height,
+        numbers.join(", ")
+    );
+    Rig::from_toml(Path::new(topic), &text)?;
+    Ok(text)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ros::message::{Header, RegionOfInterest};
+    use semidense::slam::geometry::camera_model::Distortion;
+
+    fn info(model: &str, d: &[f64]) -> CameraInfo {
+        CameraInfo {
+            header: Header::default(),
+            height: 480,
+            width: 640,
+            distortion_model: model.to_owned(),
+            d: d.to_vec(),
+            k: [500.0, 0.0, 320.0, 0.0, 501.0, 240.0, 0.0, 0.0, 1.0],
+            r: [0.0; 9],
+            p: [400.0, 0.0, 310.0, 0.0, 0.0, 401.0, 230.0, 0.0, 0.0, 0.0, 1.0, 0.0],
+            binning_x: 0,
+            binning_y: 0,
+            roi: RegionOfInterest::default(),
+        }
+    }
+
+    fn rig(info: &CameraInfo, is_rectified: bool) -> Result<Rig, CameraRigError> {
+        let text = rig_text(info, "/c/camera_info", is_rectified)?;
+        Ok(Rig::from_toml(Path::new("x"), &text)?)
+    }
+
+    #[test]
+    fn the_lenses_of_ros_are_ours() {
+        let plain = rig(&info("plumb_bob", &[0.0; 5]), false).unwrap();
+        assert_eq!(*plain.camera.distortion(), Distortion::None);
+        assert_eq!(plain.camera.intrinsics().fy, 501.0);
+        let five = rig(&info("plumb_bob", &[-0.1, 0.02, 0.001, 0.0, 0.0]), false).unwrap();
+        assert!(matches!(five.camera.distortion(), Distortion::RadTan5(_)));
+        rig(&info("rational_polynomial", &[0.1, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0]), false)
+            .unwrap();
+        let fisheye = rig(&info("equidistant", &[0.0, 0.01, 0.0, 0.0]), false).unwrap();
+        assert!(matches!(fisheye.camera.distortion(), Distortion::Equidistant(_)));
+        let rectified = rig(&info("plumb_bob", &[-0.1, 0.02, 0.0, 0.0, 0.0]), true).unwrap();
+        assert_eq!(*rectified.camera.distortion(), Distortion::None);
+        assert_eq!(rectified.camera.intrinsics().cx, 310.0);
+    }
+
+    #[test]
+    fn what_is_no_calibration_is_said() {
+        let words = |info: CameraInfo| rig(&info, false).unwrap_err().to_string();
+        let none = CameraInfo { k: [0.0; 9], ..info("plumb_bob", &[]) };
+        assert!(words(none).contains("not calibrated"));
+        assert!(words(info("thin_prism", &[1.0])).contains("`thin_prism`"));
+        assert!(words(CameraInfo { binning_x: 2, ..info("plumb_bob", &[]) }).contains("binned"));
+        assert!(words(info("plumb_bob", &[f64::NAN; 5])).contains("coefficients"));
+        assert!(words(CameraInfo { width: 0, ..info("plumb_bob", &[]) }).contains("width"));
+    }
+
+    #[test]
+    fn the_camera_is_beside_its_images() {
+        assert_eq!(camera_info_topic("/camera/image_raw"), "/camera/camera_info");
+        assert_eq!(camera_info_topic("/a/b/image_rect/compressed"), "/a/b/camera_info");
+        assert_eq!(camera_info_topic("/image"), "/camera_info");
+        assert!(is_rectified("/a/image_rect/compressed") && !is_rectified("/rect/image_raw"));
+    }
+}

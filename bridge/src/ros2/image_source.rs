@@ -1,0 +1,141 @@
+//! Images of ROS as frames of a stream that capture reads.
+
+use semidense::capture::image_file::{DecodeError, decode_gray_into, image_size};
+use semidense::capture::ros_image::{RosImage, RosImageError};
+use semidense::capture::stream::format::{StreamClock, StreamHeader};
+
+use crate::ros::message::{CompressedImage, Image, Time};
+
+/// A stamp further than this from the arrival is of another clock: a recording's, a simulation's.
+const PLAUSIBLE_NANOS: u64 = 10_000_000_000;
+
+/// Why an image is not passed on.
+#[derive(Debug, thiserror::Error)]
+pub enum ImageError {
+    /// Its format or bytes.
+    #[error(transparent)]
+    Raw(#[from] RosImageError),
+    /// Its format or bytes.
+    #[error("a compressed image ({format}): {source}")]
+    Compressed {
+        /// What its sender calls the format.
+        format: String,
+        /// What is wrong.
+        source: DecodeError,
+    },
+    /// A size that no image has.
+    #[error("an image of {0}x{1} pixels")]
+    Size(usize, usize),
+}
+
+/// Memory that is used again from image to image.
+#[derive(Debug, Default)]
+pub struct GrayFrame {
+    /// Grey values, row by row.
+    pub pixels: Vec<u8>,
+    samples: Vec<u8>,
+    size: (u32, u32),
+}
+
+/// Pixels of the largest image that is taken: that of a rig.
+const MAX_SIDE: usize = 8192;
+
+impl GrayFrame {
+    fn resize(&mut self, width: usize, height: usize) -> Result<(), ImageError> {
+        if width == 0 || height == 0 || width > MAX_SIDE || height > MAX_SIDE {
+            return Err(ImageError::Size(width, height));
+        }
+        self.size = (width as u32, height as u32);
+        self.pixels.resize(width * height, 0);
+        Ok(())
+    }
+
+    /// Takes the grey values of an image.
+    pub fn unpack(&mut self, image: &Image) -> Result<(), ImageError> {
+        let Image { encoding, width, height, step, is_bigendian, data, .. } = image;
+        // Before memory is taken: each pixel has at least a byte.
+        if (data.len() as u64) < u64::from(*width) * u64::from(*height) {
+            return Err(ImageError::Size(*width as usize, *height as usize));
+        }
+        self.resize(*width as usize, *height as usize)?;
+        let image = RosImage {
+            encoding,
+            width: *width,
+            height: *height,
+            step: *step,
+            is_bigendian: *is_bigendian != 0,
+            data,
+        };
+        Ok(image.unpack_gray(&mut self.pixels)?)
+    }
+
+    /// Takes the grey values of a compressed image, a JPEG or PNG.
+    pub fn decode(&mut self, image: &CompressedImage) -> Result<(), ImageError> {
+        let broken = |source| ImageError::Compressed { format: image.format.clone(), source };
+        let (width, height) = image_size(&image.data).map_err(broken)?;
+        self.resize(width, height)?;
+        decode_gray_into(&image.data, width, height, &mut self.samples, &mut self.pixels)
+            .map_err(broken)
+    }
+
+    /// The header of a stream for it. `stamp` is ROS's, `now_nanos` CLOCK_REALTIME.
+    pub fn header(&self, stamp: Time, sequence: u64, now_nanos: i64) -> StreamHeader {
+        let (clock, nanos) = clock_of(stamp, now_nanos);
+        StreamHeader::gray(self.size, clock, nanos, sequence)
+    }
+}
+
+/// Which clock a stamp is of. An image without one is stamped as it arrives.
+fn clock_of(stamp: Time, now_nanos: i64) -> (StreamClock, i64) {
+    let nanos = stamp.nanos();
+    match nanos {
+        0 => (StreamClock::Realtime, now_nanos),
+        _ if nanos.abs_diff(now_nanos) <= PLAUSIBLE_NANOS => (StreamClock::Realtime, nanos),
+        // Before 1970 there are no stamps.
+        _ => (StreamClock::Other, nanos.max(0)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ros::message::Header;
+
+    const NOW: i64 = 1_700_000_000_000_000_000;
+
+    fn image(encoding: &str, step: u32, data: Vec<u8>) -> Image {
+        let header = Header::default();
+        let encoding = encoding.to_owned();
+        Image { header, height: 2, width: 4, encoding, is_bigendian: 0, step, data }
+    }
+
+    #[test]
+    fn an_image_becomes_a_frame_of_its_stamp() {
+        let mut frame = GrayFrame::default();
+        frame.unpack(&image("rgb8", 12, [255, 0, 0].repeat(8))).unwrap();
+        assert_eq!(frame.pixels, [76; 8]);
+        let header = frame.header(Time::from_nanos(NOW - 5), 3, NOW);
+        assert_eq!(header, StreamHeader::gray((4, 2), StreamClock::Realtime, NOW - 5, 3));
+        let recorded = Time::from_nanos(1_300_000_000_000_000_001);
+        let header = frame.header(recorded, 3, NOW);
+        assert_eq!((header.clock, header.stamp_nanos), (StreamClock::Other, recorded.nanos()));
+        assert_eq!(frame.header(Time::default(), 3, NOW).stamp_nanos, NOW);
+    }
+
+    #[test]
+    fn hostile_images_are_errors_and_take_no_memory() {
+        let mut frame = GrayFrame::default();
+        let huge = Image { width: 8192, height: 8192, ..image("mono8", 8192, vec![0; 8]) };
+        assert!(frame.unpack(&huge).is_err());
+        assert!(frame.pixels.is_empty());
+        assert!(frame.unpack(&image("32FC1", 16, vec![0; 32])).is_err());
+        let compressed = |data: &[u8]| CompressedImage {
+            header: Header::default(),
+            format: "jpeg".to_owned(),
+            data: data.to_vec(),
+        };
+        assert!(frame.decode(&compressed(b"\xff\xd8\xff")).is_err());
+        let error = frame.decode(&compressed(b"ConfigHeader")).unwrap_err().to_string();
+        assert!(error.contains("compressed image (jpeg)"), "{error}");
+    }
+}

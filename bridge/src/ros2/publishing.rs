@@ -1,0 +1,406 @@
+//! What a session reads, published: one thread reads and converts, another hands messages to the network.
+
+use std::collections::HashSet;
+use std::os::fd::BorrowedFd;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use ros2_client::dds::Publisher;
+use semidense::service::clock::now_nanos;
+use semidense::slam::keyframe::Keyframe;
+
+use crate::ros::axes::{ros_from_world, transform_message};
+use crate::ros::converter::{Converter, PoseMessages};
+use crate::ros::frame_ids::FrameIds;
+use crate::ros::message::{
+    CameraInfo, DiagnosticArray, DiagnosticStatus, Header, Image, KeyValue, Odometry, PointCloud2,
+    PoseArray, PoseWithCovarianceStamped, RosMessage, TfMessage, Time, TransformStamped,
+};
+use crate::ros::topic::{self, Reliability, RosTopic};
+use crate::ros2::node::{NodeError, RosNode, dds_name};
+use crate::ros2::outbox::{Outbox, Outgoing};
+use crate::session::{Event, Graph, Session, SessionError};
+
+/// Time between two looks who reads.
+const READERS_PERIOD: Duration = Duration::from_millis(500);
+/// Time between two reports of our own, and between two keyframe graphs: what changes the map does so about as often.
+const REPORT_PERIOD: Duration = Duration::from_secs(1);
+/// Longest wait for something to publish: how soon a signal is seen.
+const WAIT: Duration = Duration::from_millis(100);
+
+/// What is published and how.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PublishParams {
+    /// The instance that is read.
+    pub instance: String,
+    /// Namespace of the topics, beginning with `/`.
+    pub namespace: String,
+    /// Names of the frames.
+    pub frames: FrameIds,
+    /// Name of the camera's frame with x forward, for `/tf_static`; `None` for no such frame.
+    pub camera_link: Option<String>,
+    /// Whether transforms are published.
+    pub tf: bool,
+    /// Least time between two images; `None` for no images.
+    pub image_period: Option<Duration>,
+    /// Least time between two clouds; `None` for no clouds.
+    pub points_period: Option<Duration>,
+    /// Whether images and clouds are reliable too.
+    pub reliable_sensors: bool,
+}
+
+/// Who reads what is costly to make, as of the last look.
+#[derive(Debug, Default)]
+struct Demand {
+    images: AtomicU64,
+    points: AtomicU64,
+    compatible: AtomicU64,
+}
+
+/// The publishers of one node.
+pub struct Publishers {
+    params: PublishParams,
+    pose: Publisher<PoseWithCovarianceStamped>,
+    odometry: Publisher<Odometry>,
+    tf: Option<Publisher<TfMessage>>,
+    /// Kept: its message is for who comes later.
+    _tf_static: Option<Publisher<TfMessage>>,
+    images: Option<(Publisher<Image>, Publisher<CameraInfo>)>,
+    points: Option<Publisher<PointCloud2>>,
+    keyframes: Publisher<PoseArray>,
+    diagnostics: Publisher<DiagnosticArray>,
+    outbox: Arc<Outbox>,
+    demand: Arc<Demand>,
+    /// Readers that cannot be served, by topic: each is named once.
+    named: HashSet<String>,
+    published: u64,
+    refused: u64,
+    longest: Duration,
+    /// Last: the publishers say goodbye through it.
+    node: RosNode,
+}
+
+/// Images and clouds of this node, with the reliability that was asked for.
+fn sensor(params: &PublishParams, topic: RosTopic) -> RosTopic {
+    let reliability =
+        if params.reliable_sensors { Reliability::Reliable } else { topic.reliability };
+    RosTopic { reliability, ..topic }
+}
+
+/// From the camera's optical axes to x forward, y left, z up.
+fn camera_link_transform(params: &PublishParams, camera_link: &str) -> TfMessage {
+    let header = Header {
+        stamp: Time::from_nanos(realtime_nanos()),
+        frame_id: params.frames.camera.clone(),
+    };
+    let transform = transform_message(&ros_from_world().inverse());
+    let child_frame_id = camera_link.to_owned();
+    TfMessage { transforms: vec![TransformStamped { header, child_frame_id, transform }] }
+}
+
+/// CLOCK_REALTIME, nanoseconds.
+pub fn realtime_nanos() -> i64 {
+    let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
+    since.map_or(0, |since| i64::try_from(since.as_nanos()).unwrap_or(i64::MAX))
+}
+
+impl Publishers {
+    /// All topics of a node.
+    pub fn open(mut node: RosNode, params: PublishParams) -> Result<Self, NodeError> {
+        let name = |topic: RosTopic| topic.name_in(&params.namespace);
+        let tf_static = match &params.camera_link {
+            Some(link) if params.tf => {
+                let publisher = node.publisher(&topic::TF_STATIC, &name(topic::TF_STATIC))?;
+                // The only message: there is room for it.
+                let _ = publisher.publish(camera_link_transform(&params, link));
+                Some(publisher)
+            }
+            _ => None,
+        };
+        let tf = match params.tf {
+            true => Some(node.publisher(&topic::TF, &name(topic::TF))?),
+            false => None,
+        };
+        let images = match params.image_period {
+            Some(_) => Some((
+                node.publisher(&sensor(&params, topic::IMAGE), &name(topic::IMAGE))?,
+                node.publisher(&sensor(&params, topic::CAMERA_INFO), &name(topic::CAMERA_INFO))?,
+            )),
+            None => None,
+        };
+        let points = match params.points_period {
+            Some(_) => Some(node.publisher(&sensor(&params, topic::POINTS), &name(topic::POINTS))?),
+            None => None,
+        };
+        Ok(Self {
+            pose: node.publisher(&topic::POSE, &name(topic::POSE))?,
+            odometry: node.publisher(&topic::ODOMETRY, &name(topic::ODOMETRY))?,
+            keyframes: node.publisher(&topic::KEYFRAMES, &name(topic::KEYFRAMES))?,
+            diagnostics: node.publisher(&topic::DIAGNOSTICS, &name(topic::DIAGNOSTICS))?,
+            tf,
+            _tf_static: tf_static,
+            images,
+            points,
+            node,
+            params,
+            outbox: Arc::default(),
+            demand: Arc::default(),
+            named: HashSet::new(),
+            published: 0,
+            refused: 0,
+            longest: Duration::ZERO,
+        })
+    }
+
+    /// What goes on the reading thread.
+    pub fn reader(&self) -> Reader {
+        Reader {
+            converter: Converter::new(&self.params.instance, self.params.frames.clone()),
+            params: self.params.clone(),
+            outbox: Arc::clone(&self.outbox),
+            demand: Arc::clone(&self.demand),
+            keyframe: None,
+            keyframe_is_new: false,
+            points_readers: 0,
+            image_sent: None,
+            points_sent: None,
+            graph: None,
+            graph_sent: None,
+        }
+    }
+
+    /// Publishes until the outbox is closed.
+    pub fn run(mut self) {
+        let (mut looked, mut reported) = (None::<Instant>, Instant::now());
+        while let Ok(message) = self.outbox.take(WAIT) {
+            if let Some(message) = message {
+                self.publish(message);
+            }
+            if looked.is_none_or(|looked| looked.elapsed() >= READERS_PERIOD) {
+                looked = Some(Instant::now());
+                self.look_for_readers();
+            }
+            if reported.elapsed() >= REPORT_PERIOD {
+                reported = Instant::now();
+                let report = self.report();
+                self.publish(Outgoing::Diagnostics(Box::new(report)));
+            }
+        }
+    }
+
+    fn publish(&mut self, message: Outgoing) {
+        let begin = Instant::now();
+        match message {
+            Outgoing::Pose(messages) => {
+                let PoseMessages { pose, odometry, transforms } = *messages;
+                let sent = send(&self.odometry, odometry)
+                    & send(&self.pose, pose)
+                    & self.tf.as_ref().is_none_or(|tf| send(tf, transforms));
+                self.count(sent);
+            }
+            Outgoing::Diagnostics(message) => {
+                let sent = send(&self.diagnostics, *message);
+                self.count(sent);
+            }
+            Outgoing::Image(pair) => {
+                let (image, camera_info) = *pair;
+                if let Some((images, camera_infos)) = &self.images {
+                    let sent = send(camera_infos, camera_info) & send(images, image);
+                    self.count(sent);
+                }
+            }
+            Outgoing::Points(message) => {
+                if let Some(points) = &self.points {
+                    let sent = send(points, *message);
+                    self.count(sent);
+                }
+            }
+            Outgoing::Keyframes(message) => {
+                let sent = send(&self.keyframes, *message);
+                self.count(sent);
+            }
+        }
+        self.longest = self.longest.max(begin.elapsed());
+    }
+
+    fn count(&mut self, is_sent: bool) {
+        match is_sent {
+            true => self.published += 1,
+            false => self.refused += 1,
+        }
+    }
+
+    /// Counts the readers of what is costly to make, and names those that get nothing.
+    fn look_for_readers(&mut self) {
+        let name_of = |topic: RosTopic| dds_name(&topic.name_in(&self.params.namespace));
+        let (Ok(image), Ok(info), Ok(points)) =
+            (name_of(topic::IMAGE), name_of(topic::CAMERA_INFO), name_of(topic::POINTS))
+        else {
+            return;
+        };
+        let (mut images, mut clouds, mut all) = (0, 0, 0);
+        for reader in self.node.remote_readers() {
+            let is_image = reader.topic == image || reader.topic == info;
+            let is_points = reader.topic == points;
+            if (is_image || is_points) && reader.wants_reliable && !self.params.reliable_sensors {
+                if self.named.insert(reader.topic.clone()) {
+                    tracing::warn!(
+                        "a subscriber of {} wants it reliable and gets nothing: set it to best effort, or start this with --reliable-sensors",
+                        reader.topic.trim_start_matches("rt")
+                    );
+                }
+                continue;
+            }
+            images += u64::from(is_image);
+            clouds += u64::from(is_points);
+            all += 1;
+        }
+        self.demand.images.store(images, Ordering::Relaxed);
+        self.demand.points.store(clouds, Ordering::Relaxed);
+        self.demand.compatible.store(all, Ordering::Relaxed);
+    }
+
+    /// How this node does, as a diagnostic of its own.
+    fn report(&mut self) -> DiagnosticArray {
+        let drops = self.outbox.drops();
+        let lost = drops.poses + self.refused;
+        let value = |key: &str, value: String| KeyValue { key: key.to_owned(), value };
+        let longest_ms = self.longest.as_secs_f64() * 1e3;
+        self.longest = Duration::ZERO;
+        let status = DiagnosticStatus {
+            level: 0,
+            name: format!("{}: ros2", self.params.instance),
+            message: if lost == 0 { "publishing" } else { "publishing; some were dropped" }
+                .to_owned(),
+            hardware_id: self.params.instance.clone(),
+            values: vec![
+                value("published", self.published.to_string()),
+                value("dropped_poses", drops.poses.to_string()),
+                value("dropped_images", drops.images.to_string()),
+                value("dropped_points", drops.points.to_string()),
+                value("refused_by_slow_readers", self.refused.to_string()),
+                value("longest_publish_ms", format!("{longest_ms:.3}")),
+            ],
+        };
+        let header = Header { stamp: Time::from_nanos(realtime_nanos()), frame_id: String::new() };
+        DiagnosticArray { header, status: vec![status] }
+    }
+}
+
+/// Whether a message was taken: a topic whose reliable readers confirm nothing takes no more after a while.
+fn send<M: RosMessage>(publisher: &Publisher<M>, message: M) -> bool {
+    publisher.publish(message).inspect_err(|_| tracing::debug!("{} was refused", M::TYPE)).is_ok()
+}
+
+/// Reads a session and makes messages of what it gives.
+pub struct Reader {
+    converter: Converter,
+    params: PublishParams,
+    outbox: Arc<Outbox>,
+    demand: Arc<Demand>,
+    /// The active keyframe, for who comes later.
+    keyframe: Option<Arc<Keyframe>>,
+    keyframe_is_new: bool,
+    points_readers: u64,
+    image_sent: Option<Instant>,
+    points_sent: Option<Instant>,
+    /// The newest graph, until it is sent.
+    graph: Option<Arc<Graph>>,
+    graph_sent: Option<Instant>,
+}
+
+impl Drop for Reader {
+    fn drop(&mut self) {
+        self.outbox.close();
+    }
+}
+
+/// Whether something that is sent at most once in `period` is due.
+fn is_due(sent: Option<Instant>, period: Duration) -> bool {
+    sent.is_none_or(|sent| sent.elapsed() >= period)
+}
+
+impl Reader {
+    /// Reads what has come; see [`Session::read`].
+    pub fn read(
+        &mut self,
+        session: &mut Session,
+        interrupt: Option<BorrowedFd<'_>>,
+    ) -> Result<(), SessionError> {
+        session.read(interrupt, WAIT, |event| self.take(&event))?;
+        self.put_points_if_due();
+        self.put_graph_if_due();
+        Ok(())
+    }
+
+    fn take(&mut self, event: &Event) {
+        self.converter.observe(event);
+        match event {
+            Event::Joined => {
+                tracing::info!("joined instance {}", self.params.instance);
+                self.keyframe = None;
+            }
+            Event::Left => tracing::warn!(
+                "instance {} is gone; waiting for the next one of that name",
+                self.params.instance
+            ),
+            Event::Pose(pose) => {
+                if let Some(messages) = self.converter.pose(pose) {
+                    self.outbox.put(Outgoing::Pose(Box::new(messages)));
+                }
+            }
+            Event::Frame(frame) => {
+                let has_readers = self.demand.images.load(Ordering::Relaxed) > 0;
+                let Some(period) = self.params.image_period.filter(|_| has_readers) else { return };
+                if is_due(self.image_sent, period) {
+                    self.image_sent = Some(Instant::now());
+                    let pair = (self.converter.image(frame), self.converter.camera_info(frame));
+                    self.outbox.put(Outgoing::Image(Box::new(pair)));
+                }
+            }
+            Event::Keyframe(keyframe) => {
+                self.keyframe = Some(Arc::clone(keyframe));
+                self.keyframe_is_new = true;
+            }
+            Event::Graph(graph) => self.graph = Some(Arc::clone(graph)),
+            Event::Health(owner, health) => {
+                // Stamped with when the process wrote it.
+                let age = now_nanos().saturating_sub(health.published_nanos);
+                let stamp = Time::from_nanos(realtime_nanos().saturating_sub(age));
+                let report = self.converter.diagnostics(owner, health, stamp);
+                self.outbox.put(Outgoing::Diagnostics(Box::new(report)));
+            }
+            Event::Adjustment(_) => {}
+        }
+    }
+
+    /// The newest revision of the keyframe, at most once in a period, and again when somebody has come.
+    fn put_points_if_due(&mut self) {
+        let readers = self.demand.points.load(Ordering::Relaxed);
+        let has_new_reader = readers > self.points_readers;
+        self.points_readers = readers;
+        self.keyframe_is_new |= has_new_reader;
+        let (Some(period), Some(keyframe)) = (self.params.points_period, &self.keyframe) else {
+            return;
+        };
+        if readers > 0 && self.keyframe_is_new && is_due(self.points_sent, period) {
+            self.points_sent = Some(Instant::now());
+            self.keyframe_is_new = false;
+            let points = self.converter.points(keyframe);
+            self.outbox.put(Outgoing::Points(Box::new(points)));
+        }
+    }
+
+    /// The newest graph, at most once a second.
+    fn put_graph_if_due(&mut self) {
+        if !is_due(self.graph_sent, REPORT_PERIOD) {
+            return;
+        }
+        if let Some(graph) = self.graph.take() {
+            self.graph_sent = Some(Instant::now());
+            let keyframes = self.converter.keyframes(&graph, Time::from_nanos(realtime_nanos()));
+            self.outbox.put(Outgoing::Keyframes(Box::new(keyframes)));
+        }
+    }
+}
