@@ -52,6 +52,85 @@ fn units_are_closed_alike() {
     }
 }
 
+/// Units of the ways out of shared memory, and the addresses that each may use.
+const WAYS_OUT: [(&str, &[&str]); 5] = [
+    ("view", &["localhost"]),
+    ("record", &[]),
+    ("ros2", &["localhost", "239.255.0.1"]),
+    ("ros2-camera", &["localhost", "239.255.0.1"]),
+    ("zenoh", &["localhost"]),
+];
+
+fn bridge_unit(name: &str) -> String {
+    let path = root().join(format!("deploy/systemd/bridge/semidense-{name}@.service"));
+    fs::read_to_string(path).unwrap()
+}
+
+#[test]
+fn ways_out_are_off_closed_and_below_the_rig() {
+    let target = fs::read_to_string(root().join("deploy/systemd/semidense@.target")).unwrap();
+    let tracker = unit("tracker");
+    let (_, closed) = tracker.split_once("# Everything else is closed.").unwrap();
+    for (name, addresses) in WAYS_OUT {
+        let text = bridge_unit(name);
+        assert!(!target.contains(name), "{name} must be asked for");
+        let has = |line: &str| text.lines().any(|own| own == line);
+        assert!(has("PartOf=semidense@%i.target") && has("WantedBy=semidense@%i.target"), "{name}");
+        assert!(has("User=semidense") && has("IPAddressDeny=any"), "{name}");
+        let allowed = addresses.join(" ");
+        let is_allowed = |line: &&str| line.starts_with("IPAddressAllow=");
+        let found = text.lines().find(is_allowed).unwrap_or("IPAddressAllow=");
+        assert_eq!(found, format!("IPAddressAllow={allowed}"), "{name}");
+        // What differs is the network, and only where there is one.
+        for line in closed.lines().filter(|line| line.contains('=') && !line.starts_with('#')) {
+            let is_network =
+                line.starts_with("PrivateNetwork") || line.starts_with("RestrictAddressFamilies");
+            assert!(has(line) || is_network && !addresses.is_empty(), "{name} lacks {line}");
+        }
+        // A camera feeds the rig; all others come after it.
+        let weight = text.lines().find_map(|line| line.strip_prefix("CPUWeight=")).unwrap();
+        let weight: u32 = weight.parse().unwrap();
+        assert_eq!(weight > 100, name == "ros2-camera", "{name}: the usual weight is 100");
+    }
+}
+
+#[test]
+fn systemd_understands_every_unit() {
+    let is_there = Command::new("systemd-analyze").arg("--version").output().is_ok();
+    if !is_there {
+        eprintln!("left out: there is no systemd-analyze");
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let named = |name: &str| format!("semidense-{name}@.service");
+    let units = PROCESSES.iter().map(|name| (named(name), unit(name)));
+    let units: Vec<_> =
+        units.chain(WAYS_OUT.iter().map(|(name, _)| (named(name), bridge_unit(name)))).collect();
+    for (name, text) in &units {
+        // Programs are only looked for: any will do.
+        let text = text
+            .replace("/usr/bin/semidense-bridge", "/bin/true")
+            .replace("/usr/bin/semidense", "/bin/true")
+            .replace("-/usr/lib/semidense/back-off", "-/bin/true");
+        fs::write(folder.path().join(name), text).unwrap();
+    }
+    for target in ["semidense.target", "semidense@.target"] {
+        fs::copy(root().join("deploy/systemd").join(target), folder.path().join(target)).unwrap();
+    }
+    for (name, _) in &units {
+        let instance = name.replace('@', "@front");
+        fs::copy(folder.path().join(name), folder.path().join(&instance)).unwrap();
+        let output = Command::new("systemd-analyze")
+            .args(["verify", "--man=no"])
+            .arg(folder.path().join(&instance))
+            .env("SYSTEMD_UNIT_PATH", format!("{}:", folder.path().display()))
+            .output()
+            .unwrap();
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success() && !said.contains(&instance), "{name}: {said}");
+    }
+}
+
 #[test]
 fn the_rig_of_the_package_is_accepted() {
     let file = root().join("deploy/debian/webcam.toml");

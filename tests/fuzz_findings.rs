@@ -9,17 +9,20 @@ use std::path::Path;
 mod parsers;
 #[path = "../fuzz/seeds.rs"]
 mod seeds;
+#[path = "../src/capture/test_bag.rs"]
+mod test_bag;
 #[path = "../src/capture/test_images.rs"]
 mod test_images;
 
 type Target = (&'static str, fn(&[u8]));
 
 /// Every target. A new one is listed here and in `fuzz/Cargo.toml`.
-const TARGETS: [Target; 10] = [
+const TARGETS: [Target; 11] = [
     ("trajectory", parsers::trajectory),
     ("rig", parsers::rig),
     ("lists", parsers::lists),
     ("image", parsers::image),
+    ("bag", parsers::bag),
     ("configuration", parsers::configuration),
     ("message", parsers::message),
     ("map", parsers::map),

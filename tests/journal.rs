@@ -14,12 +14,11 @@ use serde_json::Value;
 use support::{Ended, Rig, end, finish, journal_of, signal, small_camera, until, with_mount};
 
 /// The files of a run.
-const FILES: [&str; 8] = [
+const FILES: [&str; 7] = [
     "trajectory.txt",
     "trajectory_online.txt",
     "keyframes.txt",
     "map.ply",
-    "map.pcd",
     "points.ply",
     "summary.json",
     "report.html",

@@ -6,7 +6,7 @@ mod support;
 use std::collections::BTreeMap;
 use std::fs;
 use std::io::{BufRead, BufReader};
-use std::time::Duration;
+use std::time::{Duration, UNIX_EPOCH};
 
 use rustix::process::{Pid, Signal};
 use semidense::capture::source::{SourceName, open};
@@ -19,11 +19,11 @@ use semidense::wire::command::{Command, CommandClient};
 use semidense::wire::conversion::{keyframe_from_messages, pose_from_message};
 use semidense::wire::keyframe_inbox::KeyframeInbox;
 use semidense::wire::message::{
-    GraphHeader, KeyframeHeader, KeyframeImageHeader, KeyframePoseMessage, PoseMessage,
+    FrameHeader, GraphHeader, KeyframeHeader, KeyframeImageHeader, KeyframePoseMessage, PoseMessage,
 };
 use semidense::wire::port::{Hub, Subscriber};
 use semidense::wire::topic::{
-    EARLIER_KEYFRAME, EARLIER_KEYFRAME_IMAGE, GRAPH, HEALTH_TOPICS, POSE, TRACKER_HEALTH,
+    EARLIER_KEYFRAME, EARLIER_KEYFRAME_IMAGE, FRAME, GRAPH, HEALTH_TOPICS, POSE, TRACKER_HEALTH,
 };
 use serde_json::Value;
 use support::{Rig, end, finish, signal, small_camera, until};
@@ -112,6 +112,40 @@ fn lockstep_gives_the_bits_of_replay_with_any_number_of_threads() {
         let read = |rig: &Rig| fs::read(rig.output().join(file)).unwrap();
         assert!(read(&one) == read(&other), "{file} differs");
     }
+}
+
+#[test]
+fn a_pose_has_the_real_time_of_its_frame() {
+    let rig = Rig::new();
+    let since_1970 = || UNIX_EPOCH.elapsed().unwrap().as_nanos() as i64;
+    let begin = since_1970();
+    let child = rig.run(SLOW_FRAMES, SLOW).spawn().unwrap();
+    let hub = rig.observe();
+    let frames: Subscriber<u8, FrameHeader> = until("frames", || hub.subscriber(&FRAME).ok());
+    let poses: Subscriber<PoseMessage, ()> = until("poses", || hub.subscriber(&POSE).ok());
+    let mut sent = BTreeMap::new();
+    let (mut compared, mut before) = (0, None);
+    until("ten poses of frames that were seen", || {
+        while let Some(frame) = frames.receive().unwrap() {
+            let header = *frame.header();
+            sent.insert(header.sequence, header);
+        }
+        while let Some(message) = poses.receive().unwrap() {
+            let pose = message.payload()[0];
+            let Some(header) = sent.get(&pose.sequence) else { continue };
+            assert_eq!(pose.realtime_nanos, header.realtime_nanos);
+            assert!((begin..=since_1970()).contains(&pose.realtime_nanos));
+            // Both clocks advance alike, but for what the system clock is slewed by.
+            let offset = header.realtime_nanos - header.clock_nanos;
+            let drift = before.replace(offset).map_or(0, |before: i64| (before - offset).abs());
+            assert!(drift < 5_000_000, "{drift} ns");
+            compared += 1;
+        }
+        (compared >= 10).then_some(())
+    });
+    signal(&child, Signal::INT);
+    drop((frames, poses, hub));
+    end(child);
 }
 
 #[test]

@@ -112,7 +112,7 @@ impl FrameSource for Script {
         let sequence = self.next as u64;
         let capture_nanos = self.next as i64 * PERIOD_NANOS;
         self.next += 1;
-        Ok(Some(FrameStamp { sequence, capture_nanos, exposure_nanos: 0, gain: 0.0 }))
+        Ok(Some(FrameStamp { sequence, capture_nanos, exposure_nanos: 0, gain: 0.0, clocks: None }))
     }
 
     fn ground_truth(&self) -> &[StampedPose] {

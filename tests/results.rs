@@ -1,194 +1,22 @@
 //! The files that a run leaves behind, from records made by hand.
 
-use std::path::Path;
+#[path = "support/records.rs"]
+mod records;
 
-use semidense::capture::source::{FrameSource, FrameStamp, SourceError};
+use records::{UNIT_M, keyframe, nanos, pose, record, written};
 use semidense::service::adjustments::{AdjustmentRecord, Fate, SearchRecord};
-use semidense::service::alignment_stamps::{AlignmentTrace, LevelTrace};
 use semidense::service::results::output_folder::prepare_output;
-use semidense::service::results::untracked::StartTally;
-use semidense::service::results::{
-    EndOfRun, RecordedPose, Rejection, ResultsParams, RunMode, RunRecord, write_results,
-};
+use semidense::service::results::{Rejection, RunRecord};
 use semidense::service::trajectory_file::read_trajectory;
 use semidense::slam::evaluation::depth_error::DepthScale;
-use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
-use semidense::slam::geometry::sim3::Sim3;
 use semidense::slam::graph::constraint::Refusal;
-use semidense::slam::image::buffer::Image;
-use semidense::slam::keyframe::{DepthPoint, Keyframe};
 use semidense::slam::loops::{SearchFate, SearchReport};
-use semidense::slam::map::Map;
 use semidense::slam::mapper::consistency::Contradiction;
-use semidense::slam::pose::{
-    Brightness, DegradedReason, LostReason, PoseEstimate, Quality, TrackingState,
-};
-use semidense::slam::trajectory::StampedPose;
+use semidense::slam::pose::{DegradedReason, LostReason, TrackingState};
 use semidense::slam::window::Adjustment;
 use semidense::slam::window::confirmed::ConfirmedPoint;
 use semidense::slam::window::frames::PlacedFrame;
-use serde_json::Value;
-
-const INTRINSICS: Intrinsics = Intrinsics::pinhole(32, 24, 30.0);
-
-/// A source whose only use is its depth: 4 m at every pixel of every frame.
-struct Wall;
-
-impl FrameSource for Wall {
-    fn intrinsics(&self) -> Intrinsics {
-        INTRINSICS
-    }
-
-    fn num_frames(&self) -> Option<usize> {
-        None
-    }
-
-    fn next_into(&mut self, _pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
-        Ok(None)
-    }
-
-    fn depth_at(&mut self, _capture_nanos: i64) -> Result<Option<Image<f32>>, SourceError> {
-        Ok(Some(Image::filled(INTRINSICS.width, INTRINSICS.height, 4.0)))
-    }
-}
-
-fn nanos(i: usize) -> i64 {
-    1_305_033_527_000_000_001 + i as i64 * 33_333_333
-}
-
-/// Where the camera of frame i truly is, metres.
-fn truth(i: usize) -> SE3 {
-    let t = i as f64 / 30.0;
-    SE3 { translation: [t.sin(), 0.1 * (3.0 * t).cos(), 0.5 * t].into(), ..SE3::identity() }
-}
-
-/// A map unit is 2 m; keyframe 1 moved by (1, 0, 0) units after its frames were published.
-const UNIT_M: f64 = 2.0;
-
-fn world_from_keyframe(id: u64) -> Sim3 {
-    let shift = if id == 1 { 1.0 } else { 0.0 };
-    let rigid = SE3 { translation: [shift, 0.0, 0.0].into(), ..SE3::identity() };
-    Sim3::new(rigid, 0.5)
-}
-
-fn pose(i: usize, state: TrackingState, keyframe_id: u64) -> RecordedPose {
-    let mut world_from_camera = truth(i);
-    world_from_camera.translation /= UNIT_M;
-    let estimate = PoseEstimate {
-        sequence: i as u64,
-        capture_nanos: nanos(i),
-        epoch: 0,
-        revision: 0,
-        keyframe_id,
-        state,
-        world_from_camera,
-        map_revision: 0,
-        map_from_camera: world_from_camera,
-        keyframe_from_camera: world_from_keyframe(0).locate(&world_from_camera),
-        covariance: [0.0; 21],
-        map_covariance: [0.0; 21],
-        alignment_covariance: [0.0; 21],
-        velocity: None,
-        brightness: Brightness::default(),
-        quality: Quality::default(),
-        proposes_keyframe: false,
-    };
-    RecordedPose {
-        estimate,
-        latency_nanos: None,
-        track_nanos: Some(1_000_000 * (i as u64 % 7 + 1)),
-        trace: (state != TrackingState::Initializing).then(|| trace(i)),
-        wake_nanos: Some(40_000),
-    }
-}
-
-/// Level 1 with 1000 points, 2 or 5 iterations of 3 µs.
-fn trace(i: usize) -> AlignmentTrace {
-    let iterations = if i.is_multiple_of(3) { 5 } else { 2 };
-    let mut trace = AlignmentTrace { pyramid_nanos: 50_000, ..AlignmentTrace::default() };
-    trace.levels[1] = LevelTrace {
-        points: 1000,
-        iterations,
-        timed_evaluations: iterations,
-        timed_nanos: 3_000 * u64::from(iterations),
-    };
-    trace
-}
-
-fn keyframe(keyframe_id: u64) -> Keyframe {
-    // A keyframe unit is half a map unit: 4 m are 4 keyframe units. One point is too uncertain.
-    let points = (0..20u16).map(|i| DepthPoint {
-        u: i,
-        v: 3,
-        inverse_depth: 0.25,
-        variance: if i == 0 { 0.01 } else { 1e-5 },
-        intensity: 100.0,
-    });
-    Keyframe {
-        keyframe_id,
-        revision: 1,
-        sequence: keyframe_id * 10,
-        capture_nanos: nanos(keyframe_id as usize * 10),
-        ..Keyframe::at(
-            world_from_keyframe(keyframe_id),
-            INTRINSICS,
-            points.collect(),
-            vec![90; 32 * 24],
-        )
-    }
-}
-
-fn record(poses: Vec<RecordedPose>, keyframes: Vec<Keyframe>, with_truth: bool) -> RunRecord {
-    let frames = poses.len();
-    let pose = |i| StampedPose { nanos: nanos(i), world_from_camera: truth(i) };
-    RunRecord {
-        searches: None,
-        mode: RunMode::Lockstep,
-        source: "tum:a<script>\"b\"".to_owned(),
-        ended: EndOfRun::Interrupted,
-        poses,
-        map: Map { keyframes, ..Map::default() },
-        ground_truth: if with_truth { (0..frames).map(pose).collect() } else { Vec::new() },
-        depth_scale: DepthScale::MedianRatio,
-        is_depth_from_sensor: false,
-        frames_in: frames as u64,
-        frames_refused: 0,
-        refused: None,
-        frames_dropped: 0,
-        gaps: 0,
-        restarts: 0,
-        restart_causes: Vec::new(),
-        frames_skipped_by_mapper: None,
-        deadline_nanos: None,
-        deadline_misses: None,
-        send_counts: None,
-        page_faults: None,
-        map_nanos: vec![2_000_000; frames],
-        keyframe_step_nanos: vec![5_000_000; 3],
-        keyframe_nanos: vec![3_000_000; 3],
-        adjustments: Vec::new(),
-        start: StartTally::default(),
-        rejections: None,
-        budget_samples: Vec::new(),
-        recorded_nanos: 2_000_000_000,
-        wall_nanos: 1_000_000_000,
-        peak_rss_bytes: None,
-    }
-}
-
-fn written(dir: &Path, record: &RunRecord) -> (Value, String) {
-    prepare_output(dir).unwrap();
-    write_results(dir, record, &mut Wall, &ResultsParams::default()).unwrap();
-    let read = |name: &str| std::fs::read_to_string(dir.join(name)).unwrap();
-    let report = read("report.html");
-    assert!(report.ends_with("</html>\n"));
-    assert_eq!(report.matches("<svg").count(), report.matches("</svg>").count());
-    assert!(!report.contains("<script>"), "the source's name is escaped");
-    assert!(!report.contains("http://") || !report.contains("src=\"http"), "no network is needed");
-    assert!(!report.contains("NaN"));
-    (serde_json::from_str(&read("summary.json")).unwrap(), report)
-}
 
 #[test]
 fn frames_aligned_afterwards_count_where_the_map_was_tracked_on() {
@@ -269,18 +97,8 @@ fn figures_and_files_of_a_run_with_truth_and_a_loss() {
     let moved = last.world_from_camera.translation - online.world_from_camera.translation;
     assert!((moved.x - 1.0).abs() < 1e-12 && moved.y.abs() < 1e-12);
 
-    let ply = std::fs::read(dir.join("map.ply")).unwrap();
-    let header_end = ply.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
-    assert_eq!(ply.len() - header_end, 38 * 24, "38 points of six numbers");
-    let z = f32::from_le_bytes(ply[header_end + 8..header_end + 12].try_into().unwrap());
-    assert!((z - 2.0).abs() < 1e-6, "4 m are 2 map units");
-    let pcd = std::fs::read(dir.join("map.pcd")).unwrap();
-    let data = pcd.windows(12).position(|w| w == b"DATA binary\n").unwrap() + 12;
-    assert_eq!(pcd[data..], ply[header_end..], "the same points in both files");
-    let header = std::str::from_utf8(&pcd[..data]).unwrap();
-    assert!(header.contains("\nWIDTH 38\nHEIGHT 1\n") && header.contains("\nPOINTS 38\n"));
     let names: Vec<_> = std::fs::read_dir(&dir).unwrap().map(|e| e.unwrap().file_name()).collect();
-    assert_eq!(names.len(), 8, "nothing temporary is left: {names:?}");
+    assert_eq!(names.len(), 7, "nothing temporary is left: {names:?}");
 }
 
 #[test]

@@ -29,7 +29,7 @@ pub struct CaptureArguments {
 #[derive(Debug, Clone, Args)]
 pub struct SourceArguments {
     /// Where frames come from: DIR (its layout is detected), sim, sim:SCENE, tum:DIR, euroc:DIR,
-    /// images:DIR, v4l:DEVICE, or loop:FRAMES:HZ:SOURCE, which plays another source back and forth, FRAMES frames
+    /// images:DIR, mcap:FILE[:TOPIC], v4l:DEVICE, ros2:TOPIC (images of ROS 2), stream:SOCKET (frames that another program sends), or loop:FRAMES:HZ:SOURCE, which plays another source back and forth, FRAMES frames
     /// at HZ [default: capture.source of the configuration, which is sim]
     #[arg(value_name = "SOURCE")]
     source: Option<OsString>,

@@ -6,6 +6,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use crate::capture::source::{FrameSource, SourceName};
 use crate::command::print::{note, print};
+use crate::command::progress::Progress;
 use crate::command::{CommandResult, INTERRUPTED, NOTHING_TRACKED};
 use crate::service::config::Config;
 use crate::service::journal::Journal;
@@ -41,7 +42,11 @@ impl Ending<'_> {
     ) -> CommandResult {
         let output = self.output.path();
         let place = output.display().to_string();
-        let results = Results::new(record, source, &self.config.results)?;
+        let progress = Progress::new("fusing the map", Some(record.map.keyframes.len()));
+        let results = Results::new(record, source, &self.config.results, &mut |done, _| {
+            progress.update(done, "");
+        })?;
+        progress.finish();
         let is_tracked = results.summary.frames.frames_tracked > 0;
         // Poses without a map, of a run that failed: a full disk, a mapper that is gone.
         let is_torn = matches!(record.ended, EndOfRun::Failed(_)) && results.summary.points == 0;

@@ -8,7 +8,9 @@ use std::time::{Duration, Instant, UNIX_EPOCH};
 use clap::{Args, Subcommand};
 
 use crate::command::CommandResult;
+use crate::command::map_points::MapPointOptions;
 use crate::command::print::{note, print};
+use crate::command::progress::Progress;
 use crate::service::config::{Config, MapConfig};
 use crate::service::health::ProcessState;
 use crate::service::map_folder::merge::merge;
@@ -141,6 +143,8 @@ struct ExportArguments {
     /// The epoch to write: each has a place and a unit of its own [default: the one with the most keyframes]
     #[arg(long, value_name = "N")]
     epoch: Option<u32>,
+    #[command(flatten)]
+    points: MapPointOptions,
 }
 
 /// Runs it.
@@ -220,9 +224,13 @@ fn export_map(config: &Config, arguments: &ExportArguments) -> CommandResult {
         )
         .into());
     }
-    let most = config.results.max_relative_std_dev;
-    let (points, keyframes) = export(&arguments.output, &loaded.map, epoch, most)
-        .map_err(|error| format!("{}: {error}", arguments.output.display()))?;
+    let params = arguments.points.of(&config.results);
+    let progress = Progress::new("fusing the map", Some(loaded.map.keyframes.len()));
+    let mut show = |done, _| progress.update(done, "");
+    let exported = export(&arguments.output, &loaded.map, epoch, &params, &mut show);
+    progress.finish();
+    let (points, keyframes) =
+        exported.map_err(|error| format!("{}: {error}", arguments.output.display()))?;
     print(&format!(
         "{}: map.ply with {points} points, keyframes.txt with {keyframes} poses of epoch {epoch}\n",
         arguments.output.display()

@@ -8,6 +8,7 @@ use clap::Args;
 
 use crate::capture::source::{FrameSource, FrameStamp, SourceError, SourceName, open};
 use crate::command::ending::{Ending, note_unfinished};
+use crate::command::map_points::MapPointOptions;
 use crate::command::print::note;
 use crate::command::{CommandResult, NOTHING_TRACKED};
 use crate::service::config::Config;
@@ -34,6 +35,8 @@ pub struct RecoverArguments {
     /// Write the results into another folder
     #[arg(long, value_name = "DIR")]
     output: Option<PathBuf>,
+    #[command(flatten)]
+    points: MapPointOptions,
     /// Keep the journal, so that the run can be recovered again
     #[arg(long)]
     keep: bool,
@@ -70,7 +73,8 @@ pub fn run(config: &Config, arguments: &RecoverArguments) -> CommandResult {
     }
     let output = OutputFolder::of_recovery(&output)?;
     let start = recovered.start.clone();
-    let config = Config::from_text(&start.config, "the journal's configuration")?;
+    let mut config = Config::from_text(&start.config, "the journal's configuration")?;
+    config.results = arguments.points.of(&config.results);
     let mut source = source_of(&start, &config);
     let record = record_of(recovered, &config, &found.folder, source.as_ref());
     if let Some(warning) = depth_warning(&record.map, &config, &found.folder) {

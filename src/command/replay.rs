@@ -12,6 +12,7 @@ use crate::command::INTERRUPTED;
 use crate::command::capture::SourceArguments;
 use crate::command::ending::{Ending, note_unfinished, run_start};
 use crate::command::map::MapOptions;
+use crate::command::map_points::MapPointOptions;
 use crate::command::print::note;
 use crate::command::progress::Progress;
 use crate::service::config::{CaptureConfig, Config};
@@ -32,7 +33,7 @@ use crate::wire::place::Place;
 
 /// What a replay can take; a camera gives no frame twice.
 const SOURCE_HELP: &str = "Where frames come from: DIR (its layout is detected), sim, sim:SCENE, tum:DIR, euroc:DIR, images:DIR, \
-     or loop:FRAMES:HZ:SOURCE, which plays another source back and forth, FRAMES frames at HZ [default: capture.source \
+     mcap:FILE[:TOPIC] (a recording of `semidense record` or a ROS 2 bag), or loop:FRAMES:HZ:SOURCE, which plays another source back and forth, FRAMES frames at HZ [default: capture.source \
      of the configuration, which is sim]. A camera cannot be replayed: use `semidense run`";
 const RIG_HELP: &str = "Rig file with the camera's calibration, for recordings without their own [default: capture.rig of the \
      configuration, for the source configured there]";
@@ -64,13 +65,15 @@ pub struct ReplayArgs {
     /// Where frames come from and how the camera is.
     #[command(flatten)]
     source: SourceArguments,
-    /// Folder for trajectory.txt, trajectory_online.txt, keyframes.txt, map.ply, map.pcd, points.ply,
-    /// summary.json and report.html [default: a new folder under ./output named by the time (UTC); output/latest links to the
+    /// Folder for trajectory.txt, trajectory_online.txt, keyframes.txt, map.ply, points.ply, summary.json and report.html
+    /// [default: a new folder under ./output named by the time (UTC); output/latest links to the
     /// newest]
     #[arg(long, value_name = "DIR")]
     output: Option<PathBuf>,
     #[command(flatten)]
     map: MapOptions,
+    #[command(flatten)]
+    points: MapPointOptions,
     /// Where the first depth of a keyframe comes from
     #[arg(long, value_enum, default_value_t)]
     initial_depth: InitialDepth,
@@ -110,7 +113,8 @@ pub fn run(config: &Config, args: ReplayArgs) -> Result<ExitCode, Box<dyn Error>
     if args.poses == Poses::Groundtruth && !map.folder.is_empty() {
         return Err("--poses groundtruth cannot be used with a map: its poses would be those of another world".into());
     }
-    let config = &Config { capture, map, ..config.clone() };
+    let results = args.points.of(&config.results);
+    let config = &Config { capture, map, results, ..config.clone() };
     let shutdown = Shutdown::install()?;
     let place = Place::new(&config.instance, &config.root)?;
     let output = OutputFolder::prepare(args.output.as_deref())?;

@@ -6,11 +6,14 @@ use std::process::ExitCode;
 
 use clap::Args;
 
+use crate::capture::source::SourceName;
 use crate::command::bridge::{BridgeError, handed_on, program};
 use crate::command::capture::{ModeArguments, SourceArguments, usual_mode};
 use crate::command::ending::{Ending, note_unfinished, run_start};
 use crate::command::map::MapOptions;
+use crate::command::map_points::MapPointOptions;
 use crate::command::print::note;
+use crate::command::ros2_rig::{Ros2RigError, fetch as fetch_rig};
 use crate::command::run_progress::start_display;
 use crate::command::{CommandResult, CommonArguments, INTERRUPTED};
 use crate::service::config::Config;
@@ -40,6 +43,8 @@ pub struct RunArguments {
     /// time (UTC); output/latest links to the newest]
     #[arg(long, value_name = "DIR")]
     output: Option<PathBuf>,
+    #[command(flatten)]
+    points: MapPointOptions,
     /// Print the summary as JSON and show no progress
     #[arg(long)]
     json: bool,
@@ -66,13 +71,21 @@ pub fn run(
     if !map.folder.is_empty() {
         child_arguments.extend(MapOptions::settings(&map));
     }
-    let config = &Config { map, ..config.clone() };
+    let results = arguments.points.of(&config.results);
+    let config = &Config { map, results, ..config.clone() };
     let (source, rig) = arguments.source.source_and_rig(&config.capture)?;
     let mode = arguments.mode.mode(usual_mode(&source));
     let place = Place::new(&config.instance, &config.root)?;
     // First: a signal must find the folder's owner ready to remove it.
     let shutdown = Shutdown::install()?;
     let output = OutputFolder::prepare(arguments.output.as_deref())?;
+    let rig = match (&source, rig) {
+        (SourceName::Ros2(topic), None) => match fetch_rig(topic, output.path(), &shutdown) {
+            Err(Ros2RigError::Interrupted) => return Ok(ExitCode::from(INTERRUPTED)),
+            fetched => Some(fetched?),
+        },
+        (_, rig) => rig,
+    };
     note_unfinished(&unfinished(Some(&place), output.path()));
     let journal = JournalOptions {
         output: output.path().to_owned(),

@@ -51,7 +51,10 @@ pub struct StatusArguments {
     /// Show the status once and exit
     #[arg(long)]
     once: bool,
-    /// Print one JSON object per update
+    /// Refresh once a second until Ctrl-C, also where nothing runs yet and where a run has ended
+    #[arg(long, conflicts_with = "once")]
+    watch: bool,
+    /// Print one JSON object per update, each on a line
     #[arg(long)]
     json: bool,
 }
@@ -60,10 +63,42 @@ pub struct StatusArguments {
 pub fn run(config: &Config, arguments: StatusArguments) -> CommandResult {
     let place = Place::new(&config.instance, &config.root)?;
     note_unfinished(&unfinished(Some(&place), Path::new(".")));
-    let hub = Hub::join(&place, "status", Access::Observer)?;
-    let mut watch = Watch::open(&hub, &place, &config.instance)?;
     let shutdown = Shutdown::install()?;
+    loop {
+        match follow(&place, &arguments, &shutdown) {
+            Err(error) if arguments.watch && is_absence(error.as_ref()) => {
+                let look = format!("{}\n", nothing_runs(&place.instance));
+                let text = format!("{}{error}\n", clear(&arguments));
+                print(if arguments.json { &look } else { &text })?;
+            }
+            shown => shown?,
+        }
+        if !arguments.watch || shutdown.is_requested() {
+            return Ok(ExitCode::SUCCESS);
+        }
+        wait(&[], Some(shutdown.descriptor()), PERIOD)?;
+    }
+}
+
+/// Whether nothing runs there, as far as can be seen from here.
+fn is_absence(error: &(dyn Error + 'static)) -> bool {
+    error.downcast_ref().is_some_and(OpenError::is_absence)
+}
+
+/// What goes in front of an update: on a terminal it takes the place of the one before.
+fn clear(arguments: &StatusArguments) -> &'static str {
     let is_live = std::io::stdout().is_terminal() && !arguments.once && !arguments.json;
+    if is_live { CLEAR_SCREEN } else { "" }
+}
+
+/// Shows the run that is on until it ends, or once.
+fn follow(
+    place: &Place,
+    arguments: &StatusArguments,
+    shutdown: &Shutdown,
+) -> Result<(), Box<dyn Error>> {
+    let hub = Hub::join(place, "status", Access::Observer)?;
+    let mut watch = Watch::open(&hub, place, &place.instance)?;
     let period = if arguments.once { ONCE_PERIOD } else { PERIOD };
     for looks in 1.. {
         wait(&[], Some(shutdown.descriptor()), period)?;
@@ -75,12 +110,11 @@ pub fn run(config: &Config, arguments: StatusArguments) -> CommandResult {
         if arguments.once && looks < MAX_LOOKS && !watch.is_complete(&look) {
             continue;
         }
-        let clear = if is_live { CLEAR_SCREEN } else { "" };
         let text = match arguments.json {
             true => format!("{look}\n"),
             false => status_text(&look, terminal_width()),
         };
-        print(&format!("{clear}{text}"))?;
+        print(&format!("{}{text}", clear(arguments)))?;
         if has_ended && !arguments.json {
             print("the run has ended\n")?;
         }
@@ -88,7 +122,15 @@ pub fn run(config: &Config, arguments: StatusArguments) -> CommandResult {
             break;
         }
     }
-    Ok(ExitCode::SUCCESS)
+    Ok(())
+}
+
+/// A look where there is nothing to see.
+fn nothing_runs(instance: &str) -> Value {
+    json!({
+        "instance": instance, "source": null, "uptime_secs": null, "keyframes": null, "capture": null, "tracker": null,
+        "mapper": null, "pose": null, "ended": true,
+    })
 }
 
 /// Columns of the terminal; the usual ones where standard output is none.

@@ -172,9 +172,9 @@ impl<'a> Shell<'a> {
         options: &CaptureOptions,
         shutdown: &'a Shutdown,
     ) -> Result<Self, CaptureError> {
-        if let (SourceName::Camera(name), Mode::Lockstep) = (&options.source, options.mode) {
+        if options.source.is_camera() && options.mode == Mode::Lockstep {
             let reason = "a camera does not wait for the map; leave out --lockstep".to_owned();
-            return Err(SourceError::Camera { name: name.clone(), reason }.into());
+            return Err(SourceError::Stream { name: options.source.to_string(), reason }.into());
         }
         let rig = options.rig.as_deref();
         let source = open(&options.source, rig, &config.source_params())?;
@@ -382,6 +382,9 @@ impl<'a> Shell<'a> {
             return Err(CaptureError::Interrupted);
         }
         let clock_nanos = match self.mode {
+            Mode::Live if stamp.clocks.is_some() => {
+                stamp.clocks.map_or(0, |clocks| clocks.clock_nanos)
+            }
             // A driver's stamp may lie in the future; no latency is negative.
             Mode::Live if !self.is_recorded() => stamp.capture_nanos.min(now_nanos()),
             Mode::Live => {
@@ -429,7 +432,9 @@ impl<'a> Shell<'a> {
             sequence: stamp.sequence,
             capture_nanos: stamp.capture_nanos,
             clock_nanos,
-            realtime_nanos: realtime_of(clock_nanos),
+            realtime_nanos: stamp
+                .clocks
+                .map_or_else(|| realtime_of(clock_nanos), |clocks| clocks.realtime_nanos),
             sent_nanos: now_nanos(),
             exposure_nanos: stamp.exposure_nanos,
             intrinsics: [k.fx, k.fy, k.cx, k.cy],

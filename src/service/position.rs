@@ -271,8 +271,13 @@ mod tests {
 
     #[test]
     fn frames_before_the_last_one_are_left_out_where_there_is_a_clock() {
-        let at =
-            |capture_nanos| FrameStamp { sequence: 0, capture_nanos, exposure_nanos: 0, gain: 0.0 };
+        let at = |capture_nanos| FrameStamp {
+            sequence: 0,
+            capture_nanos,
+            exposure_nanos: 0,
+            gain: 0.0,
+            clocks: None,
+        };
         let behind = |last, stamps: &[i64]| {
             let mut predecessor = Predecessor { last_nanos: Some(last), ..Predecessor::default() };
             stamps.iter().filter(|&&nanos| predecessor.is_ahead_of(&at(nanos))).count()

@@ -4,7 +4,7 @@
 mod subscribers;
 
 use std::fmt::Debug;
-use std::os::fd::BorrowedFd;
+use std::os::fd::{AsFd, BorrowedFd};
 use std::time::Duration;
 
 use iceoryx2::port::listener::Listener;
@@ -381,7 +381,8 @@ impl<T: Debug + ZeroCopySend, H: Debug + ZeroCopySend> Subscriber<T, H> {
         Ok(newest)
     }
 
-    fn has_unread(&self) -> Result<bool, ReceiveError> {
+    /// Whether there is an unread message.
+    pub fn has_unread(&self) -> Result<bool, ReceiveError> {
         self.port.has_samples().map_err(|e| self.error(&e))
     }
 
@@ -425,8 +426,11 @@ impl Events {
     fn take(&self) {
         let _ = self.listener.try_wait(|_| {});
     }
+}
 
-    fn descriptor(&self) -> BorrowedFd<'_> {
+/// Readable while a wake-up is unread: for a poll of one's own; [`wait`] takes the wake-ups.
+impl AsFd for Events {
+    fn as_fd(&self) -> BorrowedFd<'_> {
         // SAFETY: the descriptor is the listener's and lives as long as it.
         unsafe { BorrowedFd::borrow_raw(self.listener.file_descriptor().native_handle()) }
     }
@@ -453,7 +457,7 @@ pub fn wait<'a>(
 ) -> Result<(), WaitError> {
     let timeout =
         Timespec { tv_sec: timeout.as_secs() as i64, tv_nsec: timeout.subsec_nanos().into() };
-    let mut descriptors = events.iter().map(|e| e.descriptor()).chain(interrupts);
+    let mut descriptors = events.iter().map(|&e| e.as_fd()).chain(interrupts);
     let polled = match descriptors.next() {
         None => rustix::event::poll(&mut [], Some(&timeout)),
         // An array: a frame loop that waits must not allocate.

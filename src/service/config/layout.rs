@@ -12,7 +12,7 @@ use toml::{Table, Value};
 pub const EXPERT: &str = "expert";
 
 /// Keys outside `[expert]`: what a camera, a robot, a recording or a first try may need.
-const USER_KEYS: [&str; 39] = [
+const USER_KEYS: [&str; 42] = [
     "instance",
     "root",
     "capture.source",
@@ -47,6 +47,9 @@ const USER_KEYS: [&str; 39] = [
     "mapping.max_map_megabytes",
     "supervisor.watchdog_s",
     "results.max_relative_std_dev",
+    "results.map_resolution",
+    "results.pcd",
+    "results.full_points",
     "results.alignment",
     "simulator.scene",
     "simulator.seed",

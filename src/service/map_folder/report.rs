@@ -9,8 +9,13 @@ use serde::Serialize;
 use crate::service::map_folder::depth_file::MapDetail;
 use crate::service::map_folder::manifest::VERSION;
 use crate::service::map_folder::{KEYFRAMES, Loaded};
-use crate::service::results::ply::{point_cloud, write_ply};
+use crate::service::results::ResultsParams;
+use crate::service::results::full_points::write_full_points;
+use crate::service::results::pcd::write_pcd;
+use crate::service::results::ply::write_surface;
 use crate::service::trajectory_file::write_trajectory;
+use crate::slam::fusion::fuse;
+use crate::slam::keyframe::Keyframe;
 use crate::slam::map::Map;
 use crate::slam::trajectory::StampedPose;
 
@@ -103,18 +108,28 @@ fn bytes_in(folder: &Path) -> u64 {
     files.map(|metadata| metadata.len()).sum()
 }
 
-/// Writes a map's points (PLY) and the trajectory of its keyframes (TUM), of one epoch.
+/// Writes a map's points (PLY, on request PCD and every point) and the trajectory of its keyframes (TUM), of one epoch: how
+/// many of each. `progress` is called with how many keyframes are fused, of how many.
 pub fn export(
     folder: &Path,
     map: &Map,
     epoch: u32,
-    max_relative_std_dev: f64,
+    params: &ResultsParams,
+    progress: &mut dyn FnMut(usize, usize),
 ) -> io::Result<(usize, usize)> {
     fs::create_dir_all(folder)?;
     let of_epoch = map.keyframes.iter().filter(|keyframe| keyframe.epoch == epoch);
     let map = Map { keyframes: of_epoch.cloned().collect(), ..Map::default() };
-    let cloud = point_cloud(&map, max_relative_std_dev);
-    write_ply(&folder.join("map.ply"), &cloud)?;
+    let keyframes: Vec<&Keyframe> = map.keyframes.iter().collect();
+    let surface = fuse(&keyframes, &params.fusion(), progress);
+    write_surface(&folder.join("map.ply"), &surface)?;
+    if params.pcd {
+        write_pcd(&folder.join("map.pcd"), &surface)?;
+    }
+    if params.full_points {
+        let path = folder.join("points-full.ply");
+        write_full_points(&path, &map, params.max_relative_std_dev)?;
+    }
     let poses: Vec<StampedPose> = map
         .keyframes
         .iter()
@@ -125,5 +140,5 @@ pub fn export(
         .collect();
     let comment = "map_from_keyframe of every keyframe, map units";
     write_trajectory(&folder.join("keyframes.txt"), comment, &poses)?;
-    Ok((cloud.len(), poses.len()))
+    Ok((surface.len(), poses.len()))
 }

@@ -9,6 +9,7 @@ pub mod calibration;
 pub mod colour;
 pub mod debug_pictures;
 pub mod depth_maps;
+pub mod full_points;
 pub mod joint;
 pub mod joint_points;
 pub mod lettering;
@@ -29,7 +30,7 @@ pub mod weight_picture;
 
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
-use std::time::SystemTime;
+use std::time::{Instant, SystemTime};
 
 use serde::{Deserialize, Serialize};
 
@@ -40,7 +41,8 @@ use crate::service::atomic_file::write_atomically;
 use crate::service::recording::TimeCounts;
 use crate::service::results::budget_curve::BudgetSample;
 use crate::service::results::depth_maps::DepthEvaluation;
-use crate::service::results::ply::CloudPoint;
+use crate::service::results::full_points::{FULL_POINT_BYTES, num_points, write_full_points};
+use crate::service::results::ply::SURFACE_POINT_BYTES;
 use crate::service::results::report::{ReportInput, report};
 use crate::service::results::set::ResultSet;
 use crate::service::results::summary::Summary;
@@ -49,6 +51,8 @@ use crate::service::trajectory_file::write_trajectory;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::evaluation::umeyama::TrajectoryAlignment;
 use crate::slam::evaluation::{MAX_DIFFERENCE_NANOS, TrajectoryEvaluation, evaluate_trajectory};
+use crate::slam::fusion::{FusionParams, MapResolution, SurfacePoint, fuse};
+use crate::slam::keyframe::Keyframe;
 use crate::slam::map::Map;
 use crate::slam::mapper::consistency::Contradiction;
 use crate::slam::parameter::{ParameterError, check_range};
@@ -189,16 +193,29 @@ pub struct RunRecord {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ResultsParams {
-    /// Largest σ/d of a point of `map.ply`, `map.pcd` and of the report's pictures. 0.1: a point that is known
-    /// to a tenth of its distance; larger values keep more points and more outliers.
+    /// Largest σ/d of a point that is written or shown. 0.1: a point that is known to a tenth of its distance; larger
+    /// values keep more points and more outliers.
     pub max_relative_std_dev: f64,
+    /// Distance between the points of `map.ply`: a length in map units (`"0.02"`), or a share of the distance from the
+    /// camera (`"0.5%"`), so that near surfaces are finer; nowhere below the points' standard deviation.
+    pub map_resolution: MapResolution,
+    /// Write `map.pcd` too: the points of `map.ply` for PCL.
+    pub pcd: bool,
+    /// Write `points-full.ply` too: every point of every keyframe, before fusion.
+    pub full_points: bool,
     /// What is fitted before positions are compared with the ground truth: `sim3`, `se3` or `none`.
     pub alignment: TrajectoryAlignment,
 }
 
 impl Default for ResultsParams {
     fn default() -> Self {
-        Self { max_relative_std_dev: 0.1, alignment: TrajectoryAlignment::Sim3 }
+        Self {
+            max_relative_std_dev: 0.1,
+            map_resolution: MapResolution::default(),
+            pcd: false,
+            full_points: false,
+            alignment: TrajectoryAlignment::Sim3,
+        }
     }
 }
 
@@ -206,6 +223,15 @@ impl ResultsParams {
     /// Checks every value.
     pub fn validate(&self) -> Result<(), ParameterError> {
         check_range("max_relative_std_dev", self.max_relative_std_dev, 0.0..=10.0)
+    }
+
+    /// How keyframes are fused to one surface.
+    pub fn fusion(&self) -> FusionParams {
+        FusionParams {
+            resolution: self.map_resolution,
+            max_relative_std_dev: self.max_relative_std_dev,
+            ..FusionParams::default()
+        }
     }
 }
 
@@ -264,15 +290,17 @@ pub struct Results<'a> {
     online: Vec<StampedPose>,
     evaluation: Option<TrajectoryEvaluation>,
     online_evaluation: Option<TrajectoryEvaluation>,
-    cloud: Vec<CloudPoint>,
+    surface: Vec<SurfacePoint>,
 }
 
 impl<'a> Results<'a> {
-    /// Evaluates a run. True depth comes from `depth_source` where it has any.
+    /// Evaluates a run. True depth comes from `depth_source` where it has any. `progress` is called with how many keyframes
+    /// are fused, of how many.
     pub fn new(
         record: &'a RunRecord,
         depth_source: &mut dyn FrameSource,
         params: &'a ResultsParams,
+        progress: &mut dyn FnMut(usize, usize),
     ) -> Result<Self, ResultsError> {
         // Files hold every epoch; figures and pictures are of the longest.
         let epoch = poses::longest_epoch(record);
@@ -289,10 +317,16 @@ impl<'a> Results<'a> {
             true => DepthEvaluation::default(),
             false => depth_maps::evaluate_depth(record, depth_source)?,
         };
-        let cloud = ply::point_cloud(&record.map, params.max_relative_std_dev);
+        let begin = Instant::now();
+        let surface = fuse(&keyframes_of(&record.map, epoch), &params.fusion(), progress);
+        let points = PointCounts {
+            points: num_points(&record.map, params.max_relative_std_dev),
+            map_points: surface.len(),
+            fusion_secs: begin.elapsed().as_secs_f64(),
+        };
         let summary = Summary::new(
             record,
-            cloud.len(),
+            points,
             evaluation.as_ref(),
             online_evaluation.as_ref(),
             poses::normalized_errors_of(record, epoch),
@@ -306,12 +340,12 @@ impl<'a> Results<'a> {
             online,
             evaluation,
             online_evaluation,
-            cloud,
+            surface,
         })
     }
 
-    /// Writes `trajectory.txt`, `trajectory_online.txt`, `keyframes.txt`, `map.ply`, `map.pcd`, `points.ply`,
-    /// `summary.json` and `report.html` into `dir`, which [`output_folder::prepare_output`] has made: all of
+    /// Writes `trajectory.txt`, `trajectory_online.txt`, `keyframes.txt`, `map.ply`, `points.ply`, `summary.json`,
+    /// `report.html`, and on request `map.pcd` and `points-full.ply` into `dir`, which [`output_folder::prepare_output`] has made: all of
     /// them, in the place of an earlier run's, or none. `write_more` writes what belongs to the set
     /// besides, into the folder that it is given.
     pub fn write(
@@ -327,10 +361,10 @@ impl<'a> Results<'a> {
             online: &self.online,
             evaluation: self.evaluation.as_ref(),
             online_evaluation: self.online_evaluation.as_ref(),
-            cloud: &self.cloud,
+            surface: &self.surface,
             max_relative_std_dev: self.params.max_relative_std_dev,
         });
-        let needed = needed_bytes(record, self.cloud.len(), page.len());
+        let needed = self.needed_bytes(page.len());
         let failed = |path: PathBuf, source| write_failure(dir, needed, path, source);
         let set = ResultSet::begin(dir).map_err(|source| failed(dir.to_owned(), source))?;
         let write = |name: &str, write: &dyn Fn(&Path) -> io::Result<()>| {
@@ -344,9 +378,15 @@ impl<'a> Results<'a> {
             write_trajectory(path, poses::ONLINE_COMMENT, &poses::online_trajectory(record, None))
         })?;
         write("keyframes.txt", &|path| poses::write_keyframes(path, &record.map))?;
-        write("map.ply", &|path| ply::write_ply(path, &self.cloud))?;
+        write("map.ply", &|path| ply::write_surface(path, &self.surface))?;
         write("points.ply", &|path| joint_points::write_points(path, &record.map))?;
-        write("map.pcd", &|path| pcd::write_pcd(path, &self.cloud))?;
+        if self.params.pcd {
+            write("map.pcd", &|path| pcd::write_pcd(path, &self.surface))?;
+        }
+        if self.params.full_points {
+            let most = self.params.max_relative_std_dev;
+            write("points-full.ply", &|path| write_full_points(path, &record.map, most))?;
+        }
         write("summary.json", &|path| {
             write_atomically(path, |file| {
                 serde_json::to_writer_pretty(&mut *file, &self.summary)?;
@@ -359,6 +399,23 @@ impl<'a> Results<'a> {
         write_more(set.folder())?;
         set.commit().map_err(|source| failed(dir.to_owned(), source))
     }
+
+    /// About what the files of the run take.
+    fn needed_bytes(&self, page: usize) -> u64 {
+        /// Of a line of either trajectory, a line of `keyframes.txt`, a point of `points.ply`.
+        const POSE_BYTES: usize = 170;
+        const KEYFRAME_BYTES: usize = 220;
+        const CONFIRMED_BYTES: usize = 24;
+        /// Largest `summary.json`.
+        const SUMMARY_BYTES: usize = 50_000;
+        let Self { record, params, summary, .. } = self;
+        let lines = 2 * POSE_BYTES * record.poses.len()
+            + KEYFRAME_BYTES * record.map.keyframes.len()
+            + CONFIRMED_BYTES * record.map.confirmed.len();
+        let surface = (1 + usize::from(params.pcd)) * SURFACE_POINT_BYTES * self.surface.len();
+        let full = if params.full_points { FULL_POINT_BYTES * summary.points as usize } else { 0 };
+        (surface + full + lines + page + SUMMARY_BYTES) as u64
+    }
 }
 
 /// Evaluates a run and writes its files into `dir`; see [`Results`].
@@ -368,22 +425,28 @@ pub fn write_results(
     depth_source: &mut dyn FrameSource,
     params: &ResultsParams,
 ) -> Result<Summary, ResultsError> {
-    let results = Results::new(record, depth_source, params)?;
+    let results = Results::new(record, depth_source, params, &mut |_, _| ())?;
     results.write(dir, &|_| Ok(()))?;
     Ok(results.summary)
 }
 
-/// About what the files of a run take.
-fn needed_bytes(record: &RunRecord, points: usize, page: usize) -> u64 {
-    /// Of a point in either cloud, a line of either trajectory, a line of `keyframes.txt`.
-    const POINT_BYTES: usize = 24;
-    const POSE_BYTES: usize = 170;
-    const KEYFRAME_BYTES: usize = 220;
-    /// Largest `summary.json`.
-    const SUMMARY_BYTES: usize = 50_000;
-    let lines = 2 * POSE_BYTES * record.poses.len() + KEYFRAME_BYTES * record.map.keyframes.len();
-    let points = 2 * points + record.map.confirmed.len();
-    (POINT_BYTES * points + lines + page + SUMMARY_BYTES) as u64
+/// How many points there are, and what it took to fuse them.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct PointCounts {
+    /// Points of all keyframes.
+    pub points: usize,
+    /// Points of the surface.
+    pub map_points: usize,
+    /// Time of the fusion.
+    pub fusion_secs: f64,
+}
+
+/// Keyframes of one epoch, the one that is written and shown; of the newest where none was tracked. Each epoch has a place
+/// and a unit of its own.
+fn keyframes_of(map: &Map, epoch: Option<u32>) -> Vec<&Keyframe> {
+    let newest = map.keyframes.last().map(|keyframe| keyframe.epoch);
+    let of_epoch = |keyframe: &&Keyframe| Some(keyframe.epoch) == epoch.or(newest);
+    map.keyframes.iter().filter(of_epoch).collect()
 }
 
 /// What to say where a file cannot be written: how much is lacking, where it is room.

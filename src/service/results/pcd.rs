@@ -1,35 +1,40 @@
-//! The map as a point cloud, binary PCD v0.7: the same points as in the PLY.
+//! The surface of the map as a point cloud, binary PCD v0.7: the same points as in the PLY, with the names that PCL has.
 
 use std::io::{self, Write};
 use std::path::Path;
 
 use crate::service::atomic_file::write_atomically;
-use crate::service::results::ply::CloudPoint;
+use crate::slam::fusion::SurfacePoint;
 
-/// Writes the cloud.
-pub fn write_pcd(path: &Path, cloud: &[CloudPoint]) -> io::Result<()> {
+/// What the file begins with.
+pub const BEGINNING: &str = "# .PCD v0.7 - x y z in map units";
+
+/// Writes the surface of the map.
+pub fn write_pcd(path: &Path, surface: &[SurfacePoint]) -> io::Result<()> {
     write_atomically(path, |file| {
         write!(
             file,
-            "# .PCD v0.7 - x y z in map units, variance of the inverse depth in keyframe units\n\
+            "{BEGINNING}, sigma along the ray in map units, keyframes that agree\n\
              VERSION 0.7\n\
-             FIELDS x y z intensity variance keyframe\n\
-             SIZE 4 4 4 4 4 4\n\
-             TYPE F F F F F U\n\
-             COUNT 1 1 1 1 1 1\n\
+             FIELDS x y z normal_x normal_y normal_z rgb sigma keyframes\n\
+             SIZE 4 4 4 4 4 4 4 4 1\n\
+             TYPE F F F F F F F F U\n\
+             COUNT 1 1 1 1 1 1 1 1 1\n\
              WIDTH {count}\n\
              HEIGHT 1\n\
              VIEWPOINT 0 0 0 1 0 0 0\n\
              POINTS {count}\n\
              DATA binary\n",
-            count = cloud.len()
+            count = surface.len()
         )?;
-        for point in cloud {
-            for number in point.position.iter().chain([&point.intensity, &point.variance]) {
+        surface.iter().try_for_each(|point| {
+            for number in point.position.iter().chain(&point.normal) {
                 file.write_all(&number.to_le_bytes())?;
             }
-            file.write_all(&point.keyframe_id.to_le_bytes())?;
-        }
-        Ok(())
+            // PCL keeps blue, green and red in the bytes of a number.
+            file.write_all(&[point.grey, point.grey, point.grey, 0])?;
+            file.write_all(&point.sigma.to_le_bytes())?;
+            file.write_all(&[point.keyframes])
+        })
     })
 }

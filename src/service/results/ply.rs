@@ -1,78 +1,142 @@
 //! The map as a point cloud, binary little-endian PLY.
 
-use std::io::{self, Write};
-use std::path::Path;
-
-use nalgebra::Vector3;
+use std::fs::File;
+use std::io::{self, BufRead, BufReader, Read, Write};
+use std::path::{Path, PathBuf};
 
 use crate::service::atomic_file::write_atomically;
-use crate::slam::keyframe::{Keyframe, MapState};
-use crate::slam::map::Map;
+use crate::slam::fusion::SurfacePoint;
 
-/// A point of the cloud.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct CloudPoint {
-    /// Position in the world, map units.
-    pub position: [f32; 3],
-    /// Brightness of its pixel, 0 to 255.
-    pub intensity: f32,
-    /// Variance of its inverse depth, keyframe units.
-    pub variance: f32,
-    /// Its keyframe.
-    pub keyframe_id: u32,
-}
+/// Bytes of a point of the surface in the file.
+pub const SURFACE_POINT_BYTES: usize = 32;
+/// What each begins with.
+pub const BEGINNING: &str =
+    "ply\nformat binary_little_endian 1.0\ncomment x y z in map units, sigma";
+/// The properties of a point, in their order.
+const PROPERTIES: &str = "property float x\nproperty float y\nproperty float z\n\
+     property float nx\nproperty float ny\nproperty float nz\n\
+     property uchar red\nproperty uchar green\nproperty uchar blue\n\
+     property float sigma\nproperty uchar keyframes\n\
+     end_header\n";
 
-/// Every point of an established keyframe whose σ/d is at most `max_relative_std_dev`.
-pub fn point_cloud(map: &Map, max_relative_std_dev: f64) -> Vec<CloudPoint> {
-    map.keyframes
-        .iter()
-        .filter(|k| k.map_state == MapState::Established)
-        .flat_map(|k| keyframe_points(k, max_relative_std_dev))
-        .collect()
-}
-
-fn keyframe_points(
-    keyframe: &Keyframe,
-    max_relative_std_dev: f64,
-) -> impl Iterator<Item = CloudPoint> + '_ {
-    let k = keyframe.intrinsics;
-    keyframe.points.iter().filter_map(move |point| {
-        let d = f64::from(point.inverse_depth);
-        let relative_std_dev = f64::from(point.variance).sqrt() / d;
-        if !(d > 0.0 && relative_std_dev <= max_relative_std_dev) {
-            return None;
-        }
-        let (u, v) = (f64::from(point.u), f64::from(point.v));
-        let in_keyframe = Vector3::new((u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.0) / d;
-        let in_world = keyframe.map_from_keyframe * in_keyframe;
-        Some(CloudPoint {
-            position: [in_world.x as f32, in_world.y as f32, in_world.z as f32],
-            intensity: point.intensity,
-            variance: point.variance,
-            keyframe_id: keyframe.keyframe_id as u32,
-        })
-    })
-}
-
-/// Writes the cloud.
-pub fn write_ply(path: &Path, cloud: &[CloudPoint]) -> io::Result<()> {
+/// Writes the surface of the map so that most programs open it.
+pub fn write_surface(path: &Path, surface: &[SurfacePoint]) -> io::Result<()> {
     write_atomically(path, |file| {
         write!(
             file,
-            "ply\nformat binary_little_endian 1.0\n\
-             comment x y z in map units, variance of the inverse depth in keyframe units\n\
-             element vertex {}\n\
-             property float x\nproperty float y\nproperty float z\n\
-             property float intensity\nproperty float variance\nproperty uint keyframe\n\
-             end_header\n",
-            cloud.len()
+            "{BEGINNING} along the ray in map units, keyframes that agree; normal 0 0 0: not known\n\
+             comment any beginning of the list shows all of the map\n\
+             element vertex {}\n{PROPERTIES}",
+            surface.len()
         )?;
-        for point in cloud {
-            for number in point.position.iter().chain([&point.intensity, &point.variance]) {
-                file.write_all(&number.to_le_bytes())?;
-            }
-            file.write_all(&point.keyframe_id.to_le_bytes())?;
-        }
-        Ok(())
+        surface.iter().try_for_each(|point| file.write_all(&bytes_of(point)))
     })
+}
+
+/// Why a surface cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub enum ReadSurfaceError {
+    /// The file cannot be read, or ends too early.
+    #[error("{path}: {source}; the map's points cannot be read")]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+    /// It is another file.
+    #[error("{0} is no map.ply of this version of semidense: write it again")]
+    Foreign(PathBuf),
+}
+
+/// The first points of a `map.ply`, at most `most` of them: they show all of the map, coarser the fewer they are. Points
+/// that are not finite are left out.
+pub fn read_surface(path: &Path, most: usize) -> Result<Vec<SurfacePoint>, ReadSurfaceError> {
+    let failed = |source| ReadSurfaceError::Read { path: path.to_owned(), source };
+    let mut file = BufReader::new(File::open(path).map_err(failed)?);
+    let count = read_header(&mut file).map_err(failed)?;
+    let count = count.ok_or_else(|| ReadSurfaceError::Foreign(path.to_owned()))?.min(most);
+    let mut points = Vec::new();
+    let mut bytes = [0; SURFACE_POINT_BYTES];
+    for _ in 0..count {
+        file.read_exact(&mut bytes).map_err(failed)?;
+        points.extend(point_of(&bytes));
+    }
+    Ok(points)
+}
+
+/// How many points follow; `None` of another file.
+fn read_header(file: &mut impl BufRead) -> io::Result<Option<usize>> {
+    /// No header of ours is longer.
+    const LONGEST: usize = 1000;
+    const END: &[u8] = b"\nend_header\n";
+    let mut header = Vec::new();
+    let mut file = file.take(LONGEST as u64);
+    while !header.ends_with(END) && file.read_until(b'\n', &mut header)? > 0 {}
+    let header = String::from_utf8(header).unwrap_or_default();
+    let count = header
+        .strip_suffix(PROPERTIES)
+        .filter(|header| header.starts_with(BEGINNING))
+        .and_then(|header| header.trim_end().rsplit_once("element vertex "))
+        .and_then(|(_, count)| count.parse().ok());
+    Ok(count)
+}
+
+fn bytes_of(point: &SurfacePoint) -> [u8; SURFACE_POINT_BYTES] {
+    let mut bytes = [0; SURFACE_POINT_BYTES];
+    for (i, number) in point.position.iter().chain(&point.normal).enumerate() {
+        bytes[4 * i..][..4].copy_from_slice(&number.to_le_bytes());
+    }
+    bytes[24..27].fill(point.grey);
+    bytes[27..31].copy_from_slice(&point.sigma.to_le_bytes());
+    bytes[31] = point.keyframes;
+    bytes
+}
+
+fn point_of(bytes: &[u8; SURFACE_POINT_BYTES]) -> Option<SurfacePoint> {
+    let number =
+        |at: usize| f32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]);
+    let point = SurfacePoint {
+        position: [number(0), number(4), number(8)],
+        normal: [number(12), number(16), number(20)],
+        grey: bytes[24],
+        sigma: number(27),
+        keyframes: bytes[31],
+    };
+    let numbers = || point.position.iter().chain(&point.normal).chain([&point.sigma]);
+    numbers().all(|number| number.is_finite()).then_some(point)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_surface_is_read_as_it_was_written_and_a_short_or_foreign_file_is_refused() {
+        let point = |i: u8| SurfacePoint {
+            position: [f32::from(i), 0.5, -1.25],
+            normal: [0.0, f32::from(i % 2), 0.0],
+            grey: i,
+            sigma: 0.25,
+            keyframes: 255 - i,
+        };
+        let points: Vec<SurfacePoint> = (0..100).map(point).collect();
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("map.ply");
+        write_surface(&path, &points).unwrap();
+        assert_eq!(read_surface(&path, usize::MAX).unwrap(), points);
+        assert_eq!(read_surface(&path, 7).unwrap(), points[..7]);
+        let whole = std::fs::read(&path).unwrap();
+        std::fs::write(&path, &whole[..whole.len() - 1]).unwrap();
+        assert!(matches!(read_surface(&path, 100), Err(ReadSurfaceError::Read { .. })));
+        assert_eq!(read_surface(&path, 99).unwrap().len(), 99);
+        for foreign in [&b""[..], b"ply\nformat ascii 1.0\n", &[b'x'; 5000], &whole[40..]] {
+            std::fs::write(&path, foreign).unwrap();
+            assert!(matches!(read_surface(&path, 9), Err(ReadSurfaceError::Foreign(_))));
+        }
+        let mut hostile = points.clone();
+        (hostile[3].position[1], hostile[4].sigma) = (f32::NAN, f32::INFINITY);
+        write_surface(&path, &hostile).unwrap();
+        assert_eq!(read_surface(&path, usize::MAX).unwrap().len(), 98);
+    }
 }

@@ -12,6 +12,7 @@ use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::evaluation::normalized_error::{
     NormalizedErrors, map_normalized_errors, normalized_errors,
 };
+use crate::slam::evaluation::velocity_error::velocity_normalized_errors;
 use crate::slam::map::Map;
 use crate::slam::pose::PoseEstimate;
 use crate::slam::trajectory::StampedPose;
@@ -96,14 +97,14 @@ pub fn online_trajectory(record: &RunRecord, epoch: Option<u32>) -> Vec<StampedP
         .collect()
 }
 
-/// Errors of the tracked frames of one epoch against their covariance, on their keyframes and in the map; `None` without
-/// ground truth or where it was given.
+/// Errors of the tracked frames of one epoch against their covariance, on their keyframes, in the map and of their
+/// velocities; `None` without ground truth or where it was given.
 pub fn normalized_errors_of(
     record: &RunRecord,
     epoch: Option<u32>,
-) -> [Option<NormalizedErrors>; 2] {
+) -> [Option<NormalizedErrors>; 3] {
     if record.depth_scale == DepthScale::Given {
-        return [None, None];
+        return [None; 3];
     }
     let in_epoch = |of: u32| epoch.is_none_or(|epoch| of == epoch);
     let estimates = record.poses.iter().map(|pose| &pose.estimate);
@@ -115,6 +116,7 @@ pub fn normalized_errors_of(
     [
         normalized_errors(&tracked, &stamps, truth, MAX_DIFFERENCE_NANOS),
         map_normalized_errors(&tracked, truth, MAX_DIFFERENCE_NANOS),
+        velocity_normalized_errors(&tracked, &stamps, truth, MAX_DIFFERENCE_NANOS),
     ]
 }
 

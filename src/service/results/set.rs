@@ -12,17 +12,21 @@ use std::time::SystemTime;
 
 use rustix::fs::FlockOperation;
 
+use crate::service::results::{full_points, pcd};
+
 /// Files of every set, with what each begins with: a file of that name that begins otherwise is the user's.
-const FILES: [(&str, &str); 8] = [
+const FILES: [(&str, &str); 7] = [
     ("summary.json", "{\n  \"mode\": \""),
     ("trajectory.txt", "# world_from_camera of every tracked frame"),
     ("trajectory_online.txt", "# world_from_camera of every tracked frame"),
     ("keyframes.txt", "# world_from_keyframe; lengths in the keyframe"),
     ("map.ply", "ply\nformat binary_little_endian 1.0\ncomment x y z in map units"),
     ("points.ply", "ply\nformat binary_little_endian 1.0\ncomment points of the joint estimation"),
-    ("map.pcd", "# .PCD v0.7 - x y z in map units"),
     ("report.html", "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">"),
 ];
+/// Files of sets for which they were asked, likewise.
+const ON_REQUEST: [(&str, &str); 2] =
+    [("map.pcd", pcd::BEGINNING), ("points-full.ply", full_points::BEGINNING)];
 /// The file that is moved up first: as long as it is still aside, the files of the set before are in place.
 const FIRST: &str = FILES[0].0;
 /// Folder of pictures for whoever works on the algorithms, in sets that have them.
@@ -90,7 +94,7 @@ pub fn finish_commit(output: &Path) -> io::Result<bool> {
 
 /// The first file in `output` that a set would replace and that no run has written.
 pub fn foreign_file(output: &Path) -> io::Result<Option<PathBuf>> {
-    for (name, beginning) in FILES {
+    for (name, beginning) in FILES.into_iter().chain(ON_REQUEST) {
         let path = output.join(name);
         if fs::symlink_metadata(&path).is_ok() && !begins_with(&path, beginning)? {
             return Ok(Some(path));
@@ -152,6 +156,7 @@ fn move_up(output: &Path) -> io::Result<()> {
     }
     if complete.join(FIRST).exists() {
         remove_debug_pictures(output)?;
+        remove_on_request(output)?;
         fs::rename(complete.join(FIRST), output.join(FIRST))?;
     }
     move_files(&complete, output)?;
@@ -198,6 +203,17 @@ fn remove_debug_pictures(output: &Path) -> io::Result<()> {
     }
     // A folder that holds something of the user's stays.
     drop(fs::remove_dir(debug));
+    Ok(())
+}
+
+/// Removes what the set before had on request: the new one need not have it.
+fn remove_on_request(output: &Path) -> io::Result<()> {
+    for (name, beginning) in ON_REQUEST {
+        let path = output.join(name);
+        if fs::symlink_metadata(&path).is_ok() && begins_with(&path, beginning)? {
+            fs::remove_file(&path)?;
+        }
+    }
     Ok(())
 }
 
@@ -249,6 +265,10 @@ mod tests {
     /// Writes a set whose files all end in `text`, with so many pictures.
     fn write(set: &ResultSet, text: &str, pictures: usize) {
         for (name, beginning) in FILES {
+            fs::write(set.folder().join(name), format!("{beginning}{text}")).unwrap();
+        }
+        // Whoever asks for pictures asks for the other files too.
+        for (name, beginning) in ON_REQUEST.into_iter().filter(|_| pictures > 0) {
             fs::write(set.folder().join(name), format!("{beginning}{text}")).unwrap();
         }
         let debug = set.folder().join(DEBUG_FOLDER);
@@ -305,8 +325,13 @@ mod tests {
         assert!(names.contains(&"debug/mine.png") && names.contains(&"notes.txt"));
         assert!(!names.iter().any(|name| name.starts_with('.')), "{names:?}");
         fs::remove_file(output.join("debug/mine.png")).unwrap();
+        assert!(names.contains(&"map.pcd") && names.contains(&"points-full.ply"));
         commit(output, "third", 0);
         assert!(!output.join("debug").exists());
+        assert!(
+            ON_REQUEST.iter().all(|(name, _)| !output.join(name).exists()),
+            "of the second set"
+        );
     }
 
     #[test]
@@ -333,6 +358,7 @@ mod tests {
             // The process dies when it has moved so many files.
             if moved > 0 {
                 remove_debug_pictures(output).unwrap();
+                remove_on_request(output).unwrap();
             }
             for (name, _) in &FILES[..moved] {
                 fs::rename(output.join(COMPLETE).join(name), output.join(name)).unwrap();
@@ -340,7 +366,7 @@ mod tests {
             assert!(finish_commit(output).unwrap());
             let found = content(output);
             assert!(all_of(&found, "second"), "after {moved} files: {found:?}");
-            assert_eq!(found.len(), FILES.len() + 2, "{found:?}");
+            assert_eq!(found.len(), FILES.len() + ON_REQUEST.len() + 2, "{found:?}");
             assert!(!finish_commit(output).unwrap());
         }
     }

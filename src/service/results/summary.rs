@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::{Deserialize, Serialize};
 
+use crate::service::results::PointCounts;
 use crate::service::results::alignment_levels::{LevelSummary, alignment_levels};
 use crate::service::results::budget_curve::BudgetCurve;
 use crate::service::results::calibration::whitened_residual_median;
@@ -230,8 +231,12 @@ pub struct Summary {
     pub keyframes: u64,
     /// Of them those whose depth is not held: the oldest of a long run, or what a recovery could not find.
     pub keyframes_without_depth: u64,
-    /// Points of `map.ply`.
+    /// Points of all keyframes that are known well enough.
     pub points: u64,
+    /// Points of `map.ply`: the surface that they are fused to, of `evaluated_epoch`.
+    pub map_points: u64,
+    /// Time that it took to fuse them.
+    pub fusion_secs: f64,
     /// Life of the map at the end, from 0.
     pub epoch: u32,
     /// Epochs with tracked frames.
@@ -298,6 +303,8 @@ pub struct Summary {
     pub nees: NeesSummary,
     /// The same of their places in the map, as they were published.
     pub map_nees: NeesSummary,
+    /// The same of their velocities.
+    pub velocity_nees: NeesSummary,
     /// Depth of the keyframes against ground truth.
     #[serde(flatten)]
     pub depth: DepthSummary,
@@ -319,14 +326,14 @@ impl From<&Rejection> for RejectionSummary {
 }
 
 impl Summary {
-    /// The figures of `record`, with `points` in the cloud and what the evaluations gave: `nees` on keyframes and in the
-    /// map.
+    /// The figures of `record`, with so many `points` and what the evaluations gave: `nees` on keyframes, in the map and
+    /// of velocities.
     pub fn new(
         record: &RunRecord,
-        points: usize,
+        points: PointCounts,
         trajectory: Option<&TrajectoryEvaluation>,
         online: Option<&TrajectoryEvaluation>,
-        nees: [Option<NormalizedErrors>; 2],
+        nees: [Option<NormalizedErrors>; 3],
         depth: DepthEvaluation,
     ) -> Self {
         let (recorded_secs, wall_secs) =
@@ -358,7 +365,9 @@ impl Summary {
             untracked: Untracked::of(record).map(|why| why.to_string()),
             keyframes: record.map.keyframes.len() as u64,
             keyframes_without_depth: without_depth(&record.map),
-            points: points as u64,
+            points: points.points as u64,
+            map_points: points.map_points as u64,
+            fusion_secs: points.fusion_secs,
             epoch: record.poses.last().map_or(0, |pose| pose.estimate.epoch),
             epochs: count_epochs(&record.poses),
             evaluated_epoch: trajectory.and_then(|_| longest_epoch(record)),
@@ -388,6 +397,7 @@ impl Summary {
             online: online.map(TrajectorySummary::from).unwrap_or_default(),
             nees: nees[0].as_ref().map(NeesSummary::from).unwrap_or_default(),
             map_nees: nees[1].as_ref().map(NeesSummary::from).unwrap_or_default(),
+            velocity_nees: nees[2].as_ref().map(NeesSummary::from).unwrap_or_default(),
             depth: depth.into(),
         }
     }

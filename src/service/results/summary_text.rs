@@ -22,13 +22,14 @@ pub fn summary_text(summary: &Summary) -> String {
     line(
         "map",
         format!(
-            "{} keyframes{}, {} points, epoch {}",
+            "{} keyframes{}, {} points fused to {}, epoch {}",
             summary.keyframes,
             match summary.keyframes_without_depth {
                 0 => String::new(),
                 count => format!(" ({count} without depth)"),
             },
             summary.points,
+            summary.map_points,
             summary.epoch
         ),
     );

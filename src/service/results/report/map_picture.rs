@@ -3,9 +3,9 @@
 use nalgebra::Vector3;
 
 use crate::service::results::colour::{Picture, Rgb, rainbow};
-use crate::service::results::ply::CloudPoint;
 use crate::service::results::report::views::Views;
 use crate::slam::evaluation::statistics::percentile;
+use crate::slam::fusion::SurfacePoint;
 use crate::slam::trajectory::StampedPose;
 
 /// Width of the picture, pixels: sharp on a page twice as dense as its layout.
@@ -24,9 +24,9 @@ const GROUND: Rgb = [16, 20, 27];
 const WAY: Rgb = [255, 255, 255];
 
 /// Points and way from above, coloured by height (blue low, red high); `None` without points.
-pub fn map_picture(cloud: &[CloudPoint], way: &[StampedPose]) -> Option<Picture> {
+pub fn map_picture(cloud: &[SurfacePoint], way: &[StampedPose]) -> Option<Picture> {
     let views = Views::of(way);
-    let position = |point: &CloudPoint| Vector3::from(point.position.map(f64::from));
+    let position = |point: &SurfacePoint| Vector3::from(point.position.map(f64::from));
     let flat: Vec<[f64; 3]> = cloud
         .iter()
         .map(position)
@@ -123,13 +123,13 @@ mod tests {
     use super::*;
     use crate::slam::geometry::se3::SE3;
 
-    fn point(x: f32, y: f32, z: f32) -> CloudPoint {
-        CloudPoint { position: [x, y, z], intensity: 0.0, variance: 0.0, keyframe_id: 0 }
+    fn point(x: f32, y: f32, z: f32) -> SurfacePoint {
+        SurfacePoint { position: [x, y, z], ..SurfacePoint::default() }
     }
 
     #[test]
     fn points_and_way_are_seen_and_outliers_do_not_shrink_them() {
-        let mut cloud: Vec<CloudPoint> = (0..5000)
+        let mut cloud: Vec<SurfacePoint> = (0..5000)
             .map(|i| point((i % 100) as f32, (i / 500) as f32, (i / 100) as f32))
             .collect();
         cloud.extend([point(1e9, 0.0, 0.0), point(f32::NAN, 0.0, 0.0)]);

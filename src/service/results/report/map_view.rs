@@ -2,16 +2,13 @@
 
 use std::fmt::Write;
 
-use nalgebra::Vector3;
-
-use crate::service::results::ply::CloudPoint;
 use crate::service::results::poses::longest_epoch;
 use crate::service::results::report::html::base64;
 use crate::service::results::report::scene::{
     PLAYER, SceneInput, SceneKeyframe, ScenePoint, VIEWER, pack,
 };
 use crate::service::results::report::{ReportInput, grouped};
-use crate::slam::map::Map;
+use crate::slam::fusion::SurfacePoint;
 
 /// Most points of the map in a report: 3.2 MB of text, which a browser opens at once.
 const MAX_POINTS: usize = 300_000;
@@ -19,7 +16,7 @@ const MAX_POINTS: usize = 300_000;
 /// The section; nothing without points.
 pub fn map_view(input: &ReportInput<'_>) -> String {
     let map = &input.record.map;
-    let Some(first) = map.keyframes.first().filter(|_| !input.cloud.is_empty()) else {
+    let Some(first) = map.keyframes.first().filter(|_| !input.surface.is_empty()) else {
         return String::new();
     };
     // Each epoch has a place and a unit of its own.
@@ -34,7 +31,7 @@ pub fn map_view(input: &ReportInput<'_>) -> String {
             place: k.map_from_keyframe,
         })
         .collect();
-    let points = scene_points(map, input.cloud);
+    let points = scene_points(input.surface);
     let block = pack(&SceneInput {
         points: &points,
         keyframes: &keyframes,
@@ -62,26 +59,13 @@ pub fn map_view(input: &ReportInput<'_>) -> String {
     html
 }
 
-/// The points of the cloud for the view.
-fn scene_points(map: &Map, cloud: &[CloudPoint]) -> Vec<ScenePoint> {
-    let mut of = None;
-    cloud
-        .iter()
-        .map(|point| {
-            let keyframe_id = u64::from(point.keyframe_id);
-            if of.is_none_or(|(id, _)| id != keyframe_id) {
-                of = map.get(keyframe_id).map(|k| (keyframe_id, k.map_from_keyframe));
-            }
-            let std_dev = of.map_or(f64::NAN, |(_, place)| {
-                let depth = (place.inverse() * Vector3::from(point.position.map(f64::from))).z;
-                place.scale * f64::from(point.variance).sqrt() * depth * depth
-            });
-            ScenePoint {
-                position: point.position,
-                grey: point.intensity.clamp(0.0, 255.0) as u8,
-                std_dev: std_dev as f32,
-                keyframe_id: Some(keyframe_id),
-            }
-        })
-        .collect()
+/// The points of the map's surface for the view; each is of the first keyframe that saw it.
+fn scene_points(surface: &[SurfacePoint]) -> Vec<ScenePoint> {
+    let scene_point = |point: &SurfacePoint| ScenePoint {
+        position: point.position,
+        grey: point.grey,
+        std_dev: point.sigma,
+        keyframe_id: None,
+    };
+    surface.iter().map(scene_point).collect()
 }

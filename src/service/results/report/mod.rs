@@ -22,7 +22,6 @@ use crate::service::results::output_folder::utc_text;
 use crate::service::results::pictures::{
     RELATIVE_STD_DEV_RANGE, density_picture, inverse_depth_picture, variance_picture,
 };
-use crate::service::results::ply::CloudPoint;
 use crate::service::results::report::budget_charts::budget_charts;
 use crate::service::results::report::chart::Chart;
 use crate::service::results::report::charts::{
@@ -38,6 +37,7 @@ use crate::service::results::report::map_view::map_view;
 use crate::service::results::summary::Summary;
 use crate::service::results::{EndOfRun, RunMode, RunRecord};
 use crate::slam::evaluation::TrajectoryEvaluation;
+use crate::slam::fusion::SurfacePoint;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::pose::TrackingState;
 use crate::slam::trajectory::StampedPose;
@@ -60,8 +60,8 @@ pub struct ReportInput<'a> {
     pub evaluation: Option<&'a TrajectoryEvaluation>,
     /// The published one against ground truth.
     pub online_evaluation: Option<&'a TrajectoryEvaluation>,
-    /// The map's points.
-    pub cloud: &'a [CloudPoint],
+    /// The map's surface: any beginning shows all of it.
+    pub surface: &'a [SurfacePoint],
     /// Largest σ/d of points that are shown.
     pub max_relative_std_dev: f64,
 }
@@ -136,14 +136,14 @@ fn end_notice(ended: &EndOfRun) -> String {
 
 /// The map from above; nothing without points.
 fn map(input: &ReportInput<'_>) -> String {
-    let picture = map_picture(input.cloud, input.trajectory);
+    let picture = map_picture(input.surface, input.trajectory);
     let Some(png) = picture.and_then(|picture| picture.png()) else { return String::new() };
     format!(
         "<section><h2>Map</h2><figure><img alt=\"map from above\" src=\"{}\"><figcaption>{} points \
          from above, <span class=\"scale near-far\"></span> low to high; the camera's path in \
          white.</figcaption></figure></section>",
         png_address(&png),
-        grouped(input.cloud.len() as u64)
+        grouped(input.surface.len() as u64)
     )
 }
 

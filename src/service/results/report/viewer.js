@@ -572,8 +572,8 @@ const Viewer = (() => {
       if (!camera || !camera.covariance) return;
       const l = cholesky(camera.covariance), largest = Math.max(l[0], Math.hypot(l[1], l[3]), Math.hypot(l[2], l[4], l[5]));
       if (!(largest > 0) || !Number.isFinite(largest)) return;
-      // At least a hundredth of the view: by a power of ten, which the legend says.
-      this.exaggeration = Math.max(1, 10 ** Math.ceil(Math.log10(this.eye.distance / 100 / largest)));
+      // At least a 200th of the view: by a power of ten, which the legend says.
+      this.exaggeration = Math.max(1, 10 ** Math.ceil(Math.log10(this.eye.distance / 200 / largest)));
       const k = this.exaggeration, e = 1e-4 * largest * k;
       const gl = this.gl, { p, u } = this.balls;
       gl.useProgram(p);

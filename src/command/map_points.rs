@@ -1,0 +1,35 @@
+//! Options of the commands that write a map's points.
+
+use clap::Args;
+
+use crate::service::results::ResultsParams;
+use crate::slam::fusion::MapResolution;
+
+/// How a map's points are written.
+#[derive(Debug, Clone, Args)]
+pub struct MapPointOptions {
+    /// Distance between the points of map.ply: a length in map units (0.02), or a share of the distance from the camera
+    /// (0.5%), so that near surfaces are finer; nowhere below the points' standard deviation
+    /// [default: results.map_resolution of the configuration, which is 0.5%]
+    #[arg(long, value_name = "LENGTH|SHARE%")]
+    map_resolution: Option<MapResolution>,
+    /// Write map.pcd too: the points of map.ply for PCL
+    #[arg(long)]
+    pcd: bool,
+    /// Write points-full.ply too: every point of every keyframe, before they are fused to one surface (about 25 MB for
+    /// each million)
+    #[arg(long)]
+    full_points: bool,
+}
+
+impl MapPointOptions {
+    /// What the configuration says, with what the command line says.
+    pub fn of(&self, configured: &ResultsParams) -> ResultsParams {
+        ResultsParams {
+            map_resolution: self.map_resolution.unwrap_or(configured.map_resolution),
+            pcd: self.pcd || configured.pcd,
+            full_points: self.full_points || configured.full_points,
+            ..configured.clone()
+        }
+    }
+}

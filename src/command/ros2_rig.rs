@@ -1,0 +1,68 @@
+//! The rig of a ROS 2 camera where none is named: what its CameraInfo says, fetched by `semidense-bridge`.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use crate::command::bridge::program;
+use crate::command::print::note;
+use crate::service::shutdown::Shutdown;
+use crate::wire::port::{WaitError, wait};
+
+/// Time between two looks for its end.
+const POLL_PERIOD: Duration = Duration::from_millis(50);
+
+/// Why there is no rig.
+#[derive(Debug, thiserror::Error)]
+pub enum Ros2RigError {
+    /// There is no bridge.
+    #[error("ros2:{0} is read by semidense-bridge: install the package semidense-bridge")]
+    NoBridge(String),
+    /// It cannot be started or waited for.
+    #[error("{}: {source}", program.display())]
+    Program {
+        /// The program.
+        program: PathBuf,
+        /// What the system says.
+        source: std::io::Error,
+    },
+    /// It failed, and has said why.
+    #[error("ros2:{0}: the camera's calibration is not known; name it with --rig FILE")]
+    Failed(String),
+    /// Waiting failed.
+    #[error(transparent)]
+    Wait(#[from] WaitError),
+    /// A signal came first.
+    #[error("interrupted")]
+    Interrupted,
+}
+
+/// Waits for the CameraInfo beside `topic` and writes a rig file of it into `folder`.
+pub fn fetch(topic: &str, folder: &Path, shutdown: &Shutdown) -> Result<PathBuf, Ros2RigError> {
+    let own = std::env::current_exe().unwrap_or_default();
+    let program = program(&own).ok_or_else(|| Ros2RigError::NoBridge(topic.to_owned()))?;
+    let path = folder.join("rig.toml");
+    let failed = |source| Ros2RigError::Program { program: program.clone(), source };
+    let mut child = Command::new(&program)
+        .args(["ros2-camera", topic, "--write-rig"])
+        .arg(&path)
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .spawn()
+        .map_err(failed)?;
+    let status = loop {
+        if let Some(status) = child.try_wait().map_err(failed)? {
+            break status;
+        }
+        if shutdown.is_requested() {
+            child.kill().and_then(|()| child.wait()).map_err(failed)?;
+            return Err(Ros2RigError::Interrupted);
+        }
+        wait(&[], Some(shutdown.descriptor()), POLL_PERIOD)?;
+    };
+    if !status.success() {
+        return Err(Ros2RigError::Failed(topic.to_owned()));
+    }
+    note(&format!("no rig was named: the camera's is of its CameraInfo, {}", path.display()));
+    Ok(path)
+}
