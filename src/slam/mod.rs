@@ -26,5 +26,4 @@ pub mod test_scene;
 pub mod tracker;
 pub mod trajectory;
 pub mod two_frame;
-pub mod up_direction;
 pub mod window;

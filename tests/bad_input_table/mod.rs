@@ -88,7 +88,7 @@ const SOURCES: &[Row] = &[
         &["ffmpeg -i 'walk.mp4'", "times.txt"],
     ),
     row("an archive", "touch a.zip", "semidense replay a.zip", 1, &["unpack it"]),
-    row("a ROS bag", "touch a.bag", "semidense replay a.bag", 1, &["export its images"]),
+    row("a ROS bag", "touch a.bag", "semidense replay a.bag", 1, &["convert it to MCAP"]),
     row(
         "a list in place of its folder",
         "",
