@@ -18,7 +18,7 @@ const ALLOWED: &[&str] = &[
     "Unicode-3.0",
     "BSL-1.0",
     "MIT-0",
-    // The JPEG encoder's tables; the notice is in the bridge's documentation.
+    // The JPEG encoder's tables; the notice is at the end of docs/recording.md.
     "IJG",
 ];
 
