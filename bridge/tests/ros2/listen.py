@@ -1,7 +1,7 @@
 """Reads a robot's topics with Cyclone DDS and writes what came: listen.py DOMAIN NAMESPACE FOLDER NUM_POSES.
 
 Ends when as many poses have come and one of everything else, or after a minute. `poses.json` has the small messages,
-`cloud.bin` and `image.bin` the bytes of the last cloud and image. With --latency, how old odometry is when it comes.
+`cloud.bin` and `image.bin` the bytes of the last cloud and image.
 """
 
 import json
@@ -82,7 +82,6 @@ def main():
         "nodes": reader(participant, "ros_discovery_info", m.ParticipantEntitiesInfo, RELIABLE, 10, LATE),
     }
     came = {name: [] for name in readers}
-    ages = []
     begin = time.monotonic()
     optional = {"cloud_reliable"}
     while time.monotonic() - begin < LONGEST_S:
@@ -91,8 +90,6 @@ def main():
                 if hasattr(message, "sample_info") and not message.sample_info.valid_data:
                     continue
                 came[name].append(message)
-                if name == "odometry":
-                    ages.append(time.clock_gettime_ns(time.CLOCK_REALTIME) - header(message)["stamp"])
         is_whole = all(came[name] or name in optional for name in readers)
         if is_whole and len(came["odometry"]) >= num_poses:
             break
@@ -118,7 +115,6 @@ def main():
             for message in came["nodes"]
             for node in message.node_entities_info_seq
         ],
-        "ages": ages,
     }
     for message in came["cloud"][-1:]:
         fields = [[one.name, one.offset, one.datatype, one.count] for one in message.fields]
