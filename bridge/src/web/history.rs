@@ -1,5 +1,5 @@
-//! Keyframes that pages have not seen, or have in an older revision: the mapper is asked for them, a few a second, while a
-//! page is open.
+//! Keyframes that pages have not seen, about ten a second, or have in an older revision, one a second: the mapper is asked
+//! for them while a page is open.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -19,6 +19,8 @@ use crate::web::scene::Scene;
 
 /// Pause between two keyframes: each costs the mapper a copy of up to 2 MB, about a millisecond.
 const REQUEST_PAUSE: Duration = Duration::from_millis(60);
+/// Pause behind a new revision: a correction of the map is one of all its keyframes.
+const REVISION_PAUSE: Duration = Duration::from_secs(1);
 /// Pause where nothing is missing or nobody looks.
 const IDLE_PAUSE: Duration = Duration::from_millis(300);
 /// Pause after a failure: another reader has the place, or the run has just ended.
@@ -30,9 +32,11 @@ const LONGEST_ANSWER: Duration = Duration::from_secs(2);
 pub fn follow(place: &Place, scene: &Arc<Scene>, is_over: &AtomicBool) {
     let mut asking: Option<(u64, Asking)> = None;
     while !is_over.load(Ordering::Relaxed) {
-        let (run, is_joined, wanted) = {
+        let (run, is_joined, wanted, is_known) = {
             let state = scene.lock();
-            (state.run, state.is_joined, state.missing().first().copied())
+            let wanted = state.missing().first().copied();
+            let is_known = wanted.is_some_and(|id| state.keyframes.contains_key(&id));
+            (state.run, state.is_joined, wanted, is_known)
         };
         if !is_joined || asking.as_ref().is_some_and(|(of, _)| *of != run) {
             asking = None;
@@ -74,7 +78,7 @@ pub fn follow(place: &Place, scene: &Arc<Scene>, is_over: &AtomicBool) {
                 std::thread::sleep(FAILURE_PAUSE);
             }
         }
-        std::thread::sleep(REQUEST_PAUSE);
+        std::thread::sleep(if is_known { REVISION_PAUSE } else { REQUEST_PAUSE });
     }
 }
 

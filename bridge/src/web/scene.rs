@@ -234,23 +234,22 @@ impl State {
         bytes
     }
 
-    /// Keyframes whose depth the map has in another revision than pages: those that were not seen at all first.
+    /// Keyframes whose depth the map has in another revision than pages: those that were not seen at all first, the newest
+    /// of them first, which the camera sees; then those that are furthest behind.
     pub fn missing(&self) -> Vec<u64> {
-        let mut missing: Vec<(bool, u64)> = self
+        let mut missing: Vec<(u64, u64)> = self
             .places
             .values()
             .map(|(_, pose)| pose)
             .filter(|pose| Some(pose.keyframe_id) != self.active_id)
             .filter(|pose| !self.refused.contains(&(pose.keyframe_id, pose.revision)))
             .filter_map(|pose| match self.keyframes.get(&pose.keyframe_id) {
-                None => Some((false, pose.keyframe_id)),
-                Some(packed) => {
-                    (packed.revision < pose.revision).then_some((true, pose.keyframe_id))
-                }
+                None => Some((0, pose.keyframe_id)),
+                Some(packed) => (packed.revision < pose.revision)
+                    .then_some((packed.revision.max(1), pose.keyframe_id)),
             })
             .collect();
-        // The newest first: they are what the camera sees.
-        missing.sort_by_key(|&(is_known, id)| (is_known, std::cmp::Reverse(id)));
+        missing.sort_by_key(|&(revision, id)| (revision, std::cmp::Reverse(id)));
         missing.into_iter().map(|(_, id)| id).collect()
     }
 

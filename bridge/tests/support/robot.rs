@@ -153,6 +153,10 @@ fn pose(number: u64, sequence: u64, now: i64) -> PoseMessage {
         *entry = next();
     }
     message.inlier_ratio = next();
+    message.has_velocity = 1;
+    message.linear_velocity = [next(), next(), next()];
+    message.angular_velocity = [next(), next(), next()];
+    message.velocity_covariance.iter_mut().for_each(|entry| *entry = next());
     message.points = sequence as u32;
     message
 }

@@ -11,8 +11,8 @@ const Viewer = (() => {
   const SMALLEST_BUDGET = 50000, LARGEST_BUDGET = 4000000, FIRST_BUDGET = 400000;
   // Time of a frame in ms above which less is drawn, and below which more.
   const SLOW_MS = 30, FAST_MS = 19;
-  // A view that does not move may take longer: this many budgets, once.
-  const STILL_BUDGETS = 4, STILL_AFTER_MS = 250;
+  // A view that does not move is drawn once more with more points, as many as take this long, at most so many budgets.
+  const STILL_MS = 300, STILL_BUDGETS = 8, STILL_AFTER_MS = 250;
   const POINT_BYTES = 8, SEGMENT_BYTES = 32;
   const STATE_COLOURS = { 1: [64, 156, 255], 2: [255, 176, 32], 3: [235, 70, 70], 0: [150, 150, 160] };
 
@@ -212,7 +212,7 @@ const Viewer = (() => {
       this.options = Object.assign({ colour: "brightness", view: "orbit", maxSigma: 1, dark: true, keyframes: true, grid: true }, options);
       this.clusters = new Map(); this.places = new Map(); this.path = []; this.camera = null; this.active = null; this.epoch = null;
       this.up = [0, -1, 0]; this.upIsGiven = false; this.time = Infinity; this.visiblePath = 0;
-      this.budget = FIRST_BUDGET; this.drawn = 0; this.frames = 0; this.fps = 0; this.lastFrame = 0; this.lastChange = 0; this.isStill = false;
+      this.budget = FIRST_BUDGET; this.drawn = 0; this.frames = 0; this.fps = 0; this.lastChange = 0; this.hasDrawn = false; this.isStill = false;
       this.eye = { yaw: 0.6, pitch: 0.55, distance: 4, target: [0, 0, 0] }; this.isFitted = false; this.isTouched = false;
       this.exaggeration = 1; this.fovy = 0.9; this.dirty = true; this.linesDirty = true; this.onFrame = null; this.matrices = null;
       this.start();
@@ -220,7 +220,13 @@ const Viewer = (() => {
       canvas.addEventListener("webglcontextrestored", () => this.start());
       new ResizeObserver(() => this.touch()).observe(canvas);
       this.listen();
-      const loop = (now) => { this.tick(now); requestAnimationFrame(loop); };
+      // What a frame takes shows in when the next one may begin.
+      let before = 0;
+      const loop = (now) => {
+        if (this.hasDrawn) this.adapt(now - before);
+        before = now; this.hasDrawn = false;
+        this.tick(now); requestAnimationFrame(loop);
+      };
       requestAnimationFrame(loop);
     }
 
@@ -431,27 +437,28 @@ const Viewer = (() => {
 
     // ---- a frame --------------------------------------------------------------------------------------------------
     tick(now) {
-      const since = now - this.lastFrame;
       // Nobody sees it.
       if (!this.gl || !this.canvas.clientWidth) return;
       if (!this.dirty) {
         if (this.isStill || now - this.lastChange < STILL_AFTER_MS) return;
         this.isStill = true;
-        this.draw(this.budget * STILL_BUDGETS);
-        this.lastFrame = 0;
+        this.draw(this.budget * Math.max(1, Math.min(STILL_BUDGETS, STILL_MS / (this.slowness || STILL_MS))));
         return;
       }
-      this.dirty = false;
+      this.dirty = false; this.hasDrawn = true;
       this.draw(this.budget);
-      if (this.lastFrame && since < 500) this.adapt(since);
-      this.lastFrame = now;
       this.frames++;
     }
     adapt(ms) {
+      // A hidden page is no slow one.
+      if (ms > 5000) return;
       this.fps = this.fps ? 0.9 * this.fps + 0.1 * 1000 / ms : 1000 / ms;
-      this.slowness = 0.8 * (this.slowness || 16) + 0.2 * ms;
-      if (this.slowness > SLOW_MS) this.budget = Math.max(SMALLEST_BUDGET, this.budget * 0.9);
-      else if (this.slowness < FAST_MS && this.drawn > 0.9 * this.budget) this.budget = Math.min(LARGEST_BUDGET, this.budget * 1.06);
+      this.slowness = 0.7 * (this.slowness || 16) + 0.3 * ms;
+      const budget = this.budget;
+      if (ms > 4 * SLOW_MS) this.budget *= Math.max(0.4, SLOW_MS / ms);
+      else if (this.slowness > SLOW_MS) this.budget *= 0.9;
+      else if (this.slowness < FAST_MS && this.drawn > 0.9 * budget) this.budget *= 1.06;
+      this.budget = Math.max(SMALLEST_BUDGET, Math.min(LARGEST_BUDGET, this.budget));
     }
     draw(budget) {
       const gl = this.gl, canvas = this.canvas, ratio = Math.min(window.devicePixelRatio || 1, 2);
