@@ -3,7 +3,7 @@
 //! # Rules
 //! * `unsafe` stands in this crate only where a pointer of the caller is read or written, each time with its reason; the
 //!   rest is safe Rust over the readers that every Rust program uses.
-//! * A reader's handle is a number in the table of the thread that opened it ([`table`]), never an address: one that is
+//! * A reader's handle is a number in the table of the thread that opened it (`table`), never an address: one that is
 //!   closed, made up, or of another thread gives an error.
 //! * No function panics across the boundary: a panic becomes `SEMIDENSE_ERROR_INTERNAL`.
 //!

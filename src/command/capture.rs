@@ -28,10 +28,14 @@ pub struct CaptureArguments {
 /// Where frames come from.
 #[derive(Debug, Clone, Args)]
 pub struct SourceArguments {
-    /// Where frames come from: DIR (its layout is detected), sim, sim:SCENE, tum:DIR, euroc:DIR,
-    /// images:DIR, mcap:FILE[:TOPIC], v4l:DEVICE, ros2:TOPIC (images of ROS 2), stream:SOCKET (frames that another program sends), or loop:FRAMES:HZ:SOURCE, which plays another source back and forth, FRAMES frames
-    /// at HZ [default: capture.source of the configuration, which is sim]
-    #[arg(value_name = "SOURCE")]
+    /// Where frames come from.
+    #[arg(
+        value_name = "SOURCE",
+        help = "Where frames come from: DIR (its layout is detected), sim, sim:SCENE, tum:DIR, euroc:DIR, \
+                images:DIR, mcap:FILE[:TOPIC], v4l:DEVICE, ros2:TOPIC (images of ROS 2), stream:SOCKET (frames that \
+                another program sends), or loop:FRAMES:HZ:SOURCE, which plays another source back and forth, FRAMES \
+                frames at HZ [default: capture.source of the configuration, which is sim]"
+    )]
     source: Option<OsString>,
     /// The same as SOURCE, as scripts of earlier versions have it
     #[arg(long = "source", value_name = "SOURCE", hide = true, conflicts_with = "source")]

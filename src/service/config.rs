@@ -71,8 +71,9 @@ pub struct Config {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CaptureConfig {
-    /// Where frames come from when the command line does not say: a folder whose layout is recognised, sim,
-    /// sim:SCENE, tum:DIR, euroc:DIR, images:DIR, mcap:FILE[:TOPIC], v4l:DEVICE, ros2:TOPIC, stream:SOCKET or loop:FRAMES:HZ:SOURCE.
+    /// Where frames come from when the command line does not say: a folder whose layout is recognised, `sim`,
+    /// `sim:SCENE`, `tum:DIR`, `euroc:DIR`, `images:DIR`, `mcap:FILE[:TOPIC]`, `v4l:DEVICE`, `ros2:TOPIC`, `stream:SOCKET`
+    /// or `loop:FRAMES:HZ:SOURCE`.
     pub source: String,
     /// The camera's rig file when `--rig` does not say; empty for none. In a configuration file a path is
     /// relative to that file.

@@ -52,8 +52,12 @@ pub struct ViewArguments {
     /// A name of this machine besides localhost and its IP addresses that pages are opened by; may be repeated
     #[arg(long, value_name = "NAME")]
     host: Vec<String>,
-    /// Another site whose pages may connect, e.g. https://app.foxglove.dev; may be repeated
-    #[arg(long, value_name = "ORIGIN")]
+    /// Another site whose pages may connect.
+    #[arg(
+        long,
+        value_name = "ORIGIN",
+        help = "Another site whose pages may connect, e.g. https://app.foxglove.dev; may be repeated"
+    )]
     allow_origin: Vec<String>,
     /// Most images a second for each page
     #[arg(long, value_name = "HZ", default_value_t = 10.0, value_parser = rate)]
