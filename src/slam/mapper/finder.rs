@@ -37,7 +37,7 @@ fn least_points(camera: &Intrinsics) -> usize {
 #[derive(Debug)]
 pub(super) struct Finder {
     aligner: Aligner,
-    verdict: VerdictParams,
+    pub(super) verdict: VerdictParams,
     reference: Reference,
     pyramid: SumPyramid,
     /// What keyframes look like, by their id, in order.

@@ -265,6 +265,32 @@ mod tests {
     }
 
     #[test]
+    fn the_camera_goes_on_from_a_keyframe_that_disagrees_where_that_is_sure_and_only_there() {
+        // The first keyframe has the camera at 0.1, the tracker at 0.2: more than `max_disagreement`.
+        let drifted = |is_believed: bool| {
+            let mut walk = Walk::new();
+            if !is_believed {
+                // No share of inliers is enough after a loss.
+                walk.mapper.finder.verdict.recovery_margin = 1.0;
+            }
+            walk.step(0.0, 0.0);
+            walk.step(1.2, 1.2);
+            walk.is_exact = false;
+            (walk.step(0.1, 0.2), walk)
+        };
+        let (outcome, walk) = drifted(true);
+        assert!(outcome.keyframe_restored);
+        assert_eq!(walk.mapper.keyframe().unwrap().keyframe_id, 0);
+        // The map keeps its places, and what the drifted keyframe saw is not carried over.
+        let depth = &walk.mapper.depth.active;
+        let held = walk.mapper.map.keyframes[0].points.len();
+        assert!(depth.num_hypotheses() <= held, "{} of {held} points", depth.num_hypotheses());
+        let (outcome, walk) = drifted(false);
+        assert!(!outcome.keyframe_restored && outcome.keyframe_created);
+        assert_eq!(walk.mapper.map.keyframes.len(), 3);
+    }
+
+    #[test]
     fn zero_makes_a_new_keyframe_every_time() {
         let mut walk = Walk::new();
         walk.mapper.params.reuse.max_distance = 0.0;

@@ -213,7 +213,7 @@ mod tests {
 
     use crate::slam::geometry::se3::SE3;
     use crate::slam::geometry::sim3::Matrix7;
-    use crate::slam::keyframe::DepthPoint;
+    use crate::slam::keyframe::{DepthPoint, DistanceWeights};
     use crate::slam::loops::known::{KnownLoops, Link};
     use crate::slam::mapper::MapperParams;
     use crate::slam::mapper::phase::Active;
@@ -279,6 +279,21 @@ mod tests {
         let mut map = near(&[0.0, 0.02, -0.01, 0.03]);
         map.keyframes[1].epoch = 1;
         assert!(shown_by(&map, 0, &ReuseParams::default()).is_none(), "one of another epoch");
+    }
+
+    #[test]
+    fn a_keyframe_stays_where_none_can_be_taken_up_in_its_stead() {
+        let at = [0.0, 0.02, -0.01, 0.03].iter().enumerate();
+        let keyframes = at.map(|(k, x)| keyframe(k as u64, *x, 0.0)).collect();
+        let map = Map { keyframes, ..Map::default() };
+        let stands_in = |max_distance: f64| {
+            shown_by(&map, 0, &ReuseParams { max_distance, ..ReuseParams::default() })
+        };
+        // All its points are shown: what is left is the way of a hundredth of a mean depth.
+        let weight = DistanceWeights::default().translation;
+        let nearest = (0.01 * weight).powi(2);
+        assert_eq!(stands_in(1.01 * nearest + 1e-3).map(|(id, _)| id), Some(2));
+        assert!(stands_in(0.5 * nearest).is_none());
     }
 
     fn loop_between(i: u64, j: u64) -> Link {
