@@ -71,7 +71,7 @@ fn enlarged(pixels: &[u8], width: usize) -> Vec<u8> {
     large
 }
 
-/// To and fro, without end: the camera never jumps.
+/// Back and forth, without end: the camera never jumps.
 fn feed(source: &str, rate_hz: &str) -> Result<(), Box<dyn Error>> {
     let mut source = open(&source.parse()?, None, &SourceParams::default())?;
     let width = source.intrinsics().width;

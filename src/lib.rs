@@ -36,12 +36,12 @@
 //!
 //! | feature | what | default |
 //! |---|---|---|
-//! | `service` | processes, topics, recordings, results, the program | yes |
-//! | `cameras` | V4L2 cameras as a source | yes |
+//! | `service` | processes, topics, results, the program; needs `cameras` | yes |
+//! | `cameras` | where frames come from: cameras, recordings, the simulator | yes |
 //!
 //! Without them (`default-features = false`) the algorithm builds with nalgebra, rayon, serde and thiserror alone.
 
-#[cfg(feature = "service")]
+#[cfg(feature = "cameras")]
 pub mod capture;
 #[cfg(feature = "service")]
 pub mod command;

@@ -1,4 +1,4 @@
-//! The shape of the house: imports run down, `slam` is pure, foreign names stay in their room,
+//! The structure: imports run down, `slam` is pure, foreign names stay in their module,
 //! files can be read in one sitting. The rule about imports is the table in docs/development.md.
 
 use std::collections::BTreeMap;
@@ -8,14 +8,14 @@ use std::path::{Path, PathBuf};
 /// A file longer than this is split along its algorithm.
 const MAX_LINES: usize = 500;
 
-/// What only some rooms may name, and why.
+/// What only some modules may name, and why.
 const RESERVED: &[(&str, &[&str], &str)] = &[
-    ("iceoryx2::", &["src/wire/"], "its API changes with every release: one room to change"),
-    ("png::", &["src/capture/"], "image files are read and written in one room"),
-    ("zune_jpeg", &["src/capture/"], "image files are read and written in one room"),
-    ("mcap::", &["src/capture/bag"], "bags are read in one room"),
-    ("cdr_encoding", &["src/capture/bag"], "bags are read in one room"),
-    ("ioctl", &["src/capture/v4l"], "the kernel's video interface is spoken in one room"),
+    ("iceoryx2::", &["src/wire/"], "its API changes with every release: one module to change"),
+    ("png::", &["src/capture/"], "image files are read and written in one module"),
+    ("zune_jpeg", &["src/capture/"], "image files are read and written in one module"),
+    ("mcap::", &["src/capture/bag"], "bags are read in one module"),
+    ("cdr_encoding", &["src/capture/bag"], "bags are read in one module"),
+    ("ioctl", &["src/capture/v4l"], "the kernel's video interface is spoken in one module"),
     (
         "std::time",
         &["src/service/", "src/command/", "src/wire/", "src/capture/v4l"],
@@ -32,7 +32,7 @@ const IMPURE: &[&str] =
     &["std::fs", "std::io", "std::net", "std::env", "rand::", "thread_local!", "static mut"];
 
 /// Where `unsafe` may stand.
-const UNSAFE_ROOMS: &[&str] = &["src/wire/", "src/capture/v4l", "src/service/schedule.rs"];
+const UNSAFE_MODULES: &[&str] = &["src/wire/", "src/capture/v4l", "src/service/schedule.rs"];
 const UNSAFE_KERNEL_MARK: &str = "kernel";
 
 fn root() -> PathBuf {
@@ -68,10 +68,10 @@ fn sources(folder: &str) -> Vec<(String, Vec<String>)> {
         .collect()
 }
 
-/// The table of docs/development.md, `| room | may import | … |` as room → rooms.
+/// The table of docs/development.md, `| module | may import | … |` as module → modules.
 fn allowed_imports() -> BTreeMap<String, Vec<String>> {
     let page = fs::read_to_string(root().join("docs/development.md")).unwrap();
-    let rows = page.lines().skip_while(|l| !l.starts_with("| room | may import")).skip(2);
+    let rows = page.lines().skip_while(|l| !l.starts_with("| module | may import")).skip(2);
     let table: BTreeMap<String, Vec<String>> = rows
         .take_while(|l| l.starts_with('|'))
         .map(|row| {
@@ -85,7 +85,7 @@ fn allowed_imports() -> BTreeMap<String, Vec<String>> {
             (words(cells[0]).concat(), words(cells[1]))
         })
         .collect();
-    assert_eq!(table.len(), 5, "the table of rooms in docs/development.md: {table:?}");
+    assert_eq!(table.len(), 5, "the table of modules in docs/development.md: {table:?}");
     table
 }
 
@@ -94,22 +94,22 @@ fn imports_run_down() {
     let allowed = allowed_imports();
     let mut wrong = Vec::new();
     for (file, lines) in sources("src") {
-        let Some(room) = file.strip_prefix("src/").and_then(|f| f.split_once('/')).map(|f| f.0)
+        let Some(module) = file.strip_prefix("src/").and_then(|f| f.split_once('/')).map(|f| f.0)
         else {
             continue;
         };
-        let may = allowed
-            .get(room)
-            .unwrap_or_else(|| panic!("{file}: {room} is not in the table of docs/development.md"));
+        let may = allowed.get(module).unwrap_or_else(|| {
+            panic!("{file}: {module} is not in the table of docs/development.md")
+        });
         for (number, line) in lines.iter().enumerate() {
             for (other, _) in
-                allowed.iter().filter(|(other, _)| *other != room && !may.contains(other))
+                allowed.iter().filter(|(other, _)| *other != module && !may.contains(other))
             {
                 if line.contains(&format!("crate::{other}"))
                     || line.contains(&format!("semidense::{other}"))
                 {
                     wrong.push(format!(
-                        "{file}:{}: {room} must not import {other}: imports run down",
+                        "{file}:{}: {module} must not import {other}: imports run down",
                         number + 1
                     ));
                 }
@@ -120,14 +120,14 @@ fn imports_run_down() {
 }
 
 #[test]
-fn foreign_names_stay_in_their_room() {
+fn foreign_names_stay_in_their_module() {
     let mut wrong = Vec::new();
     for (file, lines) in sources("src") {
         for (number, line) in lines.iter().enumerate() {
-            for (name, rooms, reason) in RESERVED {
-                if line.contains(name) && !rooms.iter().any(|room| file.starts_with(room)) {
+            for (name, modules, reason) in RESERVED {
+                if line.contains(name) && !modules.iter().any(|module| file.starts_with(module)) {
                     wrong.push(format!(
-                        "{file}:{}: {name} belongs to {rooms:?}: {reason}",
+                        "{file}:{}: {name} belongs to {modules:?}: {reason}",
                         number + 1
                     ));
                 }
@@ -154,17 +154,17 @@ fn slam_is_pure() {
 }
 
 #[test]
-fn unsafe_stays_in_its_rooms_with_a_reason() {
+fn unsafe_stays_in_its_modules_with_a_reason() {
     let mut wrong = Vec::new();
     for (file, lines) in sources("src") {
         let name = file.rsplit('/').next().unwrap();
-        let may = UNSAFE_ROOMS.iter().any(|room| file.starts_with(room))
+        let may = UNSAFE_MODULES.iter().any(|module| file.starts_with(module))
             || (file.starts_with("src/slam/") && name.contains(UNSAFE_KERNEL_MARK));
         for (number, line) in lines.iter().enumerate() {
             if !may && line.split(|c: char| !c.is_alphanumeric() && c != '_').any(|w| w == "unsafe")
             {
                 wrong.push(format!(
-                    "{file}:{}: unsafe belongs to {UNSAFE_ROOMS:?} and kernels",
+                    "{file}:{}: unsafe belongs to {UNSAFE_MODULES:?} and kernels",
                     number + 1
                 ));
             }

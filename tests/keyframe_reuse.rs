@@ -21,7 +21,7 @@ struct Outcome {
     ate: f64,
 }
 
-fn to_and_fro(max_distance: f64) -> Outcome {
+fn back_and_forth(max_distance: f64) -> Outcome {
     let motion = MotionParams { kind: MotionKind::Straight, ..MotionParams::default() };
     let params = SimulatorParams { frames: FRAMES, motion, ..SimulatorParams::half_size() };
     let mut simulator = Simulator::new(params).unwrap();
@@ -54,9 +54,9 @@ fn to_and_fro(max_distance: f64) -> Outcome {
 }
 
 #[test]
-fn to_and_fro_does_not_grow_the_map() {
-    let without = to_and_fro(0.0);
-    let with = to_and_fro(ReuseParams::default().max_distance);
+fn going_back_and_forth_does_not_grow_the_map() {
+    let without = back_and_forth(0.0);
+    let with = back_and_forth(ReuseParams::default().max_distance);
     assert_eq!(without.restored, 0);
     let (many, few) = (without.record.map.keyframes.len(), with.record.map.keyframes.len());
     assert!(few * 2 <= many, "{few} keyframes instead of {many}");

@@ -51,7 +51,7 @@ typedef enum semidense_status {
   SEMIDENSE_STATUS_ERROR_INTERNAL = -7,
 } semidense_status;
 
-// What a pose is worth.
+// Tracking status of a frame.
 typedef enum semidense_state {
   // No map that can be trusted yet; the pose is a working value.
   SEMIDENSE_STATE_INITIALIZING = 0,
@@ -122,7 +122,7 @@ typedef struct semidense_pose {
   uint64_t map_revision;
   // Life of the map.
   uint32_t epoch;
-  // What the pose is worth.
+  // Tracking status.
   enum semidense_state state;
   // Why it is degraded or lost.
   enum semidense_reason reason;

@@ -3,7 +3,7 @@
 //! Frames: the camera looks along z, x is right and y is down. `a_from_b` takes points in b to a. Lengths are map units, or
 //! those of the keyframe where it says so. Matrices are row by row.
 
-/// What a pose is worth.
+/// Tracking status of a frame.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum State {
@@ -81,7 +81,7 @@ pub struct Pose {
     pub map_revision: u64,
     /// Life of the map.
     pub epoch: u32,
-    /// What the pose is worth.
+    /// Tracking status.
     pub state: State,
     /// Why it is degraded or lost.
     pub reason: Reason,

@@ -611,7 +611,7 @@ class HealthMessage(ctypes.Structure):
         ("loops_unconfirmed", ctypes.c_uint64),
         # Mapper: places that contradicted other loops.
         ("loops_inconsistent", ctypes.c_uint64),
-        # Scheduling in force: 0 other, 1 FIFO, 2 deadline, 3 unknown.
+        # Active scheduling: 0 other, 1 FIFO, 2 deadline, 3 unknown.
         ("scheduling", ctypes.c_uint32),
         # Priority of FIFO scheduling, else 0.
         ("priority", ctypes.c_uint32),
@@ -686,7 +686,7 @@ class CommandResponse(ctypes.Structure):
 
 
 class State(enum.IntEnum):
-    """What a pose is worth."""
+    """Tracking status of a frame."""
 
     INITIALIZING = 0
     TRACKING = 1
@@ -742,7 +742,7 @@ class ProcessState(enum.IntEnum):
 
 
 class Scheduling(enum.IntEnum):
-    """Scheduling in force of a process."""
+    """Active scheduling of a process."""
 
     OTHER = 0
     FIFO = 1

@@ -373,7 +373,7 @@ class Health:
             self.state = ProcessState(message.state)
             """What it is doing."""
             self.scheduling = Scheduling(message.scheduling)
-            """Scheduling in force."""
+            """Active scheduling."""
         except ValueError as error:
             raise BrokenMessage(str(error)) from None
         self.message = message

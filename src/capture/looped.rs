@@ -147,7 +147,7 @@ mod tests {
     use crate::capture::source::{SourceParams, open};
 
     #[test]
-    fn frames_go_to_and_fro_at_the_rate() {
+    fn frames_go_back_and_forth_at_the_rate() {
         let simulator = SimulatorParams {
             frames: 4,
             width: 64,

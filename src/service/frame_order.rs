@@ -51,7 +51,7 @@ impl FrameOrder {
             .is_some_and(|last| now_nanos().saturating_sub(last) as f64 > allowed_nanos)
     }
 
-    /// Says what the next frame is. Hostile numbers are as good as any.
+    /// Says what the next frame is. Accepts arbitrary numbers.
     pub fn arrive(&mut self, header: &FrameHeader) -> FrameOrderOutcome {
         let (sequence, stamp) = (header.sequence, header.capture_nanos);
         let Some((last_sequence, last_stamp)) = self.last else {

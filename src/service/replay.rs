@@ -451,7 +451,7 @@ impl<'a> Replay<'a> {
         let (samples, rehearsal_nanos) = self.rehearsal.into_samples();
         record.budget_samples = samples;
         record.wall_nanos = elapsed_nanos(begin).saturating_sub(rehearsal_nanos);
-        record.map = self.mapper.map().clone();
+        record.map = self.mapper.into_map();
         record.peak_rss_bytes = peak_rss_bytes();
         Ok((record, saved))
     }

@@ -179,7 +179,7 @@ impl Supervised {
         self.child = None;
     }
 
-    /// Whether it is worth starting again after this death: a process that names a fault of its own would
+    /// Whether it is started again after this death: a process that names a fault of its own would
     /// meet it again, unless it is one that has just taken the place of another and found the place not yet
     /// cleared, or another was killed at that time (`kill_is_felt`), whose half-made ports it has met.
     pub fn may_restart(&self, death: &Death, kill_is_felt: bool, max_restarts: u32) -> bool {

@@ -312,6 +312,11 @@ impl Mapper {
         &self.map
     }
 
+    /// Every keyframe, where nothing more is mapped.
+    pub fn into_map(self) -> Map {
+        self.map
+    }
+
     /// Keyframes of the active epoch, counted up to one more than judge its start.
     fn num_epoch_keyframes(&self) -> usize {
         let Some(active) = self.keyframe() else { return 0 };

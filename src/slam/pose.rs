@@ -11,7 +11,7 @@ pub const NO_KEYFRAME: u64 = u64::MAX;
 /// Variance of what is not known, units² of whatever it is measured in and radians²: large and finite.
 pub const UNKNOWN_VARIANCE: f64 = 1.0e6;
 
-/// What a pose is worth.
+/// Tracking status of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TrackingState {
     /// No map that can be trusted yet; the pose is a working value.
@@ -109,7 +109,7 @@ pub struct Velocity {
     pub covariance: [f64; 21],
 }
 
-/// The tracker's word on one frame.
+/// Tracking result of one frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PoseEstimate {
     /// Sequence of the frame.
@@ -122,7 +122,7 @@ pub struct PoseEstimate {
     pub revision: u64,
     /// Keyframe it was tracked on, [`NO_KEYFRAME`] before the first.
     pub keyframe_id: u64,
-    /// What it is worth.
+    /// Tracking status.
     pub state: TrackingState,
     /// How often the map had been corrected when that keyframe was published.
     pub map_revision: u64,

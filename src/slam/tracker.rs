@@ -36,7 +36,7 @@ pub struct TrackerParams {
     pub reference: ReferenceParams,
     /// How they are aligned.
     pub alignment: AlignmentParams,
-    /// What the result is worth.
+    /// Tracking status.
     pub verdict: VerdictParams,
     /// What the published covariance holds beside noise and common errors of depth.
     pub covariance_floor: CovarianceFloorParams,

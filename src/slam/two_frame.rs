@@ -4,6 +4,7 @@
 //!
 //! A camera that stands or only turns never gets there, however noisy its images: see [`evidence`].
 
+pub mod earlier_frames;
 pub mod elimination;
 pub mod evidence;
 pub mod fit;
@@ -14,7 +15,6 @@ pub mod points;
 pub mod spread;
 pub mod system;
 mod system_kernel;
-pub mod witness;
 
 use nalgebra::{Matrix6, Vector3};
 use serde::{Deserialize, Serialize};
@@ -27,6 +27,7 @@ use crate::slam::image::buffer::Image;
 use crate::slam::image::pyramid::Pyramid;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::Brightness;
+use crate::slam::two_frame::earlier_frames::EarlierFrames;
 use crate::slam::two_frame::evidence::{
     Evidence, EvidenceParams, Waiting, judge, residual_variance,
 };
@@ -39,7 +40,6 @@ use crate::slam::two_frame::lead::Lead;
 use crate::slam::two_frame::points::Points;
 use crate::slam::two_frame::spread::spread;
 use crate::slam::two_frame::system::State;
-use crate::slam::two_frame::witness::Witnesses;
 
 /// Tuning of the two-frame start.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -60,7 +60,7 @@ pub struct TwoFrameParams {
     /// Frames in a row that may fail to match before it begins again.
     pub max_mismatches: u32,
     /// Earlier frames that are kept to choose between motions: about 1 MB each at 640×480.
-    pub max_witnesses: usize,
+    pub max_earlier_frames: usize,
     /// Standard deviation that interpolation and sampling leave in a match, pixels.
     pub match_noise_px: f32,
 }
@@ -75,7 +75,7 @@ impl Default for TwoFrameParams {
             confirming_frames: 2,
             max_frames: 60,
             max_mismatches: 3,
-            max_witnesses: 8,
+            max_earlier_frames: 8,
             match_noise_px: 0.15,
         }
     }
@@ -91,7 +91,7 @@ impl TwoFrameParams {
         check_range("confirming_frames", self.confirming_frames, 1..=100)?;
         check_range("max_frames", self.max_frames, 2..=100_000)?;
         check_range("max_mismatches", self.max_mismatches, 1..=1000)?;
-        check_range("max_witnesses", self.max_witnesses, 1..=100)?;
+        check_range("max_earlier_frames", self.max_earlier_frames, 1..=100)?;
         check_range("match_noise_px", self.match_noise_px, 0.0..=5.0)
     }
 }
@@ -159,7 +159,7 @@ pub struct TwoFrameInitializer {
     first_pixels: Vec<u8>,
     points: Points,
     joint: Hypotheses,
-    witnesses: Witnesses,
+    earlier_frames: EarlierFrames,
     rotation: State,
     rotation_scratch: FitScratch,
     /// The latest result: pose, brightness, inverse depth of each point and its variance.
@@ -202,7 +202,7 @@ impl TwoFrameInitializer {
             first_pixels: Vec::new(),
             points: Points::default(),
             joint: Hypotheses::new(&state),
-            witnesses: Witnesses::default(),
+            earlier_frames: EarlierFrames::default(),
             rotation: state,
             rotation_scratch: FitScratch::default(),
             current_from_first: SE3::identity(),
@@ -239,7 +239,7 @@ impl TwoFrameInitializer {
         self.rotation.inverse_depths.clear();
         self.rotation.inverse_depths.resize(found, 1.0);
         self.joint.restart();
-        self.witnesses.clear();
+        self.earlier_frames.clear();
         self.current_from_first = SE3::identity();
         self.brightness = Brightness::default();
         self.inverse_depths.clear();
@@ -275,7 +275,11 @@ impl TwoFrameInitializer {
                 *self.joint.best().0 = before;
             }
         }
-        self.witnesses.push(self.pyramid.levels(), &self.rotation, self.params.max_witnesses);
+        self.earlier_frames.push(
+            self.pyramid.levels(),
+            &self.rotation,
+            self.params.max_earlier_frames,
+        );
         let travelled = self.current_from_first.inverse().translation;
         let heading = travelled / travelled.norm().max(f64::MIN_POSITIVE);
         let excess = evidence.rival.map_or(0.0, |rival| rival.excess);
@@ -340,7 +344,13 @@ impl TwoFrameInitializer {
         const PARALLAX_SIGNIFICANCE: f64 = 3.0;
         let input = input(self.pyramid.levels(), &self.intrinsics, &self.points);
         let with_directions = self.significance > PARALLAX_SIGNIFICANCE;
-        self.joint.fit(&input, &self.rotation, with_directions, &self.witnesses, &self.params.fit);
+        self.joint.fit(
+            &input,
+            &self.rotation,
+            with_directions,
+            &self.earlier_frames,
+            &self.params.fit,
+        );
     }
 
     /// The best motion and its depths again, by the images alone. The priors choose between motions; in the
@@ -358,7 +368,7 @@ impl TwoFrameInitializer {
 
     /// Variances and figures of the latest fit; then the scale goes to mean inverse depth 1.
     fn judge(&mut self) -> Evidence {
-        let (rival, heard) = (self.joint.rival(), self.joint.heard());
+        let (rival, scored_by) = (self.joint.rival(), self.joint.scored_by());
         let (state, scratch) = self.joint.best();
         let (joint, rotation) = (&scratch.system, &self.rotation_scratch.system);
         let floor = self.params.fit.noise.pixel_std_dev.powi(2);
@@ -372,7 +382,7 @@ impl TwoFrameInitializer {
         self.least_residual = self.least_residual.min(evidence.median_residual);
         let evidence = Evidence {
             rival,
-            witnesses: heard,
+            earlier_frames: scored_by,
             common_error,
             // Images without noise leave next to nothing while the camera hardly moves.
             least_residual: self.least_residual.max(self.params.fit.noise.pixel_std_dev.into()),

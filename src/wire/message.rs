@@ -447,7 +447,7 @@ pub struct HealthMessage {
     pub loops_unconfirmed: u64,
     /// Mapper: places that contradicted other loops.
     pub loops_inconsistent: u64,
-    /// Scheduling in force: 0 other, 1 FIFO, 2 deadline, 3 unknown.
+    /// Active scheduling: 0 other, 1 FIFO, 2 deadline, 3 unknown.
     pub scheduling: u32,
     /// Priority of FIFO scheduling, else 0.
     pub priority: u32,

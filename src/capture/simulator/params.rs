@@ -49,7 +49,7 @@ impl FromStr for SceneKind {
 pub enum MotionKind {
     /// A walk with the camera in the hand: swaying, turning, trembling.
     Handheld,
-    /// To and fro on a straight line across the view, without turning or tremor.
+    /// Back and forth on a straight line across the view, without turning or tremor.
     Straight,
     /// Turning about the optical centre, without moving or tremor.
     Rotation,

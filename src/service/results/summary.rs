@@ -201,7 +201,7 @@ pub struct Summary {
     pub failure: Option<String>,
     /// When the run ended from whose journal this was recovered (UTC); null of any other run.
     pub recovered_run_end: Option<String>,
-    /// What the run is worth by what can be known without ground truth.
+    /// Grade of the run by what can be known without ground truth.
     pub grade: Grade,
     /// Frames that the source gave.
     pub frames_in: u64,

@@ -291,7 +291,7 @@ impl Aligner {
     }
 
     /// Takes an alignment that was cut short to the finest level as it stands, without a step: there its
-    /// figures say what it is worth, and it can be compared with others.
+    /// figures say how well it fits, and it can be compared with others.
     pub fn stand_on_finest(
         &self,
         reference: &Reference,
@@ -470,7 +470,7 @@ fn worse(lambda: f64, failures: u32) -> (f64, u32) {
     (lambda, failures)
 }
 
-/// Whether a step is worth an evaluation: a rotation beyond a quarter turn or a gain beyond e² is
+/// Whether a step stays in the range that is evaluated: a rotation beyond a quarter turn or a gain beyond e² is
 /// an artefact of a nearly singular system.
 fn is_sane(step: &SVector<f64, UNKNOWNS>) -> bool {
     let rotation = step.fixed_rows::<3>(3).norm();

@@ -1,4 +1,4 @@
-//! How much an observation of depth is worth beside what is known, when a part of both errors is the same.
+//! Weight of an observation of depth beside what is known, when a part of both errors is the same.
 
 /// How uncertain an inverse depth is.
 #[derive(Debug, Clone, Copy, PartialEq)]

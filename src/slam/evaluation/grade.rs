@@ -1,4 +1,4 @@
-//! What a run is worth by what can be known without ground truth: good, doubtful, poor, or not judged.
+//! Grade of a run by what can be known without ground truth: good, doubtful, poor, or not judged.
 //!
 //! Nothing is good by default: a map whose keyframes never see the same place from apart is not judged.
 //! `docs/grade.md` holds the grades of all sequences against their truth, and what the grade cannot see.

@@ -3,7 +3,7 @@
 //! The trajectory figures are those of the Python package `evo` on the same files: nearest stamps
 //! without interpolation ([`association`]), Umeyama alignment ([`mod@umeyama`]), absolute and relative
 //! errors ([`trajectory_error`]); [`normalized_error`] holds pose errors against their covariance. [`windows`] adds how the scale wanders, [`depth_error`] what the
-//! depth maps and their variances are worth, [`depth_modes`] what is wrong with the whole of one, [`start_error`] what a start is worth. Without any truth, [`map_consistency`] holds the keyframes
+//! depth maps and their variances are good for, [`depth_modes`] what is wrong with the whole of one, [`start_error`] how far a start is off. Without any truth, [`map_consistency`] holds the keyframes
 //! against each other ([`shared_view`], [`patch_misfit`], [`depth_agreement`]), and [`grade`] says what
 //! that is worth.
 
@@ -71,7 +71,7 @@ pub enum EvaluationError {
     Alignment(#[from] AlignmentError),
 }
 
-/// What a trajectory is worth against the ground truth. Lengths are in the ground truth's unit.
+/// Errors of a trajectory against the ground truth. Lengths are in the ground truth's unit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrajectoryEvaluation {
     /// Which poses were compared.

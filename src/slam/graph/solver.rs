@@ -11,7 +11,7 @@ const FIRST_DAMPING: f64 = 1e-5;
 /// Factors after a step that lowers the cost, and after one that does not.
 const DAMPING_DOWN: f64 = 0.1;
 const DAMPING_UP: f64 = 10.0;
-/// Least damping, of no effect but to let the next one rise; beyond the most no step is worth the name.
+/// Least damping, of no effect but to let the next one rise; beyond the most every step vanishes.
 const LEAST_DAMPING: f64 = 1e-12;
 const MOST_DAMPING: f64 = 1e8;
 /// The places have converged when a step would lower the cost by less than this, and by less than this share of it: a

@@ -117,7 +117,7 @@ fn with_false_loops(kernel: RobustKernel, num_false: usize, seed: u64) -> f64 {
     for _ in 0..num_false {
         let i = (random.uniform() * 45.0) as usize;
         let j = i + 20 + (random.uniform() * 30.0) as usize;
-        // Two rooms alike: the measurement looks as good as any.
+        // Two rooms alike: nothing in the measurement itself tells.
         loops.push((i, j, Sim3::exp(&noise(&mut random, 5.0))));
     }
     let chain = |k: usize| measured(&truth, k - 1, k, &errors[k]);

@@ -52,7 +52,7 @@ impl Motion {
         }
     }
 
-    /// Forgets the velocity: after a loss only the place is worth something.
+    /// Forgets the velocity: after a loss only the position is used.
     pub fn stop(&mut self) {
         self.velocity = None;
     }

@@ -1,4 +1,4 @@
-//! What an aligned frame is worth: the thresholds between tracked, degraded and lost.
+//! Tracking status of an aligned frame: the thresholds between tracked, degraded and lost.
 
 use serde::{Deserialize, Serialize};
 

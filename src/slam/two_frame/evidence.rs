@@ -22,7 +22,7 @@ pub struct EvidenceParams {
     /// earlier frames must confirm it; its depths are good to a tenth, and later frames correct them.
     pub min_early_translation: f64,
     /// Earlier frames that an early start needs.
-    pub min_early_witnesses: usize,
+    pub min_earlier_frames: usize,
     /// Energy by which another motion must be worse, in this frame and the earlier ones together, as a
     /// share: what a rolling shutter and the lens leave is of that size.
     pub min_rival_excess: f64,
@@ -57,7 +57,7 @@ impl Default for EvidenceParams {
         Self {
             min_translation: 1.0 / 60.0,
             min_early_translation: 0.004,
-            min_early_witnesses: 4,
+            min_earlier_frames: 4,
             min_rival_excess: 0.03,
             min_turning_rival_excess: 0.2,
             max_turn_ratio: 0.8,
@@ -77,7 +77,7 @@ impl EvidenceParams {
     pub fn validate(&self) -> Result<(), ParameterError> {
         check_range("min_translation", self.min_translation, 1e-4..=1.0)?;
         check_range("min_early_translation", self.min_early_translation, 1e-4..=1.0)?;
-        check_range("min_early_witnesses", self.min_early_witnesses, 1..=1000)?;
+        check_range("min_earlier_frames", self.min_earlier_frames, 1..=1000)?;
         check_range("min_rival_excess", self.min_rival_excess, 0.0..=10.0)?;
         check_range("min_turning_rival_excess", self.min_turning_rival_excess, 0.0..=10.0)?;
         check_range("max_turn_ratio", self.max_turn_ratio, 0.0..=1e6)?;
@@ -134,7 +134,7 @@ pub struct Evidence {
     /// The second best motion; `None` where there is no other.
     pub rival: Option<Rival>,
     /// Earlier frames that were asked which motion they show.
-    pub witnesses: usize,
+    pub earlier_frames: usize,
 }
 
 impl Evidence {
@@ -164,7 +164,7 @@ impl Evidence {
 
     /// Whether the translation is long enough, or confirmed well enough.
     fn has_moved(&self, params: &EvidenceParams) -> bool {
-        let is_confirmed = self.witnesses >= params.min_early_witnesses;
+        let is_confirmed = self.earlier_frames >= params.min_earlier_frames;
         self.translation >= params.min_translation
             || is_confirmed && self.translation >= params.min_early_translation
     }
@@ -232,7 +232,7 @@ pub fn judge(
         common_error: f64::INFINITY,
         least_residual: median_residual,
         rival: None,
-        witnesses: 0,
+        earlier_frames: 0,
     }
 }
 
@@ -258,7 +258,7 @@ mod tests {
             common_error: 0.01,
             least_residual: 3.0,
             rival: None,
-            witnesses: 8,
+            earlier_frames: 8,
         }
     }
 
@@ -305,7 +305,7 @@ mod tests {
         let early = Evidence { translation: 0.006, ..proven() };
         assert_eq!(early.missing(&params), None);
         let waits = |evidence: Evidence| evidence.missing(&params) == Some(Waiting::Translation);
-        assert!(waits(Evidence { witnesses: 2, ..early }));
+        assert!(waits(Evidence { earlier_frames: 2, ..early }));
         assert!(waits(Evidence { translation: 0.001, ..early }));
     }
 }

@@ -10,9 +10,9 @@ use nalgebra::{Vector3, Vector6};
 use rayon::prelude::*;
 
 use crate::slam::geometry::se3::SE3;
+use crate::slam::two_frame::earlier_frames::EarlierFrames;
 use crate::slam::two_frame::fit::{FitInput, FitParams, FitScratch, Freedom, fit_level};
 use crate::slam::two_frame::system::State;
-use crate::slam::two_frame::witness::Witnesses;
 
 /// Survivors, the same aligned first, rest, mirror and six directions.
 const MAX_HYPOTHESES: usize = 2 * NUM_SURVIVORS + 2 + 6;
@@ -48,7 +48,7 @@ pub struct Hypotheses {
     survivors: usize,
     rival: Option<Rival>,
     /// Earlier frames that were asked about the latest one.
-    heard: usize,
+    scored_by: usize,
 }
 
 impl Hypotheses {
@@ -60,24 +60,24 @@ impl Hypotheses {
             scratch: FitScratch::default(),
         };
         let all = (0..MAX_HYPOTHESES).map(empty).collect();
-        Self { all, used: 0, survivors: 0, rival: None, heard: 0 }
+        Self { all, used: 0, survivors: 0, rival: None, scored_by: 0 }
     }
 
     /// Forgets what earlier frames have shown.
     pub fn restart(&mut self) {
         (self.used, self.survivors) = (0, 0);
-        (self.rival, self.heard) = (None, 0);
+        (self.rival, self.scored_by) = (None, 0);
     }
 
     /// Fits all hypotheses to a frame. `rotation` is its fit without translation; `with_directions` adds
-    /// the starts, and asks the `witnesses`, which is worth its time only where there is parallax. The
+    /// the starts, and scores the survivors by `earlier_frames`, which pays only where there is parallax. The
     /// result does not depend on the number of threads.
     pub fn fit(
         &mut self,
         input: &FitInput<'_>,
         rotation: &State,
         with_directions: bool,
-        witnesses: &Witnesses,
+        earlier_frames: &EarlierFrames,
         params: &FitParams,
     ) {
         self.propose(rotation, with_directions);
@@ -104,17 +104,17 @@ impl Hypotheses {
             best.for_each(|h| fit_down_to(0, coarse, Freedom::Everything, h));
             all[..self.survivors].sort_by(|a, b| a.energy.total_cmp(&b.energy));
         }
-        (self.rival, self.heard) = (None, 0);
+        (self.rival, self.scored_by) = (None, 0);
         if with_directions && self.survivors > 1 {
-            self.hear(input, witnesses, params);
+            self.score(input, earlier_frames, params);
         }
     }
 
     /// Puts that survivor first whose depths explain this frame and the earlier ones best.
-    fn hear(&mut self, input: &FitInput<'_>, witnesses: &Witnesses, params: &FitParams) {
-        self.heard = witnesses.len();
+    fn score(&mut self, input: &FitInput<'_>, earlier_frames: &EarlierFrames, params: &FitParams) {
+        self.scored_by = earlier_frames.len();
         let together = |h: &MotionHypothesis| {
-            h.energy + witnesses.energy(input, &h.state.inverse_depths, params)
+            h.energy + earlier_frames.energy(input, &h.state.inverse_depths, params)
         };
         let (mut best, mut other) = (together(&self.all[0]), together(&self.all[1]));
         if other < best {
@@ -142,8 +142,8 @@ impl Hypotheses {
     }
 
     /// How many earlier frames were asked about the latest one: none where there is but one motion.
-    pub fn heard(&self) -> usize {
-        self.heard
+    pub fn scored_by(&self) -> usize {
+        self.scored_by
     }
 
     /// The best fit with its normal equations at the finest level; before any fit the state given first.

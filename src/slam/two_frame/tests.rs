@@ -280,7 +280,7 @@ fn earlier_frames_tell_true_depths_from_those_of_another_motion() {
         let moved = SE3::exp(&Vector6::new(x, y, z, 0.002, -0.003, 0.001));
         initializer.step(&scene.render(&CAMERA, &moved).noisy(2.0, 2 + frame as u64));
     }
-    assert_eq!(initializer.witnesses.len(), 3);
+    assert_eq!(initializer.earlier_frames.len(), 3);
     let input = input(initializer.pyramid.levels(), &initializer.intrinsics, &initializer.points);
     let at = |&(u, v): &(u16, u16)| first.inverse_depth.at(usize::from(u), usize::from(v));
     let truth: Vec<f32> = initializer.points.pixels.iter().map(at).collect();
@@ -289,7 +289,7 @@ fn earlier_frames_tell_true_depths_from_those_of_another_motion() {
         at(p) * (1.0 + 0.8 * across)
     });
     let energy =
-        |depths: &[f32]| initializer.witnesses.energy(&input, depths, &initializer.params.fit);
+        |depths: &[f32]| initializer.earlier_frames.energy(&input, depths, &initializer.params.fit);
     let (right, wrong) = (energy(&truth), energy(&tilted.collect::<Vec<_>>()));
     assert!(right * (1.0 + EvidenceParams::default().min_rival_excess) < wrong, "{right} {wrong}");
 }
@@ -385,16 +385,16 @@ fn a_step_that_goes_too_far_is_damped_and_taken() {
 }
 
 #[test]
-fn earlier_frames_that_were_not_asked_are_no_witnesses() {
+fn earlier_frames_that_were_not_aligned_do_not_score() {
     let standing = |frame| Scene::new(5).render(&CAMERA, &SE3::identity()).noisy(2.0, frame);
     let mut initializer = TwoFrameInitializer::new(CAMERA, TwoFrameParams::default()).unwrap();
     assert!(initializer.begin(&standing(1)));
     for frame in 2..6 {
-        assert_eq!(initializer.step(&standing(frame)).evidence.witnesses, 0);
+        assert_eq!(initializer.step(&standing(frame)).evidence.earlier_frames, 0);
     }
-    assert_eq!(initializer.witnesses.len(), 4);
+    assert_eq!(initializer.earlier_frames.len(), 4);
     let (_, outcomes) = run(Motion::Sideways, 1, 2.0, 40);
-    let asked = outcomes.iter().map(|outcome| outcome.evidence.witnesses).max();
+    let asked = outcomes.iter().map(|outcome| outcome.evidence.earlier_frames).max();
     assert!(asked > Some(3), "{asked:?}");
 }
 

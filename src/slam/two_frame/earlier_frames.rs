@@ -19,7 +19,7 @@ const LEVELS: std::ops::RangeInclusive<usize> = 1..=2;
 
 /// One earlier frame.
 #[derive(Debug)]
-struct Witness {
+struct EarlierFrame {
     /// Its images, finest kept level first.
     images: Vec<Image<f32>>,
     /// Its fit without translation: where the search for its pose begins.
@@ -28,11 +28,11 @@ struct Witness {
 
 /// The latest frames before the current one.
 #[derive(Debug, Default)]
-pub struct Witnesses {
-    kept: VecDeque<Witness>,
+pub struct EarlierFrames {
+    kept: VecDeque<EarlierFrame>,
 }
 
-impl Witnesses {
+impl EarlierFrames {
     /// Forgets all.
     pub fn clear(&mut self) {
         self.kept.clear();
@@ -53,21 +53,21 @@ impl Witnesses {
         while self.kept.len() >= most.max(1) {
             self.kept.pop_front();
         }
-        let (finest, coarsest) = heard_levels(images.len());
+        let (finest, coarsest) = scoring_levels(images.len());
         let images = images[finest..=coarsest].to_vec();
-        self.kept.push_back(Witness { images, rotation: rotation.clone() });
+        self.kept.push_back(EarlierFrame { images, rotation: rotation.clone() });
     }
 
-    /// Energy of the witnesses with these depths, each frame from the pose that fits it best. `input`
+    /// Energy of the earlier frames with these depths, each frame from the pose that fits it best. `input`
     /// gives points and intrinsics. The sum goes in the order of the frames.
     pub fn energy(&self, input: &FitInput<'_>, inverse_depths: &[f32], params: &FitParams) -> f64 {
-        let (finest, coarsest) = heard_levels(input.intrinsics.len());
+        let (finest, coarsest) = scoring_levels(input.intrinsics.len());
         let energies: Vec<f64> = self
             .kept
             .par_iter()
-            .map(|witness| {
-                let input = FitInput { images: &witness.images, finest, ..*input };
-                let mut state = witness.rotation.clone();
+            .map(|frame| {
+                let input = FitInput { images: &frame.images, finest, ..*input };
+                let mut state = frame.rotation.clone();
                 state.inverse_depths.clear();
                 state.inverse_depths.extend_from_slice(inverse_depths);
                 let mut scratch = FitScratch::default();
@@ -81,8 +81,8 @@ impl Witnesses {
     }
 }
 
-/// Finest and coarsest level heard of so many.
-fn heard_levels(levels: usize) -> (usize, usize) {
+/// Finest and coarsest level of so many that score.
+fn scoring_levels(levels: usize) -> (usize, usize) {
     let last = levels.saturating_sub(1);
     ((*LEVELS.start()).min(last), (*LEVELS.end()).min(last))
 }
