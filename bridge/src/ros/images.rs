@@ -1,6 +1,6 @@
 //! Images as they are sent: pixels, PNG or JPEG.
 
-use jpeg_encoder::{ColorType, Encoder, EncodingError};
+use crate::jpeg::{JpegError, encode_gray};
 
 /// How images are sent and recorded. Measured for grey 640x480 of a camera (`fr1-floor`): PNG 1.6 ms and 170 kB,
 /// JPEG 5.9 ms and 73 kB, pixels 307 kB.
@@ -28,7 +28,7 @@ pub enum CompressError {
     Png(#[from] png::EncodingError),
     /// The JPEG encoder refuses it.
     #[error("an image cannot be written as JPEG: {0}")]
-    Jpeg(#[from] EncodingError),
+    Jpeg(#[from] JpegError),
 }
 
 /// A grey image of `width * height` pixels as PNG.
@@ -47,10 +47,5 @@ pub fn png(width: u32, height: u32, pixels: &[u8]) -> Result<Vec<u8>, CompressEr
 
 /// A grey image of `width * height` pixels as JPEG.
 pub fn jpeg(width: u32, height: u32, pixels: &[u8]) -> Result<Vec<u8>, CompressError> {
-    // The largest side of a frame is far below what 16 bits hold; the encoder refuses a size that does not fit.
-    let side = |length: u32| u16::try_from(length).unwrap_or(u16::MAX);
-    let mut bytes = Vec::with_capacity(pixels.len() / 4);
-    let encoder = Encoder::new(&mut bytes, JPEG_QUALITY);
-    encoder.encode(pixels, side(width), side(height), ColorType::Luma)?;
-    Ok(bytes)
+    Ok(encode_gray(pixels, [width as usize, height as usize], JPEG_QUALITY)?)
 }
