@@ -686,7 +686,7 @@ class CommandResponse(ctypes.Structure):
 
 
 class State(enum.IntEnum):
-    """Tracking status of a frame."""
+    """What a pose is worth."""
 
     INITIALIZING = 0
     TRACKING = 1
@@ -742,7 +742,7 @@ class ProcessState(enum.IntEnum):
 
 
 class Scheduling(enum.IntEnum):
-    """Active scheduling of a process."""
+    """Scheduling in force of a process."""
 
     OTHER = 0
     FIFO = 1
