@@ -227,6 +227,7 @@ fn plot(costs: &[Cost], path: &str) -> std::io::Result<()> {
         let each = Series { name: "", colour: "#b4bccb", mark: Mark::Dots(1.2), points };
         Chart {
             title,
+            meaning: "Time as the map grows; it should stay level.",
             x_label: "keyframes".to_owned(),
             y_label: "ms of one core".to_owned(),
             height: 260.0,

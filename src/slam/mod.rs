@@ -26,4 +26,5 @@ pub mod test_scene;
 pub mod tracker;
 pub mod trajectory;
 pub mod two_frame;
+pub mod up;
 pub mod window;

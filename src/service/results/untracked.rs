@@ -243,7 +243,7 @@ fn advice(seen: StartFrame) -> &'static str {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
     use crate::service::recording::{RecordParts, Recording, RunCounters};
     use crate::slam::frame::FrameView;
@@ -253,7 +253,12 @@ mod tests {
 
     /// A live run of `frames` frames with these states from its tenth on, of which the mapper handled `handled`
     /// and found them too little like the first.
-    fn record(frames: u64, handled: u64, state: TrackingState) -> RunRecord {
+    /// A run without a map.
+    pub(in crate::service::results) fn record(
+        frames: u64,
+        handled: u64,
+        state: TrackingState,
+    ) -> RunRecord {
         let mut recording = Recording::default();
         for sequence in 0..frames {
             let frame = FrameView {

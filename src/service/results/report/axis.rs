@@ -85,7 +85,7 @@ impl Range {
 }
 
 /// The smallest of 1, 2, 5 × 10ⁿ that is at least `least`.
-fn round_step(least: f64) -> f64 {
+pub(super) fn round_step(least: f64) -> f64 {
     let decade = 10f64.powf(least.log10().floor());
     let factor = [1.0, 2.0, 5.0].into_iter().find(|f| f * decade >= least * (1.0 - 1e-9));
     factor.unwrap_or(10.0) * decade

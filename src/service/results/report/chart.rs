@@ -3,6 +3,7 @@
 use std::fmt::Write;
 
 use crate::service::results::report::axis::Range;
+use crate::service::results::report::chart_points::thinned;
 use crate::service::results::report::html::escaped;
 
 /// Width of every chart's coordinate system; the page scales it.
@@ -10,9 +11,6 @@ pub const CHART_WIDTH: f64 = 640.0;
 
 /// Space left of, above, right of and below the plot.
 const MARGIN: [f64; 4] = [66.0, 34.0, 14.0, 42.0];
-
-/// Most points that a path keeps.
-const MAX_PATH_POINTS: usize = 3000;
 
 /// How the points of a series are drawn.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -62,6 +60,8 @@ pub enum Scaling {
 pub struct Chart {
     /// What it shows.
     pub title: &'static str,
+    /// What it means and what is good, in one line below it; may be empty.
+    pub meaning: &'static str,
     /// Label of the x axis.
     pub x_label: String,
     /// Label of the y axis.
@@ -75,17 +75,18 @@ pub struct Chart {
 }
 
 /// Where the axes' values lie in the picture.
-struct Frame {
-    x: Range,
+pub(super) struct Frame {
+    pub(super) x: Range,
     /// Of the values, or of their decimal logarithms.
-    y: Range,
-    in_decades: bool,
+    pub(super) y: Range,
+    pub(super) in_decades: bool,
     width: f64,
     height: f64,
 }
 
 impl Frame {
-    fn place(&self, [x, y]: [f64; 2]) -> [f64; 2] {
+    /// Where a point lies in the picture.
+    pub(super) fn place(&self, [x, y]: [f64; 2]) -> [f64; 2] {
         let y = if self.in_decades { y.log10() } else { y };
         [
             MARGIN[0] + (x - self.x.low) / self.x.width() * self.width,
@@ -125,28 +126,34 @@ impl Chart {
         svg
     }
 
-    fn frame(&self) -> Frame {
-        let width = CHART_WIDTH - MARGIN[0] - MARGIN[2];
-        let height = self.height - MARGIN[1] - MARGIN[3];
+    /// The ranges of the axes, a length as long along both where that is asked for.
+    pub(super) fn frame(&self) -> Frame {
+        let mut frame = self.tight_frame();
+        if self.scaling == Scaling::Equal {
+            let unit = (frame.x.width() / frame.width).max(frame.y.width() / frame.height);
+            frame.x = frame.x.widened_to(unit * frame.width);
+            frame.y = frame.y.widened_to(unit * frame.height);
+        }
+        frame
+    }
+
+    /// The ranges that the points need.
+    pub(super) fn tight_frame(&self) -> Frame {
         let points = || self.series.iter().flat_map(|series| &series.points);
-        let rules_excluded = || {
+        let drawn = || {
             let drawn = self.series.iter().filter(|series| series.mark != Mark::Rule);
             drawn.flat_map(|series| &series.points)
         };
         let in_decades = self.scaling == Scaling::Decades;
         let height_of = |y: f64| if in_decades { y.log10() } else { y };
-        let mut x = Range::around(points().map(|p| p[0]));
-        let mut y = Range::around(rules_excluded().map(|p| height_of(p[1])));
-        match self.scaling {
-            Scaling::Free | Scaling::Decades => {}
-            Scaling::FromZero => y = y.from_zero(),
-            Scaling::Equal => {
-                let unit = (x.width() / width).max(y.width() / height);
-                x = x.widened_to(unit * width);
-                y = y.widened_to(unit * height);
-            }
+        let y = Range::around(drawn().map(|p| height_of(p[1])));
+        Frame {
+            x: Range::around(points().map(|p| p[0])),
+            y: if self.scaling == Scaling::FromZero { y.from_zero() } else { y },
+            in_decades,
+            width: CHART_WIDTH - MARGIN[0] - MARGIN[2],
+            height: self.height - MARGIN[1] - MARGIN[3],
         }
-        Frame { x, y, in_decades, width, height }
     }
 
     /// Names with a stroke of their colour, from the right end of the title's line.
@@ -240,37 +247,31 @@ fn draw_text(svg: &mut String, x: f64, y: f64, anchor: &str, attributes: &str, t
 
 fn draw_series(svg: &mut String, frame: &Frame, series: &Series) {
     let colour = series.colour;
-    let finite = |p: &&[f64; 2]| p.iter().all(|c| c.is_finite());
+    let placed = || thinned(frame, series).into_iter().map(|point| frame.place(point));
+    let seen = || placed().filter(|p| p.iter().all(|c| c.is_finite()));
     match series.mark {
-        Mark::Line => draw_line(svg, &line_path(frame, &series.points), colour, "", 1.6),
-        Mark::Path => draw_line(svg, &stride_path(frame, &series.points), colour, "", 1.8),
-        Mark::DashedPath => draw_line(svg, &stride_path(frame, &series.points), colour, DASH, 1.6),
+        Mark::Line => draw_line(svg, &joined(placed()), colour, "", 1.6),
+        Mark::Path => draw_line(svg, &joined(placed()), colour, "", 1.8),
+        Mark::DashedPath => draw_line(svg, &joined(placed()), colour, DASH, 1.6),
         Mark::Dots(radius) => {
-            let mut path = String::new();
-            for &point in thinned(&series.points).filter(finite) {
-                let [x, y] = frame.place(point);
-                // A stroke of no length with round ends is a dot.
-                let _ = write!(path, "M{x:.1} {y:.1}h0");
-            }
+            // A stroke of no length with round ends is a dot.
+            let path: String = seen().map(|[x, y]| format!("M{x:.1} {y:.1}h0")).collect();
             let round = " stroke-linecap=\"round\"";
             draw_line(svg, &path, colour, round, 2.0 * radius);
         }
         Mark::Bars(width) => {
             let mut path = String::new();
-            for &[x, y] in series.points.iter().filter(finite) {
-                let [left, top] = frame.place([x, y]);
-                let [right, bottom] = frame.place([x + width, 0.0]);
+            for [left, top] in seen() {
+                let right = left + width / frame.x.width() * frame.width;
+                let [_, bottom] = frame.place([0.0, 0.0]);
                 let _ = write!(path, "M{left:.1} {bottom:.1}V{top:.1}H{right:.1}V{bottom:.1}z");
             }
             let _ = write!(svg, "<path d=\"{path}\" fill=\"{colour}\" fill-opacity=\"0.75\"/>");
         }
         Mark::Rule => {
             let (top, bottom) = (MARGIN[1], MARGIN[1] + frame.height);
-            let mut path = String::new();
-            for &point in series.points.iter().filter(finite) {
-                let [x, _] = frame.place(point);
-                let _ = write!(path, "M{x:.1} {top:.1}V{bottom:.1}");
-            }
+            let path: String =
+                seen().map(|[x, _]| format!("M{x:.1} {top:.1}V{bottom:.1}")).collect();
             draw_line(svg, &path, colour, DASH, 1.4);
         }
     }
@@ -282,48 +283,6 @@ fn draw_line(svg: &mut String, path: &str, colour: &str, attributes: &str, width
         "<path d=\"{path}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"{width:.1}\" \
          stroke-linejoin=\"round\"{attributes}/>"
     );
-}
-
-/// Every n-th point, such that few enough are left; the last always.
-fn thinned(points: &[[f64; 2]]) -> impl Iterator<Item = &[f64; 2]> {
-    let stride = points.len().div_ceil(MAX_PATH_POINTS).max(1);
-    let last = points.len().saturating_sub(1);
-    points.iter().enumerate().filter(move |(i, _)| i % stride == 0 || *i == last).map(|(_, p)| p)
-}
-
-fn stride_path(frame: &Frame, points: &[[f64; 2]]) -> String {
-    joined(thinned(points).map(|&point| frame.place(point)))
-}
-
-/// A line over x: of the points that fall on one column of the picture, the first, the lowest,
-/// the highest and the last.
-fn line_path(frame: &Frame, points: &[[f64; 2]]) -> String {
-    let mut kept: Vec<[f64; 2]> = Vec::new();
-    let mut column: Vec<[f64; 2]> = Vec::new();
-    let mut flush = |column: &mut Vec<[f64; 2]>| {
-        let order = |a: &&[f64; 2], b: &&[f64; 2]| a[1].total_cmp(&b[1]);
-        let ends = [column.first(), column.iter().min_by(order), column.iter().max_by(order)];
-        let mut chosen: Vec<[f64; 2]> =
-            ends.into_iter().chain([column.last()]).flatten().copied().collect();
-        chosen.sort_by(|a, b| a[0].total_cmp(&b[0]));
-        chosen.dedup();
-        kept.extend(chosen);
-        column.clear();
-    };
-    for &point in points {
-        let placed = frame.place(point);
-        let breaks = !placed.iter().all(|c| c.is_finite());
-        let other_column = column.last().is_some_and(|last| last[0].floor() != placed[0].floor());
-        if breaks || other_column {
-            flush(&mut column);
-        }
-        column.push(placed);
-        if breaks {
-            flush(&mut column);
-        }
-    }
-    flush(&mut column);
-    joined(kept.into_iter())
 }
 
 /// An SVG path through the points; one that is not finite breaks it.
@@ -347,6 +306,7 @@ mod tests {
     fn chart(mark: Mark, points: Vec<[f64; 2]>) -> Chart {
         Chart {
             title: "t",
+            meaning: "",
             x_label: "x".into(),
             y_label: "<y>".into(),
             height: 240.0,

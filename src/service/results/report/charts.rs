@@ -34,24 +34,31 @@ pub fn secs(record: &RunRecord, nanos: i64) -> f64 {
     nanos.saturating_sub(first) as f64 * 1e-9
 }
 
-/// The trajectory from above and from the side, in the ground truth's frame where there is one.
-pub fn trajectory_views(input: &ReportInput<'_>) -> [Chart; 2] {
+/// The trajectory from above and from the side, in the ground truth's frame where there is one. `up` is in the map's.
+pub fn trajectory_views(input: &ReportInput<'_>, up: Option<Vector3<f64>>) -> [Chart; 2] {
     let truth: Vec<StampedPose> = truth_in_time(input);
     let (alignment, unit) = match input.evaluation {
         Some(evaluation) => (evaluation.alignment, "m"),
         None if input.record.depth_scale == DepthScale::Given => (Sim3::identity(), "m"),
         None => (Sim3::identity(), "map units"),
     };
-    trajectory_charts(input.trajectory, &truth, &alignment, unit, &keyframe_poses(input.record))
+    let views = match up {
+        Some(up) => Views::of(input.trajectory, Some(up)).turned(&alignment.rigid.rotation),
+        None => Views::of(if truth.is_empty() { input.trajectory } else { &truth }, None),
+    };
+    let keyframes = keyframe_poses(input.record);
+    trajectory_charts(input.trajectory, &truth, &alignment, unit, &keyframes, &views)
 }
 
-/// From above and from the side: `truth`, and `estimate` and `keyframes` brought to its frame.
+/// From above and from the side, as `views` of the truth's frame has it: `truth`, and `estimate` and `keyframes` brought
+/// to its frame.
 pub fn trajectory_charts(
     estimate: &[StampedPose],
     truth: &[StampedPose],
     alignment: &Sim3,
     unit: &str,
     keyframes: &[StampedPose],
+    views: &Views,
 ) -> [Chart; 2] {
     let place = |pose: &StampedPose| StampedPose {
         nanos: pose.nanos,
@@ -59,7 +66,6 @@ pub fn trajectory_charts(
     };
     let estimate: Vec<StampedPose> = estimate.iter().map(place).collect();
     let keyframes: Vec<StampedPose> = keyframes.iter().map(place).collect();
-    let views = Views::of(if truth.is_empty() { &estimate } else { truth });
     let chart = |title, y_label: &str, project: &dyn Fn(&Vector3<f64>) -> [f64; 2]| {
         let points = |poses: &[StampedPose]| -> Vec<[f64; 2]> {
             poses.iter().map(|pose| project(&pose.world_from_camera.translation)).collect()
@@ -86,6 +92,7 @@ pub fn trajectory_charts(
         ];
         Chart {
             title,
+            meaning: TRAJECTORY_MEANING,
             x_label: format!("along the longest extent of the path [{unit}]"),
             y_label: format!("{y_label} [{unit}]"),
             height: 420.0,
@@ -149,6 +156,8 @@ pub fn error_points(
 pub fn error_chart(series: Vec<Series>) -> Chart {
     Chart {
         title: "Position error",
+        meaning: "Distance of each frame from the ground truth after alignment: final poses and those published during \
+                  the run. Low and level is good; a step is a place where the map is bent or its scale changes.",
         x_label: "time [s]".into(),
         y_label: "error after alignment [m]".into(),
         height: 280.0,
@@ -185,6 +194,8 @@ pub fn scale_over_time(input: &ReportInput<'_>) -> Option<Chart> {
         .collect();
     Some(Chart {
         title: "Scale of 100-frame windows",
+        meaning: "Length of the estimated path over that of the ground truth, window by window. 1 everywhere means \
+                  that the scale does not drift.",
         x_label: "time [s]".into(),
         y_label: "scale / overall scale".into(),
         height: 280.0,
@@ -216,24 +227,57 @@ pub fn time_charts(record: &RunRecord) -> Vec<Chart> {
         .collect();
     let deadline = record.deadline_nanos.map(|n| n as f64 * 1e-6);
     let mut charts = Vec::new();
-    for (over_time, occurrence, colour, samples, limit) in [
-        ("Tracking time", "Distribution of tracking time", ESTIMATE, track, None),
-        ("Mapping time", "Distribution of mapping time", MAPPING, map, None),
-        ("Latency from stamp to pose", "Distribution of latency", ONLINE, latency, deadline),
-    ] {
+    for (times, samples, limit) in
+        [(&TRACKING, track, None), (&MAPPING_STEPS, map, None), (&LATENCY, latency, deadline)]
+    {
         if !samples.is_empty() {
-            charts.push(time_chart(over_time, colour, samples.clone()));
-            charts.push(histogram(occurrence, colour, &samples, limit));
+            charts.push(time_chart(times, samples.clone()));
+            charts.push(histogram(times, &samples, limit));
         }
     }
     charts
 }
 
-fn time_chart(title: &'static str, colour: &'static str, points: Vec<[f64; 2]>) -> Chart {
+/// One kind of time, and what is said of it.
+struct Times {
+    over_run: &'static str,
+    distribution: &'static str,
+    colour: &'static str,
+    meaning: &'static str,
+}
+
+const TRACKING: Times = Times {
+    over_run: "Tracking time",
+    distribution: "Distribution of tracking time",
+    colour: ESTIMATE,
+    meaning: "Time in the tracker for each frame. Good is well below the interval between frames.",
+};
+
+const MAPPING_STEPS: Times = Times {
+    over_run: "Mapping time",
+    distribution: "Distribution of mapping time",
+    colour: MAPPING,
+    meaning: "Time in the mapper for each frame. It may exceed the interval between frames now and then: poses do not \
+              wait for it.",
+};
+
+const LATENCY: Times = Times {
+    over_run: "Latency from stamp to pose",
+    distribution: "Distribution of latency",
+    colour: ONLINE,
+    meaning: "From a frame's stamp to the publication of its pose: how old a pose is when it can be used.",
+};
+
+const TRAJECTORY_MEANING: &str = "Path of the camera; keyframes are the frames that carry the map. With ground truth the \
+                                  estimate is aligned to it, and good means that the two lines cover each other.";
+
+fn time_chart(times: &Times, points: Vec<[f64; 2]>) -> Chart {
+    let colour = times.colour;
     Chart {
-        title,
+        title: times.over_run,
+        meaning: times.meaning,
         x_label: "time [s]".into(),
-        y_label: "[ms]".into(),
+        y_label: "duration [ms]".into(),
         height: 230.0,
         scaling: Scaling::FromZero,
         series: vec![Series { name: "", colour, mark: Mark::Line, points }],
@@ -242,12 +286,8 @@ fn time_chart(title: &'static str, colour: &'static str, points: Vec<[f64; 2]>) 
 
 /// How many frames took how long. The range ends at the 99th percentile and a half more; what is
 /// beyond is counted in the last bar.
-fn histogram(
-    title: &'static str,
-    colour: &'static str,
-    samples: &[[f64; 2]],
-    limit: Option<f64>,
-) -> Chart {
+fn histogram(times: &Times, samples: &[[f64; 2]], limit: Option<f64>) -> Chart {
+    let colour = times.colour;
     let mut sorted: Vec<f64> = samples.iter().map(|sample| sample[1]).collect();
     sorted.sort_by(f64::total_cmp);
     let p99 = percentile(&sorted, 0.99).unwrap_or(0.0);
@@ -274,8 +314,9 @@ fn histogram(
         series.push(Series { name: "deadline", colour: TRUTH, mark: Mark::Rule, points });
     }
     Chart {
-        title,
-        x_label: "[ms]".into(),
+        title: times.distribution,
+        meaning: "How many frames took how long; 95 % of them are left of p95. The last bar also has all longer ones.",
+        x_label: "time [ms]".into(),
         y_label: "frames".into(),
         height: 230.0,
         scaling: Scaling::FromZero,

@@ -1,38 +1,61 @@
-//! Every figure of the summary in writing.
+//! Every figure of the summary in words, with its unit and what it means.
 
 use std::fmt::Write;
 
-use serde_json::{Map, Value};
+use serde_json::Value;
 
+use crate::service::results::report::figure_words::{Format, GROUPS, Group, Words, all_words};
 use crate::service::results::report::html::escaped;
+use crate::service::results::report::{grouped, length};
 use crate::service::results::summary::Summary;
+use crate::slam::geometry::intrinsics::Intrinsics;
 
-/// What has a place of its own on the page.
-const DRAWN: [&str; 3] = ["budget_curve", "grade", "keyframe_depth"];
+/// Most columns of a histogram that are written out.
+const HISTOGRAM_ROWS: usize = 40;
 
-/// The figures as a list, and those that are lists themselves as tables.
+/// The section: the figures by groups, those that are lists themselves as tables.
 pub fn figures(summary: &Summary) -> String {
-    let mut html = String::from("<section><h2>Figures</h2><dl>");
     let value = serde_json::to_value(summary).unwrap_or_default();
-    let entries = value.as_object().into_iter().flatten();
-    let shown = entries.filter(|(key, value)| !DRAWN.contains(&key.as_str()) && has_figures(value));
-    let mut tables = String::new();
-    for (key, value) in shown {
-        match value {
-            Value::Array(rows) if rows.iter().all(Value::is_object) => {
-                let _ = write!(tables, "<h2>{key}</h2>{}", table(rows));
+    let mut html = String::from(
+        "<section><h2>Figures</h2><p><code>summary.json</code> beside this page has the same for programs.</p>",
+    );
+    let shown = placed_figures(&value);
+    for (group, heading) in GROUPS {
+        let of_group: Vec<_> = shown.iter().filter(|(of, _, _)| *of == group).collect();
+        if of_group.is_empty() {
+            continue;
+        }
+        let _ = write!(html, "<h3>{heading}</h3>");
+        let (tables, entries): (Vec<_>, Vec<_>) =
+            of_group.into_iter().partition(|(_, words, _)| matches!(words.format, Format::Rows(_)));
+        if !entries.is_empty() {
+            html.push_str("<dl>");
+            entries.iter().for_each(|(_, words, value)| entry(&mut html, words, value));
+            html.push_str("</dl>");
+        }
+        tables.iter().for_each(|(_, words, value)| table(&mut html, words, value));
+    }
+    html.push_str("</section>");
+    html
+}
+
+/// The figures that are known in the order of their words, each with its group; those of nested ones in the group that the
+/// outer names.
+fn placed_figures(summary: &Value) -> Vec<(Group, &'static Words, &Value)> {
+    let mut placed = Vec::new();
+    for words in all_words() {
+        let value = &summary[words.key];
+        match words.format {
+            _ if !has_figures(value) => {}
+            Format::Drawn => {}
+            Format::Nested(group) => {
+                let inner = all_words().map(|words| (group, words, &value[words.key]));
+                placed.extend(inner.filter(|(_, _, value)| has_figures(value)));
             }
-            // Figures of another trajectory under the same names: one entry each.
-            Value::Object(inner) if key == "online" => {
-                for (name, value) in inner.iter().filter(|(_, value)| has_figures(value)) {
-                    entry(&mut html, &format!("{key}.{name}"), value);
-                }
-            }
-            other => entry(&mut html, key, other),
+            _ => placed.push((words.group, words, value)),
         }
     }
-    let _ = write!(html, "</dl>{tables}</section>");
-    html
+    placed
 }
 
 /// Whether there is anything to tell.
@@ -41,53 +64,229 @@ fn has_figures(value: &Value) -> bool {
         Value::Null => false,
         Value::Object(entries) => !entries.values().all(Value::is_null),
         Value::Array(values) => !values.is_empty(),
+        Value::String(text) => !text.is_empty(),
         _ => true,
     }
 }
 
-fn entry(html: &mut String, key: &str, value: &Value) {
-    let _ = write!(html, "<div><dt>{key}</dt><dd>{}</dd></div>", escaped(&figure(value)));
+fn entry(html: &mut String, words: &Words, value: &Value) {
+    let _ = write!(
+        html,
+        "<div><dt>{}<small>{}</small></dt><dd>{}</dd></div>",
+        escaped(words.name),
+        escaped(words.meaning),
+        escaped(&written(words.format, value))
+    );
 }
 
-/// Rows that have the same keys.
-fn table(rows: &[Value]) -> String {
-    let rows: Vec<&Map<String, Value>> = rows.iter().filter_map(Value::as_object).collect();
-    let mut html = String::from("<div class=\"table\"><table><tr>");
-    for key in rows.first().into_iter().flat_map(|row| row.keys()) {
-        let _ = write!(html, "<th>{key}</th>");
+fn table(html: &mut String, words: &Words, value: &Value) {
+    let Format::Rows(columns) = words.format else { return };
+    let _ = write!(
+        html,
+        "<div class=\"table\"><p>{}<small>{}</small></p><table><tr>",
+        escaped(words.name),
+        escaped(words.meaning)
+    );
+    for (_, heading, _) in columns {
+        let _ = write!(html, "<th>{}</th>", escaped(heading));
     }
-    for row in rows {
+    for row in value.as_array().into_iter().flatten() {
         html.push_str("</tr><tr>");
-        for value in row.values() {
-            let _ = write!(html, "<td>{}</td>", escaped(&figure(value)));
+        for (key, _, format) in columns {
+            let _ = write!(html, "<td>{}</td>", escaped(&written(*format, &row[*key])));
         }
     }
     html.push_str("</tr></table></div>");
-    html
 }
 
-/// A number with at most five significant digits after the point; text as it is; several with
-/// their names.
-fn figure(value: &Value) -> String {
-    match value {
-        Value::String(text) => text.clone(),
-        Value::Object(entries) => {
-            let entries = entries.iter().filter(|(_, value)| !value.is_null());
-            let named = entries.map(|(key, value)| format!("{key} {}", figure(value)));
-            named.collect::<Vec<_>>().join(", ")
+/// A figure with its unit; a dash where there is none.
+fn written(format: Format, value: &Value) -> String {
+    const NONE: &str = "–";
+    match (format, value) {
+        (_, Value::Null) | (Format::Drawn | Format::Nested(_) | Format::Rows(_), _) => NONE.into(),
+        (Format::Text, Value::String(text)) => text.clone(),
+        (Format::Times, times) => times_text(times),
+        (Format::Histogram, histogram) => histogram_text(histogram),
+        (Format::Camera, camera) => camera_text(camera),
+        (Format::Counts, Value::Object(counts)) => {
+            let counts = counts.iter().map(|(name, count)| format!("{name} {count}"));
+            counts.collect::<Vec<_>>().join(", ")
         }
-        Value::Array(values) => {
-            let separator = if values.iter().any(|value| value.is_object()) { "; " } else { ", " };
-            values.iter().map(figure).collect::<Vec<_>>().join(separator)
+        (Format::Named(names, is_share), Value::Array(values)) => {
+            let values = values.iter().filter_map(Value::as_f64).zip(names);
+            let values = values.map(|(value, name)| match is_share {
+                true => format!("{name} {:.1} %", 100.0 * value),
+                false => format!("{name} {}", plain(value)),
+            });
+            values.collect::<Vec<_>>().join(", ")
         }
-        Value::Number(number) if number.is_f64() => {
-            let number = number.as_f64().unwrap_or(f64::NAN);
-            if number != 0.0 && number.abs() < 1e-3 {
-                format!("{number:.3e}")
-            } else {
-                format!("{number:.4}")
-            }
+        (format, value) => match value.as_f64() {
+            Some(number) => number_text(format, number),
+            None => value.as_str().unwrap_or(NONE).to_owned(),
+        },
+    }
+}
+
+fn number_text(format: Format, number: f64) -> String {
+    match format {
+        Format::Count if number >= 0.0 => grouped(number.round() as u64),
+        Format::Unit("°") => format!("{}°", plain(number)),
+        Format::Unit(unit) => format!("{} {unit}", plain(number)),
+        Format::Metres => length(number),
+        Format::Percent => format!("{:.1} %", 100.0 * number),
+        _ => plain(number),
+    }
+}
+
+/// A number with three significant digits or all before the point.
+fn plain(number: f64) -> String {
+    const DIGITS: f64 = 2.0;
+    if number == 0.0 {
+        return "0".to_owned();
+    }
+    let decimals = DIGITS - number.abs().log10().floor();
+    if decimals > 8.0 || decimals < -9.0 {
+        return format!("{number:.2e}");
+    }
+    format!("{number:.*}", decimals.max(0.0) as usize)
+}
+
+fn times_text(times: &Value) -> String {
+    let of = |key: &str| times[key].as_f64().map_or("–".to_owned(), plain);
+    format!(
+        "median {} ms; 95 % below {}, 99 % below {}, 99.9 % below {}; longest {} ms",
+        of("p50"),
+        of("p95"),
+        of("p99"),
+        of("p999"),
+        of("max")
+    )
+}
+
+fn histogram_text(histogram: &Value) -> String {
+    let list = |key: &str| histogram[key].as_array().cloned().unwrap_or_default();
+    let rows = list("below_ms").into_iter().zip(list("counts")).take(HISTOGRAM_ROWS);
+    let rows = rows.map(|(end, count)| {
+        let (end, count) = (end.as_f64().unwrap_or(f64::NAN), count.as_u64().unwrap_or(0));
+        format!("below {} ms: {}", plain(end), grouped(count))
+    });
+    rows.collect::<Vec<_>>().join(", ")
+}
+
+fn camera_text(camera: &Value) -> String {
+    match serde_json::from_value::<Intrinsics>(camera.clone()) {
+        Ok(k) => format!(
+            "{} × {}, focal lengths {:.1} and {:.1}, principal point {:.1}, {:.1}",
+            k.width, k.height, k.fx, k.fy, k.cx, k.cy
+        ),
+        Err(_) => "–".to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::service::results::PointCounts;
+    use crate::service::results::alignment_levels::LevelSummary;
+    use crate::service::results::depth_maps::DepthEvaluation;
+    use crate::service::results::summary::RejectionSummary;
+    use crate::service::results::times::{Histogram, Percentiles};
+    use crate::service::results::untracked::tests::record;
+    use crate::slam::pose::TrackingState;
+    use serde_json::json;
+
+    /// A summary with every key: what is null is one as well.
+    fn summary() -> Value {
+        let counts = PointCounts { points: 0, map_points: 0, fusion_secs: 0.0 };
+        let record = record(0, 0, TrackingState::Initializing);
+        let depth = DepthEvaluation::default();
+        let summary = Summary::new(&record, counts, None, None, [None, None, None], depth);
+        serde_json::to_value(summary).unwrap()
+    }
+
+    fn words_of(key: &str) -> Option<&'static Words> {
+        all_words().find(|words| words.key == key)
+    }
+
+    fn keys(value: &impl serde::Serialize) -> Vec<String> {
+        let value = serde_json::to_value(value).unwrap();
+        value.as_object().unwrap().keys().cloned().collect()
+    }
+
+    #[test]
+    fn every_key_of_the_summary_has_words_and_a_meaning() {
+        let summary = summary();
+        let nested = ["online", "map_nees", "velocity_nees"].map(|key| &summary[key]);
+        let all = nested.into_iter().chain([&summary]);
+        let mut count = 0;
+        for (key, _) in all.flat_map(|value| value.as_object().unwrap()) {
+            let words = words_of(key).unwrap_or_else(|| panic!("{key} has no words"));
+            assert!(!words.name.contains('_') && words.name.len() > 2, "{key}");
+            assert!(words.meaning.ends_with('.'), "{key}: {}", words.meaning);
+            count += 1;
         }
-        other => other.to_string(),
+        assert!(count > 110, "{count}");
+    }
+
+    #[test]
+    fn every_column_of_a_table_has_a_heading() {
+        let level = LevelSummary {
+            level: 0,
+            frames: 1,
+            points: 1.0,
+            iterations_median: 1.0,
+            iterations_mean: 1.0,
+            nanos_per_point: None,
+        };
+        let rejection = RejectionSummary { sequence: 0, reason: String::new() };
+        let cause = crate::service::results::RestartCause {
+            process: String::new(),
+            cause: String::new(),
+            count: 1,
+        };
+        let rows = [
+            ("alignment_levels", keys(&level)),
+            ("map_rejections", keys(&rejection)),
+            ("restart_causes", keys(&cause)),
+        ];
+        for (key, mut keys) in rows {
+            let Format::Rows(columns) = words_of(key).unwrap().format else { panic!("{key}") };
+            let mut known: Vec<&str> = columns.iter().map(|(key, _, _)| *key).collect();
+            keys.sort_unstable();
+            known.sort_unstable();
+            assert_eq!(known, keys, "{key}");
+        }
+    }
+
+    #[test]
+    fn figures_have_units_and_no_key_is_seen() {
+        let mut value = summary();
+        let times = Percentiles { p50: 1.5, p95: 2.0, p99: 3.0, p999: 4.0, max: 12.25 };
+        value["track_ms"] = json!(times);
+        value["ate_rmse_m"] = json!(0.0123);
+        value["online"]["ate_rmse_m"] = json!(0.5);
+        value["nees_below_bound"] = json!(0.9);
+        value["depth_coverage"] = json!([0.6, 0.9, 0.99]);
+        value["map_rejections"] = json!([{ "sequence": 7, "reason": "<two>" }]);
+        value["latency_histogram"] = json!(Histogram { below_ms: vec![1.0], counts: vec![12345] });
+        value["camera"] = json!(Intrinsics::pinhole(640, 480, 500.0));
+        let html = figures(&serde_json::from_value(value).unwrap());
+        for part in [
+            "median 1.50 ms; 95 % below 2.00",
+            "<dd>1.23 cm</dd>",
+            "<dd>50.00 cm</dd>",
+            "trajectory as published</h3>",
+            "<dd>90.0 %</dd>",
+            "1 σ 60.0 %, 2 σ 90.0 %, 3 σ 99.0 %",
+            "<td>7</td><td>&lt;two&gt;</td>",
+            "12\u{202f}345",
+            "640 × 480, focal lengths 500.0",
+        ] {
+            assert!(html.contains(part), "{part}: {html}");
+        }
+        let keys = summary().as_object().unwrap().keys().cloned().collect::<Vec<_>>();
+        for key in keys.iter().filter(|key| key.contains('_')) {
+            assert!(!html.contains(key.as_str()), "{key}");
+        }
     }
 }

@@ -10,6 +10,13 @@ use crate::service::results::report::charts::{ERROR, ESTIMATE, MAPPING, ONLINE, 
 use crate::slam::evaluation::depth_error::KeyframeDepth;
 use crate::slam::evaluation::statistics::median;
 
+const RESIDUAL_MEANING: &str = "Difference in brightness between the keyframes after they are estimated together: a few \
+                                grey levels are the camera's noise; a rise means that the map does not fit the images.";
+const INLIER_MEANING: &str = "Comparisons of a point with a keyframe that agree. Above 80 % is good; low values are moving things, hidden points or \
+     wrong depth.";
+const TIME_MEANING: &str =
+    "CPU time of each joint estimate of keyframes; it runs beside tracking and mapping.";
+
 /// Residual, share of inliers and time of every joint estimate; none where there was none.
 pub fn joint_charts(record: &RunRecord) -> Vec<Chart> {
     let poses = record.poses.iter();
@@ -22,8 +29,9 @@ pub fn joint_charts(record: &RunRecord) -> Vec<Chart> {
         });
         timed.collect()
     };
-    let chart = |title, y_label: &str, colour, points: Vec<[f64; 2]>| Chart {
+    let chart = |title, meaning, y_label: &str, colour, points: Vec<[f64; 2]>| Chart {
         title,
+        meaning,
         x_label: "time [s]".into(),
         y_label: y_label.into(),
         height: 230.0,
@@ -37,11 +45,26 @@ pub fn joint_charts(record: &RunRecord) -> Vec<Chart> {
     let inliers = points(|estimate| 100.0 * estimate.adjustment.inlier_ratio);
     let time = points(|estimate| estimate.nanos as f64 * 1e-6);
     vec![
-        chart("Residual of joint estimates", "root mean square [grey levels]", ERROR, residual),
-        chart("Inliers of joint estimates", "of comparisons [%]", ESTIMATE, inliers),
-        chart("CPU time of joint estimates", "[ms]", MAPPING, time),
+        chart(
+            "Residual of joint estimates",
+            RESIDUAL_MEANING,
+            "root mean square [grey levels]",
+            ERROR,
+            residual,
+        ),
+        chart(
+            "Inliers of joint estimates",
+            INLIER_MEANING,
+            "of comparisons [%]",
+            ESTIMATE,
+            inliers,
+        ),
+        chart("CPU time of joint estimates", TIME_MEANING, "CPU time [ms]", MAPPING, time),
     ]
 }
+
+const MODES_MEANING: &str = "Depth errors that all points of a keyframe share: depth that grows across the columns or rows \
+                             of the image, and relief that is too strong or too weak. 0 is right.";
 
 /// The unit and the common errors of each keyframe's depth over the run; none without true depth.
 pub fn depth_charts(record: &RunRecord, keyframes: &[KeyframeDepth]) -> Vec<Chart> {
@@ -51,8 +74,9 @@ pub fn depth_charts(record: &RunRecord, keyframes: &[KeyframeDepth]) -> Vec<Char
     };
     let units: Vec<f64> = keyframes.iter().map(|of| of.units_per_metre).collect();
     let Some(middle) = median(&units).filter(|_| units.len() > 1) else { return Vec::new() };
-    let chart = |title, y_label: &str, series| Chart {
+    let chart = |title, meaning, y_label: &str, series| Chart {
         title,
+        meaning,
         x_label: "time [s]".into(),
         y_label: y_label.into(),
         height: 230.0,
@@ -69,11 +93,13 @@ pub fn depth_charts(record: &RunRecord, keyframes: &[KeyframeDepth]) -> Vec<Char
     ];
     let mut charts = vec![chart(
         "Unit of the keyframes' depth",
+        "Length of a true metre in each keyframe's depth, over the median of all. 1 everywhere means that the scale does \
+         not drift.",
         "map units in a metre / their median",
         vec![series("", MAPPING, unit)],
     )];
     if modes.iter().any(|of| !of.points.is_empty()) {
-        charts.push(chart("Common errors of depth", "for each unit", modes));
+        charts.push(chart("Common errors of depth", MODES_MEANING, "for each unit", modes));
     }
     charts
 }

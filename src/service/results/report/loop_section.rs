@@ -3,10 +3,13 @@
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
+use nalgebra::Vector3;
+
 use crate::service::adjustments::SearchRecord;
 use crate::service::results::RunRecord;
 use crate::service::results::report::ReportInput;
 use crate::service::results::report::chart::{Chart, Mark, Scaling, Series};
+use crate::service::results::report::chart_figure::chart_figure;
 use crate::service::results::report::charts::{
     ERROR, ESTIMATE, MAPPING, ONLINE, TRUTH, keyframe_poses,
 };
@@ -22,7 +25,7 @@ const REFUSED_RADIUS: f64 = 2.5;
 const MOST_LINKS: usize = 1000;
 
 /// Figures, why places were refused, and a view of the map from above; nothing where no loop was looked for.
-pub fn loop_section(input: &ReportInput<'_>) -> String {
+pub fn loop_section(input: &ReportInput<'_>, up: Option<Vector3<f64>>) -> String {
     let Some(figures) = loops_text(&input.summary.loops) else { return String::new() };
     let searches = input.record.searches.as_deref().unwrap_or_default();
     let mut section = format!("<section><h2>Loops</h2><p>{}</p>", escaped(&figures));
@@ -36,9 +39,8 @@ pub fn loop_section(input: &ReportInput<'_>) -> String {
             listed.join("; ")
         );
     }
-    let chart = from_above(input.record, searches);
-    let _ =
-        write!(section, "<div class=\"charts\"><figure>{}</figure></div></section>", chart.svg());
+    let chart = from_above(input.record, searches, up);
+    let _ = write!(section, "<div class=\"charts\">{}</div></section>", chart_figure(&chart));
     section
 }
 
@@ -59,9 +61,9 @@ fn reasons(searches: &[SearchRecord]) -> Vec<(String, usize)> {
 }
 
 /// The keyframes' way, and what was found where; loops with a line between the keyframes.
-fn from_above(record: &RunRecord, searches: &[SearchRecord]) -> Chart {
+fn from_above(record: &RunRecord, searches: &[SearchRecord], up: Option<Vector3<f64>>) -> Chart {
     let way = keyframe_poses(record);
-    let views = Views::of(&way);
+    let views = Views::of(&way, up);
     let at = |id: u64| {
         let keyframe = record.map.get(id)?;
         Some(views.from_above(&keyframe.map_from_keyframe.rigid.translation))
@@ -85,8 +87,10 @@ fn from_above(record: &RunRecord, searches: &[SearchRecord]) -> Chart {
     let path = way.iter().map(|pose| views.from_above(&pose.world_from_camera.translation));
     Chart {
         title: "Loops from above",
-        x_label: "[map units]".into(),
-        y_label: "[map units]".into(),
+        meaning: "Where earlier places were recognised. Closed or joined: the map was moved by it; held already: the map had it \
+                  so; against the drift and other place: refused.",
+        x_label: "along the longest extent of the path [map units]".into(),
+        y_label: "across [map units]".into(),
         height: 480.0,
         scaling: Scaling::Equal,
         series: vec![

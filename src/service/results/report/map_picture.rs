@@ -3,7 +3,11 @@
 use nalgebra::Vector3;
 
 use crate::service::results::colour::{Picture, Rgb, rainbow};
+use crate::service::results::report::axis::round_step;
+use crate::service::results::report::html::png_address;
 use crate::service::results::report::views::Views;
+use crate::service::results::report::{ReportInput, grouped};
+use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::evaluation::statistics::percentile;
 use crate::slam::fusion::SurfacePoint;
 use crate::slam::trajectory::StampedPose;
@@ -23,9 +27,72 @@ const POINTS_FOR_BRIGHT: f64 = 6.0;
 const GROUND: Rgb = [16, 20, 27];
 const WAY: Rgb = [255, 255, 255];
 
+/// Least share of the picture's width that its scale bar has; the most is two and a half times as much.
+const LEAST_BAR: f64 = 0.14;
+
+/// The map from above.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MapPicture {
+    /// Points and path.
+    pub picture: Picture,
+    /// Length that the picture's width shows, map units.
+    pub width: f64,
+    /// What the ends of the colours stand for, map units apart.
+    pub height_range: f64,
+}
+
+/// The section; nothing without points.
+pub fn map_section(input: &ReportInput<'_>, up: Option<Vector3<f64>>) -> String {
+    let map = map_picture(input.surface, input.trajectory, up);
+    let Some(map) = map else { return String::new() };
+    let Some(png) = map.picture.png() else { return String::new() };
+    let unit = if input.record.depth_scale == DepthScale::Given { "m" } else { "map units" };
+    let metres = input.evaluation.filter(|_| unit != "m").map(|of| of.alignment.scale);
+    let about_up = match up {
+        Some(_) => "up is estimated from how the camera was held and from horizontal surfaces",
+        None => "what is up is not known: the view is along the path's shortest extent",
+    };
+    format!(
+        "<section><h2>Map from above</h2><figure><div class=\"map\"><img alt=\"map from above\" src=\"{}\">{}</div>\
+         <figcaption>{} points, coloured by height: <span class=\"scale near-far\"></span> low to high, {} {unit} apart. \
+         The camera's path is white; {about_up}.</figcaption></figure></section>",
+        png_address(&png),
+        scale_bar(map.width, unit, metres),
+        grouped(input.surface.len() as u64),
+        significant(map.height_range)
+    )
+}
+
+/// A bar over a picture of this width, with its length, and in metres where the map unit is known.
+fn scale_bar(width: f64, unit: &str, metres_per_unit: Option<f64>) -> String {
+    let length = round_step(LEAST_BAR * width);
+    let metres = metres_per_unit.map(|scale| format!(" = {} m", significant(length * scale)));
+    let unit = if length == 1.0 { unit.trim_end_matches('s') } else { unit };
+    format!(
+        "<div class=\"scale-bar\" style=\"width:{:.2}%\"><span>{} {unit}{}</span></div>",
+        100.0 * length / width,
+        significant(length),
+        metres.unwrap_or_default()
+    )
+}
+
+/// A number with two significant digits, in full.
+fn significant(number: f64) -> String {
+    let decimals = 1.0 - number.abs().max(f64::MIN_POSITIVE).log10().floor();
+    let text = format!("{number:.*}", decimals.clamp(0.0, 12.0) as usize);
+    match text.contains('.') {
+        true => text.trim_end_matches('0').trim_end_matches('.').to_owned(),
+        false => text,
+    }
+}
+
 /// Points and way from above, coloured by height (blue low, red high); `None` without points.
-pub fn map_picture(cloud: &[SurfacePoint], way: &[StampedPose]) -> Option<Picture> {
-    let views = Views::of(way);
+pub fn map_picture(
+    cloud: &[SurfacePoint],
+    way: &[StampedPose],
+    up: Option<Vector3<f64>>,
+) -> Option<MapPicture> {
+    let views = Views::of(way, up);
     let position = |point: &SurfacePoint| Vector3::from(point.position.map(f64::from));
     let flat: Vec<[f64; 3]> = cloud
         .iter()
@@ -47,7 +114,9 @@ pub fn map_picture(cloud: &[SurfacePoint], way: &[StampedPose]) -> Option<Pictur
             *range = [range[0].min(point[axis]), range[1].max(point[axis])];
         }
     }
-    Some(draw(&flat, &way, &ranges))
+    let [_, _, [low, high]] = ranges;
+    let (picture, width) = draw(&flat, &way, &ranges);
+    Some(MapPicture { picture, width, height_range: high - low })
 }
 
 /// Lower and upper end of the values without [`CUT_SHARE`] at either end.
@@ -58,7 +127,8 @@ fn middle_range(values: impl Iterator<Item = f64>) -> Option<[f64; 2]> {
     (high > low).then_some([low, high])
 }
 
-fn draw(points: &[[f64; 3]], way: &[[f64; 2]], ranges: &[[f64; 2]; 3]) -> Picture {
+/// The picture, and the length that its width shows.
+fn draw(points: &[[f64; 3]], way: &[[f64; 2]], ranges: &[[f64; 2]; 3]) -> (Picture, f64) {
     let [x, y, z] = ranges;
     let (x_width, y_width) = (x[1] - x[0], y[1] - y[0]);
     let tallest = MAX_HEIGHT_RATIO * WIDTH as f64;
@@ -93,7 +163,7 @@ fn draw(points: &[[f64; 3]], way: &[[f64; 2]], ranges: &[[f64; 2]; 3]) -> Pictur
     for step in way.windows(2) {
         draw_step(&mut picture, step, pixels_per_unit, &pixel);
     }
-    picture
+    (picture, WIDTH as f64 / pixels_per_unit)
 }
 
 /// A white stroke three pixels wide from one position to the next.
@@ -137,11 +207,22 @@ mod tests {
             nanos: 0,
             world_from_camera: SE3 { translation: [x, 0.0, 10.0].into(), ..SE3::identity() },
         });
-        let picture = map_picture(&cloud, &way).unwrap();
+        let map = map_picture(&cloud, &way, None).unwrap();
+        assert!((90.0..140.0).contains(&map.width), "{}", map.width);
+        let picture = map.picture;
         let seen = picture.pixels.iter().filter(|&&p| p != GROUND && p != WAY).count();
         assert!(seen > 3000, "{seen} of 5000 points are seen");
         assert!(picture.pixels.iter().filter(|&&p| p == WAY).count() > 700);
-        assert_eq!(map_picture(&[], &way), None);
-        assert_eq!(map_picture(&cloud[..1], &[]), None);
+        assert_eq!(map_picture(&[], &way, None), None);
+        assert_eq!(map_picture(&cloud[..1], &[], None), None);
+    }
+
+    #[test]
+    fn the_scale_bar_is_a_round_length_and_says_metres_where_they_are_known() {
+        let bar = scale_bar(6.2, "map units", Some(0.43));
+        assert!(bar.contains("width:16.13%") && bar.contains(">1 map unit = 0.43 m<"), "{bar}");
+        let bar = scale_bar(1300.0, "m", None);
+        assert!(bar.contains("width:15.38%") && bar.contains(">200 m<"), "{bar}");
+        assert!(scale_bar(0.03, "map units", None).contains(">0.005 map units<"));
     }
 }

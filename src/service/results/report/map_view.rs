@@ -2,6 +2,8 @@
 
 use std::fmt::Write;
 
+use nalgebra::Vector3;
+
 use crate::service::results::poses::longest_epoch;
 use crate::service::results::report::html::base64;
 use crate::service::results::report::scene::{
@@ -14,7 +16,7 @@ use crate::slam::fusion::SurfacePoint;
 const MAX_POINTS: usize = 300_000;
 
 /// The section; nothing without points.
-pub fn map_view(input: &ReportInput<'_>) -> String {
+pub fn map_view(input: &ReportInput<'_>, up: Option<Vector3<f64>>) -> String {
     let map = &input.record.map;
     let Some(first) = map.keyframes.first().filter(|_| !input.surface.is_empty()) else {
         return String::new();
@@ -37,7 +39,7 @@ pub fn map_view(input: &ReportInput<'_>) -> String {
         keyframes: &keyframes,
         path: input.trajectory,
         intrinsics: &first.intrinsics,
-        up: None,
+        up: up.map(Into::into),
         max_points: MAX_POINTS,
     });
     let shown = points.len().min(MAX_POINTS);

@@ -3,8 +3,12 @@
 pub mod axis;
 pub mod budget_charts;
 pub mod chart;
+mod chart_figure;
+mod chart_points;
 pub mod charts;
 pub mod evaluation_plot;
+mod figure_words;
+mod figure_words_quality;
 pub mod figures;
 pub mod grade_banner;
 pub mod html;
@@ -24,6 +28,7 @@ use crate::service::results::pictures::{
 };
 use crate::service::results::report::budget_charts::budget_charts;
 use crate::service::results::report::chart::Chart;
+use crate::service::results::report::chart_figure::{CHART_SCRIPT, chart_figure};
 use crate::service::results::report::charts::{
     error_over_time, scale_over_time, time_charts, trajectory_views,
 };
@@ -32,7 +37,7 @@ use crate::service::results::report::grade_banner::grade_banner;
 use crate::service::results::report::html::{escaped, png_address};
 use crate::service::results::report::joint_charts::{depth_charts, joint_charts};
 use crate::service::results::report::loop_section::loop_section;
-use crate::service::results::report::map_picture::map_picture;
+use crate::service::results::report::map_picture::map_section;
 use crate::service::results::report::map_view::map_view;
 use crate::service::results::summary::Summary;
 use crate::service::results::{EndOfRun, RunMode, RunRecord};
@@ -41,6 +46,7 @@ use crate::slam::fusion::SurfacePoint;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::pose::TrackingState;
 use crate::slam::trajectory::StampedPose;
+use crate::slam::up::up_direction;
 
 /// Keyframes whose depth is shown: enough to see the run, few enough for one page.
 const PICTURED_KEYFRAMES: usize = 8;
@@ -87,12 +93,14 @@ pub fn report(input: &ReportInput<'_>) -> String {
         summary.recorded_secs,
         notices(summary, &input.record.ended)
     );
+    let normals = input.surface.iter().map(|point| point.normal);
+    let up = up_direction(input.trajectory.iter(), normals);
     page.push_str(&grade_banner(&summary.grade));
     page.push_str(&cards(summary));
     page.push_str(&states(input.record));
-    page.push_str(&map_view(input));
-    page.push_str(&map(input));
-    section(&mut page, "Trajectory", &trajectory_views(input));
+    page.push_str(&map_view(input, up));
+    page.push_str(&map_section(input, up));
+    section(&mut page, "Trajectory", &trajectory_views(input, up));
     let errors: Vec<Chart> =
         error_over_time(input).into_iter().chain(scale_over_time(input)).collect();
     section(&mut page, "Error", &errors);
@@ -100,11 +108,11 @@ pub fn report(input: &ReportInput<'_>) -> String {
     let of_keyframes = &summary.depth.keyframe_depth;
     section(&mut page, "Depth of the keyframes", &depth_charts(input.record, of_keyframes));
     section(&mut page, "Joint estimation", &joint_charts(input.record));
-    page.push_str(&loop_section(input));
+    page.push_str(&loop_section(input, up));
     section(&mut page, "Time", &time_charts(input.record));
     page.push_str(&budget(input));
     page.push_str(&figures(summary));
-    page.push_str("</main></body></html>\n");
+    let _ = write!(page, "<script>{CHART_SCRIPT}</script></main></body></html>\n");
     page
 }
 
@@ -134,19 +142,6 @@ fn end_notice(ended: &EndOfRun) -> String {
     format!("<p class=\"notice\">{text}</p>")
 }
 
-/// The map from above; nothing without points.
-fn map(input: &ReportInput<'_>) -> String {
-    let picture = map_picture(input.surface, input.trajectory);
-    let Some(png) = picture.and_then(|picture| picture.png()) else { return String::new() };
-    format!(
-        "<section><h2>Map</h2><figure><img alt=\"map from above\" src=\"{}\"><figcaption>{} points \
-         from above, <span class=\"scale near-far\"></span> low to high; the camera's path in \
-         white.</figcaption></figure></section>",
-        png_address(&png),
-        grouped(input.surface.len() as u64)
-    )
-}
-
 /// What a deadline costs; nothing where no frame was aligned again.
 fn budget(input: &ReportInput<'_>) -> String {
     let samples = &input.record.budget_samples;
@@ -162,7 +157,7 @@ fn budget(input: &ReportInput<'_>) -> String {
         samples.len()
     );
     for chart in &charts {
-        let _ = write!(html, "<figure>{}</figure>", chart.svg());
+        html.push_str(&chart_figure(chart));
     }
     html.push_str("</div></section>");
     html
@@ -175,7 +170,7 @@ fn section(page: &mut String, heading: &str, charts: &[Chart]) {
     }
     let _ = write!(page, "<section><h2>{heading}</h2><div class=\"charts\">");
     for chart in charts {
-        let _ = write!(page, "<figure>{}</figure>", chart.svg());
+        page.push_str(&chart_figure(chart));
     }
     page.push_str("</div></section>");
 }

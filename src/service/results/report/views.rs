@@ -1,11 +1,9 @@
 //! Directions in which a trajectory is looked at: from above and from the side.
 
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{Matrix3, UnitQuaternion, Vector3};
 
 use crate::slam::trajectory::StampedPose;
-
-/// Length of the mean of the cameras' up vectors below which they agree on no direction.
-const SHORTEST_UP: f64 = 0.3;
+use crate::slam::up::up_direction;
 
 /// Orthonormal directions of a drawing.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -14,23 +12,29 @@ pub struct Views {
     right: Vector3<f64>,
     /// Level, into the side view.
     forward: Vector3<f64>,
-    /// Where the cameras' upper edges point on average.
+    /// Up, as far as it is known.
     up: Vector3<f64>,
 }
 
 impl Views {
-    /// Directions for these poses. Cameras that do not agree on an up direction (one that looks
-    /// straight down may turn freely) are shown by the extent of their path alone.
-    pub fn of(poses: &[StampedPose]) -> Self {
-        let ups = poses.iter().map(|pose| pose.world_from_camera.rotation * -Vector3::y());
-        let mean_up = ups.sum::<Vector3<f64>>() / poses.len().max(1) as f64;
+    /// Directions for these poses, with what is `up` where that is known; else what the cameras have above them on
+    /// average. Cameras that do not agree on that (one that looks straight down may turn freely) are shown by the extent
+    /// of their path alone.
+    pub fn of(poses: &[StampedPose], up: Option<Vector3<f64>>) -> Self {
         let extent = extent_axes(poses);
-        let up = if mean_up.norm() > SHORTEST_UP { mean_up.normalize() } else { extent[2] };
+        let up = up.or_else(|| up_direction(poses.iter(), std::iter::empty()));
+        let up = up.unwrap_or(extent[2]);
         let level = |axis: &Vector3<f64>| axis - up * up.dot(axis);
         // Of the extent's axes at most one is along `up`; the largest that is not gives the width.
         let right = extent.iter().map(level).find(|axis| axis.norm() > 0.5);
         let right = right.map_or_else(Vector3::x, |axis| axis.normalize());
         Self { right, forward: up.cross(&right), up }
+    }
+
+    /// The same views of a frame that is turned against this one.
+    pub fn turned(self, rotation: &UnitQuaternion<f64>) -> Self {
+        let [right, forward, up] = [self.right, self.forward, self.up].map(|axis| rotation * axis);
+        Self { right, forward, up }
     }
 
     /// Right and forward: seen from above.
@@ -79,13 +83,16 @@ mod tests {
                 StampedPose { nanos: i64::from(i), world_from_camera }
             })
             .collect();
-        let views = Views::of(&poses);
+        let views = Views::of(&poses, None);
         for pose in &poses {
             assert!(views.from_side(&pose.world_from_camera.translation)[1].abs() < 1e-12);
         }
         let [x, y] = views.from_above(&Vector3::new(0.0, 0.0, 1.0));
         assert!(x > 0.9 && y.abs() < 0.5, "the long way lies along x");
-        let _ = Views::of(&[]);
-        let _ = Views::of(&poses[..1]);
+        let slope = Views::of(&poses, Some(-Vector3::x()));
+        assert!((slope.from_side(&-Vector3::x())[1] - 1.0).abs() < 1e-12, "up is as given");
+        assert!(slope.from_above(&Vector3::x()).iter().all(|c| c.abs() < 1e-12));
+        let _ = Views::of(&[], None);
+        let _ = Views::of(&poses[..1], None);
     }
 }
