@@ -14,7 +14,8 @@
     const least = (high - low) / Math.max(count, 1), decade = 10 ** Math.floor(Math.log10(least));
     const step = decade * ([1, 2, 5].find((f) => f * decade >= least * (1 - 1e-9)) ?? 10), list = [];
     for (let i = Math.ceil(low / step); i * step <= high * (1 + 1e-12) && list.length < 50; i++) list.push(i * step);
-    return list.map((value) => [value, written(value, step)]);
+    // One alone says nothing of the scale.
+    return list.length < 3 && count < 20 ? ticks([low, high], count + 1) : list.map((value) => [value, written(value, step)]);
   };
   const decadeTicks = ([low, high], count) => {
     const list = [], stride = Math.ceil((Math.floor(high) - Math.ceil(low) + 1) / Math.max(count, 1));
@@ -64,7 +65,7 @@
       if (value === null || value === undefined) return "";
       const [low, high] = this.chart[axis], isLog = axis === "y" && this.chart.scaling === "decades";
       const text = isLog ? String(+value.toPrecision(3)) : Number.isInteger(value) ? String(value) : written(value, (high - low) / 1000);
-      return this[axis].unit === "%" || this[axis].unit ? `${text} ${this[axis].unit}` : text;
+      return this[axis].unit ? `${text} ${this[axis].unit}` : text;
     }
     draw(width) {
       const { chart, svg } = this, isLog = chart.scaling === "decades";
@@ -88,7 +89,7 @@
       for (const [key, value] of Object.entries({ width, height: bottom + BOTTOM, viewBox: `0 0 ${width} ${bottom + BOTTOM}`, "font-size": TEXT, fill: "currentColor" })) svg.setAttribute(key, value);
       let grid = "";
       const label = (at, down, anchor, text) => make(svg, "text", { x: at, y: down, "text-anchor": anchor, opacity: 0.8 }, text);
-      for (const [value, text] of ticks(x, Math.floor(plotWidth / 75))) { const at = this.px(value); grid += `M${at} ${TOP}V${bottom}`; label(at, bottom + 16, "middle", text); }
+      for (const [value, text] of ticks(x, Math.floor(plotWidth / 60))) { const at = this.px(value); grid += `M${at} ${TOP}V${bottom}`; label(at, bottom + 16, "middle", text); }
       for (const [value, text] of isLog ? decadeTicks(y, count) : ticks(y, Math.max(2, Math.round(plotHeight / 45)))) {
         const at = TOP + (y[1] - value) / (y[1] - y[0]) * plotHeight; grid += `M${left} ${at}H${right}`; label(left - 6, at + 4, "end", text);
       }
@@ -149,12 +150,13 @@
       for (const p of found) {
         const line = make(this.tip, "div", {});
         make(line, "i", { style: `background:${p.s.colour}` });
-        line.append([nameOf(p.s), this.y.name, this.value(p.y, "y")].filter(Boolean).join(" "));
+        const name = nameOf(p.s), what = this.chart.scaling === "equal" ? [name, this.y.name].filter(Boolean).join(", ") : name || this.y.name;
+        line.append(`${what} ${this.value(p.y, "y")}`);
       }
       this.tip.hidden = false;
       const width = this.tip.offsetWidth, after = middle(first) + 12;
       this.tip.style.left = `${Math.max(0, after + width > right ? middle(first) - 12 - width : after, 0)}px`;
-      this.tip.style.top = `${this.svg.offsetTop + TOP}px`;
+      this.tip.style.top = `${this.svg.getBoundingClientRect().top - this.box.getBoundingClientRect().top + TOP}px`;
     }
     leave() { this.tip.hidden = true; this.cursor?.replaceChildren(); }
   }

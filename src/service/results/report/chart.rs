@@ -103,7 +103,8 @@ impl Chart {
             "<svg class=\"chart\" xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {CHART_WIDTH} {}\" \
              font-family=\"system-ui, sans-serif\" font-size=\"12\" fill=\"currentColor\" role=\"img\">\
              <title>{}</title>",
-            self.height, self.title
+            self.height,
+            escaped(self.title)
         );
         draw_text(
             &mut svg,

@@ -66,7 +66,7 @@ pub fn trajectory_charts(
     };
     let estimate: Vec<StampedPose> = estimate.iter().map(place).collect();
     let keyframes: Vec<StampedPose> = keyframes.iter().map(place).collect();
-    let chart = |title, y_label: &str, project: &dyn Fn(&Vector3<f64>) -> [f64; 2]| {
+    let chart = |title, meaning, y_label: &str, project: &dyn Fn(&Vector3<f64>) -> [f64; 2]| {
         let points = |poses: &[StampedPose]| -> Vec<[f64; 2]> {
             poses.iter().map(|pose| project(&pose.world_from_camera.translation)).collect()
         };
@@ -92,7 +92,7 @@ pub fn trajectory_charts(
         ];
         Chart {
             title,
-            meaning: TRAJECTORY_MEANING,
+            meaning,
             x_label: format!("along the longest extent of the path [{unit}]"),
             y_label: format!("{y_label} [{unit}]"),
             height: 420.0,
@@ -101,8 +101,8 @@ pub fn trajectory_charts(
         }
     };
     [
-        chart("Trajectory from above", "across", &|p| views.from_above(p)),
-        chart("Trajectory from the side", "up", &|p| views.from_side(p)),
+        chart("Trajectory from above", ABOVE_MEANING, "across", &|p| views.from_above(p)),
+        chart("Trajectory from the side", SIDE_MEANING, "up", &|p| views.from_side(p)),
     ]
 }
 
@@ -268,8 +268,10 @@ const LATENCY: Times = Times {
     meaning: "From a frame's stamp to the publication of its pose: how old a pose is when it can be used.",
 };
 
-const TRAJECTORY_MEANING: &str = "Path of the camera; keyframes are the frames that carry the map. With ground truth the \
-                                  estimate is aligned to it, and good means that the two lines cover each other.";
+const ABOVE_MEANING: &str = "Path of the camera; keyframes are the frames that carry the map. With ground truth the \
+                             estimate is aligned to it, and good means that the two lines cover each other.";
+const SIDE_MEANING: &str = "The same from the side, one length along both axes: how the camera rose and fell. Up is \
+                            estimated from how it was held and from horizontal surfaces.";
 
 fn time_chart(times: &Times, points: Vec<[f64; 2]>) -> Chart {
     let colour = times.colour;

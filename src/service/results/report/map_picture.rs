@@ -24,6 +24,10 @@ const CUT_SHARE: f64 = 0.01;
 /// Points on a pixel that make it nearly as bright as it gets.
 const POINTS_FOR_BRIGHT: f64 = 6.0;
 
+/// Part of the rainbow that is used: its ends are as dark as the ground.
+const LOWEST_COLOUR: f64 = 0.14;
+const HIGHEST_COLOUR: f64 = 0.92;
+
 const GROUND: Rgb = [16, 20, 27];
 const WAY: Rgb = [255, 255, 255];
 
@@ -142,9 +146,13 @@ fn draw(points: &[[f64; 3]], way: &[[f64; 2]], ranges: &[[f64; 2]; 3]) -> (Pictu
     };
     let mut counts = vec![(0u32, 0.0f64); WIDTH * height];
     for &[px, py, pz] in points {
-        if let Some(i) = pixel(px, py) {
-            counts[i].0 += 1;
-            counts[i].1 += pz;
+        // Two pixels wide and high: single ones fade where a page shows the picture smaller.
+        let half = 0.5 / pixels_per_unit;
+        for (dx, dy) in [(-half, -half), (-half, half), (half, -half), (half, half)] {
+            if let Some(i) = pixel(px + dx, py + dy) {
+                counts[i].0 += 1;
+                counts[i].1 += pz;
+            }
         }
     }
     let colour = |&(count, sum): &(u32, f64)| {
@@ -154,7 +162,8 @@ fn draw(points: &[[f64; 3]], way: &[[f64; 2]], ranges: &[[f64; 2]; 3]) -> (Pictu
         let share = (sum / f64::from(count) - z[0]) / (z[1] - z[0]);
         // A single point is already seen; more make it brighter.
         let bright = 1.0 - 0.65 * (-f64::from(count) / POINTS_FOR_BRIGHT).exp();
-        let full = rainbow(0.08 + 0.84 * share.clamp(0.0, 1.0));
+        let full =
+            rainbow(LOWEST_COLOUR + (HIGHEST_COLOUR - LOWEST_COLOUR) * share.clamp(0.0, 1.0));
         std::array::from_fn(|c| {
             (f64::from(GROUND[c]) * (1.0 - bright) + f64::from(full[c]) * bright) as u8
         })
