@@ -10,9 +10,10 @@ use crate::slam::trajectory::StampedPose;
 /// Length of the mean of the cameras' up vectors below which they agree on no direction.
 const SHORTEST_MEAN: f64 = 0.3;
 
-/// Furthest that up is sought from the cameras' mean, radians: a camera that looks at a table is tilted by 30° or so. At
-/// twice as much a wall could be taken for a floor.
-const MOST_TILT: f64 = 35.0 * DEGREE;
+/// How far up is sought from the cameras' mean, radians, and the least share of the normals that must point there or
+/// opposite. A camera that looks at a table is tilted by 30° or so, one that looks at the floor before its feet by 40°;
+/// further off a wall could be taken for a floor. Of evenly spread directions 1.5 % are within the last cone.
+const LIMITS: [(f64, f64); 2] = [(35.0 * DEGREE, 0.05), (50.0 * DEGREE, 0.12)];
 
 /// Surfaces whose normals differ from a direction by less agree with it at first, and in the end: normals of neighbouring
 /// points scatter by some ten degrees. Radians.
@@ -30,15 +31,12 @@ const MOST_STARTS: usize = 200;
 /// Fewest normals that are a surface.
 const FEWEST_NORMALS: usize = 100;
 
-/// Least share of the normals within the last cone: 1.5 % of evenly spread directions are.
-const LEAST_SHARE: f64 = 0.05;
-
 const DEGREE: f64 = std::f64::consts::PI / 180.0;
 
 /// The direction that is up, a unit vector in the frame of `poses` and `normals`; `None` where the cameras agree on none.
 ///
-/// Of the directions within 35° of the mean of the cameras' up vectors it is the one that most normals share, pointing up
-/// or down, and the mean itself where too few do. Zero and non-finite normals do not count.
+/// Of the directions near the mean of the cameras' up vectors it is the one that most normals share, pointing up or down,
+/// and the mean itself where too few do. Zero and non-finite normals do not count.
 pub fn up_direction<'a>(
     poses: impl Iterator<Item = &'a StampedPose>,
     normals: impl ExactSizeIterator<Item = [f32; 3]>,
@@ -50,7 +48,10 @@ pub fn up_direction<'a>(
         .filter_map(|normal| Vector3::from(normal.map(f64::from)).try_normalize(0.5))
         .filter(|normal| normal.iter().all(|c| c.is_finite()))
         .collect();
-    Some(shared_normal(&mean, &normals).unwrap_or(mean))
+    let shared = LIMITS
+        .into_iter()
+        .find_map(|(most_tilt, share)| shared_normal(&mean, &normals, most_tilt.cos(), share));
+    Some(shared.unwrap_or(mean))
 }
 
 /// The mean of what the cameras had above them.
@@ -63,9 +64,13 @@ fn mean_up<'a>(poses: impl Iterator<Item = &'a StampedPose>) -> Option<Vector3<f
     (mean.norm() > SHORTEST_MEAN).then(|| mean.normalize())
 }
 
-/// The normal that most have in common, near enough to `mean`.
-fn shared_normal(mean: &Vector3<f64>, normals: &[Vector3<f64>]) -> Option<Vector3<f64>> {
-    let least = MOST_TILT.cos();
+/// The normal that most have in common, this `share` of them at least; its product with `mean` is more than `least`.
+fn shared_normal(
+    mean: &Vector3<f64>,
+    normals: &[Vector3<f64>],
+    least: f64,
+    share: f64,
+) -> Option<Vector3<f64>> {
     let upright: Vec<Vector3<f64>> = normals
         .iter()
         .map(|normal| if normal.dot(mean) < 0.0 { -normal } else { *normal })
@@ -85,7 +90,7 @@ fn shared_normal(mean: &Vector3<f64>, normals: &[Vector3<f64>]) -> Option<Vector
         up = sum.try_normalize(f64::EPSILON)?;
     }
     let count = within(normals, &up, cone).count();
-    let is_shared = count >= FEWEST_NORMALS && count as f64 >= LEAST_SHARE * normals.len() as f64;
+    let is_shared = count >= FEWEST_NORMALS && count as f64 >= share * normals.len() as f64;
     (is_shared && up.dot(mean) > least).then_some(up)
 }
 
@@ -149,6 +154,19 @@ mod tests {
             let mean = up_direction(poses.iter(), std::iter::empty()).unwrap();
             assert!((degrees(mean, up) - f64::abs(tilt)).abs() < 1.0, "the mean is tilted");
         }
+    }
+
+    #[test]
+    fn a_camera_that_looks_down_at_a_large_floor_finds_it_and_a_small_one_keeps_the_mean() {
+        let up = -Vector3::y();
+        let poses = cameras(f64::to_radians(-42.0));
+        let walls = |count: usize| surface(Vector3::x(), count);
+        let large = [surface(up, 2000), walls(4000)].concat();
+        let found = up_direction(poses.iter(), large.iter().copied()).unwrap();
+        assert!(degrees(found, up) < 2.0, "{:.2}", degrees(found, up));
+        let small = [surface(up, 500), walls(6000)].concat();
+        let found = up_direction(poses.iter(), small.iter().copied());
+        assert_eq!(found, up_direction(poses.iter(), std::iter::empty()));
     }
 
     #[test]

@@ -63,8 +63,9 @@
     /** A value of an axis with its unit. */
     value(value, axis) {
       if (value === null || value === undefined) return "";
-      const [low, high] = this.chart[axis], isLog = axis === "y" && this.chart.scaling === "decades";
-      const text = isLog ? String(+value.toPrecision(3)) : Number.isInteger(value) ? String(value) : written(value, (high - low) / 1000);
+      const { scaling, x, y } = this.chart, isLog = axis === "y" && scaling === "decades";
+      const range = scaling === "equal" ? Math.max(x[1] - x[0], y[1] - y[0]) : this.chart[axis][1] - this.chart[axis][0];
+      const text = isLog ? String(+value.toPrecision(3)) : Number.isInteger(value) ? String(value) : written(value, range / 1000);
       return this[axis].unit ? `${text} ${this[axis].unit}` : text;
     }
     draw(width) {

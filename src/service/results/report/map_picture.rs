@@ -21,6 +21,9 @@ const MAX_HEIGHT_RATIO: f64 = 0.7;
 /// Share of the points at either end that the picture leaves out: outliers would shrink the rest.
 const CUT_SHARE: f64 = 0.01;
 
+/// Space around what is shown, as a share of it.
+const MARGIN_RATIO: f64 = 0.02;
+
 /// Points on a pixel that make it nearly as bright as it gets.
 const POINTS_FOR_BRIGHT: f64 = 6.0;
 
@@ -117,6 +120,8 @@ pub fn map_picture(
         for point in &way {
             *range = [range[0].min(point[axis]), range[1].max(point[axis])];
         }
+        let margin = MARGIN_RATIO * (range[1] - range[0]);
+        *range = [range[0] - margin, range[1] + margin];
     }
     let [_, _, [low, high]] = ranges;
     let (picture, width) = draw(&flat, &way, &ranges);
