@@ -4,18 +4,22 @@ use std::fs::{self, File};
 use std::io::{self, BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 
+use semidense::service::results::ply::read_surface;
 use semidense::service::results::report::scene::{SceneInput, SceneKeyframe, ScenePoint, pack};
 use semidense::service::trajectory_file::{TrajectoryFileError, nanos_from_secs, read_trajectory};
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::geometry::sim3::Sim3;
 use semidense::slam::trajectory::StampedPose;
+use semidense::slam::up::up_direction;
 use serde_json::Value;
 
 /// Most lines of a PLY's header.
 const MAX_HEADER_LINES: usize = 256;
 /// Most bytes of one point of a PLY: ours has 40.
 const MAX_POINT_BYTES: usize = 1024;
+/// Points that are asked for their normals, to find what is up.
+const MOST_NORMALS: usize = 20_000;
 /// Points that are read at a time.
 const CHUNK: usize = 4096;
 /// The camera where the folder does not say: 640 by 480, 62° wide.
@@ -51,12 +55,15 @@ pub fn read_run(folder: &Path, max_points: usize) -> Result<Vec<u8>, FinishedErr
     let path: Vec<StampedPose> = read_trajectory(&folder.join("trajectory.txt"))?;
     let points = read_points(&folder.join("map.ply"), max_points)?;
     let intrinsics = camera(&read_summary(folder)).unwrap_or(USUAL_CAMERA);
+    // A cloud without normals leaves it to the cameras.
+    let surface = read_surface(&folder.join("map.ply"), MOST_NORMALS).unwrap_or_default();
+    let up = up_direction(path.iter(), surface.iter().map(|point| point.normal));
     Ok(pack(&SceneInput {
         points: &points,
         keyframes: &keyframes,
         path: &path,
         intrinsics: &intrinsics,
-        up: None,
+        up: up.map(Into::into),
         max_points,
     }))
 }

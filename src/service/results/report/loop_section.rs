@@ -82,8 +82,7 @@ fn from_above(record: &RunRecord, searches: &[SearchRecord], up: Option<Vector3<
         .filter_map(|link| Some([at(link.i)?, at(link.j)?]));
     // A broken line: one piece for each loop.
     let links = links.flat_map(|[i, j]| [i, j, [f64::NAN; 2]]).collect();
-    let series = |name, colour, mark, points| Series { name, colour, mark, points };
-    let dots = |radius| Mark::Dots(radius);
+    let line = |name, colour, points| Series { name, colour, mark: Mark::Path, points };
     let path = way.iter().map(|pose| views.from_above(&pose.world_from_camera.translation));
     Chart {
         title: "Loops from above",
@@ -93,38 +92,31 @@ fn from_above(record: &RunRecord, searches: &[SearchRecord], up: Option<Vector3<
         y_label: "across [map units]".into(),
         height: 480.0,
         scaling: Scaling::Equal,
-        series: vec![
-            series("keyframes", TRUTH, Mark::Path, path.collect()),
-            series(
-                "other place",
-                ERROR,
-                dots(REFUSED_RADIUS),
-                of(|fate| {
-                    matches!(
-                        fate,
-                        SearchFate::Refused(_) | SearchFate::Unconfirmed | SearchFate::Inconsistent
-                    )
-                }),
-            ),
-            series(
-                "against the drift",
-                ONLINE,
-                dots(REFUSED_RADIUS),
-                of(|fate| matches!(fate, SearchFate::AgainstDrift(_))),
-            ),
-            series(
-                "held already",
-                ESTIMATE,
-                dots(LOOP_RADIUS),
-                of(|fate| *fate == SearchFate::Held),
-            ),
-            series(
-                "closed or joined",
-                MAPPING,
-                dots(LOOP_RADIUS),
-                of(|fate| matches!(fate, SearchFate::Closed | SearchFate::Joined)),
-            ),
-            series("loops of the map", MAPPING, Mark::Path, links),
-        ],
+        series: [line("keyframes", TRUTH, path.collect())]
+            .into_iter()
+            .chain(place_series(&of))
+            .chain([line("loops of the map", MAPPING, links)])
+            .collect(),
     }
+}
+
+/// Where searches ended how: `of` gives the places of those with such a fate.
+fn place_series(of: &dyn Fn(fn(&SearchFate) -> bool) -> Vec<[f64; 2]>) -> [Series; 4] {
+    let dots = |name, colour, radius, is| Series {
+        name,
+        colour,
+        mark: Mark::Dots(radius),
+        points: of(is),
+    };
+    let is_other = |fate: &SearchFate| {
+        matches!(fate, SearchFate::Refused(_) | SearchFate::Unconfirmed | SearchFate::Inconsistent)
+    };
+    let is_too_far = |fate: &SearchFate| matches!(fate, SearchFate::AgainstDrift(_));
+    let moved_the_map = |fate: &SearchFate| matches!(fate, SearchFate::Closed | SearchFate::Joined);
+    [
+        dots("other place", ERROR, REFUSED_RADIUS, is_other as fn(&SearchFate) -> bool),
+        dots("against the drift", ONLINE, REFUSED_RADIUS, is_too_far),
+        dots("held already", ESTIMATE, LOOP_RADIUS, |fate| *fate == SearchFate::Held),
+        dots("closed or joined", MAPPING, LOOP_RADIUS, moved_the_map),
+    ]
 }
