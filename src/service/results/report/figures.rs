@@ -145,7 +145,7 @@ fn plain(number: f64) -> String {
         return "0".to_owned();
     }
     let decimals = DIGITS - number.abs().log10().floor();
-    if decimals > 8.0 || decimals < -9.0 {
+    if !(-9.0..=8.0).contains(&decimals) {
         return format!("{number:.2e}");
     }
     format!("{number:.*}", decimals.max(0.0) as usize)

@@ -68,7 +68,7 @@ fn from_above(record: &RunRecord, searches: &[SearchRecord], up: Option<Vector3<
         let keyframe = record.map.get(id)?;
         Some(views.from_above(&keyframe.map_from_keyframe.rigid.translation))
     };
-    let of = |is: fn(&SearchFate) -> bool| -> Vec<[f64; 2]> {
+    let of = |is: IsFate| -> Vec<[f64; 2]> {
         let found = searches.iter().filter(|search| is(&search.report.fate));
         found.filter_map(|search| at(search.report.keyframe_id)).collect()
     };
@@ -100,8 +100,11 @@ fn from_above(record: &RunRecord, searches: &[SearchRecord], up: Option<Vector3<
     }
 }
 
+/// Whether a search ended so.
+type IsFate = fn(&SearchFate) -> bool;
+
 /// Where searches ended how: `of` gives the places of those with such a fate.
-fn place_series(of: &dyn Fn(fn(&SearchFate) -> bool) -> Vec<[f64; 2]>) -> [Series; 4] {
+fn place_series(of: &dyn Fn(IsFate) -> Vec<[f64; 2]>) -> [Series; 4] {
     let dots = |name, colour, radius, is| Series {
         name,
         colour,
@@ -114,7 +117,7 @@ fn place_series(of: &dyn Fn(fn(&SearchFate) -> bool) -> Vec<[f64; 2]>) -> [Serie
     let is_too_far = |fate: &SearchFate| matches!(fate, SearchFate::AgainstDrift(_));
     let moved_the_map = |fate: &SearchFate| matches!(fate, SearchFate::Closed | SearchFate::Joined);
     [
-        dots("other place", ERROR, REFUSED_RADIUS, is_other as fn(&SearchFate) -> bool),
+        dots("other place", ERROR, REFUSED_RADIUS, is_other as IsFate),
         dots("against the drift", ONLINE, REFUSED_RADIUS, is_too_far),
         dots("held already", ESTIMATE, LOOP_RADIUS, |fate| *fate == SearchFate::Held),
         dots("closed or joined", MAPPING, LOOP_RADIUS, moved_the_map),

@@ -112,7 +112,7 @@ pub fn report(input: &ReportInput<'_>) -> String {
     section(&mut page, "Time", &time_charts(input.record));
     page.push_str(&budget(input));
     page.push_str(&figures(summary));
-    let _ = write!(page, "<script>{CHART_SCRIPT}</script></main></body></html>\n");
+    let _ = writeln!(page, "<script>{CHART_SCRIPT}</script></main></body></html>");
     page
 }
 
