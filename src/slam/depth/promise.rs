@@ -28,6 +28,26 @@ pub struct PixelLanes {
     pub structure: [Lanes; 3],
 }
 
+/// Where the pixels of a row are in the frame.
+struct Projected {
+    u: [f32; LANES],
+    v: [f32; LANES],
+    /// Depth in the keyframe over depth in the frame.
+    depth_ratio: [f32; LANES],
+    /// Displacement by the translation, focal lengths.
+    parallax: [f32; LANES],
+    is_inside: [bool; LANES],
+}
+
+/// Directions of the epipolar lines in the keyframe, and what a pixel along them tells.
+struct Lines {
+    /// Along the line and across it, keyframe pixels per frame pixel.
+    along: [[f32; LANES]; 2],
+    across: [[f32; LANES]; 2],
+    inverse_depth_per_px: [f32; LANES],
+    is_regular: [bool; LANES],
+}
+
 /// Whether each pixel of row `v` is seen within a frame of `size` (width, height), and one match there
 /// promises to leave no more than the share `enough` of its variance.
 #[inline(always)]
@@ -40,50 +60,9 @@ pub fn promises(
     enough: f32,
     params: &MatchingParams,
 ) -> [bool; LANES] {
-    let (m, kt) = (&view.rotation, &view.translation);
+    let at = project(pixels, v, view, size);
+    let lines = lines(&at, view);
     let mut promises = [false; LANES];
-    // Projection.
-    let (mut at_u, mut at_v, mut depth_ratio) = ([0.0; LANES], [0.0; LANES], [0.0; LANES]);
-    let mut parallax = [0.0; LANES];
-    let right = size.0 as f32 - 1.0 - MARGIN_PX;
-    let bottom = size.1 as f32 - 1.0 - MARGIN_PX;
-    for k in 0..LANES {
-        let (u, d) = (pixels.u[k], pixels.inverse_depth[k]);
-        let pr_u = m[0][0] * u + m[0][1] * v + m[0][2];
-        let pr_v = m[1][0] * u + m[1][1] * v + m[1][2];
-        let pr_z = m[2][0] * u + m[2][1] * v + m[2][2];
-        let z = pr_z + kt[2] * d;
-        depth_ratio[k] = 1.0 / z;
-        at_u[k] = (pr_u + kt[0] * d) * depth_ratio[k];
-        at_v[k] = (pr_v + kt[1] * d) * depth_ratio[k];
-        let (du, dv) = (at_u[k] - pr_u / pr_z, at_v[k] - pr_v / pr_z);
-        parallax[k] = (du * du + dv * dv).sqrt() * view.per_focal_length;
-        promises[k] = (z > MIN_DEPTH_RATIO)
-            & (at_u[k] >= MARGIN_PX)
-            & (at_v[k] >= MARGIN_PX)
-            & (at_u[k] < right)
-            & (at_v[k] < bottom);
-    }
-    // The line's direction in the keyframe.
-    let (mut along_u, mut along_v) = ([0.0; LANES], [0.0; LANES]);
-    let (mut across_u, mut across_v) = ([0.0; LANES], [0.0; LANES]);
-    let mut inverse_depth_per_px = [0.0; LANES];
-    for k in 0..LANES {
-        let (u, v, s) = (at_u[k], at_v[k], depth_ratio[k]);
-        let (speed_u, speed_v) = ((kt[0] - kt[2] * u) * s, (kt[1] - kt[2] * v) * s);
-        let speed = (speed_u * speed_u + speed_v * speed_v).sqrt();
-        let (du, dv) = (speed_u / speed, speed_v / speed);
-        let (uu, uv) = ((m[0][0] - u * m[2][0]) * s, (m[0][1] - u * m[2][1]) * s);
-        let (vu, vv) = ((m[1][0] - v * m[2][0]) * s, (m[1][1] - v * m[2][1]) * s);
-        let determinant = uu * vv - uv * vu;
-        let (a, b) = (vv / determinant, -uv / determinant);
-        let (c, d) = (-vu / determinant, uu / determinant);
-        (along_u[k], along_v[k]) = (a * du + b * dv, c * du + d * dv);
-        (across_u[k], across_v[k]) = (-a * dv + b * du, -c * dv + d * du);
-        inverse_depth_per_px[k] = 1.0 / speed;
-        promises[k] &= (speed > f32::MIN_POSITIVE) & DETERMINANT.contains(&determinant);
-    }
-    // What a match there would be worth.
     let samples = PATTERN.len() as f32;
     let pixel_std_dev = params.noise.pixel_std_dev;
     let noise = (1.0 + gain * gain) * pixel_std_dev * pixel_std_dev;
@@ -93,30 +72,94 @@ pub fn promises(
         let uu = gain * gain * structure_uu[k];
         let uv = gain * gain * structure_uv[k];
         let vv = gain * gain * structure_vv[k];
-        let (a, b) = (along_u[k], along_v[k]);
-        let (c, d) = (across_u[k], across_v[k]);
+        let (a, b) = (lines.along[0][k], lines.along[1][k]);
+        let (c, d) = (lines.across[0][k], lines.across[1][k]);
         let measured = uu * a * a + uv * (a * b + b * a) + vv * b * b;
         let by_noise = 0.5 * samples * (gain * pixel_std_dev).powi(2) * (a * a + b * b);
         let information = measured - by_noise;
         let tangent = (uu * a * c + uv * (a * d + b * c) + vv * b * d) / information;
         let geometric = params.line_noise_px * params.line_noise_px * (1.0 + tangent * tangent);
         let photometric = noise * measured / (information * information);
-        let slant = params.slant_noise_px * parallax[k];
+        let slant = params.slant_noise_px * at.parallax[k];
         let sampling = params.sampling_noise_px * params.sampling_noise_px + slant * slant;
         let match_variance = geometric + photometric + sampling;
         let independent = params.independent_line_ratio * geometric
             + photometric / (1.0 + gain * gain)
             + params.sampling_noise_px * params.sampling_noise_px;
-        let factor = inverse_depth_per_px[k] * inverse_depth_per_px[k];
+        let factor = lines.inverse_depth_per_px[k] * lines.inverse_depth_per_px[k];
         let (variance, known) = (pixels.variance[k], pixels.independent[k]);
         let left = Gain::of(
             Uncertainty { variance, independent: known },
             Uncertainty { variance: factor * match_variance, independent: factor * independent },
         )
         .left;
-        promises[k] &= (information >= least) & !(left.variance > enough * variance);
+        promises[k] = at.is_inside[k]
+            & lines.is_regular[k]
+            & (information >= least)
+            & !(left.variance > enough * variance);
     }
     promises
+}
+
+#[inline(always)]
+fn project(pixels: &PixelLanes, v: f32, view: &TwoView, size: (usize, usize)) -> Projected {
+    let (m, kt) = (&view.rotation, &view.translation);
+    let zero = [0.0; LANES];
+    let mut at = Projected {
+        u: zero,
+        v: zero,
+        depth_ratio: zero,
+        parallax: zero,
+        is_inside: [false; LANES],
+    };
+    let right = size.0 as f32 - 1.0 - MARGIN_PX;
+    let bottom = size.1 as f32 - 1.0 - MARGIN_PX;
+    for k in 0..LANES {
+        let (u, d) = (pixels.u[k], pixels.inverse_depth[k]);
+        let pr_u = m[0][0] * u + m[0][1] * v + m[0][2];
+        let pr_v = m[1][0] * u + m[1][1] * v + m[1][2];
+        let pr_z = m[2][0] * u + m[2][1] * v + m[2][2];
+        let z = pr_z + kt[2] * d;
+        at.depth_ratio[k] = 1.0 / z;
+        at.u[k] = (pr_u + kt[0] * d) * at.depth_ratio[k];
+        at.v[k] = (pr_v + kt[1] * d) * at.depth_ratio[k];
+        let (du, dv) = (at.u[k] - pr_u / pr_z, at.v[k] - pr_v / pr_z);
+        at.parallax[k] = (du * du + dv * dv).sqrt() * view.per_focal_length;
+        at.is_inside[k] = (z > MIN_DEPTH_RATIO)
+            & (at.u[k] >= MARGIN_PX)
+            & (at.v[k] >= MARGIN_PX)
+            & (at.u[k] < right)
+            & (at.v[k] < bottom);
+    }
+    at
+}
+
+#[inline(always)]
+fn lines(at: &Projected, view: &TwoView) -> Lines {
+    let (m, kt) = (&view.rotation, &view.translation);
+    let zero = [0.0; LANES];
+    let mut lines = Lines {
+        along: [zero; 2],
+        across: [zero; 2],
+        inverse_depth_per_px: zero,
+        is_regular: [false; LANES],
+    };
+    for k in 0..LANES {
+        let (u, v, s) = (at.u[k], at.v[k], at.depth_ratio[k]);
+        let (speed_u, speed_v) = ((kt[0] - kt[2] * u) * s, (kt[1] - kt[2] * v) * s);
+        let speed = (speed_u * speed_u + speed_v * speed_v).sqrt();
+        let (du, dv) = (speed_u / speed, speed_v / speed);
+        let (uu, uv) = ((m[0][0] - u * m[2][0]) * s, (m[0][1] - u * m[2][1]) * s);
+        let (vu, vv) = ((m[1][0] - v * m[2][0]) * s, (m[1][1] - v * m[2][1]) * s);
+        let determinant = uu * vv - uv * vu;
+        let (a, b) = (vv / determinant, -uv / determinant);
+        let (c, d) = (-vu / determinant, uu / determinant);
+        (lines.along[0][k], lines.along[1][k]) = (a * du + b * dv, c * du + d * dv);
+        (lines.across[0][k], lines.across[1][k]) = (-a * dv + b * du, -c * dv + d * du);
+        lines.inverse_depth_per_px[k] = 1.0 / speed;
+        lines.is_regular[k] = (speed > f32::MIN_POSITIVE) & DETERMINANT.contains(&determinant);
+    }
+    lines
 }
 
 #[cfg(test)]

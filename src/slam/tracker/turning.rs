@@ -16,7 +16,9 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::sums::SumPyramid;
-use crate::slam::pose::{Brightness, DegradedReason, LostReason, PoseEstimate, TrackingState};
+use crate::slam::pose::{
+    Brightness, DegradedReason, LostReason, PoseEstimate, Quality, TrackingState,
+};
 use crate::slam::tracker::covariance_floor::displacement_covariance;
 use crate::slam::tracker::verdict::quality_of;
 use crate::slam::tracker::{MOST_DEVIATIONS, Memory, Tracker, upper_triangle};
@@ -342,58 +344,33 @@ impl Tracker {
         place: &Place,
         distance_variance: f64,
     ) -> Option<(PoseEstimate, Matrix6<f64>)> {
-        let mut quality = self.quality(alignment);
-        if alignment.ending == Ending::OutOfBudget {
-            let unsolved_px = CUT_SHORT_PX * f64::from(1u32 << view.finest_level());
-            quality.displacement_px = quality.displacement_px.hypot(unsolved_px);
-        }
-        let fits = self.params.verdict.judge(alignment, &quality, false, 0);
-        let is_seen = quality.points >= FEWEST_POINTS
-            && matches!(
-                fits,
-                TrackingState::Tracking
-                    | TrackingState::Degraded(DegradedReason::LowOverlap | DegradedReason::Budget)
-            );
-        // By the image's noise alone: parallax that the uncertain depth would explain is no rotation.
-        let explained = self.aligner.explanation(view, &self.pyramid, alignment);
-        let inliers = f64::from(explained.inliers) / f64::from(explained.compared.max(1));
-        let is_even = alignment.state.brightness.a.abs() <= MOST_GAIN;
+        let quality = self.quality_on_view(view, alignment);
         let predicted = self.memory.motion.predict(frame.capture_nanos, 1.0)?;
         let expected = place.world_from_view.locate(&predicted).inverse();
-        let change = expected.rotation.angle_to(&alignment.state.current_from_keyframe.rotation);
-        let is_smooth = self.turning.is_first || change <= MOST_CHANGE_RAD;
-        if !is_smooth || !is_seen || inliers < LEAST_INLIERS || !is_even {
+        if !self.fits_view(view, alignment, &quality, &expected) {
             return None;
         }
         // What turns and what moves look alike over a step: added up, translations would run away by a scene in seconds.
         let rotation = alignment.state.current_from_keyframe.rotation;
         let current_from_view = SE3 { rotation, ..SE3::identity() };
-        let mut of_step = alignment.covariance(&self.params.alignment)?
-            + from_prior(alignment, view.translation_information(), distance_variance)?
-            + alignment.covariance_from_modes(view).unwrap_or_default()
-            + displacement_covariance(quality.displacement_px, &self.intrinsics, 1.0);
-        of_step.fixed_view_mut::<3, 6>(0, 0).fill(0.0);
-        of_step.fixed_view_mut::<6, 3>(0, 0).fill(0.0);
-        (0..3).for_each(|axis| of_step[(axis, axis)] = distance_variance);
-        // A comparison that is false of what is no number.
-        if !(rotation_std_dev(&of_step) <= MOST_ROTATION_STD_DEV) {
-            return None;
-        }
+        let of_step =
+            self.step_covariance(view, alignment, quality.displacement_px, distance_variance)?;
         let adjoint = current_from_view.adjoint();
         let covariance = of_step + adjoint * place.covariance * adjoint.transpose();
-        let world_from_camera = place.world_from_view.place(&current_from_view.inverse());
-        let mut published = covariance;
-        let translation: Matrix3<f64> = published.fixed_view::<3, 3>(0, 0).into_owned();
+        let translation: Matrix3<f64> = covariance.fixed_view::<3, 3>(0, 0).into_owned();
         let deviation = translation.symmetric_eigenvalues().max().sqrt();
+        // A comparison that is false of what is no number.
         if !(deviation <= self.params.max_turning_deviation) {
             return None;
         }
+        let world_from_camera = place.world_from_view.place(&current_from_view.inverse());
         let keyframe_from_camera = reference.world_from_keyframe().locate(&world_from_camera);
         let map_from_camera = reference.map_from_keyframe().place(&keyframe_from_camera);
         if !(world_from_camera.is_finite() && map_from_camera.is_finite()) {
             return None;
         }
         let unit = reference.world_from_keyframe().scale;
+        let mut published = covariance;
         scale_translation(&mut published, place.world_from_view.scale / unit);
         let in_map = reference.uncertain_place().of_camera(&keyframe_from_camera, &published);
         let state = TrackingState::Degraded(DegradedReason::Turning);
@@ -412,6 +389,60 @@ impl Tracker {
             ..self.unclaimed(frame, Some(reference), state)
         };
         Some((estimate, covariance))
+    }
+
+    /// Quality of an alignment to the view, with what a step that was cut short may be off.
+    fn quality_on_view(&self, view: &Reference, alignment: &Alignment) -> Quality {
+        let mut quality = self.quality(alignment);
+        if alignment.ending == Ending::OutOfBudget {
+            let unsolved_px = CUT_SHORT_PX * f64::from(1u32 << view.finest_level());
+            quality.displacement_px = quality.displacement_px.hypot(unsolved_px);
+        }
+        quality
+    }
+
+    /// Whether a frame fits the view as well as after a loss, and turns about as `expected`.
+    fn fits_view(
+        &self,
+        view: &Reference,
+        alignment: &Alignment,
+        quality: &Quality,
+        expected: &SE3,
+    ) -> bool {
+        let fits = self.params.verdict.judge(alignment, quality, false, 0);
+        let is_seen = quality.points >= FEWEST_POINTS
+            && matches!(
+                fits,
+                TrackingState::Tracking
+                    | TrackingState::Degraded(DegradedReason::LowOverlap | DegradedReason::Budget)
+            );
+        // By the image's noise alone: parallax that the uncertain depth would explain is no rotation.
+        let explained = self.aligner.explanation(view, &self.pyramid, alignment);
+        let inliers = f64::from(explained.inliers) / f64::from(explained.compared.max(1));
+        let is_even = alignment.state.brightness.a.abs() <= MOST_GAIN;
+        let change = expected.rotation.angle_to(&alignment.state.current_from_keyframe.rotation);
+        let is_smooth = self.turning.is_first || change <= MOST_CHANGE_RAD;
+        is_smooth && is_seen && inliers >= LEAST_INLIERS && is_even
+    }
+
+    /// Covariance of the step from the view, units of the mean depth: of the rotation as it was measured, of the
+    /// translation as far as a hand moves; `None` where the rotation is not known.
+    fn step_covariance(
+        &self,
+        view: &Reference,
+        alignment: &Alignment,
+        displacement_px: f64,
+        distance_variance: f64,
+    ) -> Option<Matrix6<f64>> {
+        let mut of_step = alignment.covariance(&self.params.alignment)?
+            + from_prior(alignment, view.translation_information(), distance_variance)?
+            + alignment.covariance_from_modes(view).unwrap_or_default()
+            + displacement_covariance(displacement_px, &self.intrinsics, 1.0);
+        of_step.fixed_view_mut::<3, 6>(0, 0).fill(0.0);
+        of_step.fixed_view_mut::<6, 3>(0, 0).fill(0.0);
+        (0..3).for_each(|axis| of_step[(axis, axis)] = distance_variance);
+        // A comparison that is false of what is no number.
+        (rotation_std_dev(&of_step) <= MOST_ROTATION_STD_DEV).then_some(of_step)
     }
 }
 

@@ -328,31 +328,8 @@ impl PatternSums {
             lanes(|l| if visible[l] { self.q[1][l] } else { 0.0 }),
             lanes(|l| if visible[l] { self.q[2][l] } else { 1.0 }),
         ];
-        let t = &geometry.translation;
-        let inverse_z = lanes(|l| 1.0 / q[2][l]);
-        let alpha = lanes(|l| geometry.fx * inverse_z[l]);
-        let beta = lanes(|l| geometry.fy * inverse_z[l]);
-        let gamma_u = lanes(|l| -alpha[l] * q[0][l] * inverse_z[l]);
-        let gamma_v = lanes(|l| -beta[l] * q[1][l] * inverse_z[l]);
+        let Displacement { by_u, by_v, speed_u, speed_v } = displacement(geometry, &q, d);
         let zero = [0.0; LANES];
-        let by_u = [
-            lanes(|l| d[l] * alpha[l]),
-            zero,
-            lanes(|l| d[l] * gamma_u[l]),
-            lanes(|l| q[1][l] * gamma_u[l]),
-            lanes(|l| q[2][l] * alpha[l] - q[0][l] * gamma_u[l]),
-            lanes(|l| -q[1][l] * alpha[l]),
-        ];
-        let by_v = [
-            zero,
-            lanes(|l| d[l] * beta[l]),
-            lanes(|l| d[l] * gamma_v[l]),
-            lanes(|l| q[1][l] * gamma_v[l] - q[2][l] * beta[l]),
-            lanes(|l| -q[0][l] * gamma_v[l]),
-            lanes(|l| q[0][l] * beta[l]),
-        ];
-        let speed_u = lanes(|l| alpha[l] * t[0] + gamma_u[l] * t[2]);
-        let speed_v = lanes(|l| beta[l] * t[1] + gamma_v[l] * t[2]);
         let [uu, uv, vv] = &self.squares;
         let [ru, rv, rc, r1] = &self.residuals;
         let mut mixed = [zero; NUM_UNKNOWNS];
@@ -395,6 +372,47 @@ impl PatternSums {
             visible,
         }
     }
+}
+
+/// How points move in the image.
+struct Displacement {
+    /// With each unknown of the pose, pixels.
+    by_u: [Lanes; 6],
+    by_v: [Lanes; 6],
+    /// With inverse depth, pixels.
+    speed_u: Lanes,
+    speed_v: Lanes,
+}
+
+/// How points at `q` of inverse depth `d` move.
+#[inline(always)]
+fn displacement(geometry: &Geometry, q: &[Lanes; 3], d: &Lanes) -> Displacement {
+    let t = &geometry.translation;
+    let inverse_z = lanes(|l| 1.0 / q[2][l]);
+    let alpha = lanes(|l| geometry.fx * inverse_z[l]);
+    let beta = lanes(|l| geometry.fy * inverse_z[l]);
+    let gamma_u = lanes(|l| -alpha[l] * q[0][l] * inverse_z[l]);
+    let gamma_v = lanes(|l| -beta[l] * q[1][l] * inverse_z[l]);
+    let zero = [0.0; LANES];
+    let by_u = [
+        lanes(|l| d[l] * alpha[l]),
+        zero,
+        lanes(|l| d[l] * gamma_u[l]),
+        lanes(|l| q[1][l] * gamma_u[l]),
+        lanes(|l| q[2][l] * alpha[l] - q[0][l] * gamma_u[l]),
+        lanes(|l| -q[1][l] * alpha[l]),
+    ];
+    let by_v = [
+        zero,
+        lanes(|l| d[l] * beta[l]),
+        lanes(|l| d[l] * gamma_v[l]),
+        lanes(|l| q[1][l] * gamma_v[l] - q[2][l] * beta[l]),
+        lanes(|l| -q[0][l] * gamma_v[l]),
+        lanes(|l| q[0][l] * beta[l]),
+    ];
+    let speed_u = lanes(|l| alpha[l] * t[0] + gamma_u[l] * t[2]);
+    let speed_v = lanes(|l| beta[l] * t[1] + gamma_v[l] * t[2]);
+    Displacement { by_u, by_v, speed_u, speed_v }
 }
 
 #[inline(always)]
