@@ -1,6 +1,20 @@
 // A finished run in `semidense view`, and its report opened from a file.
 import { launch, open, picture, stat, until, check, checkPage, lines } from "./browser.mjs";
 
+/** Charts are as wide as their figures, can be read, and say what is under the pointer. */
+async function checkCharts(page, name) {
+  const charts = await page.evaluate(() => [...document.querySelectorAll("figure.drawn .live > svg")].map((svg) => ({
+    width: svg.getBoundingClientRect().width / svg.closest("figure").clientWidth,
+    text: Math.min(...[...svg.querySelectorAll("text")].map((t) => parseFloat(getComputedStyle(t).fontSize))),
+  })));
+  check(`${name}: charts`, charts.length > 2, JSON.stringify(charts));
+  for (const c of charts) check(`${name}: a chart that can be read`, c.width > 0.8 && c.text >= 11, JSON.stringify(c));
+  const first = page.locator("figure.drawn .live > svg").first();
+  await first.scrollIntoViewIfNeeded(); await first.hover();
+  const tip = await page.locator("figure.drawn .live .tip").first().textContent();
+  check(`${name}: values under the pointer`, /\d/.test(tip) && !tip.includes("NaN"), tip);
+}
+
 const [address, report] = lines;
 const browser = await launch();
 try {
@@ -21,6 +35,7 @@ try {
     await page.locator("#map3d").scrollIntoViewIfNeeded();
     const s = await until(page, "the map in the report", (s) => s.points > 500 && s.lit > 1000);
     check("a path in the report", s.path > 3, JSON.stringify(s));
+    await checkCharts(page, name);
     await page.waitForTimeout(600);
     check(`${name}: errors`, page.errors.length === 0, page.errors.join("\n"));
     await picture(page, name);
