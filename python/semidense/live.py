@@ -21,9 +21,16 @@ PATH_BYTES = 4096
 _SAVE_FOLDER, _LOAD_FOLDER, _LOCATE_IN_FOLDER = 2, 3, 4
 
 
-def _stream(kind: Type[M], instance: str, root: Optional[AnyPath], timeout: Optional[float], follow: bool) -> Iterator[M]:
+def _stream(
+    kind: Type[M],
+    instance: str,
+    root: Optional[AnyPath],
+    timeout: Optional[float],
+    follow: bool,
+    copy: bool = True,
+) -> Iterator[M]:
     # Joined when it is called: what is wrong is said there, not at the first turn of the loop.
-    reader = Reader(kind, instance=instance, root=root, timeout=timeout, follow=follow)
+    reader = Reader(kind, instance=instance, root=root, timeout=timeout, follow=follow, copy=copy)
 
     def messages() -> Iterator[M]:
         with reader:
@@ -68,12 +75,14 @@ def keyframes(
     root: Optional[AnyPath] = None,
     timeout: Optional[float] = None,
     follow: bool = False,
+    copy: bool = True,
 ) -> Iterator[Keyframe]:
     """The active keyframe at once, then each new one and each revision of its depth; the newest wins.
 
-    Each is copied once and may be kept.
+    Each is copied once and may be kept. With `copy=False` its points stay in shared memory, where a reader may hold one:
+    write `del keyframe` at the end of the loop, or `TooManyHeld` is raised.
     """
-    return _stream(Keyframe, instance, root, timeout, follow)
+    return _stream(Keyframe, instance, root, timeout, follow, copy)
 
 
 def graph(

@@ -59,10 +59,12 @@ class Reader:
         root: Optional[AnyPath] = None,
         timeout: Optional[float] = None,
         follow: bool = False,
+        copy: bool = True,
     ) -> None:
         """Waits for the instance for `timeout` seconds (None: for ever), else `NotRunning`.
 
-        With `follow` it goes on to the next run of the instance when one ends.
+        With `follow` it continues with the next run of the instance when one ends. Without `copy` the points of a
+        keyframe stay in shared memory, where a reader may hold one: `del` it before the next.
         """
         unknown = [kind for kind in kinds if kind not in _PATHS]
         if unknown or not kinds:
@@ -73,6 +75,7 @@ class Reader:
         self._kinds = tuple(dict.fromkeys(kinds))
         self._timeout = timeout
         self._follow = follow
+        self._copy = copy
         self._ports: Optional[Ports] = None
         self._states: Dict[str, ProcessState] = {}
         self._heard = time.monotonic()
@@ -200,10 +203,12 @@ class Reader:
             yield from self._checked(lambda: Graph(header, messages))
 
     def _keyframe(self) -> Iterator[Keyframe]:
-        # Depth first: the mapper sends the image before it, so the image of what comes is here. Both are copied: there
-        # is room to hold one, and the loop still has the one before when the next comes.
-        if (depth := self._receive("mapper/keyframe")) is not None:
-            self._depth = (depth.header(), depth.copied_array())
+        # Depth first: the mapper sends the image before it, so the image of what comes is here. Points are copied unless
+        # told otherwise: there is room to hold one, and the loop still has the one before when the next comes. An image
+        # serves all revisions of its keyframe.
+        is_free = self._copy or self._depth is None
+        if is_free and (depth := self._receive("mapper/keyframe")) is not None:
+            self._depth = (depth.header(), depth.copied_array() if self._copy else depth.array())
             del depth
         if (image := self._receive("mapper/keyframe_image")) is not None:
             self._image = (image.header(), image.copied_array())
@@ -213,6 +218,9 @@ class Reader:
         (header, points), (image_header, pixels) = self._depth, self._image
         if (header.keyframe_id, header.epoch) != (image_header.keyframe_id, image_header.epoch):
             # The other half is on its way; a newer depth replaces this one.
+            if not self._copy:
+                # It would take the place of the newer one.
+                self._depth = None
             return
         self._depth = None
         yield from self._checked(lambda: Keyframe(header, points, image_header, pixels))

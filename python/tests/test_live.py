@@ -119,6 +119,22 @@ def test_too_many_held_is_said_and_a_copy_may_be_kept(running: Rig) -> None:
     assert len({k.revision for k in kept}) == 5 and not kept[0].points.flags.writeable
 
 
+def test_points_of_a_keyframe_may_stay_in_shared_memory(running: Rig) -> None:
+    revisions = set()
+    for keyframe in semidense.keyframes(copy=False, **options(running)):
+        assert not keyframe.points.flags.owndata and not keyframe.points.flags.writeable
+        revisions.add(keyframe.revision)
+        points, before = keyframe.points, keyframe.points.copy()
+        assert np.array_equal(points, before) and len(points) > 100
+        del keyframe, points
+        if len(revisions) == 5:
+            break
+    with pytest.raises(semidense.TooManyHeld, match="1 messages are held"):
+        held = []
+        for keyframe in semidense.keyframes(copy=False, **options(running)):
+            held.append(keyframe)
+
+
 def test_what_is_held_outlives_the_reader(running: Rig) -> None:
     frame = next(semidense.frames(**options(running)))
     image, before = frame.image, frame.copy().image
