@@ -243,7 +243,7 @@ fn a_full_disk_leaves_the_set_before_and_the_journal() {
         "{binary} replay sim --frames 20 --output {mount}/out {settings} >/dev/null 2>&1 || exit 98
          cat {mount}/out/* | cksum > {mount}/sum
          # Room for nothing but the journal, for some files, for all but the last.
-         for free in 120 400 900 1500; do
+         for free in 120 400 900 1200; do
              dd if=/dev/zero of={mount}/ballast bs=1024 count=$(($(df -k --output=avail {mount} | tail -n 1) - free)) 2>/dev/null
              {binary} replay sim --frames 40 --output {mount}/out {settings} >/dev/null 2>{mount}/../said
              echo \"code $?\"; grep '^error' {mount}/../said

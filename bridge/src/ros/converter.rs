@@ -19,8 +19,8 @@ use crate::ros::message::{
 };
 use crate::session::{Event, Frame, Graph, Pose};
 
-/// Variance of a velocity that is not known, in ROS's way of saying so: the first of the covariance.
-const UNKNOWN: f64 = -1.0;
+/// Variance of a velocity that is not known: so large that filters, which do not know of a mark for it, leave it alone.
+const UNKNOWN_VARIANCE: f64 = 1e6;
 
 /// The messages of a pose that is claimed.
 #[derive(Debug, Clone, PartialEq)]
@@ -216,8 +216,7 @@ fn pose_realtime(pose: &Pose) -> Option<i64> {
 /// Velocities of the camera in its own axes.
 fn twist(message: &PoseMessage) -> TwistWithCovariance {
     if message.has_velocity == 0 {
-        let mut covariance = [0.0; 36];
-        covariance[0] = UNKNOWN;
+        let covariance = std::array::from_fn(|at| if at % 7 == 0 { UNKNOWN_VARIANCE } else { 0.0 });
         return TwistWithCovariance { twist: Twist::default(), covariance };
     }
     let twist = Twist {
