@@ -32,7 +32,7 @@ static void print(const semidense::keyframe &keyframe) {
         sum += pixel;
     }
     std::cout << "keyframe " << keyframe.keyframe_id << " revision " << keyframe.revision << ": "
-              << keyframe.num_points << " points, median depth " << median(depths) << " to "
+              << keyframe.num_points << " points, median depth " << median(depths) << " +- "
               << 100.0F * median(deviations) << " %, mean grey " << sum / std::max<std::size_t>(1, keyframe.pixels().size())
               << std::endl;
 }

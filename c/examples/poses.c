@@ -19,7 +19,7 @@ static int failed(const char *what) {
 static void print(const semidense_pose *pose) {
     const double *t = pose->world_from_camera.translation;
     const double *q = pose->world_from_camera.quaternion;
-    printf("%llu %s %.6f %.6f %.6f %.6f %.6f %.6f %.6f sigma %.2g\n", (unsigned long long)pose->sequence,
+    printf("%llu %s %.6f %.6f %.6f %.6f %.6f %.6f %.6f variance %.2g\n", (unsigned long long)pose->sequence,
            STATES[pose->state], t[0], t[1], t[2], q[0], q[1], q[2], q[3], pose->map_covariance[0]);
 }
 
