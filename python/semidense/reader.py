@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import time
 from types import TracebackType
@@ -16,10 +17,14 @@ from .messages import BrokenMessage, Frame, Graph, Health, Keyframe, Pose
 
 # Between two attempts to join an instance that is not there yet.
 RETRY_SECS = 0.1
+# After so long a wait it is said what is waited for.
+PATIENCE_SECS = 1.0
 # Longest wait in one go: so late a Ctrl-C is heard, or the end of a run.
 WAIT_SECS = 0.1
 # Processes report once a second: one that has said nothing for so long is not there any more.
 LONGEST_SILENCE_SECS = 3.0
+
+_LOG = logging.getLogger("semidense")
 
 Message = Union[Pose, Frame, Keyframe, Graph, Health]
 M = TypeVar("M", Pose, Frame, Keyframe, Graph, Health)
@@ -85,8 +90,15 @@ class Reader:
         self._join()
 
     def _join(self) -> None:
-        end = None if self._timeout is None else time.monotonic() + self._timeout
+        begin = time.monotonic()
+        end = None if self._timeout is None else begin + self._timeout
+        is_silent = True
         while not self._try_to_join(end):
+            if is_silent and time.monotonic() - begin > PATIENCE_SECS:
+                is_silent = False
+                _LOG.warning(
+                    "waiting for instance `%s` in %s: start it with `semidense run`", self.place.instance, self.place.root
+                )
             left = RETRY_SECS if end is None else min(RETRY_SECS, end - time.monotonic())
             time.sleep(max(0.0, left))
 

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from typing import Any, Dict
 
@@ -219,3 +220,10 @@ def test_too_many_readers_are_told_who_has_the_places(running: Rig) -> None:
     for reader in readers:
         reader.close()
     next(semidense.frames(**options(running)))
+
+
+def test_a_long_wait_says_what_for(caplog: pytest.LogCaptureFixture) -> None:
+    with tempfile.TemporaryDirectory(prefix="sd") as root, pytest.raises(semidense.NotRunning):
+        semidense.poses("absent", root=root, timeout=1.5)
+    said = [record.getMessage() for record in caplog.records if record.name == "semidense"]
+    assert len(said) == 1 and "instance `absent`" in said[0] and "semidense run" in said[0]
