@@ -100,7 +100,10 @@ fn conclude(ended: &EndOfRun, summary: &Summary, where_to: &str) -> CommandResul
     match ended {
         EndOfRun::Failed(cause) => Err(cause.as_str().into()),
         EndOfRun::Interrupted => {
-            note(&format!("interrupted: {where_to}"));
+            note(&match &summary.untracked {
+                Some(why) => format!("interrupted, and nothing was tracked: {why}; {where_to}"),
+                None => format!("interrupted: {where_to}"),
+            });
             Ok(ExitCode::from(INTERRUPTED))
         }
         EndOfRun::Finished | EndOfRun::Recovered(_) if summary.frames.frames_tracked == 0 => {

@@ -32,12 +32,20 @@ struct Shown {
     waits_for: Option<String>,
 }
 
+/// Of a source with so many frames.
+const WITH_END: &str = "{prefix:9} {bar:40} {pos}/{len} {msg}";
+/// Of a camera.
+const WITHOUT_END: &str = "{prefix:9} {pos} frames, {msg}";
+
+fn style(template: &str) -> ProgressStyle {
+    ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar())
+}
+
 impl Shown {
     fn new(is_quiet: bool) -> Self {
         let bar = (!is_quiet && std::io::stderr().is_terminal()).then(|| {
             let bar = ProgressBar::new(0);
-            let style = ProgressStyle::with_template("{prefix:9} {bar:40} {pos}/{len} {msg}");
-            bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
+            bar.set_style(style(WITH_END));
             bar
         });
         Self { bar, is_quiet, last_line: Instant::now(), waits_for: None }
@@ -54,6 +62,7 @@ impl Shown {
         };
         self.waits_for = None;
         if let Some(bar) = &self.bar {
+            bar.set_style(style(if total == 0 { WITHOUT_END } else { WITH_END }));
             bar.set_prefix(prefix);
             bar.set_length(total);
             bar.set_position(done);

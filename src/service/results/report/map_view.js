@@ -16,7 +16,7 @@
     choose($("-views"), (d) => { view.isTouched = false; view.setView(d.view); });
     choose($("-colours"), (d) => view.set({ colour: d.colour }));
     new Player(view, header.end, { bar: $("-player"), play: $("-play"), time: $("-time"), clock: $("-clock"), speed: $("-speed") });
-    view.onFrame = () => { $("-note").textContent = view.gridStep ? `grid: squares of ${+view.gridStep.toPrecision(1)} map units` : ""; };
+    view.onFrame = () => { $("-note").textContent = view.gridStep ? `grid: squares of ${+view.gridStep.toPrecision(1)} map unit${view.gridStep === 1 ? "" : "s"}` : ""; };
     window.stat = { get: () => ({ lit: view.litPixels(), points: view.totalPoints, drawn: view.drawn, keyframes: view.clusters.size, path: view.visiblePath }) };
   } catch (error) { $("-note").textContent = `The 3D view does not start: ${error.message}`; }
 })();
