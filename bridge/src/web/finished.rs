@@ -1,5 +1,7 @@
 //! A run that is over, read from its folder: `keyframes.txt`, `trajectory.txt`, `map.ply`, `summary.json`.
 
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
 use std::io::{self, BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
@@ -53,6 +55,9 @@ pub enum FinishedError {
 pub fn read_run(folder: &Path, max_points: usize) -> Result<Vec<u8>, FinishedError> {
     let keyframes = read_keyframes(&folder.join("keyframes.txt"))?;
     let path: Vec<StampedPose> = read_trajectory(&folder.join("trajectory.txt"))?;
+    // Frames that were placed afterwards are not in it: which epoch they are of does not show in their stamps.
+    let online = read_trajectory(&folder.join("trajectory_online.txt")).unwrap_or_default();
+    let (keyframes, path) = of_longest_epoch(keyframes, path, &online);
     let points = read_points(&folder.join("map.ply"), max_points)?;
     let intrinsics = camera(&read_summary(folder)).unwrap_or(USUAL_CAMERA);
     // A cloud without normals leaves it to the cameras.
@@ -84,8 +89,8 @@ fn camera(summary: &Value) -> Option<Intrinsics> {
     camera.is_valid().then_some(camera)
 }
 
-/// The keyframes of the epoch that has most of them: each has a place and a unit of its own.
-fn read_keyframes(path: &Path) -> Result<Vec<SceneKeyframe>, FinishedError> {
+/// The keyframes with their epochs, in the order of their stamps.
+fn read_keyframes(path: &Path) -> Result<Vec<(u32, SceneKeyframe)>, FinishedError> {
     let text = fs::read_to_string(path)
         .map_err(|source| FinishedError::Read { path: path.to_owned(), source })?;
     let mut keyframes = Vec::new();
@@ -96,16 +101,37 @@ fn read_keyframes(path: &Path) -> Result<Vec<SceneKeyframe>, FinishedError> {
         })?;
         keyframes.push(keyframe);
     }
-    let epochs: Vec<u32> = keyframes.iter().map(|(epoch, _)| *epoch).collect();
-    let count = |epoch: u32| epochs.iter().filter(|of| **of == epoch).count();
-    let largest =
-        epochs.iter().copied().max_by_key(|epoch| (count(*epoch), std::cmp::Reverse(*epoch)));
-    let mut keyframes: Vec<SceneKeyframe> = keyframes
-        .into_iter()
-        .filter_map(|(epoch, keyframe)| (Some(epoch) == largest).then_some(keyframe))
-        .collect();
-    keyframes.sort_by_key(|keyframe| keyframe.nanos);
+    keyframes.sort_by_key(|(_, keyframe)| keyframe.nanos);
     Ok(keyframes)
+}
+
+/// Keyframes and path of the epoch with the most poses, of which map.ply is: each epoch has a place and a unit of its own.
+/// A pose is of the epoch of the newest keyframe at its stamp; where there are several epochs, poses that are not `online`
+/// are left out.
+fn of_longest_epoch(
+    keyframes: Vec<(u32, SceneKeyframe)>,
+    path: Vec<StampedPose>,
+    online: &[StampedPose],
+) -> (Vec<SceneKeyframe>, Vec<StampedPose>) {
+    let is_one = keyframes.windows(2).all(|pair| pair[0].0 == pair[1].0);
+    if is_one {
+        return (keyframes.into_iter().map(|(_, keyframe)| keyframe).collect(), path);
+    }
+    let epoch_at = |pose: &StampedPose| {
+        let after = keyframes.partition_point(|(_, keyframe)| keyframe.nanos <= pose.nanos);
+        keyframes.get(after.saturating_sub(1)).map(|(epoch, _)| *epoch)
+    };
+    // A folder without published poses has only the final ones.
+    let online = if online.is_empty() { &path } else { online };
+    let mut counts: BTreeMap<u32, usize> = BTreeMap::new();
+    online.iter().filter_map(epoch_at).for_each(|epoch| *counts.entry(epoch).or_default() += 1);
+    let longest = counts.iter().max_by_key(|(epoch, count)| (**count, Reverse(**epoch)));
+    let longest = longest.map(|(epoch, _)| *epoch);
+    let stamps: BTreeSet<i64> = online.iter().map(|pose| pose.nanos).collect();
+    let is_shown = |pose: &StampedPose| stamps.contains(&pose.nanos) && epoch_at(pose) == longest;
+    let path = path.iter().copied().filter(is_shown).collect();
+    let of_epoch = keyframes.into_iter().filter(|(epoch, _)| Some(*epoch) == longest);
+    (of_epoch.map(|(_, keyframe)| keyframe).collect(), path)
 }
 
 /// A line: stamp, translation, quaternion, unit, id, sequence, epoch …
@@ -246,7 +272,8 @@ impl Layout {
     }
 }
 
-/// The points, an even part of them where they are more than `most`.
+/// The points; where they are more than `most` the first of them, which show all of the map, or an even part of those
+/// that stand by keyframe.
 fn read_points(path: &Path, most: usize) -> Result<Vec<ScenePoint>, FinishedError> {
     let content = |what: String| FinishedError::Content { path: path.to_owned(), what };
     let failed = |source| FinishedError::Read { path: path.to_owned(), source };
@@ -258,7 +285,7 @@ fn read_points(path: &Path, most: usize) -> Result<Vec<ScenePoint>, FinishedErro
     let position = [want("x")?, want("y")?, want("z")?];
     let grey = layout.property(&["intensity", "green", "red"]);
     let (std_dev, keyframe) = (layout.property(&["sigma"]), layout.property(&["keyframe"]));
-    let every = layout.count.div_ceil(most.max(1)).max(1);
+    let every = if keyframe.is_some() { layout.count.div_ceil(most.max(1)).max(1) } else { 1 };
     let mut points = Vec::with_capacity(most.min(layout.count).min(1 << 16));
     let mut chunk = vec![0; CHUNK * layout.bytes.max(1)];
     let mut index = 0;
@@ -267,7 +294,7 @@ fn read_points(path: &Path, most: usize) -> Result<Vec<ScenePoint>, FinishedErro
         let bytes = &mut chunk[..length * layout.bytes];
         file.read_exact(bytes).map_err(failed)?;
         for point in bytes.chunks_exact(layout.bytes.max(1)) {
-            if index.is_multiple_of(every) {
+            if index.is_multiple_of(every) && points.len() < most {
                 points.push(ScenePoint {
                     position: position.map(|property| property.read(point) as f32),
                     grey: grey.map_or(255, |property| property.read(point) as u8),
@@ -330,15 +357,35 @@ mod tests {
     }
 
     #[test]
-    fn of_keyframes_the_largest_epoch_is_taken() {
+    fn of_several_epochs_that_with_the_most_poses_is_shown_alone() {
         let file = tempfile::NamedTempFile::new().unwrap();
         let line = |secs: f64, id: u64, epoch: u32| {
             format!("{secs} 1 2 3 0 0 0 1 0.5 {id} 9 {epoch} 100 Established\n")
         };
-        let text = format!("# c\n{}{}{}", line(1.0, 1, 0), line(3.0, 3, 1), line(2.0, 2, 1));
+        let lines = [line(1.0, 1, 0), line(6.0, 4, 0), line(3.0, 3, 1), line(2.5, 2, 1)];
+        let text = format!("# c\n{}", lines.concat());
+        fs::write(file.path(), &text).unwrap();
+        let at = |secs: &[f64]| -> Vec<StampedPose> {
+            let pose = |secs: &f64| StampedPose {
+                nanos: (secs * 1e9) as i64,
+                world_from_camera: SE3::identity(),
+            };
+            secs.iter().map(pose).collect()
+        };
+        // The pose at 2.0 was placed afterwards: it is one from before the second epoch began.
+        let (path, online) = (at(&[1.0, 1.5, 2.0, 2.5, 3.0, 6.0]), at(&[1.0, 1.5, 2.5, 3.0, 6.0]));
+        let keyframes = read_keyframes(file.path()).unwrap();
+        let (keyframes, shown) = of_longest_epoch(keyframes, path.clone(), &online);
+        assert_eq!(keyframes.iter().map(|k| k.keyframe_id).collect::<Vec<_>>(), [1, 4]);
+        assert_eq!(shown, at(&[1.0, 1.5, 6.0]));
+        // Of one epoch everything is shown.
+        fs::write(file.path(), [line(1.0, 1, 0), line(2.0, 2, 0)].concat()).unwrap();
+        let (all, shown) =
+            of_longest_epoch(read_keyframes(file.path()).unwrap(), path.clone(), &online);
+        assert_eq!((all.len(), shown.len()), (2, path.len()));
         fs::write(file.path(), &text).unwrap();
         let keyframes = read_keyframes(file.path()).unwrap();
-        assert_eq!(keyframes.iter().map(|k| k.keyframe_id).collect::<Vec<_>>(), [2, 3]);
+        assert_eq!(of_longest_epoch(keyframes, path, &[]).1, at(&[1.0, 1.5, 2.0, 6.0]));
         fs::write(file.path(), text.replace("0.5", "NaN")).unwrap();
         assert!(read_keyframes(file.path()).unwrap_err().to_string().contains("line 2"));
     }
