@@ -36,6 +36,13 @@ fn units_call_commands_that_exist() {
     }
 }
 
+/// A booted machine needs minutes to tell that its services refuse their configuration.
+#[test]
+fn the_robot_of_the_checks_has_a_configuration_that_is_accepted() {
+    let rig = root().join("deploy/robot-test/guest/robot.toml");
+    Config::load(Some(&rig), &[]).unwrap();
+}
+
 #[test]
 fn units_are_closed_alike() {
     let closed = |process: &str| -> BTreeSet<String> {
