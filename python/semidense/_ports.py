@@ -136,7 +136,9 @@ def not_running(place: Place) -> NotRunning:
             f"instance `{place.instance}` runs (process {holder}), but its topics are not here: it is just starting, or "
             "this container has a /dev/shm of its own (docker run --ipc=host shares the host's)"
         )
-    return NotRunning(f"nothing is running as instance `{place.instance}` in {place.root}")
+    return NotRunning(
+        f"nothing is running as instance `{place.instance}` in {place.root}: start `semidense run`, or name another instance"
+    )
 
 
 def _config(place: Place) -> Any:

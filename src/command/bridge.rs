@@ -66,6 +66,8 @@ pub fn run(
     let own = std::env::current_exe().unwrap_or_else(|_| PathBuf::from("semidense"));
     let program = program(&own).ok_or(BridgeError::Missing { command, own })?;
     let source = Command::new(&program)
+        // Its help and its errors then name the command that was typed.
+        .arg0("semidense")
         .args(handed_on(common))
         .arg(command)
         .args(&arguments.arguments)

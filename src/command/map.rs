@@ -96,7 +96,7 @@ struct SaveArguments {
 #[derive(Debug, Args)]
 struct LoadArguments {
     /// Folder of the map
-    #[arg(value_name = "DIR")]
+    #[arg(value_name = "MAP")]
     folder: PathBuf,
     /// Only locate the camera in the map: nothing in its folder changes
     #[arg(long)]
@@ -124,7 +124,7 @@ struct MergeArguments {
 #[derive(Debug, Args)]
 struct InfoArguments {
     /// The map's folder
-    #[arg(value_name = "DIR")]
+    #[arg(value_name = "MAP")]
     folder: PathBuf,
     /// Print it as JSON
     #[arg(long)]
@@ -135,7 +135,7 @@ struct InfoArguments {
 #[derive(Debug, Args)]
 struct ExportArguments {
     /// The map's folder
-    #[arg(value_name = "DIR")]
+    #[arg(value_name = "MAP")]
     folder: PathBuf,
     /// Folder to write into
     #[arg(long, value_name = "DIR")]
@@ -241,7 +241,9 @@ fn export_map(config: &Config, arguments: &ExportArguments) -> CommandResult {
 fn save(config: &Config, arguments: &SaveArguments) -> CommandResult {
     let folder = arguments.folder.as_ref().map(std::path::absolute).transpose()?;
     ask(config, "map-save", &Command::SaveFolder(folder.clone().unwrap_or_default()))?;
-    let place = folder.map_or("its folder".to_owned(), |folder| folder.display().to_string());
+    let place = folder.map_or("the folder that the mapper was started with".to_owned(), |folder| {
+        folder.display().to_string()
+    });
     print(&format!("saved in {place}\n"))?;
     Ok(ExitCode::SUCCESS)
 }
@@ -285,6 +287,12 @@ fn ready_mapper(hub: &Hub) -> Result<Peer, Box<dyn std::error::Error>> {
 }
 
 fn merge_maps(arguments: &MergeArguments) -> CommandResult {
+    let same =
+        || Some(arguments.first.canonicalize().ok()? == arguments.second.canonicalize().ok()?);
+    if same().unwrap_or(false) {
+        let folder = arguments.first.display();
+        return Err(format!("{folder} is named twice: name two maps").into());
+    }
     let (first, second) = (load_all(&arguments.first)?, load_all(&arguments.second)?);
     let map = merge(&arguments.output, first, second, &arguments.second)?;
     print(&format!(

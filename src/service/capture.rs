@@ -326,7 +326,8 @@ impl<'a> Shell<'a> {
         match arrival {
             Arrival::Frame => {
                 if self.absence.take().is_some() {
-                    tracing::warn!("capture: frames are coming again");
+                    let again = if self.next_sequence.is_some() { " again" } else { "" };
+                    tracing::warn!("capture: frames are coming{again}");
                 }
                 let left_out = self.refused.text();
                 self.health.enter(ProcessState::Running, left_out.as_deref().unwrap_or_default());

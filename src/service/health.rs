@@ -96,6 +96,16 @@ pub fn percentile_ms(counts: &[u64; HISTOGRAM_BUCKETS], share: f64) -> Option<f6
     None
 }
 
+/// Mean of what was counted, milliseconds, each in the middle of its bucket. `None` where nothing was counted.
+pub fn mean_ms(counts: &[u64; HISTOGRAM_BUCKETS]) -> Option<f64> {
+    let begin = |index: usize| if index == 0 { 0.0 } else { bucket_end_ms(index - 1) };
+    let middle = |index: usize| 0.5 * (begin(index) + bucket_end_ms(index));
+    let sum: f64 =
+        counts.iter().enumerate().map(|(index, &count)| count as f64 * middle(index)).sum();
+    let total: f64 = counts.iter().map(|&count| count as f64).sum();
+    (total > 0.0).then_some(sum / total)
+}
+
 /// Where a bucket ends, milliseconds.
 pub fn bucket_end_ms(index: usize) -> f64 {
     f64::powf(2.0, (index as f64 + 1.0) / 2.0) / 1000.0

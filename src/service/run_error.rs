@@ -3,6 +3,7 @@
 use std::io;
 
 use crate::capture::source::SourceError;
+use crate::service::map_folder::MapFolderError;
 use crate::wire::place::PlaceError;
 use crate::wire::port::{OpenError, ReceiveError, WaitError};
 
@@ -15,6 +16,9 @@ pub enum RunError {
     /// A topic cannot be opened.
     #[error(transparent)]
     Open(#[from] OpenError),
+    /// The map is another camera's, or cannot be read.
+    #[error(transparent)]
+    Map(#[from] MapFolderError),
     /// The source cannot be opened.
     #[error(transparent)]
     Source(#[from] SourceError),

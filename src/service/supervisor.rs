@@ -15,6 +15,7 @@ use crate::service::error_log::ErrorLog;
 use crate::service::final_map::{FinalMapError, final_map};
 use crate::service::health::{ProcessState, cause};
 use crate::service::journal::{Journal, JournalOptions};
+use crate::service::map_folder::session::check_camera;
 use crate::service::mode::Mode;
 use crate::service::peers::Peer;
 use crate::service::position::{position_key, read_position};
@@ -87,6 +88,7 @@ pub fn run(
     observe: &mut dyn FnMut(&RunProgress),
 ) -> Result<RunOutcome, RunError> {
     let source = open(&options.source, options.rig.as_deref(), &config.source_params())?;
+    check_camera(&config.map, &source.intrinsics())?;
     let place = Place::new(&config.instance, &config.root)?;
     let _claim = claim_all(&place)?;
     // What a run before has left is not of this one.
@@ -136,7 +138,8 @@ fn supervise(
         ended = Ended::Failed(format!("{missing} poses cannot be read back from the journal"));
     }
     if let (Ended::Failed(cause), true, frames @ 1..) = (&mut ended, is_cut, recorder.num_poses()) {
-        let _ = write!(cause, "; the results are of the {frames} frames before");
+        let of = if frames == 1 { "frame".to_owned() } else { format!("{frames} frames") };
+        let _ = write!(cause, "; the results are of the {of} before");
     }
     let lost = counters.frames_in.saturating_sub(recorder.num_poses() as u64);
     if options.mode == Mode::Lockstep && ended == Ended::Finished && lost > 0 {

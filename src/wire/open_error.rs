@@ -18,7 +18,9 @@ pub enum OpenError {
         reason: String,
     },
     /// Nobody offers this topic.
-    #[error("nothing is running as instance `{instance}` in {root}")]
+    #[error(
+        "nothing is running as instance `{instance}` in {root}: start `semidense run`, or name another with --instance"
+    )]
     NotRunning {
         /// Instance.
         instance: String,

@@ -1,7 +1,7 @@
 //! `semidense-bridge view`: the live page, or a finished run.
 
 use std::io::Write;
-use std::net::SocketAddr;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr, UdpSocket};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -178,19 +178,31 @@ fn own_names() -> Vec<String> {
     if name.is_empty() { Vec::new() } else { vec![name.to_owned(), format!("{name}.local")] }
 }
 
-/// Prints the address to open, on standard output: a script may read it.
+/// The address of this machine in the network that its default route leads to.
+fn own_address() -> Option<IpAddr> {
+    /// Of a network for documentation (RFC 5737): connecting a datagram socket chooses a route and sends nothing.
+    const ELSEWHERE: (Ipv4Addr, u16) = (Ipv4Addr::new(192, 0, 2, 1), 9);
+    let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).ok()?;
+    socket.connect(ELSEWHERE).ok()?;
+    Some(socket.local_addr().ok()?.ip())
+}
+
+/// Prints the addresses to open, on standard output: a script may read it.
 fn say(server: &Server, arguments: &ViewArguments, token: Option<&str>) {
     let address = server.address();
-    let shown = match address.ip() {
-        // It stands for all addresses: the name is one that others can open.
+    let shown: Vec<String> = match address.ip() {
+        // It stands for all addresses: the name is one that others can open, the number where names are not looked up.
         ip if ip.is_unspecified() => {
-            let name = own_names().pop().unwrap_or_else(|| "ADDRESS-OF-THIS-MACHINE".to_owned());
-            format!("{name}:{}", address.port())
+            let number = own_address().map(|ip| SocketAddr::new(ip, address.port()).to_string());
+            let name = own_names().pop().map(|name| format!("{name}:{}", address.port()));
+            name.into_iter().chain(number).collect()
         }
-        _ => address.to_string(),
+        _ => vec![address.to_string()],
     };
     let token = token.map(|token| format!("?token={token}")).unwrap_or_default();
-    let _ = writeln!(std::io::stdout(), "http://{shown}/{token}");
+    for shown in &shown {
+        let _ = writeln!(std::io::stdout(), "http://{shown}/{token}");
+    }
     let _ = std::io::stdout().flush();
     if arguments.no_token && !address.ip().is_loopback() {
         let _ = writeln!(

@@ -54,7 +54,9 @@ const MAX_READS: usize = 3;
 #[derive(Debug, thiserror::Error)]
 pub enum MapFolderError {
     /// There is none.
-    #[error("{0} holds no map: check the path, or leave out --read-only to begin one there")]
+    #[error(
+        "{0} holds no map: check the path, or begin one there with `semidense run SOURCE --map {0}`"
+    )]
     Missing(PathBuf),
     /// The folder is full of other things.
     #[error(

@@ -147,6 +147,18 @@ pub fn check(config: &MapConfig) -> Result<(), MapFolderError> {
     }
 }
 
+/// Checks that a map that is there is of this camera, before anything is started.
+pub fn check_camera(config: &MapConfig, camera: &Intrinsics) -> Result<(), MapFolderError> {
+    if config.folder.is_empty() {
+        return Ok(());
+    }
+    match check_loadable(Path::new(&config.folder), camera) {
+        // It is to be begun, or a check before has refused it.
+        Err(MapFolderError::Missing(_)) => Ok(()),
+        checked => checked,
+    }
+}
+
 /// Checks that a folder holds a map of this camera that a running mapper could go over to.
 pub fn check_loadable(folder: &Path, camera: &Intrinsics) -> Result<(), MapFolderError> {
     let (manifest, _) = read_manifest(folder)?;

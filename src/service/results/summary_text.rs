@@ -74,7 +74,10 @@ pub fn summary_text(summary: &Summary) -> String {
     if let (Some(deadline_ms), Some(misses)) = (summary.deadline_ms, summary.deadline_misses) {
         line(
             "deadline",
-            format!("{misses} poses later than {deadline_ms:.2} ms after the frame arrived"),
+            format!(
+                "{misses} {} later than {deadline_ms:.2} ms after the frame arrived",
+                if misses == 1 { "pose" } else { "poses" }
+            ),
         );
     }
     line("run", run(summary));
@@ -182,7 +185,8 @@ pub(super) fn loops_text(loops: &LoopSummary) -> Option<String> {
 }
 
 fn times_text(p: &Percentiles) -> String {
-    format!("{:.2} ms median, {:.2} p95, {:.2} p99, {:.2} max", p.p50, p.p95, p.p99, p.max)
+    let Percentiles { mean, p50, p95, p99, max, .. } = p;
+    format!("{mean:.2} ms mean, {p50:.2} median, {p95:.2} p95, {p99:.2} p99, {max:.2} max")
 }
 
 fn run(summary: &Summary) -> String {

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::service::health::{bucket, bucket_end_ms, percentile_ms};
+use crate::service::health::{bucket, bucket_end_ms, mean_ms, percentile_ms};
 use crate::service::recording::TimeCounts;
 use crate::service::results::RecordedPose;
 use crate::slam::evaluation::statistics::percentile;
@@ -12,6 +12,8 @@ use crate::wire::message::HISTOGRAM_BUCKETS;
 /// Percentiles of a time in milliseconds.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Percentiles {
+    /// Mean.
+    pub mean: f64,
     /// Median.
     pub p50: f64,
     /// 95 of 100 are not longer.
@@ -31,14 +33,16 @@ impl Percentiles {
         millis.sort_by(f64::total_cmp);
         let at = |share| percentile(&millis, share);
         let (p50, p95, p99) = (at(0.5)?, at(0.95)?, at(0.99)?);
-        Some(Self { p50, p95, p99, p999: at(0.999)?, max: at(1.0)? })
+        let mean = millis.iter().sum::<f64>() / millis.len() as f64;
+        Some(Self { mean, p50, p95, p99, p999: at(0.999)?, max: at(1.0)? })
     }
 
     /// Percentiles of times that were counted: right to a few per cent, the longest is where its bucket ends.
     pub fn of_counts(counts: &TimeCounts) -> Option<Self> {
         let at = |share| percentile_ms(&counts.0, share);
         let (p50, p95, p99) = (at(0.5)?, at(0.95)?, at(0.99)?);
-        Some(Self { p50, p95, p99, p999: at(0.999)?, max: at(1.0)? })
+        let mean = mean_ms(&counts.0)?;
+        Some(Self { mean, p50, p95, p99, p999: at(0.999)?, max: at(1.0)? })
     }
 }
 

@@ -61,6 +61,13 @@ fn world_units(
     for estimate in estimates {
         by_keyframe.entry(estimate.keyframe_id).or_default().push(estimate);
     }
+    let mut steps: BTreeMap<u64, Vec<[&PoseEstimate; 2]>> = BTreeMap::new();
+    for pair in estimates.windows(2) {
+        let &[before, now] = pair else { continue };
+        if before.keyframe_id == now.keyframe_id {
+            steps.entry(now.keyframe_id).or_default().push([before, now]);
+        }
+    }
     let unit = |&(id, nanos): &(u64, i64)| {
         let frames = by_keyframe.get(&id).filter(|frames| frames.len() >= LEAST_FRAMES)?;
         let keyframe = true_pose(nanos)?;
@@ -68,17 +75,18 @@ fn world_units(
             Some((*estimate, true_pose(estimate.capture_nanos)?.inverse() * keyframe))
         });
         let in_truth = unit_length(&known.collect::<Vec<_>>())?;
-        Some((id, in_truth / world_units_of(frames)?))
+        Some((id, in_truth / world_units_of(steps.get(&id)?)?))
     };
     keyframes.iter().filter_map(unit).collect()
 }
 
-/// World units of a unit of the keyframe that `frames` were tracked on.
-fn world_units_of(frames: &[&PoseEstimate]) -> Option<f64> {
-    let first = frames.first()?;
+/// World units of a unit of a keyframe, from what the camera moved `steps` on it: within a visit. Between two visits the
+/// world may have drifted.
+fn world_units_of(steps: &[[&PoseEstimate; 2]]) -> Option<f64> {
     let length = |of: fn(&PoseEstimate) -> &SE3| {
-        let moved = |frame: &&PoseEstimate| of(frame).translation - of(first).translation;
-        frames.iter().map(|frame| moved(frame).norm_squared()).sum::<f64>().sqrt()
+        let moved =
+            |[before, now]: &[&PoseEstimate; 2]| of(now).translation - of(before).translation;
+        steps.iter().map(|step| moved(step).norm_squared()).sum::<f64>().sqrt()
     };
     let units =
         length(|frame| &frame.world_from_camera) / length(|frame| &frame.keyframe_from_camera);
@@ -153,6 +161,28 @@ mod tests {
             }
         };
         (0..FRAMES).map(estimate).collect()
+    }
+
+    #[test]
+    fn a_keyframe_that_the_camera_comes_back_to_after_a_drift_has_one_unit() {
+        let mut estimates = run(&mut Noise(3));
+        let to_first = exact(0).inverse() * exact(FRAMES / 2);
+        for estimate in estimates.iter_mut().filter(|estimate| estimate.sequence >= FRAMES * 3 / 4)
+        {
+            estimate.keyframe_id = 0;
+            let on_second = Sim3::new(to_first, UNITS[1] * WORLD_M);
+            let first_unit = Sim3::new(SE3::identity(), UNITS[0] * WORLD_M);
+            estimate.keyframe_from_camera =
+                first_unit.locate(&on_second.place(&estimate.keyframe_from_camera));
+            estimate.world_from_camera.translation += Vector3::new(40.0, 0.0, 0.0);
+        }
+        let truth: Vec<_> = (0..FRAMES)
+            .map(|frame| StampedPose { nanos: nanos(frame), world_from_camera: exact(frame) })
+            .collect();
+        let keyframes = [(0, nanos(0)), (1, nanos(FRAMES / 2))];
+        let estimates: Vec<&PoseEstimate> = estimates.iter().collect();
+        let errors = velocity_normalized_errors(&estimates, &keyframes, &truth, 1_000_000).unwrap();
+        assert!((errors.translation - 3.0).abs() < 0.4, "{errors:?}");
     }
 
     #[test]

@@ -123,7 +123,7 @@ fn fused(
     let (mut weight, mut sum, mut least) = (1.0 / variance, d / variance, variance);
     let (mut agreeing, mut seeing_through, mut hiding) = (1u8, 0u8, 0u8);
     for sight in sights {
-        match sight.opinion(&ray, [d, variance], params.tolerance, params.floor) {
+        match sight.opinion(&ray, [d, variance], params) {
             Some(Opinion::Agrees(other, of_other)) if of_other > 0.0 => {
                 weight += 1.0 / of_other;
                 sum += other / of_other;

@@ -2,6 +2,7 @@
 
 use nalgebra::{Matrix3, Vector3};
 
+use crate::slam::fusion::params::FusionParams;
 use crate::slam::fusion::pixel_index::PixelIndex;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
 
@@ -83,14 +84,15 @@ impl<'a> Sight<'a> {
     }
 
     /// What the other keyframe knows of a point with this ray, inverse depth and variance, where errors beyond
-    /// `tolerance` standard deviations, and beyond a share `floor` of the distance in all, are contradictions.
+    /// `tolerance` standard deviations, and beyond a share `floor` of the distance in all, are contradictions. Depth too
+    /// uncertain to count knows nothing.
     pub fn opinion(
         &self,
         ray: &Vector3<f64>,
         [d, variance]: [f64; 2],
-        tolerance: f64,
-        floor: f64,
+        params: &FusionParams,
     ) -> Option<Opinion> {
+        let &FusionParams { tolerance, floor, max_relative_std_dev, .. } = params;
         let turned = self.rotation * ray;
         let q = turned + self.translation * d;
         // Depth in units of the other: q.z / d.
@@ -112,7 +114,8 @@ impl<'a> Sight<'a> {
             let (e, e_variance) = (f64::from(point.inverse_depth), f64::from(point.variance));
             let spread = (floor * there).powi(2) + there_variance + e_variance;
             let difference = there - e;
-            if !(e > 0.0 && spread.is_finite()) {
+            let most = max_relative_std_dev * e;
+            if !(e > 0.0 && spread.is_finite() && e_variance <= most * most) {
                 continue;
             }
             if difference * difference <= tolerance * tolerance * spread {

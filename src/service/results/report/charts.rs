@@ -3,6 +3,7 @@
 use nalgebra::Vector3;
 
 use crate::service::results::RunRecord;
+use crate::service::results::poses::longest_epoch;
 use crate::service::results::report::ReportInput;
 use crate::service::results::report::axis::Range;
 use crate::service::results::report::chart::{Chart, Mark, Scaling, Series};
@@ -12,6 +13,7 @@ use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::evaluation::statistics::percentile;
 use crate::slam::evaluation::windows::SCALE_WINDOW;
 use crate::slam::geometry::sim3::Sim3;
+use crate::slam::keyframe::Keyframe;
 use crate::slam::trajectory::StampedPose;
 
 /// Colours that can be told apart with any sight, on white and on black: of the truth,
@@ -117,12 +119,15 @@ fn truth_in_time(input: &ReportInput<'_>) -> Vec<StampedPose> {
     input.record.ground_truth.iter().filter(|pose| time.contains(&pose.nanos)).copied().collect()
 }
 
+/// Poses of the keyframes of the longest epoch: each epoch has a place and a unit of its own.
 pub(super) fn keyframe_poses(record: &RunRecord) -> Vec<StampedPose> {
-    let pose = |k: &crate::slam::keyframe::Keyframe| StampedPose {
+    let epoch = longest_epoch(record);
+    let pose = |k: &Keyframe| StampedPose {
         nanos: k.capture_nanos,
         world_from_camera: k.map_from_keyframe.rigid,
     };
-    record.map.keyframes.iter().map(pose).collect()
+    let of_epoch = |k: &&Keyframe| epoch.is_none_or(|epoch| k.epoch == epoch);
+    record.map.keyframes.iter().filter(of_epoch).map(pose).collect()
 }
 
 /// Position error over time, final and as published; `None` without ground truth.

@@ -154,7 +154,8 @@ fn plain(number: f64) -> String {
 fn times_text(times: &Value) -> String {
     let of = |key: &str| times[key].as_f64().map_or("–".to_owned(), plain);
     format!(
-        "median {} ms; 95 % below {}, 99 % below {}, 99.9 % below {}; longest {} ms",
+        "mean {} ms, median {}; 95 % below {}, 99 % below {}, 99.9 % below {}; longest {} ms",
+        of("mean"),
         of("p50"),
         of("p95"),
         of("p99"),
@@ -261,7 +262,7 @@ mod tests {
     #[test]
     fn figures_have_units_and_no_key_is_seen() {
         let mut value = summary();
-        let times = Percentiles { p50: 1.5, p95: 2.0, p99: 3.0, p999: 4.0, max: 12.25 };
+        let times = Percentiles { mean: 1.75, p50: 1.5, p95: 2.0, p99: 3.0, p999: 4.0, max: 12.25 };
         value["track_ms"] = json!(times);
         value["ate_rmse_m"] = json!(0.0123);
         value["online"]["ate_rmse_m"] = json!(0.5);
@@ -272,7 +273,7 @@ mod tests {
         value["camera"] = json!(Intrinsics::pinhole(640, 480, 500.0));
         let html = figures(&serde_json::from_value(value).unwrap());
         for part in [
-            "median 1.50 ms; 95 % below 2.00",
+            "mean 1.75 ms, median 1.50; 95 % below 2.00",
             "<dd>1.23 cm</dd>",
             "<dd>50.00 cm</dd>",
             "trajectory as published</h3>",

@@ -7,6 +7,7 @@ use nalgebra::Vector3;
 
 use crate::service::adjustments::SearchRecord;
 use crate::service::results::RunRecord;
+use crate::service::results::poses::longest_epoch;
 use crate::service::results::report::ReportInput;
 use crate::service::results::report::chart::{Chart, Mark, Scaling, Series};
 use crate::service::results::report::chart_figure::chart_figure;
@@ -16,6 +17,7 @@ use crate::service::results::report::charts::{
 use crate::service::results::report::html::escaped;
 use crate::service::results::report::views::Views;
 use crate::service::results::summary_text::loops_text;
+use crate::slam::keyframe::Keyframe;
 use crate::slam::loops::SearchFate;
 
 /// Radius of a loop that holds, and of a place that was refused.
@@ -60,12 +62,14 @@ fn reasons(searches: &[SearchRecord]) -> Vec<(String, usize)> {
     counts
 }
 
-/// The keyframes' way, and what was found where; loops with a line between the keyframes.
+/// The keyframes' path in the longest epoch, and what was found where; loops with a line between the keyframes.
 fn from_above(record: &RunRecord, searches: &[SearchRecord], up: Option<Vector3<f64>>) -> Chart {
-    let way = keyframe_poses(record);
-    let views = Views::of(&way, up);
+    let keyframes = keyframe_poses(record);
+    let views = Views::of(&keyframes, up);
+    let epoch = longest_epoch(record);
     let at = |id: u64| {
-        let keyframe = record.map.get(id)?;
+        let is_shown = |of: &&Keyframe| epoch.is_none_or(|epoch| of.epoch == epoch);
+        let keyframe = record.map.get(id).filter(is_shown)?;
         Some(views.from_above(&keyframe.map_from_keyframe.rigid.translation))
     };
     let of = |is: IsFate| -> Vec<[f64; 2]> {
@@ -83,7 +87,7 @@ fn from_above(record: &RunRecord, searches: &[SearchRecord], up: Option<Vector3<
     // A broken line: one piece for each loop.
     let links = links.flat_map(|[i, j]| [i, j, [f64::NAN; 2]]).collect();
     let line = |name, colour, points| Series { name, colour, mark: Mark::Path, points };
-    let path = way.iter().map(|pose| views.from_above(&pose.world_from_camera.translation));
+    let path = keyframes.iter().map(|pose| views.from_above(&pose.world_from_camera.translation));
     Chart {
         title: "Loops from above",
         meaning: "Where earlier places were recognised. Closed or joined: the map was moved by it; held already: the map had it \

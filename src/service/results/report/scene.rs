@@ -261,11 +261,12 @@ fn cluster(
             let q = (f64::from(point.position[axis]) - f64::from(low[axis])) / step[axis];
             bytes.extend_from_slice(&(q.round() as u16).to_le_bytes());
         }
-        let depth = (keyframe_from_map * nalgebra::Vector3::from(point.position.map(f64::from))).z;
-        if depth > NEAREST {
-            inverse_depths.push(1.0 / depth);
+        let seen = keyframe_from_map * nalgebra::Vector3::from(point.position.map(f64::from));
+        if seen.z > NEAREST {
+            inverse_depths.push(1.0 / seen.z);
         }
-        let relative = f64::from(point.std_dev) / (depth * keyframe.place.scale).abs();
+        // σ is along the ray.
+        let relative = f64::from(point.std_dev) / (seen.norm() * keyframe.place.scale);
         bytes.extend_from_slice(&[point.grey, deviation_code(relative)]);
     };
     match is_ordered {
