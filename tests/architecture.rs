@@ -10,21 +10,21 @@ const MAX_LINES: usize = 500;
 
 /// What only some modules may name, and why.
 const RESERVED: &[(&str, &[&str], &str)] = &[
-    ("iceoryx2::", &["src/wire/"], "its API changes with every release: one module to change"),
-    ("png::", &["src/capture/"], "image files are read and written in one module"),
-    ("zune_jpeg", &["src/capture/"], "image files are read and written in one module"),
+    ("iceoryx2::", &["src/wire"], "its API changes with every release: one module to change"),
+    ("png::", &["src/capture"], "image files are read and written in one module"),
+    ("zune_jpeg", &["src/capture"], "image files are read and written in one module"),
     ("mcap::", &["src/capture/bag"], "bags are read in one module"),
     ("cdr_encoding", &["src/capture/bag"], "bags are read in one module"),
     ("ioctl", &["src/capture/v4l"], "the kernel's video interface is spoken in one module"),
     (
         "std::time",
-        &["src/service/", "src/command/", "src/wire/", "src/capture/v4l"],
+        &["src/service", "src/command", "src/wire", "src/capture/v4l"],
         "time is a value: only shells ask for it",
     ),
-    ("std::thread", &["src/service/", "src/capture/v4l"], "threads belong to the shells"),
-    ("tracing::", &["src/service/", "src/command/", "src/main.rs"], "only shells log"),
-    ("println!", &["src/command/", "src/service/progress"], "only commands print"),
-    ("std::process::exit", &["src/command/"], "only commands choose exit codes"),
+    ("std::thread", &["src/service", "src/capture/v4l"], "threads belong to the shells"),
+    ("tracing::", &["src/service", "src/command", "src/main.rs"], "only shells log"),
+    ("println!", &["src/command", "src/service/progress"], "only commands print"),
+    ("std::process::exit", &["src/command"], "only commands choose exit codes"),
 ];
 
 /// What `slam` must not do: it takes images and poses and gives poses and depth.
@@ -32,7 +32,7 @@ const IMPURE: &[&str] =
     &["std::fs", "std::io", "std::net", "std::env", "rand::", "thread_local!", "static mut"];
 
 /// Where `unsafe` may stand.
-const UNSAFE_MODULES: &[&str] = &["src/wire/", "src/capture/v4l", "src/service/schedule.rs"];
+const UNSAFE_MODULES: &[&str] = &["src/wire", "src/capture/v4l", "src/service/schedule.rs"];
 const UNSAFE_KERNEL_MARK: &str = "kernel";
 
 fn root() -> PathBuf {
@@ -87,6 +87,15 @@ fn allowed_imports() -> BTreeMap<String, Vec<String>> {
         .collect();
     assert_eq!(table.len(), 5, "the table of modules in docs/development.md: {table:?}");
     table
+}
+
+#[test]
+fn a_module_with_parts_is_a_file_beside_its_folder() {
+    for folder in ["src", "bridge/src", "c/src"] {
+        for (file, _) in sources(folder) {
+            assert!(!file.ends_with("/mod.rs"), "{file}: name it after its folder, beside it");
+        }
+    }
 }
 
 #[test]

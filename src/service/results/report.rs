@@ -87,7 +87,7 @@ pub fn report(input: &ReportInput<'_>) -> String {
          <title>semidense: {source}</title><style>{}</style></head><body><main>\
          <header><p class=\"product\">semidense {}</p><h1>{source}</h1>\
          <p class=\"mode\">{mode} &middot; {} frames &middot; {:.1} s</p>{}</header>",
-        include_str!("report.css"),
+        include_str!("report/report.css"),
         env!("CARGO_PKG_VERSION"),
         summary.frames_in,
         summary.recorded_secs,
