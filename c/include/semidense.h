@@ -292,7 +292,7 @@ int semidense_descriptor(const struct semidense_reader *reader);
 // the next run.
 enum semidense_status semidense_wait(struct semidense_reader *reader, int64_t timeout_ms);
 
-// The oldest pose that has not been read: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. A thousand are kept.
+// The oldest pose that has not been read: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. 900 are kept.
 //
 // # Safety
 // `pose` is null or may be written to.

@@ -162,7 +162,7 @@ pub extern "C" fn semidense_wait(reader: *mut ReaderHandle, timeout_ms: i64) -> 
     call(|| table::with(number(reader), |reader| reader.wait(duration(timeout_ms))))
 }
 
-/// The oldest pose that has not been read: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. A thousand are kept.
+/// The oldest pose that has not been read: SEMIDENSE_STATUS_OK, …_NONE or …_ENDED. 900 are kept.
 ///
 /// # Safety
 /// `pose` is null or may be written to.

@@ -1,5 +1,5 @@
 //! A stream of frames as its bytes are: for each frame a header of 64 bytes, then the picture. All numbers are little
-//! endian; docs/ros2.md has the table.
+//! endian; docs/sources.md has the table.
 
 use crate::capture::v4l::pixel_format::PixelFormat;
 use crate::capture::v4l::video_device::FourCc;
