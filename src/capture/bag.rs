@@ -7,7 +7,6 @@ mod camera;
 mod chunk;
 mod contents;
 mod message;
-mod pixels;
 mod records;
 mod topics;
 
@@ -22,6 +21,7 @@ use crate::capture::bag::records::{Place, Records};
 use crate::capture::bag::topics::Kind;
 use crate::capture::image_file::{DecodeError, decode_gray_into};
 use crate::capture::rig::Rig;
+use crate::capture::ros_image::RosImageError;
 use crate::capture::source::{FrameSource, FrameStamp, Notice, SourceError};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::rectification::Rectification;
@@ -79,23 +79,9 @@ pub enum BagImageError {
     /// The message is not what its type says.
     #[error("is not a message of its type: {0}")]
     Message(#[from] message::CdrError),
-    /// The pixels are of a kind that is not read.
-    #[error("has the encoding `{0}`, which is not read; convert it to mono8 or rgb8")]
-    Encoding(String),
-    /// Fewer bytes than its size needs.
-    #[error("has {found} bytes where {width}x{height} pixels of {encoding} need {needed}")]
-    Length {
-        /// Bytes that are there.
-        found: usize,
-        /// Bytes that are needed.
-        needed: usize,
-        /// Width, pixels.
-        width: usize,
-        /// Height, pixels.
-        height: usize,
-        /// The encoding.
-        encoding: String,
-    },
+    /// Its pixels are of a kind that is not read, or not as many as it says.
+    #[error("has {0}")]
+    Pixels(#[from] RosImageError),
     /// It does not decode, or has another size than the camera's.
     #[error(transparent)]
     Decode(#[from] DecodeError),
@@ -252,7 +238,14 @@ impl Bag {
                 let image: CompressedImage<'_> = message::decode(data)?;
                 decode_gray_into(image.data, width, height, &mut self.samples, gray)?;
             }
-            _ => pixels::gray_into(&message::decode::<Image<'_>>(data)?, width, height, gray)?,
+            _ => {
+                let image: Image<'_> = message::decode(data)?;
+                let found = (image.width as usize, image.height as usize);
+                if found != (width, height) {
+                    return Err(DecodeError::Size { found, expected: (width, height) }.into());
+                }
+                image.as_ros().unpack_gray(gray)?;
+            }
         }
         if !is_identity {
             self.rectification.rectify_into(&self.raw, pixels);

@@ -28,7 +28,7 @@ const MAX_SIDE: u32 = 8192;
 pub enum RosImageError {
     /// A format without grey values, or one that is not known.
     #[error(
-        "encoding `{0}`: known are mono8, mono16, rgb8, bgr8, rgba8, bgra8, 8UC1, 8UC3, 8UC4, 16UC1, rgb16, bgr16, bayer_*8, bayer_*16, yuv422, yuv422_yuy2, uyvy, yuyv, nv21, nv24"
+        "encoding `{0}`: known are mono8, mono16, rgb8, bgr8, rgba8, bgra8, 8UC1, 8UC3, 8UC4, 16UC1, rgb16, bgr16, bayer_*8, bayer_*16, yuv422, yuv422_yuy2, uyvy, yuyv, nv12, nv21, nv24"
     )]
     Encoding(String),
     /// A size that no camera has, or another one than the buffer's.
@@ -79,8 +79,7 @@ impl RosImage<'_> {
             let (step, samples) = (self.step as usize, &mut Vec::new());
             return Ok(unpack_gray(format, self.data, step, (width, height), samples, gray)?);
         }
-        let samples =
-            self.samples().ok_or_else(|| RosImageError::Encoding(self.encoding.to_owned()))?;
+        let samples = self.samples().ok_or_else(|| RosImageError::Encoding(self.shown()))?;
         let pixel_bytes = match samples {
             Samples::Colour { channels, bytes, .. } => channels * bytes,
             Samples::Bayer { bytes, .. } => bytes,
@@ -95,7 +94,7 @@ impl RosImage<'_> {
                 step: self.step,
                 width: self.width,
                 height: self.height,
-                encoding: self.encoding.to_owned(),
+                encoding: self.shown(),
             });
         }
         for (v, gray) in gray.chunks_exact_mut(width).enumerate() {
@@ -105,6 +104,12 @@ impl RosImage<'_> {
             }
         }
         Ok(())
+    }
+
+    /// The name of the format as far as an error shows it.
+    fn shown(&self) -> String {
+        const MOST: usize = 40;
+        self.encoding.escape_debug().take(MOST).collect()
     }
 
     /// The format of cameras that has the same bytes.
@@ -117,7 +122,7 @@ impl RosImage<'_> {
             "yuv422" | "uyvy" => PixelFormat::Uyvy,
             "yuv422_yuy2" | "yuyv" => PixelFormat::Yuyv,
             // Planes: the first one is luma.
-            "nv21" | "nv24" => PixelFormat::Nv12,
+            "nv12" | "nv21" | "nv24" => PixelFormat::Nv12,
             _ => return None,
         })
     }
@@ -207,7 +212,7 @@ fn around(at: usize, length: usize) -> [usize; 3] {
 mod tests {
     use super::*;
 
-    const ALL: [&str; 27] = [
+    const ALL: [&str; 28] = [
         "mono8",
         "8UC1",
         "mono16",
@@ -232,6 +237,7 @@ mod tests {
         "uyvy",
         "yuv422_yuy2",
         "yuyv",
+        "nv12",
         "nv21",
         "nv24",
         "bayer_rggb16",

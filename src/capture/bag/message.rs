@@ -3,6 +3,8 @@
 use byteorder::{BigEndian, LittleEndian};
 use serde::Deserialize;
 
+use crate::capture::ros_image::RosImage;
+
 /// Bytes before a message: encoding and options.
 const HEADER_BYTES: usize = 4;
 
@@ -61,6 +63,14 @@ pub struct Image<'a> {
     /// The pixels.
     #[serde(with = "serde_bytes")]
     pub data: &'a [u8],
+}
+
+impl Image<'_> {
+    /// The image without its header.
+    pub fn as_ros(&self) -> RosImage<'_> {
+        let &Self { height, width, ref encoding, is_bigendian, step, data, .. } = self;
+        RosImage { encoding, width, height, step, is_bigendian: is_bigendian != 0, data }
+    }
 }
 
 /// `sensor_msgs/CompressedImage`.
