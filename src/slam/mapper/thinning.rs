@@ -154,36 +154,26 @@ fn shown_by(map: &Map, index: usize, reuse: &ReuseParams) -> Option<(u64, Sim3)>
     let views: Vec<Sim3> = others.iter().map(|of| of.map_from_keyframe.inverse() * place).collect();
     let stride = keyframe.points.len().div_ceil(MOST_POINTS).max(1);
     let (mut shown, mut all) = (0u32, 0u32);
-    let mut shown_by_each = vec![0u32; others.len()];
     for point in keyframe.points.iter().step_by(stride) {
         let Intrinsics { fx, fy, cx, cy, .. } = keyframe.intrinsics;
         let ray = Vector3::new((f64::from(point.u) - cx) / fx, (f64::from(point.v) - cy) / fy, 1.0);
         let at = ray / f64::from(point.inverse_depth);
-        let mut num_showing = 0;
-        for ((of, view), count) in others.iter().zip(&views).zip(&mut shown_by_each) {
-            let is_shown = shows(of, view, &at);
-            num_showing += usize::from(is_shown);
-            *count += u32::from(is_shown);
-        }
+        let num_showing =
+            others.iter().zip(&views).filter(|(of, view)| shows(of, view, &at)).count();
         shown += u32::from(num_showing >= NUM_OTHERS);
         all += 1;
     }
     if f64::from(shown) < LEAST_SHARE * f64::from(all) {
         return None;
     }
-    // Who comes back here must find one to be tracked on in its stead: where there is none the way back is mapped anew,
-    // and drifts.
-    let stands_in = |of: &Keyframe, count: u32| {
-        let usage = f64::from(count) / f64::from(all);
-        reuse.distance.distance(distance(of) / place.scale, usage) < reuse.max_distance
+    // Who comes back here must find one to be tracked on in its stead, by that one's unit and points as reuse measures:
+    // where there is none the way back is mapped anew, and drifts.
+    let stands_in = |of: &Keyframe| {
+        let at = of.map_from_keyframe.locate(&place.rigid);
+        reuse.distance.distance(at.translation.norm(), of.usage(&at)) < reuse.max_distance
     };
-    let nearest = others
-        .iter()
-        .zip(views)
-        .zip(shown_by_each)
-        .filter(|((of, _), count)| stands_in(of, *count))
-        .map(|(near, _)| near)
-        .min_by(|(one, _), (other, _)| {
+    let nearest =
+        others.iter().zip(views).filter(|(of, _)| stands_in(of)).min_by(|(one, _), (other, _)| {
             distance(one).total_cmp(&distance(other)).then(one.keyframe_id.cmp(&other.keyframe_id))
         });
     nearest.map(|(of, view)| (of.keyframe_id, view))
@@ -294,6 +284,34 @@ mod tests {
         let nearest = (0.01 * weight).powi(2);
         assert_eq!(stands_in(1.01 * nearest + 1e-3).map(|(id, _)| id), Some(2));
         assert!(stands_in(0.5 * nearest).is_none());
+    }
+
+    /// A keyframe nearer to the wall shows fewer points and has a smaller unit: what is little in the unit of the one
+    /// that goes is more in its own.
+    #[test]
+    fn what_stands_in_is_measured_in_its_own_unit_and_by_its_own_points() {
+        let mut map = Map {
+            keyframes: [0.0, 0.02, -0.01, 0.03]
+                .iter()
+                .enumerate()
+                .map(|(k, x)| keyframe(k as u64, *x, 0.0))
+                .collect(),
+            ..Map::default()
+        };
+        // The first is a fifth of its unit behind the others, and its unit is the distance of the wall from there.
+        let first = &mut map.keyframes[0];
+        first.map_from_keyframe =
+            Sim3::new(SE3 { translation: Vector3::new(0.0, 0.0, -0.2), ..SE3::identity() }, 1.2);
+        let weight = DistanceWeights::default().translation;
+        let squared = |distance: f64| (distance * weight).powi(2);
+        let reuse = |max_distance| ReuseParams { max_distance, ..ReuseParams::default() };
+        let of_nearest =
+            map.keyframes[2].map_from_keyframe.locate(&map.keyframes[0].map_from_keyframe.rigid);
+        let in_its_own = DistanceWeights::default()
+            .distance(of_nearest.translation.norm(), map.keyframes[2].usage(&of_nearest));
+        assert!(squared(0.2) > squared(0.2 / 1.2) && in_its_own >= squared(0.2));
+        assert!(shown_by(&map, 0, &reuse(0.99 * in_its_own)).is_none());
+        assert!(shown_by(&map, 0, &reuse(1.01 * in_its_own)).is_some());
     }
 
     fn loop_between(i: u64, j: u64) -> Link {
