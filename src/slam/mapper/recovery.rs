@@ -24,6 +24,22 @@ use crate::slam::tracker::MOST_DEVIATIONS;
 /// further off, and a map that has drifted by as much is none to go on with.
 pub(super) const MAX_DISAGREEMENT: f64 = 0.1;
 
+/// Who is asked whether a place that was found is right.
+pub(super) struct ByOthers {
+    /// A keyframe that is not: its place in the map.
+    pub but: Option<usize>,
+    /// Largest difference of a pose on another keyframe from the one found, translation in mean depths plus rotation in
+    /// radians.
+    pub max_disagreement: f64,
+}
+
+impl ByOthers {
+    /// After a loss all may be asked.
+    pub fn after_loss() -> Self {
+        Self { but: None, max_disagreement: MAX_DISAGREEMENT }
+    }
+}
+
 /// Tuning of the recovery from a loss.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -121,7 +137,7 @@ impl Mapper {
         let (index, keyframe_from_camera) = found?;
         let is_possible = !self.contradicts_hold(pose, index, &keyframe_from_camera);
         if is_possible
-            && self.is_confirmed(index, &keyframe_from_camera, pixels)
+            && self.is_confirmed(index, &keyframe_from_camera, pixels, &ByOthers::after_loss())
             && self.points_agree(index, &keyframe_from_camera, pixels)
         {
             return found;
@@ -156,6 +172,7 @@ impl Mapper {
         index: usize,
         keyframe_from_camera: &SE3,
         pixels: &[u8],
+        by: &ByOthers,
     ) -> bool {
         /// Keyframes that are asked.
         const MOST: usize = 3;
@@ -169,7 +186,8 @@ impl Mapper {
         let mut others: Vec<(f64, usize, SE3)> = self
             .map
             .seen_from(epoch, &map_from_camera, REACH)
-            .filter(|(other, view)| *other != index && view.usage >= LEAST_USAGE)
+            .filter(|(other, _)| *other != index && Some(*other) != by.but)
+            .filter(|(_, view)| view.usage >= LEAST_USAGE)
             .filter(|(other, _)| self.map.keyframes[*other].map_state == MapState::Established)
             .map(|(other, view)| (view.usage, other, view.keyframe_from_camera))
             .collect();
@@ -179,7 +197,7 @@ impl Mapper {
         let is_young = of_epoch.take(START_KEYFRAMES + 1).count() <= START_KEYFRAMES;
         let mut agrees = |(_, other, expected): &(f64, usize, SE3)| {
             let keyframe = &self.map.keyframes[*other];
-            self.finder.locate(keyframe, pixels, expected, MAX_DISAGREEMENT).is_some()
+            self.finder.locate(keyframe, pixels, expected, by.max_disagreement).is_some()
         };
         others.is_empty() && is_young || others.iter().any(&mut agrees)
     }
@@ -351,13 +369,16 @@ mod tests {
     fn a_place_is_believed_where_another_keyframe_has_the_camera_there_too() {
         let pixels = Scene::new(3).render(&CAMERA, &sideways(0.1)).noisy(2.0, 9);
         let mut mapper = mapper_with(&[0.0, 0.15]);
-        assert!(mapper.is_confirmed(0, &sideways(0.1), &pixels));
+        assert!(mapper.is_confirmed(0, &sideways(0.1), &pixels, &ByOthers::after_loss()));
         let turned = SE3::exp(&Vector6::new(0.1, 0.05, 0.0, 0.1, 0.25, 0.0));
-        assert!(!mapper.is_confirmed(0, &turned, &pixels), "the other one sees something else");
+        assert!(
+            !mapper.is_confirmed(0, &turned, &pixels, &ByOthers::after_loss()),
+            "the other one sees something else"
+        );
         // Nobody else is there to be asked, or only one that is not believed.
-        assert!(mapper_with(&[0.0]).is_confirmed(0, &turned, &pixels));
+        assert!(mapper_with(&[0.0]).is_confirmed(0, &turned, &pixels, &ByOthers::after_loss()));
         mapper.map.keyframes[1].map_state = MapState::Rejected;
-        assert!(mapper.is_confirmed(0, &turned, &pixels));
+        assert!(mapper.is_confirmed(0, &turned, &pixels, &ByOthers::after_loss()));
     }
 
     #[test]
@@ -367,7 +388,7 @@ mod tests {
         let confirms = |elsewhere: usize| {
             let places = (0..elsewhere).map(|k| 30.0 + 0.3 * k as f64);
             let places: Vec<f64> = std::iter::once(0.0).chain(places).collect();
-            mapper_with(&places).is_confirmed(0, &here, &pixels)
+            mapper_with(&places).is_confirmed(0, &here, &pixels, &ByOthers::after_loss())
         };
         assert!(confirms(START_KEYFRAMES - 1), "the map is young");
         assert!(!confirms(START_KEYFRAMES));
