@@ -12,6 +12,11 @@ use crate::slam::window::surface::Surface;
 /// Frames aligned with one adjustment: twice as many as come between two keyframes, so that those of an epoch's first
 /// keyframes are made up for without delaying it.
 const MOST_AT_ONCE: usize = 30;
+/// Keyframes after its own that a frame of an epoch's first keyframes waits for: all of these move with each estimate, and
+/// the frame with its own.
+const FIRST_LAG: usize = 4;
+/// Images of frames whose memory is kept for others: as many as come between two keyframes.
+const MOST_SPARE: usize = 30;
 /// Levels that a frame is aligned on: it is within a pixel or two already.
 const FRAME_LEVELS: [usize; 2] = [1, 0];
 /// The same of a frame whose pose is a guess.
@@ -68,6 +73,7 @@ impl Window {
         waiting.append(frames);
         let excess = waiting.len().saturating_sub(self.params.max_waiting_frames);
         spare.extend(waiting.drain(..excess).map(|frame| frame.pixels));
+        spare.truncate(MOST_SPARE);
     }
 
     /// Frames that have been aligned again since somebody asked.
@@ -75,13 +81,11 @@ impl Window {
         std::mem::take(&mut self.frames.placed)
     }
 
-    /// Aligns the frames that have waited long enough: until enough keyframes have come, and an epoch's first ones have
-    /// settled.
+    /// Aligns the frames that have waited long enough: until enough keyframes have come, more among an epoch's first ones.
     pub(super) fn place_frames(&mut self, newest: usize, is_first: bool) {
-        if is_first {
-            return;
-        }
-        let ready = (newest + 1).saturating_sub(self.params.frame_lag);
+        let lag =
+            if is_first { self.params.frame_lag.max(FIRST_LAG) } else { self.params.frame_lag };
+        let ready = (newest + 1).saturating_sub(lag);
         self.place_frames_before(ready, MOST_AT_ONCE);
     }
 
