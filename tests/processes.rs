@@ -9,7 +9,8 @@ use std::io::{BufRead, BufReader};
 use std::time::{Duration, UNIX_EPOCH};
 
 use rustix::process::{Pid, Signal};
-use semidense::capture::source::{SourceName, open};
+use semidense::capture::opening::open;
+use semidense::capture::source_name::SourceName;
 use semidense::service::config::Config;
 use semidense::service::peers::Peer;
 use semidense::service::replay::{ReplayConfig, replay};

@@ -4,7 +4,8 @@ use std::path::Path;
 use std::process::ExitCode;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use crate::capture::source::{FrameSource, SourceName};
+use crate::capture::source::FrameSource;
+use crate::capture::source_name::SourceName;
 use crate::command::print::{note, print};
 use crate::command::progress::Progress;
 use crate::command::{CommandResult, INTERRUPTED, NOTHING_TRACKED};

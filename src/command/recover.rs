@@ -6,7 +6,10 @@ use std::process::ExitCode;
 
 use clap::Args;
 
-use crate::capture::source::{FrameSource, FrameStamp, SourceError, SourceName, open};
+use crate::capture::opening::open;
+use crate::capture::source::{FrameSource, FrameStamp};
+use crate::capture::source_error::SourceError;
+use crate::capture::source_name::SourceName;
 use crate::command::ending::{Ending, note_unfinished};
 use crate::command::map_points::MapPointOptions;
 use crate::command::print::note;

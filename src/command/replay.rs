@@ -7,7 +7,8 @@ use std::process::ExitCode;
 
 use clap::{Args, ValueEnum};
 
-use crate::capture::source::{FrameSource, open, rig_remarks};
+use crate::capture::opening::{open, rig_remarks};
+use crate::capture::source::FrameSource;
 use crate::command::INTERRUPTED;
 use crate::command::capture::SourceArguments;
 use crate::command::ending::{Ending, note_unfinished, run_start};

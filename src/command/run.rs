@@ -6,7 +6,7 @@ use std::process::ExitCode;
 
 use clap::Args;
 
-use crate::capture::source::SourceName;
+use crate::capture::source_name::SourceName;
 use crate::command::bridge::{BridgeError, handed_on, program};
 use crate::command::capture::{ModeArguments, SourceArguments, usual_mode};
 use crate::command::ending::{Ending, note_unfinished, run_start};

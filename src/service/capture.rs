@@ -3,9 +3,10 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use crate::capture::source::{
-    Arrival, FrameSource, FrameStamp, SourceError, SourceName, open, rig_remarks,
-};
+use crate::capture::opening::{open, rig_remarks};
+use crate::capture::source::{Arrival, FrameSource, FrameStamp};
+use crate::capture::source_error::SourceError;
+use crate::capture::source_name::SourceName;
 use crate::service::child::{is_supervised, prepared_frames};
 use crate::service::clock::{Pace, duration_from_nanos, now_nanos, realtime_of};
 use crate::service::config::Config;

@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use rustix::fs::MemfdFlags;
 use rustix::process::{Pid, Signal};
 
-use crate::capture::source::SourceName;
+use crate::capture::source_name::SourceName;
 use crate::service::error_log::ErrorLog;
 use crate::service::liveness::Liveness;
 use crate::service::manager_notice::VARIABLES;

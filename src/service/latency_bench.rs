@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use crate::capture::source::SourceName;
+use crate::capture::source_name::SourceName;
 use crate::service::config::Config;
 use crate::service::error_log::ErrorLog;
 use crate::service::mode::Mode;

@@ -7,7 +7,8 @@
 
 use std::time::Instant;
 
-use crate::capture::source::{FrameSource, FrameStamp, SourceError};
+use crate::capture::source::{FrameSource, FrameStamp};
+use crate::capture::source_error::SourceError;
 use crate::service::adjustments::{Adjustments, Entry};
 use crate::service::alignment_stamps::AlignmentStamps;
 use crate::service::config::MapConfig;

@@ -34,7 +34,8 @@ use std::time::{Instant, SystemTime};
 
 use serde::{Deserialize, Serialize};
 
-use crate::capture::source::{FrameSource, SourceError};
+use crate::capture::source::FrameSource;
+use crate::capture::source_error::SourceError;
 use crate::service::adjustments::{AdjustmentRecord, SearchRecord};
 use crate::service::alignment_stamps::AlignmentTrace;
 use crate::service::atomic_file::write_atomically;

@@ -2,7 +2,7 @@
 
 use std::io;
 
-use crate::capture::source::SourceError;
+use crate::capture::source_error::SourceError;
 use crate::service::map_folder::MapFolderError;
 use crate::wire::place::PlaceError;
 use crate::wire::port::{OpenError, ReceiveError, WaitError};

@@ -6,7 +6,9 @@ use std::fs::File;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use crate::capture::source::{FrameSource, SourceName, open};
+use crate::capture::opening::open;
+use crate::capture::source::FrameSource;
+use crate::capture::source_name::SourceName;
 use crate::service::checkpoint::read_checkpoint;
 use crate::service::child::{Child, memory_for_frames};
 use crate::service::clock::now_nanos;

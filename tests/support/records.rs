@@ -1,6 +1,7 @@
 //! Records of runs made by hand, and a source whose depth is a wall.
 
-use semidense::capture::source::{FrameSource, FrameStamp, SourceError};
+use semidense::capture::source::{FrameSource, FrameStamp};
+use semidense::capture::source_error::SourceError;
 use semidense::service::alignment_stamps::{AlignmentTrace, LevelTrace};
 use semidense::service::results::output_folder::prepare_output;
 use semidense::service::results::untracked::StartTally;
