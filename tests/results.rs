@@ -12,11 +12,10 @@ use semidense::slam::evaluation::depth_error::DepthScale;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::graph::constraint::Refusal;
 use semidense::slam::loops::{SearchFate, SearchReport};
+use semidense::slam::map::{ConfirmedPoint, PlacedFrame};
 use semidense::slam::mapper::consistency::Contradiction;
 use semidense::slam::pose::{DegradedReason, LostReason, TrackingState};
 use semidense::slam::window::Adjustment;
-use semidense::slam::window::confirmed::ConfirmedPoint;
-use semidense::slam::window::frames::PlacedFrame;
 
 #[test]
 fn frames_aligned_afterwards_count_where_the_map_was_tracked_on() {
