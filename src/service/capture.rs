@@ -19,7 +19,8 @@ use crate::service::schedule::{apply, in_force};
 use crate::service::shutdown::Shutdown;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::wire::message::{FrameHeader, HealthMessage, PoseMessage, StepMessage};
-use crate::wire::place::{Claim, Place, PlaceError};
+use crate::wire::place::{Claim, Place};
+use crate::wire::place_error::PlaceError;
 use crate::wire::port::{
     Access, Hub, OpenError, Publisher, ReceiveError, SendError, Subscriber, WaitError, wait,
 };

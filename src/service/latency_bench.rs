@@ -20,7 +20,8 @@ use crate::service::run_progress::RunProgress;
 use crate::service::shutdown::Shutdown;
 use crate::service::supervisor::{Ended, RunError, RunOptions, RunOutcome, run};
 use crate::wire::message::{FrameHeader, PoseMessage};
-use crate::wire::place::{Place, PlaceError};
+use crate::wire::place::Place;
+use crate::wire::place_error::PlaceError;
 use crate::wire::port::{Access, Hub, OpenError, Subscriber, wait};
 use crate::wire::topic::{FRAME, POSE};
 

@@ -14,7 +14,7 @@ use crate::service::liveness::Liveness;
 use crate::service::mapper::WRITES_MAP;
 use crate::service::peers::Peer;
 use crate::service::results::RestartCause;
-use crate::wire::place::SHARED_MEMORY;
+use crate::wire::folders::SHARED_MEMORY;
 use crate::wire::port::ReceiveError;
 use crate::wire::shared_memory::free_shared_memory;
 use crate::wire::topic::CAPTURE_HEALTH;

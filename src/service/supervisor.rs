@@ -33,7 +33,8 @@ use crate::service::supervised::{Death, Supervised};
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::map::Map;
 use crate::wire::command::CommandClient;
-use crate::wire::place::{Claim, Place, PlaceError};
+use crate::wire::place::{Claim, Place};
+use crate::wire::place_error::PlaceError;
 use crate::wire::port::{Access, Hub, wait};
 use crate::wire::topic::{HEALTH_TOPICS, shared_memory_bytes};
 
