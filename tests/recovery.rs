@@ -15,7 +15,7 @@ use semidense::capture::source::{FrameSource, FrameStamp};
 use semidense::capture::source_error::SourceError;
 use semidense::capture::source_name::SourceName;
 use semidense::service::replay::{ReplayConfig, replay};
-use semidense::service::results::RunRecord;
+use semidense::service::results::record::RunRecord;
 use semidense::slam::evaluation::umeyama::TrajectoryAlignment;
 use semidense::slam::evaluation::{
     MAX_DIFFERENCE_NANOS, TrajectoryEvaluation, evaluate_trajectory,

@@ -6,7 +6,7 @@ mod records;
 use records::{UNIT_M, keyframe, nanos, pose, record, written};
 use semidense::service::adjustments::{AdjustmentRecord, Fate, SearchRecord};
 use semidense::service::results::output_folder::prepare_output;
-use semidense::service::results::{Rejection, RunRecord};
+use semidense::service::results::record::{Rejection, RunRecord};
 use semidense::service::trajectory_file::read_trajectory;
 use semidense::slam::evaluation::depth_error::DepthScale;
 use semidense::slam::geometry::se3::SE3;

@@ -14,7 +14,7 @@ use crate::capture::source_name::SourceName;
 use crate::service::config::Config;
 use crate::service::error_log::ErrorLog;
 use crate::service::mode::Mode;
-use crate::service::results::RecordedPose;
+use crate::service::results::record::RecordedPose;
 use crate::service::results::times::Percentiles;
 use crate::service::run_progress::RunProgress;
 use crate::service::shutdown::Shutdown;

@@ -13,7 +13,7 @@ use crate::service::health::{ProcessState, cause};
 use crate::service::liveness::Liveness;
 use crate::service::mapper::WRITES_MAP;
 use crate::service::peers::Peer;
-use crate::service::results::RestartCause;
+use crate::service::results::record::RestartCause;
 use crate::wire::folders::SHARED_MEMORY;
 use crate::wire::port::ReceiveError;
 use crate::wire::shared_memory::free_shared_memory;

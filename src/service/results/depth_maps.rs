@@ -2,7 +2,7 @@
 
 use crate::capture::source::FrameSource;
 use crate::capture::source_error::SourceError;
-use crate::service::results::RunRecord;
+use crate::service::results::record::RunRecord;
 use crate::slam::evaluation::depth_error::{DepthErrors, DepthStatistics, KeyframeDepth};
 use crate::slam::keyframe::{Keyframe, MapState};
 
