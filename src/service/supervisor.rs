@@ -35,7 +35,6 @@ use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::map::Map;
 use crate::wire::command::CommandClient;
 use crate::wire::place::{Claim, Place};
-use crate::wire::place_error::PlaceError;
 use crate::wire::port::{Access, Hub, wait};
 use crate::wire::topic::{HEALTH_TOPICS, shared_memory_bytes};
 
@@ -178,7 +177,7 @@ fn begin_journal(options: &RunOptions, place: &Place) -> Option<Journal> {
 }
 
 /// The claim of the supervisor, after a look that none of the three runs already.
-fn claim_all(place: &Place) -> Result<Claim, PlaceError> {
+fn claim_all(place: &Place) -> Result<Claim, RunError> {
     let claim = place.claim("supervisor")?;
     for topic in HEALTH_TOPICS {
         place.claim(topic.owner)?;
