@@ -123,7 +123,8 @@ fn read_tree<'a>(text: &'a str, before: &str, paths: &mut Vec<String>) -> &'a st
     let is_name = |c: char| c.is_alphanumeric() || c == '_' || c == ':' || c == '*';
     let end = text.find(|c| !is_name(c)).unwrap_or(text.len());
     let path = format!("{before}{}", &text[..end]);
-    if !(path.ends_with("::") && text[end..].starts_with('{')) {
+    let is_group = text[end..].starts_with('{') && (path.is_empty() || path.ends_with("::"));
+    if !is_group {
         paths.push(path);
         return &text[end..];
     }
@@ -133,7 +134,11 @@ fn read_tree<'a>(text: &'a str, before: &str, paths: &mut Vec<String>) -> &'a st
         if let Some(after) = rest.strip_prefix('}') {
             return after;
         }
-        rest = read_tree(rest, &path, paths);
+        let after = read_tree(rest, &path, paths);
+        if after.len() == rest.len() {
+            return after;
+        }
+        rest = after;
         if let Some(renamed) = rest.strip_prefix(" as ") {
             rest = &renamed[renamed.find([',', '}', '\n']).unwrap_or(renamed.len())..];
         }
@@ -196,16 +201,16 @@ fn is_below(module: &str, other: &str) -> bool {
     module.strip_prefix(other).is_some_and(|rest| rest.starts_with("::"))
 }
 
-/// The shortest way along imports, both ends included.
-fn shortest_way(imports: &Imports, from: &str, to: &str) -> Option<Vec<String>> {
+/// The shortest path along imports, both ends included.
+fn shortest_path(imports: &Imports, from: &str, to: &str) -> Option<Vec<String>> {
     let mut before = BTreeMap::from([(from.to_owned(), None)]);
     let mut waiting = VecDeque::from([from.to_owned()]);
     while let Some(module) = waiting.pop_front() {
         if module == to {
             let back = |of: &String| before.get(of).cloned().flatten();
-            let mut way: Vec<String> = std::iter::successors(Some(module), back).collect();
-            way.reverse();
-            return Some(way);
+            let mut path: Vec<String> = std::iter::successors(Some(module), back).collect();
+            path.reverse();
+            return Some(path);
         }
         for next in imports.get(&module).into_iter().flatten() {
             if !before.contains_key(next) {
@@ -229,10 +234,10 @@ fn circle_in(imports: &Imports) -> Option<Vec<String>> {
         beside.map(move |other| (module, other))
     });
     let circles = beside.filter_map(|(module, other)| {
-        shortest_way(&down, other, module).or_else(|| {
-            let way = shortest_way(imports, other, module)?;
-            let is_above_all = |top: &String| way.iter().all(|of| of == top || is_below(of, top));
-            (!way.iter().any(is_above_all)).then_some(way)
+        shortest_path(&down, other, module).or_else(|| {
+            let path = shortest_path(imports, other, module)?;
+            let is_above_all = |top: &String| path.iter().all(|of| of == top || is_below(of, top));
+            (!path.iter().any(is_above_all)).then_some(path)
         })
     });
     circles.min_by_key(Vec::len)
