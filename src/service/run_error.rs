@@ -3,7 +3,7 @@
 use std::io;
 
 use crate::capture::source_error::SourceError;
-use crate::service::map_folder::MapFolderError;
+use crate::service::map_folder::map_folder_error::MapFolderError;
 use crate::wire::place_error::PlaceError;
 use crate::wire::port::{OpenError, ReceiveError, WaitError};
 
