@@ -16,7 +16,8 @@ use std::path::Path;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use semidense::capture::source::{FrameSource, SourceParams, open};
+use semidense::capture::opening::{SourceParams, open};
+use semidense::capture::source::FrameSource;
 use semidense::service::shutdown::Shutdown;
 use semidense::service::trajectory_file::write_trajectory;
 use semidense::slam::trajectory::StampedPose;

@@ -11,7 +11,9 @@ use std::time::Instant;
 
 use clap::Parser;
 use nalgebra::Vector3;
-use semidense::capture::source::{FrameSource, SourceName, SourceParams, open};
+use semidense::capture::opening::{SourceParams, open};
+use semidense::capture::source::FrameSource;
+use semidense::capture::source_name::SourceName;
 use semidense::service::config::Config;
 use semidense::service::replay::{DepthOrigin, PoseOrigin, ReplayConfig, replay};
 use semidense::slam::geometry::se3::SE3;

@@ -5,8 +5,9 @@ use std::path::Path;
 use std::time::Instant;
 
 use semidense::service::map_folder::depth_file::MapDetail;
+use semidense::service::map_folder::reading::load;
+use semidense::service::map_folder::write_new;
 use semidense::service::map_folder::writer::MapHead;
-use semidense::service::map_folder::{load, write_new};
 use semidense::slam::keyframe::Keyframe;
 use semidense::slam::map::Map;
 use semidense::slam::mapper::prior::MapUse;

@@ -9,7 +9,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use clap::Parser;
-use semidense::capture::source::{SourceName, SourceParams, open};
+use semidense::capture::opening::{SourceParams, open};
+use semidense::capture::source_name::SourceName;
 use semidense::service::replay::{ReplayConfig, replay};
 
 /// Replays recordings with their own calibration and with wrong ones.

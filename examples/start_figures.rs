@@ -10,7 +10,9 @@ use std::process::ExitCode;
 use std::time::Instant;
 
 use clap::Parser;
-use semidense::capture::source::{FrameSource, SourceName, SourceParams, open};
+use semidense::capture::opening::{SourceParams, open};
+use semidense::capture::source::FrameSource;
+use semidense::capture::source_name::SourceName;
 use semidense::slam::evaluation::start_error::StartErrors;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;

@@ -7,7 +7,8 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use nalgebra::Vector3;
-use semidense::capture::source::{FrameSource, SourceParams, open};
+use semidense::capture::opening::{SourceParams, open};
+use semidense::capture::source::FrameSource;
 use semidense::capture::source_name::SourceName;
 use semidense::service::map_file::{read_map, write_map};
 use semidense::service::replay::{PoseOrigin, ReplayConfig, replay};

@@ -7,8 +7,10 @@ use std::fs;
 use std::path::Path;
 
 use semidense::capture::image_file::decode_gray_into;
+use semidense::capture::opening::open;
 use semidense::capture::rig::Rig;
-use semidense::capture::source::{FrameSource, SourceName, open};
+use semidense::capture::source::FrameSource;
+use semidense::capture::source_name::SourceName;
 use semidense::capture::{png_image, sensor_yaml};
 use semidense::service::adjustments::message::adjustment_from_message;
 use semidense::service::config::Config;

@@ -7,7 +7,7 @@ use semidense::service::map_file::write_map;
 use semidense::service::map_folder::depth_file::{MapDetail, encode};
 use semidense::service::map_folder::manifest::{DepthFile, Listed, Manifest};
 use semidense::service::recording::RunCounters;
-use semidense::service::results::RunMode;
+use semidense::service::results::record::RunMode;
 use semidense::slam::frame::FrameView;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;

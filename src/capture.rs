@@ -4,6 +4,7 @@ pub mod bag;
 #[cfg(test)]
 mod conformance;
 pub mod dataset_writer;
+pub mod decode_error;
 pub mod euroc;
 pub mod frame_store;
 pub mod image_file;
@@ -14,13 +15,16 @@ pub mod input_file;
 pub mod jpeg_image;
 pub mod listing;
 pub mod looped;
+pub mod opening;
 pub mod png_image;
 pub mod recording;
 pub mod rig;
+pub mod rig_error;
 pub mod ros_image;
 pub mod sensor_yaml;
 pub mod simulator;
 pub mod source;
+pub mod source_error;
 pub mod source_name;
 pub mod stream;
 #[cfg(test)]

@@ -46,6 +46,7 @@ pub mod shutdown;
 pub mod soak_bench;
 pub mod supervised;
 pub mod supervisor;
+pub mod time_counts;
 pub mod tracker;
 pub mod trajectory_file;
 pub mod view_child;

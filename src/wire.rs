@@ -5,6 +5,7 @@
 
 pub mod command;
 pub mod conversion;
+pub mod folders;
 pub mod keyframe_inbox;
 pub mod limits;
 pub mod message;

@@ -1,7 +1,7 @@
 //! The structure: imports run down, `slam` is pure, foreign names stay in their module,
 //! files can be read in one sitting. The rule about imports is the table in docs/development.md.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -89,6 +89,160 @@ fn allowed_imports() -> BTreeMap<String, Vec<String>> {
     table
 }
 
+/// Which files a file imports from, by the paths of their modules: `src/slam/map.rs` is `slam::map`.
+type Imports = BTreeMap<String, BTreeSet<String>>;
+
+/// The code of a file without what is only for tests, and the modules that it declares for these. An item ends where
+/// a line as far in as its attribute ends it.
+fn without_tests(lines: &[String]) -> (String, Vec<String>) {
+    let (mut code, mut test_modules) = (String::new(), Vec::new());
+    let mut lines = lines.iter();
+    while let Some(line) = lines.next() {
+        let indent = line.len() - line.trim_start().len();
+        if !line.trim_start().starts_with("#[cfg(test)]") {
+            code.push_str(line);
+            code.push('\n');
+            continue;
+        }
+        for line in lines.by_ref() {
+            let text = line.trim();
+            let name = text.strip_suffix(';').and_then(|text| text.split("mod ").nth(1));
+            test_modules.extend(name.map(str::to_owned));
+            let is_attribute = text.starts_with("#[");
+            let ends = !is_attribute && text.ends_with(['}', ';', ',']);
+            if ends && line.len() - line.trim_start().len() == indent {
+                break;
+            }
+        }
+    }
+    (code, test_modules)
+}
+
+/// The paths of a tree as in `use`, from `text` on, behind `before`; what comes after the tree.
+fn read_tree<'a>(text: &'a str, before: &str, paths: &mut Vec<String>) -> &'a str {
+    let is_name = |c: char| c.is_alphanumeric() || c == '_' || c == ':' || c == '*';
+    let end = text.find(|c| !is_name(c)).unwrap_or(text.len());
+    let path = format!("{before}{}", &text[..end]);
+    let is_group = text[end..].starts_with('{') && (path.is_empty() || path.ends_with("::"));
+    if !is_group {
+        paths.push(path);
+        return &text[end..];
+    }
+    let mut rest = &text[end + 1..];
+    loop {
+        rest = rest.trim_start_matches([',', ' ', '\n']);
+        if let Some(after) = rest.strip_prefix('}') {
+            return after;
+        }
+        let after = read_tree(rest, &path, paths);
+        if after.len() == rest.len() {
+            return after;
+        }
+        rest = after;
+        if let Some(renamed) = rest.strip_prefix(" as ") {
+            rest = &renamed[renamed.find([',', '}', '\n']).unwrap_or(renamed.len())..];
+        }
+    }
+}
+
+/// What the code of `module` names: by whole paths, and its own parts by theirs.
+fn named_in(module: &str, code: &str) -> Vec<String> {
+    let parent = module.rsplit_once("::").map_or("", |(parent, _)| parent);
+    let starts = [("crate::", ""), ("super::", parent), ("self::", module)];
+    let mut named = Vec::new();
+    for (start, from) in starts {
+        for (at, _) in code.match_indices(start) {
+            let is_inside = code[..at].ends_with(|c: char| c.is_alphanumeric() || "_:".contains(c));
+            let before = if from.is_empty() { String::new() } else { format!("{from}::") };
+            if !is_inside {
+                read_tree(&code[at + start.len()..], &before, &mut named);
+            }
+        }
+    }
+    let declared = code.lines().filter_map(|line| line.strip_suffix(';')?.split("mod ").nth(1));
+    for part in declared {
+        let uses = code.match_indices(&format!("{part}::")).any(|(at, _)| {
+            !code[..at].ends_with(|c: char| c.is_alphanumeric() || "_:".contains(c))
+        });
+        named.extend(uses.then(|| format!("{module}::{part}")));
+    }
+    named
+}
+
+/// All imports between the files of a folder, tests left out.
+fn imports_in(folder: &str) -> Imports {
+    let mut codes = BTreeMap::new();
+    let mut for_tests = Vec::new();
+    for (file, lines) in sources(folder) {
+        let path = file.trim_start_matches(folder).trim_start_matches('/').trim_end_matches(".rs");
+        let module = path.replace('/', "::");
+        let (code, test_modules) = without_tests(&lines);
+        let below = if module == "lib" { String::new() } else { format!("{module}::") };
+        for_tests.extend(test_modules.into_iter().map(|name| format!("{below}{name}")));
+        codes.insert(module, code);
+    }
+    let is_test = |module: &str| for_tests.iter().any(|of| module == of || is_below(module, of));
+    codes.retain(|module, _| !is_test(module));
+    let imports_of = |(module, code): (&String, &String)| {
+        let named = named_in(module, code);
+        let others = named.iter().filter_map(|path| file_of(path, &codes));
+        (module.clone(), others.filter(|other| other != module).map(str::to_owned).collect())
+    };
+    codes.iter().map(imports_of).collect()
+}
+
+/// The file that a path leads into: of those that it begins with the longest.
+fn file_of<'a>(path: &'a str, codes: &BTreeMap<String, String>) -> Option<&'a str> {
+    let ends = path.match_indices("::").map(|(end, _)| end).chain([path.len()]);
+    ends.map(|end| &path[..end]).filter(|module| codes.contains_key(*module)).last()
+}
+
+fn is_below(module: &str, other: &str) -> bool {
+    module.strip_prefix(other).is_some_and(|rest| rest.starts_with("::"))
+}
+
+/// The shortest path along imports, both ends included.
+fn shortest_path(imports: &Imports, from: &str, to: &str) -> Option<Vec<String>> {
+    let mut before = BTreeMap::from([(from.to_owned(), None)]);
+    let mut waiting = VecDeque::from([from.to_owned()]);
+    while let Some(module) = waiting.pop_front() {
+        if module == to {
+            let back = |of: &String| before.get(of).cloned().flatten();
+            let mut path: Vec<String> = std::iter::successors(Some(module), back).collect();
+            path.reverse();
+            return Some(path);
+        }
+        for next in imports.get(&module).into_iter().flatten() {
+            if !before.contains_key(next) {
+                before.insert(next.clone(), Some(module.clone()));
+                waiting.push_back(next.clone());
+            }
+        }
+    }
+    None
+}
+
+/// The shortest circle of imports that is more than a file and its parts: none of its files is above all others, or
+/// there is one without the imports from a part to a file above it.
+fn circle_in(imports: &Imports) -> Option<Vec<String>> {
+    let mut down = imports.clone();
+    for (module, others) in &mut down {
+        others.retain(|other| !is_below(module, other));
+    }
+    let beside = down.iter().flat_map(|(module, others)| {
+        let beside = others.iter().filter(|other| !is_below(other, module));
+        beside.map(move |other| (module, other))
+    });
+    let circles = beside.filter_map(|(module, other)| {
+        shortest_path(&down, other, module).or_else(|| {
+            let path = shortest_path(imports, other, module)?;
+            let is_above_all = |top: &String| path.iter().all(|of| of == top || is_below(of, top));
+            (!path.iter().any(is_above_all)).then_some(path)
+        })
+    });
+    circles.min_by_key(Vec::len)
+}
+
 #[test]
 fn a_module_with_parts_is_a_file_beside_its_folder() {
     for folder in ["src", "bridge/src", "c/src"] {
@@ -126,6 +280,25 @@ fn imports_run_down() {
         }
     }
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+#[test]
+fn imports_make_no_circles() {
+    for folder in ["src", "bridge/src", "c/src"] {
+        let imports = imports_in(folder);
+        assert!(imports.values().any(|others| !others.is_empty()), "no imports in {folder}");
+        if let Some(circle) = circle_in(&imports) {
+            let files: Vec<String> = circle
+                .iter()
+                .chain(circle.first())
+                .map(|module| format!("{folder}/{}.rs", module.replace("::", "/")))
+                .collect();
+            panic!(
+                "a circle of imports: what both need belongs into a file below them\n    {}",
+                files.join("\n -> ")
+            );
+        }
+    }
 }
 
 #[test]

@@ -7,7 +7,7 @@ use semidense::capture::simulator::Simulator;
 use semidense::capture::simulator::params::{SensorParams, SimulatorParams};
 use semidense::capture::source::FrameSource;
 use semidense::service::replay::{ReplayConfig, replay};
-use semidense::service::results::RunRecord;
+use semidense::service::results::record::RunRecord;
 use semidense::slam::evaluation::umeyama::TrajectoryAlignment;
 use semidense::slam::evaluation::{MAX_DIFFERENCE_NANOS, evaluate_trajectory};
 use semidense::slam::pose::TrackingState;

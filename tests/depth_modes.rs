@@ -9,9 +9,11 @@ mod recordings;
 
 use figures::{Figure, hold};
 use recordings::recording;
+use semidense::capture::opening::{SourceParams, open};
 use semidense::capture::simulator::Simulator;
 use semidense::capture::simulator::params::SimulatorParams;
-use semidense::capture::source::{FrameSource, SourceName, SourceParams, open};
+use semidense::capture::source::FrameSource;
+use semidense::capture::source_name::SourceName;
 use semidense::service::replay::{PoseOrigin, ReplayConfig, replay};
 use semidense::slam::alignment::kernel::SimdMode;
 use semidense::slam::evaluation::depth_error::{DepthErrors, DepthScale};

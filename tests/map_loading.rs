@@ -10,7 +10,7 @@ use std::process::Child;
 
 use rustix::process::{Pid, Signal, kill_process};
 use semidense::service::health::cause;
-use semidense::service::map_folder::{load, read_manifest};
+use semidense::service::map_folder::reading::{load, read_manifest};
 use semidense::service::peers::Peer;
 use semidense::slam::map::Map;
 use semidense::wire::port::Hub;

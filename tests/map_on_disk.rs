@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use semidense::service::journal::folder::unfinished;
 use semidense::service::journal::recovered::Recovered;
-use semidense::service::map_folder::{load, read_manifest};
+use semidense::service::map_folder::reading::{load, read_manifest};
 use semidense::service::trajectory_file::read_trajectory;
 use semidense::slam::map::Map;
 use serde_json::Value;

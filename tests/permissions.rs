@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use rustix::process::Signal;
 use semidense::service::peers::Peer;
-use semidense::wire::place::SHARED_MEMORY;
+use semidense::wire::folders::SHARED_MEMORY;
 use semidense::wire::topic::MAPPER_HEALTH;
 use support::{Rig, end, signal, until};
 

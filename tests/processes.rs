@@ -9,11 +9,12 @@ use std::io::{BufRead, BufReader};
 use std::time::{Duration, UNIX_EPOCH};
 
 use rustix::process::{Pid, Signal};
-use semidense::capture::source::{SourceName, open};
+use semidense::capture::opening::open;
+use semidense::capture::source_name::SourceName;
 use semidense::service::config::Config;
 use semidense::service::peers::Peer;
 use semidense::service::replay::{ReplayConfig, replay};
-use semidense::service::results::RecordedPose;
+use semidense::service::results::record::RecordedPose;
 use semidense::slam::keyframe::DepthPoint;
 use semidense::wire::command::{Command, CommandClient};
 use semidense::wire::conversion::{keyframe_from_messages, pose_from_message};

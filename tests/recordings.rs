@@ -4,7 +4,8 @@
 mod recordings;
 
 use recordings::recording;
-use semidense::capture::source::{SourceName, SourceParams, open};
+use semidense::capture::opening::{SourceParams, open};
+use semidense::capture::source_name::SourceName;
 
 #[test]
 fn every_recording_is_read_whole() {

@@ -6,15 +6,16 @@ mod recordings;
 
 use nalgebra::Vector6;
 use recordings::recording;
+use semidense::capture::opening::{SourceParams, open};
 use semidense::capture::simulator::Simulator;
 use semidense::capture::simulator::params::{
     MotionKind, MotionParams, SensorParams, SimulatorParams,
 };
-use semidense::capture::source::{
-    FrameSource, FrameStamp, SourceError, SourceName, SourceParams, open,
-};
+use semidense::capture::source::{FrameSource, FrameStamp};
+use semidense::capture::source_error::SourceError;
+use semidense::capture::source_name::SourceName;
 use semidense::service::replay::{ReplayConfig, replay};
-use semidense::service::results::RunRecord;
+use semidense::service::results::record::RunRecord;
 use semidense::slam::evaluation::umeyama::TrajectoryAlignment;
 use semidense::slam::evaluation::{
     MAX_DIFFERENCE_NANOS, TrajectoryEvaluation, evaluate_trajectory,

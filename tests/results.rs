@@ -6,17 +6,16 @@ mod records;
 use records::{UNIT_M, keyframe, nanos, pose, record, written};
 use semidense::service::adjustments::{AdjustmentRecord, Fate, SearchRecord};
 use semidense::service::results::output_folder::prepare_output;
-use semidense::service::results::{Rejection, RunRecord};
+use semidense::service::results::record::{Rejection, RunRecord};
 use semidense::service::trajectory_file::read_trajectory;
 use semidense::slam::evaluation::depth_error::DepthScale;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::graph::constraint::Refusal;
 use semidense::slam::loops::{SearchFate, SearchReport};
+use semidense::slam::map::{ConfirmedPoint, PlacedFrame};
 use semidense::slam::mapper::consistency::Contradiction;
 use semidense::slam::pose::{DegradedReason, LostReason, TrackingState};
 use semidense::slam::window::Adjustment;
-use semidense::slam::window::confirmed::ConfirmedPoint;
-use semidense::slam::window::frames::PlacedFrame;
 
 #[test]
 fn frames_aligned_afterwards_count_where_the_map_was_tracked_on() {

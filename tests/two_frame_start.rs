@@ -5,11 +5,14 @@
 mod recordings;
 
 use recordings::{recording, say};
+use semidense::capture::opening::{SourceParams, open};
 use semidense::capture::simulator::Simulator;
 use semidense::capture::simulator::params::{
-    MotionKind, MotionParams, SceneKind, SensorParams, SimulatorParams,
+    MotionKind, MotionParams, SensorParams, SimulatorParams,
 };
-use semidense::capture::source::{FrameSource, SourceName, SourceParams, open};
+use semidense::capture::simulator::scene_kind::SceneKind;
+use semidense::capture::source::FrameSource;
+use semidense::capture::source_name::SourceName;
 use semidense::slam::evaluation::start_error::StartErrors;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;

@@ -12,12 +12,13 @@ use semidense::service::health::{ProcessState, bucket_end_ms, scheduling_name};
 use semidense::slam::keyframe::{DepthPoint, MAX_KEYFRAME_POINTS};
 use semidense::slam::pose::TrackingState;
 use semidense::wire::conversion::{map_state_from_code, start_frame_from_code, state_from_codes};
+use semidense::wire::folders::{ROOT_VARIABLE, SYSTEM_ROOT};
 use semidense::wire::message::{
     AdjustmentMessage, CommandRequest, CommandResponse, FrameHeader, GraphHeader,
     HISTOGRAM_BUCKETS, HealthMessage, KeyframeHeader, KeyframeImageHeader, KeyframePoseMessage,
     PATH_BYTES, PoseMessage, StepMessage, TEXT_BYTES,
 };
-use semidense::wire::place::{Place, ROOT_VARIABLE, SYSTEM_ROOT};
+use semidense::wire::place::Place;
 use semidense::wire::topic::{
     ADJUSTMENT, CAPTURE_HEALTH, FRAME, GRAPH, KEYFRAME, KEYFRAME_IMAGE, MAPPER_COMMAND,
     MAPPER_HEALTH, POSE, STEP, TRACKER_HEALTH, Topic, WIRE_VERSION,

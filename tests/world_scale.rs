@@ -4,7 +4,7 @@
 use semidense::capture::simulator::Simulator;
 use semidense::capture::simulator::params::SimulatorParams;
 use semidense::service::replay::{DepthOrigin, PoseOrigin, ReplayConfig, replay};
-use semidense::service::results::RunRecord;
+use semidense::service::results::record::RunRecord;
 use semidense::slam::mapper::MapperParams;
 use semidense::slam::window::params::WindowParams;
 

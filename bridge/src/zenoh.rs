@@ -20,6 +20,7 @@ pub mod rate;
 pub mod receiver;
 pub mod remote;
 pub mod sender;
+pub mod shared;
 pub mod slots;
 pub mod stamps;
 pub mod traffic;

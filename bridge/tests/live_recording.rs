@@ -6,7 +6,8 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 
 use semidense::capture::image_file::write_gray_png;
-use semidense::capture::source::{SourceName, SourceParams, open};
+use semidense::capture::opening::{SourceParams, open};
+use semidense::capture::source_name::SourceName;
 use support::{Process, Rig, semidense, succeed, until};
 
 /// Frames of the run, and how fast they come: slow enough for a busy machine without an optimised build.

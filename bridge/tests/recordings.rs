@@ -10,7 +10,9 @@ use std::time::{Duration, Instant};
 use sample_run::{
     CAMERA, CAPTURE, HEIGHT, PERIOD, REALTIME, WIDTH, frame, health, pixels, pose, run, script,
 };
-use semidense::capture::source::{FrameStamp, SourceName, SourceParams, open};
+use semidense::capture::opening::{SourceParams, open};
+use semidense::capture::source::FrameStamp;
+use semidense::capture::source_name::SourceName;
 use semidense_bridge::record::queue::queue;
 use semidense_bridge::record::recorder::{RecordParams, RecordSummary, Recorder};
 use semidense_bridge::ros::encoder::Moment;

@@ -8,8 +8,9 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
+use semidense::capture::opening::{SourceParams, open};
 use semidense::capture::simulator::params::SimulatorParams;
-use semidense::capture::source::{SourceName, SourceParams, open};
+use semidense::capture::source_name::SourceName;
 use semidense::service::health::ProcessState;
 use semidense::slam::geometry::se3::SE3;
 use semidense_bridge::session::{Event, Session, Wants};

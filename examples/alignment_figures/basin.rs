@@ -10,8 +10,10 @@ use std::path::PathBuf;
 
 use nalgebra::{Vector3, Vector6};
 use semidense::capture::simulator::Simulator;
-use semidense::capture::simulator::params::{SceneKind, SimulatorParams};
-use semidense::service::results::report::chart::{Chart, Mark, Scaling, Series, svg_file};
+use semidense::capture::simulator::params::SimulatorParams;
+use semidense::capture::simulator::scene_kind::SceneKind;
+use semidense::service::results::report::chart::{Chart, Scaling, svg_file};
+use semidense::service::results::report::series::{Mark, Series};
 use semidense::slam::alignment::align::{Aligner, AlignmentParams};
 use semidense::slam::alignment::displacement::mean_displacement_px;
 use semidense::slam::alignment::reference::{Reference, num_levels};

@@ -6,7 +6,8 @@
 use std::error::Error;
 
 use semidense::capture::simulator::Simulator;
-use semidense::capture::simulator::params::{SceneKind, SensorParams, SimulatorParams};
+use semidense::capture::simulator::params::{SensorParams, SimulatorParams};
+use semidense::capture::simulator::scene_kind::SceneKind;
 use semidense::slam::tracker::TrackerParams;
 
 use crate::sequence::{KeyframeChoice, Recorded, TrackedFrame, track};

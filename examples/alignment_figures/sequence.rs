@@ -5,7 +5,8 @@ use std::error::Error;
 use std::time::Instant;
 
 use nalgebra::Vector6;
-use semidense::capture::source::{FrameSource, FrameStamp, SourceError};
+use semidense::capture::source::{FrameSource, FrameStamp};
+use semidense::capture::source_error::SourceError;
 use semidense::slam::alignment::reference::Reference;
 use semidense::slam::evaluation::normalized_error::normalized;
 use semidense::slam::frame::FrameView;

@@ -5,7 +5,7 @@ use std::fs;
 use std::path::Path;
 
 use nalgebra::Vector3;
-use semidense::capture::source::{SourceParams, open};
+use semidense::capture::opening::{SourceParams, open};
 use semidense::service::trajectory_file::read_trajectory;
 use semidense::slam::depth::map::DepthMap;
 use semidense::slam::geometry::intrinsics::Intrinsics;

@@ -17,7 +17,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Parser;
-use semidense::capture::source::SourceName;
+use semidense::capture::source_name::SourceName;
 
 use crate::footage::Footage;
 use crate::methods::{Kind, Scores};

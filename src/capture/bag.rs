@@ -3,6 +3,7 @@
 //! Read once from the start, message by message, so that a file without end (of a recorder that was killed) is played to
 //! the last whole chunk. Sizes in the file are never trusted.
 
+pub mod bag_error;
 mod camera;
 mod chunk;
 mod contents;
@@ -15,91 +16,18 @@ mod tests;
 
 use std::path::{Path, PathBuf};
 
+use crate::capture::bag::bag_error::{BagError, BagImageError};
 use crate::capture::bag::contents::Contents;
 use crate::capture::bag::message::{CompressedImage, FrameRecord, Image, Stamped};
 use crate::capture::bag::records::{Place, Records};
 use crate::capture::bag::topics::Kind;
-use crate::capture::image_file::{DecodeError, decode_gray_into};
+use crate::capture::decode_error::DecodeError;
+use crate::capture::image_file::decode_gray_into;
 use crate::capture::rig::Rig;
-use crate::capture::ros_image::RosImageError;
-use crate::capture::source::{FrameSource, FrameStamp, Notice, SourceError};
+use crate::capture::source::{FrameSource, FrameStamp, Notice};
+use crate::capture::source_error::SourceError;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::rectification::Rectification;
-
-/// Why a bag cannot be used, or a message of it; the file and topic are named beside it.
-#[derive(Debug, thiserror::Error)]
-pub enum BagError {
-    /// The file cannot be read.
-    #[error("cannot be read: {0}; check the path and its permissions")]
-    Read(#[from] std::io::Error),
-    /// Another kind of file.
-    #[error("is no MCAP file; write a bag as one with `ros2 bag convert` or `mcap convert`")]
-    NotMcap,
-    /// A record that is not what its kind needs.
-    #[error("is damaged at byte {at}: {reason}; `mcap recover` saves what can be read")]
-    Damaged {
-        /// Where the record begins.
-        at: u64,
-        /// What is wrong with it.
-        reason: String,
-    },
-    /// No topic of images.
-    #[error("has no topic with images (sensor_msgs/Image or CompressedImage); it has {0}")]
-    NoImages(String),
-    /// Several topics of images.
-    #[error("has several topics with images: name one as mcap:FILE:TOPIC, of {0}")]
-    SeveralTopics(String),
-    /// The named topic is not there, or has no images.
-    #[error("has no images on the topic `{topic}`; topics with images are {known}")]
-    NoTopic {
-        /// The topic that was named.
-        topic: String,
-        /// Topics with images.
-        known: String,
-    },
-    /// Nothing says what the camera is.
-    #[error("has no CameraInfo beside `{0}`; name the camera with --rig FILE")]
-    NoCamera(String),
-    /// A `CameraInfo` that no rig can be made of.
-    #[error("CameraInfo of `{topic}`: {reason}; name the camera with --rig FILE")]
-    Camera {
-        /// The topic of the images.
-        topic: String,
-        /// What is wrong with it.
-        reason: String,
-    },
-    /// The topic has no messages.
-    #[error("has no images on `{0}`; check that this is the right recording")]
-    Empty(String),
-}
-
-/// An image that cannot be used; the next may be good.
-#[derive(Debug, thiserror::Error)]
-pub enum BagImageError {
-    /// The message is not what its type says.
-    #[error("is not a message of its type: {0}")]
-    Message(#[from] message::CdrError),
-    /// Its pixels are of a kind that is not read, or not as many as it says.
-    #[error("has {0}")]
-    Pixels(#[from] RosImageError),
-    /// It does not decode, or has another size than the camera's.
-    #[error(transparent)]
-    Decode(#[from] DecodeError),
-    /// Its stamp does not come after that of the image before.
-    #[error("has the stamp {nanos} ns, which does not come after the one before")]
-    Disordered {
-        /// Its stamp.
-        nanos: i64,
-    },
-    /// The chunk that it was in is damaged.
-    #[error("is lost with a part of the file that is damaged at byte {at}: {reason}")]
-    Chunk {
-        /// Where the record begins.
-        at: u64,
-        /// What is wrong with it.
-        reason: String,
-    },
-}
 
 /// The images of a topic as a source of frames.
 #[derive(Debug)]

@@ -4,10 +4,11 @@ use std::fs;
 use std::path::Path;
 
 use crate::capture::image_file::{write_depth_png, write_gray_png};
+use crate::capture::opening::{self, SourceParams};
 use crate::capture::simulator::params::SimulatorParams;
-use crate::capture::source::{
-    self, FrameSource, FrameStamp, SourceError, SourceName, SourceParams,
-};
+use crate::capture::source::{FrameSource, FrameStamp};
+use crate::capture::source_error::SourceError;
+use crate::capture::source_name::SourceName;
 use crate::capture::test_bag::{TestBag, camera_info, compressed_image};
 use crate::capture::test_images::flat_block_jpeg;
 
@@ -123,7 +124,7 @@ fn open(name: &SourceName, rig: Option<&Path>) -> Result<Box<dyn FrameSource>, S
         focal_px: 30.0,
         ..SimulatorParams::default()
     };
-    source::open(name, rig, &SourceParams { simulator, ..SourceParams::default() })
+    opening::open(name, rig, &SourceParams { simulator, ..SourceParams::default() })
 }
 
 /// Makes a dataset, lets `spoil` change it and opens it.

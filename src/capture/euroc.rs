@@ -6,7 +6,7 @@ use crate::capture::listing::{read_text, rows};
 use crate::capture::recording::{Contents, ListedImage, Recording};
 use crate::capture::rig::Rig;
 use crate::capture::sensor_yaml;
-use crate::capture::source::SourceError;
+use crate::capture::source_error::SourceError;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::trajectory::StampedPose;
 

@@ -2,8 +2,9 @@
 
 use png::{BitDepth, ColorType};
 
+use crate::capture::decode_error::DecodeError;
 use crate::capture::image_file::{
-    DecodeError, ImageFileReader, decode_gray_into, write_depth_png, write_gray_png,
+    ImageFileReader, decode_gray_into, write_depth_png, write_gray_png,
 };
 use crate::capture::test_images::{flat_block_jpeg, png_of};
 

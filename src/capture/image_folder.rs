@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use crate::capture::listing::{Row, read_text, rows};
 use crate::capture::recording::{Contents, ListedImage, Recording};
-use crate::capture::source::SourceError;
+use crate::capture::source_error::SourceError;
 use crate::capture::tum::read_rig;
 use crate::capture::{input_file, jpeg_image, png_image};
 

@@ -5,7 +5,7 @@ use zune_core::colorspace::ColorSpace;
 use zune_core::options::DecoderOptions;
 use zune_jpeg::JpegDecoder;
 
-use crate::capture::image_file::{DecodeError, MAX_SIDE};
+use crate::capture::decode_error::{DecodeError, MAX_SIDE};
 use crate::slam::image::gray::gray_from_interleaved;
 
 /// The first bytes of every JPEG: start of image, and the start of a marker.

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use crate::capture::input_file;
-use crate::capture::source::SourceError;
+use crate::capture::source_error::SourceError;
 use crate::slam::geometry::se3::SE3;
 
 /// Largest list: a week at 100 Hz with 1 kB a line is far below.

@@ -6,7 +6,9 @@ use std::io;
 use std::path::PathBuf;
 
 use crate::capture::frame_store::FrameStore;
-use crate::capture::source::{FrameSource, FrameStamp, Notice, SourceError, SourceName};
+use crate::capture::source::{FrameSource, FrameStamp, Notice};
+use crate::capture::source_error::SourceError;
+use crate::capture::source_name::SourceName;
 use crate::slam::geometry::intrinsics::Intrinsics;
 
 /// Most memory for the frames that are kept, bytes: two thousand VGA images.
@@ -143,8 +145,8 @@ impl FrameSource for Looped {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::capture::opening::{SourceParams, open};
     use crate::capture::simulator::params::SimulatorParams;
-    use crate::capture::source::{SourceParams, open};
 
     #[test]
     fn frames_go_back_and_forth_at_the_rate() {

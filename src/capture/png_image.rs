@@ -4,7 +4,7 @@ use std::io::Cursor;
 
 use png::{BitDepth, ColorType, Decoder, Limits, Reader, Transformations};
 
-use crate::capture::image_file::{DecodeError, MAX_SIDE};
+use crate::capture::decode_error::{DecodeError, MAX_SIDE};
 use crate::slam::image::gray::gray_from_interleaved;
 
 /// The first bytes of every PNG.

@@ -8,7 +8,8 @@ use std::path::PathBuf;
 
 use crate::capture::image_file::ImageFileReader;
 use crate::capture::rig::Rig;
-use crate::capture::source::{FrameSource, FrameStamp, SourceError};
+use crate::capture::source::{FrameSource, FrameStamp};
+use crate::capture::source_error::SourceError;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::rectification::Rectification;
 use crate::slam::image::buffer::Image;

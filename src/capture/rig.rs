@@ -1,12 +1,13 @@
 //! Rigs: what is known about a camera before it is opened, from TOML or a TUM `camera.txt`.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use nalgebra::Vector2;
 use serde::Deserialize;
 
 use crate::capture::listing;
-use crate::capture::source::SourceError;
+use crate::capture::rig_error::RigError;
+use crate::capture::source_error::SourceError;
 use crate::slam::geometry::camera_model::{CameraModel, Distortion};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::parameter::{ParameterError, check_range};
@@ -36,29 +37,6 @@ pub struct Rig {
     pub camera: CameraModel,
     /// Frames a second, where the rig names it.
     pub rate_hz: Option<f64>,
-}
-
-/// Why a rig cannot be used; names the file.
-#[derive(Debug, thiserror::Error)]
-pub enum RigError {
-    /// The file is not a rig: bad syntax, an unknown or a missing key.
-    #[error("{}, line {line}: {problem}", path.display())]
-    Syntax {
-        /// The rig file.
-        path: PathBuf,
-        /// Line, from 1.
-        line: usize,
-        /// What is wrong, in one line.
-        problem: String,
-    },
-    /// A value that no camera can have.
-    #[error("{}: {source}", path.display())]
-    Value {
-        /// The rig file.
-        path: PathBuf,
-        /// Key, value and allowed range.
-        source: ParameterError,
-    },
 }
 
 /// The lens models of a rig file.

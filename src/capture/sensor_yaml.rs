@@ -10,7 +10,7 @@ use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 
 use crate::capture::listing::{Row, read_text, rows};
 use crate::capture::rig::{LensModel, Rig, RigFile};
-use crate::capture::source::SourceError;
+use crate::capture::source_error::SourceError;
 use crate::slam::geometry::se3::SE3;
 
 /// How far the rotation of `T_BS` may be from orthonormal: files are written with few digits.

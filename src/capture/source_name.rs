@@ -7,7 +7,7 @@ use std::os::unix::fs::FileTypeExt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
-use crate::capture::source::SourceError;
+use crate::capture::source_error::SourceError;
 use crate::capture::{euroc, image_folder, tum};
 
 /// The forms of a source name, for errors and help.

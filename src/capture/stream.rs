@@ -18,9 +18,9 @@ use self::feed::{Feed, Listener, Program, await_readable};
 use self::format::{StreamClock, StreamHeader};
 use self::reader::{FrameReader, Progress, StreamFault};
 use crate::capture::rig::Rig;
-use crate::capture::source::{
-    Arrival, FrameClocks, FrameLosses, FrameSource, FrameStamp, Notice, SourceError, SourceName,
-};
+use crate::capture::source::{Arrival, FrameClocks, FrameLosses, FrameSource, FrameStamp, Notice};
+use crate::capture::source_error::SourceError;
+use crate::capture::source_name::SourceName;
 use crate::capture::v4l::pixel_format::{PixelFormat, unpack_gray};
 use crate::capture::v4l::stamps::FrameNumbers;
 use crate::slam::geometry::intrinsics::Intrinsics;

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use crate::capture::listing::{read_text, rows};
 use crate::capture::recording::{Contents, ListedImage, Recording};
 use crate::capture::rig::Rig;
-use crate::capture::source::SourceError;
+use crate::capture::source_error::SourceError;
 use crate::slam::trajectory::StampedPose;
 
 /// The list of the images, by which the layout is known.

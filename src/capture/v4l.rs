@@ -33,7 +33,8 @@ use self::params::CameraParams;
 use self::pixel_format::{PixelFormat, unpack_gray};
 use self::video_device::VideoSystem;
 use crate::capture::rig::Rig;
-use crate::capture::source::{Arrival, FrameLosses, FrameSource, FrameStamp, Notice, SourceError};
+use crate::capture::source::{Arrival, FrameLosses, FrameSource, FrameStamp, Notice};
+use crate::capture::source_error::SourceError;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::rectification::Rectification;
 

@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use clap::{Args, Subcommand, ValueEnum};
 
-use crate::capture::source::SourceName;
+use crate::capture::source_name::SourceName;
 use crate::command::ending::run_start;
 use crate::command::print::{note, print};
 use crate::command::run_progress::start_display;

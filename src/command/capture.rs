@@ -6,7 +6,8 @@ use std::process::ExitCode;
 
 use clap::Args;
 
-use crate::capture::source::{SourceError, SourceName};
+use crate::capture::source_error::SourceError;
+use crate::capture::source_name::SourceName;
 use crate::command::print::note;
 use crate::command::{CommandResult, INTERRUPTED};
 use crate::service::capture::{CaptureError, CaptureOptions, run as run_shell};

@@ -4,7 +4,8 @@ use std::path::Path;
 use std::process::ExitCode;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use crate::capture::source::{FrameSource, SourceName};
+use crate::capture::source::FrameSource;
+use crate::capture::source_name::SourceName;
 use crate::command::print::{note, print};
 use crate::command::progress::Progress;
 use crate::command::{CommandResult, INTERRUPTED, NOTHING_TRACKED};
@@ -12,12 +13,14 @@ use crate::service::config::Config;
 use crate::service::journal::Journal;
 use crate::service::journal::folder::Unfinished;
 use crate::service::journal::log::RunStart;
+use crate::service::results::Results;
 use crate::service::results::calibration::calibration_warning;
 use crate::service::results::output_folder::OutputFolder;
+use crate::service::results::record::{EndOfRun, RunMode, RunRecord};
+use crate::service::results::results_error::ResultsError;
 use crate::service::results::set::has_tracked_set;
 use crate::service::results::summary::Summary;
 use crate::service::results::summary_text::{recovery_text, refused_text, summary_text};
-use crate::service::results::{EndOfRun, Results, ResultsError, RunMode, RunRecord};
 
 /// Where and how results are given out.
 pub struct Ending<'a> {

@@ -6,7 +6,10 @@ use std::process::ExitCode;
 
 use clap::Args;
 
-use crate::capture::source::{FrameSource, FrameStamp, SourceError, SourceName, open};
+use crate::capture::opening::open;
+use crate::capture::source::{FrameSource, FrameStamp};
+use crate::capture::source_error::SourceError;
+use crate::capture::source_name::SourceName;
 use crate::command::ending::{Ending, note_unfinished};
 use crate::command::map_points::MapPointOptions;
 use crate::command::print::note;
@@ -18,9 +21,9 @@ use crate::service::journal::log::RunStart;
 use crate::service::journal::recovered::Recovered;
 use crate::service::recording::RecordParts;
 use crate::service::results::output_folder::{OutputFolder, PARENT, utc_text};
+use crate::service::results::record::{EndOfRun, RunRecord};
 use crate::service::results::set::has_set_since;
 use crate::service::results::summary::without_depth;
-use crate::service::results::{EndOfRun, RunRecord};
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::map::Map;

@@ -7,7 +7,8 @@ use std::process::ExitCode;
 
 use clap::{Args, ValueEnum};
 
-use crate::capture::source::{FrameSource, open, rig_remarks};
+use crate::capture::opening::{open, rig_remarks};
+use crate::capture::source::FrameSource;
 use crate::command::INTERRUPTED;
 use crate::command::capture::SourceArguments;
 use crate::command::ending::{Ending, note_unfinished, run_start};
@@ -25,8 +26,9 @@ use crate::service::replay::{
 };
 use crate::service::results::debug_pictures::write_debug_pictures;
 use crate::service::results::output_folder::OutputFolder;
+use crate::service::results::record::{EndOfRun, RunRecord};
+use crate::service::results::results_error::ResultsError;
 use crate::service::results::set::{DEBUG_FOLDER, foreign_debug};
-use crate::service::results::{EndOfRun, ResultsError, RunRecord};
 use crate::service::shutdown::Shutdown;
 use crate::slam::pose::TrackingState;
 use crate::wire::place::Place;

@@ -6,7 +6,7 @@ use std::process::ExitCode;
 
 use clap::Args;
 
-use crate::capture::source::SourceName;
+use crate::capture::source_name::SourceName;
 use crate::command::bridge::{BridgeError, handed_on, program};
 use crate::command::capture::{ModeArguments, SourceArguments, usual_mode};
 use crate::command::ending::{Ending, note_unfinished, run_start};
@@ -22,8 +22,8 @@ use crate::service::journal::folder::unfinished;
 use crate::service::journal::log::RunStart;
 use crate::service::journal::{Journal, JournalOptions};
 use crate::service::mode::Mode;
-use crate::service::results::RunMode;
 use crate::service::results::output_folder::OutputFolder;
+use crate::service::results::record::RunMode;
 use crate::service::shutdown::Shutdown;
 use crate::service::supervisor::{Ended, RunOptions, run as supervise};
 use crate::service::view_child::{ViewChild, ViewOptions};

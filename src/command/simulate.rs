@@ -10,7 +10,8 @@ use serde::Serialize;
 
 use crate::capture::dataset_writer::{DatasetError, DatasetLayout, DatasetWriter};
 use crate::capture::simulator::Simulator;
-use crate::capture::simulator::params::{MotionKind, SceneKind, SimulatorParams};
+use crate::capture::simulator::params::{MotionKind, SimulatorParams};
+use crate::capture::simulator::scene_kind::SceneKind;
 use crate::capture::simulator::summary::{PathSummary, gradient_share, summarize};
 use crate::capture::source::FrameSource;
 use crate::command::INTERRUPTED;

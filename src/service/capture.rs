@@ -3,9 +3,10 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use crate::capture::source::{
-    Arrival, FrameSource, FrameStamp, SourceError, SourceName, open, rig_remarks,
-};
+use crate::capture::opening::{open, rig_remarks};
+use crate::capture::source::{Arrival, FrameSource, FrameStamp};
+use crate::capture::source_error::SourceError;
+use crate::capture::source_name::SourceName;
 use crate::service::child::{is_supervised, prepared_frames};
 use crate::service::clock::{Pace, duration_from_nanos, now_nanos, realtime_of};
 use crate::service::config::Config;
@@ -18,7 +19,8 @@ use crate::service::schedule::{apply, in_force};
 use crate::service::shutdown::Shutdown;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::wire::message::{FrameHeader, HealthMessage, PoseMessage, StepMessage};
-use crate::wire::place::{Claim, Place, PlaceError};
+use crate::wire::place::{Claim, Place};
+use crate::wire::place_error::PlaceError;
 use crate::wire::port::{
     Access, Hub, OpenError, Publisher, ReceiveError, SendError, Subscriber, WaitError, wait,
 };

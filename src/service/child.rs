@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use rustix::fs::MemfdFlags;
 use rustix::process::{Pid, Signal};
 
-use crate::capture::source::SourceName;
+use crate::capture::source_name::SourceName;
 use crate::service::error_log::ErrorLog;
 use crate::service::liveness::Liveness;
 use crate::service::manager_notice::VARIABLES;
@@ -141,7 +141,7 @@ impl Child {
             .arg(name)
             .args(arguments)
             .env(SUPERVISOR_VARIABLE, std::process::id().to_string())
-            .env(crate::wire::place::ROOT_VARIABLE, root)
+            .env(crate::wire::folders::ROOT_VARIABLE, root)
             .env(RUN_VARIABLE, run)
             .env(FRAMES_VARIABLE, if frames.is_some() { FRAMES_ON_STDIN } else { "" })
             .stdin(frames.map_or_else(Stdio::null, Stdio::from))

@@ -15,8 +15,8 @@ use toml::de::DeTable;
 use toml::{Table, Value};
 
 use crate::capture::input_file;
+use crate::capture::opening::SourceParams;
 use crate::capture::simulator::params::SimulatorParams;
-use crate::capture::source::SourceParams;
 use crate::capture::v4l::params::CameraParams;
 pub use crate::service::config::origins::{KeyInForce, Origin};
 pub use crate::service::config_error::ConfigError;

@@ -13,7 +13,8 @@ use self::cameras::{CameraAccess, camera_access};
 use crate::service::config::Config;
 use crate::service::schedule::Policy;
 use crate::slam::geometry::intrinsics::Intrinsics;
-use crate::wire::place::{Place, SHARED_MEMORY};
+use crate::wire::folders::SHARED_MEMORY;
+use crate::wire::place::Place;
 use crate::wire::topic::shared_memory_bytes;
 
 /// How bad a finding is.

@@ -10,17 +10,18 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use crate::capture::source::SourceName;
+use crate::capture::source_name::SourceName;
 use crate::service::config::Config;
 use crate::service::error_log::ErrorLog;
 use crate::service::mode::Mode;
-use crate::service::results::RecordedPose;
+use crate::service::results::record::RecordedPose;
 use crate::service::results::times::Percentiles;
 use crate::service::run_progress::RunProgress;
 use crate::service::shutdown::Shutdown;
 use crate::service::supervisor::{Ended, RunError, RunOptions, RunOutcome, run};
 use crate::wire::message::{FrameHeader, PoseMessage};
-use crate::wire::place::{Place, PlaceError};
+use crate::wire::place::Place;
+use crate::wire::place_error::PlaceError;
 use crate::wire::port::{Access, Hub, OpenError, Subscriber, wait};
 use crate::wire::topic::{FRAME, POSE};
 

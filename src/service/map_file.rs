@@ -19,9 +19,8 @@ use crate::service::loop_bytes::{LoopBytesError, MAX_LOOP_BYTES, loop_bytes, par
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS};
 use crate::slam::loops::known::KnownLoops;
-use crate::slam::map::{FramePlace, Map};
+use crate::slam::map::{ConfirmedPoint, FramePlace, Map};
 use crate::slam::pose::NO_KEYFRAME;
-use crate::slam::window::confirmed::ConfirmedPoint;
 use crate::wire::conversion::{
     MessageError, check_points, code_from_map_state, map_state_from_code,
     mode_covariance_from_message, place_covariance_from_message, rigid_from_message, rigid_message,

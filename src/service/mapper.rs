@@ -30,7 +30,8 @@ use crate::slam::pose::{NO_KEYFRAME, PoseEstimate};
 use crate::wire::command::{CommandError, CommandServer};
 use crate::wire::conversion::{code_from_map_state, frame_from_message, pose_from_message};
 use crate::wire::message::{FrameHeader, PoseMessage};
-use crate::wire::place::{Claim, Place, PlaceError};
+use crate::wire::place::{Claim, Place};
+use crate::wire::place_error::PlaceError;
 use crate::wire::port::{
     Access, Hub, OpenError, ReceiveError, Received, SendError, Subscriber, WaitError, wait,
 };

@@ -4,7 +4,8 @@ use std::thread::Scope;
 
 use crossbeam::channel::{Receiver, Sender, bounded};
 
-use crate::capture::source::{FrameSource, FrameStamp, SourceError};
+use crate::capture::source::{FrameSource, FrameStamp};
+use crate::capture::source_error::SourceError;
 use crate::slam::image::buffer::Image;
 
 /// Frames that are read before they are asked for. One is enough while decoding is faster than mapping; the others

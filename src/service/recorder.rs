@@ -6,7 +6,7 @@ use crate::service::journal::feed::KeyframeFeed;
 use crate::service::journal::log::{Record, Step};
 use crate::service::journal::recovered::complete;
 use crate::service::recording::{RecordParts, Recording, RunCounters};
-use crate::service::results::RunRecord;
+use crate::service::results::record::RunRecord;
 use crate::slam::map::Map;
 use crate::slam::pose::TrackingState;
 use crate::wire::message::{AdjustmentMessage, PoseMessage, StepMessage};

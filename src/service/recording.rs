@@ -3,14 +3,15 @@
 use serde::{Deserialize, Serialize};
 
 use crate::service::adjustments::AdjustmentRecord;
-use crate::service::results::untracked::StartTally;
-use crate::service::results::{RecordedPose, RunMode, RunRecord};
+use crate::service::results::record::{RecordedPose, RunMode, RunRecord};
+use crate::service::results::start_tally::StartTally;
+use crate::service::time_counts::TimeCounts;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::map::Map;
 use crate::slam::pose::TrackingState;
 use crate::slam::trajectory::StampedPose;
 use crate::wire::conversion::{MessageError, pose_from_message, start_frame_from_code};
-use crate::wire::message::{HISTOGRAM_BUCKETS, PoseMessage};
+use crate::wire::message::PoseMessage;
 
 /// What only the supervisor knows of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -32,37 +33,6 @@ pub struct RunCounters {
     pub peak_rss_bytes: u64,
     /// Live: how late capture sent frames after their stamp.
     pub send_counts: TimeCounts,
-}
-
-/// Times by the buckets of [`crate::service::health::bucket`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(into = "Vec<u64>", from = "Vec<u64>")]
-pub struct TimeCounts(pub [u64; HISTOGRAM_BUCKETS]);
-
-impl TimeCounts {
-    fn add(&mut self, others: &Self) {
-        let pairs = self.0.iter_mut().zip(&others.0);
-        pairs.for_each(|(sum, count)| *sum = sum.saturating_add(*count));
-    }
-}
-
-impl Default for TimeCounts {
-    fn default() -> Self {
-        Self([0; HISTOGRAM_BUCKETS])
-    }
-}
-
-impl From<TimeCounts> for Vec<u64> {
-    fn from(counts: TimeCounts) -> Self {
-        counts.0.to_vec()
-    }
-}
-
-impl From<Vec<u64>> for TimeCounts {
-    /// Buckets that are missing are empty.
-    fn from(counts: Vec<u64>) -> Self {
-        Self(std::array::from_fn(|i| counts.get(i).copied().unwrap_or(0)))
-    }
 }
 
 impl RunCounters {

@@ -1,6 +1,6 @@
 //! Images of a recording that could not be used: left out, counted and named.
 
-use crate::capture::source::SourceError;
+use crate::capture::source_error::SourceError;
 
 /// Images that are named one by one; of more only the number is told.
 const MAX_NAMED: usize = 10;
@@ -77,7 +77,8 @@ mod tests {
     use std::path::PathBuf;
 
     use super::*;
-    use crate::capture::image_file::{DecodeError, ImageFileError};
+    use crate::capture::decode_error::DecodeError;
+    use crate::capture::image_file::ImageFileError;
 
     fn empty(name: usize) -> SourceError {
         let path = PathBuf::from(format!("{name}.png"));

@@ -7,7 +7,8 @@
 
 use std::time::Instant;
 
-use crate::capture::source::{FrameSource, FrameStamp, SourceError};
+use crate::capture::source::{FrameSource, FrameStamp};
+use crate::capture::source_error::SourceError;
 use crate::service::adjustments::{Adjustments, Entry};
 use crate::service::alignment_stamps::AlignmentStamps;
 use crate::service::config::MapConfig;
@@ -16,7 +17,7 @@ use crate::service::map_folder::session::{MapSession, MapSessionError};
 use crate::service::read_ahead::{ReadAhead, ReadingPlan};
 use crate::service::refused_images::RefusedImages;
 use crate::service::rehearsal::Rehearsal;
-use crate::service::results::{RecordedPose, Rejection, RunMode, RunRecord};
+use crate::service::results::record::{RecordedPose, Rejection, RunMode, RunRecord};
 use crate::service::schedule::{Background, peak_rss_bytes};
 use crate::slam::alignment::reference::Reference;
 use crate::slam::evaluation::depth_error::DepthScale;

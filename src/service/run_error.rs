@@ -2,9 +2,9 @@
 
 use std::io;
 
-use crate::capture::source::SourceError;
-use crate::service::map_folder::MapFolderError;
-use crate::wire::place::PlaceError;
+use crate::capture::source_error::SourceError;
+use crate::service::map_folder::map_folder_error::MapFolderError;
+use crate::wire::place_error::PlaceError;
 use crate::wire::port::{OpenError, ReceiveError, WaitError};
 
 /// Why a run does not start, or its record cannot be made.

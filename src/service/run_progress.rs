@@ -1,6 +1,6 @@
 //! How far a run is, for whoever shows it.
 
-use crate::service::results::EndOfRun;
+use crate::service::results::record::EndOfRun;
 use crate::slam::pose::TrackingState;
 
 /// How far a run is, for whoever watches.

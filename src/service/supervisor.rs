@@ -6,7 +6,9 @@ use std::fs::File;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use crate::capture::source::{FrameSource, SourceName, open};
+use crate::capture::opening::open;
+use crate::capture::source::FrameSource;
+use crate::capture::source_name::SourceName;
 use crate::service::checkpoint::read_checkpoint;
 use crate::service::child::{Child, memory_for_frames};
 use crate::service::clock::now_nanos;
@@ -20,18 +22,19 @@ use crate::service::mode::Mode;
 use crate::service::peers::Peer;
 use crate::service::position::{position_key, read_position};
 use crate::service::recorder::Recorder;
-use crate::service::recording::{RecordParts, RunCounters, TimeCounts};
-use crate::service::results::{RestartCause, RunMode, RunRecord};
+use crate::service::recording::{RecordParts, RunCounters};
+use crate::service::results::record::{RestartCause, RunMode, RunRecord};
 pub use crate::service::run_error::RunError;
 pub use crate::service::run_progress::Ended;
 use crate::service::run_progress::RunProgress;
 use crate::service::schedule::peak_rss_bytes;
 use crate::service::shutdown::Shutdown;
 use crate::service::supervised::{Death, Supervised};
+use crate::service::time_counts::TimeCounts;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::map::Map;
 use crate::wire::command::CommandClient;
-use crate::wire::place::{Claim, Place, PlaceError};
+use crate::wire::place::{Claim, Place};
 use crate::wire::port::{Access, Hub, wait};
 use crate::wire::topic::{HEALTH_TOPICS, shared_memory_bytes};
 
@@ -174,7 +177,7 @@ fn begin_journal(options: &RunOptions, place: &Place) -> Option<Journal> {
 }
 
 /// The claim of the supervisor, after a look that none of the three runs already.
-fn claim_all(place: &Place) -> Result<Claim, PlaceError> {
+fn claim_all(place: &Place) -> Result<Claim, RunError> {
     let claim = place.claim("supervisor")?;
     for topic in HEALTH_TOPICS {
         place.claim(topic.owner)?;

@@ -24,7 +24,8 @@ use crate::wire::conversion::{
 };
 use crate::wire::keyframe_inbox::InboxError;
 use crate::wire::message::{FrameHeader, PoseMessage};
-use crate::wire::place::{Claim, Place, PlaceError};
+use crate::wire::place::{Claim, Place};
+use crate::wire::place_error::PlaceError;
 use crate::wire::port::{
     Access, Hub, OpenError, Publisher, ReceiveError, Received, SendError, Subscriber, WaitError,
     wait,

@@ -13,7 +13,7 @@ use rustix::process::{Pid, Signal};
 use crate::service::child::SUPERVISOR_VARIABLE;
 use crate::service::error_log::ErrorLog;
 use crate::service::manager_notice::VARIABLES;
-use crate::wire::place::ROOT_VARIABLE;
+use crate::wire::folders::ROOT_VARIABLE;
 
 /// Pause before it is started again.
 const RESTART_PAUSE: Duration = Duration::from_secs(10);

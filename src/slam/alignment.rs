@@ -21,5 +21,6 @@ pub mod selection;
 pub mod surroundings;
 #[cfg(test)]
 mod tests;
+pub mod tiles;
 pub mod unknown_depth;
 pub mod weights;

@@ -19,6 +19,7 @@ pub mod map;
 pub mod matching;
 mod neighbour_sums;
 mod observation_kernel;
+pub mod pattern;
 pub mod pose_noise;
 pub mod promise;
 pub mod propagation;

@@ -16,9 +16,6 @@ use crate::slam::keyframe::{DepthPoint, Keyframe};
 use crate::slam::loops::known::KnownLoops;
 use crate::slam::modes::ModeCovariance;
 use crate::slam::place_covariance::PlaceCovariance;
-use crate::slam::window::confirmed::ConfirmedPoint;
-use crate::slam::window::dense::RefinedDepth;
-use crate::slam::window::frames::PlacedFrame;
 
 /// All keyframes of all epochs, with their depth. Each epoch has a scale and a drift of its own.
 #[derive(Debug, Clone, Default)]
@@ -49,6 +46,45 @@ pub struct FramePlace {
     pub keyframe_id: u64,
     /// In the keyframe's unit.
     pub keyframe_from_camera: SE3,
+}
+
+/// Where a frame is after it was aligned again.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PlacedFrame {
+    /// Its sequence.
+    pub sequence: u64,
+    /// Its keyframe.
+    pub keyframe_id: u64,
+    /// Where it is, in the unit of the map.
+    pub keyframe_from_camera: SE3,
+}
+
+/// A point that several keyframes were estimated from jointly.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ConfirmedPoint {
+    /// The keyframe that it was chosen in.
+    pub keyframe_id: u64,
+    /// Column of its pixel there, level 0.
+    pub u: u16,
+    /// Row.
+    pub v: u16,
+    /// Keyframes that agreed with it when it was last estimated, beside its own.
+    pub confirmations: u32,
+    /// 1/z along the keyframe's optical axis, one over the keyframe's unit.
+    pub inverse_depth: f32,
+    /// Brightness of its pixel, grey levels.
+    pub intensity: f32,
+}
+
+/// Depth of a keyframe as it is known better.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RefinedDepth {
+    /// The keyframe.
+    pub keyframe_id: u64,
+    /// Revision of the keyframe that it was refined from.
+    pub of_revision: u64,
+    /// Its points, inverse depth in one over the keyframe's unit.
+    pub points: Vec<DepthPoint>,
 }
 
 /// What is known better of the map than before: new places, depth and epochs, all at once.

@@ -17,6 +17,7 @@ mod elimination_kernel;
 mod factors;
 mod feedback;
 pub mod frames;
+pub mod functional;
 pub mod keyframe;
 mod looping;
 pub mod marginals;

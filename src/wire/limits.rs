@@ -2,7 +2,7 @@
 
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 
-use crate::wire::place::PlaceError;
+use crate::wire::place_error::PlaceError;
 
 /// Files that a process of the pipeline may have to open at a time: the mapper has 134, each topic with
 /// its event and each further subscriber takes some more.

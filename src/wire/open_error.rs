@@ -1,6 +1,8 @@
 //! Why a process cannot take part in an instance, in words that say what to do.
 
-use crate::wire::place::{Place, PlaceError, SHARED_MEMORY};
+use crate::wire::folders::SHARED_MEMORY;
+use crate::wire::place::Place;
+use crate::wire::place_error::PlaceError;
 use crate::wire::topic::WIRE_VERSION;
 
 /// Why a process cannot take part.

@@ -11,16 +11,10 @@ use iceoryx2::prelude::{Config, FileName, Path as IpcPath, SemanticString};
 use rustix::fs::FlockOperation;
 use rustix::thread::Timespec;
 
+use crate::wire::folders::{MAX_ROOT_BYTES, SHARED_MEMORY, SYSTEM_ROOT};
 use crate::wire::limits::raise_open_files;
-pub use crate::wire::place_error::PlaceError;
+use crate::wire::place_error::PlaceError;
 use crate::wire::root_folder::{is_mine, usual_root};
-
-/// The folder under systemd, where every unit has the same one.
-pub const SYSTEM_ROOT: &str = "/run/semidense";
-/// Environment variable that names the folder.
-pub const ROOT_VARIABLE: &str = "SEMIDENSE_ROOT";
-/// Where the kernel keeps shared memory.
-pub const SHARED_MEMORY: &str = "/dev/shm";
 
 /// Longest wait for a process that joins or tidies up: both take milliseconds, on a busy machine a second.
 const LONGEST_HOLD: Duration = Duration::from_secs(10);
@@ -43,8 +37,6 @@ pub(in crate::wire) const LOADED_MAP_SUFFIX: &str = ".map";
 /// End of the name of a claim's file, behind the instance and the process.
 pub(in crate::wire) const CLAIM_SUFFIX: &str = ".lock";
 
-/// Longest folder: the socket of a listener lies in it, and a socket's path has at most 107 bytes.
-pub(in crate::wire) const MAX_ROOT_BYTES: usize = 48;
 /// Longest name of an instance: it is part of every topic's name.
 const MAX_INSTANCE_BYTES: usize = 32;
 

@@ -3,7 +3,7 @@
 use std::io;
 use std::path::PathBuf;
 
-use crate::wire::place::{MAX_ROOT_BYTES, ROOT_VARIABLE, SHARED_MEMORY};
+use crate::wire::folders::{MAX_ROOT_BYTES, ROOT_VARIABLE, SHARED_MEMORY};
 
 /// Why an instance cannot live there.
 #[derive(Debug, thiserror::Error)]

@@ -5,7 +5,7 @@ use std::io;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use crate::wire::place::{ROOT_VARIABLE, SYSTEM_ROOT};
+use crate::wire::folders::{ROOT_VARIABLE, SYSTEM_ROOT};
 
 /// What the environment names, else systemd's runtime folder, else for the user of the services theirs, else the
 /// user's own, else one in the temporary folder; there with the name that somebody else has taken.

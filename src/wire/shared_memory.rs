@@ -7,8 +7,10 @@ use std::path::Path;
 
 use rustix::fs::{Access, FallocateFlags, OFlags};
 
+use crate::wire::folders::SHARED_MEMORY;
 use crate::wire::limits::check_address_space;
-use crate::wire::place::{Place, PlaceError, SHARED_MEMORY};
+use crate::wire::place::Place;
+use crate::wire::place_error::PlaceError;
 use crate::wire::root_folder::is_mine;
 
 impl Place {

@@ -8,7 +8,8 @@ use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
 use semidense::service::journal::recovered::Recovered;
-use semidense::wire::place::{Place, SHARED_MEMORY};
+use semidense::wire::folders::SHARED_MEMORY;
+use semidense::wire::place::Place;
 use semidense::wire::port::{Access, Hub};
 
 /// Far above anything that is expected: it ends a test that hangs, it measures nothing.

@@ -1,12 +1,12 @@
 //! Records of runs made by hand, and a source whose depth is a wall.
 
-use semidense::capture::source::{FrameSource, FrameStamp, SourceError};
+use semidense::capture::source::{FrameSource, FrameStamp};
+use semidense::capture::source_error::SourceError;
 use semidense::service::alignment_stamps::{AlignmentTrace, LevelTrace};
 use semidense::service::results::output_folder::prepare_output;
-use semidense::service::results::untracked::StartTally;
-use semidense::service::results::{
-    EndOfRun, RecordedPose, ResultsParams, RunMode, RunRecord, write_results,
-};
+use semidense::service::results::record::{EndOfRun, RecordedPose, RunMode, RunRecord};
+use semidense::service::results::start_tally::StartTally;
+use semidense::service::results::{ResultsParams, write_results};
 use semidense::slam::evaluation::depth_error::DepthScale;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;

@@ -2,7 +2,8 @@
 
 use std::path::Path;
 
-use semidense::capture::rig::{Rig, RigError};
+use semidense::capture::rig::Rig;
+use semidense::capture::rig_error::RigError;
 
 use crate::ros::message::CameraInfo;
 

@@ -1,6 +1,7 @@
 //! Images of ROS as frames of a stream that capture reads.
 
-use semidense::capture::image_file::{DecodeError, decode_gray_into, image_size};
+use semidense::capture::decode_error::DecodeError;
+use semidense::capture::image_file::{decode_gray_into, image_size};
 use semidense::capture::ros_image::{RosImage, RosImageError};
 use semidense::capture::stream::format::{StreamClock, StreamHeader};
 

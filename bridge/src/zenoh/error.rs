@@ -1,6 +1,6 @@
 //! Why sending or receiving ends early.
 
-use semidense::wire::place::PlaceError;
+use semidense::wire::place_error::PlaceError;
 use semidense::wire::port::{OpenError, SendError, WaitError};
 
 use crate::session::SessionError;

@@ -13,7 +13,7 @@ use zenoh::{Session, Wait};
 use crate::zenoh::clock_offset::ClockAnswer;
 use crate::zenoh::envelope::{EnvelopeError, open};
 use crate::zenoh::kind::Kind;
-use crate::zenoh::receiver::Shared;
+use crate::zenoh::shared::Shared;
 use crate::zenoh::unpack::{Arrival, unpack};
 
 /// Time between two questions.

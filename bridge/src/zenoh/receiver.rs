@@ -3,37 +3,28 @@
 //! Zenoh's threads only put into queues in which the newest wins; one thread unpacks what is large, one asks the sender
 //! whether it is there, and the main one publishes: a pose never waits for an image.
 
-use std::io::{Read, Write};
+use std::io::Read;
 use std::os::fd::AsFd;
 use std::os::unix::net::UnixStream;
+use std::sync::Arc;
 use std::sync::mpsc::channel;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use semidense::service::clock::now_nanos;
 use semidense::service::shutdown::Shutdown;
 use semidense::wire::place::Place;
 use semidense::wire::port::wait;
-use zenoh::bytes::ZBytes;
 use zenoh::{Session, Wait};
 
-use crate::zenoh::envelope::{EnvelopeError, open as open_envelope};
 use crate::zenoh::error::ZenohError;
 use crate::zenoh::kind::Kind;
 use crate::zenoh::link::{Endpoints, declare_error, open as open_network};
 use crate::zenoh::mirror::Mirror;
 use crate::zenoh::poll::poll;
-use crate::zenoh::remote::Remote;
-use crate::zenoh::slots::Slots;
-use crate::zenoh::stamps::translate;
-use crate::zenoh::unpack::{Arrival, unpack};
+use crate::zenoh::shared::Shared;
 
 /// Longest wait for a message without a look at the silence and at subscribers that came late.
 const WAKE_PERIOD: Duration = Duration::from_millis(100);
-/// Poses that wait for the main thread: what came while the machine was busy for seconds.
-const WAITING_POSES: usize = 256;
-/// Of health, joint estimates.
-const WAITING_SMALL: usize = 16;
+
 /// Time between two lines of the log.
 const TELL_PERIOD: Duration = Duration::from_secs(10);
 
@@ -44,91 +35,6 @@ pub struct ReceiveOptions {
     pub endpoints: Endpoints,
     /// Name of the instance on the robot.
     pub from: String,
-}
-
-/// What the receiver's threads share.
-#[derive(Debug)]
-pub struct Shared {
-    remote: Mutex<Remote>,
-    urgent: Slots<(Kind, ZBytes)>,
-    large: Slots<(Kind, ZBytes)>,
-    ready: Slots<Arrival>,
-    /// Wakes the main thread.
-    wake: UnixStream,
-}
-
-impl Shared {
-    fn new(wake: UnixStream) -> Self {
-        // By kind; those that do not go there stay empty.
-        let depths = Kind::ALL.map(|kind| match kind {
-            Kind::Pose => WAITING_POSES,
-            Kind::Keyframe | Kind::KeyframeImage | Kind::Graph | Kind::Frame => 1,
-            _ => WAITING_SMALL,
-        });
-        let queue = || Slots::new(&depths);
-        let ready = Slots::new(&depths);
-        Self { remote: Mutex::default(), urgent: queue(), large: Slots::new(&depths), ready, wake }
-    }
-
-    /// What is known of the sender.
-    pub fn remote(&self) -> MutexGuard<'_, Remote> {
-        self.remote.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Takes in a message; never waits.
-    pub fn arrive(&self, kind: Kind, bytes: ZBytes) {
-        if kind.is_urgent() {
-            self.urgent.put(kind as usize, (kind, bytes));
-            self.wake();
-        } else {
-            self.large.put(kind as usize, (kind, bytes));
-        }
-    }
-
-    fn wake(&self) {
-        // A full pipe wakes as well.
-        let _ = (&self.wake).write(&[0]);
-    }
-
-    /// Checks and unpacks; `None` for what is not to be used.
-    fn unpack(&self, kind: Kind, bytes: &ZBytes) -> Option<Arrival> {
-        let bytes = bytes.to_bytes();
-        let opened = match open_envelope(&bytes) {
-            Ok(opened) if opened.kind == kind => opened,
-            Err(EnvelopeError::Version { found }) => {
-                self.remote().hear_foreign(found, Instant::now());
-                return None;
-            }
-            _ => {
-                self.remote().refused += 1;
-                return None;
-            }
-        };
-        if !self.remote().admit(&opened.envelope, kind, Instant::now()) {
-            return None;
-        }
-        match unpack(&opened) {
-            Ok(mut arrival) => {
-                translate(&mut arrival, &self.remote().clock, now_nanos());
-                Some(arrival)
-            }
-            Err(error) => {
-                tracing::debug!("{kind:?} {}: {error}", opened.envelope.number);
-                self.remote().refused += 1;
-                None
-            }
-        }
-    }
-
-    /// Unpacks what is large until the queue is closed.
-    fn unpack_large(&self) {
-        while let Some((kind, bytes)) = self.large.take() {
-            if let Some(arrival) = self.unpack(kind, &bytes) {
-                self.ready.put(kind as usize, arrival);
-                self.wake();
-            }
-        }
-    }
 }
 
 /// Receives until the signal, and publishes as the instance at `place`. Waits for a robot that is not there yet.

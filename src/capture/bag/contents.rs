@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::path::Path;
 
-use crate::capture::bag::BagError;
+use crate::capture::bag::bag_error::BagError;
 use crate::capture::bag::camera::rig_of;
 use crate::capture::bag::message::{CameraInfo, decode};
 use crate::capture::bag::records::{Place, Records};

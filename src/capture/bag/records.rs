@@ -8,7 +8,7 @@ use std::path::Path;
 use mcap::records::{Channel, Footer, Record, SchemaHeader, op};
 use mcap::{MAGIC, parse_record};
 
-use crate::capture::bag::BagError;
+use crate::capture::bag::bag_error::BagError;
 use crate::capture::bag::chunk::{MAX_CHUNK_BYTES, decompress_into};
 use crate::capture::input_file;
 

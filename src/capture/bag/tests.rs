@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use super::*;
 use crate::capture::png_image::encode_gray;
-use crate::capture::source::SourceName;
+use crate::capture::source_name::SourceName;
 use crate::capture::test_bag::{
     TestBag, camera_info, compressed_image, frame_record, image, record,
 };

@@ -13,10 +13,9 @@
 
 use std::f32::consts::FRAC_PI_2;
 
-use crate::capture::simulator::furnish::{Furnished, picture};
 use crate::capture::simulator::pattern::Pattern;
 use crate::capture::simulator::route::{Route, Waypoint, waypoint};
-use crate::capture::simulator::scene::{Builder, Cover, Stage};
+use crate::capture::simulator::scene::{Builder, Cover, Furnished, Stage, picture};
 
 /// Height of the rooms, metres.
 pub const HEIGHT_M: f32 = 2.7;

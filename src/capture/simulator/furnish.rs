@@ -2,24 +2,15 @@
 
 use std::f32::consts::FRAC_PI_2;
 
-use crate::capture::simulator::params::SceneKind;
 use crate::capture::simulator::pattern::Pattern;
-use crate::capture::simulator::scene::{Block, Builder, Cover, Scene, Stage};
+use crate::capture::simulator::scene::{Builder, Cover, Furnished, Scene, Stage, picture};
+use crate::capture::simulator::scene_kind::SceneKind;
 use crate::capture::simulator::{flat, twins};
 
 /// Builds a scene and paints its textures, in parallel on the current rayon pool.
 pub fn build(kind: SceneKind, seed: u64) -> Scene {
     let Furnished { blocks, stage } = furnish(kind, seed);
     Scene::new(blocks, stage, seed)
-}
-
-/// A scene without its textures.
-#[derive(Debug, Clone)]
-pub struct Furnished {
-    /// Everything that can be seen.
-    pub blocks: Vec<Block>,
-    /// Where a camera may walk.
-    pub stage: Stage,
 }
 
 /// Puts up a scene; the seed chooses textures and small things, not where furniture stands.
@@ -157,24 +148,6 @@ fn room_west(b: &mut Builder) {
     b.bookshelf([0.2, 3.2], [1.4, 0.32, 1.8], 4, -FRAC_PI_2, wood);
     picture(b, [0.015, 2.1], 1.7, 0.7, 0.9, FRAC_PI_2, Pattern::Picture);
     b.stack([0.4, 4.5], 0.0, &[[0.5, 0.45, 0.4], [0.4, 0.36, 0.34]], Cover::of(Pattern::Cardboard));
-}
-
-/// A framed picture on a wall that runs along `turn_rad`, centred on height `z`.
-pub fn picture(
-    b: &mut Builder,
-    at: [f32; 2],
-    z: f32,
-    width: f32,
-    height: f32,
-    turn_rad: f32,
-    pattern: Pattern,
-) {
-    let (frame, depth) = (0.04, 0.025);
-    let wood = Cover::of(Pattern::Veneer).with_middle(0.3);
-    let size = [width + 2.0 * frame, depth, height + 2.0 * frame];
-    b.place(at, z - 0.5 * size[2], size, turn_rad, wood);
-    let size = [width, depth + 0.006, height];
-    b.place(at, z - 0.5 * height, size, turn_rad, Cover::of(pattern));
 }
 
 /// A large printed table top seen from above.

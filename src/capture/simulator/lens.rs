@@ -6,6 +6,9 @@ use rayon::prelude::*;
 use crate::slam::geometry::camera_model::CameraModel;
 use crate::slam::geometry::intrinsics::Intrinsics;
 
+/// Nothing is seen closer than this, metres.
+pub const NEAREST_M: f32 = 0.05;
+
 /// The direction of a pixel as `(x, y, 1)`, and how it changes to the right and down.
 #[derive(Debug, Clone, Copy)]
 pub struct Ray {

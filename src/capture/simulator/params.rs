@@ -1,47 +1,15 @@
 //! Everything that can be set about a simulated sequence.
 
-use std::str::FromStr;
-
 use serde::{Deserialize, Serialize};
 
 use crate::capture::simulator::furnish::furnish;
+use crate::capture::simulator::scene_kind::SceneKind;
 use crate::slam::geometry::camera_model::{CameraModel, Distortion};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::parameter::{ParameterError, check_range};
 
 /// Most frames of a sequence: an hour and more at 25 Hz.
 const MAX_FRAMES: usize = 100_000;
-
-/// Which scene is seen.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum SceneKind {
-    /// A furnished room of 6 × 5 × 3 m.
-    Room,
-    /// One large printed plane, seen from 1.5 m above.
-    Plane,
-    /// A corridor of 24 × 2.4 × 2.6 m.
-    Corridor,
-    /// Four furnished rooms about a corridor, 9 × 10 × 2.7 m, walked through in rounds.
-    Flat,
-    /// Two rooms that are exactly alike on a corridor that repeats, 13.8 × 5.8 × 2.7 m.
-    Twins,
-}
-
-impl FromStr for SceneKind {
-    type Err = &'static str;
-
-    fn from_str(name: &str) -> Result<Self, Self::Err> {
-        match name {
-            "room" => Ok(Self::Room),
-            "plane" => Ok(Self::Plane),
-            "corridor" => Ok(Self::Corridor),
-            "flat" => Ok(Self::Flat),
-            "twins" => Ok(Self::Twins),
-            _ => Err("unknown scene; scenes are room, plane, corridor, flat and twins"),
-        }
-    }
-}
 
 /// How the camera moves.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

@@ -3,13 +3,11 @@
 use nalgebra::{Matrix3, Vector3};
 
 use crate::capture::simulator::cull::{NearBlock, TileLists};
-use crate::capture::simulator::lens::{Lens, Ray};
+use crate::capture::simulator::lens::{Lens, NEAREST_M, Ray};
 use crate::capture::simulator::scene::{Block, Scene};
 use crate::capture::simulator::texture::Footprint;
 use crate::slam::geometry::se3::SE3;
 
-/// Nothing is seen closer than this, metres.
-pub const NEAREST_M: f32 = 0.05;
 /// Side of the grid of rays cast through a pixel that an edge crosses.
 const EDGE_GRID: usize = 4;
 /// Side of the square that a pixel averages over, pixels: its own area and the blur of a good lens,

@@ -5,7 +5,7 @@ use nalgebra::Vector3;
 use super::flat::{HEIGHT_M, ROOM_M, ROOMS_M};
 use super::tests::distance;
 use super::*;
-use crate::capture::simulator::params::SceneKind;
+use crate::capture::simulator::scene_kind::SceneKind;
 use crate::capture::simulator::summary::summarize;
 use crate::capture::simulator::twins::PERIOD_M;
 

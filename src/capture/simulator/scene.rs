@@ -280,3 +280,30 @@ impl Builder {
         }
     }
 }
+
+/// A scene without its textures.
+#[derive(Debug, Clone)]
+pub struct Furnished {
+    /// Everything that can be seen.
+    pub blocks: Vec<Block>,
+    /// Where a camera may walk.
+    pub stage: Stage,
+}
+
+/// A framed picture on a wall that runs along `turn_rad`, centred on height `z`.
+pub fn picture(
+    b: &mut Builder,
+    at: [f32; 2],
+    z: f32,
+    width: f32,
+    height: f32,
+    turn_rad: f32,
+    pattern: Pattern,
+) {
+    let (frame, depth) = (0.04, 0.025);
+    let wood = Cover::of(Pattern::Veneer).with_middle(0.3);
+    let size = [width + 2.0 * frame, depth, height + 2.0 * frame];
+    b.place(at, z - 0.5 * size[2], size, turn_rad, wood);
+    let size = [width, depth + 0.006, height];
+    b.place(at, z - 0.5 * height, size, turn_rad, Cover::of(pattern));
+}

@@ -3,8 +3,9 @@
 use nalgebra::{Vector2, Vector3};
 
 use super::*;
-use crate::capture::simulator::params::{MotionKind, SceneKind};
+use crate::capture::simulator::params::MotionKind;
 use crate::capture::simulator::scene::Block;
+use crate::capture::simulator::scene_kind::SceneKind;
 use crate::capture::simulator::summary::{gradient_share, summarize};
 
 fn small(scene: SceneKind) -> SimulatorParams {

@@ -3,10 +3,9 @@
 //! Everything stands a second time one bay further east, the corridor a third time: textures, doors, light.
 
 use crate::capture::simulator::flat::{Door, ROOM_M, Side, enclose, living, stage};
-use crate::capture::simulator::furnish::{Furnished, picture};
 use crate::capture::simulator::pattern::Pattern;
 use crate::capture::simulator::route::{Route, Waypoint, waypoint};
-use crate::capture::simulator::scene::{Builder, Cover};
+use crate::capture::simulator::scene::{Builder, Cover, Furnished, picture};
 
 /// After how many metres along x everything repeats.
 pub const PERIOD_M: f32 = 4.6;

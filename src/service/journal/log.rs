@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use crate::service::journal::any_bytes;
 use crate::service::map_file::{keyframe_bytes, parse_keyframe};
 use crate::service::recording::RunCounters;
-use crate::service::results::RunMode;
+use crate::service::results::record::RunMode;
 use crate::slam::keyframe::{Keyframe, KeyframePose};
 use crate::wire::conversion::{similarity_from_message, similarity_message};
 use crate::wire::message::{AdjustmentMessage, PoseMessage};

@@ -9,7 +9,7 @@ use crate::service::journal::log::{Record, Step};
 use crate::service::journal::{Journal, JournalOptions};
 use crate::service::recording::RunCounters;
 use crate::service::replay::ReplayProgress;
-use crate::service::results::RunRecord;
+use crate::service::results::record::RunRecord;
 use crate::slam::keyframe::{Keyframe, KeyframePose};
 use crate::wire::conversion::{PoseTiming, code_from_start_frame, pose_message};
 use crate::wire::place::Place;

@@ -18,7 +18,7 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use crate::capture::image_file::DecodeError;
+use crate::capture::decode_error::DecodeError;
 use crate::capture::png_image::{decode_gray_into, encode_gray_small};
 use crate::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS};
 use crate::wire::conversion::{MessageError, check_points};

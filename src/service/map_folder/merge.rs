@@ -3,8 +3,10 @@
 use std::path::Path;
 use std::sync::Arc;
 
+use crate::service::map_folder::map_folder_error::MapFolderError;
+use crate::service::map_folder::reading::Loaded;
+use crate::service::map_folder::write_new;
 use crate::service::map_folder::writer::MapHead;
-use crate::service::map_folder::{Loaded, MapFolderError, write_new};
 use crate::slam::keyframe::Keyframe;
 use crate::slam::map::Map;
 

@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use crate::service::map_folder::depth_file::MapDetail;
 use crate::service::map_folder::manifest::VERSION;
-use crate::service::map_folder::{KEYFRAMES, Loaded};
+use crate::service::map_folder::reading::{KEYFRAMES, Loaded};
 use crate::service::results::ResultsParams;
 use crate::service::results::full_points::write_full_points;
 use crate::service::results::pcd::write_pcd;

@@ -4,9 +4,10 @@ use std::path::{Path, PathBuf};
 
 use crate::service::config::MapConfig;
 use crate::service::map_folder::keeper::MapKeeper;
+use crate::service::map_folder::map_folder_error::MapFolderError;
 use crate::service::map_folder::numbering::Numbering;
+use crate::service::map_folder::reading::{Loaded, load, read_manifest};
 use crate::service::map_folder::writer::MapWriter;
-use crate::service::map_folder::{Loaded, MapFolderError, load, read_manifest};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::map::Map;
 use crate::slam::mapper::prior::{MapUse, PriorError};

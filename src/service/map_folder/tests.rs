@@ -1,14 +1,15 @@
 //! A map on disk comes back as it was, and what is damaged costs nothing but itself.
 
 use std::fs;
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use super::*;
-use crate::service::map_folder::depth_file::MapDetail;
+use crate::service::map_folder::reading::{BEFORE, KEYFRAMES, MANIFEST, load};
 use crate::service::map_folder::writer::{MapHead, MapWriter};
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
-use crate::slam::keyframe::MapState;
+use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
 use crate::slam::mapper::MapperParams;
 use crate::slam::mapper::prior::MapUse;
 use crate::slam::places::Description;

@@ -1,6 +1,6 @@
 //! Whether the images of a run fit their calibration, as far as the residuals tell.
 
-use crate::service::results::RecordedPose;
+use crate::service::results::record::RecordedPose;
 use crate::slam::evaluation::statistics::percentile;
 
 /// Tracked frames from which the residuals tell anything: a second of video.

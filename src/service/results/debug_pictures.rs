@@ -5,9 +5,9 @@ use std::io::{self, Write};
 use std::path::Path;
 
 use crate::service::atomic_file::write_atomically;
-use crate::service::results::ResultsError;
 use crate::service::results::colour::Picture;
 use crate::service::results::pictures::{density_picture, inverse_depth_picture, variance_picture};
+use crate::service::results::results_error::ResultsError;
 use crate::service::results::weight_picture::weight_picture;
 use crate::slam::map::Map;
 use crate::slam::tracker::TrackerParams;

@@ -1,7 +1,8 @@
 //! The keyframes' depth against the source's true depth.
 
-use crate::capture::source::{FrameSource, SourceError};
-use crate::service::results::RunRecord;
+use crate::capture::source::FrameSource;
+use crate::capture::source_error::SourceError;
+use crate::service::results::record::RunRecord;
 use crate::slam::evaluation::depth_error::{DepthErrors, DepthStatistics, KeyframeDepth};
 use crate::slam::keyframe::{Keyframe, MapState};
 

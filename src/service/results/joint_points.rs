@@ -7,8 +7,7 @@ use std::path::Path;
 use nalgebra::Vector3;
 
 use crate::service::atomic_file::write_atomically;
-use crate::slam::map::Map;
-use crate::slam::window::confirmed::ConfirmedPoint;
+use crate::slam::map::{ConfirmedPoint, Map};
 
 /// Writes the points of a map.
 pub fn write_points(path: &Path, map: &Map) -> io::Result<()> {

@@ -9,8 +9,8 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use rustix::fs::{Mode, OFlags};
 
-use crate::service::results::ResultsError;
 use crate::service::results::output_lock::{Locking, OutputLock};
+use crate::service::results::results_error::ResultsError;
 use crate::service::results::set::{finish_commit, foreign_file};
 
 /// Folder of the folders, below the one that the program is started in.

@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use std::path::Path;
 
 use crate::service::atomic_file::write_atomically;
-use crate::service::results::{RecordedPose, RunRecord};
+use crate::service::results::record::{RecordedPose, RunRecord};
 use crate::service::trajectory_file::tum_line;
 use crate::slam::evaluation::MAX_DIFFERENCE_NANOS;
 use crate::slam::evaluation::depth_error::DepthScale;

@@ -4,6 +4,7 @@ pub mod axis;
 pub mod budget_charts;
 pub mod chart;
 mod chart_figure;
+mod chart_frame;
 mod chart_points;
 pub mod charts;
 pub mod evaluation_plot;
@@ -12,11 +13,14 @@ mod figure_words_quality;
 pub mod figures;
 pub mod grade_banner;
 pub mod html;
+pub mod input;
 pub mod joint_charts;
 pub mod loop_section;
 pub mod map_picture;
 pub mod map_view;
+mod number_text;
 pub mod scene;
+pub mod series;
 pub mod views;
 
 use std::fmt::Write;
@@ -26,6 +30,7 @@ use crate::service::results::output_folder::utc_text;
 use crate::service::results::pictures::{
     RELATIVE_STD_DEV_RANGE, density_picture, inverse_depth_picture, variance_picture,
 };
+use crate::service::results::record::{EndOfRun, RunMode, RunRecord};
 use crate::service::results::report::budget_charts::budget_charts;
 use crate::service::results::report::chart::Chart;
 use crate::service::results::report::chart_figure::{CHART_SCRIPT, chart_figure};
@@ -35,42 +40,19 @@ use crate::service::results::report::charts::{
 use crate::service::results::report::figures::figures;
 use crate::service::results::report::grade_banner::grade_banner;
 use crate::service::results::report::html::{escaped, png_address};
+use crate::service::results::report::input::ReportInput;
 use crate::service::results::report::joint_charts::{depth_charts, joint_charts};
 use crate::service::results::report::loop_section::loop_section;
 use crate::service::results::report::map_picture::map_section;
 use crate::service::results::report::map_view::map_view;
+use crate::service::results::report::number_text::{grouped, length};
 use crate::service::results::summary::Summary;
-use crate::service::results::{EndOfRun, RunMode, RunRecord};
-use crate::slam::evaluation::TrajectoryEvaluation;
-use crate::slam::fusion::SurfacePoint;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::pose::TrackingState;
-use crate::slam::trajectory::StampedPose;
 use crate::slam::up::up_direction;
 
 /// Keyframes whose depth is shown: enough to see the run, few enough for one page.
 const PICTURED_KEYFRAMES: usize = 8;
-
-/// What a report is made from.
-#[derive(Debug, Clone, Copy)]
-pub struct ReportInput<'a> {
-    /// The run.
-    pub record: &'a RunRecord,
-    /// Its figures.
-    pub summary: &'a Summary,
-    /// Final trajectory.
-    pub trajectory: &'a [StampedPose],
-    /// Trajectory as published.
-    pub online: &'a [StampedPose],
-    /// The final trajectory against ground truth.
-    pub evaluation: Option<&'a TrajectoryEvaluation>,
-    /// The published one against ground truth.
-    pub online_evaluation: Option<&'a TrajectoryEvaluation>,
-    /// The map's surface: any beginning shows all of it.
-    pub surface: &'a [SurfacePoint],
-    /// Largest σ/d of points that are shown.
-    pub max_relative_std_dev: f64,
-}
 
 /// The page.
 pub fn report(input: &ReportInput<'_>) -> String {
@@ -226,30 +208,6 @@ fn cards(summary: &Summary) -> String {
     }
     cards.push_str("</section>");
     cards
-}
-
-/// A length in metres, in the unit that keeps it readable.
-fn length(metres: f64) -> String {
-    if metres < 0.01 {
-        format!("{:.2} mm", 1e3 * metres)
-    } else if metres < 1.0 {
-        format!("{:.2} cm", 1e2 * metres)
-    } else {
-        format!("{metres:.2} m")
-    }
-}
-
-/// A number with spaces between groups of three digits.
-fn grouped(number: u64) -> String {
-    let digits = number.to_string();
-    let mut out = String::new();
-    for (i, digit) in digits.chars().enumerate() {
-        if i > 0 && (digits.len() - i).is_multiple_of(3) {
-            out.push('\u{202f}');
-        }
-        out.push(digit);
-    }
-    out
 }
 
 /// Name, class and share of each state, and a strip that shows when it was.

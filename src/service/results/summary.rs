@@ -4,7 +4,6 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::{Deserialize, Serialize};
 
-use crate::service::results::PointCounts;
 use crate::service::results::alignment_levels::{LevelSummary, alignment_levels};
 use crate::service::results::budget_curve::BudgetCurve;
 use crate::service::results::calibration::whitened_residual_median;
@@ -13,11 +12,11 @@ use crate::service::results::joint::JointSummary;
 use crate::service::results::loops::LoopSummary;
 use crate::service::results::output_folder::utc_text;
 use crate::service::results::poses::{longest_epoch, placed_later};
-use crate::service::results::times::{LatencySummary, Percentiles, track_nanos};
-use crate::service::results::untracked::Untracked;
-use crate::service::results::{
+use crate::service::results::record::{
     EndOfRun, RecordedPose, Rejection, RestartCause, RunMode, RunRecord,
 };
+use crate::service::results::times::{LatencySummary, Percentiles, track_nanos};
+use crate::service::results::untracked::Untracked;
 use crate::slam::evaluation::TrajectoryEvaluation;
 use crate::slam::evaluation::depth_error::{DepthScale, KeyframeDepth, depth_scale_ratio};
 use crate::slam::evaluation::grade::{Grade, GradeInput};
@@ -26,6 +25,17 @@ use crate::slam::evaluation::normalized_error::NormalizedErrors;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::map::Map;
 use crate::slam::pose::{PoseEstimate, TrackingState};
+
+/// How many points there are, and what it took to fuse them.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct PointCounts {
+    /// Points of all keyframes.
+    pub points: usize,
+    /// Points of the surface.
+    pub map_points: usize,
+    /// Time of the fusion.
+    pub fusion_secs: f64,
+}
 
 /// A trajectory against ground truth; all null where there is none. Lengths in the ground truth's
 /// unit (metres), errors after the alignment.

@@ -3,8 +3,8 @@
 use serde::{Deserialize, Serialize};
 
 use crate::service::health::{bucket, bucket_end_ms, mean_ms, percentile_ms};
-use crate::service::recording::TimeCounts;
-use crate::service::results::RecordedPose;
+use crate::service::results::record::RecordedPose;
+use crate::service::time_counts::TimeCounts;
 use crate::slam::evaluation::statistics::percentile;
 use crate::slam::pose::NO_KEYFRAME;
 use crate::wire::message::HISTOGRAM_BUCKETS;

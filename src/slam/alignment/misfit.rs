@@ -4,7 +4,7 @@
 //! tiles: the shape of the depth, what the lens model leaves, a rolling shutter. The part of it that is common to
 //! all tiles has gone into the pose and cannot be seen; what is left between the tiles says how large it may be.
 
-use crate::slam::alignment::scatter::{NUM_TILES, TileSum};
+use crate::slam::alignment::tiles::{NUM_TILES, TileSum};
 
 /// Displacement of tiles along the direction in which each is best known.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]

@@ -4,9 +4,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::slam::alignment::fusion::{Candidates, DepthFusion};
 use crate::slam::alignment::points::{LevelPoints, Point};
-use crate::slam::alignment::scatter::tile_of;
 use crate::slam::alignment::selection::{Selection, SelectionParams};
 use crate::slam::alignment::surroundings::Surroundings;
+use crate::slam::alignment::tiles::tile_of;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::sums::{MAX_LEVELS, SumPyramid, grey_per_sum};

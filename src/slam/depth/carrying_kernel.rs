@@ -6,13 +6,18 @@
 use std::ops::Range;
 
 use crate::slam::depth::map::Reprojected;
-use crate::slam::depth::propagation::Reprojection;
 
-/// A version of [`Reprojection::carry_rows`].
-pub(super) type CarryingKernel = fn(&Reprojection<'_>, Range<usize>, &mut Vec<Reprojected>);
+/// What carries the hypotheses of rows.
+pub(super) trait RowCarrier {
+    /// Carries the hypotheses of some source rows, in their order.
+    fn carry_rows(&self, rows: Range<usize>, reprojected: &mut Vec<Reprojected>);
+}
+
+/// A version of [`RowCarrier::carry_rows`].
+pub(super) type CarryingKernel<C> = fn(&C, Range<usize>, &mut Vec<Reprojected>);
 
 /// The best version for this processor.
-pub(super) fn carrying_kernel() -> CarryingKernel {
+pub(super) fn carrying_kernel<C: RowCarrier>() -> CarryingKernel<C> {
     #[cfg(target_arch = "x86_64")]
     if std::arch::is_x86_feature_detected!("avx2") {
         return |way, rows, reprojected| {
@@ -24,8 +29,8 @@ pub(super) fn carrying_kernel() -> CarryingKernel {
 }
 
 /// The explanation of the others.
-fn carry_rows_portable(
-    way: &Reprojection<'_>,
+fn carry_rows_portable<C: RowCarrier>(
+    way: &C,
     rows: Range<usize>,
     reprojected: &mut Vec<Reprojected>,
 ) {
@@ -34,7 +39,7 @@ fn carry_rows_portable(
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn carry_rows_avx2(way: &Reprojection<'_>, rows: Range<usize>, reprojected: &mut Vec<Reprojected>) {
+fn carry_rows_avx2<C: RowCarrier>(way: &C, rows: Range<usize>, reprojected: &mut Vec<Reprojected>) {
     way.carry_rows(rows, reprojected)
 }
 
@@ -45,7 +50,7 @@ mod tests {
     use super::*;
     use crate::slam::depth::epipolar::TwoView;
     use crate::slam::depth::map::{BORDER_PX, DepthMap, Hypothesis};
-    use crate::slam::depth::propagation::PropagationParams;
+    use crate::slam::depth::propagation::{PropagationParams, Reprojection};
     use crate::slam::geometry::se3::SE3;
     use crate::slam::test_scene::{CAMERA, Scene};
 

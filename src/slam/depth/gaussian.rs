@@ -11,7 +11,7 @@ use crate::slam::depth::map::{BORDER_PX, DepthMap, GradientImage, Hypothesis};
 use crate::slam::depth::matching::{
     Conditioning, Match, MatchingParams, Miss, Patch, condition, is_inside, search,
 };
-use crate::slam::depth::observation_kernel::row_kernel;
+use crate::slam::depth::observation_kernel::{RowObserver, row_kernel};
 use crate::slam::depth::promise::{LANES, PixelLanes, promises};
 use crate::slam::image::buffer::Image;
 use crate::slam::image::quads::QuadImage;
@@ -192,7 +192,7 @@ const PROBE_ROW_SHIFT: usize = 11;
 const BLOCK: usize = 512;
 
 /// Everything that the observation of a pixel needs.
-pub(super) struct PixelObserver<'a> {
+struct PixelObserver<'a> {
     image: &'a GradientImage,
     candidates: &'a Image<bool>,
     structure: &'a Image<[f32; 3]>,
@@ -203,15 +203,11 @@ pub(super) struct PixelObserver<'a> {
     params: &'a GaussianParams,
 }
 
-impl PixelObserver<'_> {
-    /// Observes the pixels of row `v`.
+impl RowObserver for PixelObserver<'_> {
+    type Observation = Observation;
+
     #[inline(always)]
-    pub(super) fn observe_row<S: Sampler>(
-        &self,
-        sampler: S,
-        row: &mut [Hypothesis],
-        v: usize,
-    ) -> Observation {
+    fn observe_row<S: Sampler>(&self, sampler: S, row: &mut [Hypothesis], v: usize) -> Observation {
         let mut seen = Observation::default();
         let candidates = self.candidates.row(v);
         let skips_propagated = self.observer.pixels == ObservedPixels::New;
@@ -236,7 +232,9 @@ impl PixelObserver<'_> {
         }
         seen
     }
+}
 
+impl PixelObserver<'_> {
     /// Updates those of the `columns` of row `v`, at most [`LANES`], whose match promises something.
     #[inline(always)]
     fn update_promising<S: Sampler>(

@@ -5,7 +5,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::epipolar::{EpipolarLine, Projection, TwoView};
 use crate::slam::depth::map::{BORDER_PX, GradientImage};
-use crate::slam::depth::matching::{PATTERN, is_inside};
+use crate::slam::depth::matching::is_inside;
+use crate::slam::depth::pattern::PATTERN;
 use crate::slam::depth::segment::{Segment, search};
 use crate::slam::image::quads::QuadImage;
 use crate::slam::parameter::{ParameterError, check_range};
@@ -82,6 +83,51 @@ pub enum TraceStatus {
     Skipped,
     /// The match would be less certain than the interval is: no parallax, or the gradient lies across.
     BadCondition,
+}
+
+/// What one frame did to the points.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct TraceCounts {
+    /// Matched.
+    pub good: usize,
+    /// Ended by leaving the image.
+    pub out_of_bounds: usize,
+    /// Without an acceptable match.
+    pub outlier: usize,
+    /// Certain already.
+    pub skipped: usize,
+    /// Nothing to gain in this frame.
+    pub bad_condition: usize,
+    /// Not tried: ended in an earlier frame.
+    pub ended: usize,
+}
+
+impl TraceCounts {
+    /// One point that came to `status`.
+    pub(super) fn of(status: TraceStatus) -> Self {
+        let mut counts = Self::default();
+        match status {
+            TraceStatus::Good => counts.good = 1,
+            TraceStatus::OutOfBounds => counts.out_of_bounds = 1,
+            TraceStatus::Outlier => counts.outlier = 1,
+            TraceStatus::Skipped => counts.skipped = 1,
+            TraceStatus::BadCondition => counts.bad_condition = 1,
+            TraceStatus::Uninitialized => {}
+        }
+        counts
+    }
+
+    /// The counts of two sets of points together.
+    pub fn plus(self, other: Self) -> Self {
+        Self {
+            good: self.good + other.good,
+            out_of_bounds: self.out_of_bounds + other.out_of_bounds,
+            outlier: self.outlier + other.outlier,
+            skipped: self.skipped + other.skipped,
+            bad_condition: self.bad_condition + other.bad_condition,
+            ended: self.ended + other.ended,
+        }
+    }
 }
 
 /// A frame to trace in.

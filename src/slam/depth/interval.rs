@@ -6,55 +6,10 @@ use rayon::prelude::*;
 use crate::slam::depth::candidate::{Candidate, CandidateParams, CandidateSelector};
 use crate::slam::depth::gaussian::{MAX_VALIDITY, NEW_VALIDITY, ObservationCounts};
 use crate::slam::depth::immature::{
-    HALF_INTERVAL_SIGMAS, ImmaturePoint, IntervalParams, TraceFrame, TraceStatus,
+    HALF_INTERVAL_SIGMAS, ImmaturePoint, IntervalParams, TraceCounts, TraceFrame, TraceStatus,
 };
 use crate::slam::depth::map::{DepthMap, GradientImage, Hypothesis};
 use crate::slam::depth::trace_kernel::trace_kernel;
-
-/// What one frame did to the points.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct TraceCounts {
-    /// Matched.
-    pub good: usize,
-    /// Ended by leaving the image.
-    pub out_of_bounds: usize,
-    /// Without an acceptable match.
-    pub outlier: usize,
-    /// Certain already.
-    pub skipped: usize,
-    /// Nothing to gain in this frame.
-    pub bad_condition: usize,
-    /// Not tried: ended in an earlier frame.
-    pub ended: usize,
-}
-
-impl TraceCounts {
-    /// One point that came to `status`.
-    pub(super) fn of(status: TraceStatus) -> Self {
-        let mut counts = Self::default();
-        match status {
-            TraceStatus::Good => counts.good = 1,
-            TraceStatus::OutOfBounds => counts.out_of_bounds = 1,
-            TraceStatus::Outlier => counts.outlier = 1,
-            TraceStatus::Skipped => counts.skipped = 1,
-            TraceStatus::BadCondition => counts.bad_condition = 1,
-            TraceStatus::Uninitialized => {}
-        }
-        counts
-    }
-
-    /// The counts of two sets of points together.
-    pub fn plus(self, other: Self) -> Self {
-        Self {
-            good: self.good + other.good,
-            out_of_bounds: self.out_of_bounds + other.out_of_bounds,
-            outlier: self.outlier + other.outlier,
-            skipped: self.skipped + other.skipped,
-            bad_condition: self.bad_condition + other.bad_condition,
-            ended: self.ended + other.ended,
-        }
-    }
-}
 
 /// A depth that became certain.
 #[derive(Debug, Clone, Copy, PartialEq)]

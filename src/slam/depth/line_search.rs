@@ -1,6 +1,6 @@
 //! The search for a patch along a line of a frame: 1-px steps, then Gauss–Newton. Both filters search this way.
 
-use crate::slam::depth::matching::PATTERN;
+use crate::slam::depth::pattern::PATTERN;
 use crate::slam::image::quads_kernel::{Sampled, Sampler};
 
 /// Most places of one search: bounds the time a pixel can take.

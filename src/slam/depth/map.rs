@@ -4,7 +4,7 @@
 use rayon::prelude::*;
 
 use crate::slam::depth::gain::Uncertainty;
-use crate::slam::depth::matching::PATTERN;
+use crate::slam::depth::pattern::PATTERN;
 use crate::slam::image::buffer::Image;
 
 /// Pixels nearer to the border than this carry no depth: the matching pattern reaches 2 pixels, its

@@ -10,14 +10,10 @@ use crate::slam::depth::epipolar::{EpipolarLine, Projection, TwoView};
 use crate::slam::depth::gain::Uncertainty;
 use crate::slam::depth::line_search::{Along, MAX_STEPS};
 use crate::slam::depth::map::{BORDER_PX, GradientImage};
+use crate::slam::depth::pattern::PATTERN;
 use crate::slam::image::noise::ImageNoise;
 use crate::slam::image::quads_kernel::{Sampled, Sampler};
 use crate::slam::parameter::{ParameterError, check_range};
-
-/// The 8-sample residual pattern of Engel, Koltun, Cremers 2018 (fig. 4): even offsets only, so that no
-/// sample takes part in the central difference of another and noise does not bias the refinement.
-pub const PATTERN: [(i32, i32); 8] =
-    [(0, -2), (-1, -1), (1, -1), (-2, 0), (0, 0), (2, 0), (-1, 1), (0, 2)];
 
 /// Tuning of the search.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

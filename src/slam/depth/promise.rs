@@ -6,7 +6,8 @@
 
 use crate::slam::depth::epipolar::{MIN_DEPTH_RATIO, TwoView};
 use crate::slam::depth::gain::{Gain, Uncertainty};
-use crate::slam::depth::matching::{DETERMINANT, MARGIN_PX, MatchingParams, PATTERN};
+use crate::slam::depth::matching::{DETERMINANT, MARGIN_PX, MatchingParams};
+use crate::slam::depth::pattern::PATTERN;
 
 /// Pixels that are judged at a time: a register of the widest vector unit.
 pub const LANES: usize = 16;

@@ -8,7 +8,7 @@ use std::ops::Range;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::slam::depth::carrying_kernel::carrying_kernel;
+use crate::slam::depth::carrying_kernel::{RowCarrier, carrying_kernel};
 use crate::slam::depth::epipolar::{MIN_DEPTH_RATIO, TwoView};
 use crate::slam::depth::map::{
     BAND_ROWS, BORDER_PX, DepthMap, Hypothesis, KnownColumns, Reprojected, for_each_known,
@@ -119,10 +119,11 @@ impl<'a> Reprojection<'a> {
     ) -> Self {
         Self { source, target, view, gain, offset, params }
     }
+}
 
-    /// Carries the hypotheses of some source rows, in their order.
+impl RowCarrier for Reprojection<'_> {
     #[inline(always)]
-    pub(super) fn carry_rows(&self, rows: Range<usize>, reprojected: &mut Vec<Reprojected>) {
+    fn carry_rows(&self, rows: Range<usize>, reprojected: &mut Vec<Reprojected>) {
         let mut columns = KnownColumns::default();
         for v in rows {
             let hypotheses = self.source.hypotheses.row(v);
@@ -143,7 +144,9 @@ impl<'a> Reprojection<'a> {
             });
         }
     }
+}
 
+impl Reprojection<'_> {
     /// The projections of some hypotheses of row `v`; each operation is that of
     /// [`EpipolarLine::project`](crate::slam::depth::epipolar::EpipolarLine::project).
     #[inline(always)]

@@ -14,7 +14,7 @@ use crate::slam::depth::map::{BAND_ROWS, BORDER_PX, DepthMap, Hypothesis};
 use crate::slam::depth::neighbour_sums::{
     FillingSums, LANES, RADIUS, RowPlanes, SmoothingSums, WINDOW_ROWS, filling_sums, smoothing_sums,
 };
-use crate::slam::depth::smoothing_kernel::{SmoothingKernel, smoothing_kernel};
+use crate::slam::depth::smoothing_kernel::{SmoothedRows, smoothing_kernel};
 use crate::slam::image::buffer::Image;
 use crate::slam::parameter::{ParameterError, check_range};
 
@@ -87,11 +87,11 @@ pub fn regularise(
     scratch: &mut RegularisationScratch,
     params: &RegularisationParams,
 ) {
-    regularise_with(smoothing_kernel(), map, scratch, params);
+    regularise_with(|band| smoothing_kernel()(band), map, scratch, params);
 }
 
 fn regularise_with(
-    smooth_band: SmoothingKernel,
+    smooth_band: fn(&mut Band<'_>),
     map: &mut DepthMap,
     scratch: &mut RegularisationScratch,
     params: &RegularisationParams,
@@ -125,7 +125,7 @@ fn regularise_with(
 }
 
 /// Some rows of the map, on their way from before to after.
-pub(super) struct Band<'a> {
+struct Band<'a> {
     candidates: &'a Image<bool>,
     width: usize,
     height: usize,
@@ -138,10 +138,10 @@ pub(super) struct Band<'a> {
     params: &'a RegularisationParams,
 }
 
-impl Band<'_> {
-    /// Smooths, drops and fills row by row; the window keeps what the rows were before.
+impl SmoothedRows for Band<'_> {
+    /// The window keeps what the rows were before.
     #[inline(always)]
-    pub(super) fn regularise(&mut self) {
+    fn regularise(&mut self) {
         let (first, end) = (self.first, self.first + self.rows.len() / self.width);
         let inner = first.max(BORDER_PX)..end.min(self.height - BORDER_PX);
         let mut next = inner.start - RADIUS;
@@ -153,7 +153,9 @@ impl Band<'_> {
             self.regularise_row(v);
         }
     }
+}
 
+impl Band<'_> {
     /// Takes row `v` as it is now into the window.
     #[inline(always)]
     fn load(&mut self, v: usize) {
@@ -422,7 +424,9 @@ mod tests {
         let pairs = || expected.iter().zip(map.hypotheses.pixels());
         assert!(pairs().filter(|p| filled(*p)).count() > 100);
         assert!(pairs().filter(|p| dropped(*p)).count() > 100);
-        for kernel in [smoothing_kernel(), |band: &mut Band<'_>| band.regularise()] {
+        let kernels: [fn(&mut Band<'_>); 2] =
+            [|band| smoothing_kernel()(band), |band| band.regularise()];
+        for kernel in kernels {
             let mut found = map.clone();
             let mut scratch = RegularisationScratch::with_size(width, height);
             // Twice with the same memory: nothing of the first may be left in it.

@@ -2,13 +2,17 @@
 //!
 //! One source for all: no operation is fused or reordered, so every version gives the same bits.
 
-use crate::slam::depth::regularisation::Band;
+/// Rows that are smoothed.
+pub(super) trait SmoothedRows {
+    /// Smooths, drops and fills row by row.
+    fn regularise(&mut self);
+}
 
-/// A version of [`Band::regularise`].
-pub(super) type SmoothingKernel = fn(&mut Band<'_>);
+/// A version of [`SmoothedRows::regularise`].
+pub(super) type SmoothingKernel<R> = fn(&mut R);
 
 /// The best version for this processor.
-pub(super) fn smoothing_kernel() -> SmoothingKernel {
+pub(super) fn smoothing_kernel<R: SmoothedRows>() -> SmoothingKernel<R> {
     #[cfg(target_arch = "x86_64")]
     if std::arch::is_x86_feature_detected!("avx2") {
         return |band| {
@@ -20,12 +24,12 @@ pub(super) fn smoothing_kernel() -> SmoothingKernel {
 }
 
 /// The explanation of the others.
-fn regularise_portable(band: &mut Band<'_>) {
+fn regularise_portable<R: SmoothedRows>(band: &mut R) {
     band.regularise()
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn regularise_avx2(band: &mut Band<'_>) {
+fn regularise_avx2<R: SmoothedRows>(band: &mut R) {
     band.regularise()
 }

@@ -2,8 +2,7 @@
 //!
 //! One source for all: no operation is fused or reordered, so every version gives the same bits.
 
-use crate::slam::depth::immature::{ImmaturePoint, IntervalParams, TraceFrame};
-use crate::slam::depth::interval::TraceCounts;
+use crate::slam::depth::immature::{ImmaturePoint, IntervalParams, TraceCounts, TraceFrame};
 
 /// A version of [`trace_points`].
 pub(super) type TraceKernel =

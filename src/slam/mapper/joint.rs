@@ -3,13 +3,13 @@
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::keyframe::Keyframe;
+use crate::slam::map::{PlacedFrame, RefinedDepth};
 use crate::slam::mapper::consistency::Contradiction;
 use crate::slam::mapper::phase::Phase;
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::pose::{NO_KEYFRAME, PoseEstimate};
 use crate::slam::window::Window;
-use crate::slam::window::dense::RefinedDepth;
-use crate::slam::window::frames::{PlacedFrame, TrackedFrame};
+use crate::slam::window::frames::TrackedFrame;
 use crate::slam::window::marginals::Marginal;
 
 impl Mapper {

@@ -12,9 +12,11 @@
 
 use nalgebra::SVector;
 
-use crate::slam::two_frame::lanes::{LANES, LaneSum, Lanes, NormalSums, lanes, lanes_of};
+use crate::slam::two_frame::lanes::{
+    LANES, LaneSum, Lanes, NUM_UNKNOWNS, NormalSums, lanes, lanes_of,
+};
 use crate::slam::two_frame::points::{NUM_NEIGHBOURS, NeighbourBlock};
-use crate::slam::two_frame::system::{NUM_UNKNOWNS, System};
+use crate::slam::two_frame::system::System;
 
 /// Smallest and largest inverse depth, the mean being 1. Negative ones have no meaning; that a point
 /// reaches them tells a wrong minimum.

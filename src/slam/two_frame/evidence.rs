@@ -6,9 +6,10 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::slam::depth::matching::PATTERN;
+use crate::slam::depth::pattern::PATTERN;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::two_frame::hypothesis::Rival;
+use crate::slam::two_frame::median::median;
 use crate::slam::two_frame::system::{State, System};
 
 /// What counts as proof.
@@ -234,12 +235,6 @@ pub fn judge(
         rival: None,
         earlier_frames: 0,
     }
-}
-
-/// Median; `None` of nothing.
-pub fn median(values: &mut [f32]) -> Option<f32> {
-    let middle = values.len() / 2;
-    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f32::total_cmp).1)
 }
 
 #[cfg(test)]

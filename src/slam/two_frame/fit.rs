@@ -10,9 +10,10 @@ use crate::slam::image::buffer::Image;
 use crate::slam::image::noise::ImageNoise;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::two_frame::elimination::{Elimination, PriorWeights, prior_energy};
-use crate::slam::two_frame::evidence::median;
+use crate::slam::two_frame::lanes::NUM_UNKNOWNS;
+use crate::slam::two_frame::median::median;
 use crate::slam::two_frame::points::Points;
-use crate::slam::two_frame::system::{LevelView, NUM_UNKNOWNS, PointSystem, State, System};
+use crate::slam::two_frame::system::{LevelView, PointSystem, State, System};
 use crate::slam::two_frame::system_kernel::system_kernels;
 
 /// Tuning of the fit.

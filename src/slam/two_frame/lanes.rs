@@ -1,7 +1,5 @@
 //! Eight points side by side: what the start computes for all points goes through blocks of them.
 
-use crate::slam::two_frame::system::NUM_UNKNOWNS;
-
 /// Points of a block.
 pub const LANES: usize = 8;
 
@@ -52,6 +50,9 @@ impl LaneSum {
         (self.0[0] + self.0[2]) + (self.0[1] + self.0[3])
     }
 }
+
+/// Translation, rotation, a, b.
+pub const NUM_UNKNOWNS: usize = 8;
 
 /// Places of a symmetric matrix's lower triangle.
 pub const NUM_TRIANGLE: usize = NUM_UNKNOWNS * (NUM_UNKNOWNS + 1) / 2;

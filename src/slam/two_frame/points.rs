@@ -3,7 +3,7 @@
 
 use crate::slam::depth::candidate::{CandidateParams, CandidateSelector};
 use crate::slam::depth::map::GradientImage;
-use crate::slam::depth::matching::PATTERN;
+use crate::slam::depth::pattern::PATTERN;
 use crate::slam::image::buffer::Image;
 use crate::slam::image::pyramid::Pyramid;
 use crate::slam::two_frame::lanes::{LANES, Lanes};

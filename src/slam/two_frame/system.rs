@@ -16,17 +16,16 @@
 
 use nalgebra::{SMatrix, SVector};
 
-use crate::slam::depth::matching::PATTERN;
+use crate::slam::depth::pattern::PATTERN;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;
 use crate::slam::pose::Brightness;
-use crate::slam::two_frame::lanes::{LANES, LaneSum, Lanes, NormalSums, lanes, lanes_of};
+use crate::slam::two_frame::lanes::{
+    LANES, LaneSum, Lanes, NUM_UNKNOWNS, NormalSums, lanes, lanes_of,
+};
 use crate::slam::two_frame::points::PatchBlock;
-use crate::slam::two_frame::system_kernel::{WindowSampler, system_kernels};
-
-/// Translation, rotation, a, b.
-pub const NUM_UNKNOWNS: usize = 8;
+use crate::slam::two_frame::sampling_kernel::WindowSampler;
 
 /// Residuals beyond this many grey levels grow linearly (Engel, Koltun, Cremers 2018).
 pub const HUBER_GREY: f32 = 9.0;
@@ -124,11 +123,6 @@ impl Default for System {
 }
 
 impl System {
-    /// Evaluates every point at `state`. Sums go in the order of the points.
-    pub fn evaluate(&mut self, level: &LevelView<'_>, state: &State) {
-        (system_kernels().evaluate)(self, level, state);
-    }
-
     /// Each point's part.
     pub fn points(&self) -> impl Iterator<Item = PointSystem> {
         (0..self.num_points).map(|i| {

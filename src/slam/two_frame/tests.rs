@@ -210,7 +210,8 @@ fn two_views(noise: f64) -> (Vec<u8>, Vec<u8>, SE3) {
 
 #[test]
 fn derivatives_are_those_of_the_residuals() {
-    use crate::slam::two_frame::system::{NUM_UNKNOWNS, System};
+    use crate::slam::two_frame::lanes::NUM_UNKNOWNS;
+    use crate::slam::two_frame::system::System;
     let (first, second, moved) = two_views(0.0);
     let mut initializer = TwoFrameInitializer::new(CAMERA, TwoFrameParams::default()).unwrap();
     assert!(initializer.begin(&first));
@@ -471,7 +472,7 @@ fn a_point_counts_as_it_does_alone() {
     for (i, point) in system.points().enumerate().filter(|(_, p)| p.visible) {
         let (patch, l) = (&view.patches[i / 8], i % 8);
         let mut energy = 0.0;
-        for (s, (du, dv)) in crate::slam::depth::matching::PATTERN.iter().enumerate() {
+        for (s, (du, dv)) in crate::slam::depth::pattern::PATTERN.iter().enumerate() {
             let pixel =
                 [f64::from(patch.u[l]) + f64::from(*du), f64::from(patch.v[l]) + f64::from(*dv)];
             let ray = Vector3::new((pixel[0] - k.cx) / k.fx, (pixel[1] - k.cy) / k.fy, 1.0);

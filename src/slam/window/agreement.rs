@@ -4,20 +4,12 @@
 //! the next room in view, more of them than of its own surroundings where it looks at a wall from near.
 
 use crate::slam::window::Window;
+use crate::slam::window::keyframe::Agreed;
 
 /// Share of the comparisons with a host's points that count, from which on some of them are seen: of those behind a wall
 /// one in ten to three does by chance, on a wall of little contrast more, of others four in five, and of a host seen
 /// through a door something between.
 const LEAST_SHARE: f64 = 0.3;
-
-/// A point that a keyframe agrees with.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Agreed {
-    /// Its host.
-    pub keyframe_id: u64,
-    /// Its place among its host's points.
-    pub point: usize,
-}
 
 impl Window {
     /// Keeps, right after an adjustment, which points those members agree with whose own points are still to be chosen:

@@ -1,7 +1,5 @@
 //! Where the points of a keyframe come from.
 
-use serde::{Deserialize, Serialize};
-
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::DepthPoint;
 use crate::slam::window::params::WindowParams;
@@ -10,18 +8,6 @@ use crate::slam::window::{Window, selection};
 /// Fewer mature points than this hold neither a keyframe's pose nor a plane through its depth, which wants 30 of them:
 /// they are chosen from its depth then.
 const FEWEST_MATURE: usize = 40;
-
-/// From which filter points enter the joint estimation; `docs/depth-filters.md` compares them.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum PointSource {
-    /// The surest pixels of the keyframe's depth.
-    #[default]
-    Gaussian,
-    /// Pixels chosen when the keyframe is made and traced as intervals through the frames that follow: those that are
-    /// mature when the next keyframe comes (Engel, Koltun, Cremers 2018 §2.2).
-    Interval,
-}
 
 /// Points of the interval filter that were mature when their keyframe was left.
 #[derive(Debug, Clone, PartialEq)]

@@ -7,7 +7,7 @@ use super::comparison::{
     sum_of_samples,
 };
 use crate::slam::alignment::kernel::Kernel;
-use crate::slam::depth::matching::PATTERN;
+use crate::slam::depth::pattern::PATTERN;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;
 use crate::slam::test_scene::{CAMERA, Random};

@@ -1,24 +1,7 @@
 //! The window's points for whoever shows the map: where each is, and how many keyframes confirm it.
 
-use crate::slam::map::Map;
+use crate::slam::map::{ConfirmedPoint, Map};
 use crate::slam::window::Window;
-
-/// A point that several keyframes were estimated from jointly.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct ConfirmedPoint {
-    /// The keyframe that it was chosen in.
-    pub keyframe_id: u64,
-    /// Column of its pixel there, level 0.
-    pub u: u16,
-    /// Row.
-    pub v: u16,
-    /// Keyframes that agreed with it when it was last estimated, beside its own.
-    pub confirmations: u32,
-    /// 1/z along the keyframe's optical axis, one over the keyframe's unit.
-    pub inverse_depth: f32,
-    /// Brightness of its pixel, grey levels.
-    pub intensity: f32,
-}
 
 impl Window {
     /// The points that something agrees with, by keyframe; those of keyframes that `map` does not hold are left out.

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use crate::slam::alignment::kernel::{Kernel, SimdMode};
 use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::{DepthPoint, Keyframe};
-use crate::slam::map::{LogPlane, Map};
+use crate::slam::map::{LogPlane, Map, RefinedDepth};
 use crate::slam::window::Window;
 use crate::slam::window::comparison::{
     Compared, LANES, Pair, PairSums, Patterns, Robustness, SAMPLES, Wanted,
@@ -44,17 +44,6 @@ const DOUBT: f64 = 2.0;
 /// all of them alike. Chosen by the share of true depths within one standard deviation: between 0.6 and 0.8 in
 /// freiburg1_floor, ICL office3 and rooms.
 const COMMON: f64 = 0.415;
-
-/// Depth of a keyframe as it is known better.
-#[derive(Debug, Clone, PartialEq)]
-pub struct RefinedDepth {
-    /// The keyframe.
-    pub keyframe_id: u64,
-    /// Revision of the keyframe that it was refined from.
-    pub of_revision: u64,
-    /// Its points, inverse depth in one over the keyframe's unit.
-    pub points: Vec<DepthPoint>,
-}
 
 /// Whose depth is refined, once all else is done.
 #[derive(Debug, Clone, Default)]

@@ -5,6 +5,7 @@
 
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;
+use crate::slam::map::PlacedFrame;
 use crate::slam::window::Window;
 use crate::slam::window::keyframe::WindowKeyframe;
 use crate::slam::window::surface::Surface;
@@ -43,17 +44,6 @@ pub struct TrackedFrame {
     pub is_guess: bool,
     /// Grey values.
     pub pixels: Vec<u8>,
-}
-
-/// Where a frame is after it was aligned again.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct PlacedFrame {
-    /// Its sequence.
-    pub sequence: u64,
-    /// Its keyframe.
-    pub keyframe_id: u64,
-    /// Where it is, in the unit of the map.
-    pub keyframe_from_camera: SE3,
 }
 
 /// Frames that wait and frames that are done.

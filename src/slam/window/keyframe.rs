@@ -1,10 +1,9 @@
 //! Keyframes and points of the window.
 
-use crate::slam::depth::matching::PATTERN;
+use crate::slam::depth::pattern::PATTERN;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;
-use crate::slam::window::agreement::Agreed;
 use crate::slam::window::comparison::{Look, SAMPLES, sum_of_samples};
 use crate::slam::window::params::WindowParams;
 use crate::slam::window::surface::Surface;
@@ -35,6 +34,15 @@ pub struct WindowKeyframe {
     pub agreed: Vec<Agreed>,
     /// How far it sees.
     pub surface: Surface,
+}
+
+/// A point that a keyframe agrees with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Agreed {
+    /// Its host.
+    pub keyframe_id: u64,
+    /// Its place among its host's points.
+    pub point: usize,
 }
 
 /// A point that is estimated jointly with others.

@@ -25,6 +25,7 @@ use crate::slam::modes::NUM_MODES;
 use crate::slam::place_covariance::PlaceMatrix;
 use crate::slam::window::Window;
 use crate::slam::window::comparison::{POSE, Pair};
+use crate::slam::window::functional::{Functional, Seen};
 use crate::slam::window::keyframe::{WindowKeyframe, WindowPoint};
 use crate::slam::window::place_marginals::{Gauge, PlaceMarginal, place_of_displaced, unit_fit};
 use crate::slam::window::solver::Solver;
@@ -46,48 +47,12 @@ pub struct Marginal {
     pub place: Option<PlaceMarginal>,
 }
 
-/// A linear function of everything that is free.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Functional {
-    /// By entry of the left increments of the free poses.
-    pub poses: DVector<f64>,
-    /// By inverse depth, of some points by their place in the views.
-    pub depths: Vec<(usize, f64)>,
-}
-
-impl Functional {
-    /// That nothing changes.
-    pub fn zero(num_free: usize) -> Self {
-        Self { poses: DVector::zeros(POSE * num_free), depths: Vec::new() }
-    }
-
-    /// Adds a function of a free pose.
-    pub fn add_pose(&mut self, number: usize, of: &Vector6<f64>) {
-        let mut entries = self.poses.fixed_rows_mut::<POSE>(POSE * number);
-        entries += of;
-    }
-}
-
 /// Points that a fit of the modes wants: ten for each of its numbers, as the plane.
 const FEWEST_POINTS: usize = 40;
 
 /// Standard deviation of a point's inverse depth, over that depth, above which it tells nothing of the modes: a few that
 /// no baseline shows would otherwise be all that they are uncertain by.
 const LEAST_CERTAIN: f64 = 0.3;
-
-/// A point as a keyframe has it.
-pub(super) struct Seen {
-    /// Place among the points of the views.
-    slot: usize,
-    /// Who else moves it: its host, with where the keyframe stands from that; `None` of the keyframe's own.
-    from_host: Option<(usize, SE3)>,
-    /// (1, X, Y, ln d') there.
-    pub(super) phi: Vector4<f64>,
-    /// ∂ ln d'/∂d.
-    by_depth: f64,
-    /// ∂ ln d'/∂ the left increment of the keyframe's pose.
-    by_pose: Vector6<f64>,
-}
 
 impl Window {
     /// What the last adjustment says of a keyframe.

@@ -3,7 +3,18 @@
 use serde::{Deserialize, Serialize};
 
 use crate::slam::parameter::{ParameterError, check_range};
-use crate::slam::window::candidates::PointSource;
+
+/// From which filter points enter the joint estimation; `docs/depth-filters.md` compares them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PointSource {
+    /// The surest pixels of the keyframe's depth.
+    #[default]
+    Gaussian,
+    /// Pixels chosen when the keyframe is made and traced as intervals through the frames that follow: those that are
+    /// mature when the next keyframe comes (Engel, Koltun, Cremers 2018 §2.2).
+    Interval,
+}
 
 /// Tuning of the joint estimation.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -17,8 +17,8 @@ use crate::slam::geometry::sim3::Sim3;
 use crate::slam::place_covariance::{PLACE_ERRORS, PlaceMatrix, transport};
 use crate::slam::tracker::covariance_floor::displacement_covariance;
 use crate::slam::window::comparison::POSE;
+use crate::slam::window::functional::{Functional, Seen};
 use crate::slam::window::keyframe::WindowKeyframe;
-use crate::slam::window::marginals::{Functional, Seen};
 use crate::slam::window::system::{Members, System};
 use crate::slam::window::view::Views;
 

@@ -5,7 +5,6 @@
 
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::DepthPoint;
-use crate::slam::window::view::Projected;
 
 /// Side of a part: a door three metres off is four parts wide at f = 500, and half as large an image has parts enough.
 const CELL_PX: usize = 32;
@@ -18,6 +17,17 @@ const OUTLIERS: f64 = 0.1;
 /// A point so many times as far as the farthest that is seen there is hidden. Depth and unit of a keyframe are known
 /// better than that, and what is behind a wall seen from near is farther than that.
 const HIDDEN_RATIO: f64 = 1.5;
+
+/// A point as an observer sees it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Projected {
+    /// Column, level 0.
+    pub u: f64,
+    /// Row.
+    pub v: f64,
+    /// Its inverse depth there.
+    pub inverse_depth: f64,
+}
 
 /// How far a keyframe sees.
 #[derive(Debug, Clone, PartialEq, Default)]

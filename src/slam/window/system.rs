@@ -17,8 +17,8 @@ use crate::slam::window::elimination_kernel::{
     Block, PADDED, PointRow, RowBlock, eliminate, lower,
 };
 use crate::slam::window::factors::{Factors, solve};
+use crate::slam::window::functional::Functional;
 use crate::slam::window::keyframe::WindowKeyframe;
-use crate::slam::window::marginals::Functional;
 use crate::slam::window::view::{PairView, Views};
 
 /// The normal equations at one state. Its memory is kept from one to the next.

@@ -8,6 +8,7 @@ use super::*;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{DepthPoint, Keyframe};
+use crate::slam::map::PlacedFrame;
 use crate::slam::modes::ModeCovariance;
 use crate::slam::place_covariance::{PlaceCovariance, PlaceMatrix};
 use crate::slam::test_scene::{CAMERA, Random, Rendering, Scene};
@@ -426,7 +427,7 @@ fn keyframes_that_are_not_estimated_follow_the_last_before_them_that_moved() {
 fn a_frame_is_kept_in_the_unit_of_its_keyframe() {
     let mut map = Map::default();
     map.keyframes.push(in_map(3, 0, 1.0, 2.0));
-    let placed = |sequence, keyframe_id, x: f64| frames::PlacedFrame {
+    let placed = |sequence, keyframe_id, x: f64| PlacedFrame {
         sequence,
         keyframe_id,
         keyframe_from_camera: SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() },

@@ -4,6 +4,7 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::window::comparison::{LANES, Patterns};
 use crate::slam::window::keyframe::{WindowKeyframe, WindowPoint};
+use crate::slam::window::surface::Projected;
 use nalgebra::Vector3;
 
 /// Pixels at the border where a pattern is not compared.
@@ -185,17 +186,6 @@ pub struct Sight {
     rotation: nalgebra::Matrix3<f64>,
     translation: Vector3<f64>,
     camera: Intrinsics,
-}
-
-/// A point as an observer sees it.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Projected {
-    /// Column, level 0.
-    pub u: f64,
-    /// Row.
-    pub v: f64,
-    /// Its inverse depth there.
-    pub inverse_depth: f64,
 }
 
 impl Sight {

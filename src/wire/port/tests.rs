@@ -199,7 +199,7 @@ fn nothing_is_left_behind() {
 
 /// Files of this place in shared memory.
 fn shared_memory(place: &Place) -> usize {
-    let names = std::fs::read_dir(StdPath::new(crate::wire::place::SHARED_MEMORY)).unwrap();
+    let names = std::fs::read_dir(StdPath::new(crate::wire::folders::SHARED_MEMORY)).unwrap();
     let ours = |name: &str| name.starts_with(&place.prefix);
     names.filter(|name| ours(&name.as_ref().unwrap().file_name().to_string_lossy())).count()
 }
@@ -208,6 +208,6 @@ fn shared_memory(place: &Place) -> usize {
 fn the_file_for_foreign_tools_says_the_same() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/config/iceoryx2.toml");
     let file = Config::from_file(&FilePath::new(path.as_bytes()).unwrap()).unwrap();
-    let place = Place::new("semidense", crate::wire::place::SYSTEM_ROOT).unwrap();
+    let place = Place::new("semidense", crate::wire::folders::SYSTEM_ROOT).unwrap();
     assert_eq!(file, place.transport_config().unwrap());
 }

@@ -1,8 +1,9 @@
 //! How good a pose is after some iterations or some time: two charts of the report.
 
 use crate::service::results::budget_curve::{BudgetCurve, BudgetSample, displacement_by_time};
-use crate::service::results::report::chart::{Chart, Mark, Scaling, Series};
+use crate::service::results::report::chart::{Chart, Scaling};
 use crate::service::results::report::charts::{ERROR, ESTIMATE};
+use crate::service::results::report::series::{Mark, Series};
 use crate::slam::evaluation::statistics::median;
 
 /// A displacement below this is none: a hundredth of what the alignment itself is right to, pixels.

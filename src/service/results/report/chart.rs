@@ -3,44 +3,13 @@
 use std::fmt::Write;
 
 use crate::service::results::report::axis::Range;
+use crate::service::results::report::chart_frame::{Frame, MARGIN};
 use crate::service::results::report::chart_points::thinned;
 use crate::service::results::report::html::escaped;
+use crate::service::results::report::series::{Mark, Series};
 
 /// Width of every chart's coordinate system; the page scales it.
 pub const CHART_WIDTH: f64 = 640.0;
-
-/// Space left of, above, right of and below the plot.
-const MARGIN: [f64; 4] = [66.0, 34.0, 14.0, 42.0];
-
-/// How the points of a series are drawn.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Mark {
-    /// A line over x in ascending order; its extremes survive when it is thinned. NaN breaks it.
-    Line,
-    /// A line in any direction.
-    Path,
-    /// A broken line in any direction.
-    DashedPath,
-    /// Dots of this radius.
-    Dots(f64),
-    /// Bars from zero, of this width in x.
-    Bars(f64),
-    /// A vertical line through all of the plot at each x.
-    Rule,
-}
-
-/// Points drawn in one way.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Series {
-    /// Name in the legend; an empty one has no entry.
-    pub name: &'static str,
-    /// CSS colour.
-    pub colour: &'static str,
-    /// How the points are drawn.
-    pub mark: Mark,
-    /// x and y.
-    pub points: Vec<[f64; 2]>,
-}
 
 /// How the axes are scaled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -72,27 +41,6 @@ pub struct Chart {
     pub scaling: Scaling,
     /// What is drawn, the first at the bottom.
     pub series: Vec<Series>,
-}
-
-/// Where the axes' values lie in the picture.
-pub(super) struct Frame {
-    pub(super) x: Range,
-    /// Of the values, or of their decimal logarithms.
-    pub(super) y: Range,
-    pub(super) in_decades: bool,
-    width: f64,
-    height: f64,
-}
-
-impl Frame {
-    /// Where a point lies in the picture.
-    pub(super) fn place(&self, [x, y]: [f64; 2]) -> [f64; 2] {
-        let y = if self.in_decades { y.log10() } else { y };
-        [
-            MARGIN[0] + (x - self.x.low) / self.x.width() * self.width,
-            MARGIN[1] + (self.y.high - y) / self.y.width() * self.height,
-        ]
-    }
 }
 
 impl Chart {

@@ -3,9 +3,10 @@
 
 use serde_json::json;
 
-use crate::service::results::report::chart::{Chart, Mark, Scaling, Series};
+use crate::service::results::report::chart::{Chart, Scaling};
 use crate::service::results::report::chart_points::{number, points_json};
 use crate::service::results::report::html::escaped;
+use crate::service::results::report::series::{Mark, Series};
 
 /// The script, once for all charts, after them.
 pub const CHART_SCRIPT: &str = include_str!("chart.js");

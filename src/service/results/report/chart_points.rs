@@ -3,7 +3,8 @@
 use std::fmt::Write;
 
 use crate::service::results::report::axis::Range;
-use crate::service::results::report::chart::{Frame, Mark, Series};
+use crate::service::results::report::chart_frame::Frame;
+use crate::service::results::report::series::{Mark, Series};
 
 /// Most points that a path keeps.
 const MAX_PATH_POINTS: usize = 3000;

@@ -2,11 +2,12 @@
 
 use nalgebra::Vector3;
 
-use crate::service::results::RunRecord;
 use crate::service::results::poses::longest_epoch;
-use crate::service::results::report::ReportInput;
+use crate::service::results::record::RunRecord;
 use crate::service::results::report::axis::Range;
-use crate::service::results::report::chart::{Chart, Mark, Scaling, Series};
+use crate::service::results::report::chart::{Chart, Scaling};
+use crate::service::results::report::input::ReportInput;
+use crate::service::results::report::series::{Mark, Series};
 use crate::service::results::report::views::Views;
 use crate::slam::evaluation::TrajectoryEvaluation;
 use crate::slam::evaluation::depth_error::DepthScale;
@@ -211,7 +212,7 @@ pub fn scale_over_time(input: &ReportInput<'_>) -> Option<Chart> {
 
 /// Times of tracker and mapper over the run, and how often each occurs.
 pub fn time_charts(record: &RunRecord) -> Vec<Chart> {
-    let of_poses = |nanos: fn(&crate::service::results::RecordedPose) -> Option<u64>| {
+    let of_poses = |nanos: fn(&crate::service::results::record::RecordedPose) -> Option<u64>| {
         let samples = record.poses.iter().filter_map(|pose| {
             nanos(pose).map(|n| [secs(record, pose.estimate.capture_nanos), n as f64 * 1e-6])
         });

@@ -1,7 +1,5 @@
 //! What the figures of `summary.json` are called on the page, and what each means.
 
-use crate::service::results::report::figure_words_quality::QUALITY_WORDS;
-
 /// Where a figure stands on the page.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Group {
@@ -103,11 +101,6 @@ macro_rules! words {
 }
 pub(super) use words;
 
-/// The words of all figures in the order of the page.
-pub(super) fn all_words() -> impl Iterator<Item = &'static Words> {
-    RUN_WORDS.iter().chain(QUALITY_WORDS)
-}
-
 const LEVELS: &[(&str, &str, Format)] = &[
     ("level", "level (0 is the finest)", Format::Count),
     ("frames", "frames", Format::Count),
@@ -125,7 +118,7 @@ const CAUSES: &[(&str, &str, Format)] = &[
 ];
 
 /// Figures that need no ground truth.
-const RUN_WORDS: &[Words] = words! {
+pub(super) const RUN_WORDS: &[Words] = words! {
     mode: Run, Format::Text, "Mode", "Replay and lockstep take every frame; live takes the newest and leaves out what it has no time for.";
     source: Run, Format::Text, "Source", "Where the frames came from.";
     camera: Run, Format::Camera, "Camera", "Focal lengths, principal point and size of the rectified images, pixels.";

@@ -4,9 +4,10 @@ use std::fmt::Write;
 
 use serde_json::Value;
 
-use crate::service::results::report::figure_words::{Format, GROUPS, Group, Words, all_words};
+use crate::service::results::report::figure_words::{Format, GROUPS, Group, RUN_WORDS, Words};
+use crate::service::results::report::figure_words_quality::QUALITY_WORDS;
 use crate::service::results::report::html::escaped;
-use crate::service::results::report::{grouped, length};
+use crate::service::results::report::number_text::{grouped, length};
 use crate::service::results::summary::Summary;
 use crate::slam::geometry::intrinsics::Intrinsics;
 
@@ -184,13 +185,17 @@ fn camera_text(camera: &Value) -> String {
     }
 }
 
+/// The words of all figures in the order of the page.
+fn all_words() -> impl Iterator<Item = &'static Words> {
+    RUN_WORDS.iter().chain(QUALITY_WORDS)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::service::results::PointCounts;
     use crate::service::results::alignment_levels::LevelSummary;
     use crate::service::results::depth_maps::DepthEvaluation;
-    use crate::service::results::summary::RejectionSummary;
+    use crate::service::results::summary::{PointCounts, RejectionSummary};
     use crate::service::results::times::{Histogram, Percentiles};
     use crate::service::results::untracked::tests::record;
     use crate::slam::pose::TrackingState;
@@ -240,7 +245,7 @@ mod tests {
             nanos_per_point: None,
         };
         let rejection = RejectionSummary { sequence: 0, reason: String::new() };
-        let cause = crate::service::results::RestartCause {
+        let cause = crate::service::results::record::RestartCause {
             process: String::new(),
             cause: String::new(),
             count: 1,

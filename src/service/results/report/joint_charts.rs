@@ -4,9 +4,10 @@
 use std::collections::HashMap;
 
 use crate::service::adjustments::AdjustmentRecord;
-use crate::service::results::RunRecord;
-use crate::service::results::report::chart::{Chart, Mark, Scaling, Series};
+use crate::service::results::record::RunRecord;
+use crate::service::results::report::chart::{Chart, Scaling};
 use crate::service::results::report::charts::{ERROR, ESTIMATE, MAPPING, ONLINE, secs};
+use crate::service::results::report::series::{Mark, Series};
 use crate::slam::evaluation::depth_error::KeyframeDepth;
 use crate::slam::evaluation::statistics::median;
 

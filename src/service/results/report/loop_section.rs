@@ -6,15 +6,16 @@ use std::fmt::Write;
 use nalgebra::Vector3;
 
 use crate::service::adjustments::SearchRecord;
-use crate::service::results::RunRecord;
 use crate::service::results::poses::longest_epoch;
-use crate::service::results::report::ReportInput;
-use crate::service::results::report::chart::{Chart, Mark, Scaling, Series};
+use crate::service::results::record::RunRecord;
+use crate::service::results::report::chart::{Chart, Scaling};
 use crate::service::results::report::chart_figure::chart_figure;
 use crate::service::results::report::charts::{
     ERROR, ESTIMATE, MAPPING, ONLINE, TRUTH, keyframe_poses,
 };
 use crate::service::results::report::html::escaped;
+use crate::service::results::report::input::ReportInput;
+use crate::service::results::report::series::{Mark, Series};
 use crate::service::results::report::views::Views;
 use crate::service::results::summary_text::loops_text;
 use crate::slam::keyframe::Keyframe;

@@ -6,10 +6,11 @@ use nalgebra::Vector3;
 
 use crate::service::results::poses::longest_epoch;
 use crate::service::results::report::html::base64;
+use crate::service::results::report::input::ReportInput;
+use crate::service::results::report::number_text::grouped;
 use crate::service::results::report::scene::{
     PLAYER, SceneInput, SceneKeyframe, ScenePoint, VIEWER, pack,
 };
-use crate::service::results::report::{ReportInput, grouped};
 use crate::slam::fusion::SurfacePoint;
 
 /// Most points of the map in a report: 3.2 MB of text, which a browser opens at once.

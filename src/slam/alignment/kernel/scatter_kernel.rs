@@ -13,7 +13,8 @@ use crate::slam::alignment::kernel::mode_kernel::{ModeSums, add_modes};
 use crate::slam::alignment::normal_equations::UNKNOWNS;
 use crate::slam::alignment::points::{LANES, LevelPoints, TileRun};
 use crate::slam::alignment::residual::Evaluation;
-use crate::slam::alignment::scatter::{GradientScatter, NUM_TILES, ScatterSums};
+use crate::slam::alignment::scatter::{GradientScatter, ScatterSums};
+use crate::slam::alignment::tiles::NUM_TILES;
 use crate::slam::image::buffer::Image;
 
 /// The columns of the rotations about x and y.

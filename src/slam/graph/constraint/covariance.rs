@@ -14,7 +14,7 @@ use super::align::Sums;
 use super::residual::{Row, SCALE, State, Terms, UNKNOWNS};
 use super::view::KeyframeView;
 use crate::slam::alignment::misfit::TileMisfit;
-use crate::slam::alignment::scatter::{NUM_TILES, TileSum, tile_of};
+use crate::slam::alignment::tiles::{NUM_TILES, TileSum, tile_of};
 use crate::slam::geometry::sim3::Matrix7;
 use crate::slam::modes::NUM_MODES;
 use crate::slam::tracker::covariance_floor::displacement_covariance;

@@ -1,0 +1,123 @@
+//! Opens a source by its name, with the reader of its kind.
+
+use std::path::{Path, PathBuf};
+
+use crate::capture::looped::Looped;
+use crate::capture::rig::Rig;
+use crate::capture::simulator::Simulator;
+use crate::capture::simulator::params::SimulatorParams;
+use crate::capture::source::FrameSource;
+use crate::capture::source_error::SourceError;
+use crate::capture::source_name::SourceName;
+use crate::capture::v4l::params::CameraParams;
+use crate::capture::{bag, euroc, image_folder, stream, tum, v4l};
+
+/// What can be set about sources.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct SourceParams {
+    /// The simulated camera and its world.
+    pub simulator: SimulatorParams,
+    /// What is asked of a camera.
+    pub camera: CameraParams,
+}
+
+/// Opens a source. `rig` is a rig file, which wins over the calibration that a recording brings. A camera
+/// is opened when its first frame is awaited.
+pub fn open(
+    name: &SourceName,
+    rig: Option<&Path>,
+    params: &SourceParams,
+) -> Result<Box<dyn FrameSource>, SourceError> {
+    let unavailable = |reason| SourceError::Unavailable { name: name.to_string(), reason };
+    if let Some(folder) = name.folder().filter(|folder| !folder.is_dir()) {
+        return Err(SourceError::NoFolder { name: name.to_string(), folder: folder.to_owned() });
+    }
+    if let Some(likely) = misnamed(name) {
+        return Err(SourceError::Layout { name: name.to_string(), likely: likely.to_string() });
+    }
+    match name {
+        SourceName::Tum(folder) => Ok(Box::new(tum::open(folder, rig)?)),
+        SourceName::Euroc(folder) => Ok(Box::new(euroc::open(folder, rig)?)),
+        SourceName::Images(folder) => Ok(Box::new(image_folder::open(folder, rig)?)),
+        SourceName::Mcap { file, topic } => Ok(Box::new(bag::open(file, topic.as_deref(), rig)?)),
+        SourceName::Simulator { .. } if rig.is_some() => Err(unavailable(
+            "the simulator takes no rig; its camera is in the table [simulator] of the configuration",
+        )),
+        SourceName::Simulator { scene } => {
+            let mut params = params.simulator.clone();
+            if let Some(scene) = scene {
+                params = params.with_scene(scene.parse().map_err(|problem: &str| {
+                    SourceError::Name { name: name.to_string(), problem: problem.to_owned() }
+                })?);
+            }
+            Ok(Box::new(Simulator::unpainted(params)?))
+        }
+        SourceName::Looped { inner, .. } if inner.is_camera() => {
+            Err(unavailable("a camera cannot be repeated; name a recording or the simulator"))
+        }
+        SourceName::Looped { num_frames, rate_hz, inner } => {
+            let source = open(inner, rig, params)?;
+            Ok(Box::new(Looped::new(name.clone(), source, *num_frames, *rate_hz)))
+        }
+        SourceName::Camera(device) => Ok(Box::new(v4l::open(device, rig, &params.camera)?)),
+        SourceName::Stream(path) => {
+            Ok(Box::new(stream::open_socket(path, rig, params.camera.stall_s)?))
+        }
+        SourceName::Ros2(topic) => {
+            Ok(Box::new(stream::open_ros2(topic, rig, params.camera.stall_s)?))
+        }
+    }
+}
+
+/// What a folder without the layout that its source names is by the layout that it has.
+fn misnamed(name: &SourceName) -> Option<SourceName> {
+    let (SourceName::Tum(folder) | SourceName::Euroc(folder) | SourceName::Images(folder)) = name
+    else {
+        // What a loop repeats is looked at when that is opened.
+        return None;
+    };
+    if name.has_layout() { None } else { SourceName::of_folder(folder) }
+}
+
+/// Where the recording's own camera is another than that of the `rig` which wins over it: what differs,
+/// in one line. `None` where they agree, or the recording brings no camera that can be read.
+fn rig_conflict(name: &SourceName, rig: Option<&Path>) -> Option<String> {
+    /// Displacement that no calibration of the same camera brings about, pixels: files are written
+    /// with few digits, and calibrations of one camera differ by tenths.
+    const MAX_SHIFT_PX: f64 = 2.0;
+    let (folder, rig) = (name.folder()?, rig?);
+    let (own, own_path) = own_rig(name, folder)?;
+    let shift_px = own.largest_shift_px(&Rig::read(rig).ok()?);
+    let difference = match shift_px.is_finite() {
+        true => format!("differ by up to {shift_px:.0} px"),
+        false => "see different parts of the world or have images of different sizes".to_owned(),
+    };
+    (shift_px > MAX_SHIFT_PX).then(|| {
+        format!(
+            "the camera of {} and that of {} {difference}; the first is used, leave out --rig for the second",
+            rig.display(),
+            own_path.display()
+        )
+    })
+}
+
+/// What may be wrong with the camera of a source, one line each: it is another than the recording's own, or
+/// its field of view is unusual.
+pub fn rig_remarks(name: &SourceName, rig: Option<&Path>) -> Vec<String> {
+    let used = match (name.folder(), rig) {
+        (_, Some(path)) => Rig::read(path).ok().map(|rig| (rig, path.to_owned())),
+        (Some(folder), None) => own_rig(name, folder),
+        (None, None) => None,
+    };
+    let unusual =
+        used.and_then(|(rig, path)| Some(format!("{}: {}", path.display(), rig.remark()?)));
+    rig_conflict(name, rig).into_iter().chain(unusual).collect()
+}
+
+/// The camera that a recording brings, and where it says so.
+fn own_rig(name: &SourceName, folder: &Path) -> Option<(Rig, PathBuf)> {
+    match name {
+        SourceName::Euroc(_) => euroc::own_rig(folder),
+        _ => tum::own_rig(folder),
+    }
+}

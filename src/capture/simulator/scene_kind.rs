@@ -1,0 +1,36 @@
+//! Which scenes there are, by name.
+
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+/// Which scene is seen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum SceneKind {
+    /// A furnished room of 6 × 5 × 3 m.
+    Room,
+    /// One large printed plane, seen from 1.5 m above.
+    Plane,
+    /// A corridor of 24 × 2.4 × 2.6 m.
+    Corridor,
+    /// Four furnished rooms about a corridor, 9 × 10 × 2.7 m, walked through in rounds.
+    Flat,
+    /// Two rooms that are exactly alike on a corridor that repeats, 13.8 × 5.8 × 2.7 m.
+    Twins,
+}
+
+impl FromStr for SceneKind {
+    type Err = &'static str;
+
+    fn from_str(name: &str) -> Result<Self, Self::Err> {
+        match name {
+            "room" => Ok(Self::Room),
+            "plane" => Ok(Self::Plane),
+            "corridor" => Ok(Self::Corridor),
+            "flat" => Ok(Self::Flat),
+            "twins" => Ok(Self::Twins),
+            _ => Err("unknown scene; scenes are room, plane, corridor, flat and twins"),
+        }
+    }
+}

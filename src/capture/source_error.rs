@@ -1,0 +1,199 @@
+//! Why frames cannot be had: what is wrong with a source, where, and what to do.
+
+use std::path::PathBuf;
+
+use crate::capture::bag::bag_error::{BagError, BagImageError};
+use crate::capture::image_file::ImageFileError;
+use crate::capture::rig_error::RigError;
+use crate::slam::geometry::rectification::RectificationError;
+use crate::slam::parameter::ParameterError;
+
+/// Why a source cannot be opened or gave no frame; says what, where and what to do.
+#[derive(Debug, thiserror::Error)]
+pub enum SourceError {
+    /// The name of a source is not understood.
+    #[error("source `{name}`: {problem}")]
+    Name {
+        /// The name as it was given.
+        name: String,
+        /// What is wrong with it, and what to do.
+        problem: String,
+    },
+    /// The source exists but not in this binary or not by this way of opening.
+    #[error("source `{name}`: {reason}")]
+    Unavailable {
+        /// The source.
+        name: String,
+        /// Why, and what to do.
+        reason: &'static str,
+    },
+    /// The folder of a recording is not there.
+    #[error("source `{name}`: there is no folder {}; check the path", folder.display())]
+    NoFolder {
+        /// The source.
+        name: String,
+        /// The folder.
+        folder: PathBuf,
+    },
+    /// The folder has the layout of another kind of source.
+    #[error("source `{name}`: the folder does not have this layout; it looks like {likely}")]
+    Layout {
+        /// The source.
+        name: String,
+        /// What it could be named.
+        likely: String,
+    },
+    /// A list, rig or calibration file cannot be read.
+    #[error("{}: cannot be read: {source}; check the path and its permissions", path.display())]
+    Read {
+        /// The file or folder.
+        path: PathBuf,
+        /// What the system says.
+        source: std::io::Error,
+    },
+    /// A line of a list or calibration file is wrong.
+    #[error("{}, line {line}: {problem}", path.display())]
+    Line {
+        /// The file.
+        path: PathBuf,
+        /// Line, from 1.
+        line: usize,
+        /// What is wrong and what to do.
+        problem: String,
+    },
+    /// There is not a single frame.
+    #[error("{}: has no frames; check that this is the right recording", path.display())]
+    Empty {
+        /// The list or folder.
+        path: PathBuf,
+    },
+    /// Nothing says what the camera is.
+    #[error(
+        "{}: has no camera.txt; name the camera with --rig FILE (examples: config/rigs, /usr/share/semidense/rigs)",
+        folder.display()
+    )]
+    NoRig {
+        /// The recording's folder.
+        folder: PathBuf,
+    },
+    /// Nothing says when the images were taken.
+    #[error(
+        "{}: has no times.txt and {} names no rate_hz; add one of them (name a rig with --rig)",
+        folder.display(), rig.display()
+    )]
+    NoStamps {
+        /// The folder of images.
+        folder: PathBuf,
+        /// The rig or camera.txt.
+        rig: PathBuf,
+    },
+    /// A list of stamps ends before the images do.
+    #[error("{}: has {stamps} time stamps for {images} images; give each image one", path.display())]
+    FewStamps {
+        /// The list.
+        path: PathBuf,
+        /// Stamps in it.
+        stamps: usize,
+        /// Images in the folder.
+        images: usize,
+    },
+    /// The rig is not usable.
+    #[error(transparent)]
+    Rig(#[from] RigError),
+    /// The rig's lens cannot be rectified.
+    #[error("{}: {source}; check the calibration", path.display())]
+    Rectification {
+        /// The rig file.
+        path: PathBuf,
+        /// Why not.
+        source: RectificationError,
+    },
+    /// A parameter of the simulator is out of its range.
+    #[error("simulator.{0}")]
+    Simulator(#[from] ParameterError),
+    /// An image of the sequence is not usable.
+    #[error(transparent)]
+    Image(#[from] ImageFileError),
+    /// A camera without a calibration.
+    #[error(
+        "v4l:{name}: a camera needs a rig file with its calibration: name it with --rig FILE (for a first try at 640x480, webcam.toml in config/rigs or /usr/share/semidense/rigs will do)"
+    )]
+    CameraRig {
+        /// The camera.
+        name: String,
+    },
+    /// A camera that cannot serve.
+    #[error("v4l:{name}: {reason}")]
+    Camera {
+        /// The camera.
+        name: String,
+        /// Why, and what to do.
+        reason: String,
+    },
+    /// A stream of frames without a calibration.
+    #[error("{name}: needs a rig file with the camera's calibration: name it with --rig FILE")]
+    StreamRig {
+        /// The source.
+        name: String,
+    },
+    /// A stream that cannot serve.
+    #[error("{name}: {reason}")]
+    Stream {
+        /// The source.
+        name: String,
+        /// Why, and what to do.
+        reason: String,
+    },
+    /// A frame came damaged; the next may be good.
+    #[error("{name}: a damaged frame: {reason}")]
+    BrokenFrame {
+        /// The source.
+        name: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// A bag cannot be used.
+    #[error("{}: {problem}", path.display())]
+    Bag {
+        /// The file.
+        path: PathBuf,
+        /// Why, and what to do.
+        problem: BagError,
+    },
+    /// An image of a bag is not usable; the next may be good.
+    #[error("{}: an image on {topic} {problem}", path.display())]
+    BagImage {
+        /// The file.
+        path: PathBuf,
+        /// The topic.
+        topic: String,
+        /// What is wrong with it.
+        problem: BagImageError,
+    },
+    /// A recording without one image that can be used.
+    #[error("none of its {count} images can be used; the first: {first}")]
+    AllDamaged {
+        /// Images.
+        count: u64,
+        /// Which the first is, and what is wrong with it.
+        first: String,
+    },
+    /// The caller's buffer does not fit the frames.
+    #[error("a buffer of {found} bytes for frames of {width}x{height}; give width * height bytes")]
+    Buffer {
+        /// Bytes of the buffer.
+        found: usize,
+        /// Frame width, pixels.
+        width: usize,
+        /// Frame height, pixels.
+        height: usize,
+    },
+}
+
+impl SourceError {
+    /// Whether only this frame is lost and the next may be good: a damaged frame of a camera, a damaged or
+    /// missing image of a recording.
+    pub fn is_passing(&self) -> bool {
+        matches!(self, Self::BrokenFrame { .. } | Self::Image(_) | Self::BagImage { .. })
+    }
+}

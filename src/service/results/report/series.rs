@@ -1,0 +1,31 @@
+//! Points of a chart that are drawn in one way.
+
+/// How the points of a series are drawn.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Mark {
+    /// A line over x in ascending order; its extremes survive when it is thinned. NaN breaks it.
+    Line,
+    /// A line in any direction.
+    Path,
+    /// A broken line in any direction.
+    DashedPath,
+    /// Dots of this radius.
+    Dots(f64),
+    /// Bars from zero, of this width in x.
+    Bars(f64),
+    /// A vertical line through all of the plot at each x.
+    Rule,
+}
+
+/// Points drawn in one way.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Series {
+    /// Name in the legend; an empty one has no entry.
+    pub name: &'static str,
+    /// CSS colour.
+    pub colour: &'static str,
+    /// How the points are drawn.
+    pub mark: Mark,
+    /// x and y.
+    pub points: Vec<[f64; 2]>,
+}
