@@ -245,10 +245,10 @@ fn what_moves_takes_its_frames_along() {
     let expected = map.place(pose.keyframe_id, &pose.keyframe_from_camera).unwrap();
     assert!(distance(&expected, &new.map_from_keyframe.rigid) < 1e-9);
     let in_world = new.world_from_keyframe.rigid;
-    assert!(distance(&in_world, &pose.world_from_camera) < 1e-6, "odometry goes on");
+    assert!(distance(&in_world, &pose.world_from_camera) < 1e-6, "odometry continues");
 }
 
-/// Depth by a plane on its logarithm: in the keyframe, in what goes on being observed, and in the file.
+/// Depth by a plane on its logarithm: in the keyframe, in what continues to be observed, and in the file.
 #[test]
 fn depth_is_corrected_where_it_is_observed_too() {
     let footage = &*FOOTAGE;
@@ -291,7 +291,7 @@ fn depth_is_corrected_where_it_is_observed_too() {
     assert_eq!((read.revision, read.keyframes), (1, written));
 }
 
-/// A mapper that dies after a correction goes on from the corrected map, and odometry where it was.
+/// A mapper that dies after a correction continues from the corrected map, and odometry where it was.
 #[test]
 fn a_successor_goes_on_from_the_corrected_map() {
     let footage = &*FOOTAGE;

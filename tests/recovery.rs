@@ -175,7 +175,7 @@ fn after_a_blackout_a_known_view_is_found_again() {
     assert!(estimates(&record).all(|e| e.epoch == 0), "it is the same map");
     let ratio = error_ratio(&record, 0);
     assert!(ratio < 0.02, "{ratio}");
-    // In the map it is back where it was; odometry goes on from where it was lost.
+    // In the map it is back where it was; odometry continues from where it was lost.
     let tracked: Vec<_> = estimates(&record).filter(|e| e.state.is_tracked()).collect();
     let found = tracked.iter().position(|e| e.sequence >= 160).unwrap();
     let (last, first) = (tracked[found - 1], tracked[found]);
@@ -236,7 +236,7 @@ fn back_at_a_place_of_an_earlier_epoch_the_camera_is_found_there() {
     assert!(back.iter().all(|e| e.epoch == 0 || !e.state.is_tracked()), "claimed elsewhere");
     let ratio = error_ratio(&record, 0);
     assert!(ratio < 0.02, "{ratio}");
-    // Odometry goes on from where it was lost.
+    // Odometry continues from where it was lost.
     let last = between.iter().rfind(|e| e.state.is_tracked()).unwrap();
     let first = back.iter().find(|e| e.state.is_tracked()).unwrap();
     let jump = (last.world_from_camera.translation - first.world_from_camera.translation).norm();

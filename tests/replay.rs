@@ -226,7 +226,7 @@ fn results_are_of_the_frames_before_one_that_cannot_be_read() {
     assert!(said.contains("the results are of the 5 frames before"), "{said}");
     assert_eq!(summary["frames_in"], 5);
     let (code, said, summary) = replayed(&[]);
-    // It goes on to the end, where seven frames were too few to start a map.
+    // It continues to the end, where seven frames were too few to start a map.
     assert_eq!(code, Some(3), "{said}");
     assert!(said.contains("is neither PNG nor JPEG"), "{said}");
     assert_eq!((&summary["frames_in"], &summary["frames_refused"]), (&7.into(), &1.into()));

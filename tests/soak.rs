@@ -285,7 +285,7 @@ impl Rigged {
         [resident(self.run.id()).unwrap(), peers.sum()]
     }
 
-    /// Kills as often at random instants, and looks after each that all goes on.
+    /// Kills as often at random instants, and looks after each that all continues.
     fn soak(&mut self, kills: usize, seed: u64) -> Vec<Pause> {
         let mut dice = Dice(seed);
         let mut pauses = Vec::new();

@@ -98,7 +98,7 @@ fn stamps(rig: &Rig) -> Vec<f64> {
     poses.map(|line| line.split_whitespace().next().unwrap().parse().unwrap()).collect()
 }
 
-/// Whoever dies, the source goes on where it was: no frame comes twice and no stamp goes back.
+/// Whoever dies, the source continues where it was: no frame comes twice and no stamp goes back.
 fn kills_do_not_rewind(processes: &[usize]) {
     let mut live = Live::start(&[]);
     live.until_frames(TRACKER, 90);

@@ -46,7 +46,7 @@ impl Feed {
         self.shared.lock().listen(depth)
     }
 
-    /// Why the reading has ended; `None` while it goes on.
+    /// Why the reading has ended; `None` while it continues.
     pub fn failure(&self) -> Option<String> {
         self.shared.lock().failure.clone()
     }
@@ -149,7 +149,7 @@ impl State {
     }
 }
 
-/// The way to one listener.
+/// The queue to one listener.
 #[derive(Debug)]
 struct Outlet {
     sender: SyncSender<Event>,

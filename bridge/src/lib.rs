@@ -1,7 +1,7 @@
 //! Ways out of semidense's shared memory: each is one more process that reads the topics like anybody else, and may be
 //! slow, die or be absent without the pipeline noticing.
 //!
-//! [`session`] reads the topics of a running instance; every way out is a folder beside it.
+//! [`session`] reads the topics of a running instance; every output is a folder beside it.
 
 pub mod command;
 pub mod feed;

@@ -1,3 +1,3 @@
-//! The reader of an instance's topics, which every way out starts from.
+//! The reader of an instance's topics, which every output starts from.
 
 pub use semidense::reader::{Event, Frame, Graph, Pose, Session, SessionError, Wants};

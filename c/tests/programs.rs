@@ -78,7 +78,7 @@ impl Rig {
         Self { folder, pipeline: None }
     }
 
-    /// With a live run that goes on for longer than any test.
+    /// With a live run that continues for longer than any test.
     fn running() -> Self {
         let mut rig = Self::new();
         let mut command = rig.command(&semidense());
@@ -192,7 +192,7 @@ fn a_program_in_c_reads_poses_and_ends_with_the_run() {
     let mut rows = Vec::new();
     // A busy machine may take long to begin a map; one that is dead ends the lines.
     while rows.len() < 30 || !rows.iter().any(|row: &Vec<String>| row[1] == "tracking") {
-        let line = lines.next().expect("poses of a run that goes on");
+        let line = lines.next().expect("poses of a run that continues");
         rows.push(line.split(' ').map(str::to_owned).collect());
     }
     rig.stop();

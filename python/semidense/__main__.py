@@ -27,7 +27,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--timeout", type=float, metavar="SECONDS", help="wait so long for the instance, then fail [for ever]"
     )
-    parser.add_argument("--follow", action="store_true", help="go on with the next run when one ends")
+    parser.add_argument("--follow", action="store_true", help="continue with the next run when one ends")
     parser.add_argument("--map", action="store_true", help="print map_from_camera instead of world_from_camera")
     parser.add_argument("--json", action="store_true", help="one JSON object a line, with covariance and velocity")
     parser.add_argument("--count", type=int, metavar="N", help="end after N poses")

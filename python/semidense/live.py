@@ -49,7 +49,7 @@ def poses(
     """Every pose as it is published, also of frames that are lost, until the run ends.
 
     Waits for the instance for `timeout` seconds (None: for ever), then raises `NotRunning`. `root` is the folder of the
-    instance where it is not the usual one (`SEMIDENSE_ROOT`). With `follow` it goes on to the next run. 900 poses
+    instance where it is not the usual one (`SEMIDENSE_ROOT`). With `follow` it continues to the next run. 900 poses
     are kept for a loop that is late.
     """
     return _stream(Pose, instance, root, timeout, follow)

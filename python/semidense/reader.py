@@ -130,7 +130,7 @@ class Reader:
 
     @property
     def is_open(self) -> bool:
-        """Whether the run that is read still goes on."""
+        """Whether the run that is read still continues."""
         return self._ports is not None
 
     def __iter__(self) -> Iterator[Message]:

@@ -54,7 +54,7 @@ class Rig:
         return child
 
     def live(self) -> subprocess.Popen[bytes]:
-        """A run that goes on for longer than any test."""
+        """A run that continues for longer than any test."""
         return self.run("--live", "--source", "loop:1000000:30:sim")
 
     def end(self, child: subprocess.Popen[bytes]) -> None:

@@ -82,7 +82,7 @@ pub fn open(path: &Path, topic: Option<&str>, rig: Option<&Path>) -> Result<Bag,
 }
 
 impl Bag {
-    /// Goes on to the next image; gives its stamp. `None` after the last.
+    /// Continues to the next image; gives its stamp. `None` after the last.
     fn advance(&mut self) -> Result<Option<FrameStamp>, SourceError> {
         loop {
             let found = match self.records.advance() {

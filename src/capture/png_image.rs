@@ -90,7 +90,7 @@ fn open(
     decoder.read_info().map_err(damaged)
 }
 
-/// Reads the pixels and goes on to the end of the file, so that one that is cut short is noticed.
+/// Reads the pixels and continues to the end of the file, so that one that is cut short is noticed.
 fn finish(reader: &mut Reader<Cursor<&[u8]>>, samples: &mut [u8]) -> Result<(), DecodeError> {
     reader.next_frame(samples).map_err(damaged)?;
     reader.finish().map_err(damaged)

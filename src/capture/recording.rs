@@ -99,7 +99,7 @@ impl FrameSource for Recording {
         }
         let Some(frame) = self.contents.frames.get(self.next) else { return Ok(None) };
         let sequence = self.next as u64;
-        // Counted before it is read: whoever goes on after a bad image gets the one after it.
+        // Counted before it is read: whoever continues after a bad image gets the one after it.
         self.next += 1;
         if self.rectification.is_identity() {
             self.reader.read_gray_into(&frame.path, width, height, pixels)?;

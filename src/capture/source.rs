@@ -97,7 +97,7 @@ pub trait FrameSource: Send {
     }
 
     /// Writes the next frame into `pixels` (`width * height` of [`FrameSource::intrinsics`]);
-    /// `None` after the last. After an error the next call goes on with the frame after it; what
+    /// `None` after the last. After an error the next call continues with the frame after it; what
     /// `pixels` holds then is not a frame.
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError>;
 

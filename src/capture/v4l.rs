@@ -2,7 +2,7 @@
 //!
 //! The kernel is spoken to directly, through the few structures of `linux/videodev2.h` in `kernel`.
 //! The crate `v4l` (0.14, last released in 2023) would need libclang at build time, and its stream
-//! cannot go on after one timeout: it gives the kernel a buffer that the kernel still has. The interface
+//! cannot continue after one timeout: it gives the kernel a buffer that the kernel still has. The interface
 //! is the kernel's ABI, so nothing here ages.
 //!
 //! From the inside out: `video_device` is what a device does, `device` the kernel's; `negotiation`,

@@ -1,4 +1,4 @@
-//! `semidense bench`: the latency of poses, idle and under load, and how a long run goes on.
+//! `semidense bench`: the latency of poses, idle and under load, and how a long run behaves.
 
 use std::ffi::OsString;
 use std::fs;

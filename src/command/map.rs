@@ -92,7 +92,7 @@ struct SaveArguments {
 ///
 /// It saves its own map first, where that has a folder, then looks for the camera in the other one and goes on there; a
 /// new epoch begins beside it where the camera is not found for two seconds. A map that does not fit is refused, and the
-/// mapper goes on in its own.
+/// mapper continues in its own.
 #[derive(Debug, Args)]
 struct LoadArguments {
     /// Folder of the map

@@ -1,4 +1,4 @@
-//! How long work shows that it goes on: a bar on a terminal, plain lines otherwise; on stderr, so
+//! How long work shows that it continues: a bar on a terminal, plain lines otherwise; on stderr, so
 //! that stdout stays the result.
 
 use std::cell::Cell;
@@ -9,7 +9,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::command::print::note;
 
-/// Time between two plain lines: a log of a long run stays short, and it is seen to go on.
+/// Time between two plain lines: a log of a long run stays short, and it is seen to continue.
 pub const LINE_PERIOD: Duration = Duration::from_secs(5);
 
 /// Progress of one piece of work.

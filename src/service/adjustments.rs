@@ -1,4 +1,4 @@
-//! Keyframes are estimated jointly on a thread of its own, while frames go on: what is handed over, when it comes back
+//! Keyframes are estimated jointly on a thread of its own, while frames continue: what is handed over, when it comes back
 //! into the map, and what is counted.
 //!
 //! One estimate is away at a time. A keyframe that is added meanwhile waits for the next, which takes in all new ones.

@@ -1,4 +1,4 @@
-//! The mapper's checkpoint: what it needs to go on after its death, in the runtime folder. Written by a
+//! The mapper's checkpoint: what it needs to continue after its death, in the runtime folder. Written by a
 //! thread of its own, so that no frame waits for a file.
 
 use std::fs;
@@ -87,7 +87,7 @@ impl Kept {
         }
     }
 
-    /// Nobody needs to go on from here: the files are removed with this.
+    /// Nobody needs to continue from here: the files are removed with this.
     pub fn end_in_order(&mut self) {
         self.checkpoint.is_over = true;
     }

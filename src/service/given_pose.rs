@@ -8,7 +8,7 @@ use crate::slam::evaluation::association::nearest;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::keyframe::Keyframe;
-use crate::slam::pose::{Brightness, NO_KEYFRAME, PoseEstimate, Quality, TrackingState};
+use crate::slam::pose::{PoseEstimate, Quality, TrackingState};
 use crate::slam::tracker::TrackerParams;
 use crate::slam::trajectory::StampedPose;
 
@@ -39,23 +39,10 @@ pub fn given_pose(
     let index = nearest(ground_truth, frame.capture_nanos, MAX_DIFFERENCE_NANOS)?;
     let world_from_camera = ground_truth[index].world_from_camera;
     let mut estimate = PoseEstimate {
-        sequence: frame.sequence,
-        capture_nanos: frame.capture_nanos,
-        epoch: 0,
-        revision: 0,
-        keyframe_id: NO_KEYFRAME,
         state: TrackingState::Tracking,
-        map_revision: 0,
         world_from_camera,
         map_from_camera: world_from_camera,
-        keyframe_from_camera: SE3::identity(),
-        covariance: [0.0; 21],
-        map_covariance: [0.0; 21],
-        alignment_covariance: [0.0; 21],
-        velocity: None,
-        brightness: Brightness::default(),
-        quality: Quality::default(),
-        proposes_keyframe: false,
+        ..PoseEstimate::unknown(frame)
     };
     if let Some(keyframe) = keyframe {
         estimate.epoch = keyframe.epoch;

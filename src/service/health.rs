@@ -32,7 +32,7 @@ pub enum ProcessState {
     Running,
     /// Its input has ended.
     Finished,
-    /// It cannot go on.
+    /// It cannot continue.
     Failed,
     /// It works, but its input has stopped coming.
     Stale,
@@ -171,49 +171,11 @@ impl Health {
     /// Opens the topic and reports [`ProcessState::Starting`].
     pub fn open(hub: &Hub, topic: &Topic) -> Result<Self, OpenError> {
         let message = HealthMessage {
-            published_nanos: 0,
             started_nanos: now_nanos(),
             process_id: std::process::id(),
             state: ProcessState::Starting.code(),
-            progress_done: 0,
-            progress_total: 0,
-            frames: 0,
-            rate_hz: f64::NAN,
-            dropped: 0,
-            gaps: 0,
-            refused: 0,
-            disordered: 0,
-            resized: 0,
-            deadline_misses: 0,
-            page_faults: 0,
-            total: 0,
-            detail: 0,
-            cause_bytes: 0,
-            peak_rss_bytes: 0,
-            latency_counts: [0; HISTOGRAM_BUCKETS],
-            work_counts: [0; HISTOGRAM_BUCKETS],
-            wake_counts: [0; HISTOGRAM_BUCKETS],
-            adjustments: 0,
-            adjustments_merged: 0,
-            adjustments_dropped: 0,
-            adjustment_counts: [0; HISTOGRAM_BUCKETS],
-            loop_searches: 0,
-            loops_closed: 0,
-            loops_held: 0,
-            epochs_joined: 0,
-            loops_refused: 0,
-            loops_against_drift: 0,
-            loops_unconfirmed: 0,
-            loops_inconsistent: 0,
             scheduling: scheduling_code(None),
-            priority: 0,
-            memory_locked: 0,
-            warning_bytes: 0,
-            warning: [0; TEXT_BYTES],
-            cause: [0; TEXT_BYTES],
-            source: [0; TEXT_BYTES],
-            source_bytes: 0,
-            reserved: 0,
+            ..HealthMessage::empty()
         };
         let publisher = hub.publisher(topic, 1)?;
         let notice = ManagerNotice::from_environment();
@@ -259,7 +221,7 @@ impl Health {
         self.message.adjustments_merged += u64::from(record.fate == Fate::Merged);
     }
 
-    /// Takes down a search for loops; one that proposes a loop goes on.
+    /// Takes down a search for loops; one that proposes a loop continues.
     pub fn count_search(&mut self, fate: &SearchFate) {
         let of = &mut self.message;
         let count = match fate {

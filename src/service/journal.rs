@@ -1,4 +1,4 @@
-//! The journal of a run: what it takes to write its results, on the disk while it goes on.
+//! The journal of a run: what it takes to write its results, on the disk while it continues.
 //!
 //! A folder inside the output folder: `log` has poses, times and keyframe poses as they come, and each keyframe has
 //! a file with its newest depth. Everything is written by a thread of its own and is on the disk after about a
@@ -60,7 +60,7 @@ pub struct JournalOptions {
     pub max_depth_bytes: u64,
 }
 
-/// The journal of the run that goes on. Dropped without [`Journal::finish`] it stays.
+/// The journal of the run that continues. Dropped without [`Journal::finish`] it stays.
 #[derive(Debug)]
 pub struct Journal {
     folder: PathBuf,
@@ -79,7 +79,7 @@ pub struct Journal {
     poses: u64,
     has_hole: bool,
     on_disk: Arc<AtomicU64>,
-    /// The log, held: says that the run goes on.
+    /// The log, held: says that the run continues.
     log: File,
 }
 

@@ -43,7 +43,7 @@ const REAL_TIME: [&str; 6] = [
     "tracker.early_wake_us=300.0",
 ];
 
-/// What goes on beside the pipeline.
+/// What runs beside the pipeline.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Disturbance {
@@ -79,7 +79,7 @@ impl Disturbance {
 /// One trial.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Trial {
-    /// What goes on beside.
+    /// What runs beside.
     pub disturbance: Disturbance,
     /// Whether capture and tracker run under FIFO scheduling with locked memory.
     pub real_time: bool,
@@ -92,7 +92,7 @@ pub struct Trial {
 /// What came of a trial.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Measurement {
-    /// What went on beside.
+    /// What ran beside.
     pub disturbance: Disturbance,
     /// Whether real-time scheduling was asked for.
     pub real_time: bool,
@@ -234,7 +234,7 @@ fn stolen_ms() -> Option<f64> {
     Some(ticks * 1000.0 / rustix::param::clock_ticks_per_second() as f64)
 }
 
-/// The disturbance while it goes on; ends when dropped.
+/// The disturbance while it continues; ends when dropped.
 struct Disturber {
     stop: Arc<AtomicBool>,
     threads: Vec<JoinHandle<()>>,

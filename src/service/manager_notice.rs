@@ -79,7 +79,7 @@ impl ManagerNotice {
         self.send(format_args!("STOPPING=1"));
     }
 
-    /// The preparation goes on: until the process is ready the manager waits longer.
+    /// The preparation continues: until the process is ready the manager waits longer.
     pub fn prepares(&self) {
         if !self.said_ready {
             self.send(format_args!("EXTEND_TIMEOUT_USEC={START_EXTENSION_US}"));

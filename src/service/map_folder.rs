@@ -1,4 +1,4 @@
-//! The map on disk: a folder that a run begins or goes on with, and that the next one finds the camera in.
+//! The map on disk: a folder that a run begins or continues with, and that the next one finds the camera in.
 //!
 //! ```text
 //! DIR/manifest           camera, poses, units and covariances of all keyframes, and which file each one's depth is in

@@ -126,7 +126,7 @@ struct Shell<'a> {
     health: Health,
     mapper: Option<(Intrinsics, Mapper)>,
     adjustments: Adjustments,
-    /// Live: what a successor goes on from.
+    /// Live: what a successor continues from.
     kept: Option<Kept>,
     /// What a mapper that died has left for this one, until the first frame.
     left: Option<Map>,
@@ -364,7 +364,7 @@ impl<'a> Shell<'a> {
         Ok(())
     }
 
-    /// A mapper for another camera: the first, which goes on from what a dead one has left, or one in
+    /// A mapper for another camera: the first, which continues from what a dead one has left, or one in
     /// mid-stream, which begins an epoch.
     fn change_camera(&mut self, intrinsics: Intrinsics) -> Result<(), MapperError> {
         let mut mapper = Mapper::new(intrinsics, self.config.mapping.clone())?;

@@ -79,29 +79,9 @@ impl<F> Pairing<F> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::slam::geometry::se3::SE3;
-    use crate::slam::pose::{Brightness, NO_KEYFRAME, Quality, TrackingState};
 
     fn pose(sequence: u64) -> PoseEstimate {
-        PoseEstimate {
-            sequence,
-            capture_nanos: 0,
-            epoch: 0,
-            revision: 0,
-            keyframe_id: NO_KEYFRAME,
-            state: TrackingState::Initializing,
-            map_revision: 0,
-            world_from_camera: SE3::identity(),
-            map_from_camera: SE3::identity(),
-            keyframe_from_camera: SE3::identity(),
-            covariance: [0.0; 21],
-            map_covariance: [0.0; 21],
-            alignment_covariance: [0.0; 21],
-            velocity: None,
-            brightness: Brightness::default(),
-            quality: Quality::default(),
-            proposes_keyframe: false,
-        }
+        PoseEstimate::unknown_at(sequence, 0)
     }
 
     fn take(pairing: &mut Pairing<char>) -> Option<(char, u64)> {

@@ -80,7 +80,7 @@ impl Recorder {
         Ok(self.recording.num_poses() + self.recording.num_steps() > before)
     }
 
-    /// Gives the journal the keyframes that came. Without them the run goes on, and what is left of it after
+    /// Gives the journal the keyframes that came. Without them the run continues, and what is left of it after
     /// a kill has no depth: worth a warning, not the end of a run.
     fn collect_keyframes(&mut self, is_end: bool) {
         let (Some(journal), Some(keyframes)) = (&mut self.journal, &mut self.keyframes) else {

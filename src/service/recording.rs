@@ -1,4 +1,4 @@
-//! What is collected of a run while it goes on: poses, times and counts, until they are a record.
+//! What is collected of a run while it continues: poses, times and counts, until they are a record.
 
 use serde::{Deserialize, Serialize};
 
@@ -182,13 +182,8 @@ impl Recording {
         }
         let skipped = self.poses.len().saturating_sub(self.map_nanos.len());
         RunRecord {
-            searches: None,
-            mode: parts.mode,
-            source: parts.source,
-            ended: Default::default(),
             frames_in: counters.frames_in,
             frames_refused: counters.frames_refused,
-            refused: None,
             frames_dropped: counters.frames_in.saturating_sub(self.poses.len() as u64),
             poses: self.poses,
             map: parts.map,
@@ -197,7 +192,6 @@ impl Recording {
             is_depth_from_sensor: parts.is_depth_from_sensor,
             gaps: counters.gaps,
             restarts: counters.restarts,
-            restart_causes: Vec::new(),
             frames_skipped_by_mapper: (!is_replay).then_some(skipped as u64),
             deadline_nanos: is_live.then_some(deadline_nanos),
             deadline_misses: is_live.then_some(counters.deadline_misses),
@@ -208,11 +202,10 @@ impl Recording {
             keyframe_nanos: self.keyframe_nanos,
             adjustments: self.adjustments,
             start: self.start,
-            rejections: None,
-            budget_samples: Vec::new(),
             recorded_nanos,
             wall_nanos: positive(wall_nanos),
             peak_rss_bytes: (counters.peak_rss_bytes > 0).then_some(counters.peak_rss_bytes),
+            ..RunRecord::empty(parts.mode, &parts.source)
         }
     }
 }

@@ -244,7 +244,10 @@ impl<'a> Replay<'a> {
             spare: None,
             record: RunRecord {
                 is_depth_from_sensor: config.initial_depth == DepthOrigin::Sensor,
-                ..empty_record(source_name, ground_truth, given)
+                depth_scale: if given { DepthScale::Given } else { DepthScale::MedianRatio },
+                ground_truth,
+                rejections: Some(Vec::new()),
+                ..RunRecord::empty(RunMode::Replay, source_name)
             },
             adjustments: Adjustments::start(
                 Entry::AfterFrames(config.mapper.window.delay_frames as u64),
@@ -455,43 +458,6 @@ impl<'a> Replay<'a> {
         record.map = self.mapper.into_map();
         record.peak_rss_bytes = peak_rss_bytes();
         Ok((record, saved))
-    }
-}
-
-fn empty_record(source_name: &str, ground_truth: Vec<StampedPose>, poses_given: bool) -> RunRecord {
-    let depth_scale = if poses_given { DepthScale::Given } else { DepthScale::MedianRatio };
-    RunRecord {
-        searches: None,
-        mode: RunMode::Replay,
-        source: source_name.to_owned(),
-        ended: Default::default(),
-        poses: Vec::new(),
-        map: Default::default(),
-        ground_truth,
-        depth_scale,
-        is_depth_from_sensor: false,
-        frames_in: 0,
-        frames_refused: 0,
-        refused: None,
-        frames_dropped: 0,
-        gaps: 0,
-        restarts: 0,
-        restart_causes: Vec::new(),
-        frames_skipped_by_mapper: None,
-        deadline_nanos: None,
-        deadline_misses: None,
-        send_counts: None,
-        page_faults: None,
-        map_nanos: Vec::new(),
-        keyframe_step_nanos: Vec::new(),
-        keyframe_nanos: Vec::new(),
-        adjustments: Vec::new(),
-        start: Default::default(),
-        rejections: Some(Vec::new()),
-        budget_samples: Vec::new(),
-        recorded_nanos: 0,
-        wall_nanos: 0,
-        peak_rss_bytes: None,
     }
 }
 

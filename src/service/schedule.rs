@@ -1,5 +1,5 @@
 //! What a process asks of the kernel: policy and priority, CPUs, locked and touched memory, timer
-//! slack. What is refused is a warning that names the limit to raise; the process goes on without.
+//! slack. What is refused is a warning that names the limit to raise; the process continues without.
 
 use std::mem::MaybeUninit;
 use std::num::NonZeroU64;

@@ -98,7 +98,7 @@ pub fn run(
     place.forget_run();
     place.check_shared_memory(shared_memory_bytes(&source.intrinsics(), None))?;
     let outcome = supervise(config, options, &place, source, shutdown, observe);
-    // However it ended, nobody goes on from here.
+    // However it ended, nobody continues from here.
     place.forget_run();
     outcome
 }
@@ -164,7 +164,7 @@ fn supervise(
     Ok(RunOutcome { record, journal, source, ended })
 }
 
-/// The journal of the run. Without one it goes on.
+/// The journal of the run. Without one it continues.
 fn begin_journal(options: &RunOptions, place: &Place) -> Option<Journal> {
     let begun = Journal::begin(options.journal.as_ref()?, place);
     begun

@@ -74,7 +74,7 @@ impl ViewChild {
         if let Ok(Some(status)) = child.try_wait() {
             let next =
                 if self.restarts < MOST_RESTARTS { "it is started again" } else { "it stays away" };
-            tracing::warn!("the live page has ended ({status}); the run goes on, {next}");
+            tracing::warn!("the live page has ended ({status}); the run continues, {next}");
             (self.running, self.ended) = (None, Some(Instant::now()));
         }
         line

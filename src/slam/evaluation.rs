@@ -90,7 +90,7 @@ pub struct TrajectoryEvaluation {
     pub rpe_translation_1s: Option<ErrorStatistics>,
     /// Relative rotation error over 1 s, degrees.
     pub rpe_rotation_deg_1s: Option<ErrorStatistics>,
-    /// Length of the way between the matched ground-truth positions.
+    /// Length of the path between the matched ground-truth positions.
     pub path_length: f64,
     /// Scale of each window of 100 matches up to the last match, by the index of its first match.
     pub window_scales: Vec<(usize, f64)>,

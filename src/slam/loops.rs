@@ -240,7 +240,7 @@ impl Loops {
         Arc::make_mut(&mut self.known).held_by.insert(newest, against);
     }
 
-    /// Goes on with what a mapper before knew of the loops of these keyframes. Those that it had searched are only found,
+    /// Continues with what a mapper before knew of the loops of these keyframes. Those that it had searched are only found,
     /// and so are those of which it is not known what they were estimated with.
     pub fn take_up(&mut self, known: Arc<KnownLoops>, keyframes: &[Keyframe]) {
         self.partners = known.partners();

@@ -335,7 +335,7 @@ mod tests {
             let expected = next(&is).covariance.matrix();
             assert!((found - expected).norm() < 1e-9 * expected.norm(), "{found}{expected}");
         }
-        // One that was surer than its leader is as sure as that.
+        // One that was more certain than its leader is as certain as that.
         let (was, is) = (leader(1e-2, &Sim3::identity()), leader(1e-4, &Sim3::identity()));
         let sure = UncertainPlace { covariance: PlaceCovariance::ZERO, ..was };
         let found = sure.following(&was, &is).matrix();

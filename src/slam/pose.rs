@@ -159,9 +159,14 @@ pub struct PoseEstimate {
 impl PoseEstimate {
     /// Nothing known of `frame` yet: at the world's origin, not claimed.
     pub fn unknown(frame: &FrameView<'_>) -> Self {
+        Self::unknown_at(frame.sequence, frame.capture_nanos)
+    }
+
+    /// The same of a frame with this number and stamp.
+    pub fn unknown_at(sequence: u64, capture_nanos: i64) -> Self {
         Self {
-            sequence: frame.sequence,
-            capture_nanos: frame.capture_nanos,
+            sequence,
+            capture_nanos,
             epoch: 0,
             revision: 0,
             keyframe_id: NO_KEYFRAME,

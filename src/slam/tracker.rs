@@ -194,7 +194,7 @@ impl Tracker {
         before
     }
 
-    /// Goes on where another tracker of this camera ended: at `nanos` it claimed this pose. The next frame
+    /// Continues where another tracker of this camera ended: at `nanos` it claimed this pose. The next frame
     /// is searched for around it, and must fit as well as after a loss.
     pub fn resume_at(&mut self, nanos: i64, world_from_camera: &SE3) {
         self.memory.motion.observe(nanos, world_from_camera);

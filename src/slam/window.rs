@@ -83,7 +83,7 @@ pub struct Adjustment {
 }
 
 /// Keyframes and points that are estimated together. It keeps its own copy of what it needs, so that it can work while
-/// the map goes on; [`Window::take_in`] and [`Window::correction`] are the two places where they meet.
+/// the map continues; [`Window::take_in`] and [`Window::correction`] are the two places where they meet.
 #[derive(Debug, Clone)]
 pub struct Window {
     params: WindowParams,

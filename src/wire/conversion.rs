@@ -1,4 +1,4 @@
-//! The checked way between messages and the types of `slam`. A hostile message gives an error.
+//! The checked conversion between messages and the types of `slam`. An invalid message gives an error.
 //!
 //! Going out and back in keeps every bit: lockstep and replay must agree to the last digit.
 

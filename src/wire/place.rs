@@ -123,7 +123,7 @@ impl Place {
         }
     }
 
-    /// Where the mapper keeps what it needs to go on after its death.
+    /// Where the mapper keeps what it needs to continue after its death.
     pub fn checkpoint_path(&self) -> PathBuf {
         self.kept_path(&self.instance, CHECKPOINT_SUFFIX)
     }

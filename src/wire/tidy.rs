@@ -121,7 +121,7 @@ impl Place {
         }
     }
 
-    /// Whether a process of `instance` may come and go on from what is kept for it: one holds its claim and has
+    /// Whether a process of `instance` may come and continue from what is kept for it: one holds its claim and has
     /// not joined yet, or one was killed, which leaves its claim, so lately that its successor is still due.
     fn awaits_successor(&self, instance: &str) -> bool {
         let claims = MEMBERS.map(|member| self.claim_path_of(instance, member));

@@ -5,16 +5,14 @@ use semidense::capture::source_error::SourceError;
 use semidense::service::alignment_stamps::{AlignmentTrace, LevelTrace};
 use semidense::service::results::output_folder::prepare_output;
 use semidense::service::results::record::{EndOfRun, RecordedPose, RunMode, RunRecord};
-use semidense::service::results::start_tally::StartTally;
 use semidense::service::results::{ResultsParams, write_results};
-use semidense::slam::evaluation::depth_error::DepthScale;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::geometry::sim3::Sim3;
 use semidense::slam::image::buffer::Image;
 use semidense::slam::keyframe::{DepthPoint, Keyframe};
 use semidense::slam::map::Map;
-use semidense::slam::pose::{Brightness, PoseEstimate, Quality, TrackingState};
+use semidense::slam::pose::{PoseEstimate, TrackingState};
 use semidense::slam::trajectory::StampedPose;
 use serde_json::Value;
 use std::path::Path;
@@ -65,23 +63,12 @@ pub fn pose(i: usize, state: TrackingState, keyframe_id: u64) -> RecordedPose {
     let mut world_from_camera = truth(i);
     world_from_camera.translation /= UNIT_M;
     let estimate = PoseEstimate {
-        sequence: i as u64,
-        capture_nanos: nanos(i),
-        epoch: 0,
-        revision: 0,
         keyframe_id,
         state,
         world_from_camera,
-        map_revision: 0,
         map_from_camera: world_from_camera,
         keyframe_from_camera: world_from_keyframe(0).locate(&world_from_camera),
-        covariance: [0.0; 21],
-        map_covariance: [0.0; 21],
-        alignment_covariance: [0.0; 21],
-        velocity: None,
-        brightness: Brightness::default(),
-        quality: Quality::default(),
-        proposes_keyframe: false,
+        ..PoseEstimate::unknown_at(i as u64, nanos(i))
     };
     RecordedPose {
         estimate,
@@ -132,37 +119,17 @@ pub fn record(poses: Vec<RecordedPose>, keyframes: Vec<Keyframe>, with_truth: bo
     let frames = poses.len();
     let pose = |i| StampedPose { nanos: nanos(i), world_from_camera: truth(i) };
     RunRecord {
-        searches: None,
-        mode: RunMode::Lockstep,
-        source: "tum:a<script>\"b\"".to_owned(),
         ended: EndOfRun::Interrupted,
         poses,
         map: Map { keyframes, ..Map::default() },
         ground_truth: if with_truth { (0..frames).map(pose).collect() } else { Vec::new() },
-        depth_scale: DepthScale::MedianRatio,
-        is_depth_from_sensor: false,
         frames_in: frames as u64,
-        frames_refused: 0,
-        refused: None,
-        frames_dropped: 0,
-        gaps: 0,
-        restarts: 0,
-        restart_causes: Vec::new(),
-        frames_skipped_by_mapper: None,
-        deadline_nanos: None,
-        deadline_misses: None,
-        send_counts: None,
-        page_faults: None,
         map_nanos: vec![2_000_000; frames],
         keyframe_step_nanos: vec![5_000_000; 3],
         keyframe_nanos: vec![3_000_000; 3],
-        adjustments: Vec::new(),
-        start: StartTally::default(),
-        rejections: None,
-        budget_samples: Vec::new(),
         recorded_nanos: 2_000_000_000,
         wall_nanos: 1_000_000_000,
-        peak_rss_bytes: None,
+        ..RunRecord::empty(RunMode::Lockstep, "tum:a<script>\"b\"")
     }
 }
 

@@ -13,7 +13,7 @@ const LONGEST_HEAD: Duration = Duration::from_secs(5);
 
 /// Longest wait, once it is answered, for the other end to close.
 const LONGEST_CLOSE: Duration = Duration::from_secs(1);
-/// Most bytes that are read meanwhile: a request that is refused may go on.
+/// Most bytes that are read meanwhile: a request that is refused may continue.
 const MOST_LEFT_BYTES: usize = 256 << 10;
 
 /// The head of a request.

@@ -12,9 +12,7 @@ use semidense::slam::geometry::sim3::Sim3;
 use semidense::slam::keyframe::{DepthPoint, Keyframe, KeyframePose};
 use semidense::slam::pose::{PoseEstimate, TrackingState};
 use semidense::wire::conversion::{PoseTiming, pose_message};
-use semidense::wire::message::{
-    FrameHeader, GraphHeader, HISTOGRAM_BUCKETS, HealthMessage, TEXT_BYTES,
-};
+use semidense::wire::message::{FrameHeader, GraphHeader, HealthMessage};
 use semidense_bridge::session::{Event, Frame, Graph, Pose};
 
 pub const WIDTH: usize = 64;
@@ -94,51 +92,7 @@ pub fn graph() -> Event {
 }
 
 pub fn health(owner: &'static str) -> Event {
-    let message = HealthMessage {
-        published_nanos: 0,
-        started_nanos: 0,
-        process_id: 7,
-        state: 3,
-        progress_done: 0,
-        progress_total: 0,
-        frames: 90,
-        rate_hz: f64::NAN,
-        dropped: 0,
-        gaps: 0,
-        refused: 0,
-        disordered: 0,
-        resized: 0,
-        deadline_misses: 0,
-        page_faults: 0,
-        total: 0,
-        detail: 0,
-        cause_bytes: 0,
-        peak_rss_bytes: 0,
-        latency_counts: [0; HISTOGRAM_BUCKETS],
-        work_counts: [0; HISTOGRAM_BUCKETS],
-        wake_counts: [0; HISTOGRAM_BUCKETS],
-        adjustments: 0,
-        adjustments_merged: 0,
-        adjustments_dropped: 0,
-        adjustment_counts: [0; HISTOGRAM_BUCKETS],
-        loop_searches: 0,
-        loops_closed: 0,
-        loops_held: 0,
-        epochs_joined: 0,
-        loops_refused: 0,
-        loops_against_drift: 0,
-        loops_unconfirmed: 0,
-        loops_inconsistent: 0,
-        scheduling: 0,
-        priority: 0,
-        memory_locked: 0,
-        warning_bytes: 0,
-        warning: [0; TEXT_BYTES],
-        cause: [0; TEXT_BYTES],
-        source: [0; TEXT_BYTES],
-        source_bytes: 0,
-        reserved: 0,
-    };
+    let message = HealthMessage { process_id: 7, state: 3, frames: 90, ..HealthMessage::empty() };
     Event::Health(owner, Box::new(message))
 }
 

@@ -55,4 +55,4 @@ systemctl start semidense@other.target
 soon "a second rig gives poses" 300 tracks
 systemctl stop semidense@other.target
 rig=robot
-soon "the first goes on" 30 tracks
+soon "the first continues" 30 tracks

@@ -1,4 +1,4 @@
-# kill -9 of each service: it is started again, the others go on, poses resume.
+# kill -9 of each service: it is started again, the others continue, poses resume.
 . /host/guest/lib
 rig=robot
 

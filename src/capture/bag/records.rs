@@ -152,7 +152,7 @@ impl Records {
         BagError::Damaged { at, reason: reason.to_string() }
     }
 
-    /// Goes on to the next record that is read here; `None` at the end. After [`BagError::Damaged`] the next call goes
+    /// Continues to the next record that is read here; `None` at the end. After [`BagError::Damaged`] the next call goes
     /// on behind what is damaged.
     pub fn advance(&mut self) -> Result<Option<Place>, BagError> {
         loop {

@@ -30,7 +30,7 @@ pub const ROOMS_M: [[f32; 2]; 4] = [[0.0, 0.0], [4.6, 0.0], [4.6, 6.0], [0.0, 6.
 /// Where the corridor begins and how large it is, metres.
 const CORRIDOR_M: ([f32; 2], [f32; 2]) = ([0.0, 4.2], [9.0, 1.6]);
 
-/// A round through all rooms. The camera looks where there is furniture, mostly across its way.
+/// A round through all rooms. The camera looks where there is furniture, mostly across its path.
 static ROUND: [Waypoint; 43] = [
     // A, from a step aside in front of the sofa.
     waypoint(3.0, 2.9, -100.0, -9.0),

@@ -80,7 +80,7 @@ impl MapSession {
     }
 
     /// Lets a mapper of `camera` begin in the map, before its first frame; where one that died has `left` a checkpoint and
-    /// the map goes on, it goes on from that.
+    /// the map continues, it continues from that.
     pub fn begin(
         &mut self,
         mapper: &mut Mapper,

@@ -88,7 +88,7 @@ impl Shell<'_> {
         save_copy(path, mapper, detail, &mut || health.report()).map_err(|error| error.to_string())
     }
 
-    /// Goes over to the map in another folder. Whatever is wrong with that, the map at hand goes on as it is.
+    /// Goes over to the map in another folder. Whatever is wrong with that, the map at hand continues as it is.
     fn load_folder(&mut self, folder: PathBuf, read_only: bool) -> Result<(), String> {
         let Some((camera, mapper)) = &self.mapper else { return Err(NO_FRAME.to_owned()) };
         let (camera, numbering) = (*camera, Numbering::above(mapper));

@@ -51,7 +51,7 @@ impl GoneOver {
         write_privately(path, |file| file.write_all(&bytes))
     }
 
-    /// Nobody is to go on from there.
+    /// Nobody is to continue from there.
     pub(super) fn forget(path: &Path) {
         // What is not there need not be removed; of another configuration it is not read.
         drop(fs::remove_file(path));

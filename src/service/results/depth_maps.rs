@@ -6,7 +6,7 @@ use crate::service::results::record::RunRecord;
 use crate::slam::evaluation::depth_error::{DepthErrors, DepthStatistics, KeyframeDepth};
 use crate::slam::keyframe::{Keyframe, MapState};
 
-/// What the depth maps are worth.
+/// How good the depth maps are.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct DepthEvaluation {
     /// Statistics over all keyframes with true depth; `None` where there is none.

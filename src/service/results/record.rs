@@ -144,3 +144,42 @@ pub struct RunRecord {
     /// Largest resident memory of all processes together.
     pub peak_rss_bytes: Option<u64>,
 }
+
+impl RunRecord {
+    /// Of a run that has not begun.
+    pub fn empty(mode: RunMode, source: &str) -> Self {
+        Self {
+            mode,
+            source: source.to_owned(),
+            ended: EndOfRun::default(),
+            poses: Vec::new(),
+            map: Map::default(),
+            ground_truth: Vec::new(),
+            depth_scale: DepthScale::MedianRatio,
+            is_depth_from_sensor: false,
+            frames_in: 0,
+            frames_refused: 0,
+            refused: None,
+            frames_dropped: 0,
+            gaps: 0,
+            restarts: 0,
+            restart_causes: Vec::new(),
+            frames_skipped_by_mapper: None,
+            deadline_nanos: None,
+            deadline_misses: None,
+            send_counts: None,
+            page_faults: None,
+            map_nanos: Vec::new(),
+            keyframe_step_nanos: Vec::new(),
+            keyframe_nanos: Vec::new(),
+            adjustments: Vec::new(),
+            searches: None,
+            start: StartTally::default(),
+            rejections: None,
+            budget_samples: Vec::new(),
+            recorded_nanos: 0,
+            wall_nanos: 0,
+            peak_rss_bytes: None,
+        }
+    }
+}

@@ -2,7 +2,7 @@
 //!
 //! A set is written into a folder of its own inside the output folder, synchronised, and renamed to a name that
 //! says that it is complete. From then on its files only have to be moved up: whoever finds a complete set
-//! (see [`finish_commit`]) goes on with that, so that two sets are never mixed. Only files that a run writes are
+//! (see [`finish_commit`]) continues with that, so that two sets are never mixed. Only files that a run writes are
 //! ever replaced or removed.
 
 use std::fs::{self, File};

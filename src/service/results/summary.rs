@@ -61,7 +61,7 @@ pub struct TrajectorySummary {
     pub rpe_translation_1s: Option<f64>,
     /// Root mean square rotation error over 1 s, degrees.
     pub rpe_rotation_deg_1s: Option<f64>,
-    /// Length of the true way between matched poses.
+    /// Length of the true path between matched poses.
     pub path_length_m: Option<f64>,
     /// Largest over smallest scale of consecutive windows of 100 frames.
     pub window_scale_ratio: Option<f64>,

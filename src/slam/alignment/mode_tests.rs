@@ -51,7 +51,7 @@ fn with_error(keyframe: &Keyframe, m: &Vector3<f64>, centre: &Vector3<f64>) -> K
     changed
 }
 
-/// An aligner that goes on until nothing moves any more.
+/// An aligner that continues until nothing moves any more.
 fn patient() -> Aligner {
     Aligner::new(AlignmentParams {
         step_tolerance: 1e-4,

@@ -1,4 +1,4 @@
-//! The way of some rows of hypotheses to the next keyframe, compiled for the vector units that the
+//! Carrying some rows of hypotheses to the next keyframe, compiled for the vector units that the
 //! processor has.
 //!
 //! One source for all: no operation is fused or reordered, so every version gives the same bits.
@@ -20,9 +20,9 @@ pub(super) type CarryingKernel<C> = fn(&C, Range<usize>, &mut Vec<Reprojected>);
 pub(super) fn carrying_kernel<C: RowCarrier>() -> CarryingKernel<C> {
     #[cfg(target_arch = "x86_64")]
     if std::arch::is_x86_feature_detected!("avx2") {
-        return |way, rows, reprojected| {
+        return |carrier, rows, reprojected| {
             // SAFETY: the processor has AVX2, as was just asked.
-            unsafe { carry_rows_avx2(way, rows, reprojected) }
+            unsafe { carry_rows_avx2(carrier, rows, reprojected) }
         };
     }
     carry_rows_portable
@@ -30,17 +30,21 @@ pub(super) fn carrying_kernel<C: RowCarrier>() -> CarryingKernel<C> {
 
 /// The explanation of the others.
 fn carry_rows_portable<C: RowCarrier>(
-    way: &C,
+    carrier: &C,
     rows: Range<usize>,
     reprojected: &mut Vec<Reprojected>,
 ) {
-    way.carry_rows(rows, reprojected)
+    carrier.carry_rows(rows, reprojected)
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn carry_rows_avx2<C: RowCarrier>(way: &C, rows: Range<usize>, reprojected: &mut Vec<Reprojected>) {
-    way.carry_rows(rows, reprojected)
+fn carry_rows_avx2<C: RowCarrier>(
+    carrier: &C,
+    rows: Range<usize>,
+    reprojected: &mut Vec<Reprojected>,
+) {
+    carrier.carry_rows(rows, reprojected)
 }
 
 #[cfg(test)]
@@ -71,11 +75,11 @@ mod tests {
         }
         let params = PropagationParams::default();
         let view = TwoView::new(&CAMERA, &new_from_old);
-        let way = Reprojection::new(&maps[0], &maps[1], view, (1.02, -1.0), &params);
+        let carrier = Reprojection::new(&maps[0], &maps[1], view, (1.02, -1.0), &params);
         let rows = BORDER_PX..CAMERA.height - BORDER_PX;
         let (mut portable, mut fast) = (Vec::new(), Vec::new());
-        carry_rows_portable(&way, rows.clone(), &mut portable);
-        carrying_kernel()(&way, rows.clone(), &mut fast);
+        carry_rows_portable(&carrier, rows.clone(), &mut portable);
+        carrying_kernel()(&carrier, rows.clone(), &mut fast);
         assert_eq!(portable, fast);
         // Where and with what depth each must arrive, by the geometry of a single pixel.
         let mut expected = Vec::new();

@@ -221,7 +221,7 @@ impl ImmaturePoint {
         Self { min_inverse_depth, max_inverse_depth, quality: f32::INFINITY, ..self }
     }
 
-    /// Ends the point: others go on with its depth.
+    /// Ends the point: others continue with its depth.
     pub fn end(&mut self) {
         self.ended = true;
     }

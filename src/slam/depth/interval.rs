@@ -120,7 +120,7 @@ impl IntervalFilter {
     }
 
     /// Gives the pixels of mature points their first hypothesis in `map` and ends these points: from
-    /// there on the map's own filter goes on. The number of new hypotheses.
+    /// there on the map's own filter continues. The number of new hypotheses.
     pub fn hand_over(&mut self, map: &mut DepthMap, params: &IntervalParams) -> usize {
         let mut created = 0;
         for point in self.points.iter_mut().filter(|p| !p.is_ended() && p.is_mature(params)) {

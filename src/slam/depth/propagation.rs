@@ -69,12 +69,12 @@ pub fn propagate(
     reprojected.resize_with(height.div_ceil(BAND_ROWS), Vec::new);
     let view = TwoView::new(intrinsics, target_from_source);
     let brighter = (brightness.a.exp() as f32, brightness.b as f32);
-    let way = Reprojection::new(source, target, view, brighter, params);
+    let reprojection = Reprojection::new(source, target, view, brighter, params);
     let carry_rows = carrying_kernel();
     reprojected.par_iter_mut().enumerate().for_each(|(band, reprojected)| {
         reprojected.clear();
         let (first, end) = (band * BAND_ROWS, (band + 1) * BAND_ROWS);
-        carry_rows(&way, first.max(BORDER_PX)..end.min(height - BORDER_PX), reprojected);
+        carry_rows(&reprojection, first.max(BORDER_PX)..end.min(height - BORDER_PX), reprojected);
     });
     // In the order of the source's rows: who comes first to a pixel matters there.
     let present = target.hypotheses.pixels_mut();
@@ -109,7 +109,7 @@ struct Places {
 }
 
 impl<'a> Reprojection<'a> {
-    /// The way between two maps, seen like this; brightness grows by a gain and an offset.
+    /// The reprojection between two maps, seen like this; brightness grows by a gain and an offset.
     pub(super) fn new(
         source: &'a DepthMap,
         target: &'a DepthMap,

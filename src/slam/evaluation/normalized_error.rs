@@ -141,7 +141,7 @@ pub fn map_normalized_errors(
     NormalizedErrors::of(&errors.collect::<Vec<_>>())
 }
 
-/// `found_from_exact` of poses of one camera. Positions alone leave the rotation about a straight way open, and turn the
+/// `found_from_exact` of poses of one camera. Positions alone leave the rotation about a straight path open, and turn the
 /// map by a few of their errors over its length, far beyond what rotations are uncertain by.
 fn similarity(poses: impl Iterator<Item = (SE3, SE3)> + Clone) -> Option<Sim3> {
     let count = poses.clone().count() as f64;

@@ -71,7 +71,7 @@ fn motion(poses: &[StampedPose], i: usize, j: usize) -> SE3 {
     poses[i].world_from_camera.inverse() * poses[j].world_from_camera
 }
 
-/// Length of the way from position to position.
+/// Length of the path through the positions.
 pub fn path_length(poses: &[StampedPose]) -> f64 {
     let step = |pair: &[StampedPose]| {
         (pair[1].world_from_camera.translation - pair[0].world_from_camera.translation).norm()

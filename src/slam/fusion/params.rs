@@ -30,7 +30,7 @@ pub struct FusionParams {
     pub min_support: u32,
     /// Share of the pixels around with depth that agree, at least. 0.7: at a step in depth half of them do.
     pub support_ratio: f64,
-    /// Other points within four sides of a point's cell, at least. 8: those of an edge that goes on to both sides.
+    /// Other points within four sides of a point's cell, at least. 8: those of an edge that continues to both sides.
     pub min_company: usize,
 }
 

@@ -165,7 +165,7 @@ fn largest_view(camera: &CameraModel) -> Option<View> {
     best.map(|(_, view)| view)
 }
 
-/// How far `holds` goes on from 0, at most to `end`.
+/// How far `holds` continues from 0, at most to `end`.
 fn extent(end: f64, holds: impl Fn(f64) -> bool) -> f64 {
     let at = |i: usize| end * i as f64 / WALK_STEPS as f64;
     let Some(fails) = (0..=WALK_STEPS).find(|&i| !holds(at(i))) else { return end };
@@ -189,7 +189,7 @@ struct RemapTable {
     fractions: Vec<u16>,
 }
 
-/// A camera's rectification: the rectified intrinsics and the way of each pixel to the raw image.
+/// A camera's rectification: the rectified intrinsics and the place of each pixel in the raw image.
 #[derive(Debug, Clone)]
 pub struct Rectification {
     intrinsics: Intrinsics,

@@ -2,18 +2,18 @@
 
 use crate::slam::image::quads::QuadImage;
 
-/// A way to take eight bilinear samples; all ways give the same bits.
+/// How eight bilinear samples are taken; all versions give the same bits.
 pub trait Sampler: Copy {
     /// What [`QuadImage::sample`] explains.
     fn sample(self, image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> [f32; 8];
 }
 
-/// An image and the way to sample it.
+/// An image and how it is sampled.
 #[derive(Debug, Clone, Copy)]
 pub struct Sampled<'a, S> {
     /// The image.
     pub image: &'a QuadImage,
-    /// The way.
+    /// How.
     pub sampler: S,
 }
 

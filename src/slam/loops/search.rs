@@ -176,7 +176,7 @@ fn confirming(job: &Job, link: &Link) -> Vec<Pair> {
             * one.map_from_keyframe;
         pairs.push(Pair { i: one.keyframe_id, j: other.keyframe_id, j_from_i });
     }
-    // Those that look the same way first: the smallest turn and way between them.
+    // Those that look the same way first: the smallest turn and distance between them.
     let apart = |pair: &Pair| pair.j_from_i.log().norm();
     pairs.sort_by(|one, other| apart(one).total_cmp(&apart(other)));
     pairs

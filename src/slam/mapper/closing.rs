@@ -1,4 +1,4 @@
-//! What a loop does to the map that goes on meanwhile.
+//! What a loop does to the map that continues meanwhile.
 
 use std::sync::Arc;
 
@@ -27,7 +27,7 @@ impl Mapper {
         self.take_up_loops();
     }
 
-    /// The search for loops goes on with what is known of the map.
+    /// The search for loops continues with what is known of the map.
     pub(super) fn take_up_loops(&mut self) {
         self.window.iter_mut().for_each(|window| window.take_up_loops(&self.map));
     }
@@ -120,7 +120,7 @@ mod tests {
         assert_eq!(active.map_revision, before + 1);
         assert!((active.map_from_keyframe.rigid.translation.x - 1.7).abs() < 1e-12);
         assert!((active.map_from_keyframe.scale - 1.2).abs() < 1e-12);
-        // The camera stands still, and a way of the keyframe's unit is as long as before.
+        // The camera stands still, and a step of the keyframe's unit is as long as before.
         assert!((in_world(&mapper, 0.1) - 1.1).abs() < 1e-12);
         assert!((in_world(&mapper, 0.4) - 1.4).abs() < 1e-12);
         assert_eq!(mapper.map.keyframes[0].map_from_keyframe, Sim3::identity());

@@ -30,7 +30,7 @@ impl Mapper {
                 self.modes.enter(modes, &self.params.modes);
             }
         }
-        // The camera stays where odometry has it, and odometry goes on in the unit that it has.
+        // The camera stays where odometry has it, and odometry continues in the unit that it has.
         let world_from_camera = self.world_from_map.place(&before);
         let joined = correction.joins.iter().filter(|join| Some(join.epoch) == epoch);
         let unit = joined.map(|join| join.into_from_epoch.scale).product::<f64>()

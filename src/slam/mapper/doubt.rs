@@ -3,7 +3,7 @@
 //!
 //! That helps where keyframes were left at wrong places or with wrong units, not where depth is lost or the start was
 //! wrong. The estimate is one like the others: it goes to their thread next and enters as they do. Until it has entered,
-//! poses go on being claimed, with the covariance of a keyframe of whose depth nothing is known.
+//! poses continue to be claimed, with the covariance of a keyframe of whose depth nothing is known.
 
 use crate::slam::depth::gaussian::ObservationCounts;
 use crate::slam::mapper::consistency::{Contradiction, START_KEYFRAMES, is_plausible_ratio};

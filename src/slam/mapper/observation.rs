@@ -20,7 +20,7 @@ pub enum DepthFilter {
     /// A mean and a variance at every pixel with gradient, fused and smoothed (SD13 §2.4–2.6).
     #[default]
     Gaussian,
-    /// New pixels are brought to maturity by the interval filter and go on in the Gaussian one.
+    /// New pixels are brought to maturity by the interval filter and continue in the Gaussian one.
     Both,
 }
 
@@ -75,7 +75,7 @@ impl Mapper {
         if filter.has_points() {
             let interval = &self.params.interval;
             points.trace(&TraceFrame { image, view, brightness }, interval);
-            // Beside the Gaussian filter a mature point is its to go on with.
+            // Beside the Gaussian filter a mature point is its to continue with.
             counts = match filter.is_dense() {
                 true => ObservationCounts { created: points.hand_over(depth, interval), ..counts },
                 false => points.write_into(depth, interval),

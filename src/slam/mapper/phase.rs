@@ -42,7 +42,7 @@ pub(super) struct Loss {
 }
 
 impl Phase {
-    /// The loss that goes on, or a new one.
+    /// The loss that continues, or a new one.
     pub(super) fn loss(&self) -> Loss {
         match *self {
             Self::Lost(loss) | Self::Rejected(_, loss) | Self::Restarting(loss) => loss,

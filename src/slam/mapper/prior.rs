@@ -1,4 +1,4 @@
-//! A map of earlier runs: the camera is looked for on its keyframes, and found there the map goes on, or is left as it
+//! A map of earlier runs: the camera is looked for on its keyframes, and found there the map continues, or is left as it
 //! is and only tells where the camera is.
 
 use crate::slam::frame::FrameView;
@@ -13,7 +13,7 @@ use crate::slam::pose::PoseEstimate;
 /// What is done with a map of earlier runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MapUse {
-    /// It goes on.
+    /// It continues.
     Extend,
     /// It stays as it is: no keyframe is added, and no depth and no place changes.
     Locate,
@@ -67,7 +67,7 @@ impl Map {
 }
 
 impl Mapper {
-    /// Begins in a map of earlier runs, before the first frame: its epochs, ids and revisions go on, and each frame is
+    /// Begins in a map of earlier runs, before the first frame: its epochs, ids and revisions continue, and each frame is
     /// looked for on its keyframes. Odometry begins where the map has the camera then.
     pub fn begin_in(&mut self, map: Map, map_use: MapUse) -> Result<(), PriorError> {
         let foreign = map.keyframes.iter().find(|of| of.intrinsics != self.intrinsics);

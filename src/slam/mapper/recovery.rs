@@ -21,7 +21,7 @@ use crate::slam::pose::{DegradedReason, PoseEstimate, TrackingState};
 use crate::slam::tracker::MOST_DEVIATIONS;
 
 /// Largest difference of two poses for one place, translation in mean depths plus rotation in radians: a wrong place is
-/// further off, and a map that has drifted by as much is none to go on with.
+/// further off, and a map that has drifted by as much is none to continue with.
 pub(super) const MAX_DISAGREEMENT: f64 = 0.1;
 
 /// Who is asked whether a place that was found is right.
@@ -244,7 +244,7 @@ impl Mapper {
     }
 
     /// Makes an earlier keyframe active again, with the depth it was left with. The camera was found on it;
-    /// odometry goes on from its last pose.
+    /// odometry continues from its last pose.
     pub(super) fn restore_keyframe(
         &mut self,
         index: usize,

@@ -1,4 +1,4 @@
-//! What of the map a mapper needs to go on after its death, and how it goes on.
+//! What of the map a mapper needs to continue after its death, and how it continues.
 
 use std::sync::Arc;
 
@@ -45,7 +45,7 @@ impl Mapper {
     }
 
     /// The active keyframe with its image and depth, and the poses of the others of its epoch; `None`
-    /// where there is no established keyframe to go on from.
+    /// where there is no established keyframe to continue from.
     pub fn checkpoint(&self) -> Option<Map> {
         let in_force = self.keyframe()?;
         if in_force.map_state != MapState::Established {
@@ -70,7 +70,7 @@ impl Mapper {
     }
 
     /// Takes over from the mapper of another camera: its keyframes stay in the map, and epochs, ids and
-    /// revisions go on.
+    /// revisions continue.
     pub fn succeed(&mut self, before: Self) {
         self.map = before.map;
         self.revision = before.revision;
@@ -79,7 +79,7 @@ impl Mapper {
         self.take_up_loops();
     }
 
-    /// Goes on from a checkpoint: its keyframe is active again, the epoch and all ids go on. Does nothing
+    /// Continues from a checkpoint: its keyframe is active again, the epoch and all ids continue. Does nothing
     /// with a map that this camera cannot have made.
     pub fn resume(&mut self, map: Map) -> StepOutcome {
         let fits = |keyframe: &Keyframe| {

@@ -1,6 +1,6 @@
 //! A keyframe that the camera has come back to is taken up again instead of making a new one beside it:
 //! where the camera goes back and forth the map does not grow. One that has the camera elsewhere than the map expects
-//! tells of drift: where it is as sure as after a loss the camera goes on from there, and the drift ends.
+//! tells of drift: where it is as sure as after a loss the camera continues from there, and the drift ends.
 
 use serde::{Deserialize, Serialize};
 
@@ -74,7 +74,7 @@ impl Mapper {
         true
     }
 
-    /// Goes on from a keyframe that has the camera elsewhere than the map expects it, where that is as sure as it has to
+    /// Continues from a keyframe that has the camera elsewhere than the map expects it, where that is as sure as it has to
     /// be after a loss.
     fn return_to(&mut self, near: &NearKeyframe, pixels: &[u8]) -> bool {
         let at = &near.located.keyframe_from_camera;

@@ -26,7 +26,7 @@ pub enum Situation {
     Lost,
     /// The map contradicted itself; earlier keyframes are searched for the camera.
     Rejected(Contradiction),
-    /// The camera has been lost for long: a new epoch is being begun, and the search goes on.
+    /// The camera has been lost for long: a new epoch is being begun, and the search continues.
     Restarting(StartProgress),
 }
 

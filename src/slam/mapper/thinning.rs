@@ -279,7 +279,7 @@ mod tests {
         let stands_in = |max_distance: f64| {
             shown_by(&map, 0, &ReuseParams { max_distance, ..ReuseParams::default() })
         };
-        // All its points are shown: what is left is the way of a hundredth of a mean depth.
+        // All its points are shown: what is left is the distance of a hundredth of a mean depth.
         let weight = DistanceWeights::default().translation;
         let nearest = (0.01 * weight).powi(2);
         assert_eq!(stands_in(1.01 * nearest + 1e-3).map(|(id, _)| id), Some(2));

@@ -295,7 +295,7 @@ impl Tracker {
     /// No view holds the camera from here on.
     pub(super) fn end_turning(&mut self) {
         if self.turning.end() {
-            // The way from where it was held to where it is was made in one frame of no camera.
+            // The motion from where it was held to where it is was made in one frame of no camera.
             self.memory.motion.stop();
         }
     }

@@ -58,9 +58,9 @@ fn a_pan_away_from_all_depth_is_held_with_a_covariance_that_is_honest() {
         // Of six degrees of freedom 99.9 % are below.
         assert!(worst < 22.5, "{metres_a_frame}: {worst}");
         let deviation = |of: &PoseEstimate| of.covariance[0].sqrt();
-        // Where there is no parallax the camera has not moved, and noise adds up; a way has the error of its depth.
-        let way = metres_a_frame * FRAMES as f64 / 4.0;
-        let least = f64::max(2.0 * deviation(&said[3]), 0.3 * way);
+        // Where there is no parallax the camera has not moved, and noise adds up; a path has the error of its depth.
+        let path = metres_a_frame * FRAMES as f64 / 4.0;
+        let least = f64::max(2.0 * deviation(&said[3]), 0.3 * path);
         let last = deviation(said.last().unwrap());
         assert!(last > least, "{metres_a_frame}: {last} of {least}");
     }

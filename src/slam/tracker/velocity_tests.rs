@@ -219,7 +219,7 @@ fn errors_that_two_poses_share_cancel_and_their_own_count_twice() {
         let (error, variance) = monte_carlo(of_depth);
         // Steady motion is never sure to be steady: somewhat below 6.
         assert!((3.0..6.5).contains(&error), "{of_depth}: {error}");
-        // As if the poses' common errors were independent it were that of the whole way, not of a step.
+        // As if the poses' common errors were independent it were that of the whole path, not of a step.
         let of_noise = 2.0 * 6e-4f64.powi(2);
         let of_step = 3.0 * (of_depth * step()[2]).powi(2);
         let expected = (of_noise + of_step) / (INTERVAL * INTERVAL);

@@ -16,7 +16,7 @@ use crate::slam::two_frame::system::State;
 
 /// Survivors, the same aligned first, rest, mirror and six directions.
 const MAX_HYPOTHESES: usize = 2 * NUM_SURVIVORS + 2 + 6;
-/// Fits that go on to the finest level and to the next frame.
+/// Fits that continue to the finest level and to the next frame.
 const NUM_SURVIVORS: usize = 2;
 
 /// Cosine of 30°: nearer directions are the same motion, seen inaccurately.

@@ -81,7 +81,7 @@ impl Window {
         };
         // Depth in the unit of the map is larger by e^offset, so that the unit is shorter.
         let plane = fit(&better);
-        // Depth that was not moved to the points is no surer than before.
+        // Depth that was not moved to the points is no more certain than before.
         let is_tilted = plane.is_some_and(|[_, per_x, per_y]| (per_x, per_y) != (0.0, 0.0));
         let said = self.marginal_of(keyframe.keyframe_id).map(said_of);
         // The plane leaves the depth's own relief, while the estimate speaks of that of the points.

@@ -22,7 +22,7 @@ pub(super) struct Pass {
     has_jumped: bool,
     /// A loop was closed: one is due, whether they are made or not.
     is_called: bool,
-    /// Where it goes on; `None` where none is under way.
+    /// Where it continues; `None` where none is under way.
     next: Option<Place>,
     /// Where the piece begins that is being estimated.
     piece: Option<Place>,

@@ -1,4 +1,4 @@
-//! The map from above: every point of the cloud and the camera's way through it.
+//! The map from above: every point of the cloud and the camera's path through it.
 
 use nalgebra::Vector3;
 
@@ -94,13 +94,13 @@ fn significant(number: f64) -> String {
     }
 }
 
-/// Points and way from above, coloured by height (blue low, red high); `None` without points.
+/// Points and path from above, coloured by height (blue low, red high); `None` without points.
 pub fn map_picture(
     cloud: &[SurfacePoint],
-    way: &[StampedPose],
+    path: &[StampedPose],
     up: Option<Vector3<f64>>,
 ) -> Option<MapPicture> {
-    let views = Views::of(way, up);
+    let views = Views::of(path, up);
     let position = |point: &SurfacePoint| Vector3::from(point.position.map(f64::from));
     let flat: Vec<[f64; 3]> = cloud
         .iter()
@@ -111,21 +111,21 @@ pub fn map_picture(
             [x, y, height]
         })
         .collect();
-    let way: Vec<[f64; 2]> =
-        way.iter().map(|pose| views.from_above(&pose.world_from_camera.translation)).collect();
+    let path: Vec<[f64; 2]> =
+        path.iter().map(|pose| views.from_above(&pose.world_from_camera.translation)).collect();
     let mut ranges = [[0.0; 2]; 3];
     for (axis, range) in ranges.iter_mut().enumerate() {
         *range = middle_range(flat.iter().map(|p| p[axis]))?;
     }
     for (axis, range) in ranges.iter_mut().take(2).enumerate() {
-        for point in &way {
+        for point in &path {
             *range = [range[0].min(point[axis]), range[1].max(point[axis])];
         }
         let margin = MARGIN_RATIO * (range[1] - range[0]);
         *range = [range[0] - margin, range[1] + margin];
     }
     let [_, _, [low, high]] = ranges;
-    let (picture, width) = draw(&flat, &way, &ranges);
+    let (picture, width) = draw(&flat, &path, &ranges);
     Some(MapPicture { picture, width, height_range: high - low })
 }
 
@@ -138,7 +138,7 @@ fn middle_range(values: impl Iterator<Item = f64>) -> Option<[f64; 2]> {
 }
 
 /// The picture, and the length that its width shows.
-fn draw(points: &[[f64; 3]], way: &[[f64; 2]], ranges: &[[f64; 2]; 3]) -> (Picture, f64) {
+fn draw(points: &[[f64; 3]], path: &[[f64; 2]], ranges: &[[f64; 2]; 3]) -> (Picture, f64) {
     let [x, y, z] = ranges;
     let (x_width, y_width) = (x[1] - x[0], y[1] - y[0]);
     let tallest = MAX_HEIGHT_RATIO * WIDTH as f64;
@@ -175,7 +175,7 @@ fn draw(points: &[[f64; 3]], way: &[[f64; 2]], ranges: &[[f64; 2]; 3]) -> (Pictu
         })
     };
     let mut picture = Picture { width: WIDTH, height, pixels: counts.iter().map(colour).collect() };
-    for step in way.windows(2) {
+    for step in path.windows(2) {
         draw_step(&mut picture, step, pixels_per_unit, &pixel);
     }
     (picture, WIDTH as f64 / pixels_per_unit)
@@ -218,17 +218,17 @@ mod tests {
             .map(|i| point((i % 100) as f32, (i / 500) as f32, (i / 100) as f32))
             .collect();
         cloud.extend([point(1e9, 0.0, 0.0), point(f32::NAN, 0.0, 0.0)]);
-        let way = [0.0, 50.0].map(|x| StampedPose {
+        let path = [0.0, 50.0].map(|x| StampedPose {
             nanos: 0,
             world_from_camera: SE3 { translation: [x, 0.0, 10.0].into(), ..SE3::identity() },
         });
-        let map = map_picture(&cloud, &way, None).unwrap();
+        let map = map_picture(&cloud, &path, None).unwrap();
         assert!((90.0..140.0).contains(&map.width), "{}", map.width);
         let picture = map.picture;
         let seen = picture.pixels.iter().filter(|&&p| p != GROUND && p != WAY).count();
         assert!(seen > 3000, "{seen} of 5000 points are seen");
         assert!(picture.pixels.iter().filter(|&&p| p == WAY).count() > 700);
-        assert_eq!(map_picture(&[], &way, None), None);
+        assert_eq!(map_picture(&[], &path, None), None);
         assert_eq!(map_picture(&cloud[..1], &[], None), None);
     }
 

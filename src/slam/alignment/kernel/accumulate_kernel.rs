@@ -114,7 +114,7 @@ pub unsafe fn whiten<L: Lanes>(
         let warped_y = r3.mul_add(x, r4.mul_add(y, ty.mul_add(d, r5)));
         let depth_ratio = r6.mul_add(x, r7.mul_add(y, tz.mul_add(d, r8)));
         let in_front = depth_ratio.greater(constant(NEAREST_DEPTH_RATIO));
-        // Lanes that are not in view go on with harmless numbers: 0 · NaN would be NaN.
+        // Lanes that are not in view continue with harmless numbers: 0 · NaN would be NaN.
         let depth_ratio = L::select(in_front, depth_ratio, one);
         let inverse_ratio = one.div(depth_ratio);
         let (nx, ny) = (warped_x.mul(inverse_ratio), warped_y.mul(inverse_ratio));

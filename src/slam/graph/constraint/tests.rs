@@ -179,7 +179,7 @@ const WIDE: [[f64; 6]; 6] = [
     [0.0, 0.1, 0.1, 0.1, 0.2, -0.3],
 ];
 
-/// The one of them with the longest way aside.
+/// The one of them with the largest offset aside.
 const WIDEST: usize = 4;
 
 #[test]
@@ -356,7 +356,7 @@ fn one_loop_makes_a_drifted_chain_consistent() {
         error(graph.map_from_keyframe(ids[k]).unwrap(), &places[k]).norm()
     };
     let before: Vec<f64> = (1..NUMBER).map(|k| error_of(&graph, k)).collect();
-    // A kernel that gives false loops up gives up this one: it is much surer than the chain has drifted.
+    // A kernel that gives false loops up gives up this one: it is much more certain than the chain has drifted.
     let kernel = RobustKernel::None;
     let constraint = found.constraint(ids[0], ids[NUMBER - 1], kernel).unwrap();
     graph.add_constraint(constraint).unwrap();
