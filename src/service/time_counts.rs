@@ -10,7 +10,7 @@ use crate::wire::message::HISTOGRAM_BUCKETS;
 pub struct TimeCounts(pub [u64; HISTOGRAM_BUCKETS]);
 
 impl TimeCounts {
-    /// Adds others.
+    /// Adds the counts of another process.
     pub fn add(&mut self, others: &Self) {
         let pairs = self.0.iter_mut().zip(&others.0);
         pairs.for_each(|(sum, count)| *sum = sum.saturating_add(*count));

@@ -1,4 +1,4 @@
-//! The median of numbers of points.
+//! The median of single-precision numbers.
 
 /// Median; `None` of nothing.
 pub fn median(values: &mut [f32]) -> Option<f32> {

@@ -1,4 +1,4 @@
-//! Numbers as a reader likes them.
+//! Numbers and lengths as text.
 
 /// A length in metres, in the unit that keeps it readable.
 pub(super) fn length(metres: f64) -> String {
