@@ -304,65 +304,39 @@ fn a_named_rig_wins_over_the_recordings_own() {
     }
 }
 
+const CAM: &str = "mav0/cam0/data.csv";
+const TRUTH: &str = "mav0/state_groundtruth_estimate0/data.csv";
+
+/// Layout, file, what is replaced in it by what, and what is said of that.
+const BAD_RECORDINGS: &[(&str, &str, &str, &str, &str)] = &[
+    ("tum", "rgb.txt", "000.10", "000.01", "rgb.txt, line 4: has an earlier time stamp"),
+    ("tum", "rgb.txt", "000.10", "000.05", "rgb.txt, line 4: has the same time stamp"),
+    ("tum", "rgb.txt", "1000000000.10", "nan", "rgb.txt, line 4: `nan0000001` is not a time"),
+    ("tum", "rgb.txt", "1000000000.100000001 ", "", "rgb.txt, line 4: needs `timestamp filename`"),
+    ("tum", "rgb.txt", "rgb/3.png", "rgb/x.png", "rgb/x.png: cannot be read: No such file"),
+    ("tum", "groundtruth.txt", " 2 0 0 0 0 0 1", " 2 0 0 0 0 1", "line 4: needs the eight"),
+    ("tum", "groundtruth.txt", " 2 0 0 0 0 0 1", " 2 0 0 0 0 0 0", "line 4: its quaternion"),
+    ("tum", "groundtruth.txt", " 2 0 0 0", " inf 0 0 0", "line 4: `inf` is not a finite"),
+    ("tum", "camera.txt", "32 24", "40 24", "rgb/0.png: is 32x24 pixels where the rig says 40x24"),
+    ("tum", "camera.txt", "32 24", "32", "camera.txt: height = 0: must be 16 to 8192"),
+    ("tum", "camera.txt", " 0 0", " 0", "camera.txt: coefficients = [-0.1, 0.02, 0.0]: must be"),
+    ("tum", "camera.txt", "30 31 15.5 11.5 32 24 -0.1 0.02 0 0", "30 31", "has 2 numbers"),
+    ("tum", "camera.txt", "15.5", "35.5", "camera.txt: cx = 35.5: must be 0 to 31"),
+    ("euroc", CAM, "0001,", "0001", "data.csv, line 2: needs `timestamp,filename`"),
+    ("euroc", CAM, "1000000000050000001,", "1.5,", "data.csv, line 3: `1.5` is not a time stamp"),
+    ("euroc", CAM, "1000000000050000001,", "7,", "data.csv, line 3: has an earlier time"),
+    ("euroc", CAM, ",1000000000050000001", ",5", "cam0/data/5.png: cannot be read: No such file"),
+    ("euroc", TRUTH, ",2,0,0,1", ",2,0,0,0", "line 4: its quaternion has no length"),
+    ("euroc", TRUTH, ",0,0,1,0,0,0,0.1,0.2,0.3,0,0,0,0,0,0", "", "line 2: needs `timestamp,px"),
+    ("images", "rig.toml", "rate_hz = 20", "", "has no times.txt and "),
+    ("images", "rig.toml", "rate_hz", "rate", "rig.toml, line 8: unknown field `rate`"),
+    ("images", "rig.toml", "= 20", "= nan", "rig.toml: rate_hz = NaN: must be 0.1 to 1000"),
+];
+
 /// One line of a file replaced; the error names the file and what to do.
 #[test]
 fn a_bad_recording_is_one_clear_line() {
-    let cam = "mav0/cam0/data.csv";
-    let truth = "mav0/state_groundtruth_estimate0/data.csv";
-    for (kind, file, from, to, expected) in [
-        ("tum", "rgb.txt", "000.10", "000.01", "rgb.txt, line 4: has an earlier time stamp"),
-        ("tum", "rgb.txt", "000.10", "000.05", "rgb.txt, line 4: has the same time stamp"),
-        ("tum", "rgb.txt", "1000000000.10", "nan", "rgb.txt, line 4: `nan0000001` is not a time"),
-        (
-            "tum",
-            "rgb.txt",
-            "1000000000.100000001 ",
-            "",
-            "rgb.txt, line 4: needs `timestamp filename`",
-        ),
-        ("tum", "rgb.txt", "rgb/3.png", "rgb/x.png", "rgb/x.png: cannot be read: No such file"),
-        ("tum", "groundtruth.txt", " 2 0 0 0 0 0 1", " 2 0 0 0 0 1", "line 4: needs the eight"),
-        ("tum", "groundtruth.txt", " 2 0 0 0 0 0 1", " 2 0 0 0 0 0 0", "line 4: its quaternion"),
-        ("tum", "groundtruth.txt", " 2 0 0 0", " inf 0 0 0", "line 4: `inf` is not a finite"),
-        (
-            "tum",
-            "camera.txt",
-            "32 24",
-            "40 24",
-            "rgb/0.png: is 32x24 pixels where the rig says 40x24",
-        ),
-        ("tum", "camera.txt", "32 24", "32", "camera.txt: height = 0: must be 16 to 8192"),
-        (
-            "tum",
-            "camera.txt",
-            " 0 0",
-            " 0",
-            "camera.txt: coefficients = [-0.1, 0.02, 0.0]: must be",
-        ),
-        ("tum", "camera.txt", "30 31 15.5 11.5 32 24 -0.1 0.02 0 0", "30 31", "has 2 numbers"),
-        ("tum", "camera.txt", "15.5", "35.5", "camera.txt: cx = 35.5: must be 0 to 31"),
-        ("euroc", cam, "0001,", "0001", "data.csv, line 2: needs `timestamp,filename`"),
-        (
-            "euroc",
-            cam,
-            "1000000000050000001,",
-            "1.5,",
-            "data.csv, line 3: `1.5` is not a time stamp",
-        ),
-        ("euroc", cam, "1000000000050000001,", "7,", "data.csv, line 3: has an earlier time"),
-        (
-            "euroc",
-            cam,
-            ",1000000000050000001",
-            ",5",
-            "cam0/data/5.png: cannot be read: No such file",
-        ),
-        ("euroc", truth, ",2,0,0,1", ",2,0,0,0", "line 4: its quaternion has no length"),
-        ("euroc", truth, ",0,0,1,0,0,0,0.1,0.2,0.3,0,0,0,0,0,0", "", "line 2: needs `timestamp,px"),
-        ("images", "rig.toml", "rate_hz = 20", "", "has no times.txt and "),
-        ("images", "rig.toml", "rate_hz", "rate", "rig.toml, line 8: unknown field `rate`"),
-        ("images", "rig.toml", "= 20", "= nan", "rig.toml: rate_hz = NaN: must be 0.1 to 1000"),
-    ] {
+    for &(kind, file, from, to, expected) in BAD_RECORDINGS {
         let (_folder, source) = opened(kind, |root| {
             let text = fs::read_to_string(root.join(file)).expect("there");
             assert!(text.contains(from), "{file} has no `{from}`");

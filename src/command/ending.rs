@@ -52,7 +52,8 @@ impl Ending<'_> {
         progress.finish();
         let is_tracked = results.summary.frames.frames_tracked > 0;
         // Poses without a map, of a run that failed: a full disk, a mapper that is gone.
-        let is_torn = matches!(record.ended, EndOfRun::Failed(_)) && results.summary.points == 0;
+        let is_torn =
+            matches!(record.ended, EndOfRun::Failed(_)) && results.summary.point_counts.points == 0;
         let keeps_earlier = (!is_tracked || is_torn) && has_tracked_set(output);
         let keeps_journal = is_torn && is_tracked && keeps_earlier;
         if !keeps_earlier {

@@ -9,6 +9,7 @@ use clap::{Args, ValueEnum};
 
 use crate::capture::opening::{open, rig_remarks};
 use crate::capture::source::FrameSource;
+use crate::capture::source_name::SourceName;
 use crate::command::INTERRUPTED;
 use crate::command::capture::SourceArguments;
 use crate::command::ending::{Ending, note_unfinished, run_start};
@@ -16,7 +17,7 @@ use crate::command::map::MapOptions;
 use crate::command::map_points::MapPointOptions;
 use crate::command::print::note;
 use crate::command::progress::Progress;
-use crate::service::config::{CaptureConfig, Config};
+use crate::service::config::Config;
 use crate::service::journal::folder::unfinished;
 use crate::service::journal::log::RunStart;
 use crate::service::journal::replayed::ReplayJournal;
@@ -102,21 +103,8 @@ pub struct ReplayArgs {
 
 /// Replays, writes the results and prints the summary.
 pub fn run(config: &Config, args: ReplayArgs) -> Result<ExitCode, Box<dyn Error>> {
-    let is_strict = config.capture.strict || args.source.strict;
     let (name, rig) = args.source.clone().source_and_rig(&config.capture)?;
-    if name.is_camera() {
-        return Err(
-            format!("{name}: a camera cannot be replayed; use `semidense run {name}`").into()
-        );
-    }
-    let args = &args;
-    let capture = CaptureConfig { strict: is_strict, ..config.capture.clone() };
-    let map = args.map.of(config)?;
-    if args.poses == Poses::Groundtruth && !map.folder.is_empty() {
-        return Err("--poses groundtruth cannot be used with a map: its poses would be those of another world".into());
-    }
-    let results = args.points.of(&config.results);
-    let config = &Config { capture, map, results, ..config.clone() };
+    let (args, config) = (&args, &meant_config(config, &args, &name)?);
     let shutdown = Shutdown::install()?;
     let place = Place::new(&config.instance, &config.root)?;
     let output = OutputFolder::prepare(args.output.as_deref())?;
@@ -124,11 +112,7 @@ pub fn run(config: &Config, args: ReplayArgs) -> Result<ExitCode, Box<dyn Error>
         return Err(ResultsError::Foreign(file).into());
     }
     note_unfinished(&unfinished(Some(&place), output.path()));
-    let mut params = config.source_params();
-    let simulator = &mut params.simulator;
-    simulator.seed = args.seed.unwrap_or(simulator.seed);
-    simulator.frames = args.frames.map_or(simulator.frames, |n| simulator.frames.min(n as usize));
-    let mut source = open(&name, rig.as_deref(), &params)?;
+    let mut source = open(&name, rig.as_deref(), &config.source_params())?;
     for remark in rig_remarks(&name, rig.as_deref()) {
         note(&format!("warning: {remark}"));
     }
@@ -137,19 +121,7 @@ pub fn run(config: &Config, args: ReplayArgs) -> Result<ExitCode, Box<dyn Error>
         .num_threads(threads)
         .thread_name(|i| format!("mapper-{i}"))
         .build()?;
-    let journal = JournalOptions {
-        output: output.path().to_owned(),
-        start: RunStart {
-            poses_given: args.poses == Poses::Groundtruth,
-            is_depth_from_sensor: args.initial_depth == InitialDepth::Sensor,
-            ..run_start(
-                &Config { simulator: params.simulator, ..config.clone() },
-                &name,
-                rig.as_deref(),
-            )
-        },
-        max_depth_bytes: config.mapping.max_map_bytes() as u64,
-    };
+    let journal = journal_options(config, args, &name, rig.as_deref(), output.path());
     let begin = || ReplayJournal::begin(&journal, &place);
     let replayed = pool.install(|| {
         record(config, args, &name.to_string(), source.as_mut(), &shutdown, &begin)
@@ -165,6 +137,49 @@ pub fn run(config: &Config, args: ReplayArgs) -> Result<ExitCode, Box<dyn Error>
     };
     let ending = Ending { output: &output, config, json: args.json, write_more: &write_more };
     ending.finish(&record, source.as_mut(), journal)
+}
+
+/// The configuration as the arguments change it; an error where that cannot be replayed.
+fn meant_config(
+    config: &Config,
+    args: &ReplayArgs,
+    name: &SourceName,
+) -> Result<Config, Box<dyn Error>> {
+    if name.is_camera() {
+        return Err(
+            format!("{name}: a camera cannot be replayed; use `semidense run {name}`").into()
+        );
+    }
+    let map = args.map.of(config)?;
+    if args.poses == Poses::Groundtruth && !map.folder.is_empty() {
+        return Err("--poses groundtruth cannot be used with a map: its poses would be those of another world".into());
+    }
+    let results = args.points.of(&config.results);
+    let mut meant = Config { map, results, ..config.clone() };
+    meant.capture.strict |= args.source.strict;
+    let simulator = &mut meant.simulator;
+    simulator.seed = args.seed.unwrap_or(simulator.seed);
+    simulator.frames = args.frames.map_or(simulator.frames, |n| simulator.frames.min(n as usize));
+    Ok(meant)
+}
+
+/// The journal, from which a replay that is killed can be recovered.
+fn journal_options(
+    config: &Config,
+    args: &ReplayArgs,
+    name: &SourceName,
+    rig: Option<&Path>,
+    output: &Path,
+) -> JournalOptions {
+    JournalOptions {
+        output: output.to_owned(),
+        start: RunStart {
+            poses_given: args.poses == Poses::Groundtruth,
+            is_depth_from_sensor: args.initial_depth == InitialDepth::Sensor,
+            ..run_start(config, name, rig)
+        },
+        max_depth_bytes: config.mapping.max_map_bytes() as u64,
+    }
 }
 
 /// What was replayed.

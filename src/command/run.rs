@@ -1,7 +1,9 @@
 //! `semidense run`: the three processes, from the first frame to the report.
 
+use std::error::Error;
+use std::ffi::OsString;
 use std::net::SocketAddr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Args;
@@ -16,7 +18,7 @@ use crate::command::print::note;
 use crate::command::ros2_rig::{Ros2RigError, fetch as fetch_rig};
 use crate::command::run_progress::start_display;
 use crate::command::{CommandResult, CommonArguments, INTERRUPTED};
-use crate::service::config::Config;
+use crate::service::config::{Config, MapConfig};
 use crate::service::error_log::ErrorLog;
 use crate::service::journal::folder::unfinished;
 use crate::service::journal::log::RunStart;
@@ -25,7 +27,7 @@ use crate::service::mode::Mode;
 use crate::service::results::output_folder::OutputFolder;
 use crate::service::results::record::RunMode;
 use crate::service::shutdown::Shutdown;
-use crate::service::supervisor::{Ended, RunOptions, run as supervise};
+use crate::service::supervisor::{Ended, RunOptions, RunOutcome, run as supervise};
 use crate::service::view_child::{ViewChild, ViewOptions};
 use crate::wire::place::Place;
 
@@ -63,14 +65,8 @@ pub fn run(
     log: &ErrorLog,
     arguments: RunArguments,
 ) -> CommandResult {
-    let mut child_arguments = common.to_arguments();
-    if arguments.source.strict {
-        child_arguments.extend(["--set".into(), "capture.strict=true".into()]);
-    }
     let map = arguments.map.of(config)?;
-    if !map.folder.is_empty() {
-        child_arguments.extend(MapOptions::settings(&map));
-    }
+    let child_arguments = child_arguments(common, &arguments, &map);
     let results = arguments.points.of(&config.results);
     let config = &Config { map, results, ..config.clone() };
     let (source, rig) = arguments.source.source_and_rig(&config.capture)?;
@@ -79,22 +75,12 @@ pub fn run(
     // First: a signal must find the folder's owner ready to remove it.
     let shutdown = Shutdown::install()?;
     let output = OutputFolder::prepare(arguments.output.as_deref())?;
-    let rig = match (&source, rig) {
-        (SourceName::Ros2(topic), None) => match fetch_rig(topic, output.path(), &shutdown) {
-            Err(Ros2RigError::Interrupted) => return Ok(ExitCode::from(INTERRUPTED)),
-            fetched => Some(fetched?),
-        },
-        (_, rig) => rig,
+    let rig = match rig_of(&source, rig, output.path(), &shutdown) {
+        Err(Ros2RigError::Interrupted) => return Ok(ExitCode::from(INTERRUPTED)),
+        rig => rig?,
     };
     note_unfinished(&unfinished(Some(&place), output.path()));
-    let journal = JournalOptions {
-        output: output.path().to_owned(),
-        start: RunStart {
-            mode: if mode == Mode::Live { RunMode::Live } else { RunMode::Lockstep },
-            ..run_start(config, &source, rig.as_deref())
-        },
-        max_depth_bytes: config.mapping.max_map_bytes() as u64,
-    };
+    let journal = journal_options(config, &source, rig.as_deref(), mode, output.path());
     let options = RunOptions {
         source,
         rig,
@@ -105,9 +91,72 @@ pub fn run(
         arguments: child_arguments,
         log: log.clone(),
     };
-    let mut page = arguments.view.map(|at| start_page(at, common, &place, log)).transpose()?;
-    let display = start_display(arguments.json)?;
-    let outcome = supervise(config, &options, &shutdown, &mut |progress| {
+    let page = arguments.view.map(|at| start_page(at, common, &place, log)).transpose()?;
+    let mut outcome = supervise_shown(config, &options, &shutdown, page, arguments.json)?;
+    if outcome.record.poses.is_empty() && outcome.ended != Ended::Finished {
+        return end_without_results(outcome);
+    }
+    let ending = Ending { output: &output, config, json: arguments.json, write_more: &|_| Ok(()) };
+    ending.finish(&outcome.record, outcome.source.as_mut(), outcome.journal.take())
+}
+
+/// What each process is told: what is common to all commands, and what this one was given for them.
+fn child_arguments(
+    common: &CommonArguments,
+    arguments: &RunArguments,
+    map: &MapConfig,
+) -> Vec<OsString> {
+    let mut told = common.to_arguments();
+    if arguments.source.strict {
+        told.extend(["--set".into(), "capture.strict=true".into()]);
+    }
+    if !map.folder.is_empty() {
+        told.extend(MapOptions::settings(map));
+    }
+    told
+}
+
+/// The rig file of a source: a ROS 2 topic without one brings its own calibration.
+fn rig_of(
+    source: &SourceName,
+    rig: Option<PathBuf>,
+    folder: &Path,
+    shutdown: &Shutdown,
+) -> Result<Option<PathBuf>, Ros2RigError> {
+    match (source, rig) {
+        (SourceName::Ros2(topic), None) => fetch_rig(topic, folder, shutdown).map(Some),
+        (_, rig) => Ok(rig),
+    }
+}
+
+/// The journal, from which a run that is killed can be recovered.
+fn journal_options(
+    config: &Config,
+    source: &SourceName,
+    rig: Option<&Path>,
+    mode: Mode,
+    output: &Path,
+) -> JournalOptions {
+    JournalOptions {
+        output: output.to_owned(),
+        start: RunStart {
+            mode: if mode == Mode::Live { RunMode::Live } else { RunMode::Lockstep },
+            ..run_start(config, source, rig)
+        },
+        max_depth_bytes: config.mapping.max_map_bytes() as u64,
+    }
+}
+
+/// Supervises the processes under a display, which names the live page once there is one.
+fn supervise_shown(
+    config: &Config,
+    options: &RunOptions,
+    shutdown: &Shutdown,
+    mut page: Option<ViewChild>,
+    json: bool,
+) -> Result<RunOutcome, Box<dyn Error>> {
+    let display = start_display(json)?;
+    let outcome = supervise(config, options, shutdown, &mut |progress| {
         display.show(progress);
         if let Some(address) = page.as_mut().and_then(ViewChild::look) {
             note(&format!("live page: {address}"));
@@ -115,18 +164,17 @@ pub fn run(
     });
     display.finish();
     drop(page);
-    let mut outcome = outcome?;
-    if outcome.record.poses.is_empty() && outcome.ended != Ended::Finished {
-        // There is nothing that could be lost.
-        drop(outcome.journal.take().map(Journal::finish));
-        let Ended::Failed(cause) = outcome.ended else {
-            note("interrupted before the first pose: there are no results");
-            return Ok(ExitCode::from(INTERRUPTED));
-        };
-        return Err(cause.into());
-    }
-    let ending = Ending { output: &output, config, json: arguments.json, write_more: &|_| Ok(()) };
-    ending.finish(&outcome.record, outcome.source.as_mut(), outcome.journal.take())
+    Ok(outcome?)
+}
+
+/// Ends a run that came to its end before the first pose: there is nothing that could be lost.
+fn end_without_results(outcome: RunOutcome) -> CommandResult {
+    drop(outcome.journal.map(Journal::finish));
+    let Ended::Failed(cause) = outcome.ended else {
+        note("interrupted before the first pose: there are no results");
+        return Ok(ExitCode::from(INTERRUPTED));
+    };
+    Err(cause.into())
 }
 
 /// Starts the live page beside the run.
@@ -135,7 +183,7 @@ fn start_page(
     common: &CommonArguments,
     place: &Place,
     log: &ErrorLog,
-) -> Result<ViewChild, Box<dyn std::error::Error>> {
+) -> Result<ViewChild, Box<dyn Error>> {
     let own = std::env::current_exe()?;
     // The instance may be named by `--set` as well.
     let common = CommonArguments { instance: Some(place.instance.clone()), ..common.clone() };

@@ -293,16 +293,8 @@ impl<'a> Shell<'a> {
         else {
             return Ok(());
         };
-        if self.mapper.as_ref().is_none_or(|(of, _)| *of != intrinsics) {
-            match self.change_camera(intrinsics) {
-                Err(MapperError::Parameter(error)) => {
-                    // The configuration was checked at the start: it is the image that is too small.
-                    self.health.counters().refused += 1;
-                    self.health.enter(ProcessState::Running, &error.to_string());
-                    return Ok(());
-                }
-                changed => changed?,
-            }
+        if !self.suits_camera(intrinsics)? {
+            return Ok(());
         }
         let Some((_, mapper)) = &mut self.mapper else { return Ok(()) };
         let _span = tracing::trace_span!("frame", sequence = frame.sequence).entered();
@@ -330,15 +322,44 @@ impl<'a> Shell<'a> {
         tell_adjustments(&mut self.adjustments, &self.output, &mut self.health)?;
         let durations = [step_nanos, change_nanos];
         self.output.publish_step(mapper, frame.sequence, durations, self.last_pose.as_ref())?;
+        self.follow(&[&outcome, &adjusted]);
+        if let Some(failure) = self.map.as_mut().and_then(MapSession::take_failure) {
+            self.health.warn(&failure);
+        }
+        self.tell_step(step_nanos);
+        Ok(())
+    }
+
+    /// Whether there is a mapper for frames of this camera; makes one where it is another than before.
+    fn suits_camera(&mut self, intrinsics: Intrinsics) -> Result<bool, MapperError> {
+        if self.mapper.as_ref().is_some_and(|(of, _)| *of == intrinsics) {
+            return Ok(true);
+        }
+        match self.change_camera(intrinsics) {
+            Err(MapperError::Parameter(error)) => {
+                // The configuration was checked at the start: it is the image that is too small.
+                self.health.counters().refused += 1;
+                self.health.enter(ProcessState::Running, &error.to_string());
+                Ok(false)
+            }
+            changed => changed.map(|()| true),
+        }
+    }
+
+    /// Takes changes of the map into the checkpoint and into the map on disk.
+    fn follow(&mut self, outcomes: &[&StepOutcome]) {
+        let Some((_, mapper)) = &mut self.mapper else { return };
         if let Some(kept) = &mut self.kept {
-            kept.follow(mapper, &outcome);
-            kept.follow(mapper, &adjusted);
+            outcomes.iter().for_each(|outcome| kept.follow(mapper, outcome));
         }
         if let Some(map) = &mut self.map {
-            map.follow(mapper, &outcome);
-            map.follow(mapper, &adjusted);
-            map.take_failure().iter().for_each(|failure| self.health.warn(failure));
+            outcomes.iter().for_each(|outcome| map.follow(mapper, outcome));
         }
+    }
+
+    /// Tells what the map holds after a step, and what the step took.
+    fn tell_step(&mut self, step_nanos: u64) {
+        let Some((_, mapper)) = &self.mapper else { return };
         self.health.enter(ProcessState::Running, &mapper.situation().to_string());
         let counters = self.health.counters();
         counters.frames += 1;
@@ -348,7 +369,6 @@ impl<'a> Shell<'a> {
         self.health.count_work(step_nanos);
         self.health.count_latency(step_nanos);
         self.health.report();
-        Ok(())
     }
 
     /// Live: a joint estimate that is ready enters the map, and goes out, though no frame comes.
@@ -356,10 +376,7 @@ impl<'a> Shell<'a> {
         let Some((_, mapper)) = &mut self.mapper else { return Ok(()) };
         let outcome = self.adjustments.pick_up(mapper);
         self.output.publish(mapper, &outcome)?;
-        if let Some(kept) = &mut self.kept {
-            kept.follow(mapper, &outcome);
-        }
-        self.map.iter_mut().for_each(|map| map.follow(mapper, &outcome));
+        self.follow(&[&outcome]);
         tell_adjustments(&mut self.adjustments, &self.output, &mut self.health)?;
         Ok(())
     }

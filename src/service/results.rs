@@ -25,6 +25,7 @@ pub mod report;
 pub mod results_error;
 pub mod set;
 pub mod start_tally;
+pub mod step_times;
 pub mod summary;
 pub mod summary_text;
 pub mod times;
@@ -237,7 +238,8 @@ impl<'a> Results<'a> {
             + KEYFRAME_BYTES * record.map.keyframes.len()
             + CONFIRMED_BYTES * record.map.confirmed.len();
         let surface = (1 + usize::from(params.pcd)) * SURFACE_POINT_BYTES * self.surface.len();
-        let full = if params.full_points { FULL_POINT_BYTES * summary.points as usize } else { 0 };
+        let full =
+            if params.full_points { FULL_POINT_BYTES * summary.point_counts.points } else { 0 };
         (surface + full + lines + page + SUMMARY_BYTES) as u64
     }
 }

@@ -4,6 +4,7 @@
 //! level, [`normal_equations`] solves for a step, [`align`] iterates coarse to fine.
 
 pub mod align;
+mod damping;
 pub mod displacement;
 pub mod fusion;
 pub mod kernel;

@@ -14,58 +14,62 @@ const BAYS: usize = 3;
 /// Width of the corridor, metres.
 const CORRIDOR_M: f32 = 1.6;
 
+/// From the corridor into the first room, around and out.
+const BAY: [Waypoint; 20] = [
+    waypoint(0.9, 5.0, -20.0, -8.0),
+    waypoint(1.6, 5.0, -38.0, -8.0),
+    waypoint(2.3, 4.9, -60.0, -8.0),
+    waypoint(2.8, 4.4, -80.0, -8.0),
+    waypoint(2.9, 3.7, -95.0, -8.0),
+    waypoint(2.7, 3.0, -105.0, -9.0),
+    waypoint(2.0, 2.8, -110.0, -10.0),
+    waypoint(1.4, 2.4, -95.0, -10.0),
+    waypoint(1.2, 1.8, -65.0, -9.0),
+    waypoint(1.7, 1.3, -35.0, -8.0),
+    waypoint(2.4, 1.2, -5.0, -8.0),
+    waypoint(3.0, 1.5, 25.0, -8.0),
+    waypoint(3.3, 2.1, 52.0, -8.0),
+    waypoint(3.2, 2.8, 72.0, -8.0),
+    waypoint(3.0, 3.5, 78.0, -8.0),
+    waypoint(3.0, 4.2, 62.0, -8.0),
+    waypoint(3.2, 4.8, 38.0, -8.0),
+    waypoint(3.8, 5.05, 15.0, -8.0),
+    waypoint(4.4, 5.05, 0.0, -8.0),
+    waypoint(5.0, 5.05, -10.0, -8.0),
+];
+
+/// From the second room to the end of the corridor and back.
+const REST: [Waypoint; 23] = [
+    waypoint(10.1, 5.0, 0.0, -8.0),
+    waypoint(10.9, 4.9, 15.0, -8.0),
+    waypoint(11.6, 4.8, 32.0, -8.0),
+    waypoint(12.1, 4.7, 52.0, -8.0),
+    waypoint(12.5, 4.7, 78.0, -8.0),
+    waypoint(12.7, 4.9, 104.0, -8.0),
+    waypoint(12.6, 5.2, 130.0, -8.0),
+    waypoint(12.2, 5.3, 152.0, -8.0),
+    waypoint(11.6, 5.2, 168.0, -8.0),
+    waypoint(10.8, 5.1, 178.0, -8.0),
+    waypoint(9.9, 5.0, 190.0, -8.0),
+    waypoint(8.9, 4.9, 200.0, -8.0),
+    waypoint(7.9, 4.9, 190.0, -8.0),
+    waypoint(6.9, 5.0, 172.0, -8.0),
+    waypoint(5.9, 5.1, 165.0, -8.0),
+    waypoint(4.9, 5.1, 175.0, -8.0),
+    waypoint(3.9, 5.1, 188.0, -8.0),
+    waypoint(2.9, 5.2, 196.0, -8.0),
+    waypoint(2.0, 5.3, 212.0, -8.0),
+    waypoint(1.4, 5.4, 236.0, -8.0),
+    waypoint(0.95, 5.45, 262.0, -8.0),
+    waypoint(0.65, 5.2, 288.0, -8.0),
+    waypoint(0.65, 4.85, 315.0, -8.0),
+];
+
 /// Into the first room and out, into the second and out, to the end of the corridor and back.
 static ROUND: [Waypoint; 63] = twins_round();
 
 /// The round; the second room's part is the first one's, a period on.
 const fn twins_round() -> [Waypoint; 63] {
-    const BAY: [Waypoint; 20] = [
-        waypoint(0.9, 5.0, -20.0, -8.0),
-        waypoint(1.6, 5.0, -38.0, -8.0),
-        waypoint(2.3, 4.9, -60.0, -8.0),
-        waypoint(2.8, 4.4, -80.0, -8.0),
-        waypoint(2.9, 3.7, -95.0, -8.0),
-        waypoint(2.7, 3.0, -105.0, -9.0),
-        waypoint(2.0, 2.8, -110.0, -10.0),
-        waypoint(1.4, 2.4, -95.0, -10.0),
-        waypoint(1.2, 1.8, -65.0, -9.0),
-        waypoint(1.7, 1.3, -35.0, -8.0),
-        waypoint(2.4, 1.2, -5.0, -8.0),
-        waypoint(3.0, 1.5, 25.0, -8.0),
-        waypoint(3.3, 2.1, 52.0, -8.0),
-        waypoint(3.2, 2.8, 72.0, -8.0),
-        waypoint(3.0, 3.5, 78.0, -8.0),
-        waypoint(3.0, 4.2, 62.0, -8.0),
-        waypoint(3.2, 4.8, 38.0, -8.0),
-        waypoint(3.8, 5.05, 15.0, -8.0),
-        waypoint(4.4, 5.05, 0.0, -8.0),
-        waypoint(5.0, 5.05, -10.0, -8.0),
-    ];
-    const REST: [Waypoint; 23] = [
-        waypoint(10.1, 5.0, 0.0, -8.0),
-        waypoint(10.9, 4.9, 15.0, -8.0),
-        waypoint(11.6, 4.8, 32.0, -8.0),
-        waypoint(12.1, 4.7, 52.0, -8.0),
-        waypoint(12.5, 4.7, 78.0, -8.0),
-        waypoint(12.7, 4.9, 104.0, -8.0),
-        waypoint(12.6, 5.2, 130.0, -8.0),
-        waypoint(12.2, 5.3, 152.0, -8.0),
-        waypoint(11.6, 5.2, 168.0, -8.0),
-        waypoint(10.8, 5.1, 178.0, -8.0),
-        waypoint(9.9, 5.0, 190.0, -8.0),
-        waypoint(8.9, 4.9, 200.0, -8.0),
-        waypoint(7.9, 4.9, 190.0, -8.0),
-        waypoint(6.9, 5.0, 172.0, -8.0),
-        waypoint(5.9, 5.1, 165.0, -8.0),
-        waypoint(4.9, 5.1, 175.0, -8.0),
-        waypoint(3.9, 5.1, 188.0, -8.0),
-        waypoint(2.9, 5.2, 196.0, -8.0),
-        waypoint(2.0, 5.3, 212.0, -8.0),
-        waypoint(1.4, 5.4, 236.0, -8.0),
-        waypoint(0.95, 5.45, 262.0, -8.0),
-        waypoint(0.65, 5.2, 288.0, -8.0),
-        waypoint(0.65, 4.85, 315.0, -8.0),
-    ];
     let mut round = [BAY[0]; 63];
     let mut i = 0;
     while i < 20 {

@@ -192,9 +192,9 @@ fn cards(summary: &Summary) -> String {
         let note = format!("median; {:.1} % in the more certain half", 100.0 * best);
         card("Depth error", format!("{:.1} %", 100.0 * error), note);
     }
-    let points = format!("{} points", grouped(summary.points));
+    let points = format!("{} points", grouped(summary.point_counts.points as u64));
     card("Keyframes", summary.keyframes.to_string(), points);
-    if let Some(times) = summary.track_ms {
+    if let Some(times) = summary.times.track_ms {
         let note = format!("median; p99 {:.1} ms", times.p99);
         card("Tracking a frame", format!("{:.1} ms", times.p50), note);
     }

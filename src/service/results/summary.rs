@@ -4,7 +4,6 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::{Deserialize, Serialize};
 
-use crate::service::results::alignment_levels::{LevelSummary, alignment_levels};
 use crate::service::results::budget_curve::BudgetCurve;
 use crate::service::results::calibration::whitened_residual_median;
 use crate::service::results::depth_maps::DepthEvaluation;
@@ -15,7 +14,8 @@ use crate::service::results::poses::{longest_epoch, placed_later};
 use crate::service::results::record::{
     EndOfRun, RecordedPose, Rejection, RestartCause, RunMode, RunRecord,
 };
-use crate::service::results::times::{LatencySummary, Percentiles, track_nanos};
+use crate::service::results::step_times::StepTimes;
+use crate::service::results::times::{LatencySummary, Percentiles};
 use crate::service::results::untracked::Untracked;
 use crate::slam::evaluation::TrajectoryEvaluation;
 use crate::slam::evaluation::depth_error::{DepthScale, KeyframeDepth, depth_scale_ratio};
@@ -27,13 +27,13 @@ use crate::slam::map::Map;
 use crate::slam::pose::{PoseEstimate, TrackingState};
 
 /// How many points there are, and what it took to fuse them.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct PointCounts {
-    /// Points of all keyframes.
+    /// Points of all keyframes that are known well enough.
     pub points: usize,
-    /// Points of the surface.
+    /// Points of `map.ply`: the surface that they are fused to, of the evaluated epoch.
     pub map_points: usize,
-    /// Time of the fusion.
+    /// Time that it took to fuse them.
     pub fusion_secs: f64,
 }
 
@@ -241,12 +241,9 @@ pub struct Summary {
     pub keyframes: u64,
     /// Of them those whose depth is not held: the oldest of a long run, or what a recovery could not find.
     pub keyframes_without_depth: u64,
-    /// Points of all keyframes that are known well enough.
-    pub points: u64,
-    /// Points of `map.ply`: the surface that they are fused to, of `evaluated_epoch`.
-    pub map_points: u64,
-    /// Time that it took to fuse them.
-    pub fusion_secs: f64,
+    /// Their points, and those of `map.ply`.
+    #[serde(flatten)]
+    pub point_counts: PointCounts,
     /// Life of the map at the end, from 0.
     pub epoch: u32,
     /// Epochs with tracked frames.
@@ -273,20 +270,9 @@ pub struct Summary {
     pub restart_causes: Vec<RestartCause>,
     /// Frames with a pose that the mapper did not take in because newer ones had come. Null in one process.
     pub frames_skipped_by_mapper: Option<u64>,
-    /// Time in the tracker for a frame.
-    pub track_ms: Option<Percentiles>,
-    /// Of it, from the frame to the first iteration: the image pyramid, but for some thousandths.
-    /// Known in a replay.
-    pub pyramid_ms: Option<Percentiles>,
-    /// What aligning costs on each pyramid level, finest first. Known in a replay.
-    pub alignment_levels: Option<Vec<LevelSummary>>,
-    /// Time in the mapper for a frame.
-    pub map_ms: Option<Percentiles>,
-    /// Of it, the steps that changed to a new keyframe.
-    pub keyframe_step_ms: Option<Percentiles>,
-    /// Of those, from the observed frame to a keyframe that others can have: carrying, smoothing, live
-    /// also publishing. What follows, depth for new pixels, is published as its next revision.
-    pub keyframe_ms: Option<Percentiles>,
+    /// Time in the tracker and in the mapper.
+    #[serde(flatten)]
+    pub times: StepTimes,
     /// Joint estimates of keyframes.
     #[serde(flatten)]
     pub joint: JointSummary,
@@ -335,6 +321,13 @@ impl From<&Rejection> for RejectionSummary {
     }
 }
 
+/// 2²⁰.
+const BYTES_PER_MB: f64 = 1_048_576.0;
+
+fn secs(nanos: u64) -> f64 {
+    nanos as f64 * 1e-9
+}
+
 impl Summary {
     /// The figures of `record`, with so many `points` and what the evaluations gave: `nees` on keyframes, in the map and
     /// of velocities.
@@ -346,21 +339,15 @@ impl Summary {
         nees: [Option<NormalizedErrors>; 3],
         depth: DepthEvaluation,
     ) -> Self {
-        let (recorded_secs, wall_secs) =
-            (record.recorded_nanos as f64 * 1e-9, record.wall_nanos as f64 * 1e-9);
-        let traces: Vec<_> = record.poses.iter().filter_map(|pose| pose.trace).collect();
-        const BYTES_PER_MB: f64 = 1_048_576.0;
-        let (ended, failure) = end_in_words(&record.ended);
+        let (recorded_secs, wall_secs) = (secs(record.recorded_nanos), secs(record.wall_nanos));
+        let (ended, failure, recovered_run_end) = end_in_words(&record.ended);
         Self {
             mode: record.mode,
             source: record.source.clone(),
             camera: record.map.keyframes.first().map(|keyframe| keyframe.intrinsics),
             ended,
             failure,
-            recovered_run_end: match record.ended {
-                EndOfRun::Recovered(time) => Some(utc_text(time)),
-                _ => None,
-            },
+            recovered_run_end,
             grade: grade(record),
             frames_in: record.frames_in,
             frames_refused: record.frames_refused,
@@ -375,9 +362,7 @@ impl Summary {
             untracked: Untracked::of(record).map(|why| why.to_string()),
             keyframes: record.map.keyframes.len() as u64,
             keyframes_without_depth: without_depth(&record.map),
-            points: points.points as u64,
-            map_points: points.map_points as u64,
-            fusion_secs: points.fusion_secs,
+            point_counts: points,
             epoch: record.poses.last().map_or(0, |pose| pose.estimate.epoch),
             epochs: count_epochs(&record.poses),
             evaluated_epoch: trajectory.and_then(|_| longest_epoch(record)),
@@ -390,12 +375,7 @@ impl Summary {
             restarts_by_process: restarts_by_process(&record.restart_causes),
             restart_causes: record.restart_causes.clone(),
             frames_skipped_by_mapper: record.frames_skipped_by_mapper,
-            track_ms: Percentiles::of(track_nanos(&record.poses)),
-            pyramid_ms: Percentiles::of(traces.iter().map(|trace| trace.pyramid_nanos)),
-            alignment_levels: alignment_levels(&traces),
-            map_ms: Percentiles::of(record.map_nanos.iter().copied()),
-            keyframe_step_ms: Percentiles::of(record.keyframe_step_nanos.iter().copied()),
-            keyframe_ms: Percentiles::of(record.keyframe_nanos.iter().copied()),
+            times: StepTimes::of(record),
             joint: JointSummary::of(&record.adjustments),
             loops: LoopSummary::of(record.searches.as_deref(), record.map.keyframes.len()),
             budget_curve: BudgetCurve::of(&record.budget_samples),
@@ -413,15 +393,15 @@ impl Summary {
     }
 }
 
-/// How a run ended in a word, and what failed.
-fn end_in_words(ended: &EndOfRun) -> (String, Option<String>) {
-    let (word, failure) = match ended {
-        EndOfRun::Finished => ("finished", None),
-        EndOfRun::Interrupted => ("interrupted", None),
-        EndOfRun::Failed(cause) => ("failed", Some(cause.clone())),
-        EndOfRun::Recovered(_) => ("recovered", None),
+/// How a run ended in a word, what failed, and when a run that was recovered ended.
+fn end_in_words(ended: &EndOfRun) -> (String, Option<String>, Option<String>) {
+    let (word, failure, recovered) = match ended {
+        EndOfRun::Finished => ("finished", None, None),
+        EndOfRun::Interrupted => ("interrupted", None, None),
+        EndOfRun::Failed(cause) => ("failed", Some(cause.clone()), None),
+        EndOfRun::Recovered(time) => ("recovered", None, Some(utc_text(*time))),
     };
-    (word.to_owned(), failure)
+    (word.to_owned(), failure, recovered)
 }
 
 fn rejections(record: &RunRecord) -> Option<Vec<RejectionSummary>> {

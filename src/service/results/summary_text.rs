@@ -4,85 +4,79 @@ use std::fmt::Write;
 
 use crate::service::results::joint::JointSummary;
 use crate::service::results::loops::LoopSummary;
-use crate::service::results::summary::{DepthSummary, Summary, TrajectorySummary};
+use crate::service::results::summary::{
+    DepthSummary, RejectionSummary, Summary, TrajectorySummary,
+};
 use crate::service::results::times::Percentiles;
 use crate::slam::evaluation::grade::Grade;
 
 /// The lines, each ended.
 pub fn summary_text(summary: &Summary) -> String {
-    let mut text = String::new();
-    let mut line = |name: &str, value: String| {
-        // Writing to a string cannot fail.
-        let _ = writeln!(text, "{name:<11} {value}");
-    };
-    line("frames", frames(summary));
-    if let Some(refused) = &summary.refused {
-        line("images", refused.clone());
-    }
-    line(
-        "map",
-        format!(
-            "{} keyframes{}, {} points fused to {}, epoch {}",
-            summary.keyframes,
-            match summary.keyframes_without_depth {
-                0 => String::new(),
-                count => format!(" ({count} without depth)"),
-            },
-            summary.points,
-            summary.map_points,
-            summary.epoch
-        ),
-    );
-    for restart in &summary.restart_causes {
-        line("restarts", format!("{} {}: {}", restart.count, restart.process, restart.cause));
-    }
-    for rejection in summary.map_rejections.iter().flatten() {
-        line("rejected", format!("map at frame {}: {}", rejection.sequence, rejection.reason));
-    }
-    if let Some(epoch) = summary.evaluated_epoch.filter(|_| summary.epochs > 1) {
-        let figures =
-            format!("below are those of epoch {epoch}, the longest of {}", summary.epochs);
-        line("errors", figures);
-    }
-    if let Some(error) = trajectory_errors(&summary.trajectory) {
-        line("trajectory", error);
-    }
-    if let Some(error) = trajectory_errors(&summary.online) {
-        line("online", error);
-    }
-    if let Some(errors) = depth_errors(&summary.depth) {
-        line("depth", errors);
-    }
-    let times = [
-        ("track", summary.track_ms),
-        ("map", summary.map_ms),
-        ("keyframe", summary.keyframe_ms),
-        ("sent after", summary.send_ms),
-        ("latency", summary.latency.latency_ms),
-    ];
-    for (name, percentiles) in times {
-        if let Some(percentiles) = percentiles {
-            line(name, times_text(&percentiles));
+    let mut lines = Lines(String::new());
+    lines.add("frames", [frames(summary)]);
+    lines.add("images", summary.refused.clone());
+    lines.add("map", [map(summary)]);
+    let restarts = summary.restart_causes.iter();
+    lines.add("restarts", restarts.map(|of| format!("{} {}: {}", of.count, of.process, of.cause)));
+    let rejections = summary.map_rejections.iter().flatten();
+    let rejected = |of: &RejectionSummary| format!("map at frame {}: {}", of.sequence, of.reason);
+    lines.add("rejected", rejections.map(rejected));
+    lines.add("errors", evaluated(summary));
+    lines.add("trajectory", trajectory_errors(&summary.trajectory));
+    lines.add("online", trajectory_errors(&summary.online));
+    lines.add("depth", depth_errors(&summary.depth));
+    lines.add("track", summary.times.track_ms.as_ref().map(times_text));
+    lines.add("map", summary.times.map_ms.as_ref().map(times_text));
+    lines.add("keyframe", summary.times.keyframe_ms.as_ref().map(times_text));
+    lines.add("sent after", summary.send_ms.as_ref().map(times_text));
+    lines.add("latency", summary.latency.latency_ms.as_ref().map(times_text));
+    lines.add("joint", joint_text(&summary.joint));
+    lines.add("loops", loops_text(&summary.loops));
+    lines.add("deadline", deadline(summary));
+    lines.add("run", [run(summary)]);
+    lines.add("grade", [grade_text(&summary.grade)]);
+    lines.0
+}
+
+/// Lines of a name and a value.
+struct Lines(String);
+
+impl Lines {
+    /// A line for each value; none where there is none.
+    fn add(&mut self, name: &str, values: impl IntoIterator<Item = String>) {
+        for value in values {
+            // Writing to a string cannot fail.
+            let _ = writeln!(self.0, "{name:<11} {value}");
         }
     }
-    if let Some(text) = joint_text(&summary.joint) {
-        line("joint", text);
-    }
-    if let Some(text) = loops_text(&summary.loops) {
-        line("loops", text);
-    }
-    if let (Some(deadline_ms), Some(misses)) = (summary.deadline_ms, summary.deadline_misses) {
-        line(
-            "deadline",
-            format!(
-                "{misses} {} later than {deadline_ms:.2} ms after the frame arrived",
-                if misses == 1 { "pose" } else { "poses" }
-            ),
-        );
-    }
-    line("run", run(summary));
-    line("grade", grade_text(&summary.grade));
-    text
+}
+
+/// What the map holds.
+fn map(summary: &Summary) -> String {
+    let without_depth = match summary.keyframes_without_depth {
+        0 => String::new(),
+        count => format!(" ({count} without depth)"),
+    };
+    format!(
+        "{} keyframes{without_depth}, {} points fused to {}, epoch {}",
+        summary.keyframes,
+        summary.point_counts.points,
+        summary.point_counts.map_points,
+        summary.epoch
+    )
+}
+
+/// Whose errors follow; nothing where there is one epoch alone.
+fn evaluated(summary: &Summary) -> Option<String> {
+    let epoch = summary.evaluated_epoch.filter(|_| summary.epochs > 1)?;
+    Some(format!("below are those of epoch {epoch}, the longest of {}", summary.epochs))
+}
+
+/// Poses that came late; nothing where nothing waits for them.
+fn deadline(summary: &Summary) -> Option<String> {
+    let (deadline_ms, misses) = (summary.deadline_ms?, summary.deadline_misses?);
+    let poses = if misses == 1 { "pose" } else { "poses" };
+    Some(format!("{misses} {poses} later than {deadline_ms:.2} ms after the frame arrived"))
 }
 
 fn depth_errors(depth: &DepthSummary) -> Option<String> {

@@ -3,12 +3,12 @@
 use nalgebra::{Matrix6, Matrix6x3, SVector, Vector3};
 use serde::{Deserialize, Serialize};
 
+use crate::slam::alignment::damping::Damping;
 use crate::slam::alignment::kernel::{Kernel, SimdMode};
 use crate::slam::alignment::normal_equations::{NormalEquations, UNKNOWNS, pose_step};
 use crate::slam::alignment::reference::Reference;
 use crate::slam::alignment::residual::{Evaluation, Weighting, mean_squared_flow};
 use crate::slam::alignment::scatter::GradientScatter;
-use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::noise::ImageNoise;
 use crate::slam::image::sums::{MAX_LEVELS, SumPyramid};
@@ -115,10 +115,26 @@ pub struct AlignedState {
 impl AlignedState {
     /// Where an undamped step leads; `None` where it leads nowhere that a camera can be.
     pub fn after_step(&self) -> Option<(SE3, Brightness)> {
-        let step = self.sums.damped_step(0.0).filter(is_sane)?;
-        let pose = SE3::exp(&pose_step(&step)) * self.current_from_keyframe;
+        Some(self.moved_by(&self.sums.damped_step(0.0).filter(is_sane)?))
+    }
+
+    /// Where `step` leads.
+    fn moved_by(&self, step: &SVector<f64, UNKNOWNS>) -> (SE3, Brightness) {
+        let pose = SE3::exp(&pose_step(step)) * self.current_from_keyframe;
         let Brightness { a, b } = self.brightness;
-        Some((pose, Brightness { a: a + step[6], b: b + step[7] }))
+        (pose, Brightness { a: a + step[6], b: b + step[7] })
+    }
+
+    /// Whether a step from `before` to here is taken: it keeps the points in view and the energy low.
+    fn is_acceptable_after(&self, before: &Self, min_in_view: f64) -> bool {
+        let compared = f64::from(self.sums.compared);
+        let keeps_view = compared >= MIN_KEPT_IN_VIEW * f64::from(before.sums.compared);
+        keeps_view && compared >= min_in_view && self.energy_ratio(before) < TOLERATED_RISE
+    }
+
+    /// Mean energy as a share of that `before`.
+    fn energy_ratio(&self, before: &Self) -> f64 {
+        self.sums.mean_energy() / before.sums.mean_energy()
     }
 }
 
@@ -355,49 +371,34 @@ impl Aligner {
         if f64::from(state.sums.compared) < min_in_view.max(UNKNOWNS as f64) {
             return true;
         }
-        let intrinsics = reference.intrinsics().at_level(level);
-        let (mut lambda, mut failures, mut within_budget) = (0.0, 0, true);
+        let (mut damping, mut within_budget) = (Damping::default(), true);
         for iteration in 0..self.params.max_iterations[level] {
             // The first iteration was paid with the evaluation above.
             if iteration > 0 && !budget(level) {
                 within_budget = false;
                 break;
             }
-            let step = state.sums.damped_step(lambda);
-            let Some(step) = step.filter(is_sane) else {
-                (lambda, failures) = worse(lambda, failures);
-                if failures > MAX_FAILURES {
+            let Some(step) = state.sums.damped_step(damping.lambda).filter(is_sane) else {
+                if damping.fail() {
                     break;
                 }
                 continue;
             };
             alignment.iterations[level] += 1;
-            let moved_px = step_in_pixels(&step, &intrinsics, reference.mean_inverse_depth());
-            let candidate = self.evaluate(
-                reference,
-                frame,
-                level,
-                &(SE3::exp(&pose_step(&step)) * state.current_from_keyframe),
-                Brightness { a: state.brightness.a + step[6], b: state.brightness.b + step[7] },
-                &held,
-            );
-            let compared = f64::from(candidate.sums.compared);
-            let keeps_view = compared >= MIN_KEPT_IN_VIEW * f64::from(state.sums.compared);
-            let ratio = candidate.sums.mean_energy() / state.sums.mean_energy();
+            let (pose, brightness) = state.moved_by(&step);
+            let candidate = self.evaluate(reference, frame, level, &pose, brightness, &held);
             let is_small = state.sums.decrement(&step) < self.params.step_tolerance;
-            if keeps_view && compared >= min_in_view && ratio < TOLERATED_RISE {
+            let is_over = if candidate.is_acceptable_after(&state, min_in_view) {
+                let is_flat = candidate.energy_ratio(&state) > self.params.energy_tolerance
+                    && step_in_pixels(&step, reference, level) < FLAT_STEP_PX;
                 state = candidate;
-                lambda = if lambda <= FIRST_DAMPING { 0.0 } else { 0.5 * lambda };
-                failures = 0;
-                let is_flat = ratio > self.params.energy_tolerance;
-                if is_small || (is_flat && moved_px < FLAT_STEP_PX) {
-                    break;
-                }
+                damping.succeed();
+                is_flat
             } else {
-                (lambda, failures) = worse(lambda, failures);
-                if is_small || failures > MAX_FAILURES {
-                    break;
-                }
+                damping.fail()
+            };
+            if is_small || is_over {
+                break;
             }
         }
         alignment.state = state;
@@ -444,9 +445,6 @@ impl Aligner {
     }
 }
 
-/// λ after the first failure, and the bound below which a success sets it to zero.
-const FIRST_DAMPING: f64 = 0.2;
-
 /// A step is taken although it raises the mean energy by less than this: interpolation smooths
 /// noise, so that the energy is lowest between pixels, while the gradient is not misled.
 const TOLERATED_RISE: f64 = 1.02;
@@ -455,20 +453,9 @@ const TOLERATED_RISE: f64 = 1.02;
 /// level: the energy says little about where its minimum is.
 const FLAT_STEP_PX: f64 = 0.1;
 
-/// Failures in a row after which a level is given up as converged: λ has grown by 2¹⁵ then.
-const MAX_FAILURES: u32 = 5;
-
 /// A step that pushes more than half of the points out of the image, or beyond the range of the sensor, is a step
 /// into the dark, also when the rest fits better.
 const MIN_KEPT_IN_VIEW: f64 = 0.5;
-
-/// λ and the number of failures in a row after one more.
-fn worse(lambda: f64, failures: u32) -> (f64, u32) {
-    let failures = failures + 1;
-    let lambda =
-        if lambda == 0.0 { FIRST_DAMPING } else { lambda * f64::from(1u32 << failures.min(20)) };
-    (lambda, failures)
-}
 
 /// Whether a step stays in the range that is evaluated: a rotation beyond a quarter turn or a gain beyond e² is
 /// an artefact of a nearly singular system.
@@ -478,8 +465,9 @@ fn is_sane(step: &SVector<f64, UNKNOWNS>) -> bool {
 }
 
 /// How far a step moves the image, pixels of the level: f (‖t‖ d̄ + ‖ω‖).
-fn step_in_pixels(step: &SVector<f64, UNKNOWNS>, at: &Intrinsics, mean_inverse_depth: f64) -> f64 {
-    let translation = step.fixed_rows::<3>(0).norm() * mean_inverse_depth;
+fn step_in_pixels(step: &SVector<f64, UNKNOWNS>, reference: &Reference, level: usize) -> f64 {
+    let at = reference.intrinsics().at_level(level);
+    let translation = step.fixed_rows::<3>(0).norm() * reference.mean_inverse_depth();
     let rotation = step.fixed_rows::<3>(3).norm();
     at.fx.max(at.fy) * (translation + rotation)
 }

@@ -106,6 +106,19 @@ impl Evaluation {
             inlier_gate_squared: weighting.inlier_gate * weighting.inlier_gate,
         }
     }
+
+    /// X̃ of a point at inverse depth `d`.
+    #[inline(always)]
+    fn warp(&self, point: &Point, d: f32) -> [f32; 3] {
+        let [r0, r1, r2, r3, r4, r5, r6, r7, r8] = self.rotation;
+        let [tx, ty, tz] = self.translation;
+        let (x, y) = (point.ray_x, point.ray_y);
+        [
+            r0 * x + r1 * y + r2 + tx * d,
+            r3 * x + r4 * y + r5 + ty * d,
+            r6 * x + r7 * y + r8 + tz * d,
+        ]
+    }
 }
 
 /// What one point contributes.
@@ -128,55 +141,18 @@ pub struct PointTerms {
 /// The terms of one point; `None` out of view.
 #[inline(always)]
 pub fn point_terms(image: &Image<u16>, at: &Evaluation, point: &Point) -> Option<PointTerms> {
-    let [r0, r1, r2, r3, r4, r5, r6, r7, r8] = at.rotation;
-    let [tx, ty, tz] = at.translation;
-    let (x, y, d) = (point.ray_x, point.ray_y, point.inverse_depth);
-    let warped_x = r0 * x + r1 * y + r2 + tx * d;
-    let warped_y = r3 * x + r4 * y + r5 + ty * d;
-    let depth_ratio = r6 * x + r7 * y + r8 + tz * d;
-    if depth_ratio.partial_cmp(&NEAREST_DEPTH_RATIO) != Some(Ordering::Greater) {
-        return None;
-    }
-    let inverse_ratio = 1.0 / depth_ratio;
-    let (nx, ny) = (warped_x * inverse_ratio, warped_y * inverse_ratio);
-    let u = at.focal[0] * nx + at.centre[0];
-    let v = at.focal[1] * ny + at.centre[1];
-    let inside = u >= BORDER_PX && v >= BORDER_PX && u < at.upper_bound[0] && v < at.upper_bound[1];
-    if !inside {
-        return None;
-    }
-    let (column, row) = (u as usize, v as usize);
-    let (du, dv) = (u - column as f32, v - row as f32);
-    let upper = column + row * image.width();
-    let pixel = |index: usize| f32::from(image.pixels()[index]);
-    let (p00, p10) = (pixel(upper), pixel(upper + 1));
-    let (p01, p11) = (pixel(upper + image.width()), pixel(upper + image.width() + 1));
-    let (above, below) = (p00 + (p10 - p00) * du, p01 + (p11 - p01) * du);
-    let value = (above + (below - above) * dv) * at.grey_per_sum;
-
-    let d = point.surrounding_inverse_depth;
-    let depth_ratio = (r6 * x + r7 * y + r8 + tz * d).max(NEAREST_DEPTH_RATIO);
-    let inverse_ratio = 1.0 / depth_ratio;
-    let nx = (r0 * x + r1 * y + r2 + tx * d) * inverse_ratio;
-    let ny = (r3 * x + r4 * y + r5 + ty * d) * inverse_ratio;
-    // How the warp turns and scales a neighbourhood: ∂n/∂(x, y) = M/z̃.
-    let (m11, m12) = (r0 - nx * r6, r1 - nx * r7);
-    let (m21, m22) = (r3 - ny * r6, r4 - ny * r7);
-    let determinant = (m11 * m22 - m12 * m21).max(SMALLEST_DETERMINANT);
-    let scale = at.gain * depth_ratio / determinant;
-    let keyframe_x = point.gradient_x * at.focal[0];
-    let keyframe_y = point.gradient_y * at.focal[1];
-    let ax = scale * (m22 * keyframe_x - m21 * keyframe_y);
-    let ay = scale * (m11 * keyframe_y - m12 * keyframe_x);
+    let [u, v] = projection(at, point)?;
+    let value = sample(image, u, v) * at.grey_per_sum;
+    let Surface { a: [ax, ay], n: [nx, ny], inverse_ratio } = Surface::of(at, point);
     let m = ax * nx + ay * ny;
-    let predicted = at.gain * point.intensity;
-    let inverse_depth_derivative = (ax * tx + ay * ty - m * tz) * inverse_ratio;
-    let [vx, vy, vz] = at.variance_translation;
-    let weighing_derivative = (ax * vx + ay * vy - m * vz) * inverse_ratio;
+    let along = |[x, y, z]: [f32; 3]| -> f32 { (ax * x + ay * y - m * z) * inverse_ratio };
+    let inverse_depth_derivative = along(at.translation);
+    let weighing_derivative = along(at.variance_translation);
     let from_depth = weighing_derivative * weighing_derivative * point.variance;
-    let scale = d * inverse_ratio;
+    let predicted = at.gain * point.intensity;
     let residual = value - (predicted + at.offset);
     let [darkest, lightest] = UNCLIPPED_GREY;
+    let scale = point.surrounding_inverse_depth * inverse_ratio;
     Some(PointTerms {
         projection: [u, v],
         residual,
@@ -194,6 +170,64 @@ pub fn point_terms(image: &Image<u16>, at: &Evaluation, point: &Point) -> Option
             -1.0,
         ],
     })
+}
+
+/// Where a point falls, pixels of the level; `None` out of view.
+#[inline(always)]
+fn projection(at: &Evaluation, point: &Point) -> Option<[f32; 2]> {
+    let [warped_x, warped_y, depth_ratio] = at.warp(point, point.inverse_depth);
+    if depth_ratio.partial_cmp(&NEAREST_DEPTH_RATIO) != Some(Ordering::Greater) {
+        return None;
+    }
+    let inverse_ratio = 1.0 / depth_ratio;
+    let (nx, ny) = (warped_x * inverse_ratio, warped_y * inverse_ratio);
+    let u = at.focal[0] * nx + at.centre[0];
+    let v = at.focal[1] * ny + at.centre[1];
+    let inside = u >= BORDER_PX && v >= BORDER_PX && u < at.upper_bound[0] && v < at.upper_bound[1];
+    inside.then_some([u, v])
+}
+
+/// The image between its pixels.
+#[inline(always)]
+fn sample(image: &Image<u16>, u: f32, v: f32) -> f32 {
+    let (column, row) = (u as usize, v as usize);
+    let (du, dv) = (u - column as f32, v - row as f32);
+    let upper = column + row * image.width();
+    let pixel = |index: usize| f32::from(image.pixels()[index]);
+    let (p00, p10) = (pixel(upper), pixel(upper + 1));
+    let (p01, p11) = (pixel(upper + image.width()), pixel(upper + image.width() + 1));
+    let (above, below) = (p00 + (p10 - p00) * du, p01 + (p11 - p01) * du);
+    above + (below - above) * dv
+}
+
+/// The surface around a point as the frame sees it, at the depth of its surroundings.
+struct Surface {
+    /// (a_x, a_y): the keyframe's gradient, turned and scaled by the warp.
+    a: [f32; 2],
+    n: [f32; 2],
+    /// 1/z̃.
+    inverse_ratio: f32,
+}
+
+impl Surface {
+    #[inline(always)]
+    fn of(at: &Evaluation, point: &Point) -> Self {
+        let [r0, r1, _, r3, r4, _, r6, r7, _] = at.rotation;
+        let [warped_x, warped_y, depth_ratio] = at.warp(point, point.surrounding_inverse_depth);
+        let depth_ratio = depth_ratio.max(NEAREST_DEPTH_RATIO);
+        let inverse_ratio = 1.0 / depth_ratio;
+        let (nx, ny) = (warped_x * inverse_ratio, warped_y * inverse_ratio);
+        // How the warp turns and scales a neighbourhood: ∂n/∂(x, y) = M/z̃.
+        let (m11, m12) = (r0 - nx * r6, r1 - nx * r7);
+        let (m21, m22) = (r3 - ny * r6, r4 - ny * r7);
+        let determinant = (m11 * m22 - m12 * m21).max(SMALLEST_DETERMINANT);
+        let scale = at.gain * depth_ratio / determinant;
+        let keyframe_x = point.gradient_x * at.focal[0];
+        let keyframe_y = point.gradient_y * at.focal[1];
+        let ax = scale * (m22 * keyframe_x - m21 * keyframe_y);
+        let ay = scale * (m11 * keyframe_y - m12 * keyframe_x);
+        Self { a: [ax, ay], n: [nx, ny], inverse_ratio }
+    }
 }
 
 /// Sums the normal equations of `points` over `image`; the explanation of every fast kernel.

@@ -326,8 +326,6 @@ impl ImmaturePoint {
         /// Depth in the keyframe over depth in the frame at the far end: a patch seen larger or smaller
         /// shows other detail.
         const DEPTH_RATIO: std::ops::RangeInclusive<f32> = 0.75..=1.5;
-        /// Motion over all depths, pixels, below which the line has no direction.
-        const NO_MOTION_PX: f32 = 1e-4;
         let image = frame.image;
         let line = frame.view.line(f32::from(self.u), f32::from(self.v));
         let visible = |p: &Projection| is_inside(image.width(), image.height(), p.u, p.v);
@@ -340,29 +338,9 @@ impl ImmaturePoint {
         let (direction, length) = match self.max_inverse_depth {
             Some(max) => {
                 let near = line.project(max).filter(visible).ok_or(TraceStatus::OutOfBounds)?;
-                let (du, dv) = (near.u - far.u, near.v - far.v);
-                let length = du.hypot(dv);
-                self.last_segment_px = length;
-                if length < params.min_segment_px {
-                    return Err(TraceStatus::Skipped);
-                }
-                ((du / length, dv / length), length)
+                self.extent(&far, &near, params)?
             }
-            None => {
-                let (du, dv) = line.velocity(&far);
-                let speed = du.hypot(dv);
-                if !(speed > NO_MOTION_PX) {
-                    return Err(TraceStatus::BadCondition);
-                }
-                let direction = (du / speed, dv / speed);
-                let most = params.max_first_search_ratio * (image.width() + image.height()) as f32;
-                let length = most.min(distance_to_epipole(&line, &far));
-                let end = (far.u + length * direction.0, far.v + length * direction.1);
-                if !is_inside(image.width(), image.height(), end.0, end.1) {
-                    return Err(TraceStatus::OutOfBounds);
-                }
-                (direction, length)
-            }
+            None => first_extent(image, &line, &far, params)?,
         };
         // Turned and scaled as the middle of the interval says; the literature takes the turn alone,
         // the upper left of K R K⁻¹, which brings 2 % fewer points to maturity.
@@ -378,6 +356,23 @@ impl ImmaturePoint {
         let offsets_v = PATTERN.map(|(x, y)| warp[2] * x as f32 + warp[3] * y as f32);
         let start = (far.u, far.v);
         Ok(Segment { line, start, direction, length, offsets_u, offsets_v, inverse_warp })
+    }
+
+    /// Direction and length of the segment between the ends of the interval.
+    #[inline(always)]
+    fn extent(
+        &mut self,
+        far: &Projection,
+        near: &Projection,
+        params: &IntervalParams,
+    ) -> Result<((f32, f32), f32), TraceStatus> {
+        let (du, dv) = (near.u - far.u, near.v - far.v);
+        let length = du.hypot(dv);
+        self.last_segment_px = length;
+        if length < params.min_segment_px {
+            return Err(TraceStatus::Skipped);
+        }
+        Ok(((du / length, dv / length), length))
     }
 
     /// Expected error of a match, pixels: `e = c + c (h_∥ + h_⊥)/h_∥` with the structure tensor along
@@ -409,6 +404,31 @@ impl ImmaturePoint {
         let mixed = (u32::from(self.u) << 16 | u32::from(self.v)).wrapping_mul(0x9E37_79B9);
         ((mixed ^ (mixed >> 15)).wrapping_mul(0x85EB_CA6B) >> 8) as f32 / (1 << 24) as f32
     }
+}
+
+/// Direction and length of the first segment, which only the longest search and the epipole end.
+#[inline(always)]
+fn first_extent(
+    image: &QuadImage,
+    line: &EpipolarLine,
+    far: &Projection,
+    params: &IntervalParams,
+) -> Result<((f32, f32), f32), TraceStatus> {
+    /// Motion over all depths, pixels, below which the line has no direction.
+    const NO_MOTION_PX: f32 = 1e-4;
+    let (du, dv) = line.velocity(far);
+    let speed = du.hypot(dv);
+    if !(speed > NO_MOTION_PX) {
+        return Err(TraceStatus::BadCondition);
+    }
+    let direction = (du / speed, dv / speed);
+    let most = params.max_first_search_ratio * (image.width() + image.height()) as f32;
+    let length = most.min(distance_to_epipole(line, far));
+    let end = (far.u + length * direction.0, far.v + length * direction.1);
+    if !is_inside(image.width(), image.height(), end.0, end.1) {
+        return Err(TraceStatus::OutOfBounds);
+    }
+    Ok((direction, length))
 }
 
 /// How far ahead of `far` the image of infinitely near points lies, if the line runs towards it.

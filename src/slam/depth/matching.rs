@@ -194,26 +194,7 @@ pub fn condition(
     gain: f32,
     params: &MatchingParams,
 ) -> Option<Conditioning> {
-    let (vu, vv) = line.velocity(at);
-    let speed = (vu * vu + vv * vv).sqrt();
-    if !(speed > f32::MIN_POSITIVE) {
-        return None;
-    }
-    let direction = (vu / speed, vv / speed);
-    let warp = view.patch_warp(at);
-    let determinant = warp[0] * warp[3] - warp[1] * warp[2];
-    if !DETERMINANT.contains(&determinant) {
-        return None;
-    }
-    let inverse = [warp[3], -warp[1], -warp[2], warp[0]].map(|x| x / determinant);
-    let along = (
-        inverse[0] * direction.0 + inverse[1] * direction.1,
-        inverse[2] * direction.0 + inverse[3] * direction.1,
-    );
-    let across = (
-        -inverse[0] * direction.1 + inverse[1] * direction.0,
-        -inverse[2] * direction.1 + inverse[3] * direction.0,
-    );
+    let LineAxes { direction, warp, along, across, speed } = LineAxes::of(view, line, at)?;
     let [uu, uv, vv] = structure.map(|sum| gain * gain * sum);
     let product = |a: (f32, f32), b: (f32, f32)| {
         uu * a.0 * b.0 + uv * (a.0 * b.1 + a.1 * b.0) + vv * a.1 * b.1
@@ -252,6 +233,47 @@ pub fn condition(
     })
 }
 
+/// A line at one projection, in the frame and turned back into the keyframe.
+struct LineAxes {
+    /// Unit direction of the line in the frame, towards larger inverse depth.
+    direction: (f32, f32),
+    /// Jacobian of the frame's position by the keyframe's, row-major.
+    warp: [f32; 4],
+    /// The steps in the keyframe of one pixel in the frame, along the line and across it.
+    along: (f32, f32),
+    across: (f32, f32),
+    /// Pixels a unit of inverse depth.
+    speed: f32,
+}
+
+impl LineAxes {
+    /// `None` where there is no parallax, or where the patch is seen too much smaller or larger.
+    #[inline(always)]
+    fn of(view: &TwoView, line: &EpipolarLine, at: &Projection) -> Option<Self> {
+        let (vu, vv) = line.velocity(at);
+        let speed = (vu * vu + vv * vv).sqrt();
+        if !(speed > f32::MIN_POSITIVE) {
+            return None;
+        }
+        let direction = (vu / speed, vv / speed);
+        let warp = view.patch_warp(at);
+        let determinant = warp[0] * warp[3] - warp[1] * warp[2];
+        if !DETERMINANT.contains(&determinant) {
+            return None;
+        }
+        let inverse = [warp[3], -warp[1], -warp[2], warp[0]].map(|x| x / determinant);
+        let along = (
+            inverse[0] * direction.0 + inverse[1] * direction.1,
+            inverse[2] * direction.0 + inverse[3] * direction.1,
+        );
+        let across = (
+            -inverse[0] * direction.1 + inverse[1] * direction.0,
+            -inverse[2] * direction.1 + inverse[3] * direction.0,
+        );
+        Some(Self { direction, warp, along, across, speed })
+    }
+}
+
 impl Conditioning {
     /// How uncertain a match would leave the inverse depth.
     #[inline(always)]
@@ -263,6 +285,13 @@ impl Conditioning {
     #[inline(always)]
     pub fn own_std_dev(&self) -> f32 {
         self.own_variance.sqrt()
+    }
+
+    /// Largest mean squared residual of a match, grey levels².
+    #[inline(always)]
+    fn residual_limit(&self, params: &MatchingParams) -> f32 {
+        params.max_residual * params.max_residual
+            + params.residual_per_gradient * params.residual_per_gradient * self.squared_gradient
     }
 
     #[inline(always)]
@@ -296,17 +325,10 @@ pub fn search<S: Sampler>(
     }
     let middle = (0.5 * (from.u + to.u), 0.5 * (from.v + to.v));
     let reach = 0.5 * length + REFINE_REACH_PX;
-    if !is_inside(
-        frame.image.width(),
-        frame.image.height(),
-        middle.0 - reach * du,
-        middle.1 - reach * dv,
-    ) || !is_inside(
-        frame.image.width(),
-        frame.image.height(),
-        middle.0 + reach * du,
-        middle.1 + reach * dv,
-    ) {
+    let (width, height) = (frame.image.width(), frame.image.height());
+    if !is_inside(width, height, middle.0 - reach * du, middle.1 - reach * dv)
+        || !is_inside(width, height, middle.0 + reach * du, middle.1 + reach * dv)
+    {
         return Err(Miss::OutOfView);
     }
     let along = along(frame, patch, conditioning, middle);
@@ -315,12 +337,8 @@ pub fn search<S: Sampler>(
     let best = if steps == 0 { along.only(0.0) } else { along.scan(-0.5 * steps as f32, steps) };
     let gradients = patch.gradients_along(conditioning.along);
     let (lambda, cost) = along.refine(&best, |_| gradients, REFINE_REACH_PX);
-    let limit = params.max_residual * params.max_residual
-        + params.residual_per_gradient
-            * params.residual_per_gradient
-            * conditioning.squared_gradient;
     let mean_squared_residual = cost / PATTERN.len() as f32;
-    if !(mean_squared_residual <= limit) {
+    if !(mean_squared_residual <= conditioning.residual_limit(params)) {
         return Err(Miss::Mismatch);
     }
     let pixel_std_dev = params.noise.pixel_std_dev;
@@ -334,11 +352,8 @@ pub fn search<S: Sampler>(
     let at = line.project(inverse_depth).ok_or(Miss::OutOfView)?;
     let (vu, vv) = line.velocity(&at);
     let alpha = 1.0 / (vu * vu + vv * vv).sqrt().max(f32::MIN_POSITIVE);
-    Ok(Match {
-        inverse_depth,
-        uncertainty: conditioning.times(alpha * alpha),
-        mean_squared_residual,
-    })
+    let uncertainty = conditioning.times(alpha * alpha);
+    Ok(Match { inverse_depth, uncertainty, mean_squared_residual })
 }
 
 /// The patch of a keyframe pixel in a frame, from `middle` along its line.

@@ -56,7 +56,7 @@ fn solve_from<const D: usize>(
         iterations += 1;
         // Damping hides how far it is along what is hardly determined: a long chain bends at next to no cost.
         let used = if is_near { 0.0 } else { damping };
-        if !factorisation.factorise(&system.blocks, used) {
+        let Some(expected) = take_step(&system, &mut factorisation, used, &mut step) else {
             if is_near {
                 // The best there is, of places that are not all determined.
                 break;
@@ -66,11 +66,7 @@ fn solve_from<const D: usize>(
                 return Err(SolveError::Singular);
             }
             continue;
-        }
-        step.clear();
-        step.extend(system.gradient.iter().map(|value| -value));
-        factorisation.solve(&mut step);
-        let expected = expected_decrease(&system, &step, used);
+        };
         place_after(&places, &system, &step, &mut moved);
         let trial = cost::<D>(constraints, &moved);
         let decrease = current - trial;
@@ -92,6 +88,22 @@ fn solve_from<const D: usize>(
     let chi2 = constraints.iter().map(|constraint| error::<D>(constraint, &places)).sum();
     graph.places_mut().zip(places).for_each(|(into, place)| *into = place);
     Ok(Outcome { initial_cost, cost: current, chi2, iterations, is_converged })
+}
+
+/// Solves for the step; by how much it would lower the cost, `None` where the equations are singular.
+fn take_step<const D: usize>(
+    system: &System<D>,
+    factorisation: &mut Factorisation<D>,
+    damping: f64,
+    step: &mut Vec<f64>,
+) -> Option<f64> {
+    if !factorisation.factorise(&system.blocks, damping) {
+        return None;
+    }
+    step.clear();
+    step.extend(system.gradient.iter().map(|value| -value));
+    factorisation.solve(step);
+    Some(expected_decrease(system, step, damping))
 }
 
 /// What the linear equations promise: −2gᵀδ − δᵀHδ with (H + μ diag H) δ = −g.

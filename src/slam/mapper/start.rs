@@ -1,6 +1,8 @@
 //! How a map begins: from two frames, from a sensor, or from given poses.
 
-use crate::slam::depth::gaussian::{NEW_VALIDITY, ObservedPixels, Observer, observe};
+use crate::slam::depth::gaussian::{
+    NEW_VALIDITY, ObservationCounts, ObservedPixels, Observer, observe,
+};
 use crate::slam::depth::map::{DepthMap, Hypothesis};
 use crate::slam::depth::matching::MatchingParams;
 use crate::slam::depth::pose_noise::pose_noise_px;
@@ -190,6 +192,37 @@ impl Mapper {
         self.begin_epoch(&first_pixels);
         let epoch = self.next_epoch();
         self.start.initializer.fill(&mut self.depth.active);
+        let observations = self.observe_proven(frame, start);
+        self.depth.refine(&self.params);
+        let scale = self.depth.normalise();
+        self.modes.rescale(scale);
+        let first_frame = FrameView {
+            sequence: first.0,
+            capture_nanos: first.1,
+            pixels: &first_pixels,
+            ..*frame
+        };
+        let place = UncertainPlace::exact(Sim3::new(origin, unit * scale));
+        self.add_keyframe(&first_frame, &place, epoch);
+        let pose = PoseEstimate {
+            epoch,
+            world_from_camera: Sim3::new(origin, unit).place(&start.first_from_current),
+            keyframe_id: self.next_keyframe_id - 1,
+            ..proven_pose(frame, start, scale)
+        };
+        self.change_keyframe(frame, &pose, None);
+        self.adopt_early_frames(&pose.keyframe_from_camera);
+        StepOutcome {
+            keyframe_created: true,
+            keyframe_changed: true,
+            graph_changed: true,
+            observations,
+            ..Default::default()
+        }
+    }
+
+    /// Observes the depth of the first frame in the one that proves the start.
+    fn observe_proven(&mut self, frame: &FrameView<'_>, start: &InitOutcome) -> ObservationCounts {
         self.frame.fill(frame.pixels);
         let observer = Observer {
             image: &self.frame,
@@ -203,41 +236,23 @@ impl Mapper {
         self.modes.begin(&self.depth.active, &self.intrinsics, &current_from_first, covariance);
         let observations = observe(&mut self.depth.active, &observer, matching, gaussian).counts;
         self.modes.observed(&self.depth.active, &current_from_first);
-        self.depth.refine(&self.params);
-        let scale = self.depth.normalise();
-        self.modes.rescale(scale);
-        let first_frame = FrameView {
-            sequence: first.0,
-            capture_nanos: first.1,
-            pixels: &first_pixels,
-            ..*frame
-        };
-        let place = UncertainPlace::exact(Sim3::new(origin, unit * scale));
-        self.add_keyframe(&first_frame, &place, epoch);
-        let mut keyframe_from_camera = start.first_from_current;
-        keyframe_from_camera.translation /= scale;
-        let pose = PoseEstimate {
-            state: TrackingState::Initializing,
-            epoch,
-            world_from_camera: Sim3::new(origin, unit).place(&start.first_from_current),
-            keyframe_from_camera,
-            covariance: upper_triangle(|row, column| {
-                let unit = |of: usize| if of < 3 { scale } else { 1.0 };
-                start.pose_covariance[(row, column)] / (unit(row) * unit(column))
-            }),
-            brightness: start.brightness,
-            keyframe_id: self.next_keyframe_id - 1,
-            ..PoseEstimate::unknown(frame)
-        };
-        self.change_keyframe(frame, &pose, None);
-        self.adopt_early_frames(&pose.keyframe_from_camera);
-        StepOutcome {
-            keyframe_created: true,
-            keyframe_changed: true,
-            graph_changed: true,
-            observations,
-            ..Default::default()
-        }
+        observations
+    }
+}
+
+/// The pose of the frame that proves a start, on the first as a keyframe whose unit is `scale`.
+fn proven_pose(frame: &FrameView<'_>, start: &InitOutcome, scale: f64) -> PoseEstimate {
+    let mut keyframe_from_camera = start.first_from_current;
+    keyframe_from_camera.translation /= scale;
+    PoseEstimate {
+        state: TrackingState::Initializing,
+        keyframe_from_camera,
+        covariance: upper_triangle(|row, column| {
+            let unit = |of: usize| if of < 3 { scale } else { 1.0 };
+            start.pose_covariance[(row, column)] / (unit(row) * unit(column))
+        }),
+        brightness: start.brightness,
+        ..PoseEstimate::unknown(frame)
     }
 }
 

@@ -1,5 +1,7 @@
 //! What is said of a frame: judged, with its covariance, or not claimed.
 
+use nalgebra::Matrix6;
+
 use crate::slam::alignment::align::Alignment;
 use crate::slam::alignment::reference::Reference;
 use crate::slam::frame::FrameView;
@@ -13,6 +15,29 @@ use crate::slam::tracker::velocity::PoseErrors;
 use crate::slam::tracker::verdict::quality_of;
 use crate::slam::tracker::{Tracker, upper_triangle};
 
+/// Where the camera is.
+struct Placed {
+    keyframe_from_camera: SE3,
+    world_from_camera: SE3,
+    map_from_camera: SE3,
+}
+
+impl Placed {
+    /// Where `alignment` finds it.
+    fn of(reference: &Reference, alignment: &Alignment) -> Self {
+        let keyframe_from_camera = alignment.state.current_from_keyframe.inverse();
+        Self {
+            keyframe_from_camera,
+            world_from_camera: reference.world_from_keyframe().place(&keyframe_from_camera),
+            map_from_camera: reference.map_from_keyframe().place(&keyframe_from_camera),
+        }
+    }
+
+    fn is_finite(&self) -> bool {
+        self.world_from_camera.is_finite() && self.map_from_camera.is_finite()
+    }
+}
+
 impl Tracker {
     /// Judges the alignment and puts the estimate together.
     pub(super) fn report(
@@ -23,29 +48,43 @@ impl Tracker {
         missing: u64,
     ) -> PoseEstimate {
         let quality = self.quality(alignment);
-        let found =
-            reference.world_from_keyframe().place(&alignment.state.current_from_keyframe.inverse());
-        if self.contradicts_hold(frame.capture_nanos, &found) {
+        let placed = Placed::of(reference, alignment);
+        let (nanos, world_from_camera) = (frame.capture_nanos, &placed.world_from_camera);
+        if self.contradicts_hold(nanos, world_from_camera) {
             return self.lost(frame, reference, LostReason::TooFewInliers, quality);
         }
-        let has_jumped = missing == 0 && self.has_jumped(reference, frame.capture_nanos, &found);
+        let has_jumped = missing == 0 && self.has_jumped(reference, nanos, world_from_camera);
         let must_be_sure = self.memory.was_lost || has_jumped;
         let verdict = self.params.verdict.judge(alignment, &quality, must_be_sure, missing);
+        if let TrackingState::Lost(reason) = verdict {
+            return self.lost(frame, reference, reason, quality);
+        }
         let covariance = alignment.covariance(&self.params.alignment);
-        let keyframe_from_camera = alignment.state.current_from_keyframe.inverse();
-        let world_from_camera = reference.world_from_keyframe().place(&keyframe_from_camera);
-        let map_from_camera = reference.map_from_keyframe().place(&keyframe_from_camera);
-        let covariance = match (verdict, covariance) {
-            (TrackingState::Lost(reason), _) => {
-                return self.lost(frame, reference, reason, quality);
-            }
-            (_, Some(covariance))
-                if world_from_camera.is_finite() && map_from_camera.is_finite() =>
-            {
-                covariance
-            }
-            _ => return self.lost(frame, reference, LostReason::TooFewInliers, quality),
+        let Some(covariance) = covariance.filter(|_| placed.is_finite()) else {
+            return self.lost(frame, reference, LostReason::TooFewInliers, quality);
         };
+        self.memory.motion.observe(nanos, world_from_camera);
+        self.memory.brightness = alignment.state.brightness;
+        let state = match reference.map_state() {
+            MapState::Established => verdict,
+            MapState::Rejected => TrackingState::Lost(LostReason::MapRejected),
+        };
+        let estimate = self.unclaimed(frame, Some(reference), state);
+        self.claim(reference, alignment, &placed, &covariance, PoseEstimate { quality, ..estimate })
+    }
+
+    /// An estimate with its pose and what is known of that: `covariance` is that of the alignment, to which the common
+    /// errors of the depth and the displacement of the whole image add.
+    fn claim(
+        &mut self,
+        reference: &Reference,
+        alignment: &Alignment,
+        placed: &Placed,
+        covariance: &Matrix6<f64>,
+        unclaimed: PoseEstimate,
+    ) -> PoseEstimate {
+        let Placed { keyframe_from_camera, world_from_camera, map_from_camera } = *placed;
+        let PoseEstimate { state, quality, .. } = unclaimed;
         let displacement = displacement_covariance(
             quality.displacement_px,
             &self.intrinsics,
@@ -55,23 +94,16 @@ impl Tracker {
             + alignment.covariance_from_modes(reference).unwrap_or_default()
             + displacement;
         let in_map = reference.uncertain_place().of_camera(&keyframe_from_camera, &published);
-        self.memory.motion.observe(frame.capture_nanos, &world_from_camera);
-        self.memory.brightness = alignment.state.brightness;
-        let state = match reference.map_state() {
-            MapState::Established => verdict,
-            MapState::Rejected => TrackingState::Lost(LostReason::MapRejected),
-        };
         let errors = PoseErrors {
             keyframe: (reference.keyframe_id(), reference.epoch()),
             unit: reference.world_from_keyframe().scale,
-            alignment: covariance,
+            alignment: *covariance,
             displacement,
             by_mode: alignment.d_pose_d_modes(reference).unwrap_or_default(),
             modes: *reference.mode_covariance(),
         };
         let velocity = self.memory.velocity.observe(errors, self.memory.motion.last_step());
         PoseEstimate {
-            state,
             world_from_camera,
             map_from_camera,
             keyframe_from_camera,
@@ -81,8 +113,7 @@ impl Tracker {
             velocity: velocity.filter(|_| state.is_tracked()),
             brightness: alignment.state.brightness,
             proposes_keyframe: self.proposes_keyframe(reference, alignment, &quality),
-            quality,
-            ..self.unclaimed(frame, Some(reference), state)
+            ..unclaimed
         }
     }
 

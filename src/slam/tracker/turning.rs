@@ -120,6 +120,14 @@ pub(super) struct Place {
     covariance: Matrix6<f64>,
 }
 
+impl Place {
+    /// Of the distance that a camera goes from here until `since_secs`: one that moves on evenly, whose distance grows
+    /// with the time and not with the root of it.
+    fn distance_variance(&self, since_secs: f64) -> f64 {
+        self.speed.powi(2) * (since_secs.powi(2) - self.since_secs.powi(2))
+    }
+}
+
 impl Turning {
     /// With memory for frames like `pyramid`, of a camera with these intrinsics.
     pub(super) fn new(
@@ -187,6 +195,15 @@ impl Turning {
         self.is_due = false;
     }
 
+    /// The frame of `estimate` is to be the next view.
+    fn take_over(&mut self, estimate: &PoseEstimate, place: Place) {
+        self.is_first = false;
+        // Frames that follow each other are blurred alike, and show nearly the same.
+        self.is_due = true;
+        let world_from_view = Sim3::new(estimate.world_from_camera, place.world_from_view.scale);
+        self.place = Some(Place { world_from_view, nanos: estimate.capture_nanos, ..place });
+    }
+
     /// The keyframe fits again, or nothing does; whether a view was held.
     pub(super) fn end(&mut self) -> bool {
         self.is_due = false;
@@ -216,20 +233,12 @@ impl Tracker {
         }
         let place = self.turning.place?;
         let mut view = self.turning.view.take()?;
-        let last_sequence = self.memory.last_sequence;
-        let held = Memory { last_sequence, ..before.clone() };
-        let lost = std::mem::replace(&mut self.memory, held);
-        (self.memory.brightness, self.memory.coarse_fit) =
-            (Brightness::default(), self.turning.coarse_fit);
-        // The motion on the keyframe's last points may be anything.
-        self.memory.was_lost = self.turning.is_first;
+        let lost = self.recall(before);
         let since_view = frame.capture_nanos.saturating_sub(place.nanos) as f64 * 1e-9;
         let step = since_view.clamp(LEAST_SECONDS, MOST_SECONDS);
         view.stand_at(&place.world_from_view, TIGHTNESS * place.speed * step);
-        let since = place.since_secs;
-        let mut next = Place { since_secs: since + step, ..place };
-        // A camera that moves on evenly: its distance grows with the time, not with the root of it.
-        let distance_variance = place.speed.powi(2) * (next.since_secs.powi(2) - since.powi(2));
+        let mut next = Place { since_secs: place.since_secs + step, ..place };
+        let distance_variance = place.distance_variance(next.since_secs);
         std::mem::swap(&mut self.aligner, &mut self.turning.aligner);
         let (alignment, coarse_fit) = self.align(&view, frame, budget);
         std::mem::swap(&mut self.aligner, &mut self.turning.aligner);
@@ -256,15 +265,23 @@ impl Tracker {
         self.memory.coarse_fit = before.coarse_fit;
         // One that was cut short is no view for the next: its error would stay.
         if !is_cut_short {
-            (self.turning.is_first, self.turning.coarse_fit) = (false, coarse_fit);
-            // Frames that follow each other are blurred alike, and show nearly the same.
-            self.turning.is_due = true;
-            let world_from_view =
-                Sim3::new(estimate.world_from_camera, place.world_from_view.scale);
-            let nanos = frame.capture_nanos;
-            self.turning.place = Some(Place { world_from_view, nanos, covariance, ..next });
+            self.turning.coarse_fit = coarse_fit;
+            self.turning.take_over(&estimate, Place { covariance, ..next });
         }
         Some(estimate)
+    }
+
+    /// Remembers what was before the loss, as it is expected of the next frame on the view; what the loss has left.
+    fn recall(&mut self, before: &Memory) -> Memory {
+        let held = Memory {
+            last_sequence: self.memory.last_sequence,
+            brightness: Brightness::default(),
+            coarse_fit: self.turning.coarse_fit,
+            // The motion on the keyframe's last points may be anything.
+            was_lost: self.turning.is_first,
+            ..before.clone()
+        };
+        std::mem::replace(&mut self.memory, held)
     }
 
     /// Whether a keyframe's points would be in view from where a view holds the camera: it has not turned away from them then,

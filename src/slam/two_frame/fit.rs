@@ -136,65 +136,94 @@ pub fn fit_level(
     scratch: &mut FitScratch,
     params: &FitParams,
 ) -> f64 {
-    const FIRST_DAMPING: f64 = 0.01;
-    const LEAST_DAMPING: f64 = 1e-6;
-    const SUCCESS_FACTOR: f64 = 0.3;
-    const FAILURE_FACTOR: f64 = 5.0;
-    /// So many failures in a row make a step of nothing.
-    const MAX_FAILURES: u32 = 5;
     let view = input.level(level);
     let find_medians = system_kernels().medians;
     let weights = params.prior_weights();
     scratch.system.evaluate(&view, state);
     find_medians(&input.points.neighbours, &state.inverse_depths, &mut scratch.medians);
-    let (mut damping, mut failures) = (FIRST_DAMPING, 0);
+    let mut damping = Damping::FIRST;
     for _ in 0..params.max_iterations {
-        let step = match freedom {
-            Freedom::Rotation => rotation_step(&scratch.system, damping),
-            Freedom::Pose => pose_step(&scratch.system, damping),
-            Freedom::Everything => {
-                scratch.elimination.weights = weights;
-                joint_step(scratch, state, damping)
-            }
-        };
-        let Some(step) = step else {
+        let Some(step) = step_of(freedom, scratch, state, damping.factor, weights) else {
             // The model is good for less than the step that it asks for.
-            damping *= FAILURE_FACTOR;
-            failures += 1;
-            if failures >= MAX_FAILURES {
+            if damping.fail() {
                 break;
             }
             continue;
         };
-        let mut next = State {
-            inverse_depths: std::mem::take(&mut scratch.trial_depths),
-            ..moved(state, &step)
-        };
+        let depths = std::mem::take(&mut scratch.trial_depths);
+        let mut next = State { inverse_depths: depths, ..moved(state, &step) };
         if freedom != Freedom::Everything {
             next.inverse_depths.clone_from(&state.inverse_depths);
         }
         scratch.trial.evaluate(&view, &next);
-        let before =
-            scratch.system.energy + prior_energy(&state.inverse_depths, &scratch.medians, weights);
-        let after =
-            scratch.trial.energy + prior_energy(&next.inverse_depths, &scratch.medians, weights);
-        if after < before {
+        let before = energy(&scratch.system, state, &scratch.medians, weights);
+        let after = energy(&scratch.trial, &next, &scratch.medians, weights);
+        let is_over = if after < before {
             std::mem::swap(state, &mut next);
             std::mem::swap(&mut scratch.system, &mut scratch.trial);
             find_medians(&input.points.neighbours, &state.inverse_depths, &mut scratch.medians);
-            damping = (damping * SUCCESS_FACTOR).max(LEAST_DAMPING);
-            failures = 0;
+            damping.succeed();
+            before - after < params.min_energy_drop * before
         } else {
-            damping *= FAILURE_FACTOR;
-            failures += 1;
-        }
+            damping.fail()
+        };
         scratch.trial_depths = next.inverse_depths;
-        let stalled = after < before && before - after < params.min_energy_drop * before;
-        if stalled || failures >= MAX_FAILURES {
+        if is_over {
             break;
         }
     }
-    scratch.system.energy + prior_energy(&state.inverse_depths, &scratch.medians, weights)
+    energy(&scratch.system, state, &scratch.medians, weights)
+}
+
+/// Damping of the steps, and how many in a row failed.
+struct Damping {
+    factor: f64,
+    failures: u32,
+}
+
+impl Damping {
+    const FIRST: Self = Self { factor: 0.01, failures: 0 };
+
+    /// A step lowered the energy.
+    fn succeed(&mut self) {
+        const SUCCESS_FACTOR: f64 = 0.3;
+        const LEAST_DAMPING: f64 = 1e-6;
+        self.factor = (self.factor * SUCCESS_FACTOR).max(LEAST_DAMPING);
+        self.failures = 0;
+    }
+
+    /// There was no step, or it did not; whether it is over.
+    fn fail(&mut self) -> bool {
+        const FAILURE_FACTOR: f64 = 5.0;
+        /// So many failures in a row make a step of nothing.
+        const MAX_FAILURES: u32 = 5;
+        self.factor *= FAILURE_FACTOR;
+        self.failures += 1;
+        self.failures >= MAX_FAILURES
+    }
+}
+
+/// Energy of `system`, evaluated at `state`, with the priors.
+fn energy(system: &System, state: &State, medians: &[f32], weights: PriorWeights) -> f64 {
+    system.energy + prior_energy(&state.inverse_depths, medians, weights)
+}
+
+/// The step of what may move; where the depths may, those after it go to `trial_depths`.
+fn step_of(
+    freedom: Freedom,
+    scratch: &mut FitScratch,
+    state: &State,
+    damping: f64,
+    weights: PriorWeights,
+) -> Option<SVector<f64, NUM_UNKNOWNS>> {
+    match freedom {
+        Freedom::Rotation => rotation_step(&scratch.system, damping),
+        Freedom::Pose => pose_step(&scratch.system, damping),
+        Freedom::Everything => {
+            scratch.elimination.weights = weights;
+            joint_step(scratch, state, damping)
+        }
+    }
 }
 
 /// The state after a step of pose and brightness, without depths.

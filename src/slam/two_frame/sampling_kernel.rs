@@ -1,5 +1,8 @@
 //! Samples of a frame with their gradients, for the vector units that the processor has.
 
+#[cfg(target_arch = "x86_64")]
+use std::arch::x86_64::*;
+
 use crate::slam::image::buffer::Image;
 use crate::slam::two_frame::lanes::{LANES, Lanes, lanes};
 
@@ -92,8 +95,6 @@ impl WindowSampler for Avx2Sampler {
 #[cfg(target_arch = "x86_64")]
 #[inline(always)]
 unsafe fn sample_avx2(image: &Image<f32>, u: &Lanes, v: &Lanes) -> [Lanes; 3] {
-    use std::arch::x86_64::*;
-
     let (pixels, width) = (image.pixels(), image.width());
     let last = last_window(image);
     // SAFETY: AVX2 is this function's contract. Loads and stores are of arrays of eight, or of four
@@ -123,7 +124,25 @@ unsafe fn sample_avx2(image: &Image<f32>, u: &Lanes, v: &Lanes) -> [Lanes; 3] {
             let b = _mm_add_ps(upper, _mm_mul_ps(fv, _mm_sub_ps(lower, upper)));
             rows[l] = _mm256_set_m128(b, a);
         }
-        // 8×8 transposed: in each half of the registers first pairs, then fours.
+        let (mut fractions, mut out) = ([0.0; LANES], [[0.0; LANES]; 6]);
+        _mm256_storeu_ps(fractions.as_mut_ptr(), fu);
+        for (out, column) in out.iter_mut().zip(transposed(&rows)) {
+            _mm256_storeu_ps(out.as_mut_ptr(), column);
+        }
+        across(&fractions, &out)
+    }
+}
+
+/// The first six columns of eight rows.
+///
+/// # Safety
+/// As [`sample_avx2`].
+#[cfg(target_arch = "x86_64")]
+#[inline(always)]
+unsafe fn transposed(rows: &[__m256; LANES]) -> [__m256; 6] {
+    // SAFETY: AVX2 is this function's contract.
+    unsafe {
+        // In each half of the registers first pairs, then fours.
         let (p0, p1) = (_mm256_unpacklo_ps(rows[0], rows[1]), _mm256_unpackhi_ps(rows[0], rows[1]));
         let (p2, p3) = (_mm256_unpacklo_ps(rows[2], rows[3]), _mm256_unpackhi_ps(rows[2], rows[3]));
         let (p4, p5) = (_mm256_unpacklo_ps(rows[4], rows[5]), _mm256_unpackhi_ps(rows[4], rows[5]));
@@ -136,19 +155,13 @@ unsafe fn sample_avx2(image: &Image<f32>, u: &Lanes, v: &Lanes) -> [Lanes; 3] {
         let f5 = _mm256_shuffle_ps::<0xEE>(p4, p6);
         let f6 = _mm256_shuffle_ps::<0x44>(p5, p7);
         let f7 = _mm256_shuffle_ps::<0xEE>(p5, p7);
-        let columns = [
+        [
             _mm256_permute2f128_ps::<0x20>(f0, f4),
             _mm256_permute2f128_ps::<0x20>(f1, f5),
             _mm256_permute2f128_ps::<0x20>(f2, f6),
             _mm256_permute2f128_ps::<0x20>(f3, f7),
             _mm256_permute2f128_ps::<0x31>(f1, f5),
             _mm256_permute2f128_ps::<0x31>(f2, f6),
-        ];
-        let (mut fractions, mut out) = ([0.0; LANES], [[0.0; LANES]; 6]);
-        _mm256_storeu_ps(fractions.as_mut_ptr(), fu);
-        for (out, column) in out.iter_mut().zip(columns) {
-            _mm256_storeu_ps(out.as_mut_ptr(), column);
-        }
-        across(&fractions, &out)
+        ]
     }
 }

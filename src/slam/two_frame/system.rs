@@ -206,6 +206,26 @@ impl Geometry {
             offset: state.brightness.b as f32,
         }
     }
+
+    /// q of points of inverse depth `d`.
+    #[inline(always)]
+    fn moved(&self, patch: &PatchBlock, d: &Lanes) -> [Lanes; 3] {
+        let (m, t) = (&self.rotation, &self.translation);
+        let x = lanes(|l| (patch.u[l] - self.cx) / self.fx);
+        let y = lanes(|l| (patch.v[l] - self.cy) / self.fy);
+        [0, 1, 2].map(|r| lanes(|l| m[r][0] * x[l] + m[r][1] * y[l] + m[r][2] + t[r] * d[l]))
+    }
+
+    /// Where sample `k` of points at `q` falls: column, row, and its depth ratio.
+    #[inline(always)]
+    fn project(&self, q: &[Lanes; 3], k: usize) -> [Lanes; 3] {
+        let offset = &self.offsets[k];
+        let z = lanes(|l| q[2][l] + offset[2]);
+        let inverse_z = lanes(|l| 1.0 / z[l]);
+        let u = lanes(|l| self.fx * (q[0][l] + offset[0]) * inverse_z[l] + self.cx);
+        let v = lanes(|l| self.fy * (q[1][l] + offset[1]) * inverse_z[l] + self.cy);
+        [u, v, z]
+    }
 }
 
 /// Sums over the samples of each point's pattern. c is eᵃ I₀, w the weight with Huber's.
@@ -237,17 +257,10 @@ impl PatternSums {
     ) -> Self {
         /// Depth ratio below which a point counts as behind the camera.
         const MIN_DEPTH_RATIO: f32 = 0.05;
-        let (m, t) = (&geometry.rotation, &geometry.translation);
-        let (x, y) = (
-            lanes(|l| (patch.u[l] - geometry.cx) / geometry.fx),
-            lanes(|l| (patch.v[l] - geometry.cy) / geometry.fy),
-        );
-        let q =
-            [0, 1, 2].map(|r| lanes(|l| m[r][0] * x[l] + m[r][1] * y[l] + m[r][2] + t[r] * d[l]));
         // One pixel inside the border, where the central difference is defined.
         let (last_u, last_v) = ((image.width() - 2) as f32, (image.height() - 2) as f32);
         let mut sums = Self {
-            q,
+            q: geometry.moved(patch, d),
             squares: [[0.0; LANES]; 3],
             by_u: [[0.0; LANES]; 2],
             by_v: [[0.0; LANES]; 2],
@@ -257,44 +270,46 @@ impl PatternSums {
             visible: patch.weight.map(|weight| weight > 0.0),
         };
         for k in 0..PATTERN.len() {
-            let offset = &geometry.offsets[k];
-            let z = lanes(|l| q[2][l] + offset[2]);
-            let inverse_z = lanes(|l| 1.0 / z[l]);
-            let u = lanes(|l| geometry.fx * (q[0][l] + offset[0]) * inverse_z[l] + geometry.cx);
-            let v = lanes(|l| geometry.fy * (q[1][l] + offset[1]) * inverse_z[l] + geometry.cy);
+            let [u, v, z] = geometry.project(&sums.q, k);
             for l in 0..LANES {
                 let is_inside = (u[l] >= 1.0) & (v[l] >= 1.0) & (u[l] < last_u) & (v[l] < last_v);
                 sums.visible[l] &= is_inside & (z[l] > MIN_DEPTH_RATIO);
             }
-            let [brightness, gu, gv] = sampler.sample(image, &u, &v);
             let c = lanes(|l| geometry.gain * patch.intensities[k][l]);
+            let [brightness, gu, gv] = sampler.sample(image, &u, &v);
             let r = lanes(|l| brightness[l] - (c[l] + geometry.offset));
-            let huber = lanes(|l| {
-                let size = r[l].abs();
-                HUBER_GREY / if size > HUBER_GREY { size } else { HUBER_GREY }
-            });
-            let w = lanes(|l| huber[l] * patch.weights[k][l]);
-            let (wu, wv) = (lanes(|l| w[l] * gu[l]), lanes(|l| w[l] * gv[l]));
-            let (wc, wr) = (lanes(|l| w[l] * c[l]), lanes(|l| w[l] * r[l]));
-            add_product(&mut sums.squares[0], &wu, &gu);
-            add_product(&mut sums.squares[1], &wu, &gv);
-            add_product(&mut sums.squares[2], &wv, &gv);
-            add_product(&mut sums.by_u[0], &wu, &c);
-            add(&mut sums.by_u[1], &wu);
-            add_product(&mut sums.by_v[0], &wv, &c);
-            add(&mut sums.by_v[1], &wv);
-            add_product(&mut sums.by_brightness[0], &wc, &c);
-            add(&mut sums.by_brightness[1], &wc);
-            add(&mut sums.by_brightness[2], &w);
-            add_product(&mut sums.residuals[0], &wr, &gu);
-            add_product(&mut sums.residuals[1], &wr, &gv);
-            add_product(&mut sums.residuals[2], &wr, &c);
-            add(&mut sums.residuals[3], &wr);
-            for l in 0..LANES {
-                sums.energy[l] += (2.0 - huber[l]) * wr[l] * r[l];
-            }
+            sums.add_sample(&r, [&gu, &gv], &c, &patch.weights[k]);
         }
         sums
+    }
+
+    /// Adds a sample of each point, of residual `r`.
+    #[inline(always)]
+    fn add_sample(&mut self, r: &Lanes, [gu, gv]: [&Lanes; 2], c: &Lanes, weight: &Lanes) {
+        let huber = lanes(|l| {
+            let size = r[l].abs();
+            HUBER_GREY / if size > HUBER_GREY { size } else { HUBER_GREY }
+        });
+        let w = lanes(|l| huber[l] * weight[l]);
+        let (wu, wv) = (lanes(|l| w[l] * gu[l]), lanes(|l| w[l] * gv[l]));
+        let (wc, wr) = (lanes(|l| w[l] * c[l]), lanes(|l| w[l] * r[l]));
+        add_product(&mut self.squares[0], &wu, gu);
+        add_product(&mut self.squares[1], &wu, gv);
+        add_product(&mut self.squares[2], &wv, gv);
+        add_product(&mut self.by_u[0], &wu, c);
+        add(&mut self.by_u[1], &wu);
+        add_product(&mut self.by_v[0], &wv, c);
+        add(&mut self.by_v[1], &wv);
+        add_product(&mut self.by_brightness[0], &wc, c);
+        add(&mut self.by_brightness[1], &wc);
+        add(&mut self.by_brightness[2], &w);
+        add_product(&mut self.residuals[0], &wr, gu);
+        add_product(&mut self.residuals[1], &wr, gv);
+        add_product(&mut self.residuals[2], &wr, c);
+        add(&mut self.residuals[3], &wr);
+        for l in 0..LANES {
+            self.energy[l] += (2.0 - huber[l]) * wr[l] * r[l];
+        }
     }
 
     /// The normal equations of the block; the pose's go to `normal`.
@@ -306,6 +321,33 @@ impl PatternSums {
         d: &Lanes,
         normal: &mut NormalSums,
     ) -> SystemBlock {
+        self.clear_hidden(patch);
+        let visible = self.visible;
+        let d = lanes(|l| if visible[l] { d[l] } else { 0.0 });
+        let motion = displacement(geometry, &self.q, &d);
+        let mixed = self.add_to(normal, &motion);
+        let Displacement { speed_u, speed_v, .. } = motion;
+        let ([uu, uv, vv], [ru, rv, ..]) = (&self.squares, &self.residuals);
+        SystemBlock {
+            mixed,
+            information: lanes(|l| {
+                let squared = (uu[l] * speed_u[l] + 2.0 * uv[l] * speed_v[l]) * speed_u[l]
+                    + vv[l] * speed_v[l] * speed_v[l];
+                // A sum of squares: what rounding leaves of terms that cancel is none.
+                squared.max(0.0)
+            }),
+            gradient: lanes(|l| ru[l] * speed_u[l] + rv[l] * speed_v[l]),
+            energy: self.energy,
+            weight: lanes(|l| if visible[l] { patch.weight[l] } else { 0.0 }),
+            squared_speed: lanes(|l| speed_u[l] * speed_u[l] + speed_v[l] * speed_v[l]),
+            visible,
+        }
+    }
+
+    /// Leaves of the points out of view their energy: what such a lane holds may not be finite, and 0 times that
+    /// is not 0.
+    #[inline(always)]
+    fn clear_hidden(&mut self, patch: &PatchBlock) {
         let visible = self.visible;
         let groups = [&mut self.squares[..], &mut self.by_u, &mut self.by_v];
         let groups = groups.into_iter().chain([&mut self.by_brightness[..], &mut self.residuals]);
@@ -313,20 +355,21 @@ impl PatternSums {
             *sum = lanes(|l| if visible[l] { sum[l] } else { 0.0 });
         }
         let hidden = lanes(|l| if patch.weight[l] > 0.0 { HIDDEN_ENERGY } else { 0.0 });
-        let energy = lanes(|l| if visible[l] { self.energy[l] } else { hidden[l] });
-        let weight = lanes(|l| if visible[l] { patch.weight[l] } else { 0.0 });
-        // What a lane out of view holds may not be finite, and 0 times that is not 0.
-        let d = &lanes(|l| if visible[l] { d[l] } else { 0.0 });
-        let q = [
+        self.energy = lanes(|l| if visible[l] { self.energy[l] } else { hidden[l] });
+        self.q = [
             lanes(|l| if visible[l] { self.q[0][l] } else { 0.0 }),
             lanes(|l| if visible[l] { self.q[1][l] } else { 0.0 }),
             lanes(|l| if visible[l] { self.q[2][l] } else { 1.0 }),
         ];
-        let Displacement { by_u, by_v, speed_u, speed_v } = displacement(geometry, &q, d);
-        let zero = [0.0; LANES];
+    }
+
+    /// Adds to the normal equations of pose and brightness; their products with ∂r/∂d.
+    #[inline(always)]
+    fn add_to(&self, normal: &mut NormalSums, motion: &Displacement) -> [Lanes; NUM_UNKNOWNS] {
+        let Displacement { by_u, by_v, speed_u, speed_v } = motion;
         let [uu, uv, vv] = &self.squares;
         let [ru, rv, rc, r1] = &self.residuals;
-        let mut mixed = [zero; NUM_UNKNOWNS];
+        let mut mixed = [[0.0; LANES]; NUM_UNKNOWNS];
         for i in 0..6 {
             let along_u = lanes(|l| uu[l] * by_u[i][l] + uv[l] * by_v[i][l]);
             let along_v = lanes(|l| uv[l] * by_u[i][l] + vv[l] * by_v[i][l]);
@@ -351,20 +394,7 @@ impl PatternSums {
         normal.add_entry(6, 6, &self.by_brightness[0]);
         normal.add_entry(7, 6, &self.by_brightness[1]);
         normal.add_entry(7, 7, &self.by_brightness[2]);
-        SystemBlock {
-            mixed,
-            information: lanes(|l| {
-                let squared = (uu[l] * speed_u[l] + 2.0 * uv[l] * speed_v[l]) * speed_u[l]
-                    + vv[l] * speed_v[l] * speed_v[l];
-                // A sum of squares: what rounding leaves of terms that cancel is none.
-                squared.max(0.0)
-            }),
-            gradient: lanes(|l| ru[l] * speed_u[l] + rv[l] * speed_v[l]),
-            energy,
-            weight,
-            squared_speed: lanes(|l| speed_u[l] * speed_u[l] + speed_v[l] * speed_v[l]),
-            visible,
-        }
+        mixed
     }
 }
 
