@@ -58,7 +58,7 @@ pub enum BagImageError {
     #[error("is not a message of its type: {0}")]
     Message(#[from] CdrError),
     /// Its pixels are of a kind that is not read, or not as many as it says.
-    #[error("has {0}")]
+    #[error("cannot be used: {0}")]
     Pixels(#[from] RosImageError),
     /// It does not decode, or has another size than the camera's.
     #[error(transparent)]

@@ -165,7 +165,7 @@ fn images_that_cannot_be_used_are_one_error_each() {
     let mut bag = camera_bag(1);
     let mut add = |nanos, message: &[u8]| bag.message(1, nanos, message);
     let later = 2_000_000_000;
-    add(5, &image(later, WIDTH, HEIGHT, "bayer_rggb8", WIDTH, &[1; PIXELS]));
+    add(5, &image(later, WIDTH, HEIGHT, "yuv444", WIDTH, &[1; PIXELS]));
     add(5, &image(later + 1, WIDTH, HEIGHT, "mono8", WIDTH, &[1; PIXELS - 1]));
     add(5, &image(later + 2, WIDTH, HEIGHT, "mono8", 1, &[1; PIXELS]));
     add(5, &image(later + 3, 16, HEIGHT, "mono8", WIDTH, &[1; PIXELS]));
@@ -175,8 +175,14 @@ fn images_that_cannot_be_used_are_one_error_each() {
     let (_file, bag) = opened(&bag.finish(), None);
     let (frames, errors) = play(&mut bag.unwrap());
     assert_eq!(frames, [(0, 0), (7, 8)]);
-    let expected =
-        ["bayer_rggb8", "has 767 bytes", "768 bytes", "is 16x24", "stamp", "end of input"];
+    let expected = [
+        "`yuv444`: known are",
+        "767 of 768 bytes",
+        "rows of 1 bytes",
+        "is 16x24",
+        "stamp",
+        "end of input",
+    ];
     for (error, expected) in errors.iter().zip(expected) {
         assert!(error.contains(expected) && error.contains("/cam/image_raw"), "{error}");
     }

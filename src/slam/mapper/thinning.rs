@@ -286,32 +286,24 @@ mod tests {
         assert!(stands_in(0.5 * nearest).is_none());
     }
 
-    /// A keyframe nearer to the wall shows fewer points and has a smaller unit: what is little in the unit of the one
-    /// that goes is more in its own.
+    /// One behind the others has points at its border that they do not show: what counts is what it sees of theirs.
     #[test]
     fn what_stands_in_is_measured_in_its_own_unit_and_by_its_own_points() {
-        let mut map = Map {
-            keyframes: [0.0, 0.02, -0.01, 0.03]
-                .iter()
-                .enumerate()
-                .map(|(k, x)| keyframe(k as u64, *x, 0.0))
-                .collect(),
-            ..Map::default()
-        };
-        // The first is a fifth of its unit behind the others, and its unit is the distance of the wall from there.
-        let first = &mut map.keyframes[0];
-        first.map_from_keyframe =
-            Sim3::new(SE3 { translation: Vector3::new(0.0, 0.0, -0.2), ..SE3::identity() }, 1.2);
+        const BEHIND: f64 = 0.04;
+        let at = [0.0, 0.02, -0.01, 0.03].iter().enumerate();
+        let keyframes = at.map(|(k, x)| keyframe(k as u64, *x, 0.0)).collect();
+        let mut map = Map { keyframes, ..Map::default() };
+        // Its unit is the distance of the wall from there.
+        let translation = Vector3::new(0.0, 0.0, -BEHIND);
+        map.keyframes[0].map_from_keyframe =
+            Sim3::new(SE3 { translation, ..SE3::identity() }, 1.0 + BEHIND);
         let weight = DistanceWeights::default().translation;
-        let squared = |distance: f64| (distance * weight).powi(2);
-        let reuse = |max_distance| ReuseParams { max_distance, ..ReuseParams::default() };
-        let of_nearest =
-            map.keyframes[2].map_from_keyframe.locate(&map.keyframes[0].map_from_keyframe.rigid);
-        let in_its_own = DistanceWeights::default()
-            .distance(of_nearest.translation.norm(), map.keyframes[2].usage(&of_nearest));
-        assert!(squared(0.2) > squared(0.2 / 1.2) && in_its_own >= squared(0.2));
-        assert!(shown_by(&map, 0, &reuse(0.99 * in_its_own)).is_none());
-        assert!(shown_by(&map, 0, &reuse(1.01 * in_its_own)).is_some());
+        let nearest = (weight * 0.01f64.hypot(BEHIND)).powi(2);
+        let stands_in = |max_distance: f64| {
+            shown_by(&map, 0, &ReuseParams { max_distance, ..ReuseParams::default() })
+        };
+        assert_eq!(stands_in(1.01 * nearest).map(|(id, _)| id), Some(2));
+        assert!(stands_in(0.99 * nearest).is_none());
     }
 
     fn loop_between(i: u64, j: u64) -> Link {
