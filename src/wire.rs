@@ -5,6 +5,7 @@
 
 pub mod command;
 pub mod conversion;
+mod empty_message;
 pub mod folders;
 pub mod keyframe_inbox;
 pub mod limits;

@@ -183,6 +183,11 @@ fn what_does_not_fit_is_refused_in_a_line() {
     };
     let other = refused(&["--set", "simulator.focal_px=140.0"], &map);
     assert!(other.contains("another camera") && other.contains("140"), "{other}");
+    // A run says so before it starts anything.
+    let never = rig.folder().join("never");
+    let ended = finish(with_map(&rig, "run", &never, &map, &["--set", "simulator.focal_px=140.0"]));
+    assert_eq!(ended.status.code(), Some(1), "{}", ended.stderr);
+    assert!(ended.stderr.contains("another camera") && !never.exists(), "{}", ended.stderr);
     let missing = refused(&["--read-only"], &rig.folder().join("nowhere"));
     assert!(missing.contains("holds no map"), "{missing}");
     let given = refused(&["--poses", "groundtruth"], &map);
@@ -193,6 +198,17 @@ fn what_does_not_fit_is_refused_in_a_line() {
     fs::write(&manifest, newer).unwrap();
     let version = refused(&[], &map);
     assert!(version.contains("version 200"), "{version}");
+}
+
+fn copy_folder(from: &Path, to: &Path) {
+    fs::create_dir(to).unwrap();
+    for entry in fs::read_dir(from).unwrap().map(Result::unwrap) {
+        let (path, copy) = (entry.path(), to.join(entry.file_name()));
+        match path.is_dir() {
+            true => copy_folder(&path, &copy),
+            false => drop(fs::copy(&path, &copy).unwrap()),
+        }
+    }
 }
 
 #[test]
@@ -217,7 +233,10 @@ fn a_map_is_described_exported_and_merged() {
     let poses = read_trajectory(&at("exported").join("keyframes.txt")).unwrap();
     assert_eq!(poses.len(), keyframes);
     assert!(fs::read(at("exported").join("map.ply")).unwrap().starts_with(b"ply"));
-    assert!(map(&["merge", "map", "map", "--output", "both"]).status.success());
+    let twice = map(&["merge", "map", "./map", "--output", "both"]);
+    assert!(twice.stderr.contains("named twice") && !at("both").exists(), "{}", twice.stderr);
+    copy_folder(&at("map"), &at("same"));
+    assert!(map(&["merge", "map", "same", "--output", "both"]).status.success());
     let both = loaded(&at("both"));
     let epochs: BTreeSet<u32> = both.keyframes.iter().map(|keyframe| keyframe.epoch).collect();
     assert_eq!((both.keyframes.len(), epochs.len()), (2 * keyframes, 2));

@@ -121,8 +121,8 @@ pub(super) struct Place {
 }
 
 impl Place {
-    /// Of the distance that a camera goes from here until `since_secs`: one that moves on evenly, whose distance grows
-    /// with the time and not with the root of it.
+    /// Variance of how far the camera has gone from here at `since_secs`. It moves on evenly: the distance grows with the
+    /// time, not with the root of it.
     fn distance_variance(&self, since_secs: f64) -> f64 {
         self.speed.powi(2) * (since_secs.powi(2) - self.since_secs.powi(2))
     }

@@ -52,6 +52,30 @@ impl<L: Lanes> Statistics<L> {
         let zero = unsafe { L::splat(0.0) };
         Self { energy: zero, squared_residual: zero, in_view: 0, compared: 0, inliers: 0 }
     }
+
+    /// Counts residuals that are compared; their weights, with Huber's.
+    ///
+    /// # Safety
+    /// The CPU has the instructions of `L`.
+    #[inline(always)]
+    unsafe fn weigh(&mut self, at: &Evaluation, r: L, variance: L, is_compared: L::Mask) -> L {
+        // SAFETY: this function's own contract.
+        unsafe {
+            let (zero, one) = (L::splat(0.0), L::splat(1.0));
+            let squared = r.mul(r);
+            let information = one.div(variance);
+            let normalized = squared.mul(information);
+            let huber = L::min(L::splat(at.huber).div(normalized.sqrt()), one);
+            let inlier = L::splat(at.inlier_gate_squared).greater(normalized);
+            self.compared += L::count(is_compared);
+            self.inliers += L::count(L::both(is_compared, inlier));
+            let energy = huber.mul(L::splat(2.0).sub(huber)).mul(normalized);
+            self.energy = self.energy.add(L::select(is_compared, energy, zero));
+            self.squared_residual =
+                self.squared_residual.add(L::select(is_compared, squared, zero));
+            L::select(is_compared, huber.mul(information), zero)
+        }
+    }
 }
 
 /// # Safety
@@ -85,7 +109,7 @@ pub unsafe fn accumulate<L: Lanes>(
     }
 }
 
-/// Residual, weight and Jacobian of `L::N` points; the formulas stand in `residual`.
+/// Residual, weight and Jacobian of `L::N` points; the formulas and the steps are those of `residual::point_terms`.
 ///
 /// # Safety
 /// As [`accumulate`].
@@ -101,84 +125,31 @@ pub unsafe fn whiten<L: Lanes>(
     // SAFETY: this function's own contract; `lane` + N is at most sixteen.
     unsafe {
         let load = |column: &[f32; LANES]| L::load(column.as_ptr().add(lane));
-        let constant = |value: f32| L::splat(value);
-        let [r0, r1, r2, r3, r4, r5, r6, r7, r8] = at.rotation.map(constant);
-        let [tx, ty, tz] = at.translation.map(constant);
-        let [fx, fy] = at.focal.map(constant);
-        let [cx, cy] = at.centre.map(constant);
-        let (zero, one) = (constant(0.0), constant(1.0));
-
-        let (x, y) = (load(&block.ray_x), load(&block.ray_y));
-        let d = load(&block.inverse_depth);
-        let warped_x = r0.mul_add(x, r1.mul_add(y, tx.mul_add(d, r2)));
-        let warped_y = r3.mul_add(x, r4.mul_add(y, ty.mul_add(d, r5)));
-        let depth_ratio = r6.mul_add(x, r7.mul_add(y, tz.mul_add(d, r8)));
-        let in_front = depth_ratio.greater(constant(NEAREST_DEPTH_RATIO));
-        // Lanes that are not in view continue with harmless numbers: 0 · NaN would be NaN.
-        let depth_ratio = L::select(in_front, depth_ratio, one);
-        let inverse_ratio = one.div(depth_ratio);
-        let (nx, ny) = (warped_x.mul(inverse_ratio), warped_y.mul(inverse_ratio));
-        let (u, v) = (fx.mul_add(nx, cx), fy.mul_add(ny, cy));
-        let border = constant(BORDER_PX);
-        let inside =
-            |value: L, bound: f32| L::both(value.at_least(border), constant(bound).greater(value));
-        let inside = L::both(inside(u, at.upper_bound[0]), inside(v, at.upper_bound[1]));
-        let in_view = L::both(in_front, inside);
-        let (u, v) = (L::select(in_view, u, border), L::select(in_view, v, border));
-
-        let pixels = L::sample(image.pixels(), image.width(), u, v);
-        let above = pixels.upper_right.sub(pixels.upper_left).mul_add(pixels.du, pixels.upper_left);
-        let below = pixels.lower_right.sub(pixels.lower_left).mul_add(pixels.du, pixels.lower_left);
-        let value = below.sub(above).mul_add(pixels.dv, above).mul(constant(at.grey_per_sum));
-        let predicted = load(&block.intensity).mul(constant(at.gain));
-        let residual = value.sub(predicted.add(constant(at.offset)));
+        let (zero, one) = (L::splat(0.0), L::splat(1.0));
+        let (u, v, in_view) = project::<L>(block, lane, at);
+        let value = sample::<L>(image, u, v).mul(L::splat(at.grey_per_sum));
+        let predicted = load(&block.intensity).mul(L::splat(at.gain));
+        let residual = value.sub(predicted.add(L::splat(at.offset)));
         // Where the sensor ends, a residual that points beyond its end says nothing.
-        let [darkest, lightest] = UNCLIPPED_GREY.map(constant);
+        let [darkest, lightest] = UNCLIPPED_GREY.map(|grey| L::splat(grey));
         let within = L::select(value.greater(lightest), residual, one);
         let within = L::select(darkest.greater(value), zero.sub(residual), within);
         let is_compared = L::both(in_view, within.at_least(zero));
 
-        let d = load(&block.surrounding_inverse_depth);
-        let depth_ratio = r6.mul_add(x, r7.mul_add(y, tz.mul_add(d, r8)));
-        let depth_ratio = depth_ratio.max(constant(NEAREST_DEPTH_RATIO));
-        let inverse_ratio = one.div(depth_ratio);
-        let nx = r0.mul_add(x, r1.mul_add(y, tx.mul_add(d, r2))).mul(inverse_ratio);
-        let ny = r3.mul_add(x, r4.mul_add(y, ty.mul_add(d, r5))).mul(inverse_ratio);
-        let (m11, m12) = (r0.sub(nx.mul(r6)), r1.sub(nx.mul(r7)));
-        let (m21, m22) = (r3.sub(ny.mul(r6)), r4.sub(ny.mul(r7)));
-        let determinant = m11.mul(m22).sub(m12.mul(m21)).max(constant(SMALLEST_DETERMINANT));
-        let scale = depth_ratio.mul(constant(at.gain)).div(determinant);
-        let keyframe_x = load(&block.gradient_x).mul(fx).mul(scale);
-        let keyframe_y = load(&block.gradient_y).mul(fy).mul(scale);
-        let ax = m22.mul(keyframe_x).sub(m21.mul(keyframe_y));
-        let ay = m11.mul(keyframe_y).sub(m12.mul(keyframe_x));
+        let Surface { ax, ay, nx, ny, inverse_ratio } = Surface::<L>::of(block, lane, at);
         let m = ax.mul_add(nx, ay.mul(ny));
-
-        let [wx, wy, wz] = at.variance_translation.map(constant);
+        let [wx, wy, wz] = at.variance_translation.map(|value| L::splat(value));
         let weighing = ax.mul_add(wx, ay.mul_add(wy, zero.sub(m).mul(wz))).mul(inverse_ratio);
         let from_depth = weighing.mul(weighing).mul(load(&block.variance));
         let variance =
-            from_depth.mul_add(constant(at.depth_variance_factor), constant(at.intensity_variance));
-        let squared = residual.mul(residual);
-        let information = one.div(variance);
-        let normalized = squared.mul(information);
-        let huber = L::min(constant(at.huber).div(normalized.sqrt()), one);
-        let weight = L::select(is_compared, huber.mul(information), zero);
-        let root = weight.sqrt();
-
-        let inlier = constant(at.inlier_gate_squared).greater(normalized);
+            from_depth.mul_add(L::splat(at.depth_variance_factor), L::splat(at.intensity_variance));
         statistics.in_view += L::count(in_view);
-        statistics.compared += L::count(is_compared);
-        statistics.inliers += L::count(L::both(is_compared, inlier));
-        let energy = huber.mul(constant(2.0).sub(huber)).mul(normalized);
-        statistics.energy = statistics.energy.add(L::select(is_compared, energy, zero));
-        statistics.squared_residual =
-            statistics.squared_residual.add(L::select(is_compared, squared, zero));
+        let root = statistics.weigh(at, residual, variance, is_compared).sqrt();
 
         let store = |whitened: &mut Whitened, column: usize, value: L| {
             value.mul(root).store(whitened.0[column].as_mut_ptr().add(lane));
         };
-        let translation = d.mul(inverse_ratio);
+        let translation = load(&block.surrounding_inverse_depth).mul(inverse_ratio);
         store(whitened, 0, translation.mul(ax));
         store(whitened, 1, translation.mul(ay));
         store(whitened, 2, zero.sub(translation).mul(m));
@@ -186,8 +157,106 @@ pub unsafe fn whiten<L: Lanes>(
         store(whitened, 4, nx.mul_add(m, ax));
         store(whitened, 5, nx.mul(ay).sub(ny.mul(ax)));
         store(whitened, 6, zero.sub(predicted));
-        store(whitened, 7, constant(-1.0));
+        store(whitened, 7, L::splat(-1.0));
         store(whitened, RESIDUAL, residual);
+    }
+}
+
+/// X̃ of points at inverse depth `d`.
+///
+/// # Safety
+/// As [`whiten`].
+#[inline(always)]
+unsafe fn warp<L: Lanes>(block: &PointBlock, lane: usize, at: &Evaluation, d: L) -> [L; 3] {
+    // SAFETY: this function's own contract.
+    unsafe {
+        let [r0, r1, r2, r3, r4, r5, r6, r7, r8] = at.rotation.map(|value| L::splat(value));
+        let [tx, ty, tz] = at.translation.map(|value| L::splat(value));
+        let x = L::load(block.ray_x.as_ptr().add(lane));
+        let y = L::load(block.ray_y.as_ptr().add(lane));
+        [
+            r0.mul_add(x, r1.mul_add(y, tx.mul_add(d, r2))),
+            r3.mul_add(x, r4.mul_add(y, ty.mul_add(d, r5))),
+            r6.mul_add(x, r7.mul_add(y, tz.mul_add(d, r8))),
+        ]
+    }
+}
+
+/// Where points fall, and which of them are in view; the others fall on the border.
+///
+/// # Safety
+/// As [`whiten`].
+#[inline(always)]
+unsafe fn project<L: Lanes>(block: &PointBlock, lane: usize, at: &Evaluation) -> (L, L, L::Mask) {
+    // SAFETY: this function's own contract.
+    unsafe {
+        let ([fx, fy], [cx, cy]) = (at.focal.map(|f| L::splat(f)), at.centre.map(|c| L::splat(c)));
+        let d = L::load(block.inverse_depth.as_ptr().add(lane));
+        let [warped_x, warped_y, depth_ratio] = warp::<L>(block, lane, at, d);
+        let in_front = depth_ratio.greater(L::splat(NEAREST_DEPTH_RATIO));
+        // Lanes that are not in view continue with harmless numbers: 0 · NaN would be NaN.
+        let depth_ratio = L::select(in_front, depth_ratio, L::splat(1.0));
+        let inverse_ratio = L::splat(1.0).div(depth_ratio);
+        let (nx, ny) = (warped_x.mul(inverse_ratio), warped_y.mul(inverse_ratio));
+        let (u, v) = (fx.mul_add(nx, cx), fy.mul_add(ny, cy));
+        let border = L::splat(BORDER_PX);
+        let inside =
+            |value: L, bound: f32| L::both(value.at_least(border), L::splat(bound).greater(value));
+        let inside = L::both(inside(u, at.upper_bound[0]), inside(v, at.upper_bound[1]));
+        let in_view = L::both(in_front, inside);
+        (L::select(in_view, u, border), L::select(in_view, v, border), in_view)
+    }
+}
+
+/// The image between its pixels.
+///
+/// # Safety
+/// As [`whiten`].
+#[inline(always)]
+unsafe fn sample<L: Lanes>(image: &Image<u16>, u: L, v: L) -> L {
+    // SAFETY: this function's own contract.
+    unsafe {
+        let pixels = L::sample(image.pixels(), image.width(), u, v);
+        let above = pixels.upper_right.sub(pixels.upper_left).mul_add(pixels.du, pixels.upper_left);
+        let below = pixels.lower_right.sub(pixels.lower_left).mul_add(pixels.du, pixels.lower_left);
+        below.sub(above).mul_add(pixels.dv, above)
+    }
+}
+
+/// The surface around points as the frame sees it: its gradient, n and 1/z̃.
+struct Surface<L> {
+    ax: L,
+    ay: L,
+    nx: L,
+    ny: L,
+    inverse_ratio: L,
+}
+
+impl<L: Lanes> Surface<L> {
+    /// # Safety
+    /// As [`whiten`].
+    #[inline(always)]
+    unsafe fn of(block: &PointBlock, lane: usize, at: &Evaluation) -> Self {
+        // SAFETY: this function's own contract.
+        unsafe {
+            let load = |column: &[f32; LANES]| L::load(column.as_ptr().add(lane));
+            let [r0, r1, _, r3, r4, _, r6, r7, _] = at.rotation.map(|value| L::splat(value));
+            let [fx, fy] = at.focal.map(|f| L::splat(f));
+            let d = load(&block.surrounding_inverse_depth);
+            let [warped_x, warped_y, depth_ratio] = warp::<L>(block, lane, at, d);
+            let depth_ratio = depth_ratio.max(L::splat(NEAREST_DEPTH_RATIO));
+            let inverse_ratio = L::splat(1.0).div(depth_ratio);
+            let (nx, ny) = (warped_x.mul(inverse_ratio), warped_y.mul(inverse_ratio));
+            let (m11, m12) = (r0.sub(nx.mul(r6)), r1.sub(nx.mul(r7)));
+            let (m21, m22) = (r3.sub(ny.mul(r6)), r4.sub(ny.mul(r7)));
+            let determinant = m11.mul(m22).sub(m12.mul(m21)).max(L::splat(SMALLEST_DETERMINANT));
+            let scale = depth_ratio.mul(L::splat(at.gain)).div(determinant);
+            let keyframe_x = load(&block.gradient_x).mul(fx).mul(scale);
+            let keyframe_y = load(&block.gradient_y).mul(fy).mul(scale);
+            let ax = m22.mul(keyframe_x).sub(m21.mul(keyframe_y));
+            let ay = m11.mul(keyframe_y).sub(m12.mul(keyframe_x));
+            Self { ax, ay, nx, ny, inverse_ratio }
+        }
     }
 }
 
