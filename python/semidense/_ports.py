@@ -137,7 +137,8 @@ def not_running(place: Place) -> NotRunning:
             "this container has a /dev/shm of its own (docker run --ipc=host shares the host's)"
         )
     return NotRunning(
-        f"nothing is running as instance `{place.instance}` in {place.root}: start `semidense run`, or name another instance"
+        f"nothing is running as instance `{place.instance}` in {place.root}: "
+        "start `semidense run`, or name another instance"
     )
 
 
