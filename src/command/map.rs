@@ -36,7 +36,7 @@ pub struct MapArguments {
 /// The map on disk that a command begins or continues.
 #[derive(Debug, Clone, Args)]
 pub struct MapOptions {
-    /// Begin a map in this folder, or continue the one it holds: the camera is looked for in it, and mapping goes on there
+    /// Begin a map in this folder, or continue the one it holds: the camera is looked for in it, and mapping continues there
     /// [default: map.folder of the configuration, which is none]
     #[arg(long, value_name = "DIR")]
     map: Option<PathBuf>,
@@ -90,7 +90,7 @@ struct SaveArguments {
 
 /// Have the running mapper go over to the map in another folder
 ///
-/// It saves its own map first, where that has a folder, then looks for the camera in the other one and goes on there; a
+/// It saves its own map first, where that has a folder, then looks for the camera in the other one and continues there; a
 /// new epoch begins beside it where the camera is not found for two seconds. A map that does not fit is refused, and the
 /// mapper continues in its own.
 #[derive(Debug, Args)]

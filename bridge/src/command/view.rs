@@ -195,7 +195,11 @@ fn say(server: &Server, arguments: &ViewArguments, token: Option<&str>) {
         ip if ip.is_unspecified() => {
             let number = own_address().map(|ip| SocketAddr::new(ip, address.port()).to_string());
             let name = own_names().pop().map(|name| format!("{name}:{}", address.port()));
-            name.into_iter().chain(number).collect()
+            let known: Vec<String> = name.into_iter().chain(number).collect();
+            match known.is_empty() {
+                true => vec![format!("ADDRESS-OF-THIS-MACHINE:{}", address.port())],
+                false => known,
+            }
         }
         _ => vec![address.to_string()],
     };

@@ -152,8 +152,8 @@ impl Records {
         BagError::Damaged { at, reason: reason.to_string() }
     }
 
-    /// Continues to the next record that is read here; `None` at the end. After [`BagError::Damaged`] the next call goes
-    /// on behind what is damaged.
+    /// Continues to the next record that is read here; `None` at the end. After [`BagError::Damaged`] the next call
+    /// continues behind what is damaged.
     pub fn advance(&mut self) -> Result<Option<Place>, BagError> {
         loop {
             let found = if self.chunk_position < self.chunk.len() {

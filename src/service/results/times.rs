@@ -103,3 +103,21 @@ pub fn track_nanos(poses: &[RecordedPose]) -> impl Iterator<Item = u64> {
     let has_keyframe = |pose: &&RecordedPose| pose.estimate.keyframe_id != NO_KEYFRAME;
     poses.iter().filter(has_keyframe).filter_map(|pose| pose.track_nanos)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_mean_is_that_of_all_times_and_of_counted_ones_within_their_buckets() {
+        let times = [1_000_000, 2_000_000, 9_000_000];
+        let exact = Percentiles::of(times.into_iter()).unwrap();
+        assert!((exact.mean - 4.0).abs() < 1e-12 && exact.p50 == 2.0, "{exact:?}");
+        let mut counts = TimeCounts::default();
+        times.iter().for_each(|&nanos| counts.0[bucket(nanos)] += 1);
+        let counted = Percentiles::of_counts(&counts).unwrap();
+        // A bucket is half an octave wide.
+        assert!((counted.mean / 4.0).ln().abs() < 0.18, "{counted:?}");
+        assert_eq!(Percentiles::of_counts(&TimeCounts::default()), None);
+    }
+}

@@ -96,6 +96,17 @@ fn what_others_see_through_goes_and_what_they_do_not_know_stays() {
 }
 
 #[test]
+fn depth_that_is_too_uncertain_confirms_nothing() {
+    let mut keyframes = row(|_, _| DEPTH);
+    let most = FusionParams::default().max_relative_std_dev as f32;
+    for point in keyframes[1..].iter_mut().flat_map(|keyframe| &mut keyframe.points) {
+        point.variance = (1.01 * most * point.inverse_depth).powi(2);
+    }
+    let points = fused_of(&keyframes);
+    assert!(!points.is_empty() && points.iter().all(|point| point.keyframes == 1));
+}
+
+#[test]
 fn pixels_that_stand_alone_in_depth_go() {
     let wrong = |u: u16, v: u16| u.is_multiple_of(16) && v.is_multiple_of(16) && u > 0 && v > 0;
     let lone = [keyframe(0, 0.0, |u, v| if wrong(u, v) { 1.3 * DEPTH } else { DEPTH })];

@@ -24,19 +24,19 @@ use crate::slam::tracker::MOST_DEVIATIONS;
 /// further off, and a map that has drifted by as much is none to continue with.
 pub(super) const MAX_DISAGREEMENT: f64 = 0.1;
 
-/// Who is asked whether a place that was found is right.
-pub(super) struct ByOthers {
-    /// A keyframe that is not: its place in the map.
-    pub but: Option<usize>,
+/// How other keyframes confirm a place that was found.
+pub(super) struct Confirmation {
+    /// The place in the map of a keyframe that is not asked.
+    pub except: Option<usize>,
     /// Largest difference of a pose on another keyframe from the one found, translation in mean depths plus rotation in
     /// radians.
     pub max_disagreement: f64,
 }
 
-impl ByOthers {
+impl Confirmation {
     /// After a loss all may be asked.
     pub fn after_loss() -> Self {
-        Self { but: None, max_disagreement: MAX_DISAGREEMENT }
+        Self { except: None, max_disagreement: MAX_DISAGREEMENT }
     }
 }
 
@@ -137,7 +137,7 @@ impl Mapper {
         let (index, keyframe_from_camera) = found?;
         let is_possible = !self.contradicts_hold(pose, index, &keyframe_from_camera);
         if is_possible
-            && self.is_confirmed(index, &keyframe_from_camera, pixels, &ByOthers::after_loss())
+            && self.is_confirmed(index, &keyframe_from_camera, pixels, &Confirmation::after_loss())
             && self.points_agree(index, &keyframe_from_camera, pixels)
         {
             return found;
@@ -172,7 +172,7 @@ impl Mapper {
         index: usize,
         keyframe_from_camera: &SE3,
         pixels: &[u8],
-        by: &ByOthers,
+        by: &Confirmation,
     ) -> bool {
         /// Keyframes that are asked.
         const MOST: usize = 3;
@@ -186,7 +186,7 @@ impl Mapper {
         let mut others: Vec<(f64, usize, SE3)> = self
             .map
             .seen_from(epoch, &map_from_camera, REACH)
-            .filter(|(other, _)| *other != index && Some(*other) != by.but)
+            .filter(|(other, _)| *other != index && Some(*other) != by.except)
             .filter(|(_, view)| view.usage >= LEAST_USAGE)
             .filter(|(other, _)| self.map.keyframes[*other].map_state == MapState::Established)
             .map(|(other, view)| (view.usage, other, view.keyframe_from_camera))
@@ -369,16 +369,32 @@ mod tests {
     fn a_place_is_believed_where_another_keyframe_has_the_camera_there_too() {
         let pixels = Scene::new(3).render(&CAMERA, &sideways(0.1)).noisy(2.0, 9);
         let mut mapper = mapper_with(&[0.0, 0.15]);
-        assert!(mapper.is_confirmed(0, &sideways(0.1), &pixels, &ByOthers::after_loss()));
+        assert!(mapper.is_confirmed(0, &sideways(0.1), &pixels, &Confirmation::after_loss()));
         let turned = SE3::exp(&Vector6::new(0.1, 0.05, 0.0, 0.1, 0.25, 0.0));
         assert!(
-            !mapper.is_confirmed(0, &turned, &pixels, &ByOthers::after_loss()),
+            !mapper.is_confirmed(0, &turned, &pixels, &Confirmation::after_loss()),
             "the other one sees something else"
         );
         // Nobody else is there to be asked, or only one that is not believed.
-        assert!(mapper_with(&[0.0]).is_confirmed(0, &turned, &pixels, &ByOthers::after_loss()));
+        assert!(mapper_with(&[0.0]).is_confirmed(0, &turned, &pixels, &Confirmation::after_loss()));
         mapper.map.keyframes[1].map_state = MapState::Rejected;
-        assert!(mapper.is_confirmed(0, &turned, &pixels, &ByOthers::after_loss()));
+        assert!(mapper.is_confirmed(0, &turned, &pixels, &Confirmation::after_loss()));
+    }
+
+    #[test]
+    fn a_keyframe_that_is_not_asked_and_one_that_is_not_near_enough_confirm_nothing() {
+        let here = sideways(0.1);
+        let pixels = Scene::new(3).render(&CAMERA, &here).noisy(2.0, 9);
+        let elsewhere = (0..START_KEYFRAMES).map(|k| 30.0 + 0.3 * k as f64);
+        let places: Vec<f64> = [0.0, 0.15].into_iter().chain(elsewhere).collect();
+        let is_confirmed =
+            |by: Confirmation| mapper_with(&places).is_confirmed(0, &here, &pixels, &by);
+        assert!(is_confirmed(Confirmation::after_loss()));
+        assert!(!is_confirmed(Confirmation { except: Some(1), ..Confirmation::after_loss() }));
+        assert!(!is_confirmed(Confirmation {
+            max_disagreement: 0.0,
+            ..Confirmation::after_loss()
+        }));
     }
 
     #[test]
@@ -388,7 +404,7 @@ mod tests {
         let confirms = |elsewhere: usize| {
             let places = (0..elsewhere).map(|k| 30.0 + 0.3 * k as f64);
             let places: Vec<f64> = std::iter::once(0.0).chain(places).collect();
-            mapper_with(&places).is_confirmed(0, &here, &pixels, &ByOthers::after_loss())
+            mapper_with(&places).is_confirmed(0, &here, &pixels, &Confirmation::after_loss())
         };
         assert!(confirms(START_KEYFRAMES - 1), "the map is young");
         assert!(!confirms(START_KEYFRAMES));

@@ -10,7 +10,7 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::keyframe::{DistanceWeights, MapState};
 use crate::slam::mapper::Mapper;
 use crate::slam::mapper::finder::Located;
-use crate::slam::mapper::recovery::{ByOthers, MAX_DISAGREEMENT, restore_points};
+use crate::slam::mapper::recovery::{Confirmation, MAX_DISAGREEMENT, restore_points};
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::{Brightness, PoseEstimate};
 
@@ -80,8 +80,8 @@ impl Mapper {
         let at = &near.located.keyframe_from_camera;
         // The active keyframe has the camera where it drifted to. Another that has it nearer to the place that was found
         // than to that one is needed.
-        let by = ByOthers {
-            but: self.active.as_ref().map(|active| active.index),
+        let by = Confirmation {
+            except: self.active.as_ref().map(|active| active.index),
             max_disagreement: MAX_DISAGREEMENT.min(0.5 * near.located.disagreement),
         };
         let is_believed = near.located.is_sure

@@ -182,3 +182,58 @@ impl Window {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::test_scene::CAMERA;
+    use crate::slam::window::params::WindowParams;
+
+    fn frame(keyframe_id: u64) -> TrackedFrame {
+        TrackedFrame {
+            sequence: keyframe_id,
+            keyframe_id,
+            keyframe_from_camera: SE3::identity(),
+            is_guess: false,
+            pixels: vec![0; CAMERA.width * CAMERA.height],
+        }
+    }
+
+    /// A window of eight keyframes without points, and a frame on each that waits.
+    fn window() -> Window {
+        let mut window = Window::new(CAMERA, WindowParams::default());
+        window.keyframes = (0..8)
+            .map(|keyframe_id| WindowKeyframe {
+                keyframe_id,
+                epoch: 0,
+                images: Vec::new(),
+                camera_from_map: SE3::identity(),
+                unit: 1.0,
+                points: Vec::new(),
+                is_host: false,
+                agreed: Vec::new(),
+                surface: Surface::default(),
+            })
+            .collect();
+        window.take_frames(&mut (0..8).map(frame).collect(), &mut Vec::new());
+        window
+    }
+
+    #[test]
+    fn frames_of_an_epochs_first_keyframes_wait_for_more_of_them_and_not_for_all() {
+        let left = |is_first| {
+            let mut window = window();
+            window.place_frames(7, is_first);
+            window.frames.waiting.iter().map(|frame| frame.keyframe_id).collect::<Vec<_>>()
+        };
+        assert_eq!(left(true), [4, 5, 6, 7]);
+        assert_eq!(left(false), [7]);
+    }
+
+    #[test]
+    fn memory_of_few_images_is_kept() {
+        let (mut window, mut spare) = (window(), vec![Vec::new(); 3 * MOST_SPARE]);
+        window.take_frames(&mut Vec::new(), &mut spare);
+        assert_eq!(spare.len(), MOST_SPARE);
+    }
+}

@@ -331,3 +331,37 @@ fn histogram(times: &Times, samples: &[[f64; 2]], limit: Option<f64>) -> Chart {
         series,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::service::results::record::{RecordedPose, RunMode};
+    use crate::slam::geometry::intrinsics::Intrinsics;
+    use crate::slam::pose::{PoseEstimate, TrackingState};
+
+    #[test]
+    fn keyframes_of_other_epochs_are_not_drawn() {
+        let mut record = RunRecord::empty(RunMode::Replay, "x");
+        for keyframe_id in 0..3 {
+            let camera = Intrinsics::pinhole(32, 24, 30.0);
+            let keyframe = Keyframe::at(Sim3::identity(), camera, Vec::new(), Vec::new());
+            let epoch = u32::from(keyframe_id > 0);
+            let capture_nanos = keyframe_id as i64;
+            record.map.keyframes.push(Keyframe { keyframe_id, epoch, capture_nanos, ..keyframe });
+        }
+        // Two frames of the second epoch, one of the first.
+        record.poses.extend([0, 1, 2].map(|keyframe_id| RecordedPose {
+            estimate: PoseEstimate {
+                keyframe_id,
+                state: TrackingState::Tracking,
+                ..PoseEstimate::unknown_at(keyframe_id, 0)
+            },
+            latency_nanos: None,
+            track_nanos: None,
+            trace: None,
+            wake_nanos: None,
+        }));
+        let drawn: Vec<i64> = keyframe_poses(&record).iter().map(|pose| pose.nanos).collect();
+        assert_eq!(drawn, [1, 2]);
+    }
+}

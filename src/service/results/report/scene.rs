@@ -340,6 +340,16 @@ mod tests {
     }
 
     #[test]
+    fn a_standard_deviation_is_a_share_of_the_distance_along_the_ray() {
+        // As far aside as it is deep, in a keyframe whose unit is two of the map's.
+        let block = pack_points(&[point(2.0, Some(3))], 10);
+        let (_, bytes) = unpack(&block);
+        let (distance, depth) = (8.0f64.sqrt(), 2.0);
+        assert_eq!(bytes[7], deviation_code(0.02 / distance));
+        assert_ne!(bytes[7], deviation_code(0.02 / depth));
+    }
+
+    #[test]
     fn a_fused_point_belongs_to_the_first_keyframe_that_saw_it() {
         let (header, _) =
             unpack(&pack_points(&[point(0.0, None), point(10.0, None), point(500.0, None)], 10))
