@@ -136,17 +136,21 @@ fn prometheus_reads_the_metrics() {
     let python = tools().join("venv/bin/python");
     let (_view, address) = rig.view(&[]);
     let run = Process::start(rig.run(LONG_FRAMES, LONG));
-    let tracked = |text: &str| {
-        text.contains("semidense_poses_total{state=\"tracking\"}")
-            && !text.contains("semidense_poses_total{state=\"tracking\"} 0\n")
-    };
-    let all = |text: &str| {
+    let of_all = |text: &str| {
         ["capture", "tracker", "mapper"]
             .iter()
             .all(|p| text.contains(&format!("semidense_frames_total{{process=\"{p}\"}}")))
     };
+    // Poses are counted as they come, the rest is what a process said last: either may be ahead.
+    let counted = |text: &str, figure: &str| {
+        text.contains(&format!("{figure} ")) && !text.contains(&format!("{figure} 0\n"))
+    };
+    let tracked = |text: &str| {
+        counted(text, "semidense_poses_total{state=\"tracking\"}")
+            && counted(text, "semidense_latency_seconds_count{process=\"tracker\"}")
+    };
     let text = until("figures of all three", || {
-        Some(get(&address, "/metrics", "")).filter(|text| tracked(text) && all(text))
+        Some(get(&address, "/metrics", "")).filter(|text| tracked(text) && of_all(text))
     });
     drop(run);
     if !has_tool(&python) {
