@@ -1,23 +1,23 @@
 //! Frames in: dataset readers, simulator, cameras. The only place that names image files and video devices.
 
-pub mod bag;
+pub(crate) mod bag;
 #[cfg(test)]
 mod conformance;
 pub mod dataset_writer;
 pub mod decode_error;
 pub mod euroc;
-pub mod frame_store;
+pub(crate) mod frame_store;
 pub mod image_file;
 #[cfg(test)]
 mod image_file_tests;
-pub mod image_folder;
-pub mod input_file;
-pub mod jpeg_image;
-pub mod listing;
-pub mod looped;
+pub(crate) mod image_folder;
+pub(crate) mod input_file;
+pub(crate) mod jpeg_image;
+pub(crate) mod listing;
+pub(crate) mod looped;
 pub mod opening;
 pub mod png_image;
-pub mod recording;
+pub(crate) mod recording;
 pub mod rig;
 pub mod rig_error;
 pub mod ros_image;

@@ -3,28 +3,28 @@
 //! Exit codes: 0 done, 1 failed (one line says what, where and what to do), 2 the command line is
 //! not understood, 3 nothing was tracked (one line says why), 130 interrupted (results so far are written).
 
-pub mod bench;
-pub mod bridge;
-pub mod cameras;
-pub mod capture;
-pub mod config;
-pub mod doctor;
-pub mod ending;
-pub mod evaluate;
-pub mod map;
-pub mod map_points;
-pub mod mapper;
-pub mod print;
-pub mod progress;
-pub mod recover;
-pub mod replay;
-pub mod ros2_rig;
-pub mod run;
-pub mod run_progress;
-pub mod simulate;
-pub mod status;
-pub mod status_text;
-pub mod tracker;
+pub(crate) mod bench;
+pub(crate) mod bridge;
+pub(crate) mod cameras;
+pub(crate) mod capture;
+pub(crate) mod config;
+pub(crate) mod doctor;
+pub(crate) mod ending;
+pub(crate) mod evaluate;
+pub(crate) mod map;
+pub(crate) mod map_points;
+pub(crate) mod mapper;
+pub(crate) mod print;
+pub(crate) mod progress;
+pub(crate) mod recover;
+pub(crate) mod replay;
+pub(crate) mod ros2_rig;
+pub(crate) mod run;
+pub(crate) mod run_progress;
+pub(crate) mod simulate;
+pub(crate) mod status;
+pub(crate) mod status_text;
+pub(crate) mod tracker;
 
 use std::error::Error;
 use std::ffi::{OsStr, OsString};

@@ -1,7 +1,7 @@
 //! The simulator: a camera in a textured scene, with exact poses and exact depth.
 //!
-//! [`trajectory`] says where the camera is, [`render`] what it sees there, [`sensor`] what becomes
-//! of the light; [`furnish`] builds the scenes. The same [`params`] give the same bytes.
+//! `trajectory` says where the camera is, `render` what it sees there, `sensor` what becomes
+//! of the light; `furnish` builds the scenes. The same [`params`] give the same bytes.
 
 use std::borrow::Cow;
 use std::fs::File;
@@ -30,21 +30,21 @@ use crate::slam::trajectory::StampedPose;
 
 mod canvas;
 mod cull;
-pub mod flat;
-pub mod furnish;
-pub mod lens;
+pub(crate) mod flat;
+pub(crate) mod furnish;
+pub(crate) mod lens;
 pub mod params;
-pub mod pattern;
+pub(crate) mod pattern;
 pub mod random;
-pub mod render;
-pub mod route;
-pub mod scene;
+pub(crate) mod render;
+pub(crate) mod route;
+pub(crate) mod scene;
 pub mod scene_kind;
-pub mod sensor;
+pub(crate) mod sensor;
 pub mod summary;
-pub mod texture;
-pub mod trajectory;
-pub mod twins;
+pub(crate) mod texture;
+pub(crate) mod trajectory;
+pub(crate) mod twins;
 
 /// Stamp of the first frame: one second, so that no reader takes it for a missing one.
 const FIRST_NANOS: i64 = 1_000_000_000;

@@ -9,7 +9,7 @@
 //! `controls`, `stamps` and `pixel_format` decide about one thing each; `connection` is the
 //! camera that comes and goes, and this file makes a [`FrameSource`] of it.
 
-pub mod connection;
+pub(crate) mod connection;
 mod controls;
 mod device;
 mod device_name;
@@ -17,9 +17,9 @@ mod device_name;
 mod fake;
 mod kernel;
 pub mod listing;
-pub mod negotiation;
+pub(crate) mod negotiation;
 pub mod params;
-pub mod pixel_format;
+pub(crate) mod pixel_format;
 pub(in crate::capture) mod stamps;
 pub mod video_device;
 

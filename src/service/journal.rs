@@ -6,11 +6,11 @@
 //! killed, and [`recovered`] makes its record.
 
 mod any_bytes;
-pub mod feed;
+pub(crate) mod feed;
 pub mod folder;
 pub mod log;
 pub mod recovered;
-pub mod replayed;
+pub(crate) mod replayed;
 mod writer;
 
 use std::fs::File;

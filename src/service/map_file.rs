@@ -7,7 +7,7 @@
 //! image was given up), image bytes. Then the number of frames that were aligned again (u64), each: sequence, keyframe
 //! (u64), pose relative to that (7 × f64); and the number of points of the joint estimation (u64), each: keyframe (u64),
 //! u, v (u16), confirmations (u32), inverse depth, brightness (f32). Then bytes of the loops (u64), and these
-//! ([`loop_bytes`]).
+//! (`loop_bytes`).
 
 use std::io::{self, BufReader, Read, Write};
 use std::path::{Path, PathBuf};

@@ -11,19 +11,19 @@
 //! whole map at every instant: the last that was saved. Every file has a checksum; a keyframe whose file is damaged
 //! keeps its pose and loses its depth, and a damaged manifest costs what was saved last.
 //!
-//! It stands beside the [checkpoint](crate::service::checkpoint), which is of an instant and not of a map: the active
+//! It stands beside the checkpoint, which is of an instant and not of a map: the active
 //! keyframe in the middle of its depth, several times a second, in memory, for the one process that comes after. Both,
 //! the journal and the recorder's map write the numbers of a keyframe alike ([`map_file`](crate::service::map_file)).
 
 pub mod depth_file;
-pub mod keeper;
+pub(crate) mod keeper;
 pub mod manifest;
 pub mod map_folder_error;
-pub mod merge;
-pub mod numbering;
+pub(crate) mod merge;
+pub(crate) mod numbering;
 pub mod reading;
-pub mod report;
-pub mod session;
+pub(crate) mod report;
+pub(crate) mod session;
 pub mod writer;
 
 use std::path::Path;

@@ -53,11 +53,6 @@ impl RefusedImages {
         self.count
     }
 
-    /// The first of them, which and why.
-    pub fn reasons(&self) -> &[String] {
-        &self.reasons
-    }
-
     /// The error of a source that has ended without one good image; `None` where there was one, or
     /// nothing was left out.
     pub fn error(&self) -> Option<SourceError> {
@@ -92,7 +87,7 @@ mod tests {
         for name in 0..25 {
             refused.refuse(&empty(name));
         }
-        assert_eq!((refused.count(), refused.reasons().len(), refused.logged), (25, 10, 0));
+        assert_eq!((refused.count(), refused.reasons.len(), refused.logged), (25, 10, 0));
         let error = refused.error().unwrap().to_string();
         assert!(error.contains("25") && error.contains("0.png: is empty"), "{error}");
         refused.accept();

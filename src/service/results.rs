@@ -3,34 +3,34 @@
 //! `run` and `replay` end in [`write_results`] with a [`RunRecord`], so that their files mean the
 //! same and can be compared byte by byte.
 
-pub mod alignment_levels;
-pub mod budget_curve;
-pub mod calibration;
-pub mod colour;
-pub mod debug_pictures;
-pub mod depth_maps;
-pub mod full_points;
-pub mod joint;
-pub mod joint_points;
-pub mod lettering;
-pub mod loops;
+pub(crate) mod alignment_levels;
+pub(crate) mod budget_curve;
+pub(crate) mod calibration;
+pub(crate) mod colour;
+pub(crate) mod debug_pictures;
+pub(crate) mod depth_maps;
+pub(crate) mod full_points;
+pub(crate) mod joint;
+pub(crate) mod joint_points;
+pub(crate) mod lettering;
+pub(crate) mod loops;
 pub mod output_folder;
-pub mod output_lock;
-pub mod pcd;
-pub mod pictures;
+pub(crate) mod output_lock;
+pub(crate) mod pcd;
+pub(crate) mod pictures;
 pub mod ply;
-pub mod poses;
+pub(crate) mod poses;
 pub mod record;
 pub mod report;
 pub mod results_error;
-pub mod set;
-pub mod start_tally;
-pub mod step_times;
-pub mod summary;
-pub mod summary_text;
-pub mod times;
-pub mod untracked;
-pub mod weight_picture;
+pub(crate) mod set;
+pub(crate) mod start_tally;
+pub(crate) mod step_times;
+pub(crate) mod summary;
+pub(crate) mod summary_text;
+pub(crate) mod times;
+pub(crate) mod untracked;
+pub(crate) mod weight_picture;
 
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};

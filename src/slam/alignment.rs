@@ -1,27 +1,27 @@
 //! Variance-normalised direct image alignment on SE(3) (Engel, Schöps, Cremers 2014, §3.3).
 //!
 //! [`mod@reference`] prepares a keyframe, [`residual`] evaluates the cost of one pose on one pyramid
-//! level, [`normal_equations`] solves for a step, [`align`] iterates coarse to fine.
+//! level, `normal_equations` solves for a step, [`align`] iterates coarse to fine.
 
 pub mod align;
 mod damping;
 pub mod displacement;
-pub mod fusion;
+pub(crate) mod fusion;
 pub mod kernel;
-pub mod misfit;
+pub(crate) mod misfit;
 #[cfg(test)]
 mod mode_tests;
-pub mod normal_equations;
+pub(crate) mod normal_equations;
 pub mod points;
 pub mod reference;
 pub mod residual;
 pub mod scatter;
 #[cfg(test)]
-pub mod scene;
+pub(crate) mod scene;
 pub mod selection;
-pub mod surroundings;
+pub(crate) mod surroundings;
 #[cfg(test)]
 mod tests;
-pub mod tiles;
-pub mod unknown_depth;
+pub(crate) mod tiles;
+pub(crate) mod unknown_depth;
 pub mod weights;

@@ -1,13 +1,13 @@
 //! How good an estimate is: trajectories against ground truth, depth against true depth.
 //!
 //! The trajectory figures are those of the Python package `evo` on the same files: nearest stamps
-//! without interpolation ([`association`]), Umeyama alignment ([`mod@umeyama`]), absolute and relative
-//! errors ([`trajectory_error`]); [`normalized_error`] holds pose errors against their covariance. [`windows`] adds how the scale wanders, [`depth_error`] what the
+//! without interpolation (`association`), Umeyama alignment ([`mod@umeyama`]), absolute and relative
+//! errors ([`trajectory_error`]); [`normalized_error`] holds pose errors against their covariance. `windows` adds how the scale wanders, [`depth_error`] what the
 //! depth maps and their variances are good for, [`depth_modes`] what is wrong with the whole of one, [`start_error`] how far a start is off. Without any truth, [`map_consistency`] holds the keyframes
 //! against each other ([`shared_view`], [`patch_misfit`], [`depth_agreement`]), and [`grade`] says what
 //! that is worth.
 
-pub mod association;
+pub(crate) mod association;
 pub mod depth_agreement;
 pub mod depth_error;
 pub mod depth_modes;
@@ -22,7 +22,7 @@ pub mod surface_error;
 pub mod trajectory_error;
 pub mod umeyama;
 pub mod velocity_error;
-pub mod windows;
+pub(crate) mod windows;
 
 use crate::slam::evaluation::association::{Association, associate};
 use crate::slam::evaluation::statistics::ErrorStatistics;

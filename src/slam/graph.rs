@@ -1,7 +1,7 @@
 //! The pose graph: keyframes at similarities, measurements between them, and the places that fit best (Engel, Schöps,
 //! Cremers 2014, §3.6).
 //!
-//! [`optimise`] is the recipe: [`pose_graph`] is what goes in, [`residual`] what a measurement says, [`robust`] what a false
+//! [`optimise`] is the recipe: [`pose_graph`] is what goes in, `residual` what a measurement says, [`robust`] what a false
 //! one may do; the normal equations are solved by a sparse Cholesky factorisation over blocks (`ordering`, `fronts`,
 //! `factorisation`, `dense_kernel`) within Levenberg–Marquardt (`solver`). [`marginal`] says how sure the result is.
 //! All sums are in a fixed order and no operation is fused: results do not depend on the vector unit.
@@ -13,7 +13,7 @@ mod fronts;
 pub mod marginal;
 mod ordering;
 pub mod pose_graph;
-pub mod residual;
+pub(crate) mod residual;
 pub mod robust;
 mod solver;
 mod system;

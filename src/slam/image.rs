@@ -3,7 +3,7 @@
 pub mod buffer;
 pub mod gray;
 pub mod noise;
-pub mod pyramid;
+pub(crate) mod pyramid;
 pub mod quads;
 pub mod quads_kernel;
 pub mod sums;

@@ -8,7 +8,7 @@
 
 mod chain;
 mod closure;
-pub mod known;
+pub(crate) mod known;
 mod likeness;
 mod search;
 #[cfg(test)]

@@ -12,7 +12,7 @@ mod finder;
 mod joint;
 mod maturing;
 pub mod modes;
-pub mod observation;
+pub(crate) mod observation;
 mod params;
 mod past;
 mod phase;

@@ -104,8 +104,7 @@ pub struct Velocity {
     /// About the camera's own axes, radians a second.
     pub angular: Vector3<f64>,
     /// Upper triangle, row-major, of the covariance of (linear, angular), (world units/s)² and (rad/s)²: errors of both
-    /// poses, and what the velocity may have changed by within the interval
-    /// ([`velocity`](crate::slam::tracker::velocity)). The error of the map's scale is not in it.
+    /// poses, and what the velocity may have changed by within the interval. The error of the map's scale is not in it.
     pub covariance: [f64; 21],
 }
 

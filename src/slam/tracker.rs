@@ -1,11 +1,11 @@
 //! The recipe of a frame: predict, align to the keyframe coarse to fine, judge, report.
 
 pub mod covariance_floor;
-pub mod motion;
+pub(crate) mod motion;
 mod proposal;
 mod report;
 mod turning;
-pub mod velocity;
+pub(crate) mod velocity;
 pub mod verdict;
 
 use serde::{Deserialize, Serialize};

@@ -4,18 +4,18 @@
 //!
 //! A camera that stands or only turns never gets there, however noisy its images: see [`evidence`].
 
-pub mod earlier_frames;
-pub mod elimination;
+pub(crate) mod earlier_frames;
+pub(crate) mod elimination;
 pub mod evidence;
 pub mod fit;
-pub mod hypothesis;
-pub mod lanes;
+pub(crate) mod hypothesis;
+pub(crate) mod lanes;
 mod lead;
-pub mod median;
-pub mod points;
+pub(crate) mod median;
+pub(crate) mod points;
 mod sampling_kernel;
-pub mod spread;
-pub mod system;
+pub(crate) mod spread;
+pub(crate) mod system;
 mod system_kernel;
 
 use nalgebra::{Matrix6, Vector3};

@@ -7,29 +7,29 @@
 //! and see the same things hold it in place; nothing is marginalised, and the filter's variance is no prior.
 
 mod agreement;
-pub mod candidates;
+pub(crate) mod candidates;
 pub mod comparison;
 mod comparison_kernel;
 mod conclusion;
-pub mod confirmed;
-pub mod dense;
+pub(crate) mod confirmed;
+pub(crate) mod dense;
 mod elimination_kernel;
 mod factors;
 mod feedback;
 pub mod frames;
-pub mod functional;
-pub mod keyframe;
+pub(crate) mod functional;
+pub(crate) mod keyframe;
 mod looping;
-pub mod marginals;
+pub(crate) mod marginals;
 mod members;
 mod neighbours;
 pub mod params;
 mod pass;
-pub mod place_marginals;
+pub(crate) mod place_marginals;
 mod plane;
 mod rival;
 mod selection;
-pub mod sighting;
+pub(crate) mod sighting;
 mod solver;
 mod surface;
 mod system;

@@ -9,8 +9,7 @@ use crate::capture::simulator::{flat, twins};
 
 /// Builds a scene and paints its textures, in parallel on the current rayon pool.
 pub fn build(kind: SceneKind, seed: u64) -> Scene {
-    let Furnished { blocks, stage } = furnish(kind, seed);
-    Scene::new(blocks, stage, seed)
+    Scene::new(furnish(kind, seed).blocks, seed)
 }
 
 /// Puts up a scene; the seed chooses textures and small things, not where furniture stands.

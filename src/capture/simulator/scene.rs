@@ -89,14 +89,12 @@ pub struct Scene {
     pub blocks: Vec<Block>,
     /// What the faces refer to.
     pub textures: Vec<Texture>,
-    /// Where a camera may walk.
-    pub stage: Stage,
 }
 
 impl Scene {
     /// A scene of blocks with freshly painted textures.
-    pub fn new(blocks: Vec<Block>, stage: Stage, seed: u64) -> Self {
-        Self { blocks, textures: paint_all(seed), stage }
+    pub fn new(blocks: Vec<Block>, seed: u64) -> Self {
+        Self { blocks, textures: paint_all(seed) }
     }
 }
 

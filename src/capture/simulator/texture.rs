@@ -51,11 +51,6 @@ impl Texture {
         Self { levels, size }
     }
 
-    /// Side of the finest level in texels.
-    pub fn size(&self) -> usize {
-        self.size
-    }
-
     /// Mean over the footprint: trilinear samples as wide as its short axis, in a row along its
     /// long axis (Heckbert 1989, with Gaussian weights left out), so that a surface keeps its
     /// brightness from every distance and angle.

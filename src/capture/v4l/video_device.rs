@@ -68,17 +68,6 @@ pub struct SizeRange {
     pub step: (u32, u32),
 }
 
-impl SizeRange {
-    /// Whether it has this size.
-    pub fn contains(&self, width: u32, height: u32) -> bool {
-        let fits = |side: u32, smallest: u32, largest: u32, step: u32| {
-            (smallest..=largest).contains(&side) && (side - smallest).is_multiple_of(step.max(1))
-        };
-        fits(width, self.smallest.0, self.largest.0, self.step.0)
-            && fits(height, self.smallest.1, self.largest.1, self.step.1)
-    }
-}
-
 impl fmt::Display for SizeRange {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(out, "{}x{}", self.smallest.0, self.smallest.1)?;

@@ -6,7 +6,7 @@
 //!
 //! * `CAMR`: width, height (u32), fx, fy, cx, cy (f64).
 //! * `STAT`: detail (u32), first free epoch (u32), revision of the map, number of saves, seconds since 1970 (u64).
-//! * `loop`: loops, as in [`loop_bytes`](crate::service::loop_bytes); left out where there are none.
+//! * `loop`: loops, as in `loop_bytes`; left out where there are none.
 //! * `KEYF`: number of keyframes (u64), each: bytes (u32) of the keyframe without image and points as in
 //!   [`map_file`](crate::service::map_file), these; then, 0 where it has no file, revision in the file's name, bytes
 //!   (u64), checksum, number of points (u32) of its file.

@@ -1,27 +1,27 @@
 //! `report.html`: a run on one page that needs no other file and no network.
 
-pub mod axis;
-pub mod budget_charts;
+pub(crate) mod axis;
+pub(crate) mod budget_charts;
 pub mod chart;
 mod chart_figure;
 mod chart_frame;
 mod chart_points;
-pub mod charts;
-pub mod evaluation_plot;
+pub(crate) mod charts;
+pub(crate) mod evaluation_plot;
 mod figure_words;
 mod figure_words_quality;
-pub mod figures;
-pub mod grade_banner;
-pub mod html;
-pub mod input;
-pub mod joint_charts;
-pub mod loop_section;
-pub mod map_picture;
-pub mod map_view;
+pub(crate) mod figures;
+pub(crate) mod grade_banner;
+pub(crate) mod html;
+pub(crate) mod input;
+pub(crate) mod joint_charts;
+pub(crate) mod loop_section;
+pub(crate) mod map_picture;
+pub(crate) mod map_view;
 mod number_text;
 pub mod scene;
 pub mod series;
-pub mod views;
+pub(crate) mod views;
 
 use std::fmt::Write;
 

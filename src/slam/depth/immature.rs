@@ -148,7 +148,7 @@ pub struct ImmaturePoint {
     pub u: u16,
     /// Row of its pixel.
     pub v: u16,
-    /// Brightness at the samples of the [`PATTERN`].
+    /// Brightness at the samples of the `PATTERN`.
     pub intensities: [f32; 8],
     /// Weight of each sample, `c²/(c²+‖g‖²)`: strong gradients misjudge sub-pixel errors as residual.
     pub weights: [f32; 8],

@@ -1,6 +1,6 @@
 //! The search for a keyframe pixel along its epipolar segment in another frame.
 //!
-//! A patch of [`PATTERN`] samples around the pixel, turned and scaled as the geometry says, is
+//! A patch of `PATTERN` samples around the pixel, turned and scaled as the geometry says, is
 //! compared at 1-px steps along the segment, then refined by Gauss–Newton in one dimension. The
 //! uncertainty of the match follows Engel, Sturm, Cremers 2013 §2.2–2.3, summed over the patch.
 

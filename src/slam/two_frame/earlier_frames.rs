@@ -43,11 +43,6 @@ impl EarlierFrames {
         self.kept.len()
     }
 
-    /// Whether there is none.
-    pub fn is_empty(&self) -> bool {
-        self.kept.is_empty()
-    }
-
     /// Adds a frame (all its levels, and its fit without translation); at most `most` are kept.
     pub fn push(&mut self, images: &[Image<f32>], rotation: &State, most: usize) {
         while self.kept.len() >= most.max(1) {

@@ -6,11 +6,6 @@ pub const LANES: usize = 8;
 /// One number of each point of a block.
 pub type Lanes = [f32; LANES];
 
-/// How many blocks hold so many points; the last may have lanes to spare.
-pub fn num_blocks(points: usize) -> usize {
-    points.div_ceil(LANES)
-}
-
 /// A function of each lane.
 #[inline(always)]
 pub fn lanes(value: impl Fn(usize) -> f32) -> Lanes {

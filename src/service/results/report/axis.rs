@@ -36,7 +36,7 @@ impl Range {
     }
 
     /// The same range begun at zero, for quantities that cannot be negative.
-    pub fn from_zero(self) -> Self {
+    pub fn begun_at_zero(self) -> Self {
         Self { low: 0.0, high: if self.high > 0.0 { self.high } else { 1.0 } }
     }
 

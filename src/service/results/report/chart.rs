@@ -98,7 +98,7 @@ impl Chart {
         let y = Range::around(drawn().map(|p| height_of(p[1])));
         Frame {
             x: Range::around(points().map(|p| p[0])),
-            y: if self.scaling == Scaling::FromZero { y.from_zero() } else { y },
+            y: if self.scaling == Scaling::FromZero { y.begun_at_zero() } else { y },
             in_decades,
             width: CHART_WIDTH - MARGIN[0] - MARGIN[2],
             height: self.height - MARGIN[1] - MARGIN[3],

@@ -104,8 +104,8 @@ pub fn trajectory_charts(
         }
     };
     [
-        chart("Trajectory from above", ABOVE_MEANING, "across", &|p| views.from_above(p)),
-        chart("Trajectory from the side", SIDE_MEANING, "up", &|p| views.from_side(p)),
+        chart("Trajectory from above", ABOVE_MEANING, "across", &|p| views.seen_from_above(p)),
+        chart("Trajectory from the side", SIDE_MEANING, "up", &|p| views.seen_from_side(p)),
     ]
 }
 
@@ -299,7 +299,7 @@ fn histogram(times: &Times, samples: &[[f64; 2]], limit: Option<f64>) -> Chart {
     let mut sorted: Vec<f64> = samples.iter().map(|sample| sample[1]).collect();
     sorted.sort_by(f64::total_cmp);
     let p99 = percentile(&sorted, 0.99).unwrap_or(0.0);
-    let end = Range::around([1.5 * p99.max(limit.unwrap_or(0.0))].into_iter()).from_zero().high;
+    let end = Range::around([1.5 * p99.max(limit.unwrap_or(0.0))].into_iter()).begun_at_zero().high;
     let end = end.min(1.5 * p99.max(limit.unwrap_or(0.0)).max(1e-3));
     let width = end / BARS as f64;
     let mut counts = [0u32; BARS];

@@ -42,7 +42,7 @@ pub fn loop_section(input: &ReportInput<'_>, up: Option<Vector3<f64>>) -> String
             listed.join("; ")
         );
     }
-    let chart = from_above(input.record, searches, up);
+    let chart = seen_from_above(input.record, searches, up);
     let _ = write!(section, "<div class=\"charts\">{}</div></section>", chart_figure(&chart));
     section
 }
@@ -64,14 +64,18 @@ fn reasons(searches: &[SearchRecord]) -> Vec<(String, usize)> {
 }
 
 /// The keyframes' path in the longest epoch, and what was found where; loops with a line between the keyframes.
-fn from_above(record: &RunRecord, searches: &[SearchRecord], up: Option<Vector3<f64>>) -> Chart {
+fn seen_from_above(
+    record: &RunRecord,
+    searches: &[SearchRecord],
+    up: Option<Vector3<f64>>,
+) -> Chart {
     let keyframes = keyframe_poses(record);
     let views = Views::of(&keyframes, up);
     let epoch = longest_epoch(record);
     let at = |id: u64| {
         let is_shown = |of: &&Keyframe| epoch.is_none_or(|epoch| of.epoch == epoch);
         let keyframe = record.map.get(id).filter(is_shown)?;
-        Some(views.from_above(&keyframe.map_from_keyframe.rigid.translation))
+        Some(views.seen_from_above(&keyframe.map_from_keyframe.rigid.translation))
     };
     let of = |is: IsFate| -> Vec<[f64; 2]> {
         let found = searches.iter().filter(|search| is(&search.report.fate));
@@ -88,7 +92,8 @@ fn from_above(record: &RunRecord, searches: &[SearchRecord], up: Option<Vector3<
     // A broken line: one piece for each loop.
     let links = links.flat_map(|[i, j]| [i, j, [f64::NAN; 2]]).collect();
     let line = |name, colour, points| Series { name, colour, mark: Mark::Path, points };
-    let path = keyframes.iter().map(|pose| views.from_above(&pose.world_from_camera.translation));
+    let path =
+        keyframes.iter().map(|pose| views.seen_from_above(&pose.world_from_camera.translation));
     Chart {
         title: "Loops from above",
         meaning: "Where earlier places were recognised. Closed or joined: the map was moved by it; held already: the map had it \

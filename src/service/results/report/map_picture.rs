@@ -107,12 +107,14 @@ pub fn map_picture(
         .map(position)
         .filter(|p| p.iter().all(|c| c.is_finite()))
         .map(|p| {
-            let ([x, y], [_, height]) = (views.from_above(&p), views.from_side(&p));
+            let ([x, y], [_, height]) = (views.seen_from_above(&p), views.seen_from_side(&p));
             [x, y, height]
         })
         .collect();
-    let path: Vec<[f64; 2]> =
-        path.iter().map(|pose| views.from_above(&pose.world_from_camera.translation)).collect();
+    let path: Vec<[f64; 2]> = path
+        .iter()
+        .map(|pose| views.seen_from_above(&pose.world_from_camera.translation))
+        .collect();
     let mut ranges = [[0.0; 2]; 3];
     for (axis, range) in ranges.iter_mut().enumerate() {
         *range = middle_range(flat.iter().map(|p| p[axis]))?;

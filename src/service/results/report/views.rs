@@ -38,12 +38,12 @@ impl Views {
     }
 
     /// Right and forward: seen from above.
-    pub fn from_above(&self, position: &Vector3<f64>) -> [f64; 2] {
+    pub fn seen_from_above(&self, position: &Vector3<f64>) -> [f64; 2] {
         [self.right.dot(position), self.forward.dot(position)]
     }
 
     /// Right and up: seen from the side.
-    pub fn from_side(&self, position: &Vector3<f64>) -> [f64; 2] {
+    pub fn seen_from_side(&self, position: &Vector3<f64>) -> [f64; 2] {
         [self.right.dot(position), self.up.dot(position)]
     }
 }
@@ -85,13 +85,13 @@ mod tests {
             .collect();
         let views = Views::of(&poses, None);
         for pose in &poses {
-            assert!(views.from_side(&pose.world_from_camera.translation)[1].abs() < 1e-12);
+            assert!(views.seen_from_side(&pose.world_from_camera.translation)[1].abs() < 1e-12);
         }
-        let [x, y] = views.from_above(&Vector3::new(0.0, 0.0, 1.0));
+        let [x, y] = views.seen_from_above(&Vector3::new(0.0, 0.0, 1.0));
         assert!(x > 0.9 && y.abs() < 0.5, "the long way lies along x");
         let slope = Views::of(&poses, Some(-Vector3::x()));
-        assert!((slope.from_side(&-Vector3::x())[1] - 1.0).abs() < 1e-12, "up is as given");
-        assert!(slope.from_above(&Vector3::x()).iter().all(|c| c.abs() < 1e-12));
+        assert!((slope.seen_from_side(&-Vector3::x())[1] - 1.0).abs() < 1e-12, "up is as given");
+        assert!(slope.seen_from_above(&Vector3::x()).iter().all(|c| c.abs() < 1e-12));
         let _ = Views::of(&[], None);
         let _ = Views::of(&poses[..1], None);
     }
