@@ -19,7 +19,7 @@ impl Mapper {
         let epoch = self.keyframe().map(|keyframe| keyframe.epoch);
         let before = self.last_map_from_camera();
         self.revision += 1;
-        self.map.correct(&self.thinning.follow(correction), self.revision)?;
+        self.map.correct(&self.thinning.follow(&self.map, correction), self.revision)?;
         self.depth.maturing.correct(correction, &self.intrinsics);
         let (Some(before), Some(after)) = (before, self.last_map_from_camera()) else {
             return Ok(StepOutcome { graph_changed: true, ..finished });

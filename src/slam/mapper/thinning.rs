@@ -30,7 +30,7 @@ const LEAST_COSINE: f64 = 0.94;
 /// Keyframes further away than so many mean depths see what they have in common from other directions.
 const REACH: f64 = 0.5;
 
-/// Which keyframes have given up their depth, and where they are now.
+/// Which keyframes have given up their depth, and what they move with.
 #[derive(Debug, Default)]
 pub(super) struct Thinning {
     attached: Vec<Attached>,
@@ -43,12 +43,12 @@ pub(super) struct Thinning {
 struct Attached {
     keyframe_id: u64,
     to: u64,
-    to_from_keyframe: Sim3,
 }
 
 impl Thinning {
-    /// The correction with the keyframes that move with those in it.
-    pub fn follow(&self, correction: &Correction) -> Correction {
+    /// The correction with the keyframes that move with those in it, from where they are in the map: another correction
+    /// may have moved the two each for itself.
+    pub fn follow(&self, map: &Map, correction: &Correction) -> Correction {
         let mut extended = correction.clone();
         let mut places: Vec<(u64, Sim3)> =
             correction.keyframes.iter().map(|k| (k.keyframe_id, k.map_from_keyframe)).collect();
@@ -59,9 +59,12 @@ impl Thinning {
         };
         let followers = self.attached.iter().filter(|of| find(of.keyframe_id).is_none());
         extended.keyframes.extend(followers.filter_map(|of| {
+            let moved = find(of.to)?;
+            let to = map.get(of.to)?.map_from_keyframe;
+            let keyframe = map.get(of.keyframe_id)?.map_from_keyframe;
             Some(KeyframeCorrection {
                 keyframe_id: of.keyframe_id,
-                map_from_keyframe: find(of.to)? * of.to_from_keyframe,
+                map_from_keyframe: moved * to.inverse() * keyframe,
                 depth: LogPlane::default(),
                 modes: None,
                 place: None,
@@ -71,11 +74,11 @@ impl Thinning {
     }
 
     /// A keyframe moves with another from now on, and so does what moved with it.
-    fn attach(&mut self, keyframe_id: u64, to: u64, to_from_keyframe: Sim3) {
+    fn attach(&mut self, keyframe_id: u64, to: u64) {
         for of in self.attached.iter_mut().filter(|of| of.to == keyframe_id) {
-            (of.to, of.to_from_keyframe) = (to, to_from_keyframe * of.to_from_keyframe);
+            of.to = to;
         }
-        self.attached.push(Attached { keyframe_id, to, to_from_keyframe });
+        self.attached.push(Attached { keyframe_id, to });
     }
 
     /// The next places in the list of keyframes to be examined, newest first and round again.
@@ -119,21 +122,18 @@ impl Mapper {
             if excess == 0 {
                 break;
             }
-            let Some((to, to_from_keyframe)) = shown_by(&self.map, index, &self.params.reuse)
-            else {
-                continue;
-            };
+            let Some(to) = shown_by(&self.map, index, &self.params.reuse) else { continue };
             let keyframe = &mut self.map.keyframes[index];
             keyframe.forget_depth();
-            self.thinning.attach(keyframe.keyframe_id, to, to_from_keyframe);
+            self.thinning.attach(keyframe.keyframe_id, to);
             excess -= 1;
         }
     }
 }
 
 /// Of a keyframe whose points enough others show as well, one of them from near enough to be taken up in its stead: the
-/// nearest of those, and where it stands on that.
-fn shown_by(map: &Map, index: usize, reuse: &ReuseParams) -> Option<(u64, Sim3)> {
+/// nearest of those.
+fn shown_by(map: &Map, index: usize, reuse: &ReuseParams) -> Option<u64> {
     let keyframe = &map.keyframes[index];
     let place = keyframe.map_from_keyframe;
     let forward = place.rigid.rotation * Vector3::z();
@@ -172,11 +172,10 @@ fn shown_by(map: &Map, index: usize, reuse: &ReuseParams) -> Option<(u64, Sim3)>
         let at = of.map_from_keyframe.locate(&place.rigid);
         reuse.distance.distance(at.translation.norm(), of.usage(&at)) < reuse.max_distance
     };
-    let nearest =
-        others.iter().zip(views).filter(|(of, _)| stands_in(of)).min_by(|(one, _), (other, _)| {
-            distance(one).total_cmp(&distance(other)).then(one.keyframe_id.cmp(&other.keyframe_id))
-        });
-    nearest.map(|(of, view)| (of.keyframe_id, view))
+    let nearest = others.iter().filter(|of| stands_in(of)).min_by(|one, other| {
+        distance(one).total_cmp(&distance(other)).then(one.keyframe_id.cmp(&other.keyframe_id))
+    });
+    nearest.map(|of| of.keyframe_id)
 }
 
 /// Whether a keyframe shows a point as well as another, in whose frame and unit it is; `view` maps that into the
@@ -200,6 +199,8 @@ fn shows(keyframe: &Keyframe, view: &Sim3, at: &Vector3<f64>) -> bool {
 mod tests {
     use super::*;
     use std::sync::Arc;
+
+    use nalgebra::Vector6;
 
     use crate::slam::geometry::se3::SE3;
     use crate::slam::geometry::sim3::Matrix7;
@@ -247,10 +248,8 @@ mod tests {
             let at = x.iter().enumerate().map(|(k, x)| keyframe(k as u64, *x, 0.0));
             Map { keyframes: at.collect(), ..Map::default() }
         };
-        let (id, place) =
-            shown_by(&near(&[0.0, 0.02, -0.01, 0.03]), 0, &ReuseParams::default()).unwrap();
-        assert_eq!(id, 2);
-        assert!((place.rigid.translation.x - 0.01).abs() < 1e-12, "{place:?}");
+        let found = shown_by(&near(&[0.0, 0.02, -0.01, 0.03]), 0, &ReuseParams::default());
+        assert_eq!(found, Some(2));
         assert!(
             shown_by(&near(&[0.0, 0.02, -0.01]), 0, &ReuseParams::default()).is_none(),
             "two others"
@@ -282,7 +281,7 @@ mod tests {
         // All its points are shown: what is left is the distance of a hundredth of a mean depth.
         let weight = DistanceWeights::default().translation;
         let nearest = (0.01 * weight).powi(2);
-        assert_eq!(stands_in(1.01 * nearest + 1e-3).map(|(id, _)| id), Some(2));
+        assert_eq!(stands_in(1.01 * nearest + 1e-3), Some(2));
         assert!(stands_in(0.5 * nearest).is_none());
     }
 
@@ -302,7 +301,7 @@ mod tests {
         let stands_in = |max_distance: f64| {
             shown_by(&map, 0, &ReuseParams { max_distance, ..ReuseParams::default() })
         };
-        assert_eq!(stands_in(1.01 * nearest).map(|(id, _)| id), Some(2));
+        assert_eq!(stands_in(1.01 * nearest), Some(2));
         assert!(stands_in(0.99 * nearest).is_none());
     }
 
@@ -336,6 +335,19 @@ mod tests {
         for _ in 0..200 {
             mapper.thin();
         }
+        // A loop moves every keyframe by its own.
+        let by_its_own = |of: &Keyframe| KeyframeCorrection {
+            keyframe_id: of.keyframe_id,
+            map_from_keyframe: Sim3::new(
+                SE3::exp(&(Vector6::repeat(1e-3) * of.keyframe_id as f64)),
+                1.0 + 1e-3 * of.keyframe_id as f64,
+            ) * of.map_from_keyframe,
+            depth: LogPlane::default(),
+            modes: None,
+            place: None,
+        };
+        let keyframes = mapper.map.keyframes.iter().map(by_its_own).collect();
+        mapper.apply(&Correction { keyframes, ..Correction::default() }).unwrap();
         // All that have depth are turned, moved and scaled alike: so must be the others.
         let moved = Sim3::new(SE3::exp(&[0.3, -0.1, 0.2, 0.1, 0.4, -0.2].into()), 1.3);
         let held = mapper.map.keyframes.iter().filter(|of| of.has_depth());
