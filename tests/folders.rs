@@ -190,7 +190,7 @@ fn of_a_run_that_was_killed_while_it_prepared_there_is_nothing_to_recover() {
 fn a_recovery_finds_a_source_whose_path_is_no_text() {
     let rig = Rig::new();
     let (output, recording) = (rig.output(), rig.folder().join(OsStr::from_bytes(b"b\xffd")));
-    let mut simulate = command(&rig, &["simulate", "--frames", "200"]);
+    let mut simulate = command(&rig, &["simulate", "--frames", "400"]);
     simulate.arg("--output").arg(&recording);
     assert!(finish(simulate).status.success());
     let mut run = rig.command(&["run", "--live", "--output", output.to_str().unwrap()]);

@@ -253,7 +253,7 @@ fn a_map_is_described_exported_and_merged() {
 fn a_running_mapper_saves_when_it_is_asked() {
     let rig = Rig::new();
     let map = rig.folder().join("map");
-    let source = "loop:300:30:sim";
+    let source = "loop:1000000:30:sim";
     let mut command = rig.run(40, &["--live", "--source", source]);
     let mut child = command.arg("--map").arg(&map).spawn().unwrap();
     let copy = rig.folder().join("copy");

@@ -164,17 +164,20 @@ fn who_comes_late_gets_the_keyframe_and_status_sees_all_three() {
     let keyframe = until("the keyframe", || inbox.newest().unwrap());
     assert_eq!(keyframe.image.len(), 160 * 120);
 
-    let status = finish(rig.command(&["status", "--once", "--json"]));
-    assert!(status.status.success(), "{}", status.stderr);
-    let status: Value = serde_json::from_str(&status.stdout).unwrap();
-    for process in ["capture", "tracker", "mapper"] {
-        assert_eq!(status[process]["state"], "running", "{status}");
-        let rate_hz = status[process]["rate_hz"].as_f64();
-        assert!(rate_hz.is_some_and(|rate_hz| rate_hz > 0.5), "{process}: {status}");
-    }
+    // What a process tells once a second may be of before.
+    let status = until("the figures of all three", || {
+        let status = finish(rig.command(&["status", "--once", "--json"]));
+        assert!(status.status.success(), "{}", status.stderr);
+        let status: Value = serde_json::from_str(&status.stdout).unwrap();
+        let runs = |process: &str| {
+            status[process]["state"] == "running" && status[process]["rate_hz"].as_f64() > Some(0.5)
+        };
+        let told = ["capture", "tracker", "mapper"].into_iter().all(runs);
+        (told && status["keyframes"].as_u64() > Some(0)).then_some(status)
+    });
     assert_eq!((&status["instance"], &status["source"]), (&"semidense".into(), &"sim".into()));
     assert_eq!(status["ended"], false, "{status}");
-    assert!(status["keyframes"].as_u64() > Some(0) && status["uptime_secs"].as_f64() > Some(0.5));
+    assert!(status["uptime_secs"].as_f64() > Some(0.5));
     assert!(status["pose"]["state"].is_string() && status["pose"]["position"][2].is_f64());
     assert!(status["pose"]["age_secs"].as_f64() < Some(60.0), "{status}");
 

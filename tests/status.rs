@@ -6,6 +6,7 @@ mod support;
 use std::io::{BufRead, BufReader};
 use std::process::Child;
 use std::sync::mpsc::{Receiver, channel};
+use std::time::Instant;
 
 use rustix::process::Signal;
 use serde_json::Value;
@@ -28,11 +29,13 @@ fn next(lines: &Receiver<String>) -> Value {
 
 /// The first object that is as it should be.
 fn until(lines: &Receiver<String>, is_right: impl Fn(&Value) -> bool) -> Value {
+    let begin = Instant::now();
     loop {
         let value = next(lines);
         if is_right(&value) {
             return value;
         }
+        assert!(begin.elapsed() < WATCH_DOG, "waited in vain: {value}");
     }
 }
 
@@ -44,10 +47,11 @@ fn watching_goes_on_through_the_ends_of_runs_with_an_object_a_line() {
     let nothing = next(&said);
     assert_eq!((&nothing["ended"], &nothing["capture"]), (&true.into(), &Value::Null));
     for _ in 0..2 {
-        let child = rig.run(60, &["--live", "--set", "simulator.rate_hz=15"]).spawn().unwrap();
+        let child = rig.run(60, &["--live", "--source", "loop:1000000:15:sim"]).spawn().unwrap();
         let on = until(&said, |value| value["tracker"]["frames"].as_u64() > Some(5));
         assert_eq!((&on["ended"], &on["instance"]), (&false.into(), &"semidense".into()));
-        assert!(end(child).status.success());
+        signal(&child, Signal::INT);
+        assert_eq!(end(child).status.code(), Some(130));
         let off = until(&said, |value| value["ended"] == true);
         let keys = |value: &Value| value.as_object().unwrap().keys().cloned().collect::<Vec<_>>();
         assert_eq!((keys(&off), keys(&nothing)), (keys(&on), keys(&on)));

@@ -198,9 +198,12 @@ fn a_hanging_process_is_started_again(process: usize) {
     live.until_replaced(process, stopped);
     let (code, stderr, summary, rig) = live.end();
     assert_eq!(code, Some(0), "{stderr}");
-    let cause = summary["restart_causes"][0]["cause"].as_str().unwrap_or_default();
-    assert!(cause.contains("was stopped"), "{summary}");
-    assert!(cause.starts_with(HEALTH_TOPICS[process].owner), "{summary}");
+    // On a busy machine another may have been taken for hung too.
+    let is_its_own = |of: &Value| {
+        let cause = of["cause"].as_str().unwrap_or_default();
+        cause.starts_with(HEALTH_TOPICS[process].owner) && cause.contains("was stopped")
+    };
+    assert!(summary["restart_causes"].as_array().unwrap().iter().any(is_its_own), "{summary}");
     assert!(stamps(&rig).is_sorted_by(|one, next| one < next));
 }
 
@@ -242,7 +245,11 @@ fn a_process_that_hangs_in_lockstep_ends_the_run_with_its_name() {
 #[test]
 fn a_mapper_that_hangs_at_the_end_does_not_hold_up_the_results() {
     let mut live = Live::start(&[]);
-    live.until_frames(MAPPER, 90);
+    let begun = until("a keyframe", || {
+        let health = live.peers[MAPPER].update().unwrap()?;
+        (health.total > 0).then_some(health.frames)
+    });
+    live.until_frames(MAPPER, begun + 60);
     // More than a second of mapping: there is a checkpoint.
     live.send(&[MAPPER], Signal::STOP);
     signal(&live.run, Signal::INT);
@@ -377,7 +384,7 @@ fn with_shared_memory(rig: &Rig, megabytes: u32, script: &str) -> Option<support
 }
 
 /// Options of a small live run, for a shell.
-const SMALL: &str = "--live --source loop:150:30:sim --output $OUTPUT --set simulator.frames=40 \
+const SMALL: &str = "--live --source loop:600:30:sim --output $OUTPUT --set simulator.frames=40 \
      --set simulator.width=160 --set simulator.height=120 --set simulator.focal_px=131.0";
 
 #[test]
@@ -386,7 +393,8 @@ fn shared_memory_that_others_fill_costs_a_run_nothing() {
     // Whatever is left once frames flow is taken by somebody else.
     let script = format!(
         "$SEMIDENSE run {SMALL} & run=$!; \
-         until $SEMIDENSE status --once --json 2>/dev/null | grep -q '\"mapping\"'; do sleep 0.2; done; \
+         until $SEMIDENSE status --once --json 2>/dev/null | grep -q '\"mapping\"' || ! kill -0 $run; \
+         do sleep 0.2; done; \
          dd if=/dev/zero of=/dev/shm/foreign bs=64k 2>/dev/null; \
          $SEMIDENSE status --once >&2; echo status $? >&2; wait $run"
     );
@@ -399,7 +407,7 @@ fn shared_memory_that_others_fill_costs_a_run_nothing() {
     let summary = fs::read_to_string(rig.output().join("summary.json")).unwrap();
     let summary: Value = serde_json::from_str(&summary).unwrap();
     assert_eq!(summary["restarts"], 0, "{summary}");
-    assert_eq!(summary["frames_in"], 150, "{summary}");
+    assert_eq!(summary["frames_in"], 600, "{summary}");
 }
 
 #[test]

@@ -18,6 +18,9 @@ enum Fate {
     Killed,
 }
 
+/// Frames that are rendered while the bridge joins.
+const RENDERED: usize = 1500;
+
 /// A run on a small simulated camera beside a bridge; what it wrote into `output`.
 fn run(mode: &str, frames: usize, fate: Fate, read: impl Fn(&Path) -> String) -> String {
     let root = Root::new("bystander");
@@ -31,11 +34,15 @@ fn run(mode: &str, frames: usize, fate: Fate, read: impl Fn(&Path) -> String) ->
     });
     let mut command = Command::new(semidense());
     command.args(["run", mode, "--instance", "bystander", "--output"]).arg(&output);
-    for setting in ["width=160", "height=120", "focal_px=131.0", &format!("frames={frames}")] {
+    command.args(["--source", &format!("loop:{frames}:30:sim")]);
+    for setting in ["width=160", "height=120", "focal_px=131.0", &format!("frames={RENDERED}")] {
         command.args(["--set", &format!("simulator.{setting}")]);
     }
     // A debug build is slow, and not hung.
     command.args(["--set", "supervisor.watchdog_s=100.0"]);
+    if let Some(bystander) = &bystander {
+        bystander.wait_for("sending instance");
+    }
     let mut pipeline = Running::start(command, root.path());
     if let Some(bystander) = &bystander {
         bystander.wait_for("joined the instance");

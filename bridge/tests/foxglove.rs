@@ -58,7 +58,7 @@ fn foxgloves_own_client_gets_what_it_subscribes_to() {
         assert_eq!(found["cloudPoints"], 500);
         let seconds = REALTIME / 1_000_000_000;
         let stamp = found["odomSeconds"].as_i64().unwrap();
-        assert!((seconds..seconds + 60).contains(&stamp), "{stamp}");
+        assert!((seconds..seconds + 600).contains(&stamp), "{stamp}");
         server.join().unwrap().unwrap();
     }
 }
@@ -70,7 +70,7 @@ fn the_port_of_the_live_page_speaks_it() {
     }
     let rig = Rig::new();
     let (_view, address) = rig.view(&[]);
-    let mut run = Process::start(rig.run(80, &["--live", "loop:400:8:sim"]));
+    let mut run = Process::start(rig.run(80, &["--live", "loop:20000:8:sim"]));
     let host = address.strip_prefix("http://").unwrap().split('/').next().unwrap();
     for protocol in SUBPROTOCOLS {
         check(&run_client(host, protocol, "semidense"), "semidense");

@@ -239,13 +239,15 @@ fn trajectories(rig: &Rig) -> [Vec<u8>; 3] {
 
 #[test]
 fn a_page_that_is_stopped_or_killed_changes_no_result() {
-    const FRAMES: usize = 60;
+    /// Rendered while the page joins; the run begins with the first sixty.
+    const FRAMES: usize = 1500;
+    let arguments = ["--lockstep", "--source", "loop:60:30:sim"];
     let alone = Rig::new();
-    succeed(alone.run(FRAMES, &["--lockstep"]));
+    succeed(alone.run(FRAMES, &arguments));
     for signal in ["-STOP", "-KILL"] {
         let rig = Rig::new();
         let (view, address) = rig.view(&[]);
-        let run = rig.run(FRAMES, &["--lockstep"]).spawn().unwrap();
+        let run = rig.run(FRAMES, &arguments).spawn().unwrap();
         until("the page to have joined", || {
             get(&address, "/metrics", "").contains("semidense_up 1").then_some(())
         });

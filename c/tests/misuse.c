@@ -29,7 +29,7 @@ static void *elsewhere(void *reader) {
 /* A reader that is never closed goes with its thread. */
 static void *forgetful(void *unused) {
     semidense_reader *reader = NULL;
-    EXPECT(semidense_open(NULL, NULL, SEMIDENSE_WANT_FRAMES, 10000, &reader), OK, NULL);
+    EXPECT(semidense_open(NULL, NULL, SEMIDENSE_WANT_FRAMES, 120000, &reader), OK, NULL);
     return unused;
 }
 
@@ -67,7 +67,7 @@ int main(void) {
     EXPECT(semidense_close(NULL), OK, NULL);
     EXPECT(semidense_close((semidense_reader *)&failures), ERROR_HANDLE, "closed");
 
-    EXPECT(semidense_open(NULL, NULL, poses, 10000, &reader), OK, NULL);
+    EXPECT(semidense_open(NULL, NULL, poses, 120000, &reader), OK, NULL);
     semidense_frame frame;
     semidense_keyframe keyframe;
     semidense_graph graph;
@@ -99,7 +99,7 @@ int main(void) {
     without_reader(reader, "closed");
     /* Opened again it is another one, and stays open to the end of the program. */
     semidense_reader *again = NULL;
-    EXPECT(semidense_open(NULL, NULL, poses, 10000, &again), OK, NULL);
+    EXPECT(semidense_open(NULL, NULL, poses, 120000, &again), OK, NULL);
     if (again == reader || strcmp(semidense_status_name(77), "unknown status") != 0) {
         failures += 1;
     }

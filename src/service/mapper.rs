@@ -360,7 +360,6 @@ impl<'a> Shell<'a> {
     /// Tells what the map holds after a step, and what the step took.
     fn tell_step(&mut self, step_nanos: u64) {
         let Some((_, mapper)) = &self.mapper else { return };
-        self.health.enter(ProcessState::Running, &mapper.situation().to_string());
         let counters = self.health.counters();
         counters.frames += 1;
         counters.dropped = self.missing.saturating_add(self.pairing.dropped());
@@ -368,6 +367,8 @@ impl<'a> Shell<'a> {
         counters.detail = mapper.keyframe().map_or(0, |k| code_from_map_state(k.map_state));
         self.health.count_work(step_nanos);
         self.health.count_latency(step_nanos);
+        // A report that goes out at once has the step in it.
+        self.health.enter(ProcessState::Running, &mapper.situation().to_string());
         self.health.report();
     }
 

@@ -322,7 +322,6 @@ impl<'a> Shell<'a> {
             message = pose_message(&unclaimed(estimate), &timing);
         }
         self.poses.send((), &[message])?;
-        self.health.enter(ProcessState::Running, state_text(estimate.state));
         self.health.count_latency(timing.latency_nanos);
         self.health.count_work(timing.track_nanos);
         self.health.count_wake(timing.wake_nanos);
@@ -331,6 +330,8 @@ impl<'a> Shell<'a> {
         counters.detail = codes_from_state(estimate.state).0;
         let late = deadline_nanos.is_some_and(|deadline| published_nanos > deadline);
         counters.deadline_misses += u64::from(late);
+        // A report that goes out at once has the frame in it.
+        self.health.enter(ProcessState::Running, state_text(estimate.state));
         Ok(())
     }
 }

@@ -15,16 +15,15 @@ try {
   await step("waiting");
 
   await until(page, "poses", (s) => s.joined && s.poses > 3);
-  const s = await until(page, "points, frames and a path", (s) => s.points > 1000 && s.keyframes > 1 && s.frames > 2 && s.path > 3 && s.state === "tracking");
-  check("points are drawn", s.drawn > 500 && s.lit > 2000, JSON.stringify(s));
+  const s = await until(page, "points, frames and a path", (s) => s.points > 1000 && s.keyframes > 1 && s.frames > 2 && s.path > 3 && s.state === "tracking" && s.drawn > 500 && s.lit > 2000);
   await until(page, "depth over the image", (s) => s.overlay > 100);
   for (const colour of ["depth", "height", "sigma", "brightness"]) {
     await page.click(`[data-colour=${colour}]`);
-    check(`lit by ${colour}`, (await stat(page)).lit > 2000);
+    await until(page, `light by ${colour}`, (s) => s.lit > 2000);
   }
   await page.mouse.move(400, 400); await page.mouse.down(); await page.mouse.move(520, 430, { steps: 4 }); await page.mouse.up();
   await page.mouse.wheel(0, -200);
-  check("lit after turning", (await stat(page)).lit > 1000);
+  await until(page, "light after turning", (s) => s.lit > 1000);
   await page.click("[data-view=top]"); await page.waitForTimeout(400); await picture(page, "live-top");
   await page.click("[data-view=follow]"); await page.waitForTimeout(800); await picture(page, "live-follow");
   await page.click("[data-view=orbit]"); await page.waitForTimeout(400); await picture(page, "live");

@@ -20,7 +20,10 @@ import messages as m
 RELIABLE = Policy.Reliability.Reliable(duration(seconds=1))
 BEST_EFFORT = Policy.Reliability.BestEffort
 LATE = Policy.Durability.TransientLocal
-LONGEST_S = 60
+LONGEST_S = 200
+# Topics with a message for every pose, and processes that say how they are, one a message.
+OF_EVERY_POSE = ("odometry", "odometry_best_effort", "pose", "tf")
+NUM_SPEAKERS = 4
 
 
 def reader(participant, name, kind, reliability, depth=10, durability=Policy.Durability.Volatile):
@@ -91,7 +94,8 @@ def main():
                     continue
                 came[name].append(message)
         is_whole = all(came[name] or name in optional for name in readers)
-        if is_whole and len(came["odometry"]) >= num_poses:
+        speakers = {status.name for message in came["diagnostics"] for status in message.status}
+        if is_whole and len(speakers) >= NUM_SPEAKERS and all(len(came[name]) >= num_poses for name in OF_EVERY_POSE):
             break
         time.sleep(0.0005)
     result = {

@@ -49,8 +49,8 @@ client.on("message", ({ subscriptionId, timestamp, data }) => {
       if (channel.topic === `/${instance}/odom`) client.unsubscribe(id);
     }
     // What was on its way may still come; then nothing.
-    setTimeout(() => (found.afterUnsubscribe = 0), 300);
-    setTimeout(finish, 800);
+    setTimeout(() => (found.afterUnsubscribe = 0), 3000);
+    setTimeout(finish, 4000);
   }
 });
 
