@@ -30,8 +30,10 @@ use crate::slam::trajectory::StampedPose;
 
 mod canvas;
 mod cull;
+mod edges;
 pub mod flat;
 pub mod furnish;
+mod lanes_kernel;
 pub mod lens;
 pub mod params;
 pub mod pattern;
@@ -41,10 +43,12 @@ pub mod route;
 pub mod scene;
 pub mod scene_kind;
 pub mod sensor;
+mod shade;
 pub mod summary;
 pub mod texture;
 pub mod trajectory;
 pub mod twins;
+mod view;
 
 /// Stamp of the first frame: one second, so that no reader takes it for a missing one.
 const FIRST_NANOS: i64 = 1_000_000_000;
