@@ -13,7 +13,7 @@ use rayon::prelude::*;
 
 use crate::capture::frame_store::FrameStore;
 use crate::capture::simulator::lens::Lens;
-use crate::capture::simulator::params::SimulatorParams;
+use crate::capture::simulator::params::{SensorParams, SimulatorParams};
 use crate::capture::simulator::render::{RenderScratch, Renderer};
 use crate::capture::simulator::scene::Scene;
 use crate::capture::simulator::sensor::Sensor;
@@ -30,8 +30,10 @@ use crate::slam::trajectory::StampedPose;
 
 mod canvas;
 mod cull;
+mod edges;
 pub(crate) mod flat;
 pub(crate) mod furnish;
+mod lanes_kernel;
 pub(crate) mod lens;
 pub mod params;
 pub(crate) mod pattern;
@@ -41,10 +43,12 @@ pub(crate) mod route;
 pub(crate) mod scene;
 pub mod scene_kind;
 pub(crate) mod sensor;
+mod shade;
 pub mod summary;
 pub(crate) mod texture;
 pub(crate) mod trajectory;
 pub(crate) mod twins;
+mod view;
 
 /// Stamp of the first frame: one second, so that no reader takes it for a missing one.
 const FIRST_NANOS: i64 = 1_000_000_000;
@@ -213,14 +217,40 @@ impl Simulator {
     /// Exact depth along the optical axis of the raw image at a frame's ground-truth pose, in world
     /// units (0 where nothing is). `None` beyond the last frame.
     pub fn raw_depth(&self, frame: usize) -> Option<Image<f32>> {
-        (frame < self.params.frames).then(|| self.depth_through(&self.lens, frame))
+        let mut scratch = RenderScratch::default();
+        (frame < self.params.frames).then(|| self.depth_through(&self.lens, frame, &mut scratch))
     }
 
-    fn depth_through(&self, lens: &Lens, frame: usize) -> Image<f32> {
+    /// [`Simulator::raw_frame`] and [`Simulator::raw_depth`], rendered together.
+    pub fn raw_frame_and_depth(
+        &self,
+        frame: usize,
+        scratch: &mut RenderScratch,
+    ) -> Option<(Vec<u8>, Image<f32>)> {
+        if frame >= self.params.frames {
+            return None;
+        }
+        let pixels = self.render(frame, scratch);
+        let SensorParams { exposure_ms, row_time_us, .. } = self.params.sensor;
+        let depth = if exposure_ms == 0.0 && row_time_us == 0.0 {
+            // The image was cast at the one pose of the frame: its depth is there already.
+            let mut depth = Image::filled(self.lens.width, self.lens.height, 0.0);
+            scratch.depth_into(depth.pixels_mut());
+            self.in_world_units(depth)
+        } else {
+            self.depth_through(&self.lens, frame, scratch)
+        };
+        Some((pixels, depth))
+    }
+
+    fn depth_through(&self, lens: &Lens, frame: usize, scratch: &mut RenderScratch) -> Image<f32> {
         let pose = self.pose(self.time_s(frame));
         let mut depth = Image::filled(lens.width, lens.height, 0.0);
-        let renderer = Renderer { scene: self.scene(), lens };
-        renderer.depth_into(&pose, &mut RenderScratch::default(), depth.pixels_mut());
+        Renderer { scene: self.scene(), lens }.depth_into(&pose, scratch, depth.pixels_mut());
+        self.in_world_units(depth)
+    }
+
+    fn in_world_units(&self, mut depth: Image<f32>) -> Image<f32> {
         let scale = self.params.world_scale as f32;
         for value in depth.pixels_mut() {
             *value *= scale;
@@ -308,7 +338,8 @@ impl FrameSource for Simulator {
         let frame = self.ground_truth.binary_search_by_key(&capture_nanos, |pose| pose.nanos);
         // Cast through the rectified rays: exact, where resampling would blur or shift it.
         let lens = self.rectified_lens.as_ref().unwrap_or(&self.lens);
-        Ok(frame.ok().map(|frame| self.depth_through(lens, frame)))
+        let mut scratch = RenderScratch::default();
+        Ok(frame.ok().map(|frame| self.depth_through(lens, frame, &mut scratch)))
     }
 }
 

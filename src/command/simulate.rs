@@ -11,6 +11,7 @@ use serde::Serialize;
 use crate::capture::dataset_writer::{DatasetError, DatasetLayout, DatasetWriter};
 use crate::capture::simulator::Simulator;
 use crate::capture::simulator::params::{MotionKind, SimulatorParams};
+use crate::capture::simulator::render::RenderScratch;
 use crate::capture::simulator::scene_kind::SceneKind;
 use crate::capture::simulator::summary::{PathSummary, gradient_share, summarize};
 use crate::capture::source::FrameSource;
@@ -21,7 +22,7 @@ use crate::service::config::Config;
 use crate::service::shutdown::Shutdown;
 
 /// Frames written between two looks at progress and Ctrl-C.
-const FRAMES_PER_BATCH: usize = 8;
+const FRAMES_PER_BATCH: usize = 24;
 /// Gradient from which a pixel counts as textured, grey levels a pixel.
 const TEXTURED_GRADIENT: f64 = 5.0;
 
@@ -215,7 +216,9 @@ fn write_frames(
         let written: Result<Vec<f64>, DatasetError> = batch
             .clone()
             .into_par_iter()
-            .map(|frame| write_frame(simulator, writer, frame))
+            .map_init(RenderScratch::default, |scratch, frame| {
+                write_frame(simulator, writer, frame, scratch)
+            })
             .collect();
         shares += written?.iter().sum::<f64>();
         batch.for_each(|frame| progress.update(frame + 1, ""));
@@ -229,9 +232,9 @@ fn write_frame(
     simulator: &Simulator,
     writer: &DatasetWriter,
     frame: usize,
+    scratch: &mut RenderScratch,
 ) -> Result<f64, DatasetError> {
-    let (Some(pixels), Some(depth)) = (simulator.raw_frame(frame), simulator.raw_depth(frame))
-    else {
+    let Some((pixels, depth)) = simulator.raw_frame_and_depth(frame, scratch) else {
         return Ok(0.0);
     };
     writer.write_frame(simulator.nanos(frame), &pixels, &depth)?;

@@ -2,12 +2,15 @@
 
 use nalgebra::Vector3;
 
+use crate::capture::simulator::lanes_kernel::LANES;
 use crate::capture::simulator::lens::{Lens, NEAREST_M};
 use crate::capture::simulator::scene::{Block, Scene};
 use crate::slam::geometry::se3::SE3;
 
 /// Side of a tile, pixels: a few blocks each, and few enough tiles to sort.
 const TILE_PX: usize = 16;
+/// Rays that are cast together have one list.
+const _: () = assert!(TILE_PX.is_multiple_of(LANES));
 
 /// A block that may be seen, and the least depth at which it may be, metres.
 #[derive(Debug, Clone, Copy)]
@@ -113,15 +116,15 @@ fn tile_bounds(
     let mut bounds = Bounds::EMPTY;
     for v in rows.clone() {
         for u in [columns.start, columns.end - 1] {
-            bounds.include(lens.rays[v * lens.width + u].at);
+            bounds.include(lens.ray(v * lens.width + u).at);
         }
     }
     for u in columns.clone() {
         for v in [rows.start, rows.end - 1] {
-            bounds.include(lens.rays[v * lens.width + u].at);
+            bounds.include(lens.ray(v * lens.width + u).at);
         }
     }
-    let ray = &lens.rays[rows.start * lens.width + columns.start];
+    let ray = lens.ray(rows.start * lens.width + columns.start);
     for k in 0..2 {
         let spare = 1.5 * (ray.du[k].abs() + ray.dv[k].abs());
         bounds.low[k] -= spare;

@@ -3,29 +3,42 @@
 use nalgebra::Vector2;
 use rayon::prelude::*;
 
+use crate::capture::simulator::lanes_kernel::LANES;
 use crate::slam::geometry::camera_model::CameraModel;
 use crate::slam::geometry::intrinsics::Intrinsics;
 
 /// Nothing is seen closer than this, metres.
 pub const NEAREST_M: f32 = 0.05;
 
-/// The direction of a pixel as `(x, y, 1)`, and how it changes to the right and down.
+/// A direction as `(x, y, 1)`, and how it changes from pixel to pixel; of one pixel or, as arrays, of many.
 #[derive(Debug, Clone, Copy)]
-pub struct Ray {
+pub struct Ray<T = f32> {
     /// x and y at z = 1.
-    pub at: [f32; 2],
+    pub at: [T; 2],
     /// Change for one pixel to the right.
-    pub du: [f32; 2],
+    pub du: [T; 2],
     /// Change for one pixel down.
-    pub dv: [f32; 2],
+    pub dv: [T; 2],
 }
 
 impl Ray {
+    /// No direction.
+    const NOWHERE: Self = Self { at: [f32::NAN; 2], du: [f32::NAN; 2], dv: [f32::NAN; 2] };
+
     /// x and y at z = 1, `a` pixels to the right and `b` down.
     #[inline]
     pub fn shifted(&self, a: f32, b: f32) -> [f32; 2] {
         let Self { at, du, dv } = self;
         [at[0] + a * du[0] + b * dv[0], at[1] + a * du[1] + b * dv[1]]
+    }
+}
+
+impl<T> Ray<T> {
+    /// The same function of every number.
+    #[inline(always)]
+    pub fn map<'a, U>(&'a self, of: impl Fn(&'a T) -> U) -> Ray<U> {
+        let two = |pair: &'a [T; 2]| [of(&pair[0]), of(&pair[1])];
+        Ray { at: two(&self.at), du: two(&self.du), dv: two(&self.dv) }
     }
 }
 
@@ -36,8 +49,8 @@ pub struct Lens {
     pub width: usize,
     /// Image height, pixels.
     pub height: usize,
-    /// `width * height` rays.
-    pub rays: Vec<Ray>,
+    /// `width * height` rays, and [`LANES`] without a direction behind them.
+    rays: Ray<Vec<f32>>,
 }
 
 impl Lens {
@@ -70,7 +83,29 @@ impl Lens {
             };
             Ray { at: grid[at].map(|x| x as f32), du: slope(1), dv: slope(wide) }
         };
-        Self { width, height, rays: (0..width * height).map(ray).collect() }
+        let size = width * height + LANES;
+        let no_rays = Ray { at: [(); 2], du: [(); 2], dv: [(); 2] };
+        let mut rays = no_rays.map(|_| Vec::with_capacity(size));
+        for ray in (0..width * height).map(ray).chain([Ray::NOWHERE; LANES]) {
+            for k in 0..2 {
+                rays.at[k].push(ray.at[k]);
+                rays.du[k].push(ray.du[k]);
+                rays.dv[k].push(ray.dv[k]);
+            }
+        }
+        Self { width, height, rays }
+    }
+
+    /// The ray of a pixel by its place in the image, row by row.
+    #[inline(always)]
+    pub fn ray(&self, pixel: usize) -> Ray {
+        self.rays.map(|plane| plane[pixel])
+    }
+
+    /// The rays from a pixel on, enough to fill lanes.
+    #[inline(always)]
+    pub fn rays_from(&self, pixel: usize) -> Ray<&[f32]> {
+        self.rays.map(|plane| &plane[pixel..])
     }
 
     /// The rays of an ideal pinhole.

@@ -1,5 +1,6 @@
 //! What stands in a scene: textured blocks, lit once and for all, and where a camera may walk.
 
+use crate::capture::simulator::lanes_kernel::Lanes;
 use crate::capture::simulator::pattern::{PATTERNS, Pattern, TEXTURE_SIZE, paint_all};
 use crate::capture::simulator::random::Stream;
 use crate::capture::simulator::route::Route;
@@ -41,23 +42,28 @@ pub struct Block {
 }
 
 impl Block {
-    /// Light that falls on a point with this normal, as a factor on reflectance. It depends on
+    /// Light that falls on points with this normal, as a factor on reflectance. It depends on
     /// nothing but the place, so a surface has one brightness from wherever it is seen.
-    #[inline]
-    pub fn light(&self, point: [f32; 3], normal: [f32; 3]) -> f32 {
+    #[inline(always)]
+    pub fn light<L: Lanes>(&self, lanes: L, point: [L::F; 3], normal: [f32; 3]) -> L::F {
         /// Share of the light that comes from everywhere.
         const AMBIENT: f32 = 0.62;
         /// Light of the lamp at no distance, facing it.
         const LAMP: f32 = 0.75;
         /// Distance at which the lamp's light is halved, metres.
         const HALF_DISTANCE_M: f32 = 3.0;
-        let to = [self.lamp[0] - point[0], self.lamp[1] - point[1], self.lamp[2] - point[2]];
+        let number = |x: f32| lanes.splat(x);
+        let mut to = point;
+        for k in 0..3 {
+            to[k] = number(self.lamp[k]) - point[k];
+        }
         let squared = to[0] * to[0] + to[1] * to[1] + to[2] * to[2];
-        let facing = to[0] * normal[0] + to[1] * normal[1] + to[2] * normal[2];
-        let cosine = (facing / squared.sqrt().max(1e-3)).max(0.0);
-        AMBIENT
-            + LAMP * cosine / (1.0 + squared / (HALF_DISTANCE_M * HALF_DISTANCE_M))
-            + 0.06 * normal[0]
+        let along = |k: usize| to[k] * number(normal[k]);
+        let facing = along(0) + along(1) + along(2);
+        let distance = lanes.max(lanes.sqrt(squared), number(1e-3));
+        let cosine = lanes.max(facing / distance, number(0.0));
+        let falloff = number(1.0) + squared / number(HALF_DISTANCE_M * HALF_DISTANCE_M);
+        number(AMBIENT) + number(LAMP) * cosine / falloff + number(0.06 * normal[0])
     }
 }
 

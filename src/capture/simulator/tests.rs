@@ -248,6 +248,24 @@ fn frames_are_the_same_whether_prepared_or_not() {
 }
 
 #[test]
+fn a_frame_and_its_depth_are_the_same_alone_and_together() {
+    let sharp = SimulatorParams { world_scale: 2.0, ..small(SceneKind::Flat) };
+    let (mut rolling, mut blurred) = (sharp.clone(), sharp.clone());
+    rolling.sensor.row_time_us = 50.0;
+    blurred.sensor.exposure_ms = 10.0;
+    // Of no whole number of lanes, and used again from one to the next.
+    let odd = SimulatorParams { width: 101, height: 35, ..sharp.clone() };
+    let mut scratch = RenderScratch::default();
+    for params in [sharp, rolling, odd, blurred] {
+        let source = Simulator::new(params).unwrap();
+        let (pixels, depth) = source.raw_frame_and_depth(7, &mut scratch).unwrap();
+        assert!(pixels == *source.raw_frame(7).unwrap());
+        assert!(depth.pixels() == source.raw_depth(7).unwrap().pixels());
+        assert!(source.raw_frame_and_depth(12, &mut scratch).is_none());
+    }
+}
+
+#[test]
 fn a_scaled_world_looks_the_same() {
     let metres = Simulator::new(small(SceneKind::Room)).unwrap();
     let tenths = SimulatorParams { world_scale: 10.0, ..small(SceneKind::Room) };

@@ -1,41 +1,40 @@
 //! A printed surface: a tileable bitmap with its mip levels, sampled over the footprint of a pixel.
 
+use crate::capture::simulator::lanes_kernel::Lanes;
+
 /// Reflectance of a tileable square surface, 0 (black) to 1 (white), with every halving of it.
+///
+/// One sheet holds all levels: the finest on the left, the others on its right below each other, level l from row
+/// `size − 2 (size >> l)` on. Every row ends with its first texel, so that what lies right of a texel is next to it.
 #[derive(Debug, Clone)]
 pub struct Texture {
-    /// Finest first, in [`STEPS`]; level l is `size >> l` a side.
-    levels: Vec<Vec<u16>>,
+    /// In [`STEPS`], row by row.
+    sheet: Vec<u16>,
     size: usize,
 }
 
-/// Where a pixel falls on a texture, in texels of the finest level.
+/// Where pixels fall on a texture, in texels of the finest level.
 #[derive(Debug, Clone, Copy)]
-pub struct Footprint {
+pub struct Footprint<F> {
     /// Centre of the pixel.
-    pub centre: [f32; 2],
+    pub centre: [F; 2],
     /// Step on the texture for one pixel to the right.
-    pub du: [f32; 2],
+    pub du: [F; 2],
     /// Step on the texture for one pixel down.
-    pub dv: [f32; 2],
+    pub dv: [F; 2],
 }
 
 /// Steps of a stored reflectance: far finer than a grey level, half the memory traffic of f32.
 const STEPS: f32 = 65535.0;
 /// Longest chain of samples along a stretched footprint; beyond it the footprint is blurred.
 const MAX_TAPS: f32 = 12.0;
-/// Samples for each texel of the footprint's length, measured in its width.
-const TAPS_PER_RATIO: f32 = 1.0;
-
 impl Texture {
     /// Builds the mip levels by 2×2 means. `size` is a power of two and `texels` has `size²` entries.
     pub fn new(size: usize, texels: Vec<f32>) -> Self {
         assert!(size.is_power_of_two() && texels.len() == size * size, "texture size");
-        let quantize = |texels: &[f32]| -> Vec<u16> {
-            texels.iter().map(|&t| (t.clamp(0.0, 1.0) * STEPS + 0.5) as u16).collect()
-        };
-        let mut fine = texels;
-        let mut levels = vec![quantize(&fine)];
-        let mut side = size;
+        let mut texture = Self { sheet: vec![0; size * Self::stride(size)], size };
+        texture.paint_level(0, 0, size, &texels);
+        let (mut fine, mut side) = (texels, size);
         while side > 1 {
             let half = side / 2;
             let coarse: Vec<f32> = (0..half * half)
@@ -44,80 +43,107 @@ impl Texture {
                     0.25 * (fine[at] + fine[at + 1] + fine[at + side] + fine[at + side + 1])
                 })
                 .collect();
-            levels.push(quantize(&coarse));
-            fine = coarse;
-            side = half;
+            texture.paint_level(size - side, size + 1, half, &coarse);
+            (fine, side) = (coarse, half);
         }
-        Self { levels, size }
+        texture
     }
 
-    /// Mean over the footprint: trilinear samples as wide as its short axis, in a row along its
-    /// long axis (Heckbert 1989, with Gaussian weights left out), so that a surface keeps its
-    /// brightness from every distance and angle.
-    #[inline]
-    pub fn sample(&self, footprint: &Footprint) -> f32 {
+    /// Entries from one row of the sheet to the next: the rows of the two finest levels.
+    fn stride(size: usize) -> usize {
+        size + 1 + size / 2 + 1
+    }
+
+    fn paint_level(&mut self, top: usize, left: usize, side: usize, texels: &[f32]) {
+        let stride = Self::stride(self.size);
+        for (row, texels) in texels.chunks_exact(side).enumerate() {
+            let start = (top + row) * stride + left;
+            let (out, texels) = (&mut self.sheet[start..], texels.iter().chain(&texels[..1]));
+            for (out, &texel) in out.iter_mut().zip(texels) {
+                *out = (texel.clamp(0.0, 1.0) * STEPS + 0.5) as u16;
+            }
+        }
+    }
+
+    /// Means over the footprints of some pixels, of which bits of `wanted` say which matter: trilinear samples as
+    /// wide as the short axis, in a row along the long axis (Heckbert 1989, with Gaussian weights left out), so that
+    /// a surface keeps its brightness from every distance and angle.
+    #[inline(always)]
+    pub fn sample<L: Lanes>(&self, lanes: L, wanted: usize, footprint: &Footprint<L::F>) -> L::F {
+        let number = |x: f32| lanes.splat(x);
         let ([ux, uy], [vx, vy]) = (footprint.du, footprint.dv);
         // Principal axes of the ellipse that the unit circle of pixels becomes.
         let (xx, xy, yy) = (ux * ux + vx * vx, ux * uy + vx * vy, uy * uy + vy * vy);
-        let mean = 0.5 * (xx + yy);
-        let spread = (0.25 * (xx - yy) * (xx - yy) + xy * xy).sqrt();
-        let major = (mean + spread).sqrt();
-        let minor = (mean - spread).max(0.0).sqrt().max(major / MAX_TAPS);
-        let taps =
-            ((TAPS_PER_RATIO * major / minor.max(1e-12)).min(MAX_TAPS - 1.0) as i32 + 1) as f32;
-        if taps <= 2.0 {
-            return self.trilinear(footprint.centre, (major * minor).sqrt());
+        let mean = number(0.5) * (xx + yy);
+        let spread = lanes.sqrt(number(0.25) * (xx - yy) * (xx - yy) + xy * xy);
+        let major = lanes.sqrt(mean + spread);
+        let shortest = major / number(MAX_TAPS);
+        let minor = lanes.max(lanes.sqrt(lanes.max(mean - spread, number(0.0))), shortest);
+        let ratio = major / lanes.max(minor, number(1e-12));
+        let taps = lanes.floor(lanes.min(ratio, number(MAX_TAPS - 1.0))) + number(1.0);
+        let is_long = |yes, no| lanes.if_less(number(2.0), taps, yes, no);
+        let width = is_long(minor, lanes.sqrt(major * minor));
+        let counts = lanes.store(is_long(taps, number(1.0)));
+        let most = counts[..wanted].iter().fold(1.0, |a: f32, &b| a.max(b));
+        if most == 1.0 {
+            return self.trilinear(lanes, footprint.centre, width);
         }
-        let axis = if xx >= yy { [mean + spread - yy, xy] } else { [xy, mean + spread - xx] };
-        let step = major / ((axis[0] * axis[0] + axis[1] * axis[1]).sqrt().max(1e-12) * taps);
-        let mut sum = 0.0;
-        let mut place = -0.5 * (taps - 1.0);
-        for _ in 0..taps as usize {
-            let at = |k: usize| footprint.centre[k] + place * step * axis[k];
-            sum += self.trilinear([at(0), at(1)], minor);
-            place += 1.0;
+        let along_x = lanes.if_less(xx, yy, xy, mean + spread - yy);
+        let along_y = lanes.if_less(xx, yy, mean + spread - xx, xy);
+        let length = lanes.sqrt(along_x * along_x + along_y * along_y);
+        let step = major / (lanes.max(length, number(1e-12)) * taps);
+        let mut sum = number(0.0);
+        let mut place = number(-0.5) * (taps - number(1.0));
+        for tap in 0..most as usize {
+            let [x, y] = footprint.centre;
+            let x = is_long(x + place * step * along_x, x);
+            let y = is_long(y + place * step * along_y, y);
+            let tapped = self.trilinear(lanes, [x, y], width);
+            let sampled = lanes.if_less(number(tap as f32), taps, sum + tapped, sum);
+            sum = if tap == 0 { sampled } else { is_long(sampled, sum) };
+            place = place + number(1.0);
         }
-        sum / taps
+        sum / is_long(taps, number(1.0))
     }
 
-    /// Mean over a disc of `width` texels around `centre`.
-    #[inline]
-    pub fn trilinear(&self, centre: [f32; 2], width: f32) -> f32 {
-        // The exponent of the width is the level, its mantissa the way to the next: log2 made of
+    /// Means over discs of `width` texels around `centre`.
+    #[inline(always)]
+    pub fn trilinear<L: Lanes>(&self, lanes: L, centre: [L::F; 2], width: L::F) -> L::F {
+        // The power of two below the width is the level, the rest the way to the next: log2 made of
         // straight pieces, exact at whole levels and without a call.
-        let bits = width.clamp(1.0, self.size as f32).to_bits();
-        let fine = (bits >> 23) as usize - 127;
-        let between = (bits & 0x7F_FFFF) as f32 / 8_388_608.0;
-        let first = self.bilinear(fine, centre);
-        if between < 1e-3 {
-            return first;
-        }
-        first + between * (self.bilinear(fine + 1, centre) - first)
+        let size = lanes.splat(self.size as f32);
+        let width = lanes.min(lanes.max(width, lanes.splat(1.0)), size);
+        let whole = lanes.power_of_two_below(width);
+        let scale = lanes.splat(1.0) / whole;
+        let between = width * scale - lanes.splat(1.0);
+        let first = self.bilinear(lanes, whole, scale, centre);
+        let (twice, half) = (lanes.splat(2.0) * whole, lanes.splat(0.5) * scale);
+        let second = self.bilinear(lanes, twice, half, centre);
+        lanes.if_less(between, lanes.splat(1e-3), first, first + between * (second - first))
     }
 
-    #[inline]
-    fn bilinear(&self, level: usize, centre: [f32; 2]) -> f32 {
-        let side = self.size >> level;
-        let mask = side as i32 - 1;
-        let scale = 1.0 / (1u32 << level) as f32;
+    /// On the levels whose texels are `width` of the finest, which is 1 / `scale`. Garbage of one that is not there.
+    #[inline(always)]
+    fn bilinear<L: Lanes>(&self, lanes: L, width: L::F, scale: L::F, centre: [L::F; 2]) -> L::F {
+        let number = |x: f32| lanes.splat(x);
+        let (size, stride) = (number(self.size as f32), number(Self::stride(self.size) as f32));
+        let side = size * scale;
         // Texel centres are at half-integer coordinates of the finest level.
-        let (x, y) = (centre[0] * scale - 0.5, centre[1] * scale - 0.5);
-        let (column, row) = (floor(x), floor(y));
-        let (a, b) = (x - column as f32, y - row as f32);
-        let (left, right) = ((column & mask) as usize, ((column + 1) & mask) as usize);
-        let (top, bottom) = ((row & mask) as usize, ((row + 1) & mask) as usize);
-        let texels = &self.levels[level];
-        let (upper, lower) = (&texels[top * side..][..side], &texels[bottom * side..][..side]);
-        let at = |row: &[u16], column: usize| f32::from(row[column]);
-        let above = at(upper, left) + a * (at(upper, right) - at(upper, left));
-        let below = at(lower, left) + a * (at(lower, right) - at(lower, left));
-        (above + b * (below - above)) * (1.0 / STEPS)
+        let (x, y) = (centre[0] * scale - number(0.5), centre[1] * scale - number(0.5));
+        let (column, row) = (lanes.floor(x), lanes.floor(y));
+        let (a, b) = (x - column, y - row);
+        let per_side = number(1.0 / self.size as f32) * width;
+        let wrapped = |x| x - side * lanes.floor(x * per_side);
+        let (left, top) = (wrapped(column), wrapped(row));
+        let below = top + number(1.0);
+        let bottom = lanes.if_less(below, side, below, number(0.0));
+        // Whole numbers below 2²⁴, as all places of a sheet.
+        let coarse = (size - side - side) * stride + (size + number(1.0));
+        let corner = lanes.if_less(side, size, coarse, number(0.0)) + left;
+        let [p00, p10] = lanes.pairs(&self.sheet, corner + top * stride);
+        let [p01, p11] = lanes.pairs(&self.sheet, corner + bottom * stride);
+        let above = p00 + a * (p10 - p00);
+        let below = p01 + a * (p11 - p01);
+        (above + b * (below - above)) * number(1.0 / STEPS)
     }
-}
-
-/// The whole number below, without the call that the baseline instruction set needs for it.
-#[inline]
-fn floor(x: f32) -> i32 {
-    let towards_zero = x as i32;
-    towards_zero - i32::from((towards_zero as f32) > x)
 }
