@@ -33,3 +33,5 @@ mod test_bag;
 mod test_images;
 pub mod tum;
 pub mod v4l;
+
+pub use recording::Recording;

@@ -50,3 +50,5 @@ pub(crate) mod time_counts;
 pub mod tracker;
 pub mod trajectory_file;
 pub(crate) mod view_child;
+
+pub use time_counts::TimeCounts;

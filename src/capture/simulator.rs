@@ -14,7 +14,7 @@ use rayon::prelude::*;
 use crate::capture::frame_store::FrameStore;
 use crate::capture::simulator::lens::Lens;
 use crate::capture::simulator::params::{SensorParams, SimulatorParams};
-use crate::capture::simulator::render::{RenderScratch, Renderer};
+use crate::capture::simulator::render::Renderer;
 use crate::capture::simulator::scene::Scene;
 use crate::capture::simulator::sensor::Sensor;
 use crate::capture::simulator::trajectory::Trajectory;
@@ -27,6 +27,8 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;
 use crate::slam::parameter::ParameterError;
 use crate::slam::trajectory::StampedPose;
+
+pub use crate::capture::simulator::render::RenderScratch;
 
 mod canvas;
 mod cull;

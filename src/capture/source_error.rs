@@ -2,11 +2,12 @@
 
 use std::path::PathBuf;
 
-use crate::capture::bag::bag_error::{BagError, BagImageError};
 use crate::capture::image_file::ImageFileError;
 use crate::capture::rig_error::RigError;
 use crate::slam::geometry::rectification::RectificationError;
 use crate::slam::parameter::ParameterError;
+
+pub use crate::capture::bag::bag_error::{BagError, BagImageError};
 
 /// Why a source cannot be opened or gave no frame; says what, where and what to do.
 #[derive(Debug, thiserror::Error)]

@@ -30,13 +30,15 @@ use self::connection::Camera;
 use self::device::Kernel;
 use self::negotiation::Wish;
 use self::params::CameraParams;
-use self::pixel_format::{PixelFormat, unpack_gray};
+use self::pixel_format::unpack_gray;
 use self::video_device::VideoSystem;
 use crate::capture::rig::Rig;
 use crate::capture::source::{Arrival, FrameLosses, FrameSource, FrameStamp, Notice};
 use crate::capture::source_error::SourceError;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::rectification::Rectification;
+
+pub use self::pixel_format::{BrokenPicture, PixelFormat};
 
 /// How long a reader that has not waited before is made to wait at a time, milliseconds.
 const READ_MILLIS: u32 = 1000;

@@ -9,11 +9,10 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::capture::dataset_writer::{DatasetError, DatasetLayout, DatasetWriter};
-use crate::capture::simulator::Simulator;
 use crate::capture::simulator::params::{MotionKind, SimulatorParams};
-use crate::capture::simulator::render::RenderScratch;
 use crate::capture::simulator::scene_kind::SceneKind;
 use crate::capture::simulator::summary::{PathSummary, gradient_share, summarize};
+use crate::capture::simulator::{RenderScratch, Simulator};
 use crate::capture::source::FrameSource;
 use crate::command::INTERRUPTED;
 use crate::command::print::{note, print};
@@ -21,7 +20,7 @@ use crate::command::progress::Progress;
 use crate::service::config::Config;
 use crate::service::shutdown::Shutdown;
 
-/// Frames written between two looks at progress and Ctrl-C.
+/// Frames written between two updates of the progress bar.
 const FRAMES_PER_BATCH: usize = 24;
 /// Gradient from which a pixel counts as textured, grey levels a pixel.
 const TEXTURED_GRADIENT: f64 = 5.0;
@@ -208,19 +207,20 @@ fn write_frames(
     let mut shares = 0.0;
     // Rendered and written batch by batch: memory stays small however long the sequence is.
     for first in (0..frames).step_by(FRAMES_PER_BATCH) {
-        if shutdown.is_requested() {
-            progress.finish();
-            return Ok(None);
-        }
         let batch = first..(first + FRAMES_PER_BATCH).min(frames);
         let written: Result<Vec<f64>, DatasetError> = batch
             .clone()
             .into_par_iter()
-            .map_init(RenderScratch::default, |scratch, frame| {
-                write_frame(simulator, writer, frame, scratch)
+            .map_init(RenderScratch::default, |scratch, frame| match shutdown.is_requested() {
+                true => Ok(0.0),
+                false => write_frame(simulator, writer, frame, scratch),
             })
             .collect();
         shares += written?.iter().sum::<f64>();
+        if shutdown.is_requested() {
+            progress.finish();
+            return Ok(None);
+        }
         batch.for_each(|frame| progress.update(frame + 1, ""));
     }
     progress.finish();

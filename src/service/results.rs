@@ -48,7 +48,7 @@ use crate::service::results::report::input::ReportInput;
 use crate::service::results::report::report;
 use crate::service::results::results_error::ResultsError;
 use crate::service::results::set::ResultSet;
-use crate::service::results::summary::{PointCounts, Summary};
+use crate::service::results::summary::PointCounts;
 use crate::service::trajectory_file::write_trajectory;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::evaluation::umeyama::TrajectoryAlignment;
@@ -58,6 +58,10 @@ use crate::slam::keyframe::Keyframe;
 use crate::slam::map::Map;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::trajectory::StampedPose;
+
+pub use crate::service::results::budget_curve::BudgetSample;
+pub use crate::service::results::start_tally::StartTally;
+pub use crate::service::results::summary::Summary;
 
 /// What of the map is written and how it is judged.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -25,3 +25,8 @@ mod tests;
 pub(crate) mod tiles;
 pub(crate) mod unknown_depth;
 pub mod weights;
+
+pub use fusion::Candidates;
+pub use misfit::TileMisfit;
+pub use normal_equations::NormalEquations;
+pub use tiles::TileSum;

@@ -27,3 +27,5 @@ pub mod regularisation;
 mod segment;
 mod smoothing_kernel;
 mod trace_kernel;
+
+pub use gain::Uncertainty;

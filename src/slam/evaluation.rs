@@ -24,7 +24,7 @@ pub mod umeyama;
 pub mod velocity_error;
 pub(crate) mod windows;
 
-use crate::slam::evaluation::association::{Association, associate};
+use crate::slam::evaluation::association::associate;
 use crate::slam::evaluation::statistics::ErrorStatistics;
 use crate::slam::evaluation::trajectory_error::{
     absolute_errors, path_length, relative_errors, successive_pairs, timed_pairs,
@@ -33,6 +33,8 @@ use crate::slam::evaluation::umeyama::{AlignmentError, TrajectoryAlignment, umey
 use crate::slam::evaluation::windows::{scale_windows, window_error};
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::trajectory::StampedPose;
+
+pub use crate::slam::evaluation::association::Association;
 
 /// Largest difference of two stamps that are taken for the same instant: 0.02 s, less than half a
 /// frame at 20 Hz and the habit of the field's tools.

@@ -24,13 +24,13 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::graph::constraint::{ConstraintParams, ConstraintSolver, Refusal};
 use crate::slam::keyframe::{Keyframe, MapState};
-use crate::slam::loops::known::{KnownLoops, Link};
 use crate::slam::loops::likeness::{Alike, Likeness};
 use crate::slam::map::Map;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::place_covariance::PlaceCovariance;
 
 pub use closure::Closure;
+pub use known::{KnownLoops, Link};
 
 /// Tuning of the search for loops.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -1,6 +1,6 @@
 """Reads a robot's topics with Cyclone DDS and writes what came: listen.py DOMAIN NAMESPACE FOLDER NUM_POSES.
 
-Ends when as many poses have come and one of everything else, or after a minute. `poses.json` has the small messages,
+Ends when as many poses have come and one of everything else, or after some minutes. `poses.json` has the small messages,
 `cloud.bin` and `image.bin` the bytes of the last cloud and image.
 """
 

@@ -10,7 +10,7 @@ use crate::capture::simulator::view::{LocalView, NO_SURFACE, Nearest};
 const EDGE_GRID: usize = 4;
 /// Rays of the grid.
 const RAYS: usize = EDGE_GRID * EDGE_GRID;
-/// So many shares are worth sorting.
+/// Shares that make sorting worthwhile.
 const ENOUGH_SHARES: usize = 2048;
 
 /// Place of every ray of the grid in its pixel: to the right, and down.
@@ -26,7 +26,7 @@ const PLACES: [[f32; RAYS]; 2] = {
     places
 };
 
-/// What a surface fills of a pixel.
+/// The part of a pixel that one surface fills.
 #[derive(Debug, Clone, Copy)]
 struct Share {
     surface: f32,
@@ -140,7 +140,7 @@ impl Shares {
 }
 
 impl Share {
-    /// The part of a pixel in which those rays of the grid are whose bits are set.
+    /// The part of a pixel covered by the grid rays whose bits are set.
     #[inline(always)]
     fn of_rays(mut bits: u32, surface: f32, ray: &Ray, pixel: usize) -> Self {
         let count = bits.count_ones() as f32;

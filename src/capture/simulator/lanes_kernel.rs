@@ -21,7 +21,7 @@ pub trait Lanes: Copy {
 
     /// The same number in all lanes.
     fn splat(self, x: f32) -> Self::F;
-    /// The first numbers of a slice, which has that many.
+    /// The first [`LANES`] numbers of a slice; panics on a shorter one.
     fn load(self, from: &[f32]) -> Self::F;
     /// All numbers.
     fn store(self, x: Self::F) -> [f32; LANES];
@@ -76,7 +76,7 @@ fn with_avx2<W: LaneWork>(work: W) -> W::Output {
     work.run(unsafe { Avx2::new() })
 }
 
-/// For every processor; the explanation of the others.
+/// Plain Rust for every processor: the reference for the others.
 #[derive(Debug, Clone, Copy)]
 pub struct Portable;
 
@@ -140,9 +140,16 @@ impl Lanes for Portable {
     /// Without the call that the baseline instruction set needs for it.
     #[inline(always)]
     fn floor(self, x: Eight) -> Eight {
+        /// From here on all numbers are whole.
+        const WHOLE: f32 = 8_388_608.0;
         Eight(x.0.map(|x| {
+            // NaN stays too.
+            if !(x.abs() < WHOLE) {
+                return x;
+            }
             let towards_zero = x as i32 as f32;
-            if towards_zero > x { towards_zero - 1.0 } else { towards_zero }
+            let below = if towards_zero > x { towards_zero - 1.0 } else { towards_zero };
+            below.copysign(x)
         }))
     }
 
@@ -176,7 +183,7 @@ impl Lanes for Portable {
         let last = table.len() - 2;
         let mut pairs = [[0.0; LANES]; 2];
         for (i, &at) in at.0.iter().enumerate() {
-            let at = (at as usize).min(last);
+            let at = if at > -1.0 { (at as usize).min(last) } else { last };
             pairs[0][i] = f32::from(table[at]);
             pairs[1][i] = f32::from(table[at + 1]);
         }
@@ -221,7 +228,7 @@ mod avx2 {
 
                 #[inline(always)]
                 fn $name(self, other: Self) -> Self {
-                    // SAFETY: who made the lanes vouched for AVX2.
+                    // SAFETY: whoever made the lanes vouched for AVX2.
                     Self(unsafe { $instruction(self.0, other.0) })
                 }
             }
@@ -355,14 +362,18 @@ mod tests {
             let number = |x: f32| lanes.splat(x);
             let table: Vec<u16> = (0..1000).map(|i| (i * 7919 % 65_536) as u16).collect();
             let numbers =
-                [0.0, -0.5, 1.0, 3.75, 1023.9, -7.0, 0.1, 998.0, f32::NAN, 2.5, 1e6, -1.0];
+                [0.0, -0.5, 1.0, 3.75, 1023.9, -7.0, 0.1, 998.0, f32::NAN, 2.5, 1e6, -1.0]
+                    .into_iter()
+                    .chain([-0.0, 3e9, f32::INFINITY, f32::NEG_INFINITY, -0.999, 8_388_609.0]);
+            let numbers: Vec<f32> = numbers.collect();
+            let starts = 0..=numbers.len() - LANES;
             let mut bits = Vec::new();
-            for (i, j) in (0..5).flat_map(|i| (0..5).map(move |j| (i, j))) {
+            for (i, j) in starts.clone().flat_map(|i| starts.clone().map(move |j| (i, j))) {
                 let (a, b) = (lanes.load(&numbers[i..]), lanes.load(&numbers[j..]));
                 let (sum, size) = (a + b, lanes.abs(a));
-                let whole = lanes.floor(lanes.min(a, number(5e5)));
+                let whole = lanes.floor(a);
                 let power = lanes.power_of_two_below(lanes.max(size, number(1.0)));
-                let [left, right] = lanes.pairs(&table, lanes.max(whole, number(0.0)));
+                let [left, right] = lanes.pairs(&table, a);
                 let less = lanes.if_less(a, b, left, lanes.sqrt(size));
                 let equal = lanes.if_equal(a, b, left, right);
                 for x in [sum, a - b, a * b, a / b, whole, power, left, right, less, equal] {

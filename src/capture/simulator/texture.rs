@@ -28,6 +28,7 @@ pub struct Footprint<F> {
 const STEPS: f32 = 65535.0;
 /// Longest chain of samples along a stretched footprint; beyond it the footprint is blurred.
 const MAX_TAPS: f32 = 12.0;
+
 impl Texture {
     /// Builds the mip levels by 2×2 means. `size` is a power of two and `texels` has `size²` entries.
     pub fn new(size: usize, texels: Vec<f32>) -> Self {
@@ -65,9 +66,9 @@ impl Texture {
         }
     }
 
-    /// Means over the footprints of some pixels, of which bits of `wanted` say which matter: trilinear samples as
-    /// wide as the short axis, in a row along the long axis (Heckbert 1989, with Gaussian weights left out), so that
-    /// a surface keeps its brightness from every distance and angle.
+    /// Means over the footprints of pixels, of which only the first `wanted` matter: trilinear samples as wide as the
+    /// short axis, in a row along the long axis (Heckbert 1989, with Gaussian weights left out), so that a surface
+    /// keeps its brightness from every distance and angle.
     #[inline(always)]
     pub fn sample<L: Lanes>(&self, lanes: L, wanted: usize, footprint: &Footprint<L::F>) -> L::F {
         let number = |x: f32| lanes.splat(x);
@@ -122,7 +123,7 @@ impl Texture {
         lanes.if_less(between, lanes.splat(1e-3), first, first + between * (second - first))
     }
 
-    /// On the levels whose texels are `width` of the finest, which is 1 / `scale`. Garbage of one that is not there.
+    /// On the levels whose texels are `width` of the finest, which is 1 / `scale`. Meaningless for a level that does not exist.
     #[inline(always)]
     fn bilinear<L: Lanes>(&self, lanes: L, width: L::F, scale: L::F, centre: [L::F; 2]) -> L::F {
         let number = |x: f32| lanes.splat(x);

@@ -6,7 +6,7 @@ use crate::capture::simulator::lanes_kernel::{ALL_LANES, Lanes};
 use crate::capture::simulator::lens::NEAREST_M;
 use crate::capture::simulator::scene::Block;
 
-/// A surface that is none. Surfaces are numbered block × 8 + face, and kept as `f32` among other numbers.
+/// No surface. Surfaces are numbered block × 8 + face, and kept as `f32` among other numbers.
 pub const NO_SURFACE: f32 = -1.0;
 
 /// A block as one camera sees it: everything that does not change from ray to ray.
