@@ -19,11 +19,11 @@ use semidense::wire::topic::{FRAME, KEYFRAME, KEYFRAME_IMAGE, TRACKER_HEALTH};
 
 use waves::{CAMERA, header, keyframe};
 
-/// Reports that are waited for: at one a second they would not come within the patience.
-const REPORTS: usize = 100;
-/// Most frames from one report to the next that was heard: a report is due within 10 ms, and who listens beside two busy
-/// threads may miss some.
-const MOST_FRAMES_BETWEEN: u64 = 300;
+/// Reports that are waited for.
+const REPORTS: usize = 40;
+/// Most frames from one report to the next that was heard. With every frame of a flood others are dropped, which is
+/// reported within 10 ms; a frame that is searched for everywhere takes some of them.
+const MOST_FRAMES_BETWEEN: u64 = 60;
 /// Far above anything that is expected: it ends a test that hangs.
 const PATIENCE: Duration = Duration::from_secs(60);
 
@@ -90,8 +90,7 @@ fn a_tracker_that_is_always_behind_reports_and_ends() {
     flooding.join().unwrap();
     tracking.join().unwrap();
     assert!(told.len() >= REPORTS, "it told {told:?} in all");
-    let is_prompt = |pair: &[u64]| (pair[0]..=pair[0] + MOST_FRAMES_BETWEEN).contains(&pair[1]);
-    assert!(told.first() < told.last(), "no frame was tracked: {told:?}");
+    let is_prompt = |pair: &[u64]| (pair[0] + 1..=pair[0] + MOST_FRAMES_BETWEEN).contains(&pair[1]);
     assert!(told.windows(2).all(is_prompt), "frames at its reports: {told:?}");
     assert!(has_ended, "the signal to end was not heard as long as frames came");
 }

@@ -1,7 +1,7 @@
 """Reads a robot's topics with Cyclone DDS and writes what came: listen.py DOMAIN NAMESPACE FOLDER NUM_POSES.
 
-Ends when as many poses have come and one of everything else, or after some minutes. `poses.json` has the small messages,
-`cloud.bin` and `image.bin` the bytes of the last cloud and image.
+Ends when as many poses have come on each of their topics and one of everything else, or after some minutes.
+`poses.json` has the small messages, `cloud.bin` and `image.bin` the bytes of the last cloud and image.
 """
 
 import json

@@ -49,8 +49,8 @@ client.on("message", ({ subscriptionId, timestamp, data }) => {
       if (channel.topic === `/${instance}/odom`) client.unsubscribe(id);
     }
     // What was on its way may still come; then nothing.
-    setTimeout(() => (found.afterUnsubscribe = 0), 3000);
-    setTimeout(finish, 4000);
+    setTimeout(() => (found.afterUnsubscribe = 0), 1000);
+    setTimeout(finish, 2000);
   }
 });
 

@@ -242,7 +242,7 @@ mod avx2 {
         Div::div = _mm256_div_ps
     );
 
-    // Who made an `Avx2` vouched for what these instructions need.
+    // Whoever made an `Avx2` vouched for what these instructions need.
     impl Lanes for Avx2 {
         type F = Register;
 
