@@ -10,7 +10,7 @@ pub enum Liveness {
     Running,
     /// It is stopped by a signal (SIGSTOP, Ctrl-Z) or by a debugger, and does nothing until it is continued.
     Stopped,
-    /// There is no such process, or only its exit code is left.
+    /// There is no such process, it is on its way out, or only its exit code is left.
     Gone,
 }
 
@@ -23,9 +23,17 @@ impl Liveness {
 
     /// By the contents of `/proc/ID/stat`: the state stands behind the name, which may hold anything.
     fn from_stat(stat: &str) -> Self {
-        let state = stat.rsplit_once(')').and_then(|(_, rest)| rest.trim_start().chars().next());
+        /// `flags` is the 9th field, the state the third.
+        const FLAGS_AFTER_STATE: usize = 9 - 3;
+        /// `PF_EXITING` of the kernel: the process gives back what it has, which takes it some time.
+        const EXITING: u32 = 4;
+        let mut fields = stat.rsplit_once(')').map_or("", |(_, rest)| rest).split_whitespace();
+        let state = fields.next().and_then(|state| state.chars().next());
+        let flags = fields.nth(FLAGS_AFTER_STATE - 1).and_then(|flags| flags.parse().ok());
+        let is_exiting = flags.unwrap_or(0) & EXITING != 0;
         match state {
             None | Some('Z' | 'X' | 'x') => Self::Gone,
+            Some(_) if is_exiting => Self::Gone,
             Some('T' | 't') => Self::Stopped,
             Some(_) => Self::Running,
         }
@@ -59,6 +67,9 @@ mod tests {
         assert_eq!(Liveness::from_stat("7 (semidense) T 1 7"), Liveness::Stopped);
         assert_eq!(Liveness::from_stat("7 (semidense) t 1 7"), Liveness::Stopped);
         assert_eq!(Liveness::from_stat("7 (semidense) Z 1 7"), Liveness::Gone);
+        let running = "7 (a) b) R 1 7 7 0 -1 4194560 0 0";
+        assert_eq!(Liveness::from_stat(running), Liveness::Running);
+        assert_eq!(Liveness::from_stat(&running.replace("4194560", "4194564")), Liveness::Gone);
         assert_eq!(Liveness::from_stat(""), Liveness::Gone);
         assert_eq!(Liveness::of(std::process::id()), Liveness::Running);
     }
