@@ -122,7 +122,7 @@ fn walk(
     let world_from_first = truth[0].world_from_camera;
     let mut window = Window::new(*camera, WindowParams::default());
     let mut map = Map::default();
-    let (mut frames, mut spare) = (Vec::new(), Vec::new());
+    let mut frames = Vec::new();
     let mut costs = Vec::new();
     for id in 0..keyframes {
         let index = id * INTERVAL;
@@ -131,7 +131,7 @@ fn walk(
         map.keyframes.push(keyframe(simulator, camera, id as u64, index, place));
         let begin = cpu_secs();
         if window.take_in(&map, id as u64) {
-            window.take_frames(&mut frames, &mut spare);
+            window.take_frames(&mut frames);
             let snapshot = cpu_secs() - begin;
             let begin = cpu_secs();
             let adjusted = window.optimise();
@@ -140,7 +140,6 @@ fn walk(
             black_box(window.correction(&map, |_| (ModeCovariance::ZERO, None)));
             let correction = cpu_secs() - begin;
             drop(window.take_placed());
-            spare.clear();
             if let Some(Adjustment { free, fixed, comparisons, .. }) = adjusted {
                 let (keyframes, memory) = (id + 1, resident_bytes() - map_bytes(&map));
                 costs.push(Cost {
@@ -163,7 +162,11 @@ fn walk(
                 keyframe_id: id as u64,
                 keyframe_from_camera: world_from_keyframe.inverse() * world_from_camera,
                 is_guess: false,
-                pixels: simulator.raw_frame(between).expect("within the sequence").into_owned(),
+                pixels: simulator
+                    .raw_frame(between)
+                    .expect("within the sequence")
+                    .into_owned()
+                    .into(),
             });
         }
     }

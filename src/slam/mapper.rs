@@ -9,6 +9,7 @@ mod correction;
 mod depth_buffers;
 mod doubt;
 mod finder;
+mod frame_copies;
 mod joint;
 mod maturing;
 pub mod modes;
@@ -42,6 +43,7 @@ use crate::slam::mapper::consistency::START_KEYFRAMES;
 use crate::slam::mapper::depth_buffers::DepthBuffers;
 use crate::slam::mapper::doubt::Doubt;
 use crate::slam::mapper::finder::Finder;
+use crate::slam::mapper::frame_copies::FrameCopies;
 use crate::slam::mapper::modes::{KeyframeModes, in_unit};
 use crate::slam::mapper::past::PastFrames;
 use crate::slam::mapper::phase::{Active, Phase};
@@ -119,8 +121,8 @@ pub struct Mapper {
     tracked: Vec<TrackedFrame>,
     /// Frames of a start that has not been proven.
     early: Vec<TrackedFrame>,
-    /// Memory for more of them.
-    spare_pixels: Vec<Vec<u8>>,
+    /// Copies of frames, for these lists and for `past`.
+    copies: FrameCopies,
     /// Keyframes whose depth is final for now, until somebody asks for them.
     left: VecDeque<u64>,
     /// Memory for the frame at hand.
@@ -164,7 +166,7 @@ impl Mapper {
             doubt: Doubt::None,
             tracked: Vec::new(),
             early: Vec::new(),
-            spare_pixels: Vec::new(),
+            copies: FrameCopies::default(),
             left: VecDeque::new(),
             frame: QuadImage::with_size(width, height),
             unfinished: None,
@@ -187,6 +189,7 @@ impl Mapper {
     ) -> StepOutcome {
         let finished = self.finish_keyframe();
         self.start.last_frame = None;
+        self.copies.begin_frame();
         let outcome = self.take_in(frame, pose, sensor_depth, change_begins);
         let is_told = self.tell_doubt();
         let keyframe_changed = outcome.keyframe_changed || finished.keyframe_changed || is_told;
@@ -285,7 +288,8 @@ impl Mapper {
                 observations,
             };
         }
-        self.past.push(frame.pixels, pose.keyframe_id, pose.keyframe_from_camera, pose.brightness);
+        let copy = self.copies.of(frame);
+        self.past.push(copy, pose.keyframe_id, pose.keyframe_from_camera, pose.brightness);
         let keyframe_changed =
             self.depth.unpublished as f64 > self.params.publish_change_ratio * points as f64;
         if keyframe_changed {

@@ -235,7 +235,8 @@ impl Mapper {
         self.finder.learn(&mut self.map.keyframes);
         self.map.forget_depth_beyond(self.params.max_map_bytes());
         self.next_keyframe_id += 1;
-        self.past.push(frame.pixels, keyframe_id, SE3::identity(), Brightness::default());
+        let copy = self.copies.of(frame);
+        self.past.push(copy, keyframe_id, SE3::identity(), Brightness::default());
         self.enter_keyframe(self.map.keyframes.len() - 1);
     }
 }

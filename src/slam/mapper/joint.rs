@@ -1,5 +1,7 @@
 //! When keyframes are estimated together, and what becomes of it.
 
+use std::sync::Arc;
+
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::keyframe::Keyframe;
@@ -27,7 +29,7 @@ impl Mapper {
         }
         let is_begun = match active {
             _ if is_new || is_doubted => {
-                window.take_frames(&mut self.tracked, &mut self.spare_pixels);
+                window.take_frames(&mut self.tracked);
                 true
             }
             Some(active) if is_mapping => {
@@ -119,7 +121,7 @@ impl Mapper {
     /// still wait.
     pub fn begin_last_adjustment(&mut self) -> Option<Box<Window>> {
         let (mut window, _) = self.take_window()?;
-        window.take_frames(&mut self.tracked, &mut self.spare_pixels);
+        window.take_frames(&mut self.tracked);
         window.conclude();
         Some(window)
     }
@@ -165,8 +167,8 @@ impl Mapper {
     pub(super) fn keep_frame(&mut self, frame: &FrameView<'_>, pose: &PoseEstimate) {
         let most = self.params.window.max_waiting_frames;
         if self.aligns_again() {
-            let (at, spare) = (&pose.keyframe_from_camera, &mut self.spare_pixels);
-            keep(&mut self.tracked, most, spare, frame, (pose.keyframe_id, at));
+            let (copy, at) = (self.copies.of(frame), &pose.keyframe_from_camera);
+            keep(&mut self.tracked, most, (frame.sequence, copy), (pose.keyframe_id, at));
         }
     }
 
@@ -175,8 +177,8 @@ impl Mapper {
         /// Two seconds at 30 Hz, one byte a pixel each.
         const MOST: usize = 60;
         if self.aligns_again() {
-            let (at, spare) = (&SE3::identity(), &mut self.spare_pixels);
-            keep(&mut self.early, MOST, spare, frame, (NO_KEYFRAME, at));
+            let (copy, at) = (self.copies.of(frame), &SE3::identity());
+            keep(&mut self.early, MOST, (frame.sequence, copy), (NO_KEYFRAME, at));
         }
     }
 
@@ -186,7 +188,7 @@ impl Mapper {
 
     /// Forgets frames from before a map that has not begun.
     pub(super) fn drop_early_frames(&mut self) {
-        self.spare_pixels.extend(self.early.drain(..).map(|frame| frame.pixels));
+        self.early.clear();
     }
 
     /// A map has begun with two frames, its first keyframes, of which the second stands at `first_from_second`. Frames
@@ -198,7 +200,6 @@ impl Mapper {
         let interval = second.sequence.saturating_sub(begin).max(1) as f64;
         for mut frame in self.early.drain(..) {
             if frame.sequence == begin {
-                self.spare_pixels.push(frame.pixels);
                 continue;
             }
             let share = (frame.sequence as f64 - begin as f64) / interval;
@@ -227,22 +228,18 @@ impl Mapper {
     }
 }
 
-/// Copies a frame to the end of a list of at most so many; the oldest gives way.
+/// Files the copy of a frame at the end of a list of at most so many; the oldest gives way.
 fn keep(
     frames: &mut Vec<TrackedFrame>,
     most: usize,
-    spare: &mut Vec<Vec<u8>>,
-    frame: &FrameView<'_>,
+    (sequence, pixels): (u64, Arc<[u8]>),
     (keyframe_id, at): (u64, &SE3),
 ) {
     if frames.len() >= most {
-        spare.push(frames.remove(0).pixels);
+        frames.remove(0);
     }
-    let mut pixels = spare.pop().unwrap_or_default();
-    pixels.clear();
-    pixels.extend_from_slice(frame.pixels);
     frames.push(TrackedFrame {
-        sequence: frame.sequence,
+        sequence,
         keyframe_id,
         keyframe_from_camera: *at,
         is_guess: false,

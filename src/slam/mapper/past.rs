@@ -1,6 +1,7 @@
 //! Frames from before the keyframe, kept to give depth to the new pixels of the next one.
 
 use std::collections::VecDeque;
+use std::sync::Arc;
 
 use crate::slam::geometry::se3::SE3;
 use crate::slam::pose::Brightness;
@@ -9,7 +10,7 @@ use crate::slam::pose::Brightness;
 #[derive(Debug)]
 pub(super) struct PastFrame {
     /// Grey values, level 0.
-    pub(super) pixels: Vec<u8>,
+    pub(super) pixels: Arc<[u8]>,
     /// The keyframe that it was tracked on.
     pub(super) keyframe_id: u64,
     /// Where it was taken, in that keyframe's unit.
@@ -18,7 +19,7 @@ pub(super) struct PastFrame {
     pub(super) brightness: Brightness,
 }
 
-/// At most a fixed number of past frames; the oldest give way and leave their memory.
+/// At most a fixed number of past frames; the oldest give way.
 #[derive(Debug)]
 pub(super) struct PastFrames {
     frames: VecDeque<PastFrame>,
@@ -36,20 +37,18 @@ impl PastFrames {
         self.frames.clear();
     }
 
-    /// Files a copy of a frame.
+    /// Files the copy of a frame.
     pub(super) fn push(
         &mut self,
-        pixels: &[u8],
+        pixels: Arc<[u8]>,
         keyframe_id: u64,
         keyframe_from_camera: SE3,
         brightness: Brightness,
     ) {
-        let full = self.frames.len() >= self.capacity;
-        let oldest = if full { self.frames.pop_front() } else { None };
-        let mut memory = oldest.map(|frame| frame.pixels).unwrap_or_default();
-        memory.clear();
-        memory.extend_from_slice(pixels);
-        let frame = PastFrame { pixels: memory, keyframe_id, keyframe_from_camera, brightness };
+        if self.frames.len() >= self.capacity {
+            self.frames.pop_front();
+        }
+        let frame = PastFrame { pixels, keyframe_id, keyframe_from_camera, brightness };
         self.frames.push_back(frame);
     }
 
@@ -76,8 +75,8 @@ mod tests {
     fn brightness_follows_the_keyframe() {
         let mut past = PastFrames::with_capacity(4);
         // I_f = e^0.3 I_k + 5 and I_n = e^0.1 I_k − 2: a grey of 100 in the new keyframe.
-        past.push(&[2], 0, SE3::identity(), Brightness::default());
-        past.push(&[1], 0, SE3::identity(), Brightness { a: 0.3, b: 5.0 });
+        past.push([2].into(), 0, SE3::identity(), Brightness::default());
+        past.push([1].into(), 0, SE3::identity(), Brightness { a: 0.3, b: 5.0 });
         past.rebase(Brightness { a: 0.1, b: -2.0 });
         let shown = |b: Brightness| b.a.exp() * 100.0 + b.b;
         let in_keyframe = (100.0 + 2.0) / 0.1f64.exp();
@@ -92,7 +91,7 @@ mod tests {
     fn the_oldest_gives_way() {
         let mut past = PastFrames::with_capacity(2);
         for i in 0..5u8 {
-            past.push(&[i], 0, SE3::identity(), Brightness::default());
+            past.push([i].into(), 0, SE3::identity(), Brightness::default());
         }
         let kept: Vec<u8> = past.newest_first().map(|f| f.pixels[0]).collect();
         assert_eq!(kept, [4, 3]);

@@ -3,6 +3,8 @@
 //! The tracker aligned a frame to depth that was still being estimated; its errors, tilt above all, are in the frame's
 //! pose relative to the keyframe and stay there when the keyframe moves.
 
+use std::sync::Arc;
+
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;
 use crate::slam::map::PlacedFrame;
@@ -16,8 +18,6 @@ const MOST_AT_ONCE: usize = 30;
 /// Keyframes after its own that a frame of an epoch's first keyframes waits for: all of these move with each estimate, and
 /// the frame with its own.
 const FIRST_LAG: usize = 4;
-/// Images of frames whose memory is kept for others: as many as come between two keyframes.
-const MOST_SPARE: usize = 30;
 /// Levels that a frame is aligned on: it is within a pixel or two already.
 const FRAME_LEVELS: [usize; 2] = [1, 0];
 /// The same of a frame whose pose is a guess.
@@ -43,7 +43,7 @@ pub struct TrackedFrame {
     /// Whether that is only a guess: nothing was known when the frame came.
     pub is_guess: bool,
     /// Grey values.
-    pub pixels: Vec<u8>,
+    pub pixels: Arc<[u8]>,
 }
 
 /// Frames that wait and frames that are done.
@@ -51,19 +51,17 @@ pub struct TrackedFrame {
 pub(super) struct WindowFrames {
     waiting: Vec<TrackedFrame>,
     placed: Vec<PlacedFrame>,
-    /// Memory of images that are not needed any more.
-    spare: Vec<Vec<u8>>,
+    /// Memory for the image of the one that is aligned.
+    pixels: Vec<u8>,
 }
 
 impl Window {
-    /// Takes frames that were tracked since the last time, in their order, and leaves memory for others.
-    pub fn take_frames(&mut self, frames: &mut Vec<TrackedFrame>, spare: &mut Vec<Vec<u8>>) {
-        spare.append(&mut self.frames.spare);
+    /// Takes frames that were tracked since the last time, in their order.
+    pub fn take_frames(&mut self, frames: &mut Vec<TrackedFrame>) {
         let waiting = &mut self.frames.waiting;
         waiting.append(frames);
         let excess = waiting.len().saturating_sub(self.params.max_waiting_frames);
-        spare.extend(waiting.drain(..excess).map(|frame| frame.pixels));
-        spare.truncate(MOST_SPARE);
+        waiting.drain(..excess);
     }
 
     /// Frames that have been aligned again since somebody asked.
@@ -88,7 +86,7 @@ impl Window {
         let mut waiting = std::mem::take(&mut self.frames.waiting);
         let mut left = most;
         self.retrace(&mut waiting, end, &mut left);
-        waiting.retain_mut(|frame| {
+        waiting.retain(|frame| {
             let index = self.index_of(frame.keyframe_id);
             if frame.is_guess || left == 0 || index.is_some_and(|index| index >= end) {
                 return true;
@@ -96,7 +94,6 @@ impl Window {
             left -= 1;
             let placed = index.and_then(|index| self.place_frame(index, frame, &FRAME_LEVELS));
             self.frames.placed.extend(placed);
-            self.frames.spare.push(std::mem::take(&mut frame.pixels));
             false
         });
         self.frames.waiting = waiting;
@@ -119,8 +116,7 @@ impl Window {
                 frame.keyframe_from_camera = off * guess;
             }
             let index = self.index_of(keyframe_id);
-            let placed = index.and_then(|index| self.place_frame(index, &mut frame, &GUESS_LEVELS));
-            self.frames.spare.push(std::mem::take(&mut frame.pixels));
+            let placed = index.and_then(|index| self.place_frame(index, &frame, &GUESS_LEVELS));
             let (Some(placed), Some(index)) = (placed, index) else {
                 waiting.retain(|other| !(other.is_guess && other.keyframe_id == keyframe_id));
                 continue;
@@ -140,7 +136,7 @@ impl Window {
     fn place_frame(
         &mut self,
         index: usize,
-        frame: &mut TrackedFrame,
+        frame: &TrackedFrame,
         levels: &[usize],
     ) -> Option<PlacedFrame> {
         let keyframe = &self.keyframes[index];
@@ -155,7 +151,9 @@ impl Window {
             return None;
         }
         let (width, height) = (self.camera.width, self.camera.height);
-        let pixels = std::mem::take(&mut frame.pixels);
+        let mut pixels = std::mem::take(&mut self.frames.pixels);
+        pixels.clear();
+        pixels.extend_from_slice(&frame.pixels);
         let image = Image::try_from_pixels(width, height, pixels)?;
         members.push(self.keyframes.len());
         self.keyframes.push(WindowKeyframe {
@@ -171,7 +169,7 @@ impl Window {
         });
         let is_aligned = self.align_last(&members, levels, MAX_ITERATIONS);
         let mut placed = self.keyframes.pop()?;
-        frame.pixels = placed.images.swap_remove(0).into_pixels();
+        self.frames.pixels = placed.images.swap_remove(0).into_pixels();
         let system = &self.solver.system;
         let agrees = system.inliers >= FEWEST_INLIERS
             && system.inliers as f64 >= LEAST_INLIER_RATIO * system.compared as f64;
@@ -195,7 +193,7 @@ mod tests {
             keyframe_id,
             keyframe_from_camera: SE3::identity(),
             is_guess: false,
-            pixels: vec![0; CAMERA.width * CAMERA.height],
+            pixels: vec![0; CAMERA.width * CAMERA.height].into(),
         }
     }
 
@@ -215,7 +213,7 @@ mod tests {
                 surface: Surface::default(),
             })
             .collect();
-        window.take_frames(&mut (0..8).map(frame).collect(), &mut Vec::new());
+        window.take_frames(&mut (0..8).map(frame).collect());
         window
     }
 
@@ -228,12 +226,5 @@ mod tests {
         };
         assert_eq!(left(true), [4, 5, 6, 7]);
         assert_eq!(left(false), [7]);
-    }
-
-    #[test]
-    fn memory_of_few_images_is_kept() {
-        let (mut window, mut spare) = (window(), vec![Vec::new(); 3 * MOST_SPARE]);
-        window.take_frames(&mut Vec::new(), &mut spare);
-        assert_eq!(spare.len(), MOST_SPARE);
     }
 }

@@ -1,0 +1,88 @@
+//! Copies of frames that outlive them: one of each frame, however many keep it.
+
+use std::sync::Arc;
+
+use crate::slam::frame::FrameView;
+
+/// Most copies that are kept for frames to come, one byte a pixel each.
+const MOST_SPARE: usize = 30;
+
+/// The copies that somebody keeps, and memory for more.
+#[derive(Debug, Default)]
+pub(super) struct FrameCopies {
+    copies: Vec<Arc<[u8]>>,
+    /// The one of the frame at hand.
+    current: Option<Arc<[u8]>>,
+}
+
+impl FrameCopies {
+    /// A new frame is at hand.
+    pub(super) fn begin_frame(&mut self) {
+        self.current = None;
+    }
+
+    /// The grey values of the frame at hand, copied when they are first asked for.
+    pub(super) fn of(&mut self, frame: &FrameView<'_>) -> Arc<[u8]> {
+        if let Some(copy) = &self.current {
+            return Arc::clone(copy);
+        }
+        let copy = self.copy(frame.pixels);
+        self.current = Some(Arc::clone(&copy));
+        copy
+    }
+
+    fn copy(&mut self, pixels: &[u8]) -> Arc<[u8]> {
+        let mut spare = 0;
+        // Nobody else keeps a copy that can be written to.
+        self.copies.retain_mut(|copy| {
+            let is_free = Arc::get_mut(copy).is_some_and(|of| of.len() == pixels.len());
+            spare += usize::from(is_free);
+            !is_free || spare <= MOST_SPARE
+        });
+        for copy in &mut self.copies {
+            if let Some(memory) = Arc::get_mut(copy).filter(|of| of.len() == pixels.len()) {
+                memory.copy_from_slice(pixels);
+                return Arc::clone(copy);
+            }
+        }
+        let copy: Arc<[u8]> = pixels.into();
+        self.copies.push(Arc::clone(&copy));
+        copy
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::test_scene::CAMERA;
+
+    fn copy_of(copies: &mut FrameCopies, grey: u8) -> Arc<[u8]> {
+        let pixels = vec![grey; CAMERA.width * CAMERA.height];
+        copies.begin_frame();
+        copies.of(&FrameView::new(&CAMERA, 0, 0, &pixels))
+    }
+
+    #[test]
+    fn a_frame_is_copied_once_and_its_memory_is_used_again() {
+        let mut copies = FrameCopies::default();
+        let first = copy_of(&mut copies, 1);
+        let same = copies.of(&FrameView::new(&CAMERA, 0, 0, &[]));
+        assert!(Arc::ptr_eq(&first, &same));
+        let second = copy_of(&mut copies, 2);
+        assert!((first[0], second[0]) == (1, 2));
+        let memory = first.as_ptr();
+        drop((first, same));
+        let third = copy_of(&mut copies, 3);
+        assert!(third[0] == 3 && third.as_ptr() == memory && second[0] == 2);
+    }
+
+    #[test]
+    fn memory_of_few_images_is_kept() {
+        let mut copies = FrameCopies::default();
+        let kept: Vec<_> = (0..100).map(|grey| copy_of(&mut copies, grey)).collect();
+        assert_eq!(copies.copies.len(), 100);
+        drop(kept);
+        let _ = copy_of(&mut copies, 0);
+        assert_eq!(copies.copies.len(), MOST_SPARE);
+    }
+}
