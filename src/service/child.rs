@@ -16,7 +16,7 @@ use rustix::process::{Pid, Signal};
 
 use crate::capture::source_name::SourceName;
 use crate::service::error_log::ErrorLog;
-use crate::service::liveness::Liveness;
+use crate::service::liveness::{Liveness, is_ending};
 use crate::service::manager_notice::VARIABLES;
 use crate::service::mode::Mode;
 use crate::service::position::RUN_VARIABLE;
@@ -88,26 +88,15 @@ pub fn follow_supervisor() -> Result<(), FollowError> {
 
 /// What a process does last: removes what is left where nobody else is there, of this instance and, where its
 /// supervisor was killed, of that. A killed process holds its locks for some time after its children have heard of
-/// its death, and until it has let go of the last one it cannot be told from a living one.
+/// its death, and until then it cannot be told from a living one.
 pub fn tidy_up(place: &Place) {
     /// Longest time that a killed process takes to be gone, on a busy machine with a slow disk.
     const LONGEST_DEATH: Duration = Duration::from_secs(10);
-    const PAUSE: Duration = Duration::from_millis(20);
-    let end = Instant::now() + LONGEST_DEATH;
-    while place.tidy() && is_orphaned() && Instant::now() < end {
-        std::thread::sleep(PAUSE);
+    let supervisor = std::env::var(SUPERVISOR_VARIABLE).ok().and_then(|pid| pid.parse().ok());
+    if let Some(supervisor) = supervisor {
+        wait_at_most(LONGEST_DEATH, || !is_ending(supervisor));
     }
-}
-
-/// Whether a supervisor has started this process and has died or is about to. The kernel tells its children that it
-/// dies before it has closed the files of it, and is their parent until then.
-fn is_orphaned() -> bool {
-    let parent = rustix::process::getppid().map(|parent| parent.as_raw_nonzero().get());
-    let supervisor: Option<i32> =
-        std::env::var(SUPERVISOR_VARIABLE).ok().and_then(|pid| pid.parse().ok());
-    supervisor.is_some_and(|supervisor| {
-        Some(supervisor) != parent || Liveness::of(supervisor.unsigned_abs()) == Liveness::Gone
-    })
+    place.tidy();
 }
 
 /// A running child. Killed when dropped while it still runs.

@@ -10,7 +10,7 @@ pub enum Liveness {
     Running,
     /// It is stopped by a signal (SIGSTOP, Ctrl-Z) or by a debugger, and does nothing until it is continued.
     Stopped,
-    /// There is no such process, it is on its way out, or only its exit code is left.
+    /// There is no such process, or only its exit code is left.
     Gone,
 }
 
@@ -23,21 +23,36 @@ impl Liveness {
 
     /// By the contents of `/proc/ID/stat`: the state stands behind the name, which may hold anything.
     fn from_stat(stat: &str) -> Self {
-        /// `flags` is the 9th field, the state the third.
-        const FLAGS_AFTER_STATE: usize = 9 - 3;
-        /// `PF_EXITING` of the kernel: the process gives back what it has, which takes it some time.
-        const EXITING: u32 = 4;
-        let mut fields = stat.rsplit_once(')').map_or("", |(_, rest)| rest).split_whitespace();
-        let state = fields.next().and_then(|state| state.chars().next());
-        let flags = fields.nth(FLAGS_AFTER_STATE - 1).and_then(|flags| flags.parse().ok());
-        let is_exiting = flags.unwrap_or(0) & EXITING != 0;
+        let state = stat.rsplit_once(')').and_then(|(_, rest)| rest.trim_start().chars().next());
         match state {
             None | Some('Z' | 'X' | 'x') => Self::Gone,
-            Some(_) if is_exiting => Self::Gone,
             Some('T' | 't') => Self::Stopped,
             Some(_) => Self::Running,
         }
     }
+}
+
+/// Whether the process with this id was killed or has exited and still gives back what it has: the kernel closes its
+/// files, and with them its locks, when the last of its threads has come to its end.
+pub fn is_ending(process_id: u32) -> bool {
+    ends_by(&fs::read_to_string(format!("/proc/{process_id}/stat")).unwrap_or_default())
+}
+
+/// By the contents of `/proc/ID/stat`.
+fn ends_by(stat: &str) -> bool {
+    /// The state is the 3rd field, `flags` the 9th, `num_threads` the 20th.
+    const FLAGS_AFTER_STATE: usize = 9 - 3;
+    const THREADS_AFTER_FLAGS: usize = 20 - 9;
+    /// `PF_EXITING` of the kernel.
+    const EXITING: u32 = 4;
+    let mut fields = stat.rsplit_once(')').map_or("", |(_, rest)| rest).split_whitespace();
+    let state = fields.next();
+    let flags: Option<u32> = fields.nth(FLAGS_AFTER_STATE - 1).and_then(|of| of.parse().ok());
+    let threads: Option<u32> = fields.nth(THREADS_AFTER_FLAGS - 1).and_then(|of| of.parse().ok());
+    // The first thread of a process stays as a zombie until the others are gone, and until somebody asks for its exit
+    // code.
+    let is_left = state == Some("Z") && threads.is_none_or(|threads| threads <= 1);
+    flags.is_some_and(|flags| flags & EXITING != 0) && !is_left
 }
 
 /// For how long the process with this id has lived; `None` where there is none.
@@ -67,12 +82,29 @@ mod tests {
         assert_eq!(Liveness::from_stat("7 (semidense) T 1 7"), Liveness::Stopped);
         assert_eq!(Liveness::from_stat("7 (semidense) t 1 7"), Liveness::Stopped);
         assert_eq!(Liveness::from_stat("7 (semidense) Z 1 7"), Liveness::Gone);
-        let running = "7 (a) b) R 1 7 7 0 -1 4194560 0 0";
-        assert_eq!(Liveness::from_stat(running), Liveness::Running);
-        assert_eq!(Liveness::from_stat(&running.replace("4194560", "4194564")), Liveness::Gone);
         assert_eq!(Liveness::from_stat(""), Liveness::Gone);
         assert_eq!(Liveness::of(std::process::id()), Liveness::Running);
     }
+
+    #[test]
+    fn a_process_ends_until_its_last_thread_is_gone() {
+        let stat = |state: &str, flags: u32, threads: u32| {
+            format!("7 (a) b) {state} 1 7 7 0 -1 {flags} 0 0 0 0 0 0 0 0 20 0 {threads} 0 4711 0 0")
+        };
+        let (usual, exiting) = (4_194_560, 4_194_564);
+        assert!(!ends_by(&stat("S", usual, 4)));
+        assert!(ends_by(&stat("R", exiting, 4)) && ends_by(&stat("R", exiting, 1)));
+        assert!(ends_by(&stat("Z", exiting, 2)));
+        assert!(!ends_by(&stat("Z", exiting, 1)) && !ends_by(""));
+        assert!(!is_ending(std::process::id()) && !is_ending(u32::MAX));
+        let mut child = std::process::Command::new("true").spawn().unwrap();
+        while Liveness::of(child.id()) != Liveness::Gone {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        assert!(!is_ending(child.id()), "only its exit code is left");
+        child.wait().unwrap();
+    }
+
     #[test]
     fn a_process_has_an_age() {
         let stat = "7 (a) b) S 1 7 7 0 -1 4194560 0 0 0 0 0 0 0 0 20 0 1 0 4711 0 0";

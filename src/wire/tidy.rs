@@ -25,36 +25,31 @@ impl Place {
     /// Removes what iceoryx2 leaves behind on purpose when its last node is gone: its counter of
     /// nodes and its empty folders; and what processes that were killed have left, unless a successor may still
     /// come for it. Does nothing while anybody is here or joins.
-    ///
-    /// Says whether somebody is still here: a node, or a claim that is held. A process that was killed is until the
-    /// kernel has closed all its files, one after the other.
-    pub fn tidy(&self) -> bool {
+    pub fn tidy(&self) {
         let path = self.root.join(JOIN_LOCK);
-        let Ok(lock) = open_lock(&path) else { return false };
+        let Ok(lock) = open_lock(&path) else { return };
         // Waits for whoever joins or tidies up: of two that leave together, the second must look. One that is
         // stopped meanwhile leaves it to the next.
         let end = Instant::now() + LONGEST_TIDY_WAIT;
         let is_alone = lock_until(&lock, FlockOperation::NonBlockingLockExclusive, end)
             && is_same_file(&lock, &path);
         if !is_alone {
-            return true;
+            return;
         }
         // What cannot be removed is removed by the next one.
         let is_empty =
             |folder: &Path| fs::read_dir(folder).map_or(true, |mut f| f.next().is_none());
         self.remove_dead_nodes();
         self.remove_failed_nodes();
-        if !is_empty(&self.root.join("nodes")) {
-            return true;
+        if is_empty(&self.root.join("nodes")) {
+            self.node_counters().for_each(|path| drop(fs::remove_file(path)));
+            self.remove_abandoned();
+            let _ = fs::remove_dir(self.root.join("nodes"));
+            // Without a node nobody has a service open: what is left there is of the dead.
+            let _ = fs::remove_dir_all(self.root.join("services"));
+            self.events().for_each(|path| drop(fs::remove_file(path)));
+            let _ = fs::remove_file(&path);
         }
-        self.node_counters().for_each(|path| drop(fs::remove_file(path)));
-        let is_claimed = self.remove_abandoned();
-        let _ = fs::remove_dir(self.root.join("nodes"));
-        // Without a node nobody has a service open: what is left there is of the dead.
-        let _ = fs::remove_dir_all(self.root.join("services"));
-        self.events().for_each(|path| drop(fs::remove_file(path)));
-        let _ = fs::remove_file(&path);
-        is_claimed
     }
 
     /// Whether nodes, living or dead, are below the root.
@@ -106,37 +101,39 @@ impl Place {
     }
 
     /// Removes checkpoints, positions and dead claims of instances for which no successor is waited for. While
-    /// nobody may join. Says whether a claim is held.
-    fn remove_abandoned(&self) -> bool {
+    /// nobody may join.
+    fn remove_abandoned(&self) {
         let files = self.instance_files();
-        // Once: a killed process may let go of its claim at any moment, and whoever counts as there must be waited for.
-        let held: Vec<&(String, Kind, PathBuf)> =
-            files.iter().filter(|(_, kind, path)| *kind == Kind::Claim && is_held(path)).collect();
         let instances: BTreeSet<&str> =
             files.iter().map(|(instance, ..)| instance.as_str()).collect();
-        let is_there = |instance: &str| held.iter().any(|(held, ..)| held == instance);
-        let waiting: BTreeSet<&str> = instances
-            .into_iter()
-            .filter(|instance| is_there(instance) || self.awaits_successor(instance))
-            .collect();
+        let waiting: BTreeSet<&str> =
+            instances.into_iter().filter(|instance| self.awaits_successor(instance)).collect();
         for (instance, kind, path) in &files {
-            // What is unfinished has a dead writer: nobody completes it.
-            if *kind == Kind::Unfinished || !waiting.contains(instance.as_str()) {
+            let is_needed = match kind {
+                // Its writer is dead: nobody completes it.
+                Kind::Unfinished => false,
+                Kind::Kept => waiting.contains(instance.as_str()),
+                Kind::Claim => waiting.contains(instance.as_str()) || is_held(path),
+            };
+            if !is_needed {
                 let _ = fs::remove_file(path);
             }
         }
-        !held.is_empty()
     }
 
-    /// Whether a process of `instance` that was killed, which leaves its claim, is so lately gone that its successor
-    /// is still due to continue from what is kept for it.
+    /// Whether a process of `instance` may come and continue from what is kept for it: one holds its claim and has
+    /// not joined yet, or one was killed, which leaves its claim, so lately that its successor is still due.
     fn awaits_successor(&self, instance: &str) -> bool {
-        let mut claims = MEMBERS.map(|member| self.claim_path_of(instance, member)).into_iter();
+        let claims = MEMBERS.map(|member| self.claim_path_of(instance, member));
+        let mut there = claims.iter().filter(|path| path.exists()).peekable();
+        if there.peek().is_none() {
+            return false;
+        }
         let kept = [
             self.kept_path(instance, CHECKPOINT_SUFFIX),
             self.kept_path(instance, POSITION_SUFFIX),
         ];
-        claims.any(|path| path.exists()) && kept.iter().any(|path| is_young(path))
+        there.any(|path| is_held(path)) || kept.iter().any(|path| is_young(path))
     }
 
     /// What processes of this instance keep for their successors.
@@ -308,11 +305,11 @@ mod tests {
         let other = folder.path().join("rig2.tracker.lock");
         fs::write(&other, "4194304\n").unwrap();
         let living = place.claim("capture").unwrap();
-        assert!(place.tidy());
+        place.tidy();
         assert!(place.claim("capture").is_err(), "the living one still holds its claim");
         assert!(dead.exists() && !other.exists());
         drop(living);
-        assert!(!place.tidy());
+        place.tidy();
         assert!(!dead.exists());
     }
 

@@ -59,8 +59,18 @@ pub trait LaneWork {
     fn run<L: Lanes>(self, lanes: L) -> Self::Output;
 }
 
+#[cfg(test)]
+thread_local! {
+    /// Whether this thread computes as on a processor without vector registers.
+    pub static IS_PORTABLE: std::cell::Cell<bool> = const { std::cell::Cell::new(false) };
+}
+
 /// Computes with the best lanes that this processor has.
 pub fn with_lanes<W: LaneWork>(work: W) -> W::Output {
+    #[cfg(test)]
+    if IS_PORTABLE.get() {
+        return work.run(Portable);
+    }
     #[cfg(target_arch = "x86_64")]
     if std::arch::is_x86_feature_detected!("avx2") {
         // SAFETY: the processor has AVX2, as was just asked.

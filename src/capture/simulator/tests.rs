@@ -3,6 +3,7 @@
 use nalgebra::{Vector2, Vector3};
 
 use super::*;
+use crate::capture::simulator::lanes_kernel::IS_PORTABLE;
 use crate::capture::simulator::params::MotionKind;
 use crate::capture::simulator::scene::Block;
 use crate::capture::simulator::scene_kind::SceneKind;
@@ -226,6 +227,28 @@ fn the_same_seed_gives_the_same_bytes_on_any_number_of_threads() {
     assert!(one == render(3, &params));
     params.seed = 2;
     assert!(one.0 != render(1, &params).0);
+}
+
+#[test]
+fn frames_are_the_same_on_every_processor() {
+    let mut sharp = small(SceneKind::Room);
+    sharp.frames = 3;
+    let mut blurred = sharp.clone();
+    blurred.sensor.exposure_ms = 8.0;
+    blurred.sensor.distortion = vec![-0.2, 0.05, 0.0, 0.0];
+    for params in [sharp, blurred] {
+        let render = |is_portable: bool| {
+            let (mut scratch, source) = (RenderScratch::default(), Simulator::new(params.clone()));
+            IS_PORTABLE.set(is_portable);
+            let (pixels, depth) = source.unwrap().raw_frame_and_depth(1, &mut scratch).unwrap();
+            let depth: Vec<u32> = depth.pixels().iter().map(|depth| depth.to_bits()).collect();
+            (pixels.to_vec(), depth)
+        };
+        // All of it in one thread.
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+        let (portable, vectorised) = pool.install(|| (render(true), render(false)));
+        assert!(portable == vectorised);
+    }
 }
 
 #[test]
