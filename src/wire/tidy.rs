@@ -27,15 +27,7 @@ impl Place {
     /// come for it. Does nothing while anybody is here or joins.
     pub fn tidy(&self) {
         let path = self.root.join(JOIN_LOCK);
-        let Ok(lock) = open_lock(&path) else { return };
-        // Waits for whoever joins or tidies up: of two that leave together, the second must look. One that is
-        // stopped meanwhile leaves it to the next.
-        let end = Instant::now() + LONGEST_TIDY_WAIT;
-        let is_alone = lock_until(&lock, FlockOperation::NonBlockingLockExclusive, end)
-            && is_same_file(&lock, &path);
-        if !is_alone {
-            return;
-        }
+        let Some(_lock) = lock_alone(&path) else { return };
         // What cannot be removed is removed by the next one.
         let is_empty =
             |folder: &Path| fs::read_dir(folder).map_or(true, |mut f| f.next().is_none());
@@ -193,6 +185,23 @@ impl Kind {
     }
 }
 
+/// The lock that says that nobody joins. Waits for whoever joins or tidies up: of two that leave together, the second
+/// must look too, at what the first could not remove while the second was there. One that is stopped meanwhile leaves
+/// it to the next.
+fn lock_alone(path: &Path) -> Option<File> {
+    let end = Instant::now() + LONGEST_TIDY_WAIT;
+    loop {
+        let lock = open_lock(path).ok()?;
+        if !lock_until(&lock, FlockOperation::NonBlockingLockExclusive, end) {
+            return None;
+        }
+        // Whoever held it before may have removed the file, and others lock the new one.
+        if is_same_file(&lock, path) {
+            return Some(lock);
+        }
+    }
+}
+
 /// Whether a process holds a claim. One that cannot be looked at counts as held.
 fn is_held(claim: &Path) -> bool {
     File::open(claim).map_or(true, |file| {
@@ -251,6 +260,25 @@ mod tests {
         drop(joining);
         place.tidy();
         assert!(!folder.path().join(JOIN_LOCK).exists());
+    }
+
+    #[test]
+    fn of_two_that_tidy_up_together_the_second_looks_too() {
+        let (folder, place) = place();
+        place.create().unwrap();
+        let path = folder.path().join(JOIN_LOCK);
+        let first = lock_alone(&path).unwrap();
+        std::thread::scope(|scope| {
+            let second = scope.spawn(|| place.tidy());
+            // Long enough for the second to have opened the file that the first removes.
+            std::thread::sleep(Duration::from_millis(100));
+            let left = killed(&place, "supervisor");
+            fs::remove_file(&path).unwrap();
+            drop(first);
+            second.join().unwrap();
+            assert!(!left.exists());
+        });
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
     }
 
     #[test]
