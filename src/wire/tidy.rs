@@ -27,7 +27,7 @@ impl Place {
     /// come for it. Does nothing while anybody is here or joins.
     pub fn tidy(&self) {
         let path = self.root.join(JOIN_LOCK);
-        let Some(_lock) = lock_alone(&path) else { return };
+        let Some(_lock) = lock_alone(&path, LONGEST_TIDY_WAIT) else { return };
         // What cannot be removed is removed by the next one.
         let is_empty =
             |folder: &Path| fs::read_dir(folder).map_or(true, |mut f| f.next().is_none());
@@ -188,8 +188,8 @@ impl Kind {
 /// The lock that says that nobody joins. Waits for whoever joins or tidies up: of two that leave together, the second
 /// must look too, at what the first could not remove while the second was there. One that is stopped meanwhile leaves
 /// it to the next.
-fn lock_alone(path: &Path) -> Option<File> {
-    let end = Instant::now() + LONGEST_TIDY_WAIT;
+fn lock_alone(path: &Path, longest: Duration) -> Option<File> {
+    let end = Instant::now() + longest;
     loop {
         let lock = open_lock(path).ok()?;
         if !lock_until(&lock, FlockOperation::NonBlockingLockExclusive, end) {
@@ -222,6 +222,8 @@ fn is_young(path: &Path) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use rustix::thread::Timespec;
+
     use super::*;
 
     /// A place in a folder of its own.
@@ -264,21 +266,21 @@ mod tests {
 
     #[test]
     fn of_two_that_tidy_up_together_the_second_looks_too() {
-        let (folder, place) = place();
+        /// For the second to open the file that the first removes.
+        const HOLD: Timespec = Timespec { tv_sec: 0, tv_nsec: 100_000_000 };
+        let (_folder, place) = place();
         place.create().unwrap();
-        let path = folder.path().join(JOIN_LOCK);
-        let first = lock_alone(&path).unwrap();
-        std::thread::scope(|scope| {
-            let second = scope.spawn(|| place.tidy());
-            // Long enough for the second to have opened the file that the first removes.
-            std::thread::sleep(Duration::from_millis(100));
-            let left = killed(&place, "supervisor");
+        let path = place.root.join(JOIN_LOCK);
+        let longest = Duration::from_secs(240);
+        let first = lock_alone(&path, longest).unwrap();
+        let leave = || {
+            drop(rustix::thread::nanosleep(&HOLD));
             fs::remove_file(&path).unwrap();
             drop(first);
-            second.join().unwrap();
-            assert!(!left.exists());
-        });
-        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 0);
+        };
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
+        let (second, ()) = pool.join(|| lock_alone(&path, longest), leave);
+        assert!(second.is_some_and(|lock| is_same_file(&lock, &path)));
     }
 
     #[test]
