@@ -21,9 +21,9 @@ impl Liveness {
         Self::from_stat(&stat)
     }
 
-    /// By the contents of `/proc/ID/stat`: the state stands behind the name, which may hold anything.
+    /// By the contents of `/proc/ID/stat`.
     fn from_stat(stat: &str) -> Self {
-        let state = stat.rsplit_once(')').and_then(|(_, rest)| rest.trim_start().chars().next());
+        let state = field(stat, STATE).and_then(|state| state.chars().next());
         match state {
             None | Some('Z' | 'X' | 'x') => Self::Gone,
             Some('T' | 't') => Self::Stopped,
@@ -40,19 +40,25 @@ pub fn is_ending(process_id: u32) -> bool {
 
 /// By the contents of `/proc/ID/stat`.
 fn ends_by(stat: &str) -> bool {
-    /// The state is the 3rd field, `flags` the 9th, `num_threads` the 20th.
-    const FLAGS_AFTER_STATE: usize = 9 - 3;
-    const THREADS_AFTER_FLAGS: usize = 20 - 9;
+    const FLAGS: usize = 9;
+    const NUM_THREADS: usize = 20;
     /// `PF_EXITING` of the kernel.
     const EXITING: u32 = 4;
-    let mut fields = stat.rsplit_once(')').map_or("", |(_, rest)| rest).split_whitespace();
-    let state = fields.next();
-    let flags: Option<u32> = fields.nth(FLAGS_AFTER_STATE - 1).and_then(|of| of.parse().ok());
-    let threads: Option<u32> = fields.nth(THREADS_AFTER_FLAGS - 1).and_then(|of| of.parse().ok());
+    let number = |at: usize| field(stat, at).and_then(|of| of.parse::<u32>().ok());
     // The first thread of a process stays as a zombie until the others are gone, and until somebody asks for its exit
     // code.
-    let is_left = state == Some("Z") && threads.is_none_or(|threads| threads <= 1);
-    flags.is_some_and(|flags| flags & EXITING != 0) && !is_left
+    let is_left =
+        field(stat, STATE) == Some("Z") && number(NUM_THREADS).is_none_or(|threads| threads <= 1);
+    number(FLAGS).is_some_and(|flags| flags & EXITING != 0) && !is_left
+}
+
+/// Where the state stands in `/proc/ID/stat`, the first field behind the name.
+const STATE: usize = 3;
+
+/// A field of `/proc/ID/stat`, from the state on, counted from 1 as the kernel's manual does: the name before it may
+/// hold anything.
+fn field(stat: &str, at: usize) -> Option<&str> {
+    stat.rsplit_once(')')?.1.split_whitespace().nth(at - STATE)
 }
 
 /// For how long the process with this id has lived; `None` where there is none.
@@ -66,10 +72,8 @@ pub fn age(process_id: u32) -> Option<Duration> {
 
 /// Clock ticks from the start of the machine to that of the process, by the contents of `/proc/ID/stat`.
 fn began_ticks(stat: &str) -> Option<u64> {
-    /// `starttime` is the 22nd field, the state behind the name the third.
-    const AFTER_STATE: usize = 22 - 3;
-    let (_, rest) = stat.rsplit_once(')')?;
-    rest.split_whitespace().nth(AFTER_STATE)?.parse().ok()
+    const START_TIME: usize = 22;
+    field(stat, START_TIME)?.parse().ok()
 }
 
 #[cfg(test)]

@@ -189,16 +189,8 @@ impl Place {
         let path = self.root.join(JOIN_LOCK);
         let io = |source| PlaceError::Io { path: path.clone(), source };
         let end = Instant::now() + LONGEST_HOLD;
-        loop {
-            let file = open_lock(&path).map_err(io)?;
-            if lock_until(&file, FlockOperation::NonBlockingLockShared, end) {
-                if is_same_file(&file, &path) {
-                    return Ok(file);
-                }
-            } else {
-                return Err(PlaceError::Held(path));
-            }
-        }
+        let lock = lock_named(&path, FlockOperation::NonBlockingLockShared, end).map_err(io)?;
+        lock.ok_or(PlaceError::Held(path))
     }
 
     /// The process id of a member of the instance that runs, by its claim.
@@ -225,6 +217,24 @@ impl Drop for Claim {
     fn drop(&mut self) {
         // Removed while still locked, so that no other process can hold the same name.
         let _ = fs::remove_file(&self.path);
+    }
+}
+
+/// Opens and locks the file that has this name in the end: whoever held it before may have removed it, and others
+/// lock the new one. `None` if that is not possible in time.
+pub(in crate::wire) fn lock_named(
+    path: &Path,
+    operation: FlockOperation,
+    end: Instant,
+) -> io::Result<Option<File>> {
+    loop {
+        let file = open_lock(path)?;
+        if !lock_until(&file, operation, end) {
+            return Ok(None);
+        }
+        if is_same_file(&file, path) {
+            return Ok(Some(file));
+        }
     }
 }
 

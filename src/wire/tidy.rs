@@ -12,7 +12,7 @@ use rustix::fs::FlockOperation;
 
 use crate::wire::place::{
     CHECKPOINT_SUFFIX, CLAIM_SUFFIX, JOIN_LOCK, LOADED_MAP_SUFFIX, MEMBERS, POSITION_SUFFIX, Place,
-    is_same_file, lock_until, open_lock,
+    lock_named,
 };
 
 /// Longest wait before tidying up, which the next process that leaves can do as well.
@@ -27,7 +27,11 @@ impl Place {
     /// come for it. Does nothing while anybody is here or joins.
     pub fn tidy(&self) {
         let path = self.root.join(JOIN_LOCK);
-        let Some(_lock) = lock_alone(&path, LONGEST_TIDY_WAIT) else { return };
+        // Waits for whoever joins or tidies up: of two that leave together, the second must look too, at what the first
+        // could not remove while the second was there. One that is stopped meanwhile leaves it to the next.
+        let end = Instant::now() + LONGEST_TIDY_WAIT;
+        let alone = FlockOperation::NonBlockingLockExclusive;
+        let Ok(Some(_lock)) = lock_named(&path, alone, end) else { return };
         // What cannot be removed is removed by the next one.
         let is_empty =
             |folder: &Path| fs::read_dir(folder).map_or(true, |mut f| f.next().is_none());
@@ -185,23 +189,6 @@ impl Kind {
     }
 }
 
-/// The lock that says that nobody joins. Waits for whoever joins or tidies up: of two that leave together, the second
-/// must look too, at what the first could not remove while the second was there. One that is stopped meanwhile leaves
-/// it to the next.
-fn lock_alone(path: &Path, longest: Duration) -> Option<File> {
-    let end = Instant::now() + longest;
-    loop {
-        let lock = open_lock(path).ok()?;
-        if !lock_until(&lock, FlockOperation::NonBlockingLockExclusive, end) {
-            return None;
-        }
-        // Whoever held it before may have removed the file, and others lock the new one.
-        if is_same_file(&lock, path) {
-            return Some(lock);
-        }
-    }
-}
-
 /// Whether a process holds a claim. One that cannot be looked at counts as held.
 fn is_held(claim: &Path) -> bool {
     File::open(claim).map_or(true, |file| {
@@ -225,6 +212,7 @@ mod tests {
     use rustix::thread::Timespec;
 
     use super::*;
+    use crate::wire::place::{is_same_file, lock_until, open_lock};
 
     /// A place in a folder of its own.
     fn place() -> (tempfile::TempDir, Place) {
@@ -271,15 +259,16 @@ mod tests {
         let (_folder, place) = place();
         place.create().unwrap();
         let path = place.root.join(JOIN_LOCK);
-        let longest = Duration::from_secs(240);
-        let first = lock_alone(&path, longest).unwrap();
+        let end = Instant::now() + Duration::from_secs(240);
+        let lock = || lock_named(&path, FlockOperation::NonBlockingLockExclusive, end).unwrap();
+        let first = lock();
         let leave = || {
             drop(rustix::thread::nanosleep(&HOLD));
             fs::remove_file(&path).unwrap();
             drop(first);
         };
         let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
-        let (second, ()) = pool.join(|| lock_alone(&path, longest), leave);
+        let (second, ()) = pool.join(lock, leave);
         assert!(second.is_some_and(|lock| is_same_file(&lock, &path)));
     }
 

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use crate::slam::frame::FrameView;
 
-/// Most copies that are kept for frames to come, one byte a pixel each.
+/// Most copies that are kept for frames to come, one byte a pixel each: as many as come between two keyframes.
 const MOST_SPARE: usize = 30;
 
 /// The copies that somebody keeps, and memory for more.
@@ -32,12 +32,11 @@ impl FrameCopies {
     }
 
     fn copy(&mut self, pixels: &[u8]) -> Arc<[u8]> {
-        let mut spare = 0;
         // Nobody else keeps a copy that can be written to.
+        let mut spare = 0;
         self.copies.retain_mut(|copy| {
-            let is_free = Arc::get_mut(copy).is_some_and(|of| of.len() == pixels.len());
-            spare += usize::from(is_free);
-            !is_free || spare <= MOST_SPARE
+            spare += usize::from(Arc::get_mut(copy).is_some());
+            Arc::get_mut(copy).is_none() || spare <= MOST_SPARE
         });
         for copy in &mut self.copies {
             if let Some(memory) = Arc::get_mut(copy).filter(|of| of.len() == pixels.len()) {
