@@ -23,7 +23,7 @@ use semidense::service::map_folder::manifest::Manifest;
 use semidense::service::pairing::Pairing;
 use semidense::service::recording::RecordParts;
 use semidense::service::trajectory_file::{parse_trajectory, tum_line};
-use semidense::slam::alignment::reference::{Reference, ReferenceParams};
+use semidense::slam::alignment::reference::{Reference, ReferenceParams, ReferenceScratch};
 use semidense::slam::evaluation::depth_error::DepthScale;
 use semidense::slam::frame::FrameView;
 use semidense::slam::geometry::intrinsics::Intrinsics;
@@ -437,7 +437,7 @@ pub fn pipeline(bytes: &[u8]) {
                     keyframe_from_messages(&header, &points, &image_header, &image)
                 {
                     let mut reference = Reference::new(ReferenceParams::default());
-                    reference.prepare_into(&keyframe);
+                    reference.prepare_into(&keyframe, &mut ReferenceScratch::default());
                     tracker.adopt(Box::new(reference));
                 }
             }
@@ -446,7 +446,7 @@ pub fn pipeline(bytes: &[u8]) {
                 let keyframe = mapper.as_ref().and_then(|(_, mapper)| mapper.keyframe());
                 if let (Some(keyframe), Some((_, tracker))) = (keyframe, tracker.as_mut()) {
                     let mut reference = Reference::new(ReferenceParams::default());
-                    reference.prepare_into(keyframe);
+                    reference.prepare_into(keyframe, &mut ReferenceScratch::default());
                     tracker.adopt(Box::new(reference));
                 }
             }

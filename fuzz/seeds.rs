@@ -194,7 +194,7 @@ fn journal() -> Vec<u8> {
         began_nanos: 1,
     };
     let map_from_keyframe = Sim3::new(SE3::identity(), 2.0);
-    let without_depth = Keyframe { image: Vec::new(), points: Vec::new(), ..keyframe() };
+    let without_depth = keyframe().without_depth();
     let records = [
         Record::Start(Box::new(start)),
         Record::Pose(Box::new(pose_message(&pose(1), &PoseTiming::default()))),

@@ -7,7 +7,7 @@ mod counting_allocator;
 #[path = "support/waves.rs"]
 mod waves;
 
-use semidense::slam::alignment::reference::{Reference, ReferenceParams};
+use semidense::slam::alignment::reference::{Reference, ReferenceParams, ReferenceScratch};
 use semidense::slam::depth::candidate::CandidateParams;
 use semidense::slam::depth::epipolar::TwoView;
 use semidense::slam::depth::immature::{IntervalParams, TraceFrame};
@@ -27,6 +27,7 @@ fn a_frame_and_a_keyframe_allocate_nothing_after_warm_up() {
     count_everywhere();
     let mut tracker = Tracker::new(CAMERA, TrackerParams::default()).unwrap();
     let mut spare = Some(Box::new(Reference::new(ReferenceParams::default())));
+    let mut scratch = ReferenceScratch::default();
     let keyframes = [keyframe(0), keyframe(1), keyframe(2), keyframe(3)];
     let mut pixels: Vec<_> = (0..12).map(|i| image(0.4 * f64::from(i))).collect();
     // One unlike all others, so that other motions are tried and the frame is lost.
@@ -39,7 +40,7 @@ fn a_frame_and_a_keyframe_allocate_nothing_after_warm_up() {
         // Two references take turns, as in the shell: one active, one being prepared.
         let mut reference =
             spare.take().unwrap_or_else(|| Box::new(Reference::new(ReferenceParams::default())));
-        reference.prepare_into(keyframe);
+        reference.prepare_into(keyframe, &mut scratch);
         spare = tracker.adopt(reference);
         for (sequence, pixels) in pixels.iter().enumerate() {
             let frame = FrameView::new(
@@ -81,7 +82,7 @@ fn holding_a_view_allocates_nothing() {
         point.intensity =
             f32::from(known[usize::from(point.v) * CAMERA.width + usize::from(point.u)]);
     }
-    known_here.image = known;
+    known_here.image = known.into();
     tracker.adopt(Box::new(Reference::prepare(&known_here)));
     let pixels: Vec<_> = (0..FRAMES).map(|k| panorama(0.045 * k as f64)).collect();
     let (mut before, mut held) = (0, 0);

@@ -14,7 +14,9 @@ use std::hint::black_box;
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group};
 use semidense::slam::alignment::align::AlignmentParams;
 use semidense::slam::alignment::kernel::Kernel;
-use semidense::slam::alignment::reference::{Reference, ReferenceParams, num_levels};
+use semidense::slam::alignment::reference::{
+    Reference, ReferenceParams, ReferenceScratch, num_levels,
+};
 use semidense::slam::alignment::residual::{Evaluation, accumulate_reference};
 use semidense::slam::alignment::scatter::GradientScatter;
 use semidense::slam::geometry::se3::SE3;
@@ -28,7 +30,7 @@ fn normal_equations(criterion: &mut Criterion) {
     let camera = camera(SIZES[0]);
     let params = ReferenceParams { finest_level: 0, ..ReferenceParams::default() };
     let mut reference = Reference::new(params);
-    reference.prepare_into(&keyframe(&camera));
+    reference.prepare_into(&keyframe(&camera), &mut ReferenceScratch::default());
     let levels = num_levels(camera.width, camera.height);
     let mut pyramid = SumPyramid::with_size(camera.width, camera.height, levels, 0);
     pyramid.fill(&image(&camera, 1.3));
@@ -76,8 +78,9 @@ fn whole_frame(criterion: &mut Criterion) {
         });
         let keyframe = keyframe(&camera);
         let mut reference = Reference::new(ReferenceParams::default());
+        let mut scratch = ReferenceScratch::default();
         criterion.bench_function(&format!("prepare/{name}"), |bencher| {
-            bencher.iter(|| reference.prepare_into(black_box(&keyframe)));
+            bencher.iter(|| reference.prepare_into(black_box(&keyframe), &mut scratch));
         });
         let Ok(mut tracker) = Tracker::new(camera, TrackerParams::default()) else { return };
         tracker.adopt(Box::new(Reference::prepare(&keyframe)));

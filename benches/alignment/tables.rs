@@ -6,7 +6,9 @@ use std::time::Instant;
 use semidense::slam::alignment::align::AlignmentParams;
 use semidense::slam::alignment::kernel::{Kernel, SimdMode};
 use semidense::slam::alignment::points::{LANES, PointBlock};
-use semidense::slam::alignment::reference::{Reference, ReferenceParams, num_levels};
+use semidense::slam::alignment::reference::{
+    Reference, ReferenceParams, ReferenceScratch, num_levels,
+};
 use semidense::slam::alignment::residual::Evaluation;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
@@ -54,7 +56,7 @@ impl Stage {
         let images = [image(&camera, 1.3), image(&camera, 2.6)];
         let params = ReferenceParams { finest_level, ..ReferenceParams::default() };
         let mut reference = Reference::new(params);
-        reference.prepare_into(&keyframe(&camera));
+        reference.prepare_into(&keyframe(&camera), &mut ReferenceScratch::default());
         let levels = num_levels(size.0, size.1);
         let mut pyramid = SumPyramid::with_size(size.0, size.1, levels, finest_level);
         pyramid.fill(&images[0]);
@@ -133,8 +135,9 @@ fn print_times() {
         row(&name, "pyramid (gradients are the keyframe's)", times);
         let keyframe = keyframe(&stage.camera);
         let prepared = format!("prepare a keyframe of {} points", keyframe.points.len());
-        let reference = &mut stage.reference;
-        let times = self::times(KEYFRAMES, |_| reference.prepare_into(black_box(&keyframe)));
+        let (reference, mut scratch) = (&mut stage.reference, ReferenceScratch::default());
+        let times =
+            self::times(KEYFRAMES, |_| reference.prepare_into(black_box(&keyframe), &mut scratch));
         row(&name, &prepared, times);
         let (kernel, at) = (Kernel::choose(SimdMode::Auto), stage.evaluation(1));
         let (points, image) = (stage.reference.level(1), stage.pyramid.level(1));

@@ -268,7 +268,7 @@ fn resident_bytes() -> f64 {
 /// Bytes of the map's images and depth.
 fn map_bytes(map: &Map) -> f64 {
     let bytes = |keyframe: &Keyframe| {
-        keyframe.image.capacity() + keyframe.points.capacity() * size_of::<DepthPoint>()
+        keyframe.image.len() + keyframe.points.capacity() * size_of::<DepthPoint>()
     };
     map.keyframes.iter().map(bytes).sum::<usize>() as f64
 }

@@ -143,7 +143,7 @@ fn assert_map_and_frames_arrive(hub: &Hub, robot: &Robot) {
     let mut keyframes = KeyframeInbox::open(hub).unwrap();
     let keyframe = until("a keyframe", || keyframes.newest().unwrap());
     assert_eq!((keyframe.keyframe_id, keyframe.revision), (1, 3));
-    assert!(keyframe.image == image(1) && keyframe.points == points(1));
+    assert!(keyframe.image[..] == image(1) && keyframe.points == points(1));
     let graphs: Subscriber<KeyframePoseMessage, GraphHeader> = hub.subscriber(&GRAPH).unwrap();
     let arrived = until("the graph", || graphs.newest().unwrap());
     assert_eq!((arrived.header().revision, arrived.payload()), (3, &graph(1)[..]));

@@ -7,7 +7,7 @@ use std::time::Instant;
 use nalgebra::Vector6;
 use semidense::capture::source::{FrameSource, FrameStamp};
 use semidense::capture::source_error::SourceError;
-use semidense::slam::alignment::reference::Reference;
+use semidense::slam::alignment::reference::{Reference, ReferenceScratch};
 use semidense::slam::evaluation::normalized_error::normalized;
 use semidense::slam::frame::FrameView;
 use semidense::slam::geometry::intrinsics::Intrinsics;
@@ -147,6 +147,7 @@ pub fn track(
     let recorded = std::mem::take(&mut source.frames);
     let mut tracker = Tracker::new(intrinsics, params.clone())?;
     let mut memory = Some(Box::new(Reference::new(params.reference.clone())));
+    let mut scratch = ReferenceScratch::default();
     let mut noise = Noise(1);
     let (mut frames, mut keyframe) = (Vec::new(), None::<(Keyframe, SE3, f64)>);
     let (mut due, mut age) = (true, 0);
@@ -187,7 +188,7 @@ pub fn track(
             let begin = Instant::now();
             let mut reference =
                 memory.take().unwrap_or_else(|| Box::new(Reference::new(params.reference.clone())));
-            reference.prepare_into(&made);
+            reference.prepare_into(&made, &mut scratch);
             let prepare_ms = begin.elapsed().as_secs_f64() * 1e3;
             memory = tracker.adopt(reference);
             keyframe = Some((made, true_pose, prepare_ms));

@@ -350,7 +350,7 @@ impl<R: Read> Reader<'_, R> {
             place_covariance,
             is_refined,
             intrinsics,
-            image,
+            image: image.into(),
             points,
             description: None,
         })

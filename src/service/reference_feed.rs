@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use crossbeam::queue::ArrayQueue;
 
-use crate::slam::alignment::reference::{Reference, ReferenceParams};
+use crate::slam::alignment::reference::{Reference, ReferenceParams, ReferenceScratch};
 use crate::slam::geometry::se3::SE3;
 use crate::slam::keyframe::Keyframe;
 use crate::wire::conversion::rigid_from_message;
@@ -58,7 +58,8 @@ impl ReferenceFeed {
     /// Prepares when asked.
     pub fn synchronous(hub: &Hub, params: &ReferenceParams) -> Result<Self, OpenError> {
         let (inbox, params) = (KeyframeInbox::open(hub)?, params.clone());
-        Ok(Self::Synchronous(Box::new(Synchronous { inbox, params, used: None })))
+        let scratch = ReferenceScratch::default();
+        Ok(Self::Synchronous(Box::new(Synchronous { inbox, params, used: None, scratch })))
     }
 
     /// Prepares on a thread of its own, which joins the instance by itself.
@@ -81,7 +82,8 @@ impl ReferenceFeed {
             Self::Threaded(preparer) => Ok(preparer.shared.prepared.pop()),
             Self::Synchronous(synchronous) => match synchronous.inbox.newest() {
                 Ok(keyframe) => Ok(keyframe.map(|keyframe| {
-                    prepare(&keyframe, synchronous.used.take(), &synchronous.params)
+                    let Synchronous { params, used, scratch, .. } = &mut **synchronous;
+                    prepare(&keyframe, used.take(), params, scratch)
                 })),
                 Err(InboxError::Message(error)) => {
                     tracing::warn!("mapper/keyframe: {error}");
@@ -109,9 +111,10 @@ fn prepare(
     keyframe: &Keyframe,
     used: Option<Box<Reference>>,
     params: &ReferenceParams,
+    scratch: &mut ReferenceScratch,
 ) -> Box<Reference> {
     let mut reference = used.unwrap_or_else(|| Box::new(Reference::new(params.clone())));
-    reference.prepare_into(keyframe);
+    reference.prepare_into(keyframe, scratch);
     reference
 }
 
@@ -121,6 +124,7 @@ pub struct Synchronous {
     inbox: KeyframeInbox,
     params: ReferenceParams,
     used: Option<Box<Reference>>,
+    scratch: ReferenceScratch,
 }
 
 /// The second thread; ends when dropped.
@@ -193,6 +197,7 @@ fn prepare_until_stopped(place: &Place, params: &ReferenceParams, shared: &Share
     // Until the first keyframe. Here and not in the frame loop: it maps memory of the mapper's.
     let mut steps: Option<Subscriber<StepMessage, ()>> = Some(steps);
     let mut said = SaidOnce::default();
+    let mut scratch = ReferenceScratch::default();
     while !shared.stop.load(Ordering::Acquire) {
         if let Err(error) = wait(&[inbox.events()], None, WAKE_PERIOD) {
             tracing::error!("no keyframes any more: {error}");
@@ -203,7 +208,7 @@ fn prepare_until_stopped(place: &Place, params: &ReferenceParams, shared: &Share
             Ok(Some(keyframe)) => {
                 said = SaidOnce::default();
                 // What the tracker has not taken yet is older: it goes.
-                let reference = prepare(&keyframe, shared.used.pop(), params);
+                let reference = prepare(&keyframe, shared.used.pop(), params, &mut scratch);
                 if let Some(last) = steps.take().and_then(|steps| last_pose(&steps)) {
                     shared.last_pose.force_push(last);
                 }

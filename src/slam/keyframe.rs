@@ -99,8 +99,8 @@ pub struct Keyframe {
     pub map_revision: u64,
     /// Intrinsics of its image.
     pub intrinsics: Intrinsics,
-    /// Rectified grey image, `width * height` bytes.
-    pub image: Vec<u8>,
+    /// Rectified grey image, `width * height` bytes; shared by all who keep it.
+    pub image: Arc<[u8]>,
     /// How uncertain the errors are that all of its depth shares.
     pub mode_covariance: ModeCovariance,
     /// How uncertain its place in the map is, relative to the keyframes that held those it was estimated with; of the
@@ -136,7 +136,7 @@ impl Keyframe {
             place_covariance: PlaceCovariance::ZERO,
             is_refined: false,
             intrinsics,
-            image,
+            image: image.into(),
             points,
             description: None,
         }

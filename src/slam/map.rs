@@ -343,12 +343,12 @@ impl Keyframe {
 
     /// The same without image, its description and points.
     pub fn without_depth(&self) -> Self {
-        Self { image: Vec::new(), points: Vec::new(), description: None, ..*self }
+        Self { image: Arc::default(), points: Vec::new(), description: None, ..*self }
     }
 
     /// Gives up image, its description and points; the pose stays.
     pub fn forget_depth(&mut self) {
-        (self.image, self.points, self.description) = (Vec::new(), Vec::new(), None);
+        (self.image, self.points, self.description) = (Arc::default(), Vec::new(), None);
     }
 
     /// Share of its points that a camera sees; every so many are enough for a share.
@@ -368,7 +368,7 @@ impl Keyframe {
 
 /// Bytes held by a keyframe's image and points.
 fn depth_bytes(keyframe: &Keyframe) -> usize {
-    keyframe.image.capacity() + keyframe.points.capacity() * size_of::<DepthPoint>()
+    keyframe.image.len() + keyframe.points.capacity() * size_of::<DepthPoint>()
 }
 
 #[cfg(test)]

@@ -36,8 +36,9 @@ mod system;
 mod unit;
 mod view;
 
+use std::sync::Arc;
+
 use crate::slam::geometry::intrinsics::Intrinsics;
-use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::loops::{LoopParams, Loops};
 use crate::slam::map::Map;
@@ -190,14 +191,16 @@ impl Window {
     /// Adds a keyframe; false where its image is not of the camera's size.
     fn add(&mut self, keyframe: &Keyframe) -> bool {
         let (width, height) = (self.camera.width, self.camera.height);
-        let image = Image::try_from_pixels(width, height, keyframe.image.clone());
-        let Some(image) = image else { return false };
+        if keyframe.image.len() != width * height {
+            return false;
+        }
         let id = keyframe.keyframe_id;
         let place = self.keyframes.partition_point(|of| of.keyframe_id < id);
         let added = WindowKeyframe {
             keyframe_id: id,
             epoch: keyframe.epoch,
-            images: vec![image],
+            image: Arc::clone(&keyframe.image),
+            images: Vec::new(),
             camera_from_map: keyframe.map_from_keyframe.rigid.inverse(),
             unit: keyframe.map_from_keyframe.scale,
             points: Vec::new(),
@@ -304,7 +307,7 @@ impl Window {
         let params = &self.params;
         let keyframe = &mut self.keyframes[host];
         keyframe.take_part(&self.camera);
-        let chosen = candidates.choose(keyframe.images[0].pixels(), &self.camera, params);
+        let chosen = candidates.choose(&keyframe.image, &self.camera, params);
         keyframe.points = chosen
             .iter()
             .map(|point| {

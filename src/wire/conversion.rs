@@ -425,7 +425,7 @@ pub fn keyframe_from_messages(
         place_covariance: place_covariance_from_message(&header.place_covariance)?,
         is_refined: false,
         intrinsics,
-        image: image.to_vec(),
+        image: image.into(),
         points: points.to_vec(),
         description: None,
     })

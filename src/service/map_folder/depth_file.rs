@@ -112,7 +112,7 @@ fn most_small_points(num_pixels: usize) -> usize {
 pub fn encode(keyframe: &Keyframe, detail: MapDetail) -> Vec<u8> {
     let (width, height) = (keyframe.intrinsics.width, keyframe.intrinsics.height);
     let mut points = in_order(keyframe);
-    let (mut step, mut coded, mut is_own_brightness) = (0, keyframe.image.clone(), false);
+    let (mut step, mut coded, mut is_own_brightness) = (0, Arc::clone(&keyframe.image), false);
     match detail {
         MapDetail::Full => {
             is_own_brightness = points
@@ -121,7 +121,8 @@ pub fn encode(keyframe: &Keyframe, detail: MapDetail) -> Vec<u8> {
         }
         MapDetail::Small => {
             points = best_of_groups(&points, most_small_points(width * height));
-            (step, coded) = small_image(&keyframe.image, width, height);
+            let (by, small) = small_image(&keyframe.image, width, height);
+            (step, coded) = (by, small.into());
         }
     }
     let depths = Logarithms::of(points.iter().map(|point| point.inverse_depth));
@@ -144,7 +145,7 @@ pub fn encode(keyframe: &Keyframe, detail: MapDetail) -> Vec<u8> {
     }
     bytes.extend((places.len() as u32).to_le_bytes());
     bytes.extend((described.len() as u32).to_le_bytes());
-    for part in [described, places, coded] {
+    for part in [&described, &places, &coded[..]] {
         bytes.extend(part);
     }
     for point in &points {
@@ -234,7 +235,7 @@ pub fn decode_into(bytes: &[u8], keyframe: &mut Keyframe) -> Result<(), DepthFil
     }
     check_points(&points, &keyframe.intrinsics)?;
     let description = description::decode(described, &keyframe.intrinsics);
-    (keyframe.image, keyframe.points) = (image, points);
+    (keyframe.image, keyframe.points) = (image.into(), points);
     keyframe.description = description.map(Arc::new);
     Ok(())
 }

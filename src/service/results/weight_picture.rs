@@ -5,7 +5,7 @@ use nalgebra::Vector6;
 use crate::service::results::colour::{Picture, Rgb, heat, rainbow};
 use crate::service::results::lettering::{text_size, write_text};
 use crate::service::results::pictures::{background, middle_range};
-use crate::slam::alignment::reference::{Reference, ReferenceParams, num_levels};
+use crate::slam::alignment::reference::{Reference, ReferenceParams, ReferenceScratch, num_levels};
 use crate::slam::alignment::weights::{PointWeight, point_weights};
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::sums::{MAX_LEVELS, SumPyramid};
@@ -38,7 +38,7 @@ pub fn weight_picture(keyframe: &Keyframe, params: &TrackerParams) -> Option<Pic
         ..params.reference.clone()
     };
     let mut reference = Reference::new(all);
-    reference.prepare_into(keyframe);
+    reference.prepare_into(keyframe, &mut ReferenceScratch::default());
     if reference.level(level).is_empty() {
         return None;
     }

@@ -87,9 +87,22 @@ pub struct Reference {
     finest_level: usize,
     levels: Vec<LevelPoints>,
     pyramid: SumPyramid,
+}
+
+/// Memory that a preparation works in and that no frame needs: one for all references of a thread.
+#[derive(Debug, Clone, Default)]
+pub struct ReferenceScratch {
     fusion: DepthFusion,
     selection: Selection,
     surroundings: Surroundings,
+}
+
+impl ReferenceScratch {
+    /// The candidates of one level of the reference that was prepared last, before selection; on levels that are not
+    /// aligned, also those behind a jump in depth.
+    pub fn candidates(&self, level: usize) -> &Candidates {
+        self.fusion.level(level)
+    }
 }
 
 impl Reference {
@@ -114,22 +127,19 @@ impl Reference {
             translation_information: 0.0,
             levels: vec![LevelPoints::default(); MAX_LEVELS],
             pyramid: SumPyramid::default(),
-            fusion: DepthFusion::default(),
-            selection: Selection::default(),
-            surroundings: Surroundings::default(),
         }
     }
 
     /// Prepares `keyframe` with the default parameters.
     pub fn prepare(keyframe: &Keyframe) -> Self {
         let mut reference = Self::new(ReferenceParams::default());
-        reference.prepare_into(keyframe);
+        reference.prepare_into(keyframe, &mut ReferenceScratch::default());
         reference
     }
 
     /// Prepares `keyframe` in the memory of this reference. A keyframe that cannot be used (image
     /// of another size than its intrinsics, no valid point) leaves a reference without points.
-    pub fn prepare_into(&mut self, keyframe: &Keyframe) {
+    pub fn prepare_into(&mut self, keyframe: &Keyframe, scratch: &mut ReferenceScratch) {
         self.keyframe_id = keyframe.keyframe_id;
         self.epoch = keyframe.epoch;
         self.revision = keyframe.revision;
@@ -161,7 +171,7 @@ impl Reference {
             self.pyramid = SumPyramid::with_size(width, height, levels, finest);
         }
         self.pyramid.fill(&keyframe.image);
-        self.pack(&keyframe.points);
+        self.pack(&keyframe.points, scratch);
     }
 
     /// Prepares a view with these points, which stands where frames are measured from, in the memory of this reference. Its
@@ -172,6 +182,7 @@ impl Reference {
         pyramid: &mut SumPyramid,
         points: &[DepthPoint],
         mode_covariance: ModeCovariance,
+        scratch: &mut ReferenceScratch,
     ) {
         self.keyframe_id = NO_KEYFRAME;
         self.map_state = MapState::Established;
@@ -189,7 +200,7 @@ impl Reference {
             self.pyramid = SumPyramid::with_size(width, height, levels, finest);
         }
         std::mem::swap(&mut self.pyramid, pyramid);
-        self.pack(points);
+        self.pack(points, scratch);
     }
 
     /// Places the view in world and map, with how far from it frames are expected, a standard deviation in its units.
@@ -206,26 +217,27 @@ impl Reference {
     }
 
     /// Fuses points of the image in the pyramid and packs those of every level.
-    fn pack(&mut self, points: &[DepthPoint]) {
+    fn pack(&mut self, points: &[DepthPoint], scratch: &mut ReferenceScratch) {
         let greys: f64 = points.iter().map(|point| f64::from(point.intensity)).sum();
         self.mean_grey = greys / points.len().max(1) as f64;
         let Intrinsics { width, height, .. } = self.intrinsics;
         let (levels, finest) = (self.pyramid.num_levels(), self.finest_level);
-        self.fusion.fuse(points, width, height, levels, finest);
-        self.mean_inverse_depth = self.fusion.mean_inverse_depth().unwrap_or(1.0);
+        scratch.fusion.fuse(points, width, height, levels, finest);
+        self.mean_inverse_depth = scratch.fusion.mean_inverse_depth().unwrap_or(1.0);
         for level in finest..levels {
-            self.pack_level(level);
+            self.pack_level(level, scratch);
         }
     }
 
     /// Chooses the points of one level and packs them for the loop over points.
-    fn pack_level(&mut self, level: usize) {
+    fn pack_level(&mut self, level: usize, scratch: &mut ReferenceScratch) {
+        let ReferenceScratch { fusion, selection, surroundings } = scratch;
         let intrinsics = self.intrinsics.at_level(level);
         let image = self.pyramid.level(level);
-        let candidates = self.fusion.level(level);
+        let candidates = fusion.level(level);
         let budget = self.params.point_budget[level];
         self.levels[level].reserve(budget.min(candidates.len()));
-        let chosen = self.selection.choose(
+        let chosen = selection.choose(
             &self.params.selection,
             candidates,
             image,
@@ -236,7 +248,7 @@ impl Reference {
         // Coarser levels only start the finer ones, and their depth has less noise to be pulled by.
         let is_finest = level == self.finest_level;
         if is_finest {
-            self.surroundings.measure(candidates, image.width(), image.height());
+            surroundings.measure(candidates, image.width(), image.height());
         }
         let (inverse_fx, inverse_fy) = (1.0 / intrinsics.fx, 1.0 / intrinsics.fy);
         for &index in chosen {
@@ -253,7 +265,7 @@ impl Reference {
                 inverse_depth: candidate.inverse_depth,
                 variance: candidate.variance,
                 surrounding_inverse_depth: if is_finest {
-                    self.surroundings.without(&candidate)
+                    surroundings.without(&candidate)
                 } else {
                     candidate.inverse_depth
                 },
@@ -339,11 +351,5 @@ impl Reference {
     /// The points of one level; empty where the level is not aligned.
     pub fn level(&self, level: usize) -> &LevelPoints {
         &self.levels[level]
-    }
-
-    /// The candidates of one level before selection; on levels that are not aligned, also those
-    /// behind a jump in depth.
-    pub fn candidates(&self, level: usize) -> &Candidates {
-        self.fusion.level(level)
     }
 }

@@ -6,7 +6,7 @@ use crate::slam::alignment::align::{Aligner, AlignmentParams, Ending};
 use crate::slam::alignment::kernel::{Kernel, SimdMode};
 use crate::slam::alignment::normal_equations::UNKNOWNS;
 use crate::slam::alignment::points::{LevelPoints, Point};
-use crate::slam::alignment::reference::{Reference, ReferenceParams};
+use crate::slam::alignment::reference::{Reference, ReferenceParams, ReferenceScratch};
 use crate::slam::alignment::residual::{Evaluation, PointTerms, accumulate_reference, point_terms};
 use crate::slam::alignment::scatter::GradientScatter;
 use crate::slam::alignment::scene::{Noise, Plane, small_camera, small_plane};
@@ -56,7 +56,7 @@ fn jacobians_are_the_central_differences_of_the_residual() {
     let plane = Plane::new([0.0, 0.0, 0.95], [60.0, 180.0], &camera);
     let mut keyframe = plane.keyframe(&camera, 1, 0.0);
     // No noise: strong gradients are preferred, also where noise made them.
-    keyframe.image = plane.render(&camera, &SE3::identity(), 0.0, (1.0, 0.0), 1);
+    keyframe.image = plane.render(&camera, &SE3::identity(), 0.0, (1.0, 0.0), 1).into();
     let reference = Reference::prepare(&keyframe);
     let current_from_keyframe = move_of(4, 0.06);
     let image = plane.render(&camera, &current_from_keyframe.inverse(), 0.0, (0.9, 6.0), 5);
@@ -391,11 +391,11 @@ fn each_level_that_there_is_time_for_makes_the_pose_better() {
 fn a_budget_of_points_is_kept_and_spread() {
     let (plane, camera) = (small_plane(), small_camera());
     let params = ReferenceParams { point_budget: [1000; 5], ..ReferenceParams::default() };
-    let mut reference = Reference::new(params);
-    reference.prepare_into(&plane.keyframe(&camera, 1, 0.1));
+    let (mut reference, mut scratch) = (Reference::new(params), ReferenceScratch::default());
+    reference.prepare_into(&plane.keyframe(&camera, 1, 0.1), &mut scratch);
     for level in 1..LEVELS {
         let points = reference.level(level);
-        let available = reference.candidates(level).len();
+        let available = scratch.candidates(level).len();
         assert!(points.len() <= 1000 && points.len() > 900.min(available * 7 / 10), "{level}");
         let centre = points.iter().map(|point| f64::from(point.ray_x)).sum::<f64>();
         assert!((centre / points.len() as f64).abs() < 0.05);

@@ -5,7 +5,7 @@
 //! translation: such a pixel counts in full while the camera turns, and the less the further it moves. It holds the
 //! camera's rotation, and its translation as far as it is small.
 
-use crate::slam::alignment::reference::Reference;
+use crate::slam::alignment::reference::{Reference, ReferenceScratch};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::image::sums::{SumPyramid, grey_per_sum};
 use crate::slam::keyframe::{DepthPoint, MAX_KEYFRAME_POINTS};
@@ -27,6 +27,7 @@ const MIN_GRADIENT: f32 = 1.0;
 #[derive(Debug, Clone, Default)]
 pub struct UnknownDepth {
     points: Vec<DepthPoint>,
+    scratch: ReferenceScratch,
 }
 
 impl UnknownDepth {
@@ -40,7 +41,7 @@ impl UnknownDepth {
     ) {
         self.choose(pyramid);
         let modes = ModeCovariance::of_std_devs([TILT, TILT, 0.0]);
-        reference.prepare_view(intrinsics, pyramid, &self.points, modes);
+        reference.prepare_view(intrinsics, pyramid, &self.points, modes, &mut self.scratch);
     }
 
     /// The pixels of the finest level with gradient, as points of level 0.

@@ -168,7 +168,7 @@ mod tests {
         assert_eq!(MapConsistency::measure(&[]), MapConsistency::default());
         let mut map: Vec<_> = (0..5).map(|i| keyframe(i, STEP * i as f64, 1.0, |_| 1.0)).collect();
         // Given up for memory; of another epoch; unproven; looking elsewhere; broken numbers.
-        (map[0].image, map[0].points) = (Vec::new(), Vec::new());
+        map[0].forget_depth();
         map[1].epoch = 1;
         map[2].map_state = MapState::Rejected;
         map[3].map_from_keyframe =

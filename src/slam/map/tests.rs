@@ -23,7 +23,7 @@ fn keyframe(keyframe_id: u64) -> Keyframe {
 fn a_keyframe_holds_what_is_stated() {
     const NUM_PIXELS: usize = 640 * 480;
     let mut full = keyframe(0);
-    full.image = vec![0; NUM_PIXELS];
+    full.image = vec![0; NUM_PIXELS].into();
     full.points = vec![DepthPoint::default(); MAX_KEYFRAME_POINTS];
     assert_eq!(depth_bytes(&full), most_keyframe_bytes(NUM_PIXELS));
     assert_eq!(most_keyframe_bytes(NUM_PIXELS), 1_907_200);

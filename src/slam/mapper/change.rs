@@ -1,6 +1,8 @@
 //! The step to a new keyframe: carry the depth over, smooth it, rescale, publish; then, what can wait
 //! until it is published: the last depth of the keyframe before, and a look back for new pixels.
 
+use std::sync::Arc;
+
 use crate::slam::depth::common_error::full_covariance;
 use crate::slam::depth::epipolar::TwoView;
 use crate::slam::depth::gaussian::{ObservedPixels, Observer, observe};
@@ -213,7 +215,7 @@ impl Mapper {
         epoch: u32,
     ) {
         let UncertainPlace { map_from_keyframe, covariance: place_covariance } = *place;
-        let keyframe_id = self.next_keyframe_id;
+        let (keyframe_id, image) = (self.next_keyframe_id, self.copies.of(frame));
         self.map.keyframes.push(Keyframe {
             keyframe_id,
             epoch,
@@ -228,15 +230,14 @@ impl Mapper {
             place_covariance,
             is_refined: false,
             intrinsics: self.intrinsics,
-            image: frame.pixels.to_vec(),
+            image: Arc::clone(&image),
             points: Vec::new(),
             description: None,
         });
         self.finder.learn(&mut self.map.keyframes);
         self.map.forget_depth_beyond(self.params.max_map_bytes());
         self.next_keyframe_id += 1;
-        let copy = self.copies.of(frame);
-        self.past.push(copy, keyframe_id, SE3::identity(), Brightness::default());
+        self.past.push(image, keyframe_id, SE3::identity(), Brightness::default());
         self.enter_keyframe(self.map.keyframes.len() - 1);
     }
 }

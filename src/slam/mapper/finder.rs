@@ -5,7 +5,9 @@ use std::sync::Arc;
 use crate::slam::alignment::align::{Aligner, Alignment, AlignmentParams};
 use crate::slam::alignment::kernel::SimdMode;
 use crate::slam::alignment::normal_equations::NormalEquations;
-use crate::slam::alignment::reference::{Reference, ReferenceParams, finest_level, num_levels};
+use crate::slam::alignment::reference::{
+    Reference, ReferenceParams, ReferenceScratch, finest_level, num_levels,
+};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::sums::SumPyramid;
@@ -39,6 +41,7 @@ pub(super) struct Finder {
     aligner: Aligner,
     pub(super) verdict: VerdictParams,
     reference: Reference,
+    scratch: ReferenceScratch,
     pyramid: SumPyramid,
     /// What keyframes look like, by their id, in order.
     appearances: Vec<(u64, Option<Appearance>)>,
@@ -77,6 +80,7 @@ impl Finder {
             verdict: VerdictParams::default(),
             pyramid: SumPyramid::with_size(width, height, levels, finest_level(levels, &reference)),
             reference: Reference::new(reference),
+            scratch: ReferenceScratch::default(),
             appearances: Vec::new(),
             places: PlaceIndex::new(),
             describer: Describer::new(),
@@ -304,7 +308,7 @@ impl Finder {
         max_disagreement: f64,
     ) -> Option<Located> {
         self.pyramid.fill(pixels);
-        self.reference.prepare_into(keyframe);
+        self.reference.prepare_into(keyframe, &mut self.scratch);
         let (start, brightness) = (expected.inverse(), Brightness::default());
         let (reference, pyramid) = (&self.reference, &self.pyramid);
         let found = self.aligner.align(reference, pyramid, &start, brightness, &mut |_| true);
@@ -331,7 +335,7 @@ impl Finder {
     /// `keyframe_from_camera` of the frame in the pyramid, where it can be aligned to `keyframe` from some view
     /// near the expected one.
     fn find_near(&mut self, keyframe: &Keyframe, expected: &SE3, rotation_rad: f64) -> Option<SE3> {
-        self.reference.prepare_into(keyframe);
+        self.reference.prepare_into(keyframe, &mut self.scratch);
         let (aligner, reference, pyramid) = (&self.aligner, &self.reference, &self.pyramid);
         let mut best: Option<(Alignment, NormalEquations)> = None;
         for keyframe_from_camera in turned(expected, rotation_rad) {

@@ -11,8 +11,8 @@ const MOST_SPARE: usize = 30;
 #[derive(Debug, Default)]
 pub(super) struct FrameCopies {
     copies: Vec<Arc<[u8]>>,
-    /// The one of the frame at hand.
-    current: Option<Arc<[u8]>>,
+    /// The one of the frame at hand, by its sequence: a map begins with two frames in one step.
+    current: Option<(u64, Arc<[u8]>)>,
 }
 
 impl FrameCopies {
@@ -23,12 +23,18 @@ impl FrameCopies {
 
     /// The grey values of the frame at hand, copied when they are first asked for.
     pub(super) fn of(&mut self, frame: &FrameView<'_>) -> Arc<[u8]> {
-        if let Some(copy) = &self.current {
+        if let Some((_, copy)) = self.current.as_ref().filter(|(of, _)| *of == frame.sequence) {
             return Arc::clone(copy);
         }
         let copy = self.copy(frame.pixels);
-        self.current = Some(Arc::clone(&copy));
+        self.current = Some((frame.sequence, Arc::clone(&copy)));
         copy
+    }
+
+    /// Gives back the memory of copies that nobody keeps, where no more frames come.
+    pub(super) fn forget_spare(&mut self) {
+        self.current = None;
+        self.copies.retain_mut(|copy| Arc::get_mut(copy).is_none());
     }
 
     fn copy(&mut self, pixels: &[u8]) -> Arc<[u8]> {
@@ -76,6 +82,15 @@ mod tests {
     }
 
     #[test]
+    fn two_frames_of_one_step_have_a_copy_each() {
+        let pixels = [1u8, 2].map(|grey| vec![grey; CAMERA.width * CAMERA.height]);
+        let frame = |k: usize| FrameView::new(&CAMERA, k as u64, 0, &pixels[k]);
+        let mut copies = FrameCopies::default();
+        copies.begin_frame();
+        assert_eq!([0, 1, 1, 0].map(|k| copies.of(&frame(k))[0]), [1, 2, 2, 1]);
+    }
+
+    #[test]
     fn memory_of_few_images_is_kept() {
         let mut copies = FrameCopies::default();
         let kept: Vec<_> = (0..100).map(|grey| copy_of(&mut copies, grey)).collect();
@@ -83,5 +98,7 @@ mod tests {
         drop(kept);
         let _ = copy_of(&mut copies, 0);
         assert_eq!(copies.copies.len(), MOST_SPARE);
+        copies.forget_spare();
+        assert_eq!(copies.copies.len(), 0);
     }
 }

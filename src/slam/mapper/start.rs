@@ -26,7 +26,10 @@ use crate::slam::two_frame::{InitOutcome, InitState, TwoFrameInitializer, TwoFra
 /// A two-frame start, and what is said of it.
 #[derive(Debug)]
 pub(super) struct Start {
-    initializer: TwoFrameInitializer,
+    intrinsics: Intrinsics,
+    params: TwoFrameParams,
+    /// Its memory is given back when a map has begun.
+    initializer: Option<Box<TwoFrameInitializer>>,
     /// Sequence and stamp of its first frame.
     first: Option<(u64, i64)>,
     /// How far it is.
@@ -41,22 +44,34 @@ impl Start {
         intrinsics: Intrinsics,
         params: &TwoFrameParams,
     ) -> Result<Self, ParameterError> {
-        let initializer = TwoFrameInitializer::new(intrinsics, params.clone())
+        // For its checks: it is made when frames come.
+        TwoFrameInitializer::new(intrinsics, params.clone())
             .map_err(|error| error.within("two_frame"))?;
-        Ok(Self { initializer, first: None, progress: StartProgress::default(), last_frame: None })
+        Ok(Self {
+            intrinsics,
+            params: params.clone(),
+            initializer: None,
+            first: None,
+            progress: StartProgress::default(),
+            last_frame: None,
+        })
     }
 
     /// Forgets what it has seen.
     pub(super) fn forget(&mut self) {
         self.first = None;
         self.progress = StartProgress::default();
-        self.initializer.begin(&[]);
+        self.initializer = None;
     }
 
-    /// Takes another frame; once parallax is proven gives the stamp of the first frame and what was found.
-    fn step(&mut self, frame: &FrameView<'_>) -> Option<((u64, i64), InitOutcome)> {
-        let is_first = self.initializer.first_pixels().is_empty();
-        let outcome = self.initializer.step(frame.pixels);
+    /// Takes another frame; once parallax is proven gives what was found.
+    fn step(&mut self, frame: &FrameView<'_>) -> Option<Proven> {
+        let mut initializer = match self.initializer.take() {
+            Some(initializer) => initializer,
+            None => TwoFrameInitializer::new(self.intrinsics, self.params.clone()).ok()?.into(),
+        };
+        let is_first = initializer.first_pixels().is_empty();
+        let outcome = initializer.step(frame.pixels);
         self.last_frame = Some(StartFrame::of(&outcome, is_first, frame.pixels));
         self.progress.observe(outcome.state);
         let stamp = (frame.sequence, frame.capture_nanos);
@@ -64,15 +79,26 @@ impl Start {
         match outcome.state {
             InitState::Waiting(Waiting::Texture) => self.first = None,
             InitState::Waiting(_) => {}
-            InitState::Failed(_) if self.initializer.first_pixels().is_empty() => self.first = None,
+            InitState::Failed(_) if initializer.first_pixels().is_empty() => self.first = None,
             InitState::Failed(_) => self.first = Some(stamp),
             InitState::Proven => {
                 self.first = None;
-                return Some((first, outcome));
+                return Some(Proven { first, outcome, initializer });
             }
         }
+        self.initializer = Some(initializer);
         None
     }
+}
+
+/// A start whose parallax is proven.
+struct Proven {
+    /// Sequence and stamp of its first frame.
+    first: (u64, i64),
+    /// What the frame that proved it came to.
+    outcome: InitOutcome,
+    /// Where the depth is.
+    initializer: Box<TwoFrameInitializer>,
 }
 
 impl Mapper {
@@ -90,7 +116,7 @@ impl Mapper {
         let is_given = pose.state.is_tracked() && matches!(self.phase, Phase::Starting);
         if sensor_depth.is_none() && !is_given {
             return match self.start.step(frame) {
-                Some((first, proven)) => self.begin_proven(frame, pose, first, &proven),
+                Some(proven) => self.begin_proven(frame, pose, &proven),
                 None => {
                     self.keep_early_frame(frame);
                     StepOutcome::default()
@@ -184,24 +210,20 @@ impl Mapper {
         &mut self,
         frame: &FrameView<'_>,
         pose: &PoseEstimate,
-        first: (u64, i64),
-        start: &InitOutcome,
+        proven: &Proven,
     ) -> StepOutcome {
+        let Proven { first, outcome: start, initializer } = proven;
         let (origin, unit) = self.origin(pose);
-        let first_pixels = self.start.initializer.first_pixels().to_vec();
-        self.begin_epoch(&first_pixels);
+        let first_pixels = initializer.first_pixels();
+        self.begin_epoch(first_pixels);
         let epoch = self.next_epoch();
-        self.start.initializer.fill(&mut self.depth.active);
+        initializer.fill(&mut self.depth.active);
         let observations = self.observe_proven(frame, start);
         self.depth.refine(&self.params);
         let scale = self.depth.normalise();
         self.modes.rescale(scale);
-        let first_frame = FrameView {
-            sequence: first.0,
-            capture_nanos: first.1,
-            pixels: &first_pixels,
-            ..*frame
-        };
+        let first_frame =
+            FrameView { sequence: first.0, capture_nanos: first.1, pixels: first_pixels, ..*frame };
         let place = UncertainPlace::exact(Sim3::new(origin, unit * scale));
         self.add_keyframe(&first_frame, &place, epoch);
         let pose = PoseEstimate {

@@ -97,7 +97,7 @@ impl Harm {
         }
         keyframe.world_from_keyframe.scale = self.scale;
         keyframe.map_from_keyframe.scale = self.map_scale;
-        keyframe.image = self.image.pixels(&keyframe.image);
+        keyframe.image = self.image.pixels(&keyframe.image).into();
         keyframe
     }
 }
@@ -224,7 +224,7 @@ fn the_smallest_images_neither_panic_nor_lie() {
         let mut tracker = Tracker::new(camera, TrackerParams::default()).unwrap();
         tracker.adopt(Box::new(Reference::prepare(&keyframe)));
         for (sequence, image) in
-            [&keyframe.image, &vec![0; width * height], &keyframe.image].into_iter().enumerate()
+            [&keyframe.image[..], &vec![0; width * height], &keyframe.image].into_iter().enumerate()
         {
             let view = FrameView::new(&camera, sequence as u64, sequence as i64, image);
             let estimate = tracker.track(&view, &mut |_| true);

@@ -42,7 +42,6 @@ impl Window {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::slam::image::buffer::Image;
     use crate::slam::keyframe::DepthPoint;
     use crate::slam::test_scene::{CAMERA, Random};
     use crate::slam::window::params::WindowParams;
@@ -74,9 +73,9 @@ mod tests {
         assert!(!window.projected_into(last, &depth).is_empty());
         // Something else stands before all of it.
         let mut random = Random::new(5);
-        let mut wall = Image::filled(CAMERA.width, CAMERA.height, 0u8);
-        wall.pixels_mut().fill_with(|| (128.0 + 40.0 * random.normal()).clamp(0.0, 255.0) as u8);
-        window.keyframes[last].images = vec![wall];
+        let mut wall = vec![0u8; CAMERA.width * CAMERA.height];
+        wall.fill_with(|| (128.0 + 40.0 * random.normal()).clamp(0.0, 255.0) as u8);
+        (window.keyframes[last].image, window.keyframes[last].images) = (wall.into(), Vec::new());
         assert!(window.align_last(&members, &[0], 0));
         window.note_agreement(&members);
         assert_eq!(window.keyframes[last].agreed, []);

@@ -17,7 +17,7 @@ use crate::slam::window::Window;
 use crate::slam::window::comparison::{
     Compared, LANES, Pair, PairSums, Patterns, Robustness, SAMPLES, Wanted,
 };
-use crate::slam::window::keyframe::{WindowKeyframe, WindowPoint, halve, num_levels};
+use crate::slam::window::keyframe::{WindowKeyframe, WindowPoint, num_levels};
 use crate::slam::window::neighbours::{Single, smoothed};
 use crate::slam::window::params::WindowParams;
 use crate::slam::window::plane::fit;
@@ -188,12 +188,7 @@ impl Window {
 
     /// Its images on the levels that are used.
     fn images_of(&self, keyframe: &WindowKeyframe) -> Vec<Image<u8>> {
-        let Some(finest) = keyframe.images.first() else { return Vec::new() };
-        let mut images = vec![finest.clone()];
-        while images.len() < STEPS.len().min(num_levels(&self.camera)) {
-            images.push(halve(&images[images.len() - 1]));
-        }
-        images
+        keyframe.levels(&self.camera, STEPS.len().min(num_levels(&self.camera)))
     }
 
     fn observers<'a>(

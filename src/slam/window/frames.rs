@@ -6,7 +6,6 @@
 use std::sync::Arc;
 
 use crate::slam::geometry::se3::SE3;
-use crate::slam::image::buffer::Image;
 use crate::slam::map::PlacedFrame;
 use crate::slam::window::Window;
 use crate::slam::window::keyframe::WindowKeyframe;
@@ -51,8 +50,6 @@ pub struct TrackedFrame {
 pub(super) struct WindowFrames {
     waiting: Vec<TrackedFrame>,
     placed: Vec<PlacedFrame>,
-    /// Memory for the image of the one that is aligned.
-    pixels: Vec<u8>,
 }
 
 impl Window {
@@ -150,16 +147,15 @@ impl Window {
         if members.is_empty() {
             return None;
         }
-        let (width, height) = (self.camera.width, self.camera.height);
-        let mut pixels = std::mem::take(&mut self.frames.pixels);
-        pixels.clear();
-        pixels.extend_from_slice(&frame.pixels);
-        let image = Image::try_from_pixels(width, height, pixels)?;
+        if frame.pixels.len() != self.camera.width * self.camera.height {
+            return None;
+        }
         members.push(self.keyframes.len());
         self.keyframes.push(WindowKeyframe {
             keyframe_id: u64::MAX,
             epoch,
-            images: vec![image],
+            image: Arc::clone(&frame.pixels),
+            images: Vec::new(),
             camera_from_map: host_from_camera.inverse() * host_from_map,
             unit: 1.0,
             points: Vec::new(),
@@ -168,8 +164,7 @@ impl Window {
             surface: Surface::default(),
         });
         let is_aligned = self.align_last(&members, levels, MAX_ITERATIONS);
-        let mut placed = self.keyframes.pop()?;
-        self.frames.pixels = placed.images.swap_remove(0).into_pixels();
+        let placed = self.keyframes.pop()?;
         let system = &self.solver.system;
         let agrees = system.inliers >= FEWEST_INLIERS
             && system.inliers as f64 >= LEAST_INLIER_RATIO * system.compared as f64;
@@ -204,6 +199,7 @@ mod tests {
             .map(|keyframe_id| WindowKeyframe {
                 keyframe_id,
                 epoch: 0,
+                image: Vec::new().into(),
                 images: Vec::new(),
                 camera_from_map: SE3::identity(),
                 unit: 1.0,

@@ -1,5 +1,7 @@
 //! Keyframes and points of the window.
 
+use std::sync::Arc;
+
 use crate::slam::depth::pattern::PATTERN;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
@@ -20,7 +22,9 @@ pub struct WindowKeyframe {
     pub keyframe_id: u64,
     /// Its epoch.
     pub epoch: u32,
-    /// Grey values by level; level 0 alone while it takes no part.
+    /// Grey values, shared with the map.
+    pub image: Arc<[u8]>,
+    /// The same by level; none while it takes no part.
     pub images: Vec<Image<u8>>,
     /// Where it is, in the unit of the map.
     pub camera_from_map: SE3,
@@ -65,17 +69,22 @@ pub struct WindowPoint {
 }
 
 impl WindowKeyframe {
-    /// Makes its coarser images, unless it has them.
+    /// Makes its images by level, unless it has them.
     pub fn take_part(&mut self, camera: &Intrinsics) {
-        while self.images.len() < num_levels(camera) {
-            let Some(finer) = self.images.last() else { return };
-            self.images.push(halve(finer));
+        if self.images.is_empty() {
+            self.images = self.levels(camera, num_levels(camera));
         }
     }
 
-    /// Gives its coarser images up.
+    /// Gives its images by level up.
     pub fn leave(&mut self) {
-        self.images.truncate(1);
+        self.images = Vec::new();
+    }
+
+    /// So many levels of its image, finest first; none where that is of another size than the camera's.
+    pub fn levels(&self, camera: &Intrinsics, num_levels: usize) -> Vec<Image<u8>> {
+        let finest = Image::try_from_pixels(camera.width, camera.height, self.image.to_vec());
+        std::iter::successors(finest, |finer| Some(halve(finer))).take(num_levels).collect()
     }
 }
 

@@ -230,6 +230,7 @@ mod tests {
             WindowKeyframe {
                 keyframe_id: k as u64,
                 epoch: 0,
+                image: Vec::new().into(),
                 images: Vec::new(),
                 camera_from_map: map_from_camera.inverse(),
                 unit: RADIUS,

@@ -1,7 +1,6 @@
 //! Whether an image shows the window's points where a camera is thought to be.
 
 use crate::slam::geometry::se3::SE3;
-use crate::slam::image::buffer::Image;
 use crate::slam::window::keyframe::WindowKeyframe;
 use crate::slam::window::members::FEWEST_COMMON;
 use crate::slam::window::surface::Surface;
@@ -34,13 +33,15 @@ impl Window {
             rotation: pose.rotation,
         };
         let map_from_camera = map_from_known * scaled(unit, keyframe_from_camera);
-        let (width, height) = (self.camera.width, self.camera.height);
-        let image = Image::try_from_pixels(width, height, pixels.to_vec())?;
+        if pixels.len() != self.camera.width * self.camera.height {
+            return None;
+        }
         // The last of them for as long as it is asked about.
         self.keyframes.push(WindowKeyframe {
             keyframe_id: u64::MAX,
             epoch,
-            images: vec![image],
+            image: pixels.into(),
+            images: Vec::new(),
             camera_from_map: map_from_camera.inverse(),
             unit,
             points: Vec::new(),
@@ -51,7 +52,7 @@ impl Window {
         let last = self.keyframes.len() - 1;
         let mut members = self.hosts_to_align_to(last);
         let at_rest: Vec<usize> =
-            members.iter().copied().filter(|&of| self.keyframes[of].images.len() == 1).collect();
+            members.iter().copied().filter(|&of| self.keyframes[of].images.is_empty()).collect();
         members.push(last);
         let is_aligned = members.len() > 1
             && self.align_last(&members, &ALIGNMENT_LEVELS, MAX_ALIGNMENT_ITERATIONS);

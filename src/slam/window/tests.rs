@@ -64,7 +64,8 @@ pub(super) fn exact_host(
     let mut keyframe = WindowKeyframe {
         keyframe_id,
         epoch: 0,
-        images: vec![Image::try_from_pixels(CAMERA.width, CAMERA.height, pixels).unwrap()],
+        image: pixels.into(),
+        images: Vec::new(),
         camera_from_map: map_from_camera.inverse(),
         unit: 1.0,
         points: Vec::new(),
@@ -82,10 +83,16 @@ pub(super) fn exact_host(
             intensity: 0.0,
         })
         .collect();
-    let (images, params) = (&keyframe.images, WindowParams::default());
-    let chosen = selection::choose(&dense, images[0].pixels(), &CAMERA, num_cells, 8.0, 0.3);
+    let params = WindowParams::default();
+    let chosen = selection::choose(&dense, &keyframe.image, &CAMERA, num_cells, 8.0, 0.3);
     let points = chosen.iter().map(|of| {
-        WindowPoint::new((of.u, of.v), f64::from(of.inverse_depth), images, &CAMERA, &params)
+        WindowPoint::new(
+            (of.u, of.v),
+            f64::from(of.inverse_depth),
+            &keyframe.images,
+            &CAMERA,
+            &params,
+        )
     });
     keyframe.points = points.collect();
     keyframe
@@ -240,7 +247,7 @@ fn what_one_keyframe_alone_shows_is_left_out() {
     for row in 60..180 {
         for column in 120..220 {
             let grey = (255.0 * random.uniform()) as u8;
-            hidden.images[0].pixels_mut()[row * CAMERA.width + column] = grey;
+            Arc::make_mut(&mut hidden.image)[row * CAMERA.width + column] = grey;
         }
     }
     hidden.leave();

@@ -1,5 +1,7 @@
 //! Keyframes of rendered rooms aligned to each other: derivatives, true loops, false ones.
 
+use std::sync::Arc;
+
 use nalgebra::Vector6;
 
 use super::residual::{Level, Row, State, UNKNOWNS};
@@ -274,7 +276,7 @@ fn a_picture_with_other_depth_and_a_mirrored_one_are_refused() {
     flat.points.iter_mut().for_each(|point| point.inverse_depth = 1.0);
     assert!(outcome(&i, &flat).is_err());
     let mut mirrored = i.clone();
-    mirrored.image.chunks_exact_mut(CAMERA.width).for_each(<[u8]>::reverse);
+    Arc::make_mut(&mut mirrored.image).chunks_exact_mut(CAMERA.width).for_each(<[u8]>::reverse);
     mirrored.points.iter_mut().for_each(|point| point.u = CAMERA.width as u16 - 1 - point.u);
     assert!(outcome(&i, &mirrored).is_err());
 }
@@ -288,7 +290,7 @@ fn what_cannot_be_used_is_refused() {
         |j: &Keyframe, start: Option<&Sim3>| solver.measure(&view, &solver.view(j), start).err();
     let nothing = Keyframe { points: Vec::new(), ..i.clone() };
     assert_eq!(of(&nothing, None), Some(Refusal::TooFewPoints));
-    let cut = Keyframe { image: vec![0; 7], ..i.clone() };
+    let cut = Keyframe { image: [0; 7].into(), ..i.clone() };
     assert_eq!(of(&cut, None), Some(Refusal::TooFewPoints));
     let mut hostile = i.clone();
     for point in &mut hostile.points {

@@ -2,7 +2,7 @@
 
 use crate::slam::alignment::fusion::Candidates;
 use crate::slam::alignment::reference::num_levels;
-use crate::slam::alignment::reference::{Reference, ReferenceParams};
+use crate::slam::alignment::reference::{Reference, ReferenceParams, ReferenceScratch};
 use crate::slam::image::sums::SumPyramid;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::mapper::appearance::Appearance;
@@ -125,7 +125,8 @@ impl KeyframeView {
     /// points, and every measurement with it is refused.
     pub fn new(keyframe: &Keyframe, params: &ReferenceParams) -> Self {
         let mut reference = Reference::new(params.clone());
-        reference.prepare_into(keyframe);
+        let mut scratch = ReferenceScratch::default();
+        reference.prepare_into(keyframe, &mut scratch);
         let (width, height) = (keyframe.intrinsics.width, keyframe.intrinsics.height);
         let is_usable = !reference.level(reference.finest_level()).is_empty();
         let levels = if is_usable { num_levels(width, height) } else { 0 };
@@ -137,7 +138,7 @@ impl KeyframeView {
         }
         let depth_of = |level: usize| match level < finest {
             true => DepthGrid::default(),
-            false => DepthGrid::new(reference.candidates(level), width >> level, height >> level),
+            false => DepthGrid::new(scratch.candidates(level), width >> level, height >> level),
         };
         let depths = (0..levels).map(depth_of).collect();
         let appearance =
