@@ -19,7 +19,7 @@ use semidense::slam::alignment::kernel::Kernel;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::geometry::sim3::Sim3;
-use semidense::slam::image::buffer::Image;
+use semidense::slam::image::shared::SharedImage;
 use semidense::slam::keyframe::{DepthPoint, Keyframe};
 use semidense::slam::map::Map;
 use semidense::slam::modes::ModeCovariance;
@@ -60,7 +60,7 @@ fn main() {
 
 /// Nanoseconds of a comparison, by kernel.
 fn comparisons(camera: &Intrinsics, pixels: &[u8]) {
-    let image = Image::try_from_pixels(camera.width, camera.height, pixels.to_vec())
+    let image = SharedImage::try_from_pixels(camera.width, camera.height, pixels.into())
         .expect("a frame has the camera's pixels");
     let observer_from_host = SE3 { translation: [0.05, 0.01, 0.0].into(), ..SE3::identity() };
     let wanted = Wanted { poses: true, depths: true, host: true };

@@ -31,7 +31,7 @@ pub struct Ending<'a> {
     /// Whether the summary is printed as JSON.
     pub json: bool,
     /// Writes what belongs to the set besides, into the folder that it is given.
-    pub write_more: &'a dyn Fn(&Path) -> Result<(), ResultsError>,
+    pub write_more: &'a (dyn Fn(&Path) -> Result<(), ResultsError> + Sync),
 }
 
 impl Ending<'_> {

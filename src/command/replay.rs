@@ -136,7 +136,11 @@ pub fn run(config: &Config, args: ReplayArgs) -> Result<ExitCode, Box<dyn Error>
         false => Ok(()),
     };
     let ending = Ending { output: &output, config, json: args.json, write_more: &write_more };
-    ending.finish(&record, source.as_mut(), journal)
+    // In the memory that the replay has left.
+    let ended = pool.install(|| {
+        ending.finish(&record, source.as_mut(), journal).map_err(|error| error.to_string())
+    });
+    Ok(ended?)
 }
 
 /// The configuration as the arguments change it; an error where that cannot be replayed.

@@ -6,4 +6,5 @@ pub mod noise;
 pub(crate) mod pyramid;
 pub mod quads;
 pub mod quads_kernel;
+pub mod shared;
 pub mod sums;

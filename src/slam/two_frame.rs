@@ -22,7 +22,8 @@ use nalgebra::{Matrix6, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::candidate::CandidateParams;
-use crate::slam::depth::map::{DepthMap, GradientImage};
+use crate::slam::depth::gradient_image::GradientImage;
+use crate::slam::depth::map::DepthMap;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;

@@ -39,6 +39,7 @@ mod view;
 use std::sync::Arc;
 
 use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::image::shared::SharedImage;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::loops::{LoopParams, Loops};
 use crate::slam::map::Map;
@@ -191,16 +192,14 @@ impl Window {
     /// Adds a keyframe; false where its image is not of the camera's size.
     fn add(&mut self, keyframe: &Keyframe) -> bool {
         let (width, height) = (self.camera.width, self.camera.height);
-        if keyframe.image.len() != width * height {
-            return false;
-        }
+        let image = SharedImage::try_from_pixels(width, height, Arc::clone(&keyframe.image));
+        let Some(image) = image else { return false };
         let id = keyframe.keyframe_id;
         let place = self.keyframes.partition_point(|of| of.keyframe_id < id);
         let added = WindowKeyframe {
             keyframe_id: id,
             epoch: keyframe.epoch,
-            image: Arc::clone(&keyframe.image),
-            images: Vec::new(),
+            images: vec![image],
             camera_from_map: keyframe.map_from_keyframe.rigid.inverse(),
             unit: keyframe.map_from_keyframe.scale,
             points: Vec::new(),
@@ -307,7 +306,7 @@ impl Window {
         let params = &self.params;
         let keyframe = &mut self.keyframes[host];
         keyframe.take_part(&self.camera);
-        let chosen = candidates.choose(&keyframe.image, &self.camera, params);
+        let chosen = candidates.choose(keyframe.images[0].pixels(), &self.camera, params);
         keyframe.points = chosen
             .iter()
             .map(|point| {

@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::slam::depth::map::{BORDER_PX, GradientImage};
+use crate::slam::depth::gradient_image::{BORDER_PX, GradientImage};
 use crate::slam::parameter::{ParameterError, check_range};
 
 /// Tuning of the choice.
@@ -94,7 +94,7 @@ impl CandidateSelector {
     /// averaged with the neighbouring regions.
     fn measure(&mut self, image: &GradientImage) {
         let (width, height) = (image.width(), image.height());
-        let gradients = image.gradient_u.pixels().iter().zip(image.gradient_v.pixels());
+        let gradients = image.gradients(0..width * height);
         self.squared_gradient.clear();
         self.squared_gradient.extend(gradients.map(|(gu, gv)| gu * gu + gv * gv));
         self.columns = width.div_ceil(REGION_PX);

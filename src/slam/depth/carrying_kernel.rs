@@ -49,11 +49,12 @@ fn carry_rows_avx2<C: RowCarrier>(
 
 #[cfg(test)]
 mod tests {
+    use crate::slam::depth::gradient_image::BORDER_PX;
     use nalgebra::Vector6;
 
     use super::*;
     use crate::slam::depth::epipolar::TwoView;
-    use crate::slam::depth::map::{BORDER_PX, DepthMap, Hypothesis};
+    use crate::slam::depth::map::{DepthMap, Hypothesis};
     use crate::slam::depth::propagation::{PropagationParams, Reprojection};
     use crate::slam::geometry::se3::SE3;
     use crate::slam::test_scene::{CAMERA, Scene};

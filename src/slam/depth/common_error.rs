@@ -155,11 +155,9 @@ impl SampledDepth {
                     (v as f64 - intrinsics.cy) / intrinsics.fy,
                     1.0,
                 );
-                let gradient = [
-                    f64::from(image.gradient_u.at(u, v)) * intrinsics.fx,
-                    f64::from(image.gradient_v.at(u, v)) * intrinsics.fy,
-                ];
                 let index = v * image.width() + u;
+                let (gu, gv) = image.gradient(index);
+                let gradient = [f64::from(gu) * intrinsics.fx, f64::from(gv) * intrinsics.fy];
                 self.samples.push(Sample { index, ray, gradient, before: *hypothesis });
             }
         }

@@ -6,8 +6,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::epipolar::{EpipolarLine, Projection, TwoView};
 use crate::slam::depth::gain::{Gain, Uncertainty};
+use crate::slam::depth::gradient_image::{BORDER_PX, GradientImage};
 use crate::slam::depth::line_noise::Innovations;
-use crate::slam::depth::map::{BORDER_PX, DepthMap, GradientImage, Hypothesis};
+use crate::slam::depth::map::{DepthMap, Hypothesis};
 use crate::slam::depth::matching::{
     Conditioning, Match, MatchingParams, Miss, Patch, condition, is_inside, search,
 };

@@ -4,7 +4,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::epipolar::{EpipolarLine, Projection, TwoView};
-use crate::slam::depth::map::{BORDER_PX, GradientImage};
+use crate::slam::depth::gradient_image::{BORDER_PX, GradientImage};
 use crate::slam::depth::matching::is_inside;
 use crate::slam::depth::pattern::PATTERN;
 use crate::slam::depth::segment::{Segment, search};
@@ -191,8 +191,8 @@ impl ImmaturePoint {
         let (mut intensities, mut weights, mut structure) = ([0.0; 8], [0.0; 8], [0.0; 3]);
         for (k, (x, y)) in PATTERN.iter().enumerate() {
             let i = ((row as i32 + y) * width as i32 + column as i32 + x) as usize;
-            let (gu, gv) = (image.gradient_u.pixels()[i], image.gradient_v.pixels()[i]);
-            intensities[k] = image.intensity.pixels()[i];
+            let (gu, gv) = image.gradient(i);
+            intensities[k] = f32::from(image.intensity.pixels()[i]);
             let half = HALF_WEIGHT_GRADIENT * HALF_WEIGHT_GRADIENT;
             weights[k] = half / (half + gu * gu + gv * gv);
             structure[0] += gu * gu;

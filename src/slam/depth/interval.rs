@@ -5,10 +5,11 @@ use rayon::prelude::*;
 
 use crate::slam::depth::candidate::{Candidate, CandidateParams, CandidateSelector};
 use crate::slam::depth::gaussian::{MAX_VALIDITY, NEW_VALIDITY, ObservationCounts};
+use crate::slam::depth::gradient_image::GradientImage;
 use crate::slam::depth::immature::{
     HALF_INTERVAL_SIGMAS, ImmaturePoint, IntervalParams, TraceCounts, TraceFrame, TraceStatus,
 };
-use crate::slam::depth::map::{DepthMap, GradientImage, Hypothesis};
+use crate::slam::depth::map::{DepthMap, Hypothesis};
 use crate::slam::depth::trace_kernel::trace_kernel;
 
 /// A depth that became certain.

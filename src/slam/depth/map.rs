@@ -4,100 +4,9 @@
 use rayon::prelude::*;
 
 use crate::slam::depth::gain::Uncertainty;
+use crate::slam::depth::gradient_image::{BAND_ROWS, BORDER_PX, GradientImage};
 use crate::slam::depth::pattern::PATTERN;
 use crate::slam::image::buffer::Image;
-
-/// Pixels nearer to the border than this carry no depth: the matching pattern reaches 2 pixels, its
-/// gradients 1, and a bilinear sample 1 more.
-pub const BORDER_PX: usize = 4;
-
-/// Rows that a thread takes at least, where a row is cheap: waking another thread costs as much as
-/// thousands of pixels.
-pub(super) const BAND_ROWS: usize = 60;
-
-/// Grey level of a pixel without any light.
-const BLACK: f32 = 0.0;
-/// Grey level of a pixel that could be any brighter.
-const WHITE: f32 = 255.0;
-
-/// A keyframe's image with its gradients, level 0.
-#[derive(Debug, Clone)]
-pub struct GradientImage {
-    /// Brightness, 0 to 255.
-    pub intensity: Image<f32>,
-    /// ∂I/∂u by central difference, grey levels a pixel; 0 on the border.
-    pub gradient_u: Image<f32>,
-    /// ∂I/∂v by central difference, grey levels a pixel; 0 on the border.
-    pub gradient_v: Image<f32>,
-}
-
-impl GradientImage {
-    /// A black image.
-    pub fn with_size(width: usize, height: usize) -> Self {
-        let black = Image::filled(width, height, 0.0);
-        Self { intensity: black.clone(), gradient_u: black.clone(), gradient_v: black }
-    }
-
-    /// Takes the grey values of a frame of the same size and differentiates them.
-    pub fn fill(&mut self, pixels: &[u8]) {
-        let (width, height) = (self.intensity.width(), self.intensity.height());
-        let row = |v: usize| &pixels[v * width..(v + 1) * width];
-        let intensity = self.intensity.pixels_mut().par_chunks_exact_mut(width);
-        let gradient_u = self.gradient_u.pixels_mut().par_chunks_exact_mut(width);
-        let gradient_v = self.gradient_v.pixels_mut().par_chunks_exact_mut(width);
-        let rows = intensity.zip(gradient_u).zip(gradient_v).enumerate();
-        rows.with_min_len(BAND_ROWS).for_each(|(v, ((intensity, gradient_u), gradient_v))| {
-            let here = row(v);
-            for (out, &grey) in intensity.iter_mut().zip(here) {
-                *out = f32::from(grey);
-            }
-            if v == 0 || v + 1 == height {
-                return;
-            }
-            let sides = here.iter().zip(&here[2..]);
-            for (out, (&left, &right)) in gradient_u[1..].iter_mut().zip(sides) {
-                *out = 0.5 * (f32::from(right) - f32::from(left));
-            }
-            let ends = row(v - 1).iter().zip(row(v + 1)).skip(1).take(width - 2);
-            for (out, (&above, &below)) in gradient_v[1..].iter_mut().zip(ends) {
-                *out = 0.5 * (f32::from(below) - f32::from(above));
-            }
-        });
-    }
-
-    /// ‖g‖ of the pixels of row `v` that are not on the border, grey levels a pixel.
-    #[inline(always)]
-    fn strengths(&self, v: usize) -> impl Iterator<Item = f32> {
-        let inner = BORDER_PX..self.width() - BORDER_PX;
-        let (u, v) = (&self.gradient_u.row(v)[inner.clone()], &self.gradient_v.row(v)[inner]);
-        u.iter().zip(v).map(|(gu, gv)| (gu * gu + gv * gv).sqrt())
-    }
-
-    /// Whether the pixels of row `v` that are not on the border, and the four beside each, are neither black nor
-    /// white: where the sensor ends, brightness is not what was seen and gradients are not where they appear.
-    #[inline(always)]
-    fn unsaturated(&self, v: usize) -> impl Iterator<Item = bool> {
-        let (first, end) = (BORDER_PX, self.width() - BORDER_PX);
-        let row = |v: usize, from: usize, to: usize| &self.intensity.row(v)[from..to];
-        let beside = row(v, first - 1, end - 1).iter().zip(row(v, first + 1, end + 1));
-        let above_below = row(v - 1, first, end).iter().zip(row(v + 1, first, end));
-        row(v, first, end).iter().zip(beside).zip(above_below).map(|((at, (l, r)), (a, b))| {
-            let darkest = at.min(*l).min(*r).min(*a).min(*b);
-            let brightest = at.max(*l).max(*r).max(*a).max(*b);
-            (darkest > BLACK) & (brightest < WHITE)
-        })
-    }
-
-    /// Width in pixels.
-    pub fn width(&self) -> usize {
-        self.intensity.width()
-    }
-
-    /// Height in pixels.
-    pub fn height(&self) -> usize {
-        self.intensity.height()
-    }
-}
 
 /// A Gaussian hypothesis on the inverse depth of a pixel.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -195,20 +104,14 @@ const LANES: usize = 8;
 
 /// Σ (g_u², g_u g_v, g_v²) over the pattern around [`LANES`] pixels from `first` on, by quantity.
 #[inline(always)]
-fn structure_of_block(
-    gradient_u: &[f32],
-    gradient_v: &[f32],
-    width: usize,
-    first: usize,
-) -> [[f32; LANES]; 3] {
+fn structure_of_block(image: &GradientImage, first: usize) -> [[f32; LANES]; 3] {
     let [mut uu, mut uv, mut vv] = [[0.0f32; LANES]; 3];
     for (x, y) in PATTERN {
-        let from = first.wrapping_add_signed(y as isize * width as isize + x as isize);
-        let (gu, gv) = (&gradient_u[from..from + LANES], &gradient_v[from..from + LANES]);
-        for k in 0..LANES {
-            uu[k] += gu[k] * gu[k];
-            uv[k] += gu[k] * gv[k];
-            vv[k] += gv[k] * gv[k];
+        let from = first.wrapping_add_signed(y as isize * image.width() as isize + x as isize);
+        for (k, (gu, gv)) in image.gradients(from..from + LANES).enumerate() {
+            uu[k] += gu * gu;
+            uv[k] += gu * gv;
+            vv[k] += gv * gv;
         }
     }
     [uu, uv, vv]
@@ -247,18 +150,21 @@ impl DepthMap {
     /// Starts over on a new image: no hypotheses, candidates where ‖g‖ ≥ `min_gradient`, raised
     /// evenly until at most `max_candidates` remain.
     pub fn restart(&mut self, pixels: &[u8], min_gradient: f32, max_candidates: usize) {
+        self.show(pixels, min_gradient, max_candidates);
+        self.sum_structure();
+    }
+
+    /// The same without what only observation needs: depth can be carried to it.
+    pub fn show(&mut self, pixels: &[u8], min_gradient: f32, max_candidates: usize) {
         self.image.fill(pixels);
         let rows = self.hypotheses.pixels_mut().par_chunks_exact_mut(self.image.width());
         rows.with_min_len(BAND_ROWS).for_each(|row| row.fill(Hypothesis::NONE));
         self.choose_candidates(min_gradient, max_candidates);
-        self.sum_structure();
     }
 
     fn sum_structure(&mut self) {
         let (width, height) = (self.image.width(), self.image.height());
-        let candidates = &self.candidates;
-        let gradient_u = self.image.gradient_u.pixels();
-        let gradient_v = self.image.gradient_v.pixels();
+        let (candidates, image) = (&self.candidates, &self.image);
         let rows = self.structure.pixels_mut().par_chunks_exact_mut(width).enumerate();
         rows.with_min_len(BAND_ROWS).for_each(|(v, row)| {
             if !(BORDER_PX..height - BORDER_PX).contains(&v) {
@@ -271,7 +177,7 @@ impl DepthMap {
                 if !candidates[first..first + LANES].iter().any(|&candidate| candidate) {
                     continue;
                 }
-                let sums = structure_of_block(gradient_u, gradient_v, width, v * width + first);
+                let sums = structure_of_block(image, v * width + first);
                 for (k, structure) in row[first..first + LANES].iter_mut().enumerate() {
                     *structure = sums.map(|plane| plane[k]);
                 }
@@ -415,18 +321,6 @@ mod tests {
     }
 
     #[test]
-    fn gradients_are_central_differences() {
-        let (width, height) = (20, 16);
-        let pixels: Vec<u8> =
-            (0..width * height).map(|i| ((i % width) * 5 + (i / width) * 3) as u8).collect();
-        let mut image = GradientImage::with_size(width, height);
-        image.fill(&pixels);
-        assert_eq!(image.gradient_u.at(7, 8), 5.0);
-        assert_eq!(image.gradient_v.at(7, 8), 3.0);
-        assert_eq!(image.gradient_u.at(0, 8), 0.0);
-    }
-
-    #[test]
     fn candidates_are_bounded_and_have_gradient() {
         let (width, height) = (64, 64);
         let pixels: Vec<u8> =
@@ -447,8 +341,10 @@ mod tests {
             (0..width * height).map(|i| ((i * i * 31 + i * 7) % 251 + 2) as u8).collect();
         let mut map = DepthMap::with_size(width, height);
         map.restart(&pixels, 40.0, 700);
-        let (gu, gv) = (map.image.gradient_u.pixels(), map.image.gradient_v.pixels());
-        let strength = |i: usize| (gu[i] * gu[i] + gv[i] * gv[i]).sqrt();
+        let strength = |i: usize| {
+            let (gu, gv) = map.image.gradient(i);
+            (gu * gu + gv * gv).sqrt()
+        };
         let weakest = |wanted: bool, worst: fn(f32, f32) -> f32, start: f32| {
             let inner = (BORDER_PX..height - BORDER_PX)
                 .flat_map(|v| (BORDER_PX..width - BORDER_PX).map(move |u| v * width + u));
@@ -463,9 +359,10 @@ mod tests {
                 let mut sums = [0.0f32; 3];
                 for (x, y) in PATTERN {
                     let i = (v as i32 + y) as usize * width + (u as i32 + x) as usize;
-                    sums[0] += gu[i] * gu[i];
-                    sums[1] += gu[i] * gv[i];
-                    sums[2] += gv[i] * gv[i];
+                    let (gu, gv) = map.image.gradient(i);
+                    sums[0] += gu * gu;
+                    sums[1] += gu * gv;
+                    sums[2] += gv * gv;
                 }
                 assert_eq!(map.structure.at(u, v).map(f32::to_bits), sums.map(f32::to_bits));
             }

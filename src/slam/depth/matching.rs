@@ -8,8 +8,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::epipolar::{EpipolarLine, Projection, TwoView};
 use crate::slam::depth::gain::Uncertainty;
+use crate::slam::depth::gradient_image::{BORDER_PX, GradientImage};
 use crate::slam::depth::line_search::{Along, MAX_STEPS};
-use crate::slam::depth::map::{BORDER_PX, GradientImage};
 use crate::slam::depth::pattern::PATTERN;
 use crate::slam::image::noise::ImageNoise;
 use crate::slam::image::quads_kernel::{Sampled, Sampler};
@@ -115,9 +115,9 @@ impl Patch {
         let mut patch = Self { intensity: [0.0; 8], gradient_u: [0.0; 8], gradient_v: [0.0; 8] };
         for k in 0..PATTERN.len() {
             let i = at(k);
-            patch.intensity[k] = gain * image.intensity.pixels()[i] + offset;
-            patch.gradient_u[k] = gain * image.gradient_u.pixels()[i];
-            patch.gradient_v[k] = gain * image.gradient_v.pixels()[i];
+            let (gu, gv) = image.gradient(i);
+            patch.intensity[k] = gain * f32::from(image.intensity.pixels()[i]) + offset;
+            (patch.gradient_u[k], patch.gradient_v[k]) = (gain * gu, gain * gv);
         }
         patch
     }

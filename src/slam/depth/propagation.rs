@@ -10,9 +10,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::carrying_kernel::{RowCarrier, carrying_kernel};
 use crate::slam::depth::epipolar::{MIN_DEPTH_RATIO, TwoView};
-use crate::slam::depth::map::{
-    BAND_ROWS, BORDER_PX, DepthMap, Hypothesis, KnownColumns, Reprojected, for_each_known,
-};
+use crate::slam::depth::gradient_image::{BAND_ROWS, BORDER_PX};
+use crate::slam::depth::map::{DepthMap, Hypothesis, KnownColumns, Reprojected, for_each_known};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::parameter::{ParameterError, check_range};
@@ -135,7 +134,7 @@ impl RowCarrier for Reprojection<'_> {
                         let u = usize::from(u);
                         self.arrive(
                             &hypotheses[u],
-                            self.source.image.intensity.at(u, v),
+                            f32::from(self.source.image.intensity.at(u, v)),
                             &places,
                             k,
                         )
@@ -204,8 +203,8 @@ impl Reprojection<'_> {
         }
         let expected = self.gain * intensity + self.offset;
         let residual = (image.intensity.bilinear(u, v) - expected).abs();
-        let gradient_u = f64::from(image.gradient_u.pixels()[index]);
-        let gradient_v = f64::from(image.gradient_v.pixels()[index]);
+        let (gradient_u, gradient_v) = image.gradient(index);
+        let (gradient_u, gradient_v) = (f64::from(gradient_u), f64::from(gradient_v));
         let gradient = (gradient_u * gradient_u + gradient_v * gradient_v).sqrt() as f32;
         if !(residual <= params.max_residual + params.residual_per_gradient * gradient) {
             return None;

@@ -10,7 +10,8 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::gaussian::NEW_VALIDITY;
-use crate::slam::depth::map::{BAND_ROWS, BORDER_PX, DepthMap, Hypothesis};
+use crate::slam::depth::gradient_image::{BAND_ROWS, BORDER_PX};
+use crate::slam::depth::map::{DepthMap, Hypothesis};
 use crate::slam::depth::neighbour_sums::{
     FillingSums, LANES, RADIUS, RowPlanes, SmoothingSums, WINDOW_ROWS, filling_sums, smoothing_sums,
 };

@@ -49,7 +49,7 @@ fn trace_points_avx2(
 mod tests {
     use super::*;
     use crate::slam::depth::epipolar::TwoView;
-    use crate::slam::depth::map::GradientImage;
+    use crate::slam::depth::gradient_image::GradientImage;
     use crate::slam::geometry::se3::SE3;
     use crate::slam::image::quads::QuadImage;
     use crate::slam::pose::Brightness;

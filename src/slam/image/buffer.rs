@@ -57,7 +57,7 @@ impl<T: Copy> Image<T> {
     }
 }
 
-impl Image<f32> {
+impl<T: Copy + Into<f32>> Image<T> {
     /// Bilinear sample; positions outside take the nearest pixel inside.
     #[inline]
     pub fn bilinear(&self, u: f32, v: f32) -> f32 {
@@ -66,9 +66,11 @@ impl Image<f32> {
         let (column, row) = (u as usize, v as usize);
         let (fu, fv) = (u - column as f32, v - row as f32);
         let i = row * self.width + column;
-        let (pixels, below) = (&self.pixels, i + self.width);
-        let upper = pixels[i] + fu * (pixels[i + 1] - pixels[i]);
-        let lower = pixels[below] + fu * (pixels[below + 1] - pixels[below]);
+        let between = |i: usize| {
+            let [left, right] = [self.pixels[i], self.pixels[i + 1]].map(Into::into);
+            left + fu * (right - left)
+        };
+        let (upper, lower) = (between(i), between(i + self.width));
         upper + fv * (lower - upper)
     }
 }
@@ -80,7 +82,7 @@ mod tests {
     #[test]
     fn samples_are_bilinear_and_stay_inside() {
         // 0, 10, 20, below them 100, 110, 120 and 200, 210, 220.
-        let greys = (0..9).map(|i| (100 * (i / 3) + 10 * (i % 3)) as f32).collect();
+        let greys = (0..9).map(|i| (100 * (i / 3) + 10 * (i % 3)) as u8).collect();
         let image = Image::try_from_pixels(3, 3, greys).unwrap();
         for (u, v, expected) in [
             (0.25, 0.5, 52.5f32),

@@ -105,7 +105,7 @@ impl Mapper {
         let frame_from_before = in_unit(&pose.keyframe_from_camera, self.depth.unit);
         let (min_gradient, most) = (self.params.min_gradient, self.params.max_candidates);
         self.depth.swap();
-        self.depth.active.restart(frame.pixels, min_gradient, most);
+        self.depth.active.show(frame.pixels, min_gradient, most);
         propagate(
             &self.depth.spare,
             &mut self.depth.active,

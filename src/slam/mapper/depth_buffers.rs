@@ -4,6 +4,7 @@ use crate::slam::depth::interval::IntervalFilter;
 use crate::slam::depth::map::{DepthMap, KnownColumns, for_each_known};
 use crate::slam::depth::regularisation::{RegularisationScratch, regularise};
 use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS};
 use crate::slam::map::LogPlane;
 use crate::slam::mapper::MapperParams;
@@ -33,9 +34,12 @@ pub(super) struct DepthBuffers {
 impl DepthBuffers {
     /// Empty, for images of this size.
     pub(super) fn with_size(width: usize, height: usize) -> Self {
+        let active = DepthMap::with_size(width, height);
+        let mut spare = active.clone();
+        spare.structure = Image::filled(0, 0, [0.0; 3]);
         Self {
-            active: DepthMap::with_size(width, height),
-            spare: DepthMap::with_size(width, height),
+            active,
+            spare,
             points: IntervalFilter::default(),
             maturing: Maturing::default(),
             regularisation: RegularisationScratch::with_size(width, height),
@@ -52,9 +56,11 @@ impl DepthBuffers {
         (self.unit, self.is_unit_open) = (1.0, false);
     }
 
-    /// The active depth becomes the spare one, and the other way round.
+    /// The active depth becomes the spare one, and the other way round. What only observation needs stays with the active
+    /// one, of which it is no more.
     pub(super) fn swap(&mut self) {
         std::mem::swap(&mut self.active, &mut self.spare);
+        std::mem::swap(&mut self.active.structure, &mut self.spare.structure);
     }
 
     /// Chooses the points that the interval filter traces.
@@ -135,7 +141,7 @@ pub(super) fn write_depth(depth: &DepthMap, unit: f64, keyframe: &mut Keyframe) 
         let (row, intensities) = (depth.hypotheses.row(v), image.row(v));
         for_each_known(row, &mut columns, |known| {
             keyframe.points.extend(known.iter().map(|&u| {
-                let (h, intensity) = (&row[usize::from(u)], intensities[usize::from(u)]);
+                let (h, intensity) = (&row[usize::from(u)], f32::from(intensities[usize::from(u)]));
                 let inverse_depth = h.smoothed * inverse_unit;
                 let variance = h.variance * (inverse_unit * inverse_unit);
                 DepthPoint { u, v: v as u16, inverse_depth, variance, intensity }

@@ -2,9 +2,9 @@
 //! Gaussian map that frames are tracked on.
 
 use crate::slam::depth::candidate::CandidateParams;
+use crate::slam::depth::gradient_image::GradientImage;
 use crate::slam::depth::immature::{IntervalParams, TraceFrame};
 use crate::slam::depth::interval::IntervalFilter;
-use crate::slam::depth::map::GradientImage;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::DepthPoint;
 use crate::slam::map::Correction;
@@ -61,7 +61,7 @@ impl Maturing {
                 v: of.v,
                 inverse_depth: of.inverse_depth * inverse_unit,
                 variance: of.variance * (inverse_unit * inverse_unit),
-                intensity: image.intensity.at(usize::from(of.u), usize::from(of.v)),
+                intensity: f32::from(image.intensity.at(usize::from(of.u), usize::from(of.v))),
             });
             let points = points.collect();
             self.left.retain(|left| left.keyframe_id != keyframe_id);

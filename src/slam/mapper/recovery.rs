@@ -6,7 +6,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::common_error::{full_covariance, rotation_std_dev};
 use crate::slam::depth::gaussian::MAX_VALIDITY;
-use crate::slam::depth::map::{BORDER_PX, DepthMap, Hypothesis};
+use crate::slam::depth::gradient_image::BORDER_PX;
+use crate::slam::depth::map::{DepthMap, Hypothesis};
 use crate::slam::depth::propagation::joined;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;

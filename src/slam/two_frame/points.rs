@@ -2,7 +2,7 @@
 //! neighbours.
 
 use crate::slam::depth::candidate::{CandidateParams, CandidateSelector};
-use crate::slam::depth::map::GradientImage;
+use crate::slam::depth::gradient_image::GradientImage;
 use crate::slam::depth::pattern::PATTERN;
 use crate::slam::image::buffer::Image;
 use crate::slam::image::pyramid::Pyramid;

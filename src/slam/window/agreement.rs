@@ -42,6 +42,7 @@ impl Window {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::slam::image::shared::SharedImage;
     use crate::slam::keyframe::DepthPoint;
     use crate::slam::test_scene::{CAMERA, Random};
     use crate::slam::window::params::WindowParams;
@@ -75,7 +76,8 @@ mod tests {
         let mut random = Random::new(5);
         let mut wall = vec![0u8; CAMERA.width * CAMERA.height];
         wall.fill_with(|| (128.0 + 40.0 * random.normal()).clamp(0.0, 255.0) as u8);
-        (window.keyframes[last].image, window.keyframes[last].images) = (wall.into(), Vec::new());
+        let wall = SharedImage::try_from_pixels(CAMERA.width, CAMERA.height, wall.into());
+        window.keyframes[last].images = vec![wall.unwrap()];
         assert!(window.align_last(&members, &[0], 0));
         window.note_agreement(&members);
         assert_eq!(window.keyframes[last].agreed, []);

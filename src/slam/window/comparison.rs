@@ -16,7 +16,7 @@ use nalgebra::Matrix6;
 use crate::slam::depth::pattern::PATTERN;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
-use crate::slam::image::buffer::Image;
+use crate::slam::image::shared::SharedImage;
 
 /// Samples of a pattern.
 pub const SAMPLES: usize = PATTERN.len();
@@ -197,7 +197,7 @@ impl Pair {
 }
 
 /// Whether positions up to [`Pair`]'s last are inside an image.
-pub(super) fn fits(image: &Image<u8>, pair: &Pair) -> bool {
+pub(super) fn fits(image: &SharedImage, pair: &Pair) -> bool {
     let [right, bottom] = pair.last;
     image.width() >= 4
         && image.height() >= 4

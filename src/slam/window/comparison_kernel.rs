@@ -5,7 +5,7 @@
 use crate::slam::alignment::kernel::Kernel;
 use crate::slam::alignment::kernel::lanes_kernel::Lanes;
 use crate::slam::alignment::kernel::portable_kernel::FourLanes;
-use crate::slam::image::buffer::Image;
+use crate::slam::image::shared::SharedImage;
 use crate::slam::window::comparison::{
     BORDER_PX, Compared, LANES, Lane, POSE, Pair, PairSums, Patterns, Robustness, SAMPLES, fits,
 };
@@ -18,7 +18,7 @@ impl Kernel {
     /// blocks of `compared` are written as there are patterns; none where the image is smaller than the pair's camera.
     pub fn compare(
         self,
-        image: &Image<u8>,
+        image: &SharedImage,
         pair: &Pair,
         patterns: &[Patterns],
         robustness: &Robustness,
@@ -58,7 +58,7 @@ impl Kernel {
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
 unsafe fn compare_avx2(
-    image: &Image<u8>,
+    image: &SharedImage,
     pair: &Pair,
     patterns: &[Patterns],
     robustness: &Robustness,
@@ -75,7 +75,7 @@ unsafe fn compare_avx2(
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f")]
 unsafe fn compare_avx512(
-    image: &Image<u8>,
+    image: &SharedImage,
     pair: &Pair,
     patterns: &[Patterns],
     robustness: &Robustness,
@@ -92,7 +92,7 @@ unsafe fn compare_avx512(
 #[cfg(target_arch = "aarch64")]
 #[target_feature(enable = "neon")]
 unsafe fn compare_neon(
-    image: &Image<u8>,
+    image: &SharedImage,
     pair: &Pair,
     patterns: &[Patterns],
     robustness: &Robustness,
@@ -108,7 +108,7 @@ unsafe fn compare_neon(
 /// The processor has the instructions of `L`; the image is as large as the pair's camera says.
 #[inline(always)]
 unsafe fn compare<L: Lanes>(
-    image: &Image<u8>,
+    image: &SharedImage,
     pair: &Pair,
     patterns: &[Patterns],
     robustness: &Robustness,
@@ -162,7 +162,12 @@ struct Weighed<L> {
 /// # Safety
 /// As [`compare`].
 #[inline(always)]
-unsafe fn warp<L: Lanes>(of: &Patterns, lane: usize, pair: &Pair, image: &Image<u8>) -> Warped<L> {
+unsafe fn warp<L: Lanes>(
+    of: &Patterns,
+    lane: usize,
+    pair: &Pair,
+    image: &SharedImage,
+) -> Warped<L> {
     // SAFETY: this function's own contract.
     unsafe {
         let (zero, one) = (L::splat(0.0), L::splat(1.0));

@@ -9,13 +9,13 @@ use super::comparison::{
 use crate::slam::alignment::kernel::Kernel;
 use crate::slam::depth::pattern::PATTERN;
 use crate::slam::geometry::se3::SE3;
-use crate::slam::image::buffer::Image;
+use crate::slam::image::shared::SharedImage;
 use crate::slam::test_scene::{CAMERA, Random};
 
 const EASY: Robustness = Robustness { huber_grey: 1e3, most_energy: f32::INFINITY };
 
 /// A smooth image, so that a bilinear sample is hardly ever between two slopes.
-fn waves(phase: f32) -> Image<u8> {
+fn waves(phase: f32) -> SharedImage {
     let pixels: Vec<u8> = (0..CAMERA.width * CAMERA.height)
         .map(|i| {
             let (u, v) = ((i % CAMERA.width) as f32, (i / CAMERA.width) as f32);
@@ -24,13 +24,14 @@ fn waves(phase: f32) -> Image<u8> {
             (128.0 + wave).round() as u8
         })
         .collect();
-    Image::try_from_pixels(CAMERA.width, CAMERA.height, pixels).unwrap()
+    SharedImage::try_from_pixels(CAMERA.width, CAMERA.height, pixels.into()).unwrap()
 }
 
 /// What the pattern around a pixel looks like, every sample of weight 1.
-fn look(image: &Image<u8>, u: usize, v: usize) -> Look {
+fn look(image: &SharedImage, u: usize, v: usize) -> Look {
     let samples = PATTERN.map(|(du, dv)| {
-        f32::from(image.at(u.wrapping_add_signed(du as isize), v.wrapping_add_signed(dv as isize)))
+        let row = image.row(v.wrapping_add_signed(dv as isize));
+        f32::from(row[u.wrapping_add_signed(du as isize)])
     });
     let mean = sum_of_samples(&samples) / SAMPLES as f32;
     Look { shape: samples.map(|grey| grey / mean), weight: [1.0; SAMPLES] }
@@ -46,7 +47,7 @@ const ALL_WANTED: Wanted = Wanted { poses: true, depths: true, host: true };
 /// One comparison, in the first lane.
 fn compare(
     kernel: Kernel,
-    image: &Image<u8>,
+    image: &SharedImage,
     pair: &Pair,
     look: &Look,
     ray: [f32; 2],
@@ -63,7 +64,7 @@ fn compare(
 
 /// Cost of a comparison and half its gradient, by pose of the observer and by depth.
 fn compared(
-    image: &Image<u8>,
+    image: &SharedImage,
     look: &Look,
     ray: [f32; 2],
     pose: &SE3,
@@ -114,7 +115,7 @@ fn derivatives_are_those_of_the_cost() {
 /// A comparison without lanes, tricks and f32: the samples at their own places, ∂π at the pattern's centre. Cost, the
 /// sums H of (pose, depth) and the right side.
 fn explained(
-    image: &Image<u8>,
+    image: &SharedImage,
     look: &Look,
     ray: [f32; 2],
     pose: &SE3,
@@ -131,7 +132,7 @@ fn explained(
         let (u, v) = (CAMERA.fx * at.x / at.z + CAMERA.cx, CAMERA.fy * at.y / at.z + CAMERA.cy);
         let (column, row) = (u as usize, v as usize);
         let (a, b) = (u - column as f64, v - row as f64);
-        let grey = |column: usize, row: usize| f64::from(image.at(column, row));
+        let grey = |column: usize, row: usize| f64::from(image.row(row)[column]);
         let (p00, p10) = (grey(column, row), grey(column + 1, row));
         let (p01, p11) = (grey(column, row + 1), grey(column + 1, row + 1));
         let value = (1.0 - b) * ((1.0 - a) * p00 + a * p10) + b * ((1.0 - a) * p01 + a * p11);
@@ -212,7 +213,7 @@ fn all_instruction_sets_give_the_same_bits() {
     let mut random = Random::new(4);
     let pixels: Vec<u8> =
         (0..CAMERA.width * CAMERA.height).map(|_| (255.0 * random.uniform()) as u8).collect();
-    let image = Image::try_from_pixels(CAMERA.width, CAMERA.height, pixels).unwrap();
+    let image = SharedImage::try_from_pixels(CAMERA.width, CAMERA.height, pixels.into()).unwrap();
     let robustness = Robustness { huber_grey: 9.0, most_energy: 8.0 * 900.0 };
     let mut counts = [0; 3];
     for round in 0..100 {
@@ -272,7 +273,7 @@ fn numbers_that_are_none_are_outside() {
             assert!(seen.cost[1].is_nan() && seen.depth[0].is_finite(), "{ray:?} {depth}");
         }
         // A smaller image than the camera's is not read.
-        let small = Image::filled(100, 50, 7);
+        let small = SharedImage::try_from_pixels(100, 50, [7; 5000].into()).unwrap();
         let (seen, _) = compare(kernel, &small, &pair, &look, ray(150.0, 100.0), 1.0, &EASY);
         assert!(seen.cost.iter().all(|cost| cost.is_nan()));
     }

@@ -19,7 +19,7 @@ impl Window {
                     v: point.v,
                     confirmations: point.confirmations,
                     inverse_depth: (point.inverse_depth * keyframe.map_from_keyframe.scale) as f32,
-                    intensity: f32::from(*host.image.get(pixel)?),
+                    intensity: f32::from(*host.images.first()?.pixels().get(pixel)?),
                 })
             })
         });

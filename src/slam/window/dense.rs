@@ -10,7 +10,7 @@ use std::collections::HashSet;
 use rayon::prelude::*;
 
 use crate::slam::alignment::kernel::{Kernel, SimdMode};
-use crate::slam::image::buffer::Image;
+use crate::slam::image::shared::SharedImage;
 use crate::slam::keyframe::{DepthPoint, Keyframe};
 use crate::slam::map::{LogPlane, Map, RefinedDepth};
 use crate::slam::window::Window;
@@ -83,7 +83,7 @@ struct State {
 struct Observers<'a> {
     level: usize,
     steps: u32,
-    images: Vec<&'a Image<u8>>,
+    images: Vec<&'a SharedImage>,
     pairs: Vec<Pair>,
     robustness: Robustness,
 }
@@ -159,7 +159,7 @@ impl Window {
         }
         let images = |&k: &usize| self.images_of(&self.keyframes[k]);
         let of_host = images(&index);
-        let of_observers: Vec<Vec<Image<u8>>> = observers.iter().map(images).collect();
+        let of_observers: Vec<Vec<SharedImage>> = observers.iter().map(images).collect();
         let levels: Vec<Observers<'_>> = STEPS
             .into_iter()
             .filter(|(level, _)| *level < of_host.len())
@@ -187,15 +187,17 @@ impl Window {
     }
 
     /// Its images on the levels that are used.
-    fn images_of(&self, keyframe: &WindowKeyframe) -> Vec<Image<u8>> {
-        keyframe.levels(&self.camera, STEPS.len().min(num_levels(&self.camera)))
+    fn images_of(&self, keyframe: &WindowKeyframe) -> Vec<SharedImage> {
+        let levels = STEPS.len().min(num_levels(&self.camera));
+        let finest = keyframe.images.first().cloned();
+        std::iter::successors(finest, |finer| Some(finer.halved())).take(levels).collect()
     }
 
     fn observers<'a>(
         &self,
         host: &WindowKeyframe,
         observers: &[usize],
-        images: &'a [Vec<Image<u8>>],
+        images: &'a [Vec<SharedImage>],
         level: usize,
         steps: u32,
     ) -> Observers<'a> {
@@ -234,7 +236,7 @@ impl Window {
     fn descend(
         &self,
         points: &[DepthPoint],
-        images: &[Image<u8>],
+        images: &[SharedImage],
         levels: &[Observers<'_>],
     ) -> Vec<State> {
         let look = |point: &DepthPoint| {

@@ -36,7 +36,7 @@ fn keyframe(room: &Room, relief: f64) -> (Keyframe, Vec<f64>) {
     let place = Sim3::new(host.camera_from_map.inverse(), UNIT);
     let keyframe = Keyframe {
         keyframe_id: 1,
-        ..Keyframe::at(place, CAMERA, points.collect(), host.image.to_vec())
+        ..Keyframe::at(place, CAMERA, points.collect(), host.images[0].pixels().to_vec())
     };
     (keyframe, truth)
 }

@@ -6,6 +6,7 @@
 use std::sync::Arc;
 
 use crate::slam::geometry::se3::SE3;
+use crate::slam::image::shared::SharedImage;
 use crate::slam::map::PlacedFrame;
 use crate::slam::window::Window;
 use crate::slam::window::keyframe::WindowKeyframe;
@@ -147,15 +148,13 @@ impl Window {
         if members.is_empty() {
             return None;
         }
-        if frame.pixels.len() != self.camera.width * self.camera.height {
-            return None;
-        }
+        let (width, height) = (self.camera.width, self.camera.height);
+        let image = SharedImage::try_from_pixels(width, height, Arc::clone(&frame.pixels))?;
         members.push(self.keyframes.len());
         self.keyframes.push(WindowKeyframe {
             keyframe_id: u64::MAX,
             epoch,
-            image: Arc::clone(&frame.pixels),
-            images: Vec::new(),
+            images: vec![image],
             camera_from_map: host_from_camera.inverse() * host_from_map,
             unit: 1.0,
             points: Vec::new(),
@@ -199,7 +198,6 @@ mod tests {
             .map(|keyframe_id| WindowKeyframe {
                 keyframe_id,
                 epoch: 0,
-                image: Vec::new().into(),
                 images: Vec::new(),
                 camera_from_map: SE3::identity(),
                 unit: 1.0,

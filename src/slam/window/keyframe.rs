@@ -1,11 +1,9 @@
 //! Keyframes and points of the window.
 
-use std::sync::Arc;
-
 use crate::slam::depth::pattern::PATTERN;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
-use crate::slam::image::buffer::Image;
+use crate::slam::image::shared::SharedImage;
 use crate::slam::window::comparison::{Look, SAMPLES, sum_of_samples};
 use crate::slam::window::params::WindowParams;
 use crate::slam::window::surface::Surface;
@@ -22,10 +20,8 @@ pub struct WindowKeyframe {
     pub keyframe_id: u64,
     /// Its epoch.
     pub epoch: u32,
-    /// Grey values, shared with the map.
-    pub image: Arc<[u8]>,
-    /// The same by level; none while it takes no part.
-    pub images: Vec<Image<u8>>,
+    /// Grey values by level, the finest shared with the map; that alone while it takes no part.
+    pub images: Vec<SharedImage>,
     /// Where it is, in the unit of the map.
     pub camera_from_map: SE3,
     /// Length of its unit in that of the map.
@@ -69,22 +65,17 @@ pub struct WindowPoint {
 }
 
 impl WindowKeyframe {
-    /// Makes its images by level, unless it has them.
+    /// Makes its coarser images, unless it has them.
     pub fn take_part(&mut self, camera: &Intrinsics) {
-        if self.images.is_empty() {
-            self.images = self.levels(camera, num_levels(camera));
+        while self.images.len() < num_levels(camera) {
+            let Some(finer) = self.images.last() else { return };
+            self.images.push(finer.halved());
         }
     }
 
-    /// Gives its images by level up.
+    /// Gives its coarser images up.
     pub fn leave(&mut self) {
-        self.images = Vec::new();
-    }
-
-    /// So many levels of its image, finest first; none where that is of another size than the camera's.
-    pub fn levels(&self, camera: &Intrinsics, num_levels: usize) -> Vec<Image<u8>> {
-        let finest = Image::try_from_pixels(camera.width, camera.height, self.image.to_vec());
-        std::iter::successors(finest, |finer| Some(halve(finer))).take(num_levels).collect()
+        self.images.truncate(1);
     }
 }
 
@@ -95,29 +86,12 @@ pub fn num_levels(camera: &Intrinsics) -> usize {
     (0..LEVELS).take_while(is_large).count().max(1)
 }
 
-/// 2×2 means, rounded: half a grey level is far below the noise.
-pub(super) fn halve(fine: &Image<u8>) -> Image<u8> {
-    let (columns, rows) = (fine.width() / 2, fine.height() / 2);
-    let mut coarse = Image::filled(columns, rows, 0);
-    for (v, row) in coarse.pixels_mut().chunks_exact_mut(columns).enumerate() {
-        let pairs = fine.row(2 * v).chunks_exact(2).zip(fine.row(2 * v + 1).chunks_exact(2));
-        for (mean, (upper, lower)) in row.iter_mut().zip(pairs) {
-            let sum = u16::from(upper[0])
-                + u16::from(upper[1])
-                + u16::from(lower[0])
-                + u16::from(lower[1]);
-            *mean = ((sum + 2) / 4) as u8;
-        }
-    }
-    coarse
-}
-
 impl WindowPoint {
     /// The point at a pixel of the keyframe with these images.
     pub fn new(
         (u, v): (u16, u16),
         inverse_depth: f64,
-        images: &[Image<u8>],
+        images: &[SharedImage],
         camera: &Intrinsics,
         params: &WindowParams,
     ) -> Self {
@@ -134,7 +108,7 @@ impl WindowPoint {
 }
 
 /// What the pattern around a pixel looks like.
-fn look_at(image: &Image<u8>, u: f32, v: f32, half_weight_gradient: f32) -> Look {
+fn look_at(image: &SharedImage, u: f32, v: f32, half_weight_gradient: f32) -> Look {
     let reach = CENTRE as f32;
     let inside = |at: f32, side: usize| at >= reach && at < side as f32 - 1.0 - reach;
     if !(inside(u, image.width()) && inside(v, image.height())) {
@@ -165,7 +139,7 @@ const CENTRE: i32 = 3;
 const SIDE: usize = 2 * CENTRE as usize + 1;
 
 /// The bilinear samples around a position that is so many pixels inside, a pixel apart.
-fn around(image: &Image<u8>, u: f32, v: f32) -> [[f32; SIDE]; SIDE] {
+fn around(image: &SharedImage, u: f32, v: f32) -> [[f32; SIDE]; SIDE] {
     let (column, row) = (u as usize, v as usize);
     let (du, dv) = (u - column as f32, v - row as f32);
     let (left, top) = (column - CENTRE as usize, row - CENTRE as usize);

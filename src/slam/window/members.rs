@@ -194,7 +194,7 @@ mod tests {
 
     use super::*;
     use crate::slam::geometry::se3::SE3;
-    use crate::slam::image::buffer::Image;
+    use crate::slam::image::shared::SharedImage;
     use crate::slam::keyframe::DepthPoint;
     use crate::slam::test_scene::{CAMERA, Random};
     use crate::slam::window::keyframe::WindowPoint;
@@ -206,7 +206,8 @@ mod tests {
     /// A window of keyframes of a camera that wanders about the middle of a round room and turns, 30 to a turn.
     fn wandering(keyframes: usize) -> Window {
         let mut random = Random::new(9);
-        let blank = [Image::filled(CAMERA.width, CAMERA.height, 100)];
+        let pixels = vec![100; CAMERA.width * CAMERA.height].into();
+        let blank = [SharedImage::try_from_pixels(CAMERA.width, CAMERA.height, pixels).unwrap()];
         let mut window = Window::new(CAMERA, WindowParams::default());
         let hosts = (0..keyframes).map(|k| {
             let angle = std::f64::consts::TAU * k as f64 / 30.0;
@@ -230,7 +231,6 @@ mod tests {
             WindowKeyframe {
                 keyframe_id: k as u64,
                 epoch: 0,
-                image: Vec::new().into(),
                 images: Vec::new(),
                 camera_from_map: map_from_camera.inverse(),
                 unit: RADIUS,

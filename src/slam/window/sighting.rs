@@ -1,6 +1,7 @@
 //! Whether an image shows the window's points where a camera is thought to be.
 
 use crate::slam::geometry::se3::SE3;
+use crate::slam::image::shared::SharedImage;
 use crate::slam::window::keyframe::WindowKeyframe;
 use crate::slam::window::members::FEWEST_COMMON;
 use crate::slam::window::surface::Surface;
@@ -33,15 +34,13 @@ impl Window {
             rotation: pose.rotation,
         };
         let map_from_camera = map_from_known * scaled(unit, keyframe_from_camera);
-        if pixels.len() != self.camera.width * self.camera.height {
-            return None;
-        }
+        let (width, height) = (self.camera.width, self.camera.height);
+        let image = SharedImage::try_from_pixels(width, height, pixels.into())?;
         // The last of them for as long as it is asked about.
         self.keyframes.push(WindowKeyframe {
             keyframe_id: u64::MAX,
             epoch,
-            image: pixels.into(),
-            images: Vec::new(),
+            images: vec![image],
             camera_from_map: map_from_camera.inverse(),
             unit,
             points: Vec::new(),
@@ -52,7 +51,7 @@ impl Window {
         let last = self.keyframes.len() - 1;
         let mut members = self.hosts_to_align_to(last);
         let at_rest: Vec<usize> =
-            members.iter().copied().filter(|&of| self.keyframes[of].images.is_empty()).collect();
+            members.iter().copied().filter(|&of| self.keyframes[of].images.len() == 1).collect();
         members.push(last);
         let is_aligned = members.len() > 1
             && self.align_last(&members, &ALIGNMENT_LEVELS, MAX_ALIGNMENT_ITERATIONS);

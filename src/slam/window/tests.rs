@@ -64,8 +64,9 @@ pub(super) fn exact_host(
     let mut keyframe = WindowKeyframe {
         keyframe_id,
         epoch: 0,
-        image: pixels.into(),
-        images: Vec::new(),
+        images: vec![
+            SharedImage::try_from_pixels(CAMERA.width, CAMERA.height, pixels.into()).unwrap(),
+        ],
         camera_from_map: map_from_camera.inverse(),
         unit: 1.0,
         points: Vec::new(),
@@ -84,7 +85,8 @@ pub(super) fn exact_host(
         })
         .collect();
     let params = WindowParams::default();
-    let chosen = selection::choose(&dense, &keyframe.image, &CAMERA, num_cells, 8.0, 0.3);
+    let chosen =
+        selection::choose(&dense, keyframe.images[0].pixels(), &CAMERA, num_cells, 8.0, 0.3);
     let points = chosen.iter().map(|of| {
         WindowPoint::new(
             (of.u, of.v),
@@ -244,13 +246,15 @@ fn what_one_keyframe_alone_shows_is_left_out() {
     // Something stands before a sixth of the view of one keyframe.
     let mut random = Random::new(9);
     let hidden = &mut room.keyframes[2];
+    let mut pixels = hidden.images[0].pixels().to_vec();
     for row in 60..180 {
         for column in 120..220 {
             let grey = (255.0 * random.uniform()) as u8;
-            Arc::make_mut(&mut hidden.image)[row * CAMERA.width + column] = grey;
+            pixels[row * CAMERA.width + column] = grey;
         }
     }
-    hidden.leave();
+    hidden.images =
+        vec![SharedImage::try_from_pixels(CAMERA.width, CAMERA.height, pixels.into()).unwrap()];
     hidden.take_part(&CAMERA);
     hidden.points.clear();
     let mut right = truth.clone();

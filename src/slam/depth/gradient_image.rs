@@ -1,0 +1,127 @@
+//! A keyframe's image with its gradients.
+
+use rayon::prelude::*;
+
+use crate::slam::image::buffer::Image;
+
+/// Pixels nearer to the border than this carry no depth: the matching pattern reaches 2 pixels, its
+/// gradients 1, and a bilinear sample 1 more.
+pub const BORDER_PX: usize = 4;
+
+/// Rows that a thread takes at least, where a row is cheap: waking another thread costs as much as
+/// thousands of pixels.
+pub(super) const BAND_ROWS: usize = 60;
+
+/// Grey level of a pixel without any light.
+const BLACK: u8 = 0;
+/// Grey level of a pixel that could be any brighter.
+const WHITE: u8 = 255;
+
+/// An image with its gradients, level 0, in few bytes: depth maps of two keyframes are at hand.
+#[derive(Debug, Clone)]
+pub struct GradientImage {
+    /// Brightness, 0 to 255.
+    pub intensity: Image<u8>,
+    /// Differences of the pixels to the right and the left, and below and above; 0 on the border.
+    differences: [Image<i16>; 2],
+}
+
+impl GradientImage {
+    /// A black image.
+    pub fn with_size(width: usize, height: usize) -> Self {
+        let flat = Image::filled(width, height, 0);
+        Self { intensity: Image::filled(width, height, 0), differences: [flat.clone(), flat] }
+    }
+
+    /// Takes the grey values of a frame of the same size and differentiates them.
+    pub fn fill(&mut self, pixels: &[u8]) {
+        let (width, height) = (self.width(), self.height());
+        let row = |v: usize| &pixels[v * width..(v + 1) * width];
+        self.intensity.pixels_mut().copy_from_slice(pixels);
+        let [along_u, along_v] =
+            self.differences.each_mut().map(|of| of.pixels_mut().par_chunks_exact_mut(width));
+        let rows = along_u.zip(along_v).enumerate().with_min_len(BAND_ROWS);
+        rows.filter(|(v, _)| (1..height - 1).contains(v)).for_each(|(v, (along_u, along_v))| {
+            let here = row(v);
+            for (out, (&left, &right)) in along_u[1..].iter_mut().zip(here.iter().zip(&here[2..])) {
+                *out = i16::from(right) - i16::from(left);
+            }
+            let ends = row(v - 1).iter().zip(row(v + 1)).skip(1).take(width - 2);
+            for (out, (&above, &below)) in along_v[1..].iter_mut().zip(ends) {
+                *out = i16::from(below) - i16::from(above);
+            }
+        });
+    }
+
+    /// (∂I/∂u, ∂I/∂v) by central difference of the pixel at this place in the image, grey levels a pixel; 0 on the border.
+    #[inline(always)]
+    pub fn gradient(&self, index: usize) -> (f32, f32) {
+        let [u, v] = &self.differences;
+        (half(u.pixels()[index]), half(v.pixels()[index]))
+    }
+
+    /// The gradients of a row of places in the image.
+    #[inline(always)]
+    pub fn gradients(&self, indices: std::ops::Range<usize>) -> impl Iterator<Item = (f32, f32)> {
+        let [u, v] = &self.differences;
+        let both = u.pixels()[indices.clone()].iter().zip(&v.pixels()[indices]);
+        both.map(|(&u, &v)| (half(u), half(v)))
+    }
+
+    /// ‖g‖ of the pixels of row `v` that are not on the border, grey levels a pixel.
+    #[inline(always)]
+    pub(super) fn strengths(&self, v: usize) -> impl Iterator<Item = f32> {
+        let row = v * self.width();
+        let gradients = self.gradients(row + BORDER_PX..row + self.width() - BORDER_PX);
+        gradients.map(|(gu, gv)| (gu * gu + gv * gv).sqrt())
+    }
+
+    /// Whether the pixels of row `v` that are not on the border, and the four beside each, are neither black nor
+    /// white: where the sensor ends, brightness is not what was seen and gradients are not where they appear.
+    #[inline(always)]
+    pub(super) fn unsaturated(&self, v: usize) -> impl Iterator<Item = bool> {
+        let (first, end) = (BORDER_PX, self.width() - BORDER_PX);
+        let row = |v: usize, from: usize, to: usize| &self.intensity.row(v)[from..to];
+        let beside = row(v, first - 1, end - 1).iter().zip(row(v, first + 1, end + 1));
+        let above_below = row(v - 1, first, end).iter().zip(row(v + 1, first, end));
+        row(v, first, end).iter().zip(beside).zip(above_below).map(|((at, (l, r)), (a, b))| {
+            let darkest = at.min(l).min(r).min(a).min(b);
+            let brightest = at.max(l).max(r).max(a).max(b);
+            (*darkest > BLACK) & (*brightest < WHITE)
+        })
+    }
+
+    /// Width in pixels.
+    pub fn width(&self) -> usize {
+        self.intensity.width()
+    }
+
+    /// Height in pixels.
+    pub fn height(&self) -> usize {
+        self.intensity.height()
+    }
+}
+
+/// Of a central difference over two pixels.
+#[inline(always)]
+fn half(difference: i16) -> f32 {
+    0.5 * f32::from(difference)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn gradients_are_central_differences() {
+        let (width, height) = (20, 16);
+        let pixels: Vec<u8> =
+            (0..width * height).map(|i| ((i % width) * 5 + (i / width) * 3) as u8).collect();
+        let mut image = GradientImage::with_size(width, height);
+        image.fill(&pixels);
+        assert_eq!(image.gradient(8 * width + 7), (5.0, 3.0));
+        assert_eq!(image.gradient(8 * width), (0.0, 0.0));
+        image.fill(&pixels.iter().map(|grey| 255 - grey).collect::<Vec<u8>>());
+        assert_eq!(image.gradient(8 * width + 7), (-5.0, -3.0));
+    }
+}
