@@ -30,6 +30,7 @@ use crate::service::results::output_folder::OutputFolder;
 use crate::service::results::record::{EndOfRun, RunRecord};
 use crate::service::results::results_error::ResultsError;
 use crate::service::results::set::{DEBUG_FOLDER, foreign_debug};
+use crate::service::schedule::give_back_large_blocks;
 use crate::service::shutdown::Shutdown;
 use crate::slam::pose::TrackingState;
 use crate::wire::place::Place;
@@ -105,6 +106,7 @@ pub struct ReplayArgs {
 pub fn run(config: &Config, args: ReplayArgs) -> Result<ExitCode, Box<dyn Error>> {
     let (name, rig) = args.source.clone().source_and_rig(&config.capture)?;
     let (args, config) = (&args, &meant_config(config, &args, &name)?);
+    give_back_large_blocks();
     let shutdown = Shutdown::install()?;
     let place = Place::new(&config.instance, &config.root)?;
     let output = OutputFolder::prepare(args.output.as_deref())?;

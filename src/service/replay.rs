@@ -19,7 +19,7 @@ use crate::service::refused_images::RefusedImages;
 use crate::service::rehearsal::Rehearsal;
 use crate::service::results::record::{RecordedPose, Rejection, RunMode, RunRecord};
 use crate::service::schedule::{Background, peak_rss_bytes};
-use crate::slam::alignment::reference::{Reference, ReferenceScratch};
+use crate::slam::alignment::reference::Reference;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::frame::FrameView;
 use crate::slam::image::buffer::Image;
@@ -200,7 +200,6 @@ struct Replay<'a> {
     rehearsal: Rehearsal,
     /// Memory of the reference that the tracker gave back.
     spare: Option<Box<Reference>>,
-    scratch: ReferenceScratch,
     record: RunRecord,
     adjustments: Adjustments,
     stamps: Option<(FrameStamp, FrameStamp)>,
@@ -243,7 +242,6 @@ impl<'a> Replay<'a> {
             given_poses: Vec::new(),
             rehearsal: Rehearsal::new(frames_to_come(source, config)),
             spare: None,
-            scratch: ReferenceScratch::default(),
             record: RunRecord {
                 is_depth_from_sensor: config.initial_depth == DepthOrigin::Sensor,
                 depth_scale: if given { DepthScale::Given } else { DepthScale::MedianRatio },
@@ -377,7 +375,7 @@ impl<'a> Replay<'a> {
         let Some(keyframe) = self.mapper.keyframe() else { return };
         let new = || Box::new(Reference::new(self.config.tracker.reference.clone()));
         let mut reference = self.spare.take().unwrap_or_else(new);
-        reference.prepare_into(keyframe, &mut self.scratch);
+        reference.prepare_into(keyframe, self.tracker.scratch());
         let is_found = Tracker::is_found_on(reference.keyframe_id());
         let is_first = self.tracker.reference().is_none();
         self.spare = self.tracker.adopt(reference);

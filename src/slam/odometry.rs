@@ -5,7 +5,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::slam::alignment::reference::{Reference, ReferenceScratch};
+use crate::slam::alignment::reference::Reference;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{Keyframe, MapState};
@@ -73,7 +73,6 @@ pub struct Odometry {
     mapper: Mapper,
     /// Memory of the reference that the tracker gave back.
     spare: Option<Box<Reference>>,
-    scratch: ReferenceScratch,
     estimate: Option<Estimate>,
     frames: u64,
 }
@@ -99,7 +98,6 @@ impl Odometry {
             mapper: Mapper::new(intrinsics, params.mapper.clone())?,
             params,
             spare: None,
-            scratch: ReferenceScratch::default(),
             estimate: None,
             frames: 0,
         })
@@ -198,7 +196,7 @@ impl Odometry {
         let Some(keyframe) = self.mapper.keyframe() else { return };
         let new = || Box::new(Reference::new(self.params.tracker.reference.clone()));
         let mut reference = self.spare.take().unwrap_or_else(new);
-        reference.prepare_into(keyframe, &mut self.scratch);
+        reference.prepare_into(keyframe, self.tracker.scratch());
         self.spare = self.tracker.adopt(reference);
     }
 }

@@ -11,7 +11,9 @@ pub mod verdict;
 use serde::{Deserialize, Serialize};
 
 use crate::slam::alignment::align::{Aligner, Alignment, AlignmentParams, Ending};
-use crate::slam::alignment::reference::{Reference, ReferenceParams, finest_level, num_levels};
+use crate::slam::alignment::reference::{
+    Reference, ReferenceParams, ReferenceScratch, finest_level, num_levels,
+};
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
@@ -159,6 +161,11 @@ impl Tracker {
             memory: Memory::default(),
             params,
         })
+    }
+
+    /// Memory for references that are prepared on its thread.
+    pub fn scratch(&mut self) -> &mut ReferenceScratch {
+        self.turning.scratch()
     }
 
     /// Makes a prepared reference the active one and gives back the one before, for its memory. The

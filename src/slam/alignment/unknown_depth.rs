@@ -44,6 +44,11 @@ impl UnknownDepth {
         reference.prepare_view(intrinsics, pyramid, &self.points, modes, &mut self.scratch);
     }
 
+    /// The memory that it prepares in, for other references.
+    pub fn scratch(&mut self) -> &mut ReferenceScratch {
+        &mut self.scratch
+    }
+
     /// The pixels of the finest level with gradient, as points of level 0.
     fn choose(&mut self, pyramid: &SumPyramid) {
         self.points.clear();

@@ -8,7 +8,7 @@
 use nalgebra::{Matrix3, Matrix6};
 
 use crate::slam::alignment::align::{Aligner, Alignment, AlignmentParams, Ending};
-use crate::slam::alignment::reference::Reference;
+use crate::slam::alignment::reference::{Reference, ReferenceScratch};
 use crate::slam::alignment::unknown_depth::UnknownDepth;
 use crate::slam::depth::common_error::{full_covariance, rotation_std_dev};
 use crate::slam::frame::FrameView;
@@ -159,6 +159,11 @@ impl Turning {
             frames: Frames::default(),
             is_due: false,
         }
+    }
+
+    /// The memory that views are prepared in.
+    pub(super) fn scratch(&mut self) -> &mut ReferenceScratch {
+        self.unknown.scratch()
     }
 
     /// Keeps the frame in `pyramid`, into which another will be filled.
