@@ -222,12 +222,14 @@ fn a_mapper_that_hangs_is_started_again_and_said() {
 #[test]
 fn a_process_that_hangs_in_lockstep_ends_the_run_with_its_name() {
     let rig = Rig::new();
-    let watchdog = ["--set", "supervisor.watchdog_s=2"];
+    // A disk that holds a process up for two seconds is no hang.
+    let watchdog = ["--set", "supervisor.watchdog_s=5"];
     let mut command = rig.run(40, &["--lockstep", "--source", "loop:1000000:30:sim"]);
-    let run = command.args(watchdog).spawn().unwrap();
+    let mut run = command.args(watchdog).spawn().unwrap();
     let hub = rig.observe();
     let mut tracker = until("the tracker", || Peer::open(&hub, &HEALTH_TOPICS[TRACKER]).ok());
     let id = until("frames", || {
+        assert_eq!(run.try_wait().unwrap(), None, "the run has ended before");
         let health = tracker.update().unwrap();
         health.filter(|health| health.frames > 5).map(|health| health.process_id)
     });
