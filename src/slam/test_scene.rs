@@ -1,6 +1,8 @@
 //! An analytic scene for tests: a textured room with boxes in it, rendered by ray casting with exact
 //! depth.
 
+use std::ops::Range;
+
 use nalgebra::Vector3;
 
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -62,12 +64,12 @@ struct Cuboid {
 }
 
 impl Cuboid {
-    /// Where a ray enters and leaves, as multiples of its direction, with the axes of the faces.
-    fn cross(&self, origin: &Vector3<f64>, ray: &Vector3<f64>) -> Option<[(f64, usize); 2]> {
+    /// Where a ray of this `inverse` direction enters and leaves, as multiples of its direction, with the axes of the faces.
+    fn cross(&self, origin: &Vector3<f64>, inverse: &Vector3<f64>) -> Option<[(f64, usize); 2]> {
         let (mut enter, mut leave) = ((f64::NEG_INFINITY, 0), (f64::INFINITY, 0));
         for axis in 0..3 {
-            let a = (self.low[axis] - origin[axis]) / ray[axis];
-            let b = (self.high[axis] - origin[axis]) / ray[axis];
+            let a = (self.low[axis] - origin[axis]) * inverse[axis];
+            let b = (self.high[axis] - origin[axis]) * inverse[axis];
             if a.min(b) > enter.0 {
                 enter = (a.min(b), axis);
             }
@@ -76,6 +78,26 @@ impl Cuboid {
             }
         }
         (enter.0 < leave.0).then_some([enter, leave])
+    }
+
+    /// Columns and rows in which a camera can see it: all where it reaches behind the camera.
+    fn seen_in(&self, camera: &Intrinsics, camera_from_world: &SE3) -> [Range<f64>; 2] {
+        const ALL: Range<f64> = f64::NEG_INFINITY..f64::INFINITY;
+        let mut seen = [f64::INFINITY..f64::NEG_INFINITY, f64::INFINITY..f64::NEG_INFINITY];
+        for corner in 0..8 {
+            let side = |axis: usize| if corner >> axis & 1 == 0 { self.low } else { self.high };
+            let at = Vector3::from_fn(|axis, _| side(axis)[axis]);
+            let at = *camera_from_world * at;
+            if at.z < 0.01 {
+                return [ALL, ALL];
+            }
+            let place = [camera.fx * at.x / at.z + camera.cx, camera.fy * at.y / at.z + camera.cy];
+            for (seen, place) in seen.iter_mut().zip(place) {
+                // A ray is at most a quarter of a pixel from its pixel's centre.
+                *seen = seen.start.min(place - 1.0)..seen.end.max(place + 1.0);
+            }
+        }
+        seen
     }
 }
 
@@ -172,19 +194,31 @@ impl Scene {
         };
         let mut intensity = Image::filled(camera.width, camera.height, 0.0);
         let mut inverse_depth = intensity.clone();
+        let mut cells = [Cell::default(); 3];
+        let camera_from_world = world_from_camera.inverse();
+        let seen = self.boxes.map(|cuboid| cuboid.seen_in(camera, &camera_from_world));
         for i in 0..camera.width * camera.height {
             let (u, v) = ((i % camera.width) as f64, (i / camera.width) as f64);
-            inverse_depth.pixels_mut()[i] = (1.0 / self.hit(&origin, &ray(u, v)).0) as f32;
+            let near = seen.each_ref().map(|[us, vs]| us.contains(&u) && vs.contains(&v));
+            inverse_depth.pixels_mut()[i] = (1.0 / self.hit(&origin, &ray(u, v), &near).0) as f32;
             let samples = [(-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)];
-            let sum: f64 =
-                samples.iter().map(|s| self.shade(&origin, &ray(u + s.0, v + s.1))).sum();
+            let mut shade = |s: (f64, f64)| {
+                let ray = ray(u + s.0, v + s.1);
+                self.shade(&origin, &ray, self.hit(&origin, &ray, &near), &mut cells)
+            };
+            let sum: f64 = samples.into_iter().map(&mut shade).sum();
             intensity.pixels_mut()[i] = (0.25 * sum) as f32;
         }
         Rendering { intensity, inverse_depth }
     }
 
-    fn shade(&self, origin: &Vector3<f64>, ray: &Vector3<f64>) -> f64 {
-        let (distance, axis, surface) = self.hit(origin, ray);
+    fn shade(
+        &self,
+        origin: &Vector3<f64>,
+        ray: &Vector3<f64>,
+        (distance, axis, surface): (f64, usize, u64),
+        cells: &mut [Cell; 3],
+    ) -> f64 {
         let at = origin + ray * distance;
         let (x, y) = match axis {
             0 => (at.y, at.z),
@@ -192,15 +226,22 @@ impl Scene {
             _ => (at.x, at.y),
         };
         let repeated = |x: f64| self.period.map_or(x, |period| x.rem_euclid(period));
-        self.texture(surface * 3 + axis as u64, repeated(x), repeated(y))
+        self.texture(surface * 3 + axis as u64, repeated(x), repeated(y), cells)
     }
 
-    /// Distance along the ray (depth, for rays of unit depth), axis of the face and surface.
-    fn hit(&self, origin: &Vector3<f64>, ray: &Vector3<f64>) -> (f64, usize, u64) {
-        let [_, wall] = self.room.cross(origin, ray).unwrap_or([(0.0, 0), (1.0, 0)]);
+    /// Distance along the ray (depth, for rays of unit depth), axis of the face and surface; of the boxes only those that
+    /// are `near` the ray are looked at.
+    fn hit(
+        &self,
+        origin: &Vector3<f64>,
+        ray: &Vector3<f64>,
+        near: &[bool; 4],
+    ) -> (f64, usize, u64) {
+        let inverse = ray.map(|along| 1.0 / along);
+        let [_, wall] = self.room.cross(origin, &inverse).unwrap_or([(0.0, 0), (1.0, 0)]);
         let mut nearest = (wall.0, wall.1, 0);
-        for (index, cuboid) in self.boxes.iter().enumerate() {
-            if let Some([(enter, axis), _]) = cuboid.cross(origin, ray)
+        for (index, cuboid) in self.boxes.iter().enumerate().filter(|(index, _)| near[*index]) {
+            if let Some([(enter, axis), _]) = cuboid.cross(origin, &inverse)
                 && enter > 0.0
                 && enter < nearest.0
             {
@@ -211,27 +252,44 @@ impl Scene {
     }
 
     /// Smooth noise of three sizes and soft-edged stripes, so that there are corners and edges.
-    fn texture(&self, surface: u64, x: f64, y: f64) -> f64 {
+    fn texture(&self, surface: u64, x: f64, y: f64, [fine, middle, coarse]: &mut [Cell; 3]) -> f64 {
         let surface = surface ^ (self.seed << 8);
-        let noise = 45.0 * lattice_noise(surface, x / 0.06, y / 0.06)
-            + 50.0 * lattice_noise(surface ^ 0x55, x / 0.2, y / 0.2)
-            + 60.0 * lattice_noise(surface ^ 0xAA, x / 0.7, y / 0.7);
-        let stripes = 25.0 * ((4.0 * x + 1.5 * y).sin() * 12.0).tanh();
+        let noise = 45.0 * fine.noise(surface, x / 0.06, y / 0.06)
+            + 50.0 * middle.noise(surface ^ 0x55, x / 0.2, y / 0.2)
+            + 60.0 * coarse.noise(surface ^ 0xAA, x / 0.7, y / 0.7);
+        // tanh z, of the one function that is fast.
+        let tanh = |z: f64| 1.0 - 2.0 / ((2.0 * z).exp() + 1.0);
+        let stripes = 25.0 * tanh((4.0 * x + 1.5 * y).sin() * 12.0);
         128.0 + self.contrast * (noise + stripes)
     }
 }
 
-/// Value noise in [-1, 1], smooth between the points of a unit lattice.
-fn lattice_noise(seed: u64, x: f64, y: f64) -> f64 {
-    let (column, row) = (x.floor(), y.floor());
-    let corner = |dx: f64, dy: f64| {
-        let cell = ((column + dx) as i64 as u64).wrapping_mul(0x9E37_79B9)
-            ^ ((row + dy) as i64 as u64).wrapping_mul(0x85EB_CA6B_1234_5677);
-        2.0 * Random::new(cell ^ seed.wrapping_mul(0x2545_F491_4F6C_DD1D)).uniform() - 1.0
-    };
-    let smooth = |t: f64| t * t * (3.0 - 2.0 * t);
-    let (fx, fy) = (smooth(x - column), smooth(y - row));
-    let upper = corner(0.0, 0.0) * (1.0 - fx) + corner(1.0, 0.0) * fx;
-    let lower = corner(0.0, 1.0) * (1.0 - fx) + corner(1.0, 1.0) * fx;
-    upper * (1.0 - fy) + lower * fy
+/// A cell of a unit lattice, and the noise at its corners: those of the ray before are mostly those of the next.
+#[derive(Clone, Copy, Default)]
+struct Cell {
+    /// Seed of the lattice, column and row; `None` before the first.
+    place: Option<(u64, i64, i64)>,
+    corners: [[f64; 2]; 2],
+}
+
+impl Cell {
+    /// Value noise in [-1, 1], smooth between the points of the lattice.
+    fn noise(&mut self, seed: u64, x: f64, y: f64) -> f64 {
+        let below = |x: f64| x as i64 - i64::from(x < (x as i64) as f64);
+        let (column, row) = (below(x), below(y));
+        let place = Some((seed, column, row));
+        if self.place != place {
+            let corner = |dx: i64, dy: i64| {
+                let cell = ((column + dx) as u64).wrapping_mul(0x9E37_79B9)
+                    ^ ((row + dy) as u64).wrapping_mul(0x85EB_CA6B_1234_5677);
+                2.0 * Random::new(cell ^ seed.wrapping_mul(0x2545_F491_4F6C_DD1D)).uniform() - 1.0
+            };
+            let corners = [0, 1].map(|dy| [0, 1].map(|dx| corner(dx, dy)));
+            *self = Self { place, corners };
+        }
+        let smooth = |t: f64| t * t * (3.0 - 2.0 * t);
+        let (fx, fy) = (smooth(x - column as f64), smooth(y - row as f64));
+        let [upper, lower] = self.corners.map(|[left, right]| left * (1.0 - fx) + right * fx);
+        upper * (1.0 - fy) + lower * fy
+    }
 }
