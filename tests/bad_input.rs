@@ -246,10 +246,14 @@ fn a_full_standard_output_is_an_error_and_a_reader_that_leaves_is_none() {
     command.stdout(fs::OpenOptions::new().write(true).open("/dev/full").unwrap());
     assert_refused(&finish(command), &["standard output"], "/dev/full");
 
-    let (reader, writer) = std::io::pipe().unwrap();
-    drop(reader);
-    let mut command = evaluate();
-    command.stdout(writer);
-    let ended = finish(command);
-    assert!(ended.status.success() && ended.stderr.is_empty(), "{}", ended.stderr);
+    let mut replay = rig.command(&["replay", "--output", rig.output().to_str().unwrap()]);
+    replay.arg(&folder);
+    for mut command in [evaluate(), replay] {
+        let (reader, writer) = std::io::pipe().unwrap();
+        drop(reader);
+        command.stdout(writer);
+        let ended = finish(command);
+        assert!(ended.status.success(), "{}", ended.stderr);
+        assert!(!ended.stderr.contains("error"), "{}", ended.stderr);
+    }
 }

@@ -23,13 +23,14 @@ fn poses_and_map_are_those_of_a_replay() {
     let camera = source.intrinsics();
     let mut odometry = Odometry::new(camera, OdometryParams::default()).unwrap();
     let mut pixels = vec![0; camera.width * camera.height];
-    let mut poses = Vec::new();
+    let (mut poses, mut frames) = (Vec::new(), Vec::new());
     while let Some(stamp) = source.next_into(&mut pixels).unwrap() {
         let frame = FrameView {
             exposure_nanos: stamp.exposure_nanos,
             ..FrameView::new(&camera, stamp.sequence, stamp.capture_nanos, &pixels)
         };
         poses.push(odometry.push(&frame));
+        frames.push(pixels.clone());
     }
     odometry.finish();
     assert_eq!(poses.len(), record.poses.len());
@@ -44,6 +45,7 @@ fn poses_and_map_are_those_of_a_replay() {
     for (keyframe, replayed) in odometry.keyframes().iter().zip(&record.map.keyframes) {
         assert_eq!(keyframe.map_from_keyframe, replayed.map_from_keyframe);
         assert_eq!(keyframe.points, replayed.points);
+        assert!(keyframe.image[..] == frames[keyframe.sequence as usize], "{}", keyframe.sequence);
     }
 }
 

@@ -15,7 +15,7 @@ use crate::command::capture::SourceArguments;
 use crate::command::ending::{Ending, note_unfinished, run_start};
 use crate::command::map::MapOptions;
 use crate::command::map_points::MapPointOptions;
-use crate::command::print::note;
+use crate::command::print::{PrintError, note};
 use crate::command::progress::Progress;
 use crate::service::config::Config;
 use crate::service::journal::folder::unfinished;
@@ -94,13 +94,16 @@ pub struct ReplayArgs {
     /// Seed of the simulator [default: simulator.seed]
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
-    /// Threads of the mapper; they do not change the result [default: mapper.threads]
+    /// Threads of the mapper, and of the results; they do not change either [default: mapper.threads]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: Option<u16>,
     /// Print the summary as JSON
     #[arg(long)]
     json: bool,
 }
+
+/// An error that comes from another thread.
+type SentError = dyn Error + Send + Sync;
 
 /// Replays, writes the results and prints the summary.
 pub fn run(config: &Config, args: ReplayArgs) -> Result<ExitCode, Box<dyn Error>> {
@@ -138,11 +141,17 @@ pub fn run(config: &Config, args: ReplayArgs) -> Result<ExitCode, Box<dyn Error>
         false => Ok(()),
     };
     let ending = Ending { output: &output, config, json: args.json, write_more: &write_more };
-    // In the memory that the replay has left.
+    // On the threads of the replay: what it has freed is theirs.
     let ended = pool.install(|| {
-        ending.finish(&record, source.as_mut(), journal).map_err(|error| error.to_string())
+        ending.finish(&record, source.as_mut(), journal).map_err(|error| -> Box<SentError> {
+            // Whether only the reader has gone is decided by its type.
+            match error.downcast::<PrintError>() {
+                Ok(error) => error,
+                Err(error) => error.to_string().into(),
+            }
+        })
     });
-    Ok(ended?)
+    ended.map_err(|error| -> Box<dyn Error> { error })
 }
 
 /// The configuration as the arguments change it; an error where that cannot be replayed.

@@ -442,6 +442,7 @@ impl<'a> Replay<'a> {
 
     /// The record, and whether the map was saved.
     fn finish(mut self, begin: Instant) -> Result<(RunRecord, Saved), ReplayError> {
+        self.mapper.give_back_frames();
         self.adjustments.finish(&mut self.mapper);
         let saved = self.map.map_or(Ok(()), |mut map| map.save_all(&self.mapper, &mut || ()));
         let mut record = self.record;

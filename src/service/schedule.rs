@@ -337,15 +337,15 @@ pub fn peak_rss_bytes() -> Option<u64> {
     u64::try_from(usage(libc::RUSAGE_SELF)?.ru_maxrss).ok()?.checked_mul(BYTES_PER_KB)
 }
 
-/// Has the allocator take every large block from the kernel and give it back when it is freed. By itself glibc's does so
-/// only until the first is freed, and then keeps what lies between blocks that stay: a fifth of a replay's memory.
+/// Has the allocator map every large block by itself and unmap it when it is freed. glibc otherwise raises its threshold
+/// with the first that is freed, and keeps the gaps between blocks that stay: a fifth of a replay's memory.
 pub fn give_back_large_blocks() {
-    /// Smaller than any image: glibc's own first threshold.
-    const LARGE_BYTES: libc::c_int = 128 << 10;
-    #[cfg(all(target_os = "linux", target_env = "gnu"))]
-    // SAFETY: it sets a number of the allocator, which takes its own lock.
-    unsafe {
-        libc::mallopt(libc::M_MMAP_THRESHOLD, LARGE_BYTES);
+    #[cfg(target_env = "gnu")]
+    {
+        /// glibc's first threshold; an image of 640×480 is larger.
+        const LARGE_BYTES: libc::c_int = 128 << 10;
+        // SAFETY: it sets a number of the allocator, which takes its own lock.
+        unsafe { libc::mallopt(libc::M_MMAP_THRESHOLD, LARGE_BYTES) };
     }
 }
 

@@ -121,7 +121,7 @@ pub struct Mapper {
     tracked: Vec<TrackedFrame>,
     /// Frames of a start that has not been proven.
     early: Vec<TrackedFrame>,
-    /// Copies of frames, for these lists and for `past`.
+    /// Copies of frames, for these lists, for `past` and for the keyframes of the map.
     copies: FrameCopies,
     /// Keyframes whose depth is final for now, until somebody asks for them.
     left: VecDeque<u64>,
@@ -314,6 +314,12 @@ impl Mapper {
     /// Every keyframe.
     pub fn map(&self) -> &Map {
         &self.map
+    }
+
+    /// Gives back the memory of frames that only later ones need: where none comes, before the last estimate.
+    pub fn give_back_frames(&mut self) {
+        self.past.clear();
+        self.copies.let_go();
     }
 
     /// Every keyframe, where nothing more is mapped.

@@ -84,8 +84,8 @@ pub struct Adjustment {
     pub iterations: u32,
 }
 
-/// Keyframes and points that are estimated together. It keeps its own copy of what it needs, so that it can work while
-/// the map continues; [`Window::take_in`] and [`Window::correction`] are the two places where they meet.
+/// Keyframes and points that are estimated together. It keeps its own copy of what it needs, but for the images, which never
+/// change, so that it can work while the map continues; [`Window::take_in`] and [`Window::correction`] are the two places where they meet.
 #[derive(Debug, Clone)]
 pub struct Window {
     params: WindowParams,

@@ -89,7 +89,7 @@ pub struct Reference {
     pyramid: SumPyramid,
 }
 
-/// Memory that a preparation works in and that no frame needs: one for all references of a thread.
+/// Memory that a preparation works in and that no frame needs; references can share it.
 #[derive(Debug, Clone, Default)]
 pub struct ReferenceScratch {
     fusion: DepthFusion,
@@ -98,7 +98,7 @@ pub struct ReferenceScratch {
 }
 
 impl ReferenceScratch {
-    /// The candidates of one level of the reference that was prepared last, before selection; on levels that are not
+    /// The candidates of one level of the usable keyframe that was prepared last, before selection; on levels that are not
     /// aligned, also those behind a jump in depth.
     pub fn candidates(&self, level: usize) -> &Candidates {
         self.fusion.level(level)

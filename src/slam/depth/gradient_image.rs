@@ -121,7 +121,9 @@ mod tests {
         image.fill(&pixels);
         assert_eq!(image.gradient(8 * width + 7), (5.0, 3.0));
         assert_eq!(image.gradient(8 * width), (0.0, 0.0));
-        image.fill(&pixels.iter().map(|grey| 255 - grey).collect::<Vec<u8>>());
-        assert_eq!(image.gradient(8 * width + 7), (-5.0, -3.0));
+        let step: Vec<u8> =
+            (0..width * height).map(|i| if i % width < 8 { 255 } else { 0 }).collect();
+        image.fill(&step);
+        assert_eq!(image.gradient(8 * width + 7), (-127.5, 0.0));
     }
 }

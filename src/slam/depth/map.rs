@@ -126,7 +126,8 @@ pub struct DepthMap {
     pub hypotheses: Image<Hypothesis>,
     /// Whether a pixel has enough gradient to carry depth.
     pub candidates: Image<bool>,
-    /// Σ (g_u², g_u g_v, g_v²) over the matching pattern around each candidate.
+    /// Σ (g_u², g_u g_v, g_v²) over the matching pattern around each candidate and each hypothesis that was restored; of
+    /// another image, or none, where the map is only carried to or from.
     pub structure: Image<[f32; 3]>,
     /// Memory for what arrives from the keyframe before, by band of its rows.
     pub(super) reprojected: Vec<Vec<Reprojected>>,
@@ -162,19 +163,22 @@ impl DepthMap {
         self.choose_candidates(min_gradient, max_candidates);
     }
 
-    fn sum_structure(&mut self) {
+    /// Sums the structure around all candidates and hypotheses.
+    pub(in crate::slam) fn sum_structure(&mut self) {
         let (width, height) = (self.image.width(), self.image.height());
-        let (candidates, image) = (&self.candidates, &self.image);
+        let (candidates, hypotheses, image) = (&self.candidates, &self.hypotheses, &self.image);
         let rows = self.structure.pixels_mut().par_chunks_exact_mut(width).enumerate();
         rows.with_min_len(BAND_ROWS).for_each(|(v, row)| {
             if !(BORDER_PX..height - BORDER_PX).contains(&v) {
                 return;
             }
-            let candidates = candidates.row(v);
+            let (candidates, hypotheses) = (candidates.row(v), hypotheses.row(v));
             for first in (BORDER_PX..width - BORDER_PX).step_by(LANES) {
                 // The last block is summed with some of the one before it, so that it is whole.
                 let first = first.min(width - BORDER_PX - LANES);
-                if !candidates[first..first + LANES].iter().any(|&candidate| candidate) {
+                let block = first..first + LANES;
+                let is_candidate = candidates[block.clone()].iter().any(|&candidate| candidate);
+                if !is_candidate && !hypotheses[block].iter().any(Hypothesis::is_some) {
                     continue;
                 }
                 let sums = structure_of_block(image, v * width + first);

@@ -247,6 +247,7 @@ mod tests {
     use super::*;
     use crate::slam::keyframe::DepthPoint;
     use crate::slam::mapper::MapperParams;
+    use crate::slam::mapper::depth_buffers::DepthBuffers;
     use crate::slam::mapper::reuse::ReuseParams;
     use crate::slam::place_covariance::PlaceCovariance;
     use crate::slam::pose::TrackingState;
@@ -380,6 +381,23 @@ mod tests {
         let (outcomes, _) = walk(params, 5, true);
         let [step, rest] = &outcomes[4];
         assert!(rest.points[1].len() > step.points[1].len());
+    }
+
+    #[test]
+    fn looking_whether_depth_is_left_behind_changes_none_of_it() {
+        let (_, mut mapper) = walk(MapperParams::default(), 3, true);
+        let before = mapper.depth.active.clone();
+        let (_, pixels) = seen(&Scene::new(8), &SE3::identity(), 1);
+        let frame = FrameView::new(&CAMERA, 3, 0, &pixels);
+        // It sees nothing of the keyframe, which is no given pose.
+        let pose =
+            PoseEstimate { alignment_covariance: [1e-6; 21], ..PoseEstimate::unknown(&frame) };
+        mapper.leaves_depth_behind(&frame, &pose);
+        let DepthBuffers { active, spare, .. } = &mapper.depth;
+        assert!(spare.image.intensity.pixels() == pixels && spare.structure.pixels().is_empty());
+        assert!(active.image.intensity == before.image.intensity);
+        assert!(active.hypotheses == before.hypotheses && active.candidates == before.candidates);
+        assert!(active.structure == before.structure);
     }
 
     #[test]

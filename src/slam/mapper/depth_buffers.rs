@@ -15,7 +15,7 @@ use crate::slam::mapper::maturing::Maturing;
 pub(super) struct DepthBuffers {
     /// The depth map of the active keyframe.
     pub(super) active: DepthMap,
-    /// Memory for the next; after a change the depth map of the keyframe before.
+    /// Memory for the next, without `structure`; after a change the depth map of the keyframe before.
     pub(super) spare: DepthMap,
     /// The immature points of the active keyframe.
     pub(super) points: IntervalFilter,
@@ -56,8 +56,8 @@ impl DepthBuffers {
         (self.unit, self.is_unit_open) = (1.0, false);
     }
 
-    /// The active depth becomes the spare one, and the other way round. What only observation needs stays with the active
-    /// one, of which it is no more.
+    /// The active depth becomes the spare one, and the other way round. `structure` stays with the active one, still that of
+    /// the image before: the active depth is restarted before it is observed, or swapped back.
     pub(super) fn swap(&mut self) {
         std::mem::swap(&mut self.active, &mut self.spare);
         std::mem::swap(&mut self.active.structure, &mut self.spare.structure);

@@ -11,30 +11,29 @@ const MOST_SPARE: usize = 30;
 #[derive(Debug, Default)]
 pub(super) struct FrameCopies {
     copies: Vec<Arc<[u8]>>,
-    /// The one of the frame at hand, by its sequence: a map begins with two frames in one step.
-    current: Option<(u64, Arc<[u8]>)>,
+    /// The one of the frame at hand.
+    current: Option<Arc<[u8]>>,
 }
 
 impl FrameCopies {
-    /// A new frame is at hand.
+    /// Another frame is at hand.
     pub(super) fn begin_frame(&mut self) {
         self.current = None;
     }
 
     /// The grey values of the frame at hand, copied when they are first asked for.
     pub(super) fn of(&mut self, frame: &FrameView<'_>) -> Arc<[u8]> {
-        if let Some((_, copy)) = self.current.as_ref().filter(|(of, _)| *of == frame.sequence) {
+        if let Some(copy) = &self.current {
             return Arc::clone(copy);
         }
         let copy = self.copy(frame.pixels);
-        self.current = Some((frame.sequence, Arc::clone(&copy)));
+        self.current = Some(Arc::clone(&copy));
         copy
     }
 
-    /// Gives back the memory of copies that nobody keeps, where no more frames come.
-    pub(super) fn forget_spare(&mut self) {
-        self.current = None;
-        self.copies.retain_mut(|copy| Arc::get_mut(copy).is_none());
+    /// Gives back the memory of copies that nobody keeps, and that of the others as soon as nobody does.
+    pub(super) fn let_go(&mut self) {
+        *self = Self::default();
     }
 
     fn copy(&mut self, pixels: &[u8]) -> Arc<[u8]> {
@@ -82,15 +81,6 @@ mod tests {
     }
 
     #[test]
-    fn two_frames_of_one_step_have_a_copy_each() {
-        let pixels = [1u8, 2].map(|grey| vec![grey; CAMERA.width * CAMERA.height]);
-        let frame = |k: usize| FrameView::new(&CAMERA, k as u64, 0, &pixels[k]);
-        let mut copies = FrameCopies::default();
-        copies.begin_frame();
-        assert_eq!([0, 1, 1, 0].map(|k| copies.of(&frame(k))[0]), [1, 2, 2, 1]);
-    }
-
-    #[test]
     fn memory_of_few_images_is_kept() {
         let mut copies = FrameCopies::default();
         let kept: Vec<_> = (0..100).map(|grey| copy_of(&mut copies, grey)).collect();
@@ -98,7 +88,8 @@ mod tests {
         drop(kept);
         let _ = copy_of(&mut copies, 0);
         assert_eq!(copies.copies.len(), MOST_SPARE);
-        copies.forget_spare();
-        assert_eq!(copies.copies.len(), 0);
+        let kept = copy_of(&mut copies, 7);
+        copies.let_go();
+        assert_eq!((Arc::strong_count(&kept), kept[0]), (1, 7));
     }
 }

@@ -122,8 +122,6 @@ impl Mapper {
     pub fn begin_last_adjustment(&mut self) -> Option<Box<Window>> {
         let (mut window, _) = self.take_window()?;
         window.take_frames(&mut self.tracked);
-        self.past.clear();
-        self.copies.forget_spare();
         window.conclude();
         Some(window)
     }

@@ -265,6 +265,7 @@ impl Mapper {
         self.anchor(keyframe.keyframe_id, keyframe_from_camera);
         self.past.clear();
         self.drop_early_frames();
+        self.start.give_up();
         self.phase = Phase::Mapping;
         self.doubt = Doubt::None;
         if self.is_locating() {
@@ -313,6 +314,8 @@ pub(super) fn restore_points(map: &mut DepthMap, points: &[DepthPoint]) {
             };
         }
     }
+    // Those of another image, or of other parameters, need not be candidates.
+    map.sum_structure();
 }
 
 #[cfg(test)]

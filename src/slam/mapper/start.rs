@@ -59,9 +59,13 @@ impl Start {
 
     /// Forgets what it has seen.
     pub(super) fn forget(&mut self) {
-        self.first = None;
+        self.give_up();
         self.progress = StartProgress::default();
-        self.initializer = None;
+    }
+
+    /// A map is there without it: gives its memory back.
+    pub(super) fn give_up(&mut self) {
+        (self.first, self.initializer) = (None, None);
     }
 
     /// Takes another frame; once parallax is proven gives what was found.
@@ -124,6 +128,7 @@ impl Mapper {
             };
         }
         self.drop_early_frames();
+        self.start.give_up();
         let (origin, _) = self.origin(pose);
         self.begin_epoch(frame.pixels);
         if let Some(sensor) = sensor_depth {
@@ -226,6 +231,8 @@ impl Mapper {
             FrameView { sequence: first.0, capture_nanos: first.1, pixels: first_pixels, ..*frame };
         let place = UncertainPlace::exact(Sim3::new(origin, unit * scale));
         self.add_keyframe(&first_frame, &place, epoch);
+        // A map begins with two frames in one step.
+        self.copies.begin_frame();
         let pose = PoseEstimate {
             epoch,
             world_from_camera: Sim3::new(origin, unit).place(&start.first_from_current),

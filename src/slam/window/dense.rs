@@ -188,9 +188,13 @@ impl Window {
 
     /// Its images on the levels that are used.
     fn images_of(&self, keyframe: &WindowKeyframe) -> Vec<SharedImage> {
-        let levels = STEPS.len().min(num_levels(&self.camera));
-        let finest = keyframe.images.first().cloned();
-        std::iter::successors(finest, |finer| Some(finer.halved())).take(levels).collect()
+        let mut images: Vec<SharedImage> = keyframe.images.first().cloned().into_iter().collect();
+        while let Some(finer) = images.last()
+            && images.len() < STEPS.len().min(num_levels(&self.camera))
+        {
+            images.push(finer.halved());
+        }
+        images
     }
 
     fn observers<'a>(
