@@ -338,7 +338,7 @@ pub fn peak_rss_bytes() -> Option<u64> {
 }
 
 /// Has the allocator map every large block by itself and unmap it when it is freed. glibc otherwise raises its threshold
-/// with the first that is freed, and keeps the gaps between blocks that stay: a fifth of a replay's memory.
+/// with the first that is freed, and keeps the gaps between blocks that stay: an eighth of a replay's memory, a quarter with its results.
 pub fn give_back_large_blocks() {
     #[cfg(target_env = "gnu")]
     {

@@ -14,6 +14,7 @@
 mod description;
 mod pixels;
 
+use std::borrow::Cow;
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
@@ -112,7 +113,7 @@ fn most_small_points(num_pixels: usize) -> usize {
 pub fn encode(keyframe: &Keyframe, detail: MapDetail) -> Vec<u8> {
     let (width, height) = (keyframe.intrinsics.width, keyframe.intrinsics.height);
     let mut points = in_order(keyframe);
-    let (mut step, mut coded, mut is_own_brightness) = (0, Arc::clone(&keyframe.image), false);
+    let (mut step, mut coded, mut is_own_brightness) = (0, Cow::from(&keyframe.image[..]), false);
     match detail {
         MapDetail::Full => {
             is_own_brightness = points
@@ -122,7 +123,7 @@ pub fn encode(keyframe: &Keyframe, detail: MapDetail) -> Vec<u8> {
         MapDetail::Small => {
             points = best_of_groups(&points, most_small_points(width * height));
             let (by, small) = small_image(&keyframe.image, width, height);
-            (step, coded) = (by, small.into());
+            (step, coded) = (by, Cow::from(small));
         }
     }
     let depths = Logarithms::of(points.iter().map(|point| point.inverse_depth));

@@ -478,6 +478,24 @@ mod tests {
     }
 
     #[test]
+    fn points_that_are_no_candidates_have_the_gradients_of_their_image() {
+        let keyframe = Scene::new(4).keyframe(0, SE3::identity(), 1.0);
+        let restored = |before: u64| {
+            let mut map = DepthMap::with_size(CAMERA.width, CAMERA.height);
+            map.restart(&Scene::new(before).keyframe(0, SE3::identity(), 1.0).image, 1.0, 100_000);
+            // Hardly any is a candidate.
+            map.restart(&keyframe.image, 100.0, 100_000);
+            restore_points(&mut map, &keyframe.points);
+            map
+        };
+        let (one, other) = (restored(5), restored(6));
+        for point in &keyframe.points {
+            let at = |map: &DepthMap| map.structure.at(usize::from(point.u), usize::from(point.v));
+            assert_eq!(at(&one), at(&other), "{} {}", point.u, point.v);
+        }
+    }
+
+    #[test]
     fn a_depth_map_is_restored_from_its_points() {
         let scene = Scene::new(4);
         let keyframe = scene.keyframe(0, SE3::identity(), 1.0);
