@@ -1,6 +1,6 @@
 //! What a fuzz target does with its bytes: everything that semidense reads from files and from shared
 //! memory, each in one function. None may panic, hang or take memory without bound; what is accepted must
-//! hold what its type promises. `tests/fuzz_findings.rs` runs the seeds and all that was found through the
+//! hold what its type promises. `tests/files/fuzz_findings.rs` runs the seeds and all that was found through the
 //! same functions.
 
 use std::fs;

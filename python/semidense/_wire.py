@@ -1,6 +1,6 @@
 """The messages in shared memory. Generated from the Rust definitions: never edit it.
 
-SEMIDENSE_WRITE_WIRE=1 cargo test --test wire_table
+SEMIDENSE_WRITE_WIRE=1 cargo test --test repository wire_table
 """
 # ruff: noqa
 from __future__ import annotations

@@ -29,6 +29,7 @@ use crate::service::results::record::RunMode;
 use crate::service::shutdown::Shutdown;
 use crate::service::supervisor::{Ended, RunOptions, RunOutcome, run as supervise};
 use crate::service::view_child::{ViewChild, ViewOptions};
+use crate::wire::limits::raise_open_files;
 use crate::wire::place::Place;
 
 /// Run capture, tracker and mapper on a source, supervise them and write the results
@@ -72,6 +73,8 @@ pub fn run(
     let (source, rig) = arguments.source.source_and_rig(&config.capture)?;
     let mode = arguments.mode.mode(usual_mode(&source));
     let place = Place::new(&config.instance, &config.root)?;
+    // Where files are short whatever is opened next would take the blame.
+    raise_open_files()?;
     // First: a signal must find the folder's owner ready to remove it.
     let shutdown = Shutdown::install()?;
     let output = OutputFolder::prepare(arguments.output.as_deref())?;

@@ -172,7 +172,7 @@ pub struct ImmaturePoint {
 
 /// Standard deviations in half an interval. The interval is meant to hold the truth nearly always, so
 /// that it is 3σ: in the simulated room with 3 grey levels of noise 66, 83 and 88 % of the mature points
-/// are then within 1, 2 and 3 σ (`tests/interval_filter.rs` prints it), without noise 79, 87 and 90 %.
+/// are then within 1, 2 and 3 σ (`tests/estimation/interval_filter.rs` prints it), without noise 79, 87 and 90 %.
 pub const HALF_INTERVAL_SIGMAS: f32 = 3.0;
 
 /// Gradient, grey levels a pixel, at which the weight of a sample is one half.

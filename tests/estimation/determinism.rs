@@ -1,0 +1,139 @@
+//! The same bits for any number of threads, and for three processes as for one, on a sequence that
+//! initialises, tracks and changes keyframes.
+
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+
+use crate::support::{Rig, finish, small_camera};
+use serde_json::Value;
+
+/// Half-size images of the default room: 3 s, enough for a map and its first new keyframes.
+const SETTINGS: [&str; 4] = [
+    "simulator.frames=90",
+    "simulator.width=320",
+    "simulator.height=240",
+    "simulator.focal_px=262.5",
+];
+/// What must be equal.
+const FILES: [&str; 5] =
+    ["trajectory.txt", "trajectory_online.txt", "keyframes.txt", "map.ply", "points.ply"];
+
+/// Runs a command of the binary on the sequence and gives its summary.
+fn summary(mut command: Command, output: &Path) -> Value {
+    for setting in SETTINGS {
+        command.args(["--set", setting]);
+    }
+    command.arg("--json").arg("--output").arg(output);
+    let ended = finish(command);
+    assert!(ended.status.success(), "{}", ended.stderr);
+    serde_json::from_str(&ended.stdout).unwrap()
+}
+
+fn contents(output: &Path) -> [Vec<u8>; FILES.len()] {
+    FILES.map(|name| fs::read(output.join(name)).unwrap())
+}
+
+/// Compares file by file, so that a failure names the file and not a megabyte of bytes.
+fn assert_same(one: &[Vec<u8>], other: &[Vec<u8>], what: &str) {
+    for (name, (one, other)) in FILES.iter().zip(one.iter().zip(other)) {
+        assert!(one == other, "{name} differs: {what}");
+    }
+}
+
+#[test]
+fn threads_and_processes_do_not_change_a_bit() {
+    let rig = Rig::new();
+    let replayed = ["1", "2", "4"].map(|threads| {
+        let output = rig.folder().join(threads);
+        let figures = summary(rig.command(&["replay", "sim", "--threads", threads]), &output);
+        // Equal files of a run that never tracked would prove nothing.
+        assert!(figures["frames_tracked"].as_u64().unwrap() >= 45, "{figures}");
+        // … as would those of one whose keyframes were not estimated jointly.
+        assert!(figures["adjustments"].as_u64().unwrap() >= 3, "{figures}");
+        contents(&output)
+    });
+    assert_same(&replayed[0], &replayed[1], "1 and 2 threads");
+    assert_same(&replayed[0], &replayed[2], "1 and 4 threads");
+
+    let output = rig.folder().join("processes");
+    summary(rig.command(&["run", "--set", "mapper.threads=2"]), &output);
+    assert_same(&replayed[0], &contents(&output), "one process and three in lockstep");
+    assert_eq!(rig.leftovers(), Vec::<String>::new());
+}
+
+#[test]
+fn poses_that_a_run_has_only_in_its_journal_are_those_of_a_replay() {
+    let rig = Rig::new();
+    // Three hundred are written at a time.
+    let long = "loop:900:30:sim";
+    let small = small_camera(90).map(|setting| format!("--set=simulator.{setting}"));
+    let finished = |arguments: &[&str], output: &Path| {
+        let mut command = rig.command(arguments);
+        command.args(&small).arg("--output").arg(output);
+        let ended = finish(command);
+        assert!(ended.status.success(), "{}", ended.stderr);
+        contents(output)
+    };
+    let replayed = finished(&["replay", long], &rig.folder().join("replay"));
+    let run = finished(&["run", "--source", long], &rig.folder().join("run"));
+    assert_same(&replayed, &run, "poses in memory and in the journal");
+}
+
+#[test]
+fn no_depth_filter_depends_on_the_number_of_threads() {
+    let rig = Rig::new();
+    for filter in ["interval", "both", "gaussian"] {
+        let chosen = format!("mapping.depth_filter=\"{filter}\"");
+        let replayed = ["1", "3"].map(|threads| {
+            let output = rig.folder().join(format!("{filter}-{threads}"));
+            let arguments = ["replay", "sim", "--threads", threads, "--set", &chosen];
+            let figures = summary(rig.command(&arguments), &output);
+            assert!(figures["frames_tracked"].as_u64().unwrap() >= 45, "{filter}: {figures}");
+            assert!(figures["keyframes"].as_u64().unwrap() >= 2, "{filter}: {figures}");
+            contents(&output)
+        });
+        assert_same(&replayed[0], &replayed[1], &format!("{filter}, 1 and 3 threads"));
+    }
+}
+
+#[test]
+fn points_from_either_filter_do_not_depend_on_the_number_of_threads() {
+    let rig = Rig::new();
+    let [gaussian, interval] = ["gaussian", "interval"].map(|source| {
+        let chosen = format!("mapping.window.points_from=\"{source}\"");
+        let replayed = ["1", "2", "4"].map(|threads| {
+            let output = rig.folder().join(format!("{source}-{threads}"));
+            let arguments = ["replay", "sim", "--threads", threads, "--set", &chosen];
+            let figures = summary(rig.command(&arguments), &output);
+            assert!(figures["adjustments"].as_u64().unwrap() >= 3, "{source}: {figures}");
+            contents(&output)
+        });
+        assert_same(&replayed[0], &replayed[1], &format!("points from {source}, 1 and 2 threads"));
+        assert_same(&replayed[0], &replayed[2], &format!("points from {source}, 1 and 4 threads"));
+        replayed.into_iter().next().unwrap()
+    });
+    let points = FILES.iter().position(|name| *name == "points.ply").unwrap();
+    assert!(gaussian[points] != interval[points], "the switch changes no point");
+}
+
+#[test]
+fn passes_over_all_keyframes_do_not_depend_on_the_number_of_threads() {
+    let rig = Rig::new();
+    let of = |name: &str, threads: &str, every: &str| {
+        let output = rig.folder().join(name);
+        let mut arguments = vec!["replay", "sim", "--threads", threads];
+        // Keyframes of a short sequence are few: a pass begins with the third.
+        let every = format!("mapping.window.pass_every={every}");
+        for chosen in [&every, "mapping.window.num_first=2", "mapping.window.num_free=2"] {
+            arguments.extend(["--set", chosen]);
+        }
+        let figures = summary(rig.command(&arguments), &output);
+        (contents(&output), figures["adjustments"].as_u64().unwrap())
+    };
+    let [(one, estimates), (two, _), (four, _)] = ["1", "2", "4"].map(|n| of(n, n, "1"));
+    assert_same(&one, &two, "passes, 1 and 2 threads");
+    assert_same(&one, &four, "passes, 1 and 4 threads");
+    let (_, without) = of("without", "1", "0");
+    assert!(estimates > without, "no piece was estimated: {estimates} of {without}");
+}

@@ -1,0 +1,390 @@
+//! The rows of `docs/bad-inputs.md`.
+
+mod environment;
+
+use environment::{CONFIGURATION, LIMITS, OUTPUT, TRAJECTORIES};
+
+/// One thing that is tried.
+pub struct Row {
+    /// In words.
+    pub tried: &'static str,
+    /// What breaks the folder, in the shell.
+    pub setup: &'static str,
+    /// The command line, in the shell.
+    pub command: &'static str,
+    /// The exit code.
+    pub code: i32,
+    /// What must be said.
+    pub words: &'static [&'static str],
+}
+
+/// Rows about one kind of input.
+pub struct Section {
+    /// Its heading.
+    pub title: &'static str,
+    /// Its rows.
+    pub rows: &'static [Row],
+}
+
+pub const INTRODUCTION: &str = "\
+# Bad inputs
+
+The messages of semidense for wrong inputs, and its exit code: 0 done (it says what was left out), 1 failed, 2 wrong \
+command line, 3 nothing was tracked, 130 stopped by Ctrl-C. Every row is run by `tests/files/bad_input.rs`, which fails when the \
+program says anything else than this page; `SEMIDENSE_WRITE_DOCS=1 cargo test --release --test files bad_input` writes the page. `recording` is a folder \
+in TUM layout with twenty images of 160x120 pixels, `rig.toml` its camera, `…` the folder where the command runs, N a number \
+that depends on the machine.
+";
+
+const fn row(
+    tried: &'static str,
+    setup: &'static str,
+    command: &'static str,
+    code: i32,
+    words: &'static [&'static str],
+) -> Row {
+    Row { tried, setup, command, code, words }
+}
+
+pub const SECTIONS: &[Section] = &[
+    Section { title: "Sources", rows: SOURCES },
+    Section { title: "Images", rows: IMAGES },
+    Section { title: "Lists", rows: LISTS },
+    Section { title: "Rigs and calibrations", rows: RIGS },
+    Section { title: "Cameras", rows: CAMERAS },
+    Section { title: "Configuration", rows: CONFIGURATION },
+    Section { title: "Output", rows: OUTPUT },
+    Section { title: "Trajectories", rows: TRAJECTORIES },
+    Section { title: "Limits, shared memory and the runtime folder", rows: LIMITS },
+];
+
+const SOURCES: &[Row] = &[
+    row("a folder that is not there", "", "semidense run nowhere", 1, &["nowhere", "No such file"]),
+    row("the same with its layout", "", "semidense replay tum:nowhere", 1, &["no folder nowhere"]),
+    row("a kind that is not known", "", "semidense run ros:topic", 1, &["unknown kind"]),
+    row("no folder after the kind", "", "semidense run euroc:", 1, &["the folder is missing"]),
+    row("a scene that is not known", "", "semidense run sim:moon", 1, &["sim:moon"]),
+    row("an empty folder", "mkdir empty", "semidense run empty", 1, &["it is empty", "rgb.txt"]),
+    row(
+        "a folder with something else",
+        "mkdir other; touch other/a.txt other/b.bin",
+        "semidense replay other",
+        1,
+        &["found a.txt, b.bin"],
+    ),
+    row(
+        "the folder above a recording",
+        "mkdir outer; mv recording outer",
+        "semidense run outer",
+        1,
+        &["there is a recording in it: tum:outer/recording"],
+    ),
+    row("another layout than named", "", "semidense run euroc:recording", 1, &["looks like tum:"]),
+    row(
+        "a video",
+        "touch walk.mp4",
+        "semidense run walk.mp4",
+        1,
+        &["ffmpeg -i 'walk.mp4'", "times.txt"],
+    ),
+    row("an archive", "touch a.zip", "semidense replay a.zip", 1, &["unpack it"]),
+    row("a ROS bag", "touch a.bag", "semidense replay a.bag", 1, &["convert it to MCAP"]),
+    row(
+        "a list in place of its folder",
+        "",
+        "semidense run recording/rgb.txt",
+        1,
+        &["name its folder, recording"],
+    ),
+    row("a loop without its numbers", "", "semidense run loop:sim", 1, &["loop:FRAMES:HZ:SOURCE"]),
+    row("a source twice", "", "semidense run recording --source sim", 2, &["cannot be used"]),
+];
+
+const IMAGES: &[Row] = &[
+    row(
+        "one image cut short",
+        "halve $(image 3)",
+        "semidense replay recording --output out",
+        0,
+        &["1 of 20 images"],
+    ),
+    row(
+        "the same in three processes",
+        "halve $(image 3)",
+        "semidense run recording --output out",
+        0,
+        &["damaged PNG"],
+    ),
+    row(
+        "one image missing",
+        "rm $(image 2)",
+        "semidense replay recording --output out",
+        0,
+        &["1 of 20 images"],
+    ),
+    row(
+        "one image empty",
+        "truncate -s 0 $(image 2)",
+        "semidense run recording --output out",
+        0,
+        &["is empty"],
+    ),
+    row(
+        "one image is text",
+        "echo hello > $(image 2)",
+        "semidense run recording --output out",
+        0,
+        &["neither PNG nor JPEG"],
+    ),
+    row(
+        "one image of another size",
+        "semidense simulate --frames 1 --width 32 --height 32 --output small; cp small/rgb/*.png $(image 4)",
+        "semidense run recording --output out",
+        0,
+        &["is 32x32 pixels where the rig says 160x120"],
+    ),
+    row(
+        "a folder named as an image",
+        "i=$(image 5); rm $i; mkdir $i",
+        "semidense run recording --output out",
+        0,
+        &["it is a folder"],
+    ),
+    row(
+        "a pipe named as an image",
+        "i=$(image 5); rm $i; mkfifo $i",
+        "semidense run recording --output out",
+        0,
+        &["a named pipe"],
+    ),
+    row(
+        "a device named as an image",
+        "ln -sf /dev/zero $(image 1)",
+        "semidense run recording --output out",
+        0,
+        &["a device"],
+    ),
+    row(
+        "a link that leads nowhere",
+        "ln -sf none $(image 1)",
+        "semidense run recording --output out",
+        0,
+        &["No such file"],
+    ),
+    row(
+        "half of the images cut short",
+        "for i in $(seq 1 2 20); do halve $(image $i); done",
+        "semidense replay recording --output out",
+        0,
+        &["10 of 20 images"],
+    ),
+    row(
+        "a bad image, strictly",
+        "halve $(image 3)",
+        "semidense replay --strict recording",
+        1,
+        &["damaged PNG"],
+    ),
+    row(
+        "the same in three processes, strictly",
+        "rm $(image 3)",
+        "semidense run --strict recording",
+        1,
+        &["No such file"],
+    ),
+    row(
+        "no good image",
+        "truncate -s 0 recording/rgb/*",
+        "semidense run recording",
+        1,
+        &["none of its 20 images"],
+    ),
+    row(
+        "all images of another size than the camera's",
+        "echo '100 100 50 50 320 240' > recording/camera.txt",
+        "semidense replay recording",
+        1,
+        &["none of its 20 images", "320x240"],
+    ),
+];
+
+const LISTS: &[Row] = &[
+    row(
+        "a list without images",
+        "echo '# none' > recording/rgb.txt",
+        "semidense run recording",
+        1,
+        &["has no frames"],
+    ),
+    row(
+        "stamps that go back",
+        "change recording/rgb.txt '4{h;d};5{p;x}'",
+        "semidense replay recording",
+        1,
+        &["line 5", "earlier"],
+    ),
+    row(
+        "two equal stamps",
+        "change recording/rgb.txt 4p",
+        "semidense replay recording",
+        1,
+        &["line 5", "same time stamp"],
+    ),
+    row(
+        "a line without a stamp",
+        "change recording/rgb.txt '4s/^[^ ]* //'",
+        "semidense run recording",
+        1,
+        &["line 4", "timestamp"],
+    ),
+    row(
+        "a stamp that is not a number",
+        "change recording/rgb.txt '3s/^[^ ]*/inf/'",
+        "semidense run recording",
+        1,
+        &["line 3", "`inf`"],
+    ),
+    row(
+        "a list that is not text",
+        r"printf '1.0 \377.png\n' > recording/rgb.txt",
+        "semidense replay recording",
+        1,
+        &["not UTF-8", "line 1"],
+    ),
+    row(
+        "a list that is a pipe",
+        "rm recording/rgb.txt; mkfifo recording/rgb.txt",
+        "semidense run tum:recording",
+        1,
+        &["a named pipe"],
+    ),
+    row(
+        "a list that is a folder",
+        "rm recording/rgb.txt; mkdir recording/rgb.txt",
+        "semidense run tum:recording",
+        1,
+        &["a folder"],
+    ),
+    row(
+        "a list that never ends",
+        "ln -sf /dev/zero recording/rgb.txt",
+        "semidense replay tum:recording",
+        1,
+        &["a device"],
+    ),
+    row(
+        "ground truth with a bad line",
+        "echo '99 1 2' >> recording/groundtruth.txt",
+        "semidense replay recording",
+        1,
+        &["groundtruth.txt", "eight numbers"],
+    ),
+    row(
+        "fewer stamps than images",
+        "mv recording/rgb images; echo 1 > images/times.txt",
+        "semidense run images --rig rig.toml",
+        1,
+        &["1 time stamps for 20 images"],
+    ),
+    row(
+        "images without stamps or rate",
+        "mv recording/rgb images",
+        "semidense run images --rig rig.toml",
+        1,
+        &["no times.txt", "rate_hz"],
+    ),
+];
+
+const RIGS: &[Row] = &[
+    row("no calibration", "rm recording/camera.txt", "semidense run recording", 1, &["--rig FILE"]),
+    row(
+        "a rig that is not there",
+        "",
+        "semidense run recording --rig none.toml",
+        1,
+        &["none.toml", "No such file"],
+    ),
+    row("a rig that is a folder", "", "semidense run recording --rig recording", 1, &["a folder"]),
+    row(
+        "a rig that never ends",
+        "",
+        "semidense replay recording --rig /dev/zero",
+        1,
+        &["a device"],
+    ),
+    row(
+        "a key that is not known",
+        "echo 'lens = 3' >> rig.toml",
+        "semidense run recording --rig rig.toml",
+        1,
+        &["unknown field `lens`"],
+    ),
+    row(
+        "something that is not a number",
+        "echo 'nan 131 79.5 59.5 160 120' > recording/camera.txt",
+        "semidense run recording",
+        1,
+        &["camera.txt", "nan"],
+    ),
+    row(
+        "a principal point outside the image",
+        "change rig.toml 's/cx = .*/cx = 999/'",
+        "semidense run recording --rig rig.toml",
+        1,
+        &["cx = 999", "0 to 159"],
+    ),
+    row(
+        "a field of view that no such lens has",
+        "change rig.toml 's/fx = .*/fx = 3/'",
+        "semidense run recording --rig rig.toml",
+        1,
+        &["fx = 3", "field of view"],
+    ),
+    row(
+        "a field of view that is unusual",
+        "change rig.toml 's/f\\([xy]\\) = .*/f\\1 = 2000/'; rm recording/camera.txt",
+        "semidense replay recording --rig rig.toml --output out",
+        3,
+        &["field of view of 4.6°"],
+    ),
+    row(
+        "the rig of another camera",
+        "change rig.toml 's/f\\([xy]\\) = .*/f\\1 = 140/'",
+        "semidense run recording --rig rig.toml --output out",
+        0,
+        &["rig.toml", "camera.txt", "differ by up to"],
+    ),
+    row("a rig for the simulator", "", "semidense run sim --rig rig.toml", 1, &["takes no rig"]),
+];
+
+const CAMERAS: &[Row] = &[
+    row("a camera without a rig", "", "semidense run v4l:/dev/video99", 1, &["needs a rig file"]),
+    row(
+        "a camera in lockstep",
+        "",
+        "semidense run --lockstep v4l:/dev/video99 --rig rig.toml",
+        1,
+        &["leave out --lockstep"],
+    ),
+    row(
+        "a camera to replay",
+        "",
+        "semidense replay v4l:0 --rig rig.toml",
+        1,
+        &["cannot be replayed", "semidense run v4l:0"],
+    ),
+    row(
+        "a camera to repeat",
+        "",
+        "semidense run loop:9:30:v4l:0 --rig rig.toml",
+        1,
+        &["cannot be repeated"],
+    ),
+    row(
+        "a camera that is not there, until Ctrl-C",
+        "",
+        "until_said waiting semidense run v4l:/dev/video99 --rig rig.toml --output out",
+        130,
+        &["waiting: there is no camera /dev/video99", "Ctrl-C stops the run"],
+    ),
+];

@@ -1,0 +1,68 @@
+//! What fuzzing starts from and what it has found, through the same functions as in `fuzz/`: each finding is
+//! a file in `fuzz/findings/TARGET/`.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::Path;
+
+use crate::{parsers, seeds};
+
+type Target = (&'static str, fn(&[u8]));
+
+/// Every target. A new one is listed here and in `fuzz/Cargo.toml`.
+const TARGETS: [Target; 11] = [
+    ("trajectory", parsers::trajectory),
+    ("rig", parsers::rig),
+    ("lists", parsers::lists),
+    ("image", parsers::image),
+    ("bag", parsers::bag),
+    ("configuration", parsers::configuration),
+    ("message", parsers::message),
+    ("map", parsers::map),
+    ("map_folder", parsers::map_folder),
+    ("journal", parsers::journal),
+    ("pipeline", parsers::pipeline),
+];
+
+#[test]
+fn every_seed_is_taken_whole_cut_and_broken() {
+    let mut seen = BTreeMap::new();
+    for seed in seeds::seeds() {
+        let (_, run) = TARGETS.iter().find(|(name, _)| *name == seed.target).expect(seed.target);
+        *seen.entry(seed.target).or_insert(0) += 1;
+        run(&seed.bytes);
+        // Some cuts and some flipped bytes, spread over it.
+        for i in 0..20 {
+            let place = i * seed.bytes.len() / 20;
+            run(&seed.bytes[..place]);
+            let mut broken = seed.bytes.clone();
+            broken[place] ^= 0xff;
+            run(&broken);
+        }
+    }
+    assert_eq!(seen.len(), TARGETS.len(), "a target without a seed: {seen:?}");
+}
+
+#[test]
+fn what_was_found_stays_mended() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz/findings");
+    let mut count = 0;
+    for (name, run) in TARGETS {
+        for entry in fs::read_dir(folder.join(name)).into_iter().flatten().flatten() {
+            run(&fs::read(entry.path()).unwrap());
+            count += 1;
+        }
+    }
+    let there_are = fs::read_dir(&folder).into_iter().flatten().flatten().count();
+    assert!(count >= there_are, "findings of a target that does not exist");
+}
+
+#[test]
+fn every_target_is_built_and_fed() {
+    let manifest =
+        fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("fuzz/Cargo.toml")).unwrap();
+    for (name, _) in TARGETS {
+        assert!(manifest.contains(&format!("fuzz_targets/{name}.rs")), "{name}");
+    }
+    assert_eq!(manifest.matches("fuzz_targets/").count(), TARGETS.len());
+}

@@ -1,0 +1,106 @@
+//! What the real binary does with cameras that are missing, are none, or are asked for wrongly. Cameras
+//! that are there are the matter of `deploy/robot-test`.
+
+use crate::support::{Ended, Rig, end, finish, signal, until};
+use rustix::process::Signal;
+use serde_json::Value;
+
+const WEBCAM: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/config/rigs/webcam.toml");
+
+fn assert_refused(ended: &Ended, words: &[&str]) {
+    assert_eq!(ended.status.code(), Some(1), "{}", ended.stderr);
+    let errors: Vec<_> = ended.stderr.lines().filter(|l| l.starts_with("error: ")).collect();
+    assert_eq!(errors.len(), 1, "{}", ended.stderr);
+    for word in words {
+        assert!(errors[0].contains(word), "`{word}` is not in: {}", errors[0]);
+    }
+}
+
+/// `run` and `capture` on a camera.
+fn start(rig: &Rig, command: &str, source: &str, more: &[&str]) -> std::process::Command {
+    let mut command = rig.command(&[command, "--source", source]);
+    if command.get_args().next().is_some_and(|name| name == "run") {
+        command.arg("--output").arg(rig.output());
+    }
+    command.args(more);
+    command
+}
+
+#[test]
+fn a_camera_needs_a_rig_and_does_not_wait() {
+    let rig = Rig::new();
+    for command in ["run", "capture"] {
+        let ended = finish(start(&rig, command, "v4l:0", &[]));
+        assert_refused(&ended, &["v4l:0: a camera needs a rig file", "--rig FILE"]);
+        let ended = finish(start(&rig, command, "v4l:0", &["--rig", WEBCAM, "--lockstep"]));
+        assert_refused(&ended, &["leave out --lockstep"]);
+    }
+    let ended = finish(rig.command(&["replay", "v4l:0", "--output", "/nowhere/output"]));
+    assert_refused(&ended, &["v4l:0: a camera cannot be replayed"]);
+    assert_eq!(rig.leftovers(), Vec::<String>::new());
+}
+
+#[test]
+fn what_is_no_camera_ends_the_run() {
+    let rig = Rig::new();
+    for command in ["run", "capture"] {
+        let ended = finish(start(&rig, command, "v4l:/dev/null", &["--rig", WEBCAM]));
+        assert_refused(&ended, &["/dev/null: is not a camera", "it is no video device"]);
+    }
+    assert_eq!(rig.leftovers(), Vec::<String>::new());
+}
+
+#[test]
+fn a_missing_camera_is_a_state() {
+    let rig = Rig::new();
+    let camera = "v4l:usb-nobody-has-this";
+    let child = start(&rig, "capture", camera, &["--rig", WEBCAM]).spawn().unwrap();
+    let capture = until("a state", || {
+        let status = finish(rig.command(&["status", "--once", "--json"]));
+        let status: Value = serde_json::from_str(&status.stdout).ok()?;
+        (status["capture"]["state"] == "stale").then(|| status["capture"].clone())
+    });
+    let cause = capture["cause"].as_str().unwrap();
+    assert!(cause.starts_with("there is no camera usb-nobody-has-this; plug it in"), "{cause}");
+    assert_eq!(capture["frames"], 0);
+    signal(&child, Signal::INT);
+    let ended = end(child);
+    assert_eq!(ended.status.code(), Some(130), "{}", ended.stderr);
+    // Said once, however often it is tried.
+    assert_eq!(ended.stderr.matches("there is no camera").count(), 1, "{}", ended.stderr);
+    assert_eq!(rig.leftovers(), Vec::<String>::new());
+}
+
+#[test]
+fn a_run_says_once_that_it_waits_for_a_camera() {
+    let rig = Rig::new();
+    for more in [&[][..], &["--json"]] {
+        let arguments = [&["--rig", WEBCAM], more].concat();
+        let mut child = start(&rig, "run", "v4l:usb-nobody-has-this", &arguments).spawn().unwrap();
+        let mut said = std::io::BufReader::new(child.stderr.take().unwrap());
+        let mut lines = String::new();
+        while !lines.contains("there is no camera") {
+            assert!(std::io::BufRead::read_line(&mut said, &mut lines).unwrap() > 0, "{lines}");
+        }
+        assert!(lines.contains("waiting: there is no camera"), "{lines}");
+        // A second line would come with it.
+        std::thread::sleep(std::time::Duration::from_millis(500));
+        signal(&child, Signal::INT);
+        std::io::Read::read_to_string(&mut said, &mut lines).unwrap();
+        assert_eq!(end(child).status.code(), Some(130), "{lines}");
+        assert_eq!(lines.matches("there is no camera").count(), 1, "{lines}");
+    }
+}
+
+#[test]
+fn cameras_are_listed() {
+    let rig = Rig::new();
+    let ended = finish(rig.command(&["cameras", "--json"]));
+    assert!(ended.status.success(), "{}", ended.stderr);
+    let list: Value = serde_json::from_str(&ended.stdout).unwrap();
+    for camera in list.as_array().unwrap() {
+        assert!(camera["path"].as_str().unwrap().starts_with("/dev/video"), "{camera}");
+    }
+    let ended = finish(rig.command(&["cameras"]));
+    assert!(ended.status.success() && !ended.stdout.is_empty(), "{}", ended.stderr);
+}

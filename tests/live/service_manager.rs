@@ -1,0 +1,165 @@
+//! What the service manager hears of the three processes: READY, STATUS, and WATCHDOG from the frame loop
+//! itself. The manager is a socket of the test.
+
+use std::io::ErrorKind;
+use std::os::unix::net::UnixDatagram;
+use std::process::Child;
+
+use crate::support::{Rig, WATCH_DOG, finish, signal, small_camera, until};
+use rustix::process::Signal;
+use semidense::wire::command::{Command, CommandClient};
+
+/// Time between two heartbeats that the manager allows: loops wake ten times in a second.
+const WATCHDOG_US: &str = "800000";
+/// Heartbeats that are waited for.
+const BEATS: usize = 5;
+
+/// The manager of one process, and what it has heard.
+struct Manager {
+    socket: UnixDatagram,
+    heard: Vec<String>,
+    child: Child,
+}
+
+impl Manager {
+    /// Starts a process as a manager would.
+    fn start(rig: &Rig, arguments: &[&str]) -> Self {
+        let path = rig.folder().join(format!("{}.notify", arguments[0]));
+        let socket = UnixDatagram::bind(&path).unwrap();
+        socket.set_nonblocking(true).unwrap();
+        let mut command = rig.command(arguments);
+        for setting in small_camera(40) {
+            command.args(["--set", &format!("simulator.{setting}")]);
+        }
+        command.env("NOTIFY_SOCKET", &path).env("WATCHDOG_USEC", WATCHDOG_US);
+        Self { socket, heard: Vec::new(), child: command.spawn().unwrap() }
+    }
+
+    fn listen(&mut self) {
+        let mut bytes = [0; 4096];
+        loop {
+            match self.socket.recv(&mut bytes) {
+                Ok(length) => self.heard.push(String::from_utf8(bytes[..length].to_vec()).unwrap()),
+                Err(error) if error.kind() == ErrorKind::WouldBlock => return,
+                Err(error) => panic!("{error}"),
+            }
+        }
+    }
+
+    /// Until something that was heard from the message `from` on is so.
+    fn until_heard(&mut self, from: usize, what: &str, is: impl Fn(&str) -> bool) {
+        until(what, || {
+            self.listen();
+            self.heard[from..].iter().any(|message| is(message)).then_some(())
+        });
+    }
+
+    fn until_beats(&mut self, count: usize) {
+        let before = self.beats();
+        until("heartbeats", || {
+            self.listen();
+            (self.beats() >= before + count).then_some(())
+        });
+    }
+
+    fn beats(&self) -> usize {
+        self.heard.iter().filter(|message| *message == "WATCHDOG=1").count()
+    }
+
+    fn says(&self, message: &str) -> bool {
+        self.heard.iter().any(|heard| heard == message)
+    }
+
+    /// Ends it, and listens until it has ended: a socket holds few messages.
+    fn stop(mut self) -> Vec<String> {
+        self.listen();
+        signal(&self.child, Signal::TERM);
+        until("its end", || {
+            self.listen();
+            self.child.try_wait().unwrap()
+        });
+        self.listen();
+        self.heard
+    }
+}
+
+#[test]
+fn all_three_are_ready_say_what_they_do_and_beat_while_a_source_stalls() {
+    let rig = Rig::new();
+    let mut tracker = Manager::start(&rig, &["tracker", "--live"]);
+    let mut mapper = Manager::start(&rig, &["mapper", "--live"]);
+    for waiting in [&mut tracker, &mut mapper] {
+        waiting.until_heard(0, "READY", |message| message == "READY=1");
+        waiting.until_heard(0, "a status", |message| message.starts_with("STATUS=ready"));
+        // Nobody sends a frame.
+        waiting.until_beats(BEATS);
+    }
+    let source = ["capture", "--live", "--source", "loop:1000000:20:sim"];
+    let mut capture = Manager::start(&rig, &source);
+    for at_work in [&mut capture, &mut tracker, &mut mapper] {
+        at_work.until_heard(0, "frames in a second", |message| {
+            message.starts_with("STATUS=running") && !message.contains("(0.0 frames/s")
+        });
+        at_work.until_beats(BEATS);
+        assert!(at_work.says("READY=1"));
+    }
+    let ready = capture.heard.iter().position(|message| message == "READY=1").unwrap();
+    let beat = capture.heard.iter().rposition(|message| message == "WATCHDOG=1").unwrap();
+    assert!(ready < beat, "{:?}", capture.heard);
+
+    // A source that stalls: its readers say so and live on, and what hangs does not beat.
+    signal(&capture.child, Signal::STOP);
+    for reader in [&mut tracker, &mut mapper] {
+        let from = reader.heard.len();
+        reader.until_heard(from, "a stale source", |message| message.starts_with("STATUS=stale"));
+        capture.listen();
+        let stopped = capture.beats();
+        reader.until_beats(BEATS);
+        capture.listen();
+        assert_eq!(capture.beats(), stopped, "a stopped process beats");
+    }
+    signal(&capture.child, Signal::CONT);
+    for reader in [&mut tracker, &mut mapper] {
+        let from = reader.heard.len();
+        reader.until_heard(from, "recovery", |message| message.starts_with("STATUS=running"));
+    }
+    for process in [capture, tracker, mapper] {
+        let heard = process.stop();
+        assert!(heard.iter().any(|message| message == "STOPPING=1"), "{heard:?}");
+        assert_eq!(heard.iter().filter(|message| *message == "READY=1").count(), 1);
+        assert!(heard.iter().all(|message| message.lines().count() == 1), "{heard:?}");
+    }
+    assert!(rig.leftovers().is_empty());
+}
+
+#[test]
+fn the_children_of_a_supervisor_leave_its_manager_alone() {
+    let rig = Rig::new();
+    let path = rig.folder().join("run.notify");
+    let socket = UnixDatagram::bind(&path).unwrap();
+    socket.set_nonblocking(true).unwrap();
+    let mut command = rig.run(20, &[]);
+    command.env("NOTIFY_SOCKET", &path).env("WATCHDOG_USEC", WATCHDOG_US);
+    let ended = finish(command);
+    assert!(ended.status.success(), "{}", ended.stderr);
+    let nothing = socket.recv(&mut [0; 64]).unwrap_err();
+    assert_eq!(nothing.kind(), ErrorKind::WouldBlock);
+}
+
+#[test]
+fn a_mapper_that_has_written_its_map_does_again_what_it_did() {
+    let rig = Rig::new();
+    let mut mapper = Manager::start(&rig, &["mapper", "--live"]);
+    mapper.until_heard(0, "a status", |message| message.starts_with("STATUS=ready ("));
+    let commands = CommandClient::open(&rig.observe()).unwrap();
+    let map = rig.folder().join("map.bin");
+    let from = mapper.heard.len();
+    commands.ask(&Command::SaveMap(map.clone()), WATCH_DOG, || true).unwrap();
+    assert!(map.exists());
+    mapper.until_heard(from, "its writing", |message| {
+        message.starts_with("STATUS=running: the map is being written")
+    });
+    mapper.until_heard(from, "what it did before", |message| message.starts_with("STATUS=ready ("));
+    drop(commands);
+    mapper.stop();
+}
