@@ -8,13 +8,13 @@ use std::ops::Range;
 
 use nalgebra::{DVector, Matrix6, Vector6};
 
-use crate::slam::alignment::kernel::{Kernel, SimdMode};
 use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::kernel::{Kernel, SimdMode};
 use crate::slam::window::comparison::{
     Compared, LANES, POSE, Pair, PairSums, Robustness, SAMPLES, Wanted, sum,
 };
 use crate::slam::window::elimination_kernel::{
-    Block, PADDED, PointRow, RowBlock, eliminate, lower,
+    Block, PADDED, PointElimination, PointRow, RowBlock, lower,
 };
 use crate::slam::window::factors::{Factors, solve};
 use crate::slam::window::functional::Functional;
@@ -363,7 +363,7 @@ impl System {
             let some = first..(first + CHUNK).min(self.points.len());
             self.collect(some, members, views, damping, memory);
             let Elimination { points, rows, reduced, right } = &mut *memory;
-            eliminate(kernel, points, rows, reduced, right);
+            kernel.run(PointElimination { points, rows, reduced, right });
         }
     }
 

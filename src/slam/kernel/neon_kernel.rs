@@ -2,38 +2,7 @@
 
 use std::arch::aarch64::*;
 
-use crate::slam::alignment::kernel::accumulate_kernel::accumulate;
-use crate::slam::alignment::kernel::lanes_kernel::{Lanes, Sample};
-use crate::slam::alignment::kernel::scatter_kernel::scatter;
-use crate::slam::alignment::normal_equations::NormalEquations;
-use crate::slam::alignment::points::LevelPoints;
-use crate::slam::alignment::residual::Evaluation;
-use crate::slam::alignment::scatter::GradientScatter;
-use crate::slam::image::buffer::Image;
-
-/// # Safety
-/// The CPU has NEON; `at` was made for the size of `image`.
-#[target_feature(enable = "neon")]
-pub unsafe fn accumulate_neon(
-    points: &LevelPoints,
-    image: &Image<u16>,
-    at: &Evaluation,
-) -> NormalEquations {
-    // SAFETY: this function's own contract.
-    unsafe { accumulate::<float32x4_t>(points, image, at) }
-}
-
-/// # Safety
-/// The CPU has NEON; `at` was made for the size of `image`.
-#[target_feature(enable = "neon")]
-pub unsafe fn scatter_neon(
-    points: &LevelPoints,
-    image: &Image<u16>,
-    at: &Evaluation,
-) -> GradientScatter {
-    // SAFETY: this function's own contract.
-    unsafe { scatter::<float32x4_t>(points, image, at) }
-}
+use crate::slam::kernel::lanes_kernel::{Lanes, Sample};
 
 impl Lanes for float32x4_t {
     const N: usize = 4;

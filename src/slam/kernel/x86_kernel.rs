@@ -2,62 +2,7 @@
 
 use std::arch::x86_64::*;
 
-use crate::slam::alignment::kernel::accumulate_kernel::accumulate;
-use crate::slam::alignment::kernel::lanes_kernel::{Lanes, Sample};
-use crate::slam::alignment::kernel::scatter_kernel::scatter;
-use crate::slam::alignment::normal_equations::NormalEquations;
-use crate::slam::alignment::points::LevelPoints;
-use crate::slam::alignment::residual::Evaluation;
-use crate::slam::alignment::scatter::GradientScatter;
-use crate::slam::image::buffer::Image;
-
-/// # Safety
-/// The CPU has AVX2 and FMA; `at` was made for the size of `image`.
-#[target_feature(enable = "avx2,fma")]
-pub unsafe fn accumulate_avx2(
-    points: &LevelPoints,
-    image: &Image<u16>,
-    at: &Evaluation,
-) -> NormalEquations {
-    // SAFETY: this function's own contract.
-    unsafe { accumulate::<__m256>(points, image, at) }
-}
-
-/// # Safety
-/// The CPU has AVX-512F; `at` was made for the size of `image`.
-#[target_feature(enable = "avx512f")]
-pub unsafe fn accumulate_avx512(
-    points: &LevelPoints,
-    image: &Image<u16>,
-    at: &Evaluation,
-) -> NormalEquations {
-    // SAFETY: this function's own contract.
-    unsafe { accumulate::<__m512>(points, image, at) }
-}
-
-/// # Safety
-/// The CPU has AVX2 and FMA; `at` was made for the size of `image`.
-#[target_feature(enable = "avx2,fma")]
-pub unsafe fn scatter_avx2(
-    points: &LevelPoints,
-    image: &Image<u16>,
-    at: &Evaluation,
-) -> GradientScatter {
-    // SAFETY: this function's own contract.
-    unsafe { scatter::<__m256>(points, image, at) }
-}
-
-/// # Safety
-/// The CPU has AVX-512F; `at` was made for the size of `image`.
-#[target_feature(enable = "avx512f")]
-pub unsafe fn scatter_avx512(
-    points: &LevelPoints,
-    image: &Image<u16>,
-    at: &Evaluation,
-) -> GradientScatter {
-    // SAFETY: this function's own contract.
-    unsafe { scatter::<__m512>(points, image, at) }
-}
+use crate::slam::kernel::lanes_kernel::{Lanes, Sample};
 
 /// Defines methods of `Lanes` that are one intrinsic each.
 macro_rules! intrinsics {
