@@ -14,7 +14,7 @@ use crate::slam::window::comparison::{
     Compared, LANES, POSE, Pair, PairSums, Robustness, SAMPLES, Wanted, sum,
 };
 use crate::slam::window::elimination_kernel::{
-    Block, PADDED, PointElimination, PointRow, RowBlock, lower,
+    Block, PADDED, PointRow, RowBlock, eliminate, lower,
 };
 use crate::slam::window::factors::{Factors, solve};
 use crate::slam::window::functional::Functional;
@@ -363,7 +363,7 @@ impl System {
             let some = first..(first + CHUNK).min(self.points.len());
             self.collect(some, members, views, damping, memory);
             let Elimination { points, rows, reduced, right } = &mut *memory;
-            kernel.run(PointElimination { points, rows, reduced, right });
+            eliminate(kernel, points, rows, reduced, right);
         }
     }
 
