@@ -11,6 +11,7 @@ pub mod fusion;
 pub mod geometry;
 pub mod graph;
 pub mod image;
+pub mod kernel;
 pub mod keyframe;
 pub mod loops;
 pub mod map;

@@ -13,7 +13,6 @@ use std::hint::black_box;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group};
 use semidense::slam::alignment::align::AlignmentParams;
-use semidense::slam::alignment::kernel::Kernel;
 use semidense::slam::alignment::reference::{
     Reference, ReferenceParams, ReferenceScratch, num_levels,
 };
@@ -21,6 +20,7 @@ use semidense::slam::alignment::residual::{Evaluation, accumulate_reference};
 use semidense::slam::alignment::scatter::GradientScatter;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::image::sums::SumPyramid;
+use semidense::slam::kernel::Kernel;
 use semidense::slam::pose::Brightness;
 use semidense::slam::tracker::{Tracker, TrackerParams};
 

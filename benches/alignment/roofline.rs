@@ -3,7 +3,7 @@
 use std::hint::black_box;
 use std::time::Instant;
 
-use semidense::slam::alignment::kernel::Kernel;
+use semidense::slam::kernel::Kernel;
 
 /// Independent chains of sums: two pipes with a latency of four cycles fused, six not, want up to
 /// twelve, and with two operands fourteen registers of the sixteen that AVX2 has are taken.

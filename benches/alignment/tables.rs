@@ -4,7 +4,6 @@ use std::hint::black_box;
 use std::time::Instant;
 
 use semidense::slam::alignment::align::AlignmentParams;
-use semidense::slam::alignment::kernel::{Kernel, SimdMode};
 use semidense::slam::alignment::points::{LANES, PointBlock};
 use semidense::slam::alignment::reference::{
     Reference, ReferenceParams, ReferenceScratch, num_levels,
@@ -13,6 +12,7 @@ use semidense::slam::alignment::residual::Evaluation;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::image::sums::SumPyramid;
+use semidense::slam::kernel::{Kernel, SimdMode};
 use semidense::slam::pose::Brightness;
 use semidense::slam::tracker::{Tracker, TrackerParams};
 

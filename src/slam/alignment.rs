@@ -7,7 +7,7 @@ pub mod align;
 mod damping;
 pub mod displacement;
 pub(crate) mod fusion;
-pub mod kernel;
+mod kernel;
 pub(crate) mod misfit;
 #[cfg(test)]
 mod mode_tests;

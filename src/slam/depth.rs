@@ -6,7 +6,6 @@
 //! at the pixels that [`candidate`] chooses (Engel, Koltun, Cremers 2018).
 
 pub mod candidate;
-mod carrying_kernel;
 pub mod common_error;
 pub mod epipolar;
 pub(crate) mod gain;
@@ -19,14 +18,12 @@ pub(crate) mod line_search;
 pub mod map;
 pub mod matching;
 mod neighbour_sums;
-mod observation_kernel;
 pub(crate) mod pattern;
 pub mod pose_noise;
 pub(crate) mod promise;
 pub mod propagation;
 pub mod regularisation;
 mod segment;
-mod smoothing_kernel;
 mod trace_kernel;
 
 pub use gain::Uncertainty;

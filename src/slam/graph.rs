@@ -20,10 +20,10 @@ mod system;
 #[cfg(test)]
 mod tests;
 
-use crate::slam::alignment::kernel::{Kernel, SimdMode};
 use crate::slam::graph::pose_graph::{PoseGraph, VertexId};
 use crate::slam::graph::solver::solve;
 use crate::slam::graph::system::error;
+use crate::slam::kernel::{Kernel, SimdMode};
 
 /// Most memory of the equations of a graph, and of their factor with what waits to be added to it, bytes each: 1 GiB, a
 /// quarter of a small robot's. Public graphs of 5 000 keyframes need less; ten constraints a keyframe at random between as

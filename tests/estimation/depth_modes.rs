@@ -10,9 +10,9 @@ use semidense::capture::simulator::params::SimulatorParams;
 use semidense::capture::source::FrameSource;
 use semidense::capture::source_name::SourceName;
 use semidense::service::replay::{PoseOrigin, ReplayConfig, replay};
-use semidense::slam::alignment::kernel::SimdMode;
 use semidense::slam::evaluation::depth_error::{DepthErrors, DepthScale};
 use semidense::slam::evaluation::depth_modes::DepthModes;
+use semidense::slam::kernel::SimdMode;
 
 /// Frames of a room.
 const FRAMES: usize = 150;

@@ -6,10 +6,10 @@ use semidense::capture::simulator::Simulator;
 use semidense::capture::simulator::params::SimulatorParams;
 use semidense::capture::source::FrameSource;
 use semidense::service::replay::{PoseOrigin, ReplayConfig, replay};
-use semidense::slam::alignment::kernel::SimdMode;
 use semidense::slam::evaluation::surface_error::{SeenPoint, TrueSurface};
 use semidense::slam::fusion::{FusionParams, fuse};
 use semidense::slam::geometry::sim3::Sim3;
+use semidense::slam::kernel::SimdMode;
 use semidense::slam::keyframe::Keyframe;
 use semidense::slam::trajectory::StampedPose;
 

@@ -16,7 +16,8 @@ use semidense::slam::geometry::se3::SE3;
 use semidense::slam::image::buffer::Image;
 use semidense::slam::image::noise::ImageNoise;
 use semidense::slam::image::quads::QuadImage;
-use semidense::slam::image::quads_kernel::{PortableSampler, Sampled};
+use semidense::slam::image::quads_kernel::Sampled;
+use semidense::slam::kernel::Portable;
 
 /// Frames of a sequence; every third observes the first one, over baselines up to 0.3 m.
 const FRAMES: usize = 19;
@@ -111,7 +112,7 @@ fn observe(
         return None;
     }
     let patch = Patch::new(&map.image, u, v, 1.0, 0.0);
-    let frame = Sampled { image: frame, sampler: PortableSampler };
+    let frame = Sampled { image: frame, sampler: Portable };
     let found = search(frame, &line, &patch, &conditioning, &from, &to, params).ok()?;
     Some(f64::from((found.inverse_depth - truth) / found.uncertainty.variance.sqrt()))
 }

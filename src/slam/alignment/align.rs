@@ -4,7 +4,6 @@ use nalgebra::{Matrix6, Matrix6x3, SVector, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::slam::alignment::damping::Damping;
-use crate::slam::alignment::kernel::{Kernel, SimdMode};
 use crate::slam::alignment::normal_equations::{NormalEquations, UNKNOWNS, pose_step};
 use crate::slam::alignment::reference::Reference;
 use crate::slam::alignment::residual::{Evaluation, Weighting, mean_squared_flow};
@@ -12,6 +11,7 @@ use crate::slam::alignment::scatter::GradientScatter;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::noise::ImageNoise;
 use crate::slam::image::sums::{MAX_LEVELS, SumPyramid};
+use crate::slam::kernel::{Kernel, SimdMode};
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::Brightness;
 

@@ -4,7 +4,6 @@
 use nalgebra::{Matrix6, SMatrix, Vector3, Vector6};
 
 use crate::slam::alignment::align::{Aligner, Alignment, AlignmentParams};
-use crate::slam::alignment::kernel::Kernel;
 use crate::slam::alignment::normal_equations::UNKNOWNS;
 use crate::slam::alignment::reference::Reference;
 use crate::slam::alignment::residual::{Evaluation, accumulate_reference};
@@ -12,6 +11,7 @@ use crate::slam::alignment::scatter::GradientScatter;
 use crate::slam::alignment::scene::{small_camera, small_plane};
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::sums::SumPyramid;
+use crate::slam::kernel::Kernel;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::modes::{ModeCovariance, NUM_MODES};
 use crate::slam::pose::Brightness;

@@ -3,7 +3,6 @@
 use nalgebra::Vector6;
 
 use crate::slam::alignment::align::{Aligner, AlignmentParams, Ending};
-use crate::slam::alignment::kernel::{Kernel, SimdMode};
 use crate::slam::alignment::normal_equations::UNKNOWNS;
 use crate::slam::alignment::points::{LevelPoints, Point};
 use crate::slam::alignment::reference::{Reference, ReferenceParams, ReferenceScratch};
@@ -12,6 +11,7 @@ use crate::slam::alignment::scatter::GradientScatter;
 use crate::slam::alignment::scene::{Noise, Plane, small_camera, small_plane};
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::sums::SumPyramid;
+use crate::slam::kernel::{Kernel, SimdMode};
 use crate::slam::keyframe::Keyframe;
 use crate::slam::pose::Brightness;
 

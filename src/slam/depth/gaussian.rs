@@ -12,11 +12,11 @@ use crate::slam::depth::map::{DepthMap, Hypothesis};
 use crate::slam::depth::matching::{
     Conditioning, Match, MatchingParams, Miss, Patch, condition, is_inside, search,
 };
-use crate::slam::depth::observation_kernel::{RowObserver, row_kernel};
 use crate::slam::depth::promise::{LANES, PixelLanes, promises};
 use crate::slam::image::buffer::Image;
 use crate::slam::image::quads::QuadImage;
 use crate::slam::image::quads_kernel::{Sampled, Sampler};
+use crate::slam::kernel::{Body, Instructions, Kernel};
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::Brightness;
 
@@ -174,13 +174,13 @@ pub fn observe(
         matching,
         params,
     };
-    let observe_row = row_kernel();
+    let kernel = Kernel::fastest();
     map.hypotheses
         .pixels_mut()
         .par_chunks_exact_mut(width)
         .enumerate()
         .filter(|(v, _)| (BORDER_PX..height - BORDER_PX).contains(v))
-        .map(|(v, row)| observe_row(&pixel, row, v))
+        .map(|(v, row)| kernel.run(ObservedRow { pixel: &pixel, row, v }))
         .reduce(Observation::default, Observation::plus)
 }
 
@@ -204,9 +204,24 @@ struct PixelObserver<'a> {
     params: &'a GaussianParams,
 }
 
-impl RowObserver for PixelObserver<'_> {
-    type Observation = Observation;
+/// A row of the map whose pixels are observed.
+struct ObservedRow<'a> {
+    pixel: &'a PixelObserver<'a>,
+    row: &'a mut [Hypothesis],
+    v: usize,
+}
 
+impl Body for ObservedRow<'_> {
+    type Output = Observation;
+
+    #[inline(always)]
+    fn run<I: Instructions>(self, instructions: I) -> Observation {
+        self.pixel.observe_row(instructions, self.row, self.v)
+    }
+}
+
+impl PixelObserver<'_> {
+    /// Observes the pixels of row `v`.
     #[inline(always)]
     fn observe_row<S: Sampler>(&self, sampler: S, row: &mut [Hypothesis], v: usize) -> Observation {
         let mut seen = Observation::default();
@@ -233,9 +248,7 @@ impl RowObserver for PixelObserver<'_> {
         }
         seen
     }
-}
 
-impl PixelObserver<'_> {
     /// Updates those of the `columns` of row `v`, at most [`LANES`], whose match promises something.
     #[inline(always)]
     fn update_promising<S: Sampler>(

@@ -10,7 +10,8 @@ use crate::slam::depth::immature::{
     HALF_INTERVAL_SIGMAS, ImmaturePoint, IntervalParams, TraceCounts, TraceFrame, TraceStatus,
 };
 use crate::slam::depth::map::{DepthMap, Hypothesis};
-use crate::slam::depth::trace_kernel::trace_kernel;
+use crate::slam::depth::trace_kernel::Tracing;
+use crate::slam::kernel::Kernel;
 
 /// A depth that became certain.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -113,10 +114,10 @@ impl IntervalFilter {
     pub fn trace(&mut self, frame: &TraceFrame<'_>, params: &IntervalParams) -> TraceCounts {
         /// Points a thread takes at once: some tens of microseconds.
         const CHUNK: usize = 128;
-        let trace = trace_kernel();
+        let kernel = Kernel::fastest();
         self.points
             .par_chunks_mut(CHUNK)
-            .map(|points| trace(points, frame, params))
+            .map(|points| kernel.run(Tracing { points, frame, params }))
             .reduce(TraceCounts::default, TraceCounts::plus)
     }
 

@@ -8,12 +8,12 @@ use std::ops::Range;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::slam::depth::carrying_kernel::{RowCarrier, carrying_kernel};
 use crate::slam::depth::epipolar::{MIN_DEPTH_RATIO, TwoView};
 use crate::slam::depth::gradient_image::{BAND_ROWS, BORDER_PX};
 use crate::slam::depth::map::{DepthMap, Hypothesis, KnownColumns, Reprojected, for_each_known};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
+use crate::slam::kernel::{Body, Instructions, Kernel};
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::Brightness;
 
@@ -69,11 +69,12 @@ pub fn propagate(
     let view = TwoView::new(intrinsics, target_from_source);
     let brighter = (brightness.a.exp() as f32, brightness.b as f32);
     let reprojection = Reprojection::new(source, target, view, brighter, params);
-    let carry_rows = carrying_kernel();
+    let kernel = Kernel::fastest();
     reprojected.par_iter_mut().enumerate().for_each(|(band, reprojected)| {
         reprojected.clear();
         let (first, end) = (band * BAND_ROWS, (band + 1) * BAND_ROWS);
-        carry_rows(&reprojection, first.max(BORDER_PX)..end.min(height - BORDER_PX), reprojected);
+        let rows = first.max(BORDER_PX)..end.min(height - BORDER_PX);
+        kernel.run(CarriedRows { reprojection: &reprojection, rows, reprojected });
     });
     // In the order of the source's rows: who comes first to a pixel matters there.
     let present = target.hypotheses.pixels_mut();
@@ -84,7 +85,7 @@ pub fn propagate(
 }
 
 /// What a hypothesis needs on its way from one keyframe to the next.
-pub(super) struct Reprojection<'a> {
+struct Reprojection<'a> {
     source: &'a DepthMap,
     target: &'a DepthMap,
     view: TwoView,
@@ -109,7 +110,7 @@ struct Places {
 
 impl<'a> Reprojection<'a> {
     /// The reprojection between two maps, seen like this; brightness grows by a gain and an offset.
-    pub(super) fn new(
+    fn new(
         source: &'a DepthMap,
         target: &'a DepthMap,
         view: TwoView,
@@ -120,7 +121,23 @@ impl<'a> Reprojection<'a> {
     }
 }
 
-impl RowCarrier for Reprojection<'_> {
+/// Source rows whose hypotheses are carried, in their order.
+struct CarriedRows<'a> {
+    reprojection: &'a Reprojection<'a>,
+    rows: Range<usize>,
+    reprojected: &'a mut Vec<Reprojected>,
+}
+
+impl Body for CarriedRows<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<I: Instructions>(self, _: I) {
+        self.reprojection.carry_rows(self.rows, self.reprojected);
+    }
+}
+
+impl Reprojection<'_> {
     #[inline(always)]
     fn carry_rows(&self, rows: Range<usize>, reprojected: &mut Vec<Reprojected>) {
         let mut columns = KnownColumns::default();
@@ -143,9 +160,7 @@ impl RowCarrier for Reprojection<'_> {
             });
         }
     }
-}
 
-impl Reprojection<'_> {
     /// The projections of some hypotheses of row `v`; each operation is that of
     /// [`EpipolarLine::project`](crate::slam::depth::epipolar::EpipolarLine::project).
     #[inline(always)]
@@ -277,6 +292,7 @@ mod tests {
     use nalgebra::Vector6;
 
     use super::*;
+    use crate::slam::test_scene::{CAMERA as SCENE_CAMERA, Scene};
 
     const CAMERA: Intrinsics = Intrinsics::pinhole(160, 120, 120.0);
 
@@ -377,5 +393,51 @@ mod tests {
         assert_eq!(pixel.variance, 1e-4);
         // Without any variance there is nothing to weigh with.
         assert!(joined(at(1.0, 0.0), &at(1.0, 0.0)).is_none());
+    }
+
+    #[test]
+    fn every_kernel_gives_the_bits_of_the_projection_of_each_pixel() {
+        let scene = Scene::new(6);
+        let new_from_old = SE3::exp(&Vector6::new(0.1, -0.02, 0.05, 0.01, 0.02, -0.03));
+        let mut maps = [SE3::identity(), new_from_old.inverse()].map(|world_from_camera| {
+            let mut map = DepthMap::with_size(SCENE_CAMERA.width, SCENE_CAMERA.height);
+            map.restart(
+                &scene.render(&SCENE_CAMERA, &world_from_camera).noisy(2.0, 1),
+                5.0,
+                100_000,
+            );
+            map
+        });
+        let depth = scene.render(&SCENE_CAMERA, &SE3::identity()).inverse_depth;
+        for (i, h) in maps[0].hypotheses.pixels_mut().iter_mut().enumerate() {
+            let smoothed = depth.pixels()[i];
+            let known = Hypothesis { smoothed, variance: 1e-4, validity: 9, ..Hypothesis::NONE };
+            *h = if i % 5 < 3 { known } else { Hypothesis::NONE };
+        }
+        let params = PropagationParams::default();
+        let view = TwoView::new(&SCENE_CAMERA, &new_from_old);
+        let carrier = Reprojection::new(&maps[0], &maps[1], view, (1.02, -1.0), &params);
+        let rows = BORDER_PX..SCENE_CAMERA.height - BORDER_PX;
+        let (mut portable, mut fast) = (Vec::new(), Vec::new());
+        let carry = |kernel: Kernel, reprojected| {
+            kernel.run(CarriedRows { reprojection: &carrier, rows: rows.clone(), reprojected });
+        };
+        carry(Kernel::Portable, &mut portable);
+        carry(Kernel::fastest(), &mut fast);
+        assert_eq!(portable, fast);
+        // Where and with what depth each must arrive, by the geometry of a single pixel.
+        let mut expected = Vec::new();
+        for (u, v) in rows.flat_map(|v| (0..SCENE_CAMERA.width).map(move |u| (u, v))) {
+            let from = maps[0].hypotheses.at(u, v);
+            let Some(at) = view.line(u as f32, v as f32).project(from.smoothed) else { continue };
+            if from.is_some() {
+                let index = (at.v + 0.5) as usize * SCENE_CAMERA.width + (at.u + 0.5) as usize;
+                expected.push((index as u32, (from.smoothed * at.depth_ratio).to_bits()));
+            }
+        }
+        let mut expected = expected.into_iter();
+        let arrived = portable.iter().map(|(index, h)| (*index, h.inverse_depth.to_bits()));
+        assert!(portable.len() > 3000, "{}", portable.len());
+        assert!(arrived.into_iter().all(|arrival| expected.any(|other| other == arrival)));
     }
 }

@@ -15,8 +15,8 @@ use crate::slam::depth::map::{DepthMap, Hypothesis};
 use crate::slam::depth::neighbour_sums::{
     FillingSums, LANES, RADIUS, RowPlanes, SmoothingSums, WINDOW_ROWS, filling_sums, smoothing_sums,
 };
-use crate::slam::depth::smoothing_kernel::{SmoothedRows, smoothing_kernel};
 use crate::slam::image::buffer::Image;
+use crate::slam::kernel::{Body, Instructions, Kernel};
 use crate::slam::parameter::{ParameterError, check_range};
 
 /// Tuning of the regularisation.
@@ -88,11 +88,11 @@ pub fn regularise(
     scratch: &mut RegularisationScratch,
     params: &RegularisationParams,
 ) {
-    regularise_with(|band| smoothing_kernel()(band), map, scratch, params);
+    regularise_with(Kernel::fastest(), map, scratch, params);
 }
 
 fn regularise_with(
-    smooth_band: fn(&mut Band<'_>),
+    kernel: Kernel,
     map: &mut DepthMap,
     scratch: &mut RegularisationScratch,
     params: &RegularisationParams,
@@ -111,17 +111,8 @@ fn regularise_with(
     bands.zip(&mut scratch.bands).for_each(|((band, rows), scratch)| {
         let BandScratch { window, above, below } = scratch;
         let first = band * BAND_ROWS;
-        smooth_band(&mut Band {
-            candidates,
-            width,
-            height,
-            first,
-            rows,
-            above,
-            below,
-            window,
-            params,
-        });
+        let rows = Band { candidates, width, height, first, rows, above, below, window, params };
+        kernel.run(rows);
     });
 }
 
@@ -139,10 +130,12 @@ struct Band<'a> {
     params: &'a RegularisationParams,
 }
 
-impl SmoothedRows for Band<'_> {
-    /// The window keeps what the rows were before.
+impl Body for Band<'_> {
+    type Output = ();
+
+    /// Smooths, drops and fills row by row; the window keeps what the rows were before.
     #[inline(always)]
-    fn regularise(&mut self) {
+    fn run<I: Instructions>(mut self, _: I) {
         let (first, end) = (self.first, self.first + self.rows.len() / self.width);
         let inner = first.max(BORDER_PX)..end.min(self.height - BORDER_PX);
         let mut next = inner.start - RADIUS;
@@ -425,9 +418,7 @@ mod tests {
         let pairs = || expected.iter().zip(map.hypotheses.pixels());
         assert!(pairs().filter(|p| filled(*p)).count() > 100);
         assert!(pairs().filter(|p| dropped(*p)).count() > 100);
-        let kernels: [fn(&mut Band<'_>); 2] =
-            [|band| smoothing_kernel()(band), |band| band.regularise()];
-        for kernel in kernels {
+        for kernel in Kernel::available() {
             let mut found = map.clone();
             let mut scratch = RegularisationScratch::with_size(width, height);
             // Twice with the same memory: nothing of the first may be left in it.

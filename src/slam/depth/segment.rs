@@ -3,7 +3,8 @@
 use crate::slam::depth::epipolar::EpipolarLine;
 use crate::slam::depth::line_search::{Along, MAX_STEPS};
 use crate::slam::image::quads::QuadImage;
-use crate::slam::image::quads_kernel::{PortableSampler, Sampled};
+use crate::slam::image::quads_kernel::Sampled;
+use crate::slam::kernel::Portable;
 
 /// The part of an epipolar line to be searched.
 pub(super) struct Segment {
@@ -50,7 +51,7 @@ pub(super) fn search(image: &QuadImage, segment: &Segment, patch: &[f32; 8], dit
     /// How far the refinement may go, pixels: to the steps beside the best.
     const REFINE_REACH_PX: f32 = 1.5;
     let along = Along {
-        frame: Sampled { image, sampler: PortableSampler },
+        frame: Sampled { image, sampler: Portable },
         intensity: patch,
         direction: segment.direction,
         u: segment.offsets_u.map(|offset| segment.start.0 + offset),

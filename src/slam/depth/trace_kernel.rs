@@ -3,46 +3,27 @@
 //! One source for all: no operation is fused or reordered, so every version gives the same bits.
 
 use crate::slam::depth::immature::{ImmaturePoint, IntervalParams, TraceCounts, TraceFrame};
+use crate::slam::kernel::{Body, Instructions};
 
-/// A version of [`trace_points`].
-pub(super) type TraceKernel =
-    fn(&mut [ImmaturePoint], &TraceFrame<'_>, &IntervalParams) -> TraceCounts;
+/// Points that are traced one after the other.
+pub(super) struct Tracing<'a> {
+    pub points: &'a mut [ImmaturePoint],
+    pub frame: &'a TraceFrame<'a>,
+    pub params: &'a IntervalParams,
+}
 
-/// The best version for this processor.
-pub(super) fn trace_kernel() -> TraceKernel {
-    #[cfg(target_arch = "x86_64")]
-    if std::arch::is_x86_feature_detected!("avx2") {
-        return |points, frame, params| {
-            // SAFETY: the processor has AVX2, as was just asked.
-            unsafe { trace_points_avx2(points, frame, params) }
-        };
+impl Body for Tracing<'_> {
+    type Output = TraceCounts;
+
+    #[inline(always)]
+    fn run<I: Instructions>(self, _: I) -> TraceCounts {
+        self.points.iter_mut().fold(TraceCounts::default(), |counts, point| {
+            if point.is_ended() {
+                return counts.plus(TraceCounts { ended: 1, ..Default::default() });
+            }
+            counts.plus(TraceCounts::of(point.trace(self.frame, self.params)))
+        })
     }
-    trace_points
-}
-
-/// Traces points one after the other; the explanation of the others.
-#[inline(always)]
-fn trace_points(
-    points: &mut [ImmaturePoint],
-    frame: &TraceFrame<'_>,
-    params: &IntervalParams,
-) -> TraceCounts {
-    points.iter_mut().fold(TraceCounts::default(), |counts, point| {
-        if point.is_ended() {
-            return counts.plus(TraceCounts { ended: 1, ..Default::default() });
-        }
-        counts.plus(TraceCounts::of(point.trace(frame, params)))
-    })
-}
-
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2")]
-fn trace_points_avx2(
-    points: &mut [ImmaturePoint],
-    frame: &TraceFrame<'_>,
-    params: &IntervalParams,
-) -> TraceCounts {
-    trace_points(points, frame, params)
 }
 
 #[cfg(test)]
@@ -52,6 +33,7 @@ mod tests {
     use crate::slam::depth::gradient_image::GradientImage;
     use crate::slam::geometry::se3::SE3;
     use crate::slam::image::quads::QuadImage;
+    use crate::slam::kernel::Kernel;
     use crate::slam::pose::Brightness;
     use crate::slam::test_scene::{CAMERA, Scene};
     use nalgebra::Vector6;
@@ -72,8 +54,11 @@ mod tests {
         let mut fast = portable.clone();
         let params = IntervalParams::default();
         for _ in 0..2 {
-            let counts = trace_points(&mut portable, &frame, &params);
-            assert_eq!(trace_kernel()(&mut fast, &frame, &params), counts);
+            let trace = |kernel: Kernel, points| {
+                kernel.run(Tracing { points, frame: &frame, params: &params })
+            };
+            let counts = trace(Kernel::Portable, &mut portable);
+            assert_eq!(trace(Kernel::fastest(), &mut fast), counts);
         }
         let bits = |p: &ImmaturePoint| {
             let max = p.max_inverse_depth.map(f32::to_bits);

@@ -2,7 +2,7 @@
 //!
 //! One source for all: no operation is fused or reordered, so every version gives the same bits.
 
-use crate::slam::alignment::kernel::Kernel;
+use crate::slam::kernel::{Body, Instructions};
 
 /// Rows and columns of a tile of products: two registers' worth of the widest vector unit.
 const TILE: usize = 8;
@@ -29,60 +29,47 @@ pub(super) struct Part<'a> {
     pub packed: &'a mut Vec<f64>,
 }
 
-/// Eliminates the columns; `factor` has the factor's then, and `rest` what is left.
-pub(super) fn eliminate(kernel: Kernel, part: Part<'_>) -> Result<(), NotPositive> {
-    match kernel {
-        // SAFETY: only `available` makes these values, after it has found AVX2 and AVX-512F.
-        #[cfg(target_arch = "x86_64")]
-        Kernel::Avx2 => unsafe { eliminate_avx2(part) },
-        // SAFETY: as above.
-        #[cfg(target_arch = "x86_64")]
-        Kernel::Avx512 => unsafe { eliminate_avx512(part) },
-        _ => eliminate_portable(part),
-    }
-}
+impl Body for Part<'_> {
+    type Output = Result<(), NotPositive>;
 
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2")]
-fn eliminate_avx2(part: Part<'_>) -> Result<(), NotPositive> {
-    eliminate_portable(part)
-}
-
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2,avx512f")]
-fn eliminate_avx512(part: Part<'_>) -> Result<(), NotPositive> {
-    eliminate_portable(part)
-}
-
-/// The explanation of the others.
-#[inline(always)]
-fn eliminate_portable(part: Part<'_>) -> Result<(), NotPositive> {
-    let Part { size, least, factor, rest, packed } = part;
-    let pivots = least.len();
-    for first in (0..pivots).step_by(PANEL) {
-        let end = (first + PANEL).min(pivots);
-        eliminate_panel(size, first, end, least, factor)?;
-        let (left, right) = factor.split_at_mut(end * size);
-        let panel = &left[first * size..];
-        pack(panel, size, end, size, packed);
-        let tiles = (size - end).div_ceil(TILE);
-        let width = (end - first) * TILE;
-        // The remaining pivots' columns, then the others: rows of both are counted from `end` in `packed`.
-        let own = pivots - end;
-        if own > 0 {
-            subtract_products(packed, width, 0..own, tiles, &mut right[end..], size, size - end);
+    /// Eliminates the columns; `factor` has the factor's then, and `rest` what is left.
+    #[inline(always)]
+    fn run<I: Instructions>(self, _: I) -> Result<(), NotPositive> {
+        let Self { size, least, factor, rest, packed } = self;
+        let pivots = least.len();
+        for first in (0..pivots).step_by(PANEL) {
+            let end = (first + PANEL).min(pivots);
+            eliminate_panel(size, first, end, least, factor)?;
+            let (left, right) = factor.split_at_mut(end * size);
+            let panel = &left[first * size..];
+            pack(panel, size, end, size, packed);
+            let tiles = (size - end).div_ceil(TILE);
+            let width = (end - first) * TILE;
+            // The remaining pivots' columns, then the others: rows of both are counted from `end` in `packed`.
+            let own = pivots - end;
+            if own > 0 {
+                subtract_products(
+                    packed,
+                    width,
+                    0..own,
+                    tiles,
+                    &mut right[end..],
+                    size,
+                    size - end,
+                );
+            }
+            let others = size - pivots;
+            if others > 0 && own == 0 {
+                subtract_products(packed, width, 0..others, tiles, rest, others, others);
+            } else if others > 0 {
+                // Tiles start at the first row of `rest`.
+                pack(panel, size, pivots, size, packed);
+                let tiles = others.div_ceil(TILE);
+                subtract_products(packed, width, 0..others, tiles, rest, others, others);
+            }
         }
-        let others = size - pivots;
-        if others > 0 && own == 0 {
-            subtract_products(packed, width, 0..others, tiles, rest, others, others);
-        } else if others > 0 {
-            // Tiles start at the first row of `rest`.
-            pack(panel, size, pivots, size, packed);
-            let tiles = others.div_ceil(TILE);
-            subtract_products(packed, width, 0..others, tiles, rest, others, others);
-        }
+        Ok(())
     }
-    Ok(())
 }
 
 /// Eliminates columns `first..end`, with their rows below.
@@ -178,6 +165,7 @@ fn tile_product(of_rows: &[f64], of_columns: &[f64]) -> [[f64; TILE]; TILE] {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::slam::kernel::Kernel;
     use crate::slam::test_scene::Random;
 
     /// A positive definite matrix by columns.
@@ -201,7 +189,7 @@ mod tests {
         factor: &mut [f64],
         rest: &mut [f64],
     ) -> Result<(), NotPositive> {
-        eliminate(kernel, Part { size, least, factor, rest, packed: &mut Vec::new() })
+        kernel.run(Part { size, least, factor, rest, packed: &mut Vec::new() })
     }
 
     fn run(kernel: Kernel, matrix: &[f64], size: usize, pivots: usize) -> (Vec<f64>, Vec<f64>) {

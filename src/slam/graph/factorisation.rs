@@ -2,10 +2,10 @@
 
 use nalgebra::SMatrix;
 
-use crate::slam::alignment::kernel::Kernel;
 use crate::slam::graph::SolveError;
-use crate::slam::graph::dense_kernel::{NotPositive, Part, eliminate};
+use crate::slam::graph::dense_kernel::{NotPositive, Part};
 use crate::slam::graph::fronts::{Front, Plan};
+use crate::slam::kernel::Kernel;
 
 /// The factor of a symmetric positive definite matrix with blocks of `D` × `D`, and the memory to make it.
 #[derive(Debug, Clone)]
@@ -66,7 +66,7 @@ impl<const D: usize> Factorisation<D> {
             let (factor_of, rest_of) = (&mut factor, &mut rest);
             let (least, packed) = (&self.diagonal, &mut self.packed);
             let part = Part { size, least, factor: factor_of, rest: rest_of, packed };
-            let done = eliminate(self.kernel, part);
+            let done = self.kernel.run(part);
             self.factors[number] = factor;
             self.rests[number] = rest;
             if let Err(NotPositive(_)) = done {

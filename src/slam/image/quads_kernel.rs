@@ -1,6 +1,7 @@
 //! Bilinear samples of a [`QuadImage`] in vector registers.
 
 use crate::slam::image::quads::QuadImage;
+use crate::slam::kernel::Instructions;
 
 /// How eight bilinear samples are taken; all versions give the same bits.
 pub trait Sampler: Copy {
@@ -17,38 +18,15 @@ pub struct Sampled<'a, S> {
     pub sampler: S,
 }
 
-/// The explanation of the others: for every processor.
-#[derive(Debug, Clone, Copy)]
-pub struct PortableSampler;
-
-impl Sampler for PortableSampler {
+impl<I: Instructions> Sampler for I {
     #[inline(always)]
     fn sample(self, image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> [f32; 8] {
+        #[cfg(target_arch = "x86_64")]
+        if I::HAS_AVX2 {
+            // SAFETY: who made the instructions vouched for them.
+            return unsafe { sample_avx2(image, u, v) };
+        }
         image.sample(u, v)
-    }
-}
-
-/// Gathers with AVX2.
-#[cfg(target_arch = "x86_64")]
-#[derive(Debug, Clone, Copy)]
-pub struct Avx2Sampler(());
-
-#[cfg(target_arch = "x86_64")]
-impl Avx2Sampler {
-    /// # Safety
-    /// The processor has AVX2.
-    #[inline(always)]
-    pub unsafe fn new() -> Self {
-        Self(())
-    }
-}
-
-#[cfg(target_arch = "x86_64")]
-impl Sampler for Avx2Sampler {
-    #[inline(always)]
-    fn sample(self, image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> [f32; 8] {
-        // SAFETY: who made the sampler vouched for AVX2.
-        unsafe { sample_avx2(image, u, v) }
     }
 }
 
@@ -96,20 +74,20 @@ mod tests {
         if !std::arch::is_x86_feature_detected!("avx2") {
             return;
         }
-        // SAFETY: the processor has AVX2, as was just asked.
-        let sampler = unsafe { Avx2Sampler::new() };
         let (width, height) = (37, 23);
         let pixels: Vec<u8> = (0..width * height).map(|i| (i * i * 31 % 251) as u8).collect();
         let mut image = QuadImage::with_size(width, height);
         image.fill(&pixels);
+        // SAFETY: the processor has AVX2, as was just asked.
+        let sample = |u: &[f32; 8], v: &[f32; 8]| unsafe { sample_avx2(&image, u, v) };
         let place = |i: usize, side: usize| 0.5 + (i as f32 * 0.377) % (side as f32 - 2.0);
         for i in 0..500 {
             let u: [f32; 8] = std::array::from_fn(|k| place(8 * i + k, width));
             let v: [f32; 8] = std::array::from_fn(|k| place(5 * i + 3 * k, height));
             let bits = |samples: [f32; 8]| samples.map(f32::to_bits);
-            assert_eq!(bits(sampler.sample(&image, &u, &v)), bits(image.sample(&u, &v)));
+            assert_eq!(bits(sample(&u, &v)), bits(image.sample(&u, &v)));
         }
         let wild = [f32::NAN, f32::INFINITY, -5.0, 1e9, -1e9, 0.0, 36.0, 200.0];
-        let _harmless = sampler.sample(&image, &wild, &[22.5; 8]);
+        let _harmless = sample(&wild, &[22.5; 8]);
     }
 }

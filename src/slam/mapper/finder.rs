@@ -3,7 +3,6 @@
 use std::sync::Arc;
 
 use crate::slam::alignment::align::{Aligner, Alignment, AlignmentParams};
-use crate::slam::alignment::kernel::SimdMode;
 use crate::slam::alignment::normal_equations::NormalEquations;
 use crate::slam::alignment::reference::{
     Reference, ReferenceParams, ReferenceScratch, finest_level, num_levels,
@@ -11,6 +10,7 @@ use crate::slam::alignment::reference::{
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::sums::SumPyramid;
+use crate::slam::kernel::SimdMode;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::mapper::appearance::Appearance;
 use crate::slam::mapper::recovery::RecoveryParams;

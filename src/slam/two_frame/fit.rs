@@ -8,13 +8,14 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;
 use crate::slam::image::noise::ImageNoise;
+use crate::slam::kernel::Kernel;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::two_frame::elimination::{Elimination, PriorWeights, prior_energy};
 use crate::slam::two_frame::lanes::NUM_UNKNOWNS;
 use crate::slam::two_frame::median::median;
 use crate::slam::two_frame::points::Points;
 use crate::slam::two_frame::system::{LevelView, PointSystem, State, System};
-use crate::slam::two_frame::system_kernel::system_kernels;
+use crate::slam::two_frame::system_kernel::{Medians, Reduction};
 
 /// Tuning of the fit.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -137,10 +138,9 @@ pub fn fit_level(
     params: &FitParams,
 ) -> f64 {
     let view = input.level(level);
-    let find_medians = system_kernels().medians;
     let weights = params.prior_weights();
     scratch.system.evaluate(&view, state);
-    find_medians(&input.points.neighbours, &state.inverse_depths, &mut scratch.medians);
+    find_medians(input, state, &mut scratch.medians);
     let mut damping = Damping::FIRST;
     for _ in 0..params.max_iterations {
         let Some(step) = step_of(freedom, scratch, state, damping.factor, weights) else {
@@ -161,7 +161,7 @@ pub fn fit_level(
         let is_over = if after < before {
             std::mem::swap(state, &mut next);
             std::mem::swap(&mut scratch.system, &mut scratch.trial);
-            find_medians(&input.points.neighbours, &state.inverse_depths, &mut scratch.medians);
+            find_medians(input, state, &mut scratch.medians);
             damping.succeed();
             before - after < params.min_energy_drop * before
         } else {
@@ -252,6 +252,11 @@ fn rotation_step(system: &System, damping: f64) -> Option<SVector<f64, NUM_UNKNO
     is_sane(&step).then_some(step)
 }
 
+fn find_medians(input: &FitInput<'_>, state: &State, medians: &mut Vec<f32>) {
+    let (neighbours, inverse_depths) = (&input.points.neighbours, &state.inverse_depths);
+    Kernel::fastest().run(Medians { neighbours, inverse_depths, medians });
+}
+
 /// The step of pose and brightness with the depths held.
 fn pose_step(system: &System, damping: f64) -> Option<SVector<f64, NUM_UNKNOWNS>> {
     let mut hessian = system.hessian;
@@ -270,7 +275,8 @@ fn joint_step(
 ) -> Option<SVector<f64, NUM_UNKNOWNS>> {
     let (system, elimination) = (&scratch.system, &mut scratch.elimination);
     elimination.damping_factor = 1.0 + damping as f32;
-    (system_kernels().reduce)(elimination, system, &state.inverse_depths, &scratch.medians);
+    let (inverse_depths, medians) = (&state.inverse_depths, &scratch.medians);
+    Kernel::fastest().run(Reduction { elimination, system, inverse_depths, medians });
     let (mut hessian, mut gradient) = (system.hessian, system.gradient);
     for r in 0..NUM_UNKNOWNS {
         hessian[(r, r)] *= 1.0 + damping;

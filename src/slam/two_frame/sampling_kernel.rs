@@ -4,6 +4,7 @@
 use std::arch::x86_64::*;
 
 use crate::slam::image::buffer::Image;
+use crate::slam::kernel::Instructions;
 use crate::slam::two_frame::lanes::{LANES, Lanes, lanes};
 
 /// Samples with their gradients: bilinear between the pixels, of the grey values and of their central
@@ -14,35 +15,42 @@ pub(super) trait WindowSampler: Copy {
     fn sample(self, image: &Image<f32>, u: &Lanes, v: &Lanes) -> [Lanes; 3];
 }
 
-/// For every processor.
-#[derive(Clone, Copy)]
-pub(super) struct PortableSampler;
-
-impl WindowSampler for PortableSampler {
+impl<I: Instructions> WindowSampler for I {
     #[inline(always)]
     fn sample(self, image: &Image<f32>, u: &Lanes, v: &Lanes) -> [Lanes; 3] {
-        let (pixels, width) = (image.pixels(), image.width());
-        let last = last_window(image);
-        let (mut fu, mut columns) = ([0.0; LANES], [[0.0; LANES]; 6]);
-        for l in 0..LANES {
-            let (column, row) = (u[l] as i32, v[l] as i32);
-            fu[l] = u[l] - column as f32;
-            let fv = v[l] - row as f32;
-            let index =
-                row.wrapping_sub(1).wrapping_mul(width as i32).wrapping_add(column.wrapping_sub(1));
-            let first = (index as u32).min(last) as usize;
-            let window = &pixels[first..first + 3 * width + 4];
-            let at = |row: usize, column: usize| window[row * width + column];
-            for (c, out) in columns[..4].iter_mut().enumerate() {
-                out[l] = at(1, c) + fv * (at(2, c) - at(1, c));
-            }
-            for (c, out) in columns[4..].iter_mut().enumerate() {
-                let (upper, lower) = (at(2, c + 1) - at(0, c + 1), at(3, c + 1) - at(1, c + 1));
-                out[l] = upper + fv * (lower - upper);
-            }
+        #[cfg(target_arch = "x86_64")]
+        if I::HAS_AVX2 {
+            // SAFETY: who made the instructions vouched for them.
+            return unsafe { sample_avx2(image, u, v) };
         }
-        across(&fu, &columns)
+        sample_portable(image, u, v)
     }
+}
+
+/// The explanation of the other.
+#[inline(always)]
+fn sample_portable(image: &Image<f32>, u: &Lanes, v: &Lanes) -> [Lanes; 3] {
+    let (pixels, width) = (image.pixels(), image.width());
+    let last = last_window(image);
+    let (mut fu, mut columns) = ([0.0; LANES], [[0.0; LANES]; 6]);
+    for l in 0..LANES {
+        let (column, row) = (u[l] as i32, v[l] as i32);
+        fu[l] = u[l] - column as f32;
+        let fv = v[l] - row as f32;
+        let index =
+            row.wrapping_sub(1).wrapping_mul(width as i32).wrapping_add(column.wrapping_sub(1));
+        let first = (index as u32).min(last) as usize;
+        let window = &pixels[first..first + 3 * width + 4];
+        let at = |row: usize, column: usize| window[row * width + column];
+        for (c, out) in columns[..4].iter_mut().enumerate() {
+            out[l] = at(1, c) + fv * (at(2, c) - at(1, c));
+        }
+        for (c, out) in columns[4..].iter_mut().enumerate() {
+            let (upper, lower) = (at(2, c + 1) - at(0, c + 1), at(3, c + 1) - at(1, c + 1));
+            out[l] = upper + fv * (lower - upper);
+        }
+    }
+    across(&fu, &columns)
 }
 
 /// Index of the last pixel that has 3 rows and 4 columns behind it.
@@ -66,29 +74,8 @@ fn across(fu: &Lanes, [a0, a1, a2, a3, b1, b2]: &[Lanes; 6]) -> [Lanes; 3] {
     ]
 }
 
-/// Rows of four pixels at a time. Only made where the processor has AVX2.
-#[cfg(target_arch = "x86_64")]
-#[derive(Clone, Copy)]
-pub(super) struct Avx2Sampler(());
-
-#[cfg(target_arch = "x86_64")]
-impl Avx2Sampler {
-    /// # Safety
-    /// The processor has AVX2.
-    pub(super) unsafe fn new() -> Self {
-        Self(())
-    }
-}
-
-#[cfg(target_arch = "x86_64")]
-impl WindowSampler for Avx2Sampler {
-    #[inline(always)]
-    fn sample(self, image: &Image<f32>, u: &Lanes, v: &Lanes) -> [Lanes; 3] {
-        // SAFETY: who makes this sampler promises AVX2.
-        unsafe { sample_avx2(image, u, v) }
-    }
-}
-
+/// Rows of four pixels at a time.
+///
 /// # Safety
 /// The processor has AVX2. Without the attribute that says so, because only that goes into the loop of
 /// the caller whatever its size.

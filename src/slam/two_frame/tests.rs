@@ -429,8 +429,9 @@ fn hostile_frames_are_refused_and_a_start_begins_again_by_itself() {
 
 #[test]
 fn every_version_of_the_sums_gives_the_same_bits() {
+    use crate::slam::kernel::Kernel;
     use crate::slam::two_frame::system::System;
-    use crate::slam::two_frame::system_kernel::{portable_kernels, system_kernels};
+    use crate::slam::two_frame::system_kernel::Evaluation;
     let (first, second, moved) = two_views(2.0);
     let mut initializer = TwoFrameInitializer::new(CAMERA, TwoFrameParams::default()).unwrap();
     assert!(initializer.begin(&first));
@@ -443,9 +444,10 @@ fn every_version_of_the_sums_gives_the_same_bits() {
             brightness: Brightness { a: 0.02, b: -1.0 },
             inverse_depths: (0..num_points).map(|i| depth + 0.01 * (i % 7) as f32).collect(),
         };
-        let systems = [system_kernels(), portable_kernels()].map(|kernels| {
+        let systems = [Kernel::fastest(), Kernel::Portable].map(|kernel| {
             let mut system = System::default();
-            (kernels.evaluate)(&mut system, &input.level(level), &state);
+            let level = &input.level(level);
+            kernel.run(Evaluation { system: &mut system, level, state: &state });
             format!("{system:?}")
         });
         assert!(systems[0] == systems[1], "level {level}, depth {depth}");

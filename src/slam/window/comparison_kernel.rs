@@ -2,10 +2,9 @@
 //!
 //! Nothing is summed across lanes and nothing is fused, so that all instruction sets give the same bits.
 
-use crate::slam::alignment::kernel::Kernel;
-use crate::slam::alignment::kernel::lanes_kernel::Lanes;
-use crate::slam::alignment::kernel::portable_kernel::FourLanes;
 use crate::slam::image::shared::SharedImage;
+use crate::slam::kernel::lanes_kernel::Lanes;
+use crate::slam::kernel::{Body, Instructions, Kernel};
 use crate::slam::window::comparison::{
     BORDER_PX, Compared, LANES, Lane, POSE, Pair, PairSums, Patterns, Robustness, SAMPLES, fits,
 };
@@ -29,79 +28,29 @@ impl Kernel {
             compared.fill(Compared::NONE);
             return;
         }
-        match self {
-            // SAFETY: plain arithmetic needs no instructions; the bounds were checked above.
-            Self::Portable => unsafe {
-                compare::<FourLanes>(image, pair, patterns, robustness, compared, sums);
-            },
-            // SAFETY: only `available` makes this value, after it has found AVX2; the bounds were checked above.
-            #[cfg(target_arch = "x86_64")]
-            Self::Avx2 => unsafe {
-                compare_avx2(image, pair, patterns, robustness, compared, sums);
-            },
-            // SAFETY: as above with AVX-512F.
-            #[cfg(target_arch = "x86_64")]
-            Self::Avx512 => unsafe {
-                compare_avx512(image, pair, patterns, robustness, compared, sums);
-            },
-            // SAFETY: as above with NEON.
-            #[cfg(target_arch = "aarch64")]
-            Self::Neon => unsafe {
-                compare_neon(image, pair, patterns, robustness, compared, sums);
-            },
-        }
+        self.run(Comparison { image, pair, patterns, robustness, compared, sums });
     }
 }
 
-/// # Safety
-/// The processor has AVX2; the image is as large as the pair's camera says.
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2")]
-unsafe fn compare_avx2(
-    image: &SharedImage,
-    pair: &Pair,
-    patterns: &[Patterns],
-    robustness: &Robustness,
-    compared: &mut [Compared],
-    sums: &mut PairSums,
-) {
-    use std::arch::x86_64::__m256;
-    // SAFETY: this function's own contract.
-    unsafe { compare::<__m256>(image, pair, patterns, robustness, compared, sums) }
+/// What [`Kernel::compare`] compares.
+struct Comparison<'a> {
+    image: &'a SharedImage,
+    pair: &'a Pair,
+    patterns: &'a [Patterns],
+    robustness: &'a Robustness,
+    compared: &'a mut [Compared],
+    sums: &'a mut PairSums,
 }
 
-/// # Safety
-/// The processor has AVX-512F; the image is as large as the pair's camera says.
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx512f")]
-unsafe fn compare_avx512(
-    image: &SharedImage,
-    pair: &Pair,
-    patterns: &[Patterns],
-    robustness: &Robustness,
-    compared: &mut [Compared],
-    sums: &mut PairSums,
-) {
-    use std::arch::x86_64::__m512;
-    // SAFETY: this function's own contract.
-    unsafe { compare::<__m512>(image, pair, patterns, robustness, compared, sums) }
-}
+impl Body for Comparison<'_> {
+    type Output = ();
 
-/// # Safety
-/// The processor has NEON; the image is as large as the pair's camera says.
-#[cfg(target_arch = "aarch64")]
-#[target_feature(enable = "neon")]
-unsafe fn compare_neon(
-    image: &SharedImage,
-    pair: &Pair,
-    patterns: &[Patterns],
-    robustness: &Robustness,
-    compared: &mut [Compared],
-    sums: &mut PairSums,
-) {
-    use std::arch::aarch64::float32x4_t;
-    // SAFETY: this function's own contract.
-    unsafe { compare::<float32x4_t>(image, pair, patterns, robustness, compared, sums) }
+    #[inline(always)]
+    fn run<I: Instructions>(self, _: I) {
+        let Self { image, pair, patterns, robustness, compared, sums } = self;
+        // SAFETY: who made the instructions vouched for them; `compare` above has checked the bounds.
+        unsafe { compare::<I::Lanes>(image, pair, patterns, robustness, compared, sums) }
+    }
 }
 
 /// # Safety

@@ -6,10 +6,10 @@ use super::comparison::{
     Compared, LANES, Look, POSE, Pair, PairSums, Patterns, Robustness, SAMPLES, Wanted, sum,
     sum_of_samples,
 };
-use crate::slam::alignment::kernel::Kernel;
 use crate::slam::depth::pattern::PATTERN;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::shared::SharedImage;
+use crate::slam::kernel::Kernel;
 use crate::slam::test_scene::{CAMERA, Random};
 
 const EASY: Robustness = Robustness { huber_grey: 1e3, most_energy: f32::INFINITY };

@@ -9,8 +9,8 @@ use std::collections::HashSet;
 
 use rayon::prelude::*;
 
-use crate::slam::alignment::kernel::{Kernel, SimdMode};
 use crate::slam::image::shared::SharedImage;
+use crate::slam::kernel::{Kernel, SimdMode};
 use crate::slam::keyframe::{DepthPoint, Keyframe};
 use crate::slam::map::{LogPlane, Map, RefinedDepth};
 use crate::slam::window::Window;

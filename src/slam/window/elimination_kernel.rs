@@ -2,7 +2,7 @@
 //!
 //! One source for all: no operation is fused or reordered, so every version gives the same bits.
 
-use crate::slam::alignment::kernel::Kernel;
+use crate::slam::kernel::Kernel;
 use crate::slam::window::comparison::POSE;
 
 /// Entries of a row of a block: a register's, the last two are 0.
@@ -57,6 +57,8 @@ pub(super) fn eliminate(
         _ => eliminate_portable(points, rows, reduced, right),
     }
 }
+
+// Not a `Body`: the compiler must know that the slices do not overlap, which only arguments of these functions say.
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]

@@ -8,8 +8,8 @@ use std::ops::Range;
 
 use nalgebra::{DVector, Matrix6, Vector6};
 
-use crate::slam::alignment::kernel::{Kernel, SimdMode};
 use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::kernel::{Kernel, SimdMode};
 use crate::slam::window::comparison::{
     Compared, LANES, POSE, Pair, PairSums, Robustness, SAMPLES, Wanted, sum,
 };

@@ -4,13 +4,13 @@
 //! point, the columns of the whitened Jacobian √w J and residual √w r; then five passes sum their
 //! products with at most eleven sums each, what sixteen registers hold without spilling.
 
-use crate::slam::alignment::kernel::lanes_kernel::Lanes;
 use crate::slam::alignment::normal_equations::{NormalEquations, UNKNOWNS};
 use crate::slam::alignment::points::{LANES, LevelPoints, PointBlock};
 use crate::slam::alignment::residual::{
     BORDER_PX, Evaluation, NEAREST_DEPTH_RATIO, SMALLEST_DETERMINANT, UNCLIPPED_GREY,
 };
 use crate::slam::image::buffer::Image;
+use crate::slam::kernel::lanes_kernel::Lanes;
 
 /// Blocks of a chunk: its columns take 10 kB, a third of a small first-level cache.
 pub const CHUNK_BLOCKS: usize = 16;

@@ -6,9 +6,9 @@
 use nalgebra::SMatrix;
 
 use crate::slam::alignment::kernel::accumulate_kernel::Whitened;
-use crate::slam::alignment::kernel::lanes_kernel::Lanes;
 use crate::slam::alignment::normal_equations::UNKNOWNS;
 use crate::slam::alignment::points::{LANES, PointBlock};
+use crate::slam::kernel::lanes_kernel::Lanes;
 use crate::slam::modes::NUM_MODES;
 
 /// Σ w J (∂r/∂d) d φᵀ, lane by lane.

@@ -8,7 +8,6 @@
 use crate::slam::alignment::kernel::accumulate_kernel::{
     CHUNK_BLOCKS, RESIDUAL, Statistics, Whitened, whiten,
 };
-use crate::slam::alignment::kernel::lanes_kernel::Lanes;
 use crate::slam::alignment::kernel::mode_kernel::{ModeSums, add_modes};
 use crate::slam::alignment::normal_equations::UNKNOWNS;
 use crate::slam::alignment::points::{LANES, LevelPoints, TileRun};
@@ -16,6 +15,7 @@ use crate::slam::alignment::residual::Evaluation;
 use crate::slam::alignment::scatter::{GradientScatter, ScatterSums};
 use crate::slam::alignment::tiles::NUM_TILES;
 use crate::slam::image::buffer::Image;
+use crate::slam::kernel::lanes_kernel::Lanes;
 
 /// The columns of the rotations about x and y.
 const ABOUT_X: usize = 3;

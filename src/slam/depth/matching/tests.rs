@@ -7,7 +7,7 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::noise::ImageNoise;
 use crate::slam::image::quads::QuadImage;
-use crate::slam::image::quads_kernel::PortableSampler;
+use crate::slam::kernel::Portable;
 
 const CAMERA: Intrinsics = Intrinsics::pinhole(200, 150, 200.0);
 const PLANE_INVERSE_DEPTH: f64 = 0.8;
@@ -41,8 +41,8 @@ fn quads(pixels: &[u8]) -> QuadImage {
     image
 }
 
-fn sampled(image: &QuadImage) -> Sampled<'_, PortableSampler> {
-    Sampled { image, sampler: PortableSampler }
+fn sampled(image: &QuadImage) -> Sampled<'_, Portable> {
+    Sampled { image, sampler: Portable }
 }
 
 fn structure(patch: &Patch) -> [f32; 3] {

@@ -1,35 +1,6 @@
 //! Four lanes of plain arithmetic: the same bits on every CPU.
 
-use crate::slam::alignment::kernel::accumulate_kernel::accumulate;
-use crate::slam::alignment::kernel::lanes_kernel::{Lanes, Sample};
-use crate::slam::alignment::kernel::scatter_kernel::scatter;
-use crate::slam::alignment::normal_equations::NormalEquations;
-use crate::slam::alignment::points::LevelPoints;
-use crate::slam::alignment::residual::Evaluation;
-use crate::slam::alignment::scatter::GradientScatter;
-use crate::slam::image::buffer::Image;
-
-/// # Safety
-/// `at` was made for the size of `image`.
-pub unsafe fn accumulate_portable(
-    points: &LevelPoints,
-    image: &Image<u16>,
-    at: &Evaluation,
-) -> NormalEquations {
-    // SAFETY: this function's own contract.
-    unsafe { accumulate::<FourLanes>(points, image, at) }
-}
-
-/// # Safety
-/// `at` was made for the size of `image`.
-pub unsafe fn scatter_portable(
-    points: &LevelPoints,
-    image: &Image<u16>,
-    at: &Evaluation,
-) -> GradientScatter {
-    // SAFETY: this function's own contract.
-    unsafe { scatter::<FourLanes>(points, image, at) }
-}
+use crate::slam::kernel::lanes_kernel::{Lanes, Sample};
 
 /// Four floats.
 #[derive(Clone, Copy)]

@@ -2,123 +2,30 @@
 
 use std::arch::aarch64::*;
 
-use crate::slam::alignment::kernel::accumulate_kernel::accumulate;
-use crate::slam::alignment::kernel::lanes_kernel::{Lanes, Sample};
-use crate::slam::alignment::kernel::scatter_kernel::scatter;
-use crate::slam::alignment::normal_equations::NormalEquations;
-use crate::slam::alignment::points::LevelPoints;
-use crate::slam::alignment::residual::Evaluation;
-use crate::slam::alignment::scatter::GradientScatter;
-use crate::slam::image::buffer::Image;
-
-/// # Safety
-/// The CPU has NEON; `at` was made for the size of `image`.
-#[target_feature(enable = "neon")]
-pub unsafe fn accumulate_neon(
-    points: &LevelPoints,
-    image: &Image<u16>,
-    at: &Evaluation,
-) -> NormalEquations {
-    // SAFETY: this function's own contract.
-    unsafe { accumulate::<float32x4_t>(points, image, at) }
-}
-
-/// # Safety
-/// The CPU has NEON; `at` was made for the size of `image`.
-#[target_feature(enable = "neon")]
-pub unsafe fn scatter_neon(
-    points: &LevelPoints,
-    image: &Image<u16>,
-    at: &Evaluation,
-) -> GradientScatter {
-    // SAFETY: this function's own contract.
-    unsafe { scatter::<float32x4_t>(points, image, at) }
-}
+use crate::slam::kernel::lanes_kernel::{Lanes, Sample, intrinsics};
 
 impl Lanes for float32x4_t {
     const N: usize = 4;
     type Mask = uint32x4_t;
 
-    #[inline(always)]
-    unsafe fn splat(value: f32) -> Self {
-        // SAFETY: the trait's contract.
-        unsafe { vdupq_n_f32(value) }
-    }
-    #[inline(always)]
-    unsafe fn load(from: *const f32) -> Self {
-        // SAFETY: the trait's contract.
-        unsafe { vld1q_f32(from) }
-    }
-    #[inline(always)]
-    unsafe fn store(self, to: *mut f32) {
-        // SAFETY: the trait's contract.
-        unsafe { vst1q_f32(to, self) }
-    }
-    #[inline(always)]
-    unsafe fn add(self, other: Self) -> Self {
-        // SAFETY: the trait's contract.
-        unsafe { vaddq_f32(self, other) }
-    }
-    #[inline(always)]
-    unsafe fn sub(self, other: Self) -> Self {
-        // SAFETY: the trait's contract.
-        unsafe { vsubq_f32(self, other) }
-    }
-    #[inline(always)]
-    unsafe fn mul(self, other: Self) -> Self {
-        // SAFETY: the trait's contract.
-        unsafe { vmulq_f32(self, other) }
-    }
-    #[inline(always)]
-    unsafe fn div(self, other: Self) -> Self {
-        // SAFETY: the trait's contract.
-        unsafe { vdivq_f32(self, other) }
-    }
-    #[inline(always)]
-    unsafe fn sqrt(self) -> Self {
-        // SAFETY: the trait's contract.
-        unsafe { vsqrtq_f32(self) }
-    }
-    #[inline(always)]
-    unsafe fn min(self, other: Self) -> Self {
+    intrinsics! {
+        splat(value: f32) -> Self = vdupq_n_f32(value);
+        load(from: *const f32) -> Self = vld1q_f32(from);
+        add(self: Self, other: Self) -> Self = vaddq_f32(self, other);
+        sub(self: Self, other: Self) -> Self = vsubq_f32(self, other);
+        mul(self: Self, other: Self) -> Self = vmulq_f32(self, other);
+        div(self: Self, other: Self) -> Self = vdivq_f32(self, other);
+        sqrt(self: Self) -> Self = vsqrtq_f32(self);
         // The number where the other is not one (0/0 in Huber's weight), as on the other CPUs.
-        // SAFETY: the trait's contract.
-        unsafe { vminnmq_f32(self, other) }
-    }
-    #[inline(always)]
-    unsafe fn max(self, other: Self) -> Self {
-        // SAFETY: the trait's contract.
-        unsafe { vmaxnmq_f32(self, other) }
-    }
-    #[inline(always)]
-    unsafe fn mul_add(self, factor: Self, summand: Self) -> Self {
-        // SAFETY: the trait's contract.
-        unsafe { vfmaq_f32(summand, self, factor) }
-    }
-    #[inline(always)]
-    unsafe fn greater(self, other: Self) -> uint32x4_t {
-        // SAFETY: the trait's contract.
-        unsafe { vcgtq_f32(self, other) }
-    }
-    #[inline(always)]
-    unsafe fn at_least(self, other: Self) -> uint32x4_t {
-        // SAFETY: the trait's contract.
-        unsafe { vcgeq_f32(self, other) }
-    }
-    #[inline(always)]
-    unsafe fn both(one: uint32x4_t, other: uint32x4_t) -> uint32x4_t {
-        // SAFETY: the trait's contract.
-        unsafe { vandq_u32(one, other) }
-    }
-    #[inline(always)]
-    unsafe fn select(mask: uint32x4_t, yes: Self, no: Self) -> Self {
-        // SAFETY: the trait's contract.
-        unsafe { vbslq_f32(mask, yes, no) }
-    }
-    #[inline(always)]
-    unsafe fn count(mask: uint32x4_t) -> u32 {
-        // SAFETY: the trait's contract.
-        unsafe { vaddvq_u32(vshrq_n_u32::<31>(mask)) }
+        min(self: Self, other: Self) -> Self = vminnmq_f32(self, other);
+        max(self: Self, other: Self) -> Self = vmaxnmq_f32(self, other);
+        mul_add(self: Self, factor: Self, summand: Self) -> Self = vfmaq_f32(summand, self, factor);
+        greater(self: Self, other: Self) -> uint32x4_t = vcgtq_f32(self, other);
+        at_least(self: Self, other: Self) -> uint32x4_t = vcgeq_f32(self, other);
+        both(one: uint32x4_t, other: uint32x4_t) -> uint32x4_t = vandq_u32(one, other);
+        select(mask: uint32x4_t, yes: Self, no: Self) -> Self = vbslq_f32(mask, yes, no);
+        count(mask: uint32x4_t) -> u32 = vaddvq_u32(vshrq_n_u32::<31>(mask));
+        store(self: Self, to: *mut f32) -> () = vst1q_f32(to, self);
     }
     #[inline(always)]
     unsafe fn sample(image: &[u16], stride: usize, u: Self, v: Self) -> Sample<Self> {

@@ -45,3 +45,16 @@ pub trait Lanes: Copy {
     /// row and the last but two.
     unsafe fn sample_bytes(image: &[u8], stride: usize, u: Self, v: Self) -> Sample<Self>;
 }
+
+/// Defines methods of `Lanes` that are one intrinsic each.
+macro_rules! intrinsics {
+    ($($name:ident($($argument:ident: $kind:ty),*) -> $result:ty = $body:expr;)*) => {$(
+        #[inline(always)]
+        unsafe fn $name($($argument: $kind),*) -> $result {
+            // SAFETY: the trait's contract: the CPU has the instructions, pointers are good for N.
+            unsafe { $body }
+        }
+    )*};
+}
+
+pub(super) use intrinsics;
