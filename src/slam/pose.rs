@@ -25,6 +25,24 @@ pub enum TrackingState {
 }
 
 impl TrackingState {
+    /// The names of the states, in the order of their codes.
+    pub const NAMES: [&'static str; 4] = ["initializing", "tracking", "degraded", "lost"];
+
+    /// Its place among them.
+    pub fn index(self) -> usize {
+        match self {
+            Self::Initializing => 0,
+            Self::Tracking => 1,
+            Self::Degraded(_) => 2,
+            Self::Lost(_) => 3,
+        }
+    }
+
+    /// Its name.
+    pub fn name(self) -> &'static str {
+        Self::NAMES[self.index()]
+    }
+
     /// Whether the pose is claimed: Tracking or Degraded.
     pub fn is_tracked(self) -> bool {
         matches!(self, Self::Tracking | Self::Degraded(_))
