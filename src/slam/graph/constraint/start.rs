@@ -10,6 +10,7 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::pose::Brightness;
 use crate::slam::tracker::motion::turned;
+use crate::slam::upper_median::upper_median;
 
 /// Turns that are tried around a rotation that is given, degrees: half a step of those that places are compared by.
 const AROUND_DEG: f64 = 4.5;
@@ -108,10 +109,5 @@ fn log_scale(
     let at = params.level(views, level, state, state);
     let depths = at.terms().filter_map(|terms| terms.depth);
     let mut residuals: Vec<f64> = depths.map(|depth| depth.residual).collect();
-    if residuals.is_empty() {
-        return state.log_scale;
-    }
-    let middle = residuals.len() / 2;
-    let median = *residuals.select_nth_unstable_by(middle, f64::total_cmp).1;
-    state.log_scale + median
+    state.log_scale + upper_median(&mut residuals, f64::total_cmp).unwrap_or(0.0)
 }

@@ -54,7 +54,7 @@ pub(in crate::slam) fn keyframe(
             continue;
         }
         let exact = f64::from(view.inverse_depth.at(u, v)) * unit;
-        let ray = [(u as f64 - CAMERA.cx) / CAMERA.fx, (v as f64 - CAMERA.cy) / CAMERA.fy];
+        let ray = CAMERA.ray(u as f64, v as f64);
         // A constant error is one of the unit: shapes are taken about their usual means.
         let common = modes[0] * ray[0] + modes[1] * ray[1] + modes[2] * (exact / usual).ln();
         let inverse_depth = exact * (common + error.noise * random.normal()).exp();
