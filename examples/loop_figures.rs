@@ -19,12 +19,12 @@ use semidense::service::replay::{DepthOrigin, PoseOrigin, ReplayConfig, replay};
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::geometry::sim3::Sim3;
 use semidense::slam::graph::constraint::{
-    ConstraintParams, ConstraintSolver, KeyframeView, Measurement, Refusal,
+    ConstraintParams, ConstraintSolver, KeyframeView, Measurement, Refusal, Start,
 };
 use semidense::slam::keyframe::Keyframe;
 use semidense::slam::trajectory::StampedPose;
 
-/// Every pair of keyframes of a map, measured from nothing.
+/// Every pair of keyframes of a map, measured from the true rotation.
 #[derive(Debug, Parser)]
 struct Arguments {
     /// Source with ground truth and depth images.
@@ -68,7 +68,6 @@ fn main() -> ExitCode {
 
 fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
     let mut source = open(&arguments.source, None, &SourceParams::default())?;
-    let intrinsics = source.intrinsics();
     let config = Config::default();
     let config = ReplayConfig {
         map: Default::default(),
@@ -103,7 +102,7 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {
         }
         return Ok(());
     }
-    let solver = ConstraintSolver::new(&intrinsics, ConstraintParams::default());
+    let solver = ConstraintSolver::new(ConstraintParams::default());
     let mut placed = Vec::new();
     let begin = Instant::now();
     for keyframe in record.map.keyframes.iter().step_by(arguments.stride) {
@@ -158,9 +157,13 @@ fn overlap(i: &Placed, j: &Placed) -> f64 {
     i.keyframe.usage(&i.world_from_keyframe.locate(&world_from_j))
 }
 
+fn truth(i: &Placed, j: &Placed) -> Sim3 {
+    j.world_from_keyframe.inverse() * i.world_from_keyframe
+}
+
 /// Errors of a measurement: translation in metres, rotation in degrees, scale, normalised square.
 fn errors(i: &Placed, j: &Placed, found: &Measurement) -> [f64; 4] {
-    let truth = j.world_from_keyframe.inverse() * i.world_from_keyframe;
+    let truth = truth(i, j);
     let error = (found.j_from_i * truth.inverse()).log();
     let rigid =
         (found.j_from_i.rigid.translation - truth.rigid.translation) * j.world_from_keyframe.scale;
@@ -188,7 +191,8 @@ fn pairs(solver: &ConstraintSolver, placed: &[Placed], prints_all: bool) {
             let seen = overlap(i, j).min(overlap(j, i));
             let class = CLASSES.iter().rposition(|&from| seen >= from).unwrap_or(0);
             let begin = Instant::now();
-            let found = solver.measure(&i.view, &j.view, None);
+            let rotation = truth(i, j).rigid.rotation;
+            let found = solver.measure(&i.view, &j.view, Start::Rotation(rotation));
             millis[usize::from(found.is_ok())].push(1e3 * begin.elapsed().as_secs_f64());
             let of = &mut classes[class];
             of.0 += 1;
@@ -260,8 +264,8 @@ fn basin(solver: &ConstraintSolver, placed: &[Placed]) {
             if overlap(i, j).min(overlap(j, i)) < 0.5 || good.len() > 40 {
                 continue;
             }
-            let truth = j.world_from_keyframe.inverse() * i.world_from_keyframe;
-            if solver.measure(&i.view, &j.view, Some(&truth)).is_ok() {
+            let truth = truth(i, j);
+            if solver.measure(&i.view, &j.view, Start::Similarity(truth)).is_ok() {
                 good.push((i, j, truth));
             }
         }
@@ -270,7 +274,7 @@ fn basin(solver: &ConstraintSolver, placed: &[Placed]) {
         let accepted = good.iter().enumerate().filter(|(k, (i, j, truth))| {
             let sign = if k % 2 == 0 { 1.0 } else { -1.0 };
             let start = Sim3::exp(&twist(sign).into()) * *truth;
-            solver.measure(&i.view, &j.view, Some(&start)).is_ok()
+            solver.measure(&i.view, &j.view, Start::Similarity(start)).is_ok()
         });
         accepted.count() as f64 / good.len().max(1) as f64
     };

@@ -18,6 +18,7 @@ pub(crate) mod looped;
 pub mod opening;
 pub mod png_image;
 pub(crate) mod recording;
+mod rectifier;
 pub mod rig;
 pub mod rig_error;
 pub mod ros_image;

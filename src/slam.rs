@@ -28,4 +28,5 @@ pub mod tracker;
 pub mod trajectory;
 pub mod two_frame;
 pub mod up;
+pub(crate) mod upper_median;
 pub mod window;

@@ -9,6 +9,7 @@ mod empty_message;
 pub mod folders;
 pub mod keyframe_inbox;
 pub(crate) mod limits;
+pub mod lock_file;
 pub mod message;
 pub mod open_error;
 pub mod place;

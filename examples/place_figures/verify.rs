@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use nalgebra::Vector3;
 use semidense::slam::geometry::sim3::Sim3;
-use semidense::slam::graph::constraint::{ConstraintParams, ConstraintSolver, Refusal};
+use semidense::slam::graph::constraint::{ConstraintParams, ConstraintSolver, Refusal, Start};
 use semidense::slam::keyframe::Keyframe;
 use semidense::slam::places::PlaceCandidate;
 
@@ -29,7 +29,7 @@ pub fn verify(
     gap: usize,
     depth_error: f64,
 ) {
-    let solver = ConstraintSolver::new(&footage.camera, ConstraintParams::default());
+    let solver = ConstraintSolver::new(ConstraintParams::default());
     let (mut revisits, mut measured) = (0usize, Vec::new());
     let mut refusals = BTreeMap::<String, usize>::new();
     for (i, row) in overlaps.iter().enumerate() {
@@ -43,7 +43,7 @@ pub fn verify(
             let j = candidate.keyframe_id as usize;
             let Some(other) = footage.keyframe(j, depth_error) else { continue };
             let rotation = candidate.rotation(&footage.camera);
-            let found = solver.measure_turned(&view, &solver.view(&other), &rotation);
+            let found = solver.measure(&view, &solver.view(&other), Start::Rotation(rotation));
             let found = found.map(|found| is_true(&keyframe, &other, &found.j_from_i));
             let is_same = match row[j] {
                 Overlap { least, .. } if least >= SAME => Some(true),

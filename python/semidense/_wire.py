@@ -13,54 +13,16 @@ WIRE_VERSION = 11
 MAX_KEYFRAME_POINTS = 100000
 # Where the buckets of a histogram end, milliseconds.
 BUCKET_ENDS_MS = (
-    0.0014142135623730952,
-    0.002,
-    0.0028284271247461905,
-    0.004,
-    0.005656854249492381,
-    0.008,
-    0.011313708498984762,
-    0.016,
-    0.022627416997969524,
-    0.032,
-    0.04525483399593905,
-    0.064,
-    0.0905096679918781,
-    0.128,
-    0.1810193359837562,
-    0.256,
-    0.3620386719675124,
-    0.512,
-    0.7240773439350248,
-    1.024,
-    1.4481546878700495,
-    2.048,
-    2.896309375740099,
-    4.096,
-    5.792618751480198,
-    8.192,
-    11.585237502960396,
-    16.384,
-    23.170475005920792,
-    32.768,
-    46.340950011841585,
-    65.536,
-    92.68190002368317,
-    131.072,
-    185.36380004736634,
-    262.144,
-    370.7276000947327,
-    524.288,
-    741.4552001894654,
-    1048.576,
-    1482.9104003789307,
-    2097.152,
-    2965.8208007578614,
-    4194.304,
-    5931.641601515723,
-    8388.608,
-    11863.283203031446,
-    16777.216,
+    0.0014142135623730952, 0.002, 0.0028284271247461905, 0.004, 0.005656854249492381,
+    0.008, 0.011313708498984762, 0.016, 0.022627416997969524, 0.032,
+    0.04525483399593905, 0.064, 0.0905096679918781, 0.128, 0.1810193359837562,
+    0.256, 0.3620386719675124, 0.512, 0.7240773439350248, 1.024,
+    1.4481546878700495, 2.048, 2.896309375740099, 4.096, 5.792618751480198,
+    8.192, 11.585237502960396, 16.384, 23.170475005920792, 32.768,
+    46.340950011841585, 65.536, 92.68190002368317, 131.072, 185.36380004736634,
+    262.144, 370.7276000947327, 524.288, 741.4552001894654, 1048.576,
+    1482.9104003789307, 2097.152, 2965.8208007578614, 4194.304, 5931.641601515723,
+    8388.608, 11863.283203031446, 16777.216,
 )
 
 
@@ -68,19 +30,6 @@ class FrameHeader(ctypes.Structure):
     """Header of `capture/frame`; the payload is the grey image."""
 
     SIZE = 96
-    OFFSETS = {
-        "sequence": 0,
-        "capture_nanos": 8,
-        "clock_nanos": 16,
-        "realtime_nanos": 24,
-        "sent_nanos": 32,
-        "exposure_nanos": 40,
-        "intrinsics": 48,
-        "width": 80,
-        "height": 84,
-        "stride": 88,
-        "gain": 92,
-    }
     _fields_ = [
         # Number of the frame at its source; a gap is a frame that is missing.
         ("sequence", ctypes.c_uint64),
@@ -115,42 +64,6 @@ class PoseMessage(ctypes.Structure):
     """Message of `tracker/pose`."""
 
     SIZE = 1064
-    OFFSETS = {
-        "sequence": 0,
-        "capture_nanos": 8,
-        "realtime_nanos": 16,
-        "published_nanos": 24,
-        "latency_nanos": 32,
-        "track_nanos": 40,
-        "wake_nanos": 48,
-        "revision": 56,
-        "keyframe_id": 64,
-        "epoch": 72,
-        "state": 76,
-        "reason": 80,
-        "proposes_keyframe": 84,
-        "map_revision": 88,
-        "world_from_camera": 96,
-        "map_from_camera": 152,
-        "keyframe_from_camera": 208,
-        "covariance": 264,
-        "map_covariance": 432,
-        "alignment_covariance": 600,
-        "linear_velocity": 768,
-        "angular_velocity": 792,
-        "velocity_covariance": 816,
-        "brightness": 984,
-        "in_view_ratio": 1000,
-        "inlier_ratio": 1008,
-        "whitened_rmse": 1016,
-        "residual_rmse": 1024,
-        "mean_squared_flow": 1032,
-        "displacement_px": 1040,
-        "iterations": 1048,
-        "finest_level": 1052,
-        "points": 1056,
-        "has_velocity": 1060,
-    }
     _fields_ = [
         # Sequence of the frame.
         ("sequence", ctypes.c_uint64),
@@ -231,22 +144,6 @@ class KeyframeHeader(ctypes.Structure):
     """Header of `mapper/keyframe`; the payload is its `DepthPoint`s."""
 
     SIZE = 488
-    OFFSETS = {
-        "keyframe_id": 0,
-        "revision": 8,
-        "sequence": 16,
-        "capture_nanos": 24,
-        "world_from_keyframe": 32,
-        "map_from_keyframe": 96,
-        "map_revision": 160,
-        "intrinsics": 168,
-        "mode_covariance": 200,
-        "place_covariance": 248,
-        "epoch": 472,
-        "map_state": 476,
-        "width": 480,
-        "height": 484,
-    }
     _fields_ = [
         # Its id.
         ("keyframe_id", ctypes.c_uint64),
@@ -287,13 +184,6 @@ class DepthPoint(ctypes.Structure):
     """One pixel with depth, as it goes over the wire."""
 
     SIZE = 16
-    OFFSETS = {
-        "u": 0,
-        "v": 2,
-        "inverse_depth": 4,
-        "variance": 8,
-        "intensity": 12,
-    }
     _fields_ = [
         # Column of the pixel, level 0.
         ("u", ctypes.c_uint16),
@@ -316,13 +206,6 @@ class KeyframeImageHeader(ctypes.Structure):
     """Header of `mapper/keyframe_image`; the payload is the grey image."""
 
     SIZE = 24
-    OFFSETS = {
-        "keyframe_id": 0,
-        "epoch": 8,
-        "width": 12,
-        "height": 16,
-        "stride": 20,
-    }
     _fields_ = [
         # The keyframe.
         ("keyframe_id", ctypes.c_uint64),
@@ -345,21 +228,6 @@ class StepMessage(ctypes.Structure):
     """Message of `mapper/step`: this frame is in the map."""
 
     SIZE = 136
-    OFFSETS = {
-        "sequence": 0,
-        "keyframe_id": 8,
-        "revision": 16,
-        "step_nanos": 24,
-        "change_nanos": 32,
-        "keyframes": 40,
-        "points": 48,
-        "pose_nanos": 56,
-        "world_from_camera": 64,
-        "has_pose": 120,
-        "epoch": 124,
-        "start_frame": 128,
-        "reserved": 132,
-    }
     _fields_ = [
         # Sequence of the frame.
         ("sequence", ctypes.c_uint64),
@@ -398,12 +266,6 @@ class GraphHeader(ctypes.Structure):
     """Header of `mapper/graph`; the payload is one `KeyframePoseMessage` per keyframe."""
 
     SIZE = 24
-    OFFSETS = {
-        "revision": 0,
-        "map_revision": 8,
-        "epoch": 16,
-        "reserved": 20,
-    }
     _fields_ = [
         # Newest revision of a keyframe in it.
         ("revision", ctypes.c_uint64),
@@ -424,11 +286,6 @@ class KeyframePoseMessage(ctypes.Structure):
     """The pose of one keyframe in `mapper/graph`."""
 
     SIZE = 80
-    OFFSETS = {
-        "keyframe_id": 0,
-        "revision": 8,
-        "map_from_keyframe": 16,
-    }
     _fields_ = [
         # The keyframe.
         ("keyframe_id", ctypes.c_uint64),
@@ -447,20 +304,6 @@ class AdjustmentMessage(ctypes.Structure):
     """Message of `mapper/adjustment`: a joint estimate of keyframes is over."""
 
     SIZE = 72
-    OFFSETS = {
-        "sequence": 0,
-        "frames": 8,
-        "cpu_nanos": 16,
-        "keyframe_id": 24,
-        "inlier_ratio": 32,
-        "rms_grey": 40,
-        "fate": 48,
-        "free": 52,
-        "fixed": 56,
-        "points": 60,
-        "comparisons": 64,
-        "iterations": 68,
-    }
     _fields_ = [
         # Sequence of the last frame before it entered the map.
         ("sequence", ctypes.c_uint64),
@@ -497,51 +340,6 @@ class HealthMessage(ctypes.Structure):
     """Message of `<process>/health`."""
 
     SIZE = 2360
-    OFFSETS = {
-        "published_nanos": 0,
-        "started_nanos": 8,
-        "process_id": 16,
-        "state": 20,
-        "progress_done": 24,
-        "progress_total": 32,
-        "frames": 40,
-        "rate_hz": 48,
-        "dropped": 56,
-        "gaps": 64,
-        "refused": 72,
-        "disordered": 80,
-        "resized": 88,
-        "deadline_misses": 96,
-        "page_faults": 104,
-        "total": 112,
-        "detail": 120,
-        "cause_bytes": 124,
-        "peak_rss_bytes": 128,
-        "latency_counts": 136,
-        "work_counts": 520,
-        "wake_counts": 904,
-        "adjustments": 1288,
-        "adjustments_merged": 1296,
-        "adjustments_dropped": 1304,
-        "adjustment_counts": 1312,
-        "loop_searches": 1696,
-        "loops_closed": 1704,
-        "loops_held": 1712,
-        "epochs_joined": 1720,
-        "loops_refused": 1728,
-        "loops_against_drift": 1736,
-        "loops_unconfirmed": 1744,
-        "loops_inconsistent": 1752,
-        "scheduling": 1760,
-        "priority": 1764,
-        "memory_locked": 1768,
-        "warning_bytes": 1772,
-        "warning": 1776,
-        "cause": 1968,
-        "source": 2160,
-        "source_bytes": 2352,
-        "reserved": 2356,
-    }
     _fields_ = [
         # CLOCK_MONOTONIC when it was published.
         ("published_nanos", ctypes.c_int64),
@@ -640,12 +438,6 @@ class CommandRequest(ctypes.Structure):
     """Request of `mapper/command`."""
 
     SIZE = 4112
-    OFFSETS = {
-        "keyframe_id": 0,
-        "kind": 8,
-        "path_bytes": 12,
-        "path": 16,
-    }
     _fields_ = [
         # The keyframe that is asked for; otherwise 0.
         ("keyframe_id", ctypes.c_uint64),
@@ -666,11 +458,6 @@ class CommandResponse(ctypes.Structure):
     """Response of `mapper/command`."""
 
     SIZE = 200
-    OFFSETS = {
-        "status": 0,
-        "text_bytes": 4,
-        "text": 8,
-    }
     _fields_ = [
         # 0 done, 1 failed.
         ("status", ctypes.c_uint32),

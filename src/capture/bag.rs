@@ -23,11 +23,11 @@ use crate::capture::bag::records::{Place, Records};
 use crate::capture::bag::topics::Kind;
 use crate::capture::decode_error::DecodeError;
 use crate::capture::image_file::decode_gray_into;
+use crate::capture::rectifier::Rectifier;
 use crate::capture::rig::Rig;
 use crate::capture::source::{FrameSource, FrameStamp, Notice};
 use crate::capture::source_error::SourceError;
 use crate::slam::geometry::intrinsics::Intrinsics;
-use crate::slam::geometry::rectification::Rectification;
 
 /// The images of a topic as a source of frames.
 #[derive(Debug)]
@@ -35,9 +35,7 @@ pub struct Bag {
     path: PathBuf,
     contents: Contents,
     records: Records,
-    rectification: Rectification,
-    /// The raw image, where it is not the rectified one.
-    raw: Vec<u8>,
+    rectifier: Rectifier,
     samples: Vec<u8>,
     /// What our own recording says of the next image.
     record: Option<FrameRecord>,
@@ -58,10 +56,7 @@ pub fn open(path: &Path, topic: Option<&str>, rig: Option<&Path>) -> Result<Bag,
         Some(rig) => (Rig::read(rig)?, rig.to_owned()),
         None => (contents.rig(path).map_err(bag)?, path.to_owned()),
     };
-    let rectification = Rectification::new(&rig.camera)
-        .map_err(|source| SourceError::Rectification { path: rig_path, source })?;
-    let Intrinsics { width, height, .. } = *rectification.intrinsics();
-    let raw = if rectification.is_identity() { Vec::new() } else { vec![0; width * height] };
+    let rectifier = Rectifier::new(&rig, &rig_path)?;
     let notice = contents.is_unfinished.then(|| Notice {
         text: format!("{}: ends early; it is played to its last whole part", path.display()),
         is_warning: true,
@@ -70,8 +65,7 @@ pub fn open(path: &Path, topic: Option<&str>, rig: Option<&Path>) -> Result<Bag,
         path: path.to_owned(),
         records: Records::open(path).map_err(bag)?,
         contents,
-        rectification,
-        raw,
+        rectifier,
         samples: Vec::new(),
         record: None,
         first_sequence: None,
@@ -157,34 +151,28 @@ impl Bag {
 
     /// Decodes the image at hand into `pixels`.
     fn decode_into(&mut self, pixels: &mut [u8]) -> Result<(), BagImageError> {
-        let Intrinsics { width, height, .. } = *self.rectification.intrinsics();
-        let is_identity = self.rectification.is_identity();
-        let gray = if is_identity { &mut *pixels } else { &mut self.raw[..] };
+        let Intrinsics { width, height, .. } = self.rectifier.intrinsics();
         let data = self.records.message();
-        match self.contents.image_kind(self.records.channel()) {
-            Some(Kind::CompressedImage) => {
+        let kind = self.contents.image_kind(self.records.channel());
+        self.rectifier.read_into(pixels, |gray| {
+            if kind == Some(Kind::CompressedImage) {
                 let image: CompressedImage<'_> = message::decode(data)?;
                 decode_gray_into(image.data, width, height, &mut self.samples, gray)?;
+                return Ok(());
             }
-            _ => {
-                let image: Image<'_> = message::decode(data)?;
-                let found = (image.width as usize, image.height as usize);
-                if found != (width, height) {
-                    return Err(DecodeError::Size { found, expected: (width, height) }.into());
-                }
-                image.as_ros().unpack_gray(gray)?;
+            let image: Image<'_> = message::decode(data)?;
+            let found = (image.width as usize, image.height as usize);
+            if found != (width, height) {
+                return Err(DecodeError::Size { found, expected: (width, height) }.into());
             }
-        }
-        if !is_identity {
-            self.rectification.rectify_into(&self.raw, pixels);
-        }
-        Ok(())
+            Ok(image.as_ros().unpack_gray(gray)?)
+        })
     }
 }
 
 impl FrameSource for Bag {
     fn intrinsics(&self) -> Intrinsics {
-        *self.rectification.intrinsics()
+        self.rectifier.intrinsics()
     }
 
     fn num_frames(&self) -> Option<usize> {
@@ -192,10 +180,7 @@ impl FrameSource for Bag {
     }
 
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
-        let Intrinsics { width, height, .. } = self.intrinsics();
-        if pixels.len() != width * height {
-            return Err(SourceError::Buffer { found: pixels.len(), width, height });
-        }
+        self.rectifier.check_buffer(pixels)?;
         let Some(stamp) = self.advance()? else { return Ok(None) };
         self.decode_into(pixels).map_err(|problem| self.lost(problem))?;
         Ok(Some(stamp))

@@ -7,11 +7,11 @@
 use std::path::PathBuf;
 
 use crate::capture::image_file::ImageFileReader;
+use crate::capture::rectifier::Rectifier;
 use crate::capture::rig::Rig;
 use crate::capture::source::{FrameSource, FrameStamp};
 use crate::capture::source_error::SourceError;
 use crate::slam::geometry::intrinsics::Intrinsics;
-use crate::slam::geometry::rectification::Rectification;
 use crate::slam::image::buffer::Image;
 use crate::slam::trajectory::StampedPose;
 
@@ -45,10 +45,8 @@ pub struct Contents {
 #[derive(Debug)]
 pub struct Recording {
     contents: Contents,
-    rectification: Rectification,
+    rectifier: Rectifier,
     reader: ImageFileReader,
-    /// The raw image, where it is not the rectified one.
-    raw: Vec<u8>,
     next: usize,
 }
 
@@ -64,11 +62,8 @@ impl Recording {
         if contents.frames.is_empty() {
             return Err(SourceError::Empty { path: listed_in });
         }
-        let rectification = Rectification::new(&rig.camera)
-            .map_err(|source| SourceError::Rectification { path: rig_path, source })?;
-        let Intrinsics { width, height, .. } = *rectification.intrinsics();
-        let raw = if rectification.is_identity() { Vec::new() } else { vec![0; width * height] };
-        Ok(Self { contents, rectification, reader: ImageFileReader::default(), raw, next: 0 })
+        let rectifier = Rectifier::new(rig, &rig_path)?;
+        Ok(Self { contents, rectifier, reader: ImageFileReader::default(), next: 0 })
     }
 
     /// The depth image nearest to a stamp, where one is near enough.
@@ -85,7 +80,7 @@ impl Recording {
 
 impl FrameSource for Recording {
     fn intrinsics(&self) -> Intrinsics {
-        *self.rectification.intrinsics()
+        self.rectifier.intrinsics()
     }
 
     fn num_frames(&self) -> Option<usize> {
@@ -93,20 +88,15 @@ impl FrameSource for Recording {
     }
 
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
-        let Intrinsics { width, height, .. } = *self.rectification.intrinsics();
-        if pixels.len() != width * height {
-            return Err(SourceError::Buffer { found: pixels.len(), width, height });
-        }
+        self.rectifier.check_buffer(pixels)?;
         let Some(frame) = self.contents.frames.get(self.next) else { return Ok(None) };
         let sequence = self.next as u64;
         // Counted before it is read: whoever continues after a bad image gets the one after it.
         self.next += 1;
-        if self.rectification.is_identity() {
-            self.reader.read_gray_into(&frame.path, width, height, pixels)?;
-        } else {
-            self.reader.read_gray_into(&frame.path, width, height, &mut self.raw)?;
-            self.rectification.rectify_into(&self.raw, pixels);
-        }
+        let Intrinsics { width, height, .. } = self.rectifier.intrinsics();
+        self.rectifier.read_into(pixels, |gray| {
+            self.reader.read_gray_into(&frame.path, width, height, gray)
+        })?;
         let (capture_nanos, exposure_nanos) = (frame.nanos, frame.exposure_nanos);
         Ok(Some(FrameStamp { sequence, capture_nanos, exposure_nanos, gain: 0.0, clocks: None }))
     }
@@ -126,8 +116,8 @@ impl FrameSource for Recording {
         let Some(path) = self.nearest_depth(capture_nanos).map(|depth| depth.path.clone()) else {
             return Ok(None);
         };
-        let Intrinsics { width, height, .. } = *self.rectification.intrinsics();
+        let Intrinsics { width, height, .. } = self.rectifier.intrinsics();
         let raw = self.reader.read_depth(&path, width, height)?;
-        Ok(self.rectification.rectify_depth(&raw))
+        Ok(self.rectifier.rectify_depth(&raw))
     }
 }

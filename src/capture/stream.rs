@@ -17,6 +17,7 @@ use rustix::time::{ClockId, clock_gettime};
 use self::feed::{Feed, Listener, Program, await_readable};
 use self::format::{StreamClock, StreamHeader};
 use self::reader::{FrameReader, Progress, StreamFault};
+use crate::capture::rectifier::Rectifier;
 use crate::capture::rig::Rig;
 use crate::capture::source::{Arrival, FrameClocks, FrameLosses, FrameSource, FrameStamp, Notice};
 use crate::capture::source_error::SourceError;
@@ -24,7 +25,6 @@ use crate::capture::source_name::SourceName;
 use crate::capture::v4l::pixel_format::{PixelFormat, unpack_gray};
 use crate::capture::v4l::stamps::FrameNumbers;
 use crate::slam::geometry::intrinsics::Intrinsics;
-use crate::slam::geometry::rectification::Rectification;
 
 /// The program that reads ROS 2 topics.
 const BRIDGE: &str = "semidense-bridge";
@@ -45,12 +45,10 @@ pub struct StreamSource {
     stream: Option<UnixStream>,
     feed: Feed,
     reader: FrameReader,
-    rectification: Rectification,
+    rectifier: Rectifier,
     held: Option<(StreamHeader, FrameStamp)>,
     /// The picture of the frame that is held.
     picture: Vec<u8>,
-    /// The grey image, where it is not the rectified one.
-    raw: Vec<u8>,
     /// Memory of the JPEG decoder.
     samples: Vec<u8>,
     numbers: FrameNumbers,
@@ -106,19 +104,16 @@ impl StreamSource {
         stall_s: f64,
     ) -> Result<Self, SourceError> {
         let path = rig.ok_or_else(|| SourceError::StreamRig { name: name.clone() })?;
-        let rectification = Rectification::new(&Rig::read(path)?.camera)
-            .map_err(|source| SourceError::Rectification { path: path.to_owned(), source })?;
-        let Intrinsics { width, height, .. } = *rectification.intrinsics();
-        let raw = if rectification.is_identity() { Vec::new() } else { vec![0; width * height] };
+        let rectifier = Rectifier::new(&Rig::read(path)?, path)?;
+        let Intrinsics { width, height, .. } = rectifier.intrinsics();
         Ok(Self {
             name,
             stream: None,
             feed,
             reader: FrameReader::new((width as u32, height as u32)),
-            rectification,
+            rectifier,
             held: None,
             picture: Vec::new(),
-            raw,
             samples: Vec::new(),
             numbers: FrameNumbers::default(),
             losses: FrameLosses::default(),
@@ -247,22 +242,18 @@ impl StreamSource {
 
     /// Converts the frame that is held; why it is none.
     fn convert(&mut self, header: &StreamHeader, pixels: &mut [u8]) -> Result<(), String> {
-        let Intrinsics { width, height, .. } = *self.rectification.intrinsics();
+        let Intrinsics { width, height, .. } = self.rectifier.intrinsics();
         let bytes = self.picture.get(..header.bytes as usize).unwrap_or(&[]);
         let stride = header.stride as usize;
         let is_packed = header.format == PixelFormat::Grey && stride == width;
         if let (true, Some(packed)) = (is_packed, bytes.get(..width * height)) {
-            self.rectification.rectify_into(packed, pixels);
+            self.rectifier.rectify_into(packed, pixels);
             return Ok(());
         }
-        let is_identity = self.rectification.is_identity();
-        let gray = if is_identity { &mut *pixels } else { &mut self.raw[..] };
-        unpack_gray(header.format, bytes, stride, (width, height), &mut self.samples, gray)
-            .map_err(|broken| broken.to_string())?;
-        if !is_identity {
-            self.rectification.rectify_into(&self.raw, pixels);
-        }
-        Ok(())
+        let unpacked = self.rectifier.read_into(pixels, |gray| {
+            unpack_gray(header.format, bytes, stride, (width, height), &mut self.samples, gray)
+        });
+        unpacked.map_err(|broken| broken.to_string())
     }
 }
 
@@ -290,7 +281,7 @@ fn stamp_of(header: &StreamHeader, arrival_nanos: i64, realtime_nanos: i64) -> (
 
 impl FrameSource for StreamSource {
     fn intrinsics(&self) -> Intrinsics {
-        *self.rectification.intrinsics()
+        self.rectifier.intrinsics()
     }
 
     fn num_frames(&self) -> Option<usize> {
@@ -313,10 +304,7 @@ impl FrameSource for StreamSource {
     }
 
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
-        let Intrinsics { width, height, .. } = *self.rectification.intrinsics();
-        if pixels.len() != width * height {
-            return Err(SourceError::Buffer { found: pixels.len(), width, height });
-        }
+        self.rectifier.check_buffer(pixels)?;
         let (header, stamp) = loop {
             if let Some(held) = self.held.take() {
                 break held;

@@ -32,11 +32,11 @@ use self::negotiation::Wish;
 use self::params::CameraParams;
 use self::pixel_format::unpack_gray;
 use self::video_device::VideoSystem;
+use crate::capture::rectifier::Rectifier;
 use crate::capture::rig::Rig;
 use crate::capture::source::{Arrival, FrameLosses, FrameSource, FrameStamp, Notice};
 use crate::capture::source_error::SourceError;
 use crate::slam::geometry::intrinsics::Intrinsics;
-use crate::slam::geometry::rectification::Rectification;
 
 pub use self::pixel_format::{BrokenPicture, PixelFormat};
 
@@ -47,9 +47,7 @@ const READ_MILLIS: u32 = 1000;
 pub struct CameraSource<S: VideoSystem> {
     name: String,
     camera: Camera<S>,
-    rectification: Rectification,
-    /// The raw image, where it is not the rectified one.
-    raw: Vec<u8>,
+    rectifier: Rectifier,
     /// Memory of the JPEG decoder.
     samples: Vec<u8>,
 }
@@ -73,9 +71,8 @@ impl<S: VideoSystem> CameraSource<S> {
         rig_path: &Path,
         params: &CameraParams,
     ) -> Result<Self, SourceError> {
-        let rectification = Rectification::new(&rig.camera)
-            .map_err(|source| SourceError::Rectification { path: rig_path.to_owned(), source })?;
-        let Intrinsics { width, height, .. } = *rectification.intrinsics();
+        let rectifier = Rectifier::new(rig, rig_path)?;
+        let Intrinsics { width, height, .. } = rectifier.intrinsics();
         let own_rate = (params.rate_hz > 0.0).then_some(params.rate_hz);
         let wish = Wish {
             width: width as u32,
@@ -83,9 +80,8 @@ impl<S: VideoSystem> CameraSource<S> {
             format: params.format.format(),
             rate_hz: own_rate.or(rig.rate_hz),
         };
-        let raw = if rectification.is_identity() { Vec::new() } else { vec![0; width * height] };
         let camera = Camera::new(system, name.to_owned(), params.clone(), wish);
-        Ok(Self { name: name.to_owned(), camera, rectification, raw, samples: Vec::new() })
+        Ok(Self { name: name.to_owned(), camera, rectifier, samples: Vec::new() })
     }
 
     fn failed(&self, reason: String) -> SourceError {
@@ -94,28 +90,25 @@ impl<S: VideoSystem> CameraSource<S> {
 
     /// Converts the frame that waits; why it is none.
     fn convert(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, String> {
-        let Intrinsics { width, height, .. } = *self.rectification.intrinsics();
+        let Intrinsics { width, height, .. } = self.rectifier.intrinsics();
         let Some((held, grant, bytes)) = self.camera.held() else { return Ok(None) };
         let is_packed = grant.format == PixelFormat::Grey && grant.stride == width;
         if let (true, Some(packed)) = (is_packed, bytes.get(..width * height)) {
             // Straight from the driver's memory, rectified or not.
-            self.rectification.rectify_into(packed, pixels);
+            self.rectifier.rectify_into(packed, pixels);
             return Ok(Some(held.stamp));
         }
-        let is_identity = self.rectification.is_identity();
-        let gray = if is_identity { &mut *pixels } else { &mut self.raw[..] };
-        unpack_gray(grant.format, bytes, grant.stride, (width, height), &mut self.samples, gray)
-            .map_err(|broken| broken.to_string())?;
-        if !is_identity {
-            self.rectification.rectify_into(&self.raw, pixels);
-        }
-        Ok(Some(held.stamp))
+        let (format, stride) = (grant.format, grant.stride);
+        let unpacked = self.rectifier.read_into(pixels, |gray| {
+            unpack_gray(format, bytes, stride, (width, height), &mut self.samples, gray)
+        });
+        unpacked.map(|()| Some(held.stamp)).map_err(|broken| broken.to_string())
     }
 }
 
 impl<S: VideoSystem> FrameSource for CameraSource<S> {
     fn intrinsics(&self) -> Intrinsics {
-        *self.rectification.intrinsics()
+        self.rectifier.intrinsics()
     }
 
     fn num_frames(&self) -> Option<usize> {
@@ -127,10 +120,7 @@ impl<S: VideoSystem> FrameSource for CameraSource<S> {
     }
 
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
-        let Intrinsics { width, height, .. } = *self.rectification.intrinsics();
-        if pixels.len() != width * height {
-            return Err(SourceError::Buffer { found: pixels.len(), width, height });
-        }
+        self.rectifier.check_buffer(pixels)?;
         while self.camera.held().is_none() {
             let arrival = self.camera.await_frame(None, READ_MILLIS);
             if let Arrival::Absent(reason) = arrival.map_err(|reason| self.failed(reason))? {

@@ -22,9 +22,7 @@ use crate::service::journal::folder::unfinished;
 use crate::service::journal::log::RunStart;
 use crate::service::journal::replayed::ReplayJournal;
 use crate::service::journal::{Journal, JournalOptions};
-use crate::service::replay::{
-    DepthOrigin, PoseOrigin, ReplayConfig, ReplayError, ReplayProgress, replay,
-};
+use crate::service::replay::{DepthOrigin, PoseOrigin, ReplayConfig, ReplayError, replay};
 use crate::service::results::debug_pictures::write_debug_pictures;
 use crate::service::results::output_folder::OutputFolder;
 use crate::service::results::record::{EndOfRun, RunRecord};
@@ -32,7 +30,6 @@ use crate::service::results::results_error::ResultsError;
 use crate::service::results::set::{DEBUG_FOLDER, foreign_debug};
 use crate::service::schedule::give_back_large_blocks;
 use crate::service::shutdown::Shutdown;
-use crate::slam::pose::TrackingState;
 use crate::wire::place::Place;
 
 /// What a replay can take; a camera gives no frame twice.
@@ -232,7 +229,7 @@ fn record(
         })
         .ok();
     let replayed = replay(source, source_name, &config, &mut |frame| {
-        progress.update(frame.done, state_word(frame));
+        progress.update(frame.done, frame.state.name());
         journal.iter_mut().for_each(|journal| journal.observe(frame));
         goes_on()
     });
@@ -271,14 +268,5 @@ fn replay_config(config: &Config, args: &ReplayArgs) -> ReplayConfig {
         },
         max_frames: args.frames.map(|frames| frames as usize),
         strict: config.capture.strict,
-    }
-}
-
-fn state_word(frame: &ReplayProgress<'_>) -> &'static str {
-    match frame.state {
-        TrackingState::Initializing => "initializing",
-        TrackingState::Tracking => "tracking",
-        TrackingState::Degraded(_) => "degraded",
-        TrackingState::Lost(_) => "lost",
     }
 }

@@ -56,7 +56,7 @@ impl Shown {
             RunProgress::Waiting(reason) => return self.show_waiting(reason),
             RunProgress::Preparing(done, total) => ("preparing", *done, *total, String::new()),
             RunProgress::Running { frames, total, state, keyframes } => {
-                let state = state.map_or("", state_name);
+                let state = state.map_or("", TrackingState::name);
                 ("running", *frames, *total, format!("{state}, {keyframes} keyframes"))
             }
         };
@@ -95,15 +95,5 @@ impl Shown {
     /// Takes the bar away.
     fn finish(&self) {
         self.bar.iter().for_each(ProgressBar::finish_and_clear);
-    }
-}
-
-/// One word for a state.
-pub fn state_name(state: TrackingState) -> &'static str {
-    match state {
-        TrackingState::Initializing => "initializing",
-        TrackingState::Tracking => "tracking",
-        TrackingState::Degraded(_) => "degraded",
-        TrackingState::Lost(_) => "lost",
     }
 }

@@ -21,6 +21,7 @@ use crate::service::journal::folder::unfinished;
 use crate::service::liveness::{Liveness, age};
 use crate::service::peers::Peer;
 use crate::service::shutdown::Shutdown;
+use crate::slam::pose::TrackingState;
 use crate::wire::message::{HealthMessage, PoseMessage};
 use crate::wire::place::Place;
 use crate::wire::port::{Access, Hub, OpenError, Subscriber, wait};
@@ -264,13 +265,7 @@ fn state_of(health: &HealthMessage, reported: Option<&'static str>, now: i64) ->
 
 /// A pose as JSON.
 fn pose_row(pose: &PoseMessage, now: i64) -> Value {
-    let state = match pose.state {
-        0 => "initializing",
-        1 => "tracking",
-        2 => "degraded",
-        3 => "lost",
-        _ => "unknown",
-    };
+    let state = TrackingState::NAMES.get(pose.state as usize).copied().unwrap_or("unknown");
     let [.., x, y, z] = pose.world_from_camera;
     json!({
         "state": state,

@@ -1,8 +1,6 @@
 //! A frame's pose from ground truth, in the words of the tracker, so that the mapper can be run and
 //! judged alone.
 
-use nalgebra::Vector3;
-
 use crate::slam::evaluation::MAX_DIFFERENCE_NANOS;
 use crate::slam::evaluation::association::nearest;
 use crate::slam::frame::FrameView;
@@ -73,7 +71,7 @@ fn view_of(keyframe: &Keyframe, keyframe_from_camera: &SE3, tracker: &TrackerPar
     for point in &keyframe.points {
         let (u, v, d) = (f64::from(point.u), f64::from(point.v), f64::from(point.inverse_depth));
         inverse_depths += d;
-        let ray = Vector3::new((u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.0);
+        let ray = k.ray(u, v);
         let in_camera = rotation * ray + camera_from_keyframe.translation * d;
         if in_camera.z <= 0.0 {
             continue;

@@ -1,6 +1,6 @@
 //! What a run leaves behind: trajectories, keyframes, point cloud, summary and report.
 //!
-//! `run` and `replay` end in [`write_results`] with a [`RunRecord`], so that their files mean the
+//! `run` and `replay` end in [`Results`] of a [`RunRecord`], so that their files mean the
 //! same and can be compared byte by byte.
 
 pub(crate) mod alignment_levels;
@@ -246,18 +246,6 @@ impl<'a> Results<'a> {
             if params.full_points { FULL_POINT_BYTES * summary.point_counts.points } else { 0 };
         (surface + full + lines + page + SUMMARY_BYTES) as u64
     }
-}
-
-/// Evaluates a run and writes its files into `dir`; see [`Results`].
-pub fn write_results(
-    dir: &Path,
-    record: &RunRecord,
-    depth_source: &mut dyn FrameSource,
-    params: &ResultsParams,
-) -> Result<Summary, ResultsError> {
-    let results = Results::new(record, depth_source, params, &mut |_, _| ())?;
-    results.write(dir, &|_| Ok(()))?;
-    Ok(results.summary)
 }
 
 /// Keyframes of one epoch, the one that is written and shown; of the newest where none was tracked. Each epoch has a place

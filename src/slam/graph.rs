@@ -95,18 +95,10 @@ pub fn optimise(graph: &mut PoseGraph, params: &GraphParams) -> Result<Outcome, 
     if params.is_scale_known { solve::<6>(graph, params) } else { solve::<7>(graph, params) }
 }
 
-/// How well each constraint fits: rᵀΛr, and the weight ρ' that its kernel leaves it.
-pub fn fits(graph: &PoseGraph, is_scale_known: bool) -> Vec<(f64, f64)> {
+/// How well each constraint fits: rᵀΛr.
+pub fn normalized_errors(graph: &PoseGraph) -> impl Iterator<Item = f64> {
     let places: Vec<_> = graph.vertices().iter().map(|v| v.map_from_keyframe).collect();
-    let of = |constraint| {
-        let e = if is_scale_known {
-            error::<6>(constraint, &places)
-        } else {
-            error::<7>(constraint, &places)
-        };
-        (e, constraint.kernel.at(e).weight)
-    };
-    graph.constraints().iter().map(of).collect()
+    graph.constraints().iter().map(move |constraint| error::<7>(constraint, &places))
 }
 
 /// Checks that every vertex is connected to a fixed one.

@@ -31,11 +31,6 @@ pub struct DepthPoint {
 /// Most points of one keyframe: bounds the message and the tracker's memory.
 pub const MAX_KEYFRAME_POINTS: usize = 100_000;
 
-/// Most bytes of image and depth that a keyframe of `num_pixels` holds: one a pixel, 16 a point.
-pub const fn most_keyframe_bytes(num_pixels: usize) -> usize {
-    num_pixels + MAX_KEYFRAME_POINTS * size_of::<DepthPoint>()
-}
-
 /// What counts in the distance of a camera from a keyframe (Engel, Schöps, Cremers 2014, §3.4, with the share of
 /// points in view).
 #[derive(Debug, Clone, Copy, PartialEq)]

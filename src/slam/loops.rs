@@ -22,7 +22,7 @@ use serde::{Deserialize, Serialize};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
-use crate::slam::graph::constraint::{ConstraintParams, ConstraintSolver, Refusal};
+use crate::slam::graph::constraint::Refusal;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::loops::likeness::{Alike, Likeness};
 use crate::slam::map::Map;
@@ -163,8 +163,6 @@ impl Job {
 pub struct Loops {
     params: LoopParams,
     intrinsics: Intrinsics,
-    /// Made with the first search: three megabytes.
-    solver: Option<Arc<ConstraintSolver>>,
     likeness: Likeness,
     /// By keyframe those that it was estimated with, older and newer.
     partners: BTreeMap<u64, BTreeSet<u64>>,
@@ -188,7 +186,6 @@ impl Loops {
         Self {
             params,
             intrinsics,
-            solver: None,
             likeness: Likeness::default(),
             partners: BTreeMap::new(),
             epoch_starts: BTreeSet::new(),
@@ -378,12 +375,6 @@ impl Loops {
     fn searched(&mut self, keyframe_id: u64) {
         Arc::make_mut(&mut self.known).searched_to = Some(keyframe_id);
         self.likeness.forget(keyframe_id);
-    }
-
-    fn solver(&mut self) -> Arc<ConstraintSolver> {
-        let intrinsics = &self.intrinsics;
-        let make = || Arc::new(ConstraintSolver::new(intrinsics, ConstraintParams::default()));
-        self.solver.get_or_insert_with(make).clone()
     }
 }
 

@@ -156,8 +156,8 @@ pub enum CorrectionError {
 impl LogPlane {
     /// The factor at a pixel.
     pub fn factor(&self, intrinsics: &Intrinsics, u: f64, v: f64) -> f64 {
-        let (x, y) = ((u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy);
-        (self.offset + self.per_x * x + self.per_y * y).exp()
+        let ray = intrinsics.ray(u, v);
+        (self.offset + self.per_x * ray.x + self.per_y * ray.y).exp()
     }
 
     /// Whether it changes nothing.

@@ -1,6 +1,6 @@
 //! What the tracker says of one frame: pose, covariance, state and quality.
 
-use nalgebra::Vector3;
+use nalgebra::{Matrix6, Vector3};
 
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
@@ -25,6 +25,24 @@ pub enum TrackingState {
 }
 
 impl TrackingState {
+    /// The names of the states, in the order of their codes.
+    pub const NAMES: [&'static str; 4] = ["initializing", "tracking", "degraded", "lost"];
+
+    /// Its place among them.
+    pub fn index(self) -> usize {
+        match self {
+            Self::Initializing => 0,
+            Self::Tracking => 1,
+            Self::Degraded(_) => 2,
+            Self::Lost(_) => 3,
+        }
+    }
+
+    /// Its name.
+    pub fn name(self) -> &'static str {
+        Self::NAMES[self.index()]
+    }
+
     /// Whether the pose is claimed: Tracking or Degraded.
     pub fn is_tracked(self) -> bool {
         matches!(self, Self::Tracking | Self::Degraded(_))
@@ -182,5 +200,37 @@ impl PoseEstimate {
             quality: Quality::default(),
             proposes_keyframe: false,
         }
+    }
+}
+
+/// The upper triangle of a symmetric matrix, row by row.
+pub(in crate::slam) fn upper_triangle(entry: impl Fn(usize, usize) -> f64) -> [f64; 21] {
+    let mut entries = (0..6).flat_map(|row| (row..6).map(move |column| (row, column)));
+    std::array::from_fn(|_| entries.next().map_or(0.0, |(row, column)| entry(row, column)))
+}
+
+/// The symmetric matrix of an upper triangle, row by row.
+pub(in crate::slam) fn full_covariance(upper_triangle: &[f64; 21]) -> Matrix6<f64> {
+    let mut entries = upper_triangle.iter();
+    let mut matrix = Matrix6::zeros();
+    for row in 0..6 {
+        for column in row..6 {
+            let entry = entries.next().copied().unwrap_or_default();
+            (matrix[(row, column)], matrix[(column, row)]) = (entry, entry);
+        }
+    }
+    matrix
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_upper_triangle_is_a_whole_matrix() {
+        let triangle = std::array::from_fn(|i| i as f64);
+        let full = full_covariance(&triangle);
+        assert_eq!((full[(0, 5)], full[(5, 0)], full[(1, 1)], full[(5, 5)]), (5.0, 5.0, 6.0, 20.0));
+        assert_eq!(upper_triangle(|row, column| full[(row, column)]), triangle);
     }
 }

@@ -189,9 +189,7 @@ impl Scene {
     pub fn render(&self, camera: &Intrinsics, world_from_camera: &SE3) -> Rendering {
         let rotation = world_from_camera.rotation_matrix();
         let origin = world_from_camera.translation;
-        let ray = |u: f64, v: f64| {
-            rotation * Vector3::new((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0)
-        };
+        let ray = |u: f64, v: f64| rotation * camera.ray(u, v);
         let mut intensity = Image::filled(camera.width, camera.height, 0.0);
         let mut inverse_depth = intensity.clone();
         let mut cells = [Cell::default(); 3];

@@ -431,12 +431,6 @@ impl Tracker {
     }
 }
 
-/// The upper triangle of a 6×6 matrix, row by row.
-pub(in crate::slam) fn upper_triangle(entry: impl Fn(usize, usize) -> f64) -> [f64; 21] {
-    let mut entries = (0..6).flat_map(|row| (row..6).map(move |column| (row, column)));
-    std::array::from_fn(|_| entries.next().map_or(0.0, |(row, column)| entry(row, column)))
-}
-
 /// Standard deviation of the coarsest level, grey levels.
 fn contrast(pyramid: &SumPyramid) -> f64 {
     let level = pyramid.num_levels().saturating_sub(1);

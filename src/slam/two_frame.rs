@@ -11,7 +11,6 @@ pub mod fit;
 pub(crate) mod hypothesis;
 pub(crate) mod lanes;
 mod lead;
-pub(crate) mod median;
 pub(crate) mod points;
 mod sampling_kernel;
 pub(crate) mod spread;

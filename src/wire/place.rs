@@ -1,18 +1,18 @@
 //! Where an instance lives: its name, the folder of its files, the prefix of its shared memory, and
 //! the claim of a process to be the only one of its kind.
 
-use std::fs::{self, DirBuilder, File, OpenOptions};
-use std::io::{self, Read, Seek, Write};
-use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsExt};
+use std::fs::{self, DirBuilder, File};
+use std::io::Read;
+use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use iceoryx2::prelude::{Config, FileName, Path as IpcPath, SemanticString};
 use rustix::fs::FlockOperation;
-use rustix::thread::Timespec;
 
 use crate::wire::folders::{MAX_ROOT_BYTES, SHARED_MEMORY, SYSTEM_ROOT};
 use crate::wire::limits::raise_open_files;
+use crate::wire::lock_file::{LockFile, Locking, USER_ALONE, lock_named};
 use crate::wire::place_error::PlaceError;
 use crate::wire::root_folder::{is_mine, usual_root};
 
@@ -105,20 +105,11 @@ impl Place {
         let _joining = self.hold()?;
         let path = self.claim_path_of(&self.instance, process);
         let io = |source| PlaceError::Io { path: path.clone(), source };
-        loop {
-            let mut file = open_lock(&path).map_err(io)?;
-            if rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive).is_err() {
-                let mut holder = String::new();
-                file.read_to_string(&mut holder).map_err(io)?;
+        match LockFile::take(&path, USER_ALONE).map_err(io)? {
+            Locking::Locked(lock) => Ok(lock),
+            Locking::HeldBy(holder) => {
                 let (process, instance) = (process.to_owned(), self.instance.clone());
-                return Err(PlaceError::Taken { process, instance, holder: holder.trim().into() });
-            }
-            // The one before may have removed the file between our opening and our lock.
-            if is_same_file(&file, &path) {
-                file.set_len(0).map_err(io)?;
-                file.rewind().map_err(io)?;
-                writeln!(file, "{}", std::process::id()).map_err(io)?;
-                return Ok(Claim { _file: file, path });
+                Err(PlaceError::Taken { process, instance, holder })
             }
         }
     }
@@ -207,65 +198,7 @@ impl Place {
 }
 
 /// The claim of a process to be the only one; ends when dropped.
-#[derive(Debug)]
-pub struct Claim {
-    _file: File,
-    path: PathBuf,
-}
-
-impl Drop for Claim {
-    fn drop(&mut self) {
-        // Removed while still locked, so that no other process can hold the same name.
-        let _ = fs::remove_file(&self.path);
-    }
-}
-
-/// Opens and locks the file that has this name in the end: whoever held it before may have removed it, and others
-/// lock the new one. `None` if that is not possible in time.
-pub(in crate::wire) fn lock_named(
-    path: &Path,
-    operation: FlockOperation,
-    end: Instant,
-) -> io::Result<Option<File>> {
-    loop {
-        let file = open_lock(path)?;
-        if !lock_until(&file, operation, end) {
-            return Ok(None);
-        }
-        if is_same_file(&file, path) {
-            return Ok(Some(file));
-        }
-    }
-}
-
-/// Tries to lock until `end`; whether it is locked.
-pub(in crate::wire) fn lock_until(file: &File, operation: FlockOperation, end: Instant) -> bool {
-    /// Between two attempts.
-    const PAUSE: Timespec = Timespec { tv_sec: 0, tv_nsec: 2_000_000 };
-    loop {
-        if rustix::fs::flock(file, operation).is_ok() {
-            return true;
-        }
-        if Instant::now() >= end {
-            return false;
-        }
-        // Interrupted or not, the end decides.
-        drop(rustix::thread::nanosleep(&PAUSE));
-    }
-}
-
-pub(in crate::wire) fn open_lock(path: &Path) -> io::Result<File> {
-    const USER_ALONE: u32 = 0o600;
-    let mut options = OpenOptions::new();
-    options.read(true).write(true).create(true).truncate(false).mode(USER_ALONE).open(path)
-}
-
-pub(in crate::wire) fn is_same_file(file: &File, path: &Path) -> bool {
-    match (file.metadata(), fs::metadata(path)) {
-        (Ok(open), Ok(named)) => (open.dev(), open.ino()) == (named.dev(), named.ino()),
-        _ => false,
-    }
-}
+pub type Claim = LockFile;
 
 /// Names in shared memory are global: folders that differ need prefixes that differ, of which none begins with
 /// another.

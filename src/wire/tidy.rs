@@ -10,9 +10,9 @@ use iceoryx2::node::NodeState;
 use iceoryx2::prelude::*;
 use rustix::fs::FlockOperation;
 
+use crate::wire::lock_file::lock_named;
 use crate::wire::place::{
     CHECKPOINT_SUFFIX, CLAIM_SUFFIX, JOIN_LOCK, LOADED_MAP_SUFFIX, MEMBERS, POSITION_SUFFIX, Place,
-    lock_named,
 };
 
 /// Longest wait before tidying up, which the next process that leaves can do as well.
@@ -212,7 +212,7 @@ mod tests {
     use rustix::thread::Timespec;
 
     use super::*;
-    use crate::wire::place::{is_same_file, lock_until, open_lock};
+    use crate::wire::lock_file::{USER_ALONE, is_same_file, lock_until, open_lock};
 
     /// A place in a folder of its own.
     fn place() -> (tempfile::TempDir, Place) {
@@ -241,7 +241,7 @@ mod tests {
         let joining = place.hold().unwrap();
         let end = Instant::now();
         assert!(!lock_until(
-            &open_lock(&folder.path().join(JOIN_LOCK)).unwrap(),
+            &open_lock(&folder.path().join(JOIN_LOCK), USER_ALONE).unwrap(),
             FlockOperation::NonBlockingLockExclusive,
             end
         ));

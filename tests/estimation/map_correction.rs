@@ -131,7 +131,7 @@ fn reprojection_error(one: (&Map, [usize; 2]), other: &Map) -> f64 {
         let k = host.intrinsics;
         let target_from_host = target.map_from_keyframe.inverse() * host.map_from_keyframe;
         let project = move |u: f64, v: f64, inverse_depth: f64| {
-            let ray = nalgebra::Vector3::new((u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.0);
+            let ray = k.ray(u, v);
             let at = target_from_host * (ray / inverse_depth);
             (k.fx * at.x / at.z, k.fy * at.y / at.z)
         };

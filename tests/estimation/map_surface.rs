@@ -44,9 +44,8 @@ fn the_surface_of_a_room_has_fewer_points_and_fewer_of_them_off() {
         cameras.push(place.rigid.translation);
         let known = |variance: f32, d: f32| d > 0.0 && variance.sqrt() <= 0.1 * d;
         for p in keyframe.points.iter().filter(|p| known(p.variance, p.inverse_depth)) {
-            let ray = [(f64::from(p.u) - k.cx) / k.fx, (f64::from(p.v) - k.cy) / k.fy];
-            let d = f64::from(p.inverse_depth);
-            all.push(place * (Vector3::new(ray[0], ray[1], 1.0) / d));
+            let ray = k.ray(f64::from(p.u), f64::from(p.v));
+            all.push(place * (ray / f64::from(p.inverse_depth)));
         }
     }
     let seen = |position: Vector3<f64>| {

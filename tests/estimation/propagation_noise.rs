@@ -1,7 +1,7 @@
 //! Monte-Carlo: hypotheses with known noise through an exact motion; the variance that propagation
 //! predicts against the scatter of what arrives.
 
-use nalgebra::{Vector3, Vector6};
+use nalgebra::Vector6;
 use semidense::slam::depth::map::{DepthMap, Hypothesis};
 use semidense::slam::depth::propagation::{PropagationParams, propagate};
 use semidense::slam::geometry::intrinsics::Intrinsics;
@@ -46,11 +46,7 @@ fn carried(target_from_source: &SE3) -> Vec<Carried> {
     for v in (8..CAMERA.height - 8).step_by(SPACING) {
         for u in (8..CAMERA.width - 8).step_by(SPACING) {
             let inverse_depth = 0.6 + 0.004 * u as f64 + 0.002 * v as f64;
-            let ray = Vector3::new(
-                (u as f64 - CAMERA.cx) / CAMERA.fx,
-                (v as f64 - CAMERA.cy) / CAMERA.fy,
-                1.0,
-            );
+            let ray = CAMERA.ray(u as f64, v as f64);
             let point = *target_from_source * (ray / inverse_depth);
             let (x, y) = (point.x / point.z, point.y / point.z);
             let (x, y) = (CAMERA.fx * x + CAMERA.cx, CAMERA.fy * y + CAMERA.cy);

@@ -1,9 +1,9 @@
 //! The map's points as files: one surface of all keyframes, and what is written on request.
 
-use crate::records::{Wall, keyframe, pose, record, written};
+use crate::records::{keyframe, pose, record, write_results, written};
+use semidense::service::results::ResultsParams;
 use semidense::service::results::output_folder::prepare_output;
 use semidense::service::results::ply::read_surface;
-use semidense::service::results::{ResultsParams, write_results};
 use semidense::slam::fusion::MapResolution;
 use semidense::slam::keyframe::{DepthPoint, Keyframe};
 use semidense::slam::pose::TrackingState;
@@ -50,7 +50,7 @@ fn a_wall_that_two_keyframes_see_is_written_once_and_every_point_on_request() {
         full_points: true,
         ..ResultsParams::default()
     };
-    write_results(&second, &record, &mut Wall, &params).unwrap();
+    write_results(&second, &record, &params);
     let coarse = read_surface(&second.join("map.ply"), usize::MAX).unwrap();
     // 32 of 30 by 24 of 30 of 2 map units: six by five cells.
     assert!((12..=42).contains(&coarse.len()), "{}", coarse.len());
@@ -65,6 +65,6 @@ fn a_wall_that_two_keyframes_see_is_written_once_and_every_point_on_request() {
     let z = f32::from_le_bytes(full[begin + 8..begin + 12].try_into().unwrap());
     assert!((z - 2.0).abs() < 1e-6, "4 keyframe units are 2 map units");
     // The next set has neither.
-    write_results(&second, &record, &mut Wall, &ResultsParams::default()).unwrap();
+    write_results(&second, &record, &ResultsParams::default());
     assert!(!second.join("map.pcd").exists() && !second.join("points-full.ply").exists());
 }

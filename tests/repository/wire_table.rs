@@ -1,11 +1,12 @@
-//! `python/semidense/_wire.py` says what the Rust definitions say: every message field by field, every topic, every code.
+//! `python/semidense/_wire.py` says what the Rust definitions say: every message field by field, every topic, every code;
+//! `python/tests/offsets.json`, where each field lies, for the Python reader's own test.
 //!
 //! The fields and their comments are read from `src/wire/message.rs`; sizes, names, codes and quality of service come from
 //! the compiled types. After a change of the wire: `SEMIDENSE_WRITE_WIRE=1 cargo test --test repository wire_table`.
 
 use std::fmt::Write;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use iceoryx2::prelude::ZeroCopySend;
 use semidense::service::health::{ProcessState, bucket_end_ms, scheduling_name};
@@ -24,7 +25,7 @@ use semidense::wire::topic::{
     MAPPER_HEALTH, POSE, STEP, TRACKER_HEALTH, Topic, WIRE_VERSION,
 };
 
-/// Writes the file anew where it is set.
+/// Writes the files anew where it is set.
 const WRITE: &str = "SEMIDENSE_WRITE_WIRE";
 
 /// A message as its definition has it.
@@ -136,7 +137,7 @@ fn message(file: &syn::File, name: &str) -> Message {
 }
 
 /// The Python class of a message, held to the compiled type.
-fn class<T: ZeroCopySend>(text: &mut String, file: &syn::File) {
+fn class<T: ZeroCopySend>(text: &mut String, file: &syn::File) -> Message {
     let path = std::any::type_name::<T>();
     let message = message(file, path.rsplit("::").next().unwrap());
     let laid_out = (message.size, message.alignment);
@@ -146,11 +147,7 @@ fn class<T: ZeroCopySend>(text: &mut String, file: &syn::File) {
     let Message { name, comment, size, .. } = &message;
     writeln!(text, "\n\nclass {name}(ctypes.Structure):\n    \"\"\"{}\"\"\"\n", plain(comment))
         .unwrap();
-    writeln!(text, "    SIZE = {size}\n    OFFSETS = {{").unwrap();
-    for Field { name, offset, .. } in &message.fields {
-        writeln!(text, "        {name:?}: {offset},").unwrap();
-    }
-    writeln!(text, "    }}\n    _fields_ = [").unwrap();
+    writeln!(text, "    SIZE = {size}\n    _fields_ = [").unwrap();
     for Field { name, comment, scalar, length, .. } in &message.fields {
         let kind = match scalar.as_str() {
             "f32" => "ctypes.c_float".to_owned(),
@@ -168,6 +165,18 @@ fn class<T: ZeroCopySend>(text: &mut String, file: &syn::File) {
         "    ]\n\n    @staticmethod\n    def type_name() -> str:\n        return {type_name:?}"
     )
     .unwrap();
+    message
+}
+
+/// Where the fields of the messages lie, a message a line.
+fn offsets(messages: &[Message]) -> String {
+    let line = |Message { name, fields, .. }: &Message| {
+        let of = |Field { name, offset, .. }: &Field| format!("{name:?}: {offset}");
+        let fields: Vec<_> = fields.iter().map(of).collect();
+        format!("    {name:?}: {{{}}}", fields.join(", "))
+    };
+    let lines: Vec<_> = messages.iter().map(line).collect();
+    format!("{{\n{}\n}}\n", lines.join(",\n"))
 }
 
 /// A comment without the links and quotation marks of Rust's documentation.
@@ -326,7 +335,10 @@ import enum
 from typing import NamedTuple, Optional
 "#;
 
-fn generated() -> String {
+/// The files with their text.
+fn generated() -> [(&'static str, String); 2] {
+    /// Ends of buckets on a line.
+    const ENDS: usize = 5;
     let parse =
         |path: &str| syn::parse_file(&fs::read_to_string(root().join(path)).unwrap()).unwrap();
     let (messages, keyframe) = (parse("src/wire/message.rs"), parse("src/slam/keyframe.rs"));
@@ -335,43 +347,46 @@ fn generated() -> String {
         .unwrap();
     let ends: Vec<_> =
         (0..HISTOGRAM_BUCKETS).map(|index| format!("{:?}", bucket_end_ms(index))).collect();
+    let lines: Vec<_> = ends.chunks(ENDS).map(|ends| ends.join(", ")).collect();
     writeln!(
         text,
         "# Where the buckets of a histogram end, milliseconds.\nBUCKET_ENDS_MS = (\n    {},\n)",
-        ends.join(",\n    ")
+        lines.join(",\n    ")
     )
     .unwrap();
-    class::<FrameHeader>(&mut text, &messages);
-    class::<PoseMessage>(&mut text, &messages);
-    class::<KeyframeHeader>(&mut text, &messages);
-    class::<DepthPoint>(&mut text, &keyframe);
-    class::<KeyframeImageHeader>(&mut text, &messages);
-    class::<StepMessage>(&mut text, &messages);
-    class::<GraphHeader>(&mut text, &messages);
-    class::<KeyframePoseMessage>(&mut text, &messages);
-    class::<AdjustmentMessage>(&mut text, &messages);
-    class::<HealthMessage>(&mut text, &messages);
-    class::<CommandRequest>(&mut text, &messages);
-    class::<CommandResponse>(&mut text, &messages);
+    let classes = [
+        class::<FrameHeader>(&mut text, &messages),
+        class::<PoseMessage>(&mut text, &messages),
+        class::<KeyframeHeader>(&mut text, &messages),
+        class::<DepthPoint>(&mut text, &keyframe),
+        class::<KeyframeImageHeader>(&mut text, &messages),
+        class::<StepMessage>(&mut text, &messages),
+        class::<GraphHeader>(&mut text, &messages),
+        class::<KeyframePoseMessage>(&mut text, &messages),
+        class::<AdjustmentMessage>(&mut text, &messages),
+        class::<HealthMessage>(&mut text, &messages),
+        class::<CommandRequest>(&mut text, &messages),
+        class::<CommandResponse>(&mut text, &messages),
+    ];
     state_enumerations(&mut text);
     topics(&mut text);
     places(&mut text);
-    text
+    [("python/semidense/_wire.py", text), ("python/tests/offsets.json", offsets(&classes))]
 }
 
 #[test]
 fn python_reads_what_rust_writes() {
-    let path = root().join("python/semidense/_wire.py");
-    let generated = generated();
-    if std::env::var_os(WRITE).is_some() {
-        fs::write(&path, &generated).unwrap();
+    for (name, generated) in generated() {
+        let path = root().join(name);
+        if std::env::var_os(WRITE).is_some() {
+            fs::write(&path, &generated).unwrap();
+        }
+        let committed = fs::read_to_string(&path).unwrap_or_default();
+        let first = committed.lines().zip(generated.lines()).find(|(old, new)| old != new);
+        assert!(
+            committed == generated,
+            "{}: differs from the Rust definitions, first in {first:?}; write it anew with {WRITE}=1 cargo test --test repository wire_table",
+            path.display()
+        );
     }
-    let committed = fs::read_to_string(&path).unwrap_or_default();
-    let same = Path::new(&path).exists() && committed == generated;
-    let first = committed.lines().zip(generated.lines()).find(|(old, new)| old != new);
-    assert!(
-        same,
-        "{}: differs from the Rust definitions, first in {first:?}; write it anew with {WRITE}=1 cargo test --test repository wire_table",
-        path.display()
-    );
 }

@@ -5,7 +5,7 @@ use semidense::capture::source_error::SourceError;
 use semidense::service::alignment_stamps::{AlignmentTrace, LevelTrace};
 use semidense::service::results::output_folder::prepare_output;
 use semidense::service::results::record::{EndOfRun, RecordedPose, RunMode, RunRecord};
-use semidense::service::results::{ResultsParams, write_results};
+use semidense::service::results::{Results, ResultsParams};
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::geometry::sim3::Sim3;
@@ -133,9 +133,15 @@ pub fn record(poses: Vec<RecordedPose>, keyframes: Vec<Keyframe>, with_truth: bo
     }
 }
 
+/// Evaluates a run and writes its files into `dir`.
+pub fn write_results(dir: &Path, record: &RunRecord, params: &ResultsParams) {
+    let results = Results::new(record, &mut Wall, params, &mut |_, _| ()).unwrap();
+    results.write(dir, &|_| Ok(())).unwrap();
+}
+
 pub fn written(dir: &Path, record: &RunRecord) -> (Value, String) {
     prepare_output(dir).unwrap();
-    write_results(dir, record, &mut Wall, &ResultsParams::default()).unwrap();
+    write_results(dir, record, &ResultsParams::default());
     let read = |name: &str| std::fs::read_to_string(dir.join(name)).unwrap();
     let report = read("report.html");
     assert!(report.ends_with("</html>\n"));

@@ -1,6 +1,7 @@
 //! Health of a process as ROS's diagnostics.
 
 use semidense::service::health::{ProcessState, cause, percentile_ms, source, warning};
+use semidense::slam::pose::TrackingState;
 use semidense::wire::message::HealthMessage;
 
 use crate::ros::message::{DiagnosticArray, DiagnosticStatus, Header, KeyValue};
@@ -10,9 +11,8 @@ const WARN: u8 = 1;
 const ERROR: u8 = 2;
 const STALE: u8 = 3;
 
-/// What a last frame came to, by its code in [`HealthMessage::detail`], and how bad that is.
-const TRACKER_STATES: [(&str, u8); 4] =
-    [("initializing", WARN), ("tracking", OK), ("degraded", WARN), ("lost", ERROR)];
+/// How bad the states are that a last frame came to, by their codes in [`HealthMessage::detail`].
+const FRAME_LEVELS: [u8; 4] = [WARN, OK, WARN, ERROR];
 
 /// The health of the process `owner` (capture, tracker or mapper) of `instance`.
 pub fn diagnostics(
@@ -41,11 +41,11 @@ fn verdict(owner: &str, health: &HealthMessage) -> (u8, String) {
         Some(state) => (OK, state.name().to_owned()),
         None => (ERROR, format!("unknown state {}", health.state)),
     };
-    let last_frame = TRACKER_STATES.get(health.detail as usize);
-    if let (Some(ProcessState::Running), "tracker", Some((name, frame_level))) =
-        (state, owner, last_frame)
+    let last_frame = health.detail as usize;
+    if let (Some(ProcessState::Running), "tracker", Some(frame_level)) =
+        (state, owner, FRAME_LEVELS.get(last_frame))
     {
-        (level, words) = (*frame_level, (*name).to_owned());
+        (level, words) = (*frame_level, TrackingState::NAMES[last_frame].to_owned());
     }
     let warned = warning(health);
     if level == OK && !warned.is_empty() {

@@ -30,10 +30,14 @@ pub struct Moment {
 impl Moment {
     /// Now.
     pub fn now() -> Self {
-        let since_epoch = std::time::SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default();
-        let realtime_nanos = i64::try_from(since_epoch.as_nanos()).unwrap_or(i64::MAX);
-        Self { instant: Instant::now(), realtime_nanos }
+        Self { instant: Instant::now(), realtime_nanos: realtime_nanos() }
     }
+}
+
+/// CLOCK_REALTIME, nanoseconds.
+pub fn realtime_nanos() -> i64 {
+    let since_epoch = std::time::SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default();
+    i64::try_from(since_epoch.as_nanos()).unwrap_or(i64::MAX)
 }
 
 /// One message.

@@ -1,6 +1,5 @@
 //! A keyframe's depth as a cloud of points in the map.
 
-use nalgebra::Vector3;
 use semidense::slam::keyframe::Keyframe;
 
 use crate::ros::axes::ros_from_world;
@@ -24,11 +23,7 @@ pub fn keyframe_cloud(keyframe: &Keyframe, header: Header) -> PointCloud2 {
     let mut data = Vec::with_capacity(keyframe.points.len() * POINT_BYTES);
     for point in keyframe.points.iter().filter(|point| point.inverse_depth > 0.0) {
         let depth = unit / f64::from(point.inverse_depth);
-        let ray = Vector3::new(
-            (f64::from(point.u) - k.cx) / k.fx,
-            (f64::from(point.v) - k.cy) / k.fy,
-            1.0,
-        );
+        let ray = k.ray(f64::from(point.u), f64::from(point.v));
         let place = rotation * (ray * depth) + ros_from_keyframe.translation;
         // σ of 1/z is σ/d² of z, and the ray is longer than z.
         let sigma = f64::from(point.variance.max(0.0)).sqrt() / f64::from(point.inverse_depth)

@@ -18,13 +18,13 @@ use semidense::capture::stream::format::StreamHeader;
 use semidense::service::shutdown::Shutdown;
 use serde::de::DeserializeOwned;
 
+use crate::ros::encoder::realtime_nanos;
 use crate::ros::message::{CameraInfo, CompressedImage, Image, RosMessage, Time};
 use crate::ros::topic::{self, RosTopic};
 use crate::ros2::camera_rig::{CameraRigError, camera_info_topic, is_rectified, rig_text};
 use crate::ros2::image_source::{GrayFrame, ImageError};
 use crate::ros2::network::Network;
 use crate::ros2::node::{NodeError, RosNode};
-use crate::ros2::publishing::realtime_nanos;
 
 /// Pause between two looks for a socket that is not there, or for a message.
 const RETRY_PERIOD: Duration = Duration::from_millis(100);

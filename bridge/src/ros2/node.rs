@@ -118,13 +118,6 @@ impl RosNode {
         };
         readers.iter().map(remote).collect()
     }
-
-    /// Whether somebody publishes `name`.
-    pub fn has_remote_writer(&self, name: &str) -> bool {
-        let Ok(wanted) = dds_name(name) else { return false };
-        let writers = self.participant.discovered_writers();
-        writers.iter().any(|writer| writer.publication_topic_data.topic_name == wanted)
-    }
 }
 
 /// The name of a ROS topic in DDS: `rt/a/b` of `/a/b`.

@@ -12,6 +12,7 @@ use semidense::slam::keyframe::Keyframe;
 
 use crate::ros::axes::{ros_from_world, transform_message};
 use crate::ros::converter::{Converter, PoseMessages};
+use crate::ros::encoder::realtime_nanos;
 use crate::ros::frame_ids::FrameIds;
 use crate::ros::message::{
     CameraInfo, DiagnosticArray, DiagnosticStatus, Header, Image, KeyValue, Odometry, PointCloud2,
@@ -97,12 +98,6 @@ fn camera_link_transform(params: &PublishParams, camera_link: &str) -> TfMessage
     let transform = transform_message(&ros_from_world().inverse());
     let child_frame_id = camera_link.to_owned();
     TfMessage { transforms: vec![TransformStamped { header, child_frame_id, transform }] }
-}
-
-/// CLOCK_REALTIME, nanoseconds.
-pub fn realtime_nanos() -> i64 {
-    let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
-    since.map_or(0, |since| i64::try_from(since.as_nanos()).unwrap_or(i64::MAX))
 }
 
 impl Publishers {

@@ -4,14 +4,13 @@ use std::fmt::Write;
 
 use semidense::service::clock::now_nanos;
 use semidense::service::health::{ProcessState, bucket_end_ms, source};
+use semidense::slam::pose::TrackingState;
 use semidense::wire::message::{HISTOGRAM_BUCKETS, HealthMessage};
 
 use crate::web::scene::State;
 
 /// Type of the text.
 pub const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
-/// States of a pose, by their codes.
-const STATES: [&str; 4] = ["initializing", "tracking", "degraded", "lost"];
 /// States of a process.
 const PROCESS_STATES: u32 = 7;
 
@@ -153,13 +152,13 @@ fn of_poses(text: &mut Text, state: &State) {
         "counter",
         "Poses by the state that they were in, since this server joined the run",
     );
-    for (name, count) in STATES.iter().zip(state.poses_by_state) {
+    for (name, count) in TrackingState::NAMES.iter().zip(state.poses_by_state) {
         text.line("semidense_poses_total", &[("state", name)], count as f64);
     }
     let Some((_, pose)) = &state.pose else { return };
     let pose = &pose.message;
     text.family("semidense_tracking_state", "gauge", "1 for the state of the newest pose");
-    for (code, name) in STATES.iter().enumerate() {
+    for (code, name) in TrackingState::NAMES.iter().enumerate() {
         let is_it = f64::from(u8::from(code == pose.state as usize));
         text.line("semidense_tracking_state", &[("state", name)], is_it);
     }

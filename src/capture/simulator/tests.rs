@@ -147,7 +147,7 @@ fn warp_difference(
             if !smooth(&depth_from, u, v, z) {
                 continue;
             }
-            let ray = Vector3::new((u as f64 - k.cx) / k.fx, (v as f64 - k.cy) / k.fy, 1.0);
+            let ray = k.ray(u as f64, v as f64);
             let point = to_from_from * (ray * z);
             if point.z < 0.1 {
                 continue;
@@ -308,7 +308,7 @@ fn the_depth_of_the_plane_is_that_of_geometry() {
     let pose = source.ground_truth()[7].world_from_camera;
     for v in (0..k.height).step_by(7) {
         for u in (0..k.width).step_by(7) {
-            let ray = Vector3::new((u as f64 - k.cx) / k.fx, (v as f64 - k.cy) / k.fy, 1.0);
+            let ray = k.ray(u as f64, v as f64);
             // The plane is z = 0 of the world.
             let exact = -pose.translation.z / (pose.rotation * ray).z;
             let found = f64::from(depth.at(u, v));

@@ -6,6 +6,7 @@ use super::fake::{Event, Fake, frame};
 use super::kernel::FLAG_TIMESTAMP_MONOTONIC;
 use super::*;
 use crate::capture::test_images::flat_block_jpeg;
+use crate::slam::geometry::rectification::Rectification;
 
 const WIDTH: usize = 32;
 const HEIGHT: usize = 24;

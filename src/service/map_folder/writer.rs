@@ -12,10 +12,11 @@ use crate::service::map_folder::depth_file::{MapDetail, checksum_of, encode};
 use crate::service::map_folder::manifest::{DepthFile, Listed, Manifest};
 use crate::service::map_folder::map_folder_error::MapFolderError;
 use crate::service::map_folder::reading::{BEFORE, KEYFRAMES, MANIFEST, read_manifest};
-use crate::service::results::output_lock::{Locking, OutputLock};
+use crate::service::results::output_lock::lock_output;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::loops::known::KnownLoops;
+use crate::wire::lock_file::{LockFile, Locking};
 
 /// What of a map is in its manifest.
 #[derive(Debug, Clone, Default)]
@@ -43,7 +44,7 @@ pub struct MapWriter {
     files: BTreeMap<u64, DepthFile>,
     /// Names of the files there are.
     names: BTreeSet<String>,
-    _lock: OutputLock,
+    _lock: LockFile,
 }
 
 impl MapWriter {
@@ -60,7 +61,7 @@ impl MapWriter {
             }
             Err(error) => return Err(error),
         };
-        let lock = match OutputLock::take(folder).map_err(failed)? {
+        let lock = match lock_output(folder).map_err(failed)? {
             Locking::Locked(lock) => lock,
             Locking::HeldBy(holder) => {
                 let by = if holder.is_empty() { holder } else { format!(" ({holder})") };

@@ -3,8 +3,6 @@
 use std::io::{self, Write};
 use std::path::Path;
 
-use nalgebra::Vector3;
-
 use crate::service::atomic_file::write_atomically;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::map::Map;
@@ -50,7 +48,7 @@ fn keyframe_points(
             return None;
         }
         let (u, v) = (f64::from(point.u), f64::from(point.v));
-        let in_keyframe = Vector3::new((u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.0) / d;
+        let in_keyframe = k.ray(u, v) / d;
         let in_world = keyframe.map_from_keyframe * in_keyframe;
         Some(FullPoint {
             position: [in_world.x as f32, in_world.y as f32, in_world.z as f32],

@@ -4,8 +4,6 @@
 use std::io::{self, Write};
 use std::path::Path;
 
-use nalgebra::Vector3;
-
 use crate::service::atomic_file::write_atomically;
 use crate::slam::map::{ConfirmedPoint, Map};
 
@@ -39,7 +37,7 @@ fn position(map: &Map, point: &ConfirmedPoint) -> Option<[f32; 3]> {
     let keyframe = map.get(point.keyframe_id)?;
     let k = &keyframe.intrinsics;
     let (u, v) = (f64::from(point.u), f64::from(point.v));
-    let ray = Vector3::new((u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.0);
+    let ray = k.ray(u, v);
     let in_world = keyframe.map_from_keyframe * (ray / f64::from(point.inverse_depth));
     let position = [in_world.x as f32, in_world.y as f32, in_world.z as f32];
     position.iter().all(|x| x.is_finite()).then_some(position)

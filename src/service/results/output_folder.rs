@@ -9,9 +9,10 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use rustix::fs::{Mode, OFlags};
 
-use crate::service::results::output_lock::{Locking, OutputLock};
+use crate::service::results::output_lock::lock_output;
 use crate::service::results::results_error::ResultsError;
 use crate::service::results::set::{finish_commit, foreign_file};
+use crate::wire::lock_file::{LockFile, Locking};
 
 /// Folder of the folders, below the one that the program is started in.
 pub const PARENT: &str = "output";
@@ -30,7 +31,7 @@ pub struct OutputFolder {
     made: Vec<PathBuf>,
     kind: Kind,
     /// Taken before the folders are removed.
-    lock: Option<OutputLock>,
+    lock: Option<LockFile>,
 }
 
 /// Where the folder's name comes from.
@@ -74,7 +75,7 @@ impl OutputFolder {
 
     fn open(path: &Path, made: Vec<PathBuf>, kind: Kind) -> Result<Self, ResultsError> {
         let mut folder = Self { path: path.to_owned(), made, kind, lock: None };
-        let locking = fs::create_dir_all(path).and_then(|()| OutputLock::take(path));
+        let locking = fs::create_dir_all(path).and_then(|()| lock_output(path));
         match locking.map_err(|source| write_error(path, source))? {
             Locking::Locked(lock) => folder.lock = Some(lock),
             Locking::HeldBy(process) => {

@@ -16,10 +16,11 @@ use crate::slam::pose::PoseEstimate;
 use crate::slam::trajectory::StampedPose;
 
 /// How a run was driven.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum RunMode {
     /// One process, every frame in order.
+    #[default]
     Replay,
     /// Processes over shared memory, every frame in order.
     Lockstep,
@@ -77,7 +78,7 @@ pub struct RestartCause {
 }
 
 /// Everything that is known of a run when it ends.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct RunRecord {
     /// How it was driven.
     pub mode: RunMode,
@@ -148,38 +149,6 @@ pub struct RunRecord {
 impl RunRecord {
     /// Of a run that has not begun.
     pub fn empty(mode: RunMode, source: &str) -> Self {
-        Self {
-            mode,
-            source: source.to_owned(),
-            ended: EndOfRun::default(),
-            poses: Vec::new(),
-            map: Map::default(),
-            ground_truth: Vec::new(),
-            depth_scale: DepthScale::MedianRatio,
-            is_depth_from_sensor: false,
-            frames_in: 0,
-            frames_refused: 0,
-            refused: None,
-            frames_dropped: 0,
-            gaps: 0,
-            restarts: 0,
-            restart_causes: Vec::new(),
-            frames_skipped_by_mapper: None,
-            deadline_nanos: None,
-            deadline_misses: None,
-            send_counts: None,
-            page_faults: None,
-            map_nanos: Vec::new(),
-            keyframe_step_nanos: Vec::new(),
-            keyframe_nanos: Vec::new(),
-            adjustments: Vec::new(),
-            searches: None,
-            start: StartTally::default(),
-            rejections: None,
-            budget_samples: Vec::new(),
-            recorded_nanos: 0,
-            wall_nanos: 0,
-            peak_rss_bytes: None,
-        }
+        Self { mode, source: source.to_owned(), ..Self::default() }
     }
 }

@@ -210,14 +210,13 @@ fn cards(summary: &Summary) -> String {
     cards
 }
 
-/// Name, class and share of each state, and a strip that shows when it was.
+/// Name and share of each state, and a strip that shows when it was.
 fn states(record: &RunRecord) -> String {
     let count = record.poses.len();
     if count == 0 {
         return String::new();
     }
-    let kinds: Vec<usize> =
-        record.poses.iter().map(|pose| state_kind(pose.estimate.state)).collect();
+    let kinds: Vec<usize> = record.poses.iter().map(|pose| pose.estimate.state.index()).collect();
     let mut html = String::from(
         "<section><h2>States</h2><svg class=\"states\" viewBox=\"0 0 1000 22\" \
          preserveAspectRatio=\"none\">",
@@ -230,34 +229,17 @@ fn states(record: &RunRecord) -> String {
             "<rect x=\"{:.2}\" width=\"{:.2}\" height=\"22\" class=\"{}\"/>",
             start as f64 * scale,
             run.len() as f64 * scale,
-            STATES[run[0]].1
+            TrackingState::NAMES[run[0]]
         );
         start += run.len();
     }
     html.push_str("</svg><p class=\"legend\">");
-    for (kind, (name, class)) in STATES.iter().enumerate() {
+    for (kind, name) in TrackingState::NAMES.iter().enumerate() {
         let frames = kinds.iter().filter(|&&k| k == kind).count();
-        let _ = write!(html, "<span><i class=\"{class}\"></i>{name} {frames}</span>");
+        let _ = write!(html, "<span><i class=\"{name}\"></i>{name} {frames}</span>");
     }
     html.push_str("</p></section>");
     html
-}
-
-/// Name and CSS class of each kind of state.
-const STATES: [(&str, &str); 4] = [
-    ("initializing", "initializing"),
-    ("tracking", "tracking"),
-    ("degraded", "degraded"),
-    ("lost", "lost"),
-];
-
-fn state_kind(state: TrackingState) -> usize {
-    match state {
-        TrackingState::Initializing => 0,
-        TrackingState::Tracking => 1,
-        TrackingState::Degraded(_) => 2,
-        TrackingState::Lost(_) => 3,
-    }
 }
 
 /// Depth of keyframes spread over the run, and one with its uncertainty.

@@ -5,6 +5,7 @@
 //! all tiles has gone into the pose and cannot be seen; what is left between the tiles says how large it may be.
 
 use crate::slam::alignment::tiles::{NUM_TILES, TileSum};
+use crate::slam::upper_median::upper_median;
 
 /// Displacement of tiles along the direction in which each is best known.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -27,13 +28,7 @@ impl TileMisfit {
             (squares[count], noises[count]) = (square, noise);
             count += 1;
         }
-        let median = |values: &mut [f64]| {
-            let middle = values.len() / 2;
-            *values.select_nth_unstable_by(middle, f64::total_cmp).1
-        };
-        if count == 0 {
-            return Self::default();
-        }
+        let median = |values: &mut [f64]| upper_median(values, f64::total_cmp).unwrap_or(0.0);
         Self {
             variance: median(&mut squares[..count]) / CHI_SQUARE_MEDIAN,
             noise: median(&mut noises[..count]),

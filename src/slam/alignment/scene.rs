@@ -67,7 +67,7 @@ impl Plane {
         u: f64,
         v: f64,
     ) -> f64 {
-        let ray = nalgebra::Vector3::new((u - at.cx) / at.fx, (v - at.cy) / at.fy, 1.0);
+        let ray = at.ray(u, v);
         let normal = nalgebra::Vector3::from(self.normal);
         let direction = keyframe_from_camera.rotation * ray;
         normal.dot(&direction) / (1.0 - normal.dot(&keyframe_from_camera.translation))
@@ -75,7 +75,7 @@ impl Plane {
 
     /// The grey value at a (sub-)pixel of a camera.
     pub fn grey(&self, at: &Intrinsics, keyframe_from_camera: &SE3, u: f64, v: f64) -> f64 {
-        let ray = nalgebra::Vector3::new((u - at.cx) / at.fx, (v - at.cy) / at.fy, 1.0);
+        let ray = at.ray(u, v);
         let depth = 1.0 / self.inverse_depth(at, keyframe_from_camera, u, v);
         let point = *keyframe_from_camera * (ray * depth);
         self.brightness(point.x, point.y)

@@ -150,11 +150,7 @@ impl SampledDepth {
                 if count % step != 0 {
                     continue;
                 }
-                let ray = Vector3::new(
-                    (u as f64 - intrinsics.cx) / intrinsics.fx,
-                    (v as f64 - intrinsics.cy) / intrinsics.fy,
-                    1.0,
-                );
+                let ray = intrinsics.ray(u as f64, v as f64);
                 let index = v * image.width() + u;
                 let (gu, gv) = image.gradient(index);
                 let gradient = [f64::from(gu) * intrinsics.fx, f64::from(gv) * intrinsics.fy];
@@ -332,19 +328,6 @@ pub fn rotation_std_dev(covariance: &Matrix6<f64>) -> f64 {
     let largest = rotation.symmetric_eigenvalues().max();
     // By rounding it may be below zero; what is no number stays none.
     if largest < 0.0 { 0.0 } else { largest.sqrt() }
-}
-
-/// The symmetric matrix of an upper triangle, row by row.
-pub fn full_covariance(upper_triangle: &[f64; 21]) -> Matrix6<f64> {
-    let mut entries = upper_triangle.iter();
-    let mut matrix = Matrix6::zeros();
-    for row in 0..6 {
-        for column in row..6 {
-            let entry = entries.next().copied().unwrap_or_default();
-            (matrix[(row, column)], matrix[(column, row)]) = (entry, entry);
-        }
-    }
-    matrix
 }
 
 #[cfg(test)]

@@ -149,7 +149,7 @@ impl EpipolarLine {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::{Vector3, Vector6};
+    use nalgebra::Vector6;
     use proptest::prelude::*;
 
     use super::*;
@@ -158,7 +158,7 @@ mod tests {
         Intrinsics { fx: 525.0, fy: 515.0, cx: 319.5, cy: 240.0, width: 640, height: 480 };
 
     fn project_exactly(transform: &SE3, u: f64, v: f64, d: f64) -> (f64, f64, f64) {
-        let x = Vector3::new((u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, 1.0) / d;
+        let x = CAMERA.ray(u, v) / d;
         let y = *transform * x;
         (CAMERA.fx * y.x / y.z + CAMERA.cx, CAMERA.fy * y.y / y.z + CAMERA.cy, y.z)
     }

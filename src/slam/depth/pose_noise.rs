@@ -43,11 +43,12 @@ fn quadratic_form(upper_triangle: &[f64; 21], j: &[f64; UNKNOWNS]) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::{Matrix6, Vector3, Vector6};
+    use nalgebra::{Matrix6, Vector6};
 
     use super::*;
     use crate::slam::alignment::scene::Noise;
     use crate::slam::geometry::se3::SE3;
+    use crate::slam::pose::upper_triangle;
 
     #[test]
     fn it_is_the_scatter_of_projected_points() {
@@ -57,13 +58,12 @@ mod tests {
         // Any covariance: A Aᵀ, of a tenth of a percent.
         let root = Matrix6::from_fn(|_, _| 1e-3 * noise.uniform());
         let matrix = root * root.transpose();
-        let mut entries = (0..6).flat_map(|row| (row..6).map(move |column| (row, column)));
-        let covariance = std::array::from_fn(|_| matrix[entries.next().unwrap()]);
+        let covariance = upper_triangle(|row, column| matrix[(row, column)]);
         let (mut squares, mut count) = (0.0, 0.0);
         for _ in 0..4000 {
             let moved = SE3::exp(&(root * Vector6::from_fn(|_, _| noise.normal())));
             let (u, v) = (320.0 + 320.0 * noise.uniform(), 240.0 + 240.0 * noise.uniform());
-            let point = Vector3::new((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0);
+            let point = camera.ray(u, v);
             let point = moved * point;
             let du = camera.fx * point.x / point.z + camera.cx - u;
             let dv = camera.fy * point.y / point.z + camera.cy - v;

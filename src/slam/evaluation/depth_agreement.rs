@@ -59,7 +59,7 @@ pub fn depth_agreement(view: &SharedView<'_>, later: &Image<u32>) -> Option<Dept
         }
         within += usize::from(difference * difference <= 9.0 * variance);
         differences.push(difference);
-        rays.push([(at.u - camera.cx) / camera.fx, (at.v - camera.cy) / camera.fy]);
+        rays.push(camera.ray(at.u, at.v).xy().into());
     }
     if differences.len() < MIN_POINTS {
         return None;

@@ -8,9 +8,10 @@ use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::Keyframe;
 
 /// Where a keyframe's scale comes from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum DepthScale {
     /// The median ratio of true to estimated depth: the map has no metres of its own.
+    #[default]
     MedianRatio,
     /// The keyframe's pose: the poses were given in metres.
     Given,

@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::Keyframe;
+use crate::slam::upper_median::upper_median;
 
 /// The common errors of one keyframe's depth.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -57,8 +58,7 @@ impl DepthModes {
             modes = solve(normal, &right)?;
             let mut residuals: Vec<f64> =
                 samples.iter().map(|(phi, error)| (error - phi.dot(&modes)).abs()).collect();
-            let middle = residuals.len() / 2;
-            let median = *residuals.select_nth_unstable_by(middle, f64::total_cmp).1;
+            let median = upper_median(&mut residuals, f64::total_cmp)?;
             half_weight = (HALF_WEIGHT_MEDIANS * median).max(MIN_HALF_WEIGHT);
         }
         let [scale, column, row, relief] = modes.into();
@@ -105,9 +105,9 @@ fn samples(
         if !(z_true > 0.0 && z_true.is_finite() && d > 0.0 && d.is_finite()) {
             continue;
         }
-        let (x, y) = ((u as f64 - camera.cx) / camera.fx, (v as f64 - camera.cy) / camera.fy);
+        let ray = camera.ray(u as f64, v as f64);
         let error = (metres_per_unit / (d * z_true)).ln();
-        samples.push((Vector4::new(1.0, x, y, -z_true.ln()), error));
+        samples.push((Vector4::new(1.0, ray.x, ray.y, -z_true.ln()), error));
     }
     samples
 }
@@ -141,9 +141,9 @@ mod tests {
                 let k = v * CAMERA.width + u;
                 let z = 1.0 + (k * 7919 % 1000) as f64 / 500.0;
                 truth.pixels_mut()[k] = z as f32;
-                let (x, y) =
-                    ((u as f64 - CAMERA.cx) / CAMERA.fx, (v as f64 - CAMERA.cy) / CAMERA.fy);
-                let exponent = modes.column * x + modes.row * y - modes.relief * (z / 1.89).ln();
+                let ray = CAMERA.ray(u as f64, v as f64);
+                let exponent =
+                    modes.column * ray.x + modes.row * ray.y - modes.relief * (z / 1.89).ln();
                 let is_wrong = ((k * 31 % 100) as f64) < 100.0 * wrong_share;
                 let wrong = if is_wrong { 3.0 } else { 1.0 };
                 let inverse_depth = (2.0 / (z * wrong * (modes.scale + exponent).exp())) as f32;

@@ -6,13 +6,13 @@
 
 use std::collections::BTreeMap;
 
-use nalgebra::{Matrix3, Matrix6, Rotation3, UnitQuaternion, Vector3, Vector6};
+use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3, Vector6};
 
 use crate::slam::evaluation::association::nearest;
 use crate::slam::evaluation::statistics::median;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
-use crate::slam::pose::PoseEstimate;
+use crate::slam::pose::{PoseEstimate, full_covariance};
 use crate::slam::trajectory::StampedPose;
 
 /// What 95 of 100 values of χ²₆ do not exceed.
@@ -58,7 +58,7 @@ impl NormalizedErrors {
 /// eᵀ Σ⁻¹ e of (all six, translation, rotation) for an error (translation, rotation) and the upper
 /// triangle, row by row, of its covariance; `None` where that cannot be inverted.
 pub fn normalized(error: &Vector6<f64>, covariance: &[f64; 21]) -> Option<[f64; 3]> {
-    let covariance = full(covariance);
+    let covariance = full_covariance(covariance);
     let all = error.dot(&(covariance.try_inverse()? * error));
     let part = |start: usize| {
         let block = covariance.fixed_view::<3, 3>(start, start).into_owned();
@@ -67,19 +67,6 @@ pub fn normalized(error: &Vector6<f64>, covariance: &[f64; 21]) -> Option<[f64; 
     };
     let errors = [all, part(0)?, part(3)?];
     errors.iter().all(|error| error.is_finite()).then_some(errors)
-}
-
-fn full(triangle: &[f64; 21]) -> Matrix6<f64> {
-    let mut matrix = Matrix6::zeros();
-    let mut entries = triangle.iter();
-    for row in 0..6 {
-        for column in row..6 {
-            let value = entries.next().copied().unwrap_or(0.0);
-            matrix[(row, column)] = value;
-            matrix[(column, row)] = value;
-        }
-    }
-    matrix
 }
 
 /// Normalised errors of `estimates` (tracked frames of one epoch), whose keyframes are given as (id,

@@ -1,7 +1,5 @@
 //! Which keyframes see the same place, and where a point of one falls in the other.
 
-use nalgebra::Vector3;
-
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
 
@@ -50,7 +48,7 @@ impl<'a> SharedView<'a> {
     pub fn project(&self, u: f64, v: f64, inverse_depth: f64) -> Option<Projection> {
         let (a, b) = (&self.from.intrinsics, &self.into.intrinsics);
         let depth = 1.0 / inverse_depth;
-        let ray = Vector3::new((u - a.cx) / a.fx, (v - a.cy) / a.fy, 1.0);
+        let ray = a.ray(u, v);
         let point = self.into_from_from * (ray * depth);
         let is_near = point.z < NEAREST_DEPTH_RATIO * depth * self.into_from_from.scale;
         if is_near || !(point.z > 0.0 && point.z.is_finite()) {

@@ -79,7 +79,7 @@ impl TrueSurface {
     pub fn add(&mut self, depth: &Image<f32>, k: &Intrinsics, world_from_camera: &SE3) {
         let at = |u: usize, v: usize| {
             let z = f64::from(depth.at(u, v));
-            Vector3::new((u as f64 - k.cx) / k.fx, (v as f64 - k.cy) / k.fy, 1.0) * z
+            k.ray(u as f64, v as f64) * z
         };
         for v in (0..k.height - 1).step_by(STRIDE) {
             for u in (0..k.width - 1).step_by(STRIDE) {

@@ -46,8 +46,7 @@ impl<'a> View<'a> {
 
     /// The ray of a pixel at depth 1.
     pub fn ray(&self, u: f64, v: f64) -> Vector3<f64> {
-        let k = &self.keyframe.intrinsics;
-        Vector3::new((u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.0)
+        self.keyframe.intrinsics.ray(u, v)
     }
 
     /// The points of the square that reaches `radius` pixels to each side of a point, itself among them.

@@ -1,5 +1,6 @@
 //! The pinhole intrinsics of a rectified image and of its pyramid levels.
 
+use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
 /// Pinhole intrinsics in pixels; the integer coordinate is the **centre** of a pixel.
@@ -38,6 +39,12 @@ impl Intrinsics {
             width: self.width >> level,
             height: self.height >> level,
         }
+    }
+
+    /// The ray of a pixel in the camera's frame, where it is 1 ahead.
+    #[inline]
+    pub fn ray(&self, u: f64, v: f64) -> Vector3<f64> {
+        Vector3::new((u - self.cx) / self.fx, (v - self.cy) / self.fy, 1.0)
     }
 
     /// Whether the numbers can belong to a camera: finite, positive focal lengths, a size within

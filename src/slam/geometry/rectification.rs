@@ -109,8 +109,7 @@ fn has_data(raw: &Intrinsics, pixel: &Vector2<f64>) -> bool {
 
 /// The raw position seen by a rectified pixel.
 fn raw_pixel(camera: &CameraModel, rectified: &Intrinsics, u: f64, v: f64) -> Option<Vector2<f64>> {
-    let ray =
-        Vector3::new((u - rectified.cx) / rectified.fx, (v - rectified.cy) / rectified.fy, 1.0);
+    let ray = rectified.ray(u, v);
     camera.project(&ray)
 }
 
@@ -429,7 +428,7 @@ mod tests {
             let depth = rectification.rectify_depth(&depth).expect("same size");
             for (i, &grey) in rectified.iter().enumerate() {
                 let (u, v) = ((i % k.width) as f64, (i / k.width) as f64);
-                let ray = Vector3::new((u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.0);
+                let ray = k.ray(u, v);
                 // Two roundings of half a level and the curvature of the scene.
                 assert!((f64::from(grey) - scene(&ray)).abs() < 1.6, "{u} {v}");
                 // Half a pixel diagonal times the steepest slope of the scene.

@@ -1,7 +1,7 @@
 //! The relative similarity of two keyframes by direct alignment of image and depth (Engel, Schöps, Cremers 2014, §3.5).
 //!
-//! [`ConstraintSolver::measure`] is the recipe: each keyframe is aligned to the other (`residual`, `align`, from a given
-//! similarity or from one that `start` finds), each alignment must pass for itself (`verdict`), and both must agree
+//! [`ConstraintSolver::measure`] is the recipe: each keyframe is aligned to the other (`residual`, `align`, from where
+//! `start` finds that it begins best), each alignment must pass for itself (`verdict`), and both must agree
 //! within what they claim (`covariance`). What is left becomes a constraint of the pose graph.
 
 mod align;
@@ -15,21 +15,15 @@ mod view;
 #[cfg(test)]
 pub(in crate::slam) mod tests;
 
-use nalgebra::UnitQuaternion;
-
 use crate::slam::alignment::align::AlignmentParams;
 use crate::slam::alignment::reference::ReferenceParams;
-use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::sim3::{Matrix7, Sim3};
-use crate::slam::graph::constraint::start::Start;
-use crate::slam::graph::pose_graph::{Constraint, VertexId};
-use crate::slam::graph::robust::RobustKernel;
 use crate::slam::image::sums::MAX_LEVELS;
 use crate::slam::keyframe::Keyframe;
-use crate::slam::mapper::turned_views::TurnedViews;
 use crate::slam::tracker::covariance_floor::CovarianceFloorParams;
 
 pub use covariance::TileAgreement;
+pub use start::Start;
 pub use verdict::{GateParams, Refusal};
 pub use view::KeyframeView;
 
@@ -113,25 +107,16 @@ pub struct Measurement {
     pub reciprocal_chi2: f64,
 }
 
-impl Measurement {
-    /// As a constraint of the pose graph between the vertices of keyframes i and j.
-    pub fn constraint(&self, i: VertexId, j: VertexId, kernel: RobustKernel) -> Option<Constraint> {
-        let information = self.covariance.cholesky()?.inverse();
-        Some(Constraint { i, j, j_from_i: self.j_from_i, information, kernel })
-    }
-}
-
 /// Measures similarities between keyframes of one camera.
 #[derive(Debug)]
 pub struct ConstraintSolver {
     params: ConstraintParams,
-    turned_views: TurnedViews,
 }
 
 impl ConstraintSolver {
-    /// For keyframes of `intrinsics`.
-    pub fn new(intrinsics: &Intrinsics, params: ConstraintParams) -> Self {
-        Self { params, turned_views: TurnedViews::new(intrinsics) }
+    /// With its tuning.
+    pub fn new(params: ConstraintParams) -> Self {
+        Self { params }
     }
 
     /// Prepares a keyframe for measurements.
@@ -139,36 +124,17 @@ impl ConstraintSolver {
         KeyframeView::new(keyframe, &self.params.reference)
     }
 
-    /// Measures `j_from_i` from an initial one, or from nothing.
+    /// Measures `j_from_i` from what is known of it.
     pub fn measure(
         &self,
         i: &KeyframeView,
         j: &KeyframeView,
-        initial: Option<&Sim3>,
-    ) -> Result<Measurement, Refusal> {
-        self.measure_from(i, j, initial.map_or(Start::Nothing, Start::Similarity))
-    }
-
-    /// The same where about the rotation is known, as of places that look alike.
-    pub fn measure_turned(
-        &self,
-        i: &KeyframeView,
-        j: &KeyframeView,
-        j_from_i: &UnitQuaternion<f64>,
-    ) -> Result<Measurement, Refusal> {
-        self.measure_from(i, j, Start::Rotation(j_from_i))
-    }
-
-    fn measure_from(
-        &self,
-        i: &KeyframeView,
-        j: &KeyframeView,
-        start: Start<'_>,
+        start: Start,
     ) -> Result<Measurement, Refusal> {
         let gates = &self.params.gates;
-        let forward = self.align_from(i, j, start)?;
+        let forward = self.align(i, j, start)?;
         gates.judge(&forward)?;
-        let backward = self.align(j, i, Some(&forward.j_from_i.inverse()))?;
+        let backward = self.align(j, i, Start::Similarity(forward.j_from_i.inverse()))?;
         gates.judge(&backward)?;
         let measurement = fuse(forward, backward).ok_or(Refusal::Undetermined)?;
         gates.judge_reciprocity(measurement.reciprocal_chi2)?;
@@ -180,24 +146,14 @@ impl ConstraintSolver {
     }
 
     /// Aligns i to j, whatever comes of it.
-    pub fn align(
+    fn align(
         &self,
         i: &KeyframeView,
         j: &KeyframeView,
-        initial: Option<&Sim3>,
-    ) -> Result<KeyframeAlignment, Refusal> {
-        self.align_from(i, j, initial.map_or(Start::Nothing, Start::Similarity))
-    }
-
-    fn align_from(
-        &self,
-        i: &KeyframeView,
-        j: &KeyframeView,
-        start: Start<'_>,
+        start: Start,
     ) -> Result<KeyframeAlignment, Refusal> {
         let (views, params) = ([i, j], &self.params);
-        let camera = i.reference.intrinsics();
-        if camera != j.reference.intrinsics() || !self.turned_views.is_for(camera) {
+        if i.reference.intrinsics() != j.reference.intrinsics() {
             return Err(Refusal::OtherCamera);
         }
         let finest = i.levels().start;
@@ -207,8 +163,7 @@ impl ConstraintSolver {
         if matches!(start, Start::Similarity(j_from_i) if !j_from_i.is_valid()) {
             return Err(Refusal::InvalidStart);
         }
-        let start = start::find(views, start, &self.turned_views, params);
-        let start = start.ok_or(Refusal::NothingAlike)?;
+        let start = start::find(views, start, params).ok_or(Refusal::NothingAlike)?;
         let (state, sums) = align::descend(views, &start, params).ok_or(Refusal::NothingInView)?;
         if (sums.compared as usize) < params.gates.min_points {
             return Err(Refusal::LittleOverlap);

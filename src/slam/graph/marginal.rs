@@ -42,15 +42,8 @@ impl Marginals {
         Ok(Self { factor, places })
     }
 
-    /// Covariance of the left increment (translation, rotation, log scale) of `map_from_keyframe` against the fixed
-    /// vertices; `None` where the graph has no such vertex.
-    pub fn covariance(&mut self, of: VertexId) -> Option<Matrix7> {
-        let adjoint = self.places.get(of.index())?.adjoint();
-        let [local, ..] = self.joint(of.index(), of.index());
-        Some(adjoint * local * adjoint.transpose())
-    }
-
-    /// Covariance of the left increment of `a_from_b`; `None` where the graph lacks one of them.
+    /// Covariance of the left increment (translation, rotation, log scale) of `a_from_b`; `None` where the graph lacks
+    /// one of them.
     pub fn relative_covariance(&mut self, a: VertexId, b: VertexId) -> Option<Matrix7> {
         let (a, b) = (a.index(), b.index());
         // exp(−δ_a) a_from_b exp(δ_b) = exp(−δ_a + Ad(a_from_b) δ_b) a_from_b.

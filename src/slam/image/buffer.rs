@@ -39,11 +39,6 @@ impl<T: Copy> Image<T> {
         &mut self.pixels
     }
 
-    /// The pixels alone.
-    pub fn into_pixels(self) -> Vec<T> {
-        self.pixels
-    }
-
     /// The pixel at column `u`, row `v`.
     #[inline]
     pub fn at(&self, u: usize, v: usize) -> T {

@@ -11,7 +11,7 @@ use crate::slam::geometry::sim3::{Matrix7, Sim3};
 use crate::slam::graph::marginal::Marginals;
 use crate::slam::graph::pose_graph::{Constraint, PoseGraph, VertexId};
 use crate::slam::graph::robust::RobustKernel;
-use crate::slam::graph::{GraphParams, fits};
+use crate::slam::graph::{GraphParams, normalized_errors};
 use crate::slam::loops::known::Link;
 use crate::slam::loops::{Loops, Node};
 use crate::slam::place_covariance::PlaceCovariance;
@@ -93,7 +93,7 @@ impl Chain {
 
     /// rᵀΛr of the loops, the newest last.
     pub(super) fn loop_errors(&self) -> Vec<f64> {
-        fits(&self.graph, false).iter().skip(self.num_links).map(|(e, _)| *e).collect()
+        normalized_errors(&self.graph).skip(self.num_links).collect()
     }
 }
 

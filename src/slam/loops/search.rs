@@ -2,7 +2,7 @@
 //! pair.
 
 use crate::slam::geometry::sim3::{Matrix7, Sim3, Twist7};
-use crate::slam::graph::constraint::Refusal;
+use crate::slam::graph::constraint::{ConstraintParams, ConstraintSolver, Refusal, Start};
 use crate::slam::loops::chain::{Chain, link_covariance};
 use crate::slam::loops::known::Link;
 use crate::slam::loops::{Job, Loops, Pair, Plan, SearchFate, Stage, confirmations};
@@ -13,7 +13,7 @@ pub(super) const LARGEST_CHI2: f64 = 18.5;
 impl Loops {
     /// Measures the candidates of a keyframe, and plans the confirmation of the first that may be its place.
     pub(super) fn search(&mut self, job: &Job) -> (u32, SearchFate) {
-        let solver = self.solver();
+        let solver = ConstraintSolver::new(ConstraintParams::default());
         let mut refusal = None;
         let (mut compared, mut against_drift) = (0, None);
         let (Some(of), Some(node)) = (job.keyframe(job.plan.of), job.node(job.plan.of)) else {
@@ -37,8 +37,8 @@ impl Loops {
             }
             compared += 1;
             let view = view.get_or_insert_with(|| solver.view(of));
-            let rotation = pair.j_from_i.rigid.rotation;
-            let measurement = match solver.measure_turned(view, &solver.view(other), &rotation) {
+            let start = Start::Rotation(pair.j_from_i.rigid.rotation);
+            let measurement = match solver.measure(view, &solver.view(other), start) {
                 Ok(measurement) => measurement,
                 Err(why) => {
                     refusal.get_or_insert(why);
@@ -67,7 +67,7 @@ impl Loops {
 
     /// Measures pairs beside a loop; one must say the same, of a loop between two epochs two.
     pub(super) fn confirm(&mut self, job: &Job, link: &Link) -> (u32, SearchFate) {
-        let solver = self.solver();
+        let solver = ConstraintSolver::new(ConstraintParams::default());
         let (Some(i), Some(j)) = (job.node(link.i), job.node(link.j)) else {
             return (0, SearchFate::Unconfirmed);
         };
@@ -80,7 +80,7 @@ impl Loops {
             };
             compared += 1;
             let views = [solver.view(one), solver.view(other)];
-            let measured = solver.measure(&views[0], &views[1], Some(&pair.j_from_i));
+            let measured = solver.measure(&views[0], &views[1], Start::Similarity(pair.j_from_i));
             let Ok(measurement) = measured else { continue };
             let confirmation = Link::of(pair.i, pair.j, &measurement);
             if self.agrees(job, link, &confirmation) {

@@ -3,7 +3,6 @@
 
 use std::sync::Arc;
 
-use crate::slam::depth::common_error::full_covariance;
 use crate::slam::depth::epipolar::TwoView;
 use crate::slam::depth::gaussian::{ObservedPixels, Observer, observe};
 use crate::slam::depth::matching::MatchingParams;
@@ -19,7 +18,7 @@ use crate::slam::mapper::modes::in_unit;
 use crate::slam::mapper::start::take_sensor_depth;
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::place_covariance::UncertainPlace;
-use crate::slam::pose::{Brightness, PoseEstimate};
+use crate::slam::pose::{Brightness, PoseEstimate, full_covariance};
 
 /// What a new keyframe still wants when it is published.
 #[derive(Debug, Clone, Copy)]

@@ -4,16 +4,14 @@
 use nalgebra::{Matrix3, Matrix6};
 use serde::{Deserialize, Serialize};
 
-use crate::slam::depth::common_error::{
-    JointCovariance, PoseByModes, SampledDepth, full_covariance,
-};
+use crate::slam::depth::common_error::{JointCovariance, PoseByModes, SampledDepth};
 use crate::slam::depth::map::DepthMap;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::modes::ModeCovariance;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::place_covariance::PlaceCovariance;
-use crate::slam::pose::PoseEstimate;
+use crate::slam::pose::{PoseEstimate, full_covariance};
 use crate::slam::tracker::covariance_floor::displacement_covariance;
 use crate::slam::window::marginals::Marginal;
 use crate::slam::window::place_marginals::PlaceMarginal;

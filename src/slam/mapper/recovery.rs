@@ -4,7 +4,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::slam::depth::common_error::{full_covariance, rotation_std_dev};
+use crate::slam::depth::common_error::rotation_std_dev;
 use crate::slam::depth::gaussian::MAX_VALIDITY;
 use crate::slam::depth::gradient_image::BORDER_PX;
 use crate::slam::depth::map::{DepthMap, Hypothesis};
@@ -18,7 +18,7 @@ use crate::slam::mapper::doubt::Doubt;
 use crate::slam::mapper::phase::{Loss, Phase};
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::parameter::{ParameterError, check_range};
-use crate::slam::pose::{DegradedReason, PoseEstimate, TrackingState};
+use crate::slam::pose::{DegradedReason, PoseEstimate, TrackingState, full_covariance};
 use crate::slam::tracker::MOST_DEVIATIONS;
 
 /// Largest difference of two poses for one place, translation in mean depths plus rotation in radians: a wrong place is

@@ -18,8 +18,7 @@ use crate::slam::mapper::situation::{StartFrame, StartProgress};
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::parameter::ParameterError;
 use crate::slam::place_covariance::UncertainPlace;
-use crate::slam::pose::{PoseEstimate, TrackingState};
-use crate::slam::tracker::upper_triangle;
+use crate::slam::pose::{PoseEstimate, TrackingState, upper_triangle};
 use crate::slam::two_frame::evidence::Waiting;
 use crate::slam::two_frame::{InitOutcome, InitState, TwoFrameInitializer, TwoFrameParams};
 

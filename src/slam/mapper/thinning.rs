@@ -155,8 +155,7 @@ fn shown_by(map: &Map, index: usize, reuse: &ReuseParams) -> Option<u64> {
     let stride = keyframe.points.len().div_ceil(MOST_POINTS).max(1);
     let (mut shown, mut all) = (0u32, 0u32);
     for point in keyframe.points.iter().step_by(stride) {
-        let Intrinsics { fx, fy, cx, cy, .. } = keyframe.intrinsics;
-        let ray = Vector3::new((f64::from(point.u) - cx) / fx, (f64::from(point.v) - cy) / fy, 1.0);
+        let ray = keyframe.intrinsics.ray(f64::from(point.u), f64::from(point.v));
         let at = ray / f64::from(point.inverse_depth);
         let num_showing =
             others.iter().zip(&views).filter(|(of, view)| shows(of, view, &at)).count();
@@ -215,11 +214,7 @@ mod tests {
         let rotation = SE3::exp(&[0.0, 0.0, 0.0, 0.0, turn_rad, 0.0].into()).rotation;
         let place = SE3 { rotation, translation: Vector3::new(x, 0.0, 0.0) };
         let point = |u: u16, v: u16| {
-            let ray = Vector3::new(
-                (f64::from(u) - CAMERA.cx) / CAMERA.fx,
-                (f64::from(v) - CAMERA.cy) / CAMERA.fy,
-                1.0,
-            );
+            let ray = CAMERA.ray(f64::from(u), f64::from(v));
             // The wall is z = 1 of the map.
             let inverse_depth = (rotation * ray).z as f32;
             DepthPoint { u, v, inverse_depth, variance: 1e-4, intensity: 100.0 }

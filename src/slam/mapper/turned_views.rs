@@ -110,7 +110,7 @@ fn seen_at(camera: &Intrinsics, camera_from_keyframe: &Rotation3<f64>, pixel: us
     let scale_v = camera.height as f64 / ROWS as f64;
     let u = ((pixel % COLUMNS) as f64 + 0.5) * scale_u - 0.5;
     let v = ((pixel / COLUMNS) as f64 + 0.5) * scale_v - 0.5;
-    let ray = Vector3::new((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0);
+    let ray = camera.ray(u, v);
     let ray = camera_from_keyframe * ray.normalize();
     if !(ray.z > LEAST_COSINE) {
         return OUTSIDE;

@@ -5,13 +5,13 @@ use proptest::prelude::*;
 
 use crate::slam::alignment::reference::Reference;
 use crate::slam::alignment::scene::{Noise, Plane};
-use crate::slam::depth::common_error::full_covariance;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::pose::UNKNOWN_VARIANCE;
+use crate::slam::pose::full_covariance;
 use crate::slam::tracker::tests::is_clean;
 use crate::slam::tracker::{Tracker, TrackerParams};
 

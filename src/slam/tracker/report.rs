@@ -9,11 +9,12 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::keyframe::MapState;
 use crate::slam::pose::{
     Brightness, LostReason, NO_KEYFRAME, PoseEstimate, Quality, TrackingState, UNKNOWN_VARIANCE,
+    upper_triangle,
 };
+use crate::slam::tracker::Tracker;
 use crate::slam::tracker::covariance_floor::displacement_covariance;
 use crate::slam::tracker::velocity::PoseErrors;
 use crate::slam::tracker::verdict::quality_of;
-use crate::slam::tracker::{Tracker, upper_triangle};
 
 /// Where the camera is.
 struct Placed {

@@ -4,13 +4,13 @@ use nalgebra::{Matrix6, Vector6};
 
 use crate::slam::alignment::reference::Reference;
 use crate::slam::alignment::scene::{Noise, Plane, small_camera, small_plane};
-use crate::slam::depth::common_error::full_covariance;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::place_covariance::{PlaceCovariance, PlaceMatrix, UncertainPlace};
+use crate::slam::pose::full_covariance;
 use crate::slam::pose::{
     DegradedReason, LostReason, PoseEstimate, TrackingState, UNKNOWN_VARIANCE,
 };

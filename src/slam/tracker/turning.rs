@@ -10,18 +10,19 @@ use nalgebra::{Matrix3, Matrix6};
 use crate::slam::alignment::align::{Aligner, Alignment, AlignmentParams, Ending};
 use crate::slam::alignment::reference::{Reference, ReferenceScratch};
 use crate::slam::alignment::unknown_depth::UnknownDepth;
-use crate::slam::depth::common_error::{full_covariance, rotation_std_dev};
+use crate::slam::depth::common_error::rotation_std_dev;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::sums::SumPyramid;
 use crate::slam::pose::{
-    Brightness, DegradedReason, LostReason, PoseEstimate, Quality, TrackingState,
+    Brightness, DegradedReason, LostReason, PoseEstimate, Quality, TrackingState, full_covariance,
+    upper_triangle,
 };
 use crate::slam::tracker::covariance_floor::displacement_covariance;
 use crate::slam::tracker::verdict::quality_of;
-use crate::slam::tracker::{MOST_DEVIATIONS, Memory, Tracker, upper_triangle};
+use crate::slam::tracker::{MOST_DEVIATIONS, Memory, Tracker};
 
 /// Change of the exposure since the view: of the logarithm of the gain, and of the offset in grey levels. Some frames
 /// pass at most; more freedom flattens a view of little contrast until it fits anything.

@@ -3,11 +3,11 @@
 use nalgebra::Vector6;
 
 use crate::slam::alignment::reference::Reference;
-use crate::slam::depth::common_error::full_covariance;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::{Sim3, Twist7};
 use crate::slam::keyframe::Keyframe;
+use crate::slam::pose::full_covariance;
 use crate::slam::pose::{DegradedReason, LostReason, PoseEstimate, TrackingState};
 use crate::slam::test_scene::{CAMERA, Scene};
 use crate::slam::tracker::{Tracker, TrackerParams};

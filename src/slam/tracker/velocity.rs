@@ -16,8 +16,7 @@ use nalgebra::{Matrix6, Matrix6x3, Vector6};
 
 use crate::slam::geometry::se3::SE3;
 use crate::slam::modes::ModeCovariance;
-use crate::slam::pose::Velocity;
-use crate::slam::tracker::upper_triangle;
+use crate::slam::pose::{Velocity, upper_triangle};
 
 /// Longest interval that has a velocity, seconds: what a camera does in more is no steady motion.
 const LONGEST_INTERVAL: f64 = 0.5;

@@ -4,12 +4,12 @@ use nalgebra::{Matrix6, Matrix6x3, Vector3, Vector6};
 
 use crate::slam::alignment::reference::Reference;
 use crate::slam::alignment::scene::{Noise, Plane, small_camera, small_plane};
-use crate::slam::depth::common_error::full_covariance;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::modes::ModeCovariance;
+use crate::slam::pose::full_covariance;
 use crate::slam::pose::{PoseEstimate, Velocity};
 use crate::slam::tracker::velocity::{PoseErrors, VelocityMemory};
 use crate::slam::tracker::{Tracker, TrackerParams};

@@ -9,8 +9,8 @@ use serde::{Deserialize, Serialize};
 use crate::slam::depth::pattern::PATTERN;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::two_frame::hypothesis::Rival;
-use crate::slam::two_frame::median::median;
 use crate::slam::two_frame::system::{State, System};
+use crate::slam::upper_median::upper_median;
 
 /// What counts as proof.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -180,7 +180,7 @@ pub fn residual_variance(system: &System, sorted: &mut Vec<f32>) -> f32 {
     sorted.extend(
         system.points().filter(|p| p.visible).map(|p| p.energy / (p.weight * FREEDOM_RATIO)),
     );
-    median(sorted).unwrap_or(f32::INFINITY)
+    upper_median(sorted, f32::total_cmp).unwrap_or(f32::INFINITY)
 }
 
 /// Judges the joint fit (`state`, `joint` and its variances) against the pure `rotation`; what other
@@ -227,7 +227,9 @@ pub fn judge(
         } else {
             1.0
         },
-        median_std_dev_ratio: f64::from(median(sorted).unwrap_or(f32::INFINITY)),
+        median_std_dev_ratio: f64::from(
+            upper_median(sorted, f32::total_cmp).unwrap_or(f32::INFINITY),
+        ),
         visible_ratio: joint.num_visible as f64 / joint.num_points.max(1) as f64,
         median_residual,
         common_error: f64::INFINITY,

@@ -12,10 +12,10 @@ use crate::slam::kernel::Kernel;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::two_frame::elimination::{Elimination, PriorWeights, prior_energy};
 use crate::slam::two_frame::lanes::NUM_UNKNOWNS;
-use crate::slam::two_frame::median::median;
 use crate::slam::two_frame::points::Points;
 use crate::slam::two_frame::system::{LevelView, PointSystem, State, System};
 use crate::slam::two_frame::system_kernel::{Medians, Reduction};
+use crate::slam::upper_median::upper_median;
 
 /// Tuning of the fit.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -346,7 +346,7 @@ pub fn common_error(
             variance.sqrt() / d
         })
         .collect();
-    median(&mut errors).map_or(f64::INFINITY, f64::from)
+    upper_median(&mut errors, f32::total_cmp).map_or(f64::INFINITY, f64::from)
 }
 
 /// Inverse of the pose's normal equations after elimination of the depths, scale held; `None` where

@@ -477,7 +477,7 @@ fn a_point_counts_as_it_does_alone() {
         for (s, (du, dv)) in crate::slam::depth::pattern::PATTERN.iter().enumerate() {
             let pixel =
                 [f64::from(patch.u[l]) + f64::from(*du), f64::from(patch.v[l]) + f64::from(*dv)];
-            let ray = Vector3::new((pixel[0] - k.cx) / k.fx, (pixel[1] - k.cy) / k.fy, 1.0);
+            let ray = k.ray(pixel[0], pixel[1]);
             let pose = &state.current_from_first;
             let q = pose.rotation_matrix() * ray + pose.translation * 0.4f32 as f64;
             let (u, v) = (k.fx * q.x / q.z + k.cx, k.fy * q.y / q.z + k.cy);

@@ -39,7 +39,7 @@ fn look(image: &SharedImage, u: usize, v: usize) -> Look {
 
 /// Of a pixel at depth 1.
 fn ray(u: f64, v: f64) -> [f32; 2] {
-    [((u - CAMERA.cx) / CAMERA.fx) as f32, ((v - CAMERA.cy) / CAMERA.fy) as f32]
+    CAMERA.ray(u, v).xy().map(|x| x as f32).into()
 }
 
 const ALL_WANTED: Wanted = Wanted { poses: true, depths: true, host: true };

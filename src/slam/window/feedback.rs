@@ -146,10 +146,7 @@ impl Window {
                     continue;
                 }
                 found.push(Correspondence {
-                    ray: [
-                        (seen.u - self.camera.cx) / self.camera.fx,
-                        (seen.v - self.camera.cy) / self.camera.fy,
-                    ],
+                    ray: self.camera.ray(seen.u, seen.v).xy().into(),
                     log_ratio: (seen.inverse_depth / depth).ln(),
                     log_inverse_depth: depth.ln(),
                 });

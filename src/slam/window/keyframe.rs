@@ -100,9 +100,8 @@ impl WindowPoint {
             let at = |pixel: u16| (f32::from(pixel) + 0.5) * 0.5f32.powi(level as i32) - 0.5;
             *look = look_at(image, at(u), at(v), params.half_weight_gradient);
         }
-        let (x, y) =
-            ((f64::from(u) - camera.cx) / camera.fx, (f64::from(v) - camera.cy) / camera.fy);
-        let ray = [x as f32, y as f32];
+        let ray = camera.ray(f64::from(u), f64::from(v));
+        let ray = [ray.x as f32, ray.y as f32];
         Self { u, v, ray, inverse_depth, looks, confirmations: 0, is_alive: true }
     }
 }

@@ -41,8 +41,8 @@ fn modes_of(room: &Room, truth: &Room, keyframe: usize) -> Vector3<f64> {
         for host in (0..room.keyframes.len()).filter(|&host| host != keyframe) {
             for (found, exact) in seen(room, host).into_iter().zip(seen(truth, host)) {
                 let (Some(found), Some(exact)) = (found, exact) else { continue };
-                let ray = [(exact.u - CAMERA.cx) / CAMERA.fx, (exact.v - CAMERA.cy) / CAMERA.fy];
-                add(ray, found.inverse_depth, exact.inverse_depth);
+                let ray = CAMERA.ray(exact.u, exact.v).xy();
+                add(ray.into(), found.inverse_depth, exact.inverse_depth);
             }
         }
     }

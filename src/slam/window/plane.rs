@@ -2,6 +2,8 @@
 
 use nalgebra::{Matrix3, Matrix4, Vector3, Vector4};
 
+use crate::slam::upper_median::upper_median;
+
 /// One point that is known better.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Correspondence {
@@ -104,9 +106,5 @@ fn spread(sizes: Vec<f64>) -> f64 {
 
 /// The upper median; 0 of none.
 pub(super) fn median(mut values: Vec<f64>) -> f64 {
-    if values.is_empty() {
-        return 0.0;
-    }
-    let middle = values.len() / 2;
-    *values.select_nth_unstable_by(middle, f64::total_cmp).1
+    upper_median(&mut values, f64::total_cmp).unwrap_or(0.0)
 }

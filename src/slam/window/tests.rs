@@ -15,7 +15,7 @@ use crate::slam::test_scene::{CAMERA, Random, Rendering, Scene};
 use crate::slam::window::plane::Correspondence;
 
 pub(super) fn ray(u: f64, v: f64) -> [f32; 2] {
-    [((u - CAMERA.cx) / CAMERA.fx) as f32, ((v - CAMERA.cy) / CAMERA.fy) as f32]
+    CAMERA.ray(u, v).xy().map(|x| x as f32).into()
 }
 
 /// Keyframes of a room with points, of which the first and those in `held` stay where they are.

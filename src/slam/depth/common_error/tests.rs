@@ -188,9 +188,3 @@ fn covariances_are_those_of_samples() {
     assert!(off < 0.03, "{predicted} {measured}");
     assert!(predicted.symmetric_eigenvalues().min() > 0.0);
 }
-
-#[test]
-fn the_upper_triangle_is_a_whole_matrix() {
-    let full = full_covariance(&std::array::from_fn(|i| i as f64));
-    assert_eq!((full[(0, 5)], full[(5, 0)], full[(1, 1)], full[(5, 5)]), (5.0, 5.0, 6.0, 20.0));
-}

@@ -18,11 +18,7 @@ fn render(current_from_keyframe: &SE3) -> Vec<u8> {
     let mut pixels = Vec::new();
     for v in 0..CAMERA.height {
         for u in 0..CAMERA.width {
-            let ray = nalgebra::Vector3::new(
-                (u as f64 - CAMERA.cx) / CAMERA.fx,
-                (v as f64 - CAMERA.cy) / CAMERA.fy,
-                1.0,
-            );
+            let ray = CAMERA.ray(u as f64, v as f64);
             let (o, r) = (keyframe_from_current.translation, keyframe_from_current.rotation * ray);
             let s = (1.0 / PLANE_INVERSE_DEPTH - o.z) / r.z;
             let (x, y) = ((o + r * s).x, (o + r * s).y);

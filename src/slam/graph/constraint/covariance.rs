@@ -138,8 +138,8 @@ impl Scatter {
             scatter.by_modes[0] += row * (weight * depth.by_log_depth) * own.transpose();
             // Of j: the plane of its modes at the ray of p'.
             let [u, v] = terms.photometric.projection.map(f64::from);
-            let ray = [(u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy];
-            let theirs = shape(ray, depth.other_inverse_depth) - centres[1];
+            let theirs =
+                shape(intrinsics.ray(u, v).xy().into(), depth.other_inverse_depth) - centres[1];
             scatter.by_modes[1] -= row * weight * theirs.transpose();
         }
         scatter

@@ -1,5 +1,4 @@
-//! Where an alignment of two keyframes begins of which nothing is known: at the rotation that makes their small images
-//! most alike, and around it.
+//! Where an alignment of two keyframes begins: around what is known, where their blurred images agree best.
 
 use nalgebra::{UnitQuaternion, Vector3, Vector6};
 
@@ -9,13 +8,13 @@ use super::residual::State;
 use super::view::KeyframeView;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
-use crate::slam::mapper::turned_views::TurnedViews;
 use crate::slam::pose::Brightness;
 use crate::slam::tracker::motion::turned;
+use crate::slam::upper_median::upper_median;
 
-/// Half a step of the rotations that are compared, degrees: the search around them.
+/// Turns that are tried around a rotation that is given, degrees: half a step of those that places are compared by.
 const AROUND_DEG: f64 = 4.5;
-/// Translations that are tried with a rotation that keeps the middle of the view about in place, mean depths.
+/// Translations that are tried with a turn that keeps the middle of the view about in place, mean depths.
 const ASIDE: f64 = 0.3;
 /// The same around a similarity that is given.
 const GIVEN_DEG: f64 = 3.0;
@@ -25,32 +24,28 @@ const MOST_FOLLOWED: usize = 3;
 
 /// What is known of a similarity before it is measured.
 #[derive(Debug, Clone, Copy)]
-pub(super) enum Start<'a> {
-    Nothing,
-    /// About how the cameras are turned, `j_from_i`.
-    Rotation(&'a UnitQuaternion<f64>),
+pub enum Start {
+    /// About how the cameras are turned, `j_from_i`, as of places that look alike.
+    Rotation(UnitQuaternion<f64>),
     /// `j_from_i`.
-    Similarity(&'a Sim3),
+    Similarity(Sim3),
 }
 
 /// The best state after the two coarsest levels; `None` where the images have nothing in common.
 pub(super) fn find(
     views: [&KeyframeView; 2],
-    start: Start<'_>,
-    turned_views: &TurnedViews,
+    start: Start,
     params: &ConstraintParams,
 ) -> Option<State> {
     let coarsest = views[0].levels().next_back()?;
     let unit = 1.0 / views[0].reference.mean_inverse_depth();
-    let from_rotations = |rotations: Vec<UnitQuaternion<f64>>| -> Vec<SE3> {
-        let poses = rotations.into_iter().map(|rotation| SE3 { rotation, ..SE3::identity() });
-        poses.flat_map(|at| around(&at, AROUND_DEG, unit * ASIDE)).collect()
-    };
     let (starts, given_scale) = match start {
-        Start::Nothing => (from_rotations(rotations(views, turned_views)?), 0.0),
-        Start::Rotation(rotation) => (from_rotations(vec![*rotation]), 0.0),
+        Start::Rotation(rotation) => {
+            let at = SE3 { rotation, ..SE3::identity() };
+            (around(&at, AROUND_DEG, unit * ASIDE), 0.0)
+        }
         Start::Similarity(given) => {
-            let given = State::of(given);
+            let given = State::of(&given);
             (around(&given.rigid, GIVEN_DEG, unit * GIVEN_ASIDE), given.log_scale)
         }
     };
@@ -89,19 +84,6 @@ fn explained(views: [&KeyframeView; 2], level: usize, inliers: u32) -> f64 {
     f64::from(inliers) / views[0].reference.level(level).len().max(1) as f64
 }
 
-/// `j_from_i` of the rotations to begin with: none, and the one that makes the images most alike.
-fn rotations(
-    [i, j]: [&KeyframeView; 2],
-    turned_views: &TurnedViews,
-) -> Option<Vec<UnitQuaternion<f64>>> {
-    let (here, there) = (i.appearance.as_ref()?, j.appearance.as_ref()?);
-    let best = turned_views.compare(there.details(), &[here.details()]);
-    let mut rotations = vec![UnitQuaternion::identity()];
-    // Its rotation is i_from_j.
-    rotations.extend(best.first()?.map(|best| best.rotation.inverse()));
-    Some(rotations)
-}
-
 /// Poses around one: turned by `degrees`, and moved by `aside`, units of i, with a turn that keeps the view.
 fn around(at: &SE3, degrees: f64, aside: f64) -> Vec<SE3> {
     let turn_rad = degrees.to_radians();
@@ -127,10 +109,5 @@ fn log_scale(
     let at = params.level(views, level, state, state);
     let depths = at.terms().filter_map(|terms| terms.depth);
     let mut residuals: Vec<f64> = depths.map(|depth| depth.residual).collect();
-    if residuals.is_empty() {
-        return state.log_scale;
-    }
-    let middle = residuals.len() / 2;
-    let median = *residuals.select_nth_unstable_by(middle, f64::total_cmp).1;
-    state.log_scale + median
+    state.log_scale + upper_median(&mut residuals, f64::total_cmp).unwrap_or(0.0)
 }

@@ -64,7 +64,7 @@ pub enum Refusal {
     /// The similarity to begin with is none.
     #[error("the initial similarity is not finite or its scale is not positive")]
     InvalidStart,
-    /// No rotation makes the images alike.
+    /// No start makes the images alike.
     #[error("the images have nothing in common")]
     NothingAlike,
     /// No point falls into the other image.

@@ -5,7 +5,6 @@ use crate::slam::alignment::reference::num_levels;
 use crate::slam::alignment::reference::{Reference, ReferenceParams, ReferenceScratch};
 use crate::slam::image::sums::SumPyramid;
 use crate::slam::keyframe::Keyframe;
-use crate::slam::mapper::appearance::Appearance;
 
 /// Depth at one pixel of a level, as a plane of the inverse depth around it.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -117,7 +116,6 @@ pub struct KeyframeView {
     pub(super) reference: Reference,
     pub(super) pyramid: SumPyramid,
     pub(super) depths: Vec<DepthGrid>,
-    pub(super) appearance: Option<Appearance>,
 }
 
 impl KeyframeView {
@@ -141,9 +139,7 @@ impl KeyframeView {
             false => DepthGrid::new(scratch.candidates(level), width >> level, height >> level),
         };
         let depths = (0..levels).map(depth_of).collect();
-        let appearance =
-            is_usable.then(|| Appearance::of(&keyframe.image, width, height)).flatten();
-        Self { reference, pyramid, depths, appearance }
+        Self { reference, pyramid, depths }
     }
 
     /// Levels that are aligned, finest first; none where the keyframe cannot be used.

@@ -7,8 +7,8 @@ use crate::slam::geometry::sim3::Sim3;
 use crate::slam::map::{Correction, KeyframeCorrection, LogPlane};
 use crate::slam::mapper::MapperParams;
 use crate::slam::mapper::phase::Active;
+use crate::slam::pose::upper_triangle;
 use crate::slam::test_scene::{CAMERA, Scene};
-use crate::slam::tracker::upper_triangle;
 
 #[test]
 fn a_place_that_is_turned_against_a_held_pose_is_not_believed() {
