@@ -114,11 +114,11 @@ pub fn peak_gflops(kernel: Kernel) -> f64 {
     let (run, width): (fn(), usize) = match kernel {
         Kernel::Portable => (instructions::run_portable, 4),
         #[cfg(target_arch = "x86_64")]
-        Kernel::Avx2 => (instructions::run_avx2, 8),
+        Kernel::Avx2 { .. } => (instructions::run_avx2, 8),
         #[cfg(target_arch = "x86_64")]
-        Kernel::Avx512 => (instructions::run_avx512, 16),
+        Kernel::Avx512 { .. } => (instructions::run_avx512, 16),
         #[cfg(target_arch = "aarch64")]
-        Kernel::Neon => (instructions::run_neon, 4),
+        Kernel::Neon { .. } => (instructions::run_neon, 4),
     };
     (CHAINS * STEPS * width) as f64 * FLOPS_PER_STEP / best_nanos(run)
 }

@@ -25,19 +25,22 @@ pub enum SimdMode {
     Portable,
 }
 
-/// An instruction set that this CPU has.
+/// An instruction set that this CPU has: only [`Kernel::available`] and the like make the vector ones.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kernel {
     /// Plain arithmetic in four lanes.
     Portable,
     /// AVX2 and FMA, eight lanes.
     #[cfg(target_arch = "x86_64")]
+    #[non_exhaustive]
     Avx2,
     /// AVX-512, sixteen lanes.
     #[cfg(target_arch = "x86_64")]
+    #[non_exhaustive]
     Avx512,
     /// NEON, four lanes.
     #[cfg(target_arch = "aarch64")]
+    #[non_exhaustive]
     Neon,
 }
 

@@ -199,7 +199,7 @@ fn who_comes_late_gets_the_keyframe_and_status_sees_all_three() {
 #[test]
 fn a_killed_tracker_comes_back() {
     let rig = Rig::new();
-    let child = rig.run(100, SLOW).spawn().unwrap();
+    let child = rig.run(60, SLOW).spawn().unwrap();
     let hub = rig.observe();
     let mut tracker = until("the tracker", || Peer::open(&hub, &TRACKER_HEALTH).ok());
     let victim = until("ten frames", || {

@@ -116,22 +116,49 @@ fn kills_do_not_rewind(processes: &[usize]) {
     assert!((FRAMES - 2..=FRAMES).contains(&frames_in), "{summary}");
 }
 
-/// Nearly all of such a run is waiting: all together take no longer than one.
-fn at_once<T: Send>(cases: impl IntoIterator<Item = T>, run: impl Fn(T) + Sync) {
+/// Nearly all of such a run is waiting: several together take no longer than one.
+fn at_once(scenarios: &[(&str, &(dyn Fn() + Sync))]) {
     std::thread::scope(|scope| {
-        for case in cases {
-            let run = &run;
-            scope.spawn(move || run(case));
+        for (name, run) in scenarios {
+            // A panic says the name of its thread.
+            let thread = std::thread::Builder::new().name((*name).to_owned());
+            thread.spawn_scoped(scope, run).unwrap();
         }
     });
 }
 
 #[test]
-fn processes_that_die_together_do_not_rewind_the_source() {
-    at_once([&[CAPTURE, TRACKER][..], &[CAPTURE, TRACKER, MAPPER]], kills_do_not_rewind);
+fn what_dies_is_started_again() {
+    at_once(&[
+        ("capture and tracker", &|| kills_do_not_rewind(&[CAPTURE, TRACKER])),
+        ("all three", &|| kills_do_not_rewind(&[CAPTURE, TRACKER, MAPPER])),
+        ("estimate", &a_mapper_that_dies_during_an_estimate_leaves_a_map_as_it_was_published),
+        ("numbers", &a_mapper_that_dies_before_it_numbers_anything_leaves_the_first_numbers),
+        ("status", &status_knows_the_age_of_the_run_and_its_keyframes_whoever_died_or_is_stopped),
+    ]);
 }
 
 #[test]
+fn what_hangs_is_started_again_and_said() {
+    at_once(&[
+        ("capture", &|| a_hanging_process_is_started_again(CAPTURE)),
+        ("tracker", &|| a_hanging_process_is_started_again(TRACKER)),
+        ("mapper", &|| a_hanging_process_is_started_again(MAPPER)),
+        ("lockstep", &a_process_that_hangs_in_lockstep_ends_the_run_with_its_name),
+        ("end", &a_mapper_that_hangs_at_the_end_does_not_hold_up_the_results),
+        ("slow disk", &a_mapper_that_writes_its_map_to_a_slow_disk_is_let_alone),
+    ]);
+}
+
+#[test]
+fn what_others_do_costs_a_run_nothing() {
+    at_once(&[
+        ("closed terminal", &a_closed_terminal_ends_a_run_with_its_results),
+        ("unread standard error", &a_standard_error_that_nobody_reads_holds_nothing_up),
+        ("full shared memory", &shared_memory_that_others_fill_costs_a_run_nothing),
+    ]);
+}
+
 fn a_closed_terminal_ends_a_run_with_its_results() {
     let mut live = Live::start(&[]);
     live.until_frames(TRACKER, 60);
@@ -144,21 +171,27 @@ fn a_closed_terminal_ends_a_run_with_its_results() {
 
 #[test]
 fn a_replay_that_is_ended_by_any_signal_keeps_its_results() {
-    for ending in [Signal::INT, Signal::TERM, Signal::HUP] {
-        let rig = Rig::new();
-        let output = rig.output();
-        let arguments = ["replay", "loop:1000000:30:sim", "--output", output.to_str().unwrap()];
-        let mut command = rig.command(&arguments);
-        for setting in small_camera(20) {
-            command.args(["--set", &format!("simulator.{setting}")]);
-        }
-        let replay = command.spawn().unwrap();
-        // Nothing says that frames are done; what comes too soon ends it without results and another code path.
-        std::thread::sleep(Duration::from_secs(3));
-        signal(&replay, ending);
-        let ended = end(replay);
-        assert_eq!(ended.status.code(), Some(130), "{ending:?}: {}", ended.stderr);
+    at_once(&[
+        ("interrupted", &|| ends_with_results(Signal::INT)),
+        ("terminated", &|| ends_with_results(Signal::TERM)),
+        ("hung up", &|| ends_with_results(Signal::HUP)),
+    ]);
+}
+
+fn ends_with_results(ending: Signal) {
+    let rig = Rig::new();
+    let output = rig.output();
+    let arguments = ["replay", "loop:1000000:30:sim", "--output", output.to_str().unwrap()];
+    let mut command = rig.command(&arguments);
+    for setting in small_camera(20) {
+        command.args(["--set", &format!("simulator.{setting}")]);
     }
+    let replay = command.spawn().unwrap();
+    // Nothing says that frames are done; what comes too soon ends it without results and another code path.
+    std::thread::sleep(Duration::from_secs(3));
+    signal(&replay, ending);
+    let ended = end(replay);
+    assert_eq!(ended.status.code(), Some(130), "{ending:?}: {}", ended.stderr);
 }
 
 /// A pipe into which nothing more goes, and who does not read it.
@@ -171,7 +204,6 @@ fn full_pipe() -> (PipeReader, PipeWriter) {
     (reader, writer)
 }
 
-#[test]
 fn a_standard_error_that_nobody_reads_holds_nothing_up() {
     let (unread, full) = full_pipe();
     let rig = Rig::new();
@@ -206,12 +238,6 @@ fn a_hanging_process_is_started_again(process: usize) {
     assert!(stamps(&rig).is_sorted_by(|one, next| one < next));
 }
 
-#[test]
-fn whichever_process_hangs_is_started_again_and_said() {
-    at_once([CAPTURE, TRACKER, MAPPER], a_hanging_process_is_started_again);
-}
-
-#[test]
 fn a_process_that_hangs_in_lockstep_ends_the_run_with_its_name() {
     let rig = Rig::new();
     let watchdog = ["--set", "supervisor.watchdog_s=2"];
@@ -233,7 +259,6 @@ fn a_process_that_hangs_in_lockstep_ends_the_run_with_its_name() {
     assert_eq!(rig.leftovers(), Vec::<String>::new());
 }
 
-#[test]
 fn a_mapper_that_hangs_at_the_end_does_not_hold_up_the_results() {
     let mut live = Live::start(&[]);
     let begun = until("a keyframe", || {
@@ -268,7 +293,6 @@ fn slow_disk(path: &Path) -> JoinHandle<usize> {
     })
 }
 
-#[test]
 fn a_mapper_that_writes_its_map_to_a_slow_disk_is_let_alone() {
     let mut live = Live::start(&["--set", "supervisor.watchdog_s=2"]);
     live.until_frames(MAPPER, 90);
@@ -286,7 +310,6 @@ fn a_mapper_that_writes_its_map_to_a_slow_disk_is_let_alone() {
     assert_eq!(summary["restarts"], 0, "{summary}");
 }
 
-#[test]
 fn a_mapper_that_dies_before_it_numbers_anything_leaves_the_first_numbers() {
     let mut live = Live::start(&[]);
     let before = live.pid(MAPPER);
@@ -315,7 +338,6 @@ fn graphs(graph: &Subscriber<KeyframePoseMessage, GraphHeader>) -> Vec<(GraphHea
     received.collect()
 }
 
-#[test]
 fn a_mapper_that_dies_during_an_estimate_leaves_a_map_as_it_was_published() {
     // Estimates that take long, so that each death falls into one.
     let slow = ["--live", "--set", "mapping.window.max_first_iterations=200"];
@@ -375,10 +397,9 @@ fn with_shared_memory(rig: &Rig, megabytes: u32, script: &str) -> Option<Ended> 
 }
 
 /// Options of a small live run, for a shell.
-const SMALL: &str = "--live --source loop:600:30:sim --output $OUTPUT --set simulator.frames=40 \
+const SMALL: &str = "--live --source loop:300:30:sim --output $OUTPUT --set simulator.frames=40 \
      --set simulator.width=160 --set simulator.height=120 --set simulator.focal_px=131.0";
 
-#[test]
 fn shared_memory_that_others_fill_costs_a_run_nothing() {
     let rig = Rig::new();
     // Whatever is left once frames flow is taken by somebody else.
@@ -398,7 +419,7 @@ fn shared_memory_that_others_fill_costs_a_run_nothing() {
     let summary = fs::read_to_string(rig.output().join("summary.json")).unwrap();
     let summary: Value = serde_json::from_str(&summary).unwrap();
     assert_eq!(summary["restarts"], 0, "{summary}");
-    assert_eq!(summary["frames_in"], 600, "{summary}");
+    assert_eq!(summary["frames_in"], 300, "{summary}");
 }
 
 #[test]
@@ -421,7 +442,6 @@ fn status(rig: &Rig) -> Value {
     serde_json::from_str(&ended.stdout).unwrap()
 }
 
-#[test]
 fn status_knows_the_age_of_the_run_and_its_keyframes_whoever_died_or_is_stopped() {
     let mut live = Live::start(&[]);
     live.until_frames(MAPPER, 60);

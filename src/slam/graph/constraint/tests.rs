@@ -203,7 +203,7 @@ fn true_loops_are_accepted_at_wide_baselines_and_other_units() {
                 let found = match found {
                     Ok(found) => found,
                     Err(_) if k == WIDEST => {
-                        widest += 1;
+                        widest += u32::from(knows_start);
                         continue;
                     }
                     Err(refusal) => {
@@ -224,8 +224,9 @@ fn true_loops_are_accepted_at_wide_baselines_and_other_units() {
         }
     }
     assert!(refused.is_empty(), "{refused:?}");
-    // Of the widest one, which loses most of what is near, all but one at most are refused.
-    assert!(widest <= 5, "{widest} of 6");
+    // The widest one loses most of what is near: from a rotation it is found in none of the three units, from a
+    // similarity in one at least.
+    assert!(widest <= 2, "{widest} of 3");
 }
 
 /// What comes of two keyframes of which about the rotation is known.
