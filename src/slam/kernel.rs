@@ -1,6 +1,6 @@
 //! The vector instructions that a loop is compiled for: the one place that asks the CPU for them.
 //!
-//! A loop is a [`Body`], one source; it is compiled for every instruction set and run with one that the CPU has. The
+//! A loop is a `Body`, one source; it is compiled for every instruction set and run with one that the CPU has. The
 //! portable one is plain arithmetic without fused multiply-add and gives the same bits on every CPU.
 
 pub(in crate::slam) mod lanes_kernel;
