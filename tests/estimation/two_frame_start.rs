@@ -122,9 +122,8 @@ fn a_camera_on_a_rail_starts_in_every_scene() {
 
 #[test]
 fn a_standing_camera_never_starts() {
-    // Twice as long in the rendered room of the library's own tests.
     for (seed, noise_std_dev) in [(1, 2.0), (2, 4.0)] {
-        let start = simulated(params(MotionKind::Standing, seed, 100, noise_std_dev));
+        let start = simulated(params(MotionKind::Standing, seed, 200, noise_std_dev));
         assert!(start.is_none(), "{seed}: {start:?}");
     }
 }
