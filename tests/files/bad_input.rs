@@ -4,9 +4,10 @@
 mod table;
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Command, Stdio};
 
+use crate::rendered::rendered;
 use crate::support::{Ended, Rig, finish};
 use table::{Row, SECTIONS};
 
@@ -33,17 +34,6 @@ halve() { truncate -s $(($(stat -c %s "$1") / 2)) "$1"; }
 
 const RIG: &str =
     "model = \"pinhole\"\nwidth = 160\nheight = 120\nfx = 131\nfy = 131\ncx = 79.5\ncy = 59.5\n";
-
-/// A small recording in TUM layout.
-fn recording(rig: &Rig) -> PathBuf {
-    let folder = rig.folder().join("recording");
-    let mut command = rig.command(&["simulate", "--force", "--output"]);
-    command.arg(&folder).args(["--frames", &FRAMES.to_string()]);
-    command.args(["--width", "160", "--height", "120", "--focal", "131"]);
-    let ended = finish(command);
-    assert!(ended.status.success(), "{}", ended.stderr);
-    folder
-}
 
 /// A shell in the folder of `rig` whose `semidense` is the real one.
 fn shell(rig: &Rig, script: &str) -> Command {
@@ -125,7 +115,7 @@ fn observe(row: &Row, template: &Path) -> Result<String, String> {
 #[test]
 fn every_bad_input_has_its_line_and_its_exit_code() {
     let rig = Rig::new();
-    let template = recording(&rig);
+    let template = rendered(&rig, FRAMES);
     // Mostly they wait for processes to start: the sections go side by side.
     let seen: Vec<Vec<Result<String, String>>> = std::thread::scope(|scope| {
         let observe_all = |section: &'static table::Section| {
@@ -180,7 +170,7 @@ fn assert_refused(ended: &Ended, words: &[&str], what: &str) {
 #[test]
 fn paths_of_any_bytes_are_accepted() {
     let rig = Rig::new();
-    let folder = recording(&rig);
+    let folder = rendered(&rig, FRAMES);
     let odd = r"$(printf 'b\xffd $x')";
     fs::write(rig.folder().join("rig.toml"), RIG).unwrap();
     let script = format!(
@@ -232,7 +222,7 @@ fn results_that_do_not_fit_are_one_line_and_no_half_file() {
 #[test]
 fn a_full_standard_output_is_an_error_and_a_reader_that_leaves_is_none() {
     let rig = Rig::new();
-    let folder = recording(&rig);
+    let folder = rendered(&rig, FRAMES);
     let truth = folder.join("groundtruth.txt");
     let evaluate = || {
         let mut command = rig.command(&["evaluate"]);

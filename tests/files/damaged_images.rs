@@ -4,23 +4,13 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use crate::rendered::rendered;
 use crate::support::{Ended, Rig, finish};
 use serde_json::Value;
 
 const FRAMES: usize = 40;
 /// Exit code of a run that tracked nothing.
 const NOTHING_TRACKED: i32 = 3;
-
-/// A recording that can be tracked, in TUM layout.
-fn recording(rig: &Rig) -> PathBuf {
-    let folder = rig.folder().join("recording");
-    let mut command = rig.command(&["simulate", "--force", "--output"]);
-    command.arg(&folder).args(["--frames", &FRAMES.to_string()]);
-    command.args(["--width", "160", "--height", "120", "--focal", "131"]);
-    let ended = finish(command);
-    assert!(ended.status.success(), "{}", ended.stderr);
-    folder
-}
 
 /// The image of a frame.
 fn image(folder: &Path, frame: usize) -> PathBuf {
@@ -71,7 +61,7 @@ fn summary(output: &Path) -> Value {
 #[test]
 fn damaged_images_are_left_out_and_the_rest_is_tracked_alike() {
     let rig = Rig::new();
-    let folder = recording(&rig);
+    let folder = rendered(&rig, FRAMES);
     let lost = break_some(&folder);
     let mut trajectories = Vec::new();
     for (arguments, name) in
@@ -108,7 +98,7 @@ fn damaged_images_are_left_out_and_the_rest_is_tracked_alike() {
 #[test]
 fn a_strict_run_ends_at_the_first_damaged_image() {
     let rig = Rig::new();
-    let folder = recording(&rig);
+    let folder = rendered(&rig, FRAMES);
     cut(&image(&folder, 9));
     for arguments in [&["replay", "--strict"][..], &["run", "--strict"]] {
         let (ended, _) = play(&rig, arguments, &folder, "strict");
@@ -123,7 +113,7 @@ fn a_strict_run_ends_at_the_first_damaged_image() {
 #[test]
 fn a_recording_without_one_good_image_is_an_error() {
     let rig = Rig::new();
-    let folder = recording(&rig);
+    let folder = rendered(&rig, FRAMES);
     (0..FRAMES).for_each(|frame| cut(&image(&folder, frame)));
     for arguments in [&["replay"][..], &["run"], &["run", "--live"]] {
         let (ended, _) = play(&rig, arguments, &folder, "none");
@@ -137,7 +127,7 @@ fn a_recording_without_one_good_image_is_an_error() {
 #[test]
 fn damaged_depth_images_do_not_cost_the_results() {
     let rig = Rig::new();
-    let folder = recording(&rig);
+    let folder = rendered(&rig, FRAMES);
     for entry in fs::read_dir(folder.join("depth")).unwrap() {
         cut(&entry.unwrap().path());
     }

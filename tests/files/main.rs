@@ -22,6 +22,7 @@ mod damaged_images;
 mod fuzz_findings;
 mod map_files;
 mod recordings;
+mod rendered;
 mod replay;
 mod results;
 mod untracked;
