@@ -324,6 +324,9 @@ unsafe fn derive_depths<L: Lanes>(
         let b = weighed.uv.mul(u).add(weighed.vv.mul(v));
         store(u.mul(a).add(v.mul(b)), &mut out.depth, lane);
         store(u.mul(weighed.right_u).add(v.mul(weighed.right_v)), &mut out.depth_right, lane);
+        if !pair.wanted.poses {
+            return;
+        }
         let mut mixed = [L::splat(0.0); POSE];
         for row in 0..POSE {
             mixed[row] = motion.along(row, a, b);

@@ -6,19 +6,21 @@
 //! no prior: its errors are those of its poses, common to all pixels.
 
 use std::collections::HashSet;
+use std::ops::Range;
 
 use rayon::prelude::*;
 
+use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::image::shared::SharedImage;
-use crate::slam::kernel::{Kernel, SimdMode};
+use crate::slam::kernel::{Body, Instructions, Kernel, SimdMode};
 use crate::slam::keyframe::{DepthPoint, Keyframe};
 use crate::slam::map::{LogPlane, Map, RefinedDepth};
 use crate::slam::window::Window;
 use crate::slam::window::comparison::{
     Compared, LANES, Pair, PairSums, Patterns, Robustness, SAMPLES, Wanted,
 };
-use crate::slam::window::keyframe::{WindowKeyframe, WindowPoint, num_levels};
-use crate::slam::window::neighbours::{Single, smoothed};
+use crate::slam::window::keyframe::{WindowKeyframe, at_level, look_at, num_levels};
+use crate::slam::window::neighbours::{Neighbourhood, Single};
 use crate::slam::window::params::WindowParams;
 use crate::slam::window::plane::fit;
 
@@ -166,24 +168,21 @@ impl Window {
             .map(|(level, steps)| self.observers(host, &observers, &of_observers, level, steps))
             .collect();
         let points = self.placed_points(host, keyframe);
-        let descend = |chunk: &[DepthPoint]| self.descend(chunk, &of_host, &levels);
-        // The thread of the joint estimation works alone beside the frames.
-        let found: Vec<Vec<State>> = match rayon::current_thread_index() {
-            Some(_) => points.par_chunks(CHUNK).map(descend).collect(),
-            None => points.chunks(CHUNK).map(descend).collect(),
-        };
-        let found: Vec<State> = found.into_iter().flatten().collect();
+        let found = by_chunk(points.len(), |chunk| self.descend(&points[chunk], &of_host, &levels));
         let squared = mean_squared_residual(&found);
+        let fuse = |place: usize| fused(&points[place], &found[place], squared);
+        let singles = by_chunk(points.len(), |chunk| chunk.map(fuse).collect());
+        let neighbourhood = Neighbourhood::new(&points, &singles, self.camera.width);
         let unit = keyframe.map_from_keyframe.scale as f32;
-        let fuse = |(point, found): (&DepthPoint, &State)| fused(point, found, squared);
-        let singles: Vec<Single> = points.iter().zip(&found).map(fuse).collect();
-        let smooth = smoothed(&points, &singles, self.camera.width).into_iter().map(|point| {
+        let smooth = |place: usize| {
+            let point = neighbourhood.smoothed(place);
             let (inverse_depth, variance) =
                 (point.inverse_depth * unit, point.variance * unit * unit);
             DepthPoint { inverse_depth, variance, ..point }
-        });
+        };
+        let smooth = by_chunk(points.len(), |chunk| chunk.map(smooth).collect());
         let (keyframe_id, of_revision) = (keyframe.keyframe_id, keyframe.revision);
-        Some(RefinedDepth { keyframe_id, of_revision, points: smooth.collect() })
+        Some(RefinedDepth { keyframe_id, of_revision, points: smooth })
     }
 
     /// Its images on the levels that are used.
@@ -243,19 +242,57 @@ impl Window {
         images: &[SharedImage],
         levels: &[Observers<'_>],
     ) -> Vec<State> {
-        let look = |point: &DepthPoint| {
-            let inverse_depth = f64::from(point.inverse_depth);
-            let at = (point.u, point.v);
-            WindowPoint::new(at, inverse_depth, images, &self.camera, &self.params)
-        };
-        let looks: Vec<WindowPoint> = points.iter().map(look).collect();
         let begin =
             |point: &DepthPoint| State { inverse_depth: point.inverse_depth, ..State::default() };
         let mut states: Vec<State> = points.iter().map(begin).collect();
+        let mut chunk = Chunk::of(points.len());
         for observers in levels {
-            Chunk::new(&looks, observers.level).descend(&mut states, observers);
+            let (level, camera) = (observers.level, &self.camera);
+            let half_weight_gradient = self.params.half_weight_gradient;
+            let (image, patterns) = (&images[level], &mut chunk.patterns);
+            let look = Looking { points, image, level, camera, half_weight_gradient, patterns };
+            Kernel::fastest().run(look);
+            chunk.descend(&mut states, observers);
         }
         states
+    }
+}
+
+/// What `of` gives for so many points, some at a time; the thread of the joint estimation works alone beside the frames.
+fn by_chunk<T: Send>(points: usize, of: impl Fn(Range<usize>) -> Vec<T> + Sync) -> Vec<T> {
+    let chunk = |index: usize| of(CHUNK * index..(CHUNK * (index + 1)).min(points));
+    let chunks = 0..points.div_ceil(CHUNK);
+    match rayon::current_thread_index() {
+        Some(_) => {
+            chunks.into_par_iter().map(chunk).collect::<Vec<_>>().into_iter().flatten().collect()
+        }
+        None => chunks.flat_map(chunk).collect(),
+    }
+}
+
+/// What points of a host look like at a level.
+struct Looking<'a> {
+    points: &'a [DepthPoint],
+    image: &'a SharedImage,
+    level: usize,
+    camera: &'a Intrinsics,
+    half_weight_gradient: f32,
+    patterns: &'a mut [Patterns],
+}
+
+impl Body for Looking<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<I: Instructions>(self, _: I) {
+        self.patterns.fill(Patterns::NONE);
+        for (place, point) in self.points.iter().enumerate() {
+            let [u, v] = [point.u, point.v].map(|pixel| at_level(pixel, self.level));
+            let look = look_at(self.image, u, v, self.half_weight_gradient);
+            let ray = self.camera.ray(f64::from(point.u), f64::from(point.v));
+            let ray = [ray.x as f32, ray.y as f32];
+            self.patterns[place / LANES].set(place % LANES, &look, ray);
+        }
     }
 }
 
@@ -266,13 +303,10 @@ struct Chunk {
 }
 
 impl Chunk {
-    fn new(points: &[WindowPoint], level: usize) -> Self {
-        let blocks = points.len().div_ceil(LANES);
-        let mut patterns = vec![Patterns::NONE; blocks];
-        for (place, point) in points.iter().enumerate() {
-            patterns[place / LANES].set(place % LANES, &point.looks[level], point.ray);
-        }
-        Self { patterns, seen: vec![Compared::NONE; blocks] }
+    /// Memory for so many points.
+    fn of(points: usize) -> Self {
+        let blocks = points.div_ceil(LANES);
+        Self { patterns: vec![Patterns::NONE; blocks], seen: vec![Compared::NONE; blocks] }
     }
 
     /// A few steps of each point for itself; one that does not lower the cost is not taken.

@@ -97,8 +97,8 @@ impl WindowPoint {
     ) -> Self {
         let mut looks = [Look::default(); LEVELS];
         for (level, (look, image)) in looks.iter_mut().zip(images).enumerate() {
-            let at = |pixel: u16| (f32::from(pixel) + 0.5) * 0.5f32.powi(level as i32) - 0.5;
-            *look = look_at(image, at(u), at(v), params.half_weight_gradient);
+            let [u, v] = [u, v].map(|pixel| at_level(pixel, level));
+            *look = look_at(image, u, v, params.half_weight_gradient);
         }
         let ray = camera.ray(f64::from(u), f64::from(v));
         let ray = [ray.x as f32, ray.y as f32];
@@ -106,53 +106,70 @@ impl WindowPoint {
     }
 }
 
-/// What the pattern around a pixel looks like.
-fn look_at(image: &SharedImage, u: f32, v: f32, half_weight_gradient: f32) -> Look {
+/// Where a column or row of pixels is at a level.
+#[inline(always)]
+pub(super) fn at_level(pixel: u16, level: usize) -> f32 {
+    (f32::from(pixel) + 0.5) * 0.5f32.powi(level as i32) - 0.5
+}
+
+/// What the pattern around a position of the image looks like.
+#[inline(always)]
+pub(super) fn look_at(image: &SharedImage, u: f32, v: f32, half_weight_gradient: f32) -> Look {
     let reach = CENTRE as f32;
     let inside = |at: f32, side: usize| at >= reach && at < side as f32 - 1.0 - reach;
     if !(inside(u, image.width()) && inside(v, image.height())) {
         return Look::default();
     }
     let around = around(image, u, v);
-    let moved = |(right, down): (i32, i32)| {
-        PATTERN
-            .map(|(du, dv)| around[(CENTRE + dv + down) as usize][(CENTRE + du + right) as usize])
+    let of_pattern = |from: &[f32; AROUND]| {
+        PATTERN.map(|(du, dv)| from[STRIDE * at(CENTRE + dv) + at(CENTRE + du)])
     };
-    let here = moved((0, 0));
+    let here = of_pattern(&around);
     let mean = sum_of_samples(&here) / SAMPLES as f32;
     if !(mean >= DARKEST) {
         return Look::default();
     }
-    let (left, right, up, down) = (moved((-1, 0)), moved((1, 0)), moved((0, -1)), moved((0, 1)));
     let squared = half_weight_gradient * half_weight_gradient;
-    let weight = std::array::from_fn(|k| {
-        let (du, dv) = (0.5 * (right[k] - left[k]), 0.5 * (down[k] - up[k]));
-        squared / (squared + du * du + dv * dv)
-    });
-    Look { shape: here.map(|grey| grey / mean), weight }
+    let mut weights = [0.0; AROUND];
+    for k in STRIDE..AROUND - STRIDE {
+        let du = 0.5 * (around[k + 1] - around[k - 1]);
+        let dv = 0.5 * (around[k + STRIDE] - around[k - STRIDE]);
+        weights[k] = squared / (squared + du * du + dv * dv);
+    }
+    Look { shape: here.map(|grey| grey / mean), weight: of_pattern(&weights) }
 }
 
 /// Pixels that pattern and differences reach to each side.
 const CENTRE: i32 = 3;
 /// As many and the middle.
 const SIDE: usize = 2 * CENTRE as usize + 1;
+/// Pixels of a row that are read: one more, for interpolation; the last of [`around`] is of no use.
+const STRIDE: usize = SIDE + 1;
+/// [`SIDE`] rows of [`STRIDE`].
+const AROUND: usize = SIDE * STRIDE;
 
-/// The bilinear samples around a position that is so many pixels inside, a pixel apart.
-fn around(image: &SharedImage, u: f32, v: f32) -> [[f32; SIDE]; SIDE] {
+const fn at(place: i32) -> usize {
+    place as usize
+}
+
+/// The bilinear samples around a position that is so many pixels inside, a pixel apart: loops over whole squares, which
+/// compilers turn into vector instructions.
+#[inline(always)]
+fn around(image: &SharedImage, u: f32, v: f32) -> [f32; AROUND] {
+    /// One for the right neighbour of the last, which is of no use.
+    const READ: usize = STRIDE * STRIDE + 1;
     let (column, row) = (u as usize, v as usize);
     let (du, dv) = (u - column as f32, v - row as f32);
-    let (left, top) = (column - CENTRE as usize, row - CENTRE as usize);
-    let rows: [[f32; SIDE]; SIDE + 1] = std::array::from_fn(|k| {
-        let of = &image.row(top + k)[left..=left + SIDE];
-        std::array::from_fn(|x| {
-            let (left, right) = (f32::from(of[x]), f32::from(of[x + 1]));
-            left + du * (right - left)
-        })
-    });
-    std::array::from_fn(|y| {
-        std::array::from_fn(|x| {
-            let (upper, lower) = (rows[y][x], rows[y + 1][x]);
-            upper + dv * (lower - upper)
-        })
-    })
+    let (left, top) = (column - at(CENTRE), row - at(CENTRE));
+    let mut grey = [0.0; READ];
+    for (y, to) in grey.chunks_exact_mut(STRIDE).enumerate() {
+        for (to, &of) in to.iter_mut().zip(&image.row(top + y)[left..left + STRIDE]) {
+            *to = f32::from(of);
+        }
+    }
+    let mut rows = [0.0; STRIDE * STRIDE];
+    for k in 0..STRIDE * STRIDE {
+        rows[k] = grey[k] + du * (grey[k + 1] - grey[k]);
+    }
+    std::array::from_fn(|k| rows[k] + dv * (rows[k + STRIDE] - rows[k]))
 }

@@ -29,16 +29,28 @@ pub struct Single {
     pub most: f64,
 }
 
-/// The points, each the mean of itself and its neighbours in the image; `singles` are in their order.
-///
-/// A pixel at an edge of depth, of whose neighbours some are of another surface, is less sure by their share: which of
-/// the surfaces it is of is not known.
-pub fn smoothed(points: &[DepthPoint], singles: &[Single], width: usize) -> Vec<DepthPoint> {
-    let places = Places::new(points, width);
-    let smooth = |(point, single): (&DepthPoint, &Single)| {
+/// Points with what is known of each by itself, in the same order.
+pub struct Neighbourhood<'a> {
+    points: &'a [DepthPoint],
+    singles: &'a [Single],
+    places: Places,
+}
+
+impl<'a> Neighbourhood<'a> {
+    /// Of points in an image of this width.
+    pub fn new(points: &'a [DepthPoint], singles: &'a [Single], width: usize) -> Self {
+        Self { points, singles, places: Places::new(points, width) }
+    }
+
+    /// A point as the mean of itself and its neighbours in the image.
+    ///
+    /// A pixel at an edge of depth, of whose neighbours some are of another surface, is less sure by their share: which of
+    /// the surfaces it is of is not known.
+    pub fn smoothed(&self, place: usize) -> DepthPoint {
+        let (point, single) = (&self.points[place], &self.singles[place]);
         let (mut sum, mut weights, mut others, mut apart) = (0.0, 0.0, 0.0f64, 0.0);
-        for (place, squared_distance) in places.around(point) {
-            let neighbour = &singles[place];
+        for (place, squared_distance) in self.places.around(point) {
+            let neighbour = &self.singles[place];
             let squared = (neighbour.inverse_depth - single.inverse_depth).powi(2);
             let slant = (SLANT * single.inverse_depth).powi(2) * squared_distance;
             let weight = 1.0 / (neighbour.own + slant);
@@ -64,8 +76,7 @@ pub fn smoothed(points: &[DepthPoint], singles: &[Single], width: usize) -> Vec<
             true => DepthPoint { inverse_depth, variance: variance as f32, ..*point },
             false => *point,
         }
-    };
-    points.iter().zip(singles).map(smooth).collect()
+    }
 }
 
 /// Where in a list of points those of a pixel and its neighbours are.
@@ -74,10 +85,14 @@ struct Places {
     places: Vec<u32>,
     stride: usize,
     num_points: u32,
+    /// Of a pixel and its neighbours, row by row: how far they are from the first in `places`, and their squared distance in
+    /// pixels.
+    near: Vec<(usize, f64)>,
 }
 
 impl Places {
     fn new(points: &[DepthPoint], width: usize) -> Self {
+        const SIDE: usize = 2 * REACH_PX + 1;
         let stride = width + 2 * REACH_PX;
         let rows = points.iter().map(|point| usize::from(point.v) + 1 + 2 * REACH_PX).max();
         let rows = rows.unwrap_or_default();
@@ -89,21 +104,21 @@ impl Places {
                 places[row * stride + usize::from(point.u) + REACH_PX] = place;
             }
         }
-        Self { places, stride, num_points }
+        let near = (0..SIDE * SIDE).filter_map(|k| {
+            let (row, column) = (k / SIDE, k % SIDE);
+            let squared = row.abs_diff(REACH_PX).pow(2) + column.abs_diff(REACH_PX).pow(2);
+            (squared <= MAX_SQUARED_DISTANCE).then_some((row * stride + column, squared as f64))
+        });
+        Self { places, stride, num_points, near: near.collect() }
     }
 
     /// Those of a pixel and of its neighbours, with their squared distance in pixels.
     fn around(&self, point: &DepthPoint) -> impl Iterator<Item = (usize, f64)> {
-        const SIDE: usize = 2 * REACH_PX + 1;
         let first = usize::from(point.v) * self.stride + usize::from(point.u);
-        let at = move |k: usize| {
-            let (row, column) = (k / SIDE, k % SIDE);
-            let squared = row.abs_diff(REACH_PX).pow(2) + column.abs_diff(REACH_PX).pow(2);
-            let place = *self.places.get(first + row * self.stride + column)?;
-            let is_near = squared <= MAX_SQUARED_DISTANCE && place < self.num_points;
-            is_near.then_some((place as usize, squared as f64))
-        };
-        (0..SIDE * SIDE).filter_map(at)
+        self.near.iter().filter_map(move |&(offset, squared)| {
+            let place = *self.places.get(first + offset)?;
+            (place < self.num_points).then_some((place as usize, squared))
+        })
     }
 }
 
@@ -135,6 +150,11 @@ mod tests {
             Single { inverse_depth, own: 1e-4, common: 1e-6, most: 1.01e-4 }
         });
         (points.collect(), singles.collect())
+    }
+
+    fn smoothed(points: &[DepthPoint], singles: &[Single], width: usize) -> Vec<DepthPoint> {
+        let neighbourhood = Neighbourhood::new(points, singles, width);
+        (0..points.len()).map(|place| neighbourhood.smoothed(place)).collect()
     }
 
     fn rms(points: &[DepthPoint], of: impl Fn(&DepthPoint) -> f64) -> f64 {
