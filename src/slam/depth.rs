@@ -11,6 +11,7 @@ pub mod epipolar;
 pub(crate) mod gain;
 pub mod gaussian;
 pub mod gradient_image;
+pub mod hypotheses;
 pub mod immature;
 pub mod interval;
 pub mod line_noise;

@@ -140,12 +140,10 @@ impl SampledDepth {
         let known = map.num_hypotheses();
         let step = known.div_ceil(ROW_STEP * MAX_SAMPLES).max(1);
         let image = &map.image;
-        let mut count = 0;
+        let (mut count, mut memory) = (0, Vec::new());
         for v in (ROW_STEP / 2..image.height()).step_by(ROW_STEP) {
-            for (u, hypothesis) in map.hypotheses.row(v).iter().enumerate() {
-                if !hypothesis.is_some() {
-                    continue;
-                }
+            let row = map.hypotheses.row(v);
+            for u in map.hypotheses.known_columns(v, &mut memory).iter().map(|&u| usize::from(u)) {
                 count += 1;
                 if count % step != 0 {
                     continue;
@@ -154,7 +152,7 @@ impl SampledDepth {
                 let index = v * image.width() + u;
                 let (gu, gv) = image.gradient(index);
                 let gradient = [f64::from(gu) * intrinsics.fx, f64::from(gv) * intrinsics.fy];
-                self.samples.push(Sample { index, ray, gradient, before: *hypothesis });
+                self.samples.push(Sample { index, ray, gradient, before: row[u] });
             }
         }
     }

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::slam::depth::epipolar::{EpipolarLine, Projection, TwoView};
 use crate::slam::depth::gain::{Gain, Uncertainty};
 use crate::slam::depth::gradient_image::{BORDER_PX, GradientImage};
+use crate::slam::depth::hypotheses::{ChangedColumns, ListedRow};
 use crate::slam::depth::line_noise::Innovations;
 use crate::slam::depth::map::{DepthMap, Hypothesis};
 use crate::slam::depth::matching::{
@@ -163,7 +164,6 @@ pub fn observe(
     matching: &MatchingParams,
     params: &GaussianParams,
 ) -> Observation {
-    let (width, height) = (map.image.width(), map.image.height());
     let pixel = PixelObserver {
         image: &map.image,
         candidates: &map.candidates,
@@ -176,10 +176,8 @@ pub fn observe(
     };
     let kernel = Kernel::fastest();
     map.hypotheses
-        .pixels_mut()
-        .par_chunks_exact_mut(width)
+        .observed_rows()
         .enumerate()
-        .filter(|(v, _)| (BORDER_PX..height - BORDER_PX).contains(v))
         .map(|(v, row)| kernel.run(ObservedRow { pixel: &pixel, row, v }))
         .reduce(Observation::default, Observation::plus)
 }
@@ -188,9 +186,6 @@ pub fn observe(
 pub const PROBE_STEP: usize = 32;
 /// Columns by which the probed pixels of a row are displaced against those of the row above: no column has all.
 const PROBE_ROW_SHIFT: usize = 11;
-
-/// Columns that are listed at a time, on the stack.
-const BLOCK: usize = 512;
 
 /// Everything that the observation of a pixel needs.
 struct PixelObserver<'a> {
@@ -207,7 +202,7 @@ struct PixelObserver<'a> {
 /// A row of the map whose pixels are observed.
 struct ObservedRow<'a> {
     pixel: &'a PixelObserver<'a>,
-    row: &'a mut [Hypothesis],
+    row: ListedRow<'a>,
     v: usize,
 }
 
@@ -223,30 +218,39 @@ impl Body for ObservedRow<'_> {
 impl PixelObserver<'_> {
     /// Observes the pixels of row `v`.
     #[inline(always)]
-    fn observe_row<S: Sampler>(&self, sampler: S, row: &mut [Hypothesis], v: usize) -> Observation {
+    fn observe_row<S: Sampler>(&self, sampler: S, row: ListedRow<'_>, v: usize) -> Observation {
         let mut seen = Observation::default();
+        let ListedRow { hypotheses: row, mut lists } = row;
         let candidates = self.candidates.row(v);
+        lists.fill(row, candidates);
+        if !(BORDER_PX..self.image.height() - BORDER_PX).contains(&v) {
+            return seen;
+        }
+        let mut changed = ChangedColumns::none();
         let skips_propagated = self.observer.pixels == ObservedPixels::New;
-        let creates = self.observer.pixels != ObservedPixels::Known;
-        let (mut known, mut unknown) = ([0u16; BLOCK], [0u16; BLOCK]);
-        for first in (BORDER_PX..row.len() - BORDER_PX).step_by(BLOCK) {
-            let (mut num_known, mut num_unknown) = (0, 0);
-            // Lists without branches: what comes next can hardly be guessed.
-            for u in first..(first + BLOCK).min(row.len() - BORDER_PX) {
-                let (hypothesis, is_some) = (&row[u], row[u].is_some());
-                (known[num_known], unknown[num_unknown]) = (u as u16, u as u16);
-                num_known += usize::from(is_some & !(skips_propagated & hypothesis.propagated));
-                num_unknown += usize::from(!is_some & candidates[u] & creates);
-            }
-            for columns in known[..num_known].chunks(LANES) {
-                self.update_promising(sampler, row, columns, v, &mut seen);
-            }
-            for &u in &unknown[..num_unknown] {
-                let u = usize::from(u);
+        for columns in self.inside(lists.known()).chunks(LANES) {
+            self.update_promising(sampler, row, columns, v, skips_propagated, &mut seen);
+            let gone = columns.iter().filter(|&&u| !row[usize::from(u)].is_some());
+            gone.for_each(|&u| changed.push(u));
+        }
+        if self.observer.pixels != ObservedPixels::Known {
+            for &column in self.inside(lists.unknown()) {
+                let u = usize::from(column);
                 self.create(sampler, &mut row[u], u, v, &mut seen.counts);
+                if row[u].is_some() {
+                    changed.push(column);
+                }
             }
         }
+        lists.note(&changed, row, candidates);
         seen
+    }
+
+    /// Those of ascending columns that are far enough from the border.
+    fn inside<'a>(&self, columns: &'a [u16]) -> &'a [u16] {
+        let end = self.image.width() - BORDER_PX;
+        let before = |bound: usize| columns.partition_point(|&u| usize::from(u) < bound);
+        &columns[before(BORDER_PX)..before(end)]
     }
 
     /// Updates those of the `columns` of row `v`, at most [`LANES`], whose match promises something.
@@ -257,6 +261,7 @@ impl PixelObserver<'_> {
         row: &mut [Hypothesis],
         columns: &[u16],
         v: usize,
+        skips_propagated: bool,
         seen: &mut Observation,
     ) {
         let mut pixels = PixelLanes::default();
@@ -277,6 +282,9 @@ impl PixelObserver<'_> {
         let promises = promises(&pixels, v as f32, view, size, self.gain, enough, self.matching);
         for (&u, &promises) in columns.iter().zip(&promises) {
             let u = usize::from(u);
+            if skips_propagated && row[u].propagated {
+                continue;
+            }
             if promises {
                 self.update(sampler, &mut row[u], u, v, seen);
             } else if (u + PROBE_ROW_SHIFT * v).is_multiple_of(PROBE_STEP) {

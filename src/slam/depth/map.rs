@@ -3,90 +3,11 @@
 
 use rayon::prelude::*;
 
-use crate::slam::depth::gain::Uncertainty;
 use crate::slam::depth::gradient_image::{BAND_ROWS, BORDER_PX, GradientImage};
+use crate::slam::depth::hypotheses::Hypotheses;
+pub use crate::slam::depth::hypotheses::Hypothesis;
 use crate::slam::depth::pattern::PATTERN;
 use crate::slam::image::buffer::Image;
-
-/// A Gaussian hypothesis on the inverse depth of a pixel.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Hypothesis {
-    /// Inverse depth as filtered from observations, 1/keyframe units.
-    pub inverse_depth: f32,
-    /// Its variance; negative where the pixel has no hypothesis.
-    pub variance: f32,
-    /// The part of `variance` that differs from one observation to the next; the rest is common to all.
-    pub independent: f32,
-    /// Inverse depth smoothed over consistent neighbours: what is published and searched around.
-    pub smoothed: f32,
-    /// How often it was confirmed less how often it failed; at 0 it is dropped.
-    pub validity: u8,
-    /// Whether it holds what earlier frames say: those of the keyframe before, or the two of a start.
-    pub propagated: bool,
-    /// Failures of a pixel without hypothesis: it is tried less often the more it failed.
-    pub failures: u8,
-}
-
-impl Hypothesis {
-    /// No hypothesis.
-    pub const NONE: Self = Self {
-        inverse_depth: 0.0,
-        variance: -1.0,
-        independent: 0.0,
-        smoothed: 0.0,
-        validity: 0,
-        propagated: false,
-        failures: 0,
-    };
-
-    /// Whether there is a hypothesis.
-    #[inline]
-    pub fn is_some(&self) -> bool {
-        self.variance >= 0.0
-    }
-
-    /// How uncertain it is.
-    #[inline(always)]
-    pub fn uncertainty(&self) -> Uncertainty {
-        Uncertainty { variance: self.variance, independent: self.independent }
-    }
-
-    /// Removes the hypothesis and remembers that this pixel failed.
-    #[inline]
-    pub fn reject(&mut self) {
-        *self = Self { failures: self.failures.saturating_add(1), ..Self::NONE };
-    }
-}
-
-/// Columns that are listed at a time, on the stack.
-const LISTED_COLUMNS: usize = 512;
-
-/// Room for a list of columns.
-pub(in crate::slam) struct KnownColumns([u16; LISTED_COLUMNS]);
-
-impl Default for KnownColumns {
-    fn default() -> Self {
-        Self([0; LISTED_COLUMNS])
-    }
-}
-
-/// Gives the columns of `row` that have a hypothesis, ascending, some hundred at a time. Listed without
-/// branches: what comes next can hardly be guessed.
-#[inline(always)]
-pub(in crate::slam) fn for_each_known(
-    row: &[Hypothesis],
-    KnownColumns(columns): &mut KnownColumns,
-    mut take: impl FnMut(&[u16]),
-) {
-    for (block, hypotheses) in row.chunks(LISTED_COLUMNS).enumerate() {
-        let mut known = 0;
-        for (k, hypothesis) in hypotheses.iter().enumerate() {
-            columns[known] = (block * LISTED_COLUMNS + k) as u16;
-            known += usize::from(hypothesis.is_some());
-        }
-        take(&columns[..known]);
-    }
-}
 
 /// Largest ‖g‖ of an 8-bit image: ½·255 in both directions.
 const MAX_GRADIENT: f32 = 181.0;
@@ -123,7 +44,7 @@ pub struct DepthMap {
     /// The keyframe's image.
     pub image: GradientImage,
     /// A hypothesis a pixel.
-    pub hypotheses: Image<Hypothesis>,
+    pub hypotheses: Hypotheses,
     /// Whether a pixel has enough gradient to carry depth.
     pub candidates: Image<bool>,
     /// Σ (g_u², g_u g_v, g_v²) over the matching pattern around each candidate and each hypothesis that was restored; of
@@ -141,7 +62,7 @@ impl DepthMap {
     pub fn with_size(width: usize, height: usize) -> Self {
         Self {
             image: GradientImage::with_size(width, height),
-            hypotheses: Image::filled(width, height, Hypothesis::NONE),
+            hypotheses: Hypotheses::none(width, height),
             candidates: Image::filled(width, height, false),
             structure: Image::filled(width, height, [0.0; 3]),
             reprojected: Vec::new(),
@@ -255,18 +176,18 @@ impl DepthMap {
 
     /// Number of hypotheses.
     pub fn num_hypotheses(&self) -> usize {
-        self.hypotheses.pixels().iter().map(|h| usize::from(h.is_some())).sum()
+        self.hypotheses.count()
     }
 
     /// Mean smoothed inverse depth of the hypotheses; `None` without any.
     pub fn mean_inverse_depth(&self) -> Option<f64> {
         let (mut sum, mut count) = (0.0, 0usize);
-        let mut columns = KnownColumns::default();
-        for row in self.hypotheses.pixels().chunks_exact(self.image.width().max(1)) {
-            for_each_known(row, &mut columns, |known| {
-                count += known.len();
-                known.iter().for_each(|&u| sum += f64::from(row[usize::from(u)].smoothed));
-            });
+        let mut memory = Vec::new();
+        for v in 0..self.image.height() {
+            let (row, known) =
+                (self.hypotheses.row(v), self.hypotheses.known_columns(v, &mut memory));
+            count += known.len();
+            known.iter().for_each(|&u| sum += f64::from(row[usize::from(u)].smoothed));
         }
         (count > 0).then(|| sum / count as f64)
     }
@@ -294,6 +215,7 @@ impl DepthMap {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::slam::depth::gain::Uncertainty;
 
     #[test]
     fn black_and_white_pixels_and_their_neighbours_carry_no_depth() {

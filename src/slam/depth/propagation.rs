@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::epipolar::{MIN_DEPTH_RATIO, TwoView};
 use crate::slam::depth::gradient_image::{BAND_ROWS, BORDER_PX};
-use crate::slam::depth::map::{DepthMap, Hypothesis, KnownColumns, Reprojected, for_each_known};
+use crate::slam::depth::map::{DepthMap, Hypothesis, Reprojected};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::kernel::{Body, Instructions, Kernel};
@@ -140,24 +140,23 @@ impl Body for CarriedRows<'_> {
 impl Reprojection<'_> {
     #[inline(always)]
     fn carry_rows(&self, rows: Range<usize>, reprojected: &mut Vec<Reprojected>) {
-        let mut columns = KnownColumns::default();
+        let mut memory = Vec::new();
         for v in rows {
             let hypotheses = self.source.hypotheses.row(v);
-            for_each_known(hypotheses, &mut columns, |known| {
-                for columns in known.chunks(LANES) {
-                    let places = self.project(hypotheses, columns, v);
-                    let inside = columns.iter().enumerate().filter(|(k, _)| places.inside[*k]);
-                    reprojected.extend(inside.filter_map(|(k, &u)| {
-                        let u = usize::from(u);
-                        self.arrive(
-                            &hypotheses[u],
-                            f32::from(self.source.image.intensity.at(u, v)),
-                            &places,
-                            k,
-                        )
-                    }));
-                }
-            });
+            let known = self.source.hypotheses.known_columns(v, &mut memory);
+            for columns in known.chunks(LANES) {
+                let places = self.project(hypotheses, columns, v);
+                let inside = columns.iter().enumerate().filter(|(k, _)| places.inside[*k]);
+                reprojected.extend(inside.filter_map(|(k, &u)| {
+                    let u = usize::from(u);
+                    self.arrive(
+                        &hypotheses[u],
+                        f32::from(self.source.image.intensity.at(u, v)),
+                        &places,
+                        k,
+                    )
+                }));
+            }
         }
     }
 

@@ -1,7 +1,7 @@
 //! The depth of the active keyframe while it is estimated, and the memory for the next.
 
 use crate::slam::depth::interval::IntervalFilter;
-use crate::slam::depth::map::{DepthMap, KnownColumns, for_each_known};
+use crate::slam::depth::map::DepthMap;
 use crate::slam::depth::regularisation::{RegularisationScratch, regularise};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::image::buffer::Image;
@@ -57,10 +57,11 @@ impl DepthBuffers {
     }
 
     /// The active depth becomes the spare one, and the other way round. `structure` stays with the active one, still that of
-    /// the image before: the active depth is restarted before it is observed, or swapped back.
+    /// the image before: the active depth is restarted before it is observed, or swapped back. So does the memory of lists.
     pub(super) fn swap(&mut self) {
         std::mem::swap(&mut self.active, &mut self.spare);
         std::mem::swap(&mut self.active.structure, &mut self.spare.structure);
+        self.active.hypotheses.take_lists(&mut self.spare.hypotheses);
     }
 
     /// Chooses the points that the interval filter traces.
@@ -136,17 +137,16 @@ pub(super) fn write_depth(depth: &DepthMap, unit: f64, keyframe: &mut Keyframe) 
     keyframe.points.reserve_exact(depth.num_hypotheses().min(MAX_KEYFRAME_POINTS));
     let image = &depth.image.intensity;
     let inverse_unit = (1.0 / unit) as f32;
-    let mut columns = KnownColumns::default();
+    let mut memory = Vec::new();
     for v in 0..image.height() {
         let (row, intensities) = (depth.hypotheses.row(v), image.row(v));
-        for_each_known(row, &mut columns, |known| {
-            keyframe.points.extend(known.iter().map(|&u| {
-                let (h, intensity) = (&row[usize::from(u)], f32::from(intensities[usize::from(u)]));
-                let inverse_depth = h.smoothed * inverse_unit;
-                let variance = h.variance * (inverse_unit * inverse_unit);
-                DepthPoint { u, v: v as u16, inverse_depth, variance, intensity }
-            }));
-        });
+        let known = depth.hypotheses.known_columns(v, &mut memory);
+        keyframe.points.extend(known.iter().map(|&u| {
+            let (h, intensity) = (&row[usize::from(u)], f32::from(intensities[usize::from(u)]));
+            let inverse_depth = h.smoothed * inverse_unit;
+            let variance = h.variance * (inverse_unit * inverse_unit);
+            DepthPoint { u, v: v as u16, inverse_depth, variance, intensity }
+        }));
     }
     keyframe.points.retain(|point| point.inverse_depth > 0.0);
     keyframe.points.truncate(MAX_KEYFRAME_POINTS);
