@@ -5,6 +5,10 @@ use crate::slam::image::quads_kernel::{Sampled, Sampler};
 
 /// Most places of one search: bounds the time a pixel can take.
 pub const MAX_STEPS: usize = 100;
+/// Costs that are compared at a time.
+const LANES: usize = 8;
+/// Room for their costs and those that belong to the last.
+const MOST_COSTS: usize = (MAX_STEPS + 2).next_multiple_of(LANES);
 
 /// Residuals beyond this many grey levels grow linearly (Engel, Koltun, Cremers 2018).
 const HUBER_GREY: f32 = 9.0;
@@ -53,23 +57,19 @@ impl<S: Sampler> Along<'_, S> {
     pub(super) fn scan(&self, first: f32, steps: usize) -> Best {
         /// Steps this near to the minimum belong to it.
         const SAME_MINIMUM_STEPS: usize = 2;
-        let mut seen = [0.0; 8];
-        let mut costs = [f32::INFINITY; MAX_STEPS];
-        let mut best = 0;
-        for step in 0..=steps {
-            let samples = self.look(first + step as f32);
-            costs[step] = self.cost(&samples);
-            if costs[step] < costs[best] || step == 0 {
-                (best, seen) = (step, samples);
-            }
+        let mut costs = [f32::INFINITY; MOST_COSTS];
+        for (step, cost) in costs[..=steps].iter_mut().enumerate() {
+            *cost = self.cost(&self.look(first + step as f32));
         }
-        let mut second = f32::INFINITY;
-        for (step, &cost) in costs[..=steps].iter().enumerate() {
-            if step.abs_diff(best) > SAME_MINIMUM_STEPS {
-                second = second.min(cost);
-            }
-        }
-        Best { lambda: first + best as f32, seen, cost: costs[best], second }
+        // What is least of all is looked for afterwards: on the way nobody can guess which step it will be.
+        let padded = (steps + 1).next_multiple_of(LANES);
+        let least = least(&costs[..padded]);
+        let best = costs[..=steps].iter().position(|&cost| cost == least).unwrap_or(0);
+        let lambda = first + best as f32;
+        let cost = costs[best];
+        costs[best.saturating_sub(SAME_MINIMUM_STEPS)..=best + SAME_MINIMUM_STEPS]
+            .fill(f32::INFINITY);
+        Best { lambda, seen: self.look(lambda), cost, second: self::least(&costs[..padded]) }
     }
 
     /// Gauss–Newton along the line from `best`, each step clamped, undone when the cost rises: where it ends and the cost
@@ -149,6 +149,19 @@ impl<S: Sampler> Along<'_, S> {
         }
         Slope { gradient: sum(&gradients), information: sum(&informations) }
     }
+}
+
+/// The least of some costs, whole registers of them; infinite where none is a number.
+#[inline(always)]
+fn least(costs: &[f32]) -> f32 {
+    let lower = |one: f32, other: f32| if other < one { other } else { one };
+    let mut least = [f32::INFINITY; LANES];
+    for costs in costs.chunks_exact(LANES) {
+        for (least, &cost) in least.iter_mut().zip(costs) {
+            *least = lower(*least, cost);
+        }
+    }
+    least.into_iter().fold(f32::INFINITY, lower)
 }
 
 /// Huber's: 1 up to the bound, without a branch, so that the lanes go together.
