@@ -19,6 +19,7 @@ pub(crate) mod line_search;
 pub mod map;
 pub mod matching;
 mod neighbour_sums;
+mod patch_kernel;
 pub(crate) mod pattern;
 pub mod pose_noise;
 pub(crate) mod promise;

@@ -16,7 +16,7 @@ use crate::slam::depth::matching::{
 use crate::slam::depth::promise::{LANES, PixelLanes, promises};
 use crate::slam::image::buffer::Image;
 use crate::slam::image::quads::QuadImage;
-use crate::slam::image::quads_kernel::{Sampled, Sampler};
+use crate::slam::image::quads_kernel::Sampled;
 use crate::slam::kernel::{Body, Instructions, Kernel};
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::Brightness;
@@ -218,7 +218,12 @@ impl Body for ObservedRow<'_> {
 impl PixelObserver<'_> {
     /// Observes the pixels of row `v`.
     #[inline(always)]
-    fn observe_row<S: Sampler>(&self, sampler: S, row: ListedRow<'_>, v: usize) -> Observation {
+    fn observe_row<S: Instructions>(
+        &self,
+        sampler: S,
+        row: ListedRow<'_>,
+        v: usize,
+    ) -> Observation {
         let mut seen = Observation::default();
         let ListedRow { hypotheses: row, mut lists } = row;
         let candidates = self.candidates.row(v);
@@ -255,7 +260,7 @@ impl PixelObserver<'_> {
 
     /// Updates those of the `columns` of row `v`, at most [`LANES`], whose match promises something.
     #[inline(always)]
-    fn update_promising<S: Sampler>(
+    fn update_promising<S: Instructions>(
         &self,
         sampler: S,
         row: &mut [Hypothesis],
@@ -314,7 +319,7 @@ impl PixelObserver<'_> {
 
     /// Observes a pixel that has a hypothesis.
     #[inline(always)]
-    fn update<S: Sampler>(
+    fn update<S: Instructions>(
         &self,
         sampler: S,
         hypothesis: &mut Hypothesis,
@@ -367,7 +372,7 @@ impl PixelObserver<'_> {
 
     /// Whether a hypothesis holds in the frame; it is not changed.
     #[inline(always)]
-    fn probe<S: Sampler>(
+    fn probe<S: Instructions>(
         &self,
         sampler: S,
         hypothesis: &Hypothesis,
@@ -429,7 +434,7 @@ impl PixelObserver<'_> {
 
     /// Tries to give a pixel its first hypothesis, searching all depths.
     #[inline(always)]
-    fn create<S: Sampler>(
+    fn create<S: Instructions>(
         &self,
         sampler: S,
         hypothesis: &mut Hypothesis,

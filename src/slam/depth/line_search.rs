@@ -1,7 +1,9 @@
 //! The search for a patch along a line of a frame: 1-px steps, then Gauss–Newton. Both filters search this way.
 
+use crate::slam::depth::patch_kernel::PatchSums;
 use crate::slam::depth::pattern::PATTERN;
 use crate::slam::image::quads_kernel::{Sampled, Sampler};
+use crate::slam::kernel::Instructions;
 
 /// Most places of one search: bounds the time a pixel can take.
 pub const MAX_STEPS: usize = 100;
@@ -9,9 +11,6 @@ pub const MAX_STEPS: usize = 100;
 const LANES: usize = 8;
 /// Room for their costs and those that belong to the last.
 const MOST_COSTS: usize = (MAX_STEPS + 2).next_multiple_of(LANES);
-
-/// Residuals beyond this many grey levels grow linearly (Engel, Koltun, Cremers 2018).
-const HUBER_GREY: f32 = 9.0;
 
 /// The patch as a function of its place λ along the line, pixels from where λ is 0.
 pub(super) struct Along<'a, S> {
@@ -30,21 +29,13 @@ pub(super) struct Best {
     pub(super) lambda: f32,
     /// What the frame looks like there: kept for the refinement.
     pub(super) seen: [f32; 8],
-    /// Σ ρ(residual) there, ρ(r) = r² up to [`HUBER_GREY`], linear beyond.
+    /// Σ ρ(residual) there, Huber's ρ.
     pub(super) cost: f32,
     /// The least that does not belong to the same minimum.
     pub(super) second: f32,
 }
 
-/// The slope of the cost at one place.
-struct Slope {
-    /// Half its derivative by λ.
-    gradient: f32,
-    /// Gauss–Newton's half second derivative.
-    information: f32,
-}
-
-impl<S: Sampler> Along<'_, S> {
+impl<S: Instructions> Along<'_, S> {
     /// The place λ alone.
     #[inline(always)]
     pub(super) fn only(&self, lambda: f32) -> Best {
@@ -90,8 +81,9 @@ impl<S: Sampler> Along<'_, S> {
         let start = best.lambda;
         let (mut lambda, mut cost, mut seen) = (start, best.cost, best.seen);
         for _ in 0..MAX_ITERATIONS {
-            let at = self.slope(&seen, &gradients_at(lambda));
-            let step = -at.gradient / (at.information + LEAST_INFORMATION);
+            let [gradient, information] =
+                self.frame.sampler.slope(&seen, self.intensity, &gradients_at(lambda));
+            let step = -gradient / (information + LEAST_INFORMATION);
             let next = (lambda + step.clamp(-MAX_STEP_PX, MAX_STEP_PX))
                 .clamp(start - reach, start + reach);
             let moved = (next - lambda).abs();
@@ -129,25 +121,7 @@ impl<S: Sampler> Along<'_, S> {
 
     #[inline(always)]
     fn cost(&self, samples: &[f32; 8]) -> f32 {
-        let mut costs = [0.0; 8];
-        for k in 0..PATTERN.len() {
-            let residual = samples[k] - self.intensity[k];
-            let weight = weight(residual);
-            costs[k] = weight * (2.0 - weight) * residual * residual;
-        }
-        sum(&costs)
-    }
-
-    #[inline(always)]
-    fn slope(&self, samples: &[f32; 8], line_gradients: &[f32; 8]) -> Slope {
-        let (mut gradients, mut informations) = ([0.0; 8], [0.0; 8]);
-        for k in 0..PATTERN.len() {
-            let residual = samples[k] - self.intensity[k];
-            let weight = weight(residual);
-            gradients[k] = weight * line_gradients[k] * residual;
-            informations[k] = weight * line_gradients[k] * line_gradients[k];
-        }
-        Slope { gradient: sum(&gradients), information: sum(&informations) }
+        self.frame.sampler.cost(samples, self.intensity)
     }
 }
 
@@ -162,16 +136,4 @@ fn least(costs: &[f32]) -> f32 {
         }
     }
     least.into_iter().fold(f32::INFINITY, lower)
-}
-
-/// Huber's: 1 up to the bound, without a branch, so that the lanes go together.
-#[inline(always)]
-fn weight(residual: f32) -> f32 {
-    HUBER_GREY / residual.abs().max(HUBER_GREY)
-}
-
-/// Sum in a fixed order that eight lanes can do.
-#[inline(always)]
-pub(super) fn sum(x: &[f32; 8]) -> f32 {
-    ((x[0] + x[4]) + (x[2] + x[6])) + ((x[1] + x[5]) + (x[3] + x[7]))
 }

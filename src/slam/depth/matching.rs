@@ -12,7 +12,8 @@ use crate::slam::depth::gradient_image::{BORDER_PX, GradientImage};
 use crate::slam::depth::line_search::{Along, MAX_STEPS};
 use crate::slam::depth::pattern::PATTERN;
 use crate::slam::image::noise::ImageNoise;
-use crate::slam::image::quads_kernel::{Sampled, Sampler};
+use crate::slam::image::quads_kernel::Sampled;
+use crate::slam::kernel::Instructions;
 use crate::slam::parameter::{ParameterError, check_range};
 
 /// Tuning of the search.
@@ -305,7 +306,7 @@ impl Conditioning {
 
 /// Searches between the projections `from` and `to`; a segment below a pixel is only refined.
 #[inline(always)]
-pub fn search<S: Sampler>(
+pub fn search<S: Instructions>(
     frame: Sampled<'_, S>,
     line: &EpipolarLine,
     patch: &Patch,
@@ -358,7 +359,7 @@ pub fn search<S: Sampler>(
 
 /// The patch of a keyframe pixel in a frame, from `middle` along its line.
 #[inline(always)]
-fn along<'a, S: Sampler>(
+fn along<'a, S: Instructions>(
     frame: Sampled<'a, S>,
     patch: &'a Patch,
     conditioning: &Conditioning,
