@@ -44,9 +44,9 @@ impl SharedImage {
         for (v, row) in pixels.chunks_exact_mut(width.max(1)).enumerate() {
             let (upper, lower) = (self.row(2 * v), self.row(2 * v + 1));
             let pairs = upper.as_chunks::<2>().0.iter().zip(lower.as_chunks::<2>().0);
-            for (mean, (upper, lower)) in row.iter_mut().zip(pairs) {
-                let sum: u16 = upper.iter().chain(lower).map(|&grey| u16::from(grey)).sum();
-                *mean = ((sum + 2) / 4) as u8;
+            for (mean, (&upper, &lower)) in row.iter_mut().zip(pairs) {
+                let [[a, b], [c, d]] = [upper, lower].map(|pair| pair.map(u16::from));
+                *mean = ((a + b + c + d + 2) / 4) as u8;
             }
         }
         Self { width, height, pixels: pixels.into() }

@@ -349,6 +349,9 @@ impl PatternSums {
     #[inline(always)]
     fn clear_hidden(&mut self, patch: &PatchBlock) {
         let visible = self.visible;
+        if visible == [true; LANES] {
+            return;
+        }
         let groups = [&mut self.squares[..], &mut self.by_u, &mut self.by_v];
         let groups = groups.into_iter().chain([&mut self.by_brightness[..], &mut self.residuals]);
         for sum in groups.flatten() {
