@@ -28,7 +28,7 @@ use crate::slam::window::plane::fit;
 /// redkitchen's depth is no better.
 const OBSERVERS: usize = 4;
 /// Levels, and steps on each. Without level 1 the floor's median error is 2.2 % instead of 1.7.
-const STEPS: [(usize, u32); 2] = [(1, 3), (0, 4)];
+const STEPS: [(usize, u32); 2] = [(1, 3), (0, 3)];
 /// Points that are compared at a time: they stay in the cache.
 const CHUNK: usize = 16 * LANES;
 /// Largest factor by which a step may change a depth, either way: further the linearisation says nothing.
