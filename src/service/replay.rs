@@ -250,7 +250,7 @@ impl<'a> Replay<'a> {
                 ..RunRecord::empty(RunMode::Replay, source_name)
             },
             adjustments: Adjustments::start(
-                Entry::AfterFrames(config.mapper.window.delay_frames as u64),
+                Entry::AfterFrames(config.mapper.window.delay()),
                 Background::Other,
             )
             .map_err(ReplayError::Thread)?,

@@ -86,6 +86,11 @@ impl Walk {
     }
 }
 
+/// An estimate enters so many frames after it began.
+pub(super) fn after_frames(frames: u64) -> Entry {
+    Entry::AfterFrames(Delay { least: frames, most: frames })
+}
+
 pub(super) fn start(entry: Entry, optimise: Optimise) -> Adjustments {
     Adjustments::start_with(entry, Background::Other, optimise).unwrap()
 }
@@ -115,7 +120,7 @@ fn an_estimate_enters_at_its_frame_however_long_it_took() {
             std::thread::sleep(pause);
             window.optimise()
         };
-        let mut adjustments = start(Entry::AfterFrames(2), Box::new(optimise));
+        let mut adjustments = start(after_frames(2), Box::new(optimise));
         let mut walk = Walk::new();
         let mut records = Vec::new();
         for _ in 0..14 {
@@ -136,7 +141,7 @@ fn an_estimate_enters_at_its_frame_however_long_it_took() {
 
 #[test]
 fn with_no_delay_an_estimate_enters_with_its_own_frame() {
-    let mut adjustments = start(Entry::AfterFrames(0), Box::new(Window::optimise));
+    let mut adjustments = start(after_frames(0), Box::new(Window::optimise));
     let mut walk = Walk::new();
     let outcomes: Vec<bool> = (0..6).map(|_| walk.go(&mut adjustments).keyframe_changed).collect();
     assert_eq!(outcomes, [false, false, false, false, true, false]);
@@ -174,7 +179,7 @@ fn the_checkpoint_has_the_correction_and_the_depth_that_goes_with_it() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("rig.checkpoint");
     let (Some(mut kept), None) = Kept::open(&path) else { panic!("an empty folder") };
-    let mut adjustments = start(Entry::AfterFrames(2), Box::new(Window::optimise));
+    let mut adjustments = start(after_frames(2), Box::new(Window::optimise));
     let mut walk = Walk::new();
     for _ in 0..=10 {
         let sequence = walk.frames;
@@ -201,7 +206,7 @@ fn the_checkpoint_has_the_correction_and_the_depth_that_goes_with_it() {
 
 #[test]
 fn an_estimate_of_a_map_that_was_corrected_meanwhile_is_dropped() {
-    let mut adjustments = start(Entry::AfterFrames(2), Box::new(Window::optimise));
+    let mut adjustments = start(after_frames(2), Box::new(Window::optimise));
     let mut walk = Walk::new();
     for _ in 0..=4 {
         walk.go(&mut adjustments);
@@ -230,7 +235,7 @@ fn an_estimate_of_a_map_that_was_corrected_meanwhile_is_dropped() {
 
 #[test]
 fn an_estimate_for_a_camera_that_is_gone_is_dropped() {
-    let mut adjustments = start(Entry::AfterFrames(2), Box::new(Window::optimise));
+    let mut adjustments = start(after_frames(2), Box::new(Window::optimise));
     let mut walk = Walk::new();
     for _ in 0..=4 {
         walk.go(&mut adjustments);
@@ -247,7 +252,7 @@ fn an_estimate_for_a_camera_that_is_gone_is_dropped() {
 #[test]
 fn a_panic_is_said_once_and_mapping_continues() {
     let panics = |_: &mut Window| -> Option<Adjustment> { panic!("a broken estimate") };
-    for entry in [Entry::AfterFrames(1), Entry::WhenReady] {
+    for entry in [after_frames(1), Entry::WhenReady] {
         let mut adjustments = start(entry, Box::new(panics));
         let mut walk = Walk::new();
         let mut failures = Vec::new();
@@ -266,7 +271,7 @@ fn a_panic_is_said_once_and_mapping_continues() {
 #[test]
 fn the_last_keyframe_is_estimated_before_the_end() {
     // The estimate before it is still away then.
-    for entry in [Entry::AfterFrames(6), Entry::WhenReady] {
+    for entry in [after_frames(6), Entry::WhenReady] {
         let pauses = |window: &mut Window| {
             std::thread::sleep(Duration::from_millis(200));
             window.optimise()
