@@ -346,20 +346,30 @@ impl Window {
     }
 
     fn adjust(&mut self, chosen: &Chosen) -> Option<Adjustment> {
+        let iterations = match chosen.is_first {
+            true => self.params.max_first_iterations,
+            false => self.params.max_iterations,
+        };
+        self.adjust_on(chosen, &ADJUSTED_LEVELS, iterations)
+    }
+
+    /// The same on some levels, with at most so many iterations on each.
+    fn adjust_on(
+        &mut self,
+        chosen: &Chosen,
+        levels: &[usize],
+        iterations: u32,
+    ) -> Option<Adjustment> {
         let num_free = chosen.free.iter().flatten().count();
         if num_free == 0 {
             return None;
         }
         let members =
             Members { members: &chosen.members, free: &chosen.free, depths_are_free: true };
-        let iterations = match chosen.is_first {
-            true => self.params.max_first_iterations,
-            false => self.params.max_iterations,
-        };
         self.thin_out(&chosen.members);
         self.solver.iterations = 0;
         let unit = Unit::of(&self.keyframes, &members);
-        if !self.run(&members, &ADJUSTED_LEVELS, iterations, |_, _| true) {
+        if !self.run(&members, levels, iterations, |_, _| true) {
             return None;
         }
         self.note_agreement(&chosen.members);

@@ -11,6 +11,10 @@ const PIECE: usize = 40;
 const STEP: usize = 20;
 /// Newest keyframes that are estimated once more: six pieces take a few seconds.
 pub(super) const MOST: usize = 120;
+/// Levels that all are estimated on once more: they are within a pixel or two already.
+const LEVELS: [usize; 2] = [1, 0];
+/// Most iterations of a level. Beyond the tenth the cost falls by what interpolation makes of it and nothing else changes.
+const MAX_ITERATIONS: u32 = 15;
 
 impl Window {
     /// Estimates all keyframes of the newest one's epoch, piece by piece.
@@ -21,7 +25,7 @@ impl Window {
         loop {
             let end = (begin + PIECE).min(of_epoch.len());
             let chosen = self.choose_piece(&of_epoch, begin, end);
-            last = self.adjust(&chosen).or(last);
+            last = self.adjust_on(&chosen, &LEVELS, MAX_ITERATIONS).or(last);
             self.leave(&chosen.members);
             if end == of_epoch.len() {
                 self.moved.sort_unstable();
