@@ -24,9 +24,9 @@ use crate::slam::window::neighbours::{Neighbourhood, Single};
 use crate::slam::window::params::WindowParams;
 use crate::slam::window::plane::fit;
 
-/// Keyframes that a keyframe's depth is compared with, those that see most of it: with eight, which are farther off,
-/// redkitchen's depth is no better.
-const OBSERVERS: usize = 4;
+/// Keyframes that a keyframe's depth is compared with, those that see most of it. With four or eight, which are farther
+/// off, depth is no better; with two ICL's median error is 1.9 % instead of 1.7.
+const OBSERVERS: usize = 3;
 /// Levels, and steps on each. Without level 1 the floor's median error is 2.2 % instead of 1.7.
 const STEPS: [(usize, u32); 2] = [(1, 3), (0, 3)];
 /// Points that are compared at a time: they stay in the cache.
