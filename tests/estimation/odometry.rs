@@ -4,6 +4,9 @@ use semidense::capture::simulator::Simulator;
 use semidense::capture::simulator::params::SimulatorParams;
 use semidense::capture::source::FrameSource;
 use semidense::service::replay::{ReplayConfig, replay};
+use semidense::slam::evaluation::evaluate_trajectory;
+use semidense::slam::evaluation::umeyama::TrajectoryAlignment;
+use semidense::slam::trajectory::StampedPose;
 use semidense::{FrameView, Intrinsics, Odometry, OdometryError, OdometryParams};
 
 /// Enough for a map, its first new keyframes and their joint estimates.
@@ -47,6 +50,41 @@ fn poses_and_map_are_those_of_a_replay() {
         assert_eq!(keyframe.points, replayed.points);
         assert!(keyframe.image[..] == frames[keyframe.sequence as usize], "{}", keyframe.sequence);
     }
+}
+
+#[test]
+fn frames_go_on_after_the_end() {
+    let mut source = source();
+    let truth = source.ground_truth().to_vec();
+    let camera = source.intrinsics();
+    let mut odometry = Odometry::new(camera, OdometryParams::default()).unwrap();
+    let mut pixels = vec![0; camera.width * camera.height];
+    let (mut estimates, mut at_end) = (Vec::new(), None);
+    while let Some(stamp) = source.next_into(&mut pixels).unwrap() {
+        let frame = FrameView::new(&camera, stamp.sequence, stamp.capture_nanos, &pixels);
+        let pose = odometry.push(&frame);
+        if at_end.is_some() {
+            assert!(pose.state.is_tracked(), "{}: {:?}", stamp.sequence, pose.state);
+        }
+        if stamp.sequence as usize == 2 * FRAMES / 3 {
+            odometry.finish();
+            at_end = Some(odometry.keyframes().len());
+        }
+        estimates.push(pose);
+    }
+    odometry.finish();
+    let keyframes = odometry.keyframes();
+    assert!(keyframes.len() > at_end.unwrap(), "{} keyframes", keyframes.len());
+    assert!(keyframes.iter().all(|keyframe| keyframe.epoch == 0 && !keyframe.points.is_empty()));
+    let tracked = estimates.iter().filter(|pose| pose.state.is_tracked());
+    let poses: Vec<StampedPose> = tracked
+        .map(|pose| StampedPose {
+            nanos: pose.capture_nanos,
+            world_from_camera: pose.world_from_camera,
+        })
+        .collect();
+    let found = evaluate_trajectory(&poses, &truth, TrajectoryAlignment::Sim3, 1_000_000).unwrap();
+    assert!(found.ate.rmse < 0.01, "{} m of {} m", found.ate.rmse, found.path_length);
 }
 
 #[test]

@@ -140,6 +140,33 @@ fn an_estimate_enters_at_its_frame_however_long_it_took() {
 }
 
 #[test]
+fn an_estimate_enters_the_later_the_slower_keyframes_come() {
+    let entered = |least, most| {
+        let mut adjustments =
+            start(Entry::AfterFrames(Delay { least, most }), Box::new(Window::optimise));
+        let mut walk = Walk::new();
+        for _ in 0..14 {
+            walk.go(&mut adjustments);
+        }
+        adjustments.take_records().map(|r| r.frames).collect::<Vec<_>>()
+    };
+    // A third of four frames is one.
+    assert_eq!(entered(0, 8), [1, 1, 1]);
+    assert_eq!(entered(2, 8), [2, 2]);
+    assert_eq!(entered(0, 0), [0, 0, 0]);
+    let mut walk = Walk::new();
+    (0..5).for_each(|_| _ = walk.step());
+    let mut keyframes = walk.mapper.map().keyframes.clone();
+    let delay = Delay { least: 3, most: 8 };
+    let mut frames = |interval| {
+        keyframes[1].sequence = keyframes[0].sequence + interval;
+        delay.frames(&keyframes)
+    };
+    assert_eq!([2, 15, 600].map(&mut frames), [3, 5, 8]);
+    assert_eq!(delay.frames(&keyframes[..1]), 3);
+}
+
+#[test]
 fn with_no_delay_an_estimate_enters_with_its_own_frame() {
     let mut adjustments = start(after_frames(0), Box::new(Window::optimise));
     let mut walk = Walk::new();
