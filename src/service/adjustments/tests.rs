@@ -88,7 +88,7 @@ impl Walk {
 
 /// An estimate enters so many frames after it began.
 pub(super) fn after_frames(frames: u64) -> Entry {
-    Entry::AfterFrames(Delay { least: frames, most: frames })
+    Entry::AfterFrames(Delay { least: frames, most: frames, num_first: 0 })
 }
 
 pub(super) fn start(entry: Entry, optimise: Optimise) -> Adjustments {
@@ -142,8 +142,8 @@ fn an_estimate_enters_at_its_frame_however_long_it_took() {
 #[test]
 fn an_estimate_enters_the_later_the_slower_keyframes_come() {
     let entered = |least, most| {
-        let mut adjustments =
-            start(Entry::AfterFrames(Delay { least, most }), Box::new(Window::optimise));
+        let entry = Entry::AfterFrames(Delay { least, most, num_first: 0 });
+        let mut adjustments = start(entry, Box::new(Window::optimise));
         let mut walk = Walk::new();
         for _ in 0..14 {
             walk.go(&mut adjustments);
@@ -157,13 +157,14 @@ fn an_estimate_enters_the_later_the_slower_keyframes_come() {
     let mut walk = Walk::new();
     (0..5).for_each(|_| _ = walk.step());
     let mut keyframes = walk.mapper.map().keyframes.clone();
-    let delay = Delay { least: 3, most: 8 };
+    let delay = Delay { least: 3, most: 8, num_first: 1 };
     let mut frames = |interval| {
         keyframes[1].sequence = keyframes[0].sequence + interval;
         delay.frames(&keyframes)
     };
     assert_eq!([2, 15, 600].map(&mut frames), [3, 5, 8]);
     assert_eq!(delay.frames(&keyframes[..1]), 3);
+    assert_eq!(Delay { num_first: 2, ..delay }.frames(&keyframes), 3, "the first two");
 }
 
 #[test]

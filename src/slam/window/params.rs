@@ -64,7 +64,7 @@ pub struct WindowParams {
     /// that every run gives the same map. 3 are 100 ms at 30 Hz, about what it takes live, where it enters as soon as
     /// it is ready.
     pub delay_frames: usize,
-    /// At most so many where keyframes come slowly: frames go on beside the estimate meanwhile.
+    /// At most so many where keyframes come slowly and the first ones are there: frames go on beside the estimate meanwhile.
     pub max_delay_frames: usize,
 }
 
@@ -75,12 +75,18 @@ pub struct Delay {
     pub least: u64,
     /// Where they do not.
     pub most: u64,
+    /// Keyframes of an epoch that are all free with every new one: depth is seen with poses that they correct.
+    pub num_first: usize,
 }
 
 impl Delay {
     /// A third of what lies between the two newest of `keyframes`: a map that grows fast wants its estimates soon.
     pub fn frames(self, keyframes: &[Keyframe]) -> u64 {
         let [.., before, newest] = keyframes else { return self.least };
+        let of_epoch = keyframes.iter().rev().take_while(|keyframe| keyframe.epoch == newest.epoch);
+        if of_epoch.take(self.num_first + 1).count() <= self.num_first {
+            return self.least;
+        }
         let interval = newest.sequence.saturating_sub(before.sequence);
         (interval / 3).clamp(self.least, self.most)
     }
@@ -117,7 +123,8 @@ impl WindowParams {
     /// When estimates enter where every run is to give the same map.
     pub fn delay(&self) -> Delay {
         let least = self.delay_frames as u64;
-        Delay { least, most: least.max(self.max_delay_frames as u64) }
+        let most = least.max(self.max_delay_frames as u64);
+        Delay { least, most, num_first: self.num_first }
     }
 
     /// Whether candidates are traced for it, beside the depth of the active keyframe.
