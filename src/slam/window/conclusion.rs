@@ -3,7 +3,7 @@
 //! What the window froze early is free again: in rendered rooms the error of the trajectory is halved or better.
 
 use crate::slam::window::members::Chosen;
-use crate::slam::window::{Adjustment, Window};
+use crate::slam::window::{ADJUSTED_LEVELS, Adjustment, Window};
 
 /// Keyframes that are free at once: bounds memory (the equations, about 170 bytes a comparison) and time.
 const PIECE: usize = 40;
@@ -11,9 +11,8 @@ const PIECE: usize = 40;
 const STEP: usize = 20;
 /// Newest keyframes that are estimated once more: six pieces take a few seconds.
 pub(super) const MOST: usize = 120;
-/// Levels that all are estimated on once more: they are within a pixel or two already.
-const LEVELS: [usize; 2] = [1, 0];
-/// Most iterations of a level. Beyond the tenth the cost falls by what interpolation makes of it and nothing else changes.
+/// Most iterations of a level: further ones lower the cost by what interpolation makes of it and change nothing else.
+/// Without level 2 the office's depth would be tilted by 0.034 instead of 0.024.
 const MAX_ITERATIONS: u32 = 15;
 
 impl Window {
@@ -25,7 +24,7 @@ impl Window {
         loop {
             let end = (begin + PIECE).min(of_epoch.len());
             let chosen = self.choose_piece(&of_epoch, begin, end);
-            last = self.adjust_on(&chosen, &LEVELS, MAX_ITERATIONS).or(last);
+            last = self.adjust_on(&chosen, &ADJUSTED_LEVELS, MAX_ITERATIONS).or(last);
             self.leave(&chosen.members);
             if end == of_epoch.len() {
                 self.moved.sort_unstable();
