@@ -15,7 +15,6 @@ use crate::service::schedule::Background;
 use crate::slam::keyframe::MapState;
 use crate::slam::loops::SearchReport;
 use crate::slam::mapper::{Mapper, StepOutcome};
-use crate::slam::window::params::Delay;
 use crate::slam::window::{Adjustment, Window};
 
 /// Live: longest wait for estimates after the last frame, twenty times what they take.
@@ -25,7 +24,7 @@ const LAST_ADJUSTMENTS: Duration = Duration::from_secs(5);
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Entry {
     /// So many frames after it began; it is waited for. The same map in every run.
-    AfterFrames(Delay),
+    AfterFrames(u64),
     /// Between two frames as soon as it is ready. No frame waits.
     WhenReady,
 }
@@ -70,9 +69,8 @@ pub struct SearchRecord {
 /// The estimate that is away, and the map that it was taken from.
 #[derive(Debug, Clone, Copy)]
 struct Away {
-    /// Frames that had been counted when it began, and will have been when it enters.
+    /// Frames that had been counted when it began.
     began: u64,
-    due: u64,
     epoch: u32,
     map_revision: u64,
     newest: Option<u64>,
@@ -220,13 +218,8 @@ impl Adjustments {
     ) {
         let (None, Some(thread)) = (self.away, &self.thread) else { return };
         let Some(window) = begin(mapper) else { return };
-        let delay = match self.entry {
-            Entry::AfterFrames(delay) => delay.frames(&mapper.map().keyframes),
-            Entry::WhenReady => 0,
-        };
         self.away = Some(Away {
             began: self.frames,
-            due: self.frames.saturating_add(delay),
             epoch: mapper.keyframe().map_or(0, |keyframe| keyframe.epoch),
             map_revision: mapper.map().revision,
             newest: newest(mapper),
@@ -241,7 +234,9 @@ impl Adjustments {
             return StepOutcome::default();
         };
         let back = match self.entry {
-            Entry::AfterFrames(_) if self.frames < away.due => Err(Missing::Unfinished),
+            Entry::AfterFrames(frames) if self.frames < away.began.saturating_add(frames) => {
+                Err(Missing::Unfinished)
+            }
             Entry::AfterFrames(_) => thread.wait(),
             Entry::WhenReady => thread.poll(),
         };

@@ -446,7 +446,7 @@ fn tell_search(report: &SearchReport) {
 
 /// The joint estimation of keyframes, as the mode wants it.
 fn start_adjustments(config: &Config, mode: Mode) -> std::io::Result<Adjustments> {
-    let delay = Entry::AfterFrames(config.mapping.window.delay());
+    let delay = Entry::AfterFrames(config.mapping.window.delay_frames as u64);
     match mode {
         // The frames wait for it.
         Mode::Lockstep => Adjustments::start(delay, Background::Other),

@@ -250,7 +250,7 @@ impl<'a> Replay<'a> {
                 ..RunRecord::empty(RunMode::Replay, source_name)
             },
             adjustments: Adjustments::start(
-                Entry::AfterFrames(config.mapper.window.delay()),
+                Entry::AfterFrames(config.mapper.window.delay_frames as u64),
                 Background::Other,
             )
             .map_err(ReplayError::Thread)?,

@@ -165,7 +165,7 @@ impl Odometry {
         let epoch = self.mapper.keyframe().map_or(0, |keyframe| keyframe.epoch);
         let map_revision = self.mapper.map().revision;
         window.optimise();
-        let due = self.frames + self.params.mapper.window.delay().frames(self.keyframes());
+        let due = self.frames + self.params.mapper.window.delay_frames as u64;
         self.estimate = Some(Estimate { window, due, epoch, map_revision });
     }
 

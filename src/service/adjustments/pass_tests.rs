@@ -2,7 +2,7 @@
 
 use std::sync::mpsc::channel;
 
-use super::tests::{KEYFRAME_INTERVAL, Walk, after_frames, start};
+use super::tests::{KEYFRAME_INTERVAL, Walk, start};
 use super::*;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::map::{Correction, KeyframeCorrection, LogPlane};
@@ -31,7 +31,7 @@ fn a_new_keyframe_goes_first_and_waits_for_one_piece_at_most() {
         say.send(window.is_piece()).unwrap();
         window.optimise()
     };
-    let mut adjustments = start(after_frames(3), Box::new(optimise));
+    let mut adjustments = start(Entry::AfterFrames(3), Box::new(optimise));
     let mut walk = Walk::with(with_passes());
     let (mut waits_since, mut pieces, mut last) = (Some(0), 0, None);
     for _ in 0..40 {
@@ -55,7 +55,7 @@ fn a_new_keyframe_goes_first_and_waits_for_one_piece_at_most() {
 
 #[test]
 fn a_piece_moves_the_map_and_odometry_does_not_jump() {
-    let mut adjustments = start(after_frames(1), Box::new(Window::optimise));
+    let mut adjustments = start(Entry::AfterFrames(1), Box::new(Window::optimise));
     let mut walk = Walk::with(with_passes());
     for _ in 0..=14 {
         walk.go(&mut adjustments);

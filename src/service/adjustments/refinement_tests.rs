@@ -1,6 +1,6 @@
 //! Depth that is refined while frames come.
 
-use super::tests::{Walk, after_frames, start, until};
+use super::tests::{Walk, start, until};
 use super::*;
 use crate::slam::mapper::MapperParams;
 use crate::slam::window::params::WindowParams;
@@ -41,7 +41,7 @@ fn keyframes_that_have_settled_are_refined_and_told_of() {
         let told = left.iter().filter(|&&of| of == id).count();
         assert!(told >= 2, "keyframe {id}: when it was left and when it was refined: {left:?}");
     }
-    let (lockstep, _) = walk(after_frames(1));
+    let (lockstep, _) = walk(Entry::AfterFrames(1));
     assert!(refined(&lockstep).is_empty(), "there it is done after the last frame");
     let points = |walk: &Walk| walk.mapper.map().get(1).unwrap().points.clone();
     assert_ne!(points(&live), points(&lockstep));
@@ -53,7 +53,7 @@ fn keyframes_that_have_settled_are_refined_and_told_of() {
 
 #[test]
 fn depth_that_was_dropped_is_refined_later() {
-    let (mut live, _) = walk(after_frames(1));
+    let (mut live, _) = walk(Entry::AfterFrames(1));
     let mut first = live.mapper.begin_adjustment(true).unwrap();
     assert_eq!(first.optimise(), None);
     live.mapper.drop_adjustment(first);

@@ -86,11 +86,6 @@ impl Walk {
     }
 }
 
-/// An estimate enters so many frames after it began.
-pub(super) fn after_frames(frames: u64) -> Entry {
-    Entry::AfterFrames(Delay { least: frames, most: frames, num_first: 0 })
-}
-
 pub(super) fn start(entry: Entry, optimise: Optimise) -> Adjustments {
     Adjustments::start_with(entry, Background::Other, optimise).unwrap()
 }
@@ -120,7 +115,7 @@ fn an_estimate_enters_at_its_frame_however_long_it_took() {
             std::thread::sleep(pause);
             window.optimise()
         };
-        let mut adjustments = start(after_frames(2), Box::new(optimise));
+        let mut adjustments = start(Entry::AfterFrames(2), Box::new(optimise));
         let mut walk = Walk::new();
         let mut records = Vec::new();
         for _ in 0..14 {
@@ -140,36 +135,8 @@ fn an_estimate_enters_at_its_frame_however_long_it_took() {
 }
 
 #[test]
-fn an_estimate_enters_the_later_the_slower_keyframes_come() {
-    let entered = |least, most| {
-        let entry = Entry::AfterFrames(Delay { least, most, num_first: 0 });
-        let mut adjustments = start(entry, Box::new(Window::optimise));
-        let mut walk = Walk::new();
-        for _ in 0..14 {
-            walk.go(&mut adjustments);
-        }
-        adjustments.take_records().map(|r| r.frames).collect::<Vec<_>>()
-    };
-    // A third of four frames is one.
-    assert_eq!(entered(0, 8), [1, 1, 1]);
-    assert_eq!(entered(2, 8), [2, 2]);
-    assert_eq!(entered(0, 0), [0, 0, 0]);
-    let mut walk = Walk::new();
-    (0..5).for_each(|_| _ = walk.step());
-    let mut keyframes = walk.mapper.map().keyframes.clone();
-    let delay = Delay { least: 3, most: 8, num_first: 1 };
-    let mut frames = |interval| {
-        keyframes[1].sequence = keyframes[0].sequence + interval;
-        delay.frames(&keyframes)
-    };
-    assert_eq!([2, 15, 600].map(&mut frames), [3, 5, 8]);
-    assert_eq!(delay.frames(&keyframes[..1]), 3);
-    assert_eq!(Delay { num_first: 2, ..delay }.frames(&keyframes), 3, "the first two");
-}
-
-#[test]
 fn with_no_delay_an_estimate_enters_with_its_own_frame() {
-    let mut adjustments = start(after_frames(0), Box::new(Window::optimise));
+    let mut adjustments = start(Entry::AfterFrames(0), Box::new(Window::optimise));
     let mut walk = Walk::new();
     let outcomes: Vec<bool> = (0..6).map(|_| walk.go(&mut adjustments).keyframe_changed).collect();
     assert_eq!(outcomes, [false, false, false, false, true, false]);
@@ -207,7 +174,7 @@ fn the_checkpoint_has_the_correction_and_the_depth_that_goes_with_it() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("rig.checkpoint");
     let (Some(mut kept), None) = Kept::open(&path) else { panic!("an empty folder") };
-    let mut adjustments = start(after_frames(2), Box::new(Window::optimise));
+    let mut adjustments = start(Entry::AfterFrames(2), Box::new(Window::optimise));
     let mut walk = Walk::new();
     for _ in 0..=10 {
         let sequence = walk.frames;
@@ -234,7 +201,7 @@ fn the_checkpoint_has_the_correction_and_the_depth_that_goes_with_it() {
 
 #[test]
 fn an_estimate_of_a_map_that_was_corrected_meanwhile_is_dropped() {
-    let mut adjustments = start(after_frames(2), Box::new(Window::optimise));
+    let mut adjustments = start(Entry::AfterFrames(2), Box::new(Window::optimise));
     let mut walk = Walk::new();
     for _ in 0..=4 {
         walk.go(&mut adjustments);
@@ -263,7 +230,7 @@ fn an_estimate_of_a_map_that_was_corrected_meanwhile_is_dropped() {
 
 #[test]
 fn an_estimate_for_a_camera_that_is_gone_is_dropped() {
-    let mut adjustments = start(after_frames(2), Box::new(Window::optimise));
+    let mut adjustments = start(Entry::AfterFrames(2), Box::new(Window::optimise));
     let mut walk = Walk::new();
     for _ in 0..=4 {
         walk.go(&mut adjustments);
@@ -280,7 +247,7 @@ fn an_estimate_for_a_camera_that_is_gone_is_dropped() {
 #[test]
 fn a_panic_is_said_once_and_mapping_continues() {
     let panics = |_: &mut Window| -> Option<Adjustment> { panic!("a broken estimate") };
-    for entry in [after_frames(1), Entry::WhenReady] {
+    for entry in [Entry::AfterFrames(1), Entry::WhenReady] {
         let mut adjustments = start(entry, Box::new(panics));
         let mut walk = Walk::new();
         let mut failures = Vec::new();
@@ -299,7 +266,7 @@ fn a_panic_is_said_once_and_mapping_continues() {
 #[test]
 fn the_last_keyframe_is_estimated_before_the_end() {
     // The estimate before it is still away then.
-    for entry in [after_frames(6), Entry::WhenReady] {
+    for entry in [Entry::AfterFrames(6), Entry::WhenReady] {
         let pauses = |window: &mut Window| {
             std::thread::sleep(Duration::from_millis(200));
             window.optimise()

@@ -111,7 +111,7 @@ impl Mapper {
     /// Takes in another frame of a map in doubt; rejects it where nobody has estimated it again.
     fn has_waited_in_vain(&mut self, nanos: i64) -> bool {
         // In lockstep estimates enter after so many frames: one that is away, and its own.
-        let least_frames = 2 * (self.params.window.delay().most as usize + 1);
+        let least_frames = 2 * (self.params.window.delay_frames + 1);
         let Doubt::Raised { contradiction, lasting, frames, .. } = &mut self.doubt else {
             return false;
         };
@@ -255,7 +255,7 @@ mod tests {
         let is_waiting =
             |mapper: &mut Mapper, frame: i64| !mapper.has_waited_in_vain(frame * 1_000_000_000);
         let waits = (0..100).take_while(|&frame| is_waiting(&mut mapper, frame)).count();
-        assert_eq!(waits, 2 * (mapper.params.window.max_delay_frames + 1));
+        assert_eq!(waits, 2 * (mapper.params.window.delay_frames + 1));
     }
 
     #[test]

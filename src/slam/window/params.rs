@@ -2,7 +2,6 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::slam::keyframe::Keyframe;
 use crate::slam::parameter::{ParameterError, check_range};
 
 /// From which filter points enter the joint estimation; `docs/depth-filters.md` compares them.
@@ -64,32 +63,6 @@ pub struct WindowParams {
     /// that every run gives the same map. 3 are 100 ms at 30 Hz, about what it takes live, where it enters as soon as
     /// it is ready.
     pub delay_frames: usize,
-    /// At most so many where keyframes come slowly and the first ones are there: frames go on beside the estimate meanwhile.
-    pub max_delay_frames: usize,
-}
-
-/// Frames from a keyframe to the entry of its joint estimate where every run is to give the same map.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Delay {
-    /// Where keyframes follow each other closely.
-    pub least: u64,
-    /// Where they do not.
-    pub most: u64,
-    /// Keyframes of an epoch that are all free with every new one: depth is seen with poses that they correct.
-    pub num_first: usize,
-}
-
-impl Delay {
-    /// A third of what lies between the two newest of `keyframes`: a map that grows fast wants its estimates soon.
-    pub fn frames(self, keyframes: &[Keyframe]) -> u64 {
-        let [.., before, newest] = keyframes else { return self.least };
-        let of_epoch = keyframes.iter().rev().take_while(|keyframe| keyframe.epoch == newest.epoch);
-        if of_epoch.take(self.num_first + 1).count() <= self.num_first {
-            return self.least;
-        }
-        let interval = newest.sequence.saturating_sub(before.sequence);
-        (interval / 3).clamp(self.least, self.most)
-    }
 }
 
 impl Default for WindowParams {
@@ -114,19 +87,11 @@ impl Default for WindowParams {
             pass_piece: 14,
             converged_decrement: 2.0,
             delay_frames: 3,
-            max_delay_frames: 8,
         }
     }
 }
 
 impl WindowParams {
-    /// When estimates enter where every run is to give the same map.
-    pub fn delay(&self) -> Delay {
-        let least = self.delay_frames as u64;
-        let most = least.max(self.max_delay_frames as u64);
-        Delay { least, most, num_first: self.num_first }
-    }
-
     /// Whether candidates are traced for it, beside the depth of the active keyframe.
     pub fn traces_candidates(&self) -> bool {
         self.num_free > 0 && self.points_from == PointSource::Interval
@@ -151,7 +116,6 @@ impl WindowParams {
         check_range("pass_every", self.pass_every, 0..=10_000)?;
         check_range("pass_piece", self.pass_piece, 2..=40)?;
         check_range("converged_decrement", self.converged_decrement, 0.0..=1e6)?;
-        check_range("delay_frames", self.delay_frames, 0..=30)?;
-        check_range("max_delay_frames", self.max_delay_frames, 0..=30)
+        check_range("delay_frames", self.delay_frames, 0..=30)
     }
 }
