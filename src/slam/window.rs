@@ -350,16 +350,11 @@ impl Window {
             true => self.params.max_first_iterations,
             false => self.params.max_iterations,
         };
-        self.adjust_on(chosen, &ADJUSTED_LEVELS, iterations)
+        self.adjust_within(chosen, iterations)
     }
 
-    /// The same on some levels, with at most so many iterations on each.
-    fn adjust_on(
-        &mut self,
-        chosen: &Chosen,
-        levels: &[usize],
-        iterations: u32,
-    ) -> Option<Adjustment> {
+    /// The same with at most so many iterations of a level.
+    fn adjust_within(&mut self, chosen: &Chosen, iterations: u32) -> Option<Adjustment> {
         let num_free = chosen.free.iter().flatten().count();
         if num_free == 0 {
             return None;
@@ -369,7 +364,7 @@ impl Window {
         self.thin_out(&chosen.members);
         self.solver.iterations = 0;
         let unit = Unit::of(&self.keyframes, &members);
-        if !self.run(&members, levels, iterations, |_, _| true) {
+        if !self.run(&members, &ADJUSTED_LEVELS, iterations, |_, _| true) {
             return None;
         }
         self.note_agreement(&chosen.members);

@@ -1,5 +1,6 @@
 //! The cost of a patch in vector registers. Compilers that see its sum take two samples at a time, with a division each.
 
+use crate::slam::depth::pattern::sum_of_samples;
 use crate::slam::kernel::Instructions;
 
 /// Residuals beyond this many grey levels grow linearly (Engel, Koltun, Cremers 2018).
@@ -45,7 +46,7 @@ fn cost(seen: &[f32; 8], expected: &[f32; 8]) -> f32 {
         let weight = weight(residual);
         costs[k] = weight * (2.0 - weight) * residual * residual;
     }
-    sum(&costs)
+    sum_of_samples(&costs)
 }
 
 /// The explanation of the others.
@@ -56,19 +57,13 @@ fn slope(seen: &[f32; 8], expected: &[f32; 8], gradients: &[f32; 8]) -> [f32; 2]
         let weighted = weight(seen[k] - expected[k]) * gradients[k];
         (mixed[k], squares[k]) = (weighted * (seen[k] - expected[k]), weighted * gradients[k]);
     }
-    [sum(&mixed), sum(&squares)]
+    [sum_of_samples(&mixed), sum_of_samples(&squares)]
 }
 
 /// Huber's: 1 up to the bound, without a branch, so that the lanes go together.
 #[inline(always)]
 fn weight(residual: f32) -> f32 {
     HUBER_GREY / residual.abs().max(HUBER_GREY)
-}
-
-/// Sum in a fixed order that eight lanes can do.
-#[inline(always)]
-pub(super) fn sum(x: &[f32; 8]) -> f32 {
-    ((x[0] + x[4]) + (x[2] + x[6])) + ((x[1] + x[5]) + (x[3] + x[7]))
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -124,6 +119,8 @@ mod avx2 {
         }
     }
 
+    /// [`sum_of_samples`](crate::slam::depth::pattern::sum_of_samples).
+    ///
     /// # Safety
     /// As [`cost`].
     #[inline(always)]

@@ -13,7 +13,7 @@
 
 use nalgebra::Matrix6;
 
-use crate::slam::depth::pattern::PATTERN;
+use crate::slam::depth::pattern::{PATTERN, sum_of_samples};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::shared::SharedImage;
@@ -100,7 +100,7 @@ pub struct Compared {
     /// Robust cost, grey levels²; NaN where a sample is outside the image or behind the camera, infinite where something
     /// else is seen.
     pub cost: Lane,
-    /// Σ w J ∂r/∂d of the observer's pose.
+    /// Σ w J ∂r/∂d of the observer's pose; as it was where poses are not wanted.
     pub observer: [Lane; POSE],
     /// The same of the host's.
     pub host: [Lane; POSE],
@@ -209,9 +209,4 @@ pub(super) fn fits(image: &SharedImage, pair: &Pair) -> bool {
 pub fn sum(of: &Lane) -> f32 {
     let half: [f32; 8] = std::array::from_fn(|k| of[k] + of[k + 8]);
     sum_of_samples(&half)
-}
-
-/// The sum of a pattern's eight samples, in pairs.
-pub fn sum_of_samples(of: &[f32; SAMPLES]) -> f32 {
-    ((of[0] + of[4]) + (of[2] + of[6])) + ((of[1] + of[5]) + (of[3] + of[7]))
 }

@@ -4,9 +4,8 @@ use nalgebra::Vector6;
 
 use super::comparison::{
     Compared, LANES, Look, POSE, Pair, PairSums, Patterns, Robustness, SAMPLES, Wanted, sum,
-    sum_of_samples,
 };
-use crate::slam::depth::pattern::PATTERN;
+use crate::slam::depth::pattern::{PATTERN, sum_of_samples};
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::shared::SharedImage;
 use crate::slam::kernel::Kernel;

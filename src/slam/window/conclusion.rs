@@ -3,7 +3,7 @@
 //! What the window froze early is free again: in rendered rooms the error of the trajectory is halved or better.
 
 use crate::slam::window::members::Chosen;
-use crate::slam::window::{ADJUSTED_LEVELS, Adjustment, Window};
+use crate::slam::window::{Adjustment, Window};
 
 /// Keyframes that are free at once: bounds memory (the equations, about 170 bytes a comparison) and time.
 const PIECE: usize = 40;
@@ -12,7 +12,6 @@ const STEP: usize = 20;
 /// Newest keyframes that are estimated once more: six pieces take a few seconds.
 pub(super) const MOST: usize = 120;
 /// Most iterations of a level: further ones lower the cost by what interpolation makes of it and change nothing else.
-/// Without level 2 the office's depth would be tilted by 0.034 instead of 0.024.
 const MAX_ITERATIONS: u32 = 15;
 
 impl Window {
@@ -24,7 +23,7 @@ impl Window {
         loop {
             let end = (begin + PIECE).min(of_epoch.len());
             let chosen = self.choose_piece(&of_epoch, begin, end);
-            last = self.adjust_on(&chosen, &ADJUSTED_LEVELS, MAX_ITERATIONS).or(last);
+            last = self.adjust_within(&chosen, MAX_ITERATIONS).or(last);
             self.leave(&chosen.members);
             if end == of_epoch.len() {
                 self.moved.sort_unstable();

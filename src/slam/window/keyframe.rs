@@ -1,10 +1,10 @@
 //! Keyframes and points of the window.
 
-use crate::slam::depth::pattern::PATTERN;
+use crate::slam::depth::pattern::{PATTERN, sum_of_samples};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::shared::SharedImage;
-use crate::slam::window::comparison::{Look, SAMPLES, sum_of_samples};
+use crate::slam::window::comparison::{Look, SAMPLES};
 use crate::slam::window::params::WindowParams;
 use crate::slam::window::surface::Surface;
 
