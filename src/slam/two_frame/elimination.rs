@@ -76,18 +76,19 @@ impl Elimination {
         }
     }
 
-    /// The depths after the pose's step.
+    /// The depths after the pose's step; their part −Σ g_i δd_i of what the step promises.
     pub fn depths_after(
         &self,
         system: &System,
         inverse_depths: &[f32],
         step: &SVector<f64, NUM_UNKNOWNS>,
         after: &mut Vec<f32>,
-    ) {
+    ) -> f64 {
         /// Largest change of a depth in one step: the projection is far from linear beyond.
         const MAX_DEPTH_STEP: f32 = 0.5;
         let step: [f32; NUM_UNKNOWNS] = std::array::from_fn(|k| step[k] as f32);
         after.clear();
+        let mut promised = LaneSum::default();
         for (i, block) in system.blocks.iter().enumerate() {
             let d = lanes_of(inverse_depths, i, 1.0);
             let mut by_pose = [0.0; LANES];
@@ -102,8 +103,13 @@ impl Elimination {
                     .clamp(INVERSE_DEPTHS.0, INVERSE_DEPTHS.1)
             });
             after.extend_from_slice(&changed);
+            promised.add(&lanes(|l| {
+                let gradient = self.slopes[i][l] / self.inverse_information[i][l];
+                -gradient * (changed[l] - d[l])
+            }));
         }
         after.truncate(inverse_depths.len());
+        promised.total()
     }
 }
 

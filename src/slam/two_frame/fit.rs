@@ -30,7 +30,7 @@ pub struct FitParams {
     pub depth_std_dev: f32,
     /// Most iterations a level.
     pub max_iterations: u32,
-    /// A level is done when a step lowers the energy by less than this share.
+    /// A level is done when a step lowers the energy by less than this share, or promises no more.
     pub min_energy_drop: f64,
 }
 
@@ -142,6 +142,7 @@ pub fn fit_level(
     scratch.system.evaluate(&view, state);
     find_medians(input, state, &mut scratch.medians);
     let mut damping = Damping::FIRST;
+    let mut before = energy(&scratch.system, state, &scratch.medians, weights);
     for _ in 0..params.max_iterations {
         let Some(step) = step_of(freedom, scratch, state, damping.factor, weights) else {
             // The model is good for less than the step that it asks for.
@@ -150,20 +151,25 @@ pub fn fit_level(
             }
             continue;
         };
+        let least_drop = params.min_energy_drop * before;
+        if step.promised_drop < least_drop {
+            break;
+        }
         let depths = std::mem::take(&mut scratch.trial_depths);
-        let mut next = State { inverse_depths: depths, ..moved(state, &step) };
+        let mut next = State { inverse_depths: depths, ..moved(state, &step.of_pose) };
         if freedom != Freedom::Everything {
             next.inverse_depths.clone_from(&state.inverse_depths);
         }
         scratch.trial.evaluate(&view, &next);
-        let before = energy(&scratch.system, state, &scratch.medians, weights);
         let after = energy(&scratch.trial, &next, &scratch.medians, weights);
         let is_over = if after < before {
             std::mem::swap(state, &mut next);
             std::mem::swap(&mut scratch.system, &mut scratch.trial);
+            let is_small = before - after < least_drop;
             find_medians(input, state, &mut scratch.medians);
+            before = energy(&scratch.system, state, &scratch.medians, weights);
             damping.succeed();
-            before - after < params.min_energy_drop * before
+            is_small
         } else {
             damping.fail()
         };
@@ -172,35 +178,42 @@ pub fn fit_level(
             break;
         }
     }
-    energy(&scratch.system, state, &scratch.medians, weights)
+    before
 }
 
-/// Damping of the steps, and how many in a row failed.
+/// Damping of the steps, and how many more in a row may fail.
 struct Damping {
     factor: f64,
-    failures: u32,
+    patience: u32,
 }
 
 impl Damping {
-    const FIRST: Self = Self { factor: 0.01, failures: 0 };
+    /// A level that is far from its minimum may need smaller steps than the first.
+    const FIRST: Self = Self { factor: 0.01, patience: 3 };
 
-    /// A step lowered the energy.
+    /// A step lowered the energy. When one does not any more, what is left is kinks between pixels: of six smaller
+    /// steps one lowered it, by less than half a per cent.
     fn succeed(&mut self) {
         const SUCCESS_FACTOR: f64 = 0.3;
         const LEAST_DAMPING: f64 = 1e-6;
         self.factor = (self.factor * SUCCESS_FACTOR).max(LEAST_DAMPING);
-        self.failures = 0;
+        self.patience = 1;
     }
 
     /// There was no step, or it did not; whether it is over.
     fn fail(&mut self) -> bool {
-        const FAILURE_FACTOR: f64 = 5.0;
-        /// So many failures in a row make a step of nothing.
-        const MAX_FAILURES: u32 = 5;
+        const FAILURE_FACTOR: f64 = 25.0;
         self.factor *= FAILURE_FACTOR;
-        self.failures += 1;
-        self.failures >= MAX_FAILURES
+        self.patience -= 1;
+        self.patience == 0
     }
+}
+
+/// A step of what may move; that of the depths is in the scratch.
+struct Step {
+    of_pose: SVector<f64, NUM_UNKNOWNS>,
+    /// By how much the energy would fall if it were quadratic and the step not damped: −gᵀδ.
+    promised_drop: f64,
 }
 
 /// Energy of `system`, evaluated at `state`, with the priors.
@@ -215,7 +228,7 @@ fn step_of(
     state: &State,
     damping: f64,
     weights: PriorWeights,
-) -> Option<SVector<f64, NUM_UNKNOWNS>> {
+) -> Option<Step> {
     match freedom {
         Freedom::Rotation => rotation_step(&scratch.system, damping),
         Freedom::Pose => pose_step(&scratch.system, damping),
@@ -240,7 +253,7 @@ fn moved(state: &State, step: &SVector<f64, NUM_UNKNOWNS>) -> State {
 }
 
 /// The step of rotation and brightness; the translation stays.
-fn rotation_step(system: &System, damping: f64) -> Option<SVector<f64, NUM_UNKNOWNS>> {
+fn rotation_step(system: &System, damping: f64) -> Option<Step> {
     let mut hessian = system.hessian.fixed_view::<5, 5>(3, 3).into_owned();
     for i in 0..5 {
         hessian[(i, i)] = hessian[(i, i)] * (1.0 + damping) + f64::MIN_POSITIVE;
@@ -249,7 +262,7 @@ fn rotation_step(system: &System, damping: f64) -> Option<SVector<f64, NUM_UNKNO
     let solved = hessian.cholesky()?.solve(&-gradient);
     let mut step = SVector::<f64, NUM_UNKNOWNS>::zeros();
     step.fixed_rows_mut::<5>(3).copy_from(&solved);
-    is_sane(&step).then_some(step)
+    Step::of_pose_alone(step, system)
 }
 
 fn find_medians(input: &FitInput<'_>, state: &State, medians: &mut Vec<f32>) {
@@ -258,21 +271,17 @@ fn find_medians(input: &FitInput<'_>, state: &State, medians: &mut Vec<f32>) {
 }
 
 /// The step of pose and brightness with the depths held.
-fn pose_step(system: &System, damping: f64) -> Option<SVector<f64, NUM_UNKNOWNS>> {
+fn pose_step(system: &System, damping: f64) -> Option<Step> {
     let mut hessian = system.hessian;
     for i in 0..NUM_UNKNOWNS {
         hessian[(i, i)] = hessian[(i, i)] * (1.0 + damping) + f64::MIN_POSITIVE;
     }
     let step = hessian.cholesky()?.solve(&-system.gradient);
-    is_sane(&step).then_some(step)
+    Step::of_pose_alone(step, system)
 }
 
 /// The step of pose and brightness; the depths after it go to `trial_depths`.
-fn joint_step(
-    scratch: &mut FitScratch,
-    state: &State,
-    damping: f64,
-) -> Option<SVector<f64, NUM_UNKNOWNS>> {
+fn joint_step(scratch: &mut FitScratch, state: &State, damping: f64) -> Option<Step> {
     let (system, elimination) = (&scratch.system, &mut scratch.elimination);
     elimination.damping_factor = 1.0 + damping as f32;
     let (inverse_depths, medians) = (&state.inverse_depths, &scratch.medians);
@@ -286,13 +295,21 @@ fn joint_step(
             hessian[(r, c)] -= elimination.sums.entry(r, c);
         }
     }
-    let step = hessian.cholesky()?.solve(&-gradient);
-    if !is_sane(&step) {
+    let of_pose = hessian.cholesky()?.solve(&-gradient);
+    if !is_sane(&of_pose) {
         return None;
     }
     let after = &mut scratch.trial_depths;
-    elimination.depths_after(system, &state.inverse_depths, &step, after);
-    Some(step)
+    let by_depths = elimination.depths_after(system, &state.inverse_depths, &of_pose, after);
+    Some(Step { of_pose, promised_drop: by_depths - system.gradient.dot(&of_pose) })
+}
+
+impl Step {
+    /// Depths held; `None` where it cannot be taken.
+    fn of_pose_alone(of_pose: SVector<f64, NUM_UNKNOWNS>, system: &System) -> Option<Self> {
+        let promised_drop = -system.gradient.dot(&of_pose);
+        is_sane(&of_pose).then_some(Self { of_pose, promised_drop })
+    }
 }
 
 /// Whether a step can be taken: finite and within what two frames in a row show.
