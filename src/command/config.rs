@@ -34,11 +34,7 @@ pub struct ConfigArguments {
 /// Runs it.
 pub fn run(common: &CommonArguments, arguments: &ConfigArguments) -> CommandResult {
     let keys = Config::keys_in_force(common.file().as_deref(), &common.settings())?;
-    let is_wanted = |key: &&KeyInForce| match arguments.changed {
-        true => key.built_in.is_some(),
-        false => arguments.all || !key.is_expert,
-    };
-    let wanted: Vec<_> = keys.iter().filter(is_wanted).collect();
+    let wanted = arguments.wanted(&keys);
     let text = match arguments.json {
         true => format!("{}\n", Value::Object(wanted.iter().map(|key| as_json(key)).collect())),
         false => as_toml(&wanted),
@@ -47,21 +43,33 @@ pub fn run(common: &CommonArguments, arguments: &ConfigArguments) -> CommandResu
     Ok(ExitCode::SUCCESS)
 }
 
-/// `key = value   # origin`, below the table that the key belongs to.
+impl ConfigArguments {
+    /// The keys that are printed.
+    fn wanted<'a>(&self, keys: &'a [KeyInForce]) -> Vec<&'a KeyInForce> {
+        let is_wanted = |key: &&KeyInForce| match self.changed {
+            true => key.built_in.is_some(),
+            false => self.all || !key.is_expert,
+        };
+        keys.iter().filter(is_wanted).collect()
+    }
+}
+
+/// `key = value   # origin`, below the table that the key belongs to. A table may be opened once, and keys of none
+/// must come before the first.
 fn as_toml(keys: &[&KeyInForce]) -> String {
     /// Column of the origins where lines are short enough.
     const ORIGIN_COLUMN: usize = 40;
-    let mut text = String::new();
-    let mut last_table = "";
+    let mut tables = vec![("", String::new())];
     for key in keys {
         let (table, name) = key.key.rsplit_once('.').unwrap_or(("", &key.key));
-        if table != last_table {
-            text += &format!("\n[{table}]\n");
-            last_table = table;
-        }
         let line = format!("{name} = {}", key.value);
-        text += &format!("{line:<ORIGIN_COLUMN$} # {}\n", origin(key));
+        let line = format!("{line:<ORIGIN_COLUMN$} # {}\n", origin(key));
+        match tables.iter_mut().find(|(known, _)| *known == table) {
+            Some((_, lines)) => *lines += &line,
+            None => tables.push((table, format!("\n[{table}]\n{line}"))),
+        }
     }
+    let text: String = tables.into_iter().map(|(_, lines)| lines).collect();
     match text.is_empty() {
         true => "# every value is the built-in one\n".to_owned(),
         false => text.trim_start().to_owned(),
@@ -95,4 +103,36 @@ fn as_json(key: &KeyInForce) -> (String, Value) {
         "origin": from,
     });
     (key.key.clone(), object)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_printed_can_be_saved_and_read_again() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("robot.toml");
+        std::fs::write(&file, "root = \"/tmp/robot\"\n[capture.camera]\nrate_hz = 15.0\n").unwrap();
+        let user = ["instance=front", "mapper.threads=2", "capture.scheduling.cpus=[0, 1]"];
+        let expert = ["capture.connect_timeout_s=7.5", "mapping.min_gradient=6.5"];
+        let texts = |keys: &[&str]| keys.iter().map(|&key| key.to_owned()).collect::<Vec<_>>();
+        let both = texts(&[&user[..], &expert].concat());
+        // Expert keys are printed on request alone.
+        for (all, changed, file, settings) in [
+            (false, false, Some(file.as_path()), texts(&user)),
+            (true, false, Some(file.as_path()), both.clone()),
+            (false, true, Some(file.as_path()), both),
+            (false, true, None, Vec::new()),
+        ] {
+            let keys = Config::keys_in_force(file, &settings).unwrap();
+            let arguments = ConfigArguments { all, changed, json: false };
+            let text = as_toml(&arguments.wanted(&keys));
+            let saved = folder.path().join("saved.toml");
+            std::fs::write(&saved, &text).unwrap();
+            let read = Config::load(Some(&saved), &[]);
+            let read = read.unwrap_or_else(|error| panic!("{error}\n{text}"));
+            assert_eq!(read, Config::load(file, &settings).unwrap(), "{text}");
+        }
+    }
 }
