@@ -35,32 +35,42 @@ def draw(axes: Any, positions: Any, keyframes: Any, title: str) -> None:
     axes.set_title(title)
 
 
+def with_gaps(positions: Any, epochs: Any) -> Any:
+    """A row of NaN where another epoch begins: it has another origin and unit, and no line leads there."""
+    begins = np.flatnonzero(np.diff(epochs)) + 1
+    return np.insert(positions, begins, np.nan, axis=0)
+
+
 def finished(folder: str, axes: Any) -> None:
     """A run that is over."""
     run = semidense.load(folder)
     if run.trajectory is None:
         raise semidense.BadRun(f"{run.folder}: no trajectory.txt")
     keyframes = np.array([k.world_from_keyframe.translation for k in run.keyframes]).reshape(-1, 3)
-    draw(axes, run.trajectory.positions, keyframes, f"{len(run.trajectory)} poses")
+    positions = with_gaps(run.trajectory.positions, run.trajectory.epochs)
+    draw(axes, positions, keyframes, f"{len(run.trajectory)} poses")
 
 
 def live(arguments: argparse.Namespace, axes: Any, plot: Any) -> None:
     """A run as it grows."""
     positions: List[Any] = []
+    epochs: List[int] = []
     begun = drawn = time.monotonic()
     for pose in semidense.poses(arguments.instance, timeout=arguments.timeout):
         if pose.is_tracked:
             positions.append(pose.map_from_camera.translation)
+            epochs.append(pose.epoch)
         now = time.monotonic()
         if arguments.seconds is not None and now - begun > arguments.seconds:
             break
         if positions and arguments.save is None and now - drawn > REDRAW_SECS:
             drawn = now
-            draw(axes, np.array(positions), [], f"{len(positions)} poses, {pose.state.name.lower()}")
+            path = with_gaps(np.array(positions), epochs)
+            draw(axes, path, [], f"{len(positions)} poses, {pose.state.name.lower()}")
             plot.pause(0.001)
             if not plot.fignum_exists(axes.figure.number):
                 return
-    draw(axes, np.array(positions).reshape(-1, 3), [], f"{len(positions)} poses")
+    draw(axes, with_gaps(np.array(positions).reshape(-1, 3), epochs), [], f"{len(positions)} poses")
 
 
 def main() -> None:

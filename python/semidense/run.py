@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from functools import cached_property
 from typing import Any, Dict, Iterator, List, Optional
 
@@ -17,19 +18,23 @@ from .ply import read_ply
 
 # What tells a folder of results from any other.
 FILES = ("summary.json", "trajectory.txt", "keyframes.txt", "map.ply")
+# Before the poses of each epoch, where there are several.
+EPOCH_MARK = re.compile(r"# epoch (\d{1,10}):")
 
 
 class Trajectory:
     """Poses over time. Iterating gives (seconds, `world_from_camera`)."""
 
-    def __init__(self, table: Floats) -> None:
-        """From rows of timestamp, tx, ty, tz, qx, qy, qz, qw."""
+    def __init__(self, table: Floats, epochs: Optional[npt.NDArray[np.int64]] = None) -> None:
+        """From rows of timestamp, tx, ty, tz, qx, qy, qz, qw, and the epoch of each."""
         self.times: Floats = table[:, 0]
         """Seconds, of the source's clock."""
         self.positions: Floats = table[:, 1:4]
         """N×3, map units."""
         self.quaternions: Floats = table[:, 4:8]
         """N×4: x, y, z, w."""
+        self.epochs = np.zeros(len(table), dtype=np.int64) if epochs is None else epochs
+        """N: poses of different epochs have different origins and units of length; all 0 where the file marks none."""
 
     def __len__(self) -> int:
         """How many poses there are."""
@@ -105,15 +110,18 @@ class Run:
     def _path(self, name: str) -> str:
         return os.path.join(self.folder, name)
 
-    def _lines(self, name: str) -> Optional[List[List[str]]]:
+    def _text(self, name: str) -> Optional[List[str]]:
         try:
             with open(self._path(name), encoding="utf-8") as file:
-                lines = [line.split() for line in file if line.strip() and not line.startswith("#")]
+                return [line for line in file if line.strip()]
         except FileNotFoundError:
             return None
         except UnicodeDecodeError as error:
             raise BadRun(f"{self._path(name)}: {error}") from None
-        return lines
+
+    def _lines(self, name: str) -> Optional[List[List[str]]]:
+        text = self._text(name)
+        return None if text is None else [line.split() for line in text if not line.startswith("#")]
 
     def _trajectory(self, name: str) -> Optional[Trajectory]:
         lines = self._lines(name)
@@ -127,7 +135,17 @@ class Run:
                 raise BadRun(
                     f"{self._path(name)}: pose {index + 1} is not `timestamp tx ty tz qx qy qz qw`: {' '.join(line)[:80]}"
                 ) from None
-        return Trajectory(rows)
+        return Trajectory(rows, self._epochs(name))
+
+    def _epochs(self, name: str) -> npt.NDArray[np.int64]:
+        epoch, epochs = 0, []
+        for line in self._text(name) or []:
+            mark = EPOCH_MARK.match(line)
+            if mark is not None:
+                epoch = int(mark.group(1))
+            elif not line.startswith("#"):
+                epochs.append(epoch)
+        return np.array(epochs, dtype=np.int64)
 
     @cached_property
     def summary(self) -> Dict[str, Any]:

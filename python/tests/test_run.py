@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -75,6 +76,34 @@ def test_broken_files_are_named(tmp_path: Path, name: str, text: str, attribute:
     (tmp_path / name).write_text(text)
     with pytest.raises(semidense.BadRun, match=name):
         getattr(semidense.load(tmp_path), attribute)
+
+
+EPOCHS = """# map_from_camera of every tracked frame
+# timestamp tx ty tz qx qy qz qw
+# epoch 0: an origin and a unit of length of its own
+1 0 0 0 0 0 0 1
+2 1 0 0 0 0 0 1
+# epoch 2: an origin and a unit of length of its own
+3 9 0 0 0 0 0 1
+"""
+
+
+def test_poses_know_their_epoch(tmp_path: Path) -> None:
+    (tmp_path / "trajectory.txt").write_text(EPOCHS)
+    # Of one epoch nothing is marked.
+    unmarked = "".join(line + "\n" for line in EPOCHS.splitlines() if "epoch" not in line)
+    (tmp_path / "trajectory_online.txt").write_text(unmarked)
+    run = semidense.load(tmp_path)
+    assert run.trajectory is not None and run.trajectory_online is not None
+    assert run.trajectory.epochs.tolist() == [0, 0, 2] and len(run.trajectory) == 3
+    assert run.trajectory_online.epochs.tolist() == [0, 0, 0]
+
+
+def test_the_example_leaves_a_gap_between_epochs() -> None:
+    example = runpy.run_path(str(REPOSITORY / "python" / "examples" / "trajectory.py"))
+    path = example["with_gaps"](np.arange(9.0).reshape(3, 3), [0, 0, 2])
+    assert np.isnan(path).all(axis=1).tolist() == [False, False, True, False]
+    assert len(example["with_gaps"](np.zeros((0, 3)), [])) == 0
 
 
 def test_ply_in_text_and_in_both_orders(tmp_path: Path) -> None:

@@ -49,7 +49,7 @@ use crate::service::results::report::report;
 use crate::service::results::results_error::ResultsError;
 use crate::service::results::set::ResultSet;
 use crate::service::results::summary::PointCounts;
-use crate::service::trajectory_file::write_trajectory;
+use crate::service::trajectory_file::write_epochs;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::evaluation::umeyama::TrajectoryAlignment;
 use crate::slam::evaluation::{MAX_DIFFERENCE_NANOS, TrajectoryEvaluation, evaluate_trajectory};
@@ -133,7 +133,7 @@ impl<'a> Results<'a> {
     ) -> Result<Self, ResultsError> {
         // Files hold every epoch; figures and pictures are of the longest.
         let epoch = poses::longest_epoch(record);
-        let trajectory = poses::final_trajectory(record, epoch);
+        let trajectory = poses::of_epoch(&poses::final_poses(record), epoch);
         let online = poses::online_trajectory(record, epoch);
         let evaluate = |estimate: &[StampedPose]| {
             // Poses that were given have no error.
@@ -201,10 +201,10 @@ impl<'a> Results<'a> {
             write(&set.folder().join(name)).map_err(|source| failed(dir.join(name), source))
         };
         write("trajectory.txt", &|path| {
-            write_trajectory(path, poses::FINAL_COMMENT, &poses::final_trajectory(record, None))
+            write_epochs(path, poses::FINAL_COMMENT, &poses::final_poses(record))
         })?;
         write("trajectory_online.txt", &|path| {
-            write_trajectory(path, poses::ONLINE_COMMENT, &poses::online_trajectory(record, None))
+            write_epochs(path, poses::ONLINE_COMMENT, &poses::online_poses(record))
         })?;
         write("keyframes.txt", &|path| poses::write_keyframes(path, &record.map))?;
         write("map.ply", &|path| ply::write_surface(path, &self.surface))?;

@@ -222,10 +222,38 @@ pub fn tum_line(pose: &StampedPose) -> String {
 /// Writes a trajectory in TUM layout. `comment` is one line without the `#`.
 pub fn write_trajectory(path: &Path, comment: &str, poses: &[StampedPose]) -> io::Result<()> {
     write_atomically(path, |file| {
-        writeln!(file, "# {comment}")?;
-        writeln!(file, "# timestamp tx ty tz qx qy qz qw")?;
+        write_head(file, comment)?;
         poses.iter().try_for_each(|pose| writeln!(file, "{}", tum_line(pose)))
     })
+}
+
+/// A pose, and the epoch whose origin and unit of length it has.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct EpochPose {
+    /// The epoch.
+    pub epoch: u32,
+    /// The pose.
+    pub pose: StampedPose,
+}
+
+/// Writes what [`write_trajectory`] does; of several epochs each begins with a comment, `# epoch N: …`.
+pub fn write_epochs(path: &Path, comment: &str, poses: &[EpochPose]) -> io::Result<()> {
+    let is_one = poses.windows(2).all(|pair| pair[0].epoch == pair[1].epoch);
+    write_atomically(path, |file| {
+        write_head(file, comment)?;
+        let mut epoch = None;
+        poses.iter().try_for_each(|of| {
+            if !is_one && epoch.replace(of.epoch) != Some(of.epoch) {
+                writeln!(file, "# epoch {}: an origin and a unit of length of its own", of.epoch)?;
+            }
+            writeln!(file, "{}", tum_line(&of.pose))
+        })
+    })
+}
+
+fn write_head(file: &mut dyn Write, comment: &str) -> io::Result<()> {
+    writeln!(file, "# {comment}")?;
+    writeln!(file, "# timestamp tx ty tz qx qy qz qw")
 }
 
 #[cfg(test)]

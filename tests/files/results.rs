@@ -13,6 +13,7 @@ use semidense::slam::map::{ConfirmedPoint, PlacedFrame};
 use semidense::slam::mapper::consistency::Contradiction;
 use semidense::slam::pose::{DegradedReason, LostReason, TrackingState};
 use semidense::slam::window::Adjustment;
+use std::path::Path;
 
 #[test]
 fn frames_aligned_afterwards_count_where_the_map_was_tracked_on() {
@@ -216,6 +217,54 @@ fn of_several_epochs_the_longest_is_judged_and_all_are_written() {
     assert!((summary["ate_scale"].as_f64().unwrap() - UNIT_M / 3.0).abs() < 1e-9);
     assert!(report.contains("Position error"));
     assert_eq!(read_trajectory(&folder.path().join("trajectory.txt")).unwrap().len(), 60);
+}
+
+/// Number of poses of each epoch of a trajectory file, in the order of its comments.
+fn poses_by_epoch(path: &Path) -> Vec<(String, usize)> {
+    let mut parts: Vec<(String, usize)> = vec![(String::new(), 0)];
+    for line in std::fs::read_to_string(path).unwrap().lines().skip(2) {
+        match line.strip_prefix("# epoch ").and_then(|rest| rest.split_once(':')) {
+            Some((epoch, _)) => parts.push((epoch.to_owned(), 0)),
+            None => parts.last_mut().unwrap().1 += 1,
+        }
+    }
+    parts.retain(|(_, poses)| *poses > 0);
+    parts
+}
+
+#[test]
+fn trajectories_say_where_another_epoch_begins() {
+    let epoch_of = |i: usize| if (20..40).contains(&i) { 1 } else { 0 };
+    let state = |i| match i {
+        15..20 => TrackingState::Lost(LostReason::TooFewInliers),
+        _ => TrackingState::Tracking,
+    };
+    let mut poses: Vec<_> = (0..60).map(|i| pose(i, state(i), 0)).collect();
+    for (i, pose) in poses.iter_mut().enumerate() {
+        pose.estimate.epoch = epoch_of(i);
+        pose.estimate.keyframe_id = u64::from(epoch_of(i));
+    }
+    let mut record = record(poses, vec![keyframe(0), keyframe(1)], false);
+    // Two frames before the second epoch are aligned to it afterwards.
+    record.map.keyframes[1].epoch = 1;
+    for sequence in 18..20 {
+        let keyframe_from_camera = SE3::identity();
+        record.map.place_frame(&PlacedFrame { sequence, keyframe_id: 1, keyframe_from_camera });
+    }
+    let part = |epoch: &str, poses: usize| (epoch.to_owned(), poses);
+    let parts = |record: &RunRecord| {
+        let folder = tempfile::tempdir().unwrap();
+        written(folder.path(), record);
+        ["trajectory.txt", "trajectory_online.txt"]
+            .map(|name| poses_by_epoch(&folder.path().join(name)))
+    };
+    // Odometry stays in the second world when the first epoch is taken up again.
+    let online = vec![part("0", 15), part("1", 40)];
+    let apart = vec![part("0", 15), part("1", 22), part("0", 20)];
+    assert_eq!(parts(&record), [apart, online.clone()]);
+    // Joined to the first in the end: one map.
+    record.map.keyframes[1].epoch = 0;
+    assert_eq!(parts(&record), [vec![part("", 57)], online]);
 }
 
 #[test]

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use crate::service::atomic_file::write_atomically;
 use crate::service::results::record::{RecordedPose, RunRecord};
-use crate::service::trajectory_file::tum_line;
+use crate::service::trajectory_file::{EpochPose, tum_line};
 use crate::slam::evaluation::MAX_DIFFERENCE_NANOS;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::evaluation::normalized_error::{
@@ -34,11 +34,11 @@ pub fn longest_epoch(record: &RunRecord) -> Option<u32> {
     frames.into_iter().rev().max_by_key(|&(_, count)| count).map(|(epoch, _)| epoch)
 }
 
-/// Every frame with a pose, of one epoch or of all, on the final place of its keyframe, in the map: frames that were
-/// tracked, and those that came before their map began and were aligned to it afterwards. A tracked frame whose
-/// keyframe the final map does not hold keeps its published place. None where no frame was tracked when it came: a map
-/// that began with the last frames is unproven.
-pub fn final_trajectory(record: &RunRecord, epoch: Option<u32>) -> Vec<StampedPose> {
+/// Every frame with a pose, on the final place of its keyframe, in the map, with the epoch that it belongs to in the end:
+/// frames that were tracked, and those that came before their map began and were aligned to it afterwards. A tracked frame
+/// whose keyframe the final map does not hold keeps its published place. None where no frame was tracked when it came: a
+/// map that began with the last frames is unproven.
+pub fn final_poses(record: &RunRecord) -> Vec<EpochPose> {
     if !is_any_tracked(&record.poses) {
         return Vec::new();
     }
@@ -51,16 +51,19 @@ pub fn final_trajectory(record: &RunRecord, epoch: Option<u32>) -> Vec<StampedPo
             None if !estimate.state.is_tracked() => return None,
             None => (estimate.keyframe_id, &estimate.keyframe_from_camera),
         };
-        let (of, place) = match places.get(&keyframe_id) {
+        let (epoch, place) = match places.get(&keyframe_id) {
             Some(keyframe) => (keyframe.epoch, keyframe.map_from_keyframe.place(at)),
             None => (estimate.epoch, estimate.map_from_camera),
         };
-        let nanos = estimate.capture_nanos;
-        epoch
-            .is_none_or(|epoch| of == epoch)
-            .then_some(StampedPose { nanos, world_from_camera: place })
+        let pose = StampedPose { nanos: estimate.capture_nanos, world_from_camera: place };
+        Some(EpochPose { epoch, pose })
     });
     with_pose.collect()
+}
+
+/// The poses of one epoch; none of no epoch.
+pub fn of_epoch(poses: &[EpochPose], epoch: Option<u32>) -> Vec<StampedPose> {
+    poses.iter().filter(|of| Some(of.epoch) == epoch).map(|of| of.pose).collect()
 }
 
 /// Frames that came before their map began and were aligned to it afterwards.
@@ -83,18 +86,28 @@ fn final_epoch(record: &RunRecord, estimate: &PoseEstimate) -> u32 {
     record.map.get(estimate.keyframe_id).map_or(estimate.epoch, |keyframe| keyframe.epoch)
 }
 
-/// Every tracked frame, of one epoch or of all, as it was published.
+/// Every tracked frame of one epoch as it was published.
 pub fn online_trajectory(record: &RunRecord, epoch: Option<u32>) -> Vec<StampedPose> {
-    let estimates = record.poses.iter().map(|pose| &pose.estimate);
-    let in_epoch =
-        |estimate: &&PoseEstimate| epoch.is_none_or(|epoch| final_epoch(record, estimate) == epoch);
-    let tracked = estimates.filter(|estimate| estimate.state.is_tracked()).filter(in_epoch);
-    tracked
-        .map(|estimate| StampedPose {
-            nanos: estimate.capture_nanos,
-            world_from_camera: estimate.world_from_camera,
-        })
-        .collect()
+    let estimates = tracked(record).filter(|of| Some(final_epoch(record, of)) == epoch);
+    estimates.map(in_world).collect()
+}
+
+/// Every tracked frame as it was published, with the epoch that its world began with.
+pub fn online_poses(record: &RunRecord) -> Vec<EpochPose> {
+    let with_epoch = tracked(record).scan(0, |newest, estimate| {
+        // Where an epoch is joined to an older one, or an older one is taken up again, odometry stays where it is.
+        *newest = estimate.epoch.max(*newest);
+        Some(EpochPose { epoch: *newest, pose: in_world(estimate) })
+    });
+    with_epoch.collect()
+}
+
+fn tracked(record: &RunRecord) -> impl Iterator<Item = &PoseEstimate> {
+    record.poses.iter().map(|pose| &pose.estimate).filter(|of| of.state.is_tracked())
+}
+
+fn in_world(estimate: &PoseEstimate) -> StampedPose {
+    StampedPose { nanos: estimate.capture_nanos, world_from_camera: estimate.world_from_camera }
 }
 
 /// Errors of the tracked frames of one epoch against their covariance, on their keyframes, in the map and of their
