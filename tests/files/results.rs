@@ -268,6 +268,41 @@ fn trajectories_say_where_another_epoch_begins() {
 }
 
 #[test]
+fn frames_that_got_their_pose_afterwards_are_not_lost_and_their_epoch_counts() {
+    let state = |i| match i {
+        40.. => TrackingState::Lost(LostReason::TooFewInliers),
+        _ => TrackingState::Tracking,
+    };
+    let poses = (0..60).map(|i| pose(i, state(i), 0)).collect();
+    let mut record = record(poses, vec![keyframe(0), keyframe(1)], false);
+    // A second epoch began with the last frames: none was tracked on it when it came.
+    record.map.keyframes[1].epoch = 1;
+    for sequence in 50..60 {
+        let keyframe_from_camera = SE3::identity();
+        record.map.place_frame(&PlacedFrame { sequence, keyframe_id: 1, keyframe_from_camera });
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let (summary, report) = written(folder.path(), &record);
+    let path = folder.path().join("trajectory.txt");
+    assert_eq!(poses_by_epoch(&path), [("0".to_owned(), 40), ("1".to_owned(), 10)]);
+    for (key, value) in [
+        ("frames_tracked", 50),
+        ("frames_tracked_later", 10),
+        ("frames_lost", 10),
+        ("lost_count", 1),
+        ("epochs", 2),
+    ] {
+        assert_eq!(summary[key], value, "{key}");
+    }
+    let reasons = summary["grade"]["reasons"].to_string();
+    assert!(reasons.contains("for 16.7 % of the frames"), "{reasons}");
+    assert!(report.contains("for 16.7 % of the frames"));
+    // Joined to the first, it is none of its own.
+    record.map.keyframes[1].epoch = 0;
+    assert_eq!(written(folder.path(), &record).0["epochs"], 1);
+}
+
+#[test]
 fn a_run_without_truth_keyframes_or_a_tracked_frame_is_reported_too() {
     let folder = tempfile::tempdir().unwrap();
     for frames in [0, 1, 5] {
@@ -284,7 +319,10 @@ fn a_run_without_truth_keyframes_or_a_tracked_frame_is_reported_too() {
 fn what_was_given_is_not_judged_as_if_it_was_estimated() {
     let poses = |epochs: u32| {
         let mut poses: Vec<_> = (0..60).map(|i| pose(i, TrackingState::Tracking, 0)).collect();
-        poses[30..].iter_mut().for_each(|pose| pose.estimate.epoch = epochs - 1);
+        for pose in &mut poses[30..] {
+            // On a keyframe of its own, which the map does not hold.
+            (pose.estimate.epoch, pose.estimate.keyframe_id) = (epochs - 1, 1);
+        }
         poses
     };
     let of = |record: &RunRecord| written(tempfile::tempdir().unwrap().path(), record).0;

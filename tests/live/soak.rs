@@ -307,7 +307,11 @@ impl Rigged {
         let summary: Value = serde_json::from_str(&summary).unwrap();
         let of = |name: &str| summary[name].as_u64().unwrap();
         assert!(of("frames_in") >= of("frames_tracked") + of("frames_initializing"), "{summary}");
-        assert_eq!(of("epochs"), epochs.len() as u64, "epochs are counted: {epochs:?}");
+        // Epochs that were joined are one in the end.
+        assert!(
+            (1..=epochs.len() as u64).contains(&of("epochs")),
+            "epochs are counted: {epochs:?}"
+        );
     }
 }
 

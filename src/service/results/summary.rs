@@ -10,7 +10,7 @@ use crate::service::results::depth_maps::DepthEvaluation;
 use crate::service::results::joint::JointSummary;
 use crate::service::results::loops::LoopSummary;
 use crate::service::results::output_folder::utc_text;
-use crate::service::results::poses::{longest_epoch, placed_later};
+use crate::service::results::poses::{final_poses, longest_epoch, placed_later};
 use crate::service::results::record::{
     EndOfRun, RecordedPose, Rejection, RestartCause, RunMode, RunRecord,
 };
@@ -24,7 +24,7 @@ use crate::slam::evaluation::map_consistency::MapConsistency;
 use crate::slam::evaluation::normalized_error::NormalizedErrors;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::map::Map;
-use crate::slam::pose::{PoseEstimate, TrackingState};
+use crate::slam::pose::TrackingState;
 
 /// How many points there are, and what it took to fuse them.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
@@ -175,22 +175,23 @@ pub struct FrameCounts {
     pub frames_degraded: u64,
     /// Frames before the map could be trusted that have none.
     pub frames_initializing: u64,
-    /// Frames whose pose is not claimed.
+    /// Frames that have none because tracking was lost.
     pub frames_lost: u64,
 }
 
 impl FrameCounts {
     fn of(poses: &[RecordedPose], map: &Map) -> Self {
         let count = |is: fn(TrackingState) -> bool| count_states(poses, is);
-        let later = || placed_later(poses, map);
-        let is_initializing = |of: &&PoseEstimate| of.state == TrackingState::Initializing;
-        let initializing = count(|s| s == TrackingState::Initializing);
+        let later: Vec<TrackingState> = placed_later(poses, map).map(|of| of.state).collect();
+        let without_pose = |is: fn(TrackingState) -> bool| {
+            count(is) - later.iter().filter(|state| is(**state)).count() as u64
+        };
         Self {
-            frames_tracked: count(TrackingState::is_tracked) + later().count() as u64,
-            frames_tracked_later: later().count() as u64,
+            frames_tracked: count(TrackingState::is_tracked) + later.len() as u64,
+            frames_tracked_later: later.len() as u64,
             frames_degraded: count(|s| matches!(s, TrackingState::Degraded(_))),
-            frames_initializing: initializing - later().filter(is_initializing).count() as u64,
-            frames_lost: count(is_lost),
+            frames_initializing: without_pose(|s| s == TrackingState::Initializing),
+            frames_lost: without_pose(is_lost),
         }
     }
 }
@@ -246,7 +247,7 @@ pub struct Summary {
     pub point_counts: PointCounts,
     /// Life of the map at the end, from 0.
     pub epoch: u32,
-    /// Epochs with tracked frames.
+    /// Epochs of the poses in `trajectory.txt`.
     pub epochs: u64,
     /// The epoch that is compared with ground truth: the one with the most tracked frames. Each epoch
     /// has a frame and a scale of its own; `matched_poses` says how many frames its figures cover.
@@ -364,7 +365,7 @@ impl Summary {
             keyframes_without_depth: without_depth(&record.map),
             point_counts: points,
             epoch: record.poses.last().map_or(0, |pose| pose.estimate.epoch),
-            epochs: count_epochs(&record.poses),
+            epochs: count_epochs(record),
             evaluated_epoch: trajectory.and_then(|_| longest_epoch(record)),
             send_ms: record.send_counts.as_ref().and_then(Percentiles::of_counts),
             latency: LatencySummary::of(&record.poses),
@@ -420,11 +421,12 @@ fn grade(record: &RunRecord) -> Grade {
     let sequences = record.poses.iter().map(|pose| pose.estimate.sequence);
     let (first, last) = (sequences.clone().min(), sequences.max());
     let frames = last.zip(first).map_or(0, |(last, first)| last - first + 1);
+    let counts = FrameCounts::of(&record.poses, &record.map);
     Grade::of(&GradeInput {
-        frames_tracked: count_states(&record.poses, TrackingState::is_tracked),
-        frames_lost: count_states(&record.poses, is_lost),
+        frames_tracked: counts.frames_tracked,
+        frames_lost: counts.frames_lost,
         losses: count_losses(&record.poses),
-        epochs: count_epochs(&record.poses),
+        epochs: count_epochs(record),
         are_poses_given: record.depth_scale == DepthScale::Given,
         rejections: record.rejections.as_ref().map_or(0, |all| all.len() as u64),
         frames,
@@ -447,9 +449,9 @@ fn count_states(poses: &[RecordedPose], is: fn(TrackingState) -> bool) -> u64 {
     poses.iter().filter(|pose| is(pose.estimate.state)).count() as u64
 }
 
-fn count_epochs(poses: &[RecordedPose]) -> u64 {
-    let tracked = poses.iter().filter(|pose| pose.estimate.state.is_tracked());
-    tracked.map(|pose| pose.estimate.epoch).collect::<BTreeSet<_>>().len() as u64
+/// Epochs of the poses that are written: one that was joined to another is no epoch of its own.
+fn count_epochs(record: &RunRecord) -> u64 {
+    final_poses(record).iter().map(|of| of.epoch).collect::<BTreeSet<_>>().len() as u64
 }
 
 /// Entries into Lost.

@@ -125,7 +125,7 @@ fn frames(summary: &Summary) -> String {
         Some(frames) => format!(", {frames} skipped by the mapper"),
     };
     let lost = match (summary.frames.frames_lost, summary.lost_count) {
-        (0, _) => "never lost".to_owned(),
+        (0, 0) => "never lost".to_owned(),
         (frames, 0 | 1) => format!("{frames} lost"),
         (frames, times) => format!("{frames} lost ({times} times)"),
     };
@@ -193,4 +193,47 @@ fn run(summary: &Summary) -> String {
         let _ = write!(text, ", {memory:.0} MB");
     }
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::service::results::depth_maps::DepthEvaluation;
+    use crate::service::results::record::RunRecord;
+    use crate::service::results::summary::PointCounts;
+    use crate::service::results::untracked::tests::record;
+    use crate::slam::geometry::intrinsics::Intrinsics;
+    use crate::slam::geometry::se3::SE3;
+    use crate::slam::geometry::sim3::Sim3;
+    use crate::slam::keyframe::Keyframe;
+    use crate::slam::map::PlacedFrame;
+    use crate::slam::pose::{LostReason, TrackingState};
+
+    const LOST: TrackingState = TrackingState::Lost(LostReason::TooFewInliers);
+
+    /// A run of 60 frames, the first ten before the map, with a map of one keyframe.
+    fn run(state: TrackingState) -> RunRecord {
+        let mut record = record(60, 60, state);
+        let camera = Intrinsics::pinhole(8, 6, 8.0);
+        let keyframe = Keyframe::at(Sim3::identity(), camera, Vec::new(), vec![0; 8 * 6]);
+        record.map.keyframes.push(Keyframe { keyframe_id: 3, ..keyframe });
+        record
+    }
+
+    fn summary(record: &RunRecord) -> Summary {
+        let (points, depth) = (PointCounts::default(), DepthEvaluation::default());
+        Summary::new(record, points, None, None, [None; 3], depth)
+    }
+
+    #[test]
+    fn every_frame_is_counted_once() {
+        let mut record = run(TrackingState::Tracking);
+        record.poses[40..].iter_mut().for_each(|pose| pose.estimate.state = LOST);
+        for sequence in 50..60 {
+            let keyframe_from_camera = SE3::identity();
+            record.map.place_frame(&PlacedFrame { sequence, keyframe_id: 3, keyframe_from_camera });
+        }
+        let text = summary_text(&summary(&record));
+        assert!(text.contains(" 60 in, 40 tracked (10 of them afterwards), 10 lost, "), "{text}");
+    }
 }

@@ -51,9 +51,9 @@ impl GradeLevel {
 /// What a grade is made from.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct GradeInput {
-    /// Frames whose pose is claimed.
+    /// Frames with a pose, claimed when they came or found afterwards.
     pub frames_tracked: u64,
-    /// Frames whose pose is not claimed.
+    /// Frames without one because tracking was lost.
     pub frames_lost: u64,
     /// How often tracking was lost.
     pub losses: u64,
