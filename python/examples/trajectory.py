@@ -46,7 +46,7 @@ def finished(folder: str, axes: Any) -> None:
     run = semidense.load(folder)
     if run.trajectory is None:
         raise semidense.BadRun(f"{run.folder}: no trajectory.txt")
-    keyframes = np.array([k.world_from_keyframe.translation for k in run.keyframes]).reshape(-1, 3)
+    keyframes = np.array([k.map_from_keyframe.translation for k in run.keyframes]).reshape(-1, 3)
     positions = with_gaps(run.trajectory.positions, run.trajectory.epochs)
     draw(axes, positions, keyframes, f"{len(run.trajectory)} poses")
 

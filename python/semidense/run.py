@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import warnings
 from functools import cached_property
 from typing import Any, Dict, Iterator, List, Optional
 
@@ -23,7 +24,10 @@ EPOCH_MARK = re.compile(r"# epoch (\d{1,10}):")
 
 
 class Trajectory:
-    """Poses over time. Iterating gives (seconds, `world_from_camera`)."""
+    """Poses over time: `map_from_camera` of a final trajectory, `world_from_camera` of the online one.
+
+    Iterating gives (seconds, pose).
+    """
 
     def __init__(self, table: Floats, epochs: Optional[npt.NDArray[np.int64]] = None) -> None:
         """From rows of timestamp, tx, ty, tz, qx, qy, qz, qw, and the epoch of each."""
@@ -41,11 +45,11 @@ class Trajectory:
         return len(self.times)
 
     def __getitem__(self, index: int) -> Transform:
-        """`world_from_camera` of one."""
+        """One pose."""
         return Transform(self.quaternions[index], self.positions[index])
 
     def __iter__(self) -> Iterator[Any]:
-        """(seconds, `world_from_camera`) of each."""
+        """(seconds, pose) of each."""
         return ((float(self.times[index]), self[index]) for index in range(len(self)))
 
     def matrices(self) -> Floats:
@@ -61,16 +65,22 @@ class Trajectory:
 class RunKeyframe:
     """A keyframe of a finished run."""
 
-    def __init__(self, run: Run, time: float, world_from_keyframe: Transform, numbers: List[str]) -> None:
+    def __init__(self, run: Run, time: float, map_from_keyframe: Transform, numbers: List[str]) -> None:
         """From its line in keyframes.txt."""
         self._run = run
         self.time = time
         """Seconds, of the source's clock."""
-        self.world_from_keyframe = world_from_keyframe
+        self.map_from_keyframe = map_from_keyframe
         """Final pose; the scale is the keyframe's unit in map units."""
         self.keyframe_id, self.sequence, self.epoch, self.num_points = (int(number) for number in numbers[:4])
         self.state = numbers[4] if len(numbers) > 4 else ""
         """What the mapper thought of it."""
+
+    @property
+    def world_from_keyframe(self) -> Transform:
+        """Deprecated name of `map_from_keyframe`."""
+        warnings.warn("world_from_keyframe is map_from_keyframe now", DeprecationWarning, stacklevel=2)
+        return self.map_from_keyframe
 
     @property
     def points(self) -> npt.NDArray[np.void]:
@@ -87,7 +97,7 @@ class RunKeyframe:
         """Depth of each of its `points` along its optical axis, map units."""
         points = self.points
         positions = np.column_stack([points[axis] for axis in "xyz"]).astype(np.float64)
-        rigid = Transform(self.world_from_keyframe.quaternion, self.world_from_keyframe.translation)
+        rigid = Transform(self.map_from_keyframe.quaternion, self.map_from_keyframe.translation)
         depths: Floats = (rigid.inverse() @ positions)[:, 2]
         return depths
 
@@ -163,12 +173,12 @@ class Run:
 
     @cached_property
     def trajectory(self) -> Optional[Trajectory]:
-        """Final pose of every tracked frame."""
+        """Final pose of every tracked frame, `map_from_camera`."""
         return self._trajectory("trajectory.txt")
 
     @cached_property
     def trajectory_online(self) -> Optional[Trajectory]:
-        """The poses as they were published."""
+        """The poses as they were published, `world_from_camera`."""
         return self._trajectory("trajectory_online.txt")
 
     @cached_property

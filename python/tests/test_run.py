@@ -99,6 +99,14 @@ def test_poses_know_their_epoch(tmp_path: Path) -> None:
     assert run.trajectory_online.epochs.tolist() == [0, 0, 0]
 
 
+def test_the_old_name_of_a_keyframes_pose_is_deprecated(tmp_path: Path) -> None:
+    (tmp_path / "keyframes.txt").write_text("1 2 3 4 0 0 0 1 0.5 7 9 0 100 Established\n")
+    (keyframe,) = semidense.load(tmp_path).keyframes
+    assert keyframe.map_from_keyframe.translation.tolist() == [2.0, 3.0, 4.0]
+    with pytest.warns(DeprecationWarning, match="map_from_keyframe"):
+        assert keyframe.world_from_keyframe is keyframe.map_from_keyframe
+
+
 def test_the_example_leaves_a_gap_between_epochs() -> None:
     example = runpy.run_path(str(REPOSITORY / "python" / "examples" / "trajectory.py"))
     path = example["with_gaps"](np.arange(9.0).reshape(3, 3), [0, 0, 2])

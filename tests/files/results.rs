@@ -88,6 +88,13 @@ fn figures_and_files_of_a_run_with_truth_and_a_loss() {
     assert_eq!(summary["depth_pixels"], 40);
     assert!(report.contains("Position error") && report.contains("data:image/png"));
 
+    for (name, pose) in [
+        ("trajectory.txt", "# map_from_camera of"),
+        ("trajectory_online.txt", "# world_from_camera of"),
+        ("keyframes.txt", "# map_from_keyframe;"),
+    ] {
+        assert!(std::fs::read_to_string(dir.join(name)).unwrap().starts_with(pose), "{name}");
+    }
     let last = read_trajectory(&dir.join("trajectory.txt")).unwrap()[53];
     assert_eq!(last.nanos, nanos(59));
     let online = read_trajectory(&dir.join("trajectory_online.txt")).unwrap()[53];

@@ -19,7 +19,7 @@ use crate::slam::trajectory::StampedPose;
 
 /// First line of `trajectory.txt`.
 pub const FINAL_COMMENT: &str =
-    "world_from_camera of every tracked frame: final pose of its keyframe x relative pose";
+    "map_from_camera of every tracked frame: final pose of its keyframe x relative pose";
 
 /// First line of `trajectory_online.txt`.
 pub const ONLINE_COMMENT: &str = "world_from_camera of every tracked frame as it was published";
@@ -136,7 +136,7 @@ pub fn normalized_errors_of(
 /// Writes one line for each keyframe: its pose as in a TUM file, then what a map needs besides.
 pub fn write_keyframes(path: &Path, map: &Map) -> io::Result<()> {
     write_atomically(path, |file| {
-        writeln!(file, "# world_from_keyframe; lengths in the keyframe x scale = map units")?;
+        writeln!(file, "# map_from_keyframe; lengths in the keyframe x scale = map units")?;
         writeln!(
             file,
             "# timestamp tx ty tz qx qy qz qw scale keyframe_id sequence epoch points state"

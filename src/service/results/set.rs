@@ -17,9 +17,9 @@ use crate::service::results::{full_points, pcd};
 /// Files of every set, with what each begins with: a file of that name that begins otherwise is the user's.
 const FILES: [(&str, &str); 7] = [
     ("summary.json", "{\n  \"mode\": \""),
-    ("trajectory.txt", "# world_from_camera of every tracked frame"),
+    ("trajectory.txt", "# map_from_camera of every tracked frame"),
     ("trajectory_online.txt", "# world_from_camera of every tracked frame"),
-    ("keyframes.txt", "# world_from_keyframe; lengths in the keyframe"),
+    ("keyframes.txt", "# map_from_keyframe; lengths in the keyframe"),
     ("map.ply", "ply\nformat binary_little_endian 1.0\ncomment x y z in map units"),
     ("points.ply", "ply\nformat binary_little_endian 1.0\ncomment points of the joint estimation"),
     ("report.html", "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">"),
@@ -27,6 +27,11 @@ const FILES: [(&str, &str); 7] = [
 /// Files of sets for which they were asked, likewise.
 const ON_REQUEST: [(&str, &str); 2] =
     [("map.pcd", pcd::BEGINNING), ("points-full.ply", full_points::BEGINNING)];
+/// How files of earlier versions begin: they are ours too.
+const EARLIER: [(&str, &str); 2] = [
+    ("trajectory.txt", "# world_from_camera of every tracked frame"),
+    ("keyframes.txt", "# world_from_keyframe; lengths in the keyframe"),
+];
 /// The file that is moved up first: as long as it is still aside, the files of the set before are in place.
 const FIRST: &str = FILES[0].0;
 /// Folder of pictures for whoever works on the algorithms, in sets that have them.
@@ -96,7 +101,10 @@ pub fn finish_commit(output: &Path) -> io::Result<bool> {
 pub fn foreign_file(output: &Path) -> io::Result<Option<PathBuf>> {
     for (name, beginning) in FILES.into_iter().chain(ON_REQUEST) {
         let path = output.join(name);
-        if fs::symlink_metadata(&path).is_ok() && !begins_with(&path, beginning)? {
+        if fs::symlink_metadata(&path).is_ok()
+            && !begins_with(&path, beginning)?
+            && !begins_as_earlier(&path, name)?
+        {
             return Ok(Some(path));
         }
     }
@@ -129,6 +137,11 @@ pub fn has_tracked_set(output: &Path) -> bool {
 pub fn has_set_since(output: &Path, time: SystemTime) -> bool {
     let written = fs::metadata(output.join(FILES[0].0)).and_then(|found| found.modified());
     has_set(output) && written.is_ok_and(|written| written > time)
+}
+
+fn begins_as_earlier(path: &Path, name: &str) -> io::Result<bool> {
+    let earlier = EARLIER.iter().find(|(of, _)| *of == name);
+    earlier.map_or(Ok(false), |(_, beginning)| begins_with(path, beginning))
 }
 
 fn begins_with(path: &Path, beginning: &str) -> io::Result<bool> {
@@ -430,6 +443,10 @@ mod tests {
         assert!(foreign_file(folder.path()).unwrap().is_none() && !has_set(folder.path()));
         commit(folder.path(), "first", 0);
         assert!(foreign_file(folder.path()).unwrap().is_none() && has_set(folder.path()));
+        for (name, beginning) in EARLIER {
+            fs::write(folder.path().join(name), beginning).unwrap();
+        }
+        assert_eq!(foreign_file(folder.path()).unwrap(), None, "of an earlier version");
         let mine = folder.path().join("trajectory.txt");
         fs::write(&mine, "1.0 0 0 0 0 0 0 1\n").unwrap();
         assert_eq!(foreign_file(folder.path()).unwrap(), Some(mine));
