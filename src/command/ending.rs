@@ -1,5 +1,6 @@
 //! How a run, a replay or a recovery ends: results written, what is said, exit code.
 
+use std::error::Error;
 use std::path::Path;
 use std::process::ExitCode;
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -15,6 +16,7 @@ use crate::service::journal::folder::Unfinished;
 use crate::service::journal::log::RunStart;
 use crate::service::results::Results;
 use crate::service::results::calibration::calibration_warning;
+use crate::service::results::mapping_load::mapping_warning;
 use crate::service::results::output_folder::OutputFolder;
 use crate::service::results::record::{EndOfRun, RunMode, RunRecord};
 use crate::service::results::results_error::ResultsError;
@@ -75,14 +77,7 @@ impl Ending<'_> {
         if let Some(Err(error)) = journal.filter(|_| !keeps_journal).map(Journal::finish) {
             note(&format!("warning: cannot remove the journal of this run ({error})"));
         }
-        if self.json {
-            print(&format!("{}\n", serde_json::to_string_pretty(&results.summary)?))?;
-        } else {
-            print(&summary_text(&results.summary))?;
-            if let Some(warning) = calibration_warning(results.summary.whitened_residual_median) {
-                note(&format!("warning: {warning}"));
-            }
-        }
+        self.print_summary(&results.summary)?;
         let where_to = match (keeps_earlier, kept) {
             (true, Some(command)) => format!(
                 "the earlier results in {place} are kept, and so is the journal of this run: `{command}` writes its results"
@@ -96,6 +91,24 @@ impl Ending<'_> {
             print(&format!("{where_to}{recovery}{refused}\n"))?;
         }
         conclude(&record.ended, &results.summary, &where_to)
+    }
+
+    /// Prints the figures, and warnings of what the user can change.
+    fn print_summary(&self, summary: &Summary) -> Result<(), Box<dyn Error>> {
+        if self.json {
+            print(&format!("{}\n", serde_json::to_string_pretty(summary)?))?;
+            return Ok(());
+        }
+        print(&summary_text(summary))?;
+        let Summary { mode, frames_in, frames_skipped_by_mapper: skipped, .. } = *summary;
+        let calibration = calibration_warning(summary.whitened_residual_median);
+        // Where nothing was tracked, the reason follows.
+        let mapping =
+            mapping_warning(mode, skipped, frames_in).filter(|_| summary.untracked.is_none());
+        for warning in calibration.into_iter().chain(mapping) {
+            note(&format!("warning: {warning}"));
+        }
+        Ok(())
     }
 }
 

@@ -14,6 +14,7 @@ pub(crate) mod joint;
 pub(crate) mod joint_points;
 pub(crate) mod lettering;
 pub(crate) mod loops;
+pub(crate) mod mapping_load;
 pub mod output_folder;
 pub(crate) mod output_lock;
 pub(crate) mod pcd;

@@ -2,7 +2,8 @@
 
 use std::fmt;
 
-use crate::service::results::record::{RunMode, RunRecord};
+use crate::service::results::mapping_load::is_overloaded;
+use crate::service::results::record::RunRecord;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::evaluation::statistics::percentile;
 use crate::slam::keyframe::Keyframe;
@@ -124,7 +125,7 @@ impl Untracked {
 /// Whether a live run left out so many frames that the rest are too far apart.
 fn slowness(record: &RunRecord, frames_in: u64) -> Option<Slowness> {
     let skipped = frames_in.saturating_sub(record.map_nanos.len() as u64);
-    if record.mode != RunMode::Live || 3 * skipped <= frames_in {
+    if !is_overloaded(record.mode, skipped, frames_in) {
         return None;
     }
     let mut times: Vec<f64> = record.map_nanos.iter().map(|&n| n as f64 * 1e-6).collect();
@@ -205,6 +206,7 @@ fn advice(seen: StartFrame) -> &'static str {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
+    use crate::service::results::record::RunMode;
     use crate::service::recording::{RecordParts, Recording, RunCounters};
     use crate::slam::frame::FrameView;
     use crate::slam::map::Map;
