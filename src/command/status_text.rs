@@ -147,19 +147,20 @@ fn clock(secs: f64) -> String {
     }
 }
 
-/// Last pose: state, position, age.
+/// Last pose: state, position where one is claimed, age.
 fn pose_line(pose: &Value) -> Option<String> {
     let state = pose["state"].as_str()?;
     let at = |i: usize| pose["position"][i].as_f64();
     let age = pose["age_secs"].as_f64()?;
     let age =
         if age < 10.0 { format!("{:.0} ms ago", 1e3 * age) } else { format!("{age:.0} s ago") };
-    Some(format!(
-        "last pose {state}, x {:.2} y {:.2} z {:.2} map units, {age}",
-        at(0)?,
-        at(1)?,
-        at(2)?
-    ))
+    let position = match state {
+        "tracking" | "degraded" => {
+            format!(", x {:.2} y {:.2} z {:.2} map units", at(0)?, at(1)?, at(2)?)
+        }
+        _ => String::new(),
+    };
+    Some(format!("last pose {state}{position}, {age}"))
 }
 
 /// A process: its row, why it is in its state, what it was refused.
@@ -299,6 +300,19 @@ mod tests {
         }
         assert!(status_text(&look(), 80).contains("12.50"));
         assert!(status_text(&look(), 45).contains("30.0"));
+    }
+
+    #[test]
+    fn where_no_pose_is_claimed_no_position_is_shown() {
+        let mut look = look();
+        for (state, is_shown) in
+            [("tracking", true), ("degraded", true), ("lost", false), ("initializing", false)]
+        {
+            look["pose"]["state"] = json!(state);
+            let text = status_text(&look, 120);
+            assert!(text.contains(&format!("last pose {state}, ")), "{text}");
+            assert!(text.contains("21 ms ago") && text.contains("x 1.20") == is_shown, "{text}");
+        }
     }
 
     #[test]
