@@ -90,7 +90,25 @@ impl Ending<'_> {
                 (recovery_text(&results.summary), refused_text(&results.summary));
             print(&format!("{where_to}{recovery}{refused}\n"))?;
         }
-        conclude(&record.ended, &results.summary, &where_to)
+        self.conclude(&record.ended, &results.summary, &where_to)
+    }
+
+    /// What is said last, and the exit code.
+    fn conclude(&self, ended: &EndOfRun, summary: &Summary, where_to: &str) -> CommandResult {
+        let untracked = summary.untracked.as_deref();
+        if let EndOfRun::Failed(cause) = ended {
+            return Err(cause.as_str().into());
+        }
+        // Where standard output has the summary as JSON, it does not say where the results are.
+        let place = Some(where_to).filter(|_| self.json);
+        if let Some(words) = last_words(ended, untracked, place) {
+            note(&words);
+        }
+        Ok(match ended {
+            EndOfRun::Interrupted => ExitCode::from(INTERRUPTED),
+            _ if untracked.is_some() => ExitCode::from(NOTHING_TRACKED),
+            _ => ExitCode::SUCCESS,
+        })
     }
 
     /// Prints the figures, and warnings of what the user can change.
@@ -112,24 +130,17 @@ impl Ending<'_> {
     }
 }
 
-/// What is said last, and the exit code.
-fn conclude(ended: &EndOfRun, summary: &Summary, where_to: &str) -> CommandResult {
-    match ended {
-        EndOfRun::Failed(cause) => Err(cause.as_str().into()),
-        EndOfRun::Interrupted => {
-            note(&match &summary.untracked {
-                Some(why) => format!("interrupted, and nothing was tracked: {why}; {where_to}"),
-                None => format!("interrupted: {where_to}"),
-            });
-            Ok(ExitCode::from(INTERRUPTED))
+/// How a run ended that did not go as it should, and the `place` of its results.
+fn last_words(ended: &EndOfRun, untracked: Option<&str>, place: Option<&str>) -> Option<String> {
+    let how = match (ended, untracked) {
+        (EndOfRun::Interrupted, None) => "interrupted".to_owned(),
+        (EndOfRun::Interrupted, Some(why)) => {
+            format!("interrupted, and nothing was tracked: {why}")
         }
-        EndOfRun::Finished | EndOfRun::Recovered(_) if summary.frames.frames_tracked == 0 => {
-            let why = summary.untracked.as_deref().unwrap_or_default();
-            note(&format!("nothing was tracked: {why}; {where_to}"));
-            Ok(ExitCode::from(NOTHING_TRACKED))
-        }
-        EndOfRun::Finished | EndOfRun::Recovered(_) => Ok(ExitCode::SUCCESS),
-    }
+        (_, Some(why)) => format!("nothing was tracked: {why}"),
+        (_, None) => return None,
+    };
+    Some(place.map_or(how.clone(), |place| format!("{how}; {place}")))
 }
 
 /// What is said where results cannot be written: nothing is lost.

@@ -116,6 +116,23 @@ fn what_the_images_lack_is_said() {
 }
 
 #[test]
+fn where_the_results_are_is_said_once() {
+    let rig = Rig::new();
+    let source = record(&rig.folder().join("few"), 3, turned);
+    let output = rig.output();
+    for (json, on_stdout) in [(false, true), (true, false)] {
+        let ended = finish({
+            let mut command = rig.command(&["replay", &source, "--output"]);
+            command.arg(&output).args(json.then_some("--json"));
+            command
+        });
+        assert_eq!(ended.status.code(), Some(NOTHING_TRACKED), "{}", ended.stderr);
+        assert_eq!(ended.stdout.contains("results in "), on_stdout, "{}", ended.stdout);
+        assert_eq!(ended.stderr.contains("results in "), !on_stdout, "{}", ended.stderr);
+    }
+}
+
+#[test]
 fn a_machine_that_is_too_slow_is_said() {
     let rig = Rig::new();
     // Nothing of a frame is in any other, so that nothing is tracked on any machine; and none handles a thousand

@@ -47,6 +47,7 @@ use crate::service::results::report::map_picture::map_section;
 use crate::service::results::report::map_view::map_view;
 use crate::service::results::report::number_text::{grouped, length};
 use crate::service::results::summary::Summary;
+use crate::service::results::summary_text::is_unproven;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::pose::TrackingState;
 use crate::slam::up::up_direction;
@@ -172,6 +173,7 @@ fn cards(summary: &Summary) -> String {
         _ if summary.frames.frames_tracked == 0 && summary.frames.frames_lost > 0 => {
             "lost at once".to_owned()
         }
+        _ if is_unproven(summary) => "none on the map".to_owned(),
         _ if summary.frames.frames_tracked == 0 => "never initialised".to_owned(),
         0 => "never lost".to_owned(),
         1 => "lost once".to_owned(),
@@ -187,7 +189,8 @@ fn cards(summary: &Summary) -> String {
         let note = "largest / smallest scale of 100-frame windows".to_owned();
         card("Scale drift", format!("&times; {ratio:.2}"), note);
     }
-    if let Some(error) = summary.depth.depth_relative_error_median {
+    let depth_error = summary.depth.depth_relative_error_median;
+    if let Some(error) = depth_error.filter(|_| !is_unproven(summary)) {
         let best = summary.depth.depth_relative_error_median_best_half.unwrap_or(error);
         let note = format!("median; {:.1} % in the more certain half", 100.0 * best);
         card("Depth error", format!("{:.1} %", 100.0 * error), note);

@@ -24,7 +24,8 @@ pub fn summary_text(summary: &Summary) -> String {
     lines.add("errors", evaluated(summary));
     lines.add("trajectory", trajectory_errors(&summary.trajectory));
     lines.add("online", trajectory_errors(&summary.online));
-    lines.add("depth", depth_errors(&summary.depth));
+    // What no frame has confirmed is not judged.
+    lines.add("depth", depth_errors(&summary.depth).filter(|_| !is_unproven(summary)));
     lines.add("track", summary.times.track_ms.as_ref().map(times_text));
     lines.add("map", summary.times.map_ms.as_ref().map(times_text));
     lines.add("keyframe", summary.times.keyframe_ms.as_ref().map(times_text));
@@ -57,13 +58,20 @@ fn map(summary: &Summary) -> String {
         0 => String::new(),
         count => format!(" ({count} without depth)"),
     };
+    let unproven = if is_unproven(summary) { "; no frame was tracked on it" } else { "" };
     format!(
-        "{} keyframes{without_depth}, {} points fused to {}, epoch {}",
+        "{} keyframes{without_depth}, {} points fused to {}, epoch {}{unproven}",
         summary.keyframes,
         summary.point_counts.points,
         summary.point_counts.map_points,
         summary.epoch
     )
+}
+
+/// Whether there is a map that no frame has confirmed: it began with the last frames, was lost at once, or the camera was
+/// not found in it.
+pub(super) fn is_unproven(summary: &Summary) -> bool {
+    summary.frames.frames_tracked == 0 && summary.keyframes > 0
 }
 
 /// Whose errors follow; nothing where there is one epoch alone.
@@ -115,8 +123,8 @@ pub fn refused_text(summary: &Summary) -> String {
 fn frames(summary: &Summary) -> String {
     let initialised = match summary.initialization_secs {
         Some(secs) => format!("initialised after {secs:.2} s"),
-        None if summary.frames.frames_lost > 0 => {
-            "a map began, no frame was tracked on it".to_owned()
+        None if summary.frames.frames_lost > 0 || is_unproven(summary) => {
+            "no frame was tracked on the map".to_owned()
         }
         None => "never initialised".to_owned(),
     };
@@ -235,5 +243,22 @@ mod tests {
         }
         let text = summary_text(&summary(&record));
         assert!(text.contains(" 60 in, 40 tracked (10 of them afterwards), 10 lost, "), "{text}");
+    }
+
+    #[test]
+    fn a_map_that_no_frame_was_tracked_on_is_not_judged() {
+        let text = |state| {
+            let mut summary = summary(&run(state));
+            summary.depth.depth_relative_error_median = Some(0.011);
+            summary.depth.depth_relative_error_median_best_half = Some(0.005);
+            summary_text(&summary)
+        };
+        let tracked = text(TrackingState::Tracking);
+        assert!(tracked.contains("error 1.1 %") && !tracked.contains("no frame"), "{tracked}");
+        for state in [TrackingState::Initializing, LOST] {
+            let untracked = text(state);
+            assert!(!untracked.contains("1.1 %") && !untracked.contains("never init"), "{untracked}");
+            assert!(untracked.contains("epoch 0; no frame was tracked on it"), "{untracked}");
+        }
     }
 }
