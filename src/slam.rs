@@ -4,6 +4,7 @@
 //! [`geometry`], [`image`], [`alignment`] and [`depth`].
 
 pub mod alignment;
+pub(crate) mod counted;
 pub mod depth;
 pub mod evaluation;
 pub mod frame;

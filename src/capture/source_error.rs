@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use crate::capture::image_file::ImageFileError;
 use crate::capture::rig_error::RigError;
+use crate::slam::counted::counted;
 use crate::slam::geometry::rectification::RectificationError;
 use crate::slam::parameter::ParameterError;
 
@@ -89,7 +90,10 @@ pub enum SourceError {
         rig: PathBuf,
     },
     /// A list of stamps ends before the images do.
-    #[error("{}: has {stamps} time stamps for {images} images; give each image one", path.display())]
+    #[error(
+        "{}: has {} for {}; give each image one", path.display(), counted(*stamps, "time stamp"),
+        counted(*images, "image")
+    )]
     FewStamps {
         /// The list.
         path: PathBuf,

@@ -19,6 +19,7 @@ use crate::service::map_folder::report::{MapReport, export};
 use crate::service::map_folder::session::check;
 use crate::service::peers::Peer;
 use crate::service::results::output_folder::utc_text;
+use crate::slam::counted::counted;
 use crate::wire::command::{Command, CommandClient};
 use crate::wire::place::Place;
 use crate::wire::port::{Access, Hub, wait};
@@ -188,21 +189,25 @@ fn text_of(report: &MapReport) -> String {
             report.width, report.height
         ),
         format!(
-            "keyframes  {}, {} of them with depth, {} points",
-            report.keyframes, report.keyframes_with_depth, report.points
+            "keyframes  {}, {} of them with depth, {}",
+            report.keyframes,
+            report.keyframes_with_depth,
+            counted(report.points, "point")
         ),
         format!("size       {:.1} MB", report.bytes as f64 / MEGABYTE),
         format!(
-            "saved      {} (UTC), {} times; corrected {} times",
+            "saved      {} (UTC), {}; corrected {}",
             utc_text(saved),
-            report.saves,
-            report.revision
+            counted(report.saves, "time"),
+            counted(report.revision, "time")
         ),
     ];
     lines.extend(report.epochs.iter().map(|of| {
         format!(
-            "epoch {:<4} {} keyframes, path {:.2} map units",
-            of.epoch, of.keyframes, of.path_length
+            "epoch {:<4} {}, path {:.2} map units",
+            of.epoch,
+            counted(of.keyframes, "keyframe"),
+            of.path_length
         )
     }));
     lines.join("\n") + "\n"
@@ -232,8 +237,10 @@ fn export_map(config: &Config, arguments: &ExportArguments) -> CommandResult {
     let (points, keyframes) =
         exported.map_err(|error| format!("{}: {error}", arguments.output.display()))?;
     print(&format!(
-        "{}: map.ply with {points} points, keyframes.txt with {keyframes} poses of epoch {epoch}\n",
-        arguments.output.display()
+        "{}: map.ply with {}, keyframes.txt with {} of epoch {epoch}\n",
+        arguments.output.display(),
+        counted(points, "point"),
+        counted(keyframes, "pose")
     ))?;
     Ok(ExitCode::SUCCESS)
 }
@@ -296,9 +303,9 @@ fn merge_maps(arguments: &MergeArguments) -> CommandResult {
     let (first, second) = (load_all(&arguments.first)?, load_all(&arguments.second)?);
     let map = merge(&arguments.output, first, second, &arguments.second)?;
     print(&format!(
-        "{}: {} keyframes; the epochs of both maps are kept apart\n",
+        "{}: {}; the epochs of both maps are kept apart\n",
         arguments.output.display(),
-        map.keyframes.len()
+        counted(map.keyframes.len(), "keyframe")
     ))?;
     Ok(ExitCode::SUCCESS)
 }

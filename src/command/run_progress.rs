@@ -10,6 +10,7 @@ use crate::command::print::note;
 use crate::command::progress::LINE_PERIOD;
 use crate::service::progress_thread::ProgressThread;
 use crate::service::run_progress::RunProgress;
+use crate::slam::counted::counted;
 use crate::slam::pose::TrackingState;
 
 /// Starts the thread that shows the progress of a run: nothing if quiet, else what suits the terminal.
@@ -57,7 +58,12 @@ impl Shown {
             RunProgress::Preparing(done, total) => ("preparing", *done, *total, String::new()),
             RunProgress::Running { frames, total, state, keyframes } => {
                 let state = state.map_or("", TrackingState::name);
-                ("running", *frames, *total, format!("{state}, {keyframes} keyframes"))
+                (
+                    "running",
+                    *frames,
+                    *total,
+                    format!("{state}, {}", counted(*keyframes, "keyframe")),
+                )
             }
         };
         self.waits_for = None;

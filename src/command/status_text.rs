@@ -2,6 +2,8 @@
 
 use serde_json::Value;
 
+use crate::slam::counted::counted;
+
 /// A column of the table.
 struct Column {
     heading: &'static str,
@@ -130,8 +132,7 @@ fn headline(look: &Value) -> String {
     parts.extend(look["uptime_secs"].as_f64().map(|secs| format!("up {}", clock(secs))));
     parts.push(match look["keyframes"].as_u64() {
         None => "keyframes unknown".to_owned(),
-        Some(1) => "1 keyframe".to_owned(),
-        Some(count) => format!("{count} keyframes"),
+        Some(count) => counted(count, "keyframe"),
     });
     parts.join(", ")
 }
@@ -203,13 +204,13 @@ fn loop_line(loops: &Value) -> Option<String> {
     let of = |key: &str| loops[key].as_u64();
     of("searched").filter(|searched| *searched > 0)?;
     Some(format!(
-        "  loops: {} keyframes searched, {} closed, {} held already, {} epochs joined; refused: {} other places, {} \
+        "  loops: {} searched, {} closed, {} held already, {} joined; refused: {}, {} \
          against the drift, {} unconfirmed, {} inconsistent",
-        of("searched")?,
+        counted(of("searched")?, "keyframe"),
         of("closed")?,
         of("held")?,
-        of("joined")?,
-        of("other_places")?,
+        counted(of("joined")?, "epoch"),
+        counted(of("other_places")?, "other place"),
         of("against_drift")?,
         of("unconfirmed")?,
         of("inconsistent")?,
@@ -290,7 +291,7 @@ mod tests {
                 "x 1.20 y -0.05 z 3.00",
                 "21 ms ago",
                 "mapper not running",
-                "20 keyframes searched, 2 closed, 3 held already, 1 epochs joined; refused: 5 other places, 4 against",
+                "20 keyframes searched, 2 closed, 3 held already, 1 epoch joined; refused: 5 other places, 4 against",
                 "3 unconfirmed, 2 inconsistent",
                 "41 entered (3 merged), 1 dropped; median 21.2 ms, p99 60.5 ms of a CPU",
             ] {

@@ -196,7 +196,7 @@ fn searches_for_loops_are_in_summary_and_report() {
     for part in [
         "<h2>Loops</h2>",
         "5 keyframes searched, 1 closed, 0 held already",
-        "2 times both directions disagree; 1 times too few points are inliers",
+        "2 times both directions disagree; 1 time too few points are inliers",
         "Loops from above",
         "against the drift",
     ] {

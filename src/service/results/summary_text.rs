@@ -8,6 +8,7 @@ use crate::service::results::summary::{
     DepthSummary, RejectionSummary, Summary, TrajectorySummary,
 };
 use crate::service::results::times::Percentiles;
+use crate::slam::counted::counted;
 use crate::slam::evaluation::grade::Grade;
 
 /// The lines, each ended.
@@ -60,9 +61,9 @@ fn map(summary: &Summary) -> String {
     };
     let unproven = if is_unproven(summary) { "; no frame was tracked on it" } else { "" };
     format!(
-        "{} keyframes{without_depth}, {} points fused to {}, epoch {}{unproven}",
-        summary.keyframes,
-        summary.point_counts.points,
+        "{}{without_depth}, {} fused to {}, epoch {}{unproven}",
+        counted(summary.keyframes, "keyframe"),
+        counted(summary.point_counts.points, "point"),
         summary.point_counts.map_points,
         summary.epoch
     )
@@ -83,8 +84,8 @@ fn evaluated(summary: &Summary) -> Option<String> {
 /// Poses that came late; nothing where nothing waits for them.
 fn deadline(summary: &Summary) -> Option<String> {
     let (deadline_ms, misses) = (summary.deadline_ms?, summary.deadline_misses?);
-    let poses = if misses == 1 { "pose" } else { "poses" };
-    Some(format!("{misses} {poses} later than {deadline_ms:.2} ms after the frame arrived"))
+    let late = counted(misses, "pose");
+    Some(format!("{late} later than {deadline_ms:.2} ms after the frame arrived"))
 }
 
 fn depth_errors(depth: &DepthSummary) -> Option<String> {
@@ -142,16 +143,20 @@ fn frames(summary: &Summary) -> String {
         frames => format!(" ({frames} of them afterwards)"),
     };
     format!(
-        "{} in, {} tracked{later}, {lost}, {} dropped, {} gaps{skipped}; {initialised}",
-        summary.frames_in, summary.frames.frames_tracked, summary.frames_dropped, summary.gaps
+        "{} in, {} tracked{later}, {lost}, {} dropped, {}{skipped}; {initialised}",
+        summary.frames_in,
+        summary.frames.frames_tracked,
+        summary.frames_dropped,
+        counted(summary.gaps, "gap")
     )
 }
 
 fn trajectory_errors(trajectory: &TrajectorySummary) -> Option<String> {
     let (ate, path) = (trajectory.ate_rmse_m?, trajectory.path_length_m?);
     let mut text = format!(
-        "ATE {ate:.4} m over {} poses and {path:.2} m, scale {:.4}",
-        trajectory.matched_poses?, trajectory.ate_scale?
+        "ATE {ate:.4} m over {} and {path:.2} m, scale {:.4}",
+        counted(trajectory.matched_poses?, "pose"),
+        trajectory.ate_scale?
     );
     if let Some(ratio) = trajectory.window_scale_ratio {
         let _ = write!(text, ", scale drift x{ratio:.2}");
@@ -163,8 +168,9 @@ fn trajectory_errors(trajectory: &TrajectorySummary) -> Option<String> {
 fn joint_text(joint: &JointSummary) -> Option<String> {
     let times = times_text(joint.adjustment_ms.as_ref()?);
     let JointSummary { adjustments, adjustments_merged, adjustments_dropped, .. } = *joint;
+    let estimates = counted(adjustments, "estimate");
     Some(format!(
-        "{adjustments} estimates of keyframes ({adjustments_merged} merged), {adjustments_dropped} dropped; {times}"
+        "{estimates} of keyframes ({adjustments_merged} merged), {adjustments_dropped} dropped; {times}"
     ))
 }
 
@@ -173,13 +179,13 @@ pub(super) fn loops_text(loops: &LoopSummary) -> Option<String> {
     let times = times_text(loops.loop_search_ms.as_ref()?);
     let of = |count: Option<u64>| count.unwrap_or(0);
     Some(format!(
-        "{} keyframes searched, {} closed, {} held already, {} epochs joined; refused: {} other places, {} against the drift, {} unconfirmed, \
+        "{} searched, {} closed, {} held already, {} joined; refused: {}, {} against the drift, {} unconfirmed, \
          {} inconsistent; a search takes {times}",
-        of(loops.loop_searches),
+        counted(of(loops.loop_searches), "keyframe"),
         of(loops.loops_closed),
         of(loops.loops_held),
-        of(loops.epochs_joined),
-        of(loops.loops_refused),
+        counted(of(loops.epochs_joined), "epoch"),
+        counted(of(loops.loops_refused), "other place"),
         of(loops.loops_against_drift),
         of(loops.loops_unconfirmed),
         of(loops.loops_inconsistent),
@@ -246,6 +252,24 @@ mod tests {
     }
 
     #[test]
+    fn one_of_a_thing_is_no_plural() {
+        let mut summary = summary(&run(TrackingState::Tracking));
+        (summary.gaps, summary.joint.adjustments) = (1, 1);
+        summary.joint.adjustment_ms = summary.times.map_ms;
+        summary.loops.loop_search_ms = summary.times.map_ms;
+        (summary.loops.loop_searches, summary.loops.epochs_joined) = (Some(1), Some(1));
+        let text = summary_text(&summary);
+        for part in [
+            " 1 keyframe (1 without depth), 0 points fused",
+            " 1 gap;",
+            " 1 estimate of keyframes (0 merged)",
+            " 1 keyframe searched, 0 closed, 0 held already, 1 epoch joined; refused: 0 other places,",
+        ] {
+            assert!(text.contains(part), "{part}: {text}");
+        }
+    }
+
+    #[test]
     fn a_map_that_no_frame_was_tracked_on_is_not_judged() {
         let text = |state| {
             let mut summary = summary(&run(state));
@@ -257,7 +281,10 @@ mod tests {
         assert!(tracked.contains("error 1.1 %") && !tracked.contains("no frame"), "{tracked}");
         for state in [TrackingState::Initializing, LOST] {
             let untracked = text(state);
-            assert!(!untracked.contains("1.1 %") && !untracked.contains("never init"), "{untracked}");
+            assert!(
+                !untracked.contains("1.1 %") && !untracked.contains("never init"),
+                "{untracked}"
+            );
             assert!(untracked.contains("epoch 0; no frame was tracked on it"), "{untracked}");
         }
     }

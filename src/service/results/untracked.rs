@@ -4,6 +4,7 @@ use std::fmt;
 
 use crate::service::results::mapping_load::is_overloaded;
 use crate::service::results::record::RunRecord;
+use crate::slam::counted::counted;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::evaluation::statistics::percentile;
 use crate::slam::keyframe::Keyframe;
@@ -141,7 +142,9 @@ impl fmt::Display for Untracked {
             Self::NoFrame => f.write_str("the source gave no frame"),
             Self::FewFrames(frames) => write!(
                 f,
-                "{frames} frames are too few: a map begins after the camera has moved sideways for some frames"
+                "{} {} too few: a map begins after the camera has moved sideways for some frames",
+                counted(frames, "frame"),
+                if frames == 1 { "is" } else { "are" }
             ),
             Self::TooSlow(slowness) => slowness.fmt(f),
             Self::NoGivenPose => f.write_str(
@@ -206,8 +209,8 @@ fn advice(seen: StartFrame) -> &'static str {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use crate::service::results::record::RunMode;
     use crate::service::recording::{RecordParts, Recording, RunCounters};
+    use crate::service::results::record::RunMode;
     use crate::slam::frame::FrameView;
     use crate::slam::map::Map;
     use crate::slam::pose::PoseEstimate;
@@ -249,6 +252,14 @@ pub(super) mod tests {
             deadline_ms: 0.0,
             counters: RunCounters { frames_in: frames, ..RunCounters::default() },
         })
+    }
+
+    #[test]
+    fn one_frame_is_too_few() {
+        let text = |frames| Untracked::FewFrames(frames).to_string();
+        assert!(
+            text(1).starts_with("1 frame is too few:") && text(3).starts_with("3 frames are too")
+        );
     }
 
     #[test]

@@ -5,6 +5,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::slam::counted::counted;
 use crate::slam::evaluation::map_consistency::MapConsistency;
 
 /// Fewest wide pairs: three come with the fourth keyframe that shares a view.
@@ -125,9 +126,9 @@ fn misfit(input: &GradeInput) -> (GradeLevel, String) {
     }
     let misfit = figures.wide_misfit_px.filter(|_| figures.wide_pairs >= MIN_WIDE_PAIRS);
     let Some(misfit) = misfit else {
-        let pairs = figures.wide_pairs;
+        let pairs = counted(figures.wide_pairs, "pair");
         let reason = format!(
-            "too few keyframes far apart see the same place ({pairs} pairs, {MIN_WIDE_PAIRS} are needed)"
+            "too few keyframes far apart see the same place ({pairs}, {MIN_WIDE_PAIRS} are needed)"
         );
         return (GradeLevel::NotJudged, reason);
     };
@@ -222,8 +223,12 @@ mod tests {
         assert_eq!(untracked.level, GradeLevel::NotJudged);
         assert_eq!(untracked.reasons, ["no frame was tracked"]);
         let mut short = input(0.5);
-        short.consistency.wide_pairs = 2;
-        assert_eq!(Grade::of(&short).level, GradeLevel::NotJudged);
+        for (pairs, word) in [(1, "(1 pair, 3 are needed)"), (2, "(2 pairs, ")] {
+            short.consistency.wide_pairs = pairs;
+            let grade = Grade::of(&short);
+            assert_eq!(grade.level, GradeLevel::NotJudged);
+            assert!(grade.reasons[0].contains(word), "{:?}", grade.reasons);
+        }
         short.consistency = MapConsistency::default();
         assert_eq!(Grade::of(&short).level, GradeLevel::NotJudged);
         // But what is known to be bad is said.

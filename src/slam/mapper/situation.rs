@@ -2,6 +2,7 @@
 
 use std::fmt;
 
+use crate::slam::counted::counted;
 use crate::slam::mapper::Mapper;
 use crate::slam::mapper::consistency::Contradiction;
 use crate::slam::mapper::phase::Phase;
@@ -86,7 +87,8 @@ impl fmt::Display for Situation {
             Self::Starting(progress) => write!(f, "starting: {progress}"),
             Self::Unproven => f.write_str("starting: random depth is not proven yet"),
             Self::Localising(keyframes) => {
-                write!(f, "localising: looking for the camera on {keyframes} keyframes of the map")
+                let keyframes = counted(*keyframes, "keyframe");
+                write!(f, "localising: looking for the camera on {keyframes} of the map")
             }
             Self::Localised(certainty) => write!(f, "localised in the map: {certainty}"),
             Self::Mapping => f.write_str("mapping"),
@@ -196,7 +198,7 @@ impl fmt::Display for StartProgress {
             Some(Failure::Mismatch) => "the view changed too much",
             Some(Failure::WrongSize) => "a frame of another size",
         };
-        write!(f, "; begun again {} times, the last for {why}", self.failures)
+        write!(f, "; begun again {}, the last for {why}", counted(self.failures, "time"))
     }
 }
 
@@ -213,7 +215,7 @@ mod tests {
         progress.observe(InitState::Waiting(Waiting::Texture));
         let text = Situation::Restarting(progress).to_string();
         assert!(text.starts_with("lost: beginning a new epoch, waiting for texture"), "{text}");
-        assert!(text.ends_with("begun again 1 times, the last for too many frames without proof"));
+        assert!(text.ends_with("begun again 1 time, the last for too many frames without proof"));
         progress.observe(InitState::Proven);
         assert_eq!(progress, StartProgress::default());
     }

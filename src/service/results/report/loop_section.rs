@@ -18,6 +18,7 @@ use crate::service::results::report::input::ReportInput;
 use crate::service::results::report::series::{Mark, Series};
 use crate::service::results::report::views::Views;
 use crate::service::results::summary_text::loops_text;
+use crate::slam::counted::counted;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::loops::SearchFate;
 
@@ -34,8 +35,10 @@ pub fn loop_section(input: &ReportInput<'_>, up: Option<Vector3<f64>>) -> String
     let mut section = format!("<section><h2>Loops</h2><p>{}</p>", escaped(&figures));
     let reasons = reasons(searches);
     if !reasons.is_empty() {
-        let listed: Vec<String> =
-            reasons.iter().map(|(why, count)| format!("{count} times {}", escaped(why))).collect();
+        let listed: Vec<String> = reasons
+            .iter()
+            .map(|(why, n)| format!("{} {}", counted(*n, "time"), escaped(why)))
+            .collect();
         let _ = write!(
             section,
             "<p>Other places, by what the first candidate lacks: {}.</p>",
