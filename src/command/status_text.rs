@@ -61,7 +61,7 @@ const COLUMNS: [Column; 8] = [
         legend: "99th percentile of the same",
     },
     Column {
-        heading: "MB",
+        heading: "MiB",
         width: 5,
         rank: 6,
         value: (&["peak_rss_mb"], 0),
@@ -300,6 +300,7 @@ mod tests {
             assert!(shown.contains("rate: frames per second"), "{text}");
         }
         assert!(status_text(&look(), 80).contains("12.50"));
+        assert!(status_text(&look(), 120).contains("MiB: peak memory"));
         assert!(status_text(&look(), 45).contains("30.0"));
     }
 

@@ -204,7 +204,7 @@ fn run(summary: &Summary) -> String {
         let _ = write!(text, " (x{factor:.2} real time)");
     }
     if let Some(memory) = summary.peak_rss_mb {
-        let _ = write!(text, ", {memory:.0} MB");
+        let _ = write!(text, ", {memory:.0} MiB");
     }
     text
 }
@@ -267,6 +267,14 @@ mod tests {
         ] {
             assert!(text.contains(part), "{part}: {text}");
         }
+    }
+
+    #[test]
+    fn memory_has_the_unit_of_the_report() {
+        let mut summary = summary(&run(TrackingState::Tracking));
+        summary.peak_rss_mb = Some(118.6);
+        let text = summary_text(&summary);
+        assert!(text.contains(", 119 MiB\n"), "{text}");
     }
 
     #[test]
