@@ -1,8 +1,9 @@
 //! Another process on the same machine, started at any time: prints every pose and keyframe.
 //!
 //! ```sh
-//! semidense run --live &
-//! cargo run --release --example subscribe
+//! cargo build --release --example subscribe    # first: it takes minutes
+//! semidense run --live loop:9000:30:sim &
+//! target/release/examples/subscribe
 //! ```
 
 use std::error::Error;
