@@ -265,7 +265,7 @@ extern "C" {
 // Waits for an instance and joins it.
 //
 // `instance`: its name, null for "semidense". `root`: its folder, null for the usual one (SEMIDENSE_ROOT and so on).
-// `wanted`: the sum of SEMIDENSE_WANT_… that are read. `timeout_ms`: how long to wait for it, -1 for ever, 0 when it must
+// `wanted`: the sum of SEMIDENSE_WANT_… that are read. `timeout_ms`: how long to wait for it, -1 forever, 0 when it must
 // be there now. `reader` gets the reader; it is null after an error.
 //
 // SEMIDENSE_STATUS_OK, or SEMIDENSE_STATUS_ERROR_NOT_RUNNING, …_WIRE_VERSION, …_TRANSPORT, …_ARGUMENT.
@@ -285,7 +285,7 @@ enum semidense_status semidense_close(struct semidense_reader *reader);
 // timeout of 0, then read until SEMIDENSE_STATUS_NONE. It belongs to the reader: do not read from it, do not close it.
 int semidense_descriptor(const struct semidense_reader *reader);
 
-// Waits for messages, `timeout_ms` at most (-1: for ever).
+// Waits for messages, `timeout_ms` at most (-1: forever).
 //
 // SEMIDENSE_STATUS_OK: there may be something to read; read each kind until SEMIDENSE_STATUS_NONE. SEMIDENSE_STATUS_NONE:
 // the time is over. SEMIDENSE_STATUS_ENDED: the run is over and all has been read; close the reader, and open another for

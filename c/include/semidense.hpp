@@ -85,7 +85,7 @@ struct options {
     std::string instance = "semidense";
     // Empty for the usual folder (SEMIDENSE_ROOT and so on).
     std::string root;
-    // Negative: for ever.
+    // Negative: forever.
     std::chrono::milliseconds timeout{-1};
 };
 
@@ -110,7 +110,7 @@ public:
 
     ~reader() { semidense_close(reader_); }
 
-    // Waits for messages, `timeout` at most (negative: for ever); false when the run is over and all has been read.
+    // Waits for messages, `timeout` at most (negative: forever); false when the run is over and all has been read.
     bool wait(std::chrono::milliseconds timeout = std::chrono::milliseconds(-1)) {
         return check(semidense_wait(reader_, timeout.count())) != SEMIDENSE_STATUS_ENDED;
     }

@@ -89,7 +89,7 @@ unsafe fn give<T>(
 /// Waits for an instance and joins it.
 ///
 /// `instance`: its name, null for "semidense". `root`: its folder, null for the usual one (SEMIDENSE_ROOT and so on).
-/// `wanted`: the sum of SEMIDENSE_WANT_… that are read. `timeout_ms`: how long to wait for it, -1 for ever, 0 when it must
+/// `wanted`: the sum of SEMIDENSE_WANT_… that are read. `timeout_ms`: how long to wait for it, -1 forever, 0 when it must
 /// be there now. `reader` gets the reader; it is null after an error.
 ///
 /// SEMIDENSE_STATUS_OK, or SEMIDENSE_STATUS_ERROR_NOT_RUNNING, …_WIRE_VERSION, …_TRANSPORT, …_ARGUMENT.
@@ -124,7 +124,7 @@ pub unsafe extern "C" fn semidense_open(
     })
 }
 
-/// Milliseconds; for ever where they are negative.
+/// Milliseconds; forever where they are negative.
 fn duration(milliseconds: i64) -> Option<Duration> {
     u64::try_from(milliseconds).ok().map(Duration::from_millis)
 }
@@ -152,7 +152,7 @@ pub extern "C" fn semidense_descriptor(reader: *const ReaderHandle) -> c_int {
     descriptor
 }
 
-/// Waits for messages, `timeout_ms` at most (-1: for ever).
+/// Waits for messages, `timeout_ms` at most (-1: forever).
 ///
 /// SEMIDENSE_STATUS_OK: there may be something to read; read each kind until SEMIDENSE_STATUS_NONE. SEMIDENSE_STATUS_NONE:
 /// the time is over. SEMIDENSE_STATUS_ENDED: the run is over and all has been read; close the reader, and open another for

@@ -93,7 +93,7 @@ impl From<rustix::io::Errno> for Failure {
     }
 }
 
-/// Waits for the instance and joins it; `timeout` of `None` waits for ever.
+/// Waits for the instance and joins it; `timeout` of `None` waits forever.
 pub fn open(place: &Place, wanted: u32, timeout: Option<Duration>) -> Result<Reader, Failure> {
     let begun = Instant::now();
     loop {

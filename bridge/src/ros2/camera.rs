@@ -135,7 +135,7 @@ pub fn run(params: &CameraParams, output: &Output, shutdown: &Shutdown) -> Resul
             forward(&images, &topic, unpack, sink)
         })?
     };
-    // The thread may wait for an image, or for capture, for ever; it ends with the process.
+    // The thread may wait for an image, or for capture, forever; it ends with the process.
     while !reading.is_finished() && !shutdown.is_requested() {
         if is_closed(output, shutdown.descriptor()) {
             break;
