@@ -14,6 +14,9 @@ pub enum MapFolderError {
         "{0} holds no map: check the path, or begin one there with `semidense run SOURCE --map {0}`"
     )]
     Missing(PathBuf),
+    /// There is a file in its place.
+    #[error("{0} is a file; name a folder")]
+    File(PathBuf),
     /// The folder is full of other things.
     #[error(
         "{0} is not a map, and not empty: name an empty folder, or one that does not exist yet"

@@ -69,6 +69,7 @@ pub fn read_manifest(folder: &Path) -> Result<(Manifest, Vec<String>), MapFolder
         Ok(manifest) => return Ok((manifest, Vec::new())),
         Err(error) => error,
     };
+    refuse_file(folder)?;
     // What a newer program has written is not to be taken for what an older one has left beside it.
     if let MapFolderError::Manifest {
         source: ManifestError::Version(_) | ManifestError::Section(_),
@@ -83,6 +84,14 @@ pub fn read_manifest(folder: &Path) -> Result<(Manifest, Vec<String>), MapFolder
             Err(MapFolderError::Missing(folder.to_owned()))
         }
         Err(_) => Err(error),
+    }
+}
+
+/// Refuses what is there and is not a folder: what the system says of files below it would not tell.
+pub(super) fn refuse_file(folder: &Path) -> Result<(), MapFolderError> {
+    match folder.metadata() {
+        Ok(metadata) if !metadata.is_dir() => Err(MapFolderError::File(folder.to_owned())),
+        _ => Ok(()),
     }
 }
 

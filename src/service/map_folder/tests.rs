@@ -85,6 +85,16 @@ fn a_map_comes_back_with_the_same_bits() {
 }
 
 #[test]
+fn a_file_in_the_place_of_the_folder_is_named_as_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("afile");
+    fs::write(&file, "x").unwrap();
+    let expected = format!("{} is a file; name a folder", file.display());
+    assert_eq!(load(&file, ALL).unwrap_err().to_string(), expected);
+    assert_eq!(MapWriter::open(&file, MapDetail::Full).unwrap_err().to_string(), expected);
+}
+
+#[test]
 fn a_save_writes_what_has_changed_and_removes_what_nobody_lists() {
     let folder = tempfile::tempdir().unwrap();
     let mut writer = open(folder.path());

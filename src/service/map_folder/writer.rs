@@ -11,7 +11,9 @@ use crate::service::atomic_file::write_durably;
 use crate::service::map_folder::depth_file::{MapDetail, checksum_of, encode};
 use crate::service::map_folder::manifest::{DepthFile, Listed, Manifest};
 use crate::service::map_folder::map_folder_error::MapFolderError;
-use crate::service::map_folder::reading::{BEFORE, KEYFRAMES, MANIFEST, read_manifest};
+use crate::service::map_folder::reading::{
+    BEFORE, KEYFRAMES, MANIFEST, read_manifest, refuse_file,
+};
 use crate::service::results::output_lock::lock_output;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::{Keyframe, MapState};
@@ -52,6 +54,7 @@ impl MapWriter {
     /// keeps its detail.
     pub fn open(folder: &Path, detail: MapDetail) -> Result<Self, MapFolderError> {
         let failed = |source| MapFolderError::Write { path: folder.to_owned(), source };
+        refuse_file(folder)?;
         fs::create_dir_all(folder).map_err(failed)?;
         let manifest = match read_manifest(folder) {
             Ok((manifest, _)) => Some(manifest),
