@@ -412,7 +412,7 @@ fn source_names_are_parsed_and_explained() {
         assert_eq!(parsed.is_camera(), cameras.contains(&name));
     }
     for (name, expected) in [
-        ("", "No such file"),
+        ("", "there is no such file or folder: ;"),
         ("ros:topic", "unknown kind; sources are a folder (TUM, EuRoC or images), sim[:SCENE]"),
         ("tum", "the folder is missing"),
         ("images:", "the folder is missing"),

@@ -21,6 +21,25 @@ pub enum SourceError {
         /// What is wrong with it, and what to do.
         problem: String,
     },
+    /// A path that leads nowhere.
+    #[error("there is no such file or folder: {path}; {hint}")]
+    NoPath {
+        /// The path as it was given.
+        path: String,
+        /// What may have been meant.
+        hint: String,
+    },
+    /// A video, which has to be made a folder of images first.
+    #[error(
+        "source `{path}`: by its name this is a video: make a folder of images and times from it with the command below, \
+         then name that folder, with --rig FILE for the camera"
+    )]
+    Video {
+        /// The path as it was given.
+        path: String,
+        /// The command that makes the folder, for the shell.
+        command: String,
+    },
     /// The source exists but not in this binary or not by this way of opening.
     #[error("source `{name}`: {reason}")]
     Unavailable {
@@ -196,6 +215,14 @@ pub enum SourceError {
 }
 
 impl SourceError {
+    /// A command that the message refers to; printed on a line of its own, it can be copied.
+    pub fn command(&self) -> Option<&str> {
+        match self {
+            Self::Video { command, .. } => Some(command),
+            _ => None,
+        }
+    }
+
     /// Whether only this frame is lost and the next may be good: a damaged frame of a camera, a damaged or
     /// missing image of a recording.
     pub fn is_passing(&self) -> bool {

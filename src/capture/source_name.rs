@@ -2,6 +2,7 @@
 
 use std::ffi::{OsStr, OsString};
 use std::fmt;
+use std::io::ErrorKind;
 use std::os::unix::ffi::{OsStrExt, OsStringExt};
 use std::os::unix::fs::FileTypeExt;
 use std::path::{Path, PathBuf};
@@ -266,9 +267,8 @@ fn recognise(path: &Path) -> Result<SourceName, SourceError> {
         Err(_) if has_kind(path) => {
             return error(format!("unknown kind; sources are {SOURCE_FORMS}"));
         }
-        Err(cause) => {
-            return error(format!("{cause}; sources are {SOURCE_FORMS}"));
-        }
+        Err(cause) if cause.kind() == ErrorKind::NotFound => return Err(no_path(path)),
+        Err(cause) => return error(cause.to_string()),
     };
     if kind.is_dir() {
         return match SourceName::of_folder(path) {
@@ -283,6 +283,7 @@ fn recognise(path: &Path) -> Result<SourceName, SourceError> {
     let is_video_device = || path.to_string_lossy().contains("video") && kind.is_char_device();
     match path.to_str() {
         Some(device) if is_video_device() => Ok(SourceName::Camera(device.to_owned())),
+        _ if kind.is_file() && has_ending(path, &VIDEO_ENDINGS) => Err(video(path)),
         _ => error(what_a_file_is(path)),
     }
 }
@@ -298,20 +299,37 @@ fn has_ending(path: &Path, endings: &[&str]) -> bool {
     endings.iter().any(|known| ending.eq_ignore_ascii_case(known))
 }
 
+/// A path that leads nowhere, and what may have been meant: the number or the device of a camera is often tried.
+fn no_path(path: &Path) -> SourceError {
+    let name = path.to_string_lossy();
+    let number = name.strip_prefix("/dev/video").unwrap_or(&name);
+    let is_number = !number.is_empty() && number.bytes().all(|byte| byte.is_ascii_digit());
+    let hint = match name.starts_with("/dev/") {
+        _ if is_number => {
+            format!("a camera is named v4l:{number} (`semidense cameras` lists the cameras)")
+        }
+        true => format!("a camera is named v4l:{name} (`semidense cameras` lists the cameras)"),
+        false => "check the path (`semidense run --help` lists the kinds of sources)".to_owned(),
+    };
+    SourceError::NoPath { path: name.into_owned(), hint }
+}
+
+/// The error of a file whose name ends as a video's does, with the command that makes a folder of it.
+fn video(path: &Path) -> SourceError {
+    let (video, frames) = (quoted(path), quoted(&path.with_extension("frames")));
+    let command = format!(
+        "mkdir {frames} && ffmpeg -i {video} -fps_mode passthrough -pix_fmt gray {frames}/%06d.png && ffprobe -v error \
+         -select_streams v:0 -show_entries frame=pts_time -of default=nw=1:nk=1 {video} > {frames}/times.txt"
+    );
+    SourceError::Video { path: path.to_string_lossy().into_owned(), command }
+}
+
 /// What to do with a file that is named instead of a folder.
 fn what_a_file_is(path: &Path) -> String {
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
     let folder = folder.unwrap_or(Path::new("."));
     let is_list =
         path.file_name().is_some_and(|name| name == tum::FRAME_LIST || name == "data.csv");
-    if has_ending(path, &VIDEO_ENDINGS) {
-        let (video, frames) = (quoted(path), quoted(&path.with_extension("frames")));
-        return format!(
-            "this is a video: make a folder of images and times from it, mkdir {frames} && ffmpeg -i {video} -fps_mode passthrough \
-             -pix_fmt gray {frames}/%06d.png && ffprobe -v error -select_streams v:0 -show_entries frame=pts_time \
-             -of default=nw=1:nk=1 {video} > {frames}/times.txt, and name that folder with --rig FILE for the camera"
-        );
-    }
     if has_ending(path, &ARCHIVE_ENDINGS) {
         return "this is an archive: unpack it and name its folder".to_owned();
     }
@@ -395,7 +413,8 @@ mod tests {
         let error = of("outer").unwrap_err().to_string();
         assert!(error.contains("found inner; there is a recording in it: tum:"), "{error}");
         let error = of("none").unwrap_err().to_string();
-        assert!(error.contains("No such file"), "{error}");
+        assert!(error.starts_with("there is no such file or folder: /"), "{error}");
+        assert!(error.len() < 250 && error.contains("check the path"), "{error}");
     }
 
     fn png_start() -> [u8; 8] {
@@ -406,7 +425,7 @@ mod tests {
     fn files_say_what_to_do_with_them() {
         let folder = tempfile::tempdir().unwrap();
         for (name, words) in [
-            ("it's.MP4", "mkdir '"),
+            ("it's.MP4", "by its name this is a video"),
             ("a.zip", "unpack"),
             ("a.bag", "ROS bag"),
             ("rgb.txt", "name its folder"),
@@ -419,5 +438,18 @@ mod tests {
             assert!(error.contains(words) && !error.contains('\n'), "{error}");
         }
         assert_eq!(quoted(Path::new("it's")), r"'it'\''s'");
+        let video = SourceName::parse(folder.path().join("it's.MP4").as_os_str()).unwrap_err();
+        assert!(video.command().unwrap().starts_with("mkdir '"), "{video:?}");
+    }
+
+    #[test]
+    fn who_means_a_camera_is_told_how_it_is_named() {
+        let told = |name: &str| no_path(Path::new(name)).to_string();
+        assert!(told("0").contains("no such file or folder: 0; a camera is named v4l:0 "));
+        assert!(told("/dev/video12").contains(": /dev/video12; a camera is named v4l:12 "));
+        assert!(told("/dev/camera").contains("a camera is named v4l:/dev/camera "));
+        for name in ["", "walk0", "/dev-0"] {
+            assert!(!told(name).contains("v4l"), "{name}");
+        }
     }
 }
