@@ -14,6 +14,7 @@ pub(crate) mod evaluate;
 pub(crate) mod map;
 pub(crate) mod map_points;
 pub(crate) mod mapper;
+pub(crate) mod parse;
 pub(crate) mod print;
 pub(crate) mod progress;
 pub(crate) mod recover;
@@ -38,6 +39,7 @@ use tracing_subscriber::EnvFilter;
 use tracing_subscriber::fmt::format::FmtSpan;
 use tracing_subscriber::prelude::*;
 
+use crate::capture::source_error::SourceError;
 use crate::command::print::{PrintError, note};
 use crate::service::child::tidy_up;
 use crate::service::child::{ERROR_PREFIX, follow_supervisor};
@@ -191,7 +193,7 @@ pub fn command_line() -> clap::Command {
 
 /// Parses the command line and runs the chosen subcommand.
 pub fn main() -> ExitCode {
-    let line = CommandLine::parse();
+    let line: CommandLine = parse::parse();
     let log = match ErrorLog::start() {
         Ok(log) => log,
         Err(error) => {
@@ -214,6 +216,9 @@ pub fn main() -> ExitCode {
         }
         let line = error.to_string().split_whitespace().collect::<Vec<_>>().join(" ");
         note(&format!("{ERROR_PREFIX}{line}"));
+        if let Some(command) = error.downcast_ref().and_then(SourceError::command) {
+            note(&format!("  {command}"));
+        }
         ExitCode::FAILURE
     })
 }
