@@ -28,6 +28,9 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 
 /// The program that reads ROS 2 topics.
 const BRIDGE: &str = "semidense-bridge";
+/// What to do where it is missing.
+pub const INSTALL_BRIDGE: &str = "install the package semidense-bridge (`apt install ./semidense-bridge_*.deb`), or build it \
+     with `cargo build --release -p semidense-bridge`";
 /// Its command that writes the images of a topic to its standard output.
 const BRIDGE_COMMAND: &str = "ros2-camera";
 /// Most frames that are taken at a look: a sender that never pauses must not keep capture from its other work.

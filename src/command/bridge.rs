@@ -7,6 +7,7 @@ use std::process::Command;
 
 use clap::Args;
 
+use crate::capture::stream::INSTALL_BRIDGE;
 use crate::command::{CommandResult, CommonArguments};
 
 /// The program that they are in.
@@ -26,11 +27,11 @@ pub struct BridgeArguments {
 pub enum BridgeError {
     /// It is nowhere.
     #[error(
-        "`semidense {command}` is part of {PROGRAM}, which is neither beside {own} nor on the PATH: install the package {PROGRAM} (`apt install ./semidense-bridge_*.deb`), or build it with `cargo build --release -p {PROGRAM}`"
+        "`semidense {command}` needs {PROGRAM}, which is neither beside {own} nor on the PATH: {INSTALL_BRIDGE}"
     )]
     Missing {
-        /// The subcommand that was wanted.
-        command: &'static str,
+        /// The command that was given.
+        command: String,
         /// This program.
         own: PathBuf,
     },
@@ -64,7 +65,8 @@ pub fn run(
         return Err(BridgeError::Option { command, option: "--set" }.into());
     }
     let own = std::env::current_exe().unwrap_or_else(|_| PathBuf::from("semidense"));
-    let program = program(&own).ok_or(BridgeError::Missing { command, own })?;
+    let missing = || BridgeError::Missing { command: command.to_owned(), own: own.clone() };
+    let program = program(&own).ok_or_else(missing)?;
     let source = Command::new(&program)
         // Its help and its errors then name the command that was typed.
         .arg0("semidense")
@@ -108,5 +110,13 @@ mod tests {
         assert_ne!(program(&own), Some(beside.clone()));
         std::fs::write(&beside, "").unwrap();
         assert_eq!(program(&own), Some(beside));
+    }
+
+    #[test]
+    fn a_missing_program_is_said_alike_by_whoever_needs_it() {
+        let error = BridgeError::Missing { command: "ros2".to_owned(), own: "/x/semidense".into() };
+        let error = error.to_string();
+        assert!(error.contains("neither beside /x/semidense nor on the PATH"), "{error}");
+        assert!(error.contains(INSTALL_BRIDGE) && INSTALL_BRIDGE.contains(PROGRAM), "{error}");
     }
 }

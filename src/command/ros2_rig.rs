@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use crate::command::bridge::program;
+use crate::command::bridge::{BridgeError, program};
 use crate::command::print::note;
 use crate::service::shutdown::Shutdown;
 use crate::wire::port::{WaitError, wait};
@@ -16,8 +16,8 @@ const POLL_PERIOD: Duration = Duration::from_millis(50);
 #[derive(Debug, thiserror::Error)]
 pub enum Ros2RigError {
     /// There is no bridge.
-    #[error("ros2:{0} is read by semidense-bridge: install the package semidense-bridge")]
-    NoBridge(String),
+    #[error(transparent)]
+    NoBridge(#[from] BridgeError),
     /// It cannot be started or waited for.
     #[error("{}: {source}", program.display())]
     Program {
@@ -40,7 +40,9 @@ pub enum Ros2RigError {
 /// Waits for the CameraInfo beside `topic` and writes a rig file of it into `folder`.
 pub fn fetch(topic: &str, folder: &Path, shutdown: &Shutdown) -> Result<PathBuf, Ros2RigError> {
     let own = std::env::current_exe().unwrap_or_default();
-    let program = program(&own).ok_or_else(|| Ros2RigError::NoBridge(topic.to_owned()))?;
+    let command = format!("run ros2:{topic}");
+    let missing = || BridgeError::Missing { command, own: own.clone() };
+    let program = program(&own).ok_or_else(missing)?;
     let path = folder.join("rig.toml");
     let failed = |source| Ros2RigError::Program { program: program.clone(), source };
     let mut child = Command::new(&program)

@@ -192,7 +192,8 @@ fn start_page(
     let common = CommonArguments { instance: Some(place.instance.clone()), ..common.clone() };
     let mut arguments = handed_on(&common);
     arguments.extend(["view".into(), "--listen".into(), at.to_string().into()]);
-    let program = program(&own).ok_or(BridgeError::Missing { command: "run --view", own })?;
+    let missing = || BridgeError::Missing { command: "run --view".to_owned(), own: own.clone() };
+    let program = program(&own).ok_or_else(missing)?;
     let (root, log) = (place.root.clone(), log.clone());
     Ok(ViewChild::start(ViewOptions { program, arguments, root, log })?)
 }

@@ -9,6 +9,8 @@ use std::process::{Child, Command, Stdio};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
+use crate::capture::stream::INSTALL_BRIDGE;
+
 /// Pause before a sender is started, or a socket opened, again; doubled each time.
 const FIRST_PAUSE_NANOS: i64 = 200_000_000;
 /// The longest such pause.
@@ -230,7 +232,7 @@ impl Program {
                 let program = self.program.display();
                 let is_missing = error.kind() == ErrorKind::NotFound;
                 self.last = match is_missing {
-                    true => format!("{program} is not there: install the package semidense-bridge"),
+                    true => format!("{program} is not installed: {INSTALL_BRIDGE}"),
                     false => format!("{program} cannot be started ({error})"),
                 };
                 self.pause.begin(now);

@@ -279,5 +279,5 @@ fn a_program_that_is_missing_or_misused_is_an_error() {
         StreamSource::new("ros2:/x".to_owned(), Feed::Program(program), Some(rig), STALL_S).unwrap()
     });
     let error = scene.wait(0).unwrap_err().to_string();
-    assert!(error.contains("install the package semidense-bridge"), "{error}");
+    assert!(error.contains("is not installed: install the package semidense-bridge"), "{error}");
 }
