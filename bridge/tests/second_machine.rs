@@ -231,7 +231,7 @@ fn four_robots_to_one_host() {
     let mut second = receive(network.on_host(bridge()), &far[0], "semidense", &options);
     assert!(!second.end());
     let said = second.said();
-    assert!(said.contains("instance `robot0` already runs as process"), "{said}");
+    assert!(said.contains("instance `robot0` is already running (process"), "{said}");
     assert!(far[0].place().claim("tracker").is_err(), "a pipeline of this machine");
 }
 

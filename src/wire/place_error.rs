@@ -41,7 +41,8 @@ pub enum PlaceError {
     Held(PathBuf),
     /// There is one already.
     #[error(
-        "{process} of instance `{instance}` already runs as process {holder}: stop it, or choose another --instance"
+        "{}instance `{instance}` is already running (process {holder}): stop it, or choose another name with --instance",
+        part_of(process)
     )]
     Taken {
         /// Kind of process.
@@ -96,4 +97,25 @@ pub enum PlaceError {
         /// Needed.
         needed_mb: u64,
     },
+}
+
+/// The process of an instance that is meant; nothing where that is the supervisor, who stands for all of it.
+fn part_of(process: &str) -> String {
+    if process == "supervisor" { String::new() } else { format!("{process} of ") }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::PlaceError;
+
+    #[test]
+    fn who_is_second_is_told_what_runs_already() {
+        let told = |process: &str| {
+            let (process, instance) = (process.to_owned(), "semidense".to_owned());
+            PlaceError::Taken { process, instance, holder: "7".to_owned() }.to_string()
+        };
+        let expected = "instance `semidense` is already running (process 7): stop it, or choose another name with --instance";
+        assert_eq!(told("supervisor"), expected);
+        assert_eq!(told("tracker"), format!("tracker of {expected}"));
+    }
 }

@@ -184,7 +184,7 @@ fn who_comes_late_gets_the_keyframe_and_status_sees_all_three() {
     let elsewhere = rig.folder().join("elsewhere");
     let third = finish(rig.command(&["run", "--output", elsewhere.to_str().unwrap()]));
     assert_eq!(third.status.code(), Some(1));
-    assert_one_error(&third.stderr, "already runs as process");
+    assert_one_error(&third.stderr, "instance `semidense` is already running (process ");
     assert!(!elsewhere.exists());
 
     drop((tracker, inbox, hub, late));
