@@ -327,12 +327,12 @@ impl<'a> Shell<'a> {
         }
         match arrival {
             Arrival::Frame => {
-                if self.absence.take().is_some() {
-                    let again = if self.next_sequence.is_some() { " again" } else { "" };
-                    tracing::warn!("capture: frames are coming{again}");
+                match self.absence.take().map(|_| self.next_sequence) {
+                    Some(None) => tracing::info!("capture: frames are coming"),
+                    Some(Some(_)) => tracing::warn!("capture: frames are coming again"),
+                    None => {}
                 }
-                let left_out = self.refused.text();
-                self.health.enter(ProcessState::Running, left_out.as_deref().unwrap_or_default());
+                self.health.enter(ProcessState::Running, &self.refused.text().unwrap_or_default());
                 return Ok(true);
             }
             Arrival::Nothing => {}
