@@ -1,8 +1,12 @@
 //! What the real binary does with cameras that are missing, are none, or are asked for wrongly. Cameras
 //! that are there are the matter of `deploy/robot-test`.
 
+use std::io::Write;
+use std::os::unix::net::UnixStream;
+
 use crate::support::{Ended, Rig, end, finish, signal, until};
 use rustix::process::Signal;
+use semidense::capture::stream::format::{StreamClock, StreamHeader};
 use serde_json::Value;
 
 const WEBCAM: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/config/rigs/webcam.toml");
@@ -45,7 +49,7 @@ fn what_is_no_camera_ends_the_run() {
     let rig = Rig::new();
     for command in ["run", "capture"] {
         let ended = finish(start(&rig, command, "v4l:/dev/null", &["--rig", WEBCAM]));
-        assert_refused(&ended, &["/dev/null: is not a camera", "it is no video device"]);
+        assert_refused(&ended, &["/dev/null: is not a camera", "it is not a video device"]);
     }
     assert_eq!(rig.leftovers(), Vec::<String>::new());
 }
@@ -69,6 +73,30 @@ fn a_missing_camera_is_a_state() {
     // Said once, however often it is tried.
     assert_eq!(ended.stderr.matches("there is no camera").count(), 1, "{}", ended.stderr);
     assert_eq!(rig.leftovers(), Vec::<String>::new());
+}
+
+#[test]
+fn the_first_frames_of_a_stream_are_no_warning() {
+    let rig = Rig::new();
+    let socket = rig.folder().join("frames");
+    let source = format!("stream:{}", socket.display());
+    let arguments = ["--rig", WEBCAM, "--log", "info"];
+    let child = start(&rig, "capture", &source, &arguments).spawn().unwrap();
+    let is_in = |state: &str| {
+        let status = finish(rig.command(&["status", "--once", "--json"]));
+        let status: Value = serde_json::from_str(&status.stdout).ok()?;
+        (status["capture"]["state"] == state).then_some(())
+    };
+    until("that it waits", || is_in("stale"));
+    let mut sender = UnixStream::connect(&socket).unwrap();
+    let header = StreamHeader::gray((640, 480), StreamClock::Other, 1_000_000, 0);
+    sender.write_all(&header.to_bytes()).unwrap();
+    sender.write_all(&vec![90; 640 * 480]).unwrap();
+    until("that it runs", || is_in("running"));
+    signal(&child, Signal::INT);
+    let ended = end(child);
+    let line = ended.stderr.lines().find(|line| line.contains("frames are coming"));
+    assert!(line.is_some_and(|line| line.contains(" INFO ")), "{}", ended.stderr);
 }
 
 #[test]
