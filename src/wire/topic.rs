@@ -175,6 +175,8 @@ mod tests {
         assert!(sum < 64 << 20, "{sum} bytes");
         let large = shared_memory_bytes(&intrinsics(1280, 720), None);
         assert!(large < 128 << 20, "{large} bytes");
+        // As docs/operations.md and `semidense doctor` have it.
+        assert_eq!([sum, large].map(|bytes| (bytes >> 20) + 1), [62, 101]);
     }
 
     #[test]
