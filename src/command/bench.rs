@@ -96,7 +96,7 @@ pub struct LatencyArguments {
 /// after the first quarter.
 #[derive(Debug, Args)]
 pub struct SoakArguments {
-    /// Source to play back and forth; of the default flat the first 2000 frames, a round
+    /// Source to play back and forth: its first 640 MB, 2184 frames at 640x480 (more than a round of the default flat)
     #[arg(long, value_name = "SOURCE", default_value = "sim:flat")]
     source: OsString,
     /// Number of frames; 108000 are an hour at 30 Hz

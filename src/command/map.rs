@@ -37,8 +37,8 @@ pub struct MapArguments {
 /// The map on disk that a command begins or continues.
 #[derive(Debug, Clone, Args)]
 pub struct MapOptions {
-    /// Begin a map in this folder, or continue the one it holds: the camera is looked for in it, and mapping continues there
-    /// [default: map.folder of the configuration, which is none]
+    /// Begin a map in this folder, or continue the one it holds: the camera is relocalised in it, and mapping continues
+    /// there [default: map.folder of the configuration, which is none]
     #[arg(long, value_name = "DIR")]
     map: Option<PathBuf>,
     /// Only locate the camera in the map: nothing in its folder changes
@@ -89,9 +89,9 @@ struct SaveArguments {
     folder: Option<PathBuf>,
 }
 
-/// Have the running mapper go over to the map in another folder
+/// Have the running mapper switch to the map in another folder
 ///
-/// It saves its own map first, where that has a folder, then looks for the camera in the other one and continues there; a
+/// It saves its own map first, where that has a folder, then relocalises the camera in the other one and continues there; a
 /// new epoch begins beside it where the camera is not found for two seconds. A map that does not fit is refused, and the
 /// mapper continues in its own.
 #[derive(Debug, Args)]
@@ -259,7 +259,7 @@ fn load_running(config: &Config, arguments: &LoadArguments) -> CommandResult {
     let folder = std::path::absolute(&arguments.folder)?;
     let read_only = arguments.read_only;
     ask(config, "map-load", &Command::LoadFolder { folder: folder.clone(), read_only })?;
-    print(&format!("loaded {}; the camera is looked for in it\n", folder.display()))?;
+    print(&format!("loaded {}; the camera is relocalised in it\n", folder.display()))?;
     Ok(ExitCode::SUCCESS)
 }
 
