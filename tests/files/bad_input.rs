@@ -59,16 +59,20 @@ fn shell(rig: &Rig, script: &str) -> Command {
     command
 }
 
-/// What is said, as the page has it: the error, else the first warning, and the last line of the result where that
-/// tells of images that were left out. What differs from machine to machine is replaced.
+/// What is said, as the page has it: the error with the command or tip below it, else the first warning, and the last
+/// line of the result where that tells of images that were left out. What differs from machine to machine is replaced.
 fn said(ended: &Ended, rig: &Rig) -> String {
     let find = |start: &str| ended.stderr.lines().find(|line| line.contains(start));
+    let below = ended.stderr.lines().skip_while(|line| !line.starts_with("error: ")).skip(1);
+    let below =
+        below.map(str::trim).find(|line| line.starts_with("mkdir ") || line.starts_with("tip: "));
     let line = find("error: ").or_else(|| find("waiting: ")).or_else(|| find(" WARN "));
     let line = line.or_else(|| find("warning: ")).unwrap_or_default();
     let line = match line.split_once(" WARN ") {
         Some((_, text)) => format!("warning: {text}"),
         None => line.to_owned(),
     };
+    let line = below.map_or(line.clone(), |below| format!("{line}<br>{below}"));
     let last = ended.stdout.lines().last().filter(|line| line.contains("left out"));
     let line = last.map_or(line.clone(), |last| format!("{line}<br>{last}"));
     let line = line.replace(&rig.folder().display().to_string(), "…");

@@ -59,7 +59,20 @@ pub const SECTIONS: &[Section] = &[
 ];
 
 const SOURCES: &[Row] = &[
-    row("a folder that is not there", "", "semidense run nowhere", 1, &["nowhere", "No such file"]),
+    row(
+        "a folder that is not there",
+        "",
+        "semidense run nowhere",
+        1,
+        &["error: there is no such file or folder: nowhere; check the path"],
+    ),
+    row(
+        "the number of a camera",
+        "",
+        "semidense run 0",
+        1,
+        &["no such file or folder: 0; a camera is named v4l:0"],
+    ),
     row("the same with its layout", "", "semidense replay tum:nowhere", 1, &["no folder nowhere"]),
     row("a kind that is not known", "", "semidense run ros:topic", 1, &["unknown kind"]),
     row("no folder after the kind", "", "semidense run euroc:", 1, &["the folder is missing"]),
@@ -85,7 +98,7 @@ const SOURCES: &[Row] = &[
         "touch walk.mp4",
         "semidense run walk.mp4",
         1,
-        &["ffmpeg -i 'walk.mp4'", "times.txt"],
+        &["by its name this is a video", "<br>mkdir 'walk.frames' && ffmpeg -i 'walk.mp4'"],
     ),
     row("an archive", "touch a.zip", "semidense replay a.zip", 1, &["unpack it"]),
     row("a ROS bag", "touch a.bag", "semidense replay a.bag", 1, &["convert it to MCAP"]),

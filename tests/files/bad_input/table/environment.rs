@@ -48,12 +48,34 @@ pub const CONFIGURATION: &[Row] = &[
         1,
         &["expected a number"],
     ),
-    row("an instance that is no name", "", "semidense run --instance a/b", 1, &["a/b"]),
+    row("an invalid instance name", "", "semidense run --instance a/b", 1, &["a/b"]),
     row("a word that is not a log level", "", "semidense run --log loud", 1, &["--log loud"]),
     row("an option that is not known", "", "semidense run --fast", 2, &["--fast"]),
+    row(
+        "an option of another command",
+        "",
+        "semidense run --debug-images",
+        2,
+        &["<br>tip: '--debug-images' belongs to 'replay'"],
+    ),
+    row(
+        "a negative number",
+        "",
+        "semidense simulate --output out --noise -3",
+        1,
+        &["noise_std_dev = -3: must be 0 to"],
+    ),
 ];
 
 pub const OUTPUT: &[Row] = &[
+    row(
+        "a file in the place of a map",
+        "touch file",
+        "semidense run recording --map file",
+        1,
+        &["/file is a file; name a folder"],
+    ),
+    row("the same to read", "touch file", "semidense map info file", 1, &["file is a file"]),
     row(
         "a file in the place of the folder",
         "touch file",
@@ -151,7 +173,7 @@ pub const TRAJECTORIES: &[Row] = &[
         &["none.yaml"],
     ),
     row(
-        "a sensor file that is none",
+        "not a sensor file",
         "",
         "semidense evaluate recording/groundtruth.txt recording/groundtruth.txt --sensor rig.toml",
         1,
