@@ -1,5 +1,5 @@
-//! Ways out of semidense's shared memory: each is one more process that reads the topics like anybody else, and may be
-//! slow, die or be absent without the pipeline noticing.
+//! Outputs of semidense beyond its shared memory: each is one more process that reads the topics like anybody else, and
+//! may be slow, die or be absent without the pipeline noticing.
 //!
 //! [`session`] reads the topics of a running instance; every output is a folder beside it.
 

@@ -65,7 +65,7 @@ impl<'a> Row<'a> {
         translation: [f64; 3],
     ) -> Result<SE3, SourceError> {
         SE3::try_from_parts(quaternion_xyzw, translation).ok_or_else(|| {
-            self.error("its quaternion has no length, so it is no rotation; remove the line")
+            self.error("its quaternion has no length, so it is not a rotation; remove the line")
         })
     }
 

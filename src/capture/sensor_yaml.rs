@@ -84,7 +84,7 @@ pub fn parse(path: &Path, text: &str) -> Result<SensorYaml, SourceError> {
     .rig_of(path)?;
     let transform = get("T_BS.data")?;
     let body_from_camera = rigid_from_rows(&transform.numbers(16)?).ok_or_else(|| {
-        transform.row.error("T_BS is no rigid transform: a rotation, a translation, 0 0 0 1")
+        transform.row.error("T_BS is not a rigid transform: a rotation, a translation, 0 0 0 1")
     })?;
     Ok(SensorYaml { rig, body_from_camera })
 }
@@ -227,7 +227,7 @@ distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
             ("camera_model: pinhole", "camera_model: omni", "line 18: camera_model is `omni`"),
             ("458.654", "nan", "line 19: `nan` is not a finite number"),
             ("intrinsics:", "intrinsic:", "the key `intrinsics` is missing"),
-            ("0.999557249008", "0.5", "line 10: T_BS is no rigid transform"),
+            ("0.999557249008", "0.5", "line 10: T_BS is not a rigid transform"),
             ("76187114e-05]", "76187114e-05", "line 21: its list is not closed"),
             ("rate_hz: 20", "rate_hz: 20\nrate_hz: 30", "repeats the key of `rate_hz: 20`"),
             ("rate_hz: 20", "rate_hz 20", "line 16: is not `key: value`"),

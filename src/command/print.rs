@@ -26,7 +26,7 @@ pub fn print(text: &str) -> Result<(), PrintError> {
     Ok(stdout.flush()?)
 }
 
-/// Prints a line on standard error; nobody is left to be told when that fails. Nothing waits for ever for
+/// Prints a line on standard error; nobody is left to be told when that fails. Nothing waits forever for
 /// somebody to read it.
 pub fn note(line: &str) {
     let stderr = io::stderr();

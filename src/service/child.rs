@@ -180,7 +180,7 @@ impl Child {
         }
     }
 
-    /// Kills it and waits for its end, but not for ever.
+    /// Kills it and waits for its end, but not forever.
     pub fn kill(&mut self) {
         let _ = self.process.kill();
         wait_at_most(LONGEST_DEATH, || !matches!(self.process.try_wait(), Ok(None)));

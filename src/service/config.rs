@@ -168,7 +168,7 @@ pub struct SupervisorConfig {
     /// ready and was killed (SIGKILL), up to ten times in a row.
     pub max_restarts: u32,
     /// Longest time without a sign of life of a process before it is killed, seconds; live it is started again,
-    /// in lockstep the run ends. 0 waits for ever.
+    /// in lockstep the run ends. 0 waits forever.
     pub watchdog_s: f64,
     /// Longest wait for a process to end before it is killed, seconds.
     pub stop_timeout_s: f64,

@@ -24,7 +24,7 @@ pub enum LoopBytesError {
     #[error("the loops are cut, or followed by something else")]
     Length,
     /// A number is not possible.
-    #[error("loop {0} is no measurement between two keyframes")]
+    #[error("loop {0} is not a measurement between two keyframes")]
     Link(usize),
 }
 

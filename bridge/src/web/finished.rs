@@ -97,7 +97,7 @@ fn read_keyframes(path: &Path) -> Result<Vec<(u32, SceneKeyframe)>, FinishedErro
     for (number, line) in text.lines().enumerate().filter(|(_, line)| !line.starts_with('#')) {
         let keyframe = keyframe(line).ok_or_else(|| FinishedError::Content {
             path: path.to_owned(),
-            what: format!("line {} is no keyframe", number + 1),
+            what: format!("line {} is not a keyframe", number + 1),
         })?;
         keyframes.push(keyframe);
     }
@@ -231,7 +231,7 @@ impl Layout {
             match words.as_slice() {
                 _ if length == 0 => return Err("its header has no end".to_owned()),
                 ["ply"] if number == 0 => {}
-                _ if number == 0 => return Err("it is no PLY".to_owned()),
+                _ if number == 0 => return Err("it is not a PLY file".to_owned()),
                 ["end_header"] if is_binary => return Ok(layout),
                 ["end_header"] => return Err("it is not binary and little-endian".to_owned()),
                 ["format", format, _] => is_binary = *format == "binary_little_endian",

@@ -62,7 +62,7 @@ pub struct Envelope {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum EnvelopeError {
     /// Not from this program.
-    #[error("{bytes} bytes are no message of semidense")]
+    #[error("{bytes} bytes are not a message of semidense")]
     Foreign {
         /// How many came.
         bytes: usize,

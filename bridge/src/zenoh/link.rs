@@ -40,7 +40,9 @@ pub struct Endpoint {
 
 /// Why a text names no endpoint.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("`{0}` is no endpoint: write tcp/HOST:PORT, as in tcp/192.168.1.7:7447 or tcp/[::1]:7447")]
+#[error(
+    "`{0}` is not an endpoint: write tcp/HOST:PORT, as in tcp/192.168.1.7:7447 or tcp/[::1]:7447"
+)]
 pub struct EndpointError(String);
 
 impl FromStr for Endpoint {

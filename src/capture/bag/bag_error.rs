@@ -11,7 +11,7 @@ pub enum BagError {
     #[error("cannot be read: {0}; check the path and its permissions")]
     Read(#[from] std::io::Error),
     /// Another kind of file.
-    #[error("is no MCAP file; write a bag as one with `ros2 bag convert` or `mcap convert`")]
+    #[error("is not an MCAP file; write a bag as one with `ros2 bag convert` or `mcap convert`")]
     NotMcap,
     /// A record that is not what its kind needs.
     #[error("is damaged at byte {at}: {reason}; `mcap recover` saves what can be read")]

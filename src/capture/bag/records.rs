@@ -282,7 +282,7 @@ impl Records {
             Ok(Record::Chunk { header, data }) => {
                 decompress_into(&header, &data, &mut self.chunk).map_err(|e| e.to_string())
             }
-            Ok(_) => Err("a chunk that is none".to_owned()),
+            Ok(_) => Err("its record is not a chunk".to_owned()),
             Err(error) => Err(error.to_string()),
         };
         decoded.map_err(|reason| {

@@ -266,7 +266,7 @@ fn several_topics_none_and_no_camera_are_said() {
     let mut bag = TestBag::default();
     bag.topic("/tf", "tf2_msgs/msg/TFMessage");
     assert!(error_of(&bag.finish(), None).contains("no topic with images"));
-    assert!(error_of(b"no", None).contains("is no MCAP file"));
+    assert!(error_of(b"no", None).contains("is not an MCAP file"));
     let mut bag = camera_bag(0);
     bag.topic("/more", IMAGE);
     assert!(error_of(&bag.finish(), Some("/more")).contains("has no images on `/more`"));

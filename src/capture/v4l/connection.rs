@@ -25,7 +25,7 @@ const HEALTHY_NANOS: i64 = 2_000_000_000;
 const EXPOSURE_PERIOD_NANOS: i64 = 200_000_000;
 /// Pause after a wake-up without a frame.
 const IDLE_PAUSE_MILLIS: u32 = 1;
-/// Most notices that are kept for who asks: a camera that complains for ever is heard often enough.
+/// Most notices that are kept for who asks: a camera that complains forever is heard often enough.
 const MAX_NOTICES: usize = 16;
 /// Frames whose stamps go back are refused; after so many in a row, a third of a second, it is the clock that has
 /// stepped.
@@ -301,7 +301,7 @@ impl<S: VideoSystem> Camera<S> {
             let before = stream.held.map(|held| held.stamp.capture_nanos).or(self.last_nanos);
             if !taken.is_stamped || self.refused_in_a_row >= MAX_REFUSED_IN_A_ROW {
                 // Frames that were fetched together have arrived together; and a driver whose stamps have
-                // gone back for good is not blind for ever.
+                // gone back for good is not blind forever.
                 taken.nanos =
                     before.map_or(taken.nanos, |before| taken.nanos.max(before.saturating_add(1)));
             }

@@ -82,7 +82,7 @@ pub fn rate_differs(wanted: Option<f64>, granted: Option<f64>) -> bool {
 fn check_capability(device: &dyn VideoDevice) -> Result<(), NegotiationError> {
     let no_camera = NegotiationError::NoCamera;
     let capability = device.capability().map_err(|error| match error {
-        Errno::NOTTY | Errno::INVAL => no_camera("it is no video device"),
+        Errno::NOTTY | Errno::INVAL => no_camera("it is not a video device"),
         error => NegotiationError::Device(error),
     })?;
     let has = |flag: u32| capability.flags & flag != 0;

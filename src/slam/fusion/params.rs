@@ -68,7 +68,7 @@ pub enum MapResolution {
 /// A resolution that is no length and no share.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "`{0}` is no resolution: give a length in map units above 0 (0.02), or a share of the distance up to 100% (0.5%)"
+    "`{0}` is not a resolution: give a length in map units above 0 (0.02), or a share of the distance up to 100% (0.5%)"
 )]
 pub struct MapResolutionError(String);
 
