@@ -84,7 +84,8 @@ mod tests {
         assert!(error.contains("tip: '--debug-images' belongs to 'replay'\n"), "{error}");
         assert!(!error.contains("as a value"), "{error}");
         let error = refused("semidense replay DIR --live");
-        assert!(error.contains("tip: '--live' belongs to 'run' and 'capture'\n"), "{error}");
+        let tip = "tip: '--live' belongs to 'run', 'capture', 'tracker' and 'mapper'\n";
+        assert!(error.contains(tip), "{error}");
         let error = refused("semidense run DIR --frames 5");
         assert!(error.contains("belongs to 'replay', "), "{error}");
         assert!(error.contains("'bench soak'"), "{error}");
