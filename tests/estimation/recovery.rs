@@ -381,12 +381,12 @@ fn a_map_whose_poses_are_wrong_is_rejected() {
 #[test]
 fn a_start_with_the_wrong_motion_is_rejected_and_another_begun() {
     // A plane seen from two places has two explanations, and here the wrong one fits better.
-    wrong_start(3, 40);
+    wrong_start(4, 40);
 }
 
 #[test]
 fn a_start_with_the_wrong_motion_that_the_joint_estimate_bends_until_it_fits_is_rejected() {
-    wrong_start(5, 50);
+    wrong_start(3, 50);
 }
 
 /// A start on the floor from a frame on, with the wrong one of its motions, is rejected within so many frames.
