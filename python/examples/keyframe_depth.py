@@ -37,7 +37,7 @@ def main() -> None:
     """Parses the arguments and draws."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--instance", default="semidense")
-    parser.add_argument("--timeout", type=float, help="seconds to wait for the instance [for ever]")
+    parser.add_argument("--timeout", type=float, help="seconds to wait for the instance [forever]")
     parser.add_argument("--save", metavar="FILE", help="write a picture instead of opening a window")
     arguments = parser.parse_args()
     if arguments.save is not None:

@@ -78,7 +78,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", nargs="?", help="output folder of a finished run; live without")
     parser.add_argument("--instance", default="semidense")
-    parser.add_argument("--timeout", type=float, help="seconds to wait for the instance [for ever]")
+    parser.add_argument("--timeout", type=float, help="seconds to wait for the instance [forever]")
     parser.add_argument("--seconds", type=float, help="live: end after so long")
     parser.add_argument("--save", metavar="FILE", help="write a picture instead of opening a window")
     arguments = parser.parse_args()

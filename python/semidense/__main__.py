@@ -25,7 +25,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--instance", default="semidense", metavar="NAME", help="instance to read [semidense]")
     parser.add_argument("--root", metavar="DIR", help="its folder [SEMIDENSE_ROOT, else the usual one]")
     parser.add_argument(
-        "--timeout", type=float, metavar="SECONDS", help="wait so long for the instance, then fail [for ever]"
+        "--timeout", type=float, metavar="SECONDS", help="wait at most this long for the instance [forever]"
     )
     parser.add_argument("--follow", action="store_true", help="continue with the next run when one ends")
     parser.add_argument("--map", action="store_true", help="print map_from_camera instead of world_from_camera")

@@ -150,7 +150,7 @@ def _config(place: Place) -> Any:
 
 
 def _check_version(config: Any, place: Place) -> None:
-    """Topics of another version have other names: without this look the reader would wait for ever."""
+    """Topics of another version have other names: without this look the reader would wait forever."""
     try:
         services = iox2.Service.list(config, iox2.ServiceType.Ipc)
     except Exception:

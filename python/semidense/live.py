@@ -48,7 +48,7 @@ def poses(
 ) -> Iterator[Pose]:
     """Every pose as it is published, also of frames that are lost, until the run ends.
 
-    Waits for the instance for `timeout` seconds (None: for ever), then raises `NotRunning`. `root` is the folder of the
+    Waits for the instance for `timeout` seconds (None: forever), then raises `NotRunning`. `root` is the folder of the
     instance where it is not the usual one (`SEMIDENSE_ROOT`). With `follow` it continues to the next run. 900 poses
     are kept for a loop that is late.
     """

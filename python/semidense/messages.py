@@ -197,7 +197,7 @@ class Frame:
         self._header = header
 
     def copy(self) -> Frame:
-        """The same in memory of its own: may be kept for ever."""
+        """The same in memory of its own: may be kept forever."""
         return Frame(self._header, self.image.ravel().copy())
 
     def __repr__(self) -> str:

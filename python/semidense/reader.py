@@ -66,7 +66,7 @@ class Reader:
         follow: bool = False,
         copy: bool = True,
     ) -> None:
-        """Waits for the instance for `timeout` seconds (None: for ever), else `NotRunning`.
+        """Waits for the instance for `timeout` seconds (None: forever), else `NotRunning`.
 
         With `follow` it continues with the next run of the instance when one ends. Without `copy` the points of a
         keyframe stay in shared memory, where a reader may hold one: `del` it before the next.
@@ -134,7 +134,7 @@ class Reader:
         return self._ports is not None
 
     def __iter__(self) -> Iterator[Message]:
-        """Every message as it comes, until the run ends (with `follow`: for ever)."""
+        """Every message as it comes, until the run ends (with `follow`: forever)."""
         while True:
             while self._ports is not None:
                 is_quiet = True

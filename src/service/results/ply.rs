@@ -45,7 +45,7 @@ pub enum ReadSurfaceError {
         source: io::Error,
     },
     /// It is another file.
-    #[error("{0} is no map.ply of this version of semidense: write it again")]
+    #[error("{0} is not a map.ply of this version of semidense: write it again")]
     Foreign(PathBuf),
 }
 

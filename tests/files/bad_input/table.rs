@@ -297,7 +297,7 @@ const LISTS: &[Row] = &[
         "mv recording/rgb images; echo 1 > images/times.txt",
         "semidense run images --rig rig.toml",
         1,
-        &["1 time stamps for 20 images"],
+        &["1 time stamp for 20 images"],
     ),
     row(
         "images without stamps or rate",
