@@ -1,5 +1,7 @@
 //! Spreads the depths of a few points over the candidate pixels around them.
 
+use rayon::prelude::*;
+
 use crate::slam::depth::gaussian::NEW_VALIDITY;
 use crate::slam::depth::map::{DepthMap, Hypothesis};
 use crate::slam::two_frame::InitialDepth;
@@ -22,31 +24,33 @@ const LONELY_STD_DEV_RATIO: f32 = 0.2;
 /// variance widened by the distance and by how much the nearest points differ.
 pub fn spread(depths: &[InitialDepth], map: &mut DepthMap) {
     let (width, height) = (map.image.width(), map.image.height());
-    let (columns, rows) = (width.div_ceil(CELL_PX), height.div_ceil(CELL_PX));
-    let mut cells: Vec<Vec<usize>> = vec![Vec::new(); columns * rows];
+    let (columns, rows_of_cells) = (width.div_ceil(CELL_PX), height.div_ceil(CELL_PX));
+    let mut cells: Vec<Vec<usize>> = vec![Vec::new(); columns * rows_of_cells];
     for (i, depth) in depths.iter().enumerate() {
         let (u, v) = (usize::from(depth.u), usize::from(depth.v));
         if u < width && v < height {
             cells[v / CELL_PX * columns + u / CELL_PX].push(i);
         }
     }
-    let candidates = map.candidates.pixels();
-    let pixels = map.hypotheses.pixels_mut().iter_mut().enumerate();
-    for (i, hypothesis) in pixels.filter(|(i, _)| candidates[*i]) {
-        let (u, v) = (i % width, i / width);
-        let (column, row) = (u / CELL_PX, v / CELL_PX);
-        let mut nearest = [(f32::INFINITY, 0); NUM_NEAREST];
-        for y in row.saturating_sub(1)..(row + 2).min(rows) {
-            for x in column.saturating_sub(1)..(column + 2).min(columns) {
-                for &point in &cells[y * columns + x] {
-                    insert(&mut nearest, squared_distance(&depths[point], u, v), point);
+    let candidates = &map.candidates;
+    let rows = map.hypotheses.pixels_mut().par_chunks_mut(width).enumerate();
+    rows.for_each(|(v, hypotheses)| {
+        let candidates = candidates.row(v);
+        for (u, hypothesis) in hypotheses.iter_mut().enumerate().filter(|(u, _)| candidates[*u]) {
+            let (column, row) = (u / CELL_PX, v / CELL_PX);
+            let mut nearest = [(f32::INFINITY, 0); NUM_NEAREST];
+            for y in row.saturating_sub(1)..(row + 2).min(rows_of_cells) {
+                for x in column.saturating_sub(1)..(column + 2).min(columns) {
+                    for &point in &cells[y * columns + x] {
+                        insert(&mut nearest, squared_distance(&depths[point], u, v), point);
+                    }
                 }
             }
+            if nearest[0].0.is_finite() {
+                *hypothesis = hypothesis_from(depths, &nearest);
+            }
         }
-        if nearest[0].0.is_finite() {
-            *hypothesis = hypothesis_from(depths, &nearest);
-        }
-    }
+    });
 }
 
 fn squared_distance(depth: &InitialDepth, u: usize, v: usize) -> f32 {
