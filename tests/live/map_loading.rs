@@ -14,8 +14,8 @@ use semidense::slam::map::Map;
 use semidense::wire::port::Hub;
 use semidense::wire::topic::MAPPER_HEALTH;
 
-/// A room that is seen again and again, at the camera's rate.
-const SOURCE: &str = "loop:300:30:sim";
+/// A room that is seen again and again, at the camera's rate, for longer than the tests take on a busy machine: they end it.
+const SOURCE: &str = "loop:1000:30:sim";
 
 /// A map of the simulated room, or of what another camera sees of it.
 fn make_map(rig: &Rig, name: &str, setting: Option<&str>) -> PathBuf {
