@@ -341,7 +341,7 @@ mod tests {
             (HEADER.replace("binary_little_endian", "ascii"), "not binary"),
             (HEADER.replace("float y", "float b"), "no y"),
             (HEADER.replace("double z", "list uchar int z"), "lists"),
-            (HEADER.replace("ply\n", "png\n"), "no PLY"),
+            (HEADER.replace("ply\n", "png\n"), "not a PLY file"),
             (HEADER.replace("vertex 2", "vertex 3"), "fill whole buffer"),
             (HEADER.replace("end_header\n", ""), "no end"),
         ];
