@@ -140,7 +140,10 @@ fn last_words(ended: &EndOfRun, untracked: Option<&str>, place: Option<&str>) ->
         (_, Some(why)) => format!("nothing was tracked: {why}"),
         (_, None) => return None,
     };
-    Some(place.map_or(how.clone(), |place| format!("{how}; {place}")))
+    Some(match place {
+        Some(place) => format!("{how}; {place}"),
+        None => how,
+    })
 }
 
 /// What is said where results cannot be written: nothing is lost.

@@ -385,3 +385,56 @@ pub fn pose_covariance(state: &State, system: &System) -> Option<PoseCovariance>
     }
     hessian.cholesky().map(|factor| factor.inverse())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::pose::Brightness;
+    use crate::slam::two_frame::lanes::{LANES, lanes};
+    use crate::slam::two_frame::system::SystemBlock;
+
+    /// Of a quadratic energy, with its priors, the step that is not damped brings what it promises.
+    #[test]
+    fn a_step_promises_what_it_brings() {
+        let block = SystemBlock {
+            mixed: std::array::from_fn(|k| lanes(|l| 0.1 * ((3 * k + l) as f32).sin())),
+            information: lanes(|l| 3.0 + l as f32),
+            gradient: lanes(|l| 0.4 * (l as f32).cos()),
+            energy: [0.0; LANES],
+            weight: [1.0; LANES],
+            squared_speed: [1.0; LANES],
+            visible: [true; LANES],
+        };
+        let system = System {
+            blocks: vec![block],
+            num_points: LANES,
+            hessian: SMatrix::identity() * 9.0,
+            gradient: SVector::from_fn(|k, _| 0.3 * (k as f64).sin()),
+            ..System::default()
+        };
+        let state = State {
+            current_from_first: SE3::identity(),
+            brightness: Brightness::default(),
+            inverse_depths: (0..LANES).map(|l| 0.8 + 0.05 * l as f32).collect(),
+        };
+        let weights = PriorWeights { neighbour: 0.7, depth: 0.5 };
+        let medians = vec![1.1; LANES];
+        let mut scratch = FitScratch { system, medians, ..FitScratch::default() };
+        scratch.elimination.weights = weights;
+        let Step { of_pose, promised_drop } = joint_step(&mut scratch, &state, 0.0).unwrap();
+
+        let (system, before) = (&scratch.system, &state.inverse_depths);
+        let quadratic = (of_pose.transpose() * system.hessian * of_pose)[0];
+        let mut change = 2.0 * system.gradient.dot(&of_pose) + quadratic;
+        for (l, point) in system.points().enumerate() {
+            let moved = f64::from(scratch.trial_depths[l] - before[l]);
+            let mixed = SVector::from(point.mixed.map(f64::from)).dot(&of_pose);
+            let [gradient, information] = [point.gradient, point.information].map(f64::from);
+            change += (2.0 * (gradient + mixed) + information * moved) * moved;
+        }
+        let prior = |depths: &[f32]| prior_energy(depths, &scratch.medians, weights);
+        change += prior(&scratch.trial_depths) - prior(before);
+        assert!(change < -0.05, "{change}");
+        assert!((promised_drop + change).abs() < 1e-4 * promised_drop, "{promised_drop} {change}");
+    }
+}

@@ -173,7 +173,7 @@ pub const TRAJECTORIES: &[Row] = &[
         &["none.yaml"],
     ),
     row(
-        "not a sensor file",
+        "a file that is not a sensor's",
         "",
         "semidense evaluate recording/groundtruth.txt recording/groundtruth.txt --sensor rig.toml",
         1,
