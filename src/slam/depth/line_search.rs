@@ -1,6 +1,6 @@
 //! The search for a patch along a line of a frame: 1-px steps, then Gauss–Newton. Both filters search this way.
 
-use crate::slam::depth::patch_kernel::PatchSums;
+use crate::slam::depth::patch_kernel::{PatchSums, huber};
 use crate::slam::depth::pattern::PATTERN;
 use crate::slam::image::quads_kernel::{Sampled, Sampler};
 use crate::slam::kernel::Instructions;
@@ -49,8 +49,12 @@ impl<S: Instructions> Along<'_, S> {
         /// Steps this near to the minimum belong to it.
         const SAME_MINIMUM_STEPS: usize = 2;
         let mut costs = [f32::INFINITY; MOST_COSTS];
-        for (step, cost) in costs[..=steps].iter_mut().enumerate() {
-            *cost = self.cost(&self.look(first + step as f32));
+        for (begin, costs) in (0..=steps).step_by(LANES).zip(costs.chunks_exact_mut(LANES)) {
+            let mut terms = [[f32::INFINITY; 8]; LANES];
+            for (step, terms) in (begin..=steps).zip(&mut terms) {
+                *terms = huber(&self.look(first + step as f32), self.intensity);
+            }
+            costs.copy_from_slice(&self.frame.sampler.sums(&terms));
         }
         // What is least of all is looked for afterwards: on the way nobody can guess which step it will be.
         let padded = (steps + 1).next_multiple_of(LANES);
@@ -121,7 +125,7 @@ impl<S: Instructions> Along<'_, S> {
 
     #[inline(always)]
     fn cost(&self, samples: &[f32; 8]) -> f32 {
-        self.frame.sampler.cost(samples, self.intensity)
+        self.frame.sampler.sum(&huber(samples, self.intensity))
     }
 }
 

@@ -8,8 +8,11 @@ const HUBER_GREY: f32 = 9.0;
 
 /// How the eight residuals of a patch are summed; all versions give the same bits.
 pub(super) trait PatchSums: Copy {
-    /// Σ ρ(r), ρ(r) = r² up to [`HUBER_GREY`], linear beyond; r = `seen` − `expected`.
-    fn cost(self, seen: &[f32; 8], expected: &[f32; 8]) -> f32;
+    /// The sum of eight.
+    fn sum(self, terms: &[f32; 8]) -> f32;
+
+    /// The sum of each row: of several at once, because within one row each addition waits for the one before.
+    fn sums(self, rows: &[[f32; 8]; 8]) -> [f32; 8];
 
     /// Σ w g r and Σ w g², w = Huber's weight.
     fn slope(self, seen: &[f32; 8], expected: &[f32; 8], gradients: &[f32; 8]) -> [f32; 2];
@@ -17,13 +20,23 @@ pub(super) trait PatchSums: Copy {
 
 impl<I: Instructions> PatchSums for I {
     #[inline(always)]
-    fn cost(self, seen: &[f32; 8], expected: &[f32; 8]) -> f32 {
+    fn sum(self, terms: &[f32; 8]) -> f32 {
         #[cfg(target_arch = "x86_64")]
         if I::HAS_AVX2 {
             // SAFETY: who made the instructions vouched for them.
-            return unsafe { avx2::cost(seen, expected) };
+            return unsafe { avx2::sum_of(terms) };
         }
-        cost(seen, expected)
+        sum_of_samples(terms)
+    }
+
+    #[inline(always)]
+    fn sums(self, rows: &[[f32; 8]; 8]) -> [f32; 8] {
+        #[cfg(target_arch = "x86_64")]
+        if I::HAS_AVX2 {
+            // SAFETY: as above.
+            return unsafe { avx2::sums(rows) };
+        }
+        rows.map(|row| sum_of_samples(&row))
     }
 
     #[inline(always)]
@@ -37,16 +50,17 @@ impl<I: Instructions> PatchSums for I {
     }
 }
 
-/// The explanation of the others.
+/// ρ(r) by sample: r² up to [`HUBER_GREY`], linear beyond; r = `seen` − `expected`. Without the division of a weight.
 #[inline(always)]
-fn cost(seen: &[f32; 8], expected: &[f32; 8]) -> f32 {
-    let mut costs = [0.0; 8];
+pub(super) fn huber(seen: &[f32; 8], expected: &[f32; 8]) -> [f32; 8] {
+    let mut terms = [0.0; 8];
     for k in 0..8 {
-        let residual = seen[k] - expected[k];
-        let weight = weight(residual);
-        costs[k] = weight * (2.0 - weight) * residual * residual;
+        let size = (seen[k] - expected[k]).abs();
+        // Not `min`, which asks for NaN: its term is NaN either way.
+        let bounded = if size < HUBER_GREY { size } else { HUBER_GREY };
+        terms[k] = bounded * (2.0 * size - bounded);
     }
-    sum_of_samples(&costs)
+    terms
 }
 
 /// The explanation of the others.
@@ -72,21 +86,47 @@ mod avx2 {
 
     use super::HUBER_GREY;
 
+    /// [`sum_of_samples`](crate::slam::depth::pattern::sum_of_samples).
+    ///
     /// # Safety
     /// The processor has AVX2. Without the attribute that says so, because only that goes into the loop of the caller
     /// whatever its size. So have the others.
     #[inline(always)]
-    pub(super) unsafe fn cost(seen: &[f32; 8], expected: &[f32; 8]) -> f32 {
-        // SAFETY: this function's own contract.
+    pub(super) unsafe fn sum_of(terms: &[f32; 8]) -> f32 {
+        // SAFETY: this function's own contract; eight numbers are loaded.
+        unsafe { sum(_mm256_loadu_ps(terms.as_ptr())) }
+    }
+
+    /// The same of several at once.
+    ///
+    /// # Safety
+    /// As [`sum_of`].
+    #[inline(always)]
+    pub(super) unsafe fn sums(rows: &[[f32; 8]; 8]) -> [f32; 8] {
+        // SAFETY: this function's own contract; eight numbers are loaded and stored.
         unsafe {
-            let (residual, weight) = weighed(seen, expected);
-            let factor = _mm256_mul_ps(weight, _mm256_sub_ps(_mm256_set1_ps(2.0), weight));
-            sum(_mm256_mul_ps(_mm256_mul_ps(factor, residual), residual))
+            let row = |k: usize| _mm256_loadu_ps(rows[k].as_ptr());
+            // Halves of two rows, then quarters of four, then eighths of all, each in the place of its row.
+            let halves = |one, other| {
+                let lower = _mm256_permute2f128_ps::<0x20>(one, other);
+                _mm256_add_ps(lower, _mm256_permute2f128_ps::<0x31>(one, other))
+            };
+            let quarters = |one, other| {
+                let lower = _mm256_shuffle_ps::<0x44>(one, other);
+                _mm256_add_ps(lower, _mm256_shuffle_ps::<0xee>(one, other))
+            };
+            let left = quarters(halves(row(0), row(4)), halves(row(1), row(5)));
+            let right = quarters(halves(row(2), row(6)), halves(row(3), row(7)));
+            let even = _mm256_shuffle_ps::<0x88>(left, right);
+            let sums = _mm256_add_ps(even, _mm256_shuffle_ps::<0xdd>(left, right));
+            let mut out = [0.0; 8];
+            _mm256_storeu_ps(out.as_mut_ptr(), sums);
+            out
         }
     }
 
     /// # Safety
-    /// As [`cost`].
+    /// As [`sum_of`].
     #[inline(always)]
     pub(super) unsafe fn slope(
         seen: &[f32; 8],
@@ -105,7 +145,7 @@ mod avx2 {
     /// Residuals and their weights.
     ///
     /// # Safety
-    /// As [`cost`].
+    /// As [`sum_of`].
     #[inline(always)]
     unsafe fn weighed(seen: &[f32; 8], expected: &[f32; 8]) -> (__m256, __m256) {
         // SAFETY: this function's own contract; eight numbers are loaded.
@@ -122,7 +162,7 @@ mod avx2 {
     /// [`sum_of_samples`](crate::slam::depth::pattern::sum_of_samples).
     ///
     /// # Safety
-    /// As [`cost`].
+    /// As [`sum_of`].
     #[inline(always)]
     unsafe fn sum(x: __m256) -> f32 {
         // SAFETY: this function's own contract.
@@ -135,7 +175,8 @@ mod avx2 {
 
     #[cfg(test)]
     mod tests {
-        use super::super::{cost, slope};
+        use super::super::{HUBER_GREY, huber, slope, weight};
+        use crate::slam::depth::pattern::sum_of_samples;
         use crate::slam::test_scene::Random;
 
         #[test]
@@ -149,19 +190,41 @@ mod avx2 {
                 let mut eight =
                     || -> [f32; 8] { std::array::from_fn(|_| (scale * random.normal()) as f32) };
                 let (mut seen, expected, gradients) = (eight(), eight(), eight());
+                let mut rows: [[f32; 8]; 8] = std::array::from_fn(|_| eight());
                 if round % 97 == 0 {
                     seen[round % 8] = [f32::NAN, f32::INFINITY][round % 2];
+                    rows[round % 8] = seen;
                 }
                 // SAFETY: the processor has AVX2, as was just asked.
-                let (found, slopes) = unsafe {
-                    (super::cost(&seen, &expected), super::slope(&seen, &expected, &gradients))
-                };
+                let (sums, slopes) =
+                    unsafe { (super::sums(&rows), super::slope(&seen, &expected, &gradients)) };
                 let is_same = |one: f32, other: f32| {
                     one.to_bits() == other.to_bits() || one.is_nan() && other.is_nan()
                 };
-                assert!(is_same(found, cost(&seen, &expected)), "{seen:?} {expected:?}");
+                for (row, found) in rows.iter().zip(sums) {
+                    // SAFETY: as above.
+                    let alone = unsafe { super::sum_of(row) };
+                    let expected = sum_of_samples(row);
+                    assert!(is_same(found, expected) && is_same(alone, expected), "{row:?}");
+                }
                 let expected = slope(&seen, &expected, &gradients);
                 assert!(is_same(slopes[0], expected[0]) && is_same(slopes[1], expected[1]));
+            }
+        }
+
+        #[test]
+        fn hubers_terms_are_squares_that_grow_linearly_beyond_the_bound() {
+            let seen = [0.0, 3.0, -8.9, 9.0, 9.1, -200.0, f32::INFINITY, f32::NAN];
+            for (residual, term) in seen.into_iter().zip(huber(&seen, &[0.0; 8])) {
+                let weight = weight(residual);
+                let expected = weight * (2.0 - weight) * residual * residual;
+                match residual.is_finite() {
+                    true => assert!((term - expected).abs() <= 1e-6 * expected, "{residual}"),
+                    false => assert!(!term.is_finite()),
+                }
+                assert!(
+                    residual.abs() > HUBER_GREY || term == residual * residual || term.is_nan()
+                );
             }
         }
     }
