@@ -4,6 +4,8 @@ use std::fs;
 use std::io::{self, Write};
 use std::path::Path;
 
+use rayon::prelude::*;
+
 use crate::service::atomic_file::write_atomically;
 use crate::service::results::colour::Picture;
 use crate::service::results::pictures::{density_picture, inverse_depth_picture, variance_picture};
@@ -21,7 +23,7 @@ pub fn write_debug_pictures(
 ) -> Result<(), ResultsError> {
     let at = |path: &Path, source| ResultsError::Write { path: path.to_path_buf(), source };
     fs::create_dir_all(dir).map_err(|source| at(dir, source))?;
-    for keyframe in &map.keyframes {
+    map.keyframes.par_iter().try_for_each(|keyframe| {
         let pictures = [
             ("inverse-depth", Some(inverse_depth_picture(keyframe, f64::INFINITY).0)),
             ("variance", Some(variance_picture(keyframe))),
@@ -33,8 +35,8 @@ pub fn write_debug_pictures(
             let path = dir.join(format!("keyframe-{:04}-{kind}.png", keyframe.keyframe_id));
             write_picture(&path, &picture).map_err(|source| at(&path, source))?;
         }
-    }
-    Ok(())
+        Ok(())
+    })
 }
 
 fn write_picture(path: &Path, picture: &Picture) -> io::Result<()> {

@@ -25,6 +25,8 @@ pub(crate) mod views;
 
 use std::fmt::Write;
 
+use rayon::prelude::*;
+
 use crate::service::results::colour::Picture;
 use crate::service::results::output_folder::utc_text;
 use crate::service::results::pictures::{
@@ -261,7 +263,8 @@ fn depth_maps(input: &ReportInput<'_>) -> String {
         keyframes.len(),
         100.0 * input.max_relative_std_dev
     );
-    for keyframe in (0..shown).map(spread) {
+    let pictured = |i: usize| {
+        let keyframe = spread(i);
         let (picture, range) = inverse_depth_picture(keyframe, input.max_relative_std_dev);
         let depths = match range {
             Some([far, near]) => {
@@ -270,8 +273,9 @@ fn depth_maps(input: &ReportInput<'_>) -> String {
             }
             None => "no points".to_owned(),
         };
-        picture_figure(&mut html, &picture, keyframe, &depths);
-    }
+        picture_figure(&picture, keyframe, &depths)
+    };
+    html.extend((0..shown).into_par_iter().map(pictured).collect::<Vec<_>>());
     let middle = spread(shown / 2);
     let [low, high] = RELATIVE_STD_DEV_RANGE;
     let _ = write!(
@@ -282,23 +286,27 @@ fn depth_maps(input: &ReportInput<'_>) -> String {
         100.0 * low,
         100.0 * high
     );
-    let (all, _) = inverse_depth_picture(middle, f64::INFINITY);
-    picture_figure(&mut html, &all, middle, "inverse depth");
-    picture_figure(&mut html, &variance_picture(middle), middle, "uncertainty");
-    picture_figure(&mut html, &density_picture(middle), middle, "density");
+    let whole: [(&str, fn(&Keyframe) -> Picture); 3] = [
+        ("inverse depth", |keyframe| inverse_depth_picture(keyframe, f64::INFINITY).0),
+        ("uncertainty", variance_picture),
+        ("density", density_picture),
+    ];
+    let figure =
+        |(note, of): &(&str, fn(&Keyframe) -> Picture)| picture_figure(&of(middle), middle, note);
+    html.extend(whole.par_iter().map(figure).collect::<Vec<_>>());
     html.push_str("</div></section>");
     html
 }
 
-fn picture_figure(html: &mut String, picture: &Picture, keyframe: &Keyframe, note: &str) {
-    let Some(png) = picture.png() else { return };
-    let _ = write!(
-        html,
+/// The picture as part of the page; nothing where it cannot be encoded.
+fn picture_figure(picture: &Picture, keyframe: &Keyframe, note: &str) -> String {
+    let Some(png) = picture.png() else { return String::new() };
+    format!(
         "<figure><img alt=\"depth of keyframe {0}\" src=\"{1}\">\
          <figcaption>keyframe {0}, frame {2}: {3} points, {note}</figcaption></figure>",
         keyframe.keyframe_id,
         png_address(&png),
         keyframe.sequence,
         grouped(keyframe.points.len() as u64)
-    );
+    )
 }

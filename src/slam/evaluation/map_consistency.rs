@@ -4,11 +4,12 @@
 //! the earlier; keyframes further apart have come to their poses and scales over different paths, and
 //! whatever drifted between them shows as a misfit in pixels.
 
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::slam::evaluation::depth_agreement::{DepthAgreement, depth_agreement, point_index};
 use crate::slam::evaluation::patch_misfit::{PatchMisfit, ReducedImage, patch_misfit};
-use crate::slam::evaluation::shared_view::{SharedView, pairs};
+use crate::slam::evaluation::shared_view::{Pair, SharedView, pairs};
 use crate::slam::evaluation::statistics::median;
 use crate::slam::keyframe::Keyframe;
 
@@ -39,45 +40,54 @@ impl MapConsistency {
     /// Measures it: 2 to 4 ms a pair of 640 columns, at most four pairs for each of sixty keyframes.
     pub fn measure(keyframes: &[Keyframe]) -> Self {
         let pairs = pairs(keyframes);
-        let (mut near, mut wide) = (Vec::new(), Vec::new());
-        let mut depths = Vec::new();
-        let mut longest_span_frames = 0;
-        for of_later in pairs.chunk_by(|a, b| a.later == b.later) {
-            let later = &keyframes[of_later[0].later];
-            let (image, index) = (ReducedImage::of(later), point_index(later));
-            for pair in of_later {
-                let earlier = &keyframes[pair.earlier];
-                let view = SharedView::new(earlier, later);
-                let misfit = patch_misfit(&view, &ReducedImage::of(earlier), &image);
-                if !pair.is_wide {
-                    near.push(misfit);
-                    continue;
-                }
-                if misfit.has_texture {
-                    let span = later.sequence.saturating_sub(earlier.sequence);
-                    longest_span_frames = longest_span_frames.max(span);
-                    wide.push(misfit);
-                    depths.extend(depth_agreement(&view, &index));
-                }
-            }
-        }
-        let misfit = |of: &[PatchMisfit]| {
-            median(&of.iter().map(|misfit| misfit.median_px).collect::<Vec<_>>())
-        };
+        let of_each: Vec<_> = pairs.chunk_by(|a, b| a.later == b.later).collect();
+        let textured: Vec<Compared> = of_each
+            .par_iter()
+            .flat_map_iter(|of_later| compare(keyframes, of_later))
+            .filter(|pair| pair.misfit.has_texture)
+            .collect();
+        let (wide, near): (Vec<_>, Vec<_>) =
+            textured.into_iter().partition(|pair| pair.depth.is_some());
+        let misfit =
+            |of: &[Compared]| median(&of.iter().map(|of| of.misfit.median_px).collect::<Vec<_>>());
+        let depths: Vec<_> = wide.iter().filter_map(|pair| pair.depth.flatten()).collect();
         let depth =
             |part: fn(&DepthAgreement) -> f64| median(&depths.iter().map(part).collect::<Vec<_>>());
-        near.retain(|misfit| misfit.has_texture);
         Self {
             wide_pairs: wide.len() as u64,
-            longest_span_frames,
+            longest_span_frames: wide.iter().map(|pair| pair.span_frames).max().unwrap_or(0),
             wide_misfit_px: misfit(&wide),
             near_misfit_px: misfit(&near),
-            wide_found: median(&wide.iter().map(|misfit| misfit.found).collect::<Vec<_>>()),
+            wide_found: median(&wide.iter().map(|pair| pair.misfit.found).collect::<Vec<_>>()),
             wide_depth_difference: depth(|d| d.difference),
             wide_depth_within_3_sigma: depth(|d| d.within_3_sigma),
             wide_depth_tilt: depth(|d| d.tilt),
         }
     }
+}
+
+/// What a pair came to.
+struct Compared {
+    span_frames: u64,
+    misfit: PatchMisfit,
+    /// Of a wide pair; `None` within where too few depths coincide.
+    depth: Option<Option<DepthAgreement>>,
+}
+
+/// Compares the pairs of one later keyframe.
+fn compare(keyframes: &[Keyframe], of_later: &[Pair]) -> Vec<Compared> {
+    let later = &keyframes[of_later[0].later];
+    let (image, index) = (ReducedImage::of(later), point_index(later));
+    let compare = |pair: &Pair| {
+        let earlier = &keyframes[pair.earlier];
+        let view = SharedView::new(earlier, later);
+        Compared {
+            span_frames: later.sequence.saturating_sub(earlier.sequence),
+            misfit: patch_misfit(&view, &ReducedImage::of(earlier), &image),
+            depth: pair.is_wide.then(|| depth_agreement(&view, &index)),
+        }
+    };
+    of_later.iter().map(compare).collect()
 }
 
 #[cfg(test)]
