@@ -237,7 +237,7 @@ impl Window {
 
     /// Estimates the newest keyframes and all points that they and older ones see; `None` where there is too little.
     pub fn optimise(&mut self) -> Option<Adjustment> {
-        if self.refine_begun() || self.search_begun() {
+        if self.refine_begun() || self.search_begun() || self.frames_begun() {
             return None;
         }
         let mut is_new = false;
@@ -261,7 +261,9 @@ impl Window {
                 self.refuted_epoch = Some(self.keyframes[newest].epoch);
             }
             self.plan_search(self.num_unsettled());
-            self.place_frames(newest, chosen.is_first);
+            if self.refuted_epoch.is_none() {
+                self.plan_frames(newest, chosen.is_first);
+            }
             self.leave(&chosen.members);
         }
         if std::mem::take(&mut self.is_last) {

@@ -15,8 +15,8 @@ use crate::slam::window::frames::TrackedFrame;
 use crate::slam::window::marginals::Marginal;
 
 impl Mapper {
-    /// The keyframes to be estimated together, where one has been added since the last time, or else where a piece of a
-    /// pass over all is due and the camera is not lost, or else, with `may_refine`, where the depth of one that has settled
+    /// The keyframes to be estimated together, where one has been added since the last time, or else, where the camera is
+    /// not lost, a piece of a pass over all or frames to be aligned again, or else, with `may_refine`, where the depth of one that has settled
     /// can be refined: to be given back with [`Mapper::end_adjustment`] after [`Window::optimise`], which may take its time.
     pub fn begin_adjustment(&mut self, may_refine: bool) -> Option<Box<Window>> {
         let (mut window, is_new) = self.take_window()?;
@@ -35,6 +35,7 @@ impl Mapper {
             Some(active) if is_mapping => {
                 window.begin_search(&self.map, false)
                     || window.begin_piece()
+                    || window.begin_frames()
                     || (may_refine && window.begin_refinement(&self.map, active))
             }
             _ => false,
@@ -71,6 +72,11 @@ impl Mapper {
             let outcome = self.close_loop(&closure, &mut window);
             self.put_back(window);
             return outcome;
+        }
+        if let Some(placed) = window.take_frames_alone() {
+            placed.iter().for_each(|frame| self.map.place_frame(frame));
+            self.put_back(window);
+            return StepOutcome { graph_changed: !placed.is_empty(), ..Default::default() };
         }
         let finished = self.finish_keyframe();
         let mut outcome = StepOutcome::default();
@@ -219,6 +225,7 @@ impl Mapper {
     /// another map.
     pub fn drop_adjustment(&mut self, mut window: Box<Window>) {
         // They keep the poses that the tracker gave them.
+        drop(window.take_frames_alone());
         drop(window.take_placed());
         window.leave_unrefined();
         window.repeat_piece();

@@ -51,6 +51,12 @@ pub struct TrackedFrame {
 pub(super) struct WindowFrames {
     waiting: Vec<TrackedFrame>,
     placed: Vec<PlacedFrame>,
+    /// Those that have waited long enough are to be aligned, after an estimate of an epoch's first keyframes or not.
+    planned: Option<bool>,
+    /// The window is given away for that.
+    is_begun: bool,
+    /// It was, and has come back.
+    is_done: bool,
 }
 
 impl Window {
@@ -67,16 +73,60 @@ impl Window {
         std::mem::take(&mut self.frames.placed)
     }
 
+    /// After an estimate: frames that have waited long enough are to be aligned. By themselves, so that the keyframes need
+    /// not be waited for; here and now where the ones of the estimate before still are to be.
+    pub(super) fn plan_frames(&mut self, newest: usize, is_first: bool) {
+        if self.frames.planned.take().is_some() {
+            self.place_frames(newest, is_first);
+            return;
+        }
+        let end = self.settled(newest, is_first);
+        let is_ready = |frame: &TrackedFrame| self.index_of(frame.keyframe_id) < Some(end);
+        self.frames.planned = self.frames.waiting.iter().any(is_ready).then_some(is_first);
+    }
+
+    /// Whether frames are to be aligned, by [`Window::optimise`]: to be asked where nothing else is to be done.
+    pub fn begin_frames(&mut self) -> bool {
+        self.frames.is_begun = self.frames.planned.is_some();
+        self.frames.is_begun
+    }
+
+    /// Aligns the frames for which the window was given away; false where it was not for them.
+    pub(super) fn frames_begun(&mut self) -> bool {
+        if !std::mem::take(&mut self.frames.is_begun) {
+            return false;
+        }
+        if let (Some(newest), Some(is_first)) =
+            (self.keyframes.len().checked_sub(1), self.frames.planned.take())
+        {
+            self.place_frames(newest, is_first);
+            let members = self.choose_members(newest).members;
+            self.leave(&members);
+        }
+        self.frames.is_done = true;
+        true
+    }
+
+    /// The frames that were aligned, where the window was away for them alone.
+    pub fn take_frames_alone(&mut self) -> Option<Vec<PlacedFrame>> {
+        std::mem::take(&mut self.frames.is_done).then(|| self.take_placed())
+    }
+
     /// Aligns the frames that have waited long enough: until enough keyframes have come, more among an epoch's first ones.
-    pub(super) fn place_frames(&mut self, newest: usize, is_first: bool) {
+    fn place_frames(&mut self, newest: usize, is_first: bool) {
+        self.place_frames_before(self.settled(newest, is_first), MOST_AT_ONCE);
+    }
+
+    /// How many of the keyframes have been followed by enough others.
+    fn settled(&self, newest: usize, is_first: bool) -> usize {
         let lag =
             if is_first { self.params.frame_lag.max(FIRST_LAG) } else { self.params.frame_lag };
-        let ready = (newest + 1).saturating_sub(lag);
-        self.place_frames_before(ready, MOST_AT_ONCE);
+        (newest + 1).saturating_sub(lag)
     }
 
     /// Aligns all frames that still wait.
     pub fn place_rest(&mut self) {
+        self.frames.planned = None;
         self.place_frames_before(self.keyframes.len(), usize::MAX);
     }
 
