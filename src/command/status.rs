@@ -22,6 +22,7 @@ use crate::service::liveness::{Liveness, age};
 use crate::service::peers::Peer;
 use crate::service::shutdown::Shutdown;
 use crate::slam::pose::TrackingState;
+use crate::wire::conversion::state_from_codes;
 use crate::wire::message::{HealthMessage, PoseMessage};
 use crate::wire::place::Place;
 use crate::wire::port::{Access, Hub, OpenError, Subscriber, wait};
@@ -55,7 +56,7 @@ pub struct StatusArguments {
     /// Refresh once a second until Ctrl-C, also where nothing runs yet and where a run has ended
     #[arg(long, conflicts_with = "once")]
     watch: bool,
-    /// Print one JSON object per update, each on a line
+    /// Print one JSON object per update, each on a line; the position of the pose is null while none is claimed
     #[arg(long)]
     json: bool,
 }
@@ -263,15 +264,15 @@ fn state_of(health: &HealthMessage, reported: Option<&'static str>, now: i64) ->
     }
 }
 
-/// A pose as JSON.
+/// A pose as JSON. It has a position only while it is claimed: what a lost tracker sends is where it was last.
 fn pose_row(pose: &PoseMessage, now: i64) -> Value {
-    let state = TrackingState::NAMES.get(pose.state as usize).copied().unwrap_or("unknown");
+    let state = state_from_codes(pose.state, pose.reason).ok();
     let [.., x, y, z] = pose.world_from_camera;
     json!({
-        "state": state,
+        "state": state.map_or("unknown", TrackingState::name),
         "sequence": pose.sequence,
         "epoch": pose.epoch,
-        "position": [x, y, z],
+        "position": state.is_some_and(TrackingState::is_tracked).then_some([x, y, z]),
         "age_secs": (now - pose.published_nanos).max(0) as f64 * 1e-9,
     })
 }
@@ -339,4 +340,31 @@ fn row(topic: &Topic, health: &HealthMessage, state: &str, now: i64) -> Value {
             "max": percentile_ms(&health.wake_counts, 1.0),
         },
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slam::pose::{DegradedReason, LostReason, PoseEstimate};
+    use crate::wire::conversion::{PoseTiming, pose_message};
+
+    #[test]
+    fn a_position_is_given_only_while_a_pose_is_claimed() {
+        for (state, is_given) in [
+            (TrackingState::Initializing, false),
+            (TrackingState::Tracking, true),
+            (TrackingState::Degraded(DegradedReason::Turning), true),
+            (TrackingState::Lost(LostReason::Diverged), false),
+        ] {
+            let mut estimate = PoseEstimate { state, ..PoseEstimate::unknown_at(7, 0) };
+            estimate.world_from_camera.translation = [1.0, 2.0, 3.0].into();
+            let row = pose_row(&pose_message(&estimate, &PoseTiming::default()), 0);
+            let position = if is_given { json!([1.0, 2.0, 3.0]) } else { Value::Null };
+            assert_eq!((&row["state"], &row["position"]), (&json!(state.name()), &position));
+        }
+        let mut message = pose_message(&PoseEstimate::unknown_at(7, 0), &PoseTiming::default());
+        message.state = 99;
+        let row = pose_row(&message, 0);
+        assert_eq!((&row["state"], &row["position"]), (&json!("unknown"), &Value::Null));
+    }
 }

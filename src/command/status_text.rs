@@ -148,17 +148,17 @@ fn clock(secs: f64) -> String {
     }
 }
 
-/// Last pose: state, position where one is claimed, age.
+/// Last pose: state, position where there is one, age.
 fn pose_line(pose: &Value) -> Option<String> {
     let state = pose["state"].as_str()?;
-    let at = |i: usize| pose["position"][i].as_f64();
     let age = pose["age_secs"].as_f64()?;
     let age =
         if age < 10.0 { format!("{:.0} ms ago", 1e3 * age) } else { format!("{age:.0} s ago") };
-    let position = match state {
-        "tracking" | "degraded" => {
-            format!(", x {:.2} y {:.2} z {:.2} map units", at(0)?, at(1)?, at(2)?)
-        }
+    let at: Option<Vec<f64>> = pose["position"]
+        .as_array()
+        .and_then(|position| position.iter().map(Value::as_f64).collect());
+    let position = match at.as_deref() {
+        Some([x, y, z]) => format!(", x {x:.2} y {y:.2} z {z:.2} map units"),
         _ => String::new(),
     };
     Some(format!("last pose {state}{position}, {age}"))
@@ -305,12 +305,13 @@ mod tests {
     }
 
     #[test]
-    fn where_no_pose_is_claimed_no_position_is_shown() {
+    fn a_pose_without_a_position_has_its_state_and_age() {
         let mut look = look();
-        for (state, is_shown) in
-            [("tracking", true), ("degraded", true), ("lost", false), ("initializing", false)]
-        {
+        for (state, is_shown) in [("degraded", true), ("lost", false)] {
             look["pose"]["state"] = json!(state);
+            if !is_shown {
+                look["pose"]["position"] = Value::Null;
+            }
             let text = status_text(&look, 120);
             assert!(text.contains(&format!("last pose {state}, ")), "{text}");
             assert!(text.contains("21 ms ago") && text.contains("x 1.20") == is_shown, "{text}");
