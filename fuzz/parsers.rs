@@ -32,6 +32,7 @@ use semidense::slam::geometry::sim3::Sim3;
 use semidense::slam::keyframe::{DepthPoint, Keyframe};
 use semidense::slam::mapper::{Mapper, MapperParams};
 use semidense::slam::tracker::{Tracker, TrackerParams};
+use semidense::slam::trajectory::EpochPose;
 use semidense::wire::command::{command_of, text_from_bytes};
 use semidense::wire::conversion::{
     PoseTiming, frame_from_message, keyframe_from_messages, keyframe_pose_from_message,
@@ -50,12 +51,12 @@ pub const IMAGE_SIDE: usize = 16;
 /// A trajectory file: what is read is in order and finite, and comes back from its own lines.
 pub fn trajectory(bytes: &[u8]) {
     let Ok(poses) = parse_trajectory(bytes) else { return };
-    assert!(poses.windows(2).all(|pair| pair[0].nanos <= pair[1].nanos));
-    for pose in &poses {
+    assert!(poses.windows(2).all(|pair| pair[0].pose.nanos <= pair[1].pose.nanos));
+    for EpochPose { pose, .. } in &poses {
         assert!(pose.world_from_camera.translation.iter().all(|x| x.is_finite()));
         assert!((pose.world_from_camera.rotation.norm() - 1.0).abs() < 1e-9);
         let again = parse_trajectory(tum_line(pose).as_bytes()).expect("our own line");
-        assert_eq!(again[0].nanos, pose.nanos);
+        assert_eq!(again[0].pose.nanos, pose.nanos);
     }
 }
 

@@ -11,6 +11,7 @@ pub(crate) mod config;
 pub(crate) mod doctor;
 pub(crate) mod ending;
 pub(crate) mod evaluate;
+mod evaluate_text;
 pub(crate) mod map;
 pub(crate) mod map_points;
 pub(crate) mod mapper;

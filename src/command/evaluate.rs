@@ -2,21 +2,21 @@
 
 use std::error::Error;
 use std::io::Write as _;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::{Args, ValueEnum};
 
 use crate::capture::euroc::sensor_beside;
 use crate::capture::sensor_yaml;
+use crate::command::evaluate_text::{evaluation_json, evaluation_text};
 use crate::command::print::{note, print};
 use crate::service::atomic_file::write_atomically;
 use crate::service::results::report::evaluation_plot::evaluation_plot;
-use crate::service::results::summary::TrajectorySummary;
 use crate::service::trajectory_file::{TrajectoryFile, read_trajectory_file};
-use crate::slam::evaluation::statistics::ErrorStatistics;
+use crate::slam::evaluation::epochs::evaluate_epochs;
 use crate::slam::evaluation::umeyama::TrajectoryAlignment;
-use crate::slam::evaluation::{TrajectoryEvaluation, evaluate_trajectory};
+use crate::slam::trajectory::{EpochPose, StampedPose, by_epoch};
 
 /// What is fitted before positions are compared.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -35,6 +35,10 @@ enum Align {
 /// those of the body; they are moved to the camera with T_BS of cam0/sensor.yaml, as is an estimate in that
 /// layout. Each pose of the shorter trajectory is compared with the pose of the longer one that is nearest in
 /// time; the figures are those of the Python package evo.
+///
+/// Where the estimate marks several epochs (`# epoch N: …`, as trajectory.txt of a run does), each has an origin and a unit
+/// of its own: it is aligned and judged by itself, and the total is over the matched poses of all epochs. One with too few
+/// poses to align is named and left out.
 #[derive(Debug, Args)]
 pub struct EvaluateArgs {
     /// Estimated trajectory
@@ -53,7 +57,7 @@ pub struct EvaluateArgs {
     /// also says that its poses are those of the body
     #[arg(long, value_name = "FILE")]
     sensor: Option<PathBuf>,
-    /// Print the figures as JSON, with the keys of summary.json
+    /// Print the figures as JSON, with the keys of summary.json: of the total, and in `epochs` of each epoch
     #[arg(long)]
     json: bool,
     /// Write a plot of both trajectories and the error
@@ -74,29 +78,41 @@ pub fn run(args: &EvaluateArgs) -> Result<ExitCode, Box<dyn Error>> {
     let mut estimate = read_trajectory_file(&args.estimate)?;
     let mut truth = read_trajectory_file(&args.truth)?;
     move_to_camera(&mut estimate, &mut truth, args)?;
-    let (estimate, truth) = (estimate.poses, truth.poses);
+    let truth = one_path(&truth.poses, &args.truth)?;
     let alignment = match args.align {
         Align::Sim3 => TrajectoryAlignment::Sim3,
         Align::Se3 => TrajectoryAlignment::SE3,
         Align::None => TrajectoryAlignment::None,
     };
     let max_difference_nanos = (args.max_difference * 1e9).round() as i64;
-    let evaluation = evaluate_trajectory(&estimate, &truth, alignment, max_difference_nanos)
+    let evaluation = evaluate_epochs(&estimate.poses, &truth, alignment, max_difference_nanos)
         .map_err(|error| {
             format!("{} against {}: {error}", args.estimate.display(), args.truth.display())
         })?;
     if let Some(path) = &args.plot {
-        let svg = evaluation_plot(&estimate, &truth, &evaluation);
+        let svg = evaluation_plot(&evaluation, &truth);
         write_atomically(path, |file| file.write_all(svg.as_bytes()))
             .map_err(|error| format!("cannot write {}: {error}", path.display()))?;
     }
-    let text = if args.json {
-        serde_json::to_string_pretty(&TrajectorySummary::from(&evaluation))?
-    } else {
-        evaluation_text(&evaluation, estimate.len(), alignment)
+    let text = match args.json {
+        true => evaluation_json(&evaluation)?,
+        false => evaluation_text(&evaluation, alignment),
     };
     print(&format!("{text}\n"))?;
     Ok(ExitCode::SUCCESS)
+}
+
+/// The poses of the truth, which must have one origin and one unit.
+fn one_path(truth: &[EpochPose], path: &Path) -> Result<Vec<StampedPose>, String> {
+    let epochs = by_epoch(truth);
+    match epochs.len() {
+        0 | 1 => Ok(epochs.into_values().flatten().collect()),
+        count => Err(format!(
+            "{} marks {count} epochs, each with an origin and a unit of its own, and is no ground truth: keep the \
+             lines of one epoch",
+            path.display()
+        )),
+    }
 }
 
 /// Moves poses of the body to the camera on it: an estimate is the camera's, and seen from another
@@ -121,48 +137,10 @@ fn move_to_camera(
     let body_from_camera = sensor_yaml::read(&path)?.body_from_camera;
     let with_estimate = estimate.is_euroc;
     let moved = if with_estimate { &mut estimate.poses[..] } else { &mut [] };
-    for pose in truth.poses.iter_mut().chain(moved) {
+    for EpochPose { pose, .. } in truth.poses.iter_mut().chain(moved) {
         pose.world_from_camera = pose.world_from_camera * body_from_camera;
     }
     let what = if with_estimate { "estimate and ground truth" } else { "ground truth" };
     note(&format!("{what}: poses of the body, moved to the camera with {}", path.display()));
     Ok(())
-}
-
-/// The figures as a table.
-fn evaluation_text(
-    evaluation: &TrajectoryEvaluation,
-    estimated: usize,
-    alignment: TrajectoryAlignment,
-) -> String {
-    let fitted = match alignment {
-        TrajectoryAlignment::Sim3 => format!("sim3, scale {:.6}", evaluation.alignment.scale),
-        TrajectoryAlignment::SE3 => "se3".to_owned(),
-        TrajectoryAlignment::None => "none".to_owned(),
-    };
-    let mut lines = vec![
-        format!("{} of {estimated} poses matched", evaluation.association.pairs.len()),
-        format!("alignment {fitted}; path {:.3} m", evaluation.path_length),
-        format!("{:<26} {:>12} {:>12} {:>12} {:>12}", "", "rmse", "mean", "median", "max"),
-    ];
-    let mut row = |name: &str, statistics: Option<ErrorStatistics>| {
-        if let Some(s) = statistics {
-            lines.push(format!(
-                "{name:<26} {:>12.6} {:>12.6} {:>12.6} {:>12.6}",
-                s.rmse, s.mean, s.median, s.max
-            ));
-        }
-    };
-    row("ATE [m]", Some(evaluation.ate));
-    row("RPE, one frame [m]", Some(evaluation.rpe_translation));
-    row("RPE, one frame [deg]", Some(evaluation.rpe_rotation_deg));
-    row("RPE, 1 s [m]", evaluation.rpe_translation_1s);
-    row("RPE, 1 s [deg]", evaluation.rpe_rotation_deg_1s);
-    if let Some(error) = evaluation.window_error {
-        lines.push(format!("windows of 30 frames: median error {error:.6} m"));
-    }
-    if let Some(ratio) = evaluation.window_scale_ratio {
-        lines.push(format!("windows of 100 frames: largest / smallest scale {ratio:.4}"));
-    }
-    lines.join("\n")
 }

@@ -9,10 +9,13 @@ use std::path::{Path, PathBuf};
 use crate::capture::input_file;
 use crate::service::atomic_file::write_atomically;
 use crate::slam::geometry::se3::SE3;
-use crate::slam::trajectory::StampedPose;
+use crate::slam::trajectory::{EpochPose, StampedPose};
 
 /// Largest file that is read: 18 hours of poses at 30 Hz. A larger one is no trajectory.
 const MAX_FILE_BYTES: u64 = 256 << 20;
+
+/// What stands before an epoch's number in the comment that marks its beginning; a colon follows.
+const EPOCH_MARK: &str = "# epoch ";
 
 const NANOS_PER_SEC: i64 = 1_000_000_000;
 
@@ -78,15 +81,15 @@ pub enum LineFault {
 /// A trajectory as a file holds it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrajectoryFile {
-    /// Its poses, in order of their stamps.
-    pub poses: Vec<StampedPose>,
+    /// Its poses, in order of their stamps, all of epoch 0 where it marks none.
+    pub poses: Vec<EpochPose>,
     /// Whether it is in EuRoC's layout, whose poses are those of the body that carries the camera.
     pub is_euroc: bool,
 }
 
-/// The poses of a file, in order of their stamps; see [`read_trajectory_file`].
+/// The poses of a file, of whatever epochs, in order of their stamps; see [`read_trajectory_file`].
 pub fn read_trajectory(path: &Path) -> Result<Vec<StampedPose>, TrajectoryFileError> {
-    Ok(read_trajectory_file(path)?.poses)
+    Ok(read_trajectory_file(path)?.poses.into_iter().map(|of| of.pose).collect())
 }
 
 /// Reads a trajectory in TUM layout, or in EuRoC's (`nanoseconds, p x y z, q w x y z, …`) where
@@ -110,23 +113,33 @@ pub fn read_trajectory_file(path: &Path) -> Result<TrajectoryFile, TrajectoryFil
     Ok(TrajectoryFile { poses, is_euroc: first.is_some_and(|line| line.contains(&b',')) })
 }
 
-/// The poses of a file's bytes, or the line (from 1) that is at fault.
-pub fn parse_trajectory(bytes: &[u8]) -> Result<Vec<StampedPose>, (usize, LineFault)> {
-    let mut poses: Vec<StampedPose> = Vec::new();
+/// The poses of a file's bytes, or the line (from 1) that is at fault. Comments but the marks of [`write_epochs`] mean
+/// nothing.
+pub fn parse_trajectory(bytes: &[u8]) -> Result<Vec<EpochPose>, (usize, LineFault)> {
+    let mut poses: Vec<EpochPose> = Vec::new();
+    let mut epoch = 0;
     for (i, line) in bytes.split(|&b| b == b'\n').enumerate() {
         let at = |fault| (i + 1, fault);
         let line = std::str::from_utf8(line).map_err(|_| at(LineFault::NotText))?.trim();
         if line.is_empty() || line.starts_with('#') {
+            epoch = epoch_mark(line).unwrap_or(epoch);
             continue;
         }
         let pose = parse_pose(line).map_err(at)?;
-        if poses.last().is_some_and(|last| pose.nanos < last.nanos) {
+        if poses.last().is_some_and(|last| pose.nanos < last.pose.nanos) {
             let stamp = line.split([' ', '\t', ',']).next().unwrap_or_default();
             return Err(at(LineFault::Order(shortened(stamp))));
         }
-        poses.push(pose);
+        poses.push(EpochPose { epoch, pose });
     }
     Ok(poses)
+}
+
+/// The epoch that a comment marks the beginning of.
+fn epoch_mark(line: &str) -> Option<u32> {
+    let (digits, _) = line.strip_prefix(EPOCH_MARK)?.split_once(':')?;
+    let is_number = digits.bytes().all(|b| b.is_ascii_digit());
+    is_number.then(|| digits.parse().ok()).flatten()
 }
 
 fn parse_pose(line: &str) -> Result<StampedPose, LineFault> {
@@ -227,15 +240,6 @@ pub fn write_trajectory(path: &Path, comment: &str, poses: &[StampedPose]) -> io
     })
 }
 
-/// A pose, and the epoch whose origin and unit of length it has.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct EpochPose {
-    /// The epoch.
-    pub epoch: u32,
-    /// The pose.
-    pub pose: StampedPose,
-}
-
 /// Writes what [`write_trajectory`] does; of several epochs each begins with a comment, `# epoch N: …`.
 pub fn write_epochs(path: &Path, comment: &str, poses: &[EpochPose]) -> io::Result<()> {
     let is_one = poses.windows(2).all(|pair| pair[0].epoch == pair[1].epoch);
@@ -244,7 +248,8 @@ pub fn write_epochs(path: &Path, comment: &str, poses: &[EpochPose]) -> io::Resu
         let mut epoch = None;
         poses.iter().try_for_each(|of| {
             if !is_one && epoch.replace(of.epoch) != Some(of.epoch) {
-                writeln!(file, "# epoch {}: an origin and a unit of length of its own", of.epoch)?;
+                let epoch = of.epoch;
+                writeln!(file, "{EPOCH_MARK}{epoch}: an origin and a unit of length of its own")?;
             }
             writeln!(file, "{}", tum_line(&of.pose))
         })
@@ -315,7 +320,37 @@ mod tests {
             b"#t\n1500000000,1,2,3,1,0,0,0,9,9\n2500000000, 1, 2, 3, .5, .5, .5, .5\n",
         );
         assert_eq!(euroc.unwrap(), tum);
-        assert_eq!(tum[0].nanos, 1_500_000_000);
+        assert_eq!(tum[0].pose.nanos, 1_500_000_000);
+    }
+
+    #[test]
+    fn poses_have_the_epoch_that_was_marked_last() {
+        let at = |secs: i64, epoch| {
+            let pose =
+                StampedPose { nanos: secs * NANOS_PER_SEC, world_from_camera: SE3::identity() };
+            EpochPose { epoch, pose }
+        };
+        let file = tempfile::NamedTempFile::new().unwrap();
+        for poses in [vec![at(1, 0), at(2, 4), at(3, 4), at(4, 0)], vec![at(1, 0), at(2, 0)]] {
+            write_epochs(file.path(), "c", &poses).unwrap();
+            assert_eq!(read_trajectory_file(file.path()).unwrap().poses, poses);
+        }
+        // Nothing else is a mark; what stands before the first is of epoch 0.
+        let pose = "0 0 0 0 0 0 1\n";
+        for (comment, epoch) in [
+            ("# epoch 7: x", 7),
+            ("# epoch 7", 0),
+            ("# epoch x:", 0),
+            ("# epoch :", 0),
+            ("# epoch +7:", 0),
+            ("# epoch 99999999999:", 0),
+            ("#epoch 7:", 0),
+            ("# the epoch 7: x", 0),
+        ] {
+            let text = format!("1 {pose}{comment}\n2 {pose}");
+            let read = parse_trajectory(text.as_bytes()).unwrap();
+            assert_eq!([read[0].epoch, read[1].epoch], [0, epoch], "{comment}");
+        }
     }
 
     #[test]

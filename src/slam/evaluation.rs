@@ -2,7 +2,7 @@
 //!
 //! The trajectory figures are those of the Python package `evo` on the same files: nearest stamps
 //! without interpolation (`association`), Umeyama alignment ([`mod@umeyama`]), absolute and relative
-//! errors ([`trajectory_error`]); [`normalized_error`] holds pose errors against their covariance. `windows` adds how the scale wanders, [`depth_error`] what the
+//! errors ([`trajectory_error`]), epoch by epoch where there are several ([`epochs`]); [`normalized_error`] holds pose errors against their covariance. `windows` adds how the scale wanders, [`depth_error`] what the
 //! depth maps and their variances are good for, [`depth_modes`] what is wrong with the whole of one, [`start_error`] how far a start is off. Without any truth, [`map_consistency`] holds the keyframes
 //! against each other ([`shared_view`], [`patch_misfit`], [`depth_agreement`]), and [`grade`] says what
 //! that is worth.
@@ -11,8 +11,10 @@ pub(crate) mod association;
 pub mod depth_agreement;
 pub mod depth_error;
 pub mod depth_modes;
+pub mod epochs;
 pub mod grade;
 pub mod map_consistency;
+mod measured;
 pub mod normalized_error;
 pub mod patch_misfit;
 pub mod shared_view;
@@ -24,13 +26,9 @@ pub mod umeyama;
 pub mod velocity_error;
 pub(crate) mod windows;
 
-use crate::slam::evaluation::association::associate;
+use crate::slam::evaluation::measured::Measured;
 use crate::slam::evaluation::statistics::ErrorStatistics;
-use crate::slam::evaluation::trajectory_error::{
-    absolute_errors, path_length, relative_errors, successive_pairs, timed_pairs,
-};
-use crate::slam::evaluation::umeyama::{AlignmentError, TrajectoryAlignment, umeyama};
-use crate::slam::evaluation::windows::{scale_windows, window_error};
+use crate::slam::evaluation::umeyama::{AlignmentError, TrajectoryAlignment};
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::trajectory::StampedPose;
 
@@ -39,9 +37,6 @@ pub use crate::slam::evaluation::association::Association;
 /// Largest difference of two stamps that are taken for the same instant: 0.02 s, less than half a
 /// frame at 20 Hz and the habit of the field's tools.
 pub const MAX_DIFFERENCE_NANOS: i64 = 20_000_000;
-
-/// Interval of the second relative error: long enough that drift shows above noise.
-const INTERVAL_NANOS: i64 = 1_000_000_000;
 
 /// Why two trajectories cannot be compared.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -71,6 +66,16 @@ pub enum EvaluationError {
     /// The positions do not fix the alignment.
     #[error(transparent)]
     Alignment(#[from] AlignmentError),
+    /// None of several epochs can be compared.
+    #[error("none of {epochs} epochs can be compared; epoch {longest}, the longest: {reason}")]
+    NoEpoch {
+        /// How many there are.
+        epochs: usize,
+        /// The one with the most poses.
+        longest: u32,
+        /// What is wrong with it.
+        reason: Box<EvaluationError>,
+    },
 }
 
 /// Errors of a trajectory against the ground truth. Lengths are in the ground truth's unit.
@@ -111,43 +116,16 @@ pub fn evaluate_trajectory(
 ) -> Result<TrajectoryEvaluation, EvaluationError> {
     check_finite(estimate, "estimate")?;
     check_finite(truth, "ground truth")?;
-    let association = associate(estimate, truth, max_difference_nanos);
-    let needed = alignment.poses_needed().max(2);
-    if association.pairs.len() < needed {
-        return Err(EvaluationError::TooFewMatches {
-            found: association.pairs.len(),
-            estimated: estimate.len(),
-            needed,
-            max_difference_secs: max_difference_nanos as f64 * 1e-9,
-        });
-    }
-    let (estimated, true_poses) = association.select(estimate, truth);
-    let truth_from_estimate = umeyama(&estimated, &true_poses, alignment)?;
-    let absolute = absolute_errors(&estimated, &true_poses, &truth_from_estimate);
-    let scale = truth_from_estimate.scale;
-    let frames = relative_errors(&estimated, &true_poses, &successive_pairs(&estimated), scale);
-    let second_pairs = timed_pairs(&estimated, INTERVAL_NANOS, max_difference_nanos);
-    let seconds = relative_errors(&estimated, &true_poses, &second_pairs, scale);
-    let window_scales = scale_windows(&estimated, &true_poses);
-    let unusable = AlignmentError::NotFinite;
-    Ok(TrajectoryEvaluation {
-        ate: ErrorStatistics::of(&absolute).ok_or(unusable.clone())?,
-        rpe_translation: ErrorStatistics::of(&frames.translation).ok_or(unusable.clone())?,
-        rpe_rotation_deg: ErrorStatistics::of(&frames.rotation_deg).ok_or(unusable)?,
-        rpe_translation_1s: ErrorStatistics::of(&seconds.translation),
-        rpe_rotation_deg_1s: ErrorStatistics::of(&seconds.rotation_deg),
-        path_length: path_length(&true_poses),
-        window_scale_ratio: windows::scale_ratio(&window_scales),
-        window_scales,
-        window_error: window_error(&estimated, &true_poses, alignment),
-        alignment: truth_from_estimate,
-        association,
-        absolute,
-    })
+    let (measured, truth_from_estimate) =
+        Measured::new(estimate, truth, alignment, max_difference_nanos)?;
+    measured.evaluation(truth_from_estimate)
 }
 
-fn check_finite(poses: &[StampedPose], which: &'static str) -> Result<(), EvaluationError> {
-    match poses.iter().position(|pose| !pose.world_from_camera.is_finite()) {
+fn check_finite<'a>(
+    poses: impl IntoIterator<Item = &'a StampedPose>,
+    which: &'static str,
+) -> Result<(), EvaluationError> {
+    match poses.into_iter().position(|pose| !pose.world_from_camera.is_finite()) {
         Some(index) => Err(EvaluationError::NotFinite { which, index }),
         None => Ok(()),
     }

@@ -172,6 +172,112 @@ fn ground_truth_of_a_body_is_moved_to_its_camera() {
     }
 }
 
+/// Lines of a trajectory file: every pose of `poses` seen in another frame, at another scale.
+fn tum_lines(poses: &[(i64, SE3)], other_from_world: &SE3, scale: f64) -> String {
+    let line = |(nanos, pose): &(i64, SE3)| {
+        let other = *other_from_world * *pose;
+        let (t, [x, y, z, w]) = (other.translation * scale, other.quaternion_xyzw());
+        format!("{} {} {} {} {x} {y} {z} {w}\n", *nanos as f64 * 1e-9, t.x, t.y, t.z)
+    };
+    poses.iter().map(line).collect()
+}
+
+/// An estimate of three epochs, of two poses the last, beside its ground truth.
+fn write_epochs(folder: &Path) -> [String; 2] {
+    let path = |i: i64| {
+        let s = i as f64 / 20.0;
+        let off = if i % 2 == 0 { 0.002 } else { 0.0 };
+        let pose =
+            |off: f64| SE3::exp(&Vector6::new(s + off, (2.0 * s).sin(), 0.0, 0.2 * s, s, 0.1));
+        let nanos = 1_000_000_000 + i * 50_000_000;
+        ((nanos, pose(0.0)), (nanos, pose(off)))
+    };
+    let (truth, estimate): (Vec<_>, Vec<_>) = (0..120).map(path).unzip();
+    let frame = |turn: f64| SE3::exp(&Vector6::new(turn, 2.0, -1.0, 0.3, turn, 0.1));
+    let text = format!(
+        "# c\n# epoch 0: x\n{}# epoch 1: x\n{}# epoch 0: x\n{}# epoch 2: x\n{}",
+        tum_lines(&estimate[..40], &frame(0.5), 0.5),
+        tum_lines(&estimate[45..85], &frame(2.0), 4.0),
+        tum_lines(&estimate[90..110], &frame(0.5), 0.5),
+        tum_lines(&estimate[115..117], &frame(1.0), 1.0)
+    );
+    [("estimate.txt", text), ("truth.txt", tum_lines(&truth, &SE3::identity(), 1.0))].map(
+        |(name, text)| {
+            std::fs::write(folder.join(name), text).unwrap();
+            folder.join(name).display().to_string()
+        },
+    )
+}
+
+#[test]
+fn every_epoch_that_is_marked_is_judged_by_itself() {
+    let folder = tempfile::tempdir().unwrap();
+    let [estimate, truth] = write_epochs(folder.path());
+    let json = |estimate: &str| -> Value {
+        let output = evaluate(&[estimate, &truth, "--json"]);
+        serde_json::from_slice(&output.stdout)
+            .unwrap_or_else(|e| panic!("{e}: {}", String::from_utf8_lossy(&output.stderr)))
+    };
+    let found = json(&estimate);
+    let [first, second, short] = found["epochs"].as_array().unwrap().as_slice() else {
+        panic!("{found}")
+    };
+    for (epoch, (number_of, poses, scale)) in [(first, (0, 60, 2.0)), (second, (1, 40, 0.25))] {
+        assert_eq!(
+            (&epoch["epoch"], &epoch["poses"], &epoch["matched_poses"], &epoch["left_out"]),
+            (&number_of.into(), &poses.into(), &poses.into(), &Value::Null)
+        );
+        assert!((number(&epoch["ate_scale"]) / scale - 1.0).abs() < 0.01, "{epoch}");
+        assert!((1e-4..2e-3).contains(&number(&epoch["ate_rmse_m"])), "{epoch}");
+    }
+    assert_eq!((&short["epoch"], &short["poses"]), (&2.into(), &2.into()));
+    assert!(short["left_out"].as_str().unwrap().contains("2 of 2 poses"), "{short}");
+    assert!(short["ate_rmse_m"].is_null() && found["ate_scale"].is_null(), "{found}");
+    let of = |epoch: &Value, key: &str| number(&epoch[key]);
+    let squares = 60.0 * of(first, "ate_rmse_m").powi(2) + 40.0 * of(second, "ate_rmse_m").powi(2);
+    assert!((of(&found, "ate_rmse_m") - (squares / 100.0).sqrt()).abs() < 1e-9, "{found}");
+    assert_eq!(found["matched_poses"], 100);
+    let path = of(first, "path_length_m") + of(second, "path_length_m");
+    assert!((of(&found, "path_length_m") - path).abs() < 1e-9, "{found}");
+
+    let text = String::from_utf8(evaluate(&[&estimate, &truth]).stdout).unwrap();
+    for part in ["3 epochs, each with", "epoch 2             2 left out: only 2 of 2 poses"] {
+        assert!(text.contains(part), "{part}: {text}");
+    }
+    assert!(text.contains("total of 2 epochs, over all matched poses:\n100 of 102"), "{text}");
+
+    // Without marks it is one path, as a file of any other program is.
+    let all = std::fs::read_to_string(&estimate).unwrap();
+    let unmarked = folder.path().join("unmarked.txt").display().to_string();
+    let lines = all.lines().filter(|line| !line.starts_with("# epoch"));
+    std::fs::write(&unmarked, lines.map(|line| format!("{line}\n")).collect::<String>()).unwrap();
+    let one = json(&unmarked);
+    assert!(number(&one["ate_rmse_m"]) > 0.1 && number(&one["ate_scale"]) > 0.0, "{one}");
+    assert_eq!(one["epochs"].as_array().unwrap().len(), 1);
+    assert_eq!(one["epochs"][0]["ate_rmse_m"], one["ate_rmse_m"]);
+    assert!(!String::from_utf8(evaluate(&[&unmarked, &truth]).stdout).unwrap().contains("epoch"));
+    // An epoch alone is what it is beside others.
+    let end = all.find("# epoch 0: x\n").unwrap()..all.find("# epoch 1: x\n").unwrap();
+    let begin = all.rfind("# epoch 0: x\n").unwrap()..all.find("# epoch 2: x\n").unwrap();
+    std::fs::write(&unmarked, all[end].to_owned() + &all[begin]).unwrap();
+    assert_eq!(json(&unmarked)["epochs"][0], *first);
+
+    let refused = evaluate(&[&truth, &estimate]);
+    let message = String::from_utf8(refused.stderr).unwrap();
+    assert_eq!(refused.status.code(), Some(1), "{message}");
+    assert!(message.contains("estimate.txt marks 3 epochs"), "{message}");
+    let last = &all[all.find("# epoch 2: x\n").unwrap()..];
+    let none = format!("{last}# epoch 3: x\n9 0 0 0 0 0 0 1\n");
+    std::fs::write(&unmarked, none).unwrap();
+    let refused = evaluate(&[&unmarked, &truth]);
+    let message = String::from_utf8(refused.stderr).unwrap();
+    assert_eq!(refused.status.code(), Some(1), "{message}");
+    assert!(
+        message.contains("none of 2 epochs can be compared; epoch 2, the longest"),
+        "{message}"
+    );
+}
+
 #[test]
 fn hostile_files_are_refused_in_one_line_that_names_the_place() {
     let folder = tempfile::tempdir().unwrap();

@@ -4,8 +4,11 @@ use crate::records::{UNIT_M, keyframe, nanos, pose, record, written};
 use semidense::service::adjustments::{AdjustmentRecord, Fate, SearchRecord};
 use semidense::service::results::output_folder::prepare_output;
 use semidense::service::results::record::{Rejection, RunRecord};
-use semidense::service::trajectory_file::read_trajectory;
+use semidense::service::trajectory_file::{read_trajectory, read_trajectory_file};
+use semidense::slam::evaluation::MAX_DIFFERENCE_NANOS;
 use semidense::slam::evaluation::depth_error::DepthScale;
+use semidense::slam::evaluation::epochs::evaluate_epochs;
+use semidense::slam::evaluation::umeyama::TrajectoryAlignment;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::graph::constraint::Refusal;
 use semidense::slam::loops::{SearchFate, SearchReport};
@@ -251,7 +254,7 @@ fn trajectories_say_where_another_epoch_begins() {
         pose.estimate.epoch = epoch_of(i);
         pose.estimate.keyframe_id = u64::from(epoch_of(i));
     }
-    let mut record = record(poses, vec![keyframe(0), keyframe(1)], false);
+    let mut record = record(poses, vec![keyframe(0), keyframe(1)], true);
     // Two frames before the second epoch are aligned to it afterwards.
     record.map.keyframes[1].epoch = 1;
     for sequence in 18..20 {
@@ -269,6 +272,21 @@ fn trajectories_say_where_another_epoch_begins() {
     let online = vec![part("0", 15), part("1", 40)];
     let apart = vec![part("0", 15), part("1", 22), part("0", 20)];
     assert_eq!(parts(&record), [apart, online.clone()]);
+    // The figures of the run are what `evaluate` finds for its longest epoch.
+    let folder = tempfile::tempdir().unwrap();
+    let (summary, _) = written(folder.path(), &record);
+    let file = read_trajectory_file(&folder.path().join("trajectory.txt")).unwrap();
+    let truth = &record.ground_truth;
+    let found =
+        evaluate_epochs(&file.poses, truth, TrajectoryAlignment::Sim3, MAX_DIFFERENCE_NANOS)
+            .unwrap();
+    let longest = found.epochs.iter().find(|of| summary["evaluated_epoch"] == of.epoch).unwrap();
+    let longest = longest.result.as_ref().unwrap();
+    assert_eq!((&summary["evaluated_epoch"], longest.association.pairs.len()), (&0.into(), 35));
+    for (key, found) in [("ate_rmse_m", longest.ate.rmse), ("path_length_m", longest.path_length)] {
+        let expected = summary[key].as_f64().unwrap();
+        assert!((found - expected).abs() < 1e-9, "{key}: {found}, {expected}");
+    }
     // Joined to the first in the end: one map.
     record.map.keyframes[1].epoch = 0;
     assert_eq!(parts(&record), [vec![part("", 57)], online]);

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use crate::service::atomic_file::write_atomically;
 use crate::service::results::record::{RecordedPose, RunRecord};
-use crate::service::trajectory_file::{EpochPose, tum_line};
+use crate::service::trajectory_file::tum_line;
 use crate::slam::evaluation::MAX_DIFFERENCE_NANOS;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::evaluation::normalized_error::{
@@ -15,7 +15,7 @@ use crate::slam::evaluation::normalized_error::{
 use crate::slam::evaluation::velocity_error::velocity_normalized_errors;
 use crate::slam::map::Map;
 use crate::slam::pose::PoseEstimate;
-use crate::slam::trajectory::StampedPose;
+use crate::slam::trajectory::{EpochPose, StampedPose};
 
 /// First line of `trajectory.txt`.
 pub const FINAL_COMMENT: &str =

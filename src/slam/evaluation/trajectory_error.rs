@@ -14,6 +14,14 @@ pub struct RelativeErrors {
     pub rotation_deg: Vec<f64>,
 }
 
+impl RelativeErrors {
+    /// Adds those of other pairs.
+    pub fn append(&mut self, other: &Self) {
+        self.translation.extend(&other.translation);
+        self.rotation_deg.extend(&other.rotation_deg);
+    }
+}
+
 /// Distance of each aligned position from its true one.
 pub fn absolute_errors(
     estimate: &[StampedPose],

@@ -1,6 +1,5 @@
 //! How the estimate does over short stretches: its scale as it wanders, its shape.
 
-use crate::slam::evaluation::statistics::median;
 use crate::slam::evaluation::trajectory_error::absolute_errors;
 use crate::slam::evaluation::umeyama::{TrajectoryAlignment, umeyama};
 use crate::slam::trajectory::StampedPose;
@@ -40,18 +39,9 @@ pub fn scale_ratio(window_scales: &[(usize, f64)]) -> Option<f64> {
     Some(scales.clone().fold(0.0, f64::max) / scales.fold(f64::INFINITY, f64::min))
 }
 
-/// Median position error over windows of [`SHAPE_WINDOW`] matches, each aligned by itself; `None` where there is no window that can be aligned.
-pub fn window_error(
-    estimate: &[StampedPose],
-    truth: &[StampedPose],
-    alignment: TrajectoryAlignment,
-) -> Option<f64> {
-    median(&shape_errors(estimate, truth, alignment))
-}
-
 /// Position errors in windows of [`SHAPE_WINDOW`] matches up to the last one, each window aligned by itself and each
-/// match counted once.
-fn shape_errors(
+/// match counted once; windows that cannot be aligned are left out.
+pub fn shape_errors(
     estimate: &[StampedPose],
     truth: &[StampedPose],
     alignment: TrajectoryAlignment,

@@ -22,12 +22,14 @@ pub(super) fn thinned(frame: &Frame, series: &Series) -> Vec<[f64; 2]> {
     }
 }
 
-/// Every n-th point, such that few enough are left; the last always.
+/// Every n-th point, such that few enough are left; the last always, and the first of those that break a line.
 fn by_stride(points: &[[f64; 2]]) -> Vec<[f64; 2]> {
     let stride = points.len().div_ceil(MAX_PATH_POINTS).max(1);
     let last = points.len().saturating_sub(1);
-    let kept = points.iter().enumerate().filter(|(i, _)| i % stride == 0 || *i == last);
-    kept.map(|(_, point)| *point).collect()
+    let is_finite = |i: usize| points[i].iter().all(|c| c.is_finite());
+    let breaks = |i: usize| !is_finite(i) && i > 0 && is_finite(i - 1);
+    let kept = (0..points.len()).filter(|&i| i % stride == 0 || i == last || breaks(i));
+    kept.map(|i| points[i]).collect()
 }
 
 /// A line over x: of the points that fall on one column of the picture, the first, the lowest, the highest and the last.

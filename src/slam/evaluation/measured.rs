@@ -1,0 +1,103 @@
+//! What the figures of a trajectory are made of: the errors of the poses that were aligned together, or of several epochs,
+//! each aligned by itself.
+
+use crate::slam::evaluation::association::{Association, associate};
+use crate::slam::evaluation::statistics::{ErrorStatistics, median};
+use crate::slam::evaluation::trajectory_error::{
+    RelativeErrors, absolute_errors, path_length, relative_errors, successive_pairs, timed_pairs,
+};
+use crate::slam::evaluation::umeyama::{AlignmentError, TrajectoryAlignment, umeyama};
+use crate::slam::evaluation::windows::{scale_ratio, scale_windows, shape_errors};
+use crate::slam::evaluation::{EvaluationError, TrajectoryEvaluation};
+use crate::slam::geometry::sim3::Sim3;
+use crate::slam::trajectory::StampedPose;
+
+/// Interval of the second relative error: long enough that drift shows above noise.
+const INTERVAL_NANOS: i64 = 1_000_000_000;
+
+/// Matches and the errors at them.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Measured {
+    association: Association,
+    absolute: Vec<f64>,
+    frames: RelativeErrors,
+    seconds: RelativeErrors,
+    path_length: f64,
+    window_scales: Vec<(usize, f64)>,
+    shape: Vec<f64>,
+}
+
+impl Measured {
+    /// The errors of `estimate` once it is aligned, and `truth_from_estimate`.
+    pub(super) fn new(
+        estimate: &[StampedPose],
+        truth: &[StampedPose],
+        alignment: TrajectoryAlignment,
+        max_difference_nanos: i64,
+    ) -> Result<(Self, Sim3), EvaluationError> {
+        let association = associate(estimate, truth, max_difference_nanos);
+        let needed = alignment.poses_needed().max(2);
+        if association.pairs.len() < needed {
+            return Err(EvaluationError::TooFewMatches {
+                found: association.pairs.len(),
+                estimated: estimate.len(),
+                needed,
+                max_difference_secs: max_difference_nanos as f64 * 1e-9,
+            });
+        }
+        let (estimated, true_poses) = association.select(estimate, truth);
+        let truth_from_estimate = umeyama(&estimated, &true_poses, alignment)?;
+        let relative = |pairs: &[(usize, usize)]| {
+            relative_errors(&estimated, &true_poses, pairs, truth_from_estimate.scale)
+        };
+        let second_pairs = timed_pairs(&estimated, INTERVAL_NANOS, max_difference_nanos);
+        let measured = Self {
+            absolute: absolute_errors(&estimated, &true_poses, &truth_from_estimate),
+            frames: relative(&successive_pairs(&estimated)),
+            seconds: relative(&second_pairs),
+            path_length: path_length(&true_poses),
+            window_scales: scale_windows(&estimated, &true_poses),
+            shape: shape_errors(&estimated, &true_poses, alignment),
+            association,
+        };
+        Ok((measured, truth_from_estimate))
+    }
+
+    /// Adds another epoch, whose poses stand after `poses` others. The scale of a window is then relative to that of its
+    /// epoch, as units of epochs have nothing to do with each other.
+    pub(super) fn append(&mut self, epoch: &Self, scale: f64, poses: usize) {
+        let matches = self.absolute.len();
+        let pairs = epoch.association.pairs.iter().map(|&(e, t)| (e + poses, t));
+        self.association.pairs.extend(pairs);
+        self.absolute.extend(&epoch.absolute);
+        self.frames.append(&epoch.frames);
+        self.seconds.append(&epoch.seconds);
+        self.path_length += epoch.path_length;
+        let windows = epoch.window_scales.iter().map(|&(first, of)| (first + matches, of / scale));
+        self.window_scales.extend(windows);
+        self.shape.extend(&epoch.shape);
+    }
+
+    /// The statistics. `alignment` brought the estimate to the truth.
+    pub(super) fn evaluation(
+        self,
+        alignment: Sim3,
+    ) -> Result<TrajectoryEvaluation, EvaluationError> {
+        let unusable = AlignmentError::NotFinite;
+        Ok(TrajectoryEvaluation {
+            ate: ErrorStatistics::of(&self.absolute).ok_or(unusable.clone())?,
+            rpe_translation: ErrorStatistics::of(&self.frames.translation)
+                .ok_or(unusable.clone())?,
+            rpe_rotation_deg: ErrorStatistics::of(&self.frames.rotation_deg).ok_or(unusable)?,
+            rpe_translation_1s: ErrorStatistics::of(&self.seconds.translation),
+            rpe_rotation_deg_1s: ErrorStatistics::of(&self.seconds.rotation_deg),
+            path_length: self.path_length,
+            window_scale_ratio: scale_ratio(&self.window_scales),
+            window_scales: self.window_scales,
+            window_error: median(&self.shape),
+            alignment,
+            association: self.association,
+            absolute: self.absolute,
+        })
+    }
+}
