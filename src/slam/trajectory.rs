@@ -28,3 +28,24 @@ pub fn by_epoch(poses: &[EpochPose]) -> BTreeMap<u32, Vec<StampedPose>> {
     poses.iter().for_each(|of| epochs.entry(of.epoch).or_default().push(of.pose));
     epochs
 }
+
+/// Among the poses of `epoch`, in their order, the places of those before which other epochs stand, after one of its own.
+pub fn gaps_in(poses: &[EpochPose], epoch: u32) -> Vec<usize> {
+    let at: Vec<usize> = (0..poses.len()).filter(|&i| poses[i].epoch == epoch).collect();
+    (1..at.len()).filter(|&i| at[i] > at[i - 1] + 1).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_epoch_has_a_gap_where_another_stands_in_it() {
+        let pose = StampedPose { nanos: 0, world_from_camera: SE3::identity() };
+        let poses = [0, 1, 1, 0, 0, 2, 1].map(|epoch| EpochPose { epoch, pose });
+        assert_eq!(
+            [0, 1, 2, 3].map(|epoch| gaps_in(&poses, epoch)),
+            [vec![1], vec![2], vec![], vec![]]
+        );
+    }
+}

@@ -8,11 +8,13 @@ use std::path::{Path, PathBuf};
 
 use semidense::service::results::ply::read_surface;
 use semidense::service::results::report::scene::{SceneInput, SceneKeyframe, ScenePoint, pack};
-use semidense::service::trajectory_file::{TrajectoryFileError, nanos_from_secs, read_trajectory};
+use semidense::service::trajectory_file::{
+    TrajectoryFileError, nanos_from_secs, read_trajectory, read_trajectory_file,
+};
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
 use semidense::slam::geometry::sim3::Sim3;
-use semidense::slam::trajectory::StampedPose;
+use semidense::slam::trajectory::{EpochPose, StampedPose, gaps_in};
 use semidense::slam::up::up_direction;
 use serde_json::Value;
 
@@ -54,10 +56,10 @@ pub enum FinishedError {
 /// Reads a run's folder and packs it for the page, with at most `max_points` points.
 pub fn read_run(folder: &Path, max_points: usize) -> Result<Vec<u8>, FinishedError> {
     let keyframes = read_keyframes(&folder.join("keyframes.txt"))?;
-    let path: Vec<StampedPose> = read_trajectory(&folder.join("trajectory.txt"))?;
-    // Frames that were placed afterwards are not in it: which epoch they are of does not show in their stamps.
+    let path = read_trajectory_file(&folder.join("trajectory.txt"))?.poses;
+    // Frames that were placed afterwards are not in it.
     let online = read_trajectory(&folder.join("trajectory_online.txt")).unwrap_or_default();
-    let (keyframes, path) = of_longest_epoch(keyframes, path, &online);
+    let Shown { keyframes, path, gaps } = of_longest_epoch(keyframes, &path, &online);
     let points = read_points(&folder.join("map.ply"), max_points)?;
     let intrinsics = camera(&read_summary(folder)).unwrap_or(USUAL_CAMERA);
     // A cloud without normals leaves it to the cameras.
@@ -67,6 +69,7 @@ pub fn read_run(folder: &Path, max_points: usize) -> Result<Vec<u8>, FinishedErr
         points: &points,
         keyframes: &keyframes,
         path: &path,
+        gaps: &gaps,
         intrinsics: &intrinsics,
         up: up.map(Into::into),
         max_points,
@@ -105,33 +108,47 @@ fn read_keyframes(path: &Path) -> Result<Vec<(u32, SceneKeyframe)>, FinishedErro
     Ok(keyframes)
 }
 
-/// Keyframes and path of the epoch with the most poses, of which map.ply is: each epoch has a place and a unit of its own.
-/// A pose is of the epoch of the newest keyframe at its stamp; where there are several epochs, poses that are not `online`
-/// are left out.
+/// What is shown of a run.
+#[derive(Debug)]
+struct Shown {
+    keyframes: Vec<SceneKeyframe>,
+    path: Vec<StampedPose>,
+    /// Places in it before which another epoch stands.
+    gaps: Vec<usize>,
+}
+
+/// The epoch with the most tracked frames, of which map.ply is: each epoch has a place and a unit of its own. Frames that are
+/// not `online` got their pose afterwards and do not count. Where `path` marks no epochs and there are keyframes of several,
+/// a pose is taken to be of the epoch of the newest keyframe at its stamp, and those that are not `online`, whose stamps do
+/// not tell, are left out.
 fn of_longest_epoch(
     keyframes: Vec<(u32, SceneKeyframe)>,
-    path: Vec<StampedPose>,
+    path: &[EpochPose],
     online: &[StampedPose],
-) -> (Vec<SceneKeyframe>, Vec<StampedPose>) {
+) -> Shown {
+    let is_marked = path.windows(2).any(|pair| pair[0].epoch != pair[1].epoch);
     let is_one = keyframes.windows(2).all(|pair| pair[0].0 == pair[1].0);
-    if is_one {
-        return (keyframes.into_iter().map(|(_, keyframe)| keyframe).collect(), path);
-    }
-    let epoch_at = |pose: &StampedPose| {
-        let after = keyframes.partition_point(|(_, keyframe)| keyframe.nanos <= pose.nanos);
-        keyframes.get(after.saturating_sub(1)).map(|(epoch, _)| *epoch)
+    let epoch_of = |of: &EpochPose| {
+        let after = keyframes.partition_point(|(_, keyframe)| keyframe.nanos <= of.pose.nanos);
+        let by_keyframe = || keyframes.get(after.saturating_sub(1)).map(|(epoch, _)| *epoch);
+        if is_marked { Some(of.epoch) } else { by_keyframe() }
     };
     // A folder without published poses has only the final ones.
-    let online = if online.is_empty() { &path } else { online };
+    let stamps: BTreeSet<i64> = online.iter().map(|pose| pose.nanos).collect();
+    let is_online = |of: &EpochPose| stamps.is_empty() || stamps.contains(&of.pose.nanos);
     let mut counts: BTreeMap<u32, usize> = BTreeMap::new();
-    online.iter().filter_map(epoch_at).for_each(|epoch| *counts.entry(epoch).or_default() += 1);
+    let counted = path.iter().filter(|of| is_online(of)).filter_map(epoch_of);
+    counted.for_each(|epoch| *counts.entry(epoch).or_default() += 1);
     let longest = counts.iter().max_by_key(|(epoch, count)| (**count, Reverse(**epoch)));
     let longest = longest.map(|(epoch, _)| *epoch);
-    let stamps: BTreeSet<i64> = online.iter().map(|pose| pose.nanos).collect();
-    let is_shown = |pose: &StampedPose| stamps.contains(&pose.nanos) && epoch_at(pose) == longest;
-    let path = path.iter().copied().filter(is_shown).collect();
-    let of_epoch = keyframes.into_iter().filter(|(epoch, _)| Some(*epoch) == longest);
-    (of_epoch.map(|(_, keyframe)| keyframe).collect(), path)
+    let is_all = is_one && !is_marked;
+    let is_shown =
+        |of: &&EpochPose| is_all || epoch_of(of) == longest && (is_marked || is_online(of));
+    let shown = path.iter().filter(is_shown).map(|of| of.pose).collect();
+    // Poses that are left out without a mark are of this epoch, as far as anyone knows.
+    let gaps = longest.filter(|_| is_marked).map_or_else(Vec::new, |epoch| gaps_in(path, epoch));
+    let of_epoch = keyframes.iter().filter(|(epoch, _)| is_all || Some(*epoch) == longest);
+    Shown { keyframes: of_epoch.map(|(_, keyframe)| *keyframe).collect(), path: shown, gaps }
 }
 
 /// A line: stamp, translation, quaternion, unit, id, sequence, epoch …
@@ -372,22 +389,59 @@ mod tests {
             };
             secs.iter().map(pose).collect()
         };
+        let unmarked = |poses: &[StampedPose]| -> Vec<EpochPose> {
+            poses.iter().map(|pose| EpochPose { epoch: 0, pose: *pose }).collect()
+        };
         // The pose at 2.0 was placed afterwards: it is one from before the second epoch began.
         let (path, online) = (at(&[1.0, 1.5, 2.0, 2.5, 3.0, 6.0]), at(&[1.0, 1.5, 2.5, 3.0, 6.0]));
-        let keyframes = read_keyframes(file.path()).unwrap();
-        let (keyframes, shown) = of_longest_epoch(keyframes, path.clone(), &online);
-        assert_eq!(keyframes.iter().map(|k| k.keyframe_id).collect::<Vec<_>>(), [1, 4]);
-        assert_eq!(shown, at(&[1.0, 1.5, 6.0]));
+        let all = unmarked(&path);
+        let shown = of_longest_epoch(read_keyframes(file.path()).unwrap(), &all, &online);
+        assert_eq!(shown.keyframes.iter().map(|k| k.keyframe_id).collect::<Vec<_>>(), [1, 4]);
+        assert_eq!((shown.path, shown.gaps), (at(&[1.0, 1.5, 6.0]), vec![]));
         // Of one epoch everything is shown.
         fs::write(file.path(), [line(1.0, 1, 0), line(2.0, 2, 0)].concat()).unwrap();
-        let (all, shown) =
-            of_longest_epoch(read_keyframes(file.path()).unwrap(), path.clone(), &online);
-        assert_eq!((all.len(), shown.len()), (2, path.len()));
+        let shown = of_longest_epoch(read_keyframes(file.path()).unwrap(), &all, &online);
+        assert_eq!((shown.keyframes.len(), shown.path), (2, path));
         fs::write(file.path(), &text).unwrap();
-        let keyframes = read_keyframes(file.path()).unwrap();
-        assert_eq!(of_longest_epoch(keyframes, path, &[]).1, at(&[1.0, 1.5, 2.0, 6.0]));
+        let shown = of_longest_epoch(read_keyframes(file.path()).unwrap(), &all, &[]);
+        assert_eq!(shown.path, at(&[1.0, 1.5, 2.0, 6.0]));
         fs::write(file.path(), text.replace("0.5", "NaN")).unwrap();
         assert!(read_keyframes(file.path()).unwrap_err().to_string().contains("line 2"));
+    }
+
+    #[test]
+    fn the_path_is_of_one_marked_epoch_with_a_gap_where_another_stands_in_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let write = |name: &str, text: &str| fs::write(folder.path().join(name), text).unwrap();
+        // The camera is found in the first epoch again while the newest keyframe is of the second.
+        let keyframe = |secs: f64, id: u64, epoch: u32| {
+            format!("{secs} 0 0 0 0 0 0 1 1 {id} 9 {epoch} 100 Established\n")
+        };
+        write("keyframes.txt", &[keyframe(1.0, 1, 0), keyframe(1.3, 2, 1)].concat());
+        let pose = |tenths: i64| format!("{}.{} {tenths} 0 0 0 0 0 1\n", tenths / 10, tenths % 10);
+        let poses = |of: &[i64]| of.iter().copied().map(pose).collect::<String>();
+        let marked = format!(
+            "# epoch 0: x\n{}# epoch 1: x\n{}# epoch 0: x\n{}",
+            poses(&[10, 11, 12]),
+            poses(&[13, 14, 15, 16]),
+            poses(&[17, 18])
+        );
+        write("trajectory.txt", &marked);
+        write("map.ply", &HEADER.replace("vertex 2", "vertex 0"));
+        // The epoch with the most tracked frames counts: two of the second were placed afterwards.
+        for (online, expected, gaps) in [
+            (&[10, 11, 12, 15, 16, 17, 18][..], &[10, 11, 12, 17, 18][..], &[3][..]),
+            (&[13, 14, 15, 16], &[13, 14, 15, 16], &[]),
+        ] {
+            write("trajectory_online.txt", &poses(online));
+            let block = read_run(folder.path(), 10).unwrap();
+            let length = u32::from_le_bytes(block[..4].try_into().unwrap()) as usize;
+            let header: Value = serde_json::from_slice(&block[4..4 + length]).unwrap();
+            let path = header["path"].as_array().unwrap().iter();
+            let shown: Vec<i64> = path.map(|pose| pose[1].as_f64().unwrap() as i64).collect();
+            assert_eq!((&shown[..], &header["gaps"]), (expected, &serde_json::json!(gaps)));
+            assert_eq!(header["clusters"].as_array().unwrap().len(), 1);
+        }
     }
 
     proptest! {

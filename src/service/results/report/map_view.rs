@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use nalgebra::Vector3;
 
-use crate::service::results::poses::longest_epoch;
+use crate::service::results::poses::{final_poses, longest_epoch};
 use crate::service::results::report::html::base64;
 use crate::service::results::report::input::ReportInput;
 use crate::service::results::report::number_text::grouped;
@@ -12,6 +12,7 @@ use crate::service::results::report::scene::{
     PLAYER, SceneInput, SceneKeyframe, ScenePoint, VIEWER, pack,
 };
 use crate::slam::fusion::SurfacePoint;
+use crate::slam::trajectory::gaps_in;
 
 /// Most points of the map in a report: 3.2 MB of text, which a browser opens at once.
 const MAX_POINTS: usize = 300_000;
@@ -35,10 +36,12 @@ pub fn map_view(input: &ReportInput<'_>, up: Option<Vector3<f64>>) -> String {
         })
         .collect();
     let points = scene_points(input.surface);
+    let gaps = epoch.map_or_else(Vec::new, |epoch| gaps_in(&final_poses(input.record), epoch));
     let block = pack(&SceneInput {
         points: &points,
         keyframes: &keyframes,
         path: input.trajectory,
+        gaps: &gaps,
         intrinsics: &first.intrinsics,
         up: up.map(Into::into),
         max_points: MAX_POINTS,

@@ -64,6 +64,8 @@ pub struct SceneInput<'a> {
     pub keyframes: &'a [SceneKeyframe],
     /// The trajectory.
     pub path: &'a [StampedPose],
+    /// Places in it before which the line has a gap, in ascending order; a pause is a gap too.
+    pub gaps: &'a [usize],
     /// The camera.
     pub intrinsics: &'a Intrinsics,
     /// What is above, where it is known; else the page takes what the cameras had above them.
@@ -128,6 +130,8 @@ pub fn pack(input: &SceneInput<'_>) -> Vec<u8> {
         "up": input.up,
         "end": path.last().and_then(|pose| pose[0].as_f64()).unwrap_or(0.0),
         "gap": gap(input.path) * every as f64,
+        // One that falls between two poses that are packed stands before the second.
+        "gaps": input.gaps.iter().map(|place| place.div_ceil(every)).collect::<Vec<usize>>(),
         "points": input.points.len(),
         "shown": bytes.len() / POINT_BYTES,
         "clusters": clusters,
@@ -312,6 +316,7 @@ mod tests {
             points,
             keyframes: &[keyframe(3, 0.0), keyframe(5, 10.0)],
             path: &[],
+            gaps: &[],
             intrinsics: &Intrinsics::pinhole(64, 48, 50.0),
             up: None,
             max_points,
@@ -370,6 +375,25 @@ mod tests {
         };
         assert_eq!((bytes.len() / POINT_BYTES, &header["points"]), (99, &json!(1000)));
         assert!(header["clusters"][0]["min"][0].as_f64().unwrap() > 0.0);
+    }
+
+    #[test]
+    fn a_gap_of_the_path_stays_where_the_path_is_thinned() {
+        let pose =
+            |i: i64| StampedPose { nanos: i * 33_333_333, world_from_camera: SE3::identity() };
+        for (count, places) in [(6000, [1, 2999]), (18_000, [1, 1000])] {
+            let path: Vec<StampedPose> = (0..count).map(pose).collect();
+            let block = pack(&SceneInput {
+                points: &[],
+                keyframes: &[],
+                path: &path,
+                gaps: &[1, 2999],
+                intrinsics: &Intrinsics::pinhole(64, 48, 50.0),
+                up: None,
+                max_points: 0,
+            });
+            assert_eq!(unpack(&block).0["gaps"], json!(places), "{count}");
+        }
     }
 
     #[test]

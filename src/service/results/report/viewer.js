@@ -685,8 +685,9 @@ const Viewer = (() => {
       }
       if (header.up) this.setUp(header.up);
       this.setPath(header.path.map((p) => ({ t: p[0], place: p.slice(1, 8), at: p.slice(1, 4), state: 1 })));
-      // A gap in time is a gap of the line.
-      this.path.forEach((p, i) => { if (i && p.t - this.path[i - 1].t > header.gap) this.path[i - 1].state = 3; });
+      // A gap in time is a gap of the line, and so is another epoch.
+      const gaps = new Set(header.gaps);
+      this.path.forEach((p, i) => { if (i && (gaps.has(i) || p.t - this.path[i - 1].t > header.gap)) this.path[i - 1].state = 3; });
       this.run = header;
     }
     /** Puts time and camera at `t`, seconds of the recording. */
