@@ -6,7 +6,6 @@
 pub mod command;
 pub mod feed;
 pub mod foxglove;
-#[cfg(feature = "zenoh")]
 pub mod jpeg;
 pub mod keyframe_pace;
 pub mod record;
