@@ -25,6 +25,7 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::rectification::Rectification;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;
+use crate::slam::kernel::Kernel;
 use crate::slam::parameter::ParameterError;
 use crate::slam::trajectory::StampedPose;
 
@@ -35,7 +36,6 @@ mod cull;
 mod edges;
 pub(crate) mod flat;
 pub(crate) mod furnish;
-mod lanes_kernel;
 pub(crate) mod lens;
 pub mod params;
 pub(crate) mod pattern;
@@ -84,6 +84,8 @@ pub struct Simulator {
     /// Raw frames rendered so far.
     frames: FrameStore,
     next: usize,
+    /// Instructions of the renderer.
+    kernel: Kernel,
 }
 
 impl Simulator {
@@ -122,6 +124,7 @@ impl Simulator {
             ground_truth: Vec::new(),
             frames,
             next: 0,
+            kernel: Kernel::fastest(),
         };
         simulator.ground_truth = (0..simulator.params.frames)
             .map(|i| {
@@ -140,6 +143,10 @@ impl Simulator {
 
     fn scene(&self) -> &Scene {
         self.scene.get_or_init(|| furnish::build(self.params.scene, self.params.seed))
+    }
+
+    fn renderer<'a>(&'a self, lens: &'a Lens) -> Renderer<'a> {
+        Renderer { scene: self.scene(), lens, kernel: self.kernel }
     }
 
     /// Stamp of a frame: the middle of the exposure (of the middle row), nanoseconds.
@@ -161,7 +168,7 @@ impl Simulator {
     fn light(&self, frame: usize, scratch: &mut RenderScratch) -> Vec<f32> {
         let sensor = &self.params.sensor;
         let mut light = vec![0.0; self.params.width * self.params.height];
-        let renderer = Renderer { scene: self.scene(), lens: &self.lens };
+        let renderer = self.renderer(&self.lens);
         let middle_s = self.time_s(frame);
         let exposure_s = sensor.exposure_ms * 1e-3;
         let row_s = sensor.row_time_us * 1e-6;
@@ -248,7 +255,7 @@ impl Simulator {
     fn depth_through(&self, lens: &Lens, frame: usize, scratch: &mut RenderScratch) -> Image<f32> {
         let pose = self.pose(self.time_s(frame));
         let mut depth = Image::filled(lens.width, lens.height, 0.0);
-        Renderer { scene: self.scene(), lens }.depth_into(&pose, scratch, depth.pixels_mut());
+        self.renderer(lens).depth_into(&pose, scratch, depth.pixels_mut());
         self.in_world_units(depth)
     }
 

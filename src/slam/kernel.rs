@@ -3,7 +3,7 @@
 //! A loop is a `Body`, one source; it is compiled for every instruction set and run with one that the CPU has. The
 //! portable one is plain arithmetic without fused multiply-add and gives the same bits on every CPU.
 
-pub(in crate::slam) mod lanes_kernel;
+pub(crate) mod lanes_kernel;
 #[cfg(target_arch = "aarch64")]
 mod neon_kernel;
 mod portable_kernel;
@@ -12,7 +12,7 @@ mod x86_kernel;
 
 use serde::{Deserialize, Serialize};
 
-use crate::slam::kernel::lanes_kernel::Lanes;
+use crate::slam::kernel::lanes_kernel::{Lanes, Register};
 
 /// Which instructions the loops over points use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -91,7 +91,7 @@ impl Kernel {
     }
 
     /// Runs a loop with these instructions.
-    pub(in crate::slam) fn run<B: Body>(self, body: B) -> B::Output {
+    pub(crate) fn run<B: Body>(self, body: B) -> B::Output {
         match self {
             Self::Portable => body.run(Portable),
             // SAFETY: only `available` and `fastest` make this value, after they have found AVX2 and FMA.
@@ -105,10 +105,22 @@ impl Kernel {
             Self::Neon => unsafe { run_neon(body) },
         }
     }
+
+    /// Runs a loop with these instructions in eight lanes. In code for AVX-512 they are slower: comparisons go through
+    /// its mask registers.
+    #[cfg(feature = "cameras")]
+    pub(crate) fn run_eight<B: Body>(self, body: B) -> B::Output {
+        match self {
+            // SAFETY: as above; a CPU with AVX-512 has AVX2 and FMA.
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2 | Self::Avx512 => unsafe { run_avx2(body) },
+            _ => body.run(PortableEight),
+        }
+    }
 }
 
 /// What a loop does.
-pub(in crate::slam) trait Body {
+pub(crate) trait Body {
     /// Its result.
     type Output;
     /// Runs it. All that does arithmetic must be inlined, closures too: what is not is compiled for every CPU, and slow.
@@ -118,34 +130,82 @@ pub(in crate::slam) trait Body {
 /// An instruction set; a value of it says that the CPU has it.
 ///
 /// # Safety
-/// Only who knows that the CPU has what `Lanes` and the constants stand for can make a value.
+/// Only who knows that the CPU has what `Register` and the constants stand for can make a value.
 pub unsafe trait Instructions: Copy {
     /// Its registers of f32.
-    type Lanes: Lanes;
+    type Register: Register;
+    /// Number of their lanes.
+    const N: usize = Self::Register::N;
     /// AVX2 is among them.
     const HAS_AVX2: bool = false;
+    /// The same CPU with registers of eight lanes.
+    type Eight: Instructions;
+
+    /// For loops whose results depend on the number of lanes.
+    fn eight(self) -> Self::Eight;
+
+    /// The same number in all lanes.
+    #[inline(always)]
+    fn splat(self, value: f32) -> Lanes<Self::Register> {
+        // SAFETY: a value of the instructions says that the CPU has them.
+        Lanes(unsafe { Self::Register::splat(value) })
+    }
+
+    /// The first numbers of a slice; panics where there are fewer than lanes.
+    #[inline(always)]
+    fn load(self, from: &[f32]) -> Lanes<Self::Register> {
+        let from = &from[..Self::N];
+        // SAFETY: as above; there are N numbers.
+        Lanes(unsafe { Self::Register::load(from.as_ptr()) })
+    }
 }
+
+/// Some f32 in a register of these instructions.
+pub type Floats<I> = Lanes<<I as Instructions>::Register>;
 
 /// Plain arithmetic, the explanation of the others.
 #[derive(Debug, Clone, Copy)]
 pub struct Portable;
 
-// SAFETY: every CPU has them.
-unsafe impl Instructions for Portable {
-    type Lanes = portable_kernel::FourLanes;
+/// Plain arithmetic in eight lanes.
+#[derive(Debug, Clone, Copy)]
+pub struct PortableEight;
+
+macro_rules! portable {
+    ($name:ident, $lanes:literal) => {
+        // SAFETY: every CPU has them.
+        unsafe impl Instructions for $name {
+            type Register = portable_kernel::Numbers<$lanes>;
+            type Eight = PortableEight;
+
+            #[inline(always)]
+            fn eight(self) -> PortableEight {
+                PortableEight
+            }
+        }
+    };
 }
+
+portable!(Portable, 4);
+portable!(PortableEight, 8);
 
 /// Instructions beyond those that every CPU has: their type, and the one place that compiles a body for them.
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 macro_rules! instructions {
-    ($name:ident, $run:ident, $features:literal, $lanes:ty, $has_avx2:literal) => {
+    ($name:ident, $run:ident, $features:literal, $register:ty, $has_avx2:literal, $Eight:ty = $eight:expr) => {
         #[derive(Clone, Copy)]
         struct $name(());
 
-        // SAFETY: only the function below makes a value.
+        // SAFETY: only the function below, and instructions that include these, make a value.
         unsafe impl Instructions for $name {
-            type Lanes = $lanes;
+            type Register = $register;
             const HAS_AVX2: bool = $has_avx2;
+            type Eight = $Eight;
+
+            #[inline(always)]
+            fn eight(self) -> $Eight {
+                $eight
+            }
         }
 
         #[target_feature(enable = $features)]
@@ -156,14 +216,22 @@ macro_rules! instructions {
 }
 
 #[cfg(target_arch = "x86_64")]
-instructions!(Avx2, run_avx2, "avx2,fma", std::arch::x86_64::__m256, true);
+instructions!(Avx2, run_avx2, "avx2,fma", std::arch::x86_64::__m256, true, Avx2 = Avx2(()));
 #[cfg(target_arch = "x86_64")]
 instructions!(
     Avx512,
     run_avx512,
     "avx512f,avx512vl,avx512bw,avx512dq",
     std::arch::x86_64::__m512,
-    true
+    true,
+    Avx2 = Avx2(())
 );
 #[cfg(target_arch = "aarch64")]
-instructions!(Neon, run_neon, "neon", std::arch::aarch64::float32x4_t, false);
+instructions!(
+    Neon,
+    run_neon,
+    "neon",
+    std::arch::aarch64::float32x4_t,
+    false,
+    PortableEight = PortableEight
+);

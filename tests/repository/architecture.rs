@@ -32,12 +32,7 @@ const IMPURE: &[&str] =
     &["std::fs", "std::io", "std::net", "std::env", "rand::", "thread_local!", "static mut"];
 
 /// Where `unsafe` may stand.
-const UNSAFE_MODULES: &[&str] = &[
-    "src/wire",
-    "src/capture/v4l",
-    "src/capture/simulator/lanes_kernel.rs",
-    "src/service/schedule.rs",
-];
+const UNSAFE_MODULES: &[&str] = &["src/wire", "src/capture/v4l", "src/service/schedule.rs"];
 const UNSAFE_KERNEL_MARK: &str = "kernel";
 
 fn root() -> PathBuf {

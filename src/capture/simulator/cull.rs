@@ -2,8 +2,7 @@
 
 use nalgebra::Vector3;
 
-use crate::capture::simulator::lanes_kernel::LANES;
-use crate::capture::simulator::lens::{Lens, NEAREST_M};
+use crate::capture::simulator::lens::{LANES, Lens, NEAREST_M};
 use crate::capture::simulator::scene::{Block, Scene};
 use crate::slam::geometry::se3::SE3;
 

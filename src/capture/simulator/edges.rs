@@ -1,10 +1,10 @@
 //! Pixels that more than one surface fills: what share each has of them, and how bright all of it is.
 
-use crate::capture::simulator::lanes_kernel::{LANES, Lanes};
-use crate::capture::simulator::lens::Ray;
+use crate::capture::simulator::lens::{LANES, Ray};
 use crate::capture::simulator::scene::Scene;
 use crate::capture::simulator::shade::{FaceView, PIXEL_WIDTH, grey};
 use crate::capture::simulator::view::{LocalView, NO_SURFACE, Nearest};
+use crate::slam::kernel::{Floats, Instructions};
 
 /// Side of the grid of rays cast through a pixel that an edge crosses.
 const EDGE_GRID: usize = 4;
@@ -58,9 +58,9 @@ impl Shares {
     /// Divides a pixel: a grid of rays counts each surface's share among the blocks `around`, which are those of the
     /// surfaces of the pixel and its neighbours.
     #[inline(always)]
-    pub fn divide<L: Lanes>(
+    pub fn divide<I: Instructions>(
         &mut self,
-        lanes: L,
+        lanes: I,
         views: &[LocalView],
         around: [f32; 5],
         ray: &Ray,
@@ -81,14 +81,14 @@ impl Shares {
             }
             seen[part] = nearest.surfaces(lanes, views, at);
         }
-        let surfaces = seen.map(|part| lanes.store(part));
+        let surfaces = seen.map(|part| part.to_array::<LANES>());
         let mut left: u32 = (1 << RAYS) - 1;
         while left != 0 {
             let first = left.trailing_zeros() as usize;
             let surface = surfaces[first / LANES][first % LANES];
             let mut here = 0;
             for (part, &seen) in seen.iter().enumerate() {
-                here |= lanes.equal_bits(seen, lanes.splat(surface)) << (part * LANES);
+                here |= seen.equal(lanes.splat(surface)).bits() << (part * LANES);
             }
             left &= !here;
             self.shares.push(Share::of_rays(here, surface, ray, pixel));
@@ -97,9 +97,9 @@ impl Shares {
 
     /// Adds `weight` × the mean brightness of every divided pixel to `out`; each share is sampled once, in its middle.
     #[inline(always)]
-    pub fn add_to<L: Lanes>(
+    pub fn add_to<I: Instructions>(
         &mut self,
-        lanes: L,
+        lanes: I,
         scene: &Scene,
         views: &[LocalView],
         weight: f32,
@@ -118,7 +118,7 @@ impl Shares {
     }
 
     #[inline(always)]
-    fn shade<L: Lanes>(&mut self, lanes: L, scene: &Scene, views: &[LocalView]) {
+    fn shade<I: Instructions>(&mut self, lanes: I, scene: &Scene, views: &[LocalView]) {
         let Self { shares, order, greys } = self;
         order.clear();
         // One more than the surface: none comes first.
@@ -130,7 +130,7 @@ impl Shares {
             let face = FaceView::new(scene, views, alike[0].0 as f32 - 1.0);
             for some in alike.chunks(LANES) {
                 let ray = together(lanes, shares, some);
-                let values = lanes.store(grey(lanes, face.as_ref(), some.len(), &ray));
+                let values = grey(lanes, face.as_ref(), some.len(), &ray).to_array::<LANES>();
                 for (&(_, i), value) in some.iter().zip(values) {
                     greys[i as usize] = value;
                 }
@@ -160,7 +160,7 @@ impl Share {
 
 /// The rays of some shares; where fewer than [`LANES`], the last one for the rest.
 #[inline(always)]
-fn together<L: Lanes>(lanes: L, shares: &[Share], some: &[(u32, u32)]) -> Ray<L::F> {
+fn together<I: Instructions>(lanes: I, shares: &[Share], some: &[(u32, u32)]) -> Ray<Floats<I>> {
     let mut numbers = [[0.0; LANES]; 6];
     for lane in 0..LANES {
         let Ray { at, du, dv } = shares[some[lane.min(some.len() - 1)].1 as usize].ray;

@@ -3,10 +3,13 @@
 use nalgebra::Vector2;
 use rayon::prelude::*;
 
-use crate::capture::simulator::lanes_kernel::LANES;
 use crate::slam::geometry::camera_model::CameraModel;
 use crate::slam::geometry::intrinsics::Intrinsics;
 
+/// How many rays are cast together.
+pub const LANES: usize = 8;
+/// A bit for each of them.
+pub const ALL_LANES: u32 = (1 << LANES) - 1;
 /// Nothing is seen closer than this, metres.
 pub const NEAREST_M: f32 = 0.05;
 

@@ -2,12 +2,12 @@
 
 use crate::capture::simulator::cull::TileLists;
 use crate::capture::simulator::edges::Shares;
-use crate::capture::simulator::lanes_kernel::{ALL_LANES, LANES, LaneWork, Lanes, with_lanes};
-use crate::capture::simulator::lens::Lens;
+use crate::capture::simulator::lens::{ALL_LANES, LANES, Lens};
 use crate::capture::simulator::scene::Scene;
 use crate::capture::simulator::shade::{FaceView, grey};
 use crate::capture::simulator::view::{LocalView, Nearest};
 use crate::slam::geometry::se3::SE3;
+use crate::slam::kernel::{Body, Instructions, Kernel};
 
 /// Reused memory of a renderer: one for each thread.
 #[derive(Debug, Default)]
@@ -39,6 +39,8 @@ pub struct Renderer<'a> {
     pub scene: &'a Scene,
     /// Through which rays.
     pub lens: &'a Lens,
+    /// With which instructions: all give the same bits.
+    pub kernel: Kernel,
 }
 
 /// The camera pose of every image row, all the same under a global shutter.
@@ -52,7 +54,7 @@ impl Renderer<'_> {
     /// Depth along the optical axis of every pixel, metres (0 where nothing is).
     pub fn depth_into(&self, pose: &SE3, scratch: &mut RenderScratch, depth: &mut [f32]) {
         let shutter = Shutter { pose_of_row: &|_| *pose, is_global: true };
-        with_lanes(Casting { renderer: self, shutter, names_surfaces: false, scratch });
+        self.kernel.run_eight(Casting { renderer: self, shutter, names_surfaces: false, scratch });
         scratch.depth_into(depth);
     }
 
@@ -67,8 +69,8 @@ impl Renderer<'_> {
         grey: &mut [f32],
     ) {
         let shutter = Shutter { pose_of_row, is_global };
-        with_lanes(Casting { renderer: self, shutter, names_surfaces: true, scratch });
-        with_lanes(Shading { renderer: self, shutter, weight, scratch, grey });
+        self.kernel.run_eight(Casting { renderer: self, shutter, names_surfaces: true, scratch });
+        self.kernel.run_eight(Shading { renderer: self, shutter, weight, scratch, grey });
     }
 
     /// The blocks as the camera sees them when it takes a row; the same as in the last row under a global shutter.
@@ -93,11 +95,11 @@ struct Casting<'a> {
     scratch: &'a mut RenderScratch,
 }
 
-impl LaneWork for Casting<'_> {
+impl Body for Casting<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn run<L: Lanes>(self, lanes: L) {
+    fn run<I: Instructions>(self, lanes: I) {
         let Self { renderer, shutter, names_surfaces, scratch } = self;
         let lens = renderer.lens;
         let (width, height) = (lens.width, lens.height);
@@ -114,14 +116,14 @@ impl LaneWork for Casting<'_> {
                 let mut nearest = Nearest::nothing(lanes);
                 // Sorted by nearest depth.
                 for near in lists.of_pixel(u, v) {
-                    if lanes.less_bits(nearest.depth, lanes.splat(near.nearest)) == ALL_LANES {
+                    if lanes.splat(near.nearest).greater(nearest.depth).bits() == ALL_LANES {
                         break;
                     }
                     nearest = nearest.or_block(lanes, views, near.block, at);
                 }
-                depths[first..first + LANES].copy_from_slice(&lanes.store(nearest.depth));
+                depths[first..first + LANES].copy_from_slice(&nearest.depth.to_array::<LANES>());
                 if names_surfaces {
-                    let seen = lanes.store(nearest.surfaces(lanes, views, at));
+                    let seen = nearest.surfaces(lanes, views, at).to_array::<LANES>();
                     surfaces[first..first + LANES].copy_from_slice(&seen);
                 }
             }
@@ -138,13 +140,13 @@ struct Shading<'a> {
     grey: &'a mut [f32],
 }
 
-impl LaneWork for Shading<'_> {
+impl Body for Shading<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn run<L: Lanes>(self, lanes: L) {
+    fn run<I: Instructions>(self, lanes: I) {
         let Self { renderer, shutter, weight, scratch, grey } = self;
-        let Renderer { scene, lens } = *renderer;
+        let Renderer { scene, lens, .. } = *renderer;
         let RenderScratch { surfaces, views, is_edge, shares, .. } = scratch;
         for v in 0..lens.height {
             renderer.view_blocks(shutter, v, views);
@@ -173,8 +175,8 @@ impl LaneWork for Shading<'_> {
 
 /// Adds `weight` × the brightness of a face to the pixels from `first` on, all of which see it alone.
 #[inline(always)]
-fn add_face<L: Lanes>(
-    lanes: L,
+fn add_face<I: Instructions>(
+    lanes: I,
     lens: &Lens,
     face: Option<&FaceView<'_>>,
     first: usize,
@@ -184,7 +186,7 @@ fn add_face<L: Lanes>(
     for (part, out) in out.chunks_mut(LANES).enumerate() {
         let rays = lens.rays_from(first + part * LANES);
         let ray = rays.map(|numbers| lanes.load(numbers));
-        let values = lanes.store(grey(lanes, face, out.len(), &ray));
+        let values = grey(lanes, face, out.len(), &ray).to_array::<LANES>();
         for (out, value) in out.iter_mut().zip(values) {
             *out += weight * value;
         }

@@ -124,7 +124,7 @@ fn the_twin_rooms_look_exactly_alike() {
     let mut params = params.with_scene(SceneKind::Twins);
     params.sensor.noise_std_dev = 0.0;
     let simulator = Simulator::new(params).unwrap();
-    let renderer = Renderer { scene: simulator.scene(), lens: &simulator.lens };
+    let renderer = simulator.renderer(&simulator.lens);
     let image = |x: f64, y: f64, heading_deg: f64| {
         let mut grey = vec![0.0; 320 * 240];
         let pose = SE3 {

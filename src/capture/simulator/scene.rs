@@ -1,10 +1,10 @@
 //! What stands in a scene: textured blocks, lit once and for all, and where a camera may walk.
 
-use crate::capture::simulator::lanes_kernel::Lanes;
 use crate::capture::simulator::pattern::{PATTERNS, Pattern, TEXTURE_SIZE, paint_all};
 use crate::capture::simulator::random::Stream;
 use crate::capture::simulator::route::Route;
 use crate::capture::simulator::texture::Texture;
+use crate::slam::kernel::{Floats, Instructions};
 
 /// Texels a metre of a surface that is not made to measure: 2 mm a texel.
 pub const TEXELS_PER_METRE: f32 = 500.0;
@@ -45,7 +45,12 @@ impl Block {
     /// Light that falls on points with this normal, as a factor on reflectance. It depends on
     /// nothing but the place, so a surface has one brightness from wherever it is seen.
     #[inline(always)]
-    pub fn light<L: Lanes>(&self, lanes: L, point: [L::F; 3], normal: [f32; 3]) -> L::F {
+    pub fn light<I: Instructions>(
+        &self,
+        lanes: I,
+        point: [Floats<I>; 3],
+        normal: [f32; 3],
+    ) -> Floats<I> {
         /// Share of the light that comes from everywhere.
         const AMBIENT: f32 = 0.62;
         /// Light of the lamp at no distance, facing it.
@@ -60,8 +65,8 @@ impl Block {
         let squared = to[0] * to[0] + to[1] * to[1] + to[2] * to[2];
         let along = |k: usize| to[k] * number(normal[k]);
         let facing = along(0) + along(1) + along(2);
-        let distance = lanes.max(lanes.sqrt(squared), number(1e-3));
-        let cosine = lanes.max(facing / distance, number(0.0));
+        let distance = squared.sqrt().max(number(1e-3));
+        let cosine = (facing / distance).max(number(0.0));
         let falloff = number(1.0) + squared / number(HALF_DISTANCE_M * HALF_DISTANCE_M);
         number(AMBIENT) + number(LAMP) * cosine / falloff + number(0.06 * normal[0])
     }

@@ -1,10 +1,10 @@
 //! How bright a face is where rays meet it, many at a time.
 
-use crate::capture::simulator::lanes_kernel::Lanes;
 use crate::capture::simulator::lens::Ray;
 use crate::capture::simulator::scene::{Block, Face, Scene};
 use crate::capture::simulator::texture::{Footprint, Texture};
 use crate::capture::simulator::view::{LocalView, NO_SURFACE};
+use crate::slam::kernel::{Floats, Instructions};
 
 /// Side of the square that a pixel averages over, pixels: its own area and the blur of a good lens,
 /// which keeps what is finer than the pixels out of the image.
@@ -52,7 +52,12 @@ impl<'a> FaceView<'a> {
 
     /// Brightness over the footprints of rays, grey levels; only the first `wanted` matter.
     #[inline(always)]
-    pub fn grey<L: Lanes>(&self, lanes: L, wanted: usize, ray: &Ray<L::F>) -> L::F {
+    pub fn grey<I: Instructions>(
+        &self,
+        lanes: I,
+        wanted: usize,
+        ray: &Ray<Floats<I>>,
+    ) -> Floats<I> {
         let number = |x: f32| lanes.splat(x);
         let Self { view, face, axis, right, down, .. } = *self;
         let mut d = [number(0.0); 3];
@@ -76,14 +81,20 @@ impl<'a> FaceView<'a> {
         let dv = [wide * dv[0], high * dv[1]];
         let texel = self.texture.sample(lanes, wanted, &Footprint { centre, du, dv });
         let deviation = number(face.contrast) * (texel - number(0.5));
-        let reflectance = lanes.max(number(face.middle) + deviation, number(0.02));
-        let reflectance = lanes.min(reflectance, number(0.98));
+        let reflectance = (number(face.middle) + deviation).max(number(0.02));
+        let reflectance = reflectance.min(number(0.98));
         number(255.0) * reflectance * self.light(lanes, point)
     }
 
     /// How far what rays of direction `d` meet at `depth` moves along the face when their directions change, metres.
     #[inline(always)]
-    fn step<L: Lanes>(&self, lanes: L, change: [L::F; 2], d: [L::F; 3], depth: L::F) -> [L::F; 2] {
+    fn step<I: Instructions>(
+        &self,
+        lanes: I,
+        change: [Floats<I>; 2],
+        d: [Floats<I>; 3],
+        depth: Floats<I>,
+    ) -> [Floats<I>; 2] {
         let mut turned = d;
         for k in 0..3 {
             let [x, y] = [lanes.splat(self.view.rows[k][0]), lanes.splat(self.view.rows[k][1])];
@@ -97,7 +108,7 @@ impl<'a> FaceView<'a> {
 
     /// Light on points of the face.
     #[inline(always)]
-    fn light<L: Lanes>(&self, lanes: L, point: [L::F; 3]) -> L::F {
+    fn light<I: Instructions>(&self, lanes: I, point: [Floats<I>; 3]) -> Floats<I> {
         let (block, number) = (self.block, |x: f32| lanes.splat(x));
         let (sin, cos) = block.turn;
         let [x, y, z] = point;
@@ -118,12 +129,12 @@ impl<'a> FaceView<'a> {
 
 /// Brightness of a surface or of where none is.
 #[inline(always)]
-pub fn grey<L: Lanes>(
-    lanes: L,
+pub fn grey<I: Instructions>(
+    lanes: I,
     face: Option<&FaceView<'_>>,
     wanted: usize,
-    ray: &Ray<L::F>,
-) -> L::F {
+    ray: &Ray<Floats<I>>,
+) -> Floats<I> {
     match face {
         Some(face) => face.grey(lanes, wanted, ray),
         None => lanes.splat(SKY_GREY),

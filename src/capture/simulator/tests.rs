@@ -3,7 +3,6 @@
 use nalgebra::{Vector2, Vector3};
 
 use super::*;
-use crate::capture::simulator::lanes_kernel::IS_PORTABLE;
 use crate::capture::simulator::params::MotionKind;
 use crate::capture::simulator::scene::Block;
 use crate::capture::simulator::scene_kind::SceneKind;
@@ -237,17 +236,18 @@ fn frames_are_the_same_on_every_processor() {
     blurred.sensor.exposure_ms = 8.0;
     blurred.sensor.distortion = vec![-0.2, 0.05, 0.0, 0.0];
     for params in [sharp, blurred] {
-        let render = |is_portable: bool| {
-            let (mut scratch, source) = (RenderScratch::default(), Simulator::new(params.clone()));
-            IS_PORTABLE.set(is_portable);
-            let (pixels, depth) = source.unwrap().raw_frame_and_depth(1, &mut scratch).unwrap();
+        let render = |kernel: Kernel| {
+            let mut source = Simulator::new(params.clone()).unwrap();
+            source.kernel = kernel;
+            let mut scratch = RenderScratch::default();
+            let (pixels, depth) = source.raw_frame_and_depth(1, &mut scratch).unwrap();
             let depth: Vec<u32> = depth.pixels().iter().map(|depth| depth.to_bits()).collect();
             (pixels.to_vec(), depth)
         };
-        // All of it in one thread.
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
-        let (portable, vectorised) = pool.install(|| (render(true), render(false)));
-        assert!(portable == vectorised);
+        let portable = render(Kernel::Portable);
+        for kernel in Kernel::available() {
+            assert!(render(kernel) == portable, "{kernel:?}");
+        }
     }
 }
 
@@ -326,7 +326,7 @@ fn a_rolling_shutter_takes_every_row_at_its_own_time() {
     params.sensor.row_time_us = 0.0;
     let global = Simulator::new(params).unwrap();
     let image = rolling.raw_frame(4).unwrap();
-    let renderer = Renderer { scene: global.scene(), lens: &global.lens };
+    let renderer = global.renderer(&global.lens);
     for row in [3usize, 120, 236] {
         let time_s = global.time_s(4) + (row as f64 - 119.5) * 1e-4;
         let pose = global.pose(time_s);

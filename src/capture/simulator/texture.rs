@@ -1,6 +1,8 @@
 //! A printed surface: a tileable bitmap with its mip levels, sampled over the footprint of a pixel.
 
-use crate::capture::simulator::lanes_kernel::Lanes;
+use crate::capture::simulator::lens::LANES;
+use crate::slam::kernel::lanes_kernel::Pixel;
+use crate::slam::kernel::{Floats, Instructions};
 
 /// Reflectance of a tileable square surface, 0 (black) to 1 (white), with every halving of it.
 ///
@@ -70,29 +72,34 @@ impl Texture {
     /// short axis, in a row along the long axis (Heckbert 1989, with Gaussian weights left out), so that a surface
     /// keeps its brightness from every distance and angle.
     #[inline(always)]
-    pub fn sample<L: Lanes>(&self, lanes: L, wanted: usize, footprint: &Footprint<L::F>) -> L::F {
+    pub fn sample<I: Instructions>(
+        &self,
+        lanes: I,
+        wanted: usize,
+        footprint: &Footprint<Floats<I>>,
+    ) -> Floats<I> {
         let number = |x: f32| lanes.splat(x);
         let ([ux, uy], [vx, vy]) = (footprint.du, footprint.dv);
         // Principal axes of the ellipse that the unit circle of pixels becomes.
         let (xx, xy, yy) = (ux * ux + vx * vx, ux * uy + vx * vy, uy * uy + vy * vy);
         let mean = number(0.5) * (xx + yy);
-        let spread = lanes.sqrt(number(0.25) * (xx - yy) * (xx - yy) + xy * xy);
-        let major = lanes.sqrt(mean + spread);
+        let spread = (number(0.25) * (xx - yy) * (xx - yy) + xy * xy).sqrt();
+        let major = (mean + spread).sqrt();
         let shortest = major / number(MAX_TAPS);
-        let minor = lanes.max(lanes.sqrt(lanes.max(mean - spread, number(0.0))), shortest);
-        let ratio = major / lanes.max(minor, number(1e-12));
-        let taps = lanes.floor(lanes.min(ratio, number(MAX_TAPS - 1.0))) + number(1.0);
-        let is_long = |yes, no| lanes.if_less(number(2.0), taps, yes, no);
-        let width = is_long(minor, lanes.sqrt(major * minor));
-        let counts = lanes.store(is_long(taps, number(1.0)));
+        let minor = (mean - spread).max(number(0.0)).sqrt().max(shortest);
+        let ratio = major / minor.max(number(1e-12));
+        let taps = ratio.min(number(MAX_TAPS - 1.0)).floor() + number(1.0);
+        let is_long = |yes, no| taps.greater(number(2.0)).select(yes, no);
+        let width = is_long(minor, (major * minor).sqrt());
+        let counts = is_long(taps, number(1.0)).to_array::<LANES>();
         let most = counts[..wanted].iter().fold(1.0, |a: f32, &b| a.max(b));
         if most == 1.0 {
             return self.trilinear(lanes, footprint.centre, width);
         }
-        let along_x = lanes.if_less(xx, yy, xy, mean + spread - yy);
-        let along_y = lanes.if_less(xx, yy, mean + spread - xx, xy);
-        let length = lanes.sqrt(along_x * along_x + along_y * along_y);
-        let step = major / (lanes.max(length, number(1e-12)) * taps);
+        let along_x = yy.greater(xx).select(xy, mean + spread - yy);
+        let along_y = yy.greater(xx).select(mean + spread - xx, xy);
+        let length = (along_x * along_x + along_y * along_y).sqrt();
+        let step = major / (length.max(number(1e-12)) * taps);
         let mut sum = number(0.0);
         let mut place = number(-0.5) * (taps - number(1.0));
         for tap in 0..most as usize {
@@ -100,7 +107,7 @@ impl Texture {
             let x = is_long(x + place * step * along_x, x);
             let y = is_long(y + place * step * along_y, y);
             let tapped = self.trilinear(lanes, [x, y], width);
-            let sampled = lanes.if_less(number(tap as f32), taps, sum + tapped, sum);
+            let sampled = taps.greater(number(tap as f32)).select(sum + tapped, sum);
             sum = if tap == 0 { sampled } else { is_long(sampled, sum) };
             place = place + number(1.0);
         }
@@ -109,40 +116,51 @@ impl Texture {
 
     /// Means over discs of `width` texels around `centre`.
     #[inline(always)]
-    pub fn trilinear<L: Lanes>(&self, lanes: L, centre: [L::F; 2], width: L::F) -> L::F {
+    pub fn trilinear<I: Instructions>(
+        &self,
+        lanes: I,
+        centre: [Floats<I>; 2],
+        width: Floats<I>,
+    ) -> Floats<I> {
         // The power of two below the width is the level, the rest the way to the next: log2 made of
         // straight pieces, exact at whole levels and without a call.
         let size = lanes.splat(self.size as f32);
-        let width = lanes.min(lanes.max(width, lanes.splat(1.0)), size);
-        let whole = lanes.power_of_two_below(width);
+        let width = width.max(lanes.splat(1.0)).min(size);
+        let whole = width.power_of_two_below();
         let scale = lanes.splat(1.0) / whole;
         let between = width * scale - lanes.splat(1.0);
         let first = self.bilinear(lanes, whole, scale, centre);
         let (twice, half) = (lanes.splat(2.0) * whole, lanes.splat(0.5) * scale);
         let second = self.bilinear(lanes, twice, half, centre);
-        lanes.if_less(between, lanes.splat(1e-3), first, first + between * (second - first))
+        lanes.splat(1e-3).greater(between).select(first, first + between * (second - first))
     }
 
     /// On the levels whose texels are `width` of the finest, which is 1 / `scale`. Meaningless for a level that does not exist.
     #[inline(always)]
-    fn bilinear<L: Lanes>(&self, lanes: L, width: L::F, scale: L::F, centre: [L::F; 2]) -> L::F {
+    fn bilinear<I: Instructions>(
+        &self,
+        lanes: I,
+        width: Floats<I>,
+        scale: Floats<I>,
+        centre: [Floats<I>; 2],
+    ) -> Floats<I> {
         let number = |x: f32| lanes.splat(x);
         let (size, stride) = (number(self.size as f32), number(Self::stride(self.size) as f32));
         let side = size * scale;
         // Texel centres are at half-integer coordinates of the finest level.
         let (x, y) = (centre[0] * scale - number(0.5), centre[1] * scale - number(0.5));
-        let (column, row) = (lanes.floor(x), lanes.floor(y));
+        let (column, row) = (x.floor(), y.floor());
         let (a, b) = (x - column, y - row);
         let per_side = number(1.0 / self.size as f32) * width;
-        let wrapped = |x| x - side * lanes.floor(x * per_side);
+        let wrapped = |x: Floats<I>| x - side * (x * per_side).floor();
         let (left, top) = (wrapped(column), wrapped(row));
         let below = top + number(1.0);
-        let bottom = lanes.if_less(below, side, below, number(0.0));
+        let bottom = side.greater(below).select(below, number(0.0));
         // Whole numbers below 2²⁴, as all places of a sheet.
         let coarse = (size - side - side) * stride + (size + number(1.0));
-        let corner = lanes.if_less(side, size, coarse, number(0.0)) + left;
-        let [p00, p10] = lanes.pairs(&self.sheet, corner + top * stride);
-        let [p01, p11] = lanes.pairs(&self.sheet, corner + bottom * stride);
+        let corner = size.greater(side).select(coarse, number(0.0)) + left;
+        let [p00, p10] = u16::pairs(&self.sheet, (corner + top * stride).truncate());
+        let [p01, p11] = u16::pairs(&self.sheet, (corner + bottom * stride).truncate());
         let above = p00 + a * (p10 - p00);
         let below = p01 + a * (p11 - p01);
         (above + b * (below - above)) * number(1.0 / STEPS)

@@ -2,9 +2,10 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use crate::capture::simulator::lanes_kernel::{ALL_LANES, Lanes};
-use crate::capture::simulator::lens::NEAREST_M;
+use crate::capture::simulator::lens::{ALL_LANES, LANES, NEAREST_M};
 use crate::capture::simulator::scene::Block;
+use crate::slam::kernel::lanes_kernel::{Lanes, Register};
+use crate::slam::kernel::{Floats, Instructions};
 
 /// No surface. Surfaces are numbered block × 8 + face, and kept as `f32` among other numbers.
 pub const NO_SURFACE: f32 = -1.0;
@@ -39,39 +40,49 @@ impl LocalView {
 
     /// The direction of rays along one of the block's axes.
     #[inline(always)]
-    pub fn direction<L: Lanes>(&self, lanes: L, axis: usize, [x, y]: [L::F; 2]) -> L::F {
+    pub fn direction<I: Instructions>(
+        &self,
+        lanes: I,
+        axis: usize,
+        [x, y]: [Floats<I>; 2],
+    ) -> Floats<I> {
         let row = &self.rows[axis];
         lanes.splat(row[0]) * x + lanes.splat(row[1]) * y + lanes.splat(row[2])
     }
 
     /// Depths at which rays enter (a hollow block: leave); infinite where they miss.
     #[inline(always)]
-    pub fn depth<L: Lanes>(&self, lanes: L, at: [L::F; 2]) -> L::F {
+    pub fn depth<I: Instructions>(&self, lanes: I, at: [Floats<I>; 2]) -> Floats<I> {
         let infinite = lanes.splat(f32::INFINITY);
         let (mut enter, mut leave) = (lanes.splat(f32::NEG_INFINITY), infinite);
         for k in 0..3 {
             let inverse = lanes.splat(1.0) / self.direction(lanes, k, at);
             let middle = lanes.splat(-self.origin[k]) * inverse;
-            let reach = lanes.abs(lanes.splat(self.half[k]) * inverse);
-            enter = lanes.max(middle - reach, enter);
-            leave = lanes.min(middle + reach, leave);
+            let reach = (lanes.splat(self.half[k]) * inverse).abs();
+            enter = (middle - reach).max(enter);
+            leave = (middle + reach).min(leave);
         }
         let depth = if self.is_hollow { leave } else { enter };
-        let met = lanes.if_less(enter, leave, depth, infinite);
-        lanes.if_less(lanes.splat(NEAREST_M), met, met, infinite)
+        let met = leave.greater(enter).select(depth, infinite);
+        met.greater(lanes.splat(NEAREST_M)).select(met, infinite)
     }
 
     /// The faces that rays meet at `depth`: 2 × axis, plus 1 on the positive side.
     #[inline(always)]
-    pub fn face<L: Lanes>(&self, lanes: L, at: [L::F; 2], depth: L::F) -> L::F {
+    pub fn face<I: Instructions>(
+        &self,
+        lanes: I,
+        at: [Floats<I>; 2],
+        depth: Floats<I>,
+    ) -> Floats<I> {
         let (mut outermost, mut face) = (lanes.splat(f32::NEG_INFINITY), lanes.splat(0.0));
         for k in 0..3 {
             let place = lanes.splat(self.origin[k]) + depth * self.direction(lanes, k, at);
-            let outside = lanes.abs(place) - lanes.splat(self.half[k]);
+            let outside = place.abs() - lanes.splat(self.half[k]);
             let (low, high) = (lanes.splat((2 * k) as f32), lanes.splat((2 * k + 1) as f32));
-            let side = lanes.if_less(lanes.splat(0.0), place, high, low);
-            face = lanes.if_less(outermost, outside, side, face);
-            outermost = lanes.max(outside, outermost);
+            let side = place.greater(lanes.splat(0.0)).select(high, low);
+            face = outside.greater(outermost).select(side, face);
+            outermost = outside.max(outermost);
         }
         face
     }
@@ -79,52 +90,54 @@ impl LocalView {
 
 /// What rays meet first.
 #[derive(Debug, Clone, Copy)]
-pub struct Nearest<F> {
+pub struct Nearest<R> {
     /// Depth along the optical axis, metres; infinite where nothing is.
-    pub depth: F,
-    block: F,
+    pub depth: Lanes<R>,
+    block: Lanes<R>,
 }
 
-impl<F: Copy> Nearest<F> {
+impl<R: Register> Nearest<R> {
     /// Nothing.
     #[inline(always)]
-    pub fn nothing<L: Lanes<F = F>>(lanes: L) -> Self {
+    pub fn nothing<I: Instructions<Register = R>>(lanes: I) -> Self {
         Self { depth: lanes.splat(f32::INFINITY), block: lanes.splat(NO_SURFACE) }
     }
 
     /// This or, where it is nearer, one more block.
     #[inline(always)]
-    pub fn or_block<L: Lanes<F = F>>(
+    pub fn or_block<I: Instructions<Register = R>>(
         self,
-        lanes: L,
+        lanes: I,
         views: &[LocalView],
         block: u32,
-        at: [F; 2],
+        at: [Lanes<R>; 2],
     ) -> Self {
         let met = views[block as usize].depth(lanes, at);
         let index = lanes.splat(block as f32);
         Self {
-            depth: lanes.min(met, self.depth),
-            block: lanes.if_less(met, self.depth, index, self.block),
+            depth: met.min(self.depth),
+            block: self.depth.greater(met).select(index, self.block),
         }
     }
 
     /// The surfaces that the rays meet.
     #[inline(always)]
-    pub fn surfaces<L: Lanes<F = F>>(self, lanes: L, views: &[LocalView], at: [F; 2]) -> F
-    where
-        F: std::ops::Add<Output = F> + std::ops::Mul<Output = F>,
-    {
-        let blocks = lanes.store(self.block);
+    pub fn surfaces<I: Instructions<Register = R>>(
+        self,
+        lanes: I,
+        views: &[LocalView],
+        at: [Lanes<R>; 2],
+    ) -> Lanes<R> {
+        let blocks = self.block.to_array::<LANES>();
         let mut surfaces = lanes.splat(NO_SURFACE);
-        let mut left = !lanes.equal_bits(self.block, surfaces) & ALL_LANES;
+        let mut left = !self.block.equal(surfaces).bits() & ALL_LANES;
         while left != 0 {
             let block = blocks[left.trailing_zeros() as usize];
             let face = views[block as usize].face(lanes, at, self.depth);
             let surface = lanes.splat(8.0 * block) + face;
             let here = lanes.splat(block);
-            surfaces = lanes.if_equal(self.block, here, surface, surfaces);
-            left &= !lanes.equal_bits(self.block, here);
+            surfaces = self.block.equal(here).select(surface, surfaces);
+            left &= !self.block.equal(here).bits();
         }
         surfaces
     }

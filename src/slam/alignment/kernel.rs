@@ -1,18 +1,18 @@
-//! The loop over points. `accumulate_kernel` and `scatter_kernel` are the algorithms, once, over any `Lanes`;
+//! The loop over points. `accumulate_kernel` and `scatter_kernel` are the algorithms, once, over any instructions;
 //! `residual::accumulate_reference` is the explanation of all.
 
 mod accumulate_kernel;
 mod mode_kernel;
 mod scatter_kernel;
 
-use crate::slam::alignment::kernel::accumulate_kernel::accumulate;
-use crate::slam::alignment::kernel::scatter_kernel::scatter;
+use crate::slam::alignment::kernel::accumulate_kernel::Accumulation;
+use crate::slam::alignment::kernel::scatter_kernel::Scattering;
 use crate::slam::alignment::normal_equations::NormalEquations;
 use crate::slam::alignment::points::LevelPoints;
 use crate::slam::alignment::residual::Evaluation;
 use crate::slam::alignment::scatter::GradientScatter;
 use crate::slam::image::buffer::Image;
-use crate::slam::kernel::{Body, Instructions, Kernel};
+use crate::slam::kernel::Kernel;
 
 impl Kernel {
     /// Sums the normal equations of `points` over `image`, the sums of a pyramid level, whose
@@ -44,40 +44,8 @@ impl Kernel {
     }
 }
 
-/// What the kernels rely on: a projection below the bound of `at` has a right and a lower neighbour.
+/// Whether a projection below the bound of `at` has a right and a lower neighbour.
 fn fits(image: &Image<u16>, at: &Evaluation) -> bool {
     let (right, bottom) = (at.upper_bound[0] as usize, at.upper_bound[1] as usize);
     right < image.width() && bottom < image.height()
-}
-
-struct Accumulation<'a> {
-    points: &'a LevelPoints,
-    image: &'a Image<u16>,
-    at: &'a Evaluation,
-}
-
-impl Body for Accumulation<'_> {
-    type Output = NormalEquations;
-
-    #[inline(always)]
-    fn run<I: Instructions>(self, _: I) -> NormalEquations {
-        // SAFETY: who made the instructions vouched for them; `accumulate` above has checked the bounds.
-        unsafe { accumulate::<I::Lanes>(self.points, self.image, self.at) }
-    }
-}
-
-struct Scattering<'a> {
-    points: &'a LevelPoints,
-    image: &'a Image<u16>,
-    at: &'a Evaluation,
-}
-
-impl Body for Scattering<'_> {
-    type Output = GradientScatter;
-
-    #[inline(always)]
-    fn run<I: Instructions>(self, _: I) -> GradientScatter {
-        // SAFETY: who made the instructions vouched for them; `scatter` above has checked the bounds.
-        unsafe { scatter::<I::Lanes>(self.points, self.image, self.at) }
-    }
 }

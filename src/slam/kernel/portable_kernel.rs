@@ -1,128 +1,91 @@
-//! Four lanes of plain arithmetic: the same bits on every CPU.
+//! Lanes of plain arithmetic: the same bits on every CPU.
 
-use crate::slam::kernel::lanes_kernel::{Lanes, Sample};
+use std::array::from_fn;
 
-/// Four floats.
-#[derive(Clone, Copy)]
+use crate::slam::kernel::lanes_kernel::{EXPONENT, Register, intrinsics};
+
+/// Some floats.
+#[derive(Debug, Clone, Copy)]
 #[repr(C, align(16))]
-pub struct FourLanes([f32; 4]);
+pub struct Numbers<const N: usize>([f32; N]);
 
-impl FourLanes {
+impl<const N: usize> Numbers<N> {
     #[inline(always)]
     fn zip(self, other: Self, operation: impl Fn(f32, f32) -> f32) -> Self {
-        Self(std::array::from_fn(|lane| operation(self.0[lane], other.0[lane])))
+        Self(from_fn(|lane| operation(self.0[lane], other.0[lane])))
     }
 
     #[inline(always)]
-    fn compare(self, other: Self, operation: impl Fn(f32, f32) -> bool) -> [bool; 4] {
-        std::array::from_fn(|lane| operation(self.0[lane], other.0[lane]))
+    fn compare(self, other: Self, operation: impl Fn(f32, f32) -> bool) -> [bool; N] {
+        from_fn(|lane| operation(self.0[lane], other.0[lane]))
+    }
+
+    #[inline(always)]
+    fn pairs<Number>(table: &[Number], index: [i32; N], last: u32) -> [Self; 2]
+    where
+        Number: Copy + Into<f32>,
+    {
+        [0, 1].map(|k| Self(index.map(|i| table[(i as u32).min(last) as usize + k].into())))
     }
 }
 
-// SAFETY of every function: plain arithmetic; `load` and `store` get pointers to four floats.
-impl Lanes for FourLanes {
-    const N: usize = 4;
-    type Mask = [bool; 4];
+impl<const N: usize> Register for Numbers<N> {
+    const N: usize = N;
+    type Mask = [bool; N];
+    type Whole = [i32; N];
 
-    #[inline(always)]
-    unsafe fn splat(value: f32) -> Self {
-        Self([value; 4])
-    }
-    #[inline(always)]
-    unsafe fn load(from: *const f32) -> Self {
-        // SAFETY: the caller points to four floats.
-        Self(unsafe { from.cast::<[f32; 4]>().read_unaligned() })
-    }
-    #[inline(always)]
-    unsafe fn store(self, to: *mut f32) {
-        // SAFETY: the caller points to four floats.
-        unsafe { to.cast::<[f32; 4]>().write_unaligned(self.0) }
-    }
-    #[inline(always)]
-    unsafe fn add(self, other: Self) -> Self {
-        self.zip(other, |a, b| a + b)
-    }
-    #[inline(always)]
-    unsafe fn sub(self, other: Self) -> Self {
-        self.zip(other, |a, b| a - b)
-    }
-    #[inline(always)]
-    unsafe fn mul(self, other: Self) -> Self {
-        self.zip(other, |a, b| a * b)
-    }
-    #[inline(always)]
-    unsafe fn div(self, other: Self) -> Self {
-        self.zip(other, |a, b| a / b)
-    }
-    #[inline(always)]
-    unsafe fn sqrt(self) -> Self {
-        Self(self.0.map(f32::sqrt))
-    }
-    #[inline(always)]
-    unsafe fn min(self, other: Self) -> Self {
-        self.zip(other, |a, b| if a < b { a } else { b })
-    }
-    #[inline(always)]
-    unsafe fn max(self, other: Self) -> Self {
-        self.zip(other, |a, b| if a > b { a } else { b })
-    }
-    #[inline(always)]
-    unsafe fn mul_add(self, factor: Self, summand: Self) -> Self {
+    intrinsics! {
+        splat(value: f32) -> Self = Self([value; N]);
+        load(from: *const f32) -> Self = Self(from.cast::<[f32; N]>().read_unaligned());
+        store(self: Self, to: *mut f32) -> () = to.cast::<[f32; N]>().write_unaligned(self.0);
+        add(self: Self, other: Self) -> Self = self.zip(other, |a, b| a + b);
+        sub(self: Self, other: Self) -> Self = self.zip(other, |a, b| a - b);
+        mul(self: Self, other: Self) -> Self = self.zip(other, |a, b| a * b);
+        div(self: Self, other: Self) -> Self = self.zip(other, |a, b| a / b);
+        sqrt(self: Self) -> Self = Self(self.0.map(f32::sqrt));
+        abs(self: Self) -> Self = Self(self.0.map(f32::abs));
+        floor(self: Self) -> Self = Self(self.0.map(floor));
+        power_of_two_below(self: Self) -> Self =
+            Self(self.0.map(|x| f32::from_bits(x.to_bits() & EXPONENT.to_bits())));
+        min(self: Self, other: Self) -> Self = self.zip(other, |a, b| if a < b { a } else { b });
+        max(self: Self, other: Self) -> Self = self.zip(other, |a, b| if a > b { a } else { b });
         // Not fused: a CPU without the instruction would emulate it, and the bits must not differ.
-        Self(std::array::from_fn(|lane| self.0[lane] * factor.0[lane] + summand.0[lane]))
+        mul_add(self: Self, factor: Self, summand: Self) -> Self =
+            Self(from_fn(|lane| self.0[lane] * factor.0[lane] + summand.0[lane]));
+        greater(self: Self, other: Self) -> [bool; N] = self.compare(other, |a, b| a > b);
+        at_least(self: Self, other: Self) -> [bool; N] = self.compare(other, |a, b| a >= b);
+        equal(self: Self, other: Self) -> [bool; N] = self.compare(other, |a, b| a == b);
+        both(one: [bool; N], other: [bool; N]) -> [bool; N] = from_fn(|lane| one[lane] & other[lane]);
+        select(mask: [bool; N], yes: Self, no: Self) -> Self =
+            Self(from_fn(|lane| if mask[lane] { yes.0[lane] } else { no.0[lane] }));
+        bits(mask: [bool; N]) -> u32 =
+            (0..N).fold(0, |bits, lane| bits | u32::from(mask[lane]) << lane);
+        truncate(self: Self) -> [i32; N] = self.0.map(truncate);
+        float(whole: [i32; N]) -> Self = Self(whole.map(|x| x as f32));
+        index(column: [i32; N], row: [i32; N], stride: i32) -> [i32; N] =
+            from_fn(|lane| row[lane].wrapping_mul(stride).wrapping_add(column[lane]));
+        pairs(table: &[u16], index: [i32; N], last: u32) -> [Self; 2] = Self::pairs(table, index, last);
+        byte_pairs(table: &[u8], index: [i32; N], last: u32) -> [Self; 2] =
+            Self::pairs(table, index, last);
     }
-    #[inline(always)]
-    unsafe fn greater(self, other: Self) -> [bool; 4] {
-        self.compare(other, |a, b| a > b)
+}
+
+/// Without the call that the baseline instruction set needs for it.
+#[inline(always)]
+fn floor(x: f32) -> f32 {
+    /// From here on all numbers are whole.
+    const WHOLE: f32 = 8_388_608.0;
+    // NaN stays too.
+    if !(x.abs() < WHOLE) {
+        return x;
     }
-    #[inline(always)]
-    unsafe fn at_least(self, other: Self) -> [bool; 4] {
-        self.compare(other, |a, b| a >= b)
-    }
-    #[inline(always)]
-    unsafe fn both(one: [bool; 4], other: [bool; 4]) -> [bool; 4] {
-        std::array::from_fn(|lane| one[lane] & other[lane])
-    }
-    #[inline(always)]
-    unsafe fn select(mask: [bool; 4], yes: Self, no: Self) -> Self {
-        Self(std::array::from_fn(|lane| if mask[lane] { yes.0[lane] } else { no.0[lane] }))
-    }
-    #[inline(always)]
-    unsafe fn count(mask: [bool; 4]) -> u32 {
-        mask.iter().map(|&set| u32::from(set)).sum()
-    }
-    #[inline(always)]
-    unsafe fn sample(image: &[u16], stride: usize, u: Self, v: Self) -> Sample<Self> {
-        let mut pixels = [[0.0f32; 4]; 6];
-        for lane in 0..4 {
-            let (column, row) = (u.0[lane] as usize, v.0[lane] as usize);
-            let upper = column + row * stride;
-            pixels[0][lane] = f32::from(image[upper]);
-            pixels[1][lane] = f32::from(image[upper + 1]);
-            pixels[2][lane] = f32::from(image[upper + stride]);
-            pixels[3][lane] = f32::from(image[upper + stride + 1]);
-            pixels[4][lane] = u.0[lane] - column as f32;
-            pixels[5][lane] = v.0[lane] - row as f32;
-        }
-        let [upper_left, upper_right, lower_left, lower_right, du, dv] = pixels.map(Self);
-        Sample { upper_left, upper_right, lower_left, lower_right, du, dv }
-    }
-    #[inline(always)]
-    unsafe fn sample_bytes(image: &[u8], stride: usize, u: Self, v: Self) -> Sample<Self> {
-        let last = image.len() - stride - 4;
-        let mut pixels = [[0.0f32; 4]; 6];
-        for lane in 0..4 {
-            let (column, row) = (u.0[lane] as i32, v.0[lane] as i32);
-            let index = row.wrapping_mul(stride as i32).wrapping_add(column);
-            let upper = (index as u32 as usize).min(last);
-            pixels[0][lane] = f32::from(image[upper]);
-            pixels[1][lane] = f32::from(image[upper + 1]);
-            pixels[2][lane] = f32::from(image[upper + stride]);
-            pixels[3][lane] = f32::from(image[upper + stride + 1]);
-            pixels[4][lane] = u.0[lane] - column as f32;
-            pixels[5][lane] = v.0[lane] - row as f32;
-        }
-        let [upper_left, upper_right, lower_left, lower_right, du, dv] = pixels.map(Self);
-        Sample { upper_left, upper_right, lower_left, lower_right, du, dv }
-    }
+    let towards_zero = x as i32 as f32;
+    let below = if towards_zero > x { towards_zero - 1.0 } else { towards_zero };
+    below.copysign(x)
+}
+
+/// As vector instructions do it, where plain Rust would give the nearest i32, and 0 for NaN.
+#[inline(always)]
+fn truncate(x: f32) -> i32 {
+    if x.abs() < -(i32::MIN as f32) { x as i32 } else { i32::MIN }
 }

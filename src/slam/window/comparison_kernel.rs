@@ -3,8 +3,8 @@
 //! Nothing is summed across lanes and nothing is fused, so that all instruction sets give the same bits.
 
 use crate::slam::image::shared::SharedImage;
-use crate::slam::kernel::lanes_kernel::Lanes;
-use crate::slam::kernel::{Body, Instructions, Kernel};
+use crate::slam::kernel::lanes_kernel::{Lanes, Mask, Register};
+use crate::slam::kernel::{Body, Floats, Instructions, Kernel};
 use crate::slam::window::comparison::{
     BORDER_PX, Compared, LANES, Lane, POSE, Pair, PairSums, Patterns, Robustness, SAMPLES, fits,
 };
@@ -46,36 +46,18 @@ impl Body for Comparison<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn run<I: Instructions>(self, _: I) {
+    fn run<I: Instructions>(self, lanes: I) {
         let Self { image, pair, patterns, robustness, compared, sums } = self;
-        // SAFETY: who made the instructions vouched for them; `compare` above has checked the bounds.
-        unsafe { compare::<I::Lanes>(image, pair, patterns, robustness, compared, sums) }
-    }
-}
-
-/// # Safety
-/// The processor has the instructions of `L`; the image is as large as the pair's camera says.
-#[inline(always)]
-unsafe fn compare<L: Lanes>(
-    image: &SharedImage,
-    pair: &Pair,
-    patterns: &[Patterns],
-    robustness: &Robustness,
-    compared: &mut [Compared],
-    sums: &mut PairSums,
-) {
-    // SAFETY: this function's own contract; `lane` + N is at most sixteen.
-    unsafe {
         for (of, out) in patterns.iter().zip(compared) {
-            for lane in (0..LANES).step_by(L::N) {
-                let warped = warp::<L>(of, lane, pair, image);
-                let seen = weigh::<L>(of, lane, &warped, robustness, &mut out.cost);
-                let motion = Motion::of(pair, &warped);
+            for lane in (0..LANES).step_by(I::N) {
+                let warped = warp(lanes, of, lane, pair, image);
+                let seen = weigh(lanes, of, lane, &warped, robustness, &mut out.cost);
+                let motion = Motion::of(lanes, pair, &warped);
                 if pair.wanted.depths {
-                    derive_depths(lane, pair, &motion, &seen, out);
+                    derive_depths(lanes, lane, pair, &motion, &seen, out);
                 }
                 if pair.wanted.poses {
-                    derive_poses(lane, &motion, &seen, sums);
+                    derive_poses(lanes, lane, &motion, &seen, sums);
                 }
             }
         }
@@ -83,316 +65,249 @@ unsafe fn compare<L: Lanes>(
 }
 
 /// Some points in the observer's image.
-struct Warped<L: Lanes> {
+struct Warped<R: Register> {
     /// All samples are inside the image.
-    inside: L::Mask,
+    inside: Mask<R>,
     /// X' over its depth.
-    x: L,
-    y: L,
+    x: Lanes<R>,
+    y: Lanes<R>,
     /// Inverse depth in the observer over that in the host.
-    nearness: L,
-    inverse_depth: L,
-    observed: [L; SAMPLES],
-    gradient_u: [L; SAMPLES],
-    gradient_v: [L; SAMPLES],
+    nearness: Lanes<R>,
+    inverse_depth: Lanes<R>,
+    observed: [Lanes<R>; SAMPLES],
+    gradient_u: [Lanes<R>; SAMPLES],
+    gradient_v: [Lanes<R>; SAMPLES],
 }
 
 /// What the samples of some points sum to.
-struct Weighed<L> {
+struct Weighed<R> {
     /// M.
-    uu: L,
-    uv: L,
-    vv: L,
+    uu: Lanes<R>,
+    uv: Lanes<R>,
+    vv: Lanes<R>,
     /// b.
-    right_u: L,
-    right_v: L,
+    right_u: Lanes<R>,
+    right_v: Lanes<R>,
 }
 
-/// # Safety
-/// As [`compare`].
 #[inline(always)]
-unsafe fn warp<L: Lanes>(
+fn warp<I: Instructions>(
+    lanes: I,
     of: &Patterns,
     lane: usize,
     pair: &Pair,
     image: &SharedImage,
-) -> Warped<L> {
-    // SAFETY: this function's own contract.
-    unsafe {
-        let (zero, one) = (L::splat(0.0), L::splat(1.0));
-        let depth = load::<L>(&of.inverse_depth, lane);
-        let ray = [load::<L>(&of.ray[0], lane), load::<L>(&of.ray[1], lane)];
-        let c0 = turned::<L>(pair, 0, ray, depth);
-        let c1 = turned::<L>(pair, 1, ray, depth);
-        let c2 = turned::<L>(pair, 2, ray, depth);
-        let mut inside = c2.at_least(L::splat(MIN_DEPTH_RATIO));
-        let nearness = one.div(L::select(inside, c2, one));
-        let (fx, fy) = (L::splat(pair.focal[0]), L::splat(pair.focal[1]));
-        let (cx, cy) = (L::splat(pair.centre[0]), L::splat(pair.centre[1]));
-        let first = L::splat(BORDER_PX);
-        let (last_u, last_v) = (L::splat(pair.last[0]), L::splat(pair.last[1]));
-        let mut positions = [(zero, zero); SAMPLES];
-        for k in 0..SAMPLES {
-            // 1/(z + o) = n / (1 + e), e = o n, a hundredth at most: exact to e³.
-            let e = nearness.mul(L::splat(-pair.offsets[2][k]));
-            let near = nearness.add(nearness.mul(e.add(e.mul(e))));
-            let u = fx.mul(c0.add(L::splat(pair.offsets[0][k])).mul(near)).add(cx);
-            let v = fy.mul(c1.add(L::splat(pair.offsets[1][k])).mul(near)).add(cy);
-            inside = L::both(inside, L::both(u.at_least(first), last_u.at_least(u)));
-            inside = L::both(inside, L::both(v.at_least(first), last_v.at_least(v)));
-            positions[k] = (u, v);
-        }
-        let (mut observed, mut gradient_u, mut gradient_v) =
-            ([zero; SAMPLES], [zero; SAMPLES], [zero; SAMPLES]);
-        for k in 0..SAMPLES {
-            let (u, v) = positions[k];
-            let at = L::sample_bytes(image.pixels(), image.width(), u, v);
-            let upper = at.upper_right.sub(at.upper_left);
-            let lower = at.lower_right.sub(at.lower_left);
-            let top = at.upper_left.add(at.du.mul(upper));
-            let bottom = at.lower_left.add(at.du.mul(lower));
-            gradient_v[k] = bottom.sub(top);
-            observed[k] = top.add(at.dv.mul(gradient_v[k]));
-            gradient_u[k] = upper.add(at.dv.mul(lower.sub(upper)));
-        }
-        // Elsewhere harmless numbers: 0 · NaN would be NaN.
-        Warped {
-            inside,
-            x: L::select(inside, c0.mul(nearness), zero),
-            y: L::select(inside, c1.mul(nearness), zero),
-            nearness: L::select(inside, nearness, zero),
-            inverse_depth: L::select(inside, depth, zero),
-            observed,
-            gradient_u,
-            gradient_v,
-        }
+) -> Warped<I::Register> {
+    let (zero, one) = (lanes.splat(0.0), lanes.splat(1.0));
+    let depth = lanes.load(&of.inverse_depth[lane..]);
+    let ray = [lanes.load(&of.ray[0][lane..]), lanes.load(&of.ray[1][lane..])];
+    let c0 = turned(lanes, pair, 0, ray, depth);
+    let c1 = turned(lanes, pair, 1, ray, depth);
+    let c2 = turned(lanes, pair, 2, ray, depth);
+    let mut inside = c2.at_least(lanes.splat(MIN_DEPTH_RATIO));
+    let nearness = one / inside.select(c2, one);
+    let (fx, fy) = (lanes.splat(pair.focal[0]), lanes.splat(pair.focal[1]));
+    let (cx, cy) = (lanes.splat(pair.centre[0]), lanes.splat(pair.centre[1]));
+    let first = lanes.splat(BORDER_PX);
+    let (last_u, last_v) = (lanes.splat(pair.last[0]), lanes.splat(pair.last[1]));
+    let mut positions = [(zero, zero); SAMPLES];
+    for k in 0..SAMPLES {
+        // 1/(z + o) = n / (1 + e), e = o n, a hundredth at most: exact to e³.
+        let e = nearness * lanes.splat(-pair.offsets[2][k]);
+        let near = nearness + nearness * (e + e * e);
+        let u = fx * ((c0 + lanes.splat(pair.offsets[0][k])) * near) + cx;
+        let v = fy * ((c1 + lanes.splat(pair.offsets[1][k])) * near) + cy;
+        inside = inside & u.at_least(first) & last_u.at_least(u);
+        inside = inside & v.at_least(first) & last_v.at_least(v);
+        positions[k] = (u, v);
+    }
+    let [mut observed, mut gradient_u, mut gradient_v] = [[zero; SAMPLES]; 3];
+    for k in 0..SAMPLES {
+        let (u, v) = positions[k];
+        let at = Lanes::sample(image.pixels(), image.width(), u, v);
+        let upper = at.upper_right - at.upper_left;
+        let lower = at.lower_right - at.lower_left;
+        let top = at.upper_left + at.du * upper;
+        let bottom = at.lower_left + at.du * lower;
+        gradient_v[k] = bottom - top;
+        observed[k] = top + at.dv * gradient_v[k];
+        gradient_u[k] = upper + at.dv * (lower - upper);
+    }
+    // Elsewhere harmless numbers: 0 · NaN would be NaN.
+    Warped {
+        inside,
+        x: inside.select(c0 * nearness, zero),
+        y: inside.select(c1 * nearness, zero),
+        nearness: inside.select(nearness, zero),
+        inverse_depth: inside.select(depth, zero),
+        observed,
+        gradient_u,
+        gradient_v,
     }
 }
 
 /// A coordinate of X' d at the pattern's centre.
-///
-/// # Safety
-/// As [`compare`].
 #[inline(always)]
-unsafe fn turned<L: Lanes>(pair: &Pair, row: usize, ray: [L; 2], depth: L) -> L {
-    let ([a, b, c], t) = (pair.rotation[row], pair.translation[row]);
-    // SAFETY: this function's own contract.
-    unsafe {
-        let turned = L::splat(a).mul(ray[0]).add(L::splat(b).mul(ray[1])).add(L::splat(c));
-        turned.add(depth.mul(L::splat(t)))
-    }
+fn turned<I: Instructions>(
+    lanes: I,
+    pair: &Pair,
+    row: usize,
+    ray: [Floats<I>; 2],
+    depth: Floats<I>,
+) -> Floats<I> {
+    let [a, b, c] = pair.rotation[row].map(|x| lanes.splat(x));
+    a * ray[0] + b * ray[1] + c + depth * lanes.splat(pair.translation[row])
 }
 
-/// # Safety
-/// As [`compare`].
 #[inline(always)]
-unsafe fn weigh<L: Lanes>(
+fn weigh<I: Instructions>(
+    lanes: I,
     of: &Patterns,
     lane: usize,
-    warped: &Warped<L>,
+    warped: &Warped<I::Register>,
     robustness: &Robustness,
     costs: &mut Lane,
-) -> Weighed<L> {
-    // SAFETY: this function's own contract.
-    unsafe {
-        let (zero, two) = (L::splat(0.0), L::splat(2.0));
-        let largest = L::splat(robustness.huber_grey);
-        let observed_mean = mean::<L>(&warped.observed);
-        let (mean_u, mean_v) = (mean::<L>(&warped.gradient_u), mean::<L>(&warped.gradient_v));
-        let mut energy = zero;
-        let (mut uu, mut uv, mut vv) = (zero, zero, zero);
-        let (mut right_u, mut right_v) = (zero, zero);
-        for k in 0..SAMPLES {
-            let shape = load::<L>(&of.shape[k], lane);
-            let residual = warped.observed[k].sub(observed_mean.mul(shape));
-            let size = residual.max(zero.sub(residual));
-            let huber = largest.div(size.max(largest));
-            let weight = load::<L>(&of.weight[k], lane).mul(huber);
-            let weighted = weight.mul(residual);
-            energy = energy.add(weighted.mul(residual).mul(two.sub(huber)));
-            let u = warped.gradient_u[k].sub(shape.mul(mean_u));
-            let v = warped.gradient_v[k].sub(shape.mul(mean_v));
-            let along = weight.mul(u);
-            uu = uu.add(along.mul(u));
-            uv = uv.add(along.mul(v));
-            vv = vv.add(weight.mul(v).mul(v));
-            right_u = right_u.add(weighted.mul(u));
-            right_v = right_v.add(weighted.mul(v));
-        }
-        let same = L::both(warped.inside, L::splat(robustness.most_energy).at_least(energy));
-        let cost = L::select(same, energy, L::splat(f32::INFINITY));
-        store(L::select(warped.inside, cost, L::splat(f32::NAN)), costs, lane);
-        Weighed {
-            uu: L::select(same, uu, zero),
-            uv: L::select(same, uv, zero),
-            vv: L::select(same, vv, zero),
-            right_u: L::select(same, right_u, zero),
-            right_v: L::select(same, right_v, zero),
-        }
+) -> Weighed<I::Register> {
+    let (zero, two) = (lanes.splat(0.0), lanes.splat(2.0));
+    let largest = lanes.splat(robustness.huber_grey);
+    let observed_mean = mean(lanes, &warped.observed);
+    let (mean_u, mean_v) = (mean(lanes, &warped.gradient_u), mean(lanes, &warped.gradient_v));
+    let mut energy = zero;
+    let (mut uu, mut uv, mut vv) = (zero, zero, zero);
+    let (mut right_u, mut right_v) = (zero, zero);
+    for k in 0..SAMPLES {
+        let shape = lanes.load(&of.shape[k][lane..]);
+        let residual = warped.observed[k] - observed_mean * shape;
+        let size = residual.max(zero - residual);
+        let huber = largest / size.max(largest);
+        let weight = lanes.load(&of.weight[k][lane..]) * huber;
+        let weighted = weight * residual;
+        energy = energy + weighted * residual * (two - huber);
+        let u = warped.gradient_u[k] - shape * mean_u;
+        let v = warped.gradient_v[k] - shape * mean_v;
+        let along = weight * u;
+        uu = uu + along * u;
+        uv = uv + along * v;
+        vv = vv + weight * v * v;
+        right_u = right_u + weighted * u;
+        right_v = right_v + weighted * v;
+    }
+    let same = warped.inside & lanes.splat(robustness.most_energy).at_least(energy);
+    let cost = same.select(energy, lanes.splat(f32::INFINITY));
+    warped.inside.select(cost, lanes.splat(f32::NAN)).store(&mut costs[lane..]);
+    Weighed {
+        uu: same.select(uu, zero),
+        uv: same.select(uv, zero),
+        vv: same.select(vv, zero),
+        right_u: same.select(right_u, zero),
+        right_v: same.select(right_v, zero),
     }
 }
 
-/// # Safety
-/// As [`compare`].
 #[inline(always)]
-unsafe fn mean<L: Lanes>(of: &[L; SAMPLES]) -> L {
-    // SAFETY: this function's own contract.
-    unsafe {
-        let even = of[0].add(of[4]).add(of[2].add(of[6]));
-        let odd = of[1].add(of[5]).add(of[3].add(of[7]));
-        even.add(odd).mul(L::splat(1.0 / SAMPLES as f32))
-    }
+fn mean<I: Instructions>(lanes: I, of: &[Floats<I>; SAMPLES]) -> Floats<I> {
+    let even = of[0] + of[4] + (of[2] + of[6]);
+    let odd = of[1] + of[5] + (of[3] + of[7]);
+    (even + odd) * lanes.splat(1.0 / SAMPLES as f32)
 }
 
 /// ∂π/∂p and ∂π/∂d at the pattern's centre, column and row of the image.
-struct Motion<L> {
-    u: [L; POSE],
-    v: [L; POSE],
-    depth_u: L,
-    depth_v: L,
+struct Motion<R> {
+    u: [Lanes<R>; POSE],
+    v: [Lanes<R>; POSE],
+    depth_u: Lanes<R>,
+    depth_v: Lanes<R>,
 }
 
-impl<L: Lanes> Motion<L> {
-    /// # Safety
-    /// As [`compare`].
+impl<R: Register> Motion<R> {
     #[inline(always)]
-    unsafe fn of(pair: &Pair, warped: &Warped<L>) -> Self {
-        // SAFETY: this function's own contract.
-        unsafe {
-            let (zero, one) = (L::splat(0.0), L::splat(1.0));
-            let (fx, fy) = (L::splat(pair.focal[0]), L::splat(pair.focal[1]));
-            let [tx, ty, tz] = pair.translation;
-            let (x, y, depth) = (warped.x, warped.y, warped.inverse_depth);
-            let (along_u, along_v) = (fx.mul(warped.nearness), fy.mul(warped.nearness));
-            let (moved_u, moved_v) = (depth.mul(along_u), depth.mul(along_v));
-            let both = x.mul(y);
-            let u = [
-                moved_u,
-                zero,
-                zero.sub(moved_u.mul(x)),
-                zero.sub(fx.mul(both)),
-                fx.mul(one.add(x.mul(x))),
-                zero.sub(fx.mul(y)),
-            ];
-            let v = [
-                zero,
-                moved_v,
-                zero.sub(moved_v.mul(y)),
-                zero.sub(fy.mul(one.add(y.mul(y)))),
-                fy.mul(both),
-                fy.mul(x),
-            ];
-            let depth_u = along_u.mul(L::splat(tx).sub(x.mul(L::splat(tz))));
-            let depth_v = along_v.mul(L::splat(ty).sub(y.mul(L::splat(tz))));
-            Self { u, v, depth_u, depth_v }
-        }
+    fn of<I: Instructions<Register = R>>(lanes: I, pair: &Pair, warped: &Warped<R>) -> Self {
+        let (zero, one) = (lanes.splat(0.0), lanes.splat(1.0));
+        let (fx, fy) = (lanes.splat(pair.focal[0]), lanes.splat(pair.focal[1]));
+        let [tx, ty, tz] = pair.translation.map(|x| lanes.splat(x));
+        let (x, y, depth) = (warped.x, warped.y, warped.inverse_depth);
+        let (along_u, along_v) = (fx * warped.nearness, fy * warped.nearness);
+        let (moved_u, moved_v) = (depth * along_u, depth * along_v);
+        let both = x * y;
+        let u = [
+            moved_u,
+            zero,
+            zero - moved_u * x,
+            zero - fx * both,
+            fx * (one + x * x),
+            zero - fx * y,
+        ];
+        let v = [zero, moved_v, zero - moved_v * y, zero - fy * (one + y * y), fy * both, fy * x];
+        Self { u, v, depth_u: along_u * (tx - x * tz), depth_v: along_v * (ty - y * tz) }
     }
 
     /// A row of (∂π/∂p)ᵀ times (a, b).
-    ///
-    /// # Safety
-    /// As [`compare`].
     #[inline(always)]
-    unsafe fn along(&self, row: usize, a: L, b: L) -> L {
-        // SAFETY: this function's own contract.
-        unsafe {
-            match row {
-                0 => self.u[0].mul(a),
-                1 => self.v[1].mul(b),
-                _ => self.u[row].mul(a).add(self.v[row].mul(b)),
-            }
+    fn along(&self, row: usize, a: Lanes<R>, b: Lanes<R>) -> Lanes<R> {
+        match row {
+            0 => self.u[0] * a,
+            1 => self.v[1] * b,
+            _ => self.u[row] * a + self.v[row] * b,
         }
     }
 }
 
 /// The sums of the points.
-///
-/// # Safety
-/// As [`compare`].
 #[inline(always)]
-unsafe fn derive_depths<L: Lanes>(
+fn derive_depths<I: Instructions>(
+    lanes: I,
     lane: usize,
     pair: &Pair,
-    motion: &Motion<L>,
-    weighed: &Weighed<L>,
+    motion: &Motion<I::Register>,
+    weighed: &Weighed<I::Register>,
     out: &mut Compared,
 ) {
-    // SAFETY: this function's own contract.
-    unsafe {
-        let (u, v) = (motion.depth_u, motion.depth_v);
-        let a = weighed.uu.mul(u).add(weighed.uv.mul(v));
-        let b = weighed.uv.mul(u).add(weighed.vv.mul(v));
-        store(u.mul(a).add(v.mul(b)), &mut out.depth, lane);
-        store(u.mul(weighed.right_u).add(v.mul(weighed.right_v)), &mut out.depth_right, lane);
-        if !pair.wanted.poses {
-            return;
-        }
-        let mut mixed = [L::splat(0.0); POSE];
-        for row in 0..POSE {
-            mixed[row] = motion.along(row, a, b);
-            store(mixed[row], &mut out.observer[row], lane);
-        }
-        if pair.wanted.host {
-            for column in 0..POSE {
-                let mut carried = L::splat(0.0);
-                for row in 0..POSE {
-                    carried = carried.add(L::splat(pair.by_host[row][column]).mul(mixed[row]));
-                }
-                store(carried, &mut out.host[column], lane);
+    let (u, v) = (motion.depth_u, motion.depth_v);
+    let a = weighed.uu * u + weighed.uv * v;
+    let b = weighed.uv * u + weighed.vv * v;
+    (u * a + v * b).store(&mut out.depth[lane..]);
+    (u * weighed.right_u + v * weighed.right_v).store(&mut out.depth_right[lane..]);
+    if !pair.wanted.poses {
+        return;
+    }
+    let mut mixed = [lanes.splat(0.0); POSE];
+    for row in 0..POSE {
+        mixed[row] = motion.along(row, a, b);
+        mixed[row].store(&mut out.observer[row][lane..]);
+    }
+    if pair.wanted.host {
+        for column in 0..POSE {
+            let mut carried = lanes.splat(0.0);
+            for row in 0..POSE {
+                carried = carried + lanes.splat(pair.by_host[row][column]) * mixed[row];
             }
+            carried.store(&mut out.host[column][lane..]);
         }
     }
 }
 
 /// The sums of the pair.
-///
-/// # Safety
-/// As [`compare`].
 #[inline(always)]
-unsafe fn derive_poses<L: Lanes>(
+fn derive_poses<I: Instructions>(
+    lanes: I,
     lane: usize,
-    motion: &Motion<L>,
-    weighed: &Weighed<L>,
+    motion: &Motion<I::Register>,
+    weighed: &Weighed<I::Register>,
     sums: &mut PairSums,
 ) {
-    // SAFETY: this function's own contract.
-    unsafe {
-        let mut entry = 0;
-        for row in 0..POSE {
-            // A column of M ∂π/∂p.
-            let (u, v) = (motion.u[row], motion.v[row]);
-            let a = weighed.uu.mul(u).add(weighed.uv.mul(v));
-            let b = weighed.uv.mul(u).add(weighed.vv.mul(v));
-            for column in row..POSE {
-                add(motion.along(column, a, b), &mut sums.pose[entry], lane);
-                entry += 1;
-            }
-            let right = motion.along(row, weighed.right_u, weighed.right_v);
-            add(right, &mut sums.right[row], lane);
+    let add = |value: Floats<I>, to: &mut Lane| {
+        (lanes.load(&to[lane..]) + value).store(&mut to[lane..]);
+    };
+    let mut entry = 0;
+    for row in 0..POSE {
+        // A column of M ∂π/∂p.
+        let (u, v) = (motion.u[row], motion.v[row]);
+        let a = weighed.uu * u + weighed.uv * v;
+        let b = weighed.uv * u + weighed.vv * v;
+        for column in row..POSE {
+            add(motion.along(column, a, b), &mut sums.pose[entry]);
+            entry += 1;
         }
+        add(motion.along(row, weighed.right_u, weighed.right_v), &mut sums.right[row]);
     }
-}
-
-/// # Safety
-/// As [`compare`]; `lane` + N is at most sixteen.
-#[inline(always)]
-unsafe fn load<L: Lanes>(from: &Lane, lane: usize) -> L {
-    // SAFETY: this function's own contract.
-    unsafe { L::load(from.as_ptr().add(lane)) }
-}
-
-/// # Safety
-/// As [`load`].
-#[inline(always)]
-unsafe fn store<L: Lanes>(value: L, to: &mut Lane, lane: usize) {
-    // SAFETY: this function's own contract.
-    unsafe { value.store(to.as_mut_ptr().add(lane)) }
-}
-
-/// # Safety
-/// As [`load`].
-#[inline(always)]
-unsafe fn add<L: Lanes>(value: L, to: &mut Lane, lane: usize) {
-    // SAFETY: this function's own contract.
-    unsafe { store(load::<L>(to, lane).add(value), to, lane) }
 }

@@ -15,7 +15,7 @@ use crate::slam::alignment::residual::Evaluation;
 use crate::slam::alignment::scatter::{GradientScatter, ScatterSums};
 use crate::slam::alignment::tiles::NUM_TILES;
 use crate::slam::image::buffer::Image;
-use crate::slam::kernel::lanes_kernel::Lanes;
+use crate::slam::kernel::{Body, Floats, Instructions};
 
 /// The columns of the rotations about x and y.
 const ABOUT_X: usize = 3;
@@ -52,104 +52,95 @@ static ONES: [f32; 3 * LANES] = {
     ones
 };
 
-/// # Safety
-/// The CPU has the instructions of `L`; a projection below `at.upper_bound` has a right and a
-/// lower neighbour in `image`.
-#[inline(always)]
-pub unsafe fn scatter<L: Lanes>(
-    points: &LevelPoints,
-    image: &Image<u16>,
-    at: &Evaluation,
-) -> GradientScatter {
-    let mut columns = [Whitened::ZERO; CHUNK_BLOCKS];
-    let mut tiles = [TileSums::ZERO; NUM_TILES];
-    let mut sums = ScatterSums::default();
-    let mut mode_sums = ModeSums::ZERO;
-    let mut logs = points.log_inverse_depths();
-    let mut runs = points.runs();
-    // SAFETY: this function's own contract; all pointers go to blocks of sixteen floats.
-    unsafe {
-        let mut statistics = Statistics::<L>::zero();
-        let mut quadratic = L::splat(0.0);
+/// What `Kernel::scatter` measures.
+pub struct Scattering<'a> {
+    pub points: &'a LevelPoints,
+    pub image: &'a Image<u16>,
+    pub at: &'a Evaluation,
+}
+
+impl Body for Scattering<'_> {
+    type Output = GradientScatter;
+
+    #[inline(always)]
+    fn run<I: Instructions>(self, lanes: I) -> GradientScatter {
+        let Self { points, image, at } = self;
+        let mut columns = [Whitened::ZERO; CHUNK_BLOCKS];
+        let mut tiles = [TileSums::ZERO; NUM_TILES];
+        let mut sums = ScatterSums::default();
+        let mut mode_sums = ModeSums::ZERO;
+        let mut logs = points.log_inverse_depths();
+        let mut runs = points.runs();
+        let mut statistics = Statistics::zero(lanes.splat(0.0));
+        let mut quadratic = lanes.splat(0.0);
         for (chunk, blocks) in points.blocks().chunks(CHUNK_BLOCKS).enumerate() {
             for (block, whitened) in blocks.iter().zip(&mut columns) {
-                for lane in (0..LANES).step_by(L::N) {
-                    whiten::<L>(block, lane, image, at, whitened, &mut statistics);
-                    quadratic = quadratic.add(quadratic_weight::<L>(whitened, lane, at.huber));
+                for lane in (0..LANES).step_by(I::N) {
+                    whiten(lanes, block, lane, image, at, whitened, &mut statistics);
+                    quadratic = quadratic + quadratic_weight(lanes, whitened, lane, at.huber);
                 }
             }
             let (chunk_logs, later_logs) = logs.split_at(blocks.len().min(logs.len()));
             logs = later_logs;
-            add_modes::<L>(blocks, chunk_logs, &columns, at.translation, &mut mode_sums);
+            add_modes(lanes, blocks, chunk_logs, &columns, at.translation, &mut mode_sums);
             let first_block = chunk * CHUNK_BLOCKS;
             let is_here = |run: &TileRun| (run.block as usize) < first_block + blocks.len();
             let (here, rest) = runs.split_at(runs.partition_point(is_here));
             runs = rest;
             for run in here {
                 let Some(tile) = tiles.get_mut(usize::from(run.tile)) else { continue };
-                add_run::<L>(&columns[run.block as usize - first_block], run, tile);
+                add_run(lanes, &columns[run.block as usize - first_block], run, tile);
             }
         }
-        let mut lanes = [0.0; LANES];
-        quadratic.store(lanes.as_mut_ptr());
-        sums.quadratic = total(&lanes);
-    }
-    for (tile, sums) in tiles.iter().zip(&mut sums.tiles) {
-        sums.weight = total(&tile.weight);
-        if sums.weight > 0.0 {
-            sums.gradient = std::array::from_fn(|i| total(&tile.gradient[i]));
-            sums.information = std::array::from_fn(|i| total(&tile.information[i]));
+        sums.quadratic = total(&quadratic.to_array());
+        for (tile, sums) in tiles.iter().zip(&mut sums.tiles) {
+            sums.weight = total(&tile.weight);
+            if sums.weight > 0.0 {
+                sums.gradient = std::array::from_fn(|i| total(&tile.gradient[i]));
+                sums.information = std::array::from_fn(|i| total(&tile.information[i]));
+            }
         }
+        sums.d_gradient_d_modes = mode_sums.total();
+        GradientScatter::from_sums(&sums)
     }
-    sums.d_gradient_d_modes = mode_sums.total();
-    GradientScatter::from_sums(&sums)
 }
 
 /// The weights of the points whose Huber weight is 1.
-///
-/// # Safety
-/// The CPU has the instructions of `L`; `lane` + N is at most sixteen.
 #[inline(always)]
-unsafe fn quadratic_weight<L: Lanes>(whitened: &Whitened, lane: usize, huber: f32) -> L {
-    // SAFETY: this function's own contract.
-    unsafe {
-        let root = L::load(whitened.0[WEIGHT].as_ptr().add(lane));
-        let residual = L::load(whitened.0[RESIDUAL].as_ptr().add(lane));
-        let is_within = L::splat(huber * huber).at_least(residual.mul(residual));
-        L::select(is_within, root.mul(root), L::splat(0.0))
-    }
+fn quadratic_weight<I: Instructions>(
+    lanes: I,
+    whitened: &Whitened,
+    lane: usize,
+    huber: f32,
+) -> Floats<I> {
+    let root = lanes.load(&whitened.0[WEIGHT][lane..]);
+    let residual = lanes.load(&whitened.0[RESIDUAL][lane..]);
+    let is_within = lanes.splat(huber * huber).at_least(residual * residual);
+    is_within.select(root * root, lanes.splat(0.0))
 }
 
 /// Adds the products of the lanes of `run`, whose block is `whitened`.
-///
-/// # Safety
-/// The CPU has the instructions of `L`.
 #[inline(always)]
-unsafe fn add_run<L: Lanes>(whitened: &Whitened, run: &TileRun, tile: &mut TileSums) {
+fn add_run<I: Instructions>(lanes: I, whitened: &Whitened, run: &TileRun, tile: &mut TileSums) {
     let (first, end) = (usize::from(run.first).min(LANES), usize::from(run.end).min(LANES));
-    // SAFETY: this function's own contract; a register begins at a multiple of N below sixteen,
-    // and the ones at most sixteen before or after those of the mask.
-    unsafe {
-        for lane in (first - first % L::N..end).step_by(L::N) {
-            let column = |index: usize| L::load(whitened.0[index].as_ptr().add(lane));
-            // One from the first lane on, and one before the end.
-            let from_first = L::load(ONES.as_ptr().add(LANES + lane - first));
-            let before_end = L::load(ONES.as_ptr().add(2 * LANES + lane - end));
-            let mask = from_first.mul(before_end);
-            let residual = column(RESIDUAL).mul(mask);
-            let root = column(WEIGHT);
-            for (index, sum) in tile.gradient.iter_mut().enumerate() {
-                column(index).mul_add(residual, L::load(sum.as_ptr())).store(sum.as_mut_ptr());
-            }
-            let (about_x, about_y) = (column(ABOUT_X), column(ABOUT_Y));
-            let factors = [(about_x, about_x), (about_x, about_y), (about_y, about_y)];
-            for ((one, other), sum) in factors.into_iter().zip(&mut tile.information) {
-                let one = one.mul(mask);
-                one.mul_add(other, L::load(sum.as_ptr())).store(sum.as_mut_ptr());
-            }
-            let sum = &mut tile.weight;
-            root.mul(mask).mul_add(root, L::load(sum.as_ptr())).store(sum.as_mut_ptr());
+    for lane in (first - first % I::N..end).step_by(I::N) {
+        let column = |index: usize| lanes.load(&whitened.0[index][lane..]);
+        // One from the first lane on, and one before the end.
+        let from_first = lanes.load(&ONES[LANES + lane - first..]);
+        let before_end = lanes.load(&ONES[2 * LANES + lane - end..]);
+        let mask = from_first * before_end;
+        let residual = column(RESIDUAL) * mask;
+        let root = column(WEIGHT);
+        for (index, sum) in tile.gradient.iter_mut().enumerate() {
+            column(index).mul_add(residual, lanes.load(sum)).store(sum);
         }
+        let (about_x, about_y) = (column(ABOUT_X), column(ABOUT_Y));
+        let factors = [(about_x, about_x), (about_x, about_y), (about_y, about_y)];
+        for ((one, other), sum) in factors.into_iter().zip(&mut tile.information) {
+            (one * mask).mul_add(other, lanes.load(sum)).store(sum);
+        }
+        let sum = &mut tile.weight;
+        (root * mask).mul_add(root, lanes.load(sum)).store(sum);
     }
 }
 
