@@ -1,7 +1,7 @@
 //! The search for a patch along a line of a frame: 1-px steps, then Gauss–Newton. Both filters search this way.
 
-use crate::slam::depth::patch_kernel::{PatchSums, huber};
-use crate::slam::depth::pattern::PATTERN;
+use crate::slam::depth::patch_kernel::{huber, slope, sums};
+use crate::slam::depth::pattern::{PATTERN, sum_of_samples};
 use crate::slam::image::quads_kernel::{Sampled, Sampler};
 use crate::slam::kernel::Instructions;
 
@@ -52,9 +52,9 @@ impl<S: Instructions> Along<'_, S> {
         for (begin, costs) in (0..=steps).step_by(LANES).zip(costs.chunks_exact_mut(LANES)) {
             let mut terms = [[f32::INFINITY; 8]; LANES];
             for (step, terms) in (begin..=steps).zip(&mut terms) {
-                *terms = huber(&self.look(first + step as f32), self.intensity);
+                *terms = self.terms(&self.look(first + step as f32));
             }
-            costs.copy_from_slice(&self.frame.sampler.sums(&terms));
+            costs.copy_from_slice(&sums(self.frame.sampler, &terms));
         }
         // What is least of all is looked for afterwards: on the way nobody can guess which step it will be.
         let padded = (steps + 1).next_multiple_of(LANES);
@@ -86,7 +86,7 @@ impl<S: Instructions> Along<'_, S> {
         let (mut lambda, mut cost, mut seen) = (start, best.cost, best.seen);
         for _ in 0..MAX_ITERATIONS {
             let [gradient, information] =
-                self.frame.sampler.slope(&seen, self.intensity, &gradients_at(lambda));
+                slope(self.frame.sampler, &seen, self.intensity, &gradients_at(lambda));
             let step = -gradient / (information + LEAST_INFORMATION);
             let next = (lambda + step.clamp(-MAX_STEP_PX, MAX_STEP_PX))
                 .clamp(start - reach, start + reach);
@@ -125,7 +125,12 @@ impl<S: Instructions> Along<'_, S> {
 
     #[inline(always)]
     fn cost(&self, samples: &[f32; 8]) -> f32 {
-        self.frame.sampler.sum(&huber(samples, self.intensity))
+        sum_of_samples(&self.terms(samples))
+    }
+
+    #[inline(always)]
+    fn terms(&self, samples: &[f32; 8]) -> [f32; 8] {
+        huber(self.frame.sampler, samples, self.intensity)
     }
 }
 
