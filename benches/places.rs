@@ -11,7 +11,7 @@ const QUERIES: usize = 100;
 
 fn main() {
     println!("keyframes: describe, insert, query (median, worst) ms; B a keyframe");
-    let (mut describer, mut index) = (Describer::new(), PlaceIndex::new());
+    let (mut describer, mut index) = (Describer::default(), PlaceIndex::default());
     let mut known: Vec<Description> = Vec::new();
     let [mut describing, mut inserting] = [0.0f64; 2];
     for keyframe in 0..10_000u64 {

@@ -55,7 +55,7 @@ fn micros(began: f64, count: usize) -> f64 {
 fn tree(footage: &Footage, queries: &[Vec<u8>], gap: usize) -> Scores {
     let (width, height) = (footage.camera.width, footage.camera.height);
     let count = footage.frames.len();
-    let (mut describer, mut index) = (Describer::new(), PlaceIndex::new());
+    let (mut describer, mut index) = (Describer::default(), PlaceIndex::default());
     let began = busy_secs();
     let described: Vec<_> =
         footage.frames.iter().map(|f| describer.describe(&f.pixels, width, height)).collect();

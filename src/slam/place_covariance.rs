@@ -35,15 +35,9 @@ const IGNORANCE: [f64; PLACE_ERRORS] = {
 const ROUNDING: f64 = 1e-9;
 
 /// Covariance of the errors (ξ, λ) of a keyframe's place.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct PlaceCovariance {
     upper_triangle: [f64; PLACE_ENTRIES],
-}
-
-impl Default for PlaceCovariance {
-    fn default() -> Self {
-        Self::ZERO
-    }
 }
 
 /// A keyframe's place and how uncertain it is.

@@ -128,7 +128,7 @@ fn read(
     let mut session = Session::new(place.clone(), "zenoh-send", wants);
     let mut frame_rate = Rate::new(options.frames.map_or(1.0, |frames| frames.rate_hz));
     let mut keyframes = Latest::new(options.keyframe_rate_hz);
-    let mut traffic = Traffic::new();
+    let mut traffic = Traffic::default();
     while !shutdown.is_requested() {
         session.read(Some(shutdown.descriptor()), WAKE_PERIOD, |event| {
             to.take(event, &mut frame_rate, &mut keyframes);

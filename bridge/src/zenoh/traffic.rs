@@ -17,12 +17,14 @@ pub struct Traffic {
     dropped: u64,
 }
 
-impl Traffic {
+impl Default for Traffic {
     /// Nothing told yet.
-    pub fn new() -> Self {
+    fn default() -> Self {
         Self { told: Instant::now(), counts: [0; Kind::COUNT], bytes: [0; Kind::COUNT], dropped: 0 }
     }
+}
 
+impl Traffic {
     /// Tells what went since the last line, where that is due.
     pub fn tell(
         &mut self,
@@ -56,11 +58,5 @@ impl Traffic {
             tracing::warn!("the network does not take messages in time; {line}");
         }
         *self = Self { told: Instant::now(), counts, bytes, dropped: sum };
-    }
-}
-
-impl Default for Traffic {
-    fn default() -> Self {
-        Self::new()
     }
 }

@@ -65,11 +65,9 @@ pub struct Normal {
     table: Vec<f32>,
 }
 
-impl Normal {
-    const BITS: u32 = 12;
-
+impl Default for Normal {
     /// Fills the table.
-    pub fn new() -> Self {
+    fn default() -> Self {
         let size = 1usize << Self::BITS;
         let raw: Vec<f64> =
             (0..size).map(|i| normal_quantile((i as f64 + 0.5) / size as f64)).collect();
@@ -78,18 +76,16 @@ impl Normal {
         let scale = (0.5 / variance).sqrt();
         Self { table: raw.iter().map(|q| (q * scale) as f32).collect() }
     }
+}
+
+impl Normal {
+    const BITS: u32 = 12;
 
     /// A standard normal number from the lowest 24 bits of `bits`.
     #[inline]
     pub fn sample(&self, bits: u64) -> f32 {
         const MASK: u64 = (1 << Normal::BITS) - 1;
         self.table[(bits & MASK) as usize] + self.table[(bits >> Self::BITS & MASK) as usize]
-    }
-}
-
-impl Default for Normal {
-    fn default() -> Self {
-        Self::new()
     }
 }
 
@@ -119,7 +115,7 @@ mod tests {
 
     #[test]
     fn normal_numbers_have_the_moments_and_tails_of_a_normal_distribution() {
-        let normal = Normal::new();
+        let normal = Normal::default();
         let samples: Vec<f64> =
             (0..400_000u64).map(|i| f64::from(normal.sample(mix2(7, i)))).collect();
         let n = samples.len() as f64;

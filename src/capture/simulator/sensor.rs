@@ -20,7 +20,12 @@ impl Sensor {
     pub fn new(params: &SensorParams, seed: u64, width: usize, height: usize) -> Self {
         let vignette =
             if params.vignette > 0.0 { vignette(params.vignette, width, height) } else { vec![] };
-        Self { params: params.clone(), seed: mix2(seed, 0x5E50), normal: Normal::new(), vignette }
+        Self {
+            params: params.clone(),
+            seed: mix2(seed, 0x5E50),
+            normal: Normal::default(),
+            vignette,
+        }
     }
 
     /// Gain and offset (grey levels) of the exposure at a time from the start: 1 and 0 at the start.

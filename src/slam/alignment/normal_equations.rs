@@ -9,7 +9,7 @@ use nalgebra::{Matrix6, SMatrix, SVector, Vector6};
 pub const UNKNOWNS: usize = 8;
 
 /// Information, gradient and statistics of the residuals at one state.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Default)]
 pub struct NormalEquations {
     /// Σ w J Jᵀ.
     pub information: SMatrix<f64, UNKNOWNS, UNKNOWNS>,
@@ -25,20 +25,6 @@ pub struct NormalEquations {
     pub compared: u32,
     /// Points compared with |r| below the inlier gate.
     pub inliers: u32,
-}
-
-impl Default for NormalEquations {
-    fn default() -> Self {
-        Self {
-            information: SMatrix::zeros(),
-            gradient: SVector::zeros(),
-            energy: 0.0,
-            squared_residual: 0.0,
-            in_view: 0,
-            compared: 0,
-            inliers: 0,
-        }
-    }
 }
 
 impl NormalEquations {

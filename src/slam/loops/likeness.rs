@@ -111,7 +111,7 @@ mod tests {
         let away = SE3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, 2.6, 0.0));
         for (id, pose) in [(1, SE3::identity()), (5, away), (9, turned)] {
             let image = pixels(&pose);
-            let description = Describer::new().describe(&image, CAMERA.width, CAMERA.height);
+            let description = Describer::default().describe(&image, CAMERA.width, CAMERA.height);
             likeness.offer(&[Keyframe {
                 keyframe_id: id,
                 description: description.map(Arc::new),

@@ -66,7 +66,7 @@ impl Course {
                 ..image
             };
             let Intrinsics { width, height, .. } = keyframe.intrinsics;
-            let description = Describer::new().describe(&keyframe.image, width, height);
+            let description = Describer::default().describe(&keyframe.image, width, height);
             map.keyframes.push(Keyframe { description: description.map(Arc::new), ..keyframe });
             loops.offer(&map.keyframes);
         }

@@ -82,8 +82,8 @@ impl Finder {
             reference: Reference::new(reference),
             scratch: ReferenceScratch::default(),
             appearances: Vec::new(),
-            places: PlaceIndex::new(),
-            describer: Describer::new(),
+            places: PlaceIndex::default(),
+            describer: Describer::default(),
             turned_views: None,
             doubted: None,
         }

@@ -66,7 +66,7 @@ impl Description {
 }
 
 /// Describes images; owns the memory for that.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct Describer {
     pattern: Pattern,
     scales: Vec<Scale>,
@@ -76,25 +76,7 @@ pub struct Describer {
     chosen: Vec<Corner>,
 }
 
-impl Default for Describer {
-    fn default() -> Self {
-        Self::new()
-    }
-}
-
 impl Describer {
-    /// For images of any size.
-    pub fn new() -> Self {
-        Self {
-            pattern: Pattern::new(),
-            scales: Vec::new(),
-            sums: Vec::new(),
-            finder: CornerFinder::default(),
-            corners: Vec::new(),
-            chosen: Vec::new(),
-        }
-    }
-
     /// Of an image, row after row; `None` where it is too small, or shows nothing.
     pub fn describe(&mut self, pixels: &[u8], width: usize, height: usize) -> Option<Description> {
         /// Fewest pixels of a side: of a scale.
@@ -240,7 +222,7 @@ mod tests {
     }
 
     fn described(pixels: &[u8], width: usize, height: usize) -> Description {
-        Describer::new().describe(pixels, width, height).unwrap()
+        Describer::default().describe(pixels, width, height).unwrap()
     }
 
     /// Share of the features of one that another has within a few pixels, turned by so many steps, with few other bits.
@@ -313,7 +295,7 @@ mod tests {
 
     #[test]
     fn what_is_too_small_or_shows_nothing_has_no_description() {
-        let mut describer = Describer::new();
+        let mut describer = Describer::default();
         assert!(describer.describe(&[70; 320 * 240], 320, 240).is_none(), "a wall");
         assert!(describer.describe(&[70; 40 * 40], 40, 40).is_none());
         assert!(describer.describe(&[70; 100], 320, 240).is_none());
@@ -324,10 +306,10 @@ mod tests {
     #[test]
     fn a_describer_gives_the_same_whatever_it_saw_before() {
         let pixels = image();
-        let mut used = Describer::new();
+        let mut used = Describer::default();
         let _other = used.describe(&[9; 640 * 480], 640, 480);
         let _small = used.describe(&pixels[..100 * 100], 100, 100);
         let again = used.describe(&pixels, CAMERA.width, CAMERA.height);
-        assert_eq!(again, Describer::new().describe(&pixels, CAMERA.width, CAMERA.height));
+        assert_eq!(again, Describer::default().describe(&pixels, CAMERA.width, CAMERA.height));
     }
 }

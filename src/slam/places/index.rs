@@ -57,7 +57,7 @@ struct Slot {
 }
 
 /// Keyframes by what they look like.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct PlaceIndex {
     tree: Tree,
     slots: Vec<Slot>,
@@ -65,18 +65,7 @@ pub struct PlaceIndex {
     removed: usize,
 }
 
-impl Default for PlaceIndex {
-    fn default() -> Self {
-        Self::new()
-    }
-}
-
 impl PlaceIndex {
-    /// Without keyframes.
-    pub fn new() -> Self {
-        Self { tree: Tree::new(), slots: Vec::new(), slot_of: BTreeMap::new(), removed: 0 }
-    }
-
     /// Keyframes in it.
     pub fn len(&self) -> usize {
         self.slot_of.len()
@@ -236,7 +225,7 @@ mod tests {
     fn seen(twist: [f64; 6], seed: u64) -> Description {
         let pose = SE3::exp(&Vector6::from(twist));
         let pixels = Scene::new(3).render(&CAMERA, &pose).noisy(2.0, seed);
-        Describer::new().describe(&pixels, CAMERA.width, CAMERA.height).unwrap()
+        Describer::default().describe(&pixels, CAMERA.width, CAMERA.height).unwrap()
     }
 
     fn panned(angle: f64) -> [f64; 6] {
@@ -245,7 +234,7 @@ mod tests {
 
     /// Views all around, 60° apart.
     fn around() -> PlaceIndex {
-        let mut index = PlaceIndex::new();
+        let mut index = PlaceIndex::default();
         for k in 0..6 {
             index.insert(10 + k, &seen(panned(k as f64 * std::f64::consts::FRAC_PI_3), k));
         }
@@ -306,7 +295,7 @@ mod tests {
 
     #[test]
     fn of_equals_the_newest_is_first_and_an_id_is_entered_once() {
-        let mut index = PlaceIndex::new();
+        let mut index = PlaceIndex::default();
         let here = seen([0.0; 6], 1);
         [4, 9, 4].into_iter().for_each(|id| index.insert(id, &here));
         assert_eq!(index.len(), 2);

@@ -16,8 +16,8 @@ pub(super) type Pair = [[i8; 2]; 2];
 #[derive(Debug, Clone)]
 pub(super) struct Pattern(Vec<Pair>);
 
-impl Pattern {
-    pub(super) fn new() -> Self {
+impl Default for Pattern {
+    fn default() -> Self {
         let upright = upright();
         let turned = |k: usize| {
             let (sin, cos) = angle_rad(k).sin_cos();
@@ -28,7 +28,9 @@ impl Pattern {
         };
         Self((0..ORIENTATIONS).flat_map(turned).collect())
     }
+}
 
+impl Pattern {
     /// Those of an orientation.
     pub(super) fn turned(&self, orientation: u8) -> &[Pair] {
         let begin = BITS * (usize::from(orientation) % ORIENTATIONS);

@@ -32,11 +32,13 @@ pub(super) struct Tree {
     nodes: Vec<Node>,
 }
 
-impl Tree {
-    pub(super) fn new() -> Self {
+impl Default for Tree {
+    fn default() -> Self {
         Self { nodes: vec![Node::Leaf(Vec::new())] }
     }
+}
 
+impl Tree {
     /// Enters a descriptor.
     pub(super) fn insert(&mut self, entry: Entry) {
         let at = self.leaf_of(&entry.bits);
@@ -226,7 +228,7 @@ mod tests {
     #[test]
     fn what_was_entered_is_found_among_few() {
         let mut random = Random::new(1);
-        let mut tree = Tree::new();
+        let mut tree = Tree::default();
         let all: Vec<_> = (0..5_000).map(|_| random_bits(&mut random)).collect();
         for (slot, bits) in (0..).zip(&all) {
             tree.insert(Entry { bits: *bits, slot, feature: 0 });
@@ -244,7 +246,7 @@ mod tests {
     #[test]
     fn a_bit_that_turned_over_is_met_where_it_was_unsure() {
         let mut random = Random::new(2);
-        let mut tree = Tree::new();
+        let mut tree = Tree::default();
         let all: Vec<_> = (0..5_000).map(|_| random_bits(&mut random)).collect();
         for (slot, bits) in (0..).zip(&all) {
             tree.insert(Entry { bits: *bits, slot, feature: 0 });
@@ -264,7 +266,7 @@ mod tests {
 
     #[test]
     fn what_looks_the_same_a_thousand_times_is_kept_a_few_times() {
-        let mut tree = Tree::new();
+        let mut tree = Tree::default();
         (0..1_000).for_each(|slot| tree.insert(Entry { bits: [7; WORDS], slot, feature: 0 }));
         assert_eq!(found(&tree, &[7; WORDS], &[0; WORDS], 1).len(), MOST_IN_LEAF);
         tree.retain(|entry| entry.slot == 3);
@@ -274,7 +276,7 @@ mod tests {
     #[test]
     fn taking_out_keeps_the_others_and_joins_leaves() {
         let mut random = Random::new(3);
-        let mut tree = Tree::new();
+        let mut tree = Tree::default();
         let all: Vec<_> = (0..5_000).map(|_| random_bits(&mut random)).collect();
         for (slot, bits) in (0..).zip(&all) {
             tree.insert(Entry { bits: *bits, slot, feature: 0 });

@@ -92,7 +92,7 @@ pub struct PointSystem {
 }
 
 /// Normal equations at one state.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct System {
     /// The points' parts.
     pub blocks: Vec<SystemBlock>,
@@ -107,19 +107,6 @@ pub struct System {
     pub energy: f64,
     /// Points in view.
     pub num_visible: usize,
-}
-
-impl Default for System {
-    fn default() -> Self {
-        Self {
-            blocks: Vec::new(),
-            num_points: 0,
-            hessian: SMatrix::zeros(),
-            gradient: SVector::zeros(),
-            energy: 0.0,
-            num_visible: 0,
-        }
-    }
 }
 
 impl System {

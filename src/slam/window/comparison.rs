@@ -122,19 +122,13 @@ impl Compared {
 }
 
 /// Sums of the comparisons of a host with an observer, by lane.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 #[repr(C, align(64))]
 pub struct PairSums {
     /// Σ w J Jᵀ of the observer's pose, rows of the upper triangle.
     pub pose: [Lane; TRIANGLE],
     /// Σ w J r.
     pub right: [Lane; POSE],
-}
-
-impl Default for PairSums {
-    fn default() -> Self {
-        Self { pose: [[0.0; LANES]; TRIANGLE], right: [[0.0; LANES]; POSE] }
-    }
 }
 
 /// Which derivatives are wanted.
