@@ -15,6 +15,8 @@ use crate::slam::window::surface::Surface;
 /// Frames aligned with one adjustment: twice as many as come between two keyframes, so that those of an epoch's first
 /// keyframes are made up for without delaying it.
 const MOST_AT_ONCE: usize = 30;
+/// As many are aligned in the time of one or two frames.
+const FEW_FRAMES: usize = 8;
 /// Keyframes after its own that a frame of an epoch's first keyframes waits for: all of these move with each estimate, and
 /// the frame with its own.
 const FIRST_LAG: usize = 4;
@@ -73,16 +75,17 @@ impl Window {
         std::mem::take(&mut self.frames.placed)
     }
 
-    /// After an estimate: frames that have waited long enough are to be aligned. By themselves, so that the keyframes need
-    /// not be waited for; here and now where the ones of the estimate before still are to be.
+    /// After an estimate: frames that have waited long enough are to be aligned, by themselves where they are many, so that
+    /// the keyframes need not be waited for. Here and now where they are few, since keyframes that follow each other so
+    /// soon should not have to wait for that, and where those of the estimate before still are to be.
     pub(super) fn plan_frames(&mut self, newest: usize, is_first: bool) {
-        if self.frames.planned.take().is_some() {
-            self.place_frames(newest, is_first);
-            return;
-        }
         let end = self.settled(newest, is_first);
-        let is_ready = |frame: &TrackedFrame| self.index_of(frame.keyframe_id) < Some(end);
-        self.frames.planned = self.frames.waiting.iter().any(is_ready).then_some(is_first);
+        let is_ready = |frame: &&TrackedFrame| self.index_of(frame.keyframe_id) < Some(end);
+        let are_many = self.frames.waiting.iter().filter(is_ready).count() > FEW_FRAMES;
+        match self.frames.planned.take() {
+            None if are_many => self.frames.planned = Some(is_first),
+            _ => self.place_frames(newest, is_first),
+        }
     }
 
     /// Whether frames are to be aligned, by [`Window::optimise`]: to be asked where nothing else is to be done.
@@ -270,5 +273,27 @@ mod tests {
         };
         assert_eq!(left(true), [4, 5, 6, 7]);
         assert_eq!(left(false), [7]);
+    }
+    #[test]
+    fn many_frames_are_aligned_by_themselves_and_few_with_the_estimate() {
+        let left = |window: &Window| window.frames.waiting.len();
+        let mut few = window();
+        few.plan_frames(7, false);
+        assert_eq!((left(&few), few.begin_frames()), (1, false));
+        let many = || {
+            let mut many = window();
+            many.take_frames(&mut (0..20).map(|_| frame(3)).collect());
+            many.plan_frames(7, false);
+            many
+        };
+        let mut alone = many();
+        assert_eq!((left(&alone), alone.begin_frames()), (28, true));
+        assert!(alone.optimise().is_none());
+        assert_eq!((left(&alone), alone.begin_frames()), (1, false));
+        assert!(alone.take_frames_alone().is_some() && alone.take_frames_alone().is_none());
+        // The next keyframe came before that.
+        let mut overtaken = many();
+        overtaken.plan_frames(7, false);
+        assert_eq!((left(&overtaken), overtaken.begin_frames()), (1, false));
     }
 }
