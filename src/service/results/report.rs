@@ -286,14 +286,13 @@ fn depth_maps(input: &ReportInput<'_>) -> String {
         100.0 * low,
         100.0 * high
     );
-    let whole: [(&str, fn(&Keyframe) -> Picture); 3] = [
-        ("inverse depth", |keyframe| inverse_depth_picture(keyframe, f64::INFINITY).0),
-        ("uncertainty", variance_picture),
-        ("density", density_picture),
+    let whole = [
+        ("inverse depth", inverse_depth_picture(middle, f64::INFINITY).0),
+        ("uncertainty", variance_picture(middle)),
+        ("density", density_picture(middle)),
     ];
-    let figure =
-        |(note, of): &(&str, fn(&Keyframe) -> Picture)| picture_figure(&of(middle), middle, note);
-    html.extend(whole.par_iter().map(figure).collect::<Vec<_>>());
+    let figures = whole.par_iter().map(|(note, picture)| picture_figure(picture, middle, note));
+    html.extend(figures.collect::<Vec<_>>());
     html.push_str("</div></section>");
     html
 }
