@@ -125,6 +125,7 @@ mod tests {
             }
         }
     }
+
     #[test]
     fn hubers_terms_are_squares_that_grow_linearly_beyond_the_bound() {
         let seen = [0.0, 3.0, -8.9, 9.0, 9.1, -200.0, f32::INFINITY, f32::NAN];

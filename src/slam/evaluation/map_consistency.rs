@@ -46,11 +46,10 @@ impl MapConsistency {
             .flat_map_iter(|of_later| compare(keyframes, of_later))
             .filter(|pair| pair.misfit.has_texture)
             .collect();
-        let (wide, near): (Vec<_>, Vec<_>) =
-            textured.into_iter().partition(|pair| pair.depth.is_some());
+        let (wide, near): (Vec<_>, Vec<_>) = textured.into_iter().partition(|pair| pair.is_wide);
         let misfit =
             |of: &[Compared]| median(&of.iter().map(|of| of.misfit.median_px).collect::<Vec<_>>());
-        let depths: Vec<_> = wide.iter().filter_map(|pair| pair.depth.flatten()).collect();
+        let depths: Vec<_> = wide.iter().filter_map(|pair| pair.depth).collect();
         let depth =
             |part: fn(&DepthAgreement) -> f64| median(&depths.iter().map(part).collect::<Vec<_>>());
         Self {
@@ -68,10 +67,11 @@ impl MapConsistency {
 
 /// What a pair came to.
 struct Compared {
+    is_wide: bool,
     span_frames: u64,
     misfit: PatchMisfit,
-    /// Of a wide pair; `None` within where too few depths coincide.
-    depth: Option<Option<DepthAgreement>>,
+    /// Of a wide pair where enough depths coincide.
+    depth: Option<DepthAgreement>,
 }
 
 /// Compares the pairs of one later keyframe.
@@ -82,9 +82,10 @@ fn compare(keyframes: &[Keyframe], of_later: &[Pair]) -> Vec<Compared> {
         let earlier = &keyframes[pair.earlier];
         let view = SharedView::new(earlier, later);
         Compared {
+            is_wide: pair.is_wide,
             span_frames: later.sequence.saturating_sub(earlier.sequence),
             misfit: patch_misfit(&view, &ReducedImage::of(earlier), &image),
-            depth: pair.is_wide.then(|| depth_agreement(&view, &index)),
+            depth: pair.is_wide.then(|| depth_agreement(&view, &index)).flatten(),
         }
     };
     of_later.iter().map(compare).collect()

@@ -274,6 +274,7 @@ mod tests {
         assert_eq!(left(true), [4, 5, 6, 7]);
         assert_eq!(left(false), [7]);
     }
+
     #[test]
     fn many_frames_are_aligned_by_themselves_and_few_with_the_estimate() {
         let left = |window: &Window| window.frames.waiting.len();
