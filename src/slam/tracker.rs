@@ -10,7 +10,9 @@ pub mod verdict;
 
 use serde::{Deserialize, Serialize};
 
-use crate::slam::alignment::align::{Aligner, Alignment, AlignmentParams, Ending};
+use crate::slam::alignment::align::{
+    Aligner, Alignment, AlignmentParams, Ending, next_finer_level,
+};
 use crate::slam::alignment::reference::{
     Reference, ReferenceParams, ReferenceScratch, finest_level, num_levels,
 };
@@ -369,11 +371,42 @@ impl Tracker {
         }
         let is_solved = best.ending == Ending::Finished;
         let coarse_fit = is_solved.then(|| quality_of(&best).whitened_rmse);
+        if is_solved && !self.memory.was_lost {
+            best = self.better_on_next(reference, best, &predicted, budget);
+        }
         self.aligner.descend(reference, &self.pyramid, &mut best, budget);
         if best.ending == Ending::OutOfBudget {
             best = self.better_when_cut_short(reference, &best, &predicted);
         }
         (best, coarse_fit)
+    }
+
+    /// Of an alignment on the coarsest level and the prediction that it began with, the one that explains the next level
+    /// better when both are solved there: the few pixels of the coarsest may fit best elsewhere, and from a wrong
+    /// minimum the finer levels do not return.
+    fn better_on_next(
+        &self,
+        reference: &Reference,
+        mut coarsest: Alignment,
+        predicted: &SE3,
+        budget: &mut dyn FnMut(usize) -> bool,
+    ) -> Alignment {
+        let (aligner, frame) = (&self.aligner, &self.pyramid);
+        let Some(level) = next_finer_level(reference, frame, coarsest.level) else {
+            return coarsest;
+        };
+        if !aligner.solve_level(reference, frame, level, &mut coarsest, budget) {
+            return coarsest;
+        }
+        let start = reference.world_from_keyframe().locate(predicted).inverse();
+        let mut direct = aligner.start_on(reference, frame, level, &start, self.memory.brightness);
+        aligner.solve_level(reference, frame, level, &mut direct, budget);
+        let explain = |of: &Alignment| aligner.explanation(reference, frame, of);
+        let is_solved = direct.ending == Ending::Finished;
+        match is_solved && fits_better(&explain(&direct), &explain(&coarsest)) {
+            true => direct,
+            false => coarsest,
+        }
     }
 
     /// Of an alignment that was cut short and the prediction it began with, the one that

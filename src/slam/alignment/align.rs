@@ -138,6 +138,12 @@ impl AlignedState {
     }
 }
 
+/// The next level below `level` on which a frame has pixels and `reference` points; `None` where there is none.
+pub fn next_finer_level(reference: &Reference, frame: &SumPyramid, level: usize) -> Option<usize> {
+    let finest = reference.finest_level().max(frame.finest_level());
+    (finest..level).rev().find(|&level| !reference.level(level).is_empty())
+}
+
 /// Why an alignment came to its end.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Ending {
@@ -286,8 +292,19 @@ impl Aligner {
         current_from_keyframe: &SE3,
         brightness: Brightness,
     ) -> Alignment {
-        let has_points = |&level: &usize| !reference.level(level).is_empty();
-        let level = (0..frame.num_levels()).rev().find(has_points).unwrap_or(0);
+        let level = next_finer_level(reference, frame, frame.num_levels()).unwrap_or(0);
+        self.start_on(reference, frame, level, current_from_keyframe, brightness)
+    }
+
+    /// A guess, evaluated on `level`.
+    pub fn start_on(
+        &self,
+        reference: &Reference,
+        frame: &SumPyramid,
+        level: usize,
+        current_from_keyframe: &SE3,
+        brightness: Brightness,
+    ) -> Alignment {
         Alignment {
             state: self.evaluate(
                 reference,

@@ -220,6 +220,25 @@ fn only_frames_that_are_found_say_what_a_good_fit_is() {
 }
 
 #[test]
+fn of_the_coarsest_level_and_the_prediction_the_one_that_is_right_goes_on() {
+    let (plane, camera) = (small_plane(), small_camera());
+    let mut tracker = tracker_on(&plane.keyframe(&camera, 2, 0.02));
+    let reference = tracker.reference.take().unwrap();
+    tracker.pyramid.fill(&plane.render(&camera, &path(6), 2.0, (1.0, 0.0), 7));
+    // From 10° away the finer level does not come back.
+    let astray = path(6) * SE3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.1, -0.15, 0.0));
+    for (of_coarsest, predicted) in [(astray, path(5)), (path(6), astray)] {
+        let (aligner, frame) = (&tracker.aligner, &tracker.pyramid);
+        let brightness = tracker.memory.brightness;
+        let coarsest = aligner.start(&reference, frame, &of_coarsest.inverse(), brightness);
+        let best = tracker.better_on_next(&reference, coarsest.clone(), &predicted, &mut always);
+        assert_eq!(best.level + 1, coarsest.level);
+        let error = (best.state.current_from_keyframe * path(6)).log();
+        assert!(error.norm() < 0.01, "{error}");
+    }
+}
+
+#[test]
 fn a_far_hypothesis_does_not_win_by_its_tolerance() {
     let (plane, camera) = (small_plane(), small_camera());
     // From afar, depth as uncertain as this explains any image.
