@@ -8,9 +8,9 @@ use std::sync::Arc;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::image::shared::SharedImage;
 use crate::slam::map::PlacedFrame;
-use crate::slam::window::Window;
 use crate::slam::window::keyframe::WindowKeyframe;
 use crate::slam::window::surface::Surface;
+use crate::slam::window::{ALIGNMENT_LEVELS, Window};
 
 /// Frames aligned with one adjustment: twice as many as come between two keyframes, so that those of an epoch's first
 /// keyframes are made up for without delaying it.
@@ -20,10 +20,6 @@ const FEW_FRAMES: usize = 8;
 /// Keyframes after its own that a frame of an epoch's first keyframes waits for: all of these move with each estimate, and
 /// the frame with its own.
 const FIRST_LAG: usize = 4;
-/// Levels that a frame is aligned on: it is within a pixel or two already.
-const FRAME_LEVELS: [usize; 2] = [1, 0];
-/// The same of a frame whose pose is a guess.
-const GUESS_LEVELS: [usize; 4] = [3, 2, 1, 0];
 /// Most iterations of a level.
 const MAX_ITERATIONS: u32 = 10;
 /// Keyframes before and after its own whose points a frame is aligned to.
@@ -143,7 +139,7 @@ impl Window {
                 return true;
             }
             left -= 1;
-            let placed = index.and_then(|index| self.place_frame(index, frame, &FRAME_LEVELS));
+            let placed = index.and_then(|index| self.place_frame(index, frame));
             self.frames.placed.extend(placed);
             false
         });
@@ -167,7 +163,7 @@ impl Window {
                 frame.keyframe_from_camera = off * guess;
             }
             let index = self.index_of(keyframe_id);
-            let placed = index.and_then(|index| self.place_frame(index, &frame, &GUESS_LEVELS));
+            let placed = index.and_then(|index| self.place_frame(index, &frame));
             let (Some(placed), Some(index)) = (placed, index) else {
                 waiting.retain(|other| !(other.is_guess && other.keyframe_id == keyframe_id));
                 continue;
@@ -184,12 +180,7 @@ impl Window {
         }
     }
 
-    fn place_frame(
-        &mut self,
-        index: usize,
-        frame: &TrackedFrame,
-        levels: &[usize],
-    ) -> Option<PlacedFrame> {
+    fn place_frame(&mut self, index: usize, frame: &TrackedFrame) -> Option<PlacedFrame> {
         let keyframe = &self.keyframes[index];
         let (epoch, host_from_map) = (keyframe.epoch, keyframe.camera_from_map);
         let mut host_from_camera = frame.keyframe_from_camera;
@@ -215,7 +206,7 @@ impl Window {
             agreed: Vec::new(),
             surface: Surface::default(),
         });
-        let is_aligned = self.align_last(&members, levels, MAX_ITERATIONS);
+        let is_aligned = self.align_last(&members, &ALIGNMENT_LEVELS, MAX_ITERATIONS);
         let placed = self.keyframes.pop()?;
         let system = &self.solver.system;
         let agrees = system.inliers >= FEWEST_INLIERS
@@ -230,9 +221,12 @@ impl Window {
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::Vector6;
+
     use super::*;
     use crate::slam::test_scene::CAMERA;
     use crate::slam::window::params::WindowParams;
+    use crate::slam::window::tests::room;
 
     fn frame(keyframe_id: u64) -> TrackedFrame {
         TrackedFrame {
@@ -262,6 +256,25 @@ mod tests {
             .collect();
         window.take_frames(&mut (0..8).map(frame).collect());
         window
+    }
+
+    #[test]
+    fn a_frame_that_is_ten_pixels_off_is_found() {
+        let mut room = room(|_, _| (1.0, 0.0)).keyframes;
+        let seen = room.remove(2);
+        let truth = room[1].camera_from_map * seen.camera_from_map.inverse();
+        let mut window = Window::new(CAMERA, WindowParams::default());
+        window.keyframes = room;
+        let off = SE3::exp(&Vector6::new(0.02, 0.0, 0.01, 0.02, -0.03, 0.0));
+        let frame = TrackedFrame {
+            keyframe_from_camera: truth * off,
+            pixels: seen.images[0].pixels().into(),
+            ..frame(1)
+        };
+        let placed = window.place_frame(1, &frame).unwrap();
+        let error = (placed.keyframe_from_camera * truth.inverse()).log();
+        assert!(error.norm() < 0.003, "{error}");
+        assert_eq!(window.keyframes.len(), 3);
     }
 
     #[test]
