@@ -20,6 +20,11 @@ const FEW_FRAMES: usize = 8;
 /// Keyframes after its own that a frame of an epoch's first keyframes waits for: all of these move with each estimate, and
 /// the frame with its own.
 const FIRST_LAG: usize = 4;
+/// Levels that a frame is aligned on first: most are within a pixel or two. Where their keyframe's first depth was wrong they may
+/// be ten off.
+const FINE_LEVELS: [usize; 2] = [1, 0];
+/// Share of the comparisons that agree with most frames that stand where they should.
+const SURE_INLIER_RATIO: f64 = 0.8;
 /// Most iterations of a level.
 const MAX_ITERATIONS: u32 = 10;
 /// Keyframes before and after its own whose points a frame is aligned to.
@@ -206,16 +211,37 @@ impl Window {
             agreed: Vec::new(),
             surface: Surface::default(),
         });
-        let is_aligned = self.align_last(&members, &ALIGNMENT_LEVELS, MAX_ITERATIONS);
-        let placed = self.keyframes.pop()?;
-        let system = &self.solver.system;
-        let agrees = system.inliers >= FEWEST_INLIERS
-            && system.inliers as f64 >= LEAST_INLIER_RATIO * system.compared as f64;
-        (is_aligned && agrees).then(|| PlacedFrame {
+        let camera_from_map = self.align_frame(&members);
+        self.keyframes.pop();
+        camera_from_map.map(|camera_from_map| PlacedFrame {
             sequence: frame.sequence,
             keyframe_id: frame.keyframe_id,
-            keyframe_from_camera: host_from_map * placed.camera_from_map.inverse(),
+            keyframe_from_camera: host_from_map * camera_from_map.inverse(),
         })
+    }
+
+    /// Aligns the last of the members, which is a frame: on the fine levels, and where less agrees with it than with most
+    /// frames, from the coarse ones too. Of both what more agrees with; nothing where that is too little.
+    fn align_frame(&mut self, members: &[usize]) -> Option<SE3> {
+        let begin = self.keyframes.last()?.camera_from_map;
+        let mut best: Option<(usize, usize, SE3)> = None;
+        for levels in [&FINE_LEVELS[..], &ALIGNMENT_LEVELS] {
+            self.keyframes.last_mut()?.camera_from_map = begin;
+            if !self.align_last(members, levels, MAX_ITERATIONS) {
+                continue;
+            }
+            let (inliers, compared) = (self.solver.system.inliers, self.solver.system.compared);
+            if best.is_none_or(|(most, ..)| inliers > most) {
+                best = Some((inliers, compared, self.keyframes.last()?.camera_from_map));
+            }
+            if inliers as f64 >= SURE_INLIER_RATIO * compared as f64 {
+                break;
+            }
+        }
+        best.filter(|&(inliers, compared, _)| {
+            inliers >= FEWEST_INLIERS && inliers as f64 >= LEAST_INLIER_RATIO * compared as f64
+        })
+        .map(|(.., camera_from_map)| camera_from_map)
     }
 }
 
