@@ -211,7 +211,7 @@ impl Window {
             agreed: Vec::new(),
             surface: Surface::default(),
         });
-        let camera_from_map = self.align_frame(&members);
+        let camera_from_map = self.align_frame(&members, frame.is_guess);
         self.keyframes.pop();
         camera_from_map.map(|camera_from_map| PlacedFrame {
             sequence: frame.sequence,
@@ -220,12 +220,14 @@ impl Window {
         })
     }
 
-    /// Aligns the last of the members, which is a frame: on the fine levels, and where less agrees with it than with most
-    /// frames, from the coarse ones too. Of both what more agrees with; nothing where that is too little.
-    fn align_frame(&mut self, members: &[usize]) -> Option<SE3> {
+    /// Aligns the last of the members, which is a frame: from the coarse levels if it is where a guess has it, else on the
+    /// fine ones, and from the coarse ones too where less agrees with it than with most frames. Of both what more agrees
+    /// with; nothing where that is too little.
+    fn align_frame(&mut self, members: &[usize], is_guess: bool) -> Option<SE3> {
         let begin = self.keyframes.last()?.camera_from_map;
         let mut best: Option<(usize, usize, SE3)> = None;
-        for levels in [&FINE_LEVELS[..], &ALIGNMENT_LEVELS] {
+        let begun_on = [&FINE_LEVELS[..], &ALIGNMENT_LEVELS];
+        for levels in &begun_on[usize::from(is_guess)..] {
             self.keyframes.last_mut()?.camera_from_map = begin;
             if !self.align_last(members, levels, MAX_ITERATIONS) {
                 continue;
