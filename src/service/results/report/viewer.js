@@ -308,7 +308,7 @@ const Viewer = (() => {
       this.places.clear(); this.path = []; this.camera = null; this.active = null; this.isFitted = false; this.upIsGiven = false;
       this.linesDirty = true; this.touch();
     }
-    /** A pose of the path: { t, state, id, local } relative to keyframe `id`, or { t, state, at } in the map. */
+    /** A pose of the path: { t, state, id, local } relative to keyframe `id`, or { t, state, at } in the map; no line leads to one that `begins`. */
     addPose(pose) {
       this.path.push(pose);
       this.placePose(pose); this.pathDirty = true;
@@ -626,7 +626,7 @@ const Viewer = (() => {
       for (const pose of this.path) {
         if (pose.t > this.time) break;
         const isHere = pose.at && (this.epoch === null || pose.epoch === undefined || pose.epoch === this.epoch);
-        if (isHere && before && pose.state !== 3 && pose.state !== 0) {
+        if (isHere && before && !pose.begins && pose.state !== 3 && pose.state !== 0) {
           out.add(before.at, pose.at, STATE_COLOURS[pose.state] || STATE_COLOURS[1], 0.95, 2.4);
         }
         before = isHere && pose.state !== 3 ? pose : null;
@@ -687,7 +687,7 @@ const Viewer = (() => {
       this.setPath(header.path.map((p) => ({ t: p[0], place: p.slice(1, 8), at: p.slice(1, 4), state: 1 })));
       // A gap in time is a gap of the line, and so is another epoch.
       const gaps = new Set(header.gaps);
-      this.path.forEach((p, i) => { if (i && (gaps.has(i) || p.t - this.path[i - 1].t > header.gap)) this.path[i - 1].state = 3; });
+      this.path.forEach((p, i) => { p.begins = i > 0 && (gaps.has(i) || p.t - this.path[i - 1].t > header.gap); });
       this.run = header;
     }
     /** Puts time and camera at `t`, seconds of the recording. */
