@@ -395,11 +395,15 @@ impl Tracker {
         let Some(level) = next_finer_level(reference, frame, coarsest.level) else {
             return coarsest;
         };
+        let mut direct = coarsest.clone();
         if !aligner.solve_level(reference, frame, level, &mut coarsest, budget) {
             return coarsest;
         }
-        let start = reference.world_from_keyframe().locate(predicted).inverse();
-        let mut direct = aligner.start_on(reference, frame, level, &start, self.memory.brightness);
+        // A level takes pose and brightness alone from what it begins with.
+        direct.state.current_from_keyframe =
+            reference.world_from_keyframe().locate(predicted).inverse();
+        direct.state.brightness = self.memory.brightness;
+        direct.ending = Ending::NothingInView;
         aligner.solve_level(reference, frame, level, &mut direct, budget);
         let explain = |of: &Alignment| aligner.explanation(reference, frame, of);
         let is_solved = direct.ending == Ending::Finished;

@@ -57,8 +57,7 @@ use crate::slam::window::surface::Surface;
 use crate::slam::window::system::{Level, Members};
 use crate::slam::window::unit::Unit;
 
-/// Levels of the alignment of a new keyframe and of a frame, which is ten pixels off where its keyframe's first depth was wrong,
-/// and of an adjustment.
+/// Levels of the alignment of one image that may be ten pixels off, and of an adjustment.
 const ALIGNMENT_LEVELS: [usize; 4] = [3, 2, 1, 0];
 const ADJUSTED_LEVELS: [usize; 3] = [2, 1, 0];
 /// Most iterations of a level of that alignment.

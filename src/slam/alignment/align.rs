@@ -293,18 +293,6 @@ impl Aligner {
         brightness: Brightness,
     ) -> Alignment {
         let level = next_finer_level(reference, frame, frame.num_levels()).unwrap_or(0);
-        self.start_on(reference, frame, level, current_from_keyframe, brightness)
-    }
-
-    /// A guess, evaluated on `level`.
-    pub fn start_on(
-        &self,
-        reference: &Reference,
-        frame: &SumPyramid,
-        level: usize,
-        current_from_keyframe: &SE3,
-        brightness: Brightness,
-    ) -> Alignment {
         Alignment {
             state: self.evaluate(
                 reference,
