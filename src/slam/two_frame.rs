@@ -448,15 +448,16 @@ fn input<'a>(
     FitInput { images, finest: 0, intrinsics, points }
 }
 
-/// Levels down to about 80 pixels across: a tenth of the image then moves by a few pixels. The height
+/// Levels down to about 80 pixels across: a tenth of the image then moves by a few pixels. The shorter side
 /// bounds only stripes: a car's camera is four times as wide as high, and at 1.2 m a frame the road needs
 /// all levels.
 fn num_levels(intrinsics: &Intrinsics) -> usize {
-    const MIN_WIDTH: usize = 64;
-    const MIN_HEIGHT: usize = 20;
+    const MIN_LONG_SIDE: usize = 64;
+    const MIN_SHORT_SIDE: usize = 20;
     const MAX_LEVELS: usize = 6;
-    let fits =
-        |l: &usize| intrinsics.width >> l >= MIN_WIDTH && intrinsics.height >> l >= MIN_HEIGHT;
+    let (width, height) = (intrinsics.width, intrinsics.height);
+    let (long, short) = (width.max(height), width.min(height));
+    let fits = |l: &usize| long >> l >= MIN_LONG_SIDE && short >> l >= MIN_SHORT_SIDE;
     (0..MAX_LEVELS).take_while(fits).count().max(1)
 }
 
