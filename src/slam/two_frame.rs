@@ -345,7 +345,9 @@ impl TwoFrameInitializer {
         /// Significance of the frame before from which on parallax may show.
         const PARALLAX_SIGNIFICANCE: f64 = 3.0;
         let input = input(self.pyramid.levels(), &self.intrinsics, &self.points);
-        let with_directions = self.significance > PARALLAX_SIGNIFICANCE;
+        // From the first frame nothing is known: where the camera moves on by many pixels the right motion may not be
+        // found from rest.
+        let with_directions = self.frames == 1 || self.significance > PARALLAX_SIGNIFICANCE;
         self.joint.fit(
             &input,
             &self.rotation,
