@@ -11,7 +11,7 @@ use rayon::prelude::*;
 
 use crate::slam::image::buffer::Image;
 use crate::slam::two_frame::fit::{FitInput, FitParams, FitScratch, Freedom, fit_level};
-use crate::slam::two_frame::system::State;
+use crate::slam::two_frame::system::{State, System, compare};
 
 /// Levels on which an earlier frame is used to score, coarse to fine: motions differ by pixels, and half of the
 /// resolution is a quarter of the time and memory.
@@ -53,26 +53,35 @@ impl EarlierFrames {
         self.kept.push_back(EarlierFrame { images, rotation: rotation.clone() });
     }
 
-    /// Energy of the earlier frames with these depths, each frame from the pose that fits it best. `input`
-    /// gives points and intrinsics. The sum goes in the order of the frames.
-    pub fn energy(&self, input: &FitInput<'_>, inverse_depths: &[f32], params: &FitParams) -> f64 {
+    /// Energies of the earlier frames with the depths of two motions, each frame from the pose that fits it best, of the
+    /// points that both see. `input` gives points and intrinsics. The sums go in the order of the frames.
+    pub fn compare(
+        &self,
+        input: &FitInput<'_>,
+        inverse_depths: [&[f32]; 2],
+        params: &FitParams,
+    ) -> [f64; 2] {
         let (finest, coarsest) = scoring_levels(input.intrinsics.len());
-        let energies: Vec<f64> = self
+        let fit = |frame: &EarlierFrame, inverse_depths: &[f32]| -> System {
+            let input = FitInput { images: &frame.images, finest, ..*input };
+            let mut state = frame.rotation.clone();
+            state.inverse_depths.clear();
+            state.inverse_depths.extend_from_slice(inverse_depths);
+            let mut scratch = FitScratch::default();
+            for level in (finest..=coarsest).rev() {
+                fit_level(&input, level, Freedom::Pose, &mut state, &mut scratch, params);
+            }
+            scratch.system
+        };
+        let energies: Vec<[f64; 2]> = self
             .kept
             .par_iter()
             .map(|frame| {
-                let input = FitInput { images: &frame.images, finest, ..*input };
-                let mut state = frame.rotation.clone();
-                state.inverse_depths.clear();
-                state.inverse_depths.extend_from_slice(inverse_depths);
-                let mut scratch = FitScratch::default();
-                for level in (finest..=coarsest).rev() {
-                    fit_level(&input, level, Freedom::Pose, &mut state, &mut scratch, params);
-                }
-                scratch.system.energy
+                let [one, other] = inverse_depths.map(|depths| fit(frame, depths));
+                compare(&one, &other)
             })
             .collect();
-        energies.iter().sum()
+        energies.iter().fold([0.0, 0.0], |sum, energy| [0, 1].map(|i| sum[i] + energy[i]))
     }
 }
 

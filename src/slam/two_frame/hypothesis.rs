@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::two_frame::earlier_frames::EarlierFrames;
 use crate::slam::two_frame::fit::{FitInput, FitParams, FitScratch, Freedom, fit_level};
-use crate::slam::two_frame::system::State;
+use crate::slam::two_frame::system::{State, compare};
 
 /// Survivors, the same aligned first, rest, mirror and six directions.
 const MAX_HYPOTHESES: usize = 2 * NUM_SURVIVORS + 2 + 6;
@@ -113,10 +113,10 @@ impl Hypotheses {
     /// Puts that survivor first whose depths explain this frame and the earlier ones best.
     fn score(&mut self, input: &FitInput<'_>, earlier_frames: &EarlierFrames, params: &FitParams) {
         self.scored_by = earlier_frames.len();
-        let together = |h: &MotionHypothesis| {
-            h.energy + earlier_frames.energy(input, &h.state.inverse_depths, params)
-        };
-        let (mut best, mut other) = (together(&self.all[0]), together(&self.all[1]));
+        let of_this_frame = compare(&self.all[0].scratch.system, &self.all[1].scratch.system);
+        let depths = [0, 1].map(|i| self.all[i].state.inverse_depths.as_slice());
+        let of_earlier_frames = earlier_frames.compare(input, depths, params);
+        let [mut best, mut other] = [0, 1].map(|i| of_this_frame[i] + of_earlier_frames[i]);
         if other < best {
             self.all.swap(0, 1);
             std::mem::swap(&mut best, &mut other);

@@ -157,6 +157,19 @@ impl System {
     }
 }
 
+/// Energies of two motions in one frame, of the points that both see: what one does not see says nothing, and where the
+/// images fit badly it would be cheaper than a match.
+pub fn compare(one: &System, other: &System) -> [f64; 2] {
+    let mut sums = [0.0; 2];
+    for (a, b) in one.blocks.iter().zip(&other.blocks) {
+        for l in (0..LANES).filter(|&l| a.visible[l] && b.visible[l]) {
+            sums[0] += f64::from(a.energy[l]);
+            sums[1] += f64::from(b.energy[l]);
+        }
+    }
+    sums
+}
+
 /// Energy of a point out of view: every sample at the end of Huber's parabola.
 const HIDDEN_ENERGY: f32 = PATTERN.len() as f32 * HUBER_GREY * HUBER_GREY;
 
