@@ -194,6 +194,9 @@ pub fn judge(
 ) -> Evidence {
     /// A point whose depth is known to better than this share of the mean has a sign.
     const PLACED_STD_DEV: f32 = 0.3;
+    /// Standard deviations by which a point must lie behind the camera: of points at infinity every second one is
+    /// found there, a little.
+    const BEHIND_STD_DEVS: f32 = 2.0;
     let (mut explained, mut remaining, mut both, mut depths) = (0.0f64, 0.0f64, 0usize, 0.0f64);
     let (mut placed, mut negative) = (0usize, 0usize);
     for (i, (point, alone)) in joint.points().zip(rotation.points()).enumerate() {
@@ -204,7 +207,7 @@ pub fn judge(
         depths += f64::from(d);
         if variances[i] < PLACED_STD_DEV * PLACED_STD_DEV {
             placed += 1;
-            negative += usize::from(d <= 0.0);
+            negative += usize::from(d < -BEHIND_STD_DEVS * variances[i].sqrt());
         }
         if alone.visible {
             explained += f64::from(alone.energy - point.energy);
