@@ -33,6 +33,9 @@ pub struct EvidenceParams {
     pub min_turning_rival_excess: f64,
     /// Rotation over the rival's from which that holds.
     pub max_turn_ratio: f64,
+    /// Rotation between two motions, radians, over the translation in mean depths, below which neither turns more. Along
+    /// a plane the two differ by 1.
+    pub min_turn_apart: f64,
     /// Largest median of the relative error that the uncertainty of the pose gives all depths together:
     /// later frames cannot see it, and take it for the shape of the scene.
     pub max_common_error: f64,
@@ -62,6 +65,7 @@ impl Default for EvidenceParams {
             min_rival_excess: 0.03,
             min_turning_rival_excess: 0.2,
             max_turn_ratio: 0.8,
+            min_turn_apart: 0.1,
             max_common_error: 0.02,
             min_significance: 8.0,
             max_negative_ratio: 0.05,
@@ -82,6 +86,7 @@ impl EvidenceParams {
         check_range("min_rival_excess", self.min_rival_excess, 0.0..=10.0)?;
         check_range("min_turning_rival_excess", self.min_turning_rival_excess, 0.0..=10.0)?;
         check_range("max_turn_ratio", self.max_turn_ratio, 0.0..=1e6)?;
+        check_range("min_turn_apart", self.min_turn_apart, 0.0..=10.0)?;
         check_range("max_common_error", self.max_common_error, 1e-3..=1.0)?;
         check_range("min_significance", self.min_significance, 1.0..=1e4)?;
         check_range("max_negative_ratio", self.max_negative_ratio, 0.0..=0.5)?;
@@ -145,7 +150,8 @@ impl Evidence {
             && self.median_residual <= params.max_median_residual
             && self.median_residual <= params.max_residual_growth * self.least_residual;
         let is_unrivalled = self.rival.is_none_or(|rival| {
-            let turns_less = rival.turn_ratio <= params.max_turn_ratio;
+            let turns_less = rival.turn_ratio <= params.max_turn_ratio
+                || rival.turn_apart < params.min_turn_apart;
             let min_excess =
                 if turns_less { params.min_rival_excess } else { params.min_turning_rival_excess };
             rival.excess >= min_excess
@@ -267,7 +273,7 @@ mod tests {
         let params = EvidenceParams::default();
         assert_eq!(proven().missing(&params), None);
         let against = |excess| {
-            let rival = Some(Rival { excess, turn_ratio: 0.5 });
+            let rival = Some(Rival { excess, turn_ratio: 0.5, turn_apart: 1.0 });
             Evidence { rival, ..proven() }.missing(&params)
         };
         assert_eq!(against(0.2), None);
@@ -278,14 +284,16 @@ mod tests {
     #[test]
     fn a_motion_that_turns_more_than_its_rival_needs_more_evidence() {
         let params = EvidenceParams::default();
-        let against = |excess, turn_ratio| {
-            let rival = Some(Rival { excess, turn_ratio });
+        let against = |excess, turn_ratio, turn_apart| {
+            let rival = Some(Rival { excess, turn_ratio, turn_apart });
             Evidence { rival, ..proven() }.missing(&params)
         };
-        assert_eq!(against(0.1, 0.5), None);
-        assert_eq!(against(0.1, 1.9), Some(Waiting::Rival));
-        assert_eq!(against(0.1, f64::NAN), Some(Waiting::Rival));
-        assert_eq!(against(0.4, 1.9), None);
+        assert_eq!(against(0.1, 0.5, 1.0), None);
+        assert_eq!(against(0.1, 1.9, 1.0), Some(Waiting::Rival));
+        assert_eq!(against(0.1, f64::NAN, 1.0), Some(Waiting::Rival));
+        assert_eq!(against(0.1, 1.9, f64::NAN), Some(Waiting::Rival));
+        assert_eq!(against(0.4, 1.9, 1.0), None);
+        assert_eq!(against(0.1, 1.9, 0.01), None, "they hardly differ in their rotation");
     }
 
     #[test]

@@ -37,6 +37,9 @@ pub struct Rival {
     pub excess: f64,
     /// Rotation that the best needs over the one that this needs.
     pub turn_ratio: f64,
+    /// Rotation between the two, radians, over the translation of the best in mean depths. What a plane exchanges is
+    /// of the size of its tilt against the path.
+    pub turn_apart: f64,
 }
 
 /// The hypotheses of one frame, best first after a fit.
@@ -125,7 +128,13 @@ impl Hypotheses {
         if heading(&poses[0]).dot(&heading(&poses[1])) < RIVAL_COSINE {
             let turns = poses.map(|pose| pose.rotation.angle().max(f64::MIN_POSITIVE));
             let excess = (other - best) / best.max(f64::MIN_POSITIVE);
-            self.rival = Some(Rival { excess, turn_ratio: turns[0] / turns[1] });
+            let translation = poses[0].translation.norm() * mean(&self.all[0].state.inverse_depths);
+            let between = (poses[0].rotation.inverse() * poses[1].rotation).angle();
+            self.rival = Some(Rival {
+                excess,
+                turn_ratio: turns[0] / turns[1],
+                turn_apart: between / translation.max(f64::MIN_POSITIVE),
+            });
         }
     }
 
@@ -197,6 +206,11 @@ fn bring_forward_distinct(sorted: &mut [MotionHypothesis]) -> usize {
     let Some(other) = other else { return 1 };
     sorted.swap(1, other);
     NUM_SURVIVORS
+}
+
+/// Mean of the inverse depths.
+fn mean(inverse_depths: &[f32]) -> f64 {
+    inverse_depths.iter().map(|&d| f64::from(d)).sum::<f64>() / inverse_depths.len().max(1) as f64
 }
 
 /// Direction of a pose's translation; zero without one.
