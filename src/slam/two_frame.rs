@@ -16,6 +16,7 @@ mod sampling_kernel;
 pub(crate) mod spread;
 pub(crate) mod system;
 mod system_kernel;
+mod waypoint;
 
 use nalgebra::{Matrix6, Vector3};
 use serde::{Deserialize, Serialize};
@@ -42,6 +43,7 @@ use crate::slam::two_frame::lead::Lead;
 use crate::slam::two_frame::points::Points;
 use crate::slam::two_frame::spread::spread;
 use crate::slam::two_frame::system::State;
+use crate::slam::two_frame::waypoint::Waypoint;
 
 /// Tuning of the two-frame start.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -127,6 +129,8 @@ pub struct InitOutcome {
     pub state: InitState,
     /// The figures behind it.
     pub evidence: Evidence,
+    /// How many frames after the first one this frame is; 0 where the next are seen against it.
+    pub frames: u32,
     /// Pose of the frame, in units in which the points' mean inverse depth is 1.
     pub first_from_current: SE3,
     /// Brightness of the frame against the first.
@@ -178,6 +182,8 @@ pub struct TwoFrameInitializer {
     /// Direction from the first camera to the one before, in the first frame.
     heading: Vector3<f64>,
     lead: Lead,
+    /// The frame before, where the next one may need it.
+    waypoint: Option<Waypoint>,
     frames: u32,
     confirmed: u32,
     mismatches: u32,
@@ -217,6 +223,7 @@ impl TwoFrameInitializer {
             sorted: Vec::new(),
             heading: Vector3::zeros(),
             lead: Lead::default(),
+            waypoint: None,
             frames: 0,
             confirmed: 0,
             mismatches: 0,
@@ -249,6 +256,7 @@ impl TwoFrameInitializer {
         self.significance = 0.0;
         self.least_residual = f64::INFINITY;
         self.lead = Lead::default();
+        self.waypoint = None;
         (self.frames, self.confirmed, self.mismatches) = (0, 0, 0);
         true
     }
@@ -262,6 +270,24 @@ impl TwoFrameInitializer {
             let missing = if self.begin(pixels) { Waiting::Translation } else { Waiting::Texture };
             return self.outcome(InitState::Waiting(missing), Evidence::default());
         }
+        let waypoint = self.waypoint.take();
+        let mut outcome = self.follow(pixels);
+        if let Some(waypoint) = waypoint
+            && self.confirmed == 0
+            && (waypoint.confirmed > 0 || self.mismatches > 0)
+        {
+            self.begin_on(&waypoint);
+            outcome = self.follow(pixels);
+        }
+        if matches!(outcome.state, InitState::Failed(_)) {
+            self.begin(pixels);
+            outcome.frames = 0;
+        }
+        outcome
+    }
+
+    /// Fits a frame against the first one and judges.
+    fn follow(&mut self, pixels: &[u8]) -> InitOutcome {
         self.pyramid.fill(pixels);
         self.frames += 1;
         self.fit_rotation();
@@ -298,11 +324,20 @@ impl TwoFrameInitializer {
             _ if self.frames >= self.params.max_frames => InitState::Failed(Failure::TooLong),
             missing => InitState::Waiting(missing.unwrap_or(Waiting::Confirmation)),
         };
-        let outcome = self.outcome(state, evidence);
-        if matches!(state, InitState::Failed(_)) {
-            self.begin(pixels);
-        }
-        outcome
+        let pace = evidence.translation / f64::from(self.frames);
+        let is_fast = pace >= self.params.evidence.min_translation && self.mismatches == 0;
+        self.waypoint = is_fast.then(|| Waypoint {
+            pixels: pixels.to_vec(),
+            heading: self.current_from_first.rotation * self.heading,
+            confirmed: self.confirmed,
+        });
+        self.outcome(state, evidence)
+    }
+
+    /// Begins on a frame that proved the parallax; what it proved still counts.
+    fn begin_on(&mut self, waypoint: &Waypoint) {
+        self.begin(&waypoint.pixels);
+        (self.heading, self.confirmed) = (waypoint.heading, waypoint.confirmed);
     }
 
     /// The frame that the depths belong to; empty before one is begun.
@@ -434,6 +469,7 @@ impl TwoFrameInitializer {
             rotation_px: rotation_rad * self.intrinsics[0].fx,
             state,
             evidence,
+            frames: self.frames,
             first_from_current: self.current_from_first.inverse(),
             pose_covariance: self.pose_covariance,
             brightness: self.brightness,

@@ -19,7 +19,6 @@ use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::parameter::ParameterError;
 use crate::slam::place_covariance::UncertainPlace;
 use crate::slam::pose::{PoseEstimate, TrackingState, upper_triangle};
-use crate::slam::two_frame::evidence::Waiting;
 use crate::slam::two_frame::{InitOutcome, InitState, TwoFrameInitializer, TwoFrameParams};
 
 /// A two-frame start, and what is said of it.
@@ -31,6 +30,8 @@ pub(super) struct Start {
     initializer: Option<Box<TwoFrameInitializer>>,
     /// Sequence and stamp of its first frame.
     first: Option<(u64, i64)>,
+    /// Those of the latest frame.
+    latest: Option<(u64, i64)>,
     /// How far it is.
     pub(super) progress: StartProgress,
     /// What the last frame came to, where it was one of the start.
@@ -51,6 +52,7 @@ impl Start {
             params: params.clone(),
             initializer: None,
             first: None,
+            latest: None,
             progress: StartProgress::default(),
             last_frame: None,
         })
@@ -64,7 +66,7 @@ impl Start {
 
     /// A map is there without it: gives its memory back.
     pub(super) fn give_up(&mut self) {
-        (self.first, self.initializer) = (None, None);
+        (self.first, self.latest, self.initializer) = (None, None, None);
     }
 
     /// Takes another frame; once parallax is proven gives what was found.
@@ -78,16 +80,14 @@ impl Start {
         self.last_frame = Some(StartFrame::of(&outcome, is_first, frame.pixels));
         self.progress.observe(outcome.state);
         let stamp = (frame.sequence, frame.capture_nanos);
-        let first = *self.first.get_or_insert(stamp);
-        match outcome.state {
-            InitState::Waiting(Waiting::Texture) => self.first = None,
-            InitState::Waiting(_) => {}
-            InitState::Failed(_) if initializer.first_pixels().is_empty() => self.first = None,
-            InitState::Failed(_) => self.first = Some(stamp),
-            InitState::Proven => {
-                self.first = None;
-                return Some(Proven { first, outcome, initializer });
-            }
+        let before = self.latest.replace(stamp);
+        self.first = match outcome.frames {
+            0 => self.latest,
+            1 => before,
+            _ => self.first,
+        };
+        if outcome.state == InitState::Proven {
+            return self.first.map(|first| Proven { first, outcome, initializer });
         }
         self.initializer = Some(initializer);
         None

@@ -19,6 +19,9 @@ pub struct EvidenceParams {
     /// Shortest translation, in mean depths: 1/60 moves a point at the mean depth by 9 px of a 640 px
     /// image (Engel, Koltun, Cremers 2018 latch there).
     pub min_translation: f64,
+    /// Longest translation, in mean depths. Beyond it what is seen changes its size so much that nothing is matched: a fit
+    /// that goes there has drawn all points together on a few pixels.
+    pub max_translation: f64,
     /// Shortest translation with which a start can be proven early, in mean depths: 2 px at 640. The
     /// earlier frames must confirm it; its depths are good to a tenth, and later frames correct them.
     pub min_early_translation: f64,
@@ -60,6 +63,7 @@ impl Default for EvidenceParams {
     fn default() -> Self {
         Self {
             min_translation: 1.0 / 60.0,
+            max_translation: 0.5,
             min_early_translation: 0.004,
             min_earlier_frames: 4,
             min_rival_excess: 0.03,
@@ -81,6 +85,7 @@ impl EvidenceParams {
     /// Checks every value.
     pub fn validate(&self) -> Result<(), ParameterError> {
         check_range("min_translation", self.min_translation, 1e-4..=1.0)?;
+        check_range("max_translation", self.max_translation, 0.01..=100.0)?;
         check_range("min_early_translation", self.min_early_translation, 1e-4..=1.0)?;
         check_range("min_earlier_frames", self.min_earlier_frames, 1..=1000)?;
         check_range("min_rival_excess", self.min_rival_excess, 0.0..=10.0)?;
@@ -147,6 +152,7 @@ impl Evidence {
     /// What is missing; `None` when the parallax is proven.
     pub fn missing(&self, params: &EvidenceParams) -> Option<Waiting> {
         let matches = self.visible_ratio >= params.min_visible_ratio
+            && self.translation <= params.max_translation
             && self.median_residual <= params.max_median_residual
             && self.median_residual <= params.max_residual_growth * self.least_residual;
         let is_unrivalled = self.rival.is_none_or(|rival| {
