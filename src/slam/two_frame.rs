@@ -40,7 +40,7 @@ use crate::slam::two_frame::fit::{
 };
 use crate::slam::two_frame::hypothesis::Hypotheses;
 use crate::slam::two_frame::lead::Lead;
-use crate::slam::two_frame::points::Points;
+use crate::slam::two_frame::points::{Points, num_levels};
 use crate::slam::two_frame::spread::spread;
 use crate::slam::two_frame::system::State;
 use crate::slam::two_frame::waypoint::Waypoint;
@@ -486,18 +486,7 @@ fn input<'a>(
     FitInput { images, finest: 0, intrinsics, points }
 }
 
-/// Levels down to about 80 pixels across: a tenth of the image then moves by a few pixels. The shorter side
-/// bounds only stripes: a car's camera is four times as wide as high, and at 1.2 m a frame the road needs
-/// all levels.
-fn num_levels(intrinsics: &Intrinsics) -> usize {
-    const MIN_LONG_SIDE: usize = 64;
-    const MIN_SHORT_SIDE: usize = 20;
-    const MAX_LEVELS: usize = 6;
-    let (width, height) = (intrinsics.width, intrinsics.height);
-    let (long, short) = (width.max(height), width.min(height));
-    let fits = |l: &usize| long >> l >= MIN_LONG_SIDE && short >> l >= MIN_SHORT_SIDE;
-    (0..MAX_LEVELS).take_while(fits).count().max(1)
-}
-
+#[cfg(test)]
+mod fast_tests;
 #[cfg(test)]
 mod tests;

@@ -59,12 +59,17 @@ fn next(source: &mut dyn FrameSource) -> Option<Frame> {
 /// The first start on these frames.
 fn start<'a>(camera: Intrinsics, frames: impl Iterator<Item = &'a Frame>) -> Option<Start> {
     let mut initializer = TwoFrameInitializer::new(camera, TwoFrameParams::default()).unwrap();
-    let mut first = None;
+    let (mut first, mut before) = (None, None);
     for (index, frame) in frames.enumerate() {
         let outcome = initializer.step(&frame.pixels);
+        match outcome.frames {
+            0 => first = Some(frame),
+            1 => first = before,
+            _ => {}
+        }
+        before = Some(frame);
         match outcome.state {
-            InitState::Failed(_) => first = Some(frame),
-            InitState::Waiting(_) => first = first.or(Some(frame)),
+            InitState::Failed(_) | InitState::Waiting(_) => {}
             InitState::Proven => {
                 let first: &Frame = first.expect("a start takes two frames");
                 let truth = first.world_from_camera.inverse() * frame.world_from_camera;

@@ -289,9 +289,9 @@ fn earlier_frames_tell_true_depths_from_those_of_another_motion() {
         let across = f32::from(p.0) / CAMERA.width as f32 - 0.5;
         at(p) * (1.0 + 0.8 * across)
     });
-    let energy =
-        |depths: &[f32]| initializer.earlier_frames.energy(&input, depths, &initializer.params.fit);
-    let (right, wrong) = (energy(&truth), energy(&tilted.collect::<Vec<_>>()));
+    let depths = [&truth[..], &tilted.collect::<Vec<_>>()];
+    let [right, wrong] =
+        initializer.earlier_frames.compare(&input, depths, &initializer.params.fit);
     assert!(right * (1.0 + EvidenceParams::default().min_rival_excess) < wrong, "{right} {wrong}");
 }
 
