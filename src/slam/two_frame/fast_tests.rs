@@ -51,7 +51,9 @@ fn where_the_first_frame_is_out_of_view_the_frame_before_takes_its_place() {
 fn the_first_frame_of_a_slow_camera_stays() {
     let frames = along_the_axis(1, 0.03, 3);
     let mut initializer = initializer();
-    frames[..2].iter().for_each(|frame| drop(initializer.step(frame)));
+    for frame in &frames[..2] {
+        initializer.step(frame);
+    }
     initializer.params.evidence.min_visible_ratio = 1.0;
     assert_eq!(initializer.step(&frames[2]).frames, 2);
     assert_eq!(initializer.first_pixels(), frames[0]);
@@ -97,7 +99,9 @@ fn motions_are_compared_where_both_see_the_points() {
 fn a_point_that_is_behind_the_camera_by_its_noise_is_not_behind_it() {
     let frames = along_the_axis(1, 0.2, 2);
     let mut initializer = initializer();
-    frames.iter().for_each(|frame| drop(initializer.step(frame)));
+    for frame in &frames {
+        initializer.step(frame);
+    }
     let (state, scratch) = initializer.joint.best();
     let negative_ratio = |inverse_depth: f32, std_dev: f32| {
         let num_points = scratch.system.num_points;
@@ -115,7 +119,9 @@ fn a_point_that_is_behind_the_camera_by_its_noise_is_not_behind_it() {
 fn a_point_in_a_wrong_minimum_behind_the_camera_does_not_count() {
     let frames = along_the_axis(1, 0.2, 2);
     let mut initializer = initializer();
-    frames.iter().for_each(|frame| drop(initializer.step(frame)));
+    for frame in &frames {
+        initializer.step(frame);
+    }
     let (state, scratch) = initializer.joint.best();
     let system = &scratch.system;
     let fit = residual_variance(system, &mut Vec::new());
