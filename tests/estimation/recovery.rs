@@ -381,7 +381,8 @@ fn a_map_whose_poses_are_wrong_is_rejected() {
 #[test]
 fn a_start_with_the_wrong_motion_is_rejected_and_another_begun() {
     // A plane seen from two places has two explanations, and here the wrong one fits better.
-    wrong_start(4, 40);
+    wrong_start(6, 40);
+    wrong_start(10, 40);
 }
 
 #[test]
