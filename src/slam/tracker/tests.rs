@@ -313,31 +313,6 @@ fn where_the_light_has_changed_much_another_keyframe_is_asked_for() {
     assert!(proposes((0.5, 0.0)) && proposes((0.6, -10.0)));
 }
 
-#[test]
-fn what_fits_in_another_light_alone_must_fit_as_well_as_after_a_loss() {
-    let (plane, camera) = (small_plane(), small_camera());
-    let keyframe = plane.keyframe(&camera, 2, 0.02);
-    let track = |gain: f64, doubtful_gain: f64| {
-        let mut image = plane.render(&camera, &path(1), 2.0, (gain, 0.0), 7);
-        // A quarter of the view shows something else.
-        let changed = camera.width * (camera.height * 3 / 4);
-        image[changed..].iter_mut().for_each(|grey| *grey = 255 - *grey);
-        let mut params = TrackerParams::default();
-        params.verdict.doubtful_gain = doubtful_gain;
-        let mut tracker = Tracker::new(camera, params).unwrap();
-        tracker.adopt(Box::new(Reference::prepare(&keyframe)));
-        tracker.track(&frame(1, &image), &mut always)
-    };
-    let doubtful = TrackerParams::default().verdict.doubtful_gain;
-    let [same, darker, believed] =
-        [(1.0, doubtful), (0.6, doubtful), (0.6, 10.0)].map(|(gain, most)| track(gain, most));
-    assert!(same.state.is_tracked() && believed.state.is_tracked(), "{same:?}, {believed:?}");
-    assert_eq!(darker.state, TrackingState::Lost(LostReason::TooFewInliers));
-    for inliers in [same, darker].map(|estimate| estimate.quality.inlier_ratio) {
-        assert!((0.55..0.8).contains(&inliers), "{inliers}: the test needs an image in between");
-    }
-}
-
 /// An image without noise, and many with noise of their own.
 struct Shot(Vec<f64>);
 

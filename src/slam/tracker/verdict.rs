@@ -27,10 +27,6 @@ pub struct VerdictParams {
     /// Largest logarithm of the gain, either way, with which a lost tracker may claim a pose: a small gain flattens any
     /// image. Where the camera was before, automatic exposure is about what it was; wrong places had 0.7 to 1.
     pub recovery_gain: f64,
-    /// Logarithm of the gain, either way, beyond which as many inliers are asked for as of a lost tracker: exposure that
-    /// really changes leaves nearly all of them, of a wrong pose the gain is what makes it fit. On recordings that were
-    /// tracked well one in a thousand frames beyond it had fewer.
-    pub doubtful_gain: f64,
     /// Share of points in view and not clipped by the sensor below which a pose is degraded.
     pub degraded_in_view: f64,
     /// Whitened RMSE above which a pose is degraded.
@@ -48,7 +44,6 @@ impl Default for VerdictParams {
             recovery_margin: 0.3,
             recovery_distance: 0.5,
             recovery_gain: 0.5,
-            doubtful_gain: 0.3,
             degraded_in_view: 0.35,
             degraded_whitened_rmse: 2.0,
             gap_frames: 2,
@@ -65,7 +60,6 @@ impl VerdictParams {
         check_range("recovery_margin", self.recovery_margin, 0.0..=1.0)?;
         check_range("recovery_distance", self.recovery_distance, 0.0..=1e3)?;
         check_range("recovery_gain", self.recovery_gain, 0.0..=100.0)?;
-        check_range("doubtful_gain", self.doubtful_gain, 0.0..=100.0)?;
         check_range("degraded_in_view", self.degraded_in_view, 0.0..=1.0)?;
         check_range("degraded_whitened_rmse", self.degraded_whitened_rmse, 0.0..=1e3)?;
         check_range("gap_frames", self.gap_frames, 0..=1_000_000)
@@ -80,8 +74,7 @@ impl VerdictParams {
         missing: u64,
     ) -> TrackingState {
         let compared = f64::from(quality.points) / alignment.points.max(1) as f64;
-        let is_doubtful = was_lost || alignment.state.brightness.a.abs() > self.doubtful_gain;
-        let inliers = self.lost_inliers + if is_doubtful { self.recovery_margin } else { 0.0 };
+        let inliers = self.lost_inliers + if was_lost { self.recovery_margin } else { 0.0 };
         if !alignment.state.current_from_keyframe.is_finite() {
             TrackingState::Lost(LostReason::Diverged)
         } else if alignment.points < self.min_points as usize {
