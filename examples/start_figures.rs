@@ -156,15 +156,20 @@ fn start(
     millis: &mut Vec<f64>,
 ) -> Result<Option<Start>, Box<dyn Error>> {
     let mut initializer = TwoFrameInitializer::new(intrinsics, TwoFrameParams::default())?;
-    let mut first = &frames[0];
+    let (mut first, mut before) = (&frames[0], &frames[0]);
     initializer.begin(&first.pixels);
     for (i, frame) in frames.iter().enumerate().step_by(stride).skip(1) {
         let begun = Instant::now();
         let outcome = initializer.step(&frame.pixels);
         millis.push(begun.elapsed().as_secs_f64() * 1e3);
+        first = match outcome.frames {
+            0 => frame,
+            1 => before,
+            _ => first,
+        };
+        before = frame;
         match outcome.state {
-            InitState::Failed(_) => first = frame,
-            InitState::Waiting(_) => {}
+            InitState::Failed(_) | InitState::Waiting(_) => {}
             InitState::Proven => {
                 let truth = first.world_from_camera.inverse() * frame.world_from_camera;
                 let (found, depths) = (&outcome.first_from_current, initializer.depths());

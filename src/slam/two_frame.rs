@@ -129,7 +129,7 @@ pub struct InitOutcome {
     pub state: InitState,
     /// The figures behind it.
     pub evidence: Evidence,
-    /// How many frames after the first one this frame is; 0 where the next are seen against it.
+    /// How many frames after the first one this frame is; 0 where it is the new first one itself.
     pub frames: u32,
     /// Pose of the frame, in units in which the points' mean inverse depth is 1.
     pub first_from_current: SE3,
@@ -179,7 +179,8 @@ pub struct TwoFrameInitializer {
     significance: f64,
     /// Least median residual of a frame since the first, grey levels.
     least_residual: f64,
-    /// Direction from the first camera to the one before, in the first frame.
+    /// Direction from the first camera to the one before, in the first frame; where the start went on from another frame,
+    /// at first the one in which the camera came there.
     heading: Vector3<f64>,
     lead: Lead,
     /// The frame before, where the next one may need it.
@@ -274,10 +275,12 @@ impl TwoFrameInitializer {
         let mut outcome = self.follow(pixels);
         if let Some(waypoint) = waypoint
             && self.confirmed == 0
-            && (waypoint.confirmed > 0 || self.mismatches > 0)
+            && waypoint.is_needed(&outcome, &self.params.evidence)
         {
-            self.begin_on(&waypoint);
-            outcome = self.follow(pixels);
+            outcome = match self.begin_on(&waypoint) {
+                true => self.follow(pixels),
+                false => self.outcome(InitState::Failed(Failure::Mismatch), outcome.evidence),
+            };
         }
         if matches!(outcome.state, InitState::Failed(_)) {
             self.begin(pixels);
@@ -330,14 +333,17 @@ impl TwoFrameInitializer {
             pixels: pixels.to_vec(),
             heading: self.current_from_first.rotation * self.heading,
             confirmed: self.confirmed,
+            least_residual: self.least_residual,
         });
         self.outcome(state, evidence)
     }
 
-    /// Begins on a frame that proved the parallax; what it proved still counts.
-    fn begin_on(&mut self, waypoint: &Waypoint) {
-        self.begin(&waypoint.pixels);
+    /// Begins on the frame before; what it proved still counts. `false` where it has too little texture.
+    fn begin_on(&mut self, waypoint: &Waypoint) -> bool {
+        let has_begun = self.begin(&waypoint.pixels);
         (self.heading, self.confirmed) = (waypoint.heading, waypoint.confirmed);
+        self.least_residual = waypoint.least_residual;
+        has_begun
     }
 
     /// The frame that the depths belong to; empty before one is begun.
@@ -380,7 +386,7 @@ impl TwoFrameInitializer {
         /// Significance of the frame before from which on parallax may show.
         const PARALLAX_SIGNIFICANCE: f64 = 3.0;
         let input = input(self.pyramid.levels(), &self.intrinsics, &self.points);
-        // From the first frame nothing is known: where the camera moves on by many pixels the right motion may not be
+        // Before the first fit nothing is known: where the camera moves on by many pixels the right motion may not be
         // found from rest.
         let with_directions = self.frames == 1 || self.significance > PARALLAX_SIGNIFICANCE;
         self.joint.fit(
@@ -392,7 +398,7 @@ impl TwoFrameInitializer {
         );
     }
 
-    /// The best motion and its depths again, by the images alone. The priors choose between motions; in the
+    /// The best motion and its depths again, by the images alone. The priors lead to a motion; in the
     /// modes that two frames hardly show (tilt, relief) those of all points add up and would flatten the
     /// scene: by 20 to 60 % on a rendered office.
     fn refit(&mut self) {

@@ -19,7 +19,9 @@ use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::parameter::ParameterError;
 use crate::slam::place_covariance::UncertainPlace;
 use crate::slam::pose::{PoseEstimate, TrackingState, upper_triangle};
-use crate::slam::two_frame::{InitOutcome, InitState, TwoFrameInitializer, TwoFrameParams};
+use crate::slam::two_frame::{
+    Failure, InitOutcome, InitState, TwoFrameInitializer, TwoFrameParams,
+};
 
 /// A two-frame start, and what is said of it.
 #[derive(Debug)]
@@ -80,12 +82,14 @@ impl Start {
         self.last_frame = Some(StartFrame::of(&outcome, is_first, frame.pixels));
         self.progress.observe(outcome.state);
         let stamp = (frame.sequence, frame.capture_nanos);
-        let before = self.latest.replace(stamp);
-        self.first = match outcome.frames {
-            0 => self.latest,
-            1 => before,
-            _ => self.first,
-        };
+        if outcome.state != InitState::Failed(Failure::WrongSize) {
+            let before = self.latest.replace(stamp);
+            self.first = match outcome.frames {
+                0 => self.latest,
+                1 => before,
+                _ => self.first,
+            };
+        }
         if outcome.state == InitState::Proven {
             return self.first.map(|first| Proven { first, outcome, initializer });
         }

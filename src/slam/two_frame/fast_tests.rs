@@ -48,6 +48,30 @@ fn where_the_first_frame_is_out_of_view_the_frame_before_takes_its_place() {
 }
 
 #[test]
+fn a_frame_before_without_enough_points_is_no_first_frame() {
+    let frames = along_the_axis(1, 0.2, 3);
+    let mut initializer = initializer();
+    initializer.step(&frames[0]);
+    initializer.step(&frames[1]);
+    initializer.params.evidence.min_visible_ratio = 0.8;
+    initializer.params.min_points = 100_000;
+    let outcome = initializer.step(&frames[2]);
+    assert_eq!((outcome.state, outcome.frames), (InitState::Failed(Failure::Mismatch), 0));
+}
+
+#[test]
+fn a_camera_that_is_back_goes_on_from_its_first_frame() {
+    let frames = along_the_axis(1, 0.2, 2);
+    let mut initializer = initializer();
+    for frame in [&frames[0], &frames[1]] {
+        initializer.step(frame);
+    }
+    let back = initializer.step(&frames[0]);
+    assert_eq!((back.frames, initializer.confirmed), (2, 0), "{back:?}");
+    assert_eq!(initializer.first_pixels(), frames[0]);
+}
+
+#[test]
 fn the_first_frame_of_a_slow_camera_stays() {
     let frames = along_the_axis(1, 0.03, 3);
     let mut initializer = initializer();

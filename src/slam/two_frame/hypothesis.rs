@@ -3,8 +3,8 @@
 //! With little parallax the energy has several minima (near and far exchanged, a translation taken for
 //! a rotation), and a fit that began in the wrong one stays there while the baseline grows. So each
 //! frame is fitted from where the two best fits of the frame before ended, from there aligned with the
-//! depths that they found, from rest, from the mirrored solution and, once there is something to see,
-//! from a small step in each direction. Of the two best the earlier frames choose.
+//! depths that they found, from rest, from the mirrored solution and, in the first frame and once there is
+//! something to see, from a small step in each direction. Of the two best the earlier frames choose.
 
 use nalgebra::{Vector3, Vector6};
 use rayon::prelude::*;
@@ -37,8 +37,8 @@ pub struct Rival {
     pub excess: f64,
     /// Rotation that the best needs over the one that this needs.
     pub turn_ratio: f64,
-    /// Rotation between the two, radians, over the translation of the best in mean depths. What a plane exchanges is
-    /// of the size of its tilt against the path.
+    /// Rotation between the two, radians, over the translation of the best in mean depths: of the two motions that a
+    /// plane allows the sine of the angle between the path and its normal.
     pub turn_apart: f64,
 }
 
@@ -73,7 +73,7 @@ impl Hypotheses {
     }
 
     /// Fits all hypotheses to a frame. `rotation` is its fit without translation; `with_directions` adds
-    /// the starts, and scores the survivors by `earlier_frames`, which pays only where there is parallax. The
+    /// the starts, and scores the survivors by `earlier_frames`, which pays only where there may be parallax. The
     /// result does not depend on the number of threads.
     pub fn fit(
         &mut self,
@@ -113,14 +113,18 @@ impl Hypotheses {
         }
     }
 
-    /// Puts that survivor first whose depths explain this frame and the earlier ones best.
+    /// Puts that survivor first whose depths explain the images of this frame and the earlier ones best.
     fn score(&mut self, input: &FitInput<'_>, earlier_frames: &EarlierFrames, params: &FitParams) {
         self.scored_by = earlier_frames.len();
         let of_this_frame = compare(&self.all[0].scratch.system, &self.all[1].scratch.system);
         let depths = [0, 1].map(|i| self.all[i].state.inverse_depths.as_slice());
         let of_earlier_frames = earlier_frames.compare(input, depths, params);
         let [mut best, mut other] = [0, 1].map(|i| of_this_frame[i] + of_earlier_frames[i]);
-        if other < best {
+        /// A motion that sees fewer of the other's points than this share has lost them, however the rest fits.
+        const LEAST_SEEN: f64 = 1.0 / 3.0;
+        let seen = [0, 1].map(|i| self.all[i].scratch.system.num_visible as f64);
+        let [is_blind, other_is_blind] = [0, 1].map(|i| seen[i] < LEAST_SEEN * seen[1 - i]);
+        if is_blind || other < best && !other_is_blind {
             self.all.swap(0, 1);
             std::mem::swap(&mut best, &mut other);
         }

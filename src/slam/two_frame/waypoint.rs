@@ -2,8 +2,11 @@
 
 use nalgebra::Vector3;
 
+use crate::slam::two_frame::evidence::{EvidenceParams, Waiting};
+use crate::slam::two_frame::{InitOutcome, InitState};
+
 /// A frame of a camera that moves by a whole baseline from one frame to the next: what follows shows the same as this
-/// frame, but no longer what the first one does.
+/// frame, but soon no longer what the first one does.
 #[derive(Debug)]
 pub(super) struct Waypoint {
     /// Its image.
@@ -12,4 +15,21 @@ pub(super) struct Waypoint {
     pub(super) heading: Vector3<f64>,
     /// Frames in a row up to this one that prove the parallax.
     pub(super) confirmed: u32,
+    /// Least median residual up to this frame, grey levels: the camera's noise.
+    pub(super) least_residual: f64,
+}
+
+impl Waypoint {
+    /// Whether a start can only go on from here after a frame that proves nothing: what was proven here is not seen any
+    /// more, or the first frame is out of view.
+    pub(super) fn is_needed(&self, outcome: &InitOutcome, params: &EvidenceParams) -> bool {
+        // A camera that is back where it was, or was never away.
+        let is_still = matches!(
+            outcome.state,
+            InitState::Waiting(Waiting::Significance | Waiting::Translation)
+        );
+        let is_out_of_view = outcome.evidence.visible_ratio < params.min_visible_ratio
+            || outcome.evidence.translation > params.max_translation;
+        !is_still && (self.confirmed > 0 || is_out_of_view)
+    }
 }
