@@ -44,7 +44,7 @@ struct Running {
 impl Running {
     fn start(rig: &Rig) -> Self {
         let own = rig.folder().join("own");
-        let mut command = rig.run(40, &["--live", "--json", "--source", SOURCE]);
+        let mut command = rig.run(120, &["--live", "--json", "--source", SOURCE]);
         let child = command.arg("--map").arg(&own).spawn().unwrap();
         let hub = rig.observe();
         let mapper = until("the mapper's health", || Peer::open(&hub, &MAPPER_HEALTH).ok());
