@@ -99,42 +99,31 @@ fn no_depth_filter_depends_on_the_number_of_threads() {
 }
 
 #[test]
-fn points_from_the_interval_filter_do_not_depend_on_the_number_of_threads() {
+fn points_of_either_filter_and_passes_do_not_depend_on_the_number_of_threads() {
     let rig = Rig::new();
-    let replayed = |source: &str, threads: &str| {
-        let output = rig.folder().join(format!("{source}-{threads}"));
-        let chosen = format!("mapping.window.points_from=\"{source}\"");
-        let arguments = ["replay", "sim", "--threads", threads, "--set", &chosen];
-        let figures = summary(rig.command(&arguments), &output);
-        assert!(figures["adjustments"].as_u64().unwrap() >= 3, "{source}: {figures}");
-        contents(&output)
-    };
-    let [one, two, four] = ["1", "2", "4"].map(|threads| replayed("interval", threads));
-    assert_same(&one, &two, "points from interval, 1 and 2 threads");
-    assert_same(&one, &four, "points from interval, 1 and 4 threads");
-    // The default, which is compared above.
-    let gaussian = replayed("gaussian", "2");
-    let points = FILES.iter().position(|name| *name == "points.ply").unwrap();
-    assert!(gaussian[points] != one[points], "the switch changes no point");
-}
-
-#[test]
-fn passes_over_all_keyframes_do_not_depend_on_the_number_of_threads() {
-    let rig = Rig::new();
-    let of = |name: &str, threads: &str, every: &str| {
-        let output = rig.folder().join(name);
+    let of = |threads: &str, source: &str, every: &str| {
+        let output = rig.folder().join(format!("{threads}-{source}-{every}"));
         let mut arguments = vec!["replay", "sim", "--threads", threads];
-        // Keyframes of a short sequence are few: a pass begins with the third.
+        let source = format!("mapping.window.points_from=\"{source}\"");
         let every = format!("mapping.window.pass_every={every}");
-        for chosen in [&every, "mapping.window.num_first=2", "mapping.window.num_free=2"] {
+        // Keyframes of a short sequence are few: a pass begins with the third.
+        let few = ["mapping.window.num_first=2", "mapping.window.num_free=2"];
+        for chosen in [&source, &every].map(String::as_str).into_iter().chain(few) {
             arguments.extend(["--set", chosen]);
         }
         let figures = summary(rig.command(&arguments), &output);
-        (contents(&output), figures["adjustments"].as_u64().unwrap())
+        let estimates = figures["adjustments"].as_u64().unwrap();
+        assert!(estimates >= 3, "points from {source}, {every}: {figures}");
+        (contents(&output), estimates)
     };
-    let [(one, estimates), (two, _), (four, _)] = ["1", "2", "4"].map(|n| of(n, n, "1"));
-    assert_same(&one, &two, "passes, 1 and 2 threads");
-    assert_same(&one, &four, "passes, 1 and 4 threads");
-    let (_, without) = of("without", "1", "0");
+    let [(one, estimates), (two, _), (four, _)] =
+        ["1", "2", "4"].map(|threads| of(threads, "interval", "1"));
+    assert_same(&one, &two, "points from interval, with passes, 1 and 2 threads");
+    assert_same(&one, &four, "points from interval, with passes, 1 and 4 threads");
+    let (_, without) = of("2", "interval", "0");
     assert!(estimates > without, "no piece was estimated: {estimates} of {without}");
+    // The default's points are compared above.
+    let (gaussian, _) = of("2", "gaussian", "1");
+    let points = FILES.iter().position(|name| *name == "points.ply").unwrap();
+    assert!(gaussian[points] != one[points], "the switch changes no point");
 }
