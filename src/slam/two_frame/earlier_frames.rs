@@ -11,7 +11,8 @@ use rayon::prelude::*;
 
 use crate::slam::image::buffer::Image;
 use crate::slam::two_frame::fit::{FitInput, FitParams, FitScratch, Freedom, fit_level};
-use crate::slam::two_frame::system::{State, System, compare};
+use crate::slam::two_frame::state::State;
+use crate::slam::two_frame::system::{System, compare};
 
 /// Levels on which an earlier frame is used to score, coarse to fine: motions differ by pixels, and half of the
 /// resolution is a quarter of the time and memory.
@@ -54,17 +55,21 @@ impl EarlierFrames {
     }
 
     /// Energies of the earlier frames with the depths of two motions, each frame from the pose that fits it best, of the
-    /// points that both see. `input` gives points and intrinsics. The sums go in the order of the frames.
+    /// points that both see; `has_slopes`: with a gain that may differ from place to place. `input` gives points and intrinsics. The sums go in the order of the frames.
     pub fn compare(
         &self,
         input: &FitInput<'_>,
         inverse_depths: [&[f32]; 2],
+        has_slopes: bool,
         params: &FitParams,
     ) -> [f64; 2] {
         let (finest, coarsest) = scoring_levels(input.intrinsics.len());
         let fit = |frame: &EarlierFrame, inverse_depths: &[f32]| -> System {
             let input = FitInput { images: &frame.images, finest, ..*input };
             let mut state = frame.rotation.clone();
+            if has_slopes {
+                state.free_slopes();
+            }
             state.inverse_depths.clear();
             state.inverse_depths.extend_from_slice(inverse_depths);
             let mut scratch = FitScratch::default();

@@ -53,6 +53,7 @@ impl Elimination {
         self.inverse_information.clear();
         self.slopes.clear();
         let weights = self.weights;
+        let num_unknowns = system.num_unknowns();
         for (i, block) in system.blocks.iter().enumerate() {
             let (d, median) = (lanes_of(inverse_depths, i, 1.0), lanes_of(medians, i, 1.0));
             let inverse = lanes(|l| {
@@ -64,7 +65,7 @@ impl Elimination {
                     weights.neighbour * (d[l] - median[l]) + weights.depth * (d[l] - 1.0);
                 (block.gradient[l] + by_prior) * inverse[l]
             });
-            for r in 0..NUM_UNKNOWNS {
+            for r in 0..num_unknowns {
                 let scaled = lanes(|l| block.mixed[r][l] * inverse[l]);
                 self.sums.add_row(r, &lanes(|l| block.mixed[r][l] * slope[l]));
                 for c in 0..=r {
@@ -89,10 +90,11 @@ impl Elimination {
         let step: [f32; NUM_UNKNOWNS] = std::array::from_fn(|k| step[k] as f32);
         after.clear();
         let mut promised = LaneSum::default();
+        let num_unknowns = system.num_unknowns();
         for (i, block) in system.blocks.iter().enumerate() {
             let d = lanes_of(inverse_depths, i, 1.0);
             let mut by_pose = [0.0; LANES];
-            for k in 0..NUM_UNKNOWNS {
+            for k in 0..num_unknowns {
                 for l in 0..LANES {
                     by_pose[l] += block.mixed[k][l] * step[k];
                 }

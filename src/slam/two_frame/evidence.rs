@@ -9,7 +9,8 @@ use serde::{Deserialize, Serialize};
 use crate::slam::depth::pattern::PATTERN;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::two_frame::hypothesis::Rival;
-use crate::slam::two_frame::system::{State, System};
+use crate::slam::two_frame::state::State;
+use crate::slam::two_frame::system::System;
 use crate::slam::upper_median::upper_median;
 
 /// What counts as proof.

@@ -11,11 +11,11 @@ use crate::slam::image::noise::ImageNoise;
 use crate::slam::kernel::Kernel;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::two_frame::elimination::{Elimination, PriorWeights, prior_energy};
-use crate::slam::two_frame::lanes::NUM_UNKNOWNS;
+use crate::slam::two_frame::lanes::{FIRST_SLOPE, NUM_UNKNOWNS};
 use crate::slam::two_frame::points::Points;
-use crate::slam::two_frame::system::{LevelView, PointSystem, State, System};
+use crate::slam::two_frame::state::State;
+use crate::slam::two_frame::system::{LevelView, System};
 use crate::slam::two_frame::system_kernel::{Medians, Reduction};
-use crate::slam::upper_median::upper_median;
 
 /// Tuning of the fit.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -181,6 +181,9 @@ pub fn fit_level(
     before
 }
 
+/// A matrix over the unknowns of pose and brightness: normal equations, or the covariance for residuals of variance 1.
+pub type PoseMatrix = SMatrix<f64, NUM_UNKNOWNS, NUM_UNKNOWNS>;
+
 /// Damping of the steps, and how many more in a row may fail.
 struct Damping {
     factor: f64,
@@ -241,6 +244,9 @@ fn step_of(
 
 /// The state after a step of pose and brightness, without depths.
 fn moved(state: &State, step: &SVector<f64, NUM_UNKNOWNS>) -> State {
+    /// What a lens that loses half of the light in the corners comes to where the image has moved by a tenth to a fifth
+    /// of its width, 1 a unit of the ray. Without a bound another scene is explained by slopes of 6.
+    const MAX_GAIN_SLOPE: f64 = 0.5;
     let twist = Vector6::from_iterator(step.iter().take(6).copied());
     let mut brightness = state.brightness;
     brightness.a += step[6];
@@ -248,20 +254,24 @@ fn moved(state: &State, step: &SVector<f64, NUM_UNKNOWNS>) -> State {
     State {
         current_from_first: SE3::exp(&twist) * state.current_from_first,
         brightness,
+        gain_slopes: state.gain_slopes.map(|slopes| {
+            let slope = |i: usize| slopes[i] + step[FIRST_SLOPE + i];
+            [0, 1].map(|i| slope(i).clamp(-MAX_GAIN_SLOPE, MAX_GAIN_SLOPE))
+        }),
         inverse_depths: Vec::new(),
     }
 }
 
 /// The step of rotation and brightness; the translation stays.
 fn rotation_step(system: &System, damping: f64) -> Option<Step> {
-    let mut hessian = system.hessian.fixed_view::<5, 5>(3, 3).into_owned();
-    for i in 0..5 {
-        hessian[(i, i)] = hessian[(i, i)] * (1.0 + damping) + f64::MIN_POSITIVE;
-    }
-    let gradient = system.gradient.fixed_rows::<5>(3).into_owned();
-    let solved = hessian.cholesky()?.solve(&-gradient);
-    let mut step = SVector::<f64, NUM_UNKNOWNS>::zeros();
-    step.fixed_rows_mut::<5>(3).copy_from(&solved);
+    const ROTATION: usize = 3;
+    const HELD: usize = FIRST_SLOPE - ROTATION;
+    const FREE: usize = NUM_UNKNOWNS - ROTATION;
+    let hessian = damped(system, damping);
+    let step = match system.has_slopes {
+        true => solve::<ROTATION, FREE>(&hessian, &system.gradient)?,
+        false => solve::<ROTATION, HELD>(&hessian, &system.gradient)?,
+    };
     Step::of_pose_alone(step, system)
 }
 
@@ -272,12 +282,41 @@ fn find_medians(input: &FitInput<'_>, state: &State, medians: &mut Vec<f32>) {
 
 /// The step of pose and brightness with the depths held.
 fn pose_step(system: &System, damping: f64) -> Option<Step> {
+    let step = solve_for_all(system, &damped(system, damping), &system.gradient)?;
+    Step::of_pose_alone(step, system)
+}
+
+/// The normal equations with damping.
+fn damped(system: &System, damping: f64) -> PoseMatrix {
     let mut hessian = system.hessian;
     for i in 0..NUM_UNKNOWNS {
         hessian[(i, i)] = hessian[(i, i)] * (1.0 + damping) + f64::MIN_POSITIVE;
     }
-    let step = hessian.cholesky()?.solve(&-system.gradient);
-    Step::of_pose_alone(step, system)
+    hessian
+}
+
+/// −H⁻¹g over all unknowns that are not held.
+fn solve_for_all(
+    system: &System,
+    hessian: &PoseMatrix,
+    gradient: &SVector<f64, NUM_UNKNOWNS>,
+) -> Option<SVector<f64, NUM_UNKNOWNS>> {
+    match system.has_slopes {
+        true => solve::<0, NUM_UNKNOWNS>(hessian, gradient),
+        false => solve::<0, FIRST_SLOPE>(hessian, gradient),
+    }
+}
+
+/// −H⁻¹g over `COUNT` unknowns from `FIRST` on; the others stay.
+fn solve<const FIRST: usize, const COUNT: usize>(
+    hessian: &PoseMatrix,
+    gradient: &SVector<f64, NUM_UNKNOWNS>,
+) -> Option<SVector<f64, NUM_UNKNOWNS>> {
+    let hessian = hessian.fixed_view::<COUNT, COUNT>(FIRST, FIRST).into_owned();
+    let gradient = gradient.fixed_rows::<COUNT>(FIRST).into_owned();
+    let mut step = SVector::<f64, NUM_UNKNOWNS>::zeros();
+    step.fixed_rows_mut::<COUNT>(FIRST).copy_from(&hessian.cholesky()?.solve(&-gradient));
+    Some(step)
 }
 
 /// The step of pose and brightness; the depths after it go to `trial_depths`.
@@ -295,7 +334,7 @@ fn joint_step(scratch: &mut FitScratch, state: &State, damping: f64) -> Option<S
             hessian[(r, c)] -= elimination.sums.entry(r, c);
         }
     }
-    let of_pose = hessian.cholesky()?.solve(&-gradient);
+    let of_pose = solve_for_all(system, &hessian, &gradient)?;
     if !is_sane(&of_pose) {
         return None;
     }
@@ -316,74 +355,29 @@ impl Step {
 fn is_sane(step: &SVector<f64, NUM_UNKNOWNS>) -> bool {
     /// In mean depths, radians and log gain; the offset is bounded by the grey scale.
     const LARGEST: f64 = 1.0;
-    step.iter().all(|x| x.is_finite()) && step.iter().take(7).all(|x| x.abs() < LARGEST)
+    const OFFSET: usize = 7;
+    step.iter().enumerate().all(|(i, x)| x.is_finite() && (i == OFFSET || x.abs() < LARGEST))
 }
 
-/// Covariance of pose and brightness for residuals of variance 1.
-pub type PoseCovariance = SMatrix<f64, NUM_UNKNOWNS, NUM_UNKNOWNS>;
-
-/// Variance of each point's inverse depth with the length of the translation held: its own residuals',
-/// and what the uncertainty of the pose adds, by [`pose_covariance`]. `noise` is the variance of a residual, `match_variance_px`
-/// that of what interpolation and sampling misplace, pixels²; infinite where a point is not visible.
-pub fn depth_variances(
-    pose_covariance: Option<&PoseCovariance>,
-    system: &System,
-    noise: f32,
-    match_variance_px: f32,
-    variances: &mut Vec<f32>,
-) {
-    variances.clear();
-    variances.extend(system.points().map(|point| {
-        let Some(pose_covariance) = pose_covariance else { return f32::INFINITY };
-        if !point.visible || !(point.information > 0.0) || !(point.squared_speed > 0.0) {
-            return f32::INFINITY;
-        }
-        let mixed = SVector::from(point.mixed.map(f64::from)) / f64::from(point.information);
-        let from_pose = (mixed.transpose() * pose_covariance * mixed)[0] as f32;
-        noise * (1.0 / point.information + from_pose) + match_variance_px / point.squared_speed
-    }));
-}
-
-/// Median over the visible points of the relative error that the uncertainty of the pose gives all depths
-/// together, infinite where it cannot be told; `noise` is the variance of a residual.
-pub fn common_error(
-    pose_covariance: Option<&PoseCovariance>,
+/// By which share its energy on a level would fall if the gain might differ from place to place, to first order: what
+/// free slopes promise beyond what the other unknowns still do. The scratch keeps the system of `state`.
+pub fn promised_by_slopes(
+    input: &FitInput<'_>,
+    level: usize,
     state: &State,
-    system: &System,
-    noise: f32,
+    scratch: &mut FitScratch,
+    params: &FitParams,
 ) -> f64 {
-    let Some(pose_covariance) = pose_covariance else { return f64::INFINITY };
-    let is_placed =
-        |(point, d): &(PointSystem, &f32)| point.visible && point.information > 0.0 && **d > 0.0;
-    let points = system.points().zip(&state.inverse_depths).filter(is_placed);
-    let mut errors: Vec<f32> = points
-        .map(|(point, d)| {
-            let mixed = SVector::from(point.mixed.map(f64::from)) / f64::from(point.information);
-            let variance = (mixed.transpose() * pose_covariance * mixed)[0] as f32 * noise;
-            variance.sqrt() / d
-        })
-        .collect();
-    upper_median(&mut errors, f32::total_cmp).map_or(f64::INFINITY, f64::from)
-}
-
-/// Inverse of the pose's normal equations after elimination of the depths, scale held; `None` where
-/// they are not positive definite.
-pub fn pose_covariance(state: &State, system: &System) -> Option<PoseCovariance> {
-    let mut hessian = system.hessian;
-    for point in system.points().filter(|p| p.visible && p.information > 0.0) {
-        let mixed = SVector::from(point.mixed.map(f64::from));
-        hessian.ger(-1.0 / f64::from(point.information), &mixed, &mixed, 1.0);
-    }
-    let length = state.current_from_first.translation.norm();
-    if length > 0.0 {
-        // A weight far above any other holds the translation's length.
-        let weight = 1e3 * system.hessian.diagonal().rows(0, 3).sum();
-        let direction = state.current_from_first.translation / length;
-        let mut along = SVector::<f64, NUM_UNKNOWNS>::zeros();
-        along.fixed_rows_mut::<3>(0).copy_from(&direction);
-        hessian.ger(weight, &along, &along, 1.0);
-    }
-    hessian.cholesky().map(|factor| factor.inverse())
+    let weights = params.prior_weights();
+    find_medians(input, state, &mut scratch.medians);
+    let mut freed = state.clone();
+    freed.free_slopes();
+    let [free, held] = [&freed, state].map(|state| {
+        scratch.system.evaluate(&input.level(level), state);
+        let step = step_of(Freedom::Everything, scratch, state, 0.0, weights);
+        step.map_or(0.0, |step| step.promised_drop)
+    });
+    (free - held) / scratch.system.energy.max(f64::MIN_POSITIVE)
 }
 
 #[cfg(test)]
@@ -415,6 +409,7 @@ mod tests {
         let state = State {
             current_from_first: SE3::identity(),
             brightness: Brightness::default(),
+            gain_slopes: None,
             inverse_depths: (0..LANES).map(|l| 0.8 + 0.05 * l as f32).collect(),
         };
         let weights = PriorWeights { neighbour: 0.7, depth: 0.5 };

@@ -11,8 +11,11 @@ use rayon::prelude::*;
 
 use crate::slam::geometry::se3::SE3;
 use crate::slam::two_frame::earlier_frames::EarlierFrames;
-use crate::slam::two_frame::fit::{FitInput, FitParams, FitScratch, Freedom, fit_level};
-use crate::slam::two_frame::system::{State, compare};
+use crate::slam::two_frame::fit::{
+    FitInput, FitParams, FitScratch, Freedom, fit_level, promised_by_slopes,
+};
+use crate::slam::two_frame::state::State;
+use crate::slam::two_frame::system::compare;
 
 /// Survivors, the same aligned first, rest, mirror and six directions.
 const MAX_HYPOTHESES: usize = 2 * NUM_SURVIVORS + 2 + 6;
@@ -118,7 +121,8 @@ impl Hypotheses {
         self.scored_by = earlier_frames.len();
         let of_this_frame = compare(&self.all[0].scratch.system, &self.all[1].scratch.system);
         let depths = [0, 1].map(|i| self.all[i].state.inverse_depths.as_slice());
-        let of_earlier_frames = earlier_frames.compare(input, depths, params);
+        let has_slopes = self.all[0].state.gain_slopes.is_some();
+        let of_earlier_frames = earlier_frames.compare(input, depths, has_slopes, params);
         let [mut best, mut other] = [0, 1].map(|i| of_this_frame[i] + of_earlier_frames[i]);
         /// A motion that sees fewer of the other's points than this share has lost them, however the rest fits.
         const LEAST_SEEN: f64 = 1.0 / 3.0;
@@ -140,6 +144,17 @@ impl Hypotheses {
                 turn_apart: between / translation.max(f64::MIN_POSITIVE),
             });
         }
+    }
+
+    /// By which share of its energy the best fit would fall if the gain might differ from place to place.
+    pub fn promised_by_slopes(&mut self, input: &FitInput<'_>, params: &FitParams) -> f64 {
+        let best = &mut self.all[0];
+        promised_by_slopes(input, 0, &best.state, &mut best.scratch, params)
+    }
+
+    /// Lets the gain differ from place to place, from the next fit on.
+    pub fn free_slopes(&mut self) {
+        self.all[..self.survivors].iter_mut().for_each(|h| h.state.free_slopes());
     }
 
     /// Fits the best again on one level, from where it is.
@@ -192,7 +207,7 @@ impl Hypotheses {
     fn add(&mut self, like: &State, current_from_first: SE3, depth: impl Fn(f32) -> f32) {
         let state = &mut self.all[self.used].state;
         state.current_from_first = current_from_first;
-        state.brightness = like.brightness;
+        (state.brightness, state.gain_slopes) = (like.brightness, like.gain_slopes);
         state.inverse_depths.clear();
         state.inverse_depths.extend(like.inverse_depths.iter().map(|&d| depth(d)));
         self.used += 1;

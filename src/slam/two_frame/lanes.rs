@@ -46,8 +46,11 @@ impl LaneSum {
     }
 }
 
-/// Translation, rotation, a, b.
-pub const NUM_UNKNOWNS: usize = 8;
+/// Translation, rotation, a, b, slopes of the gain.
+pub const NUM_UNKNOWNS: usize = 10;
+
+/// The first of the slopes among them; without these there are so many.
+pub const FIRST_SLOPE: usize = 8;
 
 /// Places of a symmetric matrix's lower triangle.
 pub const NUM_TRIANGLE: usize = NUM_UNKNOWNS * (NUM_UNKNOWNS + 1) / 2;

@@ -4,12 +4,13 @@
 //! With x = K⁻¹p of a sample p of the pattern, q = R x + t d and p' = π(q) (R, t: current_from_first):
 //!
 //! ```text
-//! r = I(p') − (eᵃ I₀(p) + b)
+//! r = I(p') − (c + b)     c = exp(a + s·x) I₀(p)
 //! (α, β) = (g_u f_x, g_v f_y)/q_z      γ = −(α q_x + β q_y)/q_z      j = (α, β, γ)
-//! ∂r/∂δ = (d j, q × j)     ∂r/∂d = j·t     ∂r/∂(a, b) = (−eᵃ I₀, −1)
+//! ∂r/∂δ = (d j, q × j)     ∂r/∂d = j·t     ∂r/∂(a, b, s) = (−c, −1, −c x)
 //! ```
 //!
-//! δ = (translation, rotation), `current_from_first ← exp(δ) current_from_first`. All of it stays finite
+//! δ = (translation, rotation), `current_from_first ← exp(δ) current_from_first`. The slope s of the gain, over x and y of
+//! the rays, is what a vignette comes to where the image moves across it. All of it stays finite
 //! at d = 0, a point at infinity. Residuals and gradients are those of each sample; what moves the
 //! projection is taken at the point itself for its whole pattern (Engel, Koltun, Cremers 2018 §2.3), so
 //! that a sample adds to 14 sums and not to 80.
@@ -18,28 +19,16 @@ use nalgebra::{SMatrix, SVector};
 
 use crate::slam::depth::pattern::PATTERN;
 use crate::slam::geometry::intrinsics::Intrinsics;
-use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;
-use crate::slam::pose::Brightness;
 use crate::slam::two_frame::lanes::{
-    LANES, LaneSum, Lanes, NUM_UNKNOWNS, NormalSums, lanes, lanes_of,
+    FIRST_SLOPE, LANES, LaneSum, Lanes, NUM_UNKNOWNS, NormalSums, lanes, lanes_of,
 };
 use crate::slam::two_frame::points::PatchBlock;
 use crate::slam::two_frame::sampling_kernel::WindowSampler;
+use crate::slam::two_frame::state::State;
 
 /// Residuals beyond this many grey levels grow linearly (Engel, Koltun, Cremers 2018).
 pub const HUBER_GREY: f32 = 9.0;
-
-/// What is estimated.
-#[derive(Debug, Clone)]
-pub struct State {
-    /// Pose, in the unit of 1/d.
-    pub current_from_first: SE3,
-    /// Brightness of the current frame against the first.
-    pub brightness: Brightness,
-    /// Inverse depth of each point.
-    pub inverse_depths: Vec<f32>,
-}
 
 /// One level of the current frame and of the points.
 #[derive(Debug, Clone, Copy)]
@@ -107,9 +96,16 @@ pub struct System {
     pub energy: f64,
     /// Points in view.
     pub num_visible: usize,
+    /// Whether the slopes of the gain are among the unknowns; where they are held their rows are zero.
+    pub has_slopes: bool,
 }
 
 impl System {
+    /// How many of the unknowns are not held; these come first.
+    pub fn num_unknowns(&self) -> usize {
+        if self.has_slopes { NUM_UNKNOWNS } else { FIRST_SLOPE }
+    }
+
     /// Each point's part.
     pub fn points(&self) -> impl Iterator<Item = PointSystem> {
         (0..self.num_points).map(|i| {
@@ -147,6 +143,7 @@ impl System {
             self.blocks.push(block);
         }
         self.energy = energy.total();
+        self.has_slopes = state.gain_slopes.is_some();
         for r in 0..NUM_UNKNOWNS {
             self.gradient[r] = sums.row(r);
             for c in 0..=r {
@@ -185,6 +182,7 @@ struct Geometry {
     cy: f32,
     gain: f32,
     offset: f32,
+    gain_slopes: Option<[f32; 2]>,
 }
 
 impl Geometry {
@@ -204,15 +202,33 @@ impl Geometry {
             cy: intrinsics.cy as f32,
             gain: state.brightness.a.exp() as f32,
             offset: state.brightness.b as f32,
+            gain_slopes: state.gain_slopes.map(|slopes| slopes.map(|slope| slope as f32)),
         }
     }
 
-    /// q of points of inverse depth `d`.
+    /// x and y of the rays of points.
     #[inline(always)]
-    fn moved(&self, patch: &PatchBlock, d: &Lanes) -> [Lanes; 3] {
+    fn rays(&self, patch: &PatchBlock) -> [Lanes; 2] {
+        [lanes(|l| (patch.u[l] - self.cx) / self.fx), lanes(|l| (patch.v[l] - self.cy) / self.fy)]
+    }
+
+    /// The gains of points on the rays, and the derivatives of their logarithms by the slopes. The exponential is its
+    /// series to the second order, which is never below ½.
+    #[inline(always)]
+    fn gains(&self, rays: &[Lanes; 2]) -> (Lanes, Option<[Lanes; 2]>) {
+        let Some([by_x, by_y]) = self.gain_slopes else { return ([self.gain; LANES], None) };
+        let [x, y] = rays;
+        let grown = lanes(|l| by_x * x[l] + by_y * y[l]);
+        let factor = lanes(|l| 1.0 + grown[l] + 0.5 * grown[l] * grown[l]);
+        let gain = lanes(|l| self.gain * factor[l]);
+        let by_slopes = rays.map(|ray| lanes(|l| ray[l] * (1.0 + grown[l]) / factor[l]));
+        (gain, Some(by_slopes))
+    }
+
+    /// q of points of inverse depth `d` on the rays.
+    #[inline(always)]
+    fn moved(&self, [x, y]: &[Lanes; 2], d: &Lanes) -> [Lanes; 3] {
         let (m, t) = (&self.rotation, &self.translation);
-        let x = lanes(|l| (patch.u[l] - self.cx) / self.fx);
-        let y = lanes(|l| (patch.v[l] - self.cy) / self.fy);
         [0, 1, 2].map(|r| lanes(|l| m[r][0] * x[l] + m[r][1] * y[l] + m[r][2] + t[r] * d[l]))
     }
 
@@ -228,8 +244,10 @@ impl Geometry {
     }
 }
 
-/// Sums over the samples of each point's pattern. c is eᵃ I₀, w the weight with Huber's.
+/// Sums over the samples of each point's pattern. w is the weight with Huber's.
 struct PatternSums {
+    /// ∂ ln c/∂s, of which all slopes of c are multiples; `None` where s is held.
+    by_slopes: Option<[Lanes; 2]>,
     /// q of the point itself.
     q: [Lanes; 3],
     /// Σ w (g_u², g_u g_v, g_v²).
@@ -259,8 +277,11 @@ impl PatternSums {
         const MIN_DEPTH_RATIO: f32 = 0.05;
         // One pixel inside the border, where the central difference is defined.
         let (last_u, last_v) = ((image.width() - 2) as f32, (image.height() - 2) as f32);
+        let rays = geometry.rays(patch);
+        let (gain, by_slopes) = geometry.gains(&rays);
         let mut sums = Self {
-            q: geometry.moved(patch, d),
+            by_slopes,
+            q: geometry.moved(&rays, d),
             squares: [[0.0; LANES]; 3],
             by_u: [[0.0; LANES]; 2],
             by_v: [[0.0; LANES]; 2],
@@ -275,7 +296,7 @@ impl PatternSums {
                 let is_inside = (u[l] >= 1.0) & (v[l] >= 1.0) & (u[l] < last_u) & (v[l] < last_v);
                 sums.visible[l] &= is_inside & (z[l] > MIN_DEPTH_RATIO);
             }
-            let c = lanes(|l| geometry.gain * patch.intensities[k][l]);
+            let c = lanes(|l| gain[l] * patch.intensities[k][l]);
             let [brightness, gu, gv] = sampler.sample(image, &u, &v);
             let r = lanes(|l| brightness[l] - (c[l] + geometry.offset));
             sums.add_sample(&r, [&gu, &gv], &c, &patch.weights[k]);
@@ -386,6 +407,9 @@ impl PatternSums {
                 let (u, v) = (&self.by_u[b], &self.by_v[b]);
                 let entry = lanes(|l| -(u[l] * by_u[i][l] + v[l] * by_v[i][l]));
                 normal.add_entry(6 + b, i, &entry);
+                for (s, x) in self.by_slopes.iter().flatten().enumerate().filter(|_| b == 0) {
+                    normal.add_entry(FIRST_SLOPE + s, i, &product(x, &entry));
+                }
             }
         }
         for b in 0..2 {
@@ -397,6 +421,16 @@ impl PatternSums {
         normal.add_entry(6, 6, &self.by_brightness[0]);
         normal.add_entry(7, 6, &self.by_brightness[1]);
         normal.add_entry(7, 7, &self.by_brightness[2]);
+        for (s, x) in self.by_slopes.iter().flatten().enumerate() {
+            let row = FIRST_SLOPE + s;
+            mixed[row] = product(x, &mixed[6]);
+            normal.add_row(row, &lanes(|l| -x[l] * rc[l]));
+            let by_brightness = [0, 1].map(|b| product(x, &self.by_brightness[b]));
+            (0..2).for_each(|b| normal.add_entry(row, 6 + b, &by_brightness[b]));
+            for (t, y) in self.by_slopes.iter().flatten().take(s + 1).enumerate() {
+                normal.add_entry(row, FIRST_SLOPE + t, &product(y, &by_brightness[0]));
+            }
+        }
         mixed
     }
 }
@@ -447,6 +481,11 @@ fn add(sum: &mut Lanes, value: &Lanes) {
     for l in 0..LANES {
         sum[l] += value[l];
     }
+}
+
+#[inline(always)]
+fn product(a: &Lanes, b: &Lanes) -> Lanes {
+    lanes(|l| a[l] * b[l])
 }
 
 #[inline(always)]

@@ -5,7 +5,8 @@
 use crate::slam::kernel::{Body, Instructions, Kernel};
 use crate::slam::two_frame::elimination::{Elimination, neighbour_medians};
 use crate::slam::two_frame::points::NeighbourBlock;
-use crate::slam::two_frame::system::{LevelView, State, System};
+use crate::slam::two_frame::state::State;
+use crate::slam::two_frame::system::{LevelView, System};
 
 impl System {
     /// Evaluates every point at `state`. Sums go in the order of the points.

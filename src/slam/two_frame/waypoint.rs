@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 
 use crate::slam::two_frame::evidence::{EvidenceParams, Waiting};
-use crate::slam::two_frame::{InitOutcome, InitState};
+use crate::slam::two_frame::outcome::{InitOutcome, InitState};
 
 /// A frame of a camera that moves by a whole baseline from one frame to the next: what follows shows the same as this
 /// frame, but soon no longer what the first one does.
