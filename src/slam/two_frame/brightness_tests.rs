@@ -86,3 +86,16 @@ fn to_ask_what_slopes_promise_changes_nothing() {
     assert_eq!(scratch.system.hessian, fitted.hessian);
     assert_eq!(scratch.system.gradient, fitted.gradient);
 }
+
+#[test]
+fn an_even_image_does_not_match() {
+    let (first, _, _) = two_views(2.0);
+    let mut initializer = TwoFrameInitializer::new(CAMERA, TwoFrameParams::default()).unwrap();
+    assert!(initializer.begin(&first));
+    for grey in [0u8, 90, 200] {
+        let even: Vec<u8> = first.iter().map(|&seen| grey + seen / 50).collect();
+        assert!(initializer.begin(&first));
+        let outcome = initializer.step(&even);
+        assert_eq!(outcome.state, InitState::Waiting(Waiting::Match), "{grey}: {outcome:?}");
+    }
+}

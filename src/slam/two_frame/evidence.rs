@@ -144,6 +144,8 @@ pub struct Evidence {
     pub median_residual: f64,
     /// The least of these among the frames of this start, at least the camera's noise.
     pub least_residual: f64,
+    /// Logarithm of the gain against the first frame.
+    pub log_gain: f64,
     /// The second best motion; `None` where there is no other.
     pub rival: Option<Rival>,
     /// Earlier frames that were asked which motion they show.
@@ -153,10 +155,14 @@ pub struct Evidence {
 impl Evidence {
     /// What is missing; `None` when the parallax is proven.
     pub fn missing(&self, params: &EvidenceParams) -> Option<Waiting> {
+        /// A factor of four: no exposure changes by more within a start, and a small gain explains any image by an even
+        /// one.
+        const MAX_LOG_GAIN: f64 = 1.4;
         let matches = self.visible_ratio >= params.min_visible_ratio
             && self.translation <= params.max_translation
             && self.median_residual <= params.max_median_residual
-            && self.median_residual <= params.max_residual_growth * self.least_residual;
+            && self.median_residual <= params.max_residual_growth * self.least_residual
+            && self.log_gain.abs() <= MAX_LOG_GAIN;
         let is_unrivalled = self.rival.is_none_or(|rival| {
             let turns_less = rival.turn_ratio <= params.max_turn_ratio
                 || rival.turn_apart < params.min_turn_apart;
@@ -255,6 +261,7 @@ pub fn judge(
         median_residual,
         common_error: f64::INFINITY,
         least_residual: median_residual,
+        log_gain: state.brightness.a,
         rival: None,
         earlier_frames: 0,
     }
@@ -275,6 +282,7 @@ mod tests {
             median_residual: 3.0,
             common_error: 0.01,
             least_residual: 3.0,
+            log_gain: 0.1,
             rival: None,
             earlier_frames: 8,
         }
@@ -317,6 +325,10 @@ mod tests {
         assert_eq!(ended_elsewhere.missing(&params), Some(Waiting::Match));
         let noisy = Evidence { least_residual: 6.0, ..ended_elsewhere };
         assert_eq!(noisy.missing(&params), None);
+        for gain in [0.05f64, 20.0] {
+            let nearly_even = Evidence { log_gain: gain.ln(), ..proven() };
+            assert_eq!(nearly_even.missing(&params), Some(Waiting::Match));
+        }
     }
 
     #[test]
