@@ -237,8 +237,7 @@ impl TwoFrameInitializer {
         self.fit_rotation();
         self.fit_jointly();
         if self.needs_slopes() {
-            self.rotation.free_slopes();
-            self.joint.free_slopes();
+            self.free_slopes();
             self.fit_rotation();
             self.fit_jointly();
         }
@@ -357,6 +356,13 @@ impl TwoFrameInitializer {
         }
         let input = input(self.pyramid.levels(), &self.intrinsics, &self.points);
         self.joint.promised_by_slopes(&input, &self.params.fit) > LEAST_SHARE
+    }
+
+    /// Lets the gain differ from place to place up to the end of this start, in the frames before as well.
+    fn free_slopes(&mut self) {
+        self.rotation.free_slopes();
+        self.joint.free_slopes();
+        self.earlier_frames.free_slopes();
     }
 
     /// The best motion and its depths again, by the images alone. The priors lead to a motion; in the

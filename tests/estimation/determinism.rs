@@ -122,8 +122,9 @@ fn points_of_either_filter_and_passes_do_not_depend_on_the_number_of_threads() {
     assert_same(&one, &four, "points from interval, with passes, 1 and 4 threads");
     let (_, without) = of("2", "interval", "0");
     assert!(estimates > without, "no piece was estimated: {estimates} of {without}");
-    // The default's points are compared above.
-    let (gaussian, _) = of("2", "gaussian", "1");
+    let [(gaussian, _), (gaussian_four, _)] =
+        ["1", "4"].map(|threads| of(threads, "gaussian", "1"));
+    assert_same(&gaussian, &gaussian_four, "passes, 1 and 4 threads");
     let points = FILES.iter().position(|name| *name == "points.ply").unwrap();
     assert!(gaussian[points] != one[points], "the switch changes no point");
 }

@@ -36,7 +36,7 @@ fn with_vignette(pixels: &[u8]) -> Vec<u8> {
     pixels.iter().enumerate().map(|(i, &grey)| (f32::from(grey) * light(i)) as u8).collect()
 }
 
-/// The start after four frames of a camera that turns by 2 px a frame and moves by so many metres.
+/// The start after four frames of a camera that turns by 9 px a frame and moves by so many metres.
 fn turning(metres: f64, has_vignette: bool) -> (TwoFrameInitializer, InitOutcome) {
     let scene = Scene::new(5);
     let mut initializer = TwoFrameInitializer::new(CAMERA, TwoFrameParams::default()).unwrap();
@@ -66,10 +66,17 @@ fn a_vignette_is_no_parallax_and_leaves_the_start_as_it_is() {
 #[test]
 fn the_gain_differs_from_place_to_place_only_where_it_must() {
     for metres in [0.0, 0.03] {
-        let [behind_a_lens, even] =
-            [true, false].map(|vignette| turning(metres, vignette).0.rotation.gain_slopes);
-        assert!(behind_a_lens.is_some() && even.is_none(), "{metres}: {behind_a_lens:?} {even:?}");
+        let [behind_a_lens, even] = [true, false].map(|vignette| {
+            let (mut initializer, _) = turning(metres, vignette);
+            [initializer.rotation.gain_slopes, initializer.joint.best().0.gain_slopes]
+        });
+        assert!(behind_a_lens.iter().all(Option::is_some), "{metres}: {behind_a_lens:?}");
+        assert!(even.iter().all(Option::is_none), "{metres}: {even:?}");
     }
+    // Where it is let in, with what the frames before have left.
+    let (mut initializer, _) = turning(0.03, false);
+    initializer.free_slopes();
+    assert!(initializer.joint.best().0.gain_slopes.is_some());
     // A start afterwards is one of its own.
     let (mut initializer, _) = turning(0.0, true);
     assert!(initializer.begin(&two_views(2.0).0));
@@ -88,10 +95,36 @@ fn to_ask_what_slopes_promise_changes_nothing() {
 }
 
 #[test]
+fn frames_before_slopes_were_let_in_are_scored_with_them() {
+    let scene = Scene::new(5);
+    let seen = |frame: f64| {
+        let pose = SE3::exp(&Vector6::new(0.0, 0.0, 0.0, 0.02 * frame, 0.03 * frame, 0.0));
+        with_vignette(&scene.render(&CAMERA, &pose).noisy(1.0, 10))
+    };
+    let mut initializer = TwoFrameInitializer::new(CAMERA, TwoFrameParams::default()).unwrap();
+    assert!(initializer.begin(&seen(0.0)));
+    for frame in [1.0, 2.0, 3.0] {
+        initializer.pyramid.fill(&seen(frame));
+        initializer.fit_rotation();
+    }
+    initializer.earlier_frames.push(initializer.pyramid.levels(), &initializer.rotation, 8);
+    let depths = initializer.rotation.inverse_depths.clone();
+    let energy = |initializer: &TwoFrameInitializer| {
+        let input =
+            input(initializer.pyramid.levels(), &initializer.intrinsics, &initializer.points);
+        let fit = &initializer.params.fit;
+        initializer.earlier_frames.compare(&input, [&depths, &depths], fit)[0]
+    };
+    let held = energy(&initializer);
+    initializer.free_slopes();
+    let free = energy(&initializer);
+    assert!(free < 0.9 * held, "{free} {held}");
+}
+
+#[test]
 fn an_even_image_does_not_match() {
     let (first, _, _) = two_views(2.0);
     let mut initializer = TwoFrameInitializer::new(CAMERA, TwoFrameParams::default()).unwrap();
-    assert!(initializer.begin(&first));
     for grey in [0u8, 90, 200] {
         let even: Vec<u8> = first.iter().map(|&seen| grey + seen / 50).collect();
         assert!(initializer.begin(&first));

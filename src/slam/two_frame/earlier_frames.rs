@@ -54,22 +54,23 @@ impl EarlierFrames {
         self.kept.push_back(EarlierFrame { images, rotation: rotation.clone() });
     }
 
+    /// Lets the gain of all of them differ from place to place.
+    pub fn free_slopes(&mut self) {
+        self.kept.iter_mut().for_each(|frame| frame.rotation.free_slopes());
+    }
+
     /// Energies of the earlier frames with the depths of two motions, each frame from the pose that fits it best, of the
-    /// points that both see; `has_slopes`: with a gain that may differ from place to place. `input` gives points and intrinsics. The sums go in the order of the frames.
+    /// points that both see. `input` gives points and intrinsics. The sums go in the order of the frames.
     pub fn compare(
         &self,
         input: &FitInput<'_>,
         inverse_depths: [&[f32]; 2],
-        has_slopes: bool,
         params: &FitParams,
     ) -> [f64; 2] {
         let (finest, coarsest) = scoring_levels(input.intrinsics.len());
         let fit = |frame: &EarlierFrame, inverse_depths: &[f32]| -> System {
             let input = FitInput { images: &frame.images, finest, ..*input };
             let mut state = frame.rotation.clone();
-            if has_slopes {
-                state.free_slopes();
-            }
             state.inverse_depths.clear();
             state.inverse_depths.extend_from_slice(inverse_depths);
             let mut scratch = FitScratch::default();

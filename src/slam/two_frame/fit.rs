@@ -359,8 +359,9 @@ fn is_sane(step: &SVector<f64, NUM_UNKNOWNS>) -> bool {
     step.iter().enumerate().all(|(i, x)| x.is_finite() && (i == OFFSET || x.abs() < LARGEST))
 }
 
-/// By which share its energy on a level would fall if the gain might differ from place to place, to first order: what
-/// free slopes promise beyond what the other unknowns still do. The scratch keeps the system of `state`.
+/// By which share the energy of a fit that ended at `state` would fall if the gain might differ from place to place, to
+/// first order: what free slopes promise beyond what the other unknowns still do. The scratch is left as the fit left it
+/// on this level.
 pub fn promised_by_slopes(
     input: &FitInput<'_>,
     level: usize,
@@ -368,15 +369,17 @@ pub fn promised_by_slopes(
     scratch: &mut FitScratch,
     params: &FitParams,
 ) -> f64 {
-    let weights = params.prior_weights();
-    find_medians(input, state, &mut scratch.medians);
+    let promised = |scratch: &mut FitScratch, state: &State| {
+        let step = step_of(Freedom::Everything, scratch, state, 0.0, params.prior_weights());
+        step.map_or(0.0, |step| step.promised_drop)
+    };
+    let held = promised(scratch, state);
     let mut freed = state.clone();
     freed.free_slopes();
-    let [free, held] = [&freed, state].map(|state| {
-        scratch.system.evaluate(&input.level(level), state);
-        let step = step_of(Freedom::Everything, scratch, state, 0.0, weights);
-        step.map_or(0.0, |step| step.promised_drop)
-    });
+    scratch.trial.evaluate(&input.level(level), &freed);
+    std::mem::swap(&mut scratch.system, &mut scratch.trial);
+    let free = promised(scratch, &freed);
+    std::mem::swap(&mut scratch.system, &mut scratch.trial);
     (free - held) / scratch.system.energy.max(f64::MIN_POSITIVE)
 }
 

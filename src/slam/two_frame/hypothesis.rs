@@ -121,8 +121,7 @@ impl Hypotheses {
         self.scored_by = earlier_frames.len();
         let of_this_frame = compare(&self.all[0].scratch.system, &self.all[1].scratch.system);
         let depths = [0, 1].map(|i| self.all[i].state.inverse_depths.as_slice());
-        let has_slopes = self.all[0].state.gain_slopes.is_some();
-        let of_earlier_frames = earlier_frames.compare(input, depths, has_slopes, params);
+        let of_earlier_frames = earlier_frames.compare(input, depths, params);
         let [mut best, mut other] = [0, 1].map(|i| of_this_frame[i] + of_earlier_frames[i]);
         /// A motion that sees fewer of the other's points than this share has lost them, however the rest fits.
         const LEAST_SEEN: f64 = 1.0 / 3.0;

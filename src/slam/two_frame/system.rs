@@ -407,8 +407,11 @@ impl PatternSums {
                 let (u, v) = (&self.by_u[b], &self.by_v[b]);
                 let entry = lanes(|l| -(u[l] * by_u[i][l] + v[l] * by_v[i][l]));
                 normal.add_entry(6 + b, i, &entry);
-                for (s, x) in self.by_slopes.iter().flatten().enumerate().filter(|_| b == 0) {
-                    normal.add_entry(FIRST_SLOPE + s, i, &product(x, &entry));
+                // Slopes scale the first of the two, the gain.
+                if b == 0 {
+                    for (s, x) in self.by_slopes.iter().flatten().enumerate() {
+                        normal.add_entry(FIRST_SLOPE + s, i, &product(x, &entry));
+                    }
                 }
             }
         }

@@ -290,7 +290,7 @@ fn earlier_frames_tell_true_depths_from_those_of_another_motion() {
     });
     let depths = [&truth[..], &tilted.collect::<Vec<_>>()];
     let [right, wrong] =
-        initializer.earlier_frames.compare(&input, depths, false, &initializer.params.fit);
+        initializer.earlier_frames.compare(&input, depths, &initializer.params.fit);
     assert!(right * (1.0 + EvidenceParams::default().min_rival_excess) < wrong, "{right} {wrong}");
 }
 
