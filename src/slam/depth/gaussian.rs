@@ -451,7 +451,8 @@ impl PixelObserver<'_> {
         let line = view.line(u as f32, v as f32);
         let (Some(from), Some(at)) = (line.project(0.0), line.project(1.0)) else { return };
         let Some(to) = line.project(self.params.max_inverse_depth) else { return };
-        let length = (to.u - from.u).hypot(to.v - from.v);
+        let (du, dv) = (to.u - from.u, to.v - from.v);
+        let length = (du * du + dv * dv).sqrt();
         if !(self.params.min_new_segment_px..=self.matching.max_search_px).contains(&length)
             || !is_inside(frame.width(), frame.height(), at.u, at.v)
         {

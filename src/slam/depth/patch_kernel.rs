@@ -68,7 +68,9 @@ pub(super) fn slope<I: Instructions>(
     let (residual, weight) = weighed(lanes, seen, expected);
     let gradients = lanes.load(gradients);
     let weighted = weight * gradients;
-    [weighted * residual, weighted * gradients].map(|x| sum_of_samples(&x.to_array()))
+    let (mixed, squared) = (weighted * residual, weighted * gradients);
+    // One after the other: `map` over registers is not always inlined, and then compiled for every CPU.
+    [sum_of_samples(&mixed.to_array()), sum_of_samples(&squared.to_array())]
 }
 
 /// Residuals and Huber's weights: 1 up to the bound, without a branch, so that the lanes go together.

@@ -122,7 +122,11 @@ pub(super) fn look_at(image: &SharedImage, u: f32, v: f32, half_weight_gradient:
     }
     let around = around(image, u, v);
     let of_pattern = |from: &[f32; AROUND]| {
-        PATTERN.map(|(du, dv)| from[STRIDE * at(CENTRE + dv) + at(CENTRE + du)])
+        let mut samples = [0.0; SAMPLES];
+        for (sample, (du, dv)) in samples.iter_mut().zip(PATTERN) {
+            *sample = from[STRIDE * at(CENTRE + dv) + at(CENTRE + du)];
+        }
+        samples
     };
     let here = of_pattern(&around);
     let mean = sum_of_samples(&here) / SAMPLES as f32;
