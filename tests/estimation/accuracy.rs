@@ -6,6 +6,8 @@ use crate::figures::{Figure, hold};
 use crate::recording::{recording, say};
 use crate::support::{Rig, finish};
 use serde_json::Value;
+use std::path::Path;
+use tempfile::TempDir;
 
 /// Limits of the default room: error of the path, and median relative error of depth.
 const MAX_ATE_PER_PATH: f64 = 0.01;
@@ -129,4 +131,36 @@ fn the_rendered_desk_is_as_before() {
 #[test]
 fn the_rendered_office_is_as_before() {
     assert_recording_is_as_before("icl-office3");
+}
+
+/// Every `step`-th frame of a recording, from the first, in a folder of its own.
+fn thinned(recording: &Path, step: usize) -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["camera.txt", "groundtruth.txt", "rgb"] {
+        std::os::unix::fs::symlink(recording.join(name), folder.path().join(name)).unwrap();
+    }
+    let list = std::fs::read_to_string(recording.join("rgb.txt")).unwrap();
+    let lines = list.lines().filter(|line| !line.starts_with('#')).step_by(step);
+    std::fs::write(folder.path().join("rgb.txt"), lines.collect::<Vec<_>>().join("\n")).unwrap();
+    folder
+}
+
+/// Between these frames no new pixel is within the search of a keyframe that has depth: each would carry less than the
+/// one before, and the camera was lost on the way, at an error of 0.03 to 0.2 m.
+#[test]
+fn frames_far_apart_do_not_starve_the_keyframes_of_depth() {
+    /// Twice the worst of seven first frames.
+    const MAX_ATE_M: [(usize, f64); 2] = [(2, 0.008), (3, 0.012)];
+    let Some(desk) = recording("tsukuba") else { return };
+    // Symbolic links are read from where they lie.
+    let desk = desk.canonicalize().unwrap();
+    for (step, max_ate_m) in MAX_ATE_M {
+        let folder = thinned(&desk, step);
+        let found = replay(&format!("tum:{}", folder.path().display()), &[]);
+        let (tracked, frames) = (number(&found, "frames_tracked"), number(&found, "frames_in"));
+        let ate = number(&found, "ate_rmse_m");
+        say(&format!("one frame in {step}: {tracked} of {frames} tracked, ATE {ate:.4} m"));
+        assert_eq!((tracked, number(&found, "lost_count")), (frames, 0.0), "one in {step}");
+        assert!(ate < max_ate_m, "one frame in {step}: {ate} m");
+    }
 }

@@ -9,7 +9,7 @@ use semidense::capture::source::FrameSource;
 use semidense::slam::depth::epipolar::TwoView;
 use semidense::slam::depth::gradient_image::BORDER_PX;
 use semidense::slam::depth::map::DepthMap;
-use semidense::slam::depth::matching::{MatchingParams, Patch, condition, search};
+use semidense::slam::depth::matching::{MatchingParams, Patch, SearchRange, condition, search};
 use semidense::slam::depth::pose_noise::pose_noise_px as predicted_px;
 use semidense::slam::geometry::intrinsics::Intrinsics;
 use semidense::slam::geometry::se3::SE3;
@@ -113,7 +113,8 @@ fn observe(
     }
     let patch = Patch::new(&map.image, u, v, 1.0, 0.0);
     let frame = Sampled { image: frame, sampler: Portable };
-    let found = search(frame, &line, &patch, &conditioning, &from, &to, params).ok()?;
+    let range = SearchRange { from, to, max_px: params.max_search_px };
+    let found = search(frame, &line, &patch, &conditioning, &range, params).ok()?;
     Some(f64::from((found.inverse_depth - truth) / found.uncertainty.variance.sqrt()))
 }
 

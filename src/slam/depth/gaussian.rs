@@ -2,7 +2,6 @@
 //! narrowed by each observation (Engel, Sturm, Cremers 2013 §2.4).
 
 use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
 
 use crate::slam::depth::epipolar::{EpipolarLine, Projection, TwoView};
 use crate::slam::depth::gain::{Gain, Uncertainty};
@@ -11,69 +10,18 @@ use crate::slam::depth::hypotheses::{ChangedColumns, ListedRow};
 use crate::slam::depth::line_noise::Innovations;
 use crate::slam::depth::map::{DepthMap, Hypothesis};
 use crate::slam::depth::matching::{
-    Conditioning, Match, MatchingParams, Miss, Patch, condition, is_inside, search,
+    Conditioning, Match, MatchingParams, Miss, Patch, SearchRange, condition, is_inside, search,
 };
 use crate::slam::depth::promise::{LANES, PixelLanes, promises};
 use crate::slam::image::buffer::Image;
 use crate::slam::image::quads::QuadImage;
 use crate::slam::image::quads_kernel::Sampled;
 use crate::slam::kernel::{Body, Instructions, Kernel};
-use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::Brightness;
 
-/// Tuning of the filter.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct GaussianParams {
-    /// Half width of the search around a hypothesis, in its standard deviations. 2 holds 95 %.
-    pub search_sigmas: f32,
-    /// An observation further off than this many joint standard deviations contradicts. A gate of 1,
-    /// the literature's, rejects a third of the right ones.
-    pub gate_sigmas: f32,
-    /// A pixel is observed only when a match promises to leave less than this share of its variance: frames that
-    /// follow each other share the error of their poses, so waiting for baseline gains more than looking again.
-    pub max_variance_ratio: f32,
-    /// Factor on the variance before each fusion: the world and the poses are never quite still.
-    pub process_inflation: f32,
-    /// Factor on the variance after a contradiction.
-    pub contradiction_inflation: f32,
-    /// Standard deviation beyond which a hypothesis is dropped, in units of the mean inverse depth.
-    pub max_std_dev: f32,
-    /// Largest inverse depth that is searched for a new pixel, in units of the mean inverse depth:
-    /// nothing nearer than a quarter of the usual distance is expected.
-    pub max_inverse_depth: f32,
-    /// Shortest segment worth a search for a new pixel, pixels.
-    pub min_new_segment_px: f32,
-}
+mod params;
 
-impl Default for GaussianParams {
-    fn default() -> Self {
-        Self {
-            search_sigmas: 2.0,
-            gate_sigmas: 2.5,
-            max_variance_ratio: 0.2,
-            process_inflation: 1.01,
-            contradiction_inflation: 1.2,
-            max_std_dev: 0.5,
-            max_inverse_depth: 4.0,
-            min_new_segment_px: 3.0,
-        }
-    }
-}
-
-impl GaussianParams {
-    /// Checks every value.
-    pub fn validate(&self) -> Result<(), ParameterError> {
-        check_range("search_sigmas", self.search_sigmas, 0.5..=10.0)?;
-        check_range("gate_sigmas", self.gate_sigmas, 0.5..=10.0)?;
-        check_range("max_variance_ratio", self.max_variance_ratio, 0.01..=1.0)?;
-        check_range("process_inflation", self.process_inflation, 1.0..=2.0)?;
-        check_range("contradiction_inflation", self.contradiction_inflation, 1.0..=10.0)?;
-        check_range("max_std_dev", self.max_std_dev, 0.01..=10.0)?;
-        check_range("max_inverse_depth", self.max_inverse_depth, 1.0..=100.0)?;
-        check_range("min_new_segment_px", self.min_new_segment_px, 1.0..=30.0)
-    }
-}
+pub use params::GaussianParams;
 
 /// Validity of a new hypothesis: so many failures in a row drop it.
 pub const NEW_VALIDITY: u8 = 4;
@@ -164,7 +112,13 @@ pub fn observe(
     matching: &MatchingParams,
     params: &GaussianParams,
 ) -> Observation {
+    let [known, unknown] = map.hypotheses.count_beside(&map.candidates);
+    let is_short_of_depth = unknown > MOST_UNKNOWN_PER_KNOWN * known;
     let pixel = PixelObserver {
+        max_new_search_px: match is_short_of_depth {
+            true => matching.max_search_px.max(params.max_first_search_px),
+            false => matching.max_search_px,
+        },
         image: &map.image,
         candidates: &map.candidates,
         structure: &map.structure,
@@ -182,6 +136,9 @@ pub fn observe(
         .reduce(Observation::default, Observation::plus)
 }
 
+/// A keyframe with more candidates without depth for each with it is short of depth.
+const MOST_UNKNOWN_PER_KNOWN: usize = 2;
+
 /// Of so many pixels one is probed: the hypotheses that it stands for.
 pub const PROBE_STEP: usize = 32;
 /// Columns by which the probed pixels of a row are displaced against those of the row above: no column has all.
@@ -197,6 +154,8 @@ struct PixelObserver<'a> {
     offset: f32,
     matching: &'a MatchingParams,
     params: &'a GaussianParams,
+    /// Longest segment that is searched for a new pixel.
+    max_new_search_px: f32,
 }
 
 /// A row of the map whose pixels are observed.
@@ -344,7 +303,8 @@ impl PixelObserver<'_> {
         };
         let patch = Patch::new(self.image, u, v, self.gain, self.offset);
         let frame = Sampled { image: self.observer.image, sampler };
-        match search(frame, &line, &patch, &conditioning, &from, &to, self.matching) {
+        let range = SearchRange { from, to, max_px: self.matching.max_search_px };
+        match search(frame, &line, &patch, &conditioning, &range, self.matching) {
             Ok(found) => {
                 counts.attempted += 1;
                 let innovation = found.inverse_depth - hypothesis.inverse_depth;
@@ -385,7 +345,8 @@ impl PixelObserver<'_> {
         };
         let patch = Patch::new(self.image, u, v, self.gain, self.offset);
         let frame = Sampled { image: self.observer.image, sampler };
-        let found = search(frame, &line, &patch, &conditioning, &at, &at, self.matching);
+        let range = SearchRange { from: at, to: at, max_px: self.matching.max_search_px };
+        let found = search(frame, &line, &patch, &conditioning, &range, self.matching);
         match found {
             Ok(found) => {
                 counts.probed += 1;
@@ -453,7 +414,8 @@ impl PixelObserver<'_> {
         let Some(to) = line.project(self.params.max_inverse_depth) else { return };
         let (du, dv) = (to.u - from.u, to.v - from.v);
         let length = (du * du + dv * dv).sqrt();
-        if !(self.params.min_new_segment_px..=self.matching.max_search_px).contains(&length)
+        let max_px = self.max_new_search_px;
+        if !(self.params.min_new_segment_px..=max_px).contains(&length)
             || !is_inside(frame.width(), frame.height(), at.u, at.v)
         {
             return;
@@ -463,7 +425,8 @@ impl PixelObserver<'_> {
         let Some(conditioning) = conditioning else { return };
         let patch = Patch::new(self.image, u, v, self.gain, self.offset);
         let frame = Sampled { image: frame, sampler };
-        match search(frame, &line, &patch, &conditioning, &from, &to, self.matching) {
+        let range = SearchRange { from, to, max_px };
+        match search(frame, &line, &patch, &conditioning, &range, self.matching) {
             Ok(found)
                 if found.inverse_depth > 0.0
                     && found.uncertainty.variance < self.params.max_std_dev.powi(2) =>
@@ -486,3 +449,6 @@ impl PixelObserver<'_> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -304,24 +304,35 @@ impl Conditioning {
     }
 }
 
-/// Searches between the projections `from` and `to`; a segment below a pixel is only refined.
+/// The part of a line that is searched.
+#[derive(Debug, Clone, Copy)]
+pub struct SearchRange {
+    /// Where it begins and ends, towards larger inverse depth.
+    pub from: Projection,
+    /// Its other end.
+    pub to: Projection,
+    /// Beyond this length it is not searched, pixels; [`MAX_STEPS`] at most.
+    pub max_px: f32,
+}
+
+/// Searches a part of the line; a segment below a pixel is only refined.
 #[inline(always)]
 pub fn search<S: Instructions>(
     frame: Sampled<'_, S>,
     line: &EpipolarLine,
     patch: &Patch,
     conditioning: &Conditioning,
-    from: &Projection,
-    to: &Projection,
+    range: &SearchRange,
     params: &MatchingParams,
 ) -> Result<Match, Miss> {
     /// Segments below this are within the reach of the refinement.
     const MIN_SEARCH_PX: f32 = 1.0;
     /// How far the refinement may go from where it starts, pixels.
     const REFINE_REACH_PX: f32 = 1.5;
+    let SearchRange { from, to, max_px } = range;
     let (du, dv) = conditioning.direction;
     let length = (to.u - from.u) * du + (to.v - from.v) * dv;
-    if !(length <= params.max_search_px) || length < 0.0 {
+    if !(length <= *max_px) || length < 0.0 {
         return Err(Miss::TooLong);
     }
     let middle = (0.5 * (from.u + to.u), 0.5 * (from.v + to.v));

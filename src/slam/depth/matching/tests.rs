@@ -41,6 +41,10 @@ fn sampled(image: &QuadImage) -> Sampled<'_, Portable> {
     Sampled { image, sampler: Portable }
 }
 
+fn range(from: Projection, to: Projection) -> SearchRange {
+    SearchRange { from, to, max_px: MatchingParams::default().max_search_px }
+}
+
 fn structure(patch: &Patch) -> [f32; 3] {
     let sum = |a: &[f32; 8], b: &[f32; 8]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f32>();
     let (gu, gv) = (&patch.gradient_u, &patch.gradient_v);
@@ -77,7 +81,7 @@ fn matches_hold_the_true_inverse_depth_within_their_variance() {
                 continue;
             };
             let Ok(found_match) =
-                search(sampled(&frame), &line, &patch, &conditioning, &from, &to, &params)
+                search(sampled(&frame), &line, &patch, &conditioning, &range(from, to), &params)
             else {
                 continue;
             };
@@ -109,7 +113,7 @@ fn gain_and_offset_are_taken_out() {
     let attempt = |gain, offset| {
         let patch = Patch::new(&keyframe, 100, 75, gain, offset);
         let conditioning = condition(&view, &line, &at, &structure(&patch), 1.0, &params).unwrap();
-        search(sampled(&frame), &line, &patch, &conditioning, &from, &to, &params)
+        search(sampled(&frame), &line, &patch, &conditioning, &range(from, to), &params)
     };
     assert!((attempt(0.8, 20.0).unwrap().inverse_depth - 0.8).abs() < 0.03);
     assert!(attempt(1.0, 0.0).map_or(true, |m| m.mean_squared_residual > 10.0));
@@ -126,15 +130,8 @@ fn a_segment_outside_the_image_or_too_long_is_a_miss() {
         let patch = Patch::new(&keyframe, u, 75, 1.0, 0.0);
         let at = line.project(0.8).unwrap();
         let conditioning = condition(&view, &line, &at, &structure(&patch), 1.0, &params).unwrap();
-        search(
-            sampled(&frame),
-            &line,
-            &patch,
-            &conditioning,
-            &line.project(d.0).unwrap(),
-            &line.project(d.1).unwrap(),
-            &params,
-        )
+        let range = range(line.project(d.0).unwrap(), line.project(d.1).unwrap());
+        search(sampled(&frame), &line, &patch, &conditioning, &range, &params)
     };
     assert_eq!(attempt(150, (0.75, 0.85)), Err(Miss::OutOfView));
     assert_eq!(attempt(60, (0.1, 1.5)), Err(Miss::TooLong));

@@ -1,0 +1,88 @@
+//! Which new pixels are searched, and what they get.
+
+use nalgebra::Vector6;
+
+use super::*;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::test_scene::{CAMERA, Rendering, Scene};
+
+/// Parallax of a point at the mean inverse depth: up to four times as near a segment is 64 px long.
+const PARALLAX_PX: f64 = 16.0;
+
+/// A keyframe without depth, its exact depth, and a frame that is far from it.
+struct Fast {
+    map: DepthMap,
+    /// In units of the mean.
+    inverse_depth: Image<f32>,
+    frame: QuadImage,
+    view: TwoView,
+}
+
+impl Fast {
+    fn new() -> Self {
+        let scene = Scene::new(7);
+        let mut map = DepthMap::with_size(CAMERA.width, CAMERA.height);
+        let Rendering { intensity, mut inverse_depth } = scene.render(&CAMERA, &SE3::identity());
+        let pixels: Vec<u8> = intensity.pixels().iter().map(|&grey| grey.round() as u8).collect();
+        map.restart(&pixels, 5.0, 100_000);
+        let candidates = map.candidates.pixels().iter().zip(inverse_depth.pixels());
+        let depths: Vec<f32> = candidates.filter(|(is, _)| **is).map(|(_, &depth)| depth).collect();
+        let mean = depths.iter().sum::<f32>() / depths.len() as f32;
+        inverse_depth.pixels_mut().iter_mut().for_each(|depth| *depth /= mean);
+        let step = PARALLAX_PX / (CAMERA.fx * f64::from(mean));
+        let moved = SE3::exp(&Vector6::new(step, 0.0, 0.0, 0.0, 0.0, 0.0));
+        let mut frame = QuadImage::with_size(CAMERA.width, CAMERA.height);
+        frame.fill(&scene.render(&CAMERA, &moved).noisy(2.0, 1));
+        let mut from_keyframe = moved.inverse();
+        from_keyframe.translation *= f64::from(mean);
+        Self { map, inverse_depth, frame, view: TwoView::new(&CAMERA, &from_keyframe) }
+    }
+
+    /// What an observation brings where one of `known_step` candidates has its depth already.
+    fn created(&self, known_step: usize, params: &GaussianParams) -> (usize, DepthMap) {
+        let mut map = self.map.clone();
+        let places = self.map.candidates.pixels().iter().enumerate().filter(|(_, is)| **is);
+        for (place, _) in places.step_by(known_step) {
+            let inverse_depth = self.inverse_depth.pixels()[place];
+            let (variance, smoothed) = (1e-6, inverse_depth);
+            let known = Hypothesis { inverse_depth, variance, smoothed, ..Hypothesis::NONE };
+            map.hypotheses.pixels_mut()[place] = Hypothesis { validity: 8, ..known };
+        }
+        let (brightness, pixels) = (Brightness::default(), ObservedPixels::All);
+        let observer = Observer { image: &self.frame, view: self.view, brightness, pixels };
+        let matching = MatchingParams::default();
+        let counts = observe(&mut map, &observer, &matching, params).counts;
+        // The same counted from lists as from pixels.
+        let listed = map.hypotheses.count_beside(&map.candidates);
+        map.hypotheses.pixels_mut();
+        assert_eq!(map.hypotheses.count_beside(&map.candidates), listed);
+        (counts.created, map)
+    }
+}
+
+#[test]
+fn a_keyframe_short_of_depth_gets_it_from_a_frame_far_away() {
+    let fast = Fast::new();
+    let params = GaussianParams::default();
+    let (created, map) = fast.created(usize::MAX, &params);
+    let candidates = fast.map.candidates.pixels().iter().filter(|is| **is).count();
+    assert!(created * 4 > candidates, "{created} of {candidates}");
+    let pixels = map.hypotheses.pixels().iter().zip(fast.inverse_depth.pixels());
+    let mut errors: Vec<f32> = pixels
+        .filter(|(hypothesis, _)| hypothesis.is_some())
+        .map(|(h, truth)| (h.inverse_depth - truth).abs() / h.variance.sqrt())
+        .collect();
+    errors.sort_by(f32::total_cmp);
+    assert!(errors[errors.len() / 2] < 1.0, "{}", errors[errors.len() / 2]);
+    assert!(errors[errors.len() * 9 / 10] < 3.0, "{}", errors[errors.len() * 9 / 10]);
+    let short = GaussianParams { max_first_search_px: 40.0, ..params };
+    assert_eq!(fast.created(usize::MAX, &short).0, 0);
+}
+
+#[test]
+fn a_keyframe_with_depth_waits_for_a_nearer_frame() {
+    let fast = Fast::new();
+    let params = GaussianParams::default();
+    assert_eq!(fast.created(2, &params).0, 0);
+    assert!(fast.created(4, &params).0 > 0);
+}
