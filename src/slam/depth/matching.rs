@@ -311,7 +311,7 @@ pub struct SearchRange {
     pub from: Projection,
     /// Its other end.
     pub to: Projection,
-    /// Beyond this length it is not searched, pixels; [`MAX_STEPS`] at most.
+    /// Beyond this length it is not searched, pixels. A hundred places a pixel apart are tried at most.
     pub max_px: f32,
 }
 
