@@ -145,14 +145,14 @@ fn thinned(recording: &Path, step: usize) -> TempDir {
     folder
 }
 
-/// Between these frames no new pixel is within the search of a keyframe that has depth: each would carry less than the
-/// one before, and the camera was lost on the way, at an error of 0.03 to 0.2 m.
+/// The parallax between these frames is beyond the usual search for new pixels. Without a longer one each keyframe has less
+/// depth than the one before, and the camera is lost on the way, at an error of 0.03 to 0.2 m.
 #[test]
 fn frames_far_apart_do_not_starve_the_keyframes_of_depth() {
     /// Twice the worst of seven first frames.
     const MAX_ATE_M: [(usize, f64); 2] = [(2, 0.008), (3, 0.012)];
     let Some(desk) = recording("tsukuba") else { return };
-    // Symbolic links are read from where they lie.
+    // A relative target of a link would be looked for beside the link.
     let desk = desk.canonicalize().unwrap();
     for (step, max_ate_m) in MAX_ATE_M {
         let folder = thinned(&desk, step);

@@ -307,9 +307,9 @@ impl Conditioning {
 /// The part of a line that is searched.
 #[derive(Debug, Clone, Copy)]
 pub struct SearchRange {
-    /// Where it begins and ends, towards larger inverse depth.
+    /// Its end of smaller inverse depth.
     pub from: Projection,
-    /// Its other end.
+    /// Its end of larger inverse depth.
     pub to: Projection,
     /// Beyond this length it is not searched, pixels. A hundred places a pixel apart are tried at most.
     pub max_px: f32,
