@@ -177,7 +177,7 @@ fn own_status(
             value("written_bytes", written_bytes),
         ],
     };
-    DiagnosticArray { header: Header { stamp, frame_id: String::new() }, status: vec![status] }
+    DiagnosticArray { header: Header::new(stamp, ""), status: vec![status] }
 }
 
 #[cfg(test)]

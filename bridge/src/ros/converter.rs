@@ -40,15 +40,15 @@ pub struct Converter {
     frames: FrameIds,
     /// The unit of each keyframe in the world.
     units: HashMap<u64, f64>,
-    /// From the stamps of frames to CLOCK_REALTIME, nanoseconds.
-    realtime_from_capture: Option<i64>,
+    /// From the stamps of frames to CLOCK_REALTIME, nanoseconds; 0 where unknown.
+    realtime_from_capture: i64,
 }
 
 impl Converter {
     /// For an instance, with its frames' names.
     pub fn new(instance: &str, frames: FrameIds) -> Self {
         let instance = instance.to_owned();
-        Self { instance, frames, units: HashMap::new(), realtime_from_capture: None }
+        Self { instance, frames, units: HashMap::new(), realtime_from_capture: 0 }
     }
 
     /// Takes what later messages need: units of keyframes, clocks.
@@ -56,7 +56,7 @@ impl Converter {
         match event {
             Event::Joined => {
                 self.units.clear();
-                self.realtime_from_capture = None;
+                self.realtime_from_capture = 0;
             }
             Event::Keyframe(keyframe) => {
                 self.units.insert(keyframe.keyframe_id, keyframe.world_from_keyframe.scale);
@@ -67,39 +67,43 @@ impl Converter {
                 self.units.entry(pose.keyframe_id).or_insert(pose.map_from_keyframe.scale);
             }),
             Event::Frame(frame) => {
-                self.set_clock(frame.header.capture_nanos, frame_realtime(frame))
+                self.set_clock(frame.header.capture_nanos, frame.header.realtime_nanos);
             }
-            Event::Pose(pose) => self.set_clock(pose.message.capture_nanos, pose_realtime(pose)),
+            Event::Pose(pose) => {
+                self.set_clock(pose.message.capture_nanos, pose.message.realtime_nanos);
+            }
             Event::Left | Event::Health(..) | Event::Adjustment(_) => {}
         }
     }
 
-    fn set_clock(&mut self, capture_nanos: i64, realtime_nanos: Option<i64>) {
-        if let Some(realtime_nanos) = realtime_nanos {
-            self.realtime_from_capture = Some(realtime_nanos.saturating_sub(capture_nanos));
+    fn set_clock(&mut self, capture_nanos: i64, realtime_nanos: i64) {
+        if realtime_nanos != 0 {
+            self.realtime_from_capture = realtime_nanos.saturating_sub(capture_nanos);
         }
     }
 
     /// The stamp of a frame in ROS: CLOCK_REALTIME of its exposure where known, else the stamp of its source.
     pub fn stamp(&self, capture_nanos: i64) -> Time {
-        let offset = self.realtime_from_capture.unwrap_or_default();
-        Time::from_nanos(capture_nanos.saturating_add(offset))
+        Time::from_nanos(capture_nanos.saturating_add(self.realtime_from_capture))
     }
 
-    fn header(&self, stamp: Time, frame_id: &str) -> Header {
-        Header { stamp, frame_id: frame_id.to_owned() }
+    /// Stamp and frame of what the camera saw; `realtime_nanos` is 0 where unknown.
+    fn camera_header(&self, capture_nanos: i64, realtime_nanos: i64) -> Header {
+        let stamp = match realtime_nanos {
+            0 => self.stamp(capture_nanos),
+            nanos => Time::from_nanos(nanos),
+        };
+        Header::new(stamp, &self.frames.camera)
     }
 
     /// Stamp of a pose, and the frame of its camera.
     pub fn pose_header(&self, pose: &Pose) -> Header {
-        let realtime = pose_realtime(pose).map(Time::from_nanos);
-        let stamp = realtime.unwrap_or_else(|| self.stamp(pose.message.capture_nanos));
-        self.header(stamp, &self.frames.camera)
+        self.camera_header(pose.message.capture_nanos, pose.message.realtime_nanos)
     }
 
     /// A stamp in the map.
     pub fn map_header(&self, stamp: Time) -> Header {
-        self.header(stamp, &self.frames.map)
+        Header::new(stamp, &self.frames.map)
     }
 
     /// The messages of a pose; `None` where it is not claimed (initializing, lost), or on a keyframe whose unit is not
@@ -123,7 +127,7 @@ impl Converter {
             covariance: odometry_covariance(&in_world, unit, &estimate.covariance),
         };
         let transform = |parent: &str, child: &str, parent_from_child| TransformStamped {
-            header: self.header(stamp, parent),
+            header: Header::new(stamp, parent),
             child_frame_id: child.to_owned(),
             transform: transform_message(&parent_from_child),
         };
@@ -132,9 +136,9 @@ impl Converter {
         let transforms =
             vec![transform(map, odom, map_from_odom), transform(odom, camera, odom_from_camera)];
         Some(PoseMessages {
-            pose: PoseWithCovarianceStamped { header: self.header(stamp, map), pose: map_pose },
+            pose: PoseWithCovarianceStamped { header: Header::new(stamp, map), pose: map_pose },
             odometry: Odometry {
-                header: self.header(stamp, odom),
+                header: Header::new(stamp, odom),
                 child_frame_id: camera.clone(),
                 pose: odometry_pose,
                 twist: twist(message),
@@ -155,14 +159,12 @@ impl Converter {
             pose_message(&(ros_from_world() * pose.map_from_keyframe.rigid))
         };
         let poses = graph.poses.iter().map(place).collect();
-        PoseArray { header: self.header(stamp, &self.frames.map), poses }
+        PoseArray { header: Header::new(stamp, &self.frames.map), poses }
     }
 
     /// Stamp and optical frame of an image.
     pub fn image_header(&self, frame: &Frame) -> Header {
-        let realtime = frame_realtime(frame).map(Time::from_nanos);
-        let stamp = realtime.unwrap_or_else(|| self.stamp(frame.header.capture_nanos));
-        self.header(stamp, &self.frames.camera)
+        self.camera_header(frame.header.capture_nanos, frame.header.realtime_nanos)
     }
 
     /// The image, as `mono8`.
@@ -199,18 +201,8 @@ impl Converter {
 
     /// Health of the process `owner`; `stamp` is when it was read.
     pub fn diagnostics(&self, owner: &str, health: &HealthMessage, stamp: Time) -> DiagnosticArray {
-        diagnostics(&self.instance, owner, health, self.header(stamp, ""))
+        diagnostics(&self.instance, owner, health, Header::new(stamp, ""))
     }
-}
-
-/// CLOCK_REALTIME of a frame's exposure, where it is known.
-fn frame_realtime(frame: &Frame) -> Option<i64> {
-    Some(frame.header.realtime_nanos).filter(|nanos| *nanos != 0)
-}
-
-/// CLOCK_REALTIME of the exposure of a pose's frame, where it is known.
-fn pose_realtime(pose: &Pose) -> Option<i64> {
-    Some(pose.message.realtime_nanos).filter(|nanos| *nanos != 0)
 }
 
 /// Velocities of the camera in its own axes.

@@ -47,6 +47,13 @@ pub struct Header {
     pub frame_id: String,
 }
 
+impl Header {
+    /// Of a stamp and a frame; empty where there is none.
+    pub fn new(stamp: Time, frame_id: &str) -> Self {
+        Self { stamp, frame_id: frame_id.to_owned() }
+    }
+}
+
 /// `geometry_msgs/Point` and `geometry_msgs/Vector3`, which have the same fields.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Vector3 {

@@ -91,10 +91,7 @@ fn sensor(params: &PublishParams, topic: RosTopic) -> RosTopic {
 
 /// From the camera's optical axes to x forward, y left, z up.
 fn camera_link_transform(params: &PublishParams, camera_link: &str) -> TfMessage {
-    let header = Header {
-        stamp: Time::from_nanos(realtime_nanos()),
-        frame_id: params.frames.camera.clone(),
-    };
+    let header = Header::new(Time::from_nanos(realtime_nanos()), &params.frames.camera);
     let transform = transform_message(&ros_from_world().inverse());
     let child_frame_id = camera_link.to_owned();
     TfMessage { transforms: vec![TransformStamped { header, child_frame_id, transform }] }
@@ -278,7 +275,7 @@ impl Publishers {
                 value("longest_publish_ms", format!("{longest_ms:.3}")),
             ],
         };
-        let header = Header { stamp: Time::from_nanos(realtime_nanos()), frame_id: String::new() };
+        let header = Header::new(Time::from_nanos(realtime_nanos()), "");
         DiagnosticArray { header, status: vec![status] }
     }
 }
