@@ -6,9 +6,10 @@ use std::time::{Duration, Instant};
 
 use crate::record::file::{FileError, RecordingFile};
 use crate::record::queue::{QueueCounts, QueueReceiver};
+use crate::ros::diagnostics::{figure, report};
 use crate::ros::encoder::{EncodeError, Encoded, EventEncoder, Moment, Sink};
 use crate::ros::images::ImageFormat;
-use crate::ros::message::{DiagnosticArray, DiagnosticStatus, Header, KeyValue, Time};
+use crate::ros::message::{DiagnosticArray, Time};
 use crate::ros::topic::{DIAGNOSTICS, RosTopic};
 use crate::session::Event;
 
@@ -163,21 +164,15 @@ fn own_status(
 ) -> DiagnosticArray {
     use std::sync::atomic::Ordering::Relaxed;
     let dropped = counts.dropped();
-    let value = |key: &str, value: u64| KeyValue { key: key.to_owned(), value: value.to_string() };
     let message = if dropped == 0 { "recording" } else { "dropped what came too fast" };
-    let status = DiagnosticStatus {
-        level: u8::from(dropped > 0),
-        name: format!("{instance}: record"),
-        message: message.to_owned(),
-        hardware_id: instance.to_owned(),
-        values: vec![
-            value("dropped_images", counts.dropped_images.load(Relaxed)),
-            value("dropped_messages", counts.dropped_messages.load(Relaxed)),
-            value("queued_bytes", counts.bytes.load(Relaxed)),
-            value("written_bytes", written_bytes),
-        ],
-    };
-    DiagnosticArray { header: Header::new(stamp, ""), status: vec![status] }
+    let verdict = (u8::from(dropped > 0), message.to_owned());
+    let values = vec![
+        figure("dropped_images", counts.dropped_images.load(Relaxed)),
+        figure("dropped_messages", counts.dropped_messages.load(Relaxed)),
+        figure("queued_bytes", counts.bytes.load(Relaxed)),
+        figure("written_bytes", written_bytes),
+    ];
+    report(instance, "record", stamp, verdict, values)
 }
 
 #[cfg(test)]

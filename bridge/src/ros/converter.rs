@@ -201,7 +201,7 @@ impl Converter {
 
     /// Health of the process `owner`; `stamp` is when it was read.
     pub fn diagnostics(&self, owner: &str, health: &HealthMessage, stamp: Time) -> DiagnosticArray {
-        diagnostics(&self.instance, owner, health, Header::new(stamp, ""))
+        diagnostics(&self.instance, owner, health, stamp)
     }
 }
 

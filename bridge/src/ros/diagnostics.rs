@@ -4,7 +4,7 @@ use semidense::service::health::{ProcessState, cause, percentile_ms, source, war
 use semidense::slam::pose::TrackingState;
 use semidense::wire::message::HealthMessage;
 
-use crate::ros::message::{DiagnosticArray, DiagnosticStatus, Header, KeyValue};
+use crate::ros::message::{DiagnosticArray, DiagnosticStatus, Header, KeyValue, Time};
 
 const OK: u8 = 0;
 const WARN: u8 = 1;
@@ -14,22 +14,33 @@ const STALE: u8 = 3;
 /// How bad the states are that a last frame came to, by their codes in [`HealthMessage::detail`].
 const FRAME_LEVELS: [u8; 4] = [WARN, OK, WARN, ERROR];
 
+/// A report of one part of `instance`: its level and state in words, and figures.
+pub fn report(
+    instance: &str,
+    part: &str,
+    stamp: Time,
+    (level, message): (u8, String),
+    values: Vec<KeyValue>,
+) -> DiagnosticArray {
+    let name = format!("{instance}: {part}");
+    let status =
+        DiagnosticStatus { level, name, message, hardware_id: instance.to_owned(), values };
+    DiagnosticArray { header: Header::new(stamp, ""), status: vec![status] }
+}
+
+/// A figure of a report.
+pub fn figure(key: &str, value: impl ToString) -> KeyValue {
+    KeyValue { key: key.to_owned(), value: value.to_string() }
+}
+
 /// The health of the process `owner` (capture, tracker or mapper) of `instance`.
 pub fn diagnostics(
     instance: &str,
     owner: &str,
     health: &HealthMessage,
-    header: Header,
+    stamp: Time,
 ) -> DiagnosticArray {
-    let (level, message) = verdict(owner, health);
-    let status = DiagnosticStatus {
-        level,
-        name: format!("{instance}: {owner}"),
-        message,
-        hardware_id: instance.to_owned(),
-        values: figures(owner, health),
-    };
-    DiagnosticArray { header, status: vec![status] }
+    report(instance, owner, stamp, verdict(owner, health), figures(owner, health))
 }
 
 /// How bad it is, and what it is, in a few words.
@@ -78,19 +89,14 @@ fn figures(owner: &str, health: &HealthMessage) -> Vec<KeyValue> {
         ("latency_p50_ms", latency(0.5)),
         ("latency_p99_ms", latency(0.99)),
     ];
-    let value = |key: &str, value: String| KeyValue { key: key.to_owned(), value };
-    let mut values: Vec<KeyValue> =
-        counts.iter().map(|(key, count)| value(key, count.to_string())).collect();
-    values.push(value(total, health.total.to_string()));
-    let known = numbers.iter().filter_map(|(key, number)| Some((key, (*number)?)));
-    values.extend(
-        known
-            .filter(|(_, number)| number.is_finite())
-            .map(|(key, number)| value(key, format!("{number:.3}"))),
-    );
+    let mut values: Vec<KeyValue> = counts.iter().map(|(key, count)| figure(key, count)).collect();
+    values.push(figure(total, health.total));
+    let known = numbers.into_iter().filter_map(|(key, number)| Some((key, number?)));
+    let finite = known.filter(|(_, number)| number.is_finite());
+    values.extend(finite.map(|(key, number)| figure(key, format!("{number:.3}"))));
     let from = source(health);
     if !from.is_empty() {
-        values.push(value("source", from));
+        values.push(figure("source", from));
     }
     values
 }

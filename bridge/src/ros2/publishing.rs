@@ -12,11 +12,12 @@ use semidense::slam::keyframe::Keyframe;
 
 use crate::ros::axes::{ros_from_world, transform_message};
 use crate::ros::converter::{Converter, PoseMessages};
+use crate::ros::diagnostics::{figure, report};
 use crate::ros::encoder::realtime_nanos;
 use crate::ros::frame_ids::FrameIds;
 use crate::ros::message::{
-    CameraInfo, DiagnosticArray, DiagnosticStatus, Header, Image, KeyValue, Odometry, PointCloud2,
-    PoseArray, PoseWithCovarianceStamped, RosMessage, TfMessage, Time, TransformStamped,
+    CameraInfo, DiagnosticArray, Header, Image, Odometry, PointCloud2, PoseArray,
+    PoseWithCovarianceStamped, RosMessage, TfMessage, Time, TransformStamped,
 };
 use crate::ros::topic::{self, Reliability, RosTopic};
 use crate::ros2::node::{NodeError, RosNode, dds_name};
@@ -257,26 +258,19 @@ impl Publishers {
     fn report(&mut self) -> DiagnosticArray {
         let drops = self.outbox.drops();
         let lost = drops.poses + self.refused;
-        let value = |key: &str, value: String| KeyValue { key: key.to_owned(), value };
         let longest_ms = self.longest.as_secs_f64() * 1e3;
         self.longest = Duration::ZERO;
-        let status = DiagnosticStatus {
-            level: 0,
-            name: format!("{}: ros2", self.params.instance),
-            message: if lost == 0 { "publishing" } else { "publishing; some were dropped" }
-                .to_owned(),
-            hardware_id: self.params.instance.clone(),
-            values: vec![
-                value("published", self.published.to_string()),
-                value("dropped_poses", drops.poses.to_string()),
-                value("dropped_images", drops.images.to_string()),
-                value("dropped_points", drops.points.to_string()),
-                value("refused_by_slow_readers", self.refused.to_string()),
-                value("longest_publish_ms", format!("{longest_ms:.3}")),
-            ],
-        };
-        let header = Header::new(Time::from_nanos(realtime_nanos()), "");
-        DiagnosticArray { header, status: vec![status] }
+        let message = if lost == 0 { "publishing" } else { "publishing; some were dropped" };
+        let values = vec![
+            figure("published", self.published),
+            figure("dropped_poses", drops.poses),
+            figure("dropped_images", drops.images),
+            figure("dropped_points", drops.points),
+            figure("refused_by_slow_readers", self.refused),
+            figure("longest_publish_ms", format!("{longest_ms:.3}")),
+        ];
+        let stamp = Time::from_nanos(realtime_nanos());
+        report(&self.params.instance, "ros2", stamp, (0, message.to_owned()), values)
     }
 }
 
