@@ -126,7 +126,7 @@ impl Recorder {
         if matches!(event, Event::Health("capture", _)) {
             let stamp = Time::from_nanos(realtime_nanos);
             let status = own_status(&self.params.instance, stamp, counts, sink.file.bytes());
-            self.encoder.send(&DIAGNOSTICS, stamp, &status, &mut sink)?;
+            self.encoder.offer(&DIAGNOSTICS, stamp, &mut sink, |_| status)?;
         }
         Ok(())
     }

@@ -107,13 +107,9 @@ impl EventEncoder {
                 ready.iter().try_for_each(|keyframe| self.put_keyframe(keyframe, sink))
             }
             Event::Graph(graph) => self.put_graph(graph, now.realtime_nanos, sink),
-            Event::Health(owner, health) => {
-                if !sink.wants(&DIAGNOSTICS) {
-                    return Ok(());
-                }
-                let array = self.converter.diagnostics(owner, health, read);
-                self.send(&DIAGNOSTICS, read, &array, sink)
-            }
+            Event::Health(owner, health) => self.offer(&DIAGNOSTICS, read, sink, |converter| {
+                converter.diagnostics(owner, health, read)
+            }),
             Event::Left => self.finish(sink),
             Event::Joined | Event::Adjustment(_) => Ok(()),
         }
@@ -127,15 +123,18 @@ impl EventEncoder {
         }
     }
 
-    /// Encodes a message and gives it to `sink`.
-    pub fn send<S: Sink>(
+    /// Encodes the message that `make` gives and puts it into `sink`, where that wants the topic.
+    pub fn offer<S: Sink, M: Serialize>(
         &mut self,
         topic: &'static RosTopic,
         stamp: Time,
-        message: &impl Serialize,
         sink: &mut S,
+        make: impl FnOnce(&Converter) -> M,
     ) -> Result<(), S::Error> {
-        encode_into(message, &mut self.bytes).map_err(EncodeError::from)?;
+        if !sink.wants(topic) {
+            return Ok(());
+        }
+        encode_into(&make(&self.converter), &mut self.bytes).map_err(EncodeError::from)?;
         sink.put(Encoded { topic, stamp, bytes: &self.bytes })
     }
 
@@ -145,22 +144,15 @@ impl EventEncoder {
         }
         let header = self.converter.image_header(frame);
         let stamp = header.stamp;
-        if sink.wants(&FRAME_RECORDS) {
-            let record = FrameRecord::new(header.clone(), &frame.header);
-            self.send(&FRAME_RECORDS, stamp, &record, sink)?;
-        }
-        if sink.wants(&CAMERA_INFO) {
-            let camera = self.converter.camera_info(frame);
-            self.send(&CAMERA_INFO, stamp, &camera, sink)?;
-        }
+        self.offer(&FRAME_RECORDS, stamp, sink, |_| {
+            FrameRecord::new(header.clone(), &frame.header)
+        })?;
+        self.offer(&CAMERA_INFO, stamp, sink, |converter| converter.camera_info(frame))?;
         match self.images {
-            ImageFormat::Raw if sink.wants(&IMAGE) => {
-                let image = self.converter.image(frame);
-                self.send(&IMAGE, stamp, &image, sink)
-            }
+            ImageFormat::Raw => self.offer(&IMAGE, stamp, sink, |converter| converter.image(frame)),
             ImageFormat::Png | ImageFormat::Jpeg if sink.wants(&COMPRESSED_IMAGE) => {
                 let image = compressed(self.images, frame, header).map_err(EncodeError::from)?;
-                self.send(&COMPRESSED_IMAGE, stamp, &image, sink)
+                self.offer(&COMPRESSED_IMAGE, stamp, sink, |_| image)
             }
             _ => Ok(()),
         }
@@ -169,24 +161,14 @@ impl EventEncoder {
     fn put_pose<S: Sink>(&mut self, pose: &Pose, sink: &mut S) -> Result<(), S::Error> {
         let header = self.converter.pose_header(pose);
         let stamp = header.stamp;
-        if sink.wants(&POSE_RECORDS) {
-            let record = PoseRecord::new(header, &pose.message);
-            self.send(&POSE_RECORDS, stamp, &record, sink)?;
-        }
+        self.offer(&POSE_RECORDS, stamp, sink, |_| PoseRecord::new(header, &pose.message))?;
         if ![&POSE, &ODOMETRY, &TF].into_iter().any(|topic| sink.wants(topic)) {
             return Ok(());
         }
         let Some(messages) = self.converter.pose(pose) else { return Ok(()) };
-        if sink.wants(&TF) {
-            self.send(&TF, stamp, &messages.transforms, sink)?;
-        }
-        if sink.wants(&POSE) {
-            self.send(&POSE, stamp, &messages.pose, sink)?;
-        }
-        if sink.wants(&ODOMETRY) {
-            self.send(&ODOMETRY, stamp, &messages.odometry, sink)?;
-        }
-        Ok(())
+        self.offer(&TF, stamp, sink, |_| messages.transforms)?;
+        self.offer(&POSE, stamp, sink, |_| messages.pose)?;
+        self.offer(&ODOMETRY, stamp, sink, |_| messages.odometry)
     }
 
     /// Puts a keyframe, whether or not one was put a moment ago.
@@ -196,15 +178,10 @@ impl EventEncoder {
         sink: &mut S,
     ) -> Result<(), S::Error> {
         let stamp = self.converter.stamp(keyframe.capture_nanos);
-        if sink.wants(&POINTS) {
-            let cloud = self.converter.points(keyframe);
-            self.send(&POINTS, stamp, &cloud, sink)?;
-        }
-        if sink.wants(&KEYFRAME_RECORDS) {
-            let record = KeyframeRecord::new(self.converter.map_header(stamp), keyframe);
-            self.send(&KEYFRAME_RECORDS, stamp, &record, sink)?;
-        }
-        Ok(())
+        self.offer(&POINTS, stamp, sink, |converter| converter.points(keyframe))?;
+        self.offer(&KEYFRAME_RECORDS, stamp, sink, |converter| {
+            KeyframeRecord::new(converter.map_header(stamp), keyframe)
+        })
     }
 
     /// Puts a graph that was read at `realtime_nanos`.
@@ -215,15 +192,10 @@ impl EventEncoder {
         sink: &mut S,
     ) -> Result<(), S::Error> {
         let read = Time::from_nanos(realtime_nanos);
-        if sink.wants(&KEYFRAMES) {
-            let poses = self.converter.keyframes(graph, read);
-            self.send(&KEYFRAMES, read, &poses, sink)?;
-        }
-        if sink.wants(&GRAPH_RECORDS) {
-            let record = GraphRecord::new(self.converter.map_header(read), graph);
-            self.send(&GRAPH_RECORDS, read, &record, sink)?;
-        }
-        Ok(())
+        self.offer(&KEYFRAMES, read, sink, |converter| converter.keyframes(graph, read))?;
+        self.offer(&GRAPH_RECORDS, read, sink, |converter| {
+            GraphRecord::new(converter.map_header(read), graph)
+        })
     }
 }
 
