@@ -3,6 +3,8 @@
 use serde::{Deserialize, Serialize};
 use serde_big_array::BigArray;
 
+use crate::ros::own_message::{FrameRecord, GraphRecord, KeyframeRecord, PoseRecord};
+
 /// A message with a ROS type.
 pub trait RosMessage: Serialize {
     /// Its type: package and name, as `nav_msgs/Odometry`.
@@ -348,4 +350,8 @@ types! {
     CompressedImage "sensor_msgs/CompressedImage",
     CameraInfo "sensor_msgs/CameraInfo",
     DiagnosticArray "diagnostic_msgs/DiagnosticArray",
+    FrameRecord "semidense_msgs/Frame",
+    PoseRecord "semidense_msgs/Pose",
+    KeyframeRecord "semidense_msgs/Keyframe",
+    GraphRecord "semidense_msgs/Graph",
 }

@@ -7,7 +7,7 @@ use semidense::wire::message::{FrameHeader, PoseMessage};
 use serde::{Deserialize, Serialize};
 use serde_big_array::BigArray;
 
-use crate::ros::message::{Header, RosMessage};
+use crate::ros::message::Header;
 use crate::session::Graph;
 
 /// `semidense_msgs/Frame`: of an image what `sensor_msgs` has no place for. A recording is played with these stamps.
@@ -205,20 +205,4 @@ impl GraphRecord {
                 .collect(),
         }
     }
-}
-
-impl RosMessage for FrameRecord {
-    const TYPE: &'static str = "semidense_msgs/Frame";
-}
-
-impl RosMessage for PoseRecord {
-    const TYPE: &'static str = "semidense_msgs/Pose";
-}
-
-impl RosMessage for KeyframeRecord {
-    const TYPE: &'static str = "semidense_msgs/Keyframe";
-}
-
-impl RosMessage for GraphRecord {
-    const TYPE: &'static str = "semidense_msgs/Graph";
 }

@@ -71,13 +71,17 @@ fn name_part(instance: &str) -> String {
 }
 
 const fn sensor<T: RosMessage>(name: &'static str, depth: usize) -> RosTopic {
-    let (reliability, durability) = (Reliability::BestEffort, Durability::Volatile);
-    RosTopic { name, message_type: T::TYPE, reliability, durability, depth }
+    RosTopic { reliability: Reliability::BestEffort, ..reliable::<T>(name, depth) }
 }
 
 const fn reliable<T: RosMessage>(name: &'static str, depth: usize) -> RosTopic {
     let (reliability, durability) = (Reliability::Reliable, Durability::Volatile);
     RosTopic { name, message_type: T::TYPE, reliability, durability, depth }
+}
+
+/// The last message stays for late subscribers.
+const fn latched<T: RosMessage>(name: &'static str) -> RosTopic {
+    RosTopic { durability: Durability::TransientLocal, ..reliable::<T>(name, 1) }
 }
 
 /// Messages of a camera that a subscriber may be behind: ROS's profile for sensor data.
@@ -94,13 +98,7 @@ pub const ODOMETRY: RosTopic = reliable::<Odometry>("odom", DEFAULT_DEPTH);
 /// map → odom → camera.
 pub const TF: RosTopic = reliable::<TfMessage>("/tf", TF_DEPTH);
 /// The camera's body axes in its optical frame; never changes.
-pub const TF_STATIC: RosTopic = RosTopic {
-    name: "/tf_static",
-    message_type: TfMessage::TYPE,
-    reliability: Reliability::Reliable,
-    durability: Durability::TransientLocal,
-    depth: 1,
-};
+pub const TF_STATIC: RosTopic = latched::<TfMessage>("/tf_static");
 /// The active keyframe's depth as points in the map.
 pub const POINTS: RosTopic = sensor::<PointCloud2>("points", SENSOR_DEPTH);
 /// The camera's image, rectified, grey.
@@ -111,13 +109,7 @@ pub const COMPRESSED_IMAGE: RosTopic =
 /// Intrinsics of the image.
 pub const CAMERA_INFO: RosTopic = sensor::<CameraInfo>("camera_info", SENSOR_DEPTH);
 /// Poses of all keyframes in the map; a late subscriber gets the last.
-pub const KEYFRAMES: RosTopic = RosTopic {
-    name: "keyframes",
-    message_type: PoseArray::TYPE,
-    reliability: Reliability::Reliable,
-    durability: Durability::TransientLocal,
-    depth: 1,
-};
+pub const KEYFRAMES: RosTopic = latched::<PoseArray>("keyframes");
 /// Health of the three processes.
 pub const DIAGNOSTICS: RosTopic = reliable::<DiagnosticArray>("/diagnostics", DEFAULT_DEPTH);
 
@@ -131,14 +123,14 @@ pub const KEYFRAME_RECORDS: RosTopic =
 /// What the map's graph has besides poses.
 pub const GRAPH_RECORDS: RosTopic = reliable::<GraphRecord>("details/graph", DEFAULT_DEPTH);
 
-/// All of ROS's types.
-pub const TOPICS: [RosTopic; 9] =
-    [POSE, ODOMETRY, TF, POINTS, IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, KEYFRAMES, DIAGNOSTICS];
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::ros::schema::{schema, type_hash};
+
+    /// All of ROS's types.
+    const TOPICS: [RosTopic; 9] =
+        [POSE, ODOMETRY, TF, POINTS, IMAGE, COMPRESSED_IMAGE, CAMERA_INFO, KEYFRAMES, DIAGNOSTICS];
 
     #[test]
     fn names_are_ros_names_and_types_are_known() {
