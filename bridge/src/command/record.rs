@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use clap::{Args, ValueEnum};
+use clap::Args;
 use semidense::service::shutdown::Shutdown;
 
 use crate::command::{CommandResult, CommonArguments};
@@ -39,8 +39,8 @@ pub struct RecordArguments {
     #[arg(long, short, value_name = "FILE")]
     output: PathBuf,
     /// How images are written
-    #[arg(long, value_enum, default_value_t = ImagesArgument::Png)]
-    images: ImagesArgument,
+    #[arg(long, value_enum, default_value_t = ImageFormat::Png)]
+    images: ImageFormat,
     /// End after so many seconds of recording
     #[arg(long, value_name = "SECONDS", value_parser = parse_seconds)]
     duration: Option<Duration>,
@@ -50,30 +50,6 @@ pub struct RecordArguments {
     /// Begin a new file when one is so many seconds long
     #[arg(long, value_name = "SECONDS", value_parser = parse_seconds)]
     max_duration: Option<Duration>,
-}
-
-/// [`ImageFormat`] on the command line.
-#[derive(Debug, Clone, Copy, ValueEnum)]
-enum ImagesArgument {
-    /// PNG: every pixel as it was; 1.6 ms and 170 kB for 640x480
-    Png,
-    /// JPEG: not exact, replays differ a little; 6 ms and 70 kB
-    Jpeg,
-    /// Pixels (mono8): no work, 307 kB; rerun shows them as depth
-    Raw,
-    /// No images; the recording cannot be replayed
-    None,
-}
-
-impl From<ImagesArgument> for ImageFormat {
-    fn from(argument: ImagesArgument) -> Self {
-        match argument {
-            ImagesArgument::Png => Self::Png,
-            ImagesArgument::Jpeg => Self::Jpeg,
-            ImagesArgument::Raw => Self::Raw,
-            ImagesArgument::None => Self::None,
-        }
-    }
 }
 
 /// A positive number of seconds.
@@ -93,7 +69,7 @@ pub fn run(common: &CommonArguments, arguments: &RecordArguments) -> CommandResu
     let params = RecordParams {
         output: output_file(&arguments.output, &instance),
         instance,
-        images: arguments.images.into(),
+        images: arguments.images,
         max_bytes: arguments.max_bytes,
         max_duration: arguments.max_duration,
     };
