@@ -9,8 +9,10 @@ pub mod zenoh;
 
 use std::error::Error;
 use std::io::{IsTerminal, Write};
+use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::str::FromStr;
 
 use clap::{Args, CommandFactory, Parser, Subcommand};
 use semidense::service::config::{Config, SYSTEM_FOLDER, file_for};
@@ -87,10 +89,23 @@ pub fn main() -> ExitCode {
     let line = CommandLine::parse();
     run(line).unwrap_or_else(|error| {
         let line = error.to_string().split_whitespace().collect::<Vec<_>>().join(" ");
-        // Standard error may be closed; there is nobody else to tell.
-        let _ = writeln!(std::io::stderr(), "error: {line}");
+        note(&format!("error: {line}"));
         ExitCode::FAILURE
     })
+}
+
+/// A line for the user. Standard error may be closed; there is nobody else to tell.
+fn note(line: &str) {
+    let _ = writeln!(std::io::stderr(), "{line}");
+}
+
+/// A number within `range`, or the text of what is `wanted`.
+fn number_within<T: FromStr + PartialOrd>(
+    text: &str,
+    range: RangeInclusive<T>,
+    wanted: &str,
+) -> Result<T, String> {
+    text.parse().ok().filter(|number| range.contains(number)).ok_or_else(|| wanted.to_owned())
 }
 
 fn run(line: CommandLine) -> CommandResult {

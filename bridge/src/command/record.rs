@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use clap::Args;
 use semidense::service::shutdown::Shutdown;
 
-use crate::command::{CommandResult, CommonArguments};
+use crate::command::{CommandResult, CommonArguments, note, number_within};
 use crate::record::queue::{QueueSender, queue};
 use crate::record::recorder::{RecordParams, RecordSummary, Recorder};
 use crate::ros::encoder::Moment;
@@ -56,10 +56,8 @@ pub struct RecordArguments {
 fn parse_seconds(text: &str) -> Result<Duration, String> {
     /// A year: more is a mistake.
     const MOST: f64 = 366.0 * 86_400.0;
-    let seconds = text.parse::<f64>().ok().filter(|s| *s > 0.0 && *s <= MOST);
-    seconds
-        .map(Duration::from_secs_f64)
-        .ok_or_else(|| "needs a number of seconds above 0".to_owned())
+    let wanted = "needs a number of seconds above 0";
+    number_within(text, f64::MIN_POSITIVE..=MOST, wanted).map(Duration::from_secs_f64)
 }
 
 /// Runs it until the instance ends, a signal comes or the time is over.
@@ -120,7 +118,7 @@ fn read(
         })?;
         if began.is_none() && !has_said && started.elapsed() > PATIENCE {
             has_said = true;
-            tell("waiting for an instance: start one with `semidense run`");
+            note("waiting for an instance: start one with `semidense run`");
         }
         has_ended |= duration.zip(began).is_some_and(|(most, began)| began.elapsed() >= most);
     }
@@ -134,11 +132,6 @@ fn output_file(output: &Path, instance: &str) -> PathBuf {
     }
     let nanos = Moment::now().realtime_nanos;
     output.join(format!("{instance}-{}.mcap", nanos / 1_000_000_000))
-}
-
-fn tell(line: &str) {
-    // Standard error may be closed; there is nobody else to tell.
-    let _ = writeln!(std::io::stderr(), "{line}");
 }
 
 fn print(summary: &RecordSummary, began: Option<Instant>, dropped: u64) {

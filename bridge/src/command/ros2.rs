@@ -8,7 +8,7 @@ use std::time::Duration;
 use clap::Args;
 use semidense::service::shutdown::Shutdown;
 
-use crate::command::{CommandResult, CommonArguments};
+use crate::command::{CommandResult, CommonArguments, note, number_within};
 use crate::ros::frame_ids::FrameIds;
 use crate::ros::topic::namespace;
 use crate::ros2::camera::{self, CameraError, CameraParams, Output};
@@ -90,10 +90,7 @@ pub struct Ros2Arguments {
 
 /// A rate, 0 to 1000 a second.
 fn parse_rate(text: &str) -> Result<f64, String> {
-    text.parse()
-        .ok()
-        .filter(|rate| (0.0..=1000.0).contains(rate))
-        .ok_or_else(|| "needs a number from 0 to 1000".to_owned())
+    number_within(text, 0.0..=1000.0, "needs a number from 0 to 1000")
 }
 
 /// Least time between two messages at a rate; 0 is no limit.
@@ -143,13 +140,11 @@ pub fn run(common: &CommonArguments, arguments: &Ros2Arguments) -> CommandResult
     let mut session = Session::new(place, "ros2", wants);
     let publishers = Publishers::open(node, params.clone())?;
     let mut reader = publishers.reader();
-    let _ = writeln!(
-        std::io::stderr(),
-        "publishing {} on ROS 2, topics below {}, domain {}, {reach}",
-        params.instance,
-        params.namespace,
-        network.domain
-    );
+    let PublishParams { instance, namespace, .. } = &params;
+    let domain = network.domain;
+    note(&format!(
+        "publishing {instance} on ROS 2, topics below {namespace}, domain {domain}, {reach}"
+    ));
     let thread = std::thread::Builder::new().name("publisher".to_owned());
     let publishing = thread.spawn(move || publishers.run())?;
     let outcome = loop {
@@ -202,7 +197,7 @@ pub fn run_camera(arguments: &Ros2CameraArguments) -> CommandResult {
     // The exit code of wrong usage, so that nobody starts this again and again.
     const WRONG_USAGE: u8 = 2;
     if let Err(error) = crate::ros2::node::dds_name(&arguments.topic) {
-        let _ = writeln!(std::io::stderr(), "error: {error}");
+        note(&format!("error: {error}"));
         return Ok(ExitCode::from(WRONG_USAGE));
     }
     let params = CameraParams {

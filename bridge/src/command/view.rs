@@ -12,7 +12,7 @@ use semidense::service::child::follow_supervisor;
 use semidense::service::shutdown::Shutdown;
 use semidense::wire::port::wait;
 
-use crate::command::{CommandResult, CommonArguments};
+use crate::command::{CommandResult, CommonArguments, note, number_within};
 use crate::feed::{Feed, Listener, USUAL_DEPTH};
 use crate::session::Wants;
 use crate::web::finished::{read_run, read_summary};
@@ -71,17 +71,11 @@ pub struct ViewArguments {
 }
 
 fn rate(text: &str) -> Result<f64, String> {
-    let rate: f64 = text.parse().map_err(|_| "a number is wanted".to_owned())?;
-    if (0.1..=60.0).contains(&rate) { Ok(rate) } else { Err("choose 0.1 to 60".to_owned()) }
+    number_within(text, 0.1..=60.0, "needs a number from 0.1 to 60")
 }
 
 fn points(text: &str) -> Result<usize, String> {
-    let points: usize = text.parse().map_err(|_| "a number is wanted".to_owned())?;
-    if (10_000..=50_000_000).contains(&points) {
-        Ok(points)
-    } else {
-        Err("choose 10000 to 50000000".to_owned())
-    }
+    number_within(text, 10_000..=50_000_000, "needs a number from 10000 to 50000000")
 }
 
 /// Runs it until a signal comes.
@@ -209,9 +203,8 @@ fn say(server: &Server, arguments: &ViewArguments, token: Option<&str>) {
     }
     let _ = std::io::stdout().flush();
     if arguments.no_token && !address.ip().is_loopback() {
-        let _ = writeln!(
-            std::io::stderr(),
+        note(&format!(
             "warning: everybody who reaches {address} sees the camera and can save the map: there is no token"
-        );
+        ));
     }
 }

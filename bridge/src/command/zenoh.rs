@@ -1,6 +1,5 @@
 //! `semidense-bridge zenoh`: to another machine, and back into shared memory there.
 
-use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -9,7 +8,7 @@ use semidense::service::child::tidy_up;
 use semidense::service::shutdown::Shutdown;
 use semidense::wire::place::Place;
 
-use crate::command::{CommandResult, CommonArguments};
+use crate::command::{CommandResult, CommonArguments, note, number_within};
 use crate::zenoh::link::{Endpoint, Endpoints};
 use crate::zenoh::receiver::{ReceiveOptions, receive};
 use crate::zenoh::sender::{FrameOptions, SendOptions, send};
@@ -35,7 +34,7 @@ enum Direction {
     Receive(ReceiveArguments),
 }
 
-#[derive(Debug, Args)]
+#[derive(Debug, Clone, Args)]
 struct LinkArguments {
     /// Open a port for the other side: tcp/HOST:PORT, beyond this machine only where HOST says so (tcp/0.0.0.0:7447);
     /// may be repeated
@@ -52,12 +51,8 @@ struct LinkArguments {
 
 impl LinkArguments {
     fn endpoints(&self) -> Endpoints {
-        let Self { listen, connect, password_file } = self;
-        Endpoints {
-            listen: listen.clone(),
-            connect: connect.clone(),
-            password_file: password_file.clone(),
-        }
+        let Self { listen, connect, password_file } = self.clone();
+        Endpoints { listen, connect, password_file }
     }
 }
 
@@ -106,10 +101,8 @@ struct ReceiveArguments {
 fn rate(text: &str) -> Result<f64, String> {
     /// Faster than any camera.
     const MAX_HZ: f64 = 1000.0;
-    match text.parse::<f64>() {
-        Ok(rate_hz) if rate_hz > 0.0 && rate_hz <= MAX_HZ => Ok(rate_hz),
-        _ => Err(format!("write a number above 0 and up to {MAX_HZ}, in Hz")),
-    }
+    let wanted = format!("write a number above 0 and up to {MAX_HZ}, in Hz");
+    number_within(text, f64::MIN_POSITIVE..=MAX_HZ, &wanted)
 }
 
 /// Runs it until a signal comes.
@@ -174,10 +167,4 @@ fn warn_of_open_port(endpoints: &Endpoints) {
         }
     };
     note(&format!("warning: {} is open beyond this machine: {who}", open.join(", ")));
-}
-
-/// A line for the user.
-fn note(line: &str) {
-    // Standard error may be closed; there is nobody else to tell.
-    let _ = writeln!(std::io::stderr(), "{line}");
 }
