@@ -1,6 +1,5 @@
 //! `semidense-bridge zenoh`: to another machine, and back into shared memory there.
 
-use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::{Args, Subcommand};
@@ -34,28 +33,6 @@ enum Direction {
     Receive(ReceiveArguments),
 }
 
-#[derive(Debug, Clone, Args)]
-struct LinkArguments {
-    /// Open a port for the other side: tcp/HOST:PORT, beyond this machine only where HOST says so (tcp/0.0.0.0:7447);
-    /// may be repeated
-    #[arg(long, value_name = "ENDPOINT")]
-    listen: Vec<Endpoint>,
-    /// Connect to a port of the other side, tcp/HOST:PORT, again and again until it answers; may be repeated
-    #[arg(long, value_name = "ENDPOINT")]
-    connect: Vec<Endpoint>,
-    /// File with one line `user:password` for both sides (mode 0600): who does not know it is refused. It does not
-    /// encrypt
-    #[arg(long, value_name = "FILE")]
-    password_file: Option<PathBuf>,
-}
-
-impl LinkArguments {
-    fn endpoints(&self) -> Endpoints {
-        let Self { listen, connect, password_file } = self.clone();
-        Endpoints { listen, connect, password_file }
-    }
-}
-
 /// Send poses, health, map graph and keyframes of the local instance, whenever it runs
 #[derive(Debug, Args)]
 #[command(after_help = "\
@@ -63,7 +40,7 @@ Listens on tcp/127.0.0.1:7447 where neither --listen nor --connect is given. The
 what it does not take in time is dropped, the newest wins; --log info counts it every ten seconds.")]
 struct SendArguments {
     #[command(flatten)]
-    link: LinkArguments,
+    endpoints: Endpoints,
     /// Send the camera's frames too, as JPEG, as long as somebody receives them
     #[arg(long)]
     frames: bool,
@@ -88,7 +65,7 @@ While the link is down health is `stale` with the cause. Several robots: one rec
 #[command(group(clap::ArgGroup::new("link").args(["listen", "connect"]).required(true).multiple(true)))]
 struct ReceiveArguments {
     #[command(flatten)]
-    link: LinkArguments,
+    endpoints: Endpoints,
     /// Name of the instance on the robot
     #[arg(long, value_name = "INSTANCE", default_value = "semidense")]
     from: String,
@@ -115,7 +92,7 @@ pub fn run(common: &CommonArguments, arguments: &ZenohArguments) -> CommandResul
 
 fn run_send(common: &CommonArguments, arguments: &SendArguments) -> CommandResult {
     let place = common.place()?;
-    let mut endpoints = arguments.link.endpoints();
+    let mut endpoints = arguments.endpoints.clone();
     if endpoints.listen.is_empty() && endpoints.connect.is_empty() {
         endpoints.listen.push("tcp/127.0.0.1".parse()?);
     }
@@ -142,7 +119,7 @@ fn run_receive(common: &CommonArguments, arguments: &ReceiveArguments) -> Comman
     let instance = arguments.local.clone().or(named).unwrap_or_else(|| arguments.from.clone());
     let place = CommonArguments { instance: Some(instance), ..common.clone() }.place()?;
     let options =
-        ReceiveOptions { endpoints: arguments.link.endpoints(), from: arguments.from.clone() };
+        ReceiveOptions { endpoints: arguments.endpoints.clone(), from: arguments.from.clone() };
     warn_of_open_port(&options.endpoints);
     let shutdown = Shutdown::install()?;
     let (from, local) = (&options.from, &place.instance);

@@ -89,14 +89,19 @@ impl Endpoint {
     }
 }
 
-/// Where to listen and where to connect to.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
+/// Where to listen and where to connect to; the texts are those of the command line.
+#[derive(Debug, Clone, Default, PartialEq, Eq, clap::Args)]
 pub struct Endpoints {
-    /// Ports that are opened here.
+    /// Open a port for the other side: tcp/HOST:PORT, beyond this machine only where HOST says so (tcp/0.0.0.0:7447);
+    /// may be repeated
+    #[arg(long, value_name = "ENDPOINT")]
     pub listen: Vec<Endpoint>,
-    /// Ports of the other side, tried until they answer.
+    /// Connect to a port of the other side, tcp/HOST:PORT, again and again until it answers; may be repeated
+    #[arg(long, value_name = "ENDPOINT")]
     pub connect: Vec<Endpoint>,
-    /// File with the line `user:password` that both sides must have.
+    /// File with one line `user:password` for both sides (mode 0600): who does not know it is refused. It does not
+    /// encrypt
+    #[arg(long, value_name = "FILE")]
     pub password_file: Option<PathBuf>,
 }
 
