@@ -11,7 +11,6 @@ use zenoh::query::{ConsolidationMode, QueryTarget};
 use zenoh::{Session, Wait};
 
 use crate::zenoh::clock_offset::ClockAnswer;
-use crate::zenoh::envelope::{EnvelopeError, open};
 use crate::zenoh::kind::Kind;
 use crate::zenoh::shared::Shared;
 use crate::zenoh::unpack::{Arrival, unpack};
@@ -50,17 +49,7 @@ fn ask(network: &Session, instance: &str, shared: &Shared) -> Option<Vec<Kind>> 
     get(network, &Kind::Presence.key(instance), Priority::RealTime, |bytes| {
         let answered_nanos = now_nanos();
         let bytes = bytes.to_bytes();
-        let opened = match open(&bytes) {
-            Ok(opened) if opened.kind == Kind::Presence => opened,
-            Err(EnvelopeError::Version { found }) => {
-                shared.remote().hear_foreign(found, Instant::now());
-                return;
-            }
-            _ => {
-                shared.remote().refused += 1;
-                return;
-            }
-        };
+        let Some(opened) = shared.open(Kind::Presence, &bytes) else { return };
         let Ok(Arrival::Presence(presence)) = unpack(&opened) else {
             shared.remote().refused += 1;
             return;

@@ -8,7 +8,7 @@ use std::time::Instant;
 use semidense::service::clock::now_nanos;
 use zenoh::bytes::ZBytes;
 
-use crate::zenoh::envelope::{EnvelopeError, open};
+use crate::zenoh::envelope::{EnvelopeError, Opened, open};
 use crate::zenoh::kind::Kind;
 use crate::zenoh::remote::Remote;
 use crate::zenoh::slots::Slots;
@@ -41,9 +41,8 @@ impl Shared {
             Kind::Keyframe | Kind::KeyframeImage | Kind::Graph | Kind::Frame => 1,
             _ => WAITING_SMALL,
         });
-        let queue = || Slots::new(&depths);
-        let ready = Slots::new(&depths);
-        Self { remote: Mutex::default(), urgent: queue(), large: Slots::new(&depths), ready, wake }
+        let (urgent, large) = (Slots::new(&depths), Slots::new(&depths));
+        Self { remote: Mutex::default(), urgent, large, ready: Slots::new(&depths), wake }
     }
 
     /// What is known of the sender.
@@ -66,20 +65,22 @@ impl Shared {
         let _ = (&self.wake).write(&[0]);
     }
 
+    /// Checks an envelope that came as one of `kind`; `None` where it is none.
+    pub(super) fn open<'a>(&self, kind: Kind, bytes: &'a [u8]) -> Option<Opened<'a>> {
+        match open(bytes) {
+            Ok(opened) if opened.kind == kind => return Some(opened),
+            Err(EnvelopeError::Version { found }) => {
+                self.remote().hear_foreign(found, Instant::now());
+            }
+            _ => self.remote().refused += 1,
+        }
+        None
+    }
+
     /// Checks and unpacks; `None` for what is not to be used.
     pub(super) fn unpack(&self, kind: Kind, bytes: &ZBytes) -> Option<Arrival> {
         let bytes = bytes.to_bytes();
-        let opened = match open(&bytes) {
-            Ok(opened) if opened.kind == kind => opened,
-            Err(EnvelopeError::Version { found }) => {
-                self.remote().hear_foreign(found, Instant::now());
-                return None;
-            }
-            _ => {
-                self.remote().refused += 1;
-                return None;
-            }
-        };
+        let opened = self.open(kind, &bytes)?;
         if !self.remote().admit(&opened.envelope, kind, Instant::now()) {
             return None;
         }
