@@ -13,11 +13,10 @@ use semidense::wire::message::{
     AdjustmentMessage, HealthMessage, KeyframePoseMessage, PoseMessage,
 };
 use semidense::wire::place::Place;
-use zenoh::bytes::ZBytes;
 use zenoh::pubsub::Publisher;
 use zenoh::query::Query;
 use zenoh::{Session as ZenohSession, Wait};
-use zerocopy::IntoBytes;
+use zerocopy::{Immutable, IntoBytes};
 
 use crate::jpeg;
 use crate::session::{Event, Frame, Graph, Session, Wants};
@@ -75,85 +74,89 @@ pub fn send(place: &Place, options: &SendOptions, shutdown: &Shutdown) -> Result
     let network = open(&options.endpoints)?;
     let outlet = Arc::new(Outlet::new(sender_id(&network)));
     declare_answers(&network, &place.instance, &outlet)?;
-    let urgent = Slots::new(&[WAITING_POSES, WAITING_HEALTH, WAITING_HEALTH, WAITING_HEALTH]);
-    let large = Slots::new(&[WAITING_ADJUSTMENTS, 1, 1, 1]);
-    let publishers = |kinds: &[Kind]| -> Result<Vec<Publisher<'static>>, ZenohError> {
-        kinds.iter().map(|kind| publisher(&network, &place.instance, *kind)).collect()
-    };
-    let kinds: Vec<Kind> = Kind::ALL.into_iter().filter(|kind| kind.topic().is_some()).collect();
-    let (of_urgent, of_large) = (publishers(&kinds)?, publishers(&kinds)?);
-    let quality = options.frames.map_or(0, |frames| frames.jpeg_quality);
+    // By kind; each queue leaves the slots of the other's empty.
+    let depths = Kind::ALL.map(|kind| match kind {
+        Kind::Pose => WAITING_POSES,
+        Kind::CaptureHealth | Kind::TrackerHealth | Kind::MapperHealth => WAITING_HEALTH,
+        Kind::Adjustment => WAITING_ADJUSTMENTS,
+        _ => 1,
+    });
+    let (urgent, large) = (Slots::new(&depths), Slots::new(&depths));
+    let kinds = Kind::ALL.into_iter().filter(|kind| kind.topic().is_some());
+    let publishers: Vec<Publisher<'static>> = kinds
+        .map(|kind| publisher(&network, &place.instance, kind))
+        .collect::<Result<_, ZenohError>>()?;
+    let jpeg_quality = options.frames.map_or(0, |frames| frames.jpeg_quality);
+    let putter =
+        || Putter { publishers: &publishers, outlet: &outlet, jpeg_quality, image_of: None };
     let outcome = std::thread::scope(|scope| {
         let named = |name: &str| std::thread::Builder::new().name(name.to_owned());
         let started = named("put-urgent")
-            .spawn_scoped(scope, || put_urgent(&urgent, &of_urgent, &outlet))
-            .and_then(|_| {
-                named("put-large")
-                    .spawn_scoped(scope, || put_large(&large, &of_large, &outlet, quality))
-            });
-        let read = || {
-            read(
-                place,
-                options,
-                shutdown,
-                &Reader { outlet: &outlet, urgent: &urgent, large: &large },
-            )
+            .spawn_scoped(scope, || putter().run(&urgent))
+            .and_then(|_| named("put-large").spawn_scoped(scope, || putter().run(&large)));
+        let reader = Reader {
+            outlet: &outlet,
+            urgent: &urgent,
+            large: &large,
+            frame_rate: Rate::new(options.frames.map_or(1.0, |frames| frames.rate_hz)),
+            keyframes: Latest::new(options.keyframe_rate_hz),
         };
-        let outcome = started.map_err(ZenohError::from).and_then(|_| read());
+        let outcome = started
+            .map_err(ZenohError::from)
+            .and_then(|_| reader.run(place, options.frames.is_some(), shutdown));
         urgent.close();
         large.close();
         outcome
     });
-    drop((of_urgent, of_large));
+    drop(publishers);
     // What cannot be told any more is noticed by the other side's lease.
     let _ = network.close().wait();
     outcome
 }
 
-/// What the reading thread gives to the others.
+/// Reads shared memory, and gives what is to be sent to the other threads.
 struct Reader<'a> {
     outlet: &'a Outlet,
     urgent: &'a Slots<Item>,
     large: &'a Slots<Item>,
-}
-
-fn read(
-    place: &Place,
-    options: &SendOptions,
-    shutdown: &Shutdown,
-    to: &Reader<'_>,
-) -> Result<(), ZenohError> {
-    let wants =
-        Wants { frames: options.frames.is_some(), keyframes: true, graph: true, adjustments: true };
-    let mut session = Session::new(place.clone(), "zenoh-send", wants);
-    let mut frame_rate = Rate::new(options.frames.map_or(1.0, |frames| frames.rate_hz));
-    let mut keyframes = Latest::new(options.keyframe_rate_hz);
-    let mut traffic = Traffic::default();
-    while !shutdown.is_requested() {
-        session.read(Some(shutdown.descriptor()), WAKE_PERIOD, |event| {
-            to.take(event, &mut frame_rate, &mut keyframes);
-        })?;
-        if let Some(keyframe) = keyframes.due(Instant::now()) {
-            to.large.put(2, Item::Keyframe(keyframe));
-        }
-        traffic.tell(to.outlet, || dropped(to), session.refused());
-    }
-    Ok(())
-}
-
-/// Messages that the network did not take in time, as the log names them.
-fn dropped(to: &Reader<'_>) -> [(&'static str, u64); 5] {
-    [
-        ("poses", to.urgent.dropped(0)),
-        ("health", (1..=3).map(|slot| to.urgent.dropped(slot)).sum()),
-        ("graphs", to.large.dropped(1)),
-        ("keyframes", to.large.dropped(2)),
-        ("frames", to.large.dropped(3)),
-    ]
+    frame_rate: Rate,
+    keyframes: Latest,
 }
 
 impl Reader<'_> {
-    fn take(&self, event: Event, frame_rate: &mut Rate, keyframes: &mut Latest) {
+    fn run(mut self, place: &Place, frames: bool, shutdown: &Shutdown) -> Result<(), ZenohError> {
+        let wants = Wants { frames, keyframes: true, graph: true, adjustments: true };
+        let mut session = Session::new(place.clone(), "zenoh-send", wants);
+        let mut traffic = Traffic::default();
+        while !shutdown.is_requested() {
+            session.read(Some(shutdown.descriptor()), WAKE_PERIOD, |event| self.take(event))?;
+            if let Some(keyframe) = self.keyframes.due(Instant::now()) {
+                self.put(Kind::Keyframe, Item::Keyframe(keyframe));
+            }
+            traffic.tell(self.outlet, || self.dropped(), session.refused());
+        }
+        Ok(())
+    }
+
+    /// Messages that the network did not take in time, as the log names them.
+    fn dropped(&self) -> [(&'static str, u64); 5] {
+        let urgent = |kind: &Kind| self.urgent.dropped(*kind as usize);
+        let large = |kind: Kind| self.large.dropped(kind as usize);
+        [
+            ("poses", urgent(&Kind::Pose)),
+            ("health", Kind::HEALTH.iter().map(urgent).sum()),
+            ("graphs", large(Kind::Graph)),
+            ("keyframes", large(Kind::Keyframe)),
+            ("frames", large(Kind::Frame)),
+        ]
+    }
+
+    fn put(&self, kind: Kind, item: Item) {
+        let queue = if kind.is_urgent() { self.urgent } else { self.large };
+        queue.put(kind as usize, item);
+    }
+
+    fn take(&mut self, event: Event) {
         match event {
             Event::Joined => {
                 tracing::info!("joined the instance");
@@ -162,22 +165,20 @@ impl Reader<'_> {
             Event::Left => {
                 tracing::info!("the instance is gone");
                 self.outlet.end_run();
-                keyframes.forget();
+                self.keyframes.forget();
             }
-            Event::Pose(pose) => self.urgent.put(0, Item::Pose(Box::new(pose.message))),
+            Event::Pose(pose) => self.put(Kind::Pose, Item::Pose(Box::new(pose.message))),
             Event::Health(owner, health) => {
-                let place =
-                    Kind::HEALTH.iter().position(|kind| Some(*kind) == Kind::of_health(owner));
-                if let Some(place) = place {
-                    self.urgent.put(1 + place, Item::Health(Kind::HEALTH[place], health));
+                if let Some(kind) = Kind::of_health(owner) {
+                    self.put(kind, Item::Health(kind, health));
                 }
             }
-            Event::Adjustment(message) => self.large.put(0, Item::Adjustment(message)),
-            Event::Graph(graph) => self.large.put(1, Item::Graph(graph)),
-            Event::Keyframe(keyframe) => keyframes.take(keyframe),
+            Event::Adjustment(message) => self.put(Kind::Adjustment, Item::Adjustment(message)),
+            Event::Graph(graph) => self.put(Kind::Graph, Item::Graph(graph)),
+            Event::Keyframe(keyframe) => self.keyframes.take(keyframe),
             Event::Frame(frame) => {
-                if frame_rate.is_due(Instant::now()) {
-                    self.large.put(3, Item::Frame(frame));
+                if self.frame_rate.is_due(Instant::now()) {
+                    self.put(Kind::Frame, Item::Frame(frame));
                 }
             }
         }
@@ -209,95 +210,75 @@ fn declare_answers(
     Ok(())
 }
 
-fn put(publishers: &[Publisher<'static>], kind: Kind, bytes: ZBytes) {
-    // Dropped on a congested link: receivers see it by the numbers.
-    if let Err(error) = publishers[kind as usize].put(bytes).wait() {
-        tracing::debug!("{error}");
-    }
-}
-
-fn put_urgent(items: &Slots<Item>, publishers: &[Publisher<'static>], outlet: &Outlet) {
-    while let Some(item) = items.take() {
-        match item {
-            Item::Pose(message) => {
-                let bytes = outlet.seal(Kind::Pose, &*message, &Packed::empty());
-                put(publishers, Kind::Pose, bytes);
-            }
-            Item::Health(kind, message) => {
-                put(publishers, kind, outlet.seal(kind, &*message, &Packed::empty()));
-            }
-            _ => {}
-        }
-    }
-}
-
-fn put_large(
-    items: &Slots<Item>,
-    publishers: &[Publisher<'static>],
-    outlet: &Outlet,
+/// Packs messages, numbers and puts them.
+struct Putter<'a> {
+    publishers: &'a [Publisher<'static>],
+    outlet: &'a Outlet,
     jpeg_quality: u8,
-) {
-    let mut image_of = None;
-    while let Some(item) = items.take() {
-        match item {
-            Item::Adjustment(message) => {
-                let bytes = outlet.seal(Kind::Adjustment, &message, &Packed::empty());
-                put(publishers, Kind::Adjustment, bytes);
-            }
-            Item::Graph(graph) => {
-                let poses: Vec<KeyframePoseMessage> =
-                    graph.poses.iter().map(keyframe_pose_message).collect();
-                let payload = pack_plain(poses.as_slice().as_bytes());
-                put(publishers, Kind::Graph, outlet.seal(Kind::Graph, &graph.header, &payload));
-            }
-            Item::Keyframe(keyframe) => {
-                // Image before depth, and once: it serves every revision.
-                let id = Some((outlet.run(), keyframe.epoch, keyframe.keyframe_id));
-                if image_of != id {
-                    image_of = id;
-                    put_keyframe_image(&keyframe, publishers, outlet);
+    /// Run, epoch and id of the keyframe whose image went out last.
+    image_of: Option<(u64, u32, u64)>,
+}
+
+impl Putter<'_> {
+    /// Puts what waits in `items` until they are closed.
+    fn run(mut self, items: &Slots<Item>) {
+        while let Some(item) = items.take() {
+            match item {
+                Item::Pose(message) => self.put(Kind::Pose, &*message, &Packed::empty()),
+                Item::Health(kind, message) => self.put(kind, &*message, &Packed::empty()),
+                Item::Adjustment(message) => self.put(Kind::Adjustment, &message, &Packed::empty()),
+                Item::Graph(graph) => {
+                    let poses: Vec<KeyframePoseMessage> =
+                        graph.poses.iter().map(keyframe_pose_message).collect();
+                    let payload = pack_plain(poses.as_slice().as_bytes());
+                    self.put(Kind::Graph, &graph.header, &payload);
                 }
-                put_depth(&keyframe, publishers, outlet);
+                Item::Keyframe(keyframe) => self.put_keyframe(&keyframe),
+                Item::Frame(frame) => self.put_frame(&frame),
             }
-            Item::Frame(frame) => put_frame(&frame, publishers, outlet, jpeg_quality),
-            _ => {}
         }
     }
-}
 
-fn put_keyframe_image(keyframe: &Keyframe, publishers: &[Publisher<'static>], outlet: &Outlet) {
-    let header = keyframe_image_header(keyframe);
-    match pack_image(&keyframe.image, header.width, header.height) {
-        Ok(payload) => {
-            let bytes = outlet.seal(Kind::KeyframeImage, &header, &payload);
-            put(publishers, Kind::KeyframeImage, bytes);
+    fn put<T: IntoBytes + Immutable>(&self, kind: Kind, message: &T, payload: &Packed) {
+        let bytes = self.outlet.seal(kind, message, payload);
+        // Dropped on a congested link: receivers see it by the numbers.
+        if let Err(error) = self.publishers[kind as usize].put(bytes).wait() {
+            tracing::debug!("{error}");
         }
-        Err(error) => tracing::debug!("keyframe {}: {error}", keyframe.keyframe_id),
     }
-}
 
-fn put_depth(keyframe: &Keyframe, publishers: &[Publisher<'static>], outlet: &Outlet) {
-    let payload = pack_points(&keyframe.points);
-    let (id, revision) = (keyframe.keyframe_id, keyframe.revision);
-    let (packed, unpacked) = (payload.bytes.len(), payload.unpacked_bytes);
-    tracing::debug!("keyframe {id} revision {revision}: {packed} bytes for {unpacked}");
-    let bytes = outlet.seal(Kind::Keyframe, &keyframe_header(keyframe), &payload);
-    put(publishers, Kind::Keyframe, bytes);
-}
-
-/// Frames are packed only where somebody takes them.
-fn put_frame(frame: &Frame, publishers: &[Publisher<'static>], outlet: &Outlet, quality: u8) {
-    let status = publishers[Kind::Frame as usize].matching_status().wait();
-    if !status.is_ok_and(|status| status.matching()) {
-        return;
-    }
-    let size = [frame.intrinsics.width, frame.intrinsics.height];
-    match jpeg::encode_gray(&frame.pixels, size, quality) {
-        Ok(bytes) => {
-            let unpacked_bytes = frame.pixels.len();
-            let payload = Packed { packing: Packing::Jpeg, unpacked_bytes, bytes };
-            put(publishers, Kind::Frame, outlet.seal(Kind::Frame, &frame.header, &payload));
+    /// Image before depth, and once: it serves every revision.
+    fn put_keyframe(&mut self, keyframe: &Keyframe) {
+        let (id, revision) = (keyframe.keyframe_id, keyframe.revision);
+        let image_of = Some((self.outlet.run(), keyframe.epoch, id));
+        if self.image_of != image_of {
+            self.image_of = image_of;
+            let header = keyframe_image_header(keyframe);
+            match pack_image(&keyframe.image, header.width, header.height) {
+                Ok(payload) => self.put(Kind::KeyframeImage, &header, &payload),
+                Err(error) => tracing::debug!("keyframe {id}: {error}"),
+            }
         }
-        Err(error) => tracing::debug!("frame {}: {error}", frame.header.sequence),
+        let payload = pack_points(&keyframe.points);
+        let (packed, unpacked) = (payload.bytes.len(), payload.unpacked_bytes);
+        tracing::debug!("keyframe {id} revision {revision}: {packed} bytes for {unpacked}");
+        self.put(Kind::Keyframe, &keyframe_header(keyframe), &payload);
+    }
+
+    /// Frames are packed only where somebody takes them.
+    fn put_frame(&self, frame: &Frame) {
+        let status = self.publishers[Kind::Frame as usize].matching_status().wait();
+        if !status.is_ok_and(|status| status.matching()) {
+            return;
+        }
+        let size = [frame.intrinsics.width, frame.intrinsics.height];
+        match jpeg::encode_gray(&frame.pixels, size, self.jpeg_quality) {
+            Ok(bytes) => {
+                let unpacked_bytes = frame.pixels.len();
+                let payload = Packed { packing: Packing::Jpeg, unpacked_bytes, bytes };
+                self.put(Kind::Frame, &frame.header, &payload);
+            }
+            Err(error) => tracing::debug!("frame {}: {error}", frame.header.sequence),
+        }
     }
 }

@@ -66,11 +66,6 @@ impl<T> Slots<T> {
         }
     }
 
-    /// Forgets what is in it: it belongs to a run that is over.
-    pub fn clear(&self) {
-        self.lock().slots.iter_mut().for_each(|slot| slot.items.clear());
-    }
-
     /// Ends every [`Slots::take`].
     pub fn close(&self) {
         self.lock().is_closed = true;
