@@ -13,6 +13,7 @@ pub mod ros;
 #[cfg(feature = "ros2")]
 pub mod ros2;
 pub mod session;
+pub mod slots;
 pub mod web;
 #[cfg(feature = "zenoh")]
 pub mod zenoh;

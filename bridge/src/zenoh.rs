@@ -21,7 +21,6 @@ pub mod receiver;
 pub mod remote;
 pub mod sender;
 pub mod shared;
-pub mod slots;
 pub mod stamps;
 pub mod traffic;
 pub mod unpack;

@@ -21,8 +21,9 @@ use crate::ros::message::{
 };
 use crate::ros::topic::{self, Reliability, RosTopic};
 use crate::ros2::node::{NodeError, RosNode, dds_name};
-use crate::ros2::outbox::{Outbox, Outgoing};
+use crate::ros2::outbox::{Outgoing, outbox, slot};
 use crate::session::{Event, Graph, Session, SessionError};
+use crate::slots::Slots;
 
 /// Time between two looks who reads.
 const READERS_PERIOD: Duration = Duration::from_millis(500);
@@ -57,7 +58,6 @@ pub struct PublishParams {
 struct Demand {
     images: AtomicU64,
     points: AtomicU64,
-    compatible: AtomicU64,
 }
 
 /// The publishers of one node.
@@ -72,7 +72,7 @@ pub struct Publishers {
     points: Option<Publisher<PointCloud2>>,
     keyframes: Publisher<PoseArray>,
     diagnostics: Publisher<DiagnosticArray>,
-    outbox: Arc<Outbox>,
+    outbox: Arc<Slots<Outgoing>>,
     demand: Arc<Demand>,
     /// Readers that cannot be served, by topic: each is named once.
     named: HashSet<String>,
@@ -111,10 +111,7 @@ impl Publishers {
             }
             _ => None,
         };
-        let tf = match params.tf {
-            true => Some(node.publisher(&topic::TF, &name(topic::TF))?),
-            false => None,
-        };
+        let tf = params.tf.then(|| node.publisher(&topic::TF, &name(topic::TF))).transpose()?;
         let images = match params.image_period {
             Some(_) => Some((
                 node.publisher(&sensor(&params, topic::IMAGE), &name(topic::IMAGE))?,
@@ -137,7 +134,7 @@ impl Publishers {
             points,
             node,
             params,
-            outbox: Arc::default(),
+            outbox: Arc::new(outbox()),
             demand: Arc::default(),
             named: HashSet::new(),
             published: 0,
@@ -166,7 +163,7 @@ impl Publishers {
     /// Publishes until the outbox is closed.
     pub fn run(mut self) {
         let (mut looked, mut reported) = (None::<Instant>, Instant::now());
-        while let Ok(message) = self.outbox.take(WAIT) {
+        while let Ok(message) = self.outbox.take_within(WAIT) {
             if let Some(message) = message {
                 self.publish(message);
             }
@@ -184,44 +181,28 @@ impl Publishers {
 
     fn publish(&mut self, message: Outgoing) {
         let begin = Instant::now();
-        match message {
+        let is_sent = match message {
             Outgoing::Pose(messages) => {
                 let PoseMessages { pose, odometry, transforms } = *messages;
-                let sent = send(&self.odometry, odometry)
+                send(&self.odometry, odometry)
                     & send(&self.pose, pose)
-                    & self.tf.as_ref().is_none_or(|tf| send(tf, transforms));
-                self.count(sent);
+                    & self.tf.as_ref().is_none_or(|tf| send(tf, transforms))
             }
-            Outgoing::Diagnostics(message) => {
-                let sent = send(&self.diagnostics, *message);
-                self.count(sent);
-            }
-            Outgoing::Image(pair) => {
-                let (image, camera_info) = *pair;
-                if let Some((images, camera_infos)) = &self.images {
-                    let sent = send(camera_infos, camera_info) & send(images, image);
-                    self.count(sent);
-                }
-            }
+            Outgoing::Diagnostics(message) => send(&self.diagnostics, *message),
+            Outgoing::Image(pair) => self.images.as_ref().is_none_or(|(images, infos)| {
+                let (image, info) = *pair;
+                send(infos, info) & send(images, image)
+            }),
             Outgoing::Points(message) => {
-                if let Some(points) = &self.points {
-                    let sent = send(points, *message);
-                    self.count(sent);
-                }
+                self.points.as_ref().is_none_or(|points| send(points, *message))
             }
-            Outgoing::Keyframes(message) => {
-                let sent = send(&self.keyframes, *message);
-                self.count(sent);
-            }
-        }
-        self.longest = self.longest.max(begin.elapsed());
-    }
-
-    fn count(&mut self, is_sent: bool) {
+            Outgoing::Keyframes(message) => send(&self.keyframes, *message),
+        };
         match is_sent {
             true => self.published += 1,
             false => self.refused += 1,
         }
+        self.longest = self.longest.max(begin.elapsed());
     }
 
     /// Counts the readers of what is costly to make, and names those that get nothing.
@@ -232,7 +213,7 @@ impl Publishers {
         else {
             return;
         };
-        let (mut images, mut clouds, mut all) = (0, 0, 0);
+        let (mut images, mut clouds) = (0, 0);
         for reader in self.node.remote_readers() {
             let is_image = reader.topic == image || reader.topic == info;
             let is_points = reader.topic == points;
@@ -247,25 +228,22 @@ impl Publishers {
             }
             images += u64::from(is_image);
             clouds += u64::from(is_points);
-            all += 1;
         }
         self.demand.images.store(images, Ordering::Relaxed);
         self.demand.points.store(clouds, Ordering::Relaxed);
-        self.demand.compatible.store(all, Ordering::Relaxed);
     }
 
     /// How this node does, as a diagnostic of its own.
     fn report(&mut self) -> DiagnosticArray {
-        let drops = self.outbox.drops();
-        let lost = drops.poses + self.refused;
-        let longest_ms = self.longest.as_secs_f64() * 1e3;
-        self.longest = Duration::ZERO;
+        let longest_ms = std::mem::take(&mut self.longest).as_secs_f64() * 1e3;
+        let dropped = |slot| self.outbox.dropped(slot);
+        let lost = dropped(slot::POSE) + self.refused;
         let message = if lost == 0 { "publishing" } else { "publishing; some were dropped" };
         let values = vec![
             figure("published", self.published),
-            figure("dropped_poses", drops.poses),
-            figure("dropped_images", drops.images),
-            figure("dropped_points", drops.points),
+            figure("dropped_poses", dropped(slot::POSE)),
+            figure("dropped_images", dropped(slot::IMAGE)),
+            figure("dropped_points", dropped(slot::POINTS)),
             figure("refused_by_slow_readers", self.refused),
             figure("longest_publish_ms", format!("{longest_ms:.3}")),
         ];
@@ -283,7 +261,7 @@ fn send<M: RosMessage>(publisher: &Publisher<M>, message: M) -> bool {
 pub struct Reader {
     converter: Converter,
     params: PublishParams,
-    outbox: Arc<Outbox>,
+    outbox: Arc<Slots<Outgoing>>,
     demand: Arc<Demand>,
     /// The active keyframe, for who comes later.
     keyframe: Option<Arc<Keyframe>>,
@@ -333,7 +311,7 @@ impl Reader {
             ),
             Event::Pose(pose) => {
                 if let Some(messages) = self.converter.pose(pose) {
-                    self.outbox.put(Outgoing::Pose(Box::new(messages)));
+                    self.outbox.put(slot::POSE, Outgoing::Pose(Box::new(messages)));
                 }
             }
             Event::Frame(frame) => {
@@ -342,7 +320,7 @@ impl Reader {
                 if is_due(self.image_sent, period) {
                     self.image_sent = Some(Instant::now());
                     let pair = (self.converter.image(frame), self.converter.camera_info(frame));
-                    self.outbox.put(Outgoing::Image(Box::new(pair)));
+                    self.outbox.put(slot::IMAGE, Outgoing::Image(Box::new(pair)));
                 }
             }
             Event::Keyframe(keyframe) => {
@@ -355,7 +333,7 @@ impl Reader {
                 let age = now_nanos().saturating_sub(health.published_nanos);
                 let stamp = Time::from_nanos(realtime_nanos().saturating_sub(age));
                 let report = self.converter.diagnostics(owner, health, stamp);
-                self.outbox.put(Outgoing::Diagnostics(Box::new(report)));
+                self.outbox.put(slot::DIAGNOSTICS, Outgoing::Diagnostics(Box::new(report)));
             }
             Event::Adjustment(_) => {}
         }
@@ -374,7 +352,7 @@ impl Reader {
             self.points_sent = Some(Instant::now());
             self.keyframe_is_new = false;
             let points = self.converter.points(keyframe);
-            self.outbox.put(Outgoing::Points(Box::new(points)));
+            self.outbox.put(slot::POINTS, Outgoing::Points(Box::new(points)));
         }
     }
 
@@ -386,7 +364,7 @@ impl Reader {
         if let Some(graph) = self.graph.take() {
             self.graph_sent = Some(Instant::now());
             let keyframes = self.converter.keyframes(&graph, Time::from_nanos(realtime_nanos()));
-            self.outbox.put(Outgoing::Keyframes(Box::new(keyframes)));
+            self.outbox.put(slot::KEYFRAMES, Outgoing::Keyframes(Box::new(keyframes)));
         }
     }
 }

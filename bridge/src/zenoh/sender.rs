@@ -20,6 +20,7 @@ use zerocopy::{Immutable, IntoBytes};
 
 use crate::jpeg;
 use crate::session::{Event, Frame, Graph, Session, Wants};
+use crate::slots::Slots;
 use crate::zenoh::envelope::{Packed, Packing};
 use crate::zenoh::error::ZenohError;
 use crate::zenoh::kind::Kind;
@@ -27,7 +28,6 @@ use crate::zenoh::link::{Endpoints, declare_error, open, publisher, sender_id};
 use crate::zenoh::outlet::Outlet;
 use crate::zenoh::packing::{pack_image, pack_plain, pack_points};
 use crate::zenoh::rate::{Latest, Rate};
-use crate::zenoh::slots::Slots;
 use crate::zenoh::traffic::Traffic;
 
 /// Longest wait for a message without a look at what is due.

@@ -8,10 +8,10 @@ use std::time::Instant;
 use semidense::service::clock::now_nanos;
 use zenoh::bytes::ZBytes;
 
+use crate::slots::Slots;
 use crate::zenoh::envelope::{EnvelopeError, Opened, open};
 use crate::zenoh::kind::Kind;
 use crate::zenoh::remote::Remote;
-use crate::zenoh::slots::Slots;
 use crate::zenoh::stamps::translate;
 use crate::zenoh::unpack::{Arrival, unpack};
 

@@ -3,6 +3,7 @@
 
 use std::collections::VecDeque;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 /// The queue.
 #[derive(Debug)]
@@ -23,6 +24,10 @@ struct Slot<T> {
     depth: usize,
     dropped: u64,
 }
+
+/// Nothing more will come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Closed;
 
 impl<T> Slots<T> {
     /// A slot for each of `depths`: how many it holds.
@@ -66,7 +71,20 @@ impl<T> Slots<T> {
         }
     }
 
-    /// Ends every [`Slots::take`].
+    /// The same, waiting for at most `longest`; an error once the queue is closed and empty.
+    pub fn take_within(&self, longest: Duration) -> Result<Option<T>, Closed> {
+        let is_idle = |inner: &mut Inner<T>| {
+            !inner.is_closed && inner.slots.iter().all(|slot| slot.items.is_empty())
+        };
+        let waited = self.filled.wait_timeout_while(self.lock(), longest, is_idle);
+        let (mut inner, _) = waited.unwrap_or_else(PoisonError::into_inner);
+        match inner.take() {
+            None if inner.is_closed => Err(Closed),
+            item => Ok(item),
+        }
+    }
+
+    /// Ends every wait.
     pub fn close(&self) {
         self.lock().is_closed = true;
         self.filled.notify_all();
