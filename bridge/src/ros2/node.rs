@@ -51,6 +51,7 @@ pub struct RemoteReader {
 
 /// A node.
 pub struct RosNode {
+    namespace: String,
     participant: DomainParticipant,
     node: Node,
     _context: Context,
@@ -72,38 +73,37 @@ impl RosNode {
         // Parameters and logs of ours are on the command line and in the journal.
         let options = NodeOptions::new().enable_rosout(false).start_parameter_services(false);
         let node = context.new_node(node_name, options).map_err(NodeError::Node)?;
-        Ok(Self { participant, node, _context: context })
+        Ok(Self { namespace: namespace.to_owned(), participant, node, _context: context })
     }
 
-    /// Publishes messages of the type `M` to the topic `name` with the quality of service of `topic`.
+    /// Publishes messages of the type `M` to a topic of the node's namespace.
     pub fn publisher<M: RosMessage>(
         &mut self,
         topic: &RosTopic,
-        name: &str,
     ) -> Result<Publisher<M>, NodeError> {
-        let made = self.topic::<M>(name, &qos(topic))?;
+        let made = self.topic::<M>(&topic.name_in(&self.namespace), topic)?;
         Ok(self.node.create_publisher(&made, None)?)
     }
 
-    /// Takes messages of the type `M` from the topic `name`.
+    /// Takes messages of the type `M` from the topic `name` with the quality of service of `topic`.
     pub fn subscription<M: RosMessage + 'static>(
         &mut self,
         topic: &RosTopic,
         name: &str,
     ) -> Result<Subscription<M>, NodeError> {
-        let made = self.topic::<M>(name, &qos(topic))?;
+        let made = self.topic::<M>(name, topic)?;
         Ok(self.node.create_subscription(&made, None)?)
     }
 
     fn topic<M: RosMessage>(
         &self,
         name: &str,
-        qos: &QosPolicies,
+        topic: &RosTopic,
     ) -> Result<rustdds::Topic, NodeError> {
         let (package, kind) = M::TYPE.split_once('/').unwrap_or(("", M::TYPE));
         let dds_type = MessageTypeName::new(package, kind).dds_msg_type();
-        let dds_name = dds_name(name)?;
-        Ok(self.participant.create_topic(dds_name, dds_type, qos, TopicKind::NoKey)?)
+        let (dds_name, qos) = (dds_name(name)?, qos(topic));
+        Ok(self.participant.create_topic(dds_name, dds_type, &qos, TopicKind::NoKey)?)
     }
 
     /// Everybody who reads a topic of the domain, ours or not.

@@ -101,33 +101,32 @@ fn camera_link_transform(params: &PublishParams, camera_link: &str) -> TfMessage
 impl Publishers {
     /// All topics of a node.
     pub fn open(mut node: RosNode, params: PublishParams) -> Result<Self, NodeError> {
-        let name = |topic: RosTopic| topic.name_in(&params.namespace);
         let tf_static = match &params.camera_link {
             Some(link) if params.tf => {
-                let publisher = node.publisher(&topic::TF_STATIC, &name(topic::TF_STATIC))?;
+                let publisher = node.publisher(&topic::TF_STATIC)?;
                 // The only message: there is room for it.
                 let _ = publisher.publish(camera_link_transform(&params, link));
                 Some(publisher)
             }
             _ => None,
         };
-        let tf = params.tf.then(|| node.publisher(&topic::TF, &name(topic::TF))).transpose()?;
+        let tf = params.tf.then(|| node.publisher(&topic::TF)).transpose()?;
         let images = match params.image_period {
             Some(_) => Some((
-                node.publisher(&sensor(&params, topic::IMAGE), &name(topic::IMAGE))?,
-                node.publisher(&sensor(&params, topic::CAMERA_INFO), &name(topic::CAMERA_INFO))?,
+                node.publisher(&sensor(&params, topic::IMAGE))?,
+                node.publisher(&sensor(&params, topic::CAMERA_INFO))?,
             )),
             None => None,
         };
         let points = match params.points_period {
-            Some(_) => Some(node.publisher(&sensor(&params, topic::POINTS), &name(topic::POINTS))?),
+            Some(_) => Some(node.publisher(&sensor(&params, topic::POINTS))?),
             None => None,
         };
         Ok(Self {
-            pose: node.publisher(&topic::POSE, &name(topic::POSE))?,
-            odometry: node.publisher(&topic::ODOMETRY, &name(topic::ODOMETRY))?,
-            keyframes: node.publisher(&topic::KEYFRAMES, &name(topic::KEYFRAMES))?,
-            diagnostics: node.publisher(&topic::DIAGNOSTICS, &name(topic::DIAGNOSTICS))?,
+            pose: node.publisher(&topic::POSE)?,
+            odometry: node.publisher(&topic::ODOMETRY)?,
+            keyframes: node.publisher(&topic::KEYFRAMES)?,
+            diagnostics: node.publisher(&topic::DIAGNOSTICS)?,
             tf,
             _tf_static: tf_static,
             images,
