@@ -11,7 +11,7 @@ use semidense::service::shutdown::Shutdown;
 use crate::command::{CommandResult, CommonArguments, note, number_within};
 use crate::ros::frame_ids::FrameIds;
 use crate::ros::topic::namespace;
-use crate::ros2::camera::{self, CameraError, CameraParams, Output};
+use crate::ros2::camera::{self, CameraError, CameraParams};
 use crate::ros2::network::{Network, Reach};
 use crate::ros2::node::RosNode;
 use crate::ros2::publishing::{PublishParams, Publishers};
@@ -215,14 +215,10 @@ pub fn run_camera(arguments: &Ros2CameraArguments) -> CommandResult {
         })?;
         return Ok(ExitCode::SUCCESS);
     }
-    let output = match &arguments.stream {
-        Some(path) => Output::Socket(path.clone()),
-        None if std::io::stdout().is_terminal() => {
-            return Err("standard output is a terminal: frames go to a program, as `semidense run ros2:TOPIC`, or to --stream PATH".into());
-        }
-        None => Output::Stdout,
-    };
-    match camera::run(&params, &output, &shutdown) {
+    if arguments.stream.is_none() && std::io::stdout().is_terminal() {
+        return Err("standard output is a terminal: frames go to a program, as `semidense run ros2:TOPIC`, or to --stream PATH".into());
+    }
+    match camera::run(&params, arguments.stream.clone(), &shutdown) {
         Ok(()) | Err(CameraError::Interrupted) => Ok(ExitCode::SUCCESS),
         Err(error) => Err(error.into()),
     }

@@ -2,7 +2,7 @@
 
 use std::fs::File;
 use std::io::{self, Write};
-use std::os::fd::{AsFd, BorrowedFd};
+use std::os::fd::BorrowedFd;
 use std::os::unix::net::UnixStream;
 use std::path::PathBuf;
 use std::pin::pin;
@@ -28,15 +28,6 @@ use crate::ros2::node::{NodeError, RosNode};
 
 /// Pause between two looks for a socket that is not there, or for a message.
 const RETRY_PERIOD: Duration = Duration::from_millis(100);
-
-/// Where frames go.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Output {
-    /// Standard output; this ends when it is closed.
-    Stdout,
-    /// The socket of `semidense capture stream:PATH`; it is connected to again when it is gone.
-    Socket(PathBuf),
-}
 
 /// What to read.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -81,10 +72,8 @@ pub enum CameraError {
     Interrupted,
 }
 
-/// A topic that is read with the quality of service of sensors, which any publisher's fits.
-fn sensor_topic() -> RosTopic {
-    topic::IMAGE
-}
+/// The quality of service that topics are read with: that of sensors, which any publisher's fits.
+const SENSOR: &RosTopic = &topic::IMAGE;
 
 /// Waits for what ROS says about the camera and gives the text of its rig file.
 pub fn await_rig(
@@ -95,7 +84,7 @@ pub fn await_rig(
 ) -> Result<String, CameraError> {
     let topic = camera_info.map_or_else(|| camera_info_topic(&params.topic), str::to_owned);
     let mut node = RosNode::new(&params.network, "/", &params.node)?;
-    let infos = node.subscription::<CameraInfo>(&sensor_topic(), &topic)?;
+    let infos = node.subscription::<CameraInfo>(SENSOR, &topic)?;
     let begin = Instant::now();
     loop {
         if let Ok(Some((info, _))) = infos.take() {
@@ -112,43 +101,42 @@ pub fn await_rig(
     }
 }
 
-/// Writes frames until a signal comes, or standard output is closed.
-pub fn run(params: &CameraParams, output: &Output, shutdown: &Shutdown) -> Result<(), CameraError> {
+/// Writes frames until a signal comes, or standard output is closed. Where there is a `socket`, that of
+/// `semidense capture stream:PATH`, they go there; it is connected to again when it is gone.
+pub fn run(
+    params: &CameraParams,
+    socket: Option<PathBuf>,
+    shutdown: &Shutdown,
+) -> Result<(), CameraError> {
     let mut node = RosNode::new(&params.network, "/", &params.node)?;
-    let sink = Sink::open(output)?;
-    let (topic, quality) = (params.topic.clone(), sensor_topic());
+    let is_stdout = socket.is_none();
+    let sink = match socket {
+        Some(path) => Sink::Socket(path, None),
+        None => Sink::Stdout(File::from(stdout().try_clone_to_owned()?)),
+    };
+    let topic = params.topic.clone();
     let named = thread::Builder::new().name("images".to_owned());
     let reading = if topic.ends_with("/compressed") {
-        let images = node.subscription::<CompressedImage>(&quality, &topic)?;
-        named.spawn(move || {
-            let unpack = |frame: &mut GrayFrame, image: &CompressedImage| {
-                frame.decode(image).map(|()| image.header.stamp)
-            };
-            forward(&images, &topic, unpack, sink)
-        })?
+        let images = node.subscription::<CompressedImage>(SENSOR, &topic)?;
+        named.spawn(move || forward(&images, &topic, GrayFrame::decode, sink))?
     } else {
-        let images = node.subscription::<Image>(&quality, &topic)?;
-        named.spawn(move || {
-            let unpack = |frame: &mut GrayFrame, image: &Image| {
-                frame.unpack(image).map(|()| image.header.stamp)
-            };
-            forward(&images, &topic, unpack, sink)
-        })?
+        let images = node.subscription::<Image>(SENSOR, &topic)?;
+        named.spawn(move || forward(&images, &topic, GrayFrame::unpack, sink))?
     };
     // The thread may wait for an image, or for capture, forever; it ends with the process.
     while !reading.is_finished() && !shutdown.is_requested() {
-        if is_closed(output, shutdown.descriptor()) {
+        if is_closed(is_stdout, shutdown.descriptor()) {
             break;
         }
     }
     Ok(())
 }
 
-/// Waits a moment for a signal; whether standard output is closed.
-fn is_closed(output: &Output, interrupt: BorrowedFd<'_>) -> bool {
+/// Waits a moment for a signal; whether standard output, where it is written to, is closed.
+fn is_closed(is_stdout: bool, interrupt: BorrowedFd<'_>) -> bool {
     let timeout = rustix::event::Timespec { tv_sec: 0, tv_nsec: 200_000_000 };
     let mut polled = vec![PollFd::from_borrowed_fd(interrupt, PollFlags::IN)];
-    if *output == Output::Stdout {
+    if is_stdout {
         // A closed end is told without being asked for.
         polled.push(PollFd::from_borrowed_fd(stdout(), PollFlags::empty()));
     }
@@ -201,21 +189,16 @@ enum Sink {
     Socket(PathBuf, Option<UnixStream>),
 }
 
-impl Sink {
-    fn open(output: &Output) -> io::Result<Self> {
-        Ok(match output {
-            Output::Stdout => Self::Stdout(File::from(stdout().as_fd().try_clone_to_owned()?)),
-            Output::Socket(path) => Self::Socket(path.clone(), None),
-        })
-    }
+fn write_frame(to: &mut impl Write, header: &StreamHeader, pixels: &[u8]) -> io::Result<()> {
+    to.write_all(&header.to_bytes())?;
+    to.write_all(pixels)
+}
 
+impl Sink {
     /// Writes a frame. A socket that is not there, or goes, loses the frame: the next one is as good.
     fn write(&mut self, header: &StreamHeader, pixels: &[u8]) -> io::Result<()> {
         match self {
-            Self::Stdout(file) => {
-                file.write_all(&header.to_bytes())?;
-                file.write_all(pixels)
-            }
+            Self::Stdout(file) => write_frame(file, header, pixels),
             Self::Socket(path, stream) => {
                 if stream.is_none() {
                     *stream = UnixStream::connect(&*path)
@@ -226,9 +209,7 @@ impl Sink {
                     thread::sleep(RETRY_PERIOD);
                     return Ok(());
                 };
-                let written =
-                    open.write_all(&header.to_bytes()).and_then(|()| open.write_all(pixels));
-                if let Err(error) = written {
+                if let Err(error) = write_frame(open, header, pixels) {
                     tracing::warn!("{}: {error}; connecting again", path.display());
                     *stream = None;
                 }

@@ -51,9 +51,9 @@ impl GrayFrame {
         Ok(())
     }
 
-    /// Takes the grey values of an image.
-    pub fn unpack(&mut self, image: &Image) -> Result<(), ImageError> {
-        let Image { encoding, width, height, step, is_bigendian, data, .. } = image;
+    /// Takes the grey values of an image and gives its stamp.
+    pub fn unpack(&mut self, image: &Image) -> Result<Time, ImageError> {
+        let Image { header, encoding, width, height, step, is_bigendian, data } = image;
         // Before memory is taken: each pixel has at least a byte.
         if (data.len() as u64) < u64::from(*width) * u64::from(*height) {
             return Err(ImageError::Size(*width as usize, *height as usize));
@@ -67,16 +67,18 @@ impl GrayFrame {
             is_bigendian: *is_bigendian != 0,
             data,
         };
-        Ok(image.unpack_gray(&mut self.pixels)?)
+        image.unpack_gray(&mut self.pixels)?;
+        Ok(header.stamp)
     }
 
-    /// Takes the grey values of a compressed image, a JPEG or PNG.
-    pub fn decode(&mut self, image: &CompressedImage) -> Result<(), ImageError> {
+    /// Takes the grey values of a compressed image, a JPEG or PNG, and gives its stamp.
+    pub fn decode(&mut self, image: &CompressedImage) -> Result<Time, ImageError> {
         let broken = |source| ImageError::Compressed { format: image.format.clone(), source };
         let (width, height) = image_size(&image.data).map_err(broken)?;
         self.resize(width, height)?;
         decode_gray_into(&image.data, width, height, &mut self.samples, &mut self.pixels)
-            .map_err(broken)
+            .map_err(broken)?;
+        Ok(image.header.stamp)
     }
 
     /// The header of a stream for it. `stamp` is ROS's, `now_nanos` CLOCK_REALTIME.
