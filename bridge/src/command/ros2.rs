@@ -11,7 +11,7 @@ use semidense::service::shutdown::Shutdown;
 use crate::command::{CommandResult, CommonArguments, note, number_within};
 use crate::ros::frame_ids::FrameIds;
 use crate::ros::topic::namespace;
-use crate::ros2::camera::{self, CameraError, CameraParams};
+use crate::ros2::camera;
 use crate::ros2::network::{Network, Reach};
 use crate::ros2::node::RosNode;
 use crate::ros2::publishing::{PublishParams, Publishers};
@@ -200,16 +200,13 @@ pub fn run_camera(arguments: &Ros2CameraArguments) -> CommandResult {
         note(&format!("error: {error}"));
         return Ok(ExitCode::from(WRONG_USAGE));
     }
-    let params = CameraParams {
-        topic: arguments.topic.clone(),
-        network: arguments.network.network()?,
-        node: arguments.node_name.clone(),
-    };
+    let network = arguments.network.network()?;
     let shutdown = Shutdown::install()?;
+    let open = || RosNode::new(&network, "/", &arguments.node_name);
     if let Some(path) = &arguments.write_rig {
         let longest = Duration::from_secs(arguments.timeout);
         let camera_info = arguments.camera_info.as_deref();
-        let text = camera::await_rig(&params, camera_info, longest, &shutdown)?;
+        let text = camera::await_rig(open()?, &arguments.topic, camera_info, longest, &shutdown)?;
         semidense::service::atomic_file::write_atomically(path, |file| {
             file.write_all(text.as_bytes())
         })?;
@@ -218,8 +215,6 @@ pub fn run_camera(arguments: &Ros2CameraArguments) -> CommandResult {
     if arguments.stream.is_none() && std::io::stdout().is_terminal() {
         return Err("standard output is a terminal: frames go to a program, as `semidense run ros2:TOPIC`, or to --stream PATH".into());
     }
-    match camera::run(&params, arguments.stream.clone(), &shutdown) {
-        Ok(()) | Err(CameraError::Interrupted) => Ok(ExitCode::SUCCESS),
-        Err(error) => Err(error.into()),
-    }
+    camera::run(open()?, arguments.topic.clone(), arguments.stream.clone(), &shutdown)?;
+    Ok(ExitCode::SUCCESS)
 }

@@ -23,22 +23,10 @@ use crate::ros::message::{CameraInfo, CompressedImage, Image, RosMessage, Time};
 use crate::ros::topic::{self, RosTopic};
 use crate::ros2::camera_rig::{CameraRigError, camera_info_topic, is_rectified, rig_text};
 use crate::ros2::image_source::{GrayFrame, ImageError};
-use crate::ros2::network::Network;
 use crate::ros2::node::{NodeError, RosNode};
 
 /// Pause between two looks for a socket that is not there, or for a message.
 const RETRY_PERIOD: Duration = Duration::from_millis(100);
-
-/// What to read.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct CameraParams {
-    /// Topic of the images, beginning with `/`; one that ends in `/compressed` is of `CompressedImage`.
-    pub topic: String,
-    /// Domain and reach.
-    pub network: Network,
-    /// Name of the node.
-    pub node: String,
-}
 
 /// Why images cannot be read.
 #[derive(Debug, thiserror::Error)]
@@ -75,20 +63,20 @@ pub enum CameraError {
 /// The quality of service that topics are read with: that of sensors, which any publisher's fits.
 const SENSOR: &RosTopic = &topic::IMAGE;
 
-/// Waits for what ROS says about the camera and gives the text of its rig file.
+/// Waits for what ROS says about the camera of the images on a topic and gives the text of its rig file.
 pub fn await_rig(
-    params: &CameraParams,
+    mut node: RosNode,
+    images: &str,
     camera_info: Option<&str>,
     longest: Duration,
     shutdown: &Shutdown,
 ) -> Result<String, CameraError> {
-    let topic = camera_info.map_or_else(|| camera_info_topic(&params.topic), str::to_owned);
-    let mut node = RosNode::new(&params.network, "/", &params.node)?;
+    let topic = camera_info.map_or_else(|| camera_info_topic(images), str::to_owned);
     let infos = node.subscription::<CameraInfo>(SENSOR, &topic)?;
     let begin = Instant::now();
     loop {
         if let Ok(Some((info, _))) = infos.take() {
-            let text = rig_text(&info, &topic, is_rectified(&params.topic));
+            let text = rig_text(&info, &topic, is_rectified(images));
             return text.map_err(|source| CameraError::Rig { topic, source });
         }
         if shutdown.is_requested() {
@@ -101,20 +89,20 @@ pub fn await_rig(
     }
 }
 
-/// Writes frames until a signal comes, or standard output is closed. Where there is a `socket`, that of
+/// Writes the images of a topic as frames until a signal comes, or standard output is closed; a topic that ends in
+/// `/compressed` is of `CompressedImage`. Where there is a `socket`, that of
 /// `semidense capture stream:PATH`, they go there; it is connected to again when it is gone.
 pub fn run(
-    params: &CameraParams,
+    mut node: RosNode,
+    topic: String,
     socket: Option<PathBuf>,
     shutdown: &Shutdown,
 ) -> Result<(), CameraError> {
-    let mut node = RosNode::new(&params.network, "/", &params.node)?;
     let is_stdout = socket.is_none();
     let sink = match socket {
         Some(path) => Sink::Socket(path, None),
         None => Sink::Stdout(File::from(stdout().try_clone_to_owned()?)),
     };
-    let topic = params.topic.clone();
     let named = thread::Builder::new().name("images".to_owned());
     let reading = if topic.ends_with("/compressed") {
         let images = node.subscription::<CompressedImage>(SENSOR, &topic)?;
