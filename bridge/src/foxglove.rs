@@ -12,11 +12,11 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use semidense::slam::keyframe::Keyframe;
-use tungstenite::{Bytes, Error, Message, WebSocket};
+use tungstenite::{Error, Message, WebSocket};
 
 use crate::feed::FeedOver;
 use crate::foxglove::protocol::{
-    Request, advertisement, message_frame, parse_request, server_info, warning,
+    Request, Subscription, advertisement, message_frame, parse_request, server_info, warning,
 };
 use crate::foxglove::subscriptions::Subscriptions;
 use crate::ros::encoder::{EncodeError, Encoded, EventEncoder, Moment, Sink};
@@ -148,8 +148,7 @@ impl Sink for ClientSink<'_> {
         let Some(channel) = channel(message.topic) else { return Ok(()) };
         for subscription in self.subscriptions.of(channel) {
             let frame = message_frame(subscription, self.realtime_nanos, message.bytes);
-            let sent = self.socket.send(Message::Binary(Bytes::from(frame)));
-            sent.map_err(Box::new)?;
+            self.socket.send(Message::binary(frame)).map_err(Box::new)?;
         }
         Ok(())
     }
@@ -210,17 +209,17 @@ impl Client {
     /// Does what the client asks for; what cannot be done is told to it.
     fn answer(&mut self, text: &str) -> Result<(), FoxgloveError> {
         match parse_request(text) {
-            Ok(Request::Subscribe(wanted)) => {
-                for (subscription, channel) in wanted {
-                    match self.subscriptions.add(subscription, channel) {
+            Ok(Request::Subscribe { subscriptions }) => {
+                for Subscription { id, channel_id } in subscriptions {
+                    match self.subscriptions.add(id, channel_id) {
                         Ok(channel) => self.send_last(channel)?,
                         Err(problem) => self.send(Message::text(warning(&problem)))?,
                     }
                 }
                 Ok(())
             }
-            Ok(Request::Unsubscribe(subscriptions)) => {
-                subscriptions.iter().for_each(|id| self.subscriptions.remove(*id));
+            Ok(Request::Unsubscribe { subscription_ids }) => {
+                subscription_ids.iter().for_each(|id| self.subscriptions.remove(*id));
                 Ok(())
             }
             Ok(Request::Other) => Ok(()),

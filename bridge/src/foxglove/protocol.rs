@@ -1,6 +1,7 @@
 //! The messages of the Foxglove WebSocket protocol: JSON, and a short header before binary ones.
 
 use serde::{Deserialize, Serialize};
+use serde_json::json;
 
 use crate::ros::schema::{full_name, schema};
 use crate::ros::topic::RosTopic;
@@ -9,23 +10,6 @@ use crate::ros::topic::RosTopic;
 const MESSAGE_DATA: u8 = 1;
 /// Bytes before the data: kind, subscription, time.
 const HEADER_BYTES: usize = 1 + 4 + 8;
-
-/// The first message to a client.
-#[derive(Serialize)]
-#[serde(rename_all = "camelCase")]
-struct ServerInfo<'a> {
-    op: &'static str,
-    name: &'a str,
-    capabilities: [&'static str; 0],
-    supported_encodings: [&'static str; 1],
-    metadata: Metadata,
-    session_id: String,
-}
-
-#[derive(Serialize)]
-struct Metadata {
-    semidense: &'static str,
-}
 
 #[derive(Serialize)]
 struct Advertisement {
@@ -44,62 +28,46 @@ struct ChannelInfo {
     schema_encoding: &'static str,
 }
 
-#[derive(Serialize)]
-struct Status<'a> {
-    op: &'static str,
-    /// 0 info, 1 warning, 2 error.
-    level: u8,
-    message: &'a str,
-}
-
-/// What a client may say.
-#[derive(Debug, Deserialize)]
-#[serde(tag = "op", rename_all = "camelCase")]
-enum ClientMessage {
+/// What a client asks for.
+#[derive(Debug, PartialEq, Eq, Deserialize)]
+#[serde(tag = "op", rename_all = "camelCase", rename_all_fields = "camelCase")]
+pub enum Request {
+    /// To be sent channels.
     Subscribe {
+        /// Which ones.
         subscriptions: Vec<Subscription>,
     },
-    #[serde(rename_all = "camelCase")]
+    /// The end of subscriptions.
     Unsubscribe {
+        /// Their numbers.
         subscription_ids: Vec<u32>,
     },
+    /// What is not offered.
     #[serde(other)]
     Other,
 }
 
-#[derive(Debug, Deserialize)]
+/// A subscription to a channel.
+#[derive(Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "camelCase")]
-struct Subscription {
-    id: u32,
-    channel_id: u32,
-}
-
-/// What a client asks for.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Request {
-    /// Subscriptions, each with its number and channel.
-    Subscribe(Vec<(u32, u32)>),
-    /// Numbers of subscriptions that end.
-    Unsubscribe(Vec<u32>),
-    /// What is not offered.
-    Other,
-}
-
-/// A message as text: what is written here always can be.
-fn json(message: &impl Serialize) -> String {
-    serde_json::to_string(message).unwrap_or_default()
+pub struct Subscription {
+    /// Its number, which the client chooses.
+    pub id: u32,
+    /// Number of the channel.
+    pub channel_id: u32,
 }
 
 /// The first message to a client of `instance`; clients that see another session forget what they had.
 pub fn server_info(instance: &str, session: i64) -> String {
-    json(&ServerInfo {
-        op: "serverInfo",
-        name: instance,
-        capabilities: [],
-        supported_encodings: ["cdr"],
-        metadata: Metadata { semidense: env!("CARGO_PKG_VERSION") },
-        session_id: session.to_string(),
-    })
+    let info = json!({
+        "op": "serverInfo",
+        "name": instance,
+        "capabilities": [],
+        "supportedEncodings": ["cdr"],
+        "metadata": { "semidense": env!("CARGO_PKG_VERSION") },
+        "sessionId": session.to_string(),
+    });
+    info.to_string()
 }
 
 /// The channels, numbered by their place.
@@ -113,12 +81,14 @@ pub fn advertisement(topics: &[&RosTopic], instance: &str) -> String {
         schema_encoding: "ros2msg",
     };
     let channels = topics.iter().enumerate().map(channel).collect();
-    json(&Advertisement { op: "advertise", channels })
+    let advertisement = Advertisement { op: "advertise", channels };
+    // What is written here always can be.
+    serde_json::to_string(&advertisement).unwrap_or_default()
 }
 
-/// A remark that a client shows.
+/// A remark that a client shows, as a warning: level 1 of 0 to 2.
 pub fn warning(message: &str) -> String {
-    json(&Status { op: "status", level: 1, message })
+    json!({ "op": "status", "level": 1, "message": message }).to_string()
 }
 
 /// Data for a subscription.
@@ -133,16 +103,7 @@ pub fn message_frame(subscription: u32, realtime_nanos: i64, data: &[u8]) -> Vec
 
 /// What a client's text asks for, or why it is not understood.
 pub fn parse_request(text: &str) -> Result<Request, String> {
-    match serde_json::from_str(text) {
-        Ok(ClientMessage::Subscribe { subscriptions }) => Ok(Request::Subscribe(
-            subscriptions.iter().map(|wanted| (wanted.id, wanted.channel_id)).collect(),
-        )),
-        Ok(ClientMessage::Unsubscribe { subscription_ids }) => {
-            Ok(Request::Unsubscribe(subscription_ids))
-        }
-        Ok(ClientMessage::Other) => Ok(Request::Other),
-        Err(error) => Err(format!("a message was not understood: {error}")),
-    }
+    serde_json::from_str(text).map_err(|error| format!("a message was not understood: {error}"))
 }
 
 #[cfg(test)]
@@ -153,9 +114,11 @@ mod tests {
     #[test]
     fn requests_are_understood_and_others_are_errors() {
         let subscribe = r#"{"op":"subscribe","subscriptions":[{"id":7,"channelId":1}]}"#;
-        assert_eq!(parse_request(subscribe), Ok(Request::Subscribe(vec![(7, 1)])));
+        let subscriptions = vec![Subscription { id: 7, channel_id: 1 }];
+        assert_eq!(parse_request(subscribe), Ok(Request::Subscribe { subscriptions }));
         let unsubscribe = r#"{"op":"unsubscribe","subscriptionIds":[7,8]}"#;
-        assert_eq!(parse_request(unsubscribe), Ok(Request::Unsubscribe(vec![7, 8])));
+        let subscription_ids = vec![7, 8];
+        assert_eq!(parse_request(unsubscribe), Ok(Request::Unsubscribe { subscription_ids }));
         assert_eq!(parse_request(r#"{"op":"getParameters","x":1}"#), Ok(Request::Other));
         for wrong in
             ["", "{}", r#"{"op":"subscribe"}"#, r#"{"op":"unsubscribe","subscriptionIds":[-1]}"#]
