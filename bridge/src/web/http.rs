@@ -1,8 +1,12 @@
 //! As much of HTTP as the page needs: one request a connection, its head bounded in bytes and time.
 
+use std::borrow::Cow;
+use std::fmt::Display;
 use std::io::{self, Read, Write};
 use std::net::{Shutdown, TcpStream};
 use std::time::{Duration, Instant};
+
+use serde_json::Value;
 
 /// Most bytes of a request's head: what browsers and scrapers send is a tenth of it.
 pub const MAX_HEAD_BYTES: usize = 8 << 10;
@@ -153,19 +157,23 @@ pub struct Answer<'a> {
     /// Further header lines, each with its end.
     pub headers: String,
     /// The content.
-    pub body: &'a [u8],
+    pub body: Cow<'a, [u8]>,
 }
 
 impl<'a> Answer<'a> {
     /// Content that is there.
-    pub fn ok(content_type: &'static str, body: &'a [u8]) -> Self {
-        Self { status: "200 OK", content_type, headers: String::new(), body }
+    pub fn ok(content_type: &'static str, body: impl Into<Cow<'a, [u8]>>) -> Self {
+        Self { status: "200 OK", content_type, headers: String::new(), body: body.into() }
+    }
+
+    /// An object that is there.
+    pub fn json(value: &Value) -> Self {
+        Self::ok("application/json", value.to_string().into_bytes())
     }
 
     /// A line of text that says what is wrong.
-    pub fn refusal(status: &'static str, text: &'a str) -> Self {
-        let content_type = "text/plain; charset=utf-8";
-        Self { status, content_type, headers: String::new(), body: text.as_bytes() }
+    pub fn refusal(status: &'static str, text: impl Display) -> Self {
+        Self { status, ..Self::ok("text/plain; charset=utf-8", format!("{text}\n").into_bytes()) }
     }
 
     /// Sends it; without the content where only the head was asked for.
@@ -183,7 +191,7 @@ impl<'a> Answer<'a> {
         );
         stream.write_all(head.as_bytes())?;
         if !is_head_only {
-            stream.write_all(self.body)?;
+            stream.write_all(&self.body)?;
         }
         stream.flush()?;
         close(stream)

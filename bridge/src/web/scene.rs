@@ -3,10 +3,10 @@
 //! Pages take what is newest when they can take something: nothing is queued for them here.
 
 use std::collections::{BTreeMap, HashSet};
-use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
+use semidense::service::results::report::scene::place_numbers;
 use semidense::slam::keyframe::{Keyframe, KeyframePose};
 use semidense::wire::message::HealthMessage;
 use serde_json::{Value, json};
@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 use crate::session::{Event, Frame, Graph, Pose};
 use crate::web::packing::Packed;
 use crate::web::path::Path;
-use crate::web::words::pose_json;
+use crate::web::seats::{Seat, Seats};
 
 /// Shortest time between two revisions of the active keyframe: each is half a megabyte for every page.
 const REVISION_PERIOD: Duration = Duration::from_secs(1);
@@ -28,8 +28,7 @@ pub const USUAL_POINTS: usize = 6_000_000;
 pub struct Scene {
     state: Mutex<State>,
     changed: Condvar,
-    /// Pages that are open.
-    pages: AtomicUsize,
+    pages: Seats,
 }
 
 /// A frame that pages have not been sent yet.
@@ -46,7 +45,7 @@ pub struct NewestFrame {
 }
 
 /// The state of the scene.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct State {
     max_points: usize,
     /// Counts up with every change.
@@ -63,7 +62,8 @@ pub struct State {
     pub placed: u64,
     /// The active keyframe as it came last, where it is not packed yet.
     active: Option<Arc<Keyframe>>,
-    active_id: Option<u64>,
+    /// The keyframe that poses refer to now.
+    pub active_id: Option<u64>,
     packed: Option<Instant>,
     /// The camera's path.
     pub path: Path,
@@ -73,7 +73,8 @@ pub struct State {
     pub frame: Option<NewestFrame>,
     /// A frame that waits for its pose, which comes some milliseconds later.
     waiting: Option<Arc<Frame>>,
-    posed: Instant,
+    /// When the newest pose came, or else the run began.
+    posed: Option<Instant>,
     /// What each process says of itself, and how many such messages came.
     pub health: BTreeMap<&'static str, HealthMessage>,
     /// Counts up with every report.
@@ -87,28 +88,7 @@ pub struct State {
 
 impl State {
     fn new(max_points: usize, run: u64, version: u64) -> Self {
-        Self {
-            max_points,
-            version,
-            run,
-            is_joined: false,
-            keyframes: BTreeMap::new(),
-            places: BTreeMap::new(),
-            placed: 0,
-            active: None,
-            active_id: None,
-            packed: None,
-            path: Path::default(),
-            pose: None,
-            frame: None,
-            waiting: None,
-            posed: Instant::now(),
-            health: BTreeMap::new(),
-            reports: 0,
-            poses_by_state: [0; 4],
-            history_note: String::new(),
-            refused: HashSet::new(),
-        }
+        Self { max_points, run, version, posed: Some(Instant::now()), ..Self::default() }
     }
 
     fn take(&mut self, event: Event, has_pages: bool) {
@@ -125,7 +105,7 @@ impl State {
             Event::Frame(frame) => {
                 // One that the tracker has left out is left out here, unless nothing is tracked at all.
                 let before = self.waiting.replace(frame);
-                if self.posed.elapsed() > LONGEST_WAIT {
+                if self.posed.is_some_and(|at| at.elapsed() > LONGEST_WAIT) {
                     before.into_iter().for_each(|frame| self.show(frame, None));
                 }
             }
@@ -152,7 +132,7 @@ impl State {
         if let Some(frame) = self.waiting.take_if(is_own) {
             self.show(frame, Some(Arc::clone(&pose)));
         }
-        (self.pose, self.posed) = (Some((number, pose)), Instant::now());
+        (self.pose, self.posed) = (Some((number, pose)), Some(Instant::now()));
     }
 
     fn show(&mut self, frame: Arc<Frame>, pose: Option<Arc<Pose>>) {
@@ -214,20 +194,13 @@ impl State {
         self.placed += 1;
     }
 
-    /// The keyframe that poses refer to now.
-    pub fn active_id(&self) -> Option<u64> {
-        self.active_id
-    }
-
     /// Where keyframes are, 40 bytes each: id, epoch, and translation, quaternion and unit as f32.
     pub fn places_bytes(&self) -> Vec<u8> {
         let mut bytes = Vec::with_capacity(self.places.len() * 40);
         for (epoch, pose) in self.places.values() {
             bytes.extend_from_slice(&(pose.keyframe_id as u32).to_le_bytes());
             bytes.extend_from_slice(&epoch.to_le_bytes());
-            for number in
-                semidense::service::results::report::scene::place_numbers(&pose.map_from_keyframe)
-            {
+            for number in place_numbers(&pose.map_from_keyframe) {
                 bytes.extend_from_slice(&(number as f32).to_le_bytes());
             }
         }
@@ -260,11 +233,6 @@ impl State {
         }
     }
 
-    /// The newest pose as JSON.
-    pub fn pose_json(&self) -> Option<Value> {
-        self.pose.as_ref().map(|(_, pose)| pose_json(pose))
-    }
-
     /// What changes rarely: whether a run is there, and how many keyframes are known.
     pub fn run_json(&self) -> Value {
         json!({
@@ -283,7 +251,7 @@ impl Scene {
     /// An empty one, which keeps `max_points` at most.
     pub fn new(max_points: usize) -> Self {
         let state = Mutex::new(State::new(max_points, 0, 0));
-        Self { state, changed: Condvar::new(), pages: AtomicUsize::new(0) }
+        Self { state, changed: Condvar::new(), pages: Seats::default() }
     }
 
     /// Its state.
@@ -313,27 +281,14 @@ impl Scene {
 
     /// Pages that are open.
     pub fn pages(&self) -> usize {
-        self.pages.load(Ordering::Relaxed)
+        self.pages.taken()
     }
 
     /// Counts a page while it is open: a page that comes gets the active keyframe at once. `None` where `most` are open.
-    pub fn open_page(&self, most: usize) -> Option<OpenPage<'_>> {
-        let taken = self
-            .pages
-            .fetch_update(Ordering::Relaxed, Ordering::Relaxed, |n| (n < most).then_some(n + 1));
-        taken.ok()?;
+    pub fn open_page(&self, most: usize) -> Option<Seat> {
+        let page = self.pages.take(most)?;
         self.lock().pack_active();
-        Some(OpenPage(self))
-    }
-}
-
-/// A page that is open.
-#[derive(Debug)]
-pub struct OpenPage<'a>(&'a Scene);
-
-impl Drop for OpenPage<'_> {
-    fn drop(&mut self) {
-        self.0.pages.fetch_sub(1, Ordering::Relaxed);
+        Some(page)
     }
 }
 

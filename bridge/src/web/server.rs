@@ -1,12 +1,15 @@
 //! One port for the page, its stream, `/metrics` and Foxglove: each connection has a thread, and there are few of them.
 
+use std::fmt::Display;
 use std::io;
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
+use semidense::service::results::report::scene::{PLAYER, VIEWER};
+use serde_json::json;
 use tungstenite::WebSocket;
 use tungstenite::handshake::derive_accept_key;
 use tungstenite::protocol::{Role, WebSocketConfig};
@@ -18,6 +21,7 @@ use crate::web::http::{Answer, Head, HeadError, read_head};
 use crate::web::metrics::{CONTENT_TYPE, metrics};
 use crate::web::saving::Saver;
 use crate::web::scene::Scene;
+use crate::web::seats::Seats;
 use crate::web::stream::{StreamOptions, serve as serve_stream};
 
 /// Connections at a time, those that only ask for a file included.
@@ -33,23 +37,20 @@ const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 /// Clients of Foxglove's protocol at a time: each has its own messages encoded.
 const MAX_FOXGLOVE: usize = 8;
 
+const NOT_FOUND: &str = "404 Not Found";
+const CONFLICT: &str = "409 Conflict";
+const UNAVAILABLE: &str = "503 Service Unavailable";
+
+const SCRIPT: &str = "text/javascript; charset=utf-8";
 /// The files of the page, in the program itself.
 const FILES: [(&str, &str, &str); 7] = [
     ("/", "text/html; charset=utf-8", include_str!("assets/index.html")),
     ("/page.css", "text/css; charset=utf-8", include_str!("assets/page.css")),
-    ("/page.js", "text/javascript; charset=utf-8", include_str!("assets/page.js")),
-    ("/overlay.js", "text/javascript; charset=utf-8", include_str!("assets/overlay.js")),
-    ("/charts.js", "text/javascript; charset=utf-8", include_str!("assets/charts.js")),
-    (
-        "/player.js",
-        "text/javascript; charset=utf-8",
-        semidense::service::results::report::scene::PLAYER,
-    ),
-    (
-        "/viewer.js",
-        "text/javascript; charset=utf-8",
-        semidense::service::results::report::scene::VIEWER,
-    ),
+    ("/page.js", SCRIPT, include_str!("assets/page.js")),
+    ("/overlay.js", SCRIPT, include_str!("assets/overlay.js")),
+    ("/charts.js", SCRIPT, include_str!("assets/charts.js")),
+    ("/player.js", SCRIPT, PLAYER),
+    ("/viewer.js", SCRIPT, VIEWER),
 ];
 
 /// What is shown.
@@ -93,8 +94,8 @@ pub struct Server {
     address: SocketAddr,
     guard: Guard,
     shown: Shown,
-    connections: AtomicUsize,
-    foxglove_clients: AtomicUsize,
+    connections: Seats,
+    foxglove_clients: Seats,
     is_over: AtomicBool,
 }
 
@@ -109,8 +110,8 @@ impl Server {
             address,
             guard,
             shown,
-            connections: AtomicUsize::new(0),
-            foxglove_clients: AtomicUsize::new(0),
+            connections: Seats::default(),
+            foxglove_clients: Seats::default(),
             is_over: AtomicBool::new(false),
         }))
     }
@@ -149,15 +150,17 @@ impl Server {
 
     fn take(self: &Arc<Self>, mut stream: TcpStream) {
         let _ = stream.set_write_timeout(Some(LONGEST_ANSWER));
-        let server = Arc::clone(self);
-        let Some(connection) = Connection::count(server) else {
-            let _ = Answer::refusal("503 Service Unavailable", "too many connections\n")
-                .send(&mut stream, false);
+        let Some(seat) = self.connections.take(MAX_CONNECTIONS) else {
+            let _ = refuse(&mut stream, UNAVAILABLE, "too many connections");
             return;
         };
+        let server = Arc::clone(self);
         let thread = std::thread::Builder::new().name("client".to_owned());
         // A thread that cannot be started drops the connection.
-        let _ = thread.spawn(move || connection.0.answer(stream));
+        let _ = thread.spawn(move || {
+            let _seat = seat;
+            server.answer(stream);
+        });
     }
 
     fn answer(&self, mut stream: TcpStream) {
@@ -170,7 +173,7 @@ impl Server {
                     HeadError::Late => "408 Request Timeout",
                     HeadError::Malformed(_) | HeadError::Connection(_) => "400 Bad Request",
                 };
-                Answer::refusal(status, &format!("{error}\n")).send(&mut stream, false)
+                refuse(&mut stream, status, error)
             }
         };
         if let Err(error) = outcome {
@@ -185,45 +188,36 @@ impl Server {
                 Refusal::Origin => "403 Forbidden",
                 Refusal::Token => "401 Unauthorized",
             };
-            return Answer::refusal(status, &format!("{refusal}\n")).send(&mut stream, false);
+            return refuse(&mut stream, status, refusal);
         }
-        match (head.method.as_str(), head.path.as_str()) {
-            ("GET", _) if head.is_upgrade() => self.upgrade(stream, head),
-            ("POST", "/api/save") => self.save(&mut stream),
-            ("GET" | "HEAD", path) => self.file(&mut stream, &head, path),
-            _ => Answer::refusal("405 Method Not Allowed", "only GET, HEAD, and POST /api/save\n")
-                .send(&mut stream, false),
-        }
+        let answer = match (head.method.as_str(), head.path.as_str()) {
+            ("GET", _) if head.is_upgrade() => return self.upgrade(stream, head),
+            ("POST", "/api/save") => self.save(),
+            ("GET" | "HEAD", path) => self.file(path),
+            _ => Answer::refusal("405 Method Not Allowed", "only GET, HEAD, and POST /api/save"),
+        };
+        answer.send(&mut stream, head.method == "HEAD")
     }
 
-    fn file(&self, stream: &mut TcpStream, head: &Head, path: &str) -> io::Result<()> {
-        let is_head_only = head.method == "HEAD";
+    fn file(&self, path: &str) -> Answer<'_> {
         match (path, &self.shown) {
             ("/metrics", Shown::Live { feed, scene, stream: options, .. }) => {
                 let text = metrics(&scene.lock(), &options.instance, scene.pages(), feed.lost());
-                return Answer::ok(CONTENT_TYPE, text.as_bytes()).send(stream, is_head_only);
+                return Answer::ok(CONTENT_TYPE, text.into_bytes());
             }
             ("/api/run", Shown::Finished(block, ..)) => {
-                return Answer::ok("application/octet-stream", block).send(stream, is_head_only);
+                return Answer::ok("application/octet-stream", &block[..]);
             }
-            ("/api/mode", shown) => {
-                let mode = match shown {
-                    Shown::Live { .. } => serde_json::json!({ "mode": "live" }),
-                    Shown::Finished(_, folder, summary) => {
-                        serde_json::json!({ "mode": "finished", "folder": folder, "summary": summary })
-                    }
-                };
-                return Answer::ok("application/json", mode.to_string().as_bytes())
-                    .send(stream, is_head_only);
+            ("/api/mode", Shown::Live { .. }) => return Answer::json(&json!({ "mode": "live" })),
+            ("/api/mode", Shown::Finished(_, folder, summary)) => {
+                let mode = json!({ "mode": "finished", "folder": folder, "summary": summary });
+                return Answer::json(&mode);
             }
             _ => {}
         }
         let Some((_, content_type, text)) = FILES.iter().find(|(name, ..)| *name == path) else {
-            return Answer::refusal(
-                "404 Not Found",
-                "there is no such page: / is the page, /metrics for Prometheus\n",
-            )
-            .send(stream, is_head_only);
+            let text = "there is no such page: / is the page, /metrics for Prometheus";
+            return Answer::refusal(NOT_FOUND, text);
         };
         let mut answer = Answer::ok(content_type, text.as_bytes());
         if let (Some(token), true) = (&self.guard.token, path == "/") {
@@ -231,22 +225,16 @@ impl Server {
             answer.headers =
                 format!("Set-Cookie: {COOKIE}={token}; Path=/; HttpOnly; SameSite=Strict\r\n");
         }
-        answer.send(stream, is_head_only)
+        answer
     }
 
-    fn save(&self, stream: &mut TcpStream) -> io::Result<()> {
+    fn save(&self) -> Answer<'_> {
         let Shown::Live { saver, .. } = &self.shown else {
-            return Answer::refusal("409 Conflict", "this run is over: its map is in its folder\n")
-                .send(stream, false);
+            return Answer::refusal(CONFLICT, "this run is over: its map is in its folder");
         };
         match saver.save() {
-            Ok(folder) => {
-                let text = serde_json::json!({ "folder": folder }).to_string();
-                Answer::ok("application/json", text.as_bytes()).send(stream, false)
-            }
-            Err(error) => {
-                Answer::refusal("409 Conflict", &format!("{error}\n")).send(stream, false)
-            }
+            Ok(folder) => Answer::json(&json!({ "folder": folder })),
+            Err(error) => Answer::refusal(CONFLICT, error),
         }
     }
 
@@ -257,16 +245,14 @@ impl Server {
             return self.foxglove(stream, head, protocol);
         }
         let Shown::Live { scene, stream: options, .. } = &self.shown else {
-            return Answer::refusal("404 Not Found", "this run is over: there is no stream\n")
-                .send(&mut stream, false);
+            return refuse(&mut stream, NOT_FOUND, "this run is over: there is no stream");
         };
         if head.path != "/stream" {
-            return Answer::refusal("404 Not Found", "the stream is /stream\n")
-                .send(&mut stream, false);
+            return refuse(&mut stream, NOT_FOUND, "the stream is /stream");
         }
         let Some(_page) = scene.open_page(MAX_PAGES) else {
-            let text = format!("{MAX_PAGES} pages are open already: close one\n");
-            return Answer::refusal("503 Service Unavailable", &text).send(&mut stream, false);
+            let text = format!("{MAX_PAGES} pages are open already: close one");
+            return refuse(&mut stream, UNAVAILABLE, text);
         };
         let socket = accept(stream, head, None)?;
         serve_stream(socket, scene, options, &self.is_over).map_err(io::Error::other)
@@ -274,23 +260,21 @@ impl Server {
 
     fn foxglove(&self, mut stream: TcpStream, head: Head, protocol: &str) -> io::Result<()> {
         let Shown::Live { feed, stream: options, .. } = &self.shown else {
-            return Answer::refusal("404 Not Found", "this run is over: nothing is sent\n")
-                .send(&mut stream, false);
+            return refuse(&mut stream, NOT_FOUND, "this run is over: nothing is sent");
         };
-        let more = |n: usize| (n < MAX_FOXGLOVE).then_some(n + 1);
-        let clients = &self.foxglove_clients;
-        if clients.fetch_update(Ordering::Relaxed, Ordering::Relaxed, more).is_err() {
-            let text = format!("{MAX_FOXGLOVE} clients are served already: close one\n");
-            return Answer::refusal("503 Service Unavailable", &text).send(&mut stream, false);
-        }
-        let outcome = accept(stream, head, Some(protocol)).and_then(|socket| {
-            let listener = feed.listen(USUAL_DEPTH);
-            foxglove::serve(socket, &options.instance, |timeout| listener.next(timeout))
-                .map_err(io::Error::other)
-        });
-        clients.fetch_sub(1, Ordering::Relaxed);
-        outcome
+        let Some(_seat) = self.foxglove_clients.take(MAX_FOXGLOVE) else {
+            let text = format!("{MAX_FOXGLOVE} clients are served already: close one");
+            return refuse(&mut stream, UNAVAILABLE, text);
+        };
+        let socket = accept(stream, head, Some(protocol))?;
+        let listener = feed.listen(USUAL_DEPTH);
+        foxglove::serve(socket, &options.instance, |timeout| listener.next(timeout))
+            .map_err(io::Error::other)
     }
+}
+
+fn refuse(stream: &mut TcpStream, status: &'static str, text: impl Display) -> io::Result<()> {
+    Answer::refusal(status, text).send(stream, false)
 }
 
 /// Answers the request for a WebSocket, and makes one of the connection.
@@ -304,8 +288,7 @@ pub fn accept(
         .header("sec-websocket-key")
         .filter(|_| head.header("sec-websocket-version") == Some("13"));
     let Some(key) = key else {
-        Answer::refusal("400 Bad Request", "a WebSocket of version 13 is wanted\n")
-            .send(&mut stream, false)?;
+        refuse(&mut stream, "400 Bad Request", "a WebSocket of version 13 is wanted")?;
         return Err(io::Error::from(io::ErrorKind::InvalidData));
     };
     let protocol =
@@ -319,21 +302,4 @@ pub fn accept(
         .max_message_size(Some(MAX_MESSAGE_BYTES))
         .max_frame_size(Some(MAX_MESSAGE_BYTES));
     Ok(WebSocket::from_partially_read(stream, head.rest, Role::Server, Some(config)))
-}
-
-/// A connection that counts while its thread lives.
-struct Connection(Arc<Server>);
-
-impl Connection {
-    fn count(server: Arc<Server>) -> Option<Self> {
-        let more = |n: usize| (n < MAX_CONNECTIONS).then_some(n + 1);
-        server.connections.fetch_update(Ordering::Relaxed, Ordering::Relaxed, more).ok()?;
-        Some(Self(server))
-    }
-}
-
-impl Drop for Connection {
-    fn drop(&mut self) {
-        self.0.connections.fetch_sub(1, Ordering::Relaxed);
-    }
 }

@@ -9,12 +9,12 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use semidense::service::results::report::scene::framed;
 use serde::Deserialize;
 use serde_json::{Value, json};
 use tungstenite::{Error, Message, WebSocket};
 
 use crate::ros::images::jpeg;
-use crate::web::message::{binary, hello, text};
 use crate::web::packing::Packed;
 use crate::web::scene::{NewestFrame, Scene, State};
 use crate::web::words::{health_json, pose_json};
@@ -67,7 +67,8 @@ pub fn serve(
     socket.get_ref().set_read_timeout(Some(READ_TIME))?;
     socket.get_ref().set_write_timeout(Some(LONGEST_WRITE))?;
     socket.get_ref().set_nodelay(true)?;
-    socket.send(text(&hello(&options.instance)))?;
+    let hello = json!({ "kind": "hello", "version": env!("CARGO_PKG_VERSION"), "protocol": 1, "instance": options.instance });
+    socket.send(text(&hello))?;
     let mut sent = Sent { shows_frames: true, ..Sent::default() };
     let mut version = u64::MAX;
     let mut period = BUSY_PERIOD;
@@ -112,6 +113,11 @@ fn listen(socket: &mut WebSocket<TcpStream>, sent: &mut Sent) -> Result<bool, Er
     }
 }
 
+/// A message that is only a header.
+fn text(header: &Value) -> Message {
+    Message::text(header.to_string())
+}
+
 /// Something to send; the work of making it is done when the scene is not held any more.
 enum Outgoing {
     Text(Value),
@@ -124,8 +130,8 @@ impl Outgoing {
     fn encode(self) -> Option<Message> {
         match self {
             Self::Text(header) => Some(text(&header)),
-            Self::Bytes(header, bytes) => Some(binary(&header, &bytes)),
-            Self::Keyframe(packed) => Some(binary(&packed.header, &packed.points)),
+            Self::Bytes(header, bytes) => Some(Message::binary(framed(&header, &bytes))),
+            Self::Keyframe(packed) => Some(Message::binary(framed(&packed.header, &packed.points))),
             Self::Frame(newest) => {
                 let image = newest.jpeg.get_or_init(|| jpeg_of(&newest));
                 let header = &newest.frame.header;
@@ -138,7 +144,7 @@ impl Outgoing {
                         "size": [header.width, header.height],
                         "pose": newest.pose.as_deref().map(pose_json),
                     });
-                    binary(&header, image)
+                    Message::binary(framed(&header, image))
                 })
             }
         }
@@ -212,11 +218,11 @@ impl Sent {
                 state.health.iter().map(|(process, health)| health_json(process, health)).collect();
             out.push(Outgoing::Text(json!({ "kind": "health", "processes": processes })));
         }
-        if let Some((number, _)) = &state.pose
+        if let Some((number, pose)) = &state.pose
             && *number != self.pose
         {
             self.pose = *number;
-            out.extend(state.pose_json().map(Outgoing::Text));
+            out.push(Outgoing::Text(pose_json(pose)));
         }
         self.collect_places(state, out);
         self.collect_frame(state, options, out);
@@ -253,7 +259,7 @@ impl Sent {
     fn collect_keyframe(&mut self, state: &State, out: &mut Vec<Outgoing>) {
         self.keyframes.retain(|id, _| state.keyframes.contains_key(id));
         // The active one first, then the newest.
-        let active = state.active_id().and_then(|id| state.keyframes.get(&id));
+        let active = state.active_id.and_then(|id| state.keyframes.get(&id));
         let all = active.into_iter().chain(state.keyframes.values().rev());
         let mut wanted = all.filter(|packed| match self.keyframes.get(&packed.keyframe_id) {
             None => true,
