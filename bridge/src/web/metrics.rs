@@ -79,57 +79,42 @@ fn secs_since(nanos: i64) -> f64 {
 /// The text; `pages` and `lost` are of the server itself.
 pub fn metrics(state: &State, instance: &str, pages: usize, lost: u64) -> String {
     let mut text = Text::default();
-    text.family("semidense", "info", "The instance and where its frames come from");
+    text.describe("info", "semidense", "The instance and where its frames come from");
     let from = state.health.get("capture").map(source).unwrap_or_default();
-    text.line(
-        "semidense_info",
-        &[("name", instance), ("version", env!("CARGO_PKG_VERSION")), ("source", &from)],
-        1.0,
-    );
-    text.family("semidense_up", "gauge", "1 while the instance runs");
-    text.line("semidense_up", &[], f64::from(u8::from(state.is_joined)));
+    let labels = [("name", instance), ("version", env!("CARGO_PKG_VERSION")), ("source", &from)];
+    text.line("semidense_info", &labels, 1.0);
+    let is_up = f64::from(state.is_joined);
+    text.family("gauge", "up", "1 while the instance runs", [([], is_up)]);
     of_processes(&mut text, state);
     of_mapper(&mut text, state);
     of_poses(&mut text, state);
-    text.family("semidense_view_pages", "gauge", "Pages that are open");
-    text.line("semidense_view_pages", &[], pages as f64);
-    text.family(
-        "semidense_view_events_lost",
-        "counter",
-        "Events that this server's own readers lost because they were slow",
-    );
-    text.line("semidense_view_events_lost_total", &[], lost as f64);
+    text.family("gauge", "view_pages", "Pages that are open", [([], pages as f64)]);
+    let help = "Events that this server's own readers lost because they were slow";
+    text.family("counter", "view_events_lost", help, [([], lost as f64)]);
     text.0 + "# EOF\n"
 }
 
 fn of_processes(text: &mut Text, state: &State) {
-    text.family("semidense_process_state", "gauge", "1 for the state that the process is in");
-    for (process, health) in &state.health {
-        for name in (0..PROCESS_STATES).filter_map(ProcessState::from_code) {
-            let is_it = f64::from(u8::from(name.code() == health.state));
-            text.line(
-                "semidense_process_state",
-                &[("process", process), ("state", name.name())],
-                is_it,
-            );
-        }
-    }
-    for (name, help, value) in COUNTERS {
-        text.family(&format!("semidense_{name}"), "counter", help);
-        for (process, health) in &state.health {
-            text.line(&format!("semidense_{name}_total"), &[("process", process)], value(health));
-        }
-    }
-    for (name, help, value) in GAUGES {
-        text.family(&format!("semidense_{name}"), "gauge", help);
-        for (process, health) in &state.health {
-            text.line(&format!("semidense_{name}"), &[("process", process)], value(health));
+    let states = state.health.iter().flat_map(|(process, health)| {
+        (0..PROCESS_STATES).filter_map(ProcessState::from_code).map(move |of| {
+            let is_it = of.code() == health.state;
+            ([("process", *process), ("state", of.name())], f64::from(is_it))
+        })
+    });
+    text.family("gauge", "process_state", "1 for the state that the process is in", states);
+    for (kind, figures) in [("counter", &COUNTERS[..]), ("gauge", &GAUGES)] {
+        for (name, help, value) in figures {
+            let processes = state.health.iter();
+            let values =
+                processes.map(|(process, health)| ([("process", *process)], value(health)));
+            text.family(kind, name, help, values);
         }
     }
     for (name, help, counts) in HISTOGRAMS {
-        text.family(&format!("semidense_{name}"), "histogram", help);
+        let name = format!("semidense_{name}");
+        text.describe("histogram", &name, help);
         for (process, health) in &state.health {
-            text.histogram(&format!("semidense_{name}"), process, counts(health));
+            text.histogram(&name, process, counts(health));
         }
     }
 }
@@ -137,45 +122,35 @@ fn of_processes(text: &mut Text, state: &State) {
 fn of_mapper(text: &mut Text, state: &State) {
     let Some(health) = state.health.get("mapper") else { return };
     for (name, help, value) in MAPPER_COUNTERS {
-        text.family(&format!("semidense_{name}"), "counter", help);
-        text.line(&format!("semidense_{name}_total"), &[], value(health));
+        text.family("counter", name, help, [([], value(health))]);
     }
-    text.family("semidense_joint_estimate_cpu_seconds", "histogram", "CPU time of joint estimates");
-    text.histogram("semidense_joint_estimate_cpu_seconds", "mapper", &health.adjustment_counts);
-    text.family("semidense_keyframes", "gauge", "Keyframes of the map");
-    text.line("semidense_keyframes", &[], health.total as f64);
+    let cpu = "semidense_joint_estimate_cpu_seconds";
+    text.describe("histogram", cpu, "CPU time of joint estimates");
+    text.histogram(cpu, "mapper", &health.adjustment_counts);
+    text.family("gauge", "keyframes", "Keyframes of the map", [([], health.total as f64)]);
 }
 
 fn of_poses(text: &mut Text, state: &State) {
-    text.family(
-        "semidense_poses",
-        "counter",
-        "Poses by the state that they were in, since this server joined the run",
-    );
-    for (name, count) in TrackingState::NAMES.iter().zip(state.poses_by_state) {
-        text.line("semidense_poses_total", &[("state", name)], count as f64);
-    }
+    let counts = TrackingState::NAMES.iter().zip(state.poses_by_state);
+    let counts = counts.map(|(name, count)| ([("state", *name)], count as f64));
+    let help = "Poses by the state that they were in, since this server joined the run";
+    text.family("counter", "poses", help, counts);
     let Some((_, pose)) = &state.pose else { return };
     let pose = &pose.message;
-    text.family("semidense_tracking_state", "gauge", "1 for the state of the newest pose");
-    for (code, name) in TrackingState::NAMES.iter().enumerate() {
-        let is_it = f64::from(u8::from(code == pose.state as usize));
-        text.line("semidense_tracking_state", &[("state", name)], is_it);
-    }
+    let states = TrackingState::NAMES.iter().enumerate();
+    let states =
+        states.map(|(code, name)| ([("state", *name)], f64::from(code == pose.state as usize)));
+    text.family("gauge", "tracking_state", "1 for the state of the newest pose", states);
+    let age = secs_since(pose.published_nanos);
     let gauges = [
-        (
-            "pose_age_seconds",
-            "Time since the newest pose was published",
-            secs_since(pose.published_nanos),
-        ),
+        ("pose_age_seconds", "Time since the newest pose was published", age),
         ("pose_in_view_ratio", "Share of the keyframe's points in view", pose.in_view_ratio),
         ("pose_inlier_ratio", "Share of those compared that are explained", pose.inlier_ratio),
         ("epoch", "Life of the map", f64::from(pose.epoch)),
         ("map_revision", "How often the map had been corrected", pose.map_revision as f64),
     ];
     for (name, help, value) in gauges {
-        text.family(&format!("semidense_{name}"), "gauge", help);
-        text.line(&format!("semidense_{name}"), &[], value);
+        text.family("gauge", name, help, [([], value)]);
     }
 }
 
@@ -184,7 +159,21 @@ fn of_poses(text: &mut Text, state: &State) {
 struct Text(String);
 
 impl Text {
-    fn family(&mut self, name: &str, kind: &str, help: &str) {
+    /// A family of counters or gauges: each value with its labels.
+    fn family<'a, const N: usize>(
+        &mut self,
+        kind: &str,
+        name: &str,
+        help: &str,
+        values: impl IntoIterator<Item = ([(&'a str, &'a str); N], f64)>,
+    ) {
+        let name = format!("semidense_{name}");
+        self.describe(kind, &name, help);
+        let line = if kind == "counter" { format!("{name}_total") } else { name };
+        values.into_iter().for_each(|(labels, value)| self.line(&line, &labels, value));
+    }
+
+    fn describe(&mut self, kind: &str, name: &str, help: &str) {
         let _ = write!(self.0, "# TYPE {name} {kind}\n# HELP {name} {help}.\n");
     }
 
@@ -198,10 +187,7 @@ impl Text {
         if !labels.is_empty() {
             self.0.push('}');
         }
-        let _ = match value {
-            value if value.is_nan() => writeln!(self.0, " NaN"),
-            value => writeln!(self.0, " {value}"),
-        };
+        let _ = writeln!(self.0, " {value}");
     }
 
     /// Buckets as Prometheus has them, each with all below it. Times are counted by half octaves and not summed: the sum
@@ -219,11 +205,8 @@ impl Text {
             } else {
                 format!("{end:.9}")
             };
-            self.line(
-                &format!("{name}_bucket"),
-                &[("process", process), ("le", &le)],
-                below as f64,
-            );
+            let labels = [("process", process), ("le", &le)];
+            self.line(&format!("{name}_bucket"), &labels, below as f64);
         }
         self.line(&format!("{name}_count"), &[("process", process)], below as f64);
         self.line(&format!("{name}_sum"), &[("process", process)], sum);
