@@ -2,6 +2,7 @@
 
 use jpeg_encoder::{ColorType, Encoder};
 use zune_jpeg::JpegDecoder;
+use zune_jpeg::errors::DecodeErrors;
 use zune_jpeg::zune_core::bytestream::ZCursor;
 use zune_jpeg::zune_core::colorspace::ColorSpace;
 use zune_jpeg::zune_core::options::DecoderOptions;
@@ -44,20 +45,19 @@ pub fn encode_gray(
 
 /// The pixels of a JPEG that has this size: one of another size is refused before it takes memory.
 pub fn decode_gray(bytes: &[u8], [width, height]: [usize; 2]) -> Result<Vec<u8>, JpegError> {
-    let failed = |error: &dyn std::fmt::Display| JpegError::Coding(error.to_string());
+    let wrong = JpegError::Size { width, height };
+    let failed = |error: DecodeErrors| JpegError::Coding(error.to_string());
     let options = DecoderOptions::default()
         .set_max_width(width)
         .set_max_height(height)
         .jpeg_set_out_colorspace(ColorSpace::Luma);
     let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
-    decoder.decode_headers().map_err(|error| failed(&error))?;
-    let pixels = match decoder.dimensions() {
-        Some(found) if found == (width, height) => {
-            decoder.decode().map_err(|error| failed(&error))?
-        }
-        _ => return Err(JpegError::Size { width, height }),
-    };
-    if pixels.len() == width * height { Ok(pixels) } else { Err(JpegError::Size { width, height }) }
+    decoder.decode_headers().map_err(failed)?;
+    if decoder.dimensions() != Some((width, height)) {
+        return Err(wrong);
+    }
+    let pixels = decoder.decode().map_err(failed)?;
+    if pixels.len() == width * height { Ok(pixels) } else { Err(wrong) }
 }
 
 #[cfg(test)]
