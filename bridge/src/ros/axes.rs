@@ -63,15 +63,19 @@ fn both_turned(rotation: &Matrix3<f64>) -> Matrix6<f64> {
     both
 }
 
-/// Covariance of position and fixed-axis rotation in `map`, of the covariance of the left increment ξ of
-/// `map_from_camera`. That turns about the map's origin: a position p errs by ξ_t + ξ_ω × p.
-pub fn map_covariance(map_from_camera: &SE3, left_increment: &[f64; 21]) -> [f64; 36] {
+/// Covariance of position and fixed-axis rotation in our axes, of the covariance of the left increment ξ of a pose. That
+/// turns about the origin: a position p errs by ξ_t + ξ_ω × p.
+pub fn place_covariance(position: &Vector3<f64>, left_increment: &[f64; 21]) -> Matrix6<f64> {
     let mut error_from_increment = Matrix6::identity();
-    error_from_increment
-        .fixed_view_mut::<3, 3>(0, 3)
-        .copy_from(&-hat(&map_from_camera.translation));
-    let jacobian = both_turned(&ros_from_world().rotation_matrix()) * error_from_increment;
-    row_major(&(jacobian * matrix(left_increment) * jacobian.transpose()))
+    error_from_increment.fixed_view_mut::<3, 3>(0, 3).copy_from(&-hat(position));
+    error_from_increment * matrix(left_increment) * error_from_increment.transpose()
+}
+
+/// The same in `map`, of the left increment of `map_from_camera`.
+pub fn map_covariance(map_from_camera: &SE3, left_increment: &[f64; 21]) -> [f64; 36] {
+    let turned = both_turned(&ros_from_world().rotation_matrix());
+    let covariance = place_covariance(&map_from_camera.translation, left_increment);
+    row_major(&(turned * covariance * turned.transpose()))
 }
 
 /// Covariance of position and fixed-axis rotation in `odom`, of the covariance of the left increment ξ of

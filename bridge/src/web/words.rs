@@ -1,6 +1,6 @@
 //! Poses and health in words and figures, as JSON.
 
-use nalgebra::{Matrix3, Matrix3x6, Matrix6, Vector3};
+use nalgebra::Vector3;
 use semidense::service::health::{
     ProcessState, cause, percentile_ms, scheduling_name, source, warning,
 };
@@ -8,6 +8,7 @@ use semidense::slam::pose::{DegradedReason, LostReason, TrackingState};
 use semidense::wire::message::HealthMessage;
 use serde_json::{Value, json};
 
+use crate::ros::axes::place_covariance;
 use crate::session::Pose;
 
 /// A state, and in words why.
@@ -75,21 +76,9 @@ fn translation_first([qx, qy, qz, qw, x, y, z]: &[f64; 7]) -> [f64; 7] {
     [*x, *y, *z, *qx, *qy, *qz, *qw]
 }
 
-/// Covariance xx, xy, xz, yy, yz, zz of the camera's position: an increment (ξ_t, ξ_ω) from the left moves the position p
-/// by ξ_t + ξ_ω × p.
+/// Covariance xx, xy, xz, yy, yz, zz of the camera's position, of that of an increment from the left.
 fn position_covariance(upper: &[f64; 21], position: &Vector3<f64>) -> [f64; 6] {
-    let mut entries = upper.iter();
-    let mut full = Matrix6::zeros();
-    for row in 0..6 {
-        for column in row..6 {
-            let entry = entries.next().copied().unwrap_or(0.0);
-            (full[(row, column)], full[(column, row)]) = (entry, entry);
-        }
-    }
-    let mut jacobian = Matrix3x6::zeros();
-    jacobian.fixed_view_mut::<3, 3>(0, 0).copy_from(&Matrix3::identity());
-    jacobian.fixed_view_mut::<3, 3>(0, 3).copy_from(&-position.cross_matrix());
-    let of = jacobian * full * jacobian.transpose();
+    let of = place_covariance(position, upper);
     [of[(0, 0)], of[(0, 1)], of[(0, 2)], of[(1, 1)], of[(1, 2)], of[(2, 2)]]
 }
 
