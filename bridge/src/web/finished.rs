@@ -6,6 +6,7 @@ use std::fs::{self, File};
 use std::io::{self, BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 
+use byteorder::{ByteOrder, LittleEndian};
 use semidense::service::results::ply::read_surface;
 use semidense::service::results::report::scene::{SceneInput, SceneKeyframe, ScenePoint, pack};
 use semidense::service::trajectory_file::{
@@ -74,10 +75,6 @@ pub fn read_run(folder: &Path, max_points: usize) -> Result<Vec<u8>, FinishedErr
         up: up.map(Into::into),
         max_points,
     }))
-}
-
-fn open(path: &Path) -> Result<File, FinishedError> {
-    File::open(path).map_err(|source| FinishedError::Read { path: path.to_owned(), source })
 }
 
 /// The summary of a run; nothing where there is none.
@@ -167,6 +164,25 @@ fn keyframe(line: &str) -> Option<(u32, SceneKeyframe)> {
     is_usable.then_some((words.get(11)?.parse().ok()?, keyframe))
 }
 
+/// The bytes of a number, and how it is read.
+type Kind = (usize, fn(&[u8]) -> f64);
+
+/// The kind of this name in a PLY.
+fn kind_of(name: &str) -> Option<Kind> {
+    let kind: Kind = match name {
+        "char" | "int8" => (1, |bytes| f64::from(bytes[0] as i8)),
+        "uchar" | "uint8" => (1, |bytes| f64::from(bytes[0])),
+        "short" | "int16" => (2, |bytes| f64::from(LittleEndian::read_i16(bytes))),
+        "ushort" | "uint16" => (2, |bytes| f64::from(LittleEndian::read_u16(bytes))),
+        "int" | "int32" => (4, |bytes| f64::from(LittleEndian::read_i32(bytes))),
+        "uint" | "uint32" => (4, |bytes| f64::from(LittleEndian::read_u32(bytes))),
+        "float" | "float32" => (4, |bytes| f64::from(LittleEndian::read_f32(bytes))),
+        "double" | "float64" => (8, LittleEndian::read_f64),
+        _ => return None,
+    };
+    Some(kind)
+}
+
 /// Where a property stands in a point, and how it is written.
 #[derive(Debug, Clone, Copy)]
 struct Property {
@@ -174,58 +190,10 @@ struct Property {
     kind: Kind,
 }
 
-#[derive(Debug, Clone, Copy)]
-enum Kind {
-    I8,
-    U8,
-    I16,
-    U16,
-    I32,
-    U32,
-    F32,
-    F64,
-}
-
-impl Kind {
-    fn of(name: &str) -> Option<Self> {
-        Some(match name {
-            "char" | "int8" => Self::I8,
-            "uchar" | "uint8" => Self::U8,
-            "short" | "int16" => Self::I16,
-            "ushort" | "uint16" => Self::U16,
-            "int" | "int32" => Self::I32,
-            "uint" | "uint32" => Self::U32,
-            "float" | "float32" => Self::F32,
-            "double" | "float64" => Self::F64,
-            _ => return None,
-        })
-    }
-
-    fn bytes(self) -> usize {
-        match self {
-            Self::I8 | Self::U8 => 1,
-            Self::I16 | Self::U16 => 2,
-            Self::I32 | Self::U32 | Self::F32 => 4,
-            Self::F64 => 8,
-        }
-    }
-}
-
 impl Property {
     fn read(self, point: &[u8]) -> f64 {
-        let at = |n: usize| &point[self.offset..self.offset + n];
-        let two = || [at(2)[0], at(2)[1]];
-        let four = || [at(4)[0], at(4)[1], at(4)[2], at(4)[3]];
-        match self.kind {
-            Kind::I8 => f64::from(at(1)[0] as i8),
-            Kind::U8 => f64::from(at(1)[0]),
-            Kind::I16 => f64::from(i16::from_le_bytes(two())),
-            Kind::U16 => f64::from(u16::from_le_bytes(two())),
-            Kind::I32 => f64::from(i32::from_le_bytes(four())),
-            Kind::U32 => f64::from(u32::from_le_bytes(four())),
-            Kind::F32 => f64::from(f32::from_le_bytes(four())),
-            Kind::F64 => f64::from_le_bytes(std::array::from_fn(|i| at(8)[i])),
-        }
+        let (length, read) = self.kind;
+        read(&point[self.offset..][..length])
     }
 }
 
@@ -272,9 +240,9 @@ impl Layout {
     }
 
     fn push(&mut self, kind: &str, name: &str) -> Result<(), String> {
-        let kind = Kind::of(kind).ok_or_else(|| format!("its property {name} is a {kind}"))?;
+        let kind = kind_of(kind).ok_or_else(|| format!("its property {name} is a {kind}"))?;
         self.properties.push((name.to_owned(), Property { offset: self.bytes, kind }));
-        self.bytes += kind.bytes();
+        self.bytes += kind.0;
         if self.bytes > MAX_POINT_BYTES {
             Err("its points are too large".to_owned())
         } else {
@@ -294,7 +262,7 @@ impl Layout {
 fn read_points(path: &Path, most: usize) -> Result<Vec<ScenePoint>, FinishedError> {
     let content = |what: String| FinishedError::Content { path: path.to_owned(), what };
     let failed = |source| FinishedError::Read { path: path.to_owned(), source };
-    let mut file = BufReader::new(open(path)?);
+    let mut file = BufReader::new(File::open(path).map_err(failed)?);
     let layout = Layout::read(&mut file).map_err(content)?;
     let want = |name: &str| {
         layout.property(&[name]).ok_or_else(|| content(format!("its points have no {name}")))
