@@ -71,18 +71,16 @@ fn check_out<T>(out: *mut T, name: &str) -> Result<(), Failure> {
 unsafe fn give<T>(
     reader: *mut ReaderHandle,
     out: *mut T,
-    ask: impl FnOnce(&mut Reader) -> Result<Result<T, Status>, Failure>,
+    ask: impl FnOnce(&mut Reader) -> Result<Option<T>, Failure>,
 ) -> Status {
     call(|| {
         check_out(out, "the structure to write to")?;
-        match table::with(number(reader), ask)? {
-            Ok(value) => {
-                // SAFETY: neither null nor misaligned, and the caller promises that it may be written to.
-                unsafe { out.write(value) };
-                Ok(Status::Ok)
-            }
-            Err(status) => Ok(status),
-        }
+        let (value, nothing) =
+            table::with(number(reader), |reader| Ok((ask(reader)?, reader.nothing())))?;
+        let Some(value) = value else { return Ok(nothing) };
+        // SAFETY: neither null nor misaligned, and the caller promises that it may be written to.
+        unsafe { out.write(value) };
+        Ok(Status::Ok)
     })
 }
 
@@ -219,7 +217,7 @@ pub unsafe extern "C" fn semidense_newest_graph(
 pub extern "C" fn semidense_refused(reader: *const ReaderHandle) -> u64 {
     let mut refused = 0;
     call(|| {
-        refused = table::with(number(reader), |reader| Ok(reader.refused()))?;
+        refused = table::with(number(reader), |reader| Ok(reader.refused))?;
         Ok(Status::Ok)
     });
     refused

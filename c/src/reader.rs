@@ -66,7 +66,8 @@ pub struct Reader {
     last_health: i64,
     has_ended: bool,
     has_told_end: bool,
-    refused: u64,
+    /// Messages that were left out because they are broken.
+    pub refused: u64,
     _hub: Hub,
 }
 
@@ -166,11 +167,6 @@ impl Reader {
         self.waited.as_raw_fd()
     }
 
-    /// Messages that were left out because they are broken.
-    pub fn refused(&self) -> u64 {
-        self.refused
-    }
-
     /// Waits until there is something to look at, and takes the wake-ups.
     pub fn wait(&mut self, timeout: Option<Duration>) -> Result<Status, Failure> {
         let begun = Instant::now();
@@ -233,33 +229,33 @@ impl Reader {
     }
 
     /// What a reader that has nothing says.
-    fn nothing(&self) -> Status {
+    pub fn nothing(&self) -> Status {
         if self.has_ended { Status::Ended } else { Status::None }
     }
 
     /// The oldest unread pose.
-    pub fn next_pose(&mut self) -> Result<Result<Pose, Status>, Failure> {
+    pub fn next_pose(&mut self) -> Result<Option<Pose>, Failure> {
         let port = self.poses.as_ref().ok_or_else(|| not_wanted("POSES"))?;
         while let Some(message) = port.receive()? {
             for message in message.payload() {
                 match conversion::pose(message) {
-                    Ok(pose) => return Ok(Ok(pose)),
+                    Ok(pose) => return Ok(Some(pose)),
                     Err(_) => self.refused += 1,
                 }
             }
         }
-        Ok(Err(self.nothing()))
+        Ok(None)
     }
 
     /// The newest frame that has not been given.
-    pub fn newest_frame(&mut self) -> Result<Result<Frame, Status>, Failure> {
+    pub fn newest_frame(&mut self) -> Result<Option<Frame>, Failure> {
         let port = self.frames.as_ref().ok_or_else(|| not_wanted("FRAMES"))?;
         self.frame = None;
-        let Some(received) = port.newest()? else { return Ok(Err(self.nothing())) };
+        let Some(received) = port.newest()? else { return Ok(None) };
         let header = *received.header();
         let Ok((view, intrinsics)) = frame_from_message(&header, received.payload()) else {
             self.refused += 1;
-            return Ok(Err(self.nothing()));
+            return Ok(None);
         };
         let frame = Frame {
             sequence: header.sequence,
@@ -273,11 +269,11 @@ impl Reader {
             pixels: view.pixels.as_ptr(),
         };
         self.frame = Some(received);
-        Ok(Ok(frame))
+        Ok(Some(frame))
     }
 
     /// The newest keyframe that has not been given.
-    pub fn newest_keyframe(&mut self) -> Result<Result<Keyframe, Status>, Failure> {
+    pub fn newest_keyframe(&mut self) -> Result<Option<Keyframe>, Failure> {
         let none = || not_wanted("KEYFRAMES");
         let depths = self.depths.as_ref().ok_or_else(none)?;
         let images = self.images.as_ref().ok_or_else(none)?;
@@ -293,36 +289,32 @@ impl Reader {
             self.image = images.receive()?;
         }
         let (Some(depth), Some(image)) = (&self.depth, &self.image) else {
-            return Ok(Err(self.nothing()));
+            return Ok(None);
         };
         let ids = (depth.header().keyframe_id, depth.header().epoch);
         if ids != (image.header().keyframe_id, image.header().epoch) {
             // The other half is on its way.
-            return Ok(Err(self.nothing()));
+            return Ok(None);
         }
         self.is_depth_new = false;
-        match whole_keyframe(depth, image) {
-            Some(keyframe) => Ok(Ok(keyframe)),
-            None => {
-                self.refused += 1;
-                Ok(Err(self.nothing()))
-            }
-        }
+        let keyframe = whole_keyframe(depth, image);
+        self.refused += u64::from(keyframe.is_none());
+        Ok(keyframe)
     }
 
     /// The newest graph that has not been given.
-    pub fn newest_graph(&mut self) -> Result<Result<Graph, Status>, Failure> {
+    pub fn newest_graph(&mut self) -> Result<Option<Graph>, Failure> {
         let port = self.graphs.as_ref().ok_or_else(|| not_wanted("GRAPH"))?;
-        let Some(received) = port.receive()? else { return Ok(Err(self.nothing())) };
+        let Some(received) = port.receive()? else { return Ok(None) };
         let header = *received.header();
         let poses: Result<Vec<_>, _> =
             received.payload().iter().map(keyframe_pose_from_message).collect();
         let Ok(poses) = poses else {
             self.refused += 1;
-            return Ok(Err(self.nothing()));
+            return Ok(None);
         };
         self.graph = poses.iter().map(conversion::keyframe_pose).collect();
-        Ok(Ok(Graph {
+        Ok(Some(Graph {
             revision: header.revision,
             map_revision: header.map_revision,
             epoch: header.epoch,

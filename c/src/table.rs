@@ -26,13 +26,18 @@ fn unknown() -> Failure {
     )
 }
 
+fn with_all<T>(
+    act: impl FnOnce(&mut BTreeMap<usize, Reader>) -> Result<T, Failure>,
+) -> Result<T, Failure> {
+    READERS
+        .try_with(|readers| act(&mut *readers.try_borrow_mut().map_err(|_| unusable())?))
+        .map_err(|_| unusable())?
+}
+
 /// Keeps a reader; gives its number.
 pub fn insert(reader: Reader) -> Result<usize, Failure> {
     let number = NEXT.fetch_add(1, Ordering::Relaxed);
-    let kept = READERS.try_with(|readers| {
-        readers.try_borrow_mut().map(|mut readers| readers.insert(number, reader)).map(drop)
-    });
-    kept.map_err(|_| unusable())?.map_err(|_| unusable())?;
+    with_all(|readers| Ok(readers.insert(number, reader)))?;
     Ok(number)
 }
 
@@ -41,20 +46,10 @@ pub fn with<T>(
     number: usize,
     act: impl FnOnce(&mut Reader) -> Result<T, Failure>,
 ) -> Result<T, Failure> {
-    READERS
-        .try_with(|readers| {
-            let mut readers = readers.try_borrow_mut().map_err(|_| unusable())?;
-            act(readers.get_mut(&number).ok_or_else(unknown)?)
-        })
-        .map_err(|_| unusable())?
+    with_all(|readers| act(readers.get_mut(&number).ok_or_else(unknown)?))
 }
 
 /// Takes the reader out.
 pub fn remove(number: usize) -> Result<Reader, Failure> {
-    READERS
-        .try_with(|readers| {
-            let mut readers = readers.try_borrow_mut().map_err(|_| unusable())?;
-            readers.remove(&number).ok_or_else(unknown)
-        })
-        .map_err(|_| unusable())?
+    with_all(|readers| readers.remove(&number).ok_or_else(unknown))
 }
