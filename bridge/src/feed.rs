@@ -3,6 +3,7 @@
 //! Each [`Listener`] has a bounded channel: one that does not keep up loses events, which are counted, and holds up neither
 //! the reading nor the others. A listener that comes late first gets the newest event of each kind.
 
+use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -135,12 +136,12 @@ impl State {
     }
 
     fn listen(&mut self, depth: usize) -> Listener {
-        let recent = self.recent.events();
+        let recent = &self.recent.0;
         let (sender, events) = sync_channel(depth.max(recent.len()));
         let lost = Arc::<AtomicU64>::default();
         let mut outlet = Outlet { sender, lost: Arc::clone(&lost), owed: None };
         if self.failure.is_none() {
-            for event in &recent {
+            for event in recent.values() {
                 outlet.give(event);
             }
             self.outlets.push(outlet);
@@ -189,39 +190,25 @@ impl Outlet {
     }
 }
 
-/// The newest event of each kind, for those who come late.
+/// The newest event of each kind, for those who come late, in the order in which they get them.
 #[derive(Debug, Default)]
-struct Recent {
-    is_joined: bool,
-    health: Vec<(&'static str, Event)>,
-    keyframe: Option<Event>,
-    graph: Option<Event>,
-    frame: Option<Event>,
-    pose: Option<Event>,
-}
+struct Recent(BTreeMap<(u8, &'static str), Event>);
 
 impl Recent {
     fn keep(&mut self, event: &Event) {
-        match event {
-            Event::Joined => *self = Self { is_joined: true, ..Self::default() },
-            Event::Left => *self = Self::default(),
-            Event::Frame(_) => self.frame = Some(event.clone()),
-            Event::Pose(_) => self.pose = Some(event.clone()),
-            Event::Keyframe(_) => self.keyframe = Some(event.clone()),
-            Event::Graph(_) => self.graph = Some(event.clone()),
-            Event::Adjustment(_) => {}
-            Event::Health(process, _) => {
-                self.health.retain(|(of, _)| of != process);
-                self.health.push((process, event.clone()));
-            }
+        if matches!(event, Event::Joined | Event::Left) {
+            self.0.clear();
         }
-    }
-
-    fn events(&self) -> Vec<Event> {
-        let joined = self.is_joined.then_some(Event::Joined);
-        let health = self.health.iter().map(|(_, event)| event.clone());
-        let rest = [&self.keyframe, &self.graph, &self.frame, &self.pose];
-        joined.into_iter().chain(health).chain(rest.into_iter().flatten().cloned()).collect()
+        let place = match event {
+            Event::Joined => (0, ""),
+            Event::Health(process, _) => (1, *process),
+            Event::Keyframe(_) => (2, ""),
+            Event::Graph(_) => (3, ""),
+            Event::Frame(_) => (4, ""),
+            Event::Pose(_) => (5, ""),
+            Event::Left | Event::Adjustment(_) => return,
+        };
+        self.0.insert(place, event.clone());
     }
 }
 
