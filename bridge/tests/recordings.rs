@@ -253,7 +253,7 @@ fn a_kill_leaves_all_but_the_last_second() {
 fn a_queue_that_nobody_empties_drops_and_counts_and_does_not_wait() {
     let (sender, receiver) = queue(10 * (WIDTH * HEIGHT) as u64);
     (0..50).for_each(|sequence| assert!(sender.put(Moment::now(), frame(sequence))));
-    let counts = sender.counts().clone();
+    let counts = sender.counts.clone();
     assert_eq!(counts.dropped_images.load(std::sync::atomic::Ordering::Relaxed), 40);
     sender.put(Moment::now(), health("capture"));
     assert_eq!(counts.dropped(), 41, "there is no room for small ones either");

@@ -85,7 +85,7 @@ pub fn run(common: &CommonArguments, arguments: &RecordArguments) -> CommandResu
     let thread = std::thread::Builder::new().name("recorder".to_owned());
     let writing = thread.spawn(move || recorder.run(&receiver))?;
     let began = read(&mut session, &sender, arguments.duration, &shutdown);
-    let counts = sender.counts().clone();
+    let counts = sender.counts.clone();
     drop(sender);
     let summary = writing.join().map_err(|_| "the recorder's thread failed")?;
     let began = began?;

@@ -45,7 +45,8 @@ pub enum FileError {
 
 /// An MCAP file that is being written.
 pub struct RecordingFile {
-    path: PathBuf,
+    /// Where it is.
+    pub path: PathBuf,
     instance: String,
     writer: Writer<BufWriter<File>>,
     /// Channel of each topic, and messages in it.
@@ -53,7 +54,7 @@ pub struct RecordingFile {
     /// When the open chunk got its first message.
     chunk_began: Option<Instant>,
     /// Bytes of messages so far.
-    bytes: u64,
+    pub bytes: u64,
 }
 
 impl RecordingFile {
@@ -68,28 +69,24 @@ impl RecordingFile {
             .compression(None)
             .chunk_size(Some(CHUNK_BYTES))
             .disable_seeking(true);
-        let writer = options.create(BufWriter::new(file));
-        let writer = writer.map_err(|source| FileError::Write { path: path.to_owned(), source })?;
-        let mut file = Self {
+        let failed = |source| FileError::Write { path: path.to_owned(), source };
+        let mut writer = options.create(BufWriter::new(file)).map_err(failed)?;
+        // By it `rosbag2` knows that the quality of service is noted in numbers; first, so that a recording without end
+        // has it too.
+        let metadata = BTreeMap::from([
+            ("serialized_metadata".to_owned(), String::new()),
+            ("ROS_DISTRO".to_owned(), "humble".to_owned()),
+        ]);
+        let metadata = Metadata { name: "rosbag2".to_owned(), metadata };
+        writer.write_metadata(&metadata).map_err(failed)?;
+        Ok(Self {
             path: path.to_owned(),
             instance: instance.to_owned(),
             writer,
             channels: HashMap::new(),
             chunk_began: None,
             bytes: 0,
-        };
-        file.write_metadata()?;
-        Ok(file)
-    }
-
-    /// Where it is.
-    pub fn path(&self) -> &Path {
-        &self.path
-    }
-
-    /// Bytes of messages so far.
-    pub fn bytes(&self) -> u64 {
-        self.bytes
+        })
     }
 
     /// Messages so far, by the topic's name.
@@ -101,22 +98,8 @@ impl RecordingFile {
         FileError::Write { path: self.path.clone(), source }
     }
 
-    /// The record by which `rosbag2` knows that the quality of service is noted in numbers; first, so that a recording
-    /// without end has it too.
-    fn write_metadata(&mut self) -> Result<(), FileError> {
-        let metadata = BTreeMap::from([
-            ("serialized_metadata".to_owned(), String::new()),
-            ("ROS_DISTRO".to_owned(), "humble".to_owned()),
-        ]);
-        let metadata = Metadata { name: "rosbag2".to_owned(), metadata };
-        self.writer.write_metadata(&metadata).map_err(|source| self.failed(source))
-    }
-
-    /// The channel of a topic.
-    fn channel(&mut self, topic: &'static RosTopic) -> Result<u16, FileError> {
-        if let Some((channel, _)) = self.channels.get(topic.name) {
-            return Ok(*channel);
-        }
+    /// Makes the channel of a topic.
+    fn add_channel(&mut self, topic: &RosTopic) -> Result<u16, FileError> {
         let text = schema(topic.message_type).ok_or(FileError::Type(topic.message_type))?;
         let type_name = full_name(topic.message_type);
         let schema_id = self.writer.add_schema(&type_name, "ros2msg", text.as_bytes());
@@ -126,19 +109,18 @@ impl RecordingFile {
         notes.extend(type_hash(topic.message_type).map(|h| ("topic_type_hash".to_owned(), h)));
         let name = topic.full_name(&self.instance);
         let channel = self.writer.add_channel(schema_id, &name, "cdr", &notes);
-        let channel = channel.map_err(|source| self.failed(source))?;
-        self.channels.insert(topic.name, (channel, 0));
-        Ok(channel)
+        channel.map_err(|source| self.failed(source))
     }
 
     /// Writes a message that was read at `realtime_nanos`.
     pub fn write(&mut self, message: Encoded<'_>, realtime_nanos: i64) -> Result<(), FileError> {
-        let channel_id = self.channel(message.topic)?;
-        let count = self.channels.get_mut(message.topic.name).map(|(_, count)| count);
-        let sequence = count.map_or(0, |count| {
-            *count += 1;
-            *count
-        });
+        let topic = message.topic;
+        let (channel_id, before) = match self.channels.get(topic.name) {
+            Some(known) => *known,
+            None => (self.add_channel(topic)?, 0),
+        };
+        let sequence = before + 1;
+        self.channels.insert(topic.name, (channel_id, sequence));
         let nanos = |nanos: i64| u64::try_from(nanos).unwrap_or_default();
         let header = MessageHeader {
             channel_id,
@@ -164,13 +146,11 @@ impl RecordingFile {
 
     /// Writes what is left, and the index.
     pub fn finish(mut self) -> Result<(), FileError> {
-        let finished = self.writer.finish().map(|_| ());
-        finished.map_err(|source| self.failed(source))?;
-        let sync = || -> std::io::Result<()> {
+        let end = || -> Result<(), McapError> {
+            self.writer.finish()?;
             let file = self.writer.into_inner().into_inner().map_err(|e| e.into_error())?;
-            file.sync_all()
+            Ok(file.sync_all()?)
         };
-        let path = self.path;
-        sync().map_err(|error| FileError::Write { path, source: McapError::Io(error) })
+        end().map_err(|source| FileError::Write { path: self.path, source })
     }
 }

@@ -38,7 +38,8 @@ pub type Stamped = (Moment, Event);
 #[derive(Debug)]
 pub struct QueueSender {
     sender: SyncSender<Stamped>,
-    counts: Arc<QueueCounts>,
+    /// What came and went.
+    pub counts: Arc<QueueCounts>,
     capacity_bytes: u64,
 }
 
@@ -46,7 +47,8 @@ pub struct QueueSender {
 #[derive(Debug)]
 pub struct QueueReceiver {
     receiver: Receiver<Stamped>,
-    counts: Arc<QueueCounts>,
+    /// What came and went.
+    pub counts: Arc<QueueCounts>,
 }
 
 /// A queue with room for `capacity_bytes`.
@@ -99,11 +101,6 @@ impl QueueSender {
             }
         }
     }
-
-    /// What came and went.
-    pub fn counts(&self) -> &Arc<QueueCounts> {
-        &self.counts
-    }
 }
 
 impl QueueReceiver {
@@ -112,10 +109,5 @@ impl QueueReceiver {
         let (moment, event) = self.receiver.recv().ok()?;
         self.counts.bytes.fetch_sub(bytes_of(&event), Ordering::Relaxed);
         Some((moment, event))
-    }
-
-    /// What came and went.
-    pub fn counts(&self) -> &Arc<QueueCounts> {
-        &self.counts
     }
 }

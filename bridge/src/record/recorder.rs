@@ -103,7 +103,7 @@ impl Recorder {
     /// Writes what comes until nobody fills the queue any more.
     pub fn run(mut self, queue: &QueueReceiver) -> Result<RecordSummary, RecordError> {
         while let Some((moment, event)) = queue.take() {
-            self.write(&event, moment, queue.counts())?;
+            self.write(&event, moment, &queue.counts)?;
             self.split_if_due()?;
         }
         let Moment { realtime_nanos, .. } = Moment::now();
@@ -125,14 +125,14 @@ impl Recorder {
         // Once a second, with the pipeline's own health.
         if matches!(event, Event::Health("capture", _)) {
             let stamp = Time::from_nanos(realtime_nanos);
-            let status = own_status(&self.params.instance, stamp, counts, sink.file.bytes());
+            let status = own_status(&self.params.instance, stamp, counts, sink.file.bytes);
             self.encoder.offer(&DIAGNOSTICS, stamp, &mut sink, |_| status)?;
         }
         Ok(())
     }
 
     fn split_if_due(&mut self) -> Result<(), RecordError> {
-        let is_full = self.params.max_bytes.is_some_and(|most| self.file.bytes() >= most);
+        let is_full = self.params.max_bytes.is_some_and(|most| self.file.bytes >= most);
         let is_long = self.params.max_duration.is_some_and(|most| self.began.elapsed() >= most);
         if !is_full && !is_long {
             return Ok(());
@@ -147,8 +147,8 @@ impl Recorder {
 
     /// Adds the file to the summary.
     fn count(&mut self) {
-        self.summary.files.push(self.file.path().to_owned());
-        self.summary.bytes += self.file.bytes();
+        self.summary.files.push(self.file.path.clone());
+        self.summary.bytes += self.file.bytes;
         for (name, count) in self.file.counts() {
             *self.summary.messages.entry(name).or_default() += u64::from(count);
         }
