@@ -45,11 +45,6 @@ pub struct ClockOffset {
 }
 
 impl ClockOffset {
-    /// Forgets everything: the other clock is another one.
-    pub fn reset(&mut self) {
-        *self = Self::default();
-    }
-
     /// Takes in CLOCK_REALTIME − CLOCK_MONOTONIC of both machines.
     pub fn tell_realtime(&mut self, remote_nanos: i64, local_nanos: i64) {
         self.by_realtime_nanos = remote_nanos.saturating_sub(local_nanos);

@@ -116,11 +116,10 @@ impl std::fmt::Display for Endpoints {
 /// Opens the session. Endpoints that do not answer are tried again and again, in the background.
 pub fn open(endpoints: &Endpoints) -> Result<Session, ZenohError> {
     let config = config(endpoints)?;
-    let failed = |error: &dyn std::fmt::Display| ZenohError::Open {
-        endpoints: endpoints.to_string(),
-        reason: first_line(&error.to_string()),
-    };
-    zenoh::open(config).wait().map_err(|e| failed(&e))
+    zenoh::open(config).wait().map_err(|error| {
+        let reason = first_line(&error);
+        ZenohError::Link(format!("cannot open {endpoints}: {reason}; is the port taken (ss -ltnp), is the address one of this machine?"))
+    })
 }
 
 /// Bits of the random name of a session's program.
@@ -147,7 +146,7 @@ pub fn publisher(
 
 /// The error of a declaration.
 pub fn declare_error(key: &str, error: &dyn std::fmt::Display) -> ZenohError {
-    ZenohError::Declare { key: key.to_owned(), reason: first_line(&error.to_string()) }
+    ZenohError::Link(format!("Zenoh does not declare {key}: {}", first_line(error)))
 }
 
 fn config(endpoints: &Endpoints) -> Result<Config, ZenohError> {
@@ -194,11 +193,10 @@ fn config(endpoints: &Endpoints) -> Result<Config, ZenohError> {
     }
     let mut config = Config::default();
     for (key, value) in keys {
-        let is_secret = key.ends_with("password");
-        config.insert_json5(key, &value).map_err(|error| ZenohError::Config {
-            key,
-            value: if is_secret { "…".into() } else { value.clone() },
-            reason: first_line(&error.to_string()),
+        config.insert_json5(key, &value).map_err(|error| {
+            let shown = if key.ends_with("password") { "…" } else { &value };
+            let reason = first_line(&error);
+            ZenohError::Link(format!("Zenoh does not take {key} = {shown}: {reason}"))
         })?;
     }
     Ok(config)
@@ -209,9 +207,11 @@ fn read_password(path: &Path) -> Result<(String, String), ZenohError> {
     use std::os::unix::fs::PermissionsExt;
     /// Permissions of the group and of all others.
     const OF_OTHERS: u32 = 0o077;
-    let wrong = |reason: &str| ZenohError::Password {
-        path: path.display().to_string(),
-        reason: reason.to_owned(),
+    let wrong = |reason: &str| {
+        let path = path.display();
+        ZenohError::Link(format!(
+            "{path}: {reason}; the file has one line `user:password` and is read by its owner alone (chmod 600)"
+        ))
     };
     let found = std::fs::metadata(path).map_err(|error| wrong(&error.to_string()))?;
     if found.permissions().mode() & OF_OTHERS != 0 {
@@ -229,7 +229,8 @@ fn read_password(path: &Path) -> Result<(String, String), ZenohError> {
 }
 
 /// Zenoh's errors name their place in its source behind the reason.
-fn first_line(text: &str) -> String {
+fn first_line(error: &dyn std::fmt::Display) -> String {
+    let text = error.to_string();
     let line = text.lines().next().unwrap_or_default();
     line.split(" at /").next().unwrap_or(line).to_owned()
 }

@@ -130,7 +130,7 @@ impl Remote {
         self.sender = Some(sender);
         (self.run, self.is_joined) = (0, None);
         self.received = [0; Kind::COUNT];
-        self.clock.reset();
+        self.clock = ClockOffset::default();
     }
 }
 
