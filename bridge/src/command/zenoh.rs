@@ -9,7 +9,7 @@ use semidense::wire::place::Place;
 
 use crate::command::{CommandResult, CommonArguments, note, number_within};
 use crate::zenoh::link::{Endpoint, Endpoints};
-use crate::zenoh::receiver::{ReceiveOptions, receive};
+use crate::zenoh::receiver::receive;
 use crate::zenoh::sender::{FrameOptions, SendOptions, send};
 
 /// Send to another machine, or receive there, over Zenoh
@@ -118,13 +118,11 @@ fn run_receive(common: &CommonArguments, arguments: &ReceiveArguments) -> Comman
     let named = common.instance.clone();
     let instance = arguments.local.clone().or(named).unwrap_or_else(|| arguments.from.clone());
     let place = CommonArguments { instance: Some(instance), ..common.clone() }.place()?;
-    let options =
-        ReceiveOptions { endpoints: arguments.endpoints.clone(), from: arguments.from.clone() };
-    warn_of_open_port(&options.endpoints);
+    let ReceiveArguments { endpoints, from, .. } = arguments;
+    warn_of_open_port(endpoints);
     let shutdown = Shutdown::install()?;
-    let (from, local) = (&options.from, &place.instance);
-    note(&format!("receiving `{from}` from {} as instance `{local}`", options.endpoints));
-    let outcome = receive(&place, &options, &shutdown);
+    note(&format!("receiving `{from}` from {endpoints} as instance `{}`", place.instance));
+    let outcome = receive(&place, endpoints, from, &shutdown);
     tidy_up(&place);
     outcome?;
     Ok(ExitCode::SUCCESS)

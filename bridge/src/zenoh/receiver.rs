@@ -28,40 +28,33 @@ const WAKE_PERIOD: Duration = Duration::from_millis(100);
 /// Time between two lines of the log.
 const TELL_PERIOD: Duration = Duration::from_secs(10);
 
-/// What is received from where.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct ReceiveOptions {
-    /// Links.
-    pub endpoints: Endpoints,
-    /// Name of the instance on the robot.
-    pub from: String,
-}
-
-/// Receives until the signal, and publishes as the instance at `place`. Waits for a robot that is not there yet.
+/// Receives the instance `from` of the robot until the signal, and publishes as the instance at `place`. Waits for a robot
+/// that is not there yet.
 pub fn receive(
     place: &Place,
-    options: &ReceiveOptions,
+    endpoints: &Endpoints,
+    from: &str,
     shutdown: &Shutdown,
 ) -> Result<(), ZenohError> {
     let mut mirror = Mirror::open(place)?;
-    let network = open_network(&options.endpoints)?;
+    let network = open_network(endpoints)?;
     let (woken, wake) = UnixStream::pair()?;
     woken.set_nonblocking(true)?;
     wake.set_nonblocking(true)?;
     let shared = Arc::new(Shared::new(wake));
-    subscribe(&network, &options.from, &shared)?;
+    subscribe(&network, from, &shared)?;
     let outcome = std::thread::scope(|scope| {
         let named = |name: &str| std::thread::Builder::new().name(name.to_owned());
         let (running, stop) = channel::<()>();
-        let (to_unpack, to_ask) = (Arc::clone(&shared), Arc::clone(&shared));
-        let (network, from) = (&network, options.from.as_str());
+        let (network, shared) = (&network, &*shared);
         let started =
-            named("unpack").spawn_scoped(scope, move || to_unpack.unpack_large()).and_then(|_| {
-                named("ask").spawn_scoped(scope, move || poll(network, from, &to_ask, &stop))
+            named("unpack").spawn_scoped(scope, move || shared.unpack_large()).and_then(|_| {
+                named("ask").spawn_scoped(scope, move || poll(network, from, shared, &stop))
             });
+        let silence = |now| shared.remote().silence(from, &endpoints.to_string(), now);
         let outcome = started
             .map_err(ZenohError::from)
-            .and_then(|_| publish(&mut mirror, options, &shared, &woken, shutdown));
+            .and_then(|_| publish(&mut mirror, shared, silence, &woken, shutdown));
         shared.large.close();
         drop(running);
         outcome
@@ -86,12 +79,11 @@ fn subscribe(network: &Session, instance: &str, shared: &Arc<Shared>) -> Result<
 
 fn publish(
     mirror: &mut Mirror,
-    options: &ReceiveOptions,
     shared: &Shared,
+    silence: impl Fn(Instant) -> Option<String>,
     mut woken: &UnixStream,
     shutdown: &Shutdown,
 ) -> Result<(), ZenohError> {
-    let endpoints = options.endpoints.to_string();
     let mut told = Instant::now();
     while !shutdown.is_requested() {
         wait(&[], [shutdown.descriptor(), woken.as_fd()], WAKE_PERIOD)?;
@@ -107,8 +99,7 @@ fn publish(
                 mirror.publish(&arrival)?;
             }
         }
-        let silence = shared.remote().silence(&options.from, &endpoints, Instant::now());
-        if let Some(cause) = silence {
+        if let Some(cause) = silence(Instant::now()) {
             mirror.tell_silence(&cause)?;
         }
         if told.elapsed() >= TELL_PERIOD {
