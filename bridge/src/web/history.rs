@@ -5,15 +5,13 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use semidense::slam::keyframe::Keyframe;
+use semidense::slam::keyframe::{DepthPoint, Keyframe};
 use semidense::wire::command::{Command, CommandClient, CommandError};
 use semidense::wire::conversion::keyframe_from_messages;
 use semidense::wire::message::{KeyframeHeader, KeyframeImageHeader};
 use semidense::wire::place::Place;
 use semidense::wire::port::{Access, Hub, OpenError, Subscriber};
 use semidense::wire::topic::{EARLIER_KEYFRAME, EARLIER_KEYFRAME_IMAGE};
-
-use semidense::slam::keyframe::DepthPoint;
 
 use crate::web::scene::Scene;
 
@@ -120,12 +118,9 @@ impl Asking {
         let (depth, image) =
             (self.depths.newest().map_err(failed)?, self.images.newest().map_err(failed)?);
         let (Some(depth), Some(image)) = (depth, image) else { return Ok(None) };
-        let keyframe = keyframe_from_messages(
-            depth.header(),
-            depth.payload(),
-            image.header(),
-            image.payload(),
-        );
+        let (header, image_header) = (depth.header(), image.header());
+        let keyframe =
+            keyframe_from_messages(header, depth.payload(), image_header, image.payload());
         Ok(keyframe.ok().filter(|keyframe| keyframe.keyframe_id == keyframe_id))
     }
 }

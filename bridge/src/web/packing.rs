@@ -63,18 +63,16 @@ impl Packed {
     }
 
     /// How many points it has.
-    pub fn len(&self) -> usize {
+    pub fn num_points(&self) -> usize {
         self.points.len() / POINT_BYTES
-    }
-
-    /// Whether it has none.
-    pub fn is_empty(&self) -> bool {
-        self.points.is_empty()
     }
 
     /// An even sample of at most `most` points.
     pub fn thinned(&self, most: usize) -> Self {
-        Self { points: self.points[..most.min(self.len()) * POINT_BYTES].into(), ..self.clone() }
+        Self {
+            points: self.points[..most.min(self.num_points()) * POINT_BYTES].into(),
+            ..self.clone()
+        }
     }
 }
 
@@ -99,7 +97,7 @@ mod tests {
     #[test]
     fn inverse_depth_survives_to_a_part_in_65535_of_the_nearest() {
         let packed = Packed::of(&keyframe(&[0.5, 2.0, f32::NAN, 0.0, -1.0, 1e-9]));
-        assert_eq!(packed.len(), 3, "what is no depth is left out");
+        assert_eq!(packed.num_points(), 3, "what is no depth is left out");
         let step = packed.header["depthStep"].as_f64().unwrap();
         for point in packed.points.chunks_exact(POINT_BYTES) {
             let number = |at: usize| u16::from_le_bytes([point[at], point[at + 1]]);
@@ -107,7 +105,7 @@ mod tests {
             assert!((f64::from(number(4)) * step - truth).abs() <= step, "{point:?}");
             assert_eq!((number(2), point[6]), (3, 255));
         }
-        assert_eq!((packed.thinned(2).len(), packed.thinned(9).len()), (2, 3));
-        assert!(Packed::of(&keyframe(&[])).is_empty());
+        assert_eq!((packed.thinned(2).num_points(), packed.thinned(9).num_points()), (2, 3));
+        assert_eq!(Packed::of(&keyframe(&[])).num_points(), 0);
     }
 }

@@ -62,13 +62,8 @@ impl Path {
     }
 
     /// How many poses it has.
-    pub fn len(&self) -> usize {
+    pub fn num_poses(&self) -> usize {
         self.poses.len()
-    }
-
-    /// Whether it has none.
-    pub fn is_empty(&self) -> bool {
-        self.poses.is_empty()
     }
 
     /// The poses from number `from` on: seconds f64, position f32 x 3, keyframe, epoch and state u32.

@@ -236,12 +236,12 @@ impl Sent {
         }
         let (generation, length) = self.path;
         let is_void = generation != state.path.generation;
-        if (is_void || length != state.path.len()) && is_due(self.path_at, PATH_PERIOD) {
+        if (is_void || length != state.path.num_poses()) && is_due(self.path_at, PATH_PERIOD) {
             let from = if is_void { 0 } else { length };
             let header = json!({ "kind": "path", "from": from });
             out.push(Outgoing::Bytes(header, state.path.bytes_from(from)));
             (self.path, self.path_at) =
-                ((state.path.generation, state.path.len()), Some(Instant::now()));
+                ((state.path.generation, state.path.num_poses()), Some(Instant::now()));
         }
     }
 
