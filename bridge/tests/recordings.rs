@@ -36,7 +36,7 @@ fn record(params: RecordParams, events: Vec<Event>) -> RecordSummary {
     let recorder = Recorder::create(params).unwrap();
     let (sender, receiver) = queue(1 << 30);
     events.into_iter().for_each(|event| assert!(sender.put(Moment::now(), event)));
-    assert_eq!(sender.counts().dropped(), 0);
+    assert_eq!(sender.counts.dropped(), 0);
     drop(sender);
     recorder.run(&receiver).unwrap()
 }

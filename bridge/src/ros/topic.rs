@@ -55,19 +55,12 @@ impl RosTopic {
     }
 }
 
-/// The namespace of an instance's topics.
+/// The namespace of an instance's topics: ROS allows letters, digits and `_`, and no digit first.
 pub fn namespace(instance: &str) -> String {
-    format!("/{}", name_part(instance))
-}
-
-/// An instance's name as a part of a topic's: ROS allows letters, digits and `_`, and no digit first.
-fn name_part(instance: &str) -> String {
     let allowed = |c: char| if c.is_ascii_alphanumeric() { c } else { '_' };
-    let mut name: String = instance.chars().map(allowed).collect();
-    if !name.starts_with(|c: char| c.is_ascii_alphabetic()) {
-        name.insert_str(0, "rig_");
-    }
-    name
+    let name: String = instance.chars().map(allowed).collect();
+    let is_whole = name.starts_with(|c: char| c.is_ascii_alphabetic());
+    format!("/{}{name}", if is_whole { "" } else { "rig_" })
 }
 
 const fn sensor<T: RosMessage>(name: &'static str, depth: usize) -> RosTopic {
