@@ -8,6 +8,7 @@ pub mod feed;
 pub mod foxglove;
 pub mod jpeg;
 pub mod keyframe_pace;
+pub mod last_time;
 pub mod record;
 pub mod ros;
 #[cfg(feature = "ros2")]

@@ -10,6 +10,7 @@ use ros2_client::dds::Publisher;
 use semidense::service::clock::now_nanos;
 use semidense::slam::keyframe::Keyframe;
 
+use crate::last_time::LastTime;
 use crate::ros::axes::{ros_from_world, transform_message};
 use crate::ros::converter::{Converter, PoseMessages};
 use crate::ros::diagnostics::{figure, report};
@@ -152,26 +153,24 @@ impl Publishers {
             keyframe: None,
             keyframe_is_new: false,
             points_readers: 0,
-            image_sent: None,
-            points_sent: None,
+            image_sent: LastTime::default(),
+            points_sent: LastTime::default(),
             graph: None,
-            graph_sent: None,
+            graph_sent: LastTime::default(),
         }
     }
 
     /// Publishes until the outbox is closed.
     pub fn run(mut self) {
-        let (mut looked, mut reported) = (None::<Instant>, Instant::now());
+        let (mut looked, mut reported) = (LastTime::default(), LastTime::now());
         while let Ok(message) = self.outbox.take_within(WAIT) {
             if let Some(message) = message {
                 self.publish(message);
             }
-            if looked.is_none_or(|looked| looked.elapsed() >= READERS_PERIOD) {
-                looked = Some(Instant::now());
+            if looked.is_due(READERS_PERIOD) {
                 self.look_for_readers();
             }
-            if reported.elapsed() >= REPORT_PERIOD {
-                reported = Instant::now();
+            if reported.is_due(REPORT_PERIOD) {
                 let report = self.report();
                 self.publish(Outgoing::Diagnostics(Box::new(report)));
             }
@@ -266,22 +265,17 @@ pub struct Reader {
     keyframe: Option<Arc<Keyframe>>,
     keyframe_is_new: bool,
     points_readers: u64,
-    image_sent: Option<Instant>,
-    points_sent: Option<Instant>,
+    image_sent: LastTime,
+    points_sent: LastTime,
     /// The newest graph, until it is sent.
     graph: Option<Arc<Graph>>,
-    graph_sent: Option<Instant>,
+    graph_sent: LastTime,
 }
 
 impl Drop for Reader {
     fn drop(&mut self) {
         self.outbox.close();
     }
-}
-
-/// Whether something that is sent at most once in `period` is due.
-fn is_due(sent: Option<Instant>, period: Duration) -> bool {
-    sent.is_none_or(|sent| sent.elapsed() >= period)
 }
 
 impl Reader {
@@ -316,8 +310,7 @@ impl Reader {
             Event::Frame(frame) => {
                 let has_readers = self.demand.images.load(Ordering::Relaxed) > 0;
                 let Some(period) = self.params.image_period.filter(|_| has_readers) else { return };
-                if is_due(self.image_sent, period) {
-                    self.image_sent = Some(Instant::now());
+                if self.image_sent.is_due(period) {
                     let pair = (self.converter.image(frame), self.converter.camera_info(frame));
                     self.outbox.put(slot::IMAGE, Outgoing::Image(Box::new(pair)));
                 }
@@ -347,8 +340,7 @@ impl Reader {
         let (Some(period), Some(keyframe)) = (self.params.points_period, &self.keyframe) else {
             return;
         };
-        if readers > 0 && self.keyframe_is_new && is_due(self.points_sent, period) {
-            self.points_sent = Some(Instant::now());
+        if readers > 0 && self.keyframe_is_new && self.points_sent.is_due(period) {
             self.keyframe_is_new = false;
             let points = self.converter.points(keyframe);
             self.outbox.put(slot::POINTS, Outgoing::Points(Box::new(points)));
@@ -357,11 +349,7 @@ impl Reader {
 
     /// The newest graph, at most once a second.
     fn put_graph_if_due(&mut self) {
-        if !is_due(self.graph_sent, REPORT_PERIOD) {
-            return;
-        }
-        if let Some(graph) = self.graph.take() {
-            self.graph_sent = Some(Instant::now());
+        if let Some(graph) = self.graph.take_if(|_| self.graph_sent.is_due(REPORT_PERIOD)) {
             let keyframes = self.converter.keyframes(&graph, Time::from_nanos(realtime_nanos()));
             self.outbox.put(slot::KEYFRAMES, Outgoing::Keyframes(Box::new(keyframes)));
         }

@@ -14,6 +14,7 @@ use serde::Deserialize;
 use serde_json::{Value, json};
 use tungstenite::{Error, Message, WebSocket};
 
+use crate::last_time::LastTime;
 use crate::ros::images::jpeg;
 use crate::web::packing::Packed;
 use crate::web::scene::{NewestFrame, Scene, State};
@@ -182,21 +183,16 @@ struct Sent {
     pose: u64,
     reports: u64,
     placed: u64,
-    placed_at: Option<Instant>,
+    placed_at: LastTime,
     path: (u64, usize),
-    path_at: Option<Instant>,
+    path_at: LastTime,
     frame: u64,
-    frame_at: Option<Instant>,
+    frame_at: LastTime,
     /// Revision of each keyframe, and when it was sent.
     keyframes: HashMap<u64, (u64, Instant)>,
     unanswered: usize,
     shows_frames: bool,
     has_more: bool,
-}
-
-/// Whether something that was last done at `at` may be done again.
-fn is_due(at: Option<Instant>, period: Duration) -> bool {
-    at.is_none_or(|at| at.elapsed() >= period)
 }
 
 impl Sent {
@@ -230,27 +226,26 @@ impl Sent {
     }
 
     fn collect_places(&mut self, state: &State, out: &mut Vec<Outgoing>) {
-        if self.placed != state.placed && is_due(self.placed_at, PLACES_PERIOD) {
-            (self.placed, self.placed_at) = (state.placed, Some(Instant::now()));
+        if self.placed != state.placed && self.placed_at.is_due(PLACES_PERIOD) {
+            self.placed = state.placed;
             out.push(Outgoing::Bytes(json!({ "kind": "places" }), state.places_bytes()));
         }
         let (generation, length) = self.path;
         let is_void = generation != state.path.generation;
-        if (is_void || length != state.path.num_poses()) && is_due(self.path_at, PATH_PERIOD) {
+        if (is_void || length != state.path.num_poses()) && self.path_at.is_due(PATH_PERIOD) {
             let from = if is_void { 0 } else { length };
             let header = json!({ "kind": "path", "from": from });
             out.push(Outgoing::Bytes(header, state.path.bytes_from(from)));
-            (self.path, self.path_at) =
-                ((state.path.generation, state.path.num_poses()), Some(Instant::now()));
+            self.path = (state.path.generation, state.path.num_poses());
         }
     }
 
     fn collect_frame(&mut self, state: &State, options: &StreamOptions, out: &mut Vec<Outgoing>) {
         let Some(newest) = &state.frame else { return };
         let period = Duration::from_secs_f64(1.0 / options.image_rate_hz);
-        let is_new = newest.number != self.frame && is_due(self.frame_at, period);
-        if self.shows_frames && is_new && self.unanswered < MAX_UNANSWERED {
-            (self.frame, self.frame_at) = (newest.number, Some(Instant::now()));
+        let is_new = newest.number != self.frame && self.unanswered < MAX_UNANSWERED;
+        if self.shows_frames && is_new && self.frame_at.is_due(period) {
+            self.frame = newest.number;
             self.unanswered += 1;
             out.push(Outgoing::Frame(newest.clone()));
         }

@@ -15,6 +15,7 @@ use semidense::wire::place::Place;
 use semidense::wire::port::wait;
 use zenoh::{Session, Wait};
 
+use crate::last_time::LastTime;
 use crate::zenoh::error::ZenohError;
 use crate::zenoh::kind::Kind;
 use crate::zenoh::link::{Endpoints, declare_error, open as open_network};
@@ -84,7 +85,7 @@ fn publish(
     mut woken: &UnixStream,
     shutdown: &Shutdown,
 ) -> Result<(), ZenohError> {
-    let mut told = Instant::now();
+    let mut told = LastTime::now();
     while !shutdown.is_requested() {
         wait(&[], [shutdown.descriptor(), woken.as_fd()], WAKE_PERIOD)?;
         let mut bytes = [0; 64];
@@ -102,8 +103,7 @@ fn publish(
         if let Some(cause) = silence(Instant::now()) {
             mirror.tell_silence(&cause)?;
         }
-        if told.elapsed() >= TELL_PERIOD {
-            told = Instant::now();
+        if told.is_due(TELL_PERIOD) {
             tell(shared);
         }
     }
