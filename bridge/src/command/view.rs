@@ -102,7 +102,7 @@ pub fn run(common: &CommonArguments, arguments: &ViewArguments) -> CommandResult
     let server = Server::open(arguments.listen, guard, shown)?;
     say(&server, arguments, token.as_deref());
     server.start()?;
-    let Shown::Live { feed, scene, .. } = server.shown() else {
+    let Shown::Live { feed, scene, .. } = &server.shown else {
         wait_for_end(&shutdown, || None)?;
         return Ok(ExitCode::SUCCESS);
     };
@@ -113,10 +113,10 @@ pub fn run(common: &CommonArguments, arguments: &ViewArguments) -> CommandResult
     })?;
     start("history", {
         let (server, scene, place) = (Arc::clone(&server), Arc::clone(scene), common.place()?);
-        move || follow(&place, &scene, server.is_over())
+        move || follow(&place, &scene, &server.is_over)
     })?;
     let failure = wait_for_end(&shutdown, || feed.failure())?;
-    server.is_over().store(true, std::sync::atomic::Ordering::Relaxed);
+    server.is_over.store(true, std::sync::atomic::Ordering::Relaxed);
     match failure {
         Some(failure) => Err(failure.into()),
         None => Ok(ExitCode::SUCCESS),
@@ -183,7 +183,7 @@ fn own_address() -> Option<IpAddr> {
 
 /// Prints the addresses to open, on standard output: a script may read it.
 fn say(server: &Server, arguments: &ViewArguments, token: Option<&str>) {
-    let address = server.address();
+    let address = server.address;
     let shown: Vec<String> = match address.ip() {
         // It stands for all addresses: the name is one that others can open, the number where names are not looked up.
         ip if ip.is_unspecified() => {

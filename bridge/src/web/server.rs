@@ -91,12 +91,15 @@ pub enum ServerError {
 #[derive(Debug)]
 pub struct Server {
     listener: TcpListener,
-    address: SocketAddr,
+    /// Where it listens.
+    pub address: SocketAddr,
     guard: Guard,
-    shown: Shown,
+    /// What is shown.
+    pub shown: Shown,
     connections: Seats,
     foxglove_clients: Seats,
-    is_over: AtomicBool,
+    /// Becomes true when everything shall end.
+    pub is_over: AtomicBool,
 }
 
 impl Server {
@@ -114,21 +117,6 @@ impl Server {
             foxglove_clients: Seats::default(),
             is_over: AtomicBool::new(false),
         }))
-    }
-
-    /// Where it listens.
-    pub fn address(&self) -> SocketAddr {
-        self.address
-    }
-
-    /// What is shown.
-    pub fn shown(&self) -> &Shown {
-        &self.shown
-    }
-
-    /// Becomes true when everything shall end.
-    pub fn is_over(&self) -> &AtomicBool {
-        &self.is_over
     }
 
     /// Takes connections on a thread of its own, for as long as the process lives.
