@@ -10,7 +10,7 @@ use mcap::records::{MessageHeader, Metadata};
 use mcap::{McapError, WriteOptions, Writer};
 
 use crate::record::qos::offered_qos_profiles;
-use crate::ros::encoder::Encoded;
+use crate::ros::encoder::{EncodeError, Encoded};
 use crate::ros::schema::{full_name, schema, type_hash};
 use crate::ros::topic::RosTopic;
 
@@ -19,9 +19,9 @@ const CHUNK_PERIOD: Duration = Duration::from_secs(1);
 /// Or when it has so many bytes: memory, and what a reader must load for one message.
 const CHUNK_BYTES: u64 = 4 << 20;
 
-/// Why a recording cannot be written.
+/// Why recording ended early.
 #[derive(Debug, thiserror::Error)]
-pub enum FileError {
+pub enum RecordError {
     /// The file exists, or cannot be made.
     #[error("{}: cannot be made: {source}; name another file with --output", path.display())]
     Create {
@@ -41,6 +41,9 @@ pub enum FileError {
     /// A topic without a definition.
     #[error("the type {0} has no definition")]
     Type(&'static str),
+    /// A message.
+    #[error(transparent)]
+    Encode(#[from] EncodeError),
 }
 
 /// An MCAP file that is being written.
@@ -59,8 +62,8 @@ pub struct RecordingFile {
 
 impl RecordingFile {
     /// Makes a new file; one that exists is not touched.
-    pub fn create(path: &Path, instance: &str) -> Result<Self, FileError> {
-        let create = |source| FileError::Create { path: path.to_owned(), source };
+    pub fn create(path: &Path, instance: &str) -> Result<Self, RecordError> {
+        let create = |source| RecordError::Create { path: path.to_owned(), source };
         let file = File::options().write(true).create_new(true).open(path).map_err(create)?;
         // Chunks are gathered in memory: a length that is filled in later would be missing after a kill.
         let options = WriteOptions::new()
@@ -69,7 +72,7 @@ impl RecordingFile {
             .compression(None)
             .chunk_size(Some(CHUNK_BYTES))
             .disable_seeking(true);
-        let failed = |source| FileError::Write { path: path.to_owned(), source };
+        let failed = |source| RecordError::Write { path: path.to_owned(), source };
         let mut writer = options.create(BufWriter::new(file)).map_err(failed)?;
         // By it `rosbag2` knows that the quality of service is noted in numbers; first, so that a recording without end
         // has it too.
@@ -94,13 +97,13 @@ impl RecordingFile {
         self.channels.iter().map(|(name, (_, count))| (*name, *count))
     }
 
-    fn failed(&self, source: McapError) -> FileError {
-        FileError::Write { path: self.path.clone(), source }
+    fn failed(&self, source: McapError) -> RecordError {
+        RecordError::Write { path: self.path.clone(), source }
     }
 
     /// Makes the channel of a topic.
-    fn add_channel(&mut self, topic: &RosTopic) -> Result<u16, FileError> {
-        let text = schema(topic.message_type).ok_or(FileError::Type(topic.message_type))?;
+    fn add_channel(&mut self, topic: &RosTopic) -> Result<u16, RecordError> {
+        let text = schema(topic.message_type).ok_or(RecordError::Type(topic.message_type))?;
         let type_name = full_name(topic.message_type);
         let schema_id = self.writer.add_schema(&type_name, "ros2msg", text.as_bytes());
         let schema_id = schema_id.map_err(|source| self.failed(source))?;
@@ -113,7 +116,7 @@ impl RecordingFile {
     }
 
     /// Writes a message that was read at `realtime_nanos`.
-    pub fn write(&mut self, message: Encoded<'_>, realtime_nanos: i64) -> Result<(), FileError> {
+    pub fn write(&mut self, message: Encoded<'_>, realtime_nanos: i64) -> Result<(), RecordError> {
         let topic = message.topic;
         let (channel_id, before) = match self.channels.get(topic.name) {
             Some(known) => *known,
@@ -135,7 +138,7 @@ impl RecordingFile {
     }
 
     /// Writes the open chunk where it is old enough.
-    pub fn write_old_chunk(&mut self) -> Result<(), FileError> {
+    pub fn write_old_chunk(&mut self) -> Result<(), RecordError> {
         let began = *self.chunk_began.get_or_insert_with(Instant::now);
         if began.elapsed() < CHUNK_PERIOD {
             return Ok(());
@@ -145,12 +148,12 @@ impl RecordingFile {
     }
 
     /// Writes what is left, and the index.
-    pub fn finish(mut self) -> Result<(), FileError> {
+    pub fn finish(mut self) -> Result<(), RecordError> {
         let end = || -> Result<(), McapError> {
             self.writer.finish()?;
             let file = self.writer.into_inner().into_inner().map_err(|e| e.into_error())?;
             Ok(file.sync_all()?)
         };
-        end().map_err(|source| FileError::Write { path: self.path, source })
+        end().map_err(|source| RecordError::Write { path: self.path, source })
     }
 }

@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use crate::record::file::{FileError, RecordingFile};
+use crate::record::file::{RecordError, RecordingFile};
 use crate::record::queue::{QueueCounts, QueueReceiver};
 use crate::ros::diagnostics::{figure, report};
-use crate::ros::encoder::{EncodeError, Encoded, EventEncoder, Moment, Sink};
+use crate::ros::encoder::{Encoded, EventEncoder, Moment, Sink};
 use crate::ros::images::ImageFormat;
 use crate::ros::message::{DiagnosticArray, Time};
 use crate::ros::topic::{DIAGNOSTICS, RosTopic};
@@ -26,17 +26,6 @@ pub struct RecordParams {
     pub max_bytes: Option<u64>,
     /// A new file is begun when one is so long.
     pub max_duration: Option<Duration>,
-}
-
-/// Why recording ended early.
-#[derive(Debug, thiserror::Error)]
-pub enum RecordError {
-    /// The file.
-    #[error(transparent)]
-    File(#[from] FileError),
-    /// A message.
-    #[error(transparent)]
-    Encode(#[from] EncodeError),
 }
 
 /// What was recorded.
@@ -87,7 +76,7 @@ impl Sink for FileSink<'_> {
     }
 
     fn put(&mut self, message: Encoded<'_>) -> Result<(), RecordError> {
-        Ok(self.file.write(message, self.realtime_nanos)?)
+        self.file.write(message, self.realtime_nanos)
     }
 }
 
