@@ -121,11 +121,10 @@ struct Client {
     graph: Option<Arc<Graph>>,
 }
 
-/// A client as a sink of the messages of one moment.
+/// A client as a sink of messages.
 struct ClientSink<'a> {
     socket: &'a mut WebSocket<TcpStream>,
     subscriptions: &'a Subscriptions,
-    realtime_nanos: i64,
     /// The only channel that is wanted, where it is one.
     only: Option<usize>,
 }
@@ -147,7 +146,7 @@ impl Sink for ClientSink<'_> {
     fn put(&mut self, message: Encoded<'_>) -> Result<(), FoxgloveError> {
         let Some(channel) = channel(message.topic) else { return Ok(()) };
         for subscription in self.subscriptions.of(channel) {
-            let frame = message_frame(subscription, self.realtime_nanos, message.bytes);
+            let frame = message_frame(subscription, message.read_nanos, message.bytes);
             self.socket.send(Message::binary(frame)).map_err(Box::new)?;
         }
         Ok(())
@@ -199,11 +198,9 @@ impl Client {
             Event::Joined => (self.keyframe, self.graph) = (None, None),
             _ => {}
         }
-        let now = Moment::now();
         let (socket, subscriptions) = (&mut self.socket, &self.subscriptions);
-        let realtime_nanos = now.realtime_nanos;
-        let mut sink = ClientSink { socket, subscriptions, realtime_nanos, only: None };
-        self.encoder.put(event, now, &mut sink)
+        let mut sink = ClientSink { socket, subscriptions, only: None };
+        self.encoder.put(event, Moment::now(), &mut sink)
     }
 
     /// Does what the client asks for; what cannot be done is told to it.
@@ -229,16 +226,9 @@ impl Client {
 
     /// Sends the last keyframe and graph on a channel that was just subscribed to.
     fn send_last(&mut self, channel: usize) -> Result<(), FoxgloveError> {
-        let Moment { realtime_nanos, .. } = Moment::now();
         let (socket, subscriptions) = (&mut self.socket, &self.subscriptions);
-        let only = Some(channel);
-        let mut sink = ClientSink { socket, subscriptions, realtime_nanos, only };
-        if let Some(keyframe) = &self.keyframe {
-            self.encoder.put_keyframe(keyframe, &mut sink)?;
-        }
-        if let Some(graph) = &self.graph {
-            self.encoder.put_graph(graph, realtime_nanos, &mut sink)?;
-        }
-        Ok(())
+        let mut sink = ClientSink { socket, subscriptions, only: Some(channel) };
+        let (keyframe, graph) = (self.keyframe.as_deref(), self.graph.as_deref());
+        self.encoder.put_last(keyframe, graph, &mut sink)
     }
 }

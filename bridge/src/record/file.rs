@@ -10,7 +10,7 @@ use mcap::records::{MessageHeader, Metadata};
 use mcap::{McapError, WriteOptions, Writer};
 
 use crate::record::qos::offered_qos_profiles;
-use crate::ros::encoder::{EncodeError, Encoded};
+use crate::ros::encoder::{EncodeError, Encoded, Sink};
 use crate::ros::schema::{full_name, schema, type_hash};
 use crate::ros::topic::RosTopic;
 
@@ -115,30 +115,8 @@ impl RecordingFile {
         channel.map_err(|source| self.failed(source))
     }
 
-    /// Writes a message that was read at `realtime_nanos`.
-    pub fn write(&mut self, message: Encoded<'_>, realtime_nanos: i64) -> Result<(), RecordError> {
-        let topic = message.topic;
-        let (channel_id, before) = match self.channels.get(topic.name) {
-            Some(known) => *known,
-            None => (self.add_channel(topic)?, 0),
-        };
-        let sequence = before + 1;
-        self.channels.insert(topic.name, (channel_id, sequence));
-        let nanos = |nanos: i64| u64::try_from(nanos).unwrap_or_default();
-        let header = MessageHeader {
-            channel_id,
-            sequence,
-            log_time: nanos(realtime_nanos),
-            publish_time: nanos(message.stamp.nanos()),
-        };
-        let written = self.writer.write_to_known_channel(&header, message.bytes);
-        written.map_err(|source| self.failed(source))?;
-        self.bytes += message.bytes.len() as u64;
-        self.write_old_chunk()
-    }
-
     /// Writes the open chunk where it is old enough.
-    pub fn write_old_chunk(&mut self) -> Result<(), RecordError> {
+    fn write_old_chunk(&mut self) -> Result<(), RecordError> {
         let began = *self.chunk_began.get_or_insert_with(Instant::now);
         if began.elapsed() < CHUNK_PERIOD {
             return Ok(());
@@ -155,5 +133,34 @@ impl RecordingFile {
             Ok(file.sync_all()?)
         };
         end().map_err(|source| RecordError::Write { path: self.path, source })
+    }
+}
+
+impl Sink for RecordingFile {
+    type Error = RecordError;
+
+    fn wants(&self, _topic: &'static RosTopic) -> bool {
+        true
+    }
+
+    fn put(&mut self, message: Encoded<'_>) -> Result<(), RecordError> {
+        let topic = message.topic;
+        let (channel_id, before) = match self.channels.get(topic.name) {
+            Some(known) => *known,
+            None => (self.add_channel(topic)?, 0),
+        };
+        let sequence = before + 1;
+        self.channels.insert(topic.name, (channel_id, sequence));
+        let nanos = |nanos: i64| u64::try_from(nanos).unwrap_or_default();
+        let header = MessageHeader {
+            channel_id,
+            sequence,
+            log_time: nanos(message.read_nanos),
+            publish_time: nanos(message.stamp.nanos()),
+        };
+        let written = self.writer.write_to_known_channel(&header, message.bytes);
+        written.map_err(|source| self.failed(source))?;
+        self.bytes += message.bytes.len() as u64;
+        self.write_old_chunk()
     }
 }

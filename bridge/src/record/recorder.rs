@@ -7,10 +7,10 @@ use std::time::{Duration, Instant};
 use crate::record::file::{RecordError, RecordingFile};
 use crate::record::queue::{QueueCounts, QueueReceiver};
 use crate::ros::diagnostics::{figure, report};
-use crate::ros::encoder::{Encoded, EventEncoder, Moment, Sink};
+use crate::ros::encoder::{EventEncoder, Moment};
 use crate::ros::images::ImageFormat;
 use crate::ros::message::{DiagnosticArray, Time};
-use crate::ros::topic::{DIAGNOSTICS, RosTopic};
+use crate::ros::topic::DIAGNOSTICS;
 use crate::session::Event;
 
 /// What is recorded, and where.
@@ -62,24 +62,6 @@ fn numbered(path: &Path, number: usize) -> PathBuf {
     path.with_file_name(name)
 }
 
-/// A file as a sink of messages that were read at one moment.
-struct FileSink<'a> {
-    file: &'a mut RecordingFile,
-    realtime_nanos: i64,
-}
-
-impl Sink for FileSink<'_> {
-    type Error = RecordError;
-
-    fn wants(&self, _topic: &'static RosTopic) -> bool {
-        true
-    }
-
-    fn put(&mut self, message: Encoded<'_>) -> Result<(), RecordError> {
-        self.file.write(message, self.realtime_nanos)
-    }
-}
-
 impl Recorder {
     /// Makes the file.
     pub fn create(params: RecordParams) -> Result<Self, RecordError> {
@@ -95,8 +77,7 @@ impl Recorder {
             self.write(&event, moment, &queue.counts)?;
             self.split_if_due()?;
         }
-        let Moment { realtime_nanos, .. } = Moment::now();
-        self.encoder.finish(&mut FileSink { file: &mut self.file, realtime_nanos })?;
+        self.encoder.finish(&mut self.file)?;
         self.count();
         self.file.finish()?;
         Ok(self.summary)
@@ -108,14 +89,12 @@ impl Recorder {
         moment: Moment,
         counts: &QueueCounts,
     ) -> Result<(), RecordError> {
-        let realtime_nanos = moment.realtime_nanos;
-        let mut sink = FileSink { file: &mut self.file, realtime_nanos };
-        self.encoder.put(event, moment, &mut sink)?;
+        self.encoder.put(event, moment, &mut self.file)?;
         // Once a second, with the pipeline's own health.
         if matches!(event, Event::Health("capture", _)) {
-            let stamp = Time::from_nanos(realtime_nanos);
-            let status = own_status(&self.params.instance, stamp, counts, sink.file.bytes);
-            self.encoder.offer(&DIAGNOSTICS, stamp, &mut sink, |_| status)?;
+            let stamp = Time::from_nanos(moment.realtime_nanos);
+            let status = own_status(&self.params.instance, stamp, counts, self.file.bytes);
+            self.encoder.offer(&DIAGNOSTICS, stamp, &mut self.file, |_| status)?;
         }
         Ok(())
     }

@@ -47,6 +47,8 @@ pub struct Encoded<'a> {
     pub topic: &'static RosTopic,
     /// The stamp of what it tells.
     pub stamp: Time,
+    /// CLOCK_REALTIME when that was read, nanoseconds.
+    pub read_nanos: i64,
     /// Its bytes, with the header of CDR.
     pub bytes: &'a [u8],
 }
@@ -80,6 +82,8 @@ pub struct EventEncoder {
     converter: Converter,
     images: ImageFormat,
     pace: KeyframePace,
+    /// CLOCK_REALTIME when what is put now was read.
+    read_nanos: i64,
     bytes: Vec<u8>,
 }
 
@@ -87,7 +91,8 @@ impl EventEncoder {
     /// For an instance.
     pub fn new(instance: &str, images: ImageFormat) -> Self {
         let converter = Converter::new(instance, FrameIds::of_instance(instance));
-        Self { converter, images, pace: KeyframePace::default(), bytes: Vec::new() }
+        let pace = KeyframePace::default();
+        Self { converter, images, pace, read_nanos: 0, bytes: Vec::new() }
     }
 
     /// Puts what an event is in ROS into `sink`.
@@ -98,7 +103,8 @@ impl EventEncoder {
         sink: &mut S,
     ) -> Result<(), S::Error> {
         self.converter.observe(event);
-        let read = Time::from_nanos(now.realtime_nanos);
+        self.read_nanos = now.realtime_nanos;
+        let read = Time::from_nanos(self.read_nanos);
         match event {
             Event::Frame(frame) => self.put_frame(frame, sink),
             Event::Pose(pose) => self.put_pose(pose, sink),
@@ -106,21 +112,36 @@ impl EventEncoder {
                 let ready = self.pace.take(keyframe.clone(), now.instant);
                 ready.iter().try_for_each(|keyframe| self.put_keyframe(keyframe, sink))
             }
-            Event::Graph(graph) => self.put_graph(graph, now.realtime_nanos, sink),
+            Event::Graph(graph) => self.put_graph(graph, sink),
             Event::Health(owner, health) => self.offer(&DIAGNOSTICS, read, sink, |converter| {
                 converter.diagnostics(owner, health, read)
             }),
-            Event::Left => self.finish(sink),
+            Event::Left => self.put_waiting(sink),
             Event::Joined | Event::Adjustment(_) => Ok(()),
         }
     }
 
     /// Puts what was held back: at the end.
     pub fn finish<S: Sink>(&mut self, sink: &mut S) -> Result<(), S::Error> {
-        match self.pace.finish() {
-            Some(keyframe) => self.put_keyframe(&keyframe, sink),
-            None => Ok(()),
-        }
+        self.read_nanos = realtime_nanos();
+        self.put_waiting(sink)
+    }
+
+    /// Puts what came rarely and before, for who comes late.
+    pub fn put_last<S: Sink>(
+        &mut self,
+        keyframe: Option<&Keyframe>,
+        graph: Option<&Graph>,
+        sink: &mut S,
+    ) -> Result<(), S::Error> {
+        self.read_nanos = realtime_nanos();
+        keyframe.map_or(Ok(()), |keyframe| self.put_keyframe(keyframe, sink))?;
+        graph.map_or(Ok(()), |graph| self.put_graph(graph, sink))
+    }
+
+    fn put_waiting<S: Sink>(&mut self, sink: &mut S) -> Result<(), S::Error> {
+        let waiting = self.pace.finish();
+        waiting.map_or(Ok(()), |keyframe| self.put_keyframe(&keyframe, sink))
     }
 
     /// Encodes the message that `make` gives and puts it into `sink`, where that wants the topic.
@@ -135,7 +156,7 @@ impl EventEncoder {
             return Ok(());
         }
         encode_into(&make(&self.converter), &mut self.bytes).map_err(EncodeError::from)?;
-        sink.put(Encoded { topic, stamp, bytes: &self.bytes })
+        sink.put(Encoded { topic, stamp, read_nanos: self.read_nanos, bytes: &self.bytes })
     }
 
     fn put_frame<S: Sink>(&mut self, frame: &Frame, sink: &mut S) -> Result<(), S::Error> {
@@ -171,12 +192,7 @@ impl EventEncoder {
         self.offer(&ODOMETRY, stamp, sink, |_| messages.odometry)
     }
 
-    /// Puts a keyframe, whether or not one was put a moment ago.
-    pub fn put_keyframe<S: Sink>(
-        &mut self,
-        keyframe: &Keyframe,
-        sink: &mut S,
-    ) -> Result<(), S::Error> {
+    fn put_keyframe<S: Sink>(&mut self, keyframe: &Keyframe, sink: &mut S) -> Result<(), S::Error> {
         let stamp = self.converter.stamp(keyframe.capture_nanos);
         self.offer(&POINTS, stamp, sink, |converter| converter.points(keyframe))?;
         self.offer(&KEYFRAME_RECORDS, stamp, sink, |converter| {
@@ -184,14 +200,8 @@ impl EventEncoder {
         })
     }
 
-    /// Puts a graph that was read at `realtime_nanos`.
-    pub fn put_graph<S: Sink>(
-        &mut self,
-        graph: &Graph,
-        realtime_nanos: i64,
-        sink: &mut S,
-    ) -> Result<(), S::Error> {
-        let read = Time::from_nanos(realtime_nanos);
+    fn put_graph<S: Sink>(&mut self, graph: &Graph, sink: &mut S) -> Result<(), S::Error> {
+        let read = Time::from_nanos(self.read_nanos);
         self.offer(&KEYFRAMES, read, sink, |converter| converter.keyframes(graph, read))?;
         self.offer(&GRAPH_RECORDS, read, sink, |converter| {
             GraphRecord::new(converter.map_header(read), graph)
