@@ -10,7 +10,7 @@ use std::time::Duration;
 use clap::Args;
 use semidense::service::child::follow_supervisor;
 use semidense::service::shutdown::Shutdown;
-use semidense::wire::port::wait;
+use semidense::wire::port::{WaitError, wait};
 
 use crate::command::{CommandResult, CommonArguments, note, number_within};
 use crate::feed::{Feed, Listener, USUAL_DEPTH};
@@ -102,20 +102,13 @@ pub fn run(common: &CommonArguments, arguments: &ViewArguments) -> CommandResult
     let server = Server::open(arguments.listen, guard, shown)?;
     say(&server, arguments, token.as_deref());
     server.start()?;
-    let Shown::Live { feed, scene, .. } = &server.shown else {
-        wait_for_end(&shutdown, || None)?;
-        return Ok(ExitCode::SUCCESS);
-    };
-    let listener = feed.listen(USUAL_DEPTH);
-    start("scene", {
-        let scene = Arc::clone(scene);
-        move || keep_up(&listener, &scene)
-    })?;
-    start("history", {
+    if let Shown::Live { feed, scene, .. } = &server.shown {
+        let (listener, shown) = (feed.listen(USUAL_DEPTH), Arc::clone(scene));
+        start("scene", move || keep_up(&listener, &shown))?;
         let (server, scene, place) = (Arc::clone(&server), Arc::clone(scene), common.place()?);
-        move || follow(&place, &scene, &server.is_over)
-    })?;
-    let failure = wait_for_end(&shutdown, || feed.failure())?;
+        start("history", move || follow(&place, &scene, &server.is_over))?;
+    }
+    let failure = wait_for_end(&shutdown, &server.shown)?;
     server.is_over.store(true, std::sync::atomic::Ordering::Relaxed);
     match failure {
         Some(failure) => Err(failure.into()),
@@ -151,14 +144,13 @@ fn start(name: &str, run: impl FnOnce() + Send + 'static) -> std::io::Result<()>
     std::thread::Builder::new().name(name.to_owned()).spawn(run).map(drop)
 }
 
-/// Until a signal comes or something fails for good.
-fn wait_for_end(
-    shutdown: &Shutdown,
-    failure: impl Fn() -> Option<String>,
-) -> Result<Option<String>, Box<dyn std::error::Error>> {
+/// Until a signal comes, or the topics cannot be read any more.
+fn wait_for_end(shutdown: &Shutdown, shown: &Shown) -> Result<Option<String>, WaitError> {
     while !shutdown.is_requested() {
         wait(&[], Some(shutdown.descriptor()), LOOK_PERIOD)?;
-        if let Some(failure) = failure() {
+        if let Shown::Live { feed, .. } = shown
+            && let Some(failure) = feed.failure()
+        {
             return Ok(Some(failure));
         }
     }
