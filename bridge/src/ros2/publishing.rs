@@ -119,10 +119,7 @@ impl Publishers {
             )),
             None => None,
         };
-        let points = match params.points_period {
-            Some(_) => Some(node.publisher(&sensor(&params, topic::POINTS))?),
-            None => None,
-        };
+        let points = params.points_period.map(|_| node.publisher(&sensor(&params, topic::POINTS)));
         Ok(Self {
             pose: node.publisher(&topic::POSE)?,
             odometry: node.publisher(&topic::ODOMETRY)?,
@@ -131,7 +128,7 @@ impl Publishers {
             tf,
             _tf_static: tf_static,
             images,
-            points,
+            points: points.transpose()?,
             node,
             params,
             outbox: Arc::new(outbox()),
