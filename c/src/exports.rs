@@ -84,6 +84,16 @@ unsafe fn give<T>(
     })
 }
 
+/// What a reader says; `otherwise` after an error.
+fn ask<T>(reader: *const ReaderHandle, otherwise: T, ask: impl FnOnce(&Reader) -> T) -> T {
+    let mut answer = otherwise;
+    call(|| {
+        answer = table::with(number(reader), |reader| Ok(ask(reader)))?;
+        Ok(Status::Ok)
+    });
+    answer
+}
+
 /// Waits for an instance and joins it.
 ///
 /// `instance`: its name, null for "semidense". `root`: its folder, null for the usual one (SEMIDENSE_ROOT and so on).
@@ -142,12 +152,7 @@ pub extern "C" fn semidense_close(reader: *mut ReaderHandle) -> Status {
 /// timeout of 0, then read until SEMIDENSE_STATUS_NONE. It belongs to the reader: do not read from it, do not close it.
 #[unsafe(no_mangle)]
 pub extern "C" fn semidense_descriptor(reader: *const ReaderHandle) -> c_int {
-    let mut descriptor = -1;
-    call(|| {
-        descriptor = table::with(number(reader), |reader| Ok(reader.descriptor()))?;
-        Ok(Status::Ok)
-    });
-    descriptor
+    ask(reader, -1, |reader| reader.descriptor())
 }
 
 /// Waits for messages, `timeout_ms` at most (-1: forever).
@@ -215,12 +220,7 @@ pub unsafe extern "C" fn semidense_newest_graph(
 /// How many messages were left out because they are broken; 0 after an error.
 #[unsafe(no_mangle)]
 pub extern "C" fn semidense_refused(reader: *const ReaderHandle) -> u64 {
-    let mut refused = 0;
-    call(|| {
-        refused = table::with(number(reader), |reader| Ok(reader.refused))?;
-        Ok(Status::Ok)
-    });
-    refused
+    ask(reader, 0, |reader| reader.refused)
 }
 
 /// Writes a transform as a 4×4 matrix, row by row; its rotation is multiplied by the scale.

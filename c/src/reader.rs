@@ -84,8 +84,12 @@ impl From<OpenError> for Failure {
 
 impl From<ReceiveError> for Failure {
     fn from(error: ReceiveError) -> Self {
-        Self::new(Status::ErrorTransport, error.to_string())
+        transport(error)
     }
+}
+
+fn transport(error: impl std::fmt::Display) -> Failure {
+    Failure::new(Status::ErrorTransport, error.to_string())
 }
 
 impl From<rustix::io::Errno> for Failure {
@@ -107,7 +111,7 @@ pub fn open(place: &Place, wanted: u32, timeout: Option<Duration>) -> Result<Rea
             return Err(failure);
         }
         let pause = left.map_or(RETRY_PERIOD, |left| left.min(RETRY_PERIOD));
-        wait(&[], None, pause).map_err(|e| Failure::new(Status::ErrorTransport, e.to_string()))?;
+        wait(&[], None, pause).map_err(transport)?;
     }
 }
 
@@ -175,11 +179,9 @@ impl Reader {
                 return Ok(Status::Ended);
             }
             let left = timeout.map(|timeout| timeout.saturating_sub(begun.elapsed()));
-            let failed =
-                |e: &dyn std::fmt::Display| Failure::new(Status::ErrorTransport, e.to_string());
             // The descriptor of all and the heartbeat wake it in time for the end of the run.
             let step = left.map_or(HEARTBEAT, |left| left.min(HEARTBEAT));
-            wait(&[], [self.waited.as_fd()], step).map_err(|e| failed(&e))?;
+            wait(&[], [self.waited.as_fd()], step).map_err(transport)?;
             let has_woken = self.take_wakes()?;
             if self.is_over()? {
                 // Once more, for what has come before the end.
@@ -199,8 +201,7 @@ impl Reader {
     fn take_wakes(&self) -> Result<bool, Failure> {
         let events: Vec<&Events> = self.events().collect();
         let woken = events.iter().any(|events| is_readable(events.as_fd()));
-        wait(&events, None, Duration::ZERO)
-            .map_err(|e| Failure::new(Status::ErrorTransport, e.to_string()))?;
+        wait(&events, None, Duration::ZERO).map_err(transport)?;
         if is_readable(self.heartbeat.as_fd()) {
             let mut count = [0; 8];
             // How many beats were missed does not matter.
