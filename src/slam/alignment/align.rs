@@ -250,13 +250,13 @@ impl Aligner {
         let of_translation = reference.translation_information();
         if of_translation > 0.0 {
             for axis in 0..3 {
-                sums.add_prior(axis, current_from_keyframe.translation[axis], 0.0, of_translation);
+                sums.add_prior(axis, current_from_keyframe.translation[axis], of_translation);
             }
         }
         if self.params.estimate_brightness {
             let information = |std_dev: f64| 1.0 / (std_dev * std_dev);
-            sums.add_prior(6, brightness.a, 0.0, information(self.params.gain_prior_std_dev));
-            sums.add_prior(7, brightness.b, 0.0, information(self.params.offset_prior_std_dev));
+            sums.add_prior(6, brightness.a, information(self.params.gain_prior_std_dev));
+            sums.add_prior(7, brightness.b, information(self.params.offset_prior_std_dev));
         } else {
             sums.fix(6);
             sums.fix(7);

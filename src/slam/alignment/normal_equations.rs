@@ -33,12 +33,11 @@ impl NormalEquations {
         if self.compared == 0 { f64::INFINITY } else { self.energy / f64::from(self.compared) }
     }
 
-    /// Adds a prior N(mean, 1/information) on unknown `index`, whose value is now `value`.
-    pub fn add_prior(&mut self, index: usize, value: f64, mean: f64, information: f64) {
-        let deviation = value - mean;
+    /// Adds a prior N(0, 1/information) on unknown `index`, whose value is now `value`.
+    pub fn add_prior(&mut self, index: usize, value: f64, information: f64) {
         self.information[(index, index)] += information;
-        self.gradient[index] += information * deviation;
-        self.energy += information * deviation * deviation;
+        self.gradient[index] += information * value;
+        self.energy += information * value * value;
     }
 
     /// Takes an unknown out of the problem: its step will be zero.
