@@ -12,6 +12,7 @@ pub(crate) mod misfit;
 #[cfg(test)]
 mod mode_tests;
 pub(crate) mod normal_equations;
+mod params;
 pub mod points;
 pub mod reference;
 pub mod residual;
