@@ -27,7 +27,7 @@ pub(crate) mod tiles;
 pub(crate) mod unknown_depth;
 pub mod weights;
 
-pub use fusion::Candidates;
+pub use fusion::LevelPoint;
 pub use misfit::TileMisfit;
 pub use normal_equations::NormalEquations;
 pub use tiles::TileSum;

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::slam::alignment::fusion::{Candidates, DepthFusion};
+use crate::slam::alignment::fusion::{DepthFusion, LevelPoint};
 use crate::slam::alignment::points::{LevelPoints, Point};
 use crate::slam::alignment::selection::{Selection, SelectionParams};
 use crate::slam::alignment::surroundings::Surroundings;
@@ -100,7 +100,7 @@ pub struct ReferenceScratch {
 impl ReferenceScratch {
     /// The candidates of one level of the usable keyframe that was prepared last, before selection; on levels that are not
     /// aligned, also those behind a jump in depth.
-    pub fn candidates(&self, level: usize) -> &Candidates {
+    pub fn candidates(&self, level: usize) -> &[LevelPoint] {
         self.fusion.level(level)
     }
 }
@@ -222,8 +222,8 @@ impl Reference {
         self.mean_grey = greys / points.len().max(1) as f64;
         let Intrinsics { width, height, .. } = self.intrinsics;
         let (levels, finest) = (self.pyramid.num_levels(), self.finest_level);
-        scratch.fusion.fuse(points, width, height, levels, finest);
-        self.mean_inverse_depth = scratch.fusion.mean_inverse_depth().unwrap_or(1.0);
+        let mean_inverse_depth = scratch.fusion.fuse(points, width, height, levels, finest);
+        self.mean_inverse_depth = mean_inverse_depth.unwrap_or(1.0);
         for level in finest..levels {
             self.pack_level(level, scratch);
         }
@@ -252,7 +252,7 @@ impl Reference {
         }
         let (inverse_fx, inverse_fy) = (1.0 / intrinsics.fx, 1.0 / intrinsics.fy);
         for &index in chosen {
-            let candidate = candidates.get(index as usize);
+            let candidate = candidates[index as usize];
             let (u, v) = (usize::from(candidate.u), usize::from(candidate.v));
             if u == 0 || v == 0 || u + 1 >= image.width() || v + 1 >= image.height() {
                 continue;
