@@ -206,17 +206,25 @@ fn rising_limit(distortion: &Distortion) -> f64 {
     first_failure(at, |radius| radtan_slope(&k, radius * radius) > 0.0)
 }
 
+/// An interval after so many halvings, at whose first end `holds` and at whose other end it does not.
+pub(super) fn bisected(
+    [mut good, mut bad]: [f64; 2],
+    halvings: usize,
+    holds: impl Fn(f64) -> bool,
+) -> [f64; 2] {
+    for _ in 0..halvings {
+        let middle = 0.5 * (good + bad);
+        if holds(middle) { good = middle } else { bad = middle }
+    }
+    [good, bad]
+}
+
 /// The last value along `at(0..=LIMIT_SAMPLES)` before `holds` first fails, bisected.
 fn first_failure(at: impl Fn(usize) -> f64, holds: impl Fn(f64) -> bool) -> f64 {
     let Some(fails) = (1..=LIMIT_SAMPLES).find(|&i| !holds(at(i))) else {
         return at(LIMIT_SAMPLES);
     };
-    let (mut good, mut bad) = (at(fails - 1), at(fails));
-    for _ in 0..BISECTIONS {
-        let middle = 0.5 * (good + bad);
-        if holds(middle) { good = middle } else { bad = middle }
-    }
-    good
+    bisected([at(fails - 1), at(fails)], BISECTIONS, holds)[0]
 }
 
 /// Numerator and denominator of the radial factor and their derivatives by r².
@@ -292,11 +300,7 @@ fn invert_rising(f: impl Fn(f64) -> f64, value: f64, limit: f64) -> Option<f64> 
     if value.is_nan() || value > f(limit) {
         return None;
     }
-    let (mut low, mut high) = (0.0, limit);
-    for _ in 0..BISECTIONS {
-        let middle = 0.5 * (low + high);
-        if f(middle) < value { low = middle } else { high = middle }
-    }
+    let [low, high] = bisected([0.0, limit], BISECTIONS, |middle| f(middle) < value);
     Some(0.5 * (low + high))
 }
 

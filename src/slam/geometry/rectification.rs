@@ -2,7 +2,7 @@
 
 use nalgebra::{Vector2, Vector3};
 
-use crate::slam::geometry::camera_model::CameraModel;
+use crate::slam::geometry::camera_model::{CameraModel, bisected};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::image::buffer::Image;
 
@@ -168,12 +168,7 @@ fn extent(end: f64, holds: impl Fn(f64) -> bool) -> f64 {
     if fails == 0 {
         return 0.0;
     }
-    let (mut good, mut bad) = (at(fails - 1), at(fails));
-    for _ in 0..WALK_BISECTIONS {
-        let middle = 0.5 * (good + bad);
-        if holds(middle) { good = middle } else { bad = middle }
-    }
-    good
+    bisected([at(fails - 1), at(fails)], WALK_BISECTIONS, holds)[0]
 }
 
 /// Where each rectified pixel reads in the raw image.
