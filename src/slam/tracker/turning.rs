@@ -8,7 +8,7 @@
 use nalgebra::{Matrix3, Matrix6};
 
 use crate::slam::alignment::align::{Aligner, Alignment, AlignmentParams, Ending};
-use crate::slam::alignment::reference::{Reference, ReferenceScratch};
+use crate::slam::alignment::reference::Reference;
 use crate::slam::alignment::unknown_depth::UnknownDepth;
 use crate::slam::depth::common_error::rotation_std_dev;
 use crate::slam::frame::FrameView;
@@ -72,7 +72,7 @@ const AHEAD_IN_VIEW: f64 = 0.5;
 /// The view that frames are aligned to, and the frame before.
 #[derive(Debug)]
 pub(super) struct Turning {
-    unknown: UnknownDepth,
+    pub(super) unknown: UnknownDepth,
     /// Expects about the same exposure.
     aligner: Aligner,
     /// Lent while a frame is aligned to it.
@@ -160,11 +160,6 @@ impl Turning {
             frames: Frames::default(),
             is_due: false,
         }
-    }
-
-    /// The memory that views are prepared in.
-    pub(super) fn scratch(&mut self) -> &mut ReferenceScratch {
-        self.unknown.scratch()
     }
 
     /// Keeps the frame in `pyramid`, into which another will be filled.
