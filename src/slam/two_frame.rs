@@ -380,7 +380,7 @@ impl TwoFrameInitializer {
 
     /// Variances and figures of the latest fit; then the scale goes to mean inverse depth 1.
     fn judge(&mut self) -> Evidence {
-        let (rival, scored_by) = (self.joint.rival(), self.joint.scored_by());
+        let (rival, scored_by) = (self.joint.rival, self.joint.scored_by);
         let (state, scratch) = self.joint.best();
         let (joint, rotation) = (&scratch.system, &self.rotation_scratch.system);
         let floor = self.params.fit.noise.pixel_std_dev.powi(2);
