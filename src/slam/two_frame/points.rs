@@ -57,10 +57,11 @@ impl Points {
         self.selector.choose(image, params, &mut chosen);
         self.pixels.clear();
         self.pixels.extend(chosen.iter().map(|c| (c.u, c.v)));
-        self.patches.resize(pyramid.num_levels(), Vec::new());
-        for (level, patches) in self.patches.iter_mut().enumerate() {
+        self.patches.resize(pyramid.levels().len(), Vec::new());
+        let levels = self.patches.iter_mut().zip(pyramid.levels());
+        for (level, (patches, image)) in levels.enumerate() {
             patches.clear();
-            let block = |pixels: &[_]| patches_at(pyramid.level(level), level, pixels);
+            let block = |pixels: &[_]| patches_at(image, level, pixels);
             patches.extend(self.pixels.chunks(LANES).map(block));
         }
         self.neighbours.clear();
