@@ -122,7 +122,7 @@ impl Alignment {
 /// Aligns frames to references.
 #[derive(Debug, Clone)]
 pub struct Aligner {
-    params: AlignmentParams,
+    pub(super) params: AlignmentParams,
     kernel: Kernel,
 }
 
@@ -131,11 +131,6 @@ impl Aligner {
     pub fn new(params: AlignmentParams) -> Self {
         let kernel = Kernel::choose(params.simd);
         Self { params, kernel }
-    }
-
-    /// Its parameters.
-    pub fn params(&self) -> &AlignmentParams {
-        &self.params
     }
 
     /// The sums at one state on one level, priors included. The depth variance weighs the residuals

@@ -164,7 +164,7 @@ fn the_covariance_holds_a_pose_on_tilted_depth() {
         tilted.mode_covariance = ModeCovariance::of_std_devs([0.05; 3]);
         let (reference, alignment) = aligned(&tilted, &frame);
         let error = (alignment.state.current_from_keyframe * sideways().inverse()).log();
-        let alone = alignment.covariance(patient().params()).unwrap();
+        let alone = alignment.covariance(&patient().params).unwrap();
         let whole = alone + alignment.covariance_from_modes(&reference).unwrap();
         let (without, with) = (normalized(&error, &alone), normalized(&error, &whole));
         assert!(without > 2.0 * RARE, "{m}: the error is one of the modes: {without}");
