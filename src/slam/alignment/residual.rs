@@ -16,8 +16,6 @@
 //! of 2 grey levels). The keyframe's central difference shares no pixel with either term of r,
 //! is paid once per keyframe, and halves what a point reads.
 
-use std::cmp::Ordering;
-
 use nalgebra::Vector3;
 
 use crate::slam::alignment::normal_equations::{NormalEquations, UNKNOWNS};
@@ -164,7 +162,7 @@ pub fn point_terms(image: &Image<u16>, at: &Evaluation, point: &Point) -> Option
 #[inline(always)]
 fn projection(at: &Evaluation, point: &Point) -> Option<[f32; 2]> {
     let [warped_x, warped_y, depth_ratio] = at.warp(point, point.inverse_depth);
-    if depth_ratio.partial_cmp(&NEAREST_DEPTH_RATIO) != Some(Ordering::Greater) {
+    if !(depth_ratio > NEAREST_DEPTH_RATIO) {
         return None;
     }
     let inverse_ratio = 1.0 / depth_ratio;
@@ -262,7 +260,7 @@ pub fn mean_squared_flow(points: &LevelPoints, at: &Evaluation) -> f64 {
         let lane = (points.len() - first - 1).min(LANES / 2);
         let (x, y, d) = (block.ray_x[lane], block.ray_y[lane], block.inverse_depth[lane]);
         let depth_ratio = r6 * x + r7 * y + r8 + tz * d;
-        if depth_ratio.partial_cmp(&NEAREST_DEPTH_RATIO) != Some(Ordering::Greater) {
+        if !(depth_ratio > NEAREST_DEPTH_RATIO) {
             continue;
         }
         let nx = (r0 * x + r1 * y + r2 + tx * d) / depth_ratio;
