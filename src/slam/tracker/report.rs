@@ -210,8 +210,6 @@ impl Tracker {
 }
 
 fn is_finite(quality: &Quality) -> bool {
-    [quality.whitened_rmse, quality.residual_rmse, quality.mean_squared_flow]
-        .iter()
-        .chain(&[quality.displacement_px])
-        .all(|figure| figure.is_finite())
+    let Quality { whitened_rmse, residual_rmse, mean_squared_flow, displacement_px, .. } = quality;
+    [whitened_rmse, residual_rmse, mean_squared_flow, displacement_px].iter().all(|x| x.is_finite())
 }

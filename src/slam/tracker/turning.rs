@@ -394,16 +394,13 @@ impl Tracker {
         let state = TrackingState::Degraded(DegradedReason::Turning);
         let published = upper_triangle(|row, column| published[(row, column)]);
         let estimate = PoseEstimate {
-            state,
             world_from_camera,
             map_from_camera,
             keyframe_from_camera,
             covariance: published,
             map_covariance: upper_triangle(|row, column| in_map[(row, column)]),
             alignment_covariance: published,
-            brightness: Brightness::default(),
             quality,
-            proposes_keyframe: false,
             ..self.unclaimed(frame, Some(reference), state)
         };
         Some((estimate, covariance))
