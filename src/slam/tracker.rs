@@ -2,7 +2,6 @@
 
 pub mod covariance_floor;
 pub(crate) mod motion;
-mod proposal;
 mod report;
 mod turning;
 pub(crate) mod velocity;
