@@ -36,11 +36,10 @@ fn normal_equations(criterion: &mut Criterion) {
     pyramid.fill(&image(&camera, 1.3));
     for level in 0..levels {
         let (points, image) = (reference.level(level), pyramid.level(level));
-        let weighting = AlignmentParams::default().weighting(level);
+        let params = AlignmentParams::default();
         let (pose, brightness) = (SE3::identity(), Brightness::default());
         let intrinsics = camera.at_level(level);
-        let at =
-            Evaluation::new(&intrinsics, level, &pose, brightness, &weighting, &pose.translation);
+        let at = Evaluation::new(&intrinsics, level, &pose, brightness, &params, &pose.translation);
         let mut group = criterion.benchmark_group("normal_equations");
         group.throughput(Throughput::Elements(points.len() as u64));
         group.bench_function(BenchmarkId::new("Reference", level), |bencher| {

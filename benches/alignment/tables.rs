@@ -65,13 +65,12 @@ impl Stage {
 
     fn evaluation(&self, level: usize) -> Evaluation {
         let pose = SE3::identity();
-        let weighting = AlignmentParams::default().weighting(level);
         Evaluation::new(
             &self.camera.at_level(level),
             level,
             &pose,
             Brightness::default(),
-            &weighting,
+            &AlignmentParams::default(),
             &pose.translation,
         )
     }

@@ -10,8 +10,8 @@ use semidense::capture::source::FrameSource;
 use semidense::slam::depth::candidate::{CandidateParams, CandidateSelector};
 use semidense::slam::depth::epipolar::TwoView;
 use semidense::slam::depth::gradient_image::GradientImage;
-use semidense::slam::depth::immature::{IntervalParams, TraceFrame, TraceStatus};
-use semidense::slam::depth::interval::{IntervalSample, interval_history};
+use semidense::slam::depth::immature::{ImmaturePoint, IntervalParams, TraceFrame, TraceStatus};
+use semidense::slam::depth::interval::interval_history;
 use semidense::slam::image::buffer::Image;
 use semidense::slam::image::quads::QuadImage;
 use semidense::slam::pose::Brightness;
@@ -44,7 +44,7 @@ struct Sequence {
 struct Story {
     pixel: (u16, u16),
     true_inverse_depth: f32,
-    samples: Vec<IntervalSample>,
+    samples: Vec<ImmaturePoint>,
 }
 
 pub fn run(arguments: &Arguments) -> Result<(), Box<dyn Error>> {

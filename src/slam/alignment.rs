@@ -12,6 +12,7 @@ pub(crate) mod misfit;
 #[cfg(test)]
 mod mode_tests;
 pub(crate) mod normal_equations;
+mod params;
 pub mod points;
 pub mod reference;
 pub mod residual;
@@ -26,7 +27,7 @@ pub(crate) mod tiles;
 pub(crate) mod unknown_depth;
 pub mod weights;
 
-pub use fusion::Candidates;
+pub use fusion::LevelPoint;
 pub use misfit::TileMisfit;
 pub use normal_equations::NormalEquations;
 pub use tiles::TileSum;

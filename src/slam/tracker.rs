@@ -2,7 +2,6 @@
 
 pub mod covariance_floor;
 pub(crate) mod motion;
-mod proposal;
 mod report;
 mod turning;
 pub(crate) mod velocity;
@@ -167,7 +166,7 @@ impl Tracker {
 
     /// Memory for references that are prepared on its thread.
     pub fn scratch(&mut self) -> &mut ReferenceScratch {
-        self.turning.scratch()
+        &mut self.turning.unknown.scratch
     }
 
     /// Makes a prepared reference the active one and gives back the one before, for its memory. The

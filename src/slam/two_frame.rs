@@ -321,7 +321,7 @@ impl TwoFrameInitializer {
     /// Rotation and brightness alone, coarse to fine, from the frame before.
     fn fit_rotation(&mut self) {
         let input = input(self.pyramid.levels(), &self.intrinsics, &self.points);
-        for level in (0..self.pyramid.num_levels()).rev() {
+        for level in (0..self.intrinsics.len()).rev() {
             let (state, scratch) = (&mut self.rotation, &mut self.rotation_scratch);
             fit_level(&input, level, Freedom::Rotation, state, scratch, &self.params.fit);
         }
@@ -373,14 +373,14 @@ impl TwoFrameInitializer {
         const LEVELS: usize = 2;
         let params = self.params.fit.released();
         let input = input(self.pyramid.levels(), &self.intrinsics, &self.points);
-        for level in (0..LEVELS.min(self.pyramid.num_levels())).rev() {
+        for level in (0..LEVELS.min(self.intrinsics.len())).rev() {
             self.joint.refit(&input, level, &params);
         }
     }
 
     /// Variances and figures of the latest fit; then the scale goes to mean inverse depth 1.
     fn judge(&mut self) -> Evidence {
-        let (rival, scored_by) = (self.joint.rival(), self.joint.scored_by());
+        let (rival, scored_by) = (self.joint.rival, self.joint.scored_by);
         let (state, scratch) = self.joint.best();
         let (joint, rotation) = (&scratch.system, &self.rotation_scratch.system);
         let floor = self.params.fit.noise.pixel_std_dev.powi(2);

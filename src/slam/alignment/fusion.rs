@@ -27,51 +27,13 @@ pub struct LevelPoint {
     pub noise: f32,
 }
 
-/// All pixels with depth of one level, row by row on the levels above 0.
-#[derive(Debug, Clone, Default)]
-pub struct Candidates {
-    points: Vec<LevelPoint>,
-}
-
-impl Candidates {
-    /// Number of pixels with depth.
-    pub fn len(&self) -> usize {
-        self.points.len()
-    }
-
-    /// Whether there is none.
-    pub fn is_empty(&self) -> bool {
-        self.points.is_empty()
-    }
-
-    /// One of them.
-    pub fn get(&self, index: usize) -> LevelPoint {
-        self.points[index]
-    }
-
-    /// All of them.
-    pub fn as_slice(&self) -> &[LevelPoint] {
-        &self.points
-    }
-
-    /// Takes the usable points of a keyframe; gives their mean inverse depth, `None` without any.
-    fn fill(&mut self, points: &[DepthPoint], width: usize, height: usize) -> Option<f64> {
-        let mut sum = 0.0;
-        self.points.extend(points.iter().take(MAX_KEYFRAME_POINTS).filter_map(|point| {
-            let inside = usize::from(point.u) < width && usize::from(point.v) < height;
-            if !inside || !is_positive(point.inverse_depth) || !is_positive(point.variance) {
-                return None;
-            }
-            sum += f64::from(point.inverse_depth);
-            Some(LevelPoint {
-                u: point.u,
-                v: point.v,
-                inverse_depth: point.inverse_depth,
-                variance: point.variance,
-                noise: point.variance,
-            })
-        }));
-        (!self.points.is_empty()).then(|| sum / self.points.len() as f64)
+impl LevelPoint {
+    /// A point of a keyframe of this size; `None` where it cannot be used.
+    fn of(point: &DepthPoint, width: usize, height: usize) -> Option<Self> {
+        let DepthPoint { u, v, inverse_depth, variance, .. } = *point;
+        let inside = usize::from(u) < width && usize::from(v) < height;
+        let usable = inside && is_positive(inverse_depth) && is_positive(variance);
+        usable.then_some(Self { u, v, inverse_depth, variance, noise: variance })
     }
 }
 
@@ -174,16 +136,16 @@ struct Cells {
 /// Builds the depth pyramid, in memory that is used again.
 #[derive(Debug, Clone, Default)]
 pub struct DepthFusion {
-    levels: [Candidates; MAX_LEVELS],
+    /// Row by row on the levels above 0.
+    levels: [Vec<LevelPoint>; MAX_LEVELS],
     cells: Cells,
-    mean_inverse_depth: Option<f64>,
 }
 
 impl DepthFusion {
     /// Fuses `points` of a `width * height` image into `num_levels` levels. Points outside the
     /// image, or without a positive finite inverse depth and variance, are left out, as are those
     /// beyond [`MAX_KEYFRAME_POINTS`]. Levels below `finest` only feed the coarser ones, and keep
-    /// what lies behind jumps.
+    /// what lies behind jumps. The mean inverse depth of all points of level 0, `None` without points.
     pub fn fuse(
         &mut self,
         points: &[DepthPoint],
@@ -191,23 +153,23 @@ impl DepthFusion {
         height: usize,
         num_levels: usize,
         finest: usize,
-    ) {
-        self.levels.iter_mut().for_each(|level| level.points.clear());
-        self.mean_inverse_depth = self.levels[0].fill(points, width, height);
+    ) -> Option<f64> {
+        self.levels.iter_mut().for_each(Vec::clear);
+        let points = points.iter().take(MAX_KEYFRAME_POINTS);
+        let usable = points.filter_map(|point| LevelPoint::of(point, width, height));
+        let mut sum = 0.0;
+        self.levels[0].extend(usable.inspect(|point| sum += f64::from(point.inverse_depth)));
+        let count = self.levels[0].len();
         for level in 1..num_levels.min(MAX_LEVELS) {
             let (fine, coarse) = self.levels.split_at_mut(level);
             self.cells.lay_out(width >> level, height >> level);
             self.cells.halve(&mut fine[level - 1], &mut coarse[0], level > finest);
         }
-    }
-
-    /// Mean inverse depth of all points of level 0, `None` without points.
-    pub fn mean_inverse_depth(&self) -> Option<f64> {
-        self.mean_inverse_depth
+        (count > 0).then(|| sum / count as f64)
     }
 
     /// The pixels with depth of one level.
-    pub fn level(&self, level: usize) -> &Candidates {
+    pub fn level(&self, level: usize) -> &[LevelPoint] {
         &self.levels[level]
     }
 }
@@ -240,23 +202,28 @@ impl Cells {
     }
 
     /// Fuses `fine` into `coarse`; drops from `fine` what lies behind a jump in depth, if wanted.
-    fn halve(&mut self, fine: &mut Candidates, coarse: &mut Candidates, drops_behind: bool) {
-        for child in &fine.points {
+    fn halve(
+        &mut self,
+        fine: &mut Vec<LevelPoint>,
+        coarse: &mut Vec<LevelPoint>,
+        drops_behind: bool,
+    ) {
+        for child in fine.iter() {
             let Some(index) = self.cell_of(child) else { continue };
             self.fronts[index] = self.fronts[index].nearer(Front::of(child));
         }
         self.find_filled();
         if drops_behind {
-            fine.points.retain(|child| self.add(child));
+            fine.retain(|child| self.add(child));
         } else {
-            fine.points.iter().for_each(|child| _ = self.add(child));
+            fine.iter().for_each(|child| _ = self.add(child));
         }
         let independent = self.average();
         self.keep_noise(independent);
         self.emit(coarse);
         if drops_behind {
             let is_behind = |index: usize| self.cells[index].is_behind;
-            fine.points.retain(|child| self.cell_of(child).is_none_or(|index| !is_behind(index)));
+            fine.retain(|child| self.cell_of(child).is_none_or(|index| !is_behind(index)));
         }
         for filled in self.filled.drain(..) {
             self.cells[filled.index as usize] = Cell::default();
@@ -329,9 +296,9 @@ impl Cells {
 
     /// Writes the means, but for those beside which depth jumps to something nearer: single
     /// children are too noisy to tell where their means can.
-    fn emit(&mut self, coarse: &mut Candidates) {
+    fn emit(&mut self, coarse: &mut Vec<LevelPoint>) {
         let stride = self.stride();
-        coarse.points.reserve(self.filled.len());
+        coarse.reserve(self.filled.len());
         for filled in &self.filled {
             let index = filled.index as usize;
             let cell = self.cells[index];
@@ -345,7 +312,7 @@ impl Cells {
                 continue;
             }
             let variance = cell.children / cell.information;
-            coarse.points.push(LevelPoint {
+            coarse.push(LevelPoint {
                 u: filled.u,
                 v: filled.v,
                 inverse_depth: cell.inverse_depth,
@@ -370,13 +337,13 @@ mod tests {
         fusion.fuse(&[point(4, 6, 1.0, 0.1), point(5, 7, 2.0, 0.3)], 64, 64, 2, 0);
         let level = fusion.level(1);
         assert_eq!(level.len(), 1);
-        let parent = level.get(0);
+        let parent = level[0];
         assert_eq!((parent.u, parent.v), (2, 3));
         // Weights 10 and 10/3: (10 + 20/3)/(40/3) = 1.25; 2/(40/3) = 0.15.
         assert!((parent.inverse_depth - 1.25).abs() < 1e-6);
         assert!((parent.variance - 0.15).abs() < 1e-6);
         fusion.fuse(&[point(0, 0, 1.0, 0.2), point(1, 1, 1.0, 0.2)], 64, 64, 2, 0);
-        assert!((fusion.level(1).get(0).variance - 0.2).abs() < 1e-6);
+        assert!((fusion.level(1)[0].variance - 0.2).abs() < 1e-6);
     }
 
     #[test]
@@ -386,7 +353,7 @@ mod tests {
         let jump = [point(4, 4, 1.0, 1e-4), point(5, 4, 0.4, 1e-4), point(6, 4, 0.4, 1e-4)];
         fusion.fuse(&jump, 64, 64, 2, 0);
         assert_eq!((fusion.level(0).len(), fusion.level(1).len()), (1, 1));
-        assert_eq!(fusion.level(1).get(0).inverse_depth, 1.0);
+        assert_eq!(fusion.level(1)[0].inverse_depth, 1.0);
         // Beyond the next cell it is not beside the jump any more; and a slope is no jump.
         fusion.fuse(&[point(4, 4, 1.0, 1e-4), point(9, 4, 0.4, 1e-4)], 64, 64, 2, 0);
         assert_eq!(fusion.level(1).len(), 2);
@@ -420,7 +387,7 @@ mod tests {
         assert_eq!(fusion.level(3).len(), 64);
         fusion.fuse(&[point(9, 9, 0.4, 1e-4)], 50, 40, 4, 0);
         assert!((0..4).all(|level| fusion.level(level).len() == 1));
-        assert_eq!(fusion.level(3).get(0).inverse_depth, 0.4);
+        assert_eq!(fusion.level(3)[0].inverse_depth, 0.4);
     }
 
     #[test]
@@ -436,7 +403,7 @@ mod tests {
                 })
                 .collect();
             fusion.fuse(&points, 64, 64, 2, 0);
-            let parent = fusion.level(1).get(77);
+            let parent = fusion.level(1)[77];
             let kept = parent.noise / (std_dev * std_dev);
             assert!((kept - expected).abs() < 0.05, "{kept} is not {expected}");
             assert!((parent.variance / (std_dev * std_dev) - 1.0).abs() < 1e-3);

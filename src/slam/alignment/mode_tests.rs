@@ -124,13 +124,13 @@ fn an_error_of_the_unit_is_none() {
 fn every_kernel_has_the_modes_of_the_reference() {
     let (keyframe, frame) = keyframe_and_frame(&sideways());
     let reference = Reference::prepare(&keyframe);
-    let weighting = AlignmentParams::default().weighting(LEVEL);
+    let params = AlignmentParams::default();
     let (points, image) = (reference.level(LEVEL), frame.level(LEVEL));
     let camera = small_camera().at_level(LEVEL);
     // Near the solution, and so that many points leave the image.
     for pose in [sideways(), SE3::exp(&Vector6::new(0.3, 0.1, 0.1, 0.05, 0.2, -0.1))] {
         let brightness = Brightness { a: -0.1, b: 3.0 };
-        let at = Evaluation::new(&camera, LEVEL, &pose, brightness, &weighting, &pose.translation);
+        let at = Evaluation::new(&camera, LEVEL, &pose, brightness, &params, &pose.translation);
         let expected = GradientScatter::reference(points, image, &at).d_gradient_d_modes;
         let sums = accumulate_reference(points, image, &at);
         assert!(sums.in_view > 200);
@@ -164,7 +164,7 @@ fn the_covariance_holds_a_pose_on_tilted_depth() {
         tilted.mode_covariance = ModeCovariance::of_std_devs([0.05; 3]);
         let (reference, alignment) = aligned(&tilted, &frame);
         let error = (alignment.state.current_from_keyframe * sideways().inverse()).log();
-        let alone = alignment.covariance(patient().params()).unwrap();
+        let alone = alignment.covariance(&patient().params).unwrap();
         let whole = alone + alignment.covariance_from_modes(&reference).unwrap();
         let (without, with) = (normalized(&error, &alone), normalized(&error, &whole));
         assert!(without > 2.0 * RARE, "{m}: the error is one of the modes: {without}");

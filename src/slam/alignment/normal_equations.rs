@@ -3,7 +3,7 @@
 //! State: the left increment (translation, rotation) of `current_from_keyframe`, then the
 //! increments of the brightness a and b.
 
-use nalgebra::{Matrix6, SMatrix, SVector, Vector6};
+use nalgebra::{SMatrix, SVector, Vector6};
 
 /// Unknowns: six of the pose, two of the brightness.
 pub const UNKNOWNS: usize = 8;
@@ -33,12 +33,11 @@ impl NormalEquations {
         if self.compared == 0 { f64::INFINITY } else { self.energy / f64::from(self.compared) }
     }
 
-    /// Adds a prior N(mean, 1/information) on unknown `index`, whose value is now `value`.
-    pub fn add_prior(&mut self, index: usize, value: f64, mean: f64, information: f64) {
-        let deviation = value - mean;
+    /// Adds a prior N(0, 1/information) on unknown `index`, whose value is now `value`.
+    pub fn add_prior(&mut self, index: usize, value: f64, information: f64) {
         self.information[(index, index)] += information;
-        self.gradient[index] += information * deviation;
-        self.energy += information * deviation * deviation;
+        self.gradient[index] += information * value;
+        self.energy += information * value * value;
     }
 
     /// Takes an unknown out of the problem: its step will be zero.
@@ -62,14 +61,6 @@ impl NormalEquations {
     /// Length of `step` in standard deviations: √(δᵀMδ), M the information.
     pub fn decrement(&self, step: &SVector<f64, UNKNOWNS>) -> f64 {
         step.dot(&(self.information * step)).max(0.0).sqrt()
-    }
-
-    /// Covariance of the pose with the brightness marginalised, before calibration; `None` where
-    /// the information does not determine all unknowns.
-    pub fn pose_covariance(&self) -> Option<Matrix6<f64>> {
-        let inverse = self.information.cholesky()?.inverse();
-        let pose: Matrix6<f64> = inverse.fixed_view::<6, 6>(0, 0).into_owned();
-        pose.iter().all(|x| x.is_finite()).then_some(pose)
     }
 }
 

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::slam::alignment::fusion::{Candidates, DepthFusion};
+use crate::slam::alignment::fusion::{DepthFusion, LevelPoint};
 use crate::slam::alignment::points::{LevelPoints, Point};
 use crate::slam::alignment::selection::{Selection, SelectionParams};
 use crate::slam::alignment::surroundings::Surroundings;
@@ -13,7 +13,7 @@ use crate::slam::image::sums::{MAX_LEVELS, SumPyramid, grey_per_sum};
 use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
 use crate::slam::modes::ModeCovariance;
 use crate::slam::parameter::{ParameterError, check_range};
-use crate::slam::place_covariance::{PlaceCovariance, UncertainPlace};
+use crate::slam::place_covariance::UncertainPlace;
 use crate::slam::pose::NO_KEYFRAME;
 
 /// Which points of a keyframe are aligned.
@@ -76,8 +76,7 @@ pub struct Reference {
     sequence: u64,
     map_state: MapState,
     world_from_keyframe: Sim3,
-    map_from_keyframe: Sim3,
-    place_covariance: PlaceCovariance,
+    place: UncertainPlace,
     map_revision: u64,
     intrinsics: Intrinsics,
     mean_inverse_depth: f64,
@@ -100,7 +99,7 @@ pub struct ReferenceScratch {
 impl ReferenceScratch {
     /// The candidates of one level of the usable keyframe that was prepared last, before selection; on levels that are not
     /// aligned, also those behind a jump in depth.
-    pub fn candidates(&self, level: usize) -> &Candidates {
+    pub fn candidates(&self, level: usize) -> &[LevelPoint] {
         self.fusion.level(level)
     }
 }
@@ -117,8 +116,7 @@ impl Reference {
             sequence: 0,
             map_state: MapState::Established,
             world_from_keyframe: Sim3::identity(),
-            map_from_keyframe: Sim3::identity(),
-            place_covariance: PlaceCovariance::ZERO,
+            place: UncertainPlace::exact(Sim3::identity()),
             map_revision: 0,
             intrinsics: Intrinsics { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, width: 0, height: 0 },
             mean_inverse_depth: 1.0,
@@ -147,10 +145,10 @@ impl Reference {
         self.map_state = keyframe.map_state;
         let placed =
             keyframe.world_from_keyframe.is_valid() && keyframe.map_from_keyframe.is_valid();
-        let place = |place: Sim3| if placed { place } else { Sim3::identity() };
-        self.world_from_keyframe = place(keyframe.world_from_keyframe);
-        self.map_from_keyframe = place(keyframe.map_from_keyframe);
-        self.place_covariance = keyframe.place_covariance;
+        let or_identity = |place: Sim3| if placed { place } else { Sim3::identity() };
+        self.world_from_keyframe = or_identity(keyframe.world_from_keyframe);
+        self.place = keyframe.uncertain_place();
+        self.place.map_from_keyframe = or_identity(keyframe.map_from_keyframe);
         self.map_revision = keyframe.map_revision;
         self.intrinsics = keyframe.intrinsics;
         self.mean_inverse_depth = 1.0;
@@ -187,8 +185,7 @@ impl Reference {
         self.keyframe_id = NO_KEYFRAME;
         self.map_state = MapState::Established;
         self.world_from_keyframe = Sim3::identity();
-        self.map_from_keyframe = Sim3::identity();
-        self.place_covariance = PlaceCovariance::ZERO;
+        self.place = UncertainPlace::exact(Sim3::identity());
         self.intrinsics = *intrinsics;
         self.mean_inverse_depth = 1.0;
         self.mode_covariance = mode_covariance;
@@ -206,7 +203,7 @@ impl Reference {
     /// Places the view in world and map, with how far from it frames are expected, a standard deviation in its units.
     pub fn stand_at(&mut self, world_from_view: &Sim3, expected_distance: f64) {
         self.world_from_keyframe = *world_from_view;
-        self.map_from_keyframe = *world_from_view;
+        self.place.map_from_keyframe = *world_from_view;
         self.translation_information = 1.0 / (expected_distance * expected_distance);
     }
 
@@ -222,8 +219,8 @@ impl Reference {
         self.mean_grey = greys / points.len().max(1) as f64;
         let Intrinsics { width, height, .. } = self.intrinsics;
         let (levels, finest) = (self.pyramid.num_levels(), self.finest_level);
-        scratch.fusion.fuse(points, width, height, levels, finest);
-        self.mean_inverse_depth = scratch.fusion.mean_inverse_depth().unwrap_or(1.0);
+        let mean_inverse_depth = scratch.fusion.fuse(points, width, height, levels, finest);
+        self.mean_inverse_depth = mean_inverse_depth.unwrap_or(1.0);
         for level in finest..levels {
             self.pack_level(level, scratch);
         }
@@ -252,7 +249,7 @@ impl Reference {
         }
         let (inverse_fx, inverse_fy) = (1.0 / intrinsics.fx, 1.0 / intrinsics.fy);
         for &index in chosen {
-            let candidate = candidates.get(index as usize);
+            let candidate = candidates[index as usize];
             let (u, v) = (usize::from(candidate.u), usize::from(candidate.v));
             if u == 0 || v == 0 || u + 1 >= image.width() || v + 1 >= image.height() {
                 continue;
@@ -314,13 +311,12 @@ impl Reference {
 
     /// Where the map has the keyframe.
     pub fn map_from_keyframe(&self) -> &Sim3 {
-        &self.map_from_keyframe
+        &self.place.map_from_keyframe
     }
 
     /// The same, and how uncertain that is.
     pub fn uncertain_place(&self) -> UncertainPlace {
-        let Self { map_from_keyframe, place_covariance: covariance, .. } = *self;
-        UncertainPlace { map_from_keyframe, covariance }
+        self.place
     }
 
     /// How often the map had been corrected by then.

@@ -16,11 +16,10 @@
 //! of 2 grey levels). The keyframe's central difference shares no pixel with either term of r,
 //! is paid once per keyframe, and halves what a point reads.
 
-use std::cmp::Ordering;
-
 use nalgebra::Vector3;
 
 use crate::slam::alignment::normal_equations::{NormalEquations, UNKNOWNS};
+use crate::slam::alignment::params::AlignmentParams;
 use crate::slam::alignment::points::{LANES, LevelPoints, Point};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
@@ -43,19 +42,6 @@ pub(crate) const SMALLEST_DETERMINANT: f32 = 0.1;
 /// is at least as bright or as dark.
 pub(crate) const UNCLIPPED_GREY: [f32; 2] = [0.5, 254.5];
 
-/// How residuals are weighted.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Weighting {
-    /// σ_I² of one image at this level, grey levels².
-    pub intensity_variance: f32,
-    /// Whether (∂r/∂d)² V enters σ_r².
-    pub use_depth_variance: bool,
-    /// Huber's k on |r|/σ_r.
-    pub huber: f32,
-    /// |r|/σ_r below which a point counts as inlier.
-    pub inlier_gate: f32,
-}
-
 /// One state on one level, in the numbers that the loop over points needs.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Evaluation {
@@ -76,14 +62,14 @@ pub struct Evaluation {
 
 impl Evaluation {
     /// For `current_from_keyframe` (translation in keyframe units) and `brightness` on `level`;
-    /// `intrinsics` are those of the level. `variance_translation` is the translation at which
-    /// (∂r/∂d)² V is taken.
+    /// `intrinsics` are those of the level, `params` say how residuals are weighted.
+    /// `variance_translation` is the translation at which (∂r/∂d)² V is taken.
     pub fn new(
         intrinsics: &Intrinsics,
         level: usize,
         current_from_keyframe: &SE3,
         brightness: Brightness,
-        weighting: &Weighting,
+        params: &AlignmentParams,
         variance_translation: &Vector3<f64>,
     ) -> Self {
         let rotation = current_from_keyframe.rotation_matrix();
@@ -100,10 +86,10 @@ impl Evaluation {
             grey_per_sum: grey_per_sum(level),
             gain,
             offset: brightness.b as f32,
-            intensity_variance: (1.0 + gain * gain) * weighting.intensity_variance,
-            depth_variance_factor: if weighting.use_depth_variance { 1.0 } else { 0.0 },
-            huber: weighting.huber,
-            inlier_gate_squared: weighting.inlier_gate * weighting.inlier_gate,
+            intensity_variance: (1.0 + gain * gain) * params.noise.variance(level),
+            depth_variance_factor: if params.use_depth_variance { 1.0 } else { 0.0 },
+            huber: params.huber,
+            inlier_gate_squared: params.inlier_gate * params.inlier_gate,
         }
     }
 
@@ -176,7 +162,7 @@ pub fn point_terms(image: &Image<u16>, at: &Evaluation, point: &Point) -> Option
 #[inline(always)]
 fn projection(at: &Evaluation, point: &Point) -> Option<[f32; 2]> {
     let [warped_x, warped_y, depth_ratio] = at.warp(point, point.inverse_depth);
-    if depth_ratio.partial_cmp(&NEAREST_DEPTH_RATIO) != Some(Ordering::Greater) {
+    if !(depth_ratio > NEAREST_DEPTH_RATIO) {
         return None;
     }
     let inverse_ratio = 1.0 / depth_ratio;
@@ -274,7 +260,7 @@ pub fn mean_squared_flow(points: &LevelPoints, at: &Evaluation) -> f64 {
         let lane = (points.len() - first - 1).min(LANES / 2);
         let (x, y, d) = (block.ray_x[lane], block.ray_y[lane], block.inverse_depth[lane]);
         let depth_ratio = r6 * x + r7 * y + r8 + tz * d;
-        if depth_ratio.partial_cmp(&NEAREST_DEPTH_RATIO) != Some(Ordering::Greater) {
+        if !(depth_ratio > NEAREST_DEPTH_RATIO) {
             continue;
         }
         let nx = (r0 * x + r1 * y + r2 + tx * d) / depth_ratio;

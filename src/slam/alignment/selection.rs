@@ -5,7 +5,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::slam::alignment::fusion::Candidates;
+use crate::slam::alignment::fusion::LevelPoint;
 use crate::slam::image::buffer::Image;
 use crate::slam::image::noise::ImageNoise;
 use crate::slam::image::sums::grey_per_sum;
@@ -57,7 +57,7 @@ impl Selection {
     pub fn choose(
         &mut self,
         params: &SelectionParams,
-        candidates: &Candidates,
+        candidates: &[LevelPoint],
         image: &Image<u16>,
         level: usize,
         focal_times_depth: f64,
@@ -82,7 +82,7 @@ impl Selection {
     fn rank_all(
         &mut self,
         params: &SelectionParams,
-        candidates: &Candidates,
+        candidates: &[LevelPoint],
         image: &Image<u16>,
         level: usize,
         pixels_per_inverse_depth: f32,
@@ -96,7 +96,7 @@ impl Selection {
         self.tile_starts.clear();
         self.tile_starts.resize(columns * image.height().div_ceil(TILE_PX) + 1, 0);
         self.ranked.clear();
-        let points = candidates.as_slice().iter().zip(0..);
+        let points = candidates.iter().zip(0..);
         self.ranked.extend(points.map(|(candidate, index)| {
             let (u, v) = (usize::from(candidate.u), usize::from(candidate.v));
             let row = v * width;

@@ -6,7 +6,7 @@
 //! and translation look alike (7 % on a plane with 10 % of noise). A Jacobian from the neighbours' depth, an instrumental variable, has the
 //! same zero without that pull, whatever the noise and however large it is believed to be.
 
-use crate::slam::alignment::fusion::{Candidates, LevelPoint};
+use crate::slam::alignment::fusion::LevelPoint;
 
 /// Side of a tile, pixels of the level: wide enough that the neighbours whose noise a point shares
 /// are few of many, and surfaces bend little within.
@@ -37,12 +37,12 @@ struct Tile {
 
 impl Surroundings {
     /// Sums the candidates of a level of `width * height` pixels.
-    pub fn measure(&mut self, candidates: &Candidates, width: usize, height: usize) {
+    pub fn measure(&mut self, candidates: &[LevelPoint], width: usize, height: usize) {
         self.columns = width.div_ceil(TILE_PX);
         self.tiles.clear();
         self.tiles.resize(self.columns * height.div_ceil(TILE_PX), Tile::default());
         let mut total = Tile::default();
-        for candidate in candidates.as_slice() {
+        for candidate in candidates {
             let index = self.tile_of(candidate);
             let Some(tile) = self.tiles.get_mut(index) else { continue };
             let information = 1.0 / candidate.variance;
@@ -101,7 +101,7 @@ mod tests {
         // The mean of all, 3, counts half a point.
         let expected = [(2.0 + 1.5) / 1.5, (1.0 + 1.5) / 1.5, 3.0];
         for (index, expected) in expected.into_iter().enumerate() {
-            let found = surroundings.without(&level.get(index));
+            let found = surroundings.without(&level[index]);
             assert!((found - expected).abs() < 1e-6, "point {index}: {found}, not {expected}");
         }
     }

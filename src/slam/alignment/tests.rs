@@ -26,9 +26,9 @@ fn pyramid(pixels: &[u8]) -> SumPyramid {
 }
 
 fn evaluation(pose: &SE3, brightness: Brightness) -> Evaluation {
-    let weighting = AlignmentParams::default().weighting(LEVEL);
+    let params = AlignmentParams::default();
     let (camera, translation) = (small_camera().at_level(LEVEL), &pose.translation);
-    Evaluation::new(&camera, LEVEL, pose, brightness, &weighting, translation)
+    Evaluation::new(&camera, LEVEL, pose, brightness, &params, translation)
 }
 
 fn move_of(seed: u64, size: f64) -> SE3 {

@@ -27,7 +27,8 @@ const MIN_GRADIENT: f32 = 1.0;
 #[derive(Debug, Clone, Default)]
 pub struct UnknownDepth {
     points: Vec<DepthPoint>,
-    scratch: ReferenceScratch,
+    /// The memory that it prepares in, for other references as well.
+    pub scratch: ReferenceScratch,
 }
 
 impl UnknownDepth {
@@ -42,11 +43,6 @@ impl UnknownDepth {
         self.choose(pyramid);
         let modes = ModeCovariance::of_std_devs([TILT, TILT, 0.0]);
         reference.prepare_view(intrinsics, pyramid, &self.points, modes, &mut self.scratch);
-    }
-
-    /// The memory that it prepares in, for other references.
-    pub fn scratch(&mut self) -> &mut ReferenceScratch {
-        &mut self.scratch
     }
 
     /// The pixels of the finest level with gradient, as points of level 0.

@@ -37,7 +37,7 @@ pub fn point_weights(
         level,
         current_from_keyframe,
         Brightness::default(),
-        &params.weighting(level),
+        params,
         &current_from_keyframe.translation,
     );
     let pixel = |ray: f32, focal: f64, centre: f64| (f64::from(ray) * focal + centre).round();

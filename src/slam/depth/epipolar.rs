@@ -3,7 +3,7 @@
 //! With `pr = K R K⁻¹ (u, v, 1)` and `kt = K t` (R, t: current_from_keyframe) a keyframe pixel of
 //! inverse depth d projects to `((pr_x + kt_x d)/(pr_z + kt_z d), (pr_y + kt_y d)/(pr_z + kt_z d))`.
 
-use nalgebra::Matrix3;
+use nalgebra::matrix;
 
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
@@ -45,34 +45,15 @@ pub struct Projection {
 impl TwoView {
     /// The geometry of images with `intrinsics`, `current_from_keyframe` in the unit of 1/d.
     pub fn new(intrinsics: &Intrinsics, current_from_keyframe: &SE3) -> Self {
-        let k = Matrix3::new(
-            intrinsics.fx,
-            0.0,
-            intrinsics.cx, //
-            0.0,
-            intrinsics.fy,
-            intrinsics.cy, //
-            0.0,
-            0.0,
-            1.0,
-        );
-        let k_inverse = Matrix3::new(
-            1.0 / intrinsics.fx,
-            0.0,
-            -intrinsics.cx / intrinsics.fx, //
-            0.0,
-            1.0 / intrinsics.fy,
-            -intrinsics.cy / intrinsics.fy, //
-            0.0,
-            0.0,
-            1.0,
-        );
+        let Intrinsics { fx, fy, cx, cy, .. } = *intrinsics;
+        let k = matrix![fx, 0.0, cx; 0.0, fy, cy; 0.0, 0.0, 1.0];
+        let k_inverse = matrix![1.0 / fx, 0.0, -cx / fx; 0.0, 1.0 / fy, -cy / fy; 0.0, 0.0, 1.0];
         let rotation = k * current_from_keyframe.rotation_matrix() * k_inverse;
         let translation = k * current_from_keyframe.translation;
         Self {
             rotation: [0, 1, 2].map(|r| [0, 1, 2].map(|c| rotation[(r, c)] as f32)),
             translation: [0, 1, 2].map(|r| translation[r] as f32),
-            per_focal_length: (1.0 / intrinsics.fx.max(intrinsics.fy)) as f32,
+            per_focal_length: (1.0 / fx.max(fy)) as f32,
         }
     }
 

@@ -126,17 +126,14 @@ impl Hypotheses {
 
     /// How many there are, and how many candidates without one.
     pub(super) fn count_beside(&self, candidates: &Image<bool>) -> [usize; 2] {
-        if self.lists.is_valid {
-            let counts = self.lists.counts.iter();
-            return counts.fold([0, 0], |[known, unknown], counts| {
-                [known + usize::from(counts.known), unknown + usize::from(counts.unknown)]
-            });
-        }
         let pixels = self.pixels().iter().zip(candidates.pixels());
-        let without = |(hypothesis, &is_candidate): (&Hypothesis, &bool)| {
-            usize::from(is_candidate & !hypothesis.is_some())
+        let unknown = match self.lists.is_valid {
+            true => self.lists.counts.iter().map(|counts| usize::from(counts.unknown)).sum(),
+            false => {
+                pixels.map(|(h, &is_candidate)| usize::from(is_candidate & !h.is_some())).sum()
+            }
         };
-        [self.count(), pixels.map(without).sum()]
+        [self.count(), unknown]
     }
 
     /// The columns of row `v` that have a hypothesis, ascending; in `memory` where they are not listed.

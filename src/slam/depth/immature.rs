@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use crate::slam::depth::epipolar::{EpipolarLine, Projection, TwoView};
 use crate::slam::depth::gradient_image::{BORDER_PX, GradientImage};
 use crate::slam::depth::matching::is_inside;
-use crate::slam::depth::pattern::PATTERN;
+use crate::slam::depth::pattern::{PATTERN, sample_weight};
 use crate::slam::depth::segment::{Segment, search};
 use crate::slam::image::quads::QuadImage;
 use crate::slam::parameter::{ParameterError, check_range};
@@ -150,7 +150,7 @@ pub struct ImmaturePoint {
     pub v: u16,
     /// Brightness at the samples of the `PATTERN`.
     pub intensities: [f32; 8],
-    /// Weight of each sample, `c²/(c²+‖g‖²)`: strong gradients misjudge sub-pixel errors as residual.
+    /// Weight of each sample.
     pub weights: [f32; 8],
     /// Gradient structure tensor Σ g gᵀ over the pattern: uu, uv, vv.
     structure: [f32; 3],
@@ -175,9 +175,6 @@ pub struct ImmaturePoint {
 /// are then within 1, 2 and 3 σ (`tests/estimation/interval_filter.rs` prints it), without noise 79, 87 and 90 %.
 pub const HALF_INTERVAL_SIGMAS: f32 = 3.0;
 
-/// Gradient, grey levels a pixel, at which the weight of a sample is one half.
-const HALF_WEIGHT_GRADIENT: f32 = 50.0;
-
 impl ImmaturePoint {
     /// The point of pixel `(u, v)` with all depths possible; `None` within [`BORDER_PX`] of the border.
     pub fn new(image: &GradientImage, u: u16, v: u16) -> Option<Self> {
@@ -193,8 +190,7 @@ impl ImmaturePoint {
             let i = ((row as i32 + y) * width as i32 + column as i32 + x) as usize;
             let (gu, gv) = image.gradient(i);
             intensities[k] = f32::from(image.intensity.pixels()[i]);
-            let half = HALF_WEIGHT_GRADIENT * HALF_WEIGHT_GRADIENT;
-            weights[k] = half / (half + gu * gu + gv * gv);
+            weights[k] = sample_weight(gu, gv);
             structure[0] += gu * gu;
             structure[1] += gu * gv;
             structure[2] += gv * gv;

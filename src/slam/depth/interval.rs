@@ -200,39 +200,18 @@ fn is_near_known(map: &DepthMap, candidate: &Candidate) -> bool {
         .any(|y| map.hypotheses.row(y)[u - REACH_PX..=u + REACH_PX].iter().any(Hypothesis::is_some))
 }
 
-/// The interval of a point after one frame.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct IntervalSample {
-    /// Lower end, 1/keyframe units.
-    pub min_inverse_depth: f32,
-    /// Upper end; unknown before the first match.
-    pub max_inverse_depth: Option<f32>,
-    /// Length of its segment in this frame, pixels.
-    pub segment_px: f32,
-    /// Energy of the second minimum over that of the best.
-    pub quality: f32,
-    /// What the trace came to.
-    pub status: TraceStatus,
-}
-
-/// Traces the pixel `(u, v)` of `image` through `frames` and tells its interval after each of them, for
-/// a picture of how it narrows; empty where the pixel is too near to the border.
+/// Traces the pixel `(u, v)` of `image` through `frames`; the point after each of them, for a picture of how its
+/// interval narrows. Empty where the pixel is too near to the border.
 pub fn interval_history<'a>(
     image: &GradientImage,
     (u, v): (u16, u16),
     frames: impl IntoIterator<Item = TraceFrame<'a>>,
     params: &IntervalParams,
-) -> Vec<IntervalSample> {
+) -> Vec<ImmaturePoint> {
     let Some(mut point) = ImmaturePoint::new(image, u, v) else { return Vec::new() };
     let trace = |frame: TraceFrame<'a>| {
-        let status = point.trace(&frame, params);
-        IntervalSample {
-            min_inverse_depth: point.min_inverse_depth,
-            max_inverse_depth: point.max_inverse_depth,
-            segment_px: point.last_segment_px,
-            quality: point.quality,
-            status,
-        }
+        point.trace(&frame, params);
+        point.clone()
     };
     frames.into_iter().map(trace).collect()
 }

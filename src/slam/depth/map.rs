@@ -89,10 +89,8 @@ impl DepthMap {
         let (width, height) = (self.image.width(), self.image.height());
         let (candidates, hypotheses, image) = (&self.candidates, &self.hypotheses, &self.image);
         let rows = self.structure.pixels_mut().par_chunks_exact_mut(width).enumerate();
-        rows.with_min_len(BAND_ROWS).for_each(|(v, row)| {
-            if !(BORDER_PX..height - BORDER_PX).contains(&v) {
-                return;
-            }
+        let inner = BORDER_PX..height - BORDER_PX;
+        rows.with_min_len(BAND_ROWS).filter(|(v, _)| inner.contains(v)).for_each(|(v, row)| {
             let (candidates, hypotheses) = (candidates.row(v), hypotheses.row(v));
             for first in (BORDER_PX..width - BORDER_PX).step_by(LANES) {
                 // The last block is summed with some of the one before it, so that it is whole.
@@ -139,14 +137,10 @@ impl DepthMap {
         let image = &self.image;
         let lowest = lowest as f32;
         let rows = self.candidates.pixels_mut().par_chunks_exact_mut(width).enumerate();
-        rows.with_min_len(BAND_ROWS).for_each(|(v, row)| {
-            if (BORDER_PX..height - BORDER_PX).contains(&v) {
-                let strengths = image.strengths(v);
-                row[BORDER_PX..]
-                    .iter_mut()
-                    .zip(strengths)
-                    .for_each(|(c, s)| *c &= bin(s) >= lowest);
-            }
+        let inner = BORDER_PX..height - BORDER_PX;
+        rows.with_min_len(BAND_ROWS).filter(|(v, _)| inner.contains(v)).for_each(|(v, row)| {
+            let candidates = row[BORDER_PX..].iter_mut().zip(image.strengths(v));
+            candidates.for_each(|(c, s)| *c &= bin(s) >= lowest);
         });
     }
 

@@ -1,10 +1,7 @@
 //! The cost of a patch in vector registers.
 
-use crate::slam::depth::pattern::sum_of_samples;
+use crate::slam::depth::pattern::{HUBER_GREY, sum_of_samples};
 use crate::slam::kernel::{Floats, Instructions};
-
-/// Residuals beyond this many grey levels grow linearly (Engel, Koltun, Cremers 2018).
-const HUBER_GREY: f32 = 9.0;
 
 /// ρ(r) by sample: r² up to [`HUBER_GREY`], linear beyond; r = `seen` − `expected`. Without the division of a weight.
 #[inline(always)]

@@ -5,6 +5,18 @@
 pub const PATTERN: [(i32, i32); 8] =
     [(0, -2), (-1, -1), (1, -1), (-2, 0), (0, 0), (2, 0), (-1, 1), (0, 2)];
 
+/// Residuals of a sample beyond this many grey levels grow linearly (Engel, Koltun, Cremers 2018).
+pub const HUBER_GREY: f32 = 9.0;
+
+/// Weight of a sample with this gradient, `c²/(c²+‖g‖²)`: strong gradients misjudge sub-pixel errors as residual.
+#[inline]
+pub fn sample_weight(gradient_u: f32, gradient_v: f32) -> f32 {
+    /// Gradient, grey levels a pixel, at which the weight is one half.
+    const HALF_WEIGHT_GRADIENT: f32 = 50.0;
+    let half = HALF_WEIGHT_GRADIENT * HALF_WEIGHT_GRADIENT;
+    half / (half + gradient_u * gradient_u + gradient_v * gradient_v)
+}
+
 /// The sum over its samples, in pairs: an order that eight lanes can do.
 #[inline(always)]
 pub fn sum_of_samples(of: &[f32; 8]) -> f32 {

@@ -67,8 +67,8 @@ pub fn propagate(
     let mut reprojected = std::mem::take(&mut target.reprojected);
     reprojected.resize_with(height.div_ceil(BAND_ROWS), Vec::new);
     let view = TwoView::new(intrinsics, target_from_source);
-    let brighter = (brightness.a.exp() as f32, brightness.b as f32);
-    let reprojection = Reprojection::new(source, target, view, brighter, params);
+    let (gain, offset) = (brightness.a.exp() as f32, brightness.b as f32);
+    let reprojection = Reprojection { source, target, view, gain, offset, params };
     let kernel = Kernel::fastest();
     reprojected.par_iter_mut().enumerate().for_each(|(band, reprojected)| {
         reprojected.clear();
@@ -106,19 +106,6 @@ struct Places {
     r_z: [f32; LANES],
     /// Whether they do, away from the target's border.
     inside: [bool; LANES],
-}
-
-impl<'a> Reprojection<'a> {
-    /// The reprojection between two maps, seen like this; brightness grows by a gain and an offset.
-    fn new(
-        source: &'a DepthMap,
-        target: &'a DepthMap,
-        view: TwoView,
-        (gain, offset): (f32, f32),
-        params: &'a PropagationParams,
-    ) -> Self {
-        Self { source, target, view, gain, offset, params }
-    }
 }
 
 /// Source rows whose hypotheses are carried, in their order.
@@ -415,7 +402,9 @@ mod tests {
         }
         let params = PropagationParams::default();
         let view = TwoView::new(&SCENE_CAMERA, &new_from_old);
-        let carrier = Reprojection::new(&maps[0], &maps[1], view, (1.02, -1.0), &params);
+        let [source, target] = &maps;
+        let (gain, offset) = (1.02, -1.0);
+        let carrier = Reprojection { source, target, view, gain, offset, params: &params };
         let rows = BORDER_PX..SCENE_CAMERA.height - BORDER_PX;
         let (mut portable, mut fast) = (Vec::new(), Vec::new());
         let carry = |kernel: Kernel, reprojected| {

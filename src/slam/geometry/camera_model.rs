@@ -94,6 +94,10 @@ const NEWTON_STEPS: usize = 20;
 /// Residual, in focal lengths, below which an inverse counts as found: far below any pixel.
 const INVERSE_TOLERANCE: f64 = 1e-11;
 
+/// Below this distance from the optical axis, relative to z, `θ_d / radius` is its limit `1/z`: the
+/// next term is smaller by the square of this, beyond f64.
+const ON_AXIS_RATIO: f64 = 1e-8;
+
 /// A calibrated camera: intrinsics of the raw image and the lens.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CameraModel {
@@ -130,20 +134,8 @@ impl CameraModel {
     /// (radtan, pinhole) or outside the lens' valid region; the pixel may lie outside the image.
     pub fn project(&self, point_in_camera: &Vector3<f64>) -> Option<Vector2<f64>> {
         let bent = match self.distortion.radtan() {
-            Some(k) => {
-                let xy = self.pinhole(point_in_camera)?;
-                radtan_bend(&k, &xy)
-            }
-            None => {
-                let (radius, theta) = self.polar(point_in_camera)?;
-                let scale = equidistant_scale(
-                    self.distortion.coefficients(),
-                    radius,
-                    theta,
-                    point_in_camera.z,
-                );
-                point_in_camera.xy() * scale
-            }
+            Some(k) => radtan_bend(&k, &self.pinhole(point_in_camera)?),
+            None => point_in_camera.xy() * self.equidistant_scale(point_in_camera)?,
         };
         let Intrinsics { fx, fy, cx, cy, .. } = self.intrinsics;
         let pixel = Vector2::new(fx * bent.x + cx, fy * bent.y + cy);
@@ -184,13 +176,17 @@ impl CameraModel {
         (xy.norm_squared() <= self.limit * self.limit).then_some(xy)
     }
 
-    /// Distance from the optical axis and angle against it, where the equidistant lens is valid.
-    fn polar(&self, point: &Vector3<f64>) -> Option<(f64, f64)> {
+    /// `θ_d / radius`, which takes (X, Y) to the bent plane, where the equidistant lens is valid for the point.
+    fn equidistant_scale(&self, point: &Vector3<f64>) -> Option<f64> {
         let radius = point.xy().norm();
         let theta = radius.atan2(point.z);
         // The point at the camera itself has no direction.
         let has_direction = radius > 0.0 || point.z > 0.0;
-        (has_direction && theta <= self.limit).then_some((radius, theta))
+        let is_on_axis = point.z > 0.0 && radius < ON_AXIS_RATIO * point.z;
+        (has_direction && theta <= self.limit).then(|| match is_on_axis {
+            true => 1.0 / point.z,
+            false => equidistant_angle(self.distortion.coefficients(), theta) / radius,
+        })
     }
 }
 
@@ -206,17 +202,25 @@ fn rising_limit(distortion: &Distortion) -> f64 {
     first_failure(at, |radius| radtan_slope(&k, radius * radius) > 0.0)
 }
 
+/// An interval after so many halvings, at whose first end `holds` and at whose other end it does not.
+pub(super) fn bisected(
+    [mut good, mut bad]: [f64; 2],
+    halvings: usize,
+    holds: impl Fn(f64) -> bool,
+) -> [f64; 2] {
+    for _ in 0..halvings {
+        let middle = 0.5 * (good + bad);
+        if holds(middle) { good = middle } else { bad = middle }
+    }
+    [good, bad]
+}
+
 /// The last value along `at(0..=LIMIT_SAMPLES)` before `holds` first fails, bisected.
 fn first_failure(at: impl Fn(usize) -> f64, holds: impl Fn(f64) -> bool) -> f64 {
     let Some(fails) = (1..=LIMIT_SAMPLES).find(|&i| !holds(at(i))) else {
         return at(LIMIT_SAMPLES);
     };
-    let (mut good, mut bad) = (at(fails - 1), at(fails));
-    for _ in 0..BISECTIONS {
-        let middle = 0.5 * (good + bad);
-        if holds(middle) { good = middle } else { bad = middle }
-    }
-    good
+    bisected([at(fails - 1), at(fails)], BISECTIONS, holds)[0]
 }
 
 /// Numerator and denominator of the radial factor and their derivatives by r².
@@ -292,11 +296,7 @@ fn invert_rising(f: impl Fn(f64) -> f64, value: f64, limit: f64) -> Option<f64> 
     if value.is_nan() || value > f(limit) {
         return None;
     }
-    let (mut low, mut high) = (0.0, limit);
-    for _ in 0..BISECTIONS {
-        let middle = 0.5 * (low + high);
-        if f(middle) < value { low = middle } else { high = middle }
-    }
+    let [low, high] = bisected([0.0, limit], BISECTIONS, |middle| f(middle) < value);
     Some(0.5 * (low + high))
 }
 
@@ -309,19 +309,6 @@ fn equidistant_angle(k: &[f64], theta: f64) -> f64 {
 fn equidistant_slope(k: &[f64], theta: f64) -> f64 {
     let t2 = theta * theta;
     1.0 + t2 * (3.0 * k[0] + t2 * (5.0 * k[1] + t2 * (7.0 * k[2] + t2 * 9.0 * k[3])))
-}
-
-/// Below this distance from the optical axis, relative to z, `θ_d / radius` is its limit `1/z`: the
-/// next term is smaller by the square of this, beyond f64.
-const ON_AXIS_RATIO: f64 = 1e-8;
-
-/// `θ_d / radius`, which takes (X, Y) to the bent plane.
-fn equidistant_scale(k: &[f64], radius: f64, theta: f64, z: f64) -> f64 {
-    if z > 0.0 && radius < ON_AXIS_RATIO * z {
-        1.0 / z
-    } else {
-        equidistant_angle(k, theta) / radius
-    }
 }
 
 #[cfg(test)]

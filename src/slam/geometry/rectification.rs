@@ -2,7 +2,7 @@
 
 use nalgebra::{Vector2, Vector3};
 
-use crate::slam::geometry::camera_model::CameraModel;
+use crate::slam::geometry::camera_model::{CameraModel, bisected};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::image::buffer::Image;
 
@@ -107,20 +107,21 @@ fn has_data(raw: &Intrinsics, pixel: &Vector2<f64>) -> bool {
         && (0.0..=(raw.height - 1) as f64).contains(&pixel.y)
 }
 
-/// The raw position seen by a rectified pixel.
+/// The raw position that sees a ray; `None` where there is no data.
+fn seen(camera: &CameraModel, ray: &Vector3<f64>) -> Option<Vector2<f64>> {
+    camera.project(ray).filter(|pixel| has_data(camera.intrinsics(), pixel))
+}
+
+/// The raw position seen by a rectified pixel; `None` where there is no data.
 fn raw_pixel(camera: &CameraModel, rectified: &Intrinsics, u: f64, v: f64) -> Option<Vector2<f64>> {
-    let ray = rectified.ray(u, v);
-    camera.project(&ray)
+    seen(camera, &rectified.ray(u, v))
 }
 
 /// Whether every pixel on the border of the view has data. The region with data is in one piece
 /// without holes, so what lies inside the border has data too.
 fn border_has_data(camera: &CameraModel, rectified: &Intrinsics) -> bool {
     let (right, bottom) = (rectified.width - 1, rectified.height - 1);
-    let seen = |u: usize, v: usize| {
-        raw_pixel(camera, rectified, u as f64, v as f64)
-            .is_some_and(|pixel| has_data(camera.intrinsics(), &pixel))
-    };
+    let seen = |u: usize, v: usize| raw_pixel(camera, rectified, u as f64, v as f64).is_some();
     (0..=right).all(|u| seen(u, 0) && seen(u, bottom))
         && (0..=bottom).all(|v| seen(0, v) && seen(right, v))
 }
@@ -132,11 +133,7 @@ fn border_has_data(camera: &CameraModel, rectified: &Intrinsics) -> bool {
 /// above and below the axis are tried; the narrowest row of a run bounds it.
 fn largest_view(camera: &CameraModel) -> Option<View> {
     let widest = WIDEST_HALF_VIEW_RAD.tan();
-    let seen = |x: f64, y: f64| {
-        camera
-            .project(&Vector3::new(x, y, 1.0))
-            .is_some_and(|pixel| has_data(camera.intrinsics(), &pixel))
-    };
+    let seen = |x: f64, y: f64| seen(camera, &Vector3::new(x, y, 1.0)).is_some();
     let top = -extent(widest, |step| seen(0.0, -step));
     let bottom = extent(widest, |step| seen(0.0, step));
     let rows_in = |end: f64| {
@@ -171,12 +168,7 @@ fn extent(end: f64, holds: impl Fn(f64) -> bool) -> f64 {
     if fails == 0 {
         return 0.0;
     }
-    let (mut good, mut bad) = (at(fails - 1), at(fails));
-    for _ in 0..WALK_BISECTIONS {
-        let middle = 0.5 * (good + bad);
-        if holds(middle) { good = middle } else { bad = middle }
-    }
-    good
+    bisected([at(fails - 1), at(fails)], WALK_BISECTIONS, holds)[0]
 }
 
 /// Where each rectified pixel reads in the raw image.
@@ -211,7 +203,6 @@ impl Rectification {
         for v in 0..height {
             for u in 0..width {
                 let pixel = raw_pixel(camera, &intrinsics, u as f64, v as f64)
-                    .filter(|pixel| has_data(&intrinsics, pixel))
                     .ok_or(RectificationError::NoView)?;
                 let (column, right) = split(pixel.x, width);
                 let (row, down) = split(pixel.y, height);

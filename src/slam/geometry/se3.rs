@@ -81,7 +81,9 @@ impl SE3 {
         let mut adjoint = Matrix6::zeros();
         adjoint.fixed_view_mut::<3, 3>(0, 0).copy_from(&rotation);
         adjoint.fixed_view_mut::<3, 3>(3, 3).copy_from(&rotation);
-        adjoint.fixed_view_mut::<3, 3>(0, 3).copy_from(&(hat(&self.translation) * rotation));
+        adjoint
+            .fixed_view_mut::<3, 3>(0, 3)
+            .copy_from(&(self.translation.cross_matrix() * rotation));
         adjoint
     }
 
@@ -110,15 +112,10 @@ impl Mul<Vector3<f64>> for SE3 {
     }
 }
 
-/// The skew-symmetric matrix with `hat(a) * b = a × b`.
-pub fn hat(v: &Vector3<f64>) -> Matrix3<f64> {
-    Matrix3::new(0.0, -v.z, v.y, v.z, 0.0, -v.x, -v.y, v.x, 0.0)
-}
-
 /// Left Jacobian of SO(3): carries the translation part of a twist to the translation.
 fn left_jacobian(omega: &Vector3<f64>) -> Matrix3<f64> {
     let angle = omega.norm();
-    let hat = hat(omega);
+    let hat = omega.cross_matrix();
     let (first, second) = if angle < SMALL_ANGLE_RAD {
         (0.5 - angle * angle / 24.0, 1.0 / 6.0 - angle * angle / 120.0)
     } else {
@@ -130,7 +127,7 @@ fn left_jacobian(omega: &Vector3<f64>) -> Matrix3<f64> {
 /// Inverse of [`left_jacobian`].
 fn left_jacobian_inverse(omega: &Vector3<f64>) -> Matrix3<f64> {
     let angle = omega.norm();
-    let hat = hat(omega);
+    let hat = omega.cross_matrix();
     let second = if angle < SMALL_ANGLE_RAD {
         1.0 / 12.0 + angle * angle / 720.0
     } else {

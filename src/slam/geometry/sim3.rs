@@ -7,7 +7,7 @@ use std::ops::Mul;
 
 use nalgebra::{Matrix3, Matrix6, SMatrix, SVector, UnitQuaternion, Vector3};
 
-use crate::slam::geometry::se3::{SE3, hat};
+use crate::slam::geometry::se3::SE3;
 
 /// A twist of Sim(3): translation, rotation, log scale.
 pub type Twist7 = SVector<f64, 7>;
@@ -142,7 +142,7 @@ fn parts(twist: &Twist7) -> (Vector3<f64>, Vector3<f64>, f64) {
 /// ∫₀¹ exp(τ(λI + ω^)) dτ, which carries the translation of a twist to the translation: Σ Mᵏ/(k+1)! with M = λI + ω^.
 /// The series needs no case for small angles, small scales or both.
 fn translation_jacobian(omega: &Vector3<f64>, log_scale: f64) -> Matrix3<f64> {
-    let generator = hat(omega) + Matrix3::identity() * log_scale;
+    let generator = omega.cross_matrix() + Matrix3::identity() * log_scale;
     let (mut term, mut sum) = (Matrix3::identity(), Matrix3::identity());
     for k in 1..MAX_TERMS {
         term = generator * term / f64::from(k + 1);
@@ -160,7 +160,7 @@ fn translation_jacobian(omega: &Vector3<f64>, log_scale: f64) -> Matrix3<f64> {
 /// so that only the upper blocks are summed; the inverse is made by blocks, too. NaN where the twist is not finite.
 pub fn left_jacobian_inverse(twist: &Twist7) -> Matrix7 {
     let (upsilon, omega, log_scale) = parts(twist);
-    let (upsilon_hat, omega_hat) = (hat(&upsilon), hat(&omega));
+    let (upsilon_hat, omega_hat) = (upsilon.cross_matrix(), omega.cross_matrix());
     let generator = omega_hat + Matrix3::identity() * log_scale;
     // adᵏ/(k+1)!, and the sum over k; k = 1 here.
     let (mut motion, mut turn) = (generator * 0.5, omega_hat * 0.5);

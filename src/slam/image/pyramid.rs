@@ -31,19 +31,9 @@ impl Pyramid {
         }
     }
 
-    /// The image of one level.
-    pub fn level(&self, level: usize) -> &Image<f32> {
-        &self.levels[level]
-    }
-
     /// All levels, finest first.
     pub fn levels(&self) -> &[Image<f32>] {
         &self.levels
-    }
-
-    /// Number of levels.
-    pub fn num_levels(&self) -> usize {
-        self.levels.len()
     }
 }
 

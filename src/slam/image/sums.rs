@@ -58,11 +58,11 @@ impl SumPyramid {
             }
         }
         if let Some(first) = self.levels.get_mut(1) {
-            halve_bytes(pixels, self.width, first);
+            halve(pixels, self.width, first);
         }
         for level in 2..self.levels.len() {
             let (fine, coarse) = self.levels.split_at_mut(level);
-            halve_sums(&fine[level - 1], &mut coarse[0]);
+            halve(fine[level - 1].pixels(), fine[level - 1].width(), &mut coarse[0]);
         }
     }
 
@@ -82,33 +82,20 @@ impl SumPyramid {
     }
 }
 
-fn halve_bytes(pixels: &[u8], width: usize, coarse: &mut Image<u16>) {
+/// Sums of 2×2 numbers in rows of `width`.
+fn halve<T: Copy + Into<u16>>(fine: &[T], width: usize, coarse: &mut Image<u16>) {
     let coarse_width = coarse.width();
     if coarse_width == 0 {
         return;
     }
-    let rows = pixels.chunks_exact(2 * width);
+    let rows = fine.chunks_exact(2 * width);
     for (out, rows) in coarse.pixels_mut().chunks_exact_mut(coarse_width).zip(rows) {
         let (upper, lower) = rows.split_at(width);
         let pairs = upper.as_chunks::<2>().0.iter().zip(lower.as_chunks::<2>().0);
-        for (out, (up, low)) in out.iter_mut().zip(pairs) {
-            *out = (u16::from(up[0]) + u16::from(up[1])) + (u16::from(low[0]) + u16::from(low[1]));
-        }
-    }
-}
-
-fn halve_sums(fine: &Image<u16>, coarse: &mut Image<u16>) {
-    let (fine_width, coarse_width) = (fine.width(), coarse.width());
-    if coarse_width == 0 {
-        return;
-    }
-    let rows = fine.pixels().chunks_exact(2 * fine_width);
-    for (out, rows) in coarse.pixels_mut().chunks_exact_mut(coarse_width).zip(rows) {
-        let (upper, lower) = rows.split_at(fine_width);
-        let pairs = upper.as_chunks::<2>().0.iter().zip(lower.as_chunks::<2>().0);
-        for (out, (up, low)) in out.iter_mut().zip(pairs) {
+        for (out, (&up, &low)) in out.iter_mut().zip(pairs) {
+            let [[a, b], [c, d]] = [up, low].map(|pair| pair.map(Into::into));
             // Sums of a fresh pyramid cannot overflow (MAX_LEVELS); wrapping spares the check.
-            *out = up[0].wrapping_add(up[1]).wrapping_add(low[0].wrapping_add(low[1]));
+            *out = a.wrapping_add(b).wrapping_add(c.wrapping_add(d));
         }
     }
 }

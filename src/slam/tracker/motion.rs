@@ -8,17 +8,11 @@ use nalgebra::Vector6;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 
-/// A pose with its stamp.
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct Seen {
-    nanos: i64,
-    world_from_camera: SE3,
-}
-
 /// The last good pose and the velocity before it.
 #[derive(Debug, Clone, Default)]
 pub struct Motion {
-    last: Option<Seen>,
+    /// Stamp, nanoseconds, and `world_from_camera`.
+    last: Option<(i64, SE3)>,
     /// Twist of `last_from_next` per interval, and the interval in nanoseconds.
     velocity: Option<(Vector6<f64>, f64)>,
 }
@@ -29,13 +23,12 @@ const LONGEST_EXTRAPOLATION: f64 = 3.0;
 impl Motion {
     /// Takes in a good pose.
     pub fn observe(&mut self, nanos: i64, world_from_camera: &SE3) {
-        let now = Seen { nanos, world_from_camera: *world_from_camera };
-        self.velocity = self.last.and_then(|last| {
-            let interval = nanos.checked_sub(last.nanos).filter(|&interval| interval > 0)?;
-            let twist = (last.world_from_camera.inverse() * *world_from_camera).log();
+        self.velocity = self.last.and_then(|(before, last)| {
+            let interval = nanos.checked_sub(before).filter(|&interval| interval > 0)?;
+            let twist = (last.inverse() * *world_from_camera).log();
             Some((twist, interval as f64))
         });
-        self.last = Some(now);
+        self.last = Some((nanos, *world_from_camera));
     }
 
     /// The keyframe that the poses are known from has been moved: they stay where they are relative to it.
@@ -43,8 +36,8 @@ impl Motion {
         if before == after {
             return;
         }
-        if let Some(last) = &mut self.last {
-            last.world_from_camera = after.place(&before.locate(&last.world_from_camera));
+        if let Some((_, last)) = &mut self.last {
+            *last = after.place(&before.locate(last));
         }
         if let Some((twist, _)) = &mut self.velocity {
             let factor = after.scale / before.scale;
@@ -77,30 +70,30 @@ impl Motion {
         /// A frame at 30 Hz, nanoseconds.
         const INTERVAL: f64 = 1e9 / 30.0;
         self.velocity?;
-        let last = self.last?;
-        let intervals = nanos.saturating_sub(last.nanos) as f64 / INTERVAL;
+        let (before, last) = self.last?;
+        let intervals = nanos.saturating_sub(before) as f64 / INTERVAL;
         let predicted = self.predict(nanos, 1.0)?;
-        Some((intervals.max(1.0), last.world_from_camera.inverse() * predicted))
+        Some((intervals.max(1.0), last.inverse() * predicted))
     }
 
     /// The last good pose, `None` before the first.
     pub fn last(&self) -> Option<SE3> {
-        self.last.map(|last| last.world_from_camera)
+        self.last.map(|(_, last)| last)
     }
 
     /// The same with its stamp, nanoseconds.
     pub fn last_seen(&self) -> Option<(i64, SE3)> {
-        self.last.map(|last| (last.nanos, last.world_from_camera))
+        self.last
     }
 
     /// The pose at `nanos` if the camera moved on with `factor` of its velocity; `None` before
     /// the first pose.
     pub fn predict(&self, nanos: i64, factor: f64) -> Option<SE3> {
-        let last = self.last?;
-        let Some((twist, interval)) = self.velocity else { return Some(last.world_from_camera) };
-        let elapsed = nanos.saturating_sub(last.nanos) as f64;
+        let (before, last) = self.last?;
+        let Some((twist, interval)) = self.velocity else { return Some(last) };
+        let elapsed = nanos.saturating_sub(before) as f64;
         let share = (elapsed / interval).clamp(0.0, LONGEST_EXTRAPOLATION);
-        Some(last.world_from_camera * SE3::exp(&(twist * (factor * share))))
+        Some(last * SE3::exp(&(twist * (factor * share))))
     }
 }
 

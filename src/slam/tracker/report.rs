@@ -1,4 +1,4 @@
-//! What is said of a frame: judged, with its covariance, or not claimed.
+//! What is said of a frame: judged, with its covariance, or not claimed; and when a new keyframe is asked for.
 
 use nalgebra::Matrix6;
 
@@ -118,6 +118,28 @@ impl Tracker {
         }
     }
 
+    /// Whether the camera is so far from the keyframe that a new one is due.
+    fn proposes_keyframe(
+        &self,
+        reference: &Reference,
+        alignment: &Alignment,
+        quality: &Quality,
+    ) -> bool {
+        let translation = alignment.state.current_from_keyframe.translation.norm();
+        let in_mean_depths = translation * reference.mean_inverse_depth();
+        self.params.keyframe_distance().distance(in_mean_depths, quality.in_view_ratio) > 1.0
+            || self.has_other_light(reference, &alignment.state.brightness)
+    }
+
+    /// Whether what has the mean grey value in the keyframe is so much brighter or darker in a frame.
+    fn has_other_light(&self, reference: &Reference, brightness: &Brightness) -> bool {
+        /// Below a few grey levels a ratio is one of noise.
+        const LEAST_GREY: f64 = 5.0;
+        let in_keyframe = reference.mean_grey().max(LEAST_GREY);
+        let in_frame = (brightness.a.exp() * in_keyframe + brightness.b).max(LEAST_GREY);
+        (in_frame / in_keyframe).ln().abs() > self.params.keyframe_brightness_ratio.ln()
+    }
+
     /// The figures of an alignment, with the displacement of the whole image.
     pub(super) fn quality(&self, alignment: &Alignment) -> Quality {
         let displacement_px = self.params.covariance_floor.displacement_px(
@@ -210,8 +232,6 @@ impl Tracker {
 }
 
 fn is_finite(quality: &Quality) -> bool {
-    [quality.whitened_rmse, quality.residual_rmse, quality.mean_squared_flow]
-        .iter()
-        .chain(&[quality.displacement_px])
-        .all(|figure| figure.is_finite())
+    let Quality { whitened_rmse, residual_rmse, mean_squared_flow, displacement_px, .. } = quality;
+    [whitened_rmse, residual_rmse, mean_squared_flow, displacement_px].iter().all(|x| x.is_finite())
 }

@@ -8,7 +8,7 @@
 use nalgebra::{Matrix3, Matrix6};
 
 use crate::slam::alignment::align::{Aligner, Alignment, AlignmentParams, Ending};
-use crate::slam::alignment::reference::{Reference, ReferenceScratch};
+use crate::slam::alignment::reference::Reference;
 use crate::slam::alignment::unknown_depth::UnknownDepth;
 use crate::slam::depth::common_error::rotation_std_dev;
 use crate::slam::frame::FrameView;
@@ -72,7 +72,7 @@ const AHEAD_IN_VIEW: f64 = 0.5;
 /// The view that frames are aligned to, and the frame before.
 #[derive(Debug)]
 pub(super) struct Turning {
-    unknown: UnknownDepth,
+    pub(super) unknown: UnknownDepth,
     /// Expects about the same exposure.
     aligner: Aligner,
     /// Lent while a frame is aligned to it.
@@ -160,11 +160,6 @@ impl Turning {
             frames: Frames::default(),
             is_due: false,
         }
-    }
-
-    /// The memory that views are prepared in.
-    pub(super) fn scratch(&mut self) -> &mut ReferenceScratch {
-        self.unknown.scratch()
     }
 
     /// Keeps the frame in `pyramid`, into which another will be filled.
@@ -399,16 +394,13 @@ impl Tracker {
         let state = TrackingState::Degraded(DegradedReason::Turning);
         let published = upper_triangle(|row, column| published[(row, column)]);
         let estimate = PoseEstimate {
-            state,
             world_from_camera,
             map_from_camera,
             keyframe_from_camera,
             covariance: published,
             map_covariance: upper_triangle(|row, column| in_map[(row, column)]),
             alignment_covariance: published,
-            brightness: Brightness::default(),
             quality,
-            proposes_keyframe: false,
             ..self.unclaimed(frame, Some(reference), state)
         };
         Some((estimate, covariance))

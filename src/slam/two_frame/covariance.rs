@@ -24,10 +24,15 @@ pub fn depth_variances(
         if !point.visible || !(point.information > 0.0) || !(point.squared_speed > 0.0) {
             return f32::INFINITY;
         }
-        let mixed = SVector::from(point.mixed.map(f64::from)) / f64::from(point.information);
-        let from_pose = (mixed.transpose() * pose_covariance * mixed)[0] as f32;
-        noise * (1.0 / point.information + from_pose) + match_variance_px / point.squared_speed
+        noise * (1.0 / point.information + from_pose(&point, pose_covariance))
+            + match_variance_px / point.squared_speed
     }));
+}
+
+/// What the uncertainty of the pose adds to the variance of a point's inverse depth, for residuals of variance 1.
+fn from_pose(point: &PointSystem, pose_covariance: &PoseMatrix) -> f32 {
+    let mixed = SVector::from(point.mixed.map(f64::from)) / f64::from(point.information);
+    (mixed.transpose() * pose_covariance * mixed)[0] as f32
 }
 
 /// Median over the visible points of the relative error that the uncertainty of the pose gives all depths
@@ -42,13 +47,8 @@ pub fn common_error(
     let is_placed =
         |(point, d): &(PointSystem, &f32)| point.visible && point.information > 0.0 && **d > 0.0;
     let points = system.points().zip(&state.inverse_depths).filter(is_placed);
-    let mut errors: Vec<f32> = points
-        .map(|(point, d)| {
-            let mixed = SVector::from(point.mixed.map(f64::from)) / f64::from(point.information);
-            let variance = (mixed.transpose() * pose_covariance * mixed)[0] as f32 * noise;
-            variance.sqrt() / d
-        })
-        .collect();
+    let mut errors: Vec<f32> =
+        points.map(|(point, d)| (from_pose(&point, pose_covariance) * noise).sqrt() / d).collect();
     upper_median(&mut errors, f32::total_cmp).map_or(f64::INFINITY, f64::from)
 }
 

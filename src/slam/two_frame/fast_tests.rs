@@ -89,7 +89,7 @@ fn directions_are_tried_in_the_first_frame() {
     let mut initializer = initializer();
     initializer.step(&frames[0]);
     initializer.step(&frames[1]);
-    let rival = initializer.joint.rival();
+    let rival = initializer.joint.rival;
     assert!(rival.is_some(), "from rest alone there is but one motion");
 }
 

@@ -224,7 +224,7 @@ fn energy(system: &System, state: &State, medians: &[f32], weights: PriorWeights
     system.energy + prior_energy(&state.inverse_depths, medians, weights)
 }
 
-/// The step of what may move; where the depths may, those after it go to `trial_depths`.
+/// The step of what may move; where the depths may, those after it go to `trial_depths`. `None` where it cannot be taken.
 fn step_of(
     freedom: Freedom,
     scratch: &mut FitScratch,
@@ -232,14 +232,17 @@ fn step_of(
     damping: f64,
     weights: PriorWeights,
 ) -> Option<Step> {
-    match freedom {
-        Freedom::Rotation => rotation_step(&scratch.system, damping),
-        Freedom::Pose => pose_step(&scratch.system, damping),
-        Freedom::Everything => {
-            scratch.elimination.weights = weights;
-            joint_step(scratch, state, damping)
-        }
+    if freedom == Freedom::Everything {
+        scratch.elimination.weights = weights;
+        return joint_step(scratch, state, damping);
     }
+    let system = &scratch.system;
+    let mut hessian = system.hessian;
+    for i in 0..NUM_UNKNOWNS {
+        hessian[(i, i)] = hessian[(i, i)] * (1.0 + damping) + f64::MIN_POSITIVE;
+    }
+    let of_pose = solve_free(freedom, system.has_slopes, &hessian, &system.gradient)?;
+    Some(Step { of_pose, promised_drop: -system.gradient.dot(&of_pose) })
 }
 
 /// The state after a step of pose and brightness, without depths.
@@ -262,49 +265,28 @@ fn moved(state: &State, step: &SVector<f64, NUM_UNKNOWNS>) -> State {
     }
 }
 
-/// The step of rotation and brightness; the translation stays.
-fn rotation_step(system: &System, damping: f64) -> Option<Step> {
-    const ROTATION: usize = 3;
-    const HELD: usize = FIRST_SLOPE - ROTATION;
-    const FREE: usize = NUM_UNKNOWNS - ROTATION;
-    let hessian = damped(system, damping);
-    let step = match system.has_slopes {
-        true => solve::<ROTATION, FREE>(&hessian, &system.gradient)?,
-        false => solve::<ROTATION, HELD>(&hessian, &system.gradient)?,
-    };
-    Step::of_pose_alone(step, system)
-}
-
 fn find_medians(input: &FitInput<'_>, state: &State, medians: &mut Vec<f32>) {
     let (neighbours, inverse_depths) = (&input.points.neighbours, &state.inverse_depths);
     Kernel::fastest().run(Medians { neighbours, inverse_depths, medians });
 }
 
-/// The step of pose and brightness with the depths held.
-fn pose_step(system: &System, damping: f64) -> Option<Step> {
-    let step = solve_for_all(system, &damped(system, damping), &system.gradient)?;
-    Step::of_pose_alone(step, system)
-}
-
-/// The normal equations with damping.
-fn damped(system: &System, damping: f64) -> PoseMatrix {
-    let mut hessian = system.hessian;
-    for i in 0..NUM_UNKNOWNS {
-        hessian[(i, i)] = hessian[(i, i)] * (1.0 + damping) + f64::MIN_POSITIVE;
-    }
-    hessian
-}
-
-/// −H⁻¹g over all unknowns that are not held.
-fn solve_for_all(
-    system: &System,
+/// −H⁻¹g over the unknowns of pose and brightness that may move; `None` where that is no step to be taken.
+fn solve_free(
+    freedom: Freedom,
+    has_slopes: bool,
     hessian: &PoseMatrix,
     gradient: &SVector<f64, NUM_UNKNOWNS>,
 ) -> Option<SVector<f64, NUM_UNKNOWNS>> {
-    match system.has_slopes {
-        true => solve::<0, NUM_UNKNOWNS>(hessian, gradient),
-        false => solve::<0, FIRST_SLOPE>(hessian, gradient),
-    }
+    const ROTATION: usize = 3;
+    const HELD: usize = FIRST_SLOPE - ROTATION;
+    const FREE: usize = NUM_UNKNOWNS - ROTATION;
+    let step = match (freedom, has_slopes) {
+        (Freedom::Rotation, true) => solve::<ROTATION, FREE>(hessian, gradient),
+        (Freedom::Rotation, false) => solve::<ROTATION, HELD>(hessian, gradient),
+        (_, true) => solve::<0, NUM_UNKNOWNS>(hessian, gradient),
+        (_, false) => solve::<0, FIRST_SLOPE>(hessian, gradient),
+    };
+    step.filter(is_sane)
 }
 
 /// −H⁻¹g over `COUNT` unknowns from `FIRST` on; the others stay.
@@ -334,21 +316,10 @@ fn joint_step(scratch: &mut FitScratch, state: &State, damping: f64) -> Option<S
             hessian[(r, c)] -= elimination.sums.entry(r, c);
         }
     }
-    let of_pose = solve_for_all(system, &hessian, &gradient)?;
-    if !is_sane(&of_pose) {
-        return None;
-    }
+    let of_pose = solve_free(Freedom::Everything, system.has_slopes, &hessian, &gradient)?;
     let after = &mut scratch.trial_depths;
     let by_depths = elimination.depths_after(system, &state.inverse_depths, &of_pose, after);
     Some(Step { of_pose, promised_drop: by_depths - system.gradient.dot(&of_pose) })
-}
-
-impl Step {
-    /// Depths held; `None` where it cannot be taken.
-    fn of_pose_alone(of_pose: SVector<f64, NUM_UNKNOWNS>, system: &System) -> Option<Self> {
-        let promised_drop = -system.gradient.dot(&of_pose);
-        is_sane(&of_pose).then_some(Self { of_pose, promised_drop })
-    }
 }
 
 /// Whether a step can be taken: finite and within what two frames in a row show.

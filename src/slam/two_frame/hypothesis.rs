@@ -52,9 +52,10 @@ pub struct Hypotheses {
     used: usize,
     /// How many of the first ones are results of the frame before.
     survivors: usize,
-    rival: Option<Rival>,
-    /// Earlier frames that were asked about the latest one.
-    scored_by: usize,
+    /// The second best motion of the latest frame, if the two can be told apart by their direction.
+    pub rival: Option<Rival>,
+    /// How many earlier frames were asked about the latest one: none where there is but one motion.
+    pub scored_by: usize,
 }
 
 impl Hypotheses {
@@ -161,16 +162,6 @@ impl Hypotheses {
         let best = &mut self.all[0];
         let (state, scratch) = (&mut best.state, &mut best.scratch);
         best.energy = fit_level(input, level, Freedom::Everything, state, scratch, params);
-    }
-
-    /// The second best motion of the latest frame, if the two can be told apart by their direction.
-    pub fn rival(&self) -> Option<Rival> {
-        self.rival
-    }
-
-    /// How many earlier frames were asked about the latest one: none where there is but one motion.
-    pub fn scored_by(&self) -> usize {
-        self.scored_by
     }
 
     /// The best fit with its normal equations at the finest level; before any fit the state given first.

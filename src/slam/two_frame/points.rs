@@ -3,7 +3,7 @@
 
 use crate::slam::depth::candidate::{CandidateParams, CandidateSelector};
 use crate::slam::depth::gradient_image::GradientImage;
-use crate::slam::depth::pattern::PATTERN;
+use crate::slam::depth::pattern::{PATTERN, sample_weight};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::image::buffer::Image;
 use crate::slam::image::pyramid::Pyramid;
@@ -11,9 +11,6 @@ use crate::slam::two_frame::lanes::{LANES, Lanes};
 
 /// Neighbours that a point's depth is smoothed with.
 pub const NUM_NEIGHBOURS: usize = 8;
-
-/// Gradient, grey levels a pixel, at which the weight of a sample is one half.
-const HALF_WEIGHT_GRADIENT: f32 = 50.0;
 
 /// A block of points as one pyramid level shows them.
 #[derive(Debug, Clone, Copy)]
@@ -57,10 +54,11 @@ impl Points {
         self.selector.choose(image, params, &mut chosen);
         self.pixels.clear();
         self.pixels.extend(chosen.iter().map(|c| (c.u, c.v)));
-        self.patches.resize(pyramid.num_levels(), Vec::new());
-        for (level, patches) in self.patches.iter_mut().enumerate() {
+        self.patches.resize(pyramid.levels().len(), Vec::new());
+        let levels = self.patches.iter_mut().zip(pyramid.levels());
+        for (level, (patches, image)) in levels.enumerate() {
             patches.clear();
-            let block = |pixels: &[_]| patches_at(pyramid.level(level), level, pixels);
+            let block = |pixels: &[_]| patches_at(image, level, pixels);
             patches.extend(self.pixels.chunks(LANES).map(block));
         }
         self.neighbours.clear();
@@ -117,9 +115,8 @@ fn fill_lane(
         let (x, y) = (u + *x as f32, v + *y as f32);
         let gu = 0.5 * (image.bilinear(x + 1.0, y) - image.bilinear(x - 1.0, y));
         let gv = 0.5 * (image.bilinear(x, y + 1.0) - image.bilinear(x, y - 1.0));
-        let half = HALF_WEIGHT_GRADIENT * HALF_WEIGHT_GRADIENT;
         block.intensities[k][l] = image.bilinear(x, y);
-        block.weights[k][l] = half / (half + gu * gu + gv * gv);
+        block.weights[k][l] = sample_weight(gu, gv);
         block.weight[l] += block.weights[k][l];
     }
 }

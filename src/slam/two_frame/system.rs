@@ -17,7 +17,7 @@
 
 use nalgebra::{SMatrix, SVector};
 
-use crate::slam::depth::pattern::PATTERN;
+use crate::slam::depth::pattern::{HUBER_GREY, PATTERN};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::image::buffer::Image;
 use crate::slam::two_frame::lanes::{
@@ -26,9 +26,6 @@ use crate::slam::two_frame::lanes::{
 use crate::slam::two_frame::points::PatchBlock;
 use crate::slam::two_frame::sampling_kernel::WindowSampler;
 use crate::slam::two_frame::state::State;
-
-/// Residuals beyond this many grey levels grow linearly (Engel, Koltun, Cremers 2018).
-pub const HUBER_GREY: f32 = 9.0;
 
 /// One level of the current frame and of the points.
 #[derive(Debug, Clone, Copy)]

@@ -145,7 +145,7 @@ fn the_interval_shrinks_as_the_baseline_grows() {
         let frames = (0..16).map(|i| sequence.frame(i));
         histories.push(interval_history(&sequence.keyframe, start, frames, &params));
     }
-    let width = |s: &IntervalSample| Some(s.max_inverse_depth? - s.min_inverse_depth);
+    let width = |s: &ImmaturePoint| Some(s.max_inverse_depth? - s.min_inverse_depth);
     let median_after = |frame: usize| {
         let mut widths: Vec<f32> = histories
             .iter()
@@ -161,7 +161,7 @@ fn the_interval_shrinks_as_the_baseline_grows() {
     assert!(medians.windows(2).all(|w| w[1] < 0.7 * w[0]), "{medians:?}");
     assert!(medians[3] < 0.12 * medians[0], "{medians:?}");
     let (near, all) = histories.iter().fold((0, 0), |(n, a), h| match h[15].status {
-        TraceStatus::Good => (n + usize::from(h[15].segment_px < 8.0), a + 1),
+        TraceStatus::Good => (n + usize::from(h[15].last_segment_px < 8.0), a + 1),
         _ => (n, a),
     });
     assert!(near * 2 > all);

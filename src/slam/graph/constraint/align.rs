@@ -176,10 +176,9 @@ impl ConstraintParams {
         state: &State,
         weighed_at: &State,
     ) -> Level<'a> {
-        let weighting = self.alignment.weighting(level);
         let is_finest = level == views[0].levels().start;
         let depth_model = if is_finest { self.depth_model_ratio } else { self.coarse_depth_ratio };
-        Level::new(views, level, state, weighed_at, &weighting, depth_model)
+        Level::new(views, level, state, weighed_at, &self.alignment, depth_model)
     }
 
     /// Huber's weight of a point whose whitened squared residual is this.

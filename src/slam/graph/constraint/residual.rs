@@ -14,8 +14,9 @@
 use nalgebra::SVector;
 
 use super::view::{DepthGrid, KeyframeView};
+use crate::slam::alignment::align::AlignmentParams;
 use crate::slam::alignment::points::Point;
-use crate::slam::alignment::residual::{Evaluation, PointTerms, Weighting, point_terms};
+use crate::slam::alignment::residual::{Evaluation, PointTerms, point_terms};
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::buffer::Image;
@@ -140,12 +141,12 @@ impl<'a> Level<'a> {
         level: usize,
         state: &State,
         weighed_at: &State,
-        weighting: &Weighting,
+        params: &AlignmentParams,
         depth_model_ratio: f64,
     ) -> Self {
         let intrinsics = i.reference.intrinsics().at_level(level);
         let (t, brightness) = (&weighed_at.rigid.translation, state.brightness);
-        let at = Evaluation::new(&intrinsics, level, &state.rigid, brightness, weighting, t);
+        let at = Evaluation::new(&intrinsics, level, &state.rigid, brightness, params, t);
         let (image, depths) = (j.pyramid.level(level), &j.depths[level]);
         Self { view: i, image, depths, level, at, state: *state, depth_model_ratio }
     }

@@ -1,6 +1,6 @@
 //! A keyframe prepared for being aligned to others, and others to it.
 
-use crate::slam::alignment::fusion::Candidates;
+use crate::slam::alignment::fusion::LevelPoint;
 use crate::slam::alignment::reference::num_levels;
 use crate::slam::alignment::reference::{Reference, ReferenceParams, ReferenceScratch};
 use crate::slam::image::sums::SumPyramid;
@@ -30,13 +30,13 @@ pub(super) struct DepthGrid {
 
 impl DepthGrid {
     /// Of the pixels with depth of a level.
-    pub(super) fn new(candidates: &Candidates, width: usize, height: usize) -> Self {
+    pub(super) fn new(candidates: &[LevelPoint], width: usize, height: usize) -> Self {
         /// Neighbours of a pixel, those that share a side first.
         const BESIDE: [[isize; 2]; 8] =
             [[-1, 0], [1, 0], [0, -1], [0, 1], [-1, -1], [1, -1], [-1, 1], [1, 1]];
         let mut nearest = vec![0u32; width * height];
         let mut surfaces = Vec::with_capacity(candidates.len());
-        for candidate in candidates.as_slice() {
+        for candidate in candidates {
             let (u, v) = (usize::from(candidate.u), usize::from(candidate.v));
             if u >= width || v >= height {
                 continue;
