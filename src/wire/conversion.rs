@@ -17,13 +17,12 @@ use crate::slam::place_covariance::{PLACE_ENTRIES, PlaceCovariance};
 use crate::slam::pose::{
     Brightness, DegradedReason, LostReason, PoseEstimate, Quality, TrackingState,
 };
+use crate::wire::conversion::velocity::put_velocity;
+pub use crate::wire::conversion::velocity::velocity_from_message;
 use crate::wire::message::{
     FrameHeader, KeyframeHeader, KeyframeImageHeader, KeyframePoseMessage, PoseMessage,
     RigidMessage, SimilarityMessage,
 };
-
-use crate::wire::conversion::velocity::put_velocity;
-pub use crate::wire::conversion::velocity::velocity_from_message;
 
 /// Farthest a sent quaternion may be from unit length: rounding, not another transform.
 const QUATERNION_TOLERANCE: f64 = 1e-6;
@@ -117,18 +116,15 @@ pub fn similarity_from_message(
     let [x, y, z, w, tx, ty, tz, scale] = *message;
     let rigid = rigid_from_message(&[x, y, z, w, tx, ty, tz], field)?;
     let similarity = Sim3::new(rigid, scale);
-    if similarity.is_valid() { Ok(similarity) } else { Err(MessageError::InvalidNumber { field }) }
+    Some(similarity).filter(Sim3::is_valid).ok_or(MessageError::InvalidNumber { field })
 }
 
 /// The intrinsics of a header, checked.
 fn intrinsics_from(values: &[f64; 4], width: u32, height: u32) -> Result<Intrinsics, MessageError> {
     let [fx, fy, cx, cy] = *values;
     let intrinsics = Intrinsics { fx, fy, cx, cy, width: width as usize, height: height as usize };
-    if intrinsics.is_valid() {
-        Ok(intrinsics)
-    } else {
-        Err(MessageError::InvalidIntrinsics { width, height })
-    }
+    let valid = Some(intrinsics).filter(Intrinsics::is_valid);
+    valid.ok_or(MessageError::InvalidIntrinsics { width, height })
 }
 
 /// The frame of a message with its intrinsics.
@@ -152,31 +148,13 @@ pub fn frame_from_message<'a>(
     Ok((frame, intrinsics))
 }
 
-/// State and reason as codes.
+/// State and reason as codes: a reason's is its place in its enumeration.
 pub fn codes_from_state(state: TrackingState) -> (u32, u32) {
     match state {
         TrackingState::Initializing => (0, 0),
         TrackingState::Tracking => (1, 0),
-        TrackingState::Degraded(reason) => (
-            2,
-            match reason {
-                DegradedReason::Budget => 0,
-                DegradedReason::LowOverlap => 1,
-                DegradedReason::HighResidual => 2,
-                DegradedReason::Gap => 3,
-                DegradedReason::Turning => 4,
-            },
-        ),
-        TrackingState::Lost(reason) => (
-            3,
-            match reason {
-                LostReason::Diverged => 0,
-                LostReason::TooFewInliers => 1,
-                LostReason::NoPoints => 2,
-                LostReason::UnusableFrame => 3,
-                LostReason::MapRejected => 4,
-            },
-        ),
+        TrackingState::Degraded(reason) => (2, reason as u32),
+        TrackingState::Lost(reason) => (3, reason as u32),
     }
 }
 

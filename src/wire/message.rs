@@ -3,7 +3,7 @@
 //! A `type_name` carries the version of its message. The checked conversion to the types of `slam` is in [`crate::wire::conversion`].
 
 use iceoryx2::prelude::ZeroCopySend;
-use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
+use zerocopy::{FromBytes, FromZeros, Immutable, IntoBytes, KnownLayout};
 
 use crate::slam::keyframe::DepthPoint;
 use crate::slam::place_covariance::PLACE_ENTRIES;
@@ -391,6 +391,13 @@ pub struct HealthMessage {
     pub source_bytes: u32,
     /// Zero.
     pub reserved: u32,
+}
+
+impl HealthMessage {
+    /// Nothing has been counted, no rate is known.
+    pub fn empty() -> Self {
+        Self { rate_hz: f64::NAN, ..Self::new_zeroed() }
+    }
 }
 
 /// Request of `mapper/command`.
