@@ -25,7 +25,6 @@ pub mod record;
 pub mod report;
 pub mod results_error;
 pub(crate) mod set;
-pub(crate) mod start_tally;
 pub(crate) mod step_times;
 pub(crate) mod summary;
 pub(crate) mod summary_text;
@@ -61,7 +60,6 @@ use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::trajectory::StampedPose;
 
 pub use crate::service::results::budget_curve::BudgetSample;
-pub use crate::service::results::start_tally::StartTally;
 pub use crate::service::results::summary::Summary;
 
 /// What of the map is written and how it is judged.

@@ -79,28 +79,20 @@ impl Untracked {
         if let Some(lost) = Self::lost_at_once(record, frames_in) {
             return Some(lost);
         }
-        let tally = record.start;
-        let most = [
-            (tally.dark, StartFrame::Dark),
-            (tally.overexposed, StartFrame::Overexposed),
-            (tally.textureless, StartFrame::Textureless),
-            (tally.unmatched, StartFrame::Unmatched),
-            (tally.still, StartFrame::Still),
-            (tally.turned, StartFrame::Turned),
-            (tally.little_parallax, StartFrame::LittleParallax),
-        ];
-        let (count, seen) = most.into_iter().max_by_key(|(count, _)| *count)?;
+        let all: u64 = record.start.0.values().sum();
+        let most = record.start.0.iter().max_by_key(|(_, count)| **count);
+        let (&seen, &count) = most.unwrap_or((&StartFrame::Begun, &0));
         // Between frames that are far apart nothing can be proven; darkness and a camera that stands still show
         // all the same.
         let is_far_apart =
             matches!(seen, StartFrame::Unmatched | StartFrame::Turned | StartFrame::LittleParallax);
         let slowness = slowness(record, frames_in);
-        if let Some(slowness) = slowness.filter(|_| is_far_apart || tally.sum() < FEWEST_FRAMES) {
+        if let Some(slowness) = slowness.filter(|_| is_far_apart || all < FEWEST_FRAMES) {
             return Some(Self::TooSlow(slowness));
         }
-        Some(match count {
-            _ if frames_in < FEWEST_FRAMES => Self::FewFrames(frames_in),
-            _ => Self::Seen(if count == 0 { StartFrame::Begun } else { seen }, count, tally.sum()),
+        Some(match frames_in < FEWEST_FRAMES {
+            true => Self::FewFrames(frames_in),
+            false => Self::Seen(seen, count, all),
         })
     }
 
