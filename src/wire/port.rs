@@ -75,9 +75,9 @@ pub enum Access {
 /// A process's membership in an instance; every port is made from it.
 #[derive(Debug)]
 pub struct Hub {
-    node: Node<ipc::Service>,
-    place: Place,
-    access: Access,
+    pub(in crate::wire) node: Node<ipc::Service>,
+    pub(in crate::wire) place: Place,
+    pub(in crate::wire) access: Access,
 }
 
 impl Hub {
@@ -142,12 +142,7 @@ impl Hub {
             .max_loaned_samples(topic.loans)
             .create()
             .map_err(|e| topic_error(&name, &e))?;
-        let notifier = self
-            .event_service(&name)?
-            .notifier_builder()
-            .create()
-            .map_err(|e| topic_error(&name, &e))?;
-        Ok(Publisher { port, notifier, topic: name })
+        Ok(Publisher { port, wake: self.notifier(&name)?, topic: name })
     }
 
     /// A receiver of slices of `T` with a header of `H`.
@@ -187,18 +182,6 @@ impl Hub {
     pub(in crate::wire) fn notifier(&self, name: &str) -> Result<Wake, OpenError> {
         let notifier = self.event_service(name)?.notifier_builder().create();
         Ok(Wake { notifier: notifier.map_err(|e| topic_error(name, &e))? })
-    }
-
-    pub(in crate::wire) fn node(&self) -> &Node<ipc::Service> {
-        &self.node
-    }
-
-    pub(in crate::wire) fn place(&self) -> &Place {
-        &self.place
-    }
-
-    pub(in crate::wire) fn access(&self) -> Access {
-        self.access
     }
 
     fn data_service<T, H>(
@@ -285,7 +268,7 @@ pub(in crate::wire) fn retry<S, E: std::fmt::Display>(
 #[derive(Debug)]
 pub struct Publisher<T: Debug + ZeroCopySend + 'static, H: Debug + ZeroCopySend + 'static> {
     port: RawPublisher<ipc::Service, [T], H>,
-    notifier: Notifier<ipc::Service>,
+    wake: Wake,
     topic: String,
 }
 
@@ -297,7 +280,7 @@ impl<T: Debug + ZeroCopySend + Copy, H: Debug + Default + ZeroCopySend> Publishe
         let mut sample = sample.write_from_slice(payload);
         *sample.user_header_mut() = header;
         sample.send().map_err(|e| failed(&e))?;
-        self.wake();
+        self.wake.notify();
         Ok(())
     }
 
@@ -305,11 +288,6 @@ impl<T: Debug + ZeroCopySend + Copy, H: Debug + Default + ZeroCopySend> Publishe
     pub fn serve_late_joiners(&self) {
         // What fails here fails again, and is reported, at the next send.
         let _ = self.port.update_connections();
-    }
-
-    fn wake(&self) {
-        // A listener that died is no reason to stop sending.
-        let _ = self.notifier.notify();
     }
 
     fn error(&self, reason: &dyn std::fmt::Display) -> SendError {
@@ -344,7 +322,7 @@ impl<H: Debug + Default + ZeroCopySend> Loan<'_, H> {
     pub fn send(mut self, header: H) -> Result<(), SendError> {
         *self.sample.user_header_mut() = header;
         self.sample.send().map_err(|e| self.publisher.error(&e))?;
-        self.publisher.wake();
+        self.publisher.wake.notify();
         Ok(())
     }
 }
@@ -360,10 +338,8 @@ pub struct Subscriber<T: Debug + ZeroCopySend + 'static, H: Debug + ZeroCopySend
 impl<T: Debug + ZeroCopySend, H: Debug + ZeroCopySend> Subscriber<T, H> {
     /// The oldest unread message.
     pub fn receive(&self) -> Result<Option<Received<T, H>>, ReceiveError> {
-        match self.port.receive() {
-            Ok(sample) => Ok(sample.map(|sample| Received { sample })),
-            Err(e) => Err(self.error(&e)),
-        }
+        let sample = self.port.receive().map_err(|e| self.error(&e))?;
+        Ok(sample.map(|sample| Received { sample }))
     }
 
     fn error(&self, reason: &dyn std::fmt::Display) -> ReceiveError {
@@ -421,13 +397,6 @@ pub struct Events {
     listener: Listener<ipc::Service>,
 }
 
-impl Events {
-    /// Takes all wake-ups; their number does not matter, messages are counted by themselves.
-    fn take(&self) {
-        let _ = self.listener.try_wait(|_| {});
-    }
-}
-
 /// Readable while a wake-up is unread: for a poll of one's own; [`wait`] takes the wake-ups.
 impl AsFd for Events {
     fn as_fd(&self) -> BorrowedFd<'_> {
@@ -444,6 +413,7 @@ pub(in crate::wire) struct Wake {
 
 impl Wake {
     pub(in crate::wire) fn notify(&self) {
+        // A listener that died is no reason to stop sending.
         let _ = self.notifier.notify();
     }
 }
@@ -479,7 +449,10 @@ pub fn wait<'a>(
         Ok(_) | Err(rustix::io::Errno::INTR) => {}
         Err(e) => return Err(WaitError(e.to_string())),
     }
-    events.iter().for_each(|e| e.take());
+    // Their number does not matter: messages are counted by themselves.
+    for event in events {
+        let _ = event.listener.try_wait(|_| {});
+    }
     Ok(())
 }
 
