@@ -33,8 +33,7 @@ impl Place {
         check_address_space(needed)?;
         let none = |cause| PlaceError::NoSharedMemory(io::Error::from(cause));
         rustix::fs::access(SHARED_MEMORY, Access::WRITE_OK | Access::EXEC_OK).map_err(none)?;
-        let stat = rustix::fs::statvfs(SHARED_MEMORY).map_err(none)?;
-        let free = stat.f_bavail.saturating_mul(stat.f_frsize);
+        let free = free_shared_memory().map_err(none)?;
         if free >= needed {
             return Ok(());
         }
@@ -43,9 +42,9 @@ impl Place {
 }
 
 /// What is free of shared memory, bytes.
-pub fn free_shared_memory() -> Option<u64> {
-    let stat = rustix::fs::statvfs(SHARED_MEMORY).ok()?;
-    Some(stat.f_bavail.saturating_mul(stat.f_frsize))
+pub fn free_shared_memory() -> rustix::io::Result<u64> {
+    let stat = rustix::fs::statvfs(SHARED_MEMORY)?;
+    Ok(stat.f_bavail.saturating_mul(stat.f_frsize))
 }
 
 /// Takes what the segments whose names begin with `prefix` in `folder` have promised and not got: they are made
