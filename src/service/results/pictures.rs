@@ -1,7 +1,7 @@
 //! Pictures of a keyframe's depth map: inverse depth, variance, density.
 
 use crate::service::results::colour::{Picture, Rgb, heat, rainbow};
-use crate::slam::evaluation::statistics::percentile;
+use crate::slam::evaluation::statistics::percentiles;
 use crate::slam::keyframe::{DepthPoint, Keyframe};
 
 /// Brightness of the image under a depth map: dark enough that colours stand out.
@@ -22,10 +22,8 @@ pub fn inverse_depth_picture(
     keyframe: &Keyframe,
     max_relative_std_dev: f64,
 ) -> (Picture, Option<[f64; 2]>) {
-    let shown = |p: &&DepthPoint| {
-        let ratio = relative_std_dev(p);
-        p.inverse_depth > 0.0 && ratio <= max_relative_std_dev
-    };
+    let shown =
+        |p: &&DepthPoint| p.inverse_depth > 0.0 && relative_std_dev(p) <= max_relative_std_dev;
     let points: Vec<&DepthPoint> = keyframe.points.iter().filter(shown).collect();
     let mut picture = background(keyframe);
     let range = middle_range(points.iter().map(|p| f64::from(p.inverse_depth)));
@@ -40,9 +38,7 @@ pub fn inverse_depth_picture(
 
 /// Lower and upper end of the values without the outliers at either end; `None` of none.
 pub fn middle_range(values: impl Iterator<Item = f64>) -> Option<[f64; 2]> {
-    let mut sorted: Vec<f64> = values.collect();
-    sorted.sort_by(f64::total_cmp);
-    Some([percentile(&sorted, CLIPPED_SHARE)?, percentile(&sorted, 1.0 - CLIPPED_SHARE)?])
+    percentiles(values, [CLIPPED_SHARE, 1.0 - CLIPPED_SHARE])
 }
 
 /// σ/d of every point in colour (bright: uncertain), logarithmic over [`RELATIVE_STD_DEV_RANGE`].

@@ -6,7 +6,7 @@ use crate::service::results::mapping_load::is_overloaded;
 use crate::service::results::record::RunRecord;
 use crate::slam::counted::counted;
 use crate::slam::evaluation::depth_error::DepthScale;
-use crate::slam::evaluation::statistics::percentile;
+use crate::slam::evaluation::statistics::percentiles;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::mapper::situation::StartFrame;
 use crate::slam::pose::{LostReason, TrackingState};
@@ -121,10 +121,9 @@ fn slowness(record: &RunRecord, frames_in: u64) -> Option<Slowness> {
     if !is_overloaded(record.mode, skipped, frames_in) {
         return None;
     }
-    let mut times: Vec<f64> = record.map_nanos.iter().map(|&n| n as f64 * 1e-6).collect();
-    times.sort_by(f64::total_cmp);
+    let times = record.map_nanos.iter().map(|&n| n as f64 * 1e-6);
     let period_ms = record.recorded_nanos as f64 * 1e-6 / frames_in.saturating_sub(1).max(1) as f64;
-    let map_ms = percentile(&times, 0.5).unwrap_or(0.0);
+    let [map_ms] = percentiles(times, [0.5]).unwrap_or_default();
     Some(Slowness { frames_in, skipped, map_ms, period_ms })
 }
 

@@ -52,6 +52,20 @@ pub fn percentile(sorted: &[f64], share: f64) -> Option<f64> {
     sorted.get(rank.max(1) - 1).copied()
 }
 
+/// The [`percentile`] of each of `shares`; `values` are in any order.
+pub fn percentiles<const N: usize>(
+    values: impl IntoIterator<Item = f64>,
+    shares: [f64; N],
+) -> Option<[f64; N]> {
+    let mut sorted: Vec<f64> = values.into_iter().collect();
+    sorted.sort_by(f64::total_cmp);
+    let mut found = shares;
+    for share in &mut found {
+        *share = percentile(&sorted, *share)?;
+    }
+    Some(found)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -118,12 +118,7 @@ type IsFate = fn(&SearchFate) -> bool;
 
 /// Where searches ended how: `of` gives the places of those with such a fate.
 fn place_series(of: &dyn Fn(IsFate) -> Vec<[f64; 2]>) -> [Series; 4] {
-    let dots = |name, colour, radius, is| Series {
-        name,
-        colour,
-        mark: Mark::Dots(radius),
-        points: of(is),
-    };
+    let dots = |name, colour, radius, is| Series::new(name, colour, Mark::Dots(radius), of(is));
     let is_other = |fate: &SearchFate| {
         matches!(fate, SearchFate::Refused(_) | SearchFate::Unconfirmed | SearchFate::Inconsistent)
     };

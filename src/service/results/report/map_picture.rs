@@ -9,7 +9,7 @@ use crate::service::results::report::input::ReportInput;
 use crate::service::results::report::number_text::grouped;
 use crate::service::results::report::views::Views;
 use crate::slam::evaluation::depth_error::DepthScale;
-use crate::slam::evaluation::statistics::percentile;
+use crate::slam::evaluation::statistics::percentiles;
 use crate::slam::fusion::SurfacePoint;
 use crate::slam::trajectory::StampedPose;
 
@@ -117,7 +117,8 @@ pub fn map_picture(
         .collect();
     let mut ranges = [[0.0; 2]; 3];
     for (axis, range) in ranges.iter_mut().enumerate() {
-        *range = middle_range(flat.iter().map(|p| p[axis]))?;
+        let ends = percentiles(flat.iter().map(|p| p[axis]), [CUT_SHARE, 1.0 - CUT_SHARE]);
+        *range = ends.filter(|[low, high]| high > low)?;
     }
     for (axis, range) in ranges.iter_mut().take(2).enumerate() {
         for point in &path {
@@ -129,14 +130,6 @@ pub fn map_picture(
     let [_, _, [low, high]] = ranges;
     let (picture, width) = draw(&flat, &path, &ranges);
     Some(MapPicture { picture, width, height_range: high - low })
-}
-
-/// Lower and upper end of the values without [`CUT_SHARE`] at either end.
-fn middle_range(values: impl Iterator<Item = f64>) -> Option<[f64; 2]> {
-    let mut sorted: Vec<f64> = values.collect();
-    sorted.sort_by(f64::total_cmp);
-    let (low, high) = (percentile(&sorted, CUT_SHARE)?, percentile(&sorted, 1.0 - CUT_SHARE)?);
-    (high > low).then_some([low, high])
 }
 
 /// The picture, and the length that its width shows.
