@@ -40,7 +40,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::capture::source::FrameSource;
 use crate::service::atomic_file::write_atomically;
-use crate::service::results::depth_maps::DepthEvaluation;
 use crate::service::results::full_points::{FULL_POINT_BYTES, num_points, write_full_points};
 use crate::service::results::ply::SURFACE_POINT_BYTES;
 use crate::service::results::record::RunRecord;
@@ -50,7 +49,7 @@ use crate::service::results::results_error::ResultsError;
 use crate::service::results::set::ResultSet;
 use crate::service::results::summary::PointCounts;
 use crate::service::trajectory_file::write_epochs;
-use crate::slam::evaluation::depth_error::DepthScale;
+use crate::slam::evaluation::depth_error::{DepthErrors, DepthScale};
 use crate::slam::evaluation::umeyama::TrajectoryAlignment;
 use crate::slam::evaluation::{MAX_DIFFERENCE_NANOS, TrajectoryEvaluation, evaluate_trajectory};
 use crate::slam::fusion::{FusionParams, MapResolution, SurfacePoint, fuse};
@@ -142,7 +141,7 @@ impl<'a> Results<'a> {
         };
         let (evaluation, online_evaluation) = (evaluate(&trajectory), evaluate(&online));
         let depth = match record.is_depth_from_sensor {
-            true => DepthEvaluation::default(),
+            true => DepthErrors::default(),
             false => depth_maps::evaluate_depth(record, depth_source)?,
         };
         let begin = Instant::now();

@@ -134,7 +134,7 @@ pub fn error_points(
     evaluation: &TrajectoryEvaluation,
     secs: impl Fn(i64) -> f64,
 ) -> Vec<[f64; 2]> {
-    let pairs = evaluation.association.pairs.iter().zip(&evaluation.absolute);
+    let pairs = evaluation.pairs.iter().zip(&evaluation.absolute);
     pairs.map(|(&(e, _), &error)| [secs(poses[e].nanos), error]).collect()
 }
 
@@ -153,7 +153,7 @@ pub fn scale_over_time(input: &ReportInput<'_>) -> Option<Chart> {
     if evaluation.window_scales.len() < 2 {
         return None;
     }
-    let pairs = &evaluation.association.pairs;
+    let pairs = &evaluation.pairs;
     let time = |i: usize| pairs.get(i).map(|p| secs(input.record, input.trajectory[p.0].nanos));
     // The last window may have matches in common with the one before.
     let mut drawn = 0;

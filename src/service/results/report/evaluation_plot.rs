@@ -23,7 +23,7 @@ pub fn evaluation_plot(evaluation: &EpochsEvaluation, truth: &[StampedPose]) -> 
     let secs = |nanos: i64| nanos.saturating_sub(first) as f64 * 1e-9;
     let epoch_of = |pair: &(usize, usize)| evaluation.placed[pair.0].epoch;
     let points = error_points(&placed, &evaluation.total, secs);
-    let epochs = evaluation.total.association.pairs.iter().map(epoch_of);
+    let epochs = evaluation.total.pairs.iter().map(epoch_of);
     let errors = with_gaps(epochs, &points, [f64::NAN; 2]);
     let errors = Series::new("error", ERROR, Mark::Line, errors);
     let views = Views::of(if truth.is_empty() { &placed } else { &truth }, None);
