@@ -22,9 +22,8 @@ pub fn inverse_depth_picture(
     keyframe: &Keyframe,
     max_relative_std_dev: f64,
 ) -> (Picture, Option<[f64; 2]>) {
-    let shown =
-        |p: &&DepthPoint| p.inverse_depth > 0.0 && relative_std_dev(p) <= max_relative_std_dev;
-    let points: Vec<&DepthPoint> = keyframe.points.iter().filter(shown).collect();
+    let shown = keyframe.points.iter().filter(|point| is_known(point, max_relative_std_dev));
+    let points: Vec<&DepthPoint> = shown.collect();
     let mut picture = background(keyframe);
     let range = middle_range(points.iter().map(|p| f64::from(p.inverse_depth)));
     let Some([far, near]) = range else { return (picture, None) };
@@ -57,18 +56,21 @@ pub fn density_picture(keyframe: &Keyframe) -> Picture {
     let (width, height) = (keyframe.intrinsics.width, keyframe.intrinsics.height);
     let columns = width.div_ceil(DENSITY_BLOCK);
     let mut counts = vec![0u32; columns * height.div_ceil(DENSITY_BLOCK)];
+    let block = |u: usize, v: usize| v / DENSITY_BLOCK * columns + u / DENSITY_BLOCK;
     for point in &keyframe.points {
         let (u, v) = (usize::from(point.u), usize::from(point.v));
         if u < width && v < height {
-            counts[v / DENSITY_BLOCK * columns + u / DENSITY_BLOCK] += 1;
+            counts[block(u, v)] += 1;
         }
     }
     let full = (DENSITY_BLOCK * DENSITY_BLOCK) as f64;
-    let colour = |i: usize| {
-        let (u, v) = (i % width, i / width);
-        heat(f64::from(counts[v / DENSITY_BLOCK * columns + u / DENSITY_BLOCK]) / full)
-    };
+    let colour = |i: usize| heat(f64::from(counts[block(i % width, i / width)]) / full);
     Picture { width, height, pixels: (0..width * height).map(colour).collect() }
+}
+
+/// Whether a point's σ/d is at most `max_relative_std_dev`.
+pub fn is_known(point: &DepthPoint, max_relative_std_dev: f64) -> bool {
+    point.inverse_depth > 0.0 && relative_std_dev(point) <= max_relative_std_dev
 }
 
 fn relative_std_dev(point: &DepthPoint) -> f64 {
@@ -85,8 +87,5 @@ pub fn background(keyframe: &Keyframe) -> Picture {
 }
 
 fn paint(picture: &mut Picture, point: &DepthPoint, colour: Rgb) {
-    let (u, v) = (usize::from(point.u), usize::from(point.v));
-    if u < picture.width && v < picture.height {
-        picture.pixels[v * picture.width + u] = colour;
-    }
+    picture.paint(usize::from(point.u), usize::from(point.v), colour);
 }

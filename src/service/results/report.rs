@@ -85,16 +85,16 @@ pub fn report(input: &ReportInput<'_>) -> String {
     page.push_str(&states(input.record));
     page.push_str(&map_view(input, up));
     page.push_str(&map_section(input, up));
-    section(&mut page, "Trajectory", &trajectory_views(input, up));
+    page.push_str(&section("Trajectory", "", &trajectory_views(input, up)));
     let errors: Vec<Chart> =
         error_over_time(input).into_iter().chain(scale_over_time(input)).collect();
-    section(&mut page, "Error", &errors);
+    page.push_str(&section("Error", "", &errors));
     page.push_str(&depth_maps(input));
-    let of_keyframes = &summary.depth.keyframe_depth;
-    section(&mut page, "Depth of the keyframes", &depth_charts(input.record, of_keyframes));
-    section(&mut page, "Joint estimation", &joint_charts(input.record));
+    let depth = depth_charts(input.record, &summary.depth.keyframe_depth);
+    page.push_str(&section("Depth of the keyframes", "", &depth));
+    page.push_str(&section("Joint estimation", "", &joint_charts(input.record)));
     page.push_str(&loop_section(input, up));
-    section(&mut page, "Time", &time_charts(input.record));
+    page.push_str(&section("Time", "", &time_charts(input.record)));
     page.push_str(&budget(input));
     page.push_str(&figures(summary));
     let _ = writeln!(page, "<script>{CHART_SCRIPT}</script></main></body></html>");
@@ -130,34 +130,23 @@ fn end_notice(ended: &EndOfRun) -> String {
 /// What a deadline costs; nothing where no frame was aligned again.
 fn budget(input: &ReportInput<'_>) -> String {
     let samples = &input.record.budget_samples;
+    let intro = format!(
+        "<p>{} frames were aligned again and stopped early: mean distance in the image between the \
+         keyframe's points at that pose and at the pose without a deadline. Each curve starts at the \
+         prediction, followed by one step; 0.001 px means no difference.</p>",
+        samples.len()
+    );
     let charts = budget_charts(samples, input.summary.budget_curve.as_ref());
+    section("Quality and budget", &intro, &charts)
+}
+
+/// Charts side by side under a heading and what `intro` says; nothing where there are none.
+fn section(heading: &str, intro: &str, charts: &[Chart]) -> String {
     if charts.is_empty() {
         return String::new();
     }
-    let mut html = format!(
-        "<section><h2>Quality and budget</h2><p>{} frames were aligned again and stopped early: mean distance in the image between the \
-         keyframe's points at that pose and at the pose without a deadline. Each curve starts at the \
-         prediction, followed by one step; 0.001 px means no difference.</p>\
-         <div class=\"charts\">",
-        samples.len()
-    );
-    for chart in &charts {
-        html.push_str(&chart_figure(chart));
-    }
-    html.push_str("</div></section>");
-    html
-}
-
-/// Charts side by side under a heading; nothing where there are none.
-fn section(page: &mut String, heading: &str, charts: &[Chart]) {
-    if charts.is_empty() {
-        return;
-    }
-    let _ = write!(page, "<section><h2>{heading}</h2><div class=\"charts\">");
-    for chart in charts {
-        page.push_str(&chart_figure(chart));
-    }
-    page.push_str("</div></section>");
+    let figures: String = charts.iter().map(chart_figure).collect();
+    format!("<section><h2>{heading}</h2>{intro}<div class=\"charts\">{figures}</div></section>")
 }
 
 /// The figures that matter most, large.

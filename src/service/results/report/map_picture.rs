@@ -6,7 +6,7 @@ use crate::service::results::colour::{Picture, Rgb, rainbow};
 use crate::service::results::report::axis::round_step;
 use crate::service::results::report::html::png_address;
 use crate::service::results::report::input::ReportInput;
-use crate::service::results::report::number_text::grouped;
+use crate::service::results::report::number_text::{grouped, without_zeros};
 use crate::service::results::report::views::Views;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::evaluation::statistics::percentiles;
@@ -87,11 +87,7 @@ fn scale_bar(width: f64, unit: &str, metres_per_unit: Option<f64>) -> String {
 /// A number with two significant digits, in full.
 fn significant(number: f64) -> String {
     let decimals = 1.0 - number.abs().max(f64::MIN_POSITIVE).log10().floor();
-    let text = format!("{number:.*}", decimals.clamp(0.0, 12.0) as usize);
-    match text.contains('.') {
-        true => text.trim_end_matches('0').trim_end_matches('.').to_owned(),
-        false => text,
-    }
+    without_zeros(&format!("{number:.*}", decimals.clamp(0.0, 12.0) as usize)).to_owned()
 }
 
 /// Points and path from above, coloured by height (blue low, red high); `None` without points.
