@@ -1,6 +1,6 @@
 //! `semidense view`, `record`, `ros2`, `zenoh`: hand over to `semidense-bridge`, a program and package of its own.
 
-use std::ffi::{OsStr, OsString};
+use std::ffi::OsString;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -64,21 +64,25 @@ pub fn run(
     if !common.set.is_empty() {
         return Err(BridgeError::Option { command, option: "--set" }.into());
     }
-    let own = std::env::current_exe().unwrap_or_else(|_| PathBuf::from("semidense"));
-    let missing = || BridgeError::Missing { command: command.to_owned(), own: own.clone() };
-    let program = program(&own).ok_or_else(missing)?;
+    let program = bridge(command)?;
     let source = Command::new(&program)
         // Its help and its errors then name the command that was typed.
         .arg0("semidense")
-        .args(handed_on(common))
+        .args(common.of_bridge())
         .arg(command)
         .args(&arguments.arguments)
         .exec();
     Err(BridgeError::Start { program, source }.into())
 }
 
+/// The program, for `command`.
+pub fn bridge(command: &str) -> Result<PathBuf, BridgeError> {
+    let own = std::env::current_exe().unwrap_or_else(|_| PathBuf::from("semidense"));
+    program(&own).ok_or_else(|| BridgeError::Missing { command: command.to_owned(), own })
+}
+
 /// The program: beside our own, which was installed or built with it, else on the path.
-pub fn program(own: &Path) -> Option<PathBuf> {
+fn program(own: &Path) -> Option<PathBuf> {
     let path = std::env::var_os("PATH").unwrap_or_default();
     let beside = own.parent().map(Path::to_owned);
     beside
@@ -86,16 +90,6 @@ pub fn program(own: &Path) -> Option<PathBuf> {
         .chain(std::env::split_paths(&path))
         .map(|f| f.join(PROGRAM))
         .find(|p| p.is_file())
-}
-
-/// The options that every command of either program has.
-pub fn handed_on(common: &CommonArguments) -> Vec<OsString> {
-    let mut arguments: Vec<OsString> = Vec::new();
-    let mut push = |option: &str, value: &OsStr| arguments.extend([option.into(), value.into()]);
-    push("--log", common.log.as_ref());
-    common.config.iter().for_each(|file| push("--config", file.as_ref()));
-    common.instance.iter().for_each(|name| push("--instance", name.as_ref()));
-    arguments
 }
 
 #[cfg(test)]
