@@ -301,10 +301,8 @@ pub fn pose_from_message(message: &PoseMessage) -> Result<PoseEstimate, MessageE
         mean_squared_flow: message.mean_squared_flow,
         displacement_px: message.displacement_px,
     };
-    let ratios = [quality.in_view_ratio, quality.inlier_ratio, quality.mean_squared_flow];
-    finite("quality", &ratios)?;
-    let errors = [quality.whitened_rmse, quality.residual_rmse, quality.displacement_px];
-    finite("quality", &errors)?;
+    finite("quality", &[quality.in_view_ratio, quality.inlier_ratio, quality.mean_squared_flow])?;
+    finite("quality", &[quality.whitened_rmse, quality.residual_rmse, quality.displacement_px])?;
     let proposes_keyframe = match message.proposes_keyframe {
         0 => false,
         1 => true,

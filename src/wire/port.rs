@@ -5,6 +5,7 @@ mod subscribers;
 
 use std::fmt::Debug;
 use std::os::fd::{AsFd, BorrowedFd};
+use std::path::Path;
 use std::time::Duration;
 
 use iceoryx2::port::listener::Listener;
@@ -21,11 +22,13 @@ use iceoryx2::service::port_factory::event::PortFactory as EventFactory;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory as DataFactory;
 use rustix::event::{PollFd, PollFlags, Timespec};
 
+use crate::wire::folders::SHARED_MEMORY;
 use crate::wire::limits::raise_open_files;
 pub use crate::wire::open_error::OpenError;
 use crate::wire::open_error::{in_words, not_running, topic_error};
 use crate::wire::place::Place;
 use crate::wire::port::subscribers::too_many;
+use crate::wire::shared_memory::reserve;
 use crate::wire::topic::Topic;
 use crate::wire::version::foreign_version;
 
@@ -37,6 +40,8 @@ const MAX_EVENT_PORTS: usize = 16;
 const MAX_PUBLISHERS: usize = 3;
 /// Most events, and the interrupt, that are waited for at a time.
 const MAX_WAITED: usize = 8;
+/// Shared memory of a process and its connections to all topics: twice what the supervisor takes, which listens to most.
+const JOIN_BYTES: u64 = 1 << 20;
 /// How often opening is tried while another process removes the same service.
 const OPEN_ATTEMPTS: usize = 50;
 /// Pause between two attempts.
@@ -91,7 +96,7 @@ impl Hub {
             return Err(not_running(place));
         }
         set_log_level(LogLevel::Fatal);
-        place.check_room_to_join()?;
+        place.check_shared_memory(JOIN_BYTES)?;
         let _joining = place.hold()?;
         let root = place.root.display().to_string();
         let failed =
@@ -119,7 +124,7 @@ impl Hub {
 
     /// Takes all shared memory that the open ports have promised; an observer's subscriber does it by itself.
     pub fn reserve(&self) -> Result<(), OpenError> {
-        Ok(self.place.reserve_shared_memory()?)
+        Ok(reserve(Path::new(SHARED_MEMORY), &self.place.prefix)?)
     }
 
     /// A sender of slices of `T` with a header of `H`, at most `max_length` elements.
