@@ -4,7 +4,7 @@
 use crate::slam::evaluation::association::associate;
 use crate::slam::evaluation::statistics::{ErrorStatistics, median};
 use crate::slam::evaluation::trajectory_error::{
-    RelativeErrors, absolute_errors, path_length, relative_errors, successive_pairs, timed_pairs,
+    RelativeErrors, absolute_errors, path_length, relative_errors, timed_pairs,
 };
 use crate::slam::evaluation::umeyama::{AlignmentError, TrajectoryAlignment, umeyama};
 use crate::slam::evaluation::windows::{scale_ratio, scale_windows, shape_errors};
@@ -52,10 +52,11 @@ impl Measured {
         let relative = |pairs: &[(usize, usize)]| {
             relative_errors(&estimated, &true_poses, pairs, truth_from_estimate.scale)
         };
+        let successive: Vec<_> = (1..estimated.len()).map(|j| (j - 1, j)).collect();
         let second_pairs = timed_pairs(&estimated, INTERVAL_NANOS, max_difference_nanos);
         let measured = Self {
             absolute: absolute_errors(&estimated, &true_poses, &truth_from_estimate),
-            frames: relative(&successive_pairs(&estimated)),
+            frames: relative(&successive),
             seconds: relative(&second_pairs),
             path_length: path_length(&true_poses),
             window_scales: scale_windows(&estimated, &true_poses),
