@@ -43,7 +43,6 @@ use crate::service::atomic_file::write_atomically;
 use crate::service::results::full_points::{FULL_POINT_BYTES, num_points, write_full_points};
 use crate::service::results::ply::SURFACE_POINT_BYTES;
 use crate::service::results::record::RunRecord;
-use crate::service::results::report::input::ReportInput;
 use crate::service::results::report::report;
 use crate::service::results::results_error::ResultsError;
 use crate::service::results::set::ResultSet;
@@ -181,16 +180,7 @@ impl<'a> Results<'a> {
         write_more: &dyn Fn(&Path) -> Result<(), ResultsError>,
     ) -> Result<(), ResultsError> {
         let record = self.record;
-        let page = report(&ReportInput {
-            record,
-            summary: &self.summary,
-            trajectory: &self.trajectory,
-            online: &self.online,
-            evaluation: self.evaluation.as_ref(),
-            online_evaluation: self.online_evaluation.as_ref(),
-            surface: &self.surface,
-            max_relative_std_dev: self.params.max_relative_std_dev,
-        });
+        let page = report(self);
         let needed = self.needed_bytes(page.len());
         let failed = |path: PathBuf, source| write_failure(dir, needed, path, source);
         let set = ResultSet::begin(dir).map_err(|source| failed(dir.to_owned(), source))?;

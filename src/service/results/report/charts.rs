@@ -2,10 +2,10 @@
 
 use nalgebra::Vector3;
 
+use crate::service::results::Results;
 use crate::service::results::poses::longest_epoch;
 use crate::service::results::record::RunRecord;
 use crate::service::results::report::chart::{Chart, Scaling};
-use crate::service::results::report::input::ReportInput;
 use crate::service::results::report::series::{Mark, Series};
 use crate::service::results::report::views::Views;
 use crate::slam::evaluation::TrajectoryEvaluation;
@@ -37,19 +37,19 @@ pub fn secs(record: &RunRecord, nanos: i64) -> f64 {
 }
 
 /// The trajectory from above and from the side, in the ground truth's frame where there is one. `up` is in the map's.
-pub fn trajectory_views(input: &ReportInput<'_>, up: Option<Vector3<f64>>) -> [Chart; 2] {
-    let truth: Vec<StampedPose> = truth_in_time(input);
-    let (alignment, unit) = match input.evaluation {
+pub fn trajectory_views(results: &Results<'_>, up: Option<Vector3<f64>>) -> [Chart; 2] {
+    let truth: Vec<StampedPose> = truth_in_time(results);
+    let (alignment, unit) = match &results.evaluation {
         Some(evaluation) => (evaluation.alignment, "m"),
-        None if input.record.depth_scale == DepthScale::Given => (Sim3::identity(), "m"),
+        None if results.record.depth_scale == DepthScale::Given => (Sim3::identity(), "m"),
         None => (Sim3::identity(), "map units"),
     };
     let views = match up {
-        Some(up) => Views::of(input.trajectory, Some(up)).turned(&alignment.rigid.rotation),
-        None => Views::of(if truth.is_empty() { input.trajectory } else { &truth }, None),
+        Some(up) => Views::of(&results.trajectory, Some(up)).turned(&alignment.rigid.rotation),
+        None => Views::of(if truth.is_empty() { &results.trajectory } else { &truth }, None),
     };
-    let keyframes = keyframe_poses(input.record);
-    trajectory_charts(input.trajectory, &truth, &alignment, unit, &keyframes, &views)
+    let keyframes = keyframe_poses(results.record);
+    trajectory_charts(&results.trajectory, &truth, &alignment, unit, &keyframes, &views)
 }
 
 /// From above and from the side, as `views` of the truth's frame has it: `truth`, and `estimate` and `keyframes` brought
@@ -94,14 +94,14 @@ pub fn trajectory_charts(
 }
 
 /// True poses during the run.
-fn truth_in_time(input: &ReportInput<'_>) -> Vec<StampedPose> {
-    if input.evaluation.is_none() {
+fn truth_in_time(results: &Results<'_>) -> Vec<StampedPose> {
+    if results.evaluation.is_none() {
         return Vec::new();
     }
-    let poses = &input.record.poses;
+    let poses = &results.record.poses;
     let (Some(first), Some(last)) = (poses.first(), poses.last()) else { return Vec::new() };
     let time = first.estimate.capture_nanos..=last.estimate.capture_nanos;
-    input.record.ground_truth.iter().filter(|pose| time.contains(&pose.nanos)).copied().collect()
+    results.record.ground_truth.iter().filter(|pose| time.contains(&pose.nanos)).copied().collect()
 }
 
 /// Poses of the keyframes of the longest epoch: each epoch has a place and a unit of its own.
@@ -116,15 +116,15 @@ pub(super) fn keyframe_poses(record: &RunRecord) -> Vec<StampedPose> {
 }
 
 /// Position error over time, final and as published; `None` without ground truth.
-pub fn error_over_time(input: &ReportInput<'_>) -> Option<Chart> {
-    let evaluation = input.evaluation?;
+pub fn error_over_time(results: &Results<'_>) -> Option<Chart> {
+    let evaluation = results.evaluation.as_ref()?;
     let series = |name, colour, poses: &[StampedPose], evaluation: &TrajectoryEvaluation| {
-        let points = error_points(poses, evaluation, |nanos| secs(input.record, nanos));
+        let points = error_points(poses, evaluation, |nanos| secs(results.record, nanos));
         Series::new(name, colour, Mark::Line, points)
     };
-    let online = input.online_evaluation;
-    let online = online.map(|of| series("as published", ONLINE, input.online, of));
-    let last = series("final", ERROR, input.trajectory, evaluation);
+    let online = results.online_evaluation.as_ref();
+    let online = online.map(|of| series("as published", ONLINE, &results.online, of));
+    let last = series("final", ERROR, &results.trajectory, evaluation);
     Some(error_chart(online.into_iter().chain([last]).collect()))
 }
 
@@ -148,13 +148,13 @@ pub fn error_chart(series: Vec<Series>) -> Chart {
 }
 
 /// Scale of windows of 100 frames over that of the whole; `None` below two windows.
-pub fn scale_over_time(input: &ReportInput<'_>) -> Option<Chart> {
-    let evaluation = input.evaluation?;
+pub fn scale_over_time(results: &Results<'_>) -> Option<Chart> {
+    let evaluation = results.evaluation.as_ref()?;
     if evaluation.window_scales.len() < 2 {
         return None;
     }
     let pairs = &evaluation.pairs;
-    let time = |i: usize| pairs.get(i).map(|p| secs(input.record, input.trajectory[p.0].nanos));
+    let time = |i: usize| pairs.get(i).map(|p| secs(results.record, results.trajectory[p.0].nanos));
     // The last window may have matches in common with the one before.
     let mut drawn = 0;
     let points: Vec<[f64; 2]> = evaluation

@@ -2,10 +2,10 @@
 
 use nalgebra::Vector3;
 
+use crate::service::results::Results;
 use crate::service::results::colour::{Picture, Rgb, rainbow};
 use crate::service::results::report::axis::round_step;
 use crate::service::results::report::html::png_address;
-use crate::service::results::report::input::ReportInput;
 use crate::service::results::report::number_text::{grouped, without_zeros};
 use crate::service::results::report::views::Views;
 use crate::slam::evaluation::depth_error::DepthScale;
@@ -50,12 +50,12 @@ pub struct MapPicture {
 }
 
 /// The section; nothing without points.
-pub fn map_section(input: &ReportInput<'_>, up: Option<Vector3<f64>>) -> String {
-    let map = map_picture(input.surface, input.trajectory, up);
+pub fn map_section(results: &Results<'_>, up: Option<Vector3<f64>>) -> String {
+    let map = map_picture(&results.surface, &results.trajectory, up);
     let Some(map) = map else { return String::new() };
     let Some(png) = map.picture.png() else { return String::new() };
-    let unit = if input.record.depth_scale == DepthScale::Given { "m" } else { "map units" };
-    let metres = input.evaluation.filter(|_| unit != "m").map(|of| of.alignment.scale);
+    let unit = if results.record.depth_scale == DepthScale::Given { "m" } else { "map units" };
+    let metres = results.evaluation.as_ref().filter(|_| unit != "m").map(|of| of.alignment.scale);
     let about_up = match up {
         Some(_) => "up is estimated from how the camera was held and from horizontal surfaces",
         None => "what is up is not known: the view is along the path's shortest extent",
@@ -66,7 +66,7 @@ pub fn map_section(input: &ReportInput<'_>, up: Option<Vector3<f64>>) -> String 
          The camera's path is white; {about_up}.</figcaption></figure></section>",
         png_address(&png),
         scale_bar(map.width, unit, metres),
-        grouped(input.surface.len() as u64),
+        grouped(results.surface.len() as u64),
         significant(map.height_range)
     )
 }
