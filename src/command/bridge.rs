@@ -35,16 +35,11 @@ pub enum BridgeError {
         /// This program.
         own: PathBuf,
     },
-    /// An option that it does not have.
+    /// It has no `--set`: the subcommand.
     #[error(
-        "`semidense {command}` has no {option}: write it into a configuration file and name that with --config"
+        "`semidense {0}` has no --set: write it into a configuration file and name that with --config"
     )]
-    Option {
-        /// The subcommand.
-        command: &'static str,
-        /// The option.
-        option: &'static str,
-    },
+    Set(&'static str),
     /// It does not start.
     #[error("cannot start {program}: {source}")]
     Start {
@@ -62,7 +57,7 @@ pub fn run(
     arguments: &BridgeArguments,
 ) -> CommandResult {
     if !common.set.is_empty() {
-        return Err(BridgeError::Option { command, option: "--set" }.into());
+        return Err(BridgeError::Set(command).into());
     }
     let program = bridge(command)?;
     let source = Command::new(&program)

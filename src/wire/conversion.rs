@@ -2,8 +2,6 @@
 //!
 //! Going out and back in keeps every bit: lockstep and replay must agree to the last digit.
 
-mod velocity;
-
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
 use crate::slam::frame::FrameView;
@@ -15,10 +13,8 @@ use crate::slam::mapper::situation::StartFrame;
 use crate::slam::modes::ModeCovariance;
 use crate::slam::place_covariance::{PLACE_ENTRIES, PlaceCovariance};
 use crate::slam::pose::{
-    Brightness, DegradedReason, LostReason, PoseEstimate, Quality, TrackingState,
+    Brightness, DegradedReason, LostReason, PoseEstimate, Quality, TrackingState, Velocity,
 };
-use crate::wire::conversion::velocity::put_velocity;
-pub use crate::wire::conversion::velocity::velocity_from_message;
 use crate::wire::message::{
     FrameHeader, KeyframeHeader, KeyframeImageHeader, KeyframePoseMessage, PoseMessage,
     RigidMessage, SimilarityMessage,
@@ -236,8 +232,8 @@ pub struct PoseTiming {
 /// The message of a pose.
 pub fn pose_message(pose: &PoseEstimate, timing: &PoseTiming) -> PoseMessage {
     let (state, reason) = codes_from_state(pose.state);
-    let quality = &pose.quality;
-    let mut message = PoseMessage {
+    let (quality, velocity) = (&pose.quality, pose.velocity.as_ref());
+    PoseMessage {
         sequence: pose.sequence,
         capture_nanos: pose.capture_nanos,
         realtime_nanos: timing.realtime_nanos,
@@ -258,9 +254,9 @@ pub fn pose_message(pose: &PoseEstimate, timing: &PoseTiming) -> PoseMessage {
         covariance: pose.covariance,
         map_covariance: pose.map_covariance,
         alignment_covariance: pose.alignment_covariance,
-        linear_velocity: [0.0; 3],
-        angular_velocity: [0.0; 3],
-        velocity_covariance: [0.0; 21],
+        linear_velocity: velocity.map_or([0.0; 3], |v| v.linear.into()),
+        angular_velocity: velocity.map_or([0.0; 3], |v| v.angular.into()),
+        velocity_covariance: velocity.map_or([0.0; 21], |v| v.covariance),
         brightness: [pose.brightness.a, pose.brightness.b],
         in_view_ratio: quality.in_view_ratio,
         inlier_ratio: quality.inlier_ratio,
@@ -271,10 +267,8 @@ pub fn pose_message(pose: &PoseEstimate, timing: &PoseTiming) -> PoseMessage {
         iterations: quality.iterations,
         finest_level: quality.finest_level,
         points: quality.points,
-        has_velocity: 0,
-    };
-    put_velocity(pose.velocity.as_ref(), &mut message);
-    message
+        has_velocity: u32::from(velocity.is_some()),
+    }
 }
 
 /// The pose of a message, checked.
@@ -330,6 +324,21 @@ pub fn pose_from_message(message: &PoseMessage) -> Result<PoseEstimate, MessageE
         quality,
         proposes_keyframe,
     })
+}
+
+/// The velocity in a pose's message, checked; `None` where it says that there is none.
+fn velocity_from_message(message: &PoseMessage) -> Result<Option<Velocity>, MessageError> {
+    let covariance = message.velocity_covariance;
+    let [linear, angular] = [message.linear_velocity, message.angular_velocity];
+    let is_finite = linear.iter().chain(&angular).chain(&covariance).all(|x| x.is_finite());
+    if !is_finite || DIAGONAL.iter().any(|&entry| covariance[entry] < 0.0) {
+        return Err(MessageError::InvalidNumber { field: "velocity" });
+    }
+    match message.has_velocity {
+        0 => Ok(None),
+        1 => Ok(Some(Velocity { linear: linear.into(), angular: angular.into(), covariance })),
+        code => Err(MessageError::UnknownCode { field: "has_velocity", code }),
+    }
 }
 
 /// The header of a keyframe's depth.

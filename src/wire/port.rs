@@ -47,6 +47,11 @@ const OPEN_ATTEMPTS: usize = 50;
 /// Pause between two attempts.
 const OPEN_PAUSE: Duration = Duration::from_millis(10);
 
+/// What a message is made of: its header, or an element of its payload.
+pub trait Part: Debug + ZeroCopySend + 'static {}
+
+impl<T: Debug + ZeroCopySend + 'static> Part for T {}
+
 /// Why a message was not sent.
 #[derive(Debug, thiserror::Error)]
 #[error("topic {topic}: sending failed ({reason})")]
@@ -128,15 +133,11 @@ impl Hub {
     }
 
     /// A sender of slices of `T` with a header of `H`, at most `max_length` elements.
-    pub fn publisher<T, H>(
+    pub fn publisher<T: Part, H: Part>(
         &self,
         topic: &Topic,
         max_length: usize,
-    ) -> Result<Publisher<T, H>, OpenError>
-    where
-        T: Debug + ZeroCopySend + 'static,
-        H: Debug + ZeroCopySend + 'static,
-    {
+    ) -> Result<Publisher<T, H>, OpenError> {
         let name = topic.service_name(&self.place.instance);
         let message_bytes = size_of::<H>() + max_length * size_of::<T>();
         self.place.check_shared_memory(topic.bytes(message_bytes))?;
@@ -151,11 +152,10 @@ impl Hub {
     }
 
     /// A receiver of slices of `T` with a header of `H`.
-    pub fn subscriber<T, H>(&self, topic: &Topic) -> Result<Subscriber<T, H>, OpenError>
-    where
-        T: Debug + ZeroCopySend + 'static,
-        H: Debug + ZeroCopySend + 'static,
-    {
+    pub fn subscriber<T: Part, H: Part>(
+        &self,
+        topic: &Topic,
+    ) -> Result<Subscriber<T, H>, OpenError> {
         let name = topic.service_name(&self.place.instance);
         let service = self.data_service::<T, H>(topic, &name)?;
         let port = service
@@ -189,15 +189,11 @@ impl Hub {
         Ok(Wake { notifier: notifier.map_err(|e| topic_error(name, &e))? })
     }
 
-    fn data_service<T, H>(
+    fn data_service<T: Part, H: Part>(
         &self,
         topic: &Topic,
         name: &str,
-    ) -> Result<DataFactory<ipc::Service, [T], H>, OpenError>
-    where
-        T: Debug + ZeroCopySend + 'static,
-        H: Debug + ZeroCopySend + 'static,
-    {
+    ) -> Result<DataFactory<ipc::Service, [T], H>, OpenError> {
         let service_name = ServiceName::new(name).map_err(|e| topic_error(name, &e))?;
         let builder = || {
             self.node
@@ -271,13 +267,13 @@ pub(in crate::wire) fn retry<S, E: std::fmt::Display>(
 
 /// Sends slices of `T` with a header of `H`, and wakes those who wait.
 #[derive(Debug)]
-pub struct Publisher<T: Debug + ZeroCopySend + 'static, H: Debug + ZeroCopySend + 'static> {
+pub struct Publisher<T: Part, H: Part> {
     port: RawPublisher<ipc::Service, [T], H>,
     wake: Wake,
     topic: String,
 }
 
-impl<T: Debug + ZeroCopySend + Copy, H: Debug + Default + ZeroCopySend> Publisher<T, H> {
+impl<T: Part + Copy, H: Part + Default> Publisher<T, H> {
     /// Copies `payload` into shared memory and sends it.
     pub fn send(&self, header: H, payload: &[T]) -> Result<(), SendError> {
         let failed = |e: &dyn std::fmt::Display| self.error(e);
@@ -300,7 +296,7 @@ impl<T: Debug + ZeroCopySend + Copy, H: Debug + Default + ZeroCopySend> Publishe
     }
 }
 
-impl<H: Debug + Default + ZeroCopySend> Publisher<u8, H> {
+impl<H: Part + Default> Publisher<u8, H> {
     /// Room for `length` bytes in shared memory, to be written in place.
     pub fn loan(&self, length: usize) -> Result<Loan<'_, H>, SendError> {
         let sample = self.port.loan_slice_uninit(length).map_err(|e| self.error(&e))?;
@@ -312,12 +308,12 @@ impl<H: Debug + Default + ZeroCopySend> Publisher<u8, H> {
 
 /// Bytes in shared memory that are not sent yet; dropped without sending they go back.
 #[derive(Debug)]
-pub struct Loan<'a, H: Debug + Default + ZeroCopySend + 'static> {
+pub struct Loan<'a, H: Part + Default> {
     sample: SampleMut<ipc::Service, [u8], H>,
     publisher: &'a Publisher<u8, H>,
 }
 
-impl<H: Debug + Default + ZeroCopySend> Loan<'_, H> {
+impl<H: Part + Default> Loan<'_, H> {
     /// The bytes.
     pub fn bytes_mut(&mut self) -> &mut [u8] {
         self.sample.payload_mut()
@@ -334,13 +330,13 @@ impl<H: Debug + Default + ZeroCopySend> Loan<'_, H> {
 
 /// Receives slices of `T` with a header of `H`.
 #[derive(Debug)]
-pub struct Subscriber<T: Debug + ZeroCopySend + 'static, H: Debug + ZeroCopySend + 'static> {
+pub struct Subscriber<T: Part, H: Part> {
     port: RawSubscriber<ipc::Service, [T], H>,
     events: Events,
     topic: String,
 }
 
-impl<T: Debug + ZeroCopySend, H: Debug + ZeroCopySend> Subscriber<T, H> {
+impl<T: Part, H: Part> Subscriber<T, H> {
     /// The oldest unread message.
     pub fn receive(&self) -> Result<Option<Received<T, H>>, ReceiveError> {
         let sample = self.port.receive().map_err(|e| self.error(&e))?;
@@ -380,11 +376,11 @@ impl<T: Debug + ZeroCopySend, H: Debug + ZeroCopySend> Subscriber<T, H> {
 
 /// A message in shared memory; its place is free again when this is dropped.
 #[derive(Debug)]
-pub struct Received<T: Debug + ZeroCopySend + 'static, H: Debug + ZeroCopySend + 'static> {
+pub struct Received<T: Part, H: Part> {
     sample: Sample<ipc::Service, [T], H>,
 }
 
-impl<T: Debug + ZeroCopySend, H: Debug + ZeroCopySend> Received<T, H> {
+impl<T: Part, H: Part> Received<T, H> {
     /// Its header.
     pub fn header(&self) -> &H {
         self.sample.user_header()
