@@ -182,7 +182,8 @@ pub struct FrameCounts {
 
 impl FrameCounts {
     fn of(poses: &[RecordedPose], map: &Map) -> Self {
-        let count = |is: fn(TrackingState) -> bool| count_states(poses, is);
+        let states = || poses.iter().map(|pose| pose.estimate.state);
+        let count = |is: fn(TrackingState) -> bool| states().filter(|of| is(*of)).count() as u64;
         let later: Vec<TrackingState> = placed_later(poses, map).map(|of| of.state).collect();
         let without_pose = |is: fn(TrackingState) -> bool| {
             count(is) - later.iter().filter(|state| is(**state)).count() as u64
@@ -441,10 +442,6 @@ fn restarts_by_process(causes: &[RestartCause]) -> BTreeMap<String, u64> {
 
 fn is_lost(state: TrackingState) -> bool {
     matches!(state, TrackingState::Lost(_))
-}
-
-fn count_states(poses: &[RecordedPose], is: fn(TrackingState) -> bool) -> u64 {
-    poses.iter().filter(|pose| is(pose.estimate.state)).count() as u64
 }
 
 /// Epochs of the poses that are written: one that was joined to another is no epoch of its own.

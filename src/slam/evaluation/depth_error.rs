@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::slam::evaluation::depth_modes::DepthModes;
-use crate::slam::evaluation::statistics::median;
+use crate::slam::evaluation::statistics::{largest_over_smallest, median};
 use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::Keyframe;
 
@@ -33,11 +33,7 @@ pub struct KeyframeDepth {
 
 /// Largest over smallest map unit of the keyframes; `None` below two.
 pub fn depth_scale_ratio(keyframes: &[KeyframeDepth]) -> Option<f64> {
-    if keyframes.len() < 2 {
-        return None;
-    }
-    let units = keyframes.iter().map(|of| of.units_per_metre);
-    Some(units.clone().fold(0.0, f64::max) / units.fold(f64::INFINITY, f64::min))
+    largest_over_smallest(keyframes.iter().map(|of| of.units_per_metre))
 }
 
 /// Pixels of one or more keyframes whose true depth is known.

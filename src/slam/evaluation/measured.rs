@@ -2,12 +2,12 @@
 //! each aligned by itself.
 
 use crate::slam::evaluation::association::associate;
-use crate::slam::evaluation::statistics::{ErrorStatistics, median};
+use crate::slam::evaluation::statistics::{ErrorStatistics, largest_over_smallest, median};
 use crate::slam::evaluation::trajectory_error::{
     RelativeErrors, absolute_errors, path_length, relative_errors, timed_pairs,
 };
 use crate::slam::evaluation::umeyama::{AlignmentError, TrajectoryAlignment, umeyama};
-use crate::slam::evaluation::windows::{scale_ratio, scale_windows, shape_errors};
+use crate::slam::evaluation::windows::{scale_windows, shape_errors};
 use crate::slam::evaluation::{EvaluationError, TrajectoryEvaluation};
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::trajectory::StampedPose;
@@ -93,7 +93,7 @@ impl Measured {
             rpe_translation_1s: ErrorStatistics::of(&self.seconds.translation),
             rpe_rotation_deg_1s: ErrorStatistics::of(&self.seconds.rotation_deg),
             path_length: self.path_length,
-            window_scale_ratio: scale_ratio(&self.window_scales),
+            window_scale_ratio: largest_over_smallest(self.window_scales.iter().map(|of| of.1)),
             window_scales: self.window_scales,
             window_error: median(&self.shape),
             alignment,

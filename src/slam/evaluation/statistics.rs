@@ -66,6 +66,13 @@ pub fn percentiles<const N: usize>(
     Some(found)
 }
 
+/// Largest over smallest of positive values; `None` below two.
+pub fn largest_over_smallest(values: impl Iterator<Item = f64> + Clone) -> Option<f64> {
+    let largest = values.clone().fold(0.0, f64::max);
+    let smallest = values.clone().fold(f64::INFINITY, f64::min);
+    (values.count() > 1).then(|| largest / smallest)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
