@@ -100,30 +100,24 @@ pub fn report(results: &Results<'_>) -> String {
     page
 }
 
-/// What a reader must know first.
+/// What a reader must know first: that a run did not come to its end, or tracked nothing.
 fn notices(summary: &Summary, ended: &EndOfRun) -> String {
-    let untracked = summary
-        .untracked
-        .as_ref()
-        .map(|why| format!("<p class=\"notice\">Nothing was tracked: {}.</p>", escaped(why)));
-    end_notice(ended) + &untracked.unwrap_or_default()
-}
-
-/// What a reader must know of a run that did not come to its end; nothing of one that did.
-fn end_notice(ended: &EndOfRun) -> String {
-    let text = match ended {
-        EndOfRun::Finished => return String::new(),
-        EndOfRun::Interrupted => "Interrupted: these are the results up to then.".to_owned(),
+    let end = match ended {
+        EndOfRun::Finished => None,
+        EndOfRun::Interrupted => Some("Interrupted: these are the results up to then.".to_owned()),
         EndOfRun::Failed(cause) => {
-            format!("Failed: {}. These are the results up to then.", escaped(cause))
+            Some(format!("Failed: {}. These are the results up to then.", escaped(cause)))
         }
-        EndOfRun::Recovered(time) => format!(
+        EndOfRun::Recovered(time) => Some(format!(
             "Recovered from the journal of a run that ended at {}: it was killed, and its last two seconds may be \
              missing.",
             utc_text(*time)
-        ),
+        )),
     };
-    format!("<p class=\"notice\">{text}</p>")
+    let untracked = summary.untracked.as_ref();
+    let untracked = untracked.map(|why| format!("Nothing was tracked: {}.", escaped(why)));
+    let notice = |text: String| format!("<p class=\"notice\">{text}</p>");
+    end.into_iter().chain(untracked).map(notice).collect()
 }
 
 /// What a deadline costs; nothing where no frame was aligned again.

@@ -35,7 +35,14 @@ pub fn map_view(results: &Results<'_>, up: Option<Vector3<f64>>) -> String {
             place: k.map_from_keyframe,
         })
         .collect();
-    let points = scene_points(&results.surface);
+    // Each is of the first keyframe that saw it.
+    let scene_point = |&SurfacePoint { position, grey, sigma, .. }: &SurfacePoint| ScenePoint {
+        position,
+        grey,
+        std_dev: sigma,
+        keyframe_id: None,
+    };
+    let points: Vec<ScenePoint> = results.surface.iter().map(scene_point).collect();
     let gaps = epoch.map_or_else(Vec::new, |epoch| gaps_in(&final_poses(results.record), epoch));
     let block = pack(&SceneInput {
         points: &points,
@@ -63,15 +70,4 @@ pub fn map_view(results: &Results<'_>, up: Option<Vector3<f64>>) -> String {
     let _ = write!(html, "<script>{VIEWER}</script><script>{PLAYER}</script>");
     let _ = write!(html, "<script>{}</script></section>", include_str!("map_view.js"));
     html
-}
-
-/// The points of the map's surface for the view; each is of the first keyframe that saw it.
-fn scene_points(surface: &[SurfacePoint]) -> Vec<ScenePoint> {
-    let scene_point = |point: &SurfacePoint| ScenePoint {
-        position: point.position,
-        grey: point.grey,
-        std_dev: point.sigma,
-        keyframe_id: None,
-    };
-    surface.iter().map(scene_point).collect()
 }
