@@ -114,16 +114,6 @@ pub enum LogFormat {
     Journald,
 }
 
-impl LogFormat {
-    fn name(self) -> &'static str {
-        match self {
-            Self::Text => "text",
-            Self::Json => "json",
-            Self::Journald => "journald",
-        }
-    }
-}
-
 impl CommonArguments {
     /// Configuration with everything that was said on the command line.
     fn load(&self) -> Result<Config, ConfigError> {
@@ -149,13 +139,21 @@ impl CommonArguments {
 
     /// The same options for a child process.
     fn to_arguments(&self) -> Vec<OsString> {
+        let mut arguments = self.of_bridge();
+        let mut push = |option: &str, value: &str| arguments.extend([option.into(), value.into()]);
+        let format = self.log_format.to_possible_value();
+        format.iter().for_each(|format| push("--log-format", format.get_name()));
+        self.set.iter().for_each(|setting| push("--set", setting));
+        arguments
+    }
+
+    /// Those of them that `semidense-bridge` has too.
+    fn of_bridge(&self) -> Vec<OsString> {
         let mut arguments: Vec<OsString> = Vec::new();
         let mut push =
             |option: &str, value: &OsStr| arguments.extend([option.into(), value.into()]);
         push("--log", self.log.as_ref());
-        push("--log-format", self.log_format.name().as_ref());
         self.config.iter().for_each(|file| push("--config", file.as_ref()));
-        self.set.iter().for_each(|setting| push("--set", setting.as_ref()));
         self.instance.iter().for_each(|name| push("--instance", name.as_ref()));
         arguments
     }

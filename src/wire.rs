@@ -5,7 +5,6 @@
 
 pub mod command;
 pub mod conversion;
-mod empty_message;
 pub mod folders;
 pub mod keyframe_inbox;
 pub(crate) mod limits;

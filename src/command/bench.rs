@@ -11,14 +11,13 @@ use std::time::Duration;
 use clap::{Args, Subcommand, ValueEnum};
 
 use crate::capture::source_name::SourceName;
-use crate::command::ending::run_start;
-use crate::command::print::{note, print};
+use crate::command::ending::journal_options;
+use crate::command::print::{note, print_as};
 use crate::command::run_progress::start_display;
 use crate::command::{CommandResult, CommonArguments, INTERRUPTED};
 use crate::service::atomic_file::write_atomically;
 use crate::service::config::Config;
 use crate::service::error_log::ErrorLog;
-use crate::service::journal::JournalOptions;
 use crate::service::latency_bench::{Disturbance, Measurement, Trial, TrialError, try_out};
 use crate::service::mode::Mode;
 use crate::service::results::times::Percentiles;
@@ -164,11 +163,7 @@ fn run_soak(
     let output = std::env::temp_dir().join(format!("semidense-soak-{}", std::process::id()));
     fs::create_dir(&output)
         .map_err(|error| format!("{}: cannot be made ({error})", output.display()))?;
-    let journal = JournalOptions {
-        output: output.clone(),
-        start: run_start(config, &source, None),
-        max_depth_bytes: config.mapping.max_map_bytes() as u64,
-    };
+    let journal = journal_options(config, &source, None, &output);
     let soaked = Soak { frames, rate_hz, mode, period, journal };
     let samples =
         soak(config, &soaked, &source, &options, log, &shutdown, &mut |p| display.show(p));
@@ -180,10 +175,7 @@ fn run_soak(
             .map_err(|error| format!("{}: cannot be written ({error})", path.display()))?;
     }
     let trends = trends(&samples);
-    print(&match arguments.json {
-        true => format!("{}\n", serde_json::to_string_pretty(&trends)?),
-        false => trend_table(&samples, &trends),
-    })?;
+    print_as(arguments.json, &trends, |trends| trend_table(&samples, trends))?;
     Ok(if shutdown.is_requested() { ExitCode::from(INTERRUPTED) } else { ExitCode::SUCCESS })
 }
 
@@ -240,10 +232,7 @@ fn run_latency(
             }
         }
     }
-    print(&match arguments.json {
-        true => format!("{}\n", serde_json::to_string_pretty(&measurements)?),
-        false => table(&measurements),
-    })?;
+    print_as(arguments.json, &measurements, |all| table(all))?;
     Ok(ExitCode::SUCCESS)
 }
 

@@ -1,6 +1,6 @@
 //! `semidense view`, `record`, `ros2`, `zenoh`: hand over to `semidense-bridge`, a program and package of its own.
 
-use std::ffi::{OsStr, OsString};
+use std::ffi::OsString;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -35,16 +35,11 @@ pub enum BridgeError {
         /// This program.
         own: PathBuf,
     },
-    /// An option that it does not have.
+    /// It has no `--set`: the subcommand.
     #[error(
-        "`semidense {command}` has no {option}: write it into a configuration file and name that with --config"
+        "`semidense {0}` has no --set: write it into a configuration file and name that with --config"
     )]
-    Option {
-        /// The subcommand.
-        command: &'static str,
-        /// The option.
-        option: &'static str,
-    },
+    Set(&'static str),
     /// It does not start.
     #[error("cannot start {program}: {source}")]
     Start {
@@ -62,23 +57,27 @@ pub fn run(
     arguments: &BridgeArguments,
 ) -> CommandResult {
     if !common.set.is_empty() {
-        return Err(BridgeError::Option { command, option: "--set" }.into());
+        return Err(BridgeError::Set(command).into());
     }
-    let own = std::env::current_exe().unwrap_or_else(|_| PathBuf::from("semidense"));
-    let missing = || BridgeError::Missing { command: command.to_owned(), own: own.clone() };
-    let program = program(&own).ok_or_else(missing)?;
+    let program = bridge(command)?;
     let source = Command::new(&program)
         // Its help and its errors then name the command that was typed.
         .arg0("semidense")
-        .args(handed_on(common))
+        .args(common.of_bridge())
         .arg(command)
         .args(&arguments.arguments)
         .exec();
     Err(BridgeError::Start { program, source }.into())
 }
 
+/// The program, for `command`.
+pub fn bridge(command: &str) -> Result<PathBuf, BridgeError> {
+    let own = std::env::current_exe().unwrap_or_else(|_| PathBuf::from("semidense"));
+    program(&own).ok_or_else(|| BridgeError::Missing { command: command.to_owned(), own })
+}
+
 /// The program: beside our own, which was installed or built with it, else on the path.
-pub fn program(own: &Path) -> Option<PathBuf> {
+fn program(own: &Path) -> Option<PathBuf> {
     let path = std::env::var_os("PATH").unwrap_or_default();
     let beside = own.parent().map(Path::to_owned);
     beside
@@ -86,16 +85,6 @@ pub fn program(own: &Path) -> Option<PathBuf> {
         .chain(std::env::split_paths(&path))
         .map(|f| f.join(PROGRAM))
         .find(|p| p.is_file())
-}
-
-/// The options that every command of either program has.
-pub fn handed_on(common: &CommonArguments) -> Vec<OsString> {
-    let mut arguments: Vec<OsString> = Vec::new();
-    let mut push = |option: &str, value: &OsStr| arguments.extend([option.into(), value.into()]);
-    push("--log", common.log.as_ref());
-    common.config.iter().for_each(|file| push("--config", file.as_ref()));
-    common.instance.iter().for_each(|name| push("--instance", name.as_ref()));
-    arguments
 }
 
 #[cfg(test)]

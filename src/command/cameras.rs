@@ -7,7 +7,7 @@ use clap::Args;
 
 use crate::capture::v4l::listing::{Access, CameraReport, ControlReport, FormatReport, cameras};
 use crate::command::CommandResult;
-use crate::command::print::print;
+use crate::command::print::print_as;
 
 /// List the cameras of this machine: names, formats, sizes, rates and controls
 ///
@@ -23,12 +23,10 @@ pub struct CamerasArguments {
 /// Runs it.
 pub fn run(arguments: CamerasArguments) -> CommandResult {
     let found = cameras(Path::new("/dev"));
-    print(&match arguments.json {
-        true => format!("{}\n", serde_json::to_string_pretty(&found)?),
-        false if found.is_empty() => {
-            "no cameras: /dev has no video capture device; recordings and the simulator need none\n"
-                .to_owned()
-        }
+    const NONE: &str =
+        "no cameras: /dev has no video capture device; recordings and the simulator need none\n";
+    print_as(arguments.json, &found, |found| match found.is_empty() {
+        true => NONE.to_owned(),
         false => found.iter().map(text_of).collect(),
     })?;
     Ok(ExitCode::SUCCESS)

@@ -63,7 +63,9 @@ fn as_toml(keys: &[&KeyInForce]) -> String {
     for key in keys {
         let (table, name) = key.key.rsplit_once('.').unwrap_or(("", &key.key));
         let line = format!("{name} = {}", key.value);
-        let line = format!("{line:<ORIGIN_COLUMN$} # {}\n", origin(key));
+        let built_in = key.built_in.iter().map(|value| format!("; built-in {value}"));
+        let origin = name_of(&key.origin) + &built_in.collect::<String>();
+        let line = format!("{line:<ORIGIN_COLUMN$} # {origin}\n");
         match tables.iter_mut().find(|(known, _)| *known == table) {
             Some((_, lines)) => *lines += &line,
             None => tables.push((table, format!("\n[{table}]\n{line}"))),
@@ -76,31 +78,22 @@ fn as_toml(keys: &[&KeyInForce]) -> String {
     }
 }
 
-fn origin(key: &KeyInForce) -> String {
-    let from = match &key.origin {
+fn name_of(origin: &Origin) -> String {
+    match origin {
         Origin::BuiltIn => "built-in".to_owned(),
         Origin::File(path) => path.display().to_string(),
         Origin::CommandLine => "command line".to_owned(),
-    };
-    match &key.built_in {
-        Some(built_in) => format!("{from}; built-in {built_in}"),
-        None => from,
     }
 }
 
 fn as_json(key: &KeyInForce) -> (String, Value) {
-    let from = match &key.origin {
-        Origin::BuiltIn => json!("built-in"),
-        Origin::File(path) => json!(path.display().to_string()),
-        Origin::CommandLine => json!("command line"),
-    };
     // TOML values that JSON has, too, but for numbers that are none.
     let value =
         |text: &str| -> Value { serde_json::from_str(text).unwrap_or_else(|_| json!(text)) };
     let object = json!({
         "value": value(&key.value),
         "built_in": value(key.built_in.as_deref().unwrap_or(&key.value)),
-        "origin": from,
+        "origin": name_of(&key.origin),
     });
     (key.key.clone(), object)
 }

@@ -5,7 +5,7 @@ use std::process::ExitCode;
 use clap::Args;
 
 use crate::command::CommandResult;
-use crate::command::print::print;
+use crate::command::print::print_as;
 use crate::service::config::Config;
 use crate::service::doctor::{Finding, Machine, Severity, examine};
 
@@ -23,10 +23,7 @@ pub struct DoctorArguments {
 /// Runs it.
 pub fn run(config: &Config, arguments: DoctorArguments) -> CommandResult {
     let findings = examine(&Machine::default(), config);
-    print(&match arguments.json {
-        true => format!("{}\n", serde_json::to_string_pretty(&findings)?),
-        false => findings.iter().map(line).collect(),
-    })?;
+    print_as(arguments.json, &findings, |findings| findings.iter().map(line).collect())?;
     let is_broken = findings.iter().any(|finding| finding.severity == Severity::Error);
     Ok(if is_broken { ExitCode::FAILURE } else { ExitCode::SUCCESS })
 }

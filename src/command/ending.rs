@@ -7,13 +7,13 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use crate::capture::source::FrameSource;
 use crate::capture::source_name::SourceName;
-use crate::command::print::{note, print};
+use crate::command::print::{note, print, print_as};
 use crate::command::progress::Progress;
 use crate::command::{CommandResult, INTERRUPTED, NOTHING_TRACKED};
 use crate::service::config::Config;
-use crate::service::journal::Journal;
 use crate::service::journal::folder::Unfinished;
 use crate::service::journal::log::RunStart;
+use crate::service::journal::{Journal, JournalOptions};
 use crate::service::results::Results;
 use crate::service::results::calibration::calibration_warning;
 use crate::service::results::mapping_load::mapping_warning;
@@ -113,11 +113,10 @@ impl Ending<'_> {
 
     /// Prints the figures, and warnings of what the user can change.
     fn print_summary(&self, summary: &Summary) -> Result<(), Box<dyn Error>> {
+        print_as(self.json, summary, summary_text)?;
         if self.json {
-            print(&format!("{}\n", serde_json::to_string_pretty(summary)?))?;
             return Ok(());
         }
-        print(&summary_text(summary))?;
         let Summary { mode, frames_in, frames_skipped_by_mapper: skipped, .. } = *summary;
         let calibration = calibration_warning(summary.whitened_residual_median);
         // Where nothing was tracked, the reason follows.
@@ -182,11 +181,16 @@ pub fn note_unfinished(found: &[Unfinished]) {
     }
 }
 
-/// What a journal keeps of how a run is started.
-pub fn run_start(config: &Config, source: &SourceName, rig: Option<&Path>) -> RunStart {
+/// The journal of a replay that begins, from which it can be recovered where it is killed.
+pub fn journal_options(
+    config: &Config,
+    source: &SourceName,
+    rig: Option<&Path>,
+    output: &Path,
+) -> JournalOptions {
     let folder = std::env::current_dir().unwrap_or_default();
     let since = SystemTime::now().duration_since(UNIX_EPOCH);
-    RunStart {
+    let start = RunStart {
         mode: RunMode::Replay,
         source: source.to_os_string(),
         rig: rig.map(|rig| rig.as_os_str().to_owned()),
@@ -195,5 +199,7 @@ pub fn run_start(config: &Config, source: &SourceName, rig: Option<&Path>) -> Ru
         poses_given: false,
         is_depth_from_sensor: false,
         began_nanos: since.map_or(0, |since| since.as_nanos() as u64),
-    }
+    };
+    let max_depth_bytes = config.mapping.max_map_bytes() as u64;
+    JournalOptions { output: output.to_owned(), start, max_depth_bytes }
 }

@@ -66,7 +66,7 @@ pub fn evaluation_text(evaluation: &EpochsEvaluation, alignment: TrajectoryAlign
     let poses: usize = evaluation.epochs.iter().map(|of| of.poses).sum();
     let mut lines = epoch_lines(evaluation);
     lines.extend([
-        format!("{} of {poses} poses matched", total.association.pairs.len()),
+        format!("{} of {poses} poses matched", total.pairs.len()),
         format!("alignment {fitted}; path {:.3} m", total.path_length),
         format!("{:<26} {:>12} {:>12} {:>12} {:>12}", "", "rmse", "mean", "median", "max"),
     ]);
@@ -111,7 +111,7 @@ fn epoch_lines(evaluation: &EpochsEvaluation) -> Vec<String> {
         lines.push(match result {
             Ok(of) => format!(
                 "{name:<12} {poses:>8} {:>8} {:>12.3} {:>12.6} {:>12.6}",
-                of.association.pairs.len(),
+                of.pairs.len(),
                 of.path_length,
                 of.alignment.scale,
                 of.ate.rmse

@@ -9,7 +9,7 @@ use clap::{Args, Subcommand};
 
 use crate::command::CommandResult;
 use crate::command::map_points::MapPointOptions;
-use crate::command::print::{note, print};
+use crate::command::print::{note, print, print_as};
 use crate::command::progress::Progress;
 use crate::service::config::{Config, MapConfig};
 use crate::service::health::ProcessState;
@@ -169,10 +169,7 @@ fn load_all(folder: &Path) -> Result<Loaded, Box<dyn std::error::Error>> {
 fn info(arguments: &InfoArguments) -> CommandResult {
     let loaded = load_all(&arguments.folder)?;
     let report = MapReport::of(&arguments.folder, &loaded);
-    print(&match arguments.json {
-        true => format!("{}\n", serde_json::to_string_pretty(&report)?),
-        false => text_of(&report),
-    })?;
+    print_as(arguments.json, &report, text_of)?;
     Ok(ExitCode::from(u8::from(!report.problems.is_empty())))
 }
 

@@ -12,6 +12,11 @@ use crate::command::print::note;
 /// Time between two plain lines: a log of a long run stays short, and it is seen to continue.
 pub const LINE_PERIOD: Duration = Duration::from_secs(5);
 
+/// How a bar looks.
+pub fn style(template: &str) -> ProgressStyle {
+    ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar())
+}
+
 /// Progress of one piece of work.
 #[derive(Debug)]
 pub struct Progress {
@@ -33,8 +38,7 @@ impl Progress {
                 ),
                 None => (ProgressBar::no_length(), "{prefix} {spinner} {pos} {elapsed} {msg}"),
             };
-            let style = ProgressStyle::with_template(template);
-            bar.with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar())).with_prefix(what)
+            bar.with_style(style(template)).with_prefix(what)
         });
         Self { what, total, bar, last_line: Cell::new(Instant::now()) }
     }

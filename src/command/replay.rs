@@ -5,23 +5,22 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use clap::{Args, ValueEnum};
+use clap::Args;
 
 use crate::capture::opening::{open, rig_remarks};
 use crate::capture::source::FrameSource;
 use crate::capture::source_name::SourceName;
 use crate::command::INTERRUPTED;
 use crate::command::capture::SourceArguments;
-use crate::command::ending::{Ending, note_unfinished, run_start};
+use crate::command::ending::{Ending, journal_options, note_unfinished};
 use crate::command::map::MapOptions;
 use crate::command::map_points::MapPointOptions;
 use crate::command::print::{PrintError, note};
 use crate::command::progress::Progress;
 use crate::service::config::Config;
+use crate::service::journal::Journal;
 use crate::service::journal::folder::unfinished;
-use crate::service::journal::log::RunStart;
 use crate::service::journal::replayed::ReplayJournal;
-use crate::service::journal::{Journal, JournalOptions};
 use crate::service::replay::{DepthOrigin, PoseOrigin, ReplayConfig, ReplayError, replay};
 use crate::service::results::debug_pictures::write_debug_pictures;
 use crate::service::results::output_folder::OutputFolder;
@@ -38,26 +37,6 @@ const SOURCE_HELP: &str = "Where frames come from: DIR (its layout is detected),
      of the configuration, which is sim]. A camera cannot be replayed: use `semidense run`";
 const RIG_HELP: &str = "Rig file with the camera's calibration, for recordings without their own [default: capture.rig of the \
      configuration, for the source configured there]";
-
-/// Where poses come from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
-enum Poses {
-    /// The tracker estimates them
-    #[default]
-    Tracker,
-    /// The source's ground truth; only the mapper runs
-    Groundtruth,
-}
-
-/// Where the first depth of a keyframe comes from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
-enum InitialDepth {
-    /// The images alone
-    #[default]
-    Images,
-    /// The source's depth camera
-    Sensor,
-}
 
 /// Replay a recorded or simulated sequence in one process: every frame, bit-identical on every run
 #[derive(Debug, Args)]
@@ -77,10 +56,10 @@ pub struct ReplayArgs {
     points: MapPointOptions,
     /// Where the first depth of a keyframe comes from
     #[arg(long, value_enum, default_value_t)]
-    initial_depth: InitialDepth,
+    initial_depth: DepthOrigin,
     /// Where poses come from
     #[arg(long, value_enum, default_value_t)]
-    poses: Poses,
+    poses: PoseOrigin,
     /// Write images of every keyframe's inverse depth, variance, density and weights for three
     /// motions into DIR/debug
     #[arg(long)]
@@ -123,7 +102,9 @@ pub fn run(config: &Config, args: ReplayArgs) -> Result<ExitCode, Box<dyn Error>
         .num_threads(threads)
         .thread_name(|i| format!("mapper-{i}"))
         .build()?;
-    let journal = journal_options(config, args, &name, rig.as_deref(), output.path());
+    let mut journal = journal_options(config, &name, rig.as_deref(), output.path());
+    journal.start.poses_given = args.poses == PoseOrigin::GroundTruth;
+    journal.start.is_depth_from_sensor = args.initial_depth == DepthOrigin::Sensor;
     let begin = || ReplayJournal::begin(&journal, &place);
     let replayed = pool.install(|| {
         record(config, args, &name.to_string(), source.as_mut(), &shutdown, &begin)
@@ -163,7 +144,7 @@ fn meant_config(
         );
     }
     let map = args.map.of(config)?;
-    if args.poses == Poses::Groundtruth && !map.folder.is_empty() {
+    if args.poses == PoseOrigin::GroundTruth && !map.folder.is_empty() {
         return Err("--poses groundtruth cannot be used with a map: its poses would be those of another world".into());
     }
     let results = args.points.of(&config.results);
@@ -173,25 +154,6 @@ fn meant_config(
     simulator.seed = args.seed.unwrap_or(simulator.seed);
     simulator.frames = args.frames.map_or(simulator.frames, |n| simulator.frames.min(n as usize));
     Ok(meant)
-}
-
-/// The journal, from which a replay that is killed can be recovered.
-fn journal_options(
-    config: &Config,
-    args: &ReplayArgs,
-    name: &SourceName,
-    rig: Option<&Path>,
-    output: &Path,
-) -> JournalOptions {
-    JournalOptions {
-        output: output.to_owned(),
-        start: RunStart {
-            poses_given: args.poses == Poses::Groundtruth,
-            is_depth_from_sensor: args.initial_depth == InitialDepth::Sensor,
-            ..run_start(config, name, rig)
-        },
-        max_depth_bytes: config.mapping.max_map_bytes() as u64,
-    }
 }
 
 /// What was replayed.
@@ -258,14 +220,8 @@ fn replay_config(config: &Config, args: &ReplayArgs) -> ReplayConfig {
         tracker: config.tracking.clone(),
         mapper: config.mapping.clone(),
         map: config.map.clone(),
-        poses: match args.poses {
-            Poses::Tracker => PoseOrigin::Tracker,
-            Poses::Groundtruth => PoseOrigin::GroundTruth,
-        },
-        initial_depth: match args.initial_depth {
-            InitialDepth::Images => DepthOrigin::Images,
-            InitialDepth::Sensor => DepthOrigin::Sensor,
-        },
+        poses: args.poses,
+        initial_depth: args.initial_depth,
         max_frames: args.frames.map(|frames| frames as usize),
         strict: config.capture.strict,
     }

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use crate::command::bridge::{BridgeError, program};
+use crate::command::bridge::{BridgeError, bridge};
 use crate::command::print::note;
 use crate::service::shutdown::Shutdown;
 use crate::wire::port::{WaitError, wait};
@@ -39,10 +39,7 @@ pub enum Ros2RigError {
 
 /// Waits for the CameraInfo beside `topic` and writes a rig file of it into `folder`.
 pub fn fetch(topic: &str, folder: &Path, shutdown: &Shutdown) -> Result<PathBuf, Ros2RigError> {
-    let own = std::env::current_exe().unwrap_or_default();
-    let command = format!("run ros2:{topic}");
-    let missing = || BridgeError::Missing { command, own: own.clone() };
-    let program = program(&own).ok_or_else(missing)?;
+    let program = bridge(&format!("run ros2:{topic}"))?;
     let path = folder.join("rig.toml");
     let failed = |source| Ros2RigError::Program { program: program.clone(), source };
     let mut child = Command::new(&program)

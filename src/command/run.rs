@@ -3,15 +3,15 @@
 use std::error::Error;
 use std::ffi::OsString;
 use std::net::SocketAddr;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Args;
 
 use crate::capture::source_name::SourceName;
-use crate::command::bridge::{BridgeError, handed_on, program};
+use crate::command::bridge::bridge;
 use crate::command::capture::{ModeArguments, SourceArguments, usual_mode};
-use crate::command::ending::{Ending, note_unfinished, run_start};
+use crate::command::ending::{Ending, journal_options, note_unfinished};
 use crate::command::map::MapOptions;
 use crate::command::map_points::MapPointOptions;
 use crate::command::print::note;
@@ -20,9 +20,8 @@ use crate::command::run_progress::start_display;
 use crate::command::{CommandResult, CommonArguments, INTERRUPTED};
 use crate::service::config::{Config, MapConfig};
 use crate::service::error_log::ErrorLog;
+use crate::service::journal::Journal;
 use crate::service::journal::folder::unfinished;
-use crate::service::journal::log::RunStart;
-use crate::service::journal::{Journal, JournalOptions};
 use crate::service::mode::Mode;
 use crate::service::results::output_folder::OutputFolder;
 use crate::service::results::record::RunMode;
@@ -78,12 +77,17 @@ pub fn run(
     // First: a signal must find the folder's owner ready to remove it.
     let shutdown = Shutdown::install()?;
     let output = OutputFolder::prepare(arguments.output.as_deref())?;
-    let rig = match rig_of(&source, rig, output.path(), &shutdown) {
-        Err(Ros2RigError::Interrupted) => return Ok(ExitCode::from(INTERRUPTED)),
-        rig => rig?,
+    let rig = match (&source, rig) {
+        // A ROS 2 topic brings its own calibration.
+        (SourceName::Ros2(topic), None) => match fetch_rig(topic, output.path(), &shutdown) {
+            Err(Ros2RigError::Interrupted) => return Ok(ExitCode::from(INTERRUPTED)),
+            rig => Some(rig?),
+        },
+        (_, rig) => rig,
     };
     note_unfinished(&unfinished(Some(&place), output.path()));
-    let journal = journal_options(config, &source, rig.as_deref(), mode, output.path());
+    let mut journal = journal_options(config, &source, rig.as_deref(), output.path());
+    journal.start.mode = if mode == Mode::Live { RunMode::Live } else { RunMode::Lockstep };
     let options = RunOptions {
         source,
         rig,
@@ -117,37 +121,6 @@ fn child_arguments(
         told.extend(MapOptions::settings(map));
     }
     told
-}
-
-/// The rig file of a source: a ROS 2 topic without one brings its own calibration.
-fn rig_of(
-    source: &SourceName,
-    rig: Option<PathBuf>,
-    folder: &Path,
-    shutdown: &Shutdown,
-) -> Result<Option<PathBuf>, Ros2RigError> {
-    match (source, rig) {
-        (SourceName::Ros2(topic), None) => fetch_rig(topic, folder, shutdown).map(Some),
-        (_, rig) => Ok(rig),
-    }
-}
-
-/// The journal, from which a run that is killed can be recovered.
-fn journal_options(
-    config: &Config,
-    source: &SourceName,
-    rig: Option<&Path>,
-    mode: Mode,
-    output: &Path,
-) -> JournalOptions {
-    JournalOptions {
-        output: output.to_owned(),
-        start: RunStart {
-            mode: if mode == Mode::Live { RunMode::Live } else { RunMode::Lockstep },
-            ..run_start(config, source, rig)
-        },
-        max_depth_bytes: config.mapping.max_map_bytes() as u64,
-    }
 }
 
 /// Supervises the processes under a display, which names the live page once there is one.
@@ -187,13 +160,11 @@ fn start_page(
     place: &Place,
     log: &ErrorLog,
 ) -> Result<ViewChild, Box<dyn Error>> {
-    let own = std::env::current_exe()?;
     // The instance may be named by `--set` as well.
     let common = CommonArguments { instance: Some(place.instance.clone()), ..common.clone() };
-    let mut arguments = handed_on(&common);
+    let mut arguments = common.of_bridge();
     arguments.extend(["view".into(), "--listen".into(), at.to_string().into()]);
-    let missing = || BridgeError::Missing { command: "run --view".to_owned(), own: own.clone() };
-    let program = program(&own).ok_or_else(missing)?;
+    let program = bridge("run --view")?;
     let (root, log) = (place.root.clone(), log.clone());
     Ok(ViewChild::start(ViewOptions { program, arguments, root, log })?)
 }

@@ -4,10 +4,10 @@
 use std::io::{self, IsTerminal};
 use std::time::Instant;
 
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::ProgressBar;
 
 use crate::command::print::note;
-use crate::command::progress::LINE_PERIOD;
+use crate::command::progress::{LINE_PERIOD, style};
 use crate::service::progress_thread::ProgressThread;
 use crate::service::run_progress::RunProgress;
 use crate::slam::counted::counted;
@@ -38,17 +38,10 @@ const WITH_END: &str = "{prefix:9} {bar:40} {pos}/{len} {msg}";
 /// Of a camera.
 const WITHOUT_END: &str = "{prefix:9} {pos} frames, {msg}";
 
-fn style(template: &str) -> ProgressStyle {
-    ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar())
-}
-
 impl Shown {
     fn new(is_quiet: bool) -> Self {
-        let bar = (!is_quiet && std::io::stderr().is_terminal()).then(|| {
-            let bar = ProgressBar::new(0);
-            bar.set_style(style(WITH_END));
-            bar
-        });
+        let is_shown = !is_quiet && std::io::stderr().is_terminal();
+        let bar = is_shown.then(|| ProgressBar::new(0).with_style(style(WITH_END)));
         Self { bar, is_quiet, last_line: Instant::now(), waits_for: None }
     }
 

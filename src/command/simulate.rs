@@ -15,7 +15,7 @@ use crate::capture::simulator::summary::{PathSummary, gradient_share, summarize}
 use crate::capture::simulator::{RenderScratch, Simulator};
 use crate::capture::source::FrameSource;
 use crate::command::INTERRUPTED;
-use crate::command::print::{note, print};
+use crate::command::print::{note, print_as};
 use crate::command::progress::Progress;
 use crate::service::config::Config;
 use crate::service::shutdown::Shutdown;
@@ -188,11 +188,7 @@ pub fn run(config: &Config, args: &SimulateArgs) -> Result<ExitCode, Box<dyn Err
         path: summarize(simulator.ground_truth()),
         gradient_share,
     };
-    if args.json {
-        print(&format!("{}\n", serde_json::to_string_pretty(&summary)?))?;
-    } else {
-        print(&summary_text(&summary))?;
-    }
+    print_as(args.json, &summary, summary_text)?;
     Ok(ExitCode::SUCCESS)
 }
 

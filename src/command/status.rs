@@ -100,7 +100,7 @@ fn follow(
     shutdown: &Shutdown,
 ) -> Result<(), Box<dyn Error>> {
     let hub = Hub::join(place, "status", Access::Observer)?;
-    let mut watch = Watch::open(&hub, place, &place.instance)?;
+    let mut watch = Watch::open(&hub, place)?;
     let period = if arguments.once { ONCE_PERIOD } else { PERIOD };
     for looks in 1.. {
         wait(&[], Some(shutdown.descriptor()), period)?;
@@ -144,22 +144,20 @@ fn terminal_width() -> usize {
 /// What is listened to.
 struct Watch<'a> {
     place: &'a Place,
-    instance: String,
     peers: Vec<Option<Peer>>,
     poses: Option<Subscriber<PoseMessage, ()>>,
     last_pose: Option<PoseMessage>,
 }
 
 impl<'a> Watch<'a> {
-    fn open(hub: &Hub, place: &'a Place, instance: &str) -> Result<Self, OpenError> {
-        let peers: Result<Vec<_>, _> =
-            HEALTH_TOPICS.iter().map(|topic| listen(hub, topic)).collect();
-        let peers = peers?;
+    fn open(hub: &Hub, place: &'a Place) -> Result<Self, OpenError> {
+        let listen = |topic| unless_absent(Peer::open(hub, topic));
+        let peers = HEALTH_TOPICS.iter().map(listen).collect::<Result<Vec<_>, _>>()?;
         if peers.iter().all(Option::is_none) {
             // Its error says that nothing runs, unless this has changed just now.
             Peer::open(hub, &HEALTH_TOPICS[0])?;
         }
-        Ok(Self { place, instance: instance.to_owned(), peers, poses: None, last_pose: None })
+        Ok(Self { place, peers, poses: None, last_pose: None })
     }
 
     /// Whether every process that is there has said how it is, and the tracker its pose.
@@ -174,14 +172,14 @@ impl<'a> Watch<'a> {
     }
 
     /// One look.
-    fn look(&mut self, hub: &Hub) -> CommandValue {
-        let mut look = json!({ "instance": self.instance, "source": null, "uptime_secs": null, "keyframes": null });
+    fn look(&mut self, hub: &Hub) -> Result<Value, Box<dyn Error>> {
+        let mut look = json!({ "instance": self.place.instance, "source": null, "uptime_secs": null, "keyframes": null });
         let now = now_nanos();
         let (mut heard, mut ended) = (0, 0);
         for (topic, peer) in HEALTH_TOPICS.iter().zip(&mut self.peers) {
             if peer.is_none() {
                 // It may have come up since the last look.
-                *peer = listen(hub, topic)?;
+                *peer = unless_absent(Peer::open(hub, topic))?;
             }
             if let Some(peer) = peer {
                 peer.update()?;
@@ -231,11 +229,7 @@ impl<'a> Watch<'a> {
     /// Keeps the newest pose.
     fn hear_poses(&mut self, hub: &Hub) -> Result<(), Box<dyn Error>> {
         if self.poses.is_none() {
-            self.poses = match hub.subscriber(&POSE) {
-                Ok(poses) => Some(poses),
-                Err(error) if error.is_absence() => None,
-                Err(error) => return Err(error.into()),
-            };
+            self.poses = unless_absent(hub.subscriber(&POSE))?;
         }
         let Some(poses) = &mut self.poses else { return Ok(()) };
         while let Some(message) = poses.receive()? {
@@ -244,9 +238,6 @@ impl<'a> Watch<'a> {
         Ok(())
     }
 }
-
-/// A look, or why there is none.
-type CommandValue = Result<Value, Box<dyn Error>>;
 
 /// The state of a process that has ended.
 const NOT_RUNNING: &str = "not running";
@@ -277,10 +268,10 @@ fn pose_row(pose: &PoseMessage, now: i64) -> Value {
     })
 }
 
-/// The process that speaks on `topic`; `None` where it does not run.
-fn listen(hub: &Hub, topic: &Topic) -> Result<Option<Peer>, OpenError> {
-    match Peer::open(hub, topic) {
-        Ok(peer) => Ok(Some(peer)),
+/// What was opened; `None` where its process does not run.
+fn unless_absent<T>(opened: Result<T, OpenError>) -> Result<Option<T>, OpenError> {
+    match opened {
+        Ok(opened) => Ok(Some(opened)),
         Err(error) if error.is_absence() => Ok(None),
         Err(error) => Err(error),
     }
@@ -290,12 +281,17 @@ fn listen(hub: &Hub, topic: &Topic) -> Result<Option<Peer>, OpenError> {
 fn row(topic: &Topic, health: &HealthMessage, state: &str, now: i64) -> Value {
     let is_running = ["running", "stale"].contains(&state);
     let rate_hz = (is_running && health.rate_hz.is_finite()).then_some(health.rate_hz);
-    let time = |share| percentile_ms(&health.adjustment_counts, share);
+    let times = |counts| {
+        let at = |share| percentile_ms(counts, share);
+        json!({ "p50": at(0.5), "p99": at(0.99), "max": at(1.0) })
+    };
+    let mut adjustment_times = times(&health.adjustment_counts);
+    adjustment_times["p95"] = json!(percentile_ms(&health.adjustment_counts, 0.95));
     let adjustments = json!({
         "entered": health.adjustments,
         "merged": health.adjustments_merged,
         "dropped": health.adjustments_dropped,
-        "cpu_ms": { "p50": time(0.5), "p95": time(0.95), "p99": time(0.99), "max": time(1.0) },
+        "cpu_ms": adjustment_times,
     });
     let loops = json!({
         "searched": health.loop_searches,
@@ -329,16 +325,8 @@ fn row(topic: &Topic, health: &HealthMessage, state: &str, now: i64) -> Value {
         "memory_locked": health.memory_locked != 0,
         "warning": warning(health),
         "peak_rss_mb": health.peak_rss_bytes as f64 / f64::from(1 << 20),
-        "latency_ms": {
-            "p50": percentile_ms(&health.latency_counts, 0.5),
-            "p99": percentile_ms(&health.latency_counts, 0.99),
-            "max": percentile_ms(&health.latency_counts, 1.0),
-        },
-        "wake_ms": {
-            "p50": percentile_ms(&health.wake_counts, 0.5),
-            "p99": percentile_ms(&health.wake_counts, 0.99),
-            "max": percentile_ms(&health.wake_counts, 1.0),
-        },
+        "latency_ms": times(&health.latency_counts),
+        "wake_ms": times(&health.wake_counts),
     })
 }
 

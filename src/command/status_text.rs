@@ -11,70 +11,34 @@ struct Column {
     width: usize,
     /// Columns of a higher number go first where the terminal is narrow.
     rank: u8,
-    /// Where the value is in a process's object, and its decimals.
-    value: (&'static [&'static str], usize),
+    /// Where the value is in a process's object (a JSON pointer), and its decimals.
+    value: (&'static str, usize),
     legend: &'static str,
+}
+
+const fn column(
+    heading: &'static str,
+    width: usize,
+    rank: u8,
+    value: (&'static str, usize),
+    legend: &'static str,
+) -> Column {
+    Column { heading, width, rank, value, legend }
 }
 
 /// Everything that can be shown of a process, in the order of the columns.
 const COLUMNS: [Column; 8] = [
-    Column {
-        heading: "frames",
-        width: 8,
-        rank: 2,
-        value: (&["frames"], 0),
-        legend: "handled since the process started",
-    },
-    Column {
-        heading: "rate",
-        width: 6,
-        rank: 1,
-        value: (&["rate_hz"], 1),
-        legend: "frames per second",
-    },
-    Column {
-        heading: "drop",
-        width: 5,
-        rank: 4,
-        value: (&["dropped"], 0),
-        legend: "skipped for a newer frame",
-    },
-    Column {
-        heading: "late",
-        width: 5,
-        rank: 3,
-        value: (&["deadline_misses"], 0),
-        legend: "finished after the deadline",
-    },
-    Column {
-        heading: "p50",
-        width: 7,
-        rank: 5,
-        value: (&["latency_ms", "p50"], 2),
-        legend: "median ms: capture from stamp to sending, tracker from stamp to pose, mapper per frame",
-    },
-    Column {
-        heading: "p99",
-        width: 7,
-        rank: 2,
-        value: (&["latency_ms", "p99"], 2),
-        legend: "99th percentile of the same",
-    },
-    Column {
-        heading: "MiB",
-        width: 5,
-        rank: 6,
-        value: (&["peak_rss_mb"], 0),
-        legend: "peak memory",
-    },
-    Column {
-        heading: "up",
-        width: 7,
-        rank: 7,
-        value: (&["uptime_secs"], 0),
-        legend: "seconds since the process started",
-    },
+    column("frames", 8, 2, ("/frames", 0), "handled since the process started"),
+    column("rate", 6, 1, ("/rate_hz", 1), "frames per second"),
+    column("drop", 5, 4, ("/dropped", 0), "skipped for a newer frame"),
+    column("late", 5, 3, ("/deadline_misses", 0), "finished after the deadline"),
+    column("p50", 7, 5, ("/latency_ms/p50", 2), P50_LEGEND),
+    column("p99", 7, 2, ("/latency_ms/p99", 2), "99th percentile of the same"),
+    column("MiB", 5, 6, ("/peak_rss_mb", 0), "peak memory"),
+    column("up", 7, 7, ("/uptime_secs", 0), "seconds since the process started"),
 ];
+const P50_LEGEND: &str =
+    "median ms: capture from stamp to sending, tracker from stamp to pose, mapper per frame";
 
 /// Name and state, in front of the columns: `capture  not running`.
 const NAME_WIDTH: usize = 8;
@@ -169,9 +133,9 @@ fn process_lines(name: &str, row: &Value, columns: &[&Column], width: usize) -> 
     let state = row["state"].as_str().unwrap_or("not running");
     let mut line = format!("{name:NAME_WIDTH$} {state:STATE_WIDTH$}");
     for column in columns.iter().filter(|_| !row.is_null()) {
-        let (path, digits) = column.value;
-        let value = path.iter().fold(row, |value, key| &value[*key]);
-        let shown = value.as_f64().map_or("-".to_owned(), |x| format!("{x:.digits$}"));
+        let (place, digits) = column.value;
+        let value = row.pointer(place).and_then(Value::as_f64);
+        let shown = value.map_or("-".to_owned(), |x| format!("{x:.digits$}"));
         line += &format!(" {shown:>0$}", column.width);
     }
     let mut lines = vec![line.trim_end().to_owned()];

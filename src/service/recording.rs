@@ -3,8 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::service::adjustments::AdjustmentRecord;
-use crate::service::results::record::{RecordedPose, RunMode, RunRecord};
-use crate::service::results::start_tally::StartTally;
+use crate::service::results::record::{RecordedPose, RunMode, RunRecord, StartTally};
 use crate::service::time_counts::TimeCounts;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::map::Map;

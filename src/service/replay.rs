@@ -7,6 +7,8 @@
 
 use std::time::Instant;
 
+use clap::ValueEnum;
+
 use crate::capture::source::{FrameSource, FrameStamp};
 use crate::capture::source_error::SourceError;
 use crate::service::adjustments::{Adjustments, Entry};
@@ -33,22 +35,23 @@ use crate::slam::tracker::{Tracker, TrackerParams};
 use crate::slam::trajectory::StampedPose;
 
 /// Where poses come from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
 pub enum PoseOrigin {
-    /// The tracker estimates them.
+    /// The tracker estimates them
     #[default]
     Tracker,
-    /// The source's ground truth; only the mapper is at work.
+    /// The source's ground truth; only the mapper runs
+    #[value(name = "groundtruth")]
     GroundTruth,
 }
 
 /// Where the first depth of a keyframe comes from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
 pub enum DepthOrigin {
-    /// Images alone.
+    /// The images alone
     #[default]
     Images,
-    /// The source's depth camera.
+    /// The source's depth camera
     Sensor,
 }
 

@@ -25,7 +25,6 @@ pub mod record;
 pub mod report;
 pub mod results_error;
 pub(crate) mod set;
-pub(crate) mod start_tally;
 pub(crate) mod step_times;
 pub(crate) mod summary;
 pub(crate) mod summary_text;
@@ -41,17 +40,15 @@ use serde::{Deserialize, Serialize};
 
 use crate::capture::source::FrameSource;
 use crate::service::atomic_file::write_atomically;
-use crate::service::results::depth_maps::DepthEvaluation;
 use crate::service::results::full_points::{FULL_POINT_BYTES, num_points, write_full_points};
 use crate::service::results::ply::SURFACE_POINT_BYTES;
 use crate::service::results::record::RunRecord;
-use crate::service::results::report::input::ReportInput;
 use crate::service::results::report::report;
 use crate::service::results::results_error::ResultsError;
 use crate::service::results::set::ResultSet;
 use crate::service::results::summary::PointCounts;
 use crate::service::trajectory_file::write_epochs;
-use crate::slam::evaluation::depth_error::DepthScale;
+use crate::slam::evaluation::depth_error::{DepthErrors, DepthScale};
 use crate::slam::evaluation::umeyama::TrajectoryAlignment;
 use crate::slam::evaluation::{MAX_DIFFERENCE_NANOS, TrajectoryEvaluation, evaluate_trajectory};
 use crate::slam::fusion::{FusionParams, MapResolution, SurfacePoint, fuse};
@@ -61,7 +58,6 @@ use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::trajectory::StampedPose;
 
 pub use crate::service::results::budget_curve::BudgetSample;
-pub use crate::service::results::start_tally::StartTally;
 pub use crate::service::results::summary::Summary;
 
 /// What of the map is written and how it is judged.
@@ -144,7 +140,7 @@ impl<'a> Results<'a> {
         };
         let (evaluation, online_evaluation) = (evaluate(&trajectory), evaluate(&online));
         let depth = match record.is_depth_from_sensor {
-            true => DepthEvaluation::default(),
+            true => DepthErrors::default(),
             false => depth_maps::evaluate_depth(record, depth_source)?,
         };
         let begin = Instant::now();
@@ -184,16 +180,7 @@ impl<'a> Results<'a> {
         write_more: &dyn Fn(&Path) -> Result<(), ResultsError>,
     ) -> Result<(), ResultsError> {
         let record = self.record;
-        let page = report(&ReportInput {
-            record,
-            summary: &self.summary,
-            trajectory: &self.trajectory,
-            online: &self.online,
-            evaluation: self.evaluation.as_ref(),
-            online_evaluation: self.online_evaluation.as_ref(),
-            surface: &self.surface,
-            max_relative_std_dev: self.params.max_relative_std_dev,
-        });
+        let page = report(self);
         let needed = self.needed_bytes(page.len());
         let failed = |path: PathBuf, source| write_failure(dir, needed, path, source);
         let set = ResultSet::begin(dir).map_err(|source| failed(dir.to_owned(), source))?;

@@ -237,7 +237,7 @@ fn death(name: &str, status: ExitStatus, fault: Option<String>) -> Death {
     let is_fault = fault.is_some();
     let cause = match (fault, status.signal()) {
         (Some(fault), _) => fault,
-        (None, Some(_)) if is_bus_error => bus_error(name, free_shared_memory()),
+        (None, Some(_)) if is_bus_error => bus_error(name, free_shared_memory().ok()),
         (None, Some(signal)) => format!("{name} was killed by {}", signal_name(signal)),
         (None, None) => format!("{name} ended with {status} in the middle of the run"),
     };

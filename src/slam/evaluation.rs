@@ -32,8 +32,6 @@ use crate::slam::evaluation::umeyama::{AlignmentError, TrajectoryAlignment};
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::trajectory::StampedPose;
 
-pub use crate::slam::evaluation::association::Association;
-
 /// Largest difference of two stamps that are taken for the same instant: 0.02 s, less than half a
 /// frame at 20 Hz and the habit of the field's tools.
 pub const MAX_DIFFERENCE_NANOS: i64 = 20_000_000;
@@ -81,8 +79,8 @@ pub enum EvaluationError {
 /// Errors of a trajectory against the ground truth. Lengths are in the ground truth's unit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrajectoryEvaluation {
-    /// Which poses were compared.
-    pub association: Association,
+    /// Which poses were compared: (index in the estimate, index in the ground truth), in order of time.
+    pub pairs: Vec<(usize, usize)>,
     /// `truth_from_estimate`, by the alignment that was asked for.
     pub alignment: Sim3,
     /// Position errors after alignment, one for each match.

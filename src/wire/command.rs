@@ -55,6 +55,10 @@ pub enum CommandError {
     NoAnswer(Duration),
 }
 
+fn failed(error: impl std::fmt::Display) -> CommandError {
+    CommandError::Transport(error.to_string())
+}
+
 /// Text as the bytes of a message, cut at a character where it is too long.
 pub fn text_bytes(text: &str) -> ([u8; TEXT_BYTES], u32) {
     let mut length = text.len().min(TEXT_BYTES);
@@ -74,28 +78,20 @@ pub fn text_from_bytes(bytes: &[u8; TEXT_BYTES], length: u32) -> String {
 }
 
 fn request_of(command: &Command) -> Result<CommandRequest, CommandError> {
-    let mut request =
-        CommandRequest { keyframe_id: 0, kind: 0, path_bytes: 0, path: [0; PATH_BYTES] };
-    let path = match command {
-        Command::SaveMap(path) => path,
-        Command::SaveFolder(path) => {
-            request.kind = 2;
-            path
-        }
+    let (kind, keyframe_id, path) = match command {
+        Command::SaveMap(path) => (0, 0, path.as_path()),
+        Command::SendKeyframe(keyframe_id) => (1, *keyframe_id, Path::new("")),
+        Command::SaveFolder(path) => (2, 0, path.as_path()),
         Command::LoadFolder { folder, read_only } => {
-            request.kind = if *read_only { 4 } else { 3 };
-            folder
-        }
-        Command::SendKeyframe(keyframe_id) => {
-            (request.kind, request.keyframe_id) = (1, *keyframe_id);
-            return Ok(request);
+            (3 + u32::from(*read_only), 0, folder.as_path())
         }
     };
     let bytes = path.as_os_str().as_encoded_bytes();
     if bytes.len() > PATH_BYTES {
-        return Err(CommandError::PathTooLong(path.clone()));
+        return Err(CommandError::PathTooLong(path.to_owned()));
     }
-    request.path_bytes = bytes.len() as u32;
+    let (path_bytes, path) = (bytes.len() as u32, [0; PATH_BYTES]);
+    let mut request = CommandRequest { keyframe_id, kind, path_bytes, path };
     request.path[..bytes.len()].copy_from_slice(bytes);
     Ok(request)
 }
@@ -125,12 +121,12 @@ type Factory = iceoryx2::service::port_factory::request_response::PortFactory<
 fn service(hub: &Hub, name: &str) -> Result<Factory, OpenError> {
     let service_name = ServiceName::new(name).map_err(|e| topic_error(name, &e))?;
     let builder = || {
-        hub.node()
+        hub.node
             .service_builder(&service_name)
             .request_response::<CommandRequest, CommandResponse>()
     };
-    match hub.access() {
-        Access::Observer => builder().open().map_err(|_| not_running(hub.place())),
+    match hub.access {
+        Access::Observer => builder().open().map_err(|_| not_running(&hub.place)),
         Access::Member => retry(name, || {
             builder()
                 .max_clients(MAX_CLIENTS)
@@ -152,7 +148,7 @@ pub struct CommandServer {
 impl CommandServer {
     /// Opens it.
     pub fn open(hub: &Hub) -> Result<Self, OpenError> {
-        let name = service_name(&hub.place().instance, MAPPER_COMMAND);
+        let name = service_name(&hub.place.instance, MAPPER_COMMAND);
         let server =
             service(hub, &name)?.server_builder().create().map_err(|e| topic_error(&name, &e))?;
         Ok(Self { server, events: hub.events(&name)? })
@@ -168,8 +164,7 @@ impl CommandServer {
         &self,
         mut act: impl FnMut(Command) -> Result<(), String>,
     ) -> Result<(), CommandError> {
-        let failed = |e: &dyn std::fmt::Display| CommandError::Transport(e.to_string());
-        while let Some(request) = self.server.receive().map_err(|e| failed(&e))? {
+        while let Some(request) = self.server.receive().map_err(failed)? {
             let result = match command_of(request.payload()) {
                 Ok(command) => act(command),
                 Err(error) => Err(error.to_string()),
@@ -177,7 +172,7 @@ impl CommandServer {
             let (text, text_bytes) = text_bytes(result.as_ref().err().map_or("", String::as_str));
             let status = u32::from(result.is_err());
             let response = CommandResponse { status, text_bytes, text };
-            request.send_copy(response).map_err(|e| failed(&e))?;
+            request.send_copy(response).map_err(failed)?;
         }
         Ok(())
     }
@@ -193,7 +188,7 @@ pub struct CommandClient {
 impl CommandClient {
     /// Opens it.
     pub fn open(hub: &Hub) -> Result<Self, OpenError> {
-        let name = service_name(&hub.place().instance, MAPPER_COMMAND);
+        let name = service_name(&hub.place.instance, MAPPER_COMMAND);
         let client =
             service(hub, &name)?.client_builder().create().map_err(|e| topic_error(&name, &e))?;
         Ok(Self { client, wake: hub.notifier(&name)? })
@@ -206,12 +201,11 @@ impl CommandClient {
         timeout: Duration,
         mut is_alive: impl FnMut() -> bool,
     ) -> Result<(), CommandError> {
-        let failed = |e: &dyn std::fmt::Display| CommandError::Transport(e.to_string());
-        let pending = self.client.send_copy(request_of(command)?).map_err(|e| failed(&e))?;
+        let pending = self.client.send_copy(request_of(command)?).map_err(failed)?;
         self.wake.notify();
         let deadline = Instant::now() + timeout;
         while Instant::now() < deadline && is_alive() {
-            if let Some(response) = pending.receive().map_err(|e| failed(&e))? {
+            if let Some(response) = pending.receive().map_err(failed)? {
                 let response = response.payload();
                 return match response.status {
                     0 => Ok(()),
@@ -221,7 +215,7 @@ impl CommandClient {
                     ))),
                 };
             }
-            wait(&[], None, ANSWER_PAUSE).map_err(|e| failed(&e))?;
+            wait(&[], None, ANSWER_PAUSE).map_err(failed)?;
         }
         Err(CommandError::NoAnswer(timeout))
     }

@@ -2,8 +2,6 @@
 //!
 //! Going out and back in keeps every bit: lockstep and replay must agree to the last digit.
 
-mod velocity;
-
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
 use crate::slam::frame::FrameView;
@@ -15,15 +13,12 @@ use crate::slam::mapper::situation::StartFrame;
 use crate::slam::modes::ModeCovariance;
 use crate::slam::place_covariance::{PLACE_ENTRIES, PlaceCovariance};
 use crate::slam::pose::{
-    Brightness, DegradedReason, LostReason, PoseEstimate, Quality, TrackingState,
+    Brightness, DegradedReason, LostReason, PoseEstimate, Quality, TrackingState, Velocity,
 };
 use crate::wire::message::{
     FrameHeader, KeyframeHeader, KeyframeImageHeader, KeyframePoseMessage, PoseMessage,
     RigidMessage, SimilarityMessage,
 };
-
-use crate::wire::conversion::velocity::put_velocity;
-pub use crate::wire::conversion::velocity::velocity_from_message;
 
 /// Farthest a sent quaternion may be from unit length: rounding, not another transform.
 const QUATERNION_TOLERANCE: f64 = 1e-6;
@@ -117,18 +112,15 @@ pub fn similarity_from_message(
     let [x, y, z, w, tx, ty, tz, scale] = *message;
     let rigid = rigid_from_message(&[x, y, z, w, tx, ty, tz], field)?;
     let similarity = Sim3::new(rigid, scale);
-    if similarity.is_valid() { Ok(similarity) } else { Err(MessageError::InvalidNumber { field }) }
+    Some(similarity).filter(Sim3::is_valid).ok_or(MessageError::InvalidNumber { field })
 }
 
 /// The intrinsics of a header, checked.
 fn intrinsics_from(values: &[f64; 4], width: u32, height: u32) -> Result<Intrinsics, MessageError> {
     let [fx, fy, cx, cy] = *values;
     let intrinsics = Intrinsics { fx, fy, cx, cy, width: width as usize, height: height as usize };
-    if intrinsics.is_valid() {
-        Ok(intrinsics)
-    } else {
-        Err(MessageError::InvalidIntrinsics { width, height })
-    }
+    let valid = Some(intrinsics).filter(Intrinsics::is_valid);
+    valid.ok_or(MessageError::InvalidIntrinsics { width, height })
 }
 
 /// The frame of a message with its intrinsics.
@@ -152,31 +144,13 @@ pub fn frame_from_message<'a>(
     Ok((frame, intrinsics))
 }
 
-/// State and reason as codes.
+/// State and reason as codes: a reason's is its place in its enumeration.
 pub fn codes_from_state(state: TrackingState) -> (u32, u32) {
     match state {
         TrackingState::Initializing => (0, 0),
         TrackingState::Tracking => (1, 0),
-        TrackingState::Degraded(reason) => (
-            2,
-            match reason {
-                DegradedReason::Budget => 0,
-                DegradedReason::LowOverlap => 1,
-                DegradedReason::HighResidual => 2,
-                DegradedReason::Gap => 3,
-                DegradedReason::Turning => 4,
-            },
-        ),
-        TrackingState::Lost(reason) => (
-            3,
-            match reason {
-                LostReason::Diverged => 0,
-                LostReason::TooFewInliers => 1,
-                LostReason::NoPoints => 2,
-                LostReason::UnusableFrame => 3,
-                LostReason::MapRejected => 4,
-            },
-        ),
+        TrackingState::Degraded(reason) => (2, reason as u32),
+        TrackingState::Lost(reason) => (3, reason as u32),
     }
 }
 
@@ -258,8 +232,8 @@ pub struct PoseTiming {
 /// The message of a pose.
 pub fn pose_message(pose: &PoseEstimate, timing: &PoseTiming) -> PoseMessage {
     let (state, reason) = codes_from_state(pose.state);
-    let quality = &pose.quality;
-    let mut message = PoseMessage {
+    let (quality, velocity) = (&pose.quality, pose.velocity.as_ref());
+    PoseMessage {
         sequence: pose.sequence,
         capture_nanos: pose.capture_nanos,
         realtime_nanos: timing.realtime_nanos,
@@ -280,9 +254,9 @@ pub fn pose_message(pose: &PoseEstimate, timing: &PoseTiming) -> PoseMessage {
         covariance: pose.covariance,
         map_covariance: pose.map_covariance,
         alignment_covariance: pose.alignment_covariance,
-        linear_velocity: [0.0; 3],
-        angular_velocity: [0.0; 3],
-        velocity_covariance: [0.0; 21],
+        linear_velocity: velocity.map_or([0.0; 3], |v| v.linear.into()),
+        angular_velocity: velocity.map_or([0.0; 3], |v| v.angular.into()),
+        velocity_covariance: velocity.map_or([0.0; 21], |v| v.covariance),
         brightness: [pose.brightness.a, pose.brightness.b],
         in_view_ratio: quality.in_view_ratio,
         inlier_ratio: quality.inlier_ratio,
@@ -293,10 +267,8 @@ pub fn pose_message(pose: &PoseEstimate, timing: &PoseTiming) -> PoseMessage {
         iterations: quality.iterations,
         finest_level: quality.finest_level,
         points: quality.points,
-        has_velocity: 0,
-    };
-    put_velocity(pose.velocity.as_ref(), &mut message);
-    message
+        has_velocity: u32::from(velocity.is_some()),
+    }
 }
 
 /// The pose of a message, checked.
@@ -323,10 +295,8 @@ pub fn pose_from_message(message: &PoseMessage) -> Result<PoseEstimate, MessageE
         mean_squared_flow: message.mean_squared_flow,
         displacement_px: message.displacement_px,
     };
-    let ratios = [quality.in_view_ratio, quality.inlier_ratio, quality.mean_squared_flow];
-    finite("quality", &ratios)?;
-    let errors = [quality.whitened_rmse, quality.residual_rmse, quality.displacement_px];
-    finite("quality", &errors)?;
+    finite("quality", &[quality.in_view_ratio, quality.inlier_ratio, quality.mean_squared_flow])?;
+    finite("quality", &[quality.whitened_rmse, quality.residual_rmse, quality.displacement_px])?;
     let proposes_keyframe = match message.proposes_keyframe {
         0 => false,
         1 => true,
@@ -354,6 +324,21 @@ pub fn pose_from_message(message: &PoseMessage) -> Result<PoseEstimate, MessageE
         quality,
         proposes_keyframe,
     })
+}
+
+/// The velocity in a pose's message, checked; `None` where it says that there is none.
+fn velocity_from_message(message: &PoseMessage) -> Result<Option<Velocity>, MessageError> {
+    let covariance = message.velocity_covariance;
+    let [linear, angular] = [message.linear_velocity, message.angular_velocity];
+    let is_finite = linear.iter().chain(&angular).chain(&covariance).all(|x| x.is_finite());
+    if !is_finite || DIAGONAL.iter().any(|&entry| covariance[entry] < 0.0) {
+        return Err(MessageError::InvalidNumber { field: "velocity" });
+    }
+    match message.has_velocity {
+        0 => Ok(None),
+        1 => Ok(Some(Velocity { linear: linear.into(), angular: angular.into(), covariance })),
+        code => Err(MessageError::UnknownCode { field: "has_velocity", code }),
+    }
 }
 
 /// The header of a keyframe's depth.

@@ -50,17 +50,15 @@ impl KeyframeInbox {
         if let Some(image) = self.images.newest()? {
             self.image = Some((*image.header(), image.payload().to_vec()));
         }
-        let (Some((header, _)), Some((image_header, pixels))) = (&self.depth, &self.image) else {
+        let (Some((header, points)), Some((image_header, pixels))) = (&self.depth, &self.image)
+        else {
             return Ok(None);
         };
         if header.keyframe_id != image_header.keyframe_id {
             return Ok(None);
         }
-        let keyframe = self
-            .depth
-            .as_ref()
-            .map(|(header, points)| keyframe_from_messages(header, points, image_header, pixels));
+        let keyframe = keyframe_from_messages(header, points, image_header, pixels);
         self.depth = None;
-        Ok(keyframe.transpose()?)
+        Ok(Some(keyframe?))
     }
 }

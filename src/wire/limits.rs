@@ -19,16 +19,12 @@ pub fn raise_open_files() -> Result<(), PlaceError> {
     if current.is_none_or(|files| files >= OPEN_FILES) {
         return Ok(());
     }
-    let wanted = Rlimit { current: Some(OPEN_FILES), maximum };
-    match maximum {
-        Some(limit) if limit < OPEN_FILES => {
-            Err(PlaceError::OpenFiles { limit, needed: OPEN_FILES })
-        }
-        _ => setrlimit(Resource::Nofile, wanted).map_err(|_| PlaceError::OpenFiles {
-            limit: current.unwrap_or_default(),
-            needed: OPEN_FILES,
-        }),
+    let too_few = |limit| PlaceError::OpenFiles { limit, needed: OPEN_FILES };
+    if let Some(limit) = maximum.filter(|limit| *limit < OPEN_FILES) {
+        return Err(too_few(limit));
     }
+    let wanted = Rlimit { current: Some(OPEN_FILES), maximum };
+    setrlimit(Resource::Nofile, wanted).map_err(|_| too_few(current.unwrap_or_default()))
 }
 
 /// Checks that the address space suffices for `shared_bytes` of shared memory and what is made of it:

@@ -3,7 +3,7 @@
 //! A `type_name` carries the version of its message. The checked conversion to the types of `slam` is in [`crate::wire::conversion`].
 
 use iceoryx2::prelude::ZeroCopySend;
-use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
+use zerocopy::{FromBytes, FromZeros, Immutable, IntoBytes, KnownLayout};
 
 use crate::slam::keyframe::DepthPoint;
 use crate::slam::place_covariance::PLACE_ENTRIES;
@@ -21,19 +21,9 @@ pub type RigidMessage = [f64; 7];
 pub type SimilarityMessage = [f64; 8];
 
 /// Header of `capture/frame`; the payload is the grey image.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 #[repr(C)]
-#[derive(
-    Debug,
-    Clone,
-    Copy,
-    PartialEq,
-    Default,
-    ZeroCopySend,
-    FromBytes,
-    IntoBytes,
-    Immutable,
-    KnownLayout,
-)]
+#[derive(ZeroCopySend, FromBytes, IntoBytes, Immutable, KnownLayout)]
 #[type_name("semidense.FrameHeader.v3")]
 pub struct FrameHeader {
     /// Number of the frame at its source; a gap is a frame that is missing.
@@ -61,10 +51,9 @@ pub struct FrameHeader {
 }
 
 /// Message of `tracker/pose`.
+#[derive(Debug, Clone, Copy, PartialEq)]
 #[repr(C)]
-#[derive(
-    Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes, IntoBytes, Immutable, KnownLayout,
-)]
+#[derive(ZeroCopySend, FromBytes, IntoBytes, Immutable, KnownLayout)]
 #[type_name("semidense.Pose.v7")]
 pub struct PoseMessage {
     /// Sequence of the frame.
@@ -148,19 +137,9 @@ pub struct PoseMessage {
 }
 
 /// Header of `mapper/keyframe`; the payload is its [`DepthPoint`]s.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 #[repr(C)]
-#[derive(
-    Debug,
-    Clone,
-    Copy,
-    PartialEq,
-    Default,
-    ZeroCopySend,
-    FromBytes,
-    IntoBytes,
-    Immutable,
-    KnownLayout,
-)]
+#[derive(ZeroCopySend, FromBytes, IntoBytes, Immutable, KnownLayout)]
 #[type_name("semidense.KeyframeHeader.v4")]
 pub struct KeyframeHeader {
     /// Its id.
@@ -203,20 +182,9 @@ unsafe impl ZeroCopySend for DepthPoint {
 }
 
 /// Header of `mapper/keyframe_image`; the payload is the grey image.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[repr(C)]
-#[derive(
-    Debug,
-    Clone,
-    Copy,
-    PartialEq,
-    Eq,
-    Default,
-    ZeroCopySend,
-    FromBytes,
-    IntoBytes,
-    Immutable,
-    KnownLayout,
-)]
+#[derive(ZeroCopySend, FromBytes, IntoBytes, Immutable, KnownLayout)]
 #[type_name("semidense.KeyframeImageHeader.v1")]
 pub struct KeyframeImageHeader {
     /// The keyframe.
@@ -232,19 +200,9 @@ pub struct KeyframeImageHeader {
 }
 
 /// Message of `mapper/step`: this frame is in the map.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 #[repr(C)]
-#[derive(
-    Debug,
-    Clone,
-    Copy,
-    PartialEq,
-    Default,
-    ZeroCopySend,
-    FromBytes,
-    IntoBytes,
-    Immutable,
-    KnownLayout,
-)]
+#[derive(ZeroCopySend, FromBytes, IntoBytes, Immutable, KnownLayout)]
 #[type_name("semidense.Step.v4")]
 pub struct StepMessage {
     /// Sequence of the frame.
@@ -278,20 +236,9 @@ pub struct StepMessage {
 }
 
 /// Header of `mapper/graph`; the payload is one [`KeyframePoseMessage`] per keyframe.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[repr(C)]
-#[derive(
-    Debug,
-    Clone,
-    Copy,
-    PartialEq,
-    Eq,
-    Default,
-    ZeroCopySend,
-    FromBytes,
-    IntoBytes,
-    Immutable,
-    KnownLayout,
-)]
+#[derive(ZeroCopySend, FromBytes, IntoBytes, Immutable, KnownLayout)]
 #[type_name("semidense.GraphHeader.v2")]
 pub struct GraphHeader {
     /// Newest revision of a keyframe in it.
@@ -305,19 +252,9 @@ pub struct GraphHeader {
 }
 
 /// The pose of one keyframe in `mapper/graph`.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 #[repr(C)]
-#[derive(
-    Debug,
-    Clone,
-    Copy,
-    PartialEq,
-    Default,
-    ZeroCopySend,
-    FromBytes,
-    IntoBytes,
-    Immutable,
-    KnownLayout,
-)]
+#[derive(ZeroCopySend, FromBytes, IntoBytes, Immutable, KnownLayout)]
 #[type_name("semidense.KeyframePose.v2")]
 pub struct KeyframePoseMessage {
     /// The keyframe.
@@ -329,19 +266,9 @@ pub struct KeyframePoseMessage {
 }
 
 /// Message of `mapper/adjustment`: a joint estimate of keyframes is over.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 #[repr(C)]
-#[derive(
-    Debug,
-    Clone,
-    Copy,
-    PartialEq,
-    Default,
-    ZeroCopySend,
-    FromBytes,
-    IntoBytes,
-    Immutable,
-    KnownLayout,
-)]
+#[derive(ZeroCopySend, FromBytes, IntoBytes, Immutable, KnownLayout)]
 #[type_name("semidense.Adjustment.v1")]
 pub struct AdjustmentMessage {
     /// Sequence of the last frame before it entered the map.
@@ -372,10 +299,9 @@ pub struct AdjustmentMessage {
 }
 
 /// Message of `<process>/health`.
+#[derive(Debug, Clone, Copy, PartialEq)]
 #[repr(C)]
-#[derive(
-    Debug, Clone, Copy, PartialEq, ZeroCopySend, FromBytes, IntoBytes, Immutable, KnownLayout,
-)]
+#[derive(ZeroCopySend, FromBytes, IntoBytes, Immutable, KnownLayout)]
 #[type_name("semidense.Health.v6")]
 pub struct HealthMessage {
     /// CLOCK_MONOTONIC when it was published.
@@ -467,9 +393,17 @@ pub struct HealthMessage {
     pub reserved: u32,
 }
 
+impl HealthMessage {
+    /// Nothing has been counted, no rate is known.
+    pub fn empty() -> Self {
+        Self { rate_hz: f64::NAN, ..Self::new_zeroed() }
+    }
+}
+
 /// Request of `mapper/command`.
+#[derive(Debug, Clone, Copy)]
 #[repr(C)]
-#[derive(Debug, Clone, Copy, ZeroCopySend, FromBytes, IntoBytes, Immutable, KnownLayout)]
+#[derive(ZeroCopySend, FromBytes, IntoBytes, Immutable, KnownLayout)]
 #[type_name("semidense.CommandRequest.v2")]
 pub struct CommandRequest {
     /// The keyframe that is asked for; otherwise 0.
@@ -484,8 +418,9 @@ pub struct CommandRequest {
 }
 
 /// Response of `mapper/command`.
+#[derive(Debug, Clone, Copy)]
 #[repr(C)]
-#[derive(Debug, Clone, Copy, ZeroCopySend, FromBytes, IntoBytes, Immutable, KnownLayout)]
+#[derive(ZeroCopySend, FromBytes, IntoBytes, Immutable, KnownLayout)]
 #[type_name("semidense.CommandResponse.v1")]
 pub struct CommandResponse {
     /// 0 done, 1 failed.

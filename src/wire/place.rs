@@ -149,7 +149,6 @@ impl Place {
     /// Takes from the group and all others what iceoryx2 gives them: its counter of nodes is the one
     /// segment that it makes for everybody.
     pub(in crate::wire) fn keep_to_user(&self) {
-        const USER_ALONE: u32 = 0o600;
         for path in self.node_counters() {
             // Another user's cannot be changed, and is not ours.
             let _ = fs::set_permissions(path, fs::Permissions::from_mode(USER_ALONE));
@@ -158,10 +157,19 @@ impl Place {
 
     /// The segments of [`SHARED_MEMORY`] in which iceoryx2 counts the nodes below the root.
     pub(in crate::wire) fn node_counters(&self) -> impl Iterator<Item = PathBuf> {
-        let entries = fs::read_dir(SHARED_MEMORY).into_iter().flatten().flatten();
-        entries.map(|entry| entry.path()).filter(|path| {
+        self.transport_files(Path::new(SHARED_MEMORY), ".global_mgmt")
+    }
+
+    /// What iceoryx2 has of this place in `folder`, by the ends of the names.
+    pub(in crate::wire) fn transport_files(
+        &self,
+        folder: &Path,
+        suffix: &str,
+    ) -> impl Iterator<Item = PathBuf> {
+        let entries = fs::read_dir(folder).into_iter().flatten().flatten();
+        entries.map(|entry| entry.path()).filter(move |path| {
             let name = path.file_name().unwrap_or_default().to_string_lossy();
-            name.starts_with(&self.prefix) && name.ends_with(".global_mgmt")
+            name.starts_with(&self.prefix) && name.ends_with(suffix)
         })
     }
 

@@ -5,6 +5,7 @@ mod subscribers;
 
 use std::fmt::Debug;
 use std::os::fd::{AsFd, BorrowedFd};
+use std::path::Path;
 use std::time::Duration;
 
 use iceoryx2::port::listener::Listener;
@@ -21,11 +22,13 @@ use iceoryx2::service::port_factory::event::PortFactory as EventFactory;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory as DataFactory;
 use rustix::event::{PollFd, PollFlags, Timespec};
 
+use crate::wire::folders::SHARED_MEMORY;
 use crate::wire::limits::raise_open_files;
 pub use crate::wire::open_error::OpenError;
 use crate::wire::open_error::{in_words, not_running, topic_error};
 use crate::wire::place::Place;
 use crate::wire::port::subscribers::too_many;
+use crate::wire::shared_memory::reserve;
 use crate::wire::topic::Topic;
 use crate::wire::version::foreign_version;
 
@@ -37,10 +40,17 @@ const MAX_EVENT_PORTS: usize = 16;
 const MAX_PUBLISHERS: usize = 3;
 /// Most events, and the interrupt, that are waited for at a time.
 const MAX_WAITED: usize = 8;
+/// Shared memory of a process and its connections to all topics: twice what the supervisor takes, which listens to most.
+const JOIN_BYTES: u64 = 1 << 20;
 /// How often opening is tried while another process removes the same service.
 const OPEN_ATTEMPTS: usize = 50;
 /// Pause between two attempts.
 const OPEN_PAUSE: Duration = Duration::from_millis(10);
+
+/// What a message is made of: its header, or an element of its payload.
+pub trait Part: Debug + ZeroCopySend + 'static {}
+
+impl<T: Debug + ZeroCopySend + 'static> Part for T {}
 
 /// Why a message was not sent.
 #[derive(Debug, thiserror::Error)]
@@ -75,9 +85,9 @@ pub enum Access {
 /// A process's membership in an instance; every port is made from it.
 #[derive(Debug)]
 pub struct Hub {
-    node: Node<ipc::Service>,
-    place: Place,
-    access: Access,
+    pub(in crate::wire) node: Node<ipc::Service>,
+    pub(in crate::wire) place: Place,
+    pub(in crate::wire) access: Access,
 }
 
 impl Hub {
@@ -91,7 +101,7 @@ impl Hub {
             return Err(not_running(place));
         }
         set_log_level(LogLevel::Fatal);
-        place.check_room_to_join()?;
+        place.check_shared_memory(JOIN_BYTES)?;
         let _joining = place.hold()?;
         let root = place.root.display().to_string();
         let failed =
@@ -119,19 +129,15 @@ impl Hub {
 
     /// Takes all shared memory that the open ports have promised; an observer's subscriber does it by itself.
     pub fn reserve(&self) -> Result<(), OpenError> {
-        Ok(self.place.reserve_shared_memory()?)
+        Ok(reserve(Path::new(SHARED_MEMORY), &self.place.prefix)?)
     }
 
     /// A sender of slices of `T` with a header of `H`, at most `max_length` elements.
-    pub fn publisher<T, H>(
+    pub fn publisher<T: Part, H: Part>(
         &self,
         topic: &Topic,
         max_length: usize,
-    ) -> Result<Publisher<T, H>, OpenError>
-    where
-        T: Debug + ZeroCopySend + 'static,
-        H: Debug + ZeroCopySend + 'static,
-    {
+    ) -> Result<Publisher<T, H>, OpenError> {
         let name = topic.service_name(&self.place.instance);
         let message_bytes = size_of::<H>() + max_length * size_of::<T>();
         self.place.check_shared_memory(topic.bytes(message_bytes))?;
@@ -142,20 +148,14 @@ impl Hub {
             .max_loaned_samples(topic.loans)
             .create()
             .map_err(|e| topic_error(&name, &e))?;
-        let notifier = self
-            .event_service(&name)?
-            .notifier_builder()
-            .create()
-            .map_err(|e| topic_error(&name, &e))?;
-        Ok(Publisher { port, notifier, topic: name })
+        Ok(Publisher { port, wake: self.notifier(&name)?, topic: name })
     }
 
     /// A receiver of slices of `T` with a header of `H`.
-    pub fn subscriber<T, H>(&self, topic: &Topic) -> Result<Subscriber<T, H>, OpenError>
-    where
-        T: Debug + ZeroCopySend + 'static,
-        H: Debug + ZeroCopySend + 'static,
-    {
+    pub fn subscriber<T: Part, H: Part>(
+        &self,
+        topic: &Topic,
+    ) -> Result<Subscriber<T, H>, OpenError> {
         let name = topic.service_name(&self.place.instance);
         let service = self.data_service::<T, H>(topic, &name)?;
         let port = service
@@ -189,27 +189,11 @@ impl Hub {
         Ok(Wake { notifier: notifier.map_err(|e| topic_error(name, &e))? })
     }
 
-    pub(in crate::wire) fn node(&self) -> &Node<ipc::Service> {
-        &self.node
-    }
-
-    pub(in crate::wire) fn place(&self) -> &Place {
-        &self.place
-    }
-
-    pub(in crate::wire) fn access(&self) -> Access {
-        self.access
-    }
-
-    fn data_service<T, H>(
+    fn data_service<T: Part, H: Part>(
         &self,
         topic: &Topic,
         name: &str,
-    ) -> Result<DataFactory<ipc::Service, [T], H>, OpenError>
-    where
-        T: Debug + ZeroCopySend + 'static,
-        H: Debug + ZeroCopySend + 'static,
-    {
+    ) -> Result<DataFactory<ipc::Service, [T], H>, OpenError> {
         let service_name = ServiceName::new(name).map_err(|e| topic_error(name, &e))?;
         let builder = || {
             self.node
@@ -283,13 +267,13 @@ pub(in crate::wire) fn retry<S, E: std::fmt::Display>(
 
 /// Sends slices of `T` with a header of `H`, and wakes those who wait.
 #[derive(Debug)]
-pub struct Publisher<T: Debug + ZeroCopySend + 'static, H: Debug + ZeroCopySend + 'static> {
+pub struct Publisher<T: Part, H: Part> {
     port: RawPublisher<ipc::Service, [T], H>,
-    notifier: Notifier<ipc::Service>,
+    wake: Wake,
     topic: String,
 }
 
-impl<T: Debug + ZeroCopySend + Copy, H: Debug + Default + ZeroCopySend> Publisher<T, H> {
+impl<T: Part + Copy, H: Part + Default> Publisher<T, H> {
     /// Copies `payload` into shared memory and sends it.
     pub fn send(&self, header: H, payload: &[T]) -> Result<(), SendError> {
         let failed = |e: &dyn std::fmt::Display| self.error(e);
@@ -297,7 +281,7 @@ impl<T: Debug + ZeroCopySend + Copy, H: Debug + Default + ZeroCopySend> Publishe
         let mut sample = sample.write_from_slice(payload);
         *sample.user_header_mut() = header;
         sample.send().map_err(|e| failed(&e))?;
-        self.wake();
+        self.wake.notify();
         Ok(())
     }
 
@@ -307,17 +291,12 @@ impl<T: Debug + ZeroCopySend + Copy, H: Debug + Default + ZeroCopySend> Publishe
         let _ = self.port.update_connections();
     }
 
-    fn wake(&self) {
-        // A listener that died is no reason to stop sending.
-        let _ = self.notifier.notify();
-    }
-
     fn error(&self, reason: &dyn std::fmt::Display) -> SendError {
         SendError { topic: self.topic.clone(), reason: reason.to_string() }
     }
 }
 
-impl<H: Debug + Default + ZeroCopySend> Publisher<u8, H> {
+impl<H: Part + Default> Publisher<u8, H> {
     /// Room for `length` bytes in shared memory, to be written in place.
     pub fn loan(&self, length: usize) -> Result<Loan<'_, H>, SendError> {
         let sample = self.port.loan_slice_uninit(length).map_err(|e| self.error(&e))?;
@@ -329,12 +308,12 @@ impl<H: Debug + Default + ZeroCopySend> Publisher<u8, H> {
 
 /// Bytes in shared memory that are not sent yet; dropped without sending they go back.
 #[derive(Debug)]
-pub struct Loan<'a, H: Debug + Default + ZeroCopySend + 'static> {
+pub struct Loan<'a, H: Part + Default> {
     sample: SampleMut<ipc::Service, [u8], H>,
     publisher: &'a Publisher<u8, H>,
 }
 
-impl<H: Debug + Default + ZeroCopySend> Loan<'_, H> {
+impl<H: Part + Default> Loan<'_, H> {
     /// The bytes.
     pub fn bytes_mut(&mut self) -> &mut [u8] {
         self.sample.payload_mut()
@@ -344,26 +323,24 @@ impl<H: Debug + Default + ZeroCopySend> Loan<'_, H> {
     pub fn send(mut self, header: H) -> Result<(), SendError> {
         *self.sample.user_header_mut() = header;
         self.sample.send().map_err(|e| self.publisher.error(&e))?;
-        self.publisher.wake();
+        self.publisher.wake.notify();
         Ok(())
     }
 }
 
 /// Receives slices of `T` with a header of `H`.
 #[derive(Debug)]
-pub struct Subscriber<T: Debug + ZeroCopySend + 'static, H: Debug + ZeroCopySend + 'static> {
+pub struct Subscriber<T: Part, H: Part> {
     port: RawSubscriber<ipc::Service, [T], H>,
     events: Events,
     topic: String,
 }
 
-impl<T: Debug + ZeroCopySend, H: Debug + ZeroCopySend> Subscriber<T, H> {
+impl<T: Part, H: Part> Subscriber<T, H> {
     /// The oldest unread message.
     pub fn receive(&self) -> Result<Option<Received<T, H>>, ReceiveError> {
-        match self.port.receive() {
-            Ok(sample) => Ok(sample.map(|sample| Received { sample })),
-            Err(e) => Err(self.error(&e)),
-        }
+        let sample = self.port.receive().map_err(|e| self.error(&e))?;
+        Ok(sample.map(|sample| Received { sample }))
     }
 
     fn error(&self, reason: &dyn std::fmt::Display) -> ReceiveError {
@@ -399,11 +376,11 @@ impl<T: Debug + ZeroCopySend, H: Debug + ZeroCopySend> Subscriber<T, H> {
 
 /// A message in shared memory; its place is free again when this is dropped.
 #[derive(Debug)]
-pub struct Received<T: Debug + ZeroCopySend + 'static, H: Debug + ZeroCopySend + 'static> {
+pub struct Received<T: Part, H: Part> {
     sample: Sample<ipc::Service, [T], H>,
 }
 
-impl<T: Debug + ZeroCopySend, H: Debug + ZeroCopySend> Received<T, H> {
+impl<T: Part, H: Part> Received<T, H> {
     /// Its header.
     pub fn header(&self) -> &H {
         self.sample.user_header()
@@ -419,13 +396,6 @@ impl<T: Debug + ZeroCopySend, H: Debug + ZeroCopySend> Received<T, H> {
 #[derive(Debug)]
 pub struct Events {
     listener: Listener<ipc::Service>,
-}
-
-impl Events {
-    /// Takes all wake-ups; their number does not matter, messages are counted by themselves.
-    fn take(&self) {
-        let _ = self.listener.try_wait(|_| {});
-    }
 }
 
 /// Readable while a wake-up is unread: for a poll of one's own; [`wait`] takes the wake-ups.
@@ -444,6 +414,7 @@ pub(in crate::wire) struct Wake {
 
 impl Wake {
     pub(in crate::wire) fn notify(&self) {
+        // A listener that died is no reason to stop sending.
         let _ = self.notifier.notify();
     }
 }
@@ -479,7 +450,10 @@ pub fn wait<'a>(
         Ok(_) | Err(rustix::io::Errno::INTR) => {}
         Err(e) => return Err(WaitError(e.to_string())),
     }
-    events.iter().for_each(|e| e.take());
+    // Their number does not matter: messages are counted by themselves.
+    for event in events {
+        let _ = event.listener.try_wait(|_| {});
+    }
     Ok(())
 }
 

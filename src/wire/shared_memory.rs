@@ -14,27 +14,13 @@ use crate::wire::place_error::PlaceError;
 use crate::wire::root_folder::is_mine;
 
 impl Place {
-    /// Takes all memory that the segments of this place have promised, where some of it is still to be had on
-    /// first use only.
-    pub(in crate::wire) fn reserve_shared_memory(&self) -> Result<(), PlaceError> {
-        reserve(Path::new(SHARED_MEMORY), &self.prefix)
-    }
-
-    /// Checks that shared memory has room for a process and its connections to all topics.
-    pub(in crate::wire) fn check_room_to_join(&self) -> Result<(), PlaceError> {
-        /// Twice what the supervisor takes, which listens to most.
-        const JOIN_BYTES: u64 = 1 << 20;
-        self.check_shared_memory(JOIN_BYTES)
-    }
-
     /// Checks that shared memory has `needed` bytes left, and the address space room for them: what is
     /// missing is not an error later but the death of the process.
     pub fn check_shared_memory(&self, needed: u64) -> Result<(), PlaceError> {
         check_address_space(needed)?;
         let none = |cause| PlaceError::NoSharedMemory(io::Error::from(cause));
         rustix::fs::access(SHARED_MEMORY, Access::WRITE_OK | Access::EXEC_OK).map_err(none)?;
-        let stat = rustix::fs::statvfs(SHARED_MEMORY).map_err(none)?;
-        let free = stat.f_bavail.saturating_mul(stat.f_frsize);
+        let free = free_shared_memory().map_err(none)?;
         if free >= needed {
             return Ok(());
         }
@@ -43,15 +29,15 @@ impl Place {
 }
 
 /// What is free of shared memory, bytes.
-pub fn free_shared_memory() -> Option<u64> {
-    let stat = rustix::fs::statvfs(SHARED_MEMORY).ok()?;
-    Some(stat.f_bavail.saturating_mul(stat.f_frsize))
+pub fn free_shared_memory() -> rustix::io::Result<u64> {
+    let stat = rustix::fs::statvfs(SHARED_MEMORY)?;
+    Ok(stat.f_bavail.saturating_mul(stat.f_frsize))
 }
 
 /// Takes what the segments whose names begin with `prefix` in `folder` have promised and not got: they are made
 /// sparse, and a page that is not there when it is touched ends the process (SIGBUS). Milliseconds for what is new,
 /// a fraction of one where all is taken.
-fn reserve(folder: &Path, prefix: &str) -> Result<(), PlaceError> {
+pub(in crate::wire) fn reserve(folder: &Path, prefix: &str) -> Result<(), PlaceError> {
     /// What `st_blocks` counts in.
     const BLOCK_BYTES: u64 = 512;
     let (mut needed, mut missing) = (0, 0);

@@ -33,17 +33,16 @@ impl Place {
         let alone = FlockOperation::NonBlockingLockExclusive;
         let Ok(Some(_lock)) = lock_named(&path, alone, end) else { return };
         // What cannot be removed is removed by the next one.
-        let is_empty =
-            |folder: &Path| fs::read_dir(folder).map_or(true, |mut f| f.next().is_none());
         self.remove_dead_nodes();
         self.remove_failed_nodes();
-        if is_empty(&self.root.join("nodes")) {
+        if !self.has_nodes() {
             self.node_counters().for_each(|path| drop(fs::remove_file(path)));
             self.remove_abandoned();
             let _ = fs::remove_dir(self.root.join("nodes"));
             // Without a node nobody has a service open: what is left there is of the dead.
             let _ = fs::remove_dir_all(self.root.join("services"));
-            self.events().for_each(|path| drop(fs::remove_file(path)));
+            // The sockets of events.
+            self.transport_files(&self.root, ".event").for_each(|path| drop(fs::remove_file(path)));
             let _ = fs::remove_file(&path);
         }
     }
@@ -87,15 +86,6 @@ impl Place {
         }
     }
 
-    /// The sockets of events in the folder.
-    fn events(&self) -> impl Iterator<Item = PathBuf> {
-        let entries = fs::read_dir(&self.root).into_iter().flatten().flatten();
-        entries.map(|entry| entry.path()).filter(|path| {
-            let name = path.file_name().unwrap_or_default().to_string_lossy();
-            name.starts_with(&self.prefix) && name.ends_with(".event")
-        })
-    }
-
     /// Removes checkpoints, positions and dead claims of instances for which no successor is waited for. While
     /// nobody may join.
     fn remove_abandoned(&self) {
@@ -125,11 +115,9 @@ impl Place {
         if there.peek().is_none() {
             return false;
         }
-        let kept = [
-            self.kept_path(instance, CHECKPOINT_SUFFIX),
-            self.kept_path(instance, POSITION_SUFFIX),
-        ];
-        there.any(|path| is_held(path)) || kept.iter().any(|path| is_young(path))
+        let mut kept = [CHECKPOINT_SUFFIX, POSITION_SUFFIX].into_iter();
+        there.any(|path| is_held(path))
+            || kept.any(|suffix| is_young(&self.kept_path(instance, suffix)))
     }
 
     /// What processes of this instance keep for their successors.
@@ -200,9 +188,8 @@ fn is_held(claim: &Path) -> bool {
 /// as good as one in the past: the clock may have been set.
 fn is_young(path: &Path) -> bool {
     let written = fs::metadata(path).and_then(|found| found.modified());
-    let age = |written: SystemTime| match SystemTime::now().duration_since(written) {
-        Ok(age) => age,
-        Err(ahead) => ahead.duration(),
+    let age = |written| {
+        SystemTime::now().duration_since(written).unwrap_or_else(|ahead| ahead.duration())
     };
     written.is_ok_and(|written| age(written) < SUCCESSOR_WAIT)
 }

@@ -69,15 +69,8 @@ pub const KEYFRAME: Topic = Topic {
 pub const KEYFRAME_IMAGE: Topic = Topic { noun: "keyframe_image", ..KEYFRAME };
 /// Depth of a keyframe that is not the active one, for the one reader that asks for it: whenever the map's graph has another
 /// revision of it than the reader.
-pub const EARLIER_KEYFRAME: Topic = Topic {
-    owner: "mapper",
-    noun: "earlier_keyframe",
-    subscribers: 1,
-    buffer: 1,
-    borrowed: 1,
-    history: 0,
-    loans: 1,
-};
+pub const EARLIER_KEYFRAME: Topic =
+    Topic { noun: "earlier_keyframe", subscribers: 1, history: 0, ..KEYFRAME };
 /// Image of that keyframe.
 pub const EARLIER_KEYFRAME_IMAGE: Topic =
     Topic { noun: "earlier_keyframe_image", ..EARLIER_KEYFRAME };

@@ -282,7 +282,7 @@ fn trajectories_say_where_another_epoch_begins() {
             .unwrap();
     let longest = found.epochs.iter().find(|of| summary["evaluated_epoch"] == of.epoch).unwrap();
     let longest = longest.result.as_ref().unwrap();
-    assert_eq!((&summary["evaluated_epoch"], longest.association.pairs.len()), (&0.into(), 35));
+    assert_eq!((&summary["evaluated_epoch"], longest.pairs.len()), (&0.into(), 35));
     for (key, found) in [("ate_rmse_m", longest.ate.rmse), ("path_length_m", longest.path_length)] {
         let expected = summary[key].as_f64().unwrap();
         assert!((found - expected).abs() < 1e-9, "{key}: {found}, {expected}");

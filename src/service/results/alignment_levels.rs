@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::service::alignment_stamps::{AlignmentTrace, LevelTrace};
-use crate::slam::evaluation::statistics::percentile;
+use crate::slam::evaluation::statistics::percentiles;
 use crate::slam::image::sums::MAX_LEVELS;
 
 /// The frames that were aligned on one level.
@@ -32,10 +32,7 @@ pub fn alignment_levels(traces: &[AlignmentTrace]) -> Option<Vec<LevelSummary>> 
 fn summary_of(traces: &[AlignmentTrace], level: usize) -> Option<LevelSummary> {
     let of_level = traces.iter().map(|trace| trace.levels[level]);
     let frames: Vec<LevelTrace> = of_level.filter(|trace| trace.iterations > 0).collect();
-    let median = |mut values: Vec<f64>| {
-        values.sort_by(f64::total_cmp);
-        percentile(&values, 0.5)
-    };
+    let median = |values: Vec<f64>| percentiles(values, [0.5]).map(|[median]| median);
     let of = |value: fn(&LevelTrace) -> u32| {
         frames.iter().map(|trace| f64::from(value(trace))).collect::<Vec<_>>()
     };

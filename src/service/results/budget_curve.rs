@@ -3,7 +3,10 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::slam::evaluation::statistics::percentile;
+use crate::slam::evaluation::statistics::percentiles;
+
+/// Shares of the frames whose displacement is told: half of them, and most.
+const SPREAD: [f64; 2] = [0.5, 0.9];
 
 /// One frame, aligned with one budget.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -45,8 +48,8 @@ impl BudgetCurve {
         for budget in budgets {
             let reached =
                 || samples.iter().filter_map(|s| within(s, |step| step.iterations <= budget));
-            let [p50, p90] = spread(reached().map(|step| step.displacement_px))?;
-            let [time, _] = spread(reached().map(|step| step.nanos as f64 * 1e-6))?;
+            let [p50, p90] = percentiles(reached().map(|step| step.displacement_px), SPREAD)?;
+            let [time] = percentiles(reached().map(|step| step.nanos as f64 * 1e-6), [0.5])?;
             curve.iterations.push(budget);
             curve.track_ms_p50.push(time);
             curve.displacement_px_p50.push(p50);
@@ -71,7 +74,7 @@ pub fn displacement_by_time(samples: &[BudgetSample], times_ms: &[f64]) -> Vec<(
         let reached = samples.iter().map(|s| within(s, |step| step.nanos <= nanos));
         let displacements: Option<Vec<f64>> =
             reached.map(|step| step.map(|step| step.displacement_px)).collect();
-        Some((time, spread(displacements?.into_iter())?))
+        Some((time, percentiles(displacements?, SPREAD)?))
     };
     times_ms.iter().filter_map(at).collect()
 }
@@ -79,12 +82,6 @@ pub fn displacement_by_time(samples: &[BudgetSample], times_ms: &[f64]) -> Vec<(
 /// The last step of a frame that is allowed; with a finer budget it had not come further.
 fn within(sample: &BudgetSample, is_allowed: impl Fn(&BudgetStep) -> bool) -> Option<&BudgetStep> {
     sample.iter().rev().find(|step| is_allowed(step))
-}
-
-fn spread(values: impl Iterator<Item = f64>) -> Option<[f64; 2]> {
-    let mut sorted: Vec<f64> = values.collect();
-    sorted.sort_by(f64::total_cmp);
-    Some([percentile(&sorted, 0.5)?, percentile(&sorted, 0.9)?])
 }
 
 #[cfg(test)]

@@ -1,7 +1,7 @@
 //! Whether the images of a run fit their calibration, as far as the residuals tell.
 
 use crate::service::results::record::RecordedPose;
-use crate::slam::evaluation::statistics::percentile;
+use crate::slam::evaluation::statistics::percentiles;
 
 /// Tracked frames from which the residuals tell anything: a second of video.
 const MIN_FRAMES: usize = 30;
@@ -16,10 +16,9 @@ const DOUBTED_RESIDUAL: f64 = 1.4;
 /// everything is as modelled. `None` of few frames.
 pub fn whitened_residual_median(poses: &[RecordedPose]) -> Option<f64> {
     let tracked = poses.iter().filter(|pose| pose.estimate.state.is_tracked());
-    let mut residuals: Vec<f64> =
-        tracked.map(|pose| pose.estimate.quality.whitened_rmse).filter(|r| *r > 0.0).collect();
-    residuals.sort_by(f64::total_cmp);
-    percentile(&residuals, 0.5).filter(|_| residuals.len() >= MIN_FRAMES)
+    let residuals = tracked.map(|pose| pose.estimate.quality.whitened_rmse).filter(|r| *r > 0.0);
+    let [median] = percentiles(residuals.clone(), [0.5])?;
+    (residuals.count() >= MIN_FRAMES).then_some(median)
 }
 
 /// A warning where the images do not fit as they do with the right calibration.

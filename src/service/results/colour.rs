@@ -64,6 +64,13 @@ pub struct Picture {
 }
 
 impl Picture {
+    /// Colours a pixel, where it is in the picture.
+    pub fn paint(&mut self, column: usize, row: usize, colour: Rgb) {
+        if column < self.width && row < self.height {
+            self.pixels[row * self.width + column] = colour;
+        }
+    }
+
     /// The picture as the bytes of a PNG file; `None` where its size and pixels disagree.
     pub fn png(&self) -> Option<Vec<u8>> {
         encode_rgb(self.width, self.height, self.pixels.as_flattened()).ok()

@@ -3,23 +3,14 @@
 use crate::capture::source::FrameSource;
 use crate::capture::source_error::SourceError;
 use crate::service::results::record::RunRecord;
-use crate::slam::evaluation::depth_error::{DepthErrors, DepthStatistics, KeyframeDepth};
+use crate::slam::evaluation::depth_error::DepthErrors;
 use crate::slam::keyframe::{Keyframe, MapState};
-
-/// How good the depth maps are.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct DepthEvaluation {
-    /// Statistics over all keyframes with true depth; `None` where there is none.
-    pub statistics: Option<DepthStatistics>,
-    /// What the depth of each has in common, of all keyframes that have true depth.
-    pub keyframes: Vec<KeyframeDepth>,
-}
 
 /// Compares every established keyframe that has true depth.
 pub fn evaluate_depth(
     record: &RunRecord,
     source: &mut dyn FrameSource,
-) -> Result<DepthEvaluation, SourceError> {
+) -> Result<DepthErrors, SourceError> {
     let mut errors = DepthErrors::default();
     for keyframe in record.map.keyframes.iter().filter(|k| is_evaluated(k)) {
         let true_depth = match source.depth_at(keyframe.capture_nanos) {
@@ -34,7 +25,7 @@ pub fn evaluate_depth(
             errors.add(keyframe, &true_depth, record.depth_scale);
         }
     }
-    Ok(DepthEvaluation { statistics: errors.statistics(), keyframes: errors.into_keyframes() })
+    Ok(errors)
 }
 
 /// Whether a keyframe's depth is proven and still held.

@@ -4,21 +4,9 @@ use std::io::{self, Write};
 use std::path::Path;
 
 use crate::service::atomic_file::write_atomically;
-use crate::slam::keyframe::{Keyframe, MapState};
+use crate::service::results::pictures::is_known;
+use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
 use crate::slam::map::Map;
-
-/// A point of a keyframe.
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct FullPoint {
-    /// Position in the world, map units.
-    position: [f32; 3],
-    /// Brightness of its pixel, 0 to 255.
-    intensity: f32,
-    /// Variance of its inverse depth, keyframe units.
-    variance: f32,
-    /// Its keyframe.
-    keyframe_id: u32,
-}
 
 /// Bytes of a point in the file.
 pub const FULL_POINT_BYTES: usize = 24;
@@ -31,32 +19,17 @@ pub fn num_points(map: &Map, max_relative_std_dev: f64) -> usize {
     points(map, max_relative_std_dev).count()
 }
 
-fn points(map: &Map, max_relative_std_dev: f64) -> impl Iterator<Item = FullPoint> + '_ {
+fn points(map: &Map, max_relative_std_dev: f64) -> impl Iterator<Item = (&Keyframe, &DepthPoint)> {
     let established = map.keyframes.iter().filter(|k| k.map_state == MapState::Established);
-    established.flat_map(move |k| keyframe_points(k, max_relative_std_dev))
+    let all = established.flat_map(|keyframe| keyframe.points.iter().map(move |p| (keyframe, p)));
+    all.filter(move |(_, point)| is_known(point, max_relative_std_dev))
 }
 
-fn keyframe_points(
-    keyframe: &Keyframe,
-    max_relative_std_dev: f64,
-) -> impl Iterator<Item = FullPoint> + '_ {
-    let k = keyframe.intrinsics;
-    keyframe.points.iter().filter_map(move |point| {
-        let d = f64::from(point.inverse_depth);
-        let relative_std_dev = f64::from(point.variance).sqrt() / d;
-        if !(d > 0.0 && relative_std_dev <= max_relative_std_dev) {
-            return None;
-        }
-        let (u, v) = (f64::from(point.u), f64::from(point.v));
-        let in_keyframe = k.ray(u, v) / d;
-        let in_world = keyframe.map_from_keyframe * in_keyframe;
-        Some(FullPoint {
-            position: [in_world.x as f32, in_world.y as f32, in_world.z as f32],
-            intensity: point.intensity,
-            variance: point.variance,
-            keyframe_id: keyframe.keyframe_id as u32,
-        })
-    })
+/// Where the pixel (u, v) of a keyframe with this inverse depth is in the world, map units.
+pub(super) fn in_world(keyframe: &Keyframe, [u, v]: [u16; 2], inverse_depth: f32) -> [f32; 3] {
+    let ray = keyframe.intrinsics.ray(f64::from(u), f64::from(v));
+    let place = keyframe.map_from_keyframe * (ray / f64::from(inverse_depth));
+    [place.x as f32, place.y as f32, place.z as f32]
 }
 
 /// Writes them, of all epochs: each has a place and a unit of its own, and `keyframes.txt` says which keyframe is of which.
@@ -71,11 +44,12 @@ pub fn write_full_points(path: &Path, map: &Map, max_relative_std_dev: f64) -> i
              property float intensity\nproperty float variance\nproperty uint keyframe\n\
              end_header\n"
         )?;
-        points(map, max_relative_std_dev).try_for_each(|point| {
-            for number in point.position.iter().chain([&point.intensity, &point.variance]) {
+        points(map, max_relative_std_dev).try_for_each(|(keyframe, point)| {
+            let position = in_world(keyframe, [point.u, point.v], point.inverse_depth);
+            for number in position.iter().chain([&point.intensity, &point.variance]) {
                 file.write_all(&number.to_le_bytes())?;
             }
-            file.write_all(&point.keyframe_id.to_le_bytes())
+            file.write_all(&(keyframe.keyframe_id as u32).to_le_bytes())
         })
     })
 }

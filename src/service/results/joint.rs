@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::service::adjustments::{AdjustmentRecord, Fate};
 use crate::service::results::times::Percentiles;
-use crate::slam::evaluation::statistics::percentile;
+use crate::slam::evaluation::statistics::percentiles;
 
 /// The joint estimates of a run. None where it is switched off, or there was no second keyframe.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
@@ -33,9 +33,7 @@ impl JointSummary {
             records.iter().filter(|record| fates.contains(&record.fate)).count() as u64
         };
         let median = |value: fn(&AdjustmentRecord) -> f64| {
-            let mut values: Vec<f64> = records.iter().map(value).collect();
-            values.sort_by(f64::total_cmp);
-            percentile(&values, 0.5)
+            percentiles(records.iter().map(value), [0.5]).map(|[median]| median)
         };
         Self {
             adjustments: count(&[Fate::Entered, Fate::Merged]),

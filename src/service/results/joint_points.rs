@@ -5,6 +5,7 @@ use std::io::{self, Write};
 use std::path::Path;
 
 use crate::service::atomic_file::write_atomically;
+use crate::service::results::full_points::in_world;
 use crate::slam::map::{ConfirmedPoint, Map};
 
 /// Writes the points of a map.
@@ -35,10 +36,6 @@ pub fn write_points(path: &Path, map: &Map) -> io::Result<()> {
 /// Where a point is in the world, map units; `None` where its keyframe is gone.
 fn position(map: &Map, point: &ConfirmedPoint) -> Option<[f32; 3]> {
     let keyframe = map.get(point.keyframe_id)?;
-    let k = &keyframe.intrinsics;
-    let (u, v) = (f64::from(point.u), f64::from(point.v));
-    let ray = k.ray(u, v);
-    let in_world = keyframe.map_from_keyframe * (ray / f64::from(point.inverse_depth));
-    let position = [in_world.x as f32, in_world.y as f32, in_world.z as f32];
+    let position = in_world(keyframe, [point.u, point.v], point.inverse_depth);
     position.iter().all(|x| x.is_finite()).then_some(position)
 }

@@ -74,9 +74,8 @@ pub fn write_text(
         for y in 0..LETTER[1] * dot {
             for x in 0..LETTER[0] * dot {
                 let is_set = rows[y / dot] >> (LETTER[0] - 1 - x / dot) & 1 == 1;
-                let (column, row) = (start + x, top + y);
-                if is_set && column < picture.width && row < picture.height {
-                    picture.pixels[row * picture.width + column] = colour;
+                if is_set {
+                    picture.paint(start + x, top + y, colour);
                 }
             }
         }

@@ -197,23 +197,17 @@ fn new_folder(parent: &Path, stamp: &str) -> io::Result<PathBuf> {
 
 /// `2026-11-22T03-15-00Z`: UTC, in order by name, and without a character that shells or Windows dislike.
 pub fn utc_stamp(time: SystemTime) -> String {
-    let [year, month, day, hour, minute, second] = utc(time);
-    format!("{year:04}-{month:02}-{day:02}T{hour:02}-{minute:02}-{second:02}Z")
+    utc_text(time).replace(':', "-")
 }
 
 /// `2026-11-22T03:15:00Z`: UTC as RFC 3339 has it.
 pub fn utc_text(time: SystemTime) -> String {
-    let [year, month, day, hour, minute, second] = utc(time);
-    format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}Z")
-}
-
-/// Year, month, day, hour, minute, second.
-fn utc(time: SystemTime) -> [u64; 6] {
     const SECS_PER_DAY: u64 = 86_400;
     let secs = time.duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs());
     let (days, of_day) = (secs / SECS_PER_DAY, secs % SECS_PER_DAY);
     let (year, month, day) = date_of(days);
-    [year, month, day, of_day / 3600, of_day / 60 % 60, of_day % 60]
+    let (hour, minute, second) = (of_day / 3600, of_day / 60 % 60, of_day % 60);
+    format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}Z")
 }
 
 /// Year, month and day of a number of days since 1970-01-01, in the Gregorian calendar: years are counted from

@@ -1,7 +1,7 @@
 //! Pictures of a keyframe's depth map: inverse depth, variance, density.
 
 use crate::service::results::colour::{Picture, Rgb, heat, rainbow};
-use crate::slam::evaluation::statistics::percentile;
+use crate::slam::evaluation::statistics::percentiles;
 use crate::slam::keyframe::{DepthPoint, Keyframe};
 
 /// Brightness of the image under a depth map: dark enough that colours stand out.
@@ -22,11 +22,8 @@ pub fn inverse_depth_picture(
     keyframe: &Keyframe,
     max_relative_std_dev: f64,
 ) -> (Picture, Option<[f64; 2]>) {
-    let shown = |p: &&DepthPoint| {
-        let ratio = relative_std_dev(p);
-        p.inverse_depth > 0.0 && ratio <= max_relative_std_dev
-    };
-    let points: Vec<&DepthPoint> = keyframe.points.iter().filter(shown).collect();
+    let shown = keyframe.points.iter().filter(|point| is_known(point, max_relative_std_dev));
+    let points: Vec<&DepthPoint> = shown.collect();
     let mut picture = background(keyframe);
     let range = middle_range(points.iter().map(|p| f64::from(p.inverse_depth)));
     let Some([far, near]) = range else { return (picture, None) };
@@ -40,9 +37,7 @@ pub fn inverse_depth_picture(
 
 /// Lower and upper end of the values without the outliers at either end; `None` of none.
 pub fn middle_range(values: impl Iterator<Item = f64>) -> Option<[f64; 2]> {
-    let mut sorted: Vec<f64> = values.collect();
-    sorted.sort_by(f64::total_cmp);
-    Some([percentile(&sorted, CLIPPED_SHARE)?, percentile(&sorted, 1.0 - CLIPPED_SHARE)?])
+    percentiles(values, [CLIPPED_SHARE, 1.0 - CLIPPED_SHARE])
 }
 
 /// σ/d of every point in colour (bright: uncertain), logarithmic over [`RELATIVE_STD_DEV_RANGE`].
@@ -61,18 +56,21 @@ pub fn density_picture(keyframe: &Keyframe) -> Picture {
     let (width, height) = (keyframe.intrinsics.width, keyframe.intrinsics.height);
     let columns = width.div_ceil(DENSITY_BLOCK);
     let mut counts = vec![0u32; columns * height.div_ceil(DENSITY_BLOCK)];
+    let block = |u: usize, v: usize| v / DENSITY_BLOCK * columns + u / DENSITY_BLOCK;
     for point in &keyframe.points {
         let (u, v) = (usize::from(point.u), usize::from(point.v));
         if u < width && v < height {
-            counts[v / DENSITY_BLOCK * columns + u / DENSITY_BLOCK] += 1;
+            counts[block(u, v)] += 1;
         }
     }
     let full = (DENSITY_BLOCK * DENSITY_BLOCK) as f64;
-    let colour = |i: usize| {
-        let (u, v) = (i % width, i / width);
-        heat(f64::from(counts[v / DENSITY_BLOCK * columns + u / DENSITY_BLOCK]) / full)
-    };
+    let colour = |i: usize| heat(f64::from(counts[block(i % width, i / width)]) / full);
     Picture { width, height, pixels: (0..width * height).map(colour).collect() }
+}
+
+/// Whether a point's σ/d is at most `max_relative_std_dev`.
+pub fn is_known(point: &DepthPoint, max_relative_std_dev: f64) -> bool {
+    point.inverse_depth > 0.0 && relative_std_dev(point) <= max_relative_std_dev
 }
 
 fn relative_std_dev(point: &DepthPoint) -> f64 {
@@ -89,8 +87,5 @@ pub fn background(keyframe: &Keyframe) -> Picture {
 }
 
 fn paint(picture: &mut Picture, point: &DepthPoint, colour: Rgb) {
-    let (u, v) = (usize::from(point.u), usize::from(point.v));
-    if u < picture.width && v < picture.height {
-        picture.pixels[v * picture.width + u] = colour;
-    }
+    picture.paint(usize::from(point.u), usize::from(point.v), colour);
 }

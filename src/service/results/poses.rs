@@ -28,8 +28,8 @@ pub const ONLINE_COMMENT: &str = "world_from_camera of every tracked frame as it
 /// epoch has a frame and a scale of its own, so that only one can be compared with ground truth.
 pub fn longest_epoch(record: &RunRecord) -> Option<u32> {
     let mut frames = BTreeMap::new();
-    for pose in record.poses.iter().filter(|pose| pose.estimate.state.is_tracked()) {
-        *frames.entry(final_epoch(record, &pose.estimate)).or_insert(0_usize) += 1;
+    for estimate in tracked(record) {
+        *frames.entry(final_epoch(record, estimate)).or_insert(0_usize) += 1;
     }
     frames.into_iter().rev().max_by_key(|&(_, count)| count).map(|(epoch, _)| epoch)
 }
@@ -120,9 +120,8 @@ pub fn normalized_errors_of(
         return [None; 3];
     }
     let in_epoch = |of: u32| epoch.is_none_or(|epoch| of == epoch);
-    let estimates = record.poses.iter().map(|pose| &pose.estimate);
     let tracked: Vec<&PoseEstimate> =
-        estimates.filter(|e| e.state.is_tracked() && in_epoch(final_epoch(record, e))).collect();
+        tracked(record).filter(|estimate| in_epoch(final_epoch(record, estimate))).collect();
     let keyframes = record.map.keyframes.iter().filter(|keyframe| in_epoch(keyframe.epoch));
     let stamps: Vec<(u64, i64)> = keyframes.map(|k| (k.keyframe_id, k.capture_nanos)).collect();
     let truth = &record.ground_truth;

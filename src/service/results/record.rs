@@ -1,5 +1,6 @@
 //! What is known of a run when it ends.
 
+use std::collections::BTreeMap;
 use std::time::SystemTime;
 
 use serde::{Deserialize, Serialize};
@@ -7,11 +8,11 @@ use serde::{Deserialize, Serialize};
 use crate::service::adjustments::{AdjustmentRecord, SearchRecord};
 use crate::service::alignment_stamps::AlignmentTrace;
 use crate::service::results::budget_curve::BudgetSample;
-use crate::service::results::start_tally::StartTally;
 use crate::service::time_counts::TimeCounts;
 use crate::slam::evaluation::depth_error::DepthScale;
 use crate::slam::map::Map;
 use crate::slam::mapper::consistency::Contradiction;
+use crate::slam::mapper::situation::StartFrame;
 use crate::slam::pose::PoseEstimate;
 use crate::slam::trajectory::StampedPose;
 
@@ -41,6 +42,19 @@ pub struct RecordedPose {
     pub trace: Option<AlignmentTrace>,
     /// From the frame's sending to the tracker's look at it; `None` in one process.
     pub wake_nanos: Option<u64>,
+}
+
+/// What frames came to while there was no map, counted.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct StartTally(pub BTreeMap<StartFrame, u64>);
+
+impl StartTally {
+    /// Counts a frame, unless a start began on it.
+    pub fn count(&mut self, frame: Option<StartFrame>) {
+        if let Some(frame) = frame.filter(|frame| *frame != StartFrame::Begun) {
+            *self.0.entry(frame).or_default() += 1;
+        }
+    }
 }
 
 /// The map was found to contradict itself.

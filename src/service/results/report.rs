@@ -13,7 +13,6 @@ mod figure_words_quality;
 pub(crate) mod figures;
 pub(crate) mod grade_banner;
 pub(crate) mod html;
-pub(crate) mod input;
 pub(crate) mod joint_charts;
 pub(crate) mod loop_section;
 pub(crate) mod map_picture;
@@ -27,6 +26,7 @@ use std::fmt::Write;
 
 use rayon::prelude::*;
 
+use crate::service::results::Results;
 use crate::service::results::colour::Picture;
 use crate::service::results::output_folder::utc_text;
 use crate::service::results::pictures::{
@@ -42,7 +42,6 @@ use crate::service::results::report::charts::{
 use crate::service::results::report::figures::figures;
 use crate::service::results::report::grade_banner::grade_banner;
 use crate::service::results::report::html::{escaped, png_address};
-use crate::service::results::report::input::ReportInput;
 use crate::service::results::report::joint_charts::{depth_charts, joint_charts};
 use crate::service::results::report::loop_section::loop_section;
 use crate::service::results::report::map_picture::map_section;
@@ -58,8 +57,8 @@ use crate::slam::up::up_direction;
 const PICTURED_KEYFRAMES: usize = 8;
 
 /// The page.
-pub fn report(input: &ReportInput<'_>) -> String {
-    let summary = input.summary;
+pub fn report(results: &Results<'_>) -> String {
+    let summary = &results.summary;
     let mode = match summary.mode {
         RunMode::Replay => "replay in one process, every frame",
         RunMode::Lockstep => "lockstep run, every frame",
@@ -76,88 +75,71 @@ pub fn report(input: &ReportInput<'_>) -> String {
         env!("CARGO_PKG_VERSION"),
         summary.frames_in,
         summary.recorded_secs,
-        notices(summary, &input.record.ended)
+        notices(summary, &results.record.ended)
     );
-    let normals = input.surface.iter().map(|point| point.normal);
-    let up = up_direction(input.trajectory.iter(), normals);
+    let normals = results.surface.iter().map(|point| point.normal);
+    let up = up_direction(results.trajectory.iter(), normals);
     page.push_str(&grade_banner(&summary.grade));
     page.push_str(&cards(summary));
-    page.push_str(&states(input.record));
-    page.push_str(&map_view(input, up));
-    page.push_str(&map_section(input, up));
-    section(&mut page, "Trajectory", &trajectory_views(input, up));
+    page.push_str(&states(results.record));
+    page.push_str(&map_view(results, up));
+    page.push_str(&map_section(results, up));
+    page.push_str(&section("Trajectory", "", &trajectory_views(results, up)));
     let errors: Vec<Chart> =
-        error_over_time(input).into_iter().chain(scale_over_time(input)).collect();
-    section(&mut page, "Error", &errors);
-    page.push_str(&depth_maps(input));
-    let of_keyframes = &summary.depth.keyframe_depth;
-    section(&mut page, "Depth of the keyframes", &depth_charts(input.record, of_keyframes));
-    section(&mut page, "Joint estimation", &joint_charts(input.record));
-    page.push_str(&loop_section(input, up));
-    section(&mut page, "Time", &time_charts(input.record));
-    page.push_str(&budget(input));
+        error_over_time(results).into_iter().chain(scale_over_time(results)).collect();
+    page.push_str(&section("Error", "", &errors));
+    page.push_str(&depth_maps(results));
+    let depth = depth_charts(results.record, &summary.depth.keyframe_depth);
+    page.push_str(&section("Depth of the keyframes", "", &depth));
+    page.push_str(&section("Joint estimation", "", &joint_charts(results.record)));
+    page.push_str(&loop_section(results, up));
+    page.push_str(&section("Time", "", &time_charts(results.record)));
+    page.push_str(&budget(results));
     page.push_str(&figures(summary));
     let _ = writeln!(page, "<script>{CHART_SCRIPT}</script></main></body></html>");
     page
 }
 
-/// What a reader must know first.
+/// What a reader must know first: that a run did not come to its end, or tracked nothing.
 fn notices(summary: &Summary, ended: &EndOfRun) -> String {
-    let untracked = summary
-        .untracked
-        .as_ref()
-        .map(|why| format!("<p class=\"notice\">Nothing was tracked: {}.</p>", escaped(why)));
-    end_notice(ended) + &untracked.unwrap_or_default()
-}
-
-/// What a reader must know of a run that did not come to its end; nothing of one that did.
-fn end_notice(ended: &EndOfRun) -> String {
-    let text = match ended {
-        EndOfRun::Finished => return String::new(),
-        EndOfRun::Interrupted => "Interrupted: these are the results up to then.".to_owned(),
+    let end = match ended {
+        EndOfRun::Finished => None,
+        EndOfRun::Interrupted => Some("Interrupted: these are the results up to then.".to_owned()),
         EndOfRun::Failed(cause) => {
-            format!("Failed: {}. These are the results up to then.", escaped(cause))
+            Some(format!("Failed: {}. These are the results up to then.", escaped(cause)))
         }
-        EndOfRun::Recovered(time) => format!(
+        EndOfRun::Recovered(time) => Some(format!(
             "Recovered from the journal of a run that ended at {}: it was killed, and its last two seconds may be \
              missing.",
             utc_text(*time)
-        ),
+        )),
     };
-    format!("<p class=\"notice\">{text}</p>")
+    let untracked = summary.untracked.as_ref();
+    let untracked = untracked.map(|why| format!("Nothing was tracked: {}.", escaped(why)));
+    let notice = |text: String| format!("<p class=\"notice\">{text}</p>");
+    end.into_iter().chain(untracked).map(notice).collect()
 }
 
 /// What a deadline costs; nothing where no frame was aligned again.
-fn budget(input: &ReportInput<'_>) -> String {
-    let samples = &input.record.budget_samples;
-    let charts = budget_charts(samples, input.summary.budget_curve.as_ref());
+fn budget(results: &Results<'_>) -> String {
+    let samples = &results.record.budget_samples;
+    let intro = format!(
+        "<p>{} frames were aligned again and stopped early: mean distance in the image between the \
+         keyframe's points at that pose and at the pose without a deadline. Each curve starts at the \
+         prediction, followed by one step; 0.001 px means no difference.</p>",
+        samples.len()
+    );
+    let charts = budget_charts(samples, results.summary.budget_curve.as_ref());
+    section("Quality and budget", &intro, &charts)
+}
+
+/// Charts side by side under a heading and what `intro` says; nothing where there are none.
+fn section(heading: &str, intro: &str, charts: &[Chart]) -> String {
     if charts.is_empty() {
         return String::new();
     }
-    let mut html = format!(
-        "<section><h2>Quality and budget</h2><p>{} frames were aligned again and stopped early: mean distance in the image between the \
-         keyframe's points at that pose and at the pose without a deadline. Each curve starts at the \
-         prediction, followed by one step; 0.001 px means no difference.</p>\
-         <div class=\"charts\">",
-        samples.len()
-    );
-    for chart in &charts {
-        html.push_str(&chart_figure(chart));
-    }
-    html.push_str("</div></section>");
-    html
-}
-
-/// Charts side by side under a heading; nothing where there are none.
-fn section(page: &mut String, heading: &str, charts: &[Chart]) {
-    if charts.is_empty() {
-        return;
-    }
-    let _ = write!(page, "<section><h2>{heading}</h2><div class=\"charts\">");
-    for chart in charts {
-        page.push_str(&chart_figure(chart));
-    }
-    page.push_str("</div></section>");
+    let figures: String = charts.iter().map(chart_figure).collect();
+    format!("<section><h2>{heading}</h2>{intro}<div class=\"charts\">{figures}</div></section>")
 }
 
 /// The figures that matter most, large.
@@ -248,9 +230,9 @@ fn states(record: &RunRecord) -> String {
 }
 
 /// Depth of keyframes spread over the run, and one with its uncertainty.
-fn depth_maps(input: &ReportInput<'_>) -> String {
+fn depth_maps(results: &Results<'_>) -> String {
     let usable = |k: &&Keyframe| k.map_state == MapState::Established && !k.points.is_empty();
-    let keyframes: Vec<&Keyframe> = input.record.map.keyframes.iter().filter(usable).collect();
+    let keyframes: Vec<&Keyframe> = results.record.map.keyframes.iter().filter(usable).collect();
     if keyframes.is_empty() {
         return String::new();
     }
@@ -261,11 +243,11 @@ fn depth_maps(input: &ReportInput<'_>) -> String {
          <span class=\"scale near-far\"></span> far to near. Shown are points whose standard deviation is \
          at most {:.0} % of their inverse depth.</p><div class=\"pictures\">",
         keyframes.len(),
-        100.0 * input.max_relative_std_dev
+        100.0 * results.params.max_relative_std_dev
     );
     let pictured = |i: usize| {
         let keyframe = spread(i);
-        let (picture, range) = inverse_depth_picture(keyframe, input.max_relative_std_dev);
+        let (picture, range) = inverse_depth_picture(keyframe, results.params.max_relative_std_dev);
         let depths = match range {
             Some([far, near]) => {
                 let scale = keyframe.map_from_keyframe.scale;

@@ -6,7 +6,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::service::results::budget_curve::BudgetCurve;
 use crate::service::results::calibration::whitened_residual_median;
-use crate::service::results::depth_maps::DepthEvaluation;
 use crate::service::results::joint::JointSummary;
 use crate::service::results::loops::LoopSummary;
 use crate::service::results::output_folder::utc_text;
@@ -18,7 +17,9 @@ use crate::service::results::step_times::StepTimes;
 use crate::service::results::times::{LatencySummary, Percentiles};
 use crate::service::results::untracked::Untracked;
 use crate::slam::evaluation::TrajectoryEvaluation;
-use crate::slam::evaluation::depth_error::{DepthScale, KeyframeDepth, depth_scale_ratio};
+use crate::slam::evaluation::depth_error::{
+    DepthErrors, DepthScale, KeyframeDepth, depth_scale_ratio,
+};
 use crate::slam::evaluation::grade::{Grade, GradeInput};
 use crate::slam::evaluation::map_consistency::MapConsistency;
 use crate::slam::evaluation::normalized_error::NormalizedErrors;
@@ -72,7 +73,7 @@ pub struct TrajectorySummary {
 impl From<&TrajectoryEvaluation> for TrajectorySummary {
     fn from(evaluation: &TrajectoryEvaluation) -> Self {
         Self {
-            matched_poses: Some(evaluation.association.pairs.len() as u64),
+            matched_poses: Some(evaluation.pairs.len() as u64),
             ate_rmse_m: Some(evaluation.ate.rmse),
             ate_mean_m: Some(evaluation.ate.mean),
             ate_median_m: Some(evaluation.ate.median),
@@ -145,9 +146,9 @@ pub struct DepthSummary {
     pub keyframe_depth: Vec<KeyframeDepth>,
 }
 
-impl From<DepthEvaluation> for DepthSummary {
-    fn from(depth: DepthEvaluation) -> Self {
-        let statistics = depth.statistics;
+impl From<DepthErrors> for DepthSummary {
+    fn from(depth: DepthErrors) -> Self {
+        let statistics = depth.statistics();
         Self {
             depth_pixels: statistics.map(|of| of.compared as u64),
             depth_relative_error_median: statistics.map(|of| of.relative_error_median),
@@ -181,7 +182,8 @@ pub struct FrameCounts {
 
 impl FrameCounts {
     fn of(poses: &[RecordedPose], map: &Map) -> Self {
-        let count = |is: fn(TrackingState) -> bool| count_states(poses, is);
+        let states = || poses.iter().map(|pose| pose.estimate.state);
+        let count = |is: fn(TrackingState) -> bool| states().filter(|of| is(*of)).count() as u64;
         let later: Vec<TrackingState> = placed_later(poses, map).map(|of| of.state).collect();
         let without_pose = |is: fn(TrackingState) -> bool| {
             count(is) - later.iter().filter(|state| is(**state)).count() as u64
@@ -316,12 +318,6 @@ pub struct RejectionSummary {
     pub reason: String,
 }
 
-impl From<&Rejection> for RejectionSummary {
-    fn from(rejection: &Rejection) -> Self {
-        Self { sequence: rejection.sequence, reason: rejection.contradiction.to_string() }
-    }
-}
-
 /// 2²⁰.
 const BYTES_PER_MB: f64 = 1_048_576.0;
 
@@ -338,7 +334,7 @@ impl Summary {
         trajectory: Option<&TrajectoryEvaluation>,
         online: Option<&TrajectoryEvaluation>,
         nees: [Option<NormalizedErrors>; 3],
-        depth: DepthEvaluation,
+        depth: DepthErrors,
     ) -> Self {
         let (recorded_secs, wall_secs) = (secs(record.recorded_nanos), secs(record.wall_nanos));
         let (ended, failure, recovered_run_end) = end_in_words(&record.ended);
@@ -357,7 +353,7 @@ impl Summary {
             frames_dropped: record.frames_dropped,
             gaps: record.gaps,
             lost_count: count_losses(&record.poses),
-            map_rejections: rejections(record),
+            map_rejections: record.rejections.as_deref().map(rejections),
             whitened_residual_median: whitened_residual_median(&record.poses),
             initialization_secs: initialization_secs(&record.poses),
             untracked: Untracked::of(record).map(|why| why.to_string()),
@@ -394,6 +390,14 @@ impl Summary {
     }
 }
 
+fn rejections(all: &[Rejection]) -> Vec<RejectionSummary> {
+    let in_words = |&Rejection { sequence, contradiction }: &Rejection| RejectionSummary {
+        sequence,
+        reason: contradiction.to_string(),
+    };
+    all.iter().map(in_words).collect()
+}
+
 /// How a run ended in a word, what failed, and when a run that was recovered ended.
 fn end_in_words(ended: &EndOfRun) -> (String, Option<String>, Option<String>) {
     let (word, failure, recovered) = match ended {
@@ -403,11 +407,6 @@ fn end_in_words(ended: &EndOfRun) -> (String, Option<String>, Option<String>) {
         EndOfRun::Recovered(time) => ("recovered", None, Some(utc_text(*time))),
     };
     (word.to_owned(), failure, recovered)
-}
-
-fn rejections(record: &RunRecord) -> Option<Vec<RejectionSummary>> {
-    let all = record.rejections.as_ref()?;
-    Some(all.iter().map(RejectionSummary::from).collect())
 }
 
 /// Keyframes that have a pose alone.
@@ -443,10 +442,6 @@ fn restarts_by_process(causes: &[RestartCause]) -> BTreeMap<String, u64> {
 
 fn is_lost(state: TrackingState) -> bool {
     matches!(state, TrackingState::Lost(_))
-}
-
-fn count_states(poses: &[RecordedPose], is: fn(TrackingState) -> bool) -> u64 {
-    poses.iter().filter(|pose| is(pose.estimate.state)).count() as u64
 }
 
 /// Epochs of the poses that are written: one that was joined to another is no epoch of its own.

@@ -213,10 +213,10 @@ fn run(summary: &Summary) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::service::results::depth_maps::DepthEvaluation;
     use crate::service::results::record::RunRecord;
     use crate::service::results::summary::PointCounts;
     use crate::service::results::untracked::tests::record;
+    use crate::slam::evaluation::depth_error::DepthErrors;
     use crate::slam::geometry::intrinsics::Intrinsics;
     use crate::slam::geometry::se3::SE3;
     use crate::slam::geometry::sim3::Sim3;
@@ -236,7 +236,7 @@ mod tests {
     }
 
     fn summary(record: &RunRecord) -> Summary {
-        let (points, depth) = (PointCounts::default(), DepthEvaluation::default());
+        let (points, depth) = (PointCounts::default(), DepthErrors::default());
         Summary::new(record, points, None, None, [None; 3], depth)
     }
 

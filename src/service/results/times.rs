@@ -31,18 +31,18 @@ impl Percentiles {
     pub fn of(nanos: impl Iterator<Item = u64>) -> Option<Self> {
         let mut millis: Vec<f64> = nanos.map(|n| n as f64 * 1e-6).collect();
         millis.sort_by(f64::total_cmp);
-        let at = |share| percentile(&millis, share);
-        let (p50, p95, p99) = (at(0.5)?, at(0.95)?, at(0.99)?);
         let mean = millis.iter().sum::<f64>() / millis.len() as f64;
+        Self::at(mean, |share| percentile(&millis, share))
+    }
+
+    fn at(mean: f64, at: impl Fn(f64) -> Option<f64>) -> Option<Self> {
+        let (p50, p95, p99) = (at(0.5)?, at(0.95)?, at(0.99)?);
         Some(Self { mean, p50, p95, p99, p999: at(0.999)?, max: at(1.0)? })
     }
 
     /// Percentiles of times that were counted: right to a few per cent, the longest is where its bucket ends.
     pub fn of_counts(counts: &TimeCounts) -> Option<Self> {
-        let at = |share| percentile_ms(&counts.0, share);
-        let (p50, p95, p99) = (at(0.5)?, at(0.95)?, at(0.99)?);
-        let mean = mean_ms(&counts.0)?;
-        Some(Self { mean, p50, p95, p99, p999: at(0.999)?, max: at(1.0)? })
+        Self::at(mean_ms(&counts.0)?, |share| percentile_ms(&counts.0, share))
     }
 }
 

@@ -6,7 +6,7 @@ use crate::service::results::mapping_load::is_overloaded;
 use crate::service::results::record::RunRecord;
 use crate::slam::counted::counted;
 use crate::slam::evaluation::depth_error::DepthScale;
-use crate::slam::evaluation::statistics::percentile;
+use crate::slam::evaluation::statistics::percentiles;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::mapper::situation::StartFrame;
 use crate::slam::pose::{LostReason, TrackingState};
@@ -79,28 +79,20 @@ impl Untracked {
         if let Some(lost) = Self::lost_at_once(record, frames_in) {
             return Some(lost);
         }
-        let tally = record.start;
-        let most = [
-            (tally.dark, StartFrame::Dark),
-            (tally.overexposed, StartFrame::Overexposed),
-            (tally.textureless, StartFrame::Textureless),
-            (tally.unmatched, StartFrame::Unmatched),
-            (tally.still, StartFrame::Still),
-            (tally.turned, StartFrame::Turned),
-            (tally.little_parallax, StartFrame::LittleParallax),
-        ];
-        let (count, seen) = most.into_iter().max_by_key(|(count, _)| *count)?;
+        let all: u64 = record.start.0.values().sum();
+        let most = record.start.0.iter().max_by_key(|(_, count)| **count);
+        let (&seen, &count) = most.unwrap_or((&StartFrame::Begun, &0));
         // Between frames that are far apart nothing can be proven; darkness and a camera that stands still show
         // all the same.
         let is_far_apart =
             matches!(seen, StartFrame::Unmatched | StartFrame::Turned | StartFrame::LittleParallax);
         let slowness = slowness(record, frames_in);
-        if let Some(slowness) = slowness.filter(|_| is_far_apart || tally.sum() < FEWEST_FRAMES) {
+        if let Some(slowness) = slowness.filter(|_| is_far_apart || all < FEWEST_FRAMES) {
             return Some(Self::TooSlow(slowness));
         }
-        Some(match count {
-            _ if frames_in < FEWEST_FRAMES => Self::FewFrames(frames_in),
-            _ => Self::Seen(if count == 0 { StartFrame::Begun } else { seen }, count, tally.sum()),
+        Some(match frames_in < FEWEST_FRAMES {
+            true => Self::FewFrames(frames_in),
+            false => Self::Seen(seen, count, all),
         })
     }
 
@@ -129,10 +121,9 @@ fn slowness(record: &RunRecord, frames_in: u64) -> Option<Slowness> {
     if !is_overloaded(record.mode, skipped, frames_in) {
         return None;
     }
-    let mut times: Vec<f64> = record.map_nanos.iter().map(|&n| n as f64 * 1e-6).collect();
-    times.sort_by(f64::total_cmp);
+    let times = record.map_nanos.iter().map(|&n| n as f64 * 1e-6);
     let period_ms = record.recorded_nanos as f64 * 1e-6 / frames_in.saturating_sub(1).max(1) as f64;
-    let map_ms = percentile(&times, 0.5).unwrap_or(0.0);
+    let [map_ms] = percentiles(times, [0.5]).unwrap_or_default();
     Some(Slowness { frames_in, skipped, map_ms, period_ms })
 }
 

@@ -91,9 +91,7 @@ fn painted(
 ) -> Picture {
     let mut picture = ground.clone();
     for point in points {
-        if point.column < picture.width && point.row < picture.height {
-            picture.pixels[point.row * picture.width + point.column] = colour(point);
-        }
+        picture.paint(point.column, point.row, colour(point));
     }
     picture
 }
@@ -135,11 +133,9 @@ fn side_by_side(panels: &[Panel]) -> Picture {
 }
 
 fn draw_scale(page: &mut Picture, [left, top]: [usize; 2], colour: fn(f64) -> Rgb) {
-    for x in (0..SCALE[0]).filter(|x| left + x < page.width) {
-        for y in 0..SCALE[1] {
-            let share = x as f64 / (SCALE[0] - 1) as f64;
-            page.pixels[(top + y) * page.width + left + x] = colour(share);
-        }
+    for x in 0..SCALE[0] {
+        let colour = colour(x as f64 / (SCALE[0] - 1) as f64);
+        (0..SCALE[1]).for_each(|y| page.paint(left + x, top + y, colour));
     }
 }
 

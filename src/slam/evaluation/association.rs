@@ -2,25 +2,7 @@
 
 use crate::slam::trajectory::StampedPose;
 
-/// Pairs of poses of one instant.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub struct Association {
-    /// (index in the estimate, index in the ground truth), in order of time.
-    pub pairs: Vec<(usize, usize)>,
-}
-
-impl Association {
-    /// The matched poses of both, of the same length.
-    pub fn select(
-        &self,
-        estimate: &[StampedPose],
-        truth: &[StampedPose],
-    ) -> (Vec<StampedPose>, Vec<StampedPose>) {
-        self.pairs.iter().map(|&(e, t)| (estimate[e], truth[t])).unzip()
-    }
-}
-
-/// Matches each pose of the trajectory that has fewer poses (the estimate where both have as many)
+/// Pairs (index in the estimate, index in the ground truth) in order of time: matches each pose of the trajectory that has fewer poses (the estimate where both have as many)
 /// with the nearest of the other, where their stamps differ by at most `max_difference_nanos`; the
 /// earlier of two that are equally near. This is the rule of the package `evo`, which may take one
 /// pose of the longer trajectory twice. Both trajectories are in order of their stamps.
@@ -28,13 +10,12 @@ pub fn associate(
     estimate: &[StampedPose],
     truth: &[StampedPose],
     max_difference_nanos: i64,
-) -> Association {
-    let pairs = if estimate.len() <= truth.len() {
+) -> Vec<(usize, usize)> {
+    if estimate.len() <= truth.len() {
         matches(estimate, truth, max_difference_nanos).collect()
     } else {
         matches(truth, estimate, max_difference_nanos).map(|(t, e)| (e, t)).collect()
-    };
-    Association { pairs }
+    }
 }
 
 fn matches<'a>(
@@ -77,7 +58,6 @@ mod tests {
     /// Pairs of stamps (ground truth, estimate) as `evo` 1.38.1 gave them for the same stamps.
     fn pairs(truth: &[i64], estimate: &[i64]) -> Vec<(i64, i64)> {
         associate(&stamps(estimate), &stamps(truth), 20_000_000)
-            .pairs
             .iter()
             .map(|&(e, t)| (truth[t], estimate[e]))
             .collect()

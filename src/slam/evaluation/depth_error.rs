@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::slam::evaluation::depth_modes::DepthModes;
-use crate::slam::evaluation::statistics::median;
+use crate::slam::evaluation::statistics::{largest_over_smallest, median};
 use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::Keyframe;
 
@@ -33,27 +33,21 @@ pub struct KeyframeDepth {
 
 /// Largest over smallest map unit of the keyframes; `None` below two.
 pub fn depth_scale_ratio(keyframes: &[KeyframeDepth]) -> Option<f64> {
-    if keyframes.len() < 2 {
-        return None;
-    }
-    let units = keyframes.iter().map(|of| of.units_per_metre);
-    Some(units.clone().fold(0.0, f64::max) / units.fold(f64::INFINITY, f64::min))
+    largest_over_smallest(keyframes.iter().map(|of| of.units_per_metre))
 }
 
 /// Pixels of one or more keyframes whose true depth is known.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct DepthErrors {
-    /// What each of the keyframes has in common.
-    keyframes: Vec<KeyframeDepth>,
+    /// What each of the keyframes that were compared has in common, in their order.
+    pub keyframes: Vec<KeyframeDepth>,
     /// `|z·s − z_true| / z_true`.
     relative_error: Vec<f64>,
     /// σ/d as reported.
     relative_std_dev: Vec<f64>,
     /// |error of d| / σ.
     whitened_error: Vec<f64>,
-    /// Errors common to a keyframe, of each that has enough points.
-    modes: Vec<[f64; 3]>,
-    /// The same over their standard deviations.
+    /// Magnitudes of the errors common to a keyframe over their standard deviations, of each that has enough points.
     whitened_modes: Vec<[f64; 3]>,
     /// Points, with or without true depth.
     points: usize,
@@ -113,7 +107,6 @@ impl DepthErrors {
         });
         if let Some(modes) = modes {
             let (errors, std_devs) = (modes.magnitudes(), keyframe.mode_covariance.std_devs());
-            self.modes.push(errors);
             let whitened = std::array::from_fn(|mode| errors[mode] / std_devs[mode]);
             // A keyframe that claims no uncertainty, as one with a sensor's depth, is not judged by it.
             self.whitened_modes.extend(whitened.iter().all(|e| e.is_finite()).then_some(whitened));
@@ -124,11 +117,6 @@ impl DepthErrors {
             // In keyframe units the true inverse depth is s / z_true.
             self.whitened_error.push((d - s / z_true).abs() / sigma.max(f64::MIN_POSITIVE));
         }
-    }
-
-    /// What each keyframe that was compared has in common, in their order.
-    pub fn into_keyframes(self) -> Vec<KeyframeDepth> {
-        self.keyframes
     }
 
     /// The statistics; `None` where nothing could be compared.
@@ -142,13 +130,15 @@ impl DepthErrors {
             let inside = self.whitened_error.iter().filter(|&&e| e <= sigmas).count();
             inside as f64 / compared as f64
         };
+        let modes = self.keyframes.iter().filter_map(|of| of.modes);
+        let modes: Vec<[f64; 3]> = modes.map(|of| of.map(f64::abs)).collect();
         Some(DepthStatistics {
             compared,
             relative_error_median: median(&self.relative_error)?,
             relative_error_median_best_half: median(&best)?,
             coverage: [within(1.0), within(2.0), within(3.0)],
             density: self.points as f64 / self.pixels as f64,
-            modes: medians(&self.modes),
+            modes: medians(&modes),
             whitened_modes: medians(&self.whitened_modes),
         })
     }
@@ -220,7 +210,7 @@ mod tests {
             assert!(s.relative_error_median_best_half < 1e-9);
             assert_eq!(s.coverage, [0.6, 0.8, 1.0]);
             assert!((s.density - 6.0 / 400.0).abs() < 1e-12);
-            let [of] = errors.into_keyframes()[..] else { panic!("one keyframe") };
+            let [of] = errors.keyframes[..] else { panic!("one keyframe") };
             assert!((of.units_per_metre - 1.0).abs() < 1e-9 && of.modes.is_none(), "{of:?}");
         }
         let mut errors = DepthErrors::default();
@@ -235,7 +225,7 @@ mod tests {
         for unit in [2.0, 2.2, 1.6] {
             errors.add(&keyframe(vec![point(0, 0.5, 0.01)], unit), &truth, DepthScale::MedianRatio);
         }
-        let keyframes = errors.into_keyframes();
+        let keyframes = errors.keyframes;
         assert!((depth_scale_ratio(&keyframes).unwrap() - 2.2 / 1.6).abs() < 1e-9);
         assert!((keyframes[1].units_per_metre - 1.1).abs() < 1e-9);
         assert_eq!(depth_scale_ratio(&keyframes[..1]), None);

@@ -148,10 +148,10 @@ mod tests {
         assert!((total.ate.rmse - (squares / 220.0).sqrt()).abs() < 1e-12);
         assert!(total.ate.max < 2e-3 && total.rpe_translation.max < 5e-3, "{total:?}");
         assert_eq!(total.path_length, first.path_length + second.path_length);
-        assert_eq!(total.association.pairs.len(), 220);
+        assert_eq!(total.pairs.len(), 220);
         assert!((total.window_error.unwrap() - first.window_error.unwrap()).abs() < 1e-3);
         // Its matches are those of the placed poses.
-        for (&(e, t), error) in total.association.pairs.iter().zip(&total.absolute) {
+        for (&(e, t), error) in total.pairs.iter().zip(&total.absolute) {
             let placed = result.placed[e].pose.world_from_camera.translation;
             let truth = path(0..300, true)[t].world_from_camera.translation;
             assert!(((placed - truth).norm() - error).abs() < 1e-9);

@@ -1,13 +1,13 @@
 //! What the figures of a trajectory are made of: the errors of the poses that were aligned together, or of several epochs,
 //! each aligned by itself.
 
-use crate::slam::evaluation::association::{Association, associate};
-use crate::slam::evaluation::statistics::{ErrorStatistics, median};
+use crate::slam::evaluation::association::associate;
+use crate::slam::evaluation::statistics::{ErrorStatistics, largest_over_smallest, median};
 use crate::slam::evaluation::trajectory_error::{
-    RelativeErrors, absolute_errors, path_length, relative_errors, successive_pairs, timed_pairs,
+    RelativeErrors, absolute_errors, path_length, relative_errors, timed_pairs,
 };
 use crate::slam::evaluation::umeyama::{AlignmentError, TrajectoryAlignment, umeyama};
-use crate::slam::evaluation::windows::{scale_ratio, scale_windows, shape_errors};
+use crate::slam::evaluation::windows::{scale_windows, shape_errors};
 use crate::slam::evaluation::{EvaluationError, TrajectoryEvaluation};
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::trajectory::StampedPose;
@@ -18,7 +18,8 @@ const INTERVAL_NANOS: i64 = 1_000_000_000;
 /// Matches and the errors at them.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Measured {
-    association: Association,
+    /// (index in the estimate, index in the ground truth)
+    pairs: Vec<(usize, usize)>,
     absolute: Vec<f64>,
     frames: RelativeErrors,
     seconds: RelativeErrors,
@@ -35,30 +36,32 @@ impl Measured {
         alignment: TrajectoryAlignment,
         max_difference_nanos: i64,
     ) -> Result<(Self, Sim3), EvaluationError> {
-        let association = associate(estimate, truth, max_difference_nanos);
+        let pairs = associate(estimate, truth, max_difference_nanos);
         let needed = alignment.poses_needed().max(2);
-        if association.pairs.len() < needed {
+        if pairs.len() < needed {
             return Err(EvaluationError::TooFewMatches {
-                found: association.pairs.len(),
+                found: pairs.len(),
                 estimated: estimate.len(),
                 needed,
                 max_difference_secs: max_difference_nanos as f64 * 1e-9,
             });
         }
-        let (estimated, true_poses) = association.select(estimate, truth);
+        let (estimated, true_poses): (Vec<_>, Vec<_>) =
+            pairs.iter().map(|&(e, t)| (estimate[e], truth[t])).unzip();
         let truth_from_estimate = umeyama(&estimated, &true_poses, alignment)?;
         let relative = |pairs: &[(usize, usize)]| {
             relative_errors(&estimated, &true_poses, pairs, truth_from_estimate.scale)
         };
+        let successive: Vec<_> = (1..estimated.len()).map(|j| (j - 1, j)).collect();
         let second_pairs = timed_pairs(&estimated, INTERVAL_NANOS, max_difference_nanos);
         let measured = Self {
             absolute: absolute_errors(&estimated, &true_poses, &truth_from_estimate),
-            frames: relative(&successive_pairs(&estimated)),
+            frames: relative(&successive),
             seconds: relative(&second_pairs),
             path_length: path_length(&true_poses),
             window_scales: scale_windows(&estimated, &true_poses),
             shape: shape_errors(&estimated, &true_poses, alignment),
-            association,
+            pairs,
         };
         Ok((measured, truth_from_estimate))
     }
@@ -67,8 +70,7 @@ impl Measured {
     /// epoch, as units of epochs have nothing to do with each other.
     pub(super) fn append(&mut self, epoch: &Self, scale: f64, poses: usize) {
         let matches = self.absolute.len();
-        let pairs = epoch.association.pairs.iter().map(|&(e, t)| (e + poses, t));
-        self.association.pairs.extend(pairs);
+        self.pairs.extend(epoch.pairs.iter().map(|&(e, t)| (e + poses, t)));
         self.absolute.extend(&epoch.absolute);
         self.frames.append(&epoch.frames);
         self.seconds.append(&epoch.seconds);
@@ -83,20 +85,19 @@ impl Measured {
         self,
         alignment: Sim3,
     ) -> Result<TrajectoryEvaluation, EvaluationError> {
-        let unusable = AlignmentError::NotFinite;
+        let of = |errors| ErrorStatistics::of(errors).ok_or(AlignmentError::NotFinite);
         Ok(TrajectoryEvaluation {
-            ate: ErrorStatistics::of(&self.absolute).ok_or(unusable.clone())?,
-            rpe_translation: ErrorStatistics::of(&self.frames.translation)
-                .ok_or(unusable.clone())?,
-            rpe_rotation_deg: ErrorStatistics::of(&self.frames.rotation_deg).ok_or(unusable)?,
+            ate: of(&self.absolute)?,
+            rpe_translation: of(&self.frames.translation)?,
+            rpe_rotation_deg: of(&self.frames.rotation_deg)?,
             rpe_translation_1s: ErrorStatistics::of(&self.seconds.translation),
             rpe_rotation_deg_1s: ErrorStatistics::of(&self.seconds.rotation_deg),
             path_length: self.path_length,
-            window_scale_ratio: scale_ratio(&self.window_scales),
+            window_scale_ratio: largest_over_smallest(self.window_scales.iter().map(|of| of.1)),
             window_scales: self.window_scales,
             window_error: median(&self.shape),
             alignment,
-            association: self.association,
+            pairs: self.pairs,
             absolute: self.absolute,
         })
     }

@@ -52,6 +52,27 @@ pub fn percentile(sorted: &[f64], share: f64) -> Option<f64> {
     sorted.get(rank.max(1) - 1).copied()
 }
 
+/// The [`percentile`] of each of `shares`; `values` are in any order.
+pub fn percentiles<const N: usize>(
+    values: impl IntoIterator<Item = f64>,
+    shares: [f64; N],
+) -> Option<[f64; N]> {
+    let mut sorted: Vec<f64> = values.into_iter().collect();
+    sorted.sort_by(f64::total_cmp);
+    let mut found = shares;
+    for share in &mut found {
+        *share = percentile(&sorted, *share)?;
+    }
+    Some(found)
+}
+
+/// Largest over smallest of positive values; `None` below two.
+pub fn largest_over_smallest(values: impl Iterator<Item = f64> + Clone) -> Option<f64> {
+    let largest = values.clone().fold(0.0, f64::max);
+    let smallest = values.clone().fold(f64::INFINITY, f64::min);
+    (values.count() > 1).then(|| largest / smallest)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

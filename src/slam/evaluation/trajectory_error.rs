@@ -35,11 +35,6 @@ pub fn absolute_errors(
     estimate.iter().zip(truth).map(error).collect()
 }
 
-/// Pairs (i, i + 1).
-pub fn successive_pairs(poses: &[StampedPose]) -> Vec<(usize, usize)> {
-    (1..poses.len()).map(|j| (j - 1, j)).collect()
-}
-
 /// Pairs (i, j) with j the pose nearest to `interval_nanos` after i, where it is at most
 /// `max_difference_nanos` off.
 pub fn timed_pairs(

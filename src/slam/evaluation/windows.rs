@@ -30,15 +30,6 @@ pub fn scale_windows(estimate: &[StampedPose], truth: &[StampedPose]) -> Vec<(us
     starts(estimate.len(), SCALE_WINDOW).filter_map(scale).collect()
 }
 
-/// Largest over smallest scale; `None` below two windows.
-pub fn scale_ratio(window_scales: &[(usize, f64)]) -> Option<f64> {
-    if window_scales.len() < 2 {
-        return None;
-    }
-    let scales = window_scales.iter().map(|&(_, scale)| scale);
-    Some(scales.clone().fold(0.0, f64::max) / scales.fold(f64::INFINITY, f64::min))
-}
-
 /// Position errors in windows of [`SHAPE_WINDOW`] matches up to the last one, each window aligned by itself and each
 /// match counted once; windows that cannot be aligned are left out.
 pub fn shape_errors(
@@ -64,7 +55,12 @@ pub fn shape_errors(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::slam::evaluation::statistics::largest_over_smallest;
     use crate::slam::geometry::se3::SE3;
+
+    fn ratio_of(window_scales: &[(usize, f64)]) -> Option<f64> {
+        largest_over_smallest(window_scales.iter().map(|&(_, scale)| scale))
+    }
 
     /// A walk on a spiral, `scaled` from match to match.
     fn walk(count: usize, scaled: impl Fn(usize) -> f64) -> (Vec<StampedPose>, Vec<StampedPose>) {
@@ -85,11 +81,11 @@ mod tests {
         assert_eq!(starts(99, 100).count(), 0);
         // The scale doubles in the last 50 of 250 matches: whole windows alone say 1.
         let (estimate, truth) = walk(250, |i| if i < 200 { 1.0 } else { 2.0 });
-        let ratio = scale_ratio(&scale_windows(&estimate, &truth)).unwrap();
+        let ratio = ratio_of(&scale_windows(&estimate, &truth)).unwrap();
         assert!(ratio > 1.2, "{ratio}");
         // Two windows need more matches than one.
         let (estimate, truth) = walk(100, |_| 1.0);
-        assert_eq!(scale_ratio(&scale_windows(&estimate, &truth)), None);
+        assert_eq!(ratio_of(&scale_windows(&estimate, &truth)), None);
     }
 
     #[test]

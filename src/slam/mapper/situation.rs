@@ -100,7 +100,7 @@ impl fmt::Display for Situation {
 }
 
 /// What one frame came to while there is no map: why none began on it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum StartFrame {
     /// It is the first frame of a start, or ended one.
     Begun,

@@ -1,20 +1,18 @@
 //! Who subscribes to a topic that has no place left for another.
 
-use std::fmt::Debug;
-
 use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::node::{NodeState, NodeView};
-use iceoryx2::prelude::{CallbackProgression, PortFactory as _, ZeroCopySend, ipc};
+use iceoryx2::prelude::{CallbackProgression, PortFactory as _, ipc};
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 
 use crate::wire::open_error::OpenError;
+use crate::wire::port::Part;
 
 /// The error of a subscriber that came when the topic `name` had all that it may have.
-pub(super) fn too_many<T, H>(name: &str, service: &PortFactory<ipc::Service, [T], H>) -> OpenError
-where
-    T: Debug + ZeroCopySend + 'static,
-    H: Debug + ZeroCopySend + 'static,
-{
+pub(super) fn too_many<T: Part, H: Part>(
+    name: &str,
+    service: &PortFactory<ipc::Service, [T], H>,
+) -> OpenError {
     let mut holders = Vec::new();
     service.dynamic_config().list_subscribers(|subscriber| {
         holders.push(subscriber.node_id);

@@ -44,6 +44,18 @@ pub struct Chart {
 }
 
 impl Chart {
+    /// A low chart of what changes over the run.
+    pub fn over_time(
+        title: &'static str,
+        meaning: &'static str,
+        y_label: &str,
+        scaling: Scaling,
+        series: Vec<Series>,
+    ) -> Self {
+        let (x_label, y_label) = ("time [s]".into(), y_label.into());
+        Self { title, meaning, x_label, y_label, height: 230.0, scaling, series }
+    }
+
     /// The chart as an `<svg>` element. Its text takes the page's colour.
     pub fn svg(&self) -> String {
         let frame = self.frame();

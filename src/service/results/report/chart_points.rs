@@ -4,6 +4,7 @@ use std::fmt::Write;
 
 use crate::service::results::report::axis::Range;
 use crate::service::results::report::chart_frame::Frame;
+use crate::service::results::report::number_text::without_zeros;
 use crate::service::results::report::series::{Mark, Series};
 
 /// Most points that a path keeps.
@@ -81,9 +82,5 @@ pub(super) fn number(value: f64, axis: Range) -> String {
     if !(-MOST_DECIMALS..=MOST_DECIMALS).contains(&decimals) {
         return format!("{value:e}");
     }
-    let text = format!("{value:.*}", decimals.max(0.0) as usize);
-    match text.contains('.') {
-        true => text.trim_end_matches('0').trim_end_matches('.').to_owned(),
-        false => text,
-    }
+    without_zeros(&format!("{value:.*}", decimals.max(0.0) as usize)).to_owned()
 }

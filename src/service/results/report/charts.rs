@@ -2,16 +2,15 @@
 
 use nalgebra::Vector3;
 
+use crate::service::results::Results;
 use crate::service::results::poses::longest_epoch;
 use crate::service::results::record::RunRecord;
-use crate::service::results::report::axis::Range;
 use crate::service::results::report::chart::{Chart, Scaling};
-use crate::service::results::report::input::ReportInput;
 use crate::service::results::report::series::{Mark, Series};
 use crate::service::results::report::views::Views;
 use crate::slam::evaluation::TrajectoryEvaluation;
 use crate::slam::evaluation::depth_error::DepthScale;
-use crate::slam::evaluation::statistics::percentile;
+use crate::slam::evaluation::statistics::percentiles;
 use crate::slam::evaluation::windows::SCALE_WINDOW;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::Keyframe;
@@ -38,19 +37,19 @@ pub fn secs(record: &RunRecord, nanos: i64) -> f64 {
 }
 
 /// The trajectory from above and from the side, in the ground truth's frame where there is one. `up` is in the map's.
-pub fn trajectory_views(input: &ReportInput<'_>, up: Option<Vector3<f64>>) -> [Chart; 2] {
-    let truth: Vec<StampedPose> = truth_in_time(input);
-    let (alignment, unit) = match input.evaluation {
+pub fn trajectory_views(results: &Results<'_>, up: Option<Vector3<f64>>) -> [Chart; 2] {
+    let truth: Vec<StampedPose> = truth_in_time(results);
+    let (alignment, unit) = match &results.evaluation {
         Some(evaluation) => (evaluation.alignment, "m"),
-        None if input.record.depth_scale == DepthScale::Given => (Sim3::identity(), "m"),
+        None if results.record.depth_scale == DepthScale::Given => (Sim3::identity(), "m"),
         None => (Sim3::identity(), "map units"),
     };
     let views = match up {
-        Some(up) => Views::of(input.trajectory, Some(up)).turned(&alignment.rigid.rotation),
-        None => Views::of(if truth.is_empty() { input.trajectory } else { &truth }, None),
+        Some(up) => Views::of(&results.trajectory, Some(up)).turned(&alignment.rigid.rotation),
+        None => Views::of(if truth.is_empty() { &results.trajectory } else { &truth }, None),
     };
-    let keyframes = keyframe_poses(input.record);
-    trajectory_charts(input.trajectory, &truth, &alignment, unit, &keyframes, &views)
+    let keyframes = keyframe_poses(results.record);
+    trajectory_charts(&results.trajectory, &truth, &alignment, unit, &keyframes, &views)
 }
 
 /// From above and from the side, as `views` of the truth's frame has it: `truth`, and `estimate` and `keyframes` brought
@@ -74,24 +73,9 @@ pub fn trajectory_charts(
             poses.iter().map(|pose| project(&pose.world_from_camera.translation)).collect()
         };
         let series = [
-            Series {
-                name: "ground truth",
-                colour: TRUTH,
-                mark: Mark::DashedPath,
-                points: points(truth),
-            },
-            Series {
-                name: "estimate",
-                colour: ESTIMATE,
-                mark: Mark::Path,
-                points: points(&estimate),
-            },
-            Series {
-                name: "keyframes",
-                colour: ESTIMATE,
-                mark: Mark::Dots(2.6),
-                points: points(&keyframes),
-            },
+            Series::new("ground truth", TRUTH, Mark::DashedPath, points(truth)),
+            Series::new("estimate", ESTIMATE, Mark::Path, points(&estimate)),
+            Series::new("keyframes", ESTIMATE, Mark::Dots(2.6), points(&keyframes)),
         ];
         Chart {
             title,
@@ -110,14 +94,14 @@ pub fn trajectory_charts(
 }
 
 /// True poses during the run.
-fn truth_in_time(input: &ReportInput<'_>) -> Vec<StampedPose> {
-    if input.evaluation.is_none() {
+fn truth_in_time(results: &Results<'_>) -> Vec<StampedPose> {
+    if results.evaluation.is_none() {
         return Vec::new();
     }
-    let poses = &input.record.poses;
+    let poses = &results.record.poses;
     let (Some(first), Some(last)) = (poses.first(), poses.last()) else { return Vec::new() };
     let time = first.estimate.capture_nanos..=last.estimate.capture_nanos;
-    input.record.ground_truth.iter().filter(|pose| time.contains(&pose.nanos)).copied().collect()
+    results.record.ground_truth.iter().filter(|pose| time.contains(&pose.nanos)).copied().collect()
 }
 
 /// Poses of the keyframes of the longest epoch: each epoch has a place and a unit of its own.
@@ -132,20 +116,16 @@ pub(super) fn keyframe_poses(record: &RunRecord) -> Vec<StampedPose> {
 }
 
 /// Position error over time, final and as published; `None` without ground truth.
-pub fn error_over_time(input: &ReportInput<'_>) -> Option<Chart> {
-    let evaluation = input.evaluation?;
-    let series = |name, colour, poses: &[StampedPose], evaluation: &TrajectoryEvaluation| Series {
-        name,
-        colour,
-        mark: Mark::Line,
-        points: error_points(poses, evaluation, |nanos| secs(input.record, nanos)),
+pub fn error_over_time(results: &Results<'_>) -> Option<Chart> {
+    let evaluation = results.evaluation.as_ref()?;
+    let series = |name, colour, poses: &[StampedPose], evaluation: &TrajectoryEvaluation| {
+        let points = error_points(poses, evaluation, |nanos| secs(results.record, nanos));
+        Series::new(name, colour, Mark::Line, points)
     };
-    let mut all = Vec::new();
-    if let Some(online) = input.online_evaluation {
-        all.push(series("as published", ONLINE, input.online, online));
-    }
-    all.push(series("final", ERROR, input.trajectory, evaluation));
-    Some(error_chart(all))
+    let online = results.online_evaluation.as_ref();
+    let online = online.map(|of| series("as published", ONLINE, &results.online, of));
+    let last = series("final", ERROR, &results.trajectory, evaluation);
+    Some(error_chart(online.into_iter().chain([last]).collect()))
 }
 
 /// Time and position error of each match.
@@ -154,37 +134,27 @@ pub fn error_points(
     evaluation: &TrajectoryEvaluation,
     secs: impl Fn(i64) -> f64,
 ) -> Vec<[f64; 2]> {
-    let pairs = evaluation.association.pairs.iter().zip(&evaluation.absolute);
+    let pairs = evaluation.pairs.iter().zip(&evaluation.absolute);
     pairs.map(|(&(e, _), &error)| [secs(poses[e].nanos), error]).collect()
 }
 
 /// Position errors over time.
 pub fn error_chart(series: Vec<Series>) -> Chart {
-    Chart {
-        title: "Position error",
-        meaning: "Distance of each frame from the ground truth after alignment: final poses and those published during \
-                  the run. Low and level is good; a step is a place where the map is bent or its scale changes.",
-        x_label: "time [s]".into(),
-        y_label: "error after alignment [m]".into(),
-        height: 280.0,
-        scaling: Scaling::FromZero,
-        series,
-    }
-}
-
-/// One line of errors.
-pub fn error_series(points: Vec<[f64; 2]>) -> Series {
-    Series { name: "error", colour: ERROR, mark: Mark::Line, points }
+    const MEANING: &str = "Distance of each frame from the ground truth after alignment: final poses and those published during \
+         the run. Low and level is good; a step is a place where the map is bent or its scale changes.";
+    let y_label = "error after alignment [m]";
+    let chart = Chart::over_time("Position error", MEANING, y_label, Scaling::FromZero, series);
+    Chart { height: 280.0, ..chart }
 }
 
 /// Scale of windows of 100 frames over that of the whole; `None` below two windows.
-pub fn scale_over_time(input: &ReportInput<'_>) -> Option<Chart> {
-    let evaluation = input.evaluation?;
+pub fn scale_over_time(results: &Results<'_>) -> Option<Chart> {
+    let evaluation = results.evaluation.as_ref()?;
     if evaluation.window_scales.len() < 2 {
         return None;
     }
-    let pairs = &evaluation.association.pairs;
-    let time = |i: usize| pairs.get(i).map(|p| secs(input.record, input.trajectory[p.0].nanos));
+    let pairs = &evaluation.pairs;
+    let time = |i: usize| pairs.get(i).map(|p| secs(results.record, results.trajectory[p.0].nanos));
     // The last window may have matches in common with the one before.
     let mut drawn = 0;
     let points: Vec<[f64; 2]> = evaluation
@@ -198,16 +168,12 @@ pub fn scale_over_time(input: &ReportInput<'_>) -> Option<Chart> {
         })
         .filter_map(|(i, ratio)| time(i).map(|t| [t, ratio]))
         .collect();
-    Some(Chart {
-        title: "Scale of 100-frame windows",
-        meaning: "Length of the estimated path over that of the ground truth, window by window. 1 everywhere means \
-                  that the scale does not drift.",
-        x_label: "time [s]".into(),
-        y_label: "scale / overall scale".into(),
-        height: 280.0,
-        scaling: Scaling::Free,
-        series: vec![Series { name: "", colour: MAPPING, mark: Mark::Path, points }],
-    })
+    const MEANING: &str = "Length of the estimated path over that of the ground truth, window by window. 1 everywhere means \
+         that the scale does not drift.";
+    let (title, y_label) = ("Scale of 100-frame windows", "scale / overall scale");
+    let series = vec![Series::new("", MAPPING, Mark::Path, points)];
+    let chart = Chart::over_time(title, MEANING, y_label, Scaling::Free, series);
+    Some(Chart { height: 280.0, ..chart })
 }
 
 /// Times of tracker and mapper over the run, and how often each occurs.
@@ -237,7 +203,10 @@ pub fn time_charts(record: &RunRecord) -> Vec<Chart> {
         [(&TRACKING, track, None), (&MAPPING_STEPS, map, None), (&LATENCY, latency, deadline)]
     {
         if !samples.is_empty() {
-            charts.push(time_chart(times, samples.clone()));
+            let line = vec![Series::new("", times.colour, Mark::Line, samples.clone())];
+            let (title, meaning) = (times.over_run, times.meaning);
+            let y_label = "duration [ms]";
+            charts.push(Chart::over_time(title, meaning, y_label, Scaling::FromZero, line));
             charts.push(histogram(times, &samples, limit));
         }
     }
@@ -279,48 +248,24 @@ const ABOVE_MEANING: &str = "Path of the camera; keyframes are the frames that c
 const SIDE_MEANING: &str = "The same from the side, one length along both axes: how the camera rose and fell. Up is \
                             estimated from how it was held and from horizontal surfaces.";
 
-fn time_chart(times: &Times, points: Vec<[f64; 2]>) -> Chart {
-    let colour = times.colour;
-    Chart {
-        title: times.over_run,
-        meaning: times.meaning,
-        x_label: "time [s]".into(),
-        y_label: "duration [ms]".into(),
-        height: 230.0,
-        scaling: Scaling::FromZero,
-        series: vec![Series { name: "", colour, mark: Mark::Line, points }],
-    }
-}
-
 /// How many frames took how long. The range ends at the 99th percentile and a half more; what is
 /// beyond is counted in the last bar.
 fn histogram(times: &Times, samples: &[[f64; 2]], limit: Option<f64>) -> Chart {
-    let colour = times.colour;
-    let mut sorted: Vec<f64> = samples.iter().map(|sample| sample[1]).collect();
-    sorted.sort_by(f64::total_cmp);
-    let p99 = percentile(&sorted, 0.99).unwrap_or(0.0);
-    let end = Range::around([1.5 * p99.max(limit.unwrap_or(0.0))].into_iter()).begun_at_zero().high;
-    let end = end.min(1.5 * p99.max(limit.unwrap_or(0.0)).max(1e-3));
+    let durations = samples.iter().map(|sample| sample[1]);
+    let [p95, p99] = percentiles(durations.clone(), [0.95, 0.99]).unwrap_or_default();
+    let end = 1.5 * p99.max(limit.unwrap_or(0.0)).max(1e-3);
     let width = end / BARS as f64;
     let mut counts = [0u32; BARS];
-    for &time in &sorted {
+    for time in durations {
         counts[((time / width) as usize).min(BARS - 1)] += 1;
     }
     let bars = counts.iter().enumerate().map(|(i, &n)| [i as f64 * width, f64::from(n)]);
-    let mut series =
-        vec![Series { name: "", colour, mark: Mark::Bars(width * 0.9), points: bars.collect() }];
-    if let Some(p) = percentile(&sorted, 0.95) {
-        series.push(Series {
-            name: "p95",
-            colour: ERROR,
-            mark: Mark::Rule,
-            points: vec![[p, 0.0]],
-        });
-    }
-    if let Some(limit) = limit {
-        let points = vec![[limit, 0.0]];
-        series.push(Series { name: "deadline", colour: TRUTH, mark: Mark::Rule, points });
-    }
+    let mut series = vec![
+        Series::new("", times.colour, Mark::Bars(width * 0.9), bars.collect()),
+        Series::new("p95", ERROR, Mark::Rule, vec![[p95, 0.0]]),
+    ];
+    let rule = |limit| Series::new("deadline", TRUTH, Mark::Rule, vec![[limit, 0.0]]);
+    series.extend(limit.map(rule));
     Chart {
         title: times.distribution,
         meaning: "How many frames took how long; 95 % of them are left of p95. The last bar also has all longer ones.",

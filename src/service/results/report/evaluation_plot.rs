@@ -4,8 +4,9 @@ use nalgebra::Vector3;
 
 use crate::service::results::report::chart::{Chart, svg_file};
 use crate::service::results::report::charts::{
-    error_chart, error_points, error_series, trajectory_charts,
+    ERROR, error_chart, error_points, trajectory_charts,
 };
+use crate::service::results::report::series::{Mark, Series};
 use crate::service::results::report::views::Views;
 use crate::slam::evaluation::epochs::EpochsEvaluation;
 use crate::slam::geometry::se3::SE3;
@@ -22,8 +23,9 @@ pub fn evaluation_plot(evaluation: &EpochsEvaluation, truth: &[StampedPose]) -> 
     let secs = |nanos: i64| nanos.saturating_sub(first) as f64 * 1e-9;
     let epoch_of = |pair: &(usize, usize)| evaluation.placed[pair.0].epoch;
     let points = error_points(&placed, &evaluation.total, secs);
-    let epochs = evaluation.total.association.pairs.iter().map(epoch_of);
-    let errors = error_series(with_gaps(epochs, &points, [f64::NAN; 2]));
+    let epochs = evaluation.total.pairs.iter().map(epoch_of);
+    let errors = with_gaps(epochs, &points, [f64::NAN; 2]);
+    let errors = Series::new("error", ERROR, Mark::Line, errors);
     let views = Views::of(if truth.is_empty() { &placed } else { &truth }, None);
     // What has no place in a chart breaks its line.
     let translation = Vector3::repeat(f64::NAN);
@@ -51,7 +53,7 @@ fn with_gaps<T: Copy>(epochs: impl Iterator<Item = u32>, points: &[T], gap: T) -
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::service::results::report::charts::{ERROR, ESTIMATE};
+    use crate::service::results::report::charts::ESTIMATE;
     use crate::slam::evaluation::MAX_DIFFERENCE_NANOS;
     use crate::slam::evaluation::epochs::evaluate_epochs;
     use crate::slam::evaluation::umeyama::TrajectoryAlignment;

@@ -194,10 +194,10 @@ fn all_words() -> impl Iterator<Item = &'static Words> {
 mod tests {
     use super::*;
     use crate::service::results::alignment_levels::LevelSummary;
-    use crate::service::results::depth_maps::DepthEvaluation;
     use crate::service::results::summary::{PointCounts, RejectionSummary};
     use crate::service::results::times::{Histogram, Percentiles};
     use crate::service::results::untracked::tests::record;
+    use crate::slam::evaluation::depth_error::DepthErrors;
     use crate::slam::pose::TrackingState;
     use serde_json::json;
 
@@ -205,7 +205,7 @@ mod tests {
     fn summary() -> Value {
         let counts = PointCounts { points: 0, map_points: 0, fusion_secs: 0.0 };
         let record = record(0, 0, TrackingState::Initializing);
-        let depth = DepthEvaluation::default();
+        let depth = DepthErrors::default();
         let summary = Summary::new(&record, counts, None, None, [None, None, None], depth);
         serde_json::to_value(summary).unwrap()
     }

@@ -30,14 +30,9 @@ pub fn joint_charts(record: &RunRecord) -> Vec<Chart> {
         });
         timed.collect()
     };
-    let chart = |title, meaning, y_label: &str, colour, points: Vec<[f64; 2]>| Chart {
-        title,
-        meaning,
-        x_label: "time [s]".into(),
-        y_label: y_label.into(),
-        height: 230.0,
-        scaling: Scaling::FromZero,
-        series: vec![Series { name: "", colour, mark: Mark::Line, points }],
+    let chart = |title, meaning, y_label, colour, points| {
+        let line = vec![Series::new("", colour, Mark::Line, points)];
+        Chart::over_time(title, meaning, y_label, Scaling::FromZero, line)
     };
     let residual = points(|estimate| estimate.adjustment.rms_grey);
     if residual.is_empty() {
@@ -75,16 +70,7 @@ pub fn depth_charts(record: &RunRecord, keyframes: &[KeyframeDepth]) -> Vec<Char
     };
     let units: Vec<f64> = keyframes.iter().map(|of| of.units_per_metre).collect();
     let Some(middle) = median(&units).filter(|_| units.len() > 1) else { return Vec::new() };
-    let chart = |title, meaning, y_label: &str, series| Chart {
-        title,
-        meaning,
-        x_label: "time [s]".into(),
-        y_label: y_label.into(),
-        height: 230.0,
-        scaling: Scaling::Free,
-        series,
-    };
-    let series = |name, colour, points| Series { name, colour, mark: Mark::Dots(2.6), points };
+    let series = |name, colour, points| Series::new(name, colour, Mark::Dots(2.6), points);
     let unit = points(&|of| Some(of.units_per_metre / middle));
     let mode = |which: usize| points(&|of| of.modes.map(|modes| modes[which]));
     let modes = vec![
@@ -92,15 +78,17 @@ pub fn depth_charts(record: &RunRecord, keyframes: &[KeyframeDepth]) -> Vec<Char
         series("along rows", ONLINE, mode(1)),
         series("relief", ERROR, mode(2)),
     ];
-    let mut charts = vec![chart(
+    let mut charts = vec![Chart::over_time(
         "Unit of the keyframes' depth",
         "Length of a true metre in each keyframe's depth, over the median of all. 1 everywhere means that the scale does \
          not drift.",
         "map units in a metre / their median",
+        Scaling::Free,
         vec![series("", MAPPING, unit)],
     )];
     if modes.iter().any(|of| !of.points.is_empty()) {
-        charts.push(chart("Common errors of depth", MODES_MEANING, "for each unit", modes));
+        let (title, y_label) = ("Common errors of depth", "for each unit");
+        charts.push(Chart::over_time(title, MODES_MEANING, y_label, Scaling::Free, modes));
     }
     charts
 }

@@ -6,6 +6,7 @@ use std::fmt::Write;
 use nalgebra::Vector3;
 
 use crate::service::adjustments::SearchRecord;
+use crate::service::results::Results;
 use crate::service::results::poses::longest_epoch;
 use crate::service::results::record::RunRecord;
 use crate::service::results::report::chart::{Chart, Scaling};
@@ -14,7 +15,6 @@ use crate::service::results::report::charts::{
     ERROR, ESTIMATE, MAPPING, ONLINE, TRUTH, keyframe_poses,
 };
 use crate::service::results::report::html::escaped;
-use crate::service::results::report::input::ReportInput;
 use crate::service::results::report::series::{Mark, Series};
 use crate::service::results::report::views::Views;
 use crate::service::results::summary_text::loops_text;
@@ -29,9 +29,9 @@ const REFUSED_RADIUS: f64 = 2.5;
 const MOST_LINKS: usize = 1000;
 
 /// Figures, why places were refused, and a view of the map from above; nothing where no loop was looked for.
-pub fn loop_section(input: &ReportInput<'_>, up: Option<Vector3<f64>>) -> String {
-    let Some(figures) = loops_text(&input.summary.loops) else { return String::new() };
-    let searches = input.record.searches.as_deref().unwrap_or_default();
+pub fn loop_section(results: &Results<'_>, up: Option<Vector3<f64>>) -> String {
+    let Some(figures) = loops_text(&results.summary.loops) else { return String::new() };
+    let searches = results.record.searches.as_deref().unwrap_or_default();
     let mut section = format!("<section><h2>Loops</h2><p>{}</p>", escaped(&figures));
     let reasons = reasons(searches);
     if !reasons.is_empty() {
@@ -45,7 +45,7 @@ pub fn loop_section(input: &ReportInput<'_>, up: Option<Vector3<f64>>) -> String
             listed.join("; ")
         );
     }
-    let chart = seen_from_above(input.record, searches, up);
+    let chart = seen_from_above(results.record, searches, up);
     let _ = write!(section, "<div class=\"charts\">{}</div></section>", chart_figure(&chart));
     section
 }
@@ -118,12 +118,7 @@ type IsFate = fn(&SearchFate) -> bool;
 
 /// Where searches ended how: `of` gives the places of those with such a fate.
 fn place_series(of: &dyn Fn(IsFate) -> Vec<[f64; 2]>) -> [Series; 4] {
-    let dots = |name, colour, radius, is| Series {
-        name,
-        colour,
-        mark: Mark::Dots(radius),
-        points: of(is),
-    };
+    let dots = |name, colour, radius, is| Series::new(name, colour, Mark::Dots(radius), of(is));
     let is_other = |fate: &SearchFate| {
         matches!(fate, SearchFate::Refused(_) | SearchFate::Unconfirmed | SearchFate::Inconsistent)
     };

@@ -2,14 +2,14 @@
 
 use nalgebra::Vector3;
 
+use crate::service::results::Results;
 use crate::service::results::colour::{Picture, Rgb, rainbow};
 use crate::service::results::report::axis::round_step;
 use crate::service::results::report::html::png_address;
-use crate::service::results::report::input::ReportInput;
-use crate::service::results::report::number_text::grouped;
+use crate::service::results::report::number_text::{grouped, without_zeros};
 use crate::service::results::report::views::Views;
 use crate::slam::evaluation::depth_error::DepthScale;
-use crate::slam::evaluation::statistics::percentile;
+use crate::slam::evaluation::statistics::percentiles;
 use crate::slam::fusion::SurfacePoint;
 use crate::slam::trajectory::StampedPose;
 
@@ -50,12 +50,12 @@ pub struct MapPicture {
 }
 
 /// The section; nothing without points.
-pub fn map_section(input: &ReportInput<'_>, up: Option<Vector3<f64>>) -> String {
-    let map = map_picture(input.surface, input.trajectory, up);
+pub fn map_section(results: &Results<'_>, up: Option<Vector3<f64>>) -> String {
+    let map = map_picture(&results.surface, &results.trajectory, up);
     let Some(map) = map else { return String::new() };
     let Some(png) = map.picture.png() else { return String::new() };
-    let unit = if input.record.depth_scale == DepthScale::Given { "m" } else { "map units" };
-    let metres = input.evaluation.filter(|_| unit != "m").map(|of| of.alignment.scale);
+    let unit = if results.record.depth_scale == DepthScale::Given { "m" } else { "map units" };
+    let metres = results.evaluation.as_ref().filter(|_| unit != "m").map(|of| of.alignment.scale);
     let about_up = match up {
         Some(_) => "up is estimated from how the camera was held and from horizontal surfaces",
         None => "what is up is not known: the view is along the path's shortest extent",
@@ -66,7 +66,7 @@ pub fn map_section(input: &ReportInput<'_>, up: Option<Vector3<f64>>) -> String 
          The camera's path is white; {about_up}.</figcaption></figure></section>",
         png_address(&png),
         scale_bar(map.width, unit, metres),
-        grouped(input.surface.len() as u64),
+        grouped(results.surface.len() as u64),
         significant(map.height_range)
     )
 }
@@ -87,11 +87,7 @@ fn scale_bar(width: f64, unit: &str, metres_per_unit: Option<f64>) -> String {
 /// A number with two significant digits, in full.
 fn significant(number: f64) -> String {
     let decimals = 1.0 - number.abs().max(f64::MIN_POSITIVE).log10().floor();
-    let text = format!("{number:.*}", decimals.clamp(0.0, 12.0) as usize);
-    match text.contains('.') {
-        true => text.trim_end_matches('0').trim_end_matches('.').to_owned(),
-        false => text,
-    }
+    without_zeros(&format!("{number:.*}", decimals.clamp(0.0, 12.0) as usize)).to_owned()
 }
 
 /// Points and path from above, coloured by height (blue low, red high); `None` without points.
@@ -117,7 +113,8 @@ pub fn map_picture(
         .collect();
     let mut ranges = [[0.0; 2]; 3];
     for (axis, range) in ranges.iter_mut().enumerate() {
-        *range = middle_range(flat.iter().map(|p| p[axis]))?;
+        let ends = percentiles(flat.iter().map(|p| p[axis]), [CUT_SHARE, 1.0 - CUT_SHARE]);
+        *range = ends.filter(|[low, high]| high > low)?;
     }
     for (axis, range) in ranges.iter_mut().take(2).enumerate() {
         for point in &path {
@@ -129,14 +126,6 @@ pub fn map_picture(
     let [_, _, [low, high]] = ranges;
     let (picture, width) = draw(&flat, &path, &ranges);
     Some(MapPicture { picture, width, height_range: high - low })
-}
-
-/// Lower and upper end of the values without [`CUT_SHARE`] at either end.
-fn middle_range(values: impl Iterator<Item = f64>) -> Option<[f64; 2]> {
-    let mut sorted: Vec<f64> = values.collect();
-    sorted.sort_by(f64::total_cmp);
-    let (low, high) = (percentile(&sorted, CUT_SHARE)?, percentile(&sorted, 1.0 - CUT_SHARE)?);
-    (high > low).then_some([low, high])
 }
 
 /// The picture, and the length that its width shows.

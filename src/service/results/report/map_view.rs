@@ -4,9 +4,9 @@ use std::fmt::Write;
 
 use nalgebra::Vector3;
 
+use crate::service::results::Results;
 use crate::service::results::poses::{final_poses, longest_epoch};
 use crate::service::results::report::html::base64;
-use crate::service::results::report::input::ReportInput;
 use crate::service::results::report::number_text::grouped;
 use crate::service::results::report::scene::{
     PLAYER, SceneInput, SceneKeyframe, ScenePoint, VIEWER, pack,
@@ -18,13 +18,13 @@ use crate::slam::trajectory::gaps_in;
 const MAX_POINTS: usize = 300_000;
 
 /// The section; nothing without points.
-pub fn map_view(input: &ReportInput<'_>, up: Option<Vector3<f64>>) -> String {
-    let map = &input.record.map;
-    let Some(first) = map.keyframes.first().filter(|_| !input.surface.is_empty()) else {
+pub fn map_view(results: &Results<'_>, up: Option<Vector3<f64>>) -> String {
+    let map = &results.record.map;
+    let Some(first) = map.keyframes.first().filter(|_| !results.surface.is_empty()) else {
         return String::new();
     };
     // Each epoch has a place and a unit of its own.
-    let epoch = longest_epoch(input.record);
+    let epoch = longest_epoch(results.record);
     let keyframes: Vec<SceneKeyframe> = map
         .keyframes
         .iter()
@@ -35,12 +35,19 @@ pub fn map_view(input: &ReportInput<'_>, up: Option<Vector3<f64>>) -> String {
             place: k.map_from_keyframe,
         })
         .collect();
-    let points = scene_points(input.surface);
-    let gaps = epoch.map_or_else(Vec::new, |epoch| gaps_in(&final_poses(input.record), epoch));
+    // Each is of the first keyframe that saw it.
+    let scene_point = |&SurfacePoint { position, grey, sigma, .. }: &SurfacePoint| ScenePoint {
+        position,
+        grey,
+        std_dev: sigma,
+        keyframe_id: None,
+    };
+    let points: Vec<ScenePoint> = results.surface.iter().map(scene_point).collect();
+    let gaps = epoch.map_or_else(Vec::new, |epoch| gaps_in(&final_poses(results.record), epoch));
     let block = pack(&SceneInput {
         points: &points,
         keyframes: &keyframes,
-        path: input.trajectory,
+        path: &results.trajectory,
         gaps: &gaps,
         intrinsics: &first.intrinsics,
         up: up.map(Into::into),
@@ -63,15 +70,4 @@ pub fn map_view(input: &ReportInput<'_>, up: Option<Vector3<f64>>) -> String {
     let _ = write!(html, "<script>{VIEWER}</script><script>{PLAYER}</script>");
     let _ = write!(html, "<script>{}</script></section>", include_str!("map_view.js"));
     html
-}
-
-/// The points of the map's surface for the view; each is of the first keyframe that saw it.
-fn scene_points(surface: &[SurfacePoint]) -> Vec<ScenePoint> {
-    let scene_point = |point: &SurfacePoint| ScenePoint {
-        position: point.position,
-        grey: point.grey,
-        std_dev: point.sigma,
-        keyframe_id: None,
-    };
-    surface.iter().map(scene_point).collect()
 }

@@ -11,6 +11,14 @@ pub(super) fn length(metres: f64) -> String {
     }
 }
 
+/// Without the zeros at the end behind the point, and without a point that nothing follows.
+pub(crate) fn without_zeros(text: &str) -> &str {
+    match text.contains('.') {
+        true => text.trim_end_matches('0').trim_end_matches('.'),
+        false => text,
+    }
+}
+
 /// A number with spaces between groups of three digits.
 pub(super) fn grouped(number: u64) -> String {
     let digits = number.to_string();

@@ -102,9 +102,8 @@ pub fn even_order(count: usize) -> impl Iterator<Item = usize> {
 
 /// The block of bytes.
 pub fn pack(input: &SceneInput<'_>) -> Vec<u8> {
-    let start =
-        input.path.first().map(|pose| pose.nanos).or(input.keyframes.first().map(|k| k.nanos));
-    let start = start.unwrap_or(0);
+    let first_keyframe = input.keyframes.first().map(|k| k.nanos);
+    let start = input.path.first().map(|pose| pose.nanos).or(first_keyframe).unwrap_or(0);
     let secs = |nanos: i64| rounded((nanos.saturating_sub(start)) as f64 * 1e-9);
     let grouped = group(input);
     let mut bytes = Vec::new();
@@ -178,7 +177,9 @@ fn group<'a>(input: &SceneInput<'a>) -> Vec<Vec<&'a ScenePoint>> {
     let mut groups = vec![Vec::new(); input.keyframes.len()];
     let index: HashMap<u64, usize> =
         input.keyframes.iter().enumerate().map(|(i, k)| (k.keyframe_id, i)).collect();
-    let viewers = Viewers::new(input);
+    let asked = input.keyframes.len().div_ceil(MAX_ASKED).max(1);
+    let views = input.keyframes.iter().enumerate().step_by(asked);
+    let views: Vec<(usize, Sim3)> = views.map(|(i, k)| (i, k.place.inverse())).collect();
     let shown = input.points.len().min(input.max_points);
     for i in 0..shown {
         let point = &input.points[i * input.points.len() / shown];
@@ -188,7 +189,7 @@ fn group<'a>(input: &SceneInput<'a>) -> Vec<Vec<&'a ScenePoint>> {
         let of = match point.keyframe_id {
             Some(id) => index.get(&id).copied(),
             // One that nobody is known to have seen belongs to the last: it is there in the end.
-            None => viewers.first(point).or(groups.len().checked_sub(1)),
+            None => first_viewer(&views, input.intrinsics, point).or(groups.len().checked_sub(1)),
         };
         if let Some(group) = of {
             groups[group].push(point);
@@ -197,41 +198,26 @@ fn group<'a>(input: &SceneInput<'a>) -> Vec<Vec<&'a ScenePoint>> {
     groups
 }
 
-/// Keyframes that are asked whether they saw a point.
-struct Viewers<'a> {
-    views: Vec<(usize, Sim3)>,
-    intrinsics: &'a Intrinsics,
-}
-
-impl<'a> Viewers<'a> {
-    fn new(input: &SceneInput<'a>) -> Self {
-        let every = input.keyframes.len().div_ceil(MAX_ASKED).max(1);
-        let views = input.keyframes.iter().enumerate().step_by(every);
-        let views = views.map(|(i, k)| (i, k.place.inverse())).collect();
-        Self { views, intrinsics: input.intrinsics }
-    }
-
-    /// The first that had it in its image, not too far away; else the first that had it in its image at all.
-    fn first(&self, point: &ScenePoint) -> Option<usize> {
-        let position = nalgebra::Vector3::from(point.position.map(f64::from));
-        let k = self.intrinsics;
-        let mut far = None;
-        for (index, keyframe_from_map) in &self.views {
-            let p = *keyframe_from_map * position;
-            if !(p.z > NEAREST) {
-                continue;
-            }
-            let (u, v) = (k.fx * p.x / p.z + k.cx, k.fy * p.y / p.z + k.cy);
-            if u < 0.0 || v < 0.0 || u >= k.width as f64 || v >= k.height as f64 {
-                continue;
-            }
-            if p.z < FURTHEST {
-                return Some(*index);
-            }
-            far = far.or(Some(*index));
+/// The first of some keyframes (`keyframe_from_map`, each with its place in the list) that had a point in its image, not
+/// too far away; else the first that had it in its image at all.
+fn first_viewer(views: &[(usize, Sim3)], k: &Intrinsics, point: &ScenePoint) -> Option<usize> {
+    let position = nalgebra::Vector3::from(point.position.map(f64::from));
+    let mut far = None;
+    for &(index, keyframe_from_map) in views {
+        let p = keyframe_from_map * position;
+        if !(p.z > NEAREST) {
+            continue;
         }
-        far
+        let (u, v) = (k.fx * p.x / p.z + k.cx, k.fy * p.y / p.z + k.cy);
+        if u < 0.0 || v < 0.0 || u >= k.width as f64 || v >= k.height as f64 {
+            continue;
+        }
+        if p.z < FURTHEST {
+            return Some(index);
+        }
+        far = far.or(Some(index));
     }
+    far
 }
 
 /// Appends a keyframe's points to `bytes` and describes them.

@@ -29,3 +29,15 @@ pub struct Series {
     /// x and y.
     pub points: Vec<[f64; 2]>,
 }
+
+impl Series {
+    /// Points with a name and a colour, drawn as `mark` says.
+    pub fn new(
+        name: &'static str,
+        colour: &'static str,
+        mark: Mark,
+        points: Vec<[f64; 2]>,
+    ) -> Self {
+        Self { name, colour, mark, points }
+    }
+}
