@@ -15,7 +15,7 @@ use crate::service::mode::Mode;
 use crate::service::peers::Peer;
 use crate::service::position::{Position, PositionKeeper, Predecessor};
 use crate::service::refused_images::RefusedImages;
-use crate::service::schedule::{apply, in_force};
+use crate::service::schedule::apply;
 use crate::service::shutdown::Shutdown;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::wire::message::{FrameHeader, HealthMessage, PoseMessage, StepMessage};
@@ -107,7 +107,7 @@ pub fn run(
         // After the preparation: rendering a simulated world has no deadline.
         let refusals = apply(&config.capture.scheduling);
         refusals.iter().for_each(|refusal| tracing::warn!("capture: {refusal}"));
-        shell.health.tell_scheduling(&in_force(), &refusals);
+        shell.health.tell_scheduling(&refusals);
         shell.health.tell_ready();
         shell.stream()
     });

@@ -3,7 +3,7 @@
 use crate::service::adjustments::{AdjustmentRecord, Fate};
 use crate::service::clock::now_nanos;
 use crate::service::manager_notice::ManagerNotice;
-use crate::service::schedule::{InForce, Policy, Refusal, peak_rss_bytes};
+use crate::service::schedule::{Policy, in_force, peak_rss_bytes};
 use crate::slam::loops::SearchFate;
 use crate::wire::command::{text_bytes, text_from_bytes};
 use crate::wire::message::{HISTOGRAM_BUCKETS, HealthMessage, TEXT_BYTES};
@@ -245,15 +245,13 @@ impl Health {
         self.report();
     }
 
-    /// Says what the kernel does for this process and what it refused; the first refusal as a text.
-    pub fn tell_scheduling(&mut self, in_force: &InForce, refusals: &[Refusal]) {
-        let warning = refusals.first().map_or(String::new(), Refusal::to_string);
+    /// Says what the kernel does for the calling thread and what it refused; the first refusal as a text.
+    pub fn tell_scheduling(&mut self, refusals: &[String]) {
+        let in_force = in_force();
         self.message.scheduling = scheduling_code(in_force.policy);
         self.message.priority = in_force.priority;
         self.message.memory_locked = u32::from(in_force.memory_locked);
-        (self.message.warning, self.message.warning_bytes) = text_bytes(&warning);
-        self.changed = true;
-        self.report();
+        self.warn(refusals.first().map_or("", String::as_str));
     }
 
     /// Enters a state; the next report goes out at once.

@@ -19,7 +19,7 @@ use crate::service::mapper::going_over::GoneOver;
 use crate::service::mapper::output::Output;
 use crate::service::mode::Mode;
 use crate::service::pairing::Pairing;
-use crate::service::schedule::{Background, apply, in_force};
+use crate::service::schedule::{Background, apply};
 use crate::service::shutdown::Shutdown;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::loops::{SearchFate, SearchReport};
@@ -88,7 +88,7 @@ pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), Mappe
     let refusals = apply(&config.mapper.scheduling);
     refusals.iter().for_each(|refusal| tracing::warn!("mapper: {refusal}"));
     let mut shell = Shell::prepare(config, mode)?;
-    shell.health.tell_scheduling(&in_force(), &refusals);
+    shell.health.tell_scheduling(&refusals);
     shell.load_map()?;
     shell.health.enter(ProcessState::Ready, "");
     shell.health.tell_ready();

@@ -87,63 +87,6 @@ impl SchedulingParams {
     }
 }
 
-/// What the kernel refused; says which limit to raise.
-#[derive(Debug, thiserror::Error, Clone, PartialEq, Eq)]
-pub enum Refusal {
-    /// No real-time policy.
-    #[error(
-        "{policy} scheduling refused ({reason}): raise RLIMIT_RTPRIO to {priority} (LimitRTPRIO= in the unit, rtprio in /etc/security/limits.conf)"
-    )]
-    RealTime {
-        /// Which policy.
-        policy: &'static str,
-        /// Which priority.
-        priority: u32,
-        /// What the kernel says.
-        reason: String,
-    },
-    /// No deadline policy.
-    #[error(
-        "deadline scheduling refused ({reason}): it needs CAP_SYS_NICE (AmbientCapabilities= in the unit), no CPU list, and a free share of the CPUs"
-    )]
-    Deadline {
-        /// What the kernel says.
-        reason: String,
-    },
-    /// No lower priority.
-    #[error(
-        "idle scheduling refused ({reason}): allow sched_setattr, or set mapper.background = \"other\""
-    )]
-    Background {
-        /// What the kernel says.
-        reason: String,
-    },
-    /// Not these CPUs.
-    #[error(
-        "CPUs {cpus:?} refused ({reason}): name CPUs that exist and that the unit's CPUAffinity= allows"
-    )]
-    Cpus {
-        /// Which.
-        cpus: Vec<usize>,
-        /// What the kernel says.
-        reason: String,
-    },
-    /// Memory cannot be locked.
-    #[error(
-        "locking memory refused ({reason}): raise RLIMIT_MEMLOCK (LimitMEMLOCK=infinity in the unit, memlock in /etc/security/limits.conf)"
-    )]
-    Memory {
-        /// What the kernel says.
-        reason: String,
-    },
-    /// No other timer slack.
-    #[error("timer slack refused ({reason}): leave timer_slack_us at 0")]
-    TimerSlack {
-        /// What the kernel says.
-        reason: String,
-    },
-}
-
 /// The scheduling in effect, as the kernel reports it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct InForce {
@@ -177,28 +120,33 @@ struct SchedAttr {
     period: u64,
 }
 
-/// Applies `params` to the calling thread (memory: to the process), and gives what was refused. Threads
-/// that are made later run as SCHED_OTHER on the same CPUs.
-pub fn apply(params: &SchedulingParams) -> Vec<Refusal> {
+/// Applies `params` to the calling thread (memory: to the process), and says what was refused and which limit to
+/// raise. Threads that are made later run as SCHED_OTHER on the same CPUs.
+pub fn apply(params: &SchedulingParams) -> Vec<String> {
     let mut refusals = Vec::new();
     // Memory first: under FIFO the touching of new pages would hold up everybody else.
     if params.lock_memory {
         let flags = MlockAllFlags::CURRENT | MlockAllFlags::FUTURE;
         match rustix::mm::mlockall(flags) {
             Ok(()) => touch_stack(),
-            Err(error) => refusals.push(Refusal::Memory { reason: error.to_string() }),
+            Err(error) => refusals.push(format!(
+                "locking memory refused ({error}): raise RLIMIT_MEMLOCK (LimitMEMLOCK=infinity in the unit, memlock in /etc/security/limits.conf)"
+            )),
         }
     }
     if let Some(slack) = NonZeroU64::new(params.timer_slack_us.saturating_mul(1000))
         && let Err(error) = rustix::thread::set_current_timer_slack(Some(slack))
     {
-        refusals.push(Refusal::TimerSlack { reason: error.to_string() });
+        refusals.push(format!("timer slack refused ({error}): leave timer_slack_us at 0"));
     }
     if !params.cpus.is_empty() {
         let mut set = CpuSet::new();
         params.cpus.iter().filter(|&&cpu| cpu < MAX_CPU).for_each(|&cpu| set.set(cpu));
         if let Err(error) = rustix::thread::sched_setaffinity(None, &set) {
-            refusals.push(Refusal::Cpus { cpus: params.cpus.clone(), reason: error.to_string() });
+            refusals.push(format!(
+                "CPUs {:?} refused ({error}): name CPUs that exist and that the unit's CPUAffinity= allows",
+                params.cpus
+            ));
         }
     }
     refusals.extend(apply_policy(params).err());
@@ -206,31 +154,27 @@ pub fn apply(params: &SchedulingParams) -> Vec<Refusal> {
 }
 
 /// Makes the calling thread one that no frame waits for. The kernel refuses this to nobody, a sandbox may.
-pub fn apply_background(background: Background) -> Result<(), Refusal> {
-    let policy = match background {
-        Background::Idle => SCHED_IDLE,
-        Background::Other => return Ok(()),
-    };
-    let size = size_of::<SchedAttr>() as u32;
-    set_attributes(&SchedAttr { size, policy, ..SchedAttr::default() })
-        .map_err(|error| Refusal::Background { reason: error.to_string() })
+pub fn apply_background(background: Background) -> Result<(), String> {
+    if background == Background::Other {
+        return Ok(());
+    }
+    set_attributes(SchedAttr { policy: SCHED_IDLE, ..SchedAttr::default() }).map_err(|error| {
+        format!("idle scheduling refused ({error}): allow sched_setattr, or set mapper.background = \"other\"")
+    })
 }
 
-fn apply_policy(params: &SchedulingParams) -> Result<(), Refusal> {
+fn apply_policy(params: &SchedulingParams) -> Result<(), String> {
     let nanos = |millis: f64| (millis * 1e6) as u64;
-    let size = size_of::<SchedAttr>() as u32;
     let attributes = match params.policy {
         Policy::Inherit => return Ok(()),
-        Policy::Other => SchedAttr { size, policy: SCHED_OTHER, ..SchedAttr::default() },
+        Policy::Other => SchedAttr { policy: SCHED_OTHER, ..SchedAttr::default() },
         Policy::Fifo => SchedAttr {
-            size,
             policy: SCHED_FIFO,
             flags: SCHED_FLAG_RESET_ON_FORK,
             priority: params.priority,
             ..SchedAttr::default()
         },
         Policy::Deadline => SchedAttr {
-            size,
             policy: SCHED_DEADLINE,
             flags: SCHED_FLAG_RESET_ON_FORK,
             runtime: nanos(params.runtime_ms),
@@ -239,17 +183,22 @@ fn apply_policy(params: &SchedulingParams) -> Result<(), Refusal> {
             ..SchedAttr::default()
         },
     };
-    set_attributes(&attributes).map_err(|error| {
-        let reason = error.to_string();
-        match params.policy {
-            Policy::Deadline => Refusal::Deadline { reason },
-            Policy::Other => Refusal::RealTime { policy: "other", priority: 0, reason },
-            _ => Refusal::RealTime { policy: "FIFO", priority: params.priority, reason },
-        }
+    let (name, priority) = match params.policy {
+        Policy::Other => ("other", 0),
+        _ => ("FIFO", params.priority),
+    };
+    set_attributes(attributes).map_err(|error| match params.policy {
+        Policy::Deadline => format!(
+            "deadline scheduling refused ({error}): it needs CAP_SYS_NICE (AmbientCapabilities= in the unit), no CPU list, and a free share of the CPUs"
+        ),
+        _ => format!(
+            "{name} scheduling refused ({error}): raise RLIMIT_RTPRIO to {priority} (LimitRTPRIO= in the unit, rtprio in /etc/security/limits.conf)"
+        ),
     })
 }
 
-fn set_attributes(attributes: &SchedAttr) -> std::io::Result<()> {
+fn set_attributes(attributes: SchedAttr) -> std::io::Result<()> {
+    let attributes = SchedAttr { size: size_of::<SchedAttr>() as u32, ..attributes };
     const NO_FLAGS: libc::c_uint = 0;
     const THIS_THREAD: libc::pid_t = 0;
     // SAFETY: the kernel reads `size` bytes from a struct that is `#[repr(C)]` and of that size.
@@ -257,7 +206,7 @@ fn set_attributes(attributes: &SchedAttr) -> std::io::Result<()> {
         libc::syscall(
             libc::SYS_sched_setattr,
             THIS_THREAD,
-            std::ptr::from_ref(attributes),
+            std::ptr::from_ref(&attributes),
             NO_FLAGS,
         )
     };

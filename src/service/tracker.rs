@@ -10,7 +10,7 @@ use crate::service::frame_order::{FrameOrder, FrameOrderOutcome, SILENCE};
 use crate::service::health::{Health, ProcessState};
 use crate::service::mode::Mode;
 use crate::service::reference_feed::ReferenceFeed;
-use crate::service::schedule::{apply, in_force, thread_usage};
+use crate::service::schedule::{apply, thread_usage};
 use crate::service::shutdown::Shutdown;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -72,7 +72,7 @@ pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), Track
     // After the thread that prepares keyframes was made: that one stays ordinary.
     let refusals = apply(&config.tracker.scheduling);
     refusals.iter().for_each(|refusal| tracing::warn!("tracker: {refusal}"));
-    shell.health.tell_scheduling(&in_force(), &refusals);
+    shell.health.tell_scheduling(&refusals);
     shell.health.enter(ProcessState::Ready, "");
     shell.health.tell_ready();
     let outcome = shell.track_until(shutdown);
