@@ -10,7 +10,7 @@ use crate::service::frame_order::{FrameOrder, FrameOrderOutcome, SILENCE};
 use crate::service::health::{Health, ProcessState};
 use crate::service::mode::Mode;
 use crate::service::reference_feed::ReferenceFeed;
-use crate::service::schedule::{apply, thread_usage};
+use crate::service::schedule::{apply, thread_page_faults};
 use crate::service::shutdown::Shutdown;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -292,7 +292,7 @@ impl<'a> Shell<'a> {
         if self.health.counters().frames < WARM_UP_FRAMES {
             return;
         }
-        let faults = thread_usage().page_faults;
+        let faults = thread_page_faults();
         let warm = *self.warm_page_faults.get_or_insert(faults);
         self.health.counters().page_faults = faults.saturating_sub(warm);
     }
