@@ -15,6 +15,7 @@ use rustix::fs::MemfdFlags;
 use rustix::process::{Pid, Signal};
 
 use crate::capture::source_name::SourceName;
+use crate::service::clock::wait_at_most;
 use crate::service::error_log::ErrorLog;
 use crate::service::liveness::{Liveness, is_ending};
 use crate::service::manager_notice::VARIABLES;
@@ -33,8 +34,6 @@ pub const ERROR_PREFIX: &str = "error: ";
 const LONGEST_DEATH: Duration = Duration::from_secs(2);
 /// How long after a process's end its last words are waited for: somebody else may hold its standard error.
 const LAST_WORDS: Duration = Duration::from_secs(1);
-/// Pause between two looks at either.
-const LOOK_PAUSE: Duration = Duration::from_millis(2);
 
 /// Why a supervised process must not start.
 #[derive(Debug, thiserror::Error)]
@@ -198,14 +197,6 @@ impl Child {
 impl Drop for Child {
     fn drop(&mut self) {
         self.kill();
-    }
-}
-
-/// Looks again and again whether something is over, at most for `longest`.
-fn wait_at_most(longest: Duration, mut is_over: impl FnMut() -> bool) {
-    let start = Instant::now();
-    while !is_over() && start.elapsed() < longest {
-        std::thread::sleep(LOOK_PAUSE);
     }
 }
 

@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 use rustix::process::{Pid, Signal};
 
 use crate::service::child::SUPERVISOR_VARIABLE;
+use crate::service::clock::wait_at_most;
 use crate::service::error_log::ErrorLog;
 use crate::service::manager_notice::VARIABLES;
 use crate::wire::folders::ROOT_VARIABLE;
@@ -21,8 +22,6 @@ const RESTART_PAUSE: Duration = Duration::from_secs(10);
 const MOST_RESTARTS: u32 = 3;
 /// How long it may take to end when it is asked to: one that is stopped never does.
 const LONGEST_END: Duration = Duration::from_millis(500);
-/// Pause between two looks for its end.
-const LOOK_PAUSE: Duration = Duration::from_millis(5);
 /// Addresses that wait to be printed.
 const WAITING_LINES: usize = 4;
 
@@ -85,10 +84,7 @@ impl Drop for ViewChild {
     fn drop(&mut self) {
         let Some((child, _)) = &mut self.running else { return };
         let _ = rustix::process::kill_process(Pid::from_child(child), Signal::TERM);
-        let begin = Instant::now();
-        while matches!(child.try_wait(), Ok(None)) && begin.elapsed() < LONGEST_END {
-            std::thread::sleep(LOOK_PAUSE);
-        }
+        wait_at_most(LONGEST_END, || !matches!(child.try_wait(), Ok(None)));
         let _ = child.kill();
         let _ = child.wait();
     }
