@@ -23,9 +23,8 @@ use crate::service::peers::Peer;
 use crate::service::position::{position_key, read_position};
 use crate::service::recorder::Recorder;
 use crate::service::recording::{RecordParts, RunCounters};
-use crate::service::results::record::{RestartCause, RunMode, RunRecord};
+use crate::service::results::record::{EndOfRun, RestartCause, RunMode, RunRecord};
 pub use crate::service::run_error::RunError;
-pub use crate::service::run_progress::Ended;
 use crate::service::run_progress::RunProgress;
 use crate::service::schedule::peak_rss_bytes;
 use crate::service::shutdown::Shutdown;
@@ -79,8 +78,6 @@ pub struct RunOutcome {
     pub journal: Option<Journal>,
     /// The source once more, for its true depth.
     pub source: Box<dyn FrameSource>,
-    /// How it ended.
-    pub ended: Ended,
 }
 
 /// Runs the three processes to the end of the source, to a signal, or to a failure.
@@ -121,8 +118,8 @@ fn supervise(
     let mut map = match has_map.then(|| supervisor.final_map(shutdown)).transpose() {
         Ok(map) => map.unwrap_or_default(),
         Err(error) => {
-            if ended == Ended::Finished {
-                ended = Ended::Failed(error.to_string());
+            if ended == EndOfRun::Finished {
+                ended = EndOfRun::Failed(error.to_string());
             }
             supervisor.map_of_checkpoint()
         }
@@ -132,21 +129,23 @@ fn supervise(
         supervisor.recorder.complete_map(&mut map, max_bytes);
     }
     let refused = supervisor.refused()?;
-    let is_cut = matches!(ended, Ended::Failed(_));
-    if let (Ended::Finished, Some(cause)) = (&ended, &supervisor.bus_error) {
-        ended = Ended::Failed(cause.clone());
+    let is_cut = matches!(ended, EndOfRun::Failed(_));
+    if let (EndOfRun::Finished, Some(cause)) = (&ended, &supervisor.bus_error) {
+        ended = EndOfRun::Failed(cause.clone());
     }
     let (mut recorder, counters, restart_causes) = supervisor.finish(shutdown)?;
-    if let (Ended::Finished, missing @ 1..) = (&ended, recorder.take_back()) {
-        ended = Ended::Failed(format!("{missing} poses cannot be read back from the journal"));
+    if let (EndOfRun::Finished, missing @ 1..) = (&ended, recorder.take_back()) {
+        ended = EndOfRun::Failed(format!("{missing} poses cannot be read back from the journal"));
     }
-    if let (Ended::Failed(cause), true, frames @ 1..) = (&mut ended, is_cut, recorder.num_poses()) {
+    if let (EndOfRun::Failed(cause), true, frames @ 1..) =
+        (&mut ended, is_cut, recorder.num_poses())
+    {
         let of = if frames == 1 { "frame".to_owned() } else { format!("{frames} frames") };
         let _ = write!(cause, "; the results are of the {of} before");
     }
     let lost = counters.frames_in.saturating_sub(recorder.num_poses() as u64);
-    if options.mode == Mode::Lockstep && ended == Ended::Finished && lost > 0 {
-        ended = Ended::Failed(format!("{lost} of {} poses did not arrive", counters.frames_in));
+    if options.mode == Mode::Lockstep && ended == EndOfRun::Finished && lost > 0 {
+        ended = EndOfRun::Failed(format!("{lost} of {} poses did not arrive", counters.frames_in));
     }
     let (name, truth) = (options.source.to_string(), source.ground_truth().to_vec());
     let deadline_ms = config.tracker.deadline_ms;
@@ -160,8 +159,8 @@ fn supervise(
         deadline_ms,
         counters,
     });
-    let record = RunRecord { ended: (&ended).into(), refused, restart_causes, ..record };
-    Ok(RunOutcome { record, journal, source, ended })
+    let record = RunRecord { ended, refused, restart_causes, ..record };
+    Ok(RunOutcome { record, journal, source })
 }
 
 /// The journal of the run. Without one it continues.
@@ -276,7 +275,7 @@ impl<'a> Supervisor<'a> {
         &mut self,
         shutdown: &Shutdown,
         observe: &mut dyn FnMut(&RunProgress),
-    ) -> Result<Ended, RunError> {
+    ) -> Result<EndOfRun, RunError> {
         loop {
             wait(&[self.recorder.events()], Some(shutdown.descriptor()), WAKE_PERIOD)?;
             self.recorder.collect()?;
@@ -288,7 +287,7 @@ impl<'a> Supervisor<'a> {
             }
             observe(&self.progress());
             if shutdown.is_requested() {
-                return Ok(Ended::Interrupted);
+                return Ok(EndOfRun::Interrupted);
             }
             if let Some(ended) = self.check_processes()? {
                 return Ok(ended);
@@ -333,7 +332,7 @@ impl<'a> Supervisor<'a> {
 
     /// Looks who has ended or hangs: the source's end ends the run, a death restarts the process (live) or
     /// ends the run (lockstep: a frame without an answer cannot be made good).
-    fn check_processes(&mut self) -> Result<Option<Ended>, RunError> {
+    fn check_processes(&mut self) -> Result<Option<EndOfRun>, RunError> {
         let watchdog = Duration::from_secs_f64(self.config.supervisor.watchdog_s);
         let mut deaths = Vec::new();
         for index in [CAPTURE, TRACKER, MAPPER] {
@@ -344,7 +343,7 @@ impl<'a> Supervisor<'a> {
                 .map_err(|source| RunError::Child { process: name, source })?;
             match ended {
                 None => {}
-                Some(None) => return Ok(Some(Ended::Finished)),
+                Some(None) => return Ok(Some(EndOfRun::Finished)),
                 Some(Some(death)) => deaths.push((index, death)),
             }
         }
@@ -368,7 +367,7 @@ impl<'a> Supervisor<'a> {
     }
 
     /// Plans a restart after a death, or says that there is none.
-    fn mourn(&mut self, index: usize, death: Death) -> Option<Ended> {
+    fn mourn(&mut self, index: usize, death: Death) -> Option<EndOfRun> {
         if death.is_bus_error {
             self.bus_error = Some(death.cause.clone());
         }
@@ -377,7 +376,7 @@ impl<'a> Supervisor<'a> {
         let kill_is_felt = self.killed.is_some_and(|killed| killed.elapsed() < KILL_IS_FELT);
         let max_restarts = self.config.supervisor.max_restarts;
         if !is_live || !process.may_restart(&death, kill_is_felt, max_restarts) {
-            return Some(Ended::Failed(death.cause));
+            return Some(EndOfRun::Failed(death.cause));
         }
         tracing::warn!("{}; restarting it", death.cause);
         process.plan_restart(death);
@@ -427,9 +426,9 @@ impl<'a> Supervisor<'a> {
     }
 
     /// Collects what is still under way after the last frame.
-    fn settle(&mut self, ended: &Ended, shutdown: &Shutdown) -> Result<(), RunError> {
+    fn settle(&mut self, ended: &EndOfRun, shutdown: &Shutdown) -> Result<(), RunError> {
         self.recorder.collect()?;
-        if self.options.mode == Mode::Lockstep || matches!(ended, Ended::Failed(_)) {
+        if self.options.mode == Mode::Lockstep || matches!(ended, EndOfRun::Failed(_)) {
             return Ok(());
         }
         let mut last = Instant::now();
