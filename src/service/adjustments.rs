@@ -113,9 +113,11 @@ impl Adjustments {
         })
     }
 
-    /// Readable when an estimate is ready: then [`Adjustments::pick_up`].
+    /// Readable when an estimate is ready: then [`Adjustments::pick_up`]. None where that lets nothing in, and a wait for
+    /// it would end at once again and again.
     pub fn descriptor(&self) -> Option<BorrowedFd<'_>> {
-        self.thread.as_ref().map(AdjustmentThread::descriptor)
+        let thread = self.thread.as_ref().filter(|_| self.entry == Entry::WhenReady);
+        thread.map(AdjustmentThread::descriptor)
     }
 
     /// What is over since the last call.
