@@ -17,7 +17,7 @@ use crate::service::error_log::ErrorLog;
 use crate::service::final_map::final_map;
 use crate::service::health::{ProcessState, cause};
 use crate::service::journal::{Journal, JournalOptions};
-use crate::service::map_folder::session::check_camera;
+use crate::service::map_folder::session::{MapSessionError, check_camera};
 use crate::service::mode::Mode;
 use crate::service::peers::Peer;
 use crate::service::position::{position_key, read_position};
@@ -88,7 +88,7 @@ pub fn run(
     observe: &mut dyn FnMut(&RunProgress),
 ) -> Result<RunOutcome, RunError> {
     let source = open(&options.source, options.rig.as_deref(), &config.source_params())?;
-    check_camera(&config.map, &source.intrinsics())?;
+    check_camera(&config.map, &source.intrinsics()).map_err(MapSessionError::from)?;
     let place = Place::new(&config.instance, &config.root)?;
     let _claim = claim_all(&place)?;
     // What a run before has left is not of this one.

@@ -10,11 +10,11 @@ use crate::service::frame_order::{FrameOrder, FrameOrderOutcome, SILENCE};
 use crate::service::health::{Health, ProcessState};
 use crate::service::mode::Mode;
 use crate::service::reference_feed::ReferenceFeed;
+use crate::service::run_error::RunError;
 use crate::service::schedule::{apply, thread_page_faults};
 use crate::service::shutdown::Shutdown;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
-use crate::slam::parameter::ParameterError;
 use crate::slam::pose::{
     DegradedReason, LostReason, PoseEstimate, TrackingState, UNKNOWN_VARIANCE,
 };
@@ -22,14 +22,9 @@ use crate::slam::tracker::Tracker;
 use crate::wire::conversion::{
     PoseTiming, codes_from_state, frame_from_message, pose_from_message, pose_message,
 };
-use crate::wire::keyframe_inbox::InboxError;
 use crate::wire::message::{FrameHeader, PoseMessage};
 use crate::wire::place::{Claim, Place};
-use crate::wire::place_error::PlaceError;
-use crate::wire::port::{
-    Access, Hub, OpenError, Publisher, ReceiveError, Received, SendError, Subscriber, WaitError,
-    wait,
-};
+use crate::wire::port::{Access, Hub, Publisher, ReceiveError, Received, Subscriber, wait};
 use crate::wire::topic::{FRAME, POSE, TRACKER_HEALTH};
 
 /// Longest sleep without a look at signals and health.
@@ -37,37 +32,8 @@ const WAKE_PERIOD: Duration = Duration::from_millis(100);
 /// Frames until everything that the loop uses has been touched: page faults count from here.
 const WARM_UP_FRAMES: u64 = 100;
 
-/// Why the tracker ends early.
-#[derive(Debug, thiserror::Error)]
-pub enum TrackerError {
-    /// The place is not right, or taken.
-    #[error(transparent)]
-    Place(#[from] PlaceError),
-    /// A topic cannot be opened.
-    #[error(transparent)]
-    Open(#[from] OpenError),
-    /// Frames cannot be received.
-    #[error(transparent)]
-    Receive(#[from] ReceiveError),
-    /// A pose cannot be sent.
-    #[error(transparent)]
-    Send(#[from] SendError),
-    /// Keyframes cannot be received.
-    #[error(transparent)]
-    Inbox(#[from] InboxError),
-    /// Waiting failed.
-    #[error(transparent)]
-    Wait(#[from] WaitError),
-    /// The configuration does not fit the frames.
-    #[error("tracking: {0}")]
-    Parameter(#[from] ParameterError),
-    /// The thread that prepares keyframes cannot be started.
-    #[error("cannot start the thread that prepares keyframes ({0})")]
-    Thread(std::io::Error),
-}
-
 /// Runs the process until the signal.
-pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), TrackerError> {
+pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), RunError> {
     let mut shell = Shell::prepare(config, mode)?;
     // After the thread that prepares keyframes was made: that one stays ordinary.
     let refusals = apply(&config.tracker.scheduling);
@@ -103,14 +69,15 @@ struct Shell<'a> {
 }
 
 impl<'a> Shell<'a> {
-    fn prepare(config: &'a Config, mode: Mode) -> Result<Self, TrackerError> {
+    fn prepare(config: &'a Config, mode: Mode) -> Result<Self, RunError> {
         let place = Place::new(&config.instance, &config.root)?;
         let claim = place.claim("tracker")?;
         let hub = Hub::join(&place, "tracker", Access::Member)?;
         let params = &config.tracking.reference;
         let references = match mode {
             Mode::Lockstep => ReferenceFeed::synchronous(&hub, params)?,
-            Mode::Live => ReferenceFeed::threaded(&place, params).map_err(TrackerError::Thread)?,
+            Mode::Live => ReferenceFeed::threaded(&place, params)
+                .map_err(|error| RunError::Thread("prepares keyframes", error))?,
         };
         let shell = Self {
             config,
@@ -132,7 +99,7 @@ impl<'a> Shell<'a> {
         Ok(shell)
     }
 
-    fn track_until(&mut self, shutdown: &Shutdown) -> Result<(), TrackerError> {
+    fn track_until(&mut self, shutdown: &Shutdown) -> Result<(), RunError> {
         while !shutdown.is_requested() {
             let mut awaited = self.await_frame(shutdown)?;
             self.poses.serve_late_joiners();
@@ -156,7 +123,7 @@ impl<'a> Shell<'a> {
     fn await_frame(
         &mut self,
         shutdown: &Shutdown,
-    ) -> Result<Option<Received<u8, FrameHeader>>, TrackerError> {
+    ) -> Result<Option<Received<u8, FrameHeader>>, RunError> {
         let early_us = self.config.tracker.early_wake_us;
         let (last, period) = (self.last_arrival_nanos, self.order.period_nanos());
         let watch = Watch::plan(early_us, last, period, now_nanos());
@@ -181,7 +148,7 @@ impl<'a> Shell<'a> {
     }
 
     /// One frame: adopt, track, publish.
-    fn step(&mut self, received: &Received<u8, FrameHeader>) -> Result<(), TrackerError> {
+    fn step(&mut self, received: &Received<u8, FrameHeader>) -> Result<(), RunError> {
         let arrival_nanos = now_nanos();
         let _span = tracing::trace_span!("frame", sequence = received.header().sequence).entered();
         let header = *received.header();
@@ -216,7 +183,7 @@ impl<'a> Shell<'a> {
         frame: &FrameView<'_>,
         intrinsics: Intrinsics,
         deadline_nanos: Option<i64>,
-    ) -> Result<(PoseEstimate, i64), TrackerError> {
+    ) -> Result<(PoseEstimate, i64), RunError> {
         let known = self.tracker.take().filter(|(of, _)| *of == intrinsics);
         let (_, tracker) = match known {
             Some(tracker) => self.tracker.insert(tracker),
@@ -224,7 +191,8 @@ impl<'a> Shell<'a> {
                 // The first, or another camera in mid-stream.
                 let is_first = self.last_intrinsics.replace(intrinsics).is_none();
                 self.health.counters().resized += u64::from(!is_first);
-                let tracker = Tracker::new(intrinsics, self.config.tracking.clone())?;
+                let tracker = Tracker::new(intrinsics, self.config.tracking.clone())
+                    .map_err(|error| RunError::Parameter("tracking", error))?;
                 self.tracker.insert((intrinsics, tracker))
             }
         };
@@ -303,7 +271,7 @@ impl<'a> Shell<'a> {
         header: &FrameHeader,
         [wake_nanos, track_nanos]: [i64; 2],
         deadline_nanos: Option<i64>,
-    ) -> Result<(), TrackerError> {
+    ) -> Result<(), RunError> {
         let _span = tracing::trace_span!("publish").entered();
         let published_nanos = now_nanos();
         // A camera's stamp may lie in the future of our clock.

@@ -14,8 +14,9 @@ use crate::service::map_folder::numbering::Numbering;
 use crate::service::map_folder::save_copy;
 use crate::service::map_folder::session::{MapSession, check_loadable};
 use crate::service::mapper::going_over::GoneOver;
-use crate::service::mapper::{MapperError, Shell, WRITES_MAP, tell_adjustments};
+use crate::service::mapper::{Shell, WRITES_MAP, tell_adjustments};
 use crate::service::mode::Mode;
+use crate::service::run_error::RunError;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::map::Map;
 use crate::slam::mapper::Mapper;
@@ -29,7 +30,7 @@ const LOADING_PAUSE: Duration = Duration::from_millis(20);
 const NO_FRAME: &str = "there is no map yet: no frame has come";
 
 impl Shell<'_> {
-    pub(super) fn answer_commands(&mut self) -> Result<(), MapperError> {
+    pub(super) fn answer_commands(&mut self) -> Result<(), RunError> {
         let commands = Rc::clone(&self.commands);
         Ok(commands.answer(|command| match command {
             Command::SendKeyframe(keyframe_id) => {
