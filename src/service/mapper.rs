@@ -217,15 +217,10 @@ impl<'a> Shell<'a> {
         }
         self.last_arrival_nanos = Some(now_nanos());
         let arrival = self.order.arrive(&header);
-        match arrival {
-            FrameOrderOutcome::Next { missing } => {
-                self.missing = self.missing.saturating_add(missing)
-            }
-            FrameOrderOutcome::ClockJump
-            | FrameOrderOutcome::Renumbered
-            | FrameOrderOutcome::Repeated => {
-                self.health.counters().disordered += 1;
-            }
+        if let FrameOrderOutcome::Next { missing } = arrival {
+            self.missing = self.missing.saturating_add(missing);
+        } else {
+            self.health.counters().disordered += 1;
         }
         if arrival == FrameOrderOutcome::Renumbered {
             self.pairing.restart();

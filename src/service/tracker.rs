@@ -237,13 +237,10 @@ impl<'a> Shell<'a> {
     fn is_in_order(&mut self, header: &FrameHeader) -> bool {
         let arrival = self.order.arrive(header);
         let counters = self.health.counters();
-        match arrival {
-            FrameOrderOutcome::Next { missing } => counters.dropped += missing,
-            FrameOrderOutcome::ClockJump
-            | FrameOrderOutcome::Renumbered
-            | FrameOrderOutcome::Repeated => {
-                counters.disordered += 1;
-            }
+        if let FrameOrderOutcome::Next { missing } = arrival {
+            counters.dropped += missing;
+        } else {
+            counters.disordered += 1;
         }
         arrival != FrameOrderOutcome::Repeated
     }
