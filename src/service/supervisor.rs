@@ -114,7 +114,7 @@ fn supervise(
     supervisor.stop(CAPTURE, shutdown);
     supervisor.settle(&ended, shutdown)?;
     // Without a pose there is no map; a mapper that is still starting would be waited for in vain.
-    let has_map = options.keeps_map && supervisor.recorder.num_poses() > 0;
+    let has_map = options.keeps_map && supervisor.recorder.recording.num_poses() > 0;
     let mut map = match has_map.then(|| supervisor.final_map(shutdown)).transpose() {
         Ok(map) => map.unwrap_or_default(),
         Err(cause) => {
@@ -138,12 +138,12 @@ fn supervise(
         ended = EndOfRun::Failed(format!("{missing} poses cannot be read back from the journal"));
     }
     if let (EndOfRun::Failed(cause), true, frames @ 1..) =
-        (&mut ended, is_cut, recorder.num_poses())
+        (&mut ended, is_cut, recorder.recording.num_poses())
     {
         let of = if frames == 1 { "frame".to_owned() } else { format!("{frames} frames") };
         let _ = write!(cause, "; the results are of the {of} before");
     }
-    let lost = counters.frames_in.saturating_sub(recorder.num_poses() as u64);
+    let lost = counters.frames_in.saturating_sub(recorder.recording.num_poses() as u64);
     if options.mode == Mode::Lockstep && ended == EndOfRun::Finished && lost > 0 {
         ended = EndOfRun::Failed(format!("{lost} of {} poses did not arrive", counters.frames_in));
     }
@@ -319,14 +319,14 @@ impl<'a> Supervisor<'a> {
         if self.processes[CAPTURE].peer.state() == Some(ProcessState::Stale) {
             return RunProgress::Waiting(cause(capture));
         }
-        if self.recorder.num_poses() == 0 {
+        if self.recorder.recording.num_poses() == 0 {
             return RunProgress::Preparing(capture.progress_done, capture.progress_total);
         }
         RunProgress::Running {
-            frames: self.recorder.num_poses() as u64,
+            frames: self.recorder.recording.num_poses() as u64,
             total: capture.total,
-            state: self.recorder.state(),
-            keyframes: self.recorder.last_step().map_or(0, |step| step.keyframes),
+            state: self.recorder.recording.state,
+            keyframes: self.recorder.last_step.map_or(0, |step| step.keyframes),
         }
     }
 
@@ -490,7 +490,7 @@ impl<'a> Supervisor<'a> {
         [CAPTURE, TRACKER].into_iter().for_each(|index| sums.add(&self.counted(index)));
         RunCounters {
             // Who is killed leaves the count of a moment before.
-            frames_in: sums.frames_in.max(self.recorder.num_poses() as u64),
+            frames_in: sums.frames_in.max(self.recorder.recording.num_poses() as u64),
             restarts: self.restarts(),
             peak_rss_bytes: peaks.sum::<u64>() + peak_rss_bytes().unwrap_or(0),
             ..sums
