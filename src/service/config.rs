@@ -206,9 +206,7 @@ impl Config {
     pub fn load(file: Option<&Path>, settings: &[String]) -> Result<Self, ConfigError> {
         let mut table = Table::new();
         if let Some(path) = file {
-            let text = input_file::read_text(path, MAX_FILE_BYTES)
-                .map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
-            (_, table) = Self::read(&text, &path.display().to_string())?;
+            table = Self::read_table(path)?;
             place_beside(&mut table, path, ["capture", "rig"]);
             place_beside(&mut table, path, ["map", "folder"]);
         }
@@ -220,6 +218,13 @@ impl Config {
             config = Self::from_table(&table, &place)?;
         }
         Ok(config)
+    }
+
+    /// The keys that a file names, none of them below `[expert]`.
+    fn read_table(file: &Path) -> Result<Table, ConfigError> {
+        let text = input_file::read_text(file, MAX_FILE_BYTES)
+            .map_err(|source| ConfigError::Read { path: file.to_owned(), source })?;
+        Ok(Self::read(&text, &file.display().to_string())?.1)
     }
 
     /// What can be set about sources.
