@@ -30,9 +30,6 @@ pub enum MapSessionError {
     /// No thread.
     #[error("cannot start the thread that saves the map ({0})")]
     Thread(std::io::Error),
-    /// The last save failed.
-    #[error("{0}")]
-    Save(String),
 }
 
 /// A map that is used.
@@ -126,7 +123,7 @@ impl MapSession {
         each: &mut dyn FnMut(),
     ) -> Result<(), MapSessionError> {
         let Some(keeper) = &mut self.keeper else { return Ok(()) };
-        keeper.save_all(mapper, each).map_err(MapSessionError::Save)
+        Ok(keeper.save_all(mapper, each)?)
     }
 
     /// Why the last save failed; told once.

@@ -159,8 +159,8 @@ impl MapWriter {
             ..Manifest::new(*camera, self.detail)
         };
         let bytes = manifest.to_bytes();
-        self.write(BEFORE, |before| before.manifest_bytes.clone())?;
-        self.write(MANIFEST, |_| bytes.clone())?;
+        self.write(BEFORE, &self.manifest_bytes)?;
+        self.write(MANIFEST, &bytes)?;
         let before = self.manifest.replace(manifest);
         self.manifest_bytes = bytes;
         self.remove_unlisted(before.as_ref());
@@ -169,18 +169,18 @@ impl MapWriter {
 
     /// The manifest before becomes this one too, at the end: the files of changed keyframes are there once.
     pub fn settle(&mut self) -> Result<(), MapFolderError> {
-        self.write(BEFORE, |now| now.manifest_bytes.clone())?;
+        self.write(BEFORE, &self.manifest_bytes)?;
         self.remove_unlisted(None);
         Ok(())
     }
 
     /// Writes a manifest; an empty one is none.
-    fn write(&self, name: &str, bytes: impl Fn(&Self) -> Vec<u8>) -> Result<(), MapFolderError> {
-        let (path, bytes) = (self.folder.join(name), bytes(self));
+    fn write(&self, name: &str, bytes: &[u8]) -> Result<(), MapFolderError> {
         if bytes.is_empty() {
             return Ok(());
         }
-        write_durably(&path, |to| to.write_all(&bytes))
+        let path = self.folder.join(name);
+        write_durably(&path, |to| to.write_all(bytes))
             .map_err(|source| MapFolderError::Write { path, source })
     }
 
