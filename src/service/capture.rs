@@ -61,14 +61,8 @@ pub fn run(config: &Config, options: &CaptureOptions, shutdown: &Shutdown) -> Re
     if outcome.is_ok() || is_asked {
         shell.position.end_in_order();
     }
-    match &outcome {
-        Ok(()) => {
-            let left_out = shell.refused.text();
-            let cause = left_out.as_deref().unwrap_or("the source has ended");
-            shell.health.enter(ProcessState::Finished, cause);
-        }
-        Err(error) => shell.health.enter(ProcessState::Failed, &error.to_string()),
-    }
+    let left_out = shell.refused.text();
+    shell.health.end(&outcome, left_out.as_deref().unwrap_or("the source has ended"));
     outcome
 }
 

@@ -51,17 +51,12 @@ pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), RunEr
     shell.health.tell_ready();
     let outcome = shell.map_until(shutdown);
     let outcome = outcome.and_then(|()| shell.save_map_folder());
-    match &outcome {
-        Ok(()) => {
-            // A supervisor that did not ask for the end starts another, which continues from the checkpoint.
-            if !is_supervised() {
-                shell.kept.iter_mut().for_each(|kept| kept.end_in_order());
-                GoneOver::forget(&shell.place.loaded_map_path());
-            }
-            shell.health.enter(ProcessState::Finished, "stopped");
-        }
-        Err(error) => shell.health.enter(ProcessState::Failed, &error.to_string()),
+    // A supervisor that did not ask for the end starts another, which continues from the checkpoint.
+    if outcome.is_ok() && !is_supervised() {
+        shell.kept.iter_mut().for_each(|kept| kept.end_in_order());
+        GoneOver::forget(&shell.place.loaded_map_path());
     }
+    shell.health.end(&outcome, "stopped");
     outcome
 }
 

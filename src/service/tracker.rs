@@ -42,10 +42,7 @@ pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), RunEr
     shell.health.enter(ProcessState::Ready, "");
     shell.health.tell_ready();
     let outcome = shell.track_until(shutdown);
-    match &outcome {
-        Ok(()) => shell.health.enter(ProcessState::Finished, "stopped"),
-        Err(error) => shell.health.enter(ProcessState::Failed, &error.to_string()),
-    }
+    shell.health.end(&outcome, "stopped");
     outcome
 }
 
