@@ -98,16 +98,18 @@ impl<'a> Shell<'a> {
 
     fn track_until(&mut self, shutdown: &Shutdown) -> Result<(), RunError> {
         while !shutdown.is_requested() {
-            let mut awaited = self.await_frame(shutdown)?;
+            let mut next = self.await_frame(shutdown)?;
             self.poses.serve_late_joiners();
-            while let Some(frame) = take_or(&mut awaited, || self.next_frame())? {
+            while let Some(frame) = next {
                 self.step(&frame)?;
+                drop(frame);
                 // Frames that take longer than their period leave no pause between them.
                 self.poses.serve_late_joiners();
                 self.health.report();
                 if shutdown.is_requested() {
                     return Ok(());
                 }
+                next = self.next_frame()?;
             }
             self.look_for_silence();
             self.health.report();
@@ -115,8 +117,8 @@ impl<'a> Shell<'a> {
         Ok(())
     }
 
-    /// Sleeps until something happens. Live, where the configuration asks for it, it is awake when the
-    /// next frame is near and looks for it.
+    /// Sleeps until something happens; the frame that has come. Live, where the configuration asks for it, it is awake
+    /// when the next frame is near and looks for it.
     fn await_frame(
         &mut self,
         shutdown: &Shutdown,
@@ -133,7 +135,7 @@ impl<'a> Shell<'a> {
             }
             std::hint::spin_loop();
         }
-        Ok(None)
+        Ok(self.next_frame()?)
     }
 
     /// The oldest frame in lockstep, the newest live.
@@ -296,14 +298,6 @@ impl<'a> Shell<'a> {
         self.health.enter(ProcessState::Running, state_text(estimate.state));
         Ok(())
     }
-}
-
-/// What has come already, else what comes now.
-fn take_or<T, E>(
-    come: &mut Option<T>,
-    next: impl FnOnce() -> Result<Option<T>, E>,
-) -> Result<Option<T>, E> {
-    come.take().map_or_else(next, |come| Ok(Some(come)))
 }
 
 /// A state and its reason, for whoever looks on.
