@@ -93,17 +93,14 @@ pub struct CaptureConfig {
 
 impl Default for CaptureConfig {
     fn default() -> Self {
-        let scheduling = SchedulingParams { priority: 80, ..SchedulingParams::default() };
-        let source = "sim".to_owned();
-        let camera = CameraParams::default();
         Self {
-            source,
+            source: "sim".to_owned(),
             rig: String::new(),
             strict: false,
             connect_timeout_s: 30.0,
             step_timeout_s: 60.0,
-            scheduling,
-            camera,
+            scheduling: SchedulingParams { priority: 80, ..SchedulingParams::default() },
+            camera: CameraParams::default(),
         }
     }
 }
