@@ -60,11 +60,6 @@ impl Position {
     }
 }
 
-/// The run that a supervisor has named to this process; empty where there is none.
-pub fn run_from_environment() -> String {
-    std::env::var(RUN_VARIABLE).unwrap_or_default()
-}
-
 /// Keeps the position of this process, where it can be kept: without a file capture works too.
 #[derive(Debug, Default)]
 pub struct PositionKeeper {
@@ -80,17 +75,12 @@ impl PositionKeeper {
         source: &str,
         rig: Option<&Path>,
     ) -> (Self, Option<Position>) {
-        match mode {
-            Mode::Lockstep => (Self::default(), None),
-            Mode::Live => {
-                Self::open_or_warn(path, position_key(&run_from_environment(), source, rig))
-            }
+        if mode == Mode::Lockstep {
+            return (Self::default(), None);
         }
-    }
-
-    /// Opens the file at `path`; with it the position that a capture of the same key has left there.
-    pub fn open_or_warn(path: &Path, key: u64) -> (Self, Option<Position>) {
-        match PositionFile::open(path, key) {
+        // Empty where no supervisor has named it.
+        let run = std::env::var(RUN_VARIABLE).unwrap_or_default();
+        match PositionFile::open(path, position_key(&run, source, rig)) {
             Ok((file, left)) => (Self { file: Some(file) }, left),
             Err(error) => {
                 let path = path.display();

@@ -107,11 +107,6 @@ impl MapWriter {
         self.manifest.as_ref().map(|manifest| &manifest.camera)
     }
 
-    /// Where it writes.
-    pub fn folder(&self) -> &Path {
-        &self.folder
-    }
-
     /// Writes image and depth of a keyframe, unless they are on the disk as they are. They belong to the map with the
     /// next [`Self::save`].
     pub fn put(&mut self, keyframe: &Keyframe) -> Result<(), MapFolderError> {
