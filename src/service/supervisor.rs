@@ -137,26 +137,23 @@ fn supervise(
     if let (EndOfRun::Finished, missing @ 1..) = (&ended, recorder.take_back()) {
         ended = EndOfRun::Failed(format!("{missing} poses cannot be read back from the journal"));
     }
-    if let (EndOfRun::Failed(cause), true, frames @ 1..) =
-        (&mut ended, is_cut, recorder.recording.num_poses())
-    {
+    let num_poses = recorder.recording.num_poses();
+    if let (EndOfRun::Failed(cause), true, frames @ 1..) = (&mut ended, is_cut, num_poses) {
         let of = if frames == 1 { "frame".to_owned() } else { format!("{frames} frames") };
         let _ = write!(cause, "; the results are of the {of} before");
     }
-    let lost = counters.frames_in.saturating_sub(recorder.recording.num_poses() as u64);
+    let lost = counters.frames_in.saturating_sub(num_poses as u64);
     if options.mode == Mode::Lockstep && ended == EndOfRun::Finished && lost > 0 {
         ended = EndOfRun::Failed(format!("{lost} of {} poses did not arrive", counters.frames_in));
     }
-    let (name, truth) = (options.source.to_string(), source.ground_truth().to_vec());
-    let deadline_ms = config.tracker.deadline_ms;
     let (record, journal) = recorder.into_record(RecordParts {
         mode: if options.mode == Mode::Live { RunMode::Live } else { RunMode::Lockstep },
-        source: name,
+        source: options.source.to_string(),
         map,
-        ground_truth: truth,
+        ground_truth: source.ground_truth().to_vec(),
         depth_scale: DepthScale::MedianRatio,
         is_depth_from_sensor: false,
-        deadline_ms,
+        deadline_ms: config.tracker.deadline_ms,
         counters,
     });
     let record = RunRecord { ended, refused, restart_causes, ..record };
