@@ -105,6 +105,8 @@ const SCHED_IDLE: u32 = 5;
 const SCHED_DEADLINE: u32 = 6;
 /// Threads that are made later do not inherit the policy (linux/sched.h).
 const SCHED_FLAG_RESET_ON_FORK: u64 = 1;
+const NO_FLAGS: libc::c_uint = 0;
+const THIS_THREAD: libc::pid_t = 0;
 
 /// `struct sched_attr` of sched_setattr(2), its first version.
 #[repr(C)]
@@ -199,8 +201,6 @@ fn apply_policy(params: &SchedulingParams) -> Result<(), String> {
 
 fn set_attributes(attributes: SchedAttr) -> std::io::Result<()> {
     let attributes = SchedAttr { size: size_of::<SchedAttr>() as u32, ..attributes };
-    const NO_FLAGS: libc::c_uint = 0;
-    const THIS_THREAD: libc::pid_t = 0;
     // SAFETY: the kernel reads `size` bytes from a struct that is `#[repr(C)]` and of that size.
     let result = unsafe {
         libc::syscall(
@@ -216,8 +216,6 @@ fn set_attributes(attributes: SchedAttr) -> std::io::Result<()> {
 /// The scheduling of the calling thread, as the kernel tells it.
 pub fn in_force() -> InForce {
     let mut attributes = SchedAttr::default();
-    const NO_FLAGS: libc::c_uint = 0;
-    const THIS_THREAD: libc::pid_t = 0;
     let size = size_of::<SchedAttr>() as libc::c_uint;
     // SAFETY: the kernel writes at most `size` bytes to a struct of that size whose every bit pattern is
     // valid.
