@@ -235,7 +235,7 @@ pub fn configuration(bytes: &[u8]) {
 
 /// A map file or checkpoint.
 pub fn map(bytes: &[u8]) {
-    let Ok(map) = parse_map(Path::new("map"), bytes) else { return };
+    let Ok(map) = parse_map(bytes) else { return };
     for keyframe in &map.keyframes {
         assert!(keyframe.intrinsics.is_valid() && keyframe.world_from_keyframe.is_valid());
     }

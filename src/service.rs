@@ -4,6 +4,7 @@ pub mod adjustments;
 pub mod alignment_stamps;
 pub mod atomic_file;
 pub(crate) mod budget;
+pub(crate) mod bytes;
 pub(crate) mod capture;
 pub(crate) mod checkpoint;
 pub mod child;

@@ -10,9 +10,10 @@ use crate::capture::source_error::SourceError;
 use crate::capture::source_name::SourceName;
 use crate::command::print::note;
 use crate::command::{CommandResult, INTERRUPTED};
-use crate::service::capture::{CaptureError, CaptureOptions, run as run_shell};
+use crate::service::capture::{CaptureOptions, run as run_shell};
 use crate::service::config::{CaptureConfig, Config};
 use crate::service::mode::Mode;
+use crate::service::run_error::RunError;
 use crate::service::shutdown::Shutdown;
 
 /// Send frames from a source into shared memory
@@ -113,7 +114,7 @@ pub fn run(config: &Config, arguments: CaptureArguments) -> CommandResult {
     let options = CaptureOptions { source, rig, mode };
     match run_shell(&config, &options, &shutdown) {
         Ok(()) => Ok(ExitCode::SUCCESS),
-        Err(CaptureError::Interrupted) => Ok(ExitCode::from(INTERRUPTED)),
+        Err(RunError::Interrupted) => Ok(ExitCode::from(INTERRUPTED)),
         Err(error) => Err(error.into()),
     }
 }

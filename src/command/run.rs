@@ -24,9 +24,9 @@ use crate::service::journal::Journal;
 use crate::service::journal::folder::unfinished;
 use crate::service::mode::Mode;
 use crate::service::results::output_folder::OutputFolder;
-use crate::service::results::record::RunMode;
+use crate::service::results::record::{EndOfRun, RunMode};
 use crate::service::shutdown::Shutdown;
-use crate::service::supervisor::{Ended, RunOptions, RunOutcome, run as supervise};
+use crate::service::supervisor::{RunOptions, RunOutcome, run as supervise};
 use crate::service::view_child::{ViewChild, ViewOptions};
 use crate::wire::limits::raise_open_files;
 use crate::wire::place::Place;
@@ -100,7 +100,7 @@ pub fn run(
     };
     let page = arguments.view.map(|at| start_page(at, common, &place, log)).transpose()?;
     let mut outcome = supervise_shown(config, &options, &shutdown, page, arguments.json)?;
-    if outcome.record.poses.is_empty() && outcome.ended != Ended::Finished {
+    if outcome.record.poses.is_empty() && outcome.record.ended != EndOfRun::Finished {
         return end_without_results(outcome);
     }
     let ending = Ending { output: &output, config, json: arguments.json, write_more: &|_| Ok(()) };
@@ -146,7 +146,7 @@ fn supervise_shown(
 /// Ends a run that came to its end before the first pose: there is nothing that could be lost.
 fn end_without_results(outcome: RunOutcome) -> CommandResult {
     drop(outcome.journal.map(Journal::finish));
-    let Ended::Failed(cause) = outcome.ended else {
+    let EndOfRun::Failed(cause) = outcome.record.ended else {
         note("interrupted before the first pose: there are no results");
         return Ok(ExitCode::from(INTERRUPTED));
     };

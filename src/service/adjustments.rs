@@ -8,9 +8,10 @@ mod thread;
 
 use std::io;
 use std::os::fd::BorrowedFd;
+use std::sync::mpsc::RecvTimeoutError;
 use std::time::{Duration, Instant};
 
-use crate::service::adjustments::thread::{AdjustmentThread, Finished, Missing, Optimise};
+use crate::service::adjustments::thread::{AdjustmentThread, Optimise};
 use crate::service::schedule::Background;
 use crate::slam::keyframe::MapState;
 use crate::slam::loops::SearchReport;
@@ -112,9 +113,11 @@ impl Adjustments {
         })
     }
 
-    /// Readable when an estimate is ready: then [`Adjustments::pick_up`].
+    /// Readable when an estimate is ready: then [`Adjustments::pick_up`]. None where that lets nothing in, and a wait for
+    /// it would end at once again and again.
     pub fn descriptor(&self) -> Option<BorrowedFd<'_>> {
-        self.thread.as_ref().map(AdjustmentThread::descriptor)
+        let thread = self.thread.as_ref().filter(|_| self.entry == Entry::WhenReady);
+        thread.map(AdjustmentThread::descriptor)
     }
 
     /// What is over since the last call.
@@ -158,45 +161,26 @@ impl Adjustments {
     /// After the last frame: lets in what is away, then estimates all keyframes once more, aligns the last frames again
     /// and refines the depth of the keyframes. It is waited for; live, where something else may have the CPU, not for long.
     pub fn finish(&mut self, mapper: &mut Mapper) -> StepOutcome {
-        let deadline = Instant::now() + LAST_ADJUSTMENTS;
-        let entry = self.entry;
-        let may_go_on = || match entry {
-            Entry::AfterFrames(_) => true,
-            Entry::WhenReady => Instant::now() < deadline,
-        };
-        let mut outcome = self.let_all_in(mapper, deadline);
-        while may_go_on() {
+        let is_live = self.entry == Entry::WhenReady;
+        let deadline = is_live.then(|| Instant::now() + LAST_ADJUSTMENTS);
+        let left =
+            || deadline.map_or(Duration::MAX, |end| end.saturating_duration_since(Instant::now()));
+        let mut outcome = StepOutcome::default();
+        outcome = joined(outcome, self.let_in_within(mapper, left()));
+        while !left().is_zero() {
             self.begin_with(mapper, Mapper::begin_last_search);
             if self.away.is_none() {
                 break;
             }
-            outcome = joined(outcome, self.let_all_in(mapper, deadline));
+            outcome = joined(outcome, self.let_in_within(mapper, left()));
         }
         self.begin_with(mapper, Mapper::begin_last_adjustment);
-        outcome = joined(outcome, self.let_all_in(mapper, deadline));
-        while may_go_on() && mapper.refine_depth() {
+        outcome = joined(outcome, self.let_in_within(mapper, left()));
+        while !left().is_zero() && mapper.refine_depth() {
             outcome.graph_changed = true;
         }
         mapper.keep_confirmed();
         outcome
-    }
-
-    /// Lets in what is away.
-    fn let_all_in(&mut self, mapper: &mut Mapper, deadline: Instant) -> StepOutcome {
-        let mut outcome = StepOutcome::default();
-        loop {
-            let (Some(away), Some(thread)) = (self.away, &self.thread) else { return outcome };
-            let back = match self.entry {
-                Entry::AfterFrames(_) => thread.wait(),
-                Entry::WhenReady => {
-                    thread.wait_at_most(deadline.saturating_duration_since(Instant::now()))
-                }
-            };
-            if back.as_ref().is_err_and(|missing| *missing == Missing::Unfinished) {
-                return outcome;
-            }
-            outcome = joined(outcome, self.end(mapper, &away, back));
-        }
     }
 
     /// The mapper is replaced by one for another camera: what is away is of no use to that.
@@ -230,35 +214,33 @@ impl Adjustments {
 
     /// Lets in what is due.
     fn let_in(&mut self, mapper: &mut Mapper) -> StepOutcome {
+        let timeout = match (self.entry, &self.away) {
+            (Entry::AfterFrames(frames), Some(away))
+                if self.frames < away.began.saturating_add(frames) =>
+            {
+                return StepOutcome::default();
+            }
+            (Entry::AfterFrames(_), _) => Duration::MAX,
+            (Entry::WhenReady, _) => Duration::ZERO,
+        };
+        self.let_in_within(mapper, timeout)
+    }
+
+    /// Lets in what is away, where it comes back within `timeout`.
+    fn let_in_within(&mut self, mapper: &mut Mapper, timeout: Duration) -> StepOutcome {
         let (Some(away), Some(thread)) = (self.away, &self.thread) else {
             return StepOutcome::default();
         };
-        let back = match self.entry {
-            Entry::AfterFrames(frames) if self.frames < away.began.saturating_add(frames) => {
-                Err(Missing::Unfinished)
-            }
-            Entry::AfterFrames(_) => thread.wait(),
-            Entry::WhenReady => thread.poll(),
-        };
-        self.end(mapper, &away, back)
-    }
-
-    fn end(
-        &mut self,
-        mapper: &mut Mapper,
-        away: &Away,
-        back: Result<Finished, Missing>,
-    ) -> StepOutcome {
-        let mut finished = match back {
+        let mut finished = match thread.wait_at_most(timeout) {
             Ok(finished) => finished,
-            Err(Missing::Unfinished) => return StepOutcome::default(),
-            Err(Missing::Ended) => {
+            Err(RecvTimeoutError::Timeout) => return StepOutcome::default(),
+            Err(RecvTimeoutError::Disconnected) => {
                 self.give_up();
                 return StepOutcome::default();
             }
         };
         self.away = None;
-        let fate = fate(mapper, away);
+        let fate = fate(mapper, &away);
         if let Some(report) = finished.window.take_search() {
             let (sequence, nanos) = (self.sequence, finished.nanos);
             self.searches.push(SearchRecord { sequence, nanos, report });

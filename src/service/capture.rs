@@ -15,15 +15,13 @@ use crate::service::mode::Mode;
 use crate::service::peers::Peer;
 use crate::service::position::{Position, PositionKeeper, Predecessor};
 use crate::service::refused_images::RefusedImages;
-use crate::service::schedule::{apply, in_force};
+use crate::service::run_error::RunError;
+use crate::service::schedule::apply;
 use crate::service::shutdown::Shutdown;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::wire::message::{FrameHeader, HealthMessage, PoseMessage, StepMessage};
 use crate::wire::place::{Claim, Place};
-use crate::wire::place_error::PlaceError;
-use crate::wire::port::{
-    Access, Hub, OpenError, Publisher, ReceiveError, SendError, Subscriber, WaitError, wait,
-};
+use crate::wire::port::{Access, Hub, Publisher, Subscriber, wait};
 use crate::wire::topic::{
     CAPTURE_HEALTH, FRAME, MAPPER_HEALTH, POSE, STEP, TRACKER_HEALTH, shared_memory_bytes,
 };
@@ -47,83 +45,24 @@ pub struct CaptureOptions {
     pub mode: Mode,
 }
 
-/// Why capture ends early.
-#[derive(Debug, thiserror::Error)]
-pub enum CaptureError {
-    /// The place is not right, or taken.
-    #[error(transparent)]
-    Place(#[from] PlaceError),
-    /// A topic cannot be opened.
-    #[error(transparent)]
-    Open(#[from] OpenError),
-    /// The source cannot be opened, or gave no frame.
-    #[error(transparent)]
-    Source(#[from] SourceError),
-    /// A frame cannot be sent.
-    #[error(transparent)]
-    Send(#[from] SendError),
-    /// The others cannot be heard.
-    #[error(transparent)]
-    Receive(#[from] ReceiveError),
-    /// Waiting failed.
-    #[error(transparent)]
-    Wait(#[from] WaitError),
-    /// Size and intrinsics of no camera.
-    #[error("{0}: its size and intrinsics are not those of a camera; check its camera file or rig")]
-    Intrinsics(SourceName),
-    /// A process that must be there is not.
-    #[error(
-        "{process} was not ready within {seconds} s; start it, or raise capture.connect_timeout_s"
-    )]
-    NotReady {
-        /// Which.
-        process: &'static str,
-        /// How long was waited.
-        seconds: f64,
-    },
-    /// The map does not take in a frame.
-    #[error(
-        "the mapper did not finish frame {sequence} within {seconds} s; raise capture.step_timeout_s if it is just slow"
-    )]
-    NoStep {
-        /// Which frame.
-        sequence: u64,
-        /// How long was waited.
-        seconds: f64,
-    },
-    /// A signal, before the end.
-    #[error("interrupted")]
-    Interrupted,
-}
-
 /// Runs the process to the end of the source or to the signal.
-pub fn run(
-    config: &Config,
-    options: &CaptureOptions,
-    shutdown: &Shutdown,
-) -> Result<(), CaptureError> {
+pub fn run(config: &Config, options: &CaptureOptions, shutdown: &Shutdown) -> Result<(), RunError> {
     let mut shell = Shell::prepare(config, options, shutdown)?;
     let outcome = shell.prepare_source().and_then(|()| {
         // After the preparation: rendering a simulated world has no deadline.
         let refusals = apply(&config.capture.scheduling);
         refusals.iter().for_each(|refusal| tracing::warn!("capture: {refusal}"));
-        shell.health.tell_scheduling(&in_force(), &refusals);
+        shell.health.tell_scheduling(&refusals);
         shell.health.tell_ready();
         shell.stream()
     });
     // A supervisor that did not ask for the end starts another, which continues from here.
-    let is_asked = matches!(outcome, Err(CaptureError::Interrupted)) && !is_supervised();
+    let is_asked = matches!(outcome, Err(RunError::Interrupted)) && !is_supervised();
     if outcome.is_ok() || is_asked {
         shell.position.end_in_order();
     }
-    match &outcome {
-        Ok(()) => {
-            let left_out = shell.refused.text();
-            let cause = left_out.as_deref().unwrap_or("the source has ended");
-            shell.health.enter(ProcessState::Finished, cause);
-        }
-        Err(error) => shell.health.enter(ProcessState::Failed, &error.to_string()),
-    }
+    let left_out = shell.refused.text();
+    shell.health.end(&outcome, left_out.as_deref().unwrap_or("the source has ended"));
     outcome
 }
 
@@ -173,7 +112,7 @@ impl<'a> Shell<'a> {
         config: &'a Config,
         options: &CaptureOptions,
         shutdown: &'a Shutdown,
-    ) -> Result<Self, CaptureError> {
+    ) -> Result<Self, RunError> {
         if options.source.is_camera() && options.mode == Mode::Lockstep {
             let reason = "a camera does not wait for the map; leave out --lockstep".to_owned();
             return Err(SourceError::Stream { name: options.source.to_string(), reason }.into());
@@ -185,7 +124,7 @@ impl<'a> Shell<'a> {
         }
         let intrinsics = source.intrinsics();
         if !intrinsics.is_valid() {
-            return Err(CaptureError::Intrinsics(options.source.clone()));
+            return Err(RunError::Intrinsics(options.source.clone()));
         }
         let place = Place::new(&config.instance, &config.root)?;
         let claim = place.claim("capture")?;
@@ -230,7 +169,7 @@ impl<'a> Shell<'a> {
     }
 
     /// Everything that must be over before the first frame: rendering, and tracker and mapper.
-    fn prepare_source(&mut self) -> Result<(), CaptureError> {
+    fn prepare_source(&mut self) -> Result<(), RunError> {
         self.health.enter(ProcessState::Preparing, "");
         if let Some(file) = prepared_frames()
             && let Err(error) = self.source.keep_prepared_in(file)
@@ -259,7 +198,7 @@ impl<'a> Shell<'a> {
                 return Ok(());
             };
             if now_nanos() > deadline {
-                return Err(CaptureError::NotReady { process: missing.name(), seconds });
+                return Err(RunError::NotReady { process: missing.name(), seconds });
             }
             self.pause(Duration::from_millis(10))?;
         }
@@ -267,7 +206,7 @@ impl<'a> Shell<'a> {
 
     /// Where another capture has died: a recording continues behind its last frame, and a camera's
     /// numbers behind its last number. Neither sequences nor stamps go back.
-    fn go_on_after_another(&mut self) -> Result<(), CaptureError> {
+    fn go_on_after_another(&mut self) -> Result<(), RunError> {
         if let Some(left) = self.left {
             self.predecessor.last_nanos = Some(left.capture_nanos);
             return self.go_on_behind(left.sequence);
@@ -284,7 +223,7 @@ impl<'a> Shell<'a> {
         Ok(())
     }
 
-    fn go_on_behind(&mut self, sequence: u64) -> Result<(), CaptureError> {
+    fn go_on_behind(&mut self, sequence: u64) -> Result<(), RunError> {
         if self.is_recorded() {
             self.source.skip_to(sequence)?;
         } else {
@@ -296,7 +235,7 @@ impl<'a> Shell<'a> {
     }
 
     /// Frame after frame.
-    fn stream(&mut self) -> Result<(), CaptureError> {
+    fn stream(&mut self) -> Result<(), RunError> {
         loop {
             if self.await_frame()? {
                 match self.send_next()? {
@@ -313,7 +252,7 @@ impl<'a> Shell<'a> {
     }
 
     /// Waits for the next frame, for a moment; whether there is one. An absent camera is a state.
-    fn await_frame(&mut self) -> Result<bool, CaptureError> {
+    fn await_frame(&mut self) -> Result<bool, RunError> {
         let millis = WAKE_PERIOD.as_millis() as u32;
         let arrival = self.source.await_frame(self.shutdown.descriptor(), millis)?;
         while let Some(notice) = self.source.take_notice() {
@@ -323,7 +262,7 @@ impl<'a> Shell<'a> {
             }
         }
         if self.shutdown.is_requested() {
-            return Err(CaptureError::Interrupted);
+            return Err(RunError::Interrupted);
         }
         match arrival {
             Arrival::Frame => {
@@ -361,7 +300,7 @@ impl<'a> Shell<'a> {
     }
 
     /// Reads the next frame into shared memory and sends it when it is due.
-    fn send_next(&mut self) -> Result<Sent, CaptureError> {
+    fn send_next(&mut self) -> Result<Sent, RunError> {
         let _span = tracing::trace_span!("frame").entered();
         let mut loan = self.frames.loan(self.intrinsics.width * self.intrinsics.height)?;
         let mut stamp = match self.source.next_into(loan.bytes_mut()) {
@@ -382,7 +321,7 @@ impl<'a> Shell<'a> {
             return Ok(Sent::Nothing);
         }
         if self.shutdown.is_requested() {
-            return Err(CaptureError::Interrupted);
+            return Err(RunError::Interrupted);
         }
         let clock_nanos = match self.mode {
             Mode::Live if stamp.clocks.is_some() => {
@@ -449,7 +388,7 @@ impl<'a> Shell<'a> {
     }
 
     /// Lockstep: waits until the frame is in the map.
-    fn await_step(&mut self, sequence: u64) -> Result<(), CaptureError> {
+    fn await_step(&mut self, sequence: u64) -> Result<(), RunError> {
         let seconds = self.config.capture.step_timeout_s;
         let deadline = now_nanos().saturating_add((seconds * 1e9) as i64);
         loop {
@@ -459,18 +398,18 @@ impl<'a> Shell<'a> {
                 }
             }
             if now_nanos() > deadline {
-                return Err(CaptureError::NoStep { sequence, seconds });
+                return Err(RunError::NoStep { sequence, seconds });
             }
             self.pause(WAKE_PERIOD)?;
         }
     }
 
     /// Sleeps until a step, a signal or the end of `period`.
-    fn pause(&mut self, period: Duration) -> Result<(), CaptureError> {
+    fn pause(&mut self, period: Duration) -> Result<(), RunError> {
         wait(&[self.steps.events()], Some(self.shutdown.descriptor()), period)?;
         self.frames.serve_late_joiners();
         self.health.report();
-        if self.shutdown.is_requested() { Err(CaptureError::Interrupted) } else { Ok(()) }
+        if self.shutdown.is_requested() { Err(RunError::Interrupted) } else { Ok(()) }
     }
 }
 
@@ -481,15 +420,11 @@ fn count(counters: &mut HealthMessage, next_sequence: &mut Option<u64>, stamp: &
 }
 
 /// Sleeps until `due_nanos`.
-fn wait_until(
-    due_nanos: i64,
-    shutdown: &Shutdown,
-    health: &mut Health,
-) -> Result<(), CaptureError> {
+fn wait_until(due_nanos: i64, shutdown: &Shutdown, health: &mut Health) -> Result<(), RunError> {
     loop {
         let left = duration_from_nanos(due_nanos - now_nanos());
         if shutdown.is_requested() {
-            return Err(CaptureError::Interrupted);
+            return Err(RunError::Interrupted);
         }
         if left.is_zero() {
             return Ok(());

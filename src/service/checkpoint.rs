@@ -174,12 +174,8 @@ impl Drop for Checkpoint {
 }
 
 /// It holds images: for the user of the process alone.
-fn write(path: &Path, map: &Map) -> io::Result<()> {
-    write_privately(path, |file| write_map_into(file, map))
-}
-
 fn write_or_warn(path: &Path, map: &Map) {
-    if let Err(error) = write(path, map) {
+    if let Err(error) = write_privately(path, |file| write_map_into(file, map)) {
         tracing::warn!(
             "{}: cannot write the checkpoint ({error}); a restarted mapper would begin a new map",
             path.display()

@@ -2,12 +2,12 @@
 
 use std::ffi::OsString;
 use std::fs::File;
-use std::io::{self, BufRead, BufReader, Write};
+use std::io::{self, BufRead, BufReader, Read, Write};
 use std::os::fd::AsFd;
 use std::os::unix::process::CommandExt;
 use std::path::Path;
-use std::process::{ChildStderr, Command, ExitStatus, Stdio};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::process::{Command, ExitStatus, Stdio};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -15,11 +15,13 @@ use rustix::fs::MemfdFlags;
 use rustix::process::{Pid, Signal};
 
 use crate::capture::source_name::SourceName;
+use crate::service::clock::wait_at_most;
 use crate::service::error_log::ErrorLog;
 use crate::service::liveness::{Liveness, is_ending};
 use crate::service::manager_notice::VARIABLES;
 use crate::service::mode::Mode;
 use crate::service::position::RUN_VARIABLE;
+use crate::wire::folders::ROOT_VARIABLE;
 use crate::wire::place::Place;
 
 /// Environment variable with the process id of the supervisor.
@@ -33,8 +35,6 @@ pub const ERROR_PREFIX: &str = "error: ";
 const LONGEST_DEATH: Duration = Duration::from_secs(2);
 /// How long after a process's end its last words are waited for: somebody else may hold its standard error.
 const LAST_WORDS: Duration = Duration::from_secs(1);
-/// Pause between two looks at either.
-const LOOK_PAUSE: Duration = Duration::from_millis(2);
 
 /// Why a supervised process must not start.
 #[derive(Debug, thiserror::Error)]
@@ -111,8 +111,7 @@ pub struct Child {
 }
 
 impl Child {
-    /// Starts the subcommand `name` of this binary, in a process group of its own, so that a Ctrl-C
-    /// at the terminal reaches only the supervisor. `run` names the run that it belongs to; `frames`
+    /// Starts the subcommand `name` of this binary. `run` names the run that it belongs to; `frames`
     /// is where it keeps frames that it prepares; its log goes to `log`.
     pub fn start(
         name: &'static str,
@@ -123,32 +122,23 @@ impl Child {
         log: &ErrorLog,
     ) -> io::Result<Self> {
         let frames = frames.map(File::try_clone).transpose()?;
-        let mut command = Command::new(std::env::current_exe()?);
-        // The service manager knows the supervisor, not its children.
-        for variable in VARIABLES {
-            command.env_remove(variable);
-        }
-        let mut process = command
+        let mut process = command(&std::env::current_exe()?, root)
             .arg(name)
             .args(arguments)
-            .env(SUPERVISOR_VARIABLE, std::process::id().to_string())
-            .env(crate::wire::folders::ROOT_VARIABLE, root)
             .env(RUN_VARIABLE, run)
             .env(FRAMES_VARIABLE, if frames.is_some() { FRAMES_ON_STDIN } else { "" })
             .stdin(frames.map_or_else(Stdio::null, Stdio::from))
-            .stdout(Stdio::null())
-            .stderr(Stdio::piped())
-            .process_group(0)
             .spawn()?;
         let fault = Arc::new(Mutex::new(None));
-        let reader = match process.stderr.take() {
-            None => None,
-            Some(stderr) => {
-                let (fault, log) = (Arc::clone(&fault), log.clone());
-                let thread = std::thread::Builder::new().name(format!("semidense-{name}-log"));
-                Some(thread.spawn(move || forward(stderr, &fault, log))?)
-            }
+        let (last_error, mut log) = (Arc::clone(&fault), log.clone());
+        // Its error is kept for the supervisor's own last line.
+        let take = move |line: &str| match line.strip_prefix(ERROR_PREFIX) {
+            Some(error) => *locked(&last_error) = Some(error.to_owned()),
+            None => drop(log.write_all(format!("{line}\n").as_bytes())),
         };
+        let log_name = format!("semidense-{name}-log");
+        let reader = process.stderr.take().map(|stderr| forward_lines(&log_name, stderr, take));
+        let reader = reader.transpose()?;
         Ok(Self { name, process, started: Instant::now(), fault, reader })
     }
 
@@ -191,7 +181,7 @@ impl Child {
         if let Some(reader) = self.reader.take() {
             wait_at_most(LAST_WORDS, || reader.is_finished());
         }
-        self.fault.lock().unwrap_or_else(PoisonError::into_inner).take()
+        locked(&self.fault).take()
     }
 }
 
@@ -201,23 +191,37 @@ impl Drop for Child {
     }
 }
 
-/// Looks again and again whether something is over, at most for `longest`.
-fn wait_at_most(longest: Duration, mut is_over: impl FnMut() -> bool) {
-    let start = Instant::now();
-    while !is_over() && start.elapsed() < longest {
-        std::thread::sleep(LOOK_PAUSE);
-    }
+fn locked(fault: &Mutex<Option<String>>) -> MutexGuard<'_, Option<String>> {
+    fault.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Passes a child's log on; its error is kept for the supervisor's own last line.
-fn forward(stderr: ChildStderr, fault: &Mutex<Option<String>>, mut log: ErrorLog) {
-    for line in BufReader::new(stderr).split(b'\n').map_while(Result::ok) {
-        let line = String::from_utf8_lossy(&line);
-        match line.strip_prefix(ERROR_PREFIX) {
-            Some(error) => {
-                *fault.lock().unwrap_or_else(PoisonError::into_inner) = Some(error.to_owned());
-            }
-            None => drop(log.write_all(format!("{line}\n").as_bytes())),
-        }
+/// What starts a process for the instance in the folder `root`: in a process group of its own, so that a Ctrl-C at the
+/// terminal reaches only this process.
+pub fn command(program: &Path, root: &Path) -> Command {
+    let mut command = Command::new(program);
+    // The service manager knows this process, not its children.
+    for variable in VARIABLES {
+        command.env_remove(variable);
     }
+    command
+        .env(SUPERVISOR_VARIABLE, std::process::id().to_string())
+        .env(ROOT_VARIABLE, root)
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(Stdio::piped())
+        .process_group(0);
+    command
+}
+
+/// Hands on every line that comes, from a thread of its own.
+pub fn forward_lines(
+    name: &str,
+    from: impl Read + Send + 'static,
+    mut take: impl FnMut(&str) + Send + 'static,
+) -> io::Result<JoinHandle<()>> {
+    std::thread::Builder::new().name(name.to_owned()).spawn(move || {
+        for line in BufReader::new(from).split(b'\n').map_while(Result::ok) {
+            take(&String::from_utf8_lossy(&line));
+        }
+    })
 }

@@ -1,6 +1,6 @@
 //! The process's clock, and the pace of a recording that is played live.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use rustix::time::{ClockId, clock_gettime};
 
@@ -38,6 +38,20 @@ pub fn realtime_of(clock_nanos: i64) -> i64 {
 /// `nanos` as a duration, nothing where it is negative.
 pub fn duration_from_nanos(nanos: i64) -> Duration {
     Duration::from_nanos(u64::try_from(nanos).unwrap_or(0))
+}
+
+/// Looks again and again whether something is over, at most for `longest`; whether it is.
+pub fn wait_at_most(longest: Duration, mut is_over: impl FnMut() -> bool) -> bool {
+    /// Between two looks.
+    const PAUSE: Duration = Duration::from_millis(2);
+    let start = Instant::now();
+    while !is_over() {
+        if start.elapsed() >= longest {
+            return false;
+        }
+        std::thread::sleep(PAUSE);
+    }
+    true
 }
 
 /// Says when a recorded frame is due: as long after the first as its stamp says.

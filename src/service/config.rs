@@ -93,17 +93,14 @@ pub struct CaptureConfig {
 
 impl Default for CaptureConfig {
     fn default() -> Self {
-        let scheduling = SchedulingParams { priority: 80, ..SchedulingParams::default() };
-        let source = "sim".to_owned();
-        let camera = CameraParams::default();
         Self {
-            source,
+            source: "sim".to_owned(),
             rig: String::new(),
             strict: false,
             connect_timeout_s: 30.0,
             step_timeout_s: 60.0,
-            scheduling,
-            camera,
+            scheduling: SchedulingParams { priority: 80, ..SchedulingParams::default() },
+            camera: CameraParams::default(),
         }
     }
 }
@@ -206,9 +203,7 @@ impl Config {
     pub fn load(file: Option<&Path>, settings: &[String]) -> Result<Self, ConfigError> {
         let mut table = Table::new();
         if let Some(path) = file {
-            let text = input_file::read_text(path, MAX_FILE_BYTES)
-                .map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
-            (_, table) = Self::read(&text, &path.display().to_string())?;
+            table = Self::read_table(path)?;
             place_beside(&mut table, path, ["capture", "rig"]);
             place_beside(&mut table, path, ["map", "folder"]);
         }
@@ -220,6 +215,13 @@ impl Config {
             config = Self::from_table(&table, &place)?;
         }
         Ok(config)
+    }
+
+    /// The keys that a file names, none of them below `[expert]`.
+    fn read_table(file: &Path) -> Result<Table, ConfigError> {
+        let text = input_file::read_text(file, MAX_FILE_BYTES)
+            .map_err(|source| ConfigError::Read { path: file.to_owned(), source })?;
+        Ok(Self::read(&text, &file.display().to_string())?.1)
     }
 
     /// What can be set about sources.

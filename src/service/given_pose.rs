@@ -48,21 +48,18 @@ pub fn given_pose(
         estimate.keyframe_id = keyframe.keyframe_id;
         estimate.keyframe_from_camera = keyframe.world_from_keyframe.locate(&world_from_camera);
         estimate.map_from_camera = keyframe.map_from_keyframe.place(&estimate.keyframe_from_camera);
-        let view = view_of(keyframe, &estimate.keyframe_from_camera, tracker);
-        estimate.quality = view.quality;
-        estimate.proposes_keyframe = view.proposes_keyframe;
+        (estimate.quality, estimate.proposes_keyframe) =
+            view_of(keyframe, &estimate.keyframe_from_camera, tracker);
     }
     Some(estimate)
 }
 
-/// How a camera sees a keyframe's points.
-struct View {
-    quality: Quality,
-    proposes_keyframe: bool,
-}
-
-/// What a tracker would find out about the view.
-fn view_of(keyframe: &Keyframe, keyframe_from_camera: &SE3, tracker: &TrackerParams) -> View {
+/// What a tracker would find out about the view of a keyframe's points, and whether it would propose another one.
+fn view_of(
+    keyframe: &Keyframe,
+    keyframe_from_camera: &SE3,
+    tracker: &TrackerParams,
+) -> (Quality, bool) {
     let k = keyframe.intrinsics;
     let camera_from_keyframe = keyframe_from_camera.inverse();
     let rotation = camera_from_keyframe.rotation_matrix();
@@ -87,17 +84,15 @@ fn view_of(keyframe: &Keyframe, keyframe_from_camera: &SE3, tracker: &TrackerPar
     let in_view_ratio = f64::from(in_view) / points;
     let translation = keyframe_from_camera.translation.norm() * inverse_depths / points;
     let distance = tracker.keyframe_distance().distance(translation, in_view_ratio);
-    View {
-        quality: Quality {
-            in_view_ratio,
-            inlier_ratio: 1.0,
-            whitened_rmse: 1.0,
-            points: in_view,
-            mean_squared_flow: squared_flow / f64::from(in_view.max(1)),
-            ..Quality::default()
-        },
-        proposes_keyframe: distance > 1.0,
-    }
+    let quality = Quality {
+        in_view_ratio,
+        inlier_ratio: 1.0,
+        whitened_rmse: 1.0,
+        points: in_view,
+        mean_squared_flow: squared_flow / f64::from(in_view.max(1)),
+        ..Quality::default()
+    };
+    (quality, distance > 1.0)
 }
 
 #[cfg(test)]

@@ -3,7 +3,8 @@
 use crate::service::adjustments::{AdjustmentRecord, Fate};
 use crate::service::clock::now_nanos;
 use crate::service::manager_notice::ManagerNotice;
-use crate::service::schedule::{InForce, Policy, Refusal, peak_rss_bytes};
+use crate::service::run_error::RunError;
+use crate::service::schedule::{Policy, in_force, peak_rss_bytes};
 use crate::slam::loops::SearchFate;
 use crate::wire::command::{text_bytes, text_from_bytes};
 use crate::wire::message::{HISTOGRAM_BUCKETS, HealthMessage, TEXT_BYTES};
@@ -146,13 +147,8 @@ pub fn scheduling_name(code: u32) -> &'static str {
     }
 }
 
-/// A state with its cause, as a process has said it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct StateAndCause {
-    state: u32,
-    cause: [u8; TEXT_BYTES],
-    cause_bytes: u32,
-}
+/// A state with its cause and the bytes of that, as a process has said it.
+pub type StateAndCause = (u32, [u8; TEXT_BYTES], u32);
 
 /// Counts, and publishes when it is time: to everybody who subscribes, and to the service manager.
 #[derive(Debug)]
@@ -245,27 +241,33 @@ impl Health {
         self.report();
     }
 
-    /// Says what the kernel does for this process and what it refused; the first refusal as a text.
-    pub fn tell_scheduling(&mut self, in_force: &InForce, refusals: &[Refusal]) {
-        let warning = refusals.first().map_or(String::new(), Refusal::to_string);
+    /// Says what the kernel does for the calling thread and what it refused; the first refusal as a text.
+    pub fn tell_scheduling(&mut self, refusals: &[String]) {
+        let in_force = in_force();
         self.message.scheduling = scheduling_code(in_force.policy);
         self.message.priority = in_force.priority;
         self.message.memory_locked = u32::from(in_force.memory_locked);
-        (self.message.warning, self.message.warning_bytes) = text_bytes(&warning);
-        self.changed = true;
-        self.report();
+        self.warn(refusals.first().map_or("", String::as_str));
     }
 
     /// Enters a state; the next report goes out at once.
     pub fn enter(&mut self, state: ProcessState, cause: &str) {
         let (cause, cause_bytes) = text_bytes(cause);
-        self.go_back_to(StateAndCause { state: state.code(), cause, cause_bytes });
+        self.go_back_to((state.code(), cause, cause_bytes));
+    }
+
+    /// Says how the process has ended: in order, for this cause, or with an error.
+    pub fn end(&mut self, outcome: &Result<(), RunError>, cause: &str) {
+        match outcome {
+            Ok(()) => self.enter(ProcessState::Finished, cause),
+            Err(error) => self.enter(ProcessState::Failed, &error.to_string()),
+        }
     }
 
     /// The state that was entered last.
     pub fn entered(&self) -> StateAndCause {
         let HealthMessage { state, cause, cause_bytes, .. } = self.message;
-        StateAndCause { state, cause, cause_bytes }
+        (state, cause, cause_bytes)
     }
 
     /// Enters a state that [`Health::entered`] has given.
@@ -273,9 +275,7 @@ impl Health {
         if wanted == self.entered() {
             return;
         }
-        let StateAndCause { state, cause, cause_bytes } = wanted;
-        (self.message.state, self.message.cause, self.message.cause_bytes) =
-            (state, cause, cause_bytes);
+        (self.message.state, self.message.cause, self.message.cause_bytes) = wanted;
         self.changed = true;
         self.report();
     }

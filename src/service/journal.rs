@@ -24,6 +24,7 @@ use std::time::{Duration, Instant};
 
 use crossbeam::channel::{SendTimeoutError, Sender, TrySendError, bounded};
 
+use crate::service::clock::wait_at_most;
 use crate::service::journal::folder::{Pointer, begin_folder, hold, remove_folder};
 use crate::service::journal::log::{Record, RunStart, log_header, read_log};
 use crate::service::journal::recovered::read_map_of;
@@ -44,8 +45,6 @@ const QUEUE: usize = 4;
 const END_TIMEOUT: Duration = Duration::from_secs(60);
 /// Longest wait for a disk that was waited for in vain already.
 const SECOND_TIMEOUT: Duration = Duration::from_secs(5);
-/// Pause between two looks for the end of the thread.
-const LOOK_PAUSE: Duration = Duration::from_millis(2);
 /// Most bytes of log that wait for a disk that hangs: an hour of poses.
 const MAX_PENDING_BYTES: usize = 64 << 20;
 
@@ -256,13 +255,10 @@ impl Journal {
     fn close(&mut self) -> bool {
         self.flush();
         self.entries = None;
-        let end = Instant::now() + self.timeout;
-        while self.thread.as_ref().is_some_and(|thread| !thread.is_finished()) {
-            if Instant::now() >= end {
-                self.thread = None;
-                return false;
-            }
-            std::thread::sleep(LOOK_PAUSE);
+        let has_ended = || self.thread.as_ref().is_none_or(JoinHandle::is_finished);
+        if !wait_at_most(self.timeout, has_ended) {
+            self.thread = None;
+            return false;
         }
         // A panic of the thread has been reported where it happened.
         drop(self.thread.take().map(JoinHandle::join));

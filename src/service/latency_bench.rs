@@ -14,11 +14,11 @@ use crate::capture::source_name::SourceName;
 use crate::service::config::Config;
 use crate::service::error_log::ErrorLog;
 use crate::service::mode::Mode;
-use crate::service::results::record::RecordedPose;
+use crate::service::results::record::{EndOfRun, RecordedPose};
 use crate::service::results::times::Percentiles;
 use crate::service::run_progress::RunProgress;
 use crate::service::shutdown::Shutdown;
-use crate::service::supervisor::{Ended, RunError, RunOptions, RunOutcome, run};
+use crate::service::supervisor::{RunError, RunOptions, RunOutcome, run};
 use crate::wire::message::{FrameHeader, PoseMessage};
 use crate::wire::place::Place;
 use crate::wire::place_error::PlaceError;
@@ -170,10 +170,10 @@ pub fn try_out(
     let stolen_ms = stolen_ms().zip(stolen_before).map(|(after, before)| after - before);
     drop(disturber);
     let outcome = outcome?;
-    match &outcome.ended {
-        Ended::Finished => Ok(measurement(trial, &outcome, stolen_ms)),
-        Ended::Interrupted => Err(TrialError::Interrupted),
-        Ended::Failed(cause) => Err(TrialError::Ended(cause.clone())),
+    match &outcome.record.ended {
+        EndOfRun::Interrupted => Err(TrialError::Interrupted),
+        EndOfRun::Failed(cause) => Err(TrialError::Ended(cause.clone())),
+        _ => Ok(measurement(trial, &outcome, stolen_ms)),
     }
 }
 

@@ -5,6 +5,9 @@
 //! keyframe (u64), number (u32) and ids (u64) of the others; number of first keyframes of joined epochs (u64), these (u64);
 //! the last keyframe that was searched (u64, all bits set where there is none).
 
+use zerocopy::{FromBytes, IntoBytes};
+
+use crate::service::bytes;
 use crate::slam::geometry::sim3::Matrix7;
 use crate::slam::loops::known::{KnownLoops, Link};
 use crate::slam::pose::NO_KEYFRAME;
@@ -33,17 +36,15 @@ pub fn loop_bytes(loops: &KnownLoops) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(64 + LINK_BYTES * loops.links.len());
     bytes.extend((loops.links.len() as u64).to_le_bytes());
     for link in &loops.links {
-        [link.i, link.j].iter().for_each(|id| bytes.extend(id.to_le_bytes()));
-        let of_covariance = upper_triangle().map(|(row, column)| link.covariance[(row, column)]);
-        for number in similarity_message(&link.j_from_i).into_iter().chain(of_covariance) {
-            bytes.extend(number.to_le_bytes());
-        }
+        bytes.extend([link.i, link.j].as_bytes());
+        bytes.extend(similarity_message(&link.j_from_i).as_bytes());
+        bytes.extend(upper_triangle().flat_map(|at| link.covariance[at].to_le_bytes()));
     }
     bytes.extend((loops.held_by.len() as u64).to_le_bytes());
     for (keyframe_id, by) in &loops.held_by {
         bytes.extend(keyframe_id.to_le_bytes());
         bytes.extend((by.len() as u32).to_le_bytes());
-        by.iter().for_each(|id| bytes.extend(id.to_le_bytes()));
+        bytes.extend(by.as_bytes());
     }
     bytes.extend((loops.beginnings.len() as u64).to_le_bytes());
     loops.beginnings.iter().for_each(|id| bytes.extend(id.to_le_bytes()));
@@ -56,9 +57,9 @@ pub fn parse_loops(mut bytes: &[u8]) -> Result<KnownLoops, LoopBytesError> {
     let bytes = &mut bytes;
     let mut loops = KnownLoops::default();
     for index in 0..count(bytes, LINK_BYTES)? {
-        let (i, j) = (id(bytes)?, id(bytes)?);
-        let similarity = numbers(bytes)?;
-        let triangle: [f64; 28] = numbers(bytes)?;
+        let [i, j]: [u64; 2] = take(bytes)?;
+        let similarity = take(bytes)?;
+        let triangle: [f64; 28] = take(bytes)?;
         let mut covariance = Matrix7::zeros();
         for ((row, column), number) in upper_triangle().zip(triangle) {
             (covariance[(row, column)], covariance[(column, row)]) = (number, number);
@@ -73,16 +74,14 @@ pub fn parse_loops(mut bytes: &[u8]) -> Result<KnownLoops, LoopBytesError> {
         }
     }
     for _ in 0..count(bytes, 8 + 4)? {
-        let keyframe_id = id(bytes)?;
-        let others = u32::from_le_bytes(take(bytes)?) as usize;
-        let others = bytes.split_off(..others.saturating_mul(8)).ok_or(LoopBytesError::Length)?;
-        let others = others.chunks_exact(8).filter_map(|of| of.first_chunk());
-        loops.held_by.insert(keyframe_id, others.map(|of| u64::from_le_bytes(*of)).collect());
+        let (keyframe_id, num_others): (_, u32) = (take(bytes)?, take(bytes)?);
+        let others: Result<_, _> = (0..num_others).map(|_| take(bytes)).collect();
+        loops.held_by.insert(keyframe_id, others?);
     }
     for _ in 0..count(bytes, 8)? {
-        loops.beginnings.insert(id(bytes)?);
+        loops.beginnings.insert(take(bytes)?);
     }
-    loops.searched_to = Some(id(bytes)?).filter(|id| *id != NO_KEYFRAME);
+    loops.searched_to = Some(take(bytes)?).filter(|id| *id != NO_KEYFRAME);
     if bytes.is_empty() { Ok(loops) } else { Err(LoopBytesError::Length) }
 }
 
@@ -91,26 +90,13 @@ fn upper_triangle() -> impl Iterator<Item = (usize, usize)> {
     (0..SIDE).flat_map(|row| (row..SIDE).map(move |column| (row, column)))
 }
 
-fn take<const N: usize>(bytes: &mut &[u8]) -> Result<[u8; N], LoopBytesError> {
-    let taken = bytes.split_off(..N).and_then(|taken| taken.first_chunk().copied());
-    taken.ok_or(LoopBytesError::Length)
-}
-
-fn id(bytes: &mut &[u8]) -> Result<u64, LoopBytesError> {
-    Ok(u64::from_le_bytes(take(bytes)?))
-}
-
-fn numbers<const N: usize>(bytes: &mut &[u8]) -> Result<[f64; N], LoopBytesError> {
-    let mut numbers = [0.0; N];
-    for number in &mut numbers {
-        *number = f64::from_le_bytes(take(bytes)?);
-    }
-    Ok(numbers)
+fn take<T: FromBytes>(bytes: &mut &[u8]) -> Result<T, LoopBytesError> {
+    bytes::take(bytes).ok_or(LoopBytesError::Length)
 }
 
 /// A number of things of at least so many bytes each: no more than there are bytes for.
 fn count(bytes: &mut &[u8], least: usize) -> Result<usize, LoopBytesError> {
-    let count = usize::try_from(id(bytes)?).unwrap_or(usize::MAX);
+    let count = usize::try_from(take::<u64>(bytes)?).unwrap_or(usize::MAX);
     if count <= bytes.len() / least { Ok(count) } else { Err(LoopBytesError::Length) }
 }
 

@@ -2,8 +2,8 @@
 //! heartbeat of its frame loop. One socket for the life of the process and no allocation: it is used from
 //! the frame loop itself, so that a loop that hangs is not taken for a live one.
 
-use std::fmt::Write as _;
-use std::io::{self, Cursor, Write as _};
+use std::fmt;
+use std::io::{self, Cursor, Write};
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::net::{SocketAddr, UnixDatagram};
 
@@ -87,8 +87,8 @@ impl ManagerNotice {
     }
 
     /// One line for `systemctl status`.
-    pub fn status(&self, status: std::fmt::Arguments<'_>) {
-        self.send(format_args!("STATUS={}", OneLine(status)));
+    pub fn status(&self, status: fmt::Arguments<'_>) {
+        self.send(format_args!("STATUS={status}"));
     }
 
     /// The frame loop is alive. Call it from there, as often as you like.
@@ -98,15 +98,27 @@ impl ManagerNotice {
         }
     }
 
-    fn send(&self, message: std::fmt::Arguments<'_>) {
+    fn send(&self, message: fmt::Arguments<'_>) {
         let Some(socket) = &self.socket else { return };
-        let mut bytes = Cursor::new([0; MESSAGE_BYTES]);
+        let mut line = OneLine(Cursor::new([0; MESSAGE_BYTES]));
         // What does not fit is cut; a manager that is full or gone is none to wait for.
-        let _ = bytes.write_fmt(message);
-        let written = &bytes.get_ref()[..bytes.position() as usize];
+        let _ = fmt::write(&mut line, message);
+        let written = &line.0.get_ref()[..line.0.position() as usize];
         // Not within a character: the manager takes UTF-8 only.
         let whole = std::str::from_utf8(written).map_or_else(|e| e.valid_up_to(), str::len);
         let _ = socket.send(&written[..whole]);
+    }
+}
+
+/// A message whose line ends are blanks: a second line would be another assignment.
+struct OneLine(Cursor<[u8; MESSAGE_BYTES]>);
+
+impl fmt::Write for OneLine {
+    fn write_str(&mut self, text: &str) -> fmt::Result {
+        text.chars().try_for_each(|of| {
+            let printed = if of.is_control() { ' ' } else { of };
+            write!(self.0, "{printed}").map_err(|_| fmt::Error)
+        })
     }
 }
 
@@ -120,26 +132,6 @@ fn connect(path: &str) -> io::Result<UnixDatagram> {
     socket.connect_addr(&address)?;
     socket.set_nonblocking(true)?;
     Ok(socket)
-}
-
-/// Text whose line ends are blanks: a second line would be another assignment.
-struct OneLine<'a>(std::fmt::Arguments<'a>);
-
-impl std::fmt::Display for OneLine<'_> {
-    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        struct Blanked<'a, 'b>(&'a mut std::fmt::Formatter<'b>);
-        impl std::fmt::Write for Blanked<'_, '_> {
-            fn write_str(&mut self, text: &str) -> std::fmt::Result {
-                text.split(char::is_control).enumerate().try_for_each(|(index, part)| {
-                    if index > 0 {
-                        self.0.write_char(' ')?;
-                    }
-                    self.0.write_str(part)
-                })
-            }
-        }
-        write!(Blanked(out), "{}", self.0)
-    }
 }
 
 #[cfg(test)]

@@ -13,11 +13,13 @@ use std::io::{self, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use zerocopy::{FromBytes, IntoBytes};
+
 use crate::capture::input_file;
 use crate::service::atomic_file::write_atomically;
 use crate::service::loop_bytes::{LoopBytesError, MAX_LOOP_BYTES, loop_bytes, parse_loops};
 use crate::slam::geometry::intrinsics::Intrinsics;
-use crate::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS};
+use crate::slam::keyframe::{Keyframe, MAX_KEYFRAME_POINTS};
 use crate::slam::loops::known::KnownLoops;
 use crate::slam::map::{ConfirmedPoint, FramePlace, Map};
 use crate::slam::pose::NO_KEYFRAME;
@@ -43,59 +45,53 @@ const MAX_CONFIRMED: u64 = MAX_KEYFRAMES * 5000;
 
 /// Why a map cannot be read.
 #[derive(Debug, thiserror::Error)]
-pub enum MapFileError {
-    /// The file cannot be read, or ends too early.
-    #[error("{path}: {source}; the map is not usable")]
-    Read {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: io::Error,
-    },
-    /// The file is something else.
-    #[error("{0} is not a map of this version")]
-    Magic(PathBuf),
+#[error("{path}: {fault}")]
+pub struct MapFileError {
+    /// The file.
+    pub path: PathBuf,
+    /// What is wrong.
+    pub fault: MapFault,
+}
+
+/// What is wrong with the bytes of a map.
+#[derive(Debug, thiserror::Error)]
+pub enum MapFault {
+    /// They cannot be read, or end too early.
+    #[error("{0}; the map is not usable")]
+    Read(#[from] io::Error),
+    /// They are something else.
+    #[error("it is not a map of this version")]
+    Magic,
     /// More than any map has.
-    #[error("{path}: {what} = {count} is more than any map has")]
+    #[error("{what} = {count} is more than any map has")]
     TooMany {
-        /// The file.
-        path: PathBuf,
         /// Of what.
         what: &'static str,
         /// How many.
         count: u64,
     },
     /// A keyframe is broken.
-    #[error("{path}: keyframe {index}: {source}")]
+    #[error("keyframe {index}: {source}")]
     Keyframe {
-        /// The file.
-        path: PathBuf,
         /// Its place in the file.
         index: u64,
         /// What is wrong.
         source: MessageError,
     },
     /// A frame is broken.
-    #[error("{path}: frame {sequence}: {source}")]
+    #[error("frame {sequence}: {source}")]
     Frame {
-        /// The file.
-        path: PathBuf,
         /// Its sequence.
         sequence: u64,
         /// What is wrong.
         source: MessageError,
     },
     /// The loops are broken.
-    #[error("{path}: loops: {source}")]
-    Loops {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        source: LoopBytesError,
-    },
+    #[error("loops: {0}")]
+    Loops(#[from] LoopBytesError),
     /// There is more than the map.
-    #[error("{0} has bytes after the end of the map")]
-    Trailing(PathBuf),
+    #[error("it has bytes after the end of the map")]
+    Trailing,
 }
 
 /// Writes `map` under a temporary name and renames it to `path`. `each` is called before each keyframe: a large
@@ -121,85 +117,65 @@ pub fn write_map_into(file: &mut impl Write, map: &Map) -> io::Result<()> {
 
 fn write_head(file: &mut impl Write, map: &Map) -> io::Result<()> {
     file.write_all(&MAGIC)?;
-    file.write_all(&map.free_epoch.to_le_bytes())?;
-    file.write_all(&map.revision.to_le_bytes())?;
-    file.write_all(&map.active.unwrap_or(NO_KEYFRAME).to_le_bytes())?;
-    file.write_all(&(map.keyframes.len() as u64).to_le_bytes())
+    file.write_all(map.free_epoch.as_bytes())?;
+    let active = map.active.unwrap_or(NO_KEYFRAME);
+    file.write_all([map.revision, active, map.keyframes.len() as u64].as_bytes())
 }
 
 fn write_keyframe(file: &mut impl Write, keyframe: &Keyframe) -> io::Result<()> {
+    let Keyframe { keyframe_id, revision, map_revision, sequence, epoch, .. } = *keyframe;
     let k = &keyframe.intrinsics;
-    let numbers =
-        [keyframe.keyframe_id, keyframe.revision, keyframe.map_revision, keyframe.sequence];
-    for number in numbers {
-        file.write_all(&number.to_le_bytes())?;
-    }
-    file.write_all(&keyframe.capture_nanos.to_le_bytes())?;
+    file.write_all([keyframe_id, revision, map_revision, sequence].as_bytes())?;
+    file.write_all(keyframe.capture_nanos.as_bytes())?;
     let state = code_from_map_state(keyframe.map_state);
     let is_refined = u32::from(keyframe.is_refined);
-    for number in [keyframe.epoch, state, is_refined, k.width as u32, k.height as u32] {
-        file.write_all(&number.to_le_bytes())?;
-    }
-    let in_world = similarity_message(&keyframe.world_from_keyframe);
-    let in_map = similarity_message(&keyframe.map_from_keyframe);
-    let intrinsics = [k.fx, k.fy, k.cx, k.cy];
-    let modes = keyframe.mode_covariance.upper_triangle();
-    let place = keyframe.place_covariance.upper_triangle();
-    for number in in_world.into_iter().chain(in_map).chain(intrinsics).chain(modes).chain(place) {
-        file.write_all(&number.to_le_bytes())?;
-    }
-    file.write_all(&(keyframe.points.len() as u64).to_le_bytes())?;
-    for point in &keyframe.points {
-        file.write_all(&point.u.to_le_bytes())?;
-        file.write_all(&point.v.to_le_bytes())?;
-        for number in [point.inverse_depth, point.variance, point.intensity] {
-            file.write_all(&number.to_le_bytes())?;
-        }
-    }
-    file.write_all(&(keyframe.image.len() as u64).to_le_bytes())?;
+    file.write_all([epoch, state, is_refined, k.width as u32, k.height as u32].as_bytes())?;
+    file.write_all(similarity_message(&keyframe.world_from_keyframe).as_bytes())?;
+    file.write_all(similarity_message(&keyframe.map_from_keyframe).as_bytes())?;
+    file.write_all([k.fx, k.fy, k.cx, k.cy].as_bytes())?;
+    file.write_all(keyframe.mode_covariance.upper_triangle().as_bytes())?;
+    file.write_all(keyframe.place_covariance.upper_triangle().as_bytes())?;
+    file.write_all((keyframe.points.len() as u64).as_bytes())?;
+    file.write_all(keyframe.points.as_bytes())?;
+    file.write_all((keyframe.image.len() as u64).as_bytes())?;
     file.write_all(&keyframe.image)
 }
 
 /// Frames that were aligned again and points of the joint estimation.
 fn write_rest(file: &mut impl Write, map: &Map) -> io::Result<()> {
-    file.write_all(&(map.frames.len() as u64).to_le_bytes())?;
+    file.write_all((map.frames.len() as u64).as_bytes())?;
     for frame in &map.frames {
-        file.write_all(&frame.sequence.to_le_bytes())?;
-        file.write_all(&frame.keyframe_id.to_le_bytes())?;
-        for number in rigid_message(&frame.keyframe_from_camera) {
-            file.write_all(&number.to_le_bytes())?;
-        }
+        file.write_all([frame.sequence, frame.keyframe_id].as_bytes())?;
+        file.write_all(rigid_message(&frame.keyframe_from_camera).as_bytes())?;
     }
-    file.write_all(&(map.confirmed.len() as u64).to_le_bytes())?;
+    file.write_all((map.confirmed.len() as u64).as_bytes())?;
     map.confirmed.iter().try_for_each(|point| {
-        file.write_all(&point.keyframe_id.to_le_bytes())?;
-        file.write_all(&point.u.to_le_bytes())?;
-        file.write_all(&point.v.to_le_bytes())?;
-        file.write_all(&point.confirmations.to_le_bytes())?;
-        file.write_all(&point.inverse_depth.to_le_bytes())?;
-        file.write_all(&point.intensity.to_le_bytes())
+        file.write_all(point.keyframe_id.as_bytes())?;
+        file.write_all([point.u, point.v].as_bytes())?;
+        file.write_all(point.confirmations.as_bytes())?;
+        file.write_all([point.inverse_depth, point.intensity].as_bytes())
     })?;
     let loops = loop_bytes(&map.loops);
-    file.write_all(&(loops.len() as u64).to_le_bytes())?;
+    file.write_all((loops.len() as u64).as_bytes())?;
     file.write_all(&loops)
 }
 
 /// Reads the map that [`write_map`] wrote.
 pub fn read_map(path: &Path) -> Result<Map, MapFileError> {
-    let file = input_file::open(path)
-        .map_err(|source| MapFileError::Read { path: path.to_owned(), source })?;
-    parse_map(path, BufReader::new(file))
+    let opened = input_file::open(path).map_err(MapFault::Read);
+    let map = opened.and_then(|file| parse_map(BufReader::new(file)));
+    map.map_err(|fault| MapFileError { path: path.to_owned(), fault })
 }
 
-/// Reads the map from the bytes of a file that came from `path`.
-pub fn parse_map(path: &Path, bytes: impl Read) -> Result<Map, MapFileError> {
-    let mut reader = Reader { file: bytes, path };
-    if reader.bytes::<16>()? != MAGIC {
-        return Err(MapFileError::Magic(path.to_owned()));
+/// Reads the map from the bytes of a file.
+pub fn parse_map(bytes: impl Read) -> Result<Map, MapFault> {
+    let mut reader = Reader(bytes);
+    if reader.take::<[u8; 16]>()? != MAGIC {
+        return Err(MapFault::Magic);
     }
     let free_epoch = reader.epoch()?;
     let revision = reader.count("map revision", MAX_NUMBER)?;
-    let active = Some(reader.u64()?).filter(|&id| id != NO_KEYFRAME);
+    let active = Some(reader.take()?).filter(|&id| id != NO_KEYFRAME);
     let mut map = Map { free_epoch, revision, active, ..Map::default() };
     let count = reader.count("keyframes", MAX_KEYFRAMES)?;
     for index in 0..count {
@@ -216,9 +192,9 @@ pub fn parse_map(path: &Path, bytes: impl Read) -> Result<Map, MapFileError> {
         map.confirmed.extend(Some(point).filter(|point| is_placed(&map, point)));
     }
     map.loops = Arc::new(reader.loops()?);
-    match reader.file.read(&mut [0]) {
+    match reader.0.read(&mut [0]) {
         Ok(0) => Ok(map),
-        _ => Err(MapFileError::Trailing(path.to_owned())),
+        _ => Err(MapFault::Trailing),
     }
 }
 
@@ -242,109 +218,75 @@ pub fn keyframe_bytes(keyframe: &Keyframe) -> Vec<u8> {
 }
 
 /// The keyframe of [`keyframe_bytes`], and nothing after it.
-pub fn parse_keyframe(bytes: &[u8]) -> Result<Keyframe, MapFileError> {
-    let path = Path::new("keyframe");
-    let mut reader = Reader { file: bytes, path };
+pub fn parse_keyframe(bytes: &[u8]) -> Result<Keyframe, MapFault> {
+    let mut reader = Reader(bytes);
     let keyframe = reader.keyframe(0)?;
-    if reader.file.is_empty() { Ok(keyframe) } else { Err(MapFileError::Trailing(path.to_owned())) }
+    if reader.0.is_empty() { Ok(keyframe) } else { Err(MapFault::Trailing) }
 }
 
-/// Reads numbers and says where it failed.
-struct Reader<'a, R> {
-    file: R,
-    path: &'a Path,
-}
+/// Reads numbers and checks them.
+struct Reader<R>(R);
 
-impl<R: Read> Reader<'_, R> {
-    fn bytes<const N: usize>(&mut self) -> Result<[u8; N], MapFileError> {
-        let mut bytes = [0; N];
-        self.file
-            .read_exact(&mut bytes)
-            .map_err(|source| MapFileError::Read { path: self.path.to_owned(), source })?;
-        Ok(bytes)
+impl<R: Read> Reader<R> {
+    fn take<T: FromBytes + IntoBytes>(&mut self) -> Result<T, MapFault> {
+        let mut value = T::new_zeroed();
+        self.0.read_exact(value.as_mut_bytes())?;
+        Ok(value)
     }
 
-    fn u64(&mut self) -> Result<u64, MapFileError> {
-        Ok(u64::from_le_bytes(self.bytes()?))
+    fn count(&mut self, what: &'static str, most: u64) -> Result<u64, MapFault> {
+        let count = self.take()?;
+        if count <= most { Ok(count) } else { Err(MapFault::TooMany { what, count }) }
     }
 
-    fn u32(&mut self) -> Result<u32, MapFileError> {
-        Ok(u32::from_le_bytes(self.bytes()?))
+    fn count_u32(&mut self, what: &'static str, most: u32) -> Result<u32, MapFault> {
+        let count = self.take()?;
+        let too_many = MapFault::TooMany { what, count: u64::from(count) };
+        if count <= most { Ok(count) } else { Err(too_many) }
     }
 
-    fn f64(&mut self) -> Result<f64, MapFileError> {
-        Ok(f64::from_le_bytes(self.bytes()?))
-    }
-
-    fn f32(&mut self) -> Result<f32, MapFileError> {
-        Ok(f32::from_le_bytes(self.bytes()?))
-    }
-
-    fn count(&mut self, what: &'static str, most: u64) -> Result<u64, MapFileError> {
-        let count = self.u64()?;
-        self.at_most(what, count, most)
-    }
-
-    fn epoch(&mut self) -> Result<u32, MapFileError> {
+    fn epoch(&mut self) -> Result<u32, MapFault> {
         self.count_u32("epoch", MAX_EPOCH)
     }
 
-    fn count_u32(&mut self, what: &'static str, most: u32) -> Result<u32, MapFileError> {
-        let count = self.u32()?;
-        self.at_most(what, u64::from(count), u64::from(most)).map(|_| count)
-    }
-
-    fn at_most(&self, what: &'static str, count: u64, most: u64) -> Result<u64, MapFileError> {
-        if count <= most {
-            return Ok(count);
-        }
-        Err(MapFileError::TooMany { path: self.path.to_owned(), what, count })
-    }
-
-    fn keyframe(&mut self, index: u64) -> Result<Keyframe, MapFileError> {
-        let path = self.path.to_owned();
-        let wrong = move |source| MapFileError::Keyframe { path: path.clone(), index, source };
+    fn keyframe(&mut self, index: u64) -> Result<Keyframe, MapFault> {
+        let wrong = |source| MapFault::Keyframe { index, source };
         let keyframe_id = self.count("keyframe id", MAX_NUMBER)?;
         let revision = self.count("revision", MAX_NUMBER)?;
         let map_revision = self.count("map revision", MAX_NUMBER)?;
-        let sequence = self.u64()?;
-        let capture_nanos = i64::from_le_bytes(self.bytes()?);
-        let (epoch, state) = (self.epoch()?, self.u32()?);
+        let (sequence, capture_nanos) = (self.take()?, self.take()?);
+        let (epoch, state) = (self.epoch()?, self.take()?);
         let is_refined = self.count_u32("refined", 1)? == 1;
-        let (width, height) = (self.u32()?, self.u32()?);
-        let (in_world, in_map) = (self.numbers()?, self.numbers()?);
-        let [fx, fy, cx, cy] = self.numbers()?;
+        let [width, height] = self.take()?;
+        let (in_world, in_map) = (self.take()?, self.take()?);
+        let [fx, fy, cx, cy] = self.take()?;
         let intrinsics =
             Intrinsics { fx, fy, cx, cy, width: width as usize, height: height as usize };
         if !intrinsics.is_valid() {
             return Err(wrong(MessageError::InvalidIntrinsics { width, height }));
         }
-        let mode_covariance = mode_covariance_from_message(&self.numbers()?).map_err(&wrong)?;
-        let place_covariance = place_covariance_from_message(&self.numbers()?).map_err(&wrong)?;
+        let mode_covariance = mode_covariance_from_message(&self.take()?).map_err(wrong)?;
+        let place_covariance = place_covariance_from_message(&self.take()?).map_err(wrong)?;
         let num_points = self.count("points", MAX_KEYFRAME_POINTS as u64)?;
-        let points = (0..num_points).map(|_| self.point()).collect::<Result<Vec<_>, _>>()?;
-        check_points(&points, &intrinsics).map_err(&wrong)?;
-        let size = intrinsics.width * intrinsics.height;
-        let bytes = self.count("image bytes", size as u64)? as usize;
-        if bytes != 0 && bytes != size {
-            let (path, what) = (self.path.to_owned(), "image bytes");
-            return Err(MapFileError::TooMany { path, what, count: bytes as u64 });
+        let points = (0..num_points).map(|_| self.take()).collect::<Result<Vec<_>, _>>()?;
+        check_points(&points, &intrinsics).map_err(wrong)?;
+        let size = (intrinsics.width * intrinsics.height) as u64;
+        let count = self.count("image bytes", size)?;
+        if count != 0 && count != size {
+            return Err(MapFault::TooMany { what: "image bytes", count });
         }
-        let mut image = vec![0; bytes];
-        self.file
-            .read_exact(&mut image)
-            .map_err(|source| MapFileError::Read { path: self.path.to_owned(), source })?;
+        let mut image = vec![0; count as usize];
+        self.0.read_exact(&mut image)?;
+        let similarity = |numbers, name| similarity_from_message(numbers, name).map_err(wrong);
         Ok(Keyframe {
             keyframe_id,
             epoch,
             revision,
             sequence,
             capture_nanos,
-            map_state: map_state_from_code(state).map_err(&wrong)?,
-            world_from_keyframe: similarity_from_message(&in_world, "world_from_keyframe")
-                .map_err(&wrong)?,
-            map_from_keyframe: similarity_from_message(&in_map, "map_from_keyframe")
-                .map_err(&wrong)?,
+            map_state: map_state_from_code(state).map_err(wrong)?,
+            world_from_keyframe: similarity(&in_world, "world_from_keyframe")?,
+            map_from_keyframe: similarity(&in_map, "map_from_keyframe")?,
             map_revision,
             mode_covariance,
             place_covariance,
@@ -356,49 +298,30 @@ impl<R: Read> Reader<'_, R> {
         })
     }
 
-    fn frame(&mut self) -> Result<FramePlace, MapFileError> {
-        let (sequence, keyframe_id) = (self.u64()?, self.u64()?);
-        let keyframe_from_camera =
-            rigid_from_message(&self.numbers()?, "keyframe_from_camera").map_err(|source| {
-                MapFileError::Frame { path: self.path.to_owned(), sequence, source }
-            })?;
+    fn frame(&mut self) -> Result<FramePlace, MapFault> {
+        let [sequence, keyframe_id] = self.take()?;
+        let keyframe_from_camera = rigid_from_message(&self.take()?, "keyframe_from_camera")
+            .map_err(|source| MapFault::Frame { sequence, source })?;
         Ok(FramePlace { sequence, keyframe_id, keyframe_from_camera })
     }
 
-    fn confirmed(&mut self) -> Result<ConfirmedPoint, MapFileError> {
+    fn confirmed(&mut self) -> Result<ConfirmedPoint, MapFault> {
         Ok(ConfirmedPoint {
-            keyframe_id: self.u64()?,
-            u: u16::from_le_bytes(self.bytes()?),
-            v: u16::from_le_bytes(self.bytes()?),
-            confirmations: self.u32()?,
-            inverse_depth: self.f32()?,
-            intensity: self.f32()?,
+            keyframe_id: self.take()?,
+            u: self.take()?,
+            v: self.take()?,
+            confirmations: self.take()?,
+            inverse_depth: self.take()?,
+            intensity: self.take()?,
         })
     }
 
-    fn loops(&mut self) -> Result<KnownLoops, MapFileError> {
+    fn loops(&mut self) -> Result<KnownLoops, MapFault> {
         let count = self.count("loop bytes", MAX_LOOP_BYTES)?;
         let mut bytes = Vec::new();
-        let wrong = |source| MapFileError::Read { path: self.path.to_owned(), source };
         // A broken number asks for no more than there is; what is missing is missed by the parser.
-        self.file.by_ref().take(count).read_to_end(&mut bytes).map_err(wrong)?;
-        parse_loops(&bytes)
-            .map_err(|source| MapFileError::Loops { path: self.path.to_owned(), source })
-    }
-
-    fn numbers<const N: usize>(&mut self) -> Result<[f64; N], MapFileError> {
-        let mut numbers = [0.0; N];
-        for number in &mut numbers {
-            *number = self.f64()?;
-        }
-        Ok(numbers)
-    }
-
-    fn point(&mut self) -> Result<DepthPoint, MapFileError> {
-        let u = u16::from_le_bytes(self.bytes()?);
-        let v = u16::from_le_bytes(self.bytes()?);
-        let (inverse_depth, variance, intensity) = (self.f32()?, self.f32()?, self.f32()?);
-        Ok(DepthPoint { u, v, inverse_depth, variance, intensity })
+        self.0.by_ref().take(count).read_to_end(&mut bytes)?;
+        Ok(parse_loops(&bytes)?)
     }
 }
 

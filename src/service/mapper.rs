@@ -19,22 +19,19 @@ use crate::service::mapper::going_over::GoneOver;
 use crate::service::mapper::output::Output;
 use crate::service::mode::Mode;
 use crate::service::pairing::Pairing;
-use crate::service::schedule::{Background, apply, in_force};
+use crate::service::run_error::RunError;
+use crate::service::schedule::{Background, apply};
 use crate::service::shutdown::Shutdown;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::loops::{SearchFate, SearchReport};
 use crate::slam::map::Map;
 use crate::slam::mapper::{Mapper, StepOutcome};
-use crate::slam::parameter::ParameterError;
 use crate::slam::pose::{NO_KEYFRAME, PoseEstimate};
-use crate::wire::command::{CommandError, CommandServer};
+use crate::wire::command::CommandServer;
 use crate::wire::conversion::{code_from_map_state, frame_from_message, pose_from_message};
 use crate::wire::message::{FrameHeader, PoseMessage};
 use crate::wire::place::{Claim, Place};
-use crate::wire::place_error::PlaceError;
-use crate::wire::port::{
-    Access, Hub, OpenError, ReceiveError, Received, SendError, Subscriber, WaitError, wait,
-};
+use crate::wire::port::{Access, Hub, Received, SendError, Subscriber, wait};
 use crate::wire::topic::{FRAME, MAPPER_HEALTH, POSE};
 
 /// Longest sleep without a look at signals and health.
@@ -42,69 +39,24 @@ const WAKE_PERIOD: Duration = Duration::from_millis(100);
 /// What a mapper says of itself before it writes its map, which may take long.
 pub const WRITES_MAP: &str = "the map is being written";
 
-/// Why the mapper ends early.
-#[derive(Debug, thiserror::Error)]
-pub enum MapperError {
-    /// The place is not right, or taken.
-    #[error(transparent)]
-    Place(#[from] PlaceError),
-    /// A topic cannot be opened.
-    #[error(transparent)]
-    Open(#[from] OpenError),
-    /// Frames or poses cannot be received.
-    #[error(transparent)]
-    Receive(#[from] ReceiveError),
-    /// The map cannot be sent.
-    #[error(transparent)]
-    Send(#[from] SendError),
-    /// A command cannot be answered.
-    #[error(transparent)]
-    Command(#[from] CommandError),
-    /// Waiting failed.
-    #[error(transparent)]
-    Wait(#[from] WaitError),
-    /// The map on disk cannot be used.
-    #[error(transparent)]
-    Map(#[from] MapSessionError),
-    /// The configuration does not fit the frames.
-    #[error("mapping: {0}")]
-    Parameter(#[from] ParameterError),
-    /// No thread for the joint estimation.
-    #[error("cannot start the thread that estimates keyframes jointly ({0})")]
-    Thread(std::io::Error),
-    /// No threads.
-    #[error("cannot start {threads} mapper threads ({reason}); lower mapper.threads")]
-    Pool {
-        /// How many were wanted.
-        threads: usize,
-        /// What the system says.
-        reason: String,
-    },
-}
-
 /// Runs the process until the signal.
-pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), MapperError> {
+pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), RunError> {
     // Before the pool is made: its threads run where this one does.
     let refusals = apply(&config.mapper.scheduling);
     refusals.iter().for_each(|refusal| tracing::warn!("mapper: {refusal}"));
     let mut shell = Shell::prepare(config, mode)?;
-    shell.health.tell_scheduling(&in_force(), &refusals);
+    shell.health.tell_scheduling(&refusals);
     shell.load_map()?;
     shell.health.enter(ProcessState::Ready, "");
     shell.health.tell_ready();
     let outcome = shell.map_until(shutdown);
     let outcome = outcome.and_then(|()| shell.save_map_folder());
-    match &outcome {
-        Ok(()) => {
-            // A supervisor that did not ask for the end starts another, which continues from the checkpoint.
-            if !is_supervised() {
-                shell.kept.iter_mut().for_each(|kept| kept.end_in_order());
-                GoneOver::forget(&shell.place.loaded_map_path());
-            }
-            shell.health.enter(ProcessState::Finished, "stopped");
-        }
-        Err(error) => shell.health.enter(ProcessState::Failed, &error.to_string()),
+    // A supervisor that did not ask for the end starts another, which continues from the checkpoint.
+    if outcome.is_ok() && !is_supervised() {
+        shell.kept.iter_mut().for_each(|kept| kept.end_in_order());
+        GoneOver::forget(&shell.place.loaded_map_path());
     }
+    shell.health.end(&outcome, "stopped");
     outcome
 }
 
@@ -141,7 +93,7 @@ struct Shell<'a> {
 }
 
 impl<'a> Shell<'a> {
-    fn prepare(config: &'a Config, mode: Mode) -> Result<Self, MapperError> {
+    fn prepare(config: &'a Config, mode: Mode) -> Result<Self, RunError> {
         let place = Place::new(&config.instance, &config.root)?;
         let claim = place.claim("mapper")?;
         let hub = Hub::join(&place, "mapper", Access::Member)?;
@@ -155,7 +107,7 @@ impl<'a> Shell<'a> {
             .num_threads(threads)
             .thread_name(|index| format!("semidense-map-{index}"))
             .build()
-            .map_err(|e| MapperError::Pool { threads, reason: e.to_string() })?;
+            .map_err(|e| RunError::Pool { threads, reason: e.to_string() })?;
         let shell = Self {
             config,
             mode,
@@ -170,7 +122,7 @@ impl<'a> Shell<'a> {
             output: Output::open(&hub)?,
             health: Health::open(&hub, &MAPPER_HEALTH)?,
             mapper: None,
-            adjustments: start_adjustments(config, mode).map_err(MapperError::Thread)?,
+            adjustments: start_adjustments(config, mode)?,
             kept,
             left,
             map: None,
@@ -185,7 +137,7 @@ impl<'a> Shell<'a> {
     }
 
     /// Reads the map on disk, where one is named.
-    fn load_map(&mut self) -> Result<(), MapperError> {
+    fn load_map(&mut self) -> Result<(), RunError> {
         let (configured, max_bytes) = (&self.config.map, self.config.mapping.max_map_bytes());
         let path = self.place.loaded_map_path();
         let gone_over = self.kept.as_ref().and_then(|_| GoneOver::read(&path, configured));
@@ -202,13 +154,13 @@ impl<'a> Shell<'a> {
     }
 
     /// Writes what the map on disk does not have yet.
-    fn save_map_folder(&mut self) -> Result<(), MapperError> {
+    fn save_map_folder(&mut self) -> Result<(), RunError> {
         let (Some(map), Some((_, mapper))) = (&mut self.map, &self.mapper) else { return Ok(()) };
         let health = &mut self.health;
         Ok(map.save_all(mapper, &mut || health.report())?)
     }
 
-    fn map_until(&mut self, shutdown: &Shutdown) -> Result<(), MapperError> {
+    fn map_until(&mut self, shutdown: &Shutdown) -> Result<(), RunError> {
         while !shutdown.is_requested() {
             let events = [self.frames.events(), self.poses.events(), self.commands.events()];
             let adjusted = self.adjustments.descriptor();
@@ -232,7 +184,7 @@ impl<'a> Shell<'a> {
     }
 
     /// The oldest frame with its pose, of those that are still here.
-    fn next_pair(&mut self) -> Result<Option<(Frame, PoseEstimate)>, MapperError> {
+    fn next_pair(&mut self) -> Result<Option<(Frame, PoseEstimate)>, RunError> {
         while let Some(frame) = self.frames.receive()? {
             self.take_in(frame);
         }
@@ -260,15 +212,10 @@ impl<'a> Shell<'a> {
         }
         self.last_arrival_nanos = Some(now_nanos());
         let arrival = self.order.arrive(&header);
-        match arrival {
-            FrameOrderOutcome::Next { missing } => {
-                self.missing = self.missing.saturating_add(missing)
-            }
-            FrameOrderOutcome::ClockJump
-            | FrameOrderOutcome::Renumbered
-            | FrameOrderOutcome::Repeated => {
-                self.health.counters().disordered += 1;
-            }
+        if let FrameOrderOutcome::Next { missing } = arrival {
+            self.missing = self.missing.saturating_add(missing);
+        } else {
+            self.health.counters().disordered += 1;
         }
         if arrival == FrameOrderOutcome::Renumbered {
             self.pairing.restart();
@@ -287,7 +234,7 @@ impl<'a> Shell<'a> {
     }
 
     /// One frame into the map, and what changed out to the others.
-    fn step(&mut self, received: &Frame, pose: &PoseEstimate) -> Result<(), MapperError> {
+    fn step(&mut self, received: &Frame, pose: &PoseEstimate) -> Result<(), RunError> {
         // Checked when it was taken in.
         let Ok((frame, intrinsics)) = frame_from_message(received.header(), received.payload())
         else {
@@ -331,12 +278,12 @@ impl<'a> Shell<'a> {
     }
 
     /// Whether there is a mapper for frames of this camera; makes one where it is another than before.
-    fn suits_camera(&mut self, intrinsics: Intrinsics) -> Result<bool, MapperError> {
+    fn suits_camera(&mut self, intrinsics: Intrinsics) -> Result<bool, RunError> {
         if self.mapper.as_ref().is_some_and(|(of, _)| *of == intrinsics) {
             return Ok(true);
         }
         match self.change_camera(intrinsics) {
-            Err(MapperError::Parameter(error)) => {
+            Err(RunError::Parameter(_, error)) => {
                 // The configuration was checked at the start: it is the image that is too small.
                 self.health.counters().refused += 1;
                 self.health.enter(ProcessState::Running, &error.to_string());
@@ -373,7 +320,7 @@ impl<'a> Shell<'a> {
     }
 
     /// Live: a joint estimate that is ready enters the map, and goes out, though no frame comes.
-    fn pick_up_adjustment(&mut self) -> Result<(), MapperError> {
+    fn pick_up_adjustment(&mut self) -> Result<(), RunError> {
         let Some((_, mapper)) = &mut self.mapper else { return Ok(()) };
         let outcome = self.adjustments.pick_up(mapper);
         self.output.publish(mapper, &outcome)?;
@@ -384,8 +331,9 @@ impl<'a> Shell<'a> {
 
     /// A mapper for another camera: the first, which continues from what a dead one has left, or one in
     /// mid-stream, which begins an epoch.
-    fn change_camera(&mut self, intrinsics: Intrinsics) -> Result<(), MapperError> {
-        let mut mapper = Mapper::new(intrinsics, self.config.mapping.clone())?;
+    fn change_camera(&mut self, intrinsics: Intrinsics) -> Result<(), RunError> {
+        let mut mapper = Mapper::new(intrinsics, self.config.mapping.clone())
+            .map_err(|error| RunError::Parameter("mapping", error))?;
         self.output.open_images(&self.hub, &intrinsics)?;
         if let Some((_, before)) = self.mapper.take() {
             self.health.counters().resized += 1;
@@ -445,13 +393,14 @@ fn tell_search(report: &SearchReport) {
 }
 
 /// The joint estimation of keyframes, as the mode wants it.
-fn start_adjustments(config: &Config, mode: Mode) -> std::io::Result<Adjustments> {
+fn start_adjustments(config: &Config, mode: Mode) -> Result<Adjustments, RunError> {
     let delay = Entry::AfterFrames(config.mapping.window.delay_frames as u64);
-    match mode {
+    let started = match mode {
         // The frames wait for it.
         Mode::Lockstep => Adjustments::start(delay, Background::Other),
         Mode::Live => Adjustments::start(Entry::WhenReady, config.mapper.background),
-    }
+    };
+    started.map_err(|error| RunError::Thread("estimates keyframes jointly", error))
 }
 
 /// Time since an instant of CLOCK_MONOTONIC.

@@ -6,6 +6,8 @@ use std::io;
 use std::os::unix::fs::{FileExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
+use zerocopy::IntoBytes;
+
 use crate::capture::source::FrameStamp;
 use crate::service::mode::Mode;
 
@@ -41,13 +43,13 @@ pub fn position_key(run: &str, source: &str, rig: Option<&Path>) -> u64 {
     let rig = rig.map_or(&b""[..], |rig| rig.as_os_str().as_encoded_bytes());
     // A byte that none of them contains keeps "ab" + "c" from "a" + "bc".
     let parts = [run.as_bytes(), &[0], source.as_bytes(), &[0], rig];
-    hash(parts.iter().flat_map(|part| part.iter().copied()))
+    hash(parts.into_iter().flatten())
 }
 
-fn hash(bytes: impl Iterator<Item = u8>) -> u64 {
+fn hash<'a>(bytes: impl IntoIterator<Item = &'a u8>) -> u64 {
     const OFFSET: u64 = 0xcbf2_9ce4_8422_2325;
     const PRIME: u64 = 0x0100_0000_01b3;
-    bytes.fold(OFFSET, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(PRIME))
+    bytes.into_iter().fold(OFFSET, |hash, byte| (hash ^ u64::from(*byte)).wrapping_mul(PRIME))
 }
 
 impl Position {
@@ -56,11 +58,6 @@ impl Position {
         let (process_id, sequence) = (std::process::id(), stamp.sequence);
         Self { process_id, sequence, capture_nanos: stamp.capture_nanos, frames, gaps }
     }
-}
-
-/// The run that a supervisor has named to this process; empty where there is none.
-pub fn run_from_environment() -> String {
-    std::env::var(RUN_VARIABLE).unwrap_or_default()
 }
 
 /// Keeps the position of this process, where it can be kept: without a file capture works too.
@@ -78,17 +75,12 @@ impl PositionKeeper {
         source: &str,
         rig: Option<&Path>,
     ) -> (Self, Option<Position>) {
-        match mode {
-            Mode::Lockstep => (Self::default(), None),
-            Mode::Live => {
-                Self::open_or_warn(path, position_key(&run_from_environment(), source, rig))
-            }
+        if mode == Mode::Lockstep {
+            return (Self::default(), None);
         }
-    }
-
-    /// Opens the file at `path`; with it the position that a capture of the same key has left there.
-    pub fn open_or_warn(path: &Path, key: u64) -> (Self, Option<Position>) {
-        match PositionFile::open(path, key) {
+        // Empty where no supervisor has named it.
+        let run = std::env::var(RUN_VARIABLE).unwrap_or_default();
+        match PositionFile::open(path, position_key(&run, source, rig)) {
             Ok((file, left)) => (Self { file: Some(file) }, left),
             Err(error) => {
                 let path = path.display();
@@ -193,33 +185,24 @@ pub fn read_position(path: &Path, key: u64) -> Option<Position> {
 fn slot_bytes(key: u64, writes: u64, position: &Position) -> [u8; SLOT_BYTES] {
     let Position { process_id, sequence, capture_nanos, frames, gaps } = *position;
     let stamp = capture_nanos.cast_unsigned();
-    let numbers = [key, writes, u64::from(process_id), sequence, stamp, frames, gaps];
-    let mut bytes = [0; SLOT_BYTES];
-    for (place, number) in bytes.chunks_exact_mut(8).zip(numbers) {
-        place.copy_from_slice(&number.to_le_bytes());
-    }
-    let sum = hash(bytes[..SLOT_BYTES - 8].iter().copied());
-    bytes[SLOT_BYTES - 8..].copy_from_slice(&sum.to_le_bytes());
-    bytes
+    let mut slot = [key, writes, u64::from(process_id), sequence, stamp, frames, gaps, 0];
+    slot[SLOT_NUMBERS - 1] = hash(slot[..SLOT_NUMBERS - 1].as_bytes());
+    zerocopy::transmute!(slot)
 }
 
 /// The slot that was written last of those that are whole and of this key.
 fn newest_slot(file: &File, key: u64) -> Option<(u64, Position)> {
     let read = |slot: u64| {
-        let mut bytes = [0; SLOT_BYTES];
-        file.read_exact_at(&mut bytes, slot * SLOT_BYTES as u64).ok()?;
-        position_from_slot(&bytes, key)
+        let mut numbers = [0; SLOT_NUMBERS];
+        file.read_exact_at(numbers.as_mut_bytes(), slot * SLOT_BYTES as u64).ok()?;
+        position_from_slot(numbers, key)
     };
     (0..SLOTS).filter_map(read).max_by_key(|(writes, _)| *writes)
 }
 
-fn position_from_slot(bytes: &[u8; SLOT_BYTES], key: u64) -> Option<(u64, Position)> {
-    let mut numbers = [0; SLOT_NUMBERS];
-    for (number, place) in numbers.iter_mut().zip(bytes.chunks_exact(8)) {
-        *number = u64::from_le_bytes(place.try_into().ok()?);
-    }
+fn position_from_slot(numbers: [u64; SLOT_NUMBERS], key: u64) -> Option<(u64, Position)> {
     let [of, writes, process_id, sequence, stamp, frames, gaps, sum] = numbers;
-    if of != key || sum != hash(bytes[..SLOT_BYTES - 8].iter().copied()) {
+    if of != key || sum != hash(numbers[..SLOT_NUMBERS - 1].as_bytes()) {
         return None;
     }
     let process_id = u32::try_from(process_id).ok()?;

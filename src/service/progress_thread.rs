@@ -5,16 +5,15 @@ use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use crossbeam::queue::ArrayQueue;
 
+use crate::service::clock::wait_at_most;
 use crate::service::run_progress::RunProgress;
 
 /// How long the end waits for the thread.
 const LONGEST_FINISH: Duration = Duration::from_secs(1);
-/// Pause between two looks whether it has ended.
-const LOOK_PAUSE: Duration = Duration::from_millis(2);
 
 /// The thread and what it is handed.
 #[derive(Debug)]
@@ -59,9 +58,6 @@ impl ProgressThread {
     pub fn finish(self) {
         self.handed.is_over.store(true, Ordering::Release);
         self.thread.thread().unpark();
-        let start = Instant::now();
-        while !self.thread.is_finished() && start.elapsed() < LONGEST_FINISH {
-            std::thread::sleep(LOOK_PAUSE);
-        }
+        wait_at_most(LONGEST_FINISH, || self.thread.is_finished());
     }
 }

@@ -8,7 +8,6 @@ use crate::service::journal::recovered::complete;
 use crate::service::recording::{RecordParts, Recording, RunCounters};
 use crate::service::results::record::RunRecord;
 use crate::slam::map::Map;
-use crate::slam::pose::TrackingState;
 use crate::wire::message::{AdjustmentMessage, PoseMessage, StepMessage};
 use crate::wire::port::{Events, Hub, OpenError, ReceiveError, Subscriber};
 use crate::wire::topic::{ADJUSTMENT, POSE, STEP};
@@ -19,8 +18,10 @@ pub struct Recorder {
     poses: Subscriber<PoseMessage, ()>,
     steps: Subscriber<StepMessage, ()>,
     adjustments: Subscriber<AdjustmentMessage, ()>,
-    recording: Recording,
-    last_step: Option<StepMessage>,
+    /// What was collected so far.
+    pub recording: Recording,
+    /// What the mapper said last.
+    pub last_step: Option<StepMessage>,
     journal: Option<Journal>,
     /// What only the journal needs; none without one, and after it has failed.
     keyframes: Option<KeyframeFeed>,
@@ -108,21 +109,6 @@ impl Recorder {
         if let Some(journal) = &mut self.journal {
             journal.count(counters);
         }
-    }
-
-    /// Poses so far.
-    pub fn num_poses(&self) -> usize {
-        self.recording.num_poses()
-    }
-
-    /// State of the last frame.
-    pub fn state(&self) -> Option<TrackingState> {
-        self.recording.state()
-    }
-
-    /// What the mapper said last.
-    pub fn last_step(&self) -> Option<&StepMessage> {
-        self.last_step.as_ref()
     }
 
     /// Completes the map of a mapper that has died on the way, or that gave none, with what the journal

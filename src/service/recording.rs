@@ -52,8 +52,8 @@ pub struct Recording {
     /// The newest; those before them were released.
     poses: Vec<RecordedPose>,
     num_released: usize,
-    /// Of the last frame.
-    state: Option<TrackingState>,
+    /// State of the last frame.
+    pub state: Option<TrackingState>,
     map_nanos: Vec<u64>,
     keyframe_step_nanos: Vec<u64>,
     keyframe_nanos: Vec<u64>,
@@ -150,11 +150,6 @@ impl Recording {
     /// Steps of the mapper so far.
     pub fn num_steps(&self) -> usize {
         self.map_nanos.len()
-    }
-
-    /// State of the last frame.
-    pub fn state(&self) -> Option<TrackingState> {
-        self.state
     }
 
     /// The record of the whole run, of which nothing is released any more.
@@ -258,7 +253,7 @@ mod tests {
                 released.release(if number > 800 { 2000 } else { number / 2 });
             }
             assert_eq!(released.num_poses(), number + 1);
-            assert_eq!(released.state(), whole.state());
+            assert_eq!(released.state, whole.state);
         }
         let num_released = released.num_released();
         assert!(num_released > 800 && released.poses.capacity() < 600, "{num_released}");

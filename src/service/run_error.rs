@@ -1,13 +1,17 @@
-//! Why a supervised run comes to nothing.
+//! Why a run, or one of its processes, comes to nothing.
 
 use std::io;
 
 use crate::capture::source_error::SourceError;
-use crate::service::map_folder::map_folder_error::MapFolderError;
+use crate::capture::source_name::SourceName;
+use crate::service::map_folder::session::MapSessionError;
+use crate::slam::parameter::ParameterError;
+use crate::wire::command::CommandError;
+use crate::wire::keyframe_inbox::InboxError;
 use crate::wire::place_error::PlaceError;
-use crate::wire::port::{OpenError, ReceiveError, WaitError};
+use crate::wire::port::{OpenError, ReceiveError, SendError, WaitError};
 
-/// Why a run does not start, or its record cannot be made.
+/// Why a run does not start or its record cannot be made, or why one of its processes ends early.
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
     /// The place is not right, or taken.
@@ -16,18 +20,67 @@ pub enum RunError {
     /// A topic cannot be opened.
     #[error(transparent)]
     Open(#[from] OpenError),
-    /// The map is another camera's, or cannot be read.
-    #[error(transparent)]
-    Map(#[from] MapFolderError),
-    /// The source cannot be opened.
+    /// The source cannot be opened, or gave no frame.
     #[error(transparent)]
     Source(#[from] SourceError),
-    /// Poses cannot be received.
+    /// A message cannot be sent.
+    #[error(transparent)]
+    Send(#[from] SendError),
+    /// The others cannot be heard.
     #[error(transparent)]
     Receive(#[from] ReceiveError),
+    /// Keyframes cannot be received.
+    #[error(transparent)]
+    Inbox(#[from] InboxError),
+    /// A command cannot be answered.
+    #[error(transparent)]
+    Command(#[from] CommandError),
     /// Waiting failed.
     #[error(transparent)]
     Wait(#[from] WaitError),
+    /// The map on disk cannot be used.
+    #[error(transparent)]
+    Map(#[from] MapSessionError),
+    /// The configuration of tracking or mapping does not fit the frames.
+    #[error("{0}: {1}")]
+    Parameter(&'static str, ParameterError),
+    /// Size and intrinsics of no camera.
+    #[error("{0}: its size and intrinsics are not those of a camera; check its camera file or rig")]
+    Intrinsics(SourceName),
+    /// A thread cannot be started, which does this.
+    #[error("cannot start the thread that {0} ({1})")]
+    Thread(&'static str, io::Error),
+    /// No threads.
+    #[error("cannot start {threads} mapper threads ({reason}); lower mapper.threads")]
+    Pool {
+        /// How many were wanted.
+        threads: usize,
+        /// What the system says.
+        reason: String,
+    },
+    /// A process that must be there is not.
+    #[error(
+        "{process} was not ready within {seconds} s; start it, or raise capture.connect_timeout_s"
+    )]
+    NotReady {
+        /// Which.
+        process: &'static str,
+        /// How long was waited.
+        seconds: f64,
+    },
+    /// The map does not take in a frame.
+    #[error(
+        "the mapper did not finish frame {sequence} within {seconds} s; raise capture.step_timeout_s if it is just slow"
+    )]
+    NoStep {
+        /// Which frame.
+        sequence: u64,
+        /// How long was waited.
+        seconds: f64,
+    },
+    /// A signal, before the end.
+    #[error("interrupted")]
+    Interrupted,
     /// A process cannot be started or watched.
     #[error("{process}: cannot be started or watched ({source})")]
     Child {

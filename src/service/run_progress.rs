@@ -1,6 +1,5 @@
 //! How far a run is, for whoever shows it.
 
-use crate::service::results::record::EndOfRun;
 use crate::slam::pose::TrackingState;
 
 /// How far a run is, for whoever watches.
@@ -21,25 +20,4 @@ pub enum RunProgress {
         /// Keyframes in the map.
         keyframes: u64,
     },
-}
-
-/// How a run ended.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Ended {
-    /// With the end of the source.
-    Finished,
-    /// By a signal.
-    Interrupted,
-    /// Because a process failed; says which and why.
-    Failed(String),
-}
-
-impl From<&Ended> for EndOfRun {
-    fn from(ended: &Ended) -> Self {
-        match ended {
-            Ended::Finished => Self::Finished,
-            Ended::Interrupted => Self::Interrupted,
-            Ended::Failed(cause) => Self::Failed(cause.clone()),
-        }
-    }
 }

@@ -87,63 +87,6 @@ impl SchedulingParams {
     }
 }
 
-/// What the kernel refused; says which limit to raise.
-#[derive(Debug, thiserror::Error, Clone, PartialEq, Eq)]
-pub enum Refusal {
-    /// No real-time policy.
-    #[error(
-        "{policy} scheduling refused ({reason}): raise RLIMIT_RTPRIO to {priority} (LimitRTPRIO= in the unit, rtprio in /etc/security/limits.conf)"
-    )]
-    RealTime {
-        /// Which policy.
-        policy: &'static str,
-        /// Which priority.
-        priority: u32,
-        /// What the kernel says.
-        reason: String,
-    },
-    /// No deadline policy.
-    #[error(
-        "deadline scheduling refused ({reason}): it needs CAP_SYS_NICE (AmbientCapabilities= in the unit), no CPU list, and a free share of the CPUs"
-    )]
-    Deadline {
-        /// What the kernel says.
-        reason: String,
-    },
-    /// No lower priority.
-    #[error(
-        "idle scheduling refused ({reason}): allow sched_setattr, or set mapper.background = \"other\""
-    )]
-    Background {
-        /// What the kernel says.
-        reason: String,
-    },
-    /// Not these CPUs.
-    #[error(
-        "CPUs {cpus:?} refused ({reason}): name CPUs that exist and that the unit's CPUAffinity= allows"
-    )]
-    Cpus {
-        /// Which.
-        cpus: Vec<usize>,
-        /// What the kernel says.
-        reason: String,
-    },
-    /// Memory cannot be locked.
-    #[error(
-        "locking memory refused ({reason}): raise RLIMIT_MEMLOCK (LimitMEMLOCK=infinity in the unit, memlock in /etc/security/limits.conf)"
-    )]
-    Memory {
-        /// What the kernel says.
-        reason: String,
-    },
-    /// No other timer slack.
-    #[error("timer slack refused ({reason}): leave timer_slack_us at 0")]
-    TimerSlack {
-        /// What the kernel says.
-        reason: String,
-    },
-}
-
 /// The scheduling in effect, as the kernel reports it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct InForce {
@@ -162,6 +105,8 @@ const SCHED_IDLE: u32 = 5;
 const SCHED_DEADLINE: u32 = 6;
 /// Threads that are made later do not inherit the policy (linux/sched.h).
 const SCHED_FLAG_RESET_ON_FORK: u64 = 1;
+const NO_FLAGS: libc::c_uint = 0;
+const THIS_THREAD: libc::pid_t = 0;
 
 /// `struct sched_attr` of sched_setattr(2), its first version.
 #[repr(C)]
@@ -177,28 +122,33 @@ struct SchedAttr {
     period: u64,
 }
 
-/// Applies `params` to the calling thread (memory: to the process), and gives what was refused. Threads
-/// that are made later run as SCHED_OTHER on the same CPUs.
-pub fn apply(params: &SchedulingParams) -> Vec<Refusal> {
+/// Applies `params` to the calling thread (memory: to the process), and says what was refused and which limit to
+/// raise. Threads that are made later run as SCHED_OTHER on the same CPUs.
+pub fn apply(params: &SchedulingParams) -> Vec<String> {
     let mut refusals = Vec::new();
     // Memory first: under FIFO the touching of new pages would hold up everybody else.
     if params.lock_memory {
         let flags = MlockAllFlags::CURRENT | MlockAllFlags::FUTURE;
         match rustix::mm::mlockall(flags) {
             Ok(()) => touch_stack(),
-            Err(error) => refusals.push(Refusal::Memory { reason: error.to_string() }),
+            Err(error) => refusals.push(format!(
+                "locking memory refused ({error}): raise RLIMIT_MEMLOCK (LimitMEMLOCK=infinity in the unit, memlock in /etc/security/limits.conf)"
+            )),
         }
     }
     if let Some(slack) = NonZeroU64::new(params.timer_slack_us.saturating_mul(1000))
         && let Err(error) = rustix::thread::set_current_timer_slack(Some(slack))
     {
-        refusals.push(Refusal::TimerSlack { reason: error.to_string() });
+        refusals.push(format!("timer slack refused ({error}): leave timer_slack_us at 0"));
     }
     if !params.cpus.is_empty() {
         let mut set = CpuSet::new();
         params.cpus.iter().filter(|&&cpu| cpu < MAX_CPU).for_each(|&cpu| set.set(cpu));
         if let Err(error) = rustix::thread::sched_setaffinity(None, &set) {
-            refusals.push(Refusal::Cpus { cpus: params.cpus.clone(), reason: error.to_string() });
+            refusals.push(format!(
+                "CPUs {:?} refused ({error}): name CPUs that exist and that the unit's CPUAffinity= allows",
+                params.cpus
+            ));
         }
     }
     refusals.extend(apply_policy(params).err());
@@ -206,31 +156,27 @@ pub fn apply(params: &SchedulingParams) -> Vec<Refusal> {
 }
 
 /// Makes the calling thread one that no frame waits for. The kernel refuses this to nobody, a sandbox may.
-pub fn apply_background(background: Background) -> Result<(), Refusal> {
-    let policy = match background {
-        Background::Idle => SCHED_IDLE,
-        Background::Other => return Ok(()),
-    };
-    let size = size_of::<SchedAttr>() as u32;
-    set_attributes(&SchedAttr { size, policy, ..SchedAttr::default() })
-        .map_err(|error| Refusal::Background { reason: error.to_string() })
+pub fn apply_background(background: Background) -> Result<(), String> {
+    if background == Background::Other {
+        return Ok(());
+    }
+    set_attributes(SchedAttr { policy: SCHED_IDLE, ..SchedAttr::default() }).map_err(|error| {
+        format!("idle scheduling refused ({error}): allow sched_setattr, or set mapper.background = \"other\"")
+    })
 }
 
-fn apply_policy(params: &SchedulingParams) -> Result<(), Refusal> {
+fn apply_policy(params: &SchedulingParams) -> Result<(), String> {
     let nanos = |millis: f64| (millis * 1e6) as u64;
-    let size = size_of::<SchedAttr>() as u32;
     let attributes = match params.policy {
         Policy::Inherit => return Ok(()),
-        Policy::Other => SchedAttr { size, policy: SCHED_OTHER, ..SchedAttr::default() },
+        Policy::Other => SchedAttr { policy: SCHED_OTHER, ..SchedAttr::default() },
         Policy::Fifo => SchedAttr {
-            size,
             policy: SCHED_FIFO,
             flags: SCHED_FLAG_RESET_ON_FORK,
             priority: params.priority,
             ..SchedAttr::default()
         },
         Policy::Deadline => SchedAttr {
-            size,
             policy: SCHED_DEADLINE,
             flags: SCHED_FLAG_RESET_ON_FORK,
             runtime: nanos(params.runtime_ms),
@@ -239,25 +185,28 @@ fn apply_policy(params: &SchedulingParams) -> Result<(), Refusal> {
             ..SchedAttr::default()
         },
     };
-    set_attributes(&attributes).map_err(|error| {
-        let reason = error.to_string();
-        match params.policy {
-            Policy::Deadline => Refusal::Deadline { reason },
-            Policy::Other => Refusal::RealTime { policy: "other", priority: 0, reason },
-            _ => Refusal::RealTime { policy: "FIFO", priority: params.priority, reason },
-        }
+    let (name, priority) = match params.policy {
+        Policy::Other => ("other", 0),
+        _ => ("FIFO", params.priority),
+    };
+    set_attributes(attributes).map_err(|error| match params.policy {
+        Policy::Deadline => format!(
+            "deadline scheduling refused ({error}): it needs CAP_SYS_NICE (AmbientCapabilities= in the unit), no CPU list, and a free share of the CPUs"
+        ),
+        _ => format!(
+            "{name} scheduling refused ({error}): raise RLIMIT_RTPRIO to {priority} (LimitRTPRIO= in the unit, rtprio in /etc/security/limits.conf)"
+        ),
     })
 }
 
-fn set_attributes(attributes: &SchedAttr) -> std::io::Result<()> {
-    const NO_FLAGS: libc::c_uint = 0;
-    const THIS_THREAD: libc::pid_t = 0;
+fn set_attributes(attributes: SchedAttr) -> std::io::Result<()> {
+    let attributes = SchedAttr { size: size_of::<SchedAttr>() as u32, ..attributes };
     // SAFETY: the kernel reads `size` bytes from a struct that is `#[repr(C)]` and of that size.
     let result = unsafe {
         libc::syscall(
             libc::SYS_sched_setattr,
             THIS_THREAD,
-            std::ptr::from_ref(attributes),
+            std::ptr::from_ref(&attributes),
             NO_FLAGS,
         )
     };
@@ -267,8 +216,6 @@ fn set_attributes(attributes: &SchedAttr) -> std::io::Result<()> {
 /// The scheduling of the calling thread, as the kernel tells it.
 pub fn in_force() -> InForce {
     let mut attributes = SchedAttr::default();
-    const NO_FLAGS: libc::c_uint = 0;
-    const THIS_THREAD: libc::pid_t = 0;
     let size = size_of::<SchedAttr>() as libc::c_uint;
     // SAFETY: the kernel writes at most `size` bytes to a struct of that size whose every bit pattern is
     // valid.
@@ -307,27 +254,10 @@ fn touch_stack() {
     std::hint::black_box(&stack);
 }
 
-/// What the calling thread has used so far.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct ThreadUsage {
-    /// Page faults, with and without input.
-    pub page_faults: u64,
-    /// Times that it gave up the CPU by itself: sleeps and waits.
-    pub waits: u64,
-    /// Times that the kernel took the CPU away.
-    pub preemptions: u64,
-}
-
-/// The usage of the calling thread. One call to the kernel, no allocation.
-pub fn thread_usage() -> ThreadUsage {
-    usage(libc::RUSAGE_THREAD).map_or(ThreadUsage::default(), |usage| {
-        let count = |value: libc::c_long| u64::try_from(value).unwrap_or(0);
-        ThreadUsage {
-            page_faults: count(usage.ru_minflt) + count(usage.ru_majflt),
-            waits: count(usage.ru_nvcsw),
-            preemptions: count(usage.ru_nivcsw),
-        }
-    })
+/// Page faults of the calling thread so far, with and without input. One call to the kernel, no allocation.
+pub fn thread_page_faults() -> u64 {
+    let count = |value: libc::c_long| u64::try_from(value).unwrap_or(0);
+    usage(libc::RUSAGE_THREAD).map_or(0, |of| count(of.ru_minflt) + count(of.ru_majflt))
 }
 
 /// Largest resident memory of this process so far; `None` where the kernel does not say. One call to the
@@ -408,12 +338,12 @@ mod tests {
     #[test]
     fn page_faults_are_counted() {
         let (before, after) = in_thread(|| {
-            let before = thread_usage();
+            let before = thread_page_faults();
             // More than the allocator ever keeps for reuse.
             std::hint::black_box(vec![1_u8; 64 << 20]);
-            (before, thread_usage())
+            (before, thread_page_faults())
         });
-        assert!(after.page_faults > before.page_faults, "{before:?} {after:?}");
+        assert!(after > before, "{before} {after}");
         assert!(peak_rss_bytes().unwrap() > 1 << 20);
     }
 

@@ -14,9 +14,10 @@ use crate::service::journal::{Journal, JournalOptions};
 use crate::service::latency_bench::{TrialError, bench_options};
 use crate::service::mode::Mode;
 use crate::service::peers::Peer;
+use crate::service::results::record::EndOfRun;
 use crate::service::run_progress::RunProgress;
 use crate::service::shutdown::Shutdown;
-use crate::service::supervisor::{Ended, run};
+use crate::service::supervisor::run;
 use crate::wire::message::{HISTOGRAM_BUCKETS, HealthMessage};
 use crate::wire::place::Place;
 use crate::wire::port::{Access, Hub};
@@ -132,9 +133,9 @@ pub fn soak(
     if let Some(Err(error)) = outcome.journal.map(Journal::finish) {
         tracing::warn!("the journal of the soak stays: {error}");
     }
-    match outcome.ended {
-        Ended::Finished | Ended::Interrupted => Ok(watch.samples),
-        Ended::Failed(cause) => Err(TrialError::Ended(cause)),
+    match outcome.record.ended {
+        EndOfRun::Failed(cause) => Err(TrialError::Ended(cause)),
+        _ => Ok(watch.samples),
     }
 }
 

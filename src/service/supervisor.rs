@@ -14,18 +14,17 @@ use crate::service::child::{Child, memory_for_frames};
 use crate::service::clock::now_nanos;
 use crate::service::config::Config;
 use crate::service::error_log::ErrorLog;
-use crate::service::final_map::{FinalMapError, final_map};
+use crate::service::final_map::final_map;
 use crate::service::health::{ProcessState, cause};
 use crate::service::journal::{Journal, JournalOptions};
-use crate::service::map_folder::session::check_camera;
+use crate::service::map_folder::session::{MapSessionError, check_camera};
 use crate::service::mode::Mode;
 use crate::service::peers::Peer;
 use crate::service::position::{position_key, read_position};
 use crate::service::recorder::Recorder;
 use crate::service::recording::{RecordParts, RunCounters};
-use crate::service::results::record::{RestartCause, RunMode, RunRecord};
+use crate::service::results::record::{EndOfRun, RestartCause, RunMode, RunRecord};
 pub use crate::service::run_error::RunError;
-pub use crate::service::run_progress::Ended;
 use crate::service::run_progress::RunProgress;
 use crate::service::schedule::peak_rss_bytes;
 use crate::service::shutdown::Shutdown;
@@ -79,8 +78,6 @@ pub struct RunOutcome {
     pub journal: Option<Journal>,
     /// The source once more, for its true depth.
     pub source: Box<dyn FrameSource>,
-    /// How it ended.
-    pub ended: Ended,
 }
 
 /// Runs the three processes to the end of the source, to a signal, or to a failure.
@@ -91,7 +88,7 @@ pub fn run(
     observe: &mut dyn FnMut(&RunProgress),
 ) -> Result<RunOutcome, RunError> {
     let source = open(&options.source, options.rig.as_deref(), &config.source_params())?;
-    check_camera(&config.map, &source.intrinsics())?;
+    check_camera(&config.map, &source.intrinsics()).map_err(MapSessionError::from)?;
     let place = Place::new(&config.instance, &config.root)?;
     let _claim = claim_all(&place)?;
     // What a run before has left is not of this one.
@@ -117,12 +114,12 @@ fn supervise(
     supervisor.stop(CAPTURE, shutdown);
     supervisor.settle(&ended, shutdown)?;
     // Without a pose there is no map; a mapper that is still starting would be waited for in vain.
-    let has_map = options.keeps_map && supervisor.recorder.num_poses() > 0;
+    let has_map = options.keeps_map && supervisor.recorder.recording.num_poses() > 0;
     let mut map = match has_map.then(|| supervisor.final_map(shutdown)).transpose() {
         Ok(map) => map.unwrap_or_default(),
-        Err(error) => {
-            if ended == Ended::Finished {
-                ended = Ended::Failed(error.to_string());
+        Err(cause) => {
+            if ended == EndOfRun::Finished {
+                ended = EndOfRun::Failed(cause);
             }
             supervisor.map_of_checkpoint()
         }
@@ -132,36 +129,35 @@ fn supervise(
         supervisor.recorder.complete_map(&mut map, max_bytes);
     }
     let refused = supervisor.refused()?;
-    let is_cut = matches!(ended, Ended::Failed(_));
-    if let (Ended::Finished, Some(cause)) = (&ended, &supervisor.bus_error) {
-        ended = Ended::Failed(cause.clone());
+    let is_cut = matches!(ended, EndOfRun::Failed(_));
+    if let (EndOfRun::Finished, Some(cause)) = (&ended, &supervisor.bus_error) {
+        ended = EndOfRun::Failed(cause.clone());
     }
     let (mut recorder, counters, restart_causes) = supervisor.finish(shutdown)?;
-    if let (Ended::Finished, missing @ 1..) = (&ended, recorder.take_back()) {
-        ended = Ended::Failed(format!("{missing} poses cannot be read back from the journal"));
+    if let (EndOfRun::Finished, missing @ 1..) = (&ended, recorder.take_back()) {
+        ended = EndOfRun::Failed(format!("{missing} poses cannot be read back from the journal"));
     }
-    if let (Ended::Failed(cause), true, frames @ 1..) = (&mut ended, is_cut, recorder.num_poses()) {
+    let num_poses = recorder.recording.num_poses();
+    if let (EndOfRun::Failed(cause), true, frames @ 1..) = (&mut ended, is_cut, num_poses) {
         let of = if frames == 1 { "frame".to_owned() } else { format!("{frames} frames") };
         let _ = write!(cause, "; the results are of the {of} before");
     }
-    let lost = counters.frames_in.saturating_sub(recorder.num_poses() as u64);
-    if options.mode == Mode::Lockstep && ended == Ended::Finished && lost > 0 {
-        ended = Ended::Failed(format!("{lost} of {} poses did not arrive", counters.frames_in));
+    let lost = counters.frames_in.saturating_sub(num_poses as u64);
+    if options.mode == Mode::Lockstep && ended == EndOfRun::Finished && lost > 0 {
+        ended = EndOfRun::Failed(format!("{lost} of {} poses did not arrive", counters.frames_in));
     }
-    let (name, truth) = (options.source.to_string(), source.ground_truth().to_vec());
-    let deadline_ms = config.tracker.deadline_ms;
     let (record, journal) = recorder.into_record(RecordParts {
         mode: if options.mode == Mode::Live { RunMode::Live } else { RunMode::Lockstep },
-        source: name,
+        source: options.source.to_string(),
         map,
-        ground_truth: truth,
+        ground_truth: source.ground_truth().to_vec(),
         depth_scale: DepthScale::MedianRatio,
         is_depth_from_sensor: false,
-        deadline_ms,
+        deadline_ms: config.tracker.deadline_ms,
         counters,
     });
-    let record = RunRecord { ended: (&ended).into(), refused, restart_causes, ..record };
-    Ok(RunOutcome { record, journal, source, ended })
+    let record = RunRecord { ended, refused, restart_causes, ..record };
+    Ok(RunOutcome { record, journal, source })
 }
 
 /// The journal of the run. Without one it continues.
@@ -259,13 +255,13 @@ impl<'a> Supervisor<'a> {
             Mode::Lockstep => "--lockstep".into(),
             Mode::Live => "--live".into(),
         });
-        if name == HEALTH_TOPICS[CAPTURE].owner {
+        let is_capture = name == HEALTH_TOPICS[CAPTURE].owner;
+        if is_capture {
             arguments.extend(["--source".into(), self.options.source.to_os_string()]);
             if let Some(rig) = &self.options.rig {
                 arguments.extend(["--rig".into(), rig.clone().into_os_string()]);
             }
         }
-        let is_capture = name == HEALTH_TOPICS[CAPTURE].owner;
         let frames = self.frames.as_ref().filter(|_| is_capture);
         Child::start(name, &arguments, &self.place.root, &self.run, frames, &self.options.log)
             .map_err(|source| RunError::Child { process: name, source })
@@ -276,7 +272,7 @@ impl<'a> Supervisor<'a> {
         &mut self,
         shutdown: &Shutdown,
         observe: &mut dyn FnMut(&RunProgress),
-    ) -> Result<Ended, RunError> {
+    ) -> Result<EndOfRun, RunError> {
         loop {
             wait(&[self.recorder.events()], Some(shutdown.descriptor()), WAKE_PERIOD)?;
             self.recorder.collect()?;
@@ -288,7 +284,7 @@ impl<'a> Supervisor<'a> {
             }
             observe(&self.progress());
             if shutdown.is_requested() {
-                return Ok(Ended::Interrupted);
+                return Ok(EndOfRun::Interrupted);
             }
             if let Some(ended) = self.check_processes()? {
                 return Ok(ended);
@@ -320,20 +316,20 @@ impl<'a> Supervisor<'a> {
         if self.processes[CAPTURE].peer.state() == Some(ProcessState::Stale) {
             return RunProgress::Waiting(cause(capture));
         }
-        if self.recorder.num_poses() == 0 {
+        if self.recorder.recording.num_poses() == 0 {
             return RunProgress::Preparing(capture.progress_done, capture.progress_total);
         }
         RunProgress::Running {
-            frames: self.recorder.num_poses() as u64,
+            frames: self.recorder.recording.num_poses() as u64,
             total: capture.total,
-            state: self.recorder.state(),
-            keyframes: self.recorder.last_step().map_or(0, |step| step.keyframes),
+            state: self.recorder.recording.state,
+            keyframes: self.recorder.last_step.map_or(0, |step| step.keyframes),
         }
     }
 
     /// Looks who has ended or hangs: the source's end ends the run, a death restarts the process (live) or
     /// ends the run (lockstep: a frame without an answer cannot be made good).
-    fn check_processes(&mut self) -> Result<Option<Ended>, RunError> {
+    fn check_processes(&mut self) -> Result<Option<EndOfRun>, RunError> {
         let watchdog = Duration::from_secs_f64(self.config.supervisor.watchdog_s);
         let mut deaths = Vec::new();
         for index in [CAPTURE, TRACKER, MAPPER] {
@@ -344,7 +340,7 @@ impl<'a> Supervisor<'a> {
                 .map_err(|source| RunError::Child { process: name, source })?;
             match ended {
                 None => {}
-                Some(None) => return Ok(Some(Ended::Finished)),
+                Some(None) => return Ok(Some(EndOfRun::Finished)),
                 Some(Some(death)) => deaths.push((index, death)),
             }
         }
@@ -368,7 +364,7 @@ impl<'a> Supervisor<'a> {
     }
 
     /// Plans a restart after a death, or says that there is none.
-    fn mourn(&mut self, index: usize, death: Death) -> Option<Ended> {
+    fn mourn(&mut self, index: usize, death: Death) -> Option<EndOfRun> {
         if death.is_bus_error {
             self.bus_error = Some(death.cause.clone());
         }
@@ -377,7 +373,7 @@ impl<'a> Supervisor<'a> {
         let kill_is_felt = self.killed.is_some_and(|killed| killed.elapsed() < KILL_IS_FELT);
         let max_restarts = self.config.supervisor.max_restarts;
         if !is_live || !process.may_restart(&death, kill_is_felt, max_restarts) {
-            return Some(Ended::Failed(death.cause));
+            return Some(EndOfRun::Failed(death.cause));
         }
         tracing::warn!("{}; restarting it", death.cause);
         process.plan_restart(death);
@@ -427,9 +423,9 @@ impl<'a> Supervisor<'a> {
     }
 
     /// Collects what is still under way after the last frame.
-    fn settle(&mut self, ended: &Ended, shutdown: &Shutdown) -> Result<(), RunError> {
+    fn settle(&mut self, ended: &EndOfRun, shutdown: &Shutdown) -> Result<(), RunError> {
         self.recorder.collect()?;
-        if self.options.mode == Mode::Lockstep || matches!(ended, Ended::Failed(_)) {
+        if self.options.mode == Mode::Lockstep || matches!(ended, EndOfRun::Failed(_)) {
             return Ok(());
         }
         let mut last = Instant::now();
@@ -442,7 +438,7 @@ impl<'a> Supervisor<'a> {
         Ok(())
     }
 
-    fn final_map(&mut self, shutdown: &Shutdown) -> Result<Map, FinalMapError> {
+    fn final_map(&mut self, shutdown: &Shutdown) -> Result<Map, String> {
         let (folder, config) = (&self.options.output, &self.config.supervisor);
         final_map(&mut self.processes[MAPPER], &self.commands, folder, config, shutdown)
     }
@@ -491,7 +487,7 @@ impl<'a> Supervisor<'a> {
         [CAPTURE, TRACKER].into_iter().for_each(|index| sums.add(&self.counted(index)));
         RunCounters {
             // Who is killed leaves the count of a moment before.
-            frames_in: sums.frames_in.max(self.recorder.num_poses() as u64),
+            frames_in: sums.frames_in.max(self.recorder.recording.num_poses() as u64),
             restarts: self.restarts(),
             peak_rss_bytes: peaks.sum::<u64>() + peak_rss_bytes().unwrap_or(0),
             ..sums

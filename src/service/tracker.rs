@@ -10,11 +10,11 @@ use crate::service::frame_order::{FrameOrder, FrameOrderOutcome, SILENCE};
 use crate::service::health::{Health, ProcessState};
 use crate::service::mode::Mode;
 use crate::service::reference_feed::ReferenceFeed;
-use crate::service::schedule::{apply, in_force, thread_usage};
+use crate::service::run_error::RunError;
+use crate::service::schedule::{apply, thread_page_faults};
 use crate::service::shutdown::Shutdown;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
-use crate::slam::parameter::ParameterError;
 use crate::slam::pose::{
     DegradedReason, LostReason, PoseEstimate, TrackingState, UNKNOWN_VARIANCE,
 };
@@ -22,14 +22,9 @@ use crate::slam::tracker::Tracker;
 use crate::wire::conversion::{
     PoseTiming, codes_from_state, frame_from_message, pose_from_message, pose_message,
 };
-use crate::wire::keyframe_inbox::InboxError;
 use crate::wire::message::{FrameHeader, PoseMessage};
 use crate::wire::place::{Claim, Place};
-use crate::wire::place_error::PlaceError;
-use crate::wire::port::{
-    Access, Hub, OpenError, Publisher, ReceiveError, Received, SendError, Subscriber, WaitError,
-    wait,
-};
+use crate::wire::port::{Access, Hub, Publisher, ReceiveError, Received, Subscriber, wait};
 use crate::wire::topic::{FRAME, POSE, TRACKER_HEALTH};
 
 /// Longest sleep without a look at signals and health.
@@ -37,49 +32,17 @@ const WAKE_PERIOD: Duration = Duration::from_millis(100);
 /// Frames until everything that the loop uses has been touched: page faults count from here.
 const WARM_UP_FRAMES: u64 = 100;
 
-/// Why the tracker ends early.
-#[derive(Debug, thiserror::Error)]
-pub enum TrackerError {
-    /// The place is not right, or taken.
-    #[error(transparent)]
-    Place(#[from] PlaceError),
-    /// A topic cannot be opened.
-    #[error(transparent)]
-    Open(#[from] OpenError),
-    /// Frames cannot be received.
-    #[error(transparent)]
-    Receive(#[from] ReceiveError),
-    /// A pose cannot be sent.
-    #[error(transparent)]
-    Send(#[from] SendError),
-    /// Keyframes cannot be received.
-    #[error(transparent)]
-    Inbox(#[from] InboxError),
-    /// Waiting failed.
-    #[error(transparent)]
-    Wait(#[from] WaitError),
-    /// The configuration does not fit the frames.
-    #[error("tracking: {0}")]
-    Parameter(#[from] ParameterError),
-    /// The thread that prepares keyframes cannot be started.
-    #[error("cannot start the thread that prepares keyframes ({0})")]
-    Thread(std::io::Error),
-}
-
 /// Runs the process until the signal.
-pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), TrackerError> {
+pub fn run(config: &Config, mode: Mode, shutdown: &Shutdown) -> Result<(), RunError> {
     let mut shell = Shell::prepare(config, mode)?;
     // After the thread that prepares keyframes was made: that one stays ordinary.
     let refusals = apply(&config.tracker.scheduling);
     refusals.iter().for_each(|refusal| tracing::warn!("tracker: {refusal}"));
-    shell.health.tell_scheduling(&in_force(), &refusals);
+    shell.health.tell_scheduling(&refusals);
     shell.health.enter(ProcessState::Ready, "");
     shell.health.tell_ready();
     let outcome = shell.track_until(shutdown);
-    match &outcome {
-        Ok(()) => shell.health.enter(ProcessState::Finished, "stopped"),
-        Err(error) => shell.health.enter(ProcessState::Failed, &error.to_string()),
-    }
+    shell.health.end(&outcome, "stopped");
     outcome
 }
 
@@ -103,14 +66,15 @@ struct Shell<'a> {
 }
 
 impl<'a> Shell<'a> {
-    fn prepare(config: &'a Config, mode: Mode) -> Result<Self, TrackerError> {
+    fn prepare(config: &'a Config, mode: Mode) -> Result<Self, RunError> {
         let place = Place::new(&config.instance, &config.root)?;
         let claim = place.claim("tracker")?;
         let hub = Hub::join(&place, "tracker", Access::Member)?;
         let params = &config.tracking.reference;
         let references = match mode {
             Mode::Lockstep => ReferenceFeed::synchronous(&hub, params)?,
-            Mode::Live => ReferenceFeed::threaded(&place, params).map_err(TrackerError::Thread)?,
+            Mode::Live => ReferenceFeed::threaded(&place, params)
+                .map_err(|error| RunError::Thread("prepares keyframes", error))?,
         };
         let shell = Self {
             config,
@@ -132,18 +96,20 @@ impl<'a> Shell<'a> {
         Ok(shell)
     }
 
-    fn track_until(&mut self, shutdown: &Shutdown) -> Result<(), TrackerError> {
+    fn track_until(&mut self, shutdown: &Shutdown) -> Result<(), RunError> {
         while !shutdown.is_requested() {
-            let mut awaited = self.await_frame(shutdown)?;
+            let mut next = self.await_frame(shutdown)?;
             self.poses.serve_late_joiners();
-            while let Some(frame) = take_or(&mut awaited, || self.next_frame())? {
+            while let Some(frame) = next {
                 self.step(&frame)?;
+                drop(frame);
                 // Frames that take longer than their period leave no pause between them.
                 self.poses.serve_late_joiners();
                 self.health.report();
                 if shutdown.is_requested() {
                     return Ok(());
                 }
+                next = self.next_frame()?;
             }
             self.look_for_silence();
             self.health.report();
@@ -151,12 +117,12 @@ impl<'a> Shell<'a> {
         Ok(())
     }
 
-    /// Sleeps until something happens. Live, where the configuration asks for it, it is awake when the
-    /// next frame is near and looks for it.
+    /// Sleeps until something happens; the frame that has come. Live, where the configuration asks for it, it is awake
+    /// when the next frame is near and looks for it.
     fn await_frame(
         &mut self,
         shutdown: &Shutdown,
-    ) -> Result<Option<Received<u8, FrameHeader>>, TrackerError> {
+    ) -> Result<Option<Received<u8, FrameHeader>>, RunError> {
         let early_us = self.config.tracker.early_wake_us;
         let (last, period) = (self.last_arrival_nanos, self.order.period_nanos());
         let watch = Watch::plan(early_us, last, period, now_nanos());
@@ -169,7 +135,7 @@ impl<'a> Shell<'a> {
             }
             std::hint::spin_loop();
         }
-        Ok(None)
+        Ok(self.next_frame()?)
     }
 
     /// The oldest frame in lockstep, the newest live.
@@ -181,7 +147,7 @@ impl<'a> Shell<'a> {
     }
 
     /// One frame: adopt, track, publish.
-    fn step(&mut self, received: &Received<u8, FrameHeader>) -> Result<(), TrackerError> {
+    fn step(&mut self, received: &Received<u8, FrameHeader>) -> Result<(), RunError> {
         let arrival_nanos = now_nanos();
         let _span = tracing::trace_span!("frame", sequence = received.header().sequence).entered();
         let header = *received.header();
@@ -216,7 +182,7 @@ impl<'a> Shell<'a> {
         frame: &FrameView<'_>,
         intrinsics: Intrinsics,
         deadline_nanos: Option<i64>,
-    ) -> Result<(PoseEstimate, i64), TrackerError> {
+    ) -> Result<(PoseEstimate, i64), RunError> {
         let known = self.tracker.take().filter(|(of, _)| *of == intrinsics);
         let (_, tracker) = match known {
             Some(tracker) => self.tracker.insert(tracker),
@@ -224,7 +190,8 @@ impl<'a> Shell<'a> {
                 // The first, or another camera in mid-stream.
                 let is_first = self.last_intrinsics.replace(intrinsics).is_none();
                 self.health.counters().resized += u64::from(!is_first);
-                let tracker = Tracker::new(intrinsics, self.config.tracking.clone())?;
+                let tracker = Tracker::new(intrinsics, self.config.tracking.clone())
+                    .map_err(|error| RunError::Parameter("tracking", error))?;
                 self.tracker.insert((intrinsics, tracker))
             }
         };
@@ -269,13 +236,10 @@ impl<'a> Shell<'a> {
     fn is_in_order(&mut self, header: &FrameHeader) -> bool {
         let arrival = self.order.arrive(header);
         let counters = self.health.counters();
-        match arrival {
-            FrameOrderOutcome::Next { missing } => counters.dropped += missing,
-            FrameOrderOutcome::ClockJump
-            | FrameOrderOutcome::Renumbered
-            | FrameOrderOutcome::Repeated => {
-                counters.disordered += 1;
-            }
+        if let FrameOrderOutcome::Next { missing } = arrival {
+            counters.dropped += missing;
+        } else {
+            counters.disordered += 1;
         }
         arrival != FrameOrderOutcome::Repeated
     }
@@ -292,7 +256,7 @@ impl<'a> Shell<'a> {
         if self.health.counters().frames < WARM_UP_FRAMES {
             return;
         }
-        let faults = thread_usage().page_faults;
+        let faults = thread_page_faults();
         let warm = *self.warm_page_faults.get_or_insert(faults);
         self.health.counters().page_faults = faults.saturating_sub(warm);
     }
@@ -303,7 +267,7 @@ impl<'a> Shell<'a> {
         header: &FrameHeader,
         [wake_nanos, track_nanos]: [i64; 2],
         deadline_nanos: Option<i64>,
-    ) -> Result<(), TrackerError> {
+    ) -> Result<(), RunError> {
         let _span = tracing::trace_span!("publish").entered();
         let published_nanos = now_nanos();
         // A camera's stamp may lie in the future of our clock.
@@ -334,14 +298,6 @@ impl<'a> Shell<'a> {
         self.health.enter(ProcessState::Running, state_text(estimate.state));
         Ok(())
     }
-}
-
-/// What has come already, else what comes now.
-fn take_or<T, E>(
-    come: &mut Option<T>,
-    next: impl FnOnce() -> Result<Option<T>, E>,
-) -> Result<Option<T>, E> {
-    come.take().map_or_else(next, |come| Ok(Some(come)))
 }
 
 /// A state and its reason, for whoever looks on.

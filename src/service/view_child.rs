@@ -1,19 +1,17 @@
 //! The live page beside a run: one more process, whose death the run does not notice.
 
 use std::ffi::OsString;
-use std::io::{self, BufRead, BufReader, Write};
-use std::os::unix::process::CommandExt;
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::io::{self, Write};
+use std::path::PathBuf;
+use std::process::{Child, Stdio};
 use std::sync::mpsc::{Receiver, sync_channel};
 use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal};
 
-use crate::service::child::SUPERVISOR_VARIABLE;
+use crate::service::child::{command, forward_lines};
+use crate::service::clock::wait_at_most;
 use crate::service::error_log::ErrorLog;
-use crate::service::manager_notice::VARIABLES;
-use crate::wire::folders::ROOT_VARIABLE;
 
 /// Pause before it is started again.
 const RESTART_PAUSE: Duration = Duration::from_secs(10);
@@ -21,8 +19,6 @@ const RESTART_PAUSE: Duration = Duration::from_secs(10);
 const MOST_RESTARTS: u32 = 3;
 /// How long it may take to end when it is asked to: one that is stopped never does.
 const LONGEST_END: Duration = Duration::from_millis(500);
-/// Pause between two looks for its end.
-const LOOK_PAUSE: Duration = Duration::from_millis(5);
 /// Addresses that wait to be printed.
 const WAITING_LINES: usize = 4;
 
@@ -85,54 +81,27 @@ impl Drop for ViewChild {
     fn drop(&mut self) {
         let Some((child, _)) = &mut self.running else { return };
         let _ = rustix::process::kill_process(Pid::from_child(child), Signal::TERM);
-        let begin = Instant::now();
-        while matches!(child.try_wait(), Ok(None)) && begin.elapsed() < LONGEST_END {
-            std::thread::sleep(LOOK_PAUSE);
-        }
+        wait_at_most(LONGEST_END, || !matches!(child.try_wait(), Ok(None)));
         let _ = child.kill();
         let _ = child.wait();
     }
 }
 
-/// In a process group of its own, so that a Ctrl-C at the terminal reaches only the run.
 fn spawn(options: &ViewOptions) -> io::Result<(Child, Receiver<String>)> {
-    let mut command = Command::new(&options.program);
-    // The service manager knows the run, not its children.
-    for variable in VARIABLES {
-        command.env_remove(variable);
-    }
-    let mut child = command
+    let mut child = command(&options.program, &options.root)
         .args(&options.arguments)
-        .env(SUPERVISOR_VARIABLE, std::process::id().to_string())
-        .env(ROOT_VARIABLE, Path::new(&options.root))
-        .stdin(Stdio::null())
         .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .process_group(0)
         .spawn()?;
     let (sender, lines) = sync_channel(WAITING_LINES);
     if let Some(stdout) = child.stdout.take() {
-        forward("semidense-view", stdout, move |line| drop(sender.try_send(line)))?;
+        let take = move |line: &str| drop(sender.try_send(line.to_owned()));
+        forward_lines("semidense-view", stdout, take)?;
     }
     if let Some(stderr) = child.stderr.take() {
         let mut log = options.log.clone();
-        forward("semidense-view-log", stderr, move |line| {
+        forward_lines("semidense-view-log", stderr, move |line| {
             drop(log.write_all(format!("live page: {line}\n").as_bytes()));
         })?;
     }
     Ok((child, lines))
-}
-
-/// Hands on every line that comes.
-fn forward(
-    name: &str,
-    from: impl io::Read + Send + 'static,
-    mut take: impl FnMut(String) + Send + 'static,
-) -> io::Result<()> {
-    std::thread::Builder::new().name(name.to_owned()).spawn(move || {
-        for line in BufReader::new(from).split(b'\n').map_while(Result::ok) {
-            take(String::from_utf8_lossy(&line).into_owned());
-        }
-    })?;
-    Ok(())
 }

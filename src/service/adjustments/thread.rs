@@ -28,15 +28,6 @@ pub(super) struct Finished {
     pub nanos: u64,
 }
 
-/// Why there is no window yet.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Missing {
-    /// It is being estimated.
-    Unfinished,
-    /// The thread has ended in a panic.
-    Ended,
-}
-
 /// One window at a time goes there and comes back.
 pub(super) struct AdjustmentThread {
     windows: Option<SyncSender<Box<Window>>>,
@@ -79,27 +70,11 @@ impl AdjustmentThread {
         }
     }
 
-    /// The window that was handed over, where it is finished.
-    pub fn poll(&self) -> Result<Finished, Missing> {
+    /// The window that was handed over, where it comes back within `timeout`; disconnected where the thread has panicked.
+    pub fn wait_at_most(&self, timeout: Duration) -> Result<Finished, RecvTimeoutError> {
         let mut counted = [0; size_of::<u64>()];
         let _ = rustix::io::read(&self.wake, &mut counted);
-        self.finished.try_recv().map_err(|error| match error {
-            TryRecvError::Empty => Missing::Unfinished,
-            TryRecvError::Disconnected => Missing::Ended,
-        })
-    }
-
-    /// The same, after a wait.
-    pub fn wait(&self) -> Result<Finished, Missing> {
-        self.finished.recv().map_err(|_| Missing::Ended)
-    }
-
-    /// The same, after a wait of at most `timeout`.
-    pub fn wait_at_most(&self, timeout: Duration) -> Result<Finished, Missing> {
-        self.finished.recv_timeout(timeout).map_err(|error| match error {
-            RecvTimeoutError::Timeout => Missing::Unfinished,
-            RecvTimeoutError::Disconnected => Missing::Ended,
-        })
+        self.finished.recv_timeout(timeout)
     }
 
     /// Readable when a window has come back and was not asked for since.

@@ -4,8 +4,7 @@ use std::path::{Path, PathBuf};
 
 use toml::{Table, Value};
 
-use crate::capture::input_file;
-use crate::service::config::{Config, ConfigError, MAX_FILE_BYTES, apply, layout};
+use crate::service::config::{Config, ConfigError, apply, layout};
 
 /// Where a value comes from.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -40,14 +39,7 @@ impl Config {
         settings: &[String],
     ) -> Result<Vec<KeyInForce>, ConfigError> {
         let config = Self::load(file, settings)?;
-        let of_file = match file {
-            None => Table::new(),
-            Some(path) => {
-                let text = input_file::read_text(path, MAX_FILE_BYTES)
-                    .map_err(|source| ConfigError::Read { path: path.to_owned(), source })?;
-                Self::read(&text, &path.display().to_string())?.1
-            }
-        };
+        let of_file = file.map(Self::read_table).transpose()?.unwrap_or_default();
         let mut of_line = Table::new();
         for setting in settings {
             apply(&mut of_line, setting).map_err(|reason| ConfigError::Syntax {

@@ -1,4 +1,4 @@
-//! The log of a run: an append-only file of checked records, little-endian.
+//! The log of a run: an append-only file of checked records, little-endian; messages are in it as they came.
 //!
 //! Layout: magic, then records: bytes of kind and payload together (u32), their CRC-32 (u32), kind (u8),
 //! payload. A process that dies tears the last record at most: reading ends at the first record that is not
@@ -9,7 +9,9 @@ use std::io::Read;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
+use zerocopy::{FromBytes, IntoBytes};
 
+use crate::service::bytes::take;
 use crate::service::journal::any_bytes;
 use crate::service::map_file::{keyframe_bytes, parse_keyframe};
 use crate::service::recording::RunCounters;
@@ -19,7 +21,7 @@ use crate::wire::conversion::{similarity_from_message, similarity_message};
 use crate::wire::message::{AdjustmentMessage, PoseMessage};
 
 /// First bytes of the file, with the version of the layout.
-const MAGIC: [u8; 16] = *b"semidense log 7\n";
+const MAGIC: [u8; 16] = *b"semidense log 8\n";
 /// Bytes before kind and payload.
 const PREFIX_BYTES: usize = 8;
 /// Largest record: the configuration is a tenth of it.
@@ -118,18 +120,16 @@ impl Record {
             }
             Self::Pose(pose) => {
                 log.push(Self::POSE);
-                write_pose(pose, log);
+                log.extend(pose.as_bytes());
             }
             Self::Step(step) => {
                 log.push(Self::STEP);
-                write_u64s(log, &[step.step_nanos, step.change_nanos]);
-                write_u32s(log, &[step.start_frame]);
+                log.extend([step.step_nanos, step.change_nanos].as_bytes());
+                log.extend(step.start_frame.as_bytes());
             }
-            Self::Adjustment(a) => {
+            Self::Adjustment(adjustment) => {
                 log.push(Self::ADJUSTMENT);
-                write_u64s(log, &[a.sequence, a.frames, a.cpu_nanos, a.keyframe_id]);
-                write_f64s(log, &[a.inlier_ratio, a.rms_grey]);
-                write_u32s(log, &[a.fate, a.free, a.fixed, a.points, a.comparisons, a.iterations]);
+                log.extend(adjustment.as_bytes());
             }
             Self::Counters(counters) => {
                 log.push(Self::COUNTERS);
@@ -141,8 +141,8 @@ impl Record {
             }
             Self::KeyframePose(epoch, pose) => {
                 log.push(Self::KEYFRAME_POSE);
-                write_u64s(log, &[u64::from(*epoch), pose.keyframe_id, pose.revision]);
-                write_f64s(log, &similarity_message(&pose.map_from_keyframe));
+                log.extend([u64::from(*epoch), pose.keyframe_id, pose.revision].as_bytes());
+                log.extend(similarity_message(&pose.map_from_keyframe).as_bytes());
             }
         }
     }
@@ -158,16 +158,16 @@ impl Record {
                 let keyframe = parse_keyframe(payload).ok()?;
                 return Some(Self::Keyframe(Box::new(keyframe)));
             }
-            Self::POSE => Self::Pose(Box::new(read_pose(&mut bytes)?)),
+            Self::POSE => Self::Pose(Box::new(take(&mut bytes)?)),
             Self::STEP => {
-                let [step_nanos, change_nanos] = read_u64s(&mut bytes)?;
-                let [start_frame] = read_u32s(&mut bytes)?;
+                let ([step_nanos, change_nanos], start_frame) =
+                    (take(&mut bytes)?, take(&mut bytes)?);
                 Self::Step(Step { step_nanos, change_nanos, start_frame })
             }
-            Self::ADJUSTMENT => Self::Adjustment(read_adjustment(&mut bytes)?),
+            Self::ADJUSTMENT => Self::Adjustment(take(&mut bytes)?),
             Self::KEYFRAME_POSE => {
-                let [epoch, keyframe_id, revision] = read_u64s(&mut bytes)?;
-                let pose = similarity_from_message(&read_f64s(&mut bytes)?, "pose").ok()?;
+                let [epoch, keyframe_id, revision]: [u64; 3] = take(&mut bytes)?;
+                let pose = similarity_from_message(&take(&mut bytes)?, "pose").ok()?;
                 let pose = KeyframePose { keyframe_id, revision, map_from_keyframe: pose };
                 Self::KeyframePose(u32::try_from(epoch).ok()?, pose)
             }
@@ -208,9 +208,7 @@ pub fn read_log(log: impl Read, take: &mut dyn FnMut(Record)) -> LogEnd {
             Ok(PREFIX_BYTES) => {}
             _ => return LogEnd::Torn,
         }
-        let mut rest = &prefix[..];
-        let (Some([length]), Some([checksum])) = (read_u32s(&mut rest), read_u32s(&mut rest))
-        else {
+        let Ok([length, checksum]) = <[u32; 2]>::read_from_bytes(&prefix) else {
             return LogEnd::Torn;
         };
         if length as usize > MAX_RECORD_BYTES {
@@ -227,135 +225,6 @@ pub fn read_log(log: impl Read, take: &mut dyn FnMut(Record)) -> LogEnd {
             None => return LogEnd::Torn,
         }
     }
-}
-
-fn write_u64s(bytes: &mut Vec<u8>, numbers: &[u64]) {
-    numbers.iter().for_each(|number| bytes.extend(number.to_le_bytes()));
-}
-
-fn write_u32s(bytes: &mut Vec<u8>, numbers: &[u32]) {
-    numbers.iter().for_each(|number| bytes.extend(number.to_le_bytes()));
-}
-
-fn write_f64s(bytes: &mut Vec<u8>, numbers: &[f64]) {
-    numbers.iter().for_each(|number| bytes.extend(number.to_le_bytes()));
-}
-
-fn read_u64s<const N: usize>(bytes: &mut &[u8]) -> Option<[u64; N]> {
-    read_numbers(bytes, u64::from_le_bytes)
-}
-
-fn read_u32s<const N: usize>(bytes: &mut &[u8]) -> Option<[u32; N]> {
-    read_numbers(bytes, u32::from_le_bytes)
-}
-
-fn read_f64s<const N: usize>(bytes: &mut &[u8]) -> Option<[f64; N]> {
-    read_numbers(bytes, f64::from_le_bytes)
-}
-
-fn read_numbers<T: Copy + Default, const N: usize, const SIZE: usize>(
-    bytes: &mut &[u8],
-    from: fn([u8; SIZE]) -> T,
-) -> Option<[T; N]> {
-    let mut numbers = [T::default(); N];
-    for number in &mut numbers {
-        let (first, rest) = bytes.split_first_chunk::<SIZE>()?;
-        (*number, *bytes) = (from(*first), rest);
-    }
-    Some(numbers)
-}
-
-fn read_adjustment(bytes: &mut &[u8]) -> Option<AdjustmentMessage> {
-    let [sequence, frames, cpu_nanos, keyframe_id] = read_u64s(bytes)?;
-    let [inlier_ratio, rms_grey] = read_f64s(bytes)?;
-    let [fate, free, fixed, points, comparisons, iterations] = read_u32s(bytes)?;
-    Some(AdjustmentMessage {
-        sequence,
-        frames,
-        cpu_nanos,
-        keyframe_id,
-        inlier_ratio,
-        rms_grey,
-        fate,
-        free,
-        fixed,
-        points,
-        comparisons,
-        iterations,
-    })
-}
-
-fn write_pose(p: &PoseMessage, bytes: &mut Vec<u8>) {
-    write_u64s(bytes, &[p.sequence, p.capture_nanos.cast_unsigned()]);
-    write_u64s(bytes, &[p.realtime_nanos.cast_unsigned()]);
-    write_u64s(bytes, &[p.published_nanos.cast_unsigned(), p.latency_nanos, p.track_nanos]);
-    write_u64s(bytes, &[p.wake_nanos, p.revision, p.map_revision, p.keyframe_id]);
-    write_u32s(bytes, &[p.epoch, p.state, p.reason, p.proposes_keyframe]);
-    write_u32s(bytes, &[p.iterations, p.finest_level, p.points, p.has_velocity]);
-    write_f64s(bytes, &p.world_from_camera);
-    write_f64s(bytes, &p.map_from_camera);
-    write_f64s(bytes, &p.keyframe_from_camera);
-    write_f64s(bytes, &p.covariance);
-    write_f64s(bytes, &p.map_covariance);
-    write_f64s(bytes, &p.alignment_covariance);
-    write_f64s(bytes, &p.linear_velocity);
-    write_f64s(bytes, &p.angular_velocity);
-    write_f64s(bytes, &p.velocity_covariance);
-    write_f64s(bytes, &p.brightness);
-    write_f64s(bytes, &[p.in_view_ratio, p.inlier_ratio, p.whitened_rmse]);
-    write_f64s(bytes, &[p.residual_rmse, p.mean_squared_flow, p.displacement_px]);
-}
-
-fn read_pose(bytes: &mut &[u8]) -> Option<PoseMessage> {
-    let [sequence, capture, realtime, published, latency_nanos, track_nanos] = read_u64s(bytes)?;
-    let [wake_nanos, revision, map_revision, keyframe_id] = read_u64s(bytes)?;
-    let [epoch, state, reason, proposes_keyframe] = read_u32s(bytes)?;
-    let [iterations, finest_level, points, has_velocity] = read_u32s(bytes)?;
-    let (world_from_camera, map_from_camera) = (read_f64s(bytes)?, read_f64s(bytes)?);
-    let keyframe_from_camera = read_f64s(bytes)?;
-    let (covariance, map_covariance) = (read_f64s(bytes)?, read_f64s(bytes)?);
-    let alignment_covariance = read_f64s(bytes)?;
-    let (linear_velocity, angular_velocity) = (read_f64s(bytes)?, read_f64s(bytes)?);
-    let velocity_covariance = read_f64s(bytes)?;
-    let brightness = read_f64s(bytes)?;
-    let [in_view_ratio, inlier_ratio, whitened_rmse] = read_f64s(bytes)?;
-    let [residual_rmse, mean_squared_flow, displacement_px] = read_f64s(bytes)?;
-    Some(PoseMessage {
-        sequence,
-        capture_nanos: capture.cast_signed(),
-        realtime_nanos: realtime.cast_signed(),
-        published_nanos: published.cast_signed(),
-        latency_nanos,
-        track_nanos,
-        wake_nanos,
-        revision,
-        keyframe_id,
-        epoch,
-        state,
-        reason,
-        proposes_keyframe,
-        map_revision,
-        world_from_camera,
-        map_from_camera,
-        keyframe_from_camera,
-        covariance,
-        map_covariance,
-        alignment_covariance,
-        linear_velocity,
-        angular_velocity,
-        velocity_covariance,
-        brightness,
-        in_view_ratio,
-        inlier_ratio,
-        whitened_rmse,
-        residual_rmse,
-        mean_squared_flow,
-        displacement_px,
-        iterations,
-        finest_level,
-        points,
-        has_velocity,
-    })
 }
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 use super::*;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
-use crate::slam::keyframe::MapState;
+use crate::slam::keyframe::{DepthPoint, MapState};
 use crate::slam::modes::ModeCovariance;
 use crate::slam::place_covariance::{PlaceCovariance, PlaceMatrix};
 use nalgebra::Vector6;
@@ -92,5 +92,5 @@ fn every_cut_and_every_wrong_byte_is_survived() {
         let _ = read_map(&path); // an error or another value, never a panic
     }
     std::fs::write(&path, [whole, vec![0]].concat()).unwrap();
-    assert!(matches!(read_map(&path), Err(MapFileError::Trailing(_))));
+    assert!(matches!(read_map(&path), Err(MapFileError { fault: MapFault::Trailing, .. })));
 }

@@ -18,9 +18,11 @@ use std::borrow::Cow;
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
+use zerocopy::{FromBytes, Immutable, IntoBytes};
 
 use crate::capture::decode_error::DecodeError;
 use crate::capture::png_image::{decode_gray_into, encode_gray_small};
+use crate::service::bytes::take;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS};
 use crate::wire::conversion::{MessageError, check_points};
 
@@ -31,8 +33,8 @@ const VERSION: u32 = 2;
 /// The one before, which can still be read.
 const VERSION_BEFORE: u32 = 1;
 /// Bytes before the description, and before the places in the version before.
-const HEAD_BYTES: usize = HEAD_BYTES_BEFORE + 2 * 4;
-const HEAD_BYTES_BEFORE: usize = 16 + 2 * 4 + 8 + 5 * 4 + 8 + 4 * 4;
+const HEAD_BYTES: usize = HEAD_BYTES_BEFORE + size_of::<PartBytes>();
+const HEAD_BYTES_BEFORE: usize = size_of::<Head>();
 /// Bytes of the checksum.
 const CHECKSUM_BYTES: usize = 4;
 
@@ -131,22 +133,23 @@ pub fn encode(keyframe: &Keyframe, detail: MapDetail) -> Vec<u8> {
     let pixel = |point: &DepthPoint| usize::from(point.v) * width + usize::from(point.u);
     let places = pixels::encode(points.iter().map(pixel), width * height);
     let described = keyframe.description.as_deref().map(description::encode).unwrap_or_default();
+    let head = Head {
+        magic: MAGIC,
+        version: VERSION,
+        detail: u32::from(detail == MapDetail::Small),
+        keyframe_id: keyframe.keyframe_id,
+        width: width as u32,
+        height: height as u32,
+        num_points: points.len() as u32,
+        step: u32::from(step),
+        is_own_brightness: u32::from(is_own_brightness),
+        image_bytes: coded.len() as u64,
+        depths,
+        deviations,
+    };
+    let sizes = PartBytes { places: places.len() as u32, description: described.len() as u32 };
     let mut bytes = Vec::with_capacity(most_bytes(width * height).min(1 << 21));
-    bytes.extend(MAGIC);
-    bytes.extend(VERSION.to_le_bytes());
-    bytes.extend(u32::from(detail == MapDetail::Small).to_le_bytes());
-    bytes.extend(keyframe.keyframe_id.to_le_bytes());
-    let own = u32::from(is_own_brightness);
-    for number in [width as u32, height as u32, points.len() as u32, u32::from(step), own] {
-        bytes.extend(number.to_le_bytes());
-    }
-    bytes.extend((coded.len() as u64).to_le_bytes());
-    for number in [depths.least, depths.most, deviations.least, deviations.most] {
-        bytes.extend(number.to_le_bytes());
-    }
-    bytes.extend((places.len() as u32).to_le_bytes());
-    bytes.extend((described.len() as u32).to_le_bytes());
-    for part in [&described, &places, &coded[..]] {
+    for part in [head.as_bytes(), sizes.as_bytes(), &described, &places, &coded[..]] {
         bytes.extend(part);
     }
     for point in &points {
@@ -181,7 +184,8 @@ pub fn seal(bytes: &mut [u8]) {
 /// The checksum of all but the description.
 fn expected_checksum(bytes: &[u8]) -> u32 {
     let mut rest = bytes;
-    let described = Head::take(&mut rest).map_or(0, |head| head.description_bytes as usize);
+    let parts = take_head(&mut rest).and_then(|(_, parts)| parts);
+    let described = parts.map_or(0, |parts| parts.description as usize);
     let (head, body) = bytes.split_at(bytes.len() - rest.len());
     let body = body.get(described..).unwrap_or_default();
     let mut hasher = crc32fast::Hasher::new();
@@ -199,11 +203,11 @@ pub fn checksum_of(bytes: &[u8]) -> u32 {
 /// it is.
 pub fn decode_into(bytes: &[u8], keyframe: &mut Keyframe) -> Result<(), DepthFileError> {
     let mut rest = bytes;
-    let head = Head::take(&mut rest).ok_or(DepthFileError::Length {
+    let (head, part_bytes) = take_head(&mut rest).ok_or(DepthFileError::Length {
         found: bytes.len(),
         expected: HEAD_BYTES_BEFORE + CHECKSUM_BYTES,
     })?;
-    let sizes = head.check(keyframe)?;
+    let sizes = head.check(part_bytes, keyframe)?;
     let parts = sizes.description + sizes.places + sizes.image + sizes.numbers;
     let expected = bytes.len() - rest.len() + parts + CHECKSUM_BYTES;
     if bytes.len() != expected {
@@ -242,6 +246,8 @@ pub fn decode_into(bytes: &[u8], keyframe: &mut Keyframe) -> Result<(), DepthFil
 }
 
 /// What stands before the parts.
+#[derive(FromBytes, IntoBytes, Immutable)]
+#[repr(C, packed)]
 struct Head {
     magic: [u8; 16],
     version: u32,
@@ -255,9 +261,20 @@ struct Head {
     image_bytes: u64,
     depths: Logarithms,
     deviations: Logarithms,
-    /// `None` in the version before.
-    place_bytes: Option<u32>,
-    description_bytes: u32,
+}
+
+/// What follows it since the second version.
+#[derive(Clone, Copy, FromBytes, IntoBytes, Immutable)]
+#[repr(C)]
+struct PartBytes {
+    places: u32,
+    description: u32,
+}
+
+fn take_head(bytes: &mut &[u8]) -> Option<(Head, Option<PartBytes>)> {
+    let head: Head = take(bytes)?;
+    let parts = if head.version == VERSION_BEFORE { None } else { Some(take(bytes)?) };
+    Some((head, parts))
 }
 
 /// Bytes of the parts of a file.
@@ -270,49 +287,12 @@ struct Sizes {
 }
 
 impl Head {
-    fn take(bytes: &mut &[u8]) -> Option<Self> {
-        let magic = *bytes.split_off(..16)?.first_chunk()?;
-        let mut u32 = || Some(u32::from_le_bytes(*bytes.split_off(..4)?.first_chunk()?));
-        let (version, detail) = (u32()?, u32()?);
-        let keyframe_id = u64::from_le_bytes(*bytes.split_off(..8)?.first_chunk()?);
-        let mut u32 = || Some(u32::from_le_bytes(*bytes.split_off(..4)?.first_chunk()?));
-        let (width, height, num_points, step, is_own_brightness) =
-            (u32()?, u32()?, u32()?, u32()?, u32()?);
-        let image_bytes = u64::from_le_bytes(*bytes.split_off(..8)?.first_chunk()?);
-        let mut f32 = || Some(f32::from_le_bytes(*bytes.split_off(..4)?.first_chunk()?));
-        let depths = Logarithms { least: f32()?, most: f32()? };
-        let deviations = Logarithms { least: f32()?, most: f32()? };
-        let mut place_bytes = None;
-        let mut description_bytes = 0;
-        if version != VERSION_BEFORE {
-            let mut u32 = || Some(u32::from_le_bytes(*bytes.split_off(..4)?.first_chunk()?));
-            place_bytes = Some(u32()?);
-            description_bytes = u32()?;
-        }
-        Some(Self {
-            magic,
-            version,
-            detail,
-            keyframe_id,
-            width,
-            height,
-            num_points,
-            step,
-            is_own_brightness,
-            image_bytes,
-            depths,
-            deviations,
-            place_bytes,
-            description_bytes,
-        })
-    }
-
     /// Checks what can be checked before anything is believed; how large the parts are then.
-    fn check(&self, of: &Keyframe) -> Result<Sizes, DepthFileError> {
+    fn check(&self, parts: Option<PartBytes>, of: &Keyframe) -> Result<Sizes, DepthFileError> {
         if self.magic != MAGIC {
             return Err(DepthFileError::Magic);
         }
-        if ![VERSION_BEFORE, VERSION].contains(&self.version) {
+        if self.version != VERSION_BEFORE && self.version != VERSION {
             return Err(DepthFileError::Version(self.version));
         }
         let (width, height) = (of.intrinsics.width, of.intrinsics.height);
@@ -324,7 +304,8 @@ impl Head {
         let is_small = self.detail == 1;
         let most_image = if is_small { most_bytes(width * height) } else { width * height };
         let bit_bytes = pixels::bit_bytes(width * height);
-        let place_bytes = self.place_bytes.map_or(bit_bytes, |bytes| bytes as usize);
+        let place_bytes = parts.map_or(bit_bytes, |parts| parts.places as usize);
+        let description_bytes = parts.map_or(0, |parts| parts.description as usize);
         let checks = [
             ("detail", u64::from(self.detail), 1),
             ("points", u64::from(self.num_points), MAX_KEYFRAME_POINTS as u64),
@@ -332,7 +313,7 @@ impl Head {
             ("brightness", u64::from(self.is_own_brightness), u64::from(!is_small)),
             ("image bytes", self.image_bytes, most_image as u64),
             ("place bytes", place_bytes as u64, bit_bytes as u64),
-            ("description bytes", self.description_bytes.into(), description::MOST_BYTES as u64),
+            ("description bytes", description_bytes as u64, description::MOST_BYTES as u64),
         ];
         let wrong = checks.into_iter().find(|(_, value, most)| value > most);
         let least_image = if is_small { 0 } else { most_image as u64 };
@@ -347,7 +328,7 @@ impl Head {
             false => 8 + 4 * self.is_own_brightness as usize,
         };
         Ok(Sizes {
-            description: self.description_bytes as usize,
+            description: description_bytes,
             places: place_bytes,
             image: self.image_bytes as usize,
             numbers: self.num_points as usize * a_point,
@@ -356,16 +337,13 @@ impl Head {
     }
 
     /// A point from its numbers; `at` has the pixel and its brightness.
-    fn point(&self, numbers: &[u8], at: DepthPoint) -> DepthPoint {
-        let f32_at = |place: usize| {
-            let bytes = numbers.get(place..).and_then(|rest| rest.first_chunk::<4>());
-            bytes.map(|bytes| f32::from_le_bytes(*bytes))
-        };
+    fn point(&self, mut numbers: &[u8], at: DepthPoint) -> DepthPoint {
         if self.detail == 0 {
+            let mut next = || take::<f32>(&mut numbers);
             return DepthPoint {
-                inverse_depth: f32_at(0).unwrap_or_default(),
-                variance: f32_at(4).unwrap_or_default(),
-                intensity: f32_at(8).unwrap_or(at.intensity),
+                inverse_depth: next().unwrap_or_default(),
+                variance: next().unwrap_or_default(),
+                intensity: next().unwrap_or(at.intensity),
                 ..at
             };
         }
@@ -381,7 +359,8 @@ impl Head {
 }
 
 /// The range of the logarithms of some numbers, which are coded in even steps of it.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, FromBytes, IntoBytes, Immutable)]
+#[repr(C)]
 struct Logarithms {
     least: f32,
     most: f32,
@@ -403,7 +382,7 @@ impl Logarithms {
         (share * steps).round().clamp(0.0, steps)
     }
 
-    fn value(&self, code: f32, steps: f32) -> f32 {
+    fn value(self, code: f32, steps: f32) -> f32 {
         (self.least + code / steps * (self.most - self.least)).exp()
     }
 }

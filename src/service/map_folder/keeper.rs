@@ -11,6 +11,7 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Instant;
 
+use crate::service::map_folder::map_folder_error::MapFolderError;
 use crate::service::map_folder::numbering::Numbering;
 use crate::service::map_folder::writer::{MapHead, MapWriter};
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -128,7 +129,11 @@ impl MapKeeper {
 
     /// Writes all that is not on the disk yet, before it returns. `each` is called before each keyframe: it may take
     /// longer than a process may be silent.
-    pub fn save_all(&mut self, mapper: &Mapper, each: &mut dyn FnMut()) -> Result<(), String> {
+    pub fn save_all(
+        &mut self,
+        mapper: &Mapper,
+        each: &mut dyn FnMut(),
+    ) -> Result<(), MapFolderError> {
         let mut writer = locked(&self.shared.writer);
         let mut waiting = locked(&self.shared.waiting);
         waiting.head = None;
@@ -147,13 +152,13 @@ impl MapKeeper {
                 continue;
             }
             if let Some(on_disk) = self.numbering.on_disk(keyframe.clone()) {
-                writer.put(&on_disk).map_err(|error| error.to_string())?;
+                writer.put(&on_disk)?;
             }
             self.handed.insert(keyframe.keyframe_id, keyframe.revision);
         }
         let head = self.numbering.head_on_disk(head_of(mapper));
-        writer.save(&self.camera, head).map_err(|error| error.to_string())?;
-        writer.settle().map_err(|error| error.to_string())
+        writer.save(&self.camera, head)?;
+        writer.settle()
     }
 
     /// Why the last save failed; told once.

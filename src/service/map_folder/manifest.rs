@@ -14,6 +14,9 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use zerocopy::{FromBytes, Immutable, IntoBytes};
+
+use crate::service::bytes;
 use crate::service::loop_bytes::{loop_bytes, parse_loops};
 use crate::service::map_file::{keyframe_bytes, parse_keyframe};
 use crate::service::map_folder::depth_file::{MapDetail, most_bytes};
@@ -65,8 +68,9 @@ pub struct Listed {
     pub file: Option<DepthFile>,
 }
 
-/// The file of a keyframe.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// The file of a keyframe, as the list has it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, FromBytes, IntoBytes, Immutable)]
+#[repr(C)]
 pub struct DepthFile {
     /// Revision in its name.
     pub revision: u64,
@@ -128,30 +132,18 @@ impl Manifest {
         let mut bytes = MAGIC.to_vec();
         bytes.extend(VERSION.to_le_bytes());
         let k = &self.camera;
-        let mut camera = Vec::new();
-        camera.extend((k.width as u32).to_le_bytes());
-        camera.extend((k.height as u32).to_le_bytes());
-        [k.fx, k.fy, k.cx, k.cy].iter().for_each(|number| camera.extend(number.to_le_bytes()));
-        push_section(&mut bytes, CAMERA, &camera);
-        let mut state = Vec::new();
-        state.extend(u32::from(self.detail == MapDetail::Small).to_le_bytes());
-        state.extend(self.free_epoch.to_le_bytes());
-        for number in [self.revision, self.saves, self.saved_secs] {
-            state.extend(number.to_le_bytes());
-        }
-        push_section(&mut bytes, STATE, &state);
+        let (size, numbers) = ([k.width as u32, k.height as u32], [k.fx, k.fy, k.cx, k.cy]);
+        push_section(&mut bytes, CAMERA, &[size.as_bytes(), numbers.as_bytes()].concat());
+        let state = [u32::from(self.detail == MapDetail::Small), self.free_epoch];
+        let counts = [self.revision, self.saves, self.saved_secs];
+        push_section(&mut bytes, STATE, &[state.as_bytes(), counts.as_bytes()].concat());
         let mut keyframes = Vec::new();
         keyframes.extend((self.keyframes.len() as u64).to_le_bytes());
         for listed in &self.keyframes {
             let head = keyframe_bytes(&listed.keyframe);
             keyframes.extend((head.len() as u32).to_le_bytes());
             keyframes.extend(head);
-            let none = DepthFile { revision: 0, bytes: 0, checksum: 0, num_points: 0 };
-            let file = listed.file.unwrap_or(none);
-            keyframes.extend(file.revision.to_le_bytes());
-            keyframes.extend(file.bytes.to_le_bytes());
-            keyframes.extend(file.checksum.to_le_bytes());
-            keyframes.extend(file.num_points.to_le_bytes());
+            keyframes.extend(listed.file.unwrap_or_default().as_bytes());
         }
         push_section(&mut bytes, KEYFRAMES, &keyframes);
         if !self.loops.is_empty() {
@@ -164,10 +156,10 @@ impl Manifest {
     /// The manifest of these bytes.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, ManifestError> {
         let mut rest = bytes;
-        if take::<16>(&mut rest)? != MAGIC {
+        if take::<[u8; 16]>(&mut rest)? != MAGIC {
             return Err(ManifestError::Magic);
         }
-        let version = u32::from_le_bytes(take(&mut rest)?);
+        let version = take(&mut rest)?;
         if version != VERSION {
             return Err(ManifestError::Version(version));
         }
@@ -179,7 +171,7 @@ impl Manifest {
         let mut sections = BTreeMap::new();
         while !rest.is_empty() {
             let tag: [u8; 4] = take(&mut rest)?;
-            let length = usize::try_from(u64::from_le_bytes(take(&mut rest)?)).ok();
+            let length = usize::try_from(take::<u64>(&mut rest)?).ok();
             let payload = length.and_then(|length| rest.split_off(..length));
             let payload = payload.ok_or_else(|| damaged("a part is cut"))?;
             let is_known = [CAMERA, STATE, KEYFRAMES, LOOPS].contains(&tag);
@@ -202,15 +194,13 @@ impl Manifest {
 
     fn read_state(&mut self, mut payload: &[u8]) -> Result<(), ManifestError> {
         let payload = &mut payload;
-        self.detail = match u32::from_le_bytes(take(payload)?) {
-            0 => MapDetail::Full,
+        self.detail = match take(payload)? {
+            0_u32 => MapDetail::Full,
             1 => MapDetail::Small,
             _ => return Err(damaged("detail")),
         };
-        self.free_epoch = u32::from_le_bytes(take(payload)?);
-        self.revision = u64::from_le_bytes(take(payload)?);
-        self.saves = u64::from_le_bytes(take(payload)?);
-        self.saved_secs = u64::from_le_bytes(take(payload)?);
+        self.free_epoch = take(payload)?;
+        [self.revision, self.saves, self.saved_secs] = take(payload)?;
         let is_possible = self.free_epoch <= MAX_EPOCH
             && [self.revision, self.saves].iter().all(|number| *number <= MAX_REVISION);
         match is_possible && payload.is_empty() {
@@ -221,21 +211,16 @@ impl Manifest {
 
     fn read_keyframes(&mut self, mut payload: &[u8]) -> Result<(), ManifestError> {
         let payload = &mut payload;
-        let count = usize::try_from(u64::from_le_bytes(take(payload)?)).unwrap_or(usize::MAX);
+        let count = usize::try_from(take::<u64>(payload)?).unwrap_or(usize::MAX);
         if count > MAX_KEYFRAMES {
             return Err(damaged("more keyframes than any map has"));
         }
         for index in 0..count {
             let at = |what: &str| damaged(&format!("keyframe {index}: {what}"));
-            let length = u32::from_le_bytes(take(payload)?) as usize;
+            let length = take::<u32>(payload)? as usize;
             let head = payload.split_off(..length).ok_or_else(|| at("it is cut"))?;
             let keyframe = parse_keyframe(head).map_err(|error| at(&error.to_string()))?;
-            let file = DepthFile {
-                revision: u64::from_le_bytes(take(payload)?),
-                bytes: u64::from_le_bytes(take(payload)?),
-                checksum: u32::from_le_bytes(take(payload)?),
-                num_points: u32::from_le_bytes(take(payload)?),
-            };
+            let file: DepthFile = take(payload)?;
             let last = self.keyframes.last().map(|last| last.keyframe.keyframe_id);
             let num_pixels = keyframe.intrinsics.width * keyframe.intrinsics.height;
             let is_possible = last.is_none_or(|last| last < keyframe.keyframe_id)
@@ -272,17 +257,14 @@ fn push_section(bytes: &mut Vec<u8>, tag: [u8; 4], payload: &[u8]) {
     bytes.extend(payload);
 }
 
-fn take<const N: usize>(bytes: &mut &[u8]) -> Result<[u8; N], ManifestError> {
-    let taken = bytes.split_off(..N).and_then(|taken| taken.first_chunk().copied());
-    taken.ok_or_else(|| damaged("it is cut"))
+fn take<T: FromBytes>(bytes: &mut &[u8]) -> Result<T, ManifestError> {
+    bytes::take(bytes).ok_or_else(|| damaged("it is cut"))
 }
 
 fn camera_of(mut payload: &[u8]) -> Result<Intrinsics, ManifestError> {
     let payload = &mut payload;
-    let width = u32::from_le_bytes(take(payload)?) as usize;
-    let height = u32::from_le_bytes(take(payload)?) as usize;
-    let mut number = || Ok(f64::from_le_bytes(take(payload)?));
-    let (fx, fy, cx, cy) = (number()?, number()?, number()?, number()?);
+    let [width, height] = take::<[u32; 2]>(payload)?.map(|pixels| pixels as usize);
+    let [fx, fy, cx, cy] = take(payload)?;
     let camera = Intrinsics { fx, fy, cx, cy, width, height };
     if camera.is_valid() { Ok(camera) } else { Err(damaged("its camera is not possible")) }
 }

@@ -1,7 +1,7 @@
 //! Why a map on disk cannot be used.
 
 use std::io;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use crate::service::map_folder::manifest::ManifestError;
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -77,6 +77,19 @@ pub enum MapFolderError {
         /// Why.
         source: io::Error,
     },
+}
+
+/// Refuses a map in `folder` that another camera than this one took.
+pub(super) fn check_same_camera(
+    folder: &Path,
+    map: &Intrinsics,
+    camera: &Intrinsics,
+) -> Result<(), MapFolderError> {
+    if map == camera {
+        return Ok(());
+    }
+    let (map, camera) = (Box::new(*map), Box::new(*camera));
+    Err(MapFolderError::Camera { folder: folder.to_owned(), map, camera })
 }
 
 fn camera_text(camera: &Intrinsics) -> String {

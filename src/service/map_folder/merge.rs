@@ -3,7 +3,8 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use crate::service::map_folder::map_folder_error::MapFolderError;
+use crate::service::map_folder::map_folder_error::{MapFolderError, check_same_camera};
+use crate::service::map_folder::numbering::Numbering;
 use crate::service::map_folder::reading::Loaded;
 use crate::service::map_folder::write_new;
 use crate::service::map_folder::writer::MapHead;
@@ -18,11 +19,8 @@ pub fn merge(
     second: Loaded,
     second_folder: &Path,
 ) -> Result<Map, MapFolderError> {
-    let (camera, other) = (first.manifest.camera, second.manifest.camera);
-    if camera != other {
-        let (map, camera) = (Box::new(other), Box::new(camera));
-        return Err(MapFolderError::Camera { folder: second_folder.to_owned(), map, camera });
-    }
+    let camera = first.manifest.camera;
+    check_same_camera(second_folder, &second.manifest.camera, &camera)?;
     let map = joined(first.map, second.map);
     let head = MapHead {
         keyframes: map.keyframes.iter().map(Keyframe::without_depth).collect(),
@@ -42,16 +40,12 @@ fn joined(first: Map, second: Map) -> Map {
     let ids = newest(|keyframe| keyframe.keyframe_id);
     let epochs = newest(|keyframe| u64::from(keyframe.epoch)).max(u64::from(first.free_epoch));
     let epochs = u32::try_from(epochs).unwrap_or(u32::MAX);
-    let moved = second.keyframes.into_iter().map(|keyframe| Keyframe {
-        keyframe_id: keyframe.keyframe_id.saturating_add(ids),
-        epoch: keyframe.epoch.saturating_add(epochs),
-        ..keyframe
-    });
+    let moved = Numbering { ids, epochs, revisions: 0 }.in_run(second);
     Map {
-        keyframes: first.keyframes.into_iter().chain(moved).collect(),
-        loops: Arc::new(Arc::unwrap_or_clone(first.loops).with(&second.loops, ids)),
-        revision: first.revision.max(second.revision),
-        free_epoch: second.free_epoch.saturating_add(epochs),
+        keyframes: first.keyframes.into_iter().chain(moved.keyframes).collect(),
+        loops: Arc::new(Arc::unwrap_or_clone(first.loops).with(&moved.loops, 0)),
+        revision: first.revision.max(moved.revision),
+        free_epoch: moved.free_epoch,
         ..Map::default()
     }
 }

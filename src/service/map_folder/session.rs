@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use crate::service::config::MapConfig;
 use crate::service::map_folder::keeper::MapKeeper;
-use crate::service::map_folder::map_folder_error::MapFolderError;
+use crate::service::map_folder::map_folder_error::{MapFolderError, check_same_camera};
 use crate::service::map_folder::numbering::Numbering;
 use crate::service::map_folder::reading::{Loaded, load, read_manifest};
 use crate::service::map_folder::writer::MapWriter;
@@ -30,9 +30,6 @@ pub enum MapSessionError {
     /// No thread.
     #[error("cannot start the thread that saves the map ({0})")]
     Thread(std::io::Error),
-    /// The last save failed.
-    #[error("{0}")]
-    Save(String),
 }
 
 /// A map that is used.
@@ -87,9 +84,8 @@ impl MapSession {
         camera: &Intrinsics,
         left: Option<Map>,
     ) -> Result<StepOutcome, MapSessionError> {
-        if let Some(map) = self.camera.filter(|map| map != camera) {
-            let (map, camera) = (Box::new(map), Box::new(*camera));
-            return Err(MapFolderError::Camera { folder: self.folder.clone(), map, camera }.into());
+        if let Some(map) = &self.camera {
+            check_same_camera(&self.folder, map, camera)?;
         }
         let map = self.loaded.take().unwrap_or_default();
         if let Some(writer) = self.writer.take() {
@@ -127,7 +123,7 @@ impl MapSession {
         each: &mut dyn FnMut(),
     ) -> Result<(), MapSessionError> {
         let Some(keeper) = &mut self.keeper else { return Ok(()) };
-        keeper.save_all(mapper, each).map_err(MapSessionError::Save)
+        Ok(keeper.save_all(mapper, each)?)
     }
 
     /// Why the last save failed; told once.
@@ -163,11 +159,7 @@ pub fn check_camera(config: &MapConfig, camera: &Intrinsics) -> Result<(), MapFo
 /// Checks that a folder holds a map of this camera that a running mapper could go over to.
 pub fn check_loadable(folder: &Path, camera: &Intrinsics) -> Result<(), MapFolderError> {
     let (manifest, _) = read_manifest(folder)?;
-    if manifest.camera == *camera {
-        return Ok(());
-    }
-    let (map, camera) = (Box::new(manifest.camera), Box::new(*camera));
-    Err(MapFolderError::Camera { folder: folder.to_owned(), map, camera })
+    check_same_camera(folder, &manifest.camera, camera)
 }
 
 fn tell_what_is_missing(loaded: &Loaded, max_bytes: usize) {

@@ -107,11 +107,6 @@ impl MapWriter {
         self.manifest.as_ref().map(|manifest| &manifest.camera)
     }
 
-    /// Where it writes.
-    pub fn folder(&self) -> &Path {
-        &self.folder
-    }
-
     /// Writes image and depth of a keyframe, unless they are on the disk as they are. They belong to the map with the
     /// next [`Self::save`].
     pub fn put(&mut self, keyframe: &Keyframe) -> Result<(), MapFolderError> {
@@ -159,8 +154,8 @@ impl MapWriter {
             ..Manifest::new(*camera, self.detail)
         };
         let bytes = manifest.to_bytes();
-        self.write(BEFORE, |before| before.manifest_bytes.clone())?;
-        self.write(MANIFEST, |_| bytes.clone())?;
+        self.write(BEFORE, &self.manifest_bytes)?;
+        self.write(MANIFEST, &bytes)?;
         let before = self.manifest.replace(manifest);
         self.manifest_bytes = bytes;
         self.remove_unlisted(before.as_ref());
@@ -169,18 +164,18 @@ impl MapWriter {
 
     /// The manifest before becomes this one too, at the end: the files of changed keyframes are there once.
     pub fn settle(&mut self) -> Result<(), MapFolderError> {
-        self.write(BEFORE, |now| now.manifest_bytes.clone())?;
+        self.write(BEFORE, &self.manifest_bytes)?;
         self.remove_unlisted(None);
         Ok(())
     }
 
     /// Writes a manifest; an empty one is none.
-    fn write(&self, name: &str, bytes: impl Fn(&Self) -> Vec<u8>) -> Result<(), MapFolderError> {
-        let (path, bytes) = (self.folder.join(name), bytes(self));
+    fn write(&self, name: &str, bytes: &[u8]) -> Result<(), MapFolderError> {
         if bytes.is_empty() {
             return Ok(());
         }
-        write_durably(&path, |to| to.write_all(&bytes))
+        let path = self.folder.join(name);
+        write_durably(&path, |to| to.write_all(bytes))
             .map_err(|source| MapFolderError::Write { path, source })
     }
 

@@ -1,5 +1,6 @@
 //! What the mapper does when it is asked: never on the frame path.
 
+use std::error::Error;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 use std::thread;
@@ -14,8 +15,9 @@ use crate::service::map_folder::numbering::Numbering;
 use crate::service::map_folder::save_copy;
 use crate::service::map_folder::session::{MapSession, check_loadable};
 use crate::service::mapper::going_over::GoneOver;
-use crate::service::mapper::{MapperError, Shell, WRITES_MAP, tell_adjustments};
+use crate::service::mapper::{Shell, WRITES_MAP, tell_adjustments};
 use crate::service::mode::Mode;
+use crate::service::run_error::RunError;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::map::Map;
 use crate::slam::mapper::Mapper;
@@ -28,8 +30,11 @@ const LOADS_MAP: &str = "another map is being loaded";
 const LOADING_PAUSE: Duration = Duration::from_millis(20);
 const NO_FRAME: &str = "there is no map yet: no frame has come";
 
+/// What came of a command; an error is told to whoever gave it.
+type Answer = Result<(), Box<dyn Error>>;
+
 impl Shell<'_> {
-    pub(super) fn answer_commands(&mut self) -> Result<(), MapperError> {
+    pub(super) fn answer_commands(&mut self) -> Result<(), RunError> {
         let commands = Rc::clone(&self.commands);
         Ok(commands.answer(|command| match command {
             Command::SendKeyframe(keyframe_id) => {
@@ -45,55 +50,46 @@ impl Shell<'_> {
     }
 
     /// Does what may take longer than the pause between two signs of life.
-    fn saying(
-        &mut self,
-        cause: &str,
-        act: impl FnOnce(&mut Self) -> Result<(), String>,
-    ) -> Result<(), String> {
+    fn saying(&mut self, cause: &str, act: impl FnOnce(&mut Self) -> Answer) -> Result<(), String> {
         let before = self.health.entered();
         self.health.enter(ProcessState::Running, cause);
         let outcome = act(self);
         self.health.go_back_to(before);
-        outcome
+        outcome.map_err(|error| error.to_string())
     }
 
-    fn save_map(&mut self, path: &Path) -> Result<(), String> {
+    fn save_map(&mut self, path: &Path) -> Answer {
         // It is asked for when the recording is over.
         if let Some((_, mapper)) = &mut self.mapper {
             let outcome = self.adjustments.finish(mapper);
-            let told = self.output.publish(mapper, &outcome).and_then(|()| {
-                tell_adjustments(&mut self.adjustments, &self.output, &mut self.health)
-            });
-            told.map_err(|error| error.to_string())?;
+            self.output.publish(mapper, &outcome)?;
+            tell_adjustments(&mut self.adjustments, &self.output, &mut self.health)?;
         }
         let empty = Map::default();
         let map = self.mapper.as_ref().map_or(&empty, |(_, mapper)| mapper.map());
         let health = &mut self.health;
         let saved = write_map(path, map, &mut || health.report())
             .map_err(|error| format!("{}: {error}", path.display()));
-        saved.and(self.save_own_folder())
+        let kept = self.save_map_folder();
+        saved?;
+        Ok(kept?)
     }
 
-    /// Saves the map in the folder that it is kept in, where there is one.
-    fn save_own_folder(&mut self) -> Result<(), String> {
-        self.save_map_folder().map_err(|error| error.to_string())
-    }
-
-    fn save_folder(&mut self, path: &Path) -> Result<(), String> {
-        let Some((_, mapper)) = &self.mapper else { return Err(NO_FRAME.to_owned()) };
+    fn save_folder(&mut self, path: &Path) -> Answer {
+        let Some((_, mapper)) = &self.mapper else { return Err(NO_FRAME.into()) };
         if self.map.as_ref().is_some_and(|map| map.is_in(path)) {
-            return self.save_own_folder();
+            return Ok(self.save_map_folder()?);
         }
         let (health, detail) = (&mut self.health, self.config.map.detail);
-        save_copy(path, mapper, detail, &mut || health.report()).map_err(|error| error.to_string())
+        Ok(save_copy(path, mapper, detail, &mut || health.report())?)
     }
 
     /// Goes over to the map in another folder. Whatever is wrong with that, the map at hand continues as it is.
-    fn load_folder(&mut self, folder: PathBuf, read_only: bool) -> Result<(), String> {
-        let Some((camera, mapper)) = &self.mapper else { return Err(NO_FRAME.to_owned()) };
+    fn load_folder(&mut self, folder: PathBuf, read_only: bool) -> Answer {
+        let Some((camera, mapper)) = &self.mapper else { return Err(NO_FRAME.into()) };
         let (camera, numbering) = (*camera, Numbering::above(mapper));
         if self.map.as_ref().is_some_and(|map| map.is_in(&folder)) {
-            return Err(format!("{} is the map that the mapper is in", folder.display()));
+            return Err(format!("{} is the map that the mapper is in", folder.display()).into());
         }
         check_loadable(&folder, &camera).map_err(|error| match error {
             MapFolderError::Missing(_) => format!("{} holds no map", folder.display()),
@@ -104,7 +100,7 @@ impl Shell<'_> {
             .ok_or_else(|| format!("{}: name a folder whose name is UTF-8", folder.display()))?;
         let map = MapConfig { folder: name.to_owned(), read_only, ..self.config.map.clone() };
         let (session, mut next) = self.begin_in(&map, &camera, numbering)?;
-        self.save_own_folder()?;
+        self.save_map_folder()?;
         let gone_over = GoneOver { from: self.config.map.folder.clone(), to: map, numbering };
         self.forget_checkpoint(&gone_over)?;
         if let Some((_, before)) = self.mapper.take() {

@@ -1,6 +1,9 @@
 //! What a keyframe looks like, in its file: number of features (u32), each column and row (u16), orientation, scale (u8)
 //! and descriptor (4 × u64); the CRC-32 of these (u32).
 
+use zerocopy::IntoBytes;
+
+use crate::service::bytes::take;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::places::{Description, Feature, FeaturePlace, MAX_FEATURES};
 
@@ -20,7 +23,7 @@ pub(super) fn encode(description: &Description) -> Vec<u8> {
         bytes.extend(place.u.to_le_bytes());
         bytes.extend(place.v.to_le_bytes());
         bytes.extend([place.orientation, place.scale]);
-        bits.iter().for_each(|word| bytes.extend(word.to_le_bytes()));
+        bytes.extend(bits.as_bytes());
     }
     bytes.extend(crc32fast::hash(&bytes).to_le_bytes());
     bytes
@@ -36,17 +39,11 @@ pub(super) fn decode(bytes: &[u8], camera: &Intrinsics) -> Option<Description> {
     if !is_whole {
         return None;
     }
+    let feature = |mut bytes: &[u8]| {
+        let ([u, v], [orientation, scale]) = (take(&mut bytes)?, take(&mut bytes)?);
+        let place = FeaturePlace { u, v, orientation, scale };
+        Some(Feature { place, bits: take(&mut bytes)? })
+    };
     let features = features.chunks_exact(FEATURE_BYTES).map(feature);
     Description::of_features(camera.width, camera.height, features.collect::<Option<_>>()?)
-}
-
-fn feature(mut bytes: &[u8]) -> Option<Feature> {
-    let mut u16 = || Some(u16::from_le_bytes(*bytes.split_off(..2)?.first_chunk()?));
-    let (u, v) = (u16()?, u16()?);
-    let [orientation, scale] = *bytes.split_off(..2)?.first_chunk()?;
-    let mut bits = [0; 4];
-    for word in &mut bits {
-        *word = u64::from_le_bytes(*bytes.split_off(..8)?.first_chunk()?);
-    }
-    Some(Feature { place: FeaturePlace { u, v, orientation, scale }, bits })
 }

@@ -172,8 +172,8 @@ fn files_of_the_version_before_are_read() {
         let of = keyframe(0.0);
         let now = encode(&of, detail);
         let mut rest = &now[..];
-        let head = Head::take(&mut rest).unwrap();
-        let (places, rest) = rest.split_at(head.place_bytes.unwrap() as usize);
+        let (head, parts) = take_head(&mut rest).unwrap();
+        let (places, rest) = rest.split_at(parts.unwrap().places as usize);
         let mut bits = vec![0u8; pixels::bit_bytes(WIDTH * HEIGHT)];
         let set = pixels::decode(places, WIDTH * HEIGHT, head.num_points as usize).unwrap();
         set.iter().for_each(|pixel| bits[pixel / 8] |= 1 << (pixel % 8));
