@@ -217,10 +217,8 @@ impl Simulator {
         if frame >= self.params.frames {
             return None;
         }
-        Some(match self.frames.get(frame) {
-            Some(rendered) => rendered,
-            None => Cow::Owned(self.render(frame, &mut RenderScratch::default())),
-        })
+        let render = || Cow::Owned(self.render(frame, &mut RenderScratch::default()));
+        Some(self.frames.get(frame).unwrap_or_else(render))
     }
 
     /// Exact depth along the optical axis of the raw image at a frame's ground-truth pose, in world
@@ -303,10 +301,10 @@ impl FrameSource for Simulator {
                 .map_init(RenderScratch::default, |scratch, frame| shared.render(frame, scratch))
                 .collect();
             for frame in rendered {
-                let path = || PathBuf::from("rendered frames");
-                self.frames
-                    .push(frame)
-                    .map_err(|source| SourceError::Read { path: path(), source })?;
+                self.frames.push(frame).map_err(|source| SourceError::Read {
+                    path: PathBuf::from("rendered frames"),
+                    source,
+                })?;
             }
         }
         progress(total, total);
