@@ -130,9 +130,7 @@ impl Bag {
             None => FrameStamp {
                 sequence,
                 capture_nanos: if stamp == 0 { log_nanos } else { stamp },
-                exposure_nanos: 0,
-                gain: 0.0,
-                clocks: None,
+                ..FrameStamp::default()
             },
         };
         let nanos = frame.capture_nanos;
@@ -180,7 +178,7 @@ impl FrameSource for Bag {
     }
 
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
-        self.rectifier.check_buffer(pixels)?;
+        self.check_buffer(pixels)?;
         let Some(stamp) = self.advance()? else { return Ok(None) };
         self.decode_into(pixels).map_err(|problem| self.lost(problem))?;
         Ok(Some(stamp))

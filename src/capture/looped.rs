@@ -119,10 +119,7 @@ impl FrameSource for Looped {
             let (name, reason) = (self.name.to_string(), "it has no frames to repeat");
             return Err(SourceError::Unavailable { name, reason });
         }
-        if pixels.len() != self.intrinsics.width * self.intrinsics.height {
-            let Intrinsics { width, height, .. } = self.intrinsics;
-            return Err(SourceError::Buffer { found: pixels.len(), width, height });
-        }
+        self.check_buffer(pixels)?;
         if self.next >= self.num_frames {
             return Ok(None);
         }
@@ -135,9 +132,7 @@ impl FrameSource for Looped {
             sequence,
             // From one period on: a stamp of zero is what a camera without a clock gives.
             capture_nanos: ((sequence + 1) as f64 * self.period_nanos) as i64,
-            exposure_nanos: 0,
-            gain: 0.0,
-            clocks: None,
+            ..FrameStamp::default()
         }))
     }
 }

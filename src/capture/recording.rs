@@ -88,7 +88,7 @@ impl FrameSource for Recording {
     }
 
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
-        self.rectifier.check_buffer(pixels)?;
+        self.check_buffer(pixels)?;
         let Some(frame) = self.contents.frames.get(self.next) else { return Ok(None) };
         let sequence = self.next as u64;
         // Counted before it is read: whoever continues after a bad image gets the one after it.

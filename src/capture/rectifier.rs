@@ -31,15 +31,6 @@ impl Rectifier {
         *self.rectification.intrinsics()
     }
 
-    /// Checks that `pixels` has room for an image and no more.
-    pub fn check_buffer(&self, pixels: &[u8]) -> Result<(), SourceError> {
-        let Intrinsics { width, height, .. } = self.intrinsics();
-        match pixels.len() == width * height {
-            true => Ok(()),
-            false => Err(SourceError::Buffer { found: pixels.len(), width, height }),
-        }
-    }
-
     /// Writes the rectified image of the grey one that `read` writes.
     pub fn read_into<E>(
         &mut self,

@@ -318,11 +318,8 @@ impl FrameSource for Simulator {
     }
 
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
+        self.check_buffer(pixels)?;
         let frame = self.next;
-        let (width, height) = (self.params.width, self.params.height);
-        if pixels.len() != width * height {
-            return Err(SourceError::Buffer { found: pixels.len(), width, height });
-        }
         let Some(raw) = self.raw_frame(frame) else { return Ok(None) };
         self.rectification.rectify_into(&raw, pixels);
         self.next += 1;

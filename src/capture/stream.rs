@@ -287,10 +287,6 @@ impl FrameSource for StreamSource {
         self.rectifier.intrinsics()
     }
 
-    fn num_frames(&self) -> Option<usize> {
-        None
-    }
-
     fn await_frame(&mut self, wake: BorrowedFd<'_>, millis: u32) -> Result<Arrival, SourceError> {
         let now = nanos_of(ClockId::Monotonic);
         if self.look(now)? == Arrival::Frame {
@@ -307,7 +303,7 @@ impl FrameSource for StreamSource {
     }
 
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
-        self.rectifier.check_buffer(pixels)?;
+        self.check_buffer(pixels)?;
         let (header, stamp) = loop {
             if let Some(held) = self.held.take() {
                 break held;
@@ -329,11 +325,6 @@ impl FrameSource for StreamSource {
             SourceError::BrokenFrame { name: self.name.clone(), reason }
         })?;
         Ok(Some(stamp))
-    }
-
-    fn skip_to(&mut self, _sequence: u64) -> Result<(), SourceError> {
-        // A sender's numbers begin with whoever takes them.
-        Ok(())
     }
 
     fn losses(&self) -> Option<FrameLosses> {

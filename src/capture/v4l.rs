@@ -111,16 +111,12 @@ impl<S: VideoSystem> FrameSource for CameraSource<S> {
         self.rectifier.intrinsics()
     }
 
-    fn num_frames(&self) -> Option<usize> {
-        None
-    }
-
     fn await_frame(&mut self, wake: BorrowedFd<'_>, millis: u32) -> Result<Arrival, SourceError> {
         self.camera.await_frame(Some(wake), millis).map_err(|reason| self.failed(reason))
     }
 
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
-        self.rectifier.check_buffer(pixels)?;
+        self.check_buffer(pixels)?;
         while self.camera.held().is_none() {
             let arrival = self.camera.await_frame(None, READ_MILLIS);
             if let Arrival::Absent(reason) = arrival.map_err(|reason| self.failed(reason))? {
@@ -133,11 +129,6 @@ impl<S: VideoSystem> FrameSource for CameraSource<S> {
             name: format!("v4l:{}", self.name),
             reason,
         })
-    }
-
-    fn skip_to(&mut self, _sequence: u64) -> Result<(), SourceError> {
-        // A camera's numbers begin with whoever opens it.
-        Ok(())
     }
 
     fn losses(&self) -> Option<FrameLosses> {
