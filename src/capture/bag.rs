@@ -36,7 +36,6 @@ pub struct Bag {
     contents: Contents,
     records: Records,
     rectifier: Rectifier,
-    samples: Vec<u8>,
     /// What our own recording says of the next image.
     record: Option<FrameRecord>,
     /// The source's number of the first frame.
@@ -66,7 +65,6 @@ pub fn open(path: &Path, topic: Option<&str>, rig: Option<&Path>) -> Result<Bag,
         records: Records::open(path).map_err(bag)?,
         contents,
         rectifier,
-        samples: Vec::new(),
         record: None,
         first_sequence: None,
         next: 0,
@@ -152,11 +150,10 @@ impl Bag {
         let Intrinsics { width, height, .. } = self.rectifier.intrinsics();
         let data = self.records.message();
         let kind = self.contents.image_kind(self.records.channel());
-        self.rectifier.read_into(pixels, |gray| {
+        self.rectifier.read_into(pixels, |gray, samples| {
             if kind == Some(Kind::CompressedImage) {
                 let image: CompressedImage<'_> = message::decode(data)?;
-                decode_gray_into(image.data, width, height, &mut self.samples, gray)?;
-                return Ok(());
+                return Ok(decode_gray_into(image.data, width, height, samples, gray)?);
             }
             let image: Image<'_> = message::decode(data)?;
             let found = (image.width as usize, image.height as usize);

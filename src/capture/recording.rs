@@ -94,7 +94,7 @@ impl FrameSource for Recording {
         // Counted before it is read: whoever continues after a bad image gets the one after it.
         self.next += 1;
         let Intrinsics { width, height, .. } = self.rectifier.intrinsics();
-        self.rectifier.read_into(pixels, |gray| {
+        self.rectifier.read_into(pixels, |gray, _| {
             self.reader.read_gray_into(&frame.path, width, height, gray)
         })?;
         let (capture_nanos, exposure_nanos) = (frame.nanos, frame.exposure_nanos);

@@ -22,7 +22,6 @@ use crate::capture::rig::Rig;
 use crate::capture::source::{Arrival, FrameClocks, FrameLosses, FrameSource, FrameStamp, Notice};
 use crate::capture::source_error::SourceError;
 use crate::capture::source_name::SourceName;
-use crate::capture::v4l::pixel_format::{PixelFormat, unpack_gray};
 use crate::capture::v4l::stamps::FrameNumbers;
 use crate::slam::geometry::intrinsics::Intrinsics;
 
@@ -52,8 +51,6 @@ pub struct StreamSource {
     held: Option<(StreamHeader, FrameStamp)>,
     /// The picture of the frame that is held.
     picture: Vec<u8>,
-    /// Memory of the JPEG decoder.
-    samples: Vec<u8>,
     numbers: FrameNumbers,
     losses: FrameLosses,
     notice: Option<Notice>,
@@ -117,7 +114,6 @@ impl StreamSource {
             rectifier,
             held: None,
             picture: Vec::new(),
-            samples: Vec::new(),
             numbers: FrameNumbers::default(),
             losses: FrameLosses::default(),
             notice: None,
@@ -242,22 +238,6 @@ impl StreamSource {
         }
         self.last_nanos = Some(capture_nanos);
     }
-
-    /// Converts the frame that is held; why it is none.
-    fn convert(&mut self, header: &StreamHeader, pixels: &mut [u8]) -> Result<(), String> {
-        let Intrinsics { width, height, .. } = self.rectifier.intrinsics();
-        let bytes = self.picture.get(..header.bytes as usize).unwrap_or(&[]);
-        let stride = header.stride as usize;
-        let is_packed = header.format == PixelFormat::Grey && stride == width;
-        if let (true, Some(packed)) = (is_packed, bytes.get(..width * height)) {
-            self.rectifier.rectify_into(packed, pixels);
-            return Ok(());
-        }
-        let unpacked = self.rectifier.read_into(pixels, |gray| {
-            unpack_gray(header.format, bytes, stride, (width, height), &mut self.samples, gray)
-        });
-        unpacked.map_err(|broken| broken.to_string())
-    }
 }
 
 /// The stamp that capture goes by, and the instant by this machine's clocks. A stamp of the wall clock is moved to
@@ -320,9 +300,11 @@ impl FrameSource for StreamSource {
                 }
             }
         };
-        self.convert(&header, pixels).map_err(|reason| {
+        let bytes = self.picture.get(..header.bytes as usize).unwrap_or(&[]);
+        let stride = header.stride as usize;
+        self.rectifier.unpack_into(header.format, bytes, stride, pixels).map_err(|broken| {
             self.losses.broken += 1;
-            SourceError::BrokenFrame { name: self.name.clone(), reason }
+            SourceError::BrokenFrame { name: self.name.clone(), reason: broken.to_string() }
         })?;
         Ok(Some(stamp))
     }

@@ -30,7 +30,6 @@ use self::connection::Camera;
 use self::device::Kernel;
 use self::negotiation::Wish;
 use self::params::CameraParams;
-use self::pixel_format::unpack_gray;
 use self::video_device::VideoSystem;
 use crate::capture::rectifier::Rectifier;
 use crate::capture::rig::Rig;
@@ -48,8 +47,6 @@ pub struct CameraSource<S: VideoSystem> {
     name: String,
     camera: Camera<S>,
     rectifier: Rectifier,
-    /// Memory of the JPEG decoder.
-    samples: Vec<u8>,
 }
 
 /// The camera of this name (a path, a number or udev's name), with the lens of a rig file. The camera
@@ -81,7 +78,7 @@ impl<S: VideoSystem> CameraSource<S> {
             rate_hz: own_rate.or(rig.rate_hz),
         };
         let camera = Camera::new(system, name.to_owned(), params.clone(), wish);
-        Ok(Self { name: name.to_owned(), camera, rectifier, samples: Vec::new() })
+        Ok(Self { name: name.to_owned(), camera, rectifier })
     }
 
     fn failed(&self, reason: String) -> SourceError {
@@ -89,20 +86,10 @@ impl<S: VideoSystem> CameraSource<S> {
     }
 
     /// Converts the frame that waits; why it is none.
-    fn convert(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, String> {
-        let Intrinsics { width, height, .. } = self.rectifier.intrinsics();
+    fn convert(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, BrokenPicture> {
         let Some((held, grant, bytes)) = self.camera.held() else { return Ok(None) };
-        let is_packed = grant.format == PixelFormat::Grey && grant.stride == width;
-        if let (true, Some(packed)) = (is_packed, bytes.get(..width * height)) {
-            // Straight from the driver's memory, rectified or not.
-            self.rectifier.rectify_into(packed, pixels);
-            return Ok(Some(held.stamp));
-        }
-        let (format, stride) = (grant.format, grant.stride);
-        let unpacked = self.rectifier.read_into(pixels, |gray| {
-            unpack_gray(format, bytes, stride, (width, height), &mut self.samples, gray)
-        });
-        unpacked.map(|()| Some(held.stamp)).map_err(|broken| broken.to_string())
+        self.rectifier.unpack_into(grant.format, bytes, grant.stride, pixels)?;
+        Ok(Some(held.stamp))
     }
 }
 
@@ -125,9 +112,9 @@ impl<S: VideoSystem> FrameSource for CameraSource<S> {
         }
         let converted = self.convert(pixels);
         self.camera.release(converted.is_err());
-        converted.map_err(|reason| SourceError::BrokenFrame {
+        converted.map_err(|broken| SourceError::BrokenFrame {
             name: format!("v4l:{}", self.name),
-            reason,
+            reason: broken.to_string(),
         })
     }
 
