@@ -44,6 +44,22 @@ pub enum Arrival {
     Absent(String),
 }
 
+/// Why there is no camera or sender to read from.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(in crate::capture) struct Absence {
+    /// The reason, for the user.
+    pub reason: String,
+    /// Whether it may pass by itself.
+    pub passes: bool,
+}
+
+impl Absence {
+    /// One that may pass by itself.
+    pub fn passing(reason: String) -> Self {
+        Self { reason, passes: true }
+    }
+}
+
 /// Frames of a camera that did not become frames here.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct FrameLosses {

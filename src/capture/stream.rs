@@ -22,7 +22,8 @@ use crate::capture::rig::Rig;
 use crate::capture::source::{Arrival, FrameClocks, FrameLosses, FrameSource, FrameStamp, Notice};
 use crate::capture::source_error::SourceError;
 use crate::capture::source_name::SourceName;
-use crate::capture::v4l::stamps::FrameNumbers;
+use crate::capture::v4l::READ_MILLIS;
+use crate::capture::v4l::stamps::{FrameNumbers, MAX_REFUSED_IN_A_ROW};
 use crate::slam::geometry::intrinsics::Intrinsics;
 
 /// The program that reads ROS 2 topics.
@@ -34,11 +35,6 @@ pub const INSTALL_BRIDGE: &str = "install the package semidense-bridge (`apt ins
 const BRIDGE_COMMAND: &str = "ros2-camera";
 /// Most frames that are taken at a look: a sender that never pauses must not keep capture from its other work.
 const MAX_FRAMES_A_LOOK: usize = 8;
-/// How long a reader that has not waited before is made to wait at a time, milliseconds.
-const READ_MILLIS: u32 = 1000;
-/// Frames whose stamps go back are refused; after so many in a row, a third of a second, it is the clock that has
-/// stepped.
-const MAX_REFUSED_IN_A_ROW: u32 = 10;
 
 /// Frames of another program, rectified: the newest that there is, without end.
 pub struct StreamSource {

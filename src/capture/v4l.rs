@@ -11,7 +11,7 @@
 
 pub(crate) mod connection;
 mod controls;
-mod device;
+pub(in crate::capture) mod device;
 mod device_name;
 #[cfg(test)]
 mod fake;
@@ -40,7 +40,7 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 pub use self::pixel_format::{BrokenPicture, PixelFormat};
 
 /// How long a reader that has not waited before is made to wait at a time, milliseconds.
-const READ_MILLIS: u32 = 1000;
+pub(in crate::capture) const READ_MILLIS: u32 = 1000;
 
 /// A camera as a source of rectified frames: the newest that there is, without end.
 pub struct CameraSource<S: VideoSystem> {

@@ -1,7 +1,7 @@
 //! A capture device of the kernel: requests, mapped buffers, waiting.
 
 use std::fs::File;
-use std::os::fd::{AsFd, AsRawFd, BorrowedFd};
+use std::os::fd::{AsRawFd, BorrowedFd};
 use std::path::{Path, PathBuf};
 use std::ptr::NonNull;
 
@@ -396,8 +396,9 @@ impl Drop for KernelDevice {
     }
 }
 
-/// What happened on the first descriptor within `millis`; nothing where a signal came.
-fn poll(descriptors: &mut [PollFd<'_>], millis: u32) -> Result<PollFlags, Errno> {
+/// What happened on the first descriptor within `millis`; nothing where a signal came. Without a descriptor it is a
+/// sleep.
+pub fn poll(descriptors: &mut [PollFd<'_>], millis: u32) -> Result<PollFlags, Errno> {
     let timeout = Timespec {
         tv_sec: i64::from(millis / 1000),
         tv_nsec: i64::from(millis % 1000) * 1_000_000,
@@ -431,13 +432,9 @@ impl VideoSystem for Kernel {
     }
 
     fn pause(&self, wake: Option<BorrowedFd<'_>>, millis: u32) {
-        // Without a descriptor it is a sleep; what wakes is looked at by the caller.
-        let _ = match wake {
-            None => poll(&mut [], millis),
-            Some(wake) => {
-                poll(&mut [PollFd::from_borrowed_fd(wake.as_fd(), PollFlags::IN)], millis)
-            }
-        };
+        // What wakes is looked at by the caller.
+        let mut polled = wake.map(|wake| PollFd::from_borrowed_fd(wake, PollFlags::IN));
+        let _ = poll(polled.as_mut_slice(), millis);
     }
 }
 
