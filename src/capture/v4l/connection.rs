@@ -14,7 +14,7 @@ use super::kernel::FLAG_ERROR;
 use super::negotiation::{Grant, NegotiationError, Wish, negotiate, rate_differs};
 use super::params::CameraParams;
 use super::stamps::{FrameNumbers, MAX_REFUSED_IN_A_ROW, taken};
-use super::video_device::{Filled, OpenFailure, Readiness, VideoDevice, VideoSystem};
+use super::video_device::{Filled, OpenFailure, VideoDevice, VideoSystem};
 use crate::capture::source::{Absence, Arrival, FrameLosses, FrameStamp, Notice};
 
 /// Pause before the first attempt to open a camera again.
@@ -220,8 +220,8 @@ impl<S: VideoSystem> Camera<S> {
         stream.return_idle()?;
         self.see_to_exposure();
         let State::Streaming(stream) = &mut self.state else { return Ok(Arrival::Nothing) };
-        let readiness = stream.device.wait(wake, millis).map_err(|error| stream.absence(error))?;
-        if readiness == Readiness::Ready && self.drain()? == 0 {
+        let is_ready = stream.device.wait(wake, millis).map_err(|error| stream.absence(error))?;
+        if is_ready && self.drain()? == 0 {
             // A driver that wakes for nothing must not turn this into a loop that never sleeps.
             self.system.pause(wake, IDLE_PAUSE_MILLIS);
         }

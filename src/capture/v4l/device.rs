@@ -13,7 +13,7 @@ use super::device_name::find;
 use super::kernel::{self, KernelStruct, Request};
 use super::video_device::{
     Capability, ControlRange, Filled, FourCc, Fraction, Layout, OfferedFormat, OpenFailure,
-    PeriodRange, Readiness, SizeRange, VideoDevice, VideoSystem,
+    PeriodRange, SizeRange, VideoDevice, VideoSystem,
 };
 
 /// Most entries of an enumeration that are believed: a driver without an end is broken.
@@ -198,12 +198,10 @@ impl VideoDevice for KernelDevice {
             entry
         };
         let mut sizes = self.enumerate(&kernel::ENUMERATE_SIZES, first, |entry| {
-            let [a, b, c, d, e, f] = entry.range;
+            let [a, b, _, d, e, _] = entry.range;
             match entry.kind {
-                kernel::ENUMERATION_DISCRETE => {
-                    SizeRange { smallest: (a, b), largest: (a, b), step: (1, 1) }
-                }
-                _ => SizeRange { smallest: (a, d), largest: (b, e), step: (c, f) },
+                kernel::ENUMERATION_DISCRETE => SizeRange { smallest: (a, b), largest: (a, b) },
+                _ => SizeRange { smallest: (a, d), largest: (b, e) },
             }
         });
         // A range has one entry; some drivers give it again for every index.
@@ -377,14 +375,14 @@ impl VideoDevice for KernelDevice {
         unsafe { std::slice::from_raw_parts(mapping.start.as_ptr().cast(), mapping.length) }
     }
 
-    fn wait(&self, wake: Option<BorrowedFd<'_>>, millis: u32) -> Result<Readiness, Errno> {
+    fn wait(&self, wake: Option<BorrowedFd<'_>>, millis: u32) -> Result<bool, Errno> {
         let own = PollFd::new(&self.file, PollFlags::IN);
         let events = match wake {
             None => poll(&mut [own], millis)?,
             Some(wake) => poll(&mut [own, PollFd::from_borrowed_fd(wake, PollFlags::IN)], millis)?,
         };
         // An error is ready too: the next dequeue names it.
-        Ok(if events.is_empty() { Readiness::Nothing } else { Readiness::Ready })
+        Ok(!events.is_empty())
     }
 }
 

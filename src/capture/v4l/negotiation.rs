@@ -110,8 +110,7 @@ fn candidates(device: &dyn VideoDevice, wish: &Wish) -> Vec<PixelFormat> {
     };
     let fastest = |format: PixelFormat| {
         let periods = device.periods(format.code(), wish.width, wish.height);
-        let rates = periods.iter().map(|period| rate_hz(period.shortest));
-        rates.fold(None, |best: Option<f64>, rate| Some(best.map_or(rate, |b| b.max(rate))))
+        periods.iter().map(|period| rate_hz(period.shortest)).reduce(f64::max)
     };
     let mut found: Vec<(PixelFormat, f64)> = PixelFormat::ALL
         .into_iter()
