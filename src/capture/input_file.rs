@@ -1,9 +1,9 @@
-//! Files that a user names: regular ones only, of bounded size, and opening one never waits.
+//! Files and folders that a user names. Files: regular ones only, of bounded size, and opening one never waits.
 
 use std::fs::{File, FileType, OpenOptions};
 use std::io::{self, Read};
 use std::os::unix::fs::{FileTypeExt, OpenOptionsExt};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Reads at most `max_bytes` of the regular file at `path` into `bytes`, which are replaced. A file
 /// that is larger, and whatever is no regular file, is an error that says so.
@@ -30,6 +30,14 @@ pub fn read_text(path: &Path, max_bytes: u64) -> io::Result<String> {
         let line = error.as_bytes()[..valid].iter().filter(|&&byte| byte == b'\n').count() + 1;
         io::Error::other(format!("it is not text: line {line} holds bytes that are not UTF-8"))
     })
+}
+
+/// What is in a folder, in the order of the names; nothing where it cannot be read.
+pub fn entries(folder: &Path) -> Vec<PathBuf> {
+    let found = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let mut paths: Vec<PathBuf> = found.map(|entry| entry.path()).collect();
+    paths.sort();
+    paths
 }
 
 /// Opens the regular file at `path` for reading.

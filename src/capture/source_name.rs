@@ -8,6 +8,7 @@ use std::os::unix::fs::FileTypeExt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
+use crate::capture::input_file::entries;
 use crate::capture::source_error::SourceError;
 use crate::capture::{euroc, image_folder, tum};
 
@@ -242,10 +243,8 @@ fn only_mcap(folder: &Path) -> Result<PathBuf, SourceError> {
 
 /// The MCAP files of a folder in the order of their names.
 fn mcap_files(folder: &Path) -> Vec<PathBuf> {
-    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
-    let mut files: Vec<PathBuf> =
-        entries.map(|e| e.path()).filter(|path| has_ending(path, &["mcap"])).collect();
-    files.sort();
+    let mut files = entries(folder);
+    files.retain(|path| has_ending(path, &["mcap"]));
     files
 }
 
@@ -351,10 +350,7 @@ fn quoted(path: &Path) -> String {
 
 /// What was looked for in a folder that holds no recording, and what is there.
 fn nothing_known_in(folder: &Path) -> String {
-    let entries = std::fs::read_dir(folder);
-    let mut entries: Vec<PathBuf> =
-        entries.into_iter().flatten().flatten().map(|entry| entry.path()).collect();
-    entries.sort();
+    let entries = entries(folder);
     let inner = entries.iter().filter(|path| path.is_dir()).find_map(|p| SourceName::of_folder(p));
     let name = |path: &PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let mut names: Vec<String> = entries.iter().take(MAX_LISTED).map(name).collect();

@@ -6,6 +6,7 @@ use rustix::io::Errno;
 use serde::Serialize;
 
 use super::device::KernelDevice;
+use super::device_name::NAME_FOLDERS;
 use super::kernel::{
     CAP_VIDEO_CAPTURE, CAP_VIDEO_CAPTURE_MPLANE, CONTROL_INACTIVE, CONTROL_READ_ONLY,
     CONTROL_TYPE_BOOLEAN, CONTROL_TYPE_INTEGER, CONTROL_TYPE_INTEGER_MENU, CONTROL_TYPE_MENU,
@@ -13,9 +14,7 @@ use super::kernel::{
 };
 use super::pixel_format::PixelFormat;
 use super::video_device::{ControlRange, OfferedFormat, SizeRange, VideoDevice, rate_hz};
-
-/// Folders of udev's names for video nodes.
-const NAME_FOLDERS: [&str; 3] = ["v4l/by-id", "v4l/by-path", "semidense"];
+use crate::capture::input_file::entries;
 
 /// Whether a node can be used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -121,11 +120,10 @@ pub fn nodes(dev: &Path) -> Vec<PathBuf> {
     let number = |path: &Path| -> Option<u32> {
         path.file_name()?.to_str()?.strip_prefix("video")?.parse().ok()
     };
-    let entries = std::fs::read_dir(dev).into_iter().flatten().flatten();
-    let mut found: Vec<(u32, PathBuf)> =
-        entries.filter_map(|entry| Some((number(&entry.path())?, entry.path()))).collect();
-    found.sort();
-    found.into_iter().map(|(_, path)| path).collect()
+    let mut found = entries(dev);
+    found.retain(|path| number(path).is_some());
+    found.sort_by_key(|path| number(path));
+    found
 }
 
 /// Every camera below `dev`, and every node that cannot be asked whether it is one.
@@ -237,17 +235,11 @@ fn control_report(device: &dyn VideoDevice, control: &ControlRange) -> Option<Co
 /// udev's names that lead to a node.
 fn names(dev: &Path, path: &Path) -> Vec<String> {
     let leads_here = |link: &Path| link.canonicalize().is_ok_and(|target| target == path);
-    let mut found = Vec::new();
-    for folder in NAME_FOLDERS {
-        let entries = std::fs::read_dir(dev.join(folder)).into_iter().flatten().flatten();
-        let links = entries.map(|entry| entry.path()).filter(|link| leads_here(link));
-        let mut names: Vec<String> = links
-            .filter_map(|link| Some(link.file_name()?.to_string_lossy().into_owned()))
-            .collect();
-        names.sort();
-        found.append(&mut names);
-    }
-    found
+    let links = NAME_FOLDERS.iter().flat_map(|folder| entries(&dev.join(folder)));
+    links
+        .filter(|link| leads_here(link))
+        .filter_map(|link| Some(link.file_name()?.to_string_lossy().into_owned()))
+        .collect()
 }
 
 #[cfg(test)]
