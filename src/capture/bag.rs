@@ -149,7 +149,7 @@ impl Bag {
     fn decode_into(&mut self, pixels: &mut [u8]) -> Result<(), BagImageError> {
         let Intrinsics { width, height, .. } = self.rectifier.intrinsics();
         let data = self.records.message();
-        let kind = self.contents.image_kind(self.records.channel());
+        let kind = self.contents.image_kind(self.records.channel);
         self.rectifier.read_into(pixels, |gray, samples| {
             if kind == Some(Kind::CompressedImage) {
                 let image: CompressedImage<'_> = message::decode(data)?;

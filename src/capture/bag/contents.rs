@@ -31,11 +31,11 @@ impl Contents {
         let mut records = Records::open(path)?;
         let summary = if records.go_to_summary()? { read_channels(&mut records)? } else { None };
         let (channels, is_unfinished) = match summary {
-            Some(channels) if is_possible(&channels, records.length()) => (channels, false),
+            Some(channels) if is_possible(&channels, records.length) => (channels, false),
             _ => {
                 records = Records::open(path)?;
                 let channels = count_all(&mut records)?;
-                (channels, records.is_unfinished())
+                (channels, records.is_unfinished)
             }
         };
         let topic = choose(&channels, topic)?;

@@ -42,30 +42,26 @@ pub enum Place {
     Counts(Vec<(u16, u64)>),
 }
 
-/// Where the bytes of the record at hand are.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Source {
-    Chunk,
-    File,
-}
-
 /// A file that is read record by record.
 #[derive(Debug)]
 pub struct Records {
     file: BufReader<File>,
     position: u64,
-    length: u64,
+    /// Bytes of the file.
+    pub length: u64,
     /// The record at hand, where it is not in the chunk; a chunk before it is decoded.
     raw: Vec<u8>,
     /// The chunk at hand, and how much of it was read.
     chunk: Vec<u8>,
     chunk_position: usize,
-    current: (Source, Range<usize>),
-    channel: u16,
+    /// The record at hand in the chunk; `None` where it is `raw`.
+    in_chunk: Option<Range<usize>>,
+    /// The channel of the message at hand.
+    pub channel: u16,
     /// Whether the end that a closed file has was reached.
     has_ended: bool,
     /// Whether the file ended before that.
-    is_unfinished: bool,
+    pub is_unfinished: bool,
 }
 
 impl Records {
@@ -87,7 +83,7 @@ impl Records {
             raw: Vec::new(),
             chunk: Vec::new(),
             chunk_position: 0,
-            current: (Source::File, 0..0),
+            in_chunk: None,
             channel: 0,
             has_ended: false,
             is_unfinished: false,
@@ -122,30 +118,16 @@ impl Records {
         Ok(())
     }
 
-    /// Bytes of the file.
-    pub fn length(&self) -> u64 {
-        self.length
-    }
-
-    /// Whether the file ended without the end that a closed file has.
-    pub fn is_unfinished(&self) -> bool {
-        self.is_unfinished
-    }
-
-    /// The channel of the message at hand.
-    pub fn channel(&self) -> u16 {
-        self.channel
-    }
-
     /// The content of the message at hand.
     pub fn message(&self) -> &[u8] {
         self.record().get(MESSAGE_HEADER_BYTES..).unwrap_or_default()
     }
 
     fn record(&self) -> &[u8] {
-        let (source, range) = &self.current;
-        let bytes = if *source == Source::Chunk { &self.chunk } else { &self.raw };
-        bytes.get(range.clone()).unwrap_or_default()
+        match &self.in_chunk {
+            Some(range) => self.chunk.get(range.clone()).unwrap_or_default(),
+            None => &self.raw,
+        }
     }
 
     fn damaged(at: u64, reason: impl ToString) -> BagError {
@@ -157,9 +139,9 @@ impl Records {
     pub fn advance(&mut self) -> Result<Option<Place>, BagError> {
         loop {
             let found = if self.chunk_position < self.chunk.len() {
-                self.in_chunk()?
+                self.next_in_chunk()?
             } else {
-                self.in_file()?
+                self.next_in_file()?
             };
             let Some((opcode, at)) = found else { return Ok(None) };
             if let Some(place) = self.place(opcode, at)? {
@@ -169,10 +151,10 @@ impl Records {
     }
 
     /// The next record of the chunk.
-    fn in_chunk(&mut self) -> Result<Option<(u8, u64)>, BagError> {
+    fn next_in_chunk(&mut self) -> Result<Option<(u8, u64)>, BagError> {
         let rest = self.chunk.get(self.chunk_position..).unwrap_or_default();
-        let record = rest.split_at_checked(PREFIX_BYTES).and_then(|(prefix, rest)| {
-            let (opcode, length) = parse_prefix(prefix);
+        let record = rest.split_first_chunk().and_then(|(prefix, rest)| {
+            let (opcode, length) = parse_prefix(*prefix);
             let length = usize::try_from(length).ok().filter(|length| *length <= rest.len())?;
             Some((opcode, length))
         });
@@ -182,12 +164,12 @@ impl Records {
         };
         let begin = self.chunk_position + PREFIX_BYTES;
         self.chunk_position = begin + length;
-        self.current = (Source::Chunk, begin..self.chunk_position);
+        self.in_chunk = Some(begin..self.chunk_position);
         Ok(Some((opcode, self.position)))
     }
 
     /// The next record of the file that is read; `None` at its end.
-    fn in_file(&mut self) -> Result<Option<(u8, u64)>, BagError> {
+    fn next_in_file(&mut self) -> Result<Option<(u8, u64)>, BagError> {
         loop {
             let left = self.length.saturating_sub(self.position);
             if self.has_ended {
@@ -200,7 +182,7 @@ impl Records {
             let at = self.position;
             let mut prefix = [0; PREFIX_BYTES];
             self.file.read_exact(&mut prefix)?;
-            let (opcode, length) = parse_prefix(&prefix);
+            let (opcode, length) = parse_prefix(prefix);
             if length > left - PREFIX_BYTES as u64 {
                 // Cut off: what lies before is whole.
                 self.end_early();
@@ -241,7 +223,7 @@ impl Records {
             // The file was cut while it was read.
             self.end_early();
         }
-        self.current = (Source::File, 0..self.raw.len());
+        self.in_chunk = None;
         Ok(())
     }
 
@@ -249,7 +231,7 @@ impl Records {
     fn place(&mut self, opcode: u8, at: u64) -> Result<Option<Place>, BagError> {
         // A chunk within a chunk is none.
         if opcode == op::CHUNK {
-            return if self.current.0 == Source::File { self.open_chunk(at) } else { Ok(None) };
+            return if self.in_chunk.is_none() { self.open_chunk(at) } else { Ok(None) };
         }
         if ![op::SCHEMA, op::CHANNEL, op::MESSAGE, op::STATISTICS].contains(&opcode) {
             return Ok(None);
@@ -294,13 +276,6 @@ impl Records {
 }
 
 /// Kind and length of a record.
-fn parse_prefix(prefix: &[u8]) -> (u8, u64) {
-    match prefix {
-        [opcode, length @ ..] if length.len() == 8 => {
-            let mut bytes = [0; 8];
-            bytes.copy_from_slice(length);
-            (*opcode, u64::from_le_bytes(bytes))
-        }
-        _ => (0, u64::MAX),
-    }
+fn parse_prefix([opcode, length @ ..]: [u8; PREFIX_BYTES]) -> (u8, u64) {
+    (opcode, u64::from_le_bytes(length))
 }
