@@ -116,8 +116,8 @@ impl FrameSource for Looped {
 
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
         if self.kept.is_empty() {
-            let (name, reason) = (self.name.to_string(), "it has no frames to repeat");
-            return Err(SourceError::Unavailable { name, reason });
+            let (name, problem) = (self.name.to_string(), "it has no frames to repeat".to_owned());
+            return Err(SourceError::Name { name, problem });
         }
         self.check_buffer(pixels)?;
         if self.next >= self.num_frames {

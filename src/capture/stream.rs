@@ -21,7 +21,6 @@ use crate::capture::rectifier::Rectifier;
 use crate::capture::rig::Rig;
 use crate::capture::source::{Arrival, FrameClocks, FrameLosses, FrameSource, FrameStamp, Notice};
 use crate::capture::source_error::SourceError;
-use crate::capture::source_name::SourceName;
 use crate::capture::v4l::READ_MILLIS;
 use crate::capture::v4l::stamps::{FrameNumbers, MAX_REFUSED_IN_A_ROW};
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -66,7 +65,7 @@ pub fn open_socket(
     rig: Option<&Path>,
     stall_s: f64,
 ) -> Result<StreamSource, SourceError> {
-    let name = SourceName::Stream(path.to_owned()).to_string();
+    let name = format!("stream:{}", path.display());
     StreamSource::new(name, Feed::Socket(Listener::new(path.to_owned())), rig, stall_s)
 }
 
@@ -76,7 +75,7 @@ pub fn open_ros2(
     rig: Option<&Path>,
     stall_s: f64,
 ) -> Result<StreamSource, SourceError> {
-    let name = SourceName::Ros2(topic.to_owned()).to_string();
+    let name = format!("ros2:{topic}");
     let arguments = vec![BRIDGE_COMMAND.to_owned(), topic.to_owned()];
     StreamSource::new(name, Feed::Program(Program::new(bridge(), arguments)), rig, stall_s)
 }
@@ -99,7 +98,11 @@ impl StreamSource {
         rig: Option<&Path>,
         stall_s: f64,
     ) -> Result<Self, SourceError> {
-        let path = rig.ok_or_else(|| SourceError::StreamRig { name: name.clone() })?;
+        let path = rig.ok_or_else(|| SourceError::Camera {
+            name: name.clone(),
+            reason: "needs a rig file with the camera's calibration: name it with --rig FILE"
+                .to_owned(),
+        })?;
         let rectifier = Rectifier::new(&Rig::read(path)?, path)?;
         let Intrinsics { width, height, .. } = rectifier.intrinsics();
         Ok(Self {
@@ -123,7 +126,7 @@ impl StreamSource {
     }
 
     fn failed(&self, reason: String) -> SourceError {
-        SourceError::Stream { name: self.name.clone(), reason }
+        SourceError::Camera { name: self.name.clone(), reason }
     }
 
     /// Takes a sender that has come, and all that it has sent; what that came to.

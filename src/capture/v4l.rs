@@ -56,7 +56,12 @@ pub fn open(
     rig: Option<&Path>,
     params: &CameraParams,
 ) -> Result<CameraSource<impl VideoSystem + use<>>, SourceError> {
-    let path = rig.ok_or_else(|| SourceError::CameraRig { name: name.to_owned() })?;
+    const NO_RIG: &str = "a camera needs a rig file with its calibration: name it with --rig FILE (for a first try at \
+                          640x480, webcam.toml in config/rigs or /usr/share/semidense/rigs will do)";
+    let path = rig.ok_or_else(|| SourceError::Camera {
+        name: format!("v4l:{name}"),
+        reason: NO_RIG.to_owned(),
+    })?;
     CameraSource::new(Kernel, name, &Rig::read(path)?, path, params)
 }
 
@@ -78,7 +83,7 @@ impl<S: VideoSystem> CameraSource<S> {
             rate_hz: own_rate.or(rig.rate_hz),
         };
         let camera = Camera::new(system, name.to_owned(), params.clone(), wish);
-        Ok(Self { name: name.to_owned(), camera, rectifier })
+        Ok(Self { name: format!("v4l:{name}"), camera, rectifier })
     }
 
     fn failed(&self, reason: String) -> SourceError {
@@ -113,7 +118,7 @@ impl<S: VideoSystem> FrameSource for CameraSource<S> {
         let converted = self.convert(pixels);
         self.camera.release(converted.is_err());
         converted.map_err(|broken| SourceError::BrokenFrame {
-            name: format!("v4l:{}", self.name),
+            name: self.name.clone(),
             reason: broken.to_string(),
         })
     }
