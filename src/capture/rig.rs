@@ -5,6 +5,7 @@ use std::path::Path;
 use nalgebra::Vector2;
 use serde::Deserialize;
 
+use crate::capture::decode_error::MAX_SIDE;
 use crate::capture::listing;
 use crate::capture::rig_error::RigError;
 use crate::capture::source_error::SourceError;
@@ -13,7 +14,7 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::parameter::{ParameterError, check_range};
 
 /// Sides of an image, pixels.
-const SIDE_RANGE: std::ops::RangeInclusive<usize> = 16..=8192;
+const SIDE_RANGE: std::ops::RangeInclusive<usize> = 16..=MAX_SIDE;
 /// Focal lengths, pixels: from a fisheye on the smallest image to a telescope on the largest.
 const FOCAL_RANGE: std::ops::RangeInclusive<f64> = 1.0..=100_000.0;
 /// Lens coefficients; those of rational lenses reach tens.
@@ -125,8 +126,6 @@ impl Rig {
             return Err(row.error(format!("{SHAPE}, has {} numbers", numbers.len())));
         };
         let model = if coefficients.is_empty() { LensModel::Pinhole } else { LensModel::Radtan };
-        // A fraction or a negative number becomes a size that the range refuses.
-        let side = |x: f64| if x.fract() == 0.0 { x as usize } else { 0 };
         let file = RigFile {
             model,
             width: side(width),
@@ -140,6 +139,11 @@ impl Rig {
         };
         Ok(file.rig_of(path)?)
     }
+}
+
+/// Side of an image that is written as any number; a fraction or a negative number becomes 0, which the range refuses.
+pub(super) fn side(number: f64) -> usize {
+    if number.fract() == 0.0 { number as usize } else { 0 }
 }
 
 impl Rig {

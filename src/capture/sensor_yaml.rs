@@ -9,7 +9,7 @@ use std::path::Path;
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 
 use crate::capture::listing::{Row, read_text, rows};
-use crate::capture::rig::{LensModel, Rig, RigFile};
+use crate::capture::rig::{LensModel, Rig, RigFile, side};
 use crate::capture::source_error::SourceError;
 use crate::slam::geometry::se3::SE3;
 
@@ -66,14 +66,11 @@ pub fn parse(path: &Path, text: &str) -> Result<SensorYaml, SourceError> {
     };
     let intrinsics = numbers("intrinsics", 4)?;
     let resolution = numbers("resolution", 2)?;
-    let rate_hz = match entries.get("rate_hz") {
-        Some(entry) => Some(entry.row.number(&entry.value)?),
-        None => None,
-    };
+    let rate_hz = entries.get("rate_hz").map(|entry| entry.row.number(&entry.value)).transpose()?;
     let rig = RigFile {
         model,
-        width: whole(resolution[0]),
-        height: whole(resolution[1]),
+        width: side(resolution[0]),
+        height: side(resolution[1]),
         fx: intrinsics[0],
         fy: intrinsics[1],
         cx: intrinsics[2],
@@ -87,11 +84,6 @@ pub fn parse(path: &Path, text: &str) -> Result<SensorYaml, SourceError> {
         transform.row.error("T_BS is not a rigid transform: a rotation, a translation, 0 0 0 1")
     })?;
     Ok(SensorYaml { rig, body_from_camera })
-}
-
-/// A size; a fraction or a negative number becomes 0, which the rig refuses by its range.
-fn whole(number: f64) -> usize {
-    if number.fract() == 0.0 { number as usize } else { 0 }
 }
 
 /// All entries by key, `outer.inner` below a key.
