@@ -67,7 +67,7 @@ pub fn sensor_beside(pose_list: &Path) -> Option<PathBuf> {
 fn read_frames(images: &Path, list: &Path) -> Result<Vec<ListedImage>, SourceError> {
     read_list(list, |row| {
         let (stamp, name) =
-            row.text().split_once(',').ok_or_else(|| row.error("needs `timestamp,filename`"))?;
+            row.text.split_once(',').ok_or_else(|| row.error("needs `timestamp,filename`"))?;
         let path = images.join(name.trim());
         let nanos = row.nanos(stamp.trim())?;
         Ok((nanos, ListedImage { nanos, path, exposure_nanos: 0 }))
@@ -77,7 +77,7 @@ fn read_frames(images: &Path, list: &Path) -> Result<Vec<ListedImage>, SourceErr
 /// Reads the body's poses, `timestamp, p x y z, q w x y z` and more, as the camera's.
 fn read_truth(list: &Path, body_from_camera: &SE3) -> Result<Vec<StampedPose>, SourceError> {
     read_list(list, |row| {
-        let fields: Vec<&str> = row.text().split(',').map(str::trim).collect();
+        let fields: Vec<&str> = row.text.split(',').map(str::trim).collect();
         let [stamp, px, py, pz, qw, qx, qy, qz, ..] = fields[..] else {
             return Err(row.error("needs `timestamp,px,py,pz,qw,qx,qy,qz` and maybe more"));
         };

@@ -16,21 +16,13 @@ const NANOS_PER_SECOND_DIGITS: i32 = 9;
 pub struct Row<'a> {
     path: &'a Path,
     line: usize,
-    text: &'a str,
-    is_indented: bool,
+    /// The line without surrounding blanks.
+    pub text: &'a str,
+    /// Whether the line begins with blanks.
+    pub is_indented: bool,
 }
 
-impl<'a> Row<'a> {
-    /// The line without surrounding blanks.
-    pub fn text(&self) -> &'a str {
-        self.text
-    }
-
-    /// Whether the line begins with blanks.
-    pub fn is_indented(&self) -> bool {
-        self.is_indented
-    }
-
+impl Row<'_> {
     /// An error about this line: what is wrong and what to do.
     pub fn error(&self, problem: impl Into<String>) -> SourceError {
         SourceError::Line { path: self.path.to_owned(), line: self.line, problem: problem.into() }

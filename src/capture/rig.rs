@@ -118,7 +118,7 @@ impl Rig {
             return Err(second.error(format!("a second camera; {SHAPE}")));
         }
         let numbers = row
-            .text()
+            .text
             .split_whitespace()
             .map(|field| row.number(field))
             .collect::<Result<Vec<f64>, SourceError>>()?;

@@ -96,7 +96,7 @@ fn read_entries<'a>(
     let mut open_list: Option<(String, Entry<'a>)> = None;
     for row in rows(path, text) {
         // A comment behind a value; none of these files has a `#` inside a value.
-        let content = row.text().split('#').next().unwrap_or_default().trim();
+        let content = row.text.split('#').next().unwrap_or_default().trim();
         if content.starts_with('%') || content == "---" || content.is_empty() {
             continue;
         }
@@ -110,8 +110,8 @@ fn read_entries<'a>(
                     .split_once(':')
                     .ok_or_else(|| row.error("is not `key: value`; remove it"))?;
                 let key = key.trim();
-                let key = if row.is_indented() { format!("{outer}.{key}") } else { key.to_owned() };
-                if !row.is_indented() {
+                let key = if row.is_indented { format!("{outer}.{key}") } else { key.to_owned() };
+                if !row.is_indented {
                     outer.clone_from(&key);
                 }
                 (key, Entry { row, value: value.trim().to_owned() })
@@ -120,7 +120,7 @@ fn read_entries<'a>(
         if entry.value.starts_with('[') && !entry.value.ends_with(']') {
             open_list = Some((key, entry));
         } else if let Some(twice) = entries.insert(key, entry) {
-            return Err(row.error(format!("repeats the key of `{}`", twice.row.text())));
+            return Err(row.error(format!("repeats the key of `{}`", twice.row.text)));
         }
     }
     match open_list {

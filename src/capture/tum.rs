@@ -49,7 +49,7 @@ pub fn read_rig(folder: &Path, rig: Option<&Path>) -> Result<(Rig, PathBuf), Sou
 /// Reads a list of `timestamp filename` lines; file names are relative to `folder`.
 fn read_images(folder: &Path, list: &Path) -> Result<Vec<ListedImage>, SourceError> {
     read_list(list, |row| {
-        let (stamp, name) = row.text().split_once(char::is_whitespace).ok_or_else(|| {
+        let (stamp, name) = row.text.split_once(char::is_whitespace).ok_or_else(|| {
             row.error("needs `timestamp filename`; complete the line or remove it")
         })?;
         let path = folder.join(name.trim_start());
@@ -61,7 +61,7 @@ fn read_images(folder: &Path, list: &Path) -> Result<Vec<ListedImage>, SourceErr
 /// Reads a trajectory of `timestamp tx ty tz qx qy qz qw` lines, `world_from_camera`.
 pub fn read_trajectory(list: &Path) -> Result<Vec<StampedPose>, SourceError> {
     read_list(list, |row| {
-        let fields: Vec<&str> = row.text().split_whitespace().collect();
+        let fields: Vec<&str> = row.text.split_whitespace().collect();
         let [stamp, tx, ty, tz, qx, qy, qz, qw] = fields[..] else {
             return Err(row.error("needs the eight numbers `timestamp tx ty tz qx qy qz qw`"));
         };
