@@ -38,20 +38,23 @@ pub enum Pattern {
     Cover,
 }
 
-/// All patterns, in the order of their discriminants.
-const PATTERNS: [Pattern; 12] = [
-    Pattern::Planks,
-    Pattern::Plaster,
-    Pattern::Wallpaper,
-    Pattern::Picture,
-    Pattern::Poster,
-    Pattern::Text,
-    Pattern::Cardboard,
-    Pattern::Fabric,
-    Pattern::Veneer,
-    Pattern::Brick,
-    Pattern::Carpet,
-    Pattern::Cover,
+/// Draws on the ground of a pattern.
+type Draw = fn(&mut Canvas, &mut Stream);
+
+/// All patterns in the order of their discriminants: reflectance of the ground, and what is drawn on it.
+const PATTERNS: [(Pattern, f32, Draw); 12] = [
+    (Pattern::Planks, 0.5, planks),
+    (Pattern::Plaster, 0.66, plaster),
+    (Pattern::Wallpaper, 0.62, wallpaper),
+    (Pattern::Picture, 0.5, |canvas, stream| leaves(canvas, stream, 1500, 6.0, 220.0)),
+    (Pattern::Poster, 0.5, |canvas, stream| leaves(canvas, stream, 500, 14.0, 300.0)),
+    (Pattern::Text, 0.82, text),
+    (Pattern::Cardboard, 0.48, cardboard),
+    (Pattern::Fabric, 0.4, fabric),
+    (Pattern::Veneer, 0.42, veneer),
+    (Pattern::Brick, 0.7, brick),
+    (Pattern::Carpet, 0.35, carpet),
+    (Pattern::Cover, 0.5, cover),
 ];
 
 /// Side of every texture in texels; at 2 mm a texel one tile is 2 m, and a pixel at 1 m is a texel.
@@ -59,29 +62,12 @@ pub const TEXTURE_SIZE: usize = 1024;
 
 /// Paints all textures, in parallel on the current rayon pool.
 pub fn paint_all(seed: u64) -> Vec<Texture> {
-    PATTERNS.par_iter().map(|&pattern| paint(pattern, seed)).collect()
-}
-
-fn paint(pattern: Pattern, seed: u64) -> Texture {
-    let mut stream = Stream::new(seed, 0x7E87_0000 + pattern as u64);
-    // Reflectance of the ground, and what is drawn on it.
-    let (ground, draw): (f32, fn(&mut Canvas, &mut Stream)) = match pattern {
-        Pattern::Planks => (0.5, planks),
-        Pattern::Plaster => (0.66, plaster),
-        Pattern::Wallpaper => (0.62, wallpaper),
-        Pattern::Picture => (0.5, |canvas, stream| leaves(canvas, stream, 1500, 6.0, 220.0)),
-        Pattern::Poster => (0.5, |canvas, stream| leaves(canvas, stream, 500, 14.0, 300.0)),
-        Pattern::Text => (0.82, text),
-        Pattern::Cardboard => (0.48, cardboard),
-        Pattern::Fabric => (0.4, fabric),
-        Pattern::Veneer => (0.42, veneer),
-        Pattern::Brick => (0.7, brick),
-        Pattern::Carpet => (0.35, carpet),
-        Pattern::Cover => (0.5, cover),
-    };
-    let mut canvas = Canvas::new(TEXTURE_SIZE, ground);
-    draw(&mut canvas, &mut stream);
-    canvas.into_texture()
+    let painted = PATTERNS.par_iter().map(|&(pattern, ground, draw)| {
+        let mut canvas = Canvas::new(TEXTURE_SIZE, ground);
+        draw(&mut canvas, &mut Stream::new(seed, 0x7E87_0000 + pattern as u64));
+        canvas.into_texture()
+    });
+    painted.collect()
 }
 
 fn planks(canvas: &mut Canvas, stream: &mut Stream) {
