@@ -139,14 +139,7 @@ impl Rig {
         };
         Ok(file.rig_of(path)?)
     }
-}
 
-/// Side of an image that is written as any number; a fraction or a negative number becomes 0, which the range refuses.
-pub(super) fn side(number: f64) -> usize {
-    if number.fract() == 0.0 { number as usize } else { 0 }
-}
-
-impl Rig {
     /// By how much the images of two cameras of the same place differ, pixels: the largest shift over
     /// a grid of rays; infinite where the sizes differ or a ray meets only one of the images.
     pub fn largest_shift_px(&self, other: &Self) -> f64 {
@@ -165,9 +158,7 @@ impl Rig {
         };
         (0..GRID * GRID).map(|index| shift(index).unwrap_or(f64::INFINITY)).fold(0.0, f64::max)
     }
-}
 
-impl Rig {
     /// What is unusual about the camera and may be a mistake, in one line.
     pub fn remark(&self) -> Option<String> {
         let k = self.camera.intrinsics();
@@ -188,6 +179,11 @@ impl Rig {
             USUAL_DEG.end()
         ))
     }
+}
+
+/// Side of an image that is written as any number; a fraction or a negative number becomes 0, which the range refuses.
+pub(super) fn side(number: f64) -> usize {
+    if number.fract() == 0.0 { number as usize } else { 0 }
 }
 
 /// Angle between the first and the last pixel of a row or column as the focal length alone has it, degrees.
