@@ -77,8 +77,9 @@ impl Bag {
     /// Continues to the next image; gives its stamp. `None` after the last.
     fn advance(&mut self) -> Result<Option<FrameStamp>, SourceError> {
         loop {
-            let found = match self.records.advance() {
-                Ok(found) => found,
+            let place = match self.records.advance() {
+                Ok(Some(place)) => place,
+                Ok(None) => return Ok(None),
                 Err(BagError::Damaged { at, reason }) => {
                     return Err(self.lost(BagImageError::Chunk { at, reason }));
                 }
@@ -86,18 +87,13 @@ impl Bag {
                     return Err(SourceError::Bag { path: self.path.clone(), problem });
                 }
             };
-            match found {
-                None => return Ok(None),
-                Some(Place::Message { channel, log_nanos }) => {
-                    let data = self.records.message();
-                    if self.contents.is_frame_record(channel) {
-                        self.record = message::decode(data).ok();
-                    } else if self.contents.image_kind(channel).is_some() {
-                        let header = message::decode(data).map(|h: Stamped| h.stamp_nanos());
-                        return self.stamp(header, log_nanos).map(Some).map_err(|e| self.lost(e));
-                    }
-                }
-                Some(_) => {}
+            let Place::Message { channel, log_nanos } = place else { continue };
+            let data = self.records.message();
+            if self.contents.is_frame_record(channel) {
+                self.record = message::decode(data).ok();
+            } else if self.contents.image_kind(channel).is_some() {
+                let header = message::decode(data).map(|h: Stamped| h.stamp_nanos());
+                return self.stamp(header, log_nanos).map(Some).map_err(|e| self.lost(e));
             }
         }
     }
