@@ -71,8 +71,7 @@ fn list_images(folder: &Path) -> Result<Vec<PathBuf>, SourceError> {
 
 /// Whether a file has the ending of an image.
 pub(super) fn is_called_image(path: &Path) -> bool {
-    let Some(extension) = path.extension() else { return false };
-    ["png", "jpg", "jpeg"].iter().any(|known| extension.eq_ignore_ascii_case(known))
+    input_file::has_ending(path, &["png", "jpg", "jpeg"])
 }
 
 fn begins_like_image(path: &Path) -> bool {

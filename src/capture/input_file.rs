@@ -40,6 +40,12 @@ pub fn entries(folder: &Path) -> Vec<PathBuf> {
     paths
 }
 
+/// Whether a file's name ends in one of these, in letters of any case.
+pub fn has_ending(path: &Path, endings: &[&str]) -> bool {
+    let ending = path.extension().unwrap_or_default();
+    endings.iter().any(|known| ending.eq_ignore_ascii_case(known))
+}
+
 /// Opens the regular file at `path` for reading.
 pub fn open(path: &Path) -> io::Result<File> {
     // A look before opening, for the words: a socket cannot be opened at all, and a pipe could be

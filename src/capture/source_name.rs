@@ -8,7 +8,7 @@ use std::os::unix::fs::FileTypeExt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
-use crate::capture::input_file::entries;
+use crate::capture::input_file::{entries, has_ending};
 use crate::capture::source_error::SourceError;
 use crate::capture::{euroc, image_folder, tum};
 
@@ -265,11 +265,6 @@ fn recognise(path: &Path) -> Result<SourceName, SourceError> {
 fn has_kind(name: &Path) -> bool {
     let name = name.to_string_lossy();
     name.split_once(':').is_some_and(|(kind, _)| !kind.is_empty() && !kind.contains(['/', '.']))
-}
-
-fn has_ending(path: &Path, endings: &[&str]) -> bool {
-    let ending = path.extension().unwrap_or_default();
-    endings.iter().any(|known| ending.eq_ignore_ascii_case(known))
 }
 
 /// A path that leads nowhere, and what may have been meant: the number or the device of a camera is often tried.
