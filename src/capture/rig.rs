@@ -107,13 +107,12 @@ impl Rig {
     pub fn from_camera_txt(path: &Path, text: &str) -> Result<Self, SourceError> {
         const SHAPE: &str =
             "needs one line `fx fy cx cy width height [k1 k2 p1 p2 [k3 [k4 k5 k6]]]`";
-        let syntax = |problem: &str| RigError::Syntax {
+        let mut rows = listing::rows(path, text);
+        let row = rows.next().ok_or_else(|| SourceError::Line {
             path: path.to_owned(),
             line: 1,
-            problem: problem.to_owned(),
-        };
-        let mut rows = listing::rows(path, text);
-        let row = rows.next().ok_or_else(|| syntax(SHAPE))?;
+            problem: SHAPE.to_owned(),
+        })?;
         if let Some(second) = rows.next() {
             return Err(second.error(format!("a second camera; {SHAPE}")));
         }
@@ -126,17 +125,9 @@ impl Rig {
             return Err(row.error(format!("{SHAPE}, has {} numbers", numbers.len())));
         };
         let model = if coefficients.is_empty() { LensModel::Pinhole } else { LensModel::Radtan };
-        let file = RigFile {
-            model,
-            width: side(width),
-            height: side(height),
-            fx,
-            fy,
-            cx,
-            cy,
-            coefficients: coefficients.to_vec(),
-            rate_hz: None,
-        };
+        let (width, height) = (side(width), side(height));
+        let coefficients = coefficients.to_vec();
+        let file = RigFile { model, width, height, fx, fy, cx, cy, coefficients, rate_hz: None };
         Ok(file.rig_of(path)?)
     }
 

@@ -46,7 +46,6 @@ pub fn parse(path: &Path, text: &str) -> Result<SensorYaml, SourceError> {
             problem: format!("the key `{key}` is missing; take the file of the original recording"),
         })
     };
-    let numbers = |key: &str, count: usize| get(key)?.numbers(count);
     let model = get("camera_model")?;
     if model.value != "pinhole" {
         let problem = format!("camera_model is `{}`; only `pinhole` is understood", model.value);
@@ -64,23 +63,13 @@ pub fn parse(path: &Path, text: &str) -> Result<SensorYaml, SourceError> {
             )));
         }
     };
-    let intrinsics = numbers("intrinsics", 4)?;
-    let resolution = numbers("resolution", 2)?;
+    let [fx, fy, cx, cy] = get("intrinsics")?.numbers()?;
+    let [width, height] = get("resolution")?.numbers()?.map(side);
     let rate_hz = entries.get("rate_hz").map(|entry| entry.row.number(&entry.value)).transpose()?;
-    let rig = RigFile {
-        model,
-        width: side(resolution[0]),
-        height: side(resolution[1]),
-        fx: intrinsics[0],
-        fy: intrinsics[1],
-        cx: intrinsics[2],
-        cy: intrinsics[3],
-        coefficients,
-        rate_hz,
-    }
-    .rig_of(path)?;
+    let file = RigFile { model, width, height, fx, fy, cx, cy, coefficients, rate_hz };
+    let rig = file.rig_of(path)?;
     let transform = get("T_BS.data")?;
-    let body_from_camera = rigid_from_rows(&transform.numbers(16)?).ok_or_else(|| {
+    let body_from_camera = rigid_from_rows(&transform.numbers()?).ok_or_else(|| {
         transform.row.error("T_BS is not a rigid transform: a rotation, a translation, 0 0 0 1")
     })?;
     Ok(SensorYaml { rig, body_from_camera })
@@ -139,17 +128,15 @@ impl Entry<'_> {
     }
 
     /// The numbers of a list of known length.
-    fn numbers(&self, count: usize) -> Result<Vec<f64>, SourceError> {
-        let numbers = self.list()?;
-        if numbers.len() == count {
-            return Ok(numbers);
-        }
-        Err(self.row.error(format!("needs {count} numbers, has {}", numbers.len())))
+    fn numbers<const COUNT: usize>(&self) -> Result<[f64; COUNT], SourceError> {
+        self.list()?.try_into().map_err(|numbers: Vec<f64>| {
+            self.row.error(format!("needs {COUNT} numbers, has {}", numbers.len()))
+        })
     }
 }
 
 /// A rigid transform from the rows of its 4×4 matrix; `None` where it is none.
-fn rigid_from_rows(m: &[f64]) -> Option<SE3> {
+fn rigid_from_rows(m: &[f64; 16]) -> Option<SE3> {
     let &[a, b, c, x, d, e, f, y, g, h, i, z, 0.0, 0.0, 0.0, 1.0] = m else { return None };
     let matrix = Matrix3::new(a, b, c, d, e, f, g, h, i);
     let off = (matrix * matrix.transpose() - Matrix3::identity()).norm();
