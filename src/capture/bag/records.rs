@@ -1,15 +1,17 @@
 //! The records of an MCAP file in the order of the file, those inside chunks among them.
 
+use std::collections::HashMap;
 use std::fs::File;
 use std::io::{BufReader, ErrorKind, Read, Seek, SeekFrom};
 use std::ops::Range;
 use std::path::Path;
 
-use mcap::records::{Channel, Footer, Record, SchemaHeader, op};
+use mcap::records::{Footer, Record, op};
 use mcap::{MAGIC, parse_record};
 
 use crate::capture::bag::bag_error::BagError;
 use crate::capture::bag::chunk::{MAX_CHUNK_BYTES, decompress_into};
+use crate::capture::bag::topics::{Channel, Kind};
 use crate::capture::input_file;
 
 /// Bytes before a record: its kind and its length.
@@ -22,15 +24,8 @@ const MESSAGE_HEADER_BYTES: usize = 22;
 /// What the records have come to.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Place {
-    /// A type's name.
-    Schema {
-        /// Its number.
-        id: u16,
-        /// Its name.
-        name: String,
-    },
-    /// A channel.
-    Channel(Channel),
+    /// A channel with its number; messages are not counted.
+    Channel(u16, Channel),
     /// A message, whose content is [`Records::message`].
     Message {
         /// Its channel.
@@ -56,6 +51,8 @@ pub struct Records {
     chunk_position: usize,
     /// The record at hand in the chunk; `None` where it is `raw`.
     in_chunk: Option<Range<usize>>,
+    /// What the messages of a type are, by the type's number.
+    kinds: HashMap<u16, Option<Kind>>,
     /// The channel of the message at hand.
     pub channel: u16,
     /// Whether the end that a closed file has was reached.
@@ -84,6 +81,7 @@ impl Records {
             chunk: Vec::new(),
             chunk_position: 0,
             in_chunk: None,
+            kinds: HashMap::new(),
             channel: 0,
             has_ended: false,
             is_unfinished: false,
@@ -238,10 +236,15 @@ impl Records {
         }
         let record = parse_record(opcode, self.record()).map_err(|e| Self::damaged(at, e))?;
         let place = match record {
-            Record::Schema { header: SchemaHeader { id, name, .. }, .. } => {
-                Place::Schema { id, name }
+            Record::Schema { header, .. } => {
+                self.kinds.insert(header.id, Kind::of_type(&header.name));
+                return Ok(None);
             }
-            Record::Channel(channel) => Place::Channel(channel),
+            Record::Channel(found) => {
+                let kind = self.kinds.get(&found.schema_id).copied().flatten();
+                let kind = kind.filter(|_| found.message_encoding == "cdr");
+                Place::Channel(found.id, Channel { topic: found.topic, kind, num_messages: 0 })
+            }
             Record::Message { header, .. } => Place::Message {
                 channel: header.channel_id,
                 log_nanos: i64::try_from(header.log_time).unwrap_or(i64::MAX),

@@ -38,8 +38,6 @@ impl Kind {
 pub struct Channel {
     /// Its topic.
     pub topic: String,
-    /// Name of its type; empty where it is not said.
-    pub type_name: String,
     /// What its messages are; `None` for what is not read.
     pub kind: Option<Kind>,
     /// Messages in it.
