@@ -276,7 +276,7 @@ impl FrameSource for Simulator {
     }
 
     fn keep_prepared_in(&mut self, file: File) -> io::Result<()> {
-        self.frames = FrameStore::in_file(file, self.params.width * self.params.height)?;
+        self.frames = FrameStore::in_file(file, self.frames.frame_bytes)?;
         Ok(())
     }
 
