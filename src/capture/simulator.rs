@@ -239,25 +239,23 @@ impl Simulator {
         }
         let pixels = self.render(frame, scratch);
         let SensorParams { exposure_ms, row_time_us, .. } = self.params.sensor;
-        let depth = if exposure_ms == 0.0 && row_time_us == 0.0 {
+        let depth = match exposure_ms == 0.0 && row_time_us == 0.0 {
             // The image was cast at the one pose of the frame: its depth is there already.
-            let mut depth = Image::filled(self.lens.width, self.lens.height, 0.0);
-            scratch.depth_into(depth.pixels_mut());
-            self.in_world_units(depth)
-        } else {
-            self.depth_through(&self.lens, frame, scratch)
+            true => self.depth_of_last(&self.lens, scratch),
+            false => self.depth_through(&self.lens, frame, scratch),
         };
         Some((pixels, depth))
     }
 
     fn depth_through(&self, lens: &Lens, frame: usize, scratch: &mut RenderScratch) -> Image<f32> {
-        let pose = self.pose(self.time_s(frame));
-        let mut depth = Image::filled(lens.width, lens.height, 0.0);
-        self.renderer(lens).depth_into(&pose, scratch, depth.pixels_mut());
-        self.in_world_units(depth)
+        self.renderer(lens).cast_depth(&self.pose(self.time_s(frame)), scratch);
+        self.depth_of_last(lens, scratch)
     }
 
-    fn in_world_units(&self, mut depth: Image<f32>) -> Image<f32> {
+    /// Depth as it was last cast through `lens`, in world units.
+    fn depth_of_last(&self, lens: &Lens, scratch: &RenderScratch) -> Image<f32> {
+        let mut depth = Image::filled(lens.width, lens.height, 0.0);
+        scratch.depth_into(depth.pixels_mut());
         let scale = self.params.world_scale as f32;
         for value in depth.pixels_mut() {
             *value *= scale;
