@@ -58,25 +58,19 @@ pub fn open(path: &Path) -> io::Result<File> {
     Ok(file)
 }
 
+/// Refuses what is not a regular file, with what it is.
 fn check(kind: FileType) -> io::Result<()> {
-    match kind_of(kind) {
-        None => Ok(()),
-        Some(kind) => Err(io::Error::other(format!("it is {kind}, not a regular file"))),
+    if kind.is_file() {
+        return Ok(());
     }
-}
-
-/// What is at a place that is not a regular file, in words; `None` for a regular file.
-fn kind_of(kind: FileType) -> Option<&'static str> {
     let kinds = [
         (kind.is_dir(), "a folder"),
         (kind.is_fifo(), "a named pipe"),
         (kind.is_socket(), "a socket"),
         (kind.is_char_device() || kind.is_block_device(), "a device"),
     ];
-    if kind.is_file() {
-        return None;
-    }
-    Some(kinds.iter().find(|(is_it, _)| *is_it).map_or("something else", |(_, name)| name))
+    let name = kinds.iter().find(|(is_it, _)| *is_it).map_or("something else", |(_, name)| name);
+    Err(io::Error::other(format!("it is {name}, not a regular file")))
 }
 
 #[cfg(test)]
