@@ -150,18 +150,20 @@ impl StreamSource {
             let reason = self.fault.clone().unwrap_or_else(|| self.feed.absence());
             return Ok(Arrival::Absent(reason));
         }
-        let silent_nanos = now.saturating_sub(self.newest_nanos);
-        if silent_nanos as f64 > self.stall_s * 1e9 {
+        if self.is_silent(now) {
             let seconds = self.stall_s;
             return Ok(Arrival::Absent(format!("its sender sends no frame for {seconds} s")));
         }
         Ok(Arrival::Nothing)
     }
 
+    fn is_silent(&self, now: i64) -> bool {
+        now.saturating_sub(self.newest_nanos) as f64 > self.stall_s * 1e9
+    }
+
     /// One sender at a time: another is taken in the place of one that has gone silent.
     fn take_sender(&mut self, stream: UnixStream, now: i64) {
-        let is_silent = now.saturating_sub(self.newest_nanos) as f64 > self.stall_s * 1e9;
-        if self.stream.is_some() && !is_silent {
+        if self.stream.is_some() && !self.is_silent(now) {
             self.remark("another program wants to send frames too; it is refused".to_owned());
             return;
         }

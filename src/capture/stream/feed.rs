@@ -117,14 +117,11 @@ impl Listener {
             if now < self.pause.retry_nanos {
                 return Err(Absence::passing(self.last.clone()));
             }
-            match bind(&self.path) {
-                Ok(listener) => self.listener = Some(listener),
-                Err(absence) => {
-                    self.pause.begin(now);
-                    self.last.clone_from(&absence.reason);
-                    return Err(absence);
-                }
-            }
+            let bound = bind(&self.path).inspect_err(|absence| {
+                self.pause.begin(now);
+                self.last.clone_from(&absence.reason);
+            });
+            self.listener = Some(bound?);
             return Ok(None);
         };
         match listener.accept() {
