@@ -36,7 +36,6 @@ pub struct Bag {
     contents: Contents,
     records: Records,
     rectifier: Rectifier,
-    samples: Vec<u8>,
     /// What our own recording says of the next image.
     record: Option<FrameRecord>,
     /// The source's number of the first frame.
@@ -66,7 +65,6 @@ pub fn open(path: &Path, topic: Option<&str>, rig: Option<&Path>) -> Result<Bag,
         records: Records::open(path).map_err(bag)?,
         contents,
         rectifier,
-        samples: Vec::new(),
         record: None,
         first_sequence: None,
         next: 0,
@@ -79,8 +77,9 @@ impl Bag {
     /// Continues to the next image; gives its stamp. `None` after the last.
     fn advance(&mut self) -> Result<Option<FrameStamp>, SourceError> {
         loop {
-            let found = match self.records.advance() {
-                Ok(found) => found,
+            let place = match self.records.advance() {
+                Ok(Some(place)) => place,
+                Ok(None) => return Ok(None),
                 Err(BagError::Damaged { at, reason }) => {
                     return Err(self.lost(BagImageError::Chunk { at, reason }));
                 }
@@ -88,18 +87,13 @@ impl Bag {
                     return Err(SourceError::Bag { path: self.path.clone(), problem });
                 }
             };
-            match found {
-                None => return Ok(None),
-                Some(Place::Message { channel, log_nanos }) => {
-                    let data = self.records.message();
-                    if self.contents.is_frame_record(channel) {
-                        self.record = message::decode(data).ok();
-                    } else if self.contents.image_kind(channel).is_some() {
-                        let header = message::decode(data).map(|h: Stamped| h.stamp_nanos());
-                        return self.stamp(header, log_nanos).map(Some).map_err(|e| self.lost(e));
-                    }
-                }
-                Some(_) => {}
+            let Place::Message { channel, log_nanos } = place else { continue };
+            let data = self.records.message();
+            if self.contents.is_frame_record(channel) {
+                self.record = message::decode(data).ok();
+            } else if self.contents.image_kind(channel).is_some() {
+                let header = message::decode(data).map(|h: Stamped| h.stamp_nanos());
+                return self.stamp(header, log_nanos).map(Some).map_err(|e| self.lost(e));
             }
         }
     }
@@ -130,9 +124,7 @@ impl Bag {
             None => FrameStamp {
                 sequence,
                 capture_nanos: if stamp == 0 { log_nanos } else { stamp },
-                exposure_nanos: 0,
-                gain: 0.0,
-                clocks: None,
+                ..FrameStamp::default()
             },
         };
         let nanos = frame.capture_nanos;
@@ -153,12 +145,11 @@ impl Bag {
     fn decode_into(&mut self, pixels: &mut [u8]) -> Result<(), BagImageError> {
         let Intrinsics { width, height, .. } = self.rectifier.intrinsics();
         let data = self.records.message();
-        let kind = self.contents.image_kind(self.records.channel());
-        self.rectifier.read_into(pixels, |gray| {
+        let kind = self.contents.image_kind(self.records.channel);
+        self.rectifier.read_into(pixels, |gray, samples| {
             if kind == Some(Kind::CompressedImage) {
                 let image: CompressedImage<'_> = message::decode(data)?;
-                decode_gray_into(image.data, width, height, &mut self.samples, gray)?;
-                return Ok(());
+                return Ok(decode_gray_into(image.data, width, height, samples, gray)?);
             }
             let image: Image<'_> = message::decode(data)?;
             let found = (image.width as usize, image.height as usize);
@@ -180,7 +171,7 @@ impl FrameSource for Bag {
     }
 
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
-        self.rectifier.check_buffer(pixels)?;
+        self.check_buffer(pixels)?;
         let Some(stamp) = self.advance()? else { return Ok(None) };
         self.decode_into(pixels).map_err(|problem| self.lost(problem))?;
         Ok(Some(stamp))

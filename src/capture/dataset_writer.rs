@@ -93,17 +93,15 @@ impl DatasetWriter {
             return Err(DatasetError::Lens);
         }
         check_target(target, replace)?;
-        let partial = beside(target, "partial");
         let writer = Self {
             layout,
             target: target.to_owned(),
-            partial,
+            partial: beside(target, "partial"),
             camera,
             rate_hz,
             is_finished: false,
         };
-        for folder in [writer.image_folder(), writer.depth_folder()] {
-            let folder = writer.partial.join(folder);
+        for folder in writer.folders() {
             fs::create_dir_all(&folder).map_err(failed(&folder))?;
         }
         Ok(writer)
@@ -119,16 +117,10 @@ impl DatasetWriter {
     ) -> Result<(), DatasetError> {
         let (width, height) = (depth.width(), depth.height());
         let name = self.image_name(nanos);
-        let image = self.partial.join(self.image_folder()).join(&name);
-        write_gray_png(&image, width, height, pixels)?;
+        let [image_path, depth_path] = self.folders().map(|folder| folder.join(&name));
+        write_gray_png(&image_path, width, height, pixels)?;
         let steps: Vec<u16> = depth.pixels().iter().map(|&z| depth_steps(z)).collect();
-        write_depth_png(
-            &self.partial.join(self.depth_folder()).join(&name),
-            width,
-            height,
-            &steps,
-        )?;
-        Ok(())
+        Ok(write_depth_png(&depth_path, width, height, &steps)?)
     }
 
     /// Writes lists, calibration and the poses of all frames, and puts the dataset in its place.
@@ -159,18 +151,13 @@ impl DatasetWriter {
         if had_one { fs::remove_dir_all(&old).map_err(failed(&old)) } else { Ok(()) }
     }
 
-    fn image_folder(&self) -> &'static str {
-        match self.layout {
-            DatasetLayout::Tum => "rgb",
-            DatasetLayout::Euroc => "mav0/cam0/data",
-        }
-    }
-
-    fn depth_folder(&self) -> &'static str {
-        match self.layout {
-            DatasetLayout::Tum => "depth",
-            DatasetLayout::Euroc => "mav0/depth0/data",
-        }
+    /// Where the images and the depth images are written.
+    fn folders(&self) -> [PathBuf; 2] {
+        let folders = match self.layout {
+            DatasetLayout::Tum => ["rgb", "depth"],
+            DatasetLayout::Euroc => ["mav0/cam0/data", "mav0/depth0/data"],
+        };
+        folders.map(|folder| self.partial.join(folder))
     }
 
     fn image_name(&self, nanos: i64) -> String {
@@ -307,13 +294,13 @@ fn check_target(target: &Path, replace: bool) -> Result<(), DatasetError> {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
         other => other.map_err(failed(target))?,
     };
-    let folder = || target.to_owned();
+    let folder = target.to_owned();
     if entries.count() == 0 {
         return Ok(());
     }
     match (replace, is_dataset(target)) {
-        (false, _) => Err(DatasetError::NotEmpty { folder: folder() }),
-        (true, false) => Err(DatasetError::NotADataset { folder: folder() }),
+        (false, _) => Err(DatasetError::NotEmpty { folder }),
+        (true, false) => Err(DatasetError::NotADataset { folder }),
         (true, true) => Ok(()),
     }
 }

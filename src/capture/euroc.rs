@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::capture::listing::{read_text, rows};
+use crate::capture::listing::read_list;
 use crate::capture::recording::{Contents, ListedImage, Recording};
 use crate::capture::rig::Rig;
 use crate::capture::sensor_yaml;
@@ -65,34 +65,24 @@ pub fn sensor_beside(pose_list: &Path) -> Option<PathBuf> {
 
 /// Reads the `timestamp [ns],filename` lines of a camera.
 fn read_frames(images: &Path, list: &Path) -> Result<Vec<ListedImage>, SourceError> {
-    let text = read_text(list)?;
-    let mut frames: Vec<ListedImage> = Vec::new();
-    for row in rows(list, &text) {
+    read_list(list, |row| {
         let (stamp, name) =
-            row.text().split_once(',').ok_or_else(|| row.error("needs `timestamp,filename`"))?;
-        let nanos = row.nanos(stamp.trim())?;
-        row.check_after(frames.last().map(|frame| frame.nanos), nanos)?;
+            row.text.split_once(',').ok_or_else(|| row.error("needs `timestamp,filename`"))?;
         let path = images.join(name.trim());
-        frames.push(ListedImage { nanos, path, exposure_nanos: 0 });
-    }
-    Ok(frames)
+        let nanos = row.nanos(stamp.trim())?;
+        Ok((nanos, ListedImage { nanos, path, exposure_nanos: 0 }))
+    })
 }
 
 /// Reads the body's poses, `timestamp, p x y z, q w x y z` and more, as the camera's.
 fn read_truth(list: &Path, body_from_camera: &SE3) -> Result<Vec<StampedPose>, SourceError> {
-    let text = read_text(list)?;
-    let mut poses: Vec<StampedPose> = Vec::new();
-    for row in rows(list, &text) {
-        let fields: Vec<&str> = row.text().split(',').map(str::trim).collect();
+    read_list(list, |row| {
+        let fields: Vec<&str> = row.text.split(',').map(str::trim).collect();
         let [stamp, px, py, pz, qw, qx, qy, qz, ..] = fields[..] else {
             return Err(row.error("needs `timestamp,px,py,pz,qw,qx,qy,qz` and maybe more"));
         };
         let nanos = row.nanos(stamp)?;
-        row.check_after(poses.last().map(|pose| pose.nanos), nanos)?;
-        let translation = [row.number(px)?, row.number(py)?, row.number(pz)?];
-        let quaternion_xyzw = [row.number(qx)?, row.number(qy)?, row.number(qz)?, row.number(qw)?];
-        let world_from_body = row.pose(quaternion_xyzw, translation)?;
-        poses.push(StampedPose { nanos, world_from_camera: world_from_body * *body_from_camera });
-    }
-    Ok(poses)
+        let world_from_camera = row.pose([qx, qy, qz, qw], [px, py, pz])? * *body_from_camera;
+        Ok((nanos, StampedPose { nanos, world_from_camera }))
+    })
 }

@@ -16,7 +16,8 @@ const FIRST_FRAME: u64 = 4096;
 /// Frames of one size, in order.
 #[derive(Debug)]
 pub struct FrameStore {
-    frame_bytes: usize,
+    /// Bytes of a frame.
+    pub frame_bytes: usize,
     is_complete: bool,
     kept: Kept,
 }

@@ -71,8 +71,7 @@ fn list_images(folder: &Path) -> Result<Vec<PathBuf>, SourceError> {
 
 /// Whether a file has the ending of an image.
 pub(super) fn is_called_image(path: &Path) -> bool {
-    let Some(extension) = path.extension() else { return false };
-    ["png", "jpg", "jpeg"].iter().any(|known| extension.eq_ignore_ascii_case(known))
+    input_file::has_ending(path, &["png", "jpg", "jpeg"])
 }
 
 fn begins_like_image(path: &Path) -> bool {
@@ -128,7 +127,7 @@ fn stamped_at(rate_hz: f64, images: Vec<PathBuf>) -> Vec<ListedImage> {
 fn read_times(times: &Path, images: Vec<PathBuf>) -> Result<Vec<ListedImage>, SourceError> {
     let text = read_text(times)?;
     let rows: Vec<Row<'_>> = rows(times, &text).collect();
-    let is_named = rows.first().is_some_and(|row| row.text().contains(char::is_whitespace));
+    let is_named = rows.first().is_some_and(|row| row.text.contains(char::is_whitespace));
     let mut by_name: HashMap<String, &PathBuf> = HashMap::new();
     for image in &images {
         let names = [image.file_name(), image.file_stem()];
@@ -136,7 +135,7 @@ fn read_times(times: &Path, images: Vec<PathBuf>) -> Result<Vec<ListedImage>, So
     }
     let mut frames: Vec<ListedImage> = Vec::with_capacity(rows.len());
     for (i, row) in rows.iter().enumerate() {
-        let fields: Vec<&str> = row.text().split_whitespace().collect();
+        let fields: Vec<&str> = row.text.split_whitespace().collect();
         let (path, stamp, exposure) = match (is_named, &fields[..]) {
             (false, [stamp]) => {
                 let missing = || row.error(format!("there are only {} images", images.len()));

@@ -1,9 +1,9 @@
-//! Files that a user names: regular ones only, of bounded size, and opening one never waits.
+//! Files and folders that a user names. Files: regular ones only, of bounded size, and opening one never waits.
 
 use std::fs::{File, FileType, OpenOptions};
 use std::io::{self, Read};
 use std::os::unix::fs::{FileTypeExt, OpenOptionsExt};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Reads at most `max_bytes` of the regular file at `path` into `bytes`, which are replaced. A file
 /// that is larger, and whatever is no regular file, is an error that says so.
@@ -32,6 +32,20 @@ pub fn read_text(path: &Path, max_bytes: u64) -> io::Result<String> {
     })
 }
 
+/// What is in a folder, in the order of the names; nothing where it cannot be read.
+pub fn entries(folder: &Path) -> Vec<PathBuf> {
+    let found = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let mut paths: Vec<PathBuf> = found.map(|entry| entry.path()).collect();
+    paths.sort();
+    paths
+}
+
+/// Whether a file's name ends in one of these, in letters of any case.
+pub fn has_ending(path: &Path, endings: &[&str]) -> bool {
+    let ending = path.extension().unwrap_or_default();
+    endings.iter().any(|known| ending.eq_ignore_ascii_case(known))
+}
+
 /// Opens the regular file at `path` for reading.
 pub fn open(path: &Path) -> io::Result<File> {
     // A look before opening, for the words: a socket cannot be opened at all, and a pipe could be
@@ -44,25 +58,19 @@ pub fn open(path: &Path) -> io::Result<File> {
     Ok(file)
 }
 
+/// Refuses what is not a regular file, with what it is.
 fn check(kind: FileType) -> io::Result<()> {
-    match kind_of(kind) {
-        None => Ok(()),
-        Some(kind) => Err(io::Error::other(format!("it is {kind}, not a regular file"))),
+    if kind.is_file() {
+        return Ok(());
     }
-}
-
-/// What is at a place that is not a regular file, in words; `None` for a regular file.
-fn kind_of(kind: FileType) -> Option<&'static str> {
     let kinds = [
         (kind.is_dir(), "a folder"),
         (kind.is_fifo(), "a named pipe"),
         (kind.is_socket(), "a socket"),
         (kind.is_char_device() || kind.is_block_device(), "a device"),
     ];
-    if kind.is_file() {
-        return None;
-    }
-    Some(kinds.iter().find(|(is_it, _)| *is_it).map_or("something else", |(_, name)| name))
+    let name = kinds.iter().find(|(is_it, _)| *is_it).map_or("something else", |(_, name)| name);
+    Err(io::Error::other(format!("it is {name}, not a regular file")))
 }
 
 #[cfg(test)]

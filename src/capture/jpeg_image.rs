@@ -11,8 +11,6 @@ use crate::slam::image::gray::gray_from_interleaved;
 /// The first bytes of every JPEG: start of image, and the start of a marker.
 pub const SIGNATURE: [u8; 3] = [0xff, 0xd8, 0xff];
 
-const FORMAT: &str = "JPEG";
-
 /// Decodes a JPEG of `width * height` pixels into grey values; `samples` is reused memory for the
 /// rare files whose luma is not stored as such (RGB, CMYK). A file that ends early is an error:
 /// the decoder alone would fill the missing part with grey.
@@ -24,7 +22,7 @@ pub fn decode_gray_into(
     samples: &mut Vec<u8>,
     gray: &mut [u8],
 ) -> Result<(), DecodeError> {
-    let damaged = |reason: String| DecodeError::Damaged { format: FORMAT, reason };
+    let damaged = |reason: String| DecodeError::Damaged { format: "JPEG", reason };
     if !reaches_end_of_image(bytes) {
         return Err(damaged("it ends before its last marker".to_owned()));
     }

@@ -16,21 +16,13 @@ const NANOS_PER_SECOND_DIGITS: i32 = 9;
 pub struct Row<'a> {
     path: &'a Path,
     line: usize,
-    text: &'a str,
-    is_indented: bool,
+    /// The line without surrounding blanks.
+    pub text: &'a str,
+    /// Whether the line begins with blanks.
+    pub is_indented: bool,
 }
 
-impl<'a> Row<'a> {
-    /// The line without surrounding blanks.
-    pub fn text(&self) -> &'a str {
-        self.text
-    }
-
-    /// Whether the line begins with blanks.
-    pub fn is_indented(&self) -> bool {
-        self.is_indented
-    }
-
+impl Row<'_> {
     /// An error about this line: what is wrong and what to do.
     pub fn error(&self, problem: impl Into<String>) -> SourceError {
         SourceError::Line { path: self.path.to_owned(), line: self.line, problem: problem.into() }
@@ -61,9 +53,12 @@ impl<'a> Row<'a> {
     /// A pose from its numbers; the quaternion is normalised.
     pub fn pose(
         &self,
-        quaternion_xyzw: [f64; 4],
-        translation: [f64; 3],
+        [qx, qy, qz, qw]: [&str; 4],
+        [x, y, z]: [&str; 3],
     ) -> Result<SE3, SourceError> {
+        let translation = [self.number(x)?, self.number(y)?, self.number(z)?];
+        let quaternion_xyzw =
+            [self.number(qx)?, self.number(qy)?, self.number(qz)?, self.number(qw)?];
         SE3::try_from_parts(quaternion_xyzw, translation).ok_or_else(|| {
             self.error("its quaternion has no length, so it is not a rotation; remove the line")
         })
@@ -86,6 +81,21 @@ impl<'a> Row<'a> {
 pub fn read_text(path: &Path) -> Result<String, SourceError> {
     input_file::read_text(path, MAX_LIST_BYTES)
         .map_err(|source| SourceError::Read { path: path.to_owned(), source })
+}
+
+/// The entries of the list at `path`, one a row, whose stamps must grow; `read` gives stamp and entry.
+pub fn read_list<T>(
+    path: &Path,
+    read: impl Fn(&Row<'_>) -> Result<(i64, T), SourceError>,
+) -> Result<Vec<T>, SourceError> {
+    let text = read_text(path)?;
+    let (mut entries, mut before) = (Vec::new(), None);
+    for row in rows(path, &text) {
+        let (nanos, entry) = read(&row)?;
+        row.check_after(before.replace(nanos), nanos)?;
+        entries.push(entry);
+    }
+    Ok(entries)
 }
 
 /// The rows of a list that was read from `path`.

@@ -18,7 +18,6 @@ const MAX_KEPT_BYTES: usize = 640 << 20;
 pub struct Looped {
     name: SourceName,
     inner: Box<dyn FrameSource>,
-    intrinsics: Intrinsics,
     kept: FrameStore,
     num_frames: u64,
     period_nanos: f64,
@@ -35,11 +34,10 @@ impl Looped {
         num_frames: u64,
         rate_hz: f64,
     ) -> Self {
-        let intrinsics = inner.intrinsics();
+        let Intrinsics { width, height, .. } = inner.intrinsics();
+        let kept = FrameStore::in_memory(width * height);
         let period_nanos = 1e9 / rate_hz;
-        let kept = FrameStore::in_memory(intrinsics.width * intrinsics.height);
-        let notices = VecDeque::new();
-        Self { name, inner, intrinsics, kept, num_frames, period_nanos, next: 0, notices }
+        Self { name, inner, kept, num_frames, period_nanos, next: 0, notices: VecDeque::new() }
     }
 
     /// The kept frame that is shown as frame `sequence`.
@@ -58,7 +56,7 @@ impl Looped {
 
 impl FrameSource for Looped {
     fn intrinsics(&self) -> Intrinsics {
-        self.intrinsics
+        self.inner.intrinsics()
     }
 
     fn num_frames(&self) -> Option<usize> {
@@ -73,7 +71,7 @@ impl FrameSource for Looped {
             return Ok(());
         }
         self.inner.prepare(progress)?;
-        let bytes = self.intrinsics.width * self.intrinsics.height;
+        let bytes = self.kept.frame_bytes;
         let most = (MAX_KEPT_BYTES / bytes).max(1);
         let total = self.inner.num_frames().map_or(most, |frames| frames.min(most));
         let mut pixels = vec![0; bytes];
@@ -101,7 +99,7 @@ impl FrameSource for Looped {
     }
 
     fn keep_prepared_in(&mut self, file: File) -> io::Result<()> {
-        self.kept = FrameStore::in_file(file, self.intrinsics.width * self.intrinsics.height)?;
+        self.kept = FrameStore::in_file(file, self.kept.frame_bytes)?;
         Ok(())
     }
 
@@ -116,13 +114,10 @@ impl FrameSource for Looped {
 
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
         if self.kept.is_empty() {
-            let (name, reason) = (self.name.to_string(), "it has no frames to repeat");
-            return Err(SourceError::Unavailable { name, reason });
+            let (name, problem) = (self.name.to_string(), "it has no frames to repeat".to_owned());
+            return Err(SourceError::Name { name, problem });
         }
-        if pixels.len() != self.intrinsics.width * self.intrinsics.height {
-            let Intrinsics { width, height, .. } = self.intrinsics;
-            return Err(SourceError::Buffer { found: pixels.len(), width, height });
-        }
+        self.check_buffer(pixels)?;
         if self.next >= self.num_frames {
             return Ok(None);
         }
@@ -135,9 +130,7 @@ impl FrameSource for Looped {
             sequence,
             // From one period on: a stamp of zero is what a camera without a clock gives.
             capture_nanos: ((sequence + 1) as f64 * self.period_nanos) as i64,
-            exposure_nanos: 0,
-            gain: 0.0,
-            clocks: None,
+            ..FrameStamp::default()
         }))
     }
 }

@@ -28,45 +28,46 @@ pub fn open(
     rig: Option<&Path>,
     params: &SourceParams,
 ) -> Result<Box<dyn FrameSource>, SourceError> {
-    let unavailable = |reason| SourceError::Unavailable { name: name.to_string(), reason };
+    let refused = |problem: &str| {
+        Err(SourceError::Name { name: name.to_string(), problem: problem.to_owned() })
+    };
     if let Some(folder) = name.folder().filter(|folder| !folder.is_dir()) {
-        return Err(SourceError::NoFolder { name: name.to_string(), folder: folder.to_owned() });
+        return refused(&format!("there is no folder {}; check the path", folder.display()));
     }
     if let Some(likely) = misnamed(name) {
-        return Err(SourceError::Layout { name: name.to_string(), likely: likely.to_string() });
+        return refused(&format!("the folder does not have this layout; it looks like {likely}"));
     }
-    match name {
-        SourceName::Tum(folder) => Ok(Box::new(tum::open(folder, rig)?)),
-        SourceName::Euroc(folder) => Ok(Box::new(euroc::open(folder, rig)?)),
-        SourceName::Images(folder) => Ok(Box::new(image_folder::open(folder, rig)?)),
-        SourceName::Mcap { file, topic } => Ok(Box::new(bag::open(file, topic.as_deref(), rig)?)),
-        SourceName::Simulator { .. } if rig.is_some() => Err(unavailable(
-            "the simulator takes no rig; its camera is in the table [simulator] of the configuration",
-        )),
+    let stall_s = params.camera.stall_s;
+    Ok(match name {
+        SourceName::Tum(folder) => Box::new(tum::open(folder, rig)?),
+        SourceName::Euroc(folder) => Box::new(euroc::open(folder, rig)?),
+        SourceName::Images(folder) => Box::new(image_folder::open(folder, rig)?),
+        SourceName::Mcap { file, topic } => Box::new(bag::open(file, topic.as_deref(), rig)?),
+        SourceName::Simulator { .. } if rig.is_some() => {
+            return refused(
+                "the simulator takes no rig; its camera is in the table [simulator] of the configuration",
+            );
+        }
         SourceName::Simulator { scene } => {
             let mut params = params.simulator.clone();
-            if let Some(scene) = scene {
-                params = params.with_scene(scene.parse().map_err(|problem: &str| {
-                    SourceError::Name { name: name.to_string(), problem: problem.to_owned() }
-                })?);
+            match scene.as_ref().map(|scene| scene.parse()) {
+                None => {}
+                Some(Ok(scene)) => params = params.with_scene(scene),
+                Some(Err(problem)) => return refused(problem),
             }
-            Ok(Box::new(Simulator::unpainted(params)?))
+            Box::new(Simulator::unpainted(params)?)
         }
         SourceName::Looped { inner, .. } if inner.is_camera() => {
-            Err(unavailable("a camera cannot be repeated; name a recording or the simulator"))
+            return refused("a camera cannot be repeated; name a recording or the simulator");
         }
         SourceName::Looped { num_frames, rate_hz, inner } => {
             let source = open(inner, rig, params)?;
-            Ok(Box::new(Looped::new(name.clone(), source, *num_frames, *rate_hz)))
+            Box::new(Looped::new(name.clone(), source, *num_frames, *rate_hz))
         }
-        SourceName::Camera(device) => Ok(Box::new(v4l::open(device, rig, &params.camera)?)),
-        SourceName::Stream(path) => {
-            Ok(Box::new(stream::open_socket(path, rig, params.camera.stall_s)?))
-        }
-        SourceName::Ros2(topic) => {
-            Ok(Box::new(stream::open_ros2(topic, rig, params.camera.stall_s)?))
-        }
-    }
+        SourceName::Camera(device) => Box::new(v4l::open(device, rig, &params.camera)?),
+        SourceName::Stream(path) => Box::new(stream::open_socket(path, rig, stall_s)?),
+        SourceName::Ros2(topic) => Box::new(stream::open_ros2(topic, rig, stall_s)?),
+    })
 }
 
 /// What a folder without the layout that its source names is by the layout that it has.

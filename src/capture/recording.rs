@@ -88,13 +88,13 @@ impl FrameSource for Recording {
     }
 
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
-        self.rectifier.check_buffer(pixels)?;
+        self.check_buffer(pixels)?;
         let Some(frame) = self.contents.frames.get(self.next) else { return Ok(None) };
         let sequence = self.next as u64;
         // Counted before it is read: whoever continues after a bad image gets the one after it.
         self.next += 1;
         let Intrinsics { width, height, .. } = self.rectifier.intrinsics();
-        self.rectifier.read_into(pixels, |gray| {
+        self.rectifier.read_into(pixels, |gray, _| {
             self.reader.read_gray_into(&frame.path, width, height, gray)
         })?;
         let (capture_nanos, exposure_nanos) = (frame.nanos, frame.exposure_nanos);

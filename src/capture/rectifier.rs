@@ -4,6 +4,7 @@ use std::path::Path;
 
 use crate::capture::rig::Rig;
 use crate::capture::source_error::SourceError;
+use crate::capture::v4l::pixel_format::{BrokenPicture, PixelFormat, unpack_gray};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::rectification::Rectification;
 use crate::slam::image::buffer::Image;
@@ -14,6 +15,8 @@ pub struct Rectifier {
     rectification: Rectification,
     /// The raw image, where it is not the rectified one.
     raw: Vec<u8>,
+    /// Memory of the decoders.
+    samples: Vec<u8>,
 }
 
 impl Rectifier {
@@ -23,7 +26,7 @@ impl Rectifier {
             .map_err(|source| SourceError::Rectification { path: rig_path.to_owned(), source })?;
         let Intrinsics { width, height, .. } = *rectification.intrinsics();
         let raw = if rectification.is_identity() { Vec::new() } else { vec![0; width * height] };
-        Ok(Self { rectification, raw })
+        Ok(Self { rectification, raw, samples: Vec::new() })
     }
 
     /// Intrinsics of the rectified images; raw images have the same size.
@@ -31,32 +34,38 @@ impl Rectifier {
         *self.rectification.intrinsics()
     }
 
-    /// Checks that `pixels` has room for an image and no more.
-    pub fn check_buffer(&self, pixels: &[u8]) -> Result<(), SourceError> {
-        let Intrinsics { width, height, .. } = self.intrinsics();
-        match pixels.len() == width * height {
-            true => Ok(()),
-            false => Err(SourceError::Buffer { found: pixels.len(), width, height }),
-        }
-    }
-
-    /// Writes the rectified image of the grey one that `read` writes.
+    /// Writes the rectified image of the grey one that `read` writes; its second argument is reused memory.
     pub fn read_into<E>(
         &mut self,
         pixels: &mut [u8],
-        read: impl FnOnce(&mut [u8]) -> Result<(), E>,
+        read: impl FnOnce(&mut [u8], &mut Vec<u8>) -> Result<(), E>,
     ) -> Result<(), E> {
         if self.rectification.is_identity() {
-            return read(pixels);
+            return read(pixels, &mut self.samples);
         }
-        read(&mut self.raw)?;
+        read(&mut self.raw, &mut self.samples)?;
         self.rectification.rectify_into(&self.raw, pixels);
         Ok(())
     }
 
-    /// Writes the rectified image of a grey one that is in memory already.
-    pub fn rectify_into(&self, raw: &[u8], pixels: &mut [u8]) {
-        self.rectification.rectify_into(raw, pixels);
+    /// Writes the rectified image of a picture of a camera's format, with `stride` bytes from row to row. Grey without
+    /// padding is taken straight from `bytes`, which may be the driver's memory.
+    pub fn unpack_into(
+        &mut self,
+        format: PixelFormat,
+        bytes: &[u8],
+        stride: usize,
+        pixels: &mut [u8],
+    ) -> Result<(), BrokenPicture> {
+        let Intrinsics { width, height, .. } = self.intrinsics();
+        let is_packed = format == PixelFormat::Grey && stride == width;
+        if let (true, Some(packed)) = (is_packed, bytes.get(..width * height)) {
+            self.rectification.rectify_into(packed, pixels);
+            return Ok(());
+        }
+        self.read_into(pixels, |gray, samples| {
+            unpack_gray(format, bytes, stride, (width, height), samples, gray)
+        })
     }
 
     /// The rectified depth image of a raw one; `None` of one that has another size.

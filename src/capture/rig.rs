@@ -5,6 +5,7 @@ use std::path::Path;
 use nalgebra::Vector2;
 use serde::Deserialize;
 
+use crate::capture::decode_error::MAX_SIDE;
 use crate::capture::listing;
 use crate::capture::rig_error::RigError;
 use crate::capture::source_error::SourceError;
@@ -13,7 +14,7 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::parameter::{ParameterError, check_range};
 
 /// Sides of an image, pixels.
-const SIDE_RANGE: std::ops::RangeInclusive<usize> = 16..=8192;
+const SIDE_RANGE: std::ops::RangeInclusive<usize> = 16..=MAX_SIDE;
 /// Focal lengths, pixels: from a fisheye on the smallest image to a telescope on the largest.
 const FOCAL_RANGE: std::ops::RangeInclusive<f64> = 1.0..=100_000.0;
 /// Lens coefficients; those of rational lenses reach tens.
@@ -106,18 +107,17 @@ impl Rig {
     pub fn from_camera_txt(path: &Path, text: &str) -> Result<Self, SourceError> {
         const SHAPE: &str =
             "needs one line `fx fy cx cy width height [k1 k2 p1 p2 [k3 [k4 k5 k6]]]`";
-        let syntax = |problem: &str| RigError::Syntax {
+        let mut rows = listing::rows(path, text);
+        let row = rows.next().ok_or_else(|| SourceError::Line {
             path: path.to_owned(),
             line: 1,
-            problem: problem.to_owned(),
-        };
-        let mut rows = listing::rows(path, text);
-        let row = rows.next().ok_or_else(|| syntax(SHAPE))?;
+            problem: SHAPE.to_owned(),
+        })?;
         if let Some(second) = rows.next() {
             return Err(second.error(format!("a second camera; {SHAPE}")));
         }
         let numbers = row
-            .text()
+            .text
             .split_whitespace()
             .map(|field| row.number(field))
             .collect::<Result<Vec<f64>, SourceError>>()?;
@@ -125,24 +125,12 @@ impl Rig {
             return Err(row.error(format!("{SHAPE}, has {} numbers", numbers.len())));
         };
         let model = if coefficients.is_empty() { LensModel::Pinhole } else { LensModel::Radtan };
-        // A fraction or a negative number becomes a size that the range refuses.
-        let side = |x: f64| if x.fract() == 0.0 { x as usize } else { 0 };
-        let file = RigFile {
-            model,
-            width: side(width),
-            height: side(height),
-            fx,
-            fy,
-            cx,
-            cy,
-            coefficients: coefficients.to_vec(),
-            rate_hz: None,
-        };
+        let (width, height) = (side(width), side(height));
+        let coefficients = coefficients.to_vec();
+        let file = RigFile { model, width, height, fx, fy, cx, cy, coefficients, rate_hz: None };
         Ok(file.rig_of(path)?)
     }
-}
 
-impl Rig {
     /// By how much the images of two cameras of the same place differ, pixels: the largest shift over
     /// a grid of rays; infinite where the sizes differ or a ray meets only one of the images.
     pub fn largest_shift_px(&self, other: &Self) -> f64 {
@@ -161,9 +149,7 @@ impl Rig {
         };
         (0..GRID * GRID).map(|index| shift(index).unwrap_or(f64::INFINITY)).fold(0.0, f64::max)
     }
-}
 
-impl Rig {
     /// What is unusual about the camera and may be a mistake, in one line.
     pub fn remark(&self) -> Option<String> {
         let k = self.camera.intrinsics();
@@ -184,6 +170,11 @@ impl Rig {
             USUAL_DEG.end()
         ))
     }
+}
+
+/// Side of an image that is written as any number; a fraction or a negative number becomes 0, which the range refuses.
+pub(super) fn side(number: f64) -> usize {
+    if number.fract() == 0.0 { number as usize } else { 0 }
 }
 
 /// Angle between the first and the last pixel of a row or column as the focal length alone has it, degrees.

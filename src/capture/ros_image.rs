@@ -1,5 +1,6 @@
 //! Images as ROS has them (`sensor_msgs/Image`), and their grey values.
 
+use crate::capture::decode_error::MAX_SIDE;
 use crate::capture::v4l::pixel_format::{BrokenPicture, PixelFormat, unpack_gray};
 use crate::slam::image::gray::gray_from_rgb;
 
@@ -19,9 +20,6 @@ pub struct RosImage<'a> {
     /// The rows.
     pub data: &'a [u8],
 }
-
-/// Longest side, pixels: that of a rig.
-const MAX_SIDE: u32 = 8192;
 
 /// Why an image has no grey values.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -69,10 +67,7 @@ impl RosImage<'_> {
     pub fn unpack_gray(&self, gray: &mut [u8]) -> Result<(), RosImageError> {
         let (width, height) = (self.width as usize, self.height as usize);
         let sides = 2..=MAX_SIDE;
-        if !sides.contains(&self.width)
-            || !sides.contains(&self.height)
-            || gray.len() != width * height
-        {
+        if !sides.contains(&width) || !sides.contains(&height) || gray.len() != width * height {
             return Err(RosImageError::Size(self.width, self.height));
         }
         if let Some(format) = self.camera_format() {

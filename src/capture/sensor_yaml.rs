@@ -9,7 +9,7 @@ use std::path::Path;
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 
 use crate::capture::listing::{Row, read_text, rows};
-use crate::capture::rig::{LensModel, Rig, RigFile};
+use crate::capture::rig::{LensModel, Rig, RigFile, side};
 use crate::capture::source_error::SourceError;
 use crate::slam::geometry::se3::SE3;
 
@@ -46,7 +46,6 @@ pub fn parse(path: &Path, text: &str) -> Result<SensorYaml, SourceError> {
             problem: format!("the key `{key}` is missing; take the file of the original recording"),
         })
     };
-    let numbers = |key: &str, count: usize| get(key)?.numbers(count);
     let model = get("camera_model")?;
     if model.value != "pinhole" {
         let problem = format!("camera_model is `{}`; only `pinhole` is understood", model.value);
@@ -64,34 +63,16 @@ pub fn parse(path: &Path, text: &str) -> Result<SensorYaml, SourceError> {
             )));
         }
     };
-    let intrinsics = numbers("intrinsics", 4)?;
-    let resolution = numbers("resolution", 2)?;
-    let rate_hz = match entries.get("rate_hz") {
-        Some(entry) => Some(entry.row.number(&entry.value)?),
-        None => None,
-    };
-    let rig = RigFile {
-        model,
-        width: whole(resolution[0]),
-        height: whole(resolution[1]),
-        fx: intrinsics[0],
-        fy: intrinsics[1],
-        cx: intrinsics[2],
-        cy: intrinsics[3],
-        coefficients,
-        rate_hz,
-    }
-    .rig_of(path)?;
+    let [fx, fy, cx, cy] = get("intrinsics")?.numbers()?;
+    let [width, height] = get("resolution")?.numbers()?.map(side);
+    let rate_hz = entries.get("rate_hz").map(|entry| entry.row.number(&entry.value)).transpose()?;
+    let file = RigFile { model, width, height, fx, fy, cx, cy, coefficients, rate_hz };
+    let rig = file.rig_of(path)?;
     let transform = get("T_BS.data")?;
-    let body_from_camera = rigid_from_rows(&transform.numbers(16)?).ok_or_else(|| {
+    let body_from_camera = rigid_from_rows(&transform.numbers()?).ok_or_else(|| {
         transform.row.error("T_BS is not a rigid transform: a rotation, a translation, 0 0 0 1")
     })?;
     Ok(SensorYaml { rig, body_from_camera })
-}
-
-/// A size; a fraction or a negative number becomes 0, which the rig refuses by its range.
-fn whole(number: f64) -> usize {
-    if number.fract() == 0.0 { number as usize } else { 0 }
 }
 
 /// All entries by key, `outer.inner` below a key.
@@ -104,7 +85,7 @@ fn read_entries<'a>(
     let mut open_list: Option<(String, Entry<'a>)> = None;
     for row in rows(path, text) {
         // A comment behind a value; none of these files has a `#` inside a value.
-        let content = row.text().split('#').next().unwrap_or_default().trim();
+        let content = row.text.split('#').next().unwrap_or_default().trim();
         if content.starts_with('%') || content == "---" || content.is_empty() {
             continue;
         }
@@ -118,8 +99,8 @@ fn read_entries<'a>(
                     .split_once(':')
                     .ok_or_else(|| row.error("is not `key: value`; remove it"))?;
                 let key = key.trim();
-                let key = if row.is_indented() { format!("{outer}.{key}") } else { key.to_owned() };
-                if !row.is_indented() {
+                let key = if row.is_indented { format!("{outer}.{key}") } else { key.to_owned() };
+                if !row.is_indented {
                     outer.clone_from(&key);
                 }
                 (key, Entry { row, value: value.trim().to_owned() })
@@ -128,7 +109,7 @@ fn read_entries<'a>(
         if entry.value.starts_with('[') && !entry.value.ends_with(']') {
             open_list = Some((key, entry));
         } else if let Some(twice) = entries.insert(key, entry) {
-            return Err(row.error(format!("repeats the key of `{}`", twice.row.text())));
+            return Err(row.error(format!("repeats the key of `{}`", twice.row.text)));
         }
     }
     match open_list {
@@ -147,17 +128,15 @@ impl Entry<'_> {
     }
 
     /// The numbers of a list of known length.
-    fn numbers(&self, count: usize) -> Result<Vec<f64>, SourceError> {
-        let numbers = self.list()?;
-        if numbers.len() == count {
-            return Ok(numbers);
-        }
-        Err(self.row.error(format!("needs {count} numbers, has {}", numbers.len())))
+    fn numbers<const COUNT: usize>(&self) -> Result<[f64; COUNT], SourceError> {
+        self.list()?.try_into().map_err(|numbers: Vec<f64>| {
+            self.row.error(format!("needs {COUNT} numbers, has {}", numbers.len()))
+        })
     }
 }
 
 /// A rigid transform from the rows of its 4×4 matrix; `None` where it is none.
-fn rigid_from_rows(m: &[f64]) -> Option<SE3> {
+fn rigid_from_rows(m: &[f64; 16]) -> Option<SE3> {
     let &[a, b, c, x, d, e, f, y, g, h, i, z, 0.0, 0.0, 0.0, 1.0] = m else { return None };
     let matrix = Matrix3::new(a, b, c, d, e, f, g, h, i);
     let off = (matrix * matrix.transpose() - Matrix3::identity()).norm();

@@ -217,10 +217,8 @@ impl Simulator {
         if frame >= self.params.frames {
             return None;
         }
-        Some(match self.frames.get(frame) {
-            Some(rendered) => rendered,
-            None => Cow::Owned(self.render(frame, &mut RenderScratch::default())),
-        })
+        let render = || Cow::Owned(self.render(frame, &mut RenderScratch::default()));
+        Some(self.frames.get(frame).unwrap_or_else(render))
     }
 
     /// Exact depth along the optical axis of the raw image at a frame's ground-truth pose, in world
@@ -241,25 +239,23 @@ impl Simulator {
         }
         let pixels = self.render(frame, scratch);
         let SensorParams { exposure_ms, row_time_us, .. } = self.params.sensor;
-        let depth = if exposure_ms == 0.0 && row_time_us == 0.0 {
+        let depth = match exposure_ms == 0.0 && row_time_us == 0.0 {
             // The image was cast at the one pose of the frame: its depth is there already.
-            let mut depth = Image::filled(self.lens.width, self.lens.height, 0.0);
-            scratch.depth_into(depth.pixels_mut());
-            self.in_world_units(depth)
-        } else {
-            self.depth_through(&self.lens, frame, scratch)
+            true => self.depth_of_last(&self.lens, scratch),
+            false => self.depth_through(&self.lens, frame, scratch),
         };
         Some((pixels, depth))
     }
 
     fn depth_through(&self, lens: &Lens, frame: usize, scratch: &mut RenderScratch) -> Image<f32> {
-        let pose = self.pose(self.time_s(frame));
-        let mut depth = Image::filled(lens.width, lens.height, 0.0);
-        self.renderer(lens).depth_into(&pose, scratch, depth.pixels_mut());
-        self.in_world_units(depth)
+        self.renderer(lens).cast_depth(&self.pose(self.time_s(frame)), scratch);
+        self.depth_of_last(lens, scratch)
     }
 
-    fn in_world_units(&self, mut depth: Image<f32>) -> Image<f32> {
+    /// Depth as it was last cast through `lens`, in world units.
+    fn depth_of_last(&self, lens: &Lens, scratch: &RenderScratch) -> Image<f32> {
+        let mut depth = Image::filled(lens.width, lens.height, 0.0);
+        scratch.depth_into(depth.pixels_mut());
         let scale = self.params.world_scale as f32;
         for value in depth.pixels_mut() {
             *value *= scale;
@@ -278,7 +274,7 @@ impl FrameSource for Simulator {
     }
 
     fn keep_prepared_in(&mut self, file: File) -> io::Result<()> {
-        self.frames = FrameStore::in_file(file, self.params.width * self.params.height)?;
+        self.frames = FrameStore::in_file(file, self.frames.frame_bytes)?;
         Ok(())
     }
 
@@ -303,10 +299,10 @@ impl FrameSource for Simulator {
                 .map_init(RenderScratch::default, |scratch, frame| shared.render(frame, scratch))
                 .collect();
             for frame in rendered {
-                let path = || PathBuf::from("rendered frames");
-                self.frames
-                    .push(frame)
-                    .map_err(|source| SourceError::Read { path: path(), source })?;
+                self.frames.push(frame).map_err(|source| SourceError::Read {
+                    path: PathBuf::from("rendered frames"),
+                    source,
+                })?;
             }
         }
         progress(total, total);
@@ -320,11 +316,8 @@ impl FrameSource for Simulator {
     }
 
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
+        self.check_buffer(pixels)?;
         let frame = self.next;
-        let (width, height) = (self.params.width, self.params.height);
-        if pixels.len() != width * height {
-            return Err(SourceError::Buffer { found: pixels.len(), width, height });
-        }
         let Some(raw) = self.raw_frame(frame) else { return Ok(None) };
         self.rectification.rectify_into(&raw, pixels);
         self.next += 1;

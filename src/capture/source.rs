@@ -9,7 +9,7 @@ use crate::slam::image::buffer::Image;
 use crate::slam::trajectory::StampedPose;
 
 /// Stamp of a frame just read.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct FrameStamp {
     /// Number of the frame at its source, from 0; a gap is a frame that the source lost.
     pub sequence: u64,
@@ -44,6 +44,22 @@ pub enum Arrival {
     Absent(String),
 }
 
+/// Why there is no camera or sender to read from.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(in crate::capture) struct Absence {
+    /// The reason, for the user.
+    pub reason: String,
+    /// Whether it may pass by itself.
+    pub passes: bool,
+}
+
+impl Absence {
+    /// One that may pass by itself.
+    pub fn passing(reason: String) -> Self {
+        Self { reason, passes: true }
+    }
+}
+
 /// Frames of a camera that did not become frames here.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct FrameLosses {
@@ -70,7 +86,9 @@ pub trait FrameSource: Send {
     fn intrinsics(&self) -> Intrinsics;
 
     /// How many frames there will be, where that is known (recordings, simulator).
-    fn num_frames(&self) -> Option<usize>;
+    fn num_frames(&self) -> Option<usize> {
+        None
+    }
 
     /// Keeps frames that are prepared in `file` and takes those that are there: of a process of the same source
     /// that was killed. Sources that prepare none have no use for it.
@@ -101,18 +119,20 @@ pub trait FrameSource: Send {
     /// `pixels` holds then is not a frame.
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError>;
 
-    /// Leaves out frames until the next one comes after `sequence`.
-    fn skip_to(&mut self, sequence: u64) -> Result<(), SourceError> {
-        let k = self.intrinsics();
-        let mut pixels = vec![0; k.width * k.height];
-        loop {
-            match self.next_into(&mut pixels) {
-                Ok(Some(stamp)) if stamp.sequence < sequence => {}
-                Err(error) if error.is_passing() => {}
-                Err(error) => return Err(error),
-                Ok(_) => return Ok(()),
-            }
+    /// Checks that `pixels` has room for a frame and no more.
+    fn check_buffer(&self, pixels: &[u8]) -> Result<(), SourceError> {
+        let Intrinsics { width, height, .. } = self.intrinsics();
+        match pixels.len() == width * height {
+            true => Ok(()),
+            false => Err(SourceError::Buffer { found: pixels.len(), width, height }),
         }
+    }
+
+    /// Leaves out frames until the next one comes after `sequence`; none of a camera, whose numbers begin with
+    /// whoever opens it.
+    fn skip_to(&mut self, sequence: u64) -> Result<(), SourceError> {
+        let _ = sequence;
+        Ok(())
     }
 
     /// What a camera has lost so far; `None` for recordings, which lose nothing.

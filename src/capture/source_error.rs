@@ -13,7 +13,7 @@ pub use crate::capture::bag::bag_error::{BagError, BagImageError};
 /// Why a source cannot be opened or gave no frame; says what, where and what to do.
 #[derive(Debug, thiserror::Error)]
 pub enum SourceError {
-    /// The name of a source is not understood.
+    /// The name of a source is not understood, or nothing can be opened by it.
     #[error("source `{name}`: {problem}")]
     Name {
         /// The name as it was given.
@@ -39,30 +39,6 @@ pub enum SourceError {
         path: String,
         /// The command that makes the folder, for the shell.
         command: String,
-    },
-    /// The source exists but not in this binary or not by this way of opening.
-    #[error("source `{name}`: {reason}")]
-    Unavailable {
-        /// The source.
-        name: String,
-        /// Why, and what to do.
-        reason: &'static str,
-    },
-    /// The folder of a recording is not there.
-    #[error("source `{name}`: there is no folder {}; check the path", folder.display())]
-    NoFolder {
-        /// The source.
-        name: String,
-        /// The folder.
-        folder: PathBuf,
-    },
-    /// The folder has the layout of another kind of source.
-    #[error("source `{name}`: the folder does not have this layout; it looks like {likely}")]
-    Layout {
-        /// The source.
-        name: String,
-        /// What it could be named.
-        likely: String,
     },
     /// A list, rig or calibration file cannot be read.
     #[error("{}: cannot be read: {source}; check the path and its permissions", path.display())]
@@ -138,31 +114,9 @@ pub enum SourceError {
     /// An image of the sequence is not usable.
     #[error(transparent)]
     Image(#[from] ImageFileError),
-    /// A camera without a calibration.
-    #[error(
-        "v4l:{name}: a camera needs a rig file with its calibration: name it with --rig FILE (for a first try at 640x480, webcam.toml in config/rigs or /usr/share/semidense/rigs will do)"
-    )]
-    CameraRig {
-        /// The camera.
-        name: String,
-    },
-    /// A camera that cannot serve.
-    #[error("v4l:{name}: {reason}")]
-    Camera {
-        /// The camera.
-        name: String,
-        /// Why, and what to do.
-        reason: String,
-    },
-    /// A stream of frames without a calibration.
-    #[error("{name}: needs a rig file with the camera's calibration: name it with --rig FILE")]
-    StreamRig {
-        /// The source.
-        name: String,
-    },
-    /// A stream that cannot serve.
+    /// A camera, or a stream of frames, that cannot serve.
     #[error("{name}: {reason}")]
-    Stream {
+    Camera {
         /// The source.
         name: String,
         /// Why, and what to do.

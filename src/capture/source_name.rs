@@ -3,11 +3,12 @@
 use std::ffi::{OsStr, OsString};
 use std::fmt;
 use std::io::ErrorKind;
-use std::os::unix::ffi::{OsStrExt, OsStringExt};
+use std::os::unix::ffi::OsStrExt;
 use std::os::unix::fs::FileTypeExt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
+use crate::capture::input_file::{entries, has_ending};
 use crate::capture::source_error::SourceError;
 use crate::capture::{euroc, image_folder, tum};
 
@@ -73,11 +74,7 @@ impl SourceName {
         match self {
             Self::Tum(folder) | Self::Euroc(folder) | Self::Images(folder) => Some(folder),
             Self::Looped { inner, .. } => inner.folder(),
-            Self::Mcap { .. }
-            | Self::Simulator { .. }
-            | Self::Camera(_)
-            | Self::Stream(_)
-            | Self::Ros2(_) => None,
+            _ => None,
         }
     }
 
@@ -95,7 +92,9 @@ impl SourceName {
             Some(Some(text)) => Ok(Some(text.to_owned())),
             None => Ok(None),
         };
-        let folder = || rest.map(PathBuf::from).ok_or_else(|| error("the folder is missing"));
+        let place = |missing: &str| rest.map(PathBuf::from).ok_or_else(|| error(missing));
+        let named = |missing: &str| text(rest)?.ok_or_else(|| error(missing));
+        let no_folder = "the folder is missing";
         match kind {
             b"loop" => text(rest)?
                 .and_then(|text| parse_loop(&text))
@@ -106,38 +105,32 @@ impl SourceName {
             }
             b"sim" if bytes == b"sim:" => Err(error("the scene's name is missing")),
             b"sim" => Ok(Self::Simulator { scene: text(rest)? }),
-            b"tum" => folder().map(Self::Tum),
-            b"euroc" => folder().map(Self::Euroc),
-            b"images" => folder().map(Self::Images),
-            b"mcap" => rest
-                .map(parse_mcap)
-                .unwrap_or_else(|| Err(error("the file is missing, as in mcap:run.mcap"))),
-            b"v4l" => match text(rest)? {
-                None => Err(error("the device is missing, as in v4l:/dev/video0")),
-                Some(device) => Ok(Self::Camera(device)),
-            },
-            b"stream" if rest.is_some() => {
-                Ok(Self::Stream(rest.map(PathBuf::from).unwrap_or_default()))
-            }
+            b"tum" => place(no_folder).map(Self::Tum),
+            b"euroc" => place(no_folder).map(Self::Euroc),
+            b"images" => place(no_folder).map(Self::Images),
+            b"mcap" => parse_mcap(&place("the file is missing, as in mcap:run.mcap")?),
+            b"v4l" => named("the device is missing, as in v4l:/dev/video0").map(Self::Camera),
             b"stream" if bytes != kind => {
-                Err(error("the socket's path is missing, as in stream:/run/semidense/front.frames"))
+                place("the socket's path is missing, as in stream:/run/semidense/front.frames")
+                    .map(Self::Stream)
             }
-            b"ros2" if bytes != kind => match text(rest)? {
-                None => Err(error("the topic is missing, as in ros2:/camera/image_raw")),
-                Some(topic) => Ok(Self::Ros2(topic)),
-            },
+            b"ros2" if bytes != kind => {
+                named("the topic is missing, as in ros2:/camera/image_raw").map(Self::Ros2)
+            }
             _ => recognise(Path::new(name)),
         }
     }
 
     /// The name as an argument of another process, byte by byte.
     pub fn to_os_string(&self) -> OsString {
-        let with = |kind: &str, place: &Path| {
-            let mut bytes = kind.as_bytes().to_vec();
-            bytes.extend_from_slice(place.as_os_str().as_bytes());
-            OsString::from_vec(bytes)
-        };
+        fn with(kind: &str, place: impl AsRef<OsStr>) -> OsString {
+            let mut name = OsString::from(kind);
+            name.push(place);
+            name
+        }
         match self {
+            Self::Simulator { scene: None } => OsString::from("sim"),
+            Self::Simulator { scene: Some(scene) } => with("sim:", scene),
             Self::Tum(folder) => with("tum:", folder),
             Self::Euroc(folder) => with("euroc:", folder),
             Self::Images(folder) => with("images:", folder),
@@ -146,12 +139,11 @@ impl SourceName {
                 topic.iter().for_each(|topic| name.push(format!(":{topic}")));
                 name
             }
-            Self::Looped { num_frames, rate_hz, inner } => {
-                with(&format!("loop:{num_frames}:{rate_hz}:"), Path::new(&inner.to_os_string()))
-            }
+            Self::Camera(device) => with("v4l:", device),
             Self::Stream(path) => with("stream:", path),
-            Self::Simulator { .. } | Self::Camera(_) | Self::Ros2(_) => {
-                OsString::from(self.to_string())
+            Self::Ros2(topic) => with("ros2:", topic),
+            Self::Looped { num_frames, rate_hz, inner } => {
+                with(&format!("loop:{num_frames}:{rate_hz}:"), inner.to_os_string())
             }
         }
     }
@@ -185,23 +177,7 @@ impl FromStr for SourceName {
 
 impl fmt::Display for SourceName {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Simulator { scene: None } => write!(out, "sim"),
-            Self::Simulator { scene: Some(scene) } => write!(out, "sim:{scene}"),
-            Self::Tum(folder) => write!(out, "tum:{}", folder.display()),
-            Self::Euroc(folder) => write!(out, "euroc:{}", folder.display()),
-            Self::Images(folder) => write!(out, "images:{}", folder.display()),
-            Self::Mcap { file, topic: None } => write!(out, "mcap:{}", file.display()),
-            Self::Mcap { file, topic: Some(topic) } => {
-                write!(out, "mcap:{}:{topic}", file.display())
-            }
-            Self::Camera(device) => write!(out, "v4l:{device}"),
-            Self::Stream(path) => write!(out, "stream:{}", path.display()),
-            Self::Ros2(topic) => write!(out, "ros2:{topic}"),
-            Self::Looped { num_frames, rate_hz, inner } => {
-                write!(out, "loop:{num_frames}:{rate_hz}:{inner}")
-            }
-        }
+        write!(out, "{}", self.to_os_string().display())
     }
 }
 
@@ -210,9 +186,8 @@ fn name_error(name: &OsStr, problem: &str) -> SourceError {
 }
 
 /// `FILE[:TOPIC]`: a topic begins with `/`, and a file that is there is no topic. A folder stands for the one file in it.
-fn parse_mcap(rest: &OsStr) -> Result<SourceName, SourceError> {
-    let whole = Path::new(rest);
-    let bytes = rest.as_bytes();
+fn parse_mcap(whole: &Path) -> Result<SourceName, SourceError> {
+    let bytes = whole.as_os_str().as_bytes();
     let colon = bytes.windows(2).rposition(|pair| pair == b":/").filter(|_| !whole.exists());
     let (file, topic) = match colon {
         Some(colon) => (Path::new(OsStr::from_bytes(&bytes[..colon])), Some(&bytes[colon + 1..])),
@@ -242,10 +217,8 @@ fn only_mcap(folder: &Path) -> Result<PathBuf, SourceError> {
 
 /// The MCAP files of a folder in the order of their names.
 fn mcap_files(folder: &Path) -> Vec<PathBuf> {
-    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
-    let mut files: Vec<PathBuf> =
-        entries.map(|e| e.path()).filter(|path| has_ending(path, &["mcap"])).collect();
-    files.sort();
+    let mut files = entries(folder);
+    files.retain(|path| has_ending(path, &["mcap"]));
     files
 }
 
@@ -292,11 +265,6 @@ fn recognise(path: &Path) -> Result<SourceName, SourceError> {
 fn has_kind(name: &Path) -> bool {
     let name = name.to_string_lossy();
     name.split_once(':').is_some_and(|(kind, _)| !kind.is_empty() && !kind.contains(['/', '.']))
-}
-
-fn has_ending(path: &Path, endings: &[&str]) -> bool {
-    let ending = path.extension().unwrap_or_default();
-    endings.iter().any(|known| ending.eq_ignore_ascii_case(known))
 }
 
 /// A path that leads nowhere, and what may have been meant: the number or the device of a camera is often tried.
@@ -351,10 +319,7 @@ fn quoted(path: &Path) -> String {
 
 /// What was looked for in a folder that holds no recording, and what is there.
 fn nothing_known_in(folder: &Path) -> String {
-    let entries = std::fs::read_dir(folder);
-    let mut entries: Vec<PathBuf> =
-        entries.into_iter().flatten().flatten().map(|entry| entry.path()).collect();
-    entries.sort();
+    let entries = entries(folder);
     let inner = entries.iter().filter(|path| path.is_dir()).find_map(|p| SourceName::of_folder(p));
     let name = |path: &PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let mut names: Vec<String> = entries.iter().take(MAX_LISTED).map(name).collect();

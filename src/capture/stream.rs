@@ -21,9 +21,8 @@ use crate::capture::rectifier::Rectifier;
 use crate::capture::rig::Rig;
 use crate::capture::source::{Arrival, FrameClocks, FrameLosses, FrameSource, FrameStamp, Notice};
 use crate::capture::source_error::SourceError;
-use crate::capture::source_name::SourceName;
-use crate::capture::v4l::pixel_format::{PixelFormat, unpack_gray};
-use crate::capture::v4l::stamps::FrameNumbers;
+use crate::capture::v4l::READ_MILLIS;
+use crate::capture::v4l::stamps::{FrameNumbers, MAX_REFUSED_IN_A_ROW};
 use crate::slam::geometry::intrinsics::Intrinsics;
 
 /// The program that reads ROS 2 topics.
@@ -35,11 +34,6 @@ pub const INSTALL_BRIDGE: &str = "install the package semidense-bridge (`apt ins
 const BRIDGE_COMMAND: &str = "ros2-camera";
 /// Most frames that are taken at a look: a sender that never pauses must not keep capture from its other work.
 const MAX_FRAMES_A_LOOK: usize = 8;
-/// How long a reader that has not waited before is made to wait at a time, milliseconds.
-const READ_MILLIS: u32 = 1000;
-/// Frames whose stamps go back are refused; after so many in a row, a third of a second, it is the clock that has
-/// stepped.
-const MAX_REFUSED_IN_A_ROW: u32 = 10;
 
 /// Frames of another program, rectified: the newest that there is, without end.
 pub struct StreamSource {
@@ -52,8 +46,6 @@ pub struct StreamSource {
     held: Option<(StreamHeader, FrameStamp)>,
     /// The picture of the frame that is held.
     picture: Vec<u8>,
-    /// Memory of the JPEG decoder.
-    samples: Vec<u8>,
     numbers: FrameNumbers,
     losses: FrameLosses,
     notice: Option<Notice>,
@@ -73,7 +65,7 @@ pub fn open_socket(
     rig: Option<&Path>,
     stall_s: f64,
 ) -> Result<StreamSource, SourceError> {
-    let name = SourceName::Stream(path.to_owned()).to_string();
+    let name = format!("stream:{}", path.display());
     StreamSource::new(name, Feed::Socket(Listener::new(path.to_owned())), rig, stall_s)
 }
 
@@ -83,7 +75,7 @@ pub fn open_ros2(
     rig: Option<&Path>,
     stall_s: f64,
 ) -> Result<StreamSource, SourceError> {
-    let name = SourceName::Ros2(topic.to_owned()).to_string();
+    let name = format!("ros2:{topic}");
     let arguments = vec![BRIDGE_COMMAND.to_owned(), topic.to_owned()];
     StreamSource::new(name, Feed::Program(Program::new(bridge(), arguments)), rig, stall_s)
 }
@@ -106,7 +98,11 @@ impl StreamSource {
         rig: Option<&Path>,
         stall_s: f64,
     ) -> Result<Self, SourceError> {
-        let path = rig.ok_or_else(|| SourceError::StreamRig { name: name.clone() })?;
+        let path = rig.ok_or_else(|| SourceError::Camera {
+            name: name.clone(),
+            reason: "needs a rig file with the camera's calibration: name it with --rig FILE"
+                .to_owned(),
+        })?;
         let rectifier = Rectifier::new(&Rig::read(path)?, path)?;
         let Intrinsics { width, height, .. } = rectifier.intrinsics();
         Ok(Self {
@@ -117,7 +113,6 @@ impl StreamSource {
             rectifier,
             held: None,
             picture: Vec::new(),
-            samples: Vec::new(),
             numbers: FrameNumbers::default(),
             losses: FrameLosses::default(),
             notice: None,
@@ -131,7 +126,7 @@ impl StreamSource {
     }
 
     fn failed(&self, reason: String) -> SourceError {
-        SourceError::Stream { name: self.name.clone(), reason }
+        SourceError::Camera { name: self.name.clone(), reason }
     }
 
     /// Takes a sender that has come, and all that it has sent; what that came to.
@@ -155,18 +150,20 @@ impl StreamSource {
             let reason = self.fault.clone().unwrap_or_else(|| self.feed.absence());
             return Ok(Arrival::Absent(reason));
         }
-        let silent_nanos = now.saturating_sub(self.newest_nanos);
-        if silent_nanos as f64 > self.stall_s * 1e9 {
+        if self.is_silent(now) {
             let seconds = self.stall_s;
             return Ok(Arrival::Absent(format!("its sender sends no frame for {seconds} s")));
         }
         Ok(Arrival::Nothing)
     }
 
+    fn is_silent(&self, now: i64) -> bool {
+        now.saturating_sub(self.newest_nanos) as f64 > self.stall_s * 1e9
+    }
+
     /// One sender at a time: another is taken in the place of one that has gone silent.
     fn take_sender(&mut self, stream: UnixStream, now: i64) {
-        let is_silent = now.saturating_sub(self.newest_nanos) as f64 > self.stall_s * 1e9;
-        if self.stream.is_some() && !is_silent {
+        if self.stream.is_some() && !self.is_silent(now) {
             self.remark("another program wants to send frames too; it is refused".to_owned());
             return;
         }
@@ -242,22 +239,6 @@ impl StreamSource {
         }
         self.last_nanos = Some(capture_nanos);
     }
-
-    /// Converts the frame that is held; why it is none.
-    fn convert(&mut self, header: &StreamHeader, pixels: &mut [u8]) -> Result<(), String> {
-        let Intrinsics { width, height, .. } = self.rectifier.intrinsics();
-        let bytes = self.picture.get(..header.bytes as usize).unwrap_or(&[]);
-        let stride = header.stride as usize;
-        let is_packed = header.format == PixelFormat::Grey && stride == width;
-        if let (true, Some(packed)) = (is_packed, bytes.get(..width * height)) {
-            self.rectifier.rectify_into(packed, pixels);
-            return Ok(());
-        }
-        let unpacked = self.rectifier.read_into(pixels, |gray| {
-            unpack_gray(header.format, bytes, stride, (width, height), &mut self.samples, gray)
-        });
-        unpacked.map_err(|broken| broken.to_string())
-    }
 }
 
 /// The stamp that capture goes by, and the instant by this machine's clocks. A stamp of the wall clock is moved to
@@ -287,10 +268,6 @@ impl FrameSource for StreamSource {
         self.rectifier.intrinsics()
     }
 
-    fn num_frames(&self) -> Option<usize> {
-        None
-    }
-
     fn await_frame(&mut self, wake: BorrowedFd<'_>, millis: u32) -> Result<Arrival, SourceError> {
         let now = nanos_of(ClockId::Monotonic);
         if self.look(now)? == Arrival::Frame {
@@ -307,7 +284,7 @@ impl FrameSource for StreamSource {
     }
 
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
-        self.rectifier.check_buffer(pixels)?;
+        self.check_buffer(pixels)?;
         let (header, stamp) = loop {
             if let Some(held) = self.held.take() {
                 break held;
@@ -324,16 +301,13 @@ impl FrameSource for StreamSource {
                 }
             }
         };
-        self.convert(&header, pixels).map_err(|reason| {
+        let bytes = self.picture.get(..header.bytes as usize).unwrap_or(&[]);
+        let stride = header.stride as usize;
+        self.rectifier.unpack_into(header.format, bytes, stride, pixels).map_err(|broken| {
             self.losses.broken += 1;
-            SourceError::BrokenFrame { name: self.name.clone(), reason }
+            SourceError::BrokenFrame { name: self.name.clone(), reason: broken.to_string() }
         })?;
         Ok(Some(stamp))
-    }
-
-    fn skip_to(&mut self, _sequence: u64) -> Result<(), SourceError> {
-        // A sender's numbers begin with whoever takes them.
-        Ok(())
     }
 
     fn losses(&self) -> Option<FrameLosses> {

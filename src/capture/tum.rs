@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::capture::listing::{read_text, rows};
+use crate::capture::listing::read_list;
 use crate::capture::recording::{Contents, ListedImage, Recording};
 use crate::capture::rig::Rig;
 use crate::capture::source_error::SourceError;
@@ -48,36 +48,25 @@ pub fn read_rig(folder: &Path, rig: Option<&Path>) -> Result<(Rig, PathBuf), Sou
 
 /// Reads a list of `timestamp filename` lines; file names are relative to `folder`.
 fn read_images(folder: &Path, list: &Path) -> Result<Vec<ListedImage>, SourceError> {
-    let text = read_text(list)?;
-    let mut images: Vec<ListedImage> = Vec::new();
-    for row in rows(list, &text) {
-        let (stamp, name) = row.text().split_once(char::is_whitespace).ok_or_else(|| {
+    read_list(list, |row| {
+        let (stamp, name) = row.text.split_once(char::is_whitespace).ok_or_else(|| {
             row.error("needs `timestamp filename`; complete the line or remove it")
         })?;
-        let nanos = row.seconds(stamp)?;
-        row.check_after(images.last().map(|image| image.nanos), nanos)?;
         let path = folder.join(name.trim_start());
-        images.push(ListedImage { nanos, path, exposure_nanos: 0 });
-    }
-    Ok(images)
+        let nanos = row.seconds(stamp)?;
+        Ok((nanos, ListedImage { nanos, path, exposure_nanos: 0 }))
+    })
 }
 
 /// Reads a trajectory of `timestamp tx ty tz qx qy qz qw` lines, `world_from_camera`.
 pub fn read_trajectory(list: &Path) -> Result<Vec<StampedPose>, SourceError> {
-    let text = read_text(list)?;
-    let mut poses: Vec<StampedPose> = Vec::new();
-    for row in rows(list, &text) {
-        let fields: Vec<&str> = row.text().split_whitespace().collect();
-        let [stamp, numbers @ ..] = &fields[..] else { continue };
-        let nanos = row.seconds(stamp)?;
-        let numbers =
-            numbers.iter().map(|n| row.number(n)).collect::<Result<Vec<f64>, SourceError>>()?;
-        let &[tx, ty, tz, qx, qy, qz, qw] = &numbers[..] else {
+    read_list(list, |row| {
+        let fields: Vec<&str> = row.text.split_whitespace().collect();
+        let [stamp, tx, ty, tz, qx, qy, qz, qw] = fields[..] else {
             return Err(row.error("needs the eight numbers `timestamp tx ty tz qx qy qz qw`"));
         };
-        row.check_after(poses.last().map(|pose| pose.nanos), nanos)?;
+        let nanos = row.seconds(stamp)?;
         let world_from_camera = row.pose([qx, qy, qz, qw], [tx, ty, tz])?;
-        poses.push(StampedPose { nanos, world_from_camera });
-    }
-    Ok(poses)
+        Ok((nanos, StampedPose { nanos, world_from_camera }))
+    })
 }

@@ -11,7 +11,7 @@
 
 pub(crate) mod connection;
 mod controls;
-mod device;
+pub(in crate::capture) mod device;
 mod device_name;
 #[cfg(test)]
 mod fake;
@@ -30,7 +30,6 @@ use self::connection::Camera;
 use self::device::Kernel;
 use self::negotiation::Wish;
 use self::params::CameraParams;
-use self::pixel_format::unpack_gray;
 use self::video_device::VideoSystem;
 use crate::capture::rectifier::Rectifier;
 use crate::capture::rig::Rig;
@@ -41,15 +40,13 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 pub use self::pixel_format::{BrokenPicture, PixelFormat};
 
 /// How long a reader that has not waited before is made to wait at a time, milliseconds.
-const READ_MILLIS: u32 = 1000;
+pub(in crate::capture) const READ_MILLIS: u32 = 1000;
 
 /// A camera as a source of rectified frames: the newest that there is, without end.
 pub struct CameraSource<S: VideoSystem> {
     name: String,
     camera: Camera<S>,
     rectifier: Rectifier,
-    /// Memory of the JPEG decoder.
-    samples: Vec<u8>,
 }
 
 /// The camera of this name (a path, a number or udev's name), with the lens of a rig file. The camera
@@ -59,7 +56,12 @@ pub fn open(
     rig: Option<&Path>,
     params: &CameraParams,
 ) -> Result<CameraSource<impl VideoSystem + use<>>, SourceError> {
-    let path = rig.ok_or_else(|| SourceError::CameraRig { name: name.to_owned() })?;
+    const NO_RIG: &str = "a camera needs a rig file with its calibration: name it with --rig FILE (for a first try at \
+                          640x480, webcam.toml in config/rigs or /usr/share/semidense/rigs will do)";
+    let path = rig.ok_or_else(|| SourceError::Camera {
+        name: format!("v4l:{name}"),
+        reason: NO_RIG.to_owned(),
+    })?;
     CameraSource::new(Kernel, name, &Rig::read(path)?, path, params)
 }
 
@@ -81,7 +83,7 @@ impl<S: VideoSystem> CameraSource<S> {
             rate_hz: own_rate.or(rig.rate_hz),
         };
         let camera = Camera::new(system, name.to_owned(), params.clone(), wish);
-        Ok(Self { name: name.to_owned(), camera, rectifier, samples: Vec::new() })
+        Ok(Self { name: format!("v4l:{name}"), camera, rectifier })
     }
 
     fn failed(&self, reason: String) -> SourceError {
@@ -89,20 +91,10 @@ impl<S: VideoSystem> CameraSource<S> {
     }
 
     /// Converts the frame that waits; why it is none.
-    fn convert(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, String> {
-        let Intrinsics { width, height, .. } = self.rectifier.intrinsics();
+    fn convert(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, BrokenPicture> {
         let Some((held, grant, bytes)) = self.camera.held() else { return Ok(None) };
-        let is_packed = grant.format == PixelFormat::Grey && grant.stride == width;
-        if let (true, Some(packed)) = (is_packed, bytes.get(..width * height)) {
-            // Straight from the driver's memory, rectified or not.
-            self.rectifier.rectify_into(packed, pixels);
-            return Ok(Some(held.stamp));
-        }
-        let (format, stride) = (grant.format, grant.stride);
-        let unpacked = self.rectifier.read_into(pixels, |gray| {
-            unpack_gray(format, bytes, stride, (width, height), &mut self.samples, gray)
-        });
-        unpacked.map(|()| Some(held.stamp)).map_err(|broken| broken.to_string())
+        self.rectifier.unpack_into(grant.format, bytes, grant.stride, pixels)?;
+        Ok(Some(held.stamp))
     }
 }
 
@@ -111,16 +103,12 @@ impl<S: VideoSystem> FrameSource for CameraSource<S> {
         self.rectifier.intrinsics()
     }
 
-    fn num_frames(&self) -> Option<usize> {
-        None
-    }
-
     fn await_frame(&mut self, wake: BorrowedFd<'_>, millis: u32) -> Result<Arrival, SourceError> {
         self.camera.await_frame(Some(wake), millis).map_err(|reason| self.failed(reason))
     }
 
     fn next_into(&mut self, pixels: &mut [u8]) -> Result<Option<FrameStamp>, SourceError> {
-        self.rectifier.check_buffer(pixels)?;
+        self.check_buffer(pixels)?;
         while self.camera.held().is_none() {
             let arrival = self.camera.await_frame(None, READ_MILLIS);
             if let Arrival::Absent(reason) = arrival.map_err(|reason| self.failed(reason))? {
@@ -129,15 +117,10 @@ impl<S: VideoSystem> FrameSource for CameraSource<S> {
         }
         let converted = self.convert(pixels);
         self.camera.release(converted.is_err());
-        converted.map_err(|reason| SourceError::BrokenFrame {
-            name: format!("v4l:{}", self.name),
-            reason,
+        converted.map_err(|broken| SourceError::BrokenFrame {
+            name: self.name.clone(),
+            reason: broken.to_string(),
         })
-    }
-
-    fn skip_to(&mut self, _sequence: u64) -> Result<(), SourceError> {
-        // A camera's numbers begin with whoever opens it.
-        Ok(())
     }
 
     fn losses(&self) -> Option<FrameLosses> {

@@ -115,7 +115,7 @@ impl<'a> Shell<'a> {
     ) -> Result<Self, RunError> {
         if options.source.is_camera() && options.mode == Mode::Lockstep {
             let reason = "a camera does not wait for the map; leave out --lockstep".to_owned();
-            return Err(SourceError::Stream { name: options.source.to_string(), reason }.into());
+            return Err(SourceError::Camera { name: options.source.to_string(), reason }.into());
         }
         let rig = options.rig.as_deref();
         let source = open(&options.source, rig, &config.source_params())?;

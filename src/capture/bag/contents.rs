@@ -31,11 +31,11 @@ impl Contents {
         let mut records = Records::open(path)?;
         let summary = if records.go_to_summary()? { read_channels(&mut records)? } else { None };
         let (channels, is_unfinished) = match summary {
-            Some(channels) if is_possible(&channels, records.length()) => (channels, false),
+            Some(channels) if is_possible(&channels, records.length) => (channels, false),
             _ => {
                 records = Records::open(path)?;
                 let channels = count_all(&mut records)?;
-                (channels, records.is_unfinished())
+                (channels, records.is_unfinished)
             }
         };
         let topic = choose(&channels, topic)?;
@@ -95,54 +95,27 @@ impl Contents {
     }
 }
 
-/// Adds a schema or channel.
-fn note(place: Place, types: &mut HashMap<u16, String>, channels: &mut Channels) {
-    match place {
-        Place::Schema { id, name } => {
-            types.insert(id, name);
-        }
-        Place::Channel(channel) => {
-            let type_name = types.get(&channel.schema_id).cloned().unwrap_or_default();
-            let is_cdr = channel.message_encoding == "cdr";
-            let kind = Kind::of_type(&type_name).filter(|_| is_cdr);
-            let topic = channel.topic;
-            let new = Channel { topic, type_name, kind, num_messages: 0 };
-            channels.entry(channel.id).or_insert(new);
-        }
-        Place::Counts(counts) => {
-            for (id, count) in counts {
-                if let Some(channel) = channels.get_mut(&id) {
-                    channel.num_messages = count;
-                }
-            }
-        }
-        Place::Message { channel, .. } => {
-            if let Some(channel) = channels.get_mut(&channel) {
-                channel.num_messages += 1;
-            }
-        }
-    }
-}
-
 /// The channels by the summary; `None` where that lacks them or their counts.
 fn read_channels(records: &mut Records) -> Result<Option<Channels>, BagError> {
-    let (mut types, mut channels, mut has_counts) = (HashMap::new(), Channels::new(), false);
-    let mut counts = Vec::new();
+    let (mut channels, mut counts) = (Channels::new(), None);
     loop {
         match records.advance() {
-            Ok(Some(Place::Counts(found))) => {
-                (counts, has_counts) = (found, true);
+            Ok(Some(Place::Channel(id, channel))) => {
+                channels.entry(id).or_insert(channel);
             }
-            Ok(Some(place @ (Place::Schema { .. } | Place::Channel(_)))) => {
-                note(place, &mut types, &mut channels);
-            }
+            Ok(Some(Place::Counts(found))) => counts = Some(found),
             Ok(Some(Place::Message { .. })) | Err(BagError::Damaged { .. }) => return Ok(None),
             Ok(None) => break,
             Err(error) => return Err(error),
         }
     }
-    note(Place::Counts(counts), &mut types, &mut channels);
-    Ok((has_counts && !channels.is_empty()).then_some(channels))
+    let Some(counts) = counts else { return Ok(None) };
+    for (id, count) in counts {
+        if let Some(channel) = channels.get_mut(&id) {
+            channel.num_messages = count;
+        }
+    }
+    Ok((!channels.is_empty()).then_some(channels))
 }
 
 /// Whether a file of this length can hold the messages that its summary counts: none is shorter than a byte.
@@ -152,12 +125,19 @@ fn is_possible(channels: &Channels, length: u64) -> bool {
 
 /// The channels and their messages by reading the whole file.
 fn count_all(records: &mut Records) -> Result<Channels, BagError> {
-    let (mut types, mut channels) = (HashMap::new(), Channels::new());
+    let mut channels = Channels::new();
     loop {
         match records.advance() {
-            Ok(Some(place)) => note(place, &mut types, &mut channels),
+            Ok(Some(Place::Channel(id, channel))) => {
+                channels.entry(id).or_insert(channel);
+            }
+            Ok(Some(Place::Message { channel, .. })) => {
+                if let Some(channel) = channels.get_mut(&channel) {
+                    channel.num_messages += 1;
+                }
+            }
             Ok(None) => return Ok(channels),
-            Err(BagError::Damaged { .. }) => {}
+            Ok(Some(Place::Counts(_))) | Err(BagError::Damaged { .. }) => {}
             Err(error) => return Err(error),
         }
     }

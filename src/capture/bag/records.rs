@@ -1,15 +1,17 @@
 //! The records of an MCAP file in the order of the file, those inside chunks among them.
 
+use std::collections::HashMap;
 use std::fs::File;
 use std::io::{BufReader, ErrorKind, Read, Seek, SeekFrom};
 use std::ops::Range;
 use std::path::Path;
 
-use mcap::records::{Channel, Footer, Record, SchemaHeader, op};
+use mcap::records::{Footer, Record, op};
 use mcap::{MAGIC, parse_record};
 
 use crate::capture::bag::bag_error::BagError;
 use crate::capture::bag::chunk::{MAX_CHUNK_BYTES, decompress_into};
+use crate::capture::bag::topics::{Channel, Kind};
 use crate::capture::input_file;
 
 /// Bytes before a record: its kind and its length.
@@ -22,15 +24,8 @@ const MESSAGE_HEADER_BYTES: usize = 22;
 /// What the records have come to.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Place {
-    /// A type's name.
-    Schema {
-        /// Its number.
-        id: u16,
-        /// Its name.
-        name: String,
-    },
-    /// A channel.
-    Channel(Channel),
+    /// A channel with its number; messages are not counted.
+    Channel(u16, Channel),
     /// A message, whose content is [`Records::message`].
     Message {
         /// Its channel.
@@ -42,30 +37,28 @@ pub enum Place {
     Counts(Vec<(u16, u64)>),
 }
 
-/// Where the bytes of the record at hand are.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Source {
-    Chunk,
-    File,
-}
-
 /// A file that is read record by record.
 #[derive(Debug)]
 pub struct Records {
     file: BufReader<File>,
     position: u64,
-    length: u64,
+    /// Bytes of the file.
+    pub length: u64,
     /// The record at hand, where it is not in the chunk; a chunk before it is decoded.
     raw: Vec<u8>,
     /// The chunk at hand, and how much of it was read.
     chunk: Vec<u8>,
     chunk_position: usize,
-    current: (Source, Range<usize>),
-    channel: u16,
+    /// The record at hand in the chunk; `None` where it is `raw`.
+    in_chunk: Option<Range<usize>>,
+    /// What the messages of a type are, by the type's number.
+    kinds: HashMap<u16, Option<Kind>>,
+    /// The channel of the message at hand.
+    pub channel: u16,
     /// Whether the end that a closed file has was reached.
     has_ended: bool,
     /// Whether the file ended before that.
-    is_unfinished: bool,
+    pub is_unfinished: bool,
 }
 
 impl Records {
@@ -87,7 +80,8 @@ impl Records {
             raw: Vec::new(),
             chunk: Vec::new(),
             chunk_position: 0,
-            current: (Source::File, 0..0),
+            in_chunk: None,
+            kinds: HashMap::new(),
             channel: 0,
             has_ended: false,
             is_unfinished: false,
@@ -122,30 +116,16 @@ impl Records {
         Ok(())
     }
 
-    /// Bytes of the file.
-    pub fn length(&self) -> u64 {
-        self.length
-    }
-
-    /// Whether the file ended without the end that a closed file has.
-    pub fn is_unfinished(&self) -> bool {
-        self.is_unfinished
-    }
-
-    /// The channel of the message at hand.
-    pub fn channel(&self) -> u16 {
-        self.channel
-    }
-
     /// The content of the message at hand.
     pub fn message(&self) -> &[u8] {
         self.record().get(MESSAGE_HEADER_BYTES..).unwrap_or_default()
     }
 
     fn record(&self) -> &[u8] {
-        let (source, range) = &self.current;
-        let bytes = if *source == Source::Chunk { &self.chunk } else { &self.raw };
-        bytes.get(range.clone()).unwrap_or_default()
+        match &self.in_chunk {
+            Some(range) => self.chunk.get(range.clone()).unwrap_or_default(),
+            None => &self.raw,
+        }
     }
 
     fn damaged(at: u64, reason: impl ToString) -> BagError {
@@ -157,9 +137,9 @@ impl Records {
     pub fn advance(&mut self) -> Result<Option<Place>, BagError> {
         loop {
             let found = if self.chunk_position < self.chunk.len() {
-                self.in_chunk()?
+                self.next_in_chunk()?
             } else {
-                self.in_file()?
+                self.next_in_file()?
             };
             let Some((opcode, at)) = found else { return Ok(None) };
             if let Some(place) = self.place(opcode, at)? {
@@ -169,10 +149,10 @@ impl Records {
     }
 
     /// The next record of the chunk.
-    fn in_chunk(&mut self) -> Result<Option<(u8, u64)>, BagError> {
+    fn next_in_chunk(&mut self) -> Result<Option<(u8, u64)>, BagError> {
         let rest = self.chunk.get(self.chunk_position..).unwrap_or_default();
-        let record = rest.split_at_checked(PREFIX_BYTES).and_then(|(prefix, rest)| {
-            let (opcode, length) = parse_prefix(prefix);
+        let record = rest.split_first_chunk().and_then(|(prefix, rest)| {
+            let (opcode, length) = parse_prefix(*prefix);
             let length = usize::try_from(length).ok().filter(|length| *length <= rest.len())?;
             Some((opcode, length))
         });
@@ -182,12 +162,12 @@ impl Records {
         };
         let begin = self.chunk_position + PREFIX_BYTES;
         self.chunk_position = begin + length;
-        self.current = (Source::Chunk, begin..self.chunk_position);
+        self.in_chunk = Some(begin..self.chunk_position);
         Ok(Some((opcode, self.position)))
     }
 
     /// The next record of the file that is read; `None` at its end.
-    fn in_file(&mut self) -> Result<Option<(u8, u64)>, BagError> {
+    fn next_in_file(&mut self) -> Result<Option<(u8, u64)>, BagError> {
         loop {
             let left = self.length.saturating_sub(self.position);
             if self.has_ended {
@@ -200,7 +180,7 @@ impl Records {
             let at = self.position;
             let mut prefix = [0; PREFIX_BYTES];
             self.file.read_exact(&mut prefix)?;
-            let (opcode, length) = parse_prefix(&prefix);
+            let (opcode, length) = parse_prefix(prefix);
             if length > left - PREFIX_BYTES as u64 {
                 // Cut off: what lies before is whole.
                 self.end_early();
@@ -241,7 +221,7 @@ impl Records {
             // The file was cut while it was read.
             self.end_early();
         }
-        self.current = (Source::File, 0..self.raw.len());
+        self.in_chunk = None;
         Ok(())
     }
 
@@ -249,17 +229,22 @@ impl Records {
     fn place(&mut self, opcode: u8, at: u64) -> Result<Option<Place>, BagError> {
         // A chunk within a chunk is none.
         if opcode == op::CHUNK {
-            return if self.current.0 == Source::File { self.open_chunk(at) } else { Ok(None) };
+            return if self.in_chunk.is_none() { self.open_chunk(at) } else { Ok(None) };
         }
         if ![op::SCHEMA, op::CHANNEL, op::MESSAGE, op::STATISTICS].contains(&opcode) {
             return Ok(None);
         }
         let record = parse_record(opcode, self.record()).map_err(|e| Self::damaged(at, e))?;
         let place = match record {
-            Record::Schema { header: SchemaHeader { id, name, .. }, .. } => {
-                Place::Schema { id, name }
+            Record::Schema { header, .. } => {
+                self.kinds.insert(header.id, Kind::of_type(&header.name));
+                return Ok(None);
             }
-            Record::Channel(channel) => Place::Channel(channel),
+            Record::Channel(found) => {
+                let kind = self.kinds.get(&found.schema_id).copied().flatten();
+                let kind = kind.filter(|_| found.message_encoding == "cdr");
+                Place::Channel(found.id, Channel { topic: found.topic, kind, num_messages: 0 })
+            }
             Record::Message { header, .. } => Place::Message {
                 channel: header.channel_id,
                 log_nanos: i64::try_from(header.log_time).unwrap_or(i64::MAX),
@@ -294,13 +279,6 @@ impl Records {
 }
 
 /// Kind and length of a record.
-fn parse_prefix(prefix: &[u8]) -> (u8, u64) {
-    match prefix {
-        [opcode, length @ ..] if length.len() == 8 => {
-            let mut bytes = [0; 8];
-            bytes.copy_from_slice(length);
-            (*opcode, u64::from_le_bytes(bytes))
-        }
-        _ => (0, u64::MAX),
-    }
+fn parse_prefix([opcode, length @ ..]: [u8; PREFIX_BYTES]) -> (u8, u64) {
+    (opcode, u64::from_le_bytes(length))
 }

@@ -38,8 +38,6 @@ impl Kind {
 pub struct Channel {
     /// Its topic.
     pub topic: String,
-    /// Name of its type; empty where it is not said.
-    pub type_name: String,
     /// What its messages are; `None` for what is not read.
     pub kind: Option<Kind>,
     /// Messages in it.
@@ -51,16 +49,17 @@ pub type Channels = BTreeMap<u16, Channel>;
 
 /// The topic of the camera that belongs to images on `topic`: `camera_info` beside it, as ROS has it.
 pub fn camera_topic(topic: &str) -> String {
-    let images = base_topic(topic);
-    let namespace = images.rsplit_once('/').map_or("", |(namespace, _)| namespace);
-    format!("{namespace}/camera_info")
+    beside(topic, "camera_info")
 }
 
 /// The topic of our own recording's stamps for images on `topic`.
 pub fn frame_record_topic(topic: &str) -> String {
-    let images = base_topic(topic);
-    let namespace = images.rsplit_once('/').map_or("", |(namespace, _)| namespace);
-    format!("{namespace}/details/frame")
+    beside(topic, "details/frame")
+}
+
+fn beside(topic: &str, name: &str) -> String {
+    let namespace = base_topic(topic).rsplit_once('/').map_or("", |(namespace, _)| namespace);
+    format!("{namespace}/{name}")
 }
 
 /// Whether the images on `topic` are rectified already, by their name (`image_rect`, `image_rect_color`).

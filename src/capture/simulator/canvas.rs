@@ -65,8 +65,9 @@ impl Canvas {
         self.size as f32
     }
 
-    /// Ends the drawing.
-    pub fn into_texture(self) -> Texture {
+    /// Ends the drawing; reflectances are kept within what surfaces have.
+    pub fn into_texture(mut self) -> Texture {
+        self.texels.iter_mut().for_each(|texel| *texel = texel.clamp(0.02, 0.98));
         Texture::new(self.size, self.texels)
     }
 
@@ -150,13 +151,6 @@ impl Canvas {
         }
     }
 
-    /// Multiplies every reflectance and adds to it, then keeps it within what surfaces have.
-    pub fn remap(&mut self, gain: f32, offset: f32) {
-        for texel in &mut self.texels {
-            *texel = (*texel * gain + offset).clamp(0.02, 0.98);
-        }
-    }
-
     /// Covers the surface with `count` opaque shapes of all directions, radii from `smallest` to
     /// `largest` texels with a density ∝ r⁻³: the dead-leaves model, whose edges, occlusions and
     /// spectrum are those of natural images (Lee, Mumford, Huang, IJCV 2001).
@@ -166,7 +160,6 @@ impl Canvas {
         count: usize,
         smallest: f32,
         largest: f32,
-        values: (f32, f32),
     ) {
         // Large first, so that the small ones stay visible.
         let mut radii: Vec<f32> = (0..count)
@@ -187,7 +180,7 @@ impl Canvas {
             };
             let centre = [stream.uniform(0.0, self.size()), stream.uniform(0.0, self.size())];
             let angle = stream.uniform(0.0, std::f32::consts::TAU);
-            let value = stream.uniform(values.0, values.1);
+            let value = stream.uniform(0.08, 0.92);
             self.draw(shape, centre, angle, value, 1.0);
         }
     }

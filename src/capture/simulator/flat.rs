@@ -97,23 +97,13 @@ pub fn flat(seed: u64) -> Furnished {
     let carpet = Cover::of(Pattern::Carpet).with_contrast(0.7);
     let print = Cover::of(Pattern::Cardboard).with_contrast(0.6);
     let doors_a = [Door::new(Side::East, 2.0, 3.0), Door::new(Side::North, 2.5, 3.5)];
-    enclose(
-        &mut b,
-        ROOMS_M[0],
-        ROOM_M,
-        [plaster, paper, brick, plaster, planks, plaster],
-        &doors_a,
-    );
+    let covers = [plaster, paper, brick, plaster, planks, plaster];
+    enclose(&mut b, ROOMS_M[0], ROOM_M, covers, &doors_a);
     living(&mut b);
     let doors_b = [Door::new(Side::West, 2.0, 3.0), Door::new(Side::North, 2.0, 3.0)];
     let lighter = paper.enlarged(1.5).with_middle(0.58);
-    enclose(
-        &mut b,
-        ROOMS_M[1],
-        ROOM_M,
-        [lighter, fabric, lighter, paper, carpet, plaster],
-        &doors_b,
-    );
+    let covers = [lighter, fabric, lighter, paper, carpet, plaster];
+    enclose(&mut b, ROOMS_M[1], ROOM_M, covers, &doors_b);
     bedroom(&mut b);
     let doors_c = [Door::new(Side::West, 1.5, 2.5), Door::new(Side::South, 0.6, 1.6)];
     let tiles = Cover::of(Pattern::Brick).enlarged(0.6).with_contrast(0.5).with_middle(0.6);

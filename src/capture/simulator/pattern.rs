@@ -38,20 +38,23 @@ pub enum Pattern {
     Cover,
 }
 
-/// All patterns, in the order of their discriminants.
-pub const PATTERNS: [Pattern; 12] = [
-    Pattern::Planks,
-    Pattern::Plaster,
-    Pattern::Wallpaper,
-    Pattern::Picture,
-    Pattern::Poster,
-    Pattern::Text,
-    Pattern::Cardboard,
-    Pattern::Fabric,
-    Pattern::Veneer,
-    Pattern::Brick,
-    Pattern::Carpet,
-    Pattern::Cover,
+/// Draws on the ground of a pattern.
+type Draw = fn(&mut Canvas, &mut Stream);
+
+/// All patterns in the order of their discriminants: reflectance of the ground, and what is drawn on it.
+const PATTERNS: [(Pattern, f32, Draw); 12] = [
+    (Pattern::Planks, 0.5, planks),
+    (Pattern::Plaster, 0.66, plaster),
+    (Pattern::Wallpaper, 0.62, wallpaper),
+    (Pattern::Picture, 0.5, |canvas, stream| leaves(canvas, stream, 1500, 6.0, 220.0)),
+    (Pattern::Poster, 0.5, |canvas, stream| leaves(canvas, stream, 500, 14.0, 300.0)),
+    (Pattern::Text, 0.82, text),
+    (Pattern::Cardboard, 0.48, cardboard),
+    (Pattern::Fabric, 0.4, fabric),
+    (Pattern::Veneer, 0.42, veneer),
+    (Pattern::Brick, 0.7, brick),
+    (Pattern::Carpet, 0.35, carpet),
+    (Pattern::Cover, 0.5, cover),
 ];
 
 /// Side of every texture in texels; at 2 mm a texel one tile is 2 m, and a pixel at 1 m is a texel.
@@ -59,31 +62,15 @@ pub const TEXTURE_SIZE: usize = 1024;
 
 /// Paints all textures, in parallel on the current rayon pool.
 pub fn paint_all(seed: u64) -> Vec<Texture> {
-    PATTERNS.par_iter().map(|&pattern| paint(pattern, seed)).collect()
+    let painted = PATTERNS.par_iter().map(|&(pattern, ground, draw)| {
+        let mut canvas = Canvas::new(TEXTURE_SIZE, ground);
+        draw(&mut canvas, &mut Stream::new(seed, 0x7E87_0000 + pattern as u64));
+        canvas.into_texture()
+    });
+    painted.collect()
 }
 
-fn paint(pattern: Pattern, seed: u64) -> Texture {
-    let mut stream = Stream::new(seed, 0x7E87_0000 + pattern as u64);
-    let stream = &mut stream;
-    let canvas = match pattern {
-        Pattern::Planks => planks(stream),
-        Pattern::Plaster => plaster(stream),
-        Pattern::Wallpaper => wallpaper(stream),
-        Pattern::Picture => leaves(stream, 1500, 6.0, 220.0),
-        Pattern::Poster => leaves(stream, 500, 14.0, 300.0),
-        Pattern::Text => text(stream),
-        Pattern::Cardboard => cardboard(stream),
-        Pattern::Fabric => fabric(stream),
-        Pattern::Veneer => veneer(stream),
-        Pattern::Brick => brick(stream),
-        Pattern::Carpet => carpet(stream),
-        Pattern::Cover => cover(stream),
-    };
-    canvas.into_texture()
-}
-
-fn planks(stream: &mut Stream) -> Canvas {
-    let mut canvas = Canvas::new(TEXTURE_SIZE, 0.5);
+fn planks(canvas: &mut Canvas, stream: &mut Stream) {
     let (size, rows) = (canvas.size(), 16);
     let width = size / rows as f32;
     for row in 0..rows {
@@ -114,12 +101,9 @@ fn planks(stream: &mut Stream) -> Canvas {
     }
     canvas.add_noise(stream.bits(), 64, 4, 0.065, 0.75, 16);
     canvas.add_noise(stream.bits(), 8, 6, 0.05, 0.7, 1);
-    canvas.remap(1.0, 0.0);
-    canvas
 }
 
-fn plaster(stream: &mut Stream) -> Canvas {
-    let mut canvas = Canvas::new(TEXTURE_SIZE, 0.66);
+fn plaster(canvas: &mut Canvas, stream: &mut Stream) {
     canvas.add_noise(stream.bits(), 4, 8, 0.06, 0.72, 1);
     // Scuffs and small holes: the few things a painted wall offers.
     for _ in 0..60 {
@@ -128,12 +112,9 @@ fn plaster(stream: &mut Stream) -> Canvas {
         let value = stream.uniform(0.35, 0.85);
         canvas.draw(shape, centre, stream.uniform(0.0, PI), value, 0.5);
     }
-    canvas.remap(1.0, 0.0);
-    canvas
 }
 
-fn wallpaper(stream: &mut Stream) -> Canvas {
-    let mut canvas = Canvas::new(TEXTURE_SIZE, 0.62);
+fn wallpaper(canvas: &mut Canvas, stream: &mut Stream) {
     canvas.add_noise(stream.bits(), 4, 7, 0.10, 0.7, 1);
     let size = canvas.size();
     // Motifs at jittered places, each a little different, as in a hand-blocked paper.
@@ -154,20 +135,14 @@ fn wallpaper(stream: &mut Stream) -> Canvas {
         }
         canvas.draw(Shape::Ellipse(0.3 * radius, 0.3 * radius), centre, 0.0, 0.85, 0.9);
     }
-    canvas.remap(1.0, 0.0);
-    canvas
 }
 
-fn leaves(stream: &mut Stream, count: usize, smallest: f32, largest: f32) -> Canvas {
-    let mut canvas = Canvas::new(TEXTURE_SIZE, 0.5);
-    canvas.scatter_leaves(stream, count, smallest, largest, (0.08, 0.92));
+fn leaves(canvas: &mut Canvas, stream: &mut Stream, count: usize, smallest: f32, largest: f32) {
+    canvas.scatter_leaves(stream, count, smallest, largest);
     canvas.add_noise(stream.bits(), 8, 6, 0.05, 0.7, 1);
-    canvas.remap(1.0, 0.0);
-    canvas
 }
 
-fn text(stream: &mut Stream) -> Canvas {
-    let mut canvas = Canvas::new(TEXTURE_SIZE, 0.82);
+fn text(canvas: &mut Canvas, stream: &mut Stream) {
     canvas.add_noise(stream.bits(), 4, 6, 0.03, 0.7, 1);
     let size = canvas.size();
     let mut v = 30.0;
@@ -191,12 +166,9 @@ fn text(stream: &mut Stream) -> Canvas {
         }
         v += 2.4 * height + if stream.index(6) == 0 { 24.0 } else { 0.0 };
     }
-    canvas.remap(1.0, 0.0);
-    canvas
 }
 
-fn cardboard(stream: &mut Stream) -> Canvas {
-    let mut canvas = Canvas::new(TEXTURE_SIZE, 0.48);
+fn cardboard(canvas: &mut Canvas, stream: &mut Stream) {
     canvas.add_noise(stream.bits(), 8, 6, 0.07, 0.7, 1);
     let size = canvas.size();
     for _ in 0..26 {
@@ -216,12 +188,9 @@ fn cardboard(stream: &mut Stream) -> Canvas {
         let turn = stream.uniform(0.0, PI);
         canvas.draw(Shape::Rectangle(240.0, 12.0), centre, turn, 0.66, 0.6);
     }
-    canvas.remap(1.0, 0.0);
-    canvas
 }
 
-fn fabric(stream: &mut Stream) -> Canvas {
-    let mut canvas = Canvas::new(TEXTURE_SIZE, 0.4);
+fn fabric(canvas: &mut Canvas, stream: &mut Stream) {
     let size = canvas.size();
     for stripe in 0..24 {
         let across = (stripe as f32 + stream.uniform(0.2, 0.8)) * size / 24.0;
@@ -232,24 +201,18 @@ fn fabric(stream: &mut Stream) -> Canvas {
         canvas.draw(Shape::Rectangle(0.5 * size, half), [0.5 * size, across], 0.0, value, 0.5);
     }
     canvas.add_noise(stream.bits(), 32, 5, 0.08, 0.7, 1);
-    canvas.remap(1.0, 0.0);
-    canvas
 }
 
-fn veneer(stream: &mut Stream) -> Canvas {
-    let mut canvas = Canvas::new(TEXTURE_SIZE, 0.42);
+fn veneer(canvas: &mut Canvas, stream: &mut Stream) {
     canvas.add_noise(stream.bits(), 16, 6, 0.08, 0.7, 8);
     for _ in 0..40 {
         let centre = [stream.uniform(0.0, canvas.size()), stream.uniform(0.0, canvas.size())];
         let shape = Shape::Ellipse(stream.uniform(10.0, 50.0), stream.uniform(2.0, 6.0));
         canvas.draw(shape, centre, stream.uniform(-0.1, 0.1), stream.uniform(0.2, 0.32), 0.7);
     }
-    canvas.remap(1.0, 0.0);
-    canvas
 }
 
-fn brick(stream: &mut Stream) -> Canvas {
-    let mut canvas = Canvas::new(TEXTURE_SIZE, 0.7);
+fn brick(canvas: &mut Canvas, stream: &mut Stream) {
     canvas.add_noise(stream.bits(), 32, 4, 0.06, 0.7, 1);
     let (width, height) = (128.0, 42.666_668);
     for row in 0..24 {
@@ -263,12 +226,9 @@ fn brick(stream: &mut Stream) -> Canvas {
         }
     }
     canvas.add_noise(stream.bits(), 16, 6, 0.05, 0.65, 1);
-    canvas.remap(1.0, 0.0);
-    canvas
 }
 
-fn carpet(stream: &mut Stream) -> Canvas {
-    let mut canvas = Canvas::new(TEXTURE_SIZE, 0.35);
+fn carpet(canvas: &mut Canvas, stream: &mut Stream) {
     let size = canvas.size();
     for cell in 0..64 {
         let centre = [(cell % 8) as f32 * size / 8.0 + 64.0, (cell / 8) as f32 * size / 8.0 + 64.0];
@@ -282,12 +242,9 @@ fn carpet(stream: &mut Stream) -> Canvas {
         canvas.draw(shape, centre, stream.uniform(0.0, TAU), stream.uniform(0.1, 0.9), 1.0);
     }
     canvas.add_noise(stream.bits(), 64, 4, 0.08, 0.8, 1);
-    canvas.remap(1.0, 0.0);
-    canvas
 }
 
-fn cover(stream: &mut Stream) -> Canvas {
-    let mut canvas = Canvas::new(TEXTURE_SIZE, 0.5);
+fn cover(canvas: &mut Canvas, stream: &mut Stream) {
     let size = canvas.size();
     let mut v = 0.0;
     while v < size {
@@ -313,6 +270,4 @@ fn cover(stream: &mut Stream) -> Canvas {
         v += band;
     }
     canvas.add_noise(stream.bits(), 16, 6, 0.05, 0.7, 1);
-    canvas.remap(1.0, 0.0);
-    canvas
 }

@@ -24,7 +24,7 @@ pub struct RenderScratch {
 }
 
 impl RenderScratch {
-    /// Depth of every pixel as it was last cast, metres (0 where nothing is).
+    /// Depth along the optical axis of every pixel as it was last cast, metres (0 where nothing is).
     pub fn depth_into(&self, depth: &mut [f32]) {
         for (out, &seen) in depth.iter_mut().zip(&self.depths) {
             *out = if seen.is_finite() { seen } else { 0.0 };
@@ -51,11 +51,10 @@ struct Shutter<'a> {
 }
 
 impl Renderer<'_> {
-    /// Depth along the optical axis of every pixel, metres (0 where nothing is).
-    pub fn depth_into(&self, pose: &SE3, scratch: &mut RenderScratch, depth: &mut [f32]) {
+    /// Casts the depth of every pixel, without what it sees, into `scratch`.
+    pub fn cast_depth(&self, pose: &SE3, scratch: &mut RenderScratch) {
         let shutter = Shutter { pose_of_row: &|_| *pose, is_global: true };
         self.kernel.run_eight(Casting { renderer: self, shutter, names_surfaces: false, scratch });
-        scratch.depth_into(depth);
     }
 
     /// Adds `weight` × brightness (grey levels, not yet quantised) of every pixel to `grey`.

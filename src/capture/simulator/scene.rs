@@ -1,6 +1,6 @@
 //! What stands in a scene: textured blocks, lit once and for all, and where a camera may walk.
 
-use crate::capture::simulator::pattern::{PATTERNS, Pattern, TEXTURE_SIZE, paint_all};
+use crate::capture::simulator::pattern::{Pattern, TEXTURE_SIZE, paint_all};
 use crate::capture::simulator::random::Stream;
 use crate::capture::simulator::route::Route;
 use crate::capture::simulator::texture::Texture;
@@ -166,9 +166,8 @@ impl Builder {
     /// A face cut at random from a pattern.
     pub fn face(&mut self, cover: Cover) -> Face {
         let size = TEXTURE_SIZE as f32;
-        let texture = PATTERNS.iter().position(|&p| p == cover.pattern).unwrap_or(0);
         Face {
-            texture,
+            texture: cover.pattern as usize,
             texels_per_metre: [cover.density; 2],
             offset: [self.stream.uniform(0.0, size), self.stream.uniform(0.0, size)],
             contrast: cover.contrast,

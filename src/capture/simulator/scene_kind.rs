@@ -2,6 +2,8 @@
 
 use std::str::FromStr;
 
+use serde::de::IntoDeserializer;
+use serde::de::value::Error;
 use serde::{Deserialize, Serialize};
 
 /// Which scene is seen.
@@ -24,13 +26,7 @@ impl FromStr for SceneKind {
     type Err = &'static str;
 
     fn from_str(name: &str) -> Result<Self, Self::Err> {
-        match name {
-            "room" => Ok(Self::Room),
-            "plane" => Ok(Self::Plane),
-            "corridor" => Ok(Self::Corridor),
-            "flat" => Ok(Self::Flat),
-            "twins" => Ok(Self::Twins),
-            _ => Err("unknown scene; scenes are room, plane, corridor, flat and twins"),
-        }
+        Self::deserialize(name.into_deserializer())
+            .map_err(|_: Error| "unknown scene; scenes are room, plane, corridor, flat and twins")
     }
 }

@@ -7,9 +7,11 @@ use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
-use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::event::{PollFd, PollFlags};
 
+use crate::capture::source::Absence;
 use crate::capture::stream::INSTALL_BRIDGE;
+use crate::capture::v4l::device::poll;
 
 /// Pause before a sender is started, or a socket opened, again; doubled each time.
 const FIRST_PAUSE_NANOS: i64 = 200_000_000;
@@ -18,24 +20,9 @@ const LONGEST_PAUSE_NANOS: i64 = 5_000_000_000;
 /// A program that has lived so long did not fail of its start.
 const HEALTHY_NANOS: i64 = 10_000_000_000;
 /// How long a program may take to end once its stream is closed: it says goodbye to its peers.
-const GOODBYE_NANOS: i64 = 1_000_000_000;
+const GOODBYE_MILLIS: u32 = 1000;
 /// Exit code of a program that does not understand its command line: starting it again does not help.
 const WRONG_USAGE: i32 = 2;
-
-/// Why there is no sender.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Absence {
-    /// The reason, for the user.
-    pub reason: String,
-    /// Whether it may pass by itself.
-    pub passes: bool,
-}
-
-impl Absence {
-    fn passing(reason: String) -> Self {
-        Self { reason, passes: true }
-    }
-}
 
 /// Where the sender comes from.
 #[derive(Debug)]
@@ -53,14 +40,11 @@ impl Feed {
             Self::Socket(listener) => listener.connect(now)?,
             Self::Program(program) => program.connect(now)?,
         };
-        match stream {
-            Some(stream) => {
-                let refused = |error| Absence::passing(format!("its stream is refused ({error})"));
-                stream.set_nonblocking(true).map_err(refused)?;
-                Ok(Some(stream))
-            }
-            None => Ok(None),
+        if let Some(stream) = &stream {
+            let refused = |error| Absence::passing(format!("its stream is refused ({error})"));
+            stream.set_nonblocking(true).map_err(refused)?;
         }
+        Ok(stream)
     }
 
     /// What can be read when a sender comes.
@@ -133,14 +117,11 @@ impl Listener {
             if now < self.pause.retry_nanos {
                 return Err(Absence::passing(self.last.clone()));
             }
-            match bind(&self.path) {
-                Ok(listener) => self.listener = Some(listener),
-                Err(absence) => {
-                    self.pause.begin(now);
-                    self.last.clone_from(&absence.reason);
-                    return Err(absence);
-                }
-            }
+            let bound = bind(&self.path).inspect_err(|absence| {
+                self.pause.begin(now);
+                self.last.clone_from(&absence.reason);
+            });
+            self.listener = Some(bound?);
             return Ok(None);
         };
         match listener.accept() {
@@ -274,12 +255,13 @@ impl Program {
 
 /// Waits for the end of a program that knows that it should end.
 fn wait_or_kill(child: &mut Child) -> Option<std::process::ExitStatus> {
-    const STEP_NANOS: i64 = 5_000_000;
-    for _ in 0..GOODBYE_NANOS / STEP_NANOS {
+    const STEP_MILLIS: u32 = 5;
+    for _ in 0..GOODBYE_MILLIS / STEP_MILLIS {
         if let Ok(Some(status)) = child.try_wait() {
             return Some(status);
         }
-        pause(STEP_NANOS);
+        // Without a descriptor it is a sleep.
+        let _ = poll(&mut [], STEP_MILLIS);
     }
     // What cannot be killed is gone already.
     let _ = child.kill();
@@ -287,21 +269,12 @@ fn wait_or_kill(child: &mut Child) -> Option<std::process::ExitStatus> {
     None
 }
 
-fn pause(nanos: i64) {
-    let timeout = Timespec { tv_sec: 0, tv_nsec: nanos };
-    let _ = poll(&mut [] as &mut [PollFd<'_>], Some(&timeout));
-}
-
 /// Waits until one of `descriptors` can be read, at most `millis`.
 pub fn await_readable<'a>(descriptors: impl Iterator<Item = BorrowedFd<'a>>, millis: u32) {
     let mut polled: Vec<PollFd<'_>> =
         descriptors.map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN)).collect();
-    let timeout = Timespec {
-        tv_sec: i64::from(millis / 1000),
-        tv_nsec: i64::from(millis % 1000) * 1_000_000,
-    };
     // A signal ends the wait early; the caller looks at everything anyway.
-    let _ = poll(&mut polled, Some(&timeout));
+    let _ = poll(&mut polled, millis);
 }
 
 impl Drop for Program {

@@ -1,6 +1,7 @@
 //! A stream of frames as its bytes are: for each frame a header of 64 bytes, then the picture. All numbers are little
 //! endian; docs/sources.md has the table.
 
+use crate::capture::decode_error::MAX_SIDE;
 use crate::capture::v4l::pixel_format::PixelFormat;
 use crate::capture::v4l::video_device::FourCc;
 
@@ -8,8 +9,6 @@ use crate::capture::v4l::video_device::FourCc;
 pub const MAGIC: [u8; 8] = *b"SDFRAME1";
 /// Bytes of a header.
 pub const HEADER_BYTES: usize = 64;
-/// Longest side of a picture, pixels: that of a rig.
-const MAX_SIDE: u32 = 8192;
 /// Longest believable exposure, nanoseconds.
 const MAX_EXPOSURE_NANOS: u64 = 60_000_000_000;
 /// A JPEG is no larger than its pixels in colour, and a header.
@@ -147,7 +146,7 @@ impl StreamHeader {
     }
 
     fn check(&self) -> Result<(), HeaderError> {
-        let sides = 1..=MAX_SIDE;
+        let sides = 1..=MAX_SIDE as u32;
         if !sides.contains(&self.width) || !sides.contains(&self.height) {
             return Err(HeaderError::Size(self.width, self.height));
         }

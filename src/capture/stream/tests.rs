@@ -6,6 +6,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::os::unix::net::{UnixListener, UnixStream};
 
 use super::*;
+use crate::capture::v4l::PixelFormat;
 
 const SIZE: (u32, u32) = (32, 24);
 const PIXELS: usize = 32 * 24;

@@ -13,9 +13,9 @@ use super::controls::{self, Exposure};
 use super::kernel::FLAG_ERROR;
 use super::negotiation::{Grant, NegotiationError, Wish, negotiate, rate_differs};
 use super::params::CameraParams;
-use super::stamps::{FrameNumbers, taken};
-use super::video_device::{Filled, OpenFailure, Readiness, VideoDevice, VideoSystem};
-use crate::capture::source::{Arrival, FrameLosses, FrameStamp, Notice};
+use super::stamps::{FrameNumbers, MAX_REFUSED_IN_A_ROW, taken};
+use super::video_device::{Filled, OpenFailure, VideoDevice, VideoSystem};
+use crate::capture::source::{Absence, Arrival, FrameLosses, FrameStamp, Notice};
 
 /// Pause before the first attempt to open a camera again.
 const FIRST_PAUSE_NANOS: i64 = 100_000_000;
@@ -27,23 +27,6 @@ const EXPOSURE_PERIOD_NANOS: i64 = 200_000_000;
 const IDLE_PAUSE_MILLIS: u32 = 1;
 /// Most notices that are kept for who asks: a camera that complains forever is heard often enough.
 const MAX_NOTICES: usize = 16;
-/// Frames whose stamps go back are refused; after so many in a row, a third of a second, it is the clock that has
-/// stepped.
-const MAX_REFUSED_IN_A_ROW: u32 = 10;
-
-/// Why a camera cannot be used, for good or for now.
-#[derive(Debug, Clone, PartialEq, Eq)]
-struct Fault {
-    reason: String,
-    /// Whether it may pass by itself.
-    passes: bool,
-}
-
-impl Fault {
-    fn passing(reason: String) -> Self {
-        Self { reason, passes: true }
-    }
-}
 
 /// A frame that waits for its reader.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -144,8 +127,8 @@ impl<S: VideoSystem> Camera<S> {
         };
         match outcome {
             Ok(arrival) => Ok(arrival),
-            Err(fault) if fault.passes || self.has_streamed => Ok(self.retire(fault.reason)),
-            Err(fault) => Err(fault.reason),
+            Err(absence) if absence.passes || self.has_streamed => Ok(self.retire(absence.reason)),
+            Err(absence) => Err(absence.reason),
         }
     }
 
@@ -170,18 +153,18 @@ impl<S: VideoSystem> Camera<S> {
     }
 
     /// Opens the camera and lets it stream.
-    fn open(&mut self) -> Result<(), Fault> {
+    fn open(&mut self) -> Result<(), Absence> {
         let (path, mut device) =
-            self.system.open(&self.name).map_err(|failure| open_fault(&self.name, failure))?;
+            self.system.open(&self.name).map_err(|failure| open_failure(&self.name, failure))?;
         let at = |reason: String| format!("{}: {reason}", path.display());
-        let refused = |error: Errno| Fault::passing(at(refusal(error, &path.display())));
+        let refused = |error: Errno| Absence::passing(at(refusal(error, &path.display())));
         let grant = negotiate(&mut device, &self.wish).map_err(|error| match error {
             NegotiationError::Device(error) => refused(error),
-            error @ NegotiationError::Size { .. } => Fault {
+            error @ NegotiationError::Size { .. } => Absence {
                 reason: at(format!("{error}; name the rig of a size that it gives with --rig")),
                 passes: false,
             },
-            error => Fault { reason: at(error.to_string()), passes: false },
+            error => Absence { reason: at(error.to_string()), passes: false },
         })?;
         if rate_differs(self.wish.rate_hz, grant.rate_hz) {
             let (wanted, granted) =
@@ -194,7 +177,7 @@ impl<S: VideoSystem> Camera<S> {
         }
         let num_buffers = device.make_buffers(self.params.buffers).map_err(refused)?;
         if num_buffers < 2 {
-            return Err(Fault::passing(at(format!(
+            return Err(Absence::passing(at(format!(
                 "its driver makes {num_buffers} buffers, two are needed"
             ))));
         }
@@ -229,7 +212,7 @@ impl<S: VideoSystem> Camera<S> {
     }
 
     /// One look at a camera that streams.
-    fn look(&mut self, wake: Option<BorrowedFd<'_>>, millis: u32) -> Result<Arrival, Fault> {
+    fn look(&mut self, wake: Option<BorrowedFd<'_>>, millis: u32) -> Result<Arrival, Absence> {
         let State::Streaming(stream) = &mut self.state else { return Ok(Arrival::Nothing) };
         if stream.held.is_some() {
             return Ok(Arrival::Frame);
@@ -237,8 +220,8 @@ impl<S: VideoSystem> Camera<S> {
         stream.return_idle()?;
         self.see_to_exposure();
         let State::Streaming(stream) = &mut self.state else { return Ok(Arrival::Nothing) };
-        let readiness = stream.device.wait(wake, millis).map_err(|error| stream.fault(error))?;
-        if readiness == Readiness::Ready && self.drain()? == 0 {
+        let is_ready = stream.device.wait(wake, millis).map_err(|error| stream.absence(error))?;
+        if is_ready && self.drain()? == 0 {
             // A driver that wakes for nothing must not turn this into a loop that never sleeps.
             self.system.pause(wake, IDLE_PAUSE_MILLIS);
         }
@@ -253,7 +236,7 @@ impl<S: VideoSystem> Camera<S> {
         if silent_nanos as f64 > self.params.stall_s * 1e9 {
             let path = stream.path.display();
             let seconds = self.params.stall_s;
-            return Err(Fault::passing(format!("{path}: gives no frame for {seconds} s")));
+            return Err(Absence::passing(format!("{path}: gives no frame for {seconds} s")));
         }
         Ok(Arrival::Nothing)
     }
@@ -281,7 +264,7 @@ impl<S: VideoSystem> Camera<S> {
     }
 
     /// Takes every buffer that is filled and holds the newest good one; how many there were.
-    fn drain(&mut self) -> Result<usize, Fault> {
+    fn drain(&mut self) -> Result<usize, Absence> {
         let State::Streaming(stream) = &mut self.state else { return Ok(0) };
         let mut count = 0;
         let arrival_nanos = self.system.now_nanos();
@@ -291,7 +274,7 @@ impl<S: VideoSystem> Camera<S> {
             let filled = match stream.device.dequeue() {
                 Ok(filled) => filled,
                 Err(Errno::AGAIN) => break,
-                Err(error) => return Err(stream.fault(error)),
+                Err(error) => return Err(stream.absence(error)),
             };
             count += 1;
             stream.newest_nanos = arrival_nanos;
@@ -364,8 +347,8 @@ fn note(notices: &mut VecDeque<Notice>, text: String, is_warning: bool) {
 
 impl<D: VideoDevice> Stream<D> {
     /// Gives idle buffers to the driver. One that it refuses stays for the next look; a driver that has
-    /// none left, or is gone, is a fault.
-    fn return_idle(&mut self) -> Result<(), Fault> {
+    /// none left, or is gone, is an absence.
+    fn return_idle(&mut self) -> Result<(), Absence> {
         let mut refused = None;
         let device = &mut self.device;
         self.idle.retain(|&index| {
@@ -374,15 +357,15 @@ impl<D: VideoDevice> Stream<D> {
             answer.is_err()
         });
         match refused {
-            Some(error @ (Errno::NODEV | Errno::NXIO)) => Err(self.fault(error)),
-            Some(error) if self.idle.len() >= self.num_buffers => Err(self.fault(error)),
+            Some(error @ (Errno::NODEV | Errno::NXIO)) => Err(self.absence(error)),
+            Some(error) if self.idle.len() >= self.num_buffers => Err(self.absence(error)),
             _ => Ok(()),
         }
     }
 
-    fn fault(&self, error: Errno) -> Fault {
+    fn absence(&self, error: Errno) -> Absence {
         let path = self.path.display();
-        Fault::passing(format!("{path}: {}", refusal(error, &path)))
+        Absence::passing(format!("{path}: {}", refusal(error, &path)))
     }
 }
 
@@ -401,18 +384,18 @@ fn refusal(error: Errno, path: &dyn std::fmt::Display) -> String {
     }
 }
 
-fn open_fault(name: &str, failure: OpenFailure) -> Fault {
+fn open_failure(name: &str, failure: OpenFailure) -> Absence {
     match failure {
-        OpenFailure::Missing => Fault::passing(format!(
+        OpenFailure::Missing => Absence::passing(format!(
             "there is no camera {name}; plug it in (`semidense cameras` lists the cameras)"
         )),
         OpenFailure::Refused(path, error) => {
-            Fault::passing(format!("{}: {}", path.display(), refusal(error, &path.display())))
+            Absence::passing(format!("{}: {}", path.display(), refusal(error, &path.display())))
         }
         OpenFailure::Ambiguous(paths) => {
             let names: Vec<String> = paths.iter().map(|path| path.display().to_string()).collect();
             let reason = format!("{name} may be {}; name one of them", names.join(" or "));
-            Fault { reason, passes: false }
+            Absence { reason, passes: false }
         }
     }
 }

@@ -1,7 +1,7 @@
 //! A capture device of the kernel: requests, mapped buffers, waiting.
 
 use std::fs::File;
-use std::os::fd::{AsFd, AsRawFd, BorrowedFd};
+use std::os::fd::{AsRawFd, BorrowedFd};
 use std::path::{Path, PathBuf};
 use std::ptr::NonNull;
 
@@ -13,7 +13,7 @@ use super::device_name::find;
 use super::kernel::{self, KernelStruct, Request};
 use super::video_device::{
     Capability, ControlRange, Filled, FourCc, Fraction, Layout, OfferedFormat, OpenFailure,
-    PeriodRange, Readiness, SizeRange, VideoDevice, VideoSystem,
+    PeriodRange, SizeRange, VideoDevice, VideoSystem,
 };
 
 /// Most entries of an enumeration that are believed: a driver without an end is broken.
@@ -198,12 +198,10 @@ impl VideoDevice for KernelDevice {
             entry
         };
         let mut sizes = self.enumerate(&kernel::ENUMERATE_SIZES, first, |entry| {
-            let [a, b, c, d, e, f] = entry.range;
+            let [a, b, _, d, e, _] = entry.range;
             match entry.kind {
-                kernel::ENUMERATION_DISCRETE => {
-                    SizeRange { smallest: (a, b), largest: (a, b), step: (1, 1) }
-                }
-                _ => SizeRange { smallest: (a, d), largest: (b, e), step: (c, f) },
+                kernel::ENUMERATION_DISCRETE => SizeRange { smallest: (a, b), largest: (a, b) },
+                _ => SizeRange { smallest: (a, d), largest: (b, e) },
             }
         });
         // A range has one entry; some drivers give it again for every index.
@@ -377,14 +375,14 @@ impl VideoDevice for KernelDevice {
         unsafe { std::slice::from_raw_parts(mapping.start.as_ptr().cast(), mapping.length) }
     }
 
-    fn wait(&self, wake: Option<BorrowedFd<'_>>, millis: u32) -> Result<Readiness, Errno> {
+    fn wait(&self, wake: Option<BorrowedFd<'_>>, millis: u32) -> Result<bool, Errno> {
         let own = PollFd::new(&self.file, PollFlags::IN);
         let events = match wake {
             None => poll(&mut [own], millis)?,
             Some(wake) => poll(&mut [own, PollFd::from_borrowed_fd(wake, PollFlags::IN)], millis)?,
         };
         // An error is ready too: the next dequeue names it.
-        Ok(if events.is_empty() { Readiness::Nothing } else { Readiness::Ready })
+        Ok(!events.is_empty())
     }
 }
 
@@ -396,8 +394,9 @@ impl Drop for KernelDevice {
     }
 }
 
-/// What happened on the first descriptor within `millis`; nothing where a signal came.
-fn poll(descriptors: &mut [PollFd<'_>], millis: u32) -> Result<PollFlags, Errno> {
+/// What happened on the first descriptor within `millis`; nothing where a signal came. Without a descriptor it is a
+/// sleep.
+pub fn poll(descriptors: &mut [PollFd<'_>], millis: u32) -> Result<PollFlags, Errno> {
     let timeout = Timespec {
         tv_sec: i64::from(millis / 1000),
         tv_nsec: i64::from(millis % 1000) * 1_000_000,
@@ -431,13 +430,9 @@ impl VideoSystem for Kernel {
     }
 
     fn pause(&self, wake: Option<BorrowedFd<'_>>, millis: u32) {
-        // Without a descriptor it is a sleep; what wakes is looked at by the caller.
-        let _ = match wake {
-            None => poll(&mut [], millis),
-            Some(wake) => {
-                poll(&mut [PollFd::from_borrowed_fd(wake.as_fd(), PollFlags::IN)], millis)
-            }
-        };
+        // What wakes is looked at by the caller.
+        let mut polled = wake.map(|wake| PollFd::from_borrowed_fd(wake, PollFlags::IN));
+        let _ = poll(polled.as_mut_slice(), millis);
     }
 }
 

@@ -3,9 +3,10 @@
 use std::path::{Path, PathBuf};
 
 use super::video_device::OpenFailure;
+use crate::capture::input_file::entries;
 
 /// Folders of udev's names, in the order of trust: an id stays with the camera, a path with the plug.
-const NAME_FOLDERS: [&str; 3] = ["v4l/by-id", "v4l/by-path", "semidense"];
+pub const NAME_FOLDERS: [&str; 3] = ["v4l/by-id", "v4l/by-path", "semidense"];
 /// What udev adds to the name of a camera's first image node.
 const FIRST_NODE: &str = "-video-index0";
 
@@ -28,17 +29,13 @@ pub fn find(dev: &Path, name: &str) -> Result<PathBuf, OpenFailure> {
                 return Ok(folder.join(exact));
             }
         }
-        let mut found: Vec<PathBuf> = std::fs::read_dir(&folder)
-            .into_iter()
-            .flatten()
-            .flatten()
-            .map(|entry| entry.file_name().to_string_lossy().into_owned())
-            .filter(|entry| entry.starts_with(name))
+        let mut found = entries(&folder);
+        found.retain(|path| {
+            let entry = path.file_name().unwrap_or_default().to_string_lossy();
             // Further nodes of the same camera carry no images.
-            .filter(|entry| entry.ends_with(FIRST_NODE) || !entry.contains("-video-index"))
-            .map(|entry| folder.join(entry))
-            .collect();
-        found.sort();
+            let is_first = entry.ends_with(FIRST_NODE) || !entry.contains("-video-index");
+            is_first && entry.starts_with(name)
+        });
         match found.as_slice() {
             [] => {}
             [only] => return Ok(only.clone()),

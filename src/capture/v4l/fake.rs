@@ -11,7 +11,7 @@ use super::kernel::{CAP_STREAMING, CAP_VIDEO_CAPTURE, FIELD_NONE, FLAG_TIMESTAMP
 use super::pixel_format::PixelFormat;
 use super::video_device::{
     Capability, ControlRange, Filled, FourCc, Fraction, Layout, OfferedFormat, OpenFailure,
-    PeriodRange, Readiness, SizeRange, VideoDevice, VideoSystem,
+    PeriodRange, SizeRange, VideoDevice, VideoSystem,
 };
 
 /// Formats with sizes and the fastest rate.
@@ -196,7 +196,7 @@ impl VideoDevice for FakeDevice {
     fn sizes(&self, code: FourCc) -> Vec<SizeRange> {
         let inner = self.fake.inner();
         let offer = inner.offers.iter().find(|(format, ..)| format.code() == code);
-        let size = |&size: &(u32, u32)| SizeRange { smallest: size, largest: size, step: (1, 1) };
+        let size = |&size: &(u32, u32)| SizeRange { smallest: size, largest: size };
         offer.map_or(Vec::new(), |(_, sizes, _)| sizes.iter().map(size).collect())
     }
 
@@ -315,12 +315,12 @@ impl VideoDevice for FakeDevice {
         self.buffers.get(index).filter(|(_, queued)| !queued).map_or(&[], |(bytes, _)| bytes)
     }
 
-    fn wait(&self, _: Option<BorrowedFd<'_>>, millis: u32) -> Result<Readiness, Errno> {
+    fn wait(&self, _: Option<BorrowedFd<'_>>, millis: u32) -> Result<bool, Errno> {
         if !self.fake.inner().events.is_empty() {
-            return Ok(Readiness::Ready);
+            return Ok(true);
         }
         self.fake.pass(i64::from(millis) * 1_000_000);
-        Ok(Readiness::Nothing)
+        Ok(false)
     }
 }
 

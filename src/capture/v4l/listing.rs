@@ -6,6 +6,7 @@ use rustix::io::Errno;
 use serde::Serialize;
 
 use super::device::KernelDevice;
+use super::device_name::NAME_FOLDERS;
 use super::kernel::{
     CAP_VIDEO_CAPTURE, CAP_VIDEO_CAPTURE_MPLANE, CONTROL_INACTIVE, CONTROL_READ_ONLY,
     CONTROL_TYPE_BOOLEAN, CONTROL_TYPE_INTEGER, CONTROL_TYPE_INTEGER_MENU, CONTROL_TYPE_MENU,
@@ -13,15 +14,14 @@ use super::kernel::{
 };
 use super::pixel_format::PixelFormat;
 use super::video_device::{ControlRange, OfferedFormat, SizeRange, VideoDevice, rate_hz};
-
-/// Folders of udev's names for video nodes.
-const NAME_FOLDERS: [&str; 3] = ["v4l/by-id", "v4l/by-path", "semidense"];
+use crate::capture::input_file::entries;
 
 /// Whether a node can be used.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Access {
     /// It can be opened, and nobody else streams from it.
+    #[default]
     Free,
     /// Another program has its buffers.
     Busy,
@@ -77,7 +77,7 @@ pub struct ControlReport {
 }
 
 /// A video node that gives pictures, or could not be asked.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct CameraReport {
     /// The node.
     pub path: PathBuf,
@@ -99,33 +99,15 @@ pub struct CameraReport {
     pub controls: Vec<ControlReport>,
 }
 
-impl CameraReport {
-    /// A node that was not asked yet.
-    fn of(path: &Path, names: Vec<String>) -> Self {
-        Self {
-            path: path.to_owned(),
-            names,
-            access: Access::Free,
-            problem: None,
-            card: String::new(),
-            driver: String::new(),
-            bus: String::new(),
-            formats: Vec::new(),
-            controls: Vec::new(),
-        }
-    }
-}
-
 /// The video nodes below `dev` (`/dev`), in the order of their numbers.
 pub fn nodes(dev: &Path) -> Vec<PathBuf> {
     let number = |path: &Path| -> Option<u32> {
         path.file_name()?.to_str()?.strip_prefix("video")?.parse().ok()
     };
-    let entries = std::fs::read_dir(dev).into_iter().flatten().flatten();
-    let mut found: Vec<(u32, PathBuf)> =
-        entries.filter_map(|entry| Some((number(&entry.path())?, entry.path()))).collect();
-    found.sort();
-    found.into_iter().map(|(_, path)| path).collect()
+    let mut found = entries(dev);
+    found.retain(|path| number(path).is_some());
+    found.sort_by_key(|path| number(path));
+    found
 }
 
 /// Every camera below `dev`, and every node that cannot be asked whether it is one.
@@ -135,48 +117,45 @@ pub fn cameras(dev: &Path) -> Vec<CameraReport> {
 
 /// Whether a node can be used; `None` for what is not a camera.
 pub fn access(path: &Path) -> Option<Access> {
-    match KernelDevice::open(path) {
-        Ok(mut device) => is_camera(&device).then(|| device_access(&mut device).0),
-        Err(error) => Some(refused_access(error)),
+    open(path).map(|(_, problem)| access_of(problem))
+}
+
+fn access_of(problem: Option<Errno>) -> Access {
+    match problem {
+        None => Access::Free,
+        Some(Errno::BUSY) => Access::Busy,
+        Some(Errno::ACCESS | Errno::PERM) => Access::Forbidden,
+        Some(_) => Access::Unusable,
     }
 }
 
-fn refused_access(error: Errno) -> Access {
-    match error {
-        Errno::ACCESS | Errno::PERM => Access::Forbidden,
-        Errno::BUSY => Access::Busy,
-        _ => Access::Unusable,
-    }
-}
-
-fn is_camera(device: &dyn VideoDevice) -> bool {
+/// The device of a node, where it can be opened, and why it cannot be used; `None` for what is not a camera.
+fn open(path: &Path) -> Option<(Option<KernelDevice>, Option<Errno>)> {
+    let mut device = match KernelDevice::open(path) {
+        Ok(device) => device,
+        Err(error) => return Some((None, Some(error))),
+    };
     let flags = device.capability().map_or(0, |capability| capability.flags);
-    flags & (CAP_VIDEO_CAPTURE | CAP_VIDEO_CAPTURE_MPLANE) != 0
-}
-
-/// A device without buffers of ours is busy where another program has some.
-fn device_access(device: &mut dyn VideoDevice) -> (Access, Option<Errno>) {
-    match device.make_buffers(0) {
-        Err(Errno::BUSY) => (Access::Busy, Some(Errno::BUSY)),
-        _ => (Access::Free, None),
+    if flags & (CAP_VIDEO_CAPTURE | CAP_VIDEO_CAPTURE_MPLANE) == 0 {
+        return None;
     }
+    // A device without buffers of ours is busy where another program has some.
+    let busy = device.make_buffers(0).err().filter(|error| *error == Errno::BUSY);
+    Some((Some(device), busy))
 }
 
 fn report(dev: &Path, path: &Path) -> Option<CameraReport> {
-    let mut found = CameraReport::of(path, names(dev, path));
-    let mut device = match KernelDevice::open(path) {
-        Ok(device) => device,
-        Err(error) => {
-            (found.access, found.problem) = (refused_access(error), Some(error.to_string()));
-            return Some(found);
-        }
+    let (device, problem) = open(path)?;
+    let mut found = CameraReport {
+        path: path.to_owned(),
+        names: names(dev, path),
+        access: access_of(problem),
+        problem: problem.map(|error| error.to_string()),
+        ..CameraReport::default()
     };
-    if !is_camera(&device) {
-        return None;
+    if let Some(device) = device {
+        describe(&device, &mut found);
     }
-    let (access, error) = device_access(&mut device);
-    (found.access, found.problem) = (access, error.map(|error| error.to_string()));
-    describe(&device, &mut found);
     Some(found)
 }
 
@@ -237,17 +216,11 @@ fn control_report(device: &dyn VideoDevice, control: &ControlRange) -> Option<Co
 /// udev's names that lead to a node.
 fn names(dev: &Path, path: &Path) -> Vec<String> {
     let leads_here = |link: &Path| link.canonicalize().is_ok_and(|target| target == path);
-    let mut found = Vec::new();
-    for folder in NAME_FOLDERS {
-        let entries = std::fs::read_dir(dev.join(folder)).into_iter().flatten().flatten();
-        let links = entries.map(|entry| entry.path()).filter(|link| leads_here(link));
-        let mut names: Vec<String> = links
-            .filter_map(|link| Some(link.file_name()?.to_string_lossy().into_owned()))
-            .collect();
-        names.sort();
-        found.append(&mut names);
-    }
-    found
+    let links = NAME_FOLDERS.iter().flat_map(|folder| entries(&dev.join(folder)));
+    links
+        .filter(|link| leads_here(link))
+        .filter_map(|link| Some(link.file_name()?.to_string_lossy().into_owned()))
+        .collect()
 }
 
 #[cfg(test)]
@@ -284,7 +257,7 @@ mod tests {
     fn a_camera_says_what_it_offers() {
         let fake = Fake::with_formats(&[(PixelFormat::Yuyv, &[(640, 480), (320, 240)], 30)])
             .with_control(0x0098_0913, "Gain", (0, 100, 5), 40, 0);
-        let mut found = CameraReport::of(Path::new("/dev/video0"), Vec::new());
+        let mut found = CameraReport::default();
         describe(&fake.device(), &mut found);
         let format = &found.formats[0];
         assert_eq!((format.code.as_str(), format.usable), ("YUYV", true));

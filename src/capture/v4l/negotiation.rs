@@ -86,18 +86,13 @@ fn check_capability(device: &dyn VideoDevice) -> Result<(), NegotiationError> {
         error => NegotiationError::Device(error),
     })?;
     let has = |flag: u32| capability.flags & flag != 0;
-    if !has(CAP_VIDEO_CAPTURE) && has(CAP_VIDEO_CAPTURE_MPLANE) {
-        return Err(no_camera("it gives pictures in several planes only"));
-    }
-    if !has(CAP_VIDEO_CAPTURE) {
-        return Err(no_camera(
-            "it gives no pictures; a camera may have several nodes, try the other",
-        ));
-    }
-    if !has(CAP_STREAMING) {
-        return Err(no_camera("it does not stream"));
-    }
-    Ok(())
+    let problem = match (has(CAP_VIDEO_CAPTURE), has(CAP_VIDEO_CAPTURE_MPLANE)) {
+        (true, _) if has(CAP_STREAMING) => return Ok(()),
+        (true, _) => "it does not stream",
+        (false, true) => "it gives pictures in several planes only",
+        (false, false) => "it gives no pictures; a camera may have several nodes, try the other",
+    };
+    Err(no_camera(problem))
 }
 
 /// Formats in the order of trial: those that reach the rate in their order, then the fastest of the
@@ -110,8 +105,7 @@ fn candidates(device: &dyn VideoDevice, wish: &Wish) -> Vec<PixelFormat> {
     };
     let fastest = |format: PixelFormat| {
         let periods = device.periods(format.code(), wish.width, wish.height);
-        let rates = periods.iter().map(|period| rate_hz(period.shortest));
-        rates.fold(None, |best: Option<f64>, rate| Some(best.map_or(rate, |b| b.max(rate))))
+        periods.iter().map(|period| rate_hz(period.shortest)).reduce(f64::max)
     };
     let mut found: Vec<(PixelFormat, f64)> = PixelFormat::ALL
         .into_iter()
@@ -174,16 +168,16 @@ fn offered_sizes(device: &dyn VideoDevice) -> String {
 }
 
 fn agree_on_rate(device: &mut dyn VideoDevice, wanted: Option<f64>) -> Option<f64> {
-    let own = device.period().ok();
-    let granted = match (wanted, own) {
-        (Some(wanted), Some((_, true))) => {
+    let (own, can_be_set) = device.period().ok()?;
+    let granted = match wanted {
+        Some(wanted) if can_be_set => {
             let denominator = (wanted * MILLIHERTZ).round().max(1.0) as u32;
             let period = Fraction { numerator: MILLIHERTZ as u32, denominator };
-            device.set_period(period).ok().or(own.map(|(period, _)| period))
+            device.set_period(period).unwrap_or(own)
         }
-        _ => own.map(|(period, _)| period),
+        _ => own,
     };
-    granted.map(rate_hz).filter(|rate| *rate > 0.0)
+    Some(rate_hz(granted)).filter(|rate| *rate > 0.0)
 }
 
 #[cfg(test)]

@@ -3,13 +3,14 @@
 use std::fmt;
 
 use serde::de::{self, Visitor};
-use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde::{Deserialize, Deserializer, Serialize};
 
 use super::pixel_format::PixelFormat;
 use crate::slam::parameter::{ParameterError, check_range};
 
 /// A setting of the camera that it can also find by itself.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Setting {
     /// As it is.
     #[default]
@@ -19,18 +20,8 @@ pub enum Setting {
     /// What the camera has found after the settling time is kept.
     Lock,
     /// This value.
+    #[serde(untagged)]
     Value(i32),
-}
-
-impl Serialize for Setting {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        match self {
-            Self::Leave => serializer.serialize_str("leave"),
-            Self::Auto => serializer.serialize_str("auto"),
-            Self::Lock => serializer.serialize_str("lock"),
-            Self::Value(value) => serializer.serialize_i32(*value),
-        }
-    }
 }
 
 impl<'de> Deserialize<'de> for Setting {

@@ -38,6 +38,10 @@ pub struct FrameNumbers {
     last: Option<u32>,
 }
 
+/// Frames whose stamps go back are refused; after so many in a row, a third of a second, it is the clock that has
+/// stepped.
+pub const MAX_REFUSED_IN_A_ROW: u32 = 10;
+
 /// A larger step of the driver's number is a new beginning, not a loss: ten minutes at 60 Hz.
 const MAX_STEP: u32 = 36_000;
 

@@ -57,15 +57,13 @@ pub struct OfferedFormat {
     pub description: String,
 }
 
-/// Image sizes from `smallest` to `largest` (width, height) in steps; one size where they are equal.
+/// Image sizes from `smallest` to `largest` (width, height); one size where they are equal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SizeRange {
     /// Smallest.
     pub smallest: (u32, u32),
     /// Largest.
     pub largest: (u32, u32),
-    /// Step.
-    pub step: (u32, u32),
 }
 
 impl fmt::Display for SizeRange {
@@ -146,15 +144,6 @@ pub struct Filled {
     pub flags: u32,
 }
 
-/// What waiting for a device came to.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Readiness {
-    /// A buffer, or an error, can be fetched.
-    Ready,
-    /// The time is over, or the other descriptor woke.
-    Nothing,
-}
-
 /// An open capture device.
 pub trait VideoDevice: Send {
     /// Who it is.
@@ -191,8 +180,9 @@ pub trait VideoDevice: Send {
     fn start(&mut self) -> Result<(), Errno>;
     /// The whole memory of a buffer that is not the driver's; empty where it is.
     fn memory(&self, index: usize) -> &[u8];
-    /// Sleeps until a buffer is there, `wake` can be read, or `millis` are over.
-    fn wait(&self, wake: Option<BorrowedFd<'_>>, millis: u32) -> Result<Readiness, Errno>;
+    /// Sleeps until a buffer is there, `wake` can be read, or `millis` are over. Whether a buffer, or an error, can be
+    /// fetched.
+    fn wait(&self, wake: Option<BorrowedFd<'_>>, millis: u32) -> Result<bool, Errno>;
 }
 
 /// Where devices and time come from.
