@@ -224,11 +224,12 @@ impl Mapper {
         let is_usable = pose.world_from_camera.is_finite() && pose.keyframe_from_camera.is_finite();
         let is_turning = pose.state == TrackingState::Degraded(DegradedReason::Turning);
         let is_trusted = is_usable && keyframe.map_state == MapState::Established;
-        if is_turning && is_trusted {
-            self.last_world_from_camera = Some(pose.world_from_camera);
-            self.last_tracked = Some((pose.keyframe_id, pose.keyframe_from_camera));
+        if is_lost || !is_trusted {
+            return self.recover(frame, pose, sensor_depth);
         }
-        if is_lost || is_turning || !is_trusted {
+        self.last_world_from_camera = Some(pose.world_from_camera);
+        self.last_tracked = Some((pose.keyframe_id, pose.keyframe_from_camera));
+        if is_turning {
             return self.recover(frame, pose, sensor_depth);
         }
         self.phase = Phase::Mapping;
@@ -258,8 +259,6 @@ impl Mapper {
         sensor_depth: Option<&Image<f32>>,
         change_begins: &mut dyn FnMut(),
     ) -> StepOutcome {
-        self.last_world_from_camera = Some(pose.world_from_camera);
-        self.last_tracked = Some((pose.keyframe_id, pose.keyframe_from_camera));
         self.keep_frame(frame, pose);
         self.guess_unit(&pose.keyframe_from_camera);
         let (unit, modes) = (self.depth.unit, &self.params.modes);

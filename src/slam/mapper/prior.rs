@@ -139,8 +139,6 @@ impl Mapper {
     ) -> StepOutcome {
         /// Where the tracker asks for another keyframe: any that is nearer than that will do.
         const MAX_DISTANCE: f64 = 1.0;
-        self.last_world_from_camera = Some(pose.world_from_camera);
-        self.last_tracked = Some((pose.keyframe_id, pose.keyframe_from_camera));
         let Some(active) = &mut self.active else { return StepOutcome::default() };
         active.frames += 1;
         if !pose.proposes_keyframe || active.frames < self.params.min_keyframe_interval {
