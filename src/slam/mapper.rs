@@ -74,6 +74,21 @@ pub struct StepOutcome {
 }
 
 impl StepOutcome {
+    /// A map has begun with its first keyframes.
+    fn begun() -> Self {
+        Self {
+            keyframe_created: true,
+            keyframe_changed: true,
+            graph_changed: true,
+            ..Self::default()
+        }
+    }
+
+    /// An earlier keyframe is active again.
+    fn restored(graph_changed: bool) -> Self {
+        Self { keyframe_restored: true, keyframe_changed: true, graph_changed, ..Self::default() }
+    }
+
     /// Whether the active keyframe is another one or another revision than before.
     pub fn needs_publishing(&self) -> bool {
         self.keyframe_created || self.keyframe_restored || self.keyframe_changed

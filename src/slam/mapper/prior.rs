@@ -163,12 +163,7 @@ impl Mapper {
         }
         self.revision += 1;
         self.publish_place();
-        StepOutcome {
-            keyframe_restored: true,
-            keyframe_changed: true,
-            graph_changed: is_first,
-            ..Default::default()
-        }
+        StepOutcome::restored(is_first)
     }
 
     /// Where a keyframe's map lies in odometry's world as odometry had it last.

@@ -272,13 +272,8 @@ impl Mapper {
             return self.enter_unchanged(index);
         }
         self.enter_keyframe(index);
-        StepOutcome {
-            keyframe_restored: true,
-            keyframe_changed: true,
-            // The rest of a map that was there before is told of with the first of it.
-            graph_changed: is_first,
-            ..Default::default()
-        }
+        // The rest of a map that was there before is told of with the first of it.
+        StepOutcome::restored(is_first)
     }
 }
 

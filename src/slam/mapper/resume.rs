@@ -113,12 +113,7 @@ impl Mapper {
         self.past.clear();
         self.phase = Phase::Mapping;
         self.enter_keyframe(index);
-        StepOutcome {
-            keyframe_restored: true,
-            keyframe_changed: true,
-            graph_changed: true,
-            ..Default::default()
-        }
+        StepOutcome::restored(true)
     }
 }
 

@@ -143,12 +143,7 @@ impl Mapper {
         let epoch = self.next_epoch();
         let place = UncertainPlace::exact(Sim3::new(map_from_camera, scale));
         self.add_keyframe(frame, &place, epoch);
-        StepOutcome {
-            keyframe_created: true,
-            keyframe_changed: true,
-            graph_changed: true,
-            ..Default::default()
-        }
+        StepOutcome::begun()
     }
 
     /// How to search in a frame at `pose`: the less is known of the pose, the less is believed of a match.
@@ -244,13 +239,7 @@ impl Mapper {
         };
         self.change_keyframe(frame, &pose, None);
         self.adopt_early_frames(&pose.keyframe_from_camera);
-        StepOutcome {
-            keyframe_created: true,
-            keyframe_changed: true,
-            graph_changed: true,
-            observations,
-            ..Default::default()
-        }
+        StepOutcome { observations, ..StepOutcome::begun() }
     }
 
     /// Observes the depth of the first frame in the one that proves the start.
