@@ -13,6 +13,7 @@ use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::mapper::consistency::judge_change;
 use crate::slam::mapper::depth_buffers::write_depth;
+use crate::slam::mapper::finder::MOST_LEARNT;
 use crate::slam::mapper::modes::in_unit;
 use crate::slam::mapper::start::take_sensor_depth;
 use crate::slam::mapper::{Mapper, StepOutcome};
@@ -213,7 +214,7 @@ impl Mapper {
             points: Vec::new(),
             description: None,
         });
-        self.finder.learn(&mut self.map.keyframes);
+        self.finder.learn(&mut self.map.keyframes, MOST_LEARNT);
         self.map.forget_depth_beyond(self.params.max_map_bytes());
         self.next_keyframe_id += 1;
         self.past.push(image, keyframe_id, SE3::identity(), Brightness::default());

@@ -23,7 +23,7 @@ impl Mapper {
 
     /// The map is of a mapper before: what it holds is looked at, and found again from now on.
     pub(super) fn take_over(&mut self) {
-        self.finder.learn_all(&mut self.map.keyframes);
+        self.finder.learn(&mut self.map.keyframes, usize::MAX);
         self.take_up_loops();
     }
 

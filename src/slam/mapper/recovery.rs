@@ -143,7 +143,7 @@ impl Mapper {
         {
             return found;
         }
-        self.finder.doubt(index);
+        self.finder.doubted = Some(index);
         None
     }
 
