@@ -102,11 +102,6 @@ impl Mapper {
         Ok(())
     }
 
-    /// Numbers of epochs from here on are given by nobody yet.
-    pub fn free_epoch(&self) -> u32 {
-        self.next_epoch()
-    }
-
     /// Whether the map stays as it is.
     pub(super) fn is_locating(&self) -> bool {
         self.prior.is_some_and(|prior| prior.map_use == MapUse::Locate)

@@ -140,7 +140,7 @@ impl Mapper {
         self.depth.is_unit_open = is_given && sensor_depth.is_none();
         let scale = self.depth.normalise();
         let map_from_camera = if is_given { pose.world_from_camera } else { origin };
-        let epoch = self.next_epoch();
+        let epoch = self.free_epoch();
         let place = UncertainPlace::exact(Sim3::new(map_from_camera, scale));
         self.add_keyframe(frame, &place, epoch);
         StepOutcome::begun()
@@ -183,8 +183,8 @@ impl Mapper {
         }
     }
 
-    /// The number of the next epoch: one that no epoch had before, here or in a mapper that died.
-    pub(super) fn next_epoch(&self) -> u32 {
+    /// The number of the next epoch: neither it nor any above was given before, here or in a mapper that died.
+    pub fn free_epoch(&self) -> u32 {
         let numbers = self.map.keyframes.iter().map(|keyframe| keyframe.epoch);
         let after_last = numbers.max().map_or(0, |last| last.saturating_add(1));
         after_last.max(self.first_free_epoch)
@@ -219,7 +219,7 @@ impl Mapper {
         let (origin, unit) = self.origin(pose);
         let first_pixels = initializer.first_pixels();
         self.begin_epoch(first_pixels);
-        let epoch = self.next_epoch();
+        let epoch = self.free_epoch();
         initializer.fill(&mut self.depth.active);
         let observations = self.observe_proven(frame, start);
         self.depth.refine(&self.params);
