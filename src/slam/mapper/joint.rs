@@ -55,7 +55,7 @@ impl Mapper {
             return None;
         }
         let mut window = self.window.take()?;
-        window.take_mature(self.depth.maturing.left());
+        window.take_mature(&mut self.depth.maturing.left);
         let is_new = window.take_in(&self.map, active);
         window.tell_looks(&self.map);
         Some((window, is_new))
@@ -190,11 +190,6 @@ impl Mapper {
 
     fn aligns_again(&self) -> bool {
         self.params.window.num_free > 0 && self.params.window.max_waiting_frames > 0
-    }
-
-    /// Forgets frames from before a map that has not begun.
-    pub(super) fn drop_early_frames(&mut self) {
-        self.early.clear();
     }
 
     /// A map has begun with two frames, its first keyframes, of which the second stands at `first_from_second`. Frames

@@ -264,7 +264,7 @@ impl Mapper {
         }
         self.anchor(keyframe.keyframe_id, keyframe_from_camera);
         self.past.clear();
-        self.drop_early_frames();
+        self.early.clear();
         self.start.give_up();
         self.phase = Phase::Mapping;
         self.doubt = Doubt::None;

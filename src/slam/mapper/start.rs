@@ -130,7 +130,7 @@ impl Mapper {
                 }
             };
         }
-        self.drop_early_frames();
+        self.early.clear();
         self.start.give_up();
         let (origin, _) = self.origin(pose);
         self.begin_epoch(frame.pixels);
