@@ -39,6 +39,8 @@ mod view;
 use std::sync::Arc;
 
 use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::shared::SharedImage;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::loops::{LoopParams, Loops};
@@ -191,24 +193,32 @@ impl Window {
 
     /// Adds a keyframe; false where its image is not of the camera's size.
     fn add(&mut self, keyframe: &Keyframe) -> bool {
-        let (width, height) = (self.camera.width, self.camera.height);
-        let image = SharedImage::try_from_pixels(width, height, Arc::clone(&keyframe.image));
-        let Some(image) = image else { return false };
-        let id = keyframe.keyframe_id;
+        let Some(image) = self.image_of(Arc::clone(&keyframe.image)) else { return false };
+        let (id, Sim3 { rigid, scale }) = (keyframe.keyframe_id, keyframe.map_from_keyframe);
+        let mut added = WindowKeyframe::new(id, keyframe.epoch, image, rigid.inverse(), scale);
+        added.surface = Surface::of(&keyframe.points, &self.camera);
         let place = self.keyframes.partition_point(|of| of.keyframe_id < id);
-        let added = WindowKeyframe {
-            keyframe_id: id,
-            epoch: keyframe.epoch,
-            images: vec![image],
-            camera_from_map: keyframe.map_from_keyframe.rigid.inverse(),
-            unit: keyframe.map_from_keyframe.scale,
-            points: Vec::new(),
-            is_host: false,
-            agreed: Vec::new(),
-            surface: Surface::of(&keyframe.points, &self.camera),
-        };
         self.keyframes.insert(place, added);
         true
+    }
+
+    /// The image of so many pixels; `None` where it is not of the camera's size.
+    fn image_of(&self, pixels: Arc<[u8]>) -> Option<SharedImage> {
+        SharedImage::try_from_pixels(self.camera.width, self.camera.height, pixels)
+    }
+
+    /// Adds a camera that is no keyframe, the last of them for as long as it is asked about, in the unit of a keyframe;
+    /// `None` where its image is not of the camera's size.
+    fn push_camera(
+        &mut self,
+        epoch: u32,
+        pixels: Arc<[u8]>,
+        camera_from_map: SE3,
+        unit: f64,
+    ) -> Option<()> {
+        let image = self.image_of(pixels)?;
+        self.keyframes.push(WindowKeyframe::new(u64::MAX, epoch, image, camera_from_map, unit));
+        Some(())
     }
 
     fn get(&self, keyframe_id: u64) -> Option<&WindowKeyframe> {
