@@ -101,7 +101,7 @@ pub struct Window {
     /// Keyframes from here on have not been aligned.
     unaligned: Vec<u64>,
     solver: Solver,
-    /// Keyframes that moved last.
+    /// Keyframes that moved last, in the order of their ids.
     moved: Vec<u64>,
     /// How uncertain those are.
     marginals: Vec<Marginal>,
@@ -382,19 +382,19 @@ impl Window {
         self.note_agreement(&chosen.members);
         let mut found =
             marginals::marginals(&self.keyframes, &members, &mut self.solver, &self.camera);
-        // They are in the unit of the equations.
+        // Places are in the unit of the equations; modes have none.
         let restored = unit.and_then(|unit| unit.restore(&mut self.keyframes, members.members));
         if let Some(by) = restored {
-            found.iter_mut().for_each(|of| of.transport(&by));
+            let places = found.iter_mut().filter_map(|of| of.place.as_mut());
+            places.for_each(|place| place.transport(&by));
         }
-        self.keep_marginals(&members, found);
-        let moved = members
-            .members
-            .iter()
-            .zip(members.free)
-            .filter(|(_, free)| free.is_some())
-            .map(|(&index, _)| self.keyframes[index].keyframe_id);
+        let free = members.members.iter().zip(members.free).filter(|(_, free)| free.is_some());
+        let moved: Vec<u64> = free.map(|(&index, _)| self.keyframes[index].keyframe_id).collect();
+        self.marginals.retain(|known| !moved.contains(&known.keyframe_id));
+        self.marginals.extend(found);
         self.moved.extend(moved);
+        self.moved.sort_unstable();
+        self.moved.dedup();
         let points = self.confirm(&members);
         let system = &self.solver.system;
         Some(Adjustment {
