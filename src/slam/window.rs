@@ -251,8 +251,7 @@ impl Window {
             return None;
         }
         let mut is_new = false;
-        while let Some(&id) = self.unaligned.first() {
-            self.unaligned.remove(0);
+        for id in std::mem::take(&mut self.unaligned) {
             let Some(index) = self.index_of(id) else { continue };
             self.choose_points_before(index);
             self.align(index);
@@ -301,12 +300,8 @@ impl Window {
     /// Chooses points in the keyframes before one, whose depth is final for now.
     fn choose_points_before(&mut self, index: usize) {
         let newest = self.keyframes[index].keyframe_id;
-        let (ready, wait) = std::mem::take(&mut self.candidates)
-            .into_iter()
-            .partition(|of| of.keyframe_id < newest);
-        self.candidates = wait;
-        let ready: Vec<Candidates> = ready;
-        for candidates in ready {
+        let ready = self.candidates.extract_if(.., |of| of.keyframe_id < newest);
+        for candidates in ready.collect::<Vec<_>>() {
             let Some(host) = self.index_of(candidates.keyframe_id) else { continue };
             self.become_host(host, &candidates);
         }
