@@ -86,7 +86,7 @@ pub(super) fn exact_host(
         .collect();
     let params = WindowParams::default();
     let chosen =
-        selection::choose(&dense, keyframe.images[0].pixels(), &CAMERA, num_cells, 8.0, 0.3);
+        selection::choose(&dense, keyframe.images[0].pixels(), &CAMERA, num_cells, &params);
     let points = chosen.iter().map(|of| {
         WindowPoint::new(
             (of.u, of.v),
