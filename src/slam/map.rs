@@ -153,6 +153,14 @@ pub enum CorrectionError {
     Unit,
 }
 
+impl KeyframeCorrection {
+    /// A new place alone.
+    pub fn of_place(keyframe_id: u64, map_from_keyframe: Sim3) -> Self {
+        let depth = LogPlane::default();
+        Self { keyframe_id, map_from_keyframe, depth, modes: None, place: None }
+    }
+}
+
 impl LogPlane {
     /// The factor at a pixel.
     pub fn factor(&self, intrinsics: &Intrinsics, u: f64, v: f64) -> f64 {

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use crate::slam::keyframe::Keyframe;
 use crate::slam::loops::Closure;
-use crate::slam::map::{Correction, KeyframeCorrection, LogPlane};
+use crate::slam::map::{Correction, KeyframeCorrection};
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::window::Window;
 
@@ -45,11 +45,11 @@ impl Mapper {
         let moved = |keyframe: &Keyframe| {
             let by = closure.of(keyframe.keyframe_id)?;
             Some(KeyframeCorrection {
-                keyframe_id: keyframe.keyframe_id,
-                map_from_keyframe: *by * keyframe.map_from_keyframe,
-                depth: LogPlane::default(),
-                modes: None,
                 place: Some(keyframe.place_covariance.transported(by)),
+                ..KeyframeCorrection::of_place(
+                    keyframe.keyframe_id,
+                    *by * keyframe.map_from_keyframe,
+                )
             })
         };
         let of_epoch = self.map.keyframes.iter().filter(|keyframe| Some(keyframe.epoch) == epoch);

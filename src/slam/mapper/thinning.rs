@@ -9,7 +9,7 @@ use crate::slam::depth::matching::is_inside;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{Keyframe, MapState};
-use crate::slam::map::{Correction, KeyframeCorrection, LogPlane, Map};
+use crate::slam::map::{Correction, KeyframeCorrection, Map};
 use crate::slam::mapper::Mapper;
 use crate::slam::mapper::reuse::ReuseParams;
 
@@ -62,13 +62,8 @@ impl Thinning {
             let moved = find(of.to)?;
             let to = map.get(of.to)?.map_from_keyframe;
             let keyframe = map.get(of.keyframe_id)?.map_from_keyframe;
-            Some(KeyframeCorrection {
-                keyframe_id: of.keyframe_id,
-                map_from_keyframe: moved * to.inverse() * keyframe,
-                depth: LogPlane::default(),
-                modes: None,
-                place: None,
-            })
+            let place = moved * to.inverse() * keyframe;
+            Some(KeyframeCorrection::of_place(of.keyframe_id, place))
         }));
         extended
     }
@@ -331,28 +326,20 @@ mod tests {
             mapper.thin();
         }
         // A loop moves every keyframe by its own.
-        let by_its_own = |of: &Keyframe| KeyframeCorrection {
-            keyframe_id: of.keyframe_id,
-            map_from_keyframe: Sim3::new(
+        let by_its_own = |of: &Keyframe| {
+            let by = Sim3::new(
                 SE3::exp(&(Vector6::repeat(1e-3) * of.keyframe_id as f64)),
                 1.0 + 1e-3 * of.keyframe_id as f64,
-            ) * of.map_from_keyframe,
-            depth: LogPlane::default(),
-            modes: None,
-            place: None,
+            );
+            KeyframeCorrection::of_place(of.keyframe_id, by * of.map_from_keyframe)
         };
         let keyframes = mapper.map.keyframes.iter().map(by_its_own).collect();
         mapper.apply(&Correction { keyframes, ..Correction::default() }).unwrap();
         // All that have depth are turned, moved and scaled alike: so must be the others.
         let moved = Sim3::new(SE3::exp(&[0.3, -0.1, 0.2, 0.1, 0.4, -0.2].into()), 1.3);
         let held = mapper.map.keyframes.iter().filter(|of| of.has_depth());
-        let keyframes = held.map(|of| KeyframeCorrection {
-            keyframe_id: of.keyframe_id,
-            map_from_keyframe: moved * of.map_from_keyframe,
-            depth: LogPlane::default(),
-            modes: None,
-            place: None,
-        });
+        let keyframes = held
+            .map(|of| KeyframeCorrection::of_place(of.keyframe_id, moved * of.map_from_keyframe));
         let correction = Correction { keyframes: keyframes.collect(), ..Correction::default() };
         let before = mapper.map.clone();
         assert!(before.num_held() < before.keyframes.len());
