@@ -24,10 +24,11 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::graph::constraint::Refusal;
 use crate::slam::keyframe::{Keyframe, MapState};
-use crate::slam::loops::likeness::{Alike, Likeness};
+use crate::slam::loops::likeness::Likeness;
 use crate::slam::map::Map;
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::place_covariance::PlaceCovariance;
+use crate::slam::places::PlaceCandidate;
 
 pub use closure::Closure;
 pub use known::{KnownLoops, Link};
@@ -301,10 +302,9 @@ impl Loops {
         let open = known[..place].iter().zip(&is_open).filter(|(_, is_open)| **is_open);
         let open: Vec<u64> = open.map(|(id, _)| *id).collect();
         let LoopParams { num_candidates, min_features, .. } = self.params;
-        let camera = &self.intrinsics;
-        let alike = self.likeness.candidates(of, &open, num_candidates, min_features, camera);
-        let pair = |alike: Alike| {
-            let rigid = SE3 { rotation: alike.rotation, ..SE3::identity() };
+        let alike = self.likeness.candidates(of, &open, num_candidates, min_features);
+        let pair = |alike: PlaceCandidate| {
+            let rigid = SE3 { rotation: alike.rotation(&self.intrinsics), ..SE3::identity() };
             (Pair { i: of, j: alike.keyframe_id, j_from_i: Sim3::new(rigid, 1.0) }, alike.score)
         };
         alike.into_iter().map(pair).collect()
