@@ -27,7 +27,6 @@ use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::loops::likeness::Likeness;
 use crate::slam::map::Map;
 use crate::slam::parameter::{ParameterError, check_range};
-use crate::slam::place_covariance::PlaceCovariance;
 use crate::slam::places::PlaceCandidate;
 
 pub use closure::Closure;
@@ -128,35 +127,30 @@ struct Plan {
     likeness: f32,
 }
 
-/// A keyframe's place when a search began.
-#[derive(Debug, Clone, Copy)]
-struct Node {
-    keyframe_id: u64,
-    epoch: u32,
-    map_from_keyframe: Sim3,
-    covariance: PlaceCovariance,
-}
-
 /// A plan with copies of what it needs.
 #[derive(Debug, Clone)]
 struct Job {
     plan: Plan,
     /// In the order of their ids.
     keyframes: Vec<Keyframe>,
-    /// All of the map, in the order of their ids.
-    nodes: Vec<Node>,
+    /// All of the map without their depth, in the order of their ids.
+    nodes: Vec<Keyframe>,
 }
 
 impl Job {
     fn keyframe(&self, id: u64) -> Option<&Keyframe> {
-        let place = self.keyframes.binary_search_by_key(&id, |k| k.keyframe_id).ok()?;
-        self.keyframes.get(place)
+        find(&self.keyframes, id)
     }
 
-    fn node(&self, id: u64) -> Option<&Node> {
-        let place = self.nodes.binary_search_by_key(&id, |node| node.keyframe_id).ok()?;
-        self.nodes.get(place)
+    fn node(&self, id: u64) -> Option<&Keyframe> {
+        find(&self.nodes, id)
     }
+}
+
+/// The keyframe with an id, of some in the order of theirs.
+fn find(keyframes: &[Keyframe], id: u64) -> Option<&Keyframe> {
+    let place = keyframes.binary_search_by_key(&id, |keyframe| keyframe.keyframe_id).ok()?;
+    keyframes.get(place)
 }
 
 /// The search for loops and what it has found.
@@ -317,7 +311,7 @@ impl Loops {
         let is_usable = |k: &&Keyframe| k.has_depth() && k.map_state == MapState::Established;
         let keyframes = ids.iter().filter_map(|id| map.get(*id).filter(is_usable).cloned());
         let keyframes: Vec<Keyframe> = keyframes.collect();
-        let mut nodes: Vec<Node> = map.keyframes.iter().map(Node::of).collect();
+        let mut nodes: Vec<Keyframe> = map.keyframes.iter().map(Keyframe::without_depth).collect();
         nodes.sort_by_key(|node| node.keyframe_id);
         self.job = Some(Box::new(Job { plan, keyframes, nodes }));
         true
@@ -381,15 +375,4 @@ impl Loops {
 /// Pairs that must say what a loop says, within an epoch and between two.
 fn confirmations(is_one_epoch: bool) -> usize {
     if is_one_epoch { 1 } else { 2 }
-}
-
-impl Node {
-    fn of(keyframe: &Keyframe) -> Self {
-        Self {
-            keyframe_id: keyframe.keyframe_id,
-            epoch: keyframe.epoch,
-            map_from_keyframe: keyframe.map_from_keyframe,
-            covariance: keyframe.place_covariance,
-        }
-    }
 }

@@ -237,7 +237,7 @@ fn a_search_that_goes_on_from_what_was_kept_has_the_same_pose_graph() {
     let kept = course.loops.known().clone();
     assert!(!kept.links.is_empty() && kept.held_by.len() == 14, "{kept:?}");
     let keyframes = &course.map.keyframes;
-    let nodes: Vec<Node> = keyframes.iter().map(Node::of).collect();
+    let nodes: Vec<Keyframe> = keyframes.iter().map(Keyframe::without_depth).collect();
     let predicted = |loops: &Loops| {
         Chain::new(loops, &nodes, 0).unwrap().into_predictions().unwrap().of(0, 13).unwrap()
     };
