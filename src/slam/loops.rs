@@ -317,14 +317,9 @@ impl Loops {
         true
     }
 
-    /// Whether something was begun.
-    pub fn is_begun(&self) -> bool {
-        self.job.is_some()
-    }
-
-    /// Does what was begun.
-    pub fn run(&mut self) {
-        let Some(job) = self.job.take() else { return };
+    /// Does what was begun; false where nothing was.
+    pub fn run(&mut self) -> bool {
+        let Some(job) = self.job.take() else { return false };
         let of = job.plan.of;
         let other = match &job.plan.stage {
             Stage::Search => job.plan.pairs.first().map(|pair| pair.j),
@@ -345,6 +340,7 @@ impl Loops {
         let keyframe_id = of;
         let report = SearchReport { keyframe_id, other, likeness, compared, fate, measured };
         self.report = Some(report);
+        true
     }
 
     /// What the last search came to: told once.

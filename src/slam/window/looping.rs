@@ -35,12 +35,11 @@ impl Window {
 
     /// Does a search that was begun; false where none was.
     pub(super) fn search_begun(&mut self) -> bool {
-        let is_begun = self.loops.is_begun();
-        if is_begun {
-            self.loops.run();
+        let is_done = self.loops.run();
+        if is_done {
             self.plan_search(self.num_unsettled());
         }
-        is_begun
+        is_done
     }
 
     /// Tells what the keyframes of the map look like.
