@@ -111,7 +111,8 @@ pub struct Window {
     reconsiders: bool,
     pass: Pass,
     refinement: Refinement,
-    loops: Loops,
+    /// The search for loops: whoever has something for it, or asks it, speaks to it.
+    pub(crate) loops: Loops,
     /// The epoch whose start was found to be wrong.
     refuted_epoch: Option<u32>,
     /// The epoch whose start was found to be right.

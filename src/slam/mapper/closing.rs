@@ -29,12 +29,14 @@ impl Mapper {
 
     /// The search for loops continues with what is known of the map.
     pub(super) fn take_up_loops(&mut self) {
-        self.window.iter_mut().for_each(|window| window.take_up_loops(&self.map));
+        if let Some(window) = &mut self.window {
+            window.loops.take_up(Arc::clone(&self.map.loops), &self.map.keyframes);
+        }
     }
 
     /// The keyframes that were estimated, or searched, are here again; what is known of loops then is the map's.
     pub(super) fn put_back(&mut self, window: Box<Window>) {
-        self.map.loops = Arc::clone(window.known_loops());
+        self.map.loops = Arc::clone(window.loops.known());
         self.window = Some(window);
     }
 
@@ -162,7 +164,7 @@ mod tests {
         assert_eq!(checkpoint.loops.links, [link]);
         let mut other = Mapper::new(CAMERA, MapperParams::default()).unwrap();
         other.resume(checkpoint.over(Map::default()));
-        assert_eq!(other.window.as_ref().unwrap().known_loops().links, [link]);
+        assert_eq!(other.window.as_ref().unwrap().loops.known().links, [link]);
     }
 
     #[test]

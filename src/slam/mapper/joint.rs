@@ -57,7 +57,7 @@ impl Mapper {
         let mut window = self.window.take()?;
         window.take_mature(&mut self.depth.maturing.left);
         let is_new = window.take_in(&self.map, active);
-        window.tell_looks(&self.map);
+        window.loops.offer(&self.map.keyframes);
         Some((window, is_new))
     }
 
@@ -68,7 +68,7 @@ impl Mapper {
             self.put_back(window);
             return StepOutcome { graph_changed, ..Default::default() };
         }
-        if let Some(closure) = window.take_closure() {
+        if let Some(closure) = window.loops.take_closure() {
             let outcome = self.close_loop(&closure, &mut window);
             self.put_back(window);
             return outcome;
@@ -224,7 +224,7 @@ impl Mapper {
         drop(window.take_placed());
         window.leave_unrefined();
         window.repeat_piece();
-        window.repeat_closure();
+        window.loops.repeat_closure();
         self.doubt.take_back();
         self.put_back(window);
     }
