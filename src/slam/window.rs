@@ -106,15 +106,16 @@ pub struct Window {
     /// How uncertain those are.
     marginals: Vec<Marginal>,
     frames: WindowFrames,
-    is_last: bool,
-    /// Whether the newest keyframes are all to be free in the next estimate.
-    reconsiders: bool,
+    /// Whether there are no more frames: the next estimate is of all keyframes, and of all frames that wait.
+    pub(super) is_last: bool,
+    /// Whether the map contradicts itself: the next estimate is of the newest keyframes with all of them free.
+    pub(super) reconsiders: bool,
     pass: Pass,
     refinement: Refinement,
     /// The search for loops: whoever has something for it, or asks it, speaks to it.
     pub(crate) loops: Loops,
-    /// The epoch whose start was found to be wrong.
-    refuted_epoch: Option<u32>,
+    /// The epoch whose start the last estimate has refuted.
+    pub(super) refuted_epoch: Option<u32>,
     /// The epoch whose start was found to be right.
     confirmed_epoch: Option<u32>,
 }
@@ -229,21 +230,6 @@ impl Window {
     /// A keyframe's place in the list, which is in the order of their creation.
     fn index_of(&self, keyframe_id: u64) -> Option<usize> {
         self.keyframes.binary_search_by_key(&keyframe_id, |of| of.keyframe_id).ok()
-    }
-
-    /// The epoch whose start the last estimate has refuted: told once.
-    pub fn take_refuted_epoch(&mut self) -> Option<u32> {
-        self.refuted_epoch.take()
-    }
-
-    /// From now on there are no more frames: the next estimate is of all keyframes, and of all frames that wait.
-    pub fn conclude(&mut self) {
-        self.is_last = true;
-    }
-
-    /// The map contradicts itself: the next estimate is of the newest keyframes with all of them free.
-    pub fn reconsider(&mut self) {
-        self.reconsiders = true;
     }
 
     /// Estimates the newest keyframes and all points that they and older ones see; `None` where there is too little.

@@ -24,9 +24,7 @@ impl Mapper {
         let is_mapping = matches!(self.phase, Phase::Mapping);
         let active = self.keyframe().map(|keyframe| keyframe.keyframe_id);
         let is_doubted = self.doubt.hand_over();
-        if is_doubted {
-            window.reconsider();
-        }
+        window.reconsiders |= is_doubted;
         let is_begun = match active {
             _ if is_new || is_doubted => {
                 window.take_frames(&mut self.tracked);
@@ -112,7 +110,7 @@ impl Mapper {
 
     /// Rejects the epoch that is mapped where the estimate has refuted its start.
     fn reject_refuted(&mut self, window: &mut Window) -> Option<StepOutcome> {
-        let refuted = window.take_refuted_epoch()?;
+        let refuted = window.refuted_epoch.take()?;
         let is_mapped = self.keyframe()?.epoch == refuted;
         if !(is_mapped && matches!(self.phase, Phase::Mapping | Phase::Lost(_))) {
             return None;
@@ -128,7 +126,7 @@ impl Mapper {
     pub fn begin_last_adjustment(&mut self) -> Option<Box<Window>> {
         let (mut window, _) = self.take_window()?;
         window.take_frames(&mut self.tracked);
-        window.conclude();
+        window.is_last = true;
         Some(window)
     }
 
