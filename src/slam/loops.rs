@@ -23,7 +23,7 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::graph::constraint::Refusal;
-use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::keyframe::Keyframe;
 use crate::slam::loops::likeness::Likeness;
 use crate::slam::map::Map;
 use crate::slam::parameter::{ParameterError, check_range};
@@ -308,8 +308,8 @@ impl Loops {
     pub fn begin(&mut self, map: &Map) -> bool {
         let Some(plan) = self.plan.take() else { return false };
         let ids: BTreeSet<u64> = plan.pairs.iter().flat_map(|pair| [pair.i, pair.j]).collect();
-        let is_usable = |k: &&Keyframe| k.has_depth() && k.map_state == MapState::Established;
-        let keyframes = ids.iter().filter_map(|id| map.get(*id).filter(is_usable).cloned());
+        let keyframes =
+            ids.iter().filter_map(|id| map.get(*id).filter(|of| of.is_usable()).cloned());
         let keyframes: Vec<Keyframe> = keyframes.collect();
         let mut nodes: Vec<Keyframe> = map.keyframes.iter().map(Keyframe::without_depth).collect();
         nodes.sort_by_key(|node| node.keyframe_id);

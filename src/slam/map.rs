@@ -12,7 +12,7 @@ use crate::slam::depth::matching::is_inside;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
-use crate::slam::keyframe::{DepthPoint, Keyframe};
+use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
 use crate::slam::loops::known::KnownLoops;
 use crate::slam::modes::ModeCovariance;
 use crate::slam::place_covariance::PlaceCovariance;
@@ -347,6 +347,11 @@ impl Keyframe {
     /// Whether it has image and depth: the oldest of a large map keep only their poses.
     pub fn has_depth(&self) -> bool {
         !self.image.is_empty() && !self.points.is_empty()
+    }
+
+    /// Whether it can be compared with others: it has image and depth that can be trusted.
+    pub fn is_usable(&self) -> bool {
+        self.has_depth() && self.map_state == MapState::Established
     }
 
     /// The same without image, its description and points.

@@ -42,7 +42,7 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::shared::SharedImage;
-use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::keyframe::Keyframe;
 use crate::slam::loops::{LoopParams, Loops};
 use crate::slam::map::Map;
 use crate::slam::window::candidates::{Candidates, MaturePoints};
@@ -153,8 +153,7 @@ impl Window {
         self.pass.leave_piece();
         // What a mapper that died has left is where it was estimated to be.
         let is_resumed = self.keyframes.is_empty() && map.keyframes.len() > 1;
-        let is_held = |k: &&Keyframe| k.has_depth() && k.map_state == MapState::Established;
-        let held: Vec<&Keyframe> = map.keyframes.iter().filter(is_held).collect();
+        let held: Vec<&Keyframe> = map.keyframes.iter().filter(|of| of.is_usable()).collect();
         let mut ids: Vec<u64> = held.iter().map(|keyframe| keyframe.keyframe_id).collect();
         ids.sort_unstable();
         let is_known = |id: u64| ids.binary_search(&id).is_ok();

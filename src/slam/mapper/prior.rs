@@ -3,7 +3,7 @@
 
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::sim3::Sim3;
-use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::keyframe::Keyframe;
 use crate::slam::map::Map;
 use crate::slam::mapper::phase::{Active, Loss, Phase};
 use crate::slam::mapper::situation::Certainty;
@@ -74,8 +74,7 @@ impl Mapper {
         if let Some(foreign) = foreign {
             return Err(PriorError::Camera(foreign.keyframe_id));
         }
-        let is_usable = |of: &Keyframe| of.has_depth() && of.map_state == MapState::Established;
-        let is_empty = !map.keyframes.iter().any(is_usable);
+        let is_empty = !map.keyframes.iter().any(Keyframe::is_usable);
         let newest = |number: fn(&Keyframe) -> u64| map.keyframes.iter().map(number).max();
         self.revision = newest(|keyframe| keyframe.revision).unwrap_or(0);
         self.next_keyframe_id = newest(|keyframe| keyframe.keyframe_id).map_or(0, |id| id + 1);

@@ -137,8 +137,7 @@ fn shown_by(map: &Map, index: usize, reuse: &ReuseParams) -> Option<u64> {
     let is_near = |of: &&Keyframe| {
         of.keyframe_id != keyframe.keyframe_id
             && of.epoch == keyframe.epoch
-            && of.has_depth()
-            && of.map_state == MapState::Established
+            && of.is_usable()
             && distance(of) < REACH * place.scale
             && (of.map_from_keyframe.rigid.rotation * Vector3::z()).dot(&forward) > 0.0
     };
