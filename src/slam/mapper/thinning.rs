@@ -3,6 +3,8 @@
 //!
 //! Its pose stays and moves with that of a neighbour: frames that were tracked on it stay where they are in the map.
 
+use std::collections::BTreeMap;
+
 use nalgebra::Vector3;
 
 use crate::slam::depth::matching::is_inside;
@@ -33,16 +35,10 @@ const REACH: f64 = 0.5;
 /// Which keyframes have given up their depth, and what they move with.
 #[derive(Debug, Default)]
 pub(super) struct Thinning {
-    attached: Vec<Attached>,
+    /// By keyframe without depth the one that it moves with.
+    attached: BTreeMap<u64, u64>,
     /// The last one that was examined: the next is the one before.
     examined: Option<u64>,
-}
-
-/// A keyframe without depth that moves with another.
-#[derive(Debug, Clone, Copy)]
-struct Attached {
-    keyframe_id: u64,
-    to: u64,
 }
 
 impl Thinning {
@@ -50,30 +46,21 @@ impl Thinning {
     /// may have moved the two each for itself.
     pub fn follow(&self, map: &Map, correction: &Correction) -> Correction {
         let mut extended = correction.clone();
-        let mut places: Vec<(u64, Sim3)> =
+        let places: BTreeMap<u64, Sim3> =
             correction.keyframes.iter().map(|k| (k.keyframe_id, k.map_from_keyframe)).collect();
-        places.sort_unstable_by_key(|(id, _)| *id);
-        let find = |id: u64| {
-            let place = places.binary_search_by_key(&id, |(id, _)| *id).ok()?;
-            Some(places[place].1)
-        };
-        let followers = self.attached.iter().filter(|of| find(of.keyframe_id).is_none());
-        extended.keyframes.extend(followers.filter_map(|of| {
-            let moved = find(of.to)?;
-            let to = map.get(of.to)?.map_from_keyframe;
-            let keyframe = map.get(of.keyframe_id)?.map_from_keyframe;
-            let place = moved * to.inverse() * keyframe;
-            Some(KeyframeCorrection::of_place(of.keyframe_id, place))
+        let followers = self.attached.iter().filter(|(id, _)| !places.contains_key(id));
+        extended.keyframes.extend(followers.filter_map(|(&id, to)| {
+            let (was, keyframe) = (map.get(*to)?, map.get(id)?);
+            let by = *places.get(to)? * was.map_from_keyframe.inverse();
+            Some(KeyframeCorrection::of_place(id, by * keyframe.map_from_keyframe))
         }));
         extended
     }
 
     /// A keyframe moves with another from now on, and so does what moved with it.
     fn attach(&mut self, keyframe_id: u64, to: u64) {
-        for of in self.attached.iter_mut().filter(|of| of.to == keyframe_id) {
-            of.to = to;
-        }
-        self.attached.push(Attached { keyframe_id, to });
+        self.attached.values_mut().filter(|of| **of == keyframe_id).for_each(|of| *of = to);
+        self.attached.insert(keyframe_id, to);
     }
 
     /// The next places in the list of keyframes to be examined, newest first and round again.
