@@ -1,5 +1,6 @@
 //! Finds the camera on keyframes: by what they look like first, then by alignment.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use crate::slam::alignment::align::{Aligner, Alignment, AlignmentParams};
@@ -108,7 +109,8 @@ impl Finder {
         let seen = Appearance::of(pixels, camera.width, camera.height)?;
         self.learn(keyframes, MOST_LEARNT);
         let mut alike = self.alike(keyframes, active, &seen).into_iter();
-        let mut sharing = self.sharing(keyframes, active, pixels, params.num_keyframes).into_iter();
+        let most = params.num_keyframes;
+        let mut sharing = self.sharing(keyframes, active, &camera, pixels, most).into_iter();
         let doubted = self.doubted.take();
         let mut candidates: Vec<(usize, SE3)> = Vec::new();
         for _ in 0..params.num_keyframes {
@@ -148,28 +150,23 @@ impl Finder {
         &mut self,
         keyframes: &[Keyframe],
         active: Option<usize>,
+        camera: &Intrinsics,
         pixels: &[u8],
         most: usize,
     ) -> Vec<(usize, SE3)> {
-        let mut ids: Vec<(u64, usize)> = eligible(keyframes, active)
-            .map(|index| (keyframes[index].keyframe_id, index))
-            .collect();
-        ids.sort_unstable();
-        let index_of =
-            |id: u64| ids.binary_search_by_key(&id, |(id, _)| *id).ok().map(|known| ids[known].1);
-        let Some(camera) = keyframes.get(active.unwrap_or(0)).map(|of| of.intrinsics) else {
-            return Vec::new();
-        };
         let Some(seen) = self.describer.describe(pixels, camera.width, camera.height) else {
             return Vec::new();
         };
-        let found = self.places.candidates(&seen, most, |id| index_of(id).is_none());
+        let index_of: BTreeMap<u64, usize> = eligible(keyframes, active)
+            .map(|index| (keyframes[index].keyframe_id, index))
+            .collect();
+        let found = self.places.candidates(&seen, most, |id| !index_of.contains_key(&id));
         let found = found.into_iter().filter(|candidate| candidate.score >= LEAST_SHARED);
         let turned = |candidate: PlaceCandidate| {
-            let rotation = candidate.rotation(&camera);
-            Some((index_of(candidate.keyframe_id)?, SE3 { rotation, ..SE3::identity() }))
+            let rotation = candidate.rotation(camera);
+            (index_of[&candidate.keyframe_id], SE3 { rotation, ..SE3::identity() })
         };
-        found.filter_map(turned).collect()
+        found.map(turned).collect()
     }
 
     /// Keyframes that may be gone back to, those that look most like `seen` first, the newest of equals.
