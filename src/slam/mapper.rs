@@ -40,7 +40,7 @@ use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::map::Map;
 use crate::slam::mapper::change::Unfinished;
 use crate::slam::mapper::consistency::START_KEYFRAMES;
-use crate::slam::mapper::depth_buffers::DepthBuffers;
+use crate::slam::mapper::depth_buffers::{DepthBuffers, write_depth};
 use crate::slam::mapper::doubt::Doubt;
 use crate::slam::mapper::finder::Finder;
 use crate::slam::mapper::frame_copies::FrameCopies;
@@ -393,7 +393,7 @@ impl Mapper {
         self.publish_place();
         let Some(active) = &self.active else { return };
         let Some(keyframe) = self.map.keyframes.get_mut(active.index) else { return };
-        self.depth.write_into(keyframe);
+        write_depth(&self.depth.active, self.depth.unit, keyframe);
         keyframe.mode_covariance = self.modes.published(&self.params.modes);
     }
 

@@ -142,11 +142,6 @@ impl DepthBuffers {
     pub(super) fn leave_points(&mut self, keyframe_id: u64, params: &MapperParams) {
         self.maturing.leave(keyframe_id, &self.active.image, self.unit, &params.interval);
     }
-
-    /// Makes the active depth the points of its keyframe.
-    pub(super) fn write_into(&self, keyframe: &mut Keyframe) {
-        write_depth(&self.active, self.unit, keyframe);
-    }
 }
 
 /// Makes the hypotheses of `depth`, whose unit is so many of the keyframe's, the points of the keyframe.

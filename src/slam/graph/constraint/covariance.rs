@@ -29,7 +29,7 @@ pub(super) struct Scatter {
     quadratic: f64,
     by_modes: [ByModes; 2],
     /// Points that meet depth of j, and those whose depths agree.
-    depths: [u32; 2],
+    pub(super) depths: [u32; 2],
 }
 
 #[derive(Clone, Default)]
@@ -180,11 +180,6 @@ impl Scatter {
         let change = row[0] * t.x + row[1] * t.y + row[2] * t.z;
         let own = shape([terms.point.ray_x, terms.point.ray_y].map(f64::from), d) - centre;
         self.by_modes[0] += row * (weight * change) * own.transpose();
-    }
-
-    /// Points that meet depth of j, and those whose depths agree.
-    pub(super) fn depths(&self) -> [u32; 2] {
-        self.depths
     }
 
     /// How far the tiles agree.
