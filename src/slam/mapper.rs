@@ -100,6 +100,15 @@ impl StepOutcome {
     }
 }
 
+/// What a step takes in.
+#[derive(Debug, Clone, Copy)]
+struct StepInput<'a> {
+    frame: &'a FrameView<'a>,
+    pose: &'a PoseEstimate,
+    /// Metres, 0 where none.
+    sensor_depth: Option<&'a Image<f32>>,
+}
+
 /// Keeps the map.
 #[derive(Debug)]
 pub struct Mapper {
@@ -205,19 +214,14 @@ impl Mapper {
         let finished = self.finish_keyframe();
         self.start.last_frame = None;
         self.copies.begin_frame();
-        let outcome = self.take_in(frame, pose, sensor_depth, change_begins);
+        let outcome = self.take_in(&StepInput { frame, pose, sensor_depth }, change_begins);
         let is_told = self.tell_doubt();
         let keyframe_changed = outcome.keyframe_changed || finished.keyframe_changed || is_told;
         StepOutcome { keyframe_changed, ..outcome }
     }
 
-    fn take_in(
-        &mut self,
-        frame: &FrameView<'_>,
-        pose: &PoseEstimate,
-        sensor_depth: Option<&Image<f32>>,
-        change_begins: &mut dyn FnMut(),
-    ) -> StepOutcome {
+    fn take_in(&mut self, input: &StepInput<'_>, change_begins: &mut dyn FnMut()) -> StepOutcome {
+        let StepInput { frame, pose, .. } = *input;
         if !frame.is_consistent()
             || (frame.width, frame.height) != (self.intrinsics.width, self.intrinsics.height)
         {
@@ -227,9 +231,9 @@ impl Mapper {
             return match self.is_localising() {
                 true => {
                     self.follow_odometry(pose);
-                    self.recover(frame, pose, sensor_depth)
+                    self.recover(input)
                 }
-                false => self.begin(frame, pose, sensor_depth),
+                false => self.begin(input),
             };
         };
         let is_lost = matches!(pose.state, TrackingState::Lost(_));
@@ -240,18 +244,18 @@ impl Mapper {
         let is_turning = pose.state == TrackingState::Degraded(DegradedReason::Turning);
         let is_trusted = is_usable && keyframe.map_state == MapState::Established;
         if is_lost || !is_trusted {
-            return self.recover(frame, pose, sensor_depth);
+            return self.recover(input);
         }
         self.last_world_from_camera = Some(pose.world_from_camera);
         self.last_tracked = Some((pose.keyframe_id, pose.keyframe_from_camera));
         if is_turning {
-            return self.recover(frame, pose, sensor_depth);
+            return self.recover(input);
         }
         self.phase = Phase::Mapping;
         self.note_certainty(pose);
         match self.is_locating() {
             true => self.locate_frame(frame, pose),
-            false => self.extend(frame, pose, sensor_depth, change_begins),
+            false => self.extend(input, change_begins),
         }
     }
 
@@ -267,13 +271,8 @@ impl Mapper {
     }
 
     /// A tracked frame: observe, judge, then change the keyframe or remember the frame.
-    fn extend(
-        &mut self,
-        frame: &FrameView<'_>,
-        pose: &PoseEstimate,
-        sensor_depth: Option<&Image<f32>>,
-        change_begins: &mut dyn FnMut(),
-    ) -> StepOutcome {
+    fn extend(&mut self, input: &StepInput<'_>, change_begins: &mut dyn FnMut()) -> StepOutcome {
+        let StepInput { frame, pose, .. } = *input;
         self.keep_frame(frame, pose);
         self.guess_unit(&pose.keyframe_from_camera);
         let (unit, modes) = (self.depth.unit, &self.params.modes);
@@ -292,7 +291,7 @@ impl Mapper {
             change_begins();
             let is_reused = self.reuse_keyframe(frame, pose);
             if !is_reused {
-                self.change_keyframe(frame, pose, sensor_depth);
+                self.change_keyframe(input);
             }
             return StepOutcome {
                 keyframe_created: !is_reused,

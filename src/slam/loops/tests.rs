@@ -6,7 +6,7 @@ use crate::slam::geometry::sim3::Twist7;
 use crate::slam::graph::constraint::tests::{DepthError, USUAL, keyframe};
 use crate::slam::loops::chain::Chain;
 use crate::slam::map::Correction;
-use crate::slam::place_covariance::PlaceMatrix;
+use crate::slam::place_covariance::{PlaceCovariance, PlaceMatrix};
 use crate::slam::places::Describer;
 use crate::slam::test_scene::{Random, Scene};
 use nalgebra::Vector6;

@@ -9,14 +9,13 @@ use crate::slam::depth::matching::MatchingParams;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
-use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::mapper::consistency::judge_change;
 use crate::slam::mapper::depth_buffers::write_depth;
 use crate::slam::mapper::finder::MOST_LEARNT;
 use crate::slam::mapper::modes::in_unit;
 use crate::slam::mapper::start::take_sensor_depth;
-use crate::slam::mapper::{Mapper, StepOutcome};
+use crate::slam::mapper::{Mapper, StepInput, StepOutcome};
 use crate::slam::place_covariance::UncertainPlace;
 use crate::slam::pose::{Brightness, PoseEstimate, full_covariance};
 
@@ -38,13 +37,9 @@ pub(super) struct Unfinished {
 }
 
 impl Mapper {
-    /// Makes `frame`, tracked on the active keyframe, the next one: carries the depth over, smooths it, rescales.
-    pub(super) fn change_keyframe(
-        &mut self,
-        frame: &FrameView<'_>,
-        pose: &PoseEstimate,
-        sensor_depth: Option<&Image<f32>>,
-    ) {
+    /// Makes a frame, tracked on the active keyframe, the next one: carries the depth over, smooths it, rescales.
+    pub(super) fn change_keyframe(&mut self, input: &StepInput<'_>) {
+        let StepInput { frame, pose, sensor_depth } = *input;
         let (Some(active), Some(before)) = (self.active, self.keyframe()) else { return };
         let (epoch, map_from_before) = (before.epoch, before.map_from_keyframe);
         let place_covariance = before
@@ -225,6 +220,7 @@ impl Mapper {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::slam::image::buffer::Image;
     use crate::slam::keyframe::DepthPoint;
     use crate::slam::mapper::MapperParams;
     use crate::slam::mapper::depth_buffers::DepthBuffers;

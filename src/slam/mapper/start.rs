@@ -15,7 +15,7 @@ use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::mapper::doubt::Doubt;
 use crate::slam::mapper::phase::Phase;
 use crate::slam::mapper::situation::{StartFrame, StartProgress};
-use crate::slam::mapper::{Mapper, StepOutcome};
+use crate::slam::mapper::{Mapper, StepInput, StepOutcome};
 use crate::slam::parameter::ParameterError;
 use crate::slam::place_covariance::UncertainPlace;
 use crate::slam::pose::{PoseEstimate, TrackingState, upper_triangle};
@@ -113,12 +113,8 @@ impl Mapper {
     /// given, so the baselines will be true), else once two frames prove it. An epoch after
     /// the first begins where the camera was last known to be and in the unit of the last keyframe:
     /// nothing ties it to the one before, and who does not look at the epoch sees the smallest jump.
-    pub(super) fn begin(
-        &mut self,
-        frame: &FrameView<'_>,
-        pose: &PoseEstimate,
-        sensor_depth: Option<&Image<f32>>,
-    ) -> StepOutcome {
+    pub(super) fn begin(&mut self, input: &StepInput<'_>) -> StepOutcome {
+        let StepInput { frame, pose, sensor_depth } = *input;
         // After a map was rejected a pose on it may still come, which nobody has given.
         let is_given = pose.state.is_tracked() && matches!(self.phase, Phase::Starting);
         if sensor_depth.is_none() && !is_given {
@@ -237,7 +233,7 @@ impl Mapper {
             keyframe_id: self.next_keyframe_id - 1,
             ..proven_pose(frame, start, scale)
         };
-        self.change_keyframe(frame, &pose, None);
+        self.change_keyframe(&StepInput { frame, pose: &pose, sensor_depth: None });
         self.adopt_early_frames(&pose.keyframe_from_camera);
         StepOutcome { observations, ..StepOutcome::begun() }
     }

@@ -3,6 +3,7 @@
 use nalgebra::Vector6;
 
 use super::*;
+use crate::slam::frame::FrameView;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::map::{Correction, KeyframeCorrection, LogPlane};
 use crate::slam::mapper::MapperParams;
