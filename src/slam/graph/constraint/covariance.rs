@@ -11,7 +11,7 @@ use nalgebra::SMatrix;
 
 use super::ConstraintParams;
 use super::align::Sums;
-use super::residual::{Row, SCALE, State, Terms, UNKNOWNS};
+use super::residual::{Level, Row, SCALE, State, Terms, UNKNOWNS};
 use super::view::KeyframeView;
 use crate::slam::alignment::misfit::TileMisfit;
 use crate::slam::alignment::tiles::{NUM_TILES, TileSum, tile_of};
@@ -94,7 +94,7 @@ impl Scatter {
         state: &State,
         params: &ConstraintParams,
     ) -> Self {
-        let at = params.level(views, level, state, state);
+        let at = Level::new(views, level, state, state, params);
         let [i, j] = views.map(|view| &view.reference);
         let centres = [i, j].map(|reference| reference.level(level).centre());
         let intrinsics = i.intrinsics().at_level(level);

@@ -13,9 +13,10 @@
 
 use nalgebra::SVector;
 
+use super::ConstraintParams;
 use super::view::{DepthGrid, KeyframeView};
 use crate::slam::alignment::points::Point;
-use crate::slam::alignment::residual::{Evaluation, PointTerms, Weighting, point_terms};
+use crate::slam::alignment::residual::{Evaluation, PointTerms, point_terms};
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::buffer::Image;
@@ -140,9 +141,13 @@ impl<'a> Level<'a> {
         level: usize,
         state: &State,
         weighed_at: &State,
-        weighting: &Weighting,
-        depth_model_ratio: f64,
+        params: &ConstraintParams,
     ) -> Self {
+        let weighting = &params.alignment.weighting(level);
+        let depth_model_ratio = match level == i.levels().start {
+            true => params.depth_model_ratio,
+            false => params.coarse_depth_ratio,
+        };
         let intrinsics = i.reference.intrinsics().at_level(level);
         let (t, brightness) = (&weighed_at.rigid.translation, state.brightness);
         let at = Evaluation::new(&intrinsics, level, &state.rigid, brightness, weighting, t);

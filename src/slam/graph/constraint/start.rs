@@ -4,7 +4,7 @@ use nalgebra::{UnitQuaternion, Vector3, Vector6};
 
 use super::ConstraintParams;
 use super::align::solve_level;
-use super::residual::State;
+use super::residual::{Level, State};
 use super::view::KeyframeView;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
@@ -102,7 +102,7 @@ fn log_scale(
     state: &State,
     params: &ConstraintParams,
 ) -> f64 {
-    let at = params.level(views, level, state, state);
+    let at = Level::new(views, level, state, state, params);
     let depths = at.terms().filter_map(|terms| terms.depth);
     let mut residuals: Vec<f64> = depths.map(|depth| depth.residual).collect();
     state.log_scale + upper_median(&mut residuals, f64::total_cmp).unwrap_or(0.0)
