@@ -321,15 +321,10 @@ impl Loops {
     pub fn run(&mut self) -> bool {
         let Some(job) = self.job.take() else { return false };
         let of = job.plan.of;
-        let other = match &job.plan.stage {
-            Stage::Search => job.plan.pairs.first().map(|pair| pair.j),
-            Stage::Confirm(link) => Some(link.j),
-            Stage::Close { .. } => None,
-        };
-        let (compared, fate) = match &job.plan.stage {
-            Stage::Search => self.search(&job),
-            Stage::Confirm(link) => self.confirm(&job, link),
-            Stage::Close { num_newest } => (0, self.solve(&job, *num_newest)),
+        let (other, (compared, fate)) = match &job.plan.stage {
+            Stage::Search => (job.plan.pairs.first().map(|pair| pair.j), self.search(&job)),
+            Stage::Confirm(link) => (Some(link.j), self.confirm(&job, link)),
+            Stage::Close { num_newest } => (None, (0, self.solve(&job, *num_newest))),
         };
         if fate != SearchFate::Proposed && self.known.searched_to.is_none_or(|to| to < of) {
             self.searched(of);
@@ -338,8 +333,7 @@ impl Loops {
         self.fruitless = is_fruitless.then_some(of);
         let (measured, likeness) = (self.measured.take(), job.plan.likeness);
         let keyframe_id = of;
-        let report = SearchReport { keyframe_id, other, likeness, compared, fate, measured };
-        self.report = Some(report);
+        self.report = Some(SearchReport { keyframe_id, other, likeness, compared, fate, measured });
         true
     }
 
