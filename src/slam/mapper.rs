@@ -340,11 +340,10 @@ impl Mapper {
         self.map
     }
 
-    /// Keyframes of the active epoch, counted up to one more than judge its start.
-    fn num_epoch_keyframes(&self) -> usize {
-        let Some(active) = self.keyframe() else { return 0 };
-        let of_epoch = self.map.keyframes.iter().rev().filter(|k| k.epoch == active.epoch);
-        of_epoch.take(START_KEYFRAMES + 1).count()
+    /// Whether an epoch has no more keyframes than those that judge its start.
+    fn is_young(&self, epoch: u32) -> bool {
+        let of_epoch = self.map.keyframes.iter().rev().filter(|k| k.epoch == epoch);
+        of_epoch.take(START_KEYFRAMES + 1).count() <= START_KEYFRAMES
     }
 
     fn num_points(&self) -> usize {

@@ -11,7 +11,7 @@ use crate::slam::depth::map::{DepthMap, Hypothesis};
 use crate::slam::depth::propagation::joined;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
-use crate::slam::mapper::consistency::{Contradiction, START_KEYFRAMES};
+use crate::slam::mapper::consistency::Contradiction;
 use crate::slam::mapper::doubt::Doubt;
 use crate::slam::mapper::phase::{Loss, Phase};
 use crate::slam::mapper::{Mapper, StepInput, StepOutcome};
@@ -188,8 +188,7 @@ impl Mapper {
             .collect();
         others.sort_by(|one, other| other.0.total_cmp(&one.0));
         others.truncate(MOST);
-        let of_epoch = self.map.keyframes.iter().filter(|keyframe| keyframe.epoch == epoch);
-        let is_young = of_epoch.take(START_KEYFRAMES + 1).count() <= START_KEYFRAMES;
+        let is_young = self.is_young(epoch);
         let mut agrees = |(_, other, expected): &(f64, usize, SE3)| {
             let keyframe = &self.map.keyframes[*other];
             self.finder.locate(keyframe, pixels, expected, by.max_disagreement).is_some()
