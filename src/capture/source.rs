@@ -128,11 +128,18 @@ pub trait FrameSource: Send {
         }
     }
 
-    /// Leaves out frames until the next one comes after `sequence`; none of a camera, whose numbers begin with
-    /// whoever opens it.
+    /// Leaves out frames until the next one comes after `sequence`.
     fn skip_to(&mut self, sequence: u64) -> Result<(), SourceError> {
-        let _ = sequence;
-        Ok(())
+        let k = self.intrinsics();
+        let mut pixels = vec![0; k.width * k.height];
+        loop {
+            match self.next_into(&mut pixels) {
+                Ok(Some(stamp)) if stamp.sequence < sequence => {}
+                Err(error) if error.is_passing() => {}
+                Err(error) => return Err(error),
+                Ok(_) => return Ok(()),
+            }
+        }
     }
 
     /// What a camera has lost so far; `None` for recordings, which lose nothing.

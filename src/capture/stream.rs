@@ -310,6 +310,11 @@ impl FrameSource for StreamSource {
         Ok(Some(stamp))
     }
 
+    fn skip_to(&mut self, _sequence: u64) -> Result<(), SourceError> {
+        // A sender's numbers begin with whoever takes them.
+        Ok(())
+    }
+
     fn losses(&self) -> Option<FrameLosses> {
         Some(self.losses)
     }

@@ -123,6 +123,11 @@ impl<S: VideoSystem> FrameSource for CameraSource<S> {
         })
     }
 
+    fn skip_to(&mut self, _sequence: u64) -> Result<(), SourceError> {
+        // A camera's numbers begin with whoever opens it.
+        Ok(())
+    }
+
     fn losses(&self) -> Option<FrameLosses> {
         Some(self.camera.losses())
     }

@@ -241,7 +241,7 @@ impl Adjustments {
         };
         self.away = None;
         let fate = fate(mapper, &away);
-        if let Some(report) = finished.window.take_search() {
+        if let Some(report) = finished.window.loops.take_report() {
             let (sequence, nanos) = (self.sequence, finished.nanos);
             self.searches.push(SearchRecord { sequence, nanos, report });
         }

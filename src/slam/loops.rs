@@ -23,11 +23,11 @@ use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::graph::constraint::Refusal;
-use crate::slam::keyframe::{Keyframe, MapState};
-use crate::slam::loops::likeness::{Alike, Likeness};
+use crate::slam::keyframe::Keyframe;
+use crate::slam::loops::likeness::Likeness;
 use crate::slam::map::Map;
 use crate::slam::parameter::{ParameterError, check_range};
-use crate::slam::place_covariance::PlaceCovariance;
+use crate::slam::places::PlaceCandidate;
 
 pub use closure::Closure;
 pub use known::{KnownLoops, Link};
@@ -127,35 +127,30 @@ struct Plan {
     likeness: f32,
 }
 
-/// A keyframe's place when a search began.
-#[derive(Debug, Clone, Copy)]
-struct Node {
-    keyframe_id: u64,
-    epoch: u32,
-    map_from_keyframe: Sim3,
-    covariance: PlaceCovariance,
-}
-
 /// A plan with copies of what it needs.
 #[derive(Debug, Clone)]
 struct Job {
     plan: Plan,
     /// In the order of their ids.
     keyframes: Vec<Keyframe>,
-    /// All of the map, in the order of their ids.
-    nodes: Vec<Node>,
+    /// All of the map without their depth, in the order of their ids.
+    nodes: Vec<Keyframe>,
 }
 
 impl Job {
     fn keyframe(&self, id: u64) -> Option<&Keyframe> {
-        let place = self.keyframes.binary_search_by_key(&id, |k| k.keyframe_id).ok()?;
-        self.keyframes.get(place)
+        find(&self.keyframes, id)
     }
 
-    fn node(&self, id: u64) -> Option<&Node> {
-        let place = self.nodes.binary_search_by_key(&id, |node| node.keyframe_id).ok()?;
-        self.nodes.get(place)
+    fn node(&self, id: u64) -> Option<&Keyframe> {
+        find(&self.nodes, id)
     }
+}
+
+/// The keyframe with an id, of some in the order of theirs.
+fn find(keyframes: &[Keyframe], id: u64) -> Option<&Keyframe> {
+    let place = keyframes.binary_search_by_key(&id, |keyframe| keyframe.keyframe_id).ok()?;
+    keyframes.get(place)
 }
 
 /// The search for loops and what it has found.
@@ -301,10 +296,9 @@ impl Loops {
         let open = known[..place].iter().zip(&is_open).filter(|(_, is_open)| **is_open);
         let open: Vec<u64> = open.map(|(id, _)| *id).collect();
         let LoopParams { num_candidates, min_features, .. } = self.params;
-        let camera = &self.intrinsics;
-        let alike = self.likeness.candidates(of, &open, num_candidates, min_features, camera);
-        let pair = |alike: Alike| {
-            let rigid = SE3 { rotation: alike.rotation, ..SE3::identity() };
+        let alike = self.likeness.candidates(of, &open, num_candidates, min_features);
+        let pair = |alike: PlaceCandidate| {
+            let rigid = SE3 { rotation: alike.rotation(&self.intrinsics), ..SE3::identity() };
             (Pair { i: of, j: alike.keyframe_id, j_from_i: Sim3::new(rigid, 1.0) }, alike.score)
         };
         alike.into_iter().map(pair).collect()
@@ -314,33 +308,23 @@ impl Loops {
     pub fn begin(&mut self, map: &Map) -> bool {
         let Some(plan) = self.plan.take() else { return false };
         let ids: BTreeSet<u64> = plan.pairs.iter().flat_map(|pair| [pair.i, pair.j]).collect();
-        let is_usable = |k: &&Keyframe| k.has_depth() && k.map_state == MapState::Established;
-        let keyframes = ids.iter().filter_map(|id| map.get(*id).filter(is_usable).cloned());
+        let keyframes =
+            ids.iter().filter_map(|id| map.get(*id).filter(|of| of.is_usable()).cloned());
         let keyframes: Vec<Keyframe> = keyframes.collect();
-        let mut nodes: Vec<Node> = map.keyframes.iter().map(Node::of).collect();
+        let mut nodes: Vec<Keyframe> = map.keyframes.iter().map(Keyframe::without_depth).collect();
         nodes.sort_by_key(|node| node.keyframe_id);
         self.job = Some(Box::new(Job { plan, keyframes, nodes }));
         true
     }
 
-    /// Whether something was begun.
-    pub fn is_begun(&self) -> bool {
-        self.job.is_some()
-    }
-
-    /// Does what was begun.
-    pub fn run(&mut self) {
-        let Some(job) = self.job.take() else { return };
+    /// Does what was begun; false where nothing was.
+    pub fn run(&mut self) -> bool {
+        let Some(job) = self.job.take() else { return false };
         let of = job.plan.of;
-        let other = match &job.plan.stage {
-            Stage::Search => job.plan.pairs.first().map(|pair| pair.j),
-            Stage::Confirm(link) => Some(link.j),
-            Stage::Close { .. } => None,
-        };
-        let (compared, fate) = match &job.plan.stage {
-            Stage::Search => self.search(&job),
-            Stage::Confirm(link) => self.confirm(&job, link),
-            Stage::Close { num_newest } => (0, self.solve(&job, *num_newest)),
+        let (other, (compared, fate)) = match &job.plan.stage {
+            Stage::Search => (job.plan.pairs.first().map(|pair| pair.j), self.search(&job)),
+            Stage::Confirm(link) => (Some(link.j), self.confirm(&job, link)),
+            Stage::Close { num_newest } => (None, (0, self.solve(&job, *num_newest))),
         };
         if fate != SearchFate::Proposed && self.known.searched_to.is_none_or(|to| to < of) {
             self.searched(of);
@@ -349,8 +333,8 @@ impl Loops {
         self.fruitless = is_fruitless.then_some(of);
         let (measured, likeness) = (self.measured.take(), job.plan.likeness);
         let keyframe_id = of;
-        let report = SearchReport { keyframe_id, other, likeness, compared, fate, measured };
-        self.report = Some(report);
+        self.report = Some(SearchReport { keyframe_id, other, likeness, compared, fate, measured });
+        true
     }
 
     /// What the last search came to: told once.
@@ -381,15 +365,4 @@ impl Loops {
 /// Pairs that must say what a loop says, within an epoch and between two.
 fn confirmations(is_one_epoch: bool) -> usize {
     if is_one_epoch { 1 } else { 2 }
-}
-
-impl Node {
-    fn of(keyframe: &Keyframe) -> Self {
-        Self {
-            keyframe_id: keyframe.keyframe_id,
-            epoch: keyframe.epoch,
-            map_from_keyframe: keyframe.map_from_keyframe,
-            covariance: keyframe.place_covariance,
-        }
-    }
 }

@@ -12,7 +12,7 @@ use crate::slam::depth::matching::is_inside;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
-use crate::slam::keyframe::{DepthPoint, Keyframe};
+use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
 use crate::slam::loops::known::KnownLoops;
 use crate::slam::modes::ModeCovariance;
 use crate::slam::place_covariance::PlaceCovariance;
@@ -151,6 +151,14 @@ pub enum CorrectionError {
     /// The unit is not finite, or not positive.
     #[error("the map's unit is to be changed by a factor that is not positive and finite")]
     Unit,
+}
+
+impl KeyframeCorrection {
+    /// A new place alone.
+    pub fn of_place(keyframe_id: u64, map_from_keyframe: Sim3) -> Self {
+        let depth = LogPlane::default();
+        Self { keyframe_id, map_from_keyframe, depth, modes: None, place: None }
+    }
 }
 
 impl LogPlane {
@@ -339,6 +347,11 @@ impl Keyframe {
     /// Whether it has image and depth: the oldest of a large map keep only their poses.
     pub fn has_depth(&self) -> bool {
         !self.image.is_empty() && !self.points.is_empty()
+    }
+
+    /// Whether it can be compared with others: it has image and depth that can be trusted.
+    pub fn is_usable(&self) -> bool {
+        self.has_depth() && self.map_state == MapState::Established
     }
 
     /// The same without image, its description and points.

@@ -40,7 +40,7 @@ use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::map::Map;
 use crate::slam::mapper::change::Unfinished;
 use crate::slam::mapper::consistency::START_KEYFRAMES;
-use crate::slam::mapper::depth_buffers::DepthBuffers;
+use crate::slam::mapper::depth_buffers::{DepthBuffers, write_depth};
 use crate::slam::mapper::doubt::Doubt;
 use crate::slam::mapper::finder::Finder;
 use crate::slam::mapper::frame_copies::FrameCopies;
@@ -74,6 +74,21 @@ pub struct StepOutcome {
 }
 
 impl StepOutcome {
+    /// A map has begun with its first keyframes.
+    fn begun() -> Self {
+        Self {
+            keyframe_created: true,
+            keyframe_changed: true,
+            graph_changed: true,
+            ..Self::default()
+        }
+    }
+
+    /// An earlier keyframe is active again.
+    fn restored(graph_changed: bool) -> Self {
+        Self { keyframe_restored: true, keyframe_changed: true, graph_changed, ..Self::default() }
+    }
+
     /// Whether the active keyframe is another one or another revision than before.
     pub fn needs_publishing(&self) -> bool {
         self.keyframe_created || self.keyframe_restored || self.keyframe_changed
@@ -83,6 +98,15 @@ impl StepOutcome {
     pub fn needs_image(&self) -> bool {
         self.keyframe_created || self.keyframe_restored
     }
+}
+
+/// What a step takes in.
+#[derive(Debug, Clone, Copy)]
+struct StepInput<'a> {
+    frame: &'a FrameView<'a>,
+    pose: &'a PoseEstimate,
+    /// Metres, 0 where none.
+    sensor_depth: Option<&'a Image<f32>>,
 }
 
 /// Keeps the map.
@@ -190,19 +214,14 @@ impl Mapper {
         let finished = self.finish_keyframe();
         self.start.last_frame = None;
         self.copies.begin_frame();
-        let outcome = self.take_in(frame, pose, sensor_depth, change_begins);
+        let outcome = self.take_in(&StepInput { frame, pose, sensor_depth }, change_begins);
         let is_told = self.tell_doubt();
         let keyframe_changed = outcome.keyframe_changed || finished.keyframe_changed || is_told;
         StepOutcome { keyframe_changed, ..outcome }
     }
 
-    fn take_in(
-        &mut self,
-        frame: &FrameView<'_>,
-        pose: &PoseEstimate,
-        sensor_depth: Option<&Image<f32>>,
-        change_begins: &mut dyn FnMut(),
-    ) -> StepOutcome {
+    fn take_in(&mut self, input: &StepInput<'_>, change_begins: &mut dyn FnMut()) -> StepOutcome {
+        let StepInput { frame, pose, .. } = *input;
         if !frame.is_consistent()
             || (frame.width, frame.height) != (self.intrinsics.width, self.intrinsics.height)
         {
@@ -212,9 +231,9 @@ impl Mapper {
             return match self.is_localising() {
                 true => {
                     self.follow_odometry(pose);
-                    self.recover(frame, pose, sensor_depth)
+                    self.recover(input)
                 }
-                false => self.begin(frame, pose, sensor_depth),
+                false => self.begin(input),
             };
         };
         let is_lost = matches!(pose.state, TrackingState::Lost(_));
@@ -224,18 +243,19 @@ impl Mapper {
         let is_usable = pose.world_from_camera.is_finite() && pose.keyframe_from_camera.is_finite();
         let is_turning = pose.state == TrackingState::Degraded(DegradedReason::Turning);
         let is_trusted = is_usable && keyframe.map_state == MapState::Established;
-        if is_turning && is_trusted {
-            self.last_world_from_camera = Some(pose.world_from_camera);
-            self.last_tracked = Some((pose.keyframe_id, pose.keyframe_from_camera));
+        if is_lost || !is_trusted {
+            return self.recover(input);
         }
-        if is_lost || is_turning || !is_trusted {
-            return self.recover(frame, pose, sensor_depth);
+        self.last_world_from_camera = Some(pose.world_from_camera);
+        self.last_tracked = Some((pose.keyframe_id, pose.keyframe_from_camera));
+        if is_turning {
+            return self.recover(input);
         }
         self.phase = Phase::Mapping;
         self.note_certainty(pose);
         match self.is_locating() {
             true => self.locate_frame(frame, pose),
-            false => self.extend(frame, pose, sensor_depth, change_begins),
+            false => self.extend(input, change_begins),
         }
     }
 
@@ -251,15 +271,8 @@ impl Mapper {
     }
 
     /// A tracked frame: observe, judge, then change the keyframe or remember the frame.
-    fn extend(
-        &mut self,
-        frame: &FrameView<'_>,
-        pose: &PoseEstimate,
-        sensor_depth: Option<&Image<f32>>,
-        change_begins: &mut dyn FnMut(),
-    ) -> StepOutcome {
-        self.last_world_from_camera = Some(pose.world_from_camera);
-        self.last_tracked = Some((pose.keyframe_id, pose.keyframe_from_camera));
+    fn extend(&mut self, input: &StepInput<'_>, change_begins: &mut dyn FnMut()) -> StepOutcome {
+        let StepInput { frame, pose, .. } = *input;
         self.keep_frame(frame, pose);
         self.guess_unit(&pose.keyframe_from_camera);
         let (unit, modes) = (self.depth.unit, &self.params.modes);
@@ -278,7 +291,7 @@ impl Mapper {
             change_begins();
             let is_reused = self.reuse_keyframe(frame, pose);
             if !is_reused {
-                self.change_keyframe(frame, pose, sensor_depth);
+                self.change_keyframe(input);
             }
             return StepOutcome {
                 keyframe_created: !is_reused,
@@ -327,11 +340,10 @@ impl Mapper {
         self.map
     }
 
-    /// Keyframes of the active epoch, counted up to one more than judge its start.
-    fn num_epoch_keyframes(&self) -> usize {
-        let Some(active) = self.keyframe() else { return 0 };
-        let of_epoch = self.map.keyframes.iter().rev().filter(|k| k.epoch == active.epoch);
-        of_epoch.take(START_KEYFRAMES + 1).count()
+    /// Whether an epoch has no more keyframes than those that judge its start.
+    fn is_young(&self, epoch: u32) -> bool {
+        let of_epoch = self.map.keyframes.iter().rev().filter(|k| k.epoch == epoch);
+        of_epoch.take(START_KEYFRAMES + 1).count() <= START_KEYFRAMES
     }
 
     fn num_points(&self) -> usize {
@@ -379,7 +391,7 @@ impl Mapper {
         self.publish_place();
         let Some(active) = &self.active else { return };
         let Some(keyframe) = self.map.keyframes.get_mut(active.index) else { return };
-        self.depth.write_into(keyframe);
+        write_depth(&self.depth.active, self.depth.unit, keyframe);
         keyframe.mode_covariance = self.modes.published(&self.params.modes);
     }
 

@@ -39,8 +39,10 @@ mod view;
 use std::sync::Arc;
 
 use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::se3::SE3;
+use crate::slam::geometry::sim3::Sim3;
 use crate::slam::image::shared::SharedImage;
-use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::keyframe::Keyframe;
 use crate::slam::loops::{LoopParams, Loops};
 use crate::slam::map::Map;
 use crate::slam::window::candidates::{Candidates, MaturePoints};
@@ -99,19 +101,21 @@ pub struct Window {
     /// Keyframes from here on have not been aligned.
     unaligned: Vec<u64>,
     solver: Solver,
-    /// Keyframes that moved last.
+    /// Keyframes that moved last, in the order of their ids.
     moved: Vec<u64>,
     /// How uncertain those are.
     marginals: Vec<Marginal>,
     frames: WindowFrames,
-    is_last: bool,
-    /// Whether the newest keyframes are all to be free in the next estimate.
-    reconsiders: bool,
+    /// Whether there are no more frames: the next estimate is of all keyframes, and of all frames that wait.
+    pub(super) is_last: bool,
+    /// Whether the map contradicts itself: the next estimate is of the newest keyframes with all of them free.
+    pub(super) reconsiders: bool,
     pass: Pass,
     refinement: Refinement,
-    loops: Loops,
-    /// The epoch whose start was found to be wrong.
-    refuted_epoch: Option<u32>,
+    /// The search for loops: whoever has something for it, or asks it, speaks to it.
+    pub(crate) loops: Loops,
+    /// The epoch whose start the last estimate has refuted.
+    pub(super) refuted_epoch: Option<u32>,
     /// The epoch whose start was found to be right.
     confirmed_epoch: Option<u32>,
 }
@@ -149,8 +153,7 @@ impl Window {
         self.pass.leave_piece();
         // What a mapper that died has left is where it was estimated to be.
         let is_resumed = self.keyframes.is_empty() && map.keyframes.len() > 1;
-        let is_held = |k: &&Keyframe| k.has_depth() && k.map_state == MapState::Established;
-        let held: Vec<&Keyframe> = map.keyframes.iter().filter(is_held).collect();
+        let held: Vec<&Keyframe> = map.keyframes.iter().filter(|of| of.is_usable()).collect();
         let mut ids: Vec<u64> = held.iter().map(|keyframe| keyframe.keyframe_id).collect();
         ids.sort_unstable();
         let is_known = |id: u64| ids.binary_search(&id).is_ok();
@@ -191,24 +194,32 @@ impl Window {
 
     /// Adds a keyframe; false where its image is not of the camera's size.
     fn add(&mut self, keyframe: &Keyframe) -> bool {
-        let (width, height) = (self.camera.width, self.camera.height);
-        let image = SharedImage::try_from_pixels(width, height, Arc::clone(&keyframe.image));
-        let Some(image) = image else { return false };
-        let id = keyframe.keyframe_id;
+        let Some(image) = self.image_of(Arc::clone(&keyframe.image)) else { return false };
+        let (id, Sim3 { rigid, scale }) = (keyframe.keyframe_id, keyframe.map_from_keyframe);
+        let mut added = WindowKeyframe::new(id, keyframe.epoch, image, rigid.inverse(), scale);
+        added.surface = Surface::of(&keyframe.points, &self.camera);
         let place = self.keyframes.partition_point(|of| of.keyframe_id < id);
-        let added = WindowKeyframe {
-            keyframe_id: id,
-            epoch: keyframe.epoch,
-            images: vec![image],
-            camera_from_map: keyframe.map_from_keyframe.rigid.inverse(),
-            unit: keyframe.map_from_keyframe.scale,
-            points: Vec::new(),
-            is_host: false,
-            agreed: Vec::new(),
-            surface: Surface::of(&keyframe.points, &self.camera),
-        };
         self.keyframes.insert(place, added);
         true
+    }
+
+    /// The image of so many pixels; `None` where it is not of the camera's size.
+    fn image_of(&self, pixels: Arc<[u8]>) -> Option<SharedImage> {
+        SharedImage::try_from_pixels(self.camera.width, self.camera.height, pixels)
+    }
+
+    /// Adds a camera that is no keyframe, the last of them for as long as it is asked about, in the unit of a keyframe;
+    /// `None` where its image is not of the camera's size.
+    fn push_camera(
+        &mut self,
+        epoch: u32,
+        pixels: Arc<[u8]>,
+        camera_from_map: SE3,
+        unit: f64,
+    ) -> Option<()> {
+        let image = self.image_of(pixels)?;
+        self.keyframes.push(WindowKeyframe::new(u64::MAX, epoch, image, camera_from_map, unit));
+        Some(())
     }
 
     fn get(&self, keyframe_id: u64) -> Option<&WindowKeyframe> {
@@ -220,29 +231,13 @@ impl Window {
         self.keyframes.binary_search_by_key(&keyframe_id, |of| of.keyframe_id).ok()
     }
 
-    /// The epoch whose start the last estimate has refuted: told once.
-    pub fn take_refuted_epoch(&mut self) -> Option<u32> {
-        self.refuted_epoch.take()
-    }
-
-    /// From now on there are no more frames: the next estimate is of all keyframes, and of all frames that wait.
-    pub fn conclude(&mut self) {
-        self.is_last = true;
-    }
-
-    /// The map contradicts itself: the next estimate is of the newest keyframes with all of them free.
-    pub fn reconsider(&mut self) {
-        self.reconsiders = true;
-    }
-
     /// Estimates the newest keyframes and all points that they and older ones see; `None` where there is too little.
     pub fn optimise(&mut self) -> Option<Adjustment> {
         if self.refine_begun() || self.search_begun() || self.frames_begun() {
             return None;
         }
         let mut is_new = false;
-        while let Some(&id) = self.unaligned.first() {
-            self.unaligned.remove(0);
+        for id in std::mem::take(&mut self.unaligned) {
             let Some(index) = self.index_of(id) else { continue };
             self.choose_points_before(index);
             self.align(index);
@@ -291,12 +286,8 @@ impl Window {
     /// Chooses points in the keyframes before one, whose depth is final for now.
     fn choose_points_before(&mut self, index: usize) {
         let newest = self.keyframes[index].keyframe_id;
-        let (ready, wait) = std::mem::take(&mut self.candidates)
-            .into_iter()
-            .partition(|of| of.keyframe_id < newest);
-        self.candidates = wait;
-        let ready: Vec<Candidates> = ready;
-        for candidates in ready {
+        let ready = self.candidates.extract_if(.., |of| of.keyframe_id < newest);
+        for candidates in ready.collect::<Vec<_>>() {
             let Some(host) = self.index_of(candidates.keyframe_id) else { continue };
             self.become_host(host, &candidates);
         }
@@ -344,7 +335,7 @@ impl Window {
         let last = members.len() - 1;
         let free: Vec<_> = (0..members.len()).map(|k| (k == last).then_some(0)).collect();
         let members = Members { members, free: &free, depths_are_free: false };
-        self.run(&members, levels, iterations, |_, observer| observer == last)
+        self.run(&members, levels, iterations)
     }
 
     fn adjust(&mut self, chosen: &Chosen) -> Option<Adjustment> {
@@ -366,25 +357,25 @@ impl Window {
         self.thin_out(&chosen.members);
         self.solver.iterations = 0;
         let unit = Unit::of(&self.keyframes, &members);
-        if !self.run(&members, &ADJUSTED_LEVELS, iterations, |_, _| true) {
+        if !self.run(&members, &ADJUSTED_LEVELS, iterations) {
             return None;
         }
         self.note_agreement(&chosen.members);
         let mut found =
             marginals::marginals(&self.keyframes, &members, &mut self.solver, &self.camera);
-        // They are in the unit of the equations.
+        // Places are in the unit of the equations; modes have none.
         let restored = unit.and_then(|unit| unit.restore(&mut self.keyframes, members.members));
         if let Some(by) = restored {
-            found.iter_mut().for_each(|of| of.transport(&by));
+            let places = found.iter_mut().filter_map(|of| of.place.as_mut());
+            places.for_each(|place| place.transport(&by));
         }
-        self.keep_marginals(&members, found);
-        let moved = members
-            .members
-            .iter()
-            .zip(members.free)
-            .filter(|(_, free)| free.is_some())
-            .map(|(&index, _)| self.keyframes[index].keyframe_id);
+        let free = members.members.iter().zip(members.free).filter(|(_, free)| free.is_some());
+        let moved: Vec<u64> = free.map(|(&index, _)| self.keyframes[index].keyframe_id).collect();
+        self.marginals.retain(|known| !moved.contains(&known.keyframe_id));
+        self.marginals.extend(found);
         self.moved.extend(moved);
+        self.moved.sort_unstable();
+        self.moved.dedup();
         let points = self.confirm(&members);
         let system = &self.solver.system;
         Some(Adjustment {
@@ -419,13 +410,7 @@ impl Window {
     }
 
     /// Adjusts what is free, level by level; false where something is not determined.
-    fn run(
-        &mut self,
-        members: &Members<'_>,
-        levels: &[usize],
-        iterations: u32,
-        mut may: impl FnMut(usize, usize) -> bool,
-    ) -> bool {
+    fn run(&mut self, members: &Members<'_>, levels: &[usize], iterations: u32) -> bool {
         for &index in members.members {
             self.keyframes[index].take_part(&self.camera);
         }
@@ -434,7 +419,7 @@ impl Window {
         levels.iter().filter(|&&level| level <= finest).all(|&level| {
             let at = Level { camera: &self.camera, level, robustness };
             let views = &mut self.solver.views;
-            views.find(&self.keyframes, members.members, &self.camera, &mut may);
+            views.find(&self.keyframes, members, &self.camera);
             views.look(&self.keyframes, members.members, level);
             let converged = self.params.converged_decrement;
             self.solver.adjust(&mut self.keyframes, members, &at, iterations, converged)

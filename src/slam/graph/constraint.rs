@@ -171,7 +171,7 @@ impl ConstraintSolver {
         let scatter = covariance::Scatter::measure(views, finest, &state, params);
         let covariance =
             scatter.covariance(views, &sums, &state, params).ok_or(Refusal::Undetermined)?;
-        let [met, agreeing] = scatter.depths();
+        let [met, agreeing] = scatter.depths;
         // Noise of single depths moves single points by a pixel, and fine texture would not correlate.
         let judged = (finest + 1).min(i.levels().end - 1);
         let compared = f64::from(sums.compared);

@@ -12,8 +12,9 @@ use crate::slam::graph::marginal::Marginals;
 use crate::slam::graph::pose_graph::{Constraint, PoseGraph, VertexId};
 use crate::slam::graph::robust::RobustKernel;
 use crate::slam::graph::{GraphParams, normalized_errors};
+use crate::slam::keyframe::Keyframe;
+use crate::slam::loops::Loops;
 use crate::slam::loops::known::Link;
-use crate::slam::loops::{Loops, Node};
 use crate::slam::place_covariance::PlaceCovariance;
 
 /// Standard deviations of a link: no less than this, whatever an estimate claims, and that of a keyframe that was not
@@ -34,8 +35,8 @@ pub(super) struct Chain {
 
 impl Chain {
     /// Of the epoch's nodes, in the order of their ids, with the loops that were found; `None` where a number is broken.
-    pub(super) fn new(loops: &Loops, nodes: &[Node], epoch: u32) -> Option<Self> {
-        let of_epoch: Vec<&Node> = nodes.iter().filter(|node| node.epoch == epoch).collect();
+    pub(super) fn new(loops: &Loops, nodes: &[Keyframe], epoch: u32) -> Option<Self> {
+        let of_epoch: Vec<&Keyframe> = nodes.iter().filter(|node| node.epoch == epoch).collect();
         let mut graph = PoseGraph::new();
         let mut vertices = BTreeMap::new();
         let mut ids = Vec::new();
@@ -51,14 +52,14 @@ impl Chain {
                 of_epoch.get(at.ok()?)
             };
             let known = loops.known.held_by.get(&node.keyframe_id).into_iter().flatten();
-            let mut others: Vec<&Node> = known.filter_map(of).copied().collect();
+            let mut others: Vec<&Keyframe> = known.filter_map(of).copied().collect();
             let is_estimated = !others.is_empty();
             if !is_estimated && !loops.known.beginnings.contains(&node.keyframe_id) {
                 others.push(of_epoch[place - 1]);
             }
             let covariance = link_covariance(
                 &node.map_from_keyframe,
-                is_estimated.then_some(&node.covariance),
+                is_estimated.then_some(&node.place_covariance),
                 loops.params.drift_inflation,
             ) * others.len() as f64;
             for other in others {

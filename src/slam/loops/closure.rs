@@ -4,10 +4,11 @@ use std::sync::Arc;
 
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::graph::{GraphParams, optimise};
+use crate::slam::keyframe::Keyframe;
 use crate::slam::loops::chain::Chain;
 use crate::slam::loops::known::Link;
 use crate::slam::loops::search::LARGEST_CHI2;
-use crate::slam::loops::{Job, Loops, Node, SearchFate};
+use crate::slam::loops::{Job, Loops, SearchFate};
 use crate::slam::map::EpochJoin;
 
 /// How the map is to be moved.
@@ -53,7 +54,7 @@ impl Loops {
         }
     }
 
-    fn join(&mut self, job: &Job, link: &Link, [i, j]: [&Node; 2]) -> SearchFate {
+    fn join(&mut self, job: &Job, link: &Link, [i, j]: [&Keyframe; 2]) -> SearchFate {
         let is_newer = i.epoch > j.epoch;
         let (newer, older) = if is_newer { (i, j) } else { (j, i) };
         let j_from_i = link.j_from_i;

@@ -3,9 +3,6 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use nalgebra::UnitQuaternion;
-
-use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::places::{Description, PlaceCandidate, PlaceIndex};
 
@@ -19,16 +16,6 @@ pub(super) struct Likeness {
     offered: Vec<(u64, Arc<Description>)>,
     /// Of those that are still to be looked for.
     waiting: BTreeMap<u64, Arc<Description>>,
-}
-
-/// A keyframe that looks like another.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Alike {
-    pub(super) keyframe_id: u64,
-    /// Features that both show, in the same arrangement.
-    pub(super) score: f32,
-    /// How it is turned: `candidate_from_keyframe`.
-    pub(super) rotation: UnitQuaternion<f64>,
 }
 
 impl Likeness {
@@ -71,8 +58,7 @@ impl Likeness {
         among: &[u64],
         most: usize,
         least: f32,
-        camera: &Intrinsics,
-    ) -> Vec<Alike> {
+    ) -> Vec<PlaceCandidate> {
         /// Places in the list within which two show the same.
         const BESIDE: usize = 3;
         let Some(description) = self.waiting.get(&of) else { return Vec::new() };
@@ -80,16 +66,14 @@ impl Likeness {
         // As many again as can be beside one.
         let most_found = most * (2 * BESIDE + 1);
         let found = self.index.candidates(description, most_found, |id| place(id).is_none());
-        let mut chosen: Vec<(usize, Alike)> = Vec::new();
+        let mut chosen: Vec<(usize, PlaceCandidate)> = Vec::new();
         for candidate in found.into_iter().filter(|of| of.score >= least) {
             let Some(at) = place(candidate.keyframe_id) else { continue };
             if chosen.len() < most && chosen.iter().all(|(other, _)| other.abs_diff(at) > BESIDE) {
-                let PlaceCandidate { keyframe_id, score, .. } = candidate;
-                let rotation = candidate.rotation(camera);
-                chosen.push((at, Alike { keyframe_id, score, rotation }));
+                chosen.push((at, candidate));
             }
         }
-        chosen.into_iter().map(|(_, alike)| alike).collect()
+        chosen.into_iter().map(|(_, candidate)| candidate).collect()
     }
 }
 
@@ -119,12 +103,12 @@ mod tests {
             }]);
         }
         likeness.enter(&[1, 5, 9]);
-        let found = likeness.candidates(9, &[1, 5], 3, 10.0, &CAMERA);
+        let found = likeness.candidates(9, &[1, 5], 3, 10.0);
         assert_eq!(found.iter().map(|of| of.keyframe_id).collect::<Vec<_>>(), [1]);
-        let error = found[0].rotation.angle_to(&turned.rotation);
+        let error = found[0].rotation(&CAMERA).angle_to(&turned.rotation);
         assert!(error < 0.12, "{error}");
         likeness.enter(&[5, 9]);
-        assert!(likeness.candidates(9, &[1, 5], 3, 10.0, &CAMERA).is_empty(), "1 is gone");
+        assert!(likeness.candidates(9, &[1, 5], 3, 10.0).is_empty(), "1 is gone");
         likeness.forget(9);
         assert!(likeness.waiting.is_empty() && likeness.offered.is_empty());
     }

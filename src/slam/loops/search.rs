@@ -112,7 +112,7 @@ impl Loops {
         let of_link = |id| {
             let node = job.node(id)?;
             let inflation = self.params.drift_inflation;
-            Some(link_covariance(&node.map_from_keyframe, Some(&node.covariance), inflation))
+            Some(link_covariance(&node.map_from_keyframe, Some(&node.place_covariance), inflation))
         };
         let (Some(of_near_i), Some(of_near_j)) = (of_link(confirmation.i), of_link(confirmation.j))
         else {

@@ -6,7 +6,7 @@ use crate::slam::geometry::sim3::Twist7;
 use crate::slam::graph::constraint::tests::{DepthError, USUAL, keyframe};
 use crate::slam::loops::chain::Chain;
 use crate::slam::map::Correction;
-use crate::slam::place_covariance::PlaceMatrix;
+use crate::slam::place_covariance::{PlaceCovariance, PlaceMatrix};
 use crate::slam::places::Describer;
 use crate::slam::test_scene::{Random, Scene};
 use nalgebra::Vector6;
@@ -237,7 +237,7 @@ fn a_search_that_goes_on_from_what_was_kept_has_the_same_pose_graph() {
     let kept = course.loops.known().clone();
     assert!(!kept.links.is_empty() && kept.held_by.len() == 14, "{kept:?}");
     let keyframes = &course.map.keyframes;
-    let nodes: Vec<Node> = keyframes.iter().map(Node::of).collect();
+    let nodes: Vec<Keyframe> = keyframes.iter().map(Keyframe::without_depth).collect();
     let predicted = |loops: &Loops| {
         Chain::new(loops, &nodes, 0).unwrap().into_predictions().unwrap().of(0, 13).unwrap()
     };

@@ -6,17 +6,16 @@ use std::sync::Arc;
 use crate::slam::depth::epipolar::TwoView;
 use crate::slam::depth::gaussian::{ObservedPixels, Observer, observe};
 use crate::slam::depth::matching::MatchingParams;
-use crate::slam::depth::propagation::propagate;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
-use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::mapper::consistency::judge_change;
 use crate::slam::mapper::depth_buffers::write_depth;
+use crate::slam::mapper::finder::MOST_LEARNT;
 use crate::slam::mapper::modes::in_unit;
 use crate::slam::mapper::start::take_sensor_depth;
-use crate::slam::mapper::{Mapper, StepOutcome};
+use crate::slam::mapper::{Mapper, StepInput, StepOutcome};
 use crate::slam::place_covariance::UncertainPlace;
 use crate::slam::pose::{Brightness, PoseEstimate, full_covariance};
 
@@ -38,13 +37,9 @@ pub(super) struct Unfinished {
 }
 
 impl Mapper {
-    /// Makes `frame`, tracked on the active keyframe, the next one: carries the depth over, smooths it, rescales.
-    pub(super) fn change_keyframe(
-        &mut self,
-        frame: &FrameView<'_>,
-        pose: &PoseEstimate,
-        sensor_depth: Option<&Image<f32>>,
-    ) {
+    /// Makes a frame, tracked on the active keyframe, the next one: carries the depth over, smooths it, rescales.
+    pub(super) fn change_keyframe(&mut self, input: &StepInput<'_>) {
+        let StepInput { frame, pose, sensor_depth } = *input;
         let (Some(active), Some(before)) = (self.active, self.keyframe()) else { return };
         let (epoch, map_from_before) = (before.epoch, before.map_from_keyframe);
         let place_covariance = before
@@ -58,7 +53,11 @@ impl Mapper {
         let (unit, is_unit_open) = (self.depth.unit, self.depth.is_unit_open);
         let frame_from_before = in_unit(&pose.keyframe_from_camera, unit);
         self.modes.carry(&frame_from_before, &self.intrinsics, &self.params.modes);
-        self.carry_over(frame.pixels, &pose.keyframe_from_camera, pose.brightness);
+        self.depth.swap();
+        self.depth.restart(frame.pixels, &self.params);
+        let (brightness, propagation) = (pose.brightness, &self.params.propagation);
+        self.depth.carry(&frame_from_before, brightness, &self.intrinsics, propagation);
+        self.past.rebase(brightness);
         let map_from_frame = map_from_before.place(&pose.keyframe_from_camera);
         let carried_unit = map_from_before.scale * unit;
         if let Some(sensor) = sensor_depth {
@@ -105,34 +104,11 @@ impl Mapper {
         let (min_gradient, most) = (self.params.min_gradient, self.params.max_candidates);
         self.depth.swap();
         self.depth.active.show(frame.pixels, min_gradient, most);
-        propagate(
-            &self.depth.spare,
-            &mut self.depth.active,
-            &self.intrinsics,
-            &frame_from_before,
-            pose.brightness,
-            &self.params.propagation,
-        );
+        let propagation = &self.params.propagation;
+        self.depth.carry(&frame_from_before, pose.brightness, &self.intrinsics, propagation);
         let carried = self.depth.active.num_hypotheses();
         self.depth.swap();
         carried < FEWEST.max((self.params.consistency.min_kept_ratio * known as f64) as usize)
-    }
-
-    /// The active depth on the pixels of a frame that stands at `keyframe_from_camera`; the depth before is the
-    /// spare one then.
-    fn carry_over(&mut self, pixels: &[u8], keyframe_from_camera: &SE3, brightness: Brightness) {
-        let frame_from_before = in_unit(keyframe_from_camera, self.depth.unit);
-        self.depth.swap();
-        self.depth.restart(pixels, &self.params);
-        propagate(
-            &self.depth.spare,
-            &mut self.depth.active,
-            &self.intrinsics,
-            &frame_from_before,
-            brightness,
-            &self.params.propagation,
-        );
-        self.past.rebase(brightness);
     }
 
     /// What a new keyframe can wait for until it is published: the last depth of the one before goes
@@ -233,7 +209,7 @@ impl Mapper {
             points: Vec::new(),
             description: None,
         });
-        self.finder.learn(&mut self.map.keyframes);
+        self.finder.learn(&mut self.map.keyframes, MOST_LEARNT);
         self.map.forget_depth_beyond(self.params.max_map_bytes());
         self.next_keyframe_id += 1;
         self.past.push(image, keyframe_id, SE3::identity(), Brightness::default());
@@ -244,6 +220,7 @@ impl Mapper {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::slam::image::buffer::Image;
     use crate::slam::keyframe::DepthPoint;
     use crate::slam::mapper::MapperParams;
     use crate::slam::mapper::depth_buffers::DepthBuffers;

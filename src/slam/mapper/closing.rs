@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use crate::slam::keyframe::Keyframe;
 use crate::slam::loops::Closure;
-use crate::slam::map::{Correction, KeyframeCorrection, LogPlane};
+use crate::slam::map::{Correction, KeyframeCorrection};
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::window::Window;
 
@@ -23,18 +23,20 @@ impl Mapper {
 
     /// The map is of a mapper before: what it holds is looked at, and found again from now on.
     pub(super) fn take_over(&mut self) {
-        self.finder.learn_all(&mut self.map.keyframes);
+        self.finder.learn(&mut self.map.keyframes, usize::MAX);
         self.take_up_loops();
     }
 
     /// The search for loops continues with what is known of the map.
     pub(super) fn take_up_loops(&mut self) {
-        self.window.iter_mut().for_each(|window| window.take_up_loops(&self.map));
+        if let Some(window) = &mut self.window {
+            window.loops.take_up(Arc::clone(&self.map.loops), &self.map.keyframes);
+        }
     }
 
     /// The keyframes that were estimated, or searched, are here again; what is known of loops then is the map's.
     pub(super) fn put_back(&mut self, window: Box<Window>) {
-        self.map.loops = Arc::clone(window.known_loops());
+        self.map.loops = Arc::clone(window.loops.known());
         self.window = Some(window);
     }
 
@@ -45,11 +47,11 @@ impl Mapper {
         let moved = |keyframe: &Keyframe| {
             let by = closure.of(keyframe.keyframe_id)?;
             Some(KeyframeCorrection {
-                keyframe_id: keyframe.keyframe_id,
-                map_from_keyframe: *by * keyframe.map_from_keyframe,
-                depth: LogPlane::default(),
-                modes: None,
                 place: Some(keyframe.place_covariance.transported(by)),
+                ..KeyframeCorrection::of_place(
+                    keyframe.keyframe_id,
+                    *by * keyframe.map_from_keyframe,
+                )
             })
         };
         let of_epoch = self.map.keyframes.iter().filter(|keyframe| Some(keyframe.epoch) == epoch);
@@ -162,7 +164,7 @@ mod tests {
         assert_eq!(checkpoint.loops.links, [link]);
         let mut other = Mapper::new(CAMERA, MapperParams::default()).unwrap();
         other.resume(checkpoint.over(Map::default()));
-        assert_eq!(other.window.as_ref().unwrap().known_loops().links, [link]);
+        assert_eq!(other.window.as_ref().unwrap().loops.known().links, [link]);
     }
 
     #[test]

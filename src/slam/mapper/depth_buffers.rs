@@ -2,13 +2,16 @@
 
 use crate::slam::depth::interval::IntervalFilter;
 use crate::slam::depth::map::DepthMap;
+use crate::slam::depth::propagation::{PropagationParams, propagate};
 use crate::slam::depth::regularisation::{RegularisationScratch, regularise};
 use crate::slam::geometry::intrinsics::Intrinsics;
+use crate::slam::geometry::se3::SE3;
 use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MAX_KEYFRAME_POINTS};
 use crate::slam::map::LogPlane;
 use crate::slam::mapper::MapperParams;
 use crate::slam::mapper::maturing::Maturing;
+use crate::slam::pose::Brightness;
 
 /// Owner of all that the filters work on.
 #[derive(Debug)]
@@ -64,6 +67,19 @@ impl DepthBuffers {
         self.active.hypotheses.take_lists(&mut self.spare.hypotheses);
     }
 
+    /// Carries the spare depth over to the active one, on a frame that stands at `frame_from_spare`, in the unit of the
+    /// spare depth, and has this brightness against the spare one's image.
+    pub(super) fn carry(
+        &mut self,
+        frame_from_spare: &SE3,
+        brightness: Brightness,
+        intrinsics: &Intrinsics,
+        params: &PropagationParams,
+    ) {
+        let (spare, active) = (&self.spare, &mut self.active);
+        propagate(spare, active, intrinsics, frame_from_spare, brightness, params);
+    }
+
     /// Chooses the points that the interval filter traces.
     pub(super) fn plant_points(&mut self, params: &MapperParams) {
         if params.window.traces_candidates() {
@@ -89,9 +105,7 @@ impl DepthBuffers {
     pub(super) fn normalise(&mut self) -> f64 {
         let Some(mean) = self.active.mean_inverse_depth().filter(|m| *m > 0.0) else { return 1.0 };
         let factor = 1.0 / mean;
-        self.active.rescale(factor as f32);
-        self.points.rescale(factor as f32);
-        self.maturing.rescale(factor as f32);
+        self.rescale(factor as f32);
         factor
     }
 
@@ -105,9 +119,13 @@ impl DepthBuffers {
     /// Changes the unit by `factor`, that of all there is.
     pub(super) fn grow_unit(&mut self, factor: f64) {
         self.unit *= factor;
-        self.active.rescale(factor as f32);
-        self.points.rescale(factor as f32);
-        self.maturing.rescale(factor as f32);
+        self.rescale(factor as f32);
+    }
+
+    fn rescale(&mut self, factor: f32) {
+        self.active.rescale(factor);
+        self.points.rescale(factor);
+        self.maturing.rescale(factor);
     }
 
     /// Moves the active depth by a plane on its logarithm.
@@ -123,11 +141,6 @@ impl DepthBuffers {
     /// Keeps those of the points to be estimated jointly that are mature, where the keyframe is left.
     pub(super) fn leave_points(&mut self, keyframe_id: u64, params: &MapperParams) {
         self.maturing.leave(keyframe_id, &self.active.image, self.unit, &params.interval);
-    }
-
-    /// Makes the active depth the points of its keyframe.
-    pub(super) fn write_into(&self, keyframe: &mut Keyframe) {
-        write_depth(&self.active, self.unit, keyframe);
     }
 }
 

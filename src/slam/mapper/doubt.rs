@@ -6,7 +6,7 @@
 //! poses continue to be claimed, with the covariance of a keyframe of whose depth nothing is known.
 
 use crate::slam::depth::gaussian::ObservationCounts;
-use crate::slam::mapper::consistency::{Contradiction, START_KEYFRAMES, is_plausible_ratio};
+use crate::slam::mapper::consistency::{Contradiction, is_plausible_ratio};
 use crate::slam::mapper::phase::Lasting;
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::modes::ModeCovariance;
@@ -66,7 +66,7 @@ impl Mapper {
         pose: &PoseEstimate,
     ) -> Option<StepOutcome> {
         let points = self.num_points();
-        let is_first = self.num_epoch_keyframes() <= START_KEYFRAMES;
+        let is_first = self.is_young(self.keyframe()?.epoch);
         let params = &self.params.consistency;
         let active = self.active.as_mut()?;
         let mut contradiction = active.consistency.observe(observations, points, params);

@@ -1,5 +1,6 @@
 //! Finds the camera on keyframes: by what they look like first, then by alignment.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use crate::slam::alignment::align::{Aligner, Alignment, AlignmentParams};
@@ -30,6 +31,9 @@ const LEAST_SHARED: f32 = 8.0;
 /// Keyframes that the small images are compared with, the newest: 12 µs each. The index has all.
 const MOST_COMPARED: usize = 300;
 
+/// New keyframes that are looked at in a frame: 2.5 ms each at 640×480.
+pub(super) const MOST_LEARNT: usize = 10;
+
 /// Points with which a keyframe shows enough of a place: one of a hundred pixels.
 fn least_points(camera: &Intrinsics) -> usize {
     camera.width * camera.height / 100
@@ -50,8 +54,9 @@ pub(super) struct Finder {
     describer: Describer,
     /// Made at the first loss that needs them: two megabytes.
     turned_views: Option<TurnedViews>,
-    /// Place of a keyframe that was found and not confirmed: the next search leaves it out, lest it be all that is found.
-    doubted: Option<usize>,
+    /// Place of a keyframe that was found and that another contradicts, or none confirms: the next search leaves it out, lest
+    /// it be all that is found.
+    pub(super) doubted: Option<usize>,
 }
 
 /// Where a frame is on a keyframe, found from where it was expected.
@@ -102,9 +107,10 @@ impl Finder {
     ) -> Option<(usize, SE3)> {
         let camera = keyframes.get(active.unwrap_or(0))?.intrinsics;
         let seen = Appearance::of(pixels, camera.width, camera.height)?;
-        self.learn(keyframes);
+        self.learn(keyframes, MOST_LEARNT);
         let mut alike = self.alike(keyframes, active, &seen).into_iter();
-        let mut sharing = self.sharing(keyframes, active, pixels, params.num_keyframes).into_iter();
+        let most = params.num_keyframes;
+        let mut sharing = self.sharing(keyframes, active, &camera, pixels, most).into_iter();
         let doubted = self.doubted.take();
         let mut candidates: Vec<(usize, SE3)> = Vec::new();
         for _ in 0..params.num_keyframes {
@@ -120,8 +126,7 @@ impl Finder {
         if candidates.is_empty() {
             return None;
         }
-        let others = candidates.get(1..).unwrap_or_default();
-        let first = candidates[*searched % candidates.len().min(2)];
+        let (first, others) = (candidates[*searched % candidates.len().min(2)], &candidates[1..]);
         self.pyramid.fill(pixels);
         let rotation_rad = params.rotation_deg.to_radians();
         for attempt in 0..params.keyframes_per_frame.min(candidates.len()) {
@@ -145,28 +150,23 @@ impl Finder {
         &mut self,
         keyframes: &[Keyframe],
         active: Option<usize>,
+        camera: &Intrinsics,
         pixels: &[u8],
         most: usize,
     ) -> Vec<(usize, SE3)> {
-        let mut ids: Vec<(u64, usize)> = eligible(keyframes, active)
-            .map(|index| (keyframes[index].keyframe_id, index))
-            .collect();
-        ids.sort_unstable();
-        let index_of =
-            |id: u64| ids.binary_search_by_key(&id, |(id, _)| *id).ok().map(|known| ids[known].1);
-        let Some(camera) = keyframes.get(active.unwrap_or(0)).map(|of| of.intrinsics) else {
-            return Vec::new();
-        };
         let Some(seen) = self.describer.describe(pixels, camera.width, camera.height) else {
             return Vec::new();
         };
-        let found = self.places.candidates(&seen, most, |id| index_of(id).is_none());
+        let index_of: BTreeMap<u64, usize> = eligible(keyframes, active)
+            .map(|index| (keyframes[index].keyframe_id, index))
+            .collect();
+        let found = self.places.candidates(&seen, most, |id| !index_of.contains_key(&id));
         let found = found.into_iter().filter(|candidate| candidate.score >= LEAST_SHARED);
         let turned = |candidate: PlaceCandidate| {
-            let rotation = candidate.rotation(&camera);
-            Some((index_of(candidate.keyframe_id)?, SE3 { rotation, ..SE3::identity() }))
+            let rotation = candidate.rotation(camera);
+            (index_of[&candidate.keyframe_id], SE3 { rotation, ..SE3::identity() })
         };
-        found.filter_map(turned).collect()
+        found.map(turned).collect()
     }
 
     /// Keyframes that may be gone back to, those that look most like `seen` first, the newest of equals.
@@ -205,7 +205,7 @@ impl Finder {
         let most = params.keyframes_per_frame.min(params.num_keyframes);
         let camera = keyframes.get(active.unwrap_or(0)).filter(|_| most > 0)?.intrinsics;
         let seen = Appearance::of(pixels, camera.width, camera.height)?;
-        self.learn(keyframes);
+        self.learn(keyframes, MOST_LEARNT);
         let eligible: Vec<usize> = eligible(keyframes, active)
             .filter(|index| Some(*index) != self.doubted)
             .filter(|&index| self.appearance(&keyframes[index]).is_some())
@@ -239,11 +239,6 @@ impl Finder {
         None
     }
 
-    /// A keyframe was found that another contradicts, or none confirms.
-    pub(super) fn doubt(&mut self, index: usize) {
-        self.doubted = Some(index);
-    }
-
     /// What a keyframe looks like, where that is known.
     fn appearance(&self, keyframe: &Keyframe) -> Option<&Appearance> {
         let id = keyframe.keyframe_id;
@@ -252,18 +247,7 @@ impl Finder {
     }
 
     /// Looks at keyframes that are new, so many at most, and describes those that nobody has described.
-    pub(super) fn learn(&mut self, keyframes: &mut [Keyframe]) {
-        /// 2.5 ms each at 640×480.
-        const MOST_AT_ONCE: usize = 10;
-        self.learn_new(keyframes, MOST_AT_ONCE);
-    }
-
-    /// Looks at all keyframes of a map that was there before the first frame.
-    pub(super) fn learn_all(&mut self, keyframes: &mut [Keyframe]) {
-        self.learn_new(keyframes, usize::MAX);
-    }
-
-    fn learn_new(&mut self, keyframes: &mut [Keyframe], most: usize) {
+    pub(super) fn learn(&mut self, keyframes: &mut [Keyframe], most: usize) {
         let known = self.appearances.last().map(|(id, _)| *id);
         self.forget_all_but(keyframes);
         let new = keyframes.iter_mut().filter(|keyframe| Some(keyframe.keyframe_id) > known);

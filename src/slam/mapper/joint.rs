@@ -24,9 +24,7 @@ impl Mapper {
         let is_mapping = matches!(self.phase, Phase::Mapping);
         let active = self.keyframe().map(|keyframe| keyframe.keyframe_id);
         let is_doubted = self.doubt.hand_over();
-        if is_doubted {
-            window.reconsider();
-        }
+        window.reconsiders |= is_doubted;
         let is_begun = match active {
             _ if is_new || is_doubted => {
                 window.take_frames(&mut self.tracked);
@@ -55,9 +53,9 @@ impl Mapper {
             return None;
         }
         let mut window = self.window.take()?;
-        window.take_mature(self.depth.maturing.left());
+        window.take_mature(&mut self.depth.maturing.left);
         let is_new = window.take_in(&self.map, active);
-        window.tell_looks(&self.map);
+        window.loops.offer(&self.map.keyframes);
         Some((window, is_new))
     }
 
@@ -68,7 +66,7 @@ impl Mapper {
             self.put_back(window);
             return StepOutcome { graph_changed, ..Default::default() };
         }
-        if let Some(closure) = window.take_closure() {
+        if let Some(closure) = window.loops.take_closure() {
             let outcome = self.close_loop(&closure, &mut window);
             self.put_back(window);
             return outcome;
@@ -112,7 +110,7 @@ impl Mapper {
 
     /// Rejects the epoch that is mapped where the estimate has refuted its start.
     fn reject_refuted(&mut self, window: &mut Window) -> Option<StepOutcome> {
-        let refuted = window.take_refuted_epoch()?;
+        let refuted = window.refuted_epoch.take()?;
         let is_mapped = self.keyframe()?.epoch == refuted;
         if !(is_mapped && matches!(self.phase, Phase::Mapping | Phase::Lost(_))) {
             return None;
@@ -128,7 +126,7 @@ impl Mapper {
     pub fn begin_last_adjustment(&mut self) -> Option<Box<Window>> {
         let (mut window, _) = self.take_window()?;
         window.take_frames(&mut self.tracked);
-        window.conclude();
+        window.is_last = true;
         Some(window)
     }
 
@@ -192,11 +190,6 @@ impl Mapper {
         self.params.window.num_free > 0 && self.params.window.max_waiting_frames > 0
     }
 
-    /// Forgets frames from before a map that has not begun.
-    pub(super) fn drop_early_frames(&mut self) {
-        self.early.clear();
-    }
-
     /// A map has begun with two frames, its first keyframes, of which the second stands at `first_from_second`. Frames
     /// from before the second will be aligned to it; where they are is guessed by an even motion.
     pub(super) fn adopt_early_frames(&mut self, first_from_second: &SE3) {
@@ -229,7 +222,7 @@ impl Mapper {
         drop(window.take_placed());
         window.leave_unrefined();
         window.repeat_piece();
-        window.repeat_closure();
+        window.loops.repeat_closure();
         self.doubt.take_back();
         self.put_back(window);
     }

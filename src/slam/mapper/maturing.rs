@@ -21,7 +21,8 @@ pub(super) struct Maturing {
     filter: IntervalFilter,
     /// Whether a frame was searched for them.
     is_traced: bool,
-    left: Vec<MaturePoints>,
+    /// What is kept of keyframes that were left; whoever takes them in takes them from there.
+    pub(super) left: Vec<MaturePoints>,
 }
 
 impl Maturing {
@@ -91,11 +92,6 @@ impl Maturing {
             }
         }
     }
-
-    /// What is kept of keyframes that were left; whoever takes them in takes them from there.
-    pub(super) fn left(&mut self) -> &mut Vec<MaturePoints> {
-        &mut self.left
-    }
 }
 
 #[cfg(test)]
@@ -146,7 +142,7 @@ mod tests {
             let all = maturing.filter.points().len();
             maturing.leave(KEYFRAME, &image, UNIT, &params);
             assert!(maturing.filter.points().is_empty());
-            let [left] = &maturing.left()[..] else { panic!("one keyframe was left") };
+            let [left] = &maturing.left[..] else { panic!("one keyframe was left") };
             let pixels = |points: &[DepthPoint]| -> Vec<_> {
                 points.iter().map(|point| (point.u, point.v)).collect()
             };
@@ -173,7 +169,7 @@ mod tests {
             maturing.is_traced = true;
             maturing.leave(keyframe_id, &image, UNIT, &IntervalParams::default());
         }
-        let kept: Vec<u64> = maturing.left().iter().map(|left| left.keyframe_id).collect();
+        let kept: Vec<u64> = maturing.left.iter().map(|left| left.keyframe_id).collect();
         assert_eq!(kept, Vec::from_iter(4..=last));
     }
 
@@ -181,14 +177,14 @@ mod tests {
     fn a_keyframe_without_a_frame_leaves_no_list() {
         let (mut maturing, image, _) = traced(0);
         maturing.leave(KEYFRAME, &image, UNIT, &IntervalParams::default());
-        assert!(maturing.left().is_empty());
+        assert!(maturing.left.is_empty());
     }
 
     #[test]
     fn what_was_left_moves_with_its_keyframe() {
         let (mut maturing, image, _) = traced(8);
         maturing.leave(KEYFRAME, &image, UNIT, &IntervalParams::default());
-        let before = maturing.left()[0].points.clone();
+        let before = maturing.left[0].points.clone();
         let doubled = |keyframe_id| KeyframeCorrection {
             keyframe_id,
             map_from_keyframe: Sim3::identity(),
@@ -199,7 +195,7 @@ mod tests {
         for (keyframe_id, factor) in [(KEYFRAME + 1, 1.0), (KEYFRAME, 2.0)] {
             let keyframes = vec![doubled(keyframe_id)];
             maturing.correct(&Correction { keyframes, ..Correction::default() }, &CAMERA);
-            for (now, before) in maturing.left()[0].points.iter().zip(&before) {
+            for (now, before) in maturing.left[0].points.iter().zip(&before) {
                 assert!((now.inverse_depth / (factor * before.inverse_depth) - 1.0).abs() < 1e-5);
             }
         }

@@ -8,6 +8,7 @@ use crate::slam::depth::immature::TraceFrame;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::mapper::Mapper;
+use crate::slam::mapper::modes::in_unit;
 use crate::slam::pose::PoseEstimate;
 
 /// Which filter estimates depth; `docs/depth-filters.md` compares them.
@@ -86,8 +87,6 @@ impl Mapper {
 
     /// The view of a frame from the active keyframe, in the unit of its depth buffer.
     pub(super) fn view_of(&self, keyframe_from_camera: &SE3) -> TwoView {
-        let mut frame_from_keyframe = keyframe_from_camera.inverse();
-        frame_from_keyframe.translation /= self.depth.unit;
-        TwoView::new(&self.intrinsics, &frame_from_keyframe)
+        TwoView::new(&self.intrinsics, &in_unit(keyframe_from_camera, self.depth.unit))
     }
 }

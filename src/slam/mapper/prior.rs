@@ -3,7 +3,7 @@
 
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::sim3::Sim3;
-use crate::slam::keyframe::{Keyframe, MapState};
+use crate::slam::keyframe::Keyframe;
 use crate::slam::map::Map;
 use crate::slam::mapper::phase::{Active, Loss, Phase};
 use crate::slam::mapper::situation::Certainty;
@@ -74,8 +74,7 @@ impl Mapper {
         if let Some(foreign) = foreign {
             return Err(PriorError::Camera(foreign.keyframe_id));
         }
-        let is_usable = |of: &Keyframe| of.has_depth() && of.map_state == MapState::Established;
-        let is_empty = !map.keyframes.iter().any(is_usable);
+        let is_empty = !map.keyframes.iter().any(Keyframe::is_usable);
         let newest = |number: fn(&Keyframe) -> u64| map.keyframes.iter().map(number).max();
         self.revision = newest(|keyframe| keyframe.revision).unwrap_or(0);
         self.next_keyframe_id = newest(|keyframe| keyframe.keyframe_id).map_or(0, |id| id + 1);
@@ -100,11 +99,6 @@ impl Mapper {
         let certainty = Certainty::default();
         self.prior = Some(Prior { map_use, first_own: self.next_keyframe_id, certainty });
         Ok(())
-    }
-
-    /// Numbers of epochs from here on are given by nobody yet.
-    pub fn free_epoch(&self) -> u32 {
-        self.next_epoch()
     }
 
     /// Whether the map stays as it is.
@@ -139,8 +133,6 @@ impl Mapper {
     ) -> StepOutcome {
         /// Where the tracker asks for another keyframe: any that is nearer than that will do.
         const MAX_DISTANCE: f64 = 1.0;
-        self.last_world_from_camera = Some(pose.world_from_camera);
-        self.last_tracked = Some((pose.keyframe_id, pose.keyframe_from_camera));
         let Some(active) = &mut self.active else { return StepOutcome::default() };
         active.frames += 1;
         if !pose.proposes_keyframe || active.frames < self.params.min_keyframe_interval {
@@ -165,12 +157,7 @@ impl Mapper {
         }
         self.revision += 1;
         self.publish_place();
-        StepOutcome {
-            keyframe_restored: true,
-            keyframe_changed: true,
-            graph_changed: is_first,
-            ..Default::default()
-        }
+        StepOutcome::restored(is_first)
     }
 
     /// Where a keyframe's map lies in odometry's world as odometry had it last.

@@ -9,14 +9,12 @@ use crate::slam::depth::gaussian::MAX_VALIDITY;
 use crate::slam::depth::gradient_image::BORDER_PX;
 use crate::slam::depth::map::{DepthMap, Hypothesis};
 use crate::slam::depth::propagation::joined;
-use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
-use crate::slam::image::buffer::Image;
 use crate::slam::keyframe::{DepthPoint, Keyframe, MapState};
-use crate::slam::mapper::consistency::{Contradiction, START_KEYFRAMES};
+use crate::slam::mapper::consistency::Contradiction;
 use crate::slam::mapper::doubt::Doubt;
 use crate::slam::mapper::phase::{Loss, Phase};
-use crate::slam::mapper::{Mapper, StepOutcome};
+use crate::slam::mapper::{Mapper, StepInput, StepOutcome};
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::{DegradedReason, PoseEstimate, TrackingState, full_covariance};
 use crate::slam::tracker::MOST_DEVIATIONS;
@@ -82,12 +80,8 @@ impl RecoveryParams {
 impl Mapper {
     /// One frame of a loss: searches some keyframes; after the timeout gives the frame to a new
     /// start as well.
-    pub(super) fn recover(
-        &mut self,
-        frame: &FrameView<'_>,
-        pose: &PoseEstimate,
-        sensor_depth: Option<&Image<f32>>,
-    ) -> StepOutcome {
+    pub(super) fn recover(&mut self, input: &StepInput<'_>) -> StepOutcome {
+        let StepInput { frame, pose, .. } = *input;
         let mut loss = self.phase.loss();
         // A view that holds the camera is no loss, and nothing to begin another map with; one of a map before is none.
         let is_held = pose.state.is_tracked()
@@ -124,7 +118,7 @@ impl Mapper {
             self.start.forget();
             self.phase = Phase::Restarting(loss);
         }
-        self.begin(frame, pose, sensor_depth)
+        self.begin(input)
     }
 
     /// What was found, where it is confirmed and not against the rotation that a view holds; the next search leaves it out
@@ -143,7 +137,7 @@ impl Mapper {
         {
             return found;
         }
-        self.finder.doubt(index);
+        self.finder.doubted = Some(index);
         None
     }
 
@@ -194,8 +188,7 @@ impl Mapper {
             .collect();
         others.sort_by(|one, other| other.0.total_cmp(&one.0));
         others.truncate(MOST);
-        let of_epoch = self.map.keyframes.iter().filter(|keyframe| keyframe.epoch == epoch);
-        let is_young = of_epoch.take(START_KEYFRAMES + 1).count() <= START_KEYFRAMES;
+        let is_young = self.is_young(epoch);
         let mut agrees = |(_, other, expected): &(f64, usize, SE3)| {
             let keyframe = &self.map.keyframes[*other];
             self.finder.locate(keyframe, pixels, expected, by.max_disagreement).is_some()
@@ -264,7 +257,7 @@ impl Mapper {
         }
         self.anchor(keyframe.keyframe_id, keyframe_from_camera);
         self.past.clear();
-        self.drop_early_frames();
+        self.early.clear();
         self.start.give_up();
         self.phase = Phase::Mapping;
         self.doubt = Doubt::None;
@@ -272,13 +265,8 @@ impl Mapper {
             return self.enter_unchanged(index);
         }
         self.enter_keyframe(index);
-        StepOutcome {
-            keyframe_restored: true,
-            keyframe_changed: true,
-            // The rest of a map that was there before is told of with the first of it.
-            graph_changed: is_first,
-            ..Default::default()
-        }
+        // The rest of a map that was there before is told of with the first of it.
+        StepOutcome::restored(is_first)
     }
 }
 

@@ -56,16 +56,13 @@ impl Mapper {
             true => keyframe.clone(),
             false => keyframe.without_depth(),
         });
-        let free_epoch = self.next_epoch().saturating_add(UNKNOWN_EPOCHS);
-        let active = Some(in_force.keyframe_id);
         Some(Map {
             keyframes: keyframes.collect(),
-            frames: Vec::new(),
-            confirmed: Vec::new(),
             loops: Arc::clone(&self.map.loops),
             revision: self.map.revision,
-            active,
-            free_epoch,
+            active: Some(in_force.keyframe_id),
+            free_epoch: self.free_epoch().saturating_add(UNKNOWN_EPOCHS),
+            ..Map::default()
         })
     }
 
@@ -113,12 +110,7 @@ impl Mapper {
         self.past.clear();
         self.phase = Phase::Mapping;
         self.enter_keyframe(index);
-        StepOutcome {
-            keyframe_restored: true,
-            keyframe_changed: true,
-            graph_changed: true,
-            ..Default::default()
-        }
+        StepOutcome::restored(true)
     }
 }
 
@@ -158,7 +150,7 @@ mod tests {
         if let Some(map) = left {
             mapper.resume(map);
         }
-        (reserved, mapper.next_epoch())
+        (reserved, mapper.free_epoch())
     }
 
     #[test]
@@ -175,14 +167,14 @@ mod tests {
         first.resume(Map { keyframes: vec![keyframe(2)], free_epoch: 7, ..Map::default() });
         assert_eq!(first.keyframe().unwrap().epoch, 2);
         // It is lost, begins an epoch with this number that is never proven, and dies.
-        let unproven = first.next_epoch();
+        let unproven = first.free_epoch();
         let mut second = mapper();
         second.resume(first.checkpoint().unwrap());
         assert_eq!(second.keyframe().unwrap().epoch, 2);
-        assert!(second.next_epoch() > unproven);
+        assert!(second.free_epoch() > unproven);
         let mut with_another_camera = mapper();
-        let unproven = second.next_epoch();
+        let unproven = second.free_epoch();
         with_another_camera.succeed(second);
-        assert_eq!(with_another_camera.next_epoch(), unproven);
+        assert_eq!(with_another_camera.free_epoch(), unproven);
     }
 }

@@ -4,7 +4,6 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::slam::depth::propagation::propagate;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::keyframe::{DistanceWeights, MapState};
@@ -146,14 +145,9 @@ impl Mapper {
         self.depth.swap();
         self.depth.spare.rescale((map_from_keyframe.scale / present_unit) as f32);
         self.depth.restart(&keyframe.image, &self.params);
-        propagate(
-            &self.depth.spare,
-            &mut self.depth.active,
-            &self.intrinsics,
-            &map_from_keyframe.locate(&present.rigid),
-            brightness,
-            &self.params.propagation,
-        );
+        let (at, propagation) =
+            (map_from_keyframe.locate(&present.rigid), &self.params.propagation);
+        self.depth.carry(&at, brightness, &self.intrinsics, propagation);
         restore_points(&mut self.depth.active, &keyframe.points);
         self.past.clear();
         self.enter_keyframe(index);

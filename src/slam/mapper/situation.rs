@@ -15,8 +15,6 @@ use crate::slam::two_frame::{Failure, InitOutcome, InitState};
 pub enum Situation {
     /// No map yet.
     Starting(StartProgress),
-    /// The first depth is random and not proven.
-    Unproven,
     /// The camera is looked for on so many keyframes of a map that was there before.
     Localising(usize),
     /// It was found there, and nothing has been added yet, or nothing is to be.
@@ -85,7 +83,6 @@ impl fmt::Display for Situation {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Starting(progress) => write!(f, "starting: {progress}"),
-            Self::Unproven => f.write_str("starting: random depth is not proven yet"),
             Self::Localising(keyframes) => {
                 let keyframes = counted(*keyframes, "keyframe");
                 write!(f, "localising: looking for the camera on {keyframes} of the map")

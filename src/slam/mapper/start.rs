@@ -15,7 +15,7 @@ use crate::slam::keyframe::{Keyframe, MapState};
 use crate::slam::mapper::doubt::Doubt;
 use crate::slam::mapper::phase::Phase;
 use crate::slam::mapper::situation::{StartFrame, StartProgress};
-use crate::slam::mapper::{Mapper, StepOutcome};
+use crate::slam::mapper::{Mapper, StepInput, StepOutcome};
 use crate::slam::parameter::ParameterError;
 use crate::slam::place_covariance::UncertainPlace;
 use crate::slam::pose::{PoseEstimate, TrackingState, upper_triangle};
@@ -113,12 +113,8 @@ impl Mapper {
     /// given, so the baselines will be true), else once two frames prove it. An epoch after
     /// the first begins where the camera was last known to be and in the unit of the last keyframe:
     /// nothing ties it to the one before, and who does not look at the epoch sees the smallest jump.
-    pub(super) fn begin(
-        &mut self,
-        frame: &FrameView<'_>,
-        pose: &PoseEstimate,
-        sensor_depth: Option<&Image<f32>>,
-    ) -> StepOutcome {
+    pub(super) fn begin(&mut self, input: &StepInput<'_>) -> StepOutcome {
+        let StepInput { frame, pose, sensor_depth } = *input;
         // After a map was rejected a pose on it may still come, which nobody has given.
         let is_given = pose.state.is_tracked() && matches!(self.phase, Phase::Starting);
         if sensor_depth.is_none() && !is_given {
@@ -130,7 +126,7 @@ impl Mapper {
                 }
             };
         }
-        self.drop_early_frames();
+        self.early.clear();
         self.start.give_up();
         let (origin, _) = self.origin(pose);
         self.begin_epoch(frame.pixels);
@@ -140,15 +136,10 @@ impl Mapper {
         self.depth.is_unit_open = is_given && sensor_depth.is_none();
         let scale = self.depth.normalise();
         let map_from_camera = if is_given { pose.world_from_camera } else { origin };
-        let epoch = self.next_epoch();
+        let epoch = self.free_epoch();
         let place = UncertainPlace::exact(Sim3::new(map_from_camera, scale));
         self.add_keyframe(frame, &place, epoch);
-        StepOutcome {
-            keyframe_created: true,
-            keyframe_changed: true,
-            graph_changed: true,
-            ..Default::default()
-        }
+        StepOutcome::begun()
     }
 
     /// How to search in a frame at `pose`: the less is known of the pose, the less is believed of a match.
@@ -188,8 +179,8 @@ impl Mapper {
         }
     }
 
-    /// The number of the next epoch: one that no epoch had before, here or in a mapper that died.
-    pub(super) fn next_epoch(&self) -> u32 {
+    /// The number of the next epoch: neither it nor any above was given before, here or in a mapper that died.
+    pub fn free_epoch(&self) -> u32 {
         let numbers = self.map.keyframes.iter().map(|keyframe| keyframe.epoch);
         let after_last = numbers.max().map_or(0, |last| last.saturating_add(1));
         after_last.max(self.first_free_epoch)
@@ -224,7 +215,7 @@ impl Mapper {
         let (origin, unit) = self.origin(pose);
         let first_pixels = initializer.first_pixels();
         self.begin_epoch(first_pixels);
-        let epoch = self.next_epoch();
+        let epoch = self.free_epoch();
         initializer.fill(&mut self.depth.active);
         let observations = self.observe_proven(frame, start);
         self.depth.refine(&self.params);
@@ -242,15 +233,9 @@ impl Mapper {
             keyframe_id: self.next_keyframe_id - 1,
             ..proven_pose(frame, start, scale)
         };
-        self.change_keyframe(frame, &pose, None);
+        self.change_keyframe(&StepInput { frame, pose: &pose, sensor_depth: None });
         self.adopt_early_frames(&pose.keyframe_from_camera);
-        StepOutcome {
-            keyframe_created: true,
-            keyframe_changed: true,
-            graph_changed: true,
-            observations,
-            ..Default::default()
-        }
+        StepOutcome { observations, ..StepOutcome::begun() }
     }
 
     /// Observes the depth of the first frame in the one that proves the start.

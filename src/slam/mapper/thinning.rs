@@ -3,13 +3,15 @@
 //!
 //! Its pose stays and moves with that of a neighbour: frames that were tracked on it stay where they are in the map.
 
+use std::collections::BTreeMap;
+
 use nalgebra::Vector3;
 
 use crate::slam::depth::matching::is_inside;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{Keyframe, MapState};
-use crate::slam::map::{Correction, KeyframeCorrection, LogPlane, Map};
+use crate::slam::map::{Correction, KeyframeCorrection, Map};
 use crate::slam::mapper::Mapper;
 use crate::slam::mapper::reuse::ReuseParams;
 
@@ -33,16 +35,10 @@ const REACH: f64 = 0.5;
 /// Which keyframes have given up their depth, and what they move with.
 #[derive(Debug, Default)]
 pub(super) struct Thinning {
-    attached: Vec<Attached>,
+    /// By keyframe without depth the one that it moves with.
+    attached: BTreeMap<u64, u64>,
     /// The last one that was examined: the next is the one before.
     examined: Option<u64>,
-}
-
-/// A keyframe without depth that moves with another.
-#[derive(Debug, Clone, Copy)]
-struct Attached {
-    keyframe_id: u64,
-    to: u64,
 }
 
 impl Thinning {
@@ -50,35 +46,21 @@ impl Thinning {
     /// may have moved the two each for itself.
     pub fn follow(&self, map: &Map, correction: &Correction) -> Correction {
         let mut extended = correction.clone();
-        let mut places: Vec<(u64, Sim3)> =
+        let places: BTreeMap<u64, Sim3> =
             correction.keyframes.iter().map(|k| (k.keyframe_id, k.map_from_keyframe)).collect();
-        places.sort_unstable_by_key(|(id, _)| *id);
-        let find = |id: u64| {
-            let place = places.binary_search_by_key(&id, |(id, _)| *id).ok()?;
-            Some(places[place].1)
-        };
-        let followers = self.attached.iter().filter(|of| find(of.keyframe_id).is_none());
-        extended.keyframes.extend(followers.filter_map(|of| {
-            let moved = find(of.to)?;
-            let to = map.get(of.to)?.map_from_keyframe;
-            let keyframe = map.get(of.keyframe_id)?.map_from_keyframe;
-            Some(KeyframeCorrection {
-                keyframe_id: of.keyframe_id,
-                map_from_keyframe: moved * to.inverse() * keyframe,
-                depth: LogPlane::default(),
-                modes: None,
-                place: None,
-            })
+        let followers = self.attached.iter().filter(|(id, _)| !places.contains_key(id));
+        extended.keyframes.extend(followers.filter_map(|(&id, to)| {
+            let (was, keyframe) = (map.get(*to)?, map.get(id)?);
+            let by = *places.get(to)? * was.map_from_keyframe.inverse();
+            Some(KeyframeCorrection::of_place(id, by * keyframe.map_from_keyframe))
         }));
         extended
     }
 
     /// A keyframe moves with another from now on, and so does what moved with it.
     fn attach(&mut self, keyframe_id: u64, to: u64) {
-        for of in self.attached.iter_mut().filter(|of| of.to == keyframe_id) {
-            of.to = to;
-        }
-        self.attached.push(Attached { keyframe_id, to });
+        self.attached.values_mut().filter(|of| **of == keyframe_id).for_each(|of| *of = to);
+        self.attached.insert(keyframe_id, to);
     }
 
     /// The next places in the list of keyframes to be examined, newest first and round again.
@@ -142,8 +124,7 @@ fn shown_by(map: &Map, index: usize, reuse: &ReuseParams) -> Option<u64> {
     let is_near = |of: &&Keyframe| {
         of.keyframe_id != keyframe.keyframe_id
             && of.epoch == keyframe.epoch
-            && of.has_depth()
-            && of.map_state == MapState::Established
+            && of.is_usable()
             && distance(of) < REACH * place.scale
             && (of.map_from_keyframe.rigid.rotation * Vector3::z()).dot(&forward) > 0.0
     };
@@ -331,28 +312,20 @@ mod tests {
             mapper.thin();
         }
         // A loop moves every keyframe by its own.
-        let by_its_own = |of: &Keyframe| KeyframeCorrection {
-            keyframe_id: of.keyframe_id,
-            map_from_keyframe: Sim3::new(
+        let by_its_own = |of: &Keyframe| {
+            let by = Sim3::new(
                 SE3::exp(&(Vector6::repeat(1e-3) * of.keyframe_id as f64)),
                 1.0 + 1e-3 * of.keyframe_id as f64,
-            ) * of.map_from_keyframe,
-            depth: LogPlane::default(),
-            modes: None,
-            place: None,
+            );
+            KeyframeCorrection::of_place(of.keyframe_id, by * of.map_from_keyframe)
         };
         let keyframes = mapper.map.keyframes.iter().map(by_its_own).collect();
         mapper.apply(&Correction { keyframes, ..Correction::default() }).unwrap();
         // All that have depth are turned, moved and scaled alike: so must be the others.
         let moved = Sim3::new(SE3::exp(&[0.3, -0.1, 0.2, 0.1, 0.4, -0.2].into()), 1.3);
         let held = mapper.map.keyframes.iter().filter(|of| of.has_depth());
-        let keyframes = held.map(|of| KeyframeCorrection {
-            keyframe_id: of.keyframe_id,
-            map_from_keyframe: moved * of.map_from_keyframe,
-            depth: LogPlane::default(),
-            modes: None,
-            place: None,
-        });
+        let keyframes = held
+            .map(|of| KeyframeCorrection::of_place(of.keyframe_id, moved * of.map_from_keyframe));
         let correction = Correction { keyframes: keyframes.collect(), ..Correction::default() };
         let before = mapper.map.clone();
         assert!(before.num_held() < before.keyframes.len());

@@ -2,8 +2,9 @@
 
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::DepthPoint;
+use crate::slam::window::Window;
 use crate::slam::window::params::WindowParams;
-use crate::slam::window::{Window, selection};
+use crate::slam::window::selection::choose_spread;
 
 /// Fewer mature points than this hold neither a keyframe's pose nor a plane through its depth, which wants 30 of them:
 /// they are chosen from its depth then.
@@ -36,16 +37,7 @@ impl Candidates {
         camera: &Intrinsics,
         params: &WindowParams,
     ) -> Vec<DepthPoint> {
-        let choose = |points: &[DepthPoint]| {
-            selection::choose_spread(
-                points,
-                pixels,
-                camera,
-                [params.points, params.max_points],
-                params.min_gradient,
-                params.max_relative_deviation,
-            )
-        };
+        let choose = |points: &[DepthPoint]| choose_spread(points, pixels, camera, params);
         let of_mature = self.mature.as_deref().map(choose);
         let are_enough = |chosen: &Vec<DepthPoint>| chosen.len() >= FEWEST_MATURE;
         of_mature.filter(are_enough).unwrap_or_else(|| choose(&self.depth))

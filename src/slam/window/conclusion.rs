@@ -26,8 +26,6 @@ impl Window {
             last = self.adjust_within(&chosen, MAX_ITERATIONS).or(last);
             self.leave(&chosen.members);
             if end == of_epoch.len() {
-                self.moved.sort_unstable();
-                self.moved.dedup();
                 return last;
             }
             begin += STEP;
@@ -41,8 +39,6 @@ impl Window {
         let chosen = self.choose_piece(&of_epoch, begin, end);
         let adjustment = self.adjust(&chosen);
         self.leave(&chosen.members);
-        self.moved.sort_unstable();
-        self.moved.dedup();
         adjustment
     }
 

@@ -32,6 +32,7 @@ impl Window {
     /// Keyframes that are not estimated, newer ones and rejected ones: each goes where the last before it that is goes,
     /// and stays where that stays.
     fn followers(&self, map: &Map, moved: &[KeyframeCorrection]) -> Vec<KeyframeCorrection> {
+        let follows = |keyframe: &&Keyframe| self.get(keyframe.keyframe_id).is_none();
         let follow = |keyframe: &Keyframe| {
             let of_epoch = |of: &&WindowKeyframe| of.epoch == keyframe.epoch;
             let before =
@@ -46,22 +47,12 @@ impl Window {
                 let is = UncertainPlace { map_from_keyframe: leader.map_from_keyframe, covariance };
                 keyframe.uncertain_place().following(&was.uncertain_place(), &is)
             });
-            Some((map_from_keyframe, place))
-        };
-        let follows = |keyframe: &&Keyframe| self.get(keyframe.keyframe_id).is_none();
-        let others = map.keyframes.iter().filter(follows);
-        others
-            .filter_map(|keyframe| {
-                let (map_from_keyframe, place) = follow(keyframe)?;
-                Some(KeyframeCorrection {
-                    keyframe_id: keyframe.keyframe_id,
-                    map_from_keyframe,
-                    depth: LogPlane::default(),
-                    modes: None,
-                    place,
-                })
+            Some(KeyframeCorrection {
+                place,
+                ..KeyframeCorrection::of_place(keyframe.keyframe_id, map_from_keyframe)
             })
-            .collect()
+        };
+        map.keyframes.iter().filter(follows).filter_map(follow).collect()
     }
 
     fn corrected(

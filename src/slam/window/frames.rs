@@ -6,10 +6,7 @@
 use std::sync::Arc;
 
 use crate::slam::geometry::se3::SE3;
-use crate::slam::image::shared::SharedImage;
 use crate::slam::map::PlacedFrame;
-use crate::slam::window::keyframe::WindowKeyframe;
-use crate::slam::window::surface::Surface;
 use crate::slam::window::{ALIGNMENT_LEVELS, Window};
 
 /// Frames aligned with one adjustment: twice as many as come between two keyframes, so that those of an epoch's first
@@ -187,9 +184,10 @@ impl Window {
 
     fn place_frame(&mut self, index: usize, frame: &TrackedFrame) -> Option<PlacedFrame> {
         let keyframe = &self.keyframes[index];
-        let (epoch, host_from_map) = (keyframe.epoch, keyframe.camera_from_map);
+        let (epoch, unit) = (keyframe.epoch, keyframe.unit);
+        let host_from_map = keyframe.camera_from_map;
         let mut host_from_camera = frame.keyframe_from_camera;
-        host_from_camera.translation *= keyframe.unit;
+        host_from_camera.translation *= unit;
         let is_host = |&k: &usize| self.keyframes[k].is_host && self.keyframes[k].epoch == epoch;
         let last = (index + REACH).min(self.keyframes.len() - 1);
         let mut members: Vec<usize> =
@@ -197,20 +195,9 @@ impl Window {
         if members.is_empty() {
             return None;
         }
-        let (width, height) = (self.camera.width, self.camera.height);
-        let image = SharedImage::try_from_pixels(width, height, Arc::clone(&frame.pixels))?;
         members.push(self.keyframes.len());
-        self.keyframes.push(WindowKeyframe {
-            keyframe_id: u64::MAX,
-            epoch,
-            images: vec![image],
-            camera_from_map: host_from_camera.inverse() * host_from_map,
-            unit: 1.0,
-            points: Vec::new(),
-            is_host: false,
-            agreed: Vec::new(),
-            surface: Surface::default(),
-        });
+        let camera_from_map = host_from_camera.inverse() * host_from_map;
+        self.push_camera(epoch, Arc::clone(&frame.pixels), camera_from_map, unit)?;
         let camera_from_map = self.align_frame(&members, frame.is_guess);
         self.keyframes.pop();
         camera_from_map.map(|camera_from_map| PlacedFrame {
@@ -253,7 +240,9 @@ mod tests {
 
     use super::*;
     use crate::slam::test_scene::CAMERA;
+    use crate::slam::window::keyframe::WindowKeyframe;
     use crate::slam::window::params::WindowParams;
+    use crate::slam::window::surface::Surface;
     use crate::slam::window::tests::room;
 
     fn frame(keyframe_id: u64) -> TrackedFrame {

@@ -65,6 +65,27 @@ pub struct WindowPoint {
 }
 
 impl WindowKeyframe {
+    /// With an image, of which nothing is known but where it is.
+    pub fn new(
+        keyframe_id: u64,
+        epoch: u32,
+        image: SharedImage,
+        camera_from_map: SE3,
+        unit: f64,
+    ) -> Self {
+        Self {
+            keyframe_id,
+            epoch,
+            images: vec![image],
+            camera_from_map,
+            unit,
+            points: Vec::new(),
+            is_host: false,
+            agreed: Vec::new(),
+            surface: Surface::default(),
+        }
+    }
+
     /// Makes its coarser images, unless it has them.
     pub fn take_part(&mut self, camera: &Intrinsics) {
         while self.images.len() < num_levels(camera) {

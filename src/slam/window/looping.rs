@@ -1,10 +1,7 @@
 //! Where the search for loops meets the window: what it is told, when it is its turn, and what moves with the map.
 
-use std::sync::Arc;
-
 use crate::slam::geometry::sim3::Sim3;
-use crate::slam::loops::known::KnownLoops;
-use crate::slam::loops::{Closure, LoopParams, Loops, SearchReport};
+use crate::slam::loops::{Closure, LoopParams, Loops};
 use crate::slam::map::Map;
 use crate::slam::window::Window;
 use crate::slam::window::members::{Chosen, FEWEST_COMMON};
@@ -35,27 +32,11 @@ impl Window {
 
     /// Does a search that was begun; false where none was.
     pub(super) fn search_begun(&mut self) -> bool {
-        let is_begun = self.loops.is_begun();
-        if is_begun {
-            self.loops.run();
+        let is_done = self.loops.run();
+        if is_done {
             self.plan_search(self.num_unsettled());
         }
-        is_begun
-    }
-
-    /// Tells what the keyframes of the map look like.
-    pub fn tell_looks(&mut self, map: &Map) {
-        self.loops.offer(&map.keyframes);
-    }
-
-    /// Takes up the loops of a map of a mapper before.
-    pub fn take_up_loops(&mut self, map: &Map) {
-        self.loops.take_up(map.loops.clone(), &map.keyframes);
-    }
-
-    /// Loops, and what held whom: to be kept with the map.
-    pub fn known_loops(&self) -> &Arc<KnownLoops> {
-        self.loops.known()
+        is_done
     }
 
     /// Tells of an estimate of the newest keyframes, right after it: who held the newest one.
@@ -101,21 +82,6 @@ impl Window {
         let num_unsettled =
             if is_one_epoch { num_unsettled } else { num_unsettled.min(UNFINISHED) };
         self.loops.plan(&known, known.len().saturating_sub(num_unsettled));
-    }
-
-    /// What the last search came to: told once.
-    pub fn take_search(&mut self) -> Option<SearchReport> {
-        self.loops.take_report()
-    }
-
-    /// How the map is to be moved by a loop: told once.
-    pub fn take_closure(&mut self) -> Option<Closure> {
-        self.loops.take_closure()
-    }
-
-    /// The map was not moved by the loop that was found: it is to be solved again.
-    pub fn repeat_closure(&mut self) {
-        self.loops.repeat_closure();
     }
 
     /// The map was moved: points move with their hosts, and what the loop joins is to be estimated together.

@@ -116,7 +116,8 @@ fn place_ratios(held: &[usize]) -> SVector<f64, PLACE_ERRORS> {
         let members = Members { members: &members, free: &free, depths_are_free: true };
         if let Some(unit) = Unit::of(&truth.keyframes, &members) {
             let by = unit.restore(&mut room.keyframes, members.members).unwrap();
-            marginals.iter_mut().for_each(|of| of.transport(&by));
+            let places = marginals.iter_mut().filter_map(|of| of.place.as_mut());
+            places.for_each(|place| place.transport(&by));
         }
         let errors = place_errors(&room, &truth, 2);
         sum += errors;

@@ -20,7 +20,6 @@ use nalgebra::{
 
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
-use crate::slam::geometry::sim3::Sim3;
 use crate::slam::modes::NUM_MODES;
 use crate::slam::place_covariance::PlaceMatrix;
 use crate::slam::window::Window;
@@ -58,25 +57,6 @@ impl Window {
     /// What the last adjustment says of a keyframe.
     pub fn marginal_of(&self, keyframe_id: u64) -> Option<&Marginal> {
         self.marginals.iter().find(|of| of.keyframe_id == keyframe_id)
-    }
-
-    /// Keeps what was found of the members that were free.
-    pub(super) fn keep_marginals(&mut self, members: &Members<'_>, found: Vec<Marginal>) {
-        let free = members.members.iter().zip(members.free).filter(|(_, free)| free.is_some());
-        for (&member, _) in free {
-            let moved = self.keyframes[member].keyframe_id;
-            self.marginals.retain(|known| known.keyframe_id != moved);
-        }
-        self.marginals.extend(found);
-    }
-}
-
-impl Marginal {
-    /// Moves it into the map that `by` makes of this one: modes have no unit.
-    pub(super) fn transport(&mut self, by: &Sim3) {
-        if let Some(place) = &mut self.place {
-            place.transport(by);
-        }
     }
 }
 

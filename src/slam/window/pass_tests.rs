@@ -101,7 +101,7 @@ fn a_map_that_is_reconsidered_is_straightened_at_once() {
     bend(&mut window, 0.01);
     let before = error(&window, &truth);
     assert_eq!(window.clone().optimise(), None, "nothing is due otherwise");
-    window.reconsider();
+    window.reconsiders = true;
     window.optimise().unwrap();
     let after = error(&window, &truth);
     assert!(before > 0.004 && after < 0.5 * before, "{before} {after}");

@@ -4,23 +4,23 @@ use std::collections::HashSet;
 
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::DepthPoint;
+use crate::slam::window::params::WindowParams;
 
 /// Pixels at the border that no point is chosen in: pattern and gradients stay inside.
 const BORDER_PX: u16 = 4;
 
-/// As [`choose`], and then as many more as there are in up to `most_cells` cells, in an order of which every beginning
+/// As [`choose`], and then as many more as there are in up to `max_points` cells, in an order of which every beginning
 /// is spread over the image.
 pub fn choose_spread(
     points: &[DepthPoint],
     pixels: &[u8],
     camera: &Intrinsics,
-    [num_cells, most_cells]: [usize; 2],
-    min_gradient: f64,
-    max_relative_deviation: f64,
+    params: &WindowParams,
 ) -> Vec<DepthPoint> {
     /// Of the others every so many at a time.
     const STEP: usize = 8;
-    let of = |cells| choose(points, pixels, camera, cells, min_gradient, max_relative_deviation);
+    let of = |num_cells| choose(points, pixels, camera, num_cells, params);
+    let (num_cells, most_cells) = (params.points, params.max_points);
     let mut chosen = of(num_cells);
     if most_cells > num_cells {
         let known: HashSet<(u16, u16)> = chosen.iter().map(|point| (point.u, point.v)).collect();
@@ -39,9 +39,9 @@ pub fn choose(
     pixels: &[u8],
     camera: &Intrinsics,
     num_cells: usize,
-    min_gradient: f64,
-    max_relative_deviation: f64,
+    params: &WindowParams,
 ) -> Vec<DepthPoint> {
+    let WindowParams { min_gradient, max_relative_deviation, .. } = *params;
     let (width, height) = (camera.width, camera.height);
     let side = ((width * height) as f64 / num_cells.max(1) as f64).sqrt().max(1.0);
     let columns = (width as f64 / side).ceil() as usize;

@@ -1,10 +1,7 @@
 //! Whether an image shows the window's points where a camera is thought to be.
 
 use crate::slam::geometry::se3::SE3;
-use crate::slam::image::shared::SharedImage;
-use crate::slam::window::keyframe::WindowKeyframe;
 use crate::slam::window::members::FEWEST_COMMON;
-use crate::slam::window::surface::Surface;
 use crate::slam::window::{ALIGNMENT_LEVELS, MAX_ALIGNMENT_ITERATIONS, Window};
 
 /// What the points say of a camera's place.
@@ -34,20 +31,7 @@ impl Window {
             rotation: pose.rotation,
         };
         let map_from_camera = map_from_known * scaled(unit, keyframe_from_camera);
-        let (width, height) = (self.camera.width, self.camera.height);
-        let image = SharedImage::try_from_pixels(width, height, pixels.into())?;
-        // The last of them for as long as it is asked about.
-        self.keyframes.push(WindowKeyframe {
-            keyframe_id: u64::MAX,
-            epoch,
-            images: vec![image],
-            camera_from_map: map_from_camera.inverse(),
-            unit,
-            points: Vec::new(),
-            is_host: false,
-            agreed: Vec::new(),
-            surface: Surface::default(),
-        });
+        self.push_camera(epoch, pixels.into(), map_from_camera.inverse(), unit)?;
         let last = self.keyframes.len() - 1;
         let mut members = self.hosts_to_align_to(last);
         let at_rest: Vec<usize> =

@@ -304,67 +304,52 @@ impl System {
         damping: f64,
         step: &mut Step,
     ) -> bool {
-        let mut memory = std::mem::take(&mut self.elimination);
-        let is_solved = self.solve_with(&mut memory, members, views, damping, step);
-        self.elimination = memory;
-        is_solved
-    }
-
-    fn solve_with(
-        &self,
-        memory: &mut Elimination,
-        members: &Members<'_>,
-        views: &Views,
-        damping: f64,
-        step: &mut Step,
-    ) -> bool {
-        self.reduce(memory, members, views, damping);
+        self.reduce(members, views, damping);
         step.depths.clear();
         step.depths.resize(self.points.len(), 0.0);
-        let Some(poses) = solve(&memory.reduced, &memory.right) else { return false };
+        let Elimination { reduced, right, .. } = &self.elimination;
+        let Some(poses) = solve(reduced, right) else { return false };
         step.poses.clear();
         step.poses.extend(poses.iter());
         step.decrement = -dot(&self.right, &step.poses);
-        if members.depths_are_free {
-            for ((change, part), view) in
-                step.depths.iter_mut().zip(&self.points).zip(&views.points)
-            {
-                if !(part.hessian > 0.0) {
-                    continue;
-                }
-                let of = |pose: usize| &step.poses[POSE * pose..][..POSE];
-                let mut along =
-                    members.free[view.host].map_or(0.0, |pose| dot(&part.host, of(pose)));
-                for link in views.links(view) {
-                    if let Some(pose) = members.free[link.observer] {
-                        along += dot(&self.mixed[link.place].map(f64::from), of(pose));
-                    }
-                }
-                *change = -(part.right + along) / (part.hessian * (1.0 + damping));
-                step.decrement -= part.right * *change;
+        if !members.depths_are_free {
+            return true;
+        }
+        for ((change, part), view) in step.depths.iter_mut().zip(&self.points).zip(&views.points) {
+            if !(part.hessian > 0.0) {
+                continue;
             }
+            let of = |pose: usize| &step.poses[POSE * pose..][..POSE];
+            let mut along = members.free[view.host].map_or(0.0, |pose| dot(&part.host, of(pose)));
+            for link in views.links(view) {
+                if let Some(pose) = members.free[link.observer] {
+                    along += dot(&self.mixed[link.place].map(f64::from), of(pose));
+                }
+            }
+            *change = -(part.right + along) / (part.hessian * (1.0 + damping));
+            step.decrement -= part.right * *change;
         }
         true
     }
 
-    /// Takes the points out of the equations of the poses.
-    fn reduce(&self, memory: &mut Elimination, members: &Members<'_>, views: &Views, damping: f64) {
+    /// Takes the points out of the equations of the poses, into `elimination`.
+    fn reduce(&mut self, members: &Members<'_>, views: &Views, damping: f64) {
+        let mut memory = std::mem::take(&mut self.elimination);
         memory.reduced.clone_from(&self.hessian);
         memory.right.clone_from(&self.right);
         for pose in 0..self.num_free {
             let diagonal = &mut memory.reduced[lower(pose, pose)];
             (0..POSE).for_each(|k| diagonal[k][k] *= 1.0 + damping);
         }
-        if !members.depths_are_free {
-            return;
-        }
+        let num_points = if members.depths_are_free { self.points.len() } else { 0 };
         let kernel = Kernel::choose(SimdMode::Auto);
-        for first in (0..self.points.len()).step_by(CHUNK) {
-            let some = first..(first + CHUNK).min(self.points.len());
-            self.collect(some, members, views, damping, memory);
-            let Elimination { points, rows, reduced, right } = &mut *memory;
+        for first in (0..num_points).step_by(CHUNK) {
+            let some = first..(first + CHUNK).min(num_points);
+            self.collect(some, members, views, damping, &mut memory);
+            let Elimination { points, rows, reduced, right } = &mut memory;
             eliminate(kernel, points, rows, reduced, right);
         }
+        self.elimination = memory;
     }
 
     /// Standard deviation of a point's inverse depth, by its place in the views, were all poses exact; infinite where
@@ -381,11 +366,8 @@ impl System {
         views: &Views,
         stiffened: Option<&DVector<f64>>,
     ) -> Option<Factors> {
-        let mut memory = std::mem::take(&mut self.elimination);
-        self.reduce(&mut memory, members, views, 0.0);
-        let factors = Factors::of(&memory.reduced, POSE * self.num_free, stiffened);
-        self.elimination = memory;
-        factors
+        self.reduce(members, views, 0.0);
+        Factors::of(&self.elimination.reduced, POSE * self.num_free, stiffened)
     }
 
     /// A vector whose scalar product with that of another function of the same depths is gᵀ H⁻¹ g', `factors` those of

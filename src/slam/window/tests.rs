@@ -86,7 +86,7 @@ pub(super) fn exact_host(
         .collect();
     let params = WindowParams::default();
     let chosen =
-        selection::choose(&dense, keyframe.images[0].pixels(), &CAMERA, num_cells, 8.0, 0.3);
+        selection::choose(&dense, keyframe.images[0].pixels(), &CAMERA, num_cells, &params);
     let points = chosen.iter().map(|of| {
         WindowPoint::new(
             (of.u, of.v),
@@ -143,7 +143,7 @@ impl Room {
         let robustness = Robustness { huber_grey: 9.0, most_energy: 8.0 * 144.0 };
         for level in ADJUSTED_LEVELS {
             let at = Level { camera: &CAMERA, level, robustness };
-            solver.views.find(&self.keyframes, members.members, &CAMERA, |_, _| true);
+            solver.views.find(&self.keyframes, &members, &CAMERA);
             solver.views.look(&self.keyframes, members.members, level);
             assert!(solver.adjust(&mut self.keyframes, &members, &at, 15, 1e-4));
         }

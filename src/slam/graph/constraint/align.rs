@@ -49,7 +49,7 @@ pub(super) fn sums(
     weighed_at: &State,
     params: &ConstraintParams,
 ) -> Sums {
-    let at = params.level(views, level, state, weighed_at);
+    let at = Level::new(views, level, state, weighed_at, params);
     let mut sums = Sums {
         information: Information::zeros(),
         gradient: Row::zeros(),
@@ -169,18 +169,6 @@ pub(super) fn descend(
 }
 
 impl ConstraintParams {
-    pub(super) fn level<'a>(
-        &self,
-        views: [&'a KeyframeView; 2],
-        level: usize,
-        state: &State,
-        weighed_at: &State,
-    ) -> Level<'a> {
-        let is_finest = level == views[0].levels().start;
-        let depth_model = if is_finest { self.depth_model_ratio } else { self.coarse_depth_ratio };
-        Level::new(views, level, state, weighed_at, &self.alignment, depth_model)
-    }
-
     /// Huber's weight of a point whose whitened squared residual is this.
     pub(super) fn huber_weight(&self, squared: f64) -> f64 {
         (f64::from(self.alignment.huber) / squared.sqrt()).min(1.0)

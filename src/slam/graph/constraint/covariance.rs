@@ -11,7 +11,7 @@ use nalgebra::SMatrix;
 
 use super::ConstraintParams;
 use super::align::Sums;
-use super::residual::{Row, SCALE, State, Terms, UNKNOWNS};
+use super::residual::{Level, Row, SCALE, State, Terms, UNKNOWNS};
 use super::view::KeyframeView;
 use crate::slam::alignment::misfit::TileMisfit;
 use crate::slam::alignment::tiles::{NUM_TILES, TileSum, tile_of};
@@ -29,7 +29,7 @@ pub(super) struct Scatter {
     quadratic: f64,
     by_modes: [ByModes; 2],
     /// Points that meet depth of j, and those whose depths agree.
-    depths: [u32; 2],
+    pub(super) depths: [u32; 2],
 }
 
 #[derive(Clone, Default)]
@@ -94,7 +94,7 @@ impl Scatter {
         state: &State,
         params: &ConstraintParams,
     ) -> Self {
-        let at = params.level(views, level, state, state);
+        let at = Level::new(views, level, state, state, params);
         let [i, j] = views.map(|view| &view.reference);
         let centres = [i, j].map(|reference| reference.level(level).centre());
         let intrinsics = i.intrinsics().at_level(level);
@@ -180,11 +180,6 @@ impl Scatter {
         let change = row[0] * t.x + row[1] * t.y + row[2] * t.z;
         let own = shape([terms.point.ray_x, terms.point.ray_y].map(f64::from), d) - centre;
         self.by_modes[0] += row * (weight * change) * own.transpose();
-    }
-
-    /// Points that meet depth of j, and those whose depths agree.
-    pub(super) fn depths(&self) -> [u32; 2] {
-        self.depths
     }
 
     /// How far the tiles agree.

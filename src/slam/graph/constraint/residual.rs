@@ -13,8 +13,8 @@
 
 use nalgebra::SVector;
 
+use super::ConstraintParams;
 use super::view::{DepthGrid, KeyframeView};
-use crate::slam::alignment::align::AlignmentParams;
 use crate::slam::alignment::points::Point;
 use crate::slam::alignment::residual::{Evaluation, PointTerms, point_terms};
 use crate::slam::geometry::se3::SE3;
@@ -141,12 +141,16 @@ impl<'a> Level<'a> {
         level: usize,
         state: &State,
         weighed_at: &State,
-        params: &AlignmentParams,
-        depth_model_ratio: f64,
+        params: &ConstraintParams,
     ) -> Self {
+        let depth_model_ratio = match level == i.levels().start {
+            true => params.depth_model_ratio,
+            false => params.coarse_depth_ratio,
+        };
         let intrinsics = i.reference.intrinsics().at_level(level);
         let (t, brightness) = (&weighed_at.rigid.translation, state.brightness);
-        let at = Evaluation::new(&intrinsics, level, &state.rigid, brightness, params, t);
+        let at =
+            Evaluation::new(&intrinsics, level, &state.rigid, brightness, &params.alignment, t);
         let (image, depths) = (j.pyramid.level(level), &j.depths[level]);
         Self { view: i, image, depths, level, at, state: *state, depth_model_ratio }
     }

@@ -4,7 +4,7 @@ use nalgebra::{UnitQuaternion, Vector3, Vector6};
 
 use super::ConstraintParams;
 use super::align::solve_level;
-use super::residual::State;
+use super::residual::{Level, State};
 use super::view::KeyframeView;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
@@ -66,7 +66,7 @@ pub(super) fn find(
     best.filter(|(explained, _)| *explained >= least).map(|(_, state)| state)
 }
 
-/// Solves a level, with the share that is explained; `None` where only a gain that is not plausible explains it, which
+/// Solves a level, with the share of all its points that are inliers; `None` where only a gain that is not plausible explains it, which
 /// would hide the right pose.
 fn follow(
     views: [&KeyframeView; 2],
@@ -76,12 +76,8 @@ fn follow(
 ) -> Option<(f64, State)> {
     let (state, sums) = solve_level(views, level, state, params)?;
     let is_even = state.brightness.a.abs() <= params.gates.max_log_gain;
-    is_even.then(|| (explained(views, level, sums.inliers), state))
-}
-
-/// Share of all points of a level that are inliers.
-fn explained(views: [&KeyframeView; 2], level: usize, inliers: u32) -> f64 {
-    f64::from(inliers) / views[0].reference.level(level).len().max(1) as f64
+    let explained = f64::from(sums.inliers) / views[0].reference.level(level).len().max(1) as f64;
+    is_even.then_some((explained, state))
 }
 
 /// Poses around one: turned by `degrees`, and moved by `aside`, units of i, with a turn that keeps the view.
@@ -106,7 +102,7 @@ fn log_scale(
     state: &State,
     params: &ConstraintParams,
 ) -> f64 {
-    let at = params.level(views, level, state, state);
+    let at = Level::new(views, level, state, state, params);
     let depths = at.terms().filter_map(|terms| terms.depth);
     let mut residuals: Vec<f64> = depths.map(|depth| depth.residual).collect();
     state.log_scale + upper_median(&mut residuals, f64::total_cmp).unwrap_or(0.0)

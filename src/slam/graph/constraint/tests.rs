@@ -106,7 +106,7 @@ fn derivatives_of_depth_are_those_of_differences() {
     let params = ConstraintParams::default();
     let level = 1;
     let terms_at = |state: &State| {
-        let at: Level<'_> = params.level([i, j], level, state, state);
+        let at = Level::new([i, j], level, state, state, &params);
         at.terms().map(|terms| (terms.point, terms)).collect::<Vec<_>>()
     };
     let (mut compared, mut wrong) = (0, 0);

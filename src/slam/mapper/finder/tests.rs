@@ -50,7 +50,7 @@ fn one_that_was_not_confirmed_leaves_the_next_frame_to_others() {
     let mut finder = Finder::new(&CAMERA);
     let params = RecoveryParams::default();
     let mut find = |doubted: Option<usize>| {
-        doubted.into_iter().for_each(|index| finder.doubt(index));
+        finder.doubted = doubted.or(finder.doubted);
         finder.find(&mut keyframes.to_vec(), Some(2), &mut 0, &pixels, &params).unwrap().0
     };
     let first = find(None);
@@ -123,13 +123,13 @@ fn keyframes_that_gave_up_their_depth_leave_the_index() {
     let pan = |k: u64| at([0.0, 0.0, 0.0, 0.0, 0.3 * k as f64, 0.0]);
     let mut keyframes: Vec<_> = (0..8).map(|k| keyframe(&scene, k, pan(k))).collect();
     let mut finder = Finder::new(&CAMERA);
-    finder.learn_all(&mut keyframes);
+    finder.learn(&mut keyframes, usize::MAX);
     assert_eq!(finder.places.len(), 8);
     let bytes = finder.places.bytes();
     for given_up in &mut keyframes[1..7] {
         *given_up = given_up.without_depth();
     }
-    finder.learn(&mut keyframes);
+    finder.learn(&mut keyframes, MOST_LEARNT);
     let left: Vec<u64> = (0..8).filter(|id| finder.places.contains(*id)).collect();
     assert_eq!(left, [0, 7]);
     assert!(2 * finder.places.bytes() < bytes, "{bytes} B, now {}", finder.places.bytes());
@@ -140,12 +140,12 @@ fn a_keyframe_is_described_once_and_found_by_the_description_that_it_came_with()
     let scene = Scene::new(3);
     let away = at([0.0, 0.0, 0.0, 0.0, 1.2, 0.0]);
     let mut keyframes = [keyframe(&scene, 0, at([0.0; 6])), keyframe(&scene, 1, away)];
-    Finder::new(&CAMERA).learn(&mut keyframes);
+    Finder::new(&CAMERA).learn(&mut keyframes, MOST_LEARNT);
     let made = keyframes.each_ref().map(|of| of.description.clone().unwrap());
     // Another finder takes what is there, also where the image would say something else.
     keyframes[0].description = Some(made[1].clone());
     let mut finder = Finder::new(&CAMERA);
-    finder.learn_all(&mut keyframes);
+    finder.learn(&mut keyframes, usize::MAX);
     assert!(Arc::ptr_eq(keyframes[0].description.as_ref().unwrap(), &made[1]));
     let found = finder.places.candidates(&made[0], 2, |_| false);
     assert!(found.iter().all(|of| of.score < 30.0), "{found:?}");

@@ -3,9 +3,11 @@
 use nalgebra::Vector6;
 
 use super::*;
+use crate::slam::frame::FrameView;
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::map::{Correction, KeyframeCorrection, LogPlane};
 use crate::slam::mapper::MapperParams;
+use crate::slam::mapper::consistency::START_KEYFRAMES;
 use crate::slam::mapper::phase::Active;
 use crate::slam::pose::upper_triangle;
 use crate::slam::test_scene::{CAMERA, Scene};
