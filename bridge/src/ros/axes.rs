@@ -5,7 +5,7 @@
 //! are map units. A camera keeps its own axes, which in ROS are those of an optical frame.
 
 use nalgebra::{Matrix3, Matrix6, UnitQuaternion, Vector3, Vector6};
-use semidense::slam::geometry::se3::{SE3, hat};
+use semidense::slam::geometry::se3::SE3;
 
 use crate::ros::message;
 
@@ -67,7 +67,7 @@ fn both_turned(rotation: &Matrix3<f64>) -> Matrix6<f64> {
 /// turns about the origin: a position p errs by ξ_t + ξ_ω × p.
 pub fn place_covariance(position: &Vector3<f64>, left_increment: &[f64; 21]) -> Matrix6<f64> {
     let mut error_from_increment = Matrix6::identity();
-    error_from_increment.fixed_view_mut::<3, 3>(0, 3).copy_from(&-hat(position));
+    error_from_increment.fixed_view_mut::<3, 3>(0, 3).copy_from(&-position.cross_matrix());
     error_from_increment * matrix(left_increment) * error_from_increment.transpose()
 }
 
