@@ -261,13 +261,16 @@ impl Mapper {
 fn proven_pose(frame: &FrameView<'_>, start: &InitOutcome, scale: f64) -> PoseEstimate {
     let mut keyframe_from_camera = start.first_from_current;
     keyframe_from_camera.translation /= scale;
+    let covariance = upper_triangle(|row, column| {
+        let unit = |of: usize| if of < 3 { scale } else { 1.0 };
+        start.pose_covariance[(row, column)] / (unit(row) * unit(column))
+    });
     PoseEstimate {
         state: TrackingState::Initializing,
         keyframe_from_camera,
-        covariance: upper_triangle(|row, column| {
-            let unit = |of: usize| if of < 3 { scale } else { 1.0 };
-            start.pose_covariance[(row, column)] / (unit(row) * unit(column))
-        }),
+        covariance,
+        // Without one it would count as given, and what is observed at it as exact.
+        alignment_covariance: covariance,
         brightness: start.brightness,
         ..PoseEstimate::unknown(frame)
     }
