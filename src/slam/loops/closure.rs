@@ -14,6 +14,8 @@ use crate::slam::map::EpochJoin;
 /// How the map is to be moved.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Closure {
+    /// The epoch that is moved, which need not be the active one.
+    pub epoch: u32,
     /// Where each keyframe goes, in the order of their ids: what its place is multiplied by from the left.
     pub moves: Vec<(u64, Sim3)>,
     /// An epoch that becomes part of another.
@@ -21,8 +23,11 @@ pub struct Closure {
 }
 
 impl Closure {
-    /// The move of a keyframe: its own, or of one that came later that of the last before it.
-    pub fn of(&self, keyframe_id: u64) -> Option<&Sim3> {
+    /// The move of a keyframe: its own, or of one of the epoch that came later that of the last before it.
+    pub fn of(&self, keyframe_id: u64, epoch: u32) -> Option<&Sim3> {
+        if epoch != self.epoch {
+            return None;
+        }
         let place = self.moves.partition_point(|(id, _)| *id <= keyframe_id);
         self.moves.get(place.checked_sub(1)?).map(|(_, by)| by)
     }
@@ -65,7 +70,7 @@ impl Loops {
         let beginning = job.nodes.iter().find(|node| node.epoch == epoch);
         Arc::make_mut(&mut self.known).beginnings.extend(beginning.map(|node| node.keyframe_id));
         let join = Some(EpochJoin { epoch, into, into_from_epoch });
-        self.closure = Some(Closure { moves: Vec::new(), join });
+        self.closure = Some(Closure { epoch, moves: Vec::new(), join });
         SearchFate::Joined
     }
 
@@ -89,7 +94,7 @@ impl Loops {
         let after = chain.graph.vertices().iter().map(|v| v.map_from_keyframe);
         let by = after.zip(before).map(|(is, was)| is * was.inverse());
         let moves = chain.ids.iter().copied().zip(by).collect();
-        self.closure = Some(Closure { moves, join: None });
+        self.closure = Some(Closure { epoch, moves, join: None });
         SearchFate::Closed
     }
 }

@@ -90,7 +90,9 @@ impl Course {
             reports.extend(self.loops.take_report());
             if let Some(closure) = self.loops.take_closure() {
                 for keyframe in &mut self.map.keyframes {
-                    let Some(by) = closure.of(keyframe.keyframe_id) else { continue };
+                    let Some(by) = closure.of(keyframe.keyframe_id, keyframe.epoch) else {
+                        continue;
+                    };
                     keyframe.map_from_keyframe = *by * keyframe.map_from_keyframe;
                 }
                 let joins = closure.join.into_iter().collect();

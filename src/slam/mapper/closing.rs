@@ -42,10 +42,10 @@ impl Mapper {
 
     /// Moves the map as a loop has it; odometry stays where it is and keeps its unit.
     pub(super) fn close_loop(&mut self, closure: &Closure, window: &mut Window) -> StepOutcome {
-        let epoch = self.keyframe().map(|keyframe| keyframe.epoch);
-        let unit = closure.moves.last().map(|(_, by)| by.scale).filter(|_| closure.join.is_none());
+        let is_active = self.keyframe().is_some_and(|active| active.epoch == closure.epoch);
+        let unit = closure.moves.last().map(|(_, by)| by.scale).filter(|_| is_active);
         let moved = |keyframe: &Keyframe| {
-            let by = closure.of(keyframe.keyframe_id)?;
+            let by = closure.of(keyframe.keyframe_id, keyframe.epoch)?;
             Some(KeyframeCorrection {
                 place: Some(keyframe.place_covariance.transported(by)),
                 ..KeyframeCorrection::of_place(
@@ -54,11 +54,7 @@ impl Mapper {
                 )
             })
         };
-        let of_epoch = self.map.keyframes.iter().filter(|keyframe| Some(keyframe.epoch) == epoch);
-        let keyframes = match closure.join {
-            Some(_) => Vec::new(),
-            None => of_epoch.filter_map(moved).collect(),
-        };
+        let keyframes = self.map.keyframes.iter().filter_map(moved).collect();
         let joins = closure.join.into_iter().collect();
         match self.apply(&Correction { keyframes, joins, unit }) {
             Ok(outcome) => {
@@ -113,7 +109,7 @@ mod tests {
     fn a_loop_moves_the_map_and_leaves_odometry_and_its_unit() {
         let mut mapper = mapper();
         let by = Sim3::new(sideways(0.5), 1.2);
-        let closure = Closure { moves: vec![(0, Sim3::identity()), (1, by)], join: None };
+        let closure = Closure { epoch: 0, moves: vec![(0, Sim3::identity()), (1, by)], join: None };
         let before = mapper.map.revision;
         let outcome = mapper.close_loop(&closure, &mut window());
         assert!(outcome.graph_changed && outcome.keyframe_changed);
@@ -126,6 +122,24 @@ mod tests {
         assert!((in_world(&mapper, 0.1) - 1.1).abs() < 1e-12);
         assert!((in_world(&mapper, 0.4) - 1.4).abs() < 1e-12);
         assert_eq!(mapper.map.keyframes[0].map_from_keyframe, Sim3::identity());
+    }
+
+    #[test]
+    fn a_loop_of_an_epoch_that_is_not_active_moves_that_one_alone() {
+        let mut mapper = mapper();
+        let scene = Scene::new(3);
+        for (id, epoch) in [(2, 1), (3, 0), (4, 1)] {
+            let keyframe = scene.keyframe(id, sideways(id as f64), 1.0);
+            mapper.map.keyframes.push(Keyframe { epoch, ..keyframe });
+        }
+        mapper.active = Some(Active::new(4));
+        let by = Sim3::new(SE3::identity(), 1.2);
+        let moves = vec![(0, Sim3::identity()), (1, by)];
+        let world = mapper.world_from_map;
+        mapper.close_loop(&Closure { epoch: 0, moves, join: None }, &mut window());
+        let units = mapper.map.keyframes.iter().map(|of| of.map_from_keyframe.scale);
+        assert_eq!(units.collect::<Vec<_>>(), [1.0, 1.2, 1.0, 1.2, 1.0]);
+        assert_eq!(mapper.world_from_map, world);
     }
 
     #[test]
@@ -173,7 +187,8 @@ mod tests {
         mapper.map.keyframes[1].epoch = 4;
         let into_from_epoch = Sim3::new(sideways(-3.0), 0.5);
         let join = Some(EpochJoin { epoch: 4, into: 0, into_from_epoch });
-        let outcome = mapper.close_loop(&Closure { moves: Vec::new(), join }, &mut window());
+        let outcome =
+            mapper.close_loop(&Closure { epoch: 4, moves: Vec::new(), join }, &mut window());
         assert!(outcome.graph_changed && outcome.keyframe_changed);
         let active = mapper.keyframe().unwrap();
         assert_eq!((active.epoch, active.map_from_keyframe.scale), (0, 0.5));
@@ -185,7 +200,7 @@ mod tests {
     fn what_is_no_similarity_leaves_the_map_as_it_is() {
         let mut mapper = mapper();
         let broken = Sim3 { scale: f64::NAN, ..Sim3::identity() };
-        let closure = Closure { moves: vec![(0, broken)], join: None };
+        let closure = Closure { epoch: 0, moves: vec![(0, broken)], join: None };
         assert_eq!(mapper.close_loop(&closure, &mut window()), StepOutcome::default());
         assert_eq!(mapper.map.revision, 0);
     }

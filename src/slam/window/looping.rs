@@ -87,7 +87,7 @@ impl Window {
     /// The map was moved: points move with their hosts, and what the loop joins is to be estimated together.
     pub fn follow(&mut self, closure: &Closure) {
         for keyframe in &mut self.keyframes {
-            let Some(by) = closure.of(keyframe.keyframe_id) else { continue };
+            let Some(by) = closure.of(keyframe.keyframe_id, keyframe.epoch) else { continue };
             let place = *by * Sim3::new(keyframe.camera_from_map.inverse(), keyframe.unit);
             keyframe.camera_from_map = place.rigid.inverse();
             keyframe.unit = place.scale;
