@@ -48,8 +48,9 @@ impl Thinning {
         let mut extended = correction.clone();
         let places: BTreeMap<u64, Sim3> =
             correction.keyframes.iter().map(|k| (k.keyframe_id, k.map_from_keyframe)).collect();
-        let followers = self.attached.iter().filter(|(id, _)| !places.contains_key(id));
-        extended.keyframes.extend(followers.filter_map(|(&id, to)| {
+        // Whatever else they followed: by two leaders they would be moved twice.
+        extended.keyframes.retain(|k| !self.attached.contains_key(&k.keyframe_id));
+        extended.keyframes.extend(self.attached.iter().filter_map(|(&id, to)| {
             let (was, keyframe) = (map.get(*to)?, map.get(id)?);
             let by = *places.get(to)? * was.map_from_keyframe.inverse();
             Some(KeyframeCorrection::of_place(id, by * keyframe.map_from_keyframe))
@@ -335,5 +336,27 @@ mod tests {
             let error = (expected.inverse() * is.map_from_keyframe).log().norm();
             assert!(error < 1e-9, "keyframe {}: {error}", was.keyframe_id);
         }
+    }
+
+    /// The window takes it for a follower of the keyframe before it.
+    #[test]
+    fn what_gave_up_its_depth_does_not_follow_two_leaders() {
+        let mut mapper = Mapper::new(CAMERA, MapperParams::default()).unwrap();
+        mapper.map.keyframes = (0..3).map(|id| keyframe(id, 0.1 * id as f64, 0.0)).collect();
+        mapper.active = Some(Active::new(2));
+        mapper.thinning.attach(1, 2);
+        let x = |mapper: &Mapper, id: usize| {
+            mapper.map.keyframes[id].map_from_keyframe.rigid.translation.x
+        };
+        let by = Sim3::new(SE3::exp(&[0.01, 0.0, 0.0, 0.0, 0.0, 0.0].into()), 1.0);
+        for moved in [&[0, 1][..], &[2]] {
+            let of_place = |&id: &u64| {
+                let of = mapper.map.get(id).unwrap();
+                KeyframeCorrection::of_place(id, by * of.map_from_keyframe)
+            };
+            let keyframes = moved.iter().map(of_place).collect();
+            mapper.apply(&Correction { keyframes, ..Correction::default() }).unwrap();
+        }
+        assert!((x(&mapper, 1) - 0.11).abs() < 1e-9, "{}", x(&mapper, 1));
     }
 }
