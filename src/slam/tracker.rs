@@ -18,7 +18,7 @@ use crate::slam::alignment::reference::{
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
-use crate::slam::image::sums::{SumPyramid, grey_per_sum};
+use crate::slam::image::sums::SumPyramid;
 use crate::slam::keyframe::{DistanceWeights, MapState};
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::{Brightness, DegradedReason, LostReason, PoseEstimate, TrackingState};
@@ -330,7 +330,7 @@ impl Tracker {
         }
         self.turning.keep(&mut self.pyramid, frame.sequence);
         self.pyramid.fill(frame.pixels);
-        let flat = contrast(&self.pyramid) < self.params.min_contrast;
+        let flat = self.pyramid.contrast() < self.params.min_contrast;
         flat.then_some(LostReason::UnusableFrame)
     }
 
@@ -465,16 +465,6 @@ impl Tracker {
             || quality.inlier_ratio < self.params.verdict.lost_inliers
             || quality.in_view_ratio < self.params.verdict.degraded_in_view
     }
-}
-
-/// Standard deviation of the coarsest level, grey levels.
-fn contrast(pyramid: &SumPyramid) -> f64 {
-    let level = pyramid.num_levels().saturating_sub(1);
-    let pixels = pyramid.level(level).pixels();
-    let count = pixels.len().max(1) as f64;
-    let mean = pixels.iter().map(|&sum| f64::from(sum)).sum::<f64>() / count;
-    let squared = pixels.iter().map(|&sum| (f64::from(sum) - mean).powi(2)).sum::<f64>();
-    (squared / count).sqrt() * f64::from(grey_per_sum(level))
 }
 
 #[cfg(test)]

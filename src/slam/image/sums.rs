@@ -71,6 +71,16 @@ impl SumPyramid {
         &self.levels[level]
     }
 
+    /// Standard deviation of the coarsest level, grey levels: noise is averaged away there.
+    pub fn contrast(&self) -> f64 {
+        let Some(coarsest) = self.levels.last() else { return 0.0 };
+        let pixels = coarsest.pixels();
+        let count = pixels.len().max(1) as f64;
+        let mean = pixels.iter().map(|&sum| f64::from(sum)).sum::<f64>() / count;
+        let squared = pixels.iter().map(|&sum| (f64::from(sum) - mean).powi(2)).sum::<f64>();
+        (squared / count).sqrt() * f64::from(grey_per_sum(self.levels.len() - 1))
+    }
+
     /// Number of levels, those below the finest included.
     pub fn num_levels(&self) -> usize {
         self.levels.len()

@@ -2,8 +2,10 @@
 
 use std::sync::Arc;
 
+use crate::slam::alignment::reference::num_levels;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
+use crate::slam::image::sums::SumPyramid;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::map::{PlacedFrame, RefinedDepth};
 use crate::slam::mapper::consistency::Contradiction;
@@ -176,11 +178,23 @@ impl Mapper {
         }
     }
 
-    /// Keeps a frame from before its map begins.
+    /// Keeps a frame from before its map begins. One without contrast would be found anywhere, as a gain of nearly 0
+    /// explains it, and leads to none before it.
     pub(super) fn keep_early_frame(&mut self, frame: &FrameView<'_>) {
         /// Two seconds at 30 Hz, one byte a pixel each.
         const MOST: usize = 60;
-        if self.aligns_again() {
+        /// Of a frame that a tracker does not align either, grey levels.
+        const LEAST_CONTRAST: f64 = 2.0;
+        let mut pyramid = SumPyramid::with_size(
+            frame.width,
+            frame.height,
+            num_levels(frame.width, frame.height),
+            0,
+        );
+        pyramid.fill(frame.pixels);
+        if pyramid.contrast() < LEAST_CONTRAST {
+            self.early.clear();
+        } else if self.aligns_again() {
             let (copy, at) = (self.copies.of(frame), &SE3::identity());
             keep(&mut self.early, MOST, (frame.sequence, copy), (NO_KEYFRAME, at));
         }
