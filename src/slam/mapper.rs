@@ -26,7 +26,7 @@ mod start;
 mod thinning;
 pub(in crate::slam) mod turned_views;
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 
 use crate::slam::depth::gaussian::ObservationCounts;
 use crate::slam::depth::line_noise::LineNoise;
@@ -122,6 +122,8 @@ pub struct Mapper {
     active: Option<Active>,
     /// Where the active epoch's map lies in odometry's world: a similarity, since a correction may change units.
     world_from_map: Sim3,
+    /// The same of epochs that were left, by their number.
+    left_worlds: BTreeMap<u32, Sim3>,
     /// Where odometry had the camera last; a tracker that has lost it, or was restarted, may not know.
     last_world_from_camera: Option<SE3>,
     /// The keyframe that the last frame was tracked on, and where that was in its unit.
@@ -172,6 +174,7 @@ impl Mapper {
             prior: None,
             active: None,
             world_from_map: Sim3::identity(),
+            left_worlds: BTreeMap::new(),
             last_world_from_camera: None,
             last_tracked: None,
             line_noise: LineNoise::new(params.matching.line_noise_px),

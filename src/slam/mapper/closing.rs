@@ -143,6 +143,23 @@ mod tests {
     }
 
     #[test]
+    fn an_epoch_that_is_taken_up_again_has_the_unit_of_odometry_whichever_keyframe_it_is_found_on()
+    {
+        for found_on in 0..2 {
+            let mut mapper = mapper();
+            let other = mapper.map.keyframes[0].clone();
+            mapper.map.keyframes.push(Keyframe { keyframe_id: 2, epoch: 1, ..other });
+            // An estimate gives one of the two another unit than it had when odometry knew it.
+            let map_from_keyframe = Sim3::new(SE3::identity(), 1.2);
+            let keyframes = vec![KeyframeCorrection::of_place(0, map_from_keyframe)];
+            mapper.apply(&Correction { keyframes, ..Correction::default() }).unwrap();
+            mapper.restore_keyframe(2, &SE3::identity());
+            mapper.restore_keyframe(found_on, &SE3::identity());
+            assert_eq!(mapper.world_from_map.scale, 1.0, "found on {found_on}");
+        }
+    }
+
+    #[test]
     fn the_search_shares_the_descriptions_of_the_finder_and_does_not_search_what_was_there_before()
     {
         let scene = Scene::new(3);

@@ -252,8 +252,11 @@ impl Mapper {
         restore_points(&mut self.depth.active, &keyframe.points);
         // One of another epoch brings the place and the unit back that its map has in odometry's world.
         let is_first = self.active.is_none();
-        if self.keyframe().is_none_or(|active| active.epoch != keyframe.epoch) {
-            self.world_from_map = Self::world_from_map_of(keyframe);
+        let left = self.keyframe().map(|active| active.epoch);
+        if left != Some(keyframe.epoch) {
+            let before = self.left_worlds.get(&keyframe.epoch).copied();
+            self.left_worlds.extend(left.map(|epoch| (epoch, self.world_from_map)));
+            self.world_from_map = before.unwrap_or_else(|| Self::world_from_map_of(keyframe));
         }
         self.anchor(keyframe.keyframe_id, keyframe_from_camera);
         self.past.clear();

@@ -189,8 +189,10 @@ impl Mapper {
     /// Leaves the active keyframe and begins depth on `pixels`, in a world of its own.
     fn begin_epoch(&mut self, pixels: &[u8]) {
         self.leave_keyframe();
-        if let Some(left) = self.keyframe().map(|keyframe| keyframe.keyframe_id) {
-            self.tell_left(left);
+        if let Some(left) = self.keyframe() {
+            let (keyframe_id, epoch) = (left.keyframe_id, left.epoch);
+            self.left_worlds.insert(epoch, self.world_from_map);
+            self.tell_left(keyframe_id);
         }
         self.active = None;
         self.phase = Phase::Mapping;
