@@ -71,8 +71,16 @@ impl Start {
         (self.first, self.latest, self.initializer) = (None, None, None);
     }
 
-    /// Takes another frame; once parallax is proven gives what was found.
+    /// Takes another frame; once parallax is proven gives what was found. Of a fast camera some are left out: a start
+    /// is judged by steps of about 30 Hz, and has to prove itself within so many of them.
     fn step(&mut self, frame: &FrameView<'_>) -> Option<Proven> {
+        /// A frame that comes so soon after the one before is left out, nanoseconds: 45 Hz.
+        const TOO_SOON: std::ops::Range<i64> = 1..22_000_000;
+        let since = self.latest.map(|(_, nanos)| frame.capture_nanos.saturating_sub(nanos));
+        if since.is_some_and(|since| TOO_SOON.contains(&since)) {
+            self.last_frame = None;
+            return None;
+        }
         let mut initializer = match self.initializer.take() {
             Some(initializer) => initializer,
             None => TwoFrameInitializer::new(self.intrinsics, self.params.clone()).ok()?.into(),
@@ -310,6 +318,35 @@ mod tests {
     use super::*;
     use crate::slam::test_scene::{CAMERA, Scene};
 
+    /// Time from frame to frame at 30 Hz.
+    const PERIOD_NANOS: i64 = 33_333_333;
+
+    #[test]
+    fn a_start_of_a_fast_camera_has_as_long_as_one_of_a_slow_camera() {
+        let image = Scene::new(1).render(&CAMERA, &SE3::identity());
+        // Frames that the start has taken when it gives up a camera that stands still, and when that is.
+        let given_up = |rate: i64| {
+            let mut start = Start::new(CAMERA, &TwoFrameParams::default()).unwrap();
+            let mut taken = 0;
+            for sequence in 0..300 {
+                let pixels = &image.noisy(2.0, sequence);
+                let nanos = sequence as i64 * 1_000_000_000 / rate;
+                start.step(&FrameView::new(&CAMERA, sequence, nanos, pixels));
+                taken += usize::from(start.last_frame.is_some());
+                if start.progress.failures > 0 {
+                    return (taken, nanos as f64 * 1e-9);
+                }
+            }
+            panic!("never at {rate} Hz");
+        };
+        for rate in [30, 60, 120] {
+            let (taken, secs) = given_up(rate);
+            assert_eq!(taken, 61, "{rate} Hz");
+            // At 120 Hz every third frame is taken.
+            assert!((1.4..2.1).contains(&secs), "{rate} Hz: {secs} s");
+        }
+    }
+
     #[test]
     fn the_first_keyframe_has_the_stamp_of_the_frame_that_the_start_went_on_from() {
         // One frame of the camera's motion shows 84 % of the points again, two of them 78 %.
@@ -321,7 +358,7 @@ mod tests {
                 let moved = Vector6::new(0.0, 0.0, 0.2 * frame as f64, 0.0, 0.0, 0.0);
                 let image = Scene::new(1).render(&CAMERA, &SE3::exp(&moved));
                 let pixels = &image.noisy(2.0, 100 + frame);
-                let (sequence, capture_nanos) = (10 + frame, 1000 * frame as i64);
+                let (sequence, capture_nanos) = (10 + frame, PERIOD_NANOS * frame as i64);
                 let (width, height) = (CAMERA.width, CAMERA.height);
                 start.step(&FrameView {
                     sequence,
@@ -332,7 +369,7 @@ mod tests {
                     pixels,
                 })
             });
-            let stamp = (first, 1000 * (first as i64 - 10));
+            let stamp = (first, PERIOD_NANOS * (first as i64 - 10));
             assert_eq!(proven.map(|proven| proven.first), Some(stamp));
         }
     }
