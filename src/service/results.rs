@@ -141,7 +141,7 @@ impl<'a> Results<'a> {
         let (evaluation, online_evaluation) = (evaluate(&trajectory), evaluate(&online));
         let depth = match record.is_depth_from_sensor {
             true => DepthErrors::default(),
-            false => depth_maps::evaluate_depth(record, depth_source)?,
+            false => depth_maps::evaluate_depth(record, epoch, depth_source)?,
         };
         let begin = Instant::now();
         let surface = fuse(&keyframes_of(&record.map, epoch), &params.fusion(), progress);

@@ -253,6 +253,10 @@ fn trajectories_say_where_another_epoch_begins() {
     for (i, pose) in poses.iter_mut().enumerate() {
         pose.estimate.epoch = epoch_of(i);
         pose.estimate.keyframe_id = u64::from(epoch_of(i));
+        if i >= 20 {
+            // Odometry begins with another unit.
+            pose.estimate.world_from_camera.translation *= 3.0;
+        }
     }
     let mut record = record(poses, vec![keyframe(0), keyframe(1)], true);
     // Two frames before the second epoch are aligned to it afterwards.
@@ -287,9 +291,18 @@ fn trajectories_say_where_another_epoch_begins() {
         let expected = summary[key].as_f64().unwrap();
         assert!((found - expected).abs() < 1e-9, "{key}: {found}, {expected}");
     }
-    // Joined to the first in the end: one map.
+    // Units of two epochs have nothing to do with each other.
+    assert!(summary["depth_scale_ratio"].is_null(), "{}", summary["depth_scale_ratio"]);
+    // Joined to the first in the end: one map, and still two worlds of odometry.
     record.map.keyframes[1].epoch = 0;
     assert_eq!(parts(&record), [vec![part("", 57)], online]);
+    let (summary, _) = written(folder.path(), &record);
+    let odometry = &summary["online"];
+    assert_eq!(odometry["matched_poses"], 40);
+    assert!(odometry["ate_rmse_m"].as_f64().unwrap() < 1e-9, "{odometry}");
+    // Frames of the second epoch were placed in a map of their own.
+    assert_eq!(summary["map_nees"]["nees_frames"], 35);
+    assert_eq!(summary["depth_scale_ratio"], 1.0);
 }
 
 #[test]

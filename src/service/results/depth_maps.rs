@@ -6,13 +6,15 @@ use crate::service::results::record::RunRecord;
 use crate::slam::evaluation::depth_error::DepthErrors;
 use crate::slam::keyframe::{Keyframe, MapState};
 
-/// Compares every established keyframe that has true depth.
+/// Compares every established keyframe of an epoch, whose unit is one, that has true depth.
 pub fn evaluate_depth(
     record: &RunRecord,
+    epoch: Option<u32>,
     source: &mut dyn FrameSource,
 ) -> Result<DepthErrors, SourceError> {
     let mut errors = DepthErrors::default();
-    for keyframe in record.map.keyframes.iter().filter(|k| is_evaluated(k)) {
+    let of_epoch = record.map.keyframes.iter().filter(|k| Some(k.epoch) == epoch);
+    for keyframe in of_epoch.filter(|k| is_evaluated(k)) {
         let true_depth = match source.depth_at(keyframe.capture_nanos) {
             // One damaged file is no reason to lose the results.
             Err(error) if error.is_passing() => {

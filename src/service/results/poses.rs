@@ -27,9 +27,14 @@ pub const ONLINE_COMMENT: &str = "world_from_camera of every tracked frame as it
 /// The epoch with the most tracked frames, the earliest of equals; `None` where none is tracked. Each
 /// epoch has a frame and a scale of its own, so that only one can be compared with ground truth.
 pub fn longest_epoch(record: &RunRecord) -> Option<u32> {
+    most_frequent(tracked(record).map(|estimate| final_epoch(record, estimate)))
+}
+
+/// The epoch that occurs most often, the earliest of equals.
+fn most_frequent(epochs: impl Iterator<Item = u32>) -> Option<u32> {
     let mut frames = BTreeMap::new();
-    for estimate in tracked(record) {
-        *frames.entry(final_epoch(record, estimate)).or_insert(0_usize) += 1;
+    for epoch in epochs {
+        *frames.entry(epoch).or_insert(0_usize) += 1;
     }
     frames.into_iter().rev().max_by_key(|&(_, count)| count).map(|(epoch, _)| epoch)
 }
@@ -86,10 +91,13 @@ fn final_epoch(record: &RunRecord, estimate: &PoseEstimate) -> u32 {
     record.map.get(estimate.keyframe_id).map_or(estimate.epoch, |keyframe| keyframe.epoch)
 }
 
-/// Every tracked frame of one epoch as it was published.
+/// Tracked frames of one epoch as they were published. Where other epochs were joined to it, each had a world of its own,
+/// in which odometry stayed: the frames of the world that has most of them.
 pub fn online_trajectory(record: &RunRecord, epoch: Option<u32>) -> Vec<StampedPose> {
-    let estimates = tracked(record).filter(|of| Some(final_epoch(record, of)) == epoch);
-    estimates.map(in_world).collect()
+    let is_of_epoch = tracked(record).map(|of| Some(final_epoch(record, of)) == epoch);
+    let with_world = online_poses(record).into_iter().zip(is_of_epoch);
+    let poses: Vec<EpochPose> = with_world.filter_map(|(pose, is)| is.then_some(pose)).collect();
+    of_epoch(&poses, most_frequent(poses.iter().map(|of| of.epoch)))
 }
 
 /// Every tracked frame as it was published, with the epoch that its world began with.
@@ -125,9 +133,12 @@ pub fn normalized_errors_of(
     let keyframes = record.map.keyframes.iter().filter(|keyframe| in_epoch(keyframe.epoch));
     let stamps: Vec<(u64, i64)> = keyframes.map(|k| (k.keyframe_id, k.capture_nanos)).collect();
     let truth = &record.ground_truth;
+    // Before its epoch was joined to this one a frame was placed in another map.
+    let in_map: Vec<&PoseEstimate> =
+        tracked.iter().copied().filter(|estimate| in_epoch(estimate.epoch)).collect();
     [
         normalized_errors(&tracked, &stamps, truth, MAX_DIFFERENCE_NANOS),
-        map_normalized_errors(&tracked, truth, MAX_DIFFERENCE_NANOS),
+        map_normalized_errors(&in_map, truth, MAX_DIFFERENCE_NANOS),
         velocity_normalized_errors(&tracked, &stamps, truth, MAX_DIFFERENCE_NANOS),
     ]
 }
