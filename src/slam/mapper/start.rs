@@ -316,6 +316,7 @@ mod tests {
     use nalgebra::Vector6;
 
     use super::*;
+    use crate::slam::mapper::MapperParams;
     use crate::slam::test_scene::{CAMERA, Scene};
 
     /// Time from frame to frame at 30 Hz.
@@ -347,30 +348,49 @@ mod tests {
         }
     }
 
+    /// A start that goes forwards, each frame by 0.2, and the frame that proves it.
+    fn proven(params: &TwoFrameParams) -> (Proven, Vec<u8>) {
+        let mut start = Start::new(CAMERA, params).unwrap();
+        let proven = (0..3).find_map(|frame| {
+            let moved = Vector6::new(0.0, 0.0, 0.2 * frame as f64, 0.0, 0.0, 0.0);
+            let pixels = Scene::new(1).render(&CAMERA, &SE3::exp(&moved)).noisy(2.0, 100 + frame);
+            let nanos = PERIOD_NANOS * frame as i64;
+            let proven = start.step(&FrameView::new(&CAMERA, 10 + frame, nanos, &pixels))?;
+            Some((proven, pixels))
+        });
+        proven.unwrap()
+    }
+
+    #[test]
+    fn new_pixels_of_the_second_keyframe_are_searched_at_an_estimated_pose() {
+        let mapper = Mapper::new(CAMERA, MapperParams::default()).unwrap();
+        let (proven, pixels) = proven(&TwoFrameParams::default());
+        let pose = proven_pose(&FrameView::new(&CAMERA, 12, 0, &pixels), &proven.outcome, 1.3);
+        let searched = mapper.matching_at(&pose).line_noise_px;
+        assert!(searched >= mapper.params.matching.line_noise_px, "{searched} px");
+    }
+
+    #[test]
+    fn a_black_frame_gets_no_pose_afterwards_and_ends_those_before_it() {
+        let mut mapper = Mapper::new(CAMERA, MapperParams::default()).unwrap();
+        let seen = Scene::new(1).render(&CAMERA, &SE3::identity()).noisy(2.0, 1);
+        // A sensor's black with its noise.
+        let dark = seen.iter().map(|&grey| 8 + grey % 5).collect::<Vec<u8>>();
+        for (sequence, pixels) in (0..).zip([&seen, &seen, &dark, &seen]) {
+            mapper.keep_early_frame(&FrameView::new(&CAMERA, sequence, 0, pixels));
+        }
+        let kept = mapper.early.iter().map(|frame| frame.sequence);
+        assert_eq!(kept.collect::<Vec<_>>(), [3]);
+    }
+
     #[test]
     fn the_first_keyframe_has_the_stamp_of_the_frame_that_the_start_went_on_from() {
         // One frame of the camera's motion shows 84 % of the points again, two of them 78 %.
         for (min_visible_ratio, first) in [(0.6, 10), (0.8, 11)] {
             let mut params = TwoFrameParams::default();
             params.evidence.min_visible_ratio = min_visible_ratio;
-            let mut start = Start::new(CAMERA, &params).unwrap();
-            let proven = (0..3).find_map(|frame| {
-                let moved = Vector6::new(0.0, 0.0, 0.2 * frame as f64, 0.0, 0.0, 0.0);
-                let image = Scene::new(1).render(&CAMERA, &SE3::exp(&moved));
-                let pixels = &image.noisy(2.0, 100 + frame);
-                let (sequence, capture_nanos) = (10 + frame, PERIOD_NANOS * frame as i64);
-                let (width, height) = (CAMERA.width, CAMERA.height);
-                start.step(&FrameView {
-                    sequence,
-                    capture_nanos,
-                    exposure_nanos: 0,
-                    width,
-                    height,
-                    pixels,
-                })
-            });
             let stamp = (first, PERIOD_NANOS * (first as i64 - 10));
-            assert_eq!(proven.map(|proven| proven.first), Some(stamp));
+            assert_eq!(proven(&params).0.first, stamp);
         }
     }
 }
