@@ -119,6 +119,7 @@ pub fn observe(
             true => matching.max_search_px.max(params.max_first_search_px),
             false => matching.max_search_px,
         },
+        is_short_of_depth,
         image: &map.image,
         candidates: &map.candidates,
         structure: &map.structure,
@@ -156,6 +157,8 @@ struct PixelObserver<'a> {
     params: &'a GaussianParams,
     /// Longest segment that is searched for a new pixel.
     max_new_search_px: f32,
+    /// Whether of longer ones as much is searched, from infinity.
+    is_short_of_depth: bool,
 }
 
 /// A row of the map whose pixels are observed.
@@ -393,6 +396,30 @@ impl PixelObserver<'_> {
         true
     }
 
+    /// The part of a new pixel's line that is searched: from infinity to the nearest depth that is looked for, or, in a
+    /// keyframe that is short of depth, as far as a search goes. `None` where it is too short or too long.
+    #[inline(always)]
+    fn new_range(&self, line: &EpipolarLine) -> Option<SearchRange> {
+        /// Share of the longest search that a cut segment takes, so that rounding does not make it too long.
+        const SEARCHED: f32 = 0.99;
+        let (from, to) = (line.project(0.0)?, line.project(self.params.max_inverse_depth)?);
+        let (du, dv) = (to.u - from.u, to.v - from.v);
+        let length = (du * du + dv * dv).sqrt();
+        let max_px = self.max_new_search_px;
+        if !(length >= self.params.min_new_segment_px) {
+            return None;
+        }
+        if length <= max_px {
+            return Some(SearchRange { from, to, max_px });
+        }
+        if !self.is_short_of_depth {
+            return None;
+        }
+        let share = SEARCHED * max_px / length;
+        let end = line.inverse_depth_at(from.u + share * du, from.v + share * dv)?;
+        Some(SearchRange { from, to: line.project(end)?, max_px })
+    }
+
     /// Tries to give a pixel its first hypothesis, searching all depths.
     #[inline(always)]
     fn create<S: Instructions>(
@@ -410,14 +437,8 @@ impl PixelObserver<'_> {
         }
         let Observer { image: frame, view, .. } = self.observer;
         let line = view.line(u as f32, v as f32);
-        let (Some(from), Some(at)) = (line.project(0.0), line.project(1.0)) else { return };
-        let Some(to) = line.project(self.params.max_inverse_depth) else { return };
-        let (du, dv) = (to.u - from.u, to.v - from.v);
-        let length = (du * du + dv * dv).sqrt();
-        let max_px = self.max_new_search_px;
-        if !(self.params.min_new_segment_px..=max_px).contains(&length)
-            || !is_inside(frame.width(), frame.height(), at.u, at.v)
-        {
+        let (Some(range), Some(at)) = (self.new_range(&line), line.project(1.0)) else { return };
+        if !is_inside(frame.width(), frame.height(), at.u, at.v) {
             return;
         }
         let structure = &self.structure.row(v)[u];
@@ -425,7 +446,6 @@ impl PixelObserver<'_> {
         let Some(conditioning) = conditioning else { return };
         let patch = Patch::new(self.image, u, v, self.gain, self.offset);
         let frame = Sampled { image: frame, sampler };
-        let range = SearchRange { from, to, max_px };
         match search(frame, &line, &patch, &conditioning, &range, self.matching) {
             Ok(found)
                 if found.inverse_depth > 0.0

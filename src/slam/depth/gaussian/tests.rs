@@ -8,6 +8,8 @@ use crate::slam::test_scene::{CAMERA, Rendering, Scene};
 
 /// Parallax of a point at the mean inverse depth: up to four times as near a segment is 64 px long.
 const PARALLAX_PX: f64 = 16.0;
+/// Here it is 120 px long.
+const WIDE_PARALLAX_PX: f64 = 30.0;
 
 /// A keyframe without depth, its exact depth, and a frame that is far from it.
 struct Fast {
@@ -19,7 +21,7 @@ struct Fast {
 }
 
 impl Fast {
-    fn new() -> Self {
+    fn new(parallax_px: f64) -> Self {
         let scene = Scene::new(7);
         let mut map = DepthMap::with_size(CAMERA.width, CAMERA.height);
         let Rendering { intensity, mut inverse_depth } = scene.render(&CAMERA, &SE3::identity());
@@ -29,7 +31,7 @@ impl Fast {
         let depths: Vec<f32> = candidates.filter(|(is, _)| **is).map(|(_, &depth)| depth).collect();
         let mean = depths.iter().sum::<f32>() / depths.len() as f32;
         inverse_depth.pixels_mut().iter_mut().for_each(|depth| *depth /= mean);
-        let step = PARALLAX_PX / (CAMERA.fx * f64::from(mean));
+        let step = parallax_px / (CAMERA.fx * f64::from(mean));
         let moved = SE3::exp(&Vector6::new(step, 0.0, 0.0, 0.0, 0.0, 0.0));
         let mut frame = QuadImage::with_size(CAMERA.width, CAMERA.height);
         frame.fill(&scene.render(&CAMERA, &moved).noisy(2.0, 1));
@@ -60,28 +62,44 @@ impl Fast {
     }
 }
 
-#[test]
-fn a_keyframe_short_of_depth_gets_it_from_a_frame_far_away() {
-    let fast = Fast::new();
-    let params = GaussianParams::default();
-    let (created, map) = fast.created(usize::MAX, &params);
+/// Of a keyframe's candidates the share that got depth in a frame far away, and the largest inverse depth of them: what
+/// they claim is right.
+fn found(fast: &Fast, params: &GaussianParams) -> (f64, f32) {
+    let (created, map) = fast.created(usize::MAX, params);
     let candidates = fast.map.candidates.pixels().iter().filter(|is| **is).count();
-    assert!(created * 4 > candidates, "{created} of {candidates}");
     let pixels = map.hypotheses.pixels().iter().zip(fast.inverse_depth.pixels());
-    let mut errors: Vec<f32> = pixels
-        .filter(|(hypothesis, _)| hypothesis.is_some())
+    let with_depth = || pixels.clone().filter(|(hypothesis, _)| hypothesis.is_some());
+    let mut errors: Vec<f32> = with_depth()
         .map(|(h, truth)| (h.inverse_depth - truth).abs() / h.variance.sqrt())
         .collect();
     errors.sort_by(f32::total_cmp);
     assert!(errors[errors.len() / 2] < 1.0, "{}", errors[errors.len() / 2]);
     assert!(errors[errors.len() * 9 / 10] < 3.0, "{}", errors[errors.len() * 9 / 10]);
-    let short = GaussianParams { max_first_search_px: 40.0, ..params };
-    assert_eq!(fast.created(usize::MAX, &short).0, 0);
+    let nearest = with_depth().map(|(h, _)| h.inverse_depth).fold(0.0, f32::max);
+    (created as f64 / candidates as f64, nearest)
+}
+
+#[test]
+fn a_keyframe_short_of_depth_gets_it_from_a_frame_far_away() {
+    let (share, _) = found(&Fast::new(PARALLAX_PX), &GaussianParams::default());
+    assert!(share > 0.25, "{share}");
+}
+
+#[test]
+fn of_longer_segments_the_far_part_is_searched() {
+    for (parallax_px, max_px) in [(PARALLAX_PX, 40.0), (WIDE_PARALLAX_PX, 90.0)] {
+        let params = GaussianParams { max_first_search_px: max_px, ..GaussianParams::default() };
+        let (share, nearest) = found(&Fast::new(parallax_px), &params);
+        assert!(share > 0.25, "{parallax_px} px: {share}");
+        // The refinement may go a little beyond.
+        let end = (max_px + 2.0) / parallax_px as f32;
+        assert!(nearest < end, "{parallax_px} px: {nearest}, {end}");
+    }
 }
 
 #[test]
 fn a_keyframe_with_depth_waits_for_a_nearer_frame() {
-    let fast = Fast::new();
+    let fast = Fast::new(PARALLAX_PX);
     let params = GaussianParams::default();
     assert_eq!(fast.created(2, &params).0, 0);
     assert!(fast.created(4, &params).0 > 0);
