@@ -4,7 +4,7 @@ use crate::service::adjustments::{AdjustmentRecord, Fate};
 use crate::service::clock::now_nanos;
 use crate::service::manager_notice::ManagerNotice;
 use crate::service::run_error::RunError;
-use crate::service::schedule::{Policy, in_force, peak_rss_bytes};
+use crate::service::schedule::{Policy, Refusal, in_force, peak_rss_bytes};
 use crate::slam::loops::SearchFate;
 use crate::wire::command::{text_bytes, text_from_bytes};
 use crate::wire::message::{HISTOGRAM_BUCKETS, HealthMessage, TEXT_BYTES};
@@ -242,12 +242,12 @@ impl Health {
     }
 
     /// Says what the kernel does for the calling thread and what it refused; the first refusal as a text.
-    pub fn tell_scheduling(&mut self, refusals: &[String]) {
+    pub fn tell_scheduling(&mut self, refusals: &[Refusal]) {
         let in_force = in_force();
         self.message.scheduling = scheduling_code(in_force.policy);
         self.message.priority = in_force.priority;
         self.message.memory_locked = u32::from(in_force.memory_locked);
-        self.warn(refusals.first().map_or("", String::as_str));
+        self.warn(&refusals.first().map(Refusal::to_string).unwrap_or_default());
     }
 
     /// Enters a state; the next report goes out at once.

@@ -87,6 +87,39 @@ impl SchedulingParams {
     }
 }
 
+/// What the kernel refused; says which limit to raise.
+#[derive(Debug, thiserror::Error, Clone, PartialEq, Eq)]
+pub enum Refusal {
+    /// Not this policy, or not this priority.
+    #[error(
+        "{0} scheduling refused ({2}): raise RLIMIT_RTPRIO to {1} (LimitRTPRIO= in the unit, rtprio in /etc/security/limits.conf)"
+    )]
+    RealTime(&'static str, u32, String),
+    /// No deadline policy.
+    #[error(
+        "deadline scheduling refused ({0}): it needs CAP_SYS_NICE (AmbientCapabilities= in the unit), no CPU list, and a free share of the CPUs"
+    )]
+    Deadline(String),
+    /// No lower priority.
+    #[error(
+        "idle scheduling refused ({0}): allow sched_setattr, or set mapper.background = \"other\""
+    )]
+    Background(String),
+    /// Not these CPUs.
+    #[error(
+        "CPUs {0:?} refused ({1}): name CPUs that exist and that the unit's CPUAffinity= allows"
+    )]
+    Cpus(Vec<usize>, String),
+    /// Memory cannot be locked.
+    #[error(
+        "locking memory refused ({0}): raise RLIMIT_MEMLOCK (LimitMEMLOCK=infinity in the unit, memlock in /etc/security/limits.conf)"
+    )]
+    Memory(String),
+    /// No other timer slack.
+    #[error("timer slack refused ({0}): leave timer_slack_us at 0")]
+    TimerSlack(String),
+}
+
 /// The scheduling in effect, as the kernel reports it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct InForce {
@@ -122,33 +155,28 @@ struct SchedAttr {
     period: u64,
 }
 
-/// Applies `params` to the calling thread (memory: to the process), and says what was refused and which limit to
-/// raise. Threads that are made later run as SCHED_OTHER on the same CPUs.
-pub fn apply(params: &SchedulingParams) -> Vec<String> {
+/// Applies `params` to the calling thread (memory: to the process), and gives what was refused. Threads that are
+/// made later run as SCHED_OTHER on the same CPUs.
+pub fn apply(params: &SchedulingParams) -> Vec<Refusal> {
     let mut refusals = Vec::new();
     // Memory first: under FIFO the touching of new pages would hold up everybody else.
     if params.lock_memory {
         let flags = MlockAllFlags::CURRENT | MlockAllFlags::FUTURE;
         match rustix::mm::mlockall(flags) {
             Ok(()) => touch_stack(),
-            Err(error) => refusals.push(format!(
-                "locking memory refused ({error}): raise RLIMIT_MEMLOCK (LimitMEMLOCK=infinity in the unit, memlock in /etc/security/limits.conf)"
-            )),
+            Err(error) => refusals.push(Refusal::Memory(error.to_string())),
         }
     }
     if let Some(slack) = NonZeroU64::new(params.timer_slack_us.saturating_mul(1000))
         && let Err(error) = rustix::thread::set_current_timer_slack(Some(slack))
     {
-        refusals.push(format!("timer slack refused ({error}): leave timer_slack_us at 0"));
+        refusals.push(Refusal::TimerSlack(error.to_string()));
     }
     if !params.cpus.is_empty() {
         let mut set = CpuSet::new();
         params.cpus.iter().filter(|&&cpu| cpu < MAX_CPU).for_each(|&cpu| set.set(cpu));
         if let Err(error) = rustix::thread::sched_setaffinity(None, &set) {
-            refusals.push(format!(
-                "CPUs {:?} refused ({error}): name CPUs that exist and that the unit's CPUAffinity= allows",
-                params.cpus
-            ));
+            refusals.push(Refusal::Cpus(params.cpus.clone(), error.to_string()));
         }
     }
     refusals.extend(apply_policy(params).err());
@@ -156,16 +184,15 @@ pub fn apply(params: &SchedulingParams) -> Vec<String> {
 }
 
 /// Makes the calling thread one that no frame waits for. The kernel refuses this to nobody, a sandbox may.
-pub fn apply_background(background: Background) -> Result<(), String> {
+pub fn apply_background(background: Background) -> Result<(), Refusal> {
     if background == Background::Other {
         return Ok(());
     }
-    set_attributes(SchedAttr { policy: SCHED_IDLE, ..SchedAttr::default() }).map_err(|error| {
-        format!("idle scheduling refused ({error}): allow sched_setattr, or set mapper.background = \"other\"")
-    })
+    set_attributes(SchedAttr { policy: SCHED_IDLE, ..SchedAttr::default() })
+        .map_err(|error| Refusal::Background(error.to_string()))
 }
 
-fn apply_policy(params: &SchedulingParams) -> Result<(), String> {
+fn apply_policy(params: &SchedulingParams) -> Result<(), Refusal> {
     let nanos = |millis: f64| (millis * 1e6) as u64;
     let attributes = match params.policy {
         Policy::Inherit => return Ok(()),
@@ -190,12 +217,8 @@ fn apply_policy(params: &SchedulingParams) -> Result<(), String> {
         _ => ("FIFO", params.priority),
     };
     set_attributes(attributes).map_err(|error| match params.policy {
-        Policy::Deadline => format!(
-            "deadline scheduling refused ({error}): it needs CAP_SYS_NICE (AmbientCapabilities= in the unit), no CPU list, and a free share of the CPUs"
-        ),
-        _ => format!(
-            "{name} scheduling refused ({error}): raise RLIMIT_RTPRIO to {priority} (LimitRTPRIO= in the unit, rtprio in /etc/security/limits.conf)"
-        ),
+        Policy::Deadline => Refusal::Deadline(error.to_string()),
+        _ => Refusal::RealTime(name, priority, error.to_string()),
     })
 }
 
