@@ -253,6 +253,10 @@ fn trajectories_say_where_another_epoch_begins() {
     for (i, pose) in poses.iter_mut().enumerate() {
         pose.estimate.epoch = epoch_of(i);
         pose.estimate.keyframe_id = u64::from(epoch_of(i));
+        // Variances on the diagonal.
+        for place in [0, 6, 11, 15, 18, 20] {
+            pose.estimate.map_covariance[place] = 1e-4;
+        }
         if i >= 20 {
             // Odometry begins with another unit.
             pose.estimate.world_from_camera.translation *= 3.0;
