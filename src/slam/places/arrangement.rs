@@ -1,7 +1,6 @@
 //! How many matches of features agree on one arrangement: turned, scaled and shifted together.
 
 use super::description::FeaturePlace;
-use super::index::PlaceCandidate;
 use super::pattern::{ORIENTATIONS, angle_rad};
 use super::scales::SCALE_STEP;
 
@@ -24,12 +23,23 @@ const MAX_SHIFT: f32 = 0.1;
 const MAX_TURN: i32 = 3;
 const MAX_ZOOM: i32 = 2;
 
-/// Places of a feature of an image and of a keyframe's.
-pub(super) type Pair = (FeaturePlace, FeaturePlace);
+/// How features of an image lie on a keyframe's.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Arrangement {
+    /// Matches that agree on it.
+    pub(super) agreeing: u32,
+    /// Angle by which the image is turned in its plane against the keyframe's, radians: a direction in the keyframe's image
+    /// plus this is the same in the image.
+    pub(super) turn_rad: f32,
+    /// A pixel of the image, the middle of those that agree.
+    pub(super) ours: [f32; 2],
+    /// The keyframe's that shows the same.
+    pub(super) theirs: [f32; 2],
+}
 
-/// A keyframe with the arrangement that most matches agree on, each of another of our features, the best first; `None`
+/// The arrangement that most matches agree on, of one keyframe and each of another of our features, the best first; `None`
 /// without matches.
-pub(super) fn arrange(keyframe_id: u64, pairs: &[Pair], width: f32) -> Option<PlaceCandidate> {
+pub(super) fn arrange(pairs: &[(FeaturePlace, FeaturePlace)], width: f32) -> Option<Arrangement> {
     let proposals = pairs.iter().take(MOST_PROPOSALS);
     let rated = proposals.map(|proposal| {
         let agrees = agreement(proposal, width);
@@ -48,14 +58,15 @@ pub(super) fn arrange(keyframe_id: u64, pairs: &[Pair], width: f32) -> Option<Pl
             (sum[0], sum[1]) = (sum[0] + value[0], sum[1] + value[1]);
         }
     }
-    Some(PlaceCandidate {
-        keyframe_id,
-        score: count,
+    Some(Arrangement {
+        agreeing: agreeing.len() as u32,
         turn_rad: direction[1].atan2(direction[0]),
-        pixel: ours.map(|sum| sum / count),
-        keyframe_pixel: theirs.map(|sum| sum / count),
+        ours: ours.map(|sum| sum / count),
+        theirs: theirs.map(|sum| sum / count),
     })
 }
+
+type Pair = (FeaturePlace, FeaturePlace);
 
 fn turn((ours, theirs): &Pair) -> i32 {
     i32::from(ours.orientation) - i32::from(theirs.orientation)
@@ -93,7 +104,7 @@ mod tests {
     use crate::slam::test_scene::Random;
 
     /// Features of a keyframe, and the same turned by a quarter, twice as large, and moved.
-    fn pairs(count: usize) -> Vec<Pair> {
+    fn pairs(count: usize) -> Vec<(FeaturePlace, FeaturePlace)> {
         let mut random = Random::new(5);
         let mut below = |limit: f64| (limit * random.uniform()) as u16;
         (0..count)
@@ -112,13 +123,13 @@ mod tests {
 
     #[test]
     fn what_is_turned_and_enlarged_together_agrees() {
-        let found = arrange(7, &pairs(30), 640.0).unwrap();
-        assert_eq!((found.keyframe_id, found.score), (7, 30.0));
+        let found = arrange(&pairs(30), 640.0).unwrap();
+        assert_eq!(found.agreeing, 30);
         assert!((found.turn_rad - std::f32::consts::FRAC_PI_2).abs() < 1e-4, "{found:?}");
-        let [u, v] = found.keyframe_pixel;
-        let error = [500.0 - 2.0 * v - found.pixel[0], 50.0 + 2.0 * u - found.pixel[1]];
+        let [u, v] = found.theirs;
+        let error = [500.0 - 2.0 * v - found.ours[0], 50.0 + 2.0 * u - found.ours[1]];
         assert!(error.iter().all(|error| error.abs() < 0.1), "{found:?}");
-        assert_eq!(arrange(7, &[], 640.0), None);
+        assert_eq!(arrange(&[], 640.0), None);
     }
 
     #[test]
@@ -126,10 +137,10 @@ mod tests {
         let change = |of: &dyn Fn(usize, &mut FeaturePlace)| {
             let mut pairs = pairs(30);
             (0..10).for_each(|k| of(k, &mut pairs[k].0));
-            arrange(7, &pairs, 640.0).unwrap().score
+            arrange(&pairs, 640.0).unwrap().agreeing
         };
-        assert_eq!(change(&|_, place| place.orientation = (place.orientation + 9) % 32), 20.0);
-        assert_eq!(change(&|_, place| place.scale = 2), 20.0);
-        assert_eq!(change(&|k, place| place.u += 150 * (k as u16 + 1)), 20.0);
+        assert_eq!(change(&|_, place| place.orientation = (place.orientation + 9) % 32), 20);
+        assert_eq!(change(&|_, place| place.scale = 2), 20);
+        assert_eq!(change(&|k, place| place.u += 150 * (k as u16 + 1)), 20);
     }
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use nalgebra::{UnitQuaternion, Vector3};
 
-use super::arrangement::{Match, Pair, arrange};
+use super::arrangement::{Arrangement, Match, arrange};
 use super::description::{Description, FeaturePlace, MAX_FEATURES};
 use super::tree::{Entry, Tree, distance};
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -152,16 +152,24 @@ impl PlaceIndex {
             (0..votes.len() as u32).filter(|&slot| votes[slot as usize] > 0).collect();
         ranked.sort_by_key(|&slot| std::cmp::Reverse((votes[slot as usize], slot)));
         ranked.truncate(MOST_ARRANGED);
-        let mut found: Vec<(PlaceCandidate, u32)> = ranked
+        let mut found: Vec<(Arrangement, u32)> = ranked
             .into_iter()
             .filter_map(|slot| {
                 let begin = matches.partition_point(|m| m.slot < slot);
                 let end = matches.partition_point(|m| m.slot <= slot);
-                Some((self.arranged(description, slot, &mut matches[begin..end])?, slot))
+                Some((self.arranged(description, &mut matches[begin..end])?, slot))
             })
             .collect();
-        found.sort_by(|(one, i), (other, j)| other.score.total_cmp(&one.score).then(j.cmp(i)));
-        found.into_iter().take(most).map(|(candidate, _)| candidate).collect()
+        found.sort_by_key(|(arrangement, slot)| std::cmp::Reverse((arrangement.agreeing, *slot)));
+        found.truncate(most);
+        let candidate = |(arrangement, slot): (Arrangement, u32)| PlaceCandidate {
+            keyframe_id: self.slots[slot as usize].keyframe_id,
+            score: arrangement.agreeing as f32,
+            turn_rad: arrangement.turn_rad,
+            pixel: arrangement.ours,
+            keyframe_pixel: arrangement.theirs,
+        };
+        found.into_iter().map(candidate).collect()
     }
 
     /// Pairs of features that look alike.
@@ -185,20 +193,16 @@ impl PlaceIndex {
     }
 
     /// How the features of one keyframe that match lie.
-    fn arranged(
-        &self,
-        description: &Description,
-        slot: u32,
-        matches: &mut [Match],
-    ) -> Option<PlaceCandidate> {
-        let Slot { keyframe_id, places, .. } = &self.slots[slot as usize];
+    fn arranged(&self, description: &Description, matches: &mut [Match]) -> Option<Arrangement> {
         matches.sort_by_key(|m| (m.distance, m.ours));
-        let place = |m: &Match| {
-            let theirs = *places.get(usize::from(m.theirs))?;
-            Some((description.features[usize::from(m.ours)].place, theirs))
-        };
-        let pairs: Vec<Pair> = matches.iter().filter_map(place).collect();
-        arrange(*keyframe_id, &pairs, f32::from(description.width))
+        let pairs: Vec<(FeaturePlace, FeaturePlace)> = matches
+            .iter()
+            .filter_map(|m| {
+                let theirs = self.slots[m.slot as usize].places.get(usize::from(m.theirs))?;
+                Some((description.features[usize::from(m.ours)].place, *theirs))
+            })
+            .collect();
+        arrange(&pairs, f32::from(description.width))
     }
 
     /// Bytes of memory.
