@@ -3,7 +3,6 @@
 use crate::service::adjustments::{AdjustmentRecord, Fate};
 use crate::service::clock::now_nanos;
 use crate::service::manager_notice::ManagerNotice;
-use crate::service::run_error::RunError;
 use crate::service::schedule::{Policy, Refusal, in_force, peak_rss_bytes};
 use crate::slam::loops::SearchFate;
 use crate::wire::command::{text_bytes, text_from_bytes};
@@ -257,7 +256,7 @@ impl Health {
     }
 
     /// Says how the process has ended: in order, for this cause, or with an error.
-    pub fn end(&mut self, outcome: &Result<(), RunError>, cause: &str) {
+    pub fn end(&mut self, outcome: &Result<(), impl std::fmt::Display>, cause: &str) {
         match outcome {
             Ok(()) => self.enter(ProcessState::Finished, cause),
             Err(error) => self.enter(ProcessState::Failed, &error.to_string()),

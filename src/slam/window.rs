@@ -335,7 +335,7 @@ impl Window {
         let last = members.len() - 1;
         let free: Vec<_> = (0..members.len()).map(|k| (k == last).then_some(0)).collect();
         let members = Members { members, free: &free, depths_are_free: false };
-        self.run(&members, levels, iterations)
+        self.run(&members, levels, iterations, |_, observer| observer == last)
     }
 
     fn adjust(&mut self, chosen: &Chosen) -> Option<Adjustment> {
@@ -357,7 +357,7 @@ impl Window {
         self.thin_out(&chosen.members);
         self.solver.iterations = 0;
         let unit = Unit::of(&self.keyframes, &members);
-        if !self.run(&members, &ADJUSTED_LEVELS, iterations) {
+        if !self.run(&members, &ADJUSTED_LEVELS, iterations, |_, _| true) {
             return None;
         }
         self.note_agreement(&chosen.members);
@@ -410,7 +410,13 @@ impl Window {
     }
 
     /// Adjusts what is free, level by level; false where something is not determined.
-    fn run(&mut self, members: &Members<'_>, levels: &[usize], iterations: u32) -> bool {
+    fn run(
+        &mut self,
+        members: &Members<'_>,
+        levels: &[usize],
+        iterations: u32,
+        mut may: impl FnMut(usize, usize) -> bool,
+    ) -> bool {
         for &index in members.members {
             self.keyframes[index].take_part(&self.camera);
         }
@@ -419,7 +425,7 @@ impl Window {
         levels.iter().filter(|&&level| level <= finest).all(|&level| {
             let at = Level { camera: &self.camera, level, robustness };
             let views = &mut self.solver.views;
-            views.find(&self.keyframes, members, &self.camera);
+            views.find(&self.keyframes, members.members, &self.camera, &mut may);
             views.look(&self.keyframes, members.members, level);
             let converged = self.params.converged_decrement;
             self.solver.adjust(&mut self.keyframes, members, &at, iterations, converged)

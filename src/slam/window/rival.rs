@@ -107,7 +107,7 @@ impl Window {
         }
         let members =
             Members { members: &chosen.members, free: &chosen.free, depths_are_free: true };
-        self.run(&members, &ADJUSTED_LEVELS, self.params.max_first_iterations)
+        self.run(&members, &ADJUSTED_LEVELS, self.params.max_first_iterations, |_, _| true)
     }
 
     /// The plane that most points of a keyframe are nearest to.

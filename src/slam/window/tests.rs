@@ -143,7 +143,7 @@ impl Room {
         let robustness = Robustness { huber_grey: 9.0, most_energy: 8.0 * 144.0 };
         for level in ADJUSTED_LEVELS {
             let at = Level { camera: &CAMERA, level, robustness };
-            solver.views.find(&self.keyframes, &members, &CAMERA);
+            solver.views.find(&self.keyframes, members.members, &CAMERA, |_, _| true);
             solver.views.look(&self.keyframes, members.members, level);
             assert!(solver.adjust(&mut self.keyframes, &members, &at, 15, 1e-4));
         }

@@ -5,7 +5,6 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::window::comparison::{LANES, Patterns};
 use crate::slam::window::keyframe::{WindowKeyframe, WindowPoint};
 use crate::slam::window::surface::Projected;
-use crate::slam::window::system::Members;
 use nalgebra::Vector3;
 
 /// Pixels at the border where a pattern is not compared.
@@ -80,15 +79,14 @@ pub struct Views {
 }
 
 impl Views {
-    /// Every living point of the members, with every other member that sees it. Where depths stay, what a member sees that
-    /// stays too says nothing.
+    /// Every living point of the members that a host may be, with every other member that may observe and sees it.
     pub fn find(
         &mut self,
         keyframes: &[WindowKeyframe],
-        members: &Members<'_>,
+        members: &[usize],
         camera: &Intrinsics,
+        mut may: impl FnMut(usize, usize) -> bool,
     ) {
-        let Members { members, free, depths_are_free } = *members;
         self.pairs.clear();
         self.slots.clear();
         self.points.clear();
@@ -102,14 +100,11 @@ impl Views {
             }));
         }
         for (observer, &other) in members.iter().enumerate() {
-            if !depths_are_free && free[observer].is_none() {
-                continue;
-            }
             let mut end = 0;
             for (host, &index) in members.iter().enumerate() {
                 let begin = end;
                 end += self.points[begin..].iter().take_while(|point| point.host == host).count();
-                if observer == host || begin == end {
+                if observer == host || begin == end || !may(host, observer) {
                     continue;
                 }
                 let map_from_host = keyframes[index].camera_from_map.inverse();
