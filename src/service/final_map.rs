@@ -7,33 +7,53 @@ use std::time::{Duration, Instant};
 use crate::service::child::Child;
 use crate::service::config::SupervisorConfig;
 use crate::service::health::cause;
-use crate::service::map_file::read_map;
+use crate::service::map_file::{MapFileError, read_map};
 use crate::service::mapper::WRITES_MAP;
 use crate::service::shutdown::Shutdown;
 use crate::service::supervised::Supervised;
 use crate::slam::map::Map;
 use crate::wire::command::{Command, CommandClient, CommandError};
+use crate::wire::port::ReceiveError;
+
+/// Why the mapper gives no map.
+#[derive(Debug, thiserror::Error)]
+pub enum FinalMapError {
+    /// It does not answer.
+    #[error("the mapper does not respond; the map is that of its last checkpoint")]
+    Silent,
+    /// It has ended.
+    #[error("the mapper is gone; the map is that of its last checkpoint")]
+    Gone,
+    /// Its signs of life cannot be received.
+    #[error(transparent)]
+    Receive(#[from] ReceiveError),
+    /// It refuses, or takes too long.
+    #[error("{0}; the map is that of its last checkpoint")]
+    Command(#[from] CommandError),
+    /// What it wrote cannot be read.
+    #[error(transparent)]
+    File(#[from] MapFileError),
+    /// The folder has no path that another process could use.
+    #[error("the output folder's path is not usable ({0})")]
+    Path(#[from] io::Error),
+}
 
 /// Has the mapper write its map into `folder`, and reads it. One that hangs is not waited for: it is given
-/// as long to begin as the watchdog allows between two signs of life, and only then the time that writing may take. An
-/// error says why there is none, for the user.
+/// as long to begin as the watchdog allows between two signs of life, and only then the time that writing may take.
 pub fn final_map(
     mapper: &mut Supervised,
     commands: &CommandClient,
     folder: &Path,
     config: &SupervisorConfig,
     shutdown: &Shutdown,
-) -> Result<Map, String> {
+) -> Result<Map, FinalMapError> {
     let file = format!(".semidense-map-{}.bin", std::process::id());
-    let path = std::path::absolute(folder.join(file))
-        .map_err(|error| format!("the output folder's path is not usable ({error})"))?;
-    let of_checkpoint = |why: &str| format!("{why}; the map is that of its last checkpoint");
-    let silent = || of_checkpoint("the mapper does not respond");
+    let path = std::path::absolute(folder.join(file))?;
     let timeout = Duration::from_secs_f64(config.save_timeout_s);
     let watchdog = Duration::from_secs_f64(config.watchdog_s);
-    mapper.listen().map_err(|error| error.to_string())?;
+    mapper.listen()?;
     if mapper.is_silent(watchdog) {
-        return Err(silent());
+        return Err(FinalMapError::Silent);
     }
     let mut is_able = |child: &mut Child| matches!(child.poll(), Ok(None)) && !child.is_stopped();
     let asked = Instant::now();
@@ -47,10 +67,10 @@ pub fn final_map(
     };
     let answer = commands.ask(&Command::SaveMap(path.clone()), timeout, is_worth_waiting);
     let map = match answer {
-        Ok(()) => read_map(&path).map_err(|error| error.to_string()),
-        Err(_) if is_gone => Err(of_checkpoint("the mapper is gone")),
-        Err(CommandError::NoAnswer(_)) if !has_begun => Err(silent()),
-        Err(error) => Err(of_checkpoint(&error.to_string())),
+        Ok(()) => read_map(&path).map_err(FinalMapError::File),
+        Err(_) if is_gone => Err(FinalMapError::Gone),
+        Err(CommandError::NoAnswer(_)) if !has_begun => Err(FinalMapError::Silent),
+        Err(error) => Err(error.into()),
     };
     if let Err(error) = std::fs::remove_file(&path)
         && error.kind() != io::ErrorKind::NotFound

@@ -14,7 +14,7 @@ use crate::service::child::{Child, memory_for_frames};
 use crate::service::clock::now_nanos;
 use crate::service::config::Config;
 use crate::service::error_log::ErrorLog;
-use crate::service::final_map::final_map;
+use crate::service::final_map::{FinalMapError, final_map};
 use crate::service::health::{ProcessState, cause};
 use crate::service::journal::{Journal, JournalOptions};
 use crate::service::map_folder::session::{MapSessionError, check_camera};
@@ -117,9 +117,9 @@ fn supervise(
     let has_map = options.keeps_map && supervisor.recorder.recording.num_poses() > 0;
     let mut map = match has_map.then(|| supervisor.final_map(shutdown)).transpose() {
         Ok(map) => map.unwrap_or_default(),
-        Err(cause) => {
+        Err(error) => {
             if ended == EndOfRun::Finished {
-                ended = EndOfRun::Failed(cause);
+                ended = EndOfRun::Failed(error.to_string());
             }
             supervisor.map_of_checkpoint()
         }
@@ -255,13 +255,13 @@ impl<'a> Supervisor<'a> {
             Mode::Lockstep => "--lockstep".into(),
             Mode::Live => "--live".into(),
         });
-        let is_capture = name == HEALTH_TOPICS[CAPTURE].owner;
-        if is_capture {
+        if name == HEALTH_TOPICS[CAPTURE].owner {
             arguments.extend(["--source".into(), self.options.source.to_os_string()]);
             if let Some(rig) = &self.options.rig {
                 arguments.extend(["--rig".into(), rig.clone().into_os_string()]);
             }
         }
+        let is_capture = name == HEALTH_TOPICS[CAPTURE].owner;
         let frames = self.frames.as_ref().filter(|_| is_capture);
         Child::start(name, &arguments, &self.place.root, &self.run, frames, &self.options.log)
             .map_err(|source| RunError::Child { process: name, source })
@@ -438,7 +438,7 @@ impl<'a> Supervisor<'a> {
         Ok(())
     }
 
-    fn final_map(&mut self, shutdown: &Shutdown) -> Result<Map, String> {
+    fn final_map(&mut self, shutdown: &Shutdown) -> Result<Map, FinalMapError> {
         let (folder, config) = (&self.options.output, &self.config.supervisor);
         final_map(&mut self.processes[MAPPER], &self.commands, folder, config, shutdown)
     }
