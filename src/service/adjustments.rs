@@ -165,8 +165,7 @@ impl Adjustments {
         let deadline = is_live.then(|| Instant::now() + LAST_ADJUSTMENTS);
         let left =
             || deadline.map_or(Duration::MAX, |end| end.saturating_duration_since(Instant::now()));
-        let mut outcome = StepOutcome::default();
-        outcome = joined(outcome, self.let_in_within(mapper, left()));
+        let mut outcome = self.let_in_within(mapper, left());
         while !left().is_zero() {
             self.begin_with(mapper, Mapper::begin_last_search);
             if self.away.is_none() {

@@ -18,7 +18,7 @@ use crate::slam::alignment::reference::{
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::geometry::se3::SE3;
-use crate::slam::image::sums::SumPyramid;
+use crate::slam::image::sums::{LEAST_CONTRAST, SumPyramid};
 use crate::slam::keyframe::{DistanceWeights, MapState};
 use crate::slam::parameter::{ParameterError, check_range};
 use crate::slam::pose::{Brightness, DegradedReason, LostReason, PoseEstimate, TrackingState};
@@ -78,7 +78,7 @@ impl Default for TrackerParams {
             hypothesis_rotation_deg: 3.0,
             recovery_rotation_deg: 6.0,
             max_turning_deviation: 1.0,
-            min_contrast: 2.0,
+            min_contrast: LEAST_CONTRAST,
             keyframe_distance_weight: DistanceWeights::default().translation,
             keyframe_usage_weight: DistanceWeights::default().usage,
             keyframe_brightness_ratio: 1.6,

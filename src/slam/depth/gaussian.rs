@@ -157,7 +157,7 @@ struct PixelObserver<'a> {
     params: &'a GaussianParams,
     /// Longest segment that is searched for a new pixel.
     max_new_search_px: f32,
-    /// Whether of longer ones as much is searched, from infinity.
+    /// Whether of longer ones the far part is searched.
     is_short_of_depth: bool,
 }
 

@@ -9,6 +9,9 @@ use crate::slam::image::buffer::Image;
 /// Most levels: 255 · 4⁴ = 65 280 is the largest sum that 16 bits hold.
 pub const MAX_LEVELS: usize = 5;
 
+/// Contrast below which an image shows nothing, grey levels: covered lens, overexposure, a white wall.
+pub const LEAST_CONTRAST: f64 = 2.0;
+
 /// What turns a pixel of `level` into grey levels.
 pub fn grey_per_sum(level: usize) -> f32 {
     1.0 / (1u32 << (2 * level)) as f32

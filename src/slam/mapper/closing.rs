@@ -58,6 +58,11 @@ impl Mapper {
         let joins = closure.join.into_iter().collect();
         match self.apply(&Correction { keyframes, joins, unit }) {
             Ok(outcome) => {
+                if let (Some((_, by)), false) = (closure.moves.last(), is_active)
+                    && let Some(world) = self.left_worlds.get_mut(&closure.epoch)
+                {
+                    world.scale /= by.scale;
+                }
                 window.follow(closure);
                 outcome
             }
@@ -133,6 +138,7 @@ mod tests {
             mapper.map.keyframes.push(Keyframe { epoch, ..keyframe });
         }
         mapper.active = Some(Active::new(4));
+        mapper.left_worlds.insert(0, Sim3::identity());
         let by = Sim3::new(SE3::identity(), 1.2);
         let moves = vec![(0, Sim3::identity()), (1, by)];
         let world = mapper.world_from_map;
@@ -140,6 +146,9 @@ mod tests {
         let units = mapper.map.keyframes.iter().map(|of| of.map_from_keyframe.scale);
         assert_eq!(units.collect::<Vec<_>>(), [1.0, 1.2, 1.0, 1.2, 1.0]);
         assert_eq!(mapper.world_from_map, world);
+        // A step of a keyframe's unit is as long in odometry as before.
+        let left = mapper.left_worlds[&0].scale * mapper.map.keyframes[3].map_from_keyframe.scale;
+        assert!((left - 1.0).abs() < 1e-12, "{left}");
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use crate::slam::alignment::reference::num_levels;
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::se3::SE3;
-use crate::slam::image::sums::SumPyramid;
+use crate::slam::image::sums::{LEAST_CONTRAST, SumPyramid};
 use crate::slam::keyframe::Keyframe;
 use crate::slam::map::{PlacedFrame, RefinedDepth};
 use crate::slam::mapper::consistency::Contradiction;
@@ -183,21 +183,18 @@ impl Mapper {
     pub(super) fn keep_early_frame(&mut self, frame: &FrameView<'_>) {
         /// Two seconds at 30 Hz, one byte a pixel each.
         const MOST: usize = 60;
-        /// Of a frame that a tracker does not align either, grey levels.
-        const LEAST_CONTRAST: f64 = 2.0;
-        let mut pyramid = SumPyramid::with_size(
-            frame.width,
-            frame.height,
-            num_levels(frame.width, frame.height),
-            0,
-        );
+        if !self.aligns_again() {
+            return;
+        }
+        let levels = num_levels(frame.width, frame.height);
+        let mut pyramid = SumPyramid::with_size(frame.width, frame.height, levels, levels - 1);
         pyramid.fill(frame.pixels);
         if pyramid.contrast() < LEAST_CONTRAST {
             self.early.clear();
-        } else if self.aligns_again() {
-            let (copy, at) = (self.copies.of(frame), &SE3::identity());
-            keep(&mut self.early, MOST, (frame.sequence, copy), (NO_KEYFRAME, at));
+            return;
         }
+        let (copy, at) = (self.copies.of(frame), &SE3::identity());
+        keep(&mut self.early, MOST, (frame.sequence, copy), (NO_KEYFRAME, at));
     }
 
     fn aligns_again(&self) -> bool {

@@ -30,7 +30,7 @@ pub struct GaussianParams {
     /// Longest segment that is searched for a new pixel while the keyframe is short of depth, that is, while less than a
     /// third of the pixels that may carry depth have it, pixels; at least the `max_search_px` of all others. A camera
     /// may be so fast that no frame has shorter segments, and a keyframe without depth is worse than repeated structure.
-    /// Of longer ones as much is searched, from infinity.
+    /// Of a longer one the far part, of this length, is searched.
     pub max_first_search_px: f32,
 }
 
