@@ -58,23 +58,23 @@ use crate::slam::window::frames::TrackedFrame;
 
 pub use params::MapperParams;
 
-/// What changed in one step, and what has to be published.
+/// The outcome of one step: what changed and must be published.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct StepOutcome {
-    /// The active keyframe was made in this step: publish its image too.
+    /// The active keyframe was created in this step: publish its image too.
     pub keyframe_created: bool,
     /// An earlier keyframe is active again: publish its image too.
     pub keyframe_restored: bool,
-    /// The active keyframe has other depth or another state than before: publish it.
+    /// The depth or the state of the active keyframe changed: publish it.
     pub keyframe_changed: bool,
     /// A keyframe's pose changed, or one was added: publish the graph.
     pub graph_changed: bool,
-    /// What the frame did to the depth map.
+    /// Counts of the frame's depth observations.
     pub observations: ObservationCounts,
 }
 
 impl StepOutcome {
-    /// A map has begun with its first keyframes.
+    /// A map was started with its first keyframes.
     fn begun() -> Self {
         Self {
             keyframe_created: true,
@@ -89,81 +89,81 @@ impl StepOutcome {
         Self { keyframe_restored: true, keyframe_changed: true, graph_changed, ..Self::default() }
     }
 
-    /// Whether the active keyframe is another one or another revision than before.
+    /// Whether the active keyframe was replaced or revised.
     pub fn needs_publishing(&self) -> bool {
         self.keyframe_created || self.keyframe_restored || self.keyframe_changed
     }
 
-    /// Whether another keyframe than before is active.
+    /// Whether a different keyframe became active.
     pub fn needs_image(&self) -> bool {
         self.keyframe_created || self.keyframe_restored
     }
 }
 
-/// What a step takes in.
+/// The input of one step.
 #[derive(Debug, Clone, Copy)]
 struct StepInput<'a> {
     frame: &'a FrameView<'a>,
     pose: &'a PoseEstimate,
-    /// Metres, 0 where none.
+    /// Metres, 0 where invalid.
     sensor_depth: Option<&'a Image<f32>>,
 }
 
-/// Keeps the map.
+/// Builds and maintains the map.
 #[derive(Debug)]
 pub struct Mapper {
     params: MapperParams,
     intrinsics: Intrinsics,
     map: Map,
     phase: Phase,
-    /// The map of earlier runs that it began in.
+    /// The map of earlier runs that this mapper started in.
     prior: Option<Prior>,
     /// The keyframe that frames are tracked on; `None` before the first.
     active: Option<Active>,
-    /// Where the active epoch's map lies in odometry's world: a similarity, since a correction may change units.
+    /// Pose of the active epoch's map in odometry's world: a similarity, since a correction may change units.
     world_from_map: Sim3,
-    /// The same of epochs that were left, by their number.
+    /// The same for epochs that were left, by epoch number.
     left_worlds: BTreeMap<u32, Sim3>,
-    /// Where odometry had the camera last; a tracker that has lost it, or was restarted, may not know.
+    /// The camera's last odometry pose; a tracker that is lost, or was restarted, may not have it.
     last_world_from_camera: Option<SE3>,
-    /// The keyframe that the last frame was tracked on, and where that was in its unit.
+    /// The keyframe that the last frame was tracked on, and the camera's pose on it, in its unit.
     last_tracked: Option<(u64, SE3)>,
     depth: DepthBuffers,
     modes: KeyframeModes,
-    /// By how much the lines of estimated poses are misplaced.
+    /// Misplacement of epipolar lines at estimated poses, from the matches.
     line_noise: LineNoise,
     start: Start,
     finder: Finder,
     past: PastFrames,
-    /// Keyframes that are estimated together; away while that is done.
+    /// Keyframes that are estimated jointly; `None` while the window is taken out.
     window: Option<Box<Window>>,
-    /// Whether anybody has asked for them.
+    /// Whether a joint estimate was ever requested.
     is_estimated: bool,
-    /// Which keyframes others show as well.
+    /// Keyframes that lost their depth because others show their points as well.
     thinning: Thinning,
     /// Whether the map has contradicted itself.
     doubt: Doubt,
-    /// Frames that were tracked since it was given away.
+    /// Tracked frames that the window has not taken yet.
     tracked: Vec<TrackedFrame>,
-    /// Frames of a start that has not been proven.
+    /// Frames of a start that is not proven yet.
     early: Vec<TrackedFrame>,
-    /// Copies of frames, for these lists, for `past` and for the keyframes of the map.
+    /// Copies of frames, shared by these lists, `past` and the keyframes of the map.
     copies: FrameCopies,
-    /// Keyframes whose depth is final for now, until somebody asks for them.
+    /// Keyframes whose depth is final for now, until they are taken.
     left: VecDeque<u64>,
-    /// Memory for the frame at hand.
+    /// Buffer for the current frame.
     frame: QuadImage,
-    /// What the active keyframe wants when it is published.
+    /// Work left on the active keyframe after it is published.
     unfinished: Option<Unfinished>,
     /// Counts up with every change of a keyframe's depth, pose or state.
     revision: u64,
     next_keyframe_id: u64,
-    /// Numbers of epochs below may have been given by a mapper that died.
+    /// Epoch numbers below this may have been assigned by a mapper that died.
     first_free_epoch: u32,
 }
 
 impl Mapper {
-    /// A mapper for images of `intrinsics`, with an empty map.
+    /// Creates a mapper with an empty map, for images of `intrinsics`.
     pub fn new(intrinsics: Intrinsics, params: MapperParams) -> Result<Self, ParameterError> {
         params.validate()?;
         let (width, height) = (intrinsics.width, intrinsics.height);
@@ -182,7 +182,7 @@ impl Mapper {
             modes: KeyframeModes::default(),
             start: Start::new(intrinsics, &params.two_frame)?,
             finder: Finder::new(&intrinsics),
-            // The active keyframe is one more.
+            // One more, for the active keyframe.
             past: PastFrames::with_capacity(params.max_past_frames + 1),
             window: (params.window.num_free > 0).then(|| {
                 let window = Window::new(intrinsics, params.window.clone());
@@ -204,9 +204,9 @@ impl Mapper {
         })
     }
 
-    /// Takes in one tracked frame. `sensor_depth` (metres, 0 where none) initialises the depth of
-    /// new keyframes where a depth camera may be used. `change_begins` is called when
-    /// the frame is observed and another keyframe is to become active, for who measures that.
+    /// Takes in one tracked frame. `sensor_depth` (metres, 0 where invalid) initialises the depth of new keyframes
+    /// where a depth camera may be used. `change_begins` is called, for timing, once the frame is observed and before
+    /// another keyframe becomes active.
     pub fn step(
         &mut self,
         frame: &FrameView<'_>,
@@ -262,8 +262,8 @@ impl Mapper {
         }
     }
 
-    /// Whether a pose is about the active keyframe: the tracker may not have seen this keyframe, or this epoch,
-    /// yet, and then its proposal and its brightness are about another one.
+    /// Whether a pose refers to the active keyframe: until the tracker has received this keyframe, or this epoch, its
+    /// proposal and its brightness refer to another one.
     fn is_about(&self, pose: &PoseEstimate, active: &Keyframe, is_lost: bool) -> bool {
         if !is_lost {
             return pose.keyframe_id == active.keyframe_id;
@@ -273,7 +273,7 @@ impl Mapper {
         pose.keyframe_id != NO_KEYFRAME && epoch == active.epoch
     }
 
-    /// A tracked frame: observe, judge, then change the keyframe or remember the frame.
+    /// Uses a tracked frame: observes depth, judges the map, then changes the keyframe or remembers the frame.
     fn extend(&mut self, input: &StepInput<'_>, change_begins: &mut dyn FnMut()) -> StepOutcome {
         let StepInput { frame, pose, .. } = *input;
         self.keep_frame(frame, pose);
@@ -317,28 +317,28 @@ impl Mapper {
         StepOutcome { keyframe_changed, observations, ..Default::default() }
     }
 
-    /// The active keyframe, once there is one.
+    /// The active keyframe; `None` before the first.
     pub fn keyframe(&self) -> Option<&Keyframe> {
         self.map.keyframes.get(self.active.as_ref()?.index)
     }
 
-    /// What the last frame came to, where it was one of a two-frame start.
+    /// The result of the last frame, if it belonged to a two-frame start.
     pub fn start_frame(&self) -> Option<StartFrame> {
         self.start.last_frame
     }
 
-    /// Every keyframe.
+    /// The map, with all its keyframes.
     pub fn map(&self) -> &Map {
         &self.map
     }
 
-    /// Gives back the memory of frames that only later ones need: where none comes, before the last estimate.
+    /// Frees the frames that only later frames need: call it before the last estimate, when no frame will follow.
     pub fn give_back_frames(&mut self) {
         self.past.clear();
         self.copies.let_go();
     }
 
-    /// Every keyframe, where nothing more is mapped.
+    /// Consumes the mapper and returns its map.
     pub fn into_map(self) -> Map {
         self.map
     }
@@ -366,7 +366,7 @@ impl Mapper {
         self.map.keyframes.get_mut(self.active.as_ref()?.index)
     }
 
-    /// Leaves the depth that was reached with the active keyframe.
+    /// Writes the final depth of the active keyframe, unless its map is rejected, before it is left.
     fn leave_keyframe(&mut self) {
         let is_rejected = self.keyframe().is_some_and(|k| k.map_state == MapState::Rejected);
         if self.depth.unpublished > 0 && !is_rejected {
@@ -374,7 +374,7 @@ impl Mapper {
         }
     }
 
-    /// Makes a keyframe of the map the active one, placed in the world as its map is.
+    /// Makes a keyframe of the map the active one, placed in the world by `world_from_map`.
     fn enter_keyframe(&mut self, index: usize) {
         if let Some(left) = self.keyframe().map(|keyframe| keyframe.keyframe_id) {
             self.tell_left(left);
@@ -388,7 +388,7 @@ impl Mapper {
         self.publish_depth();
     }
 
-    /// Writes the active depth, the place in the world and the revisions into the active keyframe.
+    /// Writes the active depth, the pose in the world and the revisions into the active keyframe.
     fn publish_depth(&mut self) {
         self.revision += 1;
         self.publish_place();
@@ -398,7 +398,7 @@ impl Mapper {
         keyframe.mode_covariance = self.modes.published(&self.params.modes);
     }
 
-    /// Writes the place in the world and the revisions into the active keyframe.
+    /// Writes the pose in the world and the revisions into the active keyframe.
     fn publish_place(&mut self) {
         let (revision, map_revision) = (self.revision, self.map.revision);
         let world_from_map = self.world_from_map;

@@ -2,9 +2,9 @@
 //! adjustment (Engel, Koltun, Cremers 2018 §2; Zubizarreta, Aguinaga, Montiel 2020).
 //!
 //! A point belongs to the keyframe that it was chosen in, its host, and is compared with every keyframe that sees it.
-//! [`comparison`] is one such comparison with its derivatives, `system` the normal equations of all with the
-//! points eliminated, `solver` the iterations, [`Window::optimise`] the recipe. Keyframes that have left the window
-//! and see the same things hold it in place; nothing is marginalised, and the filter's variance is no prior.
+//! [`comparison`] is one such comparison with its derivatives, `system` the normal equations of all with the points
+//! eliminated, `solver` the iterations, [`Window::optimise`] the recipe. Keyframes that have left the window and see
+//! the same points hold it in place; nothing is marginalised, and the filter's variance is no prior.
 
 mod agreement;
 pub(crate) mod candidates;
@@ -59,13 +59,13 @@ use crate::slam::window::surface::Surface;
 use crate::slam::window::system::{Level, Members};
 use crate::slam::window::unit::Unit;
 
-/// Levels of the alignment of one image that may be ten pixels off, and of an adjustment.
+/// Levels of the alignment of a single image, which may be ten pixels off, and of an adjustment.
 const ALIGNMENT_LEVELS: [usize; 4] = [3, 2, 1, 0];
 const ADJUSTED_LEVELS: [usize; 3] = [2, 1, 0];
 /// Most iterations of a level of that alignment.
 const MAX_ALIGNMENT_ITERATIONS: u32 = 10;
 
-/// What an adjustment came to.
+/// The result of an adjustment.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Adjustment {
     /// Newest keyframe that took part.
@@ -74,20 +74,20 @@ pub struct Adjustment {
     pub free: usize,
     /// Keyframes that held them in place.
     pub fixed: usize,
-    /// Points.
+    /// Points that some keyframe agrees with.
     pub points: usize,
     /// Comparisons of a point with a keyframe, at the finest level.
     pub comparisons: usize,
-    /// Share of them that count.
+    /// Share of them that are inliers.
     pub inlier_ratio: f64,
-    /// Root mean square of the residuals that count, grey levels.
+    /// Root mean square of the residuals of inliers, grey levels.
     pub rms_grey: f64,
     /// Steps tried, of all levels.
     pub iterations: u32,
 }
 
-/// Keyframes and points that are estimated together. It keeps its own copy of what it needs, but for the images, which never
-/// change, so that it can work while the map continues; [`Window::take_in`] and [`Window::correction`] are the two places where they meet.
+/// Keyframes and points that are estimated jointly. The window keeps its own copy of all it needs but the images, which
+/// never change, so that it can work during mapping; only [`Window::take_in`] and [`Window::correction`] meet the map.
 #[derive(Debug, Clone)]
 pub struct Window {
     params: WindowParams,
@@ -98,21 +98,21 @@ pub struct Window {
     candidates: Vec<Candidates>,
     /// Mature points of keyframes that are still to be taken in.
     mature: Vec<MaturePoints>,
-    /// Keyframes from here on have not been aligned.
+    /// Keyframes that have not been aligned yet.
     unaligned: Vec<u64>,
     solver: Solver,
-    /// Keyframes that moved last, in the order of their ids.
+    /// Keyframes moved by the last estimate, in the order of their ids.
     moved: Vec<u64>,
-    /// How uncertain those are.
+    /// Their marginal covariances.
     marginals: Vec<Marginal>,
     frames: WindowFrames,
-    /// Whether there are no more frames: the next estimate is of all keyframes, and of all frames that wait.
+    /// Whether no more frames follow: the next estimate is of all keyframes and of all frames that wait.
     pub(super) is_last: bool,
-    /// Whether the map contradicts itself: the next estimate is of the newest keyframes with all of them free.
+    /// Whether the map contradicts itself: the next estimate is of the newest keyframes, all of them free.
     pub(super) reconsiders: bool,
     pass: Pass,
     refinement: Refinement,
-    /// The search for loops: whoever has something for it, or asks it, speaks to it.
+    /// The search for loops; callers use it directly.
     pub(crate) loops: Loops,
     /// The epoch whose start the last estimate has refuted.
     pub(super) refuted_epoch: Option<u32>,
@@ -121,7 +121,7 @@ pub struct Window {
 }
 
 impl Window {
-    /// An empty one for images of `camera`.
+    /// Creates an empty window for images of `camera`.
     pub fn new(camera: Intrinsics, params: WindowParams) -> Self {
         Self {
             params,
@@ -144,14 +144,14 @@ impl Window {
         }
     }
 
-    /// Takes in what is new in the map, whose keyframe `active` is still being observed. False where there is nothing
-    /// to be estimated.
+    /// Updates the window from the map, whose keyframe `active` is still being observed. False where there is nothing
+    /// new to estimate.
     pub fn take_in(&mut self, map: &Map, active: u64) -> bool {
         self.moved.clear();
         self.marginals.clear();
         self.refuted_epoch = None;
         self.pass.leave_piece();
-        // What a mapper that died has left is where it was estimated to be.
+        // Keyframes left by a mapper that died are where they were estimated to be.
         let is_resumed = self.keyframes.is_empty() && map.keyframes.len() > 1;
         let held: Vec<&Keyframe> = map.keyframes.iter().filter(|of| of.is_usable()).collect();
         let mut ids: Vec<u64> = held.iter().map(|keyframe| keyframe.keyframe_id).collect();
@@ -178,7 +178,7 @@ impl Window {
         !self.unaligned.is_empty()
     }
 
-    /// Moves a keyframe to where the map has it; whether its points are chosen.
+    /// Updates a keyframe from the map; returns whether its points are chosen.
     fn update(&mut self, place: usize, from: &Keyframe) -> bool {
         let known = &mut self.keyframes[place];
         known.camera_from_map = from.map_from_keyframe.rigid.inverse();
@@ -203,13 +203,13 @@ impl Window {
         true
     }
 
-    /// The image of so many pixels; `None` where it is not of the camera's size.
+    /// An image of these pixels; `None` where it is not of the camera's size.
     fn image_of(&self, pixels: Arc<[u8]>) -> Option<SharedImage> {
         SharedImage::try_from_pixels(self.camera.width, self.camera.height, pixels)
     }
 
-    /// Adds a camera that is no keyframe, the last of them for as long as it is asked about, in the unit of a keyframe;
-    /// `None` where its image is not of the camera's size.
+    /// Appends a camera that is not a keyframe for the duration of a query, in the unit of a keyframe; `None` where its
+    /// image is not of the camera's size.
     fn push_camera(
         &mut self,
         epoch: u32,
@@ -226,12 +226,12 @@ impl Window {
         self.keyframes.get(self.index_of(keyframe_id)?)
     }
 
-    /// A keyframe's place in the list, which is in the order of their creation.
+    /// A keyframe's index in the list, which is in the order of creation.
     fn index_of(&self, keyframe_id: u64) -> Option<usize> {
         self.keyframes.binary_search_by_key(&keyframe_id, |of| of.keyframe_id).ok()
     }
 
-    /// Estimates the newest keyframes and all points that they and older ones see; `None` where there is too little.
+    /// Runs the task that was begun, or else estimates the newest keyframes and points; `None` without an estimate.
     pub fn optimise(&mut self) -> Option<Adjustment> {
         if self.refine_begun() || self.search_begun() || self.frames_begun() {
             return None;
@@ -274,7 +274,7 @@ impl Window {
         adjustment
     }
 
-    /// The images of those that take no part any more are given up.
+    /// Frees the images of keyframes that no longer take part.
     fn leave(&mut self, members: &[usize]) {
         for (index, keyframe) in self.keyframes.iter_mut().enumerate() {
             if !members.contains(&index) {
@@ -294,7 +294,7 @@ impl Window {
     }
 
     fn become_host(&mut self, host: usize, candidates: &Candidates) {
-        // Poses on the keyframe's depth are what its candidates were traced with: the plane is that of both.
+        // The candidates were traced with poses on the keyframe's depth: the plane applies to both.
         let plane = plane::fit(&self.projected_into(host, &candidates.depth)).unwrap_or_default();
         let params = &self.params;
         let keyframe = &mut self.keyframes[host];
@@ -318,7 +318,7 @@ impl Window {
         (keyframe.is_host, keyframe.agreed) = (true, Vec::new());
     }
 
-    /// Aligns a keyframe alone to the points of those that see what it sees.
+    /// Aligns a single keyframe to the points of those that see the same scene.
     fn align(&mut self, index: usize) {
         let mut members = self.hosts_to_align_to(index);
         if members.is_empty() {
@@ -330,7 +330,7 @@ impl Window {
         }
     }
 
-    /// Aligns the last of the members alone to the points of the others; false where its pose is not determined.
+    /// Aligns only the last of the members to the points of the others; false where its pose is not determined.
     fn align_last(&mut self, members: &[usize], levels: &[usize], iterations: u32) -> bool {
         let last = members.len() - 1;
         let free: Vec<_> = (0..members.len()).map(|k| (k == last).then_some(0)).collect();
@@ -346,7 +346,7 @@ impl Window {
         self.adjust_within(chosen, iterations)
     }
 
-    /// The same with at most so many iterations of a level.
+    /// The same with at most `iterations` per level.
     fn adjust_within(&mut self, chosen: &Chosen, iterations: u32) -> Option<Adjustment> {
         let num_free = chosen.free.iter().flatten().count();
         if num_free == 0 {
@@ -363,7 +363,7 @@ impl Window {
         self.note_agreement(&chosen.members);
         let mut found =
             marginals::marginals(&self.keyframes, &members, &mut self.solver, &self.camera);
-        // Places are in the unit of the equations; modes have none.
+        // Places are in the unit of the equations; modes are without a unit.
         let restored = unit.and_then(|unit| unit.restore(&mut self.keyframes, members.members));
         if let Some(by) = restored {
             let places = found.iter_mut().filter_map(|of| of.place.as_mut());
@@ -390,7 +390,7 @@ impl Window {
         })
     }
 
-    /// Lets points of hosts go that are too many to be estimated together: as many in all as the first keyframes have.
+    /// Drops points of hosts beyond what can be estimated together: as many in all as the first keyframes have.
     fn thin_out(&mut self, members: &[usize]) {
         let WindowParams { points, max_points, num_first, .. } = self.params;
         let hosts = members.iter().filter(|&&member| self.keyframes[member].is_host).count();
@@ -409,7 +409,7 @@ impl Window {
         }
     }
 
-    /// Adjusts what is free, level by level; false where something is not determined.
+    /// Adjusts the free parameters, level by level; false where one is not determined.
     fn run(
         &mut self,
         members: &Members<'_>,
@@ -432,7 +432,7 @@ impl Window {
         })
     }
 
-    /// Counts who agrees with each point, and lets those go that nobody agrees with; the number of the others.
+    /// Counts the keyframes that agree with each point and drops points without any; returns the number of the others.
     fn confirm(&mut self, members: &Members<'_>) -> usize {
         let mut points = 0;
         let views = &self.solver.views;

@@ -1,18 +1,18 @@
-//! A running mapper goes over to another map of its camera: another mapper takes its place.
+//! Switches a running mapper to another map of its camera: a second mapper replaces it.
 
 use crate::slam::keyframe::Keyframe;
 use crate::slam::mapper::Mapper;
 use crate::slam::pose::PoseEstimate;
 
 impl Mapper {
-    /// Ids of keyframes from here on are given to nobody yet.
+    /// The first keyframe id that has not been assigned.
     pub fn free_keyframe_id(&self) -> u64 {
         self.next_keyframe_id
     }
 
-    /// Takes the place of a mapper of this camera, having begun in a map none of whose numbers that has given. What was
-    /// mapped before keeps its places alone, which frames are placed by: the camera is not looked for there. Odometry goes
-    /// on where it has the camera.
+    /// Replaces `before`, a mapper of the same camera; this mapper must have started in a map that holds none of the
+    /// numbers that `before` has assigned. Keyframes mapped before keep only their poses, which place their frames: the
+    /// camera is not searched for there. Odometry continues from its pose of the camera.
     pub fn take_the_place_of(&mut self, before: Self) {
         let mut keyframes: Vec<Keyframe> =
             before.map.keyframes.iter().map(Keyframe::without_depth).collect();
@@ -26,7 +26,7 @@ impl Mapper {
         self.last_world_from_camera = before.last_world_from_camera;
     }
 
-    /// The camera was not found yet in this map, but the tracker still knows where it is on a keyframe before it.
+    /// Follows odometry while the camera, not yet found in this map, is still tracked on a keyframe of the map before.
     pub(super) fn follow_odometry(&mut self, pose: &PoseEstimate) {
         if pose.state.is_tracked() && pose.world_from_camera.is_finite() {
             self.last_world_from_camera = Some(pose.world_from_camera);

@@ -1,4 +1,4 @@
-//! How alike two images look, wherever their cameras stand: small blurred images, correlated over small shifts
+//! Similarity of two images, independent of their cameras' poses: small blurred images, correlated over small shifts
 //! (Klein, Murray 2008).
 
 /// Size of the small images.
@@ -8,19 +8,19 @@ pub(in crate::slam) const ROWS: usize = 24;
 const REACH: usize = 3;
 /// Columns and rows that are compared at every shift.
 const INNER: [usize; 2] = [COLUMNS - 2 * REACH, ROWS - 2 * REACH];
-/// Their number.
+/// The number of pixels compared.
 const COUNT: f32 = (INNER[0] * INNER[1]) as f32;
 
 /// A small image.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Appearance {
     greys: Vec<f32>,
-    /// The same without what changes slowly over the image.
+    /// `greys` without their slow variation over the image.
     details: Vec<f32>,
 }
 
 impl Appearance {
-    /// Of an image, row after row; `None` where it is too small to have one.
+    /// Computes the appearance of a row-major image; `None` where it is too small or `pixels` does not match its size.
     pub fn of(pixels: &[u8], width: usize, height: usize) -> Option<Self> {
         if width < COLUMNS || height < ROWS || pixels.len() != width * height {
             return None;
@@ -39,21 +39,20 @@ impl Appearance {
     }
 
     fn with(greys: Vec<f32>) -> Self {
-        /// Blurs that leave what is slow: of 1.4 pixels together, a twentieth of the image.
+        /// Blurs that leave only the slow variation: 1.4 pixels together, a twentieth of the image.
         const BLURS: usize = 4;
         let slow = (0..BLURS).fold(greys.clone(), |greys, _| blurred(&greys));
         let details = greys.iter().zip(&slow).map(|(grey, slow)| grey - slow).collect();
         Self { greys, details }
     }
 
-    /// What changes from place to place, row after row: light and large surfaces do not count, so that it tells views
-    /// apart that share little.
+    /// Fine detail, row-major: light and large surfaces are removed, so that it tells apart views that share little.
     pub(in crate::slam) fn details(&self) -> &[f32] {
         &self.details
     }
 
-    /// Correlation at the best of the shifts, −1 to 1: what brightness and contrast do to an image does not count. −1
-    /// where one of them shows nothing.
+    /// Correlation at the best shift, −1 to 1, invariant to brightness and contrast; −1 where either image has no
+    /// contrast.
     pub fn similarity(&self, other: &Self) -> f32 {
         let mut inner: Vec<f32> = self.part([REACH, REACH]).flatten().copied().collect();
         let mean = inner.iter().sum::<f32>() / COUNT;
@@ -63,14 +62,14 @@ impl Appearance {
         places.map(|at| correlation(&inner, variance, other.part(at))).fold(-1.0, f32::max)
     }
 
-    /// Rows of the part of the inner size that begins at a column and a row.
+    /// Rows of the inner-sized part that begins at column `x` and row `y`.
     fn part(&self, [x, y]: [usize; 2]) -> impl Iterator<Item = &[f32]> + Clone {
         let rows = self.greys[COLUMNS * y..].chunks_exact(COLUMNS).take(INNER[1]);
         rows.map(move |row| &row[x..x + INNER[0]])
     }
 }
 
-/// The same with a quarter of either neighbour, along rows and along columns.
+/// Blurs with the weights (1, 2, 1) / 4 along rows and along columns.
 fn blurred(greys: &[f32]) -> Vec<f32> {
     let of = |greys: &[f32], at: [usize; 2], step: [usize; 2]| {
         let grey = |x: usize, y: usize| greys[y.min(ROWS - 1) * COLUMNS + x.min(COLUMNS - 1)];
@@ -84,9 +83,9 @@ fn blurred(greys: &[f32]) -> Vec<f32> {
     pass(&pass(greys, [1, 0]), [0, 1])
 }
 
-/// Of greys whose mean is 0 and whose variance is known with rows of others.
+/// Correlation of greys of mean 0 and this variance with rows of another image; −1 where either has no contrast.
 fn correlation<'a>(centred: &[f32], variance: f32, rows: impl Iterator<Item = &'a [f32]>) -> f32 {
-    /// Variance, grey levels², below which there is nothing to be compared.
+    /// Variance, grey levels², up to which an image has too little contrast to compare.
     const LEAST_VARIANCE: f32 = 1.0;
     let [mut sum, mut squares, mut common] = [0.0f32; 3];
     for (ours, theirs) in centred.chunks_exact(INNER[0]).zip(rows) {
@@ -117,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn a_place_is_known_again_after_a_small_turn_and_in_other_light() {
+    fn a_view_is_similar_after_a_small_turn_and_in_other_light() {
         let here = seen([0.0; 6], 1);
         let turned = seen([0.05, 0.0, 0.1, 0.05, 0.06, 0.02], 2);
         let elsewhere = seen([0.0, 0.0, 0.0, 0.0, 1.5, 0.0], 3);
@@ -128,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn what_shows_nothing_is_like_nothing() {
+    fn a_uniform_image_matches_nothing_and_an_invalid_one_has_no_appearance() {
         let wall = Appearance::of(&[70; 100 * 80], 100, 80).unwrap();
         assert_eq!(wall.similarity(&wall), -1.0);
         assert_eq!(Appearance::of(&[0; 20 * 80], 20, 80), None);

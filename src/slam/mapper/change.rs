@@ -1,5 +1,5 @@
-//! The step to a new keyframe: carry the depth over, smooth it, rescale, publish; then, what can wait
-//! until it is published: the last depth of the keyframe before, and a look back for new pixels.
+//! The change to a new keyframe: propagate the depth, regularise, rescale, publish; then the work that can wait until
+//! after that: the final depth of the previous keyframe, and depth for new pixels from past frames.
 
 use std::sync::Arc;
 
@@ -19,25 +19,25 @@ use crate::slam::mapper::{Mapper, StepInput, StepOutcome};
 use crate::slam::place_covariance::UncertainPlace;
 use crate::slam::pose::{Brightness, PoseEstimate, full_covariance};
 
-/// What a new keyframe still wants when it is published.
+/// Work left on a new keyframe after it is published.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Unfinished {
-    /// Place in the map of the keyframe before, whose depth map is the spare one.
+    /// Index in the map of the previous keyframe, whose depth map is the spare one.
     before: usize,
-    /// Length of the unit of that depth in its keyframe's.
+    /// Unit of that depth, in its keyframe's unit.
     unit: f64,
-    /// Hypotheses of that.
+    /// Number of its hypotheses.
     known: usize,
-    /// Its mean inverse depth over what the new keyframe had when it was carried over.
+    /// Its mean inverse depth divided by that of the new keyframe when the depth was propagated.
     depth_ratio: f64,
     /// Whether the new pixels have no depth yet.
     has_new_pixels: bool,
-    /// By how much epipolar lines are misplaced, pixels: past frames' poses are as certain as its own.
+    /// Misplacement of epipolar lines, pixels: past frames' poses are as certain as that of the new keyframe.
     line_noise_px: f32,
 }
 
 impl Mapper {
-    /// Makes a frame, tracked on the active keyframe, the next one: carries the depth over, smooths it, rescales.
+    /// Makes a frame, tracked on the active keyframe, the next keyframe: propagates the depth, regularises, rescales.
     pub(super) fn change_keyframe(&mut self, input: &StepInput<'_>) {
         let StepInput { frame, pose, sensor_depth } = *input;
         let (Some(active), Some(before)) = (self.active, self.keyframe()) else { return };
@@ -65,13 +65,13 @@ impl Mapper {
         }
         self.depth.refine(&self.params);
         let factor = self.depth.normalise();
-        // Without any depth there was nothing to be rescaled by.
+        // Without any depth there is no mean to rescale by.
         self.depth.is_unit_open = is_unit_open && self.depth.active.num_hypotheses() == 0;
         self.unfinished = Some(Unfinished {
             before: active.index,
             unit,
             known: self.depth.spare.num_hypotheses(),
-            // The mean of a first keyframe without depth was not 1.
+            // The mean of a first keyframe without depth is not 1.
             depth_ratio: self.depth.spare.mean_inverse_depth().map_or(1.0, |mean| mean * factor),
             has_new_pixels: sensor_depth.is_none(),
             line_noise_px: self.matching_at(pose).line_noise_px,
@@ -83,16 +83,16 @@ impl Mapper {
         self.add_keyframe(frame, &place, epoch);
     }
 
-    /// Whether a keyframe made of `frame` would have next to none of the depth: the camera has turned away from it. Frames
-    /// are tracked on the keyframe at hand then as long as they see it.
+    /// Whether a keyframe made of `frame` would keep almost none of the depth because the camera has turned away from
+    /// it. Frames are then tracked on the active keyframe for as long as they see it.
     pub(super) fn leaves_depth_behind(
         &mut self,
         frame: &FrameView<'_>,
         pose: &PoseEstimate,
     ) -> bool {
-        /// Points with which a keyframe can be tracked on: those that a start needs.
+        /// Points needed to continue tracking on a keyframe: as many as a start needs.
         const FEWEST: usize = 200;
-        /// So many of the keyframe's points in view make looking closer unnecessary.
+        /// With this many of the keyframe's points in view, no closer check is needed.
         const ENOUGH_IN_VIEW: f64 = 4000.0;
         let is_exact = pose.alignment_covariance.iter().all(|entry| *entry == 0.0);
         let known = self.depth.active.num_hypotheses();
@@ -111,14 +111,14 @@ impl Mapper {
         carried < FEWEST.max((self.params.consistency.min_kept_ratio * known as f64) as usize)
     }
 
-    /// What a new keyframe can wait for until it is published: the last depth of the one before goes
-    /// into the map, new pixels get their depth from past frames, and the change is judged. To be
-    /// called when the step's outcome is out; otherwise the next step does it first.
+    /// Finishes a new keyframe after it is published: writes the final depth of the previous one into the map, gives
+    /// new pixels depth from past frames, and judges the change. Call it once the step's outcome is published;
+    /// otherwise the next step does it first.
     pub fn finish_keyframe(&mut self) -> StepOutcome {
         let Some(unfinished) = self.unfinished.take() else { return StepOutcome::default() };
         self.revision += 1;
         let before = self.map.keyframes.get_mut(unfinished.before);
-        // One whose depth was forgotten stays without.
+        // A keyframe whose depth was forgotten stays without.
         if let Some(before) = before.filter(|before| !before.image.is_empty()) {
             before.revision = self.revision;
             write_depth(&self.depth.spare, unfinished.unit, before);
@@ -142,12 +142,12 @@ impl Mapper {
         StepOutcome { keyframe_changed, ..Default::default() }
     }
 
-    /// Gives new pixels of the keyframe their depth from frames before it, shortest baseline first:
-    /// each narrows the search of the next. False where none was far enough away.
+    /// Gives new pixels of the keyframe depth from earlier frames, shortest baseline first: each narrows the search of
+    /// the next. False where no frame was far enough away.
     fn seed_from_past(&mut self, line_noise_px: f32) -> bool {
         /// Each frame's baseline is at least this many times the one before.
         const BASELINE_STEP: f64 = 1.7;
-        /// Baselines shorter than this share of the mean depth tell nothing.
+        /// Baselines shorter than this share of the mean depth yield no depth.
         const MIN_BASELINE: f64 = 0.01;
         let Some(keyframe) = self.keyframe() else { return false };
         let map_from_keyframe = keyframe.map_from_keyframe;
@@ -182,7 +182,7 @@ impl Mapper {
         used > 0
     }
 
-    /// Makes `frame`, whose depth is the active one, a keyframe of the map, and active.
+    /// Adds `frame`, whose depth is the active one, to the map as the active keyframe.
     pub(super) fn add_keyframe(
         &mut self,
         frame: &FrameView<'_>,
@@ -229,14 +229,14 @@ mod tests {
     use crate::slam::pose::TrackingState;
     use crate::slam::test_scene::{CAMERA, Scene};
 
-    /// What a step, or the rest of it, gave, and the keyframes' points then.
+    /// The outcome of a step, or of its deferred work, and the keyframes' points after it.
     #[derive(Debug, Clone, PartialEq)]
     struct Taken {
         outcome: StepOutcome,
         points: Vec<Vec<DepthPoint>>,
     }
 
-    /// What a camera sees of the room: depth, and an image with the noise of a seed.
+    /// Renders the scene from a camera: depth, and an image with noise from `seed`.
     fn seen(scene: &Scene, world_from_camera: &SE3, seed: u64) -> (Image<f32>, Vec<u8>) {
         let view = scene.render(&CAMERA, world_from_camera);
         let mut depth = view.inverse_depth.clone();
@@ -244,8 +244,8 @@ mod tests {
         (depth, view.noisy(1.0, seed))
     }
 
-    /// A camera that moves sideways with exact poses, exact depth for its first keyframe alone; a
-    /// keyframe is asked for at the fifth step. What the steps and their rests gave, and the mapper.
+    /// Moves a camera sideways with exact poses, and exact depth for its first keyframe only; the fifth step proposes a
+    /// keyframe. Returns the outcomes of the steps and of their deferred work, and the mapper.
     fn walk(params: MapperParams, steps: u64, finishes: bool) -> (Vec<[Taken; 2]>, Mapper) {
         let scene = Scene::new(3);
         let mut mapper = Mapper::new(CAMERA, params).unwrap();
@@ -277,17 +277,17 @@ mod tests {
     }
 
     #[test]
-    fn a_new_keyframe_is_published_first_and_finished_then() {
+    fn a_new_keyframe_is_published_first_and_finished_afterwards() {
         let (outcomes, mapper) = walk(MapperParams::default(), 6, true);
         let [step, rest] = &outcomes[4];
         let (published, then) = (step.outcome, rest.outcome);
         assert!(published.keyframe_created && published.needs_image());
         assert!(then.needs_publishing() && !then.needs_image() && !then.graph_changed);
         assert!(outcomes[..4].iter().all(|[_, rest]| rest.outcome == StepOutcome::default()));
-        // The one before has the depth that was reached on it, the new one depth for new pixels.
+        // The previous keyframe has its final depth, the new one depth for new pixels.
         assert!(step.points[0] != rest.points[0]);
         assert!(rest.points[1].len() > step.points[1].len());
-        // Who does not ask for the rest has it with the next step, and nothing else changes.
+        // Without the call, the next step does the deferred work, and nothing else changes.
         let (others, late) = walk(MapperParams::default(), 6, false);
         assert!(others[5][0].outcome.keyframe_changed);
         for (one, other) in mapper.map().keyframes.iter().zip(&late.map().keyframes) {
@@ -296,8 +296,8 @@ mod tests {
         }
     }
 
-    /// Points that the second keyframe has of the first one's depth, where its image is of this brightness against
-    /// the first and the tracker says so, or says `told`.
+    /// Number of points that the second keyframe gets from the first one's depth, where its image has this brightness
+    /// relative to the first and the tracker reports `told`.
     fn carried(brightness: Brightness, told: Brightness) -> usize {
         let scene = Scene::new(3);
         let params = MapperParams { min_keyframe_interval: 1, ..MapperParams::default() };
@@ -332,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn depth_is_carried_over_a_change_of_brightness_in_its_direction() {
+    fn depth_is_propagated_across_a_change_of_brightness_of_the_right_sign() {
         let brightness = Brightness { a: -0.4, b: 10.0 };
         let same = carried(Brightness::default(), Brightness::default());
         let right = carried(brightness, brightness);
@@ -341,7 +341,7 @@ mod tests {
     }
 
     #[test]
-    fn errors_of_estimated_poses_are_none_of_given_ones_in_past_frames_either() {
+    fn line_noise_of_estimated_poses_does_not_apply_to_past_frames_with_given_poses() {
         let with_line_noise = |line_noise_px| {
             let matching = MatchingParams { line_noise_px, ..MatchingParams::default() };
             walk(MapperParams { matching, ..MapperParams::default() }, 6, true).0
@@ -352,7 +352,7 @@ mod tests {
     }
 
     #[test]
-    fn one_past_frame_is_one_beside_the_keyframe() {
+    fn the_keyframe_does_not_count_as_one_of_the_past_frames() {
         let params = MapperParams { max_past_frames: 1, ..MapperParams::default() };
         let (outcomes, _) = walk(params, 5, true);
         let [step, rest] = &outcomes[4];
@@ -360,12 +360,12 @@ mod tests {
     }
 
     #[test]
-    fn looking_whether_depth_is_left_behind_changes_none_of_it() {
+    fn checking_whether_depth_is_left_behind_leaves_it_unchanged() {
         let (_, mut mapper) = walk(MapperParams::default(), 3, true);
         let before = mapper.depth.active.clone();
         let (_, pixels) = seen(&Scene::new(8), &SE3::identity(), 1);
         let frame = FrameView::new(&CAMERA, 3, 0, &pixels);
-        // It sees nothing of the keyframe, which is no given pose.
+        // The frame sees nothing of the keyframe, and its pose is not a given one.
         let pose =
             PoseEstimate { alignment_covariance: [1e-6; 21], ..PoseEstimate::unknown(&frame) };
         mapper.leaves_depth_behind(&frame, &pose);
@@ -387,7 +387,7 @@ mod tests {
     }
 
     #[test]
-    fn a_new_keyframe_is_as_uncertain_as_the_one_before_and_its_pose_on_it() {
+    fn a_new_keyframe_adds_the_uncertainty_of_its_pose_to_that_of_the_previous_one() {
         let scene = Scene::new(3);
         let reuse = ReuseParams { max_distance: 0.0, ..ReuseParams::default() };
         let params = MapperParams { min_keyframe_interval: 1, reuse, ..MapperParams::default() };

@@ -1,4 +1,4 @@
-//! What a loop does to the map that continues meanwhile.
+//! Loop closures, applied to a map that has continued to grow since the search began.
 
 use std::sync::Arc;
 
@@ -9,8 +9,8 @@ use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::window::Window;
 
 impl Mapper {
-    /// The keyframes to be given back with [`Mapper::end_adjustment`] after [`Window::optimise`] has looked for places
-    /// that one of them shows, where no more frames come; `None` where all have been looked for.
+    /// Takes out the window for a loop search after the last frame: run [`Window::optimise`] on it and give it back
+    /// with [`Mapper::end_adjustment`]. `None` once every keyframe has been searched.
     pub fn begin_last_search(&mut self) -> Option<Box<Window>> {
         let mut window = self.window.take()?;
         let is_begun = window.begin_search(&self.map, true);
@@ -21,26 +21,26 @@ impl Mapper {
         None
     }
 
-    /// The map is of a mapper before: what it holds is looked at, and found again from now on.
+    /// The map comes from an earlier mapper: index its keyframes so that their places can be recognised.
     pub(super) fn take_over(&mut self) {
         self.finder.learn(&mut self.map.keyframes, usize::MAX);
         self.take_up_loops();
     }
 
-    /// The search for loops continues with what is known of the map.
+    /// Continues the search for loops from those stored in the map.
     pub(super) fn take_up_loops(&mut self) {
         if let Some(window) = &mut self.window {
             window.loops.take_up(Arc::clone(&self.map.loops), &self.map.keyframes);
         }
     }
 
-    /// The keyframes that were estimated, or searched, are here again; what is known of loops then is the map's.
+    /// Takes the window back after an estimate or a search and hands its loops to the map.
     pub(super) fn put_back(&mut self, window: Box<Window>) {
         self.map.loops = Arc::clone(window.loops.known());
         self.window = Some(window);
     }
 
-    /// Moves the map as a loop has it; odometry stays where it is and keeps its unit.
+    /// Applies a loop closure to the map; odometry keeps the camera's pose and its unit.
     pub(super) fn close_loop(&mut self, closure: &Closure, window: &mut Window) -> StepOutcome {
         let is_active = self.keyframe().is_some_and(|active| active.epoch == closure.epoch);
         let unit = closure.moves.last().map(|(_, by)| by.scale).filter(|_| is_active);
@@ -66,7 +66,7 @@ impl Mapper {
                 window.follow(closure);
                 outcome
             }
-            // A number is broken: the map stays as it is.
+            // Non-finite values: leave the map unchanged.
             Err(_) => StepOutcome::default(),
         }
     }
@@ -89,7 +89,7 @@ mod tests {
         SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() }
     }
 
-    /// A camera beside the second of two keyframes, that the map has at 1.
+    /// A mapper with keyframes at x = 0 and 1, and a camera next to the second.
     fn mapper() -> Mapper {
         let scene = Scene::new(3);
         let mut mapper = Mapper::new(CAMERA, MapperParams::default()).unwrap();
@@ -105,13 +105,13 @@ mod tests {
         Window::new(CAMERA, WindowParams::default())
     }
 
-    /// Where odometry has a camera beside the active keyframe.
+    /// The world's x of a camera that is `x` away from the active keyframe.
     fn in_world(mapper: &Mapper, x: f64) -> f64 {
         mapper.keyframe().unwrap().world_from_keyframe.place(&sideways(x)).translation.x
     }
 
     #[test]
-    fn a_loop_moves_the_map_and_leaves_odometry_and_its_unit() {
+    fn a_loop_moves_the_map_and_leaves_odometry_and_its_unit_unchanged() {
         let mut mapper = mapper();
         let by = Sim3::new(sideways(0.5), 1.2);
         let closure = Closure { epoch: 0, moves: vec![(0, Sim3::identity()), (1, by)], join: None };
@@ -123,14 +123,14 @@ mod tests {
         assert_eq!(active.map_revision, before + 1);
         assert!((active.map_from_keyframe.rigid.translation.x - 1.7).abs() < 1e-12);
         assert!((active.map_from_keyframe.scale - 1.2).abs() < 1e-12);
-        // The camera stands still, and a step of the keyframe's unit is as long as before.
+        // The camera does not move, and the keyframe's unit is as long as before.
         assert!((in_world(&mapper, 0.1) - 1.1).abs() < 1e-12);
         assert!((in_world(&mapper, 0.4) - 1.4).abs() < 1e-12);
         assert_eq!(mapper.map.keyframes[0].map_from_keyframe, Sim3::identity());
     }
 
     #[test]
-    fn a_loop_of_an_epoch_that_is_not_active_moves_that_one_alone() {
+    fn a_loop_in_an_inactive_epoch_moves_only_that_epoch() {
         let mut mapper = mapper();
         let scene = Scene::new(3);
         for (id, epoch) in [(2, 1), (3, 0), (4, 1)] {
@@ -146,19 +146,19 @@ mod tests {
         let units = mapper.map.keyframes.iter().map(|of| of.map_from_keyframe.scale);
         assert_eq!(units.collect::<Vec<_>>(), [1.0, 1.2, 1.0, 1.2, 1.0]);
         assert_eq!(mapper.world_from_map, world);
-        // A step of a keyframe's unit is as long in odometry as before.
+        // A keyframe's unit is as long in odometry as before.
         let left = mapper.left_worlds[&0].scale * mapper.map.keyframes[3].map_from_keyframe.scale;
         assert!((left - 1.0).abs() < 1e-12, "{left}");
     }
 
     #[test]
-    fn an_epoch_that_is_taken_up_again_has_the_unit_of_odometry_whichever_keyframe_it_is_found_on()
+    fn an_epoch_that_is_resumed_has_the_unit_of_odometry_on_whichever_keyframe_the_camera_is_found()
     {
         for found_on in 0..2 {
             let mut mapper = mapper();
             let other = mapper.map.keyframes[0].clone();
             mapper.map.keyframes.push(Keyframe { keyframe_id: 2, epoch: 1, ..other });
-            // An estimate gives one of the two another unit than it had when odometry knew it.
+            // An estimate changes the unit of one of the two after odometry has used it.
             let map_from_keyframe = Sim3::new(SE3::identity(), 1.2);
             let keyframes = vec![KeyframeCorrection::of_place(0, map_from_keyframe)];
             mapper.apply(&Correction { keyframes, ..Correction::default() }).unwrap();
@@ -169,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn the_search_shares_the_descriptions_of_the_finder_and_does_not_search_what_was_there_before()
+    fn the_search_shares_descriptions_with_the_finder_and_skips_the_keyframes_of_an_earlier_mapper()
     {
         let scene = Scene::new(3);
         let loops = LoopParams { num_candidates: 3, ..LoopParams::default() };
@@ -191,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn loops_are_in_the_checkpoint_and_whoever_goes_on_from_it_has_them() {
+    fn loops_are_stored_in_the_checkpoint_and_restored_from_it() {
         let mut mapper = mapper();
         let link = Link { i: 1, j: 0, j_from_i: Sim3::identity(), covariance: Matrix7::identity() };
         let loops = Arc::new(KnownLoops { links: vec![link], ..KnownLoops::default() });
@@ -208,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn an_epoch_that_is_joined_gets_the_older_number_and_odometry_stands_still() {
+    fn a_joined_epoch_gets_the_older_number_and_odometry_does_not_move() {
         let mut mapper = mapper();
         mapper.map.keyframes[1].epoch = 4;
         let into_from_epoch = Sim3::new(sideways(-3.0), 0.5);
@@ -223,7 +223,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_similarity_leaves_the_map_as_it_is() {
+    fn an_invalid_similarity_leaves_the_map_unchanged() {
         let mut mapper = mapper();
         let broken = Sim3 { scale: f64::NAN, ..Sim3::identity() };
         let closure = Closure { epoch: 0, moves: vec![(0, broken)], join: None };

@@ -1,4 +1,4 @@
-//! Whether the map still agrees with itself: what must not pass for a pose is caught here.
+//! Checks that the map still agrees with itself: wrong results are caught before they pass for poses.
 
 use std::fmt;
 
@@ -7,26 +7,26 @@ use serde::{Deserialize, Serialize};
 use crate::slam::depth::gaussian::{ObservationCounts, PROBE_STEP};
 use crate::slam::parameter::{ParameterError, check_range};
 
-/// What a map that can be trusted does not do.
+/// Limits that a trustworthy map stays within.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ConsistencyParams {
-    /// Share of the hypotheses that a frame is searched for, or that its even sample stands for, whose search may
-    /// fail. By the searches alone recordings stayed below 0.57, nearly all of their frames below 0.4.
+    /// Largest share of failed searches among the hypotheses that a frame searches for or that its even sample
+    /// represents. Counting the searches alone, recordings stayed below 0.57, nearly all of their frames below 0.4.
     pub max_failed_ratio: f64,
-    /// Frames in a row with more failures that reject the map: one alone may be a blink.
+    /// Consecutive frames with more failures that reject the map: a single one may be a blink.
     pub max_failed_frames: u32,
     /// Share of the hypotheses that a keyframe must keep, and that must reach the next one.
     /// Recordings keep 0.4 at worst.
     pub min_kept_ratio: f64,
-    /// Largest ratio, either way, of mean inverse depths of a keyframe and the next one. A keyframe
-    /// comes after a third of the mean depth: walking up to a wall gives 1.5, recordings 0.74 to 1.32.
+    /// Largest ratio, either way, of the mean inverse depths of successive keyframes. A new keyframe follows after a
+    /// third of the mean depth: walking up to a wall gives 1.5, recordings 0.74 to 1.32.
     pub max_depth_ratio: f64,
-    /// Share of the even sample of hypotheses that may fail in a frame of the first keyframes, where the frame is also
-    /// displaced against the keyframe by more than noise: more is what a wrong start of the map leaves.
+    /// Largest share of the even sample of hypotheses that may fail in a frame on the first keyframes where the frame
+    /// is also displaced against the keyframe by more than noise: a wrong start of the map exceeds it.
     pub max_start_refuted_ratio: f64,
-    /// Frames in a row with more that reject the start. Of 16 starts of a plane with the wrong one of its two motions
-    /// 15 had as many, of 45 right ones none; 4 at most where the depth was good to a sixth.
+    /// Consecutive frames above that share that reject the start. Of 16 starts on a plane with the wrong one of its two
+    /// motions 15 had this many, of 45 correct ones none; at most 4 where the depth was accurate to a sixth.
     pub max_start_refuted_frames: u32,
 }
 
@@ -81,7 +81,7 @@ impl fmt::Display for Contradiction {
     }
 }
 
-/// What is watched from frame to frame on one keyframe.
+/// State of the checks from frame to frame on one keyframe.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Consistency {
     failed_frames: u32,
@@ -92,11 +92,11 @@ pub(super) struct Consistency {
 /// Keyframes of an epoch whose frames judge its start, the first included.
 pub(super) const START_KEYFRAMES: usize = 4;
 
-/// Fewer searches than this say nothing about the map.
+/// Fewer searches than this allow no verdict on the map.
 const MIN_SEARCHES: usize = 200;
 
 impl Consistency {
-    /// Takes in what a frame on one of the first keyframes said of an even sample of its depth, and by how much the
+    /// Takes in how much of an even sample of the depth a frame on one of the first keyframes refuted, and how far the
     /// tiles of the image are displaced, in image widths.
     pub(super) fn observe_start(
         &mut self,
@@ -115,39 +115,39 @@ impl Consistency {
             .then_some(Contradiction::WrongStart)
     }
 
-    /// Takes in what a frame did to a map of `points`.
+    /// Takes in the counts of a frame on a keyframe with this many points.
     pub(super) fn observe(
         &mut self,
         counts: &ObservationCounts,
         points: usize,
         params: &ConsistencyParams,
     ) -> Option<Contradiction> {
-        /// Nor do searches of so small a share of it: where most of the view is new, what is seen of the map
-        /// is its edge.
+        /// A smaller searched share of the points allows no verdict either: where most of the view is new, only the
+        /// edge of the map is seen.
         const MIN_SEARCHED_RATIO: f64 = 0.02;
         let enough = MIN_SEARCHED_RATIO * points as f64;
         let searched = counts.attempted + counts.probed;
         if searched >= MIN_SEARCHES && searched as f64 >= enough {
-            // What is searched to be learnt from is often what failed before, where light or a reflection changed: of
-            // all that the keyframe knows it is the smaller part.
+            // Hypotheses that are still refined are often those whose searches failed before, where light or a
+            // reflection changed: they are the smaller part of all that the keyframe has.
             let of_all = |searched: usize, probed: usize| (searched + PROBE_STEP * probed) as f64;
             let failed_ratio =
                 of_all(counts.failed, counts.refuted) / of_all(counts.attempted, counts.probed);
             let has_failed = failed_ratio > params.max_failed_ratio;
             self.failed_frames = if has_failed { self.failed_frames + 1 } else { 0 };
         } else {
-            // A frame that says nothing is not one of a row of bad ones.
+            // A frame that allows no verdict does not extend a run of bad ones.
             self.failed_frames = self.failed_frames.saturating_sub(1);
         }
         (self.failed_frames >= params.max_failed_frames).then_some(Contradiction::FailedSearches)
     }
 
-    /// Frames that failed did so on a map that has been estimated again since.
+    /// Resets the counts of bad frames: the map that they failed on has been estimated again since.
     pub(super) fn forget_failures(&mut self) {
         (self.failed_frames, self.refuted_frames) = (0, 0);
     }
 
-    /// Takes in how many points the keyframe has now.
+    /// Takes in the keyframe's current number of points.
     pub(super) fn count_points(
         &mut self,
         points: usize,
@@ -159,8 +159,8 @@ impl Consistency {
     }
 }
 
-/// Judges the step to a new keyframe: hypotheses before and after, and the new mean inverse depth in
-/// units of the one before.
+/// Judges the change to a new keyframe: hypotheses before and after, and the ratio of the previous mean inverse depth
+/// to the new one.
 pub(super) fn judge_change(
     before: usize,
     after: usize,
@@ -173,7 +173,7 @@ pub(super) fn judge_change(
     (!is_plausible_ratio(depth_ratio, params)).then_some(Contradiction::ScaleJump)
 }
 
-/// Whether mean depths of one keyframe and the next may have this ratio.
+/// Whether the mean depths of successive keyframes may have this ratio.
 pub(super) fn is_plausible_ratio(ratio: f64, params: &ConsistencyParams) -> bool {
     let bound = params.max_depth_ratio;
     ratio <= bound && ratio * bound >= 1.0
@@ -188,7 +188,7 @@ mod tests {
     }
 
     #[test]
-    fn failures_reject_only_in_a_row_and_in_number() {
+    fn only_consecutive_failures_of_enough_searches_reject_the_map() {
         let params = ConsistencyParams::default();
         let mut watched = Consistency::default();
         for _ in 0..50 {
@@ -199,11 +199,11 @@ mod tests {
         }
         let few = (0..50).filter_map(|_| watched.observe(&counts(100, 100), 500, &params)).count();
         assert_eq!(few, 0);
-        // A map of which only a twentieth is not certain yet: the sample of the others holds.
+        // Only a twentieth of the map is still uncertain: the sample of the rest holds.
         let certain = ObservationCounts { probed: 600, refuted: 20, ..counts(1000, 900) };
         let rest = (0..50).filter_map(|_| watched.observe(&certain, 20_000, &params));
         assert_eq!(rest.count(), 0);
-        // Light that has changed fails most of what is still to be learnt from, which is the smaller part.
+        // Changed light fails most of the hypotheses that are still refined, which are the smaller part.
         let relit = ObservationCounts { probed: 271, refuted: 36, ..counts(3247, 3158) };
         let relit = (0..50).filter_map(|_| watched.observe(&relit, 19_000, &params));
         assert_eq!(relit.count(), 0);
@@ -214,7 +214,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_that_refute_the_first_depth_in_a_row_reject_the_start() {
+    fn consecutive_frames_that_refute_the_first_depth_reject_the_start() {
         let params = ConsistencyParams::default();
         let saying = |refuted| ObservationCounts { probed: 1000, refuted, ..counts(1000, 100) };
         let shifted = 2.0 / 640.0;

@@ -1,8 +1,7 @@
-//! Corrections of the map from outside the step: poses, units, depth and joined epochs, consistent everywhere at
-//! once.
+//! Corrections of the map from outside a step: poses, units, depth and joined epochs, applied consistently at once.
 //!
-//! Nothing else has to be told: frames are kept relative to their keyframes, odometry has the camera where it had it,
-//! and the tracker gets the keyframe as another revision.
+//! Nothing else needs to be notified: frames are stored relative to their keyframes, odometry keeps the camera's pose,
+//! and the tracker receives the keyframe as a new revision.
 
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
@@ -10,11 +9,11 @@ use crate::slam::map::{Correction, CorrectionError, KeyframeCorrection};
 use crate::slam::mapper::{Mapper, StepOutcome};
 
 impl Mapper {
-    /// Applies a correction between two frames; what is to be published then. Refused as a whole where a number
-    /// is broken. Keyframes that the map does not hold are left out.
+    /// Applies a correction between two frames and returns what must be published. Rejects it as a whole where a value
+    /// is invalid. Keyframes that the map does not hold are left out.
     pub fn apply(&mut self, correction: &Correction) -> Result<StepOutcome, CorrectionError> {
         correction.validate()?;
-        // The depth of the keyframe before is on its way from the buffers into the map.
+        // The depth of the previous keyframe may still have to be written from the buffers into the map.
         let finished = self.finish_keyframe();
         let epoch = self.keyframe().map(|keyframe| keyframe.epoch);
         let before = self.last_map_from_camera();
@@ -30,7 +29,7 @@ impl Mapper {
                 self.modes.enter(modes, &self.params.modes);
             }
         }
-        // The camera stays where odometry has it, and odometry continues in the unit that it has.
+        // Odometry keeps the camera's pose and its own unit.
         let world_from_camera = self.world_from_map.place(&before);
         let joined = correction.joins.iter().filter(|join| Some(join.epoch) == epoch);
         let unit = joined.map(|join| join.into_from_epoch.scale).product::<f64>()
@@ -41,7 +40,7 @@ impl Mapper {
         Ok(StepOutcome { keyframe_changed: true, graph_changed: true, ..finished })
     }
 
-    /// Where the last frame is that was tracked in the active epoch, or else the active keyframe.
+    /// Pose in the map of the last frame tracked in the active epoch, or else of the active keyframe.
     fn last_map_from_camera(&self) -> Option<SE3> {
         let active = self.keyframe()?;
         let of_epoch = |id: u64| self.map.get(id).filter(|known| known.epoch == active.epoch);
@@ -50,14 +49,14 @@ impl Mapper {
         self.map.place(keyframe_id, &at)
     }
 
-    /// What the correction does to the active keyframe; `None` where it is not in it.
+    /// The correction of the active keyframe; `None` where it is not corrected.
     fn active_correction<'a>(&self, correction: &'a Correction) -> Option<&'a KeyframeCorrection> {
         let keyframe_id = self.keyframe()?.keyframe_id;
         correction.keyframes.iter().find(|k| k.keyframe_id == keyframe_id)
     }
 
-    /// The camera has been found on a keyframe: chooses where the map lies in the world so that it is where odometry had
-    /// it last, which stands still.
+    /// Anchors the map once the camera has been found on a keyframe: places the map in the world such that the camera
+    /// keeps its last odometry pose.
     pub(super) fn anchor(&mut self, keyframe_id: u64, keyframe_from_camera: &SE3) {
         self.last_tracked = Some((keyframe_id, *keyframe_from_camera));
         let map_from_camera = self.map.place(keyframe_id, keyframe_from_camera);

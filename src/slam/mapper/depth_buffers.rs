@@ -1,4 +1,4 @@
-//! The depth of the active keyframe while it is estimated, and the memory for the next.
+//! The depth of the active keyframe while it is estimated, and the buffers for the next.
 
 use crate::slam::depth::interval::IntervalFilter;
 use crate::slam::depth::map::DepthMap;
@@ -13,29 +13,29 @@ use crate::slam::mapper::MapperParams;
 use crate::slam::mapper::maturing::Maturing;
 use crate::slam::pose::Brightness;
 
-/// Owner of all that the filters work on.
+/// Owns the buffers that the depth filters work on.
 #[derive(Debug)]
 pub(super) struct DepthBuffers {
     /// The depth map of the active keyframe.
     pub(super) active: DepthMap,
-    /// Memory for the next, without `structure`; after a change the depth map of the keyframe before.
+    /// Buffer for the next one, without `structure`; after a change, the depth map of the previous keyframe.
     pub(super) spare: DepthMap,
     /// The immature points of the active keyframe.
     pub(super) points: IntervalFilter,
-    /// Points that will be estimated jointly; none unless the interval filter gives them.
+    /// Points to be estimated jointly; empty unless the interval filter provides them.
     pub(super) maturing: Maturing,
     regularisation: RegularisationScratch,
-    /// Length of the unit of `active` in the keyframe's: 1 but where poses are given, and so the keyframe's unit,
-    /// before anything is known of how far away things are.
+    /// Unit of `active`, in the keyframe's unit: 1 except where poses are given, which fixes the keyframe's unit before
+    /// any depth is known.
     pub(super) unit: f64,
-    /// Whether that unit is still to be found.
+    /// Whether that unit is still to be determined.
     pub(super) is_unit_open: bool,
     /// Hypotheses changed since the depth was smoothed and published.
     pub(super) unpublished: usize,
 }
 
 impl DepthBuffers {
-    /// Empty, for images of this size.
+    /// Creates empty buffers for images of this size.
     pub(super) fn with_size(width: usize, height: usize) -> Self {
         let active = DepthMap::with_size(width, height);
         let mut spare = active.clone();
@@ -52,23 +52,23 @@ impl DepthBuffers {
         }
     }
 
-    /// Begins the active depth anew on `pixels`, in the keyframe's unit.
+    /// Restarts the active depth on `pixels`, in the keyframe's unit.
     pub(super) fn restart(&mut self, pixels: &[u8], params: &MapperParams) {
         self.active.restart(pixels, params.min_gradient, params.max_candidates);
         self.maturing.clear();
         (self.unit, self.is_unit_open) = (1.0, false);
     }
 
-    /// The active depth becomes the spare one, and the other way round. `structure` stays with the active one, still that of
-    /// the image before: the active depth is restarted before it is observed, or swapped back. So does the memory of lists.
+    /// Swaps the active and the spare depth. `structure` and the lists' memory stay with the active one; `structure`
+    /// still belongs to the image before, as the active depth is restarted before it is observed, or swapped back.
     pub(super) fn swap(&mut self) {
         std::mem::swap(&mut self.active, &mut self.spare);
         std::mem::swap(&mut self.active.structure, &mut self.spare.structure);
         self.active.hypotheses.take_lists(&mut self.spare.hypotheses);
     }
 
-    /// Carries the spare depth over to the active one, on a frame that stands at `frame_from_spare`, in the unit of the
-    /// spare depth, and has this brightness against the spare one's image.
+    /// Propagates the spare depth to the active one, whose frame is at `frame_from_spare`, in the unit of the spare
+    /// depth, and has this brightness relative to the spare one's image.
     pub(super) fn carry(
         &mut self,
         frame_from_spare: &SE3,
@@ -93,7 +93,7 @@ impl DepthBuffers {
         }
     }
 
-    /// Smooths what was observed, where it is dense.
+    /// Regularises the observed depth where the filter is dense.
     pub(super) fn refine(&mut self, params: &MapperParams) {
         if params.depth_filter.is_dense() {
             regularise(&mut self.active, &mut self.regularisation, &params.regularisation);
@@ -101,7 +101,7 @@ impl DepthBuffers {
         self.unpublished = 0;
     }
 
-    /// Rescales to mean inverse depth 1; the factor by which the unit of the depth has grown.
+    /// Rescales to mean inverse depth 1 and returns the factor by which the unit of the depth has grown.
     pub(super) fn normalise(&mut self) -> f64 {
         let Some(mean) = self.active.mean_inverse_depth().filter(|m| *m > 0.0) else { return 1.0 };
         let factor = 1.0 / mean;
@@ -109,14 +109,14 @@ impl DepthBuffers {
         factor
     }
 
-    /// While the unit is open: the mean inverse depth is kept at 1, the keyframe's unit stays.
+    /// Keeps the mean inverse depth at 1 while the unit is open; the keyframe's unit does not change.
     pub(super) fn keep_unit_mean(&mut self) {
         if self.is_unit_open {
             self.unit *= self.normalise();
         }
     }
 
-    /// Changes the unit by `factor`, that of all there is.
+    /// Multiplies the unit of all depth by `factor`.
     pub(super) fn grow_unit(&mut self, factor: f64) {
         self.unit *= factor;
         self.rescale(factor as f32);
@@ -128,7 +128,7 @@ impl DepthBuffers {
         self.maturing.rescale(factor);
     }
 
-    /// Moves the active depth by a plane on its logarithm.
+    /// Scales the active depth by a plane on its logarithm.
     pub(super) fn correct(&mut self, plane: &LogPlane, intrinsics: &Intrinsics) {
         if !plane.is_identity() {
             let factor_at = |u, v| plane.factor(intrinsics, u as f64, v as f64) as f32;
@@ -138,13 +138,13 @@ impl DepthBuffers {
         }
     }
 
-    /// Keeps those of the points to be estimated jointly that are mature, where the keyframe is left.
+    /// Keeps the mature points among those to be estimated jointly when the keyframe is left.
     pub(super) fn leave_points(&mut self, keyframe_id: u64, params: &MapperParams) {
         self.maturing.leave(keyframe_id, &self.active.image, self.unit, &params.interval);
     }
 }
 
-/// Makes the hypotheses of `depth`, whose unit is so many of the keyframe's, the points of the keyframe.
+/// Writes the hypotheses of `depth` into the keyframe as its points; `unit` is the unit of `depth` in the keyframe's.
 pub(super) fn write_depth(depth: &DepthMap, unit: f64, keyframe: &mut Keyframe) {
     keyframe.points.clear();
     keyframe.points.reserve_exact(depth.num_hypotheses().min(MAX_KEYFRAME_POINTS));

@@ -1,9 +1,9 @@
-//! A map that contradicts itself is estimated once more, with all of its newest keyframes free, and rejected where it
+//! A map that contradicts itself is estimated once more, with all of its newest keyframes free, and rejected if it
 //! contradicts itself again.
 //!
-//! That helps where keyframes were left at wrong places or with wrong units, not where depth is lost or the start was
-//! wrong. The estimate is one like the others: it goes to their thread next and enters as they do. Until it has entered,
-//! poses continue to be claimed, with the covariance of a keyframe of whose depth nothing is known.
+//! This helps where keyframes were left with wrong poses or units, not where depth is lost or the start was wrong. The
+//! estimate is like any other: it is the next one to run, and enters in the same way. Until it has entered, poses
+//! continue to be claimed, with the covariance of a keyframe whose depth is unknown.
 
 use crate::slam::depth::gaussian::ObservationCounts;
 use crate::slam::mapper::consistency::{Contradiction, is_plausible_ratio};
@@ -12,24 +12,24 @@ use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::modes::ModeCovariance;
 use crate::slam::pose::PoseEstimate;
 
-/// Time of the stamps until the estimate must have entered, seconds: it waits for one that is away, and takes a few tenths
-/// itself.
+/// Time by the frames' stamps within which the estimate must have entered, seconds: it waits for one that is running,
+/// and takes a few tenths itself.
 const MOST_SECS: f64 = 0.7;
 
-/// Keyframes that must come without a contradiction before a map is estimated once more for another.
+/// Keyframes without a contradiction after which a map may be estimated once more because of another.
 const TRUSTED_AFTER: u64 = 4;
 
-/// What a contradiction has led to.
+/// State of the map after a contradiction.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) enum Doubt {
-    /// There was none, or long ago.
+    /// No contradiction since the map was started, or the camera last found on it.
     #[default]
     None,
     /// The map is to be estimated once more.
     Raised {
         /// Why.
         contradiction: Contradiction,
-        /// The active keyframe then.
+        /// The active keyframe at that time.
         keyframe_id: u64,
         /// Time since.
         lasting: Lasting,
@@ -38,19 +38,19 @@ pub(super) enum Doubt {
         /// Whether the estimate is under way.
         is_away: bool,
     },
-    /// It has been, when this was the active keyframe.
+    /// It was estimated again while this keyframe was active.
     Settled(u64),
 }
 
 impl Doubt {
-    /// Whether the next estimate is to be of a map in doubt: it goes away with it.
+    /// Whether the map is in doubt; if so, the next estimate is the one that settles it.
     pub(super) fn hand_over(&mut self) -> bool {
         let Self::Raised { is_away, .. } = self else { return false };
         *is_away = true;
         true
     }
 
-    /// The estimate was not taken: the next one is to be it.
+    /// The estimate was dropped: the next one replaces it.
     pub(super) fn take_back(&mut self) {
         if let Self::Raised { is_away, .. } = self {
             *is_away = false;
@@ -59,7 +59,7 @@ impl Doubt {
 }
 
 impl Mapper {
-    /// Judges what a frame did to the depth of the active keyframe; the outcome where that rejects the map.
+    /// Judges a frame's observations in the active keyframe; returns the outcome if they reject the map.
     pub(super) fn judge_frame(
         &mut self,
         observations: &ObservationCounts,
@@ -87,7 +87,7 @@ impl Mapper {
         })
     }
 
-    /// The map contradicts itself: it is put in doubt, or rejected, and then this is true.
+    /// Puts a map that contradicts itself in doubt, or rejects it and returns true.
     pub(super) fn contradict(&mut self, contradiction: Contradiction) -> bool {
         let may_help =
             matches!(contradiction, Contradiction::FailedSearches | Contradiction::ScaleJump);
@@ -108,9 +108,9 @@ impl Mapper {
         true
     }
 
-    /// Takes in another frame of a map in doubt; rejects it where nobody has estimated it again.
+    /// Counts a frame of a map in doubt; rejects the map and returns true if it was not estimated again in time.
     fn has_waited_in_vain(&mut self, nanos: i64) -> bool {
-        // In lockstep estimates enter after so many frames: one that is away, and its own.
+        // In lockstep an estimate enters after a fixed number of frames: first one that is running, then its own.
         let least_frames = 2 * (self.params.window.delay_frames + 1);
         let Doubt::Raised { contradiction, lasting, frames, .. } = &mut self.doubt else {
             return false;
@@ -124,8 +124,8 @@ impl Mapper {
         is_late
     }
 
-    /// Has the active keyframe of a map in doubt say that nothing is known of its depth, until an estimate says more; true
-    /// where that is new.
+    /// Publishes the modes of the active keyframe of a map in doubt as unknown until an estimate replaces them; true
+    /// where that changed them.
     pub(super) fn tell_doubt(&mut self) -> bool {
         if !matches!(self.doubt, Doubt::Raised { .. }) {
             return false;
@@ -142,8 +142,7 @@ impl Mapper {
         true
     }
 
-    /// An estimate has entered: where it was that of a map in doubt, what is left of it is judged anew. True where that
-    /// rejects the map.
+    /// Judges a map in doubt again once its estimate has entered; true where that rejects the map.
     pub(super) fn settle_doubt(&mut self) -> bool {
         let Doubt::Raised { contradiction, keyframe_id: id, is_away: true, .. } = self.doubt else {
             return false;
@@ -154,7 +153,7 @@ impl Mapper {
             return false;
         };
         self.doubt = Doubt::Settled(active);
-        // That which jumped: another may be active by now.
+        // The keyframe whose unit jumped: another may be active by now.
         let Some(keyframe) = self.map.get(id) else { return false };
         let (epoch, unit) = (keyframe.epoch, keyframe.map_from_keyframe.scale);
         let known = self.map.keyframes.iter().rev().filter(|k| k.epoch == epoch);
@@ -178,7 +177,7 @@ mod tests {
     use crate::slam::mapper::phase::{Active, Phase};
     use crate::slam::test_scene::{CAMERA, Scene};
 
-    /// A mapper on the first of two keyframes, whose map is estimated jointly or not.
+    /// A mapper on the second of two keyframes, whose map is estimated jointly or not.
     fn mapper(is_estimated: bool) -> Mapper {
         let scene = Scene::new(3);
         let mut mapper = Mapper::new(CAMERA, MapperParams::default()).unwrap();
@@ -197,10 +196,10 @@ mod tests {
     }
 
     #[test]
-    fn a_contradiction_is_estimated_again_first_and_rejects_the_second_time() {
+    fn a_first_contradiction_leads_to_another_estimate_and_a_second_one_rejects_the_map() {
         let mut mapper = mapper(true);
         assert!(!mapper.contradict(Contradiction::FailedSearches) && !is_rejected(&mapper));
-        // As long as it waits others change nothing.
+        // While the estimate is pending, further contradictions change nothing.
         assert!(!mapper.contradict(Contradiction::FailedSearches));
         let mut window = mapper.begin_adjustment(false).unwrap();
         window.optimise();
@@ -211,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn what_an_estimate_cannot_help_rejects_at_once() {
+    fn contradictions_that_an_estimate_cannot_resolve_reject_the_map_at_once() {
         for contradiction in [Contradiction::LostDepth, Contradiction::WrongStart] {
             let mut mapper = mapper(true);
             assert!(mapper.contradict(contradiction) && is_rejected(&mapper));
@@ -221,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn a_unit_that_still_jumps_afterwards_rejects() {
+    fn a_unit_that_still_jumps_after_the_estimate_rejects_the_map() {
         for (scale, rejects) in [(1.0, false), (3.0, true)] {
             let mut mapper = mapper(true);
             assert!(!mapper.contradict(Contradiction::ScaleJump));
@@ -232,24 +231,24 @@ mod tests {
     }
 
     #[test]
-    fn a_map_that_nobody_estimates_again_is_rejected_in_time() {
+    fn a_map_that_is_not_estimated_again_is_rejected_in_time() {
         let mut mapper = mapper(true);
         mapper.contradict(Contradiction::FailedSearches);
-        // One that was dropped is estimated again.
+        // A dropped estimate is repeated.
         assert!(mapper.doubt.hand_over());
         mapper.doubt.take_back();
         assert!(!mapper.settle_doubt(), "another's estimate is not it");
         assert!(matches!(mapper.doubt, Doubt::Raised { is_away: false, .. }));
         let is_waiting =
             |mapper: &mut Mapper, frame: i64| !mapper.has_waited_in_vain(frame * 10_000_000);
-        // At 100 Hz: frames that come faster are no longer time.
+        // At 100 Hz: a higher frame rate does not shorten the time.
         let waits = (0..500).take_while(|&frame| is_waiting(&mut mapper, frame)).count();
         assert!((65..=75).contains(&waits), "{waits}");
         assert!(is_rejected(&mapper));
     }
 
     #[test]
-    fn frames_that_come_slowly_leave_an_estimate_as_many_as_it_takes() {
+    fn at_a_low_frame_rate_an_estimate_has_as_many_frames_as_it_takes() {
         let mut mapper = mapper(true);
         mapper.contradict(Contradiction::FailedSearches);
         let is_waiting =
@@ -259,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn as_long_as_a_map_is_in_doubt_its_keyframe_says_that_nothing_is_known() {
+    fn the_modes_of_a_map_in_doubt_are_published_as_unknown() {
         let mut mapper = mapper(true);
         let deviations = |mapper: &Mapper| mapper.keyframe().unwrap().mode_covariance.std_devs();
         let before = mapper.keyframe().unwrap().revision;
@@ -267,11 +266,11 @@ mod tests {
         mapper.contradict(Contradiction::FailedSearches);
         assert!(mapper.tell_doubt() && deviations(&mapper).min() > 0.9);
         assert!(mapper.keyframe().unwrap().revision > before);
-        // Once is enough, until somebody says otherwise.
+        // Once is enough, until the covariance is overwritten.
         assert!(!mapper.tell_doubt());
         mapper.keyframe_mut().unwrap().mode_covariance = ModeCovariance::ZERO;
         assert!(mapper.tell_doubt());
-        // The estimate says what is known.
+        // The estimate replaces it.
         let mut window = mapper.begin_adjustment(false).unwrap();
         window.optimise();
         mapper.end_adjustment(window);

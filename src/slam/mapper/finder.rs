@@ -1,4 +1,4 @@
-//! Finds the camera on keyframes: by what they look like first, then by alignment.
+//! Finds the camera on keyframes: candidates by appearance first, then alignment.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -21,25 +21,25 @@ use crate::slam::pose::Brightness;
 use crate::slam::tracker::motion::turned;
 use crate::slam::tracker::verdict::{VerdictParams, is_better, quality_of};
 
-/// Correlation of small images below which a keyframe is not tried: of 24 alignments that succeeded while the camera was
-/// lost in a recording 19 were at 0.8 and more, the others, at 0.44 to 0.65, on views turned by 22° to 57°.
+/// Correlation of small images below which a keyframe is not tried: of 24 alignments that succeeded while the camera
+/// was lost in a recording, 19 were at 0.8 or more, the others, on views turned by 22° to 57°, at 0.44 to 0.65.
 const LEAST_SIMILARITY: f32 = 0.3;
 
-/// Features that an image and a keyframe must share to be tried: other places share up to twelve, and alignment judges.
+/// Features that an image and a keyframe must share to be aligned: other places share up to twelve; alignment decides.
 const LEAST_SHARED: f32 = 8.0;
 
-/// Keyframes that the small images are compared with, the newest: 12 µs each. The index has all.
+/// Newest keyframes whose small images are compared: 12 µs each. The index holds all keyframes.
 const MOST_COMPARED: usize = 300;
 
-/// New keyframes that are looked at in a frame: 2.5 ms each at 640×480.
+/// New keyframes that are indexed per frame: 2.5 ms each at 640×480.
 pub(super) const MOST_LEARNT: usize = 10;
 
-/// Points with which a keyframe shows enough of a place: one of a hundred pixels.
+/// Fewest points of a keyframe that is searched: one per hundred pixels.
 fn least_points(camera: &Intrinsics) -> usize {
     camera.width * camera.height / 100
 }
 
-/// Looks for the camera on keyframes; owns the memory for that.
+/// Searches keyframes for the camera; owns the buffers for that.
 #[derive(Debug)]
 pub(super) struct Finder {
     aligner: Aligner,
@@ -47,34 +47,34 @@ pub(super) struct Finder {
     reference: Reference,
     scratch: ReferenceScratch,
     pyramid: SumPyramid,
-    /// What keyframes look like, by their id, in order.
+    /// Appearances of keyframes, in the order of their ids.
     appearances: Vec<(u64, Option<Appearance>)>,
-    /// The same keyframes by their features.
+    /// The same keyframes, indexed by their features.
     places: PlaceIndex,
     describer: Describer,
-    /// Made at the first loss that needs them: two megabytes.
+    /// Created at the first loss that needs them: two megabytes.
     turned_views: Option<TurnedViews>,
-    /// Place of a keyframe that was found and that another contradicts, or none confirms: the next search leaves it out, lest
-    /// it be all that is found.
+    /// Index of a keyframe that was found but contradicted by another, or confirmed by none: the next search leaves it
+    /// out, so that it does not hide others.
     pub(super) doubted: Option<usize>,
 }
 
-/// Where a frame is on a keyframe, found from where it was expected.
+/// Pose of a frame on a keyframe, found from an expected pose.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Located {
     /// In the keyframe's unit.
     pub(super) keyframe_from_camera: SE3,
-    /// Of the frame against the keyframe.
+    /// Of the frame relative to the keyframe.
     pub(super) brightness: Brightness,
-    /// How far that is from where it was expected, translation in mean depths plus rotation in radians.
+    /// Distance from the expected pose: translation in mean depths plus rotation in radians.
     pub(super) disagreement: f64,
-    /// Whether it would be believed after a loss.
+    /// Whether the pose would be accepted after a loss.
     pub(super) is_sure: bool,
 }
 
 impl Finder {
-    /// For images of `intrinsics`. What it finds is only proposed, and the tracker judges by
-    /// its own parameters, so that the defaults do here; portable, so that every CPU finds the same.
+    /// Creates a finder for images of `intrinsics`. Its results are only proposals, which the tracker judges by its own
+    /// parameters, so the defaults suffice here; portable, so that every CPU finds the same.
     pub(super) fn new(intrinsics: &Intrinsics) -> Self {
         let Intrinsics { width, height, .. } = *intrinsics;
         let reference = ReferenceParams::default();
@@ -94,9 +94,9 @@ impl Finder {
         }
     }
 
-    /// Of `keyframes`, of all epochs, one that shows what `pixels` do, and the camera's pose on it. Tried are the one that
-    /// shares most features and the one whose small image is most alike, one in a frame, and in turn, after so many
-    /// `searched`, others that do.
+    /// Finds a keyframe, of any epoch, that shows what `pixels` show, and the camera's pose on it. Each call tries the
+    /// keyframe that shares most features or the one whose small image is most similar, alternating with `searched`,
+    /// then cycles through the other candidates.
     pub(super) fn find(
         &mut self,
         keyframes: &mut [Keyframe],
@@ -144,8 +144,8 @@ impl Finder {
         None
     }
 
-    /// Keyframes that may be gone back to, those that share most features with `pixels` first, and how the camera is turned
-    /// against them if nothing is near.
+    /// Eligible keyframes, those that share most features with `pixels` first, and the rotation of the camera against
+    /// each if nothing is near.
     fn sharing(
         &mut self,
         keyframes: &[Keyframe],
@@ -169,7 +169,7 @@ impl Finder {
         found.map(turned).collect()
     }
 
-    /// Keyframes that may be gone back to, those that look most like `seen` first, the newest of equals.
+    /// Eligible keyframes, those most similar to `seen` first, the newest of equals.
     fn alike(
         &self,
         keyframes: &[Keyframe],
@@ -185,8 +185,8 @@ impl Finder {
         rated.into_iter().map(|(_, index)| index).collect()
     }
 
-    /// Of `keyframes`, in turn after so many `compared`, one that shows what `pixels` do from a camera turned far
-    /// against it, and the camera's pose on it.
+    /// Finds a keyframe that shows what `pixels` show from a camera turned far against it, and the camera's pose on it.
+    /// Cycles through the keyframes: `compared` counts them across calls.
     pub(super) fn find_turned(
         &mut self,
         keyframes: &mut [Keyframe],
@@ -195,12 +195,12 @@ impl Finder {
         pixels: &[u8],
         params: &RecoveryParams,
     ) -> Option<(usize, SE3)> {
-        /// Keyframes that are compared in a frame: about a millisecond each.
+        /// Keyframes that are compared per frame: about a millisecond each.
         const MOST_COMPARED: usize = 24;
-        /// Around a rotation that was found, half a step of them.
+        /// Search around a rotation that was found: half a step between rotations.
         const ROTATION_DEG: f64 = 4.5;
-        /// How far the pose may be turned from there, degrees: a step of each rotation, and what nearness does. An
-        /// alignment that wanders further fits something else.
+        /// Largest rotation of the pose from there, degrees: a step of each rotation, plus the effect of near points.
+        /// An alignment that moves further fits something else.
         const MAX_ERROR_DEG: f64 = 15.0;
         let most = params.keyframes_per_frame.min(params.num_keyframes);
         let camera = keyframes.get(active.unwrap_or(0)).filter(|_| most > 0)?.intrinsics;
@@ -239,14 +239,14 @@ impl Finder {
         None
     }
 
-    /// What a keyframe looks like, where that is known.
+    /// The appearance of a keyframe, if it is stored.
     fn appearance(&self, keyframe: &Keyframe) -> Option<&Appearance> {
         let id = keyframe.keyframe_id;
         let known = self.appearances.binary_search_by_key(&id, |(of, _)| *of).ok()?;
         self.appearances[known].1.as_ref()
     }
 
-    /// Looks at keyframes that are new, so many at most, and describes those that nobody has described.
+    /// Indexes at most `most` new keyframes, and describes those without a description.
     pub(super) fn learn(&mut self, keyframes: &mut [Keyframe], most: usize) {
         let known = self.appearances.last().map(|(id, _)| *id);
         self.forget_all_but(keyframes);
@@ -265,7 +265,7 @@ impl Finder {
         }
     }
 
-    /// Those that keep only their poses are not looked for.
+    /// Removes keyframes that keep only their poses: they are not searched.
     fn forget_all_but(&mut self, keyframes: &[Keyframe]) {
         let mut held = keyframes.iter().filter(|of| of.has_depth()).map(|of| of.keyframe_id);
         let mut next = held.next();
@@ -282,8 +282,8 @@ impl Finder {
         });
     }
 
-    /// Aligns a frame to `keyframe` from where the camera is expected; `None` where it does not fit, or ends further from
-    /// there than `max_disagreement`, translation in mean depths plus rotation in radians.
+    /// Aligns a frame to `keyframe` from the expected pose; `None` where it does not fit, or ends further from that
+    /// pose than `max_disagreement`, translation in mean depths plus rotation in radians.
     pub(super) fn locate(
         &mut self,
         keyframe: &Keyframe,
@@ -296,7 +296,7 @@ impl Finder {
         let (start, brightness) = (expected.inverse(), Brightness::default());
         let (reference, pyramid) = (&self.reference, &self.pyramid);
         let found = self.aligner.align(reference, pyramid, &start, brightness, &mut |_| true);
-        /// Share of inliers that agreement wants: less than a claim, since where it begins is known.
+        /// Share of inliers that agreement requires: less than a claim, since the initial pose is known.
         const LEAST_INLIERS: f64 = 0.65;
         let quality = quality_of(&found);
         let is_tracked = self.verdict.judge(&found, &quality, false, 0).is_tracked();
@@ -316,8 +316,8 @@ impl Finder {
         (disagreement <= max_disagreement).then_some(located)
     }
 
-    /// `keyframe_from_camera` of the frame in the pyramid, where it can be aligned to `keyframe` from some view
-    /// near the expected one.
+    /// Aligns the frame in the pyramid to `keyframe` from views near the expected one; returns `keyframe_from_camera`
+    /// of the best where it is accepted.
     fn find_near(&mut self, keyframe: &Keyframe, expected: &SE3, rotation_rad: f64) -> Option<SE3> {
         self.reference.prepare_into(keyframe, &mut self.scratch);
         let (aligner, reference, pyramid) = (&self.aligner, &self.reference, &self.pyramid);
@@ -344,7 +344,7 @@ impl Finder {
     }
 }
 
-/// Keyframes that may be gone back to, the newest first. The tracker itself looks around the active one.
+/// Keyframes that may become active again, the newest first. The tracker itself searches around the active one.
 fn eligible(keyframes: &[Keyframe], active: Option<usize>) -> impl Iterator<Item = usize> {
     let is_eligible = move |index: &usize| {
         let keyframe = &keyframes[*index];

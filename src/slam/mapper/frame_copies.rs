@@ -1,27 +1,27 @@
-//! Copies of frames that outlive them: one of each frame, however many keep it.
+//! Copies of frames that outlive them: one per frame, shared by all that keep it.
 
 use std::sync::Arc;
 
 use crate::slam::frame::FrameView;
 
-/// Most copies that are kept for frames to come, one byte a pixel each: as many as come between two keyframes.
+/// Most unused copies that are kept for later frames, one byte a pixel each: as many as lie between two keyframes.
 const MOST_SPARE: usize = 30;
 
-/// The copies that somebody keeps, and memory for more.
+/// The copies in use, and buffers for more.
 #[derive(Debug, Default)]
 pub(super) struct FrameCopies {
     copies: Vec<Arc<[u8]>>,
-    /// The one of the frame at hand.
+    /// The copy of the current frame.
     current: Option<Arc<[u8]>>,
 }
 
 impl FrameCopies {
-    /// Another frame is at hand.
+    /// Begins a new frame.
     pub(super) fn begin_frame(&mut self) {
         self.current = None;
     }
 
-    /// The grey values of the frame at hand, copied when they are first asked for.
+    /// The grey values of the current frame, copied at the first call.
     pub(super) fn of(&mut self, frame: &FrameView<'_>) -> Arc<[u8]> {
         if let Some(copy) = &self.current {
             return Arc::clone(copy);
@@ -31,13 +31,13 @@ impl FrameCopies {
         copy
     }
 
-    /// Gives back the memory of copies that nobody keeps, and that of the others as soon as nobody does.
+    /// Frees the copies that are not in use; the others are freed when their last reference is dropped.
     pub(super) fn let_go(&mut self) {
         *self = Self::default();
     }
 
     fn copy(&mut self, pixels: &[u8]) -> Arc<[u8]> {
-        // Nobody else keeps a copy that can be written to.
+        // A copy that can be written to is not in use.
         let mut spare = 0;
         self.copies.retain_mut(|copy| {
             spare += usize::from(Arc::get_mut(copy).is_some());
@@ -67,7 +67,7 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_is_copied_once_and_its_memory_is_used_again() {
+    fn a_frame_is_copied_once_and_its_memory_is_reused() {
         let mut copies = FrameCopies::default();
         let first = copy_of(&mut copies, 1);
         let same = copies.of(&FrameView::new(&CAMERA, 0, 0, &[]));
@@ -81,7 +81,7 @@ mod tests {
     }
 
     #[test]
-    fn memory_of_few_images_is_kept() {
+    fn a_bounded_number_of_unused_copies_is_kept() {
         let mut copies = FrameCopies::default();
         let kept: Vec<_> = (0..100).map(|grey| copy_of(&mut copies, grey)).collect();
         assert_eq!(copies.copies.len(), 100);

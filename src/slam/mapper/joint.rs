@@ -1,4 +1,4 @@
-//! When keyframes are estimated together, and what becomes of it.
+//! When keyframes are estimated jointly, and how the results enter the map.
 
 use std::sync::Arc;
 
@@ -17,9 +17,9 @@ use crate::slam::window::frames::TrackedFrame;
 use crate::slam::window::marginals::Marginal;
 
 impl Mapper {
-    /// The keyframes to be estimated together, where one has been added since the last time, or else, where the camera is
-    /// not lost, a piece of a pass over all or frames to be aligned again, or else, with `may_refine`, where the depth of one that has settled
-    /// can be refined: to be given back with [`Mapper::end_adjustment`] after [`Window::optimise`], which may take its time.
+    /// Takes out the window for the next estimate if a keyframe was added or the map is in doubt; or else, while
+    /// mapping, for a loop search, a piece of a pass or frames to align again; or else, with `may_refine`, for the
+    /// depth of a settled keyframe. Run [`Window::optimise`], which may be slow, then [`Mapper::end_adjustment`].
     pub fn begin_adjustment(&mut self, may_refine: bool) -> Option<Box<Window>> {
         let (mut window, is_new) = self.take_window()?;
         self.is_estimated = true;
@@ -47,8 +47,8 @@ impl Mapper {
         Some(window)
     }
 
-    /// The window with what is new in the map, and whether anything is. `None` where it is away, and before there is
-    /// anything to be estimated.
+    /// Takes the window out, updated from the map, and tells whether the map had anything new for it. `None` while it
+    /// is out, and before there is anything to estimate.
     pub(super) fn take_window(&mut self) -> Option<(Box<Window>, bool)> {
         let active = self.keyframe()?.keyframe_id;
         if self.depth.is_unit_open {
@@ -61,7 +61,7 @@ impl Mapper {
         Some((window, is_new))
     }
 
-    /// Takes the keyframes back and moves the map to where they are now.
+    /// Takes the window back and applies its result to the map.
     pub fn end_adjustment(&mut self, mut window: Box<Window>) -> StepOutcome {
         if let Some(refined) = window.take_refined() {
             let graph_changed = self.take_refined(refined, &mut window);
@@ -96,7 +96,7 @@ impl Mapper {
         let correction = window.correction(&self.map, said_of);
         if !correction.keyframes.is_empty() {
             window.watch(&self.map, &correction);
-            // Its numbers are checked: one that is broken leaves the map as it is.
+            // The values are checked: invalid ones leave the map unchanged.
             match self.apply(&correction) {
                 Ok(applied) => outcome = applied,
                 Err(_) => window.leave_unrefined(),
@@ -110,7 +110,7 @@ impl Mapper {
         outcome
     }
 
-    /// Rejects the epoch that is mapped where the estimate has refuted its start.
+    /// Rejects the epoch being mapped where the estimate has refuted its start.
     fn reject_refuted(&mut self, window: &mut Window) -> Option<StepOutcome> {
         let refuted = window.refuted_epoch.take()?;
         let is_mapped = self.keyframe()?.epoch == refuted;
@@ -123,8 +123,8 @@ impl Mapper {
         Some(StepOutcome { keyframe_changed: true, graph_changed: true, ..Default::default() })
     }
 
-    /// As [`Mapper::begin_adjustment`], where no more frames come: of all keyframes, new or not, and of the frames that
-    /// still wait.
+    /// Like [`Mapper::begin_adjustment`], after the last frame: for an estimate of all keyframes, new or not, and of
+    /// the frames that still wait.
     pub fn begin_last_adjustment(&mut self) -> Option<Box<Window>> {
         let (mut window, _) = self.take_window()?;
         window.take_frames(&mut self.tracked);
@@ -132,8 +132,8 @@ impl Mapper {
         Some(window)
     }
 
-    /// After the last estimate: refines the depth of the newest keyframe that has not been, from the keyframes around it;
-    /// false where there is none left.
+    /// Refines, after the last estimate, the depth of the newest unrefined keyframe from the keyframes around it; false
+    /// where none is left.
     pub fn refine_depth(&mut self) -> bool {
         let Some(window) = &mut self.window else { return false };
         let Some(keyframe_id) = window.next_unrefined() else { return false };
@@ -146,8 +146,8 @@ impl Mapper {
         true
     }
 
-    /// Gives a keyframe the depth that was refined while frames came; false where it has got other depth meanwhile, is
-    /// being observed, or has been forgotten.
+    /// Gives a keyframe the depth that was refined during mapping; false where its depth has changed since, is being
+    /// observed, or has been forgotten.
     fn take_refined(&mut self, refined: RefinedDepth, window: &mut Window) -> bool {
         let keyframe_id = refined.keyframe_id;
         let is_active = self.keyframe().is_some_and(|active| active.keyframe_id == keyframe_id);
@@ -162,7 +162,7 @@ impl Mapper {
         true
     }
 
-    /// Keeps the points that the joint estimate has in the map: to be called before it is written.
+    /// Stores the points of the joint estimate in the map; call it before the map is written.
     pub fn keep_confirmed(&mut self) {
         if let Some(window) = &self.window {
             self.map.confirmed = window.confirmed_points(&self.map);
@@ -178,8 +178,8 @@ impl Mapper {
         }
     }
 
-    /// Keeps a frame from before its map begins. One without contrast would be found anywhere, as a gain of nearly 0
-    /// explains it, and leads to none before it.
+    /// Keeps a frame from before its map starts. One without contrast would align anywhere, as a gain of nearly 0
+    /// explains it, and cannot lead to the frames before it: these are dropped.
     pub(super) fn keep_early_frame(&mut self, frame: &FrameView<'_>) {
         /// Two seconds at 30 Hz, one byte a pixel each.
         const MOST: usize = 60;
@@ -201,8 +201,8 @@ impl Mapper {
         self.params.window.num_free > 0 && self.params.window.max_waiting_frames > 0
     }
 
-    /// A map has begun with two frames, its first keyframes, of which the second stands at `first_from_second`. Frames
-    /// from before the second will be aligned to it; where they are is guessed by an even motion.
+    /// Adopts the early frames for a map that has started with two frames, its first keyframes, the second at
+    /// `first_from_second`. Frames before the second will be aligned to the map, from initial poses by constant motion.
     pub(super) fn adopt_early_frames(&mut self, first_from_second: &SE3) {
         let [.., first, second] = &self.map.keyframes[..] else { return };
         let motion = first_from_second.log();
@@ -225,10 +225,10 @@ impl Mapper {
         }
     }
 
-    /// Takes the keyframes back and leaves the map as it is: it has changed meanwhile, so that the estimate is one of
+    /// Takes the window back without applying its result: the map has changed since, and the estimate belongs to
     /// another map.
     pub fn drop_adjustment(&mut self, mut window: Box<Window>) {
-        // They keep the poses that the tracker gave them.
+        // The frames keep the poses that the tracker gave them.
         drop(window.take_frames_alone());
         drop(window.take_placed());
         window.leave_unrefined();
@@ -239,7 +239,7 @@ impl Mapper {
     }
 }
 
-/// Files the copy of a frame at the end of a list of at most so many; the oldest gives way.
+/// Appends the copy of a frame to a list of at most `most`; the oldest is dropped.
 fn keep(
     frames: &mut Vec<TrackedFrame>,
     most: usize,

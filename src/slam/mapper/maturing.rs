@@ -1,5 +1,5 @@
-//! Points of the active keyframe that will be estimated jointly once the interval filter is sure of them, beside the
-//! Gaussian map that frames are tracked on.
+//! Points of the active keyframe that will be estimated jointly once they are mature in the interval filter, alongside
+//! the Gaussian map that frames are tracked on.
 
 use crate::slam::depth::candidate::CandidateParams;
 use crate::slam::depth::gradient_image::GradientImage;
@@ -10,18 +10,18 @@ use crate::slam::keyframe::DepthPoint;
 use crate::slam::map::Correction;
 use crate::slam::window::candidates::MaturePoints;
 
-/// Keyframes of which points are kept until they are taken: some that come during an estimate. Where nobody takes any, as
-/// while a start or the window is away, the oldest are forgotten, whose depth is what their points come from then.
+/// Most keyframes whose points are kept until they are taken: some are left during an estimate. Where none are taken,
+/// as during a start or while the window is out, the oldest are dropped; their points then come from their depth.
 const MOST_LEFT: usize = 16;
 
-/// Candidates of the active keyframe, in the unit of its depth buffer, and what became of those of keyframes that were
+/// Candidates of the active keyframe, in the unit of its depth buffer, and the mature points of keyframes that were
 /// left.
 #[derive(Debug, Default)]
 pub(super) struct Maturing {
     filter: IntervalFilter,
-    /// Whether a frame was searched for them.
+    /// Whether they were traced in a frame.
     is_traced: bool,
-    /// What is kept of keyframes that were left; whoever takes them in takes them from there.
+    /// Mature points of keyframes that were left, until the window takes them.
     pub(super) left: Vec<MaturePoints>,
 }
 
@@ -38,7 +38,7 @@ impl Maturing {
         self.is_traced = false;
     }
 
-    /// Searches them in a frame.
+    /// Traces the candidates in a frame.
     pub(super) fn trace(&mut self, frame: &TraceFrame<'_>, params: &IntervalParams) {
         if !self.filter.points().is_empty() {
             self.filter.trace(frame, params);
@@ -46,8 +46,8 @@ impl Maturing {
         }
     }
 
-    /// Keeps those that are mature, of the keyframe that is being left, whose depth buffer has a unit of so many of its
-    /// own. One on which no frame was tracked leaves none: its depth is all that is known of it.
+    /// Keeps the mature points of the keyframe that is being left; `unit` is the unit of its depth buffer in the
+    /// keyframe's. A keyframe on which no frame was tracked leaves no list: its depth is all that is known of it.
     pub(super) fn leave(
         &mut self,
         keyframe_id: u64,
@@ -73,17 +73,17 @@ impl Maturing {
         self.clear();
     }
 
-    /// Multiplies the inverse depths of the active keyframe's by `factor`.
+    /// Multiplies the inverse depths of the active keyframe's points by `factor`.
     pub(super) fn rescale(&mut self, factor: f32) {
         self.filter.rescale(factor);
     }
 
-    /// The same with a factor of its own for every pixel `(u, v)`.
+    /// The same with a separate factor for every pixel `(u, v)`.
     pub(super) fn rescale_by(&mut self, factor_at: impl Fn(usize, usize) -> f32) {
         self.filter.rescale_by(factor_at);
     }
 
-    /// Moves what is kept of keyframes that were left as their depth is moved.
+    /// Corrects the points of keyframes that were left as their depth is corrected.
     pub(super) fn correct(&mut self, correction: &Correction, intrinsics: &Intrinsics) {
         for left in &mut self.left {
             let mut corrected = correction.keyframes.iter();
@@ -105,7 +105,7 @@ mod tests {
     use crate::slam::pose::Brightness;
     use crate::slam::test_scene::{CAMERA, Rendering, Scene};
 
-    /// Length of the unit of the depth buffer in the keyframe's.
+    /// Unit of the depth buffer, in the keyframe's.
     const UNIT: f64 = 2.0;
     const KEYFRAME: u64 = 5;
 
@@ -113,7 +113,7 @@ mod tests {
         SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() }
     }
 
-    /// Candidates of the room's first view, after so many frames, and the view.
+    /// Candidates of the scene's first view after this many frames, and the view.
     fn traced(frames: u64) -> (Maturing, GradientImage, Rendering) {
         let scene = Scene::new(3);
         let view = scene.render(&CAMERA, &at(0.0));
@@ -133,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_mature_is_left_in_the_keyframes_unit_and_nothing_else() {
+    fn only_mature_points_are_left_and_in_the_keyframes_unit() {
         let params = IntervalParams::default();
         for frames in [1, 8] {
             let (mut maturing, image, view) = traced(frames);
@@ -149,7 +149,7 @@ mod tests {
             assert_eq!(left.keyframe_id, KEYFRAME);
             let of_mature: Vec<_> = mature.iter().map(|point| (point.u, point.v)).collect();
             assert_eq!(pixels(&left.points), of_mature);
-            // One frame's baseline makes none sure, and eight not all.
+            // The baseline of one frame matures no point, that of eight not all.
             let fewest = if frames == 1 { 0 } else { 500 };
             assert!((fewest..all).contains(&of_mature.len()), "{} of {all}", of_mature.len());
             let is_right = |point: &&DepthPoint| {
@@ -162,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn what_nobody_takes_is_kept_of_the_last_keyframes_once_each() {
+    fn points_that_are_not_taken_are_kept_once_for_each_of_the_last_keyframes() {
         let (mut maturing, image, _) = traced(1);
         let last = MOST_LEFT as u64 + 3;
         for keyframe_id in (0..=last).flat_map(|id| [id, id]) {
@@ -181,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_left_moves_with_its_keyframe() {
+    fn points_that_were_left_are_corrected_with_their_keyframe() {
         let (mut maturing, image, _) = traced(8);
         maturing.leave(KEYFRAME, &image, UNIT, &IntervalParams::default());
         let before = maturing.left[0].points.clone();

@@ -1,5 +1,5 @@
-//! How uncertain the errors are that all depth of the active keyframe shares: begun by the start, changed by every
-//! frame, carried from keyframe to keyframe.
+//! Uncertainty of the errors that all depth of the active keyframe shares: initialised by the start, updated by every
+//! frame, propagated from keyframe to keyframe.
 
 use nalgebra::{Matrix3, Matrix6};
 use serde::{Deserialize, Serialize};
@@ -20,17 +20,17 @@ use crate::slam::window::place_marginals::PlaceMarginal;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ModeParams {
-    /// Standard deviation of tilt and relief that every keyframe adds: relative depth error for each unit of the
-    /// ray's coordinates and of ln d. What no model knows; exact images leave 0.0005 to 0.0015.
+    /// Standard deviation of tilt and relief that every keyframe adds: relative depth error per unit of the ray's
+    /// coordinates and of ln d. Covers what is not modelled; exact images leave 0.0005 to 0.0015.
     pub floor_std_dev: f64,
-    /// Inflation of the covariance of a frame's pose error where it goes into depth: errors of lens and shutter are
-    /// alike in consecutive frames and do not average out.
+    /// Inflation of the covariance of a frame's pose error where it enters depth: errors of lens and shutter are
+    /// similar in consecutive frames and do not average out.
     pub pose_inflation: f64,
-    /// Inflation of the covariance that the joint estimate gives, which takes residuals for independent: those of
-    /// neighbouring samples share pixels.
+    /// Inflation of the joint estimate's covariance, which takes residuals as independent although neighbouring samples
+    /// share pixels.
     pub estimate_inflation: f64,
-    /// Share of the variance of an image's displacement that has the shape of a mode: what displaces images alike
-    /// everywhere goes into the poses. With 0.3 the depth of exact images errs by as much as P says.
+    /// Share of the variance of an image's displacement that has the shape of a mode: a displacement that is uniform
+    /// over the image goes into the poses. With 0.3 the depth errors of exact images agree with P.
     pub displaced_share: f64,
 }
 
@@ -59,35 +59,35 @@ impl ModeParams {
     }
 }
 
-/// The covariance of the active keyframe's modes, and of the frame at hand.
+/// The covariance of the active keyframe's modes, and of the current frame.
 #[derive(Debug, Default)]
 pub(super) struct KeyframeModes {
     covariance: Matrix3<f64>,
     samples: SampledDepth,
     joint: Option<JointCovariance>,
-    /// Mean square of the displacements of late images, pixels².
+    /// Mean square of the displacements of recent images, pixels².
     squared_displacement: Option<f64>,
 }
 
 impl KeyframeModes {
-    /// Nothing is known of the depth, and nothing is wrong with it yet.
+    /// Resets the modes: there is no depth yet, hence no error of it.
     pub(super) fn forget(&mut self) {
         self.covariance = Matrix3::zeros();
         self.joint = None;
     }
 
-    /// Takes over those of a keyframe that becomes active, or has been estimated.
+    /// Takes over the modes of a keyframe that becomes active, or has been estimated.
     pub(super) fn enter(&mut self, of_keyframe: &ModeCovariance, params: &ModeParams) {
         self.covariance = of_keyframe.matrix() - params.floor();
     }
 
-    /// What a keyframe says of its modes.
+    /// The mode covariance that a keyframe publishes.
     pub(super) fn published(&self, params: &ModeParams) -> ModeCovariance {
         ModeCovariance::bounded(&(self.covariance + params.floor()))
     }
 
-    /// What a keyframe says of its modes after a joint estimate by which they are as uncertain as this: noise, and what
-    /// displaces whole images here, of which P is to be for this camera.
+    /// The mode covariance that a keyframe publishes after a joint estimate with this marginal: noise, plus the
+    /// displacement of whole images, as measured for this camera.
     pub(super) fn of_estimate(&self, marginal: &Marginal, params: &ModeParams) -> ModeCovariance {
         let squared = self.squared_displacement.unwrap_or_default();
         let displaced = marginal.of_displaced * squared * params.displaced_share;
@@ -95,8 +95,8 @@ impl KeyframeModes {
         ModeCovariance::bounded(&(noise + displaced + params.floor()))
     }
 
-    /// What a keyframe says of its place after that estimate: of noise and of its image's displacement, which all goes into
-    /// its pose; `None` where the estimate says nothing.
+    /// The place covariance that a keyframe publishes after that estimate: noise, plus its image's displacement, which
+    /// all goes into its pose; `None` where the estimate has none.
     pub(super) fn place_of_estimate(
         &self,
         marginal: &Marginal,
@@ -107,13 +107,13 @@ impl KeyframeModes {
         Some(PlaceCovariance::bounded(&(noise * params.estimate_inflation + displaced)))
     }
 
-    /// The unit of the depth has grown by `factor` since the frame at hand was considered.
+    /// Rescales after the unit of the depth has grown by `factor` since the current frame was considered.
     pub(super) fn rescale(&mut self, factor: f64) {
         self.samples.rescale(factor as f32);
         self.joint = self.joint.map(|joint| joint.rescaled(factor));
     }
 
-    /// Depth that was found in a second frame alone, whose pose has this covariance.
+    /// Initialises the modes of depth that was found in a single second frame, whose pose has this covariance.
     pub(super) fn begin(
         &mut self,
         depth: &DepthMap,
@@ -127,7 +127,7 @@ impl KeyframeModes {
         self.covariance = self.joint.map_or_else(Matrix3::zeros, |joint| joint.modes);
     }
 
-    /// A frame is about to be observed on `depth`, whose unit is so many of the keyframe's.
+    /// Considers a frame before it is observed on `depth`, whose unit in the keyframe's is `unit`.
     pub(super) fn consider(
         &mut self,
         depth: &DepthMap,
@@ -136,7 +136,7 @@ impl KeyframeModes {
         pose: &PoseEstimate,
         params: &ModeParams,
     ) {
-        /// Share of the newest image: about as many are averaged as lie between two keyframes.
+        /// Weight of the newest image: averages about as many as lie between two keyframes.
         const NEWEST: f64 = 0.1;
         let squared = pose.quality.displacement_px.powi(2);
         let mean = self.squared_displacement.get_or_insert(squared);
@@ -154,7 +154,7 @@ impl KeyframeModes {
             follows.map(|follows| JointCovariance::of_aligned(&self.covariance, &follows, &noise));
     }
 
-    /// That frame has been observed.
+    /// Updates the modes after that frame was observed.
     pub(super) fn observed(&mut self, depth: &DepthMap, frame_from_keyframe: &SE3) {
         let Some(joint) = &mut self.joint else { return };
         if let Some(response) = self.samples.observed(depth, frame_from_keyframe) {
@@ -163,7 +163,7 @@ impl KeyframeModes {
         }
     }
 
-    /// That frame becomes the keyframe: its modes come from those of the one before and from its pose error.
+    /// Propagates the modes to that frame, the next keyframe, from those of the previous one and its pose error.
     pub(super) fn carry(
         &mut self,
         frame_from_keyframe: &SE3,
@@ -178,15 +178,15 @@ impl KeyframeModes {
     }
 }
 
-/// The pose of a frame from its keyframe, in the unit of its depth.
+/// `frame_from_keyframe` in the unit of the keyframe's depth.
 pub(super) fn in_unit(keyframe_from_camera: &SE3, unit: f64) -> SE3 {
     let mut frame_from_keyframe = keyframe_from_camera.inverse();
     frame_from_keyframe.translation /= unit;
     frame_from_keyframe
 }
 
-/// Covariance of the pose error of a frame beside what follows from the modes of the depth: noise of single points,
-/// and displacements of the whole image. In the unit of the depth.
+/// Covariance of a frame's pose error apart from what follows from the modes of the depth: noise of single points, and
+/// displacements of the whole image. In the unit of the depth.
 fn pose_noise(intrinsics: &Intrinsics, pose: &PoseEstimate, unit: f64) -> Matrix6<f64> {
     let mut of_alignment = full_covariance(&pose.alignment_covariance);
     for i in 0..3 {
@@ -206,7 +206,7 @@ mod tests {
     use crate::slam::pose::Quality;
     use crate::slam::test_scene::{CAMERA, Scene};
 
-    /// Depth of a scene at every pixel that may carry some.
+    /// Depth of a scene at every candidate pixel.
     fn depth() -> DepthMap {
         let view = Scene::new(3).render(&CAMERA, &SE3::identity());
         let mut map = DepthMap::with_size(CAMERA.width, CAMERA.height);
@@ -255,7 +255,7 @@ mod tests {
         }
     }
 
-    /// Standard deviations after so many frames at `place`, whose images are displaced by so much.
+    /// Standard deviations after this many frames at `place`, whose images are displaced by `displacement_px`.
     fn after_frames(
         frames: usize,
         displacement_px: f64,
@@ -277,7 +277,7 @@ mod tests {
     const SIDEWAYS: [f64; 6] = [0.25, 0.05, 0.1, 0.01, -0.02, 0.01];
 
     #[test]
-    fn poses_that_err_make_depth_err_and_the_more_the_nearer_they_are() {
+    fn pose_errors_cause_depth_errors_that_grow_as_the_baseline_shrinks() {
         let near = Vector6::from(SIDEWAYS.map(|x| 0.3 * x));
         let exact = after_frames(3, 0.0, 0.0, SIDEWAYS.into());
         assert_eq!(exact, Vector3::zeros());
@@ -293,18 +293,18 @@ mod tests {
     }
 
     #[test]
-    fn exact_frames_take_old_errors_away_and_estimated_ones_the_stiff_part_of_them() {
+    fn exact_poses_remove_old_errors_and_estimated_ones_only_the_part_they_do_not_absorb() {
         let begun = 0.1;
         let of_exact = after_frames(6, 0.0, begun, SIDEWAYS.into());
         assert!(of_exact.max() < 0.05 * begun, "{of_exact}");
-        // Whose pose follows the depth keeps what hides in the pose.
+        // A pose that follows the depth keeps the error that hides in the pose.
         let of_estimated = after_frames(6, 1e-3, begun, SIDEWAYS.into());
         assert!(of_estimated.norm() < 0.95 * begun * 3f64.sqrt(), "{of_estimated}");
         assert!(of_estimated.max() > 3.0 * of_exact.max(), "{of_estimated} {of_exact}");
     }
 
     #[test]
-    fn a_keyframe_keeps_what_it_says_and_every_change_adds_what_no_model_knows() {
+    fn a_keyframe_keeps_its_covariance_and_every_change_adds_the_floor() {
         let params =
             ModeParams { floor_std_dev: 0.01, pose_inflation: 1.0, ..ModeParams::default() };
         let mut modes = KeyframeModes::default();

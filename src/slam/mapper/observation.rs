@@ -1,4 +1,4 @@
-//! What a frame tells of the depth of the active keyframe, by the filter that was chosen.
+//! Observes the depth of the active keyframe in a frame, by the chosen filter.
 
 use serde::{Deserialize, Serialize};
 
@@ -21,13 +21,13 @@ pub enum DepthFilter {
     /// A mean and a variance at every pixel with gradient, fused and smoothed (SD13 §2.4–2.6).
     #[default]
     Gaussian,
-    /// New pixels are brought to maturity by the interval filter and continue in the Gaussian one.
+    /// New pixels mature in the interval filter and continue in the Gaussian one.
     Both,
 }
 
-/// The one place that tells the filters apart.
+/// The only place that distinguishes the filters.
 impl DepthFilter {
-    /// Which pixels the Gaussian filter observes; `None` where the points of the interval filter are alone.
+    /// Which pixels the Gaussian filter observes; `None` where the interval filter runs alone.
     fn observed(self) -> Option<ObservedPixels> {
         match self {
             Self::Gaussian => Some(ObservedPixels::All),
@@ -46,7 +46,7 @@ impl DepthFilter {
         self.observed().is_some()
     }
 
-    /// Whether new pixels are searched in frames from before their keyframe: points wait for those that follow.
+    /// Whether new pixels are searched in frames before their keyframe: interval points wait for later ones.
     pub(super) fn searches_past(self) -> bool {
         !self.has_points()
     }
@@ -76,7 +76,7 @@ impl Mapper {
         if filter.has_points() {
             let interval = &self.params.interval;
             points.trace(&TraceFrame { image, view, brightness }, interval);
-            // Beside the Gaussian filter a mature point is its to continue with.
+            // Alongside the Gaussian filter, mature points are handed over to it.
             counts = match filter.is_dense() {
                 true => ObservationCounts { created: points.hand_over(depth, interval), ..counts },
                 false => points.write_into(depth, interval),

@@ -27,41 +27,40 @@ pub struct MapperParams {
     pub min_gradient: f32,
     /// Most pixels that may carry depth; the strongest gradients are kept. Bounds time and memory.
     pub max_candidates: usize,
-    /// Frames from before a new keyframe that give depth to its new pixels in the Gaussian filter; 0
-    /// waits for the frames that follow. In the simulated room one lowers the median error by a
-    /// quarter (0.7 instead of 1.0 %), 4 no further, and each is a search over all depths for every
-    /// new pixel.
+    /// Frames before a new keyframe that give depth to its new pixels in the Gaussian filter; with 0 they wait for the
+    /// frames that follow. In the simulated room 1 lowers the median error by a quarter (0.7 instead of 1.0 %), 4 no
+    /// further, and each is a search over all depths for every new pixel.
     pub num_seed_frames: usize,
-    /// Frames kept for that, newest first, beside the active keyframe: bounds the memory (one byte a pixel each).
+    /// Frames kept for that, newest first, besides the active keyframe: bounds the memory (one byte a pixel each).
     pub max_past_frames: usize,
-    /// The depth is smoothed and published again when this share of it has changed: a map that
-    /// hardly changed costs the tracker as much to prepare as a new one.
+    /// Share of the depth that must have changed before it is smoothed and published again: a map that hardly changed
+    /// costs the tracker as much to prepare as a new one.
     pub publish_change_ratio: f64,
     /// Most memory for images and depth of the keyframes of the map, megabytes: about 1.7 a keyframe at
     /// 640×480. Beyond it the oldest keep only their poses.
     pub max_map_megabytes: usize,
-    /// Keyframes with image and depth up to which all keep them. Where there are more, those whose points three others
-    /// show as well keep only their poses, so that a map of rooms that are seen over and over does not grow.
+    /// Number of keyframes up to which all keep image and depth. Beyond it, those whose points three others show as
+    /// well keep only their poses, so that a map of rooms that are seen again and again does not grow.
     pub redundant_above: usize,
-    /// At least so many frames lie between two keyframes.
+    /// Fewest frames between two keyframes.
     pub min_keyframe_interval: u64,
     /// Which filter estimates depth: `gaussian`, `interval` (sparse) or `both`. The Gaussian filter is
     /// the cheaper of the two that make a semi-dense map; `docs/depth-filters.md` compares them.
     pub depth_filter: DepthFilter,
     /// Search along the epipolar line.
     pub matching: MatchingParams,
-    /// How far epipolar lines are misplaced, from the matches.
+    /// The misplacement of epipolar lines, from the matches.
     pub line_noise: LineNoiseParams,
     /// The Gaussian filter.
     pub gaussian: GaussianParams,
     /// The interval filter.
     pub interval: IntervalParams,
-    /// The points of the interval filter where it is alone; with the Gaussian filter it traces every
-    /// pixel with gradient that has no depth yet.
+    /// The points of the interval filter where it runs alone; with the Gaussian filter it traces every pixel with
+    /// gradient that has no depth yet.
     pub candidates: CandidateParams,
-    /// The step to a new keyframe.
+    /// Propagation of depth to a new keyframe.
     pub propagation: PropagationParams,
-    /// How uncertain errors are that a keyframe's depth shares.
+    /// Uncertainty of the errors that all depth of a keyframe shares.
     pub modes: ModeParams,
     /// Smoothing.
     pub regularisation: RegularisationParams,
@@ -69,13 +68,13 @@ pub struct MapperParams {
     pub two_frame: TwoFrameParams,
     /// When the map is rejected.
     pub consistency: ConsistencyParams,
-    /// When an earlier keyframe is taken up again.
+    /// When an earlier keyframe becomes active again.
     pub reuse: ReuseParams,
-    /// What is done when the camera is lost.
+    /// Recovery of a lost camera.
     pub recovery: RecoveryParams,
     /// The joint estimation of keyframes.
     pub window: WindowParams,
-    /// The search for places that were seen before.
+    /// The search for loops.
     pub loops: LoopParams,
 }
 
@@ -109,7 +108,7 @@ impl Default for MapperParams {
     }
 }
 
-/// Bytes in the megabyte of the configuration.
+/// Bytes per megabyte in the configuration.
 const BYTES_PER_MEGABYTE: usize = 1_000_000;
 
 impl MapperParams {

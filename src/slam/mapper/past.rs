@@ -6,20 +6,20 @@ use std::sync::Arc;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::pose::Brightness;
 
-/// One of them.
+/// A past frame.
 #[derive(Debug)]
 pub(super) struct PastFrame {
     /// Grey values, level 0.
     pub(super) pixels: Arc<[u8]>,
     /// The keyframe that it was tracked on.
     pub(super) keyframe_id: u64,
-    /// Where it was taken, in that keyframe's unit.
+    /// The camera's pose on that keyframe, in its unit.
     pub(super) keyframe_from_camera: SE3,
-    /// Its brightness against the active keyframe.
+    /// Its brightness relative to the active keyframe.
     pub(super) brightness: Brightness,
 }
 
-/// At most a fixed number of past frames; the oldest give way.
+/// A bounded list of past frames; the oldest are dropped.
 #[derive(Debug)]
 pub(super) struct PastFrames {
     frames: VecDeque<PastFrame>,
@@ -27,17 +27,17 @@ pub(super) struct PastFrames {
 }
 
 impl PastFrames {
-    /// None yet, at most `capacity`.
+    /// Creates an empty list of at most `capacity` frames.
     pub(super) fn with_capacity(capacity: usize) -> Self {
         Self { frames: VecDeque::with_capacity(capacity + 1), capacity }
     }
 
-    /// Forgets all.
+    /// Removes all frames.
     pub(super) fn clear(&mut self) {
         self.frames.clear();
     }
 
-    /// Files the copy of a frame.
+    /// Appends the copy of a frame.
     pub(super) fn push(
         &mut self,
         pixels: Arc<[u8]>,
@@ -52,8 +52,8 @@ impl PastFrames {
         self.frames.push_back(frame);
     }
 
-    /// Expresses every brightness against a new keyframe, whose brightness against the one before is
-    /// `new`: with `I_new = eᵃ I + b` a frame's `(a', b')` becomes `(a' − a, b' − e^(a' − a) b)`.
+    /// Expresses every brightness relative to a new keyframe, whose brightness relative to the previous one is `new`:
+    /// with `I_new = eᵃ I + b` a frame's `(a', b')` becomes `(a' − a, b' − e^(a' − a) b)`.
     pub(super) fn rebase(&mut self, new: Brightness) {
         for past in &mut self.frames {
             let a = past.brightness.a - new.a;
@@ -61,7 +61,7 @@ impl PastFrames {
         }
     }
 
-    /// All, the newest first.
+    /// The frames, the newest first.
     pub(super) fn newest_first(&self) -> impl Iterator<Item = &PastFrame> {
         self.frames.iter().rev()
     }
@@ -88,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn the_oldest_gives_way() {
+    fn the_oldest_frame_is_dropped() {
         let mut past = PastFrames::with_capacity(2);
         for i in 0..5u8 {
             past.push([i].into(), 0, SE3::identity(), Brightness::default());

@@ -1,28 +1,28 @@
-//! What the mapper is doing from frame to frame, with what each of it needs.
+//! The mapper's phases from frame to frame, with the state that each needs.
 
 use crate::slam::mapper::consistency::{Consistency, Contradiction};
 
-/// Longest time that two frames are taken to be apart: the slowest camera's period.
+/// Longest time that is counted between two frames: the period of the slowest camera.
 const LONGEST_STEP_NANOS: i64 = 5_000_000_000;
 
-/// What is done with the next frame.
+/// What the mapper does with the next frame.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) enum Phase {
-    /// There is no map: it goes to the start of one.
+    /// There is no map: the frame is used to start one.
     #[default]
     Starting,
-    /// Its depth is observed.
+    /// Depth is observed in it.
     Mapping,
-    /// The camera is lost: it is looked for on keyframes of all epochs.
+    /// The camera is lost: keyframes of all epochs are searched for it.
     Lost(Loss),
-    /// The map contradicted itself: the camera is looked for on others.
+    /// The map contradicted itself: other keyframes are searched for the camera.
     Rejected(Contradiction, Loss),
-    /// The camera has been lost for long: looked for as before, and the frame goes to the start of a new epoch
-    /// too. Whichever is first wins.
+    /// The camera has been lost for long: the search continues, and the frame is also used to start a new epoch.
+    /// Whichever succeeds first wins.
     Restarting(Loss),
 }
 
-/// Time of the frames' stamps since the first of some.
+/// Time by the frames' stamps since the first of several frames.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Lasting {
     /// Stamp of the last frame.
@@ -30,7 +30,7 @@ pub(super) struct Lasting {
     nanos: i64,
 }
 
-/// How long the camera has been lost, and where it was looked for.
+/// How long the camera has been lost, and how far the search has got.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Loss {
     /// Since the first lost frame.
@@ -42,7 +42,7 @@ pub(super) struct Loss {
 }
 
 impl Phase {
-    /// The loss that continues, or a new one.
+    /// The current loss, or a new one.
     pub(super) fn loss(&self) -> Loss {
         match *self {
             Self::Lost(loss) | Self::Rejected(_, loss) | Self::Restarting(loss) => loss,
@@ -50,7 +50,7 @@ impl Phase {
         }
     }
 
-    /// The same phase, this far into the loss.
+    /// The phase with this loss; one without a loss becomes `Lost`.
     pub(super) fn with_loss(self, loss: Loss) -> Self {
         match self {
             Self::Restarting(_) => Self::Restarting(loss),
@@ -61,8 +61,8 @@ impl Phase {
 }
 
 impl Lasting {
-    /// How long it is with another frame, seconds. A step of the clock, back or far forwards, is no time in which anything
-    /// was done.
+    /// Adds a frame and returns the time so far, seconds. A step of the clock adds nothing if it is backwards, and no
+    /// more than the longest time between frames if it is forwards.
     pub(super) fn secs(&mut self, nanos: i64) -> f64 {
         let step = nanos.saturating_sub(self.last_nanos.replace(nanos).unwrap_or(nanos));
         self.nanos = self.nanos.saturating_add(step.clamp(0, LONGEST_STEP_NANOS));
@@ -73,11 +73,11 @@ impl Lasting {
 /// The keyframe that frames are tracked on and whose depth is observed.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Active {
-    /// Its place in the map.
+    /// Its index in the map.
     pub(super) index: usize,
-    /// Frames that were observed on it.
+    /// Number of frames observed on it.
     pub(super) frames: u64,
-    /// Whether it still agrees with itself.
+    /// State of its consistency checks.
     pub(super) consistency: Consistency,
 }
 

@@ -1,5 +1,5 @@
-//! A map of earlier runs: the camera is looked for on its keyframes, and found there the map continues, or is left as it
-//! is and only tells where the camera is.
+//! A map of earlier runs: its keyframes are searched for the camera; once it is found, the map is extended, or left
+//! unchanged and only used to locate the camera.
 
 use crate::slam::frame::FrameView;
 use crate::slam::geometry::sim3::Sim3;
@@ -10,39 +10,39 @@ use crate::slam::mapper::situation::Certainty;
 use crate::slam::mapper::{Mapper, StepOutcome};
 use crate::slam::pose::PoseEstimate;
 
-/// What is done with a map of earlier runs.
+/// How a map of earlier runs is used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MapUse {
-    /// It continues.
+    /// It is extended.
     Extend,
-    /// It stays as it is: no keyframe is added, and no depth and no place changes.
+    /// It is left unchanged: no keyframe is added, and no depth or pose changes.
     Locate,
 }
 
-/// Why a mapper cannot begin in a map.
+/// Why a mapper cannot start in a map.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum PriorError {
-    /// Keyframes of another camera.
+    /// A keyframe was taken with another camera.
     #[error("keyframe {0} was taken with another camera")]
     Camera(u64),
-    /// Nothing to be found.
+    /// There is no keyframe with depth.
     #[error("the map has no keyframe with depth to find the camera on")]
     Empty,
 }
 
-/// The map that a mapper has begun in.
+/// The map that a mapper has started in.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Prior {
     map_use: MapUse,
-    /// Ids below are those of its keyframes.
+    /// Ids below this belong to its keyframes.
     first_own: u64,
-    /// Of the last pose.
+    /// Certainty of the last pose.
     certainty: Certainty,
 }
 
 impl Map {
-    /// What a mapper that died has left, over the map on the disk: keyframes that only that has are added, and those
-    /// without depth here get it from there.
+    /// Combines `self`, the checkpoint of a mapper that died, with the map on the disk: adds the keyframes that only
+    /// the older map has, and takes its depth for those that have none here.
     pub fn over(mut self, older: Self) -> Self {
         self.free_epoch = self.free_epoch.max(older.free_epoch);
         self.revision = self.revision.max(older.revision);
@@ -67,8 +67,8 @@ impl Map {
 }
 
 impl Mapper {
-    /// Begins in a map of earlier runs, before the first frame: its epochs, ids and revisions continue, and each frame is
-    /// looked for on its keyframes. Odometry begins where the map has the camera then.
+    /// Starts in a map of earlier runs, before the first frame: its epochs, ids and revisions continue, and its
+    /// keyframes are searched for the camera in each frame. Odometry starts from the camera's pose in the map.
     pub fn begin_in(&mut self, map: Map, map_use: MapUse) -> Result<(), PriorError> {
         let foreign = map.keyframes.iter().find(|of| of.intrinsics != self.intrinsics);
         if let Some(foreign) = foreign {
@@ -101,37 +101,37 @@ impl Mapper {
         Ok(())
     }
 
-    /// Whether the map stays as it is.
+    /// Whether the map is left unchanged.
     pub(super) fn is_locating(&self) -> bool {
         self.prior.is_some_and(|prior| prior.map_use == MapUse::Locate)
     }
 
-    /// The camera was not found yet on the map that was there before.
+    /// Whether the camera has not been found yet in the map of earlier runs.
     pub(super) fn is_localising(&self) -> bool {
         self.prior.is_some() && self.active.is_none()
     }
 
-    /// How sure the place is, as long as the keyframe that it was found on is one of the map that was there before.
+    /// Certainty of the camera's pose, as long as the active keyframe is one of the map of earlier runs.
     pub(super) fn certainty(&self) -> Option<Certainty> {
         let (prior, keyframe) = (self.prior?, self.keyframe()?);
         let is_known = prior.map_use == MapUse::Locate || keyframe.keyframe_id < prior.first_own;
         is_known.then_some(prior.certainty)
     }
 
-    /// Keeps how sure a tracked pose is.
+    /// Stores the certainty of a tracked pose.
     pub(super) fn note_certainty(&mut self, pose: &PoseEstimate) {
         if let Some(prior) = &mut self.prior {
             prior.certainty = Certainty::of(pose);
         }
     }
 
-    /// A tracked frame where the map stays as it is: near another keyframe that becomes the active one.
+    /// Uses a tracked frame without changing the map: another keyframe near the camera may become active.
     pub(super) fn locate_frame(
         &mut self,
         frame: &FrameView<'_>,
         pose: &PoseEstimate,
     ) -> StepOutcome {
-        /// Where the tracker asks for another keyframe: any that is nearer than that will do.
+        /// Distance at which the tracker proposes another keyframe: any nearer one will do.
         const MAX_DISTANCE: f64 = 1.0;
         let Some(active) = &mut self.active else { return StepOutcome::default() };
         active.frames += 1;
@@ -148,7 +148,7 @@ impl Mapper {
         }
     }
 
-    /// Makes a keyframe of the map the active one, and leaves it as it is.
+    /// Makes a keyframe of the map the active one, its depth and its pose in the map unchanged.
     pub(super) fn enter_unchanged(&mut self, index: usize) -> StepOutcome {
         let is_first = self.active.is_none();
         self.active = Some(Active::new(index));
@@ -160,7 +160,7 @@ impl Mapper {
         StepOutcome::restored(is_first)
     }
 
-    /// Where a keyframe's map lies in odometry's world as odometry had it last.
+    /// Pose of a keyframe's map in odometry's world, as last published with the keyframe.
     pub(super) fn world_from_map_of(keyframe: &Keyframe) -> Sim3 {
         keyframe.world_from_keyframe * keyframe.map_from_keyframe.inverse()
     }
@@ -192,7 +192,7 @@ mod tests {
         mapper
     }
 
-    /// A frame taken at `x`, as the tracker tells of it.
+    /// Steps with a frame taken at `x`, and the pose that the tracker would report.
     fn step(mapper: &mut Mapper, scene: &Scene, sequence: u64, x: f64) -> StepOutcome {
         let pixels = scene.render(&CAMERA, &sideways(x)).noisy(2.0, sequence);
         let frame = FrameView::new(&CAMERA, sequence, sequence as i64 * 33_333_333, &pixels);
@@ -210,14 +210,14 @@ mod tests {
     }
 
     #[test]
-    fn the_camera_is_found_on_a_map_that_stays_as_it_is() {
+    fn the_camera_is_found_in_a_map_that_is_left_unchanged() {
         let scene = Scene::new(3);
         let mut mapper = mapper_in(map(&scene), MapUse::Locate);
         assert_eq!(mapper.situation(), Situation::Localising(2));
         let found = step(&mut mapper, &scene, 0, 0.05);
         assert!(found.keyframe_restored && found.graph_changed);
         assert_eq!(mapper.keyframe().unwrap().keyframe_id, 4);
-        // It moves on, to where the other keyframe is nearer.
+        // The camera moves on to where the other keyframe is nearer.
         let outcomes: Vec<StepOutcome> =
             (1..20).map(|k| step(&mut mapper, &scene, k, 0.05 + 0.0125 * k as f64)).collect();
         assert!(outcomes.iter().all(|outcome| !outcome.keyframe_created));
@@ -229,7 +229,7 @@ mod tests {
             assert_eq!(now.map_from_keyframe, before.map_from_keyframe);
         }
         assert_eq!(mapper.map().keyframes.len(), 2);
-        // One that is lost looks on, and begins nothing.
+        // A lost camera is searched for, and no epoch is started.
         let noise: Vec<u8> =
             (0..CAMERA.width * CAMERA.height).map(|i| (i * i * 31 % 253) as u8).collect();
         for sequence in 20..40 {
@@ -241,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn a_map_goes_on_with_numbers_of_its_own() {
+    fn an_extended_map_continues_with_new_numbers() {
         let scene = Scene::new(3);
         let mut mapper = mapper_in(map(&scene), MapUse::Extend);
         assert_eq!((mapper.free_epoch(), mapper.next_keyframe_id), (3, 8));
@@ -252,7 +252,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_map_of_this_camera_is_refused() {
+    fn a_map_of_another_camera_and_an_empty_map_to_locate_in_are_refused() {
         let scene = Scene::new(3);
         let begin = |map: Map, map_use| {
             Mapper::new(CAMERA, MapperParams::default()).unwrap().begin_in(map, map_use)
@@ -265,7 +265,7 @@ mod tests {
     }
 
     #[test]
-    fn a_checkpoint_lies_over_the_map_on_the_disk() {
+    fn a_checkpoint_takes_precedence_over_the_map_on_the_disk() {
         let scene = Scene::new(3);
         let on_disk = map(&scene);
         let mut moved = scene.keyframe(7, sideways(0.4), 1.0).without_depth();

@@ -1,6 +1,6 @@
-//! What the mapper does while the camera is lost: it looks for it on keyframes of all epochs, and when that fails for
-//! long begins a new epoch beside the search. Whichever is first wins: until the new epoch's start is proven the old
-//! ones can be found again.
+//! Recovery from a loss: the mapper searches keyframes of all epochs for the camera and, if that fails for long, starts
+//! a new epoch alongside the search. Whichever succeeds first wins: until the new epoch's start is proven, the camera
+//! can be found in the old ones.
 
 use serde::{Deserialize, Serialize};
 
@@ -20,12 +20,12 @@ use crate::slam::pose::{DegradedReason, PoseEstimate, TrackingState, full_covari
 use crate::slam::tracker::MOST_DEVIATIONS;
 
 /// Largest difference of two poses for one place, translation in mean depths plus rotation in radians: a wrong place is
-/// further off, and a map that has drifted by as much is none to continue with.
+/// further off, and a map that has drifted this far should not be continued.
 pub(super) const MAX_DISAGREEMENT: f64 = 0.1;
 
 /// How other keyframes confirm a place that was found.
 pub(super) struct Confirmation {
-    /// The place in the map of a keyframe that is not asked.
+    /// Index in the map of a keyframe that must not confirm it.
     pub except: Option<usize>,
     /// Largest difference of a pose on another keyframe from the one found, translation in mean depths plus rotation in
     /// radians.
@@ -33,7 +33,7 @@ pub(super) struct Confirmation {
 }
 
 impl Confirmation {
-    /// After a loss all may be asked.
+    /// After a loss any keyframe may confirm it.
     pub fn after_loss() -> Self {
         Self { except: None, max_disagreement: MAX_DISAGREEMENT }
     }
@@ -43,16 +43,16 @@ impl Confirmation {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RecoveryParams {
-    /// Keyframes, of all epochs, that the camera is looked for on: those that look most like its image.
+    /// Keyframes, of all epochs, that are searched for the camera: those that look most like its image.
     pub num_keyframes: usize,
-    /// Of them those that are searched in one frame, the most alike and others in turn: each costs about as much as a
-    /// keyframe's preparation in the tracker, and a frame must stay bounded.
+    /// How many of these are searched per frame, the most similar and, cyclically, the others: each costs about as much
+    /// as preparing a keyframe in the tracker, and the time per frame must stay bounded.
     pub keyframes_per_frame: usize,
-    /// The camera is looked for where the keyframe was taken and turned so far about its axes,
-    /// degrees; a coarse alignment reaches about as far on each side.
+    /// Alignments start from the keyframe's pose and from poses turned by this angle about its axes, degrees; a coarse
+    /// alignment reaches about as far on each side.
     pub rotation_deg: f64,
-    /// Time of the frames' stamps without success after which a new epoch is begun, seconds: two
-    /// or three rounds of the search.
+    /// Time of the frames' stamps without success after which a new epoch is started, seconds: two or three rounds of
+    /// the search.
     pub lost_timeout_secs: f64,
 }
 
@@ -78,12 +78,11 @@ impl RecoveryParams {
 }
 
 impl Mapper {
-    /// One frame of a loss: searches some keyframes; after the timeout gives the frame to a new
-    /// start as well.
+    /// Uses one frame of a loss: searches some keyframes; after the timeout uses the frame for a new start as well.
     pub(super) fn recover(&mut self, input: &StepInput<'_>) -> StepOutcome {
         let StepInput { frame, pose, .. } = *input;
         let mut loss = self.phase.loss();
-        // A view that holds the camera is no loss, and nothing to begin another map with; one of a map before is none.
+        // While a view holds the pose there is no loss and no new start; a pose on the map before this does not count.
         let is_held = pose.state.is_tracked()
             && !matches!(self.phase, Phase::Rejected(..))
             && !self.is_localising();
@@ -108,7 +107,7 @@ impl Mapper {
             return StepOutcome::default();
         }
         let is_restarting = matches!(self.phase, Phase::Restarting(_));
-        // Of a wrong start there is nothing to be found again.
+        // A wrong start leaves nothing to find the camera on.
         let is_wrong = matches!(self.phase, Phase::Rejected(Contradiction::WrongStart, _));
         let is_late = lost_secs >= self.params.recovery.lost_timeout_secs;
         if !(is_restarting || is_wrong || is_late) {
@@ -121,8 +120,8 @@ impl Mapper {
         self.begin(input)
     }
 
-    /// What was found, where it is confirmed and not against the rotation that a view holds; the next search leaves it out
-    /// otherwise.
+    /// Returns `found` if it is confirmed and does not contradict the rotation that a view holds; otherwise the next
+    /// search leaves it out.
     fn believed(
         &mut self,
         found: Option<(usize, SE3)>,
@@ -141,7 +140,7 @@ impl Mapper {
         None
     }
 
-    /// Whether a place in the epoch of a pose that a view holds turns the camera against it by more than it is uncertain.
+    /// Whether a pose in the epoch of a held pose is rotated against it by more than drift and uncertainty allow.
     fn contradicts_hold(&self, pose: &PoseEstimate, index: usize, at: &SE3) -> bool {
         /// Rotation by which the map may have drifted since the place was mapped, radians.
         const MOST_DRIFT_RAD: f64 = 0.15;
@@ -160,8 +159,8 @@ impl Mapper {
             > MOST_DRIFT_RAD + MOST_DEVIATIONS * uncertain
     }
 
-    /// Whether another keyframe that sees the same place has the camera there too: one alone may look like what it does
-    /// not show. It is believed alone only where the map is so young that there may be no other.
+    /// Whether another keyframe that sees the same place confirms the camera's pose: one alone may resemble something
+    /// that it does not show. It is accepted alone only where the map is so young that there may be no other.
     pub(super) fn is_confirmed(
         &mut self,
         index: usize,
@@ -169,11 +168,11 @@ impl Mapper {
         pixels: &[u8],
         by: &Confirmation,
     ) -> bool {
-        /// Keyframes that are asked.
+        /// Keyframes that are checked.
         const MOST: usize = 3;
         /// Largest distance of the camera from them, in their mean depths.
         const REACH: f64 = 0.7;
-        /// Least share of their points that the camera must see: one that is turned far sees no more of any.
+        /// Least share of their points that the camera must see: one that is turned far away sees no more of any.
         const LEAST_USAGE: f64 = 0.2;
         let found = &self.map.keyframes[index];
         let epoch = found.epoch;
@@ -196,19 +195,19 @@ impl Mapper {
         others.is_empty() && is_young || others.iter().any(&mut agrees)
     }
 
-    /// Whether the points of the joint estimation, where they are at hand and in view, have the camera there too: they hang
-    /// on several keyframes each, while a keyframe's depth may be its own.
+    /// Whether the points of the joint estimate, where available and in view, confirm the camera's pose: each depends
+    /// on several keyframes, while a keyframe's depth may depend on that keyframe alone.
     pub(super) fn points_agree(
         &mut self,
         index: usize,
         keyframe_from_camera: &SE3,
         pixels: &[u8],
     ) -> bool {
-        /// Least share of the points in view that the image must agree with. Estimates have 0.9 and more, blurred images of
-        /// the right place 0.44 and now and then less, another scene of little contrast 0.37. One that is refused for
-        /// nothing costs a frame or two.
+        /// Least share of the points in view that the image must agree with. Estimates have 0.9 and more, blurred
+        /// images of the right place 0.44 and occasionally less, a different scene of low contrast 0.37. A wrong
+        /// refusal costs a frame or two.
         const LEAST_AGREEING: f64 = 0.4;
-        /// Largest difference of the two poses: that between two keyframes, of each of which the points are as far off.
+        /// Largest difference of the two poses: that of two keyframes which each differ this far from the points.
         const MAX_APART: f64 = 2.0 * MAX_DISAGREEMENT;
         let Some(window) = &mut self.window else { return true };
         let keyframe_id = self.map.keyframes[index].keyframe_id;
@@ -220,8 +219,7 @@ impl Mapper {
             && apart.translation.norm() + apart.rotation.angle() <= MAX_APART
     }
 
-    /// Declares the active keyframe contradictory, or all of its epoch where its start was wrong: nothing is claimed
-    /// on them any more.
+    /// Rejects the active keyframe, or its whole epoch where the start was wrong: no pose is claimed on them any more.
     pub(super) fn reject(&mut self, contradiction: Contradiction) {
         self.phase = Phase::Rejected(contradiction, Loss::default());
         self.doubt = Doubt::None;
@@ -237,8 +235,8 @@ impl Mapper {
         }
     }
 
-    /// Makes an earlier keyframe active again, with the depth it was left with. The camera was found on it;
-    /// odometry continues from its last pose.
+    /// Makes an earlier keyframe, on which the camera was found, active again with the depth it was left with; odometry
+    /// continues from its last pose.
     pub(super) fn restore_keyframe(
         &mut self,
         index: usize,
@@ -250,7 +248,7 @@ impl Mapper {
         };
         self.depth.restart(&keyframe.image, &self.params);
         restore_points(&mut self.depth.active, &keyframe.points);
-        // One of another epoch brings the place and the unit back that its map has in odometry's world.
+        // A keyframe of another epoch restores the pose and the unit of its map in odometry's world.
         let is_first = self.active.is_none();
         let left = self.keyframe().map(|active| active.epoch);
         if left != Some(keyframe.epoch) {
@@ -268,19 +266,19 @@ impl Mapper {
             return self.enter_unchanged(index);
         }
         self.enter_keyframe(index);
-        // The rest of a map that was there before is told of with the first of it.
+        // The first keyframe of a map of earlier runs publishes the others with it.
         StepOutcome::restored(is_first)
     }
 }
 
-/// Puts the points of a keyframe back into its depth map: each as its filter left it, half proven, and
-/// joined with what is there already if that is the same surface.
+/// Restores the points of a keyframe to its depth map: each as its filter left it, with half the validity, and joined
+/// with an existing hypothesis if that is the same surface.
 pub(super) fn restore_points(map: &mut DepthMap, points: &[DepthPoint]) {
     let inside = |at: u16, side: usize| {
         (BORDER_PX..side.saturating_sub(BORDER_PX)).contains(&usize::from(at))
     };
     let (width, height) = (map.image.width(), map.image.height());
-    // A checkpoint of other parameters may hold others.
+    // A checkpoint made with other parameters may hold unusable points.
     let usable = points.iter().filter(|point| {
         inside(point.u, width)
             && inside(point.v, height)
@@ -305,7 +303,7 @@ pub(super) fn restore_points(map: &mut DepthMap, points: &[DepthPoint]) {
             };
         }
     }
-    // Those of another image, or of other parameters, need not be candidates.
+    // Points of another image, or of other parameters, need not be candidates.
     map.sum_structure();
 }
 

@@ -1,4 +1,4 @@
-//! What of the map a mapper needs to continue after its death, and how it continues.
+//! Checkpoints: the part of the map that a mapper needs to continue after its death, and how it continues.
 
 use std::sync::Arc;
 
@@ -11,20 +11,20 @@ use crate::slam::mapper::{Mapper, StepOutcome};
 /// More keyframes than are made between two checkpoints, and more revisions.
 const UNKNOWN_KEYFRAMES: u64 = 1000;
 const UNKNOWN_REVISIONS: u64 = 1_000_000;
-/// More epochs than a mapper begins between two checkpoints: an epoch that is proven has one at once.
+/// More epochs than a mapper starts between two checkpoints: an epoch that is proven is checkpointed at once.
 const UNKNOWN_EPOCHS: u32 = 16;
 
 impl Map {
-    /// What a mapper writes before it numbers anything, where a dead one may have left `self`: who comes after
-    /// it gives other numbers to its epochs, even if it dies without another checkpoint.
+    /// Reserves epoch numbers in `self`, the checkpoint of a dead mapper if any. Write it before numbering anything:
+    /// the next mapper then uses other epoch numbers, even if this one dies without another checkpoint.
     pub fn reserve_epochs(&mut self) {
         self.free_epoch = self.free_epoch.saturating_add(UNKNOWN_EPOCHS);
     }
 }
 
 impl Mapper {
-    /// A keyframe that was left or refined, once its depth is final for now: after [`Mapper::finish_keyframe`], until
-    /// there is none.
+    /// Returns a keyframe that was left or refined and whose depth is final for now: call it after
+    /// [`Mapper::finish_keyframe`], until it returns `None`.
     pub fn take_left(&mut self) -> Option<&Keyframe> {
         while let Some(left) = self.left.pop_front() {
             if self.map.get(left).is_some_and(Keyframe::has_depth) {
@@ -34,9 +34,9 @@ impl Mapper {
         None
     }
 
-    /// Somebody may want to keep a keyframe's depth.
+    /// Queues a keyframe whose depth may be worth saving.
     pub(super) fn tell_left(&mut self, keyframe_id: u64) {
-        /// Keyframes that are told of, where nobody asks.
+        /// Most keyframes in the queue, where none are taken.
         const MOST: usize = 8;
         self.left.retain(|&id| id != keyframe_id);
         self.left.push_back(keyframe_id);
@@ -76,8 +76,8 @@ impl Mapper {
         self.take_up_loops();
     }
 
-    /// Continues from a checkpoint: its keyframe is active again, the epoch and all ids continue. Does nothing
-    /// with a map that this camera cannot have made.
+    /// Continues from a checkpoint: its keyframe becomes active again, the epoch and all ids continue. From a map that
+    /// this camera cannot have made, only the numbers continue.
     pub fn resume(&mut self, map: Map) -> StepOutcome {
         let fits = |keyframe: &Keyframe| {
             keyframe.intrinsics == self.intrinsics
@@ -88,7 +88,7 @@ impl Mapper {
         if map.free_epoch == 0 && map.keyframes.is_empty() {
             return StepOutcome::default();
         }
-        // What the dead mapper published after its last checkpoint has numbers of its own: they are left out.
+        // The dead mapper may have assigned numbers after its last checkpoint: skip these.
         let newest = |number: fn(&Keyframe) -> u64| map.keyframes.iter().map(number).max();
         let newest_revision = newest(|keyframe| keyframe.revision).unwrap_or(0);
         let newest_id = newest(|keyframe| keyframe.keyframe_id).unwrap_or(0);
@@ -105,7 +105,7 @@ impl Mapper {
         let keyframe = &self.map.keyframes[index];
         self.depth.restart(&keyframe.image, &self.params);
         restore_points(&mut self.depth.active, &keyframe.points);
-        // Where odometry had it when it died.
+        // The pose of the map in odometry's world when the mapper died.
         self.world_from_map = Self::world_from_map_of(keyframe);
         self.past.clear();
         self.phase = Phase::Mapping;
@@ -142,7 +142,7 @@ mod tests {
         }
     }
 
-    /// What a mapper leaves that dies after its start, and the number of its first epoch.
+    /// The checkpoint of a mapper that dies after its start, and the number of its first epoch.
     fn short_life(left: Option<Map>) -> (Map, u32) {
         let mut reserved = left.clone().unwrap_or_default();
         reserved.reserve_epochs();
@@ -154,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn no_epoch_has_the_number_of_one_that_died_unproven() {
+    fn no_epoch_reuses_the_number_of_one_that_was_never_proven() {
         let (left, first) = short_life(None);
         let (left, second) = short_life(Some(left));
         let (_, third) = short_life(Some(left));
@@ -162,11 +162,11 @@ mod tests {
     }
 
     #[test]
-    fn an_established_epoch_goes_on_and_the_one_after_it_is_new() {
+    fn an_established_epoch_continues_and_the_next_one_has_a_new_number() {
         let mut first = mapper();
         first.resume(Map { keyframes: vec![keyframe(2)], free_epoch: 7, ..Map::default() });
         assert_eq!(first.keyframe().unwrap().epoch, 2);
-        // It is lost, begins an epoch with this number that is never proven, and dies.
+        // It is lost, starts an epoch with this number that is never proven, and dies.
         let unproven = first.free_epoch();
         let mut second = mapper();
         second.resume(first.checkpoint().unwrap());

@@ -1,6 +1,6 @@
-//! A keyframe that the camera has come back to is taken up again instead of making a new one beside it:
-//! where the camera goes back and forth the map does not grow. One that has the camera elsewhere than the map expects
-//! tells of drift: where it is as sure as after a loss the camera continues from there, and the drift ends.
+//! Reuse of keyframes: a keyframe that the camera has returned to becomes active again instead of a new one next to it,
+//! so that the map does not grow where the camera moves back and forth. A pose on it that differs from the expected one
+//! reveals drift: if it is as certain as after a loss, the camera continues from there, and the drift ends.
 
 use serde::{Deserialize, Serialize};
 
@@ -17,16 +17,15 @@ use crate::slam::pose::{Brightness, PoseEstimate};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ReuseParams {
-    /// Largest distance of the camera from a keyframe that is taken up again, where the tracker asks
-    /// for a new one at 1. Half of it leaves as much to go before the next change; 0 makes a new keyframe
-    /// every time.
+    /// Largest distance of the camera from a keyframe that becomes active again; the tracker proposes a new one at 1.
+    /// Half of that leaves as much distance before the next change; 0 makes a new keyframe every time.
     pub max_distance: f64,
-    /// The tracker's weights of that distance, which whoever has the configuration of both passes on.
+    /// The tracker's weights of that distance, from the tracker's configuration.
     #[serde(skip)]
     pub distance: DistanceWeights,
-    /// How far the pose measured on the keyframe may be from the one expected, translation in mean
-    /// depths plus rotation in radians: 0.02 is 10 px at f = 525. Beyond it the map has drifted, and the keyframe is
-    /// gone back to where it is as sure as after a loss.
+    /// Largest difference of the pose measured on the keyframe from the expected one, translation in mean depths plus
+    /// rotation in radians: 0.02 is 10 px at f = 525. Beyond it the map has drifted, and the keyframe is reused only if
+    /// the pose is as certain as after a loss.
     pub max_disagreement: f64,
 }
 
@@ -44,18 +43,18 @@ impl ReuseParams {
     }
 }
 
-/// A keyframe near the camera, and what was measured on it.
+/// A keyframe near the camera, and the pose measured on it.
 pub(super) struct NearKeyframe {
-    /// Its place in the map.
+    /// Its index in the map.
     pub(super) index: usize,
     pub(super) keyframe_id: u64,
     pub(super) located: Located,
 }
 
 impl Mapper {
-    /// Makes the nearest earlier keyframe active again, if one is near enough and shows the frame. Where it agrees with
-    /// the frame's pose its depth is what it was left with and what the present keyframe adds; where it has the camera
-    /// elsewhere, and is sure of it, the present keyframe has drifted and adds nothing.
+    /// Makes the nearest earlier keyframe active again, if it is near enough and shows the frame. Where it agrees with
+    /// the frame's pose, it keeps its depth and gains that of the active keyframe; where it yields another pose with
+    /// certainty, the active keyframe has drifted and adds nothing.
     pub(super) fn reuse_keyframe(&mut self, frame: &FrameView<'_>, pose: &PoseEstimate) -> bool {
         let max_distance = self.params.reuse.max_distance;
         // Exact poses are the world's own: they need no anchor, and do not drift.
@@ -73,12 +72,12 @@ impl Mapper {
         true
     }
 
-    /// Continues from a keyframe that has the camera elsewhere than the map expects it, where that is as sure as it has to
-    /// be after a loss.
+    /// Continues from a keyframe on which the camera's pose differs from the expected one, if it is as certain as
+    /// required after a loss.
     fn return_to(&mut self, near: &NearKeyframe, pixels: &[u8]) -> bool {
         let at = &near.located.keyframe_from_camera;
-        // The active keyframe has the camera where it drifted to. Another that has it nearer to the place that was found
-        // than to that one is needed.
+        // The active keyframe agrees with the drifted pose. Another one must have the camera nearer to the pose that
+        // was found than to the drifted one.
         let by = Confirmation {
             except: self.active.as_ref().map(|active| active.index),
             max_disagreement: MAX_DISAGREEMENT.min(0.5 * near.located.disagreement),
@@ -92,8 +91,8 @@ impl Mapper {
         is_believed
     }
 
-    /// The nearest other keyframe below a distance of the camera, where it shows the frame and has the camera at most
-    /// `max_disagreement` from where the frame's pose has it.
+    /// The nearest other keyframe within a distance of the camera, if it shows the frame and the pose measured on it
+    /// differs by at most `max_disagreement` from the frame's pose.
     pub(super) fn near_keyframe(
         &mut self,
         frame: &FrameView<'_>,
@@ -130,7 +129,7 @@ impl Mapper {
         nearest
     }
 
-    /// Leaves the present keyframe for that at `index`, whose image is `brightness` of the present one's.
+    /// Replaces the active keyframe by that at `index`, whose image has this brightness relative to the active one's.
     fn take_up(&mut self, index: usize, brightness: Brightness) {
         if self.depth.unpublished > 0 {
             self.depth.refine(&self.params);
@@ -154,7 +153,7 @@ impl Mapper {
     }
 }
 
-/// The brightness of image 2 against image 1, from that of one frame against each: with
+/// Brightness of image 2 relative to image 1, from that of one frame relative to each: with
 /// `I = e^a₁ I₁ + b₁ = e^a₂ I₂ + b₂`, `I₂ = e^(a₁ − a₂) I₁ + e^(−a₂) (b₁ − b₂)`.
 fn between(against_one: Brightness, against_two: Brightness) -> Brightness {
     Brightness {
@@ -187,7 +186,7 @@ mod tests {
             Self { scene, mapper, sequence: 0, state, is_exact: true }
         }
 
-        /// A frame taken at `place` metres to the right, said to be at `claimed`; a keyframe is asked for.
+        /// Steps with a frame taken at `place` metres to the right, tracked at `claimed`; it proposes a keyframe.
         fn step(&mut self, place: f64, claimed: f64) -> StepOutcome {
             let at = |x: f64| SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() };
             let view = self.scene.render(&CAMERA, &at(place));
@@ -214,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn a_keyframe_is_taken_up_again_where_the_pose_agrees_and_only_there() {
+    fn a_keyframe_is_reused_only_where_the_pose_agrees() {
         let mut walk = Walk::new();
         assert!(walk.step(0.0, 0.0).keyframe_created);
         assert!(walk.step(1.2, 1.2).keyframe_created);
@@ -225,7 +224,7 @@ mod tests {
         let first = walk.mapper.keyframe().unwrap();
         assert_eq!(first.keyframe_id, 0);
         assert!(first.points.len() * 10 >= left * 9, "{} of {left} points", first.points.len());
-        // The same way again, but the pose has drifted.
+        // The same path again, but the pose has drifted.
         let mut trusting = Walk::new();
         trusting.mapper.params.reuse.max_disagreement = 1.0;
         for (walk, is_restored) in [(&mut walk, false), (&mut trusting, true)] {
@@ -236,12 +235,12 @@ mod tests {
     }
 
     #[test]
-    fn odometry_stands_still_where_an_earlier_keyframe_is_taken_up_or_found() {
+    fn odometry_does_not_jump_where_an_earlier_keyframe_is_reused_or_found() {
         use crate::slam::pose::LostReason;
         let place = |walk: &Walk, x: f64| {
             let keyframe = walk.mapper.keyframe().unwrap();
             let at = SE3 { translation: [x, 0.0, 0.0].into(), ..SE3::identity() };
-            // Exact depth: the keyframe's place in the map is where it was taken.
+            // Exact depth: the keyframe's pose in the map is where it was taken.
             keyframe.world_from_keyframe.place(&keyframe.map_from_keyframe.locate(&at))
         };
         let is_tracked_or_lost =
@@ -250,8 +249,8 @@ mod tests {
             let mut walk = Walk::new();
             walk.step(0.0, 0.0);
             walk.step(1.2, 1.2);
-            // Near the first keyframe, by an odometry that has drifted by a centimetre; or found there after a loss,
-            // by a tracker that was restarted and knows of no pose.
+            // Near the first keyframe, with odometry that has drifted by a centimetre; or found there after a loss,
+            // with a tracker that was restarted and has no pose.
             let is_lost = state != TrackingState::Tracking;
             let (claimed, expected) = if is_lost { (0.0, 1.2) } else { (0.11, 0.11) };
             walk.state = state;
@@ -265,8 +264,8 @@ mod tests {
     }
 
     #[test]
-    fn the_camera_goes_on_from_a_keyframe_that_disagrees_where_that_is_sure_and_only_there() {
-        // The first keyframe has the camera at 0.1, the tracker at 0.2: more than `max_disagreement`.
+    fn the_camera_continues_from_a_keyframe_that_disagrees_only_where_that_is_certain() {
+        // The camera is at 0.1 by the first keyframe, at 0.2 by the tracker: further apart than `max_disagreement`.
         let drifted = |is_believed: bool| {
             let mut walk = Walk::new();
             if !is_believed {
@@ -281,7 +280,7 @@ mod tests {
         let (outcome, walk) = drifted(true);
         assert!(outcome.keyframe_restored);
         assert_eq!(walk.mapper.keyframe().unwrap().keyframe_id, 0);
-        // The map keeps its places, and what the drifted keyframe saw is not carried over.
+        // The map keeps its poses, and the depth of the drifted keyframe is not carried over.
         let depth = &walk.mapper.depth.active;
         let held = walk.mapper.map.keyframes[0].points.len();
         assert!(depth.num_hypotheses() <= held, "{} of {held} points", depth.num_hypotheses());
@@ -291,7 +290,7 @@ mod tests {
     }
 
     #[test]
-    fn zero_makes_a_new_keyframe_every_time() {
+    fn a_largest_distance_of_zero_makes_a_new_keyframe_every_time() {
         let mut walk = Walk::new();
         walk.mapper.params.reuse.max_distance = 0.0;
         for place in [0.0, 1.2, 0.0, 1.2] {

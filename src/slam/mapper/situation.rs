@@ -1,4 +1,4 @@
-//! What the mapper is doing and why, for whoever looks on.
+//! What the mapper is doing and why, for display.
 
 use std::fmt;
 
@@ -10,26 +10,26 @@ use crate::slam::pose::PoseEstimate;
 use crate::slam::two_frame::evidence::Waiting;
 use crate::slam::two_frame::{Failure, InitOutcome, InitState};
 
-/// Where the mapper stands.
+/// What the mapper is doing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Situation {
     /// No map yet.
     Starting(StartProgress),
-    /// The camera is looked for on so many keyframes of a map that was there before.
+    /// This many keyframes of a map of earlier runs are searched for the camera.
     Localising(usize),
-    /// It was found there, and nothing has been added yet, or nothing is to be.
+    /// The camera was found there, and nothing has been added yet, or nothing will be.
     Localised(Certainty),
-    /// The map can be trusted and grows.
+    /// The map is trusted and grows.
     Mapping,
     /// The camera is lost; recent keyframes are searched for it.
     Lost,
     /// The map contradicted itself; earlier keyframes are searched for the camera.
     Rejected(Contradiction),
-    /// The camera has been lost for long: a new epoch is being begun, and the search continues.
+    /// The camera has been lost for long: a new epoch is being started, and the search continues.
     Restarting(StartProgress),
 }
 
-/// How sure it is where the camera is in a map.
+/// Certainty of the camera's pose in a map.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Certainty {
     /// Share of the keyframe's points in view that the image agrees with, per cent.
@@ -39,9 +39,9 @@ pub struct Certainty {
 }
 
 impl Certainty {
-    /// Of a pose on its keyframe, whose unit is the mean depth.
+    /// Certainty of a pose on its keyframe, whose unit is the mean depth.
     pub(super) fn of(pose: &PoseEstimate) -> Self {
-        /// Places of the variances of the translation in the covariance.
+        /// Indices of the translation's variances in the covariance.
         const VARIANCES: [usize; 3] = [0, 6, 11];
         let variance: f64 = VARIANCES.iter().map(|&place| pose.covariance[place]).sum();
         let std_dev = Some(variance.sqrt()).filter(|of| of.is_finite()).unwrap_or(f64::MAX);
@@ -96,7 +96,7 @@ impl fmt::Display for Situation {
     }
 }
 
-/// What one frame came to while there is no map: why none began on it.
+/// Outcome of one frame while there is no map: why no map started on it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum StartFrame {
     /// It is the first frame of a start, or ended one.
@@ -118,9 +118,9 @@ pub enum StartFrame {
 }
 
 impl StartFrame {
-    /// What the frame `pixels` came to in a start.
+    /// The outcome of the frame `pixels` in a start.
     pub(super) fn of(outcome: &InitOutcome, is_first: bool, pixels: &[u8]) -> Self {
-        /// Motion of the image that noise does not make, pixels.
+        /// Motion of the image that noise does not cause, pixels.
         const MIN_MOTION_PX: f64 = 1.0;
         match outcome.state {
             InitState::Waiting(Waiting::Texture) => Self::without_texture(pixels),
@@ -150,19 +150,19 @@ impl StartFrame {
     }
 }
 
-/// How far a two-frame start is.
+/// Progress of a two-frame start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct StartProgress {
     /// What it waits for; `None` before its first frame.
     pub waiting: Option<Waiting>,
-    /// How often it has begun again.
+    /// Number of times that it has begun again.
     pub failures: u32,
-    /// Why the last time.
+    /// Reason for the last time.
     pub last_failure: Option<Failure>,
 }
 
 impl StartProgress {
-    /// Takes in what a frame came to.
+    /// Takes in the outcome of a frame.
     pub(super) fn observe(&mut self, state: InitState) {
         match state {
             InitState::Waiting(waiting) => self.waiting = Some(waiting),
@@ -204,7 +204,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_start_tells_what_it_waits_for_and_why_it_began_again() {
+    fn a_start_reports_what_it_waits_for_and_why_it_began_again() {
         let mut progress = StartProgress::default();
         progress.observe(InitState::Waiting(Waiting::Translation));
         assert_eq!(Situation::Starting(progress).to_string(), "starting: waiting for translation");

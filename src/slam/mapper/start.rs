@@ -1,4 +1,4 @@
-//! How a map begins: from two frames, from a sensor, or from given poses.
+//! The start of a map: from two frames, from a depth sensor, or from given poses.
 
 use crate::slam::depth::gaussian::{
     NEW_VALIDITY, ObservationCounts, ObservedPixels, Observer, observe,
@@ -23,30 +23,30 @@ use crate::slam::two_frame::{
     Failure, InitOutcome, InitState, TwoFrameInitializer, TwoFrameParams,
 };
 
-/// A two-frame start, and what is said of it.
+/// A two-frame start and its progress.
 #[derive(Debug)]
 pub(super) struct Start {
     intrinsics: Intrinsics,
     params: TwoFrameParams,
-    /// Its memory is given back when a map has begun.
+    /// Freed once a map has started.
     initializer: Option<Box<TwoFrameInitializer>>,
     /// Sequence and stamp of its first frame.
     first: Option<(u64, i64)>,
-    /// Those of the latest frame.
+    /// The same of the latest frame.
     latest: Option<(u64, i64)>,
-    /// How far it is.
+    /// Its progress.
     pub(super) progress: StartProgress,
-    /// What the last frame came to, where it was one of the start.
+    /// Outcome of the last frame, if it belonged to the start.
     pub(super) last_frame: Option<StartFrame>,
 }
 
 impl Start {
-    /// A start on images of `intrinsics`; no frame yet.
+    /// Creates a start for images of `intrinsics`, before its first frame.
     pub(super) fn new(
         intrinsics: Intrinsics,
         params: &TwoFrameParams,
     ) -> Result<Self, ParameterError> {
-        // For its checks: it is made when frames come.
+        // Only validates the parameters: the initializer is created with the first frame.
         TwoFrameInitializer::new(intrinsics, params.clone())
             .map_err(|error| error.within("two_frame"))?;
         Ok(Self {
@@ -60,21 +60,21 @@ impl Start {
         })
     }
 
-    /// Forgets what it has seen.
+    /// Forgets its frames and its progress.
     pub(super) fn forget(&mut self) {
         self.give_up();
         self.progress = StartProgress::default();
     }
 
-    /// A map is there without it: gives its memory back.
+    /// Frees its memory, since a map has started without it.
     pub(super) fn give_up(&mut self) {
         (self.first, self.latest, self.initializer) = (None, None, None);
     }
 
-    /// Takes another frame; once parallax is proven gives what was found. Of a fast camera some are left out: a start
-    /// is judged by steps of about 30 Hz, and has to prove itself within so many of them.
+    /// Takes a frame; returns the start once parallax is proven. Some frames of a fast camera are left out: a start is
+    /// judged in steps of about 30 Hz, and must be proven within a fixed number of them.
     fn step(&mut self, frame: &FrameView<'_>) -> Option<Proven> {
-        /// A frame that comes so soon after the one before is left out, nanoseconds: 45 Hz.
+        /// A frame this soon after the previous one is left out, nanoseconds: 45 Hz.
         const TOO_SOON: std::ops::Range<i64> = 1..22_000_000;
         let since = self.latest.map(|(_, nanos)| frame.capture_nanos.saturating_sub(nanos));
         if since.is_some_and(|since| TOO_SOON.contains(&since)) {
@@ -110,20 +110,20 @@ impl Start {
 struct Proven {
     /// Sequence and stamp of its first frame.
     first: (u64, i64),
-    /// What the frame that proved it came to.
+    /// Outcome of the frame that proved it.
     outcome: InitOutcome,
-    /// Where the depth is.
+    /// Holds the depth.
     initializer: Box<TwoFrameInitializer>,
 }
 
 impl Mapper {
-    /// Begins an epoch: at once where a sensor gives depth or the pose is claimed without a map (it is
-    /// given, so the baselines will be true), else once two frames prove it. An epoch after
-    /// the first begins where the camera was last known to be and in the unit of the last keyframe:
-    /// nothing ties it to the one before, and who does not look at the epoch sees the smallest jump.
+    /// Starts an epoch: at once where a sensor gives depth or the pose is claimed without a map (it is given, so the
+    /// baselines will be true), otherwise once two frames prove it. A later epoch starts at the camera's last known
+    /// pose and in the unit of the last keyframe: nothing ties it to the epoch before, and a subscriber that ignores
+    /// the epoch sees the smallest jump.
     pub(super) fn begin(&mut self, input: &StepInput<'_>) -> StepOutcome {
         let StepInput { frame, pose, sensor_depth } = *input;
-        // After a map was rejected a pose on it may still come, which nobody has given.
+        // After a map was rejected, a pose on it may still arrive, which is not a given one.
         let is_given = pose.state.is_tracked() && matches!(self.phase, Phase::Starting);
         if sensor_depth.is_none() && !is_given {
             return match self.start.step(frame) {
@@ -150,7 +150,7 @@ impl Mapper {
         StepOutcome::begun()
     }
 
-    /// How to search in a frame at `pose`: the less is known of the pose, the less is believed of a match.
+    /// Matching parameters for a frame at `pose`: the less certain the pose, the less certain a match.
     pub(super) fn matching_at(&self, pose: &PoseEstimate) -> MatchingParams {
         let matching = &self.params.matching;
         let pose_noise_px = pose_noise_px(&self.intrinsics, &pose.alignment_covariance);
@@ -160,9 +160,9 @@ impl Mapper {
         }
     }
 
-    /// Gives the depth of a keyframe without any, at given poses, the unit in which the longest search in a frame
-    /// that far away reaches the nearest depth that is looked for: what the poses are measured in says
-    /// nothing about how far away things are. The keyframe's own unit stays that of the poses.
+    /// Sets the unit of the depth buffer, for a keyframe without depth at given poses, such that the longest search in
+    /// a frame at this baseline reaches the nearest depth that is searched for: the unit of the poses contains no
+    /// information about the depth of the scene. The keyframe's own unit stays that of the poses.
     pub(super) fn guess_unit(&mut self, keyframe_from_camera: &SE3) {
         /// Share of the longest search that is used, so that rounding does not make it too long.
         const USED_SEARCH: f64 = 0.95;
@@ -178,7 +178,7 @@ impl Mapper {
         }
     }
 
-    /// Where the next epoch begins and what its unit is in the one before, as far as can be known.
+    /// Pose and unit at which the next epoch starts: those of the camera and of the last trusted keyframe, if any.
     fn origin(&self, pose: &PoseEstimate) -> (SE3, f64) {
         let trusted = |keyframe: &&Keyframe| keyframe.map_state == MapState::Established;
         match self.map.keyframes.iter().rev().find(trusted) {
@@ -187,14 +187,14 @@ impl Mapper {
         }
     }
 
-    /// The number of the next epoch: neither it nor any above was given before, here or in a mapper that died.
+    /// The number of the next epoch: neither it nor any above was assigned before, here or by a mapper that died.
     pub fn free_epoch(&self) -> u32 {
         let numbers = self.map.keyframes.iter().map(|keyframe| keyframe.epoch);
         let after_last = numbers.max().map_or(0, |last| last.saturating_add(1));
         after_last.max(self.first_free_epoch)
     }
 
-    /// Leaves the active keyframe and begins depth on `pixels`, in a world of its own.
+    /// Leaves the active keyframe and starts depth on `pixels`, in a new world.
     fn begin_epoch(&mut self, pixels: &[u8]) {
         self.leave_keyframe();
         if let Some(left) = self.keyframe() {
@@ -213,8 +213,8 @@ impl Mapper {
         self.depth.restart(pixels, &self.params);
     }
 
-    /// The first frame of a proven start becomes a keyframe and this frame the next one, so that the
-    /// tracker begins where the camera is.
+    /// Makes the first frame of a proven start a keyframe and this frame the next one, so that the tracker starts where
+    /// the camera is.
     fn begin_proven(
         &mut self,
         frame: &FrameView<'_>,
@@ -235,7 +235,7 @@ impl Mapper {
             FrameView { sequence: first.0, capture_nanos: first.1, pixels: first_pixels, ..*frame };
         let place = UncertainPlace::exact(Sim3::new(origin, unit * scale));
         self.add_keyframe(&first_frame, &place, epoch);
-        // A map begins with two frames in one step.
+        // A map starts with two frames in one step.
         self.copies.begin_frame();
         let pose = PoseEstimate {
             epoch,
@@ -279,7 +279,7 @@ fn proven_pose(frame: &FrameView<'_>, start: &InitOutcome, scale: f64) -> PoseEs
         state: TrackingState::Initializing,
         keyframe_from_camera,
         covariance,
-        // Without one it would count as given, and what is observed at it as exact.
+        // Without a covariance the pose would count as given, and observations at it as exact.
         alignment_covariance: covariance,
         brightness: start.brightness,
         ..PoseEstimate::unknown(frame)
@@ -323,9 +323,9 @@ mod tests {
     const PERIOD_NANOS: i64 = 33_333_333;
 
     #[test]
-    fn a_start_of_a_fast_camera_has_as_long_as_one_of_a_slow_camera() {
+    fn a_start_has_as_much_time_with_a_fast_camera_as_with_a_slow_one() {
         let image = Scene::new(1).render(&CAMERA, &SE3::identity());
-        // Frames that the start has taken when it gives up a camera that stands still, and when that is.
+        // Number of frames taken when the start gives up on a camera at rest, and the time of that.
         let given_up = |rate: i64| {
             let mut start = Start::new(CAMERA, &TwoFrameParams::default()).unwrap();
             let mut taken = 0;
@@ -348,7 +348,7 @@ mod tests {
         }
     }
 
-    /// A start that goes forwards, each frame by 0.2, and the frame that proves it.
+    /// A start with a camera that moves forwards by 0.2 per frame, and the frame that proves it.
     fn proven(params: &TwoFrameParams) -> (Proven, Vec<u8>) {
         let mut start = Start::new(CAMERA, params).unwrap();
         let proven = (0..3).find_map(|frame| {
@@ -371,7 +371,7 @@ mod tests {
     }
 
     #[test]
-    fn a_black_frame_gets_no_pose_afterwards_and_ends_those_before_it() {
+    fn a_black_frame_is_not_kept_and_drops_the_early_frames_before_it() {
         let mut mapper = Mapper::new(CAMERA, MapperParams::default()).unwrap();
         let seen = Scene::new(1).render(&CAMERA, &SE3::identity()).noisy(2.0, 1);
         // A sensor's black with its noise.
@@ -384,8 +384,8 @@ mod tests {
     }
 
     #[test]
-    fn the_first_keyframe_has_the_stamp_of_the_frame_that_the_start_went_on_from() {
-        // One frame of the camera's motion shows 84 % of the points again, two of them 78 %.
+    fn the_first_keyframe_has_the_stamp_of_the_frame_that_the_start_continued_from() {
+        // After one frame of the camera's motion 84 % of the points are still visible, after two 78 %.
         for (min_visible_ratio, first) in [(0.6, 10), (0.8, 11)] {
             let mut params = TwoFrameParams::default();
             params.evidence.min_visible_ratio = min_visible_ratio;

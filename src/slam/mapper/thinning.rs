@@ -1,7 +1,7 @@
-//! Redundant keyframes: one whose points several others show at least as well gives up image and depth, so that the map
-//! of rooms that are seen over and over stays as large as the rooms.
+//! Thinning: a keyframe whose points several others show at least as well drops its image and depth, so that a map of
+//! rooms that are seen again and again grows only with the rooms.
 //!
-//! Its pose stays and moves with that of a neighbour: frames that were tracked on it stay where they are in the map.
+//! It keeps its pose, which moves with that of a neighbour: frames tracked on it stay placed in the map.
 
 use std::collections::BTreeMap;
 
@@ -15,40 +15,40 @@ use crate::slam::map::{Correction, KeyframeCorrection, Map};
 use crate::slam::mapper::Mapper;
 use crate::slam::mapper::reuse::ReuseParams;
 
-/// Newest keyframes that are left alone: recovery looks at the last twenty, and estimates free the last seven.
+/// Newest keyframes that are left alone: recovery tries twenty, and estimates free the last seven.
 const NUM_NEWEST: usize = 24;
-/// Keyframes that are examined with each new one: more than are added, and about a millisecond.
+/// Keyframes that are examined with each new one: more than are added, in about a millisecond.
 const NUM_EXAMINED: usize = 4;
-/// Keyframes that must show a point too: as many as an estimate needs to hold one in place, and one to spare.
+/// Other keyframes that must show a point: as many as an estimate needs to hold one in place, and one to spare.
 const NUM_OTHERS: usize = 3;
-/// Share of the points that must be shown by so many.
+/// Share of the points that this many others must show.
 const LEAST_SHARE: f64 = 0.9;
-/// Points that are looked at: the share is then known to 0.02.
+/// Points that are checked: they determine the share to 0.02.
 const MOST_POINTS: usize = 256;
-/// Another shows a point as well where it is at most so many times as far from it.
+/// Another keyframe shows a point as well if it is at most this many times as far from it.
 const MOST_DISTANCE_RATIO: f64 = 1.25;
-/// And looks at it from a direction that differs by at most 20°: beyond, alignment finds other texture.
+/// Least cosine of the angle between their directions to it, 20°: beyond, alignment meets different texture.
 const LEAST_COSINE: f64 = 0.94;
-/// Keyframes further away than so many mean depths see what they have in common from other directions.
+/// Keyframes further away than this many mean depths see common points from other directions.
 const REACH: f64 = 0.5;
 
-/// Which keyframes have given up their depth, and what they move with.
+/// Keyframes that have lost their depth, and the keyframes that they move with.
 #[derive(Debug, Default)]
 pub(super) struct Thinning {
-    /// By keyframe without depth the one that it moves with.
+    /// For each keyframe without depth, the one that it moves with.
     attached: BTreeMap<u64, u64>,
-    /// The last one that was examined: the next is the one before.
+    /// The keyframe examined last: the next is the one before.
     examined: Option<u64>,
 }
 
 impl Thinning {
-    /// The correction with the keyframes that move with those in it, from where they are in the map: another correction
-    /// may have moved the two each for itself.
+    /// Extends a correction by the keyframes that move with those in it, from their current poses in the map: another
+    /// correction may have moved the two independently.
     pub fn follow(&self, map: &Map, correction: &Correction) -> Correction {
         let mut extended = correction.clone();
         let places: BTreeMap<u64, Sim3> =
             correction.keyframes.iter().map(|k| (k.keyframe_id, k.map_from_keyframe)).collect();
-        // Whatever else they followed: by two leaders they would be moved twice.
+        // They follow nothing else: two leaders would move them twice.
         extended.keyframes.retain(|k| !self.attached.contains_key(&k.keyframe_id));
         extended.keyframes.extend(self.attached.iter().filter_map(|(&id, to)| {
             let (was, keyframe) = (map.get(*to)?, map.get(id)?);
@@ -58,13 +58,13 @@ impl Thinning {
         extended
     }
 
-    /// A keyframe moves with another from now on, and so does what moved with it.
+    /// Attaches a keyframe to another, along with the keyframes attached to it.
     fn attach(&mut self, keyframe_id: u64, to: u64) {
         self.attached.values_mut().filter(|of| **of == keyframe_id).for_each(|of| *of = to);
         self.attached.insert(keyframe_id, to);
     }
 
-    /// The next places in the list of keyframes to be examined, newest first and round again.
+    /// Indices of the next keyframes to be examined, newest first, cyclically.
     fn next(&mut self, map: &Map, may_go: impl Fn(&Keyframe) -> bool) -> Vec<usize> {
         let eligible: Vec<usize> =
             (0..map.keyframes.len()).rev().filter(|&k| may_go(&map.keyframes[k])).collect();
@@ -78,9 +78,9 @@ impl Thinning {
 }
 
 impl Mapper {
-    /// Takes image and depth from keyframes of the active epoch that others show as well, where there are more than is
-    /// allowed. A bounded number is examined with each new keyframe. Those that a loop is measured between stay: another
-    /// loop is confirmed beside it.
+    /// Drops image and depth of keyframes of the active epoch that others show as well, where there are more than
+    /// allowed. Examines a bounded number with each new keyframe. Keyframes of a measured loop stay: another loop is
+    /// confirmed next to it.
     pub(super) fn thin(&mut self) {
         let Some(active) = self.keyframe() else { return };
         let (active_id, epoch) = (active.keyframe_id, active.epoch);
@@ -114,8 +114,8 @@ impl Mapper {
     }
 }
 
-/// Of a keyframe whose points enough others show as well, one of them from near enough to be taken up in its stead: the
-/// nearest of those.
+/// The nearest keyframe that can be reused in place of one whose points enough others show as well; `None` where too
+/// few show them, or no other is near enough.
 fn shown_by(map: &Map, index: usize, reuse: &ReuseParams) -> Option<u64> {
     let keyframe = &map.keyframes[index];
     let place = keyframe.map_from_keyframe;
@@ -147,8 +147,8 @@ fn shown_by(map: &Map, index: usize, reuse: &ReuseParams) -> Option<u64> {
     if f64::from(shown) < LEAST_SHARE * f64::from(all) {
         return None;
     }
-    // Who comes back here must find one to be tracked on in its stead, by that one's unit and points as reuse measures:
-    // where there is none the way back is mapped anew, and drifts.
+    // A camera that returns here must find another keyframe to be tracked on, measured by that one's unit and points as
+    // reuse does: otherwise the path back is mapped anew, and drifts.
     let stands_in = |of: &Keyframe| {
         let at = of.map_from_keyframe.locate(&place.rigid);
         reuse.distance.distance(at.translation.norm(), of.usage(&at)) < reuse.max_distance
@@ -159,8 +159,8 @@ fn shown_by(map: &Map, index: usize, reuse: &ReuseParams) -> Option<u64> {
     nearest.map(|of| of.keyframe_id)
 }
 
-/// Whether a keyframe shows a point as well as another, in whose frame and unit it is; `view` maps that into the
-/// keyframe's. What lies between would have to fit between two rays 20° apart at most.
+/// Whether a keyframe shows a point as well as another, in whose frame and unit the point is; `view` maps these into
+/// the keyframe's. An occluder would have to fit between two rays at most 20° apart.
 fn shows(keyframe: &Keyframe, view: &Sim3, at: &Vector3<f64>) -> bool {
     let seen = *view * *at;
     let from_other = seen - view.rigid.translation;
@@ -209,7 +209,7 @@ mod tests {
         Keyframe { keyframe_id, ..Keyframe::at(place, CAMERA, points.collect(), image) }
     }
 
-    /// A mapper whose camera has gone `rounds` times along ten places before a wall.
+    /// A mapper whose camera has passed ten places in front of a wall `rounds` times.
     fn mapper(rounds: u64, redundant_above: usize) -> Mapper {
         let params = MapperParams { redundant_above, ..MapperParams::default() };
         let mut mapper = Mapper::new(CAMERA, params).unwrap();
@@ -239,7 +239,7 @@ mod tests {
         map.keyframes[3] = keyframe(3, 0.03, 0.4);
         assert!(shown_by(&map, 0, &ReuseParams::default()).is_none(), "one looks elsewhere");
         let mut map = near(&[0.0, 0.02, -0.01, 0.03]);
-        // The same place seen from twice as far shows half the detail.
+        // From further away the same place shows less detail.
         map.keyframes[3].map_from_keyframe.rigid.translation.z = -0.4;
         assert!(shown_by(&map, 0, &ReuseParams::default()).is_none(), "one from further away");
         let mut map = near(&[0.0, 0.02, -0.01, 0.03]);
@@ -248,23 +248,23 @@ mod tests {
     }
 
     #[test]
-    fn a_keyframe_stays_where_none_can_be_taken_up_in_its_stead() {
+    fn a_keyframe_keeps_its_depth_where_no_other_can_be_reused_instead() {
         let at = [0.0, 0.02, -0.01, 0.03].iter().enumerate();
         let keyframes = at.map(|(k, x)| keyframe(k as u64, *x, 0.0)).collect();
         let map = Map { keyframes, ..Map::default() };
         let stands_in = |max_distance: f64| {
             shown_by(&map, 0, &ReuseParams { max_distance, ..ReuseParams::default() })
         };
-        // All its points are shown: what is left is the distance of a hundredth of a mean depth.
+        // All its points are shown: only the distance, a hundredth of a mean depth, remains.
         let weight = DistanceWeights::default().translation;
         let nearest = (0.01 * weight).powi(2);
         assert_eq!(stands_in(1.01 * nearest + 1e-3), Some(2));
         assert!(stands_in(0.5 * nearest).is_none());
     }
 
-    /// One behind the others has points at its border that they do not show: what counts is what it sees of theirs.
+    /// A keyframe behind the others has border points that they do not show: what it sees of their points counts.
     #[test]
-    fn what_stands_in_is_measured_in_its_own_unit_and_by_its_own_points() {
+    fn a_substitute_is_measured_in_its_own_unit_and_by_its_own_points() {
         const BEHIND: f64 = 0.04;
         let at = [0.0, 0.02, -0.01, 0.03].iter().enumerate();
         let keyframes = at.map(|(k, x)| keyframe(k as u64, *x, 0.0)).collect();
@@ -287,7 +287,7 @@ mod tests {
     }
 
     #[test]
-    fn rounds_along_the_same_places_leave_as_many_keyframes_as_places_want() {
+    fn repeated_rounds_keep_only_as_many_keyframes_as_the_places_need() {
         let mut mapper = mapper(12, 30);
         mapper.map.loops =
             Arc::new(KnownLoops { links: vec![loop_between(7, 12)], ..Default::default() });
@@ -300,19 +300,19 @@ mod tests {
         assert!(has_depth(7) && has_depth(12), "keyframes with a loop");
         assert!(mapper.map.keyframes[120 - NUM_NEWEST..].iter().all(Keyframe::has_depth));
         assert_eq!(mapper.map.keyframes.len(), 120, "poses stay");
-        // A map that is not larger than allowed is left whole.
+        // A map within the limit is left unchanged.
         let mut small = self::mapper(12, 120);
         small.thin();
         assert_eq!(small.map.num_held(), 120);
     }
 
     #[test]
-    fn what_gave_up_its_depth_moves_with_a_neighbour() {
+    fn a_keyframe_without_depth_moves_with_a_neighbour() {
         let mut mapper = mapper(12, 30);
         for _ in 0..200 {
             mapper.thin();
         }
-        // A loop moves every keyframe by its own.
+        // A loop moves every keyframe differently.
         let by_its_own = |of: &Keyframe| {
             let by = Sim3::new(
                 SE3::exp(&(Vector6::repeat(1e-3) * of.keyframe_id as f64)),
@@ -322,7 +322,7 @@ mod tests {
         };
         let keyframes = mapper.map.keyframes.iter().map(by_its_own).collect();
         mapper.apply(&Correction { keyframes, ..Correction::default() }).unwrap();
-        // All that have depth are turned, moved and scaled alike: so must be the others.
+        // All that have depth are rotated, moved and scaled alike: the others must follow.
         let moved = Sim3::new(SE3::exp(&[0.3, -0.1, 0.2, 0.1, 0.4, -0.2].into()), 1.3);
         let held = mapper.map.keyframes.iter().filter(|of| of.has_depth());
         let keyframes = held
@@ -338,9 +338,9 @@ mod tests {
         }
     }
 
-    /// The window takes it for a follower of the keyframe before it.
+    /// The window treats it as a follower of the keyframe before it.
     #[test]
-    fn what_gave_up_its_depth_does_not_follow_two_leaders() {
+    fn a_keyframe_without_depth_does_not_follow_two_leaders() {
         let mut mapper = Mapper::new(CAMERA, MapperParams::default()).unwrap();
         mapper.map.keyframes = (0..3).map(|id| keyframe(id, 0.1 * id as f64, 0.0)).collect();
         mapper.active = Some(Active::new(2));

@@ -1,5 +1,5 @@
-//! How alike two images look where one camera is turned far against the other, rolled above all: small images without
-//! their slow changes, compared over what both see.
+//! Similarity of two images whose cameras are rotated far against each other, above all rolled: small images without
+//! their slow variation, compared where both see the scene.
 
 use nalgebra::{Rotation3, UnitQuaternion, Vector3};
 
@@ -8,39 +8,39 @@ use crate::slam::mapper::appearance::{COLUMNS, ROWS};
 
 /// Pixels of a small image.
 const COUNT: usize = COLUMNS * ROWS;
-/// Pixels that are summed up side by side, in the same order on every CPU.
+/// Pixels that are summed in parallel, in the same order on every CPU.
 const LANES: usize = 8;
-/// In place of a pixel that the camera does not see.
+/// Marks a pixel that the camera does not see.
 const OUTSIDE: u16 = u16::MAX;
 
-/// Rotations that a camera may have against a keyframe, and what it sees of the keyframe's image then if nothing is near.
+/// Rotations of a camera against a keyframe, and what it sees of the keyframe's image under each if nothing is near.
 #[derive(Debug)]
 pub(in crate::slam) struct TurnedViews {
     camera: Intrinsics,
     /// `keyframe_from_camera`.
     rotations: Vec<UnitQuaternion<f64>>,
-    /// For each of them, pixel by pixel of a keyframe's small image, the camera's pixel.
+    /// For each of them, the camera's pixel for every pixel of a keyframe's small image.
     pixels: Vec<u16>,
 }
 
-/// Which of the rotations makes two images look most alike.
+/// The rotation under which two images are most similar.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::slam) struct TurnedView {
     /// `keyframe_from_camera`.
     pub(in crate::slam) rotation: UnitQuaternion<f64>,
-    /// Correlation, more where more is seen by both.
+    /// Correlation, higher where the views overlap more.
     pub(in crate::slam) score: f32,
 }
 
 impl TurnedViews {
-    /// For two images of `camera`.
+    /// Creates the views for images of `camera`.
     pub(in crate::slam) fn new(camera: &Intrinsics) -> Self {
         /// Steps of the rotation about the optical axis: all around.
         const ROLLS: u32 = 24;
-        /// Steps of pan and tilt either way, degrees each: about what a coarse alignment reaches on both sides.
+        /// Steps of pan and tilt either way, and their degrees: about what a coarse alignment reaches on both sides.
         const STEPS: i32 = 4;
         const STEP_DEG: f64 = 9.0;
-        /// Share of the keyframe's image that the camera must see: below a quarter chance finds likeness.
+        /// Pixels of the keyframe's image that the camera must see: below a quarter, similarity arises by chance.
         const LEAST_SEEN: usize = COUNT / 4;
         let mut views = Self { camera: *camera, rotations: Vec::new(), pixels: Vec::new() };
         let about = |axis, angle| UnitQuaternion::from_axis_angle(&axis, angle);
@@ -66,12 +66,12 @@ impl TurnedViews {
         views
     }
 
-    /// Whether it is for this camera.
+    /// Whether the views are for this camera.
     pub(in crate::slam) fn is_for(&self, camera: &Intrinsics) -> bool {
         self.camera == *camera
     }
 
-    /// For each keyframe how it looks most like the frame. Both are details of
+    /// The view in which each keyframe is most similar to the frame. Both are given by the details of their
     /// [`Appearance`](crate::slam::mapper::appearance::Appearance).
     pub(in crate::slam) fn compare(
         &self,
@@ -102,9 +102,9 @@ impl TurnedViews {
     }
 }
 
-/// The pixel of the camera that sees what is far away at a pixel of the keyframe.
+/// The camera's pixel that sees a distant point at a pixel of the keyframe.
 fn seen_at(camera: &Intrinsics, camera_from_keyframe: &Rotation3<f64>, pixel: usize) -> u16 {
-    /// Least cosine of a ray and the optical axis: beyond it a view is stretched without limit.
+    /// Least cosine between a ray and the optical axis: below it a view is stretched without limit.
     const LEAST_COSINE: f64 = 0.2;
     let scale_u = camera.width as f64 / COLUMNS as f64;
     let scale_v = camera.height as f64 / ROWS as f64;
@@ -136,12 +136,12 @@ fn sums(keyframe: &[f32], frame: &[f32; COUNT], mask: &[f32; COUNT]) -> [f32; 3]
     lanes.map(|lane| lane.iter().sum())
 }
 
-/// Correlation in standard deviations of chance, but for a factor (Fisher's transformation); `None` where there is
-/// nothing to be compared.
+/// Correlation in standard deviations of chance, up to a factor (Fisher's transformation); `None` where there is
+/// nothing to compare.
 fn score(common: f32, [ours, theirs]: [f32; 2], count: f32) -> Option<f32> {
-    /// Variance of the details, grey levels², below which an image shows nothing.
+    /// Variance of the details, grey levels², up to which an image shows nothing.
     const LEAST_VARIANCE: f32 = 0.05;
-    /// What rounding may make of a perfect likeness.
+    /// Limits a perfect correlation against rounding.
     const MOST: f32 = 0.999;
     let least = LEAST_VARIANCE * count;
     (ours > least && theirs > least)
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rolled_and_tilted_view_is_known_and_how_it_is_turned() {
+    fn a_rolled_and_tilted_view_is_recognised_with_its_rotation() {
         let views = TurnedViews::new(&CAMERA);
         assert!(views.is_for(&CAMERA));
         let about =
@@ -185,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn what_shows_nothing_is_like_nothing_however_it_is_turned() {
+    fn a_uniform_image_is_similar_to_nothing_under_any_rotation() {
         let views = TurnedViews::new(&CAMERA);
         let here = seen(&SE3::identity(), 1);
         let wall = [0.0; COUNT];

@@ -1,19 +1,19 @@
-//! Which points of others a keyframe was seen to agree with.
+//! Which points of other keyframes a keyframe agrees with.
 //!
-//! That a point projects into an image says nothing of what stands before it: through a wall a keyframe has the points of
-//! the next room in view, more of them than of its own surroundings where it looks at a wall from near.
+//! A point that projects into an image may be occluded: behind a wall the points of the next room project into a
+//! keyframe as well, more of them than of its own surroundings if it sees the wall from near.
 
 use crate::slam::window::Window;
 use crate::slam::window::keyframe::Agreed;
 
-/// Share of the comparisons with a host's points that count, from which on some of them are seen: of those behind a wall
-/// one in ten to three does by chance, on a wall of little contrast more, of others four in five, and of a host seen
-/// through a door something between.
+/// Least share of inliers among the comparisons with a host's points at which some of them are taken as seen: of points
+/// behind a wall one in ten to three agrees by chance, more on a wall of little contrast; of visible ones four in five,
+/// and of a host seen through a door a share in between.
 const LEAST_SHARE: f64 = 0.3;
 
 impl Window {
-    /// Keeps, right after an adjustment, which points those members agree with whose own points are still to be chosen:
-    /// theirs is the depth that is held against others' points.
+    /// Records, right after an adjustment, the points that members agree with whose own points are still to be chosen:
+    /// it is their depth that is compared with others' points.
     pub(super) fn note_agreement(&mut self, members: &[usize]) {
         let most_energy = self.robustness().most_energy;
         let (views, system) = (&self.solver.views, &self.solver.system);
@@ -49,7 +49,7 @@ mod tests {
     use crate::slam::window::tests::room;
 
     #[test]
-    fn a_new_keyframe_agrees_with_what_it_sees_and_not_with_what_is_hidden() {
+    fn a_new_keyframe_agrees_with_visible_points_and_not_with_occluded_ones() {
         let mut window = Window::new(CAMERA, WindowParams::default());
         window.keyframes = room(|_, _| (1.0, 0.0)).keyframes;
         let members: Vec<usize> = (0..window.keyframes.len()).collect();
@@ -72,7 +72,7 @@ mod tests {
             .collect();
         depth.sort_by_key(|point| (point.v, point.u));
         assert!(!window.projected_into(last, &depth).is_empty());
-        // Something else stands before all of it.
+        // Something else occludes all of it.
         let mut random = Random::new(5);
         let mut wall = vec![0u8; CAMERA.width * CAMERA.height];
         wall.fill_with(|| (128.0 + 40.0 * random.normal()).clamp(0.0, 255.0) as u8);

@@ -1,4 +1,4 @@
-//! Where the points of a keyframe come from.
+//! The candidates for a keyframe's points.
 
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::DepthPoint;
@@ -6,31 +6,31 @@ use crate::slam::window::Window;
 use crate::slam::window::params::WindowParams;
 use crate::slam::window::selection::choose_spread;
 
-/// Fewer mature points than this hold neither a keyframe's pose nor a plane through its depth, which wants 30 of them:
-/// they are chosen from its depth then.
+/// Fewer mature points than this constrain neither a keyframe's pose nor a plane through its depth, which needs 30: the
+/// points are then chosen from its depth.
 const FEWEST_MATURE: usize = 40;
 
 /// Points of the interval filter that were mature when their keyframe was left.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MaturePoints {
-    /// The keyframe.
+    /// Their keyframe.
     pub keyframe_id: u64,
     /// Their depth, in the keyframe's unit, in the order in which their pixels were chosen.
     pub points: Vec<DepthPoint>,
 }
 
-/// What a keyframe's points will be chosen from.
+/// The candidates for a keyframe's points.
 #[derive(Debug, Clone)]
 pub(super) struct Candidates {
     pub(super) keyframe_id: u64,
     /// Its depth.
     pub(super) depth: Vec<DepthPoint>,
-    /// Its mature points, which are chosen from where they are not too few.
+    /// Its mature points, used where there are enough.
     pub(super) mature: Option<Vec<DepthPoint>>,
 }
 
 impl Candidates {
-    /// Those of the keyframe's points that are estimated, in an order of which every beginning is spread over its image.
+    /// Chooses the points to be estimated, in an order of which every prefix is spread over the image.
     pub(super) fn choose(
         &self,
         pixels: &[u8],
@@ -45,13 +45,13 @@ impl Candidates {
 }
 
 impl Window {
-    /// Takes the mature points of keyframes that were left since the last time; [`Window::take_in`] finds them there. A
-    /// keyframe without a list, or of whose list too few can be chosen, has its points from its depth.
+    /// Takes the mature points of keyframes that were left since the last call, for [`Window::take_in`]. A keyframe
+    /// without a list, or with too few points to choose from in it, has its points from its depth.
     pub fn take_mature(&mut self, mature: &mut Vec<MaturePoints>) {
         self.mature.append(mature);
     }
 
-    /// The mature points of a keyframe as they were last given.
+    /// Removes the mature points last given for a keyframe.
     pub(super) fn mature_of(&mut self, keyframe_id: u64) -> Option<Vec<DepthPoint>> {
         let place = self.mature.iter().rposition(|of| of.keyframe_id == keyframe_id)?;
         Some(self.mature.remove(place).points)
@@ -89,7 +89,7 @@ mod tests {
         Map { keyframes: keyframes.collect(), ..Map::default() }
     }
 
-    /// Pixels of the first keyframe's points after its mature ones were given as such of a keyframe.
+    /// Pixels of the first keyframe's points after `mature` was given as the list of keyframe `keyframe_id`.
     fn chosen(map: &Map, mature: &[DepthPoint], keyframe_id: u64) -> Vec<(u16, u16)> {
         let mut window = Window::new(CAMERA, WindowParams::default());
         let mut given = vec![MaturePoints { keyframe_id, points: mature.to_vec() }];
@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn mature_points_are_chosen_from_where_they_are_enough_and_depth_elsewhere() {
+    fn points_come_from_mature_ones_where_there_are_enough_and_from_depth_otherwise() {
         let map = map();
         let every = |step| map.keyframes[0].points.iter().step_by(step).copied();
         let mature: Vec<DepthPoint> = every(37).collect();
@@ -110,7 +110,7 @@ mod tests {
         assert!(of_mature.len() > 300 && of_mature.iter().all(is_mature), "{}", of_mature.len());
         let of_depth = chosen(&map, &mature, 1);
         assert!(of_depth.len() > 300 && !of_depth.iter().all(is_mature));
-        // None, and a few too few.
+        // None, and one too few.
         for few in [&[][..], &mature[..FEWEST_MATURE - 1]] {
             assert_eq!(chosen(&map, few, 0), of_depth, "{}", few.len());
         }

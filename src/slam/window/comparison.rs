@@ -1,14 +1,14 @@
-//! Points compared with a keyframe: what goes into the comparison, and the sums that come out.
+//! Comparison of points with a keyframe: its inputs and the resulting sums.
 //!
 //! `X' = R X + t` with (R, t) = `observer_from_host`, X at the host's pixel and the point's inverse depth d; with the
 //! image of the observer I and its gradient g at π(X'):
 //!
 //! `r_k = I(π(X'_k)) − m h_k`, `h_k` the host's samples over their mean, `m` the mean of the observer's: every pattern
-//! has a gain of its own, so that vignette, exposure and response need no model. It costs one degree of freedom of
-//! eight. X' is scaled by d throughout, so that points at infinity are finite.
+//! has its own gain, so that vignette, exposure and response need no model. It costs one degree of freedom of eight. X'
+//! is scaled by d throughout, so that points at infinity are finite.
 //!
 //! `∂r_k/∂p = (g_k − h_k mean(g))ᵀ ∂π/∂p`, where ∂π/∂p is taken at the pattern's centre (Engel, Koltun, Cremers 2018
-//! §2.3), for the observer's pose p (left increment) and for d. The eight samples then only enter by
+//! §2.3), for the observer's pose p (left increment) and for d. The eight samples then enter only through
 //! `M = Σ w g gᵀ` and `b = Σ w g r`: `H = (∂π/∂p)ᵀ M (∂π/∂p)`.
 
 use nalgebra::Matrix6;
@@ -29,10 +29,10 @@ pub const LANES: usize = 16;
 /// Pixels at the border of an observer that are not read.
 pub(super) const BORDER_PX: f32 = 1.0;
 
-/// A number of each comparison of a block.
+/// One value for each comparison of a block.
 pub type Lane = [f32; LANES];
 
-/// What a point looks like in its host, at one level.
+/// Appearance of a point in its host, at one level.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Look {
     /// Samples over their mean.
@@ -42,18 +42,18 @@ pub struct Look {
 }
 
 impl Look {
-    /// Whether there is a pattern at all.
+    /// Whether there is a valid pattern.
     pub fn is_whole(&self) -> bool {
         self.weight[0] > 0.0
     }
 }
 
-/// How residuals count.
+/// Robust weighting of residuals.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Robustness {
-    /// Residuals beyond grow linearly, grey levels.
+    /// The cost of residuals beyond this grows linearly, grey levels.
     pub huber_grey: f32,
-    /// Energy above which a comparison is of something else.
+    /// Energy above which the observer sees something else.
     pub most_energy: f32,
 }
 
@@ -70,7 +70,7 @@ pub struct Patterns {
 }
 
 impl Patterns {
-    /// No points: they are outside every image.
+    /// No points: their rays are outside every image.
     pub const NONE: Self = Self {
         shape: [[0.0; LANES]; SAMPLES],
         weight: [[0.0; LANES]; SAMPLES],
@@ -78,7 +78,7 @@ impl Patterns {
         inverse_depth: [0.0; LANES],
     };
 
-    /// Puts a point into a lane; nothing where it has no pattern.
+    /// Puts a point into a lane; does nothing where it has no valid pattern.
     #[inline(always)]
     pub fn set(&mut self, lane: usize, look: &Look, ray: [f32; 2]) {
         if !look.is_whole() {
@@ -93,16 +93,16 @@ impl Patterns {
     }
 }
 
-/// What the comparisons of a block came to.
+/// The results of the comparisons of a block.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[repr(C, align(64))]
 pub struct Compared {
-    /// Robust cost, grey levels²; NaN where a sample is outside the image or behind the camera, infinite where something
-    /// else is seen.
+    /// Robust cost, grey levels²; NaN where a sample is outside the image or behind the camera, infinite where the
+    /// observer sees something else.
     pub cost: Lane,
-    /// Σ w J ∂r/∂d of the observer's pose; as it was where poses are not wanted.
+    /// Σ w J ∂r/∂d of the observer's pose; unchanged where poses are not wanted.
     pub observer: [Lane; POSE],
-    /// The same of the host's.
+    /// The same for the host's pose.
     pub host: [Lane; POSE],
     /// Σ w (∂r/∂d)².
     pub depth: Lane,
@@ -111,7 +111,7 @@ pub struct Compared {
 }
 
 impl Compared {
-    /// Nothing was seen.
+    /// No point is seen.
     pub const NONE: Self = Self {
         cost: [f32::NAN; LANES],
         observer: [[0.0; LANES]; POSE],
@@ -142,7 +142,7 @@ pub struct Wanted {
     pub host: bool,
 }
 
-/// Where an observer stands from a host, at one level.
+/// Geometry of an observer relative to a host, at one level.
 #[derive(Debug, Clone, Copy)]
 pub struct Pair {
     pub(super) rotation: [[f32; 3]; 3],
@@ -151,15 +151,15 @@ pub struct Pair {
     pub(super) offsets: [[f32; SAMPLES]; 3],
     pub(super) focal: [f32; 2],
     pub(super) centre: [f32; 2],
-    /// Largest position that is read.
+    /// Largest pixel position that is read.
     pub(super) last: [f32; 2],
-    /// Derivative of the observer's increment by the host's.
+    /// Derivative of the observer's increment with respect to the host's.
     pub(super) by_host: [[f32; POSE]; POSE],
     pub(super) wanted: Wanted,
 }
 
 impl Pair {
-    /// Of images of `camera`, which is that of the level.
+    /// Creates the pair for images of `camera`, the camera of the level.
     pub fn new(observer_from_host: &SE3, camera: &Intrinsics, wanted: Wanted) -> Self {
         let of = observer_from_host.rotation_matrix();
         let rotation = [0, 1, 2].map(|row| [0, 1, 2].map(|column| of[(row, column)] as f32));
@@ -184,7 +184,7 @@ impl Pair {
         }
     }
 
-    /// Derivative of the observer's increment by the host's.
+    /// Derivative of the observer's increment with respect to the host's.
     pub fn by_host(observer_from_host: &SE3) -> Matrix6<f64> {
         -observer_from_host.adjoint()
     }
@@ -199,7 +199,7 @@ pub(super) fn fits(image: &SharedImage, pair: &Pair) -> bool {
         && bottom <= image.height() as f32 - 3.0
 }
 
-/// The sum of all lanes, in pairs.
+/// The sum of all lanes, added in pairs.
 pub fn sum(of: &Lane) -> f32 {
     let half: [f32; 8] = std::array::from_fn(|k| of[k] + of[k + 8]);
     sum_of_samples(&half)

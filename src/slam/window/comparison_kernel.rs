@@ -1,4 +1,4 @@
-//! The comparison in lanes: each lane is a point, the samples of its pattern come one after the other.
+//! The comparison in lanes: each lane holds a point, and the samples of its pattern follow one after the other.
 //!
 //! Nothing is summed across lanes and nothing is fused, so that all instruction sets give the same bits.
 
@@ -9,12 +9,12 @@ use crate::slam::window::comparison::{
     BORDER_PX, Compared, LANES, Lane, POSE, Pair, PairSums, Patterns, Robustness, SAMPLES, fits,
 };
 
-/// Smallest z'/z of a point: nearer than a twentieth of its distance it is not seen as it was.
+/// Smallest z'/z of a point: from nearer than a twentieth of its distance it does not look the same.
 const MIN_DEPTH_RATIO: f32 = 0.05;
 
 impl Kernel {
-    /// Compares the points of `patterns` with an observer and adds those that count to the sums of the pair. As many
-    /// blocks of `compared` are written as there are patterns; none where the image is smaller than the pair's camera.
+    /// Compares the points of `patterns` with an observer and adds the inliers to the sums of the pair. Writes one
+    /// block of `compared` per pattern; all are [`Compared::NONE`] where the image is smaller than the pair's camera.
     pub fn compare(
         self,
         image: &SharedImage,
@@ -32,7 +32,7 @@ impl Kernel {
     }
 }
 
-/// What [`Kernel::compare`] compares.
+/// The arguments of [`Kernel::compare`].
 struct Comparison<'a> {
     image: &'a SharedImage,
     pair: &'a Pair,
@@ -64,9 +64,9 @@ impl Body for Comparison<'_> {
     }
 }
 
-/// Some points in the observer's image.
+/// Points projected into the observer's image.
 struct Warped<R: Register> {
-    /// All samples are inside the image.
+    /// Whether all samples are inside the image.
     inside: Mask<R>,
     /// X' over its depth.
     x: Lanes<R>,
@@ -79,7 +79,7 @@ struct Warped<R: Register> {
     gradient_v: [Lanes<R>; SAMPLES],
 }
 
-/// What the samples of some points sum to.
+/// Sums over the samples of each point.
 struct Weighed<R> {
     /// M.
     uu: Lanes<R>,
@@ -133,7 +133,7 @@ fn warp<I: Instructions>(
         observed[k] = top + at.dv * gradient_v[k];
         gradient_u[k] = upper + at.dv * (lower - upper);
     }
-    // Elsewhere harmless numbers: 0 · NaN would be NaN.
+    // Harmless numbers outside: 0 · NaN would be NaN.
     Warped {
         inside,
         x: inside.select(c0 * nearness, zero),
@@ -252,7 +252,7 @@ impl<R: Register> Motion<R> {
     }
 }
 
-/// The sums of the points.
+/// Writes the sums of the points.
 #[inline(always)]
 fn derive_depths<I: Instructions>(
     lanes: I,
@@ -286,7 +286,7 @@ fn derive_depths<I: Instructions>(
     }
 }
 
-/// The sums of the pair.
+/// Adds to the sums of the pair.
 #[inline(always)]
 fn derive_poses<I: Instructions>(
     lanes: I,

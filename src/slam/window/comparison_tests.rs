@@ -1,4 +1,4 @@
-//! The comparison: derivatives against differences, lanes against a plain explanation and against each other.
+//! The comparison: derivatives against differences, lanes against a plain reference and against each other.
 
 use nalgebra::Vector6;
 
@@ -26,7 +26,7 @@ fn waves(phase: f32) -> SharedImage {
     SharedImage::try_from_pixels(CAMERA.width, CAMERA.height, pixels.into()).unwrap()
 }
 
-/// What the pattern around a pixel looks like, every sample of weight 1.
+/// Appearance of the pattern around a pixel, every sample of weight 1.
 fn look(image: &SharedImage, u: usize, v: usize) -> Look {
     let samples = PATTERN.map(|(du, dv)| {
         let row = image.row(v.wrapping_add_signed(dv as isize));
@@ -36,7 +36,7 @@ fn look(image: &SharedImage, u: usize, v: usize) -> Look {
     Look { shape: samples.map(|grey| grey / mean), weight: [1.0; SAMPLES] }
 }
 
-/// Of a pixel at depth 1.
+/// The ray of a pixel, at depth 1.
 fn ray(u: f64, v: f64) -> [f32; 2] {
     CAMERA.ray(u, v).xy().map(|x| x as f32).into()
 }
@@ -61,7 +61,7 @@ fn compare(
     (seen[0], sums)
 }
 
-/// Cost of a comparison and half its gradient, by pose of the observer and by depth.
+/// Cost of a comparison and half its gradient, with respect to the observer's pose and to depth.
 fn compared(
     image: &SharedImage,
     look: &Look,
@@ -79,7 +79,7 @@ fn compared(
 }
 
 #[test]
-fn derivatives_are_those_of_the_cost() {
+fn derivatives_match_differences_of_the_cost() {
     let (host, observer) = (waves(0.0), waves(0.4));
     let pose = SE3::exp(&Vector6::from([0.1, -0.05, 0.08, 0.02, -0.03, 0.05]));
     for (u, v, depth) in [(80, 60, 0.4), (200, 150, 0.9), (150, 40, 0.2)] {
@@ -87,7 +87,7 @@ fn derivatives_are_those_of_the_cost() {
         let ray = ray(u as f64, v as f64);
         let at = |pose: &SE3, depth: f64| compared(&observer, &look, ray, pose, depth);
         let found = at(&pose, depth).1;
-        // A two hundredth of a pixel to each side: hardly a sample leaves its four pixels, between which the gradient is exact.
+        // A two-hundredth of a pixel to each side: hardly a sample leaves its four pixels, where the gradient is exact.
         let pixels = 0.005 / CAMERA.fx;
         let length = found.iter().take(3).map(|g| g * g).sum::<f64>().sqrt();
         for m in 0..=POSE {
@@ -100,7 +100,7 @@ fn derivatives_are_those_of_the_cost() {
                 }
             };
             let numeric = (moved(h) - moved(-h)) / (4.0 * h);
-            // Those of translation and rotation differ by the depth.
+            // Those by translation and by rotation differ by the depth.
             let size = if m < 3 { length } else { length / depth };
             assert!(
                 (found[m] - numeric).abs() < 0.1 * size,
@@ -111,8 +111,8 @@ fn derivatives_are_those_of_the_cost() {
     }
 }
 
-/// A comparison without lanes, tricks and f32: the samples at their own places, ∂π at the pattern's centre. Cost, the
-/// sums H of (pose, depth) and the right side.
+/// Reference comparison without lanes, tricks and f32: the samples at their own positions, ∂π at the pattern's centre.
+/// Returns the cost, the sums H of (pose, depth) and the right side.
 fn explained(
     image: &SharedImage,
     look: &Look,
@@ -167,7 +167,7 @@ fn explained(
 }
 
 #[test]
-fn sums_are_those_of_a_plain_explanation() {
+fn sums_match_the_reference_comparison() {
     let (host, observer) = (waves(0.0), waves(0.4));
     let robustness = Robustness { huber_grey: 9.0, most_energy: f32::INFINITY };
     let pose = SE3::exp(&Vector6::from([0.1, -0.05, 0.08, 0.02, -0.03, 0.05]));
@@ -179,7 +179,7 @@ fn sums_are_those_of_a_plain_explanation() {
         let (seen, sums) = compare(kernel, &observer, &pair, &look, ray, depth as f32, &robustness);
         let (cost, hessian, right) = explained(&observer, &look, ray, &pose, depth, &robustness);
         assert!((f64::from(seen.cost[0]) - cost).abs() < 1e-3 * cost, "{cost}");
-        // Of what the diagonal allows.
+        // Relative to what the diagonal allows.
         let near = |found: f32, expected: f64, a: usize, b: usize| {
             let size = (hessian[a][a] * hessian[b][b]).sqrt();
             assert!(
@@ -252,7 +252,7 @@ fn all_instruction_sets_give_the_same_bits() {
 }
 
 #[test]
-fn numbers_that_are_none_are_outside() {
+fn invalid_numbers_are_outside_the_image() {
     let image = waves(0.0);
     let look = look(&image, 100, 100);
     let pair = Pair::new(&SE3::identity(), &CAMERA, ALL_WANTED);
@@ -271,7 +271,7 @@ fn numbers_that_are_none_are_outside() {
             assert!(all.flatten().all(|number| number.is_finite()), "{ray:?} {depth}");
             assert!(seen.cost[1].is_nan() && seen.depth[0].is_finite(), "{ray:?} {depth}");
         }
-        // A smaller image than the camera's is not read.
+        // An image smaller than the camera's is not read.
         let small = SharedImage::try_from_pixels(100, 50, [7; 5000].into()).unwrap();
         let (seen, _) = compare(kernel, &small, &pair, &look, ray(150.0, 100.0), 1.0, &EASY);
         assert!(seen.cost.iter().all(|cost| cost.is_nan()));

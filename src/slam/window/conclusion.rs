@@ -1,21 +1,21 @@
-//! All keyframes estimated once more, when nothing comes any more.
+//! The final estimate of all keyframes, after the last frame.
 //!
-//! What the window froze early is free again: in rendered rooms the error of the trajectory is halved or better.
+//! Keyframes that the window fixed early are free again: in rendered rooms the trajectory error is halved or better.
 
 use crate::slam::window::members::Chosen;
 use crate::slam::window::{Adjustment, Window};
 
-/// Keyframes that are free at once: bounds memory (the equations, about 170 bytes a comparison) and time.
+/// Keyframes that are free together: bounds memory (the equations, about 170 bytes a comparison) and time.
 const PIECE: usize = 40;
 /// Keyframes from one piece to the next: each is free twice, among those before it and among those after it.
 const STEP: usize = 20;
 /// Newest keyframes that are estimated once more: six pieces take a few seconds.
 pub(super) const MOST: usize = 120;
-/// Most iterations of a level: further ones lower the cost by what interpolation makes of it and change nothing else.
+/// Most iterations of a level: further ones only lower the part of the cost that is due to interpolation.
 const MAX_ITERATIONS: u32 = 15;
 
 impl Window {
-    /// Estimates all keyframes of the newest one's epoch, piece by piece.
+    /// Estimates the newest keyframes of the epoch, at most `MOST`, piece by piece.
     pub(super) fn adjust_all(&mut self, newest: usize) -> Option<Adjustment> {
         let of_epoch = self.of_epoch_up_to(newest);
         let mut last = None;
@@ -32,7 +32,7 @@ impl Window {
         }
     }
 
-    /// Estimates the newest keyframes of the epoch, as many as are free at once.
+    /// Estimates the newest keyframes of the epoch, as many as are free together.
     pub(super) fn adjust_newest(&mut self, newest: usize) -> Option<Adjustment> {
         let of_epoch = self.of_epoch_up_to(newest);
         let (begin, end) = (of_epoch.len().saturating_sub(PIECE), of_epoch.len());
@@ -42,7 +42,7 @@ impl Window {
         adjustment
     }
 
-    /// The keyframes from `begin` to `end` of an epoch's, and those beside them that hold them in place.
+    /// The keyframes `begin..end` of an epoch, which are free, and those around them that hold them in place.
     pub(super) fn choose_piece(&self, of_epoch: &[usize], begin: usize, end: usize) -> Chosen {
         let (before, piece) = of_epoch[..end].split_at(begin);
         let after = &of_epoch[end..];
@@ -51,7 +51,7 @@ impl Window {
         for group in self.groups(piece) {
             let held_by = self.covisible(&outside, &[group[0], group[group.len() - 1]]);
             let is_oldest = before.is_empty() && group[0] == piece[0];
-            // A group that nothing holds would go anywhere.
+            // A group that nothing holds would drift freely.
             if !held_by.is_empty() || is_oldest || group.len() == piece.len() {
                 fixed.extend(held_by);
                 free.extend(group);

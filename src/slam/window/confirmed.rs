@@ -1,10 +1,10 @@
-//! The window's points for whoever shows the map: where each is, and how many keyframes confirm it.
+//! The window's points for display: where each is, and how many keyframes confirm it.
 
 use crate::slam::map::{ConfirmedPoint, Map};
 use crate::slam::window::Window;
 
 impl Window {
-    /// The points that something agrees with, by keyframe; those of keyframes that `map` does not hold are left out.
+    /// Returns the points that some keyframe confirms, by host; hosts that `map` does not hold are left out.
     pub fn confirmed_points(&self, map: &Map) -> Vec<ConfirmedPoint> {
         let hosts =
             self.keyframes.iter().filter_map(|host| Some((host, map.get(host.keyframe_id)?)));

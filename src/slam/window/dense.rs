@@ -1,9 +1,9 @@
-//! The whole depth of a keyframe, compared with the keyframes around it as the chosen points are, all poses held.
+//! Refines a keyframe's whole depth by comparing it with surrounding keyframes as the chosen points are, poses fixed.
 //!
-//! The filter saw each pixel in frames near its keyframe, at the poses that the tracker had then. Keyframes are farther
-//! away and known better: each inverse depth goes to where they agree best (Gauss–Newton, coarse to fine), and that is
-//! fused with what the filter had, and with the pixels beside it. In the descent the filter's value is the beginning and
-//! no prior: its errors are those of its poses, common to all pixels.
+//! The filter saw each pixel in frames near its keyframe, at the tracker's poses. Keyframes are further away and their
+//! poses more accurate: each inverse depth moves to where they agree best (Gauss–Newton, coarse to fine), and the
+//! result is fused with the filter's value and with the neighbouring pixels. In the descent the filter's value is the
+//! initial one and no prior: its errors are those of its poses, common to all pixels.
 
 use std::collections::HashSet;
 use std::ops::Range;
@@ -24,52 +24,52 @@ use crate::slam::window::neighbours::{Neighbourhood, Single};
 use crate::slam::window::params::WindowParams;
 use crate::slam::window::plane::fit;
 
-/// Keyframes that a keyframe's depth is compared with, those that see most of it. With four or eight, which are farther
-/// off, depth is no better; with two ICL's median error is 1.9 % instead of 1.7.
+/// Keyframes that a keyframe's depth is compared with, those that see most of it. With four or eight, which are further
+/// away, depth is no better; with two, ICL's median error is 1.9 % instead of 1.7.
 const OBSERVERS: usize = 3;
 /// Levels, and steps on each. Without level 1 the floor's median error is 2.2 % instead of 1.7.
 const STEPS: [(usize, u32); 2] = [(1, 3), (0, 3)];
 /// Points that are compared at a time: they stay in the cache.
 const CHUNK: usize = 16 * LANES;
-/// Largest factor by which a step may change a depth, either way: further the linearisation says nothing.
+/// Largest factor by which a step may change a depth, either way: beyond it the linearisation does not hold.
 const MAX_STEP: f32 = 1.3;
 /// Samples of a pattern that err together: they overlap with their neighbours' interpolation.
 const SAMPLES_TOGETHER: f64 = 2.0;
-/// Depths that differ by more standard deviations than this are not of the same thing: the filter's stays.
+/// Depths that differ by more standard deviations than this belong to different surfaces: the filter's is kept.
 const MOST_APART: f64 = 3.0;
-/// By how much its variance grows then: it is half as sure.
+/// Factor by which its variance then grows: it is half as certain.
 const CONTRADICTED: f64 = 4.0;
-/// Variance over that of a point on which filter and keyframes agree, for each squared standard deviation that they are
-/// apart; with 2 instead of 1 one in a hundred true depths more lies within two standard deviations.
+/// Factor on the variance of a point on which filter and keyframes agree, for each squared standard deviation that they
+/// are apart; with 2 instead of 1, one in a hundred more true depths lies within two standard deviations.
 const DOUBT: f64 = 2.0;
-/// Of the filter's standard deviation what no keyframe takes away: lens, shutter and slanted surfaces misplace a pixel in
-/// all of them alike. Chosen by the share of true depths within one standard deviation: between 0.6 and 0.8 in
+/// Share of the filter's standard deviation that no keyframe removes: lens, shutter and slanted surfaces misplace a
+/// pixel in all of them alike. Chosen by the share of true depths within one standard deviation: between 0.6 and 0.8 in
 /// freiburg1_floor, ICL office3 and rooms.
 const COMMON: f64 = 0.415;
 
-/// Whose depth is refined, once all else is done.
+/// The keyframes whose depth is to be refined, once nothing else is to be done.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Refinement {
     waiting: Vec<u64>,
-    /// Once only: what was fused is not the filter's any more, and what nothing sees will not be seen.
+    /// Once only: fused depth is no longer the filter's, and a keyframe that none sees will not be seen later.
     done: HashSet<u64>,
-    /// The one that is away to be refined while frames come, and what became of it.
+    /// The keyframe that is being refined during mapping, and the result.
     begun: Option<Box<Keyframe>>,
     refined: Option<RefinedDepth>,
 }
 
 impl Refinement {
-    /// All that are not yet.
+    /// Queues all keyframes that are not refined yet.
     pub fn begin(&mut self, keyframes: &[WindowKeyframe]) {
         let ids = keyframes.iter().map(|keyframe| keyframe.keyframe_id);
         self.waiting = ids.filter(|id| !self.done.contains(id)).collect();
     }
 }
 
-/// What is known of a point.
+/// The estimate of a point.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct State {
-    /// One over the unit of the map.
+    /// In 1 / unit of the map.
     inverse_depth: f32,
     /// H_dd.
     hessian: f32,
@@ -91,14 +91,14 @@ struct Observers<'a> {
 }
 
 impl Window {
-    /// After the last estimate: the keyframe whose depth is to be refined next, the newest first.
+    /// After the last estimate: takes the keyframe whose depth is to be refined next, the newest first.
     pub fn next_unrefined(&mut self) -> Option<u64> {
         let next = self.refinement.waiting.pop()?;
         self.refinement.done.insert(next);
         Some(next)
     }
 
-    /// The estimate was not taken: depth is not refined from it.
+    /// The estimate was dropped: depth is not refined from it.
     pub fn leave_unrefined(&mut self) {
         let Refinement { waiting, done, begun, refined } = &mut self.refinement;
         waiting.clear();
@@ -108,8 +108,8 @@ impl Window {
         }
     }
 
-    /// While frames come: takes the newest keyframe that is not free with every new one any more and has not been refined,
-    /// for [`Window::optimise`]; false where there is none. To be asked where nothing else is to be estimated.
+    /// During mapping: takes the newest keyframe that is no longer free with every new one and has not been refined,
+    /// for [`Window::optimise`]; false where there is none. Call it when there is nothing else to estimate.
     pub fn begin_refinement(&mut self, map: &Map, active: u64) -> bool {
         let Some(newest) = self.keyframes.len().checked_sub(1) else { return false };
         let of_epoch = self.of_epoch_up_to(newest);
@@ -131,24 +131,24 @@ impl Window {
         true
     }
 
-    /// A keyframe has got other depth since it was begun with: it is refined another time.
+    /// The keyframe's depth has changed since its refinement began: it is refined another time.
     pub fn refine_later(&mut self, keyframe_id: u64) {
         self.refinement.done.remove(&keyframe_id);
     }
 
-    /// Refines the keyframe that was begun with; false where none was.
+    /// Refines the keyframe that was taken for this; false where none was.
     pub(super) fn refine_begun(&mut self) -> bool {
         let Some(keyframe) = self.refinement.begun.take() else { return false };
         self.refinement.refined = self.refined(&keyframe);
         true
     }
 
-    /// Depth that was refined while frames came.
+    /// Takes the depth that was refined during mapping.
     pub fn take_refined(&mut self) -> Option<RefinedDepth> {
         self.refinement.refined.take()
     }
 
-    /// Depth of a keyframe of the map, from those that see most of it; `None` where none does.
+    /// Refines the depth of a keyframe of the map from those that see most of it; `None` where none does.
     pub fn refined(&self, keyframe: &Keyframe) -> Option<RefinedDepth> {
         let index = self.index_of(keyframe.keyframe_id)?;
         let host = &self.keyframes[index];
@@ -185,7 +185,7 @@ impl Window {
         Some(RefinedDepth { keyframe_id, of_revision, points: smooth })
     }
 
-    /// Its images on the levels that are used.
+    /// A keyframe's images at the levels that are used.
     fn images_of(&self, keyframe: &WindowKeyframe) -> Vec<SharedImage> {
         let mut images: Vec<SharedImage> = keyframe.images.first().cloned().into_iter().collect();
         while let Some(finer) = images.last()
@@ -220,7 +220,7 @@ impl Window {
         }
     }
 
-    /// The keyframe's points, inverse depth in one over the unit of the map, moved to where its chosen points are.
+    /// The keyframe's points, inverse depth in 1 / unit of the map, corrected by the plane that fits its chosen points.
     fn placed_points(&self, host: &WindowKeyframe, keyframe: &Keyframe) -> Vec<DepthPoint> {
         let [offset, per_x, per_y] = fit(&self.of_own_points(host, keyframe)).unwrap_or_default();
         let plane = LogPlane { offset, per_x, per_y };
@@ -258,7 +258,7 @@ impl Window {
     }
 }
 
-/// What `of` gives for so many points, some at a time; the thread of the joint estimation works alone beside the frames.
+/// Applies `of` to all points by chunks: in parallel in a thread pool, alone in the estimates' thread alongside frames.
 fn by_chunk<T: Send>(points: usize, of: impl Fn(Range<usize>) -> Vec<T> + Sync) -> Vec<T> {
     let chunk = |index: usize| of(CHUNK * index..(CHUNK * (index + 1)).min(points));
     let chunks = 0..points.div_ceil(CHUNK);
@@ -270,7 +270,7 @@ fn by_chunk<T: Send>(points: usize, of: impl Fn(Range<usize>) -> Vec<T> + Sync) 
     }
 }
 
-/// What points of a host look like at a level.
+/// Determines the appearance of a host's points at a level.
 struct Looking<'a> {
     points: &'a [DepthPoint],
     image: &'a SharedImage,
@@ -296,20 +296,20 @@ impl Body for Looking<'_> {
     }
 }
 
-/// Points of a host at a level, and what a comparison with an observer comes to.
+/// Points of a host at a level, and the results of their comparison with an observer.
 struct Chunk {
     patterns: Vec<Patterns>,
     seen: Vec<Compared>,
 }
 
 impl Chunk {
-    /// Memory for so many points.
+    /// Buffers for this many points.
     fn of(points: usize) -> Self {
         let blocks = points.div_ceil(LANES);
         Self { patterns: vec![Patterns::NONE; blocks], seen: vec![Compared::NONE; blocks] }
     }
 
-    /// A few steps of each point for itself; one that does not lower the cost is not taken.
+    /// A few steps for each point independently; a step that does not lower the cost is not taken.
     fn descend(&mut self, states: &mut [State], observers: &Observers<'_>) {
         self.linearise(states, observers);
         let mut trial = states.to_vec();
@@ -356,7 +356,7 @@ impl State {
         self.right += seen.depth_right[lane];
     }
 
-    /// Where the linear model has its minimum.
+    /// The minimum of the linear model, at most a factor of `MAX_STEP` away.
     fn stepped(&self) -> f32 {
         let Self { inverse_depth, hessian, right, .. } = *self;
         if !(hessian > 0.0 && inverse_depth > 0.0) {
@@ -366,25 +366,25 @@ impl State {
         stepped.clamp(inverse_depth / MAX_STEP, inverse_depth * MAX_STEP)
     }
 
-    /// Cost of all observers, also of those that see something else or nothing.
+    /// Cost of all observers, including those that see something else or nothing.
     fn energy(&self, observers: &Observers<'_>) -> f32 {
         let others = observers.pairs.len() as f32 - self.inliers as f32;
         self.cost + others * observers.robustness.most_energy
     }
 }
 
-/// Of the observers that agree, grey levels².
+/// Mean over the observers that agree, grey levels².
 fn mean_squared_residual(found: &[State]) -> f64 {
     let cost: f64 = found.iter().map(|state| f64::from(state.cost)).sum();
     let inliers: usize = found.iter().map(|state| state.inliers as usize).sum();
     cost / (SAMPLES * inliers.max(1)) as f64
 }
 
-/// The mean of what the filter has and what the keyframes say, weighted by their certainty.
+/// Fuses the filter's depth with that of the keyframes, weighted by certainty.
 fn fused(filter: &DepthPoint, found: &State, mean_squared_residual: f64) -> Single {
     let (was, of_filter) = (f64::from(filter.inverse_depth), f64::from(filter.variance));
     let common = COMMON * COMMON * of_filter;
-    // So much less sure than the filter by itself.
+    // The filter's depth, its variance multiplied by `doubt`.
     let unchanged = |doubt: f64| Single {
         inverse_depth: was,
         own: doubt * (of_filter - common),
@@ -401,7 +401,7 @@ fn fused(filter: &DepthPoint, found: &State, mean_squared_residual: f64) -> Sing
         return unchanged(CONTRADICTED);
     }
     let share = of_filter / (of_filter + of_keyframes);
-    // What contradicts is less certain than what agrees.
+    // Depths that contradict each other are less certain than those that agree.
     let doubt = (DOUBT * apart).max(1.0);
     let own = share * of_keyframes;
     Single {

@@ -1,4 +1,4 @@
-//! Depth of a whole keyframe of the rendered room, refined by the keyframes around it at their true places.
+//! Depth of a whole keyframe of the rendered room, refined from the keyframes around it at their true poses.
 
 use super::tests::{Room, room};
 use super::*;
@@ -7,7 +7,7 @@ use crate::slam::keyframe::DepthPoint;
 use crate::slam::keyframe::Keyframe;
 use crate::slam::test_scene::{CAMERA, Random};
 
-/// Unit of the keyframe in that of the map.
+/// Unit of the keyframe, in that of the map.
 const UNIT: f64 = 2.0;
 const NOISE: f64 = 0.05;
 
@@ -18,7 +18,7 @@ fn window(room: &Room) -> Window {
     Window { keyframes, ..Window::new(CAMERA, WindowParams::default()) }
 }
 
-/// The room's keyframe 1 with noise and a common factor by depth, `relief`, in its depth, and the points without them.
+/// The room's keyframe 1, its depth with noise and a common factor by depth, `relief`, and the true inverse depths.
 fn keyframe(room: &Room, relief: f64) -> (Keyframe, Vec<f64>) {
     let mut random = Random::new(7);
     let host = &room.keyframes[1];
@@ -51,7 +51,7 @@ fn median_size(errors: &[f64]) -> f64 {
 }
 
 #[test]
-fn noise_and_relief_go_and_certainty_grows() {
+fn refinement_removes_noise_and_relief_and_increases_certainty() {
     let room = room(|_, _| (1.0, 0.0));
     let (keyframe, truth) = keyframe(&room, 0.1);
     let before = median_size(&errors(&keyframe.points, &truth));
@@ -81,7 +81,7 @@ fn noise_and_relief_go_and_certainty_grows() {
 }
 
 #[test]
-fn depth_of_something_else_stays_as_it_is() {
+fn depth_that_contradicts_the_keyframes_is_left_unchanged() {
     let room = room(|_, _| (1.0, 0.0));
     let (mut keyframe, _) = keyframe(&room, 0.0);
     let sure = keyframe.points.len() / 2;
@@ -93,7 +93,7 @@ fn depth_of_something_else_stays_as_it_is() {
 }
 
 #[test]
-fn a_keyframe_that_no_other_sees_is_left() {
+fn a_keyframe_that_no_other_sees_is_not_refined() {
     let mut room = room(|_, _| (1.0, 0.0));
     let (keyframe, _) = keyframe(&room, 0.0);
     for (index, other) in room.keyframes.iter_mut().enumerate() {
@@ -116,7 +116,7 @@ fn refined_depth_does_not_depend_on_the_number_of_threads() {
 }
 
 #[test]
-fn every_keyframe_is_refined_once_and_none_where_the_estimate_was_not_taken() {
+fn every_keyframe_is_refined_once_and_none_after_a_dropped_estimate() {
     let mut window = window(&room(|_, _| (1.0, 0.0)));
     let taken = |window: &mut Window| -> Vec<u64> {
         window.refinement.begin(&window.keyframes);

@@ -1,17 +1,17 @@
-//! Points eliminated from the normal equations, compiled for the vector units that the processor has.
+//! Elimination of points from the normal equations, compiled for the processor's vector units.
 //!
 //! One source for all: no operation is fused or reordered, so every version gives the same bits.
 
 use crate::slam::kernel::Kernel;
 use crate::slam::window::comparison::POSE;
 
-/// Entries of a row of a block: a register's, the last two are 0.
+/// Entries of a row of a block: padded to a register, the last two are 0.
 pub(super) const PADDED: usize = 8;
 
-/// What two poses have to do with each other.
+/// The block that couples two poses.
 pub(super) type Block = [[f64; PADDED]; POSE];
 
-/// What a point has to do with one free pose.
+/// The block that couples a point with one free pose.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct RowBlock {
     /// Number of the pose.
@@ -23,7 +23,7 @@ pub(super) struct RowBlock {
 /// A point's part of the equations.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct PointRow {
-    /// First of its blocks, which are in the order of the poses.
+    /// Index of the first of its blocks, which are in the order of the poses.
     pub first: usize,
     /// Number of them.
     pub count: usize,
@@ -33,13 +33,13 @@ pub(super) struct PointRow {
     pub right: f64,
 }
 
-/// Place of a block of the lower triangle.
+/// Index of a block of the lower triangle.
 #[inline(always)]
 pub(super) fn lower(row: usize, column: usize) -> usize {
     row * (row + 1) / 2 + column
 }
 
-/// Takes points out of the equations of the poses, a lower triangle of blocks.
+/// Eliminates points from the equations of the poses, a lower triangle of blocks.
 pub(super) fn eliminate(
     kernel: Kernel,
     points: &[PointRow],
@@ -58,7 +58,7 @@ pub(super) fn eliminate(
     }
 }
 
-// Not a `Body`: the compiler must know that the slices do not overlap, which only arguments of these functions say.
+// Not a `Body`: the compiler must know that the slices do not overlap, which only function arguments express.
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
@@ -82,7 +82,7 @@ fn eliminate_avx512(
     eliminate_portable(points, rows, reduced, right);
 }
 
-/// The explanation of the others.
+/// The reference, which the others compile for their instructions.
 #[inline(always)]
 fn eliminate_portable(
     points: &[PointRow],
@@ -115,7 +115,7 @@ mod tests {
     use crate::slam::test_scene::Random;
 
     #[test]
-    fn all_versions_give_the_same_bits_and_take_the_product_away() {
+    fn all_versions_give_the_same_bits_and_subtract_the_product() {
         let mut random = Random::new(3);
         let poses = 4;
         let mut rows = Vec::new();

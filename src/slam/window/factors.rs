@@ -1,4 +1,4 @@
-//! The solution of the equations that are left for the poses.
+//! Solves the equations that remain for the poses.
 
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 
@@ -14,14 +14,14 @@ pub(super) struct Factors {
 }
 
 impl Factors {
-    /// Of a lower triangle of blocks with so many rows in all, and of a stiffness of 1 along `stiffened`, after the
-    /// scaling; `None` where it is not positive.
+    /// Factorises a lower triangle of blocks with `size` rows in all, plus a stiffness of 1 along `stiffened`, after
+    /// the scaling; `None` where it is not positive definite.
     pub(super) fn of(
         blocks: &[Block],
         size: usize,
         stiffened: Option<&DVector<f64>>,
     ) -> Option<Self> {
-        /// Added to the unit diagonal: the gauge that nothing holds must not be singular.
+        /// Added to the unit diagonal, so that a gauge that nothing holds is not singular.
         const REGULARISATION: f64 = 1e-9;
         let entry = |row: usize, column: usize| {
             blocks[lower(row / POSE, column / POSE)][row % POSE][column % POSE]
@@ -48,7 +48,7 @@ impl Factors {
     }
 }
 
-/// Solves `matrix · x = −right` of a lower triangle of blocks.
+/// Solves `matrix · x = −right` for a lower triangle of blocks.
 pub(super) fn solve(blocks: &[Block], right: &[f64]) -> Option<DVector<f64>> {
     let size = right.len();
     if size == 0 {

@@ -1,4 +1,4 @@
-//! What the window says to the map: new places, units and depth.
+//! The window's corrections of the map: new poses, units and depth.
 
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::keyframe::{DepthPoint, Keyframe};
@@ -11,13 +11,12 @@ use crate::slam::window::plane::{Correspondence, fit, relief_left};
 use crate::slam::window::view::Sight;
 use crate::slam::window::{Window, selection};
 
-/// What is made of a marginal: the covariance of the modes of a keyframe's depth, and of its place.
+/// Covariances derived from a marginal: of the modes of a keyframe's depth, and of its place.
 pub type Said = (ModeCovariance, Option<PlaceCovariance>);
 
 impl Window {
-    /// What of the map is known better since the last adjustment: the keyframes that were free move, and their depth is
-    /// moved to where their points are.
-    /// `said_of` says what a marginal makes of a keyframe.
+    /// The correction of the map by the last adjustment: the keyframes that were free move, and their depth is moved to
+    /// where their points are. `said_of` derives a keyframe's covariances from its marginal.
     pub fn correction(&self, map: &Map, said_of: impl Fn(&Marginal) -> Said) -> Correction {
         let mut keyframes: Vec<KeyframeCorrection> = Vec::new();
         for &id in &self.moved {
@@ -29,8 +28,8 @@ impl Window {
         Correction { keyframes, ..Correction::default() }
     }
 
-    /// Keyframes that are not estimated, newer ones and rejected ones: each goes where the last before it that is goes,
-    /// and stays where that stays.
+    /// Corrections of keyframes that are not estimated, newer ones and rejected ones: each moves with the last
+    /// estimated one before it, if that moves.
     fn followers(&self, map: &Map, moved: &[KeyframeCorrection]) -> Vec<KeyframeCorrection> {
         let follows = |keyframe: &&Keyframe| self.get(keyframe.keyframe_id).is_none();
         let follow = |keyframe: &Keyframe| {
@@ -75,7 +74,7 @@ impl Window {
         // Depth that was not moved to the points is no more certain than before.
         let is_tilted = plane.is_some_and(|[_, per_x, per_y]| (per_x, per_y) != (0.0, 0.0));
         let said = self.marginal_of(keyframe.keyframe_id).map(said_of);
-        // The plane leaves the depth's own relief, while the estimate speaks of that of the points.
+        // The plane leaves the depth's own relief, while the estimate's covariance is that of the points' relief.
         let relief = plane.map_or(0.0, |plane| relief_left(&better, &plane));
         let modes = said.map(|(modes, _)| modes.with_relief_error(relief)).filter(|_| is_tilted);
         let [offset, per_x, per_y] = plane.unwrap_or_default();
@@ -84,12 +83,12 @@ impl Window {
             map_from_keyframe: Sim3::new(place, unit * (-offset).exp()),
             depth: LogPlane { offset: 0.0, per_x, per_y },
             modes,
-            // Its unit is that of the points only where they gave it.
+            // Its unit is that of the points only where they determine it.
             place: said.and_then(|(_, place)| place).filter(|_| plane.is_some()),
         })
     }
 
-    /// A keyframe's own points beside its depth.
+    /// Correspondences of a keyframe's own points with its depth.
     pub(super) fn of_own_points(
         &self,
         host: &WindowKeyframe,
@@ -111,7 +110,7 @@ impl Window {
             .collect()
     }
 
-    /// Points of other keyframes that one was seen to agree with, where it has depth too.
+    /// Correspondences of a keyframe's depth with the points of other keyframes that it agrees with.
     pub(super) fn projected_into(
         &self,
         index: usize,

@@ -1,4 +1,4 @@
-//! Frames between keyframes, aligned again to the points that are known better by then.
+//! Frames between keyframes, aligned again once the points are more accurate.
 //!
 //! The tracker aligned a frame to depth that was still being estimated; its errors, tilt above all, are in the frame's
 //! pose relative to the keyframe and stay there when the keyframe moves.
@@ -9,18 +9,18 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::map::PlacedFrame;
 use crate::slam::window::{ALIGNMENT_LEVELS, Window};
 
-/// Frames aligned with one adjustment: twice as many as come between two keyframes, so that those of an epoch's first
-/// keyframes are made up for without delaying it.
+/// Frames aligned with one adjustment: twice as many as lie between two keyframes, so that the backlog of an epoch's
+/// first keyframes is cleared without delaying it.
 const MOST_AT_ONCE: usize = 30;
-/// As many are aligned in the time of one or two frames.
+/// Up to this many are aligned in the time of one or two frames.
 const FEW_FRAMES: usize = 8;
-/// Keyframes after its own that a frame of an epoch's first keyframes waits for: all of these move with each estimate, and
-/// the frame with its own.
+/// Keyframes after its own that a frame of an epoch's first keyframes waits for: all of these move with each estimate,
+/// and the frame moves with its own.
 const FIRST_LAG: usize = 4;
-/// Levels that a frame is aligned on first: most are within a pixel or two. Where their keyframe's first depth was wrong they may
-/// be ten off.
+/// Levels that a frame is aligned on first: most are within a pixel or two. Where their keyframe's first depth was
+/// wrong they may be ten off.
 const FINE_LEVELS: [usize; 2] = [1, 0];
-/// Share of the comparisons that agree with most frames that stand where they should.
+/// Share of the comparisons that agree with most frames that are placed correctly.
 const SURE_INLIER_RATIO: f64 = 0.8;
 /// Most iterations of a level.
 const MAX_ITERATIONS: u32 = 10;
@@ -28,39 +28,39 @@ const MAX_ITERATIONS: u32 = 10;
 const REACH: usize = 3;
 /// Comparisons that must agree with a frame's new pose.
 const FEWEST_INLIERS: usize = 60;
-/// Share of the comparisons that must.
+/// Share of the comparisons that must agree.
 const LEAST_INLIER_RATIO: f64 = 0.5;
 
-/// A frame that was tracked, to be aligned again, or one from before its map began.
+/// A tracked frame to be aligned again, or a frame from before its map started.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrackedFrame {
-    /// Its sequence.
+    /// Its sequence number.
     pub sequence: u64,
     /// The keyframe that it was tracked on.
     pub keyframe_id: u64,
-    /// Where it is, in the keyframe's unit.
+    /// Its pose on the keyframe, in the keyframe's unit.
     pub keyframe_from_camera: SE3,
-    /// Whether that is only a guess: nothing was known when the frame came.
+    /// Whether that is only a guess: no pose was known when the frame arrived.
     pub is_guess: bool,
     /// Grey values.
     pub pixels: Arc<[u8]>,
 }
 
-/// Frames that wait and frames that are done.
+/// Frames that wait and frames that were aligned.
 #[derive(Debug, Clone, Default)]
 pub(super) struct WindowFrames {
     waiting: Vec<TrackedFrame>,
     placed: Vec<PlacedFrame>,
-    /// Those that have waited long enough are to be aligned, after an estimate of an epoch's first keyframes or not.
+    /// Set where frames that have waited long enough are to be aligned: whether after an epoch's first keyframes.
     planned: Option<bool>,
-    /// The window is given away for that.
+    /// Whether the window was taken out for that.
     is_begun: bool,
-    /// It was, and has come back.
+    /// Whether that alignment is done.
     is_done: bool,
 }
 
 impl Window {
-    /// Takes frames that were tracked since the last time, in their order.
+    /// Takes the frames tracked since the last call, in their order.
     pub fn take_frames(&mut self, frames: &mut Vec<TrackedFrame>) {
         let waiting = &mut self.frames.waiting;
         waiting.append(frames);
@@ -68,14 +68,14 @@ impl Window {
         waiting.drain(..excess);
     }
 
-    /// Frames that have been aligned again since somebody asked.
+    /// Takes the frames that were aligned again since the last call.
     pub fn take_placed(&mut self) -> Vec<PlacedFrame> {
         std::mem::take(&mut self.frames.placed)
     }
 
-    /// After an estimate: frames that have waited long enough are to be aligned, by themselves where they are many, so that
-    /// the keyframes need not be waited for. Here and now where they are few, since keyframes that follow each other so
-    /// soon should not have to wait for that, and where those of the estimate before still are to be.
+    /// After an estimate: plans the alignment of frames that have waited long enough as a separate task where they are
+    /// many, so that the keyframes need not wait. Aligns them at once where they are few, since keyframes in such close
+    /// succession should not wait for a task, and where those of the estimate before are still pending.
     pub(super) fn plan_frames(&mut self, newest: usize, is_first: bool) {
         let end = self.settled(newest, is_first);
         let is_ready = |frame: &&TrackedFrame| self.index_of(frame.keyframe_id) < Some(end);
@@ -86,13 +86,13 @@ impl Window {
         }
     }
 
-    /// Whether frames are to be aligned, by [`Window::optimise`]: to be asked where nothing else is to be done.
+    /// Begins a planned alignment of frames, by [`Window::optimise`]; false without one. Call it when all else is done.
     pub fn begin_frames(&mut self) -> bool {
         self.frames.is_begun = self.frames.planned.is_some();
         self.frames.is_begun
     }
 
-    /// Aligns the frames for which the window was given away; false where it was not for them.
+    /// Aligns the frames if the window was taken out for them; false otherwise.
     pub(super) fn frames_begun(&mut self) -> bool {
         if !std::mem::take(&mut self.frames.is_begun) {
             return false;
@@ -108,17 +108,17 @@ impl Window {
         true
     }
 
-    /// The frames that were aligned, where the window was away for them alone.
+    /// Takes the frames that were aligned, if the window was taken out for them alone.
     pub fn take_frames_alone(&mut self) -> Option<Vec<PlacedFrame>> {
         std::mem::take(&mut self.frames.is_done).then(|| self.take_placed())
     }
 
-    /// Aligns the frames that have waited long enough: until enough keyframes have come, more among an epoch's first ones.
+    /// Aligns the frames whose keyframes enough others have followed, more among an epoch's first ones.
     fn place_frames(&mut self, newest: usize, is_first: bool) {
         self.place_frames_before(self.settled(newest, is_first), MOST_AT_ONCE);
     }
 
-    /// How many of the keyframes have been followed by enough others.
+    /// Number of keyframes that enough others have followed.
     fn settled(&self, newest: usize, is_first: bool) -> usize {
         let lag =
             if is_first { self.params.frame_lag.max(FIRST_LAG) } else { self.params.frame_lag };
@@ -148,10 +148,10 @@ impl Window {
         self.frames.waiting = waiting;
     }
 
-    /// Aligns frames from before their map began, the newest first, each from where the one after it was and moved
-    /// on as that did; none before one that does not fit.
+    /// Aligns frames from before their map started, the newest first, each from its guess with the correction of the
+    /// frame after it; drops those before one that does not fit.
     fn retrace(&mut self, waiting: &mut Vec<TrackedFrame>, end: usize, left: &mut usize) {
-        // By how much the last one was found off its guess, and its keyframe.
+        // The last frame's keyframe, and the correction of its guess.
         let mut found_off: Option<(u64, SE3)> = None;
         while *left > 0 {
             let is_ready = |frame: &TrackedFrame| {
@@ -175,7 +175,7 @@ impl Window {
             found_off = Some((keyframe_id, found * guess.inverse()));
             self.frames.placed.push(placed);
         }
-        // Those that are left begin there.
+        // The remaining ones start with that correction.
         let Some((keyframe_id, off)) = found_off else { return };
         for other in waiting.iter_mut().filter(|of| of.is_guess && of.keyframe_id == keyframe_id) {
             other.keyframe_from_camera = off * other.keyframe_from_camera;
@@ -207,9 +207,9 @@ impl Window {
         })
     }
 
-    /// Aligns the last of the members, which is a frame: from the coarse levels if it is where a guess has it, else on the
-    /// fine ones, and from the coarse ones too where less agrees with it than with most frames. Of both what more agrees
-    /// with; nothing where that is too little.
+    /// Aligns the last of the members, which is a frame: from the coarse levels if its pose is a guess, otherwise on
+    /// the fine ones, and from the coarse ones too where fewer comparisons agree than with most frames. Returns the
+    /// pose that more agree with; `None` where these are too few.
     fn align_frame(&mut self, members: &[usize], is_guess: bool) -> Option<SE3> {
         let begin = self.keyframes.last()?.camera_from_map;
         let mut best: Option<(usize, usize, SE3)> = None;
@@ -276,7 +276,7 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_that_is_ten_pixels_off_is_found() {
+    fn a_frame_that_is_ten_pixels_off_is_aligned() {
         let mut room = room(|_, _| (1.0, 0.0)).keyframes;
         let seen = room.remove(2);
         let truth = room[1].camera_from_map * seen.camera_from_map.inverse();
@@ -295,7 +295,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_of_an_epochs_first_keyframes_wait_for_more_of_them_and_not_for_all() {
+    fn frames_of_an_epochs_first_keyframes_wait_for_more_keyframes_but_not_for_all() {
         let left = |is_first| {
             let mut window = window();
             window.place_frames(7, is_first);
@@ -306,7 +306,7 @@ mod tests {
     }
 
     #[test]
-    fn many_frames_are_aligned_by_themselves_and_few_with_the_estimate() {
+    fn many_frames_are_aligned_separately_and_few_with_the_estimate() {
         let left = |window: &Window| window.frames.waiting.len();
         let mut few = window();
         few.plan_frames(7, false);
@@ -322,7 +322,7 @@ mod tests {
         assert!(alone.optimise().is_none());
         assert_eq!((left(&alone), alone.begin_frames()), (1, false));
         assert!(alone.take_frames_alone().is_some() && alone.take_frames_alone().is_none());
-        // The next keyframe came before that.
+        // The next keyframe arrives before that.
         let mut overtaken = many();
         overtaken.plan_frames(7, false);
         assert_eq!((left(&overtaken), overtaken.begin_frames()), (1, false));

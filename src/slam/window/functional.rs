@@ -1,21 +1,21 @@
-//! Linear functions of everything that is free, of which the uncertainties are asked for.
+//! Linear functions of the free parameters, of which uncertainties are computed.
 
 use nalgebra::{DVector, Vector4, Vector6};
 
 use crate::slam::geometry::se3::SE3;
 use crate::slam::window::comparison::POSE;
 
-/// A linear function of everything that is free.
+/// A linear function of the free parameters.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Functional {
-    /// By entry of the left increments of the free poses.
+    /// Coefficients of the left increments of the free poses.
     pub poses: DVector<f64>,
-    /// By inverse depth, of some points by their place in the views.
+    /// Coefficients of inverse depths, each with the index of its point in the views.
     pub depths: Vec<(usize, f64)>,
 }
 
 impl Functional {
-    /// That nothing changes.
+    /// The zero function.
     pub fn zero(num_free: usize) -> Self {
         Self { poses: DVector::zeros(POSE * num_free), depths: Vec::new() }
     }
@@ -27,13 +27,13 @@ impl Functional {
     }
 }
 
-/// A point as a keyframe has it.
+/// A point as seen in a keyframe.
 pub(super) struct Seen {
-    /// Place among the points of the views.
+    /// Index among the points of the views.
     pub(super) slot: usize,
-    /// Who else moves it: its host, with where the keyframe stands from that; `None` of the keyframe's own.
+    /// Its host, which moves it too, and the pose of the keyframe relative to it; `None` for the keyframe's own.
     pub(super) from_host: Option<(usize, SE3)>,
-    /// (1, X, Y, ln d') there.
+    /// (1, X, Y, ln d') in the keyframe.
     pub(super) phi: Vector4<f64>,
     /// ∂ ln d'/∂d.
     pub(super) by_depth: f64,

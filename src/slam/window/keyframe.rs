@@ -13,26 +13,26 @@ pub const LEVELS: usize = 4;
 /// Mean of a pattern below which it has no gain, grey levels.
 const DARKEST: f32 = 1.0;
 
-/// A keyframe whose place is estimated jointly with others.
+/// A keyframe whose pose is estimated jointly with others.
 #[derive(Debug, Clone, PartialEq)]
 pub struct WindowKeyframe {
     /// Its id in the map.
     pub keyframe_id: u64,
     /// Its epoch.
     pub epoch: u32,
-    /// Grey values by level, the finest shared with the map; that alone while it takes no part.
+    /// Grey values by level, the finest shared with the map; only that one while the keyframe takes no part.
     pub images: Vec<SharedImage>,
-    /// Where it is, in the unit of the map.
+    /// Its pose, in the unit of the map.
     pub camera_from_map: SE3,
-    /// Length of its unit in that of the map.
+    /// Its unit, in that of the map.
     pub unit: f64,
-    /// The points that were chosen in it; none before the next keyframe comes.
+    /// The points chosen in it; empty before the next keyframe arrives.
     pub points: Vec<WindowPoint>,
     /// Whether its points were chosen.
     pub is_host: bool,
     /// Points of others that it agreed with when it was last aligned or estimated, until its own are chosen.
     pub agreed: Vec<Agreed>,
-    /// How far it sees.
+    /// The farthest depth in each part of its image.
     pub surface: Surface,
 }
 
@@ -41,7 +41,7 @@ pub struct WindowKeyframe {
 pub struct Agreed {
     /// Its host.
     pub keyframe_id: u64,
-    /// Its place among its host's points.
+    /// Its index among its host's points.
     pub point: usize,
 }
 
@@ -54,18 +54,18 @@ pub struct WindowPoint {
     pub v: u16,
     /// Its ray at depth 1.
     pub ray: [f32; 2],
-    /// 1/z along the host's optical axis, one over the unit of the map.
+    /// 1/z along the host's optical axis, in 1 / unit of the map.
     pub inverse_depth: f64,
-    /// What it looks like, by level.
+    /// Its appearance, by level.
     pub looks: [Look; LEVELS],
-    /// Keyframes that agreed when it was last adjusted.
+    /// Number of keyframes that agreed when it was last adjusted.
     pub confirmations: u32,
-    /// False once nothing agrees with it.
+    /// False once no keyframe agrees with it.
     pub is_alive: bool,
 }
 
 impl WindowKeyframe {
-    /// With an image, of which nothing is known but where it is.
+    /// Creates a keyframe from its image, pose and unit, without points or surface.
     pub fn new(
         keyframe_id: u64,
         epoch: u32,
@@ -86,7 +86,7 @@ impl WindowKeyframe {
         }
     }
 
-    /// Makes its coarser images, unless it has them.
+    /// Creates its coarser images, unless it has them.
     pub fn take_part(&mut self, camera: &Intrinsics) {
         while self.images.len() < num_levels(camera) {
             let Some(finer) = self.images.last() else { return };
@@ -94,7 +94,7 @@ impl WindowKeyframe {
         }
     }
 
-    /// Gives its coarser images up.
+    /// Frees its coarser images.
     pub fn leave(&mut self) {
         self.images.truncate(1);
     }
@@ -127,13 +127,13 @@ impl WindowPoint {
     }
 }
 
-/// Where a column or row of pixels is at a level.
+/// Position of a column or row of pixels at a level.
 #[inline(always)]
 pub(super) fn at_level(pixel: u16, level: usize) -> f32 {
     (f32::from(pixel) + 0.5) * 0.5f32.powi(level as i32) - 0.5
 }
 
-/// What the pattern around a position of the image looks like.
+/// Appearance of the pattern around a position of the image.
 #[inline(always)]
 pub(super) fn look_at(image: &SharedImage, u: f32, v: f32, half_weight_gradient: f32) -> Look {
     let reach = CENTRE as f32;
@@ -166,9 +166,9 @@ pub(super) fn look_at(image: &SharedImage, u: f32, v: f32, half_weight_gradient:
 
 /// Pixels that pattern and differences reach to each side.
 const CENTRE: i32 = 3;
-/// As many and the middle.
+/// Both sides and the centre.
 const SIDE: usize = 2 * CENTRE as usize + 1;
-/// Pixels of a row that are read: one more, for interpolation; the last of [`around`] is of no use.
+/// Pixels of a row that are read: one more, for interpolation; the last of [`around`] is unused.
 const STRIDE: usize = SIDE + 1;
 /// [`SIDE`] rows of [`STRIDE`].
 const AROUND: usize = SIDE * STRIDE;
@@ -177,11 +177,11 @@ const fn at(place: i32) -> usize {
     place as usize
 }
 
-/// The bilinear samples around a position that is so many pixels inside, a pixel apart: loops over whole squares, which
-/// compilers turn into vector instructions.
+/// The bilinear samples around a position at least [`CENTRE`] pixels inside, a pixel apart: loops over whole squares,
+/// which compilers vectorise.
 #[inline(always)]
 fn around(image: &SharedImage, u: f32, v: f32) -> [f32; AROUND] {
-    /// One for the right neighbour of the last, which is of no use.
+    /// One more for the right neighbour of the last, which is unused.
     const READ: usize = STRIDE * STRIDE + 1;
     let (column, row) = (u as usize, v as usize);
     let (du, dv) = (u - column as f32, v - row as f32);

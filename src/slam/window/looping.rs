@@ -1,4 +1,4 @@
-//! Where the search for loops meets the window: what it is told, when it is its turn, and what moves with the map.
+//! The window's side of the search for loops: reports estimates, schedules the search and follows closures.
 
 use crate::slam::geometry::sim3::Sim3;
 use crate::slam::loops::{Closure, LoopParams, Loops};
@@ -6,18 +6,18 @@ use crate::slam::map::Map;
 use crate::slam::window::Window;
 use crate::slam::window::members::{Chosen, FEWEST_COMMON};
 
-/// Keyframes whose depth is not complete: the one that is observed, and the one before it, which gets its last depth.
+/// Keyframes whose depth is incomplete: the one being observed, and the previous one, whose final depth is pending.
 const UNFINISHED: usize = 2;
 
 impl Window {
-    /// The same, looking for loops.
+    /// The same window, with a search for loops.
     pub fn with_loops(mut self, params: LoopParams) -> Self {
         self.loops = Loops::new(self.camera, params);
         self
     }
 
-    /// Whether a keyframe that has settled is to be looked for in older ones, by [`Window::optimise`]: to be asked where
-    /// nothing else is to be estimated. Of a map that is complete, with `is_last`, all have settled.
+    /// Begins the search for a settled keyframe in older ones, by [`Window::optimise`]; false where there is none. Call
+    /// it when there is nothing else to estimate. In a complete map, with `is_last`, all keyframes have settled.
     pub fn begin_search(&mut self, map: &Map, is_last: bool) -> bool {
         if is_last {
             self.plan_search(0);
@@ -30,7 +30,7 @@ impl Window {
         true
     }
 
-    /// Does a search that was begun; false where none was.
+    /// Runs a search that was begun; false where none was.
     pub(super) fn search_begun(&mut self) -> bool {
         let is_done = self.loops.run();
         if is_done {
@@ -39,12 +39,12 @@ impl Window {
         is_done
     }
 
-    /// Tells of an estimate of the newest keyframes, right after it: who held the newest one.
+    /// Reports an estimate of the newest keyframes, right after it: which keyframes held the newest one.
     pub(super) fn tell_estimate(&mut self, chosen: &Chosen) {
         let Some((&newest, others)) = chosen.members.split_last() else { return };
         let agreeing = self.agreeing_with_last(chosen);
         let of = |member: &usize| self.keyframes[*member].keyframe_id;
-        // Those that stand in front of it behind a wall hold nothing.
+        // Those in its view but behind a wall hold nothing.
         let holds = others.iter().zip(&agreeing).filter(|(_, count)| **count >= FEWEST_COMMON);
         let all: Vec<u64> = holds.map(|(member, _)| of(member)).collect();
         let fixed = others.iter().zip(&chosen.free).filter(|(_, free)| free.is_none());
@@ -54,7 +54,7 @@ impl Window {
         self.loops.note_estimate(newest, &all, &held);
     }
 
-    /// By member how many comparisons with the last one count.
+    /// For each member, the number of inliers among its comparisons with the last one.
     fn agreeing_with_last(&self, chosen: &Chosen) -> Vec<usize> {
         let last = chosen.members.len() - 1;
         let most_energy = self.robustness().most_energy;
@@ -74,17 +74,17 @@ impl Window {
         self.params.num_free.max(1)
     }
 
-    /// Chooses what is searched next, the newest keyframes left out.
+    /// Plans the next searches, the newest keyframes left out.
     pub(super) fn plan_search(&mut self, num_unsettled: usize) {
         let known: Vec<u64> = self.keyframes.iter().map(|of| of.keyframe_id).collect();
-        // What lies in another epoch need not wait until it knows its place in its own: only its depth must be there.
+        // Keyframes of another epoch need not wait for their pose there to settle: only their depth must be complete.
         let is_one_epoch = self.keyframes.windows(2).all(|pair| pair[0].epoch == pair[1].epoch);
         let num_unsettled =
             if is_one_epoch { num_unsettled } else { num_unsettled.min(UNFINISHED) };
         self.loops.plan(&known, known.len().saturating_sub(num_unsettled));
     }
 
-    /// The map was moved: points move with their hosts, and what the loop joins is to be estimated together.
+    /// Follows a closure: points move with their hosts, and a pass is due to estimate what the loop joins.
     pub fn follow(&mut self, closure: &Closure) {
         for keyframe in &mut self.keyframes {
             let Some(by) = closure.of(keyframe.keyframe_id, keyframe.epoch) else { continue };

@@ -1,4 +1,4 @@
-//! What the marginals say beside how much estimates of the same room differ with the noise of its images.
+//! Compares the marginals with the scatter of estimates of the same room under the noise of its images.
 
 use nalgebra::{Matrix3, Matrix4, SVector, Vector3, Vector4};
 
@@ -50,7 +50,7 @@ fn modes_of(room: &Room, truth: &Room, keyframe: usize) -> Vector3<f64> {
 }
 
 #[test]
-fn they_say_how_much_noise_moves_the_modes() {
+fn marginals_match_the_scatter_of_the_modes_under_noise() {
     const TIMES: u64 = 16;
     // The last keyframe has no points yet, as the active one.
     let mut squares = [[Vector3::zeros(); 2]; 2];
@@ -81,8 +81,7 @@ fn they_say_how_much_noise_moves_the_modes() {
     }
 }
 
-/// What the place of a keyframe errs by: the left increment of its pose, and the logarithm of the unit that its own depth
-/// has.
+/// Errors of a keyframe's place: the left increment of its pose, and the logarithm of the unit of its own depth.
 fn place_errors(room: &Room, truth: &Room, keyframe: usize) -> SVector<f64, PLACE_ERRORS> {
     let [found, exact] = [room, truth].map(|room| &room.keyframes[keyframe]);
     let pose = (found.camera_from_map.inverse() * exact.camera_from_map).log();
@@ -101,8 +100,8 @@ fn place_errors(room: &Room, truth: &Room, keyframe: usize) -> SVector<f64, PLAC
     errors
 }
 
-/// Standard deviations over noises of the place of the last keyframe but one, over what is said, where these hold the
-/// window.
+/// Ratios of the scatter under noise of the place of the last keyframe but one to its marginal's standard deviations,
+/// where the keyframes `held` hold the window.
 fn place_ratios(held: &[usize]) -> SVector<f64, PLACE_ERRORS> {
     const TIMES: u64 = 24;
     let [mut sum, mut squares, mut said] = [SVector::<f64, PLACE_ERRORS>::zeros(); 3];
@@ -132,7 +131,7 @@ fn place_ratios(held: &[usize]) -> SVector<f64, PLACE_ERRORS> {
 }
 
 #[test]
-fn they_say_how_much_noise_moves_places_and_units() {
+fn marginals_match_the_scatter_of_places_and_units_under_noise() {
     for held in [&[0][..], &[0, 1]] {
         let ratios = place_ratios(held);
         assert!(ratios.iter().all(|ratio| (0.4..1.3).contains(ratio)), "{held:?}{ratios}");
@@ -140,13 +139,13 @@ fn they_say_how_much_noise_moves_places_and_units() {
 }
 
 #[test]
-fn places_are_as_uncertain_as_the_unit_makes_them_that_is_kept() {
-    // The depths of the keyframe that holds the window are nearer than all else has them.
+fn uncertainties_of_places_are_relative_to_the_unit_that_is_kept() {
+    // The depths of the keyframe that holds the window are shorter than all others imply.
     let mut room = noisy_room(|_, _| (1.0, 0.0), 1);
     room.keyframes[0].points.iter_mut().for_each(|point| point.inverse_depth *= 1.2);
     let mut window = Window::new(CAMERA, WindowParams::default());
     window.keyframes = room.keyframes;
-    // Estimated again, all is in the unit that it begins with.
+    // Estimated again, everything stays in the unit that it starts with.
     let [(first, shorter), (second, same)] = [(); 2].map(|()| {
         let before = window.keyframes[3].camera_from_map.translation.norm();
         window.adjust(&Chosen::new(Vec::new(), &[0, 1, 2, 3], true, true)).unwrap();

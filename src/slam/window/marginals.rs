@@ -1,14 +1,14 @@
-//! How uncertain what was estimated jointly is: the covariance of a keyframe's modes and of its place.
+//! Marginal covariances of the joint estimate: of a keyframe's modes and of its place.
 //!
-//! With H the normal equations at the end and σ² the variance of a residual, the covariance of a linear function g of
-//! all that is free is σ² gᵀ H⁻¹ g. A point's depth only meets the poses that see it, so that with D the depths' part
-//! of H, S what is left for the poses, and g = (β, α):
+//! With H the final normal equations and σ² the variance of a residual, the covariance of a linear function g of the
+//! free parameters is σ² gᵀ H⁻¹ g. A point's depth is coupled only to the poses that see it, so that with D the depths'
+//! part of H, S its Schur complement, and g = (β, α):
 //! ```text
 //! gᵀ H⁻¹ g = αᵀ D⁻¹ α + (β − H_cd D⁻¹ α)ᵀ S⁻¹ (β − H_cd D⁻¹ α)
 //! ```
 //! The modes are the least-squares fit m = A δd'/d' over the points that the keyframe's depth is moved to: its own, or
-//! those of others as it sees them, whose inverse depth d' = d/z, with X' = R x + t d = (·, ·, z) and n = X'/z, follows
-//! depth and poses by
+//! those of others as it sees them, whose inverse depth d' = d/z, with X' = R x + t d = (·, ·, z) and n = X'/z, depends
+//! on depth and poses by
 //! ```text
 //! δd'/d' = δd (1/d − t_z/z) − d' ξ_tz − n_y ξ_ωx + n_x ξ_ωy
 //! ```
@@ -31,36 +31,36 @@ use crate::slam::window::solver::Solver;
 use crate::slam::window::system::{Members, System};
 use crate::slam::window::view::{MIN_DEPTH_RATIO, Sight, Views};
 
-/// How uncertain a keyframe is that was estimated with others, by the noise of the residuals alone: they are taken for
-/// independent, and the keyframes that hold the others in place for exact, which makes it too sure.
+/// Uncertainty of a jointly estimated keyframe, from the noise of the residuals alone: these are taken as independent,
+/// and the keyframes that hold the others in place as exact, which makes it overconfident.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Marginal {
     /// The keyframe.
     pub keyframe_id: u64,
-    /// Covariance of the modes of its depth, as `slam::modes` has them.
+    /// Covariance of the modes of its depth, as defined in `slam::modes`.
     pub modes: Matrix3<f64>,
-    /// What it is of if images are displaced against each other by a pixel, alike all over: for lens and shutter, which
-    /// no number of points averages out.
+    /// The same if images are displaced against each other by a pixel, uniformly: for lens and shutter, which no number
+    /// of points averages out.
     pub of_displaced: Matrix3<f64>,
-    /// Its place; `None` where one keyframe alone holds the others and has no depth that would hold their unit.
+    /// Its place; `None` where one keyframe alone holds the others and has no depth to hold their unit.
     pub place: Option<PlaceMarginal>,
 }
 
-/// Points that a fit of the modes wants: ten for each of its numbers, as the plane.
+/// Points that a fit of the modes needs: ten per parameter, as the plane.
 const FEWEST_POINTS: usize = 40;
 
-/// Standard deviation of a point's inverse depth, over that depth, above which it tells nothing of the modes: a few that
-/// no baseline shows would otherwise be all that they are uncertain by.
+/// Standard deviation of a point's inverse depth, over that depth, above which it is not used for the modes: a few
+/// points without baseline would otherwise dominate their uncertainty.
 const LEAST_CERTAIN: f64 = 0.3;
 
 impl Window {
-    /// What the last adjustment says of a keyframe.
+    /// The marginal of a keyframe by the last adjustment.
     pub fn marginal_of(&self, keyframe_id: u64) -> Option<&Marginal> {
         self.marginals.iter().find(|of| of.keyframe_id == keyframe_id)
     }
 }
 
-/// Of every member that was free in the adjustment that the solver's system is of.
+/// Marginals of every member that was free in the adjustment whose equations the solver holds.
 pub(super) fn marginals(
     keyframes: &[WindowKeyframe],
     members: &Members<'_>,
@@ -68,7 +68,7 @@ pub(super) fn marginals(
     camera: &Intrinsics,
 ) -> Vec<Marginal> {
     let (views, system) = (&solver.views, &mut solver.system);
-    // The unit that nothing holds is none of the modes: any stiffness serves. Of places it is taken out.
+    // The unit that nothing holds is not one of the modes: any stiffness serves. From places it is removed.
     let unit = unit_direction(keyframes, members, system.num_free);
     let factors = system.factors(members, views, unit.as_ref());
     let Some(factors) = factors else { return Vec::new() };
@@ -103,7 +103,7 @@ pub(super) fn marginals(
     marginals.filter(is_finite).collect()
 }
 
-/// How the free poses move when the unit of a window grows that only one keyframe holds in place; `None` where more do.
+/// Motion of the free poses as the unit grows of a window that only one keyframe holds in place; `None` where more do.
 fn unit_direction(
     keyframes: &[WindowKeyframe],
     members: &Members<'_>,
@@ -119,11 +119,11 @@ fn unit_direction(
         let translation = (keyframe.camera_from_map * map_from_anchor).translation;
         along.fixed_rows_mut::<3>(POSE * number).copy_from(&translation);
     }
-    // Where all stand in one place there is no unit.
+    // Where all poses are at one position there is no unit.
     (along.norm() > 0.0).then_some(along)
 }
 
-/// The points that a member's depth is moved to, which something agrees with.
+/// The points that a member's depth is moved to and that some keyframe agrees with.
 fn seen_by(
     keyframes: &[WindowKeyframe],
     members: &Members<'_>,
@@ -188,7 +188,7 @@ fn projected(slot: usize, point: &WindowPoint, host: usize, to_from_host: &SE3) 
     }
 }
 
-/// Mean square of how far, in pixels, a point moves in an image when its inverse depth is multiplied by e, over
+/// Mean square of the motion, in pixels, of a point in an image when its inverse depth is multiplied by e, over
 /// comparisons of the points that are seen.
 fn mean_squared_parallax(
     seen: &[Seen],
@@ -197,7 +197,7 @@ fn mean_squared_parallax(
     views: &Views,
     camera: &Intrinsics,
 ) -> f64 {
-    /// So many points apart they stand for all.
+    /// Every eighth point represents them all.
     const STRIDE: usize = 8;
     let (mut sum, mut count) = (0.0, 0.0f64);
     for view in seen.iter().step_by(STRIDE).map(|of| &views.points[of.slot]) {
@@ -224,7 +224,7 @@ fn mean_squared_parallax(
     sum / count
 }
 
-/// The equations of the modes, with the constant, over points; `None` where they do not tell them.
+/// The equations of the modes, with the constant, over points; `None` where these do not determine them.
 fn fit_of(seen: &[Seen]) -> Option<Cholesky<f64, Const<4>>> {
     if seen.len() < FEWEST_POINTS {
         return None;
@@ -232,7 +232,7 @@ fn fit_of(seen: &[Seen]) -> Option<Cholesky<f64, Const<4>>> {
     seen.iter().map(|of| of.phi * of.phi.transpose()).sum::<Matrix4<f64>>().cholesky()
 }
 
-/// Weighted sums of ln d' over the points of a member, whose pose has this number, as functions of all that is free.
+/// Weighted sums of ln d' over the points of a member, whose pose has this number, as functions of the free parameters.
 fn functionals<const N: usize>(
     seen: &[Seen],
     weights_of: impl Fn(&Seen) -> SVector<f64, N>,

@@ -1,4 +1,4 @@
-//! Which keyframes are estimated together, and which of them stay where they are.
+//! Selects the keyframes that are estimated jointly, and those that stay fixed.
 
 use nalgebra::Vector3;
 
@@ -6,31 +6,31 @@ use crate::slam::window::Window;
 use crate::slam::window::keyframe::WindowKeyframe;
 use crate::slam::window::view::Sight;
 
-/// Points that two keyframes must see both for the one to hold the other in place.
+/// Points that two keyframes must have in common for one to hold the other in place.
 pub(super) const FEWEST_COMMON: usize = 20;
-/// Share of the points of two keyframes that the other must see for an estimate to tie them together: of one keyframe and
-/// the next it is half and more; what a few points at the border of an image say of a pose is little.
+/// Share of the points of two keyframes that the other must see for an estimate to link them: for successive keyframes
+/// it is half and more; a few points at the border of an image hardly constrain a pose.
 const LINKING_SHARE: f64 = 0.2;
 /// Keyframes that a new one is aligned to.
 const NUM_ALIGNED_TO: usize = 4;
-/// Keyframes that are held in place where no older one sees the same things.
+/// Keyframes that are held in place where no older one sees the same scene.
 const NUM_HELD: usize = 2;
-/// Keyframes whose points are looked for one by one in another, the nearest: seven times those that are held, so that
-/// nearly all of those that see most are among them, and a long run costs no more than a short one.
+/// Nearest keyframes whose points are searched one by one in another: seven times those that are held, so that nearly
+/// all of those that see most are among them, and a long run costs no more than a short one.
 const NUM_NEAREST: usize = 60;
 
-/// Who takes part.
+/// The members of an estimate.
 pub(super) struct Chosen {
-    /// Places in the list of keyframes.
+    /// Indices in the list of keyframes.
     pub members: Vec<usize>,
-    /// For each its number among the free ones.
+    /// For each, its number among the free ones; `None` where it is fixed.
     pub free: Vec<Option<usize>>,
     /// Whether the epoch has just begun.
     pub is_first: bool,
 }
 
 impl Window {
-    /// Who takes part in the estimation of the newest keyframes.
+    /// Chooses the members of an estimate of the newest keyframes.
     pub(super) fn choose_members(&self, newest: usize) -> Chosen {
         let of_epoch = self.of_epoch_up_to(newest);
         let is_first = of_epoch.len() <= self.params.num_first;
@@ -46,9 +46,9 @@ impl Window {
         Chosen::new(fixed, &free, older.is_empty(), is_first)
     }
 
-    /// Keyframes in groups of those that see the same things, one by one: where the camera comes back to what older
-    /// keyframes see, the next new one may be made far from the one before, and nothing between them says where they
-    /// are to each other. Members are in the order of `of`, and so are the groups by their last ones.
+    /// Groups keyframes, one by one, that see the same scene: where the camera returns to what older keyframes see, the
+    /// next keyframe may be created far from the one before, and nothing between them constrains their relative pose.
+    /// Members are in the order of `of`, and so are the groups by their last members.
     pub(super) fn groups(&self, of: &[usize]) -> Vec<Vec<usize>> {
         let mut groups: Vec<Vec<usize>> = Vec::new();
         for &new in of {
@@ -64,7 +64,7 @@ impl Window {
         groups
     }
 
-    /// Whether two keyframes see so much of each other's points that an estimate ties them together.
+    /// Whether two keyframes see enough of each other's points for an estimate to link them.
     fn is_linked(&self, one: usize, other: usize) -> bool {
         let alive = |of: usize| self.keyframes[of].points.iter().filter(|of| of.is_alive).count();
         let common = self.common(one, other) as f64;
@@ -72,12 +72,12 @@ impl Window {
             && common >= LINKING_SHARE * (alive(one) + alive(other)) as f64
     }
 
-    /// Points of two keyframes that the other sees.
+    /// Number of points of two keyframes that the other sees.
     fn common(&self, one: usize, other: usize) -> usize {
         self.seen_by(one, other) + self.seen_by(other, one)
     }
 
-    /// Points of a keyframe that another sees and that nothing hides from it.
+    /// Number of points of a keyframe that another sees and that nothing hides from it.
     fn seen_by(&self, host: usize, observer: usize) -> usize {
         let (host, observer) = (&self.keyframes[host], &self.keyframes[observer]);
         let observer_from_host = observer.camera_from_map * host.camera_from_map.inverse();
@@ -90,13 +90,13 @@ impl Window {
         seen.filter(|seen| !observer.surface.hides(seen, observer.unit)).count()
     }
 
-    /// The keyframes up to one that are of its epoch.
+    /// The keyframes up to `newest` that are of its epoch.
     pub(super) fn of_epoch_up_to(&self, newest: usize) -> Vec<usize> {
         let epoch = self.keyframes[newest].epoch;
         (0..=newest).filter(|&k| self.keyframes[k].epoch == epoch).collect()
     }
 
-    /// The hosts that a new keyframe is aligned to: of those that see most of what it sees the newest, in their order.
+    /// The hosts that a new keyframe is aligned to: the newest of those most covisible with it, in order.
     pub(super) fn hosts_to_align_to(&self, index: usize) -> Vec<usize> {
         let epoch = self.keyframes[index].epoch;
         let is_host = |&k: &usize| self.keyframes[k].epoch == epoch && self.keyframes[k].is_host;
@@ -106,12 +106,12 @@ impl Window {
         nearest.split_off(nearest.len().saturating_sub(NUM_ALIGNED_TO))
     }
 
-    /// Of the older keyframes those that see most of what the newest see.
+    /// The older keyframes that are most covisible with the newest.
     pub(super) fn covisible(&self, older: &[usize], newest: &[usize]) -> Vec<usize> {
         self.most_common(&self.nearest(older, newest), newest)
     }
 
-    /// The same, all looked at closely.
+    /// The same, where each is checked point by point.
     fn most_common(&self, older: &[usize], newest: &[usize]) -> Vec<usize> {
         let mut seen: Vec<(usize, usize)> = older
             .iter()
@@ -123,8 +123,8 @@ impl Window {
         seen.into_iter().map(|(_, of)| of).collect()
     }
 
-    /// Of some keyframes, by their places in the list, those that stand and look nearest to where others do, in the order
-    /// in which they are given; all where they are few.
+    /// The keyframes among `of`, given by index, whose positions and views are nearest to those of `to`, in the given
+    /// order; all where they are few.
     pub(super) fn nearest(&self, of: &[usize], to: &[usize]) -> Vec<usize> {
         if of.len() <= NUM_NEAREST {
             return of.to_vec();
@@ -146,10 +146,10 @@ impl Window {
     }
 }
 
-/// Where a keyframe stands and what it looks at, in the map.
+/// A keyframe's position and the point that it looks at, in the map.
 struct Stand {
     at: Vector3<f64>,
-    /// In the middle of its image, as far off as its depth is in the mean.
+    /// In the centre of its image, at its mean depth.
     seen: Vector3<f64>,
 }
 
@@ -162,15 +162,15 @@ impl Stand {
         Self { at, seen }
     }
 
-    /// The larger, the less they see in common.
+    /// Larger the less they see in common.
     fn apart(&self, other: &Self) -> f64 {
         (self.at - other.at).norm_squared() + (self.seen - other.seen).norm_squared()
     }
 }
 
 impl Chosen {
-    /// Those of `free` are, but for who holds the gauge: the first where nothing is older, the two oldest where no
-    /// other keyframe sees the same things.
+    /// Frees the keyframes of `free`, except those that hold the gauge: the first where nothing is older, the two
+    /// oldest where no other keyframe sees the same scene.
     pub(super) fn new(fixed: Vec<usize>, free: &[usize], is_oldest: bool, is_first: bool) -> Self {
         let held = match (is_oldest, fixed.is_empty()) {
             (true, _) => 1,
@@ -203,7 +203,7 @@ mod tests {
 
     const RADIUS: f64 = 3.0;
 
-    /// A window of keyframes of a camera that wanders about the middle of a round room and turns, 30 to a turn.
+    /// A window of keyframes of a camera that wanders about the centre of a round room and turns, 30 to a turn.
     fn wandering(keyframes: usize) -> Window {
         let mut random = Random::new(9);
         let pixels = vec![100; CAMERA.width * CAMERA.height].into();
@@ -246,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    fn few_keyframes_are_all_looked_at_and_of_many_those_that_see_most() {
+    fn few_keyframes_are_all_checked_and_of_many_those_that_see_most() {
         let window = wandering(600);
         let few: Vec<usize> = (100..100 + NUM_NEAREST).collect();
         assert_eq!(window.nearest(&few, &[599]), few);
@@ -267,7 +267,7 @@ mod tests {
         assert!(10 * same >= 9 * all, "{same} of {all}");
     }
 
-    /// A camera that turned, with `places` of its keyframes seen again: made anew, one after the other, after the 45th.
+    /// A camera that turned and returned to `places` of its keyframes: these are repeated, in order, after the 45th.
     fn seen_again(places: &[usize]) -> Window {
         let mut window = wandering(50);
         let again: Vec<WindowKeyframe> =
@@ -280,7 +280,7 @@ mod tests {
     }
 
     #[test]
-    fn the_newest_are_free_together_only_where_they_see_the_same_things() {
+    fn the_newest_are_free_together_only_where_they_see_the_same_scene() {
         let mut window = seen_again(&[24, 25]);
         window.keyframes.truncate(47);
         let chosen = window.choose_members(46);
@@ -288,19 +288,19 @@ mod tests {
         assert_eq!(free.map(|(&member, _)| member).collect::<Vec<_>>(), [45, 46]);
         assert!(chosen.members.contains(&24) && chosen.members.contains(&25), "what they see");
         assert!(chosen.members.iter().all(|member| !(36..45).contains(member)));
-        // The camera has not been there before: all seven.
+        // The camera is there for the first time: all seven are free.
         let chosen = window.choose_members(44);
         assert_eq!(chosen.free.iter().flatten().count(), window.params.num_free);
     }
 
     #[test]
-    fn a_new_keyframe_is_aligned_to_what_sees_the_same_and_not_to_the_last_ones() {
+    fn a_new_keyframe_is_aligned_to_covisible_ones_and_not_to_the_last_ones() {
         let window = seen_again(&[24]);
         let hosts = window.hosts_to_align_to(45);
         assert_eq!(hosts.len(), NUM_ALIGNED_TO);
         assert!(hosts.is_sorted() && hosts.contains(&24), "{hosts:?}");
         assert!(hosts.iter().all(|&of| window.is_linked(of, 45)), "{hosts:?}");
-        // Where the camera goes on the last one is among them.
+        // Where the camera moves on, the last one is among them.
         assert!(window.hosts_to_align_to(44).contains(&43));
     }
 
@@ -319,7 +319,7 @@ mod tests {
     }
 
     #[test]
-    fn a_part_that_nothing_holds_stays_where_it_is() {
+    fn a_part_that_nothing_holds_is_left_unchanged() {
         let mut window = seen_again(&[24, 25]);
         for of in &mut window.keyframes[45..47] {
             of.camera_from_map.translation.x += 1000.0;
@@ -331,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn what_stands_before_a_keyframes_view_hides_the_others_points() {
+    fn an_occluder_in_a_keyframes_view_hides_the_points_of_others() {
         let mut window = wandering(50);
         let older: Vec<usize> = (0..40).collect();
         let before = window.covisible(&older, &[48, 49]);
@@ -342,7 +342,7 @@ mod tests {
             .flat_map(|(u, v)| [(u, v); 4])
             .map(|(u, v)| DepthPoint { u, v, inverse_depth: 5.0, variance: 1e-4, intensity: 0.0 })
             .collect();
-        // It looks at a wall from near, and its own points are behind the others' backs.
+        // It sees a wall from near, and its own points are out of the others' view.
         window.keyframes[before[0]].surface = Surface::of(&near, &CAMERA);
         window.keyframes[before[0]].points.clear();
         let after = window.covisible(&older, &[48, 49]);

@@ -1,35 +1,35 @@
-//! Depth of a pixel together with that of the pixels beside it.
+//! Smoothing of a pixel's depth over the neighbouring pixels.
 //!
-//! What a pixel's own noise does is averaged over those neighbours that can be of the same surface; what displaces all of
-//! them alike stays. Once only, for depth that is final: a mean is no observation.
+//! A pixel's own noise is averaged over the neighbours that may be on the same surface; errors common to all of them
+//! remain. Once only, for depth that is final: a mean is no observation.
 
 use crate::slam::keyframe::DepthPoint;
 
-/// Standard deviation by which inverse depth changes from a pixel to the next on a slanted surface, a share of it.
+/// Standard deviation of the change of inverse depth from a pixel to the next on a slanted surface, relative to it.
 const SLANT: f64 = 0.005;
-/// Neighbours whose inverse depth is farther away than this many standard deviations are of another surface.
+/// Neighbours whose inverse depth differs by more than this many standard deviations are on another surface.
 const MOST_APART: f64 = 2.0;
 /// Neighbours are at most this far in columns and in rows …
 const REACH_PX: usize = 2;
 /// … and this far in all, squared: the twenty around a pixel, without the corners.
 const MAX_SQUARED_DISTANCE: usize = 5;
-/// Pixels side by side that err together: their patterns share most samples.
+/// Adjacent pixels that err together: their patterns share most samples.
 const PIXELS_TOGETHER: f64 = 3.0;
 
-/// What is known of a pixel's inverse depth by itself.
+/// The estimate of a pixel's inverse depth from that pixel alone.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Single {
     /// Inverse depth.
     pub inverse_depth: f64,
     /// Part of the variance that is the pixel's own.
     pub own: f64,
-    /// Part that it shares with the pixels beside it.
+    /// Part that it shares with neighbouring pixels.
     pub common: f64,
-    /// Variance of both, at most.
+    /// Upper bound of the variance of both.
     pub most: f64,
 }
 
-/// Points with what is known of each by itself, in the same order.
+/// Points and the separate estimate of each, in the same order.
 pub struct Neighbourhood<'a> {
     points: &'a [DepthPoint],
     singles: &'a [Single],
@@ -37,15 +37,15 @@ pub struct Neighbourhood<'a> {
 }
 
 impl<'a> Neighbourhood<'a> {
-    /// Of points in an image of this width.
+    /// Creates the neighbourhood of points in an image of this width.
     pub fn new(points: &'a [DepthPoint], singles: &'a [Single], width: usize) -> Self {
         Self { points, singles, places: Places::new(points, width) }
     }
 
-    /// A point as the mean of itself and its neighbours in the image.
+    /// Returns a point as the mean of itself and its neighbours in the image.
     ///
-    /// A pixel at an edge of depth, of whose neighbours some are of another surface, is less sure by their share: which of
-    /// the surfaces it is of is not known.
+    /// A pixel at a depth edge, with neighbours on another surface, is less certain by their share: it may be on either
+    /// surface.
     pub fn smoothed(&self, place: usize) -> DepthPoint {
         let (point, single) = (&self.points[place], &self.singles[place]);
         let (mut sum, mut weights, mut others, mut apart) = (0.0, 0.0, 0.0f64, 0.0);
@@ -79,13 +79,13 @@ impl<'a> Neighbourhood<'a> {
     }
 }
 
-/// Where in a list of points those of a pixel and its neighbours are.
+/// Finds the points of a pixel and of its neighbours in a list.
 struct Places {
-    /// By pixel with a border of [`REACH_PX`], row by row; the number of points where there is none.
+    /// Index of each pixel's point, with a border of [`REACH_PX`], row by row; the number of points if it has none.
     places: Vec<u32>,
     stride: usize,
     num_points: u32,
-    /// Of a pixel and its neighbours, row by row: how far they are from the first in `places`, and their squared distance in
+    /// For a pixel and its neighbours, row by row: the offset from the first in `places`, and the squared distance in
     /// pixels.
     near: Vec<(usize, f64)>,
 }
@@ -112,7 +112,7 @@ impl Places {
         Self { places, stride, num_points, near: near.collect() }
     }
 
-    /// Those of a pixel and of its neighbours, with their squared distance in pixels.
+    /// Indices of the points of a pixel and of its neighbours, with the squared distance in pixels.
     fn around(&self, point: &DepthPoint) -> impl Iterator<Item = (usize, f64)> {
         let first = usize::from(point.v) * self.stride + usize::from(point.u);
         self.near.iter().filter_map(move |&(offset, squared)| {
@@ -162,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn noise_of_a_plane_is_averaged_and_what_is_common_stays() {
+    fn noise_on_a_plane_is_averaged_and_common_errors_remain() {
         let (points, singles) = plane(1.0);
         let smooth = smoothed(&points, &singles, WIDTH);
         let left = rms(&smooth, |p| f64::from(p.inverse_depth) - 1.0);
@@ -175,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn an_edge_of_depth_stays_and_is_less_sure() {
+    fn a_depth_edge_is_preserved_and_less_certain() {
         let (points, singles) = plane(1.2);
         let smooth = smoothed(&points, &singles, WIDTH);
         let of = |side: usize| -> Vec<DepthPoint> {
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn a_neighbour_of_no_variance_counts_as_one_that_is_apart() {
+    fn a_neighbour_without_a_valid_variance_counts_as_another_surface() {
         let (points, singles) = plane(1.0);
         let with = |single: Single| {
             let mut singles = singles.clone();
@@ -202,13 +202,13 @@ mod tests {
             for beside in [459, 460, 461, 499, 501, 539, 540, 541] {
                 assert_eq!(smooth[beside], expected[beside], "{own} {beside}");
             }
-            // With a variance of any size, its neighbours say where it is; with none it stays.
+            // With a variance of any size, its neighbours determine it; without a valid one it stays unchanged.
             assert!(own > 0.0 || smooth[500] == points[500], "{own}");
         }
     }
 
     #[test]
-    fn a_point_alone_stays_as_it_is() {
+    fn an_isolated_point_keeps_its_own_estimate() {
         let (points, singles) = plane(1.0);
         let [smooth] = smoothed(&points[77..78], &singles[77..78], WIDTH)[..] else { panic!() };
         assert_eq!(smooth.inverse_depth, singles[77].inverse_depth as f32);

@@ -4,15 +4,15 @@ use serde::{Deserialize, Serialize};
 
 use crate::slam::parameter::{ParameterError, check_range};
 
-/// From which filter points enter the joint estimation; `docs/depth-filters.md` compares them.
+/// The filter whose points enter the joint estimation; `docs/depth-filters.md` compares them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PointSource {
-    /// The surest pixels of the keyframe's depth.
+    /// The most certain pixels of the keyframe's depth.
     #[default]
     Gaussian,
-    /// Pixels chosen when the keyframe is made and traced as intervals through the frames that follow: those that are
-    /// mature when the next keyframe comes (Engel, Koltun, Cremers 2018 §2.2).
+    /// Pixels chosen when the keyframe is created and traced as intervals through the frames that follow: those that
+    /// are mature when the next keyframe arrives (Engel, Koltun, Cremers 2018 §2.2).
     Interval,
 }
 
@@ -22,7 +22,7 @@ pub enum PointSource {
 pub struct WindowParams {
     /// Newest keyframes whose poses are free.
     pub num_free: usize,
-    /// Older keyframes that see the same things, and stay where they are.
+    /// Older keyframes that see the same scene and stay fixed.
     pub num_fixed: usize,
     /// The first keyframes of an epoch, in which all but the first are free.
     pub num_first: usize,
@@ -36,13 +36,13 @@ pub struct WindowParams {
     pub min_gradient: f64,
     /// Largest standard deviation of a point that is chosen, over its inverse depth.
     pub max_relative_deviation: f64,
-    /// Residuals beyond this many grey levels grow linearly (Engel, Koltun, Cremers 2018).
+    /// The cost of residuals beyond this many grey levels grows linearly (Engel, Koltun, Cremers 2018).
     pub huber_grey: f32,
     /// Gradient of the host, grey levels a pixel, at which a sample weighs one half: sub-pixel errors show there.
     pub half_weight_gradient: f32,
     /// A comparison whose mean energy is above the square of this, grey levels, is left out: something else is seen.
     pub truncation_grey: f32,
-    /// Most iterations of a level: at 1, 2, 3, 4 and 8 the error of a recording was 0.056, 0.041, 0.036, 0.035, 0.036 m.
+    /// Most iterations of a level: at 1, 2, 3, 4, 8 the error of a recording was 0.056, 0.041, 0.036, 0.035, 0.036 m.
     pub max_iterations: u32,
     /// The same among the first keyframes.
     pub max_first_iterations: u32,
@@ -50,11 +50,11 @@ pub struct WindowParams {
     pub frame_lag: usize,
     /// Most frames that wait, one byte a pixel each; the oldest keep the pose that the tracker gave them.
     pub max_waiting_frames: usize,
-    /// Keyframes that come from the beginning of one pass over all, in spare time, to that of the next: 10 are more than
-    /// the window frees, so that each has settled once before it is freed again. 0 makes none.
+    /// Keyframes from the start of one pass over all, in spare time, to the start of the next: 10 are more than the
+    /// window frees, so that each has settled once before it is freed again. With 0 only a closed loop starts one.
     pub pass_every: usize,
-    /// Keyframes that are free at once in a pass. A new keyframe waits for one piece at most: 14 and the eight that hold
-    /// them take about 90 ms of one core, twice what a keyframe's own estimate takes.
+    /// Keyframes that are free together in a pass. A new keyframe waits for at most one piece: 14 and the eight that
+    /// hold them take about 90 ms of one core, twice what a keyframe's own estimate takes.
     pub pass_piece: usize,
     /// A level is done when the next step would lower the cost by less than this many mean squared residuals: a step of
     /// one standard deviation in one direction lowers it by about one.
@@ -92,7 +92,7 @@ impl Default for WindowParams {
 }
 
 impl WindowParams {
-    /// Whether candidates are traced for it, beside the depth of the active keyframe.
+    /// Whether candidates are traced for it, alongside the depth of the active keyframe.
     pub fn traces_candidates(&self) -> bool {
         self.num_free > 0 && self.points_from == PointSource::Interval
     }

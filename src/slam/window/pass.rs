@@ -1,30 +1,30 @@
-//! All keyframes estimated once more while frames come, a piece at a time, whenever no new keyframe waits.
+//! Passes: all keyframes are estimated again during mapping, a piece at a time, whenever no new keyframe waits.
 //!
-//! The window frees the newest keyframes only: what a loop or a better plane says of older ones goes unused until a pass
-//! frees them too. It is what the conclusion is after the last frame, in smaller pieces.
+//! The window frees only the newest keyframes: what a loop or a better plane implies for older ones has no effect until
+//! a pass frees them too. A pass does what the conclusion does after the last frame, in smaller pieces.
 
 use crate::slam::map::{Correction, Map};
 use crate::slam::window::conclusion::MOST;
 use crate::slam::window::{Adjustment, Window};
 
-/// A change of the newest keyframe's unit (logarithm) or tilt (for each unit of the ray's coordinates) above which what
-/// those around it were estimated with was wrong: in recordings one of 80 estimates after an epoch's first keyframes is
+/// A change of the newest keyframe's unit (logarithm) or tilt (per unit of the ray's coordinates) above which those
+/// around it were estimated with a wrong one: in recordings one of 80 estimates after an epoch's first keyframes is
 /// beyond it, in rendered rooms none is beyond 0.02.
 const LEAST_JUMP: f64 = 0.1;
-/// The same over its standard deviation, where one is known.
+/// The same in standard deviations, where they are known.
 const LEAST_JUMP_SIGMAS: f64 = 5.0;
 
-/// How far a pass has come, and what calls for the next.
+/// The progress of a pass, and the reasons for the next.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Pass {
-    /// Keyframes that came since the last one began.
+    /// Keyframes added since the last one began.
     pub added: usize,
     has_jumped: bool,
-    /// A loop was closed: one is due, whether they are made or not.
+    /// A loop was closed: a pass is due, even where passes are disabled.
     is_called: bool,
-    /// Where it continues; `None` where none is under way.
+    /// Where the pass continues; `None` where none is running.
     next: Option<Place>,
-    /// Where the piece begins that is being estimated.
+    /// The start of the piece that is being estimated.
     piece: Option<Place>,
 }
 
@@ -36,19 +36,19 @@ struct Place {
 }
 
 impl Pass {
-    /// One is to be made, from the beginning.
+    /// Calls for a pass from the beginning.
     pub fn call(&mut self) {
         (self.is_called, self.next) = (true, None);
     }
 
-    /// The piece that was away has entered.
+    /// The piece that was being estimated has entered.
     pub fn leave_piece(&mut self) {
         self.piece = None;
     }
 }
 
 impl Window {
-    /// Whether a piece of a pass is to be estimated, by [`Window::optimise`]: to be asked where no new keyframe waits.
+    /// Begins a piece of a pass, by [`Window::optimise`]; false where none is due. Call it when no new keyframe waits.
     pub fn begin_piece(&mut self) -> bool {
         self.pass.leave_piece();
         let Some(newest) = self.keyframes.len().checked_sub(1) else { return false };
@@ -61,7 +61,7 @@ impl Window {
         let oldest = &self.keyframes[of_epoch[of_epoch.len().saturating_sub(MOST)]];
         let start = Place { epoch: oldest.epoch, keyframe_id: oldest.keyframe_id };
         let pass = &mut self.pass;
-        // One of an epoch that was left, or has become part of another, ends there.
+        // A pass over an epoch that was left, or joined to another, ends.
         pass.next = pass.next.filter(|next| next.epoch == start.epoch);
         let is_due =
             pass.is_called || pass_every > 0 && (pass.has_jumped || pass.added >= pass_every);
@@ -72,7 +72,7 @@ impl Window {
         pass.piece.is_some()
     }
 
-    /// Whether so few are all free with every new keyframe.
+    /// Whether the epoch is so short that all its keyframes are free with every new one.
     fn is_short(&self, of_epoch: &[usize]) -> bool {
         of_epoch.len() <= self.params.num_first.max(self.params.num_free)
     }
@@ -84,7 +84,7 @@ impl Window {
         let length = self.params.pass_piece;
         let place =
             of_epoch.partition_point(|&k| self.keyframes[k].keyframe_id < piece.keyframe_id);
-        // The last one is as long as the others.
+        // The last piece is as long as the others.
         let begin = place.min(of_epoch.len().saturating_sub(length));
         let end = (begin + length).min(of_epoch.len());
         let mut chosen = self.choose_piece(&of_epoch, begin, end);
@@ -98,7 +98,7 @@ impl Window {
         adjustment
     }
 
-    /// The last estimate was not taken: a piece is estimated again.
+    /// The last estimate was dropped: its piece is estimated again.
     pub fn repeat_piece(&mut self) {
         if let Some(piece) = self.pass.piece.take() {
             self.pass.next = Some(piece);
@@ -110,7 +110,7 @@ impl Window {
         self.pass.piece.is_some()
     }
 
-    /// Takes note of a correction of the newest keyframes: where the newest one's unit or plane jumps, those before were
+    /// Watches a correction of the newest keyframes: where the newest one's unit or plane jumps, those before were
     /// estimated with a wrong one and a pass is due.
     pub fn watch(&mut self, map: &Map, correction: &Correction) {
         let Some(newest) = self.keyframes.len().checked_sub(1) else { return };

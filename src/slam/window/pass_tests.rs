@@ -1,4 +1,4 @@
-//! Passes over a walk through a room whose middle is bent.
+//! Passes over a walk through a room that is bent in the middle.
 
 use std::collections::BTreeSet;
 
@@ -41,7 +41,7 @@ fn walk() -> Window {
     window
 }
 
-/// Keyframes 4 and 5 out of line by so many metres, a pixel for each centimetre, and a quarter as many radians.
+/// Displaces keyframes 4 and 5 by this many metres, a pixel per centimetre, and a quarter as many radians.
 fn bend(window: &mut Window, by: f64) {
     let off = SE3::exp(&Vector6::from([0.0, by, 0.5 * by, 0.0, 0.0, 0.25 * by]));
     for keyframe in &mut window.keyframes[4..=5] {
@@ -49,7 +49,7 @@ fn bend(window: &mut Window, by: f64) {
     }
 }
 
-/// Root mean square distance of the keyframes from where they should be.
+/// Root mean square distance of the keyframes from their true positions.
 fn error(window: &Window, truth: &Window) -> f64 {
     let pairs = window.keyframes.iter().zip(&truth.keyframes);
     let squares = pairs.map(|(found, right)| {
@@ -59,7 +59,7 @@ fn error(window: &Window, truth: &Window) -> f64 {
     (squares.sum::<f64>() / window.keyframes.len() as f64).sqrt()
 }
 
-/// Estimates a piece; the keyframes that it freed. `None` where none is due.
+/// Estimates a piece and returns the keyframes that it freed; `None` where none is due.
 fn piece(window: &mut Window) -> Option<Vec<u64>> {
     window.moved.clear();
     window.begin_piece().then(|| {
@@ -85,7 +85,7 @@ fn a_pass_straightens_a_bend_and_leaves_the_first_keyframe() {
         assert_eq!(freed, [vec![1, 2, 3], vec![2, 3, 4, 5], vec![4, 5, 6, 7], vec![6, 7, 8, 9]]);
         assert_eq!(window.keyframes[0].camera_from_map, truth.keyframes[0].camera_from_map);
         assert!(window.keyframes.iter().all(|of| of.images.len() == 1 || of.keyframe_id > 1));
-        // The next begins when as many keyframes have come.
+        // The next pass begins after `pass_every` keyframes.
         window.pass.added = params().pass_every - 1;
         assert_eq!(piece(&mut window), None);
         window.pass.added += 1;
@@ -110,13 +110,13 @@ fn a_map_that_is_reconsidered_is_straightened_at_once() {
 }
 
 #[test]
-fn a_piece_that_was_dropped_is_estimated_again_and_a_new_keyframe_does_not_restart_the_pass() {
+fn a_dropped_piece_is_estimated_again_and_a_new_keyframe_does_not_restart_the_pass() {
     let mut window = walk();
     let first = piece(&mut window);
     window.repeat_piece();
     assert_eq!(piece(&mut window), first);
     assert_eq!(piece(&mut window), Some(vec![2, 3, 4, 5]));
-    // The newest comes between: it is estimated, not the piece that begins next.
+    // The newest keyframe takes precedence: it is estimated, not the next piece.
     window.unaligned.push(9);
     window.moved.clear();
     window.optimise().unwrap();
@@ -167,7 +167,7 @@ fn a_jump_of_the_newest_plane_or_unit_beyond_its_sigma_calls_for_a_pass() {
 }
 
 #[test]
-fn what_a_piece_does_not_free_stays_and_so_does_a_keyframe_that_came_meanwhile() {
+fn keyframes_that_a_piece_does_not_free_stay_and_so_do_new_ones() {
     let mut window = walk();
     bend(&mut window, 0.01);
     piece(&mut window).unwrap();

@@ -1,10 +1,10 @@
-//! How uncertain the places are that were estimated jointly, relative to the keyframes that held the window.
+//! Uncertainty of jointly estimated places, relative to the keyframes that held the window.
 //!
-//! With C = `camera_from_map`, whose left increments are what is estimated, a place errs by ξ = −Ad(C⁻¹) ξ_C; its unit
-//! by minus the constant of the plane that is fitted to the ln d' of the points. Both are linear in what is free, as
-//! the modes are (`marginals`), but they do depend on the unit. Where one keyframe alone holds the window, the unit is
-//! that of its depths, whatever the stiffness that the equations were given: with n the direction in which all grows and
-//! c(x) the mean change of its ln d, by which n changes by −1, a linear function g is there
+//! With C = `camera_from_map`, whose left increments are estimated, the error of a place is ξ = −Ad(C⁻¹) ξ_C; that of
+//! its unit is minus the constant of the plane fitted to the ln d' of the points. Both are linear in the free
+//! parameters, as the modes are (`marginals`), but they do depend on the unit. Where one keyframe alone holds the
+//! window, the unit is that of its depths, whatever stiffness the equations were given: with n the direction of growth
+//! and c(x) the mean change of its ln d, where c(n) = −1, a linear function g becomes
 //! ```text
 //! g(x) + c(x) g(n)
 //! ```
@@ -22,17 +22,17 @@ use crate::slam::window::keyframe::WindowKeyframe;
 use crate::slam::window::system::{Members, System};
 use crate::slam::window::view::Views;
 
-/// How uncertain the place of a keyframe is, as `slam::place_covariance` has it, relative to those that held the window.
+/// Uncertainty of a keyframe's place (see `slam::place_covariance`), relative to those that held the window.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PlaceMarginal {
-    /// By the noise of the residuals alone, as if they were independent.
+    /// From the noise of the residuals alone, taken as independent.
     pub noise: PlaceMatrix,
-    /// What it is if its image is displaced by a pixel along both axes, alike all over.
+    /// From a displacement of its image by a pixel along both axes, uniformly.
     pub of_displaced: PlaceMatrix,
 }
 
 impl PlaceMarginal {
-    /// Moves it into the map that `by` makes of this one.
+    /// Transports it into the map that `by` moves this one to.
     pub(super) fn transport(&mut self, by: &Sim3) {
         let by = transport(by);
         for matrix in [&mut self.noise, &mut self.of_displaced] {
@@ -40,7 +40,7 @@ impl PlaceMarginal {
         }
     }
 
-    /// Whether every number is.
+    /// Whether every number is finite.
     pub(super) fn is_finite(&self) -> bool {
         self.noise.iter().chain(self.of_displaced.iter()).all(|x| x.is_finite())
     }
@@ -49,13 +49,13 @@ impl PlaceMarginal {
 /// What holds the unit of a window.
 pub(super) struct Gauge {
     num_points: usize,
-    /// The change of ln d of the one keyframe that holds the window, whitened, and how the free poses move when all
-    /// grows; `None` where more hold it.
+    /// The whitened change of ln d of the one keyframe that holds the window, and the motion of the free poses as the
+    /// unit grows; `None` where more hold it.
     of_one: Option<(DVector<f64>, DVector<f64>)>,
 }
 
 impl Gauge {
-    /// Of a window that grows along `unit` if it is held by one keyframe; `None` where that has no depth.
+    /// The gauge of a window that grows along `unit` if one keyframe holds it; `None` where that has no depth.
     pub(super) fn new(
         unit: Option<DVector<f64>>,
         keyframes: &[WindowKeyframe],
@@ -67,7 +67,7 @@ impl Gauge {
         let num_points = views.points.len();
         let Some(along) = unit else { return Some(Self { num_points, of_one: None }) };
         let mut of = Functional::zero(system.num_free);
-        // The median, by which `Window` keeps the unit, listens to points as sure as they are.
+        // The median, by which `Window` keeps the unit, responds to points in proportion to their certainty.
         let mut sum = 0.0;
         for (slot, view) in views.points.iter().enumerate() {
             let inverse_depth =
@@ -83,8 +83,8 @@ impl Gauge {
         (sum > 0.0).then_some(Self { num_points, of_one: Some((whitened, along)) })
     }
 
-    /// The errors of a place, whitened: the products of two are their covariance. `number` is that of its pose, `unit`
-    /// the error of its unit were the window's exact.
+    /// The whitened errors of a place: the products of two are their covariance. `number` is that of its pose, `unit`
+    /// the error of its unit if that of the window were exact.
     pub(super) fn errors(
         &self,
         map_from_camera: &SE3,
@@ -103,7 +103,7 @@ impl Gauge {
             };
             let mut whitened = spread_out(&whiten(of), of, self.num_points);
             if let Some((of_one, along)) = &self.of_one {
-                // A unit grows with all.
+                // A unit grows with everything else.
                 let growth = if row < POSE { of.poses.dot(along) } else { 1.0 };
                 whitened.axpy(growth, of_one, 1.0);
             }
@@ -112,7 +112,7 @@ impl Gauge {
     }
 }
 
-/// A whitened function with a place for every point.
+/// A whitened function with an entry for every point.
 fn spread_out(whitened: &DVector<f64>, of: &Functional, num_points: usize) -> DVector<f64> {
     let poses = of.poses.len();
     let mut all = DVector::zeros(poses + num_points);
@@ -123,13 +123,13 @@ fn spread_out(whitened: &DVector<f64>, of: &Functional, num_points: usize) -> DV
     all
 }
 
-/// The equations of a plane over points; `None` where they do not tell it.
+/// The equations of a plane over points; `None` where these do not determine it.
 pub(super) fn unit_fit(seen: &[Seen]) -> Option<Cholesky<f64, Const<3>>> {
     let shapes = seen.iter().map(|of| of.phi.xyz());
     shapes.map(|phi| phi * phi.transpose()).sum::<Matrix3<f64>>().cholesky()
 }
 
-/// What a displacement of the whole image by a pixel makes of a place whose points are `seen`: of its pose as of a
+/// Covariance of a place whose points are `seen` by a displacement of the whole image by a pixel: of its pose as of a
 /// tracked frame's, of its unit by the parallax of its points.
 pub(super) fn place_of_displaced(
     seen: &[Seen],

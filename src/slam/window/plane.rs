@@ -1,26 +1,26 @@
-//! A smooth correction of a keyframe's depth from few points that are known better.
+//! A smooth correction of a keyframe's depth from a few points that are more accurate.
 
 use nalgebra::{Matrix3, Matrix4, Vector3, Vector4};
 
 use crate::slam::upper_median::upper_median;
 
-/// One point that is known better.
+/// A point that is more accurate than the keyframe's depth.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Correspondence {
     /// Its ray at depth 1.
     pub ray: [f64; 2],
-    /// Logarithm of its inverse depth over what the keyframe has there.
+    /// Logarithm of the ratio of its inverse depth to the keyframe's there.
     pub log_ratio: f64,
-    /// Logarithm of what the keyframe has there, in the unit of the map.
+    /// Logarithm of the keyframe's inverse depth there, in the unit of the map.
     pub log_inverse_depth: f64,
 }
 
-/// What is left of the relief when a plane has been taken out: `log_ratio - plane ≈ offset + relief ln d`; 0 where depths
-/// do not differ by more than their noise.
+/// The relief that remains when a plane has been removed: `log_ratio - plane ≈ offset + relief ln d`; 0 where depths do
+/// not differ by more than their noise.
 pub fn relief_left(points: &[Correspondence], plane: &[f64; 3]) -> f64 {
-    /// Variance of depths beyond a plane over that of their noise, from which on there is relief to be judged.
+    /// Variance of depths beyond a plane over that of their noise, above which relief can be determined.
     const LEAST_RATIO: f64 = 4.0;
-    /// Largest relief: flat instead of deep by half. More is a wrong fit.
+    /// Largest relief: depth flattened by half. More is a wrong fit.
     const MOST: f64 = 0.5;
     let residual = |point: &Correspondence| {
         point.log_ratio - plane[0] - plane[1] * point.ray[0] - plane[2] * point.ray[1]
@@ -53,11 +53,11 @@ pub fn relief_left(points: &[Correspondence], plane: &[f64; 3]) -> f64 {
 /// `log_ratio ≈ offset + per_x X + per_y Y` for most of the points: offset and slopes. A single offset where there are
 /// too few points for a plane, `None` where there are too few for that.
 pub fn fit(points: &[Correspondence]) -> Option<[f64; 3]> {
-    /// Points that a plane wants: ten for each of its numbers.
+    /// Points that a plane needs: ten per parameter.
     const FEWEST_FOR_PLANE: usize = 30;
-    /// Points that an offset wants.
+    /// Points that an offset needs.
     const FEWEST_FOR_OFFSET: usize = 10;
-    /// Iterations: the weights have settled long before.
+    /// Iterations: the weights settle long before.
     const ITERATIONS: usize = 15;
     /// Largest slope: over an image 60° wide a factor of three from side to side. More is a wrong fit.
     const STEEPEST: f64 = 1.0;
@@ -96,7 +96,7 @@ fn weight_of(residual: f64) -> f64 {
     }
 }
 
-/// Standard deviation of normal errors whose sizes these are.
+/// Standard deviation of normal errors with these absolute values.
 fn spread(sizes: Vec<f64>) -> f64 {
     const SIGMA_OF_MEDIAN: f64 = 1.4826;
     /// Depth is never known better than to a millionth.
@@ -104,7 +104,7 @@ fn spread(sizes: Vec<f64>) -> f64 {
     (SIGMA_OF_MEDIAN * median(sizes)).max(LEAST)
 }
 
-/// The upper median; 0 of none.
+/// The upper median; 0 for no values.
 pub(super) fn median(mut values: Vec<f64>) -> f64 {
     upper_median(&mut values, f64::total_cmp).unwrap_or(0.0)
 }

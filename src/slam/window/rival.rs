@@ -1,9 +1,9 @@
-//! Whether the first keyframes are explained better by the other motion that their start could have taken.
+//! Checks whether the other motion that a start could have taken explains its first keyframes better.
 //!
 //! Two views of a plane are explained by two motions, with the translation and the normal of the plane exchanged
-//! (Longuet-Higgins 1986), and two near views of a shallow scene nearly so. A start that took the wrong one looks well by
-//! itself, and the joint estimate bends it until it fits; but the keyframes that follow fit the right one better. So the
-//! first keyframes are estimated once more from the other motion, and the costs are compared.
+//! (Longuet-Higgins 1986), and two near views of a shallow scene nearly so. A start with the wrong one looks
+//! consistent, and the joint estimate bends it until it fits; but the keyframes that follow fit the right one better.
+//! The first keyframes are therefore estimated once more from the other motion, and the costs are compared.
 
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 
@@ -13,21 +13,21 @@ use crate::slam::window::plane::median;
 use crate::slam::window::system::Members;
 use crate::slam::window::{ADJUSTED_LEVELS, ALIGNMENT_LEVELS, MAX_ALIGNMENT_ITERATIONS, Window};
 
-/// Keyframes from which on there is something to compare: two are explained by both motions, three nearly.
+/// Fewest keyframes to compare: two are explained by both motions, three nearly.
 const FEWEST_KEYFRAMES: usize = 4;
-/// Cost of the rival over that of the start below which the start is wrong. Wrong starts of the floor have 0.49 to 0.87,
-/// right ones of all recordings and rooms 1.21 and more.
+/// Cost of the rival over that of the start below which the start is wrong. Wrong starts on the floor have 0.49 to
+/// 0.87, right ones of all recordings and rooms 1.21 and more.
 const REFUTED: f64 = 0.95;
-/// The same above which the start is right, and is not asked about again: wrong ones have at most 0.92, right ones 1.48 and
-/// more but for a few, which are asked about to the end.
+/// The same above which the start is right, and is not checked again: wrong ones have at most 0.92, right ones 1.48 and
+/// more except for a few, which are checked to the end.
 const CONFIRMED: f64 = 1.4;
-/// Least share of the comparisons that the rival must make too: one that sees little costs little.
+/// Least share of the comparisons that the rival must make too: a rival that sees little costs little.
 const LEAST_COMPARED: f64 = 0.8;
-/// Least inverse depth of a point on the rival's plane, as a share of that on the optical axis: a plane may rise above the
-/// horizon.
+/// Least inverse depth of a point on the rival's plane, as a share of that on the optical axis: a plane may rise above
+/// the horizon.
 const FARTHEST: f64 = 0.1;
 
-/// What a plane n, n · X = 1 in the first camera, does to a second view: H = R + t nᵀ.
+/// A plane n, n · X = 1 in the first camera, and the motion to a second view, with the homography H = R + t nᵀ.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct PlaneMotion {
     camera_from_first: SE3,
@@ -62,7 +62,7 @@ impl Window {
         is_comparable && of_rival < REFUTED * cost
     }
 
-    /// Mean cost of a comparison at the state of the solver, those that see something else included.
+    /// Mean cost of a comparison at the solver's state, including those that see something else.
     fn mean_cost(&self) -> f64 {
         let system = &self.solver.system;
         let others = (system.compared - system.inliers) as f64;
@@ -70,7 +70,7 @@ impl Window {
         (system.inlier_cost + others * most) / system.compared.max(1) as f64
     }
 
-    /// Moves the first keyframes to where the rival's motion has them and estimates them; false where there is no rival.
+    /// Moves the first keyframes to their poses by the rival's motion and estimates them; false without a rival.
     fn become_rival(&mut self, chosen: &Chosen) -> bool {
         let first = chosen.members[0];
         let map_from_first = self.keyframes[first].camera_from_map.inverse();
@@ -81,7 +81,7 @@ impl Window {
         });
         let motions: Option<Vec<PlaneMotion>> = motions.collect();
         let Some(motions) = motions else { return false };
-        // The one with the largest baseline tells most of the plane.
+        // The one with the largest baseline determines the plane best.
         let baseline = |of: &&PlaneMotion| of.camera_from_first.translation.norm();
         let Some(widest) = motions.iter().max_by(|a, b| baseline(a).total_cmp(&baseline(b))) else {
             return false;
@@ -90,7 +90,7 @@ impl Window {
         self.lie_on(first, &normal);
         for (place, motion) in motions.iter().enumerate() {
             let member = chosen.members[place + 1];
-            // Of another plane than the widest's: in the unit of that.
+            // Its plane is not that of the widest: convert to the unit of that one.
             let mut camera_from_first = motion.camera_from_first;
             camera_from_first.translation *= motion.normal.norm() / normal.norm();
             self.keyframes[member].camera_from_map = camera_from_first * map_from_first.inverse();
@@ -110,7 +110,7 @@ impl Window {
         self.run(&members, &ADJUSTED_LEVELS, self.params.max_first_iterations, |_, _| true)
     }
 
-    /// The plane that most points of a keyframe are nearest to.
+    /// The plane that is nearest to most points of a keyframe.
     fn plane_of(&self, member: usize) -> Option<Vector3<f64>> {
         /// Iterations: the weights have settled.
         const ITERATIONS: usize = 10;
@@ -138,7 +138,7 @@ impl Window {
         plane
     }
 
-    /// Puts a keyframe's points on a plane in its camera.
+    /// Moves a keyframe's points onto a plane in its camera.
     fn lie_on(&mut self, member: usize, normal: &Vector3<f64>) {
         let least = FARTHEST * normal.z.abs();
         for point in &mut self.keyframes[member].points {
@@ -150,8 +150,8 @@ impl Window {
 }
 
 impl PlaneMotion {
-    /// The other motion and plane with the same homography, the plane before the camera; `None` where the two do not
-    /// differ or a number is none (Ma, Soatto, Košecká, Sastry 2004 §5.3).
+    /// The other motion and plane with the same homography, the plane in front of the camera; `None` where the two do
+    /// not differ or a number is invalid (Ma, Soatto, Košecká, Sastry 2004 §5.3).
     fn rival(&self) -> Option<Self> {
         let Self { camera_from_first, normal } = self;
         let rotation = camera_from_first.rotation.to_rotation_matrix().into_inner();
@@ -163,7 +163,7 @@ impl PlaneMotion {
         let [v1, v2, v3] = [0, 1, 2].map(|i| rows.row(i).transpose());
         let homography = homography / s2;
         let (a, c) = ((s1 / s2).powi(2) - 1.0, 1.0 - (s3 / s2).powi(2));
-        /// Below this the two views differ by a rotation.
+        /// Below this the two views differ only by a rotation.
         const LEAST: f64 = 1e-9;
         if !(a + c > LEAST) || !homography.iter().all(|x| x.is_finite()) {
             return None;
@@ -203,7 +203,7 @@ mod tests {
     use crate::slam::window::tests::room;
 
     #[test]
-    fn the_rival_does_the_same_to_the_plane_and_is_the_rivals_rival() {
+    fn the_rival_has_the_same_homography_and_its_rival_is_the_original_motion() {
         let normal = Vector3::new(0.2, -0.3, 0.9);
         for twist in [[0.1, 0.02, -0.03, 0.02, -0.05, 0.01], [0.0, 0.01, 0.2, 0.0, 0.01, -0.03]] {
             let camera_from_first = SE3::exp(&Vector6::from(twist));
@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn the_right_motion_stays_and_the_wrong_one_is_refuted() {
+    fn the_right_motion_is_confirmed_and_the_wrong_one_is_refuted() {
         let mut window = Window::new(CAMERA, WindowParams::default());
         window.keyframes = room(|_, _| (1.0, 0.0)).keyframes;
         let chosen = window.choose_members(window.keyframes.len() - 1);

@@ -1,4 +1,4 @@
-//! Which points of a keyframe's depth take part in the joint estimation.
+//! Selects the points of a keyframe's depth that take part in the joint estimation.
 
 use std::collections::HashSet;
 
@@ -9,15 +9,15 @@ use crate::slam::window::params::WindowParams;
 /// Pixels at the border that no point is chosen in: pattern and gradients stay inside.
 const BORDER_PX: u16 = 4;
 
-/// As [`choose`], and then as many more as there are in up to `max_points` cells, in an order of which every beginning
-/// is spread over the image.
+/// Like [`choose`], followed by as many more as there are in up to `max_points` cells, in an order of which every
+/// prefix is spread over the image.
 pub fn choose_spread(
     points: &[DepthPoint],
     pixels: &[u8],
     camera: &Intrinsics,
     params: &WindowParams,
 ) -> Vec<DepthPoint> {
-    /// Of the others every so many at a time.
+    /// Stride through the others.
     const STEP: usize = 8;
     let of = |num_cells| choose(points, pixels, camera, num_cells, params);
     let (num_cells, most_cells) = (params.points, params.max_points);
@@ -33,7 +33,7 @@ pub fn choose_spread(
     chosen
 }
 
-/// The surest points with gradient, at most one in each of `num_cells` cells of the image, cell after cell.
+/// Chooses the most certain points with gradient, at most one in each of `num_cells` cells of the image, cell by cell.
 pub fn choose(
     points: &[DepthPoint],
     pixels: &[u8],
@@ -70,13 +70,13 @@ fn gradient(pixels: &[u8], width: usize, u: usize, v: usize) -> f64 {
     (0.5 * (at(u + 1, v) - at(u - 1, v))).hypot(0.5 * (at(u, v + 1) - at(u, v - 1)))
 }
 
-/// The point of a keyframe, whose points are in row-major order, that is at a pixel.
+/// The point at a pixel, among a keyframe's points in row-major order.
 pub fn at_pixel(points: &[DepthPoint], u: u16, v: u16) -> Option<&DepthPoint> {
     let place = points.binary_search_by_key(&(v, u), |point| (point.v, point.u)).ok()?;
     points.get(place)
 }
 
-/// The points of a keyframe by row: many positions are looked up.
+/// The points of a keyframe by row, for looking up many positions.
 pub struct Rows<'a> {
     points: &'a [DepthPoint],
     /// Where each row begins, and the end.
@@ -84,13 +84,13 @@ pub struct Rows<'a> {
 }
 
 impl<'a> Rows<'a> {
-    /// Of points in row-major order, in an image of so many rows.
+    /// Indexes points in row-major order, of an image with this many rows.
     pub fn of(points: &'a [DepthPoint], rows: usize) -> Self {
         let begin = |row: usize| points.partition_point(|point| usize::from(point.v) < row);
         Self { points, begins: (0..=rows).map(begin).collect() }
     }
 
-    /// The nearest to a position, within a pixel of it.
+    /// The point nearest to a position, within a pixel of it.
     pub fn near(&self, u: f64, v: f64) -> Option<&'a DepthPoint> {
         let (column, row) = (u.round(), v.round());
         if !(column >= 1.0 && row >= 1.0 && column < 65_535.0 && row < 65_535.0) {

@@ -1,22 +1,22 @@
-//! Whether an image shows the window's points where a camera is thought to be.
+//! Checks whether an image shows the window's points from an assumed camera pose.
 
 use crate::slam::geometry::se3::SE3;
 use crate::slam::window::members::FEWEST_COMMON;
 use crate::slam::window::{ALIGNMENT_LEVELS, MAX_ALIGNMENT_ITERATIONS, Window};
 
-/// What the points say of a camera's place.
+/// A camera's pose as determined by the points.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Sighting {
-    /// Where they fit best, translation in the unit of the keyframe that was named.
+    /// The pose at which they fit best, translation in the unit of the given keyframe.
     pub keyframe_from_camera: SE3,
     /// Share of the points in view that the image agrees with there.
     pub agreeing: f64,
 }
 
 impl Window {
-    /// Aligns an image to the points of the keyframes that see most of what it does, from a place in the camera of one of
-    /// them, translation in that one's unit. `None` where too few points are in view to say anything, or the keyframe is
-    /// not known. The window stays as it is.
+    /// Aligns an image to the points of the keyframes that see most of what it shows, from an initial pose on one of
+    /// them, translation in that one's unit. `None` where too few points are in view, or the keyframe is unknown. The
+    /// window does not change.
     pub fn sight(
         &mut self,
         keyframe_id: u64,
@@ -75,7 +75,7 @@ mod tests {
     }
 
     #[test]
-    fn the_points_say_where_an_image_was_taken() {
+    fn the_points_determine_where_an_image_was_taken() {
         let (mut window, truth, pixels) = window_and_image();
         let before = window.keyframes.clone();
         let off = SE3::exp(&Vector6::new(0.01, 0.01, 0.0, 0.005, 0.005, 0.0));
@@ -83,7 +83,7 @@ mod tests {
         let error = (found.keyframe_from_camera * truth.inverse()).log().norm();
         assert!(error < 0.002 && found.agreeing > 0.9, "{error} {found:?}");
         assert!(window.keyframes == before, "asking changes nothing");
-        // Of a keyframe with another unit the place is in that.
+        // On a keyframe with another unit the pose is in that unit.
         window.keyframes[1].unit = 2.0;
         let halved = SE3 { translation: truth.translation * 0.5, ..truth };
         let again = window.sight(1, &halved, &pixels).unwrap();

@@ -15,31 +15,31 @@ const DAMPING_UP: f64 = 10.0;
 const FIRST_DAMPING: f64 = 1e-3;
 /// Smallest damping: sums of f32 are exact to about a millionth, and the unit is held by nothing else.
 const LEAST_DAMPING: f64 = 1e-6;
-/// Damping of a step after one that failed is at least this.
+/// Least damping of a step after one that failed.
 const LEAST_RAISED_DAMPING: f64 = 1e-3;
-/// Steps that may fail in a row.
+/// Consecutive steps that may fail.
 const MAX_FAILURES: u32 = 5;
-/// Largest factor by which a step may change a depth, either way: further the linearisation says nothing.
+/// Largest factor by which a step may change a depth, either way: beyond it the linearisation does not hold.
 const MAX_DEPTH_FACTOR: f64 = 3.0;
 
-/// Memory of the iterations.
+/// State and buffers of the iterations.
 #[derive(Debug, Clone, Default)]
 pub struct Solver {
     /// The comparisons that are made.
     pub views: Views,
-    /// The equations at the state that was reached.
+    /// The equations at the current state.
     pub system: System,
     trial: System,
     step: Step,
     poses: Vec<SE3>,
     depths: Vec<f64>,
-    /// Steps that were tried, until somebody asks.
+    /// Steps that were tried, until it is reset.
     pub iterations: u32,
 }
 
 impl Solver {
-    /// Moves what is free to where the images agree best; `system` has the equations there. False where the poses are
-    /// not determined: nothing has moved then.
+    /// Moves the free poses and depths to where the images agree best; `system` has the equations there. False where
+    /// the poses are not determined.
     pub fn adjust(
         &mut self,
         keyframes: &mut [WindowKeyframe],
@@ -73,7 +73,7 @@ impl Solver {
             if moved < cost {
                 std::mem::swap(&mut self.system, &mut self.trial);
                 (damping, failures) = ((damping * DAMPING_DOWN).max(LEAST_DAMPING), 0);
-                // The linear model may promise more than kinks between pixels let it have.
+                // The linear model may predict more than kinks between pixels allow.
                 let is_flat = cost - moved < converged;
                 cost = moved;
                 if is_flat {

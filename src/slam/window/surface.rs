@@ -1,21 +1,21 @@
-//! How far a keyframe sees, part by part of its image: what is behind that is hidden.
+//! How far a keyframe sees in each part of its image: points behind that are hidden.
 //!
-//! Through a wall a keyframe has the points of the next room in view, more of them than of its own surroundings where it
-//! looks at the wall from near, and on walls of little contrast half of the comparisons with them count by chance.
+//! A keyframe has the points of the next room in view through a wall, more of them than of its own surroundings if it
+//! sees the wall from near, and on walls of little contrast half of the comparisons with them are inliers by chance.
 
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::keyframe::DepthPoint;
 
-/// Side of a part: a door three metres off is four parts wide at f = 500, and half as large an image has parts enough.
+/// Side of a part: a door three metres away is four parts wide at f = 500, and an image half as large has enough parts.
 const CELL_PX: usize = 32;
-/// Points of a part that are looked at, at most one of so many.
+/// One in this many points is used.
 const STEP: usize = 4;
-/// Points of a part, of those, without which nothing is known of it.
+/// Fewest of these in a part for its depth to be known.
 const FEWEST: usize = 5;
-/// Of these the share that may be farther than what counts as the farthest: wrong matches, mostly.
+/// Share of these that may be beyond what is taken as the farthest: wrong matches, mostly.
 const OUTLIERS: f64 = 0.1;
-/// A point so many times as far as the farthest that is seen there is hidden. Depth and unit of a keyframe are known
-/// better than that, and what is behind a wall seen from near is farther than that.
+/// A point this many times as far as the farthest that is seen there is hidden. Depth and unit of a keyframe are more
+/// accurate than that, and points behind a wall seen from near are further away than that.
 const HIDDEN_RATIO: f64 = 1.5;
 
 /// A point as an observer sees it.
@@ -25,20 +25,20 @@ pub struct Projected {
     pub u: f64,
     /// Row.
     pub v: f64,
-    /// Its inverse depth there.
+    /// Its inverse depth in the observer.
     pub inverse_depth: f64,
 }
 
-/// How far a keyframe sees.
+/// The farthest depth in each part of a keyframe's image.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Surface {
     columns: usize,
-    /// Smallest inverse depth of each part, row by row, in the keyframe's unit; 0 where nothing is known.
+    /// Smallest inverse depth of each part, row by row, in the keyframe's unit; 0 where it is unknown.
     least: Vec<f32>,
 }
 
 impl Surface {
-    /// That of a keyframe with this depth, in its unit.
+    /// The surface of a keyframe with this depth, in its unit.
     pub fn of(points: &[DepthPoint], camera: &Intrinsics) -> Self {
         let columns = camera.width.div_ceil(CELL_PX);
         let rows = camera.height.div_ceil(CELL_PX);
@@ -60,7 +60,7 @@ impl Surface {
         Self { columns, least: least.collect() }
     }
 
-    /// Whether something stands before what is seen there, by a keyframe of unit `unit`.
+    /// Whether the surface hides a point that is projected into a keyframe of unit `unit`.
     pub fn hides(&self, seen: &Projected, unit: f64) -> bool {
         let (column, row) = (seen.u as usize / CELL_PX, seen.v as usize / CELL_PX);
         let least = self.least.get(row * self.columns + column).copied().unwrap_or(0.0);
@@ -73,8 +73,8 @@ mod tests {
     use super::*;
     use crate::slam::test_scene::CAMERA;
 
-    /// A wall at inverse depth 1 with a door in it, from column 128 to 192, through which one sees four times as far;
-    /// one point in twenty or so is wrong.
+    /// A wall at inverse depth 1 with a door in it, from column 128 to 192, behind which depth is four times as large;
+    /// about one point in twenty is wrong.
     fn wall_with_a_door() -> Vec<DepthPoint> {
         let pixels = (0..CAMERA.height).flat_map(|v| (0..CAMERA.width).map(move |u| (u, v)));
         let point = |(k, (u, v)): (usize, (usize, usize))| {
@@ -93,7 +93,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_behind_the_wall_is_hidden_and_what_is_in_the_door_is_not() {
+    fn points_behind_the_wall_are_hidden_and_those_in_the_door_are_not() {
         let surface = Surface::of(&wall_with_a_door(), &CAMERA);
         let hides = |u: f64, inverse_depth: f64, unit: f64| {
             surface.hides(&Projected { u, v: 100.0, inverse_depth }, unit)
@@ -107,7 +107,7 @@ mod tests {
     }
 
     #[test]
-    fn where_nothing_is_known_nothing_is_hidden() {
+    fn nothing_is_hidden_where_the_surface_is_unknown() {
         let far = Projected { u: 40.0, v: 100.0, inverse_depth: 1e-6 };
         assert!(!Surface::default().hides(&far, 1.0));
         assert!(!Surface::of(&[], &CAMERA).hides(&far, 1.0));

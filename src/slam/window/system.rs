@@ -1,8 +1,8 @@
 //! The normal equations of a window and their reduction to the poses.
 //!
-//! With C_j = `camera_from_map` and an increment from the left, the derivative by the host's pose is that by the
-//! observer's times −Ad(C_j C_i⁻¹). Points are independent given the poses, so that each is eliminated by itself:
-//! `S = H − Σ h hᵀ/H_dd`.
+//! With C_j = `camera_from_map` and left increments, the derivative with respect to the host's pose is that with
+//! respect to the observer's times −Ad(C_j C_i⁻¹). Points are independent given the poses, so that each is eliminated
+//! separately: `S = H − Σ h hᵀ/H_dd`.
 
 use std::ops::Range;
 
@@ -21,10 +21,10 @@ use crate::slam::window::functional::Functional;
 use crate::slam::window::keyframe::WindowKeyframe;
 use crate::slam::window::view::{PairView, Views};
 
-/// The normal equations at one state. Its memory is kept from one to the next.
+/// The normal equations at one state. Their memory is reused for the next.
 #[derive(Debug, Clone, Default)]
 pub struct System {
-    /// Of the free poses, in their order: the lower triangle, block by block.
+    /// Of the free poses, in order: the lower triangle, block by block.
     hessian: Vec<Block>,
     /// Right side.
     right: Vec<f64>,
@@ -33,24 +33,24 @@ pub struct System {
     mixed: Vec<[f32; PADDED]>,
     /// Cost of each comparison; NaN where it was never inside the image.
     costs: Vec<f32>,
-    /// What those of one pair came to.
+    /// Results of the comparisons of one pair.
     seen: Vec<Compared>,
-    /// What is eliminated, and what it leaves.
+    /// What is eliminated, and the reduced equations.
     elimination: Elimination,
     /// Number of free poses.
     pub num_free: usize,
-    /// Comparisons that count.
+    /// Number of inliers among the comparisons.
     pub inliers: usize,
-    /// Comparisons that were made.
+    /// Number of comparisons that were made.
     pub compared: usize,
-    /// Sum of the costs of those that count.
+    /// Sum of the costs of the inliers.
     pub inlier_cost: f64,
 }
 
 /// Points that are eliminated at a time: their rows stay in the second-level cache.
 const CHUNK: usize = 256;
 
-/// Memory of a solution.
+/// Buffers of a solution.
 #[derive(Debug, Clone, Default)]
 struct Elimination {
     points: Vec<PointRow>,
@@ -64,47 +64,47 @@ struct Elimination {
 struct PointPart {
     /// Σ w J ∂r/∂d of its host.
     host: [f64; POSE],
-    /// H_dd; 0 where nothing saw it.
+    /// H_dd; 0 where no keyframe sees it.
     hessian: f64,
     /// Its right side.
     right: f64,
     inliers: u32,
 }
 
-/// Increments of everything that is free.
+/// Increments of the free parameters.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Step {
     /// Left increments (translation, rotation) of the free poses.
     pub poses: Vec<f64>,
-    /// By point.
+    /// Increments of inverse depths, by point.
     pub depths: Vec<f64>,
-    /// By how much the linear model lowers the cost.
+    /// Decrease of the cost in the linear model.
     pub decrement: f64,
 }
 
-/// What is adjusted: keyframes, of them those that take part, and of them those that are free.
+/// The keyframes that take part in an adjustment, and those of them that are free.
 #[derive(Debug, Clone, Copy)]
 pub struct Members<'a> {
-    /// Places in the list of keyframes.
+    /// Indices in the list of keyframes.
     pub members: &'a [usize],
-    /// For each its number among the free ones.
+    /// For each, its number among the free ones; `None` where it is fixed.
     pub free: &'a [Option<usize>],
     /// Whether depths are free too.
     pub depths_are_free: bool,
 }
 
-/// What stays the same for all systems of a level.
+/// The constants of all systems of a level.
 #[derive(Debug, Clone, Copy)]
 pub struct Level<'a> {
     /// Camera of level 0.
     pub camera: &'a Intrinsics,
     /// The level.
     pub level: usize,
-    /// How residuals count.
+    /// Robust weighting of residuals.
     pub robustness: Robustness,
 }
 
-/// The same of a pose's block as of the pair's lanes.
+/// Sums a pair's lanes into a pose's block and right side.
 fn pose_sums(lanes: &PairSums) -> (Matrix6<f64>, Vector6<f64>) {
     let mut pose = Matrix6::zeros();
     let mut entry = 0;
@@ -121,8 +121,8 @@ fn pose_sums(lanes: &PairSums) -> (Matrix6<f64>, Vector6<f64>) {
 }
 
 impl System {
-    /// Linearises at the state that `keyframes` are in and returns the cost, of which that of comparisons that were
-    /// not inside the image `before` is left out, and of those that are not any more is what it was.
+    /// Linearises at the state of `keyframes` and returns the cost. Comparisons that were outside the image `before`
+    /// are left out; those that have left it since keep their previous cost.
     pub fn linearise(
         &mut self,
         keyframes: &[WindowKeyframe],
@@ -174,7 +174,7 @@ impl System {
         (self.inliers, self.compared, self.inlier_cost) = (0, 0, 0.0);
     }
 
-    /// Keeps what the comparisons of a pair came to and returns what of their cost can be compared with the state
+    /// Stores the results of a pair's comparisons and returns the part of their cost that is comparable with the state
     /// before.
     fn note(
         &mut self,
@@ -261,7 +261,7 @@ impl System {
         }
     }
 
-    /// The rows of some points that are eliminated.
+    /// Collects the rows of points to be eliminated.
     fn collect(
         &self,
         points: Range<usize>,
@@ -295,7 +295,7 @@ impl System {
         }
     }
 
-    /// The increments of poses and inverse depths that a share `damping` added to each diagonal element gives; false
+    /// Computes the increments of poses and inverse depths with a share `damping` added to each diagonal element; false
     /// where the poses are not determined.
     pub fn solve(
         &mut self,
@@ -332,7 +332,7 @@ impl System {
         true
     }
 
-    /// Takes the points out of the equations of the poses, into `elimination`.
+    /// Eliminates the points from the equations of the poses, into `elimination`.
     fn reduce(&mut self, members: &Members<'_>, views: &Views, damping: f64) {
         let mut memory = std::mem::take(&mut self.elimination);
         memory.reduced.clone_from(&self.hessian);
@@ -352,14 +352,14 @@ impl System {
         self.elimination = memory;
     }
 
-    /// Standard deviation of a point's inverse depth, by its place in the views, were all poses exact; infinite where
-    /// nothing sees it.
+    /// Standard deviation of the inverse depth of a point, by its index in the views, if all poses were exact; infinite
+    /// where no keyframe sees it.
     pub fn depth_deviation(&self, slot: usize) -> f64 {
         (self.mean_squared_residual() / self.points[slot].hessian).sqrt()
     }
 
-    /// What is left for the poses without damping, but for a stiffness along `stiffened`; `None` where they are not
-    /// determined.
+    /// Factors of the reduced equations of the poses, without damping but with a stiffness along `stiffened`; `None`
+    /// where the poses are not determined.
     pub fn factors(
         &mut self,
         members: &Members<'_>,
@@ -370,7 +370,7 @@ impl System {
         Factors::of(&self.elimination.reduced, POSE * self.num_free, stiffened)
     }
 
-    /// A vector whose scalar product with that of another function of the same depths is gᵀ H⁻¹ g', `factors` those of
+    /// A vector whose dot product with that of another function of the same depths is gᵀ H⁻¹ g'; `factors` are those of
     /// this system.
     pub fn whitened(
         &self,
@@ -407,25 +407,25 @@ impl System {
         DVector::from_iterator(poses.len() + depths.len(), poses.iter().copied().chain(depths))
     }
 
-    /// Of the comparisons that count, grey levels².
+    /// Mean over the inliers, grey levels².
     pub fn mean_squared_residual(&self) -> f64 {
         self.inlier_cost / (SAMPLES * self.inliers.max(1)) as f64
     }
 
-    /// How many of the comparisons at some places count.
+    /// Number of inliers among the comparisons at these places.
     pub fn inliers_among(&self, places: std::ops::Range<usize>, most_energy: f32) -> usize {
         let costs = self.costs.get(places).unwrap_or_default();
         costs.iter().filter(|cost| **cost < most_energy).count()
     }
 
-    /// Keyframes that agree with each point, in the order of the views.
+    /// Number of keyframes that agree with each point, in the order of the views.
     pub fn inliers_by_point(&self) -> impl Iterator<Item = u32> {
         self.points.iter().map(|part| part.inliers)
     }
 }
 
 impl PointPart {
-    /// Adds a comparison, which is all 0 where it does not count.
+    /// Adds a comparison, whose sums are all 0 unless it is an inlier.
     #[inline(always)]
     fn add(&mut self, seen: &Compared, lane: usize, wanted: &Wanted) {
         self.inliers += u32::from(seen.cost[lane] < f32::INFINITY);

@@ -1,4 +1,4 @@
-//! Windows of a rendered room solved from a perturbed truth, and what becomes of them in the map.
+//! Windows of a rendered room solved from a perturbed truth, and their corrections of the map.
 
 use nalgebra::{Matrix3, Vector6};
 
@@ -18,14 +18,14 @@ pub(super) fn ray(u: f64, v: f64) -> [f32; 2] {
     CAMERA.ray(u, v).xy().map(|x| x as f32).into()
 }
 
-/// Keyframes of a room with points, of which the first and those in `held` stay where they are.
+/// Keyframes of a room with points, of which those in `held` stay fixed.
 #[derive(Clone)]
 pub(super) struct Room {
     pub(super) keyframes: Vec<WindowKeyframe>,
     pub(super) held: Vec<usize>,
 }
 
-/// Four views of the room with exact depth at every place with gradient, every keyframe a host.
+/// Four views of the room with exact depth at pixels with gradient, every keyframe a host.
 pub(super) fn room(brightness: impl Fn(usize, f64) -> (f64, f64)) -> Room {
     noisy_room(brightness, 0)
 }
@@ -53,7 +53,7 @@ pub(super) fn noisy_room(brightness: impl Fn(usize, f64) -> (f64, f64), seed: u6
     Room { keyframes: keyframes.collect(), held: vec![0] }
 }
 
-/// A keyframe with this image of a view and the exact depth of places with gradient, one in each of so many cells.
+/// A keyframe with this image of a view and the exact depth of pixels with gradient, one in each of `num_cells` cells.
 pub(super) fn exact_host(
     keyframe_id: u64,
     map_from_camera: &SE3,
@@ -101,7 +101,7 @@ pub(super) fn exact_host(
 }
 
 impl Room {
-    /// Poses and depths off by what a map may have: a centimetre and half a degree, 5 % of noise, and `modes` (column,
+    /// Perturbs poses and depths as a map may: by a centimetre and half a degree, 5 % of noise, and `modes` (column,
     /// row, relief) in the depth of every keyframe.
     fn perturbed(&self, modes: [f64; 3]) -> Self {
         let mut room = self.clone();
@@ -121,12 +121,12 @@ impl Room {
         room
     }
 
-    /// Solves it; share of the comparisons that count.
+    /// Solves the room; returns the share of inliers.
     fn solve(&mut self) -> f64 {
         self.solve_with(&mut Solver::default()).0
     }
 
-    /// The same, and how uncertain the solution is.
+    /// The same, with the marginals of the solution.
     pub(super) fn solve_with(&mut self, solver: &mut Solver) -> (f64, Vec<Marginal>) {
         let members: Vec<usize> = (0..self.keyframes.len()).collect();
         let mut count = 0;
@@ -152,7 +152,7 @@ impl Room {
     }
 
     /// Largest error of a pose relative to the first (translation over the baseline, rotation in degrees), and the
-    /// median relative error of the depths, after the unit is that of the truth.
+    /// median relative error of the depths, in the unit of the truth.
     fn errors(&self, truth: &Self) -> (f64, f64, f64) {
         let unit = self.unit(truth);
         let errors =
@@ -207,7 +207,7 @@ fn median(mut values: Vec<f64>) -> f64 {
     values[values.len() / 2]
 }
 
-/// Solves and holds what is left to bounds. Depths start 3 to 4 % off, poses 15 % of the baseline and 1°.
+/// Solves and checks the remaining errors. Depths start 3 to 4 % off, poses 15 % of the baseline and 1°.
 fn assert_solved(room: &mut Room, truth: &Room) -> f64 {
     let before = room.errors(truth);
     let inlier_ratio = room.solve();
@@ -240,10 +240,10 @@ fn neither_brightness_nor_a_vignette_needs_a_model() {
 }
 
 #[test]
-fn what_one_keyframe_alone_shows_is_left_out() {
+fn content_that_only_one_keyframe_shows_is_left_out() {
     let truth = room(|_, _| (1.0, 0.0));
     let mut room = truth.perturbed([0.0; 3]);
-    // Something stands before a sixth of the view of one keyframe.
+    // Something occludes a sixth of one keyframe's view.
     let mut random = Random::new(9);
     let hidden = &mut room.keyframes[2];
     let mut pixels = hidden.images[0].pixels().to_vec();
@@ -278,7 +278,7 @@ fn held_keyframes_keep_the_others_in_place_and_in_their_unit() {
 }
 
 #[test]
-fn any_similarity_of_the_start_gives_the_same_window() {
+fn a_similarity_of_the_initial_state_gives_the_same_window() {
     let truth = room(|_, _| (1.0, 0.0));
     let start = truth.perturbed([0.0; 3]);
     let mut moved = start.clone();
@@ -296,19 +296,19 @@ fn any_similarity_of_the_start_gives_the_same_window() {
     let mut twice = start.clone();
     twice.solve();
     assert_eq!(twice.keyframes[3].points, one.keyframes[3].points);
-    // What f32 rounds may end a level one step earlier or later.
+    // Rounding of f32 may end a level one step earlier or later.
     assert!((one_left.0 - moved_left.0).abs() < 0.002, "{one_left:?} {moved_left:?}");
     assert!((one_left.2 - moved_left.2).abs() < 0.001, "{one_left:?} {moved_left:?}");
 }
 
 #[test]
-fn the_unit_stays_where_one_keyframe_holds_it() {
+fn the_unit_is_kept_where_one_keyframe_holds_it() {
     let truth = room(|_, _| (1.0, 0.0));
     let members: Vec<usize> = (0..truth.keyframes.len()).collect();
     let free = [None, Some(0), Some(1), Some(2)];
     let members = Members { members: &members, free: &free, depths_are_free: true };
     let unit = super::unit::Unit::of(&truth.keyframes, &members).unwrap();
-    // The same window in a unit that is longer.
+    // The same window in a longer unit.
     let mut longer = truth.clone();
     let anchor = truth.keyframes[0].camera_from_map;
     for keyframe in &mut longer.keyframes {
@@ -335,7 +335,7 @@ fn the_unit_stays_where_one_keyframe_holds_it() {
 }
 
 #[test]
-fn a_plane_is_found_among_points_that_are_wrong() {
+fn a_plane_is_fitted_despite_outliers() {
     let mut random = Random::new(2);
     let mut points: Vec<Correspondence> = (0..200)
         .map(|_| {
@@ -355,7 +355,7 @@ fn a_plane_is_found_among_points_that_are_wrong() {
     }
     let relief = plane::relief_left(&points, &found);
     assert!((relief - 0.05).abs() < 0.01, "{relief}");
-    // Of a wall ln d is noise beyond the plane, which says nothing of relief.
+    // On a wall, ln d beyond the plane is noise, which does not determine relief.
     let mut wall = points.clone();
     wall.iter_mut()
         .for_each(|point| point.log_inverse_depth = 0.3 * point.ray[0] - point.log_ratio);
@@ -374,7 +374,7 @@ pub(super) fn in_map(keyframe_id: u64, epoch: u32, x: f64, unit: f64) -> Keyfram
 }
 
 #[test]
-fn keyframes_that_are_not_estimated_follow_the_last_before_them_that_moved() {
+fn keyframes_that_are_not_estimated_follow_the_last_moved_one_before_them() {
     let mut window = Window::new(CAMERA, WindowParams::default());
     let room = room(|_, _| (1.0, 0.0));
     for (id, x) in [(3, 1.0), (5, 2.0)] {
@@ -385,7 +385,7 @@ fn keyframes_that_are_not_estimated_follow_the_last_before_them_that_moved() {
         window.keyframes.push(keyframe);
         window.moved.push(id);
     }
-    // Of 5 there is depth that its unit can be taken from, of 3 there is none.
+    // Keyframe 5 has depth that determines its unit, 3 has none.
     let points: Vec<WindowPoint> = room.keyframes[0]
         .points
         .iter()
@@ -402,11 +402,11 @@ fn keyframes_that_are_not_estimated_follow_the_last_before_them_that_moved() {
         .collect();
     depth.sort_by_key(|point| (point.v, point.u));
     (window.keyframes[1].points, window.keyframes[1].is_host) = (points, true);
-    // 4 was rejected, 6 came meanwhile, 2 stays, 7 is of another epoch.
+    // 4 was rejected, 6 is new, 2 stays, 7 is of another epoch.
     let mut map = Map::default();
     let others = [(2, 0, 0.5), (3, 0, 1.0), (4, 0, 1.5), (5, 0, 2.0), (6, 0, 2.5), (7, 1, 0.0)];
     map.keyframes.extend(others.map(|(id, epoch, x)| in_map(id, epoch, x, 1.0)));
-    // What is said of 5 goes for who follows it, and what lies between beside.
+    // 6 follows 5: it gets the covariance of 5 plus its own relative to 5.
     let [said, own] =
         [1e-4, 4e-4].map(|of| PlaceCovariance::bounded(&(PlaceMatrix::identity() * of)));
     map.keyframes[3].points = depth;

@@ -1,4 +1,4 @@
-//! The unit of a window that only one keyframe holds: no image sees it, so that it would wander.
+//! The unit of a window that only one keyframe holds: no image observes it, so that it would drift.
 
 use crate::slam::geometry::se3::SE3;
 use crate::slam::geometry::sim3::Sim3;
@@ -6,14 +6,14 @@ use crate::slam::window::keyframe::WindowKeyframe;
 use crate::slam::window::plane::median;
 use crate::slam::window::system::Members;
 
-/// The depths of the one keyframe that stays, before an adjustment.
+/// The depths of the only fixed keyframe, before an adjustment.
 pub(super) struct Unit {
     anchor: usize,
     inverse_depths: Vec<f64>,
 }
 
 impl Unit {
-    /// Where exactly one keyframe stays.
+    /// Takes the depths where exactly one keyframe is fixed; `None` otherwise.
     pub(super) fn of(keyframes: &[WindowKeyframe], members: &Members<'_>) -> Option<Self> {
         let pairs = members.members.iter().zip(members.free);
         let mut fixed = pairs.filter(|(_, free)| free.is_none()).map(|(&member, _)| member);
@@ -22,8 +22,8 @@ impl Unit {
         Some(Self { anchor, inverse_depths: points.map(|point| point.inverse_depth).collect() })
     }
 
-    /// Scales depths and places about that keyframe, so that the median of its depths has not changed; what that makes of
-    /// the map. `None`, and nothing is changed, where no depth is left.
+    /// Scales depths and poses about that keyframe, so that the median of its depths is unchanged; returns the
+    /// similarity that moves the map. `None`, with nothing changed, where no depth is left.
     pub(super) fn restore(
         &self,
         keyframes: &mut [WindowKeyframe],

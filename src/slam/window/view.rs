@@ -9,17 +9,17 @@ use nalgebra::Vector3;
 
 /// Pixels at the border where a pattern is not compared.
 const MARGIN_PX: f64 = 4.0;
-/// Cosine of the largest angle between two lines of sight: beyond 40° things look different.
+/// Cosine of the largest angle between two lines of sight: beyond 40° a surface looks different.
 const MIN_COSINE: f64 = 0.766;
-/// Largest ratio of the distances from which a point is seen: beyond, a pattern covers something else.
+/// Largest ratio of the distances from which a point is seen: beyond it, a pattern covers something else.
 const MAX_DISTANCE_RATIO: f64 = 2.0;
-/// Nearest that a point may be to an observer, in its distance from its host.
+/// Least depth of a point in an observer, relative to that in its host.
 pub(super) const MIN_DEPTH_RATIO: f64 = 0.05;
 
 /// The points of a host that an observer sees.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PairView {
-    /// The host, by its place among the members.
+    /// The host, by its index among the members.
     pub host: usize,
     /// The observer.
     pub observer: usize,
@@ -30,7 +30,7 @@ pub struct PairView {
 }
 
 impl PairView {
-    /// Places of its comparisons.
+    /// Indices of its comparisons.
     pub fn places(&self) -> std::ops::Range<usize> {
         let first = LANES * self.block;
         first..first + self.count
@@ -42,12 +42,12 @@ impl PairView {
     }
 }
 
-/// A point and where the list of its comparisons is.
+/// A point and the range of its comparisons.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PointView {
-    /// Its host, by its place among the members.
+    /// Its host, by its index among the members.
     pub host: usize,
-    /// Place among its host's points.
+    /// Index among its host's points.
     pub point: usize,
     first: usize,
     count: usize,
@@ -56,21 +56,21 @@ pub struct PointView {
 /// A comparison of a point.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Link {
-    /// The observer, by its place among the members.
+    /// The observer, by its index among the members.
     pub observer: usize,
-    /// Place of the comparison.
+    /// Index of the comparison.
     pub place: usize,
 }
 
-/// All comparisons of an adjustment, in their order: by observer, host, point. One image after the other is read.
+/// All comparisons of an adjustment, ordered by observer, host, point: one image after the other is read.
 #[derive(Debug, Clone, Default)]
 pub struct Views {
     /// The pairs of keyframes of which one sees points of the other.
     pub pairs: Vec<PairView>,
-    /// Whose points are compared, by its place in `points`: of each comparison, those of a pair in blocks of which the
-    /// last may have room left, where it is 0.
+    /// For each comparison, its point's index in `points`: those of a pair in blocks, of which the last may have room
+    /// left, where the index is 0.
     pub slots: Vec<usize>,
-    /// What the points look like, by block.
+    /// Appearance of the points, by block.
     pub patterns: Vec<Patterns>,
     /// The living points of all members, by host.
     pub points: Vec<PointView>,
@@ -79,7 +79,7 @@ pub struct Views {
 }
 
 impl Views {
-    /// Every living point of the members that a host may be, with every other member that may observe and sees it.
+    /// Finds the living points of the members and which other members see each, where `may` allows the pair.
     pub fn find(
         &mut self,
         keyframes: &[WindowKeyframe],
@@ -147,7 +147,7 @@ impl Views {
         }
     }
 
-    /// Fetches what the points look like at a level.
+    /// Fetches the appearance of the points at a level.
     pub fn look(&mut self, keyframes: &[WindowKeyframe], members: &[usize], level: usize) {
         self.patterns.clear();
         self.patterns.resize(self.slots.len() / LANES, Patterns::NONE);
@@ -180,7 +180,7 @@ impl Views {
     }
 }
 
-/// How one keyframe sees another's points.
+/// An observer's view of another keyframe's points.
 #[derive(Debug, Clone, Copy)]
 pub struct Sight {
     rotation: nalgebra::Matrix3<f64>,
@@ -189,7 +189,7 @@ pub struct Sight {
 }
 
 impl Sight {
-    /// From where an observer stands.
+    /// Creates the view of an observer at this pose.
     pub fn new(observer_from_host: &SE3, camera: &Intrinsics) -> Self {
         Self {
             rotation: observer_from_host.rotation_matrix(),
@@ -198,7 +198,7 @@ impl Sight {
         }
     }
 
-    /// Where the observer sees a point, if it does so well enough to be compared.
+    /// Projects a point into the observer, if it is seen well enough to be compared.
     pub fn project(&self, point: &WindowPoint) -> Option<Projected> {
         let Intrinsics { fx, fy, cx, cy, .. } = self.camera;
         let (_, scaled) = self.directions(point);
@@ -209,8 +209,8 @@ impl Sight {
         })
     }
 
-    /// Whether the observer sees a point well enough to be compared: in the image, from a side and a distance not too
-    /// different. Without a division or root, since it is asked of every point with every keyframe.
+    /// Whether the observer sees a point well enough to be compared: in the image, from a similar direction and
+    /// distance. Without division or root, since it is evaluated for every point with every keyframe.
     #[inline]
     pub fn sees(&self, point: &WindowPoint) -> bool {
         let Intrinsics { fx, fy, cx, cy, width, height } = self.camera;
@@ -231,8 +231,8 @@ impl Sight {
             && host <= MOST * observer
     }
 
-    /// False where the observer sees none of a few of the points, which are spread over the image: of all keyframes most
-    /// look elsewhere, and finding that out must not take longer with every keyframe.
+    /// False where the observer sees none of a sample of the points, spread over the image: most keyframes are turned
+    /// elsewhere, and finding that out must not take longer with every keyframe.
     pub fn may_see(&self, points: &[WindowPoint]) -> bool {
         const STEP: usize = 8;
         points.iter().filter(|point| point.is_alive).step_by(STEP).any(|point| self.sees(point))

@@ -41,7 +41,7 @@ fn a_known_view_is_found_on_its_keyframe_and_an_unknown_one_on_none() {
 }
 
 #[test]
-fn one_that_was_not_confirmed_leaves_the_next_frame_to_others() {
+fn a_keyframe_that_was_not_confirmed_is_skipped_in_the_next_frame() {
     let scene = Scene::new(3);
     let [one, other] = [0.0, 0.05].map(|x| at([x, 0.0, 0.0, 0.0, 0.0, 0.0]));
     let active = keyframe(&scene, 2, at([0.0, 0.0, 0.0, 0.0, 2.8, 0.0]));
@@ -59,7 +59,7 @@ fn one_that_was_not_confirmed_leaves_the_next_frame_to_others() {
 }
 
 #[test]
-fn a_camera_that_is_rolled_far_is_found_with_its_roll_by_features_and_by_small_images() {
+fn a_camera_with_a_large_roll_is_found_by_features_and_by_small_images() {
     let scene = Scene::new(3);
     let home = keyframe(&scene, 0, at([0.0; 6]));
     let away = keyframe(&scene, 1, at([0.0, 0.0, 0.0, 0.0, 1.2, 0.0]));
@@ -87,7 +87,7 @@ fn a_camera_that_is_rolled_far_is_found_with_its_roll_by_features_and_by_small_i
 }
 
 #[test]
-fn those_that_look_most_alike_are_first_and_rejected_and_nearly_empty_ones_are_left_out() {
+fn the_most_similar_keyframe_comes_first_and_rejected_or_nearly_empty_ones_are_left_out() {
     let scene = Scene::new(3);
     let known = keyframe(&scene, 0, SE3::identity());
     let rejected = Keyframe { map_state: MapState::Rejected, ..known.clone() };
@@ -118,7 +118,7 @@ fn those_that_look_most_alike_are_first_and_rejected_and_nearly_empty_ones_are_l
 }
 
 #[test]
-fn keyframes_that_gave_up_their_depth_leave_the_index() {
+fn keyframes_that_lost_their_depth_are_removed_from_the_index() {
     let scene = Scene::new(3);
     let pan = |k: u64| at([0.0, 0.0, 0.0, 0.0, 0.3 * k as f64, 0.0]);
     let mut keyframes: Vec<_> = (0..8).map(|k| keyframe(&scene, k, pan(k))).collect();
@@ -136,13 +136,13 @@ fn keyframes_that_gave_up_their_depth_leave_the_index() {
 }
 
 #[test]
-fn a_keyframe_is_described_once_and_found_by_the_description_that_it_came_with() {
+fn a_keyframe_is_described_once_and_found_by_its_existing_description() {
     let scene = Scene::new(3);
     let away = at([0.0, 0.0, 0.0, 0.0, 1.2, 0.0]);
     let mut keyframes = [keyframe(&scene, 0, at([0.0; 6])), keyframe(&scene, 1, away)];
     Finder::new(&CAMERA).learn(&mut keyframes, MOST_LEARNT);
     let made = keyframes.each_ref().map(|of| of.description.clone().unwrap());
-    // Another finder takes what is there, also where the image would say something else.
+    // Another finder uses the existing description, even where the image would give a different one.
     keyframes[0].description = Some(made[1].clone());
     let mut finder = Finder::new(&CAMERA);
     finder.learn(&mut keyframes, usize::MAX);
@@ -154,10 +154,10 @@ fn a_keyframe_is_described_once_and_found_by_the_description_that_it_came_with()
 }
 
 #[test]
-fn others_take_turns() {
+fn further_keyframes_are_tried_where_the_first_does_not_align() {
     let scene = Scene::new(3);
     let (here, active) = (SE3::identity(), at([0.0, 0.0, 0.0, 0.0, 2.0, 0.0]));
-    // Looks like the frame, and has no depth that could explain it.
+    // Looks like the frame but has no valid depth to align to.
     let mut wrong = keyframe(&scene, 0, here);
     wrong.points.iter_mut().for_each(|point| point.inverse_depth = f32::NAN);
     let side = at([0.3, 0.0, 0.0, 0.0, 0.05, 0.0]);

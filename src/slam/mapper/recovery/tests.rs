@@ -1,4 +1,4 @@
-//! What is believed after a loss, and how depth comes back.
+//! Which poses are accepted after a loss, and how depth is restored.
 
 use nalgebra::Vector6;
 
@@ -13,7 +13,7 @@ use crate::slam::pose::upper_triangle;
 use crate::slam::test_scene::{CAMERA, Scene};
 
 #[test]
-fn a_place_that_is_turned_against_a_held_pose_is_not_believed() {
+fn a_pose_that_is_rotated_against_a_held_one_is_not_accepted() {
     let scene = Scene::new(3);
     let mapper = mapper_with(&[0.0, 0.1]);
     let pixels = scene.render(&CAMERA, &SE3::identity()).noisy(1.0, 7);
@@ -32,12 +32,12 @@ fn a_place_that_is_turned_against_a_held_pose_is_not_believed() {
     let is_refused = |pose: PoseEstimate| mapper.contradicts_hold(&pose, 1, &SE3::identity());
     assert!(is_refused(held(0.5, 0.02, turning)));
     assert!(!is_refused(held(0.1, 0.02, turning)));
-    // As uncertain as that anything may be true.
+    // With so large an uncertainty any rotation is possible.
     assert!(!is_refused(held(0.5, 0.2, turning)));
     assert!(!is_refused(held(0.5, 0.02, TrackingState::Tracking)));
 }
 
-/// A mapper whose keyframes, of exact depth, are at these places along a line.
+/// A mapper whose keyframes, of exact depth, are at these positions along a line.
 fn mapper_with(places: &[f64]) -> Mapper {
     let scene = Scene::new(3);
     let mut mapper = Mapper::new(CAMERA, MapperParams::default()).unwrap();
@@ -52,7 +52,7 @@ fn sideways(x: f64) -> SE3 {
 }
 
 #[test]
-fn a_place_is_believed_where_another_keyframe_has_the_camera_there_too() {
+fn a_pose_is_accepted_where_another_keyframe_confirms_it() {
     let pixels = Scene::new(3).render(&CAMERA, &sideways(0.1)).noisy(2.0, 9);
     let mut mapper = mapper_with(&[0.0, 0.15]);
     assert!(mapper.is_confirmed(0, &sideways(0.1), &pixels, &Confirmation::after_loss()));
@@ -61,14 +61,14 @@ fn a_place_is_believed_where_another_keyframe_has_the_camera_there_too() {
         !mapper.is_confirmed(0, &turned, &pixels, &Confirmation::after_loss()),
         "the other one sees something else"
     );
-    // Nobody else is there to be asked, or only one that is not believed.
+    // There is no other keyframe to confirm it, or only a rejected one.
     assert!(mapper_with(&[0.0]).is_confirmed(0, &turned, &pixels, &Confirmation::after_loss()));
     mapper.map.keyframes[1].map_state = MapState::Rejected;
     assert!(mapper.is_confirmed(0, &turned, &pixels, &Confirmation::after_loss()));
 }
 
 #[test]
-fn a_keyframe_that_is_not_asked_and_one_that_is_not_near_enough_confirm_nothing() {
+fn an_excluded_keyframe_and_one_that_disagrees_confirm_nothing() {
     let here = sideways(0.1);
     let pixels = Scene::new(3).render(&CAMERA, &here).noisy(2.0, 9);
     let elsewhere = (0..START_KEYFRAMES).map(|k| 30.0 + 0.3 * k as f64);
@@ -80,7 +80,7 @@ fn a_keyframe_that_is_not_asked_and_one_that_is_not_near_enough_confirm_nothing(
 }
 
 #[test]
-fn in_a_map_of_many_keyframes_a_place_that_no_other_sees_is_not_believed() {
+fn in_a_map_of_many_keyframes_an_unconfirmed_pose_is_not_accepted() {
     let here = sideways(0.1);
     let pixels = Scene::new(3).render(&CAMERA, &here).noisy(2.0, 9);
     let confirms = |elsewhere: usize| {
@@ -93,7 +93,7 @@ fn in_a_map_of_many_keyframes_a_place_that_no_other_sees_is_not_believed() {
 }
 
 #[test]
-fn the_points_of_the_joint_estimation_must_have_the_camera_there_too() {
+fn the_points_of_the_joint_estimate_must_confirm_the_pose() {
     let here = sideways(0.1);
     let pixels = Scene::new(3).render(&CAMERA, &here).noisy(2.0, 9);
     let mut mapper = mapper_with(&[0.0, 0.15, 0.3, 0.4]);
@@ -110,7 +110,7 @@ fn the_points_of_the_joint_estimation_must_have_the_camera_there_too() {
 }
 
 #[test]
-fn a_correction_right_after_the_camera_was_found_leaves_it_where_odometry_has_it() {
+fn a_correction_right_after_relocalisation_keeps_the_odometry_pose() {
     let mut mapper = mapper_with(&[0.0, 1.0]);
     let last = sideways(0.1);
     mapper.last_world_from_camera = Some(last);
@@ -137,7 +137,7 @@ fn a_correction_right_after_the_camera_was_found_leaves_it_where_odometry_has_it
 }
 
 #[test]
-fn points_that_no_filter_could_have_left_are_not_restored() {
+fn invalid_points_are_not_restored() {
     let mut map = DepthMap::with_size(CAMERA.width, CAMERA.height);
     let point = DepthPoint { u: 50, v: 40, inverse_depth: 1.0, variance: 1e-4, intensity: 0.0 };
     let right = CAMERA.width as u16 - 1;
@@ -156,12 +156,12 @@ fn points_that_no_filter_could_have_left_are_not_restored() {
 }
 
 #[test]
-fn points_that_are_no_candidates_have_the_gradients_of_their_image() {
+fn restored_points_that_are_no_candidates_have_the_gradients_of_their_image() {
     let keyframe = Scene::new(4).keyframe(0, SE3::identity(), 1.0);
     let restored = |before: u64| {
         let mut map = DepthMap::with_size(CAMERA.width, CAMERA.height);
         map.restart(&Scene::new(before).keyframe(0, SE3::identity(), 1.0).image, 1.0, 100_000);
-        // Hardly any is a candidate.
+        // Hardly any point is a candidate.
         map.restart(&keyframe.image, 100.0, 100_000);
         restore_points(&mut map, &keyframe.points);
         map
