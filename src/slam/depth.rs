@@ -1,9 +1,9 @@
 //! Inverse depth by small-baseline stereo, and the filters that keep it (Engel, Sturm, Cremers 2013).
 //!
-//! [`epipolar`] is the geometry between a keyframe and a frame, [`matching`] the search along an
-//! epipolar segment, [`pose_noise`] what a pose's covariance is in pixels there, [`gaussian`] the semi-dense filter, [`propagation`] the step to a new keyframe,
-//! [`regularisation`] the smoothing of the map. [`interval`] is the sparse filter on [`immature`] points
-//! at the pixels that [`candidate`] chooses (Engel, Koltun, Cremers 2018).
+//! [`epipolar`] is the geometry between a keyframe and a frame, [`matching`] the search along an epipolar segment,
+//! [`pose_noise`] the covariance of a pose in pixels there, [`gaussian`] the semi-dense filter, [`propagation`] the
+//! step to a new keyframe, [`regularisation`] the smoothing of the map. [`interval`] is the sparse filter on
+//! [`immature`] points at the pixels that [`candidate`] chooses (Engel, Koltun, Cremers 2018).
 
 pub mod candidate;
 pub mod common_error;

@@ -1,7 +1,7 @@
-//! The vector instructions that a loop is compiled for: the one place that asks the CPU for them.
+//! Vector instruction sets: the only module that queries the CPU for them.
 //!
-//! A loop is a `Body`, one source; it is compiled for every instruction set and run with one that the CPU has. The
-//! portable one is plain arithmetic without fused multiply-add and gives the same bits on every CPU.
+//! A loop is a `Body` with a single source, compiled for every instruction set and run with one that the CPU supports.
+//! The portable version is plain arithmetic without fused multiply-add and gives the same bits on every CPU.
 
 pub(crate) mod lanes_kernel;
 #[cfg(target_arch = "aarch64")]
@@ -14,18 +14,18 @@ use serde::{Deserialize, Serialize};
 
 use crate::slam::kernel::lanes_kernel::{Lanes, Register};
 
-/// Which instructions the loops over points use.
+/// The instructions that the loops over points use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum SimdMode {
-    /// The fastest that the CPU has; the last digits of results depend on it.
+    /// The fastest that the CPU supports; the last digits of results depend on it.
     #[default]
     Auto,
     /// Plain arithmetic: the same bits on every CPU.
     Portable,
 }
 
-/// An instruction set that this CPU has: only [`Kernel::available`] and the like make the vector ones.
+/// An instruction set that this CPU supports: the vector variants come only from [`Kernel::available`] and the like.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kernel {
     /// Plain arithmetic in four lanes.
@@ -106,8 +106,8 @@ impl Kernel {
         }
     }
 
-    /// Runs a loop with these instructions in eight lanes. In code for AVX-512 they are slower: comparisons go through
-    /// its mask registers.
+    /// Runs a loop with these instructions in eight lanes. AVX-512 is not used: its comparisons go through mask
+    /// registers and are slower at this width.
     #[cfg(feature = "cameras")]
     pub(crate) fn run_eight<B: Body>(self, body: B) -> B::Output {
         match self {
@@ -119,39 +119,39 @@ impl Kernel {
     }
 }
 
-/// What a loop does.
+/// A loop, compiled for each instruction set.
 pub(crate) trait Body {
-    /// Its result.
+    /// The result of the loop.
     type Output;
-    /// Runs it. All that does arithmetic must be inlined, closures too: what is not is compiled for every CPU, and slow.
+    /// Runs the loop. All arithmetic must be inlined, closures too: otherwise it is compiled for every CPU, and slow.
     fn run<I: Instructions>(self, instructions: I) -> Self::Output;
 }
 
-/// An instruction set; a value of it says that the CPU has it.
+/// An instruction set; a value of it proves that the CPU supports it.
 ///
 /// # Safety
-/// Only who knows that the CPU has what `Register` and the constants stand for can make a value.
+/// A value may be made only where the CPU is known to support the instructions behind `Register` and the constants.
 pub unsafe trait Instructions: Copy {
     /// Its registers of f32.
     type Register: Register;
     /// Number of their lanes.
     const N: usize = Self::Register::N;
-    /// AVX2 is among them.
+    /// Whether AVX2 is included.
     const HAS_AVX2: bool = false;
     /// The same CPU with registers of eight lanes.
     type Eight: Instructions;
 
-    /// For loops whose results depend on the number of lanes.
+    /// The instructions for loops whose results depend on the number of lanes.
     fn eight(self) -> Self::Eight;
 
-    /// The same number in all lanes.
+    /// Broadcasts a number to all lanes.
     #[inline(always)]
     fn splat(self, value: f32) -> Lanes<Self::Register> {
-        // SAFETY: a value of the instructions says that the CPU has them.
+        // SAFETY: a value of the instructions proves that the CPU has them.
         Lanes(unsafe { Self::Register::splat(value) })
     }
 
-    /// The first numbers of a slice; panics where there are fewer than lanes.
+    /// Loads the first numbers of a slice; panics if there are fewer than lanes.
     #[inline(always)]
     fn load(self, from: &[f32]) -> Lanes<Self::Register> {
         let from = &from[..Self::N];
@@ -160,10 +160,10 @@ pub unsafe trait Instructions: Copy {
     }
 }
 
-/// Some f32 in a register of these instructions.
+/// A register of f32 of these instructions.
 pub type Floats<I> = Lanes<<I as Instructions>::Register>;
 
-/// Plain arithmetic, the explanation of the others.
+/// Plain arithmetic, the reference for the others.
 #[derive(Debug, Clone, Copy)]
 pub struct Portable;
 
@@ -189,7 +189,7 @@ macro_rules! portable {
 portable!(Portable, 4);
 portable!(PortableEight, 8);
 
-/// Instructions beyond those that every CPU has: their type, and the one place that compiles a body for them.
+/// Defines instructions beyond the baseline: their type, and the only function that compiles a body for them.
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 macro_rules! instructions {
     ($name:ident, $run:ident, $features:literal, $register:ty, $has_avx2:literal, $Eight:ty = $eight:expr) => {

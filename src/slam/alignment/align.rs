@@ -13,52 +13,52 @@ use crate::slam::image::sums::{MAX_LEVELS, SumPyramid};
 use crate::slam::kernel::Kernel;
 use crate::slam::pose::Brightness;
 
-/// Where an alignment stands: the unknowns and how well they explain the image.
+/// The unknowns of an alignment and how well they explain the image.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AlignedState {
     /// Pose, translation in keyframe units.
     pub current_from_keyframe: SE3,
-    /// Brightness against the keyframe.
+    /// Brightness relative to the keyframe.
     pub brightness: Brightness,
-    /// Translation at which (∂r/∂d)² V weighed the residuals, keyframe units.
+    /// Translation at which (∂r/∂d)² V weights the residuals, keyframe units.
     pub variance_translation: Vector3<f64>,
     /// The sums at this state, priors included.
     pub sums: NormalEquations,
 }
 
 impl AlignedState {
-    /// Where an undamped step leads; `None` where it leads nowhere that a camera can be.
+    /// Pose and brightness after an undamped step; `None` if there is no step or it is implausible for a camera.
     pub fn after_step(&self) -> Option<(SE3, Brightness)> {
         Some(self.moved_by(&self.sums.damped_step(0.0).filter(is_sane)?))
     }
 
-    /// Where `step` leads.
+    /// Pose and brightness after `step`.
     fn moved_by(&self, step: &SVector<f64, UNKNOWNS>) -> (SE3, Brightness) {
         let pose = SE3::exp(&pose_step(step)) * self.current_from_keyframe;
         let Brightness { a, b } = self.brightness;
         (pose, Brightness { a: a + step[6], b: b + step[7] })
     }
 
-    /// Whether a step from `before` to here is taken: it keeps the points in view and the energy low.
+    /// Whether to accept a step from `before` to here: it keeps the points in view and the energy low.
     fn is_acceptable_after(&self, before: &Self, min_in_view: f64) -> bool {
         let compared = f64::from(self.sums.compared);
         let keeps_view = compared >= MIN_KEPT_IN_VIEW * f64::from(before.sums.compared);
         keeps_view && compared >= min_in_view && self.energy_ratio(before) < TOLERATED_RISE
     }
 
-    /// Mean energy as a share of that `before`.
+    /// Mean energy relative to that of `before`.
     fn energy_ratio(&self, before: &Self) -> f64 {
         self.sums.mean_energy() / before.sums.mean_energy()
     }
 }
 
-/// The next level below `level` on which a frame has pixels and `reference` points; `None` where there is none.
+/// The next level below `level` on which a frame has pixels and `reference` has points; `None` if there is none.
 pub fn next_finer_level(reference: &Reference, frame: &SumPyramid, level: usize) -> Option<usize> {
     let finest = reference.finest_level().max(frame.finest_level());
     (finest..level).rev().find(|&level| !reference.level(level).is_empty())
 }
 
-/// Why an alignment came to its end.
+/// Why an alignment ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Ending {
     /// Solved down to the finest level.
@@ -69,7 +69,7 @@ pub enum Ending {
     NothingInView,
 }
 
-/// What came of an alignment.
+/// The result of an alignment.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Alignment {
     /// The best state found.
@@ -84,34 +84,34 @@ pub struct Alignment {
     pub ending: Ending,
     /// Mean squared flow from the keyframe, pixels² of level 0.
     pub mean_squared_flow: f64,
-    /// How the gradient scatters over the image at the state.
+    /// Scatter of the gradient over the image at the state.
     pub scatter: GradientScatter,
 }
 
 impl Alignment {
-    /// Covariance of the left increment of `current_from_keyframe`, calibrated by the inflation
-    /// of `params`; `None` where the images do not determine the pose. One that was cut short by its budget
-    /// is as uncertain as the step that it could not take.
+    /// Covariance of the left increment of `current_from_keyframe`, calibrated by the inflation of `params`; `None` if
+    /// the images do not determine the pose. An alignment cut short by its budget is also uncertain by the step that it
+    /// could not take.
     pub fn covariance(&self, params: &AlignmentParams) -> Option<Matrix6<f64>> {
         let all = self.scatter.covariance(&self.state.sums)?;
         let covariance = all.fixed_view::<6, 6>(0, 0) * params.covariance_inflation;
         if self.ending != Ending::OutOfBudget {
             return Some(covariance);
         }
-        // As far as the next step would lead it may be from where it would have ended.
+        // The next step estimates the distance to where the alignment would have ended.
         let step = pose_step(&self.state.sums.damped_step(0.0)?);
         Some(covariance + step * step.transpose())
     }
 
-    /// What the common errors of the depth of `reference` add to that: (−M⁻¹H) P (−M⁻¹H)ᵀ; `None` where the images
-    /// do not determine the pose.
+    /// The contribution of the common errors of the depth of `reference`: (−M⁻¹H) P (−M⁻¹H)ᵀ; `None` if the images do
+    /// not determine the pose.
     pub fn covariance_from_modes(&self, reference: &Reference) -> Option<Matrix6<f64>> {
         let moved = self.d_pose_d_modes(reference)?;
         Some(moved * reference.mode_covariance().matrix() * moved.transpose())
     }
 
-    /// By what the left increment of `current_from_keyframe` moves for each common error of the depth of `reference`; `None`
-    /// where the images do not determine the pose.
+    /// Derivative of the left increment of `current_from_keyframe` with respect to the common errors of the depth of
+    /// `reference`; `None` if the images do not determine the pose.
     pub fn d_pose_d_modes(&self, reference: &Reference) -> Option<Matrix6x3<f64>> {
         let centre = reference.level(self.level).centre();
         let translation = &self.state.current_from_keyframe.translation;
@@ -133,9 +133,9 @@ impl Aligner {
         Self { params, kernel }
     }
 
-    /// The sums at one state on one level, priors included. The depth variance weighs the residuals
-    /// as if the translation were `variance_translation`: held while a level is solved, because an
-    /// energy of r/σ_r alone falls when σ_r grows with the translation, however bad the fit.
+    /// The sums at one state on one level, priors included. The depth variance weights the residuals as if the
+    /// translation were `variance_translation`, which is held fixed while a level is solved: an energy of r/σ_r alone
+    /// falls when σ_r grows with the translation, however bad the fit.
     pub fn evaluate(
         &self,
         reference: &Reference,
@@ -176,8 +176,8 @@ impl Aligner {
         }
     }
 
-    /// Aligns `frame` to `reference` from a first guess, from the coarsest level both have down
-    /// to the finest. `budget` is asked with the level before each iteration.
+    /// Aligns `frame` to `reference` from an initial guess, from the coarsest level both have down to the finest.
+    /// `budget` is called with the level before each iteration.
     pub fn align(
         &self,
         reference: &Reference,
@@ -191,7 +191,7 @@ impl Aligner {
         alignment
     }
 
-    /// The first guess, evaluated on the coarsest level with points.
+    /// Evaluates the initial guess on the coarsest level with points.
     pub fn start(
         &self,
         reference: &Reference,
@@ -218,8 +218,8 @@ impl Aligner {
         }
     }
 
-    /// Takes an alignment that was cut short to the finest level as it stands, without a step: there its
-    /// figures say how well it fits, and it can be compared with others.
+    /// Evaluates an alignment that was cut short on the finest level at this pose, without a step: there its statistics
+    /// show how well it fits, and it can be compared with others.
     pub fn stand_on_finest(
         &self,
         reference: &Reference,
@@ -240,7 +240,7 @@ impl Aligner {
         alignment
     }
 
-    /// Solves the levels below the one that `alignment` stands on, down to the finest.
+    /// Solves the levels below the current one of `alignment`, down to the finest.
     pub fn descend(
         &self,
         reference: &Reference,
@@ -261,7 +261,7 @@ impl Aligner {
         self.measure(reference, frame, alignment);
     }
 
-    /// Iterates on one level; whether there is budget for the next.
+    /// Iterates on one level; returns whether there is budget for the next.
     pub fn solve_level(
         &self,
         reference: &Reference,
@@ -285,7 +285,7 @@ impl Aligner {
         }
         let (mut damping, mut within_budget) = (Damping::default(), true);
         for iteration in 0..self.params.max_iterations[level] {
-            // The first iteration was paid with the evaluation above.
+            // The evaluation above paid for the first iteration.
             if iteration > 0 && !budget(level) {
                 within_budget = false;
                 break;
@@ -320,10 +320,9 @@ impl Aligner {
         within_budget
     }
 
-    /// The sums of an alignment on its level as if every depth were exact: terms on which several of
-    /// them can be compared. (∂r/∂d)² V grows with the translation, so that by its own σ_r the
-    /// alignment farthest from the keyframe explains any image best; and no translation is fair to
-    /// all, since it would be that of one of them.
+    /// The sums of an alignment on its level as if every depth were exact, so that several alignments can be compared.
+    /// (∂r/∂d)² V grows with the translation, so that with its own σ_r the alignment farthest from the keyframe would
+    /// explain any image best; and no single translation is fair to all, since it would be that of one of them.
     pub fn explanation(
         &self,
         reference: &Reference,
@@ -337,7 +336,7 @@ impl Aligner {
         state.sums
     }
 
-    /// Takes the figures of the state that an alignment ended in, with the weights that its sums have.
+    /// Computes the statistics of the final state of an alignment, with the same weights as its sums.
     fn measure(&self, reference: &Reference, frame: &SumPyramid, alignment: &mut Alignment) {
         let level = alignment.level;
         let AlignedState { current_from_keyframe, brightness, variance_translation, .. } =
@@ -357,26 +356,26 @@ impl Aligner {
     }
 }
 
-/// A step is taken although it raises the mean energy by less than this: interpolation smooths
-/// noise, so that the energy is lowest between pixels, while the gradient is not misled.
+/// A step is accepted if it raises the mean energy by less than this: interpolation smooths noise, so that the energy
+/// is lowest between pixels, while the gradient is not affected.
 const TOLERATED_RISE: f64 = 1.02;
 
-/// An energy that no longer falls ends a level only when the step is below this, pixels of the
-/// level: the energy says little about where its minimum is.
+/// When the energy stops falling, the level ends only if the step is below this, pixels of the level: near its minimum
+/// the energy hardly depends on the state.
 const FLAT_STEP_PX: f64 = 0.1;
 
-/// A step that pushes more than half of the points out of the image, or beyond the range of the sensor, is a step
-/// into the dark, also when the rest fits better.
+/// A step that moves more than half of the points out of the image, or beyond the range of the sensor, is unreliable
+/// even if the rest fits better.
 const MIN_KEPT_IN_VIEW: f64 = 0.5;
 
-/// Whether a step stays in the range that is evaluated: a rotation beyond a quarter turn or a gain beyond e² is
-/// an artefact of a nearly singular system.
+/// Whether a step is plausible: a rotation beyond a quarter turn or a gain beyond e² is an artefact of a nearly
+/// singular system.
 fn is_sane(step: &SVector<f64, UNKNOWNS>) -> bool {
     let rotation = step.fixed_rows::<3>(3).norm();
     rotation < std::f64::consts::FRAC_PI_2 && step[6].abs() < 2.0
 }
 
-/// How far a step moves the image, pixels of the level: f (‖t‖ d̄ + ‖ω‖).
+/// Displacement of the image by a step, pixels of the level: f (‖t‖ d̄ + ‖ω‖).
 fn step_in_pixels(step: &SVector<f64, UNKNOWNS>, reference: &Reference, level: usize) -> f64 {
     let at = reference.intrinsics().at_level(level);
     let translation = step.fixed_rows::<3>(0).norm() * reference.mean_inverse_depth();

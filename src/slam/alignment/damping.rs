@@ -1,9 +1,9 @@
-//! λ of the alignment's Levenberg–Marquardt: none at first, for Gauss–Newton mostly converges.
+//! λ of the alignment's Levenberg–Marquardt: zero at first, because Gauss–Newton mostly converges.
 
 /// λ after the first failure, and the bound below which a success sets it to zero.
 const FIRST_DAMPING: f64 = 0.2;
 
-/// Failures in a row after which a level is given up as converged: λ has grown by 2¹⁵ then.
+/// Failures in a row after which a level counts as converged: λ has grown by 2¹⁵ by then.
 const MAX_FAILURES: u32 = 5;
 
 /// λ and the number of failures in a row.
@@ -14,13 +14,13 @@ pub(super) struct Damping {
 }
 
 impl Damping {
-    /// A step was taken.
+    /// Records an accepted step.
     pub(super) fn succeed(&mut self) {
         self.lambda = if self.lambda <= FIRST_DAMPING { 0.0 } else { 0.5 * self.lambda };
         self.failures = 0;
     }
 
-    /// There was no step, or it was refused; whether the level is given up.
+    /// Records a rejected or missing step; returns whether to give up the level.
     pub(super) fn fail(&mut self) -> bool {
         self.failures += 1;
         let growth = f64::from(1u32 << self.failures.min(20));

@@ -1,13 +1,13 @@
-//! How far two poses put a keyframe's points apart in the image: the size of a pose error in pixels.
+//! Distance in the image between a keyframe's points under two poses: the size of a pose error in pixels.
 
 use nalgebra::Vector3;
 
 use crate::slam::alignment::reference::Reference;
 use crate::slam::geometry::se3::SE3;
 
-/// Mean distance between the places of the reference's points under two `current_from_keyframe`
-/// (translation in keyframe units), pixels of level 0, over every `stride`-th point of the finest level
-/// that is in front of the camera in both; infinite where none is.
+/// Mean distance between the projections of the reference's points under two `current_from_keyframe` (translation in
+/// keyframe units), pixels of level 0, over every `stride`-th point of the finest level that is in front of the camera
+/// in both; infinite if there are none.
 pub fn mean_displacement_px(reference: &Reference, one: &SE3, other: &SE3, stride: usize) -> f64 {
     let k = reference.intrinsics();
     let rotations = [one.rotation_matrix(), other.rotation_matrix()];
@@ -34,7 +34,7 @@ mod tests {
     use crate::slam::alignment::scene::{small_camera, small_plane};
 
     #[test]
-    fn a_small_turn_moves_the_image_by_the_focal_length_times_its_angle() {
+    fn a_small_rotation_moves_the_image_by_focal_length_times_angle() {
         let reference = Reference::prepare(&small_plane().keyframe(&small_camera(), 4, 0.0));
         let pose = |axis: usize, size: f64| {
             let mut twist = Vector6::zeros();
@@ -44,7 +44,7 @@ mod tests {
         let still = SE3::identity();
         let distance = |pose: &SE3| mean_displacement_px(&reference, pose, &still, 1);
         assert_eq!(distance(&still), 0.0);
-        // tan changes faster off the axis: the image moves by f (1 + x²), x up to 0.6.
+        // tan changes faster off the axis: the image moves by f (1 + x²), with x up to 0.6.
         let turned = distance(&pose(4, 0.01));
         assert!(turned > 2.6 && turned < 1.2 * 2.6, "{turned}");
         let moved = distance(&pose(0, 0.01));

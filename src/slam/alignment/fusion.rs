@@ -1,13 +1,12 @@
-//! The depth pyramid: a parent's inverse depth is the inverse-variance weighted mean of its valid
-//! children, its variance their harmonic mean n/Σ(1/V), because neighbours are correlated and
-//! down-sampling must not gain information.
+//! The depth pyramid: a parent's inverse depth is the inverse-variance weighted mean of its valid children, its
+//! variance their harmonic mean n/Σ(1/V): neighbours are correlated, and down-sampling must not gain information.
 //!
-//! Where depth jumps, an edge in the image moves with what is in front: children behind the
-//! nearest one are left out, and so are pixels beside a nearer one.
+//! Where depth jumps, an edge in the image belongs to the foreground: children behind the nearest one are omitted, and
+//! so are pixels next to a nearer one.
 //!
-//! How much noise the mean really keeps is known only from the data: the scatter of children about
-//! their parent says which share κ of their variance is independent. It averages down, the rest
-//! stays: N_parent = N (κ/n + 1 − κ).
+//! The noise that remains in the mean can only be estimated from the data: the scatter of children about their parent
+//! gives the share κ of their variance that is independent. It averages out, the rest remains:
+//! N_parent = N (κ/n + 1 − κ).
 
 use crate::slam::image::sums::MAX_LEVELS;
 use crate::slam::keyframe::{DepthPoint, MAX_KEYFRAME_POINTS};
@@ -23,12 +22,12 @@ pub struct LevelPoint {
     pub inverse_depth: f32,
     /// Variance of the inverse depth.
     pub variance: f32,
-    /// Variance of the noise that is left in the inverse depth, at most `variance`.
+    /// Variance of the noise remaining in the inverse depth, at most `variance`.
     pub noise: f32,
 }
 
 impl LevelPoint {
-    /// A point of a keyframe of this size; `None` where it cannot be used.
+    /// A point of a keyframe of this size; `None` if it is not usable.
     fn of(point: &DepthPoint, width: usize, height: usize) -> Option<Self> {
         let DepthPoint { u, v, inverse_depth, variance, .. } = *point;
         let inside = usize::from(u) < width && usize::from(v) < height;
@@ -37,20 +36,20 @@ impl LevelPoint {
     }
 }
 
-/// Depth jumps where neighbours differ by this share of the nearer one's inverse depth (a wall seen
-/// at 80° changes by about a hundredth a pixel at level 0) …
+/// Depth jumps where neighbours differ by this share of the nearer one's inverse depth (a wall seen at 80° changes by
+/// about a hundredth per pixel at level 0) …
 const JUMP_RATIO: f32 = 0.04;
 
-/// The same between means of neighbouring cells, two pixels apart: more, because it costs all
-/// pixels of a cell, and slanted surfaces are worth keeping.
+/// The same between means of neighbouring cells, two pixels apart: larger, because it removes all pixels of a cell, and
+/// slanted surfaces are worth keeping.
 const CELL_JUMP_RATIO: f32 = 0.15;
 
-/// … and by this many standard deviations of the noise more.
+/// … plus this many standard deviations of the noise.
 const JUMP_SIGMAS: f32 = 3.0;
 
-/// The nearest child of one parent: the bits of its inverse depth, which are in the order of what
-/// they stand for because it is positive, above those of its noise. In one word, because two
-/// children follow each other closely, and a store of halves delays the load of the whole.
+/// The nearest child of one parent: the bits of its inverse depth, whose order is that of their values because they are
+/// positive, above those of its noise. In one word, because consecutive children often share a parent, and storing
+/// halves would delay the load of the whole.
 #[derive(Debug, Clone, Copy, Default)]
 struct Front(u64);
 
@@ -68,12 +67,12 @@ impl Front {
         f32::from_bits(self.0 as u32)
     }
 
-    /// The nearer one, the first of two alike.
+    /// The nearer one; the first on a tie.
     fn nearer(self, other: Self) -> Self {
         if other.0 >> 32 > self.0 >> 32 { other } else { self }
     }
 
-    /// Whether depth jumps from here back to `child`.
+    /// Whether depth jumps from here to a farther `child`.
     fn hides(self, child: &LevelPoint) -> bool {
         let nearest = self.inverse_depth();
         let step = nearest - child.inverse_depth - JUMP_RATIO * nearest;
@@ -104,8 +103,7 @@ impl Cell {
         self.children += 1.0;
     }
 
-    /// Whether depth jumps from the mean of this cell back to that of `other`; never from a cell
-    /// without children.
+    /// Whether depth jumps from the mean of this cell to a farther mean of `other`; never from a cell without children.
     fn hides(&self, other: &Cell) -> bool {
         let nearer = self.inverse_depth;
         let step = nearer - other.inverse_depth - CELL_JUMP_RATIO * nearer;
@@ -114,7 +112,7 @@ impl Cell {
     }
 }
 
-/// A cell with children, and where it lies.
+/// A cell with children, and its position.
 #[derive(Debug, Clone, Copy)]
 struct Filled {
     index: u32,
@@ -122,8 +120,7 @@ struct Filled {
     v: u16,
 }
 
-/// The cells of one level with a rim of empty ones, so that each has four neighbours. All are zero
-/// between two levels.
+/// The cells of one level with a border of empty ones, so that each has four neighbours. All are zero between levels.
 #[derive(Debug, Clone, Default)]
 struct Cells {
     width: usize,
@@ -133,7 +130,7 @@ struct Cells {
     filled: Vec<Filled>,
 }
 
-/// Builds the depth pyramid, in memory that is used again.
+/// Builds the depth pyramid in reusable memory.
 #[derive(Debug, Clone, Default)]
 pub struct DepthFusion {
     /// Row by row on the levels above 0.
@@ -142,10 +139,10 @@ pub struct DepthFusion {
 }
 
 impl DepthFusion {
-    /// Fuses `points` of a `width * height` image into `num_levels` levels. Points outside the
-    /// image, or without a positive finite inverse depth and variance, are left out, as are those
-    /// beyond [`MAX_KEYFRAME_POINTS`]. Levels below `finest` only feed the coarser ones, and keep
-    /// what lies behind jumps. The mean inverse depth of all points of level 0, `None` without points.
+    /// Fuses `points` of a `width * height` image into `num_levels` levels. Skips points outside the image, without a
+    /// positive finite inverse depth and variance, or beyond [`MAX_KEYFRAME_POINTS`]. Levels below `finest` only feed
+    /// the coarser ones, and keep the points behind jumps. Returns the mean inverse depth of all points of level 0,
+    /// `None` without points.
     pub fn fuse(
         &mut self,
         points: &[DepthPoint],
@@ -181,7 +178,7 @@ fn is_positive(value: f32) -> bool {
 }
 
 impl Cells {
-    /// Makes room for a level of `width * height` pixels.
+    /// Allocates for a level of `width * height` pixels.
     fn lay_out(&mut self, width: usize, height: usize) {
         (self.width, self.height) = (width, height);
         let count = self.stride() * (height + 2);
@@ -195,13 +192,13 @@ impl Cells {
         self.width + 2
     }
 
-    /// The cell of a child; an odd row or column at the end has none.
+    /// The cell of a child; `None` in an odd last row or column.
     fn cell_of(&self, child: &LevelPoint) -> Option<usize> {
         let (u, v) = (usize::from(child.u / 2), usize::from(child.v / 2));
         (u < self.width && v < self.height).then(|| (v + 1) * self.stride() + u + 1)
     }
 
-    /// Fuses `fine` into `coarse`; drops from `fine` what lies behind a jump in depth, if wanted.
+    /// Fuses `fine` into `coarse`; removes the points behind a jump in depth from `fine` if `drops_behind`.
     fn halve(
         &mut self,
         fine: &mut Vec<LevelPoint>,
@@ -234,7 +231,7 @@ impl Cells {
     /// Lists the cells with children, row by row.
     fn find_filled(&mut self) {
         let (width, stride) = (self.width, self.stride());
-        // One more than there are cells: every one is written, and those without children again.
+        // One more than there are cells: every cell is written, and the next overwrites one without children.
         self.filled.resize(width * self.height + 1, Filled { index: 0, u: 0, v: 0 });
         let mut count = 0;
         for v in 0..self.height {
@@ -247,13 +244,13 @@ impl Cells {
         self.filled.truncate(count);
     }
 
-    /// Adds a child to its cell; false where it lies behind a jump and is not added.
+    /// Adds a child to its cell; returns false, without adding it, if it lies behind a jump.
     #[inline(always)]
     fn add(&mut self, child: &LevelPoint) -> bool {
         let Some(index) = self.cell_of(child) else { return true };
         let stride = self.stride();
-        // Only the neighbours that touch the child, not those across its parent; by arithmetic,
-        // because a branch on the side would be mispredicted half of the time.
+        // Only the neighbours that touch the child, not those on the other side of its parent; by arithmetic, because a
+        // branch on the side would be mispredicted half of the time.
         let beside = index + 2 * usize::from(child.u % 2) - 1;
         let across = index + 2 * usize::from(child.v % 2) * stride - stride;
         let hides = |index: usize| self.fronts[index].hides(child);
@@ -264,8 +261,8 @@ impl Cells {
         !is_behind
     }
 
-    /// Takes the means; gives κ, the scatter of children about their parent over what their
-    /// variance predicts, 0 to 1.
+    /// Computes the means; returns κ, the scatter of children about their parent over the scatter predicted by their
+    /// variance, 0 to 1.
     fn average(&mut self) -> f32 {
         let (mut scatter, mut predicted) = (0.0f64, 0.0f64);
         for filled in &self.filled {
@@ -275,7 +272,7 @@ impl Cells {
             }
             let mean = cell.weighted / cell.information;
             cell.inverse_depth = mean;
-            // An only child does not scatter, but for rounding.
+            // An only child does not scatter, except for rounding.
             let spread = cell.weighted_square - cell.information * mean * mean;
             scatter += if cell.children > 1.5 { f64::from(spread.max(0.0)) } else { 0.0 };
             predicted += f64::from(cell.children - 1.0);
@@ -283,7 +280,7 @@ impl Cells {
         if predicted == 0.0 { 0.0 } else { (scatter / predicted).min(1.0) as f32 }
     }
 
-    /// The noise that is left in each mean, when `independent` is the share that averages down.
+    /// Computes the noise remaining in each mean, given the share `independent` that averages out.
     fn keep_noise(&mut self, independent: f32) {
         for filled in &self.filled {
             let cell = &mut self.cells[filled.index as usize];
@@ -294,8 +291,8 @@ impl Cells {
         }
     }
 
-    /// Writes the means, but for those beside which depth jumps to something nearer: single
-    /// children are too noisy to tell where their means can.
+    /// Writes the means, except those next to a jump to something nearer: single children are too noisy to reveal jumps
+    /// that their means reveal.
     fn emit(&mut self, coarse: &mut Vec<LevelPoint>) {
         let stride = self.stride();
         coarse.reserve(self.filled.len());
@@ -347,28 +344,28 @@ mod tests {
     }
 
     #[test]
-    fn an_edge_belongs_to_what_is_in_front() {
+    fn an_edge_belongs_to_the_foreground() {
         let mut fusion = DepthFusion::default();
-        // One cell with a child far behind, and a pixel right beside it that is as far.
+        // One cell with a child far behind, and an adjacent pixel at the same distance.
         let jump = [point(4, 4, 1.0, 1e-4), point(5, 4, 0.4, 1e-4), point(6, 4, 0.4, 1e-4)];
         fusion.fuse(&jump, 64, 64, 2, 0);
         assert_eq!((fusion.level(0).len(), fusion.level(1).len()), (1, 1));
         assert_eq!(fusion.level(1)[0].inverse_depth, 1.0);
-        // Beyond the next cell it is not beside the jump any more; and a slope is no jump.
+        // Beyond the next cell it is no longer next to the jump; and a slope is not a jump.
         fusion.fuse(&[point(4, 4, 1.0, 1e-4), point(9, 4, 0.4, 1e-4)], 64, 64, 2, 0);
         assert_eq!(fusion.level(1).len(), 2);
         fusion.fuse(&[point(4, 4, 1.0, 1e-4), point(5, 4, 0.97, 1e-4)], 64, 64, 2, 0);
         assert_eq!((fusion.level(0).len(), fusion.level(1).len()), (2, 1));
-        // What noise explains is no jump either.
+        // A difference within the noise is not a jump either.
         fusion.fuse(&[point(4, 4, 1.0, 0.04), point(5, 4, 0.4, 0.04)], 64, 64, 2, 0);
         assert_eq!(fusion.level(0).len(), 2);
     }
 
     #[test]
-    fn the_other_side_of_the_image_is_not_beside_a_pixel() {
+    fn opposite_sides_of_the_image_are_not_neighbours() {
         let mut fusion = DepthFusion::default();
-        // Near at the left end of a row, far at the right end of the rows above and below: with
-        // single pixels, and with cells whose means jump but whose pixels do not.
+        // Near at the left end of a row, far at the right end of the rows above and below: with single pixels, and with
+        // cells whose means jump but whose pixels do not.
         let near = [point(0, 4, 1.0, 1e-4), point(0, 8, 1.0, 1e-4)];
         let far = [point(63, 2, 0.4, 1e-4), point(63, 9, 0.4, 1e-4)];
         fusion.fuse(&[near, far].concat(), 64, 64, 2, 0);
@@ -380,7 +377,7 @@ mod tests {
     }
 
     #[test]
-    fn memory_that_is_used_again_is_empty() {
+    fn reused_memory_is_empty() {
         let mut fusion = DepthFusion::default();
         let wall: Vec<_> = (0..64 * 64).map(|i| point(i % 64, i / 64, 1.0, 1e-4)).collect();
         fusion.fuse(&wall, 64, 64, 4, 0);
@@ -391,7 +388,7 @@ mod tests {
     }
 
     #[test]
-    fn independent_noise_averages_down_and_common_noise_stays() {
+    fn independent_noise_averages_out_and_common_noise_stays() {
         let mut noise = crate::slam::alignment::scene::Noise(3);
         let mut fusion = DepthFusion::default();
         let std_dev = 0.05f32;
@@ -411,7 +408,7 @@ mod tests {
     }
 
     #[test]
-    fn hostile_points_are_left_out() {
+    fn invalid_points_are_skipped() {
         let mut fusion = DepthFusion::default();
         let points = [
             point(64, 0, 1.0, 0.1),
@@ -424,7 +421,7 @@ mod tests {
         ];
         fusion.fuse(&points, 64, 64, 3, 0);
         assert!((0..3).all(|level| fusion.level(level).is_empty()));
-        // A pixel that only exists on the finer level of an odd size has no parent.
+        // A pixel in the odd last row and column has no parent.
         fusion.fuse(&[point(64, 64, 1.0, 0.1)], 65, 65, 2, 0);
         assert_eq!((fusion.level(0).len(), fusion.level(1).len()), (1, 0));
     }

@@ -1,5 +1,5 @@
-//! The loop over points. `accumulate_kernel` and `scatter_kernel` are the algorithms, once, over any instructions;
-//! `residual::accumulate_reference` is the explanation of all.
+//! The loop over points. `accumulate_kernel` and `scatter_kernel` are the algorithms, each written once for all
+//! instructions; `residual::accumulate_reference` is the scalar reference.
 
 mod accumulate_kernel;
 mod mode_kernel;
@@ -15,8 +15,8 @@ use crate::slam::image::buffer::Image;
 use crate::slam::kernel::Kernel;
 
 impl Kernel {
-    /// Sums the normal equations of `points` over `image`, the sums of a pyramid level, whose
-    /// size `at` was made for; all zero where it was not.
+    /// Sums the normal equations of `points` over `image`, the sums of a pyramid level, whose size `at` was made for;
+    /// all zero if the sizes differ.
     pub fn accumulate(
         self,
         points: &LevelPoints,
@@ -29,8 +29,8 @@ impl Kernel {
         self.run(Accumulation { points, image, at })
     }
 
-    /// Measures how the gradient of the cost scatters over `image`; nothing where `at` was made
-    /// for another size. `GradientScatter::reference` is the explanation.
+    /// Measures the scatter of the gradient of the cost over `image`; empty if `at` was made for another size.
+    /// `GradientScatter::reference` is the scalar reference.
     pub fn scatter(
         self,
         points: &LevelPoints,

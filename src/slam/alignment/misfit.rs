@@ -1,18 +1,18 @@
-//! By how much tiles of the image are displaced against the keyframe's points once the pose is found.
+//! Displacement of image tiles relative to the keyframe's points at the estimated pose.
 //!
-//! Noise of single pixels displaces a tile by as much as its information says. What is beyond that displaces whole
-//! tiles: the shape of the depth, what the lens model leaves, a rolling shutter. The part of it that is common to
-//! all tiles has gone into the pose and cannot be seen; what is left between the tiles says how large it may be.
+//! Noise of single pixels displaces a tile by the amount its information predicts. Any excess displaces whole tiles:
+//! errors in the shape of the depth, residual distortion, a rolling shutter. The part common to all tiles has been
+//! absorbed by the pose and cannot be observed; the remainder between the tiles indicates how large it may be.
 
 use crate::slam::alignment::tiles::{NUM_TILES, TileSum};
 use crate::slam::upper_median::upper_median;
 
-/// Displacement of tiles along the direction in which each is best known.
+/// Displacement of tiles along the direction in which each is determined best.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct TileMisfit {
     /// Variance of the displacement, robustly from its median square, radians².
     pub variance: f64,
-    /// What noise of single pixels gives, if σ_r is right, radians².
+    /// Variance expected from noise of single pixels if σ_r is correct, radians².
     pub noise: f64,
 }
 
@@ -20,7 +20,7 @@ pub struct TileMisfit {
 const CHI_SQUARE_MEDIAN: f64 = 0.455;
 
 impl TileMisfit {
-    /// From the sums of all tiles; zero where none has information.
+    /// Computes the displacement from the sums of all tiles; zero if none has information.
     pub fn of(tiles: &[TileSum; NUM_TILES]) -> Self {
         let (mut squares, mut noises) = ([0.0; NUM_TILES], [0.0; NUM_TILES]);
         let mut count = 0;
@@ -36,15 +36,15 @@ impl TileMisfit {
     }
 
     /// Variance of the displacement beyond the noise of single pixels, radians². `mean_energy` is the mean whitened
-    /// squared residual: by how much the noise is less, or more, than σ_r says.
+    /// squared residual: the ratio of the noise to its prediction by σ_r.
     pub fn beyond_noise(&self, mean_energy: f64) -> f64 {
         let beyond = self.variance - mean_energy * self.noise;
         if beyond.is_finite() { beyond.max(0.0) } else { 0.0 }
     }
 }
 
-/// Squared displacement of a tile along the direction in which it is best known, and its variance, radians²: with the
-/// largest eigenvalue λ of its information and the unit eigenvector e, ((e·g)/λ)² and 1/λ.
+/// Squared displacement of a tile along the direction in which it is determined best, and its variance, radians²: with
+/// the largest eigenvalue λ of its information and the unit eigenvector e, ((e·g)/λ)² and 1/λ.
 fn best_known(tile: &TileSum) -> Option<(f64, f64)> {
     let [xx, xy, yy] = tile.information.map(f64::from);
     let gradient = [tile.gradient[3], tile.gradient[4]].map(f64::from);
@@ -59,7 +59,7 @@ fn best_known(tile: &TileSum) -> Option<(f64, f64)> {
         false => [xy, largest - xx],
     };
     let length = along[0].hypot(along[1]);
-    // A tile that is known alike in all directions has no best one.
+    // A tile that is determined equally in all directions has no best one.
     let along = if length > 0.0 { along.map(|x| x / length) } else { [1.0, 0.0] };
     let displacement = (along[0] * gradient[0] + along[1] * gradient[1]) / largest;
     Some((displacement * displacement, 1.0 / largest))
@@ -70,8 +70,8 @@ mod tests {
     use super::*;
     use crate::slam::alignment::scene::Noise;
 
-    /// Tiles that know their displacement to 1/√100 along one direction and half as well across it, each displaced
-    /// by what `std_dev` says beside that noise.
+    /// Tiles whose displacement is determined to 1/√100 along one direction and half as well across it, each displaced
+    /// by `std_dev` in addition to that noise.
     fn tiles(std_dev: f64) -> [TileSum; NUM_TILES] {
         let mut noise = Noise(5);
         std::array::from_fn(|_| {
@@ -96,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn displaced_tiles_are_told_from_noise() {
+    fn displaced_tiles_are_distinguished_from_noise() {
         let of = |std_dev: f64| TileMisfit::of(&tiles(std_dev)).beyond_noise(1.0).sqrt();
         assert!(of(0.0) < 0.05, "{}", of(0.0));
         for std_dev in [0.2, 1.0] {
@@ -106,7 +106,7 @@ mod tests {
     }
 
     #[test]
-    fn tiles_without_information_say_nothing() {
+    fn tiles_without_information_give_no_misfit() {
         assert_eq!(TileMisfit::of(&[TileSum::default(); NUM_TILES]), TileMisfit::default());
         let broken = TileSum { information: [f32::NAN; 3], ..TileSum::default() };
         assert_eq!(TileMisfit::of(&[broken; NUM_TILES]), TileMisfit::default());

@@ -1,5 +1,5 @@
-//! What common errors of depth do to a pose: H against a second alignment, against the reference and
-//! against the keyframe's unit.
+//! The effect of common errors of depth on a pose: H against a second alignment, against the reference and against the
+//! keyframe's unit.
 
 use nalgebra::{Matrix6, SMatrix, Vector3, Vector6};
 
@@ -38,7 +38,7 @@ fn sideways() -> SE3 {
     SE3::exp(&Vector6::new(0.12, 0.05, -0.08, 0.02, -0.03, 0.01))
 }
 
-/// The keyframe with a common error m of its relative inverse depth, that leaves the mean at `centre` alone.
+/// The keyframe with a common error m of its relative inverse depth that leaves the mean at `centre` unchanged.
 fn with_error(keyframe: &Keyframe, m: &Vector3<f64>, centre: &Vector3<f64>) -> Keyframe {
     let mut changed = keyframe.clone();
     let camera = keyframe.intrinsics;
@@ -51,7 +51,7 @@ fn with_error(keyframe: &Keyframe, m: &Vector3<f64>, centre: &Vector3<f64>) -> K
     changed
 }
 
-/// An aligner that continues until nothing moves any more.
+/// An aligner that iterates to full convergence.
 fn patient() -> Aligner {
     Aligner::new(AlignmentParams {
         step_tolerance: 1e-4,
@@ -73,7 +73,7 @@ fn moved_per_mode(reference: &Reference, alignment: &Alignment) -> SMatrix<f64, 
     alignment.scatter.d_pose_d_modes(&alignment.state.sums, translation, &centre).unwrap()
 }
 
-/// Depth with a common error, solved again: the pose moves by −M⁻¹ H m.
+/// When depth with a common error is aligned again, the pose moves by −M⁻¹ H m.
 #[test]
 fn a_pose_on_tilted_or_flattened_depth_moves_as_predicted() {
     let (keyframe, frame) = keyframe_and_frame(&sideways());
@@ -82,7 +82,7 @@ fn a_pose_on_tilted_or_flattened_depth_moves_as_predicted() {
         (reference.level(LEVEL).centre(), moved_per_mode(&reference, &alignment));
     for mode in 0..NUM_MODES {
         let mut m = Vector3::zeros();
-        // Large enough that the rounding of grey values does not matter.
+        // Large enough that rounding of the grey values does not matter.
         m[mode] = 0.03;
         let solved = |sign: f64| {
             let (_, other) = aligned(&with_error(&keyframe, &(sign * m), &centre), &frame);
@@ -96,9 +96,9 @@ fn a_pose_on_tilted_or_flattened_depth_moves_as_predicted() {
     }
 }
 
-/// A constant error is the unit: only the translation feels it, in proportion, whatever the images are.
+/// A constant error is the unit: it only affects the translation, in proportion, whatever the images are.
 #[test]
-fn an_error_of_the_unit_is_none() {
+fn a_constant_error_only_scales_the_translation() {
     let (keyframe, frame) = keyframe_and_frame(&sideways());
     let (reference, alignment) = aligned(&keyframe, &frame);
     let translation = alignment.state.current_from_keyframe.translation;
@@ -109,7 +109,7 @@ fn an_error_of_the_unit_is_none() {
     let difference = shifted.column(0) - moved_per_mode(&reference, &alignment).column(0);
     assert!((difference.fixed_rows::<3>(0) - translation).norm() < 1e-9);
     assert!(difference.fixed_rows::<3>(3).norm() < 1e-12);
-    // The same of depth that is solved again.
+    // The same when the scaled depth is aligned again.
     let mut nearer = keyframe.clone();
     for point in &mut nearer.points {
         point.inverse_depth *= 1.05;
@@ -121,13 +121,13 @@ fn an_error_of_the_unit_is_none() {
 }
 
 #[test]
-fn every_kernel_has_the_modes_of_the_reference() {
+fn every_kernel_gives_the_modes_of_the_reference() {
     let (keyframe, frame) = keyframe_and_frame(&sideways());
     let reference = Reference::prepare(&keyframe);
     let params = AlignmentParams::default();
     let (points, image) = (reference.level(LEVEL), frame.level(LEVEL));
     let camera = small_camera().at_level(LEVEL);
-    // Near the solution, and so that many points leave the image.
+    // Near the solution, and with many points outside the image.
     for pose in [sideways(), SE3::exp(&Vector6::new(0.3, 0.1, 0.1, 0.05, 0.2, -0.1))] {
         let brightness = Brightness { a: -0.1, b: 3.0 };
         let at = Evaluation::new(&camera, LEVEL, &pose, brightness, &params, &pose.translation);
@@ -149,10 +149,10 @@ fn every_kernel_has_the_modes_of_the_reference() {
     }
 }
 
-/// What is published holds the pose that is found on depth with such an error; without the modes it would not.
+/// The published covariance covers the pose estimated on depth with such an error; without the modes it would not.
 #[test]
-fn the_covariance_holds_a_pose_on_tilted_depth() {
-    /// What 999 of 1000 values of χ²₆ do not exceed.
+fn the_covariance_covers_a_pose_on_tilted_depth() {
+    /// The 99.9 % quantile of χ²₆.
     const RARE: f64 = 22.5;
     let (keyframe, frame) = keyframe_and_frame(&sideways());
     let normalized = |error: &Vector6<f64>, covariance: &Matrix6<f64>| {
@@ -172,9 +172,9 @@ fn the_covariance_holds_a_pose_on_tilted_depth() {
     }
 }
 
-/// With a coarse rule far more than the claimed standard deviation could be left.
+/// A coarse tolerance could leave far more than the claimed standard deviation.
 #[test]
-fn what_an_alignment_leaves_is_a_small_part_of_what_it_claims() {
+fn the_remaining_step_is_small_against_the_claimed_uncertainty() {
     let left = |step_tolerance: f64| {
         let mut worst = 0.0f64;
         for seed in 0..8 {

@@ -19,28 +19,28 @@ pub struct NormalEquations {
     pub energy: f64,
     /// Σ r², grey levels².
     pub squared_residual: f64,
-    /// Points that fall inside the image.
+    /// Points that project into the image.
     pub in_view: u32,
-    /// Points in view that the sensor does not clip; all other sums are over these.
+    /// Points in view that the sensor does not clip; the other sums are over these.
     pub compared: u32,
-    /// Points compared with |r| below the inlier gate.
+    /// Compared points with |r|/σ_r below the inlier gate.
     pub inliers: u32,
 }
 
 impl NormalEquations {
-    /// Mean energy of the points compared; infinite without any.
+    /// Mean energy of the compared points; infinite without any.
     pub fn mean_energy(&self) -> f64 {
         if self.compared == 0 { f64::INFINITY } else { self.energy / f64::from(self.compared) }
     }
 
-    /// Adds a prior N(0, 1/information) on unknown `index`, whose value is now `value`.
+    /// Adds a prior N(0, 1/information) on unknown `index`, whose current value is `value`.
     pub fn add_prior(&mut self, index: usize, value: f64, information: f64) {
         self.information[(index, index)] += information;
         self.gradient[index] += information * value;
         self.energy += information * value * value;
     }
 
-    /// Takes an unknown out of the problem: its step will be zero.
+    /// Removes an unknown from the problem: its step will be zero.
     pub fn fix(&mut self, index: usize) {
         self.information.row_mut(index).fill(0.0);
         self.information.column_mut(index).fill(0.0);
@@ -48,7 +48,7 @@ impl NormalEquations {
         self.gradient[index] = 0.0;
     }
 
-    /// The step −(A + λ diag A)⁻¹ g; `None` where A is not positive definite or not finite.
+    /// The step −(A + λ diag A)⁻¹ g; `None` if A is not positive definite or not finite.
     pub fn damped_step(&self, lambda: f64) -> Option<SVector<f64, UNKNOWNS>> {
         let mut damped = self.information;
         for i in 0..UNKNOWNS {

@@ -11,11 +11,10 @@ use crate::slam::parameter::{ParameterError, check_range};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct AlignmentParams {
-    /// The camera's noise, which the configuration has once for all.
+    /// The camera's noise, configured once for all modules.
     #[serde(skip)]
     pub noise: ImageNoise,
-    /// Whether the variance of the inverse depth weighs the residuals (LSD14 §3.3); off only to
-    /// see what it buys.
+    /// Whether the variance of the inverse depth weights the residuals (LSD14 §3.3); off only to measure its effect.
     pub use_depth_variance: bool,
     /// Huber's k on |r|/σ_r; LSD-SLAM's 1.5 keeps 95 % efficiency on Gaussian noise.
     pub huber: f32,
@@ -27,20 +26,19 @@ pub struct AlignmentParams {
     pub gain_prior_std_dev: f64,
     /// Standard deviation of b around 0, grey levels.
     pub offset_prior_std_dev: f64,
-    /// Most iterations of each level, finest first.
+    /// Maximum number of iterations of each level, finest first.
     pub max_iterations: [u32; MAX_LEVELS],
-    /// A level is done when a step is shorter than this, in standard deviations of the unknowns by the level's own
-    /// information: √(δᵀMδ), the Newton decrement. What is left after that is a small part of what is claimed.
+    /// A level is finished when a step is shorter than this, in standard deviations of the unknowns by the level's own
+    /// information: √(δᵀMδ), the Newton decrement. The remaining error is then small against the claimed uncertainty.
     pub step_tolerance: f64,
-    /// A level is done when a step keeps more than this share of the mean energy.
+    /// A level is finished when a step leaves more than this share of the mean energy.
     pub energy_tolerance: f64,
-    /// Smallest share of the level's points that must be in view and not clipped by the sensor.
+    /// Smallest share of the level's points that must be in view and unclipped.
     pub min_in_view: f64,
-    /// Which instructions are used.
+    /// The instructions to use.
     pub simd: SimdMode,
-    /// Inflation s² of the covariance, for what even the scatter of the gradient does not show:
-    /// errors of one sign everywhere. Fitted by
-    /// `cargo run --release --example alignment_figures -- covariance`.
+    /// Inflation s² of the covariance, for errors that even the scatter of the gradient does not show: those of one
+    /// sign everywhere. Fitted by `cargo run --release --example alignment_figures -- covariance`.
     pub covariance_inflation: f64,
 }
 

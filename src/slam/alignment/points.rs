@@ -2,10 +2,10 @@
 
 use nalgebra::Vector3;
 
-/// Points of one block: one register of AVX-512, two of AVX2, four of NEON.
+/// Points per block: one register of AVX-512, two of AVX2, four of NEON.
 pub const LANES: usize = 16;
 
-/// Sixteen points, each quantity side by side and aligned to a cache line.
+/// Sixteen points, each quantity contiguous and aligned to a cache line.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[repr(C, align(64))]
 pub struct PointBlock {
@@ -17,7 +17,7 @@ pub struct PointBlock {
     pub inverse_depth: [f32; LANES],
     /// Variance of the inverse depth.
     pub variance: [f32; LANES],
-    /// Inverse depth of the surroundings without the point itself: where the Jacobian is taken.
+    /// Inverse depth of the surroundings, excluding the point itself: where the Jacobian is evaluated.
     pub surrounding_inverse_depth: [f32; LANES],
     /// Brightness of the keyframe there, grey levels.
     pub intensity: [f32; LANES],
@@ -27,7 +27,7 @@ pub struct PointBlock {
     pub gradient_y: [f32; LANES],
 }
 
-/// A ray so flat that no camera of ours sees it: what pads the last block is never in view.
+/// A ray so flat that no camera sees it: the padding of the last block is never in view.
 const PADDING_RAY: f32 = 1.0e6;
 
 impl PointBlock {
@@ -54,7 +54,7 @@ pub struct Point {
     pub inverse_depth: f32,
     /// Variance of the inverse depth.
     pub variance: f32,
-    /// Inverse depth of the surroundings without the point itself: where the Jacobian is taken.
+    /// Inverse depth of the surroundings, excluding the point itself: where the Jacobian is evaluated.
     pub surrounding_inverse_depth: f32,
     /// Brightness of the keyframe there, grey levels.
     pub intensity: f32,
@@ -81,7 +81,7 @@ pub struct TileRun {
 #[derive(Debug, Clone, Default)]
 pub struct LevelPoints {
     blocks: Vec<PointBlock>,
-    /// ln d by block, apart: only the figures of a frame's last state need it.
+    /// ln d by block, stored separately: only the statistics of a frame's final state need it.
     log_inverse_depths: Vec<[f32; LANES]>,
     /// Sums of x, y and ln d.
     sums: [f64; 3],
@@ -90,7 +90,7 @@ pub struct LevelPoints {
 }
 
 impl LevelPoints {
-    /// Forgets the points and keeps the memory.
+    /// Removes the points and keeps the memory.
     pub fn clear(&mut self) {
         self.blocks.clear();
         self.log_inverse_depths.clear();
@@ -99,7 +99,7 @@ impl LevelPoints {
         self.len = 0;
     }
 
-    /// Memory for so many points, however they lie: each may begin a run.
+    /// Reserves memory for this many points, however they lie: each may start a run.
     pub fn reserve(&mut self, points: usize) {
         let missing = |len: usize, wanted: usize| wanted.saturating_sub(len);
         let blocks = points.div_ceil(LANES);
@@ -142,7 +142,7 @@ impl LevelPoints {
         }
     }
 
-    /// Where the points lie: runs in their order, each within one block and one tile.
+    /// Runs of points in their order, each within one block and one tile.
     pub fn runs(&self) -> &[TileRun] {
         &self.runs
     }
@@ -157,8 +157,8 @@ impl LevelPoints {
         &self.log_inverse_depths
     }
 
-    /// Mean of (x, y, ln d) over the points: where a common error of depth, a plane over these three, leaves the
-    /// mean depth alone.
+    /// Mean of (x, y, ln d) over the points: a common error of depth, a plane over these three, leaves the mean depth
+    /// unchanged when centred here.
     pub fn centre(&self) -> Vector3<f64> {
         Vector3::from(self.sums) / self.len.max(1) as f64
     }
@@ -168,7 +168,7 @@ impl LevelPoints {
         self.len
     }
 
-    /// Whether there is none.
+    /// Whether there are no points.
     pub fn is_empty(&self) -> bool {
         self.len == 0
     }

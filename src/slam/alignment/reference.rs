@@ -1,4 +1,4 @@
-//! The keyframe prepared for alignment: everything that is paid per keyframe and not per frame.
+//! The keyframe prepared for alignment: all work done per keyframe rather than per frame.
 
 use serde::{Deserialize, Serialize};
 
@@ -23,8 +23,8 @@ pub struct ReferenceParams {
     /// Finest pyramid level that is aligned, 0 or 1. Level 1 has half the noise at a quarter of
     /// the pixels; level 0 costs another pyramid level and more iterations.
     pub finest_level: usize,
-    /// Most points of each level, finest first. A level with more keeps the most informative
-    /// ones, evenly spread; these are what the time of a frame is made of.
+    /// Maximum number of points of each level, finest first. A level with more keeps the most informative ones, evenly
+    /// spread; these determine the time per frame.
     pub point_budget: [usize; MAX_LEVELS],
     /// How the points of a level are chosen.
     pub selection: SelectionParams,
@@ -51,17 +51,17 @@ impl ReferenceParams {
     }
 }
 
-/// A side shorter than this many pixels holds too little to align.
+/// A side shorter than this many pixels contains too little to align.
 const SHORTEST_SIDE_PX: usize = 24;
 
-/// Number of pyramid levels for images of this size, [`MAX_LEVELS`] at most.
+/// Number of pyramid levels for images of this size, at most [`MAX_LEVELS`].
 pub fn num_levels(width: usize, height: usize) -> usize {
     let fits = |&level: &usize| width.min(height) >> level >= SHORTEST_SIDE_PX;
     (0..MAX_LEVELS).take_while(fits).count().max(1)
 }
 
-/// The finest of `num_levels` levels that is aligned: an image so small that it has only level 0 is
-/// aligned there, whatever the parameters prefer.
+/// The finest of `num_levels` levels that is aligned: an image so small that it only has level 0 is aligned there,
+/// regardless of the parameters.
 pub fn finest_level(num_levels: usize, params: &ReferenceParams) -> usize {
     params.finest_level.min(num_levels.saturating_sub(1))
 }
@@ -88,7 +88,7 @@ pub struct Reference {
     pyramid: SumPyramid,
 }
 
-/// Memory that a preparation works in and that no frame needs; references can share it.
+/// Working memory of a preparation, not needed by frames; references can share it.
 #[derive(Debug, Clone, Default)]
 pub struct ReferenceScratch {
     fusion: DepthFusion,
@@ -97,8 +97,8 @@ pub struct ReferenceScratch {
 }
 
 impl ReferenceScratch {
-    /// The candidates of one level of the usable keyframe that was prepared last, before selection; on levels that are not
-    /// aligned, also those behind a jump in depth.
+    /// The candidates of one level of the last usable keyframe prepared, before selection; on levels that are not
+    /// aligned they include those behind a jump in depth.
     pub fn candidates(&self, level: usize) -> &[LevelPoint] {
         self.fusion.level(level)
     }
@@ -135,8 +135,8 @@ impl Reference {
         reference
     }
 
-    /// Prepares `keyframe` in the memory of this reference. A keyframe that cannot be used (image
-    /// of another size than its intrinsics, no valid point) leaves a reference without points.
+    /// Prepares `keyframe` in the memory of this reference. An unusable keyframe (image of another size than its
+    /// intrinsics, no valid point) leaves a reference without points.
     pub fn prepare_into(&mut self, keyframe: &Keyframe, scratch: &mut ReferenceScratch) {
         self.keyframe_id = keyframe.keyframe_id;
         self.epoch = keyframe.epoch;
@@ -172,8 +172,8 @@ impl Reference {
         self.pack(&keyframe.points, scratch);
     }
 
-    /// Prepares a view with these points, which stands where frames are measured from, in the memory of this reference. Its
-    /// pyramid, which has the levels of this camera, is taken over; the one before is left in its place.
+    /// Prepares a view with these points at the identity pose, in the memory of this reference. Takes over `pyramid`,
+    /// which has the levels of this camera, and leaves the previous one in its place.
     pub(super) fn prepare_view(
         &mut self,
         intrinsics: &Intrinsics,
@@ -200,20 +200,20 @@ impl Reference {
         self.pack(points, scratch);
     }
 
-    /// Places the view in world and map, with how far from it frames are expected, a standard deviation in its units.
+    /// Places the view in world and map, with the standard deviation of the distance of frames from it, in its units.
     pub fn stand_at(&mut self, world_from_view: &Sim3, expected_distance: f64) {
         self.world_from_keyframe = *world_from_view;
         self.place.map_from_keyframe = *world_from_view;
         self.translation_information = 1.0 / (expected_distance * expected_distance);
     }
 
-    /// Information of the prior that frames are where the keyframe is, about each axis, 1/keyframe units²; 0 for a
+    /// Information of the prior that frames are at the keyframe's position, per axis, 1/keyframe units²; 0 for a
     /// keyframe with depth.
     pub fn translation_information(&self) -> f64 {
         self.translation_information
     }
 
-    /// Fuses points of the image in the pyramid and packs those of every level.
+    /// Fuses points of the image into the pyramid and packs those of every level.
     fn pack(&mut self, points: &[DepthPoint], scratch: &mut ReferenceScratch) {
         let greys: f64 = points.iter().map(|point| f64::from(point.intensity)).sum();
         self.mean_grey = greys / points.len().max(1) as f64;
@@ -242,7 +242,7 @@ impl Reference {
             intrinsics.fx / self.mean_inverse_depth,
             budget,
         );
-        // Coarser levels only start the finer ones, and their depth has less noise to be pulled by.
+        // Coarser levels only initialise the finer ones, and their depth has less noise to bias them.
         let is_finest = level == self.finest_level;
         if is_finest {
             surroundings.measure(candidates, image.width(), image.height());
@@ -279,12 +279,12 @@ impl Reference {
         self.mean_grey
     }
 
-    /// The keyframe it was prepared from; [`NO_KEYFRAME`] before any.
+    /// The keyframe it was prepared from; [`NO_KEYFRAME`] before the first.
     pub fn keyframe_id(&self) -> u64 {
         self.keyframe_id
     }
 
-    /// Life of the map that the keyframe belongs to.
+    /// Epoch of the keyframe.
     pub fn epoch(&self) -> u32 {
         self.epoch
     }
@@ -294,7 +294,7 @@ impl Reference {
         self.revision
     }
 
-    /// Sequence of the frame that the keyframe was made from.
+    /// Sequence of the frame that became the keyframe.
     pub fn sequence(&self) -> u64 {
         self.sequence
     }
@@ -309,17 +309,17 @@ impl Reference {
         &self.world_from_keyframe
     }
 
-    /// Where the map has the keyframe.
+    /// The keyframe's pose in the map.
     pub fn map_from_keyframe(&self) -> &Sim3 {
         &self.place.map_from_keyframe
     }
 
-    /// The same, and how uncertain that is.
+    /// The keyframe's pose in the map with its uncertainty.
     pub fn uncertain_place(&self) -> UncertainPlace {
         self.place
     }
 
-    /// How often the map had been corrected by then.
+    /// Revision of the map at that time.
     pub fn map_revision(&self) -> u64 {
         self.map_revision
     }
@@ -334,17 +334,17 @@ impl Reference {
         self.mean_inverse_depth
     }
 
-    /// How uncertain the errors are that all depth of the keyframe shares.
+    /// Covariance of the errors that all depth of the keyframe shares.
     pub fn mode_covariance(&self) -> &ModeCovariance {
         &self.mode_covariance
     }
 
-    /// Finest level with points prepared.
+    /// Finest level with prepared points.
     pub fn finest_level(&self) -> usize {
         self.finest_level
     }
 
-    /// The points of one level; empty where the level is not aligned.
+    /// The points of one level; empty if the level is not aligned.
     pub fn level(&self, level: usize) -> &LevelPoints {
         &self.levels[level]
     }

@@ -1,7 +1,7 @@
 //! The residual of a point, its variance and its Jacobian, and their sums over a level.
 //!
-//! With the keyframe's ray x = (x, y, 1), inverse depth d and variance V, and everything scaled
-//! by d so that points far away stay finite (`spec` letters):
+//! With the keyframe's ray x = (x, y, 1), inverse depth d and variance V, and everything scaled by d so that distant
+//! points stay finite (`spec` letters):
 //! ```text
 //! X̃  = R x + t d = (x̃, ỹ, z̃)          p' = π(X̃)        n = (x̃, ỹ)/z̃
 //! r   = I(p') − (eᵃ I_k + b)            a_x = g_x f_x     a_y = g_y f_y     m = a_x n_x + a_y n_y
@@ -9,12 +9,11 @@
 //! ∂r/∂d = (a_x t_x + a_y t_y − m t_z)/z̃
 //! σ_r² = (1 + e²ᵃ) σ_I² + (∂r/∂d)² V
 //! ```
-//! g, the gradient of the new image at p', is taken from the keyframe, which shows the same
-//! surface: eᵃ W⁻ᵀ g_k, W the derivative of the warp at constant d. A gradient sampled from the new image between
-//! the pixels that give I(p') shares their noise with the residual, and the product does not
-//! average out: where texture is weak, it pushes the pose away from whole pixels (0.3 px at noise
-//! of 2 grey levels). The keyframe's central difference shares no pixel with either term of r,
-//! is paid once per keyframe, and halves what a point reads.
+//! g, the gradient of the new image at p', is taken from the keyframe, which shows the same surface: eᵃ W⁻ᵀ g_k, with W
+//! the derivative of the warp at constant d. A gradient sampled from the new image between the pixels that give I(p')
+//! shares their noise with the residual, and the product does not average out: where texture is weak, it pushes the
+//! pose away from integer pixels (0.3 px at noise of 2 grey levels). The keyframe's central difference shares no pixel
+//! with either term of r, is computed once per keyframe, and halves the reads per point.
 
 use nalgebra::Vector3;
 
@@ -27,22 +26,21 @@ use crate::slam::image::buffer::Image;
 use crate::slam::image::sums::grey_per_sum;
 use crate::slam::pose::Brightness;
 
-/// Pixels at the rim that are not used: rectification and lenses are worst there.
+/// Unused pixels at the border, where rectification and lenses are worst.
 pub(crate) const BORDER_PX: f32 = 1.0;
 
-/// A point nearer to the camera than this share of its depth in the keyframe is not used: it is
-/// magnified beyond recognition, and division by its depth loses digits.
+/// A point nearer to the camera than this share of its depth in the keyframe is not used: it is magnified beyond
+/// recognition, and division by its depth loses digits.
 pub(crate) const NEAREST_DEPTH_RATIO: f32 = 0.1;
 
-/// A surface turned so far that its picture shrinks below this share is treated as if it were not:
-/// the gradient must stay finite.
+/// Lower bound of the determinant by which a tilted surface shrinks its image: the gradient must stay finite.
 pub(crate) const SMALLEST_DETERMINANT: f32 = 0.1;
 
-/// Grey levels between which the frame shows how bright a point is. At the ends of the sensor's range, to rounding, it
-/// is at least as bright or as dark.
+/// Grey levels between which the frame shows the brightness of a point. At the limits of the sensor's range, to
+/// rounding, the point is at least as bright or as dark.
 pub(crate) const UNCLIPPED_GREY: [f32; 2] = [0.5, 254.5];
 
-/// One state on one level, in the numbers that the loop over points needs.
+/// One state on one level, in the form needed by the loop over points.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Evaluation {
     pub(crate) rotation: [f32; 9],
@@ -61,9 +59,9 @@ pub struct Evaluation {
 }
 
 impl Evaluation {
-    /// For `current_from_keyframe` (translation in keyframe units) and `brightness` on `level`;
-    /// `intrinsics` are those of the level, `params` say how residuals are weighted.
-    /// `variance_translation` is the translation at which (∂r/∂d)² V is taken.
+    /// The evaluation at `current_from_keyframe` (translation in keyframe units) and `brightness` on `level`;
+    /// `intrinsics` are those of the level, `params` determine how residuals are weighted. `variance_translation` is
+    /// the translation at which (∂r/∂d)² V is evaluated.
     pub fn new(
         intrinsics: &Intrinsics,
         level: usize,
@@ -74,7 +72,7 @@ impl Evaluation {
     ) -> Self {
         let rotation = current_from_keyframe.rotation_matrix();
         let gain = brightness.a.exp() as f32;
-        // The last pixel whose right and lower neighbours exist, less the border.
+        // The last pixel that has a right and a lower neighbour, less the border.
         let upper = |side: usize| side as f32 - 1.0 - BORDER_PX;
         Self {
             rotation: std::array::from_fn(|i| rotation[(i / 3, i % 3)] as f32),
@@ -107,14 +105,14 @@ impl Evaluation {
     }
 }
 
-/// What one point contributes.
+/// The contribution of one point.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PointTerms {
-    /// Where it falls, pixels of the level.
+    /// Its projection, pixels of the level.
     pub projection: [f32; 2],
     /// r, grey levels.
     pub residual: f32,
-    /// Whether the sensor clipped what is predicted to lie beyond its range: then r says nothing.
+    /// Whether the sensor clipped a brightness predicted beyond its range: r then carries no information.
     pub is_clipped: bool,
     /// σ_r², grey levels².
     pub variance: f32,
@@ -124,7 +122,7 @@ pub struct PointTerms {
     pub jacobian: [f32; UNKNOWNS],
 }
 
-/// The terms of one point; `None` out of view.
+/// The terms of one point; `None` if it is out of view.
 #[inline(always)]
 pub fn point_terms(image: &Image<u16>, at: &Evaluation, point: &Point) -> Option<PointTerms> {
     let [u, v] = projection(at, point)?;
@@ -158,7 +156,7 @@ pub fn point_terms(image: &Image<u16>, at: &Evaluation, point: &Point) -> Option
     })
 }
 
-/// Where a point falls, pixels of the level; `None` out of view.
+/// Projection of a point, pixels of the level; `None` if it is out of view.
 #[inline(always)]
 fn projection(at: &Evaluation, point: &Point) -> Option<[f32; 2]> {
     let [warped_x, warped_y, depth_ratio] = at.warp(point, point.inverse_depth);
@@ -173,7 +171,7 @@ fn projection(at: &Evaluation, point: &Point) -> Option<[f32; 2]> {
     inside.then_some([u, v])
 }
 
-/// The image between its pixels.
+/// Bilinear sample of the image.
 #[inline(always)]
 fn sample(image: &Image<u16>, u: f32, v: f32) -> f32 {
     let (column, row) = (u as usize, v as usize);
@@ -186,9 +184,9 @@ fn sample(image: &Image<u16>, u: f32, v: f32) -> f32 {
     above + (below - above) * dv
 }
 
-/// The surface around a point as the frame sees it, at the depth of its surroundings.
+/// The surface around a point as seen in the frame, at the depth of its surroundings.
 struct Surface {
-    /// (a_x, a_y): the keyframe's gradient, turned and scaled by the warp.
+    /// (a_x, a_y): the keyframe's gradient, transformed by the warp.
     a: [f32; 2],
     n: [f32; 2],
     /// 1/z̃.
@@ -203,7 +201,7 @@ impl Surface {
         let depth_ratio = depth_ratio.max(NEAREST_DEPTH_RATIO);
         let inverse_ratio = 1.0 / depth_ratio;
         let (nx, ny) = (warped_x * inverse_ratio, warped_y * inverse_ratio);
-        // How the warp turns and scales a neighbourhood: ∂n/∂(x, y) = M/z̃.
+        // Derivative of the warp: ∂n/∂(x, y) = M/z̃.
         let (m11, m12) = (r0 - nx * r6, r1 - nx * r7);
         let (m21, m22) = (r3 - ny * r6, r4 - ny * r7);
         let determinant = (m11 * m22 - m12 * m21).max(SMALLEST_DETERMINANT);
@@ -216,7 +214,7 @@ impl Surface {
     }
 }
 
-/// Sums the normal equations of `points` over `image`; the explanation of every fast kernel.
+/// Sums the normal equations of `points` over `image`; the scalar reference of every fast kernel.
 pub fn accumulate_reference(
     points: &LevelPoints,
     image: &Image<u16>,
@@ -250,8 +248,8 @@ pub fn accumulate_reference(
     sums
 }
 
-/// Mean squared optical flow, pixels² of the level, of every `LANES`-th point from the keyframe
-/// to where it falls; 0 where none is in view.
+/// Mean squared optical flow, pixels² of the level, of every `LANES`-th point from the keyframe to its projection; 0 if
+/// none is in view.
 pub fn mean_squared_flow(points: &LevelPoints, at: &Evaluation) -> f64 {
     let [r0, r1, r2, r3, r4, r5, r6, r7, r8] = at.rotation;
     let [tx, ty, tz] = at.translation;

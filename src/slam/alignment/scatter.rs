@@ -1,11 +1,10 @@
-//! How the gradient of the cost scatters over the image: what the covariance is made of.
+//! The scatter of the gradient of the cost over the image: the basis of the covariance.
 //!
-//! Were residuals independent and their σ_r right, the covariance would be (Σ w J Jᵀ)⁻¹. Neither
-//! holds at occlusions, reflections and where depths share an error. The sandwich M⁻¹ S M⁻¹ takes
-//! both from the frame itself: the gradients Σ w J r of image tiles, zero in sum at the solution,
-//! scatter as much as they are uncertain (S = Σ g gᵀ over tiles), however correlated the points of
-//! one tile are. M is the curvature of the cost, which Huber's weights overstate: beyond k the
-//! gradient of a residual no longer grows.
+//! If residuals were independent and their σ_r correct, the covariance would be (Σ w J Jᵀ)⁻¹. Neither holds at
+//! occlusions, reflections and where depths share an error. The sandwich M⁻¹ S M⁻¹ estimates both from the frame
+//! itself: the gradients Σ w J r of image tiles, which sum to zero at the solution, scatter according to their
+//! uncertainty (S = Σ g gᵀ over tiles), however correlated the points within a tile are. M is the curvature of the
+//! cost, which Huber's weights overstate: beyond k the gradient of a residual no longer grows.
 
 use nalgebra::{SMatrix, Vector3};
 
@@ -20,8 +19,7 @@ use crate::slam::modes::NUM_MODES;
 /// Unknowns of the pose.
 const POSE: usize = 6;
 
-/// Where fewer tiles than this have points, their scatter is too few numbers to trust, and
-/// the information stands in for it.
+/// With points in fewer tiles than this, the scatter is too small a sample to trust, and the information replaces it.
 const TRUSTED_TILES: f64 = UNKNOWNS as f64;
 
 /// Scatter of the gradient, and the curvature of the cost.
@@ -29,14 +27,13 @@ const TRUSTED_TILES: f64 = UNKNOWNS as f64;
 pub struct GradientScatter {
     /// Σ g gᵀ over tiles, g = Σ w J r over the points of a tile.
     pub outer: SMatrix<f64, UNKNOWNS, UNKNOWNS>,
-    /// Curvature over information: the share of the Huber weights that is not beyond k.
+    /// Curvature over information: the share of the Huber weights of residuals within k.
     pub curvature_ratio: f64,
     /// Tiles with points in view.
     pub tiles: u32,
-    /// H = Σ w J (∂r/∂d) d φᵀ, φ = (X, Y, ln d): by how much a unit of each common error of depth changes the
-    /// gradient.
+    /// H = Σ w J (∂r/∂d) d φᵀ, φ = (X, Y, ln d): change of the gradient per unit of each common error of depth.
     pub d_gradient_d_modes: SMatrix<f64, UNKNOWNS, NUM_MODES>,
-    /// By how much tiles of the image are displaced.
+    /// Displacement of image tiles.
     pub misfit: TileMisfit,
 }
 
@@ -55,7 +52,7 @@ impl Default for GradientScatter {
 /// Sums over the points of all tiles.
 #[derive(Debug, Clone)]
 pub struct ScatterSums {
-    /// By tile.
+    /// The sums by tile.
     pub tiles: [TileSum; NUM_TILES],
     /// Σ w of the points whose Huber weight is 1.
     pub quadratic: f32,
@@ -74,7 +71,7 @@ impl Default for ScatterSums {
 }
 
 impl GradientScatter {
-    /// Measures it at one state, point by point; the explanation of `Kernel::scatter`.
+    /// Measures the scatter at one state, point by point; the scalar reference of `Kernel::scatter`.
     pub fn reference(points: &LevelPoints, image: &Image<u16>, at: &Evaluation) -> Self {
         let mut sums = ScatterSums::default();
         for point in points.iter() {
@@ -96,7 +93,7 @@ impl GradientScatter {
             for (sum, derivative) in tile.gradient.iter_mut().zip(terms.jacobian) {
                 *sum += weight * derivative * terms.residual;
             }
-            // (∂r/∂d) d, at the inverse depth that the Jacobian is taken at.
+            // (∂r/∂d) d, at the inverse depth where the Jacobian is evaluated.
             let [tx, ty, tz] = at.translation;
             let [jx, jy, jz, ..] = terms.jacobian;
             let change = f64::from(weight * (jx * tx + jy * ty + jz * tz));
@@ -130,15 +127,15 @@ impl GradientScatter {
         }
         scatter.outer.fill_lower_triangle_with_upper_triangle();
         if weights > 0.0 {
-            // None where every residual is an outlier: the energy has no curvature there, and the
-            // covariance no bound. Two sums of the same weights may differ by rounding.
+            // 0 if every residual is an outlier: the energy then has no curvature, and the covariance no bound. Two
+            // sums of the same weights may differ by rounding.
             scatter.curvature_ratio = (f64::from(sums.quadratic) / weights).min(1.0);
         }
         scatter
     }
 
-    /// Covariance of all unknowns before calibration, at the state whose sums are `sums`; `None`
-    /// where they do not determine all unknowns.
+    /// Covariance of all unknowns before calibration, at the state with these `sums`; `None` if they do not determine
+    /// all unknowns.
     pub fn covariance(&self, sums: &NormalEquations) -> Option<SMatrix<f64, UNKNOWNS, UNKNOWNS>> {
         let inverse = sums.information.cholesky()?.inverse() / self.curvature_ratio;
         let stand_in = TRUSTED_TILES / f64::from(self.tiles.max(1));
@@ -146,10 +143,10 @@ impl GradientScatter {
         covariance.iter().all(|x| x.is_finite()).then_some(covariance)
     }
 
-    /// By how much the solution at the state whose sums are `sums` moves for each unit of a common error of depth:
-    /// −M⁻¹ H, rows as of the left increment; `None` where the sums do not determine all unknowns. The mean
-    /// over the points, `centre`, is taken off each shape φ: a constant error is one of the keyframe's unit and
-    /// moves the translation in its own direction alone, since H of a constant is M (t, 0).
+    /// Change of the solution at the state with these `sums` per unit of each common error of depth: −M⁻¹ H, with the
+    /// rows of the left increment; `None` if the sums do not determine all unknowns. The mean over the points,
+    /// `centre`, is subtracted from each shape φ: a constant error is one of the keyframe's unit and changes the
+    /// translation along itself only, since H of a constant is M (t, 0).
     ///
     /// Huber's weights need no curvature here: M and H lose the same share of it.
     pub fn d_pose_d_modes(

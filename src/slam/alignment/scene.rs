@@ -29,7 +29,7 @@ impl Noise {
     }
 }
 
-/// The plane n·X = 1 of the keyframe's camera with a texture of sines.
+/// The plane n·X = 1 in camera coordinates of the keyframe, with a texture of sines.
 pub struct Plane {
     /// n of n·X = 1, 1/keyframe units.
     pub normal: [f64; 3],
@@ -103,8 +103,8 @@ impl Plane {
         pixels
     }
 
-    /// A keyframe at the identity with a depth at every `stride`-th pixel, off by noise of
-    /// relative size `depth_std_dev` (of the inverse depth), which its variance says.
+    /// A keyframe at the identity with a depth at every `stride`-th pixel, with noise of relative size `depth_std_dev`
+    /// (of the inverse depth) and the matching variance.
     pub fn keyframe(&self, at: &Intrinsics, stride: usize, depth_std_dev: f64) -> Keyframe {
         let image = self.render(at, &SE3::identity(), 2.0, (1.0, 0.0), 1);
         let mut noise = Noise(99);

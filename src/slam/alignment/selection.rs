@@ -1,7 +1,7 @@
-//! Which points of a level are aligned when there are more than the budget.
+//! Selects the points of a level that are aligned if there are more than the budget.
 //!
-//! The image is cut into tiles; each tile gets a share of the budget that grows with the square
-//! root of its points (between even spread and fair share), and keeps its most informative ones.
+//! The image is divided into tiles; each tile gets a share of the budget that grows with the square root of its number
+//! of points (between equal and proportional shares), and keeps its most informative ones.
 
 use serde::{Deserialize, Serialize};
 
@@ -15,11 +15,11 @@ use crate::slam::parameter::{ParameterError, check_range};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SelectionParams {
-    /// The camera's noise, which tells how strong a gradient must be to count and which the configuration has once for all.
+    /// The camera's noise, configured once for all modules; it determines how strong a gradient must be to count.
     #[serde(skip)]
     pub noise: ImageNoise,
-    /// Translation, in shares of the mean depth, at which noise in the image and in the depth are
-    /// weighed against each other. A keyframe is replaced at about a third.
+    /// Translation, relative to the mean depth, at which noise in the image and in the depth are weighed against each
+    /// other. A keyframe is replaced at about a third.
     pub typical_translation: f32,
 }
 
@@ -36,11 +36,11 @@ impl SelectionParams {
     }
 }
 
-/// Side of a tile, pixels of the level: fine enough to spread, coarse enough that a tile with
-/// points gets at least a few.
+/// Side of a tile, pixels of the level: small enough for an even spread, large enough that a tile with points gets at
+/// least a few.
 const TILE_PX: usize = 16;
 
-/// Chooses points, in memory that is used again.
+/// Chooses points, in reusable memory.
 #[derive(Debug, Clone, Default)]
 pub struct Selection {
     ranked: Vec<(u64, u32)>,
@@ -51,9 +51,9 @@ pub struct Selection {
 }
 
 impl Selection {
-    /// Indices, ascending, of at most `budget` of the `candidates` on `image`, the sums of
-    /// `level`. `focal_times_depth`: focal length of the level times mean depth, what turns a
-    /// variance of inverse depth into pixels² for a translation of one mean depth.
+    /// Indices, ascending, of at most `budget` of the `candidates` on `image`, the sums of `level`.
+    /// `focal_times_depth`: focal length of the level times mean depth, which converts a variance of inverse depth into
+    /// pixels² for a translation of one mean depth.
     pub fn choose(
         &mut self,
         params: &SelectionParams,
@@ -64,7 +64,7 @@ impl Selection {
         budget: usize,
     ) -> &[u32] {
         self.chosen.clear();
-        // One more than are chosen, see `fill_quotas`.
+        // One more than the number chosen, see `fill_quotas`.
         self.chosen.reserve(budget.min(candidates.len()) + 1);
         if candidates.len() <= budget {
             self.chosen.extend(0..candidates.len() as u32);
@@ -77,8 +77,8 @@ impl Selection {
         &self.chosen
     }
 
-    /// Ranks the candidates by their information on a shift along the gradient, 1/pixels²:
-    /// 1/(σ²/|g|² + (∂u/∂d)² V), and counts those of each tile.
+    /// Ranks the candidates by their information about a shift along the gradient, 1/pixels²: 1/(σ²/|g|² + (∂u/∂d)² V),
+    /// and counts those in each tile.
     fn rank_all(
         &mut self,
         params: &SelectionParams,
@@ -113,7 +113,7 @@ impl Selection {
         }));
     }
 
-    /// Counting sort of the ranks by tile; gives the number of tiles.
+    /// Counting sort of the ranks by tile; returns the number of tiles.
     fn sort_into_tiles(&mut self) -> usize {
         let num_tiles = self.tile_starts.len() - 1;
         for tile in 0..num_tiles {
@@ -133,13 +133,12 @@ impl Selection {
         num_tiles
     }
 
-    /// Takes from each tile its best points, as many as its share of the budget, and lists them
-    /// in ascending order.
+    /// Takes the best points of each tile, up to its share of the budget, and lists them in ascending order.
     fn fill_quotas(&mut self, num_tiles: usize, budget: usize) {
         let tile = |starts: &[u32], tile: usize| starts[tile] as usize..starts[tile + 1] as usize;
         let share = |count: usize| (count as f64).sqrt();
         let mut factor = 0.0;
-        // What full tiles cannot take goes to the others: three rounds leave a few per mille.
+        // The surplus of full tiles goes to the others: three rounds leave a few per mille.
         for _ in 0..3 {
             let (mut open, mut taken) = (0.0, 0.0);
             for index in 0..num_tiles {
@@ -175,7 +174,7 @@ impl Selection {
             }
             taken += quota;
         }
-        // One more than there are: every index is written, and over those that are not chosen.
+        // One more than the number taken: every index is written, and the next overwrites one that is not chosen.
         self.chosen.resize(taken + 1, 0);
         let mut count = 0;
         for (index, &is_chosen) in self.is_chosen.iter().enumerate() {
@@ -186,13 +185,13 @@ impl Selection {
     }
 }
 
-/// Orders candidates, the best first, the earlier of two alike: a score is never negative, so that
-/// its bits are in its order.
+/// Orders candidates from best to worst, ties by index: a score is never negative, so that the order of its bits is
+/// that of its values.
 fn rank(score: f32, index: u32) -> u64 {
     u64::from(!score.to_bits()) << 32 | u64::from(index)
 }
 
-/// The candidate of a [`rank`].
+/// The candidate index of a [`rank`].
 fn index_of(rank: u64) -> usize {
     rank as u32 as usize
 }

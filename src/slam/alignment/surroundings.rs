@@ -1,25 +1,24 @@
-//! The inverse depth around a point without the point itself: where its Jacobian is taken.
+//! The inverse depth around a point, excluding the point itself: where its Jacobian is evaluated.
 //!
-//! Noise in the depth of a point moves its residual. Were the Jacobian taken at the same depth,
-//! both would carry the same noise, their product would not average out, and the translation would
-//! be pulled towards zero, by far more than its standard deviation where rotation
-//! and translation look alike (7 % on a plane with 10 % of noise). A Jacobian from the neighbours' depth, an instrumental variable, has the
-//! same zero without that pull, whatever the noise and however large it is believed to be.
+//! Noise in the depth of a point changes its residual. If the Jacobian were evaluated at the same depth, both would
+//! carry the same noise, their product would not average out, and the translation would be biased towards zero, by far
+//! more than its standard deviation where rotation and translation look alike (7 % on a plane with 10 % of noise). A
+//! Jacobian from the neighbours' depth, an instrumental variable, has the same zero without that bias, whatever the
+//! noise and its assumed size.
 
 use crate::slam::alignment::fusion::LevelPoint;
 
-/// Side of a tile, pixels of the level: wide enough that the neighbours whose noise a point shares
-/// are few of many, and surfaces bend little within.
+/// Side of a tile, pixels of the level: large enough that only a few of the neighbours share the noise of a point, and
+/// small enough that surfaces hardly bend within.
 const TILE_PX: usize = 8;
 
-/// What the mean of the whole level counts among the points of a tile: it decides where a point is
-/// alone.
+/// Weight of the mean of the whole level against the points of a tile: it decides where a point is alone.
 const LEVEL_COUNT: f32 = 0.5;
 
-/// Share of a tile's information below which what a point leaves is rounding.
+/// Share of a tile's information below which the rest without a point is rounding error.
 const LEAST_REST: f32 = 1.0e-3;
 
-/// Sums of inverse depth over tiles, in memory that is used again.
+/// Sums of inverse depth over tiles, in reusable memory.
 #[derive(Debug, Clone, Default)]
 pub struct Surroundings {
     columns: usize,
@@ -56,11 +55,11 @@ impl Surroundings {
         self.mean_information = total.information / candidates.len().max(1) as f32;
     }
 
-    /// Mean inverse depth around `candidate`, one of those measured, without its own.
+    /// Mean inverse depth around `candidate`, one of those measured, excluding its own.
     pub fn without(&self, candidate: &LevelPoint) -> f32 {
         let tile = self.tiles.get(self.tile_of(candidate)).copied().unwrap_or_default();
         let own = 1.0 / candidate.variance;
-        // Rounding must not leave a rest where the point is alone.
+        // Rounding must not leave a remainder where the point is alone.
         let others = tile.information - own;
         let others = if others > LEAST_REST * tile.information { others } else { 0.0 };
         let level = LEVEL_COUNT * self.mean_information;
@@ -84,7 +83,7 @@ mod tests {
     use crate::slam::keyframe::DepthPoint;
 
     #[test]
-    fn a_point_counts_nothing_in_its_own_surroundings() {
+    fn a_point_does_not_count_in_its_own_surroundings() {
         let depth = |u: u16, v: u16, inverse_depth: f32| DepthPoint {
             u,
             v,
@@ -98,7 +97,7 @@ mod tests {
         let level = fusion.level(0);
         let mut surroundings = Surroundings::default();
         surroundings.measure(level, 64, 32);
-        // The mean of all, 3, counts half a point.
+        // The mean of all, 3, has the weight of half a point.
         let expected = [(2.0 + 1.5) / 1.5, (1.0 + 1.5) / 1.5, 3.0];
         for (index, expected) in expected.into_iter().enumerate() {
             let found = surroundings.without(&level[index]);

@@ -1,4 +1,4 @@
-//! The alignment against closed forms: derivatives, the claims of LSD14 fig. 4, invariances.
+//! The alignment against closed forms: derivatives, the statements of LSD14 fig. 4, invariances.
 
 use nalgebra::Vector6;
 
@@ -36,8 +36,8 @@ fn move_of(seed: u64, size: f64) -> SE3 {
     SE3::exp(&Vector6::from_fn(|_, _| size * noise.uniform()))
 }
 
-/// Asserts that `analytic` is the derivative that `numeric` measured, over many points: the
-/// regression of one on the other is 1 and little is left.
+/// Asserts that `analytic` is the derivative measured by `numeric` over many points: the regression of one on the other
+/// is 1 with little scatter.
 fn assert_derivative(name: &str, analytic: &[f64], numeric: &[f64]) {
     let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
     let slope = dot(analytic, numeric) / dot(numeric, numeric);
@@ -50,12 +50,12 @@ fn assert_derivative(name: &str, analytic: &[f64], numeric: &[f64]) {
 
 #[test]
 fn jacobians_are_the_central_differences_of_the_residual() {
-    // Long waves: the keyframe's and the frame's gradient agree to the curvature of the texture.
-    // No slant: W⁻ᵀ takes the inverse depth as constant around a point.
+    // Long waves: the gradients of keyframe and frame agree to the curvature of the texture. No slant: W⁻ᵀ treats the
+    // inverse depth as constant around a point.
     let camera = small_camera();
     let plane = Plane::new([0.0, 0.0, 0.95], [60.0, 180.0], &camera);
     let mut keyframe = plane.keyframe(&camera, 1, 0.0);
-    // No noise: strong gradients are preferred, also where noise made them.
+    // No noise: strong gradients are preferred, even those due to noise.
     keyframe.image = plane.render(&camera, &SE3::identity(), 0.0, (1.0, 0.0), 1).into();
     let reference = Reference::prepare(&keyframe);
     let current_from_keyframe = move_of(4, 0.06);
@@ -105,7 +105,7 @@ fn jacobians_are_the_central_differences_of_the_residual() {
     compare("inverse depth", &|t| t.inverse_depth_derivative, &depth, 0.08);
 }
 
-/// (point, σ_r², what the image noise alone gives) of every point in view.
+/// (point, σ_r², its part from image noise alone) for every point in view.
 fn variances(pose: &SE3) -> Vec<(Point, f32, f32)> {
     let (plane, camera) = (small_plane(), small_camera());
     let reference = Reference::prepare(&plane.keyframe(&camera, 1, 0.1));
@@ -127,7 +127,7 @@ fn under_pure_rotation_every_residual_has_the_same_variance() {
 }
 
 #[test]
-fn under_translation_along_z_the_epipole_does_not_feel_the_depth() {
+fn under_translation_along_z_depth_variance_vanishes_at_the_epipole() {
     let variances = variances(&SE3::exp(&Vector6::new(0.0, 0.0, 0.1, 0.0, 0.0, 0.0)));
     let mean_excess = |within: &dyn Fn(f32) -> bool| {
         let near = variances.iter().filter(|(point, ..)| within(point.ray_x.hypot(point.ray_y)));
@@ -140,7 +140,7 @@ fn under_translation_along_z_the_epipole_does_not_feel_the_depth() {
 }
 
 #[test]
-fn under_translation_along_x_only_gradients_along_x_feel_the_depth() {
+fn under_translation_along_x_depth_variance_affects_only_gradients_along_x() {
     let variances = variances(&SE3::exp(&Vector6::new(0.1, 0.0, 0.0, 0.0, 0.0, 0.0)));
     let mut seen = (0, 0);
     for (point, variance, image) in variances {
@@ -160,7 +160,7 @@ fn every_kernel_equals_the_reference() {
     let (plane, camera) = (small_plane(), small_camera());
     let reference = Reference::prepare(&plane.keyframe(&camera, 1, 0.1));
     let image = pyramid(&plane.render(&camera, &move_of(9, 0.02), 2.0, (0.9, 4.0), 8));
-    // Near the solution, far from it, and so that most points leave the image.
+    // Near the solution, far from it, and with most points outside the image.
     for (pose, gain) in
         [(move_of(9, 0.02).inverse(), 0.9f64), (move_of(3, 0.1), 1.0), (move_of(5, 0.3), 1.1)]
     {
@@ -187,7 +187,7 @@ fn every_kernel_equals_the_reference() {
                 expected.squared_residual,
                 expected.squared_residual
             ));
-            // A point on the very border, or on the gate, may fall to either side by rounding.
+            // A point exactly on the border, or on the gate, may fall to either side by rounding.
             assert!(sums.in_view.abs_diff(expected.in_view) <= 2);
             assert!(sums.compared.abs_diff(expected.compared) <= 2);
             assert!(sums.inliers.abs_diff(expected.inliers) <= 4);
@@ -201,7 +201,7 @@ fn pixels_that_the_sensor_clips_are_not_compared() {
     let reference = Reference::prepare(&plane.keyframe(&camera, 1, 0.01));
     let points = reference.level(LEVEL);
     let pose = move_of(9, 0.02);
-    // A third of the pixels is white in the one frame, black in the other; all is as predicted.
+    // A third of the pixels is white in one frame, black in the other; everything is as predicted.
     for (gain, offset) in [(1.6f64, 0.0), (1.6, -160.0)] {
         let frame = plane.render(&camera, &pose, 1.0, (gain, offset), 8);
         let clipped = frame.iter().filter(|grey| [0, 255].contains(*grey)).count();
@@ -223,14 +223,14 @@ fn pixels_that_the_sensor_clips_are_not_compared() {
             assert!((sums.information.trace() / trace - 1.0).abs() < 2e-3);
             let outer = kernel.scatter(points, image, &at).outer;
             assert!((outer.trace() / scattered.outer.trace() - 1.0).abs() < 0.02);
-            // What is left is as predicted, but for mixed pixels at the border of what is clipped.
+            // The remaining points are as predicted, except for mixed pixels at the border of clipped areas.
             assert!(f64::from(sums.inliers) > 0.95 * f64::from(sums.compared), "{sums:?}");
         }
     }
 }
 
 #[test]
-fn a_frame_that_is_overexposed_is_aligned_by_what_is_left() {
+fn an_overexposed_frame_is_aligned_by_its_unclipped_pixels() {
     let (plane, camera) = (small_plane(), small_camera());
     let keyframe = plane.keyframe(&camera, 1, 0.01);
     let reference = Reference::prepare(&keyframe);
@@ -241,21 +241,20 @@ fn a_frame_that_is_overexposed_is_aligned_by_what_is_left() {
     let found = aligner.align(&reference, &pyramid(&frame), &start, even, &mut |_| true).state;
     let gain = found.brightness.a.exp();
     let error = (found.current_from_keyframe * truth.inverse()).log().norm();
-    // A third of the frame is white. Compared like the rest, that makes the gain 1.43; pixels at its border, white in
-    // part, leave 1.53.
+    // A third of the frame is white. If compared like the rest, it would make the gain 1.43; partly white pixels at its
+    // border leave 1.53.
     assert!((gain - 1.6).abs() < 0.1, "{gain}");
     assert!(error < 2e-3, "{error}");
 }
 
 #[test]
-fn every_kernel_scatters_as_the_reference() {
+fn every_kernel_measures_the_scatter_of_the_reference() {
     let (plane, camera) = (small_plane(), small_camera());
     let reference = Reference::prepare(&plane.keyframe(&camera, 1, 0.1));
     let image = pyramid(&plane.render(&camera, &move_of(9, 0.02), 6.0, (0.9, 4.0), 8));
     let (points, image) = (reference.level(LEVEL), image.level(LEVEL));
     assert!(points.runs().len() > points.blocks().len());
-    // Near the solution, where the gradients of tiles are all that is left, far from it, and so
-    // that most points leave the image.
+    // Near the solution, where only the gradients of tiles remain, far from it, and with most points outside the image.
     for (pose, gain) in
         [(move_of(9, 0.02).inverse(), 0.9f64), (move_of(3, 0.1), 1.0), (move_of(5, 0.3), 1.1)]
     {
@@ -288,7 +287,7 @@ fn aligned(keyframe: &Keyframe, image: &[u8], start: &SE3, simd: SimdMode) -> (S
 }
 
 #[test]
-fn the_unit_of_depth_and_translation_changes_nothing() {
+fn the_result_is_independent_of_the_unit() {
     let (plane, camera) = (small_plane(), small_camera());
     let keyframe = plane.keyframe(&camera, 2, 0.05);
     let truth = move_of(2, 0.05);
@@ -309,12 +308,12 @@ fn the_unit_of_depth_and_translation_changes_nothing() {
 }
 
 #[test]
-fn starts_far_away_converge() {
+fn distant_initial_guesses_converge() {
     let (plane, camera) = (small_plane(), small_camera());
     let keyframe = plane.keyframe(&camera, 2, 0.05);
     let image = plane.render(&camera, &SE3::identity(), 2.0, (1.0, 0.0), 4);
     for seed in 0..20 {
-        // Up to 12 px of level 0 from each unknown alone.
+        // Up to 12 px of level 0 by each unknown alone.
         let (pose, _) = aligned(&keyframe, &image, &move_of(seed, 0.045), SimdMode::Auto);
         assert!(pose.log().norm() < 5e-3, "seed {seed}: {}", pose.log().norm());
     }
@@ -332,7 +331,7 @@ fn the_same_input_gives_the_same_bits() {
 }
 
 #[test]
-fn without_budget_the_best_so_far_is_given() {
+fn without_budget_the_best_state_so_far_is_returned() {
     let (plane, camera) = (small_plane(), small_camera());
     let reference = Reference::prepare(&plane.keyframe(&camera, 2, 0.05));
     let truth = move_of(2, 0.05);
@@ -361,11 +360,11 @@ fn median(values: &[f64]) -> f64 {
 }
 
 #[test]
-fn each_level_that_there_is_time_for_makes_the_pose_better() {
+fn each_further_level_improves_the_pose() {
     let (plane, camera) = (small_plane(), small_camera());
     let reference = Reference::prepare(&plane.keyframe(&camera, 2, 0.02));
     let aligner = Aligner::new(AlignmentParams::default());
-    // By the finest level that is solved, none first.
+    // By the finest level that is solved, starting with none.
     let mut errors = [const { Vec::new() }; LEVELS - LEVEL + 1];
     for seed in 0..9 {
         let truth = move_of(seed, 0.04);
@@ -382,13 +381,13 @@ fn each_level_that_there_is_time_for_makes_the_pose_better() {
     for pair in errors.windows(2) {
         let [coarse, fine] = [&pair[0], &pair[1]];
         assert!(fine.iter().zip(coarse).all(|(fine, coarse)| fine < coarse), "{errors:?}");
-        // Four times the points, each placed twice as finely: with independent noise a quarter is left.
+        // Four times the points, each located twice as precisely: with independent noise a quarter is left.
         assert!(median(fine) < 0.5 * median(coarse), "{errors:?}");
     }
 }
 
 #[test]
-fn a_budget_of_points_is_kept_and_spread() {
+fn the_point_budget_is_met_and_spread() {
     let (plane, camera) = (small_plane(), small_camera());
     let params = ReferenceParams { point_budget: [1000; 5], ..ReferenceParams::default() };
     let (mut reference, mut scratch) = (Reference::new(params), ReferenceScratch::default());
@@ -403,13 +402,13 @@ fn a_budget_of_points_is_kept_and_spread() {
 }
 
 #[test]
-fn noise_in_the_depth_does_not_pull_the_translation() {
+fn noise_in_the_depth_does_not_bias_the_translation() {
     let (plane, camera) = (small_plane(), small_camera());
     let truth = SE3::exp(&Vector6::new(0.1, 0.04, -0.05, 0.01, 0.02, 0.0));
     let image = pyramid(&plane.render(&camera, &truth.inverse(), 2.0, (1.0, 0.0), 4));
     let reference = Reference::prepare(&plane.keyframe(&camera, 1, 0.1));
     let at = evaluation(&truth, Brightness::default());
-    // Where the normal equations at the true pose would go, as a share of the translation.
+    // The step of the normal equations at the true pose, as a share of the translation.
     let pull = |points: &LevelPoints| {
         let sums = accumulate_reference(points, image.level(LEVEL), &at);
         let step = sums.damped_step(0.0).unwrap();
@@ -424,7 +423,7 @@ fn noise_in_the_depth_does_not_pull_the_translation() {
 }
 
 #[test]
-fn tiles_hold_the_gradient_and_correlated_residuals_cost_certainty() {
+fn correlated_residuals_increase_the_covariance() {
     let (plane, camera) = (small_plane(), small_camera());
     let reference = Reference::prepare(&plane.keyframe(&camera, 1, 0.0));
     let points = reference.level(LEVEL);
@@ -438,7 +437,7 @@ fn tiles_hold_the_gradient_and_correlated_residuals_cost_certainty() {
         covariance.fixed_view::<3, 3>(0, 0).trace().sqrt()
     };
     let clean = plane.render(&camera, &SE3::identity(), 2.0, (1.0, 0.0), 4);
-    // The same deviation in every pixel of a patch of 16: noise that does not average out in it.
+    // The same deviation in every pixel of a 16-pixel patch: noise that does not average out within it.
     let mut noise = Noise(6);
     let patches: Vec<_> = (0..20 * 15).map(|_| 4.0 * noise.normal()).collect();
     let deviating = clean.iter().enumerate().map(|(i, &grey)| {
@@ -451,12 +450,12 @@ fn tiles_hold_the_gradient_and_correlated_residuals_cost_certainty() {
 }
 
 #[test]
-fn where_every_residual_is_an_outlier_the_covariance_has_no_bound() {
+fn without_inliers_there_is_no_covariance() {
     let (plane, camera) = (small_plane(), small_camera());
     let reference = Reference::prepare(&plane.keyframe(&camera, 1, 0.0));
     let points = reference.level(LEVEL);
     let image = pyramid(&plane.render(&camera, &SE3::identity(), 2.0, (1.0, 0.0), 4));
-    // An offset of 200 grey levels is far beyond what noise explains, everywhere.
+    // An offset of 200 grey levels is far beyond noise everywhere.
     let at = evaluation(&SE3::identity(), Brightness { a: 0.0, b: 200.0 });
     let sums = accumulate_reference(points, image.level(LEVEL), &at);
     for kernel in Kernel::available() {

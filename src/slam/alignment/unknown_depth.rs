@@ -1,9 +1,9 @@
-//! A view of which no depth is known, as a reference: its pixels with gradient, all at the mean depth of the scene and
-//! as uncertain as depths of a scene differ.
+//! A view without known depth as a reference: its pixels with gradient, all at the mean depth of the scene, with the
+//! uncertainty of depths in a scene.
 //!
-//! The residual is normalised by its own variance, σ_r² = 2σ_I² + (∂r/∂d)² V, and ∂r/∂d is proportional to the
-//! translation: such a pixel counts in full while the camera turns, and the less the further it moves. It holds the
-//! camera's rotation, and its translation as far as it is small.
+//! The residual is normalised by its variance, σ_r² = 2σ_I² + (∂r/∂d)² V, and ∂r/∂d is proportional to the translation:
+//! such a pixel has full weight while the camera only rotates, and less the further it moves. It constrains the
+//! rotation and, as long as it is small, the translation.
 
 use crate::slam::alignment::reference::{Reference, ReferenceScratch};
 use crate::slam::geometry::intrinsics::Intrinsics;
@@ -11,29 +11,29 @@ use crate::slam::image::sums::{SumPyramid, grey_per_sum};
 use crate::slam::keyframe::{DepthPoint, MAX_KEYFRAME_POINTS};
 use crate::slam::modes::ModeCovariance;
 
-/// Standard deviation of a point's inverse depth, in units of the mean inverse depth: that of rooms, in which the nearest
-/// things are at half the mean distance and the farthest at twice that.
+/// Standard deviation of a point's inverse depth, in units of the mean inverse depth: that of rooms, where the nearest
+/// objects are at half the mean distance and the farthest at twice that.
 const DEPTH_SPREAD: f32 = 0.5;
 
-/// Standard deviation of tilt along columns and rows, relative inverse depth for each unit of the ray's coordinates: of a
-/// wall seen at 45°, whose inverse depth changes by as much as the ray does.
+/// Standard deviation of tilt along columns and rows, relative inverse depth per unit of the ray's coordinates: that of
+/// a wall seen at 45°, whose inverse depth changes by as much as the ray does.
 const TILT: f64 = 1.0;
 
-/// Smallest gradient of a point, grey levels a pixel of the finest level: what noise of small cameras leaves there. Of
-/// dark views nothing may be stronger; where there are more, the strongest are chosen.
+/// Smallest gradient of a point, grey levels per pixel of the finest level: the noise of small cameras there. Dark
+/// views may have nothing stronger; otherwise the strongest are chosen.
 const MIN_GRADIENT: f32 = 1.0;
 
-/// Prepares references to views without depth, in memory that is used again.
+/// Prepares references to views without depth in reusable memory.
 #[derive(Debug, Clone, Default)]
 pub struct UnknownDepth {
     points: Vec<DepthPoint>,
-    /// The memory that it prepares in, for other references as well.
+    /// Working memory of the preparation, usable for other references as well.
     pub scratch: ReferenceScratch,
 }
 
 impl UnknownDepth {
-    /// Makes `reference` one to the view in `pyramid`, of a camera with these intrinsics, in units of the mean depth. The
-    /// pyramid is taken over; what `reference` had is left in its place.
+    /// Makes `reference` a reference to the view in `pyramid`, of a camera with these intrinsics, in units of the mean
+    /// depth. Takes over `pyramid` and leaves the previous one of `reference` in its place.
     pub fn prepare(
         &mut self,
         reference: &mut Reference,
@@ -45,14 +45,14 @@ impl UnknownDepth {
         reference.prepare_view(intrinsics, pyramid, &self.points, modes, &mut self.scratch);
     }
 
-    /// The pixels of the finest level with gradient, as points of level 0.
+    /// Chooses the pixels of the finest level with gradient, as points of level 0.
     fn choose(&mut self, pyramid: &SumPyramid) {
         self.points.clear();
         let finest = pyramid.finest_level();
         let image = pyramid.level(finest);
         let (width, height) = (image.width(), image.height());
         let grey = grey_per_sum(finest);
-        // Every so many pixels, so that points of a large image come from all of it.
+        // A regular subset, so that the points of a large image cover all of it.
         let step = (1..).find(|step| width * height <= step * step * MAX_KEYFRAME_POINTS);
         let step = step.unwrap_or(1);
         for v in (1..height.saturating_sub(1)).step_by(step) {

@@ -1,4 +1,4 @@
-//! What each point of a keyframe weighs for a given motion: the picture of LSD14 fig. 4.
+//! The weight of each point of a keyframe for a given motion: reproduces LSD14 fig. 4.
 
 use crate::slam::alignment::align::AlignmentParams;
 use crate::slam::alignment::reference::Reference;
@@ -16,14 +16,14 @@ pub struct PointWeight {
     pub row: usize,
     /// Inverse depth of the point, 1/keyframe units.
     pub inverse_depth: f32,
-    /// 1/σ_r² as a share of what it were with exact depth: 1 where depth variance does not reach the
-    /// residual, towards 0 where it drowns it.
+    /// 1/σ_r² relative to its value with exact depth: 1 where depth variance does not affect the residual, towards 0
+    /// where it dominates.
     pub weight: f32,
 }
 
-/// Weights of the points of `reference` on `level` that stay in view when the camera moves by
-/// `current_from_keyframe` (translation in keyframe units), at equal brightness. `frame` is the pyramid of any image of
-/// that camera: σ_r² takes its gradients from the keyframe.
+/// Weights of the points of `reference` on `level` that stay in view when the camera moves by `current_from_keyframe`
+/// (translation in keyframe units), at equal brightness. `frame` is the pyramid of any image of that camera: the
+/// gradients in σ_r² come from the keyframe.
 pub fn point_weights(
     reference: &Reference,
     frame: &SumPyramid,
@@ -65,7 +65,7 @@ mod tests {
     const LEVEL: usize = 1;
 
     #[test]
-    fn weights_fall_where_variance_and_gradient_say() {
+    fn weights_fall_with_depth_variance_and_gradient() {
         let camera = small_camera();
         let keyframe = small_plane().keyframe(&camera, 1, 0.1);
         let reference = Reference::prepare(&keyframe);
@@ -79,7 +79,7 @@ mod tests {
         let inner: Vec<Point> = reference.level(LEVEL).iter().collect();
         assert!(still.len() > 1000 && still.len() <= inner.len());
         assert!(still.iter().all(|point| point.weight == 1.0));
-        // A point lies on the pixel whose intensity it has.
+        // The intensity of a point is that of its pixel.
         let image = pyramid.level(LEVEL);
         for point in &still {
             let intensity = f32::from(image.at(point.column, point.row)) * 0.25;
@@ -92,7 +92,7 @@ mod tests {
         );
         let along_x = weights(Vector6::new(0.1, 0.0, 0.0, 0.0, 0.0, 0.0));
         let doubled = weights(Vector6::new(0.2, 0.0, 0.0, 0.0, 0.0, 0.0));
-        // 1/weight - 1 = (∂r/∂d)² V / 2σ_I², and ∂r/∂d goes with the translation.
+        // 1/weight - 1 = (∂r/∂d)² V / 2σ_I², and ∂r/∂d is proportional to the translation.
         let mut compared = 0;
         for once in along_x.iter().filter(|point| point.weight < 0.5) {
             let same = |p: &&PointWeight| (p.column, p.row) == (once.column, once.row);

@@ -1,5 +1,5 @@
-//! Chooses pixels worth a depth, evenly over the image: where there is much texture the strongest of
-//! each block, where there is little also weaker ones (Engel, Koltun, Cremers 2018 §3.2).
+//! Chooses pixels worth a depth, evenly over the image: the strongest of each block where there is much texture, weaker
+//! ones too where there is little (Engel, Koltun, Cremers 2018 §3.2).
 
 use serde::{Deserialize, Serialize};
 
@@ -10,13 +10,13 @@ use crate::slam::parameter::{ParameterError, check_range};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CandidateParams {
-    /// Pixels wanted. The choice stays within a tenth above it; less where texture is missing.
+    /// Number of pixels wanted. The choice exceeds it by at most a tenth; it is smaller where texture is missing.
     pub wanted: usize,
 }
 
-/// Side of the regions that have their own threshold, pixels: large against texture, small against the image.
+/// Side of the regions with separate thresholds, pixels: large against texture, small against the image.
 const REGION_PX: usize = 32;
-/// How far a gradient must rise above the median of its region, grey levels a pixel. The noise of a camera, 3 grey
+/// Required excess of a gradient over the median of its region, grey levels per pixel. The noise of a camera, 3 grey
 /// levels, gives a gradient of 2.
 const THRESHOLD_OFFSET: f32 = 4.0;
 
@@ -42,33 +42,32 @@ pub struct Candidate {
     pub v: u16,
 }
 
-/// Chooses candidates; keeps its memory from image to image.
+/// Chooses candidates; reuses its memory from image to image.
 #[derive(Debug, Default)]
 pub struct CandidateSelector {
     squared_gradient: Vec<f32>,
     thresholds: Vec<f32>,
     smoothed_thresholds: Vec<f32>,
-    /// Regions a row.
+    /// Regions per row.
     columns: usize,
 }
 
-/// Each octave of blocks (d, 2d, 4d) accepts this share of the threshold of the one before: the
-/// literature's value, weak pixels only where nothing better is near.
+/// Each octave of blocks (d, 2d, 4d) accepts this share of the previous threshold: the literature's value, weak pixels
+/// only where nothing better is near.
 const OCTAVE_THRESHOLD_RATIO: f32 = 0.75;
 const OCTAVES: usize = 3;
 
 impl CandidateSelector {
-    /// Chooses candidates of `image` into `chosen`, block by block: the same image and parameters give
-    /// the same choice.
+    /// Chooses candidates of `image` into `chosen`, block by block: the same image and parameters give the same choice.
     pub fn choose(
         &mut self,
         image: &GradientImage,
         params: &CandidateParams,
         chosen: &mut Vec<Candidate>,
     ) {
-        /// Block size and count are searched so often; a step usually lands within a few per cent.
+        /// Maximum number of adjustments of the block size; one usually lands within a few per cent.
         const MAX_ROUNDS: usize = 5;
-        /// A choice this close to the wish is taken.
+        /// Relative deviation from the wanted number at which a choice is accepted.
         const TOLERANCE: f64 = 0.1;
         chosen.clear();
         let (width, height) = (image.width(), image.height());
@@ -90,8 +89,8 @@ impl CandidateSelector {
         thin_out(chosen, params.wanted + params.wanted / 10);
     }
 
-    /// Squared gradients, and the threshold of each region: its median gradient plus the offset,
-    /// averaged with the neighbouring regions.
+    /// Computes squared gradients, and the threshold of each region: its median gradient plus the offset, averaged with
+    /// the neighbouring regions.
     fn measure(&mut self, image: &GradientImage) {
         let (width, height) = (image.width(), image.height());
         let gradients = image.gradients(0..width * height);
@@ -133,8 +132,8 @@ impl CandidateSelector {
         }
     }
 
-    /// The strongest pixel above its threshold in each block; where a 2×2 or 4×4 group of blocks has
-    /// none, the strongest above a lower threshold.
+    /// Chooses the strongest pixel above its threshold in each block; where a 2×2 or 4×4 group of blocks has none, the
+    /// strongest above a lower threshold.
     fn choose_by_block(&self, image: &GradientImage, block: usize, chosen: &mut Vec<Candidate>) {
         chosen.clear();
         let (width, height) = (image.width(), image.height());
@@ -146,7 +145,7 @@ impl CandidateSelector {
         }
     }
 
-    /// Chooses in one block of the given octave; whether anything was.
+    /// Chooses in one block of the given octave; returns whether any pixel was chosen.
     fn choose_in(
         &self,
         image: &GradientImage,
@@ -193,7 +192,7 @@ impl CandidateSelector {
     }
 }
 
-/// Keeps `most` of the candidates, evenly in the order of the list.
+/// Keeps `most` of the candidates, evenly spaced in the list.
 fn thin_out(chosen: &mut Vec<Candidate>, most: usize) {
     let all = chosen.len();
     if all <= most {
@@ -221,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn the_wish_is_met_and_every_part_of_the_image_has_its_share() {
+    fn the_wanted_number_is_met_and_spread_over_the_image() {
         let pixels = Scene::new(1).render(&CAMERA, &SE3::identity()).noisy(2.0, 1);
         for wanted in [200, 1000, 3000] {
             let chosen = choose(&pixels, wanted);
@@ -237,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn weak_texture_is_taken_where_there_is_no_better() {
+    fn weak_texture_is_chosen_where_nothing_better_is_near() {
         // Left half strong, right half a tenth of it.
         let strong = Scene::new(2).render(&CAMERA, &SE3::identity()).noisy(0.0, 1);
         let pixels: Vec<u8> = strong
@@ -251,7 +250,7 @@ mod tests {
     }
 
     #[test]
-    fn a_blank_image_has_none_and_no_pixel_is_chosen_twice() {
+    fn a_blank_image_gives_none_and_no_pixel_is_chosen_twice() {
         assert!(choose(&vec![128; CAMERA.width * CAMERA.height], 500).is_empty());
         let pixels = Scene::new(3).render(&CAMERA, &SE3::identity()).noisy(3.0, 2);
         let mut chosen: Vec<_> = choose(&pixels, 5000).iter().map(|c| (c.v, c.u)).collect();

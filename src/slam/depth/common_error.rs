@@ -1,19 +1,18 @@
-//! How errors that all depth of a keyframe shares come from the errors of poses, and where they go.
+//! How errors shared by all depth of a keyframe arise from the errors of poses, and how they propagate.
 //!
-//! A frame's pose error ξ is common to all its pixels. A depth that is matched in it errs by as much as cancels the
-//! residual, δd/d = −J·ξ/q with q = (∂r/∂d) d, whatever the pixel's own noise is (Schmidt–Kalman: ξ is considered,
-//! not estimated). The filter takes over the share k of it, so that the common errors m of the keyframe
-//! (`slam::modes`) become
+//! A frame's pose error ξ is common to all its pixels. A depth matched in it errs by the amount that cancels the
+//! residual, δd/d = −J·ξ/q with q = (∂r/∂d) d, regardless of the pixel's noise (Schmidt–Kalman: ξ is considered, not
+//! estimated). The filter adopts the share k of it, so that the common errors m of the keyframe (`slam::modes`) become
 //! ```text
 //! m⁺ = (I − K) m + C ξ      K = Φ⁻¹ Σ ω k φφᵀ      C = −Φ⁻¹ Σ ω k φ Jᵀ/q      Φ = Σ ω φφᵀ
 //! ```
-//! On the next keyframe, at the pose ξ errs by, with κ = r_z z/z' of the propagation,
+//! On the next keyframe, at a pose with error ξ, with κ = r_z z/z' of the propagation,
 //! ```text
 //! m' = Φ'⁻¹ Σ ω φ' (κ φᵀm − ξ_tz d' − ξ_ωx y' + ξ_ωy x')
 //! ```
-//! and ξ itself comes from m, since the pose was estimated on this depth: ξ = D m + n, D = −(Σ w J Jᵀ)⁻¹ Σ w J q φᵀ.
-//! φ has the constant 1 beside the modes, the unit of the keyframe; it is fitted with them and left out: an
-//! error of the unit makes no error of another mode.
+//! and ξ itself depends on m, since the pose was estimated on this depth: ξ = D m + n, D = −(Σ w J Jᵀ)⁻¹ Σ w J q φᵀ.
+//! φ has the constant 1 in addition to the modes, the unit of the keyframe; it is fitted with them and then dropped: an
+//! error of the unit causes no error of another mode.
 
 use nalgebra::{Matrix3, Matrix4, Matrix6, SMatrix, Vector3, Vector4, Vector6};
 
@@ -23,54 +22,54 @@ use crate::slam::geometry::se3::SE3;
 use crate::slam::image::noise::ImageNoise;
 use crate::slam::modes::NUM_MODES;
 
-/// What a mode matrix by pose unknowns is.
+/// A matrix of modes by pose unknowns.
 pub type ModesByPose = SMatrix<f64, NUM_MODES, 6>;
-/// What a pose matrix by modes is.
+/// A matrix of pose unknowns by modes.
 pub type PoseByModes = SMatrix<f64, 6, NUM_MODES>;
 
-/// Hypotheses that stand for all, at most: three modes and a pose need hundreds.
+/// Maximum number of sampled hypotheses: three modes and a pose need hundreds.
 const MAX_SAMPLES: usize = 1500;
-/// Rows from one with samples to the next.
+/// Step between sampled rows.
 const ROW_STEP: usize = 5;
-/// Relative standard deviation of depth below which points weigh alike: surfaces are not flat to a pixel.
+/// Relative standard deviation of depth below which points have equal weight: surfaces are not flat to a pixel.
 const LEAST_RELATIVE_STD_DEV: f64 = 0.02;
-/// Level that frames are aligned on in the end.
+/// Pyramid level on which the alignment of frames ends.
 const ALIGNED_LEVEL: usize = 1;
-/// Variance of the difference of two images there, grey levels²: what a pose makes of it weighs points alike.
+/// Variance of the difference of two images there, grey levels²: the effect of a pose on it weights all points alike.
 const INTENSITY_VARIANCE: f64 = 2.0 * ImageNoise::DEFAULT.variance(ALIGNED_LEVEL) as f64;
-/// Nearest that a point may come, in shares of its depth.
+/// Least depth of a point in the frame, as a share of its depth in the keyframe.
 const NEAREST_DEPTH_RATIO: f64 = 0.1;
-/// cos² between gradient and epipolar line below which no match is made.
+/// cos² between gradient and epipolar line below which a pixel is not matched.
 const LEAST_ALIGNMENT: f64 = 0.02;
 
-/// A hypothesis as it was before a frame was observed.
+/// A hypothesis before a frame was observed.
 #[derive(Debug, Clone, Copy)]
 struct Sample {
-    /// Place in the map, row by row.
+    /// Index in the map, row by row.
     index: usize,
     /// The pixel's ray.
     ray: Vector3<f64>,
-    /// Gradient of the keyframe, grey levels for each unit of the ray's coordinates.
+    /// Gradient of the keyframe, grey levels per unit of the ray's coordinates.
     gradient: [f64; 2],
     before: Hypothesis,
 }
 
-/// Hypotheses of a keyframe that stand for all of them.
+/// A representative sample of the hypotheses of a keyframe.
 #[derive(Debug, Clone, Default)]
 pub struct SampledDepth {
     samples: Vec<Sample>,
 }
 
-/// How the modes after a frame depend on those before it and on the error of its pose.
+/// Dependence of the modes after a frame on the modes before it and on the error of its pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ModeResponse {
-    /// I − K, or the transport to another keyframe.
+    /// I − K, or the propagation to another keyframe.
     pub on_modes: Matrix3<f64>,
     /// C.
     pub on_pose: ModesByPose,
 }
 
-/// What a sample contributes at one pose.
+/// The contribution of a sample at one pose.
 struct Terms {
     /// The point in the frame's camera over its inverse depth in the keyframe: R x + t d.
     warped: Vector3<f64>,
@@ -79,11 +78,11 @@ struct Terms {
     q: f64,
     /// (1, X, Y, ln d).
     phi: Vector4<f64>,
-    /// w, with which the alignment weighs the residual.
+    /// w, the weight of the residual in the alignment.
     weight: f64,
-    /// ω, with which the point takes part in the fit of the modes.
+    /// ω, the weight of the point in the fit of the modes.
     fit_weight: f64,
-    /// Whether gradient and epipolar line tell the depth.
+    /// Whether gradient and epipolar line determine the depth.
     is_observable: bool,
 }
 
@@ -97,7 +96,7 @@ impl Sample {
             return None;
         }
         let n = warped / warped.z;
-        // The rotation turns the gradient; how the warp stretches it does not matter, since J and q share it.
+        // The rotation turns the gradient; stretching by the warp does not matter, since J and q share it.
         let turned =
             current_from_keyframe.rotation * Vector3::new(self.gradient[0], self.gradient[1], 0.0);
         let (ax, ay) = (turned.x, turned.y);
@@ -113,7 +112,7 @@ impl Sample {
         );
         let along = jacobian.fixed_rows::<3>(0).into_owned();
         let q = along.dot(t);
-        // By how much the projection moves with depth, times the gradient: q at best.
+        // Displacement of the projection with depth, times the gradient: the largest possible q.
         let flow = [t.x - n.x * t.z, t.y - n.y * t.z].map(|x| s * x);
         let best = (flow[0] * flow[0] + flow[1] * flow[1]) * (ax * ax + ay * ay);
         let relative_variance = f64::from(self.before.variance) / (d * d);
@@ -134,7 +133,7 @@ fn fit_weight(relative_variance: f64) -> f64 {
 }
 
 impl SampledDepth {
-    /// Takes samples of `map` as it is.
+    /// Samples the current state of `map`.
     pub fn take(&mut self, map: &DepthMap, intrinsics: &Intrinsics) {
         self.samples.clear();
         let known = map.num_hypotheses();
@@ -157,7 +156,7 @@ impl SampledDepth {
         }
     }
 
-    /// The unit of the depth has grown by `factor`.
+    /// Converts to a unit of depth that is `factor` times as long.
     pub fn rescale(&mut self, factor: f32) {
         for sample in &mut self.samples {
             sample.before.inverse_depth *= factor;
@@ -166,7 +165,7 @@ impl SampledDepth {
         }
     }
 
-    /// D: how the pose of a frame that was aligned to this depth follows its modes; `None` where the points do not
+    /// D: how the pose of a frame that was aligned to this depth depends on its modes; `None` if the points do not
     /// determine a pose.
     pub fn d_pose_d_modes(&self, current_from_keyframe: &SE3) -> Option<PoseByModes> {
         let mut information = Matrix6::zeros();
@@ -180,8 +179,8 @@ impl SampledDepth {
         moved.iter().all(|x| x.is_finite()).then_some(moved)
     }
 
-    /// What the observation of a frame has done to the modes: `after` is the map since [`SampledDepth::take`]. `None`
-    /// where nothing was observed.
+    /// The effect of the observation of a frame on the modes: `after` is the map since [`SampledDepth::take`]. `None`
+    /// if nothing was observed.
     pub fn observed(&self, after: &DepthMap, current_from_keyframe: &SE3) -> Option<ModeResponse> {
         let (mut fit, mut gained) = (Matrix4::zeros(), Matrix4::zeros());
         let mut by_pose = SMatrix::<f64, 4, 6>::zeros();
@@ -204,7 +203,7 @@ impl SampledDepth {
         ModeResponse::of(&on_modes, &factors.solve(&by_pose))
     }
 
-    /// The modes of depth that was found in a frame of this pose alone.
+    /// The modes of depth that was estimated from one frame at this pose alone.
     pub fn begun(&self, current_from_keyframe: &SE3) -> Option<ModesByPose> {
         let mut fit = Matrix4::zeros();
         let mut by_pose = SMatrix::<f64, 4, 6>::zeros();
@@ -217,7 +216,7 @@ impl SampledDepth {
         ModeResponse::of(&Matrix4::zeros(), &by_pose).map(|response| response.on_pose)
     }
 
-    /// The modes on a keyframe at this pose, from these.
+    /// The propagation of the modes to a keyframe at this pose.
     pub fn carried(
         &self,
         current_from_keyframe: &SE3,
@@ -248,7 +247,7 @@ impl SampledDepth {
 }
 
 impl ModeResponse {
-    /// Without the unit's row and column; `None` where a number is broken.
+    /// Drops the row and column of the unit; `None` for non-finite values.
     fn of(on_modes: &Matrix4<f64>, on_pose: &SMatrix<f64, 4, 6>) -> Option<Self> {
         let on_modes = on_modes.fixed_view::<NUM_MODES, NUM_MODES>(1, 1).into_owned();
         let on_pose = on_pose.fixed_rows::<NUM_MODES>(1).into_owned();
@@ -262,7 +261,7 @@ fn is_inside(x: f64, y: f64, camera: &Intrinsics) -> bool {
     u >= 0.0 && v >= 0.0 && u < camera.width as f64 && v < camera.height as f64
 }
 
-/// Share of a match that a hypothesis has taken over: by how much it was narrowed; none where it was not fused.
+/// Share of a match that a hypothesis has adopted: its reduction in variance; 0 if it was not fused.
 fn gain(before: &Hypothesis, after: &Hypothesis) -> f64 {
     if !after.is_some() || after.inverse_depth == before.inverse_depth {
         return 0.0;
@@ -271,7 +270,7 @@ fn gain(before: &Hypothesis, after: &Hypothesis) -> f64 {
     (1.0 - kept).clamp(0.0, 1.0)
 }
 
-/// Covariance of a keyframe's modes together with the pose error of the frame at hand.
+/// Joint covariance of a keyframe's modes and the pose error of the current frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct JointCovariance {
     /// P.
@@ -283,13 +282,13 @@ pub struct JointCovariance {
 }
 
 impl JointCovariance {
-    /// Of a frame that was aligned to depth with these modes: ξ = D m + n.
+    /// The covariance for a frame that was aligned to depth with these modes: ξ = D m + n.
     pub fn of_aligned(modes: &Matrix3<f64>, follows: &PoseByModes, noise: &Matrix6<f64>) -> Self {
         let mixed = modes * follows.transpose();
         Self { modes: *modes, mixed, pose: follows * mixed + noise }
     }
 
-    /// Of a start: the modes come from the pose error of its second frame alone.
+    /// The covariance of a start: the modes come from the pose error of its second frame alone.
     pub fn of_start(by_pose: &ModesByPose, pose: &Matrix6<f64>) -> Self {
         let mixed = by_pose * pose;
         Self { modes: mixed * by_pose.transpose(), mixed, pose: *pose }
@@ -304,7 +303,7 @@ impl JointCovariance {
         self
     }
 
-    /// After something that answers like this to modes and pose.
+    /// Propagates the covariance through a response to modes and pose.
     pub fn after(&self, response: &ModeResponse) -> Self {
         let ModeResponse { on_modes, on_pose } = response;
         let crossed = on_modes * self.mixed * on_pose.transpose();
@@ -324,7 +323,7 @@ impl JointCovariance {
 pub fn rotation_std_dev(covariance: &Matrix6<f64>) -> f64 {
     let rotation = covariance.fixed_view::<3, 3>(3, 3).into_owned();
     let largest = rotation.symmetric_eigenvalues().max();
-    // By rounding it may be below zero; what is no number stays none.
+    // Rounding may make it negative; NaN stays NaN.
     if largest < 0.0 { 0.0 } else { largest.sqrt() }
 }
 

@@ -1,7 +1,7 @@
 //! The geometry between a keyframe pixel and another frame, as a function of inverse depth.
 //!
-//! With `pr = K R K⁻¹ (u, v, 1)` and `kt = K t` (R, t: current_from_keyframe) a keyframe pixel of
-//! inverse depth d projects to `((pr_x + kt_x d)/(pr_z + kt_z d), (pr_y + kt_y d)/(pr_z + kt_z d))`.
+//! With `pr = K R K⁻¹ (u, v, 1)` and `kt = K t` (R, t: current_from_keyframe) a keyframe pixel of inverse depth d
+//! projects to `((pr_x + kt_x d)/(pr_z + kt_z d), (pr_y + kt_y d)/(pr_z + kt_z d))`.
 
 use nalgebra::matrix;
 
@@ -18,7 +18,7 @@ pub struct TwoView {
     pub(super) rotation: [[f32; 3]; 3],
     /// `K t`.
     pub(super) translation: [f32; 3],
-    /// Pixels are so many focal lengths.
+    /// Focal lengths per pixel.
     pub(super) per_focal_length: f32,
 }
 
@@ -57,7 +57,7 @@ impl TwoView {
         }
     }
 
-    /// How far the translation moves the projection `at` of a pixel of `line`, focal lengths.
+    /// Displacement of the projection `at` of a pixel of `line` by the translation, focal lengths.
     #[inline]
     pub fn disparity(&self, line: &EpipolarLine, at: &Projection) -> f32 {
         let [far_u, far_v, z] = line.pr;
@@ -74,8 +74,8 @@ impl TwoView {
         }
     }
 
-    /// Jacobian of the projected position by the keyframe position at constant inverse depth,
-    /// row-major 2×2: how a small patch is turned and scaled.
+    /// Jacobian of the projected position with respect to the keyframe position at constant inverse depth, row-major
+    /// 2×2: the warp of a small patch.
     #[inline]
     pub fn patch_warp(&self, at: &Projection) -> [f32; 4] {
         let m = &self.rotation;
@@ -105,16 +105,16 @@ impl EpipolarLine {
         })
     }
 
-    /// Velocity of the projection, pixels per unit of inverse depth: its direction is that of the
-    /// line, its length is 1/α (α = ∂d/∂λ of Engel, Sturm, Cremers 2013 §2.3).
+    /// Velocity of the projection, pixels per unit of inverse depth: it points along the line, its length is 1/α
+    /// (α = ∂d/∂λ of Engel, Sturm, Cremers 2013 §2.3).
     #[inline]
     pub fn velocity(&self, at: &Projection) -> (f32, f32) {
         let s = at.depth_ratio;
         ((self.kt[0] - self.kt[2] * at.u) * s, (self.kt[1] - self.kt[2] * at.v) * s)
     }
 
-    /// Inverse depth of the point of the line nearest to `(u, v)`, solved on the axis along which
-    /// the line is longer; `None` where the line has no direction or the result is not finite.
+    /// Inverse depth of the point on the line nearest to `(u, v)`, solved on the axis along which the line is longer;
+    /// `None` if the line has no direction or the result is not finite.
     #[inline]
     pub fn inverse_depth_at(&self, u: f32, v: f32) -> Option<f32> {
         let along_u = self.kt[0] - self.kt[2] * u;

@@ -1,32 +1,32 @@
-//! Weight of an observation of depth beside what is known, when a part of both errors is the same.
+//! Weight of a depth observation against the estimate when a part of both errors is common.
 
-/// How uncertain an inverse depth is.
+/// Uncertainty of an inverse depth.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Uncertainty {
     /// Variance.
     pub variance: f32,
-    /// The part of it that differs from one observation to the next: noise of the frame. The rest moves all
-    /// observations of the pixel together: noise of the keyframe, error of poses, slant.
+    /// The part that differs from one observation to the next: noise of the frame. The rest shifts all observations of
+    /// the pixel together: noise of the keyframe, error of poses, slant.
     pub independent: f32,
 }
 
-/// What fusing an observation does.
+/// The effect of fusing an observation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Gain {
     /// Weight of the observation.
     pub weight: f32,
-    /// Uncertainty of the mean.
+    /// Uncertainty of the fused mean.
     pub left: Uncertainty,
 }
 
 impl Gain {
-    /// The mean of least variance of two values with independent errors of variance v and n and one error that both
-    /// have, by standard deviations a and b:
+    /// The minimum-variance mean of two values with independent errors of variances v and n and one error common to
+    /// both, with standard deviations a and b:
     /// ```text
     /// V(w) = (1−w)² v + w² n + ((1−w) a + w b)²      w = (v + a (a − b)) / (v + n + (a − b)²), within 0 and 1
     /// ```
-    /// Equal views are averaged, v falls with their number and a² stays; a view in which the common error weighs
-    /// less (a longer baseline) takes over.
+    /// Equal views are averaged: v falls with their number and a² remains. A view in which the common error weighs less
+    /// (a longer baseline) takes over.
     #[inline(always)]
     pub fn of(known: Uncertainty, found: Uncertainty) -> Self {
         let a = (known.variance - known.independent).max(0.0).sqrt();
@@ -56,14 +56,14 @@ mod tests {
             known = gain.left;
             assert!((gain.weight - 1.0 / f32::from(n)).abs() < 1e-5);
         }
-        // The mean of 1 to 10, each as heavy as the others.
+        // The mean of 1 to 10, equally weighted.
         assert!((mean - 5.5).abs() < 1e-4, "{mean}");
         assert!((known.independent - 0.4).abs() < 1e-5);
         assert!((known.variance - 1.4).abs() < 1e-5);
     }
 
     #[test]
-    fn the_weight_is_the_one_of_least_variance() {
+    fn the_weight_minimises_the_variance() {
         let left = |known: Uncertainty, found: Uncertainty, w: f32| {
             let common = |u: Uncertainty| (u.variance - u.independent).sqrt();
             let independent = (1.0 - w).powi(2) * known.independent + w * w * found.independent;
@@ -84,7 +84,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_known_better_throughout_is_not_touched() {
+    fn an_estimate_better_in_every_part_is_unchanged() {
         let known = Uncertainty { variance: 1.0, independent: 0.0 };
         let gain = Gain::of(known, Uncertainty { variance: 9.0, independent: 0.0 });
         assert_eq!((gain.weight, gain.left), (0.0, known));

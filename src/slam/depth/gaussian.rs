@@ -1,5 +1,5 @@
-//! The semi-dense Gaussian filter: every pixel with gradient keeps an inverse depth and a variance,
-//! narrowed by each observation (Engel, Sturm, Cremers 2013 §2.4).
+//! The semi-dense Gaussian filter: every pixel with gradient keeps an inverse depth and a variance, narrowed by each
+//! observation (Engel, Sturm, Cremers 2013 §2.4).
 
 use rayon::prelude::*;
 
@@ -23,40 +23,40 @@ mod params;
 
 pub use params::GaussianParams;
 
-/// Validity of a new hypothesis: so many failures in a row drop it.
+/// Validity of a new hypothesis: this many failures in a row drop it.
 pub const NEW_VALIDITY: u8 = 4;
-/// Validity is counted up to here: a long-proven hypothesis survives a short occlusion.
+/// Upper bound of the validity: a long-proven hypothesis survives a short occlusion.
 pub const MAX_VALIDITY: u8 = 20;
 
-/// What one frame did to the map.
+/// The effect of one frame on the map.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct ObservationCounts {
     /// Searches for pixels that had a hypothesis.
     pub attempted: usize,
-    /// Of them, fused.
+    /// Those that were fused.
     pub fused: usize,
-    /// Of them, contradicting or without a match.
+    /// Those that contradicted or had no match.
     pub failed: usize,
     /// New hypotheses.
     pub created: usize,
-    /// Searches for an even sample of the hypotheses of which nothing was to be learnt, to see whether they still
-    /// hold: those with something to learn are often those that failed before.
+    /// Searches for an even sample of the hypotheses that the frame cannot improve, to check whether they still hold:
+    /// those that it can improve are often those that failed before.
     pub probed: usize,
-    /// Of them, contradicting or without a match.
+    /// Probes that contradicted or had no match.
     pub refuted: usize,
 }
 
-/// What one frame did to the map, and how well it fitted.
+/// The effect of one frame on the map, and how well it fitted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Observation {
-    /// By number of pixels.
+    /// Numbers of pixels.
     pub counts: ObservationCounts,
-    /// How far matches were from where known depth put them.
+    /// Distances of matches from the positions predicted by known depth.
     pub innovations: Innovations,
 }
 
 impl Observation {
-    /// Of two parts of the map together.
+    /// The sum over two parts of the map.
     pub fn plus(self, other: Self) -> Self {
         Self {
             counts: self.counts.plus(other.counts),
@@ -66,7 +66,7 @@ impl Observation {
 }
 
 impl ObservationCounts {
-    /// The counts of two parts of the map together.
+    /// The sum of the counts of two parts of the map.
     pub fn plus(self, other: Self) -> Self {
         Self {
             attempted: self.attempted + other.attempted,
@@ -79,33 +79,32 @@ impl ObservationCounts {
     }
 }
 
-/// A frame to observe with.
+/// A frame that observes the map.
 #[derive(Debug, Clone, Copy)]
 pub struct Observer<'a> {
     /// Its brightness, level 0.
     pub image: &'a QuadImage,
-    /// Its geometry against the keyframe.
+    /// Its geometry relative to the keyframe.
     pub view: TwoView,
-    /// Its brightness against the keyframe.
+    /// Its brightness relative to the keyframe.
     pub brightness: Brightness,
-    /// Which pixels are observed.
+    /// The pixels to observe.
     pub pixels: ObservedPixels,
 }
 
-/// Which pixels of a map are observed.
+/// The pixels of a map that are observed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ObservedPixels {
     /// Hypotheses, and pixels that may get one.
     All,
-    /// Without the hypotheses that already hold what the frame has to say: those that came from the keyframe before,
-    /// where it is from before this keyframe, and the points of a start in the frame that proved it.
+    /// Without the hypotheses that already contain the frame's information: those propagated from the previous
+    /// keyframe, if the frame predates this keyframe, and the points of a start in the frame that verified it.
     New,
-    /// Hypotheses alone: others bring new ones.
+    /// Hypotheses alone: new ones come from elsewhere.
     Known,
 }
 
-/// Observes every pixel of `map` in a frame. Rows are independent: the result does not depend on
-/// the number of threads.
+/// Observes every pixel of `map` in a frame. Rows are independent: the result does not depend on the number of threads.
 pub fn observe(
     map: &mut DepthMap,
     observer: &Observer<'_>,
@@ -137,12 +136,12 @@ pub fn observe(
         .reduce(Observation::default, Observation::plus)
 }
 
-/// A keyframe with more candidates without depth for each with it is short of depth.
+/// A keyframe with more candidates without depth than this per candidate with depth is short of depth.
 const MOST_UNKNOWN_PER_KNOWN: usize = 2;
 
-/// Of so many pixels one is probed: the hypotheses that it stands for.
+/// One in this many pixels is probed, on behalf of the others.
 pub const PROBE_STEP: usize = 32;
-/// Columns by which the probed pixels of a row are displaced against those of the row above: no column has all.
+/// Columns by which the probed pixels shift from one row to the next, so that no column contains all of them.
 const PROBE_ROW_SHIFT: usize = 11;
 
 /// Everything that the observation of a pixel needs.
@@ -157,7 +156,7 @@ struct PixelObserver<'a> {
     params: &'a GaussianParams,
     /// Longest segment that is searched for a new pixel.
     max_new_search_px: f32,
-    /// Whether of longer ones the far part is searched.
+    /// Whether the far part of longer ones is searched.
     is_short_of_depth: bool,
 }
 
@@ -213,14 +212,14 @@ impl PixelObserver<'_> {
         seen
     }
 
-    /// Those of ascending columns that are far enough from the border.
+    /// Those of the ascending columns that are far enough from the border.
     fn inside<'a>(&self, columns: &'a [u16]) -> &'a [u16] {
         let end = self.image.width() - BORDER_PX;
         let before = |bound: usize| columns.partition_point(|&u| usize::from(u) < bound);
         &columns[before(BORDER_PX)..before(end)]
     }
 
-    /// Updates those of the `columns` of row `v`, at most [`LANES`], whose match promises something.
+    /// Updates those of the `columns` of row `v`, at most [`LANES`], whose match promises to be informative.
     #[inline(always)]
     fn update_promising<S: Instructions>(
         &self,
@@ -260,8 +259,8 @@ impl PixelObserver<'_> {
         }
     }
 
-    /// The epipolar line of a pixel, where it falls with this inverse depth, and how well a match could be placed
-    /// there; `None` where the frame does not see it or would tell nothing.
+    /// The epipolar line of a pixel, its projection at this inverse depth, and how precisely a match could be located
+    /// there; `None` if the frame does not see it or carries no information about it.
     #[inline(always)]
     fn conditioned(
         &self,
@@ -296,7 +295,7 @@ impl PixelObserver<'_> {
         if left.variance > self.params.max_variance_ratio * hypothesis.variance {
             return;
         }
-        // No further than the search goes: half its length to either side.
+        // At most the longest search: half its length to either side.
         let longest = 0.45 * self.matching.max_search_px * conditioning.inverse_depth_per_px;
         let reach = (self.params.search_sigmas * hypothesis.variance.sqrt()).min(longest);
         let (Some(from), Some(to)) =
@@ -333,7 +332,7 @@ impl PixelObserver<'_> {
         }
     }
 
-    /// Whether a hypothesis holds in the frame; it is not changed.
+    /// Checks a hypothesis against the frame without changing it.
     #[inline(always)]
     fn probe<S: Instructions>(
         &self,
@@ -366,7 +365,7 @@ impl PixelObserver<'_> {
         }
     }
 
-    /// Product of Gaussians; false when the observation contradicts.
+    /// Fuses an observation into a hypothesis; returns false if it contradicts.
     fn fuse(&self, hypothesis: &mut Hypothesis, found: &Match) -> bool {
         let inflation = self.params.process_inflation;
         let (prior, independent) =
@@ -396,11 +395,11 @@ impl PixelObserver<'_> {
         true
     }
 
-    /// The part of a new pixel's line that is searched: from infinity to the nearest depth that is looked for, or, in a
-    /// keyframe that is short of depth, as far as a search goes. `None` where it is too short or too long.
+    /// The part of a new pixel's line that is searched: from infinity to the nearest depth considered, or, in a
+    /// keyframe short of depth, as far as a search reaches. `None` if it is too short or too long.
     #[inline(always)]
     fn new_range(&self, line: &EpipolarLine) -> Option<SearchRange> {
-        /// Share of the longest search that a cut segment takes, so that rounding does not make it too long.
+        /// Share of the longest search that a truncated segment uses, so that rounding does not make it too long.
         const SEARCHED: f32 = 0.99;
         let (from, to) = (line.project(0.0)?, line.project(self.params.max_inverse_depth)?);
         let (du, dv) = (to.u - from.u, to.v - from.v);
@@ -430,7 +429,7 @@ impl PixelObserver<'_> {
         v: usize,
         counts: &mut ObservationCounts,
     ) {
-        /// Failures after which a pixel is left alone on this keyframe.
+        /// Failures after which a pixel is ignored on this keyframe.
         const MAX_FAILURES: u8 = 6;
         if hypothesis.failures >= MAX_FAILURES {
             return;

@@ -8,21 +8,20 @@ use crate::slam::image::buffer::Image;
 /// gradients 1, and a bilinear sample 1 more.
 pub const BORDER_PX: usize = 4;
 
-/// Rows that a thread takes at least, where a row is cheap: waking another thread costs as much as
-/// thousands of pixels.
+/// Least number of rows per thread where a row is cheap: waking another thread costs as much as thousands of pixels.
 pub(super) const BAND_ROWS: usize = 60;
 
-/// Grey level of a pixel without any light.
+/// Grey level of a pixel that may be underexposed.
 const BLACK: u8 = 0;
-/// Grey level of a pixel that could be any brighter.
+/// Grey level of a pixel that may be overexposed.
 const WHITE: u8 = 255;
 
-/// An image with its gradients, level 0, in few bytes: depth maps of two keyframes are at hand.
+/// An image with its gradients, level 0, stored compactly: the depth maps of two keyframes are in memory.
 #[derive(Debug, Clone)]
 pub struct GradientImage {
     /// Brightness, 0 to 255.
     pub intensity: Image<u8>,
-    /// Differences of the pixels to the right and the left, and below and above; 0 on the border.
+    /// Difference of the right and left neighbours, and of those below and above; 0 on the border.
     differences: [Image<i16>; 2],
 }
 
@@ -33,7 +32,7 @@ impl GradientImage {
         Self { intensity: Image::filled(width, height, 0), differences: [flat.clone(), flat] }
     }
 
-    /// Takes the grey values of a frame of the same size and differentiates them.
+    /// Copies the grey values of a frame of the same size and differentiates them.
     pub fn fill(&mut self, pixels: &[u8]) {
         let (width, height) = (self.width(), self.height());
         let row = |v: usize| &pixels[v * width..(v + 1) * width];
@@ -53,14 +52,14 @@ impl GradientImage {
         });
     }
 
-    /// (∂I/∂u, ∂I/∂v) by central difference of the pixel at this place in the image, grey levels a pixel; 0 on the border.
+    /// (∂I/∂u, ∂I/∂v) at this index of the image by central difference, grey levels per pixel; 0 on the border.
     #[inline(always)]
     pub fn gradient(&self, index: usize) -> (f32, f32) {
         let [u, v] = &self.differences;
         (half(u.pixels()[index]), half(v.pixels()[index]))
     }
 
-    /// The gradients of a row of places in the image.
+    /// The gradients at a range of indices.
     #[inline(always)]
     pub fn gradients(&self, indices: std::ops::Range<usize>) -> impl Iterator<Item = (f32, f32)> {
         let [u, v] = &self.differences;
@@ -68,7 +67,7 @@ impl GradientImage {
         both.map(|(&u, &v)| (half(u), half(v)))
     }
 
-    /// ‖g‖ of the pixels of row `v` that are not on the border, grey levels a pixel.
+    /// ‖g‖ of the pixels of row `v` that are not on the border, grey levels per pixel.
     #[inline(always)]
     pub(super) fn strengths(&self, v: usize) -> impl Iterator<Item = f32> {
         let row = v * self.width();
@@ -76,8 +75,8 @@ impl GradientImage {
         gradients.map(|(gu, gv)| (gu * gu + gv * gv).sqrt())
     }
 
-    /// Whether the pixels of row `v` that are not on the border, and the four beside each, are neither black nor
-    /// white: where the sensor ends, brightness is not what was seen and gradients are not where they appear.
+    /// Whether the pixels of row `v` that are not on the border, and the four neighbours of each, are neither black nor
+    /// white: at the limits of the sensor, brightness is clipped and gradients are misplaced.
     #[inline(always)]
     pub(super) fn unsaturated(&self, v: usize) -> impl Iterator<Item = bool> {
         let (first, end) = (BORDER_PX, self.width() - BORDER_PX);
@@ -102,7 +101,7 @@ impl GradientImage {
     }
 }
 
-/// Of a central difference over two pixels.
+/// Half a difference across two pixels.
 #[inline(always)]
 fn half(difference: i16) -> f32 {
     0.5 * f32::from(difference)

@@ -1,7 +1,7 @@
-//! The hypotheses of a depth map by pixel, and the columns of each row that have one or may get one: listed when the map is
-//! observed, kept with what an observation changes, and forgotten when somebody else may have changed a hypothesis.
+//! The hypotheses of a depth map by pixel, with lists of the columns of each row that have one or may get one.
 //!
-//! Five of six pixels have none: to look at all of them takes as long as a fifth of an observation.
+//! The lists are made when the map is observed, updated with each observation, and discarded when other code may have
+//! changed a hypothesis. Five in six pixels have none: visiting all of them takes as long as a fifth of an observation.
 
 use rayon::prelude::*;
 
@@ -19,11 +19,11 @@ pub struct Hypothesis {
     pub independent: f32,
     /// Inverse depth smoothed over consistent neighbours: what is published and searched around.
     pub smoothed: f32,
-    /// How often it was confirmed less how often it failed; at 0 it is dropped.
+    /// Number of confirmations minus failures; at 0 the hypothesis is dropped.
     pub validity: u8,
-    /// Whether it holds what earlier frames say: those of the keyframe before, or the two of a start.
+    /// Whether it comes from earlier frames: those of the previous keyframe, or the two of a start.
     pub propagated: bool,
-    /// Failures of a pixel without hypothesis: it is tried less often the more it failed.
+    /// Failures of a pixel without hypothesis: the more often it failed, the less often it is tried.
     pub failures: u8,
 }
 
@@ -39,33 +39,33 @@ impl Hypothesis {
         failures: 0,
     };
 
-    /// Whether there is a hypothesis.
+    /// Whether the pixel has a hypothesis.
     #[inline]
     pub fn is_some(&self) -> bool {
         self.variance >= 0.0
     }
 
-    /// How uncertain it is.
+    /// Variance and its independent part.
     #[inline(always)]
     pub fn uncertainty(&self) -> Uncertainty {
         Uncertainty { variance: self.variance, independent: self.independent }
     }
 
-    /// Removes the hypothesis and remembers that this pixel failed.
+    /// Removes the hypothesis and records the failure of this pixel.
     #[inline]
     pub fn reject(&mut self) {
         *self = Self { failures: self.failures.saturating_add(1), ..Self::NONE };
     }
 }
 
-/// A hypothesis a pixel.
+/// One hypothesis per pixel.
 #[derive(Debug, Clone)]
 pub struct Hypotheses {
     image: Image<Hypothesis>,
     lists: Lists,
 }
 
-/// Columns by row, in the memory of all rows.
+/// Lists of columns by row, stored contiguously for all rows.
 #[derive(Debug, Clone, Default)]
 struct Lists {
     columns: Vec<u16>,
@@ -73,12 +73,12 @@ struct Lists {
     is_valid: bool,
 }
 
-/// How many columns of a row are listed.
+/// Number of listed columns of a row.
 #[derive(Debug, Clone, Copy, Default)]
 struct Counts {
-    /// The first ones: those with a hypothesis.
+    /// First: columns with a hypothesis.
     known: u16,
-    /// Behind them: candidates without.
+    /// After them: candidates without one.
     unknown: u16,
 }
 
@@ -89,7 +89,7 @@ impl PartialEq for Hypotheses {
 }
 
 impl Hypotheses {
-    /// None, for images of this size.
+    /// No hypotheses, for images of this size.
     pub fn none(width: usize, height: usize) -> Self {
         Self { image: Image::filled(width, height, Hypothesis::NONE), lists: Lists::default() }
     }
@@ -116,7 +116,7 @@ impl Hypotheses {
         self.image.row(v)
     }
 
-    /// How many there are.
+    /// Number of hypotheses.
     pub fn count(&self) -> usize {
         match self.lists.is_valid {
             true => self.lists.counts.iter().map(|counts| usize::from(counts.known)).sum(),
@@ -124,7 +124,7 @@ impl Hypotheses {
         }
     }
 
-    /// How many there are, and how many candidates without one.
+    /// Number of hypotheses, and of candidates without one.
     pub(super) fn count_beside(&self, candidates: &Image<bool>) -> [usize; 2] {
         let pixels = self.pixels().iter().zip(candidates.pixels());
         let unknown = match self.lists.is_valid {
@@ -136,7 +136,7 @@ impl Hypotheses {
         [self.count(), unknown]
     }
 
-    /// The columns of row `v` that have a hypothesis, ascending; in `memory` where they are not listed.
+    /// The columns of row `v` that have a hypothesis, ascending; stored in `memory` if they are not listed.
     #[inline(always)]
     pub(in crate::slam) fn known_columns<'a>(
         &'a self,
@@ -152,7 +152,7 @@ impl Hypotheses {
         &memory[..known]
     }
 
-    /// All rows to be observed; each must be left with its lists as they are then.
+    /// All rows, to be observed; the caller must leave each with up-to-date lists.
     pub(super) fn observed_rows(&mut self) -> impl IndexedParallelIterator<Item = ListedRow<'_>> {
         let (width, height) = (self.image.width(), self.image.height());
         let Self { image, lists: Lists { columns, counts, is_valid } } = self;
@@ -167,7 +167,7 @@ impl Hypotheses {
         })
     }
 
-    /// Memory of lists that `other` has no use for.
+    /// Takes over the memory of the lists of `other`, which no longer needs it.
     pub(in crate::slam) fn take_lists(&mut self, other: &mut Self) {
         std::mem::swap(&mut self.lists, &mut other.lists);
         self.lists.is_valid = false;
@@ -181,7 +181,7 @@ pub(super) struct ListedRow<'a> {
     pub(super) lists: RowLists<'a>,
 }
 
-/// Its lists, each ascending.
+/// The lists of one row, each ascending.
 pub(super) struct RowLists<'a> {
     columns: &'a mut [u16],
     counts: &'a mut Counts,
@@ -189,7 +189,7 @@ pub(super) struct RowLists<'a> {
 }
 
 impl RowLists<'_> {
-    /// Lists the row, unless it is listed.
+    /// Builds the lists of the row unless they are valid.
     #[inline(always)]
     pub(super) fn fill(&mut self, hypotheses: &[Hypothesis], candidates: &[bool]) {
         if !self.is_valid {
@@ -209,12 +209,12 @@ impl RowLists<'_> {
         &self.columns[..usize::from(self.counts.known)]
     }
 
-    /// Candidates without.
+    /// Candidates without one.
     pub(super) fn unknown(&self) -> &[u16] {
         &self.columns[usize::from(self.counts.known)..][..usize::from(self.counts.unknown)]
     }
 
-    /// Takes note of what an observation has changed.
+    /// Updates the lists after an observation.
     #[inline(always)]
     pub(super) fn note(
         &mut self,
@@ -232,7 +232,7 @@ impl RowLists<'_> {
         }
     }
 
-    /// Moves a column to the other list, or out.
+    /// Moves a column to the other list, or removes it.
     fn toggle(&mut self, column: u16, is_known: bool, is_candidate: bool) {
         let Counts { known, unknown } = *self.counts;
         let (known, all) = (usize::from(known), usize::from(known + unknown));
@@ -252,14 +252,14 @@ impl RowLists<'_> {
     }
 }
 
-/// Columns whose hypothesis has come or gone in an observation.
+/// Columns whose hypothesis was created or removed by an observation.
 pub(super) struct ChangedColumns {
     columns: [u16; Self::MOST],
     count: usize,
 }
 
 impl ChangedColumns {
-    /// With more the row is listed anew.
+    /// With more changes the row is listed anew.
     const MOST: usize = 32;
 
     pub(super) fn none() -> Self {
@@ -275,13 +275,13 @@ impl ChangedColumns {
     }
 }
 
-/// Lists the places where `is_listed` without branches: what comes next can hardly be guessed. The number of them;
-/// `columns` has room for as many as there are.
+/// Lists the positions where `is_listed`, without branches, which would be unpredictable; returns their number.
+/// `columns` has room for all of them.
 #[inline(always)]
 fn list(columns: &mut [u16], is_listed: impl Iterator<Item = bool>) -> usize {
     let mut count = 0;
     for (u, is_listed) in is_listed.enumerate() {
-        // Behind the last that fits only what is not listed is left.
+        // Past the capacity only unlisted positions remain.
         if let Some(to) = columns.get_mut(count) {
             *to = u as u16;
         }
@@ -303,12 +303,12 @@ mod tests {
     }
 
     #[test]
-    fn lists_follow_what_comes_and_goes() {
+    fn lists_follow_created_and_removed_hypotheses() {
         let mut random = Random::new(5);
         let mut hypotheses = Hypotheses::none(WIDTH, HEIGHT);
         let candidates: Vec<bool> = (0..WIDTH * HEIGHT).map(|_| random.uniform() < 0.4).collect();
         for round in 0..30 {
-            // Rows with few changes and rows with more than are noted.
+            // Alternately few changes, and more than are recorded.
             let share = [0.02, 0.9][round % 2];
             let seeds: Vec<u64> = (0..HEIGHT).map(|v| (round * HEIGHT + v) as u64).collect();
             hypotheses.observed_rows().zip(&seeds).enumerate().for_each(|(v, (row, seed))| {
@@ -331,14 +331,14 @@ mod tests {
                 lists.note(&changed, hypotheses, candidates);
             });
             check(&mut hypotheses, &candidates);
-            // Also where there is no candidate, by hand.
+            // Also where there is no candidate, set by hand.
             let any = (random.uniform() * (WIDTH * HEIGHT) as f64) as usize;
             hypotheses.pixels_mut()[any] = some(0.0);
             assert!(!hypotheses.lists.is_valid);
         }
     }
 
-    /// Lists that are kept are those that are made anew.
+    /// Updated lists equal those built anew.
     fn check(hypotheses: &mut Hypotheses, candidates: &[bool]) {
         assert!(hypotheses.lists.is_valid);
         let mut anew = hypotheses.clone();

@@ -1,5 +1,5 @@
-//! One immature point: an interval of inverse depth, narrowed by a search along the epipolar segment in
-//! each new frame (Engel, Koltun, Cremers 2018 §2.2).
+//! One immature point: an interval of inverse depth, narrowed by a search along the epipolar segment in each new frame
+//! (Engel, Koltun, Cremers 2018 §2.2).
 
 use serde::{Deserialize, Serialize};
 
@@ -16,26 +16,26 @@ use crate::slam::pose::Brightness;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct IntervalParams {
-    /// Longest first search, as a share of width + height: 30 px at 640×480.
+    /// Longest first search as a share of width + height: 30 px at 640×480.
     pub max_first_search_ratio: f32,
-    /// Shorter segments are certain already, pixels.
+    /// Shortest segment that is searched, pixels: below it the depth is already certain.
     pub min_segment_px: f32,
-    /// Error of a match where the gradient lies along the line: this once for the search and once for
-    /// the gradient's direction, pixels.
+    /// Error of a match where the gradient lies along the line, pixels: once for the search and once for the direction
+    /// of the gradient.
     pub match_error_px: f32,
-    /// Largest error of a match, pixels: beyond it the direction is as good as unknown.
+    /// Largest error of a match, pixels: beyond it the direction is practically unknown.
     pub max_match_error_px: f32,
-    /// A match with a larger root mean square residual over the pattern (Huber) is an outlier, grey
-    /// levels: 9, every sample where Huber's parabola ends. The literature allows 13 (1.2 × 8·12² for
-    /// the sum), which lets more patches that straddle two surfaces keep a wrong depth: in the
-    /// simulated room 94.4 instead of 95.2 % of the sure intervals then hold the truth.
+    /// A match with a larger root mean square residual over the pattern (Huber) is an outlier, grey levels: 9, every
+    /// sample at the end of Huber's parabola. The literature allows 13 (1.2 × 8·12² for the sum), which lets more
+    /// patches that straddle two surfaces keep a wrong depth: in the simulated room 94.4 instead of 95.2 % of the
+    /// unambiguous intervals then contain the truth.
     pub max_residual: f32,
-    /// A mature point's last segment is shorter, pixels.
+    /// The last segment of a mature point is shorter, pixels.
     pub mature_segment_px: f32,
-    /// A mature point's second minimum is this many times worse than its best.
+    /// The second minimum of a mature point is more than this many times worse than its best.
     pub mature_quality: f32,
-    /// A mature point's standard deviation over its inverse depth is smaller: poses on depths that are
-    /// known to a quarter only drift nine times as far in the simulated room as with a tenth.
+    /// The standard deviation of a mature point over its inverse depth is smaller: with poses estimated on depths that
+    /// are known only to a quarter, drift in the simulated room is nine times as large as with a tenth.
     pub mature_std_dev_ratio: f32,
 }
 
@@ -68,24 +68,24 @@ impl IntervalParams {
     }
 }
 
-/// What the last trace of a point came to.
+/// The result of the last trace of a point.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum TraceStatus {
     /// Never traced.
     Uninitialized,
-    /// Matched: the interval is new.
+    /// Matched: the interval was updated.
     Good,
     /// The segment leaves the image, or the patch is seen much larger or smaller. Final.
     OutOfBounds,
     /// No acceptable match. A second one in a row is final.
     Outlier,
-    /// The segment is so short that the point is certain already.
+    /// The segment is so short that the depth is already certain.
     Skipped,
-    /// The match would be less certain than the interval is: no parallax, or the gradient lies across.
+    /// A match would be less certain than the interval: no parallax, or the gradient lies across the line.
     BadCondition,
 }
 
-/// What one frame did to the points.
+/// The effect of one frame on the points.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct TraceCounts {
     /// Matched.
@@ -94,7 +94,7 @@ pub struct TraceCounts {
     pub out_of_bounds: usize,
     /// Without an acceptable match.
     pub outlier: usize,
-    /// Certain already.
+    /// Already certain.
     pub skipped: usize,
     /// Nothing to gain in this frame.
     pub bad_condition: usize,
@@ -103,7 +103,7 @@ pub struct TraceCounts {
 }
 
 impl TraceCounts {
-    /// One point that came to `status`.
+    /// The counts for one point with this `status`.
     pub(super) fn of(status: TraceStatus) -> Self {
         let mut counts = Self::default();
         match status {
@@ -117,7 +117,7 @@ impl TraceCounts {
         counts
     }
 
-    /// The counts of two sets of points together.
+    /// The sum of the counts of two sets of points.
     pub fn plus(self, other: Self) -> Self {
         Self {
             good: self.good + other.good,
@@ -135,13 +135,13 @@ impl TraceCounts {
 pub struct TraceFrame<'a> {
     /// Its brightness, level 0.
     pub image: &'a QuadImage,
-    /// Its geometry against the frame of the points.
+    /// Its geometry relative to the frame of the points.
     pub view: TwoView,
-    /// Its brightness against that frame.
+    /// Its brightness relative to that frame.
     pub brightness: Brightness,
 }
 
-/// A point whose depth is not known yet.
+/// A point whose depth is still uncertain.
 #[derive(Debug, Clone)]
 pub struct ImmaturePoint {
     /// Column of its pixel.
@@ -160,19 +160,19 @@ pub struct ImmaturePoint {
     pub max_inverse_depth: Option<f32>,
     /// Energy of the second minimum over that of the best; 0 before the first match.
     pub quality: f32,
-    /// Where the last match lies in its frame.
+    /// Position of the last match in its frame.
     pub last_match: Option<(f32, f32)>,
     /// Length of the interval's segment in the last frame, pixels; infinite before the first match.
     pub last_segment_px: f32,
-    /// What the last trace came to.
+    /// The result of the last trace.
     pub status: TraceStatus,
-    /// No further trace is tried.
+    /// Whether tracing has ended.
     ended: bool,
 }
 
-/// Standard deviations in half an interval. The interval is meant to hold the truth nearly always, so
-/// that it is 3σ: in the simulated room with 3 grey levels of noise 66, 83 and 88 % of the mature points
-/// are then within 1, 2 and 3 σ (`tests/estimation/interval_filter.rs` prints it), without noise 79, 87 and 90 %.
+/// Standard deviations in half an interval. The interval is meant to contain the truth nearly always, hence 3σ: in the
+/// simulated room with 3 grey levels of noise 66, 83 and 88 % of the mature points are then within 1, 2 and 3 σ
+/// (`tests/estimation/interval_filter.rs` prints it), without noise 79, 87 and 90 %.
 pub const HALF_INTERVAL_SIGMAS: f32 = 3.0;
 
 impl ImmaturePoint {
@@ -211,34 +211,34 @@ impl ImmaturePoint {
         })
     }
 
-    /// The point with an interval that is known from elsewhere; nothing ambiguous was seen of it yet.
+    /// The point with an interval from elsewhere; it counts as unambiguous until observed otherwise.
     pub fn with_interval(self, min_inverse_depth: f32, max_inverse_depth: f32) -> Self {
         let max_inverse_depth = Some(max_inverse_depth);
         Self { min_inverse_depth, max_inverse_depth, quality: f32::INFINITY, ..self }
     }
 
-    /// Ends the point: others continue with its depth.
+    /// Ends the point: another filter continues with its depth.
     pub fn end(&mut self) {
         self.ended = true;
     }
 
-    /// Middle of the interval; `None` before the first match.
+    /// Centre of the interval; `None` before the first match.
     pub fn inverse_depth(&self) -> Option<f32> {
         self.max_inverse_depth.map(|max| 0.5 * (self.min_inverse_depth + max))
     }
 
-    /// Standard deviation that belongs to the interval; `None` before the first match.
+    /// Standard deviation equivalent to the interval; `None` before the first match.
     pub fn std_dev(&self) -> Option<f32> {
         let length = self.max_inverse_depth? - self.min_inverse_depth;
         Some(0.5 * length / HALF_INTERVAL_SIGMAS)
     }
 
-    /// Whether no further trace is tried.
+    /// Whether tracing has ended.
     pub fn is_ended(&self) -> bool {
         self.ended
     }
 
-    /// Whether the depth is known well enough to be used.
+    /// Whether the depth is certain enough to be used.
     pub fn is_mature(&self, params: &IntervalParams) -> bool {
         let usable = matches!(
             self.status,
@@ -259,7 +259,7 @@ impl ImmaturePoint {
         self.max_inverse_depth = self.max_inverse_depth.map(|max| factor * max);
     }
 
-    /// Searches the point in a frame and narrows its interval.
+    /// Searches for the point in a frame and narrows its interval.
     #[inline(always)]
     pub fn trace(&mut self, frame: &TraceFrame<'_>, params: &IntervalParams) -> TraceStatus {
         if self.ended {
@@ -301,7 +301,7 @@ impl ImmaturePoint {
         if a.max(b) < 0.0 {
             return TraceStatus::Outlier;
         }
-        /// A longer search sees enough of the line to judge its ambiguity anew.
+        /// A longer search sees enough of the line to re-assess its ambiguity.
         const REJUDGE_STEPS: usize = 10;
         if first || found.quality < self.quality || found.steps > REJUDGE_STEPS {
             self.quality = found.quality;
@@ -319,8 +319,8 @@ impl ImmaturePoint {
         frame: &TraceFrame<'_>,
         params: &IntervalParams,
     ) -> Result<Segment, TraceStatus> {
-        /// Depth in the keyframe over depth in the frame at the far end: a patch seen larger or smaller
-        /// shows other detail.
+        /// Depth in the keyframe over depth in the frame at the far end: outside, the patch is seen at a different
+        /// level of detail.
         const DEPTH_RATIO: std::ops::RangeInclusive<f32> = 0.75..=1.5;
         let image = frame.image;
         let line = frame.view.line(f32::from(self.u), f32::from(self.v));
@@ -338,11 +338,11 @@ impl ImmaturePoint {
             }
             None => first_extent(image, &line, &far, params)?,
         };
-        // Turned and scaled as the middle of the interval says; the literature takes the turn alone,
-        // the upper left of K R K⁻¹, which brings 2 % fewer points to maturity.
+        // Warped according to the centre of the interval; the literature takes the rotation alone, the upper left of
+        // K R K⁻¹, which brings 2 % fewer points to maturity.
         let warp = frame.view.patch_warp(&centre);
         let determinant = warp[0] * warp[3] - warp[1] * warp[2];
-        /// Area of a turned pixel: outside, the view is so oblique that the patch is not comparable.
+        /// Area of a warped pixel: outside, the view is so oblique that the patch is not comparable.
         const AREA: std::ops::RangeInclusive<f32> = 0.3..=3.0;
         if !AREA.contains(&determinant) {
             return Err(TraceStatus::BadCondition);
@@ -371,8 +371,8 @@ impl ImmaturePoint {
         Ok(((du / length, dv / length), length))
     }
 
-    /// Expected error of a match, pixels: `e = c + c (h_∥ + h_⊥)/h_∥` with the structure tensor along
-    /// and across the line, turned back to where the gradients are.
+    /// Expected error of a match, pixels: `e = c + c (h_∥ + h_⊥)/h_∥` with the structure tensor along and across the
+    /// line, whose direction is warped back into the keyframe.
     #[inline(always)]
     fn match_error(&self, segment: &Segment, params: &IntervalParams) -> f32 {
         let (m, (du, dv)) = (segment.inverse_warp, segment.direction);
@@ -388,21 +388,21 @@ impl ImmaturePoint {
         params.match_error_px * (1.0 + (along + across) / along)
     }
 
-    /// The pattern's brightness as the frame shows it.
+    /// The pattern's brightness as it would appear in the frame.
     #[inline(always)]
     fn brightened(&self, brightness: &Brightness) -> [f32; 8] {
         let (gain, offset) = (brightness.a.exp() as f32, brightness.b as f32);
         self.intensities.map(|i| gain * i + offset)
     }
 
-    /// A number in [0, 1) that differs from pixel to pixel: no two neighbours search the same grid.
+    /// A number in [0, 1) that differs from pixel to pixel, so that no two neighbours search the same grid.
     fn dither(&self) -> f32 {
         let mixed = (u32::from(self.u) << 16 | u32::from(self.v)).wrapping_mul(0x9E37_79B9);
         ((mixed ^ (mixed >> 15)).wrapping_mul(0x85EB_CA6B) >> 8) as f32 / (1 << 24) as f32
     }
 }
 
-/// Direction and length of the first segment, which only the longest search and the epipole end.
+/// Direction and length of the first segment, which is limited only by the longest search and the epipole.
 #[inline(always)]
 fn first_extent(
     image: &QuadImage,
@@ -410,7 +410,7 @@ fn first_extent(
     far: &Projection,
     params: &IntervalParams,
 ) -> Result<((f32, f32), f32), TraceStatus> {
-    /// Motion over all depths, pixels, below which the line has no direction.
+    /// Motion over all depths below which the line has no direction, pixels.
     const NO_MOTION_PX: f32 = 1e-4;
     let (du, dv) = line.velocity(far);
     let speed = du.hypot(dv);
@@ -427,7 +427,7 @@ fn first_extent(
     Ok((direction, length))
 }
 
-/// How far ahead of `far` the image of infinitely near points lies, if the line runs towards it.
+/// Distance from `far` to the image of infinitely near points, if the line runs towards it.
 fn distance_to_epipole(line: &EpipolarLine, far: &Projection) -> f32 {
     // With kt_z > 0 the projection runs towards kt/kt_z; else it leaves the image at a finite depth.
     if line.kt[2] > 0.0 {

@@ -1,5 +1,5 @@
-//! The interval filter: immature points chosen evenly over a frame and traced through the frames that
-//! follow until their depth is certain (Engel, Koltun, Cremers 2018 §2.2).
+//! The interval filter: immature points chosen evenly over a frame and traced through subsequent frames until their
+//! depth is certain (Engel, Koltun, Cremers 2018 §2.2).
 
 use rayon::prelude::*;
 
@@ -13,21 +13,21 @@ use crate::slam::depth::map::{DepthMap, Hypothesis};
 use crate::slam::depth::trace_kernel::Tracing;
 use crate::slam::kernel::Kernel;
 
-/// A depth that became certain.
+/// A depth that has become certain.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MatureDepth {
     /// Column of the pixel.
     pub u: u16,
     /// Row of the pixel.
     pub v: u16,
-    /// Middle of the interval, 1/keyframe units.
+    /// Centre of the interval, 1/keyframe units.
     pub inverse_depth: f32,
-    /// Variance that belongs to the interval.
+    /// Variance equivalent to the interval.
     pub variance: f32,
 }
 
 impl MatureDepth {
-    /// What the interval of `point` says; `None` before its first match.
+    /// The depth given by the interval of `point`; `None` before its first match.
     fn of(point: &ImmaturePoint) -> Option<Self> {
         let (inverse_depth, std_dev) = (point.inverse_depth()?, point.std_dev()?);
         Some(Self { u: point.u, v: point.v, inverse_depth, variance: std_dev * std_dev })
@@ -57,7 +57,7 @@ pub struct IntervalFilter {
 }
 
 impl IntervalFilter {
-    /// Starts over on a new image: evenly chosen points, all depths possible.
+    /// Restarts on a new image: evenly chosen points, all depths possible.
     pub fn restart(&mut self, image: &GradientImage, params: &CandidateParams) {
         self.selector.choose(image, params, &mut self.candidates);
         self.points.clear();
@@ -65,12 +65,12 @@ impl IntervalFilter {
         self.points.extend(points);
     }
 
-    /// Without points.
+    /// Removes all points.
     pub fn clear(&mut self) {
         self.points.clear();
     }
 
-    /// Starts over at every pixel of `map` that may carry depth and has none.
+    /// Restarts at every pixel of `map` that may carry depth but has none.
     pub fn restart_where_empty(&mut self, map: &DepthMap) {
         let width = map.image.width();
         self.points.clear();
@@ -81,10 +81,10 @@ impl IntervalFilter {
         }));
     }
 
-    /// Starts over with the hypotheses of `map` and, between them, evenly chosen points whose depth is
-    /// not known. Where a start or a sensor gave depth to every pixel only the chosen ones keep it.
+    /// Restarts with the hypotheses of `map` and, between them, evenly chosen points of unknown depth. If a start or a
+    /// sensor gave depth to every pixel, only the chosen ones keep it.
     pub fn restart_with_known(&mut self, map: &mut DepthMap, params: &CandidateParams) {
-        /// More hypotheses than this many times what is wanted are a map of every pixel.
+        /// More hypotheses than this multiple of the wanted number mean a map with depth at every pixel.
         const MOST_PER_WANTED: usize = 3;
         self.selector.choose(&map.image, params, &mut self.candidates);
         if map.num_hypotheses() > MOST_PER_WANTED * params.wanted {
@@ -109,10 +109,9 @@ impl IntervalFilter {
         self.points.extend(unknown.filter_map(|c| ImmaturePoint::new(&map.image, c.u, c.v)));
     }
 
-    /// Traces every point in a frame. Points are independent: the result does not depend on the number
-    /// of threads.
+    /// Traces every point in a frame. Points are independent: the result does not depend on the number of threads.
     pub fn trace(&mut self, frame: &TraceFrame<'_>, params: &IntervalParams) -> TraceCounts {
-        /// Points a thread takes at once: some tens of microseconds.
+        /// Points that a thread takes at once: some tens of microseconds.
         const CHUNK: usize = 128;
         let kernel = Kernel::fastest();
         self.points
@@ -121,8 +120,8 @@ impl IntervalFilter {
             .reduce(TraceCounts::default, TraceCounts::plus)
     }
 
-    /// Gives the pixels of mature points their first hypothesis in `map` and ends these points: from
-    /// there on the map's own filter continues. The number of new hypotheses.
+    /// Gives the pixels of mature points their first hypothesis in `map` and ends these points: from then on the map's
+    /// own filter continues. Returns the number of new hypotheses.
     pub fn hand_over(&mut self, map: &mut DepthMap, params: &IntervalParams) -> usize {
         let mut created = 0;
         for point in self.points.iter_mut().filter(|p| !p.is_ended() && p.is_mature(params)) {
@@ -138,8 +137,8 @@ impl IntervalFilter {
         created
     }
 
-    /// Writes the depth of mature points into `map` after a trace, and takes out that of points without
-    /// a match; what it came to.
+    /// Writes the depth of mature points into `map` after a trace and removes that of points without a match; returns
+    /// the counts.
     pub fn write_into(&self, map: &mut DepthMap, params: &IntervalParams) -> ObservationCounts {
         let mut counts = ObservationCounts::default();
         for point in &self.points {
@@ -170,12 +169,12 @@ impl IntervalFilter {
         counts
     }
 
-    /// All points, in the order of their choice.
+    /// All points, in the order in which they were chosen.
     pub fn points(&self) -> &[ImmaturePoint] {
         &self.points
     }
 
-    /// The depths that are certain, in the order of the points.
+    /// The certain depths, in the order of the points.
     pub fn mature(&self, params: &IntervalParams) -> impl Iterator<Item = MatureDepth> {
         self.points.iter().filter(|p| p.is_mature(params)).filter_map(MatureDepth::of)
     }
@@ -185,14 +184,14 @@ impl IntervalFilter {
         self.rescale_by(|_, _| factor);
     }
 
-    /// The same with a factor of its own for every pixel `(u, v)`.
+    /// Multiplies the interval of each pixel `(u, v)` by its own factor.
     pub fn rescale_by(&mut self, factor_at: impl Fn(usize, usize) -> f32) {
         let factor = |p: &ImmaturePoint| factor_at(usize::from(p.u), usize::from(p.v));
         self.points.iter_mut().for_each(|p| p.rescale(factor(p)));
     }
 }
 
-/// Whether a hypothesis of `map` is within a pattern's reach of the candidate.
+/// Whether `map` has a hypothesis within the pattern's reach of the candidate.
 fn is_near_known(map: &DepthMap, candidate: &Candidate) -> bool {
     const REACH_PX: usize = 2;
     let (u, v) = (usize::from(candidate.u), usize::from(candidate.v));
@@ -200,8 +199,8 @@ fn is_near_known(map: &DepthMap, candidate: &Candidate) -> bool {
         .any(|y| map.hypotheses.row(y)[u - REACH_PX..=u + REACH_PX].iter().any(Hypothesis::is_some))
 }
 
-/// Traces the pixel `(u, v)` of `image` through `frames`; the point after each of them, for a picture of how its
-/// interval narrows. Empty where the pixel is too near to the border.
+/// Traces the pixel `(u, v)` of `image` through `frames`: the point after each of them, to plot how its interval
+/// narrows. Empty if the pixel is too close to the border.
 pub fn interval_history<'a>(
     image: &GradientImage,
     (u, v): (u16, u16),

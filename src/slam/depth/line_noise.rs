@@ -1,8 +1,8 @@
-//! How far epipolar lines are misplaced, from the scatter of the matches along them.
+//! The displacement of epipolar lines, estimated from the scatter of the matches along them.
 //!
-//! The poses of frames are only as good as the depth that they were found with, and their covariance does not know of
-//! errors that all points share. What matches show is how much they differ from the depth that was known: along the
-//! line, in pixels. Errors that come back with every frame do not show in it; they are taken to be in proportion.
+//! The poses of frames are only as good as the depth they were estimated with, and their covariance does not include
+//! errors that all points share. Matches show how much they differ from the known depth: along the line, in pixels.
+//! Errors that recur in every frame do not show; they are assumed to be proportional to the scatter.
 
 use serde::{Deserialize, Serialize};
 
@@ -12,12 +12,12 @@ use crate::slam::parameter::{ParameterError, check_range};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LineNoiseParams {
-    /// Line noise over the scatter of matches along the line. What is common to all frames does not show in it; the
-    /// share of true depths within one standard deviation is what it was chosen by.
+    /// Line noise over the scatter of matches along the line. It also covers errors common to all frames, which do not
+    /// show in the scatter; it was chosen by the share of true depths within one standard deviation.
     pub scatter_ratio: f32,
-    /// Least line noise, pixels: the scatter of a frame that hardly moved says little.
+    /// Least line noise, pixels: the scatter of a frame with little motion is not informative.
     pub min_px: f32,
-    /// Largest line noise, pixels: beyond it the search finds what is elsewhere.
+    /// Largest line noise, pixels: beyond it the search finds false matches.
     pub max_px: f32,
     /// Frames over which the estimate is averaged.
     pub averaged_frames: f32,
@@ -41,10 +41,10 @@ impl LineNoiseParams {
 
 /// Bins of a [`Histogram`].
 const BINS: usize = 64;
-/// Bins a pixel: matches scatter by 0.1 px at best.
+/// Bins per pixel: matches scatter by 0.1 px at best.
 const BINS_PER_PX: f32 = 16.0;
 
-/// Lengths in pixels; its sum over rows does not depend on their order.
+/// A histogram of lengths in pixels; a sum over rows does not depend on their order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Histogram([u32; BINS]);
 
@@ -58,7 +58,7 @@ impl Histogram {
         self.0.iter().sum()
     }
 
-    /// Median, linear within a bin; 0 of none.
+    /// Median, linear within a bin; 0 if empty.
     fn median(&self) -> f32 {
         let half = 0.5 * self.total() as f32;
         let mut below = 0.0;
@@ -73,12 +73,12 @@ impl Histogram {
     }
 }
 
-/// How far matches of one frame lie from where known depth put them, along the line.
+/// Distances along the line of one frame's matches from the positions predicted by known depth.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Innovations {
-    /// By size.
+    /// Their sizes.
     sizes: Histogram,
-    /// Standard deviation that noise of the images and sampling give each match.
+    /// Standard deviations of the single matches due to image noise and sampling.
     own: Histogram,
 }
 
@@ -89,26 +89,26 @@ impl Default for Innovations {
 }
 
 impl Innovations {
-    /// Adds a match so many pixels off, of which noise and sampling explain `own_px`.
+    /// Adds a match `px` off, of which noise and sampling explain `own_px`.
     #[inline(always)]
     pub fn add(&mut self, px: f32, own_px: f32) {
         self.sizes.add(px.abs());
         self.own.add(own_px);
     }
 
-    /// Those of two parts of the image together.
+    /// The sum over two parts of the image.
     pub fn plus(self, other: Self) -> Self {
         let plus =
             |a: Histogram, b: Histogram| Histogram(std::array::from_fn(|bin| a.0[bin] + b.0[bin]));
         Self { sizes: plus(self.sizes, other.sizes), own: plus(self.own, other.own) }
     }
 
-    /// Their standard deviation, pixels, beyond what noise and sampling explain, from the median of their size; `None`
-    /// of too few.
+    /// Standard deviation, pixels, beyond what noise and sampling explain, from the median size; `None` for too few
+    /// matches.
     pub fn scatter_px(&self) -> Option<f32> {
-        /// Fewer than this do not speak for a frame.
+        /// Fewer matches than this do not represent a frame.
         const MIN_MATCHES: u32 = 200;
-        /// Median of |x| over the standard deviation, of a Gaussian.
+        /// Median of |x| over the standard deviation for a Gaussian.
         const MEDIAN_RATIO: f32 = 0.6745;
         if self.sizes.total() < MIN_MATCHES {
             return None;
@@ -118,19 +118,19 @@ impl Innovations {
     }
 }
 
-/// The estimate, from frame to frame.
+/// The estimate, updated from frame to frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LineNoise {
     variance: f32,
 }
 
 impl LineNoise {
-    /// Before any frame.
+    /// The estimate before any frame.
     pub fn new(std_dev_px: f32) -> Self {
         Self { variance: std_dev_px * std_dev_px }
     }
 
-    /// Takes in the matches of a frame.
+    /// Updates the estimate with the matches of a frame.
     pub fn observe(&mut self, innovations: &Innovations, params: &LineNoiseParams) {
         let Some(scatter) = innovations.scatter_px() else { return };
         let now = (params.scatter_ratio * scatter).min(params.max_px).max(params.min_px);
@@ -149,7 +149,7 @@ mod tests {
     use crate::slam::alignment::scene::Noise;
 
     #[test]
-    fn the_scatter_is_that_of_the_matches_whatever_a_few_outliers_do() {
+    fn the_scatter_is_robust_to_a_few_outliers() {
         let (mut noise, mut innovations) = (Noise(5), Innovations::default());
         for i in 0..5000 {
             let outlier = if i % 20 == 0 { 30.0 } else { 0.0 };

@@ -5,17 +5,17 @@ use crate::slam::depth::pattern::{PATTERN, sum_of_samples};
 use crate::slam::image::quads_kernel::{Sampled, Sampler};
 use crate::slam::kernel::Instructions;
 
-/// Most places of one search: bounds the time a pixel can take.
+/// Maximum number of positions in one search: bounds the time per pixel.
 pub const MAX_STEPS: usize = 100;
-/// Costs that are compared at a time.
+/// Costs that are compared at once.
 const LANES: usize = 8;
-/// Room for their costs and those that belong to the last.
+/// Room for the costs, including those that belong to the minimum at the last one.
 const MOST_COSTS: usize = (MAX_STEPS + 2).next_multiple_of(LANES);
 
-/// The patch as a function of its place λ along the line, pixels from where λ is 0.
+/// The patch as a function of its position λ along the line, pixels from λ = 0.
 pub(super) struct Along<'a, S> {
     pub(super) frame: Sampled<'a, S>,
-    /// Brightness of the patch as the frame would show it.
+    /// Brightness of the patch as it would appear in the frame.
     pub(super) intensity: &'a [f32; 8],
     /// Unit vector towards larger inverse depth.
     pub(super) direction: (f32, f32),
@@ -24,29 +24,29 @@ pub(super) struct Along<'a, S> {
     pub(super) v: [f32; 8],
 }
 
-/// The best of some places.
+/// The best of several positions.
 pub(super) struct Best {
     pub(super) lambda: f32,
-    /// What the frame looks like there: kept for the refinement.
+    /// Samples of the frame there, kept for the refinement.
     pub(super) seen: [f32; 8],
     /// Σ ρ(residual) there, Huber's ρ.
     pub(super) cost: f32,
-    /// The least that does not belong to the same minimum.
+    /// The least cost outside the same minimum.
     pub(super) second: f32,
 }
 
 impl<S: Instructions> Along<'_, S> {
-    /// The place λ alone.
+    /// The position λ alone.
     #[inline(always)]
     pub(super) fn only(&self, lambda: f32) -> Best {
         let seen = self.look(lambda);
         Best { lambda, seen, cost: self.cost(&seen), second: f32::INFINITY }
     }
 
-    /// The best of `first` and of `steps` places after it, a pixel apart; at most [`MAX_STEPS`] in all.
+    /// The best of `first` and the `steps` positions after it, a pixel apart; at most [`MAX_STEPS`] in all.
     #[inline(always)]
     pub(super) fn scan(&self, first: f32, steps: usize) -> Best {
-        /// Steps this near to the minimum belong to it.
+        /// Steps this close to the minimum belong to it.
         const SAME_MINIMUM_STEPS: usize = 2;
         let mut costs = [f32::INFINITY; MOST_COSTS];
         for (begin, costs) in (0..=steps).step_by(LANES).zip(costs.chunks_exact_mut(LANES)) {
@@ -56,7 +56,7 @@ impl<S: Instructions> Along<'_, S> {
             }
             costs.copy_from_slice(&sums(self.frame.sampler, &terms));
         }
-        // What is least of all is looked for afterwards: on the way nobody can guess which step it will be.
+        // The minimum is searched afterwards: along the way a new minimum is an unpredictable branch.
         let padded = (steps + 1).next_multiple_of(LANES);
         let least = least(&costs[..padded]);
         let best = costs[..=steps].iter().position(|&cost| cost == least).unwrap_or(0);
@@ -67,8 +67,8 @@ impl<S: Instructions> Along<'_, S> {
         Best { lambda, seen: self.look(lambda), cost, second: self::least(&costs[..padded]) }
     }
 
-    /// Gauss–Newton along the line from `best`, each step clamped, undone when the cost rises: where it ends and the cost
-    /// there. `gradients_at` gives the gradients along the line by sample, grey levels a pixel.
+    /// Gauss–Newton along the line from `best` with clamped steps until the cost stops falling: the final position and
+    /// its cost. `gradients_at` gives the gradients along the line by sample, grey levels per pixel.
     #[inline(always)]
     pub(super) fn refine(
         &self,
@@ -78,9 +78,9 @@ impl<S: Instructions> Along<'_, S> {
     ) -> (f32, f32) {
         const MAX_ITERATIONS: usize = 4;
         const MAX_STEP_PX: f32 = 0.75;
-        /// Keeps a patch without gradient from dividing by zero, grey levels².
+        /// Avoids division by zero for a patch without gradient, grey levels².
         const LEAST_INFORMATION: f32 = 1e-6;
-        /// Further steps change the depth less than the sampling noise does.
+        /// Step below which further ones change the depth less than sampling noise.
         const CONVERGED_PX: f32 = 0.03;
         let start = best.lambda;
         let (mut lambda, mut cost, mut seen) = (start, best.cost, best.seen);
@@ -104,7 +104,7 @@ impl<S: Instructions> Along<'_, S> {
         (lambda, cost)
     }
 
-    /// Gradients of the frame along the line under the patch, grey levels a pixel.
+    /// Gradients of the frame along the line under the patch, grey levels per pixel.
     #[inline(always)]
     pub(super) fn gradients(&self, lambda: f32) -> [f32; 8] {
         let (ahead, behind) = (self.look(lambda + 1.0), self.look(lambda - 1.0));
@@ -115,7 +115,7 @@ impl<S: Instructions> Along<'_, S> {
         gradients
     }
 
-    /// The frame under the patch.
+    /// Samples of the frame under the patch.
     #[inline(always)]
     fn look(&self, lambda: f32) -> [f32; 8] {
         let (du, dv) = (lambda * self.direction.0, lambda * self.direction.1);
@@ -134,7 +134,7 @@ impl<S: Instructions> Along<'_, S> {
     }
 }
 
-/// The least of some costs, whole registers of them; infinite where none is a number.
+/// The least of several costs, in whole registers; infinite if all are NaN.
 #[inline(always)]
 fn least(costs: &[f32]) -> f32 {
     let lower = |one: f32, other: f32| if other < one { other } else { one };

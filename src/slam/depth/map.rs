@@ -1,5 +1,5 @@
-//! The semi-dense inverse-depth map of one keyframe: the image with its gradients, and a hypothesis
-//! at every pixel that has one.
+//! The semi-dense inverse-depth map of one keyframe: the image with its gradients, and a hypothesis at every pixel that
+//! has one.
 
 use rayon::prelude::*;
 
@@ -11,19 +11,19 @@ use crate::slam::image::buffer::Image;
 
 /// Largest ‖g‖ of an 8-bit image: ½·255 in both directions.
 const MAX_GRADIENT: f32 = 181.0;
-/// Steps of the strength of gradients, by which candidates are thinned out.
+/// Bins of gradient strength, by which candidates are thinned out.
 const BINS: usize = 1024;
 
-/// Where a gradient of `strength` lies among the [`BINS`]: the whole part is its bin.
+/// Position of a gradient of `strength` among the [`BINS`]; its integer part is the bin.
 #[inline(always)]
 fn bin(strength: f32) -> f32 {
     strength / MAX_GRADIENT * BINS as f32
 }
 
-/// Pixels whose structure is summed at a time.
+/// Pixels whose structure is summed at once.
 const LANES: usize = 8;
 
-/// Σ (g_u², g_u g_v, g_v²) over the pattern around [`LANES`] pixels from `first` on, by quantity.
+/// Σ (g_u², g_u g_v, g_v²) over the pattern around [`LANES`] pixels starting at `first`, by quantity.
 #[inline(always)]
 fn structure_of_block(image: &GradientImage, first: usize) -> [[f32; LANES]; 3] {
     let [mut uu, mut uv, mut vv] = [[0.0f32; LANES]; 3];
@@ -43,18 +43,18 @@ fn structure_of_block(image: &GradientImage, first: usize) -> [[f32; LANES]; 3] 
 pub struct DepthMap {
     /// The keyframe's image.
     pub image: GradientImage,
-    /// A hypothesis a pixel.
+    /// One hypothesis per pixel.
     pub hypotheses: Hypotheses,
     /// Whether a pixel has enough gradient to carry depth.
     pub candidates: Image<bool>,
-    /// Σ (g_u², g_u g_v, g_v²) over the matching pattern around each candidate and each hypothesis that was restored; of
-    /// another image, or none, where the map is only carried to or from.
+    /// Σ (g_u², g_u g_v, g_v²) over the matching pattern around each candidate and each hypothesis that was restored;
+    /// of another image, or zero, in maps that depth is only propagated to or from.
     pub structure: Image<[f32; 3]>,
-    /// Memory for what arrives from the keyframe before, by band of its rows.
+    /// Memory for the hypotheses that arrive from the previous keyframe, by band of its rows.
     pub(super) reprojected: Vec<Vec<Reprojected>>,
 }
 
-/// A hypothesis on its way to a pixel of this place in the image.
+/// A hypothesis and the index of the pixel it moves to.
 pub(super) type Reprojected = (u32, Hypothesis);
 
 impl DepthMap {
@@ -69,14 +69,14 @@ impl DepthMap {
         }
     }
 
-    /// Starts over on a new image: no hypotheses, candidates where ‖g‖ ≥ `min_gradient`, raised
-    /// evenly until at most `max_candidates` remain.
+    /// Restarts on a new image: no hypotheses, candidates where ‖g‖ ≥ `min_gradient`, which is raised for the whole
+    /// image until at most `max_candidates` remain.
     pub fn restart(&mut self, pixels: &[u8], min_gradient: f32, max_candidates: usize) {
         self.show(pixels, min_gradient, max_candidates);
         self.sum_structure();
     }
 
-    /// The same without what only observation needs: depth can be carried to it.
+    /// The same without the structure, which only observation needs: depth can be propagated to the map.
     pub fn show(&mut self, pixels: &[u8], min_gradient: f32, max_candidates: usize) {
         self.image.fill(pixels);
         let rows = self.hypotheses.pixels_mut().par_chunks_exact_mut(self.image.width());
@@ -93,7 +93,7 @@ impl DepthMap {
         rows.with_min_len(BAND_ROWS).filter(|(v, _)| inner.contains(v)).for_each(|(v, row)| {
             let (candidates, hypotheses) = (candidates.row(v), hypotheses.row(v));
             for first in (BORDER_PX..width - BORDER_PX).step_by(LANES) {
-                // The last block is summed with some of the one before it, so that it is whole.
+                // The last block overlaps the one before it, so that it is complete.
                 let first = first.min(width - BORDER_PX - LANES);
                 let block = first..first + LANES;
                 let is_candidate = candidates[block.clone()].iter().any(|&candidate| candidate);
@@ -144,13 +144,13 @@ impl DepthMap {
         });
     }
 
-    /// How many candidates there are of each strength of gradient.
+    /// Number of candidates by strength of gradient.
     fn histogram(&self) -> [u32; BINS] {
         let (width, height) = (self.image.width(), self.image.height());
         let count_row = |mut histogram: [u32; BINS + 1], v: usize| {
             let candidates = &self.candidates.row(v)[BORDER_PX..width - BORDER_PX];
             for (&is_candidate, strength) in candidates.iter().zip(self.image.strengths(v)) {
-                // The others are counted too, in a bin of their own: no branch can be guessed wrong.
+                // Other pixels are counted too, in a separate bin, to avoid an unpredictable branch.
                 let bin = (bin(strength) as usize).min(BINS - 1);
                 histogram[if is_candidate { bin } else { BINS }] += 1;
             }
@@ -163,7 +163,7 @@ impl DepthMap {
         std::array::from_fn(|bin| counts[bin])
     }
 
-    /// Place of pixel `(u, v)` in the planes.
+    /// Index of pixel `(u, v)` in the planes.
     pub(super) fn index(&self, u: u16, v: u16) -> usize {
         usize::from(v) * self.image.width() + usize::from(u)
     }
@@ -173,7 +173,7 @@ impl DepthMap {
         self.hypotheses.count()
     }
 
-    /// Mean smoothed inverse depth of the hypotheses; `None` without any.
+    /// Mean smoothed inverse depth of the hypotheses; `None` if there are none.
     pub fn mean_inverse_depth(&self) -> Option<f64> {
         let (mut sum, mut count) = (0.0, 0usize);
         let mut memory = Vec::new();
@@ -191,7 +191,7 @@ impl DepthMap {
         self.rescale_by(|_, _| factor);
     }
 
-    /// The same with a factor of its own for every pixel `(u, v)`.
+    /// The same with a separate factor for each pixel `(u, v)`.
     pub fn rescale_by(&mut self, factor_at: impl Fn(usize, usize) -> f32 + Sync) {
         let rows = self.hypotheses.pixels_mut().par_chunks_exact_mut(self.image.width());
         rows.with_min_len(BAND_ROWS).enumerate().for_each(|(v, row)| {
@@ -255,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn candidates_and_their_structure_are_those_of_each_pixel() {
+    fn candidates_and_structure_match_a_computation_by_pixel() {
         let (width, height) = (61, 45);
         let pixels: Vec<u8> =
             (0..width * height).map(|i| ((i * i * 31 + i * 7) % 251 + 2) as u8).collect();

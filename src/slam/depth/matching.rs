@@ -1,8 +1,8 @@
 //! The search for a keyframe pixel along its epipolar segment in another frame.
 //!
-//! A patch of `PATTERN` samples around the pixel, turned and scaled as the geometry says, is
-//! compared at 1-px steps along the segment, then refined by Gauss–Newton in one dimension. The
-//! uncertainty of the match follows Engel, Sturm, Cremers 2013 §2.2–2.3, summed over the patch.
+//! A patch of `PATTERN` samples around the pixel, warped according to the geometry, is compared at 1-px steps along the
+//! segment, then refined by Gauss–Newton in one dimension. The uncertainty of the match follows Engel, Sturm, Cremers
+//! 2013 §2.2–2.3, summed over the patch.
 
 use serde::{Deserialize, Serialize};
 
@@ -20,38 +20,36 @@ use crate::slam::parameter::{ParameterError, check_range};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MatchingParams {
-    /// The camera's noise, which the configuration has once for all.
+    /// The camera's noise, configured once for all modules.
     #[serde(skip)]
     pub noise: ImageNoise,
-    /// Standard deviation by which errors of an estimated pose beyond its covariance misplace the epipolar
-    /// line, pixels, until the matches have shown it. A pose that is given without covariance has none. The
-    /// covariance takes the errors of points for independent; what is common to a keyframe's depth is in every
-    /// pose on it and comes back with every match. `docs/depth-noise.md` has the figures.
+    /// Standard deviation by which errors of an estimated pose beyond its covariance misplace the epipolar line,
+    /// pixels, until the matches have shown it. A given pose without covariance has none. The covariance treats the
+    /// errors of points as independent; an error common to a keyframe's depth is in every pose on it and recurs in
+    /// every match. `docs/depth-noise.md` has the figures.
     pub line_noise_px: f32,
-    /// Share of that variance that differs from one frame to the next; the rest moves all matches of a pixel
-    /// together.
+    /// Share of that variance that differs from one frame to the next; the rest moves all matches of a pixel together.
     pub independent_line_ratio: f32,
-    /// The same of errors of the calibration, which are in every match, pixels.
+    /// The same for errors of the calibration, which affect every match, pixels.
     pub calibration_noise_px: f32,
-    /// Standard deviation that interpolation and sampling leave in a match, pixels: measured without
-    /// noise and with hardly any parallax in the simulated room.
+    /// Standard deviation of a match due to interpolation and sampling, pixels: measured without noise and with hardly
+    /// any parallax in the simulated room.
     pub sampling_noise_px: f32,
-    /// Standard deviation that the slant of surfaces leaves in a match, pixels for a disparity of one
-    /// focal length. The patch is taken for one at a single depth: on a surface slanted by θ a sample
-    /// r pixels off the centre is misplaced by r tan θ times the disparity in focal lengths. r is 1 to 2, and
-    /// most surfaces are slanted by less than 45°.
+    /// Standard deviation of a match due to the slant of surfaces, pixels at a disparity of one focal length. The patch
+    /// is assumed to lie at a single depth: on a surface slanted by θ a sample r pixels off the centre is misplaced by
+    /// r tan θ times the disparity in focal lengths. r is 1 to 2, and most surfaces are slanted by less than 45°.
     pub slant_noise_px: f32,
-    /// Longest segment that is searched, pixels: beyond it repeated structure wins.
+    /// Longest segment that is searched, pixels: beyond it repeated structure causes false matches.
     pub max_search_px: f32,
-    /// Smallest root mean square gradient along the line over the patch, grey levels a pixel:
-    /// below it noise moves the match.
+    /// Smallest root mean square gradient along the line over the patch, grey levels per pixel: below it noise shifts
+    /// the match.
     pub min_line_gradient: f32,
-    /// Largest root mean square residual of a match, grey levels, where the patch has no gradient.
+    /// Largest root mean square residual of a match for a patch without gradient, grey levels.
     pub max_residual: f32,
-    /// By how much that grows with each grey level a pixel of patch gradient: sub-pixel and
-    /// perspective errors show in proportion to it.
+    /// Growth of that limit with each grey level per pixel of patch gradient: sub-pixel and perspective errors are
+    /// proportional to it.
     pub residual_per_gradient: f32,
-    /// The second minimum must be this many times worse than the best one.
+    /// Minimum ratio of the second minimum to the best one.
     pub min_ambiguity_ratio: f32,
 }
 
@@ -74,8 +72,8 @@ impl Default for MatchingParams {
 }
 
 impl MatchingParams {
-    /// By how much the epipolar line is misplaced when the pose is uncertain by `pose_noise_px`, no more than
-    /// any search reaches. A pose that is certain is given: then only the calibration errs.
+    /// Displacement of the epipolar line for a pose uncertain by `pose_noise_px`, at most the reach of a search. A pose
+    /// without uncertainty counts as given: only the calibration errs then.
     pub fn line_noise_with(&self, line_noise_px: f32, pose_noise_px: f64) -> f32 {
         let is_estimated = pose_noise_px > 0.0;
         let of_pose = if is_estimated { line_noise_px.hypot(pose_noise_px as f32) } else { 0.0 };
@@ -97,7 +95,7 @@ impl MatchingParams {
     }
 }
 
-/// The patch of a keyframe pixel: brightness as the other frame would show it, and gradients.
+/// The patch of a keyframe pixel: brightness as it would appear in the other frame, and gradients.
 #[derive(Debug, Clone, Copy)]
 pub struct Patch {
     intensity: [f32; 8],
@@ -106,8 +104,7 @@ pub struct Patch {
 }
 
 impl Patch {
-    /// The patch around `(u, v)`, at least [`BORDER_PX`] from the border, with the brightness
-    /// `gain * I + offset`.
+    /// The patch around `(u, v)`, at least [`BORDER_PX`] from the border, with the brightness `gain * I + offset`.
     #[inline(always)]
     pub fn new(image: &GradientImage, u: usize, v: usize, gain: f32, offset: f32) -> Self {
         let width = image.width() as i32;
@@ -123,7 +120,7 @@ impl Patch {
         patch
     }
 
-    /// Gradient by sample along a step in the keyframe, grey levels a step.
+    /// Gradient of each sample along a step in the keyframe, grey levels per step.
     #[inline(always)]
     fn gradients_along(&self, (along_u, along_v): (f32, f32)) -> [f32; 8] {
         let mut gradients = [0.0; 8];
@@ -134,25 +131,25 @@ impl Patch {
     }
 }
 
-/// How well a match can be placed along the line, known before any search.
+/// How precisely a match can be located along the line, before any search.
 #[derive(Debug, Clone, Copy)]
 pub struct Conditioning {
     /// Unit direction of the line in the frame, towards larger inverse depth.
     direction: (f32, f32),
-    /// The same direction in the keyframe: the step there of one pixel here.
+    /// The same direction in the keyframe: the step there for one pixel in the frame.
     along: (f32, f32),
-    /// Jacobian of the frame's position by the keyframe's, row-major.
+    /// Jacobian of the frame position with respect to the keyframe position, row-major.
     warp: [f32; 4],
     /// Mean squared gradient of the patch.
     squared_gradient: f32,
     /// Variance of the match along the line, pixels².
     pub match_variance: f32,
-    /// The part of it that differs from one frame to the next, pixels²: the frame's own noise, sampling, and a
-    /// share of the line's misplacement.
+    /// The part that differs from one frame to the next, pixels²: the frame's noise, sampling, and a share of the
+    /// line's displacement.
     pub independent_variance: f32,
-    /// Without the line's misplacement, pixels².
+    /// Without the line's displacement, pixels².
     own_variance: f32,
-    /// ∂d/∂λ: inverse depth a pixel along the line.
+    /// ∂d/∂λ: inverse depth per pixel along the line.
     pub inverse_depth_per_px: f32,
 }
 
@@ -161,7 +158,7 @@ pub struct Conditioning {
 pub struct Match {
     /// Observed inverse depth.
     pub inverse_depth: f32,
-    /// How uncertain it is.
+    /// Its uncertainty.
     pub uncertainty: Uncertainty,
     /// Mean squared residual of the patch, grey levels².
     pub mean_squared_residual: f32,
@@ -174,7 +171,7 @@ pub enum Miss {
     OutOfView,
     /// The segment is longer than the search allows.
     TooLong,
-    /// The best residual is larger than noise explains: occluded, moved or not the point.
+    /// The best residual exceeds what noise explains: occluded, moved or a different point.
     Mismatch,
     /// Another place on the segment matches about as well.
     Ambiguous,
@@ -183,9 +180,8 @@ pub enum Miss {
 /// A patch that shrinks or grows by more than this compares different texture.
 pub(super) const DETERMINANT: std::ops::Range<f32> = 0.3..3.0;
 
-/// Judges the line of a pixel at the projection `at`, from the structure of its patch (Σ g_u², g_u g_v,
-/// g_v²) times `gain`²; `None` where a match would tell nothing: no parallax, or no gradient along
-/// the line.
+/// Assesses the line of a pixel at the projection `at`, from the structure of its patch (Σ g_u², g_u g_v, g_v²) times
+/// `gain`²; `None` where a match would carry no information: no parallax, or no gradient along the line.
 #[inline(always)]
 pub fn condition(
     view: &TwoView,
@@ -202,7 +198,7 @@ pub fn condition(
     };
     let measured = product(along, along);
     let samples = PATTERN.len() as f32;
-    // Noise of the keyframe gives gradient where there is none: of a central difference half its variance.
+    // Noise of the keyframe adds gradient: half its variance for a central difference.
     let squared_along = along.0 * along.0 + along.1 * along.1;
     let pixel_std_dev = params.noise.pixel_std_dev;
     let by_noise = 0.5 * samples * (gain * pixel_std_dev).powi(2) * squared_along;
@@ -212,13 +208,13 @@ pub fn condition(
     }
     let tangent = product(along, across) / information;
     let geometric = params.line_noise_px * params.line_noise_px * (1.0 + tangent * tangent);
-    // Noise of the frame, and of the keyframe as brightened.
+    // Noise of the frame, and of the keyframe after the brightness change.
     let noise = (1.0 + gain * gain) * pixel_std_dev * pixel_std_dev;
-    // The match is where Σ ĝ r = 0, ĝ with noise: its variance is σ² Σ ĝ²/(Σ ĝ g)².
+    // The match is where Σ ĝ r = 0, with noisy ĝ: its variance is σ² Σ ĝ²/(Σ ĝ g)².
     let photometric = noise * measured / (information * information);
     let slant = params.slant_noise_px * view.disparity(line, at);
     let sampling = params.sampling_noise_px * params.sampling_noise_px + slant * slant;
-    // The keyframe's noise is in every match, the slant too.
+    // The keyframe's noise and the slant affect every match alike.
     let independent = params.independent_line_ratio * geometric
         + photometric / (1.0 + gain * gain)
         + params.sampling_noise_px * params.sampling_noise_px;
@@ -234,21 +230,21 @@ pub fn condition(
     })
 }
 
-/// A line at one projection, in the frame and turned back into the keyframe.
+/// A line at one projection, in the frame and warped back into the keyframe.
 struct LineAxes {
     /// Unit direction of the line in the frame, towards larger inverse depth.
     direction: (f32, f32),
-    /// Jacobian of the frame's position by the keyframe's, row-major.
+    /// Jacobian of the frame position with respect to the keyframe position, row-major.
     warp: [f32; 4],
-    /// The steps in the keyframe of one pixel in the frame, along the line and across it.
+    /// The steps in the keyframe for one pixel in the frame, along the line and across it.
     along: (f32, f32),
     across: (f32, f32),
-    /// Pixels a unit of inverse depth.
+    /// Pixels per unit of inverse depth.
     speed: f32,
 }
 
 impl LineAxes {
-    /// `None` where there is no parallax, or where the patch is seen too much smaller or larger.
+    /// `None` without parallax, or if the patch is seen much smaller or larger.
     #[inline(always)]
     fn of(view: &TwoView, line: &EpipolarLine, at: &Projection) -> Option<Self> {
         let (vu, vv) = line.velocity(at);
@@ -276,13 +272,13 @@ impl LineAxes {
 }
 
 impl Conditioning {
-    /// How uncertain a match would leave the inverse depth.
+    /// Uncertainty of the inverse depth after a match.
     #[inline(always)]
     pub fn promise(&self) -> Uncertainty {
         self.times(self.inverse_depth_per_px * self.inverse_depth_per_px)
     }
 
-    /// Standard deviation that noise of the images, sampling and slant leave in a match, pixels.
+    /// Standard deviation of a match due to image noise, sampling and slant, pixels.
     #[inline(always)]
     pub fn own_std_dev(&self) -> f32 {
         self.own_variance.sqrt()
@@ -307,15 +303,15 @@ impl Conditioning {
 /// The part of a line that is searched.
 #[derive(Debug, Clone, Copy)]
 pub struct SearchRange {
-    /// Its end of smaller inverse depth.
+    /// The end of smaller inverse depth.
     pub from: Projection,
-    /// Its end of larger inverse depth.
+    /// The end of larger inverse depth.
     pub to: Projection,
-    /// Beyond this length it is not searched, pixels. A hundred places a pixel apart are tried at most.
+    /// Longest range that is searched, pixels. At most a hundred positions a pixel apart are tried.
     pub max_px: f32,
 }
 
-/// Searches a part of the line; a segment below a pixel is only refined.
+/// Searches a part of the line; a segment shorter than a pixel is only refined.
 #[inline(always)]
 pub fn search<S: Instructions>(
     frame: Sampled<'_, S>,
@@ -325,9 +321,9 @@ pub fn search<S: Instructions>(
     range: &SearchRange,
     params: &MatchingParams,
 ) -> Result<Match, Miss> {
-    /// Segments below this are within the reach of the refinement.
+    /// Shorter segments are within the reach of the refinement.
     const MIN_SEARCH_PX: f32 = 1.0;
-    /// How far the refinement may go from where it starts, pixels.
+    /// Reach of the refinement from its start, pixels.
     const REFINE_REACH_PX: f32 = 1.5;
     let SearchRange { from, to, max_px } = range;
     let (du, dv) = conditioning.direction;
@@ -360,7 +356,7 @@ pub fn search<S: Instructions>(
     }
     let (u, v) = (middle.0 + lambda * du, middle.1 + lambda * dv);
     let inverse_depth = line.inverse_depth_at(u, v).ok_or(Miss::OutOfView)?;
-    // ∂d/∂λ where the match is: it changes along the line when the camera moves towards the scene.
+    // ∂d/∂λ at the match: it changes along the line when the camera moves towards the scene.
     let at = line.project(inverse_depth).ok_or(Miss::OutOfView)?;
     let (vu, vv) = line.velocity(&at);
     let alpha = 1.0 / (vu * vu + vv * vv).sqrt().max(f32::MIN_POSITIVE);
@@ -368,7 +364,7 @@ pub fn search<S: Instructions>(
     Ok(Match { inverse_depth, uncertainty, mean_squared_residual })
 }
 
-/// The patch of a keyframe pixel in a frame, from `middle` along its line.
+/// The patch of a keyframe pixel in a frame, starting at `middle` along its line.
 #[inline(always)]
 fn along<'a, S: Instructions>(
     frame: Sampled<'a, S>,
@@ -386,8 +382,8 @@ fn along<'a, S: Instructions>(
     Along { frame, intensity: &patch.intensity, direction, u, v }
 }
 
-/// How far inside the frame a patch must be: it reaches 2 px, stretched by at most √3 (see
-/// [`condition`]), and one more for the bilinear sample.
+/// How far inside the frame a patch must be: it reaches 2 px, stretched by at most √3 (see [`condition`]), plus one for
+/// the bilinear sample.
 pub(super) const MARGIN_PX: f32 = BORDER_PX as f32 + 1.0;
 
 /// Whether a patch at this position lies inside the image; false for NaN.

@@ -1,7 +1,7 @@
-//! Sums over the 5×5 neighbours of some pixels of a row at a time, for the regularisation.
+//! Sums over the 5×5 neighbourhoods of several pixels of a row at once, for the regularisation.
 //!
-//! What depends on one pixel alone, its weights at each distance above all, is computed once a row and
-//! not once a neighbour: a division costs more than all the rest.
+//! Quantities of a single pixel, above all its weight at each distance, are computed once per row, not once per
+//! neighbour: a division costs more than all the rest.
 
 use crate::slam::depth::map::Hypothesis;
 
@@ -11,29 +11,29 @@ pub(super) const RADIUS: usize = 2;
 /// Rows of the neighbourhood.
 pub(super) const WINDOW_ROWS: usize = 2 * RADIUS + 1;
 
-/// Pixels that are summed at a time.
+/// Pixels that are summed at once.
 pub(super) const LANES: usize = 16;
 
-/// Squared distances that occur in the neighbourhood, pixels².
+/// Squared distances within the neighbourhood, pixels².
 const SQUARED_DISTANCES: [f32; 6] = [0.0, 1.0, 2.0, 4.0, 5.0, 8.0];
 
-/// Which of them a neighbour has, by the absolute rows and columns between.
+/// Index of a neighbour's squared distance, by the absolute differences in row and column.
 const PLACE_OF_DISTANCE: [[usize; RADIUS + 1]; RADIUS + 1] = [[0, 1, 3], [1, 2, 4], [3, 4, 5]];
 
-/// Keeps the weight of a certain pixel finite: far below any variance a match can have.
+/// Keeps the weight of an exact pixel finite: far below any variance that a match can have.
 const LEAST_VARIANCE: f32 = 1e-12;
 
-/// A row of the map before smoothing, by quantity; behind its end a block without hypotheses.
+/// A row of the map before smoothing, by quantity, followed by a block without hypotheses.
 #[derive(Debug, Clone)]
 pub(super) struct RowPlanes {
     inverse_depth: Vec<f32>,
-    /// −∞ where there is no hypothesis: nothing is consistent with that.
+    /// −∞ where there is no hypothesis, with which nothing is consistent.
     pub(super) variance: Vec<f32>,
     /// 1 where there is a hypothesis, else 0.
     present: Vec<f32>,
-    /// 1/(σ² + s² r²) by the distance r; 0 where there is no hypothesis.
+    /// 1/(σ² + s² r²) for each distance r; 0 where there is no hypothesis.
     weights: [Vec<f32>; SQUARED_DISTANCES.len()],
-    /// 1/(σ² + s² d²), the same times d and times d², for a hole; 0 where there is no hypothesis.
+    /// 1/(σ² + s² d²), and the same times d and times d², to fill holes; 0 where there is no hypothesis.
     filling: [Vec<f32>; 3],
 }
 
@@ -51,7 +51,7 @@ impl RowPlanes {
         }
     }
 
-    /// Takes a row of the map; neighbours differ by `distance_std_dev` (s above) a pixel.
+    /// Loads a row of the map; neighbours differ by `distance_std_dev` (s above) per pixel.
     #[inline(always)]
     pub(super) fn fill(&mut self, row: &[Hypothesis], distance_std_dev: f32) {
         let spread = distance_std_dev * distance_std_dev;
@@ -66,7 +66,7 @@ impl RowPlanes {
         }
     }
 
-    /// Takes the pixels from `first` on; `spread` is s².
+    /// Loads the block of pixels starting at `first`; `spread` is s².
     #[inline(always)]
     fn fill_block(&mut self, first: usize, hypotheses: &[Hypothesis; LANES], spread: f32) {
         let (mut d, mut variance, mut present) = ([0.0; LANES], [0.0; LANES], [0.0; LANES]);
@@ -96,7 +96,7 @@ impl RowPlanes {
         let mut moments = [[0.0; LANES]; 3];
         for k in 0..LANES {
             let weight = present[k] / (variance[k].max(0.0) + spread * d[k] * d[k]);
-            // A hypothesis that is certain and infinitely far weighs as little as none.
+            // A hypothesis with zero variance at infinity gets no weight.
             let weight = if weight < f32::INFINITY { weight } else { 0.0 };
             moments[0][k] = weight;
             moments[1][k] = weight * d[k];
@@ -112,13 +112,13 @@ impl RowPlanes {
     }
 }
 
-/// Writes values into a plane from `first` on, which has room for them.
+/// Writes values into a plane, starting at `first`; the plane has room for them.
 #[inline(always)]
 fn store(plane: &mut [f32], first: usize, values: &[f32; LANES]) {
     plane[first..first + LANES].copy_from_slice(values);
 }
 
-/// The values of a plane from `first` on.
+/// The values of a plane, starting at `first`.
 #[inline(always)]
 fn lanes(plane: &[f32], first: usize) -> [f32; LANES] {
     let mut values = [0.0; LANES];
@@ -126,7 +126,7 @@ fn lanes(plane: &[f32], first: usize) -> [f32; LANES] {
     values
 }
 
-/// Sums over the consistent neighbours of [`LANES`] pixels, each pixel its own neighbour.
+/// Sums over the consistent neighbours of [`LANES`] pixels; each pixel is its own neighbour.
 pub(super) struct SmoothingSums {
     pub(super) weighted: [f32; LANES],
     pub(super) weights: [f32; LANES],
@@ -134,7 +134,7 @@ pub(super) struct SmoothingSums {
 }
 
 impl SmoothingSums {
-    /// The weighted means; not a number where no neighbour is consistent.
+    /// The weighted means; NaN where no neighbour is consistent.
     #[inline(always)]
     pub(super) fn smoothed(&self) -> [f32; LANES] {
         let mut means = [0.0; LANES];
@@ -145,8 +145,8 @@ impl SmoothingSums {
     }
 }
 
-/// The sums of the pixels from `first` on in the middle one of the rows. Neighbours are consistent that
-/// differ by no more than a joint standard deviation and `slack` times the inverse depth.
+/// The sums of the pixels starting at `first` in the middle row. Neighbours are consistent if they differ by at most
+/// one joint standard deviation, with `slack` times the inverse depth added in quadrature.
 #[inline(always)]
 pub(super) fn smoothing_sums(
     around: &[&RowPlanes; WINDOW_ROWS],
@@ -168,7 +168,7 @@ pub(super) fn smoothing_sums(
             let by_distance = lanes(&row.weights[place], from);
             for k in 0..LANES {
                 let difference = depths[k] - centre[k];
-                // Without branches, so that the lanes go together.
+                // Without branches, so that the loop vectorises.
                 let consistent = difference * difference <= allowed[k] + variances[k];
                 let taken = if consistent { 1.0 } else { 0.0 };
                 let weight = taken * by_distance[k];
@@ -188,7 +188,7 @@ fn add(sums: &mut [f32; LANES], values: &[f32; LANES]) {
     }
 }
 
-/// Sums over all neighbours with a hypothesis of [`LANES`] pixels.
+/// Sums over all neighbours with a hypothesis, of [`LANES`] pixels.
 pub(super) struct FillingSums {
     pub(super) weights: [f32; LANES],
     pub(super) weighted: [f32; LANES],
@@ -197,14 +197,14 @@ pub(super) struct FillingSums {
 }
 
 impl FillingSums {
-    /// A bit for each pixel that has at least so many neighbours.
+    /// A bit for each pixel that has at least this many neighbours.
     #[inline(always)]
     pub(super) fn at_least(&self, neighbours: f32) -> u32 {
         (0..LANES).fold(0, |bits, k| bits | u32::from(self.count[k] >= neighbours) << k)
     }
 }
 
-/// The sums of the pixels from `first` on in the middle one of the rows.
+/// The sums of the pixels starting at `first` in the middle row.
 #[inline(always)]
 pub(super) fn filling_sums(around: &[&RowPlanes; WINDOW_ROWS], first: usize) -> FillingSums {
     let zeros = [0.0; LANES];

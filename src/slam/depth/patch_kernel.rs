@@ -3,7 +3,7 @@
 use crate::slam::depth::pattern::{HUBER_GREY, sum_of_samples};
 use crate::slam::kernel::{Floats, Instructions};
 
-/// ρ(r) by sample: r² up to [`HUBER_GREY`], linear beyond; r = `seen` − `expected`. Without the division of a weight.
+/// ρ(r) by sample: r² up to [`HUBER_GREY`], linear beyond; r = `seen` − `expected`. Avoids the division of a weight.
 #[inline(always)]
 pub(super) fn huber<I: Instructions>(lanes: I, seen: &[f32; 8], expected: &[f32; 8]) -> [f32; 8] {
     let lanes = lanes.eight();
@@ -12,20 +12,20 @@ pub(super) fn huber<I: Instructions>(lanes: I, seen: &[f32; 8], expected: &[f32;
     (bounded * (lanes.splat(2.0) * size - bounded)).to_array()
 }
 
-/// The sum of each row: of several at once, because within one row each addition waits for the one before.
+/// The sum of each row: several at once, because within a row each addition waits for the one before.
 #[inline(always)]
 pub(super) fn sums<I: Instructions>(_: I, rows: &[[f32; 8]; 8]) -> [f32; 8] {
     #[cfg(target_arch = "x86_64")]
     if I::HAS_AVX2 {
-        // SAFETY: who made the instructions vouched for them.
+        // SAFETY: whoever made the instructions vouched for them.
         return unsafe { sums_avx2(rows) };
     }
     rows.map(|row| sum_of_samples(&row))
 }
 
 /// # Safety
-/// The processor has AVX2. Without the attribute that says so, because only that goes into the loop of the caller
-/// whatever its size.
+/// The processor has AVX2. Without `#[target_feature]`, because only then is it inlined into the caller's loop whatever
+/// its size.
 #[cfg(target_arch = "x86_64")]
 #[inline(always)]
 unsafe fn sums_avx2(rows: &[[f32; 8]; 8]) -> [f32; 8] {
@@ -34,7 +34,7 @@ unsafe fn sums_avx2(rows: &[[f32; 8]; 8]) -> [f32; 8] {
     // SAFETY: this function's own contract; eight numbers are loaded and stored.
     unsafe {
         let row = |k: usize| _mm256_loadu_ps(rows[k].as_ptr());
-        // Halves of two rows, then quarters of four, then eighths of all, each in the place of its row.
+        // Halves of two rows, then quarters of four, then eighths of all, each sum at the position of its row.
         let halves = |one, other| {
             let lower = _mm256_permute2f128_ps::<0x20>(one, other);
             _mm256_add_ps(lower, _mm256_permute2f128_ps::<0x31>(one, other))
@@ -66,11 +66,11 @@ pub(super) fn slope<I: Instructions>(
     let gradients = lanes.load(gradients);
     let weighted = weight * gradients;
     let (mixed, squared) = (weighted * residual, weighted * gradients);
-    // One after the other: `map` over registers is not always inlined, and then compiled for every CPU.
+    // Each separately: `map` over registers is not always inlined, and then compiled for every CPU.
     [sum_of_samples(&mixed.to_array()), sum_of_samples(&squared.to_array())]
 }
 
-/// Residuals and Huber's weights: 1 up to the bound, without a branch, so that the lanes go together.
+/// Residuals and Huber's weights: 1 up to the bound, without a branch, so that it vectorises.
 #[inline(always)]
 fn weighed<I: Instructions>(
     lanes: I,
@@ -88,7 +88,7 @@ mod tests {
     use crate::slam::kernel::{Body, Kernel};
     use crate::slam::test_scene::Random;
 
-    /// Some samples, what is expected, gradients, and more.
+    /// Samples, expected values, gradients, and more.
     #[derive(Debug, Clone, Copy)]
     struct Rows([[f32; 8]; 8]);
 
@@ -114,7 +114,7 @@ mod tests {
             if round % 97 == 0 {
                 of.0[0][round % 8] = [f32::NAN, f32::INFINITY][round % 2];
             }
-            // One NaN is as good as another.
+            // NaN payloads are not compared.
             let bits = |kernel: Kernel| {
                 let found = kernel.run(of);
                 found.map(|row| row.map(|x| if x.is_nan() { f32::NAN } else { x }.to_bits()))
@@ -126,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn hubers_terms_are_squares_that_grow_linearly_beyond_the_bound() {
+    fn huber_terms_are_squares_up_to_the_bound_and_linear_beyond() {
         let seen = [0.0, 3.0, -8.9, 9.0, 9.1, -200.0, f32::INFINITY, f32::NAN];
         let mut rows = Rows([[0.0; 8]; 8]);
         rows.0[0] = seen;

@@ -1,18 +1,18 @@
-//! What the uncertainty of a pose is in pixels: by how much it misplaces an epipolar line.
+//! The uncertainty of a pose in pixels: by how much it misplaces an epipolar line.
 
 use crate::slam::geometry::intrinsics::Intrinsics;
 
 /// Unknowns of a pose: translation, rotation.
 const UNKNOWNS: usize = 6;
 
-/// Standard deviation along one axis of where a point falls, pixels: the root mean square over the image
-/// and over both axes, for points at inverse depth 1. `covariance`: upper triangle, row-major, of the
-/// covariance of the left increment (translation, rotation) of `current_from_keyframe`, in keyframe
-/// units, whose mean inverse depth is 1, and radians.
+/// Standard deviation of the projection of a point along one axis, pixels: the root mean square over the image and over
+/// both axes, for points at inverse depth 1. `covariance`: upper triangle, row-major, of the covariance of the left
+/// increment (translation, rotation) of `current_from_keyframe`, in keyframe units, whose mean inverse depth is 1, and
+/// radians.
 ///
 /// With the ray (x, y, 1): ∂(u, v)/∂t = f (1, 0, −x; 0, 1, −y) d, ∂(u, v)/∂ω = f (−xy, 1+x², −y; −(1+y²), xy, x).
 pub fn pose_noise_px(intrinsics: &Intrinsics, covariance: &[f64; 21]) -> f64 {
-    /// Places along each side: the middle of thirds.
+    /// Positions along each side: the centres of its thirds.
     const PLACES: [f64; 3] = [1.0 / 6.0, 0.5, 5.0 / 6.0];
     let Intrinsics { fx, fy, cx, cy, width, height } = *intrinsics;
     let mut variance = 0.0;
@@ -23,7 +23,7 @@ pub fn pose_noise_px(intrinsics: &Intrinsics, covariance: &[f64; 21]) -> f64 {
         variance += quadratic_form(covariance, &along_u) + quadratic_form(covariance, &along_v);
     }
     let places = (PLACES.len() * PLACES.len()) as f64;
-    // An invalid covariance must not pass for that of an exact pose.
+    // An invalid covariance must not count as an exact pose.
     if variance.is_finite() { (variance / (2.0 * places)).max(0.0).sqrt() } else { f64::INFINITY }
 }
 
@@ -51,11 +51,11 @@ mod tests {
     use crate::slam::pose::upper_triangle;
 
     #[test]
-    fn it_is_the_scatter_of_projected_points() {
+    fn pose_noise_matches_the_scatter_of_projected_points() {
         let camera =
             Intrinsics { fx: 400.0, fy: 410.0, cx: 315.0, cy: 243.0, width: 640, height: 480 };
         let mut noise = Noise(3);
-        // Any covariance: A Aᵀ, of a tenth of a percent.
+        // An arbitrary covariance A Aᵀ with standard deviations of a tenth of a percent.
         let root = Matrix6::from_fn(|_, _| 1e-3 * noise.uniform());
         let matrix = root * root.transpose();
         let covariance = upper_triangle(|row, column| matrix[(row, column)]);

@@ -1,35 +1,35 @@
-//! Which of many pixels a frame promises to observe well: the judgement of
-//! [`condition`](crate::slam::depth::matching::condition) for a register of pixels at a time.
+//! Which pixels a frame promises to observe well: the criterion of
+//! [`condition`](crate::slam::depth::matching::condition) for a register of pixels at once.
 //!
-//! Short loops over arrays, which every compiler turns into vector instructions; each operation is the
-//! one that the judgement of a single pixel does, so both decide alike to the last bit.
+//! Short loops over arrays, which every compiler vectorises; the operations are those of the criterion for a single
+//! pixel, so both decide alike to the last bit.
 
 use crate::slam::depth::epipolar::{MIN_DEPTH_RATIO, TwoView};
 use crate::slam::depth::gain::{Gain, Uncertainty};
 use crate::slam::depth::matching::{DETERMINANT, MARGIN_PX, MatchingParams};
 use crate::slam::depth::pattern::PATTERN;
 
-/// Pixels that are judged at a time: a register of the widest vector unit.
+/// Pixels that are tested at once: a register of the widest vector unit.
 pub const LANES: usize = 16;
 
 type Lanes = [f32; LANES];
 
-/// What is known of [`LANES`] pixels of a row, by quantity.
+/// The state of [`LANES`] pixels of a row, by quantity.
 #[derive(Debug, Clone, Default)]
 pub struct PixelLanes {
     /// Column.
     pub u: Lanes,
-    /// Inverse depth that is searched around.
+    /// Inverse depth at the centre of the search.
     pub inverse_depth: Lanes,
     /// Variance of the inverse depth.
     pub variance: Lanes,
-    /// The independent part of that.
+    /// Its independent part.
     pub independent: Lanes,
     /// Σ (g_u², g_u g_v, g_v²) over the patch.
     pub structure: [Lanes; 3],
 }
 
-/// Where the pixels of a row are in the frame.
+/// Positions in the frame of the pixels of a row.
 struct Projected {
     u: [f32; LANES],
     v: [f32; LANES],
@@ -40,7 +40,7 @@ struct Projected {
     is_inside: [bool; LANES],
 }
 
-/// Directions of the epipolar lines in the keyframe, and what a pixel along them tells.
+/// Directions of the epipolar lines in the keyframe, and the inverse depth per pixel along them.
 struct Lines {
     /// Along the line and across it, keyframe pixels per frame pixel.
     along: [[f32; LANES]; 2],
@@ -49,8 +49,8 @@ struct Lines {
     is_regular: [bool; LANES],
 }
 
-/// Whether each pixel of row `v` is seen within a frame of `size` (width, height), and one match there
-/// promises to leave no more than the share `enough` of its variance.
+/// Whether each pixel of row `v` is seen within a frame of `size` (width, height), and one match there promises to
+/// reduce its variance to the share `enough` or less.
 #[inline(always)]
 pub fn promises(
     pixels: &PixelLanes,
@@ -173,7 +173,7 @@ mod tests {
     use crate::slam::geometry::se3::SE3;
 
     #[test]
-    fn a_register_of_pixels_is_judged_as_each_of_them() {
+    fn a_register_of_pixels_decides_like_each_single_pixel() {
         let camera =
             Intrinsics { fx: 200.0, fy: 190.0, cx: 99.5, cy: 74.5, width: 200, height: 150 };
         const ENOUGH: f32 = 0.7;

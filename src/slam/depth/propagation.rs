@@ -1,4 +1,4 @@
-//! Carries the hypotheses of one keyframe to the next (Engel, Sturm, Cremers 2013 §2.5).
+//! Propagates the hypotheses of one keyframe to the next (Engel, Sturm, Cremers 2013 §2.5).
 //!
 //! `d' = 1/z' = d/(r_z + t_z d)` with r_z the third component of R (x, y, 1)ᵀ, and
 //! `σ'² = r_z² (d'/d)⁴ σ² + σ_p²`.
@@ -21,14 +21,14 @@ use crate::slam::pose::Brightness;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PropagationParams {
-    /// σ_p over the inverse depth: what rounding to a pixel and the error of the relative pose add.
-    /// Half a pixel on a surface seen at 60° is 0.2 % of its depth at f = 500 px.
+    /// σ_p over the inverse depth: the error added by rounding to a pixel and by the relative pose. Half a pixel on a
+    /// surface seen at 60° is 0.2 % of its depth at f = 500 px.
     pub process_noise_ratio: f32,
     /// Largest brightness difference between the two pixels, grey levels, where there is no gradient.
     pub max_residual: f32,
-    /// By how much that grows with each grey level a pixel of gradient at the target.
+    /// Growth of that limit with each grey level per pixel of gradient at the target.
     pub residual_per_gradient: f32,
-    /// Validity a hypothesis keeps at most: what was long proven elsewhere must be confirmed here.
+    /// Upper bound of the validity after propagation: a hypothesis long proven elsewhere must be confirmed here.
     pub max_validity: u8,
 }
 
@@ -53,8 +53,8 @@ impl PropagationParams {
     }
 }
 
-/// Fills `target` (its image and candidates already in place) from `source`. `brightness` is that of
-/// the target's image against the source's.
+/// Fills `target` (its image and candidates already in place) from `source`. `brightness` is that of the target's image
+/// relative to the source's.
 pub fn propagate(
     source: &DepthMap,
     target: &mut DepthMap,
@@ -76,7 +76,7 @@ pub fn propagate(
         let rows = first.max(BORDER_PX)..end.min(height - BORDER_PX);
         kernel.run(CarriedRows { reprojection: &reprojection, rows, reprojected });
     });
-    // In the order of the source's rows: who comes first to a pixel matters there.
+    // In the order of the source's rows: the result depends on which hypothesis reaches a pixel first.
     let present = target.hypotheses.pixels_mut();
     for &(index, arriving) in reprojected.iter().flatten() {
         settle(&mut present[index as usize], arriving);
@@ -84,7 +84,7 @@ pub fn propagate(
     target.reprojected = reprojected;
 }
 
-/// What a hypothesis needs on its way from one keyframe to the next.
+/// Everything needed to propagate a hypothesis from one keyframe to the next.
 struct Reprojection<'a> {
     source: &'a DepthMap,
     target: &'a DepthMap,
@@ -94,21 +94,21 @@ struct Reprojection<'a> {
     params: &'a PropagationParams,
 }
 
-/// Hypotheses that are projected at a time.
+/// Hypotheses that are projected at once.
 const LANES: usize = 16;
 
-/// Where [`LANES`] source pixels arrive.
+/// Projections of [`LANES`] source pixels.
 struct Places {
     u: [f32; LANES],
     v: [f32; LANES],
     depth_ratio: [f32; LANES],
     /// r_z of the formula above.
     r_z: [f32; LANES],
-    /// Whether they do, away from the target's border.
+    /// Whether they lie inside the target's border.
     inside: [bool; LANES],
 }
 
-/// Source rows whose hypotheses are carried, in their order.
+/// Source rows whose hypotheses are propagated, and the results, in their order.
 struct CarriedRows<'a> {
     reprojection: &'a Reprojection<'a>,
     rows: Range<usize>,
@@ -147,7 +147,7 @@ impl Reprojection<'_> {
         }
     }
 
-    /// The projections of some hypotheses of row `v`; each operation is that of
+    /// The projections of some hypotheses of row `v`, with the same operations as
     /// [`EpipolarLine::project`](crate::slam::depth::epipolar::EpipolarLine::project).
     #[inline(always)]
     fn project(&self, hypotheses: &[Hypothesis], columns: &[u16], v: usize) -> Places {
@@ -184,8 +184,7 @@ impl Reprojection<'_> {
         places
     }
 
-    /// The hypothesis `from`, of a pixel of this `intensity`, where it arrives, if what is seen there
-    /// looks like it.
+    /// The hypothesis `from`, of a pixel of this `intensity`, at its projection, if the brightness there matches.
     #[inline(always)]
     fn arrive(
         &self,
@@ -196,7 +195,7 @@ impl Reprojection<'_> {
     ) -> Option<Reprojected> {
         let (image, params) = (&self.target.image, self.params);
         let (u, v) = (places.u[k], places.v[k]);
-        // Through i32: what is inside fits, and the conversion is a single instruction.
+        // Through i32: the value fits, and the conversion is a single instruction.
         let (column, row) = ((u + 0.5) as i32 as usize, (v + 0.5) as i32 as usize);
         let index = row * image.width() + column;
         if !self.target.candidates.pixels()[index] {
@@ -231,7 +230,7 @@ fn carry(from: &Hypothesis, depth_ratio: f32, r_z: f32, params: &PropagationPara
     }
 }
 
-/// Two hypotheses on one pixel: fused if consistent, else the nearer one hides the other.
+/// Merges two hypotheses on one pixel: fused if consistent, else the nearer one hides the other.
 #[inline]
 fn settle(present: &mut Hypothesis, arriving: Hypothesis) {
     if !present.is_some() {
@@ -245,7 +244,7 @@ fn settle(present: &mut Hypothesis, arriving: Hypothesis) {
     }
 }
 
-/// Two hypotheses of one pixel as one; `None` where they are of different surfaces.
+/// Two hypotheses of one pixel as one; `None` if they are on different surfaces.
 #[inline]
 pub fn joined(one: Hypothesis, other: &Hypothesis) -> Option<Hypothesis> {
     /// Joint standard deviations within which two hypotheses are one surface.
@@ -316,7 +315,7 @@ mod tests {
     fn depth_and_variance_follow_the_motion_along_the_axis() {
         let (source, mut target) = (map_with(1.0, 1e-4), map_with(1.0, 1e-4));
         target.hypotheses.pixels_mut().fill(Hypothesis::NONE);
-        // A lenient colour check: the texture does not move with the surface here.
+        // A lenient brightness check: the texture does not move with the surface here.
         let params = PropagationParams {
             max_residual: 255.0,
             process_noise_ratio: 0.0,
@@ -333,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn brightness_is_that_of_the_target_against_the_source() {
+    fn brightness_is_that_of_the_target_relative_to_the_source() {
         // Darker and less contrast: nothing is clipped.
         let brightness = Brightness { a: -0.3, b: 20.0 };
         let gain = brightness.a.exp();
@@ -353,13 +352,13 @@ mod tests {
         let opposite = Brightness { a: -brightness.a, b: -brightness.b / gain };
         let (right, wrong) = (kept(brightness), kept(opposite));
         assert!(right > 0.9 && wrong < 0.2, "{right} {wrong}");
-        // Each half of it matters.
+        // Each of the two parameters matters.
         let half = kept(Brightness { b: -brightness.b, ..brightness });
         assert!(half < 0.2, "{half}");
     }
 
     #[test]
-    fn the_nearer_of_two_surfaces_wins_and_equal_ones_fuse() {
+    fn the_nearer_of_two_surfaces_wins_and_consistent_ones_fuse() {
         let at = |d: f32, variance: f32| Hypothesis {
             inverse_depth: d,
             variance,
@@ -377,12 +376,12 @@ mod tests {
         settle(&mut pixel, at(2.01, 1e-4));
         assert!((pixel.inverse_depth - 2.005).abs() < 1e-5);
         assert_eq!(pixel.variance, 1e-4);
-        // Without any variance there is nothing to weigh with.
+        // Without variances there is no weighting.
         assert!(joined(at(1.0, 0.0), &at(1.0, 0.0)).is_none());
     }
 
     #[test]
-    fn every_kernel_gives_the_bits_of_the_projection_of_each_pixel() {
+    fn every_kernel_gives_the_bits_of_the_single_pixel_projection() {
         let scene = Scene::new(6);
         let new_from_old = SE3::exp(&Vector6::new(0.1, -0.02, 0.05, 0.01, 0.02, -0.03));
         let mut maps = [SE3::identity(), new_from_old.inverse()].map(|world_from_camera| {
@@ -413,7 +412,7 @@ mod tests {
         carry(Kernel::Portable, &mut portable);
         carry(Kernel::fastest(), &mut fast);
         assert_eq!(portable, fast);
-        // Where and with what depth each must arrive, by the geometry of a single pixel.
+        // The expected index and depth of each, by the geometry of a single pixel.
         let mut expected = Vec::new();
         for (u, v) in rows.flat_map(|v| (0..SCENE_CAMERA.width).map(move |u| (u, v))) {
             let from = maps[0].hypotheses.at(u, v);

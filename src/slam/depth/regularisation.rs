@@ -1,8 +1,8 @@
-//! Smooths the map over consistent neighbours, drops what stands alone and fills small holes
-//! (Engel, Sturm, Cremers 2013 §2.6).
+//! Smooths the map over consistent neighbours, drops isolated hypotheses and fills small holes (Engel, Sturm, Cremers
+//! 2013 §2.6).
 //!
-//! Only the published value is smoothed: the filtered one and its variance stay, so that smoothing
-//! never pretends to an observation.
+//! Only the published value is smoothed: the filtered one and its variance stay, so that smoothing never counts as an
+//! observation.
 
 use std::ops::Range;
 
@@ -23,15 +23,15 @@ use crate::slam::parameter::{ParameterError, check_range};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RegularisationParams {
-    /// Standard deviation by which neighbouring inverse depths differ, a pixel of distance, in units
-    /// of the mean inverse depth (Engel, Schöps, Cremers 2014's value).
+    /// Standard deviation of the difference of neighbouring inverse depths per pixel of distance, in units of the mean
+    /// inverse depth (the value of Engel, Schöps, Cremers 2014).
     pub distance_std_dev: f32,
-    /// Neighbours belong together when they differ by less than one joint standard deviation plus this
-    /// share of their inverse depth: slanted surfaces are not steps.
+    /// Neighbours are consistent if they differ by at most one joint standard deviation, with this share of their
+    /// inverse depth added in quadrature: slanted surfaces are not steps.
     pub surface_slack_ratio: f32,
     /// A hypothesis with fewer consistent neighbours is dropped.
     pub min_neighbours: u8,
-    /// A hole with at least so many consistent neighbours is filled.
+    /// A hole with at least this many neighbours is filled.
     pub min_fill_neighbours: u8,
 }
 
@@ -62,18 +62,18 @@ pub struct RegularisationScratch {
     bands: Vec<BandScratch>,
 }
 
-/// Memory for some rows.
+/// Memory for one band of rows.
 #[derive(Debug, Clone)]
 struct BandScratch {
-    /// The rows around the one at hand, at their number modulo their count.
+    /// The rows around the current one, at their number modulo the window size.
     window: [RowPlanes; WINDOW_ROWS],
-    /// The rows above and below the band, as they were before: other threads smooth them.
+    /// The rows above and below the band before smoothing: other threads change them.
     above: Vec<Hypothesis>,
     below: Vec<Hypothesis>,
 }
 
 impl RegularisationScratch {
-    /// For maps of this size.
+    /// Allocates for maps of this size.
     pub fn with_size(width: usize, height: usize) -> Self {
         let window = std::array::from_fn(|_| RowPlanes::with_width(width));
         let band = BandScratch { window, above: Vec::new(), below: Vec::new() };
@@ -81,8 +81,7 @@ impl RegularisationScratch {
     }
 }
 
-/// Regularises `map`. Rows are independent of each other: the result does not depend on the number
-/// of threads.
+/// Regularises `map`. Rows are independent of each other: the result does not depend on the number of threads.
 pub fn regularise(
     map: &mut DepthMap,
     scratch: &mut RegularisationScratch,
@@ -116,7 +115,7 @@ fn regularise_with(
     });
 }
 
-/// Some rows of the map, on their way from before to after.
+/// A band of rows of the map, regularised in place.
 struct Band<'a> {
     candidates: &'a Image<bool>,
     width: usize,
@@ -133,7 +132,7 @@ struct Band<'a> {
 impl Body for Band<'_> {
     type Output = ();
 
-    /// Smooths, drops and fills row by row; the window keeps what the rows were before.
+    /// Smooths, drops and fills row by row; the window keeps the rows before these changes.
     #[inline(always)]
     fn run<I: Instructions>(mut self, _: I) {
         let (first, end) = (self.first, self.first + self.rows.len() / self.width);
@@ -150,13 +149,13 @@ impl Body for Band<'_> {
 }
 
 impl Band<'_> {
-    /// Takes row `v` as it is now into the window.
+    /// Loads the current row `v` into the window.
     #[inline(always)]
     fn load(&mut self, v: usize) {
         let (first, end) = (self.first, self.first + self.rows.len() / self.width);
         let at = |from: usize| (v - from) * self.width..(v - from + 1) * self.width;
         let row = if v < first {
-            // As many rows as there are end where the band begins.
+            // All rows in `above` end where the band begins.
             &self.above[at(first - self.above.len() / self.width)]
         } else if v >= end {
             &self.below[at(end)]
@@ -199,8 +198,8 @@ impl Band<'_> {
     }
 }
 
-/// Calls `take` with the places of the bits that are set, ascending: one guess wrong where they end, and
-/// not one at each.
+/// Calls `take` with the positions of the set bits, ascending: one branch misprediction at the end instead of one
+/// per bit.
 #[inline(always)]
 fn for_each_bit(mut bits: u32, mut take: impl FnMut(usize)) {
     while bits != 0 {
@@ -209,7 +208,7 @@ fn for_each_bit(mut bits: u32, mut take: impl FnMut(usize)) {
     }
 }
 
-/// Gives the hypothesis whose sums stand at `lane` their mean, or drops it for want of neighbours.
+/// Gives the hypothesis whose sums are at `lane` their mean, or drops it for lack of neighbours.
 #[inline(always)]
 fn smooth(
     hypothesis: &mut Hypothesis,
@@ -227,10 +226,10 @@ fn smooth(
     }
 }
 
-/// Gives a pixel without hypothesis the mean of its neighbours, where they agree; that they are many is known.
+/// Gives a pixel without hypothesis the mean of its neighbours if they agree; the caller has checked their number.
 #[inline(always)]
 fn fill(out: &mut Hypothesis, sums: &FillingSums, lane: usize) {
-    /// Failures after which neighbours' depth is not tried again: the pixel is something else.
+    /// Failures after which the neighbours' depth is not tried again: the pixel shows something else.
     const MAX_FAILURES: u8 = 2;
     let neighbours = sums.count[lane];
     if out.failures > MAX_FAILURES {
@@ -240,7 +239,7 @@ fn fill(out: &mut Hypothesis, sums: &FillingSums, lane: usize) {
     let mean = sums.weighted[lane] / weights;
     let scatter = (sums.squares[lane] / weights - mean * mean).max(0.0);
     let variance = scatter + neighbours / weights;
-    // Neighbours on two surfaces say nothing of which one the hole is on.
+    // Neighbours on two surfaces do not tell which one the hole is on.
     const MAX_STD_DEV_RATIO: f32 = 0.15;
     if !(variance <= (MAX_STD_DEV_RATIO * mean).powi(2)) {
         return;
@@ -328,7 +327,7 @@ mod tests {
         assert!(!map.hypotheses.at(28, 28).is_some());
     }
 
-    /// The explanation: pixel by pixel, neighbour by neighbour.
+    /// The scalar reference: pixel by pixel, neighbour by neighbour.
     fn regularised(map: &DepthMap, params: &RegularisationParams) -> Vec<Hypothesis> {
         let (width, height) = (map.image.width(), map.image.height());
         let before = &map.hypotheses;
@@ -379,8 +378,8 @@ mod tests {
     }
 
     #[test]
-    fn every_version_gives_the_bits_of_the_explanation() {
-        // No multiple of the lanes wide, more than a band high.
+    fn every_version_gives_the_bits_of_the_scalar_reference() {
+        // Width not a multiple of the lanes, height more than a band.
         let (width, height) = (83, 2 * BAND_ROWS + 7);
         let mut map = DepthMap::with_size(width, height);
         let mut state = 1u32;
@@ -421,7 +420,7 @@ mod tests {
         for kernel in Kernel::available() {
             let mut found = map.clone();
             let mut scratch = RegularisationScratch::with_size(width, height);
-            // Twice with the same memory: nothing of the first may be left in it.
+            // Twice with the same memory: nothing of the first run may remain in it.
             for _ in 0..2 {
                 found.hypotheses = map.hypotheses.clone();
                 regularise_with(kernel, &mut found, &mut scratch, &params);

@@ -1,11 +1,11 @@
-//! The tracing of immature points, compiled for the vector units that the processor has.
+//! The tracing of immature points, compiled for the processor's vector units.
 //!
-//! One source for all: no operation is fused or reordered, so every version gives the same bits.
+//! A single source: no operation is fused or reordered, so every version gives the same bits.
 
 use crate::slam::depth::immature::{ImmaturePoint, IntervalParams, TraceCounts, TraceFrame};
 use crate::slam::kernel::{Body, Instructions};
 
-/// Points that are traced one after the other.
+/// Points that are traced one after another.
 pub(super) struct Tracing<'a> {
     pub points: &'a mut [ImmaturePoint],
     pub frame: &'a TraceFrame<'a>,

@@ -1,23 +1,22 @@
-//! Lenses: from a point in front of the camera to a raw pixel, and back to its ray.
+//! Lenses: projection from a point in camera coordinates to a raw pixel, and from the pixel back to its ray.
 //!
-//! A new lens is one variant of [`Distortion`]; the round-trip and Jacobian tests run over all.
+//! A new lens is one variant of [`Distortion`]; the round-trip and Jacobian tests run over all variants.
 
 use nalgebra::{Matrix2, Vector2, Vector3};
 
 use crate::slam::geometry::intrinsics::Intrinsics;
 
-/// How a lens departs from the pinhole.
+/// How a lens deviates from the pinhole.
 ///
-/// Radial-tangential ("radtan", Brown–Conrady, as OpenCV writes it) moves the point
-/// `(x, y) = (X/Z, Y/Z)`, with `r² = x² + y²`, to
+/// Radial-tangential ("radtan", Brown–Conrady, in OpenCV's convention) maps the point `(x, y) = (X/Z, Y/Z)`,
+/// with `r² = x² + y²`, to
 ///
 /// `x' = x·g + 2·p1·x·y + p2·(r² + 2x²)`, `y' = y·g + p1·(r² + 2y²) + 2·p2·x·y`,
 ///
 /// `g = (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶)`.
 ///
-/// Equidistant (Kannala and Brandt, PAMI 2006; OpenCV's `fisheye`) bends the angle `θ` between ray
-/// and optical axis to `θ_d = θ·(1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸)`, the distance from the
-/// principal point in focal lengths.
+/// Equidistant (Kannala and Brandt, PAMI 2006; OpenCV's `fisheye`) maps the angle `θ` between ray and optical axis to
+/// `θ_d = θ·(1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸)`, the distance from the principal point in focal lengths.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Distortion {
     /// A pinhole.
@@ -50,7 +49,7 @@ impl Distortion {
         coefficients.try_into().ok().map(Self::Equidistant)
     }
 
-    /// The coefficients in the order of the variant.
+    /// The coefficients, in the order of the variant.
     pub fn coefficients(&self) -> &[f64] {
         match self {
             Self::None => &[],
@@ -60,12 +59,12 @@ impl Distortion {
         }
     }
 
-    /// Whether this lens is a pinhole: no distortion, or radtan with coefficients that are all zero.
+    /// Whether this lens is a pinhole: no distortion, or radtan with all coefficients zero.
     pub fn is_pinhole(&self) -> bool {
         !matches!(self, Self::Equidistant(_)) && self.coefficients().iter().all(|&k| k == 0.0)
     }
 
-    /// `[k1 k2 p1 p2 k3 k4 k5 k6]`, zeros where the variant has none; `None` when not radtan.
+    /// `[k1 k2 p1 p2 k3 k4 k5 k6]`, zeros where the variant has fewer; `None` if not radtan.
     fn radtan(&self) -> Option<[f64; 8]> {
         if matches!(self, Self::Equidistant(_)) {
             return None;
@@ -78,24 +77,24 @@ impl Distortion {
     }
 }
 
-/// Rays steeper than this against the optical axis are outside every radtan lens: `tan` grows
-/// without bound there and calibrations have no images of it.
+/// Rays at a larger angle to the optical axis than this are outside every radtan lens: `tan` grows without bound there
+/// and no calibration covers them.
 const STEEPEST_RADTAN_RAD: f64 = 1.5;
 
-/// Samples of the radius on which the end of a lens polynomial's rising part is looked for.
+/// Samples of the radius in the search for the end of the rising part of a lens polynomial.
 const LIMIT_SAMPLES: usize = 3000;
 
-/// Halvings that bring an interval down to the rounding of f64.
+/// Halvings that shrink an interval to the rounding of f64.
 const BISECTIONS: usize = 60;
 
-/// Newton steps of the inverse of the radtan lens; it converges in four or five.
+/// Maximum number of Newton steps in the inverse of the radtan lens; it converges in four or five.
 const NEWTON_STEPS: usize = 20;
 
 /// Residual, in focal lengths, below which an inverse counts as found: far below any pixel.
 const INVERSE_TOLERANCE: f64 = 1e-11;
 
-/// Below this distance from the optical axis, relative to z, `θ_d / radius` is its limit `1/z`: the
-/// next term is smaller by the square of this, beyond f64.
+/// Distance from the optical axis, relative to z, below which `θ_d / radius` is its limit `1/z`: the next term is
+/// smaller by the square of this, beyond f64.
 const ON_AXIS_RATIO: f64 = 1e-8;
 
 /// A calibrated camera: intrinsics of the raw image and the lens.
@@ -103,14 +102,14 @@ const ON_AXIS_RATIO: f64 = 1e-8;
 pub struct CameraModel {
     intrinsics: Intrinsics,
     distortion: Distortion,
-    /// Where the radial function stops rising: `tan θ` for radtan, `θ` for equidistant. Beyond it
-    /// one pixel would have two rays.
+    /// Where the radial function stops rising: `tan θ` for radtan, `θ` for equidistant. Beyond it a pixel would have
+    /// two rays.
     limit: f64,
 }
 
 impl CameraModel {
-    /// A camera from the intrinsics of its raw image and its lens. `None` unless the intrinsics are
-    /// valid and the coefficients finite.
+    /// A camera from the intrinsics of its raw image and its lens; `None` unless the intrinsics are valid and the
+    /// coefficients finite.
     pub fn new(intrinsics: Intrinsics, distortion: Distortion) -> Option<Self> {
         let finite = distortion.coefficients().iter().all(|k| k.is_finite());
         (intrinsics.is_valid() && finite).then(|| Self {
@@ -167,7 +166,7 @@ impl CameraModel {
         Some(ray.normalize())
     }
 
-    /// The point on the plane `z = 1`, where the radtan lens is valid for it.
+    /// The point on the plane `z = 1`; `None` outside the valid region of the radtan lens.
     fn pinhole(&self, point: &Vector3<f64>) -> Option<Vector2<f64>> {
         if point.z.is_nan() || point.z <= 0.0 {
             return None;
@@ -176,7 +175,8 @@ impl CameraModel {
         (xy.norm_squared() <= self.limit * self.limit).then_some(xy)
     }
 
-    /// `θ_d / radius`, which takes (X, Y) to the bent plane, where the equidistant lens is valid for the point.
+    /// `θ_d / radius`, which maps (X, Y) to the distorted plane; `None` outside the valid region of the equidistant
+    /// lens.
     fn equidistant_scale(&self, point: &Vector3<f64>) -> Option<f64> {
         let radius = point.xy().norm();
         let theta = radius.atan2(point.z);
@@ -190,7 +190,7 @@ impl CameraModel {
     }
 }
 
-/// The largest radius up to which the lens' radial function rises.
+/// The largest radius up to which the radial function of the lens rises.
 fn rising_limit(distortion: &Distortion) -> f64 {
     let Some(k) = distortion.radtan() else {
         let k = distortion.coefficients();
@@ -202,7 +202,7 @@ fn rising_limit(distortion: &Distortion) -> f64 {
     first_failure(at, |radius| radtan_slope(&k, radius * radius) > 0.0)
 }
 
-/// An interval after so many halvings, at whose first end `holds` and at whose other end it does not.
+/// The interval after this many halvings: `holds` is true at its first end and false at its second.
 pub(super) fn bisected(
     [mut good, mut bad]: [f64; 2],
     halvings: usize,
@@ -215,7 +215,7 @@ pub(super) fn bisected(
     [good, bad]
 }
 
-/// The last value along `at(0..=LIMIT_SAMPLES)` before `holds` first fails, bisected.
+/// The last value along `at(0..=LIMIT_SAMPLES)` before `holds` first fails, refined by bisection.
 fn first_failure(at: impl Fn(usize) -> f64, holds: impl Fn(f64) -> bool) -> f64 {
     let Some(fails) = (1..=LIMIT_SAMPLES).find(|&i| !holds(at(i))) else {
         return at(LIMIT_SAMPLES);
@@ -223,7 +223,7 @@ fn first_failure(at: impl Fn(usize) -> f64, holds: impl Fn(f64) -> bool) -> f64 
     bisected([at(fails - 1), at(fails)], BISECTIONS, holds)[0]
 }
 
-/// Numerator and denominator of the radial factor and their derivatives by r².
+/// Numerator and denominator of the radial factor and their derivatives with respect to r².
 fn radtan_factor(k: &[f64; 8], r2: f64) -> (f64, f64, f64, f64) {
     let [k1, k2, _, _, k3, k4, k5, k6] = *k;
     let top = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
@@ -233,7 +233,7 @@ fn radtan_factor(k: &[f64; 8], r2: f64) -> (f64, f64, f64, f64) {
     (top, bottom, d_top, d_bottom)
 }
 
-/// Derivative of the bent radius `r·g(r²)` by `r`; not positive at and beyond a pole of `g`.
+/// Derivative of the distorted radius `r·g(r²)` with respect to `r`; not positive at and beyond a pole of `g`.
 fn radtan_slope(k: &[f64; 8], r2: f64) -> f64 {
     let (top, bottom, d_top, d_bottom) = radtan_factor(k, r2);
     if bottom.is_nan() || bottom <= 0.0 {
@@ -269,15 +269,15 @@ fn radtan_jacobian(k: &[f64; 8], xy: &Vector2<f64>) -> Matrix2<f64> {
     )
 }
 
-/// Inverse of [`radtan_bend`] inside the radius `limit`: the radial part inverted alone gives the
-/// start, Newton's method in the plane adds the tangential part.
+/// Inverse of [`radtan_bend`] inside the radius `limit`: the inverse of the radial part alone is the initial value,
+/// Newton's method in the plane adds the tangential part.
 fn radtan_straighten(k: &[f64; 8], bent: &Vector2<f64>, limit: f64) -> Option<Vector2<f64>> {
     let bent_radius = bent.norm();
     let radial = |r: f64| {
         let (top, bottom, _, _) = radtan_factor(k, r * r);
         r * top / bottom
     };
-    // A pixel just outside the radial range may be brought in by the tangential part.
+    // The tangential part may bring in a pixel just outside the radial range.
     let reachable = bent_radius.min(radial(limit));
     let radius = invert_rising(radial, reachable, limit)?;
     let mut xy = if bent_radius > 0.0 { bent * (radius / bent_radius) } else { *bent };
@@ -291,7 +291,7 @@ fn radtan_straighten(k: &[f64; 8], bent: &Vector2<f64>, limit: f64) -> Option<Ve
     None
 }
 
-/// The argument in `[0, limit]` at which the rising function `f` with `f(0) = 0` takes `value`.
+/// The argument in `[0, limit]` at which the rising function `f` with `f(0) = 0` equals `value`.
 fn invert_rising(f: impl Fn(f64) -> f64, value: f64, limit: f64) -> Option<f64> {
     if value.is_nan() || value > f(limit) {
         return None;
@@ -377,7 +377,7 @@ mod tests {
     }
 
     #[test]
-    fn radtan_agrees_with_the_textbook_by_hand() {
+    fn radtan_agrees_with_a_hand_calculation() {
         // x = 0.5, y = 0.25: r² = 0.3125.
         let lens = Distortion::RadTan5([0.1, -0.2, 0.01, 0.02, 0.3]);
         let g = 1.0 + 0.1 * 0.3125 - 0.2 * 0.3125f64.powi(2) + 0.3 * 0.3125f64.powi(3);
@@ -389,7 +389,7 @@ mod tests {
     }
 
     #[test]
-    fn outside_the_rising_part_there_is_no_ray_and_no_pixel() {
+    fn outside_the_rising_part_both_directions_give_none() {
         // r·(1 − 0.5 r²) rises up to r = √(2/3), where it is 0.5443.
         let camera = camera(Distortion::RadTan4([-0.5, 0.0, 0.0, 0.0]));
         let edge = (2.0f64 / 3.0).sqrt();
@@ -404,7 +404,7 @@ mod tests {
     }
 
     #[test]
-    fn an_equidistant_lens_sees_behind_itself_and_a_pinhole_does_not() {
+    fn an_equidistant_lens_sees_points_behind_it_and_a_pinhole_does_not() {
         let sideways = Vector3::new(1.0, 0.0, -0.2);
         let fisheye = camera(Distortion::Equidistant([0.0; 4]));
         let pixel = fisheye.project(&sideways).expect("101° off the axis");
@@ -415,7 +415,7 @@ mod tests {
     }
 
     #[test]
-    fn hostile_numbers_give_none() {
+    fn invalid_numbers_give_none() {
         let raw = *camera(Distortion::None).intrinsics();
         assert!(CameraModel::new(raw, Distortion::RadTan4([f64::NAN, 0.0, 0.0, 0.0])).is_none());
         assert!(CameraModel::new(Intrinsics { fx: -1.0, ..raw }, Distortion::None).is_none());

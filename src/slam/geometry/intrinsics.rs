@@ -22,13 +22,13 @@ pub struct Intrinsics {
 }
 
 impl Intrinsics {
-    /// Of a camera with square pixels whose optical axis meets the middle of its image.
+    /// The intrinsics of a camera with square pixels whose optical axis passes through the centre of its image.
     pub const fn pinhole(width: usize, height: usize, focal_px: f64) -> Self {
         let (cx, cy) = (0.5 * (width as f64 - 1.0), 0.5 * (height as f64 - 1.0));
         Self { fx: focal_px, fy: focal_px, cx, cy, width, height }
     }
 
-    /// The intrinsics of pyramid level `level`: sizes halve and truncate, `c_l = (c_0 + ½)/2^l − ½`.
+    /// The intrinsics of pyramid level `level`: sizes halve, rounding down; `c_l = (c_0 + ½)/2^l − ½`.
     pub fn at_level(&self, level: usize) -> Self {
         let factor = f64::powi(0.5, level as i32);
         Self {
@@ -41,14 +41,14 @@ impl Intrinsics {
         }
     }
 
-    /// The ray of a pixel in the camera's frame, where it is 1 ahead.
+    /// The ray of a pixel in camera coordinates, with z = 1.
     #[inline]
     pub fn ray(&self, u: f64, v: f64) -> Vector3<f64> {
         Vector3::new((u - self.cx) / self.fx, (v - self.cy) / self.fy, 1.0)
     }
 
-    /// Whether the numbers can belong to a camera: finite, positive focal lengths, a size within
-    /// [16, 8192] pixels a side (larger ones are a broken header, not a camera).
+    /// Whether the numbers can belong to a camera: finite, positive focal lengths, a size within [16, 8192] pixels per
+    /// side (larger ones mean a broken header, not a camera).
     pub fn is_valid(&self) -> bool {
         const SIDE: std::ops::RangeInclusive<usize> = 16..=8192;
         let finite = [self.fx, self.fy, self.cx, self.cy].iter().all(|x| x.is_finite());
@@ -79,7 +79,7 @@ mod tests {
     }
 
     #[test]
-    fn hostile_numbers_are_refused() {
+    fn invalid_numbers_are_rejected() {
         let good =
             Intrinsics { fx: 525.0, fy: 520.0, cx: 319.5, cy: 239.5, width: 640, height: 480 };
         assert!(good.is_valid());

@@ -1,4 +1,4 @@
-//! Rectification: the pinhole view of a raw image, as a table made once and applied to every frame.
+//! Rectification: the pinhole view of a raw image, as a table computed once and applied to every frame.
 
 use nalgebra::{Vector2, Vector3};
 
@@ -6,28 +6,26 @@ use crate::slam::geometry::camera_model::{CameraModel, bisected};
 use crate::slam::geometry::intrinsics::Intrinsics;
 use crate::slam::image::buffer::Image;
 
-/// Half the widest field of view that a rectified image may have. A pinhole image of a wider one
-/// spends almost all its pixels on the margin (at 75° a pixel at the edge is 15 times as fine as
-/// one in the middle).
+/// Half the widest field of view of a rectified image. A wider pinhole image spends almost all its pixels on the margin
+/// (at 75° a pixel at the edge is 15 times as fine as one in the middle).
 const WIDEST_HALF_VIEW_RAD: f64 = 75.0 * std::f64::consts::PI / 180.0;
 
 /// Rows on which the valid region of the `z = 1` plane is measured.
 const REGION_ROWS: usize = 2048;
 
-/// Steps of the outward walk that finds the end of the valid region along a line.
+/// Steps of the outward walk that brackets the end of the valid region along a line.
 const WALK_STEPS: usize = 96;
 
-/// Halvings that settle that end to far below a thousandth of a pixel.
+/// Halvings that refine that end to far below a thousandth of a pixel.
 const WALK_BISECTIONS: usize = 30;
 
-/// Factor by which the view shrinks until no border pixel is without data; it makes up for the
-/// spacing of the rows.
+/// Factor by which the view shrinks until every border pixel has data; it compensates for the spacing of the rows.
 const SHRINK: f64 = 1.0 - 1e-4;
 
-/// Shrinking further than this many steps means that the region is not what its rows said.
+/// Maximum number of shrink steps: if more are needed, the region is not the one measured on its rows.
 const MAX_SHRINKS: usize = 200;
 
-/// A fraction of a pixel has this many steps.
+/// Resolution of a fraction of a pixel.
 const FRACTION_STEPS: f64 = 256.0;
 
 /// Why a camera cannot be rectified.
@@ -47,7 +45,7 @@ pub enum RectificationError {
         /// Raw height, pixels.
         height: usize,
     },
-    /// The lens folds the image so that no rectangle of rays has data everywhere.
+    /// The distortion folds the image so that no rectangle of rays has data everywhere.
     #[error("the distortion coefficients leave no rectangular view with data at every pixel")]
     NoView,
 }
@@ -77,9 +75,9 @@ impl View {
     }
 }
 
-/// The intrinsics of the largest pinhole view, of the raw image's size, at whose every pixel the
-/// raw image has data with bilinear support; "largest" is its area on the plane `z = 1`. fx, fy
-/// and the principal point are free; a view is never wider than 75° to any side of the axis.
+/// The intrinsics of the largest pinhole view, of the raw image's size, in which every pixel has raw data with bilinear
+/// support; "largest" is by area on the plane `z = 1`. fx, fy and the principal point are free; a view never extends
+/// more than 75° to any side of the axis.
 pub fn rectified_intrinsics(camera: &CameraModel) -> Result<Intrinsics, RectificationError> {
     let raw = *camera.intrinsics();
     if camera.distortion().is_pinhole() {
@@ -101,24 +99,24 @@ pub fn rectified_intrinsics(camera: &CameraModel) -> Result<Intrinsics, Rectific
     Err(RectificationError::NoView)
 }
 
-/// Whether a raw position has all four neighbours of bilinear interpolation.
+/// Whether a raw position has all four neighbours for bilinear interpolation.
 fn has_data(raw: &Intrinsics, pixel: &Vector2<f64>) -> bool {
     (0.0..=(raw.width - 1) as f64).contains(&pixel.x)
         && (0.0..=(raw.height - 1) as f64).contains(&pixel.y)
 }
 
-/// The raw position that sees a ray; `None` where there is no data.
+/// The raw position that sees a ray; `None` if there is no data.
 fn seen(camera: &CameraModel, ray: &Vector3<f64>) -> Option<Vector2<f64>> {
     camera.project(ray).filter(|pixel| has_data(camera.intrinsics(), pixel))
 }
 
-/// The raw position seen by a rectified pixel; `None` where there is no data.
+/// The raw position that a rectified pixel sees; `None` if there is no data.
 fn raw_pixel(camera: &CameraModel, rectified: &Intrinsics, u: f64, v: f64) -> Option<Vector2<f64>> {
     seen(camera, &rectified.ray(u, v))
 }
 
-/// Whether every pixel on the border of the view has data. The region with data is in one piece
-/// without holes, so what lies inside the border has data too.
+/// Whether every pixel on the border of the view has data. The region with data is connected and has no holes, so
+/// everything inside the border has data too.
 fn border_has_data(camera: &CameraModel, rectified: &Intrinsics) -> bool {
     let (right, bottom) = (rectified.width - 1, rectified.height - 1);
     let seen = |u: usize, v: usize| raw_pixel(camera, rectified, u as f64, v as f64).is_some();
@@ -128,9 +126,9 @@ fn border_has_data(camera: &CameraModel, rectified: &Intrinsics) -> bool {
 
 /// The largest rectangle of rays around the optical axis inside the region with data.
 ///
-/// Every such rectangle is a run of rows, each of them inside the region from the rectangle's left
-/// to its right. So the region is measured row by row, outward from the axis, and all runs of rows
-/// above and below the axis are tried; the narrowest row of a run bounds it.
+/// Every such rectangle is a run of rows, each inside the region from the rectangle's left to its right. So the region
+/// is measured row by row, outward from the axis, and all runs of rows above and below the axis are tried; the
+/// narrowest row of a run bounds it.
 fn largest_view(camera: &CameraModel) -> Option<View> {
     let widest = WIDEST_HALF_VIEW_RAD.tan();
     let seen = |x: f64, y: f64| seen(camera, &Vector3::new(x, y, 1.0)).is_some();
@@ -161,7 +159,7 @@ fn largest_view(camera: &CameraModel) -> Option<View> {
     best.map(|(_, view)| view)
 }
 
-/// How far `holds` continues from 0, at most to `end`.
+/// The distance from 0 over which `holds` stays true, at most `end`.
 fn extent(end: f64, holds: impl Fn(f64) -> bool) -> f64 {
     let at = |i: usize| end * i as f64 / WALK_STEPS as f64;
     let Some(fails) = (0..=WALK_STEPS).find(|&i| !holds(at(i))) else { return end };
@@ -171,7 +169,7 @@ fn extent(end: f64, holds: impl Fn(f64) -> bool) -> f64 {
     bisected([at(fails - 1), at(fails)], WALK_BISECTIONS, holds)[0]
 }
 
-/// Where each rectified pixel reads in the raw image.
+/// The position in the raw image that each rectified pixel reads.
 #[derive(Debug, Clone)]
 struct RemapTable {
     /// Index of the upper left of the four raw neighbours.
@@ -180,11 +178,11 @@ struct RemapTable {
     fractions: Vec<u16>,
 }
 
-/// A camera's rectification: the rectified intrinsics and the place of each pixel in the raw image.
+/// A camera's rectification: the rectified intrinsics and the raw position of each pixel.
 #[derive(Debug, Clone)]
 pub struct Rectification {
     intrinsics: Intrinsics,
-    /// `None` where raw images already are pinhole images.
+    /// `None` if raw images are already pinhole images.
     table: Option<RemapTable>,
 }
 
@@ -223,8 +221,8 @@ impl Rectification {
         self.table.is_none()
     }
 
-    /// Writes the rectified image of the grey image `raw`, bilinear, to within half a grey level
-    /// of rounding. False, and nothing written, unless both have the camera's number of pixels.
+    /// Writes the rectified version of the grey image `raw`, bilinear, to within half a grey level of rounding. Returns
+    /// false and writes nothing unless both have the camera's number of pixels.
     pub fn rectify_into(&self, raw: &[u8], rectified: &mut [u8]) -> bool {
         let count = self.intrinsics.width * self.intrinsics.height;
         if raw.len() != count || rectified.len() != count {
@@ -237,9 +235,9 @@ impl Rectification {
         true
     }
 
-    /// The rectified depth image (z in metres, 0 where there is none) of a raw one, nearest
-    /// neighbour: depths across an edge are never mixed. z itself does not change, as the optical
-    /// axis stays. `None` unless `raw` has the camera's size.
+    /// The rectified depth image (z in metres, 0 where unknown) of a raw one, nearest neighbour: depths across an edge
+    /// are never mixed. z itself does not change, as the optical axis stays the same. `None` unless `raw` has the
+    /// camera's size.
     pub fn rectify_depth(&self, raw: &Image<f32>) -> Option<Image<f32>> {
         let Intrinsics { width, height, .. } = self.intrinsics;
         if (raw.width(), raw.height()) != (width, height) {
@@ -257,8 +255,8 @@ impl Rectification {
     }
 }
 
-/// A position inside `[0, size − 1]` as the lower neighbour, which has a next one, and the fraction
-/// towards that in 256ths.
+/// Splits a position inside `[0, size − 1]` into its lower neighbour, which is never the last pixel, and the fraction
+/// towards the next one in 256ths.
 fn split(position: f64, size: usize) -> (usize, u8) {
     let steps = (position * FRACTION_STEPS).round() as usize;
     let last = size - 2;
@@ -270,9 +268,9 @@ fn split(position: f64, size: usize) -> (usize, u8) {
 impl RemapTable {
     /// Bilinear interpolation of `raw` (rows of `width`) at every entry.
     ///
-    /// The left and the right neighbour travel in the two halves of one u32: down first, which
-    /// fits 16 bits a half (255·256), then right. `a·(256 − w) + b·w` is written as
-    /// `256·a + (b − a)·w`: a negative difference wraps, the sum is exact again.
+    /// The left and right neighbours share one u32, 16 bits each: first blended downwards, which fits 16 bits
+    /// (255·256), then to the right. `a·(256 − w) + b·w` is written as `256·a + (b − a)·w`: a negative difference
+    /// wraps, and the sum is exact again.
     fn interpolate(&self, raw: &[u8], width: usize, out: &mut [u8]) {
         const HALF: u32 = 1 << 15;
         const SPREAD: u32 = 0x00ff_00ff;
@@ -326,7 +324,7 @@ mod tests {
     }
 
     #[test]
-    fn every_rectified_pixel_has_data_and_a_larger_view_would_not() {
+    fn every_rectified_pixel_has_data_and_a_larger_view_does_not() {
         for camera in cameras() {
             let rectified = rectified_intrinsics(&camera).expect("a view");
             let Intrinsics { width, height, .. } = rectified;
@@ -348,7 +346,7 @@ mod tests {
         }
     }
 
-    /// No rectangle of a coarse grid over all four sides is larger.
+    /// On a coarse grid over all four sides no rectangle is larger.
     #[test]
     fn the_view_is_the_largest_of_all_rectangles() {
         for camera in cameras() {
@@ -383,7 +381,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pinhole_is_a_copy() {
+    fn a_pinhole_image_is_copied() {
         let raw = Intrinsics { fx: 20.0, fy: 21.0, cx: 15.0, cy: 16.0, width: 32, height: 33 };
         let camera = CameraModel::new(raw, Distortion::RadTan4([0.0; 4])).expect("valid");
         let identity = Rectification::new(&camera).expect("a view");
@@ -396,7 +394,7 @@ mod tests {
         assert!(!identity.rectify_into(&image[1..], &mut out));
     }
 
-    /// A smooth scene drawn through each lens comes back as the pinhole draws it.
+    /// A smooth scene rendered through each lens comes back as its pinhole rendering.
     #[test]
     fn a_scene_seen_through_the_lens_becomes_its_pinhole_image() {
         let scene = |ray: &Vector3<f64>| {
@@ -420,7 +418,7 @@ mod tests {
             for (i, &grey) in rectified.iter().enumerate() {
                 let (u, v) = ((i % k.width) as f64, (i / k.width) as f64);
                 let ray = k.ray(u, v);
-                // Two roundings of half a level and the curvature of the scene.
+                // Two roundings of half a level, plus the curvature of the scene.
                 assert!((f64::from(grey) - scene(&ray)).abs() < 1.6, "{u} {v}");
                 // Half a pixel diagonal times the steepest slope of the scene.
                 assert!((f64::from(depth.pixels()[i]) - scene(&ray)).abs() < 4.0, "{u} {v}");

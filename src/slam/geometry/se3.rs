@@ -7,8 +7,8 @@ use std::ops::Mul;
 
 use nalgebra::{Matrix3, Matrix6, Quaternion, UnitQuaternion, Vector3, Vector6};
 
-/// Below this rotation angle (radians) series replace the closed forms: their truncation error,
-/// O(angle⁴), is then below the rounding of f64.
+/// Rotation angle (radians) below which series replace the closed forms: their truncation error, O(angle⁴), is then
+/// below the rounding of f64.
 const SMALL_ANGLE_RAD: f64 = 1e-4;
 
 /// A rigid transform.
@@ -21,13 +21,13 @@ pub struct SE3 {
 }
 
 impl SE3 {
-    /// The transform that moves nothing.
+    /// The identity.
     pub fn identity() -> Self {
         Self { rotation: UnitQuaternion::identity(), translation: Vector3::zeros() }
     }
 
     /// From a quaternion `(x, y, z, w)` and a translation; the quaternion is normalised.
-    /// `None` where a number is not finite or the quaternion is too short to have a direction.
+    /// `None` if a number is not finite or the quaternion is too short to have a direction.
     pub fn try_from_parts(quaternion_xyzw: [f64; 4], translation: [f64; 3]) -> Option<Self> {
         let [x, y, z, w] = quaternion_xyzw;
         let quaternion = Quaternion::new(w, x, y, z);
@@ -186,7 +186,7 @@ mod tests {
     }
 
     #[test]
-    fn hostile_parts_are_refused() {
+    fn invalid_parts_are_rejected() {
         assert!(SE3::try_from_parts([0.0, 0.0, 0.0, 0.0], [0.0; 3]).is_none());
         assert!(SE3::try_from_parts([f64::NAN, 0.0, 0.0, 1.0], [0.0; 3]).is_none());
         assert!(SE3::try_from_parts([0.0, 0.0, 0.0, 1.0], [f64::INFINITY, 0.0, 0.0]).is_none());

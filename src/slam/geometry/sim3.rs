@@ -14,7 +14,8 @@ pub type Twist7 = SVector<f64, 7>;
 /// A matrix over twists of Sim(3).
 pub type Matrix7 = SMatrix<f64, 7, 7>;
 
-/// Most terms of a series below. A twist with an angle of π and a scale of e^5 needs 40; a residual needs five to ten.
+/// Maximum number of terms of a series. A twist with an angle of π and a scale of e^5 needs 40; a residual needs five
+/// to ten.
 const MAX_TERMS: u32 = 60;
 
 /// A similarity `point_in_a = scale * rotation * point_in_b + translation`.
@@ -27,7 +28,7 @@ pub struct Sim3 {
 }
 
 impl Sim3 {
-    /// The similarity that moves nothing.
+    /// The identity.
     pub fn identity() -> Self {
         Self { rigid: SE3::identity(), scale: 1.0 }
     }
@@ -37,7 +38,7 @@ impl Sim3 {
         Self { rigid, scale }
     }
 
-    /// The similarity of this scale that takes one rigid pose to another: `a_from_b` of `a_from_camera` and
+    /// The similarity of this scale that maps one rigid pose to another: `a_from_b` from `a_from_camera` and
     /// `b_from_camera`.
     pub fn between(b_from_camera: &SE3, a_from_camera: &SE3, scale: f64) -> Self {
         let rotation = a_from_camera.rotation * b_from_camera.rotation.inverse();
@@ -52,17 +53,15 @@ impl Sim3 {
         Self { rigid: SE3 { rotation, translation }, scale: 1.0 / self.scale }
     }
 
-    /// The rigid pose in this similarity's target frame of a camera that stands at
-    /// `keyframe_from_camera` (translation in keyframe units): `world_from_camera` for
-    /// `world_from_keyframe`. A camera has no scale of its own, so the result is rigid.
+    /// The rigid pose, in this similarity's target frame, of a camera at `keyframe_from_camera` (translation in
+    /// keyframe units): `world_from_camera` for `world_from_keyframe`. A camera has no scale, so the result is rigid.
     pub fn place(&self, keyframe_from_camera: &SE3) -> SE3 {
         let mut scaled = *keyframe_from_camera;
         scaled.translation *= self.scale;
         self.rigid * scaled
     }
 
-    /// The opposite of [`Sim3::place`]: `keyframe_from_camera` in keyframe units, of a camera
-    /// at `world_from_camera`.
+    /// The inverse of [`Sim3::place`]: `keyframe_from_camera`, in keyframe units, of a camera at `world_from_camera`.
     pub fn locate(&self, world_from_camera: &SE3) -> SE3 {
         let mut relative = self.rigid.inverse() * *world_from_camera;
         relative.translation /= self.scale;
@@ -77,11 +76,10 @@ impl Sim3 {
         Self::new(SE3 { rotation, translation }, log_scale.exp())
     }
 
-    /// The twist whose exponential this is; the rotation angle lies in [0, π]. Not finite where the similarity is not
-    /// valid.
+    /// The twist whose exponential this is; the rotation angle lies in [0, π]. Not finite if the similarity is invalid.
     pub fn log(&self) -> Twist7 {
         let (omega, log_scale) = (self.rigid.rotation.scaled_axis(), self.scale.ln());
-        // Its eigenvalues are (e^z − 1)/z at z = λ and λ ± iθ: not 0 for angles below 2π.
+        // The eigenvalues of the Jacobian are (e^z − 1)/z at z = λ and λ ± iθ: not 0 for angles below 2π.
         let inverse = translation_jacobian(&omega, log_scale).try_inverse();
         let upsilon = inverse.unwrap_or(Matrix3::repeat(f64::NAN)) * self.rigid.translation;
         let mut twist = Twist7::zeros();
@@ -100,8 +98,8 @@ impl Sim3 {
         adjoint
     }
 
-    /// What a left increment ξ of a rigid pose becomes where the pose is moved by this similarity: `self · exp(ξ) · pose`
-    /// is `exp(rigid_adjoint · ξ) · self · pose`.
+    /// Maps a left increment ξ of a rigid pose to that of the pose moved by this similarity: `self · exp(ξ) · pose` is
+    /// `exp(rigid_adjoint · ξ) · self · pose`.
     pub fn rigid_adjoint(&self) -> Matrix6<f64> {
         let mut adjoint = self.rigid.adjoint();
         adjoint.fixed_view_mut::<3, 3>(0, 0).scale_mut(self.scale);
@@ -139,8 +137,8 @@ fn parts(twist: &Twist7) -> (Vector3<f64>, Vector3<f64>, f64) {
     (twist.fixed_rows::<3>(0).into_owned(), twist.fixed_rows::<3>(3).into_owned(), twist[6])
 }
 
-/// ∫₀¹ exp(τ(λI + ω^)) dτ, which carries the translation of a twist to the translation: Σ Mᵏ/(k+1)! with M = λI + ω^.
-/// The series needs no case for small angles, small scales or both.
+/// ∫₀¹ exp(τ(λI + ω^)) dτ, which maps the translation part of a twist to the translation: Σ Mᵏ/(k+1)! with M = λI + ω^.
+/// The series needs no special case for small angles, small scales or both.
 fn translation_jacobian(omega: &Vector3<f64>, log_scale: f64) -> Matrix3<f64> {
     let generator = omega.cross_matrix() + Matrix3::identity() * log_scale;
     let (mut term, mut sum) = (Matrix3::identity(), Matrix3::identity());
@@ -156,8 +154,9 @@ fn translation_jacobian(omega: &Vector3<f64>, log_scale: f64) -> Matrix3<f64> {
 
 /// The inverse of the left Jacobian J of Sim(3), exp(ξ + δ) ≈ exp(J δ) exp(ξ): log(exp(δ) exp(ξ)) ≈ ξ + J⁻¹ δ.
 ///
-/// J = Σ adᵏ/(k+1)! with ad = [M, υ^, −υ; 0, ω^, 0; 0, 0, 0]. Its powers keep that shape, [Mᵏ, X, y; 0, ω^ᵏ, 0; 0, 0, 0],
-/// so that only the upper blocks are summed; the inverse is made by blocks, too. NaN where the twist is not finite.
+/// J = Σ adᵏ/(k+1)! with ad = [M, υ^, −υ; 0, ω^, 0; 0, 0, 0]. Its powers keep that shape,
+/// [Mᵏ, X, y; 0, ω^ᵏ, 0; 0, 0, 0], so only the upper blocks are summed, and the inverse is blockwise too. NaN if the
+/// twist is not finite.
 pub fn left_jacobian_inverse(twist: &Twist7) -> Matrix7 {
     let (upsilon, omega, log_scale) = parts(twist);
     let (upsilon_hat, omega_hat) = (upsilon.cross_matrix(), omega.cross_matrix());
@@ -225,7 +224,7 @@ mod tests {
 
         #[test]
         fn small_twists_keep_their_digits(xi in twist(), exponents in proptest::array::uniform3(-12.0f64..0.0)) {
-            // Each part small by itself: no case of a closed form decides.
+            // Each part small independently of the others: no special case of a closed form decides.
             let mut xi = xi;
             for (part, exponent) in [(0..3, exponents[0]), (3..6, exponents[1]), (6..7, exponents[2])] {
                 part.for_each(|i| xi[i] *= 10f64.powf(exponent));
@@ -286,7 +285,7 @@ mod tests {
 
         #[test]
         fn a_placed_camera_sees_the_same_rays(world in similarity(), camera in similarity(), p in proptest::array::uniform3(0.5f64..5.0)) {
-            // A point of the keyframe, seen by the camera, keeps its direction when both are placed in the world.
+            // A point in keyframe units, seen by the camera, keeps its direction when both are placed in the world.
             let p = Vector3::from(p);
             let in_camera = camera.rigid.inverse() * p;
             let in_world_camera = world.place(&camera.rigid).inverse() * (world * p);

@@ -9,7 +9,7 @@ pub struct Image<T> {
 }
 
 impl<T: Copy> Image<T> {
-    /// An image of one value.
+    /// An image filled with one value.
     pub fn filled(width: usize, height: usize, value: T) -> Self {
         Self { width, height, pixels: vec![value; width * height] }
     }
@@ -53,7 +53,7 @@ impl<T: Copy> Image<T> {
 }
 
 impl<T: Copy + Into<f32>> Image<T> {
-    /// Bilinear sample; positions outside take the nearest pixel inside.
+    /// Bilinear sample; positions outside are clamped to the image.
     #[inline]
     pub fn bilinear(&self, u: f32, v: f32) -> f32 {
         let u = u.max(0.0).min((self.width - 2) as f32);

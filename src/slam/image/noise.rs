@@ -1,24 +1,24 @@
-//! The noise of a camera's images: one model for all that compare grey levels.
+//! The noise of a camera's images: one model for everything that compares grey levels.
 
 use serde::{Deserialize, Serialize};
 
 use crate::slam::parameter::{ParameterError, check_range};
 
-/// How far grey levels of the same thing differ from one image to another.
+/// How much the grey levels of the same point differ between images.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ImageNoise {
     /// Standard deviation of the noise of a pixel, grey levels; halves with each level of a pyramid. Cameras in rooms
     /// have 2 to 4.
     pub pixel_std_dev: f32,
-    /// Standard deviation of what does not (interpolation, reflections, occlusion), where single pixels are compared,
-    /// grey levels. 4 needs a tenth fewer iterations of the alignment than 2; errors on recordings differ by up to a
-    /// tenth, either way.
+    /// Standard deviation of the errors that do not halve (interpolation, reflections, occlusion), where single pixels
+    /// are compared, grey levels. 4 needs a tenth fewer iterations of the alignment than 2; errors on recordings differ
+    /// by up to a tenth, either way.
     pub model_std_dev: f32,
 }
 
 impl ImageNoise {
-    /// That of a camera of which nothing is known.
+    /// The noise of an uncharacterised camera.
     pub const DEFAULT: Self = Self { pixel_std_dev: 3.0, model_std_dev: 4.0 };
 
     /// Checks every value.

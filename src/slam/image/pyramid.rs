@@ -1,4 +1,4 @@
-//! The image pyramid: level l+1 is the 2×2 mean of level l, sizes halve and truncate.
+//! The image pyramid: level l+1 is the 2×2 mean of level l; sizes halve, rounding down.
 
 use crate::slam::image::buffer::Image;
 
@@ -9,7 +9,7 @@ pub struct Pyramid {
 }
 
 impl Pyramid {
-    /// Memory for a pyramid of `levels` levels over a `width * height` image.
+    /// Allocates a pyramid of `levels` levels over a `width * height` image.
     pub fn with_size(width: usize, height: usize, levels: usize) -> Self {
         let levels = (0..levels).map(|l| Image::filled(width >> l, height >> l, 0.0)).collect();
         Self { levels }

@@ -1,6 +1,6 @@
-//! A grey image stored so that one load brings the four pixels of a bilinear sample.
+//! A grey image stored so that one load fetches the four pixels of a bilinear sample.
 
-/// Grey values with their right, lower and lower-right neighbours, one `u32` a pixel.
+/// Grey values with their right, lower and lower-right neighbours, one `u32` per pixel.
 #[derive(Debug, Clone)]
 pub struct QuadImage {
     width: usize,
@@ -14,8 +14,8 @@ impl QuadImage {
         Self { width, height, quads: vec![0; width * height] }
     }
 
-    /// Takes the grey values of a frame; does nothing when there are not `width * height` of them
-    /// (callers check it where the frame enters).
+    /// Fills the image from the grey values of a frame; does nothing unless there are `width * height` of them (callers
+    /// check the size where the frame enters).
     pub fn fill(&mut self, pixels: &[u8]) {
         let width = self.width;
         if pixels.len() != self.quads.len() {
@@ -45,8 +45,7 @@ impl QuadImage {
         &self.quads
     }
 
-    /// Bilinear samples at eight positions, each at least a pixel from the border; elsewhere the
-    /// value is some pixel's.
+    /// Bilinear samples at eight positions, each at least a pixel from the border; elsewhere the values are arbitrary.
     #[inline(always)]
     pub fn sample(&self, u: &[f32; 8], v: &[f32; 8]) -> [f32; 8] {
         let mut index = [0i32; 8];
@@ -102,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn positions_outside_or_not_finite_do_no_harm() {
+    fn accepts_positions_outside_and_non_finite() {
         let image = QuadImage::with_size(12, 9);
         let wild = [f32::NAN, f32::INFINITY, -5.0, 1e9, -1e9, 0.0, 11.0, 200.0];
         assert!(image.sample(&wild, &[0.5; 8]).iter().all(|s| s.is_nan() || s.abs() < 1e12));

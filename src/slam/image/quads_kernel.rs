@@ -3,18 +3,18 @@
 use crate::slam::image::quads::QuadImage;
 use crate::slam::kernel::Instructions;
 
-/// How eight bilinear samples are taken; all versions give the same bits.
+/// A way of taking eight bilinear samples; all implementations give the same bits.
 pub trait Sampler: Copy {
-    /// What [`QuadImage::sample`] explains.
+    /// Same as [`QuadImage::sample`].
     fn sample(self, image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> [f32; 8];
 }
 
-/// An image and how it is sampled.
+/// An image and its sampler.
 #[derive(Debug, Clone, Copy)]
 pub struct Sampled<'a, S> {
     /// The image.
     pub image: &'a QuadImage,
-    /// How.
+    /// The way it is sampled.
     pub sampler: S,
 }
 
@@ -23,7 +23,7 @@ impl<I: Instructions> Sampler for I {
     fn sample(self, image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> [f32; 8] {
         #[cfg(target_arch = "x86_64")]
         if I::HAS_AVX2 {
-            // SAFETY: who made the instructions vouched for them.
+            // SAFETY: whoever made the instructions vouched for them.
             return unsafe { sample_avx2(image, u, v) };
         }
         image.sample(u, v)
@@ -31,16 +31,16 @@ impl<I: Instructions> Sampler for I {
 }
 
 /// # Safety
-/// The processor has AVX2. Without the attribute that says so, because only that goes into the loop of
-/// the caller whatever its size.
+/// The processor has AVX2. Without `#[target_feature]`, because only then is it inlined into the caller's loop whatever
+/// its size.
 #[cfg(target_arch = "x86_64")]
 #[inline(always)]
 unsafe fn sample_avx2(image: &QuadImage, u: &[f32; 8], v: &[f32; 8]) -> [f32; 8] {
     use std::arch::x86_64::*;
 
     let quads = image.quads();
-    // SAFETY: AVX2 is this function's contract. What is loaded and stored are arrays of eight numbers,
-    // and every index is at most that of the last pixel, unsigned: images have less than 2³¹ pixels.
+    // SAFETY: AVX2 is this function's contract. The arrays loaded and stored have eight numbers,
+    // and every index is at most that of the last pixel, unsigned: images have fewer than 2³¹ pixels.
     unsafe {
         let (u, v) = (_mm256_loadu_ps(u.as_ptr()), _mm256_loadu_ps(v.as_ptr()));
         let (column, row) = (_mm256_cvttps_epi32(u), _mm256_cvttps_epi32(v));
@@ -70,7 +70,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn gathered_samples_are_those_of_the_explanation() {
+    fn gathered_samples_match_the_scalar_reference() {
         if !std::arch::is_x86_feature_detected!("avx2") {
             return;
         }
@@ -78,7 +78,7 @@ mod tests {
         let pixels: Vec<u8> = (0..width * height).map(|i| (i * i * 31 % 251) as u8).collect();
         let mut image = QuadImage::with_size(width, height);
         image.fill(&pixels);
-        // SAFETY: the processor has AVX2, as was just asked.
+        // SAFETY: the processor has AVX2, as just checked.
         let sample = |u: &[f32; 8], v: &[f32; 8]| unsafe { sample_avx2(&image, u, v) };
         let place = |i: usize, side: usize| 0.5 + (i as f32 * 0.377) % (side as f32 - 2.0);
         for i in 0..500 {

@@ -1,8 +1,8 @@
-//! A grey image whose pixels others may keep as well.
+//! A grey image with shared ownership of its pixels.
 
 use std::sync::Arc;
 
-/// A row-major image of grey values, `width * height` bytes. A clone shares them.
+/// A row-major image of grey values, `width * height` bytes. Clones share the pixels.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SharedImage {
     width: usize,
@@ -58,7 +58,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn half_an_image_has_the_rounded_means() {
+    fn halving_rounds_the_means() {
         let image =
             SharedImage::try_from_pixels(5, 2, [1, 2, 255, 254, 9, 3, 4, 255, 255, 9].into());
         assert_eq!(image.unwrap().halved().pixels(), [3, 255]);

@@ -1,23 +1,22 @@
-//! The pyramid that alignment reads: each pixel of level l is the **sum** of the 4ˡ pixels below it.
+//! The pyramid that alignment reads: each pixel of level l is the **sum** of the 4ˡ level-0 pixels that it covers.
 //!
-//! Sums of bytes are exact in 16 bits up to level 4, so that no level is rounded, two neighbours
-//! come with one 32-bit load, and half the memory of f32 moves. A sum times [`grey_per_sum`] is
-//! the 2×2 mean of means of the notation.
+//! Sums of bytes are exact in 16 bits up to level 4: no level is rounded, two neighbours fit one 32-bit load, and the
+//! memory traffic is half that of f32. A sum times [`grey_per_sum`] is the 2×2 mean of means of the notation.
 
 use crate::slam::image::buffer::Image;
 
-/// Most levels: 255 · 4⁴ = 65 280 is the largest sum that 16 bits hold.
+/// Maximum number of levels: 255 · 4⁴ = 65 280 is the largest sum that 16 bits hold.
 pub const MAX_LEVELS: usize = 5;
 
-/// Contrast below which an image shows nothing, grey levels: covered lens, overexposure, a white wall.
+/// Contrast below which an image is blank, grey levels: covered lens, overexposure, a white wall.
 pub const LEAST_CONTRAST: f64 = 2.0;
 
-/// What turns a pixel of `level` into grey levels.
+/// Factor from a pixel of `level` to grey levels.
 pub fn grey_per_sum(level: usize) -> f32 {
     1.0 / (1u32 << (2 * level)) as f32
 }
 
-/// Sums of one frame, by level.
+/// Sums of one frame by level.
 #[derive(Debug, Clone, Default)]
 pub struct SumPyramid {
     width: usize,
@@ -27,8 +26,8 @@ pub struct SumPyramid {
 }
 
 impl SumPyramid {
-    /// Memory for `num_levels` (at most [`MAX_LEVELS`]) levels over a `width * height` image.
-    /// Levels below `finest_level` (at most 1) are never filled and take no memory.
+    /// Allocates `num_levels` (at most [`MAX_LEVELS`]) levels over a `width * height` image. Levels below
+    /// `finest_level` (at most 1) are never filled and take no memory.
     pub fn with_size(width: usize, height: usize, num_levels: usize, finest_level: usize) -> Self {
         let finest_level = finest_level.min(1);
         let levels = (0..num_levels.min(MAX_LEVELS))
@@ -40,15 +39,15 @@ impl SumPyramid {
         Self { width, height, finest_level, levels }
     }
 
-    /// Whether the memory fits an image of this size and these levels.
+    /// Whether this pyramid has the levels of an image of this size.
     pub fn has_size(&self, width: usize, height: usize, levels: usize, finest: usize) -> bool {
         (self.width, self.height) == (width, height)
             && self.levels.len() == levels.min(MAX_LEVELS)
             && self.finest_level == finest.min(1)
     }
 
-    /// Fills every level from the grey values of level 0. Does nothing when their number differs
-    /// (callers check it where the frame enters).
+    /// Fills every level from the grey values of level 0. Does nothing if their number differs (callers check it where
+    /// the frame enters).
     pub fn fill(&mut self, pixels: &[u8]) {
         if pixels.len() != self.width * self.height {
             return;
@@ -74,7 +73,7 @@ impl SumPyramid {
         &self.levels[level]
     }
 
-    /// Standard deviation of the coarsest level, grey levels: noise is averaged away there.
+    /// Standard deviation of the coarsest level, grey levels: noise averages out there.
     pub fn contrast(&self) -> f64 {
         let Some(coarsest) = self.levels.last() else { return 0.0 };
         let pixels = coarsest.pixels();
@@ -84,7 +83,7 @@ impl SumPyramid {
         (squared / count).sqrt() * f64::from(grey_per_sum(self.levels.len() - 1))
     }
 
-    /// Number of levels, those below the finest included.
+    /// Number of levels, including those below the finest.
     pub fn num_levels(&self) -> usize {
         self.levels.len()
     }
@@ -107,7 +106,7 @@ fn halve<T: Copy + Into<u16>>(fine: &[T], width: usize, coarse: &mut Image<u16>)
         let pairs = upper.as_chunks::<2>().0.iter().zip(lower.as_chunks::<2>().0);
         for (out, (&up, &low)) in out.iter_mut().zip(pairs) {
             let [[a, b], [c, d]] = [up, low].map(|pair| pair.map(Into::into));
-            // Sums of a fresh pyramid cannot overflow (MAX_LEVELS); wrapping spares the check.
+            // Cannot overflow (MAX_LEVELS); wrapping spares the check.
             *out = a.wrapping_add(b).wrapping_add(c.wrapping_add(d));
         }
     }
@@ -118,7 +117,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_level_is_the_exact_sum_also_for_odd_sizes() {
+    fn every_level_is_the_exact_sum_even_for_odd_sizes() {
         let (width, height) = (77, 53);
         let pixels: Vec<u8> = (0..width * height).map(|i| ((i * 7919) % 256) as u8).collect();
         for finest in 0..2 {
@@ -151,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn pixels_of_another_size_change_nothing() {
+    fn pixels_of_another_size_are_ignored() {
         let mut pyramid = SumPyramid::with_size(32, 32, 3, 0);
         pyramid.fill(&[9; 31 * 32]);
         assert_eq!(pyramid.level(2).at(1, 1), 0);

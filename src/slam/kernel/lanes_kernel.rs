@@ -1,15 +1,15 @@
-//! What the loops ask of an instruction set, and the arithmetic that they are written in.
+//! The operations that loops require of an instruction set, and the arithmetic they are written in.
 
 use std::ops::{Add, BitAnd, Div, Mul, Sub};
 
-/// The bits of a number's exponent.
+/// The exponent bits of an f32.
 pub(super) const EXPONENT: f32 = f32::INFINITY;
 
-/// Some f32 in one register.
+/// f32 numbers in one register.
 ///
 /// # Safety
-/// Callers make sure that the CPU has the instructions, give pointers to `N` floats, and tables of more than `last` + 1
-/// numbers of 16 bits or `last` + 3 of 8.
+/// The CPU has the instructions; pointers are valid for `N` floats; tables have at least `last` + 2 numbers of 16 bits
+/// or `last` + 4 of 8 bits.
 pub trait Register: Copy {
     /// Number of lanes; divides the sixteen of a block.
     const N: usize;
@@ -38,14 +38,14 @@ pub trait Register: Copy {
     unsafe fn both(one: Self::Mask, other: Self::Mask) -> Self::Mask;
     unsafe fn select(mask: Self::Mask, yes: Self, no: Self) -> Self;
     unsafe fn bits(mask: Self::Mask) -> u32;
-    /// Towards zero; the least i32 for what fits none.
+    /// Rounds towards zero; `i32::MIN` where the result does not fit.
     unsafe fn truncate(self) -> Self::Whole;
     unsafe fn float(whole: Self::Whole) -> Self;
     /// `row * stride + column`, wrapping.
     unsafe fn index(column: Self::Whole, row: Self::Whole, stride: i32) -> Self::Whole;
-    /// The numbers at `index`, unsigned and `last` at most, and those right after them.
+    /// The numbers at `index`, unsigned and clamped to `last`, and the numbers right after them.
     unsafe fn pairs(table: &[u16], index: Self::Whole, last: u32) -> [Self; 2];
-    /// The same of bytes.
+    /// The same for bytes.
     unsafe fn byte_pairs(table: &[u8], index: Self::Whole, last: u32) -> [Self; 2];
 }
 
@@ -55,7 +55,7 @@ macro_rules! intrinsics {
         #[inline(always)]
         #[allow(unused_unsafe, reason = "plain arithmetic needs none")]
         unsafe fn $name($($argument: $kind),*) -> $result {
-            // SAFETY: the trait's contract: the CPU has the instructions, pointers are good for N.
+            // SAFETY: the trait's contract: the CPU has the instructions, pointers are valid for N.
             unsafe { $body }
         }
     )*};
@@ -63,7 +63,7 @@ macro_rules! intrinsics {
 
 pub(super) use intrinsics;
 
-/// Some f32 in a register that the CPU has: instructions make them.
+/// f32 numbers in a register that the CPU has: only instructions make them.
 #[derive(Debug, Clone, Copy)]
 pub struct Lanes<R>(pub(super) R);
 
@@ -71,9 +71,9 @@ pub struct Lanes<R>(pub(super) R);
 #[derive(Clone, Copy)]
 pub struct Mask<R: Register>(R::Mask);
 
-/// Which numbers [`Lanes::sample`] takes.
+/// A pixel type that [`Lanes::sample`] reads.
 pub trait Pixel: Sized {
-    /// The numbers at `index` and those right after them, some numbers where the table does not have both.
+    /// The numbers at `index` and those right after them; arbitrary numbers where the table does not have both.
     fn pairs<R: Register>(table: &[Self], index: Whole<R>) -> [Lanes<R>; 2];
 }
 
@@ -81,7 +81,7 @@ pub trait Pixel: Sized {
 #[derive(Clone, Copy)]
 pub struct Whole<R: Register>(R::Whole);
 
-/// Neighbouring pixels of one place, and where it lies between them.
+/// Four neighbouring pixels and the position between them.
 #[derive(Clone, Copy)]
 pub struct Sample<R> {
     pub upper_left: Lanes<R>,
@@ -99,7 +99,7 @@ macro_rules! operators {
 
             #[inline(always)]
             fn $name(self, other: Self) -> Self {
-                // SAFETY: who made the lanes vouched for the instructions.
+                // SAFETY: whoever made the lanes vouched for the instructions.
                 Self(unsafe { R::$name(self.0, other.0) })
             }
         }
@@ -113,7 +113,7 @@ macro_rules! methods {
         $(#[$doc])*
         #[inline(always)]
         pub fn $name(self, $($argument: Self),*) -> $Result<R> {
-            // SAFETY: who made the lanes vouched for the instructions.
+            // SAFETY: whoever made the lanes vouched for the instructions.
             $Result(unsafe { R::$name(self.0, $($argument.0),*) })
         }
     )*};
@@ -123,11 +123,11 @@ impl<R: Register> Lanes<R> {
     methods! {
         /// Square root.
         sqrt() -> Lanes;
-        /// Without the sign.
+        /// Absolute value.
         abs() -> Lanes;
-        /// The whole number below; of numbers that fit an `i32`.
+        /// Rounds down; for numbers that fit an `i32`.
         floor() -> Lanes;
-        /// The power of two below a number of at least 1.
+        /// The largest power of two not above a number of at least 1.
         power_of_two_below() -> Lanes;
         /// The smaller one; `other` where this is NaN.
         min(other) -> Lanes;
@@ -141,19 +141,19 @@ impl<R: Register> Lanes<R> {
         at_least(other) -> Mask;
         /// Whether both are equal.
         equal(other) -> Mask;
-        /// Towards zero.
+        /// Rounds towards zero.
         truncate() -> Whole;
     }
 
-    /// Writes the lanes; panics where there are fewer numbers.
+    /// Stores the lanes; panics if `to` has fewer numbers than lanes.
     #[inline(always)]
     pub fn store(self, to: &mut [f32]) {
         let to = &mut to[..R::N];
-        // SAFETY: who made the lanes vouched for the instructions; there are N numbers.
+        // SAFETY: whoever made the lanes vouched for the instructions; there are N numbers.
         unsafe { self.0.store(to.as_mut_ptr()) }
     }
 
-    /// The lanes, and zeros behind them.
+    /// The lanes, followed by zeros.
     #[inline(always)]
     pub fn to_array<const M: usize>(self) -> [f32; M] {
         let mut array = [0.0; M];
@@ -161,11 +161,11 @@ impl<R: Register> Lanes<R> {
         array
     }
 
-    /// The four pixels around (u, v) in rows of `stride`; some pixels where the image does not have all of them.
+    /// The four pixels around (u, v) in rows of `stride`; arbitrary pixels where the image does not have all of them.
     #[inline(always)]
     pub fn sample<P: Pixel>(image: &[P], stride: usize, u: Self, v: Self) -> Sample<R> {
         let (column, row) = (u.truncate(), v.truncate());
-        // SAFETY: who made the lanes vouched for the instructions.
+        // SAFETY: whoever made the lanes vouched for the instructions.
         let index = Whole(unsafe { R::index(column.0, row.0, stride as i32) });
         let [upper_left, upper_right] = P::pairs(&image[..image.len() - stride], index);
         let [lower_left, lower_right] = P::pairs(&image[stride..], index);
@@ -178,7 +178,7 @@ impl<R: Register> Whole<R> {
     /// The same numbers as f32.
     #[inline(always)]
     pub fn float(self) -> Lanes<R> {
-        // SAFETY: who made the lanes vouched for the instructions.
+        // SAFETY: whoever made the lanes vouched for the instructions.
         Lanes(unsafe { R::float(self.0) })
     }
 }
@@ -188,10 +188,10 @@ macro_rules! pixels {
         impl Pixel for $Pixel {
             #[inline(always)]
             fn pairs<R: Register>(table: &[Self], index: Whole<R>) -> [Lanes<R>; 2] {
-                // Places must fit an i32.
+                // Indices must fit an i32.
                 assert!(($behind..1 << 31).contains(&table.len()), "size of a table");
                 let last = (table.len() - $behind) as u32;
-                // SAFETY: who made the lanes vouched for the instructions; four bytes are read at `last`.
+                // SAFETY: whoever made the lanes vouched for the instructions; four bytes are read at `last`.
                 unsafe { R::$pairs(table, index.0, last) }.map(Lanes)
             }
         }
@@ -207,11 +207,11 @@ impl<R: Register> Mask<R> {
     /// `yes` where the mask is set, `no` elsewhere.
     #[inline(always)]
     pub fn select(self, yes: Lanes<R>, no: Lanes<R>) -> Lanes<R> {
-        // SAFETY: who made the lanes vouched for the instructions.
+        // SAFETY: whoever made the lanes vouched for the instructions.
         Lanes(unsafe { R::select(self.0, yes.0, no.0) })
     }
 
-    /// How many lanes are set.
+    /// Number of lanes that are set.
     #[inline(always)]
     pub fn count(self) -> u32 {
         self.bits().count_ones()
@@ -230,7 +230,7 @@ impl<R: Register> BitAnd for Mask<R> {
 
     #[inline(always)]
     fn bitand(self, other: Self) -> Self {
-        // SAFETY: who made the lanes vouched for the instructions.
+        // SAFETY: whoever made the lanes vouched for the instructions.
         Self(unsafe { R::both(self.0, other.0) })
     }
 }
@@ -240,7 +240,7 @@ mod tests {
     use super::*;
     use crate::slam::kernel::{Body, Instructions, Kernel};
 
-    /// Every operation that is not fused on some numbers, as bits.
+    /// Results of every unfused operation on some numbers, as bits.
     struct Everything;
 
     impl Body for Everything {
@@ -268,7 +268,7 @@ mod tests {
                 let both = (a.at_least(b) & a.equal(b)).select(left, right);
                 let sums = [a + b, a - b, a * b, a / b, a.floor(), power, left, right, less, both];
                 for x in sums.into_iter().chain([upper_right, lower_left, du, dv]) {
-                    // One NaN is as good as another.
+                    // NaN payloads are not compared.
                     let x: [f32; 8] = x.to_array();
                     bits.extend(x.map(|x| if x.is_nan() { 0 } else { x.to_bits() }));
                 }
@@ -279,7 +279,7 @@ mod tests {
     }
 
     #[test]
-    fn eight_lanes_give_the_same_bits_everywhere() {
+    fn eight_lanes_give_the_same_bits_with_every_kernel() {
         let portable = Kernel::Portable.run(Everything);
         assert!(portable.len() > 1000);
         for kernel in Kernel::available() {

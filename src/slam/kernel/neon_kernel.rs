@@ -24,7 +24,7 @@ impl Register for float32x4_t {
             vreinterpretq_u32_f32(self),
             vdupq_n_u32(EXPONENT.to_bits()),
         ));
-        // The number where the other is not one (0/0 in Huber's weight), as on the other CPUs.
+        // If one operand is NaN (0/0 in Huber's weight), the other is returned, as on the other CPUs.
         min(self: Self, other: Self) -> Self = vminnmq_f32(self, other);
         max(self: Self, other: Self) -> Self = vmaxnmq_f32(self, other);
         mul_add(self: Self, factor: Self, summand: Self) -> Self = vfmaq_f32(summand, self, factor);
@@ -45,7 +45,7 @@ impl Register for float32x4_t {
     }
 }
 
-/// Pairs of numbers of so many bits: there is no gather.
+/// Gathers pairs of numbers of `BITS` bits: NEON has no gather instruction.
 ///
 /// # Safety
 /// The CPU has NEON; `table` has more than `last` + 1 numbers.
@@ -55,7 +55,7 @@ unsafe fn gathered<Number, Pair: Into<u32>, const BITS: i32>(
     index: int32x4_t,
     last: u32,
 ) -> [float32x4_t; 2] {
-    // SAFETY: this function's own contract; a pair is two numbers of the table, its left one the lower half.
+    // SAFETY: this function's own contract; a pair is two numbers of the table, the left one the lower half.
     unsafe {
         let mut pairs = [0; 4];
         vst1q_u32(pairs.as_mut_ptr(), vminq_u32(vreinterpretq_u32_s32(index), vdupq_n_u32(last)));

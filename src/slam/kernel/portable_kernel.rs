@@ -4,7 +4,7 @@ use std::array::from_fn;
 
 use crate::slam::kernel::lanes_kernel::{EXPONENT, Register, intrinsics};
 
-/// Some floats.
+/// Lanes as an array.
 #[derive(Debug, Clone, Copy)]
 #[repr(C, align(16))]
 pub struct Numbers<const N: usize>([f32; N]);
@@ -70,12 +70,12 @@ impl<const N: usize> Register for Numbers<N> {
     }
 }
 
-/// Without the call that the baseline instruction set needs for it.
+/// Rounds down without the function call that the baseline instruction set needs for it.
 #[inline(always)]
 fn floor(x: f32) -> f32 {
-    /// From here on all numbers are whole.
+    /// From here on all numbers are integers.
     const WHOLE: f32 = 8_388_608.0;
-    // NaN stays too.
+    // NaN is returned too.
     if !(x.abs() < WHOLE) {
         return x;
     }
@@ -84,7 +84,7 @@ fn floor(x: f32) -> f32 {
     below.copysign(x)
 }
 
-/// As vector instructions do it, where plain Rust would give the nearest i32, and 0 for NaN.
+/// Truncates like the vector instructions, where plain Rust would give the nearest i32, and 0 for NaN.
 #[inline(always)]
 fn truncate(x: f32) -> i32 {
     if x.abs() < -(i32::MIN as f32) { x as i32 } else { i32::MIN }

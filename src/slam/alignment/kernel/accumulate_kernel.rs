@@ -1,8 +1,8 @@
 //! The loop over points for any instruction set: `residual::accumulate_reference` in lanes.
 //!
-//! Points are taken in chunks that stay in the first-level cache. A first pass writes, for each
-//! point, the columns of the whitened Jacobian √w J and residual √w r; then five passes sum their
-//! products with at most eleven sums each, what sixteen registers hold without spilling.
+//! Points are processed in chunks that stay in the L1 cache. A first pass writes the columns of the whitened Jacobian
+//! √w J and residual √w r for each point; then five passes sum their products with at most eleven sums each, as many as
+//! sixteen registers hold without spilling.
 
 use crate::slam::alignment::normal_equations::{NormalEquations, UNKNOWNS};
 use crate::slam::alignment::points::{LANES, LevelPoints, PointBlock};
@@ -13,7 +13,7 @@ use crate::slam::image::buffer::Image;
 use crate::slam::kernel::lanes_kernel::{Lanes, Mask, Register};
 use crate::slam::kernel::{Body, Floats, Instructions};
 
-/// Blocks of a chunk: its columns take 10 kB, a third of a small first-level cache.
+/// Blocks per chunk: its columns take 10 kB, a third of a small L1 cache.
 pub const CHUNK_BLOCKS: usize = 16;
 
 /// Columns: eight of the Jacobian, the residual.
@@ -29,8 +29,8 @@ impl Whitened {
     pub const ZERO: Self = Self([[0.0; LANES]; COLUMNS]);
 }
 
-/// Sums of products of columns, the upper triangle of JᵀWJ and JᵀWr, lane by lane; `[i][j]`, j > 7
-/// the residual.
+/// Sums of products of columns, the upper triangle of JᵀWJ and JᵀWr, lane by lane; `[i][j]`, where j > 7 is the
+/// residual.
 #[derive(Clone, Copy)]
 #[repr(C, align(64))]
 struct Sums([[[f32; LANES]; COLUMNS]; UNKNOWNS]);
@@ -50,7 +50,7 @@ impl<R: Register> Statistics<R> {
         Self { energy: zero, squared_residual: zero, in_view: 0, compared: 0, inliers: 0 }
     }
 
-    /// Counts residuals that are compared; their weights, with Huber's.
+    /// Counts the compared residuals; returns their weights, including Huber's.
     #[inline(always)]
     fn weigh<I: Instructions<Register = R>>(
         &mut self,
@@ -75,7 +75,7 @@ impl<R: Register> Statistics<R> {
     }
 }
 
-/// What `Kernel::accumulate` sums.
+/// The input of `Kernel::accumulate`.
 pub struct Accumulation<'a> {
     pub points: &'a LevelPoints,
     pub image: &'a Image<u16>,
@@ -108,7 +108,7 @@ impl Body for Accumulation<'_> {
     }
 }
 
-/// Residual, weight and Jacobian of `I::N` points; the formulas and the steps are those of `residual::point_terms`.
+/// Residual, weight and Jacobian of `I::N` points, with the same formulas and steps as `residual::point_terms`.
 #[inline(always)]
 pub fn whiten<I: Instructions>(
     lanes: I,
@@ -125,7 +125,7 @@ pub fn whiten<I: Instructions>(
     let value = sample(image, u, v) * lanes.splat(at.grey_per_sum);
     let predicted = load(&block.intensity) * lanes.splat(at.gain);
     let residual = value - (predicted + lanes.splat(at.offset));
-    // Where the sensor ends, a residual that points beyond its end says nothing.
+    // At the limits of the sensor, a residual pointing beyond the limit carries no information.
     let [darkest, lightest] = UNCLIPPED_GREY.map(|grey| lanes.splat(grey));
     let within = value.greater(lightest).select(residual, one);
     let within = darkest.greater(value).select(zero - residual, within);
@@ -177,7 +177,7 @@ fn warp<I: Instructions>(
     ]
 }
 
-/// Where points fall, and which of them are in view; the others fall on the border.
+/// Projections of points, and which of them are in view; the others are put on the border.
 #[inline(always)]
 fn project<I: Instructions>(
     lanes: I,
@@ -190,7 +190,7 @@ fn project<I: Instructions>(
     let d = lanes.load(&block.inverse_depth[lane..]);
     let [warped_x, warped_y, depth_ratio] = warp(lanes, block, lane, at, d);
     let in_front = depth_ratio.greater(lanes.splat(NEAREST_DEPTH_RATIO));
-    // Lanes that are not in view continue with harmless numbers: 0 · NaN would be NaN.
+    // Lanes out of view continue with finite numbers: 0 · NaN would be NaN.
     let depth_ratio = in_front.select(depth_ratio, lanes.splat(1.0));
     let inverse_ratio = lanes.splat(1.0) / depth_ratio;
     let (nx, ny) = (warped_x * inverse_ratio, warped_y * inverse_ratio);
@@ -202,7 +202,7 @@ fn project<I: Instructions>(
     (in_view.select(u, border), in_view.select(v, border), in_view)
 }
 
-/// The image between its pixels.
+/// Bilinear sample of the image.
 #[inline(always)]
 fn sample<R: Register>(image: &Image<u16>, u: Lanes<R>, v: Lanes<R>) -> Lanes<R> {
     let pixels = Lanes::sample(image.pixels(), image.width(), u, v);
@@ -211,7 +211,7 @@ fn sample<R: Register>(image: &Image<u16>, u: Lanes<R>, v: Lanes<R>) -> Lanes<R>
     (below - above).mul_add(pixels.dv, above)
 }
 
-/// The surface around points as the frame sees it: its gradient, n and 1/z̃.
+/// The surface around points as seen in the frame: its gradient, n and 1/z̃.
 struct Surface<R> {
     ax: Lanes<R>,
     ay: Lanes<R>,
@@ -279,7 +279,7 @@ fn sum_rows_2_to_5<I: Instructions>(lanes: I, columns: &[Whitened], sums: &mut S
         ee = e[4] * e[4], ef = e[4] * f[5], ff = f[5] * f[5]);
 }
 
-/// The products of a column of the brightness with all before it and itself.
+/// The products of a brightness column with itself and all columns before it.
 #[inline(always)]
 fn sum_column<I: Instructions, const COLUMN: usize>(
     lanes: I,

@@ -1,7 +1,7 @@
-//! What a common error of depth does to the gradient of the cost, for any instruction set: the last
-//! sum of `GradientScatter::reference` in lanes.
+//! The effect of a common error of depth on the gradient of the cost, for any instruction set: the last sum of
+//! `GradientScatter::reference` in lanes.
 //!
-//! ∂r/∂d · d is J_t · t, so that the whitened columns hold all of it but X, Y and ln d.
+//! ∂r/∂d · d is J_t · t, so that the whitened columns provide all of it except X, Y and ln d.
 
 use nalgebra::SMatrix;
 
@@ -25,7 +25,7 @@ impl ModeSums {
     }
 }
 
-/// Adds the products of a chunk whose columns are `whitened`; `translation` is that of the state.
+/// Adds the products of a chunk with columns `whitened`; `translation` is that of the state.
 #[inline(always)]
 pub fn add_modes<I: Instructions>(
     lanes: I,

@@ -1,9 +1,9 @@
-//! The gradient of the cost by tile of the image, and what common errors of depth do to it, for any
-//! instruction set: `GradientScatter::reference` in lanes.
+//! The gradient of the cost by image tile and its change with common errors of depth, for any instruction set:
+//! `GradientScatter::reference` in lanes.
 //!
-//! The whitened columns hold all of it: √w J · √w r is a point's gradient, √w · √w its weight, and
-//! its Huber weight is 1 where (√w r)² ≤ k². Points lie row by row, so that a block meets a few
-//! tiles in runs of lanes: each run adds its products, lane by lane, to the sums of its tile.
+//! The whitened columns suffice: √w J · √w r is a point's gradient, √w · √w its weight, and its Huber weight is 1 where
+//! (√w r)² ≤ k². Points lie row by row, so that a block covers a few tiles in runs of lanes: each run adds its
+//! products, lane by lane, to the sums of its tile.
 
 use crate::slam::alignment::kernel::accumulate_kernel::{
     CHUNK_BLOCKS, RESIDUAL, Statistics, Whitened, whiten,
@@ -21,10 +21,10 @@ use crate::slam::kernel::{Body, Floats, Instructions};
 const ABOUT_X: usize = 3;
 const ABOUT_Y: usize = 4;
 
-/// The column of −√w: the derivative by the offset is −1.
+/// The column of −√w: the derivative with respect to the offset is −1.
 const WEIGHT: usize = 7;
 
-/// Sums of one tile, lane by lane; where an instruction set has fewer lanes, the rest stays zero.
+/// Sums of one tile, lane by lane; with an instruction set of fewer lanes the rest stays zero.
 #[derive(Clone, Copy)]
 #[repr(C, align(64))]
 struct TileSums {
@@ -41,7 +41,7 @@ impl TileSums {
     };
 }
 
-/// Ones where a run is, read at an offset: sixteen zeros, sixteen ones, sixteen zeros.
+/// Mask of a run, read at an offset: sixteen zeros, sixteen ones, sixteen zeros.
 static ONES: [f32; 3 * LANES] = {
     let mut ones = [0.0; 3 * LANES];
     let mut lane = LANES;
@@ -52,7 +52,7 @@ static ONES: [f32; 3 * LANES] = {
     ones
 };
 
-/// What `Kernel::scatter` measures.
+/// The input of `Kernel::scatter`.
 pub struct Scattering<'a> {
     pub points: &'a LevelPoints,
     pub image: &'a Image<u16>,
@@ -144,7 +144,7 @@ fn add_run<I: Instructions>(lanes: I, whitened: &Whitened, run: &TileRun, tile: 
     }
 }
 
-/// The sum of all lanes, halving by halving: the same order everywhere.
+/// The sum of all lanes, by repeated halving: the same order on every CPU.
 #[inline(always)]
 fn total(lanes: &[f32; LANES]) -> f32 {
     let eight: [f32; 8] = std::array::from_fn(|lane| lanes[lane] + lanes[lane + 8]);

@@ -1,14 +1,14 @@
-//! Each response against geometry done by itself, and the covariances against samples.
+//! Each response against independent geometry, and the covariances against samples.
 
 use nalgebra::{SVector, Vector2};
 
 use super::*;
 use crate::slam::alignment::scene::{Noise, small_camera, small_plane};
 
-/// Relative standard deviation of the depths: the same for all, so that every point weighs alike.
+/// Relative standard deviation of the depths: the same for all, so that all points have equal weight.
 const RELATIVE_STD_DEV: f32 = 0.03;
 
-/// Depth of a plane at every third pixel, with bumps so that relief is not another tilt.
+/// Depth of a plane at every third pixel, with bumps so that relief differs from tilt.
 fn depth() -> DepthMap {
     let (plane, camera) = (small_plane(), small_camera());
     let mut map = DepthMap::with_size(camera.width, camera.height);
@@ -43,12 +43,12 @@ fn twist(seed: u64, size: f64) -> Vector6<f64> {
     Vector6::from_fn(|_, _| size * noise.uniform())
 }
 
-/// Far enough that every gradient along the line tells a depth.
+/// Far enough that every gradient along the line determines a depth.
 fn pose() -> SE3 {
     SE3::exp(&Vector6::new(0.25, -0.1, 0.15, 0.03, -0.06, 0.05))
 }
 
-/// The modes of relative errors at places (x, y, ln d), every point alike.
+/// The modes of relative errors at (x, y, ln d), with equal weight for every point.
 fn fitted(errors: &[(Vector3<f64>, f64)]) -> Vector3<f64> {
     let (mut normal, mut right) = (Matrix4::zeros(), Vector4::zeros());
     for (place, error) in errors {
@@ -65,7 +65,7 @@ fn assert_close(name: &str, found: &Vector3<f64>, expected: &Vector3<f64>) {
 }
 
 #[test]
-fn modes_on_the_next_keyframe_are_those_of_its_true_errors() {
+fn modes_on_the_next_keyframe_match_its_true_errors() {
     let (map, camera, truth) = (depth(), small_camera(), pose());
     let samples = samples(&map);
     let response = samples.carried(&truth, &camera).unwrap();
@@ -80,7 +80,7 @@ fn modes_on_the_next_keyframe_are_those_of_its_true_errors() {
             let (true_point, found) =
                 (truth * (sample.ray / d), estimated * (sample.ray / with_error));
             let (x, y) = (true_point.x / true_point.z, true_point.y / true_point.z);
-            // Inverse depths: what is too near is too large.
+            // Inverse depths: a point too near has too large a value.
             let error = true_point.z / found.z - 1.0;
             is_inside(x, y, &camera).then(|| (Vector3::new(x, y, -true_point.z.ln()), error))
         });
@@ -90,17 +90,17 @@ fn modes_on_the_next_keyframe_are_those_of_its_true_errors() {
 }
 
 #[test]
-fn depth_that_is_matched_at_a_wrong_pose_errs_by_what_hides_it() {
+fn depth_matched_at_a_wrong_pose_errs_by_what_cancels_the_residual() {
     let (map, truth) = (depth(), pose());
     let samples = samples(&map);
-    // Every match is taken over whole.
+    // Every match is adopted fully.
     let mut after = map.clone();
     for hypothesis in after.hypotheses.pixels_mut().iter_mut().filter(|h| h.is_some()) {
         hypothesis.inverse_depth *= 1.001;
         hypothesis.variance = 0.0;
     }
     let response = samples.observed(&after, &truth).unwrap();
-    // What has no gradient along its line keeps its old error.
+    // Points without gradient along their line keep their old error.
     assert!(response.on_modes.norm() < 0.3, "{}", response.on_modes);
     let by_pose = samples.begun(&truth).unwrap();
     for seed in 0..6 {
@@ -116,7 +116,7 @@ fn depth_that_is_matched_at_a_wrong_pose_errs_by_what_hides_it() {
             };
             let d = f64::from(sample.before.smoothed);
             let seen = along_gradient(&truth, d);
-            // Where the wrong pose shows the same brightness.
+            // The depth at which the wrong pose shows the same brightness.
             let slope =
                 (along_gradient(&estimated, d * 1.001) - along_gradient(&estimated, d)) / 0.001;
             let error = (seen - along_gradient(&estimated, d)) / slope;
@@ -128,13 +128,13 @@ fn depth_that_is_matched_at_a_wrong_pose_errs_by_what_hides_it() {
 }
 
 #[test]
-fn a_frame_that_gives_nothing_changes_nothing() {
+fn a_frame_without_observations_gives_no_response() {
     let map = depth();
     assert_eq!(samples(&map).observed(&map, &pose()), None);
 }
 
 #[test]
-fn the_unit_is_no_mode_and_changes_none() {
+fn a_change_of_unit_does_not_affect_the_modes() {
     let (map, camera) = (depth(), small_camera());
     let in_other_unit = {
         let mut map = map.clone();
@@ -144,7 +144,7 @@ fn the_unit_is_no_mode_and_changes_none() {
     let mut shorter = pose();
     shorter.translation *= 0.5;
     let (one, other) = (samples(&map), samples(&in_other_unit));
-    // An error of the unit is carried over as such where the pose follows it.
+    // An error of the unit is carried over as an error of the unit if the pose follows it.
     let whole = |samples: &SampledDepth, pose: &SE3| {
         let carried = samples.carried(pose, &camera).unwrap();
         carried.on_modes + carried.on_pose * samples.d_pose_d_modes(pose).unwrap()
@@ -157,7 +157,7 @@ fn the_unit_is_no_mode_and_changes_none() {
 }
 
 #[test]
-fn covariances_are_those_of_samples() {
+fn covariances_match_samples() {
     let (map, camera, truth) = (depth(), small_camera(), pose());
     let samples = samples(&map);
     let mut after = map.clone();

@@ -8,29 +8,29 @@ use crate::slam::parameter::{ParameterError, check_range};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct GaussianParams {
-    /// Half width of the search around a hypothesis, in its standard deviations. 2 holds 95 %.
+    /// Half width of the search around a hypothesis, in its standard deviations. 2 covers 95 %.
     pub search_sigmas: f32,
-    /// An observation further off than this many joint standard deviations contradicts. A gate of 1,
-    /// the literature's, rejects a third of the right ones.
+    /// An observation further off than this many joint standard deviations contradicts. A gate of 1, the value in the
+    /// literature, rejects a third of the correct ones.
     pub gate_sigmas: f32,
-    /// A pixel is observed only when a match promises to leave less than this share of its variance: frames that
-    /// follow each other share the error of their poses, so waiting for baseline gains more than looking again.
+    /// A pixel is observed only if a match promises to reduce its variance to less than this share: consecutive frames
+    /// share the error of their poses, so waiting for baseline gains more than observing again.
     pub max_variance_ratio: f32,
-    /// Factor on the variance before each fusion: the world and the poses are never quite still.
+    /// Factor on the variance before each fusion: neither the world nor the poses are exactly constant.
     pub process_inflation: f32,
     /// Factor on the variance after a contradiction.
     pub contradiction_inflation: f32,
     /// Standard deviation beyond which a hypothesis is dropped, in units of the mean inverse depth.
     pub max_std_dev: f32,
-    /// Largest inverse depth that is searched for a new pixel, in units of the mean inverse depth:
-    /// nothing nearer than a quarter of the usual distance is expected.
+    /// Largest inverse depth that is searched for a new pixel, in units of the mean inverse depth: nothing nearer than
+    /// a quarter of the usual distance is expected.
     pub max_inverse_depth: f32,
     /// Shortest segment worth a search for a new pixel, pixels.
     pub min_new_segment_px: f32,
-    /// Longest segment that is searched for a new pixel while the keyframe is short of depth, that is, while less than a
-    /// third of the pixels that may carry depth have it, pixels; at least the `max_search_px` of all others. A camera
-    /// may be so fast that no frame has shorter segments, and a keyframe without depth is worse than repeated structure.
-    /// Of a longer one the far part, of this length, is searched.
+    /// Longest segment that is searched for a new pixel while less than a third of the pixels that may carry depth have
+    /// it, pixels; not below the `max_search_px` of all others. With a fast camera no frame may have shorter segments,
+    /// and a keyframe without depth is worse than repeated structure. Of a longer segment the far part, of this length,
+    /// is searched.
     pub max_first_search_px: f32,
 }
 

@@ -1,4 +1,4 @@
-//! Which new pixels are searched, and what they get.
+//! Which new pixels are searched, and which depth they get.
 
 use nalgebra::Vector6;
 
@@ -6,12 +6,12 @@ use super::*;
 use crate::slam::geometry::se3::SE3;
 use crate::slam::test_scene::{CAMERA, Rendering, Scene};
 
-/// Parallax of a point at the mean inverse depth: up to four times as near a segment is 64 px long.
+/// Parallax of a point at the mean inverse depth: a segment up to four times as near is 64 px long.
 const PARALLAX_PX: f64 = 16.0;
-/// Here it is 120 px long.
+/// The same segment is 120 px long.
 const WIDE_PARALLAX_PX: f64 = 30.0;
 
-/// A keyframe without depth, its exact depth, and a frame that is far from it.
+/// A keyframe without depth, its exact depth, and a distant frame.
 struct Fast {
     map: DepthMap,
     /// In units of the mean.
@@ -40,7 +40,8 @@ impl Fast {
         Self { map, inverse_depth, frame, view: TwoView::new(&CAMERA, &from_keyframe) }
     }
 
-    /// What an observation brings where one of `known_step` candidates has its depth already.
+    /// Observes with one in `known_step` candidates already at its true depth: the number of new hypotheses, and the
+    /// map.
     fn created(&self, known_step: usize, params: &GaussianParams) -> (usize, DepthMap) {
         let mut map = self.map.clone();
         let places = self.map.candidates.pixels().iter().enumerate().filter(|(_, is)| **is);
@@ -54,7 +55,7 @@ impl Fast {
         let observer = Observer { image: &self.frame, view: self.view, brightness, pixels };
         let matching = MatchingParams::default();
         let counts = observe(&mut map, &observer, &matching, params).counts;
-        // The same counted from lists as from pixels.
+        // Lists and pixels give the same counts.
         let listed = map.hypotheses.count_beside(&map.candidates);
         map.hypotheses.pixels_mut();
         assert_eq!(map.hypotheses.count_beside(&map.candidates), listed);
@@ -62,8 +63,8 @@ impl Fast {
     }
 }
 
-/// Of a keyframe's candidates the share that got depth in a frame far away, and the largest inverse depth of them: what
-/// they claim is right.
+/// The share of a keyframe's candidates that got depth from a distant frame, and their largest inverse depth; checks
+/// that their variances are consistent with their errors.
 fn found(fast: &Fast, params: &GaussianParams) -> (f64, f32) {
     let (created, map) = fast.created(usize::MAX, params);
     let candidates = fast.map.candidates.pixels().iter().filter(|is| **is).count();
@@ -80,18 +81,18 @@ fn found(fast: &Fast, params: &GaussianParams) -> (f64, f32) {
 }
 
 #[test]
-fn a_keyframe_short_of_depth_gets_it_from_a_frame_far_away() {
+fn a_keyframe_short_of_depth_gets_it_from_a_distant_frame() {
     let (share, _) = found(&Fast::new(PARALLAX_PX), &GaussianParams::default());
     assert!(share > 0.25, "{share}");
 }
 
 #[test]
-fn of_longer_segments_the_far_part_is_searched() {
+fn the_far_part_of_longer_segments_is_searched() {
     for (parallax_px, max_px) in [(PARALLAX_PX, 40.0), (WIDE_PARALLAX_PX, 90.0)] {
         let params = GaussianParams { max_first_search_px: max_px, ..GaussianParams::default() };
         let (share, nearest) = found(&Fast::new(parallax_px), &params);
         assert!(share > 0.25, "{parallax_px} px: {share}");
-        // The refinement may go a little beyond.
+        // The refinement may overshoot a little.
         let end = (max_px + 2.0) / parallax_px as f32;
         assert!(nearest < end, "{parallax_px} px: {nearest}, {end}");
     }

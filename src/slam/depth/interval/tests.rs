@@ -119,20 +119,20 @@ fn coverage(noise: f64, seeds: u64) -> Coverage {
 }
 
 #[test]
-fn without_noise_sure_traces_hold_the_truth() {
+fn without_noise_unambiguous_traces_contain_the_truth() {
     let coverage = coverage(0.0, 3);
     assert!(coverage.sure > 2000);
     assert!(coverage.sure_holds * 100 >= coverage.sure * 95);
 }
 
 #[test]
-fn with_the_noise_of_a_camera_most_sure_traces_hold_the_truth() {
+fn with_camera_noise_most_unambiguous_traces_contain_the_truth() {
     let coverage = coverage(3.0, 3);
     assert!(coverage.sure > 1000);
     assert!(coverage.sure_holds * 100 >= coverage.sure * 85);
 }
 
-/// Statuses and intervals on a path of which every step is longer than the one before.
+/// Statuses and intervals on a path with growing baseline.
 #[test]
 fn the_interval_shrinks_as_the_baseline_grows() {
     let sequence = Sequence::new(4, 16, 1.0);
@@ -157,7 +157,7 @@ fn the_interval_shrinks_as_the_baseline_grows() {
         widths[widths.len() / 2]
     };
     let medians = [0, 3, 7, 15].map(median_after);
-    // The baseline doubles from one to the next, twice from the first: so does the certainty.
+    // From one to the next the baseline doubles, the first time twice: the interval halves.
     assert!(medians.windows(2).all(|w| w[1] < 0.7 * w[0]), "{medians:?}");
     assert!(medians[3] < 0.12 * medians[0], "{medians:?}");
     let (near, all) = histories.iter().fold((0, 0), |(n, a), h| match h[15].status {
@@ -168,12 +168,12 @@ fn the_interval_shrinks_as_the_baseline_grows() {
 }
 
 #[test]
-fn a_scaled_world_gives_the_same_verdicts() {
+fn a_scaled_world_gives_the_same_statuses() {
     let sequence = Sequence::new(2, 6, 2.0);
     let params = IntervalParams::default();
     let wanted = CandidateParams { wanted: 300 };
     let poses = path(2, 7);
-    // A power of two leaves the digits as they are, so that even ties fall the same way.
+    // Scaling by a power of two keeps the mantissas, so that even ties break the same way.
     let factor = 8.0;
     let (mut filter, mut scaled) = (IntervalFilter::default(), IntervalFilter::default());
     filter.restart(&sequence.keyframe, &wanted);
@@ -196,7 +196,7 @@ fn a_scaled_world_gives_the_same_verdicts() {
 }
 
 #[test]
-fn the_brightness_of_a_frame_is_taken_out() {
+fn the_brightness_of_a_frame_is_compensated() {
     let sequence = Sequence::new(3, 4, 1.0);
     let params = IntervalParams::default();
     let mut outliers = [0, 0];
@@ -216,7 +216,7 @@ fn the_brightness_of_a_frame_is_taken_out() {
 }
 
 #[test]
-fn every_status_is_reached_and_endings_are_final() {
+fn every_status_is_reached_and_ended_points_stay_ended() {
     let sequence = Sequence::new(1, 2, 0.0);
     let params = IntervalParams::default();
     let point = |u, v| ImmaturePoint::new(&sequence.keyframe, u, v).unwrap();
@@ -226,14 +226,14 @@ fn every_status_is_reached_and_endings_are_final() {
         view: TwoView::new(&CAMERA, &SE3::exp(&Vector6::new(x, 0.0, z, 0.0, 0.0, 0.0))),
         ..sequence.frame(0)
     };
-    // Nothing moves: nothing to gain.
+    // No motion: nothing to gain.
     assert_eq!(point(160, 120).trace(&frame_at(0.0, 0.0), &params), TraceStatus::BadCondition);
-    // At the border, the search would leave the image; then nothing more is tried.
+    // At the border, the search would leave the image; afterwards the point is not tried again.
     let mut leaving = point(315, 120);
     assert_eq!(leaving.trace(&frame_at(0.1, 0.0), &params), TraceStatus::OutOfBounds);
     assert_eq!(leaving.trace(&sequence.frame(0), &params), TraceStatus::OutOfBounds);
     assert!(leaving.is_ended());
-    // A black frame matches nothing, the second one ends it.
+    // A black frame matches nothing; a second one ends the point.
     let black = QuadImage::with_size(CAMERA.width, CAMERA.height);
     let dark = TraceFrame { image: &black, ..frame_at(-0.05, 0.0) };
     let mut outlier = point(160, 120);
@@ -241,7 +241,7 @@ fn every_status_is_reached_and_endings_are_final() {
     assert!(!outlier.is_ended());
     assert_eq!(outlier.trace(&dark, &params), TraceStatus::Outlier);
     assert!(outlier.is_ended());
-    // A narrow interval is skipped, a wide one across the gradient is not worth a search.
+    // A narrow interval is skipped; a wide one across the gradient is not worth a search.
     let mut certain = point(160, 120);
     (certain.min_inverse_depth, certain.max_inverse_depth) = (0.30, Some(0.301));
     assert_eq!(certain.trace(&frame_at(-0.05, 0.0), &params), TraceStatus::Skipped);

@@ -58,7 +58,7 @@ fn image(pixels: &[u8]) -> GradientImage {
 }
 
 #[test]
-fn matches_hold_the_true_inverse_depth_within_their_variance() {
+fn matches_agree_with_the_truth_within_their_variance() {
     let params = MatchingParams {
         noise: ImageNoise { pixel_std_dev: 0.5, ..ImageNoise::DEFAULT },
         line_noise_px: 0.02,
@@ -100,7 +100,7 @@ fn matches_hold_the_true_inverse_depth_within_their_variance() {
 }
 
 #[test]
-fn gain_and_offset_are_taken_out() {
+fn gain_and_offset_are_compensated() {
     let params = MatchingParams::default();
     let motion = SE3::exp(&Vector6::new(0.05, 0.0, 0.0, 0.0, 0.0, 0.0));
     let bright: Vec<u8> =
